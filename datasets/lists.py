@@ -1,0 +1,52 @@
+"""Time-stamped lists of image files, and the association of two of them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from trihedron.datasets.trajectories import parse_stamp_ns, table_lines
+from trihedron.pipeline.errors import DataError
+from trihedron.pipeline.geometry import nearest_pairs
+
+Stamps = NDArray[np.int64]
+
+
+@dataclass(frozen=True)
+class FileList:
+    """Image files with their (n,) stamps in ns, strictly increasing."""
+
+    stamps_ns: Stamps
+    files: tuple[Path, ...]
+
+
+def read_file_list(path: Path) -> FileList:
+    """Read `stamp file` lines (TUM's rgb.txt, depth.txt); files are relative to the list's folder. Raises DataError naming file and line."""
+    stamps: list[int] = []
+    files: list[Path] = []
+    for number, words in table_lines(path):
+        place = f"{path}:{number}"
+        if len(words) < 2:
+            raise DataError(place, f"has {len(words)} column instead of 2", "each line holds 'stamp file'; correct or remove this one")
+        try:
+            stamp_ns = parse_stamp_ns(words[0])
+        except ValueError as error:
+            raise DataError(place, str(error), "each line holds 'stamp file'; correct or remove this one") from error
+        if stamps and stamp_ns <= stamps[-1]:
+            raise DataError(place, f"the time stamp {words[0]} does not come after the one before", "sort the list and remove duplicates")
+        stamps.append(stamp_ns)
+        files.append(path.parent / words[1])
+    if not stamps:
+        raise DataError(str(path), "lists no images", "give a list with a line 'stamp file' for each image")
+    return FileList(np.array(stamps, dtype=np.int64), tuple(files))
+
+
+def associate(first_ns: Stamps, second_ns: Stamps, max_difference_ns: int) -> NDArray[np.int64]:
+    """Pair two increasing lists of stamps, each entry at most once, the closest pairs first (the rule of the TUM benchmark's tools).
+
+    Returns the (n, 2) row numbers of the pairs, in order of time; the difference of a pair is below `max_difference_ns`. Ties go to the
+    earlier row, so the result does not depend on anything but the stamps."""
+    return nearest_pairs(first_ns, second_ns, max_difference_ns - 1)

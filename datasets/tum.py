@@ -1,0 +1,53 @@
+"""Sequences of the TUM RGB-D benchmark."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+from trihedron.datasets.cameras import choose_calibration, with_noise
+from trihedron.datasets.lists import associate, read_file_list
+from trihedron.datasets.sequence import ImageSequence, SequenceReader, open_folder, select_frames
+from trihedron.datasets.trajectories import TRUTH, read_trajectory
+from trihedron.pipeline.errors import DataError
+from trihedron.pipeline.registry import register
+from trihedron.pipeline.slots import frame_range
+
+
+@register("dataset", "tum")
+@dataclass(frozen=True)
+class Tum(SequenceReader):
+    """Folder with rgb.txt, depth.txt and, where there is truth, groundtruth.txt (Sturm et al. 2012). Colour and depth are separate streams,
+    paired by time; a frame carries the stamp of its colour image. fr1 and fr2 are undistorted at reading."""
+
+    path: str = ""  # folder of the sequence
+    frames: str = ""  # part to read, half open: A:B, A:, :B; empty = all
+    camera: str = ""  # preset or camera.yaml; empty = the folder's file, else its name
+    max_difference_ms: float = 20.0  # of a pair's stamps; the benchmark's tools use the same
+    exact_depth: bool = False  # rendered without sensor noise; false = a Kinect's
+
+    def __post_init__(self) -> None:
+        frame_range(self.frames)
+        if self.max_difference_ms <= 0.0:
+            raise ValueError(f"max_difference_ms: {self.max_difference_ms} is not positive")
+
+    @cached_property
+    def _sequence(self) -> ImageSequence:
+        folder = open_folder(self.path)
+        for name, kind in (("rgb.txt", "colour"), ("depth.txt", "depth")):
+            if not (folder / name).is_file():
+                raise DataError(str(folder / name), "is missing", f"it lists the {kind} images; without lists use dataset=folder")
+        color, depth = read_file_list(folder / "rgb.txt"), read_file_list(folder / "depth.txt")
+        pairs = associate(color.stamps_ns, depth.stamps_ns, round(self.max_difference_ms * 1e6))
+        if not len(pairs):
+            cause = f"no colour and depth image are within {self.max_difference_ms:g} ms of each other"
+            raise DataError(str(folder), cause, "check the stamps in rgb.txt and depth.txt or raise dataset.max_difference_ms")
+        truth = folder / TRUTH
+        whole = ImageSequence(
+            color.stamps_ns[pairs[:, 0]],
+            [color.files[i] for i in pairs[:, 0]],
+            [depth.files[i] for i in pairs[:, 1]],
+            with_noise(choose_calibration(folder, self.camera), self.exact_depth),
+            read_trajectory(truth) if truth.is_file() else None,
+        )
+        return select_frames(whole, self.frames, str(folder))

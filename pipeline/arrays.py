@@ -1,0 +1,69 @@
+"""Array fields that say their element type and shape, checked in O(1)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cache
+from typing import Annotated, Any, get_args, get_origin, get_type_hints
+
+import numpy as np
+from numpy.typing import NDArray
+
+F64 = NDArray[np.float64]
+F32 = NDArray[np.float32]
+I32 = NDArray[np.int32]
+U8 = NDArray[np.uint8]
+Bool = NDArray[np.bool_]
+
+
+class Shape:
+    """Lengths of an array's axes: an int is exact, a letter is a length shared within the value."""
+
+    def __init__(self, *axes: int | str) -> None:
+        self.axes = axes
+
+    def __repr__(self) -> str:
+        return "(" + ", ".join(map(str, self.axes)) + ")"
+
+
+@dataclass(frozen=True)
+class ArraySpec:
+    """What a field's annotation promises of its array."""
+
+    name: str
+    dtype: np.dtype[Any]
+    shape: Shape
+
+
+@cache
+def array_specs(kind: Any) -> tuple[ArraySpec, ...]:
+    """The array fields of a value type, in order."""
+    found = []
+    for name, hint in get_type_hints(kind, include_extras=True).items():
+        if get_origin(hint) is Annotated:
+            array, shape = get_args(hint)
+            found.append(ArraySpec(name, _element_type(array), shape))
+    return tuple(found)
+
+
+def _element_type(array: Any) -> np.dtype[Any]:
+    """float64 of NDArray[float64], which is a `type` alias from NumPy 2.5 on and `ndarray[shape, dtype[float64]]` before."""
+    last = get_args(array)[-1]
+    element: np.dtype[Any] = np.dtype((get_args(last) or (last,))[0])
+    return element
+
+
+def check_arrays(value: Any) -> None:
+    """Raise ValueError unless each array of `value` has its declared type and shape; make it read-only."""
+    lengths: dict[str, int] = {}
+    for spec in array_specs(value.__class__):
+        array = getattr(value, spec.name)
+        where = f"{type(value).__name__}.{spec.name}"
+        if not isinstance(array, np.ndarray) or array.dtype != spec.dtype:
+            raise ValueError(f"{where}: expected an array of {spec.dtype}, got {getattr(array, 'dtype', type(array).__name__)}")
+        fits = array.ndim == len(spec.shape.axes) and all(
+            size == (axis if isinstance(axis, int) else lengths.setdefault(axis, size)) for size, axis in zip(array.shape, spec.shape.axes)
+        )
+        if not fits:
+            raise ValueError(f"{where}: expected shape {spec.shape}, got {array.shape}" + (f" with {lengths}" if lengths else ""))
+        array.flags.writeable = False

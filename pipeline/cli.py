@@ -1,0 +1,158 @@
+"""The command `trihedron`: `run` here, every other command from the entry-point group `trihedron.commands`.
+
+Exit codes: 0 done, 1 an error in configuration, data or a stage, 2 wrong usage, 130 interrupted. Errors are one line; `--debug` shows the traceback.
+"""
+
+from __future__ import annotations
+
+import importlib
+import inspect
+import os
+import sys
+import time
+from collections.abc import Callable
+from importlib.metadata import EntryPoint, entry_points, version
+from pathlib import Path
+from typing import Any
+
+from trihedron.pipeline.errors import TrihedronError, UsageError, did_you_mean
+
+_BEGAN = time.perf_counter()
+COMMAND_GROUP = "trihedron.commands"
+RUN_FLAGS = ("-m", "--multirun")
+RUN_HELP = """Track a sequence: compose the configuration, run the graph, write the run folder.
+
+Usage: trihedron run [-m] [key=value ...]
+
+  dataset=NAME dataset.path=FOLDER   what to track: tum, icl_nuim, folder, mcap, synthetic (default)
+  dataset.frames=A:B                 half-open range of frames       dataset.camera=PRESET|FILE  the camera
+  graph=NAME                         structural (default), structural_paper, structural_no_refine
+  STAGE=PLUGIN STAGE.OPTION=VALUE    swap a method, set its options (trihedron plugins lists them all)
+  graph.STAGE.INPUT=TOPIC            change a wire: topic, topic@prev or topic@5
+  outputs=[trajectory]               what must be computed           threads=2  seed=0
+  out=FOLDER                         the run folder (default runs/<date>/<time>; runs/latest points at the newest)
+  record.topics=[normals]            record dense topics too         record.frames=true  embed the input frames
+  replay=FILE.mcap only=[STAGE,...]  compute these stages again, read the rest from a recording
+  feedback=recorded                  delayed wires of recomputed stages see the recorded past
+  -m                                 sweep over comma-separated values
+
+Example: trihedron run dataset=tum dataset.path=rgbd_dataset_freiburg3_structure_notexture_far
+Example: trihedron run replay=runs/latest/run.mcap only=[manhattan,rotation] manhattan.cone_deg=8"""
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Entry point of the command; returns the exit code."""
+    words = list(sys.argv[1:] if argv is None else argv)
+    debug = "--debug" in words
+    words = [word for word in words if word != "--debug"]
+    try:
+        return _dispatch(words)
+    except TrihedronError as error:
+        if debug:
+            raise
+        print(f"trihedron: {error}", file=sys.stderr)
+        return error.exit_code
+    except KeyboardInterrupt:
+        print("trihedron: interrupted; what was done is kept", file=sys.stderr)
+        return 130
+    except BrokenPipeError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 0
+
+
+def _dispatch(words: list[str]) -> int:
+    commands = {entry.name: entry for entry in entry_points(group=COMMAND_GROUP)}
+    if not words or words[0] in ("-h", "--help", "help"):
+        print(_help(commands))
+        return 0
+    if words[0] == "--version":
+        print(f"trihedron {version('trihedron')}")
+        return 0
+    name, rest = words[0], words[1:]
+    if name == "run":
+        return _run(rest)
+    if name not in commands:
+        raise UsageError(name, "there is no such command", did_you_mean(name, ["run", *commands]))
+    command: Callable[[list[str]], int] = commands[name].load()
+    return command(rest)
+
+
+def _help(commands: dict[str, EntryPoint]) -> str:
+    lines = ["RGB-D SLAM for man-made scenes: swappable stages, recorded topics, single-stage replay.", "", "Usage: trihedron COMMAND ...", ""]
+    documents = {"run": RUN_HELP} | {name: _document(entry) for name, entry in sorted(commands.items())}
+    for name, text in documents.items():
+        lines.append(f"  {name:12} {text.splitlines()[0] if text else ''}")
+        lines += [f"               {line.strip()}" for line in text.splitlines() if line.strip().startswith("Example: ")][:1]
+    return "\n".join([*lines, "", "trihedron COMMAND --help explains a command; --debug shows the traceback of an error."])
+
+
+def _document(entry: EntryPoint) -> str:
+    return inspect.getdoc(importlib.import_module(entry.module)) or ""
+
+
+def _run(words: list[str]) -> int:
+    """Compose with Hydra and execute; Hydra writes `.hydra/` and carries sweeps."""
+    if "-h" in words or "--help" in words:
+        print(RUN_HELP)
+        return 0
+    for word in words:
+        if word.startswith("-") and word not in RUN_FLAGS:
+            raise UsageError(word, "is not an option of run", f"known: {', '.join(RUN_FLAGS)}; everything else is key=value")
+    os.environ["HYDRA_FULL_ERROR"] = "1"  # exceptions come to us instead of being printed
+    import hydra
+    from hydra.core.hydra_config import HydraConfig
+    from hydra.types import RunMode
+    from omegaconf import DictConfig
+
+    from trihedron.pipeline.config import register_configs, rewritten
+    from trihedron.pipeline.registry import load_plugins
+
+    load_plugins()
+    register_configs()
+    overrides = _with_recorded(words)
+
+    failures: list[Exception] = []
+
+    def task(config: DictConfig) -> float | None:
+        from trihedron.pipeline.execute import execute
+
+        runtime = HydraConfig.get()
+        out = Path(runtime.runtime.output_dir)
+        try:
+            metrics: dict[str, Any] = execute(config, out, list(runtime.overrides.task), _BEGAN)
+        except Exception as error:  # one job of a sweep must not stop the others, and Hydra would print its overrides
+            failures.append(error)
+            if runtime.mode == RunMode.MULTIRUN:
+                print(f"trihedron: {error}", file=sys.stderr)
+            return None
+        _point_latest(out)
+        return metrics["final"]["ate_rmse_m"] if "final" in metrics else None
+
+    sys.argv = ["trihedron run", *sorted(overrides, key=lambda word: word not in RUN_FLAGS)]  # flags first
+    try:
+        hydra.main(config_path="pkg://trihedron.conf", config_name="root", version_base="1.3")(task)()
+    except Exception as error:
+        raise rewritten(error) from error
+    if failures:
+        raise failures[0]
+    return 0
+
+
+def _with_recorded(words: list[str]) -> list[str]:
+    """In a replay, the recording's own overrides come first and the command line on top; `out` is always new."""
+    source = next((word.partition("=")[2] for word in words if word.startswith("replay=")), "")
+    if not source:
+        return words
+    from trihedron.pipeline.recording import Recording
+
+    return [word for word in Recording(source).overrides() if not word.startswith(("out=", "replay=", "only=", "feedback="))] + words
+
+
+def _point_latest(out: Path) -> None:
+    """`runs/latest` beside dated run folders points at the newest."""
+    runs = next((parent for parent in out.parents if parent.name == "runs"), None)
+    if runs is not None:
+        link = runs / "latest"
+        if link.is_symlink() or not link.exists():
+            link.unlink(missing_ok=True)
+            link.symlink_to(out.relative_to(runs), target_is_directory=True)

@@ -1,0 +1,59 @@
+"""Errors for people: one line with the place, the cause and the cure.
+
+Every error a user can provoke is a `TrihedronError`; the command line prints it as
+`trihedron: <place>: <cause>; <cure>` and exits with its `exit_code`. Anything else is a defect of the program.
+"""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Iterable
+
+
+class TrihedronError(Exception):
+    """An error with a place (file, key, stage), a cause and a cure; printed as one line."""
+
+    exit_code = 1
+
+    def __init__(self, place: str, cause: str, cure: str = "") -> None:
+        self.place, self.cause, self.cure = place, cause, cure
+        super().__init__(f"{place}: {cause}" + (f"; {cure}" if cure else ""))
+
+
+class UsageError(TrihedronError):
+    """The words of the command line are wrong (exit code 2)."""
+
+    exit_code = 2
+
+
+class ConfigError(TrihedronError):
+    """A value of the configuration is unknown, of the wrong type or out of range."""
+
+
+class GraphError(TrihedronError):
+    """The graph's wires do not fit together."""
+
+
+class PluginError(TrihedronError):
+    """A plugin breaks its slot's contract or does not load."""
+
+
+class DataError(TrihedronError):
+    """A data set, camera file or trajectory cannot be used."""
+
+
+class RecordingError(TrihedronError):
+    """A recording lacks what was asked of it, is damaged or of another version."""
+
+
+class StageError(TrihedronError):
+    """A stage failed while the pipeline ran."""
+
+
+def did_you_mean(name: str, known: Iterable[str]) -> str:
+    """The cure for an unknown name: the closest known one, or the list of them all."""
+    known = sorted(known)
+    close = difflib.get_close_matches(name, known, n=1, cutoff=0.6)
+    if close:
+        return f"did you mean '{close[0]}'?"
+    return f"known: {', '.join(known)}" if known else "none is known"

@@ -1,0 +1,208 @@
+"""From a composed configuration to a finished run folder: what `trihedron run` does."""
+
+from __future__ import annotations
+
+import importlib.metadata
+import json
+import logging
+import subprocess
+import sys
+import time
+from collections import Counter
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+from omegaconf import DictConfig, OmegaConf
+from tqdm import tqdm
+
+from trihedron.datasets.trajectories import TRUTH, attached_truth, format_trajectory
+from trihedron.pipeline import results
+from trihedron.pipeline.config import Feedback, graph_of
+from trihedron.pipeline.errors import ConfigError, TrihedronError, did_you_mean
+from trihedron.pipeline.graph import Graph
+from trihedron.pipeline.recording import Recording, RecordingWriter
+from trihedron.pipeline.runner import Replay, Runner, Step
+from trihedron.pipeline.slots import output_of
+from trihedron.pipeline.types import Trajectory
+
+RECORDING = "run.mcap"
+PATH_KEYS = ("dataset.path", "dataset.camera")
+WARM_UP_FRAMES = 3  # enough for every stage to have been called, so that compilation is not measured
+PLAIN_PROGRESS_SECONDS = 5.0
+
+
+def execute(config: DictConfig, out: Path, overrides: list[str], began: float) -> dict[str, Any]:
+    """Run the configuration into folder `out`; `began` is when the program started (perf_counter). Returns the metrics.
+
+    Raises TrihedronError. Whatever happens after the first frame, the recording is closed and the trajectory so far is written."""
+    if config.threads < 1:
+        raise ConfigError("threads", f"{config.threads} is not a number of threads", "give 1 or more")
+    graph = graph_of(config)
+    replay = _replay(config, graph)
+    frames = str(config.dataset.get("frames", "")) if config.dataset is not None else ""
+    runner = Runner(graph, config.seed, config.threads, replay, frames)
+    topics = _recorded_topics(config, graph, replay)
+    _announce(runner)
+    with _Warnings() as warnings:
+        warnings.muted = True
+        _warm_up(Runner(graph, config.seed, config.threads, replay, frames))
+        warnings.muted = False
+        writer = RecordingWriter(out / RECORDING, _metadata(config, overrides))
+        attachments = _attachments(graph, replay)
+        for name, text in attachments.items():
+            writer.attach(name, text)
+        started = time.perf_counter()
+        try:
+            for _ in _progress(runner.steps(writer, topics, embed_frames=config.record.frames)):
+                pass
+        finally:
+            writer.close()
+            metrics = _write(runner, attached_truth(attachments, str(writer.path)), out, started, began)
+            warnings.summarise()
+    _report(out, metrics)
+    return metrics
+
+
+def _replay(config: DictConfig, graph: Graph) -> Replay | None:
+    if not config.replay:
+        if config.only:
+            raise ConfigError("only", "chooses stages of a replay, and there is none", "give replay=FILE.mcap too")
+        return None
+    for name in config.only:
+        if name not in graph.stages:
+            raise ConfigError("only", f"this graph has no stage '{name}'", did_you_mean(name, graph.stages))
+    only = tuple(config.only) or tuple(graph.stages)
+    return Replay(Recording(config.replay), only, config.feedback is Feedback.recorded)
+
+
+def _recorded_topics(config: DictConfig, graph: Graph, replay: Replay | None) -> frozenset[str]:
+    """All computed topics that are not dense, and the dense ones that were named."""
+    for name in config.record.topics:
+        if name not in graph.stages:
+            raise ConfigError("record.topics", f"no stage writes '{name}'", did_you_mean(name, graph.stages))
+    names = {name for name in graph.stages if not output_of(name).dense} | set(config.record.topics)
+    names |= {"dataset"} if config.record.frames else set()
+    return frozenset(names if replay is None else names & set(replay.only))
+
+
+def _announce(runner: Runner) -> None:
+    """Say which topics a replay lacks and computes after all."""
+    if runner.replay is not None:
+        extra = [name for name in runner.computed if name not in runner.replay.only]
+        if extra:
+            print(f"not in {runner.replay.recording.path}, computed again: {', '.join(extra)}")
+
+
+def _metadata(config: DictConfig, overrides: list[str]) -> dict[str, str]:
+    return {
+        "version": importlib.metadata.version("trihedron"),
+        "commit": _commit(),
+        "overrides": json.dumps([_absolute(word) for word in overrides]),
+        "config": OmegaConf.to_yaml(config, resolve=True),
+    }
+
+
+def _absolute(override: str) -> str:
+    """A path of the data set as seen from anywhere, so that a replay finds it from another folder."""
+    key, _, value = override.partition("=")
+    return f"{key}={Path(value).expanduser().resolve()}" if key in PATH_KEYS and value and Path(value).expanduser().exists() else override
+
+
+def _commit() -> str:
+    """The git commit of the source tree, or nothing for an installed package."""
+    folder = Path(__file__).resolve().parent
+    try:
+        top = subprocess.run(["git", "-C", str(folder), "ls-files", "--error-unmatch", __file__], capture_output=True, timeout=5)
+        head = subprocess.run(["git", "-C", str(folder), "rev-parse", "HEAD"], capture_output=True, text=True, timeout=5)
+    except (OSError, subprocess.TimeoutExpired):
+        return ""
+    return head.stdout.strip() if top.returncode == 0 else ""
+
+
+def _warm_up(runner: Runner) -> None:
+    """Call every stage on the first frames so that kernels are loaded; what goes wrong here is reported by the run itself."""
+    runner.indices = runner.indices[:WARM_UP_FRAMES]
+    try:
+        for _ in runner.steps(None, frozenset()):
+            pass
+    except TrihedronError:
+        pass
+
+
+def _progress(steps: Iterator[Step]) -> Iterator[Step]:
+    """A bar with the frame rate on a terminal, a plain line every few seconds elsewhere."""
+    bar: Any = None
+    began = said = time.perf_counter()
+    for step in steps:
+        if sys.stderr.isatty():
+            bar = bar or tqdm(total=step.count, unit="frame", dynamic_ncols=True)
+            bar.update()
+        elif time.perf_counter() - said > PLAIN_PROGRESS_SECONDS:
+            said = time.perf_counter()
+            print(f"frame {step.position + 1}/{step.count}, {(step.position + 1) / (said - began):.1f} frames/s", flush=True)
+        yield step
+    if bar is not None:
+        bar.close()
+
+
+def _write(runner: Runner, truth: Trajectory | None, out: Path, started: float, began: float) -> dict[str, Any]:
+    """The files beside the recording. A trajectory is written only where poses were computed."""
+    metrics: dict[str, Any] = {}
+    if "pose" in runner.computed:
+        metrics = results.write_results(out, runner.result, truth)
+    wall_s = time.perf_counter() - started
+    results.write_json(out / results.TIMING, runner.timing.summary(runner.threads, wall_s, started - began))
+    return metrics
+
+
+def _attachments(graph: Graph, replay: Replay | None) -> dict[str, str]:
+    """The ground truth as text: of the recording that is replayed, else of the data set. A run is judged by that text, so a replay agrees."""
+    if replay is not None:
+        return replay.recording.attachments
+    truth: Trajectory | None = graph.stages["dataset"].plugin.truth()
+    return {TRUTH: format_trajectory(truth)} if truth is not None else {}
+
+
+def _report(out: Path, metrics: dict[str, Any]) -> None:
+    status = metrics.get("status", {})
+    if status:
+        print("frames: " + ", ".join(f"{count} {name}" for name, count in status.items() if count))
+    if "final" in metrics:
+        print(f"ATE {metrics['final']['ate_rmse_m']:.4f} m (as tracked {metrics['causal']['ate_rmse_m']:.4f} m)")
+    for path in sorted(out.iterdir()):
+        if path.is_file():
+            print(f"  {path}")
+
+
+class _Warnings(logging.Handler):
+    """Collects the warnings of a run: the first of each kind is shown when it comes, all are counted at the end."""
+
+    def __init__(self) -> None:
+        super().__init__(logging.WARNING)
+        self.counts: Counter[str] = Counter()
+        self.first: dict[str, str] = {}
+        self.muted = False
+
+    def emit(self, record: logging.LogRecord) -> None:
+        if not self.muted:
+            kind = str(record.msg)
+            if kind not in self.first:
+                self.first[kind] = record.getMessage()
+                print(f"trihedron: warning: {self.first[kind]}", file=sys.stderr)
+            self.counts[kind] += 1
+
+    def summarise(self) -> None:
+        """Print the count of each kind that came more than once."""
+        for kind, count in self.counts.items():
+            if count > 1:
+                print(f"trihedron: {count} such warnings, the first: {self.first[kind]}", file=sys.stderr)
+
+    def __enter__(self) -> _Warnings:
+        logger = logging.getLogger("trihedron")
+        logger.addHandler(self)
+        logger.propagate = False
+        return self
+
+    def __exit__(self, *exception: object) -> None:
+        logging.getLogger("trihedron").removeHandler(self)

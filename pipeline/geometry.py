@@ -1,0 +1,172 @@
+"""Rotations, rigid motions, planes, and numbers on a line: small, exact, NumPy only. Frames and signs as in `types`."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from trihedron.pipeline.types import F64
+
+
+def skew(v: F64) -> F64:
+    """(3,) -> (3, 3) with `skew(v) @ x = v × x`."""
+    return np.array([[0.0, -v[2], v[1]], [v[2], 0.0, -v[0]], [-v[1], v[0], 0.0]])
+
+
+def exp_so3(phi: F64) -> F64:
+    """(3,) rotation vector (rad) -> (3, 3) rotation (Rodrigues)."""
+    angle2 = float(phi @ phi)
+    angle = np.sqrt(angle2)
+    if angle2 < 1e-12:
+        a, b = 1.0 - angle2 / 6.0, 0.5 - angle2 / 24.0
+    else:
+        a, b = np.sin(angle) / angle, (1.0 - np.cos(angle)) / angle2
+    K = skew(phi)
+    return np.eye(3) + a * K + b * (K @ K)
+
+
+def log_so3(R: F64) -> F64:
+    """(3, 3) rotation -> (3,) rotation vector with angle in [0, π]; inverse of `exp_so3`."""
+    q = quaternion_from_rotation(R)
+    v, w = q[:3], q[3]
+    if w < 0.0:
+        v, w = -v, -w
+    s = float(np.linalg.norm(v))
+    factor = 2.0 / w if s < 1e-9 else 2.0 * np.arctan2(s, w) / s
+    return np.asarray(factor * v, np.float64)
+
+
+def left_jacobian_so3(phi: F64) -> F64:
+    """(3, 3) V with `exp_se3(rho, phi).t = V rho`."""
+    angle2 = float(phi @ phi)
+    angle = np.sqrt(angle2)
+    K = skew(phi)
+    if angle2 < 1e-10:
+        return np.eye(3) + 0.5 * K + K @ K / 6.0
+    a, b = (1.0 - np.cos(angle)) / angle2, (angle - np.sin(angle)) / (angle2 * angle)
+    return np.asarray(np.eye(3) + a * K + b * (K @ K), np.float64)
+
+
+def exp_se3(xi: F64) -> F64:
+    """(6,) twist (rho, phi) -> (4, 4) rigid motion."""
+    return pose_matrix(exp_so3(xi[3:]), left_jacobian_so3(xi[3:]) @ xi[:3])
+
+
+def log_se3(T: F64) -> F64:
+    """(4, 4) rigid motion -> (6,) twist (rho, phi); inverse of `exp_se3`."""
+    phi = log_so3(T[:3, :3])
+    return np.concatenate([np.linalg.solve(left_jacobian_so3(phi), T[:3, 3]), phi])
+
+
+def pose_matrix(R: F64, t: F64) -> F64:
+    """Rotation (3, 3) and translation (3,) -> (4, 4)."""
+    T = np.eye(4)
+    T[:3, :3], T[:3, 3] = R, t
+    return T
+
+
+def invert(T: F64) -> F64:
+    """(..., 4, 4) rigid motions -> their inverses."""
+    R = np.swapaxes(T[..., :3, :3], -1, -2)
+    out = np.zeros_like(T)
+    out[..., :3, :3] = R
+    out[..., :3, 3] = -(R @ T[..., :3, 3:])[..., 0]
+    out[..., 3, 3] = 1.0
+    return out
+
+
+def transform(T_a_b: F64, points_b: F64) -> F64:
+    """(4, 4) and (..., 3) points of frame b -> (..., 3) points of frame a."""
+    return points_b @ T_a_b[:3, :3].T + T_a_b[:3, 3]
+
+
+def transform_planes(T_a_b: F64, planes_b: F64) -> F64:
+    """(4, 4) and (..., 4) planes (n, d) of frame b -> the same planes in frame a (signs kept: d may turn negative)."""
+    n = planes_b[..., :3] @ T_a_b[:3, :3].T
+    return np.concatenate([n, planes_b[..., 3:] - (n @ T_a_b[:3, 3])[..., None]], axis=-1)
+
+
+def tangent_basis(n: F64) -> F64:
+    """(..., 3) unit vectors -> (..., 3, 2): two orthonormal columns spanning the plane normal to n.
+
+    A function of n alone, but it jumps where n_z changes sign: compare two normals in the basis of one of them, never each in its own."""
+    x, y, z = n[..., 0], n[..., 1], n[..., 2]
+    sign = np.where(z >= 0.0, 1.0, -1.0)
+    a = -1.0 / (sign + z)
+    b = x * y * a
+    first = np.stack([1.0 + sign * x * x * a, sign * b, -sign * x], axis=-1)
+    second = np.stack([b, sign + y * y * a, -y], axis=-1)
+    return np.stack([first, second], axis=-1)
+
+
+def nearest_rotation(M: F64) -> F64:
+    """(3, 3) -> the rotation nearest in the Frobenius norm (SVD with determinant +1)."""
+    U, _, Vt = np.linalg.svd(M)
+    return np.asarray(U @ np.diag([1.0, 1.0, np.linalg.det(U @ Vt)]) @ Vt, np.float64)
+
+
+def rotation_angle_deg(R: F64) -> float:
+    """Angle of a rotation in degrees, accurate near 0."""
+    return float(np.degrees(np.linalg.norm(log_so3(R))))
+
+
+def quaternion_from_rotation(R: F64) -> F64:
+    """(3, 3) rotation -> unit quaternion (x, y, z, w) with w >= 0, by the largest diagonal term (no cancellation)."""
+    trace = R[0, 0] + R[1, 1] + R[2, 2]
+    candidates = np.array([R[0, 0], R[1, 1], R[2, 2], trace])
+    i = int(np.argmax(candidates))
+    if i == 3:
+        q = np.array([R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1], 1.0 + trace])
+    else:
+        j, k = (i + 1) % 3, (i + 2) % 3
+        q = np.empty(4)
+        q[i] = 1.0 + R[i, i] - R[j, j] - R[k, k]
+        q[j] = R[j, i] + R[i, j]
+        q[k] = R[k, i] + R[i, k]
+        q[3] = R[k, j] - R[j, k]
+    q /= np.linalg.norm(q)
+    return q if q[3] >= 0.0 else -q
+
+
+def rotation_from_quaternion(q: F64) -> F64:
+    """(4,) quaternion (x, y, z, w), normalised here -> (3, 3) rotation. Raises ValueError for a zero or non-finite quaternion."""
+    norm = float(np.linalg.norm(q))
+    if not np.isfinite(norm) or norm < 1e-9:
+        raise ValueError("not a rotation: the quaternion is zero or not finite")
+    x, y, z, w = q / norm
+    return np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
+            [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
+            [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
+        ]
+    )
+
+
+def umeyama(estimate: F64, truth: F64) -> F64:
+    """SE(3) alignment of (n, 3) points: the T (4, 4) that minimises `Σ |truth - T estimate|²` (Umeyama 1991, scale fixed to 1)."""
+    mean_e, mean_t = estimate.mean(axis=0), truth.mean(axis=0)
+    U, _, Vt = np.linalg.svd((truth - mean_t).T @ (estimate - mean_e))
+    R = U @ np.diag([1.0, 1.0, np.sign(np.linalg.det(U) * np.linalg.det(Vt))]) @ Vt
+    return pose_matrix(R, mean_t - R @ mean_e)
+
+
+def nearest_pairs(first: NDArray[np.int64], second: NDArray[np.int64], limit: int) -> NDArray[np.int64]:
+    """Two increasing lists of integers -> (n, 2) rows of pairs at most `limit` apart, the closest pair first, each entry at most once, ties to
+    the earlier row. Sorted by the first list."""
+    low = np.searchsorted(second, first - limit, side="left")
+    counts = np.maximum(np.searchsorted(second, first + limit, side="right") - low, 0)
+    rows = np.repeat(np.arange(len(first)), counts)
+    columns = np.arange(len(rows)) - np.repeat(np.cumsum(counts) - counts, counts) + np.repeat(low, counts)
+    order = np.lexsort((columns, rows, np.abs(first[rows] - second[columns])))
+    rows, columns = rows[order], columns[order]
+    chosen = [np.empty((0, 2), np.int64)]
+    while len(rows):
+        # a candidate that is the best one left for both its entries is one the greedy rule takes
+        best = np.zeros(len(rows), bool)
+        best[np.intersect1d(np.unique(rows, return_index=True)[1], np.unique(columns, return_index=True)[1])] = True
+        chosen.append(np.stack([rows[best], columns[best]], axis=-1))
+        left = ~(np.isin(rows, rows[best]) | np.isin(columns, columns[best]))
+        rows, columns = rows[left], columns[left]
+    pairs = np.concatenate(chosen)
+    return pairs[np.argsort(pairs[:, 0], kind="stable")]

@@ -1,0 +1,66 @@
+"""The files a run leaves behind, besides the recording: trajectories, timing, metrics, the plot."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from trihedron.datasets.trajectories import write_trajectory
+from trihedron.pipeline.errors import DataError
+from trihedron.pipeline.metrics import evaluate_trajectory
+from trihedron.pipeline.plot import trajectory_figure
+from trihedron.pipeline.runner import Result
+from trihedron.pipeline.types import DEGRADED, LOST, OK, Trajectory
+
+TRAJECTORY, CAUSAL, TIMING, METRICS, PLOT = "trajectory.txt", "trajectory_causal.txt", "timing.json", "metrics.json", "trajectory.png"
+
+
+def causal_trajectory(result: Result) -> Trajectory:
+    """The tracked poses as they were said at the time."""
+    poses = [pose for pose in result.poses if pose.status != LOST]
+    return _trajectory([pose.stamp_ns for pose in poses], [pose.T_world_camera for pose in poses])
+
+
+def final_trajectory(result: Result) -> Trajectory:
+    """The tracked poses hung on the final keyframes: keyframe pose × relative pose, so corrections of the map reach every frame."""
+    poses = [pose for pose in result.poses if pose.status != LOST]
+    if result.map is None:
+        return causal_trajectory(result)
+    keyframes = result.map.keyframes.column("T_world_camera")
+    final = [p.T_world_camera if p.reference < 0 else keyframes[p.reference] @ p.T_reference_camera for p in poses]
+    return _trajectory([pose.stamp_ns for pose in poses], final)
+
+
+def _trajectory(stamps_ns: list[int], poses: list[Any]) -> Trajectory:
+    return Trajectory(np.array(stamps_ns, np.int64), np.array(poses, np.float64).reshape(-1, 4, 4))
+
+
+def write_results(out: Path, result: Result, truth: Trajectory | None) -> dict[str, Any]:
+    """Write trajectories, plot and, with ground truth, metrics; return the metrics. Statuses are counted in any case."""
+    final, causal = final_trajectory(result), causal_trajectory(result)
+    write_trajectory(out / TRAJECTORY, final)
+    write_trajectory(out / CAUSAL, causal)
+    metrics: dict[str, Any] = {
+        "frames": len(result.stamps_ns),
+        "unreadable": result.unreadable,
+        "status": {status: sum(pose.status == status for pose in result.poses) for status in (OK, DEGRADED, LOST)},
+    }
+    if truth is not None:
+        stamps = np.array(result.stamps_ns, np.int64)
+        try:
+            for name, trajectory in (("final", final), ("causal", causal)):
+                metrics[name] = evaluate_trajectory(trajectory, truth, fps=result.fps, frame_stamps_ns=stamps).to_dict()
+        except DataError as error:
+            metrics["note"] = str(error)
+        write_json(out / METRICS, metrics)
+    if len(final):
+        trajectory_figure(final, truth, out / PLOT, [(pose.stamp_ns, pose.status) for pose in result.poses])
+    return metrics
+
+
+def write_json(path: Path, content: dict[str, Any]) -> None:
+    """Write a dictionary as indented JSON."""
+    path.write_text(json.dumps(content, indent=2) + "\n")

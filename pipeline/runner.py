@@ -1,0 +1,297 @@
+"""Runs a graph over a data set or a recording: owns the state, measures, records, and says what went wrong where.
+
+Which stages compute and which are read: without a recording everything computes. In a replay the stages of `only` compute; a wire from any other
+stage is read from the file, and where the file lacks its topic the stage computes after all, back to the frames if need be.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import time
+import zlib
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import cv2
+import numpy as np
+from threadpoolctl import threadpool_limits
+
+from trihedron.pipeline.errors import DataError, RecordingError, StageError, TrihedronError
+from trihedron.pipeline.foxglove import View
+from trihedron.pipeline.graph import PREVIOUS, Graph, Stage, Wire
+from trihedron.pipeline.recording import Recording, RecordingWriter, TopicReader
+from trihedron.pipeline.scheduler import Node, NodeFailure, Scheduler
+from trihedron.pipeline.slots import frame_range, output_of
+from trihedron.pipeline.timing import Timing
+from trihedron.pipeline.types import Frame, FrameReference, Map, Pose, Value
+
+log = logging.getLogger("trihedron")
+FRAMES_TOPIC = "frames"  # one FrameReference a frame: what a replay iterates over
+RECORDED = "recorded:"  # prefix of the node that reads a topic from the file
+UNREADABLE_SHARE = 0.1
+
+
+@dataclass(frozen=True)
+class Replay:
+    """A recording to read from, the stages to compute again, and whether delayed wires of those see the recorded past."""
+
+    recording: Recording
+    only: tuple[str, ...]
+    recorded_feedback: bool = False
+
+
+@dataclass
+class Result:
+    """What a run leaves in memory: poses in frame order, the last map, results of folds, counts."""
+
+    poses: list[Pose] = field(default_factory=list)
+    map: Map | None = None
+    folds: dict[str, Value] = field(default_factory=dict)
+    stamps_ns: list[int] = field(default_factory=list)  # of every readable frame
+    unreadable: int = 0
+    fps: float = 30.0  # nominal, of the camera
+
+
+@dataclass(frozen=True)
+class Step:
+    """One finished frame, as handed to whoever watches the run (progress, tests)."""
+
+    position: int
+    count: int
+    index: int
+    values: Mapping[str, Value | None]
+
+
+class Runner:
+    """One run of a graph. `steps` does the work, frame by frame; `result` and `timing` hold what it found."""
+
+    def __init__(self, graph: Graph, seed: int = 0, threads: int = 2, replay: Replay | None = None, frames: str = "") -> None:
+        self.graph, self.seed, self.threads, self.replay = graph, seed, threads, replay
+        self.result, self.timing = Result(), Timing()
+        self.computed = self._computed()
+        self.indices, self._stamps = self._frames(frames)
+        self._first = frame_range(frames)[0]
+        self._references = TopicReader(replay.recording, FRAMES_TOPIC) if replay is not None else None
+        self._fold_states: dict[str, Any] = {}
+        self._calls_ms: dict[int, dict[str, float]] = {}
+        self._handed_over: dict[int, float] = {}
+        self._latency_ms: dict[int, float] = {}
+
+    def _computed(self) -> tuple[str, ...]:
+        """The stages that run, in order; the rest is read from the recording."""
+        if self.replay is None:
+            return tuple(self.graph.stages)
+        recorded, pending, found = self.replay.recording.topics, list(self.replay.only), set()
+        while pending:
+            name = pending.pop()
+            if name not in found:
+                found.add(name)
+                pending += [w.topic for w in self.graph.stages[name].inputs.values() if w.topic not in recorded]
+        return tuple(name for name in self.graph.stages if name in found)
+
+    def _frames(self, frames: str) -> tuple[list[int], dict[int, int]]:
+        """The frame numbers to go through, and the stamps known beforehand."""
+        first, stop = frame_range(frames)
+        if self.replay is not None and "dataset" in self.computed and "dataset" not in self.replay.only:
+            self._check_frames_are_there(self.replay)
+        if self.replay is None:
+            count = len(self.graph.stages["dataset"].plugin)
+            return list(range(first, first + count)), {}
+        references = [v for v in self.replay.recording.values(FRAMES_TOPIC) if isinstance(v, FrameReference)]
+        known = {reference.index: reference.stamp_ns for reference in references}
+        self.result.fps = references[0].camera.fps if references else self.result.fps
+        chosen = {i: stamp for i, stamp in known.items() if i >= first and (stop is None or i < stop)}
+        if not chosen:
+            raise RecordingError(str(self.replay.recording.path), f"has none of the frames '{frames}'", "give another dataset.frames")
+        return list(chosen), chosen
+
+    def _check_frames_are_there(self, replay: Replay) -> None:
+        """Raise RecordingError when a replay needs the images, the recording does not embed them, and the data set cannot be opened."""
+        try:
+            len(self.graph.stages["dataset"].plugin)
+        except DataError as error:
+            cause = f"does not embed the frames that {' and '.join(replay.only)} must see, and the data set is gone ({error.place}: {error.cause})"
+            raise RecordingError(str(replay.recording.path), cause, "give its new place as dataset.path=FOLDER") from error
+
+    def steps(self, writer: RecordingWriter | None, topics: frozenset[str], embed_frames: bool = False) -> Iterator[Step]:
+        """Run, yielding each finished frame; values of `topics` go to the writer. Raises TrihedronError (StageError names stage and frame)."""
+        scheduler = Scheduler(self._nodes(), self.threads, self.threads, self._initial())
+        view = View()
+        try:
+            with _single_threaded_libraries():
+                for position, values in scheduler.run(len(self.indices)):
+                    self._account(position, values)
+                    if writer is not None:
+                        self._record(writer, view, position, values, topics, embed_frames)
+                    self._calls_ms.pop(position, None)
+                    self._latency_ms.pop(position, None)
+                    self._handed_over.pop(position, None)
+                    yield Step(position, len(self.indices), self.indices[position], values)
+                if "map" not in self.computed:
+                    self.result.map = self._recorded_map()
+                for name in self.computed:
+                    if self.graph.stages[name].fold:
+                        self._finish_fold(name, writer if name in topics else None)
+        except NodeFailure as failure:
+            raise self._explain(failure, writer) from failure.__cause__
+
+    # --- what a node does -------------------------------------------------------------------------------------------------------------
+
+    def _nodes(self) -> list[Node]:
+        readers: dict[str, Node] = {}
+        stages = [self._stage_node(self.graph.stages[name], readers) for name in self.computed]
+        return [*readers.values(), *stages]
+
+    def _stage_node(self, stage: Stage, readers: dict[str, Node]) -> Node:
+        inputs = {}
+        for parameter, wire in stage.inputs.items():
+            from_file = wire.topic not in self.computed or (wire.delay and self._recorded_feedback(wire.topic))
+            inputs[parameter] = Wire(RECORDED + wire.topic, wire.delay) if from_file else wire
+            if from_file and RECORDED + wire.topic not in readers:
+                readers[RECORDED + wire.topic] = self._reader_node(wire.topic)
+        return Node(stage.name, lambda position, values: self._call(stage, position, values), inputs, ordered=stage.fold)
+
+    def _recorded_feedback(self, topic: str) -> bool:
+        return self.replay is not None and self.replay.recorded_feedback and topic in self.replay.recording.topics
+
+    def _reader_node(self, topic: str) -> Node:
+        assert self.replay is not None
+        reader = TopicReader(self.replay.recording, topic)
+        return Node(RECORDED + topic, lambda position, _: reader.at(self.indices[position]), {}, ordered=True)
+
+    def _initial(self) -> dict[str, Any]:
+        """What `@prev` holds before the first frame: nothing, or, when a replay begins in the middle, the recorded value before it."""
+        if self.replay is None:
+            return {}
+        delayed = {w.topic for n in self.computed for w in self.graph.stages[n].inputs.values() if w.delay == PREVIOUS}
+        held = {}
+        for topic in delayed & self.replay.recording.topics:
+            reader = TopicReader(self.replay.recording, topic)
+            reader.at(self.indices[0])
+            held[topic] = held[RECORDED + topic] = reader.latest
+        return held
+
+    def _call(self, stage: Stage, position: int, values: Mapping[str, Any]) -> Value | None:
+        """Skip, seed, time and check one call."""
+        if any(values[parameter] is None for parameter in stage.required):
+            return None
+        arguments = dict(values)
+        if stage.wants_rng:
+            arguments["rng"] = np.random.default_rng([self.seed, self.indices[position], zlib.crc32(stage.name.encode())])
+        if stage.name == "dataset":
+            arguments["index"] = self.indices[position] - self._first
+        began = time.perf_counter()
+        if stage.fold:
+            state = self._fold_states[stage.name] if stage.name in self._fold_states else stage.plugin.start()
+            self._fold_states[stage.name] = stage.plugin.add(state, **arguments)
+            value = None
+        else:
+            value = stage.plugin(**arguments)
+        ended = time.perf_counter()
+        self._calls_ms.setdefault(position, {})[stage.name] = 1e3 * (ended - began)
+        if stage.name == "dataset":
+            self._handed_over[position] = ended
+        elif stage.name == "pose":
+            self._latency_ms[position] = 1e3 * (ended - self._handed_over.get(position, began))
+        if value is not None:
+            _check_value(value, output_of(stage.name), self.indices[position])
+        return value
+
+    # --- what becomes of a finished frame ---------------------------------------------------------------------------------------------
+
+    def _account(self, position: int, values: Mapping[str, Any]) -> None:
+        calls = self._calls_ms.setdefault(position, {})
+        for name, ms in calls.items():
+            self.timing.add_call(name, ms)
+        if "dataset" in values and values["dataset"] is None:
+            self.result.unreadable += 1
+            if self.result.unreadable > UNREADABLE_SHARE * len(self.indices):
+                cause = f"{self.result.unreadable} of {len(self.indices)} frames cannot be read"
+                raise DataError("dataset", cause, "see the warnings above for the first file; the data set is damaged")
+            return
+        self.timing.add_frame(self._latency_ms.setdefault(position, sum(calls.values())))
+        first = next((v for v in values.values() if isinstance(v, Value) and v.index == self.indices[position]), None)
+        self._stamps.setdefault(self.indices[position], first.stamp_ns if first is not None else 0)
+        self.result.stamps_ns.append(self._stamps[self.indices[position]])
+        if isinstance(frame := values.get("dataset"), Frame):
+            self.result.fps = frame.camera.fps
+        if isinstance(pose := values.get("pose"), Pose):
+            self.result.poses.append(pose)
+        if isinstance(map := values.get("map"), Map):
+            self.result.map = map
+
+    def _record(
+        self, writer: RecordingWriter, view: View, position: int, values: Mapping[str, Any], topics: frozenset[str], embed_frames: bool
+    ) -> None:
+        stamp = self._stamps.get(self.indices[position])
+        if stamp is None:
+            return
+        frame = values.get("dataset")
+        if isinstance(frame, Frame):
+            writer.write(FRAMES_TOPIC, FrameReference(frame.index, frame.stamp_ns, frame.camera))
+        elif self._references is not None:
+            self._copy_reference(writer, self.indices[position])
+        for name in self.computed:
+            value = values.get(name)
+            if isinstance(value, Value):
+                if name in topics and (name != "dataset" or embed_frames):
+                    writer.write(name, value)
+                for channel, message in view.messages(value):
+                    writer.write_message(channel, message, stamp)
+        writer.write_timing(self.indices[position], stamp, self._latency_ms[position], self._calls_ms[position])
+
+    def _copy_reference(self, writer: RecordingWriter, index: int) -> None:
+        assert self._references is not None
+        reference = self._references.at(index)
+        if reference is not None:
+            writer.write(FRAMES_TOPIC, reference)
+
+    def _recorded_map(self) -> Map | None:
+        """The map after the last frame, where it was read rather than computed."""
+        if self.replay is None or "map" not in self.replay.recording.topics:
+            return None
+        reader = TopicReader(self.replay.recording, "map")
+        found = reader.at(self.indices[-1]) or reader.latest
+        return found if isinstance(found, Map) else None
+
+    def _finish_fold(self, name: str, writer: RecordingWriter | None) -> None:
+        plugin = self.graph.stages[name].plugin
+        state = self._fold_states.pop(name) if name in self._fold_states else plugin.start()
+        value = plugin.finish(state, self.result.map)
+        self.result.folds[name] = value
+        if writer is not None:
+            writer.write(name, value)
+
+    def _explain(self, failure: NodeFailure, writer: RecordingWriter | None) -> TrihedronError:
+        """The failure as one line: a user's mistake as it is, anything else with stage, frame and the command that repeats only that."""
+        error = failure.__cause__
+        if isinstance(error, TrihedronError):
+            return error
+        index, stage = self.indices[failure.position], failure.node
+        cure = ""
+        if writer is not None:
+            cure = f"repeat only that with: trihedron run replay={writer.path} only=[{stage}] dataset.frames={index}:{index + 1}"
+        plugin = type(self.graph.stages[stage].plugin).__name__ if stage in self.graph.stages else "recording"
+        return StageError(f"{stage} ({plugin}), frame {index}", f"{type(error).__name__}: {error}", cure)
+
+
+def _check_value(value: Any, kind: type[Value], index: int) -> None:
+    """A plugin must return its slot's type, and the frame's index on it."""
+    if not isinstance(value, kind):
+        raise TypeError(f"returned {type(value).__name__}, the slot's type is {kind.__name__}")
+    if value.index != index:
+        raise ValueError(f"returned a {kind.__name__} of frame {value.index} at frame {index}")
+
+
+@contextlib.contextmanager
+def _single_threaded_libraries() -> Iterator[None]:
+    """One thread per library: the runner parallelises stages itself, and sums split over threads would change with their number."""
+    before = cv2.getNumThreads()
+    cv2.setNumThreads(1)
+    try:
+        with threadpool_limits(1):
+            yield
+    finally:
+        cv2.setNumThreads(before)

@@ -1,0 +1,184 @@
+"""Runs a graph over frames on several threads, with the same values whatever their number.
+
+A task is one node at one frame. It is ready when what its wires name is there: a value of the same frame, of exactly k frames ago, or, for
+`@prev`, all earlier frames of that topic. Ready tasks run oldest frame first, so tracking goes before features of later frames; how many frames
+may be in flight is bounded. Nodes see only their inputs, so the order in which tasks happen to run cannot change a value.
+"""
+
+from __future__ import annotations
+
+import heapq
+import threading
+from collections import defaultdict
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from trihedron.pipeline.graph import PREVIOUS, Wire
+
+
+@dataclass(frozen=True)
+class Node:
+    """`call(position, inputs)` computes a value or None; `ordered` nodes (folds, topics of a file) never run two frames out of order."""
+
+    name: str
+    call: Callable[[int, Mapping[str, Any]], Any]
+    inputs: Mapping[str, Wire]
+    ordered: bool = False
+
+
+class NodeFailure(Exception):
+    """A node raised at a position; `__cause__` is what it raised."""
+
+    def __init__(self, node: str, position: int) -> None:
+        super().__init__(f"{node} at {position}")
+        self.node, self.position = node, position
+
+
+class Scheduler:
+    """Nodes in topological order, `threads` workers, at most `lookahead` frames in flight.
+
+    A node read only through `@k` wires may lag k frames behind; it does not hold back the others."""
+
+    def __init__(self, nodes: list[Node], threads: int, lookahead: int, initial: Mapping[str, Any]) -> None:
+        self._nodes = {node.name: node for node in nodes}
+        self._rank = {node.name: i for i, node in enumerate(nodes)}
+        self._threads, self._initial = threads, initial
+        delays = [wire.delay for node in nodes for wire in node.inputs.values()]
+        self._reach = max([1, *delays])
+        self._lookahead = lookahead
+        self._count = self._admitted = self._consumed = 0
+        self._consumers: dict[str, list[tuple[str, int]]] = defaultdict(list)
+        for node in nodes:
+            for wire in node.inputs.values():
+                self._consumers[wire.topic].append((node.name, wire.delay))
+            if node.ordered:
+                self._consumers[node.name].append((node.name, PREVIOUS))
+        lagging = {name for name in self._nodes if self._consumers[name] and all(delay > 0 for _, delay in self._consumers[name])}
+        self._prompt = [name for name in self._nodes if name not in lagging]
+        self._change = threading.Condition()
+        self._ready: list[tuple[int, int, str]] = []
+        self._unmet: dict[tuple[str, int], int] = {}
+        self._values: dict[str, dict[int, Any]] = {name: {} for name in self._nodes}
+        self._held: dict[str, dict[int, Any]] = {name: {} for name in self._nodes}
+        self._frontier = dict.fromkeys(self._nodes, 0)  # frames done without a gap
+        self._running = 0
+        self._failure: NodeFailure | None = None
+        self._stopped = False
+
+    def run(self, count: int) -> Iterator[tuple[int, dict[str, Any]]]:
+        """Yield (position, values by node) for 0..count-1 in order. After a failure the frames before it come, then what was done of that
+        frame, then NodeFailure is raised."""
+        workers = [threading.Thread(target=self._work, name=f"stage-{i}", daemon=True) for i in range(self._threads)]
+        for worker in workers:
+            worker.start()
+        try:
+            self._count = count
+            for position in range(count):
+                with self._change:
+                    self._consumed = position
+                    self._admit()
+                    while not self._settled(position):
+                        self._change.wait()
+                    values = {name: self._values[name][position] for name in self._nodes if position in self._values[name]}
+                    self._forget(position)
+                yield position, values
+                if self._failure is not None and self._failure.position <= position:
+                    raise self._failure
+        finally:
+            with self._change:
+                self._stopped = True
+                self._change.notify_all()
+            for worker in workers:
+                worker.join()
+
+    def _settled(self, position: int) -> bool:
+        """Whether the frame is complete, or nothing more will become of it."""
+        if all(position in values for values in self._values.values()):
+            return True
+        return self._failure is not None and self._failure.position <= position and not self._running and not self._runnable()
+
+    def _runnable(self) -> bool:
+        return bool(self._ready) and (self._failure is None or self._ready[0][0] <= self._failure.position)
+
+    def _admit(self) -> None:
+        """Let frames in while few enough are in flight and the consumer keeps up."""
+        in_flight_until = min(self._frontier[name] for name in self._prompt) + self._lookahead
+        limit = min(self._count, in_flight_until, self._consumed + self._lookahead + self._reach)
+        while self._admitted < limit:
+            for name, node in self._nodes.items():
+                wires = [*node.inputs.values(), *([Wire(name, PREVIOUS)] if node.ordered else [])]
+                self._unmet[name, self._admitted] = sum(not self._there(wire, self._admitted) for wire in wires)
+            for name in self._nodes:
+                self._offer(name, self._admitted)
+            self._admitted += 1
+        self._change.notify_all()
+
+    def _there(self, wire: Wire, position: int) -> bool:
+        if wire.delay == PREVIOUS:
+            return self._frontier[wire.topic] >= position
+        source = position - wire.delay
+        return source < 0 or source < self._frontier[wire.topic] or source in self._values[wire.topic]
+
+    def _offer(self, name: str, position: int) -> None:
+        if self._unmet[name, position] == 0:
+            heapq.heappush(self._ready, (position, self._rank[name], name))
+
+    def _work(self) -> None:
+        while True:
+            with self._change:
+                self._change.wait_for(lambda: self._stopped or self._runnable())
+                if self._stopped:
+                    return
+                position, _, name = heapq.heappop(self._ready)
+                inputs = {parameter: self._input(wire, position) for parameter, wire in self._nodes[name].inputs.items()}
+                self._running += 1
+            failure: NodeFailure | None = None
+            value = None
+            try:
+                value = self._nodes[name].call(position, inputs)
+            except BaseException as error:  # handed to the main thread, which raises it
+                failure = NodeFailure(name, position)
+                failure.__cause__ = error
+            with self._change:
+                self._running -= 1
+                if failure is None:
+                    self._complete(name, position, value)
+                    self._admit()
+                elif self._failure is None or (position, self._rank[name]) < (self._failure.position, self._rank[self._failure.node]):
+                    self._failure = failure
+                self._change.notify_all()
+
+    def _input(self, wire: Wire, position: int) -> Any:
+        if wire.delay == PREVIOUS:
+            return self._held[wire.topic][position - 1] if position else self._initial.get(wire.topic)
+        source = position - wire.delay
+        return self._values[wire.topic][source] if source >= 0 else None
+
+    def _complete(self, name: str, position: int, value: Any) -> None:
+        self._values[name][position] = value
+        for consumer, delay in self._consumers[name]:
+            if delay != PREVIOUS:
+                self._meet(consumer, position + delay)
+        while self._frontier[name] in self._values[name]:
+            front = self._frontier[name]
+            latest = self._values[name][front]
+            if latest is None:
+                latest = self._held[name][front - 1] if front else self._initial.get(name)
+            self._held[name][front] = latest
+            self._frontier[name] = front + 1
+            for consumer, delay in self._consumers[name]:
+                if delay == PREVIOUS:
+                    self._meet(consumer, front + 1)
+
+    def _meet(self, name: str, position: int) -> None:
+        if (name, position) in self._unmet:
+            self._unmet[name, position] -= 1
+            self._offer(name, position)
+
+    def _forget(self, position: int) -> None:
+        """Drop what no later frame can ask for once `position` is complete."""
+        for name in self._nodes:
+            self._unmet.pop((name, position), None)
+            self._values[name].pop(position - self._reach, None)
+            self._held[name].pop(position - 1, None)

@@ -1,0 +1,98 @@
+"""A persistent table: columns cut into chunks that successive versions share.
+
+A map grows by a few hundred rows a keyframe and changes a few hundred more. Copying it each time, or writing it whole into the recording, would
+cost the square of its size; here a new version copies only the chunks it touches, and the recording holds only those.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[Any]
+CHUNK = 256  # rows; small enough that a touched chunk is cheap to copy, large enough that gathering is
+
+
+@dataclass(frozen=True)
+class Column:
+    """Element type, and shape of one row."""
+
+    dtype: str
+    shape: tuple[int, ...] = ()
+
+
+@dataclass(frozen=True)
+class Table:
+    """Rows 0..size-1 in named columns; a row's number is its identity and is never given to another."""
+
+    schema: Mapping[str, Column]
+    size: int
+    chunks: Mapping[str, tuple[Array, ...]]
+
+    @staticmethod
+    def empty(schema: Mapping[str, Column]) -> Table:
+        """A table without rows."""
+        return Table(schema, 0, {name: () for name in schema})
+
+    def __len__(self) -> int:
+        return self.size
+
+    def column(self, name: str) -> Array:
+        """All rows of one column, (size, *shape); a copy."""
+        column = self.schema[name]
+        parts = self.chunks[name]
+        return np.concatenate(parts) if parts else np.empty((0, *column.shape), column.dtype)
+
+    def rows(self, name: str, ids: Array) -> Array:
+        """(n, *shape) rows `ids` of one column; touches only their chunks' memory. Raises IndexError for an id outside 0..size-1."""
+        column = self.schema[name]
+        if len(ids) == 0:
+            return np.empty((0, *column.shape), column.dtype)
+        if ids.min() < 0 or ids.max() >= self.size:
+            raise IndexError(f"row {ids.max() if ids.max() >= self.size else ids.min()} of a table of {self.size}")
+        number, offset = np.divmod(ids, CHUNK)
+        out = np.empty((len(ids), *column.shape), column.dtype)
+        for chunk in np.unique(number):
+            here = number == chunk
+            out[here] = self.chunks[name][chunk][offset[here]]
+        return out
+
+    def updated(self, ids: Array, **columns: Array) -> Table:
+        """A version in which rows `ids` (distinct) of the given columns hold new values; other chunks are shared."""
+        chunks = dict(self.chunks)
+        number, offset = np.divmod(np.asarray(ids), CHUNK)
+        for name, values in columns.items():
+            parts = list(chunks[name])
+            for chunk in np.unique(number):
+                here = number == chunk
+                part = parts[chunk].copy()
+                part[offset[here]] = values[here]
+                part.flags.writeable = False
+                parts[chunk] = part
+            chunks[name] = tuple(parts)
+        return Table(self.schema, self.size, chunks)
+
+    def appended(self, **columns: Array) -> tuple[Table, Array]:
+        """A version with more rows, and their ids; every column must be given, all of one length. Raises ValueError otherwise."""
+        lengths = {name: len(values) for name, values in columns.items()}
+        if set(lengths) != set(self.schema) or len(set(lengths.values())) != 1:
+            raise ValueError(f"appended needs equally long columns {sorted(self.schema)}, got {lengths}")
+        count = next(iter(lengths.values()))
+        chunks = dict(self.chunks)
+        room = -self.size % CHUNK
+        for name, values in columns.items():
+            column = self.schema[name]
+            values = np.asarray(values, column.dtype).reshape(count, *column.shape)
+            parts = list(chunks[name])
+            if room and count:
+                parts[-1] = np.concatenate([parts[-1], values[:room]])
+            parts += [values[i : i + CHUNK].copy() for i in range(room, count, CHUNK)]
+            for part in parts:
+                part.flags.writeable = False
+            chunks[name] = tuple(parts)
+        ids = np.arange(self.size, self.size + count, dtype=np.int32)
+        return Table(self.schema, self.size + count, chunks), ids

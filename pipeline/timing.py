@@ -1,0 +1,49 @@
+"""What the runner measures: how long each call took, and each frame from hand-over to pose."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from typing import Any
+
+import numpy as np
+
+
+class Timing:
+    """Collects milliseconds per stage and per frame; `summary` is `timing.json`."""
+
+    def __init__(self) -> None:
+        self._calls: dict[str, list[float]] = defaultdict(list)
+        self._frames_ms: list[float] = []
+
+    def add_call(self, stage: str, ms: float) -> None:
+        """One call of a stage."""
+        self._calls[stage].append(ms)
+
+    def add_frame(self, ms: float) -> None:
+        """One frame, from the moment it was handed over to its pose."""
+        self._frames_ms.append(ms)
+
+    def summary(self, threads: int, wall_s: float, startup_s: float) -> dict[str, Any]:
+        """Frames, wall time and percentiles; `fps` is the whole run's, with reading and recording; `startup_s` is imports and composition."""
+        frames = len(self._frames_ms)
+        p50, p95, largest = _percentiles(self._frames_ms)
+        stages = {}
+        for name, calls in self._calls.items():
+            half, high, _ = _percentiles(calls)
+            stages[name] = {"calls": len(calls), "p50_ms": half, "p95_ms": high}
+        return {
+            "frames": frames,
+            "threads": threads,
+            "wall_s": round(wall_s, 3),
+            "startup_s": round(startup_s, 3),
+            "fps": round(frames / wall_s, 2) if wall_s > 0 else 0.0,
+            "frame_ms": {"p50": p50, "p95": p95, "max": largest},
+            "stages": stages,
+        }
+
+
+def _percentiles(values: list[float]) -> tuple[float, float, float]:
+    if not values:
+        return 0.0, 0.0, 0.0
+    p50, p95 = np.percentile(values, [50, 95])
+    return round(float(p50), 3), round(float(p95), 3), round(max(values), 3)

@@ -1,0 +1,292 @@
+"""The values that travel between stages.
+
+Conventions, said once. Camera frame: x right, y down, z forward, metres. Pixel centres at integers. Depth in metres, 0 = none.
+`T_a_b` maps points of frame b into frame a: `p_a = T_a_b @ p_b`; `R_a_b`, `t_a_b` likewise. A plane is `n·x + d = 0` with `|n| = 1`;
+in the camera frame `d >= 0`, so n points towards the camera. Angles are radians unless the name says `_deg`.
+A pose covariance is that of `xi = (rho, phi)` in `T_world_camera = T_estimate · Exp(xi)` (camera frame, translation first).
+
+Every value is a frozen dataclass with `index` (frame number in the data set) and `stamp_ns`. Array fields declare element type and shape
+with `Shape`; a letter stands for a length that is the same wherever the letter appears in one value. They are checked, in O(1), when the
+value is made, and the arrays become read-only.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Annotated, ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from trihedron.pipeline.arrays import F32, F64, I32, U8, Bool, Shape, check_arrays
+from trihedron.pipeline.camera import EXACT_DEPTH, Camera, DepthNoise
+from trihedron.pipeline.table import Column, Table
+
+__all__ = [
+    "DEGRADED", "EXACT_DEPTH", "F32", "F64", "I32", "LOST", "OK", "U8", "Bool", "Camera", "Column", "Correction", "DepthNoise", "Frame",
+    "FrameReference", "Keypoints", "LineSegments", "ManhattanFrame", "Map", "Matches", "Normals", "Planes", "Pose", "PredictedView",
+    "Rotation", "Segments", "Shape", "Surface", "Table", "Tracks", "Trajectory", "Translation", "Value",
+]  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Value:
+    """Base of everything on a wire."""
+
+    version: ClassVar[int] = 1  # of the type's fields; a recording made with another one is refused
+    dense: ClassVar[bool] = False  # dense topics are recorded only when named
+
+    index: int
+    stamp_ns: int
+
+    def __post_init__(self) -> None:
+        check_arrays(self)
+
+
+@dataclass(frozen=True)
+class Frame(Value):
+    """One registered colour and depth image: RGB and metres (0 = none)."""
+
+    dense: ClassVar[bool] = True
+
+    color: Annotated[U8, Shape("h", "w", 3)]
+    depth_m: Annotated[F32, Shape("h", "w")]
+    camera: Camera
+
+    @cached_property
+    def gray(self) -> U8:
+        """(h, w) luminance."""
+        import cv2
+
+        return np.asarray(cv2.cvtColor(self.color, cv2.COLOR_RGB2GRAY), dtype=np.uint8)
+
+
+@dataclass(frozen=True)
+class FrameReference(Value):
+    """Stands for a frame in a recording that does not embed it (topic `frames`)."""
+
+    camera: Camera
+
+
+@dataclass(frozen=True)
+class Normals(Value):
+    """Unit surface normals towards the camera on a grid: cell (r, c) belongs to pixel (x = c·stride, y = r·stride); NaN = none."""
+
+    dense: ClassVar[bool] = True
+
+    normals: Annotated[F32, Shape("h", "w", 3)]
+    stride: int
+
+
+@dataclass(frozen=True)
+class Keypoints(Value):
+    """Points of interest. `points_m` is the back-projection (camera frame), NaN without a trustworthy depth; `sigma_px` grows with the octave."""
+
+    pixels: Annotated[F32, Shape("n", 2)]
+    points_m: Annotated[F32, Shape("n", 3)]
+    sigma_px: Annotated[F32, Shape("n")]
+    sigma_m: Annotated[F32, Shape("n")]  # of the depth, NaN where points_m is
+    octaves: Annotated[U8, Shape("n")]
+    angles_deg: Annotated[F32, Shape("n")]
+    descriptors: Annotated[U8, Shape("n", "b")]
+    metric: str = "hamming"  # distance between descriptors: hamming | l2
+
+
+@dataclass(frozen=True)
+class LineSegments(Value):
+    """Straight edges of the image: end points (start, end) × (x, y), and binary descriptors."""
+
+    endpoints_px: Annotated[F32, Shape("n", 2, 2)]
+    descriptors: Annotated[U8, Shape("n", "b")]
+
+
+@dataclass(frozen=True)
+class Segments(Value):
+    """The image's line segments lifted to 3D. `endpoints_m` are the extreme inliers along the fitted line, in the order of `endpoints_px`
+    (camera frame); NaN where depth supports no line. `covariance_m2` is that of each 3D end point."""
+
+    endpoints_px: Annotated[F32, Shape("n", 2, 2)]
+    endpoints_m: Annotated[F32, Shape("n", 2, 3)]
+    covariance_m2: Annotated[F32, Shape("n", 2, 3, 3)]
+    descriptors: Annotated[U8, Shape("n", "b")]
+
+
+@dataclass(frozen=True)
+class Planes(Value):
+    """Planar regions, largest first. `covariance` is that of (a, b, d): the normal's tangent coordinates in `geometry.tangent_basis(n)` and d.
+    `moments` is `Σ w [x;1][x;1]ᵀ` over the region's points with `w = 1/σ_z²`. `samples_m` spreads points over the region (NaN-padded), for overlap.
+    `labels` is on the grid of the normals: 0 = none, i + 1 = plane i."""
+
+    coefficients: Annotated[F64, Shape("n", 4)]  # (n, d), d >= 0
+    covariance: Annotated[F64, Shape("n", 3, 3)]
+    moments: Annotated[F64, Shape("n", 4, 4)]
+    pixels: Annotated[I32, Shape("n")]  # image pixels covered
+    samples_m: Annotated[F32, Shape("n", "s", 3)]
+    labels: Annotated[U8, Shape("h", "w")]
+    stride: int
+
+
+@dataclass(frozen=True)
+class ManhattanFrame(Value):
+    """Orthogonal directions of the scene: k rotations `R_camera_manhattan` whose columns are the axes seen from the camera.
+
+    `supported` says whether the scene shows a Manhattan frame at all; `ids` name the frames across time. `covariance` is that of the small
+    rotation phi in `R = Exp(phi) R_estimate` (camera frame, rad²); `inliers` and `spread` (rad, NaN = axis not seen) are per axis;
+    `gap` is the relative distance to a proven optimum (NaN when none is proven)."""
+
+    rotations: Annotated[F64, Shape("k", 3, 3)]
+    ids: Annotated[I32, Shape("k")]
+    covariance: Annotated[F64, Shape("k", 3, 3)]
+    inliers: Annotated[I32, Shape("k", 3)]
+    spread: Annotated[F64, Shape("k", 3)]
+    supported: bool
+    gap: float = float("nan")
+
+
+@dataclass(frozen=True)
+class Tracks(Value):
+    """Features of this frame found in the previous one. Pairs are rows (previous, current).
+
+    The previous geometry is copied, in the previous camera frame, so that motion can be solved from Tracks and the current features alone.
+    `R_current_previous` is the rotation that said where to look, corrected by what was found."""
+
+    previous_index: int
+    keypoints: Annotated[I32, Shape("n", 2)]
+    points_m: Annotated[F32, Shape("n", 3)]  # previous; NaN without depth
+    sigma_m: Annotated[F32, Shape("n")]  # of their depth
+    segments: Annotated[I32, Shape("m", 2)]
+    endpoints_m: Annotated[F32, Shape("m", 2, 3)]  # previous; NaN without depth
+    planes: Annotated[I32, Shape("p", 2)]
+    coefficients: Annotated[F64, Shape("p", 4)]  # previous
+    plane_covariance: Annotated[F64, Shape("p", 3, 3)]
+    R_current_previous: Annotated[F64, Shape(3, 3)]
+
+
+@dataclass(frozen=True)
+class Rotation(Value):
+    """The camera's rotation and the world–Manhattan rotations it is tied to. `source` is manhattan | tracks | prediction.
+
+    `covariance` is that of phi in `R_world_camera = R_estimate · Exp(phi)` (camera frame, rad²); `R_world_manhattan[i]` belongs to Manhattan frame
+    `ids[i]`, with `weights[i]` observations behind it, and `R_camera_manhattan[i]` is this frame's observation of it (NaN = not seen)."""
+
+    R_world_camera: Annotated[F64, Shape(3, 3)]
+    covariance: Annotated[F64, Shape(3, 3)]
+    R_world_manhattan: Annotated[F64, Shape("k", 3, 3)]
+    R_camera_manhattan: Annotated[F64, Shape("k", 3, 3)]
+    ids: Annotated[I32, Shape("k")]
+    weights: Annotated[F64, Shape("k")]
+    source: str
+
+
+@dataclass(frozen=True)
+class Translation(Value):
+    """The camera's position for the given rotation. `unobservable` holds unit vectors (world) along which the prediction was kept;
+    `inliers` counts points, lines and planes; `estimated` is False when no measurement of this frame took part. Covariance in the world frame, m²."""
+
+    t_world_camera: Annotated[F64, Shape(3)]
+    covariance: Annotated[F64, Shape(3, 3)]
+    unobservable: Annotated[F64, Shape("u", 3)]
+    inliers: Annotated[I32, Shape(3)]
+    estimated: bool
+
+
+@dataclass(frozen=True)
+class Matches(Value):
+    """This frame's features found in the map: pairs (row of the feature, id of the landmark). `parallel` and `perpendicular` pair plane rows
+    with map planes that are not the same plane. `visible_*` are the landmarks that were expected in view, found or not."""
+
+    map_revision: int
+    keypoints: Annotated[I32, Shape("n", 2)]
+    segments: Annotated[I32, Shape("m", 2)]
+    planes: Annotated[I32, Shape("p", 2)]
+    parallel: Annotated[I32, Shape("a", 2)]
+    perpendicular: Annotated[I32, Shape("b", 2)]
+    visible_points: Annotated[I32, Shape("v")]
+    visible_lines: Annotated[I32, Shape("w")]
+
+
+OK, DEGRADED, LOST = "ok", "degraded", "lost"
+
+
+@dataclass(frozen=True)
+class Pose(Value):
+    """Where the camera is. A frame counts as tracked only with status ok or degraded, which need measurements of that very frame.
+
+    `reference` is the keyframe the pose is expressed against (-1: none yet) and `T_reference_camera` the pose relative to it.
+    `inliers` counts points, lines and planes; `unobservable` the directions held at the prediction."""
+
+    T_world_camera: Annotated[F64, Shape(4, 4)]
+    covariance: Annotated[F64, Shape(6, 6)]
+    T_reference_camera: Annotated[F64, Shape(4, 4)]
+    reference: int
+    inliers: Annotated[I32, Shape(3)]
+    unobservable: int
+    status: str  # ok | degraded | lost
+    reason: str
+
+
+@dataclass(frozen=True)
+class Map(Value):
+    """Keyframes and landmarks; a row number is an id for good, dead rows have `alive` False. Columns are listed in `plugins.numerics.landmarks`.
+
+    `revision` counts versions; `point_observations` and its siblings say which keyframe (row) saw which landmark, and what it measured."""
+
+    revision: int
+    keyframes: Table
+    points: Table
+    lines: Table
+    planes: Table
+    point_observations: Table
+    line_observations: Table
+    plane_observations: Table
+
+
+@dataclass(frozen=True)
+class Correction(Value):
+    """Moves keyframes and landmarks of the map, by id, as bundle adjustment or loop closing found them from revision `based_on`."""
+
+    based_on: int
+    keyframe_ids: Annotated[I32, Shape("k")]
+    T_world_keyframe: Annotated[F64, Shape("k", 4, 4)]
+    point_ids: Annotated[I32, Shape("n")]
+    points_m: Annotated[F64, Shape("n", 3)]
+    line_ids: Annotated[I32, Shape("m")]
+    endpoints_m: Annotated[F64, Shape("m", 2, 3)]
+    plane_ids: Annotated[I32, Shape("p")]
+    coefficients: Annotated[F64, Shape("p", 4)]
+    R_corrected_world: Annotated[F64, Shape(3, 3)]  # turns the Manhattan reference with the map
+
+
+@dataclass(frozen=True)
+class PredictedView(Value):
+    """What a dense model would show from a pose: depth (0 = none), normals and colour."""
+
+    dense: ClassVar[bool] = True
+
+    T_world_camera: Annotated[F64, Shape(4, 4)]
+    depth_m: Annotated[F32, Shape("h", "w")]
+    normals: Annotated[F32, Shape("h", "w", 3)]
+    color: Annotated[U8, Shape("h", "w", 3)]
+
+
+@dataclass(frozen=True)
+class Surface(Value):
+    """A triangle mesh in the world frame; `instances` is the map plane a triangle belongs to, -1 for none."""
+
+    vertices_m: Annotated[F64, Shape("v", 3)]
+    colors: Annotated[U8, Shape("v", 3)]
+    triangles: Annotated[I32, Shape("t", 3)]
+    instances: Annotated[I32, Shape("t")]
+
+
+@dataclass(frozen=True)
+class Trajectory:
+    """Poses over time: (n,) stamps in ns, strictly increasing, and (n, 4, 4) `T_world_camera`."""
+
+    stamps_ns: NDArray[np.int64]
+    poses: F64
+
+    def __len__(self) -> int:
+        return len(self.stamps_ns)
+

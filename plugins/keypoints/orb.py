@@ -1,0 +1,169 @@
+"""ORB key points spread over the image, with depth."""
+
+from __future__ import annotations
+
+import math
+import threading
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import cv2
+import numpy as np
+
+from trihedron.pipeline.registry import register
+from trihedron.pipeline.types import F32, I32, U8, Frame, Keypoints
+from trihedron.plugins.numerics.corner_measures import centroid_angles_deg, harris_scores
+from trihedron.plugins.numerics.depth_sampling import local_depth, noise_coefficients
+from trihedron.plugins.numerics.image_pyramid import full_pixels, image_pyramid
+from trihedron.plugins.numerics.spreading import spread_over_grid
+
+MARGIN_PX = 19  # of a level, within which its descriptors would reach over the border
+FAST_PX = 4  # radius of the circle FAST compares with, and one for its comparison of neighbours
+PATCH_PX = 31  # side of what a descriptor looks at (Rublee et al.)
+
+
+@dataclass(frozen=True)
+class Corners:
+    """Corners of the whole pyramid: integer pixels (n, 2) of their own level, levels (n,), strength (n,)."""
+
+    cells: I32
+    levels: I32
+    strength: F32
+
+    def take(self, rows: Any) -> Corners:
+        """Some of the rows."""
+        return Corners(self.cells[rows], self.levels[rows], self.strength[rows])
+
+
+@register("keypoints", "orb")
+@dataclass(frozen=True)
+class Orb:
+    """Oriented FAST and rotated BRIEF (Rublee et al., ICCV 2011), chosen per grid cell so that a textured corner does not take them all."""
+
+    features: int = 1000  # most key points kept
+    scale: float = 1.2  # between pyramid levels
+    levels: int = 8
+    fast_threshold: int = 20  # grey levels
+    fast_threshold_low: int = 7  # where a grid cell has few
+    cell_px: int = 64  # side of the grid cells
+    fineness: float = 2.0  # strengths are compared after division by the level's scale to this power: fine levels place points better
+    sigma_px: float = 0.6  # of a position at level 0; grows with the level's scale
+    depth_radius_px: int = 2  # of the neighbourhood the depth is taken from
+    depth_share: float = 0.5  # of the neighbourhood that must have depth
+    depth_gate: float = 3.0  # σ_z a neighbourhood may spread about a linear surface
+    depth_edge: float = 0.01  # more than that, as a share of z, is a depth edge: no depth
+
+    def __post_init__(self) -> None:
+        if self.features < 1:
+            raise ValueError("features: must be at least 1")
+        if not 1.0 < self.scale <= 2.0:
+            raise ValueError("scale: must be in (1, 2]")
+        if not 1 <= self.levels <= 16:
+            raise ValueError("levels: must be 1 to 16")
+        if not 1 <= self.fast_threshold_low <= self.fast_threshold <= 255:
+            raise ValueError("fast_threshold, fast_threshold_low: must be 1 to 255, the low one not above the other")
+        if self.cell_px < 4 or self.sigma_px <= 0.0 or self.fineness < 0.0:
+            raise ValueError("cell_px, sigma_px, fineness: must be at least 4, above 0 and not negative")
+        if not 1 <= self.depth_radius_px <= 10 or not 0.0 < self.depth_share <= 1.0 or self.depth_gate <= 0.0 or self.depth_edge < 0.0:
+            raise ValueError("depth_radius_px, depth_share, depth_gate, depth_edge: out of range")
+
+    def __call__(self, frame: Frame) -> Keypoints:
+        """At most `features` key points ordered by level, row and column; (n, 32) binary descriptors."""
+        pyramid = image_pyramid(frame.gray, self.scale, self.levels, 2 * MARGIN_PX + 1)
+        corners = self._choose(self._corners(pyramid), pyramid)
+        angles = self._per_level(centroid_angles_deg, pyramid, corners)
+        descriptors = self._describe(frame.gray, corners, angles)
+        pixels = full_pixels(corners.cells, corners.levels, pyramid).astype(np.float32)
+        noise = noise_coefficients(frame.camera.depth_noise)
+        depth, sigma = local_depth(frame.depth_m, pixels, self.depth_radius_px, self.depth_share, noise, self.depth_gate, self.depth_edge)
+        return Keypoints(
+            index=frame.index,
+            stamp_ns=frame.stamp_ns,
+            pixels=pixels,
+            points_m=frame.camera.back_project(pixels, depth).astype(np.float32),
+            sigma_px=(self.sigma_px * self.scale**corners.levels).astype(np.float32),
+            sigma_m=sigma,
+            octaves=corners.levels.astype(np.uint8),
+            angles_deg=angles,
+            descriptors=descriptors,
+        )
+
+    def _corners(self, pyramid: list[U8]) -> Corners:
+        """FAST corners of every level: at the high threshold, and at the low one in those grid cells that would have less than their share."""
+        found = [self._fast(image, self.fast_threshold, None) for image in pyramid]
+        h, w = pyramid[0].shape
+        down, across = -(-h // self.cell_px), -(-w // self.cell_px)
+        count = np.zeros(down * across, np.int64)
+        for image, (cells, _) in zip(pyramid, found):
+            place = (cells * (w / (image.shape[1] * self.cell_px))).astype(np.int64)
+            count += np.bincount(place[:, 1].clip(0, down - 1) * across + place[:, 0].clip(0, across - 1), minlength=count.size)
+        poor = (count < 2 * self.features / count.size).astype(np.uint8).reshape(down, across)
+        if poor.any():
+            mask = np.kron(poor, np.full((self.cell_px, self.cell_px), 255, np.uint8))[:h, :w]
+            reach = 2 * math.ceil(FAST_PX * self.scale ** (len(pyramid) - 1)) + 1
+            wide = cv2.dilate(mask, np.ones((reach, reach), np.uint8))  # what FAST sees around the poor cells; the rest is blanked, for speed
+            for level, image in enumerate(pyramid):
+                shrunk, seen = (np.asarray(cv2.resize(m, image.shape[::-1], interpolation=cv2.INTER_NEAREST)) for m in (mask, wide))
+                more = self._fast(np.bitwise_and(image, seen), self.fast_threshold_low, shrunk)
+                rich = shrunk[found[level][0][:, 1], found[level][0][:, 0]] == 0
+                found[level] = np.concatenate([found[level][0][rich], more[0]]), np.concatenate([found[level][1][rich], more[1]])
+        levels = np.concatenate([np.full(len(cells), level, np.int32) for level, (cells, _) in enumerate(found)])
+        return Corners(np.concatenate([c for c, _ in found]), levels, np.concatenate([s for _, s in found]))
+
+    def _fast(self, image: U8, threshold: int, mask: U8 | None) -> tuple[I32, F32]:
+        """Corners (n, 2) of one level away from its border, and their FAST scores (n,)."""
+        detector = self._opencv.fast
+        detector.setThreshold(threshold)
+        found = detector.detect(image, mask) if min(image.shape) > 2 * MARGIN_PX else ()
+        cells = np.rint(np.asarray(cv2.KeyPoint_convert(found), np.float32).reshape(-1, 2)).astype(np.int32)
+        inside = ((cells >= MARGIN_PX) & (cells < np.array(image.shape[::-1]) - MARGIN_PX)).all(1)
+        return cells[inside], np.array([k.response for k in found], np.float32)[inside]
+
+    def _choose(self, corners: Corners, pyramid: list[U8]) -> Corners:
+        """The spread choice: by FAST score down to three times as many as wanted, then by Harris measure; in order of level, row, column."""
+        for turn in range(2):
+            if turn == 1:
+                corners = Corners(corners.cells, corners.levels, self._per_level(harris_scores, pyramid, corners))
+            wanted = self.features * (3 if turn == 0 else 1)
+            full = full_pixels(corners.cells, corners.levels, pyramid).astype(np.float32)
+            strength = corners.strength * self.scale ** (-self.fineness * turn * corners.levels.astype(np.float64))
+            order = np.argsort(-strength, kind="stable").astype(np.int32)  # FAST scans in rows, so ties keep a fixed order
+            keep = spread_over_grid(full, order, pyramid[0].shape[1], pyramid[0].shape[0], self.cell_px, wanted)
+            corners = corners.take(keep)
+        return corners.take(np.lexsort((corners.cells[:, 0], corners.cells[:, 1], corners.levels)))
+
+    def _per_level(self, measure: Any, pyramid: list[U8], corners: Corners) -> F32:
+        """A kernel's value for each corner on the image of its level."""
+        out = np.zeros(len(corners.levels), np.float32)
+        for level, image in enumerate(pyramid):
+            rows = np.flatnonzero(corners.levels == level)
+            out[rows] = measure(image, corners.cells[rows])
+        return out
+
+    def _describe(self, gray: U8, corners: Corners, angles: F32) -> U8:
+        """(n, 32) rotated BRIEF, by OpenCV, which wants a level's pixel x as x · s."""
+        scales = self.scale ** corners.levels.astype(np.float64)
+        xs, ys = (corners.cells * scales[:, None]).T.tolist()
+        points = [
+            cv2.KeyPoint(x, y, PATCH_PX * s, angle, 1.0, level, i)
+            for i, (x, y, s, angle, level) in enumerate(zip(xs, ys, scales.tolist(), angles.tolist(), corners.levels.tolist()))
+        ]
+        out = np.zeros((len(points), 32), np.uint8)
+        if points:
+            kept, described = self._opencv.orb.compute(gray, points)
+            if described is not None:
+                out[[k.class_id for k in kept]] = described
+        return out
+
+    @cached_property
+    def _local(self) -> threading.local:
+        return threading.local()
+
+    @property
+    def _opencv(self) -> Any:
+        """This thread's OpenCV objects, `fast` and `orb`: they may not be shared between threads."""
+        if not hasattr(self._local, "orb"):
+            self._local.fast = cv2.FastFeatureDetector_create(self.fast_threshold, True)
+            self._local.orb = cv2.ORB_create(self.features, self.scale, self.levels, edgeThreshold=MARGIN_PX)
+        return self._local

@@ -1,0 +1,47 @@
+"""Line segments along Canny edges, with LBD descriptors."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import cv2
+
+from trihedron.pipeline.registry import register
+from trihedron.pipeline.types import Frame, LineSegments
+from trihedron.plugins.numerics.straight_edges import SMALLEST, StraightEdges
+
+
+@register("lines", "fast_line")
+@dataclass(frozen=True)
+class FastLine(StraightEdges):
+    """Fast line detector (Lee et al., ICRA 2014; OpenCV's): chains of Canny edge pixels cut into straight runs, then joined, placed to sub-pixel and
+    described like those of `lsd`."""
+
+    scale: float = 0.7  # of the image the detector looks at; at half size close parallel edges become one
+    band_px: int = 10  # rows of an LBD band, on the reduced image
+    merge_gap_px: float = 18.0  # between fragments of one edge; Canny's chains turn at corners
+    weak: float = 20.0  # Canny's thresholds, grey levels per px times 4 (Sobel): a chain of edge pixels goes on above this
+    strong: float = 50.0  # and needs one above this (OpenCV's default)
+    straight_px: float = 1.41  # an edge pixel farther than this from the line of its run ends the run (Lee et al.)
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if not 0.0 < self.weak <= self.strong:
+            raise ValueError("weak, strong: must be above 0, weak not above strong")
+        if not 0.5 <= self.straight_px <= 5.0:
+            raise ValueError("straight_px: must be 0.5 to 5")
+
+    def __call__(self, frame: Frame) -> LineSegments:
+        """The longest segments, longest first; (n, 32) binary descriptors."""
+        small = self._reduced(frame.gray)
+        found = self._detector.detect(small) if min(small.shape) >= SMALLEST else None
+        return self._segments(frame, small, found)
+
+    @property
+    def _detector(self) -> Any:
+        """This thread's detector. Runs half as long as the shortest segment wanted are kept: they may be fragments of one."""
+        if not hasattr(self._local, "fast_line"):
+            shortest = max(int(0.5 * self.min_length_px * self.scale), 3)
+            self._local.fast_line = cv2.ximgproc.createFastLineDetector(shortest, self.straight_px, self.weak, self.strong, 3, False)
+        return self._local.fast_line

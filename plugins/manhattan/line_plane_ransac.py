@@ -1,0 +1,181 @@
+"""The Manhattan frame from a single line and a single plane."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import NamedTuple
+
+import numpy as np
+
+from trihedron.pipeline.registry import register
+from trihedron.pipeline.types import F64, Bool, ManhattanFrame, Normals, Planes, Segments
+from trihedron.plugins.numerics.axis_fit import AxisFit, gather_directions
+from trihedron.plugins.numerics.cube_symmetry import nearest_equivalent
+from trihedron.plugins.numerics.minimal_frames import frames_through, same_axes, score_frames
+from trihedron.plugins.numerics.procrustes import procrustes, square_angles
+from trihedron.plugins.numerics.sphere_modes import assign_axes
+
+
+@register("manhattan", "line_plane_ransac")
+@dataclass(frozen=True)
+class LinePlaneRansac:
+    """RANSAC over the least that fixes a Manhattan frame: a plane and a line on it, two planes, or two lines (Kim, Coltin and Kim, "Indoor RGB-D
+    Compass from a Single Line and Plane", CVPR 2018).
+
+    The plane's normal n is one axis; the second is where the line's interpretation plane, of normal m, meets the wall: `v = m × n`, which takes
+    the line's bearing and not its noisy depth; the third is `n × v`. Hypotheses are scored over all planes, lines and normals, and the best is
+    fitted to its inliers by their covariances."""
+
+    hypotheses: int = 100  # drawn; half of them right leaves no chance to miss
+    reach_deg: float = 5.0  # a plane or line this near to an axis belongs to it
+    normals_reach_deg: float = 12.0  # and a normal
+    samples: int = 300  # most normals scored
+    min_share: float = 0.05  # of the image that a plane must cover
+    min_line_px: float = 20.0  # of lines that an axis must show beside a plane
+    min_lines: int = 6  # on the axes when there is no plane
+    max_line_share: float = 0.6  # of the lines' length on the axes is always enough; with many lines, what chance does not give
+    min_plane_share: float = 0.4  # of the planes' area
+    loyalty: float = 1.2  # a frame with other axes than the previous must score so many times more
+    plane_floor_deg: float = 0.3  # a wall's deviation from the axis
+    line_floor_deg: float = 0.5  # an edge's
+    floor_deg: float = 0.1  # of the whole rotation
+    gate: float = 2.0  # σ at which a plane or line counts half
+
+    def __post_init__(self) -> None:
+        if self.hypotheses < 1 or self.samples < 0 or self.min_lines < 2:
+            raise ValueError("hypotheses, samples, min_lines: must be at least 1, 0 and 2")
+        if not 0.5 <= self.reach_deg <= 20.0 or not 0.5 <= self.normals_reach_deg <= 30.0:
+            raise ValueError("reach_deg, normals_reach_deg: must be 0.5 to 20 and 0.5 to 30")
+        if not 0.0 < self.min_share <= 1.0 or not 0.0 <= self.max_line_share <= 1.0 or not 0.0 <= self.min_plane_share <= 1.0:
+            raise ValueError("min_share, max_line_share, min_plane_share: must be above 0 to 1, and 0 to 1")
+        if self.min_line_px < 0.0 or self.loyalty < 1.0:
+            raise ValueError("min_line_px, loyalty: must be at least 0 and 1")
+        _ = self._fit  # checks its own fields
+
+    def __call__(
+        self, normals: Normals, segments: Segments, planes: Planes, previous: ManhattanFrame | None, rng: np.random.Generator
+    ) -> ManhattanFrame:
+        """One rotation with id 0; `inliers` counts planes and lines. `supported` is False where no plane has a line along it and lines are few or
+        without order; a single plane still tells two of the three angles."""
+        start = np.eye(3) if previous is None else previous.rotations[0]
+        features, reach = _features(planes, segments), np.radians(self.reach_deg)
+        R, seen, supported = self._consensus(features, normals, start, previous is not None and previous.supported, rng)
+        R, covariance = self._fit(R, R, np.zeros((3, 4)), seen, segments, planes)
+        axes = assign_axes(features.vectors, R, reach)
+        axes[(axes >= 0) & ~seen[axes]] = -1
+        on, square = axes >= 0, square_angles(features.vectors, axes, R)
+        with np.errstate(invalid="ignore"):
+            spread = np.sqrt(np.bincount(axes[on], (features.share * square)[on], 3) / np.bincount(axes[on], features.share[on], 3))
+        return ManhattanFrame(
+            index=normals.index,
+            stamp_ns=normals.stamp_ns,
+            rotations=R[None],
+            ids=np.zeros(1, np.int32),
+            covariance=covariance[None],
+            inliers=np.bincount(axes[on], minlength=3).astype(np.int32)[None],
+            spread=spread[None],
+            supported=supported,
+        )
+
+    def _consensus(self, features: Features, normals: Normals, start: F64, loyal: bool, rng: np.random.Generator) -> tuple[F64, Bool, bool]:
+        """The frame with most on its axes, named as is nearest to `start`, the axes (3,) that are seen and whether that is enough. Without a frame
+        `start`, turned to the wall when there is one."""
+        frames = self._hypotheses(features, rng)
+        if len(frames):
+            surface = gather_directions(normals.normals, None, self.samples, 0.0).vectors
+            vectors = np.concatenate([features.vectors, surface])
+            reach = np.radians(np.repeat([self.reach_deg, self.normals_reach_deg], [len(features.vectors), len(surface)]))
+            weights = np.concatenate([features.share, np.full(len(surface), 1.0 / max(len(surface), 1))])
+            score = score_frames(frames, vectors, weights, reach)
+            if loyal:
+                score *= np.where(same_axes(frames, start), self.loyalty, 1.0)
+            R = nearest_equivalent(frames[int(np.argmax(score))], start)
+            seen, supported = self._judged(features, R)
+            if supported:
+                return R, seen, True
+        walls = features.vectors[: features.planes][features.share[: features.planes] >= self.min_share]
+        seen = np.zeros(3, np.bool_)
+        if len(walls) != 1:
+            return start, seen, False
+        axis = assign_axes(walls, start, np.pi)
+        seen[axis] = True
+        return procrustes(walls, np.ones(1), axis, start, 1e-6), seen, False
+
+    def _hypotheses(self, features: Features, rng: np.random.Generator) -> F64:
+        """(m, 3, 3) rotations through drawn pairs of perpendicular features, each as likely as it is large, planes and lines half of the draws."""
+        vectors, line = features.vectors, np.arange(len(features.vectors)) >= features.planes
+        likely = features.share / np.where(line, max(features.share[line].sum(), 1e-12), max(features.share[~line].sum(), 1e-12))
+        partners = np.cumsum(likely * (np.abs(vectors @ vectors.T) < np.sin(np.radians(self.reach_deg))), axis=1)
+        total = np.cumsum(likely * (partners[:, -1] > 0.0)) if len(vectors) else np.zeros(1)
+        if total[-1] <= 0.0:
+            return np.zeros((0, 3, 3))
+        u = rng.random((self.hypotheses, 2))
+        i = np.searchsorted(total, u[:, 0] * total[-1], side="right")
+        j = (partners[i] <= u[:, 1:] * partners[i, -1:]).sum(axis=1)
+        i, j = np.minimum(i, j), np.maximum(i, j)  # the plane first
+        second = vectors[j].copy()
+        on_wall = line[j] & ~line[i]
+        second[on_wall] = _on_wall(vectors[i[on_wall]], vectors[j[on_wall]], features.across[j[on_wall]], np.cos(np.radians(self.reach_deg)))
+        return frames_through(vectors[i], second)
+
+    def _judged(self, features: Features, R: F64) -> tuple[Bool, bool]:
+        """(3,) axes with a plane or enough lines, and whether that makes a Manhattan frame."""
+        axes = assign_axes(features.vectors, R, np.radians(self.reach_deg)) + 1
+        p, share = features.planes, features.share
+        walls, lines = np.bincount(axes[:p], share[:p], 4)[1:], np.bincount(axes[p:], share[p:], 4)[1:]
+        counts = np.bincount(axes[p:], minlength=4)[1:]
+        # of lines drawn any way on one wall two axes gather four times their reach of 180°; the best of many hypotheses 4 sigma more
+        chance = 4.0 * np.radians(self.reach_deg) / np.pi
+        chance += 4.0 * np.sqrt(chance * (1.0 - chance) * (share[p:] ** 2).sum())
+        ordered = lines.sum() >= min(chance, self.max_line_share)
+        by_planes = walls >= self.min_share
+        wanted = 1 if by_planes.any() else (self.min_lines + 1) // 2
+        seen = by_planes | ((counts >= wanted) & (lines * features.length_px >= self.min_line_px) & ordered)
+        return seen, bool(seen.sum() >= 2 and walls.sum() >= self.min_plane_share * share[:p].sum())
+
+    @cached_property
+    def _fit(self) -> AxisFit:
+        return AxisFit(
+            cone_deg=self.reach_deg,
+            plane_floor_deg=self.plane_floor_deg,
+            line_floor_deg=self.line_floor_deg,
+            floor_deg=self.floor_deg,
+            gate=self.gate,
+        )
+
+
+class Features(NamedTuple):
+    """n directions: the normals of planes, then from row `planes` on those of 3D lines."""
+
+    vectors: F64  # (n, 3)
+    across: F64  # (n, 3) normals of the lines' interpretation planes
+    share: F64  # (n,) of the image, and of the length of all lines
+    planes: int
+    length_px: float  # of all lines
+
+
+def _features(planes: Planes, segments: Segments) -> Features:
+    """The planes and lines whose directions are known."""
+    good = np.isfinite(planes.coefficients).all(axis=1) & (planes.pixels > 0)
+    area = planes.pixels[good] / max(planes.labels.size * planes.stride**2, 1)
+    start, end = segments.endpoints_m[:, 0].astype(np.float64), segments.endpoints_m[:, 1].astype(np.float64)
+    length = np.linalg.norm(end - start, axis=1)
+    pixels = np.linalg.norm(segments.endpoints_px[:, 1].astype(np.float64) - segments.endpoints_px[:, 0], axis=1)
+    solid = (length > 1e-6) & np.isfinite(length) & (pixels > 0.0) & np.isfinite(pixels)
+    start, end, total = start[solid], end[solid], float(pixels[solid].sum())
+    across = np.cross(start, end)
+    across /= np.maximum(np.linalg.norm(across, axis=1, keepdims=True), 1e-12)
+    along = (end - start) / length[solid, None]
+    normals = planes.coefficients[good, :3]
+    return Features(
+        np.concatenate([normals, along]), np.concatenate([normals, across]), np.concatenate([area, pixels[solid] / total]), len(normals), total
+    )
+
+
+def _on_wall(normals: F64, along: F64, across: F64, agreement: float) -> F64:
+    """(m, 3) `m × n`: directions on walls with `normals` of lines with interpretation planes `across`; the line's own direction `along` where the
+    two are further apart than `agreement` (cosine), as when the camera looks along the wall."""
+    met = np.cross(across, normals)
+    met /= np.maximum(np.linalg.norm(met, axis=1, keepdims=True), 1e-12)
+    return np.where(np.abs(np.einsum("ij,ij->i", met, along))[:, None] > agreement, met, along)

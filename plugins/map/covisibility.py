@@ -1,0 +1,131 @@
+"""Keyframes tied by the points, lines and planes they share."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from trihedron.pipeline.geometry import rotation_angle_deg
+from trihedron.pipeline.registry import register
+from trihedron.pipeline.types import I32, LOST, Correction, Frame, Keypoints, Map, Matches, Planes, Pose, Segments
+from trihedron.plugins.numerics import insertion
+from trihedron.plugins.numerics.association import Associated, associate, existing
+from trihedron.plugins.numerics.correction import apply_correction
+from trihedron.plugins.numerics.culling import cull
+from trihedron.plugins.numerics.landmarks import empty_map
+from trihedron.plugins.numerics.local_window import newest_keyframes
+from trihedron.plugins.numerics.merging import merge_lines, merge_planes, merge_points
+
+STALE = 0.25  # of the view change of a keyframe, that makes one after max_frames: a camera at rest adds none
+
+
+@register("map", "covisibility")
+@dataclass(frozen=True)
+class Covisibility:
+    """Insert a keyframe when the view has changed, measure known landmarks again, add new ones, cull and fuse (section V-A).
+
+    Without bundle adjustment a landmark is the running estimate of all its measurements, each weighed by its covariance."""
+
+    min_frames: int = 3  # between keyframes
+    max_frames: int = 30  # after which a quarter of the view change below is enough
+    min_shift: float = 0.06  # of the camera, as a share of the median depth, that makes a keyframe
+    min_turn_deg: float = 6.0
+    min_share: float = 0.5  # of the newest keyframe's landmarks tracked, below which a keyframe is made
+    new_plane_px: int = 4000  # a plane this large that is not in the map makes a keyframe
+    memory: float = 30.0  # measurements a point or line remembers
+    plane_memory: float = 30.0  # keyframes a plane remembers
+    line_sigma_px: float = 1.0  # of a segment's end point across it
+    min_line_px: float = 30.0  # shortest segment that becomes a landmark
+    trial: int = 3  # keyframes after which a landmark seen by fewer of those that should have seen it is removed
+    min_found: float = 0.25  # found ratio below which a landmark is removed (ORB-SLAM)
+    merge_deg: float = 4.0  # planes that differ by less, and by less than merge_m on average, become one
+    merge_m: float = 0.03
+
+    def __post_init__(self) -> None:
+        if not 1 <= self.min_frames <= self.max_frames:
+            raise ValueError("min_frames: must be at least 1 and at most max_frames")
+        if self.memory <= 1.0 or self.plane_memory <= 1.0:
+            raise ValueError("memory, plane_memory: must be above 1")
+        if self.min_shift <= 0.0 or self.min_turn_deg <= 0.0 or self.line_sigma_px <= 0.0:
+            raise ValueError("min_shift, min_turn_deg, line_sigma_px: must be positive")
+        if not 0.0 <= self.min_share <= 1.0 or not 0.0 <= self.min_found <= 1.0 or self.trial < 1:
+            raise ValueError("min_share, min_found, trial: shares in [0, 1], trial at least 1")
+
+    def __call__(
+        self,
+        frame: Frame,
+        pose: Pose,
+        keypoints: Keypoints,
+        segments: Segments,
+        planes: Planes,
+        matches: Matches | None,
+        map: Map | None,
+        bundle: Correction | None,
+        loop: Correction | None,
+    ) -> Map | None:
+        """The next version of the map, or None when this frame changes nothing."""
+        corrected = self._corrected(map, bundle, loop)
+        matches = existing(matches, corrected) if matches is not None and corrected is not None else None
+        if corrected is None:
+            lengths = keypoints.descriptors.shape[1], segments.descriptors.shape[1], planes.samples_m.shape[1]
+            corrected = empty_map(frame.index, frame.stamp_ns, *lengths)
+        elif pose.status == LOST or not self._wanted(frame, pose, planes, matches, corrected):
+            return None if corrected is map else self._version(corrected, frame)
+        return self._version(self._inserted(corrected, frame, pose, keypoints, segments, planes, matches), frame)
+
+    def _corrected(self, map: Map | None, *corrections: Correction | None) -> Map | None:
+        for correction in corrections:
+            if map is not None and correction is not None:
+                map = apply_correction(map, correction)
+        return map
+
+    def _version(self, map: Map, frame: Frame) -> Map:
+        return replace(map, index=frame.index, stamp_ns=frame.stamp_ns, revision=map.revision + 1)
+
+    def _wanted(self, frame: Frame, pose: Pose, planes: Planes, matches: Matches | None, map: Map) -> bool:
+        """Whether this frame shows enough that is new."""
+        newest = newest_keyframes(map, 1)
+        if not len(newest):
+            return True
+        frames = frame.index - int(map.keyframes.rows("index", newest)[0])
+        if frames < self.min_frames:
+            return False
+        T = np.linalg.inv(map.keyframes.rows("T_world_camera", newest)[0]) @ pose.T_world_camera
+        depth = frame.depth_m[::8, ::8]
+        median = float(np.median(depth[depth > 0.0])) if (depth > 0.0).any() else 1.0
+        moved = max(float(np.linalg.norm(T[:3, 3])) / (self.min_shift * median), rotation_angle_deg(T[:3, :3]) / self.min_turn_deg)
+        spans = np.array([map.keyframes.rows(kind, newest)[0] for kind in ("points", "lines", "planes")])
+        poor = bool((pose.inliers @ [1, 5, 20]) < self.min_share * ((spans[:, 1] - spans[:, 0]) @ [1, 5, 20]))
+        known = matches.planes[:, 0] if matches is not None else np.empty(0, np.int32)
+        unknown = np.setdiff1d(np.flatnonzero(planes.pixels > self.new_plane_px), known)
+        return moved > 1.0 or poor or len(unknown) > 0 or (frames >= self.max_frames and moved > STALE)
+
+    def _inserted(
+        self, map: Map, frame: Frame, pose: Pose, keypoints: Keypoints, segments: Segments, planes: Planes, matches: Matches | None
+    ) -> Map:
+        """The map with this frame as its newest keyframe."""
+        found = associate(map, frame.camera, pose.T_world_camera, keypoints, segments, planes, matches, self.line_sigma_px)
+        map, row = insertion.add_keyframe(map, pose)
+        view = insertion.View(row, frame.camera, pose.T_world_camera, pose.covariance)
+        map = self._seen(map, matches)
+        map = insertion.insert_points(map, view, keypoints, found.points, found.new_points, self.memory)
+        map = insertion.insert_lines(map, view, segments, found.lines, self._long(segments, found), self.line_sigma_px, self.memory)
+        map = insertion.insert_planes(map, view, planes, found.planes, found.new_planes, self.plane_memory)
+        if matches is not None:
+            map = merge_points(map, view, matches.visible_points, keypoints.metric)
+            map = merge_lines(map, view, matches.visible_lines)
+        map = merge_planes(map, row, self.merge_deg, self.merge_m)
+        return cull(map, row, matches, self.trial, self.min_found)
+
+    def _seen(self, map: Map, matches: Matches | None) -> Map:
+        if matches is None:
+            return map
+        points = insertion.count_visible(map.points, matches.visible_points)
+        lines = insertion.count_visible(map.lines, matches.visible_lines)
+        return replace(map, points=points, lines=lines, planes=insertion.count_visible(map.planes, np.unique(matches.planes[:, 1])))
+
+    def _long(self, segments: Segments, found: Associated) -> I32:
+        """New segments long enough to be found again."""
+        ends = segments.endpoints_px[found.new_lines]
+        return found.new_lines[np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1) >= self.min_line_px]

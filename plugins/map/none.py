@@ -1,0 +1,18 @@
+"""No map."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from trihedron.pipeline.registry import register
+from trihedron.pipeline.types import Frame, Map, Pose
+
+
+@register("map", "none")
+@dataclass(frozen=True)
+class NoMap:
+    """Nothing is kept: every pose stands on the previous frame alone."""
+
+    def __call__(self, frame: Frame, pose: Pose) -> Map | None:
+        """None, whatever is given."""
+        return None

@@ -1,0 +1,28 @@
+"""Normals by fast approximate least squares, OpenCV's."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+
+from trihedron.pipeline.registry import register
+from trihedron.pipeline.types import Frame, Normals
+from trihedron.plugins.numerics.cloud_normals import CloudNormals
+
+
+@register("normals", "fals")
+@dataclass(frozen=True)
+class Fals(CloudNormals):
+    """Fast approximate least squares (Badino et al., ICRA 2011; OpenCV's RgbdNormals): the plane of each window, from rays known beforehand."""
+
+    window: int = 5  # cells, 3, 5 or 7
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.window not in (3, 5, 7):
+            raise ValueError("window: must be 3, 5 or 7 cells")
+
+    def __call__(self, frame: Frame) -> Normals:
+        """Normals on a grid of ceil(h / stride) × ceil(w / stride) cells; NaN within half a window of missing depth or a depth edge."""
+        return self._normals(frame, cv2.RgbdNormals_RGBD_NORMALS_METHOD_FALS, self.window, reach=self.window // 2, border=0)

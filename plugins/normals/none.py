@@ -1,0 +1,27 @@
+"""No normals."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from trihedron.pipeline.registry import register
+from trihedron.pipeline.types import Frame, Normals
+
+
+@register("normals", "none")
+@dataclass(frozen=True)
+class NoNormals:
+    """A grid of NaN: what the rest of the system does without normals (and so without planes found from them)."""
+
+    stride: int = 2  # px between cells of the grid
+
+    def __post_init__(self) -> None:
+        if not 1 <= self.stride <= 8:
+            raise ValueError("stride: must be 1 to 8 px")
+
+    def __call__(self, frame: Frame) -> Normals:
+        """Not one normal."""
+        h, w = (-(-side // self.stride) for side in frame.depth_m.shape)
+        return Normals(frame.index, frame.stamp_ns, np.full((h, w, 3), np.nan, np.float32), self.stride)

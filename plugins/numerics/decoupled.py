@@ -1,0 +1,77 @@
+"""The pose as rotation and translation said it, before any refinement."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from trihedron.pipeline.geometry import invert, pose_matrix
+from trihedron.pipeline.types import DEGRADED, F64, I32, LOST, OK, Frame, Map, Pose, Rotation, Translation
+from trihedron.plugins.numerics.local_window import newest_keyframes
+
+FIRST_SIGMA = 1e-6  # the first pose is exact by definition; positive, so that covariances stay invertible
+
+
+@dataclass(frozen=True)
+class Decoupled:
+    """`T_world_camera` (4, 4) with covariance (6, 6) of xi, counts of points, lines and planes, and what is to be said of it."""
+
+    T_world_camera: F64
+    covariance: F64
+    inliers: I32
+    unobservable: int
+    status: str
+    reason: str
+
+    def said(self, frame: Frame, map: Map | None, reason: str = "") -> Pose:
+        """As the frame's pose; `reason` says why no refinement followed (degraded, unless it was lost already)."""
+        status = DEGRADED if reason and self.status == OK else self.status
+        reference, T_reference_camera = reference_of(map, self.T_world_camera)
+        return Pose(
+            frame.index,
+            frame.stamp_ns,
+            self.T_world_camera,
+            self.covariance,
+            T_reference_camera,
+            reference,
+            self.inliers,
+            self.unobservable,
+            status,
+            self.reason if status == LOST or not reason else reason,
+        )
+
+
+def decoupled_pose(rotation: Rotation, translation: Translation, previous: Pose | None, relocalise: Pose | None = None) -> Decoupled:
+    """The decoupled pose with its status. When the previous pose was lost and the frame of that pose has been found in the map since, the motion
+    since then is put on top of the place found."""
+    T = pose_matrix(rotation.R_world_camera, translation.t_world_camera)
+    covariance = np.zeros((6, 6))
+    R = rotation.R_world_camera
+    covariance[:3, :3] = R.T @ translation.covariance @ R + FIRST_SIGMA**2 * np.eye(3)
+    covariance[3:, 3:] = rotation.covariance + FIRST_SIGMA**2 * np.eye(3)
+    unobservable = len(translation.unobservable)
+    if previous is None:
+        return Decoupled(T, FIRST_SIGMA**2 * np.eye(6), translation.inliers, 0, OK, "first frame, origin of the world")
+    if relocalise is not None and previous.status == LOST and relocalise.index == previous.index and relocalise.status != LOST:
+        T = relocalise.T_world_camera @ invert(previous.T_world_camera) @ T
+    status, reason = _judge(rotation, translation, unobservable)
+    return Decoupled(T, covariance, translation.inliers, unobservable, status, reason)
+
+
+def _judge(rotation: Rotation, translation: Translation, unobservable: int) -> tuple[str, str]:
+    if not translation.estimated:
+        return LOST, "no feature of the previous frame was found again"
+    if unobservable:
+        return DEGRADED, f"{unobservable} directions of motion cannot be seen, held at the prediction"
+    if rotation.source == "prediction":
+        return DEGRADED, "the rotation was predicted, not measured"
+    return OK, "{} points, {} lines and {} planes of the previous frame".format(*translation.inliers)
+
+
+def reference_of(map: Map | None, T_world_camera: F64) -> tuple[int, F64]:
+    """The newest living keyframe and the pose relative to it; (-1, T_world_camera) without one."""
+    newest = newest_keyframes(map, 1) if map is not None else np.empty(0, np.int32)
+    if map is None or len(newest) == 0:
+        return -1, T_world_camera
+    return int(newest[0]), invert(map.keyframes.rows("T_world_camera", newest)[0]) @ T_world_camera

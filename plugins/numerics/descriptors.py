@@ -1,0 +1,265 @@
+"""Matching of described points and lines near a predicted place, one to one.
+
+Descriptors are compared only inside a gate (pixels, octave, direction), so that a wrong twin elsewhere in the image cannot be chosen.
+Ties go to the lower row: the result does not depend on anything but the values.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+from trihedron.pipeline.types import F32, F64, I32, U8
+
+U64 = NDArray[np.uint64]
+METRICS = ("hamming", "l2")
+NONE, HAMMING, L2 = 0, 1, 2
+
+
+def match_near(
+    query_px: F32,
+    query_descriptors: U8,
+    query_octaves: U8,
+    train_px: F32,
+    train_descriptors: U8,
+    train_octaves: U8,
+    radius_px: F32,
+    max_octave_step: int,
+    max_distance: int,
+    ratio: float,
+    metric: str = "hamming",
+) -> I32:
+    """For each of n predicted points the row of the m found ones that looks like it, or -1.
+
+    `query_px` (n, 2), `query_descriptors` (n, b), `query_octaves` (n,), `radius_px` (n,); `train_*` likewise with m rows. A candidate lies within the
+    query's radius and `max_octave_step` octaves and is at most `max_distance` away (bits, or Euclidean for `metric` l2). The best must be nearer
+    than `ratio` × the second best of its own octave (1 or more: no such test). A train row goes to its best query. Without descriptors (b == 0 or
+    `max_distance` < 0) the nearest pixel is taken. NaN matches nothing. Raises ValueError for an unknown metric or unequal descriptors."""
+    mode = _mode(query_descriptors, train_descriptors, max_distance, metric)
+    query, train = _words(query_descriptors), _words(train_descriptors)
+    return _match_near(
+        np.ascontiguousarray(query_px, np.float32), query[0], query[1], np.ascontiguousarray(query_octaves, np.uint8),
+        np.ascontiguousarray(train_px, np.float32), train[0], train[1], np.ascontiguousarray(train_octaves, np.uint8),
+        np.ascontiguousarray(radius_px, np.float32), int(max_octave_step), mode, float(max_distance), float(ratio),
+    )  # fmt: skip
+
+
+def match_lines(
+    query_endpoints_px: F32,
+    query_descriptors: U8,
+    train_endpoints_px: F32,
+    train_descriptors: U8,
+    max_angle_deg: float,
+    max_offset_px: float,
+    min_overlap: float,
+    max_distance: int,
+    ratio: float,
+) -> I32:
+    """For each of n predicted image segments the row of the m found ones that is the same edge, or -1.
+
+    End points (n, 2, 2), (m, 2, 2) as (start, end) × (x, y), in either order. A candidate's direction differs by at most `max_angle_deg`, it overlaps
+    the query along its direction by `min_overlap` of the shorter of the two, and is at most `max_offset_px` beside it there; descriptors as in
+    `match_near` (Hamming). The second best for `ratio` is the best one that is not a piece of the same edge as the best. Without descriptors
+    (b == 0 or `max_distance` < 0) offset, angle and overlap decide. Raises ValueError for unequal descriptor lengths."""
+    mode = _mode(query_descriptors, train_descriptors, max_distance, "hamming")
+    return _match_lines(
+        np.ascontiguousarray(query_endpoints_px, np.float32), _words(query_descriptors)[0],
+        np.ascontiguousarray(train_endpoints_px, np.float32), _words(train_descriptors)[0],
+        float(np.sin(np.radians(max_angle_deg))), float(max_offset_px), float(min_overlap), mode, float(max_distance), float(ratio),
+    )  # fmt: skip
+
+
+def _mode(query: U8, train: U8, max_distance: int, metric: str) -> int:
+    if metric not in METRICS:
+        raise ValueError(f"metric: '{metric}' is not one of {', '.join(METRICS)}")
+    if len(query) and len(train) and query.shape[1] != train.shape[1]:
+        raise ValueError(f"descriptors of {query.shape[1]} and {train.shape[1]} bytes cannot be compared")
+    if query.shape[1] == 0 or max_distance < 0:
+        return NONE
+    return HAMMING if metric == "hamming" else L2
+
+
+def _words(descriptors: U8) -> tuple[U64, U8]:
+    """(n, b) bytes as (n, ⌈b/8⌉) words, zero padded, and the contiguous bytes."""
+    rows: Any = np.ascontiguousarray(descriptors, np.uint8)
+    missing = -rows.shape[1] % 8
+    padded = np.pad(rows, ((0, 0), (0, missing))) if missing else rows
+    return padded.view(np.uint64).reshape(len(rows), padded.shape[1] // 8), rows
+
+
+@numba.njit(cache=True, nogil=True)
+def hamming(a: U64, b: U64) -> int:
+    """Number of differing bits of two rows of words."""
+    total = np.uint64(0)
+    for k in range(len(a)):
+        x = a[k] ^ b[k]
+        x = x - ((x >> np.uint64(1)) & np.uint64(0x5555555555555555))
+        x = (x & np.uint64(0x3333333333333333)) + ((x >> np.uint64(2)) & np.uint64(0x3333333333333333))
+        x = (x + (x >> np.uint64(4))) & np.uint64(0x0F0F0F0F0F0F0F0F)
+        total += (x * np.uint64(0x0101010101010101)) >> np.uint64(56)
+    return int(total)
+
+
+@numba.njit(cache=True, nogil=True)
+def _euclidean(a: U8, b: U8) -> float:
+    total = 0
+    for k in range(len(a)):
+        step = int(a[k]) - int(b[k])
+        total += step * step
+    return float(np.sqrt(total))
+
+
+@numba.njit(cache=True, nogil=True)
+def _buckets(px: F32, cell: float, cols: int, rows: int, x0: float, y0: float) -> tuple[I32, I32]:
+    """Counting sort of points into a grid: (cols·rows + 1,) starts and the row numbers in cell order; points with NaN are left out."""
+    start = np.zeros(cols * rows + 1, np.int32)
+    place = np.full(len(px), -1, np.int32)
+    for i in range(len(px)):
+        if np.isfinite(px[i, 0]) and np.isfinite(px[i, 1]):
+            place[i] = min(int((px[i, 1] - y0) / cell), rows - 1) * cols + min(int((px[i, 0] - x0) / cell), cols - 1)
+            start[place[i] + 1] += 1
+    for c in range(cols * rows):
+        start[c + 1] += start[c]
+    fill = start.copy()
+    order = np.empty(start[cols * rows], np.int32)
+    for i in range(len(px)):
+        if place[i] >= 0:
+            order[fill[place[i]]] = i
+            fill[place[i]] += 1
+    return start, order
+
+
+@numba.njit(cache=True, nogil=True)
+def _bounds(px: F32) -> tuple[float, float, float, float]:
+    """Smallest and largest finite x, y; (0, 0, -1, -1) when there is none."""
+    x0, y0, x1, y1 = np.inf, np.inf, -np.inf, -np.inf
+    for i in range(len(px)):
+        x, y = px[i, 0], px[i, 1]
+        if np.isfinite(x) and np.isfinite(y):
+            x0, y0, x1, y1 = min(x0, x), min(y0, y), max(x1, x), max(y1, y)
+    return (x0, y0, x1, y1) if x1 >= x0 else (0.0, 0.0, -1.0, -1.0)
+
+
+@numba.njit(cache=True, nogil=True)
+def _match_near(
+    qpx: F32, qwords: U64, qbytes: U8, qoct: U8, tpx: F32, twords: U64, tbytes: U8, toct: U8,
+    radius: F32, step: int, mode: int, limit: float, ratio: float,
+) -> I32:  # fmt: skip
+    out = np.full(len(qpx), -1, np.int32)
+    x0, y0, x1, y1 = _bounds(tpx)
+    if x1 < x0:
+        return out
+    cell = max(16.0, (x1 - x0) / 256.0, (y1 - y0) / 256.0)  # the grid stays small whatever the coordinates
+    cols, rows = int((x1 - x0) / cell) + 1, int((y1 - y0) / cell) + 1
+    start, order = _buckets(tpx, cell, cols, rows, x0, y0)
+    owner = np.full(len(tpx), -1, np.int32)
+    held = np.full(len(tpx), np.inf)
+    near, apart = np.empty(len(tpx), np.int32), np.empty(len(tpx))
+    for i in range(len(qpx)):
+        x, y, r = qpx[i, 0], qpx[i, 1], radius[i]
+        if not (np.isfinite(x) and np.isfinite(y) and r >= 0.0) or x + r < x0 or x - r > x1 or y + r < y0 or y - r > y1:
+            continue
+        best, j, count = np.inf, -1, 0
+        for row in range(max(int((y - r - y0) / cell), 0), min(int((y + r - y0) / cell), rows - 1) + 1):
+            c0, c1 = max(int((x - r - x0) / cell), 0), min(int((x + r - x0) / cell), cols - 1)
+            for k in range(start[row * cols + c0], start[row * cols + c1 + 1]):
+                t = order[k]
+                apart2 = (tpx[t, 0] - x) ** 2 + (tpx[t, 1] - y) ** 2
+                if apart2 > r * r or abs(np.int64(toct[t]) - np.int64(qoct[i])) > step:
+                    continue
+                if mode == HAMMING:
+                    distance = float(hamming(qwords[i], twords[t]))
+                elif mode == L2:
+                    distance = _euclidean(qbytes[i], tbytes[t])
+                else:
+                    distance = np.sqrt(apart2)
+                near[count], apart[count] = t, distance
+                count += 1
+                if distance < best or (distance == best and t < j):
+                    best, j = distance, t
+        if j < 0 or (mode != NONE and best > limit) or best >= held[j]:
+            continue
+        rival = False
+        for k in range(count):
+            rival |= ratio < 1.0 and near[k] != j and toct[near[k]] == toct[j] and best >= ratio * apart[k]
+        if rival:
+            continue
+        if owner[j] >= 0:
+            out[owner[j]] = -1
+        owner[j], held[j], out[i] = i, best, j
+    return out
+
+
+@numba.njit(cache=True, nogil=True)
+def _directions(segments: F32) -> F64:
+    """(n, 5): middle x, y, direction x, y, length; NaN for a segment without length or with NaN."""
+    out = np.full((len(segments), 5), np.nan)
+    for i in range(len(segments)):
+        dx, dy = segments[i, 1, 0] - segments[i, 0, 0], segments[i, 1, 1] - segments[i, 0, 1]
+        length = np.sqrt(dx * dx + dy * dy)
+        if length > 1e-3:
+            out[i, 0], out[i, 1] = 0.5 * (segments[i, 0, 0] + segments[i, 1, 0]), 0.5 * (segments[i, 0, 1] + segments[i, 1, 1])
+            out[i, 2], out[i, 3], out[i, 4] = dx / length, dy / length, length
+    return out
+
+
+@numba.njit(cache=True, nogil=True)
+def _beside(q: F64, t: F64) -> tuple[float, float]:
+    """Offset (px) beside q in the middle of the overlap, and overlap as a share of the shorter segment (negative: apart)."""
+    mx, my = t[0] - q[0], t[1] - q[1]
+    along, beside = mx * q[2] + my * q[3], my * q[2] - mx * q[3]
+    cosine = q[2] * t[2] + q[3] * t[3]
+    half = 0.5 * t[4] * abs(cosine)
+    low, high = max(along - half, -0.5 * q[4]), min(along + half, 0.5 * q[4])
+    slope = (q[2] * t[3] - q[3] * t[2]) / cosine if abs(cosine) > 1e-6 else 0.0
+    return abs(beside + (0.5 * (low + high) - along) * slope), (high - low) / min(q[4], t[4])
+
+
+@numba.njit(cache=True, nogil=True)
+def _match_lines(
+    query: F32, qwords: U64, train: F32, twords: U64, sine_max: float, offset_px: float, overlap_min: float, mode: int, limit: float, ratio: float
+) -> I32:
+    q, t = _directions(query), _directions(train)
+    out = np.full(len(q), -1, np.int32)
+    owner = np.full(len(t), -1, np.int32)
+    held = np.full(len(t), np.inf)
+    cost = np.full(len(t), np.inf)
+    for i in range(len(q)):
+        best = -1
+        for j in range(len(t)):
+            cost[j] = np.inf
+            sine = abs(q[i, 2] * t[j, 3] - q[i, 3] * t[j, 2])
+            if not sine <= sine_max:  # most pairs end here
+                continue
+            offset, overlap = _beside(q[i], t[j])
+            if not (offset <= offset_px and overlap >= overlap_min):
+                continue
+            if mode == NONE:
+                cost[j] = offset / max(offset_px, 1e-9) + sine / max(sine_max, 1e-9) + 1.0 - overlap
+            else:
+                cost[j] = float(hamming(qwords[i], twords[j]))
+            if best < 0 or cost[j] < cost[best]:
+                best = j
+        if best < 0 or (mode != NONE and cost[best] > limit) or cost[best] >= held[best]:
+            continue
+        if ratio < 1.0 and _ambiguous(t, cost, best, ratio):
+            continue
+        if owner[best] >= 0:
+            out[owner[best]] = -1
+        owner[best], held[best], out[i] = i, cost[best], best
+    return out
+
+
+@numba.njit(cache=True, nogil=True)
+def _ambiguous(t: F64, cost: F64, best: int, ratio: float) -> bool:
+    """Whether another edge (not a collinear piece of the best one) is nearly as similar."""
+    for j in range(len(t)):
+        if j != best and cost[best] >= ratio * cost[j]:
+            sine = abs(t[best, 2] * t[j, 3] - t[best, 3] * t[j, 2])
+            beside = abs((t[j, 1] - t[best, 1]) * t[best, 2] - (t[j, 0] - t[best, 0]) * t[best, 3])
+            if sine > 0.1 or beside > 2.0:
+                return True
+    return False

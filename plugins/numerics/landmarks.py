@@ -1,0 +1,91 @@
+"""Columns of the map's tables."""
+
+from __future__ import annotations
+
+from trihedron.pipeline.types import Column, Map, Table
+
+OBSERVERS = 16  # most recent keyframes remembered by a landmark, enough for co-visibility; -1 = empty
+
+KEYFRAMES = {
+    "index": Column("i4"),  # frame number
+    "stamp_ns": Column("i8"),
+    "T_world_camera": Column("f8", (4, 4)),
+    "covariance": Column("f8", (6, 6)),  # of its pose, see types
+    "points": Column("i4", (2,)),  # its rows of the observation tables, half open
+    "lines": Column("i4", (2,)),
+    "planes": Column("i4", (2,)),
+    "alive": Column("?"),
+}
+
+
+def point_columns(descriptor_bytes: int) -> dict[str, Column]:
+    """`information` is the inverse covariance of the position (world, 1/m²); `distance_m` and `octave` say at which range and scale it was seen."""
+    return {
+        "position_m": Column("f8", (3,)),
+        "information": Column("f8", (3, 3)),
+        "descriptor": Column("u1", (descriptor_bytes,)),
+        "direction": Column("f4", (3,)),  # unit, from the point to the camera that saw it last
+        "distance_m": Column("f4"),
+        "octave": Column("u1"),
+        **_life(),
+    }
+
+
+def line_columns(descriptor_bytes: int) -> dict[str, Column]:
+    """End points in the world with the inverse covariance of each."""
+    return {
+        "endpoints_m": Column("f8", (2, 3)),
+        "information": Column("f8", (2, 3, 3)),
+        "descriptor": Column("u1", (descriptor_bytes,)),
+        **_life(),
+    }
+
+
+def plane_columns(samples: int) -> dict[str, Column]:
+    """World planes, re-estimated from `moments`, the sum of what each observation is equivalent to (`plane_fusion.equivalent_moments`); n points to
+    the side the plane was seen from, d has any sign."""
+    return {
+        "coefficients": Column("f8", (4,)),
+        "covariance": Column("f8", (3, 3)),  # of (a, b, d), see types.Planes
+        "moments": Column("f8", (4, 4)),
+        "samples_m": Column("f4", (samples, 3)),
+        **_life(),
+    }
+
+
+def _life() -> dict[str, Column]:
+    return {
+        "first": Column("i4"),  # keyframe that created it
+        "observers": Column("i4", (OBSERVERS,)),
+        "found": Column("i4"),  # keyframes in which it was matched
+        "visible": Column("i4"),  # keyframes in which it should have been
+        "alive": Column("?"),
+    }
+
+
+POINT_OBSERVATIONS = {
+    "keyframe": Column("i4"),
+    "point": Column("i4"),
+    "pixel": Column("f4", (2,)),
+    "depth_m": Column("f4"),  # NaN = none
+    "sigma_px": Column("f4"),
+    "sigma_m": Column("f4"),
+}
+LINE_OBSERVATIONS = {"keyframe": Column("i4"), "line": Column("i4"), "endpoints_px": Column("f4", (2, 2))}
+PLANE_OBSERVATIONS = {"keyframe": Column("i4"), "plane": Column("i4"), "moments": Column("f8", (4, 4)), "covariance": Column("f8", (3, 3))}
+
+
+def empty_map(index: int, stamp_ns: int, point_bytes: int, line_bytes: int, plane_samples: int) -> Map:
+    """A map without keyframes, for descriptors of the given lengths."""
+    return Map(
+        index=index,
+        stamp_ns=stamp_ns,
+        revision=0,
+        keyframes=Table.empty(KEYFRAMES),
+        points=Table.empty(point_columns(point_bytes)),
+        lines=Table.empty(line_columns(line_bytes)),
+        planes=Table.empty(plane_columns(plane_samples)),
+        point_observations=Table.empty(POINT_OBSERVATIONS),
+        line_observations=Table.empty(LINE_OBSERVATIONS),
+        plane_observations=Table.empty(PLANE_OBSERVATIONS),
+    )

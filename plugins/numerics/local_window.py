@@ -1,0 +1,73 @@
+"""The part of the map near the camera: a bounded number of keyframes, whatever the size of the map, and the landmarks they see."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from trihedron.pipeline.types import F64, I32, Bool, Map, Table
+
+PLANE_VOTES = 20  # a shared plane ties two keyframes like this many points: a bare room has few landmarks, and all of them large
+LINE_VOTES = 5
+
+
+@dataclass(frozen=True)
+class LocalWindow:
+    """Rows of keyframes and ids of the living landmarks they see, each sorted."""
+
+    keyframes: I32
+    points: I32
+    lines: I32
+    planes: I32
+
+
+def newest_keyframes(map: Map, count: int) -> I32:
+    """The last `count` living keyframes, oldest first."""
+    start = max(len(map.keyframes) - 4 * count, 0)
+    rows = np.arange(start, len(map.keyframes), dtype=np.int32)
+    return rows[map.keyframes.rows("alive", rows)][-count:]
+
+
+def observed_by(map: Map, keyframes: I32, kind: str) -> I32:
+    """Ids of the living `kind` landmarks ('point', 'line', 'plane') that the keyframes saw, sorted."""
+    table: Table = getattr(map, f"{kind}_observations")
+    ranges = map.keyframes.rows(f"{kind}s", keyframes)
+    rows = np.concatenate([np.arange(a, b, dtype=np.int32) for a, b in ranges]) if len(ranges) else np.empty(0, np.int32)
+    ids = np.unique(table.rows(kind, rows)).astype(np.int32)
+    alive: Bool = getattr(map, f"{kind}s").rows("alive", ids)
+    return ids[alive]
+
+
+def _votes(map: Map, keyframes: I32) -> I32:
+    """How strongly each keyframe of the map shares landmarks of any kind with the given ones, (keyframes of the map,)."""
+    votes = np.zeros(len(map.keyframes), np.int64)
+    for kind, weight in (("point", 1), ("line", LINE_VOTES), ("plane", PLANE_VOTES)):
+        observers = getattr(map, f"{kind}s").rows("observers", observed_by(map, keyframes, kind))
+        votes += weight * np.bincount(observers[observers >= 0], minlength=len(votes))
+    return votes.astype(np.int32)
+
+
+def _near(map: Map, T_world_camera: F64, near_m: float, near_deg: float) -> I32:
+    """Living keyframes taken from about here in about this direction, nearest first."""
+    poses = map.keyframes.column("T_world_camera")
+    distance = np.linalg.norm(poses[:, :3, 3] - T_world_camera[:3, 3], axis=1)
+    cosine = poses[:, :3, 2] @ T_world_camera[:3, 2]
+    good = map.keyframes.column("alive") & (distance < near_m) & (cosine > np.cos(np.radians(near_deg)))
+    rows = np.flatnonzero(good)
+    return rows[np.argsort(distance[rows] / near_m + (1.0 - cosine[rows]), kind="stable")].astype(np.int32)
+
+
+def local_window(map: Map, T_world_camera: F64, newest: int, covisible: int, near: int, near_m: float = 1.0, near_deg: float = 30.0) -> LocalWindow:
+    """The `newest` keyframes, the `covisible` ones that share most landmarks with them, and up to `near` further ones taken from about
+    `T_world_camera` (within `near_m` and `near_deg`): a place seen again after its landmarks' last observers were forgotten."""
+    chosen = newest_keyframes(map, newest)
+    votes = _votes(map, chosen)
+    votes[chosen] = 0
+    votes[~map.keyframes.column("alive")] = 0
+    order = np.argsort(-votes, kind="stable")[:covisible]
+    chosen = np.concatenate([chosen, order[votes[order] > 0].astype(np.int32)])
+    beside = _near(map, T_world_camera, near_m, near_deg)
+    beside = beside[~np.isin(beside, chosen)][:near]
+    chosen = np.sort(np.concatenate([chosen, beside])).astype(np.int32)
+    return LocalWindow(chosen, observed_by(map, chosen, "point"), observed_by(map, chosen, "line"), observed_by(map, chosen, "plane"))

@@ -1,0 +1,115 @@
+"""Which observed plane region belongs to which known plane (section III-A, with the mean distance instead of the minimum)."""
+
+from __future__ import annotations
+
+import numba
+import numpy as np
+
+from trihedron.pipeline.types import F32, F64, I32
+
+
+def associate_planes(
+    coefficients_a: F64,
+    samples_a: F32,
+    coefficients_b: F64,
+    samples_b: F32,
+    max_angle_deg: float,
+    max_distance_m: float,
+    many_to_one: bool = False,
+) -> I32:
+    """Pairs (row of a, row of b), (p, 2) sorted by a, that are the same plane seen from the same side.
+
+    `coefficients_*` (n, 4), (m, 4) and `samples_*` (n, s, 3), (m, r, 3; NaN padded) are all in one frame, metres. A pair passes when its normals
+    differ by at most `max_angle_deg` (opposite normals are the two faces of a thin wall: no pair) and the *mean* distance of the samples of one
+    region to the other plane, the better-conditioned way round, is at most `max_distance_m`; the minimum over points would merge parallel
+    planes that touch anywhere. Among those the one with the smallest `distance / max_distance_m + 1 - overlap` wins, overlap being the share of
+    a's samples near samples of b. A row of a appears once; a row of b too, unless `many_to_one` (a wall seen in two pieces)."""
+    return _associate(
+        np.ascontiguousarray(coefficients_a, np.float64), np.ascontiguousarray(samples_a, np.float32),
+        np.ascontiguousarray(coefficients_b, np.float64), np.ascontiguousarray(samples_b, np.float32),
+        float(np.cos(np.radians(max_angle_deg))), float(max_distance_m), many_to_one,
+    )  # fmt: skip
+
+
+@numba.njit(cache=True, nogil=True)
+def mean_distance(plane: F64, samples: F32) -> float:
+    """Mean |n·x + d| over the finite rows of (s, 3) samples; inf without any."""
+    total, count = 0.0, 0
+    for k in range(len(samples)):
+        x = plane[0] * samples[k, 0] + plane[1] * samples[k, 1] + plane[2] * samples[k, 2] + plane[3]
+        if np.isfinite(x):
+            total += abs(x)
+            count += 1
+    return total / count if count else np.inf
+
+
+@numba.njit(cache=True, nogil=True)
+def _spacing(samples: F32) -> float:
+    """Mean distance from a sample to its nearest neighbour, metres; 0 with fewer than two."""
+    total, count = 0.0, 0
+    for i in range(len(samples)):
+        nearest = np.inf
+        for j in range(len(samples)):
+            if j != i:
+                nearest = min(nearest, _apart2(samples[i], samples[j]))
+        if nearest < np.inf:
+            total += np.sqrt(nearest)
+            count += 1
+    return total / count if count else 0.0
+
+
+@numba.njit(cache=True, nogil=True)
+def _apart2(a: F32, b: F32) -> float:
+    """Squared distance of two points; inf with NaN."""
+    squared = (a[0] - b[0]) ** 2 + (a[1] - b[1]) ** 2 + (a[2] - b[2]) ** 2
+    return squared if squared >= 0.0 else np.inf
+
+
+@numba.njit(cache=True, nogil=True)
+def overlap(samples_a: F32, samples_b: F32, reach_m: float) -> float:
+    """Share of the finite samples of a that have a sample of b within `reach_m`."""
+    near, count = 0, 0
+    for i in range(len(samples_a)):
+        if not np.isfinite(samples_a[i, 0]):
+            continue
+        count += 1
+        for j in range(len(samples_b)):
+            if _apart2(samples_a[i], samples_b[j]) <= reach_m * reach_m:
+                near += 1
+                break
+    return near / count if count else 0.0
+
+
+@numba.njit(cache=True, nogil=True)
+def _associate(a: F64, samples_a: F32, b: F64, samples_b: F32, cosine: float, limit: float, many_to_one: bool) -> I32:
+    n, m = len(a), len(b)
+    cost = np.full((n, m), np.inf)
+    reach = np.full(m, -1.0)
+    for i in range(n):
+        for j in range(m):
+            if not a[i, 0] * b[j, 0] + a[i, 1] * b[j, 1] + a[i, 2] * b[j, 2] >= cosine:
+                continue
+            distance = min(mean_distance(b[j], samples_a[i]), mean_distance(a[i], samples_b[j]))
+            if distance > limit:
+                continue
+            if reach[j] < 0.0:
+                reach[j] = max(1.5 * _spacing(samples_b[j]), limit)
+            cost[i, j] = distance / max(limit, 1e-9) + 1.0 - overlap(samples_a[i], samples_b[j], reach[j])
+    pairs = np.full(n, -1, np.int32)
+    while True:
+        best, row, column = np.inf, -1, -1
+        for i in range(n):
+            for j in range(m):
+                if cost[i, j] < best:
+                    best, row, column = cost[i, j], i, j
+        if row < 0:
+            break
+        pairs[row] = column
+        cost[row, :] = np.inf
+        if not many_to_one:
+            cost[:, column] = np.inf
+    rows = np.flatnonzero(pairs >= 0)
+    out = np.empty((len(rows), 2), np.int32)
+    for k in range(len(rows)):
+        out[k, 0], out[k, 1] = rows[k], pairs[rows[k]]
+    return out

@@ -1,0 +1,65 @@
+"""Covariances of what an RGB-D camera measures, and how they move between frames."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from trihedron.pipeline.geometry import tangent_basis
+from trihedron.pipeline.types import F64, Camera
+
+
+def point_covariance(points_m: F64, sigma_px: F64, sigma_m: F64, camera: Camera) -> F64:
+    """(..., 3, 3) covariance (camera frame) of back-projected points (..., 3): `sigma_px` across the ray, `sigma_m` of the depth, both (...)."""
+    z = points_m[..., 2]
+    ray = points_m / z[..., None]
+    covariance = (sigma_m**2)[..., None, None] * ray[..., :, None] * ray[..., None, :]
+    covariance[..., 0, 0] += (z * sigma_px / camera.fx) ** 2
+    covariance[..., 1, 1] += (z * sigma_px / camera.fy) ** 2
+    return covariance
+
+
+def inverse(matrices: F64) -> F64:
+    """(..., k, k) inverses: covariances of information matrices and the other way round. Raises LinAlgError for a singular one."""
+    return np.asarray(np.linalg.inv(matrices), np.float64)
+
+
+def rotate_covariance(R_a_b: F64, covariance_b: F64) -> F64:
+    """(..., 3, 3) covariance of frame b in frame a."""
+    return R_a_b @ covariance_b @ R_a_b.T
+
+
+def cross_matrices(points: F64) -> F64:
+    """(..., 3) -> (..., 3, 3) with `cross_matrices(p) @ x = p × x`."""
+    x, y, z = points[..., 0], points[..., 1], points[..., 2]
+    o = np.zeros_like(x)
+    return np.stack([np.stack([o, -z, y], -1), np.stack([z, o, -x], -1), np.stack([-y, x, o], -1)], -2)
+
+
+def turned_covariance(points: F64, rotation_covariance: F64) -> F64:
+    """(..., 3, 3): what a small rotation of the camera with the given covariance (3, 3) does to camera-frame points or normals (..., 3)."""
+    P = cross_matrices(points)
+    return P @ rotation_covariance @ np.swapaxes(P, -1, -2)
+
+
+def moved_covariance(points: F64, pose_covariance: F64) -> F64:
+    """(..., 3, 3): what an uncertain pose, (6, 6) of xi = (rho, phi), does to camera-frame points (..., 3)."""
+    J = np.concatenate([np.broadcast_to(np.eye(3), (*points.shape[:-1], 3, 3)), -cross_matrices(points)], axis=-1)
+    return J @ pose_covariance @ np.swapaxes(J, -1, -2)
+
+
+def transform_plane_covariance(T_a_b: F64, planes_b: F64, planes_a: F64, covariance_b: F64) -> F64:
+    """(n, 3, 3) covariance of (a, b, d) in frame a, for planes (n, 4) of frame b and the same ones in frame a (`geometry.transform_planes`)."""
+    turned = T_a_b[:3, :3] @ tangent_basis(planes_b[:, :3])  # (n, 3, 2): how the normal of frame a moves
+    F = np.zeros((len(planes_b), 3, 3))
+    F[:, :2, :2] = np.swapaxes(tangent_basis(planes_a[:, :3]), -1, -2) @ turned
+    F[:, 2, :2] = -T_a_b[:3, 3] @ turned
+    F[:, 2, 2] = 1.0
+    return F @ covariance_b @ np.swapaxes(F, -1, -2)
+
+
+def turned_plane_covariance(planes: F64, rotation_covariance: F64) -> F64:
+    """(n, 3, 3) covariance of (a, b, d) that a small rotation of the camera adds to observed planes (n, 4): to the normal only."""
+    B = tangent_basis(planes[:, :3])
+    added = np.zeros((len(planes), 3, 3))
+    added[:, :2, :2] = np.swapaxes(B, -1, -2) @ turned_covariance(planes[:, :3], rotation_covariance) @ B
+    return added

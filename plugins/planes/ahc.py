@@ -1,0 +1,47 @@
+"""Planes by agglomerative hierarchical clustering."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from trihedron.pipeline.registry import register
+from trihedron.pipeline.types import Frame, Normals, Planes
+from trihedron.plugins.numerics.block_clustering import cluster_blocks
+from trihedron.plugins.numerics.planar_regions import PlanarRegions
+from trihedron.plugins.numerics.plane_blocks import block_sums, blocks_to_cells
+from trihedron.plugins.numerics.plane_fitting import fit_labelled
+
+
+@register("planes", "ahc")
+@dataclass(frozen=True)
+class Ahc(PlanarRegions):
+    """Agglomerative hierarchical clustering (Feng, Taguchi & Kamat, ICRA 2014) of small blocks by the mean squared error (mse) of their common plane.
+
+    The paper's thresholds (mm², mm) are a noise model of one sensor; here errors are in σ of the frame's own. Its refinement (erode the blocks at the
+    border, grow by pixels, cluster once more) is the trimmed fit, growth and merging that all detectors share."""
+
+    block_px: int = 10  # side of a node, Feng et al.
+    share: float = 0.75  # of a node's cells that must have depth; all of them in the paper, where sensors leave no speckles
+    block_sigma: float = 2.0  # rms distance, in σ_z, of a node's depths from its plane
+    sigma: float = 1.5  # the same, of a cluster
+    shift_sigma: float = 0.8  # rms, in σ_z, by which joining two clusters may move the plane away from the depths of either
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if not 4 <= self.block_px <= 100 or not 0.0 < self.share <= 1.0:
+            raise ValueError("block_px, share: must be 4 to 100 px and above 0, at most 1")
+        if self.block_sigma <= 0.0 or self.sigma <= 0.0 or self.shift_sigma <= 0.0:
+            raise ValueError("block_sigma, sigma, shift_sigma: must be positive")
+
+    def __call__(self, frame: Frame, normals: Normals) -> Planes:
+        """Planes, largest first; `labels` on the grid of the normals, which only help to refine and to tell curved surfaces."""
+        grid, stride = self._grid(frame, normals), normals.stride
+        side = max(round(self.block_px / stride), 2)
+        sums = block_sums(grid, side, self.share)
+        blocks, q = cluster_blocks(sums, self.block_sigma**2, self.sigma**2, self.shift_sigma**2, 0.5 * self.min_pixels)
+        labels = blocks_to_cells(blocks, side, grid.rho)
+        cone = float(np.radians(self.cone_deg))
+        core, q = fit_labelled(grid, labels, q, cone, self.gate, self._least(stride))
+        return self._complete(core, q, grid, frame, stride, flat=False)

@@ -1,0 +1,52 @@
+"""Planes grown over coarse cells."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from trihedron.pipeline.registry import register
+from trihedron.pipeline.types import Frame, Normals, Planes
+from trihedron.plugins.numerics.block_growing import grow_blocks
+from trihedron.plugins.numerics.planar_regions import PlanarRegions
+from trihedron.plugins.numerics.plane_blocks import block_planes, block_sums, blocks_to_cells
+from trihedron.plugins.numerics.plane_fitting import fit_labelled
+
+
+@register("planes", "cape")
+@dataclass(frozen=True)
+class Cape(PlanarRegions):
+    """Cell-wise plane extraction (Proença & Gao, IROS 2018): the fastest, and blind to planes narrower than two cells.
+
+    Planarity is the mean squared error of a cell's least-squares plane in σ of the frame's noise model; the paper takes the least eigenvalue of its
+    points' covariance, and a constant. Its refinement by pixels is the trimmed fit and growth that all detectors share; no cylinders."""
+
+    block_px: int = 20  # side of a cell, Proença & Gao
+    share: float = 0.5  # of its pixels that must have depth, Proença & Gao
+    sigma: float = 1.5  # rms distance, in σ_z, of a planar cell's depths from its plane, and from its region's
+    step_sigma: float = 4.0  # the same, from the plane of the neighbour it is reached from
+    angle_deg: float = 15.0  # between the normals of neighbours in a region, Proença & Gao
+    least: int = 3  # cells of a region; 5 in the paper, which wants no small planes
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if not 4 <= self.block_px <= 100 or not 0.0 < self.share <= 1.0:
+            raise ValueError("block_px, share: must be 4 to 100 px and above 0, at most 1")
+        if self.sigma <= 0.0 or self.step_sigma <= 0.0:
+            raise ValueError("sigma, step_sigma: must be positive")
+        if not 0.0 < self.angle_deg < 90.0 or self.least < 1:
+            raise ValueError("angle_deg, least: must be above 0 and below 90, and at least 1")
+
+    def __call__(self, frame: Frame, normals: Normals) -> Planes:
+        """Planes, largest first; `labels` on the grid of the normals, which only help to refine and to tell curved surfaces."""
+        grid, stride = self._grid(frame, normals), normals.stride
+        side = max(round(self.block_px / stride), 2)
+        sums = block_sums(grid, side, self.share)
+        flat = block_planes(sums)
+        cos_angle = float(np.cos(np.radians(self.angle_deg)))
+        blocks, q = grow_blocks(sums, *flat, self.sigma**2, cos_angle, self.step_sigma**2, self.least)
+        labels = blocks_to_cells(blocks, side, grid.rho)
+        cone = float(np.radians(self.cone_deg))
+        core, q = fit_labelled(grid, labels, q, cone, self.gate, self._least(stride))
+        return self._complete(core, q, grid, frame, stride, flat=False)

@@ -1,0 +1,44 @@
+"""Planes by sequential RANSAC."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from trihedron.pipeline.registry import register
+from trihedron.pipeline.types import Frame, Normals, Planes
+from trihedron.plugins.numerics.organised_grid import coarser
+from trihedron.plugins.numerics.planar_regions import EDGE, EDGE_M, MOST, PlanarRegions
+from trihedron.plugins.numerics.plane_consensus import consensus_planes
+from trihedron.plugins.numerics.plane_fitting import fit_labelled
+
+
+@register("planes", "ransac")
+@dataclass(frozen=True)
+class Ransac(PlanarRegions):
+    """Sequential RANSAC (Fischler & Bolles 1981, scored as MSAC, Torr & Zisserman 2000): the plane with the best consensus, its largest connected
+    region, then the next among what is left; on cells of twice the size. It needs no smooth neighbourhoods, and its random numbers are `rng`'s."""
+
+    hypotheses: int = 120  # planes drawn for each one found
+    rounds: int = 40  # at most
+    misses: int = 5  # rounds in a row without a region, before the search ends
+    sigma: float = 2.0  # σ_z of an inlier's depth
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if not 1 <= self.hypotheses <= 10000 or not 1 <= self.rounds <= MOST or self.misses < 1:
+            raise ValueError(f"hypotheses, rounds, misses: must be 1 to 10000, 1 to {MOST}, and at least 1")
+        if self.sigma <= 0.0:
+            raise ValueError("sigma: must be positive")
+
+    def __call__(self, frame: Frame, normals: Normals, rng: np.random.Generator) -> Planes:
+        """Planes, largest first; `labels` on the grid of the normals, which are asked where there are any."""
+        grid, stride = self._grid(frame, normals), normals.stride
+        cone = float(np.radians(self.cone_deg))
+        draws = rng.random((self.rounds, self.hypotheses, 7))
+        coarse = coarser(grid, EDGE, EDGE_M)
+        found, q = consensus_planes(coarse, draws, self.sigma, float(np.cos(cone)), self._least(2 * stride), self.misses)
+        labels = np.repeat(np.repeat(found, 2, axis=0), 2, axis=1)[: grid.rho.shape[0], : grid.rho.shape[1]] * (grid.rho > 0.0)
+        core, q = fit_labelled(grid, labels, q, cone, self.gate, self._least(stride))
+        return self._complete(core, q, grid, frame, stride, flat=False)

@@ -1,0 +1,21 @@
+"""No refinement: the paper's "-wo"."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from trihedron.pipeline.registry import register
+from trihedron.pipeline.types import Frame, Map, Pose, Rotation, Translation
+from trihedron.plugins.numerics.decoupled import decoupled_pose
+
+
+@register("pose", "none")
+@dataclass(frozen=True)
+class NoRefinement:
+    """The decoupled pose as it is (Table I, "Ours/-wo")."""
+
+    def __call__(
+        self, frame: Frame, rotation: Rotation, translation: Translation, previous: Pose | None, map: Map | None, relocalise: Pose | None
+    ) -> Pose:
+        """The decoupled pose; status from whether this frame's features determined it."""
+        return decoupled_pose(rotation, translation, previous, relocalise).said(frame, map)

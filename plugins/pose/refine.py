@@ -1,0 +1,114 @@
+"""All six degrees of freedom against the local map."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from trihedron.pipeline.registry import register
+from trihedron.pipeline.types import (
+    DEGRADED,
+    F64,
+    I32,
+    OK,
+    Frame,
+    Keypoints,
+    Map,
+    Matches,
+    Planes,
+    Pose,
+    Rotation,
+    Segments,
+    Tracks,
+    Translation,
+)
+from trihedron.plugins.numerics.decoupled import decoupled_pose, reference_of
+from trihedron.plugins.numerics.map_terms import line_terms, plane_terms, point_terms
+from trihedron.plugins.numerics.pose_solver import PoseSolution, solve_pose
+
+
+@register("pose", "refine")
+@dataclass(frozen=True)
+class Refine:
+    """Map-to-frame refinement with parallel and perpendicular planes (section IV-C, eq. 8), from the decoupled pose.
+
+    The decoupled rotation is a prior with its own covariance; the decoupled position only says where to start (`position_sigma_m`), since the same
+    features made it. Without a map the decoupled pose stands."""
+
+    position_sigma_m: float = 0.05  # of the decoupled position, a weak prior
+    rotation_sigma_deg: float = 0.2  # added to the rotation's own: no scene is exactly Manhattan
+    line_sigma_px: float = 1.0  # of a segment's end point across it
+    relation_sigma_deg: float = 0.5  # walls are parallel or perpendicular to within this
+    min_inliers: int = 10  # points + 2 lines + 5 planes below which the pose is called degraded
+    min_share: float = 0.25  # of the matches that must agree, else it is called degraded
+
+    def __post_init__(self) -> None:
+        for name in ("position_sigma_m", "rotation_sigma_deg", "line_sigma_px", "relation_sigma_deg"):
+            if getattr(self, name) <= 0.0:
+                raise ValueError(f"{name}: must be positive")
+        if self.min_inliers < 0 or not 0.0 <= self.min_share <= 1.0:
+            raise ValueError("min_inliers, min_share: must not be negative, min_share at most 1")
+
+    def __call__(
+        self,
+        frame: Frame,
+        rotation: Rotation,
+        translation: Translation,
+        tracks: Tracks | None,
+        matches: Matches | None,
+        keypoints: Keypoints,
+        segments: Segments,
+        planes: Planes,
+        previous: Pose | None,
+        map: Map | None,
+        relocalise: Pose | None,
+    ) -> Pose:
+        """The pose with status and reason; the identity for the first frame."""
+        start = decoupled_pose(rotation, translation, previous, relocalise)
+        if map is None or matches is None or previous is None:
+            return start.said(frame, map)
+        found = self._solve(start.T_world_camera, frame, rotation, matches, keypoints, segments, planes, map)
+        inliers = _inliers(found, len(matches.planes))
+        if not inliers.any():
+            return start.said(frame, map, "nothing of the map was found, pose from the previous frame")
+        sought = len(matches.keypoints) + len(matches.segments) + len(matches.planes)
+        status, reason = self._judge(found, inliers, sought, rotation)
+        reference, T_reference_camera = reference_of(map, found.T_world_camera)
+        held = found.unobservable.shape[1]
+        return Pose(
+            frame.index, frame.stamp_ns, found.T_world_camera, found.covariance, T_reference_camera, reference, inliers, held, status, reason
+        )
+
+    def _solve(
+        self, T: F64, frame: Frame, rotation: Rotation, matches: Matches, keypoints: Keypoints, segments: Segments, planes: Planes, map: Map
+    ) -> PoseSolution:
+        prior = np.zeros((6, 6))
+        prior[:3, :3] = np.eye(3) / self.position_sigma_m**2
+        prior[3:, 3:] = np.linalg.inv(rotation.covariance + np.radians(self.rotation_sigma_deg) ** 2 * np.eye(3))
+        return solve_pose(
+            T,
+            frame.camera,
+            T,
+            prior,
+            point_terms(map, keypoints, matches.keypoints),
+            line_terms(map, segments, matches.segments, T, frame.camera, self.line_sigma_px),
+            plane_terms(map, planes, matches.planes, matches.parallel, matches.perpendicular, self.relation_sigma_deg),
+        )
+
+    def _judge(self, found: PoseSolution, inliers: I32, sought: int, rotation: Rotation) -> tuple[str, str]:
+        """Status and reason of a refined pose."""
+        if found.unobservable.shape[1]:
+            return DEGRADED, f"{found.unobservable.shape[1]} directions of motion cannot be seen, held at the prediction"
+        if inliers @ np.array([1, 2, 5]) < self.min_inliers:
+            return DEGRADED, f"only {inliers[0]} points, {inliers[1]} lines and {inliers[2]} planes of the map were found"
+        if inliers.sum() < self.min_share * sought:
+            return DEGRADED, f"only {inliers.sum()} of {sought} matches with the map agree"
+        if rotation.source == "prediction":
+            return DEGRADED, "the rotation was predicted, not measured, before refinement"
+        return OK, f"{inliers[0]} points, {inliers[1]} lines and {inliers[2]} planes of the map"
+
+
+def _inliers(found: PoseSolution, same: int) -> I32:
+    """Points, lines and planes (relations not counted) that agree with the pose."""
+    return np.array([np.count_nonzero(found.points), np.count_nonzero(found.lines), np.count_nonzero(found.planes[:same])], np.int32)

@@ -1,0 +1,36 @@
+"""The camera's rotation by keeping on turning."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from trihedron.pipeline.registry import register
+from trihedron.pipeline.types import Keypoints, Pose, Rotation, Tracks
+from trihedron.plugins.numerics.chained_rotation import Estimate, rotation_before, rotation_value
+from trihedron.plugins.numerics.manhattan_frames import KnownFrames
+
+
+@register("rotation", "constant_velocity")
+@dataclass(frozen=True)
+class ConstantVelocity:
+    """The previous rotation turned on by the tracks' `R_current_previous` as it stands: where nothing was tracked, that is the last turn once more.
+    A baseline, and what a lost camera has left; it is never more than a prediction."""
+
+    pose_floor_deg: float = 0.1  # least error of the previous pose
+    prior_deg: float = 2.0  # of the predicted rotation, per frame
+
+    def __post_init__(self) -> None:
+        if min(self.pose_floor_deg, self.prior_deg) <= 0.0:
+            raise ValueError("pose_floor_deg, prior_deg: must be positive")
+
+    def __call__(self, tracks: Tracks | None, keypoints: Keypoints, previous: Rotation | None, previous_pose: Pose | None) -> Rotation:
+        """The rotation of this frame; the identity for the first."""
+        estimate = Estimate(np.eye(3), np.zeros((3, 3)), "prediction")
+        if previous is not None:
+            before, _ = rotation_before(previous, previous_pose, self.pose_floor_deg)
+            turn = tracks.R_current_previous if tracks is not None and tracks.previous_index == previous.index else np.eye(3)
+            grown = np.eye(3) * np.radians(self.prior_deg * max(keypoints.index - previous.index, 1)) ** 2
+            estimate = Estimate(before.R @ turn.T, turn @ before.covariance @ turn.T + grown, "prediction")
+        return rotation_value(keypoints.index, keypoints.stamp_ns, estimate, KnownFrames.none(), np.zeros((0, 3, 3)))

@@ -1,0 +1,114 @@
+"""The camera's rotation tied to the scene's Manhattan frames."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from trihedron.pipeline.geometry import exp_so3, log_so3
+from trihedron.pipeline.registry import register
+from trihedron.pipeline.types import F64, Keypoints, ManhattanFrame, Planes, Pose, Rotation, Segments, Tracks
+from trihedron.plugins.numerics.chained_rotation import Estimate, TrackedRotation, rotation_before, rotation_value
+from trihedron.plugins.numerics.manhattan_frames import KnownFrames, Sighting
+
+
+@register("rotation", "drift_free")
+@dataclass(frozen=True)
+class DriftFree:
+    """`R_world_camera = R_world_manhattan · R_camera_manhattanᵀ` (eq. 1), combined by covariance with the rotation that the tracks put on top of the
+    previous pose.
+
+    The tracks are exact from frame to frame and drift; the Manhattan frame does not drift and is coarser. Where no Manhattan frame is supported, or
+    the one seen disagrees with the tracks, the tracks go on alone and their covariance grows, so that a Manhattan frame that comes back takes over
+    by degrees. One that disagrees is remembered under a number of its own. The world–Manhattan rotations are re-estimated from refined poses."""
+
+    unit_deg: float = 0.3  # an observation of R_world_manhattan with this standard deviation counts as one
+    max_weight: float = 300.0  # observations; more do not make it stiffer
+    correlation: float = 10.0  # successive frames err alike: so many observations count as one in its covariance
+    axis_floor_deg: float = 0.1  # least error of R_world_manhattan
+    pose_floor_deg: float = 0.1  # least error of the previous pose: the map drifts, which its covariance does not know
+    gate: float = 4.0  # standard deviations between tracks and Manhattan frame
+    gate_floor_deg: float = 0.7  # least standard deviation of that difference
+    step_deg: float = 0.5  # most that a Manhattan frame corrects rotations from tracks in one frame: no jump
+    min_observations: float = 3.0  # frames seen less often are forgotten when out of sight
+    max_frames: int = 6  # Manhattan frames remembered
+    prior_deg: float = 2.0  # of the predicted rotation, per frame
+    prior_m: float = 0.1  # of the motion, per frame
+    measured_deg: float = 1.0  # tracks that leave the rotation less certain than this have not measured it
+    angle_px: float = 0.002  # rad, of a pixel
+    plane_floor_deg: float = 0.3  # error of a tracked plane's normal
+
+    def __post_init__(self) -> None:
+        if min(self.unit_deg, self.axis_floor_deg, self.pose_floor_deg, self.gate, self.gate_floor_deg, self.prior_deg, self.prior_m) <= 0.0:
+            raise ValueError("unit_deg, axis_floor_deg, pose_floor_deg, gate, gate_floor_deg, prior_deg, prior_m: must be positive")
+        if self.max_weight < 1.0 or self.correlation < 1.0 or self.max_frames < 1:
+            raise ValueError("max_weight, correlation, max_frames: must be at least 1")
+        if min(self.measured_deg, self.angle_px, self.plane_floor_deg, self.step_deg) <= 0.0:
+            raise ValueError("step_deg, measured_deg, angle_px, plane_floor_deg: must be positive")
+
+    def __call__(
+        self,
+        manhattan: ManhattanFrame | None,
+        tracks: Tracks | None,
+        keypoints: Keypoints,
+        segments: Segments,
+        planes: Planes,
+        previous: Rotation | None,
+        previous_pose: Pose | None,
+    ) -> Rotation:
+        """The rotation of this frame; the identity for the first."""
+        known, predicted = KnownFrames.none(), Estimate(np.eye(3), np.zeros((3, 3)), "prediction")
+        if previous is not None:
+            before, refined = rotation_before(previous, previous_pose, self.pose_floor_deg)
+            known = KnownFrames(previous.R_world_manhattan, previous.ids, previous.weights)
+            if refined:
+                known = known.seen_from(previous, before.R, self.max_weight, self.gate * np.radians(self.gate_floor_deg))
+            tracked = TrackedRotation(self.prior_deg, self.prior_m, self.measured_deg, self.angle_px, self.plane_floor_deg)
+            predicted = tracked(before, previous.index, tracks, keypoints, segments, planes)
+        known, estimate, seen = self._tied(known, predicted, manhattan)
+        return rotation_value(keypoints.index, keypoints.stamp_ns, estimate, known, seen)
+
+    def _tied(self, known: KnownFrames, predicted: Estimate, manhattan: ManhattanFrame | None) -> tuple[KnownFrames, Estimate, F64]:
+        """The prediction tied to the Manhattan frames seen, the known ones with those met for the first time, and R_camera_manhattan of each."""
+        estimate = predicted
+        sightings: dict[int, F64] = {}
+        for k, row in enumerate(known.sightings(manhattan, predicted.R)):
+            distances = [self._distance(s, known, predicted) for s in row]
+            best = int(np.argmin(distances)) if row else -1
+            if row and distances[best] < self.gate and best not in sightings:
+                estimate = self._combined(estimate, predicted, row[best], known)
+                sightings[best] = row[best].R_camera_manhattan
+            elif manhattan is not None and len(known.ids) < self.max_frames:
+                certain = np.radians(self.unit_deg) ** 2 / (np.trace(predicted.covariance + manhattan.covariance[k]) / 3.0 + 1e-12)
+                known = known.with_new(predicted.R @ manhattan.rotations[k], min(certain, 1.0))
+                sightings[len(known.ids) - 1] = manhattan.rotations[k]
+        keep = [i for i in range(len(known.ids)) if i in sightings or known.weights[i] >= self.min_observations]
+        seen = np.array([sightings.get(i, np.full((3, 3), np.nan)) for i in keep]).reshape(-1, 3, 3)
+        return known.only(np.array(keep, np.intp)), estimate, seen
+
+    def _noise(self, sighting: Sighting, known: KnownFrames) -> F64:
+        """Covariance (3, 3) of the rotation that a sighting says: its own and that of R_world_manhattan."""
+        weight = known.weights[sighting.row]
+        independent = max(weight / self.correlation, min(weight, 1.0))
+        axes = np.radians(self.unit_deg) ** 2 / independent + np.radians(self.axis_floor_deg) ** 2
+        return sighting.covariance + axes * np.eye(3)
+
+    def _distance(self, sighting: Sighting, known: KnownFrames, predicted: Estimate) -> float:
+        """Standard deviations between a sighting and the prediction."""
+        S = self._noise(sighting, known) + predicted.covariance + np.eye(3) * np.radians(self.gate_floor_deg) ** 2
+        return float(np.sqrt(sighting.delta @ np.linalg.solve(S, sighting.delta)))
+
+    def _combined(self, estimate: Estimate, predicted: Estimate, sighting: Sighting, known: KnownFrames) -> Estimate:
+        """Kalman update of the estimate by a sighting; both covariances are of rotations of the camera."""
+        noise = self._noise(sighting, known)
+        gain = estimate.covariance @ np.linalg.inv(estimate.covariance + noise)
+        delta = log_so3(estimate.R.T @ predicted.R @ exp_so3(sighting.delta))
+        rest = np.eye(3) - gain
+        covariance = rest @ estimate.covariance @ rest.T + gain @ noise @ gain.T
+        step = gain @ delta
+        if predicted.source == "tracks":  # what lies beyond the limit is left for the next frames, and is not yet known
+            taken = step * min(np.radians(self.step_deg) / max(float(np.linalg.norm(step)), 1e-12), 1.0)
+            covariance = covariance + np.outer(step - taken, step - taken)
+            step = taken
+        return Estimate(estimate.R @ exp_so3(step), covariance, "manhattan")

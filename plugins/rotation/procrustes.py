@@ -1,0 +1,47 @@
+"""The camera's rotation from the tracks alone."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from trihedron.pipeline.registry import register
+from trihedron.pipeline.types import Keypoints, Planes, Pose, Rotation, Segments, Tracks
+from trihedron.plugins.numerics.chained_rotation import Estimate, TrackedRotation, rotation_before, rotation_value
+from trihedron.plugins.numerics.manhattan_frames import KnownFrames
+
+
+@register("rotation", "procrustes")
+@dataclass(frozen=True)
+class Procrustes:
+    """The rotation that aligns the tracked points, lines and planes of the previous frame with this one's, on top of the previous pose: what
+    `drift_free` falls back on, for comparison. No Manhattan frame takes part, so it drifts."""
+
+    pose_floor_deg: float = 0.1  # least error of the previous pose
+    prior_deg: float = 2.0  # of the predicted rotation, per frame
+    prior_m: float = 0.1  # of the motion, per frame
+    measured_deg: float = 1.0  # tracks that leave the rotation less certain than this have not measured it
+    angle_px: float = 0.002  # rad, of a pixel
+    plane_floor_deg: float = 0.3  # error of a tracked plane's normal
+
+    def __post_init__(self) -> None:
+        if min(self.pose_floor_deg, self.prior_deg, self.prior_m, self.measured_deg, self.angle_px, self.plane_floor_deg) <= 0.0:
+            raise ValueError("pose_floor_deg, prior_deg, prior_m, measured_deg, angle_px, plane_floor_deg: must be positive")
+
+    def __call__(
+        self,
+        tracks: Tracks | None,
+        keypoints: Keypoints,
+        segments: Segments,
+        planes: Planes,
+        previous: Rotation | None,
+        previous_pose: Pose | None,
+    ) -> Rotation:
+        """The rotation of this frame; the identity for the first."""
+        estimate = Estimate(np.eye(3), np.zeros((3, 3)), "prediction")
+        if previous is not None:
+            before, _ = rotation_before(previous, previous_pose, self.pose_floor_deg)
+            tracked = TrackedRotation(self.prior_deg, self.prior_m, self.measured_deg, self.angle_px, self.plane_floor_deg)
+            estimate = tracked(before, previous.index, tracks, keypoints, segments, planes)
+        return rotation_value(keypoints.index, keypoints.stamp_ns, estimate, KnownFrames.none(), np.zeros((0, 3, 3)))

@@ -1,0 +1,192 @@
+"""Features of the previous frame found again where the rotation says they are."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from trihedron.pipeline.geometry import exp_so3, log_so3, rotation_angle_deg, transform_planes
+from trihedron.pipeline.registry import register
+from trihedron.pipeline.types import F64, I32, Camera, Frame, Keypoints, ManhattanFrame, Planes, Segments, Tracks
+from trihedron.plugins.numerics.descriptors import match_lines, match_near
+from trihedron.plugins.numerics.flow import offset_px, predict_pixels
+from trihedron.plugins.numerics.plane_association import associate_planes
+from trihedron.plugins.numerics.relative_motion import Motion, motion_terms, solve_motion
+
+NO_PAIRS = np.zeros((0, 2), np.int32)
+
+
+@dataclass(frozen=True)
+class Features:
+    """What one frame shows."""
+
+    keypoints: Keypoints
+    segments: Segments
+    planes: Planes
+
+
+@register("tracks", "projection")
+@dataclass(frozen=True)
+class Projection:
+    """Project the previous features with the predicted rotation, match by descriptor near there, solve the motion, and look again closer to where
+    it puts them. Features that contradict the motion are left out; it is deterministic throughout.
+
+    The rotation comes from the Manhattan frames of the two images, else from the last motion, else there is none; where the two differ the one that
+    finds more features is right. `R_current_previous` is the prediction corrected by what was found."""
+
+    radius_px: float = 25.0  # searched at first: the translation is unknown
+    near_px: float = 8.0  # searched once the motion is known
+    enough: int = 30  # key points; with fewer the first search is repeated with twice the radius
+    max_bits: int = 64  # of 256, descriptor distance of key points
+    max_l2: int = 250  # the same for descriptors compared by Euclidean distance
+    ratio: float = 0.9  # best to second best descriptor
+    octave_step: int = 1
+    line_deg: float = 8.0  # direction of a segment
+    line_overlap: float = 0.4  # of the shorter segment
+    line_bits: int = 80  # of 256
+    plane_deg: float = 8.0
+    plane_m: float = 0.15  # distance at first
+    plane_near_m: float = 0.05  # and once the motion is known
+    max_age: int = 10  # frames; older features are not looked for
+    error_px: float = 4.0  # sigma_px a key point may miss its place by
+    prior_deg: float = 2.0  # of the predicted rotation
+    prior_m: float = 0.1  # of no translation, per frame
+    angle_px: float = 0.002  # rad, of a pixel
+    plane_floor_deg: float = 0.3
+
+    def __post_init__(self) -> None:
+        if not 0.0 < self.near_px <= self.radius_px:
+            raise ValueError("near_px: must be positive and at most radius_px")
+        if not 0.0 < self.ratio <= 1.0 or self.octave_step < 0 or self.enough < 0 or not 0.0 <= self.line_overlap <= 1.0:
+            raise ValueError("ratio, octave_step, enough, line_overlap: in (0, 1], at least 0, at least 0, in [0, 1]")
+        if not 0.0 < self.line_deg < 90.0 or not 0.0 < self.plane_deg < 90.0 or not 0.0 < self.plane_near_m <= self.plane_m:
+            raise ValueError("line_deg, plane_deg, plane_near_m, plane_m: angles in (0, 90), plane_near_m positive and at most plane_m")
+        if self.max_age < 1 or min(self.error_px, self.prior_deg, self.prior_m, self.angle_px, self.plane_floor_deg) <= 0.0:
+            raise ValueError("max_age, error_px, prior_deg, prior_m, angle_px, plane_floor_deg: must be positive")
+
+    def __call__(
+        self,
+        frame: Frame,
+        keypoints: Keypoints,
+        segments: Segments,
+        planes: Planes,
+        previous_keypoints: Keypoints | None,
+        previous_segments: Segments | None,
+        previous_planes: Planes | None,
+        manhattan: ManhattanFrame | None,
+        previous_manhattan: ManhattanFrame | None,
+        previous: Tracks | None,
+    ) -> Tracks | None:
+        """Pairs with the previous frame; None for the first frame, no pairs when the previous features are too old."""
+        if previous_keypoints is None or previous_segments is None or previous_planes is None:
+            return None
+        now, before = Features(keypoints, segments, planes), Features(previous_keypoints, previous_segments, previous_planes)
+        gap = frame.index - previous_keypoints.index
+        rotations = self._predictions(gap, before.keypoints.index, manhattan, previous_manhattan, previous)
+        if gap > self.max_age:
+            return self._tracks(now, before, (NO_PAIRS, NO_PAIRS, NO_PAIRS), rotations[0])
+        radius = self.radius_px * min(gap, 3)
+        first = max((self._search(now, before, frame.camera, R, np.zeros(3), radius, self.plane_m) for R in rotations), key=_count)
+        if len(first.keypoints) < min(self.enough, len(keypoints.pixels)):
+            first = self._search(now, before, frame.camera, first.R_current_previous, np.zeros(3), 2.0 * radius, self.plane_m)
+        motion = self._motion(first, now, gap)
+        again = self._search(now, before, frame.camera, motion.R, motion.t, self.near_px, self.plane_near_m)
+        again = again if _count(again) >= 0.7 * _count(first) else first
+        motion = self._motion(again, now, gap)
+        return self._agreeing(again, now, before, motion, frame.camera)
+
+    def _predictions(
+        self, gap: int, previous_index: int, manhattan: ManhattanFrame | None, previous_manhattan: ManhattanFrame | None, previous: Tracks | None
+    ) -> list[F64]:
+        """Rotations R_current_previous worth trying, at least one, no two alike."""
+        found = []
+        if previous is not None and previous.index == previous_index and previous.index > previous.previous_index:
+            share = gap / (previous.index - previous.previous_index)
+            found.append(exp_so3(share * log_so3(previous.R_current_previous)))
+        if manhattan is not None and previous_manhattan is not None and manhattan.supported and previous_manhattan.supported:
+            relative = manhattan.rotations[0] @ previous_manhattan.rotations[0].T
+            if previous_manhattan.index == previous_index and all(rotation_angle_deg(relative @ R.T) > self.prior_deg for R in found):
+                found.append(relative)
+        return found or [np.eye(3)]
+
+    def _search(self, now: Features, before: Features, camera: Camera, R: F64, t: F64, radius_px: float, plane_m: float) -> Tracks:
+        """All pairs found around the motion (R, t)."""
+        points = self._find_points(now.keypoints, before.keypoints, camera, R, t, radius_px)
+        lines = self._find_lines(now.segments, before.segments, camera, R, t, radius_px)
+        T = np.eye(4)
+        T[:3, :3], T[:3, 3] = R, t
+        moved = transform_planes(T, before.planes.coefficients)
+        samples = (before.planes.samples_m @ R.T + t).astype(np.float32)
+        planes = associate_planes(now.planes.coefficients, now.planes.samples_m, moved, samples, self.plane_deg, plane_m, many_to_one=True)
+        return self._tracks(now, before, (_pairs(points), _pairs(lines), np.ascontiguousarray(planes[:, ::-1])), R)
+
+    def _find_points(self, now: Keypoints, before: Keypoints, camera: Camera, R: F64, t: F64, radius_px: float) -> I32:
+        predicted = predict_pixels(before.pixels, before.points_m, camera, R, t).astype(np.float32)
+        radius = np.full(len(predicted), radius_px, np.float32)
+        limit = self.max_bits if now.metric == "hamming" else self.max_l2
+        described = before.descriptors, before.octaves, now.pixels, now.descriptors, now.octaves
+        return match_near(predicted, *described, radius, self.octave_step, limit, self.ratio, now.metric)
+
+    def _find_lines(self, now: Segments, before: Segments, camera: Camera, R: F64, t: F64, offset_px: float) -> I32:
+        predicted = predict_pixels(before.endpoints_px, before.endpoints_m, camera, R, t).astype(np.float32)
+        return match_lines(
+            predicted, before.descriptors, now.endpoints_px, now.descriptors, self.line_deg, offset_px, self.line_overlap, self.line_bits, self.ratio
+        )
+
+    def _motion(self, tracks: Tracks, now: Features, gap: int) -> Motion:
+        terms = motion_terms(tracks, now.keypoints, now.segments, now.planes, self.angle_px, self.plane_floor_deg)
+        return solve_motion(terms, tracks.R_current_previous, self.prior_deg * gap, self.prior_m * gap)
+
+    def _agreeing(self, tracks: Tracks, now: Features, before: Features, motion: Motion, camera: Camera) -> Tracks:
+        """Without the key points and lines that the motion puts elsewhere than they were found, and key points that never had a depth."""
+        i, j = tracks.keypoints.T
+        forth = predict_pixels(before.keypoints.pixels[i], tracks.points_m, camera, motion.R, motion.t) - now.keypoints.pixels[j]
+        points_m = now.keypoints.points_m[j]
+        back = predict_pixels(now.keypoints.pixels[j], points_m, camera, motion.R.T, -motion.R.T @ motion.t) - before.keypoints.pixels[i]
+        then, since = np.isfinite(tracks.points_m[:, 2]), np.isfinite(points_m[:, 2])
+        error = np.linalg.norm(np.where(then[:, None], forth, back), axis=1)
+        depth = np.fmin(tracks.points_m[:, 2], points_m[:, 2])
+        unsure = camera.fx * np.sqrt(np.linalg.eigvalsh(motion.covariance[3:, 3:])[-1]) / np.where(depth > 0.0, depth, np.inf)
+        points = (then | since) & (error <= self.error_px * (now.keypoints.sigma_px[j] + unsure))
+        i, j = tracks.segments.T
+        moved = predict_pixels(before.segments.endpoints_px[i], tracks.endpoints_m, camera, motion.R, motion.t)
+        depth = tracks.endpoints_m[:, :, 2].min(axis=1)
+        unsure = camera.fx * np.sqrt(np.linalg.eigvalsh(motion.covariance[3:, 3:])[-1]) / np.where(depth > 0.0, depth, 1.0)
+        lines = offset_px(moved, now.segments.endpoints_px[j]) <= self.error_px * (1.0 + unsure)
+        return replace(
+            tracks,
+            keypoints=tracks.keypoints[points],
+            points_m=tracks.points_m[points],
+            sigma_m=tracks.sigma_m[points],
+            segments=tracks.segments[lines],
+            endpoints_m=tracks.endpoints_m[lines],
+            R_current_previous=motion.R,
+        )
+
+    def _tracks(self, now: Features, before: Features, pairs: tuple[I32, I32, I32], R: F64) -> Tracks:
+        points, lines, planes = pairs
+        return Tracks(
+            index=now.keypoints.index,
+            stamp_ns=now.keypoints.stamp_ns,
+            previous_index=before.keypoints.index,
+            keypoints=points,
+            points_m=before.keypoints.points_m[points[:, 0]],
+            sigma_m=before.keypoints.sigma_m[points[:, 0]],
+            segments=lines,
+            endpoints_m=before.segments.endpoints_m[lines[:, 0]],
+            planes=planes,
+            coefficients=before.planes.coefficients[planes[:, 0]],
+            plane_covariance=before.planes.covariance[planes[:, 0]],
+            R_current_previous=R,
+        )
+
+
+def _pairs(found: I32) -> I32:
+    """(n,) row of the current frame for each previous one, or -1 -> (k, 2)."""
+    rows = np.flatnonzero(found >= 0).astype(np.int32)
+    return np.stack([rows, found[rows]], axis=1)
+
+
+def _count(tracks: Tracks) -> int:
+    return len(tracks.keypoints) + len(tracks.segments) + len(tracks.planes)

@@ -1,0 +1,117 @@
+"""Position with the rotation fixed, by robust Levenberg–Marquardt."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from trihedron.pipeline.geometry import pose_matrix, transform, transform_planes
+from trihedron.pipeline.registry import register
+from trihedron.pipeline.types import F64, Frame, Keypoints, Planes, Pose, Rotation, Segments, Tracks, Translation
+from trihedron.plugins.numerics import uncertainty as un
+from trihedron.plugins.numerics.pose_solver import solve_pose
+from trihedron.plugins.numerics.pose_terms import SAME, LineTerms, PlaneTerms, PointTerms
+
+
+@register("translation", "levenberg_marquardt")
+@dataclass(frozen=True)
+class LevenbergMarquardt:
+    """Reprojected points, lines and planes of the previous frame with the rotation fixed (eqs. 2–7).
+
+    The previous features are placed in the world by the previous pose. The rotation's own uncertainty is added to the noise of what it moves, so
+    that distances to planes, which it does not move, count for more when it is poor. Three weak unknowns remain: the prediction (the previous
+    position, `motion_sigma_m`) fills the directions that no feature sees."""
+
+    motion_sigma_m: float = 0.1  # per frame, of the position about the previous one: 3 m/s at 30 frames/s
+    line_sigma_px: float = 1.0  # of a segment's end point across it
+    rotation_sigma_deg: float = 0.05  # least uncertainty granted to the fixed rotation
+
+    def __post_init__(self) -> None:
+        if self.motion_sigma_m <= 0.0 or self.line_sigma_px <= 0.0 or self.rotation_sigma_deg < 0.0:
+            raise ValueError("motion_sigma_m, line_sigma_px, rotation_sigma_deg: must be positive")
+
+    def __call__(
+        self,
+        frame: Frame,
+        rotation: Rotation,
+        tracks: Tracks | None,
+        keypoints: Keypoints,
+        segments: Segments,
+        planes: Planes,
+        previous_pose: Pose | None,
+    ) -> Translation:
+        """The position; the first frame's is the origin of the world."""
+        if previous_pose is None:
+            return self._said(frame, np.zeros(3), np.zeros((3, 3)), np.empty((0, 3)), (0, 0, 0), True)
+        start = pose_matrix(rotation.R_world_camera, previous_pose.T_world_camera[:3, 3])
+        frames = max(frame.index - previous_pose.index, 1)
+        prior = np.diag(np.repeat([(self.motion_sigma_m * frames) ** -2, 1.0], 3))
+        if tracks is None or tracks.previous_index != previous_pose.index:
+            return self._said(frame, start[:3, 3], np.linalg.inv(prior[:3, :3]), np.eye(3), (0, 0, 0), False)
+        T = previous_pose.T_world_camera
+        uncertain = rotation.covariance + np.radians(self.rotation_sigma_deg) ** 2 * np.eye(3)
+        found = solve_pose(
+            start,
+            frame.camera,
+            start,
+            prior,
+            self._points(tracks, keypoints, T, frame, uncertain),
+            self._lines(tracks, segments, T, frame, uncertain),
+            self._planes(tracks, planes, T, uncertain),
+            fixed_rotation=True,
+        )
+        R = rotation.R_world_camera
+        inliers = (int(np.count_nonzero(found.points)), int(np.count_nonzero(found.lines)), int(np.count_nonzero(found.planes)))
+        unobservable = np.ascontiguousarray((R @ found.unobservable).T)
+        return self._said(frame, found.T_world_camera[:3, 3], R @ found.covariance @ R.T, unobservable, inliers, sum(inliers) > 0)
+
+    def _points(self, tracks: Tracks, keypoints: Keypoints, T: F64, frame: Frame, uncertain: F64) -> PointTerms:
+        """Tracked key points whose previous depth is known."""
+        known = np.isfinite(tracks.points_m).all(axis=1)
+        rows = tracks.keypoints[known, 1]
+        before = tracks.points_m[known].astype(np.float64)
+        sigma_px = keypoints.sigma_px[rows].astype(np.float64)
+        covariance = un.point_covariance(before, sigma_px, tracks.sigma_m[known].astype(np.float64), frame.camera)
+        covariance += un.turned_covariance(before, uncertain)
+        return PointTerms(
+            transform(T, before),
+            un.rotate_covariance(T[:3, :3], covariance),
+            keypoints.pixels[rows].astype(np.float64),
+            keypoints.points_m[rows, 2].astype(np.float64),
+            sigma_px,
+            keypoints.sigma_m[rows].astype(np.float64),
+        )
+
+    def _lines(self, tracks: Tracks, segments: Segments, T: F64, frame: Frame, uncertain: F64) -> LineTerms:
+        """Tracked lines whose previous 3D end points are known."""
+        known = np.isfinite(tracks.endpoints_m).all(axis=(1, 2))
+        rows = tracks.segments[known, 1]
+        before = tracks.endpoints_m[known].astype(np.float64)
+        sigma_px = np.full(before.shape[:2], self.line_sigma_px)
+        covariance = un.point_covariance(before, sigma_px, frame.camera.depth_noise.sigma_m(before[..., 2]), frame.camera)
+        covariance += un.turned_covariance(before, uncertain)
+        return LineTerms(
+            transform(T, before),
+            un.rotate_covariance(T[:3, :3], covariance),
+            segments.endpoints_px[rows].astype(np.float64),
+            sigma_px[:, 0].copy(),
+            segments.endpoints_m[rows].astype(np.float64),
+            segments.covariance_m2[rows].astype(np.float64),
+        )
+
+    def _planes(self, tracks: Tracks, planes: Planes, T: F64, uncertain: F64) -> PlaneTerms:
+        """Tracked planes."""
+        rows = tracks.planes[:, 1]
+        world = transform_planes(T, tracks.coefficients)
+        observed = planes.coefficients[rows]
+        return PlaneTerms(
+            np.full(len(rows), SAME, np.int32),
+            world,
+            un.transform_plane_covariance(T, tracks.coefficients, world, tracks.plane_covariance),
+            observed,
+            planes.covariance[rows] + un.turned_plane_covariance(observed, uncertain),
+        )
+
+    def _said(self, frame: Frame, t: F64, covariance: F64, unobservable: F64, inliers: tuple[int, int, int], estimated: bool) -> Translation:
+        return Translation(frame.index, frame.stamp_ns, t.copy(), covariance, unobservable, np.array(inliers, np.int32), estimated)

@@ -1,0 +1,96 @@
+"""Camera files, presets, and which one a folder gets."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from trihedron.datasets.cameras import PRESETS, choose_calibration, read_camera_file
+from trihedron.pipeline.errors import DataError
+from trihedron.pipeline.types import EXACT_DEPTH, DepthNoise
+
+GOOD = "width: 640\nheight: 480\nfx: 500\nfy: 501.5\ncx: 320\ncy: 240\ndepth_scale: 1000\n"
+KEYS = "give width height fx fy cx cy depth_scale"
+
+
+def test_a_camera_file_says_everything(tmp_path: Path) -> None:
+    file = tmp_path / "camera.yaml"
+    file.write_text(GOOD + "fps: 15\ndistortion: {k1: 0.1, p2: -0.2}\ndepth_noise: exact\n")
+    found = read_camera_file(file)
+    assert found.distortion == (0.1, 0.0, 0.0, -0.2, 0.0)
+    assert (found.depth_scale, found.camera.fy, found.camera.fps, found.camera.width) == (1000.0, 501.5, 15.0, 640)
+    assert found.camera.depth_noise == EXACT_DEPTH
+
+
+@pytest.mark.parametrize("text", ["[0.1, 0.2, 0.3, 0.4, 5e-1]", "0.1 0.2 0.3 0.4 0.5", "0.1, 0.2, 0.3, 0.4, 0.5"])
+def test_distortion_may_be_a_list_or_a_line(tmp_path: Path, text: str) -> None:
+    (tmp_path / "camera.yaml").write_text(GOOD + f"distortion: {text}\n")
+    found = read_camera_file(tmp_path / "camera.yaml")
+    assert found.distortion == (0.1, 0.2, 0.3, 0.4, 0.5)
+    assert found.camera.depth_noise == DepthNoise()
+
+
+BAD = [
+    (GOOD.replace("fx: 500\n", ""), "{}: the key 'fx' is missing; " + KEYS),
+    (GOOD + "dept_scale: 5000\n", "{}: unknown key 'dept_scale'; did you mean 'depth_scale'?"),
+    (GOOD + "distortion: {k1: 0.1, k4: 1}\n", "{}: unknown key 'distortion.k4'; known: k1, k2, k3, p1, p2"),
+    (GOOD + "distortion: [1, 2]\n", "{}: distortion does not hold 5 numbers; give k1 k2 p1 p2 k3 as a mapping or a list"),
+    (GOOD.replace("500", "wide"), "{}: fx is 'wide'; give a finite number"),
+    (GOOD.replace("fx: 500", "fx: yes"), "{}: fx is 'True'; give a finite number"),
+    (GOOD.replace("fx: 500", "fx: .nan"), "{}: fx is 'nan'; give a finite number"),
+    (GOOD.replace("501.5", "-480"), "{}: fy is negative (y up); give it positive; dataset=icl_nuim reflects the published poses itself"),
+    (GOOD.replace("640", "640.5"), "{}: width is 640.5; give a positive whole number"),
+    (GOOD.replace("1000", "0"), "{}: depth_scale is 0; give a positive number"),
+    (GOOD + "depth_noise: kinnect\n", "{}: depth_noise is 'kinnect'; did you mean 'kinect'?"),
+    ("", "{}: holds no keys; give width height fx fy cx cy depth_scale, one 'key: value' a line"),
+    ("width: 640\nfx: [1\n", "{}:3: is not YAML; write one 'key: value' a line"),
+]
+
+
+@pytest.mark.parametrize(("text", "message"), BAD)
+def test_a_bad_camera_file_is_one_line(tmp_path: Path, text: str, message: str) -> None:
+    file = tmp_path / "camera.yaml"
+    file.write_text(text)
+    with pytest.raises(DataError) as caught:
+        read_camera_file(file)
+    assert str(caught.value) == message.format(file)
+
+
+@pytest.mark.parametrize(
+    ("name", "preset"),
+    [
+        ("rgbd_dataset_freiburg1_xyz", "tum_fr1"),
+        ("fr2_desk", "tum_fr2"),
+        ("rgbd_dataset_freiburg3_long_office_household", "tum_fr3"),
+        ("living_room_traj2_loop", "icl_nuim"),
+        ("icl_nuim_of_kt3", "icl_nuim"),
+        ("traj1_frei_png", "icl_nuim"),
+    ],
+)
+def test_the_name_of_a_published_folder_gives_the_camera(tmp_path: Path, name: str, preset: str) -> None:
+    (tmp_path / name).mkdir()
+    assert choose_calibration(tmp_path / name, "") is PRESETS[preset]
+
+
+def test_what_is_asked_for_goes_before_the_file_and_the_file_before_the_name(tmp_path: Path) -> None:
+    folder = tmp_path / "fr1_room"
+    folder.mkdir()
+    (folder / "camera.yaml").write_text(GOOD)
+    assert choose_calibration(folder, "").camera.fx == 500.0
+    assert choose_calibration(folder, "tum_fr2") is PRESETS["tum_fr2"]
+    assert choose_calibration(tmp_path, str(folder)).camera.fx == 500.0
+    assert choose_calibration(tmp_path, str(folder / "camera.yaml")).camera.fx == 500.0
+    assert choose_calibration(tmp_path, "", default="icl_nuim") is PRESETS["icl_nuim"]
+
+
+def test_a_camera_that_is_neither_file_nor_preset_is_one_line(tmp_path: Path) -> None:
+    with pytest.raises(DataError) as caught:
+        choose_calibration(tmp_path, "tum_fr4")
+    assert str(caught.value) == "dataset.camera: 'tum_fr4' is neither a file nor a preset; did you mean 'tum_fr3'?"
+
+
+def test_an_office_of_ones_own_gets_no_published_camera(tmp_path: Path) -> None:
+    (tmp_path / "my_office").mkdir()
+    with pytest.raises(DataError, match=r"has no camera\.yaml and its name speaks of no known camera"):
+        choose_calibration(tmp_path / "my_office", "")

@@ -1,0 +1,218 @@
+"""The command line: every mistake is one line with place, cause and cure, and the exit code is 1, or 2 for usage."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from importlib.metadata import version
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from trihedron.datasets.synthetic import Synthetic
+from trihedron.datasets.trajectories import read_trajectory
+from trihedron.pipeline.cli import main
+from trihedron.pipeline.recording import Recording
+
+SMALL = ["dataset=synthetic", "dataset.width=160", "dataset.height=120", "dataset.length=12"]
+
+
+@pytest.fixture(autouse=True)
+def elsewhere(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+
+
+def refused(capsys, *words, code=1):
+    """The one line that `trihedron run SMALL words` prints."""
+    assert main(["run", *SMALL, *words]) == code
+    lines = capsys.readouterr().err.strip().splitlines()
+    assert len(lines) == 1, lines
+    return lines[0]
+
+
+SEE = "see trihedron plugins for the options of"
+MISTAKES = [
+    (["threads=abc"], 1, "trihedron: threads: Value 'abc' of type 'str' could not be converted to Integer; give a value of that type"),
+    (["threads=0"], 1, "trihedron: threads: 0 is not a number of threads; give 1 or more"),
+    (["threds=1"], 1, "trihedron: threds: there is no such key; did you mean 'threads'?"),
+    (["keypoints=orbs"], 1, "trihedron: keypoints: there is no plugin 'orbs' for the slot 'keypoints'; did you mean 'orb'?"),
+    (["keypoints.featurs=3"], 1, "trihedron: keypoints.featurs: the chosen plugin has no option 'featurs'; did you mean 'features'?"),
+    (["graph=structurel"], 1, "trihedron: graph: there is no graph 'structurel'; did you mean 'structural'?"),
+    (["graph.planes.normals=normal"], 1, "trihedron: graph.planes.normals: no stage writes topic 'normal'; did you mean 'normals'?"),
+    (
+        ["graph.planes.normals=planes@prev"], 1,
+        "trihedron: graph.planes.normals: topic 'planes' is Planes, the input takes Normals; wire it to normals",
+    ),
+    (
+        ["~graph.planes.normals"], 1,
+        "trihedron: graph.planes.normals: the input is not wired, and ConnectedComponents takes it; give graph.planes.normals=TOPIC",
+    ),
+    (
+        ["graph.planes.normals=normals@prev"], 1,
+        "trihedron: graph.planes.normals: 'normals@prev' is None at first, and the input cannot be None; "
+        "wire it to 'normals', or take the input as optional",
+    ),
+    (
+        ["graph.pose.previous=pose"], 1,
+        "trihedron: graph: pose -> pose need each other within one frame; put @prev on one of these wires",
+    ),
+    (["+graph.planes.foo=dataset"], 1, "trihedron: graph.planes.foo: the slot 'planes' has no input 'foo'; known: frame, normals"),
+    (["outputs=[trajektory]"], 1, "trihedron: outputs: no stage writes 'trajektory'; did you mean 'trajectory'?"),
+    (["outputs=[]"], 1, "trihedron: outputs: is empty, so nothing would run; give outputs=[trajectory]"),
+    (["dataset.frames=9:3"], 1, f"trihedron: dataset.frames: '9:3' is not a range of frames A:B with A < B; {SEE} dataset"),
+    (["dataset=tums"], 1, "trihedron: dataset: there is no plugin 'tums' for the slot 'dataset'; did you mean 'tum'?"),
+    (["only=[pose]"], 1, "trihedron: only: chooses stages of a replay, and there is none; give replay=FILE.mcap too"),
+    (["replay=no.mcap"], 1, "trihedron: no.mcap: cannot be read: No such file or directory; give the path of a run.mcap"),
+    (["record.topics=[normal]"], 1, "trihedron: record.topics: no stage writes 'normal'; did you mean 'normals'?"),
+    (["feedback=old"], 1, "trihedron: feedback: Invalid value 'old', expected one of [new, recorded]; give a value of that type"),
+    (["out=/proc/no"], 1, "trihedron: out: the folder cannot be made: No such file or directory: /proc/no; give another out=FOLDER"),
+    (["pose"], 2, "trihedron: pose: is not an override; write key=value, for example threads=1 (quote lists: 'only=[pose]')"),
+    (["-x"], 2, "trihedron: -x: is not an option of run; known: -m, --multirun; everything else is key=value"),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("words, code, line", MISTAKES, ids=lambda value: "_".join(value) if isinstance(value, list) else "")
+def test_mistakes(capsys, words, code, line):
+    assert refused(capsys, *words, code=code) == line
+
+
+@pytest.mark.parametrize("words, line", [
+    (["dataset=tum"], "trihedron: dataset.path: is not set; give dataset.path=FOLDER"),
+    (["dataset=tum", "dataset.path=no"], "trihedron: no: does not exist; give an existing folder as dataset.path"),
+    (["dataset=mcap"], "trihedron: dataset.path: is not set; give dataset.path=FILE.mcap"),
+])  # fmt: skip
+def test_missing_data(capsys, words, line):
+    assert main(["run", *words]) == 1
+    assert capsys.readouterr().err.strip() == line
+
+
+def test_unknown_command_and_help(capsys):
+    assert main(["rum"]) == 2
+    assert capsys.readouterr().err.strip() == "trihedron: rum: there is no such command; did you mean 'run'?"
+    assert main(["--help"]) == 0
+    text = capsys.readouterr().out
+    for command in ("run", "evaluate", "plugins", "topics", "convert", "benchmark"):
+        assert f"\n  {command} " in text
+    assert text.count("Example: trihedron ") >= 6
+    assert main(["run", "--help"]) == 0 and "replay=FILE.mcap" in capsys.readouterr().out
+    assert main(["--version"]) == 0 and capsys.readouterr().out.strip() == f"trihedron {version('trihedron')}"
+
+
+def test_debug_shows_the_traceback():
+    with pytest.raises(Exception, match="there is no such key"):
+        main(["run", *SMALL, "threds=1", "--debug"])
+
+
+def test_a_run_folder_is_complete(capsys, tmp_path):
+    assert main(["run", *SMALL]) == 0
+    printed = capsys.readouterr().out
+    out = (tmp_path / "runs" / "latest").resolve()
+    expected = {"trajectory.txt", "trajectory_causal.txt", "run.mcap", "timing.json", "metrics.json", "trajectory.png", ".hydra"}
+    assert {p.name for p in out.iterdir()} == expected
+    assert all(str(out / name) in printed for name in expected - {".hydra"})
+    timing, metrics = json.loads((out / "timing.json").read_text()), json.loads((out / "metrics.json").read_text())
+    assert timing["frames"] == 12 == metrics["frames"] and timing["threads"] == 2
+    assert set(timing) == {"frames", "threads", "wall_s", "startup_s", "fps", "frame_ms", "stages"}
+    assert metrics["final"]["tracked_share"] == 1.0 and len(read_trajectory(out / "trajectory.txt")) == 12
+    recording = Recording(out / "run.mcap")
+    assert recording.metadata["version"] == version("trihedron") and set(SMALL) <= set(recording.overrides())
+    assert {"/view/pose", "/view/camera", "/view/image", "/view/planes", "/view/lines", "/view/map_points", "/tf"} <= set(recording.channels)
+    assert recording.channels["/view/pose"].message_encoding == "protobuf"
+
+
+def test_a_replay_finds_the_data_from_another_folder(tmp_path, monkeypatch):
+    assert main(["run", *SMALL, "record.frames=true", "out=embedded"]) == 0
+    assert main(["run", "dataset=mcap", "dataset.path=embedded/run.mcap", "out=again"]) == 0
+    assert (tmp_path / "again" / "trajectory.txt").read_bytes() == (tmp_path / "embedded" / "trajectory.txt").read_bytes()
+    (tmp_path / "elsewhere").mkdir()
+    monkeypatch.chdir(tmp_path / "elsewhere")
+    assert main(["run", "replay=../again/run.mcap", "only=[keypoints]", "out=replayed"]) == 0
+    expected = [m.data for m in Recording("../again/run.mcap").messages("/keypoints")]
+    assert [m.data for m in Recording("replayed/run.mcap").messages("/keypoints")] == expected
+
+
+def test_unreadable_frames_are_skipped_and_summarised(capsys, tmp_path):
+    def sequence(folder, damaged):
+        for name in ("rgb", "depth"):
+            (folder / name).mkdir(parents=True)
+        (folder / "camera.yaml").write_text("{width: 160, height: 120, fx: 130, fy: 130, cx: 79.5, cy: 59.5, depth_scale: 5000}")
+        frames = Synthetic(width=160, height=120, length=24)
+        for i in range(24):
+            frame = frames(i)
+            cv2.imwrite(str(folder / "rgb" / f"{i}.png"), frame.color[..., ::-1])
+            cv2.imwrite(str(folder / "depth" / f"{i}.png"), np.rint(frame.depth_m * 5000).astype(np.uint16))
+        for i in damaged:
+            path = folder / "depth" / f"{i}.png"
+            path.write_bytes(path.read_bytes()[:500])
+        return [f"dataset.path={folder}", f"out={folder}/run"]
+
+    assert main(["run", "dataset=folder", *sequence(tmp_path / "a", (7, 12))]) == 0
+    first = f"{tmp_path}/a/depth/7.png: is truncated; frame 7 is skipped"
+    assert capsys.readouterr().err.splitlines() == [f"trihedron: warning: {first}", f"trihedron: 2 such warnings, the first: {first}"]
+    metrics = json.loads((tmp_path / "a" / "run" / "timing.json").read_text())
+    assert metrics["frames"] == 22 and len(read_trajectory(tmp_path / "a" / "run" / "trajectory.txt")) == 22
+    assert main(["run", "dataset=folder", *sequence(tmp_path / "b", (7, 12, 15))]) == 1
+    assert capsys.readouterr().err.splitlines()[-1] == (
+        "trihedron: dataset: 3 of 24 frames cannot be read; see the warnings above for the first file; the data set is damaged"
+    )
+
+
+def test_a_sweep_goes_on_after_a_job_that_fails(capsys, tmp_path):
+    words = ["run", "-m", *SMALL, "dataset.frames=0:3,9:3,0:4", "out=sweep"]
+    assert main(words) == 1
+    assert "trihedron: dataset.frames: '9:3' is not a range" in capsys.readouterr().err
+    lengths = [json.loads((tmp_path / "sweep" / job / "timing.json").read_text())["frames"] for job in ("0", "2")]
+    assert lengths == [3, 4]
+
+
+def test_an_interrupt_leaves_a_recording_and_a_trajectory(tmp_path):
+    words = ["run", "dataset=synthetic", "dataset.length=2000", "dataset.width=160", "dataset.height=120", "out=cut"]
+    code = f"import sys; from trihedron.pipeline.cli import main; sys.exit(main({words!r}))"
+    process = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    recording = tmp_path / "cut" / "run.mcap"
+    for _ in range(600):
+        if recording.exists() and recording.stat().st_size > 2_000_000:
+            break
+        time.sleep(0.1)
+    process.send_signal(signal.SIGINT)
+    _, errors = process.communicate(timeout=60)
+    assert process.returncode == 130 and errors.strip().splitlines()[-1] == "trihedron: interrupted; what was done is kept"
+    poses = list(Recording(recording).values("pose"))
+    assert 5 < len(poses) < 2000 and len(read_trajectory(tmp_path / "cut" / "trajectory.txt")) == len(poses)
+    assert (tmp_path / "cut" / "timing.json").exists() and (tmp_path / "cut" / "metrics.json").exists()
+
+
+def readme_block(language, first_line):
+    """The fenced block of the README that begins with a comment naming its file."""
+    text = (Path(__file__).parents[2] / "README.md").read_text()
+    return text.split(f"```{language}\n# {first_line}\n")[1].split("```")[0]
+
+
+def test_the_plugin_package_of_the_readme_is_one_word_away(tmp_path):
+    package = tmp_path / "corners"
+    package.mkdir()
+    (package / "trihedron_corners.py").write_text(readme_block("python", "trihedron_corners.py"))
+    (package / "pyproject.toml").write_text(readme_block("toml", "pyproject.toml"))
+    site = tmp_path / "site"
+    install = [sys.executable, "-m", "pip", "install", "-q", "--no-deps", "--no-build-isolation", "--no-index", "--target", str(site), str(package)]
+    subprocess.run(install, check=True, capture_output=True)
+    code = "import sys; from trihedron.pipeline.cli import main; sys.exit(main(sys.argv[1:]))"
+    environment = {**os.environ, "PYTHONPATH": str(site)}
+
+    def trihedron(*words):
+        return subprocess.run([sys.executable, "-c", code, *words], env=environment, capture_output=True, text=True)
+
+    done = trihedron("run", *SMALL, "keypoints=shi_tomasi", "keypoints.features=200", "out=corners_run")
+    assert done.returncode == 0, done.stderr
+    values = list(Recording("corners_run/run.mcap").values("keypoints"))
+    assert len(values) == 12 and 20 < max(len(v.pixels) for v in values) <= 200
+    (site / "trihedron_corners.py").write_text("import not_there")
+    done = trihedron("run", *SMALL)
+    assert (done.returncode, done.stderr.strip()) == (1, (
+        "trihedron: plugin package trihedron-corners (trihedron_corners): does not load: ModuleNotFoundError: "
+        "No module named 'not_there'; mend it or uninstall it"
+    ))

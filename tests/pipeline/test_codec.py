@@ -1,0 +1,146 @@
+"""Values come back bit for bit; damaged bytes are refused in one line."""
+
+import contextlib
+
+import numpy as np
+import pytest
+
+from trihedron.pipeline.codec import FULL_EVERY, Decoder, Encoder, ValueMessage
+from trihedron.pipeline.errors import RecordingError
+from trihedron.pipeline.table import Column, Table
+from trihedron.pipeline.types import Camera, DepthNoise, Frame, Keypoints, Map, Planes, Rotation
+
+RNG = np.random.default_rng(0)
+
+
+def keypoints(n=20):
+    floats = [RNG.random(shape, dtype=np.float32) for shape in ((n, 2), (n, 3), (n,), (n,), (n,))]
+    floats[1][::3] = np.nan
+    octaves, descriptors = RNG.integers(0, 8, n, dtype=np.uint8), RNG.integers(0, 255, (n, 32), dtype=np.uint8)
+    return Keypoints(7, 2**40, *floats[:4], octaves, floats[4], descriptors, "hamming")
+
+
+def same(a, b):
+    assert type(a) is type(b)
+    for name in vars(a):
+        x, y = getattr(a, name), getattr(b, name)
+        if isinstance(x, np.ndarray):
+            assert x.dtype == y.dtype and x.shape == y.shape and x.tobytes() == y.tobytes(), name
+        elif isinstance(x, Table):
+            assert x.size == y.size and all(np.array_equal(x.column(c), y.column(c)) for c in x.schema), name
+        else:
+            assert x == y, name
+
+
+def there_and_back(value):
+    return Decoder("file: topic /x").decode(Encoder().encode(value).SerializeToString())
+
+
+def test_arrays_scalars_text_and_nested_values():
+    for n in (0, 1, 300):
+        value = keypoints(n)
+        same(value, there_and_back(value))
+    color, depth = RNG.integers(0, 255, (48, 64, 3), dtype=np.uint8), RNG.random((48, 64), dtype=np.float32)
+    depth[3, 4] = 0.0
+    frame = Frame(1, 2, color, depth, Camera(64, 48, 50.0, 51.0, 31.5, 23.5, 15.0, DepthNoise(floor_m=0.002)))
+    same(frame, there_and_back(frame))
+    none = np.empty((0, 3, 3))
+    rotation = Rotation(1, 2, np.eye(3), np.eye(3), none, none, np.empty(0, np.int32), np.empty(0), "tracks")
+    same(rotation, there_and_back(rotation))
+
+
+def test_label_images_are_stored_small():
+    labels = np.zeros((240, 320), np.uint8)
+    labels[50:150, 60:200] = 1
+    f8 = np.zeros
+    planes = Planes(0, 0, f8((1, 4)), f8((1, 3, 3)), f8((1, 4, 4)), np.zeros(1, np.int32), np.zeros((1, 48, 3), np.float32), labels, 2)
+    assert Encoder().encode(planes).ByteSize() < 3000
+    same(planes, there_and_back(planes))
+
+
+def maps(count):
+    """Successive versions of a map whose points grow and change."""
+    empty = Table.empty({"x": Column("f8")})
+    points = Table.empty({"position_m": Column("f8", (3,)), "alive": Column("?")})
+    for i in range(count):
+        if i:
+            points = points.updated(np.array([i - 1]), position_m=np.full((1, 3), -float(i)))
+        points, _ = points.appended(position_m=np.full((100, 3), float(i)), alive=np.ones(100, bool))
+        yield Map(i, i, i, empty, points, empty, empty, empty, empty, empty)
+
+
+def test_tables_are_written_as_changes_and_rebuilt():
+    encoder, decoder = Encoder(), Decoder("file: topic /map")
+    sizes = []
+    for value in maps(FULL_EVERY + 5):
+        message = encoder.encode(value)
+        sizes.append(message.ByteSize())
+        same(value, decoder.decode(message.SerializeToString()))
+    assert max(sizes[20:FULL_EVERY]) < 25_000  # a chunk or two, however large the map
+    assert sizes[FULL_EVERY] > 100_000  # whole again
+
+
+def test_changes_depend_on_values_not_on_who_holds_them():
+    versions = list(maps(3))
+    copies = [Decoder("x").decode(Encoder().encode(v).SerializeToString()) for v in versions]
+    one, two = Encoder(), Encoder()
+    for version, copy in zip(versions, copies):
+        assert one.encode(version).SerializeToString() == two.encode(copy).SerializeToString()
+
+
+def message_of(value):
+    message = ValueMessage()
+    message.ParseFromString(Encoder().encode(value).SerializeToString())
+    return message
+
+
+def refusal(message):
+    with pytest.raises(RecordingError) as error:
+        Decoder("a.mcap: topic /keypoints").decode(message if isinstance(message, bytes) else message.SerializeToString())
+    return str(error.value)
+
+
+def test_damaged_and_foreign_values_are_refused():
+    assert refusal(b"\xff\xff\xff") == (
+        "a.mcap: topic /keypoints: holds a message that is not a trihedron.Value; the file is damaged; record it again"
+    )
+    message = message_of(keypoints())
+    message.type = "Keypoint"
+    assert refusal(message) == "a.mcap: topic /keypoints: holds the unknown type 'Keypoint'; read it with the version that wrote it"
+    message = message_of(keypoints())
+    message.version = 9
+    assert refusal(message) == (
+        "a.mcap: topic /keypoints: holds Keypoints version 9, this program reads version 1; "
+        "record again, or read it with the version that wrote it"
+    )
+    message = message_of(keypoints())
+    del message.arrays[2]
+    assert refusal(message) == "a.mcap: topic /keypoints: frame 7: Keypoints does not fit: 'sigma_px'; the file is damaged; record it again"
+    message = message_of(keypoints())
+    message.arrays[0].shape[0] = 1 << 50
+    assert refusal(message) == (
+        "a.mcap: topic /keypoints: array 'pixels' claims type 'f4' and shape (1125899906842624, 2); the file is damaged; record it again"
+    )
+    message = message_of(keypoints())
+    message.arrays[0].shape[0] = 19
+    assert refusal(message) == (
+        "a.mcap: topic /keypoints: array 'pixels' does not have the 152 bytes of its shape (19, 2); the file is damaged; record it again"
+    )
+    message = message_of(keypoints())
+    message.arrays[0].dtype = "O"
+    assert "array 'pixels' claims type 'O'" in refusal(message)
+    change = list(maps(2))
+    encoder = Encoder()
+    encoder.encode(change[0])
+    assert "keyframes: a change without the version before it" in refusal(encoder.encode(change[1]).SerializeToString())
+
+
+def test_random_damage_never_raises_anything_else():
+    data = bytearray(Encoder().encode(keypoints()).SerializeToString())
+    rng = np.random.default_rng(1)
+    for _ in range(2000):
+        damaged = bytearray(data)
+        for at in rng.integers(0, len(data), 3):
+            damaged[at] = rng.integers(0, 256)
+        with contextlib.suppress(RecordingError):
+            Decoder("x").decode(bytes(damaged[: rng.integers(1, len(data))]))

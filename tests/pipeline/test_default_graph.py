@@ -1,0 +1,118 @@
+"""The promises of the dataflow over the whole default graph: bytes do not depend on threads, and every stage runs again alone, bit for bit."""
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from mcap.reader import make_reader
+from mcap.writer import CompressionType, Writer
+
+sys.path.insert(0, str(Path(__file__).parent))
+from toys import contents
+
+FRAMES = 104
+STAGES = [
+    "dataset", "normals", "keypoints", "lines", "segments", "planes", "manhattan", "tracks", "rotation", "translation", "matches", "pose", "map",
+]  # fmt: skip
+CHANGES = {
+    "dataset": "dataset.seed=5",
+    "normals": "normals.patch_px=14",
+    "keypoints": "keypoints.features=500",
+    "lines": "lines.min_length_px=40",
+    "segments": "segments.share=0.8",
+    "planes": "planes.min_pixels=4000",
+    "manhattan": "manhattan.bandwidth_deg=3",
+    "tracks": "tracks.radius_px=12",
+    "rotation": "rotation.max_weight=3",
+    "translation": "translation.line_sigma_px=3",
+    "matches": "matches.radius_px=3",
+    "pose": "pose.line_sigma_px=3",
+    "map": "map.max_frames=5",
+}
+RECORD = ["dataset=synthetic", f"dataset.frames=0:{FRAMES}", "dataset.width=320", "dataset.height=240"]
+RECORD += ["record.frames=true", "record.topics=[normals]"]
+REPLAY = """
+import json, sys
+from trihedron.pipeline.cli import main
+jobs = json.loads(sys.argv[1])
+sys.exit(max(main(["run", *job]) for job in jobs))
+"""
+
+
+def run(*jobs, cwd):
+    """Several `trihedron run` in one fresh process."""
+    done = subprocess.run([sys.executable, "-c", REPLAY, json.dumps(jobs)], cwd=cwd, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr[-2000:]
+    return done.stdout
+
+
+def without(source, topic, path):
+    """A copy of a recording, message by message, that lacks one topic."""
+    with open(source, "rb") as file, open(path, "wb") as copy:
+        reader, writer, channels = make_reader(file), Writer(copy, compression=CompressionType.NONE), {}
+        writer.start()
+        for record in reader.iter_metadata():
+            writer.add_metadata(record.name, record.metadata)
+        for record in reader.iter_attachments():
+            writer.add_attachment(0, 0, record.name, record.media_type, record.data)
+        for schema, channel, message in reader.iter_messages(log_time_order=False):
+            if channel.topic == f"/{topic}":
+                continue
+            if channel.id not in channels:
+                schema_id = writer.register_schema(schema.name, schema.encoding, schema.data)
+                channels[channel.id] = writer.register_channel(channel.topic, channel.message_encoding, schema_id)
+            writer.add_message(channels[channel.id], message.log_time, message.data, message.publish_time)
+        writer.finish()
+
+
+@pytest.fixture(scope="module")
+def recorded(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("runs")
+    run([*RECORD, f"out={folder}/two", "threads=2"], cwd=folder)
+    return folder
+
+
+def test_every_topic_has_the_same_bytes_for_one_thread_and_two(recorded):
+    run([*RECORD, f"out={recorded}/one", "threads=1"], cwd=recorded)
+    one, two = contents(recorded / "one" / "run.mcap"), contents(recorded / "two" / "run.mcap")
+    assert set(one) == set(two) >= {f"/{stage}" for stage in STAGES}
+    assert [topic for topic in one if one[topic] != two[topic]] == []
+    for name in ("trajectory.txt", "trajectory_causal.txt", "metrics.json"):
+        assert (recorded / "one" / name).read_bytes() == (recorded / "two" / name).read_bytes()
+
+
+def test_every_stage_run_again_alone_gives_its_bytes_and_a_change_changes_them(recorded):
+    source = contents(recorded / "two" / "run.mcap")
+    jobs = []
+    for stage in STAGES:
+        without(recorded / "two" / "run.mcap", stage, recorded / f"without_{stage}.mcap")
+        again = [f"replay={recorded}/without_{stage}.mcap", f"only=[{stage}]"]
+        jobs += [[*again, f"out={recorded}/same_{stage}"], [*again, f"out={recorded}/changed_{stage}", CHANGES[stage]]]
+    run(*jobs, cwd=recorded)
+    for stage in STAGES:
+        topic = f"/{stage}"
+        same, changed = contents(recorded / f"same_{stage}" / "run.mcap"), contents(recorded / f"changed_{stage}" / "run.mcap")
+        assert len(source[topic]) >= (100 if stage != "map" else 3)
+        assert same[topic] == source[topic], stage
+        assert changed[topic] != source[topic], stage
+        assert {t for t in same if t[1:] in STAGES} == {topic}  # nothing is copied that was not computed
+
+
+def test_recorded_feedback_gives_the_same_bytes_too(recorded):
+    whole = recorded / "two" / "run.mcap"
+    stateful = ["manhattan", "tracks", "rotation", "pose", "map"]
+    run(*[[f"replay={whole}", f"only=[{s}]", "feedback=recorded", f"out={recorded}/feedback_{s}"] for s in stateful], cwd=recorded)
+    source = contents(whole)
+    for stage in stateful:
+        assert contents(recorded / f"feedback_{stage}" / "run.mcap")[f"/{stage}"] == source[f"/{stage}"], stage
+
+
+def test_a_replay_with_new_poses_writes_their_trajectory(recorded):
+    whole = recorded / "two" / "run.mcap"
+    out = run([f"replay={whole}", "only=[rotation,translation,matches,pose,map]", f"out={recorded}/tracking"], cwd=recorded)
+    assert "ATE" in out
+    for name in ("trajectory.txt", "metrics.json"):
+        assert (recorded / "tracking" / name).read_bytes() == (recorded / "two" / name).read_bytes()
+    assert Path(recorded / "same_manhattan").exists() and not (recorded / "same_manhattan" / "trajectory.txt").exists()

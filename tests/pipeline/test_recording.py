@@ -1,0 +1,143 @@
+"""Recordings: what stands first, when chunks close, what a viewer sees, and what a wrong file says."""
+
+import io
+import json
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from mcap.exceptions import McapError
+from mcap.reader import make_reader
+from mcap.records import Chunk, Message, Metadata
+from mcap.stream_reader import StreamReader
+from mcap.writer import Writer
+from mcap_protobuf.decoder import DecoderFactory
+
+from trihedron.pipeline import recording as module
+from trihedron.pipeline.errors import RecordingError
+from trihedron.pipeline.foxglove import View
+from trihedron.pipeline.recording import FrameReader, Recording, RecordingWriter, TopicReader
+from trihedron.pipeline.types import Planes, Segments
+
+sys.path.insert(0, str(Path(__file__).parent))
+from toys import ToyDataset, ToyKeypoints
+
+
+def keypoints(index):
+    return ToyKeypoints()(ToyDataset(40)(index), np.random.default_rng(index))
+
+
+def write(path, indices, **metadata):
+    writer = RecordingWriter(path, {"overrides": '["threads=1"]', **metadata})
+    for i in indices:
+        writer.write("keypoints", keypoints(i))
+        writer.write_timing(i, 1000 * i, 1.5, {"keypoints": 1.25})
+    writer.close()
+    return path
+
+
+def test_metadata_stands_before_every_message(tmp_path):
+    records = list(StreamReader(io.BytesIO(write(tmp_path / "a.mcap", [1, 2], version="1.2.3").read_bytes())).records)
+    kinds = [type(r) for r in records]
+    assert kinds.index(Metadata) < kinds.index(next(k for k in kinds if k.__name__ in ("Message", "Chunk", "Schema")))
+    assert records[kinds.index(Metadata)].metadata["version"] == "1.2.3"
+    assert Recording(tmp_path / "a.mcap").overrides() == ["threads=1"]
+
+
+def chunks(path):
+    with open(path, "rb") as file:
+        return [r for r in StreamReader(file, emit_chunks=True).records if isinstance(r, Chunk)]
+
+
+def test_chunks_close_by_size_and_by_time(tmp_path, monkeypatch):
+    assert len(chunks(write(tmp_path / "few.mcap", range(4)))) == 1
+    monkeypatch.setattr(module, "CHUNK_BYTES", 5_000)
+    many = chunks(write(tmp_path / "size.mcap", [i for _ in range(4) for i in range(38) if i % 5 != 4]))
+    assert len(many) > 5 and max(c.uncompressed_size for c in many) < 5_000
+    monkeypatch.setattr(module, "CHUNK_BYTES", 1 << 20)
+    monkeypatch.setattr(module, "CHUNK_SECONDS", 0.0)
+    assert len(chunks(write(tmp_path / "time.mcap", [0, 1, 2, 3]))) == 8
+
+
+def test_what_is_flushed_survives_a_cut(tmp_path, monkeypatch):
+    monkeypatch.setattr(module, "CHUNK_SECONDS", 0.0)
+    writer = RecordingWriter(tmp_path / "a.mcap", {})
+    for i in (0, 1, 2):
+        writer.write("keypoints", keypoints(i))
+    stream = StreamReader(io.BytesIO((tmp_path / "a.mcap").read_bytes())).records
+    messages = 0
+    with pytest.raises(McapError):  # the end is missing, as after a kill
+        for record in stream:
+            messages += isinstance(record, Message)
+    assert messages == 3
+
+
+def test_topics_and_values(tmp_path):
+    recording = Recording(write(tmp_path / "a.mcap", [0, 1, 2, 3, 5]))
+    assert recording.topics == {"keypoints"} and recording.counts == {"/keypoints": 5, "/timing": 5}
+    assert [v.index for v in recording.values("keypoints")] == [0, 1, 2, 3, 5]
+    reader = TopicReader(recording, "keypoints")
+    assert reader.at(1).index == 1 and reader.latest.index == 0
+    assert reader.at(4) is None and reader.latest.index == 3
+    assert reader.at(5).index == 5 and reader.at(9) is None
+    frames = FrameReader(recording, "keypoints")
+    assert [frames.at(1000 * i).index for i in (5, 0, 2)] == [5, 0, 2] and frames.at(4000) is None
+    timing = [json.loads(m.data) for m in recording.messages("/timing")]
+    assert timing[1] == {"index": 1, "frame_ms": 1.5, "stage_ms": {"keypoints": 1.25}}
+
+
+def test_wrong_files_say_so_in_one_line(tmp_path):
+    def refusal(path):
+        with pytest.raises(RecordingError) as error:
+            Recording(path)
+        return str(error.value).replace(str(tmp_path), "DIR")
+
+    assert refusal(tmp_path / "no.mcap") == "DIR/no.mcap: cannot be read: No such file or directory; give the path of a run.mcap"
+    whole = write(tmp_path / "a.mcap", range(4)).read_bytes()
+    (tmp_path / "cut.mcap").write_bytes(whole[: len(whole) // 2])
+    assert refusal(tmp_path / "cut.mcap") == "DIR/cut.mcap: is not a complete MCAP file; the run that wrote it was cut off; record it again"
+    (tmp_path / "text.mcap").write_text("not an MCAP file")
+    assert refusal(tmp_path / "text.mcap").startswith("DIR/text.mcap: is not a complete MCAP file")
+    (tmp_path / "empty.mcap").write_bytes(b"")
+    assert refusal(tmp_path / "empty.mcap").startswith("DIR/empty.mcap: is not a complete MCAP file")
+    with open(tmp_path / "other.mcap", "wb") as file:
+        other = Writer(file)
+        other.start()
+        other.finish()
+    assert refusal(tmp_path / "other.mcap") == (
+        "DIR/other.mcap: is an MCAP file, but not a recording of trihedron; convert it with: trihedron convert SRC DST.mcap"
+    )
+    write(tmp_path / "new.mcap", [0], format="7")
+    assert refusal(tmp_path / "new.mcap") == "DIR/new.mcap: has format 7, this program reads format 1; read it with the version that wrote it"
+    with pytest.raises(RecordingError) as error:
+        RecordingWriter(tmp_path / "no" / "a.mcap", {})
+    assert str(error.value).replace(str(tmp_path), "DIR") == "DIR/no/a.mcap: cannot be written: No such file or directory; give another out=FOLDER"
+
+
+def test_viewer_messages_are_decoded_by_their_own_schema(tmp_path):
+    view, frame = View(), ToyDataset()(3)
+    pixels, points, covariance = (np.zeros((2, 2, *shape), np.float32) for shape in ((2,), (3,), (3, 3)))
+    lines = Segments(3, 3000, pixels, points, covariance, np.zeros((2, 0), np.uint8))
+    square = np.array([[[-1, -1, 2], [1, -1, 2], [1, 1, 2], [-1, 1, 2], [0, 0, 2]]], np.float32)
+    labels = np.zeros((2, 2), np.uint8)
+    front = np.array([[0, 0, -1.0, 2.0]])
+    plane = Planes(3, 3000, front, np.zeros((1, 3, 3)), np.zeros((1, 4, 4)), np.ones(1, np.int32), square, labels, 2)
+    writer = RecordingWriter(tmp_path / "a.mcap", {})
+    for value in (frame, lines, plane):
+        for channel, message in view.messages(value):
+            writer.write_message(channel, message, value.stamp_ns)
+    assert list(view.messages(frame)) == []  # the same tenth of a second
+    writer.close()
+    with open(tmp_path / "a.mcap", "rb") as file:
+        found = {c.topic: (s.name, m) for s, c, _, m in make_reader(file, decoder_factories=[DecoderFactory()]).iter_decoded_messages()}
+    assert {topic: name for topic, (name, _) in found.items()} == {
+        "/view/image": "foxglove.CompressedImage",
+        "/view/camera": "foxglove.CameraCalibration",
+        "/view/lines": "foxglove.SceneUpdate",
+        "/view/planes": "foxglove.SceneUpdate",
+    }
+    assert list(found["/view/camera"][1].K) == [2.0, 0, 1.5, 0, 2.0, 1.0, 0, 0, 1]
+    assert len(found["/view/lines"][1].entities[0].lines[0].points) == 4
+    assert len(found["/view/planes"][1].entities[0].triangles[0].points) == 6  # the square, without the point inside
+    assert found["/view/image"][1].format == "jpeg" and found["/view/image"][1].data[:2] == b"\xff\xd8"

@@ -1,0 +1,137 @@
+"""A plugin that breaks its slot's contract is refused when it registers, with its name and file."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+
+from trihedron.pipeline import registry
+from trihedron.pipeline.errors import PluginError
+from trihedron.pipeline.registry import plugin_class, plugins_of, register
+from trihedron.pipeline.types import Frame, Keypoints, Map, Normals, Surface
+
+
+@pytest.fixture(autouse=True)
+def own_plugins(monkeypatch):
+    monkeypatch.setattr(registry, "_PLUGINS", {slot: {} for slot in registry._PLUGINS})
+
+
+def refusal(slot, cls, name="mine"):
+    with pytest.raises(PluginError) as error:
+        register(slot, name)(cls)
+    return str(error.value).replace(__file__, "FILE")
+
+
+@dataclass(frozen=True)
+class Good:
+    """Takes the slot's input and a generator."""
+
+    level: float = 0.5
+
+    def __call__(self, frame: Frame, rng: np.random.Generator) -> Keypoints | None: ...
+
+
+def test_a_good_plugin_is_found_by_name():
+    assert register("keypoints", "mine")(Good) is Good
+    assert plugin_class("keypoints", "mine") is Good and plugins_of("keypoints") == {"mine": Good}
+    with pytest.raises(PluginError) as error:
+        plugin_class("keypoints", "mime")
+    assert str(error.value) == "keypoints: there is no plugin 'mime' for the slot 'keypoints'; did you mean 'mine'?"
+    with pytest.raises(PluginError) as error:
+        plugin_class("keypoint", "mine")
+    assert str(error.value) == "keypoint: there is no slot 'keypoint'; did you mean 'keypoints'?"
+
+
+def test_unknown_slot():
+    assert refusal("keypoint", Good) == "plugin keypoint=mine (FILE): there is no slot 'keypoint'; did you mean 'keypoints'?"
+
+
+def test_taken_name():
+    register("keypoints", "mine")(Good)
+
+    @dataclass(frozen=True)
+    class Other:
+        def __call__(self, frame: Frame) -> Keypoints | None: ...
+
+    assert refusal("keypoints", Other) == "plugin keypoints=mine (FILE): the name is taken by FILE; register it under another name"
+
+
+def test_not_a_frozen_dataclass():
+    @dataclass
+    class Mutable:
+        def __call__(self, frame: Frame) -> Keypoints | None: ...
+
+    expected = "plugin keypoints=mine (FILE): is not a frozen dataclass; put @dataclass(frozen=True) under @register"
+    assert refusal("keypoints", Mutable) == expected
+
+
+def test_foreign_parameter():
+    @dataclass(frozen=True)
+    class Asks:
+        def __call__(self, frme: Frame) -> Keypoints | None: ...
+
+    expected = "plugin keypoints=mine (FILE): __call__ takes 'frme', which the slot 'keypoints' does not give; did you mean 'frame'?"
+    assert refusal("keypoints", Asks) == expected
+
+
+def test_wrong_parameter_type():
+    @dataclass(frozen=True)
+    class Asks:
+        def __call__(self, frame: Normals) -> Keypoints | None: ...
+
+    assert refusal("keypoints", Asks) == "plugin keypoints=mine (FILE): __call__ takes 'frame' as Normals; the slot gives Frame"
+
+
+def test_untyped_parameter():
+    @dataclass(frozen=True)
+    class Asks:
+        def __call__(self, frame) -> Keypoints | None: ...
+
+    assert refusal("keypoints", Asks) == "plugin keypoints=mine (FILE): __call__ takes 'frame' as nothing declared; the slot gives Frame"
+
+
+def test_wrong_return_type():
+    @dataclass(frozen=True)
+    class Gives:
+        def __call__(self, frame: Frame) -> Normals: ...
+
+    assert refusal("keypoints", Gives) == "plugin keypoints=mine (FILE): returns Normals; the slot 'keypoints' returns Keypoints"
+
+
+def test_no_call():
+    @dataclass(frozen=True)
+    class Empty:
+        level: int = 0
+
+    assert refusal("keypoints", Empty) == "plugin keypoints=mine (FILE): has no method __call__; the slot 'keypoints' needs it"
+
+
+def test_a_fold_needs_three_methods():
+    @dataclass(frozen=True)
+    class Fold:
+        def start(self) -> int: ...
+        def add(self, state: int, frame: Frame) -> int: ...
+
+    assert refusal("surface", Fold) == "plugin surface=mine (FILE): has no method finish; the slot 'surface' needs it"
+
+    @dataclass(frozen=True)
+    class Whole(Fold):
+        def finish(self, state: int, map: Map | None) -> Surface: ...
+
+    assert register("surface", "mine")(Whole) is Whole
+
+
+def test_a_plugin_package_that_does_not_load_is_named(monkeypatch):
+    class Entry:
+        name, value, dist = "mine", "mine.plugins", None
+
+        def load(self):
+            raise ImportError("No module named 'mine'")
+
+    monkeypatch.setattr(registry, "_BUILT_IN", ())
+    monkeypatch.setattr(registry, "entry_points", lambda group: [Entry()])
+    with pytest.raises(PluginError) as error:
+        registry.load_plugins()
+    assert str(error.value) == (
+        "plugin package mine (mine.plugins): does not load: ImportError: No module named 'mine'; mend it or uninstall it"
+    )

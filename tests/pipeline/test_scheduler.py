@@ -1,0 +1,121 @@
+"""The scheduler: wires mean what they say, and neither thread count nor duration changes a value."""
+
+import random
+import threading
+import time
+
+import pytest
+
+from trihedron.pipeline.graph import PREVIOUS, Wire
+from trihedron.pipeline.scheduler import Node, NodeFailure, Scheduler
+
+
+def run(nodes, count, threads=2, lookahead=3, initial=None):
+    return [dict(values) for _, values in Scheduler(nodes, threads, lookahead, initial or {}).run(count)]
+
+
+def jitter():
+    time.sleep(random.random() * 0.002)
+
+
+def test_same_frame_previous_and_exact_delay():
+    nodes = [
+        Node("source", lambda k, v: k if k % 3 else None, {}),
+        Node("held", lambda k, v: (k, v["x"]), {"x": Wire("source", PREVIOUS)}),
+        Node("exact", lambda k, v: (k, v["x"]), {"x": Wire("source", 2)}),
+        Node("now", lambda k, v: (k, v["x"]), {"x": Wire("source")}),
+    ]
+    frames = run(nodes, 6)
+    assert [f["now"][1] for f in frames] == [None, 1, 2, None, 4, 5]
+    assert [f["held"][1] for f in frames] == [None, None, 1, 2, 2, 4]  # the latest earlier value, kept over frames without one
+    assert [f["exact"][1] for f in frames] == [None, None, None, 1, 2, None]  # the value of exactly two frames ago, or None
+
+
+@pytest.mark.parametrize("threads", [1, 2, 4])
+def test_values_do_not_depend_on_threads_or_durations(threads):
+    def slow(function):
+        return lambda k, v: (jitter(), function(k, v))[1]
+
+    nodes = [
+        Node("a", slow(lambda k, v: k), {}),
+        Node("b", slow(lambda k, v: v["a"] + (v["state"] or 0)), {"a": Wire("a"), "state": Wire("b", PREVIOUS)}),
+        Node("late", slow(lambda k, v: (time.sleep(0.004), v["b"] * 2)[1]), {"b": Wire("b")}),
+        Node("c", slow(lambda k, v: (v["b"], v["late"])), {"b": Wire("b"), "late": Wire("late", 3)}),
+    ]
+    frames = run(nodes, 40, threads)
+    assert [f["b"] for f in frames] == [k * (k + 1) // 2 for k in range(40)]
+    assert [f["c"][1] for f in frames] == [None] * 3 + [k * (k + 1) for k in range(37)]
+
+
+def test_ordered_nodes_never_run_out_of_order_and_frames_in_flight_are_bounded():
+    seen, flying, most = [], set(), []
+    lock = threading.Lock()
+
+    def source(k, v):
+        with lock:
+            flying.add(k)
+            most.append(len(flying))
+        jitter()
+        return k
+
+    def sink(k, v):
+        jitter()
+        with lock:
+            flying.discard(k)
+        return k
+
+    nodes = [Node("source", source, {}), Node("fold", lambda k, v: (jitter(), seen.append(k))[0], {"x": Wire("source")}, ordered=True),
+             Node("sink", sink, {"x": Wire("source")})]  # fmt: skip
+    run(nodes, 60, threads=4, lookahead=3)
+    assert seen == list(range(60))
+    assert max(most) <= 3
+
+
+def test_initial_value_is_what_previous_holds_before_the_first_frame():
+    nodes = [Node("a", lambda k, v: (v["p"] or 0) + 1, {"p": Wire("a", PREVIOUS)})]
+    assert [f["a"] for f in run(nodes, 3, initial={"a": 10})] == [11, 12, 13]
+
+
+@pytest.mark.parametrize("threads", [1, 3])
+def test_failure_comes_after_the_frames_before_it_and_the_rest_of_its_own(threads):
+    def fails(k, v):
+        if k == 4:
+            raise ValueError("no")
+        return k
+
+    nodes = [Node("a", lambda k, v: k, {}), Node("b", fails, {"a": Wire("a")}), Node("c", lambda k, v: k, {"b": Wire("b")}),
+             Node("d", lambda k, v: (time.sleep(0.003), k)[1], {"a": Wire("a")})]  # fmt: skip
+    done = []
+    with pytest.raises(NodeFailure) as failure:
+        for position, values in Scheduler(nodes, threads, 3, {}).run(10):
+            done.append((position, sorted(values)))
+    assert done == [(k, ["a", "b", "c", "d"]) for k in range(4)] + [(4, ["a", "d"])]
+    assert (failure.value.node, failure.value.position) == ("b", 4)
+    assert isinstance(failure.value.__cause__, ValueError)
+
+
+def test_later_frames_that_fail_too_do_not_hang():
+    def fails(k, v):
+        time.sleep(0.02 * k)
+        raise ValueError("no")
+
+    raised = []
+
+    def run():
+        try:
+            list(Scheduler([Node("a", fails, {})], 2, 2, {}).run(10))
+        except NodeFailure as failure:
+            raised.append(failure.position)
+
+    thread = threading.Thread(target=run, daemon=True)
+    thread.start()
+    thread.join(5.0)
+    assert raised == [0]
+
+
+def test_memory_is_bounded_by_the_reach_of_the_wires():
+    scheduler = Scheduler([Node("a", lambda k, v: k, {}), Node("b", lambda k, v: k, {"x": Wire("a", 4), "y": Wire("a", PREVIOUS)})], 2, 3, {})
+    largest = 0
+    for _ in scheduler.run(200):
+        largest = max(largest, *(len(values) for values in scheduler._values.values()), *(len(held) for held in scheduler._held.values()))
+    assert largest <= 4 + 3 + 5

@@ -1,0 +1,48 @@
+"""Tables share chunks between versions, and equal a plain array."""
+
+import numpy as np
+import pytest
+
+from trihedron.pipeline.table import CHUNK, Column, Table
+
+SCHEMA = {"x": Column("f8", (3,)), "n": Column("i4")}
+
+
+def rows(count, start=0):
+    return {"x": np.arange(3 * count, dtype=float).reshape(count, 3) + start, "n": np.arange(count) + start}
+
+
+def test_append_and_read_across_chunks():
+    table, whole = Table.empty(SCHEMA), []
+    for start, count in [(0, 5), (5, CHUNK), (CHUNK + 5, 0), (CHUNK + 5, 3 * CHUNK + 1)]:
+        table, ids = table.appended(**rows(count, start))
+        assert ids.tolist() == list(range(start, start + count))
+        whole.append(rows(count, start)["x"])
+    whole = np.concatenate(whole)
+    assert np.array_equal(table.column("x"), whole)
+    ids = np.array([700, 0, 5, 5, len(table) - 1])
+    assert np.array_equal(table.rows("x", ids), whole[ids])
+    assert table.rows("x", np.empty(0, int)).shape == (0, 3)
+
+
+def test_update_copies_only_touched_chunks_and_columns():
+    before, _ = Table.empty(SCHEMA).appended(**rows(4 * CHUNK))
+    after = before.updated(np.array([1, CHUNK + 1]), n=np.array([-1, -2]))
+    assert after.rows("n", np.array([1, CHUNK + 1, 2])).tolist() == [-1, -2, 2]
+    assert before.rows("n", np.array([1])).tolist() == [1]
+    assert [a is b for a, b in zip(before.chunks["n"], after.chunks["n"])] == [False, False, True, True]
+    assert all(a is b for a, b in zip(before.chunks["x"], after.chunks["x"]))
+    with pytest.raises(ValueError, match="read-only"):
+        after.chunks["n"][0][0] = 3
+
+
+def test_wrong_use_is_refused():
+    table, _ = Table.empty(SCHEMA).appended(**rows(3))
+    with pytest.raises(IndexError, match="row 3 of a table of 3"):
+        table.rows("x", np.array([0, 3]))
+    with pytest.raises(IndexError, match="row -1 of a table of 3"):
+        table.rows("x", np.array([0, -1]))
+    with pytest.raises(ValueError, match="appended needs equally long columns"):
+        table.appended(x=np.zeros((2, 3)), n=np.zeros(1))
+    with pytest.raises(ValueError, match="appended needs equally long columns"):
+        table.appended(x=np.zeros((2, 3)))

@@ -1,0 +1,361 @@
+"""The co-visibility map of a room that is known: what it keeps, how it converges, what it forgets, how it is corrected."""
+
+import dataclasses
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from trihedron.pipeline.geometry import exp_se3, invert, tangent_basis, transform, transform_planes
+from trihedron.pipeline.types import Correction, Pose
+from trihedron.plugins.map.covisibility import Covisibility
+from trihedron.plugins.map.none import NoMap
+from trihedron.plugins.matches.local_map import LocalMap
+from trihedron.plugins.numerics import plane_fusion
+
+sys.path.insert(0, str(Path(__file__).parent))
+from landmark_world import World, camera_at, rotation_of, translation_of
+
+EVERY = Covisibility(min_frames=1, max_frames=1, min_shift=1e-3)  # each frame of a moving camera is a keyframe
+TABLES = ("keyframes", "points", "lines", "planes", "point_observations", "line_observations", "plane_observations")
+
+
+def pose_of(T, index, status="ok", inliers=(0, 0, 0)):
+    return Pose(index, index * 33_000_000, T, np.eye(6) * 1e-10, T, -1, np.array(inliers, np.int32), 0, status, "")
+
+
+def step(stage, world, map, index, at=None, features=None, bundle=None, loop=None, **pose):
+    """The map after frame `index`, whose camera stands at step `at` of the path and is known exactly; None when the stage says None."""
+    T = camera_at(index if at is None else at)
+    features = features or world.features(T, index)
+    matches = LocalMap()(world.frame(index), rotation_of(T, index), translation_of(T, index), *features, map)
+    return stage(world.frame(index), pose_of(T, index, **pose), *features, matches, map, bundle, loop)
+
+
+def walk(world, count, stage=EVERY, stride=1):
+    map = None
+    for index in range(count):
+        map = step(stage, world, map, index, at=index * stride) or map
+    return map
+
+
+def rows_of_world(world, map):
+    """The world's row of each map point: the nearest one with the same descriptor."""
+    same = (map.points.column("descriptor")[:, None] == world.descriptor[None]).all(axis=2)
+    assert (same.sum(axis=1) == 1).all()
+    return same.argmax(axis=1)
+
+
+def test_the_first_frame_makes_a_keyframe_of_everything_with_depth():
+    world = World()
+    keypoints, segments, planes = world.features(np.eye(4), 0)
+    map = step(Covisibility(), world, None, 0)
+    with_depth = np.isfinite(keypoints.points_m).all(axis=1)
+    assert map.revision == 1 and len(map.keyframes) == 1
+    assert np.allclose(map.points.column("position_m"), keypoints.points_m[with_depth], atol=1e-6)
+    assert np.array_equal(map.points.column("descriptor"), keypoints.descriptors[with_depth])
+    assert len(map.lines) == np.isfinite(segments.endpoints_m).all(axis=(1, 2)).sum() > 0
+    assert np.allclose(map.planes.column("coefficients"), planes.coefficients, atol=1e-6)
+    for kind in ("point", "line", "plane"):
+        table, landmarks = getattr(map, f"{kind}_observations"), getattr(map, f"{kind}s")
+        assert np.array_equal(table.column(kind), np.arange(len(landmarks))) and not table.column("keyframe").any()
+        assert list(map.keyframes.column(f"{kind}s")[0]) == [0, len(landmarks)]
+        assert (landmarks.column("observers")[:, 0] == 0).all() and (landmarks.column("observers")[:, 1:] == -1).all()
+
+
+def test_nothing_is_returned_when_nothing_changes():
+    world = World()
+    map = step(Covisibility(), world, None, 0)
+    seen = dict(inliers=(60, 10, 3))
+    assert step(Covisibility(), world, map, 1, at=0.3, **seen) is None  # 6 mm on
+    assert step(Covisibility(), world, map, 1, at=20, **seen) is None  # too soon after the last keyframe
+    assert step(Covisibility(), world, map, 9, at=20, status="lost", **seen) is None
+    assert step(Covisibility(), world, map, 200, at=0.0, **seen) is None  # a camera at rest
+    assert NoMap()(world.frame(0), pose_of(np.eye(4), 0)) is None
+
+
+@pytest.mark.parametrize(
+    "at, inliers, why", [(12, (60, 10, 3), "the view has changed"), (0.2, (5, 0, 1), "little of the last keyframe was found")]
+)
+def test_a_keyframe_is_made_when(at, inliers, why):
+    world = World()
+    map = step(Covisibility(), world, None, 0)
+    after = step(Covisibility(), world, map, 9, at=at, inliers=inliers)
+    assert after is not None and len(after.keyframes) == 2 and after.revision == 2, why
+
+
+def test_a_wall_that_is_new_makes_a_keyframe():
+    world = World()
+    keypoints, segments, planes = world.features(np.eye(4), 0)
+    columns = {name: getattr(planes, name)[1:] for name in ("coefficients", "covariance", "moments", "pixels", "samples_m")}
+    map = step(Covisibility(), world, None, 0, features=(keypoints, segments, dataclasses.replace(planes, **columns)))
+    after = step(Covisibility(), world, map, 9, at=0.2, inliers=(60, 10, 2))
+    assert len(after.planes) == 3 and len(after.keyframes) == 2
+
+
+def test_an_id_is_the_same_landmark_for_good():
+    world, maps = World(), []
+    for index in range(12):
+        maps.append(step(EVERY, world, maps[-1] if maps else None, index, at=3 * index))
+    rows = rows_of_world(world, maps[-1])
+    for earlier in maps:
+        assert np.array_equal(rows_of_world(world, earlier), rows[: len(earlier.points)])
+    observations = maps[-1].point_observations
+    seen_pixels = []
+    for keyframe, (a, b) in enumerate(maps[-1].keyframes.column("points")):
+        keypoints, born = world.keypoints(camera_at(3 * keyframe), keyframe)
+        of_row = dict(zip(born, keypoints.pixels))
+        ids = observations.column("point")[a:b]
+        assert (observations.column("keyframe")[a:b] == keyframe).all()
+        seen_pixels += [np.allclose(of_row[rows[i]], pixel) for i, pixel in zip(ids, observations.column("pixel")[a:b])]
+    assert np.mean(seen_pixels) == 1.0 and len(seen_pixels) > 500
+
+
+def test_points_converge_and_their_information_is_honest():
+    """After 20 looks the mean error is far below that of the first, and normalised by the covariance it is 3 for 3 coordinates."""
+    world = World(2000)
+    first, last = walk(world, 1), walk(world, 20)
+    errors = [map.points.column("position_m") - world.position[rows_of_world(world, map)] for map in (first, last)]
+    often = last.points.column("alive") & (last.points.column("found") >= 15)
+    assert often.sum() > 50
+    before = np.sqrt((errors[0] ** 2).sum(1).mean())
+    after = np.sqrt((errors[1][often] ** 2).sum(1).mean())
+    assert after < 0.35 * before
+    chi2 = np.einsum("ni,nij,nj->n", errors[1], last.points.column("information"), errors[1])[often]
+    assert 2.0 < np.median(chi2) * 3.0 / 2.366 < 4.5  # 2.366 is the median of χ² with 3 degrees of freedom
+
+
+def test_the_information_is_bounded_so_that_a_point_can_still_move():
+    world = World()
+    short, long = (walk(world, count, dataclasses.replace(EVERY, memory=5.0), stride=0.2) for count in (12, 30))
+    everywhere = np.flatnonzero(long.points.column("found")[: len(short.points)] >= 28)
+    ratio = np.trace(long.points.rows("information", everywhere), axis1=1, axis2=2) / np.trace(
+        short.points.rows("information", everywhere), axis1=1, axis2=2
+    )
+    assert len(everywhere) > 20 and np.median(ratio) < 1.2  # 2.5 without a bound
+
+
+def test_lines_converge_and_grow_to_what_was_seen():
+    world = World()
+    errors, lengths = [], []
+    for map in (walk(world, 1), walk(world, 20)):
+        same = (map.lines.column("descriptor")[:, None] == world.line_descriptor[None]).all(axis=2).argmax(axis=1)
+        true = world.lines[same]
+        direction = (true[:, 1] - true[:, 0]) / np.linalg.norm(true[:, 1] - true[:, 0], axis=1, keepdims=True)
+        off = map.lines.column("endpoints_m") - true[:, :1]
+        off -= (off * direction[:, None]).sum(-1, keepdims=True) * direction[:, None]
+        often = map.lines.column("found") >= (1 if len(map.keyframes) == 1 else 12)
+        errors.append(np.sqrt((off[often] ** 2).sum(-1).mean()))
+        ends = map.lines.column("endpoints_m")[often]
+        lengths.append(np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1).mean())
+    assert errors[1] < 0.5 * errors[0] and errors[1] < 0.02
+    assert lengths[1] >= lengths[0]
+
+
+def test_planes_converge_to_the_truth_and_keep_their_side():
+    """Re-estimated from the summed moments; the normalised error of (a, b, d) is 3 in the mean."""
+    chi2, first_error, last_error = [], [], []
+    for seed in range(8):
+        world = World(seed=seed)
+        map, start = walk(world, 15, stride=2), walk(world, 1)
+        found, true = map.planes.column("coefficients"), world.planes
+        same = (found[:, :3] @ true[:, :3].T).argmax(axis=1)
+        assert len(found) == len(set(same))
+        for i, k in enumerate(same):
+            error = np.array([*(tangent_basis(found[i, :3]).T @ true[k, :3]), true[k, 3] - found[i, 3]])
+            chi2.append(error @ np.linalg.solve(map.planes.column("covariance")[i], error))
+            if map.planes.column("found")[i] == 15:
+                last_error.append(np.linalg.norm(error))
+                first_error.append(np.linalg.norm(start.planes.column("coefficients")[i] - true[k]))
+    assert np.mean(last_error) < 0.5 * np.mean(first_error)
+    assert 1.5 < np.mean(chi2) < 5.0
+
+
+def test_a_point_that_is_not_found_again_dies_and_the_others_live():
+    world = World()
+    keypoints, segments, planes = world.features(np.eye(4), 0)
+    false = np.flatnonzero(np.isfinite(keypoints.points_m).all(axis=1))[::4]
+    spoilt = keypoints.descriptors.copy()
+    spoilt[false] = np.random.default_rng(9).integers(0, 256, spoilt[false].shape, dtype=np.uint8)
+    map = step(EVERY, world, None, 0, features=(dataclasses.replace(keypoints, descriptors=spoilt), segments, planes))
+    ids = np.searchsorted(np.flatnonzero(np.isfinite(keypoints.points_m).all(axis=1)), false)
+    for index in range(1, 8):
+        map = step(EVERY, world, map, index)
+    alive = map.points.column("alive")
+    assert alive[ids].mean() < 0.1
+    first = np.setdiff1d(np.flatnonzero(map.points.column("first") == 0), ids)
+    assert alive[first].mean() > 0.9
+    after = step(EVERY, world, map, 8)
+    assert after.points.rows("alive", after.point_observations.column("point")[-40:]).all()
+
+
+def test_twins_are_joined_and_their_observations_go_to_the_older():
+    """Every point of the first keyframe is entered twice, the copy under an id of its own; so is every line."""
+    world = World(noise=0.3)
+    map = step(EVERY, world, None, 0)
+    n, m = len(map.points), len(map.lines)
+    points, copies = map.points.appended(**{name: map.points.column(name) for name in map.points.schema})
+    lines, line_copies = map.lines.appended(**{name: map.lines.column(name) for name in map.lines.schema})
+    observations = {name: map.point_observations.column(name) for name in map.point_observations.schema}
+    seen, _ = map.point_observations.appended(**{**observations, "point": copies})
+    observations = {name: map.line_observations.column(name) for name in map.line_observations.schema}
+    seen_lines, _ = map.line_observations.appended(**{**observations, "line": line_copies})
+    spans = {"points": np.array([[0, 2 * n]], np.int32), "lines": np.array([[0, 2 * m]], np.int32)}
+    keyframes = map.keyframes.updated(np.array([0]), **spans)
+    map = dataclasses.replace(
+        map, points=points, lines=lines, point_observations=seen, line_observations=seen_lines, keyframes=keyframes
+    )
+    map = step(EVERY, world, map, 1)
+    again = np.isin(np.arange(n), map.point_observations.column("point")[2 * n :])
+    assert again.sum() > 20
+    alive = map.points.column("alive")
+    assert alive[:n][again].all() and not alive[n : 2 * n][again].any()
+    assert not np.isin(n + np.flatnonzero(again), map.point_observations.column("point")).any()
+    alive = map.lines.column("alive")
+    assert not (alive[:m] & alive[m : 2 * m])[np.isin(np.arange(m), map.line_observations.column("line")[2 * m :])].any()
+
+
+def split(planes, gap_m):
+    """The largest plane as two, the second turned to the other side and moved back by `gap_m`."""
+    names = ("covariance", "moments", "pixels", "samples_m", "coefficients")
+    columns = {name: getattr(planes, name)[[0, 0, *range(1, len(planes.pixels))]] for name in names}
+    back = np.eye(4)
+    back[:3, 3] = -gap_m * planes.coefficients[0, :3]
+    columns["moments"][1] = plane_fusion.move_moments(back, columns["moments"][1])
+    columns["samples_m"][1] = transform(back, columns["samples_m"][1].astype(float)).astype(np.float32)
+    columns["coefficients"][1] = -transform_planes(back, planes.coefficients[:1])[0]
+    return dataclasses.replace(planes, **columns)
+
+
+def test_the_two_faces_of_a_thin_wall_stay_two():
+    world = World()
+    map = None
+    for index in range(5):
+        keypoints, segments, planes = world.features(camera_at(index), index)
+        map = step(EVERY, world, map, index, features=(keypoints, segments, split(planes, 0.02)))
+    assert map.planes.column("alive").sum() == len(map.planes) == 4
+    a, b = map.planes.column("coefficients")[:2]
+    assert a[:3] @ b[:3] < -0.999 and abs(abs(a[3] + b[3]) - 0.02) < 0.005
+
+
+def test_a_wall_entered_twice_becomes_one():
+    world = World()
+    map = step(EVERY, world, None, 0)
+    columns = {name: map.planes.column(name)[[0]] for name in map.planes.schema}
+    columns["observers"][0, 0] = 1
+    planes, copy = map.planes.appended(**columns)
+    map = step(EVERY, world, dataclasses.replace(map, planes=planes), 1)
+    seen, _ = map.plane_observations.appended(keyframe=[1], plane=copy, moments=columns["moments"], covariance=columns["covariance"])
+    span = map.keyframes.column("planes")[1] + [0, 1]
+    map = dataclasses.replace(map, plane_observations=seen, keyframes=map.keyframes.updated(np.array([1]), planes=span[None]))
+    map = step(EVERY, world, map, 2)
+    assert list(map.planes.column("alive")) == [True, True, True, False]
+    assert not (map.plane_observations.column("plane") == copy).any()
+
+
+def correction(map, **changes):
+    none = {
+        "based_on": map.revision, "keyframe_ids": np.empty(0, np.int32), "T_world_keyframe": np.empty((0, 4, 4)), "point_ids": np.empty(0, np.int32),
+        "points_m": np.empty((0, 3)), "line_ids": np.empty(0, np.int32), "endpoints_m": np.empty((0, 2, 3)), "plane_ids": np.empty(0, np.int32),
+        "coefficients": np.empty((0, 4)), "R_corrected_world": np.eye(3),
+    }  # fmt: skip
+    return Correction(map.index, map.stamp_ns, **{**none, **changes})
+
+
+@pytest.mark.parametrize("wire", ["bundle", "loop"])
+def test_a_correction_moves_what_it_names_and_nothing_else(wire):
+    world = World()
+    map = walk(world, 4)
+    dead = map.points.updated(np.array([3]), alive=np.array([False]))
+    map = dataclasses.replace(map, points=dead)
+    old = {name: map.points.column("position_m") for name in ("points",)}["points"]
+    plane = map.planes.column("coefficients")[1].copy()
+    plane[3] += 0.05
+    ends = map.lines.column("endpoints_m")[2] + 0.01
+    moved = correction(
+        map, point_ids=np.array([1, 3, 99_999], np.int32), points_m=old[[1, 3, 0]] + 0.1, line_ids=np.array([2], np.int32), endpoints_m=ends[None],
+        plane_ids=np.array([1], np.int32), coefficients=plane[None], keyframe_ids=np.array([2, 3], np.int32),
+        T_world_keyframe=np.stack([camera_at(2) @ exp_se3(np.full(6, 0.01)), camera_at(3)]),
+    )  # fmt: skip
+    after = step(EVERY, world, map, 4, at=3.0001, status="lost", **{wire: moved})
+    assert after.revision == map.revision + 1 and len(after.keyframes) == 4
+    expected = old.copy()
+    expected[1] += 0.1
+    assert np.allclose(after.points.column("position_m"), expected)
+    assert np.allclose(after.lines.column("endpoints_m")[2], ends)
+    assert np.allclose(after.planes.column("coefficients")[1], plane)
+    fitted, _ = plane_fusion.fit_planes(after.planes.column("moments"), after.planes.column("coefficients"))
+    assert np.allclose(fitted, after.planes.column("coefficients"), atol=1e-6)  # the moments moved along, so the next frame does not undo it
+    assert np.allclose(after.keyframes.column("T_world_camera")[2], camera_at(2) @ exp_se3(np.full(6, 0.01)))
+
+
+def test_what_came_after_the_corrected_keyframes_moves_with_them():
+    """A correction of keyframes 0 to 2 arrives when keyframe 3 and its landmarks exist: the whole is moved rigidly and so is the rest."""
+    world = World()
+    map = walk(world, 4, stride=6)
+    shift = exp_se3(np.array([0.1, -0.05, 0.02, 0.01, 0.03, -0.02]))
+    poses = shift @ map.keyframes.column("T_world_camera")
+    early = {kind: np.flatnonzero(getattr(map, kind).column("first") < 3).astype(np.int32) for kind in ("points", "lines", "planes")}
+    assert any(len(early[kind]) < len(getattr(map, kind)) for kind in early)
+    moved = correction(
+        map,
+        keyframe_ids=np.arange(3, dtype=np.int32),
+        T_world_keyframe=poses[:3],
+        point_ids=early["points"],
+        points_m=transform(shift, map.points.rows("position_m", early["points"])),
+        line_ids=early["lines"],
+        endpoints_m=transform(shift, map.lines.rows("endpoints_m", early["lines"])),
+        plane_ids=early["planes"],
+        coefficients=transform_planes(shift, map.planes.rows("coefficients", early["planes"])),
+    )
+    after = step(EVERY, world, map, 4, status="lost", loop=moved)
+    assert np.allclose(after.keyframes.column("T_world_camera"), poses)
+    alive = after.points.column("alive")
+    assert np.allclose(after.points.column("position_m")[alive], transform(shift, map.points.column("position_m"))[alive])
+    alive = after.lines.column("alive")
+    assert np.allclose(after.lines.column("endpoints_m")[alive], transform(shift, map.lines.column("endpoints_m"))[alive])
+    assert np.allclose(after.planes.column("coefficients"), transform_planes(shift, map.planes.column("coefficients")))
+
+
+def test_a_keyframe_without_features_is_no_error():
+    bare = World(points=0)
+    bare.lines = bare.lines[:0]
+    keypoints, segments, planes = bare.features(camera_at(0), 0)
+    columns = {name: getattr(planes, name)[:0] for name in ("coefficients", "covariance", "moments", "pixels", "samples_m")}
+    nothing = (keypoints, segments, dataclasses.replace(planes, **columns))
+    map = step(EVERY, bare, None, 0, features=nothing)
+    assert len(map.keyframes) == 1 and len(map.points) == len(map.lines) == len(map.planes) == 0
+    world = World()
+    map = step(EVERY, world, map, 1)
+    map = step(EVERY, world, map, 2, features=nothing)
+    assert len(step(EVERY, world, map, 3).keyframes) == 4
+
+
+def test_the_same_input_gives_the_same_bytes():
+    maps = [walk(World(), 6, stride=3) for _ in range(2)]
+    for table in TABLES:
+        a, b = (getattr(map, table) for map in maps)
+        assert all(a.column(name).tobytes() == b.column(name).tobytes() for name in a.schema)
+
+
+def test_the_motion_between_two_planes_is_the_smallest():
+    rng = np.random.default_rng(0)
+    old = np.array([*rng.normal(size=3), 0.7])
+    old[:3] /= np.linalg.norm(old[:3])
+    new = transform_planes(exp_se3(rng.normal(size=6) * 0.1), old[None])[0]
+    centre = -old[3] * old[:3] + tangent_basis(old[:3]) @ [0.4, -0.3]
+    T = plane_fusion.motion_between(old, new, centre)
+    assert np.allclose(transform_planes(T, old[None])[0], new)
+    across = transform(T, centre) - centre
+    assert np.allclose(across - new[:3] * (new[:3] @ across), 0.0, atol=1e-12)
+    assert np.allclose(invert(T) @ T, np.eye(4))
+
+
+@pytest.mark.parametrize(
+    "options, field",
+    [({"min_frames": 0}, "min_frames"), ({"memory": 1.0}, "memory"), ({"min_shift": 0.0}, "min_shift"), ({"min_found": 1.1}, "min_found")],
+)
+def test_ranges_are_checked(options, field):
+    with pytest.raises(ValueError, match=field):
+        Covisibility(**options)

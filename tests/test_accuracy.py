@@ -1,0 +1,78 @@
+"""The default graph on whole sequences: every frame tracked, errors below their limits, and what each kind of feature is worth."""
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
+SEQUENCES = {
+    "structure_notexture_far": (["dataset=tum", f"dataset.path={DATA}/tum_fr3_structure_notexture_far"], 0.010),
+    "of_kt3": (["dataset=icl_nuim", f"dataset.path={DATA}/icl_nuim_of_kt3"], 0.003),
+    "textured room": (["dataset=synthetic"], 0.004),
+    "bare room": (["dataset=synthetic", "dataset.texture=false"], 0.006),
+    "office": (["dataset=tum", f"dataset.path={DATA}/icl_office_rendered"], 0.004),
+}
+RUN = "import sys; from trihedron.pipeline.cli import main; sys.exit(main(['run', *sys.argv[1:]]))"
+
+
+def track(out, *overrides):
+    """`metrics.json` of a run in its own process."""
+    done = subprocess.run([sys.executable, "-c", RUN, *overrides, f"out={out}"], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr[-1000:]
+    return json.loads((out / "metrics.json").read_text())
+
+
+@pytest.mark.parametrize("name", [pytest.param(name, marks=pytest.mark.slow if name in ("office", "textured room") else ()) for name in SEQUENCES])
+def test_every_frame_is_tracked_within_the_limit(tmp_path, name):
+    overrides, limit_m = SEQUENCES[name]
+    folder = next((Path(word.partition("=")[2]) for word in overrides if word.startswith("dataset.path=")), None)
+    if folder is not None and not folder.exists():
+        pytest.skip(f"{folder.name} is not beside this checkout")
+    metrics = track(tmp_path / "run", *overrides)
+    assert metrics["final"]["tracked_share"] == 1.0 and metrics["status"]["lost"] == 0
+    assert metrics["final"]["ate_rmse_m"] < limit_m
+    assert metrics["causal"]["ate_rmse_m"] < limit_m
+
+
+REMOVED = {  # what is removed -> where it is missed most, how, and the least factor by which the error must grow
+    "points": ([], ["keypoints=none"], 1.2),
+    "lines": (["dataset.texture=false"], ["lines=none"], 1.05),
+    "planes": (["dataset.texture=false"], ["planes=none"], 1.1),
+    "lines and planes": (["dataset.texture=false"], ["lines=none", "planes=none"], 1.5),
+    "refinement": (["dataset.texture=false"], ["graph=structural_no_refine"], 1.5),
+}
+SEEDS = (0, 1)
+
+
+@pytest.fixture(scope="module")
+def ates(tmp_path_factory):
+    """ATE over two seeds of the room `where` (textured, or bare with `dataset.texture=false`) under some overrides, each run once."""
+    folder, known = tmp_path_factory.mktemp("removed"), {}
+
+    def run(where, overrides):
+        key = (*where, *overrides)
+        if key not in known:
+            runs = [track(folder / f"{len(known)}_{s}", "dataset=synthetic", f"dataset.seed={s}", *key) for s in SEEDS]
+            assert all(metrics["final"]["tracked_share"] == 1.0 for metrics in runs)
+            known[key] = [metrics["final"]["ate_rmse_m"] for metrics in runs]
+        return known[key]
+
+    return run
+
+
+@pytest.mark.slow
+def test_without_points_a_bare_room_is_tracked_in_every_frame(ates):
+    for whole, without in zip(ates(["dataset.texture=false"], []), ates(["dataset.texture=false"], ["keypoints=none"])):
+        assert without < 1.5 * whole
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", REMOVED)
+def test_what_the_removal_of_each_kind_costs(ates, kind):
+    where, overrides, least = REMOVED[kind]
+    whole, without = sum(ates(where, [])) / len(SEEDS), sum(ates(where, overrides)) / len(SEEDS)
+    print(f"without {kind}: {without:.4f} m, {without / whole:.2f} times {whole:.4f} m, {'bare' if where else 'textured'} room")
+    assert without > least * whole

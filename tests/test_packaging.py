@@ -1,0 +1,117 @@
+"""What is installed: all of it, under one name, working away from the source folder."""
+
+import json
+import os
+import shutil
+import subprocess
+import sys
+import sysconfig
+import venv
+import zipfile
+from pathlib import Path
+
+import pytest
+from setuptools.config.pyprojecttoml import load_file
+
+ROOT = Path(__file__).resolve().parents[1]
+FOLDERS = ("pipeline", "plugins", "datasets", "tools", "conf")
+PROJECT = load_file(ROOT / "pyproject.toml")
+
+
+def test_every_folder_with_modules_is_packaged():
+    folders = {path.parent for folder in FOLDERS for path in (ROOT / folder).rglob("*.py")}
+    packages = {f"trihedron.{folder.relative_to(ROOT).as_posix().replace('/', '.')}" for folder in folders}
+    assert set(PROJECT["tool"]["setuptools"]["packages"]) == packages
+
+
+def test_folders_of_configuration_and_types_are_packages():
+    """Data files are only packaged from folders that are packages, and a type checker looks for the marker in each."""
+    for path in (ROOT / "conf").rglob("*.yaml"):
+        assert (path.parent / "__init__.py").is_file(), path
+    assert all((ROOT / folder / "py.typed").is_file() for folder in FOLDERS if folder != "conf")
+
+
+def test_commands_are_registered():
+    commands = PROJECT["project"]["entry-points"]["trihedron.commands"]
+    modules = {path.stem for path in (ROOT / "tools").glob("*.py") if "\ndef main(argv: list[str]) -> int:" in path.read_text()}
+    assert {target.removesuffix(":main").removeprefix("trihedron.tools.") for target in commands.values()} == modules
+
+
+@pytest.fixture(scope="module")
+def wheel(tmp_path_factory):
+    """The wheel, built from a copy so that nothing left over in build/ gets in."""
+    folder = tmp_path_factory.mktemp("wheel")
+    source = folder / "source"
+    source.mkdir()
+    for name in (*FOLDERS, "pyproject.toml", "README.md", "LICENSE"):
+        if (ROOT / name).is_dir():
+            shutil.copytree(ROOT / name, source / name, ignore=shutil.ignore_patterns("__pycache__"))
+        elif (ROOT / name).exists():
+            shutil.copy(ROOT / name, source / name)
+    command = [sys.executable, "-m", "pip", "wheel", "--quiet", "--no-deps", "--no-build-isolation", "--wheel-dir", str(folder), str(source)]
+    subprocess.run(command, check=True, capture_output=True)
+    (built,) = folder.glob("*.whl")
+    return built
+
+
+def test_content_of_the_wheel(wheel):
+    names = zipfile.ZipFile(wheel).namelist()
+    assert {name.split("/")[0] for name in names} == {"trihedron", wheel.name.removesuffix("-py3-none-any.whl") + ".dist-info"}
+    expected = {f"trihedron/{path.relative_to(ROOT)}" for folder in FOLDERS for path in (ROOT / folder).rglob("*") if path.suffix in (".py", ".yaml")}
+    expected |= {f"trihedron/{folder}/py.typed" for folder in FOLDERS if folder != "conf"}
+    assert {name for name in names if name.startswith("trihedron/")} == expected
+
+
+def installed(wheel: Path, folder: Path, *, with_dependencies: bool) -> Path:
+    """A new environment that holds the wheel; without dependencies of its own it borrows those of this one. Returns its bin folder."""
+    venv.create(folder, with_pip=True, symlinks=True)
+    python = folder / "bin" / "python"
+    options = [] if with_dependencies else ["--no-deps"]
+    subprocess.run([python, "-m", "pip", "install", "--quiet", *options, wheel], check=True)
+    if not with_dependencies:
+        site = subprocess.run([python, "-c", "import sysconfig; print(sysconfig.get_path('purelib'))"], capture_output=True, text=True, check=True)
+        borrowed = Path(site.stdout.strip()) / "borrowed.pth"
+        borrowed.write_text(f"import sys; sys.path.append({sysconfig.get_path('purelib')!r})\n")
+    return folder / "bin"
+
+
+def run(command: Path, *words: str, folder: Path) -> str:
+    environment = {name: value for name, value in os.environ.items() if name not in ("PYTHONPATH", "VIRTUAL_ENV")}
+    done = subprocess.run([command, *words], cwd=folder, capture_output=True, text=True, env=environment)
+    assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
+def check_installation(programs: Path, folder: Path) -> None:
+    """Use the installed program from another folder; no top-level name but `trihedron` may have come with it."""
+    folder.mkdir()
+    where = run(programs / "python", "-c", "import trihedron.pipeline.cli as m; print(m.__file__)", folder=folder)
+    assert Path(where.strip()).is_relative_to(programs.parent.resolve())
+    for name in (*FOLDERS, "tests"):
+        assert not list(programs.parent.glob(f"lib/*/site-packages/{name}")), name
+    text = run(programs / "trihedron", "--help", folder=folder)
+    assert all(f"\n  {name} " in text for name in ("run", "evaluate", "plugins", "topics", "convert"))
+    slots = json.loads(run(programs / "trihedron", "plugins", "--json", folder=folder))["slots"]
+    assert {"synthetic", "tum", "icl_nuim", "folder", "mcap"} <= {plugin["name"] for plugin in slots[0]["plugins"]}
+
+
+def run_five_frames(programs: Path, folder: Path, *words: str) -> None:
+    run(programs / "trihedron", "run", "dataset=synthetic", "dataset.frames=0:5", "out=five", *words, folder=folder)
+    assert json.loads((folder / "five" / "timing.json").read_text())["frames"] == 5
+
+
+def test_wheel_in_an_empty_environment(wheel, tmp_path):
+    """Two stages only: a new environment compiles its kernels anew, and all of them take more than a minute."""
+    programs = installed(wheel, tmp_path / "env", with_dependencies=False)
+    check_installation(programs, tmp_path / "elsewhere")
+    run_five_frames(programs, tmp_path / "elsewhere", "outputs=[keypoints]")
+    topics = run(programs / "trihedron", "topics", "five/run.mcap", folder=tmp_path / "elsewhere")
+    assert ["/keypoints", "trihedron.Keypoints", "5"] in [line.split()[:3] for line in topics.splitlines()]
+
+
+@pytest.mark.slow
+def test_wheel_with_its_own_dependencies(wheel, tmp_path):
+    programs = installed(wheel, tmp_path / "env", with_dependencies=True)
+    check_installation(programs, tmp_path / "elsewhere")
+    run_five_frames(programs, tmp_path / "elsewhere")
+    assert len([line for line in (tmp_path / "elsewhere" / "five" / "trajectory.txt").read_text().splitlines() if line[0] != "#"]) == 5

@@ -1,0 +1,114 @@
+"""`trihedron convert`: frames and truth survive bit for bit, and every mistake is one line."""
+
+import cv2
+import numpy as np
+import pytest
+
+from trihedron.datasets.trajectories import read_trajectory
+from trihedron.pipeline.cli import main
+from trihedron.pipeline.recording import Recording
+from trihedron.pipeline.registry import load_plugins, plugin_class
+
+CAMERA = "width: 64\nheight: 48\nfx: 50.0\nfy: 50.0\ncx: 31.5\ncy: 23.5\ndepth_scale: 5000\nfps: 30\n"
+COUNT = 12
+
+
+@pytest.fixture
+def folder(tmp_path, monkeypatch):
+    """A data set of 12 random frames in the layout of the TUM benchmark, with truth for all."""
+    monkeypatch.chdir(tmp_path)
+    rng = np.random.default_rng(0)
+    root = tmp_path / "room"
+    for name in ("rgb", "depth"):
+        (root / name).mkdir(parents=True)
+    lists = {"rgb": "", "depth": "", "groundtruth": ""}
+    for i in range(COUNT):
+        stamp = f"{10 + i / 30:.6f}"
+        cv2.imwrite(str(root / "rgb" / f"{i}.png"), rng.integers(0, 255, (48, 64, 3), dtype=np.uint8))
+        cv2.imwrite(str(root / "depth" / f"{i}.png"), rng.integers(1, 30_000, (48, 64), dtype=np.uint16))
+        lists["rgb"] += f"{stamp} rgb/{i}.png\n"
+        lists["depth"] += f"{stamp} depth/{i}.png\n"
+        lists["groundtruth"] += f"{stamp} {0.1 * i} 0 0 0 0 0 1\n"
+    for name, text in lists.items():
+        (root / f"{name}.txt").write_text(text)
+    (root / "camera.yaml").write_text(CAMERA)
+    return root
+
+
+def dataset(name, **options):
+    load_plugins()
+    return plugin_class("dataset", name)(**options)
+
+
+def assert_same_frames(a, b, shift=0):
+    assert len(a) == len(b)
+    for i in range(len(a)):
+        first, second = a(i), b(i)
+        assert (first.stamp_ns, first.camera) == (second.stamp_ns, second.camera)
+        assert first.color.tobytes() == second.color.tobytes()
+        assert first.depth_m.tobytes() == second.depth_m.tobytes()
+        assert second.index == first.index - shift
+
+
+def test_folder_to_recording(folder, capsys):
+    assert main(["convert", "room", "room.mcap"]) == 0
+    out = capsys.readouterr().out
+    assert out.startswith("room.mcap: 12 frames, ")
+    assert out.endswith(" MB\n")
+    source, made = dataset("tum", path="room"), dataset("mcap", path="room.mcap")
+    assert_same_frames(source, made)
+    assert np.array_equal(made.truth().stamps_ns, source.truth().stamps_ns)
+    assert np.allclose(made.truth().poses, read_trajectory("room/groundtruth.txt").poses, atol=1e-9)
+    assert not list(folder.parent.glob("*.part"))
+
+
+def test_part_of_a_recording(folder, capsys):
+    assert main(["convert", "room", "room.mcap"]) == 0
+    assert main(["convert", "room.mcap", "part.mcap", "--frames", "4:9"]) == 0
+    assert capsys.readouterr().out.splitlines()[1].startswith("part.mcap: 5 frames, ")
+    assert_same_frames(dataset("tum", path="room", frames="4:9"), dataset("mcap", path="part.mcap"), shift=4)
+
+
+def test_layouts_are_recognised(folder, capsys):
+    (folder / "rgb.txt").unlink()
+    assert main(["convert", "room", "as_folder.mcap"]) == 0
+    assert capsys.readouterr().out.startswith("as_folder.mcap: 12 frames, ")
+    (folder / "associations.txt").write_text("".join(f"{i} depth/{i}.png {i} rgb/{i}.png\n" for i in range(1, COUNT)))
+    assert main(["convert", "room", "as_icl.mcap"]) == 0
+    assert capsys.readouterr().out.startswith("as_icl.mcap: 11 frames, ")
+    assert dataset("mcap", path="as_icl.mcap")(0).stamp_ns == 1_000_000_000
+
+
+def test_an_unreadable_frame_is_skipped_and_counted(folder, capsys):
+    (folder / "depth" / "5.png").write_bytes(b"\x89PNG")
+    assert main(["convert", "room", "room.mcap"]) == 0
+    assert capsys.readouterr().out.endswith(", 1 could not be read\n")
+    assert dataset("mcap", path="room.mcap")(5).stamp_ns == 10_200_000_000
+
+
+def test_a_replay_of_it_starts_from_its_frames(folder):
+    (folder.parent / "it's here").mkdir()
+    assert main(["convert", "room", "it's here/room.mcap"]) == 0
+    place = str(folder.parent / "it's here" / "room.mcap").replace("'", "\\'")
+    assert Recording("it's here/room.mcap").overrides() == ["dataset=mcap", f"dataset.path='{place}'"]
+
+
+@pytest.mark.parametrize(
+    ("words", "code", "line"),
+    [
+        (["room", "room.bag"], 2, "convert: 'room.bag' does not end in .mcap; give for example room.bag.mcap"),
+        (["room", "there.mcap"], 2, "there.mcap: exists; give another name or --overwrite"),
+        (["nowhere", "x.mcap"], 1, "nowhere: does not exist; give the folder of a data set or a .mcap file"),
+        (["room/rgb.txt", "x.mcap"], 1, "room/rgb.txt: is not a folder or a recording; give the folder of a data set or a .mcap file"),
+        (["there.mcap", "x.mcap"], 1, "there.mcap: is not a complete MCAP file; the run that wrote it was cut off; record it again"),
+        (["room", "x.mcap", "--frames", "9:3"], 1, "--frames: '9:3' is not a range of frames A:B with A < B; see trihedron convert --help"),
+        (["room", "x.mcap", "--dataset", "tun"], 1, "dataset: there is no plugin 'tun' for the slot 'dataset'; did you mean 'tum'?"),
+        (["room.mcap", "x.mcap", "--dataset", "mcap", "--camera", "a"], 1, "dataset=mcap: has no option 'camera'; leave out --camera"),
+        (["room", "no/x.mcap"], 1, "no/x.part: cannot be written: No such file or directory; give another out=FOLDER"),
+    ],
+)
+def test_errors(folder, capsys, words, code, line):
+    (folder.parent / "there.mcap").write_bytes(b"cut")
+    assert main(["convert", *words]) == code
+    assert capsys.readouterr().err == f"trihedron: {line}\n"
+    assert not (folder.parent / "x.mcap").exists()

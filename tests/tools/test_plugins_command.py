@@ -1,0 +1,101 @@
+"""`trihedron plugins`: every slot and plugin, with defaults and the comments of the fields."""
+
+import json
+import sys
+from dataclasses import dataclass, make_dataclass
+from enum import Enum
+
+import pytest
+
+from trihedron.pipeline.cli import main
+from trihedron.pipeline.slots import SLOTS
+from trihedron.pipeline.types import Frame, Normals
+from trihedron.tools.plugins import describe_plugin, field_comments, first_sentence
+
+
+class Kind(Enum):
+    fine = 1
+    coarse = 2
+
+
+@dataclass(frozen=True)
+class Example:
+    """Normals of an example. More of it.
+
+    And a paragraph."""
+
+    radius_px: int = 3  # of the patch
+    kind: Kind = Kind.coarse
+    weights: tuple[float, ...] = (1.0, 2.0)  # centre, border
+
+    def __call__(self, frame: Frame) -> Normals | None:
+        radius: str = "local"  # no comment of a field
+        assert radius
+        return None
+
+
+def described(capsys, *words):
+    assert main(["plugins", *words, "--json"]) == 0
+    return json.loads(capsys.readouterr().out)["slots"]
+
+
+def test_every_slot_is_described(capsys):
+    slots = {slot["name"]: slot for slot in described(capsys)}
+    assert list(slots) == list(SLOTS)
+    assert slots["segments"]["inputs"] == {"frame": "Frame", "lines": "LineSegments"}
+    assert slots["manhattan"]["inputs"]["previous"] == "ManhattanFrame | None"
+    assert slots["manhattan"]["output"] == "ManhattanFrame"
+    assert slots["surface"]["fold"]
+    assert all(slot["summary"] and slot["doc"] for slot in slots.values())
+
+
+def test_every_plugin_has_documentation_and_defaults(capsys):
+    for slot in described(capsys):
+        for plugin in slot["plugins"]:
+            assert plugin["doc"] and plugin["class"].startswith("trihedron."), plugin
+            assert set(plugin["inputs"]) <= {*slot["inputs"], "rng"}
+            assert all(set(option) == {"name", "type", "default", "doc"} for option in plugin["parameters"])
+
+
+def test_one_slot_as_text(capsys):
+    assert main(["plugins", "keypoints"]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[0] == "keypoints(frame: Frame) -> Keypoints"
+    assert any(line.startswith("  * orb: ") for line in lines)
+    assert any(line.split() == ["features:", "int", "=", "1000", "most", "key", "points", "kept"] for line in lines)
+
+
+def test_a_plugin_as_data():
+    found = describe_plugin("normals", "example", Example)
+    assert found["class"].endswith("test_plugins_command.Example")
+    assert found["doc"].startswith("Normals of an example. More of it.")
+    assert found["inputs"] == ["frame"]
+    assert found["parameters"] == [
+        {"name": "radius_px", "type": "int", "default": 3, "doc": "of the patch"},
+        {"name": "kind", "type": "Kind", "default": "coarse", "doc": ""},
+        {"name": "weights", "type": "tuple[float, ...]", "default": [1.0, 2.0], "doc": "centre, border"},
+    ]
+
+
+def test_a_plugin_without_source_has_no_comments():
+    assert field_comments(make_dataclass("Made", [("x", int, 1)])) == {}
+
+
+def test_first_sentence():
+    assert first_sentence("Found by (Handa et al. 2014) and others.\nThen more. And more.") == "Found by (Handa et al. 2014) and others"
+
+
+def test_unknown_slot(capsys):
+    assert main(["plugins", "manhatan"]) == 2
+    assert capsys.readouterr().err == "trihedron: plugins: there is no slot 'manhatan'; did you mean 'manhattan'?\n"
+
+
+@pytest.mark.parametrize("command", ["evaluate", "plugins", "topics", "convert"])
+def test_help_of_each_command(capsys, command):
+    with pytest.raises(SystemExit) as ended:
+        main([command, "--help"])
+    assert ended.value.code == 0
+    module = sys.modules[f"trihedron.tools.{command}"]
+    out = capsys.readouterr().out
+    assert module.__doc__.splitlines()[0] in out
+    assert f"Example: trihedron {command} " in out

@@ -1,0 +1,73 @@
+"""`trihedron topics`: what a file holds, and one clear line for one that is damaged."""
+
+import pytest
+from mcap.writer import Writer
+
+from trihedron.pipeline.cli import main
+from trihedron.pipeline.recording import RecordingWriter
+from trihedron.pipeline.types import Camera, FrameReference
+
+CAMERA = Camera(640, 480, 525.0, 525.0, 320.0, 240.0)
+CUT = "is not a complete MCAP file; the run that wrote it was cut off; record it again"
+
+
+@pytest.fixture
+def recording(tmp_path):
+    writer = RecordingWriter(tmp_path / "run.mcap", {"version": "1"})
+    for index in range(3):
+        writer.write("frames", FrameReference(index, 1_000_000_000 + index * 500_000_000, CAMERA))
+        writer.write_timing(index, 1_000_000_000 + index * 500_000_000, 10.0, {"pose": 1.0})
+    writer.close()
+    return tmp_path / "run.mcap"
+
+
+def test_our_own_recording(recording, capsys):
+    assert main(["topics", str(recording)]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[0].split() == ["topic", "schema", "messages", "first", "(s)", "last", "(s)", "bytes"]
+    rows = [line.split() for line in lines[1:]]
+    assert [row[:5] for row in rows] == [
+        ["/frames", "trihedron.FrameReference", "3", "1.000000", "2.000000"],
+        ["/timing", "trihedron.Timing", "3", "1.000000", "2.000000"],
+    ]
+    assert all(int(row[5]) > 100 for row in rows)
+
+
+def test_a_file_of_another_program(tmp_path, capsys):
+    with open(tmp_path / "other.mcap", "wb") as file:
+        writer = Writer(file)
+        writer.start()
+        channel = writer.register_channel("/odom", "json", 0)
+        for stamp in (7_000_000_000, 6_000_000_000):
+            writer.add_message(channel, stamp, b"{}", stamp)
+        writer.finish()
+    assert main(["topics", str(tmp_path / "other.mcap")]) == 0
+    assert capsys.readouterr().out.splitlines()[1].split() == ["/odom", "json", "2", "6.000000", "7.000000", "4"]
+
+
+@pytest.mark.parametrize("share", [0.02, 0.3, 0.7, 0.99])
+def test_a_truncated_file(recording, capsys, share):
+    data = recording.read_bytes()
+    recording.write_bytes(data[: int(share * len(data))])
+    assert main(["topics", str(recording)]) == 1
+    assert capsys.readouterr().err == f"trihedron: {recording}: {CUT}\n"
+
+
+def test_damage_in_the_middle(recording, capsys):
+    data = bytearray(recording.read_bytes())
+    data[len(data) // 3 : len(data) // 3 + 200] = bytes(200)
+    recording.write_bytes(data)
+    assert main(["topics", str(recording)]) == 1
+    assert capsys.readouterr().err == f"trihedron: {recording}: {CUT}\n"
+
+
+def test_other_files(tmp_path, capsys):
+    (tmp_path / "text.mcap").write_text("no recording")
+    assert main(["topics", str(tmp_path / "text.mcap")]) == 1
+    line = f"trihedron: {tmp_path / 'text.mcap'}: is not an MCAP file; give a file that trihedron run or another MCAP writer wrote\n"
+    assert capsys.readouterr().err == line
+    missing = tmp_path / "none.mcap"
+    assert main(["topics", str(missing)]) == 1
+    assert capsys.readouterr().err == f"trihedron: {missing}: cannot be read: No such file or directory; give the path of an MCAP file\n"
+    assert main(["topics"]) == 2
+    assert capsys.readouterr().err == "trihedron: topics: the following arguments are required: FILE.mcap; see trihedron topics --help\n"

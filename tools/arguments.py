@@ -1,0 +1,31 @@
+"""What the commands share: an argument parser that speaks the program's one-line errors, and tables of text."""
+
+from __future__ import annotations
+
+import argparse
+import inspect
+import sys
+from collections.abc import Sequence
+from typing import NoReturn
+
+from trihedron.pipeline.errors import UsageError
+
+
+class Parser(argparse.ArgumentParser):
+    """An ArgumentParser whose mistakes are UsageErrors. Its text is the docstring of the command's module: first line, then the rest."""
+
+    def __init__(self, command: str, module: str) -> None:
+        text = inspect.getdoc(sys.modules[module])
+        super().__init__(f"trihedron {command}", description=text, formatter_class=argparse.RawDescriptionHelpFormatter, allow_abbrev=False)
+
+    def error(self, message: str) -> NoReturn:
+        """Raise UsageError, with the command's own help as the cure."""
+        raise UsageError(self.prog.removeprefix("trihedron "), message, f"see {self.prog} --help")
+
+
+def table(rows: Sequence[Sequence[object]], right: str = "") -> str:
+    """Rows as aligned columns two blanks apart; `right` has an r for each column to be aligned to the right, for example "lrr"."""
+    cells = [[str(cell) for cell in row] for row in rows]
+    widths = [max(len(row[i]) for row in cells) for i in range(len(cells[0]))]
+    aligned = [[cell.rjust(w) if right[i : i + 1] == "r" else cell.ljust(w) for i, (cell, w) in enumerate(zip(row, widths))] for row in cells]
+    return "\n".join("  ".join(row).rstrip() for row in aligned)

@@ -1,0 +1,117 @@
+"""Convert a data set to a recording: one MCAP file with the frames, lossless, and the ground truth if there is one.
+
+SRC is a folder in one of the layouts of `trihedron plugins dataset`, recognised by its files, or a recording with embedded frames. The result is
+run with dataset=mcap dataset.path=DST.mcap, and opens in Foxglove.
+
+Example: trihedron convert rgbd_dataset_freiburg3_structure_notexture_far far.mcap
+"""
+
+from __future__ import annotations
+
+import inspect
+import json
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from trihedron.pipeline.errors import ConfigError, DataError, UsageError
+from trihedron.tools.arguments import Parser
+
+if TYPE_CHECKING:
+    from trihedron.pipeline.recording import RecordingWriter
+
+SUFFIX = ".mcap"
+
+
+def main(argv: list[str]) -> int:
+    """Run the command; returns the exit code. Raises UsageError for wrong arguments, DataError and RecordingError for what cannot be read."""
+    parser = Parser("convert", __name__)
+    parser.add_argument("source", metavar="SRC", type=Path, help="folder of a data set, or a recording with embedded frames")
+    parser.add_argument("destination", metavar="DST.mcap", type=Path)
+    parser.add_argument("--dataset", metavar="NAME", help="the layout, when it is not recognised: tum, icl_nuim, folder, ...")
+    parser.add_argument("--camera", metavar="PRESET|FILE", help="as dataset.camera of trihedron run")
+    parser.add_argument("--frames", metavar="A:B", default="", help="only this half-open range of frames")
+    parser.add_argument("--overwrite", action="store_true", help="replace DST.mcap if it exists")
+    arguments = parser.parse_args(argv)
+    destination: Path = arguments.destination
+    if destination.suffix != SUFFIX:
+        raise UsageError("convert", f"'{destination}' does not end in {SUFFIX}", f"give for example {destination.name or 'far'}{SUFFIX}")
+    if destination.exists() and not arguments.overwrite:
+        raise UsageError(str(destination), "exists", "give another name or --overwrite")
+    options = {"path": str(arguments.source), "frames": arguments.frames, "camera": arguments.camera}
+    frames, unreadable = convert(arguments.dataset or layout_of(arguments.source), options, destination)
+    skipped = f", {unreadable} could not be read" if unreadable else ""
+    print(f"{destination}: {frames} frames, {destination.stat().st_size / 1e6:.1f} MB{skipped}")
+    return 0
+
+
+def layout_of(source: Path) -> str:
+    """The data set plugin whose layout a folder has, `mcap` for a file. Raises DataError for neither."""
+    if source.is_file() and source.suffix == SUFFIX:
+        return "mcap"
+    if not source.is_dir():
+        cause = "is not a folder or a recording" if source.exists() else "does not exist"
+        raise DataError(str(source), cause, f"give the folder of a data set or a {SUFFIX} file")
+    if (source / "rgb.txt").is_file() and (source / "depth.txt").is_file():
+        return "tum"
+    if (source / "associations.txt").is_file() or any(source.glob("*.freiburg")) or any(source.glob("scene_*.depth")):
+        return "icl_nuim"
+    return "folder"
+
+
+def convert(dataset: str, options: dict[str, str | None], destination: Path) -> tuple[int, int]:
+    """Write the recording; a file of that name is replaced only when all is done. Returns how many frames are in it and how many were unreadable.
+
+    Raises DataError when the data set cannot be read, ConfigError for options it does not have."""
+    from trihedron.datasets.trajectories import TRUTH, format_trajectory
+    from trihedron.pipeline.graph import build_graph
+    from trihedron.pipeline.recording import RecordingWriter
+    from trihedron.pipeline.registry import load_plugins, plugin_class
+    from trihedron.pipeline.runner import Runner
+
+    load_plugins()
+    plugin = _plugin(plugin_class("dataset", dataset), dataset, options)
+    runner = Runner(build_graph({"dataset": {}}, {"dataset": plugin}, ["dataset"]), frames=options["frames"] or "")
+    truth = plugin.truth()
+    unfinished = destination.with_suffix(".part")
+    try:
+        writer = RecordingWriter(unfinished, _metadata(destination))
+        if truth is not None:
+            writer.attach(TRUTH, format_trajectory(truth))
+        _write(runner, writer)
+        unfinished.replace(destination)
+    finally:
+        unfinished.unlink(missing_ok=True)
+    return len(runner.result.stamps_ns), runner.result.unreadable
+
+
+def _plugin(kind: type[Any], name: str, options: dict[str, str | None]) -> Any:
+    known = inspect.signature(kind).parameters
+    given = {option: value for option, value in options.items() if value}
+    for option in given:
+        if option not in known:
+            raise ConfigError(f"dataset={name}", f"has no option '{option}'", f"leave out --{option}")
+    try:
+        return kind(**given)
+    except ValueError as error:
+        field, _, cause = str(error).partition(": ")
+        raise ConfigError(f"--{field}", cause, "see trihedron convert --help") from error
+
+
+def _write(runner: Any, writer: RecordingWriter) -> None:
+    from tqdm import tqdm
+
+    steps = runner.steps(writer, frozenset({"dataset"}), embed_frames=True)
+    try:
+        for _ in tqdm(steps, total=len(runner.indices), unit="frame", disable=None, file=sys.stderr):
+            pass
+    finally:
+        writer.close()
+
+
+def _metadata(destination: Path) -> dict[str, str]:
+    """What a replay starts from: the recording itself as the data set."""
+    from importlib.metadata import version
+
+    path = str(destination.resolve()).replace("\\", "\\\\").replace("'", "\\'")
+    return {"version": version("trihedron"), "commit": "", "overrides": json.dumps(["dataset=mcap", f"dataset.path='{path}'"]), "config": ""}

@@ -1,0 +1,151 @@
+"""Draw one frame of a recording with its features, and the map from above with the camera's path.
+
+Example: trihedron picture runs/latest/run.mcap --frame 60 --out picture.png
+"""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from trihedron.pipeline.recording import Recording
+    from trihedron.pipeline.types import Camera, Map, Planes
+
+AXIS_COLORS = ((220, 50, 50), (50, 170, 50), (60, 90, 230))
+AXIS_LENGTH_PX = 60
+
+
+def main(argv: list[str]) -> int:
+    """Write the picture and say where."""
+    parser = argparse.ArgumentParser(prog="trihedron picture", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("recording", help="run.mcap")
+    parser.add_argument("--frame", type=int, default=-1, metavar="N", help="frame number (default: the middle one)")
+    parser.add_argument("--out", default="picture.png", metavar="FILE", help="default picture.png")
+    options = parser.parse_args(argv)
+    draw(options.recording, options.frame, Path(options.out))
+    print(options.out)
+    return 0
+
+
+def draw(path: str, frame: int, out: Path) -> None:
+    """Image with features left, map from above right. Raises RecordingError when the recording lacks poses or the frame."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    from matplotlib import pyplot
+
+    from trihedron.pipeline.errors import RecordingError
+    from trihedron.pipeline.recording import Recording
+
+    recording = Recording(path)
+    poses = list(recording.values("pose"))
+    if not poses:
+        raise RecordingError(path, "holds no poses", "record a run with outputs=[trajectory]")
+    numbers = [pose.index for pose in poses]
+    frame = numbers[len(numbers) // 2] if frame < 0 else frame
+    if frame not in numbers:
+        raise RecordingError(path, f"has no frame {frame}", f"give one of {numbers[0]}..{numbers[-1]}")
+    figure, (left, right) = pyplot.subplots(1, 2, figsize=(12, 4.2), width_ratios=[4, 3], layout="constrained")
+    left.imshow(_annotated(recording, frame))
+    left.set_axis_off()
+    left.set_title(f"frame {frame}: planes, 3D lines, key points, Manhattan axes", fontsize=10)
+    _map_from_above(right, recording, poses)
+    figure.savefig(out, dpi=90)
+    pyplot.close(figure)
+
+
+def _annotated(recording: Recording, frame: int) -> Any:
+    """The frame's image (the nearest one that was kept to look at) with the features of that very frame."""
+    import cv2
+    import numpy as np
+
+    reference: Any = next(v for v in recording.values("frames") if v.index == frame)
+    camera = reference.camera
+    image = _image(recording, reference.stamp_ns, camera)
+    topics = ("planes", "segments", "keypoints", "manhattan")
+    values: dict[str, Any] = {topic: next((v for v in recording.values(topic) if v.index == frame), None) for topic in topics}
+    if values["planes"] is not None:
+        image = _tinted(image, values["planes"])
+    if values["segments"] is not None:
+        lifted = np.isfinite(values["segments"].endpoints_m).all(axis=(1, 2))
+        for ends, in_space in zip(np.rint(values["segments"].endpoints_px).astype(int), lifted):
+            cv2.line(image, tuple(map(int, ends[0])), tuple(map(int, ends[1])), (255, 230, 0) if in_space else (150, 150, 150), 2, cv2.LINE_AA)
+    if values["keypoints"] is not None:
+        for x, y in np.rint(values["keypoints"].pixels).astype(int):
+            cv2.circle(image, (int(x), int(y)), 2, (0, 230, 120), 1, cv2.LINE_AA)
+    if values["manhattan"] is not None and values["manhattan"].supported:
+        _axes(image, values["manhattan"].rotations[0])
+    return image
+
+
+def _image(recording: Recording, stamp_ns: int, camera: Camera) -> Any:
+    """The embedded frame, else the small image nearest in time, at full size (RGB)."""
+    import cv2
+    import numpy as np
+    from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
+
+    from trihedron.pipeline.recording import FrameReader
+
+    whole: Any = FrameReader(recording, "dataset").at(stamp_ns) if "dataset" in recording.topics else None
+    if whole is not None:
+        return np.array(whole.color)
+    messages = list(recording.messages("/view/image"))
+    if not messages:
+        return np.full((camera.height, camera.width, 3), 255, np.uint8)
+    nearest = min(messages, key=lambda message: abs(message.log_time - stamp_ns))
+    data = CompressedImage.FromString(nearest.data).data
+    small = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
+    return cv2.cvtColor(cv2.resize(small, (camera.width, camera.height)), cv2.COLOR_BGR2RGB)
+
+
+def _tinted(image: Any, planes: Planes) -> Any:
+    import cv2
+    import numpy as np
+    from matplotlib import colormaps
+
+    height, width = image.shape[:2]
+    labels = cv2.resize(planes.labels, (width, height), interpolation=cv2.INTER_NEAREST)
+    palette = np.vstack([[0, 0, 0], 255 * np.array([colormaps["tab20"](i % 20)[:3] for i in range(255)])])
+    mixed = np.where(labels[..., None] > 0, 0.55 * image + 0.45 * palette[labels], image)
+    return np.ascontiguousarray(mixed.astype(np.uint8))
+
+
+def _axes(image: Any, R_camera_manhattan: Any) -> None:
+    """The three axes as arrows in the lower left corner."""
+    import cv2
+
+    origin = (AXIS_LENGTH_PX + 15, image.shape[0] - AXIS_LENGTH_PX - 15)
+    for axis, color in enumerate(AXIS_COLORS):
+        x, y = R_camera_manhattan[:2, axis] * AXIS_LENGTH_PX
+        cv2.arrowedLine(image, origin, (round(origin[0] + x), round(origin[1] + y)), color, 3, cv2.LINE_AA, tipLength=0.2)
+
+
+def _map_from_above(axes: Any, recording: Recording, poses: list[Any]) -> None:
+    """Landmarks and the path, seen along the scene's vertical as far as the first camera knows it (y down)."""
+    import numpy as np
+
+    versions: list[Any] = list(recording.values("map")) if "map" in recording.topics else []
+    if versions:
+        _landmarks(axes, versions[-1])
+    path = np.array([pose.T_world_camera[:3, 3] for pose in poses])
+    axes.plot(path[:, 0], path[:, 2], color="crimson", linewidth=2, label="camera")
+    axes.set_aspect("equal")
+    axes.set_xlabel("x [m]")
+    axes.set_ylabel("z [m]")
+    axes.set_title("map from above: points, lines, planes", fontsize=10)
+    axes.legend(loc="upper right", fontsize=8)
+
+
+def _landmarks(axes: Any, map: Map) -> None:
+    import numpy as np
+
+    points = map.points.column("position_m")[map.points.column("alive")]
+    axes.scatter(points[:, 0], points[:, 2], s=1, color="0.6")
+    for ends in map.lines.column("endpoints_m")[map.lines.column("alive")]:
+        axes.plot(ends[:, 0], ends[:, 2], color="tab:blue", linewidth=0.8)
+    alive = map.planes.column("alive")
+    for samples in map.planes.column("samples_m")[alive]:
+        samples = samples[np.isfinite(samples[:, 0])]
+        axes.scatter(samples[:, 0], samples[:, 2], s=6, marker="s")

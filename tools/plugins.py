@@ -1,0 +1,147 @@
+"""List the slots with their plugins, parameters, defaults and documentation.
+
+The parameters of a plugin are set as SLOT.NAME=VALUE, the plugin itself is chosen as SLOT=PLUGIN. A star marks what graph=structural uses.
+
+Example: trihedron plugins manhattan
+"""
+
+from __future__ import annotations
+
+import contextlib
+import inspect
+import io
+import json
+import re
+import tokenize
+from enum import Enum
+from typing import Any
+
+from trihedron.pipeline.errors import UsageError, did_you_mean
+from trihedron.tools.arguments import Parser, table
+
+
+def main(argv: list[str]) -> int:
+    """Run the command; returns the exit code. Raises UsageError for an unknown slot, PluginError for a plugin that does not load."""
+    parser = Parser("plugins", __name__)
+    parser.add_argument("slot", metavar="SLOT", nargs="?", help="only this slot")
+    parser.add_argument("--json", action="store_true", help="print everything as JSON")
+    arguments = parser.parse_args(argv)
+    from trihedron.pipeline.registry import load_plugins
+    from trihedron.pipeline.slots import SLOTS
+
+    if arguments.slot is not None and arguments.slot not in SLOTS:
+        raise UsageError("plugins", f"there is no slot '{arguments.slot}'", did_you_mean(arguments.slot, SLOTS))
+    load_plugins()
+    described = [describe_slot(slot) for slot in SLOTS if arguments.slot in (None, slot)]
+    print(json.dumps({"slots": described}, indent=2) if arguments.json else "\n\n".join(map(report, described)))
+    return 0
+
+
+def describe_slot(slot: str) -> dict[str, Any]:
+    """A slot as plain data: its contract and its plugins, ready for JSON."""
+    from trihedron.pipeline.registry import plugins_of
+    from trihedron.pipeline.slots import FOLDS, SLOTS, inputs_of, output_of, summary
+
+    default = default_plugins().get(slot)
+    return {
+        "name": slot,
+        "summary": summary(slot),
+        "doc": inspect.getdoc(SLOTS[slot]) or "",
+        "inputs": {name: type_name(hint) for name, hint in inputs_of(slot).items()},
+        "output": type_name(output_of(slot)),
+        "fold": slot in FOLDS,
+        "plugins": [describe_plugin(slot, name, plugin) | {"default": name == default} for name, plugin in plugins_of(slot).items()],
+    }
+
+
+def describe_plugin(slot: str, name: str, plugin: type[Any]) -> dict[str, Any]:
+    """A plugin as plain data: what it takes, its parameters with type, default and comment, ready for JSON."""
+    from typing import get_type_hints
+
+    from trihedron.pipeline.registry import options_of, parameters_of_method
+
+    hints, comments = get_type_hints(plugin), field_comments(plugin)
+    options = []
+    for option in options_of(plugin):
+        default = option.default_factory() if callable(option.default_factory) else option.default
+        options.append(
+            {"name": option.name, "type": type_name(hints[option.name]), "default": _plain(default), "doc": comments.get(option.name, "")}
+        )
+    return {
+        "name": name,
+        "class": f"{plugin.__module__}.{plugin.__qualname__}",
+        "doc": inspect.getdoc(plugin) or "",
+        "inputs": parameters_of_method(slot, plugin),
+        "parameters": options,
+    }
+
+
+def field_comments(plugin: type[Any]) -> dict[str, str]:
+    """Field name -> the comment behind it in the source, its bases' included; nothing where the source is not there."""
+    found: dict[str, str] = {}
+    for base in reversed(plugin.__mro__[:-1]):
+        with contextlib.suppress(OSError, TypeError):
+            found |= _comments(inspect.getsource(base))
+    return found
+
+
+def _comments(source: str) -> dict[str, str]:
+    """Field name -> comment of one class's source."""
+    found, name = {}, ""
+    for token in tokenize.generate_tokens(io.StringIO(source).readline):
+        if token.type == tokenize.NAME and token.line[: token.start[1]].isspace() and token.line[token.end[1] :].lstrip().startswith(":"):
+            name = token.string
+        elif token.type == tokenize.COMMENT and name:
+            found[name] = token.string.lstrip("# ")
+            name = ""
+        elif token.type == tokenize.NEWLINE:
+            name = ""
+    return found
+
+
+def default_plugins() -> dict[str, str]:
+    """Slot -> plugin of `graph=structural` and of the root configuration."""
+    from importlib.resources import files
+
+    from omegaconf import OmegaConf
+
+    from trihedron.pipeline.config import RunOptions
+
+    graph: Any = OmegaConf.create((files("trihedron.conf") / "graph" / "structural.yaml").read_text())
+    chosen = [*RunOptions().defaults, *graph.defaults]
+    return {str(slot).lstrip("/"): str(plugin) for entry in chosen if not isinstance(entry, str) for slot, plugin in entry.items()}
+
+
+def type_name(hint: Any) -> str:
+    """A type as it is written in the code, without modules."""
+    if isinstance(hint, type) and not hasattr(hint, "__args__"):
+        return hint.__name__
+    text = str(hint)
+    for module in ("trihedron.pipeline.types.", "numpy.random._generator.", "typing."):
+        text = text.replace(module, "")
+    return text
+
+
+def _plain(value: Any) -> Any:
+    """A default as JSON has it: the name of an Enum member, tuples as lists."""
+    if isinstance(value, Enum):
+        return value.name
+    return [_plain(item) for item in value] if isinstance(value, (tuple, list)) else value
+
+
+def report(slot: dict[str, Any]) -> str:
+    """A slot as text for people."""
+    inputs = ", ".join(f"{name}: {kind}" for name, kind in slot["inputs"].items())
+    lines = [f"{slot['name']}({inputs}) -> {slot['output']}", f"  {slot['summary']}"]
+    for plugin in slot["plugins"]:
+        lines.append(f"  {'*' if plugin['default'] else ' '} {plugin['name']}: {first_sentence(plugin['doc'])}")
+        if plugin["parameters"]:
+            rows = [(f"{p['name']}: {p['type']}", f"= {json.dumps(p['default'])}", p["doc"]) for p in plugin["parameters"]]
+            lines += [f"        {line}" for line in table(rows).splitlines()]
+    return "\n".join(lines)
+
+
+def first_sentence(text: str) -> str:
+    """The first paragraph of a docstring up to its first full stop (not that of "et al."), on one line."""
+    paragraph = " ".join(text.split("\n\n")[0].split())
+    return re.split(r"(?<!\bal)\.\s+(?=[A-Z`])", paragraph, maxsplit=1)[0].rstrip(".")
