@@ -86,6 +86,8 @@ def _wall(h: int, w: int, per_metre: float, rng: np.random.Generator) -> F32:
     _scatter(image, int(30 * area), (0.008 * per_metre, 0.03 * per_metre), rng, contrast=110.0)
     for _ in range(max(1, round(area / 7.0))):
         height, width = int(rng.uniform(0.4, 0.7) * per_metre), int(rng.uniform(0.3, 0.6) * per_metre)
+        if width >= w or height >= 0.5 * h:  # the end of a wall, or a strip of one
+            continue
         top, left = int(rng.uniform(0.15, 0.5) * h), int(rng.uniform(0.0, w - width))
         image[top : top + height, left : left + width] = _picture(height, width, per_metre, rng)
     return image

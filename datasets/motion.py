@@ -16,9 +16,10 @@ from trihedron.pipeline.types import F64
 
 
 class Motion(Enum):
-    """How the camera moves: a walk looking around, not at all, or turning on the spot."""
+    """How the camera moves: a walk looking around, the same with a hasty hand, not at all, or turning on the spot."""
 
     walk = "walk"
+    fast = "fast"
     still = "still"
     pan = "pan"
 
@@ -29,6 +30,7 @@ START_YAW_DEG = 20.0  # towards a corner: two walls in view
 PITCH_DEG = -6.0
 TURN_DEG_PER_S = 6.0  # of the walk; a whole turn a minute
 PAN_DEG_PER_S = 20.0
+HASTE = 2.5  # a fast walk is the walk this much sooner, its tremor included: up to 1.25 m/s and 100 °/s
 
 
 @dataclass(frozen=True)
@@ -53,18 +55,20 @@ def camera_pose(motion: Motion, seed: int, time_s: float) -> F64:
     """(4, 4) `T_world_camera` at a time; the world is the room: origin in a corner of the floor, z up. The seed sets the phases."""
     phases = np.random.default_rng([seed, 1]).uniform(0.0, 2.0 * np.pi, size=(4, 3))
     moving = 0.0 if motion is Motion.still else time_s
+    if motion is Motion.fast:
+        moving *= HASTE
     position = np.array(CENTRE_M)
     yaw, pitch, roll = START_YAW_DEG, PITCH_DEG, 0.0
     if motion is Motion.pan:
-        return _looking(position, np.radians([yaw + PAN_DEG_PER_S * moving, pitch, roll]))
+        return looking(position, np.radians([yaw + PAN_DEG_PER_S * moving, pitch, roll]))
     turned = np.radians(yaw + TURN_DEG_PER_S * moving)
     position = position - np.array(STEP_BACK_M) * np.array([np.cos(turned), np.sin(turned), 0.0])
     position = position + POSITION_M.at(moving, phases[0]) + TREMOR_M.at(moving, phases[1])
     angles = np.array([yaw + TURN_DEG_PER_S * moving, pitch, roll]) + ANGLES_DEG.at(moving, phases[2]) + TREMOR_DEG.at(moving, phases[3])
-    return _looking(position, np.radians(angles))
+    return looking(position, np.radians(angles))
 
 
-def _looking(position_m: F64, angles: F64) -> F64:
+def looking(position_m: F64, angles: F64) -> F64:
     """Yaw about the vertical (0 = along x), pitch up, roll about the viewing direction (rad) -> (4, 4) pose of a camera with y down."""
     yaw, pitch, roll = angles
     forward = np.array([np.cos(pitch) * np.cos(yaw), np.cos(pitch) * np.sin(yaw), np.sin(pitch)])

@@ -15,6 +15,7 @@ from trihedron.pipeline.types import F64
 HEIGHT_M = 2.7
 RECTANGLE = ((0.0, 0.0), (5.0, 0.0), (5.0, 4.0), (0.0, 4.0))  # anticlockwise: south, east, north, west wall
 SLANTED = ((0.0, -0.5), (5.0, 0.4), (5.7, 4.0), (0.0, 4.0))  # south and east wall turned by 10° and 11°
+LAMP_M = (2.5, 2.0, 2.45)
 BOX, CYLINDER, SPHERE = 0, 1, 2
 UP = np.array([0.0, 0.0, 1.0])
 
@@ -32,6 +33,7 @@ class Face:
     size_m: tuple[float, float]
     material: str
     curved: int = BOX  # CYLINDER or SPHERE for a curved face
+    look: int = -1  # faces of one look, material and size show the same texture; -1 = one of its own
 
 
 @dataclass(frozen=True)
@@ -53,11 +55,15 @@ class Solid:
 
 @dataclass(frozen=True)
 class Room:
-    """Walls, floor and ceiling as (k, 4) planes `n·x + d = 0` with n into the room, their faces in the same order, and the furniture."""
+    """Walls, floor and ceiling as (k, 4) planes `n·x + d = 0` with n into the room, their faces in the same order, and the furniture.
+
+    A face is lit by the nearest lamp in front of it; `detail` multiplies the resolution of the textures."""
 
     planes: F64
     faces: tuple[Face, ...]
     solids: tuple[Solid, ...] = field(default_factory=tuple)
+    lamps_m: tuple[tuple[float, float, float], ...] = (LAMP_M,)
+    detail: float = 1.0
 
 
 def box(x: tuple[float, float], y: tuple[float, float], z: tuple[float, float], material: str, front: str = "", front_face: int = 0) -> Solid:
@@ -112,9 +118,11 @@ class Wall:
     normal: F64
     length_m: float
 
-    def mounted(self, at: float, z: tuple[float, float], width: float, thickness: float, material: str, front: str = "") -> Solid:
-        """A box on the wall, its middle `at` metres from the wall's start; `front` is the material of the face towards the room."""
-        centre = self.start + self.along * at + self.normal * (thickness / 2.0) + UP * ((z[0] + z[1]) / 2.0)
+    def mounted(
+        self, at: float, z: tuple[float, float], width: float, thickness: float, material: str, front: str = "", off_m: float = 0.0
+    ) -> Solid:
+        """A box on the wall, or `off_m` from it, its middle `at` metres from the wall's start; `front` is the material of the face towards the room."""
+        centre = self.start + self.along * at + self.normal * (off_m + thickness / 2.0) + UP * ((z[0] + z[1]) / 2.0)
         half = np.array([width / 2.0, thickness / 2.0, (z[1] - z[0]) / 2.0])
         return turned_box(centre, half, float(np.arctan2(self.along[1], self.along[0])), material, front, 3)
 
@@ -132,6 +140,12 @@ def walls_of(footprint: tuple[tuple[float, float], ...]) -> list[Wall]:
 def furnished_room(slanted: bool = False) -> Room:
     """The room with all its furniture. `slanted` turns two walls, and what hangs on them, out of the Manhattan frame."""
     footprint = SLANTED if slanted else RECTANGLE
+    planes, faces = shell(footprint)
+    return Room(planes, faces, (*_furniture(), *_on_the_walls(walls_of(footprint))))
+
+
+def shell(footprint: tuple[tuple[float, float], ...]) -> tuple[F64, tuple[Face, ...]]:
+    """(k, 4) planes and the faces of the walls, the floor and the ceiling around an anticlockwise convex footprint."""
     walls = walls_of(footprint)
     corners = np.array(footprint)
     (west, south), (east, north) = corners.min(axis=0), corners.max(axis=0)
@@ -140,8 +154,7 @@ def furnished_room(slanted: bool = False) -> Room:
     x, y = np.array([1.0, 0.0, 0.0]), np.array([0.0, 1.0, 0.0])
     faces.append(Face(np.array([west, north, 0.0]), x, -y, UP, size, "floor"))
     faces.append(Face(np.array([west, south, HEIGHT_M]), x, y, -UP, size, "ceiling"))
-    planes = np.array([[*face.normal, -float(face.normal @ face.origin)] for face in faces])
-    return Room(planes, tuple(faces), (*_furniture(), *_on_the_walls(walls)))
+    return np.array([[*face.normal, -float(face.normal @ face.origin)] for face in faces]), tuple(faces)
 
 
 def all_faces(room: Room) -> list[Face]:

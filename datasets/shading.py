@@ -17,7 +17,6 @@ from trihedron.datasets.room import BOX, CYLINDER
 from trihedron.pipeline.types import F32, F64, I32, U8, Camera
 
 AMBIENT, DIFFUSE, SKY = 0.55, 0.70, 0.12  # light: everywhere, from the lamp, by the direction of the surface
-LAMP_M = (2.5, 2.0, 2.45)
 LAMP_REACH_M = 2.6  # distance at which the lamp's light has halved
 SKY_DIRECTION = (0.55, -0.35, 0.75)  # gives every direction of the room its own brightness
 SCALES = tuple(0.5**level for level in range(16))  # of a texture's halved copies
@@ -71,7 +70,7 @@ def _color_at(
     n0, n1, n2, u, v = _surface(surfaces, face, p0, p1, p2)
     cosine = max(0.0, -(n0 * d0 + n1 * d1 + n2 * d2) / math.sqrt(dx * dx + dy * dy + 1.0))
     r, g, b = _sample(texels, levels, per_metre[face], face, u, v, pixel_m * pixel_m / max(cosine, 0.1))
-    l0, l1, l2 = LAMP_M[0] - p0, LAMP_M[1] - p1, LAMP_M[2] - p2
+    l0, l1, l2 = surfaces[face, 14] - p0, surfaces[face, 15] - p1, surfaces[face, 16] - p2
     squared = l0 * l0 + l1 * l1 + l2 * l2
     lambert = max(0.0, n0 * l0 + n1 * l1 + n2 * l2) / (math.sqrt(squared) * (1.0 + squared * (1.0 / (LAMP_REACH_M * LAMP_REACH_M))))
     light = AMBIENT + DIFFUSE * lambert + SKY * (n0 * SKY_DIRECTION[0] + n1 * SKY_DIRECTION[1] + n2 * SKY_DIRECTION[2])

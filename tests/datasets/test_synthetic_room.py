@@ -15,7 +15,7 @@ from trihedron.datasets.motion import Motion, camera_pose
 from trihedron.datasets.raytracing import geometry_of
 from trihedron.datasets.room import CYLINDER, SPHERE, Face, Room, Solid, all_faces, furnished_room
 from trihedron.datasets.shading import render
-from trihedron.datasets.synthetic import Synthetic
+from trihedron.datasets.synthetic import Scene, Synthetic
 from trihedron.datasets.textures import bake
 from trihedron.pipeline.errors import DataError
 from trihedron.pipeline.geometry import rotation_angle_deg, transform
@@ -146,10 +146,12 @@ def test_the_selection_and_its_truth() -> None:
 @pytest.mark.parametrize(
     ("values", "message"),
     [
-        ({"length": 0}, "length: 0 is not positive"),
+        ({"length": -1}, "length: -1 is negative"),
         ({"fps": -1.0}, "fps: -1.0 is not positive"),
         ({"width": 8}, "width: 8 is not within 16 … 8192"),
         ({"seed": -1}, "seed: -1 is negative"),
+        ({"scene": Scene.rooms, "motion": Motion.pan}, "motion: pan is for the room, a building is walked through"),
+        ({"scene": Scene.offices, "slanted": True}, "slanted: only the room has slanted walls"),
         ({"frames": "5"}, "frames: '5' is not a range of frames A:B with A < B"),
     ],
 )
@@ -174,6 +176,16 @@ def test_the_walk_is_a_hand_held_one() -> None:
                 beyond = np.maximum(np.abs((x - solid.centre) @ solid.R_world_solid) - solid.half, 0.0)
                 clearance.append(np.linalg.norm(beyond, axis=1).min())
             assert min(clearance) > 0.4
+
+
+def test_the_fast_walk_is_fast_and_stays_clear() -> None:
+    """0.8 to 1.3 m/s and 60 to 100 °/s at its fastest, along the places of the slow walk."""
+    for seed in range(2):
+        poses = np.array([camera_pose(Motion.fast, seed, i / 30) for i in range(600)])
+        speed = np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1) * 30
+        turning = [rotation_angle_deg(a[:3, :3].T @ b[:3, :3]) * 30 for a, b in pairwise(poses)]
+        assert 0.8 < speed.max() < 1.3 and 60.0 < max(turning) < 100.0
+        np.testing.assert_array_equal(poses[30], camera_pose(Motion.walk, seed, 2.5))
 
 
 def test_still_and_pan() -> None:

@@ -1,0 +1,97 @@
+"""The synthetic buildings: walks that stay clear of everything and come back, exact depth behind walls, offices that look the same."""
+
+from __future__ import annotations
+
+import sys
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from trihedron.datasets.buildings import Building
+from trihedron.datasets.raytracing import geometry_of
+from trihedron.datasets.room import all_faces
+from trihedron.datasets.shading import render
+from trihedron.datasets.synthetic import BUILDINGS, Scene, Synthetic
+from trihedron.datasets.textures import bake
+from trihedron.pipeline.geometry import rotation_angle_deg
+from trihedron.pipeline.types import Camera
+
+sys.path.insert(0, str(Path(__file__).parent))
+from test_synthetic_room import first_hit
+
+CAMERA = Camera(160, 120, 131.25, 131.25, 79.5, 59.5)
+WALKS = {  # scene -> least frames, and the length of the walk in metres
+    Scene.corridor: (900, 45.6),
+    Scene.offices: (1500, 43.8),
+    Scene.rooms: (2000, 52.2),
+}
+
+
+@pytest.fixture(scope="module", params=list(WALKS), ids=lambda scene: scene.name)
+def scene(request: pytest.FixtureRequest) -> tuple[Scene, Building]:
+    return request.param, BUILDINGS[request.param]()
+
+
+def clearance_m(building: Building, positions: np.ndarray) -> float:
+    """From the nearest surface, boxes around what is round."""
+    room = building.room
+    nearest = [(positions @ room.planes[:, :3].T + room.planes[:, 3]).min()]
+    for solid in room.solids:
+        beyond = np.maximum(np.abs((positions - solid.centre) @ solid.R_world_solid) - solid.half, 0.0)
+        nearest.append(np.linalg.norm(beyond, axis=1).min())
+    return float(min(nearest))
+
+
+def test_the_walk_is_clear_of_everything_and_ends_where_it_began(scene: tuple[Scene, Building]) -> None:
+    name, building = scene
+    least, length_m = WALKS[name]
+    assert building.walk.length_m == pytest.approx(length_m, abs=0.05)
+    assert len(Synthetic(scene=name)) == round(building.walk.duration_s * 30) >= least
+    for seed in range(2):
+        poses = np.array([building.walk.pose(seed, i / 30) for i in range(0, len(Synthetic(scene=name)) + 1)])
+        steps = np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1)
+        turning = [rotation_angle_deg(a[:3, :3].T @ b[:3, :3]) * 30 for a, b in pairwise(poses)]
+        assert clearance_m(building, poses[:, :3, 3]) > 0.4
+        assert 0.5 < steps.max() * 30 < 1.2 and max(turning) < 65.0
+        assert steps.sum() == pytest.approx(length_m, rel=0.06)  # corners are rounded
+        assert np.linalg.norm(poses[-1, :3, 3] - poses[0, :3, 3]) < 0.15
+
+
+def test_walls_hide_what_is_behind_them(scene: tuple[Scene, Building]) -> None:
+    """Depth is that of the nearest of all surfaces."""
+    _, building = scene
+    geometry, atlas = geometry_of(building.room), bake(all_faces(building.room), False, 0)
+    rng = np.random.default_rng(0)
+    for time_s in np.linspace(0.0, building.walk.duration_s, 6):
+        pose = building.walk.pose(0, float(time_s))
+        _, depth, _, _ = render(geometry, atlas, CAMERA, pose)
+        for x, y in zip(rng.integers(0, 160, 12), rng.integers(0, 120, 12)):
+            ray = pose[:3, :3] @ np.array([(x - CAMERA.cx) / CAMERA.fx, (y - CAMERA.cy) / CAMERA.fy, 1.0])
+            assert depth[y, x] == pytest.approx(first_hit(building.room, pose[:3, 3], ray), abs=1e-9)
+
+
+def test_frames_have_depth_and_none_beyond_the_sensor(scene: tuple[Scene, Building]) -> None:
+    dataset = Synthetic(scene=scene[0], texture=False, width=160, height=120)
+    for number in range(0, len(dataset), len(dataset) // 20):
+        frame = dataset(number)
+        assert frame is not None
+        assert (frame.depth_m > 0.5).mean() > 0.7
+        assert frame.depth_m.max() < 8.5
+    truth = dataset.truth()
+    assert truth is not None and len(truth) == len(dataset)
+    np.testing.assert_array_equal(truth.poses[number], scene[1].walk.pose(0, number / 30))
+
+
+def test_the_offices_cannot_be_told_apart() -> None:
+    """The same view in both, but for the rounding of a few samples on edges."""
+    room = BUILDINGS[Scene.offices]().room
+    geometry, atlas = geometry_of(room), bake(all_faces(room), True, 0, 0.1)
+    pose = np.array([[1.0, 0.0, 0.0, 3.4], [0.0, 0.0, 1.0, 2.8], [0.0, -1.0, 0.0, 1.4], [0.0, 0.0, 0.0, 1.0]])  # north, from the door
+    other = pose.copy()
+    other[0, 3] += 6.8
+    (color, depth, _, _), (color2, depth2, _, _) = (render(geometry, atlas, CAMERA, T) for T in (pose, other))
+    difference = np.abs(color.astype(int) - color2)
+    assert (difference <= 1).mean() > 0.999 and difference.max() < 10 and np.ptp(color) > 100
+    np.testing.assert_allclose(depth, depth2, atol=1e-9)
