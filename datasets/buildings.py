@@ -55,7 +55,7 @@ def corridor() -> Building:
     solids += [_skirting(wall) for wall in (south, east, north, west, inner_west, inner_north, inner_east, inner_south)]
     solids += furnished(south, "door 2.6, picture 4.1, cabinet 5.6, portrait 7.0, door 8.4, bin 9.4, picture 10.6, crates 12.0, door 13.9")
     solids += furnished(east, "window 1.6, portrait 3.3, door 4.6, bench 6.2, picture 7.6, pilaster 8.6, door 9.8")
-    solids += furnished(north, "picture 1.0, shelf 2.6, door 4.3, portrait 5.6, window 7.2, globe 9.1, door 10.8, picture 12.2, locker 13.6, portrait 15.0")
+    solids += furnished(north, "picture 1.0, shelf 2.6, door 4.3, portrait 5.6, window 7.2, globe 9.1, door 10.8, picture 12.2, locker 13.6")
     solids += furnished(west, "door 1.3, picture 2.7, locker 4.2, portrait 5.3, door 6.5, crates 7.6, window 9.4")
     solids += furnished(inner_south, "pilaster 1.1, picture 2.4, door 4.0, portrait 5.3, bench 6.6, picture 7.9, door 9.5, pilaster 10.7")
     solids += furnished(inner_east, "portrait 0.8, door 2.2, pilaster 3.4, picture 4.6, door 6.0")
