@@ -6,10 +6,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
-import numpy as np
-
 from trihedron.datasets.furniture import furnished
-from trihedron.datasets.room import HEIGHT_M, UP, Face, Room, Solid, Wall, box, shell, walls_of
+from trihedron.datasets.room import HEIGHT_M, Room, Solid, Wall, box, shell, walls_of
 from trihedron.datasets.walks import Walk
 
 DOORWAY_M = (0.9, 2.1)  # width and height
