@@ -122,7 +122,8 @@ class RotationSlot(Protocol):
 
 
 class TranslationSlot(Protocol):
-    """The camera's position with the rotation fixed (eqs. 2–7), from the features tracked since the previous frame."""
+    """The camera's position with the rotation fixed (eqs. 2–7), from the features tracked since the previous frame. `earlier_pose` is the pose of
+    two frames ago: with the previous one it says how fast the camera moved before its features were lost."""
 
     def __call__(
         self,
@@ -133,11 +134,13 @@ class TranslationSlot(Protocol):
         segments: Segments,
         planes: Planes,
         previous_pose: Pose | None,
+        earlier_pose: Pose | None,
     ) -> Translation | None: ...
 
 
 class MatchesSlot(Protocol):
-    """Map landmarks found among this frame's features, searched around their projection at the decoupled pose (section III-B)."""
+    """Map landmarks found among this frame's features, searched around their projection at the decoupled pose (section III-B), or at the pose where
+    a lost camera was recognised."""
 
     def __call__(
         self,
@@ -148,12 +151,14 @@ class MatchesSlot(Protocol):
         segments: Segments,
         planes: Planes,
         map: Map | None,
+        relocalise: Pose | None,
     ) -> Matches | None: ...
 
 
 class PoseSlot(Protocol):
     """The pose of this frame with its status (section IV-C, eq. 8): a pose is always said, and `ok` or `degraded` only when it was estimated
-    from this frame's measurements. `map` is the map before this frame, `previous` this stage's last output."""
+    from this frame's measurements. `map` is the map before this frame, `previous` this stage's last output, `relocalise` where this very frame was
+    recognised when that was lost. On top of a lost pose nothing is tracked: only the map says where the camera is."""
 
     def __call__(
         self,
@@ -203,10 +208,18 @@ class LoopSlot(Protocol):
 
 
 class RelocaliseSlot(Protocol):
-    """The pose found against the map without a prediction, for a camera that was lost."""
+    """The pose of this frame found against the map without a prediction, for a camera that was lost. None while the previous pose is not lost, and
+    where nothing, or more than one place, is recognised."""
 
     def __call__(
-        self, keypoints: Keypoints, segments: Segments, planes: Planes, map: Map | None, previous_pose: Pose | None
+        self,
+        frame: Frame,
+        rotation: Rotation,
+        keypoints: Keypoints,
+        segments: Segments,
+        planes: Planes,
+        map: Map | None,
+        previous_pose: Pose | None,
     ) -> Pose | None: ...
 
 

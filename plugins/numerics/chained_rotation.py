@@ -33,13 +33,14 @@ def rotation_before(previous: Rotation, previous_pose: Pose | None, floor_deg: f
 @dataclass(frozen=True)
 class TrackedRotation:
     """Puts the rotation that the tracks measure on top of the previous one; see `solve_motion` for the constants. Source "prediction" when the
-    tracks leave some axis less certain than `measured_deg`."""
+    tracks leave some axis less certain than `measured_deg`; where they say nothing at all the camera turns on for `predict_frames`, then stands."""
 
     prior_deg: float
     prior_m: float
     measured_deg: float
     angle_px: float
     plane_floor_deg: float
+    predict_frames: int
 
     def __call__(
         self, before: Estimate, previous_index: int, tracks: Tracks | None, keypoints: Keypoints, segments: Segments, planes: Planes
@@ -51,6 +52,9 @@ class TrackedRotation:
         terms = motion_terms(tracks, keypoints, segments, planes, self.angle_px, self.plane_floor_deg)
         motion = solve_motion(terms, tracks.R_current_previous, self.prior_deg * gap, self.prior_m * gap)
         turned = motion.covariance[:3, :3]
+        long_ago = np.trace(before.covariance) / 3.0 >= self.predict_frames * np.radians(self.prior_deg) ** 2
+        if motion.support == 0.0 and long_ago:
+            return Estimate(before.R, before.covariance + turned, "prediction")
         measured = bool(np.linalg.eigvalsh(turned)[-1] < np.radians(self.measured_deg) ** 2)
         return Estimate(before.R @ motion.R.T, motion.R @ before.covariance @ motion.R.T + turned, "tracks" if measured else "prediction")
 

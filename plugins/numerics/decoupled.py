@@ -43,8 +43,10 @@ class Decoupled:
 
 
 def decoupled_pose(rotation: Rotation, translation: Translation, previous: Pose | None, relocalise: Pose | None = None) -> Decoupled:
-    """The decoupled pose with its status. When the previous pose was lost and the frame of that pose has been found in the map since, the motion
-    since then is put on top of the place found."""
+    """The decoupled pose with its status. It is lost when nothing of this frame took part, and on top of a pose that was lost, however well the
+    frames fit each other: a motion since nowhere leads nowhere. Where this frame was recognised in the map, it starts from there."""
+    if relocalise is not None and relocalise.status != LOST:
+        return Decoupled(relocalise.T_world_camera, relocalise.covariance, relocalise.inliers, relocalise.unobservable, OK, relocalise.reason)
     T = pose_matrix(rotation.R_world_camera, translation.t_world_camera)
     covariance = np.zeros((6, 6))
     R = rotation.R_world_camera
@@ -53,9 +55,9 @@ def decoupled_pose(rotation: Rotation, translation: Translation, previous: Pose 
     unobservable = len(translation.unobservable)
     if previous is None:
         return Decoupled(T, FIRST_SIGMA**2 * np.eye(6), translation.inliers, 0, OK, "first frame, origin of the world")
-    if relocalise is not None and previous.status == LOST and relocalise.index == previous.index and relocalise.status != LOST:
-        T = relocalise.T_world_camera @ invert(previous.T_world_camera) @ T
     status, reason = _judge(rotation, translation, unobservable)
+    if previous.status == LOST and status != LOST:
+        status, reason = LOST, "the place was not recognised since the pose was lost"
     return Decoupled(T, covariance, translation.inliers, unobservable, status, reason)
 
 

@@ -39,7 +39,7 @@ def match_near(
     than `ratio` × the second best of its own octave (1 or more: no such test). A train row goes to its best query. Without descriptors (b == 0 or
     `max_distance` < 0) the nearest pixel is taken. NaN matches nothing. Raises ValueError for an unknown metric or unequal descriptors."""
     mode = _mode(query_descriptors, train_descriptors, max_distance, metric)
-    query, train = _words(query_descriptors), _words(train_descriptors)
+    query, train = words_of(query_descriptors), words_of(train_descriptors)
     return _match_near(
         np.ascontiguousarray(query_px, np.float32), query[0], query[1], np.ascontiguousarray(query_octaves, np.uint8),
         np.ascontiguousarray(train_px, np.float32), train[0], train[1], np.ascontiguousarray(train_octaves, np.uint8),
@@ -66,8 +66,8 @@ def match_lines(
     (b == 0 or `max_distance` < 0) offset, angle and overlap decide. Raises ValueError for unequal descriptor lengths."""
     mode = _mode(query_descriptors, train_descriptors, max_distance, "hamming")
     return _match_lines(
-        np.ascontiguousarray(query_endpoints_px, np.float32), _words(query_descriptors)[0],
-        np.ascontiguousarray(train_endpoints_px, np.float32), _words(train_descriptors)[0],
+        np.ascontiguousarray(query_endpoints_px, np.float32), words_of(query_descriptors)[0],
+        np.ascontiguousarray(train_endpoints_px, np.float32), words_of(train_descriptors)[0],
         float(np.sin(np.radians(max_angle_deg))), float(max_offset_px), float(min_overlap), mode, float(max_distance), float(ratio),
     )  # fmt: skip
 
@@ -82,7 +82,7 @@ def _mode(query: U8, train: U8, max_distance: int, metric: str) -> int:
     return HAMMING if metric == "hamming" else L2
 
 
-def _words(descriptors: U8) -> tuple[U64, U8]:
+def words_of(descriptors: U8) -> tuple[U64, U8]:
     """(n, b) bytes as (n, ⌈b/8⌉) words, zero padded, and the contiguous bytes."""
     rows: Any = np.ascontiguousarray(descriptors, np.uint8)
     missing = -rows.shape[1] % 8

@@ -11,6 +11,7 @@ from trihedron.pipeline.types import (
     DEGRADED,
     F64,
     I32,
+    LOST,
     OK,
     Frame,
     Keypoints,
@@ -23,7 +24,7 @@ from trihedron.pipeline.types import (
     Tracks,
     Translation,
 )
-from trihedron.plugins.numerics.decoupled import decoupled_pose, reference_of
+from trihedron.plugins.numerics.decoupled import Decoupled, decoupled_pose, reference_of
 from trihedron.plugins.numerics.map_terms import line_terms, plane_terms, point_terms
 from trihedron.plugins.numerics.pose_solver import PoseSolution, solve_pose
 
@@ -34,7 +35,8 @@ class Refine:
     """Map-to-frame refinement with parallel and perpendicular planes (section IV-C, eq. 8), from the decoupled pose.
 
     The decoupled rotation is a prior with its own covariance; the decoupled position only says where to start (`position_sigma_m`), since the same
-    features made it. Without a map the decoupled pose stands."""
+    features made it. Without a map the decoupled pose stands. A lost pose is only where to look: it is found again when enough of the map agrees on a
+    place that all directions are measured of, else it stays lost."""
 
     position_sigma_m: float = 0.05  # of the decoupled position, a weak prior
     rotation_sigma_deg: float = 0.2  # added to the rotation's own: no scene is exactly Manhattan
@@ -42,6 +44,8 @@ class Refine:
     relation_sigma_deg: float = 0.5  # walls are parallel or perpendicular to within this
     min_inliers: int = 10  # points + 2 lines + 5 planes below which the pose is called degraded
     min_share: float = 0.25  # of the matches that must agree, else it is called degraded
+    found_inliers: int = 30  # points + 2 lines + 5 planes that find a lost pose again
+    found_share: float = 0.5  # of the matches that must agree for that
 
     def __post_init__(self) -> None:
         for name in ("position_sigma_m", "rotation_sigma_deg", "line_sigma_px", "relation_sigma_deg"):
@@ -49,6 +53,8 @@ class Refine:
                 raise ValueError(f"{name}: must be positive")
         if self.min_inliers < 0 or not 0.0 <= self.min_share <= 1.0:
             raise ValueError("min_inliers, min_share: must not be negative, min_share at most 1")
+        if self.found_inliers < self.min_inliers or not self.min_share <= self.found_share <= 1.0:
+            raise ValueError("found_inliers, found_share: must be at least min_inliers and min_share, found_share at most 1")
 
     def __call__(
         self,
@@ -68,11 +74,13 @@ class Refine:
         start = decoupled_pose(rotation, translation, previous, relocalise)
         if map is None or matches is None or previous is None:
             return start.said(frame, map)
-        found = self._solve(start.T_world_camera, frame, rotation, matches, keypoints, segments, planes, map)
+        found = self._solve(start, frame, matches, keypoints, segments, planes, map)
         inliers = _inliers(found, len(matches.planes))
         if not inliers.any():
             return start.said(frame, map, "nothing of the map was found, pose from the previous frame")
         sought = len(matches.keypoints) + len(matches.segments) + len(matches.planes)
+        if start.status == LOST and not self._found_again(found, inliers, sought):
+            return start.said(frame, map)
         status, reason = self._judge(found, inliers, sought, rotation)
         reference, T_reference_camera = reference_of(map, found.T_world_camera)
         held = found.unobservable.shape[1]
@@ -81,11 +89,13 @@ class Refine:
         )
 
     def _solve(
-        self, T: F64, frame: Frame, rotation: Rotation, matches: Matches, keypoints: Keypoints, segments: Segments, planes: Planes, map: Map
+        self, start: Decoupled, frame: Frame, matches: Matches, keypoints: Keypoints, segments: Segments, planes: Planes, map: Map
     ) -> PoseSolution:
+        T = start.T_world_camera
+        position = self.position_sigma_m**2 * np.eye(3) + (start.covariance[:3, :3] if start.status == LOST else 0.0)
         prior = np.zeros((6, 6))
-        prior[:3, :3] = np.eye(3) / self.position_sigma_m**2
-        prior[3:, 3:] = np.linalg.inv(rotation.covariance + np.radians(self.rotation_sigma_deg) ** 2 * np.eye(3))
+        prior[:3, :3] = np.linalg.inv(position)
+        prior[3:, 3:] = np.linalg.inv(start.covariance[3:, 3:] + np.radians(self.rotation_sigma_deg) ** 2 * np.eye(3))
         return solve_pose(
             T,
             frame.camera,
@@ -95,6 +105,11 @@ class Refine:
             line_terms(map, segments, matches.segments, T, frame.camera, self.line_sigma_px),
             plane_terms(map, planes, matches.planes, matches.parallel, matches.perpendicular, self.relation_sigma_deg),
         )
+
+    def _found_again(self, found: PoseSolution, inliers: I32, sought: int) -> bool:
+        """Whether the map alone says where a lost camera is."""
+        enough = inliers @ np.array([1, 2, 5]) >= self.found_inliers and inliers.sum() >= self.found_share * sought
+        return bool(enough) and found.unobservable.shape[1] == 0
 
     def _judge(self, found: PoseSolution, inliers: I32, sought: int, rotation: Rotation) -> tuple[str, str]:
         """Status and reason of a refined pose."""

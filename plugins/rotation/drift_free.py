@@ -38,12 +38,15 @@ class DriftFree:
     measured_deg: float = 1.0  # tracks that leave the rotation less certain than this have not measured it
     angle_px: float = 0.002  # rad, of a pixel
     plane_floor_deg: float = 0.3  # error of a tracked plane's normal
+    predict_frames: int = 15  # half a second without features: beyond, a velocity says nothing of a hand
 
     def __post_init__(self) -> None:
         if min(self.unit_deg, self.axis_floor_deg, self.pose_floor_deg, self.gate, self.gate_floor_deg, self.prior_deg, self.prior_m) <= 0.0:
             raise ValueError("unit_deg, axis_floor_deg, pose_floor_deg, gate, gate_floor_deg, prior_deg, prior_m: must be positive")
         if self.max_weight < 1.0 or self.correlation < 1.0 or self.max_frames < 1:
             raise ValueError("max_weight, correlation, max_frames: must be at least 1")
+        if self.predict_frames < 0:
+            raise ValueError("predict_frames: must not be negative")
         if min(self.measured_deg, self.angle_px, self.plane_floor_deg, self.step_deg) <= 0.0:
             raise ValueError("step_deg, measured_deg, angle_px, plane_floor_deg: must be positive")
 
@@ -64,7 +67,7 @@ class DriftFree:
             known = KnownFrames(previous.R_world_manhattan, previous.ids, previous.weights)
             if refined:
                 known = known.seen_from(previous, before.R, self.max_weight, self.gate * np.radians(self.gate_floor_deg))
-            tracked = TrackedRotation(self.prior_deg, self.prior_m, self.measured_deg, self.angle_px, self.plane_floor_deg)
+            tracked = TrackedRotation(self.prior_deg, self.prior_m, self.measured_deg, self.angle_px, self.plane_floor_deg, self.predict_frames)
             predicted = tracked(before, previous.index, tracks, keypoints, segments, planes)
         known, estimate, seen = self._tied(known, predicted, manhattan)
         return rotation_value(keypoints.index, keypoints.stamp_ns, estimate, known, seen)

@@ -24,8 +24,11 @@ class Procrustes:
     measured_deg: float = 1.0  # tracks that leave the rotation less certain than this have not measured it
     angle_px: float = 0.002  # rad, of a pixel
     plane_floor_deg: float = 0.3  # error of a tracked plane's normal
+    predict_frames: int = 15  # half a second without features: beyond, a velocity says nothing of a hand
 
     def __post_init__(self) -> None:
+        if self.predict_frames < 0:
+            raise ValueError("predict_frames: must not be negative")
         if min(self.pose_floor_deg, self.prior_deg, self.prior_m, self.measured_deg, self.angle_px, self.plane_floor_deg) <= 0.0:
             raise ValueError("pose_floor_deg, prior_deg, prior_m, measured_deg, angle_px, plane_floor_deg: must be positive")
 
@@ -42,6 +45,6 @@ class Procrustes:
         estimate = Estimate(np.eye(3), np.zeros((3, 3)), "prediction")
         if previous is not None:
             before, _ = rotation_before(previous, previous_pose, self.pose_floor_deg)
-            tracked = TrackedRotation(self.prior_deg, self.prior_m, self.measured_deg, self.angle_px, self.plane_floor_deg)
+            tracked = TrackedRotation(self.prior_deg, self.prior_m, self.measured_deg, self.angle_px, self.plane_floor_deg, self.predict_frames)
             estimate = tracked(before, previous.index, tracks, keypoints, segments, planes)
         return rotation_value(keypoints.index, keypoints.stamp_ns, estimate, KnownFrames.none(), np.zeros((0, 3, 3)))

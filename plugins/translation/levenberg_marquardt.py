@@ -8,7 +8,7 @@ import numpy as np
 
 from trihedron.pipeline.geometry import pose_matrix, transform, transform_planes
 from trihedron.pipeline.registry import register
-from trihedron.pipeline.types import F64, Frame, Keypoints, Planes, Pose, Rotation, Segments, Tracks, Translation
+from trihedron.pipeline.types import F64, LOST, Frame, Keypoints, Planes, Pose, Rotation, Segments, Tracks, Translation
 from trihedron.plugins.numerics import uncertainty as un
 from trihedron.plugins.numerics.pose_solver import solve_pose
 from trihedron.plugins.numerics.pose_terms import SAME, LineTerms, PlaneTerms, PointTerms
@@ -21,15 +21,19 @@ class LevenbergMarquardt:
 
     The previous features are placed in the world by the previous pose. The rotation's own uncertainty is added to the noise of what it moves, so
     that distances to planes, which it does not move, count for more when it is poor. Three weak unknowns remain: the prediction (the previous
-    position, `motion_sigma_m`) fills the directions that no feature sees."""
+    position, `motion_sigma_m`) fills the directions that no feature sees. Without any measurement the camera is taken to keep its velocity for
+    `predict_frames`, then to stand still, ever less certain; that is a prediction and says so (`estimated` False)."""
 
     motion_sigma_m: float = 0.1  # per frame, of the position about the previous one: 3 m/s at 30 frames/s
     line_sigma_px: float = 1.0  # of a segment's end point across it
     rotation_sigma_deg: float = 0.05  # least uncertainty granted to the fixed rotation
+    predict_frames: int = 15  # half a second: beyond, a velocity says nothing of a hand
 
     def __post_init__(self) -> None:
         if self.motion_sigma_m <= 0.0 or self.line_sigma_px <= 0.0 or self.rotation_sigma_deg < 0.0:
             raise ValueError("motion_sigma_m, line_sigma_px, rotation_sigma_deg: must be positive")
+        if self.predict_frames < 0:
+            raise ValueError("predict_frames: must not be negative")
 
     def __call__(
         self,
@@ -40,6 +44,7 @@ class LevenbergMarquardt:
         segments: Segments,
         planes: Planes,
         previous_pose: Pose | None,
+        earlier_pose: Pose | None,
     ) -> Translation:
         """The position; the first frame's is the origin of the world."""
         if previous_pose is None:
@@ -48,7 +53,7 @@ class LevenbergMarquardt:
         frames = max(frame.index - previous_pose.index, 1)
         prior = np.diag(np.repeat([(self.motion_sigma_m * frames) ** -2, 1.0], 3))
         if tracks is None or tracks.previous_index != previous_pose.index:
-            return self._said(frame, start[:3, 3], np.linalg.inv(prior[:3, :3]), np.eye(3), (0, 0, 0), False)
+            return self._predicted(frame, previous_pose, earlier_pose, frames)
         T = previous_pose.T_world_camera
         uncertain = rotation.covariance + np.radians(self.rotation_sigma_deg) ** 2 * np.eye(3)
         found = solve_pose(
@@ -61,10 +66,21 @@ class LevenbergMarquardt:
             self._planes(tracks, planes, T, uncertain),
             fixed_rotation=True,
         )
+        if not (found.points.any() or found.lines.any() or found.planes.any()):
+            return self._predicted(frame, previous_pose, earlier_pose, frames)
         R = rotation.R_world_camera
         inliers = (int(np.count_nonzero(found.points)), int(np.count_nonzero(found.lines)), int(np.count_nonzero(found.planes)))
         unobservable = np.ascontiguousarray((R @ found.unobservable).T)
-        return self._said(frame, found.T_world_camera[:3, 3], R @ found.covariance @ R.T, unobservable, inliers, sum(inliers) > 0)
+        covariance = R @ found.covariance @ R.T + _unknown(previous_pose)
+        return self._said(frame, found.T_world_camera[:3, 3], covariance, unobservable, inliers, True)
+
+    def _predicted(self, frame: Frame, previous: Pose, earlier: Pose | None, frames: int) -> Translation:
+        """Where the camera is if it goes on as before, for as long as that may be said, else where it was."""
+        t, before = previous.T_world_camera[:3, 3].copy(), _unknown(previous)
+        lately = np.trace(before) / 3.0 < self.predict_frames * self.motion_sigma_m**2
+        if earlier is not None and lately:
+            t += (t - earlier.T_world_camera[:3, 3]) * frames / (previous.index - earlier.index)
+        return self._said(frame, t, before + (self.motion_sigma_m * frames) ** 2 * np.eye(3), np.eye(3), (0, 0, 0), False)
 
     def _points(self, tracks: Tracks, keypoints: Keypoints, T: F64, frame: Frame, uncertain: F64) -> PointTerms:
         """Tracked key points whose previous depth is known."""
@@ -115,3 +131,9 @@ class LevenbergMarquardt:
 
     def _said(self, frame: Frame, t: F64, covariance: F64, unobservable: F64, inliers: tuple[int, int, int], estimated: bool) -> Translation:
         return Translation(frame.index, frame.stamp_ns, t.copy(), covariance, unobservable, np.array(inliers, np.int32), estimated)
+
+
+def _unknown(previous: Pose) -> F64:
+    """(3, 3) covariance (world) that a lost pose hands on to what is put on top of it; a pose that was found hands on none."""
+    R = previous.T_world_camera[:3, :3]
+    return np.asarray(R @ previous.covariance[:3, :3] @ R.T) if previous.status == LOST else np.zeros((3, 3))

@@ -29,7 +29,7 @@ def step(stage, world, map, index, at=None, features=None, bundle=None, loop=Non
     """The map after frame `index`, whose camera stands at step `at` of the path and is known exactly; None when the stage says None."""
     T = camera_at(index if at is None else at)
     features = features or world.features(T, index)
-    matches = LocalMap()(world.frame(index), rotation_of(T, index), translation_of(T, index), *features, map)
+    matches = LocalMap()(world.frame(index), rotation_of(T, index), translation_of(T, index), *features, map, None)
     return stage(world.frame(index), pose_of(T, index, **pose), *features, matches, map, bundle, loop)
 
 
