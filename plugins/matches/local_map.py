@@ -8,7 +8,7 @@ import numpy as np
 
 from trihedron.pipeline.geometry import pose_matrix
 from trihedron.pipeline.registry import register
-from trihedron.pipeline.types import LOST, F64, Frame, Keypoints, Map, Matches, Planes, Pose, Rotation, Segments, Translation
+from trihedron.pipeline.types import F64, LOST, Frame, Keypoints, Map, Matches, Planes, Pose, Rotation, Segments, Translation
 from trihedron.plugins.numerics.local_window import local_window
 from trihedron.plugins.numerics.map_search import Guess, MapSearch
 

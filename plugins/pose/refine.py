@@ -9,7 +9,6 @@ import numpy as np
 from trihedron.pipeline.registry import register
 from trihedron.pipeline.types import (
     DEGRADED,
-    F64,
     I32,
     LOST,
     OK,

@@ -12,6 +12,8 @@ from trihedron.pipeline.types import Planes, Pose, Tracks
 from trihedron.plugins.translation.levenberg_marquardt import LevenbergMarquardt
 
 sys.path.insert(0, str(Path(__file__).parent))
+import itertools
+
 from landmark_world import INTO_CORNER, World, camera_at, rotation_of
 
 
@@ -134,7 +136,7 @@ def test_without_features_the_camera_goes_on_for_half_a_second_then_stands_ever_
         covariance = np.zeros((6, 6))
         covariance[:3, :3] = T[:3, :3].T @ found[-1].covariance @ T[:3, :3]
         poses.append(dataclasses.replace(pose_of(T, index), status="lost", covariance=covariance))
-    steps = np.array([np.linalg.norm(b.t_world_camera - a.t_world_camera) for a, b in zip(found, found[1:])])
+    steps = np.array([np.linalg.norm(b.t_world_camera - a.t_world_camera) for a, b in itertools.pairwise(found)])
     assert np.allclose(steps[:14], np.linalg.norm(camera_at(1)[:3, 3])) and np.allclose(steps[15:], 0.0)
     sigma = [np.sqrt(one.covariance[0, 0]) for one in found]
     assert np.allclose(sigma, 0.1 * np.sqrt(np.arange(1, 51)), rtol=1e-3) and not any(one.estimated for one in found)
