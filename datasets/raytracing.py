@@ -56,9 +56,9 @@ def geometry_of(room: Room) -> Geometry:
     return Geometry(
         np.ascontiguousarray(room.planes),
         np.array([solid.kind for solid in room.solids], dtype=np.int32),
-        np.array([solid.centre for solid in room.solids]),
-        np.array([solid.half for solid in room.solids]),
-        np.array([solid.R_world_solid for solid in room.solids]),
+        np.array([solid.centre for solid in room.solids]).reshape(-1, 3),
+        np.array([solid.half for solid in room.solids]).reshape(-1, 3),
+        np.array([solid.R_world_solid for solid in room.solids]).reshape(-1, 3, 3),
         np.array(first, dtype=np.int32),
         np.array(owner, dtype=np.int32),
         np.array([[*face.origin, *face.u, *face.v, *face.normal, face.curved, radius, *_lamp(face, room)] for face, radius in zip(faces, radii)]),

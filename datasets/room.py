@@ -16,6 +16,7 @@ HEIGHT_M = 2.7
 RECTANGLE = ((0.0, 0.0), (5.0, 0.0), (5.0, 4.0), (0.0, 4.0))  # anticlockwise: south, east, north, west wall
 SLANTED = ((0.0, -0.5), (5.0, 0.4), (5.7, 4.0), (0.0, 4.0))  # south and east wall turned by 10° and 11°
 LAMP_M = (2.5, 2.0, 2.45)
+LEAN = np.array([[1.0, 0.25, 0.25], [0.0, 1.0, 0.25], [0.0, 0.0, 1.0]])  # a shear after which all right angles are off by 10° to 14°
 BOX, CYLINDER, SPHERE = 0, 1, 2
 UP = np.array([0.0, 0.0, 1.0])
 
@@ -155,6 +156,27 @@ def shell(footprint: tuple[tuple[float, float], ...]) -> tuple[F64, tuple[Face, 
     faces.append(Face(np.array([west, north, 0.0]), x, -y, UP, size, "floor"))
     faces.append(Face(np.array([west, south, HEIGHT_M]), x, y, -UP, size, "ceiling"))
     return np.array([[*face.normal, -float(face.normal @ face.origin)] for face in faces]), tuple(faces)
+
+
+def leaning_room() -> Room:
+    """The rectangular room, bare, under the shear LEAN about its middle: no two of its surfaces are at right angles."""
+    upright = furnished_room()
+    middle = np.array([*np.mean(RECTANGLE, axis=0), HEIGHT_M / 2.0])
+    faces = [_leaned(face, middle) for face in upright.faces]
+    return Room(np.array([[*face.normal, -float(face.normal @ face.origin)] for face in faces]), tuple(faces))
+
+
+def _leaned(face: Face, middle: F64) -> Face:
+    """A flat face under the shear; its texture covers the parallelogram that it becomes."""
+    width, height = face.u * face.size_m[0], face.v * face.size_m[1]
+    corners = face.origin + np.array([0.0 * width, width, height, width + height])
+    corners = middle + (corners - middle) @ LEAN.T
+    normal, u = np.linalg.solve(LEAN.T, face.normal), LEAN @ face.u
+    normal, u = normal / np.linalg.norm(normal), u / np.linalg.norm(u)
+    frame = np.stack([u, np.cross(u, normal)])
+    extent = (corners - corners[0]) @ frame.T
+    size = np.ptp(extent, axis=0)
+    return Face(corners[0] + extent.min(axis=0) @ frame, frame[0], frame[1], normal, (float(size[0]), float(size[1])), face.material)
 
 
 def all_faces(room: Room) -> list[Face]:

@@ -8,6 +8,7 @@ from __future__ import annotations
 import importlib
 import inspect
 import os
+import shlex
 import sys
 import time
 from collections.abc import Callable
@@ -112,6 +113,7 @@ def _run(words: list[str]) -> int:
     overrides = _with_recorded(words)
 
     failures: list[Exception] = []
+    reports: list[list[str]] = []  # the command of a sweep, once for each job that went well
 
     def task(config: DictConfig) -> float | None:
         from trihedron.pipeline.execute import execute
@@ -125,6 +127,8 @@ def _run(words: list[str]) -> int:
             if runtime.mode == RunMode.MULTIRUN:
                 print(f"trihedron: {error}", file=sys.stderr)
             return None
+        if runtime.mode == RunMode.MULTIRUN and config.report:
+            reports.append([*shlex.split(config.report), runtime.sweep.dir])
         _point_latest(out)
         return metrics["final"]["ate_rmse_m"] if "final" in metrics else None
 
@@ -133,6 +137,8 @@ def _run(words: list[str]) -> int:
         hydra.main(config_path="pkg://trihedron.conf", config_name="root", version_base="1.3")(task)()
     except Exception as error:
         raise rewritten(error) from error
+    if reports:
+        _dispatch(reports[-1])
     if failures:
         raise failures[0]
     return 0
@@ -145,7 +151,7 @@ def _with_recorded(words: list[str]) -> list[str]:
         return words
     from trihedron.pipeline.recording import Recording
 
-    return [word for word in Recording(source).overrides() if not word.startswith(("out=", "replay=", "only=", "feedback="))] + words
+    return [word for word in Recording(source).overrides() if not word.startswith(("out=", "replay=", "only=", "feedback=", "report="))] + words
 
 
 def _point_latest(out: Path) -> None:

@@ -61,6 +61,7 @@ class RunOptions:
     replay: str = ""  # a recording to read topics from
     only: list[str] = dataclasses.field(default_factory=list)  # stages that a replay computes again; [] = all
     feedback: Feedback = Feedback.new
+    report: str = ""  # a command that is given the folder of a sweep when all its jobs are done, for example: benchmark rotations
     record: RecordOptions = dataclasses.field(default_factory=RecordOptions)
     hydra: Any = dataclasses.field(
         default_factory=lambda: {"run": {"dir": "${out}"}, "sweep": {"dir": "${out}", "subdir": "${hydra.job.num}"}, "output_subdir": ".hydra"}

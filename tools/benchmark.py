@@ -1,7 +1,8 @@
 """Time a run per frame and stage, with its memory, beside a fixed reference workload of the same minute and frames.
 
 The machine's speed varies, so times are also given as multiples of the reference: OpenCV ORB (1000 features, 8 levels) and LSD on the same frames,
-one thread.
+one thread. `trihedron benchmark manhattan` compares the estimators of the Manhattan frame on rendered rooms instead, and `trihedron benchmark
+rotations` the runs of a sweep over them; their --help explains.
 
 Example: trihedron benchmark dataset=tum dataset.path=FOLDER dataset.frames=0:150 --json benchmark.json
 """
@@ -16,14 +17,26 @@ import subprocess
 import sys
 import tempfile
 import time
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
+
+from trihedron.pipeline.types import U8
 
 REFERENCE_FRAMES = 40
 
 
 def main(argv: list[str]) -> int:
-    """Run `trihedron run` with the given overrides in a process of its own, then the reference; print a table and optionally write JSON."""
+    """Run `trihedron run` with the given overrides in a process of its own, then the reference; print a table and optionally write JSON.
+    The words `manhattan` and `rotations` hand over to the comparisons of estimators."""
+    if argv[:1] == ["manhattan"]:
+        from trihedron.tools import manhattan_family
+
+        return manhattan_family.main(argv[1:])
+    if argv[:1] == ["rotations"]:
+        from trihedron.tools import rotation_comparison
+
+        return rotation_comparison.main(argv[1:])
     parser = argparse.ArgumentParser(prog="trihedron benchmark", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("overrides", nargs="*", help="as for trihedron run")
     parser.add_argument("--json", metavar="FILE", help="write the figures too")
@@ -31,8 +44,8 @@ def main(argv: list[str]) -> int:
     overrides = [*options.overrides, *rest]
     with tempfile.TemporaryDirectory() as folder:
         figures = measure([*overrides, f"out={folder}/run"], Path(folder) / "run")
-    figures["reference_ms"] = reference_ms(overrides)
-    figures["machine"] = {"system": platform.platform(), "python": platform.python_version(), "cpus": os.cpu_count()}
+    figures["reference_ms"] = reference_ms(first_images(overrides))
+    figures["machine"] = machine()
     print(table(figures))
     if options.json:
         Path(options.json).write_text(json.dumps(figures, indent=2) + "\n")
@@ -61,10 +74,13 @@ def measure(overrides: list[str], out: Path) -> dict[str, Any]:
     return figures
 
 
-def reference_ms(overrides: list[str]) -> float:
-    """Median milliseconds of ORB + LSD over the run's first frames, one thread."""
-    import cv2
-    import numpy as np
+def machine() -> dict[str, Any]:
+    """What the figures were measured on."""
+    return {"system": platform.platform(), "python": platform.python_version(), "cpus": os.cpu_count()}
+
+
+def first_images(overrides: list[str]) -> list[U8]:
+    """Grey images (h, w) of the run's first frames."""
     from hydra import compose, initialize_config_module
 
     from trihedron.pipeline.config import make_plugin, register_configs
@@ -75,15 +91,22 @@ def reference_ms(overrides: list[str]) -> float:
     with initialize_config_module("trihedron.conf", version_base="1.3"):
         config = compose("root", overrides=overrides)
     dataset = make_plugin("dataset", config.dataset)
+    frames = [dataset(i) for i in range(min(REFERENCE_FRAMES, len(dataset)))]
+    return [frame.gray for frame in frames if frame is not None]
+
+
+def reference_ms(images: Sequence[U8]) -> float:
+    """Median milliseconds of ORB + LSD on an image (h, w), one thread."""
+    import cv2
+    import numpy as np
+
     cv2.setNumThreads(1)
     orb, lsd, times = cv2.ORB_create(1000, 1.2, 8), cv2.createLineSegmentDetector(), []
-    for i in range(min(REFERENCE_FRAMES, len(dataset))):
-        frame = dataset(i)
-        if frame is not None:
-            began = time.perf_counter()
-            orb.detectAndCompute(frame.gray, None)
-            lsd.detect(frame.gray)
-            times.append(1e3 * (time.perf_counter() - began))
+    for image in images:
+        began = time.perf_counter()
+        orb.detectAndCompute(image, None)
+        lsd.detect(image)
+        times.append(1e3 * (time.perf_counter() - began))
     return round(float(np.median(times)), 2)
 
 

@@ -1,146 +1,151 @@
-"""Rotation error against frame for each run of a sweep over estimators, and the sphere of directions of one frame."""
+"""Compare the runs of a sweep over estimators of the Manhattan frame: a table, the errors against frame, and the sphere of one frame.
+
+`trihedron run -m experiment=rotation_family` ends with this. The truth is the one rotation from the scene's axes to the world that the claims of all
+runs agree on best, carried into each camera by the ground truth of the poses. An error is that of the nearest frame in view; a claim more than 3°
+off is false. Times are those of the replay.
+
+Example: trihedron benchmark rotations runs/family --frame 60
+"""
 
 from __future__ import annotations
 
+import json
+from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import yaml
+from numpy.typing import NDArray
 
 from trihedron.datasets.trajectories import attached_truth
-from trihedron.pipeline.errors import DataError, RecordingError
-from trihedron.pipeline.geometry import nearest_pairs, nearest_rotation, rotation_angle_deg
+from trihedron.pipeline.errors import DataError
+from trihedron.pipeline.geometry import nearest_pairs, nearest_rotation
 from trihedron.pipeline.recording import Recording
-from trihedron.pipeline.types import F64, ManhattanFrame, Trajectory
-from trihedron.plugins.numerics.cube_symmetry import nearest_equivalent
-from trihedron.tools.arguments import table
+from trihedron.pipeline.types import F64, ManhattanFrame
+from trihedron.plugins.numerics.cube_symmetry import CUBE, nearest_equivalent
+from trihedron.tools.arguments import Parser, table
 
-RECORDING, ERRORS_PNG = "run.mcap", "rotation_error.png"
+RECORDING, TIMING, ERRORS_PNG = "run.mcap", "timing.json", "rotation_error.png"
 LARGEST_DIFFERENCE_NS = 20_000_000
-CANDIDATES, INLIER_DEG = 30, 5.0  # frames tried as the world–Manhattan rotation; residual of those that are averaged
+CANDIDATES, INLIER_DEG = 20, 5.0  # claims of a run tried as the truth; residual of those that are averaged
+RIGHT_DEG, FALSE_DEG = 1.0, 3.0
 
 
-def compare(folder: Path, out: Path, sphere: int | None) -> str:
-    """The table of all runs below `folder`; pictures go to `out`. Raises DataError when nothing can be compared."""
-    runs = {}
-    for path in sorted(folder.glob(f"*/{RECORDING}"), key=lambda p: (len(p.parent.name), p.parent.name)):
-        recording = Recording(path)
-        if "manhattan" in recording.topics:
-            runs[f"{path.parent.name} {_config(recording)['manhattan']['plugin']}"] = recording
-    if not runs:
-        raise DataError(str(folder), "holds no runs with a Manhattan frame", "make them with trihedron run -m experiment=rotation_family replay=FILE")
-    out.mkdir(parents=True, exist_ok=True)
-    errors = {name: rotation_errors(recording) for name, recording in runs.items()}
-    _plot_errors(errors, out / ERRORS_PNG)
-    written = [out / ERRORS_PNG]
-    if sphere is not None:
-        written.append(out / f"sphere_{sphere}.png")
-        _plot_sphere(runs, sphere, written[-1])
-    rows: list[list[str]] = [["run", "frames", "claimed", "within 1°", "median (deg)", "p95 (deg)", "max (deg)"]]
-    for name, values in errors.items():
-        known = values[np.isfinite(values[:, 1]), 1]
-        numbers = [np.median(known), np.percentile(known, 95), known.max()] if len(known) else []
-        shares = [f"{len(known) / len(values):.3f}", f"{np.mean(values[:, 1] <= 1.0):.3f}"] if len(values) else ["-", "-"]
-        rows.append([name, str(len(values)), *shares, *([f"{x:.3f}" for x in numbers] or ["-"] * 3)])
-    return "\n".join([table(rows, "lrrrrrr"), *(str(path) for path in written)])
+@dataclass(frozen=True)
+class Run:
+    """One estimator over the recording. `T_world_camera` holds the true rotations (n, 3, 3) of the frames in `found`."""
+
+    name: str
+    recording: Recording
+    found: list[ManhattanFrame]
+    R_world_camera: F64
+    p50_ms: float  # NaN where it was not timed
+
+    @cached_property
+    def claims(self) -> tuple[NDArray[np.int64], F64]:
+        """(m,) rows of `found` that claim a frame, one for each frame in view, and (m, 3, 3) R_world_manhattan as each says."""
+        rows = [(i, R) for i, value in enumerate(self.found) if value.supported for R in in_view(value)]
+        number = np.array([i for i, _ in rows], np.int64)
+        return number, self.R_world_camera[number] @ np.array([R for _, R in rows]).reshape(-1, 3, 3)
+
+    def errors_deg(self, world: F64) -> F64:
+        """(n,) error of each frame, NaN where none was claimed."""
+        errors, (rows, rotations) = np.full(len(self.found), np.inf), self.claims
+        np.minimum.at(errors, rows, residuals_deg(rotations, world))
+        return np.asarray(np.where(np.isfinite(errors), errors, np.nan))
 
 
-def rotation_errors(recording: Recording) -> F64:
-    """(n, 2) frame number and residual (deg) of `R_world_camera R_camera_manhattan` against the one constant rotation that fits the frames best;
-    NaN where no Manhattan frame was claimed. Raises DataError without ground truth."""
-    truth: Trajectory | None = attached_truth(recording.attachments, str(recording.path))
+def main(argv: list[str]) -> int:
+    """Print the table and the names of the pictures; returns the exit code. Raises DataError when there is nothing to compare."""
+    parser = Parser("benchmark rotations", __name__)
+    parser.add_argument("folder", type=Path, help="of the sweep")
+    parser.add_argument("--frame", type=int, metavar="N", help="whose sphere is drawn (default: the middle one)")
+    options = parser.parse_args(argv)
+    print(compare(options.folder, options.frame))
+    return 0
+
+
+def compare(folder: Path, frame: int | None = None) -> str:
+    """The table of all runs in `folder` and the paths of the pictures written there. Raises DataError when nothing can be compared."""
+    from trihedron.tools import rotation_pictures
+
+    runs = read_runs(folder)
+    world = common_world(runs)
+    errors = {run.name: run.errors_deg(world) for run in runs}
+    numbers = [value.index for value in runs[0].found]
+    frame = numbers[len(numbers) // 2] if frame is None else frame
+    if frame not in numbers:
+        raise DataError(str(folder), f"there is no frame {frame}", f"give one of {numbers[0]}..{numbers[-1]}")
+    written = [folder / ERRORS_PNG, folder / f"sphere_{frame}.png"]
+    rotation_pictures.errors_figure(runs, errors, written[0])
+    rotation_pictures.sphere_figure(runs, world, frame, written[1])
+    rows: list[list[str]] = [["estimator", "frames", "claimed", "within 1°", "false", "median (deg)", "p95 (deg)", "max (deg)", "p50 ms"]]
+    for run in runs:
+        error = errors[run.name]
+        known = error[np.isfinite(error)]
+        shares = [np.isfinite(error), error <= RIGHT_DEG, error > FALSE_DEG]
+        largest = [np.median(known), np.percentile(known, 95), known.max()] if len(known) else []
+        cells = [*(f"{share.mean():.3f}" for share in shares), *([f"{x:.3f}" for x in largest] or ["-"] * 3)]
+        rows.append([run.name, str(len(error)), *cells, f"{run.p50_ms:.2f}" if np.isfinite(run.p50_ms) else "-"])
+    return "\n".join([table(rows, "lrrrrrrrr"), *(str(path) for path in written)])
+
+
+def read_runs(folder: Path) -> list[Run]:
+    """The runs of `folder`, itself or the jobs of a sweep, by job number. Raises DataError without any, or without ground truth."""
+    runs: list[Run] = []
+    for path in [folder / RECORDING, *sorted(folder.glob(f"*/{RECORDING}"), key=lambda p: (len(p.parent.name), p.parent.name))]:
+        recording = Recording(path) if path.exists() else None
+        if recording is not None and "manhattan" in recording.topics:
+            runs.append(_run(recording, [run.name for run in runs]))
+    if not any(run.found for run in runs):
+        cure = "make them with: trihedron run -m experiment=rotation_family replay=FILE"
+        raise DataError(str(folder), "holds no runs with a Manhattan frame and ground truth", cure)
+    return runs
+
+
+def _run(recording: Recording, taken: list[str]) -> Run:
+    plugin: str = config_of(recording)["manhattan"]["plugin"]
+    name = plugin if plugin not in taken else f"{plugin} {recording.path.parent.name}"
+    truth = attached_truth(recording.attachments, str(recording.path))
     if truth is None:
         raise DataError(str(recording.path), "holds no ground truth", "record a data set that has one")
-    found: list[ManhattanFrame] = [v for v in recording.values("manhattan") if isinstance(v, ManhattanFrame)]
-    pairs = nearest_pairs(np.array([v.stamp_ns for v in found], np.int64), truth.stamps_ns, LARGEST_DIFFERENCE_NS)
-    frames = [found[i] for i, _ in pairs]
-    worlds = [[truth.poses[j, :3, :3] @ R for R in found[i].rotations] if found[i].supported else [] for i, j in pairs]
-    claimed = [rotations for rotations in worlds if rotations]
-    if not claimed:
-        return np.array([[frame.index, np.nan] for frame in frames]).reshape(-1, 2)
-    tried = [rotations[0] for rotations in claimed[:: max(len(claimed) // CANDIDATES, 1)]]
-    world = min(tried, key=lambda R: float(np.median([_residual(rotations, R) for rotations in claimed])))
-    near = [nearest_equivalent(R, world) for rotations in claimed for R in rotations]
-    world = nearest_rotation(sum((R for R in near if rotation_angle_deg(world.T @ R) <= INLIER_DEG), np.zeros((3, 3))))
-    return np.array([[frame.index, _residual(rotations, world) if rotations else np.nan] for frame, rotations in zip(frames, worlds)])
+    values = [v for v in recording.values("manhattan") if isinstance(v, ManhattanFrame)]
+    pairs = nearest_pairs(np.array([v.stamp_ns for v in values], np.int64), truth.stamps_ns, LARGEST_DIFFERENCE_NS)
+    timing = recording.path.with_name(TIMING)
+    stages = json.loads(timing.read_text())["stages"] if timing.exists() else {}
+    p50_ms = float(stages.get("manhattan", {}).get("p50_ms", np.nan))
+    return Run(name, recording, [values[i] for i, _ in pairs], truth.poses[pairs[:, 1], :3, :3], p50_ms)
 
 
-def _residual(rotations: list[F64], world: F64) -> float:
-    return min(rotation_angle_deg(world.T @ nearest_equivalent(R, world)) for R in rotations)
-
-
-def _config(recording: Recording) -> Any:
+def config_of(recording: Recording) -> Any:
+    """The composed configuration that made it."""
     return yaml.safe_load(recording.metadata["config"])
 
 
-def _plot_errors(errors: dict[str, F64], path: Path) -> None:
-    import matplotlib
-
-    matplotlib.use("Agg")
-    from matplotlib import pyplot
-
-    figure, axes = pyplot.subplots(figsize=(9, 4), layout="constrained")
-    for name, values in errors.items():
-        axes.plot(values[:, 0], values[:, 1], marker=".", markersize=3, linewidth=1, label=name)
-    axes.set_yscale("log")
-    axes.set_xlabel("frame")
-    axes.set_ylabel("rotation error (deg)")
-    axes.grid(alpha=0.3, which="both")
-    axes.legend(fontsize=8)
-    figure.savefig(path, dpi=100)
-    pyplot.close(figure)
+def in_view(value: ManhattanFrame) -> F64:
+    """(k, 3, 3) the frames that are seen, not only remembered."""
+    return np.asarray(value.rotations[value.inliers.sum(axis=1) > 0])
 
 
-def _plot_sphere(runs: dict[str, Recording], frame: int, path: Path) -> None:
-    """The half sphere in Lambert's equal-area projection, opposite directions folded together, seen along the camera's axis."""
-    import matplotlib
-
-    matplotlib.use("Agg")
-    from matplotlib import pyplot
-
-    first = next(iter(runs.values()))
-    source = _config(first).get("replay")
-    values = {topic: _value(Recording(source) if source else first, topic, frame) for topic in ("normals", "planes", "segments")}
-    if all(value is None for value in values.values()):
-        raise RecordingError(str(source or first.path), f"has no features of frame {frame}", "give the number of a recorded frame")
-    figure, axes = pyplot.subplots(figsize=(7, 7), layout="constrained")
-    axes.add_patch(pyplot.Circle((0, 0), 1.0, fill=False, color="0.5"))
-    if values["normals"] is not None:
-        x, y = _disc(values["normals"].normals[::4, ::4].reshape(-1, 3))
-        axes.scatter(x, y, s=2, color="0.7", label="normals")
-    if values["planes"] is not None:
-        planes = values["planes"]
-        x, y = _disc(planes.coefficients[:, :3])
-        axes.scatter(x, y, s=np.sqrt(planes.pixels) + 10.0, marker="s", alpha=0.5, color="tab:blue", label="planes")
-    if values["segments"] is not None:
-        ends = values["segments"].endpoints_m
-        x, y = _disc(ends[:, 1] - ends[:, 0])
-        axes.scatter(x, y, s=14, marker="x", linewidth=0.8, color="tab:orange", label="lines")
-    for number, (name, recording) in enumerate(runs.items()):
-        found = _value(recording, "manhattan", frame)
-        if found is not None and len(found.rotations):
-            label = name if found.supported else f"{name} (not claimed)"
-            directions = np.swapaxes(found.rotations, 1, 2).reshape(-1, 3)
-            x, y = _disc(directions)
-            axes.scatter(x, y, s=90 + 45 * number, facecolors="none", edgecolors=f"C{number + 2}", label=label)
-    axes.set_aspect("equal")
-    axes.set_axis_off()
-    axes.legend(fontsize=8, loc="lower left")
-    axes.set_title(f"directions of frame {frame}, opposite ones folded", fontsize=10)
-    figure.savefig(path, dpi=100)
-    pyplot.close(figure)
+def residuals_deg(rotations: F64, reference: F64) -> F64:
+    """(n,) angle of (n, 3, 3) to the nearest of the 24 names of the reference (3, 3)."""
+    traces = np.einsum("nij,cij->nc", reference.T @ rotations, CUBE).max(axis=1, initial=-1.0)
+    return np.asarray(np.degrees(np.arccos(np.clip((traces - 1.0) / 2.0, -1.0, 1.0))))
 
 
-def _disc(directions: F64) -> F64:
-    """(n, 3) -> (2, m) points in the unit disc of those that are finite; y down as in the image, hence drawn upside down."""
-    known = directions[np.isfinite(directions).all(axis=1)].astype(np.float64)
-    known = known / np.maximum(np.linalg.norm(known, axis=1, keepdims=True), 1e-12)
-    known = np.where(known[:, 2:] > 0.0, -known, known)
-    return np.asarray((known[:, :2] / np.sqrt(1.0 - known[:, 2:])).T * [[1.0], [-1.0]])
-
-
-def _value(recording: Recording, topic: str, frame: int) -> Any:
-    if topic not in recording.topics:
-        return None
-    return next((value for value in recording.values(topic) if value.index == frame), None)
+def common_world(runs: list[Run]) -> F64:
+    """(3, 3) R_world_manhattan: of claims spread over all runs the one with the least mean residual, larger ones cut off, each run alike; then the
+    mean of the claims near it. Raises DataError when nothing was claimed."""
+    claims = [run.claims[1] for run in runs if len(run.claims[1])]
+    if not claims:
+        raise DataError(str(runs[0].recording.path), "no run claims a Manhattan frame", "try another sequence")
+    tried = [R for rotations in claims for R in rotations[:: max(len(rotations) // CANDIDATES, 1)]]
+    cut = [np.mean([np.minimum(residuals_deg(rotations, R), INLIER_DEG).mean() for rotations in claims]) for R in tried]
+    world = tried[int(np.argmin(cut))]
+    total = np.zeros((3, 3))
+    for rotations in claims:
+        near = rotations[residuals_deg(rotations, world) <= INLIER_DEG]
+        total += sum((nearest_equivalent(R, world) for R in near), np.zeros((3, 3))) / len(rotations)
+    return nearest_rotation(total)
