@@ -25,13 +25,15 @@ def causal_trajectory(result: Result) -> Trajectory:
 
 
 def final_trajectory(result: Result) -> Trajectory:
-    """The tracked poses hung on the final keyframes: keyframe pose × relative pose, so corrections of the map reach every frame."""
+    """The tracked poses hung on the final keyframes: keyframe pose × relative pose, so corrections of the map reach every frame. A frame that became
+    a keyframe is where that is."""
     poses = [pose for pose in result.poses if pose.status != LOST]
     if result.map is None:
         return causal_trajectory(result)
     keyframes = result.map.keyframes.column("T_world_camera")
-    final = [p.T_world_camera if p.reference < 0 else keyframes[p.reference] @ p.T_reference_camera for p in poses]
-    return _trajectory([pose.stamp_ns for pose in poses], final)
+    own = dict(zip(result.map.keyframes.column("index").tolist(), keyframes))
+    hung = [pose.T_world_camera if pose.reference < 0 else keyframes[pose.reference] @ pose.T_reference_camera for pose in poses]
+    return _trajectory([pose.stamp_ns for pose in poses], [own.get(pose.index, T) for pose, T in zip(poses, hung)])
 
 
 def _trajectory(stamps_ns: list[int], poses: list[Any]) -> Trajectory:

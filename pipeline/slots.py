@@ -107,7 +107,8 @@ class TracksSlot(Protocol):
 
 class RotationSlot(Protocol):
     """The camera's rotation in the world, drift-free where the scene is Manhattan (eq. 1), with the world–Manhattan rotation it maintains.
-    The world is the first frame's camera frame. `previous` is this stage's last output, `previous_pose` the refined pose before this frame."""
+    The world is the first frame's camera frame. `previous` is this stage's last output, `previous_pose` the refined pose before this frame, `map` the
+    map before this frame: a correction may have moved the pose's reference keyframe since it was said, and both move with it."""
 
     def __call__(
         self,
@@ -118,12 +119,13 @@ class RotationSlot(Protocol):
         planes: Planes,
         previous: Rotation | None,
         previous_pose: Pose | None,
+        map: Map | None,
     ) -> Rotation | None: ...
 
 
 class TranslationSlot(Protocol):
     """The camera's position with the rotation fixed (eqs. 2–7), from the features tracked since the previous frame. `earlier_pose` is the pose of
-    two frames ago: with the previous one it says how fast the camera moved before its features were lost."""
+    two frames ago: with the previous one it says how fast the camera moved before its features were lost. `map` as for `rotation`."""
 
     def __call__(
         self,
@@ -135,6 +137,7 @@ class TranslationSlot(Protocol):
         planes: Planes,
         previous_pose: Pose | None,
         earlier_pose: Pose | None,
+        map: Map | None,
     ) -> Translation | None: ...
 
 

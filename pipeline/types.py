@@ -255,7 +255,6 @@ class Correction(Value):
     endpoints_m: Annotated[F64, Shape("m", 2, 3)]
     plane_ids: Annotated[I32, Shape("p")]
     coefficients: Annotated[F64, Shape("p", 4)]
-    R_corrected_world: Annotated[F64, Shape(3, 3)]  # turns the Manhattan reference with the map
 
 
 @dataclass(frozen=True)

@@ -10,6 +10,7 @@ from trihedron.pipeline.geometry import rotation_angle_deg
 from trihedron.pipeline.registry import register
 from trihedron.pipeline.types import I32, LOST, Correction, Frame, Keypoints, Map, Matches, Planes, Pose, Segments
 from trihedron.plugins.numerics import insertion
+from trihedron.plugins.numerics.anchoring import anchored
 from trihedron.plugins.numerics.association import Associated, associate, existing
 from trihedron.plugins.numerics.correction import apply_correction
 from trihedron.plugins.numerics.culling import cull
@@ -66,6 +67,7 @@ class Covisibility:
     ) -> Map | None:
         """The next version of the map, or None when this frame changes nothing."""
         corrected = self._corrected(map, bundle, loop)
+        pose = anchored(pose, corrected)
         matches = existing(matches, corrected) if matches is not None and corrected is not None else None
         if corrected is None:
             lengths = keypoints.descriptors.shape[1], segments.descriptors.shape[1], planes.samples_m.shape[1]

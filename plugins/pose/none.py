@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 from trihedron.pipeline.registry import register
 from trihedron.pipeline.types import Frame, Map, Pose, Rotation, Translation
+from trihedron.plugins.numerics.anchoring import anchored
 from trihedron.plugins.numerics.decoupled import decoupled_pose
 
 
@@ -18,4 +19,5 @@ class NoRefinement:
         self, frame: Frame, rotation: Rotation, translation: Translation, previous: Pose | None, map: Map | None, relocalise: Pose | None
     ) -> Pose:
         """The decoupled pose; status from whether this frame's features determined it."""
+        previous, relocalise = (anchored(said, map) if said is not None else None for said in (previous, relocalise))
         return decoupled_pose(rotation, translation, previous, relocalise).said(frame, map)

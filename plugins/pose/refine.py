@@ -23,6 +23,7 @@ from trihedron.pipeline.types import (
     Tracks,
     Translation,
 )
+from trihedron.plugins.numerics.anchoring import anchored
 from trihedron.plugins.numerics.decoupled import Decoupled, decoupled_pose, reference_of
 from trihedron.plugins.numerics.map_terms import line_terms, plane_terms, point_terms
 from trihedron.plugins.numerics.pose_solver import PoseSolution, solve_pose
@@ -70,6 +71,7 @@ class Refine:
         relocalise: Pose | None,
     ) -> Pose:
         """The pose with status and reason; the identity for the first frame."""
+        previous, relocalise = (anchored(said, map) if said is not None else None for said in (previous, relocalise))
         start = decoupled_pose(rotation, translation, previous, relocalise)
         if map is None or matches is None or previous is None:
             return start.said(frame, map)

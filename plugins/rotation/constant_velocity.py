@@ -7,7 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from trihedron.pipeline.registry import register
-from trihedron.pipeline.types import Keypoints, Pose, Rotation, Tracks
+from trihedron.pipeline.types import Keypoints, Map, Pose, Rotation, Tracks
+from trihedron.plugins.numerics.anchoring import anchored_before
 from trihedron.plugins.numerics.chained_rotation import Estimate, rotation_before, rotation_value
 from trihedron.plugins.numerics.manhattan_frames import KnownFrames
 
@@ -25,11 +26,13 @@ class ConstantVelocity:
         if min(self.pose_floor_deg, self.prior_deg) <= 0.0:
             raise ValueError("pose_floor_deg, prior_deg: must be positive")
 
-    def __call__(self, tracks: Tracks | None, keypoints: Keypoints, previous: Rotation | None, previous_pose: Pose | None) -> Rotation:
+    def __call__(
+        self, tracks: Tracks | None, keypoints: Keypoints, previous: Rotation | None, previous_pose: Pose | None, map: Map | None
+    ) -> Rotation:
         """The rotation of this frame; the identity for the first."""
         estimate = Estimate(np.eye(3), np.zeros((3, 3)), "prediction")
         if previous is not None:
-            before, _ = rotation_before(previous, previous_pose, self.pose_floor_deg)
+            before, _ = rotation_before(*anchored_before(previous, previous_pose, map), self.pose_floor_deg)
             turn = tracks.R_current_previous if tracks is not None and tracks.previous_index == previous.index else np.eye(3)
             grown = np.eye(3) * np.radians(self.prior_deg * max(keypoints.index - previous.index, 1)) ** 2
             estimate = Estimate(before.R @ turn.T, turn @ before.covariance @ turn.T + grown, "prediction")

@@ -8,7 +8,8 @@ import numpy as np
 
 from trihedron.pipeline.geometry import exp_so3, log_so3
 from trihedron.pipeline.registry import register
-from trihedron.pipeline.types import F64, Keypoints, ManhattanFrame, Planes, Pose, Rotation, Segments, Tracks
+from trihedron.pipeline.types import F64, Keypoints, ManhattanFrame, Map, Planes, Pose, Rotation, Segments, Tracks
+from trihedron.plugins.numerics.anchoring import anchored_before
 from trihedron.plugins.numerics.chained_rotation import Estimate, TrackedRotation, rotation_before, rotation_value
 from trihedron.plugins.numerics.manhattan_frames import KnownFrames, Sighting
 
@@ -59,10 +60,12 @@ class DriftFree:
         planes: Planes,
         previous: Rotation | None,
         previous_pose: Pose | None,
+        map: Map | None,
     ) -> Rotation:
         """The rotation of this frame; the identity for the first."""
         known, predicted = KnownFrames.none(), Estimate(np.eye(3), np.zeros((3, 3)), "prediction")
         if previous is not None:
+            previous, previous_pose = anchored_before(previous, previous_pose, map)
             before, refined = rotation_before(previous, previous_pose, self.pose_floor_deg)
             known = KnownFrames(previous.R_world_manhattan, previous.ids, previous.weights)
             if refined:

@@ -7,7 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from trihedron.pipeline.registry import register
-from trihedron.pipeline.types import Keypoints, Planes, Pose, Rotation, Segments, Tracks
+from trihedron.pipeline.types import Keypoints, Map, Planes, Pose, Rotation, Segments, Tracks
+from trihedron.plugins.numerics.anchoring import anchored_before
 from trihedron.plugins.numerics.chained_rotation import Estimate, TrackedRotation, rotation_before, rotation_value
 from trihedron.plugins.numerics.manhattan_frames import KnownFrames
 
@@ -40,11 +41,12 @@ class Procrustes:
         planes: Planes,
         previous: Rotation | None,
         previous_pose: Pose | None,
+        map: Map | None,
     ) -> Rotation:
         """The rotation of this frame; the identity for the first."""
         estimate = Estimate(np.eye(3), np.zeros((3, 3)), "prediction")
         if previous is not None:
-            before, _ = rotation_before(previous, previous_pose, self.pose_floor_deg)
+            before, _ = rotation_before(*anchored_before(previous, previous_pose, map), self.pose_floor_deg)
             tracked = TrackedRotation(self.prior_deg, self.prior_m, self.measured_deg, self.angle_px, self.plane_floor_deg, self.predict_frames)
             estimate = tracked(before, previous.index, tracks, keypoints, segments, planes)
         return rotation_value(keypoints.index, keypoints.stamp_ns, estimate, KnownFrames.none(), np.zeros((0, 3, 3)))

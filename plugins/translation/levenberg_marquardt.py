@@ -8,8 +8,9 @@ import numpy as np
 
 from trihedron.pipeline.geometry import pose_matrix, transform, transform_planes
 from trihedron.pipeline.registry import register
-from trihedron.pipeline.types import F64, LOST, Frame, Keypoints, Planes, Pose, Rotation, Segments, Tracks, Translation
+from trihedron.pipeline.types import F64, LOST, Frame, Keypoints, Map, Planes, Pose, Rotation, Segments, Tracks, Translation
 from trihedron.plugins.numerics import uncertainty as un
+from trihedron.plugins.numerics.anchoring import anchored
 from trihedron.plugins.numerics.pose_solver import solve_pose
 from trihedron.plugins.numerics.pose_terms import SAME, LineTerms, PlaneTerms, PointTerms
 
@@ -45,10 +46,13 @@ class LevenbergMarquardt:
         planes: Planes,
         previous_pose: Pose | None,
         earlier_pose: Pose | None,
+        map: Map | None,
     ) -> Translation:
         """The position; the first frame's is the origin of the world."""
         if previous_pose is None:
             return self._said(frame, np.zeros(3), np.zeros((3, 3)), np.empty((0, 3)), (0, 0, 0), True)
+        previous_pose = anchored(previous_pose, map)
+        earlier_pose = anchored(earlier_pose, map) if earlier_pose is not None else None
         start = pose_matrix(rotation.R_world_camera, previous_pose.T_world_camera[:3, 3])
         frames = max(frame.index - previous_pose.index, 1)
         prior = np.diag(np.repeat([(self.motion_sigma_m * frames) ** -2, 1.0], 3))

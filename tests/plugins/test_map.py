@@ -258,7 +258,7 @@ def correction(map, **changes):
     none = {
         "based_on": map.revision, "keyframe_ids": np.empty(0, np.int32), "T_world_keyframe": np.empty((0, 4, 4)), "point_ids": np.empty(0, np.int32),
         "points_m": np.empty((0, 3)), "line_ids": np.empty(0, np.int32), "endpoints_m": np.empty((0, 2, 3)), "plane_ids": np.empty(0, np.int32),
-        "coefficients": np.empty((0, 4)), "R_corrected_world": np.eye(3),
+        "coefficients": np.empty((0, 4)),
     }  # fmt: skip
     return Correction(map.index, map.stamp_ns, **{**none, **changes})
 

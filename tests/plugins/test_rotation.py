@@ -43,7 +43,7 @@ class Run:
         frame = Frame(i, i * 33_000_000, np.zeros((2, 2, 3), np.uint8), np.zeros((2, 2), np.float32), self.world.camera)
         self.tracks = Projection()(frame, *now, *self.before, None, None, self.tracks) if tracked else None
         given = {"manhattan": self.world.manhattan(T[:3, :3], i, self.rng, **how) if manhattan else None, "tracks": self.tracks}
-        given |= {"keypoints": now[0], "segments": now[1], "planes": now[2], "previous": self.previous, "previous_pose": self.pose}
+        given |= {"keypoints": now[0], "segments": now[1], "planes": now[2], "previous": self.previous, "previous_pose": self.pose, "map": None}
         wanted = type(self.plugin).__call__.__annotations__
         self.previous = self.plugin(**{name: value for name, value in given.items() if name in wanted})
         R = self.previous.R_world_camera
@@ -163,7 +163,7 @@ def test_nothing_at_all_keeps_on_turning_and_says_prediction(room):
     turn = exp_so3(np.radians([0.0, 3.0, 0.0]))
     turning = replace(run.tracks, index=3, previous_index=2, R_current_previous=turn)
     for plugin in (DriftFree(), ConstantVelocity(), Procrustes()):
-        given = {"tracks": turning, "keypoints": replace(run.before[0], index=3), "previous": third, "previous_pose": None}
+        given = {"tracks": turning, "keypoints": replace(run.before[0], index=3), "previous": third, "previous_pose": None, "map": None}
         if not isinstance(plugin, ConstantVelocity):
             given |= {"segments": run.before[1], "planes": run.before[2]}
         found = plugin(**given, **({"manhattan": None} if isinstance(plugin, DriftFree) else {}))

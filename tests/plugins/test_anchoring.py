@@ -1,0 +1,122 @@
+"""Corrections of the map while the camera is tracked: what was said before them follows the map without a jump."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import pytest
+from hydra import compose, initialize_config_module
+
+from trihedron.pipeline.config import graph_of, register_configs
+from trihedron.pipeline.geometry import exp_se3, exp_so3, invert, log_se3, pose_matrix, rotation_angle_deg, transform, transform_planes
+from trihedron.pipeline.registry import load_plugins
+from trihedron.pipeline.results import causal_trajectory, final_trajectory
+from trihedron.pipeline.runner import Runner
+from trihedron.pipeline.types import LOST, Correction, Map, Pose, Rotation
+from trihedron.plugins.numerics.anchoring import anchored, anchored_before
+from trihedron.plugins.numerics.landmarks import KEYFRAMES, empty_map
+
+SHIFT = pose_matrix(exp_so3(np.radians([3.0, 4.0, 0.0])), np.array([0.2, -0.1, 0.2]))  # 5° and 0.3 m
+
+
+def map_with(*poses):
+    n, empty = len(poses), np.zeros((len(poses), 2), np.int32)
+    map = empty_map(0, 0, 32, 32, 8)
+    keyframes, _ = map.keyframes.appended(
+        index=np.arange(n), stamp_ns=np.arange(n), T_world_camera=np.array(poses), covariance=np.tile(np.eye(6), (n, 1, 1)),
+        points=empty, lines=empty, planes=empty, alive=np.ones(n, np.bool_),
+    )  # fmt: skip
+    assert set(KEYFRAMES) == set(keyframes.schema)
+    return replace(map, keyframes=keyframes)
+
+
+def pose_against(T_world_keyframe, T, reference=1):
+    return Pose(7, 7, T, np.eye(6), invert(T_world_keyframe) @ T, reference, np.zeros(3, np.int32), 0, "ok", "")
+
+
+def test_a_pose_follows_its_keyframe_and_is_untouched_otherwise():
+    rng = np.random.default_rng(0)
+    first, second, T = (exp_se3(rng.normal(size=6)) for _ in range(3))
+    pose = pose_against(second, T)
+    assert anchored(pose, None) is pose
+    assert anchored(pose, map_with(first, second)) is pose  # not a rounding error away
+    assert anchored(pose, map_with(SHIFT @ first, second)) is pose
+    moved = anchored(pose, map_with(first, SHIFT @ second))
+    assert np.allclose(moved.T_world_camera, SHIFT @ T, atol=1e-12)
+    assert np.array_equal(moved.T_reference_camera, pose.T_reference_camera)
+    unborn = replace(pose, reference=-1)
+    assert anchored(unborn, map_with(SHIFT @ first, second)) is unborn
+
+
+def test_the_manhattan_frames_turn_with_the_camera():
+    rng = np.random.default_rng(1)
+    keyframe, T = exp_se3(rng.normal(size=6)), exp_se3(rng.normal(size=6))
+    frames = np.array([exp_so3(rng.normal(size=3)) for _ in range(2)])
+    rotation = Rotation(7, 7, T[:3, :3], np.eye(3), frames, frames, np.arange(2, dtype=np.int32), np.ones(2), "manhattan")
+    pose = pose_against(keyframe, T, reference=0)
+    assert anchored_before(rotation, None, map_with(SHIFT @ keyframe)) == (rotation, None)
+    same, said = anchored_before(rotation, pose, map_with(keyframe))
+    assert same is rotation and said is pose
+    turned, now = anchored_before(rotation, pose, map_with(SHIFT @ keyframe))
+    assert np.allclose(now.T_world_camera, SHIFT @ T)
+    before = np.swapaxes(rotation.R_world_camera.T @ frames, 1, 2)
+    assert np.allclose(np.swapaxes(turned.R_world_camera.T @ turned.R_world_manhattan, 1, 2), before, atol=1e-12)
+    assert np.allclose(turned.R_world_manhattan, SHIFT[:3, :3] @ frames)
+
+
+@dataclass(frozen=True)
+class Shove:
+    """Moves the whole map by SHIFT, once, when it has its third keyframe."""
+
+    shift: np.ndarray
+
+    def __call__(self, map: Map) -> Correction | None:
+        if len(map.keyframes) != 3 or map.keyframes.column("index")[-1] != map.index:
+            return None
+        ids = [np.arange(len(table), dtype=np.int32) for table in (map.keyframes, map.points, map.lines, map.planes)]
+        return Correction(
+            map.index, map.stamp_ns, map.revision, ids[0], self.shift @ map.keyframes.column("T_world_camera"),
+            ids[1], transform(self.shift, map.points.column("position_m")), ids[2], transform(self.shift, map.lines.column("endpoints_m")),
+            ids[3], transform_planes(self.shift, map.planes.column("coefficients")),
+        )  # fmt: skip
+
+
+def tracked(shift, *overrides, frames=40):
+    load_plugins()
+    register_configs()
+    with initialize_config_module("trihedron.conf", version_base="1.3"):
+        config = compose("root", ["dataset=synthetic", "dataset.width=320", "dataset.height=240", f"dataset.frames=0:{frames}", *overrides])
+    graph = graph_of(config)
+    stages = dict(graph.stages)
+    bundle = stages["bundle"]
+    stages["bundle"] = replace(bundle, plugin=Shove(shift)) if shift is not None else bundle
+    runner = Runner(replace(graph, stages=stages), threads=2)
+    rotations = [step.values["rotation"] for step in runner.steps(None, frozenset())]
+    return runner.result, rotations
+
+
+@pytest.fixture(scope="module")
+def still():
+    return tracked(np.eye(4))
+
+
+def test_tracking_goes_on_in_the_moved_world(still):
+    """The same camera in a map that was moved by 0.3 m and 5° half-way: every later pose is moved by as much, to a millimetre."""
+    (result, rotations), (plain, plain_rotations) = tracked(SHIFT), still
+    keyframes = result.map.keyframes
+    applied = int(keyframes.column("index")[2]) + 5  # bundle@5: seen by the poses after this frame
+    assert 10 < applied < 34 and all(pose.status != LOST for pose in result.poses)
+    assert all(np.array_equal(a.T_world_camera, b.T_world_camera) for a, b in zip(result.poses[: applied + 1], plain.poses))
+    later = zip(result.poses[applied + 1 :], plain.poses[applied + 1 :])
+    off = np.array([log_se3(invert(SHIFT @ b.T_world_camera) @ a.T_world_camera) for a, b in later])
+    assert np.linalg.norm(off[:, :3], axis=1).max() < 1e-3 and np.degrees(np.linalg.norm(off[:, 3:], axis=1)).max() < 0.05
+    relative = [log_se3(invert(a.T_reference_camera) @ b.T_reference_camera) for a, b in zip(result.poses, plain.poses) if a.reference == b.reference]
+    assert len(relative) == len(plain.poses) and np.abs(relative).max() < 1e-3
+    for now, before, moved in zip(rotations, plain_rotations, np.arange(len(rotations)) > applied):
+        expected = (SHIFT[:3, :3] if moved else np.eye(3)) @ before.R_world_manhattan[0]
+        assert rotation_angle_deg(now.R_world_manhattan[0].T @ expected) < 0.02 and now.source == before.source
+
+
+def test_the_final_trajectory_has_no_step(still):
+    (result, _), (plain, _) = tracked(SHIFT), still
+    for said, final in zip(causal_trajectory(plain).poses, final_trajectory(result).poses):
+        assert np.abs(log_se3(invert(SHIFT @ said) @ final)).max() < 2e-3
