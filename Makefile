@@ -25,10 +25,10 @@ demo: install  ## track the built-in synthetic room
 test: install  ## style, types, and the tests that are quick
 	$(BIN)/ruff check .
 	$(BIN)/mypy -p trihedron.pipeline -p trihedron.datasets -p trihedron.plugins -p trihedron.tools
-	$(BIN)/pytest
+	$(BIN)/pytest -n 2
 
 test-slow: install  ## the tests that take longer
-	$(BIN)/pytest -m slow
+	$(BIN)/pytest -n 2 -m slow
 
 benchmark: install  ## time, memory and error on the synthetic room and the sequences beside this folder
 	$(BIN)/trihedron benchmark
