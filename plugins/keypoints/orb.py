@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import threading
 from dataclasses import dataclass
 from functools import cached_property
@@ -16,7 +15,7 @@ from trihedron.pipeline.types import F32, I32, U8, Frame, Keypoints
 from trihedron.plugins.numerics.corner_measures import centroid_angles_deg, harris_scores
 from trihedron.plugins.numerics.depth_sampling import local_depth, noise_coefficients
 from trihedron.plugins.numerics.image_pyramid import full_pixels, image_pyramid
-from trihedron.plugins.numerics.spreading import spread_over_grid
+from trihedron.plugins.numerics.spreading import Grid, spread_over_grid
 
 MARGIN_PX = 19  # of a level, within which its descriptors would reach over the border
 FAST_PX = 4  # radius of the circle FAST compares with, and one for its comparison of neighbours
@@ -25,15 +24,14 @@ PATCH_PX = 31  # side of what a descriptor looks at (Rublee et al.)
 
 @dataclass(frozen=True)
 class Corners:
-    """Corners of the whole pyramid: integer pixels (n, 2) of their own level, levels (n,), strength (n,)."""
+    """Corners of the whole pyramid: integer pixels (n, 2) of their own level, levels (n,)."""
 
     cells: I32
     levels: I32
-    strength: F32
 
     def take(self, rows: Any) -> Corners:
         """Some of the rows."""
-        return Corners(self.cells[rows], self.levels[rows], self.strength[rows])
+        return Corners(self.cells[rows], self.levels[rows])
 
 
 @register("keypoints", "orb")
@@ -91,46 +89,37 @@ class Orb:
 
     def _corners(self, pyramid: list[U8]) -> Corners:
         """FAST corners of every level: at the high threshold, and at the low one in those grid cells that would have less than their share."""
-        found = [self._fast(image, self.fast_threshold, None) for image in pyramid]
         h, w = pyramid[0].shape
-        down, across = -(-h // self.cell_px), -(-w // self.cell_px)
-        count = np.zeros(down * across, np.int64)
-        for image, (cells, _) in zip(pyramid, found):
-            place = (cells * (w / (image.shape[1] * self.cell_px))).astype(np.int64)
-            count += np.bincount(place[:, 1].clip(0, down - 1) * across + place[:, 0].clip(0, across - 1), minlength=count.size)
-        poor = (count < 2 * self.features / count.size).astype(np.uint8).reshape(down, across)
-        if poor.any():
-            mask = np.kron(poor, np.full((self.cell_px, self.cell_px), 255, np.uint8))[:h, :w]
-            reach = 2 * math.ceil(FAST_PX * self.scale ** (len(pyramid) - 1)) + 1
-            wide = cv2.dilate(mask, np.ones((reach, reach), np.uint8))  # what FAST sees around the poor cells; the rest is blanked, for speed
-            for level, image in enumerate(pyramid):
-                shrunk, seen = (np.asarray(cv2.resize(m, image.shape[::-1], interpolation=cv2.INTER_NEAREST)) for m in (mask, wide))
-                more = self._fast(np.bitwise_and(image, seen), self.fast_threshold_low, shrunk)
-                rich = shrunk[found[level][0][:, 1], found[level][0][:, 0]] == 0
-                found[level] = np.concatenate([found[level][0][rich], more[0]]), np.concatenate([found[level][1][rich], more[1]])
-        levels = np.concatenate([np.full(len(cells), level, np.int32) for level, (cells, _) in enumerate(found)])
-        return Corners(np.concatenate([c for c, _ in found]), levels, np.concatenate([s for _, s in found]))
+        grid = Grid(self.cell_px, -(-h // self.cell_px), -(-w // self.cell_px))
+        ratios = [np.array([w / image.shape[1], h / image.shape[0]]) for image in pyramid]
+        found = [self._fast(image, self.fast_threshold) for image in pyramid]
+        places = [grid.places(cells, ratio) for cells, ratio in zip(found, ratios)]
+        poor = np.bincount(np.concatenate(places), minlength=grid.down * grid.across) < 2 * self.features / (grid.down * grid.across)
+        group, rectangles = grid.groups(poor)
+        for level, (image, ratio) in enumerate(zip(pyramid, ratios)):
+            kept = [found[level][~poor[places[level]]]]
+            for number, (left, top, right, bottom) in enumerate(rectangles, 1):
+                x, y = max(int(left / ratio[0]) - FAST_PX, 0), max(int(top / ratio[1]) - FAST_PX, 0)
+                patch = image[y : int(bottom / ratio[1]) + FAST_PX, x : int(right / ratio[0]) + FAST_PX]
+                more = self._fast(patch, self.fast_threshold_low) + np.array([x, y], np.int32)
+                kept.append(more[group[grid.places(more, ratio)] == number])
+            cells = np.concatenate(kept)
+            found[level] = cells[((cells >= MARGIN_PX) & (cells < np.array(image.shape[::-1]) - MARGIN_PX)).all(1)]
+        return Corners(np.concatenate(found), np.repeat(np.arange(len(found), dtype=np.int32), [len(cells) for cells in found]))
 
-    def _fast(self, image: U8, threshold: int, mask: U8 | None) -> tuple[I32, F32]:
-        """Corners (n, 2) of one level away from its border, and their FAST scores (n,)."""
-        detector = self._opencv.fast
-        detector.setThreshold(threshold)
-        found = detector.detect(image, mask) if min(image.shape) > 2 * MARGIN_PX else ()
-        cells = np.rint(np.asarray(cv2.KeyPoint_convert(found), np.float32).reshape(-1, 2)).astype(np.int32)
-        inside = ((cells >= MARGIN_PX) & (cells < np.array(image.shape[::-1]) - MARGIN_PX)).all(1)
-        return cells[inside], np.array([k.response for k in found], np.float32)[inside]
+    def _fast(self, image: U8, threshold: int) -> I32:
+        """Corners (n, 2) of an image, in rows."""
+        self._opencv.fast.setThreshold(threshold)
+        found = cv2.KeyPoint_convert(self._opencv.fast.detect(image))
+        return np.rint(np.asarray(found, np.float32).reshape(-1, 2)).astype(np.int32)
 
     def _choose(self, corners: Corners, pyramid: list[U8]) -> Corners:
-        """The spread choice: by FAST score down to three times as many as wanted, then by Harris measure; in order of level, row, column."""
-        for turn in range(2):
-            if turn == 1:
-                corners = Corners(corners.cells, corners.levels, self._per_level(harris_scores, pyramid, corners))
-            wanted = self.features * (3 if turn == 0 else 1)
-            full = full_pixels(corners.cells, corners.levels, pyramid).astype(np.float32)
-            strength = corners.strength * self.scale ** (-self.fineness * turn * corners.levels.astype(np.float64))
-            order = np.argsort(-strength, kind="stable").astype(np.int32)  # FAST scans in rows, so ties keep a fixed order
-            keep = spread_over_grid(full, order, pyramid[0].shape[1], pyramid[0].shape[0], self.cell_px, wanted)
-            corners = corners.take(keep)
+        """The strongest by Harris measure, spread over the image, in order of level, row and column."""
+        full = full_pixels(corners.cells, corners.levels, pyramid).astype(np.float32)
+        strength = self._per_level(harris_scores, pyramid, corners) * self.scale ** (-self.fineness * corners.levels.astype(np.float64))
+        order = np.argsort(-strength, kind="stable").astype(np.int32)
+        keep = spread_over_grid(full, order, pyramid[0].shape[1], pyramid[0].shape[0], self.cell_px, self.features)
+        corners = corners.take(keep)
         return corners.take(np.lexsort((corners.cells[:, 0], corners.cells[:, 1], corners.levels)))
 
     def _per_level(self, measure: Any, pyramid: list[U8], corners: Corners) -> F32:

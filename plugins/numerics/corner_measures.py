@@ -39,27 +39,28 @@ def harris_scores(image: U8, corners: I32) -> F32:
     return out
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, fastmath={"reassoc"})  # the sums are of small integers: exact in any order
 def centroid_angles_deg(image: U8, corners: I32) -> F32:
     """(n,) direction from each (n, 2) pixel to the intensity centroid of the disc around it, degrees in [0, 360), x right and y down."""
     rows, cols = image.shape
     out = np.zeros(len(corners), np.float32)
     half = np.empty(PATCH + 1, np.int64)
+    offset = np.arange(-PATCH, PATCH + 1).astype(np.float32)
     for v in range(PATCH + 1):
         half[v] = int(np.rint(np.sqrt(PATCH * PATCH - v * v)))
     for i in range(len(corners)):
         x, y = corners[i, 0], corners[i, 1]
-        mx, my = 0, 0
-        for v in range(-PATCH, PATCH + 1):
-            r = y + v
-            if r < 0 or r >= rows:
-                continue
-            total = 0
-            for u in range(max(-half[abs(v)], -x), min(half[abs(v)], cols - 1 - x) + 1):
-                value = np.int64(image[r, x + u])
+        mx, my = 0.0, 0.0
+        for v in range(max(-PATCH, -y), min(PATCH, rows - 1 - y) + 1):
+            low, high = max(-half[abs(v)], -x), min(half[abs(v)], cols - 1 - x)
+            line, across = image[y + v, x + low : x + high + 1], offset[PATCH + low : PATCH + high + 1]
+            total, moment = np.float32(0.0), np.float32(0.0)
+            for k in range(len(line)):
+                value = np.float32(line[k])
                 total += value
-                mx += u * value
+                moment += value * across[k]
+            mx += moment
             my += v * total
-        angle = np.degrees(np.arctan2(float(my), float(mx)))
+        angle = np.degrees(np.arctan2(my, mx))
         out[i] = angle + 360.0 if angle < 0.0 else angle
     return out
