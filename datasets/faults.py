@@ -29,7 +29,7 @@ class Faults:
 
     frames: str = ""  # part to read, half open: A:B, A:, :B; empty = all
     of: str = "synthetic"  # the data set underneath
-    options: dict[str, Any] = field(default_factory=dict)  # its options, for example {path: FOLDER}
+    options: dict[str, Any] = field(default_factory=dict)  # its options: +dataset.options.path=FOLDER
     cover: str = ""  # frames A:B for which the camera is covered; empty = never
     covered: Covered = Covered.both  # both | color | depth
 

@@ -69,5 +69,9 @@ def local_window(map: Map, T_world_camera: F64, newest: int, covisible: int, nea
     chosen = np.concatenate([chosen, order[votes[order] > 0].astype(np.int32)])
     beside = _near(map, T_world_camera, near_m, near_deg)
     beside = beside[~np.isin(beside, chosen)][:near]
-    chosen = np.sort(np.concatenate([chosen, beside])).astype(np.int32)
-    return LocalWindow(chosen, observed_by(map, chosen, "point"), observed_by(map, chosen, "line"), observed_by(map, chosen, "plane"))
+    return window_of(map, np.sort(np.concatenate([chosen, beside])).astype(np.int32))
+
+
+def window_of(map: Map, keyframes: I32) -> LocalWindow:
+    """The keyframes (sorted rows) and what they see."""
+    return LocalWindow(keyframes, observed_by(map, keyframes, "point"), observed_by(map, keyframes, "line"), observed_by(map, keyframes, "plane"))

@@ -18,11 +18,12 @@ INTO_CORNER = exp_se3(np.array([0.3, 0.1, -0.2, 0.35, -0.55, 0.1]))  # of the ro
 
 @dataclass
 class World:
-    """n points on the walls, the 12 edges and 60 segments on the walls, 6 walls seen from inside. The world is the first camera's frame."""
+    """n points on the walls, the 12 edges and some segments on the walls, 6 walls seen from inside. The world is the first camera's frame."""
 
     points: int = 600
     seed: int = 0
     noise: float = 1.0  # multiplies pixel and depth noise; 0 = exact
+    marks: int = 60  # segments on the walls
 
     def __post_init__(self):
         rng = np.random.default_rng(self.seed)
@@ -34,7 +35,7 @@ class World:
         self.descriptor = rng.integers(0, 256, (self.points, 32), dtype=np.uint8)
         corners = [np.array([x, y, z]) * half for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)]
         edges = [(a, b) for i, a in enumerate(corners) for b in corners[i + 1 :] if np.count_nonzero(a != b) == 1]
-        for _ in range(60):
+        for _ in range(self.marks):
             a, axis = rng.uniform(-half, half), rng.permutation(3)
             a[axis[0]] = rng.choice([-1.0, 1.0]) * half[axis[0]]
             b = a.copy()

@@ -1,0 +1,123 @@
+"""A lost camera's place, recognised by all kinds of features."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from trihedron.pipeline.registry import register
+from trihedron.pipeline.types import F64, I32, LOST, OK, Frame, Keypoints, Map, Planes, Pose, Rotation, Segments
+from trihedron.plugins.numerics.decoupled import reference_of
+from trihedron.plugins.numerics.layout_poses import layout_poses
+from trihedron.plugins.numerics.local_window import observed_by
+from trihedron.plugins.numerics.place_check import Recognised, View, check_place
+from trihedron.plugins.numerics.place_votes import apart, block_of, distinct, likely_keyframes, lookalikes, rigid_hypotheses
+
+
+@register("relocalise", "features")
+@dataclass(frozen=True)
+class Features:
+    """Hypotheses from points that look alike (three by three, Procrustes) and, where these find nothing, from the layout of planes and lines (all 24
+    ways round of each Manhattan frame in view); each is verified by searching the map from there and solving the pose with points, lines and planes.
+
+    A place is recognised when enough of the map agrees, details among it, and no other place explains the frame nearly as well: a room that looks the
+    same from two sides is refused, not guessed. A large map is looked through block by block, one a frame. Points need binary descriptors."""
+
+    block: int = 80  # keyframes looked at in one frame
+    candidates: int = 20  # of them, whose landmarks make hypotheses
+    max_bits: int = 64  # of 256 between descriptors; the mean of strangers is 128
+    ratio: float = 0.85  # best to second best descriptor
+    draws: int = 1000  # triples of points tried
+    by_points: int = 4  # hypotheses verified
+    by_layout: int = 8
+    near: int = 8  # keyframes taken from about a hypothesis, whose landmarks verify it
+    min_score: int = 40  # points + 2 lines + 5 planes that recognise a place (views never mapped reach 35 in the built-in room)
+    min_details: int = 25  # points + 3 lines among them (there at most 11)
+    min_share: float = 0.5  # of the matches that must agree
+    rival: float = 0.75  # of the best place's score, that makes another place as likely
+    angle_px: float = 0.002  # rad, of a pixel
+    floor_m: float = 0.01  # least error of a point's place
+
+    def __post_init__(self) -> None:
+        if min(self.block, self.candidates, self.draws, self.by_points, self.by_layout, self.near, self.min_score, self.min_details) < 1:
+            raise ValueError("block, candidates, draws, by_points, by_layout, near, min_score, min_details: must be at least 1")
+        if not 0.0 < self.ratio <= 1.0 or not 0.0 <= self.min_share <= 1.0 or not 0.0 < self.rival <= 1.0:
+            raise ValueError("ratio, min_share, rival: must be in (0, 1]")
+        if min(self.angle_px, self.floor_m) <= 0.0 or self.max_bits < 0:
+            raise ValueError("angle_px, floor_m, max_bits: must be positive")
+
+    def __call__(
+        self,
+        frame: Frame,
+        rotation: Rotation,
+        keypoints: Keypoints,
+        segments: Segments,
+        planes: Planes,
+        map: Map | None,
+        previous_pose: Pose | None,
+        rng: np.random.Generator,
+    ) -> Pose | None:
+        """The pose, status ok, or None."""
+        if map is None or previous_pose is None or previous_pose.status != LOST:
+            return None
+        view = View(frame, keypoints, segments, planes)
+        among = self._candidates(view, map)
+        found = self._checked(self._by_points(view, map, among, rng), view, map, among)
+        if not any(self._good(one) for one in found):  # points alone say more than any layout
+            found += self._checked(self._by_layout(view, map, among, rotation), view, map, among)
+        best = self._only_one(found)
+        return self._said(best, frame, map) if best is not None else None
+
+    def _candidates(self, view: View, map: Map) -> I32:
+        """Keyframes whose landmarks look like what is seen."""
+        alive = np.flatnonzero(map.keyframes.column("alive")).astype(np.int32)
+        among = block_of(alive, self.block, view.frame.index)
+        return likely_keyframes(map, view.keypoints, view.segments, among, self.candidates, self.max_bits)
+
+    def _by_points(self, view: View, map: Map, among: I32, rng: np.random.Generator) -> F64:
+        """(n, 4, 4) poses by points that look like those of the map, best first."""
+        seen = view.keypoints
+        ids = observed_by(map, among, "point")
+        rows = np.flatnonzero(np.isfinite(seen.points_m[:, 2])).astype(np.int32)
+        if seen.metric != "hamming":
+            return np.empty((0, 4, 4))
+        alike = lookalikes(seen.descriptors[rows], map.points.rows("descriptor", ids), self.max_bits, self.ratio)
+        rows, ids = rows[alike >= 0], ids[alike[alike >= 0]]
+        if len(rows) < 3:
+            return np.empty((0, 4, 4))
+        places = seen.points_m[rows].astype(np.float64)
+        across = seen.sigma_px[rows] * self.angle_px * places[:, 2]
+        sigma = np.sqrt(self.floor_m**2 + across**2 + seen.sigma_m[rows].astype(np.float64) ** 2)
+        draws = rng.integers(0, len(rows), (self.draws, 3)).astype(np.int32)
+        return rigid_hypotheses(places, map.points.rows("position_m", ids), sigma, draws, self.by_points)
+
+    def _by_layout(self, view: View, map: Map, among: I32, rotation: Rotation) -> F64:
+        """(n, 4, 4) poses by the layout of planes and lines about each known Manhattan frame in view, best first."""
+        found, scores = np.empty((0, 4, 4)), np.empty(0)
+        plane_ids, line_ids = observed_by(map, among, "plane"), observed_by(map, among, "line")
+        for R_world, R_camera in zip(rotation.R_world_manhattan, rotation.R_camera_manhattan):
+            if np.isfinite(R_camera).all():
+                poses, values = layout_poses(map, plane_ids, line_ids, view.planes, view.segments, R_world, R_camera)
+                found, scores = np.concatenate([found, poses]), np.concatenate([scores, values])
+        return distinct(found[np.argsort(-scores, kind="stable")], self.by_layout)
+
+    def _checked(self, poses: F64, view: View, map: Map, among: I32) -> list[Recognised]:
+        found = [check_place(T, view, map, among, self.near) for T in poses]
+        return [one for one in found if one is not None]
+
+    def _only_one(self, found: list[Recognised]) -> Recognised | None:
+        """The best place if it is good enough and no other is nearly as good."""
+        best = max(found, key=lambda one: one.score, default=None)
+        if best is None or not self._good(best):
+            return None
+        rivals = [one for one in found if one.score > self.rival * best.score and apart(one.T_world_camera, best.T_world_camera)]
+        return None if rivals else best
+
+    def _good(self, one: Recognised) -> bool:
+        return one.score >= self.min_score and one.details >= self.min_details and one.agreeing >= self.min_share
+
+    def _said(self, one: Recognised, frame: Frame, map: Map) -> Pose:
+        reference, T_reference_camera = reference_of(map, one.T_world_camera)
+        reason = "recognised by {} points, {} lines and {} planes of the map".format(*one.inliers)
+        return Pose(frame.index, frame.stamp_ns, one.T_world_camera, one.covariance, T_reference_camera, reference, one.inliers, 0, OK, reason)

@@ -1,0 +1,174 @@
+"""Relocalisation: places seen before are recognised, places never seen and rooms that look the same from two sides are not."""
+
+import dataclasses
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from trihedron.pipeline.geometry import exp_se3, exp_so3, invert, pose_matrix, rotation_angle_deg
+from trihedron.pipeline.types import LOST, Pose
+from trihedron.plugins.map.covisibility import Covisibility
+from trihedron.plugins.matches.local_map import LocalMap
+from trihedron.plugins.relocalise.features import Features
+
+sys.path.insert(0, str(Path(__file__).parent))
+from landmark_world import INTO_CORNER, World, camera_at, rotation_of, translation_of
+
+EVERY = Covisibility(min_frames=1, max_frames=1, min_shift=1e-6, min_turn_deg=1e-6)
+STEPS = range(0, 60, 6)  # where the map was made: 1.3 m of the way, 36° of the turn
+
+
+def pose_of(T, index, status="ok"):
+    return Pose(index, index * 33_000_000, T, np.eye(6) * 1e-8, T, -1, np.zeros(3, np.int32), 0, status, "")
+
+
+def mapped(world, poses=None):
+    """The map that keyframes at the poses (None: at STEPS) make, which are exact."""
+    map = None
+    for i, T in enumerate(poses or [camera_at(step) for step in STEPS]):
+        features = world.features(T, i)
+        matches = LocalMap()(world.frame(i), rotation_of(T, i), translation_of(T, i), *features, map, None) if map else None
+        map = EVERY(world.frame(i), pose_of(T, i), *features, matches, map, None, None) or map
+    return map
+
+
+def manhattan_of(T, index, turn=0):
+    """The rotation stage of a lost camera: the room's axes seen, and known in the world; its own rotation is far off."""
+    R_world, off = INTO_CORNER[:3, :3], exp_so3(np.array([0.4, 1.9, -0.7]))
+    named = R_world @ np.roll(np.eye(3), turn, axis=0)  # any of the names of the axes
+    return dataclasses.replace(
+        rotation_of(pose_matrix(T[:3, :3] @ off, T[:3, 3]), index),
+        R_world_manhattan=R_world[None], R_camera_manhattan=(T[:3, :3].T @ named)[None], ids=np.zeros(1, np.int32), weights=np.full(1, 100.0),
+    )  # fmt: skip
+
+
+def recognise(world, map, T, index, kinds=("points", "lines", "planes"), status=LOST, stage=None):
+    """What the stage says of the view from T, with the features of the given kinds."""
+    keypoints, segments, planes = world.features(T, index)
+    if "points" not in kinds:
+        keypoints = dataclasses.replace(keypoints, **{f.name: getattr(keypoints, f.name)[:0] for f in dataclasses.fields(keypoints)[2:-1]})
+    rng = np.random.default_rng(index)
+    previous = pose_of(np.eye(4), index - 1, status)
+    return (stage or Features())(world.frame(index), manhattan_of(T, index, index % 3), keypoints, segments, planes, map, previous, rng)
+
+
+def error(pose, T):
+    D = invert(T) @ pose.T_world_camera
+    return np.linalg.norm(D[:3, 3]), rotation_angle_deg(D[:3, :3])
+
+
+def views(count, seed=0):
+    """Places near the mapped way, off it by decimetres and by up to 15° or so."""
+    rng = np.random.default_rng(seed)
+    for step in rng.uniform(0.0, 54.0, count):
+        yield camera_at(step) @ exp_se3(np.concatenate([rng.normal(0.0, 0.1, 3), rng.normal(0.0, np.radians(5.0), 3)]))
+
+
+@pytest.fixture(scope="module")
+def world():
+    return World(2000, marks=400)
+
+
+@pytest.fixture(scope="module")
+def map(world):
+    return mapped(world)
+
+
+@pytest.mark.parametrize("kinds", [("points", "lines", "planes"), ("lines", "planes")])
+def test_a_kidnapped_camera_is_found(world, map, kinds):
+    """By the layout alone too: no point is needed."""
+    found = [(pose, T) for i, T in enumerate(views(20)) if (pose := recognise(world, map, T, 200 + i, kinds)) is not None]
+    errors = np.array([error(pose, T) for pose, T in found])
+    print(f"{len(found)} of 20, at most {errors[:, 0].max():.4f} m {errors[:, 1].max():.3f} degrees")
+    assert len(found) >= (20 if "points" in kinds else 16)
+    assert errors[:, 0].max() < 0.02 and errors[:, 1].max() < 1.0
+    assert all(pose.status == "ok" and pose.reference == len(map.keyframes) - 1 for pose, _ in found)
+
+
+def test_a_place_that_is_not_in_the_map_is_refused(map):
+    """Other rooms of the same size, each with walls at the same distances and details of its own."""
+    for seed in range(1, 6):
+        other = World(2000, seed, marks=400)
+        assert all(recognise(other, map, T, 300 + i) is None for i, T in enumerate(views(4, seed)))
+
+
+def test_a_box_that_looks_the_same_from_two_sides_is_refused():
+    """Walls and their 12 edges, all edges alike, seen from the middle all around: however little is asked for, there is always another place.
+    Marks on the walls make the difference."""
+    around = [INTO_CORNER @ exp_se3(np.array([0, 0, 0, 0, yaw, 0.0])) for yaw in np.linspace(0.0, 2.0 * np.pi, 25)[:-1]]
+    asked = Features(min_score=10, min_details=1, near=24)
+    bare, furnished = World(1), World(1, marks=200)
+    bare.lines, bare.line_descriptor = bare.lines[:12], np.zeros((12, 32), np.uint8)
+    answers = {}
+    for name, room in (("bare", bare), ("furnished", furnished)):
+        map = mapped(room, around)
+        places = [T @ exp_se3(np.array([0.2, 0.05, -0.1, 0, 0.1, 0])) for T in around[::4]]
+        answers[name] = [(recognise(room, map, T, 400 + i, ("lines", "planes"), stage=asked), T) for i, T in enumerate(places)]
+    assert all(pose is None for pose, _ in answers["bare"])
+    found = [error(pose, T) for pose, T in answers["furnished"] if pose is not None]
+    assert len(found) >= 5 and np.max(found, axis=0)[0] < 0.02
+
+
+def test_two_places_that_look_alike_are_refused(world):
+    """The same points, lines and descriptors twice, 20 m apart: whichever the camera is at, it cannot tell."""
+    one, step = mapped(world), np.array([20.0, 0.0, 0.0])
+    twin = dataclasses.replace(
+        one,
+        **{name: getattr(one, name).appended(**columns)[0] for name, columns in shifted(one, step).items()},
+    )
+    assert recognise(world, one, camera_at(31), 500) is not None
+    assert recognise(world, twin, camera_at(31), 500) is None
+
+
+def shifted(map, step):
+    """All rows of the map's tables once more, moved by `step` and numbered on."""
+    counts = {"keyframe": len(map.keyframes), "point": len(map.points), "line": len(map.lines), "plane": len(map.planes)}
+    tables = {}
+    for name in ("keyframes", "points", "lines", "planes", "point_observations", "line_observations", "plane_observations"):
+        table = getattr(map, name)
+        columns = {column: table.column(column).copy() for column in table.schema}
+        for column in columns:
+            if column in counts:
+                columns[column] += counts[column]
+        if "observers" in columns:
+            columns["observers"][columns["observers"] >= 0] += counts["keyframe"]
+            columns["first"] += counts["keyframe"]
+        if name == "keyframes":
+            columns["T_world_camera"][:, :3, 3] += step
+            for kind in ("point", "line", "plane"):
+                columns[f"{kind}s"] += len(getattr(map, f"{kind}_observations"))
+        if name == "points":
+            columns["position_m"] += step
+        if name == "lines":
+            columns["endpoints_m"] += step
+        if name == "planes":
+            columns["coefficients"][:, 3] -= columns["coefficients"][:, :3] @ step
+            columns["samples_m"] += step.astype(np.float32)
+        tables[name] = columns
+    return tables
+
+
+def test_it_runs_for_a_lost_camera_only(world, map):
+    assert recognise(world, map, camera_at(31), 200, status="ok") is None
+    assert recognise(world, None, camera_at(31), 200) is None
+
+
+def test_the_same_input_gives_the_same_bytes(world, map):
+    poses = [recognise(world, map, camera_at(31), 200) for _ in range(2)]
+    assert poses[0].T_world_camera.tobytes() == poses[1].T_world_camera.tobytes()
+
+
+def test_a_large_map_is_looked_through_block_by_block(world, map):
+    """Ten keyframes in blocks of four: some frame of a full round recognises the place, and each looks at four keyframes only."""
+    stage = Features(block=4, candidates=4)
+    found = [recognise(world, map, camera_at(49), 600 + i, stage=stage) for i in range(5)]
+    assert any(pose is not None for pose in found)
+    assert all(error(pose, camera_at(49))[0] < 0.02 for pose in found if pose is not None)
+
+
+@pytest.mark.parametrize("options", [{"block": 0}, {"ratio": 0.0}, {"rival": 1.5}, {"floor_m": 0.0}, {"min_share": 2.0}])
+def test_ranges_are_checked(options):
+    with pytest.raises(ValueError, match=next(iter(options))):
+        Features(**options)

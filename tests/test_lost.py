@@ -1,0 +1,118 @@
+"""A camera that is covered for a second, and one that wakes up elsewhere: over whole sequences, by the default graph."""
+
+import json
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from trihedron.datasets.motion import Motion, camera_pose
+from trihedron.datasets.synthetic import Synthetic
+from trihedron.pipeline.geometry import invert, rotation_angle_deg
+from trihedron.pipeline.recording import Recording
+from trihedron.pipeline.registry import load_plugins, plugin_class
+from trihedron.pipeline.types import Pose
+
+DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
+RUN = "import sys; from trihedron.pipeline.cli import main; sys.exit(main(['run', *sys.argv[1:]]))"
+SEQUENCES = {  # name -> data set, options of it, frames, frames covered for one second, margin of the ATE against the run without a cover
+    "textured room": ("synthetic", {}, "0:130", (60, 90)),
+    "bare room": ("synthetic", {"texture": "false"}, "0:130", (60, 90)),
+    "structure_notexture_far": ("tum", {"path": DATA / "tum_fr3_structure_notexture_far"}, "", (110, 140)),
+    "of_kt3": ("icl_nuim", {"path": DATA / "icl_nuim_of_kt3"}, "", (15, 45)),
+    "office": ("tum", {"path": DATA / "icl_office_rendered"}, "", (235, 265)),
+}
+FRONT = {
+    "normals": "integral_image", "keypoints": "orb", "lines": "lsd", "segments": "ransac", "planes": "connected_components",
+    "manhattan": "mean_shift", "relocalise": "features",
+}  # fmt: skip
+SLOW = ("office", "structure_notexture_far", "textured room")
+
+
+def run(out, kind, options, frames, *cover):
+    words = [f"dataset.of={kind}", *(f"+dataset.options.{name}={value}" for name, value in options.items()), *cover]
+    words = ["dataset=faults", *words, *([f"dataset.frames={frames}"] if frames else []), f"out={out}"]
+    done = subprocess.run([sys.executable, "-c", RUN, *words], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr[-1000:]
+    return json.loads((out / "metrics.json").read_text()), {pose.index: pose for pose in Recording(out / "run.mcap").values("pose")}
+
+
+@pytest.mark.parametrize("name", [pytest.param(name, marks=pytest.mark.slow if name in SLOW else ()) for name in SEQUENCES])
+def test_a_camera_covered_for_a_second_is_lost_just_then(tmp_path, name):
+    """Lost in the unseen frames, back in the next, and no jump left: the error of the frames seen stays what it was."""
+    kind, options, frames, (first, stop) = SEQUENCES[name]
+    if "path" in options and not options["path"].exists():
+        pytest.skip(f"{options['path'].name} is not beside this checkout")
+    covered, poses = run(tmp_path / "covered", kind, options, frames, f"dataset.cover={first}:{stop}")
+    whole, _ = run(tmp_path / "whole", kind, options, frames)
+    ate, before = covered["final"]["ate_rmse_m"], whole["final"]["ate_rmse_m"]
+    print(f"{name}: {covered['status']}, ATE {ate:.4f} m, without the cover {before:.4f} m")
+    assert [index for index, pose in poses.items() if pose.status == "lost"] == list(range(first, stop))
+    assert ate < 1.5 * before
+    *_, map = Recording(tmp_path / "covered" / "run.mcap").values("map")
+    assert not np.isin(map.keyframes.column("index"), range(first, stop)).any()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("covered", ["color", "depth"])
+def test_with_one_image_left_the_camera_is_still_tracked_or_says_that_it_is_lost(tmp_path, covered):
+    """Without colour planes are left, without depth the map's points and lines: whatever counts as tracked is right."""
+    metrics, poses = run(tmp_path / "run", "synthetic", {}, "0:130", "dataset.cover=60:90", f"dataset.covered={covered}")
+    first = camera_pose(Motion.walk, 0, 0.0)
+    true = {index: invert(first) @ camera_pose(Motion.walk, 0, index / 30.0) for index in poses}
+    errors = [np.linalg.norm((invert(true[i]) @ pose.T_world_camera)[:3, 3]) for i, pose in poses.items() if pose.status != "lost"]
+    print(f"without {covered}: {metrics['status']}, at most {max(errors):.4f} m off")
+    assert max(errors) < 0.03 and all(pose.status != "lost" for index, pose in poses.items() if index >= 91)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("texture", ["true", "false"])
+def test_views_of_the_room_are_recognised_where_they_were_mapped_and_nowhere_else(tmp_path, texture):
+    """A map of five seconds (ten, where the room is bare) and views of the next minute, which turns once around: seen before when a keyframe looked
+    within 20° of the same way, never mapped when none looked within 75°, which is more than the field of view."""
+    load_plugins()
+    seconds = 5 if texture == "true" else 10
+    run(tmp_path / "run", "synthetic", {"texture": texture, "length": 30 * seconds}, "")
+    known, unknown = recognised(tmp_path / "run" / "run.mcap", texture == "true", range(0, 1800, 12))
+    accepted = [e for e in known if e is not None]
+    right = [e for e in accepted if e[0] < 0.02 and e[1] < 1.0]
+    false = [e for e in unknown if e is not None]
+    print(f"texture={texture}: {len(accepted)} of {len(known)} recognised, {len(right)} of them right; {len(false)} of {len(unknown)} never mapped")
+    assert len(known) >= 30 and len(accepted) >= 0.8 * len(known) and len(right) >= 0.95 * len(accepted)
+    assert len(unknown) >= 50 and not false
+
+
+def recognised(path, texture, frames):
+    """Errors (m, °) of the views that a recording's last map has seen before and of those it has not; None for a view that was refused."""
+    recording, stages = Recording(path), {slot: plugin_class(slot, name)() for slot, name in FRONT.items()}
+    *_, map = recording.values("map")
+    *_, rotation = recording.values("rotation")
+    axes = map.keyframes.column("T_world_camera")[map.keyframes.column("alive"), :3, 2]
+    dataset, first = Synthetic(length=max(frames) + 1, texture=texture), camera_pose(Motion.walk, 0, 0.0)
+    known, unknown = [], []
+    for index in frames:
+        T = invert(first) @ camera_pose(Motion.walk, 0, index / 30.0)
+        apart = np.degrees(np.arccos(np.clip(axes @ T[:3, 2], -1.0, 1.0))).min()
+        if apart < 20.0 or apart > 75.0:
+            pose = answer(stages, dataset(index), rotation, map)
+            D = invert(T) @ pose.T_world_camera if pose is not None else None
+            (known if apart < 20.0 else unknown).append(None if D is None else (np.linalg.norm(D[:3, 3]), rotation_angle_deg(D[:3, :3])))
+    return known, unknown
+
+
+def answer(stages, frame, rotation, map):
+    """What relocalisation says of one frame alone, the previous one having been lost."""
+    keypoints, lines = stages["keypoints"](frame), stages["lines"](frame)
+    segments, normals = stages["segments"](frame, lines), stages["normals"](frame)
+    planes = stages["planes"](frame, normals)
+    seen = stages["manhattan"](normals, segments, planes, None)
+    camera = seen.rotations[:1] if seen.supported else np.full((1, 3, 3), np.nan)
+    rotation = replace(
+        rotation, index=frame.index, R_world_manhattan=rotation.R_world_manhattan[:1], R_camera_manhattan=camera, ids=rotation.ids[:1],
+        weights=rotation.weights[:1],
+    )  # fmt: skip
+    lost = Pose(frame.index - 1, 0, np.eye(4), np.eye(6), np.eye(4), -1, np.zeros(3, np.int32), 0, "lost", "")
+    return stages["relocalise"](frame, rotation, keypoints, segments, planes, map, lost, np.random.default_rng(frame.index))
