@@ -34,6 +34,8 @@ Usage: trihedron run [-m] [key=value ...]
   out=FOLDER                         the run folder (default runs/<date>/<time>; runs/latest points at the newest)
   record.topics=[normals]            record dense topics too         record.frames=true  embed the input frames
   replay=FILE.mcap only=[STAGE,...]  compute these stages again, read the rest from a recording
+  save_map=FILE.mcap                 keep the map, to go on from    load_map=FILE.mcap  go on from it, or find the camera in it
+  localise_only=true                 the loaded map stays as it is
   feedback=recorded                  delayed wires of recomputed stages see the recorded past
   -m                                 sweep over comma-separated values
 
@@ -151,7 +153,8 @@ def _with_recorded(words: list[str]) -> list[str]:
         return words
     from trihedron.pipeline.recording import Recording
 
-    return [word for word in Recording(source).overrides() if not word.startswith(("out=", "replay=", "only=", "feedback=", "report="))] + words
+    own = ("out=", "replay=", "only=", "feedback=", "save_map=", "report=")  # of each run
+    return [word for word in Recording(source).overrides() if not word.startswith(own)] + words
 
 
 def _point_latest(out: Path) -> None:

@@ -63,6 +63,9 @@ class RunOptions:
     feedback: Feedback = Feedback.new
     report: str = ""  # a command that is given the folder of a sweep when all its jobs are done, for example: benchmark rotations
     record: RecordOptions = dataclasses.field(default_factory=RecordOptions)
+    save_map: str = ""  # write the map, and all that is needed to go on, to this file
+    load_map: str = ""  # go on from such a file
+    localise_only: bool = False  # the loaded map stays as it is
     hydra: Any = dataclasses.field(
         default_factory=lambda: {"run": {"dir": "${out}"}, "sweep": {"dir": "${out}", "subdir": "${hydra.job.num}"}, "output_subdir": ".hydra"}
     )
@@ -96,6 +99,8 @@ def graph_of(config: DictConfig) -> Graph:
             raise ConfigError(slot, "this graph has no such stage", "choose another graph or wire the stage in a graph file")
     wiring: Any = OmegaConf.to_container(config.graph, resolve=True)
     plugins = {slot: make_plugin(slot, config[slot]) for slot in wiring if slot in SLOTS and config.get(slot) is not None}
+    if config.localise_only and "map" in plugins:
+        plugins["map"] = plugin_class("map", "none")()
     return build_graph(wiring, plugins, list(config.outputs))
 
 

@@ -9,7 +9,7 @@ import subprocess
 import sys
 import time
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -24,10 +24,11 @@ from trihedron.pipeline.graph import Graph
 from trihedron.pipeline.recording import Recording, RecordingWriter
 from trihedron.pipeline.runner import Replay, Runner, Step
 from trihedron.pipeline.slots import output_of
+from trihedron.pipeline.state import Memory, load_map, reaches
 from trihedron.pipeline.types import Trajectory
 
 RECORDING = "run.mcap"
-PATH_KEYS = ("dataset.path", "dataset.camera")
+PATH_KEYS = ("dataset.path", "dataset.camera", "load_map")
 WARM_UP_FRAMES = 3  # enough for every stage to have been called, so that compilation is not measured
 PLAIN_PROGRESS_SECONDS = 5.0
 
@@ -41,12 +42,13 @@ def execute(config: DictConfig, out: Path, overrides: list[str], began: float) -
     graph = graph_of(config)
     replay = _replay(config, graph)
     frames = str(config.dataset.get("frames", "")) if config.dataset is not None else ""
-    runner = Runner(graph, config.seed, config.threads, replay, frames)
+    remembered, source = _remembered(config, graph), _source(config)
+    runner = Runner(graph, config.seed, config.threads, replay, frames, remembered)
     topics = _recorded_topics(config, graph, replay)
     _announce(runner)
     with _Warnings() as warnings:
         warnings.muted = True
-        _warm_up(Runner(graph, config.seed, config.threads, replay, frames))
+        _warm_up(Runner(graph, config.seed, config.threads, replay, frames, remembered))
         warnings.muted = False
         writer = RecordingWriter(out / RECORDING, _metadata(config, overrides))
         attachments = _attachments(graph, replay)
@@ -56,12 +58,37 @@ def execute(config: DictConfig, out: Path, overrides: list[str], began: float) -
         try:
             for _ in _progress(runner.steps(writer, topics, embed_frames=config.record.frames)):
                 pass
+            if config.save_map:
+                runner.keeper.save(Path(config.save_map).expanduser(), _metadata(config, overrides), source)
         finally:
             writer.close()
             metrics = _write(runner, attached_truth(attachments, str(writer.path)), out, started, began)
             warnings.summarise()
     _report(out, metrics)
     return metrics
+
+
+def _remembered(config: DictConfig, graph: Graph) -> Callable[[int], Memory] | None:
+    """What a run begins with: nothing, or the map file it goes on from."""
+    if config.save_map and config.replay:
+        raise ConfigError("save_map", "a replay makes no map to go on from", "save the map of the run itself")
+    if config.save_map and not (folder := Path(config.save_map).expanduser().absolute().parent).is_dir():
+        raise ConfigError("save_map", f"the folder {folder} does not exist", "make it first")
+    if not config.load_map:
+        if config.localise_only:
+            raise ConfigError("localise_only", "needs a map to find the camera in", "give load_map=FILE.mcap too")
+        return None
+    if "map" not in reaches(graph.stages.values()):
+        raise ConfigError("load_map", "no stage of this graph reads a map", "choose another graph")
+    saved, source = load_map(config.load_map), _source(config)
+    return lambda first: saved.memory(first, source)
+
+
+def _source(config: DictConfig) -> str:
+    """What is tracked, whichever part of it: the data set's options with absolute paths."""
+    options: Any = OmegaConf.to_container(config.dataset, resolve=True, enum_to_str=True) if config.dataset is not None else {}
+    options = {name: _absolute(f"dataset.{name}={value}").partition("=")[2] for name, value in options.items() if name != "frames"}
+    return json.dumps(options, sort_keys=True)
 
 
 def _replay(config: DictConfig, graph: Graph) -> Replay | None:

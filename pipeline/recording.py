@@ -140,7 +140,7 @@ class Recording:
         """The messages of one channel in the order they were written."""
         try:
             with open(self.path, "rb") as file:
-                for _, _, message in make_reader(file).iter_messages(topics=[channel], log_time_order=False):
+                for _, _, message in make_reader(file, validate_crcs=True).iter_messages(topics=[channel], log_time_order=False):
                     yield message
         except (OSError, *DAMAGE) as error:
             raise RecordingError(str(self.path), f"channel {channel} is damaged", "record it again") from error

@@ -6,24 +6,22 @@ stage is read from the file, and where the file lacks its topic the stage comput
 
 from __future__ import annotations
 
-import contextlib
 import logging
 import time
 import zlib
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-import cv2
 import numpy as np
-from threadpoolctl import threadpool_limits
 
 from trihedron.pipeline.errors import DataError, RecordingError, StageError, TrihedronError
 from trihedron.pipeline.foxglove import View
-from trihedron.pipeline.graph import PREVIOUS, Graph, Stage, Wire
+from trihedron.pipeline.graph import Graph, Stage, Wire
 from trihedron.pipeline.recording import Recording, RecordingWriter, TopicReader
-from trihedron.pipeline.scheduler import Node, NodeFailure, Scheduler
+from trihedron.pipeline.scheduler import Node, NodeFailure, Scheduler, single_threaded_libraries
 from trihedron.pipeline.slots import frame_range, output_of
+from trihedron.pipeline.state import Keeper, Memory, reaches, recorded_memory
 from trihedron.pipeline.timing import Timing
 from trihedron.pipeline.types import Frame, FrameReference, Map, Pose, Value
 
@@ -67,12 +65,27 @@ class Step:
 class Runner:
     """One run of a graph. `steps` does the work, frame by frame; `result` and `timing` hold what it found."""
 
-    def __init__(self, graph: Graph, seed: int = 0, threads: int = 2, replay: Replay | None = None, frames: str = "") -> None:
+    def __init__(
+        self,
+        graph: Graph,
+        seed: int = 0,
+        threads: int = 2,
+        replay: Replay | None = None,
+        frames: str = "",
+        remembered: Callable[[int], Memory] | None = None,
+    ) -> None:
+        """`remembered` says what is known before the frame of a given number."""
         self.graph, self.seed, self.threads, self.replay = graph, seed, threads, replay
         self.result, self.timing = Result(), Timing()
         self.computed = self._computed()
         self.indices, self._stamps = self._frames(frames)
         self._first = frame_range(frames)[0]
+        self._memory = remembered(self.indices[0]) if remembered is not None else Memory()
+        reach = reaches(graph.stages[name] for name in self.computed)
+        if replay is not None:
+            self._memory = self._memory.updated(recorded_memory(replay.recording, reach, self.indices[0]), RECORDED)
+        self.keeper = Keeper(reach, self._memory, self.indices[0])
+        self.result.map = self._loaded_map()
         self._references = TopicReader(replay.recording, FRAMES_TOPIC) if replay is not None else None
         self._fold_states: dict[str, Any] = {}
         self._calls_ms: dict[int, dict[str, float]] = {}
@@ -117,10 +130,12 @@ class Runner:
 
     def steps(self, writer: RecordingWriter | None, topics: frozenset[str], embed_frames: bool = False) -> Iterator[Step]:
         """Run, yielding each finished frame; values of `topics` go to the writer. Raises TrihedronError (StageError names stage and frame)."""
-        scheduler = Scheduler(self._nodes(), self.threads, self.threads, self._initial())
+        before, first = self._memory, self.indices[0]
+        recent = {topic: {index - first: value for index, value in values.items()} for topic, values in before.recent.items()}
+        scheduler = Scheduler(self._nodes(), self.threads, self.threads, before.held, recent)
         view = View()
         try:
-            with _single_threaded_libraries():
+            with single_threaded_libraries():
                 for position, values in scheduler.run(len(self.indices)):
                     self._account(position, values)
                     if writer is not None:
@@ -161,18 +176,6 @@ class Runner:
         reader = TopicReader(self.replay.recording, topic)
         return Node(RECORDED + topic, lambda position, _: reader.at(self.indices[position]), {}, ordered=True)
 
-    def _initial(self) -> dict[str, Any]:
-        """What `@prev` holds before the first frame: nothing, or, when a replay begins in the middle, the recorded value before it."""
-        if self.replay is None:
-            return {}
-        delayed = {w.topic for n in self.computed for w in self.graph.stages[n].inputs.values() if w.delay == PREVIOUS}
-        held = {}
-        for topic in delayed & self.replay.recording.topics:
-            reader = TopicReader(self.replay.recording, topic)
-            reader.at(self.indices[0])
-            held[topic] = held[RECORDED + topic] = reader.latest
-        return held
-
     def _call(self, stage: Stage, position: int, values: Mapping[str, Any]) -> Value | None:
         """Skip, seed, time and check one call."""
         if any(values[parameter] is None for parameter in stage.required):
@@ -202,6 +205,7 @@ class Runner:
     # --- what becomes of a finished frame ---------------------------------------------------------------------------------------------
 
     def _account(self, position: int, values: Mapping[str, Any]) -> None:
+        self.keeper.see(self.indices[position], values)
         calls = self._calls_ms.setdefault(position, {})
         for name, ms in calls.items():
             self.timing.add_call(name, ms)
@@ -248,10 +252,14 @@ class Runner:
         if reference is not None:
             writer.write(FRAMES_TOPIC, reference)
 
+    def _loaded_map(self) -> Map | None:
+        loaded = self._memory.held.get("map")
+        return loaded if isinstance(loaded, Map) else None
+
     def _recorded_map(self) -> Map | None:
         """The map after the last frame, where it was read rather than computed."""
         if self.replay is None or "map" not in self.replay.recording.topics:
-            return None
+            return self.result.map
         reader = TopicReader(self.replay.recording, "map")
         found = reader.at(self.indices[-1]) or reader.latest
         return found if isinstance(found, Map) else None
@@ -283,15 +291,3 @@ def _check_value(value: Any, kind: type[Value], index: int) -> None:
         raise TypeError(f"returned {type(value).__name__}, the slot's type is {kind.__name__}")
     if value.index != index:
         raise ValueError(f"returned a {kind.__name__} of frame {value.index} at frame {index}")
-
-
-@contextlib.contextmanager
-def _single_threaded_libraries() -> Iterator[None]:
-    """One thread per library: the runner parallelises stages itself, and sums split over threads would change with their number."""
-    before = cv2.getNumThreads()
-    cv2.setNumThreads(1)
-    try:
-        with threadpool_limits(1):
-            yield
-    finally:
-        cv2.setNumThreads(before)

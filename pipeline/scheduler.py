@@ -7,12 +7,16 @@ may be in flight is bounded. Nodes see only their inputs, so the order in which 
 
 from __future__ import annotations
 
+import contextlib
 import heapq
 import threading
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
+
+import cv2
+from threadpoolctl import threadpool_limits
 
 from trihedron.pipeline.graph import PREVIOUS, Wire
 
@@ -38,12 +42,20 @@ class NodeFailure(Exception):
 class Scheduler:
     """Nodes in topological order, `threads` workers, at most `lookahead` frames in flight.
 
-    A node read only through `@k` wires may lag k frames behind; it does not hold back the others."""
+    A node read only through `@k` wires may lag k frames behind; it does not hold back the others. `initial` holds what `@prev` sees before the first
+    frame, `recent` what `@k` does: node -> position (-1: one frame before the first) -> value."""
 
-    def __init__(self, nodes: list[Node], threads: int, lookahead: int, initial: Mapping[str, Any]) -> None:
+    def __init__(
+        self,
+        nodes: list[Node],
+        threads: int,
+        lookahead: int,
+        initial: Mapping[str, Any],
+        recent: Mapping[str, Mapping[int, Any]] | None = None,
+    ) -> None:
         self._nodes = {node.name: node for node in nodes}
         self._rank = {node.name: i for i, node in enumerate(nodes)}
-        self._threads, self._initial = threads, initial
+        self._threads, self._initial, self._recent = threads, initial, recent or {}
         delays = [wire.delay for node in nodes for wire in node.inputs.values()]
         self._reach = max([1, *delays])
         self._lookahead = lookahead
@@ -153,7 +165,7 @@ class Scheduler:
         if wire.delay == PREVIOUS:
             return self._held[wire.topic][position - 1] if position else self._initial.get(wire.topic)
         source = position - wire.delay
-        return self._values[wire.topic][source] if source >= 0 else None
+        return self._values[wire.topic][source] if source >= 0 else self._recent.get(wire.topic, {}).get(source)
 
     def _complete(self, name: str, position: int, value: Any) -> None:
         self._values[name][position] = value
@@ -182,3 +194,15 @@ class Scheduler:
             self._unmet.pop((name, position), None)
             self._values[name].pop(position - self._reach, None)
             self._held[name].pop(position - 1, None)
+
+
+@contextlib.contextmanager
+def single_threaded_libraries() -> Iterator[None]:
+    """One thread per library: the runner parallelises stages itself, and sums split over threads would change with their number."""
+    before = cv2.getNumThreads()
+    cv2.setNumThreads(1)
+    try:
+        with threadpool_limits(1):
+            yield
+    finally:
+        cv2.setNumThreads(before)

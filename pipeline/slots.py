@@ -125,7 +125,7 @@ class RotationSlot(Protocol):
 
 class TranslationSlot(Protocol):
     """The camera's position with the rotation fixed (eqs. 2–7), from the features tracked since the previous frame. `earlier_pose` is the pose of
-    two frames ago: with the previous one it says how fast the camera moved before its features were lost. `map` as for `rotation`."""
+    two frames ago. `map` as for `rotation`."""
 
     def __call__(
         self,
@@ -142,8 +142,7 @@ class TranslationSlot(Protocol):
 
 
 class MatchesSlot(Protocol):
-    """Map landmarks found among this frame's features, searched around their projection at the decoupled pose (section III-B), or at the pose where
-    a lost camera was recognised."""
+    """Map landmarks found among this frame's features, searched around their projection at the decoupled, or recognised, pose (section III-B)."""
 
     def __call__(
         self,
@@ -160,8 +159,8 @@ class MatchesSlot(Protocol):
 
 class PoseSlot(Protocol):
     """The pose of this frame with its status (section IV-C, eq. 8): a pose is always said, and `ok` or `degraded` only when it was estimated
-    from this frame's measurements. `map` is the map before this frame, `previous` this stage's last output, `relocalise` where this very frame was
-    recognised when that was lost. On top of a lost pose nothing is tracked: only the map says where the camera is."""
+    from this frame's measurements. `map` is the map before this frame, `previous` this stage's last output, `relocalise` where this frame was
+    recognised when that was lost: on top of a lost pose nothing is tracked."""
 
     def __call__(
         self,
@@ -211,18 +210,10 @@ class LoopSlot(Protocol):
 
 
 class RelocaliseSlot(Protocol):
-    """The pose of this frame found against the map without a prediction, for a camera that was lost. None while the previous pose is not lost, and
-    where nothing, or more than one place, is recognised."""
+    """The pose of this frame found against the map without a prediction, for a camera that was lost (else None). None, too, for a doubtful place."""
 
     def __call__(
-        self,
-        frame: Frame,
-        rotation: Rotation,
-        keypoints: Keypoints,
-        segments: Segments,
-        planes: Planes,
-        map: Map | None,
-        previous_pose: Pose | None,
+        self, frame: Frame, rotation: Rotation, keypoints: Keypoints, segments: Segments, planes: Planes, map: Map | None, previous_pose: Pose | None
     ) -> Pose | None: ...
 
 

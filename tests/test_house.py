@@ -9,7 +9,7 @@ import pytest
 ROOT = Path(__file__).resolve().parents[1]
 ORDER = (
     "errors", "arrays", "camera", "table", "types", "geometry", "slots", "registry", "codec", "foxglove", "graph", "metrics", "plot", "timing",
-    "recording", "scheduler", "runner", "results", "config", "execute", "cli",
+    "recording", "scheduler", "state", "runner", "results", "config", "execute", "cli",
 )  # fmt: skip
 VOCABULARY = {"types", "geometry", "errors", "slots", "registry"}  # what plugins and data sets know of the machinery
 EXCEPTIONS = {

@@ -29,7 +29,6 @@ FRONT = {
     "normals": "integral_image", "keypoints": "orb", "lines": "lsd", "segments": "ransac", "planes": "connected_components",
     "manhattan": "mean_shift", "relocalise": "features",
 }  # fmt: skip
-SLOW = ("office", "structure_notexture_far", "textured room")
 
 
 def run(out, kind, options, frames, *cover):
@@ -40,7 +39,15 @@ def run(out, kind, options, frames, *cover):
     return json.loads((out / "metrics.json").read_text()), {pose.index: pose for pose in Recording(out / "run.mcap").values("pose")}
 
 
-@pytest.mark.parametrize("name", [pytest.param(name, marks=pytest.mark.slow if name in SLOW else ()) for name in SEQUENCES])
+def test_a_small_camera_covered_for_ten_frames_is_lost_just_then(tmp_path):
+    metrics, poses = run(tmp_path / "run", "synthetic", {"width": 320, "height": 240}, "0:32", "dataset.cover=14:24")
+    assert [index for index, pose in poses.items() if pose.status == "lost"] == list(range(14, 24))
+    assert metrics["status"]["lost"] == 10 and metrics["final"]["ate_rmse_m"] < 0.005
+    assert len((tmp_path / "run" / "trajectory.txt").read_text().splitlines()) == 1 + 22
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", SEQUENCES)
 def test_a_camera_covered_for_a_second_is_lost_just_then(tmp_path, name):
     """Lost in the unseen frames, back in the next, and no jump left: the error of the frames seen stays what it was."""
     kind, options, frames, (first, stop) = SEQUENCES[name]

@@ -91,7 +91,7 @@ class Covisibility:
         if not len(newest):
             return True
         frames = frame.index - int(map.keyframes.rows("index", newest)[0])
-        if frames < self.min_frames:
+        if 0 <= frames < self.min_frames:  # less than 0: a keyframe of another sequence
             return False
         T = np.linalg.inv(map.keyframes.rows("T_world_camera", newest)[0]) @ pose.T_world_camera
         depth = frame.depth_m[::8, ::8]

@@ -1,0 +1,155 @@
+"""Saved maps: a run cut in two gives what one run gives, another day only the map is used, and no file is trusted."""
+
+import json
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from trihedron.pipeline.codec import Encoder
+from trihedron.pipeline.errors import RecordingError
+from trihedron.pipeline.recording import Recording, RecordingWriter
+from trihedron.pipeline.runner import Runner
+from trihedron.pipeline.state import Keeper, Memory, load_map, reaches
+from trihedron.plugins.numerics.landmarks import empty_map
+
+sys.path.insert(0, str(Path(__file__).parent))
+from toys import ToyDataset, toy_graph
+
+SMALL = ["dataset.width=320", "dataset.height=240"]
+JOBS = {
+    "whole": ["dataset.frames=0:14"],
+    "first": ["dataset.frames=0:8", "save_map=map.mcap"],
+    "rest": ["dataset.frames=8:14", "load_map=map.mcap", "threads=1"],
+    "elsewhere": ["dataset.frames=10:12", "load_map=map.mcap", "save_map=again.mcap", "dataset.length=900"],
+    "only": ["dataset.frames=10:12", "load_map=map.mcap", "localise_only=true", "save_map=only.mcap"],
+}
+RUN = """
+import json, sys
+from trihedron.pipeline.cli import main
+sys.exit(max(main(["run", *job]) for job in json.loads(sys.argv[1])))
+"""
+
+
+@pytest.fixture(scope="module")
+def runs(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("maps")
+    jobs = [[*SMALL, *words, f"out={name}"] for name, words in JOBS.items()]
+    jobs.append(["replay=elsewhere/run.mcap", "only=[pose]", "out=replayed"])
+    done = subprocess.run([sys.executable, "-c", RUN, json.dumps(jobs)], cwd=folder, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr[-2000:]
+    return folder
+
+
+def contents(path, topic, first):
+    """Frame -> bytes of the value written whole, from frame `first` on."""
+    return {v.index: Encoder().encode(v).SerializeToString(deterministic=True) for v in Recording(path).values(topic) if v.index >= first}
+
+
+def test_a_run_cut_in_two_gives_what_one_run_gives(runs):
+    """Every topic, bit for bit."""
+    whole, rest = Recording(runs / "whole" / "run.mcap"), Recording(runs / "rest" / "run.mcap")
+    assert whole.topics == rest.topics >= {"pose", "map", "tracks", "matches", "rotation"}
+    for topic in whole.topics:
+        assert contents(whole.path, topic, 8) == contents(rest.path, topic, 8), topic
+    lines = (runs / "whole" / "trajectory.txt").read_text().splitlines()
+    assert (runs / "rest" / "trajectory.txt").read_text().splitlines()[-6:] == lines[-6:]
+
+
+def test_in_another_sequence_the_camera_is_lost_until_the_map_is_recognised(runs):
+    """Another frame than the next, or other options of the data set: the first frame is recognised, in the world of the map."""
+    true = {pose.index: pose.T_world_camera for pose in Recording(runs / "whole" / "run.mcap").values("pose")}
+    for name in ("elsewhere", "only"):
+        (first, *_) = Recording(runs / name / "run.mcap").values("relocalise")
+        assert first.index == 10 and first.reason.startswith("recognised by ")
+        poses = list(Recording(runs / name / "run.mcap").values("pose"))
+        assert [pose.status for pose in poses] == ["ok"] * 2
+        assert all(np.linalg.norm(pose.T_world_camera[:3, 3] - true[pose.index][:3, 3]) < 0.02 for pose in poses)
+
+
+def test_localising_leaves_the_map_alone(runs):
+    assert "map" not in Recording(runs / "only" / "run.mcap").topics
+    before, after = load_map(str(runs / "map.mcap")), load_map(str(runs / "only.mcap"))
+    assert Encoder().encode(before.map) == Encoder().encode(after.map)
+    assert load_map(str(runs / "again.mcap")).frame == 11
+
+
+def test_a_replay_loads_the_map_again_and_saves_none(runs):
+    assert contents(runs / "replayed" / "run.mcap", "pose", 0) == contents(runs / "elsewhere" / "run.mcap", "pose", 0)
+    assert (runs / "again.mcap").stat().st_mtime < (runs / "only.mcap").stat().st_mtime
+
+
+def test_wires_of_any_delay_are_remembered():
+    """Seven frames and five more: what `@prev` and `@k` see is what they see in twelve frames at once."""
+
+    def run(count, start, remembered=None):
+        runner = Runner(toy_graph(outputs=("trajectory",), dataset=ToyDataset(length=count, start=start)), frames=f"{start}:", remembered=remembered)
+        runner.keeper = Keeper({"rotation": 3, "pose": 1}, runner._memory, start)
+        for _ in runner.steps(None, frozenset()):
+            pass
+        return runner
+
+    whole, first = run(12, 0), run(7, 0)
+    kept = first.keeper._values
+    assert list(kept["rotation"]) == [5, 6] and list(kept["pose"]) == [6]  # rotation says nothing at frame 4
+    memory = Memory({topic: list(values.values())[-1] for topic, values in kept.items()} | {"map": first.result.map}, kept)
+    rest = run(5, 7, lambda _: memory)
+    assert [p.T_world_camera[0, 3] for p in rest.result.poses] == [p.T_world_camera[0, 3] for p in whole.result.poses if p.index >= 7]
+
+
+def test_the_reach_of_a_topic_is_its_longest_delay():
+    stages = toy_graph().stages
+    assert reaches(stages.values()) == {"rotation": 1, "pose": 1, "map": 1}
+
+
+def written(path, metadata, map=None):
+    writer = RecordingWriter(path, {"kind": "map", "map_version": "1", "frame": "3", "source": "{}", **metadata})
+    writer.write("map", map if map is not None else empty_map(3, 3, 32, 32, 8))
+    writer.close()
+    return str(path)
+
+
+def test_a_file_that_is_no_map_of_this_version_is_refused(tmp_path):
+    path = str(tmp_path / "a.mcap")
+    for metadata, cause in (
+        ({"map_version": "2"}, "is a map of version 2, this program reads version 1; make the map anew"),
+        ({"kind": "run"}, "is a recording, not a saved map; save one with: trihedron run save_map=FILE.mcap"),
+        ({"frame": "many"}, "holds a map that does not fit together: "),
+    ):
+        with pytest.raises(RecordingError) as error:
+            load_map(written(tmp_path / "a.mcap", metadata))
+        assert str(error.value).startswith(f"{path}: {cause}")
+    assert load_map(written(tmp_path / "a.mcap", {})).map.revision == 0
+    with pytest.raises(RecordingError, match="cannot be read: No such file"):
+        load_map(str(tmp_path / "missing.mcap"))
+
+
+def test_a_map_whose_rows_name_others_that_are_not_there_is_refused(runs, tmp_path):
+    map = load_map(str(runs / "map.mcap")).map
+    row = np.zeros(1, np.int32)
+    broken = {
+        "observers": replace(map, points=map.points.updated(row, observers=np.full((1, 16), 1 << 20, np.int32))),
+        "point": replace(map, point_observations=map.point_observations.updated(row, point=row - 1)),
+        "lines": replace(map, keyframes=map.keyframes.updated(row, lines=np.array([[0, 1 << 20]], np.int32))),
+        "finite": replace(map, keyframes=map.keyframes.updated(row, T_world_camera=np.full((1, 4, 4), np.nan))),
+        "keyframe": replace(map, line_observations=map.points),
+    }
+    for what, damaged in broken.items():
+        with pytest.raises(RecordingError, match=f"does not fit together.*{what}"):
+            load_map(written(tmp_path / "b.mcap", {}, damaged))
+
+
+@pytest.mark.parametrize("at", [0.2, 0.5, 0.9])
+def test_a_damaged_file_is_one_line(runs, tmp_path, at):
+    """Cut off, or with a byte changed anywhere: an error that names the file."""
+    data = (runs / "map.mcap").read_bytes()
+    place = int(at * len(data))
+    for name, damaged in (("cut", data[:place]), ("changed", data[:place] + bytes([data[place] ^ 0x5A]) + data[place + 1 :])):
+        path = tmp_path / f"{name}.mcap"
+        path.write_bytes(damaged)
+        with pytest.raises(RecordingError) as error:
+            load_map(str(path))
+        assert str(error.value).startswith(str(path)) and "\n" not in str(error.value)
