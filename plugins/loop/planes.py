@@ -1,0 +1,47 @@
+"""Loops found by the layout of planes."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from trihedron.pipeline.registry import register
+from trihedron.pipeline.types import Correction, Frame, Map
+from trihedron.plugins.numerics.local_window import observed_by
+from trihedron.plugins.numerics.loop_closing import LoopClosing
+from trihedron.plugins.numerics.loop_hypotheses import shift_of_planes
+from trihedron.plugins.numerics.loop_places import within_reach
+
+
+@register("loop", "planes")
+@dataclass(frozen=True)
+class PlanesLoop(LoopClosing):
+    """Recognise a place by its planes: directions, offsets and extents that agree on one displacement within the drift to be expected.
+
+    Every candidate is verified with points, lines and planes and by free space; the correction is that of a pose graph."""
+
+    looked_at: int = 20  # keyframes within reach whose layout is compared, the nearest first
+    min_layout: float = 0.3  # planes whose extents agree, at least
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.looked_at < 1 or self.min_layout < 0.0:
+            raise ValueError("looked_at, min_layout: must be at least 1 and 0")
+
+    def __call__(self, map: Map, frame: Frame) -> Correction | None:
+        """None unless the newest keyframe closes a loop."""
+        return self.closed(map, frame, self._ranked(map)) if self.due(map, frame) else None
+
+    def _ranked(self, map: Map) -> Iterator[tuple[int, float]]:
+        """Keyframes within reach, best layout first, with the way walked since."""
+        rows, way = within_reach(map, self.reach)
+        rows, way = rows[: self.looked_at], way[: self.looked_at]
+        here = observed_by(map, np.array([len(map.keyframes) - 1], np.int32), "plane")
+        scores = np.array(
+            [shift_of_planes(map, here, observed_by(map, rows[k : k + 1], "plane"), self.reach.sigma_m(way[k]))[1] for k in range(len(rows))]
+        )
+        for k in np.argsort(-scores, kind="stable"):
+            if scores[k] >= self.min_layout:
+                yield int(rows[k]), float(way[k])
