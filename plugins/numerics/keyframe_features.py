@@ -15,7 +15,7 @@ PLANE_PX = 1000  # a region's size where none is known any more: only the order 
 
 
 def features_of(map: Map, camera: Camera, T_world_camera: F64, seen: LocalWindow) -> tuple[Keypoints, Segments, Planes]:
-    """The living landmarks `seen` (ids of points, lines, planes) in a camera at `T_world_camera`, with the map's covariances as those of the features."""
+    """The landmarks `seen` in a camera at `T_world_camera`, with the map's covariances as those of the features."""
     T = invert(T_world_camera)
     return _points(map, camera, T, seen.points), _lines(map, camera, T, seen.lines), _planes(map, T, seen.planes)
 

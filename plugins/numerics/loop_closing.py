@@ -37,7 +37,7 @@ class LoopClosing:
     rotation_sigma_deg: float = 0.3  # of a keyframe; the Manhattan frame keeps it from growing
     candidates: int = 5  # places looked at in one call, at most
     shared: int = 30  # points and lines already shared with a place, from which on no loop is open there
-    min_score: int = 40  # points + 2 lines + 5 planes that must agree
+    min_score: int = 60  # points + 2 lines + 5 planes that must agree
     min_share: float = 0.5  # of the matches that must agree
     max_through: float = 0.15  # of the place's points in view that the camera may see through
 

@@ -33,6 +33,7 @@ def solve_pose_graph(poses: F64, edges: Edges, R_prior: F64, rotation_sigma: flo
     for _ in range(ITERATIONS):
         scale = diags(H.diagonal())
         step = splu((H + damping * scale).tocsc()).solve(-g).reshape(-1, 6)
+        step[0] = 0.0  # held by its weight but for rounding
         tried = _moved(current, step)
         new_cost, new_H, new_g = _normal_equations(tried, edges, R_prior, rotation_sigma)
         if new_cost <= cost:
