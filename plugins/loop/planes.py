@@ -40,7 +40,7 @@ class PlanesLoop(LoopClosing):
         rows, way = rows[: self.looked_at], way[: self.looked_at]
         here = observed_by(map, np.array([len(map.keyframes) - 1], np.int32), "plane")
         scores = np.array(
-            [shift_of_planes(map, here, observed_by(map, rows[k : k + 1], "plane"), self.reach.sigma_m(way[k]))[1] for k in range(len(rows))]
+            [shift_of_planes(map, here, observed_by(map, rows[k : k + 1], "plane"), float(self.reach.sigma_m(way[k])))[1] for k in range(len(rows))]
         )
         for k in np.argsort(-scores, kind="stable"):
             if scores[k] >= self.min_layout:
