@@ -55,7 +55,6 @@ def close(map: Map, closure: Closure, drift: Drift) -> Correction:
         _moved(T_lines, map.lines.rows("endpoints_m", lines[0])),
         planes[0],
         coefficients,
-        motions[closure.keyframe, :3, :3],
     )
 
 
