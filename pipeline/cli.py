@@ -38,6 +38,7 @@ Usage: trihedron run [-m] [key=value ...]
   localise_only=true                 the loaded map stays as it is
   feedback=recorded                  delayed wires of recomputed stages see the recorded past
   -m                                 sweep over comma-separated values
+  report=COMMAND                     what to do with the folder of a sweep at its end, for example: report="benchmark rotations"
 
 Example: trihedron run dataset=tum dataset.path=rgbd_dataset_freiburg3_structure_notexture_far
 Example: trihedron run replay=runs/latest/run.mcap only=[manhattan,rotation] manhattan.cone_deg=8"""

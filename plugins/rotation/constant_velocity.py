@@ -12,6 +12,8 @@ from trihedron.plugins.numerics.anchoring import anchored_before
 from trihedron.plugins.numerics.chained_rotation import Estimate, rotation_before, rotation_value
 from trihedron.plugins.numerics.manhattan_frames import KnownFrames
 
+FEWEST = 3  # features that fix a rotation
+
 
 @register("rotation", "constant_velocity")
 @dataclass(frozen=True)
@@ -20,11 +22,12 @@ class ConstantVelocity:
     A baseline, and what a lost camera has left; it is never more than a prediction."""
 
     pose_floor_deg: float = 0.1  # least error of the previous pose
-    prior_deg: float = 2.0  # of the predicted rotation, per frame
+    prior_deg: float = 2.0  # error of the last turn once more, per frame
+    tracked_deg: float = 0.1  # and of a turn that was corrected by what the tracks found
 
     def __post_init__(self) -> None:
-        if min(self.pose_floor_deg, self.prior_deg) <= 0.0:
-            raise ValueError("pose_floor_deg, prior_deg: must be positive")
+        if min(self.pose_floor_deg, self.prior_deg, self.tracked_deg) <= 0.0:
+            raise ValueError("pose_floor_deg, prior_deg, tracked_deg: must be positive")
 
     def __call__(
         self, tracks: Tracks | None, keypoints: Keypoints, previous: Rotation | None, previous_pose: Pose | None, map: Map | None
@@ -33,7 +36,10 @@ class ConstantVelocity:
         estimate = Estimate(np.eye(3), np.zeros((3, 3)), "prediction")
         if previous is not None:
             before, _ = rotation_before(*anchored_before(previous, previous_pose, map), self.pose_floor_deg)
-            turn = tracks.R_current_previous if tracks is not None and tracks.previous_index == previous.index else np.eye(3)
-            grown = np.eye(3) * np.radians(self.prior_deg * max(keypoints.index - previous.index, 1)) ** 2
+            reaching = tracks if tracks is not None and tracks.previous_index == previous.index else None
+            turn = np.eye(3) if reaching is None else reaching.R_current_previous
+            found = 0 if reaching is None else len(reaching.keypoints) + len(reaching.segments) + len(reaching.planes)
+            error_deg = self.tracked_deg if found >= FEWEST else self.prior_deg * max(keypoints.index - previous.index, 1)
+            grown = np.eye(3) * np.radians(error_deg) ** 2
             estimate = Estimate(before.R @ turn.T, turn @ before.covariance @ turn.T + grown, "prediction")
         return rotation_value(keypoints.index, keypoints.stamp_ns, estimate, KnownFrames.none(), np.zeros((0, 3, 3)))

@@ -21,6 +21,12 @@ def wobble(index):
     return pose_matrix(turn, np.array([0.1 * np.sin(0.9 * a), 0.05 * np.sin(a), 0.0]))
 
 
+def swing(index):
+    """(4, 4) pose of a camera whose turn changes by about 2° a frame."""
+    a = index * 0.5
+    return pose_matrix(exp_so3(np.radians([4.0 * np.sin(a), 5.0 * np.sin(0.8 * a), 4.0 * np.cos(a) - 4.0])), np.zeros(3))
+
+
 def said(T, index, rotation_covariance=None, status=OK):
     covariance = np.eye(6) * 1e-6
     covariance[3:, 3:] = np.eye(3) * np.radians(0.05) ** 2 if rotation_covariance is None else rotation_covariance
@@ -92,6 +98,23 @@ def test_covariance_is_realistic(room):
                 phi = log_so3(run.previous.R_world_camera.T @ run.path(run.index)[:3, :3])
                 squares.append(phi @ np.linalg.solve(run.previous.covariance, phi) / 3.0)
     assert 0.1 < np.mean(squares) < 2.0
+
+
+@pytest.mark.parametrize("plugin", [Procrustes(), ConstantVelocity()])
+def test_covariance_without_a_manhattan_frame_is_realistic(room, plugin):
+    """From a pose that is known, where the tracks say the turn and where nothing does: the error in units of the covariance."""
+    for kinds, least in (({}, 0.003), ({"points": False, "lines": False, "walls": False}, 0.1)):
+        squares = []
+        for seed in range(3):
+            run = Run(room, seed, plugin, path=swing, **kinds)
+            for k in range(40):
+                run.pose = said(run.path(k - 1), k - 1) if k else None
+                run.step(manhattan=False)
+                if k > 2:
+                    phi = log_so3(run.previous.R_world_camera.T @ run.path(k)[:3, :3])
+                    squares.append(phi @ np.linalg.solve(run.previous.covariance, phi) / 3.0)
+        print(type(plugin).__name__, kinds, np.mean(squares))
+        assert least < np.mean(squares) < 1.5
 
 
 def test_names_of_the_axes_do_not_matter(room):
