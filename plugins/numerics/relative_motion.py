@@ -44,19 +44,29 @@ class Motion:
 
 def motion_terms(tracks: Tracks, keypoints: Keypoints, segments: Segments, planes: Planes, rad_per_px: float, floor_deg: float) -> Terms:
     """What the tracks and the current features say about the motion. `rad_per_px` turns a key point's sigma_px into an angle; `floor_deg` is the
-    least error of a plane's normal."""
-    points = _point_pairs(tracks, keypoints, rad_per_px)
-    ends = _line_pairs(tracks, segments, rad_per_px)
+    least error of a plane's normal. Pairs that are not finite, or whose covariance is none, are left out."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        points = _finite(*_point_pairs(tracks, keypoints, rad_per_px))
+        ends = _finite(*_line_pairs(tracks, segments, rad_per_px))
     rows = tracks.planes[:, 1]
     covariance = planes.covariance[rows] + tracks.plane_covariance
     covariance[:, :2, :2] += np.eye(2) * np.radians(floor_deg) ** 2
+    known = np.isfinite(planes.coefficients[rows] + tracks.coefficients).all(axis=1) & np.isfinite(covariance).all(axis=(1, 2))
+    known[known] = np.linalg.det(covariance[known]) > 0.0
+    rows, covariance, coefficients = rows[known], covariance[known], tracks.coefficients[known]
     basis = np.zeros((len(rows), 4, 3))
     basis[:, :3, :2] = tangent_basis(planes.coefficients[rows, :3])
     basis[:, 3, 2] = 1.0
     information = basis @ np.linalg.inv(covariance) @ np.swapaxes(basis, 1, 2) if len(rows) else np.zeros((0, 4, 4))
     before, after, weight = (np.concatenate(pair) for pair in zip(points, ends))
     step = max(-(-len(before) // MOST), 1)
-    return Terms(before[::step].copy(), after[::step].copy(), weight[::step].copy(), tracks.coefficients, planes.coefficients[rows], information)
+    return Terms(before[::step].copy(), after[::step].copy(), weight[::step].copy(), coefficients, planes.coefficients[rows], information)
+
+
+def _finite(before: F64, after: F64, information: F64) -> tuple[F64, F64, F64]:
+    """The pairs (n, 3), (n, 3), (n, 3, 3) without those that are not finite."""
+    known = np.isfinite(before).all(axis=1) & np.isfinite(after).all(axis=1) & np.isfinite(information).all(axis=(1, 2))
+    return before[known], after[known], information[known]
 
 
 def _point_pairs(tracks: Tracks, keypoints: Keypoints, rad_per_px: float) -> tuple[F64, F64, F64]:
@@ -81,7 +91,7 @@ def _line_pairs(tracks: Tracks, segments: Segments, rad_per_px: float) -> tuple[
     basis = tangent_basis(direction)
     before, start = tracks.endpoints_m[known].astype(np.float64), segments.endpoints_m[rows, 0].astype(np.float64)
     covariance = 2.0 * segments.covariance_m2[rows].astype(np.float64).mean(axis=1)
-    floor = (rad_per_px * start[:, 2]) ** 2
+    floor = np.maximum(rad_per_px * start[:, 2], 1e-6) ** 2
     across = np.swapaxes(basis, 1, 2) @ covariance @ basis + np.eye(2) * floor[:, None, None]
     information = 0.5 * basis @ np.linalg.inv(across) @ np.swapaxes(basis, 1, 2)
     return before.reshape(-1, 3), np.repeat(start, 2, axis=0), np.repeat(information, 2, axis=0)

@@ -38,7 +38,7 @@ def named(directions, rng, R):
 @pytest.mark.parametrize("name", ESTIMATORS)
 def test_too_little_is_no_manhattan_frame(directions, name):
     rng = np.random.default_rng(0)
-    for _ in range(5):
+    for _ in range(2):
         R = directions.rotation(rng)
         for what, value in named(directions, rng, R).items():
             for previous in (None, directions.frame(R), directions.frame(directions.rotation(rng), supported=False)):
@@ -48,7 +48,7 @@ def test_too_little_is_no_manhattan_frame(directions, name):
 
 
 @pytest.mark.parametrize("name", ESTIMATORS)
-@settings(max_examples=30, deadline=None, derandomize=True)
+@settings(max_examples=20, deadline=None, derandomize=True)
 @given(data=st.data())
 def test_every_estimator_returns_rotations(directions, name, data):
     *value, previous = directions.awkward(data)
@@ -91,7 +91,7 @@ def check(found):
 
 
 @pytest.mark.parametrize("name", ROTATIONS)
-@settings(max_examples=80, deadline=None, derandomize=True)
+@settings(max_examples=60, deadline=None, derandomize=True)
 @given(data=st.data())
 def test_every_rotation_is_one(room, name, data):
     plugin, draw = ROTATIONS[name], lambda label, *values: data.draw(st.sampled_from(values), label=label)
