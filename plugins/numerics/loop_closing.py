@@ -66,14 +66,14 @@ class LoopClosing:
         looked_at: set[int] = set()
         tried = 0
         for keyframe, way in ranked:
+            if keyframe in looked_at:
+                continue
             if tried == self.candidates:
                 break
-            place = None if keyframe in looked_at else place_of(map, keyframe, way, self.reach, self.shared)
-            if place is None:
-                continue
             tried += 1
+            place = place_of(map, keyframe, way, self.reach)
             looked_at |= set(place.seen.keyframes.tolist())
-            closure = self._recognised(map, frame, place)
+            closure = self._recognised(map, frame, place) if place.found < self.shared else None
             if closure is not None:
                 return close(map, closure, Drift(self.drift_share, np.radians(self.rotation_sigma_deg)))
         return None

@@ -27,11 +27,13 @@ class Reach:
 
 @dataclass(frozen=True)
 class Place:
-    """A keyframe of long ago, those that saw the same from about there, the landmarks only they know, and the way walked since."""
+    """A keyframe of long ago, those that saw the same from about there, the landmarks only they know, the way walked since, and how many points
+    and lines of the place the newest keyframe has found already."""
 
     keyframe: int
     seen: LocalWindow
     walked_m: float
+    found: int
 
 
 def walked(map: Map) -> tuple[I32, F64]:
@@ -54,21 +56,18 @@ def within_reach(map: Map, reach: Reach) -> tuple[I32, F64]:
     return rows[chosen], way[chosen]
 
 
-def place_of(map: Map, keyframe: int, walked_m: float, reach: Reach, shared: int) -> Place | None:
-    """The place around a keyframe, or None when the newest keyframe already sees `shared` or more of its points and lines: no loop is open there."""
+def place_of(map: Map, keyframe: int, walked_m: float, reach: Reach) -> Place:
+    """The place around a keyframe."""
     rows, way = walked(map)
     poses = map.keyframes.rows("T_world_camera", rows)
     own = poses[np.searchsorted(rows, keyframe)]
     near = np.linalg.norm(poses[:, :3, 3] - own[:3, 3], axis=1) < reach.view_m
     near &= (poses[:, :3, 2] @ own[:3, 2] > np.cos(np.radians(reach.view_deg))) & (way > 0.5 * reach.away_m)
     recent = rows[way <= 0.5 * reach.away_m]
-    known = 0
-    ids = {}
+    found, ids = 0, []
     for kind in ("point", "line", "plane"):
         there, here = observed_by(map, rows[near], kind), observed_by(map, recent, kind)
         if kind != "plane":
-            known += int(np.isin(observed_by(map, rows[-1:], kind), there).sum())
-        ids[kind] = np.setdiff1d(there, here).astype(np.int32)
-    if known >= shared:
-        return None
-    return Place(keyframe, LocalWindow(rows[near], ids["point"], ids["line"], ids["plane"]), walked_m)
+            found += int(np.isin(observed_by(map, rows[-1:], kind), there).sum())
+        ids.append(np.setdiff1d(there, here).astype(np.int32))
+    return Place(keyframe, LocalWindow(rows[near], *ids), walked_m, found)
