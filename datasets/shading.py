@@ -59,7 +59,7 @@ def _shade(surfaces: F64, atlas: Atlas, view: View, depth: F64, faces: I32, colo
             cosine[y, x] = c
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
 def _color_at(
     surfaces: F64, texels: U8, levels: NDArray[np.int64], per_metre: F64, position: F64, R: F64,
     dx: float, dy: float, t: float, pixel_m: float, face: int,
@@ -77,7 +77,7 @@ def _color_at(
     return min(255.0, r * light), min(255.0, g * light), min(255.0, b * light), cosine
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
 def _surface(surfaces: F64, face: int, p0: float, p1: float, p2: float) -> tuple[float, float, float, float, float]:
     """Unit normal and texture coordinates (metres) of a point on a face."""
     q0, q1, q2 = p0 - surfaces[face, 0], p1 - surfaces[face, 1], p2 - surfaces[face, 2]
@@ -92,7 +92,7 @@ def _surface(surfaces: F64, face: int, p0: float, p1: float, p2: float) -> tuple
     return q0 / radius, q1 / radius, q2 / radius, around, radius * math.acos(max(-1.0, min(1.0, q2 / radius)))
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
 def _sample(
     texels: U8, levels: NDArray[np.int64], per_metre: float, face: int, u: float, v: float, footprint_m2: float
 ) -> tuple[float, float, float]:
@@ -111,7 +111,7 @@ def _sample(
     return r + share * (r2 - r), g + share * (g2 - g), b + share * (b2 - b)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
 def _bilinear(t: U8, levels: NDArray[np.int64], face: int, level: int, x: float, y: float) -> tuple[float, float, float]:
     """One level of texels `t` at (x, y) texels of level 0, clamped at the texture's border."""
     offset, w, h = levels[face, level, 0], levels[face, level, 1], levels[face, level, 2]
@@ -144,7 +144,7 @@ def _smooth_borders(geometry: Geometry, atlas: Atlas, view: View, faces: I32, co
                 _smooth_pixel(geometry, atlas, view, solids, count, seen, x, y, color)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
 def _smooth_pixel(
     geometry: Geometry, atlas: Atlas, view: View, solids: NDArray[np.int64], count: int, seen: F64, x: int, y: int, color: U8
 ) -> None:
@@ -159,7 +159,7 @@ def _smooth_pixel(
             k += 1
         if k == found:
             found += 1
-            seen[k, 0], seen[k, 1:] = face, 0.0
+            seen[k, 0], seen[k, 1], seen[k, 2], seen[k, 3], seen[k, 4] = face, 0.0, 0.0, 0.0, 0.0
         seen[k, 1] += 1.0
         seen[k, 2] += dx
         seen[k, 3] += dy
@@ -175,7 +175,7 @@ def _smooth_pixel(
     color[y, x, 0], color[y, x, 1], color[y, x, 2] = np.uint8(r + 0.5), np.uint8(g + 0.5), np.uint8(b + 0.5)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
 def _solids_around(solid_of_face: I32, faces: I32, x: int, y: int, solids: NDArray[np.int64]) -> int:
     """The different solids seen in the 3 × 3 neighbourhood, into `solids`; returns how many."""
     count = 0
