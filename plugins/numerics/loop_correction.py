@@ -10,13 +10,14 @@ from trihedron.pipeline.geometry import invert
 from trihedron.pipeline.types import F64, I32, Correction, Map, Table
 from trihedron.plugins.numerics.pose_graph import Edges, solve_pose_graph
 
+LEAST_M, LEAST = 1e-3, 1e-4  # standard deviations between two keyframes at one place, m and rad
 LINKS = 3  # further keyframes each is tied to, so that a stretch that was looked at often stays stiff
 
 
 @dataclass(frozen=True)
 class Drift:
-    """How fast keyframes that follow each other lose their way: standard deviations per square root of a metre walked and of a radian turned,
-    and that of a keyframe's rotation, which the Manhattan frame keeps from drifting."""
+    """How fast keyframes that follow each other lose their way, as standard deviations: per square root of a metre walked, and that of a rotation
+    however long the walk, since the Manhattan frame holds it. What the rotation is off by changes slowly, so all keyframes tell it but once."""
 
     share: float
     rotation_sigma: float
@@ -37,7 +38,7 @@ def close(map: Map, closure: Closure, drift: Drift) -> Correction:
     rows = np.flatnonzero(map.keyframes.column("alive")).astype(np.int32)
     before = map.keyframes.rows("T_world_camera", rows)
     edges = _edges(map, rows, before, closure, drift)
-    after = solve_pose_graph(before, edges, before[:, :3, :3], drift.rotation_sigma)
+    after = solve_pose_graph(before, edges, before[:, :3, :3], drift.rotation_sigma * np.sqrt(len(rows)))
     motions = np.broadcast_to(np.eye(4), (len(map.keyframes), 4, 4)).copy()
     motions[rows] = after @ invert(before)
     points, lines, planes = (_moving(table) for table in (map.points, map.lines, map.planes))
@@ -65,8 +66,9 @@ def _edges(map: Map, rows: I32, poses: F64, closure: Closure, drift: Drift) -> E
     measured = invert(poses[odometry[:, 0]]) @ poses[odometry[:, 1]]
     length = np.linalg.norm(measured[:, :3, 3], axis=1)
     covariance = LINKS * map.keyframes.rows("covariance", rows[odometry[:, 1]])
-    covariance[:, :3, :3] += LINKS * (drift.share**2 * length + 1e-6)[:, None, None] * np.eye(3)
-    covariance[:, 3:, 3:] += LINKS * drift.rotation_sigma**2 * 0.1 * np.eye(3)
+    covariance[:, :3, :3] += LINKS * (drift.share**2 * length + LEAST_M**2)[:, None, None] * np.eye(3)
+    walked = length[: len(rows) - 1].sum()
+    covariance[:, 3:, 3:] += LINKS * (drift.rotation_sigma**2 * length / walked + LEAST**2)[:, None, None] * np.eye(3)
     place, keyframe = np.searchsorted(rows, [closure.place, closure.keyframe])
     return Edges(
         np.concatenate([odometry, [[place, keyframe]]]).astype(np.int32),
