@@ -9,8 +9,9 @@ from typing import Any
 import numpy as np
 
 from trihedron.datasets.trajectories import write_trajectory
+from trihedron.pipeline.consistency import pose_consistency
 from trihedron.pipeline.errors import DataError
-from trihedron.pipeline.metrics import evaluate_trajectory
+from trihedron.pipeline.metrics import associate, evaluate_trajectory
 from trihedron.pipeline.plot import trajectory_figure
 from trihedron.pipeline.runner import Result
 from trihedron.pipeline.types import DEGRADED, LOST, OK, Trajectory
@@ -55,12 +56,22 @@ def write_results(out: Path, result: Result, truth: Trajectory | None) -> dict[s
         try:
             for name, trajectory in (("final", final), ("causal", causal)):
                 metrics[name] = evaluate_trajectory(trajectory, truth, fps=result.fps, frame_stamps_ns=stamps).to_dict()
+            metrics["consistency"] = _consistency(result, truth)
         except DataError as error:
             metrics["note"] = str(error)
         write_json(out / METRICS, metrics)
     if len(final):
         trajectory_figure(final, truth, out / PLOT, [(pose.stamp_ns, pose.status) for pose in result.poses])
     return metrics
+
+
+def _consistency(result: Result, truth: Trajectory) -> dict[str, Any]:
+    """Of the tracked poses but the first, which is exact by definition."""
+    poses = [pose for pose in result.poses if pose.status != LOST][1:]
+    pairs = associate(np.array([pose.stamp_ns for pose in poses], np.int64), truth.stamps_ns)
+    known = [poses[row] for row, _ in pairs]
+    covariances = np.array([pose.covariance for pose in known])
+    return pose_consistency(np.array([pose.T_world_camera for pose in known]), covariances, truth.poses[pairs[:, 1]]).to_dict()
 
 
 def write_json(path: Path, content: dict[str, Any]) -> None:

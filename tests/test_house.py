@@ -8,8 +8,8 @@ import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
 ORDER = (
-    "errors", "arrays", "camera", "table", "types", "geometry", "slots", "registry", "codec", "foxglove", "graph", "metrics", "plot", "timing",
-    "recording", "scheduler", "state", "runner", "results", "config", "execute", "cli",
+    "errors", "arrays", "camera", "table", "types", "geometry", "slots", "registry", "codec", "foxglove", "graph", "metrics", "consistency", "plot",
+    "timing", "recording", "scheduler", "state", "runner", "results", "config", "execute", "cli",
 )  # fmt: skip
 VOCABULARY = {"types", "geometry", "errors", "slots", "registry"}  # what plugins and data sets know of the machinery
 EXCEPTIONS = {

@@ -1,0 +1,50 @@
+"""Normalised errors: what covariances that are honest, too small, and honest in one direction only give."""
+
+import numpy as np
+import pytest
+
+from trihedron.pipeline.consistency import pose_consistency
+from trihedron.pipeline.geometry import exp_se3
+
+SOMEWHERE = exp_se3(np.array([3.0, -1.0, 2.0, 0.4, -2.0, 1.0]))
+
+
+def trajectory(count=2000, seed=0):
+    """Poses, their covariances, and truths drawn from them."""
+    rng = np.random.default_rng(seed)
+    poses = np.array([exp_se3(np.concatenate([rng.uniform(-2, 2, 3), rng.uniform(-1.5, 1.5, 3)])) for _ in range(count)])
+    shape = rng.normal(size=(count, 6, 6)) * 1e-3
+    covariances = shape @ np.swapaxes(shape, 1, 2) + 1e-8 * np.eye(6)
+    errors = np.array([rng.multivariate_normal(np.zeros(6), C) for C in covariances])
+    return poses, covariances, np.array([T @ exp_se3(e) for T, e in zip(poses, errors)])
+
+
+def test_honest_covariances_give_six():
+    found = pose_consistency(*trajectory())
+    assert abs(found.nees_mean - 6.0) < 0.3 and abs(found.nees_median - 5.348) < 0.3
+    assert abs(found.share_within_95 - 0.95) < 0.015 and found.poses == 2000
+    assert np.abs(np.array(found.normalised_rms) - 1.0).max() < 0.06
+
+
+@pytest.mark.parametrize("factor", [0.25, 4.0])
+def test_covariances_that_are_wrong_by_a_factor_show_it(factor):
+    poses, covariances, truth = trajectory()
+    found = pose_consistency(poses, factor * covariances, truth)
+    assert found.nees_mean * factor == pytest.approx(6.0, abs=0.3)
+    assert (found.share_within_95 > 0.95) == (factor > 1.0)
+
+
+def test_the_world_of_the_truth_does_not_matter():
+    poses, covariances, truth = trajectory(200)
+    here, there = pose_consistency(poses, covariances, truth), pose_consistency(poses, covariances, SOMEWHERE @ truth)
+    assert there.nees_mean == pytest.approx(here.nees_mean, rel=1e-9)
+    assert there.normalised_rms == pytest.approx(here.normalised_rms, rel=1e-9)
+
+
+def test_a_direction_that_is_worse_than_it_says_is_named():
+    poses, covariances, _ = trajectory()
+    covariances = np.broadcast_to(1e-6 * np.eye(6), covariances.shape)
+    rng = np.random.default_rng(1)
+    errors = rng.normal(size=(len(poses), 6)) * 1e-3 * np.array([1, 1, 5, 1, 1, 1])
+    found = pose_consistency(poses, covariances, np.array([T @ exp_se3(e) for T, e in zip(poses, errors)]))
+    assert np.argmax(found.normalised_rms) == 2 and found.normalised_rms[2] == pytest.approx(5.0, abs=0.3)
