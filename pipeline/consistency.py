@@ -36,7 +36,7 @@ class Consistency:
 
 def pose_consistency(poses: F64, covariances: F64, true_poses: F64) -> Consistency:
     """Compare (n, 4, 4) poses `T_world_camera` of (n, 6, 6) covariance (of xi as in `types`) with the truth in any world; n at least 2."""
-    information = np.linalg.inv(covariances)
+    information = np.asarray(np.linalg.inv(covariances), np.float64)
     errors = _errors(poses, true_poses, _gauge(poses, information, true_poses))
     nees = np.einsum("ni,nij,nj->n", errors, information, errors)
     sigma = np.sqrt(np.diagonal(covariances, axis1=1, axis2=2))

@@ -1,0 +1,38 @@
+"""The error budget on runs whose budget is known."""
+
+import pytest
+
+from trihedron.pipeline.cli import main
+
+ROOM = ["dataset.length=14", "dataset.width=320", "dataset.height=240", "threads=1"]
+
+
+def budget(path, capsys):
+    """Row -> ATE."""
+    capsys.readouterr()
+    assert main(["error-budget", str(path)]) == 0
+    rows = [line.rsplit(maxsplit=4) for line in capsys.readouterr().out.strip().splitlines()[1:]]
+    return {row[0].strip(): float(row[1]) for row in rows}
+
+
+def test_without_refinement_the_true_decoupled_pose_leaves_nothing(tmp_path, capsys):
+    assert main(["run", "graph=structural_no_refine", *ROOM, f"out={tmp_path}/run"]) == 0
+    found = budget(tmp_path / "run" / "run.mcap", capsys)
+    assert list(found)[0] == "nothing" and found["nothing"] > 0.0
+    assert found["rotation + translation"] == 0.0 and found["translation"] < found["nothing"]
+
+
+@pytest.mark.parametrize(
+    ("overrides", "message"),
+    [
+        (["outputs=[planes]"], "holds no poses with ground truth; record a run of a data set that has it"),
+        (None, "cannot be read: No such file or directory; give the path of a run.mcap"),
+    ],
+)
+def test_what_it_cannot_judge(tmp_path, capsys, overrides, message):
+    path = tmp_path / "run" / "run.mcap"
+    if overrides is not None:
+        assert main(["run", "dataset.length=2", *ROOM[1:], *overrides, f"out={path.parent}"]) == 0
+    capsys.readouterr()
+    assert main(["error-budget", str(path)]) == 1
+    assert capsys.readouterr().err == f"trihedron: {path}: {message}\n"
