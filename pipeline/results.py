@@ -14,27 +14,34 @@ from trihedron.pipeline.errors import DataError
 from trihedron.pipeline.metrics import associate, evaluate_trajectory
 from trihedron.pipeline.plot import trajectory_figure
 from trihedron.pipeline.runner import Result
-from trihedron.pipeline.types import DEGRADED, LOST, OK, Trajectory
+from trihedron.pipeline.types import DEGRADED, LOST, OK, Map, Pose, Trajectory
 
 TRAJECTORY, CAUSAL, TIMING, METRICS, PLOT = "trajectory.txt", "trajectory_causal.txt", "timing.json", "metrics.json", "trajectory.png"
 
 
 def causal_trajectory(result: Result) -> Trajectory:
-    """The tracked poses as they were said at the time."""
-    poses = [pose for pose in result.poses if pose.status != LOST]
+    """The tracked poses as they were said at the time, but for those in a sub-map, which were said in another world."""
+    poses = [pose for pose in result.poses if pose.status != LOST and pose.submap == 0]
     return _trajectory([pose.stamp_ns for pose in poses], [pose.T_world_camera for pose in poses])
 
 
 def final_trajectory(result: Result) -> Trajectory:
     """The tracked poses hung on the final keyframes: keyframe pose × relative pose, so corrections of the map reach every frame. A frame that became
-    a keyframe is where that is."""
-    poses = [pose for pose in result.poses if pose.status != LOST]
+    a keyframe is where that is. Frames of sub-maps are among them once these are tied to the first."""
+    poses = [pose for pose in result.poses if is_tied(pose, result.map)]
     if result.map is None:
         return causal_trajectory(result)
     keyframes = result.map.keyframes.column("T_world_camera")
-    own = dict(zip(result.map.keyframes.column("index").tolist(), keyframes))
+    own = dict(list(zip(result.map.keyframes.column("index").tolist(), keyframes))[result.loaded_keyframes :])
     hung = [pose.T_world_camera if pose.reference < 0 else keyframes[pose.reference] @ pose.T_reference_camera for pose in poses]
     return _trajectory([pose.stamp_ns for pose in poses], [own.get(pose.index, T) for pose, T in zip(poses, hung)])
+
+
+def is_tied(pose: Pose, map: Map | None) -> bool:
+    """Whether the pose was tracked and stands, in the end, in the world of the first frame."""
+    if pose.status == LOST or map is None or pose.reference < 0:
+        return pose.status != LOST and pose.submap == 0
+    return bool(map.keyframes.rows("submap", np.array([pose.reference]))[0] == 0)
 
 
 def _trajectory(stamps_ns: list[int], poses: list[Any]) -> Trajectory:
@@ -49,6 +56,7 @@ def write_results(out: Path, result: Result, truth: Trajectory | None) -> dict[s
     metrics: dict[str, Any] = {
         "frames": len(result.stamps_ns),
         "unreadable": result.unreadable,
+        "untied": sum(pose.status != LOST and not is_tied(pose, result.map) for pose in result.poses),
         "status": {status: sum(pose.status == status for pose in result.poses) for status in (OK, DEGRADED, LOST)},
     }
     if truth is not None:
@@ -59,7 +67,7 @@ def write_results(out: Path, result: Result, truth: Trajectory | None) -> dict[s
             metrics["consistency"] = _consistency(result, truth)
         except DataError as error:
             metrics["note"] = str(error)
-        write_json(out / METRICS, metrics)
+    write_json(out / METRICS, metrics)
     if len(final):
         trajectory_figure(final, truth, out / PLOT, [(pose.stamp_ns, pose.status) for pose in result.poses])
     return metrics

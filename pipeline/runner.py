@@ -46,6 +46,7 @@ class Result:
 
     poses: list[Pose] = field(default_factory=list)
     map: Map | None = None
+    loaded_keyframes: int = 0  # of another run, whose numbers say nothing here
     folds: dict[str, Value] = field(default_factory=dict)
     stamps_ns: list[int] = field(default_factory=list)  # of every readable frame
     unreadable: int = 0
@@ -86,6 +87,7 @@ class Runner:
             self._memory = self._memory.updated(recorded_memory(replay.recording, reach, self.indices[0]), RECORDED)
         self.keeper = Keeper(reach, self._memory, self.indices[0])
         self.result.map = self._loaded_map()
+        self.result.loaded_keyframes = len(self.result.map.keyframes) if self.result.map is not None else 0
         self._references = TopicReader(replay.recording, FRAMES_TOPIC) if replay is not None else None
         self._fold_states: dict[str, Any] = {}
         self._calls_ms: dict[int, dict[str, float]] = {}

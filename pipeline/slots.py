@@ -124,8 +124,7 @@ class RotationSlot(Protocol):
 
 
 class TranslationSlot(Protocol):
-    """The camera's position with the rotation fixed (eqs. 2–7), from the features tracked since the previous frame. `earlier_pose` is the pose of
-    two frames ago. `map` as for `rotation`."""
+    """The camera's position with the rotation fixed (eqs. 2–7), from features tracked since the last frame; `earlier_pose` is of two frames ago."""
 
     def __call__(
         self,
@@ -159,8 +158,7 @@ class MatchesSlot(Protocol):
 
 class PoseSlot(Protocol):
     """The pose of this frame with its status (section IV-C, eq. 8): a pose is always said, and `ok` or `degraded` only when it was estimated
-    from this frame's measurements. `map` is the map before this frame, `previous` this stage's last output, `relocalise` where this frame was
-    recognised when that was lost: on top of a lost pose nothing is tracked."""
+    from this frame's measurements. `map` is the map before this frame, `previous` this stage's last output; on a lost one nothing is tracked."""
 
     def __call__(
         self,
@@ -181,7 +179,7 @@ class PoseSlot(Protocol):
 
 
 class MapSlot(Protocol):
-    """The only writer of the map: inserts keyframes, culls and fuses landmarks, applies corrections. Returns None when nothing changed."""
+    """The only writer of the map: inserts keyframes, culls and fuses landmarks, applies corrections, ties sub-maps. None when nothing changed."""
 
     def __call__(
         self,
@@ -194,6 +192,7 @@ class MapSlot(Protocol):
         map: Map | None,
         bundle: Correction | None,
         loop: Correction | None,
+        relocalise: Pose | None,
     ) -> Map | None: ...
 
 
@@ -210,7 +209,8 @@ class LoopSlot(Protocol):
 
 
 class RelocaliseSlot(Protocol):
-    """The pose of this frame found against the map without a prediction, for a camera that was lost (else None). None, too, for a doubtful place."""
+    """The pose of this frame found against the map without a prediction: for a lost camera `ok`, or `lost` when nothing, or more than one place, was
+    recognised; `degraded` for one tracked in a sub-map that was recognised in an older one. None otherwise."""
 
     def __call__(
         self, frame: Frame, rotation: Rotation, keypoints: Keypoints, segments: Segments, planes: Planes, map: Map | None, previous_pose: Pose | None

@@ -213,8 +213,11 @@ OK, DEGRADED, LOST = "ok", "degraded", "lost"
 class Pose(Value):
     """Where the camera is. A frame counts as tracked only with status ok or degraded, which need measurements of that very frame.
 
-    `reference` is the keyframe the pose is expressed against (-1: none yet) and `T_reference_camera` the pose relative to it.
-    `inliers` counts points, lines and planes; `unobservable` the directions held at the prediction."""
+    `reference` is the keyframe the pose is expressed against (-1: none yet) and `T_reference_camera` the pose relative to it. `inliers` counts
+    points, lines and planes; `unobservable` the directions held at the prediction. `submap` is the part of the map the pose is said in (0: the first;
+    others have a world of their own until they are tied to it), `unrecognised` how many frames of a lost camera showed a place that is not known."""
+
+    version: ClassVar[int] = 2
 
     T_world_camera: Annotated[F64, Shape(4, 4)]
     covariance: Annotated[F64, Shape(6, 6)]
@@ -224,6 +227,8 @@ class Pose(Value):
     unobservable: int
     status: str  # ok | degraded | lost
     reason: str
+    submap: int = 0
+    unrecognised: int = 0
 
 
 @dataclass(frozen=True)
@@ -231,6 +236,8 @@ class Map(Value):
     """Keyframes and landmarks; a row number is an id for good, dead rows have `alive` False. Columns are listed in `plugins.numerics.landmarks`.
 
     `revision` counts versions; `point_observations` and its siblings say which keyframe (row) saw which landmark, and what it measured."""
+
+    version: ClassVar[int] = 2
 
     revision: int
     keyframes: Table

@@ -76,6 +76,21 @@ def test_with_one_image_left_the_camera_is_still_tracked_or_says_that_it_is_lost
 
 
 @pytest.mark.slow
+def test_what_is_seen_while_lost_becomes_a_sub_map_and_is_tied_when_the_turn_is_closed(tmp_path):
+    """A camera turning on the spot, 20° a second, covered for 130° of it: what it sees next it has never seen; after a whole turn it has."""
+    options = {"motion": "pan", "length": 620, "width": 320, "height": 240}
+    metrics, poses = run(tmp_path / "run", "synthetic", options, "", "dataset.cover=60:260")
+    *_, map = Recording(tmp_path / "run" / "run.mcap").values("map")
+    submaps = [pose.submap for pose in poses.values()]
+    begun, tied = submaps.index(1), len(submaps) - submaps[::-1].index(1)
+    print(f"sub-map from frame {begun} to {tied}, {metrics['untied']} frames untied, ATE {metrics['final']['ate_rmse_m']:.4f} m")
+    assert 270 <= begun <= 290 and 300 < tied < 560 and not map.keyframes.column("submap").any()
+    assert {pose.status for index, pose in poses.items() if begun <= index < tied} == {"degraded"}
+    assert metrics["untied"] == 1 and metrics["status"]["lost"] == begun - 60
+    assert metrics["final"]["ate_rmse_m"] < 0.01
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize("texture", ["true", "false"])
 def test_views_of_the_room_are_recognised_where_they_were_mapped_and_nowhere_else(tmp_path, texture):
     """A map of five seconds (ten, where the room is bare) and views of the next minute, which turns once around: seen before when a keyframe looked

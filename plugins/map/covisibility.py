@@ -8,15 +8,16 @@ import numpy as np
 
 from trihedron.pipeline.geometry import rotation_angle_deg
 from trihedron.pipeline.registry import register
-from trihedron.pipeline.types import I32, LOST, Correction, Frame, Keypoints, Map, Matches, Planes, Pose, Segments
+from trihedron.pipeline.types import DEGRADED, I32, LOST, Correction, Frame, Keypoints, Map, Matches, Planes, Pose, Segments
 from trihedron.plugins.numerics import insertion
 from trihedron.plugins.numerics.anchoring import anchored
 from trihedron.plugins.numerics.association import Associated, associate, existing
 from trihedron.plugins.numerics.correction import apply_correction
 from trihedron.plugins.numerics.culling import cull
 from trihedron.plugins.numerics.landmarks import empty_map
-from trihedron.plugins.numerics.local_window import newest_keyframes
+from trihedron.plugins.numerics.local_window import current_submap, keyframes_of, newest_keyframes
 from trihedron.plugins.numerics.merging import merge_lines, merge_planes, merge_points
+from trihedron.plugins.numerics.submaps import submap_of, tied
 
 STALE = 0.25  # of the view change of a keyframe, that makes one after max_frames: a camera at rest adds none
 
@@ -64,10 +65,13 @@ class Covisibility:
         map: Map | None,
         bundle: Correction | None,
         loop: Correction | None,
+        relocalise: Pose | None,
     ) -> Map | None:
         """The next version of the map, or None when this frame changes nothing."""
         corrected = self._corrected(map, bundle, loop)
-        pose = anchored(pose, corrected)
+        if corrected is not None and relocalise is not None and relocalise.status == DEGRADED and pose.status != LOST:
+            corrected = tied(corrected, anchored(pose, corrected), anchored(relocalise, corrected), self.merge_deg, self.merge_m)
+        pose = replace(anchored(pose, corrected), submap=submap_of(pose, corrected))
         matches = existing(matches, corrected) if matches is not None and corrected is not None else None
         if corrected is None:
             lengths = keypoints.descriptors.shape[1], segments.descriptors.shape[1], planes.samples_m.shape[1]
@@ -88,7 +92,7 @@ class Covisibility:
     def _wanted(self, frame: Frame, pose: Pose, planes: Planes, matches: Matches | None, map: Map) -> bool:
         """Whether this frame shows enough that is new."""
         newest = newest_keyframes(map, 1)
-        if not len(newest):
+        if not len(newest) or current_submap(map) != pose.submap:
             return True
         frames = frame.index - int(map.keyframes.rows("index", newest)[0])
         if 0 <= frames < self.min_frames:  # less than 0: a keyframe of another sequence
@@ -107,6 +111,7 @@ class Covisibility:
         self, map: Map, frame: Frame, pose: Pose, keypoints: Keypoints, segments: Segments, planes: Planes, matches: Matches | None
     ) -> Map:
         """The map with this frame as its newest keyframe."""
+        matches = matches if len(keyframes_of(map, pose.submap)) else None  # a new sub-map knows nothing yet
         found = associate(map, frame.camera, pose.T_world_camera, keypoints, segments, planes, matches, self.line_sigma_px)
         map, row = insertion.add_keyframe(map, pose)
         view = insertion.View(row, frame.camera, pose.T_world_camera, pose.covariance)

@@ -8,7 +8,7 @@ import numpy as np
 
 from trihedron.pipeline.geometry import pose_matrix
 from trihedron.pipeline.registry import register
-from trihedron.pipeline.types import F64, LOST, Frame, Keypoints, Map, Matches, Planes, Pose, Rotation, Segments, Translation
+from trihedron.pipeline.types import F64, OK, Frame, Keypoints, Map, Matches, Planes, Pose, Rotation, Segments, Translation
 from trihedron.plugins.numerics.local_window import local_window
 from trihedron.plugins.numerics.map_search import Guess, MapSearch
 
@@ -43,11 +43,12 @@ class LocalMap(MapSearch):
         if map is None or not map.keyframes.column("alive").any():
             return None
         guess = self._guess(rotation, translation, relocalise)
-        window = local_window(map, guess.T_world_camera, self.newest, self.covisible, self.near)
+        submap = relocalise.submap if relocalise is not None and relocalise.status == OK else None
+        window = local_window(map, guess.T_world_camera, self.newest, self.covisible, self.near, submap=submap)
         return self.search(frame, guess, keypoints, segments, planes, map, window)
 
     def _guess(self, rotation: Rotation, translation: Translation, relocalise: Pose | None) -> Guess:
-        if relocalise is not None and relocalise.status != LOST:
+        if relocalise is not None and relocalise.status == OK:
             return Guess(relocalise.T_world_camera, _sigma(relocalise.covariance[:3, :3]), _sigma(relocalise.covariance[3:, 3:]), True)
         T = pose_matrix(rotation.R_world_camera, translation.t_world_camera)
         return Guess(T, _sigma(translation.covariance), _sigma(rotation.covariance), translation.estimated)

@@ -43,16 +43,22 @@ def _carry(map: Map, correction: Correction, newest: int, T_corrected: F64) -> M
     if not len(later):
         return map
     T = T_corrected @ invert(map.keyframes.rows("T_world_camera", np.array([newest]))[0])
-    changes: dict[str, Any] = {"keyframes": map.keyframes.updated(later, T_world_camera=T @ map.keyframes.rows("T_world_camera", later))}
+    points = _born_after(map.points, newest, correction.point_ids)
+    lines = _born_after(map.lines, newest, correction.line_ids)
+    return carried(map, T, later, points, lines, _born_after(map.planes, newest, correction.plane_ids))
+
+
+def carried(map: Map, T: F64, keyframes: I32, points: I32, lines: I32, planes: I32) -> Map:
+    """These rows of the map moved rigidly by T (4, 4, from the left), what is known of them turned with them."""
     R = T[:3, :3]
-    ids = _born_after(map.points, newest, correction.point_ids)
-    information = R @ map.points.rows("information", ids) @ R.T
-    changes["points"] = map.points.updated(ids, position_m=transform(T, map.points.rows("position_m", ids)), information=information)
-    ids = _born_after(map.lines, newest, correction.line_ids)
-    information = R @ map.lines.rows("information", ids) @ R.T
-    changes["lines"] = map.lines.updated(ids, endpoints_m=transform(T, map.lines.rows("endpoints_m", ids)), information=information)
-    ids = _born_after(map.planes, newest, correction.plane_ids)
-    changes["planes"] = _move_planes(map.planes, ids, transform_planes(T, map.planes.rows("coefficients", ids)), T)
+    changes: dict[str, Any] = {"keyframes": map.keyframes.updated(keyframes, T_world_camera=T @ map.keyframes.rows("T_world_camera", keyframes))}
+    information = R @ map.points.rows("information", points) @ R.T
+    direction = (map.points.rows("direction", points) @ R.T).astype(np.float32)
+    position = transform(T, map.points.rows("position_m", points))
+    changes["points"] = map.points.updated(points, position_m=position, information=information, direction=direction)
+    information = R @ map.lines.rows("information", lines) @ R.T
+    changes["lines"] = map.lines.updated(lines, endpoints_m=transform(T, map.lines.rows("endpoints_m", lines)), information=information)
+    changes["planes"] = _move_planes(map.planes, planes, transform_planes(T, map.planes.rows("coefficients", planes)), T)
     return replace(map, **changes)
 
 

@@ -8,7 +8,7 @@ import numpy as np
 
 from trihedron.pipeline.geometry import invert, pose_matrix
 from trihedron.pipeline.types import DEGRADED, F64, I32, LOST, OK, Frame, Map, Pose, Rotation, Translation
-from trihedron.plugins.numerics.local_window import newest_keyframes
+from trihedron.plugins.numerics.local_window import keyframes_of
 
 FIRST_SIGMA = 1e-6  # the first pose is exact by definition; positive, so that covariances stay invertible
 
@@ -24,10 +24,10 @@ class Decoupled:
     status: str
     reason: str
 
-    def said(self, frame: Frame, map: Map | None, reason: str = "") -> Pose:
-        """As the frame's pose; `reason` says why no refinement followed (degraded, unless it was lost already)."""
+    def said(self, frame: Frame, map: Map | None, reason: str = "", submap: int = 0) -> Pose:
+        """As the frame's pose in a sub-map; `reason` says why no refinement followed (degraded, unless it was lost already)."""
         status = DEGRADED if reason and self.status == OK else self.status
-        reference, T_reference_camera = reference_of(map, self.T_world_camera)
+        reference, T_reference_camera = reference_of(map, self.T_world_camera, submap)
         return Pose(
             frame.index,
             frame.stamp_ns,
@@ -39,13 +39,14 @@ class Decoupled:
             self.unobservable,
             status,
             self.reason if status == LOST or not reason else reason,
+            submap,
         )
 
 
 def decoupled_pose(rotation: Rotation, translation: Translation, previous: Pose | None, relocalise: Pose | None = None) -> Decoupled:
     """The decoupled pose with its status. It is lost when nothing of this frame took part, and on top of a pose that was lost, however well the
     frames fit each other: a motion since nowhere leads nowhere. Where this frame was recognised in the map, it starts from there."""
-    if relocalise is not None and relocalise.status != LOST:
+    if relocalise is not None and relocalise.status == OK:
         return Decoupled(relocalise.T_world_camera, relocalise.covariance, relocalise.inliers, relocalise.unobservable, OK, relocalise.reason)
     T = pose_matrix(rotation.R_world_camera, translation.t_world_camera)
     covariance = np.zeros((6, 6))
@@ -71,9 +72,9 @@ def _judge(rotation: Rotation, translation: Translation, unobservable: int) -> t
     return OK, "{} points, {} lines and {} planes of the previous frame".format(*translation.inliers)
 
 
-def reference_of(map: Map | None, T_world_camera: F64) -> tuple[int, F64]:
-    """The newest living keyframe and the pose relative to it; (-1, T_world_camera) without one."""
-    newest = newest_keyframes(map, 1) if map is not None else np.empty(0, np.int32)
+def reference_of(map: Map | None, T_world_camera: F64, submap: int = 0) -> tuple[int, F64]:
+    """The newest living keyframe of the sub-map and the pose relative to it; (-1, T_world_camera) without one."""
+    newest = keyframes_of(map, submap)[-1:] if map is not None else np.empty(0, np.int32)
     if map is None or len(newest) == 0:
         return -1, T_world_camera
     return int(newest[0]), invert(map.keyframes.rows("T_world_camera", newest)[0]) @ T_world_camera

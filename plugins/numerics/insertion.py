@@ -43,6 +43,7 @@ def add_keyframe(map: Map, pose: Pose) -> tuple[Map, int]:
         points=empty,
         lines=empty,
         planes=empty,
+        submap=np.array([pose.submap]),
         alive=np.ones(1, np.bool_),
     )
     return replace(map, keyframes=table), int(rows[0])

@@ -14,6 +14,7 @@ KEYFRAMES = {
     "points": Column("i4", (2,)),  # its rows of the observation tables, half open
     "lines": Column("i4", (2,)),
     "planes": Column("i4", (2,)),
+    "submap": Column("i4"),  # poses of different sub-maps are in different worlds
     "alive": Column("?"),
 }
 

@@ -23,10 +23,23 @@ class LocalWindow:
 
 
 def newest_keyframes(map: Map, count: int) -> I32:
-    """The last `count` living keyframes, oldest first."""
+    """The last `count` living keyframes of the sub-map of the newest, oldest first."""
     start = max(len(map.keyframes) - 4 * count, 0)
     rows = np.arange(start, len(map.keyframes), dtype=np.int32)
-    return rows[map.keyframes.rows("alive", rows)][-count:]
+    rows = rows[map.keyframes.rows("alive", rows)]
+    submaps = map.keyframes.rows("submap", rows)
+    return rows[submaps == submaps[-1]][-count:] if len(rows) else rows
+
+
+def keyframes_of(map: Map, submap: int) -> I32:
+    """The living keyframes of a sub-map."""
+    return np.flatnonzero(map.keyframes.column("alive") & (map.keyframes.column("submap") == submap)).astype(np.int32)
+
+
+def current_submap(map: Map) -> int:
+    """The sub-map of the newest keyframe: what is tracked now."""
+    newest = newest_keyframes(map, 1)
+    return int(map.keyframes.rows("submap", newest)[0]) if len(newest) else 0
 
 
 def observed_by(map: Map, keyframes: I32, kind: str) -> I32:
@@ -48,26 +61,38 @@ def _votes(map: Map, keyframes: I32) -> I32:
     return votes.astype(np.int32)
 
 
-def _near(map: Map, T_world_camera: F64, near_m: float, near_deg: float) -> I32:
-    """Living keyframes taken from about here in about this direction, nearest first."""
+def _near(map: Map, T_world_camera: F64, near_m: float, near_deg: float, submap: int) -> I32:
+    """Living keyframes of the sub-map taken from about here in about this direction, nearest first."""
     poses = map.keyframes.column("T_world_camera")
     distance = np.linalg.norm(poses[:, :3, 3] - T_world_camera[:3, 3], axis=1)
     cosine = poses[:, :3, 2] @ T_world_camera[:3, 2]
-    good = map.keyframes.column("alive") & (distance < near_m) & (cosine > np.cos(np.radians(near_deg)))
+    good = map.keyframes.column("alive") & (map.keyframes.column("submap") == submap) & (distance < near_m) & (cosine > np.cos(np.radians(near_deg)))
     rows = np.flatnonzero(good)
     return rows[np.argsort(distance[rows] / near_m + (1.0 - cosine[rows]), kind="stable")].astype(np.int32)
 
 
-def local_window(map: Map, T_world_camera: F64, newest: int, covisible: int, near: int, near_m: float = 1.0, near_deg: float = 30.0) -> LocalWindow:
+def local_window(
+    map: Map,
+    T_world_camera: F64,
+    newest: int,
+    covisible: int,
+    near: int,
+    near_m: float = 1.0,
+    near_deg: float = 30.0,
+    submap: int | None = None,
+) -> LocalWindow:
     """The `newest` keyframes, the `covisible` ones that share most landmarks with them, and up to `near` further ones taken from about
-    `T_world_camera` (within `near_m` and `near_deg`): a place seen again after its landmarks' last observers were forgotten."""
-    chosen = newest_keyframes(map, newest)
+    `T_world_camera` (within `near_m` and `near_deg`): a place seen again after its landmarks' last observers were forgotten.
+    All are of one sub-map: that of the newest keyframe, or the one given."""
+    chosen = newest_keyframes(map, max(newest, 1))
+    submap = current_submap(map) if submap is None else submap
+    chosen = chosen[map.keyframes.rows("submap", chosen) == submap][:newest]
     votes = _votes(map, chosen)
     votes[chosen] = 0
     votes[~map.keyframes.column("alive")] = 0
     order = np.argsort(-votes, kind="stable")[:covisible]
     chosen = np.concatenate([chosen, order[votes[order] > 0].astype(np.int32)])
-    beside = _near(map, T_world_camera, near_m, near_deg)
+    beside = _near(map, T_world_camera, near_m, near_deg, submap)
     beside = beside[~np.isin(beside, chosen)][:near]
     return window_of(map, np.sort(np.concatenate([chosen, beside])).astype(np.int32))
 

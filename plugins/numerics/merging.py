@@ -98,6 +98,16 @@ def merge_planes(map: Map, keyframe: int, max_deg: float, max_m: float) -> Map:
     return map
 
 
+def fuse_planes(map: Map, older: I32, newer: I32, max_deg: float, max_m: float) -> Map:
+    """Join each of the planes `newer` with the first of the planes `older` that is the same one, both given by id."""
+    for b in newer:
+        for a in older:
+            if _are_one(map.planes, int(min(a, b)), int(max(a, b)), float(np.cos(np.radians(max_deg))), max_m):
+                map = _join(map, int(min(a, b)), int(max(a, b)))
+                break
+    return map
+
+
 def _are_one(planes: Table, a: int, b: int, cosine: float, max_m: float) -> bool:
     """Whether two living planes, seen from the same side, lie within `max_m` of each other on average, both ways, and overlap."""
     ids = np.array([a, b], np.int32)

@@ -54,7 +54,8 @@ class Recognised:
 
 def check_place(T_world_camera: F64, view: View, map: Map, among: I32, near: int) -> Recognised | None:
     """Search the map from a hypothesis (4, 4), widely, then closely from the pose solved, with what the `near` keyframes about it see; where there
-    are none, with what the keyframes `among` see, since a twin of a place must be able to compete. None when the place does not hold."""
+    are none, with what the keyframes `among` see, since a twin of a place must be able to compete. All are of
+    the sub-map of these. None when the place does not hold."""
     T = T_world_camera
     for sigma_m, sigma_deg in (WIDE, CLOSE):
         guess = Guess(T, sigma_m, float(np.radians(sigma_deg)), True)
@@ -71,7 +72,7 @@ def check_place(T_world_camera: F64, view: View, map: Map, among: I32, near: int
 
 
 def _window(map: Map, T: F64, among: I32, near: int) -> LocalWindow:
-    window = local_window(map, T, 0, 0, near, ABOUT_M, ABOUT_DEG)
+    window = local_window(map, T, 0, 0, near, ABOUT_M, ABOUT_DEG, int(map.keyframes.rows("submap", among[:1])[0]))
     return window if len(window.keyframes) else window_of(map, among)
 
 

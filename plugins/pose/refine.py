@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -24,9 +24,10 @@ from trihedron.pipeline.types import (
     Translation,
 )
 from trihedron.plugins.numerics.anchoring import anchored
-from trihedron.plugins.numerics.decoupled import Decoupled, decoupled_pose, reference_of
+from trihedron.plugins.numerics.decoupled import FIRST_SIGMA, Decoupled, decoupled_pose, reference_of
 from trihedron.plugins.numerics.map_terms import line_terms, plane_terms, point_terms
 from trihedron.plugins.numerics.pose_solver import PoseSolution, solve_pose
+from trihedron.plugins.numerics.submaps import submap_of
 
 
 @register("pose", "refine")
@@ -46,6 +47,7 @@ class Refine:
     min_share: float = 0.25  # of the matches that must agree, else it is called degraded
     found_inliers: int = 30  # points + 2 lines + 5 planes that find a lost pose again
     found_share: float = 0.5  # of the matches that must agree for that
+    submap_after: int = 15  # frames that show a place that is not known, after which a lost camera begins a new sub-map; 0 = never
 
     def __post_init__(self) -> None:
         for name in ("position_sigma_m", "rotation_sigma_deg", "line_sigma_px", "relation_sigma_deg"):
@@ -53,6 +55,8 @@ class Refine:
                 raise ValueError(f"{name}: must be positive")
         if self.min_inliers < 0 or not 0.0 <= self.min_share <= 1.0:
             raise ValueError("min_inliers, min_share: must not be negative, min_share at most 1")
+        if self.submap_after < 0:
+            raise ValueError("submap_after: must not be negative")
         if self.found_inliers < self.min_inliers or not self.min_share <= self.found_share <= 1.0:
             raise ValueError("found_inliers, found_share: must be at least min_inliers and min_share, found_share at most 1")
 
@@ -75,19 +79,30 @@ class Refine:
         start = decoupled_pose(rotation, translation, previous, relocalise)
         if map is None or matches is None or previous is None:
             return start.said(frame, map)
+        submap = relocalise.submap if relocalise is not None and relocalise.status == OK else submap_of(previous, map)
         found = self._solve(start, frame, matches, keypoints, segments, planes, map)
         inliers = _inliers(found, len(matches.planes))
-        if not inliers.any():
-            return start.said(frame, map, "nothing of the map was found, pose from the previous frame")
         sought = len(matches.keypoints) + len(matches.segments) + len(matches.planes)
         if start.status == LOST and not self._found_again(found, inliers, sought):
-            return start.said(frame, map)
+            return self._unknown_place(start, frame, previous, relocalise is not None and translation.estimated, map, submap)
+        if not inliers.any():
+            return start.said(frame, map, "nothing of the map was found, pose from the previous frame", submap)
         status, reason = self._judge(found, inliers, sought, rotation)
-        reference, T_reference_camera = reference_of(map, found.T_world_camera)
-        held = found.unobservable.shape[1]
-        return Pose(
-            frame.index, frame.stamp_ns, found.T_world_camera, found.covariance, T_reference_camera, reference, inliers, held, status, reason
-        )
+        if submap:
+            status, reason = DEGRADED, f"in sub-map {submap}, which is not tied to the first yet: {reason}"
+        T, held = found.T_world_camera, found.unobservable.shape[1]
+        reference, T_reference_camera = reference_of(map, T, submap)
+        return Pose(frame.index, frame.stamp_ns, T, found.covariance, T_reference_camera, reference, inliers, held, status, reason, submap)
+
+    def _unknown_place(self, start: Decoupled, frame: Frame, previous: Pose, sought: bool, map: Map, submap: int) -> Pose:
+        """Lost; or, once what is seen was `sought` in vain for long enough, the first pose of a new sub-map, exact by definition."""
+        unrecognised = previous.unrecognised + int(sought)
+        if not self.submap_after or unrecognised < self.submap_after:
+            return replace(start.said(frame, map, submap=submap), unrecognised=unrecognised)
+        number = int(map.keyframes.column("submap").max(initial=0)) + 1
+        reason = f"first frame of sub-map {number}: nothing was recognised for {unrecognised} frames"
+        new = replace(start, covariance=FIRST_SIGMA**2 * np.eye(6), status=DEGRADED, reason=reason)
+        return new.said(frame, map, submap=number)
 
     def _solve(
         self, start: Decoupled, frame: Frame, matches: Matches, keypoints: Keypoints, segments: Segments, planes: Planes, map: Map

@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from trihedron.pipeline.registry import register
-from trihedron.pipeline.types import F64, I32, LOST, OK, Frame, Keypoints, Map, Planes, Pose, Rotation, Segments
+from trihedron.pipeline.types import DEGRADED, F64, I32, LOST, OK, Frame, Keypoints, Map, Planes, Pose, Rotation, Segments
 from trihedron.plugins.numerics.decoupled import reference_of
 from trihedron.plugins.numerics.layout_poses import layout_poses
-from trihedron.plugins.numerics.local_window import observed_by
+from trihedron.plugins.numerics.local_window import keyframes_of, observed_by
 from trihedron.plugins.numerics.place_check import Recognised, View, check_place
 from trihedron.plugins.numerics.place_votes import apart, block_of, distinct, likely_keyframes, lookalikes, rigid_hypotheses
+from trihedron.plugins.numerics.submaps import submap_of
 
 
 @register("relocalise", "features")
@@ -25,6 +26,7 @@ class Features:
     same from two sides is refused, not guessed. A large map is looked through block by block, one a frame. Points need binary descriptors."""
 
     block: int = 80  # keyframes looked at in one frame
+    every: int = 5  # frames between looks at older sub-maps, while the camera is tracked in one that is not tied to them
     candidates: int = 20  # of them, whose landmarks make hypotheses
     max_bits: int = 64  # of 256 between descriptors; the mean of strangers is 128
     ratio: float = 0.85  # best to second best descriptor
@@ -40,8 +42,8 @@ class Features:
     floor_m: float = 0.01  # least error of a point's place
 
     def __post_init__(self) -> None:
-        if min(self.block, self.candidates, self.draws, self.by_points, self.by_layout, self.near, self.min_score, self.min_details) < 1:
-            raise ValueError("block, candidates, draws, by_points, by_layout, near, min_score, min_details: must be at least 1")
+        if min(self.block, self.every, self.candidates, self.draws, self.by_points, self.by_layout, self.near, self.min_score, self.min_details) < 1:
+            raise ValueError("block, every, candidates, draws, by_points, by_layout, near, min_score, min_details: must be at least 1")
         if not 0.0 < self.ratio <= 1.0 or not 0.0 <= self.min_share <= 1.0 or not 0.0 < self.rival <= 1.0:
             raise ValueError("ratio, min_share, rival: must be in (0, 1]")
         if min(self.angle_px, self.floor_m) <= 0.0 or self.max_bits < 0:
@@ -58,21 +60,31 @@ class Features:
         previous_pose: Pose | None,
         rng: np.random.Generator,
     ) -> Pose | None:
-        """The pose, status ok, or None."""
-        if map is None or previous_pose is None or previous_pose.status != LOST:
+        """The pose; for a lost camera that is not recognised the lost one, and else None."""
+        if map is None or previous_pose is None:
+            return None
+        lost, submap = previous_pose.status == LOST, submap_of(previous_pose, map)
+        submaps = self._sought(map, submap, lost, frame.index)
+        if not len(submaps):
             return None
         view = View(frame, keypoints, segments, planes)
-        among = self._candidates(view, map)
+        among = self._candidates(view, map, submaps[frame.index % len(submaps)])
         found = self._checked(self._by_points(view, map, among, rng), view, map, among)
         if not any(self._good(one) for one in found):  # points alone say more than any layout
             found += self._checked(self._by_layout(view, map, among, rotation), view, map, among)
         best = self._only_one(found)
-        return self._said(best, frame, map) if best is not None else None
+        if best is None:
+            return replace(previous_pose, index=frame.index, stamp_ns=frame.stamp_ns, reason="nothing was recognised") if lost else None
+        return self._said(best, frame, map, int(map.keyframes.rows("submap", among[:1])[0]), lost)
 
-    def _candidates(self, view: View, map: Map) -> I32:
-        """Keyframes whose landmarks look like what is seen."""
-        alive = np.flatnonzero(map.keyframes.column("alive")).astype(np.int32)
-        among = block_of(alive, self.block, view.frame.index)
+    def _sought(self, map: Map, submap: int, lost: bool, index: int) -> I32:
+        """Sub-maps to look in: all for a lost camera; now and then the older ones for one tracked in a sub-map that is not tied to the first."""
+        known = np.unique(map.keyframes.column("submap")[map.keyframes.column("alive")]).astype(np.int32)
+        return known if lost else known[known < submap] if index % self.every == 0 else known[:0]
+
+    def _candidates(self, view: View, map: Map, submap: int) -> I32:
+        """Keyframes of a sub-map whose landmarks look like what is seen."""
+        among = block_of(keyframes_of(map, submap), self.block, view.frame.index)
         return likely_keyframes(map, view.keypoints, view.segments, among, self.candidates, self.max_bits)
 
     def _by_points(self, view: View, map: Map, among: I32, rng: np.random.Generator) -> F64:
@@ -117,7 +129,8 @@ class Features:
     def _good(self, one: Recognised) -> bool:
         return one.score >= self.min_score and one.details >= self.min_details and one.agreeing >= self.min_share
 
-    def _said(self, one: Recognised, frame: Frame, map: Map) -> Pose:
-        reference, T_reference_camera = reference_of(map, one.T_world_camera)
+    def _said(self, one: Recognised, frame: Frame, map: Map, submap: int, lost: bool) -> Pose:
+        T, status = one.T_world_camera, OK if lost else DEGRADED
+        reference, T_reference_camera = reference_of(map, T, submap)
         reason = "recognised by {} points, {} lines and {} planes of the map".format(*one.inliers)
-        return Pose(frame.index, frame.stamp_ns, one.T_world_camera, one.covariance, T_reference_camera, reference, one.inliers, 0, OK, reason)
+        return Pose(frame.index, frame.stamp_ns, T, one.covariance, T_reference_camera, reference, one.inliers, 0, status, reason, submap)

@@ -23,7 +23,7 @@ def pose_of(T, index):
 
 
 def first_map(world):
-    return Covisibility()(world.frame(0), pose_of(np.eye(4), 0), *world.features(np.eye(4), 0), None, None, None, None)
+    return Covisibility()(world.frame(0), pose_of(np.eye(4), 0), *world.features(np.eye(4), 0), None, None, None, None, None)
 
 
 def matched(world, map, step, off=(0.0,) * 6, stage=None, features=None):
@@ -144,7 +144,7 @@ def test_the_window_is_bounded_and_reaches_what_was_seen_from_here():
         T = camera_at(step)
         features = world.features(T, index)
         matches = LocalMap()(world.frame(index), rotation_of(T, index), translation_of(T, index), *features, map, None)
-        map = stage(world.frame(index), pose_of(T, index), *features, matches, map, None, None) or map
+        map = stage(world.frame(index), pose_of(T, index), *features, matches, map, None, None, None) or map
     assert len(map.keyframes) == len(steps)
     window = local_window(map, camera_at(0), newest=2, covisible=6, near=3)
     assert len(window.keyframes) <= 11 and {58, 59} <= set(window.keyframes) and 0 in window.keyframes

@@ -26,7 +26,7 @@ def pose_of(T, index, status="ok"):
 
 
 def first_map(world):
-    return Covisibility()(world.frame(0), pose_of(np.eye(4), 0), *world.features(np.eye(4), 0), None, None, None, None)
+    return Covisibility()(world.frame(0), pose_of(np.eye(4), 0), *world.features(np.eye(4), 0), None, None, None, None, None)
 
 
 def refined(world, map, step=5, off=OFF, keep=tuple(KINDS), **changes):

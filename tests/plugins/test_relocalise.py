@@ -30,7 +30,7 @@ def mapped(world, poses=None):
     for i, T in enumerate(poses or [camera_at(step) for step in STEPS]):
         features = world.features(T, i)
         matches = LocalMap()(world.frame(i), rotation_of(T, i), translation_of(T, i), *features, map, None) if map else None
-        map = EVERY(world.frame(i), pose_of(T, i), *features, matches, map, None, None) or map
+        map = EVERY(world.frame(i), pose_of(T, i), *features, matches, map, None, None, None) or map
     return map
 
 
@@ -51,7 +51,9 @@ def recognise(world, map, T, index, kinds=("points", "lines", "planes"), status=
         keypoints = dataclasses.replace(keypoints, **{f.name: getattr(keypoints, f.name)[:0] for f in dataclasses.fields(keypoints)[2:-1]})
     rng = np.random.default_rng(index)
     previous = pose_of(np.eye(4), index - 1, status)
-    return (stage or Features())(world.frame(index), manhattan_of(T, index, index % 3), keypoints, segments, planes, map, previous, rng)
+    found = (stage or Features())(world.frame(index), manhattan_of(T, index, index % 3), keypoints, segments, planes, map, previous, rng)
+    assert found is None or (found.index == index and (found.status != LOST or found.reason == "nothing was recognised"))
+    return found if found is not None and found.status != LOST else None
 
 
 def error(pose, T):
@@ -153,6 +155,25 @@ def shifted(map, step):
 def test_it_runs_for_a_lost_camera_only(world, map):
     assert recognise(world, map, camera_at(31), 200, status="ok") is None
     assert recognise(world, None, camera_at(31), 200) is None
+
+
+def test_a_camera_tracked_in_a_sub_map_is_sought_in_the_older_ones_every_few_frames(world, map):
+    """The sub-map holds one keyframe of another place; the pose said of the view is in the world of the first."""
+    other = World(2000, 9, marks=400)
+    features = other.features(np.eye(4), 100)
+    origin = dataclasses.replace(pose_of(np.eye(4), 100, "degraded"), submap=1)
+    both = EVERY(other.frame(100), origin, *features, None, map, None, None, None)
+    previous = dataclasses.replace(origin, reference=len(map.keyframes))
+    assert list(both.keyframes.column("submap")) == [0] * len(map.keyframes) + [1]
+    T = camera_at(31)
+    for index in (200, 201):
+        found = Features(every=5)(
+            world.frame(index), manhattan_of(T, index), *world.features(T, index), both, dataclasses.replace(previous, index=index - 1),
+            np.random.default_rng(0),
+        )  # fmt: skip
+        assert (found is None) == (index == 201)
+        if found is not None:
+            assert (found.status, found.submap, found.reference) == ("degraded", 0, len(map.keyframes) - 1) and error(found, T)[0] < 0.01
 
 
 def test_the_same_input_gives_the_same_bytes(world, map):

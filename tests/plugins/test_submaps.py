@@ -1,0 +1,107 @@
+"""Sub-maps: begun when nothing is recognised for long, said in a world of their own, tied to the rest without a second copy of a wall."""
+
+import dataclasses
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from trihedron.pipeline.geometry import exp_se3, invert, transform
+from trihedron.pipeline.results import final_trajectory, is_tied
+from trihedron.pipeline.runner import Result
+from trihedron.pipeline.types import Pose
+from trihedron.plugins.map.covisibility import Covisibility
+from trihedron.plugins.matches.local_map import LocalMap
+from trihedron.plugins.numerics.local_window import current_submap, local_window, newest_keyframes
+from trihedron.plugins.pose.refine import Refine
+
+sys.path.insert(0, str(Path(__file__).parent))
+from landmark_world import World, camera_at, rotation_of, translation_of
+
+EVERY = Covisibility(min_frames=1, max_frames=1, min_shift=1e-6, min_turn_deg=1e-6)
+AWAY = exp_se3(np.array([3.0, -1.0, 0.5, 0.1, 1.2, -0.3]))  # from the world to that of the sub-map
+
+
+def pose_of(T, index, status="ok", **more):
+    return dataclasses.replace(Pose(index, index * 33_000_000, T, np.eye(6) * 1e-8, T, -1, np.zeros(3, np.int32), 0, status, ""), **more)
+
+
+def seen(world, map, index, step, T, **more):
+    """The map after the frame seen at `step`, whose pose is said as T."""
+    features = world.features(camera_at(step), index)
+    matches = LocalMap()(world.frame(index), rotation_of(T, index), translation_of(T, index), *features, map, None) if map else None
+    relocalise, reference = more.pop("recognised", None), more.get("reference", -1)
+    if reference >= 0:
+        more["T_reference_camera"] = invert(map.keyframes.column("T_world_camera")[reference]) @ T
+    return EVERY(world.frame(index), pose_of(T, index, **more), *features, matches, map, None, None, relocalise)
+
+
+@pytest.fixture
+def both():
+    """A world, and its map in two parts that do not know of each other: steps 0 to 20, and 12 to 32 in a world that is AWAY."""
+    world, map = World(1500), None
+    for index, step in enumerate(range(0, 24, 4)):
+        map = seen(world, map, index, step, camera_at(step))
+    for index, step in enumerate(range(12, 36, 4), 6):
+        map = seen(world, map, index, step, AWAY @ camera_at(step), submap=1, reference=index - 1 if index > 6 else -1)
+    return world, map
+
+
+def test_a_sub_map_shares_nothing_with_the_rest(both):
+    _, map = both
+    assert list(map.keyframes.column("submap")) == [0] * 6 + [1] * 6 and current_submap(map) == 1
+    assert map.points.column("first")[np.unique(map.point_observations.column("point")[map.point_observations.column("keyframe") >= 6])].min() >= 6
+    assert list(newest_keyframes(map, 9)) == list(range(6, 12))
+    assert set(local_window(map, camera_at(20), 2, 10, 3).keyframes) <= set(range(6, 12))
+    assert set(local_window(map, camera_at(20), 2, 10, 3, submap=0).keyframes) == {3, 4, 5}
+    assert map.planes.column("alive").sum() == 6  # three walls, each twice
+
+
+def test_a_sub_map_is_tied_where_the_camera_is_recognised(both):
+    """Everything moves by AWAY's inverse, walls are one again, and the next frame finds landmarks of both."""
+    world, map = both
+    step = 33
+    recognised = pose_of(camera_at(step), 12, "degraded", submap=0)
+    after = seen(world, map, 12, step, AWAY @ camera_at(step), status="degraded", submap=1, reference=11, recognised=recognised)
+    assert not after.keyframes.column("submap").any()
+    poses = after.keyframes.column("T_world_camera")
+    assert np.allclose(poses[6:12], invert(AWAY) @ map.keyframes.column("T_world_camera")[6:12])
+    assert np.allclose(poses[12], camera_at(step))
+    assert after.planes.column("alive").sum() == 3
+    ids = np.flatnonzero(after.planes.column("alive"))
+    for wall in after.planes.rows("coefficients", ids):
+        assert np.abs(world.planes @ np.append(wall[:3], 0.0) - 1.0).min() < 1e-3 and np.abs(world.planes - wall).max(axis=1).min() < 0.02
+    moved = np.flatnonzero(map.points.column("alive") & (map.points.column("first") >= 6))[:50]
+    untouched = np.isclose(after.points.rows("found", moved), map.points.rows("found", moved))  # not measured again by the frame itself
+    expected = transform(invert(AWAY), map.points.rows("position_m", moved))
+    assert np.allclose(after.points.rows("position_m", moved)[untouched], expected[untouched], atol=1e-9)
+    assert len(set(local_window(after, camera_at(20), 2, 10, 5).keyframes) & set(range(6))) >= 3
+
+
+def test_frames_of_a_sub_map_count_once_it_is_tied(both):
+    _, map = both
+    poses = [pose_of(camera_at(0), 0, reference=0), pose_of(AWAY, 20, "degraded", submap=1, reference=8), pose_of(AWAY, 21, "lost", reference=8)]
+    assert [is_tied(pose, map) for pose in poses] == [True, False, False] and len(final_trajectory(Result(poses, map))) == 1
+    tied = dataclasses.replace(map, keyframes=map.keyframes.updated(np.arange(6, 12), submap=np.zeros(6, np.int32)))
+    assert [is_tied(pose, tied) for pose in poses] == [True, True, False] and len(final_trajectory(Result(poses, tied))) == 2
+
+
+def test_a_new_sub_map_begins_after_as_many_frames_as_were_sought_in_vain():
+    """Fifteen frames whose tracks are good and whose place is not known; a frame without tracks, or without a search, does not count."""
+    world, other = World(), World(seed=5)
+    map = seen(other, None, 0, 0, np.eye(4))
+    pose, stage = pose_of(np.eye(4), 0, "lost", reference=0), Refine(submap_after=15)
+    statuses = []
+    for index in range(1, 20):
+        T, features = camera_at(index), world.features(camera_at(index), index)
+        translation = translation_of(T, index, estimated=index != 4)
+        matches = LocalMap()(world.frame(index), rotation_of(T, index), translation, *features, map, None)
+        sought = dataclasses.replace(pose, index=index) if index != 5 else None
+        pose = stage(world.frame(index), rotation_of(T, index), translation, None, matches, *features, pose, map, sought)
+        statuses.append((pose.status, pose.submap))
+        if pose.submap:
+            break
+    assert statuses == [("lost", 0)] * 16 + [("degraded", 1)]
+    assert pose.reason == "first frame of sub-map 1: nothing was recognised for 15 frames" and pose.reference == -1
+    assert np.linalg.eigvalsh(pose.covariance).max() < 1e-9
