@@ -8,6 +8,7 @@ import numpy as np
 
 from trihedron.pipeline.geometry import invert
 from trihedron.pipeline.types import F64, I32, Correction, Map, Table
+from trihedron.plugins.numerics.local_window import current_submap, keyframes_of
 from trihedron.plugins.numerics.pose_graph import Edges, solve_pose_graph
 
 LEAST_M, LEAST = 1e-3, 1e-4  # standard deviations between two keyframes at one place, m and rad
@@ -34,8 +35,8 @@ class Closure:
 
 
 def close(map: Map, closure: Closure, drift: Drift) -> Correction:
-    """The correction that lets every keyframe of the pose graph move, and each landmark with the keyframes that saw it."""
-    rows = np.flatnonzero(map.keyframes.column("alive")).astype(np.int32)
+    """The correction that lets every keyframe of the tracked sub-map move, and each landmark with the keyframes that saw it."""
+    rows = keyframes_of(map, current_submap(map))
     before = map.keyframes.rows("T_world_camera", rows)
     edges = _edges(map, rows, before, closure, drift)
     after = solve_pose_graph(before, edges, before[:, :3, :3], drift.rotation_sigma * np.sqrt(len(rows)))

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from trihedron.pipeline.types import F64, I32, Map
-from trihedron.plugins.numerics.local_window import LocalWindow, observed_by
+from trihedron.plugins.numerics.local_window import LocalWindow, current_submap, keyframes_of, observed_by
 
 
 @dataclass(frozen=True)
@@ -37,8 +37,8 @@ class Place:
 
 
 def walked(map: Map) -> tuple[I32, F64]:
-    """Rows of the living keyframes and the way walked from each to the newest, metres."""
-    rows = np.flatnonzero(map.keyframes.column("alive")).astype(np.int32)
+    """Rows of the living keyframes of the tracked sub-map and the way walked from each to the newest, metres."""
+    rows = keyframes_of(map, current_submap(map))
     positions = map.keyframes.rows("T_world_camera", rows)[:, :3, 3]
     steps = np.linalg.norm(np.diff(positions, axis=0), axis=1)
     return rows, np.concatenate([np.cumsum(steps[::-1])[::-1], [0.0]])
