@@ -13,7 +13,7 @@ from trihedron.plugins.numerics.axis_fit import HALF_SPHERE, NOTHING_KNOWN, gath
 from trihedron.plugins.numerics.cube_symmetry import nearest_equivalent
 from trihedron.plugins.numerics.direction_information import isotropic_information
 from trihedron.plugins.numerics.manhattan_modes import NORMALS_PER_SAMPLE, Directions, ModeFinder, Modes
-from trihedron.plugins.numerics.sphere_modes import mode_statistics, orthonormal, search_axes
+from trihedron.plugins.numerics.sphere_modes import mode_statistics, orthonormal, search_axes, shift_axes
 from trihedron.plugins.numerics.von_mises_fisher import AxisMixture, broad_mixture, improved
 
 
@@ -39,6 +39,8 @@ class VonMisesFisher:
     min_line_share: float = 0.15  # with this share of the lines' length
     min_explained: float = 0.3  # share of all directions on the axes
     max_skew_deg: float = 3.0  # means further from a right angle do not belong to one Manhattan frame
+    peak_spread_deg: float = 2.0  # kernel with which peaks are looked for
+    max_shift_deg: float = 0.5  # from the mean of a wall's normals to their peak, beyond the uncertainty of the mean; two walls have more
     axis_floor_deg: float = 0.2  # error of an axis however many directions it has
     floor_deg: float = 0.1  # of the whole rotation
     search_samples: int = 800  # most normals a search looks at
@@ -47,6 +49,8 @@ class VonMisesFisher:
     def __post_init__(self) -> None:
         if self.max_iterations < 1 or min(self.samples, self.search_samples) < 10 or self.min_lines < 1 or self.max_age < 1:
             raise ValueError("max_iterations, samples, search_samples, min_lines, max_age: at least 1, 10, 10, 1 and 1")
+        if not 0.5 <= self.peak_spread_deg <= 10.0 or self.max_shift_deg <= 0.0:
+            raise ValueError("peak_spread_deg, max_shift_deg: must be 0.5 to 10 and positive")
         if min(self.tolerance_deg, self.prior, self.max_skew_deg, self.axis_floor_deg, self.floor_deg) <= 0.0 or self.line_weight_per_px < 0.0:
             raise ValueError("tolerance_deg, prior, max_skew_deg, axis_floor_deg, floor_deg, line_weight_per_px: must be positive")
         if not all(0.5 <= spread <= 20.0 for spread in (self.start_spread_deg, self.prior_spread_deg, self.max_spread_deg)):
@@ -58,14 +62,8 @@ class VonMisesFisher:
         """One rotation with id 0; `inliers` counts the directions that belong to an axis, `spread` is √(2/κ). `supported` False, with a large
         covariance, where the scene shows no two axes at right angles."""
         directions = gather_directions(normals.normals, segments, self.samples, self.line_weight_per_px)
-        start = np.eye(3) if previous is None else previous.rotations[0]
-        mixture, modes = self._settled(directions, start)
-        if previous is None or not (previous.supported and modes.supported and normals.index - previous.index <= self.max_age):
-            few = directions.thinned(self.search_samples)
-            found = search_axes(few.vectors, few.weights, HALF_SPHERE, np.radians(12.0), np.radians(4.0), 6, 2)
-            far = self._settled(directions, nearest_equivalent(found, start))
-            mixture, modes = far if far[1].supported or previous is None else (mixture, modes)
-        R, covariance = self._rotation(mixture, modes, start)
+        R, mixture, modes = self._settled(directions, previous, normals.index)
+        R, covariance = self._rotation(mixture, modes, R)
         weight = np.where(self._strength(mixture) > 0.0, mixture.weight, 0.0)
         spread = (weight * 2.0 / mixture.concentration).sum(axis=0) / np.maximum(weight.sum(axis=0), 1e-9)
         return ManhattanFrame(
@@ -79,38 +77,57 @@ class VonMisesFisher:
             supported=modes.supported,
         )
 
-    def _settled(self, directions: Directions, start: F64) -> tuple[AxisMixture, Modes]:
-        """The mixture EM reaches from three axes, and the judgement on it."""
-        mixture = broad_mixture(start, np.radians(self.start_spread_deg) ** -2)
+    def _settled(self, directions: Directions, previous: ManhattanFrame | None, index: int) -> tuple[F64, AxisMixture, Modes]:
+        """From the previous axes; from everywhere when there are none, they are old or nothing supports them. See `_judged`."""
+        start, near = np.eye(3) if previous is None else previous.rotations[0], None
+        if previous is not None:
+            near = self._judged(directions, start)
+            if previous.supported and near[2].supported and index - previous.index <= self.max_age:
+                return near
+        few = directions.thinned(self.search_samples)
+        found = search_axes(few.vectors, few.weights, HALF_SPHERE, np.radians(12.0), np.radians(4.0), 6, 2)
+        far = self._judged(directions, nearest_equivalent(found, start))
+        return far if far[2].supported or near is None else near
+
+    def _judged(self, directions: Directions, start: F64) -> tuple[F64, AxisMixture, Modes]:
+        """The rotation EM reaches from a start (3, 3), the mixture when its axes are then let free, and the judgement on it: in a Manhattan world they
+        stay at right angles, elsewhere each goes to a wall of its own."""
+        mixture = self._converged(broad_mixture(start, np.radians(self.start_spread_deg) ** -2), directions, False)
+        free = self._converged(mixture, directions, True)
+        vectors, weights, first = directions
+        normals = np.stack([free.number[0], free.weight[0], 2.0 / free.concentration[0], 1.0 / free.concentration[0]], axis=1)
+        peaks = shift_axes(vectors, weights, free.R, self._rules.cone, np.radians(self.peak_spread_deg), 20, 1e-4)
+        shift = np.linalg.norm(np.cross(peaks, free.R, axis=0), axis=0)
+        sigma = np.sqrt(normals[:, 2] / np.maximum(2.0 * normals[:, 0] / NORMALS_PER_SAMPLE, 1.0))
+        normals[shift > np.radians(self.max_shift_deg) + 2.0 * sigma] = 0.0  # two walls taken for one
+        lines = mode_statistics(vectors[first:], weights[first:], free.R, self._rules.cone)
+        modes = self._rules.judged(Modes(free.R, normals, lines, np.zeros(3, np.bool_), False), directions, None)
+        return mixture.R if modes.seen.any() else start, free, modes
+
+    def _converged(self, mixture: AxisMixture, directions: Directions, free: bool) -> AxisMixture:
+        """After expectation–maximisation with axes at right angles or free."""
         prior = np.radians(self.prior_spread_deg) ** -2
         for _ in range(self.max_iterations):
             before = mixture
-            mixture = improved(before, directions.vectors, directions.weights, directions.first_line, self.prior, prior)
+            mixture = improved(before, directions.vectors, directions.weights, directions.first_line, self.prior, prior, free)
             step = np.linalg.norm(mixture.R - before.R) / np.sqrt(2.0)
             if step < np.radians(self.tolerance_deg) and np.all(np.abs(mixture.concentration / before.concentration - 1.0) < 0.01):
                 break
-        resultant = (self._strength(mixture)[:, None, :] * mixture.resultant).sum(axis=0)
-        length = np.linalg.norm(resultant, axis=0)
-        axes = np.where(length > 1e-9, resultant / np.maximum(length, 1e-9), mixture.R)
-        normals = np.stack([mixture.number[0], mixture.weight[0], 2.0 / mixture.concentration[0], 1.0 / mixture.concentration[0]], axis=1)
-        first = directions.first_line
-        lines = mode_statistics(directions.vectors[first:], directions.weights[first:], axes, self._rules.cone)
-        return mixture, self._rules.judged(Modes(axes, normals, lines, np.zeros(3, np.bool_), False), directions, None)
+        return mixture
 
     def _strength(self, mixture: AxisMixture) -> F64:
         """(2, 3) concentrations; 0 of those that are too wide to be an axis."""
         return np.where(mixture.concentration >= np.radians(self.max_spread_deg) ** -2, mixture.concentration, 0.0)
 
-    def _rotation(self, mixture: AxisMixture, modes: Modes, start: F64) -> tuple[F64, F64]:
-        """The most probable rotation of the axes seen, and the covariance of phi (3, 3)."""
+    def _rotation(self, mixture: AxisMixture, modes: Modes, R: F64) -> tuple[F64, F64]:
+        """The most probable rotation of the axes seen, R where these are no Manhattan frame, and the covariance of phi (3, 3)."""
         independent = self._strength(mixture) * mixture.number / np.array([[NORMALS_PER_SAMPLE], [1.0]])
         sigma2 = 1.0 / np.maximum(independent.sum(axis=0), 1e-9) + np.radians(self.axis_floor_deg) ** 2
+        H = np.zeros((3, 3))
         if modes.seen.any() and (modes.supported or modes.seen.sum() < 2):
             strength = np.where(modes.seen, 1.0 / sigma2, 0.0)
-            R = orthonormal(np.where(modes.seen, modes.axes, start), (strength + 1e-6 * strength.max()) / strength.max())
+            R = orthonormal(np.where(modes.seen, modes.axes, R), (strength + 1e-6 * strength.max()) / strength.max())
             H = isotropic_information(R.T, np.sqrt(sigma2))[modes.seen].sum(axis=0)
-        else:
-            R, H = mixture.R if modes.seen.any() else start, np.zeros((3, 3))
         covariance = np.linalg.inv(H + np.eye(3) / NOTHING_KNOWN) + np.eye(3) * np.radians(self.floor_deg) ** 2
         return R, covariance
 

@@ -93,18 +93,22 @@ class ModeFinder:
             on_axis = np.abs(planes.coefficients[:, :3] @ modes.axes) > np.cos(0.5 * self.cone)
             dense |= on_axis.T @ planes.pixels >= self.min_share * planes.labels.size * planes.stride**2
         enough = normals[:, 1] >= self.min_share * max(directions.first_line, 1)
-        return np.asarray(enough & dense | self._line_peaks(modes.lines, directions, widest))
+        return np.asarray(enough & dense | self._line_peaks(modes, directions, widest))
 
-    def _line_peaks(self, lines: F64, directions: Directions, widest: float) -> Bool:
-        """(3,) whether enough lines stand on the axis, and on the axes together more than lines drawn any way on one wall would."""
-        length = directions.weights[directions.first_line :]
-        total = max(float(length.sum()), 1e-9)
-        peaks = (lines[:, 0] >= self.min_lines) & (lines[:, 1] >= self.min_line_share * total) & (lines[:, 3] < widest)
-        # on one wall two axes gather four times their reach of 180° by chance, give or take 3 sigma
-        reach = np.clip(3.0 * np.sqrt(lines[peaks, 3].max(initial=0.0)), np.radians(2.0), self.cone)
-        chance = 4.0 * reach / np.pi
-        chance += 3.0 * np.sqrt(chance * (1.0 - chance) * (length * length).sum()) / total
-        return np.asarray(peaks & (lines[peaks, 1].sum() > chance * total))
+    def _line_peaks(self, modes: Modes, directions: Directions, widest: float) -> Bool:
+        """(3,) whether enough lines stand on the axis, and on the axes together more than lines drawn any way on one wall would.
+
+        An axis is measured against the lines that no heavier axis has: a few long ones along a corridor must not outweigh what is across it."""
+        lines, length = modes.lines, directions.weights[directions.first_line :]
+        on_axis = np.abs(directions.vectors[directions.first_line :] @ modes.axes) > np.cos(self.cone)
+        peaks, left = np.zeros(3, np.bool_), np.ones(len(length), np.bool_)
+        fit = (lines[:, 0] >= self.min_lines) & (lines[:, 3] < widest)
+        for k in sorted(np.flatnonzero(fit), key=lambda k: -lines[k, 1]):
+            least = _by_chance(lines[k, 3], self.cone, 2.0 / (np.pi - 2.0 * self.cone), length[left]) if peaks.any() else 0.0
+            peaks[k] = lines[k, 1] >= max(self.min_line_share * float(length[left].sum()), least)
+            left &= ~on_axis[:, k]
+        # on one wall two axes gather four times their reach of 180° by chance
+        return np.asarray(peaks & (lines[peaks, 1].sum() > _by_chance(lines[peaks, 3].max(initial=0.0), self.cone, 4.0 / np.pi, length)))
 
     def _at_right_angles(self, modes: Modes, peaks: Bool) -> Bool:
         """(3,) the most and heaviest of the peaks that are mutually at right angles, as far as their own uncertainty can tell."""
@@ -116,3 +120,9 @@ class ModeFinder:
             if sets:
                 return np.isin(np.arange(3), max(sets, key=lambda s: modes.weights[list(s)].sum()))
         return np.zeros(3, np.bool_)
+
+
+def _by_chance(mean_square: float, cone: float, per_reach: float, length: F64) -> float:
+    """The length that lines (n,) without order have within reach of an axis, give or take 3 sigma; reach is 3 standard deviations of those on it."""
+    share = per_reach * float(np.clip(3.0 * np.sqrt(mean_square), np.radians(2.0), cone))
+    return float(share * length.sum() + 3.0 * np.sqrt(share * (1.0 - share) * (length * length).sum()))

@@ -170,14 +170,18 @@ def _histogram(directions: F64, weights: F64, frame: F64, cone: float) -> F64:
     return histogram
 
 
-def _quarter_turns(histogram: F64, count: int) -> list[float]:
-    """The fullest turns (rad, modulo a quarter turn), at most `count`, 10° apart."""
-    smooth = np.sum([(5 - abs(k)) * np.roll(histogram, k) for k in range(-4, 5)], axis=0)
-    turns = []
-    for _ in range(count):
+@numba.njit(cache=True, nogil=True)
+def _quarter_turns(histogram: F64, count: int) -> F64:
+    """(count,) the fullest turns (rad, modulo a quarter turn), 10° apart."""
+    smooth, turns = np.zeros(BINS), np.empty(count)
+    for i in range(BINS):
+        for k in range(-4, 5):
+            smooth[i] += (5 - abs(k)) * histogram[(i - k) % BINS]
+    for t in range(count):
         best = int(np.argmax(smooth))
-        turns.append((best + 0.5) * 0.5 * np.pi / BINS)
-        smooth[np.arange(best - 10, best + 11) % BINS] = 0.0
+        turns[t] = (best + 0.5) * 0.5 * np.pi / BINS
+        for k in range(best - 10, best + 11):
+            smooth[k % BINS] = 0.0
     return turns
 
 

@@ -11,13 +11,14 @@ from trihedron.pipeline.geometry import nearest_rotation
 from trihedron.pipeline.types import F64
 
 LEAST, MOST = 5.0, 20000.0  # concentrations: 26° and 0.4° of standard deviation; below, 1/(1 − r) is not the concentration
+FAR = -30.0  # exponent of a density that is nothing
 
 
 class AxisMixture(NamedTuple):
     """Directions x about axes a_k, the columns of R: `p(x) = Σ_k share_k vMF(x; ±a_k, concentration_k) / 2 + share_3 / 4π`, for each population
     (rows: normals, lines) of directions."""
 
-    R: F64  # (3, 3)
+    R: F64  # (3, 3), a rotation unless the axes are free of each other
     concentration: F64  # (2, 3), 1/rad²
     share: F64  # (2, 4), the last of the background
     resultant: F64  # (2, 3, 3) sums of the directions that belong to each axis (columns), by weight
@@ -31,11 +32,14 @@ def broad_mixture(R: F64, concentration: float) -> AxisMixture:
     return AxisMixture(R, np.full((2, 3), concentration), np.full((2, 4), 0.25), np.zeros((2, 3, 3)), none, none)
 
 
-def improved(mixture: AxisMixture, directions: F64, weights: F64, first_line: int, prior: float, concentration: float) -> AxisMixture:
+def improved(
+    mixture: AxisMixture, directions: F64, weights: F64, first_line: int, prior: float, concentration: float, free: bool = False
+) -> AxisMixture:
     """One step of expectation–maximisation, antipodes being one.
 
     Given what belongs to which axis, R in closed form maximises `Σ κ_k r w ±x·a_k` (Straub et al., IROS 2015), κ solves `coth κ − 1/κ = mean
-    ±x·a_k`. As a priori knowledge each axis counts `prior` more directions of the given concentration."""
+    ±x·a_k`. As a priori knowledge each axis counts `prior` more directions of the given concentration. With `free` axes each of them maximises its
+    own sum, at whatever angles to the others."""
     sums = _belonging(directions, weights, first_line, mixture.R, mixture.concentration, mixture.share)
     number, weight, off, resultant = sums[:, :, 0], sums[:, :, 1], sums[:, :, 2], np.swapaxes(sums[:, :, 3:], 1, 2)
     total = np.array([weights[:first_line].sum(), weights[first_line:].sum()])
@@ -43,7 +47,8 @@ def improved(mixture: AxisMixture, directions: F64, weights: F64, first_line: in
     more = prior * np.maximum(mean, 1e-12)[:, None]
     kappa = np.clip((weight + more) / (off + more / concentration), LEAST, MOST)
     share = np.concatenate([weight, (total - weight.sum(axis=1))[:, None]], axis=1) + more
-    R = nearest_rotation((kappa[:, None, :] * resultant).sum(axis=0) + 1e-6 * mixture.R)
+    R = (kappa[:, None, :] * resultant).sum(axis=0) + 1e-6 * mixture.R
+    R = R / np.linalg.norm(R, axis=0) if free else nearest_rotation(R)
     return AxisMixture(R, kappa, share / share.sum(axis=1, keepdims=True), resultant, number, weight)
 
 
@@ -60,7 +65,8 @@ def _belonging(directions: F64, weights: F64, first_line: int, R: F64, concentra
         for k in range(3):
             kappa = concentration[kind, k]
             dot[k] = x * R[0, k] + y * R[1, k] + z * R[2, k]
-            p[k] = share[kind, k] * kappa * np.exp(kappa * (min(abs(dot[k]), 1.0) - 1.0))
+            exponent = kappa * (min(abs(dot[k]), 1.0) - 1.0)
+            p[k] = share[kind, k] * kappa * np.exp(exponent) if exponent > FAR else 0.0
             total += p[k]
         for k in range(3):
             r = p[k] / total
