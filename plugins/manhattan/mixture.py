@@ -9,13 +9,13 @@ from typing import Any
 import numpy as np
 
 from trihedron.pipeline.registry import register
-from trihedron.pipeline.types import F64, I32, ManhattanFrame, Normals, Planes, Segments
+from trihedron.pipeline.types import F64, ManhattanFrame, Normals, Planes, Segments
 from trihedron.plugins.numerics.axis_fit import NOTHING_KNOWN, AxisFit, gather_directions
 from trihedron.plugins.numerics.cube_symmetry import nearest_equivalent
-from trihedron.plugins.numerics.frame_identities import identified, turn_between
+from trihedron.plugins.numerics.frame_identities import identified, remembered, turn_between
 from trihedron.plugins.numerics.frame_mixture import Found, FrameMixture
-from trihedron.plugins.numerics.manhattan_modes import Directions, ModeFinder, Modes
-from trihedron.plugins.numerics.sphere_modes import orthonormal
+from trihedron.plugins.numerics.lost_frames import lost_frames, mode_spread
+from trihedron.plugins.numerics.manhattan_modes import ModeFinder
 
 
 @register("manhattan", "mixture")
@@ -75,9 +75,9 @@ class Mixture:
         turn = self._turn(followed, found, known)
         found = self._recognised(found, turn @ known)
         if not found:
-            return self._lost(directions, segments, planes, normals, known, ids)
+            return lost_frames(self._frames.finder.follow(directions, planes, known[0]), self._fit, segments, planes, normals, known, ids)
         rows = np.array([one.row for one in found])
-        unseen: Any = [] if previous is None else self._remembered(np.setdiff1d(np.arange(len(known)), rows), ids, len(found))
+        unseen: Any = [] if previous is None else remembered(np.setdiff1d(np.arange(len(known)), rows), ids, self.max_frames - len(found))
         fits = [self._fit(one.R, one.modes.axes, one.modes.normals, np.ones(3, np.bool_), segments, planes) for one in found]
         if rows.max() >= 0:  # with the fitted rotation, so that what is out of sight keeps its angles to it over many frames
             again = int(np.argmax(rows >= 0))
@@ -90,7 +90,7 @@ class Mixture:
             ids=np.concatenate([np.where(rows >= 0, ids[rows], ids.max() + np.cumsum(rows < 0)), ids[unseen]]).astype(np.int32),
             covariance=np.concatenate([[C for _, C in fits], np.tile(np.eye(3) * NOTHING_KNOWN, (len(unseen), 1, 1))]),
             inliers=np.concatenate([[one.modes.normals[:, 0] + one.modes.lines[:, 0] for one in found], nothing]).astype(np.int32),
-            spread=np.concatenate([[_spread(one.modes) for one in found], nothing * np.nan]),
+            spread=np.concatenate([[mode_spread(one.modes) for one in found], nothing * np.nan]),
             supported=True,
         )
 
@@ -111,36 +111,6 @@ class Mixture:
         rows = identified(np.array([one.R for one in found]).reshape(-1, 3, 3), expected, np.radians(self.again_deg))
         named = [Found(nearest_equivalent(one.R, expected[max(row, 0)]), one.modes, int(row)) for one, row in zip(found, rows)]
         return sorted(named, key=lambda one: -one.weight * (self.loyalty if one.row == 0 else 1.0))
-
-    def _remembered(self, unseen: I32, ids: I32, seen: int) -> I32:
-        """Rows of the frames out of sight for which there is room: those seen last, and the one with the highest id, so that no id is given twice."""
-        room = max(self.max_frames - seen, 0)
-        if len(unseen) <= room:
-            return unseen
-        newest = unseen[ids[unseen] == ids.max()]
-        return np.sort(np.concatenate([unseen[ids[unseen] != ids.max()][: max(room - len(newest), 0)], newest]))
-
-    def _lost(self, directions: Directions, segments: Segments, planes: Planes, normals: Normals, known: F64, ids: I32) -> ManhattanFrame:
-        """No frame is seen; a single axis still turns all that are known, and tells two of three angles of the first."""
-        modes = self._frames.finder.follow(directions, planes, known[0])
-        R, covariance = known[0], np.eye(3) * NOTHING_KNOWN
-        if modes.seen.sum() == 1:
-            turned = orthonormal(modes.axes, np.where(modes.seen, 1.0, 1e-6))
-            R, covariance = self._fit(turned, modes.axes, modes.normals, modes.seen, segments, planes)
-        count, spread = len(known), np.full((len(known), 3), np.nan)
-        spread[0] = _spread(modes)
-        inliers = np.zeros((count, 3), np.int32)
-        inliers[0] = np.where(modes.seen, modes.normals[:, 0] + modes.lines[:, 0], 0)
-        return ManhattanFrame(
-            index=normals.index,
-            stamp_ns=normals.stamp_ns,
-            rotations=R @ known[0].T @ known,
-            ids=ids,
-            covariance=np.concatenate([covariance[None], np.tile(np.eye(3) * NOTHING_KNOWN, (count - 1, 1, 1))]),
-            inliers=inliers,
-            spread=spread,
-            supported=False,
-        )
 
     @cached_property
     def _frames(self) -> FrameMixture:
@@ -163,8 +133,3 @@ class Mixture:
     @cached_property
     def _fit(self) -> AxisFit:
         return AxisFit(self.fit_deg, self.normals_floor_deg, self.plane_floor_deg, self.line_floor_deg, self.floor_deg)
-
-
-def _spread(modes: Modes) -> F64:
-    """(3,) rad; NaN of axes that are not seen."""
-    return np.where(modes.seen, np.sqrt(modes.mean_squares), np.nan)

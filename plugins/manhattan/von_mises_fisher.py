@@ -90,8 +90,8 @@ class VonMisesFisher:
         return far if far[2].supported or near is None else near
 
     def _judged(self, directions: Directions, start: F64) -> tuple[F64, AxisMixture, Modes]:
-        """The rotation EM reaches from a start (3, 3), the mixture when its axes are then let free, and the judgement on it: in a Manhattan world they
-        stay at right angles, elsewhere each goes to a wall of its own."""
+        """The rotation EM reaches from a start (3, 3), the mixture when its axes are then let free, and the judgement on it: in a Manhattan world
+        they stay at right angles, elsewhere each goes to a wall of its own."""
         mixture = self._converged(broad_mixture(start, np.radians(self.start_spread_deg) ** -2), directions, False)
         free = self._converged(mixture, directions, True)
         vectors, weights, first = directions

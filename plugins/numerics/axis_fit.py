@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from trihedron.pipeline.types import F32, F64, Bool, Planes, Segments
+from trihedron.pipeline.types import F32, F64, I32, Bool, Planes, Segments
 from trihedron.plugins.numerics.direction_information import isotropic_information, line_directions, plane_information
 from trihedron.plugins.numerics.manhattan_modes import NORMALS_PER_SAMPLE, Directions
 from trihedron.plugins.numerics.sphere_modes import assign_axes, fit_rotation, subsample_normals
@@ -51,6 +51,15 @@ class AxisFit:
 
         `axes` (3, 3) are the means of the normals on each axis, `normals` (3, 4) their statistics about these (`mode_statistics`); only the axes
         `taking_part` (3,) are fitted."""
+        measured, information, on_axis = self.measured(R, axes, normals, segments, planes)
+        on_axis[(on_axis >= 0) & ~taking_part[on_axis]] = -1
+        R, H, chi2, components = fit_rotation(measured, information, on_axis, R, self.gate, 5)
+        scale = max(chi2 / max(components - 3.0, 1.0), 1.0)
+        return R, np.linalg.inv(H / scale + np.eye(3) / NOTHING_KNOWN) + np.eye(3) * np.radians(self.floor_deg) ** 2
+
+    def measured(self, R: F64, axes: F64, normals: F64, segments: Segments, planes: Planes) -> tuple[F64, F64, I32]:
+        """Directions (n, 3) of planes, lines and the means of the normals, their information (n, 3, 3) and the column of R (3, m) that each
+        belongs to (-1: none). `axes` (3, m) and `normals` (m, 4) as above."""
         lines, line_weight, _ = line_directions(segments.endpoints_m, segments.covariance_m2, np.radians(self.line_floor_deg))
         plane_weight = plane_information(planes.coefficients, planes.covariance, np.radians(self.plane_floor_deg))
         independent = np.maximum(normals[:, 0] / NORMALS_PER_SAMPLE, 1.0)
@@ -60,10 +69,7 @@ class AxisFit:
         on_axis = assign_axes(measured, R, np.radians(self.cone_deg))
         used = [self.use_planes] * len(plane_weight) + [self.use_lines] * len(lines) + list(normals[:, 0] > 0)
         on_axis[~(np.array(used) & np.isfinite(measured).all(axis=1))] = -1
-        on_axis[(on_axis >= 0) & ~taking_part[on_axis]] = -1
-        R, H, chi2, components = fit_rotation(measured, information, on_axis, R, self.gate, 5)
-        scale = max(chi2 / max(components - 3.0, 1.0), 1.0)
-        return R, np.linalg.inv(H / scale + np.eye(3) / NOTHING_KNOWN) + np.eye(3) * np.radians(self.floor_deg) ** 2
+        return measured, information, on_axis
 
 
 def _half_sphere(count: int) -> F64:

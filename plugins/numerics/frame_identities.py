@@ -42,3 +42,11 @@ def turn_between(found: F64, before: F64, limit: float) -> F64:
                 if rank > best:
                     best, turn = rank, Q
     return turn
+
+
+def remembered(unseen: I32, ids: I32, room: int) -> I32:
+    """Of the rows of frames out of sight those for which there is room: seen last, and the one with the highest id, so that no id is given twice."""
+    if len(unseen) <= max(room, 0):
+        return unseen
+    newest = unseen[ids[unseen] == ids.max()]
+    return np.sort(np.concatenate([unseen[ids[unseen] != ids.max()][: max(room - len(newest), 0)], newest]))

@@ -46,17 +46,18 @@ class KnownFrames:
                 rotations[i] = nearest_rotation(rotations[i] @ exp_so3(step / weights[i]))
         return KnownFrames(rotations, self.ids, weights)
 
-    def sightings(self, manhattan: ManhattanFrame | None, R_world_camera: F64) -> list[list[Sighting]]:
-        """For each supported frame seen now, what it means if it is each of the known ones, axes named as is nearest to the predicted rotation."""
+    def sightings(self, manhattan: ManhattanFrame | None, R_world_camera: F64) -> list[tuple[int, list[Sighting]]]:
+        """For each row of the frames seen now what it means if it is each of the known ones, axes named as is nearest to the predicted rotation. A
+        frame out of sight, which an estimator carries on without inliers, is no sighting."""
         if manhattan is None or not manhattan.supported:
             return []
         found = []
-        for R, covariance in zip(manhattan.rotations, manhattan.covariance):
+        for k in np.flatnonzero(manhattan.inliers.any(axis=1)):
             row = []
             for i, R_world_manhattan in enumerate(self.R_world_manhattan):
-                named = nearest_equivalent(R, R_world_camera.T @ R_world_manhattan)
-                row.append(Sighting(i, named, covariance, log_so3(R_world_camera.T @ R_world_manhattan @ named.T)))
-            found.append(row)
+                named = nearest_equivalent(manhattan.rotations[k], R_world_camera.T @ R_world_manhattan)
+                row.append(Sighting(i, named, manhattan.covariance[k], log_so3(R_world_camera.T @ R_world_manhattan @ named.T)))
+            found.append((int(k), row))
         return found
 
     def with_new(self, R_world_manhattan: F64, weight: float) -> KnownFrames:

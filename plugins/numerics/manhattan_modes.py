@@ -81,12 +81,12 @@ class ModeFinder:
 
     def judged(self, modes: Modes, directions: Directions, planes: Planes | None) -> Modes:
         """The modes with those `seen` that are peaks at right angles, and whether these make a Manhattan frame; `planes` where they may take part."""
-        seen = self._at_right_angles(modes, self._peaks(modes, directions, planes))
+        seen = self._at_right_angles(modes, self.peaks(modes, directions, planes))
         explained = modes.weights[seen].sum() / max(directions.weights.sum(), 1e-9)
         return modes._replace(seen=seen, supported=bool(seen.sum() >= 2 and explained >= self.min_explained))
 
-    def _peaks(self, modes: Modes, directions: Directions, planes: Planes | None) -> Bool:
-        """(3,) whether a plane, enough normals or enough lines stand on the axis, the latter two more densely than directions without order would."""
+    def peaks(self, modes: Modes, directions: Directions, planes: Planes | None) -> Bool:
+        """(m,) whether a plane, enough normals or enough lines stand on each axis, the latter two denser than directions without order would."""
         normals, widest = modes.normals, (self.max_width * self.cone) ** 2
         dense = normals[:, 3] < widest
         if self.use_planes and planes is not None:
@@ -96,12 +96,12 @@ class ModeFinder:
         return np.asarray(enough & dense | self._line_peaks(modes, directions, widest))
 
     def _line_peaks(self, modes: Modes, directions: Directions, widest: float) -> Bool:
-        """(3,) whether enough lines stand on the axis, and on the axes together more than lines drawn any way on one wall would.
+        """(m,) whether enough lines stand on the axis, and on the axes together more than lines drawn any way on one wall would.
 
         An axis is measured against the lines that no heavier axis has: a few long ones along a corridor must not outweigh what is across it."""
         lines, length = modes.lines, directions.weights[directions.first_line :]
         on_axis = np.abs(directions.vectors[directions.first_line :] @ modes.axes) > np.cos(self.cone)
-        peaks, left = np.zeros(3, np.bool_), np.ones(len(length), np.bool_)
+        peaks, left = np.zeros(len(lines), np.bool_), np.ones(len(length), np.bool_)
         fit = (lines[:, 0] >= self.min_lines) & (lines[:, 3] < widest)
         for k in sorted(np.flatnonzero(fit), key=lambda k: -lines[k, 1]):
             least = _by_chance(lines[k, 3], self.cone, 2.0 / (np.pi - 2.0 * self.cone), length[left]) if peaks.any() else 0.0
@@ -112,14 +112,18 @@ class ModeFinder:
 
     def _at_right_angles(self, modes: Modes, peaks: Bool) -> Bool:
         """(3,) the most and heaviest of the peaks that are mutually at right angles, as far as their own uncertainty can tell."""
-        sigma = np.sqrt(modes.mean_squares / (2.0 * modes.independent))
-        skew = np.abs(np.arcsin(np.clip(modes.axes.T @ modes.axes, -1.0, 1.0)))
-        fits = skew <= self.max_skew + 2.0 * np.hypot(sigma[:, None], sigma[None])
+        fits = self.perpendicular(modes)
         for count in (3, 2, 1):
             sets = [s for s in combinations(np.flatnonzero(peaks), count) if all(fits[i, j] for i, j in combinations(s, 2))]
             if sets:
                 return np.isin(np.arange(3), max(sets, key=lambda s: modes.weights[list(s)].sum()))
         return np.zeros(3, np.bool_)
+
+    def perpendicular(self, modes: Modes) -> Bool:
+        """(m, m) whether two modes are at right angles, as far as their own uncertainty can tell."""
+        sigma = np.sqrt(modes.mean_squares / (2.0 * modes.independent))
+        skew = np.abs(np.arcsin(np.clip(modes.axes.T @ modes.axes, -1.0, 1.0)))
+        return np.asarray(skew <= self.max_skew + 2.0 * np.hypot(sigma[:, None], sigma[None]))
 
 
 def _by_chance(mean_square: float, cone: float, per_reach: float, length: F64) -> float:

@@ -38,17 +38,17 @@ def subsample_normals(normals: F32, most: int) -> F64:
 
 @numba.njit(cache=True, nogil=True)
 def shift_axes(directions: F64, weights: F64, axes: F64, cone: float, bandwidth: float, iterations: int, tolerance: float) -> F64:
-    """Move each axis (column) to the Gaussian-weighted mean of the directions within `cone` (rad) of it, in its tangent plane, until no axis moves by
+    """Move each of m axes (3, m) to the Gaussian-weighted mean of the directions within `cone` (rad) of it, in its tangent plane, until none moves by
     more than `tolerance` (rad). A direction goes to its nearest axis only; an axis without directions stays. Returns the axes (Zhou et al. 2016)."""
     axes = axes.copy()
     floor, narrow = np.cos(cone), -0.5 / (bandwidth * bandwidth)
-    total = np.empty((3, 4))
+    total = np.empty((axes.shape[1], 4))
     for _ in range(iterations):
         total[:] = 0.0
         for i in range(len(directions)):
             x, y, z = directions[i, 0], directions[i, 1], directions[i, 2]
             best, dot = 0, 0.0
-            for k in range(3):
+            for k in range(axes.shape[1]):
                 d = x * axes[0, k] + y * axes[1, k] + z * axes[2, k]
                 if abs(d) > abs(dot):
                     best, dot = k, d
@@ -62,7 +62,7 @@ def shift_axes(directions: F64, weights: F64, axes: F64, cone: float, bandwidth:
             total[best, 1] += w * y
             total[best, 2] += w * z
         moved = 0.0
-        for k in range(3):
+        for k in range(axes.shape[1]):
             if total[k, 3] <= 0.0:
                 continue
             norm = np.sqrt(total[k, 0] ** 2 + total[k, 1] ** 2 + total[k, 2] ** 2)
@@ -90,24 +90,31 @@ def _across(x: float, y: float, z: float) -> tuple[float, float, float, float, f
 
 @numba.njit(cache=True, nogil=True)
 def mode_statistics(directions: F64, weights: F64, axes: F64, cone: float) -> F64:
-    """(3, 4) per axis: number and weight of the directions within the cone, their mean squared angle (rad²), and the mean square of its component
-    across the axis where that is largest. Without order the latter is cone² / 4, and cone² / 3 when all directions lie in one plane."""
-    out = np.zeros((3, 4))
-    floor = np.cos(cone)
-    for k in range(3):
-        a0, a1, a2 = axes[0, k], axes[1, k], axes[2, k]
-        ux, uy, uz, vx, vy, vz = _across(a0, a1, a2)
-        uu, uv, vv = 0.0, 0.0, 0.0
-        for i in range(len(directions)):
-            x, y, z = directions[i, 0], directions[i, 1], directions[i, 2]
-            if abs(x * a0 + y * a1 + z * a2) > floor:
-                w, p, q = weights[i], x * ux + y * uy + z * uz, x * vx + y * vy + z * vz
-                out[k, 0] += 1.0
-                out[k, 1] += w
-                uu += w * p * p
-                uv += w * p * q
-                vv += w * q * q
+    """(m, 4) for each of m axes (3, m): number and weight of the directions within the cone which have none nearer, their mean squared angle (rad²),
+    and the mean square of its component across the axis where that is largest. Without order the latter is cone² / 4, and cone² / 3 when all
+    directions lie in one plane."""
+    count = axes.shape[1]
+    out, moments, basis = np.zeros((count, 4)), np.zeros((count, 3)), np.empty((count, 6))
+    for k in range(count):
+        basis[k, 0], basis[k, 1], basis[k, 2], basis[k, 3], basis[k, 4], basis[k, 5] = _across(axes[0, k], axes[1, k], axes[2, k])
+    for i in range(len(directions)):
+        x, y, z = directions[i, 0], directions[i, 1], directions[i, 2]
+        best, nearest = np.cos(cone), -1
+        for k in range(count):
+            dot = abs(x * axes[0, k] + y * axes[1, k] + z * axes[2, k])
+            if dot > best:
+                best, nearest = dot, k
+        if nearest >= 0:
+            b, w = basis[nearest], weights[i]
+            p, q = x * b[0] + y * b[1] + z * b[2], x * b[3] + y * b[4] + z * b[5]
+            out[nearest, 0] += 1.0
+            out[nearest, 1] += w
+            moments[nearest, 0] += w * p * p
+            moments[nearest, 1] += w * p * q
+            moments[nearest, 2] += w * q * q
+    for k in range(count):
         if out[k, 1] > 0.0:
+            uu, uv, vv = moments[k]
             out[k, 2] = (uu + vv) / out[k, 1]
             out[k, 3] = 0.5 * (uu + vv + np.sqrt((uu - vv) ** 2 + 4.0 * uv * uv)) / out[k, 1]
     return out
@@ -148,7 +155,7 @@ def _mass(directions: F64, weights: F64, starts: F64, cone: float) -> F64:
     return mass
 
 
-def _densest(directions: F64, weights: F64, starts: F64, cone: float, count: int) -> list[F64]:
+def densest(directions: F64, weights: F64, starts: F64, cone: float, count: int) -> list[F64]:
     """Of `starts` (m, 3) those with most weight within the cone, at least two cones apart; at most `count`, heaviest first."""
     mass = _mass(directions, weights, starts, cone)
     chosen: list[F64] = []
@@ -189,7 +196,7 @@ def search_axes(directions: F64, weights: F64, starts: F64, cone: float, bandwid
     """The three orthogonal axes of greatest density, from nothing: each of the `primaries` densest directions with its `turns` fullest turns about it
     is refined and compared. `starts` (m, 3) are directions spread over the half sphere, less than a cone apart. (3, 3) rotation."""
     best, found = -1.0, np.eye(3)
-    for start in _densest(directions, weights, starts, cone, primaries):
+    for start in densest(directions, weights, starts, cone, primaries):
         alone = np.zeros((3, 3))  # zero axes attract nothing
         alone[:, 0] = start
         frame = right_handed(shift_axes(directions, weights, alone, cone, bandwidth, 10, 1e-3)[:, 0])
@@ -206,11 +213,11 @@ def search_axes(directions: F64, weights: F64, starts: F64, cone: float, bandwid
 
 @numba.njit(cache=True, nogil=True)
 def assign_axes(directions: F64, R: F64, cone: float) -> I32:
-    """(n,) column of R nearest to each direction, antipodes being one; -1 further than `cone` (rad) from all, or NaN."""
+    """(n,) column of R (3, m) nearest to each direction, antipodes being one; -1 further than `cone` (rad) from all, or NaN."""
     out = np.full(len(directions), -1, np.int32)
     for i in range(len(directions)):
         best = np.cos(cone)
-        for k in range(3):
+        for k in range(R.shape[1]):
             dot = abs(directions[i, 0] * R[0, k] + directions[i, 1] * R[1, k] + directions[i, 2] * R[2, k])
             if dot > best:
                 best, out[i] = dot, k

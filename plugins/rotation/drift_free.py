@@ -79,7 +79,7 @@ class DriftFree:
         """The prediction tied to the Manhattan frames seen, the known ones with those met for the first time, and R_camera_manhattan of each."""
         estimate = predicted
         sightings: dict[int, F64] = {}
-        for k, row in enumerate(known.sightings(manhattan, predicted.R)):
+        for k, row in known.sightings(manhattan, predicted.R):
             distances = [self._distance(s, known, predicted) for s in row]
             best = int(np.argmin(distances)) if row else -1
             if row and distances[best] < self.gate and best not in sightings:
