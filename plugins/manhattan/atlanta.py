@@ -12,7 +12,7 @@ from trihedron.pipeline.types import F64, I32, ManhattanFrame, Normals, Planes, 
 from trihedron.plugins.numerics.atlanta_fit import fit_shared_vertical, shared_covariance, shared_vertical
 from trihedron.plugins.numerics.atlanta_modes import NONE, AtlantaFinder, AtlantaModes
 from trihedron.plugins.numerics.axis_fit import NOTHING_KNOWN, AxisFit, gather_directions
-from trihedron.plugins.numerics.frame_identities import remembered
+from trihedron.plugins.numerics.frame_identities import missing, remembered
 from trihedron.plugins.numerics.lost_frames import lost_frames
 from trihedron.plugins.numerics.manhattan_modes import ModeFinder
 
@@ -72,7 +72,8 @@ class Atlanta:
         directions = gather_directions(normals.normals, segments, self.samples, self.line_weight_per_px)
         known, ids = _sharing(previous)
         recent = previous is not None and previous.supported and normals.index - previous.index <= self.max_age
-        known, ids = self._atlanta.better_vertical(directions, known, ids) if recent else (known, ids)
+        if previous is not None and recent and np.count_nonzero(previous.inliers.any(axis=1)) == 1:
+            known, ids = self._atlanta.better_vertical(directions, known, ids)
         modes = self._atlanta.near(directions, planes, known) if recent else NONE
         if not modes.supported:
             modes = self._atlanta.search(directions, planes, None if previous is None else known)
@@ -81,7 +82,7 @@ class Atlanta:
         rotations, covariance = self._fitted(modes, segments, planes)
         first = np.argsort(-modes.weights * np.where(modes.rows == 0, self.loyalty, 1.0), kind="stable")
         rows, seen = modes.rows[first], len(first)
-        out = [] if previous is None else remembered(np.setdiff1d(np.arange(len(known)), rows), ids, self.max_azimuths - seen)
+        out = [] if previous is None else remembered(missing(rows, len(known)), ids, self.max_azimuths - seen)
         again = int(np.argmax(rows >= 0))
         turn = rotations[first[again]] @ known[max(rows[again], 0)].T  # keeps their angles to what is seen
         unseen = (turn @ known)[out]

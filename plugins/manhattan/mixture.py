@@ -12,7 +12,7 @@ from trihedron.pipeline.registry import register
 from trihedron.pipeline.types import F64, ManhattanFrame, Normals, Planes, Segments
 from trihedron.plugins.numerics.axis_fit import NOTHING_KNOWN, AxisFit, gather_directions
 from trihedron.plugins.numerics.cube_symmetry import nearest_equivalent
-from trihedron.plugins.numerics.frame_identities import identified, remembered, turn_between
+from trihedron.plugins.numerics.frame_identities import identified, missing, remembered, turn_between
 from trihedron.plugins.numerics.frame_mixture import Found, FrameMixture
 from trihedron.plugins.numerics.lost_frames import lost_frames, mode_spread
 from trihedron.plugins.numerics.manhattan_modes import ModeFinder
@@ -77,7 +77,7 @@ class Mixture:
         if not found:
             return lost_frames(self._frames.finder.follow(directions, planes, known[0]), self._fit, segments, planes, normals, known, ids)
         rows = np.array([one.row for one in found])
-        unseen: Any = [] if previous is None else remembered(np.setdiff1d(np.arange(len(known)), rows), ids, self.max_frames - len(found))
+        unseen: Any = [] if previous is None else remembered(missing(rows, len(known)), ids, self.max_frames - len(found))
         fits = [self._fit(one.R, one.modes.axes, one.modes.normals, np.ones(3, np.bool_), segments, planes) for one in found]
         if rows.max() >= 0:  # with the fitted rotation, so that what is out of sight keeps its angles to it over many frames
             again = int(np.argmax(rows >= 0))

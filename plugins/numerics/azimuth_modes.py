@@ -29,7 +29,7 @@ def azimuth_modes(directions: Directions, vertical: F64, cone: float, apart: int
         expected = share * histogram.sum()
         chance = expected + SIGMA * np.sqrt(share * (1.0 - share) * squares.sum())
         if len(masses) == most or inside.sum() < max(least, CONTRAST * expected, chance):
-            break
+            continue
         masses.append(float(inside.sum()))
         angle = (peak + 0.5 + float(inside @ WINDOW) / masses[-1]) * QUARTER / BINS
         rotations.append(exp_so3(angle * vertical) @ base)

@@ -44,6 +44,13 @@ def turn_between(found: F64, before: F64, limit: float) -> F64:
     return turn
 
 
+def missing(rows: I32, count: int) -> I32:
+    """Those of `count` rows that are not among `rows`."""
+    left = np.ones(count, np.bool_)
+    left[rows[rows >= 0]] = False
+    return np.flatnonzero(left).astype(np.int32)
+
+
 def remembered(unseen: I32, ids: I32, room: int) -> I32:
     """Of the rows of frames out of sight those for which there is room: seen last, and the one with the highest id, so that no id is given twice."""
     if len(unseen) <= max(room, 0):
