@@ -82,7 +82,7 @@ class Atlanta:
         rotations, covariance = self._fitted(modes, segments, planes)
         first = np.argsort(-modes.weights * np.where(modes.rows == 0, self.loyalty, 1.0), kind="stable")
         rows, seen = modes.rows[first], len(first)
-        out = [] if previous is None else remembered(missing(rows, len(known)), ids, self.max_azimuths - seen)
+        out = remembered(missing(rows, len(known)), ids, self.max_azimuths - seen) if previous is not None else np.zeros(0, np.int32)
         again = int(np.argmax(rows >= 0))
         turn = rotations[first[again]] @ known[max(rows[again], 0)].T  # keeps their angles to what is seen
         unseen = (turn @ known)[out]

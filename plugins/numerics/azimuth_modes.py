@@ -23,7 +23,8 @@ def azimuth_modes(directions: Directions, vertical: F64, cone: float, apart: int
     and standing out from a uniform distribution of all that the heavier ones leave."""
     base = right_handed(vertical)[:, [1, 2, 0]]
     histogram, squares = _histograms(*directions, base, np.sin(cone), NORMALS_PER_SAMPLE)
-    share, rotations, masses = len(WINDOW) / BINS, [], []
+    share, rotations = len(WINDOW) / BINS, []
+    masses: list[float] = []
     for peak in _peaks(histogram, apart):
         inside = histogram[(peak + WINDOW) % BINS]
         expected = share * histogram.sum()
