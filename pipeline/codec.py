@@ -206,18 +206,26 @@ def _decompress(array: Any, size: int) -> bytes | None:
 
 
 def _put_table(message: Any, name: str, table: Table, previous: Table | None) -> None:
-    """`name#` describes the table; `name.column[i]` holds a chunk that `previous` does not have."""
+    """`name#` describes the table; `name.column[i]` holds what `previous` does not have of a chunk: all of it, or the rows that `name.column[i]rows`
+    lists."""
     header = {"size": table.size, "full": previous is None, "schema": {c: [s.dtype, list(s.shape)] for c, s in table.schema.items()}}
     _put(message, f"{name}#", json.dumps(header), False)
     for column, chunks in table.chunks.items():
         known = previous.chunks.get(column, ()) if previous is not None else ()
         for i, chunk in enumerate(chunks):
-            if i >= len(known) or not _same(known[i], chunk):
-                _put(message, f"{name}.{column}[{i}]", chunk, False)
+            rows = _changed(known[i], chunk) if i < len(known) else np.arange(len(chunk))
+            if 0 < len(rows) < len(chunk):
+                _put(message, f"{name}.{column}[{i}]rows", rows.astype(np.uint8), False)
+            if len(rows):
+                _put(message, f"{name}.{column}[{i}]", chunk[rows], False)
 
 
-def _same(a: Any, b: Any) -> bool:
-    return a is b or (a.shape == b.shape and a.tobytes() == b.tobytes())
+def _changed(known: Any, chunk: Any) -> Any:
+    """Rows of a chunk, CHUNK at most, that the one known, no longer than this, does not have. They are compared by their bytes: NaN is no change."""
+    if known is chunk:
+        return np.empty(0, np.intp)
+    before, after = (np.ascontiguousarray(part).reshape(len(part), -1).view(np.uint8).reshape(len(part), -1) for part in (known, chunk))
+    return np.concatenate([np.flatnonzero((before != after[: len(before)]).any(axis=1)), np.arange(len(before), len(after))])
 
 
 def _get_table(name: str, chunks: Mapping[str, Any], previous: Table | None) -> Table:
@@ -229,8 +237,23 @@ def _get_table(name: str, chunks: Mapping[str, Any], previous: Table | None) -> 
     for column, spec in schema.items():
         count = -(-int(header["size"]) // CHUNK)
         known = previous.chunks[column] if previous is not None and not header["full"] else ()
-        parts = tuple(chunks[key] if (key := f"{name}.{column}[{i}]") in chunks else known[i] for i in range(count))
+        parts = tuple(_get_chunk(f"{name}.{column}[{i}]", chunks, known[i : i + 1], int(header["size"]) - i * CHUNK) for i in range(count))
         if any(part.dtype != np.dtype(spec.dtype) or part.shape[1:] != spec.shape for part in parts) or sum(map(len, parts)) != header["size"]:
             raise ValueError(f"{name}.{column}: rows of another size")
         columns[column] = parts
     return Table(schema, int(header["size"]), columns)
+
+
+def _get_chunk(key: str, chunks: Mapping[str, Any], known: tuple[Any, ...], left: int) -> Any:
+    """One chunk of a column, of the last `left` rows: the one known (none or one), changed by what the message says of it."""
+    if f"{key}rows" not in chunks:
+        return chunks[key] if key in chunks else known[0]
+    rows, size = chunks[f"{key}rows"], min(left, CHUNK)
+    before = known[0]
+    if len(np.union1d(rows, np.arange(len(before)))) != size:
+        raise ValueError(f"{key}: rows are missing")
+    chunk = np.empty((size, *before.shape[1:]), before.dtype)
+    chunk[: len(before)] = before
+    chunk[rows] = chunks[key]
+    chunk.flags.writeable = False
+    return chunk

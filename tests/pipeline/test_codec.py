@@ -1,6 +1,7 @@
 """Values come back bit for bit; damaged bytes are refused in one line."""
 
 import contextlib
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -78,6 +79,26 @@ def test_tables_are_written_as_changes_and_rebuilt():
         same(value, decoder.decode(message.SerializeToString()))
     assert max(sizes[20:FULL_EVERY]) < 25_000  # a chunk or two, however large the map
     assert sizes[FULL_EVERY] > 100_000  # whole again
+
+
+def test_of_a_touched_chunk_only_the_rows_that_changed_are_written():
+    table, ids = Table.empty({"x": Column("f8", (8,))}).appended(x=np.arange(2000.0).reshape(250, 8))
+    encoder, decoder = Encoder(), Decoder("x")
+    whole = next(iter(maps(1)))
+    decoder.decode(encoder.encode(replace(whole, points=table)).SerializeToString())
+    moved = table.updated(ids[[3, 77, 200]], x=np.full((3, 8), -1.0))
+    grown, _ = moved.appended(x=np.zeros((20, 8)))  # fills the chunk and begins the next
+    for version, most in ((moved, 3 * 64), (grown, 20 * 64)):
+        message = encoder.encode(replace(whole, points=version))
+        written = {array.name: len(array.data) for array in message.arrays if array.name.startswith("points.")}
+        assert sum(size for name, size in written.items() if not name.endswith("rows")) == most
+        same(replace(whole, points=version), decoder.decode(message.SerializeToString()))
+    message = encoder.encode(replace(whole, points=grown.updated(ids[:1], x=np.ones((1, 8)))))
+    for array in message.arrays:
+        if array.name.endswith("rows"):
+            array.dtype, array.data = "f4", bytes(4)
+    with pytest.raises(RecordingError, match="Map does not fit"):
+        decoder.decode(message.SerializeToString())
 
 
 def test_changes_depend_on_values_not_on_who_holds_them():
