@@ -58,8 +58,10 @@ class LoopClosing:
 
     def due(self, map: Map, frame: Frame) -> bool:
         """Whether this frame made a keyframe, and one that is looked at."""
-        newest = len(map.keyframes) - 1
-        return newest >= 0 and newest % self.every == 0 and int(map.keyframes.rows("index", np.array([newest]))[0]) == frame.index
+        newest = np.array([len(map.keyframes) - 1])
+        if newest[0] < 0 or newest[0] % self.every or not map.keyframes.rows("alive", newest)[0]:
+            return False
+        return int(map.keyframes.rows("index", newest)[0]) == frame.index
 
     def closed(self, map: Map, frame: Frame, ranked: Iterable[tuple[int, float]]) -> Correction | None:
         """The correction of the first of the ranked keyframes (row, way walked since) whose place is recognised."""
