@@ -90,6 +90,26 @@ def test_others_lack_it(directions):
             identities(other, directions)
 
 
+def test_a_camera_that_turns_away_and_back_knows_both_again(directions):
+    """From one frame over both to the other alone for 20 images, and back: each has its id, its place and its axes' names, in sight or not."""
+    for seed in range(3):
+        rng = np.random.default_rng(100 + seed)
+        world, axis = apart(directions, rng), directions.spherical(rng, 1)[0]
+        previous, names = None, {}
+        for k in range(40):
+            camera = exp_so3(np.radians(2.0 * min(k, 40 - k)) * axis)
+            shown = [0] if k < 5 or k >= 35 else ([1] if 10 <= k < 30 else [0, 1])
+            previous = directions.estimate(
+                Mixture(), blocks(directions, rng, [camera @ world[i] for i in shown], [0.8 / len(shown)] * len(shown), index=k), previous
+            )
+            assert previous.supported and sorted(previous.ids.tolist()) == ([0] if k < 5 else [0, 1])
+            for i in previous.ids.tolist():
+                R = previous.rotations[previous.ids.tolist().index(i)]
+                truth = names.setdefault(i, camera.T @ nearest_equivalent(camera @ world[i], R))
+                assert rotation_angle_deg(R.T @ camera @ truth) < 1.5
+                assert previous.inliers[previous.ids.tolist().index(i)].any() == (i in shown)
+
+
 def test_frames_that_share_the_floor(directions):
     """A block of walls turned by 30 degrees on one floor: two frames, with the floor's normal as an axis of both."""
     rng = np.random.default_rng(11)

@@ -8,6 +8,7 @@ import pytest
 from trihedron.pipeline.geometry import exp_so3, log_so3, pose_matrix, rotation_angle_deg
 from trihedron.pipeline.types import LOST, OK, Frame, Pose
 from trihedron.plugins.numerics.cube_symmetry import nearest_equivalent
+from trihedron.plugins.numerics.manhattan_frames import KnownFrames
 from trihedron.plugins.rotation.constant_velocity import ConstantVelocity
 from trihedron.plugins.rotation.drift_free import DriftFree
 from trihedron.plugins.rotation.procrustes import Procrustes
@@ -241,3 +242,21 @@ def test_garbage_gives_a_rotation(room):
 def test_fields_out_of_range(plugin, wrong):
     with pytest.raises(ValueError, match=next(iter(wrong))):
         plugin(**wrong)
+
+
+def test_a_frame_carried_on_out_of_sight_is_no_sighting(room):
+    """Estimators of several frames remember those out of sight, without inliers: they must not confirm themselves."""
+    run = Run(room, 4)
+    known = run.step()
+    seen = run.world.manhattan(run.path(0)[:3, :3], 0, run.rng)
+    other = seen.rotations @ exp_so3(np.radians([0.0, 0.0, 30.0]))
+    both = replace(
+        seen,
+        rotations=np.concatenate([other, seen.rotations]),
+        ids=np.array([1, 0], np.int32),
+        covariance=np.tile(seen.covariance, (2, 1, 1)),
+        inliers=np.array([[0, 0, 0], [9, 0, 9]], np.int32),
+        spread=np.array([[np.nan] * 3, [0.05, np.nan, 0.05]]),
+    )
+    frames = KnownFrames(known.R_world_manhattan, known.ids, known.weights)
+    assert [row for row, _ in frames.sightings(both, known.R_world_camera)] == [1]
