@@ -29,6 +29,8 @@ from trihedron.plugins.numerics.map_terms import line_terms, plane_terms, point_
 from trihedron.plugins.numerics.pose_solver import PoseSolution, solve_pose
 from trihedron.plugins.numerics.submaps import submap_of
 
+SCORE = np.array([1, 2, 5])  # what a point, a line and a plane that agree count
+
 
 @register("pose", "refine")
 @dataclass(frozen=True)
@@ -37,7 +39,7 @@ class Refine:
 
     The decoupled rotation is a prior with its own covariance; the decoupled position only says where to start (`position_sigma_m`), since the same
     features made it. Without a map the decoupled pose stands. A lost pose is only where to look: it is found again when enough of the map agrees on a
-    place that all directions are measured of, else it stays lost."""
+    place that all directions are measured of, else it stays lost; and what neither the previous frame nor the map agrees with is lost."""
 
     position_sigma_m: float = 0.05  # of the decoupled position, a weak prior
     rotation_sigma_deg: float = 0.2  # added to the rotation's own: no scene is exactly Manhattan
@@ -85,6 +87,10 @@ class Refine:
         sought = len(matches.keypoints) + len(matches.segments) + len(matches.planes)
         if start.status == LOST and not self._found_again(found, inliers, sought):
             return self._unknown_place(start, frame, previous, relocalise is not None and translation.estimated, map, submap)
+        enough = inliers @ SCORE >= self.min_inliers and inliers.sum() >= self.min_share * sought
+        if rotation.source == "prediction" and not enough:
+            reason = f"the rotation was not measured, and only {inliers.sum()} of {sought} matches with the map agree"
+            return replace(start, status=LOST, reason=reason).said(frame, map, submap=submap)
         if not inliers.any():
             return start.said(frame, map, "nothing of the map was found, pose from the previous frame", submap)
         status, reason = self._judge(found, inliers, sought, rotation)
@@ -124,14 +130,14 @@ class Refine:
 
     def _found_again(self, found: PoseSolution, inliers: I32, sought: int) -> bool:
         """Whether the map alone says where a lost camera is."""
-        enough = inliers @ np.array([1, 2, 5]) >= self.found_inliers and inliers.sum() >= self.found_share * sought
+        enough = inliers @ SCORE >= self.found_inliers and inliers.sum() >= self.found_share * sought
         return bool(enough) and found.unobservable.shape[1] == 0
 
     def _judge(self, found: PoseSolution, inliers: I32, sought: int, rotation: Rotation) -> tuple[str, str]:
         """Status and reason of a refined pose."""
         if found.unobservable.shape[1]:
             return DEGRADED, f"{found.unobservable.shape[1]} directions of motion cannot be seen, held at the prediction"
-        if inliers @ np.array([1, 2, 5]) < self.min_inliers:
+        if inliers @ SCORE < self.min_inliers:
             return DEGRADED, f"only {inliers[0]} points, {inliers[1]} lines and {inliers[2]} planes of the map were found"
         if inliers.sum() < self.min_share * sought:
             return DEGRADED, f"only {inliers.sum()} of {sought} matches with the map agree"

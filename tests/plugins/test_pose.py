@@ -154,6 +154,22 @@ def test_matches_that_contradict_each_other_are_not_called_ok():
     assert pose.status == "degraded" and error(pose)[0] < 0.1
 
 
+def test_a_rotation_that_was_not_measured_needs_the_map():
+    """A camera that is somewhere else from one frame to the next: a handful of matches by chance is no place."""
+    world = World(noise=0.0)
+    map, features = first_map(world), world.features(camera_at(5), 5)
+    guess = camera_at(5) @ exp_se3(OFF)
+    matches = LocalMap()(world.frame(5), rotation_of(guess, 5), translation_of(guess, 5), *features, map, None)
+    pairs, none = matches.keypoints.copy(), matches.planes[:0]
+    pairs[:, 1] = np.random.default_rng(0).permutation(pairs[:, 1])
+    wrong = dataclasses.replace(matches, keypoints=pairs, segments=none, planes=none, parallel=none, perpendicular=none)
+    previous = pose_of(camera_at(4), 4)
+    for found, status in ((wrong, "lost"), (matches, "degraded")):
+        rotation = rotation_of(guess, 5, 0.5, source="prediction")
+        pose = Refine()(world.frame(5), rotation, translation_of(guess, 5, sigma_m=0.03), None, found, *features, previous, map, None)
+        assert pose.status == status and ("not measured" in pose.reason)
+
+
 def test_a_corridor_keeps_the_prediction_along_it():
     """Only one wall of the map is matched: the pose is corrected towards it, held along it, and called degraded."""
     world = World(noise=0.0)
