@@ -11,6 +11,7 @@ from trihedron.pipeline.registry import register
 from trihedron.pipeline.types import F64, OK, Frame, Keypoints, Map, Matches, Planes, Pose, Rotation, Segments, Translation
 from trihedron.plugins.numerics.local_window import local_window
 from trihedron.plugins.numerics.map_search import Guess, MapSearch
+from trihedron.plugins.numerics.place_check import ABOUT_DEG, ABOUT_M
 
 
 @register("matches", "local_map")
@@ -22,11 +23,12 @@ class LocalMap(MapSearch):
     newest: int = 2  # keyframes always in the window
     covisible: int = 10  # keyframes that share most landmarks with those
     near: int = 3  # further keyframes taken from about here
+    recognised: int = 8  # keyframes taken from about the place where a lost camera was recognised
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.newest < 1 or self.covisible < 0 or self.near < 0:
-            raise ValueError("newest, covisible, near: must be at least 1, 0 and 0")
+        if self.newest < 1 or self.covisible < 0 or self.near < 0 or self.recognised < 1:
+            raise ValueError("newest, covisible, near, recognised: must be at least 1, 0, 0 and 1")
 
     def __call__(
         self,
@@ -43,8 +45,10 @@ class LocalMap(MapSearch):
         if map is None or not map.keyframes.column("alive").any():
             return None
         guess = self._guess(rotation, translation, relocalise)
-        submap = relocalise.submap if relocalise is not None and relocalise.status == OK else None
-        window = local_window(map, guess.T_world_camera, self.newest, self.covisible, self.near, submap=submap)
+        if relocalise is not None and relocalise.status == OK:  # the newest keyframes may be far from there
+            window = local_window(map, guess.T_world_camera, 0, 0, self.recognised, ABOUT_M, ABOUT_DEG, relocalise.submap)
+        else:
+            window = local_window(map, guess.T_world_camera, self.newest, self.covisible, self.near)
         return self.search(frame, guess, keypoints, segments, planes, map, window)
 
     def _guess(self, rotation: Rotation, translation: Translation, relocalise: Pose | None) -> Guess:
