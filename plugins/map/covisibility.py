@@ -13,7 +13,7 @@ from trihedron.plugins.numerics import insertion
 from trihedron.plugins.numerics.anchoring import anchored
 from trihedron.plugins.numerics.association import Associated, associate, existing
 from trihedron.plugins.numerics.correction import apply_correction
-from trihedron.plugins.numerics.culling import cull
+from trihedron.plugins.numerics.culling import cull, cull_keyframe
 from trihedron.plugins.numerics.landmarks import empty_map
 from trihedron.plugins.numerics.local_window import current_submap, keyframes_of, newest_keyframes
 from trihedron.plugins.numerics.merging import merge_lines, merge_planes, merge_points
@@ -41,6 +41,8 @@ class Covisibility:
     min_line_px: float = 30.0  # shortest segment that becomes a landmark
     trial: int = 3  # keyframes after which a landmark seen by fewer of those that should have seen it is removed
     min_found: float = 0.25  # found ratio below which a landmark is removed (ORB-SLAM)
+    redundant: int = 8  # keyframes that must see what another one sees, as well, for that to be redundant
+    redundant_share: float = 0.9  # of its landmarks (ORB-SLAM)
     merge_deg: float = 4.0  # planes that differ by less, and by less than merge_m on average, become one
     merge_m: float = 0.03
 
@@ -53,6 +55,8 @@ class Covisibility:
             raise ValueError("min_shift, min_turn_deg, line_sigma_px: must be positive")
         if not 0.0 <= self.min_share <= 1.0 or not 0.0 <= self.min_found <= 1.0 or self.trial < 1:
             raise ValueError("min_share, min_found, trial: shares in [0, 1], trial at least 1")
+        if self.redundant < 1 or not 0.0 < self.redundant_share <= 1.0:
+            raise ValueError("redundant, redundant_share: must be at least 1, and a share in (0, 1]")
 
     def __call__(
         self,
@@ -113,7 +117,7 @@ class Covisibility:
         """The map with this frame as its newest keyframe."""
         matches = matches if len(keyframes_of(map, pose.submap)) else None  # a new sub-map knows nothing yet
         found = associate(map, frame.camera, pose.T_world_camera, keypoints, segments, planes, matches, self.line_sigma_px)
-        map, row = insertion.add_keyframe(map, pose)
+        map, row = insertion.add_keyframe(map, pose, frame.camera)
         view = insertion.View(row, frame.camera, pose.T_world_camera, pose.covariance)
         map = self._seen(map, matches)
         map = insertion.insert_points(map, view, keypoints, found.points, found.new_points, self.memory)
@@ -123,7 +127,8 @@ class Covisibility:
             map = merge_points(map, view, matches.visible_points, keypoints.metric)
             map = merge_lines(map, view, matches.visible_lines)
         map = merge_planes(map, row, self.merge_deg, self.merge_m)
-        return cull(map, row, matches, self.trial, self.min_found)
+        map = cull(map, row, matches, self.trial, self.min_found)
+        return cull_keyframe(map, self.redundant, self.redundant_share)
 
     def _seen(self, map: Map, matches: Matches | None) -> Map:
         if matches is None:

@@ -32,7 +32,7 @@ class View:
         return np.array([self.camera.fx, self.camera.fy, self.camera.cx, self.camera.cy])
 
 
-def add_keyframe(map: Map, pose: Pose) -> tuple[Map, int]:
+def add_keyframe(map: Map, pose: Pose, camera: Camera) -> tuple[Map, int]:
     """A version with one more keyframe, whose observation rows are still to come, and its row."""
     empty = np.zeros((1, 2), np.int32)
     table, rows = map.keyframes.appended(
@@ -40,6 +40,7 @@ def add_keyframe(map: Map, pose: Pose) -> tuple[Map, int]:
         stamp_ns=np.array([pose.stamp_ns]),
         T_world_camera=pose.T_world_camera[None],
         covariance=pose.covariance[None],
+        intrinsics=np.array([[camera.fx, camera.fy, camera.cx, camera.cy]]),
         points=empty,
         lines=empty,
         planes=empty,
@@ -148,7 +149,15 @@ def insert_lines(map: Map, view: View, segments: Segments, pairs: I32, new: I32,
     )
     seen = np.concatenate([rows, new])
     ids = np.concatenate([ids, born])
-    return _tied(replace(map, lines=table), "line", view.keyframe, line=ids, endpoints_px=segments.endpoints_px[seen])
+    return _tied(
+        replace(map, lines=table),
+        "line",
+        view.keyframe,
+        line=ids,
+        endpoints_px=segments.endpoints_px[seen],
+        endpoints_m=segments.endpoints_m[seen],
+        covariance_m2=segments.covariance_m2[seen],
+    )
 
 
 def lengthened(endpoints: F64, information: F64, observed: F64) -> tuple[F64, F64]:
@@ -195,8 +204,9 @@ def insert_planes(map: Map, view: View, planes: Planes, pairs: I32, new: I32, me
         "plane",
         view.keyframe,
         plane=np.concatenate([pairs[:, 1], born]),
-        moments=planes.moments[seen],
+        coefficients=planes.coefficients[seen],
         covariance=planes.covariance[seen],
+        moments=planes.moments[seen],
     )
 
 

@@ -11,6 +11,7 @@ KEYFRAMES = {
     "stamp_ns": Column("i8"),
     "T_world_camera": Column("f8", (4, 4)),
     "covariance": Column("f8", (6, 6)),  # of its pose, see types
+    "intrinsics": Column("f8", (4,)),  # fx, fy, cx, cy
     "points": Column("i4", (2,)),  # its rows of the observation tables, half open
     "lines": Column("i4", (2,)),
     "planes": Column("i4", (2,)),
@@ -72,8 +73,20 @@ POINT_OBSERVATIONS = {
     "sigma_px": Column("f4"),
     "sigma_m": Column("f4"),
 }
-LINE_OBSERVATIONS = {"keyframe": Column("i4"), "line": Column("i4"), "endpoints_px": Column("f4", (2, 2))}
-PLANE_OBSERVATIONS = {"keyframe": Column("i4"), "plane": Column("i4"), "moments": Column("f8", (4, 4)), "covariance": Column("f8", (3, 3))}
+LINE_OBSERVATIONS = {  # as `types.Segments`, camera frame; NaN without a 3D line
+    "keyframe": Column("i4"),
+    "line": Column("i4"),
+    "endpoints_px": Column("f4", (2, 2)),
+    "endpoints_m": Column("f4", (2, 3)),
+    "covariance_m2": Column("f4", (2, 3, 3)),
+}
+PLANE_OBSERVATIONS = {  # as `types.Planes`, camera frame
+    "keyframe": Column("i4"),
+    "plane": Column("i4"),
+    "coefficients": Column("f8", (4,)),
+    "covariance": Column("f8", (3, 3)),
+    "moments": Column("f8", (4, 4)),
+}
 
 
 def empty_map(index: int, stamp_ns: int, point_bytes: int, line_bytes: int, plane_samples: int) -> Map:

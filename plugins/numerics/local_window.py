@@ -8,8 +8,7 @@ import numpy as np
 
 from trihedron.pipeline.types import F64, I32, Bool, Map, Table
 
-PLANE_VOTES = 20  # a shared plane ties two keyframes like this many points: a bare room has few landmarks, and all of them large
-LINE_VOTES = 5
+WEIGHTS = {"point": 1, "line": 5, "plane": 20}  # how strongly a shared one ties keyframes: a bare room has few landmarks, all of them large
 
 
 @dataclass(frozen=True)
@@ -55,10 +54,19 @@ def observed_by(map: Map, keyframes: I32, kind: str) -> I32:
 def _votes(map: Map, keyframes: I32) -> I32:
     """How strongly each keyframe of the map shares landmarks of any kind with the given ones, (keyframes of the map,)."""
     votes = np.zeros(len(map.keyframes), np.int64)
-    for kind, weight in (("point", 1), ("line", LINE_VOTES), ("plane", PLANE_VOTES)):
+    for kind, weight in WEIGHTS.items():
         observers = getattr(map, f"{kind}s").rows("observers", observed_by(map, keyframes, kind))
         votes += weight * np.bincount(observers[observers >= 0], minlength=len(votes))
     return votes.astype(np.int32)
+
+
+def covisible_keyframes(map: Map, keyframes: I32, count: int) -> I32:
+    """At most `count` further living keyframes that share most landmarks with the given ones, most first and of equals the newest."""
+    votes = _votes(map, keyframes)
+    votes[keyframes] = 0
+    votes[~map.keyframes.column("alive")] = 0
+    order = len(votes) - 1 - np.argsort(-votes[::-1], kind="stable")[:count]
+    return order[votes[order] > 0].astype(np.int32)
 
 
 def _near(map: Map, T_world_camera: F64, near_m: float, near_deg: float, submap: int) -> I32:
@@ -87,11 +95,7 @@ def local_window(
     chosen = newest_keyframes(map, max(newest, 1))
     submap = current_submap(map) if submap is None else submap
     chosen = chosen[map.keyframes.rows("submap", chosen) == submap][:newest]
-    votes = _votes(map, chosen)
-    votes[chosen] = 0
-    votes[~map.keyframes.column("alive")] = 0
-    order = np.argsort(-votes, kind="stable")[:covisible]
-    chosen = np.concatenate([chosen, order[votes[order] > 0].astype(np.int32)])
+    chosen = np.concatenate([chosen, covisible_keyframes(map, chosen, covisible)])
     beside = _near(map, T_world_camera, near_m, near_deg, submap)
     beside = beside[~np.isin(beside, chosen)][:near]
     return window_of(map, np.sort(np.concatenate([chosen, beside])).astype(np.int32))

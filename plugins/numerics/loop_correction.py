@@ -9,7 +9,9 @@ import numpy as np
 from trihedron.pipeline.geometry import invert
 from trihedron.pipeline.types import F64, I32, Correction, Map, Table
 from trihedron.plugins.numerics.local_window import current_submap, keyframes_of
+from trihedron.plugins.numerics.plane_fusion import information_of
 from trihedron.plugins.numerics.pose_graph import Edges, solve_pose_graph
+from trihedron.plugins.numerics.uncertainty import inverse
 
 LEAST_M, LEAST = 1e-3, 1e-4  # standard deviations between two keyframes at one place, m and rad
 LINKS = 3  # further keyframes each is tied to, so that a stretch that was looked at often stays stiff
@@ -53,10 +55,13 @@ def close(map: Map, closure: Closure, drift: Drift) -> Correction:
         after,
         points[0],
         _moved(T_points, map.points.rows("position_m", points[0])[:, None])[:, 0],
+        _turned(T_points, map.points.rows("information", points[0])),
         lines[0],
         _moved(T_lines, map.lines.rows("endpoints_m", lines[0])),
+        _turned(T_lines[:, None], map.lines.rows("information", lines[0])),
         planes[0],
         coefficients,
+        inverse(information_of(T_planes @ map.planes.rows("moments", planes[0]) @ np.swapaxes(T_planes, 1, 2), coefficients)),
     )
 
 
@@ -98,6 +103,11 @@ def _mean_motion(ids: I32, observers: I32, motions: F64) -> F64:
 def _moved(T: F64, points: F64) -> F64:
     """(n, 4, 4) and (n, k, 3) -> (n, k, 3)."""
     return points @ np.swapaxes(T[:, :3, :3], 1, 2) + T[:, None, :3, 3]
+
+
+def _turned(T: F64, information: F64) -> F64:
+    """(..., 4, 4) and (..., 3, 3): what is known of a place, turned with it."""
+    return np.asarray(T[..., :3, :3] @ information @ np.swapaxes(T[..., :3, :3], -1, -2), np.float64)
 
 
 def _moved_planes(T: F64, planes: F64) -> F64:

@@ -7,7 +7,7 @@ import numpy as np
 
 from trihedron.pipeline.types import F64, I32, U8, Keypoints, Map, Segments
 from trihedron.plugins.numerics.descriptors import U64, hamming, words_of
-from trihedron.plugins.numerics.local_window import LINE_VOTES, observed_by
+from trihedron.plugins.numerics.local_window import WEIGHTS, observed_by
 
 
 def lookalikes(query: U8, train: U8, max_bits: int, ratio: float) -> I32:
@@ -37,7 +37,7 @@ def likely_keyframes(map: Map, keypoints: Keypoints, segments: Segments, among: 
     if len(among) <= count:
         return among
     votes = np.zeros(len(map.keyframes), np.int64)
-    for kind, found, weight in (("point", keypoints, 1), ("line", segments, LINE_VOTES)):
+    for kind, found, weight in (("point", keypoints, 1), ("line", segments, WEIGHTS["line"])):
         ids = observed_by(map, among, kind)
         table = getattr(map, f"{kind}s")
         rows = lookalikes(found.descriptors, table.rows("descriptor", ids), max_bits, 1.0)

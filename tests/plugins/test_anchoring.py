@@ -14,6 +14,7 @@ from trihedron.pipeline.runner import Runner
 from trihedron.pipeline.types import LOST, Correction, Map, Pose, Rotation
 from trihedron.plugins.numerics.anchoring import anchored, anchored_before
 from trihedron.plugins.numerics.landmarks import KEYFRAMES, empty_map
+from trihedron.plugins.numerics.uncertainty import transform_plane_covariance
 
 SHIFT = pose_matrix(exp_so3(np.radians([3.0, 4.0, 0.0])), np.array([0.2, -0.1, 0.2]))  # 5° and 0.3 m
 
@@ -23,7 +24,7 @@ def map_with(*poses):
     map = empty_map(0, 0, 32, 32, 8)
     keyframes, _ = map.keyframes.appended(
         index=np.arange(n), stamp_ns=np.arange(n), T_world_camera=np.array(poses), covariance=np.tile(np.eye(6), (n, 1, 1)),
-        points=empty, lines=empty, planes=empty, alive=np.ones(n, np.bool_),
+        intrinsics=np.ones((n, 4)), submap=np.zeros(n), points=empty, lines=empty, planes=empty, alive=np.ones(n, np.bool_),
     )  # fmt: skip
     assert set(KEYFRAMES) == set(keyframes.schema)
     return replace(map, keyframes=keyframes)
@@ -72,11 +73,13 @@ class Shove:
     def __call__(self, map: Map) -> Correction | None:
         if len(map.keyframes) != 3 or map.keyframes.column("index")[-1] != map.index:
             return None
+        R, planes = self.shift[:3, :3], transform_planes(self.shift, map.planes.column("coefficients"))
         ids = [np.arange(len(table), dtype=np.int32) for table in (map.keyframes, map.points, map.lines, map.planes)]
         return Correction(
             map.index, map.stamp_ns, map.revision, ids[0], self.shift @ map.keyframes.column("T_world_camera"),
-            ids[1], transform(self.shift, map.points.column("position_m")), ids[2], transform(self.shift, map.lines.column("endpoints_m")),
-            ids[3], transform_planes(self.shift, map.planes.column("coefficients")),
+            ids[1], transform(self.shift, map.points.column("position_m")), R @ map.points.column("information") @ R.T,
+            ids[2], transform(self.shift, map.lines.column("endpoints_m")), R @ map.lines.column("information") @ R.T, ids[3], planes,
+            transform_plane_covariance(self.shift, map.planes.column("coefficients"), planes, map.planes.column("covariance")),
         )  # fmt: skip
 
 

@@ -13,6 +13,7 @@ from trihedron.plugins.map.covisibility import Covisibility
 from trihedron.plugins.map.none import NoMap
 from trihedron.plugins.matches.local_map import LocalMap
 from trihedron.plugins.numerics import plane_fusion
+from trihedron.plugins.numerics.local_window import local_window
 
 sys.path.insert(0, str(Path(__file__).parent))
 from landmark_world import World, camera_at, rotation_of, translation_of
@@ -246,12 +247,16 @@ def test_a_wall_entered_twice_becomes_one():
     columns["observers"][0, 0] = 1
     planes, copy = map.planes.appended(**columns)
     map = step(EVERY, world, dataclasses.replace(map, planes=planes), 1)
-    seen, _ = map.plane_observations.appended(keyframe=[1], plane=copy, moments=columns["moments"], covariance=columns["covariance"])
+    said = {name: columns[name] for name in ("coefficients", "covariance", "moments")}
+    seen, _ = map.plane_observations.appended(keyframe=[1], plane=copy, **said)
     span = map.keyframes.column("planes")[1] + [0, 1]
     map = dataclasses.replace(map, plane_observations=seen, keyframes=map.keyframes.updated(np.array([1]), planes=span[None]))
     map = step(EVERY, world, map, 2)
     assert list(map.planes.column("alive")) == [True, True, True, False]
     assert not (map.plane_observations.column("plane") == copy).any()
+
+
+KNOWN = (("point_information", "point_ids", (), 1e5), ("line_information", "line_ids", (2,), 1e4), ("plane_covariance", "plane_ids", (), 1e-5))
 
 
 def correction(map, **changes):
@@ -260,7 +265,9 @@ def correction(map, **changes):
         "points_m": np.empty((0, 3)), "line_ids": np.empty(0, np.int32), "endpoints_m": np.empty((0, 2, 3)), "plane_ids": np.empty(0, np.int32),
         "coefficients": np.empty((0, 4)),
     }  # fmt: skip
-    return Correction(map.index, map.stamp_ns, **{**none, **changes})
+    given = {**none, **changes}
+    known = {name: np.tile(np.eye(3), (len(given[ids]), *shape, 1, 1)) * scale for name, ids, shape, scale in KNOWN}
+    return Correction(map.index, map.stamp_ns, **known, **given)
 
 
 @pytest.mark.parametrize("wire", ["bundle", "loop"])
@@ -287,6 +294,10 @@ def test_a_correction_moves_what_it_names_and_nothing_else(wire):
     assert np.allclose(after.planes.column("coefficients")[1], plane)
     fitted, _ = plane_fusion.fit_planes(after.planes.column("moments"), after.planes.column("coefficients"))
     assert np.allclose(fitted, after.planes.column("coefficients"), atol=1e-6)  # the moments moved along, so the next frame does not undo it
+    assert np.allclose(after.points.column("information")[1], np.eye(3) * 1e5) and np.allclose(after.lines.column("information")[2], np.eye(3) * 1e4)
+    assert np.allclose(after.planes.column("covariance")[1], np.eye(3) * 1e-5)
+    again = plane_fusion.fit_planes(after.planes.rows("moments", np.array([1])), plane[None])[1]
+    assert np.allclose(again, np.eye(3) * 1e-5, rtol=1e-6)  # one measurement's worth: what is fused later is weighed against just that
     assert np.allclose(after.keyframes.column("T_world_camera")[2], camera_at(2) @ exp_se3(np.full(6, 0.01)))
 
 
@@ -316,6 +327,29 @@ def test_what_came_after_the_corrected_keyframes_moves_with_them():
     alive = after.lines.column("alive")
     assert np.allclose(after.lines.column("endpoints_m")[alive], transform(shift, map.lines.column("endpoints_m"))[alive])
     assert np.allclose(after.planes.column("coefficients"), transform_planes(shift, map.planes.column("coefficients")))
+
+
+def test_keyframes_that_others_make_redundant_are_retired():
+    """A camera that goes to and fro over 0.3 m for 60 keyframes: what three others see as well is no longer part of any window."""
+    world, stage, map = World(), dataclasses.replace(EVERY, redundant=3), None
+    counts = []
+    for index in range(60):
+        at = 12.0 * np.sin(0.4 * index)
+        map = step(stage, world, map, index, at=at) or map
+        assert not len(map.keyframes) or map.keyframes.column("alive")[[0, -1]].all()
+        counts.append(int(map.keyframes.column("alive").sum()))
+    alive = map.keyframes.column("alive")
+    assert len(alive) == 60 and max(counts) < 20 and max(counts[40:]) <= max(counts[:40]) + 1  # bounded, however long it stays
+    poses = np.stack([camera_at(12.0 * np.sin(0.4 * index)) for index in range(60)])
+    assert np.array_equal(map.keyframes.column("T_world_camera"), poses)
+    window = local_window(map, poses[-1], 2, 10, 3)
+    assert alive[window.keyframes].all() and len(window.points) > 50
+
+
+def test_a_keyframe_is_not_redundant_when_the_others_are_far_behind_or_see_something_else():
+    """Walking on, every keyframe sees something that too few others do."""
+    map = walk(World(2000), 14, dataclasses.replace(EVERY, redundant=8), stride=8)
+    assert map.keyframes.column("alive").all()
 
 
 def test_a_keyframe_without_features_is_no_error():

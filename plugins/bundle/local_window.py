@@ -1,0 +1,44 @@
+"""Bundle adjustment of the newest keyframes."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from trihedron.pipeline.registry import register
+from trihedron.pipeline.types import Correction, Map
+from trihedron.plugins.numerics.bundle_correction import bundle_correction
+from trihedron.plugins.numerics.bundle_problem import bundle_problem, bundle_window
+from trihedron.plugins.numerics.bundle_solver import solve_bundle
+from trihedron.plugins.numerics.local_window import newest_keyframes
+
+
+@register("bundle", "local_window")
+@dataclass(frozen=True)
+class LocalWindow:
+    """Once a keyframe: the newest ones, their points, lines and planes, and the right angles between these, at once.
+
+    Levenberg–Marquardt with the Schur complement on what the keyframes measured, each weighed by its covariance, with Huber's cost. Keyframes outside
+    the window that see its landmarks are held, and so is the first of all, which is the world."""
+
+    keyframes: int = 8  # at most, that may move: the newest and those that share most landmarks with it
+    fixed: int = 8  # at most, that are held
+    iterations: int = 10
+    line_sigma_px: float = 1.0  # of a segment's end point across it, as in the map
+    relation_sigma_deg: float = 0.5  # walls are parallel or perpendicular to within this
+    parallel_deg: float = 5.0  # planes nearer to parallel, or to a right angle, are meant to be
+
+    def __post_init__(self) -> None:
+        if self.keyframes < 1 or self.fixed < 0 or self.iterations < 1:
+            raise ValueError("keyframes, fixed, iterations: must be at least 1, 0 and 1")
+        if self.line_sigma_px <= 0.0 or self.relation_sigma_deg <= 0.0 or not 0.0 < self.parallel_deg < 45.0:
+            raise ValueError("line_sigma_px, relation_sigma_deg, parallel_deg: must be positive, parallel_deg below 45")
+
+    def __call__(self, map: Map) -> Correction | None:
+        """The correction, or None when this version of the map has no new keyframe, or nothing that could move."""
+        newest = newest_keyframes(map, 1)
+        if not len(newest) or map.keyframes.rows("index", newest)[0] != map.index:
+            return None
+        window = bundle_window(map, self.keyframes, self.fixed)
+        problem = bundle_problem(map, window, self.line_sigma_px, self.relation_sigma_deg, self.parallel_deg)
+        found = solve_bundle(*problem, self.iterations)  # of nothing too: the kernels are compiled on the first keyframe, before the clock starts
+        return bundle_correction(map, window, found) if len(window.free) else None
