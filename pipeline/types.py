@@ -232,7 +232,7 @@ class Pose(Value):
 
 @dataclass(frozen=True)
 class Map(Value):
-    """Keyframes and landmarks; a row number is an id for good, dead rows have `alive` False. Columns are listed in `plugins.numerics.landmarks`.
+    """Keyframes and landmarks; a row number is an id for good, dead rows have `alive` False. Columns are listed in `plugins.numerics.maps.landmarks`.
 
     `revision` counts versions; `point_observations` and its siblings say which keyframe (row) saw which landmark, and what it measured."""
 

@@ -25,7 +25,7 @@ from trihedron.pipeline.errors import UsageError, did_you_mean
 from trihedron.pipeline.geometry import exp_so3
 from trihedron.pipeline.registry import load_plugins, plugin_class, plugins_of
 from trihedron.pipeline.types import F64, ManhattanFrame
-from trihedron.plugins.numerics.cube_symmetry import CUBE
+from trihedron.plugins.numerics.axes.cube_symmetry import CUBE
 from trihedron.tools import manhattan_views as seen
 from trihedron.tools.arguments import Parser, table
 

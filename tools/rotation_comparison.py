@@ -24,7 +24,7 @@ from trihedron.pipeline.errors import DataError
 from trihedron.pipeline.geometry import nearest_pairs, nearest_rotation
 from trihedron.pipeline.recording import Recording
 from trihedron.pipeline.types import F64, ManhattanFrame
-from trihedron.plugins.numerics.cube_symmetry import CUBE, nearest_equivalent
+from trihedron.plugins.numerics.axes.cube_symmetry import CUBE, nearest_equivalent
 from trihedron.tools.arguments import Parser, table
 
 RECORDING, TIMING, ERRORS_PNG = "run.mcap", "timing.json", "rotation_error.png"

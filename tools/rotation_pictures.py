@@ -13,7 +13,7 @@ from trihedron.pipeline.errors import TrihedronError
 from trihedron.pipeline.geometry import rotation_angle_deg
 from trihedron.pipeline.recording import Recording
 from trihedron.pipeline.types import F64, Normals
-from trihedron.plugins.numerics.cube_symmetry import nearest_equivalent
+from trihedron.plugins.numerics.axes.cube_symmetry import nearest_equivalent
 from trihedron.tools import rotation_comparison as comparison
 
 AXIS_COLORS = ("tab:red", "tab:green", "tab:blue")

@@ -10,9 +10,9 @@ import numpy as np
 from trihedron.pipeline.geometry import invert, pose_matrix
 from trihedron.pipeline.registry import register
 from trihedron.pipeline.types import Correction, Map
-from trihedron.plugins.numerics.bundle_correction import carried_correction
-from trihedron.plugins.numerics.bundle_problem import BundleMeasurements, BundleState, bundle_problem, bundle_window
-from trihedron.plugins.numerics.local_window import newest_keyframes
+from trihedron.plugins.numerics.bundle.bundle_correction import carried_correction
+from trihedron.plugins.numerics.bundle.bundle_problem import BundleMeasurements, BundleState, bundle_problem, bundle_window
+from trihedron.plugins.numerics.maps.local_window import newest_keyframes
 
 
 @register("bundle", "colmap")

@@ -6,10 +6,10 @@ from dataclasses import dataclass
 
 from trihedron.pipeline.registry import register
 from trihedron.pipeline.types import Correction, Map
-from trihedron.plugins.numerics.bundle_correction import bundle_correction
-from trihedron.plugins.numerics.bundle_problem import bundle_problem, bundle_window
-from trihedron.plugins.numerics.bundle_solver import solve_bundle
-from trihedron.plugins.numerics.local_window import newest_keyframes
+from trihedron.plugins.numerics.bundle.bundle_correction import bundle_correction
+from trihedron.plugins.numerics.bundle.bundle_problem import bundle_problem, bundle_window
+from trihedron.plugins.numerics.bundle.bundle_solver import solve_bundle
+from trihedron.plugins.numerics.maps.local_window import newest_keyframes
 
 
 @register("bundle", "local_window")

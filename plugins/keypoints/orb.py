@@ -12,10 +12,10 @@ import numpy as np
 
 from trihedron.pipeline.registry import register
 from trihedron.pipeline.types import F32, I32, U8, Frame, Keypoints
-from trihedron.plugins.numerics.corner_measures import centroid_angles_deg, harris_scores
-from trihedron.plugins.numerics.depth_sampling import local_depth, noise_coefficients
-from trihedron.plugins.numerics.image_pyramid import full_pixels, image_pyramid
-from trihedron.plugins.numerics.spreading import Grid, spread_over_grid
+from trihedron.plugins.numerics.depth.depth_sampling import local_depth, noise_coefficients
+from trihedron.plugins.numerics.images.corner_measures import centroid_angles_deg, harris_scores
+from trihedron.plugins.numerics.images.image_pyramid import full_pixels, image_pyramid
+from trihedron.plugins.numerics.images.spreading import Grid, spread_over_grid
 
 MARGIN_PX = 19  # of a level, within which its descriptors would reach over the border
 FAST_PX = 4  # radius of the circle FAST compares with, and one for its comparison of neighbours

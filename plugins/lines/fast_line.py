@@ -9,7 +9,7 @@ import cv2
 
 from trihedron.pipeline.registry import register
 from trihedron.pipeline.types import Frame, LineSegments
-from trihedron.plugins.numerics.straight_edges import SMALLEST, StraightEdges
+from trihedron.plugins.numerics.images.straight_edges import SMALLEST, StraightEdges
 
 
 @register("lines", "fast_line")

@@ -9,10 +9,10 @@ import numpy as np
 
 from trihedron.pipeline.registry import register
 from trihedron.pipeline.types import I32, Correction, Frame, Map
-from trihedron.plugins.numerics.binary_words import as_bits, nearest_words, similarities, train
-from trihedron.plugins.numerics.local_window import observed_by
-from trihedron.plugins.numerics.loop_closing import LoopClosing
-from trihedron.plugins.numerics.loop_places import walked, within_reach
+from trihedron.plugins.numerics.maps.local_window import observed_by
+from trihedron.plugins.numerics.places.binary_words import as_bits, nearest_words, similarities, train
+from trihedron.plugins.numerics.places.loop_closing import LoopClosing
+from trihedron.plugins.numerics.places.loop_places import walked, within_reach
 
 
 @register("loop", "appearance")

@@ -9,12 +9,12 @@ import numpy as np
 
 from trihedron.pipeline.registry import register
 from trihedron.pipeline.types import F64, I32, ManhattanFrame, Normals, Planes, Segments
-from trihedron.plugins.numerics.atlanta_fit import fit_shared_vertical, shared_covariance, shared_vertical
-from trihedron.plugins.numerics.atlanta_modes import NONE, AtlantaFinder, AtlantaModes
-from trihedron.plugins.numerics.axis_fit import NOTHING_KNOWN, AxisFit, gather_directions
-from trihedron.plugins.numerics.frame_identities import missing, remembered
-from trihedron.plugins.numerics.lost_frames import lost_frames
-from trihedron.plugins.numerics.manhattan_modes import ModeFinder
+from trihedron.plugins.numerics.axes.atlanta_fit import fit_shared_vertical, shared_covariance, shared_vertical
+from trihedron.plugins.numerics.axes.atlanta_modes import NONE, AtlantaFinder, AtlantaModes
+from trihedron.plugins.numerics.axes.axis_fit import NOTHING_KNOWN, AxisFit, gather_directions
+from trihedron.plugins.numerics.axes.frame_identities import missing, remembered
+from trihedron.plugins.numerics.axes.lost_frames import lost_frames
+from trihedron.plugins.numerics.axes.manhattan_modes import ModeFinder
 
 
 @register("manhattan", "atlanta")

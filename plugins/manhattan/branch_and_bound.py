@@ -9,17 +9,17 @@ import numpy as np
 
 from trihedron.pipeline.registry import register
 from trihedron.pipeline.types import F64, ManhattanFrame, Normals, Planes, Segments
-from trihedron.plugins.numerics.cube_symmetry import nearest_equivalent
-from trihedron.plugins.numerics.manhattan_modes import Directions
-from trihedron.plugins.numerics.mode_options import ModeOptions
-from trihedron.plugins.numerics.rotation_search import RotationSearch
+from trihedron.plugins.numerics.axes.cube_symmetry import nearest_equivalent
+from trihedron.plugins.numerics.axes.manhattan_modes import Directions
+from trihedron.plugins.numerics.axes.mode_options import ModeOptions
+from trihedron.plugins.numerics.axes.rotation_search import RotationSearch
 
 
 @register("manhattan", "branch_and_bound")
 @dataclass(frozen=True)
 class BranchAndBound(ModeOptions):
     """The rotation with the greatest consensus of normals, planes and lines, found among all rotations whatever the previous frame was (Bazin et al.,
-    ACCV 2012; Joo et al., CVPR 2016; consensus and bounds in `numerics.consensus`, the search in `numerics.rotation_search`).
+    ACCV 2012; Joo et al., CVPR 2016; consensus and bounds in `axes.consensus`, the search in `axes.rotation_search`).
 
     What is certified, for the directions that take part in the search (`search_samples` normals spread over the image, all planes and lines): `gap`
     is how much more consensus, as a share, any rotation could have than the one returned; and unless the work limit was met, none further than

@@ -10,11 +10,11 @@ import numpy as np
 
 from trihedron.pipeline.registry import register
 from trihedron.pipeline.types import F64, Bool, ManhattanFrame, Normals, Planes, Segments
-from trihedron.plugins.numerics.axis_fit import AxisFit, gather_directions
-from trihedron.plugins.numerics.cube_symmetry import nearest_equivalent
-from trihedron.plugins.numerics.minimal_frames import frames_through, same_axes, score_frames
-from trihedron.plugins.numerics.procrustes import procrustes, square_angles
-from trihedron.plugins.numerics.sphere_modes import assign_axes
+from trihedron.plugins.numerics.axes.axis_fit import AxisFit, gather_directions
+from trihedron.plugins.numerics.axes.cube_symmetry import nearest_equivalent
+from trihedron.plugins.numerics.axes.minimal_frames import frames_through, same_axes, score_frames
+from trihedron.plugins.numerics.axes.sphere_modes import assign_axes
+from trihedron.plugins.numerics.motion.procrustes import procrustes, square_angles
 
 
 @register("manhattan", "line_plane_ransac")

@@ -8,11 +8,11 @@ import numpy as np
 
 from trihedron.pipeline.registry import register
 from trihedron.pipeline.types import ManhattanFrame, Normals, Planes, Segments
-from trihedron.plugins.numerics.axis_fit import HALF_SPHERE
-from trihedron.plugins.numerics.cube_symmetry import nearest_equivalent
-from trihedron.plugins.numerics.manhattan_modes import Directions, Modes
-from trihedron.plugins.numerics.mode_options import ModeOptions
-from trihedron.plugins.numerics.sphere_modes import search_axes
+from trihedron.plugins.numerics.axes.axis_fit import HALF_SPHERE
+from trihedron.plugins.numerics.axes.cube_symmetry import nearest_equivalent
+from trihedron.plugins.numerics.axes.manhattan_modes import Directions, Modes
+from trihedron.plugins.numerics.axes.mode_options import ModeOptions
+from trihedron.plugins.numerics.axes.sphere_modes import search_axes
 
 
 @register("manhattan", "mean_shift")

@@ -10,12 +10,12 @@ import numpy as np
 
 from trihedron.pipeline.registry import register
 from trihedron.pipeline.types import F64, ManhattanFrame, Normals, Planes, Segments
-from trihedron.plugins.numerics.axis_fit import NOTHING_KNOWN, AxisFit, gather_directions
-from trihedron.plugins.numerics.cube_symmetry import nearest_equivalent
-from trihedron.plugins.numerics.frame_identities import identified, missing, remembered, turn_between
-from trihedron.plugins.numerics.frame_mixture import Found, FrameMixture
-from trihedron.plugins.numerics.lost_frames import lost_frames, mode_spread
-from trihedron.plugins.numerics.manhattan_modes import ModeFinder
+from trihedron.plugins.numerics.axes.axis_fit import NOTHING_KNOWN, AxisFit, gather_directions
+from trihedron.plugins.numerics.axes.cube_symmetry import nearest_equivalent
+from trihedron.plugins.numerics.axes.frame_identities import identified, missing, remembered, turn_between
+from trihedron.plugins.numerics.axes.frame_mixture import Found, FrameMixture
+from trihedron.plugins.numerics.axes.lost_frames import lost_frames, mode_spread
+from trihedron.plugins.numerics.axes.manhattan_modes import ModeFinder
 
 
 @register("manhattan", "mixture")

@@ -8,11 +8,11 @@ import numpy as np
 
 from trihedron.pipeline.registry import register
 from trihedron.pipeline.types import F64, I32, ManhattanFrame, Planes
-from trihedron.plugins.numerics.axis_fit import NOTHING_KNOWN
-from trihedron.plugins.numerics.cube_symmetry import nearest_equivalent
-from trihedron.plugins.numerics.minimal_frames import frames_through, same_axes, score_frames
-from trihedron.plugins.numerics.procrustes import normal_covariance, procrustes, procrustes_covariance, square_angles
-from trihedron.plugins.numerics.sphere_modes import assign_axes
+from trihedron.plugins.numerics.axes.axis_fit import NOTHING_KNOWN
+from trihedron.plugins.numerics.axes.cube_symmetry import nearest_equivalent
+from trihedron.plugins.numerics.axes.minimal_frames import frames_through, same_axes, score_frames
+from trihedron.plugins.numerics.axes.sphere_modes import assign_axes
+from trihedron.plugins.numerics.motion.procrustes import normal_covariance, procrustes, procrustes_covariance, square_angles
 
 PRIOR = 1.0 / NOTHING_KNOWN  # 1/rad², weight of the previous rotation: holds the angles that no plane tells
 LARGEST_COS = 0.2  # of planes taken as perpendicular, however uncertain they are

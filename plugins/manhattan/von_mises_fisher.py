@@ -9,12 +9,12 @@ import numpy as np
 
 from trihedron.pipeline.registry import register
 from trihedron.pipeline.types import F64, ManhattanFrame, Normals, Segments
-from trihedron.plugins.numerics.axis_fit import HALF_SPHERE, NOTHING_KNOWN, gather_directions
-from trihedron.plugins.numerics.cube_symmetry import nearest_equivalent
-from trihedron.plugins.numerics.direction_information import isotropic_information
-from trihedron.plugins.numerics.manhattan_modes import NORMALS_PER_SAMPLE, Directions, ModeFinder, Modes
-from trihedron.plugins.numerics.sphere_modes import mode_statistics, orthonormal, search_axes, shift_axes
-from trihedron.plugins.numerics.von_mises_fisher import AxisMixture, broad_mixture, improved
+from trihedron.plugins.numerics.axes.axis_fit import HALF_SPHERE, NOTHING_KNOWN, gather_directions
+from trihedron.plugins.numerics.axes.cube_symmetry import nearest_equivalent
+from trihedron.plugins.numerics.axes.direction_information import isotropic_information
+from trihedron.plugins.numerics.axes.manhattan_modes import NORMALS_PER_SAMPLE, Directions, ModeFinder, Modes
+from trihedron.plugins.numerics.axes.sphere_modes import mode_statistics, orthonormal, search_axes, shift_axes
+from trihedron.plugins.numerics.axes.von_mises_fisher import AxisMixture, broad_mixture, improved
 
 
 @register("manhattan", "von_mises_fisher")

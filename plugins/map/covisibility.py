@@ -9,15 +9,15 @@ import numpy as np
 from trihedron.pipeline.geometry import rotation_angle_deg
 from trihedron.pipeline.registry import register
 from trihedron.pipeline.types import DEGRADED, I32, LOST, Correction, Frame, Keypoints, Map, Matches, Planes, Pose, Segments
-from trihedron.plugins.numerics import insertion
-from trihedron.plugins.numerics.anchoring import anchored
-from trihedron.plugins.numerics.association import Associated, associate, existing
-from trihedron.plugins.numerics.correction import apply_correction
-from trihedron.plugins.numerics.culling import cull, cull_keyframe
-from trihedron.plugins.numerics.landmarks import empty_map
-from trihedron.plugins.numerics.local_window import current_submap, keyframes_of, newest_keyframes
-from trihedron.plugins.numerics.merging import merge_lines, merge_planes, merge_points
-from trihedron.plugins.numerics.submaps import submap_of, tied
+from trihedron.plugins.numerics.maps import insertion
+from trihedron.plugins.numerics.maps.anchoring import anchored
+from trihedron.plugins.numerics.maps.association import Associated, associate, existing
+from trihedron.plugins.numerics.maps.correction import apply_correction
+from trihedron.plugins.numerics.maps.culling import cull, cull_keyframe
+from trihedron.plugins.numerics.maps.landmarks import empty_map
+from trihedron.plugins.numerics.maps.local_window import current_submap, keyframes_of, newest_keyframes
+from trihedron.plugins.numerics.maps.merging import merge_lines, merge_planes, merge_points
+from trihedron.plugins.numerics.maps.submaps import submap_of, tied
 
 STALE = 0.25  # of the view change of a keyframe, that makes one after max_frames: a camera at rest adds none
 

@@ -9,9 +9,9 @@ import numpy as np
 from trihedron.pipeline.geometry import pose_matrix
 from trihedron.pipeline.registry import register
 from trihedron.pipeline.types import F64, OK, Frame, Keypoints, Map, Matches, Planes, Pose, Rotation, Segments, Translation
-from trihedron.plugins.numerics.local_window import local_window
-from trihedron.plugins.numerics.map_search import Guess, MapSearch
-from trihedron.plugins.numerics.place_check import ABOUT_DEG, ABOUT_M
+from trihedron.plugins.numerics.maps.local_window import local_window
+from trihedron.plugins.numerics.maps.map_search import Guess, MapSearch
+from trihedron.plugins.numerics.places.place_check import ABOUT_DEG, ABOUT_M
 
 
 @register("matches", "local_map")

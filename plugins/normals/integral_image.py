@@ -9,7 +9,7 @@ import numpy as np
 
 from trihedron.pipeline.registry import register
 from trihedron.pipeline.types import I32, Camera, Frame, Normals
-from trihedron.plugins.numerics.patch_normals import block_sums, patch_normals, patch_sides
+from trihedron.plugins.numerics.depth.patch_normals import block_sums, patch_normals, patch_sides
 
 
 @register("normals", "integral_image")

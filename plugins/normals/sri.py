@@ -8,7 +8,7 @@ import cv2
 
 from trihedron.pipeline.registry import register
 from trihedron.pipeline.types import Frame, Normals
-from trihedron.plugins.numerics.cloud_normals import CloudNormals
+from trihedron.plugins.numerics.depth.cloud_normals import CloudNormals
 
 
 @register("normals", "sri")

@@ -8,10 +8,10 @@ import numpy as np
 
 from trihedron.pipeline.registry import register
 from trihedron.pipeline.types import Frame, Normals, Planes
-from trihedron.plugins.numerics.block_growing import grow_blocks
-from trihedron.plugins.numerics.planar_regions import PlanarRegions
-from trihedron.plugins.numerics.plane_blocks import block_planes, block_sums, blocks_to_cells
-from trihedron.plugins.numerics.plane_fitting import fit_labelled
+from trihedron.plugins.numerics.planes.block_growing import grow_blocks
+from trihedron.plugins.numerics.planes.planar_regions import PlanarRegions
+from trihedron.plugins.numerics.planes.plane_blocks import block_planes, block_sums, blocks_to_cells
+from trihedron.plugins.numerics.planes.plane_fitting import fit_labelled
 
 
 @register("planes", "cape")

@@ -8,9 +8,9 @@ import numpy as np
 
 from trihedron.pipeline.registry import register
 from trihedron.pipeline.types import F64, I32, Bool, Frame, Normals, Planes
-from trihedron.plugins.numerics.organised_grid import Grid, cells_by_component, coarser, connected_components, smooth_links
-from trihedron.plugins.numerics.planar_regions import EDGE, EDGE_M, MOST, PlanarRegions
-from trihedron.plugins.numerics.plane_fitting import fit_components
+from trihedron.plugins.numerics.depth.organised_grid import Grid, cells_by_component, coarser, connected_components, smooth_links
+from trihedron.plugins.numerics.planes.planar_regions import EDGE, EDGE_M, MOST, PlanarRegions
+from trihedron.plugins.numerics.planes.plane_fitting import fit_components
 
 
 @register("planes", "connected_components")

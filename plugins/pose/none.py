@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 from trihedron.pipeline.registry import register
 from trihedron.pipeline.types import Frame, Map, Pose, Rotation, Translation
-from trihedron.plugins.numerics.anchoring import anchored
-from trihedron.plugins.numerics.decoupled import decoupled_pose
+from trihedron.plugins.numerics.maps.anchoring import anchored
+from trihedron.plugins.numerics.maps.decoupled import decoupled_pose
 
 
 @register("pose", "none")

@@ -23,11 +23,11 @@ from trihedron.pipeline.types import (
     Tracks,
     Translation,
 )
-from trihedron.plugins.numerics.anchoring import anchored
-from trihedron.plugins.numerics.decoupled import FIRST_SIGMA, Decoupled, decoupled_pose, reference_of
-from trihedron.plugins.numerics.map_terms import line_terms, plane_terms, point_terms
-from trihedron.plugins.numerics.pose_solver import PoseSolution, solve_pose
-from trihedron.plugins.numerics.submaps import submap_of
+from trihedron.plugins.numerics.maps.anchoring import anchored
+from trihedron.plugins.numerics.maps.decoupled import FIRST_SIGMA, Decoupled, decoupled_pose, reference_of
+from trihedron.plugins.numerics.maps.map_terms import line_terms, plane_terms, point_terms
+from trihedron.plugins.numerics.maps.submaps import submap_of
+from trihedron.plugins.numerics.motion.pose_solver import PoseSolution, solve_pose
 
 SCORE = np.array([1, 2, 5])  # what a point, a line and a plane that agree count
 

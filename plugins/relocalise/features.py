@@ -8,12 +8,12 @@ import numpy as np
 
 from trihedron.pipeline.registry import register
 from trihedron.pipeline.types import DEGRADED, F64, I32, LOST, OK, Frame, Keypoints, Map, Planes, Pose, Rotation, Segments
-from trihedron.plugins.numerics.decoupled import reference_of
-from trihedron.plugins.numerics.layout_poses import layout_poses
-from trihedron.plugins.numerics.local_window import keyframes_of, observed_by
-from trihedron.plugins.numerics.place_check import Recognised, View, check_place
-from trihedron.plugins.numerics.place_votes import apart, block_of, distinct, likely_keyframes, lookalikes, rigid_hypotheses
-from trihedron.plugins.numerics.submaps import submap_of
+from trihedron.plugins.numerics.maps.decoupled import reference_of
+from trihedron.plugins.numerics.maps.local_window import keyframes_of, observed_by
+from trihedron.plugins.numerics.maps.submaps import submap_of
+from trihedron.plugins.numerics.places.layout_poses import layout_poses
+from trihedron.plugins.numerics.places.place_check import Recognised, View, check_place
+from trihedron.plugins.numerics.places.place_votes import apart, block_of, distinct, likely_keyframes, lookalikes, rigid_hypotheses
 
 
 @register("relocalise", "features")

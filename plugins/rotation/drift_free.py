@@ -9,9 +9,9 @@ import numpy as np
 from trihedron.pipeline.geometry import exp_so3, log_so3
 from trihedron.pipeline.registry import register
 from trihedron.pipeline.types import F64, Keypoints, ManhattanFrame, Map, Planes, Pose, Rotation, Segments, Tracks
-from trihedron.plugins.numerics.anchoring import anchored_before
-from trihedron.plugins.numerics.chained_rotation import Estimate, TrackedRotation, rotation_before, rotation_value
-from trihedron.plugins.numerics.manhattan_frames import KnownFrames, Sighting
+from trihedron.plugins.numerics.axes.manhattan_frames import KnownFrames, Sighting
+from trihedron.plugins.numerics.maps.anchoring import anchored_before
+from trihedron.plugins.numerics.motion.chained_rotation import Estimate, TrackedRotation, rotation_before, rotation_value
 
 
 @register("rotation", "drift_free")

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 from trihedron.pipeline.registry import register
 from trihedron.pipeline.types import Frame, LineSegments, Segments
-from trihedron.plugins.numerics.depth_sampling import noise_coefficients
-from trihedron.plugins.numerics.segment_lifting import lift_segments
+from trihedron.plugins.numerics.depth.depth_sampling import noise_coefficients
+from trihedron.plugins.numerics.depth.segment_lifting import lift_segments
 
 
 @register("segments", "ransac")

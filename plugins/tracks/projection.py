@@ -9,10 +9,10 @@ import numpy as np
 from trihedron.pipeline.geometry import exp_so3, log_so3, rotation_angle_deg, transform_planes
 from trihedron.pipeline.registry import register
 from trihedron.pipeline.types import F64, I32, Camera, Frame, Keypoints, ManhattanFrame, Planes, Segments, Tracks
-from trihedron.plugins.numerics.descriptors import match_lines, match_near
-from trihedron.plugins.numerics.flow import offset_px, predict_pixels
-from trihedron.plugins.numerics.plane_association import associate_planes
-from trihedron.plugins.numerics.relative_motion import Motion, motion_terms, solve_motion
+from trihedron.plugins.numerics.images.descriptors import match_lines, match_near
+from trihedron.plugins.numerics.images.flow import offset_px, predict_pixels
+from trihedron.plugins.numerics.motion.relative_motion import Motion, motion_terms, solve_motion
+from trihedron.plugins.numerics.planes.plane_association import associate_planes
 
 NO_PAIRS = np.zeros((0, 2), np.int32)
 

@@ -9,10 +9,10 @@ import numpy as np
 from trihedron.pipeline.geometry import pose_matrix, transform, transform_planes
 from trihedron.pipeline.registry import register
 from trihedron.pipeline.types import F64, LOST, Frame, Keypoints, Map, Planes, Pose, Rotation, Segments, Tracks, Translation
-from trihedron.plugins.numerics import uncertainty as un
-from trihedron.plugins.numerics.anchoring import anchored
-from trihedron.plugins.numerics.pose_solver import solve_pose
-from trihedron.plugins.numerics.pose_terms import SAME, LineTerms, PlaneTerms, PointTerms
+from trihedron.plugins.numerics.algebra import uncertainty as un
+from trihedron.plugins.numerics.maps.anchoring import anchored
+from trihedron.plugins.numerics.motion.pose_solver import solve_pose
+from trihedron.plugins.numerics.motion.pose_terms import SAME, LineTerms, PlaneTerms, PointTerms
 
 
 @register("translation", "levenberg_marquardt")

@@ -14,7 +14,7 @@ from trihedron.pipeline.errors import RecordingError
 from trihedron.pipeline.recording import Recording, RecordingWriter
 from trihedron.pipeline.runner import Runner
 from trihedron.pipeline.state import Keeper, Memory, load_map, reaches
-from trihedron.plugins.numerics.landmarks import empty_map
+from trihedron.plugins.numerics.maps.landmarks import empty_map
 
 sys.path.insert(0, str(Path(__file__).parent))
 from toys import ToyDataset, toy_graph

@@ -13,7 +13,7 @@ from trihedron.pipeline.camera import EXACT_DEPTH, Camera, DepthNoise
 from trihedron.pipeline.geometry import exp_so3, invert, log_so3, rotation_angle_deg, tangent_basis, transform, transform_planes
 from trihedron.pipeline.registry import parameters_of_method, plugins_of
 from trihedron.pipeline.types import Frame, Keypoints, ManhattanFrame, Normals, Planes, Segments
-from trihedron.plugins.numerics.cube_symmetry import CUBE, nearest_equivalent
+from trihedron.plugins.numerics.axes.cube_symmetry import CUBE, nearest_equivalent
 
 EXACT = Camera(640, 480, 525.0, 520.0, 319.5, 239.5, depth_noise=EXACT_DEPTH)
 SENSOR = Camera(640, 480, 525.0, 520.0, 319.5, 239.5, depth_noise=DepthNoise())

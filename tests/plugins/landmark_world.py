@@ -7,8 +7,8 @@ import numpy as np
 from trihedron.pipeline.camera import Camera
 from trihedron.pipeline.geometry import exp_se3, invert, pose_matrix, tangent_basis, transform, transform_planes
 from trihedron.pipeline.types import Frame, Keypoints, Planes, Rotation, Segments, Translation
-from trihedron.plugins.numerics.uncertainty import point_covariance
-from trihedron.plugins.numerics.visibility import clip_segments
+from trihedron.plugins.numerics.algebra.uncertainty import point_covariance
+from trihedron.plugins.numerics.maps.visibility import clip_segments
 
 CAMERA = Camera(640, 480, 525.0, 520.0, 319.5, 239.5)
 SIZE = np.array([5.0, 3.0, 6.0])  # of the room; its axes are not the world's

@@ -12,13 +12,13 @@ from trihedron.pipeline.table import Table
 from trihedron.plugins.bundle.colmap import Colmap, solve_colmap
 from trihedron.plugins.bundle.local_window import LocalWindow
 from trihedron.plugins.bundle.none import NoBundle
-from trihedron.plugins.numerics import bundle_terms as terms
-from trihedron.plugins.numerics.bundle_kernel import HUBER, SQUARES, TRUNCATED, NormalEquations, line_basis, linearise_bundle
-from trihedron.plugins.numerics.bundle_problem import bundle_problem, bundle_window
-from trihedron.plugins.numerics.bundle_solver import solve_bundle
-from trihedron.plugins.numerics.bundle_step import TRUST_LANDMARK, moved_bundle, trusted
-from trihedron.plugins.numerics.correction import apply_correction
-from trihedron.plugins.numerics.pose_terms import PARALLEL, PERPENDICULAR, SAME, basis, depth_direction, plane_rows
+from trihedron.plugins.numerics.bundle import bundle_terms as terms
+from trihedron.plugins.numerics.bundle.bundle_kernel import HUBER, SQUARES, TRUNCATED, NormalEquations, line_basis, linearise_bundle
+from trihedron.plugins.numerics.bundle.bundle_problem import bundle_problem, bundle_window
+from trihedron.plugins.numerics.bundle.bundle_solver import solve_bundle
+from trihedron.plugins.numerics.bundle.bundle_step import TRUST_LANDMARK, moved_bundle, trusted
+from trihedron.plugins.numerics.maps.correction import apply_correction
+from trihedron.plugins.numerics.motion.pose_terms import PARALLEL, PERPENDICULAR, SAME, basis, depth_direction, plane_rows
 
 sys.path.insert(0, str(Path(__file__).parent))
 from landmark_world import CAMERA, World, camera_at

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from trihedron.pipeline.geometry import exp_so3, rotation_angle_deg
 from trihedron.plugins.manhattan.von_mises_fisher import VonMisesFisher
-from trihedron.plugins.numerics.von_mises_fisher import broad_mixture, improved
+from trihedron.plugins.numerics.axes.von_mises_fisher import broad_mixture, improved
 
 KINDS = [
     ("three planes, clean", 0.99, 0.1),

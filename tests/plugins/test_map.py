@@ -12,8 +12,8 @@ from trihedron.pipeline.types import Correction, Pose
 from trihedron.plugins.map.covisibility import Covisibility
 from trihedron.plugins.map.none import NoMap
 from trihedron.plugins.matches.local_map import LocalMap
-from trihedron.plugins.numerics import plane_fusion
-from trihedron.plugins.numerics.local_window import local_window
+from trihedron.plugins.numerics.maps.local_window import local_window
+from trihedron.plugins.numerics.planes import plane_fusion
 
 sys.path.insert(0, str(Path(__file__).parent))
 from landmark_world import World, camera_at, rotation_of, translation_of

@@ -11,8 +11,8 @@ from trihedron.pipeline.geometry import exp_se3
 from trihedron.pipeline.types import Keypoints, Pose
 from trihedron.plugins.map.covisibility import Covisibility
 from trihedron.plugins.matches.local_map import LocalMap
-from trihedron.plugins.numerics.local_window import local_window, observed_by
-from trihedron.plugins.numerics.visibility import clip_segments
+from trihedron.plugins.numerics.maps.local_window import local_window, observed_by
+from trihedron.plugins.numerics.maps.visibility import clip_segments
 
 sys.path.insert(0, str(Path(__file__).parent))
 from landmark_world import CAMERA, World, camera_at, rotation_of, translation_of

@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 
 from trihedron.pipeline.geometry import exp_so3, log_so3, nearest_rotation, rotation_angle_deg
-from trihedron.plugins.numerics import rotation_search
-from trihedron.plugins.numerics.consensus import climb, consensus_bound, curvature, summit_radius
-from trihedron.plugins.numerics.cube_symmetry import CUBE, nearest_equivalent
-from trihedron.plugins.numerics.direction_groups import group_directions
-from trihedron.plugins.numerics.rotation_search import FACE, RotationSearch, angle_to_equivalent
-from trihedron.plugins.numerics.sphere_grid import cell_of, coarser, largest_near, neighbours, sphere_grid
+from trihedron.plugins.numerics.axes import rotation_search
+from trihedron.plugins.numerics.axes.consensus import climb, consensus_bound, curvature, summit_radius
+from trihedron.plugins.numerics.axes.cube_symmetry import CUBE, nearest_equivalent
+from trihedron.plugins.numerics.axes.direction_groups import group_directions
+from trihedron.plugins.numerics.axes.rotation_search import FACE, RotationSearch, angle_to_equivalent
+from trihedron.plugins.numerics.axes.sphere_grid import cell_of, coarser, largest_near, neighbours, sphere_grid
 
 INLIER = np.radians(12.0)
 SEARCH = RotationSearch(INLIER, np.radians(1.0), 0.0, 200_000)

@@ -8,11 +8,11 @@ import pytest
 from trihedron.pipeline.camera import DepthNoise
 from trihedron.plugins.normals.integral_image import IntegralImage
 from trihedron.plugins.normals.none import NoNormals
-from trihedron.plugins.numerics.block_clustering import cluster_blocks
-from trihedron.plugins.numerics.depth_sampling import noise_coefficients
-from trihedron.plugins.numerics.organised_grid import Grid, cell_inverse_depths, cell_rays
-from trihedron.plugins.numerics.plane_blocks import block_mse, block_plane, block_planes, block_sums
-from trihedron.plugins.numerics.plane_curvature import drop_engulfed, normals_of_regions
+from trihedron.plugins.numerics.depth.depth_sampling import noise_coefficients
+from trihedron.plugins.numerics.depth.organised_grid import Grid, cell_inverse_depths, cell_rays
+from trihedron.plugins.numerics.planes.block_clustering import cluster_blocks
+from trihedron.plugins.numerics.planes.plane_blocks import block_mse, block_plane, block_planes, block_sums
+from trihedron.plugins.numerics.planes.plane_curvature import drop_engulfed, normals_of_regions
 from trihedron.plugins.planes.ahc import Ahc
 from trihedron.plugins.planes.cape import Cape
 from trihedron.plugins.planes.ransac import Ransac

@@ -5,9 +5,9 @@ import pytest
 
 from trihedron.pipeline.camera import Camera
 from trihedron.pipeline.geometry import exp_se3, exp_so3, invert, log_se3, pose_matrix, tangent_basis, transform, transform_planes
-from trihedron.plugins.numerics import pose_terms as terms
-from trihedron.plugins.numerics.pose_solver import NO_LINES, NO_PLANES, NO_POINTS, classify_terms, solve_pose
-from trihedron.plugins.numerics.pose_terms import PARALLEL, PERPENDICULAR, SAME, LineTerms, PlaneTerms, PointTerms
+from trihedron.plugins.numerics.motion import pose_terms as terms
+from trihedron.plugins.numerics.motion.pose_solver import NO_LINES, NO_PLANES, NO_POINTS, classify_terms, solve_pose
+from trihedron.plugins.numerics.motion.pose_terms import PARALLEL, PERPENDICULAR, SAME, LineTerms, PlaneTerms, PointTerms
 
 CAMERA = Camera(640, 480, 525.0, 520.0, 319.5, 239.5)
 INTRINSICS = np.array([525.0, 520.0, 319.5, 239.5])

@@ -7,8 +7,8 @@ import pytest
 
 from trihedron.pipeline.geometry import exp_so3, log_so3, pose_matrix, rotation_angle_deg
 from trihedron.pipeline.types import LOST, OK, Frame, Pose
-from trihedron.plugins.numerics.cube_symmetry import nearest_equivalent
-from trihedron.plugins.numerics.manhattan_frames import KnownFrames
+from trihedron.plugins.numerics.axes.cube_symmetry import nearest_equivalent
+from trihedron.plugins.numerics.axes.manhattan_frames import KnownFrames
 from trihedron.plugins.rotation.constant_velocity import ConstantVelocity
 from trihedron.plugins.rotation.drift_free import DriftFree
 from trihedron.plugins.rotation.procrustes import Procrustes

@@ -13,7 +13,7 @@ from trihedron.pipeline.runner import Result
 from trihedron.pipeline.types import Pose
 from trihedron.plugins.map.covisibility import Covisibility
 from trihedron.plugins.matches.local_map import LocalMap
-from trihedron.plugins.numerics.local_window import current_submap, local_window, newest_keyframes
+from trihedron.plugins.numerics.maps.local_window import current_submap, local_window, newest_keyframes
 from trihedron.plugins.pose.refine import Refine
 
 sys.path.insert(0, str(Path(__file__).parent))

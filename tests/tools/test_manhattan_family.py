@@ -10,7 +10,7 @@ from trihedron.pipeline.geometry import exp_so3
 from trihedron.pipeline.registry import load_plugins
 from trihedron.pipeline.types import ManhattanFrame
 from trihedron.plugins.manhattan.branch_and_bound import BranchAndBound
-from trihedron.plugins.numerics.cube_symmetry import CUBE
+from trihedron.plugins.numerics.axes.cube_symmetry import CUBE
 from trihedron.tools import manhattan_views as seen
 from trihedron.tools.manhattan_family import error_deg, estimators, figures, measure
 

@@ -1,0 +1,1 @@
+"""The directions of a Manhattan or Atlanta world: modes, searches, fits, identities."""

@@ -1,0 +1,74 @@
+"""The Manhattan frames a camera has met, as rotations to the world with the number of observations behind each."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from trihedron.pipeline.geometry import exp_so3, log_so3, nearest_rotation
+from trihedron.pipeline.types import F64, I32, ManhattanFrame, Rotation
+from trihedron.plugins.numerics.axes.cube_symmetry import nearest_equivalent
+
+
+@dataclass(frozen=True)
+class Sighting:
+    """A Manhattan frame seen now, taken for the known one in row `row`: `R_camera_manhattan` in that one's naming of the axes, covariance (3, 3) of
+    phi in `R = Exp(phi) R_camera_manhattan`, and delta (3,) with `R_world_camera(Manhattan) = R_world_camera(predicted) · Exp(delta)`."""
+
+    row: int
+    R_camera_manhattan: F64
+    covariance: F64
+    delta: F64
+
+
+@dataclass(frozen=True)
+class KnownFrames:
+    """k frames: `R_world_manhattan` (k, 3, 3), `ids` (k,), `weights` (k,) observations."""
+
+    R_world_manhattan: F64
+    ids: I32
+    weights: F64
+
+    @staticmethod
+    def none() -> KnownFrames:
+        """No frame is known."""
+        return KnownFrames(np.zeros((0, 3, 3)), np.zeros(0, np.int32), np.zeros(0))
+
+    def seen_from(self, previous: Rotation, R_world_camera: F64, cap: float, gate: float) -> KnownFrames:
+        """With what the previous frame saw, now that its pose is known better: the mean on SO(3) of all observations. Weights end at `cap`, so that
+        the mean can follow a map that moves; what is off by more than `gate` (rad) is no observation."""
+        rotations, weights = self.R_world_manhattan.copy(), self.weights.copy()
+        for i in np.flatnonzero(np.isfinite(previous.R_camera_manhattan[:, 0, 0])):
+            step = log_so3(rotations[i].T @ R_world_camera @ previous.R_camera_manhattan[i])
+            if np.linalg.norm(step) < gate:
+                weights[i] = min(weights[i] + 1.0, cap)
+                rotations[i] = nearest_rotation(rotations[i] @ exp_so3(step / weights[i]))
+        return KnownFrames(rotations, self.ids, weights)
+
+    def sightings(self, manhattan: ManhattanFrame | None, R_world_camera: F64) -> list[tuple[int, list[Sighting]]]:
+        """For each row of the frames seen now what it means if it is each of the known ones, axes named as is nearest to the predicted rotation. A
+        frame out of sight, which an estimator carries on without inliers, is no sighting."""
+        if manhattan is None or not manhattan.supported:
+            return []
+        found = []
+        for k in np.flatnonzero(manhattan.inliers.any(axis=1)):
+            row = []
+            for i, R_world_manhattan in enumerate(self.R_world_manhattan):
+                named = nearest_equivalent(manhattan.rotations[k], R_world_camera.T @ R_world_manhattan)
+                row.append(Sighting(i, named, manhattan.covariance[k], log_so3(R_world_camera.T @ R_world_manhattan @ named.T)))
+            found.append((int(k), row))
+        return found
+
+    def with_new(self, R_world_manhattan: F64, weight: float) -> KnownFrames:
+        """With one more frame, whose first observation counts as `weight`."""
+        number = int(self.ids.max(initial=-1)) + 1
+        return KnownFrames(
+            np.concatenate([self.R_world_manhattan, R_world_manhattan[None]]),
+            np.append(self.ids, number).astype(np.int32),
+            np.append(self.weights, weight),
+        )
+
+    def only(self, keep: I32) -> KnownFrames:
+        """The given rows."""
+        return KnownFrames(self.R_world_manhattan[keep], self.ids[keep], self.weights[keep])

@@ -1,0 +1,274 @@
+"""Modes of directions on the unit sphere, antipodes being one: mean shift around three axes, search, and weighted fit of a rotation.
+
+Directions are (n, 3) unit rows with (n,) weights. Axes are the columns of a (3, 3) matrix;
+those found by mean shift are unit but only nearly at right angles.
+"""
+
+from __future__ import annotations
+
+import numba
+import numpy as np
+
+from trihedron.pipeline.geometry import nearest_rotation
+from trihedron.pipeline.types import F32, F64, I32
+from trihedron.plugins.numerics.algebra.small_linear import solve_positive, turn_left
+
+BINS = 90  # one degree each, of a quarter turn
+ROWS_APART = 4  # of those in which valid normals are counted
+
+
+@numba.njit(cache=True, nogil=True)
+def subsample_normals(normals: F32, most: int) -> F64:
+    """At most `most` of the finite normals of a grid (h, w, 3), on a regular sub-grid: (n, 3)."""
+    h, w = normals.shape[:2]
+    valid = 0
+    for r in range(0, h, ROWS_APART):
+        for c in range(w):
+            valid += min(ROWS_APART, h - r) * np.isfinite(normals[r, c, 2])
+    step = max(int(np.ceil(np.sqrt(valid / most))), 1)
+    out = np.empty((((h + step - 1) // step) * ((w + step - 1) // step), 3))
+    n = 0
+    for r in range(step // 2, h, step):
+        for c in range(step // 2, w, step):
+            if np.isfinite(normals[r, c, 0] + normals[r, c, 1] + normals[r, c, 2]) and n < most:
+                for k in range(3):
+                    out[n, k] = normals[r, c, k]
+                n += 1
+    return out[:n]
+
+
+@numba.njit(cache=True, nogil=True)
+def shift_axes(directions: F64, weights: F64, axes: F64, cone: float, bandwidth: float, iterations: int, tolerance: float) -> F64:
+    """Move each of m axes (3, m) to the Gaussian-weighted mean of the directions within `cone` (rad) of it, in its tangent plane, until none moves by
+    more than `tolerance` (rad). A direction goes to its nearest axis only; an axis without directions stays. Returns the axes (Zhou et al. 2016)."""
+    axes = axes.copy()
+    floor, narrow = np.cos(cone), -0.5 / (bandwidth * bandwidth)
+    total = np.empty((axes.shape[1], 4))
+    for _ in range(iterations):
+        total[:] = 0.0
+        for i in range(len(directions)):
+            x, y, z = directions[i, 0], directions[i, 1], directions[i, 2]
+            best, dot = 0, 0.0
+            for k in range(axes.shape[1]):
+                d = x * axes[0, k] + y * axes[1, k] + z * axes[2, k]
+                if abs(d) > abs(dot):
+                    best, dot = k, d
+            if abs(dot) < floor:
+                continue
+            # (1 - dot²) is the squared length in the tangent plane
+            w = weights[i] * np.exp(narrow * max(1.0 - dot * dot, 0.0))
+            total[best, 3] += w
+            w = w if dot > 0.0 else -w
+            total[best, 0] += w * x
+            total[best, 1] += w * y
+            total[best, 2] += w * z
+        moved = 0.0
+        for k in range(axes.shape[1]):
+            if total[k, 3] <= 0.0:
+                continue
+            norm = np.sqrt(total[k, 0] ** 2 + total[k, 1] ** 2 + total[k, 2] ** 2)
+            step = 0.0
+            for j in range(3):
+                step += (total[k, j] / norm - axes[j, k]) ** 2
+                axes[j, k] = total[k, j] / norm
+            moved = max(moved, step)
+        if moved < tolerance * tolerance:
+            break
+    return axes
+
+
+@numba.njit(cache=True, nogil=True)
+def _across(x: float, y: float, z: float) -> tuple[float, float, float, float, float, float]:
+    """Two unit vectors at right angles to the unit vector (x, y, z) and to each other."""
+    if abs(x) < 0.7:
+        norm = np.sqrt(y * y + z * z)
+        u = (0.0, z / norm, -y / norm)
+    else:
+        norm = np.sqrt(x * x + z * z)
+        u = (-z / norm, 0.0, x / norm)
+    return u[0], u[1], u[2], y * u[2] - z * u[1], z * u[0] - x * u[2], x * u[1] - y * u[0]
+
+
+@numba.njit(cache=True, nogil=True)
+def mode_statistics(directions: F64, weights: F64, axes: F64, cone: float) -> F64:
+    """(m, 4) for each of m axes (3, m): number and weight of the directions within the cone which have none nearer, their mean squared angle (rad²),
+    and the mean square of its component across the axis where that is largest. Without order the latter is cone² / 4, and cone² / 3 when all
+    directions lie in one plane."""
+    count = axes.shape[1]
+    out, moments, basis = np.zeros((count, 4)), np.zeros((count, 3)), np.empty((count, 6))
+    for k in range(count):
+        basis[k, 0], basis[k, 1], basis[k, 2], basis[k, 3], basis[k, 4], basis[k, 5] = _across(axes[0, k], axes[1, k], axes[2, k])
+    for i in range(len(directions)):
+        x, y, z = directions[i, 0], directions[i, 1], directions[i, 2]
+        best, nearest = np.cos(cone), -1
+        for k in range(count):
+            dot = abs(x * axes[0, k] + y * axes[1, k] + z * axes[2, k])
+            if dot > best:
+                best, nearest = dot, k
+        if nearest >= 0:
+            b, w = basis[nearest], weights[i]
+            p, q = x * b[0] + y * b[1] + z * b[2], x * b[3] + y * b[4] + z * b[5]
+            out[nearest, 0] += 1.0
+            out[nearest, 1] += w
+            moments[nearest, 0] += w * p * p
+            moments[nearest, 1] += w * p * q
+            moments[nearest, 2] += w * q * q
+    for k in range(count):
+        if out[k, 1] > 0.0:
+            uu, uv, vv = moments[k]
+            out[k, 2] = (uu + vv) / out[k, 1]
+            out[k, 3] = 0.5 * (uu + vv + np.sqrt((uu - vv) ** 2 + 4.0 * uv * uv)) / out[k, 1]
+    return out
+
+
+@numba.njit(cache=True, nogil=True)
+def density(directions: F64, weights: F64, axes: F64, bandwidth: float) -> float:
+    """Sum of the weights, each times a Gaussian of the angle to its nearest axis."""
+    total = 0.0
+    for i in range(len(directions)):
+        dot = 0.0
+        for k in range(3):
+            dot = max(dot, abs(directions[i, 0] * axes[0, k] + directions[i, 1] * axes[1, k] + directions[i, 2] * axes[2, k]))
+        total += weights[i] * np.exp(-0.5 * max(1.0 - dot * dot, 0.0) / (bandwidth * bandwidth))
+    return total
+
+
+def orthonormal(axes: F64, weights: F64) -> F64:
+    """The rotation nearest to three axes, each counting by its weight: SVD of `Σ w_k a_k e_kᵀ` with determinant +1. An axis of weight 0
+    becomes the cross product of the others; with fewer than two weights the remaining turn is arbitrary."""
+    return nearest_rotation(axes * weights)
+
+
+def right_handed(first: F64) -> F64:
+    """(3, 3) rotation whose first column is the unit vector `first`."""
+    return np.array([*first, *_across(first[0], first[1], first[2])]).reshape(3, 3).T
+
+
+@numba.njit(cache=True, nogil=True)
+def _mass(directions: F64, weights: F64, starts: F64, cone: float) -> F64:
+    """(m,) weight of the directions within the cone of each start, falling off towards its rim."""
+    mass, floor = np.zeros(len(starts)), np.cos(cone)
+    for s in range(len(starts)):
+        for i in range(len(directions)):
+            dot = abs(directions[i, 0] * starts[s, 0] + directions[i, 1] * starts[s, 1] + directions[i, 2] * starts[s, 2])
+            if dot > floor:
+                mass[s] += weights[i] * (dot - floor)
+    return mass
+
+
+def densest(directions: F64, weights: F64, starts: F64, cone: float, count: int) -> list[F64]:
+    """Of `starts` (m, 3) those with most weight within the cone, at least two cones apart; at most `count`, heaviest first."""
+    mass = _mass(directions, weights, starts, cone)
+    chosen: list[F64] = []
+    while len(chosen) < count and mass.max() > 0.0:
+        chosen.append(starts[int(np.argmax(mass))])
+        mass[np.abs(starts @ chosen[-1]) > np.cos(2.0 * cone)] = 0.0
+    return chosen
+
+
+@numba.njit(cache=True, nogil=True)
+def _histogram(directions: F64, weights: F64, frame: F64, cone: float) -> F64:
+    """(BINS,) weight of the directions normal to the first column of `frame` by their turn from its second to its third, modulo a quarter turn."""
+    histogram, limit = np.zeros(BINS), np.sin(cone)
+    for i in range(len(directions)):
+        x, y, z = directions[i, 0], directions[i, 1], directions[i, 2]
+        if abs(x * frame[0, 0] + y * frame[1, 0] + z * frame[2, 0]) < limit:
+            angle = np.arctan2(x * frame[0, 2] + y * frame[1, 2] + z * frame[2, 2], x * frame[0, 1] + y * frame[1, 1] + z * frame[2, 1])
+            histogram[int(np.floor(angle * BINS / (0.5 * np.pi))) % BINS] += weights[i]
+    return histogram
+
+
+@numba.njit(cache=True, nogil=True)
+def _quarter_turns(histogram: F64, count: int) -> F64:
+    """(count,) the fullest turns (rad, modulo a quarter turn), 10° apart."""
+    smooth, turns = np.zeros(BINS), np.empty(count)
+    for i in range(BINS):
+        for k in range(-4, 5):
+            smooth[i] += (5 - abs(k)) * histogram[(i - k) % BINS]
+    for t in range(count):
+        best = int(np.argmax(smooth))
+        turns[t] = (best + 0.5) * 0.5 * np.pi / BINS
+        for k in range(best - 10, best + 11):
+            smooth[k % BINS] = 0.0
+    return turns
+
+
+def search_axes(directions: F64, weights: F64, starts: F64, cone: float, bandwidth: float, primaries: int, turns: int) -> F64:
+    """The three orthogonal axes of greatest density, from nothing: each of the `primaries` densest directions with its `turns` fullest turns about it
+    is refined and compared. `starts` (m, 3) are directions spread over the half sphere, less than a cone apart. (3, 3) rotation."""
+    best, found = -1.0, np.eye(3)
+    for start in densest(directions, weights, starts, cone, primaries):
+        alone = np.zeros((3, 3))  # zero axes attract nothing
+        alone[:, 0] = start
+        frame = right_handed(shift_axes(directions, weights, alone, cone, bandwidth, 10, 1e-3)[:, 0])
+        for turn in _quarter_turns(_histogram(directions, weights, frame, cone), turns):
+            c, s = np.cos(turn), np.sin(turn)
+            R = frame @ np.array([[1.0, 0.0, 0.0], [0.0, c, -s], [0.0, s, c]])
+            axes = shift_axes(directions, weights, R, cone, bandwidth, 5, 1e-3)
+            R = orthonormal(axes, np.sqrt(mode_statistics(directions, weights, axes, cone)[:, 1]) + 1e-9)
+            score = density(directions, weights, R, bandwidth)
+            if score > best:
+                best, found = score, R
+    return found
+
+
+@numba.njit(cache=True, nogil=True)
+def assign_axes(directions: F64, R: F64, cone: float) -> I32:
+    """(n,) column of R (3, m) nearest to each direction, antipodes being one; -1 further than `cone` (rad) from all, or NaN."""
+    out = np.full(len(directions), -1, np.int32)
+    for i in range(len(directions)):
+        best = np.cos(cone)
+        for k in range(R.shape[1]):
+            dot = abs(directions[i, 0] * R[0, k] + directions[i, 1] * R[1, k] + directions[i, 2] * R[2, k])
+            if dot > best:
+                best, out[i] = dot, k
+    return out
+
+
+@numba.njit(cache=True, nogil=True)
+def fit_rotation(directions: F64, information: F64, axes: I32, R: F64, gate: float, iterations: int) -> tuple[F64, F64, float, float]:
+    """Rotation whose columns `axes[i]` best fit measured directions (n, 3), signs free; rows with axis -1 take no part. `information` is (n, 3, 3) in
+    1/rad², zero along the direction. Gauss–Newton on `R <- Exp(phi) R` with Cauchy weights, one half at `gate` σ. Returns R, the information of
+    phi (3, 3), the weighted χ² and the weighted number of its components."""
+    R = R.copy()
+    H, g, r, v, phi = np.zeros((3, 3)), np.zeros(3), np.zeros(3), np.zeros(3), np.zeros(3)
+    chi2, components = 0.0, 0.0
+    for remaining in range(iterations, -1, -1):
+        H[:] = 0.0
+        g[:] = 0.0
+        chi2, components = 0.0, 0.0
+        for i in range(len(directions)):
+            if axes[i] < 0:
+                continue
+            a, L = R[:, axes[i]], information[i]
+            sign = 1.0 if directions[i, 0] * a[0] + directions[i, 1] * a[1] + directions[i, 2] * a[2] > 0.0 else -1.0
+            for k in range(3):
+                r[k] = sign * directions[i, k] - a[k]
+            for k in range(3):
+                v[k] = L[k, 0] * r[0] + L[k, 1] * r[1] + L[k, 2] * r[2]
+            m2 = r[0] * v[0] + r[1] * v[1] + r[2] * v[2]
+            w = 1.0 / (1.0 + m2 / (gate * gate))
+            # d(phi × a)/d phi = -[a]×, so the gradient is a × (Λ r) and the Hessian [a]× Λ [a]×ᵀ
+            _add_cross(a, v, w, g)
+            for j in range(3):
+                ex = (0.0, -a[2], a[1]) if j == 0 else ((a[2], 0.0, -a[0]) if j == 1 else (-a[1], a[0], 0.0))  # e_j × a
+                for k in range(3):
+                    v[k] = L[k, 0] * ex[0] + L[k, 1] * ex[1] + L[k, 2] * ex[2]
+                _add_cross(a, v, w, H[:, j])
+            chi2 += w * m2
+            components += 2.0 * w
+        if remaining == 0:
+            break
+        for k in range(3):
+            H[k, k] += 1e-6  # a turn that nothing measures stays
+        solve_positive(H, g, phi)
+        turn_left(phi, R)
+    return R, H, chi2, components
+
+
+@numba.njit(cache=True, nogil=True)
+def _add_cross(a: F64, v: F64, w: float, out: F64) -> None:
+    """out += w (a × v)."""
+    out[0] += w * (a[1] * v[2] - a[2] * v[1])
+    out[1] += w * (a[2] * v[0] - a[0] * v[2])
+    out[2] += w * (a[0] * v[1] - a[1] * v[0])

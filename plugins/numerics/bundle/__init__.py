@@ -1,0 +1,1 @@
+"""Bundle adjustment of a window of keyframes."""

@@ -1,0 +1,151 @@
+"""The bundle-adjustment problem of a window of keyframes: what is unknown, and what was measured of it, gathered from a map."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from trihedron.pipeline.types import F64, I32, Map, Table
+from trihedron.plugins.numerics.algebra.uncertainty import inverse
+from trihedron.plugins.numerics.maps.local_window import covisible_keyframes, newest_keyframes, observed_by
+from trihedron.plugins.numerics.motion.pose_terms import PARALLEL, PERPENDICULAR
+
+
+class BundleState(NamedTuple):
+    """The unknowns: k keyframes (`T_world_camera`), n points, m lines by two points each, p planes, all in the world."""
+
+    rotations: F64  # (k, 3, 3)
+    positions: F64  # (k, 3)
+    points: F64  # (n, 3)
+    lines: F64  # (m, 2, 3)
+    planes: F64  # (p, 4)
+
+
+class BundleMeasurements(NamedTuple):
+    """What the keyframes measured. Observations of points and lines are in the order of their landmarks: those of point i are rows
+    `point_starts[i]` to `point_starts[i + 1]`. Numbers of keyframes, points, ... are rows of the state."""
+
+    free: int  # the first so many keyframes may move
+    intrinsics: F64  # (k, 4) fx, fy, cx, cy
+    point_starts: I32  # (n + 1,)
+    point_keyframes: I32  # (o,)
+    pixels: F64  # (o, 2)
+    depth_m: F64  # (o,) NaN = none
+    sigma_px: F64  # (o,)
+    sigma_m: F64  # (o,)
+    line_starts: I32  # (m + 1,)
+    line_keyframes: I32  # (q,)
+    endpoints_px: F64  # (q, 2, 2)
+    observed_m: F64  # (q, 2, 3) camera, NaN = none
+    observed_covariance_m2: F64  # (q, 2, 3, 3)
+    line_sigma_px: float
+    plane_keyframes: I32  # (r,)
+    plane_rows: I32  # (r,)
+    observed_planes: F64  # (r, 4) camera
+    plane_information: F64  # (r, 3, 3) of (a, b, d)
+    relations: I32  # (s, 3): PARALLEL or PERPENDICULAR, and two planes
+    relation_variance: F64  # (s,) rad²
+    robust: bool  # whether terms beyond their 95 % gate count less, and in the end, points and lines, not at all
+
+
+@dataclass(frozen=True)
+class BundleWindow:
+    """Rows of the map: the keyframes that may move, those that are held, and the landmarks that the former see. Each sorted."""
+
+    free: I32
+    fixed: I32
+    points: I32
+    lines: I32
+    planes: I32
+
+
+def bundle_window(map: Map, free: int, fixed: int, least_fixed: int = 1) -> BundleWindow:
+    """The newest keyframe and those that share most landmarks with it, at most `free`, held in place by at most `fixed` further ones that see the
+    same landmarks. The first keyframe is the world and never moves; where fewer than `least_fixed` hold the window, its oldest keyframes do, which
+    may leave nothing to move."""
+    newest = newest_keyframes(map, 1)
+    moving = np.sort(np.concatenate([newest, covisible_keyframes(map, newest, free - 1)]))
+    held = covisible_keyframes(map, moving, fixed)
+    while len(moving) and (len(held) < least_fixed or moving[0] == 0):
+        held, moving = np.append(held, moving[:1]), moving[1:]
+    points, lines, planes = (observed_by(map, moving, kind) for kind in ("point", "line", "plane"))
+    return BundleWindow(moving, np.sort(held), points, lines, planes)
+
+
+def bundle_problem(
+    map: Map, window: BundleWindow, line_sigma_px: float = 1.0, relation_sigma_deg: float = 0.5, parallel_deg: float = 5.0
+) -> tuple[BundleState, BundleMeasurements]:
+    """The unknowns of the window at their places in the map, and all that its keyframes measured of its landmarks. Planes within `parallel_deg` of
+    parallel or of a right angle are held to it to within `relation_sigma_deg`."""
+    keyframes = np.concatenate([window.free, window.fixed])
+    poses = map.keyframes.rows("T_world_camera", keyframes)
+    state = BundleState(
+        poses[:, :3, :3].copy(),
+        poses[:, :3, 3].copy(),
+        map.points.rows("position_m", window.points),
+        map.lines.rows("endpoints_m", window.lines),
+        map.planes.rows("coefficients", window.planes),
+    )
+    point_rows, point_keyframes, point_starts = _observations(map, "point", keyframes, window.points)
+    line_rows, line_keyframes, line_starts = _observations(map, "line", keyframes, window.lines)
+    plane_rows, plane_keyframes, plane_starts = _observations(map, "plane", keyframes, window.planes)
+    relations, variance = _relations(state.planes, relation_sigma_deg, parallel_deg)
+    return state, BundleMeasurements(
+        len(window.free),
+        map.keyframes.rows("intrinsics", keyframes),
+        point_starts,
+        point_keyframes,
+        _column(map.point_observations, "pixel", point_rows),
+        _column(map.point_observations, "depth_m", point_rows),
+        _column(map.point_observations, "sigma_px", point_rows),
+        _column(map.point_observations, "sigma_m", point_rows),
+        line_starts,
+        line_keyframes,
+        _column(map.line_observations, "endpoints_px", line_rows),
+        _column(map.line_observations, "endpoints_m", line_rows),
+        _column(map.line_observations, "covariance_m2", line_rows),
+        line_sigma_px,
+        plane_keyframes,
+        np.repeat(np.arange(len(window.planes), dtype=np.int32), np.diff(plane_starts)),
+        map.plane_observations.rows("coefficients", plane_rows),
+        inverse(map.plane_observations.rows("covariance", plane_rows)),
+        relations,
+        variance,
+        True,
+    )
+
+
+def _column(table: Table, name: str, rows: I32) -> F64:
+    return np.asarray(table.rows(name, rows), np.float64)
+
+
+def _observations(map: Map, kind: str, keyframes: I32, ids: I32) -> tuple[I32, I32, I32]:
+    """Rows of the observation table in which the keyframes saw the landmarks, in the order of these; the place among the keyframes of each, and where
+    each landmark's rows begin, (n + 1,)."""
+    table: Table = getattr(map, f"{kind}_observations")
+    spans = map.keyframes.rows(f"{kind}s", keyframes)
+    rows = np.concatenate([np.empty(0, np.int32), *(np.arange(a, b, dtype=np.int32) for a, b in spans)])
+    who = np.repeat(np.arange(len(keyframes), dtype=np.int32), spans[:, 1] - spans[:, 0])
+    seen = table.rows(kind, rows)
+    place = np.searchsorted(ids, seen)
+    known = place < len(ids)
+    known[known] = ids[place[known]] == seen[known]
+    rows, who, place = rows[known], who[known], place[known]
+    order = np.argsort(place, kind="stable")
+    starts = np.concatenate([[0], np.cumsum(np.bincount(place, minlength=len(ids)))]).astype(np.int32)
+    return rows[order], who[order], starts
+
+
+def _relations(planes: F64, sigma_deg: float, parallel_deg: float) -> tuple[I32, F64]:
+    """Pairs of planes that are parallel or at right angles, (s, 3), and the variance of each angle (rad²): walls deviate one by one, so a plane with
+    k partners says as much as one of them in all."""
+    cosine = np.abs(planes[:, :3] @ planes[:, :3].T)
+    limit = np.radians(parallel_deg)
+    related = np.triu((cosine > np.cos(limit)) | (cosine < np.sin(limit)), 1)
+    a, b = np.nonzero(related)
+    kinds = np.where(cosine[a, b] > 0.5, PARALLEL, PERPENDICULAR)
+    partners = (related | related.T).sum(axis=1)
+    variance = np.radians(sigma_deg) ** 2 * 0.5 * (partners[a] + partners[b])
+    return np.stack([kinds, a, b], axis=-1).astype(np.int32), np.asarray(variance, np.float64)

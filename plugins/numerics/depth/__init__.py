@@ -1,0 +1,1 @@
+"""Depth images: sampling, noise, normals, 3D lines."""

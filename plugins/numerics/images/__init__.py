@@ -1,0 +1,1 @@
+"""Key points and lines of an image, and matching by descriptors."""

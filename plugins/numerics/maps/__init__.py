@@ -1,0 +1,1 @@
+"""The map: its columns, what a keyframe adds, what is searched in it, how it is corrected."""

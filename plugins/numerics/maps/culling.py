@@ -1,0 +1,78 @@
+"""Removing landmarks that are not found again, and keyframes that others make redundant."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from trihedron.pipeline.types import F64, I32, Bool, Map, Matches, Table
+from trihedron.plugins.numerics.maps.local_window import WEIGHTS, covisible_keyframes, newest_keyframes, observed_by
+
+FARTHER = 1.2  # a landmark seen from at most this many times as far is seen as well: a level of the key points' pyramid
+KEPT = 4  # newest keyframes that are never redundant yet: the newest one's landmarks are still on trial
+
+
+def cull(map: Map, keyframe: int, matches: Matches | None, trial: int, min_found: float) -> Map:
+    """Kill points and lines that were expected by this keyframe, or born `trial` keyframes ago, and are found too seldom. Costs what is in view,
+    not what is in the map."""
+    young = np.array([keyframe - trial], np.int32) if keyframe >= trial else np.empty(0, np.int32)
+    changes: dict[str, Any] = {}
+    for kind, visible in (("point", "visible_points"), ("line", "visible_lines")):
+        table: Table = getattr(map, f"{kind}s")
+        ids = np.union1d(observed_by(map, young, kind), getattr(matches, visible) if matches is not None else young[:0]).astype(np.int32)
+        found, seen, first = table.rows("found", ids), table.rows("visible", ids), table.rows("first", ids)
+        seldom = (found < min_found * seen) | ((first == keyframe - trial) & (found < trial) & (seen >= trial))
+        ids = ids[seldom]
+        changes[f"{kind}s"] = table.updated(ids, alive=np.zeros(len(ids), np.bool_))
+    return replace(map, **changes)
+
+
+def cull_keyframe(map: Map, others: int, share: float) -> Map:
+    """Retire the one keyframe about the newest whose landmarks most are seen as well by at least `others` further ones, if these are more than
+    `share` of them (ORB-SLAM: 90 % by three), all kinds weighed as in co-visibility. Its pose and its measurements stay, for what hangs on them; it
+    is no longer part of any window. The first keyframe, which is the world, and the newest few are spared."""
+    newest = newest_keyframes(map, KEPT)
+    around = covisible_keyframes(map, newest, 2 * others) if len(newest) else newest
+    around = np.sort(around[around > 0])
+    shares = np.array([_redundancy(map, int(k), others) for k in around])
+    if not len(shares) or shares.max() <= share:
+        return map
+    gone = around[[int(np.argmax(shares))]]
+    return replace(map, keyframes=map.keyframes.updated(gone, alive=np.zeros(1, np.bool_)))
+
+
+def _redundancy(map: Map, keyframe: int, others: int) -> float:
+    """Weighed share of a keyframe's living landmarks that at least so many other living keyframes saw from as near."""
+    seen, redundant = 0, 0
+    for kind, weight in WEIGHTS.items():
+        ids = observed_by(map, np.array([keyframe], np.int32), kind)
+        table: Table = getattr(map, f"{kind}s")
+        as_near = _as_near(map, keyframe, table.rows("observers", ids), _centres(table, kind, ids))
+        seen += weight * len(ids)
+        redundant += weight * int(np.count_nonzero(as_near.sum(axis=1) >= others))
+    return redundant / max(seen, 1)
+
+
+def _centres(table: Table, kind: str, ids: I32) -> F64:
+    """(n, 3) where landmarks are."""
+    if kind == "point":
+        return table.rows("position_m", ids)
+    if kind == "line":
+        return np.asarray(table.rows("endpoints_m", ids).mean(axis=1), np.float64)
+    samples = table.rows("samples_m", ids).astype(np.float64)
+    known = np.isfinite(samples).all(axis=2, keepdims=True)
+    return np.asarray(np.where(known, samples, 0.0).sum(axis=1) / np.maximum(known.sum(axis=1), 1), np.float64)
+
+
+def _as_near(map: Map, keyframe: int, observers: I32, centres: F64) -> Bool:
+    """(n, OBSERVERS) which observers are living keyframes other than this one, from which a landmark is at most FARTHER times as far."""
+    rows = np.unique(observers[observers >= 0])
+    place = np.searchsorted(rows, observers)  # of an empty one: 0, and not counted
+    places = map.keyframes.rows("T_world_camera", rows)[:, :3, 3]
+    living = map.keyframes.rows("alive", rows) & (rows != keyframe)
+    away = np.linalg.norm(places[place] - centres[:, None], axis=-1)
+    own = map.keyframes.rows("T_world_camera", np.array([keyframe]))[0, :3, 3]
+    near: Bool = (observers >= 0) & living[place] & (away <= FARTHER * np.linalg.norm(own - centres, axis=-1)[:, None])
+    return near

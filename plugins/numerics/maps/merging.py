@@ -1,0 +1,163 @@
+"""Joining landmarks that turn out to be one and the same: points, lines and planes. The older id lives on."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from trihedron.pipeline.geometry import invert, transform
+from trihedron.pipeline.types import F64, I32, Bool, Map, Table
+from trihedron.plugins.numerics.algebra.uncertainty import inverse
+from trihedron.plugins.numerics.images.descriptors import match_lines, match_near
+from trihedron.plugins.numerics.maps.insertion import View, lengthened
+from trihedron.plugins.numerics.maps.landmarks import OBSERVERS
+from trihedron.plugins.numerics.maps.local_window import newest_keyframes, observed_by
+from trihedron.plugins.numerics.maps.map_terms import points_along
+from trihedron.plugins.numerics.maps.visibility import clip_segments
+from trihedron.plugins.numerics.motion.pose_kernel import CHI2_2, CHI2_3
+from trihedron.plugins.numerics.planes import plane_fusion
+from trihedron.plugins.numerics.planes.plane_association import mean_distance, overlap
+
+NEAR_PX = 3.0  # twins project this near to each other
+TWIN_BITS, TWIN_L2 = 50, 150  # and look as alike as a strict match (ORB-SLAM2: 50)
+LINE_DEG, LINE_OVERLAP, LINE_BITS = 2.0, 0.3, 60
+
+
+def merge_points(map: Map, view: View, visible: I32, metric: str) -> Map:
+    """Join points that were expected by this keyframe and not found with those it did find or make, where pixel, descriptor and place agree."""
+    seen = observed_by(map, np.array([view.keyframe], np.int32), "point")
+    idle = np.setdiff1d(visible[map.points.rows("alive", visible)], seen).astype(np.int32)
+    sides = [
+        (
+            view.camera.project(transform(invert(view.T_world_camera), map.points.rows("position_m", ids))).astype(np.float32),
+            map.points.rows("descriptor", ids),
+            map.points.rows("octave", ids),
+        )
+        for ids in (idle, seen)
+    ]
+    limit = TWIN_BITS if metric == "hamming" else TWIN_L2
+    found = match_near(*sides[0], *sides[1], np.full(len(idle), NEAR_PX, np.float32), 1, limit, 1.0, metric)
+    pairs = np.stack([idle[found >= 0], seen[found[found >= 0]]], axis=-1)
+    position, information = map.points.rows("position_m", pairs.ravel()).reshape(-1, 2, 3), map.points.rows("information", pairs.ravel())
+    information = information.reshape(-1, 2, 3, 3)
+    apart = position[:, 1] - position[:, 0]
+    covariance = inverse(information).sum(axis=1)
+    same: Bool = np.einsum("ni,nij,nj->n", apart, inverse(covariance), apart) <= CHI2_3
+    pairs, position, information = pairs[same], position[same], information[same]
+    total = information.sum(axis=1)
+    joined = np.linalg.solve(total, np.einsum("nkij,nkj->ni", information, position)[..., None])[..., 0]
+    kept, gone = pairs.min(axis=1), pairs.max(axis=1)
+    looks: dict[str, Any] = {name: map.points.rows(name, pairs[:, 1]) for name in ("descriptor", "direction", "distance_m", "octave")}
+    points = map.points.updated(kept, position_m=joined, information=0.5 * total, **looks)  # half: both knew some of the same frames
+    return _buried(replace(map, points=points), "point", kept, gone)
+
+
+def merge_lines(map: Map, view: View, visible: I32) -> Map:
+    """Join lines that were expected by this keyframe and not found with those it did find or make, where image, descriptor and place agree."""
+    seen = observed_by(map, np.array([view.keyframe], np.int32), "line")
+    idle = np.setdiff1d(visible[map.lines.rows("alive", visible)], seen).astype(np.int32)
+    sides = []
+    for ids in (idle, seen):
+        pixels, inside = clip_segments(transform(invert(view.T_world_camera), map.lines.rows("endpoints_m", ids)), view.camera)
+        pixels[~inside] = np.nan
+        sides.append((pixels.astype(np.float32), map.lines.rows("descriptor", ids)))
+    found = match_lines(*sides[0], *sides[1], LINE_DEG, NEAR_PX, LINE_OVERLAP, LINE_BITS, 1.0)
+    pairs = np.sort(np.stack([idle[found >= 0], seen[found[found >= 0]]], axis=-1), axis=1)
+    pairs = pairs[_collinear(map.lines, pairs[:, 0], pairs[:, 1])]
+    kept, gone = pairs[:, 0], pairs[:, 1]
+    endpoints, information = lengthened(
+        map.lines.rows("endpoints_m", kept), map.lines.rows("information", kept), map.lines.rows("endpoints_m", gone)
+    )
+    lines = map.lines.updated(kept, endpoints_m=endpoints, information=information, descriptor=map.lines.rows("descriptor", gone))
+    return _buried(replace(map, lines=lines), "line", kept, gone)
+
+
+def _collinear(lines: Table, a: I32, b: I32) -> Bool:
+    """(n,) whether both ends of line b lie on line a, as far as is known of either."""
+    ends, on = lines.rows("endpoints_m", b), lines.rows("endpoints_m", a)
+    direction = on[:, 1] - on[:, 0]
+    share = np.einsum("nkj,nj->nk", ends - on[:, :1], direction) / np.maximum((direction**2).sum(-1), 1e-12)[:, None]
+    foot, covariance = points_along(on, inverse(lines.rows("information", a)), share)
+    covariance += inverse(lines.rows("information", b))
+    chi2 = np.einsum("nki,nkij,nkj->nk", ends - foot, inverse(covariance), ends - foot)
+    good: Bool = (chi2 <= CHI2_2).all(axis=1)
+    return good
+
+
+def merge_planes(map: Map, keyframe: int, max_deg: float, max_m: float) -> Map:
+    """Join planes seen by this keyframe, or by those before it, that have become the same one. The older id lives on."""
+    fresh = observed_by(map, np.array([keyframe], np.int32), "plane")
+    around = observed_by(map, newest_keyframes(map, 5), "plane")
+    for b in around[::-1]:
+        for a in around[around < b]:
+            if (a in fresh or b in fresh) and _are_one(map.planes, int(a), int(b), float(np.cos(np.radians(max_deg))), max_m):
+                map = _join(map, int(a), int(b))
+                break
+    return map
+
+
+def fuse_planes(map: Map, older: I32, newer: I32, max_deg: float, max_m: float) -> Map:
+    """Join each of the planes `newer` with the first of the planes `older` that is the same one, both given by id."""
+    for b in newer:
+        for a in older:
+            if _are_one(map.planes, int(min(a, b)), int(max(a, b)), float(np.cos(np.radians(max_deg))), max_m):
+                map = _join(map, int(min(a, b)), int(max(a, b)))
+                break
+    return map
+
+
+def _are_one(planes: Table, a: int, b: int, cosine: float, max_m: float) -> bool:
+    """Whether two living planes, seen from the same side, lie within `max_m` of each other on average, both ways, and overlap."""
+    ids = np.array([a, b], np.int32)
+    if not planes.rows("alive", ids).all():
+        return False
+    coefficients: F64 = planes.rows("coefficients", ids)
+    if coefficients[0, :3] @ coefficients[1, :3] < cosine:
+        return False
+    samples = planes.rows("samples_m", ids)
+    apart = max(mean_distance(coefficients[0], samples[1]), mean_distance(coefficients[1], samples[0]))
+    return apart < max_m and max(overlap(samples[0], samples[1], 0.3), overlap(samples[1], samples[0], 0.3)) > 0.3
+
+
+def _join(map: Map, a: int, b: int) -> Map:
+    """Plane a takes over the moments, samples and observations of b."""
+    ids = np.array([a, b], np.int32)
+    table = map.planes
+    moments = table.rows("moments", ids).sum(axis=0)[None]
+    fitted, covariance = plane_fusion.fit_planes(moments, table.rows("coefficients", ids[:1]))
+    samples = table.rows("samples_m", ids)
+    spread = plane_fusion.spread(samples.reshape(-1, 3), samples.shape[1])
+    table = table.updated(ids[:1], coefficients=fitted, covariance=covariance, moments=moments, samples_m=plane_fusion.onto(spread[None], fitted))
+    return _buried(replace(map, planes=table), "plane", ids[:1], ids[1:])
+
+
+def _buried(map: Map, kind: str, kept: I32, gone: I32) -> Map:
+    """Landmarks `gone` die; their observers, counts and observations pass to the distinct ids `kept`."""
+    table: Table = getattr(map, f"{kind}s")
+    both = np.concatenate([table.rows("observers", kept), table.rows("observers", gone)], axis=1)
+    both = -np.sort(-both, axis=1)
+    both[:, 1:][both[:, 1:] == both[:, :-1]] = -1  # seen by the same keyframe
+    table = table.updated(
+        kept,
+        observers=-np.sort(-both, axis=1)[:, :OBSERVERS],
+        found=np.maximum(table.rows("found", kept), table.rows("found", gone)),
+        visible=np.maximum(table.rows("visible", kept), table.rows("visible", gone)),
+    )
+    observations = _renamed(map, kind, kept, gone)
+    changes: dict[str, Any] = {f"{kind}s": table.updated(gone, alive=np.zeros(len(gone), np.bool_)), f"{kind}_observations": observations}
+    return replace(map, **changes)
+
+
+def _renamed(map: Map, kind: str, kept: I32, gone: I32) -> Table:
+    """The observation table with the rows of `gone` given to `kept`, in the keyframes that `gone` remember."""
+    observations: Table = getattr(map, f"{kind}_observations")
+    observers = np.unique(getattr(map, f"{kind}s").rows("observers", gone))
+    spans = map.keyframes.rows(f"{kind}s", observers[observers >= 0])
+    rows = np.concatenate([np.empty(0, np.int32), *(np.arange(x, y, dtype=np.int32) for x, y in spans)])
+    ids = observations.rows(kind, rows)
+    order = np.argsort(gone)
+    place = np.minimum(np.searchsorted(gone[order], ids), max(len(gone) - 1, 0))
+    hit = gone[order][place] == ids if len(gone) else np.zeros(len(ids), np.bool_)
+    return observations.updated(rows[hit], **{kind: kept[order][place[hit]]})

@@ -1,0 +1,1 @@
+"""Motion between frames and the pose solver."""

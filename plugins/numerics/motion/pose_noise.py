@@ -1,0 +1,156 @@
+"""The noise of the pose solver's residuals: of the measurement and of the landmark, at a given pose."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numba
+import numpy as np
+
+from trihedron.pipeline.types import F64
+from trihedron.plugins.numerics.motion.pose_terms import (
+    NEAR_M,
+    PERPENDICULAR,
+    SAME,
+    LineTerms,
+    PlaneTerms,
+    PointTerms,
+    basis,
+    depth_direction,
+    line_depth_row,
+    line_row,
+    plane_noise,
+    point_rows,
+    to_camera,
+)
+
+
+class Weights(NamedTuple):
+    """Inverse covariances of the residuals, held during a round."""
+
+    points: F64  # (n, 3, 3)
+    lines: F64  # (m, 2, 2) image distances
+    line_depths: F64  # (m, 2, 2)
+    planes: F64  # (p, 3, 3)
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def invert_small(S: F64, rows: int, W: F64) -> None:
+    """Inverse of the leading block of 1, 2 or 3 rows of a symmetric matrix into W; the rest 0."""
+    W[:] = 0.0
+    if rows == 1:
+        W[0, 0] = 1.0 / S[0, 0]
+        return
+    if rows == 2:
+        det = S[0, 0] * S[1, 1] - S[0, 1] * S[1, 0]
+        W[0, 0], W[1, 1], W[0, 1], W[1, 0] = S[1, 1] / det, S[0, 0] / det, -S[0, 1] / det, -S[1, 0] / det
+        return
+    W[0, 0] = S[1, 1] * S[2, 2] - S[1, 2] * S[2, 1]
+    W[0, 1] = S[0, 2] * S[2, 1] - S[0, 1] * S[2, 2]
+    W[0, 2] = S[0, 1] * S[1, 2] - S[0, 2] * S[1, 1]
+    W[1, 1] = S[0, 0] * S[2, 2] - S[0, 2] * S[2, 0]
+    W[1, 2] = S[0, 2] * S[1, 0] - S[0, 0] * S[1, 2]
+    W[2, 2] = S[0, 0] * S[1, 1] - S[0, 1] * S[1, 0]
+    W[1, 0], W[2, 0], W[2, 1] = W[0, 1], W[0, 2], W[1, 2]
+    W /= S[0, 0] * W[0, 0] + S[0, 1] * W[1, 0] + S[0, 2] * W[2, 0]
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _spread(d: F64, R: F64, S: F64) -> float:
+    """Variance along the camera-frame direction d of a world covariance S."""
+    total = 0.0
+    for i in range(3):
+        for j in range(3):
+            total += (R[i, 0] * d[0] + R[i, 1] * d[1] + R[i, 2] * d[2]) * S[i, j] * (R[j, 0] * d[0] + R[j, 1] * d[1] + R[j, 2] * d[2])
+    return total
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _quadratic(d: F64, S: F64) -> float:
+    total = 0.0
+    for i in range(3):
+        for j in range(3):
+            total += d[i] * S[i, j] * d[j]
+    return total
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _weigh_points(R: F64, t: F64, camera: F64, terms: PointTerms, W: F64) -> None:
+    """Pixel and inverse-depth noise plus the landmark's own covariance, projected at this pose."""
+    p, r, D, S, E, F = np.empty(3), np.empty(3), np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
+    for i in range(len(terms.positions_m)):
+        to_camera(R, t, terms.positions_m[i], p)
+        z = terms.depth_m[i]
+        if not point_rows(p, terms.pixels[i], z, camera, r, D):
+            W[i] = 0.0
+            continue
+        C = terms.covariance_m2[i]
+        for j in range(3):  # E = D Rᵀ, with the zeros of D left out
+            E[0, j] = D[0, 0] * R[j, 0] + D[0, 2] * R[j, 2]
+            E[1, j] = D[1, 1] * R[j, 1] + D[1, 2] * R[j, 2]
+            E[2, j] = D[2, 2] * R[j, 2]
+        for k in range(3):
+            for j in range(3):
+                F[k, j] = E[k, 0] * C[0, j] + E[k, 1] * C[1, j] + E[k, 2] * C[2, j]
+        for k in range(3):
+            for j in range(3):
+                S[k, j] = F[k, 0] * E[j, 0] + F[k, 1] * E[j, 1] + F[k, 2] * E[j, 2]
+        noise = terms.sigma_px[i] * terms.sigma_px[i]
+        S[0, 0] += noise
+        S[1, 1] += noise
+        S[2, 2] += (terms.sigma_m[i] / (z * z)) ** 2
+        invert_small(S, 3 if np.isfinite(z) else 2, W[i])
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _pair_noise(s0: float, s1: float, at_start: float, at_end: float, map0: float, map1: float, S: F64) -> None:
+    """Covariance of the distances at parameters s0, s1 along a segment whose ends have the given variances, plus those of the map's points."""
+    S[0, 0] = (1.0 - s0) ** 2 * at_start + s0 * s0 * at_end + map0
+    S[1, 1] = (1.0 - s1) ** 2 * at_start + s1 * s1 * at_end + map1
+    S[0, 1] = S[1, 0] = (1.0 - s0) * (1.0 - s1) * at_start + s0 * s1 * at_end
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _weigh_lines(R: F64, t: F64, camera: F64, terms: LineTerms, W: F64, V: F64) -> None:
+    """Noise of the segment's ends, extrapolated to where the map's end points fall, plus that of the map's end points."""
+    p, D, m, S = np.empty((2, 3)), np.empty((2, 3)), np.empty(3), np.empty((2, 2))
+    for i in range(len(terms.endpoints_m)):
+        W[i], V[i] = 0.0, 0.0
+        to_camera(R, t, terms.endpoints_m[i, 0], p[0])
+        to_camera(R, t, terms.endpoints_m[i, 1], p[1])
+        if not (p[0, 2] > NEAR_M and p[1, 2] > NEAR_M):
+            continue
+        s0 = line_row(p[0], terms.endpoints_px[i], camera, D[0])[1]
+        s1 = line_row(p[1], terms.endpoints_px[i], camera, D[1])[1]
+        C, noise = terms.covariance_m2[i], terms.sigma_px[i] ** 2
+        _pair_noise(s0, s1, noise, noise, _spread(D[0], R, C[0]), _spread(D[1], R, C[1]), S)
+        invert_small(S, 2, W[i])
+        if depth_direction(terms.observed_m[i], m):
+            s0 = line_depth_row(p[0], terms.observed_m[i], m)[1]
+            s1 = line_depth_row(p[1], terms.observed_m[i], m)[1]
+            Q = terms.observed_covariance_m2[i]
+            _pair_noise(s0, s1, _quadratic(m, Q[0]), _quadratic(m, Q[1]), _spread(m, R, C[0]), _spread(m, R, C[1]), S)
+            invert_small(S, 2, V[i])
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def rows_of(kind: int) -> int:
+    """Number of residuals of a kind of plane term."""
+    return 3 if kind == SAME else (1 if kind == PERPENDICULAR else 2)
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _weigh_planes(R: F64, t: F64, terms: PlaneTerms, W: F64) -> None:
+    B, S = np.empty((3, 2)), np.empty((3, 3))
+    for i in range(len(terms.kinds)):
+        basis(terms.observed[i, :3], B)
+        plane_noise(terms.kinds[i], R, t, terms.coefficients[i], terms.covariance[i], terms.observed[i], terms.observed_covariance[i], B, S)
+        invert_small(S, rows_of(terms.kinds[i]), W[i])
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def weigh(R: F64, t: F64, camera: F64, points: PointTerms, lines: LineTerms, planes: PlaneTerms, weights: Weights) -> None:
+    """Fill `weights` for the pose R, t."""
+    _weigh_points(R, t, camera, points, weights.points)
+    _weigh_lines(R, t, camera, lines, weights.lines, weights.line_depths)
+    _weigh_planes(R, t, planes, weights.planes)

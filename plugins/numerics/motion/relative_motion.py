@@ -1,0 +1,221 @@
+"""Motion between two frames from 3D features seen in both: robust Gauss–Newton, no intrinsics needed.
+
+The motion is `T_current_previous`: `p_current = R p_previous + t`. Its unknowns are (phi, rho) in `R <- Exp(phi) R, t <- t + rho`. Points and the
+ends of lines are pairs of places with a 3 × 3 information, which is zero along a line; planes are pairs (n, d) with a 4 × 4 one.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numba
+import numpy as np
+
+from trihedron.pipeline.geometry import tangent_basis
+from trihedron.pipeline.types import F64, Keypoints, Planes, Segments, Tracks
+from trihedron.plugins.numerics.algebra.small_linear import solve_positive, turn_left
+
+MOST = 400  # pairs of places used; more only cost time
+GATE2 = 9.0  # squared standard deviations at which a term counts a quarter, once the scale has come down
+
+
+class Terms(NamedTuple):
+    """Pairs of places and of planes, previous and current."""
+
+    before_m: F64  # (n, 3)
+    after_m: F64  # (n, 3)
+    information: F64  # (n, 3, 3), 1/m²
+    planes_before: F64  # (p, 4)
+    planes_after: F64  # (p, 4)
+    plane_information: F64  # (p, 4, 4)
+
+
+@dataclass(frozen=True)
+class Motion:
+    """`T_current_previous` as R (3, 3) and t (3,); covariance (6, 6) of (phi, rho), the prior's width where nothing was measured;
+    `support` is the summed weight of the terms: about the number of good ones."""
+
+    R: F64
+    t: F64
+    covariance: F64
+    support: float
+
+
+def motion_terms(tracks: Tracks, keypoints: Keypoints, segments: Segments, planes: Planes, rad_per_px: float, floor_deg: float) -> Terms:
+    """What the tracks and the current features say about the motion. `rad_per_px` turns a key point's sigma_px into an angle; `floor_deg` is the
+    least error of a plane's normal. Pairs that are not finite, or whose covariance is none, are left out."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        points = _finite(*_point_pairs(tracks, keypoints, rad_per_px))
+        ends = _finite(*_line_pairs(tracks, segments, rad_per_px))
+    rows = tracks.planes[:, 1]
+    covariance = planes.covariance[rows] + tracks.plane_covariance
+    covariance[:, :2, :2] += np.eye(2) * np.radians(floor_deg) ** 2
+    known = np.isfinite(planes.coefficients[rows] + tracks.coefficients).all(axis=1) & np.isfinite(covariance).all(axis=(1, 2))
+    known[known] = np.linalg.det(covariance[known]) > 0.0
+    rows, covariance, coefficients = rows[known], covariance[known], tracks.coefficients[known]
+    basis = np.zeros((len(rows), 4, 3))
+    basis[:, :3, :2] = tangent_basis(planes.coefficients[rows, :3])
+    basis[:, 3, 2] = 1.0
+    information = basis @ np.linalg.inv(covariance) @ np.swapaxes(basis, 1, 2) if len(rows) else np.zeros((0, 4, 4))
+    before, after, weight = (np.concatenate(pair) for pair in zip(points, ends))
+    step = max(-(-len(before) // MOST), 1)
+    return Terms(before[::step].copy(), after[::step].copy(), weight[::step].copy(), coefficients, planes.coefficients[rows], information)
+
+
+def _finite(before: F64, after: F64, information: F64) -> tuple[F64, F64, F64]:
+    """The pairs (n, 3), (n, 3), (n, 3, 3) without those that are not finite."""
+    known = np.isfinite(before).all(axis=1) & np.isfinite(after).all(axis=1) & np.isfinite(information).all(axis=(1, 2))
+    return before[known], after[known], information[known]
+
+
+def _point_pairs(tracks: Tracks, keypoints: Keypoints, rad_per_px: float) -> tuple[F64, F64, F64]:
+    rows = tracks.keypoints[:, 1]
+    known = np.isfinite(tracks.points_m).all(axis=1) & np.isfinite(keypoints.points_m[rows]).all(axis=1)
+    rows = rows[known]
+    before, after = tracks.points_m[known].astype(np.float64), keypoints.points_m[rows].astype(np.float64)
+    across = keypoints.sigma_px[rows].astype(np.float64) * rad_per_px * np.hypot(before[:, 2], after[:, 2])
+    depth = np.hypot(tracks.sigma_m[known], keypoints.sigma_m[rows]).astype(np.float64)
+    ray = after / after[:, 2:]
+    shrink = depth**2 / (across**2 + depth**2 * (ray * ray).sum(axis=1))  # Sherman–Morrison
+    return before, after, (np.eye(3) - shrink[:, None, None] * ray[:, :, None] * ray[:, None, :]) / (across**2)[:, None, None]
+
+
+def _line_pairs(tracks: Tracks, segments: Segments, rad_per_px: float) -> tuple[F64, F64, F64]:
+    """Both ends of each previous line against the current one, whose own noise serves for both."""
+    rows = tracks.segments[:, 1]
+    along = (segments.endpoints_m[rows, 1] - segments.endpoints_m[rows, 0]).astype(np.float64)
+    length = np.linalg.norm(along, axis=1)
+    known = np.isfinite(tracks.endpoints_m).all(axis=(1, 2)) & np.isfinite(along).all(axis=1) & (length > 1e-3)
+    rows, direction = rows[known], (along / np.where(length > 0.0, length, 1.0)[:, None])[known]
+    basis = tangent_basis(direction)
+    before, start = tracks.endpoints_m[known].astype(np.float64), segments.endpoints_m[rows, 0].astype(np.float64)
+    covariance = 2.0 * segments.covariance_m2[rows].astype(np.float64).mean(axis=1)
+    floor = np.maximum(rad_per_px * start[:, 2], 1e-6) ** 2
+    across = np.swapaxes(basis, 1, 2) @ covariance @ basis + np.eye(2) * floor[:, None, None]
+    information = 0.5 * basis @ np.linalg.inv(across) @ np.swapaxes(basis, 1, 2)
+    return before.reshape(-1, 3), np.repeat(start, 2, axis=0), np.repeat(information, 2, axis=0)
+
+
+def solve_motion(terms: Terms, R: F64, sigma_deg: float, sigma_m: float) -> Motion:
+    """The motion that most of the terms agree on, near the predicted rotation R (3, 3), known to `sigma_deg`, and no translation, known to `sigma_m`.
+
+    Graduated non-convexity (Yang et al., RA-L 2020): the Geman–McClure scale comes down from the median residual, so that up to half of the terms
+    may be wrong. Never raises: without terms the prediction is returned, with the covariance of the prior."""
+    prior = np.repeat([1.0 / np.radians(sigma_deg) ** 2, 1.0 / sigma_m**2], 3)
+    R, t = np.array(R, np.float64), np.zeros(3)
+    residuals = np.concatenate(_residuals(terms, R, t)[:2])
+    scale2 = max(2.0 * float(np.median(residuals)), GATE2) if len(residuals) else GATE2
+    H, chi2, support = _solve(terms, R, t, prior, scale2)
+    scale = max(chi2 / max(3.0 * support - 6.0, 1.0), 1.0)
+    return Motion(R, t, np.asarray(np.linalg.inv(H / scale + np.diag(prior)), np.float64), support)
+
+
+@numba.njit(cache=True, nogil=True)
+def _residuals(terms: Terms, R: F64, t: F64) -> tuple[F64, F64, F64]:
+    """Squared Mahalanobis distances of places (n,) and planes (p,), and the rotated and moved places (n, 3)."""
+    n, p = len(terms.before_m), len(terms.planes_before)
+    places, planes, moved = np.empty(n), np.empty(p), np.empty((n, 3))
+    e = np.empty(4)
+    for i in range(n):
+        total = 0.0
+        for k in range(3):
+            moved[i, k] = R[k, 0] * terms.before_m[i, 0] + R[k, 1] * terms.before_m[i, 1] + R[k, 2] * terms.before_m[i, 2]
+            e[k] = moved[i, k] + t[k] - terms.after_m[i, k]
+        for j in range(3):
+            for k in range(3):
+                total += e[j] * terms.information[i, j, k] * e[k]
+        places[i] = total
+    for i in range(p):
+        _plane_residual(terms.planes_before[i], terms.planes_after[i], R, t, e)
+        total = 0.0
+        for j in range(4):
+            for k in range(4):
+                total += e[j] * terms.plane_information[i, j, k] * e[k]
+        planes[i] = total
+    return places, planes, moved
+
+
+@numba.njit(cache=True, nogil=True)
+def _plane_residual(before: F64, after: F64, R: F64, t: F64, e: F64) -> None:
+    """The previous plane moved into the current frame less the current one, (4,)."""
+    e[3] = before[3] - after[3]
+    for k in range(3):
+        n = R[k, 0] * before[0] + R[k, 1] * before[1] + R[k, 2] * before[2]
+        e[k] = n - after[k]
+        e[3] -= n * t[k]
+
+
+@numba.njit(cache=True, nogil=True)
+def _accumulate(e: F64, J: F64, L: F64, w: float, H: F64, g: F64) -> None:
+    """H += w JᵀLJ, g += w JᵀLe for J (rows, 6)."""
+    rows = len(e)
+    LJ = np.zeros(6)
+    for i in range(rows):
+        for b in range(6):
+            LJ[b] = 0.0
+        for j in range(rows):
+            for b in range(6):
+                LJ[b] += w * L[i, j] * J[j, b]
+        for b in range(6):
+            g[b] += LJ[b] * e[i]
+            for a in range(6):
+                H[a, b] += J[i, a] * LJ[b]
+
+
+@numba.njit(cache=True, nogil=True)
+def _normal_equations(terms: Terms, R: F64, t: F64, scale2: float, H: F64, g: F64) -> tuple[float, float]:
+    """Fill H (6, 6) and g (6,) with Geman–McClure weights at the squared scale; returns the weighted χ² and the weighted number of components."""
+    H[:], g[:] = 0.0, 0.0
+    places, planes, moved = _residuals(terms, R, t)
+    e3, J3, e4, J4 = np.empty(3), np.zeros((3, 6)), np.empty(4), np.zeros((4, 6))
+    chi2, components = 0.0, 0.0
+    for k in range(3):
+        J3[k, 3 + k] = 1.0
+    for i in range(len(places)):
+        w = (scale2 / (scale2 + places[i])) ** 2
+        chi2 += w * places[i]
+        components += 3.0 * w
+        x, y, z = moved[i, 0], moved[i, 1], moved[i, 2]
+        J3[0, 1], J3[0, 2], J3[1, 0], J3[1, 2], J3[2, 0], J3[2, 1] = z, -y, -z, x, y, -x  # d(phi × p)/d phi
+        for k in range(3):
+            e3[k] = moved[i, k] + t[k] - terms.after_m[i, k]
+        _accumulate(e3, J3, terms.information[i], w, H, g)
+    for i in range(len(planes)):
+        w = (scale2 / (scale2 + planes[i])) ** 2
+        chi2 += w * planes[i]
+        components += 3.0 * w
+        _plane_residual(terms.planes_before[i], terms.planes_after[i], R, t, e4)
+        x, y, z = e4[0] + terms.planes_after[i, 0], e4[1] + terms.planes_after[i, 1], e4[2] + terms.planes_after[i, 2]
+        J4[0, 1], J4[0, 2], J4[1, 0], J4[1, 2], J4[2, 0], J4[2, 1] = z, -y, -z, x, y, -x
+        J4[3, 0], J4[3, 1], J4[3, 2] = t[1] * z - t[2] * y, t[2] * x - t[0] * z, t[0] * y - t[1] * x  # -(phi × n)·t = -phi·(n × t)
+        J4[3, 3], J4[3, 4], J4[3, 5] = -x, -y, -z
+        _accumulate(e4, J4, terms.plane_information[i], w, H, g)
+    return chi2, components
+
+
+@numba.njit(cache=True, nogil=True)
+def _solve(terms: Terms, R: F64, t: F64, prior: F64, scale2: float) -> tuple[F64, float, float]:
+    """Moves R and t, with a prior (6,) information on the way moved; returns H (6, 6), the weighted χ² and the summed weights."""
+    H, A, g = np.zeros((6, 6)), np.zeros((6, 6)), np.zeros(6)
+    phi, step = np.zeros(3), np.zeros(6)  # phi: since the start
+    chi2, components = 0.0, 0.0
+    settled = False
+    for _ in range(40):
+        chi2, components = _normal_equations(terms, R, t, scale2, H, g)
+        if settled:
+            break
+        size = 0.0
+        for i in range(6):
+            g[i] = -g[i] - prior[i] * (phi[i] if i < 3 else t[i - 3])
+            for j in range(6):
+                A[i, j] = H[i, j] + (prior[i] if i == j else 0.0)
+        solve_positive(A, g, step)
+        turn_left(step, R)
+        for i in range(3):
+            phi[i] += step[i]
+            t[i] += step[3 + i]
+            size += step[i] * step[i] + step[3 + i] * step[3 + i]
+        settled = scale2 <= GATE2 and size < 1e-12
+        scale2 = max(0.5 * scale2, GATE2)
+    return H, chi2, components / 3.0

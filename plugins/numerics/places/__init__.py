@@ -1,0 +1,1 @@
+"""Places seen before: hypotheses, checks, pose graphs."""

@@ -1,0 +1,153 @@
+"""What all loop closers share: when to look, how a place is recognised for certain, and what is then corrected."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import numpy as np
+
+from trihedron.pipeline.geometry import invert, log_se3, pose_matrix, transform
+from trihedron.pipeline.types import F64, I32, Correction, Frame, Map, Matches
+from trihedron.plugins.numerics.maps.keyframe_features import features_of
+from trihedron.plugins.numerics.maps.local_window import LocalWindow, observed_by
+from trihedron.plugins.numerics.maps.map_search import Guess, MapSearch
+from trihedron.plugins.numerics.maps.map_terms import line_terms, plane_terms, point_terms
+from trihedron.plugins.numerics.maps.visibility import in_image
+from trihedron.plugins.numerics.motion.pose_solver import PoseSolution, solve_pose
+from trihedron.plugins.numerics.places.loop_correction import Closure, Drift, close
+from trihedron.plugins.numerics.places.loop_hypotheses import alike, shift_of_planes, shift_of_points
+from trihedron.plugins.numerics.places.loop_places import Place, Reach, place_of
+
+CHI2_6 = 22.46  # 99.9 % of six degrees of freedom
+NOTHING = np.empty((0, 2), np.int32)
+SEARCH = MapSearch(octave_step=3, relations=0)
+
+
+@dataclass(frozen=True)
+class LoopClosing:
+    """Options of a loop closer, and the parts it is made of."""
+
+    every: int = 2  # keyframes between two looks
+    away_m: float = 6.0  # walked since a place was left, before it can be come back to
+    view_m: float = 2.0  # between keyframes that show the same, besides the drift
+    view_deg: float = 45.0
+    drift_share: float = 0.01  # of the way walked: standard deviation of the position, and per root metre of the pose graph
+    floor_m: float = 0.02  # added to it
+    rotation_sigma_deg: float = 0.3  # of a keyframe; the Manhattan frame keeps it from growing
+    candidates: int = 5  # places looked at in one call, at most
+    shared: int = 30  # points and lines already shared with a place, from which on no loop is open there
+    min_score: int = 60  # points + 2 lines + 5 planes that must agree
+    min_share: float = 0.5  # of the matches that must agree
+    max_through: float = 0.15  # of the place's points in view that the camera may see through
+
+    def __post_init__(self) -> None:
+        for name in ("every", "candidates", "shared", "min_score"):
+            if getattr(self, name) < 1:
+                raise ValueError(f"{name}: must be at least 1")
+        for name in ("away_m", "view_m", "drift_share", "floor_m", "rotation_sigma_deg"):
+            if getattr(self, name) <= 0.0:
+                raise ValueError(f"{name}: must be positive")
+        if not 0.0 < self.view_deg <= 90.0 or not 0.0 <= self.min_share <= 1.0 or not 0.0 <= self.max_through <= 1.0:
+            raise ValueError("view_deg, min_share, max_through: must be in (0, 90], [0, 1] and [0, 1]")
+
+    @property
+    def reach(self) -> Reach:
+        """How far a place may be from where the camera thinks it is."""
+        return Reach(self.away_m, self.view_m, self.view_deg, self.drift_share, self.floor_m)
+
+    def due(self, map: Map, frame: Frame) -> bool:
+        """Whether this frame made a keyframe, and one that is looked at."""
+        newest = np.array([len(map.keyframes) - 1])
+        if newest[0] < 0 or newest[0] % self.every or not map.keyframes.rows("alive", newest)[0]:
+            return False
+        return int(map.keyframes.rows("index", newest)[0]) == frame.index
+
+    def closed(self, map: Map, frame: Frame, ranked: Iterable[tuple[int, float]]) -> Correction | None:
+        """The correction of the first of the ranked keyframes (row, way walked since) whose place is recognised."""
+        looked_at: set[int] = set()
+        tried = 0
+        for keyframe, way in ranked:
+            if keyframe in looked_at:
+                continue
+            if tried == self.candidates:
+                break
+            tried += 1
+            place = place_of(map, keyframe, way, self.reach)
+            looked_at |= set(place.seen.keyframes.tolist())
+            closure = self._recognised(map, frame, place) if place.found < self.shared else None
+            if closure is not None:
+                return close(map, closure, Drift(self.drift_share, np.radians(self.rotation_sigma_deg)))
+        return None
+
+    def _recognised(self, map: Map, frame: Frame, place: Place) -> Closure | None:
+        """The newest keyframe's pose by what the place's keyframes saw, or None when that is not certain."""
+        newest = len(map.keyframes) - 1
+        T_before = map.keyframes.rows("T_world_camera", np.array([newest]))[0]
+        expected = self._expected(place.walked_m)
+        here = _seen_alone(map, newest, place.seen)
+        features = features_of(map, frame.camera, T_before, here)
+        T = self._start(map, frame, place, here, T_before)
+        found, matches = None, None
+        for sigma_m in (0.03, 0.01):
+            matches = SEARCH.search(frame, Guess(T, sigma_m, 0.3 * sigma_m, True), *features, map, place.seen)
+            found = solve_pose(
+                T, frame.camera, T_before, np.linalg.inv(expected),
+                point_terms(map, features[0], matches.keypoints),
+                line_terms(map, features[1], matches.segments, T, frame.camera, 1.0),
+                plane_terms(map, features[2], matches.planes, NOTHING, NOTHING, 1.0),
+            )  # fmt: skip
+            T = found.T_world_camera
+        if found is None or matches is None or not self._certain(found, matches, expected, T_before) or self._through(map, frame, place, T):
+            return None
+        return Closure(newest, place.keyframe, T, found.covariance)
+
+    def _expected(self, walked_m: float) -> F64:
+        """(6, 6) covariance of how far the newest keyframe's pose is off relative to one so many metres of way ago."""
+        sigma_m, sigma_rad = self.floor_m + self.drift_share * walked_m, 2.0 * np.radians(self.rotation_sigma_deg)
+        return np.diag(np.repeat([sigma_m**2, sigma_rad**2], 3))
+
+    def _start(self, map: Map, frame: Frame, place: Place, here: LocalWindow, T: F64) -> F64:
+        """Where to begin: as if there were no drift, where the planes lie on those of the place, or where points that look alike agree; the one
+        of the three under which most points agree."""
+        expected = self._expected(place.walked_m)
+        sigma_m, sigma_rad = np.sqrt(expected[0, 0]), np.sqrt(expected[3, 3])
+        keypoints = features_of(map, frame.camera, T, here)[0]
+        pairs = alike(map, frame.camera, T, keypoints, place.seen.points, sigma_m, sigma_rad)
+        points, there = keypoints.points_m[pairs[:, 0]].astype(np.float64), map.points.rows("position_m", pairs[:, 1])
+        spread = 0.01 + keypoints.sigma_m[pairs[:, 0]].astype(np.float64) + sigma_rad * points[:, 2]
+        by_planes = shift_of_planes(map, here.planes, place.seen.planes, sigma_m)[0]
+        starts = [T, pose_matrix(T[:3, :3], T[:3, 3] + by_planes), shift_of_points(transform(T, points), there, spread) @ T]
+        agreeing = [np.count_nonzero(np.linalg.norm(transform(start, points) - there, axis=1) < 3.0 * spread) for start in starts]
+        return starts[int(np.argmax(agreeing))]
+
+    def _certain(self, found: PoseSolution, matches: Matches, expected: F64, T_before: F64) -> bool:
+        """Whether enough agrees, nothing is left open, and the drift is one that can be."""
+        agreeing = np.count_nonzero(found.points), np.count_nonzero(found.lines), np.count_nonzero(found.planes)
+        offered = len(matches.keypoints), len(matches.segments), len(matches.planes)
+        xi = log_se3(invert(T_before) @ found.T_world_camera)
+        possible = xi @ np.linalg.solve(expected + found.covariance, xi) < CHI2_6
+        enough = np.dot(agreeing, (1, 2, 5)) >= self.min_score and np.dot(agreeing, (1, 2, 5)) >= self.min_share * np.dot(offered, (1, 2, 5))
+        return bool(possible and enough and not found.unobservable.shape[1])
+
+    def _through(self, map: Map, frame: Frame, place: Place, T: F64) -> bool:
+        """Whether the camera sees through surfaces that the place has: points that would hang in free space."""
+        local = transform(invert(T), map.points.rows("position_m", place.seen.points))
+        local = local[local[:, 2] > 0.1]
+        pixels = frame.camera.project(local)
+        inside = in_image(pixels, frame.camera)
+        x, y = np.rint(pixels[inside]).astype(int).T
+        depth, z = frame.depth_m[y, x].astype(np.float64), local[inside, 2]
+        tolerance = 0.1 + 5.0 * frame.camera.depth_noise.sigma_m(depth)
+        through, met = (depth > 0.0) & (z < depth - tolerance), (depth > 0.0) & (np.abs(z - depth) <= tolerance)
+        return bool(np.count_nonzero(through) > self.max_through * (np.count_nonzero(through) + np.count_nonzero(met)))
+
+
+def _seen_alone(map: Map, keyframe: int, place: LocalWindow) -> LocalWindow:
+    """What a keyframe saw that the place does not have."""
+    row = np.array([keyframe], np.int32)
+    ids: list[I32] = [
+        np.setdiff1d(observed_by(map, row, kind), there).astype(np.int32)
+        for kind, there in (("point", place.points), ("line", place.lines), ("plane", place.planes))
+    ]
+    return LocalWindow(row, *ids)

@@ -1,0 +1,89 @@
+"""How much of the map agrees that a frame was taken at a supposed place."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from trihedron.pipeline.types import F64, I32, Frame, Keypoints, Map, Matches, Planes, Segments
+from trihedron.plugins.numerics.maps.local_window import LocalWindow, local_window, window_of
+from trihedron.plugins.numerics.maps.map_search import Guess, MapSearch
+from trihedron.plugins.numerics.maps.map_terms import line_terms, plane_terms, point_terms
+from trihedron.plugins.numerics.motion.pose_solver import PoseSolution, solve_pose
+from trihedron.plugins.numerics.places.place_votes import apart
+
+SCORE = np.array([1, 2, 5])  # what a point, a line and a plane that agree count for a place
+DETAILS = np.array([1, 3, 0])  # and as what tells one room from another: any room has walls at some distance or other
+ABOUT_M, ABOUT_DEG = 2.0, 60.0  # keyframes taken from nearer than this have seen a place
+WIDE, CLOSE = (0.05, 2.0), (0.005, 0.2)  # standard deviations (m, °) of a hypothesis, and of the pose solved from it
+PRIOR_M, PRIOR_DEG = 0.5, 10.0  # the data decide
+LINE_PX = 1.0  # of a segment's end point across it
+
+
+class View(NamedTuple):
+    """A frame and what was found in it."""
+
+    frame: Frame
+    keypoints: Keypoints
+    segments: Segments
+    planes: Planes
+
+
+@dataclass(frozen=True)
+class Recognised:
+    """A place after the check: the pose (4, 4) solved from what agrees, its covariance (6, 6), the points, lines and planes that agree, and the share
+    of all matches that these are."""
+
+    T_world_camera: F64
+    covariance: F64
+    inliers: I32
+    agreeing: float
+
+    @property
+    def score(self) -> float:
+        """Of all that agrees."""
+        return float(self.inliers @ SCORE)
+
+    @property
+    def details(self) -> float:
+        """Of the details among it."""
+        return float(self.inliers @ DETAILS)
+
+
+def check_place(T_world_camera: F64, view: View, map: Map, among: I32, near: int) -> Recognised | None:
+    """Search the map from a hypothesis (4, 4), widely, then closely from the pose solved, with what the `near` keyframes about it see; where there
+    are none, with what the keyframes `among` see, since a twin of a place must be able to compete. All are of
+    the sub-map of these. None when the place does not hold."""
+    T = T_world_camera
+    for sigma_m, sigma_deg in (WIDE, CLOSE):
+        guess = Guess(T, sigma_m, float(np.radians(sigma_deg)), True)
+        matches = MapSearch(enough=0).search(view.frame, guess, view.keypoints, view.segments, view.planes, map, _window(map, T, among, near))
+        found = _solved(T, view, matches, map)
+        if found.unobservable.shape[1]:
+            return None
+        before, T = T, found.T_world_camera
+    if apart(before, T):
+        return None
+    inliers = np.array([np.count_nonzero(found.points), np.count_nonzero(found.lines), np.count_nonzero(found.planes)], np.int32)
+    sought = len(matches.keypoints) + len(matches.segments) + len(matches.planes)
+    return Recognised(T, found.covariance, inliers, float(inliers.sum() / max(sought, 1)))
+
+
+def _window(map: Map, T: F64, among: I32, near: int) -> LocalWindow:
+    window = local_window(map, T, 0, 0, near, ABOUT_M, ABOUT_DEG, int(map.keyframes.rows("submap", among[:1])[0]))
+    return window if len(window.keyframes) else window_of(map, among)
+
+
+def _solved(T: F64, view: View, matches: Matches, map: Map) -> PoseSolution:
+    none = matches.parallel[:0]
+    return solve_pose(
+        T,
+        view.frame.camera,
+        T,
+        np.diag(np.repeat([PRIOR_M**-2, np.radians(PRIOR_DEG) ** -2], 3)),
+        point_terms(map, view.keypoints, matches.keypoints),
+        line_terms(map, view.segments, matches.segments, T, view.frame.camera, LINE_PX),
+        plane_terms(map, view.planes, matches.planes, none, none, 1.0),
+    )

@@ -1,0 +1,1 @@
+"""Planar regions: growing, fitting, merging, associating."""

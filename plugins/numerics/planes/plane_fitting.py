@@ -1,0 +1,212 @@
+"""Robust planes through the cells of a grid: dominant normal, trimmed weighted least squares in inverse depth, and a test for curvature."""
+
+from __future__ import annotations
+
+import numba
+import numpy as np
+
+from trihedron.pipeline.types import F32, F64, I32, Bool
+from trihedron.plugins.numerics.depth.organised_grid import Grid, cells_by_component
+from trihedron.plugins.numerics.planes.plane_curvature import linear_turn
+
+COARSE = 2000  # cells a component's first plane is estimated from
+
+
+@numba.njit(cache=True, nogil=True)
+def solve_symmetric(A: F64, b: F64) -> tuple[bool, F64]:
+    """Solution (3,) of a symmetric positive definite 3 × 3 system by cofactors; False, and zeros, when it is singular."""
+    c00, c01, c02 = A[1, 1] * A[2, 2] - A[1, 2] * A[1, 2], A[0, 2] * A[1, 2] - A[0, 1] * A[2, 2], A[0, 1] * A[1, 2] - A[0, 2] * A[1, 1]
+    c11, c12, c22 = A[0, 0] * A[2, 2] - A[0, 2] * A[0, 2], A[0, 1] * A[0, 2] - A[0, 0] * A[1, 2], A[0, 0] * A[1, 1] - A[0, 1] * A[0, 1]
+    det = A[0, 0] * c00 + A[0, 1] * c01 + A[0, 2] * c02
+    x = np.zeros(3)
+    if not det > 1e-14 * A[0, 0] * A[1, 1] * A[2, 2]:
+        return False, x
+    x[0] = (c00 * b[0] + c01 * b[1] + c02 * b[2]) / det
+    x[1] = (c01 * b[0] + c11 * b[1] + c12 * b[2]) / det
+    x[2] = (c02 * b[0] + c12 * b[1] + c22 * b[2]) / det
+    return True, x
+
+
+@numba.njit(cache=True, nogil=True)
+def fit_components(
+    grid: Grid, cells: I32, starts: I32, cone: float, gate: float, curved: float, least: int, labels: I32, planes: F64, found: int
+) -> int:
+    """Fit one plane to each component (`cells` and `starts` as from `cells_by_component`); returns how many planes there are now.
+
+    A plane with `least` members, whose normals lie within `cone` (rad) and turn by no more than `curved` (rad), is written to `planes[found]` as q,
+    and its members get the label found + 1; the first `found` planes stay. The other cells of the component stay unlabelled."""
+    flat = labels.ravel()
+    for k in range(len(starts) - 1):
+        if found == len(planes):
+            break
+        component = cells[starts[k] : starts[k + 1]]
+        member = np.zeros(len(component), np.bool_)
+        q, members = _fit_component(grid, component, np.cos(cone), gate, member)
+        if members < least or turn(q, grid, component, member, max(len(component) // COARSE, 1)) > curved:
+            continue
+        planes[found] = q
+        found += 1
+        for i in range(len(component)):
+            if member[i]:
+                flat[component[i]] = found
+    return found
+
+
+@numba.njit(cache=True, nogil=True)
+def fit_labelled(grid: Grid, labels: I32, planes: F64, cone: float, gate: float, least: int) -> tuple[I32, F64]:
+    """Fit a plane to each labelled region (h, w), starting from its q in `planes` (k, 3). Returns the labels of the members, and the q, of those that
+    have `least` members by the rules of `fit_cells`, largest first."""
+    out, fitted, found = np.zeros_like(labels), np.zeros_like(planes), 0
+    cells, starts = cells_by_component(labels - 1, least)
+    flat = out.ravel()
+    for k in range(len(starts) - 1):
+        region = cells[starts[k] : starts[k + 1]]
+        q = planes[labels[region[0] // labels.shape[1], region[0] % labels.shape[1]] - 1].copy()
+        member = np.zeros(len(region), np.bool_)
+        q, members = _trimmed(q, 1, grid, region, np.cos(cone), gate, member)
+        if members < least:
+            continue
+        fitted[found] = q
+        found += 1
+        for i in range(len(region)):
+            if member[i]:
+                flat[region[i]] = found
+    return out, fitted[:found]
+
+
+@numba.njit(cache=True, nogil=True)
+def _fit_component(grid: Grid, component: I32, cos_cone: float, gate: float, member: Bool) -> tuple[F64, int]:
+    """q of the plane that most of a component belongs to and its number of members, which are marked; zeros when there is none."""
+    some = component[:: max(len(component) // COARSE, 1)].copy()
+    normal = dominant_normal(grid.normals, some, cos_cone)
+    return _trimmed(start_plane(normal, grid, some, cos_cone), 0, grid, component, cos_cone, gate, member)
+
+
+@numba.njit(cache=True, nogil=True)
+def _trimmed(q: F64, first: int, grid: Grid, component: I32, cos_cone: float, gate: float, member: Bool) -> tuple[F64, int]:
+    """Rounds of `fit_cells` with a narrowing gate, the `first` of them left out, on some of the cells and last on all: (q, number of members), which
+    are marked."""
+    some = component[:: max(len(component) // COARSE, 1)].copy()
+    marks = np.zeros(len(some), np.bool_)
+    members = 0
+    for step in range(first, 4):
+        if q[0] == 0.0 and q[1] == 0.0 and q[2] == 0.0:
+            return q, 0
+        if step < 3:
+            q, members = fit_cells(q, grid, some, cos_cone, gate * (4.0, 2.0, 1.0)[step], marks)
+        else:
+            q, members = fit_cells(q, grid, component, cos_cone, gate, member)
+    return q, members
+
+
+@numba.njit(cache=True, nogil=True)
+def dominant_normal(normals: F32, cells: I32, cos_cone: float) -> F64:
+    """The commonest direction among the cells' normals: the fullest bin of a coarse grid over (n_x, n_y), then three mean shifts within the cone."""
+    count, sums = np.zeros((21, 21), np.int32), np.zeros((21, 21, 3))
+    w = normals.shape[1]
+    for i in cells:
+        a, b, c = normals[i // w, i % w]
+        u, v = int(np.rint(10.0 * a)) + 10, int(np.rint(10.0 * b)) + 10
+        count[u, v] += 1
+        sums[u, v, 0] += a
+        sums[u, v, 1] += b
+        sums[u, v, 2] += c
+    best = int(np.argmax(count))
+    n = sums[best // 21, best % 21]
+    n = n / max(np.sqrt(n @ n), 1e-9)
+    for _ in range(3):
+        total = np.zeros(3)
+        for i in cells:
+            a, b, c = normals[i // w, i % w]
+            if a * n[0] + b * n[1] + c * n[2] > cos_cone:
+                total[0] += a
+                total[1] += b
+                total[2] += c
+        length = np.sqrt(total @ total)
+        if length < 1e-9:
+            break
+        n = total / length
+    return n
+
+
+@numba.njit(cache=True, nogil=True)
+def start_plane(normal: F64, grid: Grid, cells: I32, cos_cone: float) -> F64:
+    """q of the plane with this normal at the median distance of (at most 400 of) the cells that face its way."""
+    rho, rays_x, rays_y, normals = grid.rho, grid.rays_x, grid.rays_y, grid.normals
+    w = rho.shape[1]
+    step = max(len(cells) // 400, 1)
+    distance = np.empty(len(cells) // step + 1)
+    m = 0
+    for k in range(0, len(cells), step):
+        r, c = cells[k] // w, cells[k] % w
+        if normals[r, c, 0] * normal[0] + normals[r, c, 1] * normal[1] + normals[r, c, 2] * normal[2] > cos_cone:
+            distance[m] = -(normal[0] * rays_x[c] + normal[1] * rays_y[r] + normal[2]) / rho[r, c]
+            m += 1
+    if m == 0:
+        return np.zeros(3)
+    d = np.median(distance[:m])
+    return -normal / d if d > 1e-6 else np.zeros(3)
+
+
+@numba.njit(cache=True, nogil=True)
+def fit_cells(q: F64, grid: Grid, cells: I32, cos_cone: float, gate: float, member: Bool) -> tuple[F64, int]:
+    """One round of trimmed weighted least squares: (q, number of members). A cell is a member when its normal is within the cone of q's and its depth
+    within `gate` σ of q's; `member` (per entry of `cells`) is written. A degenerate fit returns zeros."""
+    rho, sigma, count, rays_x, rays_y, normals = grid
+    w = rho.shape[1]
+    length = np.sqrt(q @ q)
+    nx, ny, nz = -q[0] / length, -q[1] / length, -q[2] / length
+    A, b = np.zeros((3, 3)), np.zeros(3)
+    found = 0
+    for k in range(len(cells)):
+        r, c = cells[k] // w, cells[k] % w
+        member[k] = False
+        if normals[r, c, 0] * nx + normals[r, c, 1] * ny + normals[r, c, 2] * nz < cos_cone:
+            continue
+        x, y, p, s = rays_x[c], rays_y[r], rho[r, c], sigma[r, c]
+        if abs(q[0] * x + q[1] * y + q[2] - p) > gate * s:
+            continue
+        member[k] = True
+        found += 1
+        weight = count[r, c] / (s * s)
+        A[0, 0] += weight * x * x
+        A[0, 1] += weight * x * y
+        A[0, 2] += weight * x
+        A[1, 1] += weight * y * y
+        A[1, 2] += weight * y
+        A[2, 2] += weight
+        b[0] += weight * x * p
+        b[1] += weight * y * p
+        b[2] += weight * p
+    if found < 3:
+        return np.zeros(3), 0
+    solved, q = solve_symmetric(A, b)
+    return q, found if solved else 0
+
+
+@numba.njit(cache=True, nogil=True)
+def turn(q: F64, grid: Grid, cells: I32, member: Bool, step: int) -> float:
+    """How far the normals turn across the members (one in `step`), rad: about 0 for a plane whatever its noise, all of the angle seen for a cylinder.
+    Members without a normal do not count."""
+    rho, rays_x, rays_y, normals = grid.rho, grid.rays_x, grid.rays_y, grid.normals
+    w = rho.shape[1]
+    C, D, mean_x, mean_n = np.zeros((3, 3)), np.zeros((3, 3)), np.zeros(3), np.zeros(3)
+    m = 0
+    x, n = np.empty(3), np.empty(3)
+    for k in range(0, len(cells), step):
+        r, c = cells[k] // w, cells[k] % w
+        if member[k] and not np.isnan(normals[r, c, 0]):
+            z = 1.0 / rho[r, c]
+            x[0], x[1], x[2] = rays_x[c] * z, rays_y[r] * z, z
+            for a in range(3):
+                n[a] = normals[r, c, a]
+            m += 1
+            for a in range(3):
+                mean_x[a] += x[a]
+                mean_n[a] += n[a]
+                for b in range(3):
+                    C[a, b] += x[a] * x[b]
+                    D[a, b] += n[a] * x[b]
+    if m < 3:
+        return 0.0
+    return linear_turn(C / m, D / m, mean_x / m, mean_n / m, -q / np.sqrt(q @ q))

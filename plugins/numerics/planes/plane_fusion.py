@@ -1,0 +1,87 @@
+"""Map planes from the summed moments of all their observations."""
+
+from __future__ import annotations
+
+import numba
+import numpy as np
+
+from trihedron.pipeline.geometry import exp_so3, tangent_basis
+from trihedron.pipeline.types import F32, F64
+from trihedron.plugins.numerics.algebra.uncertainty import inverse
+
+
+def information_of(moments: F64, coefficients: F64) -> F64:
+    """(n, 3, 3) information that moments (n, 4, 4) hold about (a, b, d) of planes (n, 4): `Jᵀ M J`, J the derivative of (n, d)."""
+    J = np.zeros((len(moments), 4, 3))
+    J[:, :3, :2] = tangent_basis(coefficients[:, :3])
+    J[:, 3, 2] = 1.0
+    return np.swapaxes(J, -1, -2) @ moments @ J
+
+
+def equivalent_moments(coefficients: F64, covariance: F64) -> F64:
+    """(n, 4, 4) moments whose plane is `coefficients` (n, 4) and whose information about (a, b, d) is the inverse of `covariance` (n, 3, 3).
+
+    `M = Lᵀ C⁻¹ L`, where L takes (n', d') to its (a, b, d) about the plane, homogeneous in scale. The moments of a region's own points would not do:
+    its pixels are not independent, and least squares through points that err along their rays tilts a slanted plane however often it is seen."""
+    n, d = coefficients[:, :3], coefficients[:, 3]
+    L = np.zeros((len(n), 3, 4))
+    L[:, :2, :3] = np.swapaxes(tangent_basis(n), -1, -2)
+    L[:, 2, :3] = -d[:, None] * n
+    L[:, 2, 3] = 1.0
+    return np.swapaxes(L, -1, -2) @ inverse(covariance) @ L
+
+
+def move_moments(T_a_b: F64, moments_b: F64) -> F64:
+    """(n, 4, 4) moments of the points moved into frame a."""
+    return T_a_b @ moments_b @ T_a_b.T
+
+
+def fit_planes(moments: F64, like: F64) -> tuple[F64, F64]:
+    """Planes (n, 4) of least squares through moments (n, 4, 4) and their covariance (n, 3, 3); the side is that of `like` (n, 4)."""
+    weight = moments[:, 3, 3]
+    centre = moments[:, :3, 3] / weight[:, None]
+    scatter = moments[:, :3, :3] - weight[:, None, None] * centre[:, :, None] * centre[:, None, :]
+    normal = np.asarray(np.linalg.eigh(scatter)[1][:, :, 0], np.float64)
+    normal = normal * np.where(np.einsum("ij,ij->i", normal, like[:, :3]) < 0.0, -1.0, 1.0)[:, None]
+    planes = np.concatenate([normal, -np.einsum("ij,ij->i", normal, centre)[:, None]], axis=1)
+    return planes, inverse(information_of(moments, planes))
+
+
+def motion_between(old: F64, new: F64, centre: F64) -> F64:
+    """(4, 4) smallest motion that takes the plane `old` (4,) to `new` (4,), turning about the point `centre` of the old one."""
+    axis = np.cross(old[:3], new[:3])
+    sine, cosine = float(np.linalg.norm(axis)), float(old[:3] @ new[:3])
+    R = exp_so3(axis / sine * np.arctan2(sine, cosine)) if sine > 1e-12 else np.eye(3)
+    T = np.eye(4)
+    T[:3, :3] = R
+    T[:3, 3] = centre - R @ centre - (new[:3] @ centre + new[3]) * new[:3]
+    return T
+
+
+def onto(samples: F32, planes: F64) -> F32:
+    """Samples (n, s, 3) dropped onto their planes (n, 4)."""
+    distance = np.einsum("nsj,nj->ns", samples, planes[:, :3]) + planes[:, None, 3]
+    return np.asarray(samples - distance[..., None] * planes[:, None, :3], np.float32)
+
+
+@numba.njit(cache=True, nogil=True)
+def spread(points: F32, count: int) -> F32:
+    """(count, 3) of the finite rows of points (n, 3), each the one farthest from those before it; NaN-padded."""
+    out = np.full((count, 3), np.nan, np.float32)
+    n = 0
+    kept = np.empty((len(points), 3), np.float32)
+    for i in range(len(points)):
+        if np.isfinite(points[i, 0]):
+            kept[n] = points[i]
+            n += 1
+    distance = np.full(n, np.inf)
+    chosen = 0
+    for k in range(min(n, count)):
+        out[k] = kept[chosen]
+        x, y, z = kept[chosen, 0], kept[chosen, 1], kept[chosen, 2]
+        farthest = -1.0
+        for i in range(n):
+            distance[i] = min(distance[i], (kept[i, 0] - x) ** 2 + (kept[i, 1] - y) ** 2 + (kept[i, 2] - z) ** 2)
+            if distance[i] > farthest:
+                farthest, chosen = distance[i], i
+    return out

@@ -1,0 +1,297 @@
+"""Labelled planar regions on a grid: growth to their borders, merging, and what is reported of them."""
+
+from __future__ import annotations
+
+import numba
+import numpy as np
+
+from trihedron.pipeline.types import F32, F64, I32, U8
+from trihedron.plugins.numerics.depth.organised_grid import Grid
+from trihedron.plugins.numerics.planes.plane_fitting import solve_symmetric
+
+
+@numba.njit(cache=True, nogil=True)
+def grow_regions(labels: I32, planes: F64, grid: Grid, gate: float, reach: int, cos_cone: float) -> I32:
+    """Labels (h, w), grown ring by ring into unlabelled cells whose depth is within `gate` σ of the neighbouring region's q; returns a copy.
+
+    A cell goes to the plane that explains it best. For `reach` rings normals do not count (they are blurred or missing near a border); beyond, a
+    normal must be missing or lie within the cone."""
+    rho, sigma, _, rays_x, rays_y, normals = grid
+    h, w = labels.shape
+    out = labels.copy()
+    offered = np.zeros((h, w), np.int32)
+    residual = np.empty((h, w), np.float32)
+    frontier = _border(labels)
+    nearby = np.empty(4 * h * w, np.int32)
+    unit = np.empty_like(planes)
+    for k in range(len(planes)):
+        unit[k] = -planes[k] / max(np.sqrt(planes[k] @ planes[k]), 1e-12)
+    ring = 0
+    while len(frontier) > 0:
+        m = 0
+        for i in frontier:
+            r, c = i // w, i % w
+            label = out[r, c]
+            k = label - 1
+            for s, d in ((r - 1, c), (r + 1, c), (r, c - 1), (r, c + 1)):
+                if s < 0 or s >= h or d < 0 or d >= w or out[s, d] != 0 or rho[s, d] <= 0.0:
+                    continue
+                p = rho[s, d]
+                e = abs(planes[k, 0] * rays_x[d] + planes[k, 1] * rays_y[s] + planes[k, 2] - p) / sigma[s, d]
+                if e > gate:
+                    continue
+                if ring >= reach:
+                    facing = normals[s, d, 0] * unit[k, 0] + normals[s, d, 1] * unit[k, 1] + normals[s, d, 2] * unit[k, 2]
+                    if facing < cos_cone:
+                        continue
+                if offered[s, d] == 0:
+                    nearby[m] = s * w + d
+                    m += 1
+                elif e > residual[s, d] or (e == residual[s, d] and label > offered[s, d]):
+                    continue
+                offered[s, d], residual[s, d] = label, e
+        frontier = nearby[:m].copy()
+        for i in frontier:
+            out[i // w, i % w] = offered[i // w, i % w]
+        ring += 1
+    return out
+
+
+@numba.njit(cache=True, nogil=True)
+def _border(labels: I32) -> I32:
+    """Flat numbers of the labelled cells beside unlabelled ones."""
+    h, w = labels.shape
+    out, n = np.empty(h * w, np.int32), 0
+    for r in range(h):
+        for c in range(w):
+            if labels[r, c] == 0:
+                continue
+            if (
+                (c > 0 and labels[r, c - 1] == 0)
+                or (c < w - 1 and labels[r, c + 1] == 0)
+                or (r > 0 and labels[r - 1, c] == 0)
+                or (r < h - 1 and labels[r + 1, c] == 0)
+            ):
+                out[n] = r * w + c
+                n += 1
+    return out[:n]
+
+
+@numba.njit(cache=True, nogil=True)
+def neighbours(labels: I32, count: int, gap: int) -> F64:
+    """(count, count) number of places where regions lie within `gap` cells of each other in a row or column."""
+    h, w = labels.shape
+    touch = np.zeros((count, count))
+    for r in range(h):
+        for c in range(w):
+            a = labels[r, c]
+            if a == 0:
+                continue
+            for k in range(1, min(gap, w - 1 - c) + 1):
+                b = labels[r, c + k]
+                if b == a:
+                    break
+                if b > 0:
+                    touch[a - 1, b - 1] += 1.0
+                    touch[b - 1, a - 1] += 1.0
+                    break
+            for k in range(1, min(gap, h - 1 - r) + 1):
+                b = labels[r + k, c]
+                if b == a:
+                    break
+                if b > 0:
+                    touch[a - 1, b - 1] += 1.0
+                    touch[b - 1, a - 1] += 1.0
+                    break
+    return touch
+
+
+@numba.njit(cache=True, nogil=True)
+def merge_regions(A: F64, b: F64, moments: F64, n: I32, touch: F64, limit: float) -> I32:
+    """Which region each of k becomes part of, (k + 1,) by label; the sums (as from `accumulate`, with the neighbours' counts) are added up in place.
+
+    From the largest down a region takes in those smaller neighbours for which the common plane is within `limit` σ (rms) of each one's own."""
+    k = len(n)
+    owner = np.arange(k + 1).astype(np.int32)
+    order = np.argsort(-n, kind="mergesort")
+    for i in order:
+        again = owner[i + 1] == i + 1
+        while again:
+            again = False
+            for j in range(k):
+                if touch[i, j] == 0.0 or j == i or owner[j + 1] != j + 1 or n[j] > n[i]:
+                    continue
+                if not _one_plane(A[i], b[i], n[i], A[j], b[j], n[j], limit):
+                    continue
+                A[i] += A[j]
+                b[i] += b[j]
+                moments[i] += moments[j]
+                n[i] += n[j]
+                touch[i] += touch[j]
+                again = True
+                for label in range(k + 1):
+                    if owner[label] == j + 1:
+                        owner[label] = i + 1
+    return owner
+
+
+@numba.njit(cache=True, nogil=True)
+def _one_plane(A: F64, b: F64, n: int, B: F64, c: F64, m: int, limit: float) -> bool:
+    """Whether the common plane of two regions lies within `limit` σ (rms) of each region's own."""
+    solved, common = solve_symmetric(A + B, b + c)
+    first, p = solve_symmetric(A, b)
+    second, q = solve_symmetric(B, c)
+    e, f = common - p, common - q
+    return solved and first and second and e @ (A @ e) < limit * limit * n and f @ (B @ f) < limit * limit * m
+
+
+@numba.njit(cache=True, nogil=True)
+def accumulate(labels: I32, regions: int, grid: Grid) -> tuple[F64, F64, F64, I32]:
+    """Sums over each region's cells, weighted by their number of depths: the normal equations of q (k, 3, 3) and (k, 3) with `σ = σ_z / z²`, the
+    moments `Σ [x;1][x;1]ᵀ / σ_z²` (k, 4, 4), and the number of depths (k,)."""
+    rho, sigma, count, rays_x, rays_y, _ = grid
+    sums, n = np.zeros((regions + 1, 19)), np.zeros(regions + 1, np.int32)  # upper triangles of A and M, row by row, and b between them
+    h, w = labels.shape
+    for r in range(h):
+        y = rays_y[r]
+        for c in range(w):
+            k = labels[r, c]
+            if k <= 0 or rho[r, c] <= 0.0:
+                continue
+            x, p = rays_x[c], float(rho[r, c])
+            z = 1.0 / p
+            weight = count[r, c] / (float(sigma[r, c]) * sigma[r, c])
+            moment = weight * p * p * p * p
+            px, py, s = x * z, y * z, sums[k]
+            s[0] += weight * x * x
+            s[1] += weight * x * y
+            s[2] += weight * x
+            s[3] += weight * y * y
+            s[4] += weight * y
+            s[5] += weight
+            s[6] += weight * x * p
+            s[7] += weight * y * p
+            s[8] += weight * p
+            s[9] += moment * px * px
+            s[10] += moment * px * py
+            s[11] += moment * px * z
+            s[12] += moment * px
+            s[13] += moment * py * py
+            s[14] += moment * py * z
+            s[15] += moment * py
+            s[16] += moment * z * z
+            s[17] += moment * z
+            s[18] += moment
+            n[k] += count[r, c]
+    A, b, M = np.empty((regions, 3, 3)), sums[1:, 6:9].copy(), np.empty((regions, 4, 4))
+    for k in range(regions):
+        _symmetric(sums[k + 1, :6], A[k])
+        _symmetric(sums[k + 1, 9:], M[k])
+    return A, b, M, n[1:].copy()
+
+
+@numba.njit(cache=True, nogil=True)
+def _symmetric(upper: F64, out: F64) -> None:
+    """Fill a square matrix from its upper triangle, row by row."""
+    k = 0
+    for i in range(len(out)):
+        for j in range(i, len(out)):
+            out[i, j] = out[j, i] = upper[k]
+            k += 1
+
+
+@numba.njit(cache=True, nogil=True)
+def areas(labels: I32, count: I32, regions: int) -> I32:
+    """(k,) number of depths in each region's cells."""
+    out = np.zeros(regions + 1, np.int32)
+    for r in range(labels.shape[0]):
+        for c in range(labels.shape[1]):
+            out[labels[r, c]] += count[r, c]
+    return out[1:]
+
+
+@numba.njit(cache=True, nogil=True)
+def spread_samples(labels: U8, planes: F64, rays_x: F64, rays_y: F64, wanted: int, most: int) -> F32:
+    """(k, wanted, 3) points of each plane, on its q and spread over its region by farthest-point choice among (about) `most` cells; NaN-padded."""
+    regions = len(planes)
+    h, w = labels.shape
+    size = np.zeros(regions + 1, np.int32)
+    for r in range(h):
+        for c in range(w):
+            size[labels[r, c]] += 1
+    out = np.full((regions, wanted, 3), np.nan, np.float32)
+    points, used, seen = np.empty((regions, most + 1, 3)), np.zeros(regions, np.int32), np.zeros(regions, np.int32)
+    for r in range(h):
+        for c in range(w):
+            k = labels[r, c] - 1
+            if k < 0:
+                continue
+            seen[k] += 1
+            if seen[k] * most < (used[k] + 0.5) * size[k + 1] or used[k] > most:
+                continue
+            p = planes[k, 0] * rays_x[c] + planes[k, 1] * rays_y[r] + planes[k, 2]
+            if p > 1e-6:
+                points[k, used[k], 0], points[k, used[k], 1], points[k, used[k], 2] = rays_x[c] / p, rays_y[r] / p, 1.0 / p
+                used[k] += 1
+    for k in range(regions):
+        _farthest_points(points[k, : used[k]], out[k])
+    return out
+
+
+@numba.njit(cache=True, nogil=True)
+def _farthest_points(points: F64, out: F32) -> None:
+    """Fill the rows of `out`, each the point farthest from those before it, beginning at the middle of the list."""
+    n = len(points)
+    distance = np.full(n, np.inf)
+    chosen = n // 2
+    for k in range(min(n, len(out))):
+        x, y, z = points[chosen]
+        out[k, 0], out[k, 1], out[k, 2] = x, y, z
+        best = -1.0
+        for i in range(n):
+            e = (points[i, 0] - x) ** 2 + (points[i, 1] - y) ** 2 + (points[i, 2] - z) ** 2
+            distance[i] = min(distance[i], e)
+            if distance[i] > best:
+                best, chosen = distance[i], i
+
+
+@numba.njit(cache=True, nogil=True)
+def excess_variance(labels: I32, planes: F64, grid: Grid, tiles: int, expected: float, weight: float) -> F64:
+    """(k,) variance of the mean of a patch of each region over what independent depths with the noise model's σ would give.
+
+    A region is cut into about `tiles` square tiles; with e the residuals and w the weights of a tile's cells the ratio is `Σ (Σ w e)² / Σ Σ w`, for
+    the three parameters fitted corrected, and shrunk towards `expected` with the weight of that many tiles. It measures what makes plane fits worse
+    than their least-squares covariance: correlated noise, quantisation, lens distortion and surfaces that are not quite plane."""
+    rho, sigma, count, rays_x, rays_y, _ = grid
+    h, w = labels.shape
+    regions = len(planes)
+    cells = np.zeros(regions)
+    for r in range(h):
+        for c in range(w):
+            if labels[r, c] > 0:
+                cells[labels[r, c] - 1] += 1.0
+    side = np.maximum(np.sqrt(cells / tiles), 2.0)
+    across = (w / side).astype(np.int64) + 1
+    start = np.zeros(regions + 1, np.int64)
+    for k in range(regions):
+        start[k + 1] = start[k] + across[k] * (int(h / side[k]) + 1)
+    total, information = np.zeros(start[-1]), np.zeros(start[-1])
+    for r in range(h):
+        for c in range(w):
+            k = labels[r, c] - 1
+            if k >= 0 and rho[r, c] > 0.0:
+                t = start[k] + int(r / side[k]) * across[k] + int(c / side[k])
+                inverse = count[r, c] / (float(sigma[r, c]) * sigma[r, c])
+                total[t] += inverse * (rho[r, c] - planes[k, 0] * rays_x[c] - planes[k, 1] * rays_y[r] - planes[k, 2])
+                information[t] += inverse
+    out = np.full(regions, expected)
+    for k in range(regions):
+        a, b, c = 0.0, 0.0, 0.0
+        for t in range(start[k], start[k + 1]):
+            a += total[t] * total[t]
+            b += information[t]
+            c += information[t] * information[t]
+        if c > 0.0:
+            effective = b * b / c
+            out[k] = (a / b * effective + expected * weight) / (max(effective - 3.0, 0.0) + weight)
+    return out
