@@ -28,8 +28,8 @@ def test_covered_frames_are_blind_and_the_others_untouched(covered):
         ({"cover": "9:3"}, "not a range"),
         ({"of": "faults"}, "another data set"),
         ({"options": {"frames": "0:3"}}, "dataset.frames"),
-        ({"options": {"motion": "fly"}}, "'fly' is not one of walk, still, pan"),
-        ({"options": {"length": -1}}, "length: -1 is not positive"),
+        ({"options": {"motion": "fly"}}, "'fly' is not one of walk, fast, still, pan"),
+        ({"options": {"length": -1}}, "length: -1 is negative"),
     ],
 )
 def test_what_cannot_be_read_is_refused(options, cause):

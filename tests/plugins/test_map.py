@@ -8,44 +8,13 @@ import numpy as np
 import pytest
 
 from trihedron.pipeline.geometry import exp_se3, invert, tangent_basis, transform, transform_planes
-from trihedron.pipeline.types import Correction, Pose
 from trihedron.plugins.map.covisibility import Covisibility
 from trihedron.plugins.map.none import NoMap
-from trihedron.plugins.matches.local_map import LocalMap
-from trihedron.plugins.numerics.maps.local_window import local_window
 from trihedron.plugins.numerics.planes import plane_fusion
 
 sys.path.insert(0, str(Path(__file__).parent))
-from landmark_world import World, camera_at, rotation_of, translation_of
-
-EVERY = Covisibility(min_frames=1, max_frames=1, min_shift=1e-3)  # each frame of a moving camera is a keyframe
-TABLES = ("keyframes", "points", "lines", "planes", "point_observations", "line_observations", "plane_observations")
-
-
-def pose_of(T, index, status="ok", inliers=(0, 0, 0)):
-    return Pose(index, index * 33_000_000, T, np.eye(6) * 1e-10, T, -1, np.array(inliers, np.int32), 0, status, "")
-
-
-def step(stage, world, map, index, at=None, features=None, bundle=None, loop=None, recognised=None, **pose):
-    """The map after frame `index`, whose camera stands at step `at` of the path and is known exactly; None when the stage says None."""
-    T = camera_at(index if at is None else at)
-    features = features or world.features(T, index)
-    matches = LocalMap()(world.frame(index), rotation_of(T, index), translation_of(T, index), *features, map, None)
-    return stage(world.frame(index), pose_of(T, index, **pose), *features, matches, map, bundle, loop, recognised)
-
-
-def walk(world, count, stage=EVERY, stride=1):
-    map = None
-    for index in range(count):
-        map = step(stage, world, map, index, at=index * stride) or map
-    return map
-
-
-def rows_of_world(world, map):
-    """The world's row of each map point: the nearest one with the same descriptor."""
-    same = (map.points.column("descriptor")[:, None] == world.descriptor[None]).all(axis=2)
-    assert (same.sum(axis=1) == 1).all()
-    return same.argmax(axis=1)
+from landmark_world import World, camera_at
+from map_steps import EVERY, TABLES, pose_of, rows_of_world, step, walk
 
 
 def test_the_first_frame_makes_a_keyframe_of_everything_with_depth():
@@ -254,102 +223,6 @@ def test_a_wall_entered_twice_becomes_one():
     map = step(EVERY, world, map, 2)
     assert list(map.planes.column("alive")) == [True, True, True, False]
     assert not (map.plane_observations.column("plane") == copy).any()
-
-
-KNOWN = (("point_information", "point_ids", (), 1e5), ("line_information", "line_ids", (2,), 1e4), ("plane_covariance", "plane_ids", (), 1e-5))
-
-
-def correction(map, **changes):
-    none = {
-        "based_on": map.revision, "keyframe_ids": np.empty(0, np.int32), "T_world_keyframe": np.empty((0, 4, 4)), "point_ids": np.empty(0, np.int32),
-        "points_m": np.empty((0, 3)), "line_ids": np.empty(0, np.int32), "endpoints_m": np.empty((0, 2, 3)), "plane_ids": np.empty(0, np.int32),
-        "coefficients": np.empty((0, 4)),
-    }  # fmt: skip
-    given = {**none, **changes}
-    known = {name: np.tile(np.eye(3), (len(given[ids]), *shape, 1, 1)) * scale for name, ids, shape, scale in KNOWN}
-    return Correction(map.index, map.stamp_ns, **known, **given)
-
-
-@pytest.mark.parametrize("wire", ["bundle", "loop"])
-def test_a_correction_moves_what_it_names_and_nothing_else(wire):
-    world = World()
-    map = walk(world, 4)
-    dead = map.points.updated(np.array([3]), alive=np.array([False]))
-    map = dataclasses.replace(map, points=dead)
-    old = {name: map.points.column("position_m") for name in ("points",)}["points"]
-    plane = map.planes.column("coefficients")[1].copy()
-    plane[3] += 0.05
-    ends = map.lines.column("endpoints_m")[2] + 0.01
-    moved = correction(
-        map, point_ids=np.array([1, 3, 99_999], np.int32), points_m=old[[1, 3, 0]] + 0.1, line_ids=np.array([2], np.int32), endpoints_m=ends[None],
-        plane_ids=np.array([1], np.int32), coefficients=plane[None], keyframe_ids=np.array([2, 3], np.int32),
-        T_world_keyframe=np.stack([camera_at(2) @ exp_se3(np.full(6, 0.01)), camera_at(3)]),
-    )  # fmt: skip
-    after = step(EVERY, world, map, 4, at=3.0001, status="lost", **{wire: moved})
-    assert after.revision == map.revision + 1 and len(after.keyframes) == 4
-    expected = old.copy()
-    expected[1] += 0.1
-    assert np.allclose(after.points.column("position_m"), expected)
-    assert np.allclose(after.lines.column("endpoints_m")[2], ends)
-    assert np.allclose(after.planes.column("coefficients")[1], plane)
-    fitted, _ = plane_fusion.fit_planes(after.planes.column("moments"), after.planes.column("coefficients"))
-    assert np.allclose(fitted, after.planes.column("coefficients"), atol=1e-6)  # the moments moved along, so the next frame does not undo it
-    assert np.allclose(after.points.column("information")[1], np.eye(3) * 1e5) and np.allclose(after.lines.column("information")[2], np.eye(3) * 1e4)
-    assert np.allclose(after.planes.column("covariance")[1], np.eye(3) * 1e-5)
-    again = plane_fusion.fit_planes(after.planes.rows("moments", np.array([1])), plane[None])[1]
-    assert np.allclose(again, np.eye(3) * 1e-5, rtol=1e-6)  # one measurement's worth: what is fused later is weighed against just that
-    assert np.allclose(after.keyframes.column("T_world_camera")[2], camera_at(2) @ exp_se3(np.full(6, 0.01)))
-
-
-def test_what_came_after_the_corrected_keyframes_moves_with_them():
-    """A correction of keyframes 0 to 2 arrives when keyframe 3 and its landmarks exist: the whole is moved rigidly and so is the rest."""
-    world = World()
-    map = walk(world, 4, stride=6)
-    shift = exp_se3(np.array([0.1, -0.05, 0.02, 0.01, 0.03, -0.02]))
-    poses = shift @ map.keyframes.column("T_world_camera")
-    early = {kind: np.flatnonzero(getattr(map, kind).column("first") < 3).astype(np.int32) for kind in ("points", "lines", "planes")}
-    assert any(len(early[kind]) < len(getattr(map, kind)) for kind in early)
-    moved = correction(
-        map,
-        keyframe_ids=np.arange(3, dtype=np.int32),
-        T_world_keyframe=poses[:3],
-        point_ids=early["points"],
-        points_m=transform(shift, map.points.rows("position_m", early["points"])),
-        line_ids=early["lines"],
-        endpoints_m=transform(shift, map.lines.rows("endpoints_m", early["lines"])),
-        plane_ids=early["planes"],
-        coefficients=transform_planes(shift, map.planes.rows("coefficients", early["planes"])),
-    )
-    after = step(EVERY, world, map, 4, status="lost", loop=moved)
-    assert np.allclose(after.keyframes.column("T_world_camera"), poses)
-    alive = after.points.column("alive")
-    assert np.allclose(after.points.column("position_m")[alive], transform(shift, map.points.column("position_m"))[alive])
-    alive = after.lines.column("alive")
-    assert np.allclose(after.lines.column("endpoints_m")[alive], transform(shift, map.lines.column("endpoints_m"))[alive])
-    assert np.allclose(after.planes.column("coefficients"), transform_planes(shift, map.planes.column("coefficients")))
-
-
-def test_keyframes_that_others_make_redundant_are_retired():
-    """A camera that goes to and fro over 0.3 m for 60 keyframes: what three others see as well is no longer part of any window."""
-    world, stage, map = World(), dataclasses.replace(EVERY, redundant=3), None
-    counts = []
-    for index in range(60):
-        at = 12.0 * np.sin(0.4 * index)
-        map = step(stage, world, map, index, at=at) or map
-        assert not len(map.keyframes) or map.keyframes.column("alive")[[0, -1]].all()
-        counts.append(int(map.keyframes.column("alive").sum()))
-    alive = map.keyframes.column("alive")
-    assert len(alive) == 60 and max(counts) < 20 and max(counts[40:]) <= max(counts[:40]) + 1  # bounded, however long it stays
-    poses = np.stack([camera_at(12.0 * np.sin(0.4 * index)) for index in range(60)])
-    assert np.array_equal(map.keyframes.column("T_world_camera"), poses)
-    window = local_window(map, poses[-1], 2, 10, 3)
-    assert alive[window.keyframes].all() and len(window.points) > 50
-
-
-def test_a_keyframe_is_not_redundant_when_the_others_are_far_behind_or_see_something_else():
-    """Walking on, every keyframe sees something that too few others do."""
-    map = walk(World(2000), 14, dataclasses.replace(EVERY, redundant=8), stride=8)
-    assert map.keyframes.column("alive").all()
 
 
 def test_a_keyframe_without_features_is_no_error():

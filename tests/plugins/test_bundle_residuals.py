@@ -1,0 +1,123 @@
+"""Residuals of the bundle adjustment: analytic derivatives against numeric ones."""
+
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from trihedron.pipeline.geometry import exp_se3, tangent_basis
+from trihedron.plugins.numerics.bundle import bundle_terms as terms
+from trihedron.plugins.numerics.bundle.bundle_kernel import line_basis
+from trihedron.plugins.numerics.motion.pose_terms import PARALLEL, PERPENDICULAR, SAME, basis, depth_direction, plane_rows
+
+sys.path.insert(0, str(Path(__file__).parent))
+from derivatives import numeric
+from landmark_world import CAMERA
+
+INTRINSICS = np.array([CAMERA.fx, CAMERA.fy, CAMERA.cx, CAMERA.cy])
+
+
+def shifted(T, xi):
+    return T @ exp_se3(xi)
+
+
+def parts(T):
+    return np.ascontiguousarray(T[:3, :3]), np.ascontiguousarray(T[:3, 3])
+
+
+@pytest.fixture(scope="module")
+def view():
+    """A camera, and what it might see."""
+    rng = np.random.default_rng(3)
+    T = exp_se3(rng.normal(size=6) * 0.3)
+    x = T[:3, :3] @ np.array([0.4, -0.3, 2.5]) + T[:3, 3]
+    line = x + np.array([[0.3, 0.1, -0.2], [-0.4, 0.2, 0.3]])
+    return T, x, line, np.array([[350.0, 200.0], [300.0, 260.0]])
+
+
+@pytest.mark.parametrize("depth_m", [2.6, np.nan])
+def test_the_derivatives_of_a_point(view, depth_m):
+    T, x, _, segment = view
+    out = np.empty(3), np.empty((3, 6)), np.empty((3, 3)), np.empty((3, 3)), np.empty(3)
+
+    def at(T, x):
+        assert terms.point_term(*parts(T), x, segment[0], depth_m, INTRINSICS, *out)
+        return out[0].copy()
+
+    at(T, x)
+    J_pose, J_point = out[1].copy(), out[2].copy()
+    assert np.allclose(J_pose, numeric(lambda d: at(shifted(T, d), x), 6), rtol=1e-6, atol=1e-5)
+    assert np.allclose(J_point, numeric(lambda d: at(T, x + d), 3), rtol=1e-6, atol=1e-5)
+
+
+@pytest.mark.parametrize("share", [0.2, 1.1])
+def test_the_derivatives_of_a_line(view, share):
+    T, _, line, segment = view
+    N, m = np.empty((3, 2)), np.empty(3)
+    line_basis(line, N)
+    J_pose, J_line, D, p = np.empty(6), np.empty(4), np.empty((1, 3)), np.empty(3)
+    observed = np.array([[0.7, -0.2, 2.3], [0.0, -0.1, 2.8]])
+    assert depth_direction(observed, m)
+
+    def image(T, line):
+        return np.array([terms.line_term(*parts(T), line, N, share, segment, INTRINSICS, J_pose, J_line, D, p)[0]])
+
+    def depth(T, line):
+        image(T, line)
+        return np.array([terms.line_depth_term(parts(T)[0], N, share, observed, m, J_pose, J_line, D, p)[0]])
+
+    for residual in (image, depth):
+        residual(T, line)
+        by_pose, by_line = J_pose.copy(), J_line.copy()
+        assert np.allclose(by_pose, numeric(lambda d, f=residual: f(shifted(T, d), line), 6)[0], rtol=1e-6, atol=1e-5)
+        by_hand = numeric(lambda d, f=residual: f(T, line + np.stack([N @ d[:2], N @ d[2:]])), 4)[0]
+        assert np.allclose(by_line, by_hand, rtol=1e-6, atol=1e-5)
+
+
+def moved_plane(plane, d):
+    n = plane[:3] + tangent_basis(plane[:3]) @ d[:2]
+    return np.append(n / np.linalg.norm(n), plane[3] + d[2])
+
+
+def some_planes():
+    """Two planes near a right angle, and one near parallel to the first but facing it."""
+    rng = np.random.default_rng(4)
+    n = np.linalg.qr(rng.normal(size=(3, 3)))[0]
+    planes = [np.append(n[0], 1.5), np.append(n[1], -0.7), np.append(-n[0], 2.0)]
+    return [moved_plane(plane, rng.normal(size=3) * 0.02) for plane in planes]
+
+
+def test_the_derivatives_of_a_plane(view):
+    T, first = view[0], some_planes()[0]
+    observed = np.append(T[:3, :3].T @ moved_plane(first, np.array([0.02, -0.03, 0.0]))[:3], 1.4)
+    B, r, J_pose, J_plane = np.empty((3, 2)), np.empty(3), np.empty((3, 6)), np.empty((3, 3))
+    basis(observed[:3], B)
+
+    def at(T, plane):
+        plane_rows(SAME, *parts(T), plane, observed, B, r, J_pose)
+        return r.copy()
+
+    at(T, first)
+    by_pose = J_pose.copy()
+    terms.by_plane(*parts(T), first, B, J_plane)
+    assert np.allclose(by_pose, numeric(lambda d: at(shifted(T, d), first), 6), atol=1e-8)
+    assert np.allclose(J_plane, numeric(lambda d: at(T, moved_plane(first, d)), 3), atol=1e-8)
+
+
+@pytest.mark.parametrize("kind, other", [(PERPENDICULAR, 1), (PARALLEL, 2)])
+def test_the_derivatives_of_a_relation(kind, other):
+    planes = some_planes()
+    a, b = planes[0], planes[other]
+    B, r, J_a, J_b = np.empty((3, 2)), np.empty(2), np.empty((2, 3)), np.empty((2, 3))
+    basis(b, B)
+
+    def at(a, b):
+        rows = terms.relation_rows(kind, a, b, B, r, J_a, J_b)
+        return r[:rows].copy()
+
+    rows = len(at(a, b))
+    by_a, by_b = J_a[:rows].copy(), J_b[:rows].copy()
+    assert rows == (1 if kind == PERPENDICULAR else 2)
+    assert np.allclose(by_a, numeric(lambda d: at(moved_plane(a, d), b), 3), atol=1e-8)
+    assert np.allclose(by_b, numeric(lambda d: at(a, moved_plane(b, d)), 3), atol=1e-8)

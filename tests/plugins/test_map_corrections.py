@@ -1,0 +1,98 @@
+"""What a correction does to the map: it moves what it names, and what came after."""
+
+import dataclasses
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from trihedron.pipeline.geometry import exp_se3, transform, transform_planes
+from trihedron.plugins.numerics.maps.local_window import local_window
+from trihedron.plugins.numerics.planes import plane_fusion
+
+sys.path.insert(0, str(Path(__file__).parent))
+from landmark_world import World, camera_at
+from map_steps import EVERY, correction, step, walk
+
+
+@pytest.mark.parametrize("wire", ["bundle", "loop"])
+def test_a_correction_moves_what_it_names_and_nothing_else(wire):
+    world = World()
+    map = walk(world, 4)
+    dead = map.points.updated(np.array([3]), alive=np.array([False]))
+    map = dataclasses.replace(map, points=dead)
+    old = {name: map.points.column("position_m") for name in ("points",)}["points"]
+    plane = map.planes.column("coefficients")[1].copy()
+    plane[3] += 0.05
+    ends = map.lines.column("endpoints_m")[2] + 0.01
+    moved = correction(
+        map, point_ids=np.array([1, 3, 99_999], np.int32), points_m=old[[1, 3, 0]] + 0.1, line_ids=np.array([2], np.int32), endpoints_m=ends[None],
+        plane_ids=np.array([1], np.int32), coefficients=plane[None], keyframe_ids=np.array([2, 3], np.int32),
+        T_world_keyframe=np.stack([camera_at(2) @ exp_se3(np.full(6, 0.01)), camera_at(3)]),
+    )  # fmt: skip
+    after = step(EVERY, world, map, 4, at=3.0001, status="lost", **{wire: moved})
+    assert after.revision == map.revision + 1 and len(after.keyframes) == 4
+    expected = old.copy()
+    expected[1] += 0.1
+    assert np.allclose(after.points.column("position_m"), expected)
+    assert np.allclose(after.lines.column("endpoints_m")[2], ends)
+    assert np.allclose(after.planes.column("coefficients")[1], plane)
+    fitted, _ = plane_fusion.fit_planes(after.planes.column("moments"), after.planes.column("coefficients"))
+    assert np.allclose(fitted, after.planes.column("coefficients"), atol=1e-6)  # the moments moved along, so the next frame does not undo it
+    assert np.allclose(after.points.column("information")[1], np.eye(3) * 1e5) and np.allclose(after.lines.column("information")[2], np.eye(3) * 1e4)
+    assert np.allclose(after.planes.column("covariance")[1], np.eye(3) * 1e-5)
+    again = plane_fusion.fit_planes(after.planes.rows("moments", np.array([1])), plane[None])[1]
+    assert np.allclose(again, np.eye(3) * 1e-5, rtol=1e-6)  # one measurement's worth: what is fused later is weighed against just that
+    assert np.allclose(after.keyframes.column("T_world_camera")[2], camera_at(2) @ exp_se3(np.full(6, 0.01)))
+
+
+def test_what_came_after_the_corrected_keyframes_moves_with_them():
+    """A correction of keyframes 0 to 2 arrives when keyframe 3 and its landmarks exist: the whole is moved rigidly and so is the rest."""
+    world = World()
+    map = walk(world, 4, stride=6)
+    shift = exp_se3(np.array([0.1, -0.05, 0.02, 0.01, 0.03, -0.02]))
+    poses = shift @ map.keyframes.column("T_world_camera")
+    early = {kind: np.flatnonzero(getattr(map, kind).column("first") < 3).astype(np.int32) for kind in ("points", "lines", "planes")}
+    assert any(len(early[kind]) < len(getattr(map, kind)) for kind in early)
+    moved = correction(
+        map,
+        keyframe_ids=np.arange(3, dtype=np.int32),
+        T_world_keyframe=poses[:3],
+        point_ids=early["points"],
+        points_m=transform(shift, map.points.rows("position_m", early["points"])),
+        line_ids=early["lines"],
+        endpoints_m=transform(shift, map.lines.rows("endpoints_m", early["lines"])),
+        plane_ids=early["planes"],
+        coefficients=transform_planes(shift, map.planes.rows("coefficients", early["planes"])),
+    )
+    after = step(EVERY, world, map, 4, status="lost", loop=moved)
+    assert np.allclose(after.keyframes.column("T_world_camera"), poses)
+    alive = after.points.column("alive")
+    assert np.allclose(after.points.column("position_m")[alive], transform(shift, map.points.column("position_m"))[alive])
+    alive = after.lines.column("alive")
+    assert np.allclose(after.lines.column("endpoints_m")[alive], transform(shift, map.lines.column("endpoints_m"))[alive])
+    assert np.allclose(after.planes.column("coefficients"), transform_planes(shift, map.planes.column("coefficients")))
+
+
+def test_keyframes_that_others_make_redundant_are_retired():
+    """A camera that goes to and fro over 0.3 m for 60 keyframes: what three others see as well is no longer part of any window."""
+    world, stage, map = World(), dataclasses.replace(EVERY, redundant=3), None
+    counts = []
+    for index in range(60):
+        at = 12.0 * np.sin(0.4 * index)
+        map = step(stage, world, map, index, at=at) or map
+        assert not len(map.keyframes) or map.keyframes.column("alive")[[0, -1]].all()
+        counts.append(int(map.keyframes.column("alive").sum()))
+    alive = map.keyframes.column("alive")
+    assert len(alive) == 60 and max(counts) < 20 and max(counts[40:]) <= max(counts[:40]) + 1  # bounded, however long it stays
+    poses = np.stack([camera_at(12.0 * np.sin(0.4 * index)) for index in range(60)])
+    assert np.array_equal(map.keyframes.column("T_world_camera"), poses)
+    window = local_window(map, poses[-1], 2, 10, 3)
+    assert alive[window.keyframes].all() and len(window.points) > 50
+
+
+def test_a_keyframe_is_not_redundant_when_the_others_are_far_behind_or_see_something_else():
+    """Walking on, every keyframe sees something that too few others do."""
+    map = walk(World(2000), 14, dataclasses.replace(EVERY, redundant=8), stride=8)
+    assert map.keyframes.column("alive").all()
