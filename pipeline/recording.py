@@ -29,7 +29,7 @@ CHUNK_BYTES = 1 << 20
 CHUNK_SECONDS = 0.5
 MESSAGE_OVERHEAD = 64  # bytes of a message beside its data, generously
 TIMING_TOPIC = "/timing"
-DAMAGE = (McapError, ValueError, EOFError, AssertionError, KeyError, struct.error, zstandard.ZstdError)  # what damaged bytes make the library raise
+DAMAGE = (McapError, ValueError, EOFError, AssertionError, KeyError, struct.error, zstandard.ZstdError, RuntimeError)  # by damaged bytes
 _close_chunk = methodcaller("_Writer__finalize_chunk")  # the library closes a chunk by size only, and a crash would lose a slow topic's last minutes
 TIMING_SCHEMA = {
     "type": "object",
@@ -49,7 +49,7 @@ class RecordingWriter:
             self._file = open(path, "wb")
         except OSError as error:
             raise RecordingError(str(path), f"cannot be written: {error.strerror}", "give another out=FOLDER") from error
-        self._writer: Any = Writer(self._file, chunk_size=2 * CHUNK_BYTES, compression=CompressionType.ZSTD)
+        self._writer: Any = Writer(self._file, chunk_size=2 * CHUNK_BYTES, compression=CompressionType.LZ4)  # fast: most of it hardly shrinks
         self._writer.start(library="trihedron")
         self._writer.add_metadata(METADATA, {"format": FORMAT, **metadata})
         self._file.flush()

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import contextlib
 import heapq
+import sys
 import threading
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping
@@ -19,6 +20,8 @@ import cv2
 from threadpoolctl import threadpool_limits
 
 from trihedron.pipeline.graph import PREVIOUS, Wire
+
+SWITCH_S = 0.0005  # of Python's usual 5 ms
 
 
 @dataclass(frozen=True)
@@ -198,11 +201,14 @@ class Scheduler:
 
 @contextlib.contextmanager
 def single_threaded_libraries() -> Iterator[None]:
-    """One thread per library: the runner parallelises stages itself, and sums split over threads would change with their number."""
-    before = cv2.getNumThreads()
+    """One thread per library: the runner parallelises stages itself, and sums split over threads would change with their number. A thread that
+    waits for the interpreter gets it after `SWITCH_S`: a stage returns from compiled code some hundred times a frame."""
+    before, switch_s = cv2.getNumThreads(), sys.getswitchinterval()
     cv2.setNumThreads(1)
+    sys.setswitchinterval(SWITCH_S)
     try:
         with threadpool_limits(1):
             yield
     finally:
         cv2.setNumThreads(before)
+        sys.setswitchinterval(switch_s)
