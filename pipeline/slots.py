@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import inspect
 import re
+from functools import cache
 from typing import Any, Generic, Protocol, TypeVar, get_type_hints
 
 from trihedron.pipeline.types import (
@@ -273,14 +274,13 @@ def method_of(slot: str) -> str:
 def inputs_of(slot: str) -> dict[str, Any]:
     """Parameter name -> type of a slot's inputs (without self, a fold's state or a data set's index)."""
     hints = get_type_hints(getattr(SLOTS[slot], method_of(slot)))
-    names = list(inspect.signature(getattr(SLOTS[slot], method_of(slot))).parameters)
-    return {name: hints[name] for name in names if name not in ("self", "state", "index")}
+    return {name: hint for name, hint in hints.items() if name not in ("state", "index", "return")}
 
 
+@cache
 def output_of(slot: str) -> Any:
     """The type a slot writes (without None)."""
-    hint = get_type_hints(SLOTS[slot].finish if slot in FOLDS else SLOTS[slot].__call__)["return"]
-    return strip_none(hint)
+    return strip_none(get_type_hints(SLOTS[slot].finish if slot in FOLDS else SLOTS[slot].__call__)["return"])
 
 
 def strip_none(hint: Any) -> Any:

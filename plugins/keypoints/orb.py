@@ -14,11 +14,11 @@ from trihedron.pipeline.registry import register
 from trihedron.pipeline.types import F32, I32, U8, Frame, Keypoints
 from trihedron.plugins.numerics.depth.depth_sampling import local_depth, noise_coefficients
 from trihedron.plugins.numerics.images.corner_measures import centroid_angles_deg, harris_scores
+from trihedron.plugins.numerics.images.fast_corners import fast_corners
 from trihedron.plugins.numerics.images.image_pyramid import full_pixels, image_pyramid
-from trihedron.plugins.numerics.images.spreading import Grid, spread_over_grid
+from trihedron.plugins.numerics.images.spreading import spread_over_grid
 
 MARGIN_PX = 19  # of a level, within which its descriptors would reach over the border
-FAST_PX = 4  # radius of the circle FAST compares with, and one for its comparison of neighbours
 PATCH_PX = 31  # side of what a descriptor looks at (Rublee et al.)
 
 
@@ -89,29 +89,14 @@ class Orb:
 
     def _corners(self, pyramid: list[U8]) -> Corners:
         """FAST corners of every level: at the high threshold, and at the low one in those grid cells that would have less than their share."""
-        h, w = pyramid[0].shape
-        grid = Grid(self.cell_px, -(-h // self.cell_px), -(-w // self.cell_px))
-        ratios = [np.array([w / image.shape[1], h / image.shape[0]]) for image in pyramid]
-        found = [self._fast(image, self.fast_threshold) for image in pyramid]
-        places = [grid.places(cells, ratio) for cells, ratio in zip(found, ratios)]
-        poor = np.bincount(np.concatenate(places), minlength=grid.down * grid.across) < 2 * self.features / (grid.down * grid.across)
-        group, rectangles = grid.groups(poor)
-        for level, (image, ratio) in enumerate(zip(pyramid, ratios)):
-            kept = [found[level][~poor[places[level]]]]
-            for number, (left, top, right, bottom) in enumerate(rectangles, 1):
-                x, y = max(int(left / ratio[0]) - FAST_PX, 0), max(int(top / ratio[1]) - FAST_PX, 0)
-                patch = image[y : int(bottom / ratio[1]) + FAST_PX, x : int(right / ratio[0]) + FAST_PX]
-                more = self._fast(patch, self.fast_threshold_low) + np.array([x, y], np.int32)
-                kept.append(more[group[grid.places(more, ratio)] == number])
-            cells = np.concatenate(kept)
-            found[level] = cells[((cells >= MARGIN_PX) & (cells < np.array(image.shape[::-1]) - MARGIN_PX)).all(1)]
-        return Corners(np.concatenate(found), np.repeat(np.arange(len(found), dtype=np.int32), [len(cells) for cells in found]))
-
-    def _fast(self, image: U8, threshold: int) -> I32:
-        """Corners (n, 2) of an image, in rows."""
-        self._opencv.fast.setThreshold(threshold)
-        found = cv2.KeyPoint_convert(self._opencv.fast.detect(image))
-        return np.rint(np.asarray(found, np.float32).reshape(-1, 2)).astype(np.int32)
+        found = [fast_corners(image, self.fast_threshold_low, MARGIN_PX) for image in pyramid]
+        cells, strengths = np.concatenate([cells for cells, _ in found]), np.concatenate([strengths for _, strengths in found])
+        levels = np.repeat(np.arange(len(found), dtype=np.int32), [len(cells) for cells, _ in found])
+        places = (full_pixels(cells, levels, pyramid) / self.cell_px).astype(np.int32) @ np.array([1, 1 + pyramid[0].shape[1] // self.cell_px])
+        strong = strengths >= self.fast_threshold
+        across, down = (-(-side // self.cell_px) for side in pyramid[0].shape[::-1])
+        rich = np.bincount(places[strong], minlength=places.max(initial=0) + 1) >= 2 * self.features / (across * down)
+        return Corners(cells, levels).take(strong | ~rich[places])
 
     def _choose(self, corners: Corners, pyramid: list[U8]) -> Corners:
         """The strongest by Harris measure, spread over the image, in order of level, row and column."""
@@ -140,7 +125,7 @@ class Orb:
         ]
         out = np.zeros((len(points), 32), np.uint8)
         if points:
-            kept, described = self._opencv.orb.compute(gray, points)
+            kept, described = self._orb.compute(gray, points)
             if described is not None:
                 out[[k.class_id for k in kept]] = described
         return out
@@ -150,9 +135,8 @@ class Orb:
         return threading.local()
 
     @property
-    def _opencv(self) -> Any:
-        """This thread's OpenCV objects, `fast` and `orb`: they may not be shared between threads."""
+    def _orb(self) -> Any:
+        """This thread's descriptor: OpenCV's may not be shared between threads."""
         if not hasattr(self._local, "orb"):
-            self._local.fast = cv2.FastFeatureDetector_create(self.fast_threshold, True)
             self._local.orb = cv2.ORB_create(self.features, self.scale, self.levels, edgeThreshold=MARGIN_PX)
-        return self._local
+        return self._local.orb

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
-import cv2
+import numpy as np
 
 from trihedron.pipeline.registry import register
 from trihedron.pipeline.types import Frame, LineSegments
-from trihedron.plugins.numerics.images.straight_edges import SMALLEST, StraightEdges
+from trihedron.plugins.numerics.images.line_support import line_support_segments
+from trihedron.plugins.numerics.images.straight_edges import StraightEdges
 
 
 @register("lines", "lsd")
@@ -18,15 +18,17 @@ class Lsd(StraightEdges):
     """Line segment detector (von Gioi et al., PAMI 2010) on a reduced image, fragments merged, placed to sub-pixel on the full image,
     described by LBD (Zhang & Koch, 2013). Segments are directed with the bright side on their right: start and end keep their meaning over time."""
 
+    tolerance_deg: float = 22.5  # between a pixel's level line and its segment's; this and the next two are von Gioi et al.'s
+    quantisation: float = 2.0  # grey levels a gradient may be wrong by
+    density: float = 0.7  # share of a segment's rectangle that its pixels fill
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if not 5.0 <= self.tolerance_deg <= 45.0 or self.quantisation <= 0.0 or not 0.0 < self.density <= 1.0:
+            raise ValueError("tolerance_deg, quantisation, density: must be 5 to 45, above 0, and above 0 and at most 1")
+
     def __call__(self, frame: Frame) -> LineSegments:
         """The longest segments, longest first; (n, 32) binary descriptors."""
         small = self._reduced(frame.gray)
-        found = self._detector.detect(small)[0] if min(small.shape) >= SMALLEST else None
+        found = line_support_segments(small, float(np.radians(self.tolerance_deg)), self.quantisation, self.density)
         return self._segments(frame, small, found)
-
-    @property
-    def _detector(self) -> Any:
-        """This thread's detector: two frames in one OpenCV LSD object crash the process."""
-        if not hasattr(self._local, "lsd"):
-            self._local.lsd = cv2.createLineSegmentDetector(cv2.LSD_REFINE_STD, 1.0)
-        return self._local.lsd

@@ -26,12 +26,14 @@ def line_band_descriptors(gradient_x: F32, gradient_y: F32, lines: F32, scale: f
     Bits compare two bands' values, 8 for each of 32 pairs. Gradients are read from the nearest pixel every `step_px`."""
     out = np.zeros((len(lines), BYTES), np.uint8)
     height = BANDS * band_px
-    rows = np.empty((height, 4))
+    rows, centre = np.empty((height, 4)), 0.5 * (height - 1)
+    globally = np.exp(-0.5 * ((np.arange(height) - centre) / centre) ** 2)
+    locally = np.exp(-0.5 * ((np.arange(3 * band_px) - (1.5 * band_px - 0.5)) / band_px) ** 2)
     for i in range(len(lines)):
         x0, y0 = (lines[i, 0, 0] + 0.5) * scale - 0.5, (lines[i, 0, 1] + 0.5) * scale - 0.5
         x1, y1 = (lines[i, 1, 0] + 0.5) * scale - 0.5, (lines[i, 1, 1] + 0.5) * scale - 0.5
-        _row_sums(gradient_x, gradient_y, x0, y0, x1, y1, step_px, rows)
-        values = _bands(rows, band_px)
+        _row_sums(gradient_x, gradient_y, x0, y0, x1, y1, step_px, globally, rows)
+        values = _bands(rows, band_px, locally)
         for p in range(BYTES):
             byte = 0
             for k in range(8):
@@ -41,8 +43,9 @@ def line_band_descriptors(gradient_x: F32, gradient_y: F32, lines: F32, scale: f
 
 
 @numba.njit(cache=True, nogil=True)
-def _row_sums(gx: F32, gy: F32, x0: float, y0: float, x1: float, y1: float, step_px: float, rows: F64) -> None:
-    """Sums along each row parallel to the segment of the gradient's positive and negative parts, across and along it, per sample."""
+def _row_sums(gx: F32, gy: F32, x0: float, y0: float, x1: float, y1: float, step_px: float, weights: F64, rows: F64) -> None:
+    """Sums along each row parallel to the segment of the gradient's positive and negative parts, across and along it, per sample and
+    weighted by the row."""
     h, w = gx.shape
     length = np.hypot(x1 - x0, y1 - y0)
     ux, uy = (x1 - x0) / max(length, 1e-9), (y1 - y0) / max(length, 1e-9)
@@ -60,21 +63,22 @@ def _row_sums(gx: F32, gy: F32, x0: float, y0: float, x1: float, y1: float, step
                 b += max(-across, 0.0)
                 c += max(along, 0.0)
                 d += max(-along, 0.0)
-        weight = np.exp(-0.5 * (o / centre) ** 2) / count
+        weight = weights[r] / count
         rows[r, 0], rows[r, 1], rows[r, 2], rows[r, 3] = weight * a, weight * b, weight * c, weight * d
 
 
 @numba.njit(cache=True, nogil=True)
-def _bands(rows: F64, band_px: int) -> F64:
-    """(9, 8): mean and standard deviation of each band's row sums, both parts normalised over the line."""
+def _bands(rows: F64, band_px: int, weights: F64) -> F64:
+    """(9, 8): mean and standard deviation of the row sums of each band and its neighbours, weighted (3 · band_px,); both parts normalised over the
+    line."""
     values = np.zeros((BANDS, 8))
     for b in range(BANDS):
-        middle = (b + 0.5) * band_px - 0.5
-        low, high = max((b - 1) * band_px, 0), min((b + 2) * band_px, len(rows))
+        first = (b - 1) * band_px
+        low, high = max(first, 0), min(first + 3 * band_px, len(rows))
         for k in range(4):
             s, m, q = 0.0, 0.0, 0.0
             for r in range(low, high):
-                w = np.exp(-0.5 * ((r - middle) / band_px) ** 2)
+                w = weights[r - first]
                 s += 1.0
                 m += w * rows[r, k]
                 q += w * rows[r, k] * w * rows[r, k]

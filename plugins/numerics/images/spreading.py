@@ -2,34 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
-import cv2
 import numba
 import numpy as np
 
-from trihedron.pipeline.types import F32, F64, I32, Bool
-
-
-@dataclass(frozen=True)
-class Grid:
-    """Square cells over an image, numbered row by row."""
-
-    cell_px: int
-    down: int
-    across: int
-
-    def places(self, pixels: I32, ratio: F64) -> I32:
-        """(n,) cell of each pixel (n, 2) of an image `ratio` times smaller (x, y)."""
-        cells = (pixels * (ratio / self.cell_px)).astype(np.int32)
-        return np.minimum(cells[:, 1], self.down - 1) * self.across + np.minimum(cells[:, 0], self.across - 1)
-
-    def groups(self, marked: Bool) -> tuple[I32, list[tuple[int, int, int, int]]]:
-        """Neighbouring marked cells (n,) as groups: the number of each cell's group, 0 = none (n,), and rectangles (left, top, right, bottom) in px
-        around group 1, 2, …, half open."""
-        _, numbers, stats, _ = cv2.connectedComponentsWithStats(marked.reshape(self.down, self.across).astype(np.uint8))
-        side = self.cell_px
-        return numbers.ravel(), [(x * side, y * side, (x + w) * side, (y + h) * side) for x, y, w, h, _ in stats[1:].tolist()]
+from trihedron.pipeline.types import F32, I32, Bool
 
 
 @numba.njit(cache=True, nogil=True)
