@@ -3,6 +3,7 @@
 import cv2
 import numpy as np
 import pytest
+
 from trihedron.plugins.numerics.images.fast_corners import fast_corners
 
 MARGIN = 4

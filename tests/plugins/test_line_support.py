@@ -3,6 +3,7 @@
 import cv2
 import numpy as np
 import pytest
+
 from trihedron.datasets.synthetic import Synthetic
 from trihedron.plugins.numerics.images.line_support import line_support_segments
 

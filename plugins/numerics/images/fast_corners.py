@@ -61,7 +61,10 @@ def _strengths(image: U8, y: int, first: int, out: U8) -> None:
 
 
 @numba.njit(cache=True, nogil=True)
-def _arc(p0, p1, p2, p3, p4, p5, p6, p7, p8, p9, p10, p11, p12, p13, p14, p15):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN202, PLR0913
+def _arc(
+    p0: int, p1: int, p2: int, p3: int, p4: int, p5: int, p6: int, p7: int,
+    p8: int, p9: int, p10: int, p11: int, p12: int, p13: int, p14: int, p15: int,
+) -> int:  # fmt: skip
     """The largest grey level that 9 neighbours in a row on the circle all reach."""
     m1, m3, m5, m7, m9, m11, m13, m15 = (
         min(p1, p2), min(p3, p4), min(p5, p6), min(p7, p8), min(p9, p10), min(p11, p12), min(p13, p14), min(p15, p0),
