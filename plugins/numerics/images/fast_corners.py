@@ -55,8 +55,9 @@ def _strengths(image: U8, y: int, first: int, out: U8) -> None:
             np.uint8(~p0), np.uint8(~p1), np.uint8(~p2), np.uint8(~p3), np.uint8(~p4), np.uint8(~p5), np.uint8(~p6), np.uint8(~p7),
             np.uint8(~p8), np.uint8(~p9), np.uint8(~p10), np.uint8(~p11), np.uint8(~p12), np.uint8(~p13), np.uint8(~p14), np.uint8(~p15),
         )  # fmt: skip
-        d = np.uint8(~c)
-        more = max(np.uint8(max(bright, c) - c), np.uint8(max(dark, d) - d))
+        d = int(~c) & 255
+        above, below = np.uint8(max(bright, c) - c), np.uint8(max(dark, d) - d)
+        more = max(above, below)
         out[i] = np.uint8(max(more, np.uint8(1)) - 1)
 
 

@@ -51,7 +51,7 @@ class StraightEdges:
         size = max(round(gray.shape[1] * self.scale), 1), max(round(gray.shape[0] * self.scale), 1)
         return np.asarray(cv2.resize(gray, size, interpolation=cv2.INTER_AREA))
 
-    def _segments(self, frame: Frame, small: U8, found: F32 | None) -> LineSegments:
+    def _segments(self, frame: Frame, small: U8, found: F32 | F64 | None) -> LineSegments:
         """The longest segments, longest first, with (n, 32) binary descriptors, of those `found` on the reduced image: n × 4 numbers in any shape."""
         lines = np.zeros((0, 4)) if found is None else np.asarray((found.reshape(-1, 4).astype(np.float64) + 0.5) / self.scale - 0.5)
         endpoints = self._refined(frame.gray, lines)
