@@ -6,7 +6,7 @@ cost the square of its size; here a new version copies only the chunks it touche
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -54,23 +54,20 @@ class Table:
             return np.empty((0, *column.shape), column.dtype)
         if ids.min() < 0 or ids.max() >= self.size:
             raise IndexError(f"row {ids.max() if ids.max() >= self.size else ids.min()} of a table of {self.size}")
-        number, offset = np.divmod(ids, CHUNK)
         out = np.empty((len(ids), *column.shape), column.dtype)
-        for chunk in np.unique(number):
-            here = number == chunk
-            out[here] = self.chunks[name][chunk][offset[here]]
+        for chunk, here, offset in _by_chunk(ids):
+            out[here] = self.chunks[name][chunk][offset]
         return out
 
     def updated(self, ids: Array, **columns: Array) -> Table:
         """A version in which rows `ids` (distinct) of the given columns hold new values; other chunks are shared."""
         chunks = dict(self.chunks)
-        number, offset = np.divmod(np.asarray(ids), CHUNK)
+        touched = list(_by_chunk(np.asarray(ids)))
         for name, values in columns.items():
             parts = list(chunks[name])
-            for chunk in np.unique(number):
-                here = number == chunk
+            for chunk, here, offset in touched:
                 part = parts[chunk].copy()
-                part[offset[here]] = values[here]
+                part[offset] = values[here]
                 part.flags.writeable = False
                 parts[chunk] = part
             chunks[name] = tuple(parts)
@@ -96,3 +93,16 @@ class Table:
             chunks[name] = tuple(parts)
         ids = np.arange(self.size, self.size + count, dtype=np.int32)
         return Table(self.schema, self.size + count, chunks), ids
+
+
+def _by_chunk(ids: Array) -> Iterator[tuple[int, Any, Array]]:
+    """For each chunk that holds some of the rows `ids` (n,): its number, which of the ids they are, and their rows in it."""
+    number, offset = ids // CHUNK, ids % CHUNK
+    ascending = bool((number[1:] >= number[:-1]).all())
+    order = None if ascending else np.argsort(number, kind="stable")
+    ranked = number if order is None else number[order]
+    edges = [0, *(np.flatnonzero(ranked[1:] != ranked[:-1]) + 1).tolist(), len(ids)]
+    for first, end in zip(edges, edges[1:]):
+        if end > first:
+            here = slice(first, end) if order is None else order[first:end]
+            yield int(ranked[first]), here, offset[here]

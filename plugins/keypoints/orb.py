@@ -13,25 +13,11 @@ import numpy as np
 from trihedron.pipeline.registry import register
 from trihedron.pipeline.types import F32, I32, U8, Frame, Keypoints
 from trihedron.plugins.numerics.depth.depth_sampling import local_depth, noise_coefficients
-from trihedron.plugins.numerics.images.corner_measures import centroid_angles_deg, harris_scores
-from trihedron.plugins.numerics.images.fast_corners import fast_corners
 from trihedron.plugins.numerics.images.image_pyramid import full_pixels, image_pyramid
-from trihedron.plugins.numerics.images.spreading import spread_over_grid
+from trihedron.plugins.numerics.images.oriented_corners import oriented_corners
 
 MARGIN_PX = 19  # of a level, within which its descriptors would reach over the border
 PATCH_PX = 31  # side of what a descriptor looks at (Rublee et al.)
-
-
-@dataclass(frozen=True)
-class Corners:
-    """Corners of the whole pyramid: integer pixels (n, 2) of their own level, levels (n,)."""
-
-    cells: I32
-    levels: I32
-
-    def take(self, rows: Any) -> Corners:
-        """Some of the rows."""
-        return Corners(self.cells[rows], self.levels[rows])
 
 
 @register("keypoints", "orb")
@@ -69,10 +55,11 @@ class Orb:
     def __call__(self, frame: Frame) -> Keypoints:
         """At most `features` key points ordered by level, row and column; (n, 32) binary descriptors."""
         pyramid = image_pyramid(frame.gray, self.scale, self.levels, 2 * MARGIN_PX + 1)
-        corners = self._choose(self._corners(pyramid), pyramid)
-        angles = self._per_level(centroid_angles_deg, pyramid, corners)
-        descriptors = self._describe(frame.gray, corners, angles)
-        pixels = full_pixels(corners.cells, corners.levels, pyramid).astype(np.float32)
+        weights = self.scale ** (-self.fineness * np.arange(len(pyramid.shapes)))
+        thresholds = self.fast_threshold, self.fast_threshold_low
+        cells, levels, angles = oriented_corners(pyramid, *thresholds, MARGIN_PX, self.cell_px, self.features, weights)
+        descriptors = self._describe(frame.gray, cells, levels, angles)
+        pixels = full_pixels(cells, levels, pyramid.shapes).astype(np.float32)
         noise = noise_coefficients(frame.camera.depth_noise)
         depth, sigma = local_depth(frame.depth_m, pixels, self.depth_radius_px, self.depth_share, noise, self.depth_gate, self.depth_edge)
         return Keypoints(
@@ -80,48 +67,20 @@ class Orb:
             stamp_ns=frame.stamp_ns,
             pixels=pixels,
             points_m=frame.camera.back_project(pixels, depth).astype(np.float32),
-            sigma_px=(self.sigma_px * self.scale**corners.levels).astype(np.float32),
+            sigma_px=(self.sigma_px * self.scale**levels).astype(np.float32),
             sigma_m=sigma,
-            octaves=corners.levels.astype(np.uint8),
+            octaves=levels.astype(np.uint8),
             angles_deg=angles,
             descriptors=descriptors,
         )
 
-    def _corners(self, pyramid: list[U8]) -> Corners:
-        """FAST corners of every level: at the high threshold, and at the low one in those grid cells that would have less than their share."""
-        found = [fast_corners(image, self.fast_threshold_low, MARGIN_PX) for image in pyramid]
-        cells, strengths = np.concatenate([cells for cells, _ in found]), np.concatenate([strengths for _, strengths in found])
-        levels = np.repeat(np.arange(len(found), dtype=np.int32), [len(cells) for cells, _ in found])
-        places = (full_pixels(cells, levels, pyramid) / self.cell_px).astype(np.int32) @ np.array([1, 1 + pyramid[0].shape[1] // self.cell_px])
-        strong = strengths >= self.fast_threshold
-        across, down = (-(-side // self.cell_px) for side in pyramid[0].shape[::-1])
-        rich = np.bincount(places[strong], minlength=places.max(initial=0) + 1) >= 2 * self.features / (across * down)
-        return Corners(cells, levels).take(strong | ~rich[places])
-
-    def _choose(self, corners: Corners, pyramid: list[U8]) -> Corners:
-        """The strongest by Harris measure, spread over the image, in order of level, row and column."""
-        full = full_pixels(corners.cells, corners.levels, pyramid).astype(np.float32)
-        strength = self._per_level(harris_scores, pyramid, corners) * self.scale ** (-self.fineness * corners.levels.astype(np.float64))
-        order = np.argsort(-strength, kind="stable").astype(np.int32)
-        keep = spread_over_grid(full, order, pyramid[0].shape[1], pyramid[0].shape[0], self.cell_px, self.features)
-        corners = corners.take(keep)
-        return corners.take(np.lexsort((corners.cells[:, 0], corners.cells[:, 1], corners.levels)))
-
-    def _per_level(self, measure: Any, pyramid: list[U8], corners: Corners) -> F32:
-        """A kernel's value for each corner on the image of its level."""
-        out = np.zeros(len(corners.levels), np.float32)
-        for level, image in enumerate(pyramid):
-            rows = np.flatnonzero(corners.levels == level)
-            out[rows] = measure(image, corners.cells[rows])
-        return out
-
-    def _describe(self, gray: U8, corners: Corners, angles: F32) -> U8:
+    def _describe(self, gray: U8, cells: I32, levels: I32, angles: F32) -> U8:
         """(n, 32) rotated BRIEF, by OpenCV, which wants a level's pixel x as x · s."""
-        scales = self.scale ** corners.levels.astype(np.float64)
-        xs, ys = (corners.cells * scales[:, None]).T.tolist()
+        scales = self.scale ** levels.astype(np.float64)
+        xs, ys = (cells * scales[:, None]).T.tolist()
         points = [
             cv2.KeyPoint(x, y, PATCH_PX * s, angle, 1.0, level, i)
-            for i, (x, y, s, angle, level) in enumerate(zip(xs, ys, scales.tolist(), angles.tolist(), corners.levels.tolist()))
+            for i, (x, y, s, angle, level) in enumerate(zip(xs, ys, scales.tolist(), angles.tolist(), levels.tolist()))
         ]
         out = np.zeros((len(points), 32), np.uint8)
         if points:

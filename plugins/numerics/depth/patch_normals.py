@@ -69,17 +69,16 @@ def _integrate(sums: F64) -> None:
 
 
 @numba.njit(cache=True, nogil=True)
-def _tangent(sums: F64, a: int, b: int, c: int, d: int, e: int, f: int, g: int, i: int, least: float) -> tuple[float, float, float]:
-    """Mean (z, uz, vz) of one box of blocks less that of another, times the product of their counts; zeros when either has fewer than `least` points.
+def _box(sums: F64, a: int, b: int, c: int, d: int, out: F64) -> None:
+    """Writes the sums (count, Σz, Σuz, Σvz) over a box of blocks, given by its corners' places in the flat `sums`: a − b − c + d."""
+    for k in range(4):
+        out[k] = sums[a + k] - sums[b + k] - sums[c + k] + sums[d + k]
 
-    A box is given by its corners' places in the flat `sums`: a − b − c + d, and e − f − g + i, first channel (the count)."""
-    n, m = sums[a] - sums[b] - sums[c] + sums[d], sums[e] - sums[f] - sums[g] + sums[i]
-    if n < least or m < least:
-        return 0.0, 0.0, 0.0
-    z = (sums[a + 1] - sums[b + 1] - sums[c + 1] + sums[d + 1]) * m - (sums[e + 1] - sums[f + 1] - sums[g + 1] + sums[i + 1]) * n
-    x = (sums[a + 2] - sums[b + 2] - sums[c + 2] + sums[d + 2]) * m - (sums[e + 2] - sums[f + 2] - sums[g + 2] + sums[i + 2]) * n
-    y = (sums[a + 3] - sums[b + 3] - sums[c + 3] + sums[d + 3]) * m - (sums[e + 3] - sums[f + 3] - sums[g + 3] + sums[i + 3]) * n
-    return z, x, y
+
+@numba.njit(cache=True, nogil=True)
+def _tangent(p: F64, q: F64) -> tuple[float, float, float]:
+    """Mean (z, uz, vz) of one box less that of another, times the product of their counts."""
+    return p[1] * q[0] - q[1] * p[0], p[2] * q[0] - q[2] * p[0], p[3] * q[0] - q[3] * p[0]
 
 
 @numba.njit(cache=True, nogil=True)
@@ -94,6 +93,7 @@ def patch_normals(sums: F64, clearance: F32, radii: I32, least: float, intrinsic
     fx, fy, cx, cy = intrinsics
     fx, fy = 1.0 / fx, 1.0 / fy
     out = np.full((h, w, 3), np.nan, np.float32)
+    east, west, south, north = np.empty(4), np.empty(4), np.empty(4), np.empty(4)
     flat, row = sums.reshape(-1), 4 * (w + 1)
     for r in range(h):
         for c in range(w):
@@ -109,8 +109,16 @@ def patch_normals(sums: F64, clearance: F32, radii: I32, least: float, intrinsic
             a, b = (r1 - r0) // 2, (c1 - c0) // 2
             nw, ne, sw, se = r0 * row + 4 * c0, r0 * row + 4 * c1, r1 * row + 4 * c0, r1 * row + 4 * c1
             s, t = a * row, 4 * b
-            zu, xu, yu = _tangent(flat, se, ne, se - t, ne - t, sw + t, nw + t, sw, nw, max(least * (r1 - r0) * b, 1.0))
-            zv, xv, yv = _tangent(flat, se, se - s, sw, sw - s, ne + s, ne, nw + s, nw, max(least * (c1 - c0) * a, 1.0))
+            _box(flat, se, ne, se - t, ne - t, east)
+            _box(flat, sw + t, nw + t, sw, nw, west)
+            if min(east[0], west[0]) < max(least * (r1 - r0) * b, 1.0):
+                continue
+            _box(flat, se, se - s, sw, sw - s, south)
+            _box(flat, ne + s, ne, nw + s, nw, north)
+            if min(south[0], north[0]) < max(least * (c1 - c0) * a, 1.0):
+                continue
+            zu, xu, yu = _tangent(east, west)
+            zv, xv, yv = _tangent(south, north)
             xu, yu, xv, yv = (xu - cx * zu) * fx, (yu - cy * zu) * fy, (xv - cx * zv) * fx, (yv - cy * zv) * fy
             nx, ny, nz = yv * zu - zv * yu, zv * xu - xv * zu, xv * yu - yv * xu  # vertical × horizontal: towards the camera
             length = np.sqrt(nx * nx + ny * ny + nz * nz)

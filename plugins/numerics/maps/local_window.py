@@ -46,9 +46,19 @@ def observed_by(map: Map, keyframes: I32, kind: str) -> I32:
     table: Table = getattr(map, f"{kind}_observations")
     ranges = map.keyframes.rows(f"{kind}s", keyframes)
     rows = np.concatenate([np.arange(a, b, dtype=np.int32) for a, b in ranges]) if len(ranges) else np.empty(0, np.int32)
-    ids = np.unique(table.rows(kind, rows)).astype(np.int32)
+    ids = _distinct(table.rows(kind, rows))
     alive: Bool = getattr(map, f"{kind}s").rows("alive", ids)
     return ids[alive]
+
+
+def _distinct(ids: I32) -> I32:
+    """The different ids, sorted; they lie close together, so marking them beats sorting them."""
+    if len(ids) == 0:
+        return ids
+    first = ids.min()
+    marked = np.zeros(ids.max() - first + 1, np.bool_)
+    marked[ids - first] = True
+    return (np.flatnonzero(marked) + first).astype(np.int32)
 
 
 def _votes(map: Map, keyframes: I32) -> I32:

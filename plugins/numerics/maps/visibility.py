@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import numba
 import numpy as np
 
-from trihedron.pipeline.geometry import invert, transform
-from trihedron.pipeline.types import F64, I32, U8, Bool, Camera, Table
+from trihedron.pipeline.types import F32, F64, I32, U8, Bool, Camera, Table
 
 NEAR_M = 0.1
 MAX_SCALE_CHANGE = 2.0  # of the distance; beyond, a point does not look the same
@@ -25,19 +25,39 @@ class VisiblePoints:
 
 def visible_points(points: Table, ids: I32, T_world_camera: F64, camera: Camera, view_deg: float, octave_scale: float) -> VisiblePoints:
     """Those of the points `ids` that lie in the image, are seen from within `view_deg` of the last direction and at a similar distance."""
-    world = points.rows("position_m", ids)
-    local = transform(invert(T_world_camera), world)
-    pixels = camera.project(local)
-    inside = (local[:, 2] > NEAR_M) & in_image(pixels, camera)
-    ids, world, local, pixels = ids[inside], world[inside], local[inside], pixels[inside]
-    away = T_world_camera[:3, 3] - world
-    distance = np.linalg.norm(away, axis=1)
-    change = points.rows("distance_m", ids) / distance
-    good = np.einsum("ij,ij->i", away, points.rows("direction", ids)) > np.cos(np.radians(view_deg)) * distance
-    good &= (change < MAX_SCALE_CHANGE) & (change > 1.0 / MAX_SCALE_CHANGE)
-    ids = ids[good]
-    octave = points.rows("octave", ids) + np.log(change[good]) / np.log(octave_scale)
-    return VisiblePoints(ids, pixels[good], local[good, 2], np.clip(np.round(octave), 0, 255).astype(np.uint8))
+    columns = [points.rows(name, ids) for name in ("position_m", "direction", "distance_m", "octave")]
+    intrinsics = (float(camera.fx), float(camera.fy), float(camera.cx), float(camera.cy), camera.width, camera.height)
+    rows, pixels, depth, octaves = _seen(*columns, T_world_camera, intrinsics, float(np.cos(np.radians(view_deg))), float(np.log(octave_scale)))
+    return VisiblePoints(ids[rows], pixels, depth, octaves)
+
+
+@numba.njit(cache=True, nogil=True)
+def _seen(
+    points: F64, directions: F32, distances: F32, octaves: U8, T_world_camera: F64, intrinsics: tuple[float, float, float, float, int, int],
+    cosine: float, log_scale: float,
+) -> tuple[I32, F64, F64, U8]:  # fmt: skip
+    """Rows of the points that should be seen, their pixels (n, 2), depths and octaves (n,)."""
+    fx, fy, cx, cy, width, height = intrinsics
+    rows, n = np.empty(len(points), np.int32), 0
+    pixels, depth, levels = np.empty((len(points), 2)), np.empty(len(points)), np.empty(len(points), np.uint8)
+    R, t = T_world_camera[:3, :3], T_world_camera[:3, 3]
+    for i in range(len(points)):
+        x, y, z = points[i, 0] - t[0], points[i, 1] - t[1], points[i, 2] - t[2]
+        away = R[0, 2] * x + R[1, 2] * y + R[2, 2] * z
+        if not away > NEAR_M:
+            continue
+        u = fx * (R[0, 0] * x + R[1, 0] * y + R[2, 0] * z) / away + cx
+        v = fy * (R[0, 1] * x + R[1, 1] * y + R[2, 1] * z) / away + cy
+        if not (-0.5 <= u <= width - 0.5 and -0.5 <= v <= height - 0.5):
+            continue
+        distance = np.sqrt(x * x + y * y + z * z)
+        change = distances[i] / distance
+        facing = -(x * directions[i, 0] + y * directions[i, 1] + z * directions[i, 2])
+        if facing > cosine * distance and 1.0 / MAX_SCALE_CHANGE < change < MAX_SCALE_CHANGE:
+            rows[n], pixels[n, 0], pixels[n, 1], depth[n] = i, u, v, away
+            levels[n] = min(max(np.rint(octaves[i] + np.log(change) / log_scale), 0.0), 255.0)
+            n += 1
+    return rows[:n], pixels[:n], depth[:n], levels[:n]
 
 
 def in_image(pixels: F64, camera: Camera) -> Bool:

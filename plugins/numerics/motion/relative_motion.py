@@ -16,7 +16,7 @@ from trihedron.pipeline.geometry import tangent_basis
 from trihedron.pipeline.types import F64, Keypoints, Planes, Segments, Tracks
 from trihedron.plugins.numerics.algebra.small_linear import solve_positive, turn_left
 
-MOST = 400  # pairs of places used; more only cost time
+MOST = 400  # pairs of places used, about; more only cost time
 GATE2 = 9.0  # squared standard deviations at which a term counts a quarter, once the scale has come down
 
 
@@ -45,9 +45,10 @@ class Motion:
 def motion_terms(tracks: Tracks, keypoints: Keypoints, segments: Segments, planes: Planes, rad_per_px: float, floor_deg: float) -> Terms:
     """What the tracks and the current features say about the motion. `rad_per_px` turns a key point's sigma_px into an angle; `floor_deg` is the
     least error of a plane's normal. Pairs that are not finite, or whose covariance is none, are left out."""
+    step = max(-(-(len(tracks.keypoints) + 2 * len(tracks.segments)) // MOST), 1)
     with np.errstate(divide="ignore", invalid="ignore"):
-        points = _finite(*_point_pairs(tracks, keypoints, rad_per_px))
-        ends = _finite(*_line_pairs(tracks, segments, rad_per_px))
+        points = _finite(*_point_pairs(tracks, keypoints, rad_per_px, step))
+        ends = _finite(*_line_pairs(tracks, segments, rad_per_px, step))
     rows = tracks.planes[:, 1]
     covariance = planes.covariance[rows] + tracks.plane_covariance
     covariance[:, :2, :2] += np.eye(2) * np.radians(floor_deg) ** 2
@@ -59,8 +60,7 @@ def motion_terms(tracks: Tracks, keypoints: Keypoints, segments: Segments, plane
     basis[:, 3, 2] = 1.0
     information = basis @ np.linalg.inv(covariance) @ np.swapaxes(basis, 1, 2) if len(rows) else np.zeros((0, 4, 4))
     before, after, weight = (np.concatenate(pair) for pair in zip(points, ends))
-    step = max(-(-len(before) // MOST), 1)
-    return Terms(before[::step].copy(), after[::step].copy(), weight[::step].copy(), coefficients, planes.coefficients[rows], information)
+    return Terms(before, after, weight, coefficients, planes.coefficients[rows], information)
 
 
 def _finite(before: F64, after: F64, information: F64) -> tuple[F64, F64, F64]:
@@ -69,9 +69,10 @@ def _finite(before: F64, after: F64, information: F64) -> tuple[F64, F64, F64]:
     return before[known], after[known], information[known]
 
 
-def _point_pairs(tracks: Tracks, keypoints: Keypoints, rad_per_px: float) -> tuple[F64, F64, F64]:
+def _point_pairs(tracks: Tracks, keypoints: Keypoints, rad_per_px: float, step: int) -> tuple[F64, F64, F64]:
+    """One in `step` of the pairs of points with depth."""
     rows = tracks.keypoints[:, 1]
-    known = np.isfinite(tracks.points_m).all(axis=1) & np.isfinite(keypoints.points_m[rows]).all(axis=1)
+    known = np.flatnonzero(np.isfinite(tracks.points_m[:, 2]) & np.isfinite(keypoints.points_m[rows, 2]))[::step]
     rows = rows[known]
     before, after = tracks.points_m[known].astype(np.float64), keypoints.points_m[rows].astype(np.float64)
     across = keypoints.sigma_px[rows].astype(np.float64) * rad_per_px * np.hypot(before[:, 2], after[:, 2])
@@ -81,12 +82,12 @@ def _point_pairs(tracks: Tracks, keypoints: Keypoints, rad_per_px: float) -> tup
     return before, after, (np.eye(3) - shrink[:, None, None] * ray[:, :, None] * ray[:, None, :]) / (across**2)[:, None, None]
 
 
-def _line_pairs(tracks: Tracks, segments: Segments, rad_per_px: float) -> tuple[F64, F64, F64]:
-    """Both ends of each previous line against the current one, whose own noise serves for both."""
+def _line_pairs(tracks: Tracks, segments: Segments, rad_per_px: float, step: int) -> tuple[F64, F64, F64]:
+    """Both ends of one in `step` of the previous lines against the current ones, whose own noise serves for both."""
     rows = tracks.segments[:, 1]
     along = (segments.endpoints_m[rows, 1] - segments.endpoints_m[rows, 0]).astype(np.float64)
     length = np.linalg.norm(along, axis=1)
-    known = np.isfinite(tracks.endpoints_m).all(axis=(1, 2)) & np.isfinite(along).all(axis=1) & (length > 1e-3)
+    known = np.flatnonzero(np.isfinite(tracks.endpoints_m).all(axis=(1, 2)) & np.isfinite(along).all(axis=1) & (length > 1e-3))[::step]
     rows, direction = rows[known], (along / np.where(length > 0.0, length, 1.0)[:, None])[known]
     basis = tangent_basis(direction)
     before, start = tracks.endpoints_m[known].astype(np.float64), segments.endpoints_m[rows, 0].astype(np.float64)
