@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -102,7 +103,7 @@ def _by_chunk(ids: Array) -> Iterator[tuple[int, Any, Array]]:
     order = None if ascending else np.argsort(number, kind="stable")
     ranked = number if order is None else number[order]
     edges = [0, *(np.flatnonzero(ranked[1:] != ranked[:-1]) + 1).tolist(), len(ids)]
-    for first, end in zip(edges, edges[1:]):
+    for first, end in pairwise(edges):
         if end > first:
             here = slice(first, end) if order is None else order[first:end]
             yield int(ranked[first]), here, offset[here]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
 from typing import NamedTuple
 
 import cv2
@@ -31,7 +32,7 @@ def image_pyramid(gray: U8, scale: float, levels: int, least_px: int) -> Pyramid
     pixels = np.empty(starts[-1], np.uint8)
     images = [pixels[start:end].reshape(shape) for start, end, shape in zip(starts, starts[1:], shapes)]
     images[0][:] = gray
-    for above, image in zip(images, images[1:]):
+    for above, image in pairwise(images):
         cv2.resize(above, image.shape[::-1], dst=image, interpolation=cv2.INTER_LINEAR_EXACT)
     return Pyramid(pixels, starts, np.array(shapes, np.int32))
 
