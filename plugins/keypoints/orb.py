@@ -55,7 +55,7 @@ class Orb:
     def __call__(self, frame: Frame) -> Keypoints:
         """At most `features` key points ordered by level, row and column; (n, 32) binary descriptors."""
         pyramid = image_pyramid(frame.gray, self.scale, self.levels, 2 * MARGIN_PX + 1)
-        weights = self.scale ** (-self.fineness * np.arange(len(pyramid.shapes)))
+        weights = np.asarray(self.scale ** (-self.fineness * np.arange(len(pyramid.shapes))), np.float64)
         thresholds = self.fast_threshold, self.fast_threshold_low
         cells, levels, angles = oriented_corners(pyramid, *thresholds, MARGIN_PX, self.cell_px, self.features, weights)
         descriptors = self._describe(frame.gray, cells, levels, angles)

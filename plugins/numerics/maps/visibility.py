@@ -25,9 +25,10 @@ class VisiblePoints:
 
 def visible_points(points: Table, ids: I32, T_world_camera: F64, camera: Camera, view_deg: float, octave_scale: float) -> VisiblePoints:
     """Those of the points `ids` that lie in the image, are seen from within `view_deg` of the last direction and at a similar distance."""
-    columns = [points.rows(name, ids) for name in ("position_m", "direction", "distance_m", "octave")]
+    world, directions, distances, seen_at = (points.rows(name, ids) for name in ("position_m", "direction", "distance_m", "octave"))
     intrinsics = (float(camera.fx), float(camera.fy), float(camera.cx), float(camera.cy), camera.width, camera.height)
-    rows, pixels, depth, octaves = _seen(*columns, T_world_camera, intrinsics, float(np.cos(np.radians(view_deg))), float(np.log(octave_scale)))
+    cosine, log_scale = float(np.cos(np.radians(view_deg))), float(np.log(octave_scale))
+    rows, pixels, depth, octaves = _seen(world, directions, distances, seen_at, T_world_camera, intrinsics, cosine, log_scale)
     return VisiblePoints(ids[rows], pixels, depth, octaves)
 
 
