@@ -94,3 +94,18 @@ def furnished(wall: Wall, plan: str) -> list[Solid]:
     """The solids of a plan `piece at, piece at, …` along a wall."""
     entries = (entry.split() for entry in plan.split(",") if entry.strip())
     return [solid for name, at in entries for solid in PIECES[name](wall, float(at))]
+
+
+def curved_pieces() -> list[Solid]:
+    """A column, a ball and a plant along the room's north wall: what no plane describes. The plant's crown is a clutter of small balls."""
+    column, ball = cylinder(3.0, 3.35, (0.0, HEIGHT_M), 0.22, "marble"), sphere(3.85, 3.2, 0.28, 0.28, "globe")
+    x, y = 2.55, 3.6
+    pot = [cylinder(x, y, (0.0, 0.3), 0.15, "fabric"), cylinder(x, y, (0.3, 0.8), 0.025, "wood")]
+    turns = np.arange(24) * np.pi * (3.0 - np.sqrt(5.0))  # the golden angle spreads them evenly
+    heights = np.linspace(-1.0, 1.0, len(turns))
+    reach = 0.22 * np.sqrt(1.0 - heights**2) + 0.03
+    radii = 0.05 + 0.02 * (np.arange(len(turns)) % 3)
+    crown = [
+        sphere(x + r * np.cos(t), y + r * np.sin(t), 1.02 + 0.26 * h, radius, "fabric") for t, h, r, radius in zip(turns, heights, reach, radii)
+    ]
+    return [column, ball, *pot, *crown]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import Enum
 from functools import cached_property
 
@@ -10,16 +10,18 @@ import numpy as np
 
 from trihedron.datasets import buildings
 from trihedron.datasets.buildings import Building
+from trihedron.datasets.furniture import curved_pieces
 from trihedron.datasets.motion import Motion, camera_pose
 from trihedron.datasets.noise import kinect_depth, noisy_color
 from trihedron.datasets.raytracing import Geometry, geometry_of
-from trihedron.datasets.room import Room, all_faces, furnished_room
+from trihedron.datasets.room import BOX, Room, all_faces, furnished_room
 from trihedron.datasets.sequence import clip_range
 from trihedron.datasets.shading import Atlas, render
 from trihedron.datasets.textures import bake
+from trihedron.datasets.true_surface import TrueSurface, surface_of
 from trihedron.pipeline.registry import register
 from trihedron.pipeline.slots import frame_range
-from trihedron.pipeline.types import EXACT_DEPTH, F64, Camera, DepthNoise, Frame, Trajectory
+from trihedron.pipeline.types import EXACT_DEPTH, F64, Bool, Camera, DepthNoise, Frame, Trajectory
 
 
 class Scene(Enum):
@@ -52,6 +54,7 @@ class Synthetic:
     height: int = 480
     motion: Motion = Motion.walk  # walk | fast | still | pan; in a building only walk
     slanted: bool = False  # turns two of the room's walls by about 10°
+    curved: bool = False  # adds a column, a ball and a plant to the room
 
     def __post_init__(self) -> None:
         frame_range(self.frames)
@@ -68,6 +71,8 @@ class Synthetic:
             raise ValueError(f"motion: {self.motion.name} is for the room, a building is walked through")
         if self.scene is not Scene.room and self.slanted:
             raise ValueError("slanted: only the room has slanted walls")
+        if self.scene is not Scene.room and self.curved:
+            raise ValueError("curved: only the room has these pieces")
 
     def __len__(self) -> int:
         first, stop = self._range
@@ -89,6 +94,16 @@ class Synthetic:
         """The exact pose of every frame 0 … length - 1 in the scene's frame (corner of the floor, z up)."""
         numbers = range(self._length)
         return Trajectory(np.array([self._stamp_ns(number) for number in numbers], dtype=np.int64), np.array([self._pose(n) for n in numbers]))
+
+    def surface(self) -> TrueSurface:
+        """The exact surface of the scene, in the frame of `truth`."""
+        return surface_of(self._room)
+
+    def true_view(self, index: int) -> tuple[F64, Bool]:
+        """(h, w) exact depth in metres of frame `index` of the selection, and (h, w) whether what is seen there is curved."""
+        geometry, atlas = self._scene
+        _, depth, faces, _ = render(geometry, atlas, self._camera, self._pose(self._range[0] + index))
+        return depth, np.array([face.curved != BOX for face in all_faces(self._room)])[faces]
 
     def _pose(self, number: int) -> F64:
         """(4, 4) `T_world_camera` of a frame."""
@@ -120,5 +135,11 @@ class Synthetic:
 
     @cached_property
     def _scene(self) -> tuple[Geometry, Atlas]:
-        room: Room = furnished_room(self.slanted) if self._building is None else self._building.room
-        return geometry_of(room), bake(all_faces(room), self.texture, self.seed, room.detail)
+        return geometry_of(self._room), bake(all_faces(self._room), self.texture, self.seed, self._room.detail)
+
+    @cached_property
+    def _room(self) -> Room:
+        if self._building is not None:
+            return self._building.room
+        room = furnished_room(self.slanted)
+        return replace(room, solids=(*room.solids, *curved_pieces())) if self.curved else room

@@ -1,10 +1,10 @@
-"""Array fields that say their element type and shape, checked in O(1)."""
+"""Array fields that say their element type and shape, checked in O(1), and the base of the values that have them."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cache
-from typing import Annotated, Any, get_args, get_origin, get_type_hints
+from typing import Annotated, Any, ClassVar, get_args, get_origin, get_type_hints
 
 import numpy as np
 from numpy.typing import NDArray
@@ -67,3 +67,17 @@ def check_arrays(value: Any) -> None:
         if not fits:
             raise ValueError(f"{where}: expected shape {spec.shape}, got {array.shape}" + (f" with {lengths}" if lengths else ""))
         array.flags.writeable = False
+
+
+@dataclass(frozen=True)
+class Value:
+    """Base of everything on a wire."""
+
+    version: ClassVar[int] = 1  # of the type's fields; a recording made with another one is refused
+    dense: ClassVar[bool] = False  # dense topics are recorded only when named
+
+    index: int
+    stamp_ns: int
+
+    def __post_init__(self) -> None:
+        check_arrays(self)

@@ -25,7 +25,7 @@ from trihedron.pipeline.recording import Recording, RecordingWriter
 from trihedron.pipeline.runner import Replay, Runner, Step
 from trihedron.pipeline.slots import output_of
 from trihedron.pipeline.state import Memory, load_map, reaches
-from trihedron.pipeline.types import Trajectory
+from trihedron.pipeline.types import Surface, Trajectory
 
 RECORDING = "run.mcap"
 PATH_KEYS = ("dataset.path", "dataset.camera", "load_map")
@@ -64,7 +64,7 @@ def execute(config: DictConfig, out: Path, overrides: list[str], began: float) -
             writer.close()
             metrics = _write(runner, attached_truth(attachments, str(writer.path)), out, started, began)
             warnings.summarise()
-    _report(out, metrics)
+    _report(out, metrics, [results.write_surface(out, value) for value in runner.result.folds.values() if isinstance(value, Surface)])
     return metrics
 
 
@@ -191,12 +191,14 @@ def _attachments(graph: Graph, replay: Replay | None) -> dict[str, str]:
     return {TRUTH: format_trajectory(truth)} if truth is not None else {}
 
 
-def _report(out: Path, metrics: dict[str, Any]) -> None:
+def _report(out: Path, metrics: dict[str, Any], surfaces: list[str]) -> None:
     status = metrics.get("status", {})
     if status:
         print("frames: " + ", ".join(f"{count} {name}" for name, count in status.items() if count))
     if "final" in metrics:
         print(f"ATE {metrics['final']['ate_rmse_m']:.4f} m (as tracked {metrics['causal']['ate_rmse_m']:.4f} m)")
+    for line in surfaces:
+        print(line)
     for path in sorted(out.iterdir()):
         if path.is_file():
             print(f"  {path}")

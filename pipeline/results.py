@@ -13,10 +13,13 @@ from trihedron.pipeline.consistency import pose_consistency
 from trihedron.pipeline.errors import DataError
 from trihedron.pipeline.metrics import associate, evaluate_trajectory
 from trihedron.pipeline.plot import trajectory_figure
+from trihedron.pipeline.ply import triangle_planes, write_ply
 from trihedron.pipeline.runner import Result
-from trihedron.pipeline.types import DEGRADED, LOST, OK, Map, Pose, Trajectory
+from trihedron.pipeline.types import DEGRADED, LOST, OK, Map, Pose, Surface, Trajectory
 
 TRAJECTORY, CAUSAL, TIMING, METRICS, PLOT = "trajectory.txt", "trajectory_causal.txt", "timing.json", "metrics.json", "trajectory.png"
+SURFACE = "surface.ply"
+WORLD = "metres; the world of trajectory.txt: the first camera's frame, x right, y down, z forward"
 
 
 def causal_trajectory(result: Result) -> Trajectory:
@@ -71,6 +74,15 @@ def write_results(out: Path, result: Result, truth: Trajectory | None) -> dict[s
     if len(final):
         trajectory_figure(final, truth, out / PLOT, [(pose.stamp_ns, pose.status) for pose in result.poses])
     return metrics
+
+
+def write_surface(out: Path, surface: Surface) -> str:
+    """Write surface.ply, in the world of trajectory.txt, and say in one line what is in it."""
+    write_ply(out / SURFACE, surface.vertices_m, surface.colors, surface.triangles, triangle_planes(surface), WORLD)
+    if len(surface.triangles) == 0:
+        return "the surface is empty: no tracked frame showed enough of one"
+    planar, planes = surface.instances >= 0, len(surface.plane_ids)
+    return f"surface: {len(surface.triangles)} triangles, {planar.sum()} of them in {planes} planes of {surface.areas_m2.sum():.1f} m²"
 
 
 def _consistency(result: Result, truth: Trajectory) -> dict[str, Any]:

@@ -19,29 +19,16 @@ from typing import Annotated, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from trihedron.pipeline.arrays import F32, F64, I32, U8, Bool, Shape, check_arrays
+from trihedron.pipeline.arrays import F32, F64, I32, U8, Bool, Shape, Value
 from trihedron.pipeline.camera import EXACT_DEPTH, Camera, DepthNoise
+from trihedron.pipeline.surface import PLANE_KINDS, Surface
 from trihedron.pipeline.table import Column, Table
 
 __all__ = [
     "DEGRADED", "EXACT_DEPTH", "F32", "F64", "I32", "LOST", "OK", "U8", "Bool", "Camera", "Column", "Correction", "DepthNoise", "Frame",
-    "FrameReference", "Keypoints", "LineSegments", "ManhattanFrame", "Map", "Matches", "Normals", "Planes", "Pose", "PredictedView",
+    "FrameReference", "Keypoints", "LineSegments", "ManhattanFrame", "Map", "Matches", "Normals", "PLANE_KINDS", "Planes", "Pose", "PredictedView",
     "Rotation", "Segments", "Shape", "Surface", "Table", "Tracks", "Trajectory", "Translation", "Value",
 ]  # fmt: skip
-
-
-@dataclass(frozen=True)
-class Value:
-    """Base of everything on a wire."""
-
-    version: ClassVar[int] = 1  # of the type's fields; a recording made with another one is refused
-    dense: ClassVar[bool] = False  # dense topics are recorded only when named
-
-    index: int
-    stamp_ns: int
-
-    def __post_init__(self) -> None:
-        check_arrays(self)
 
 
 @dataclass(frozen=True)
@@ -276,16 +263,6 @@ class PredictedView(Value):
     depth_m: Annotated[F32, Shape("h", "w")]
     normals: Annotated[F32, Shape("h", "w", 3)]
     color: Annotated[U8, Shape("h", "w", 3)]
-
-
-@dataclass(frozen=True)
-class Surface(Value):
-    """A triangle mesh in the world frame; `instances` is the map plane a triangle belongs to, -1 for none."""
-
-    vertices_m: Annotated[F64, Shape("v", 3)]
-    colors: Annotated[U8, Shape("v", 3)]
-    triangles: Annotated[I32, Shape("t", 3)]
-    instances: Annotated[I32, Shape("t")]
 
 
 @dataclass(frozen=True)

@@ -8,10 +8,10 @@ import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
 ORDER = (
-    "errors", "arrays", "camera", "table", "types", "geometry", "slots", "registry", "codec", "foxglove", "graph", "metrics", "consistency", "plot",
+    "errors", "arrays", "camera", "table", "surface", "types", "geometry", "slots", "registry", "codec", "foxglove", "graph", "metrics", "consistency", "plot", "ply",
     "timing", "recording", "scheduler", "state", "runner", "results", "config", "execute", "cli",
 )  # fmt: skip
-NUMERICS = ("algebra", "images", "depth", "planes", "axes", "motion", "maps", "bundle", "places")  # each imports those before it
+NUMERICS = ("algebra", "images", "depth", "planes", "axes", "motion", "maps", "bundle", "places", "surfaces")  # each imports those before it
 VOCABULARY = {"types", "geometry", "errors", "slots", "registry"}  # what plugins and data sets know of the machinery
 EXCEPTIONS = {
     ("datasets/mcap.py", "pipeline.recording"),  # reads what the machinery writes

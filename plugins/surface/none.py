@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import numpy as np
-
 from trihedron.pipeline.registry import register
 from trihedron.pipeline.types import Map, Pose, Surface
 
@@ -24,7 +22,6 @@ class NoSurface:
         return pose
 
     def finish(self, state: Pose | None, map: Map | None) -> Surface:
-        """(0, 3) vertices and triangles."""
+        """No vertex, triangle or plane."""
         index, stamp_ns = (state.index, state.stamp_ns) if state is not None else (0, 0)
-        triangles = np.empty((0, 3), np.int32)
-        return Surface(index, stamp_ns, np.empty((0, 3)), np.empty((0, 3), np.uint8), triangles, np.empty(0, np.int32))
+        return Surface.empty(index, stamp_ns)

@@ -1,7 +1,7 @@
 """Small stages with known arithmetic, to test the machinery without any algorithm."""
 
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from mcap.reader import make_reader
@@ -112,7 +112,8 @@ class ToySurface:
     def finish(self, state: list[int], map: Map | None) -> Surface:
         vertices = np.array([[i, 0.0, len(map.points) if map else 0] for i in state]).reshape(-1, 3)
         n = len(vertices)
-        return Surface(state[-1] if state else 0, 0, vertices, np.zeros((n, 3), np.uint8), np.empty((0, 3), np.int32), np.empty(0, np.int32))
+        empty = Surface.empty(state[-1] if state else 0, 0)
+        return replace(empty, vertices_m=vertices.astype(np.float32), colors=np.zeros((n, 3), np.uint8))
 
 
 WIRING = {

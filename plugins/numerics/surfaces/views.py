@@ -1,0 +1,148 @@
+"""Views: what a surface keeps of a frame, and which frames it keeps.
+
+A view is kept while it tells enough that is not known yet, so their number is bounded by the surface of the scene and not by the length of the sequence.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numba
+import numpy as np
+
+from trihedron.pipeline.types import F32, F64, I32, U8, Camera, Frame, Map, Planes, Pose
+from trihedron.plugins.numerics.surfaces.block_hash import FREE, I64, empty_table, key_of, roomy, slot_of
+
+EDGE = 0.03  # a reading farther than the nearest of its block by more than this share is behind an edge
+
+
+@dataclass(frozen=True)
+class View:
+    """A frame reduced to about `width` columns, and where it hangs. `labels` and `planes` are those of its planar regions, camera frame."""
+
+    index: int
+    camera: Camera  # of the reduced images
+    depth_m: F32  # (h, w), 0 = none
+    color: U8  # (h, w, 3)
+    labels: U8  # (h, w), 0 = none, i + 1 = region i
+    coefficients: F64  # (n, 4)
+    moments: F64  # (n, 4, 4), as types.Planes
+    samples_m: F32  # (n, s, 3)
+    T_world_camera: F64  # as it was said
+    T_reference_camera: F64
+    reference: int  # keyframe, -1 = none
+    keyframe: int  # that this frame became, -1 = none
+    submap: int
+
+    def settled(self, map: Map | None) -> F64 | None:
+        """(4, 4) final pose: the keyframe's that the frame became, else hung on its reference keyframe; None when its sub-map is not tied to the first."""
+        row = self.keyframe if self.keyframe >= 0 else self.reference
+        if map is None or row < 0:
+            return self.T_world_camera if self.submap == 0 else None
+        if map.keyframes.rows("submap", np.array([row]))[0] != 0:
+            return None
+        T = np.asarray(map.keyframes.rows("T_world_camera", np.array([row]))[0], np.float64)
+        return T if self.keyframe >= 0 else T @ self.T_reference_camera
+
+
+def view_of(frame: Frame, planes: Planes, pose: Pose, map: Map | None, width: int, max_sigma_m: float) -> View:
+    """The frame as a view; depth whose standard deviation is above `max_sigma_m` is left out. `map` is that of this very frame, or None."""
+    step = max(1, round(frame.camera.width / width))
+    depth, color = _reduced(frame.depth_m, frame.color, step)
+    camera, noise = frame.camera, frame.camera.depth_noise
+    depth[noise.sigma_m(depth) > max_sigma_m] = 0.0
+    h, w = depth.shape
+    offset = (step - 1) / 2.0
+    small = Camera(
+        w, h, camera.fx / step, camera.fy / step, (camera.cx - offset) / step, (camera.cy - offset) / step, camera.fps, camera.depth_noise
+    )  # fmt: skip
+    rows, columns = (((np.arange(n) * step + offset) / planes.stride + 0.5).astype(int) for n in (h, w))
+    grid = planes.labels
+    labels = grid[np.minimum(rows, grid.shape[0] - 1)][:, np.minimum(columns, grid.shape[1] - 1)]
+    newest = len(map.keyframes) - 1 if map is not None else -1
+    became = newest if map is not None and newest > pose.reference and map.keyframes.rows("index", np.array([newest]))[0] == frame.index else -1
+    return View(
+        frame.index, small, depth, color, np.ascontiguousarray(labels), planes.coefficients, planes.moments, planes.samples_m,
+        pose.T_world_camera, pose.T_reference_camera, pose.reference, became, pose.submap,
+    )  # fmt: skip
+
+
+@numba.njit(cache=True, nogil=True)
+def _reduced(depth: F32, color: U8, step: int) -> tuple[F32, U8]:
+    """Depth (h, w) and colour averaged over blocks of step × step pixels; of the depth only the readings that are not behind an edge."""
+    h, w = depth.shape[0] // step, depth.shape[1] // step
+    small, paint = np.zeros((h, w), np.float32), np.empty((h, w, 3), np.uint8)
+    for r in range(h):
+        for c in range(w):
+            near = np.inf
+            red, green, blue = 0, 0, 0
+            for y in range(r * step, (r + 1) * step):
+                for x in range(c * step, (c + 1) * step):
+                    red, green, blue = red + color[y, x, 0], green + color[y, x, 1], blue + color[y, x, 2]
+                    if depth[y, x] > 0.0 and depth[y, x] < near:
+                        near = depth[y, x]
+            n = step * step
+            paint[r, c, 0], paint[r, c, 1], paint[r, c, 2] = (2 * red + n) // (2 * n), (2 * green + n) // (2 * n), (2 * blue + n) // (2 * n)
+            total, count = 0.0, 0
+            for y in range(r * step, (r + 1) * step):
+                for x in range(c * step, (c + 1) * step):
+                    if depth[y, x] > 0.0 and depth[y, x] < near * (1.0 + EDGE):
+                        total, count = total + depth[y, x], count + 1
+            if count:
+                small[r, c] = total / count
+    return small, paint
+
+
+@dataclass
+class Known:
+    """How well each cell of one world has been seen: cells of `side_m` and the information (1/m²) gathered about each."""
+
+    side_m: float
+    keys: I64 = field(default_factory=lambda: empty_table(1 << 12)[0])
+    numbers: I32 = field(default_factory=lambda: empty_table(1 << 12)[1])
+    information: F64 = field(default_factory=lambda: np.zeros(0))
+
+    def news(self, view: View, step: int, views: float) -> float:
+        """The share of the view's readings, every `step`-th, whose cell is not yet known as well as from `views` views like this one."""
+        points, weight = self._sampled(view, step)
+        return float(_news(self.keys, self.numbers, self.information, points, weight, self.side_m, views)) / max(len(points), 1)
+
+    def learn(self, view: View, step: int) -> None:
+        """Gather the view's information; a cell takes that of one reading, however many fall into it."""
+        points, weight = self._sampled(view, step)
+        self.keys, self.numbers = roomy(self.keys, self.numbers, len(points))
+        self.information = np.concatenate([self.information, np.zeros(len(points))])
+        count = int((self.keys != FREE).sum())
+        gained = np.zeros(len(self.information))
+        count = _learn(self.keys, self.numbers, gained, points, weight, self.side_m, count)
+        self.information = (self.information + gained)[:count]
+
+    def _sampled(self, view: View, step: int) -> tuple[F64, F64]:
+        """(n, 3) points in the world and (n,) information of their depth."""
+        depth = view.depth_m[step // 2 :: step, step // 2 :: step].astype(np.float64)
+        r, c = np.nonzero(depth)
+        pixels = np.stack([c, r], axis=1) * step + step // 2
+        points = view.camera.back_project(pixels, depth[r, c]) @ view.T_world_camera[:3, :3].T + view.T_world_camera[:3, 3]
+        return points, 1.0 / view.camera.depth_noise.sigma_m(depth[r, c]) ** 2
+
+
+@numba.njit(cache=True, nogil=True)
+def _news(keys: I64, numbers: I32, information: F64, points: F64, weight: F64, side: float, views: float) -> int:
+    fresh = 0
+    for i in range(len(points)):
+        slot = slot_of(keys, key_of(int(np.floor(points[i, 0] / side)), int(np.floor(points[i, 1] / side)), int(np.floor(points[i, 2] / side))))
+        if keys[slot] == FREE or information[numbers[slot]] < views * weight[i]:
+            fresh += 1
+    return fresh
+
+
+@numba.njit(cache=True, nogil=True)
+def _learn(keys: I64, numbers: I32, gained: F64, points: F64, weight: F64, side: float, count: int) -> int:
+    for i in range(len(points)):
+        key = key_of(int(np.floor(points[i, 0] / side)), int(np.floor(points[i, 1] / side)), int(np.floor(points[i, 2] / side)))
+        slot = slot_of(keys, key)
+        if keys[slot] == FREE:
+            keys[slot], numbers[slot] = key, count
+            count += 1
+        gained[numbers[slot]] = max(gained[numbers[slot]], weight[i])
+    return count

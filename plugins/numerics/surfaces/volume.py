@@ -1,0 +1,165 @@
+"""A truncated signed distance field in blocks of 8 × 8 × 8 voxels (Curless and Levoy 1996; blocks: Nießner et al. 2013).
+
+A voxel holds the weighted mean of the distances at which views saw the surface before (+) or behind (-) it. A reading weighs with the inverse variance of its
+depth. Where a view has found a plane, the distance is that to the plane: least squares over a whole region, and right at grazing angles too, where the
+distance along the ray is not."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numba
+import numpy as np
+
+from trihedron.pipeline.types import F32, F64, I32, U8
+from trihedron.plugins.numerics.surfaces.block_hash import FREE, I64, empty_table, key_of, roomy, slot_of
+from trihedron.plugins.numerics.surfaces.views import View
+
+SIDE = 8  # voxels along a block's edge
+CELLS = SIDE**3
+RAY_STEP = 2  # px between the rays along which blocks are made; they are far larger
+
+
+@dataclass
+class Volume:
+    """Blocks by number: their place in blocks, mean distance (m) and weight (1/m²) of their voxels, x slowest. Voxel i of a block is at
+    (block · SIDE + i) · voxel_m, in the world."""
+
+    voxel_m: float
+    truncation_m: float
+    keys: I64 = field(default_factory=lambda: empty_table(1 << 12)[0])
+    numbers: I32 = field(default_factory=lambda: empty_table(1 << 12)[1])
+    count: int = 0
+    places: I32 = field(default_factory=lambda: np.zeros((0, 3), np.int32))
+    distance: F32 = field(default_factory=lambda: np.zeros((0, CELLS), np.float32))
+    weight: F32 = field(default_factory=lambda: np.zeros((0, CELLS), np.float32))
+
+    def integrate(self, view: View, T_world_camera: F64, planar: bool) -> None:
+        """Take in a view from a pose; `planar` says whether its planar regions are taken as the planes they are."""
+        c, T = view.camera, T_world_camera
+        lens = np.array([c.fx, c.fy, c.cx, c.cy])
+        touched, fresh = self._touched(view.depth_m, lens, T)
+        self.keys, self.numbers = roomy(self.keys, self.numbers, len(fresh))
+        self._grow(self.count + len(fresh))
+        self.count = int(_insert(self.keys, self.numbers, fresh, self.places, self.count))
+        sigma = c.depth_noise.sigma_m(np.arange(0.0, 16.0, 0.01))
+        weights = (1.0 / sigma**2).astype(np.float32)
+        labels = view.labels if planar else np.zeros_like(view.labels)
+        _integrate(
+            self.keys, self.numbers, self.distance, self.weight, touched, view.depth_m, labels, view.coefficients, weights,
+            lens, np.ascontiguousarray(T[:3, :3].T), T[:3, 3].copy(), self.voxel_m, self.truncation_m,
+        )  # fmt: skip
+
+    def _touched(self, depth: F32, lens: F64, T: F64) -> tuple[I32, I32]:
+        """Blocks (n, 3) within the truncation of a reading, and those of them that are new."""
+        local, _ = empty_table(1 << 13)
+        while True:
+            touched = _along_rays(local, depth, lens, T, self.voxel_m * SIDE, self.truncation_m)
+            if touched is not None:
+                return touched, touched[_unknown(self.keys, touched)]
+            local, _ = empty_table(4 * len(local))
+
+    def _grow(self, count: int) -> None:
+        """Room for so many blocks; by half as many again, so that the copies cost no more than the blocks."""
+        if count > len(self.places):
+            more = max(count, len(self.places) * 3 // 2, 512) - len(self.places)
+            self.places = np.concatenate([self.places, np.zeros((more, 3), np.int32)])
+            self.distance = np.concatenate([self.distance, np.zeros((more, CELLS), np.float32)])
+            self.weight = np.concatenate([self.weight, np.zeros((more, CELLS), np.float32)])
+
+
+@numba.njit(cache=True, nogil=True)
+def _along_rays(local: I64, depth: F32, lens: F64, T: F64, block_m: float, truncation: float) -> I32 | None:
+    """Blocks (n, 3) met by the rays of the readings within the truncation; None when the table `local` is too small."""
+    h, w = depth.shape
+    found, count, last = np.empty((len(local) // 2, 3), np.int32), 0, -1
+    for r in range(0, h, RAY_STEP):
+        for c in range(0, w, RAY_STEP):
+            z = depth[r, c]
+            if z <= 0.0:
+                continue
+            x, y = (c - lens[2]) / lens[0], (r - lens[3]) / lens[1]
+            reach = truncation / np.sqrt(x * x + y * y + 1.0)
+            for k in range(-1, 2):
+                t = z + k * reach
+                i = int(np.floor((T[0, 0] * x * t + T[0, 1] * y * t + T[0, 2] * t + T[0, 3]) / block_m))
+                j = int(np.floor((T[1, 0] * x * t + T[1, 1] * y * t + T[1, 2] * t + T[1, 3]) / block_m))
+                m = int(np.floor((T[2, 0] * x * t + T[2, 1] * y * t + T[2, 2] * t + T[2, 3]) / block_m))
+                key = key_of(i, j, m)
+                if key == last:
+                    continue
+                last = key
+                slot = slot_of(local, key)
+                if local[slot] == FREE:
+                    if count == len(found):
+                        return None
+                    local[slot] = key
+                    found[count, 0], found[count, 1], found[count, 2] = i, j, m
+                    count += 1
+    return found[:count].copy()
+
+
+@numba.njit(cache=True, nogil=True)
+def _unknown(keys: I64, places: I32) -> I32:
+    """The rows of the blocks (n, 3) that are not in the table."""
+    rows, count = np.empty(len(places), np.int32), 0
+    for i in range(len(places)):
+        if keys[slot_of(keys, key_of(places[i, 0], places[i, 1], places[i, 2]))] == FREE:
+            rows[count] = i
+            count += 1
+    return rows[:count].copy()
+
+
+@numba.njit(cache=True, nogil=True)
+def _insert(keys: I64, numbers: I32, fresh: I32, places: I32, count: int) -> int:
+    for i in range(len(fresh)):
+        key = key_of(fresh[i, 0], fresh[i, 1], fresh[i, 2])
+        slot = slot_of(keys, key)
+        keys[slot], numbers[slot] = key, count
+        places[count] = fresh[i]
+        count += 1
+    return count
+
+
+@numba.njit(cache=True, nogil=True)
+def _integrate(
+    keys: I64, numbers: I32, distance: F32, weight: F32, touched: I32, depth: F32, labels: U8, planes: F64, weights: F32,
+    lens: F64, R_camera_world: F64, position: F64, voxel: float, truncation: float,
+) -> None:  # fmt: skip
+    """Update the voxels of the blocks `touched` (n, 3), which are all in the table."""
+    h, w = depth.shape
+    fx, fy, cx, cy = lens
+    sx, sy, sz = voxel * R_camera_world[0, 2], voxel * R_camera_world[1, 2], voxel * R_camera_world[2, 2]  # one voxel along z
+    for b in range(len(touched)):
+        block = numbers[slot_of(keys, key_of(touched[b, 0], touched[b, 1], touched[b, 2]))]
+        for column in range(SIDE * SIDE):
+            gx = (touched[b, 0] * SIDE + column // SIDE) * voxel - position[0]
+            gy = (touched[b, 1] * SIDE + column % SIDE) * voxel - position[1]
+            gz = touched[b, 2] * SIDE * voxel - position[2]
+            x = R_camera_world[0, 0] * gx + R_camera_world[0, 1] * gy + R_camera_world[0, 2] * gz
+            y = R_camera_world[1, 0] * gx + R_camera_world[1, 1] * gy + R_camera_world[1, 2] * gz
+            z = R_camera_world[2, 0] * gx + R_camera_world[2, 1] * gy + R_camera_world[2, 2] * gz
+            for k in range(SIDE):
+                px, py, pz = x + k * sx, y + k * sy, z + k * sz
+                if pz < 0.1:
+                    continue
+                inverse = 1.0 / pz
+                u, v = int(fx * px * inverse + cx + 0.5), int(fy * py * inverse + cy + 0.5)
+                if u < 0 or v < 0 or u >= w or v >= h:
+                    continue
+                d = depth[v, u]
+                if d <= 0.0:
+                    continue
+                label = labels[v, u]
+                if label > 0:
+                    s = planes[label - 1, 0] * px + planes[label - 1, 1] * py + planes[label - 1, 2] * pz + planes[label - 1, 3]
+                else:
+                    s = (d - pz) * np.sqrt(px * px + py * py + pz * pz) * inverse
+                if s < -truncation:
+                    continue
+                s = min(s, truncation)
+                gain = weights[min(int(100.0 * d), len(weights) - 1)]
+                cell = column * SIDE + k
+                total = weight[block, cell] + gain
+                distance[block, cell] += np.float32((s - distance[block, cell]) * gain / total)
+                weight[block, cell] = total
