@@ -225,11 +225,8 @@ class ModelSlot(Protocol):
 
 
 class SurfaceSlot(Protocol, Generic[State]):
-    """A mesh of the scene. A fold: `start` makes a state, `add` takes it one frame further, `finish` turns it into a mesh with the final map.
-
-    Nothing reads it while the camera is tracked. `add` sees poses as they are said, and `map` where this frame changed it; `finish` must hang what was
-    gathered on the final keyframes (`pose.reference` and `pose.T_reference_camera`; a frame that became a keyframe is where that is), so that it agrees
-    with `trajectory.txt`. `rotation` says which way the axes of the Manhattan frame point. The result may be empty, never None."""
+    """A mesh of the scene; empty rather than None. A fold: `start` makes a state, `add` takes it one frame further (`map` where that frame changed it),
+    `finish` hangs what was gathered on the final keyframes, as `trajectory.txt` does. Nothing reads it while the camera is tracked."""
 
     def start(self) -> State: ...
 
