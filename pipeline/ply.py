@@ -8,7 +8,8 @@ import numpy as np
 
 from trihedron.pipeline.types import F32, I32, U8, Surface
 
-VERTEX = np.dtype([("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("red", "u1"), ("green", "u1"), ("blue", "u1")])
+AXES, COLORS = ("x", "y", "z"), ("red", "green", "blue")
+VERTEX = np.dtype([*((name, "<f4") for name in AXES), *((name, "u1") for name in COLORS)])
 FACE = np.dtype([("count", "u1"), ("corners", "<i4", (3,)), ("plane", "<i4")])
 
 
@@ -16,12 +17,12 @@ def write_ply(path: Path, vertices_m: F32, colors: U8, triangles: I32, planes: I
     """Write vertices (v, 3), RGB (v, 3), triangles (t, 3) and for each the id of its plane (t,), -1 for none."""
     head = [
         "ply", "format binary_little_endian 1.0", f"comment {comment}",
-        f"element vertex {len(vertices_m)}", *(f"property float {axis}" for axis in "xyz"), *(f"property uchar {name}" for name in VERTEX.names[3:]),
+        f"element vertex {len(vertices_m)}", *(f"property float {name}" for name in AXES), *(f"property uchar {name}" for name in COLORS),
         f"element face {len(triangles)}", "property list uchar int vertex_indices", "property int plane", "end_header", "",
     ]  # fmt: skip
     points, faces = np.empty(len(vertices_m), VERTEX), np.empty(len(triangles), FACE)
     for k in range(3):
-        points[VERTEX.names[k]], points[VERTEX.names[3 + k]] = vertices_m[:, k], colors[:, k]
+        points[AXES[k]], points[COLORS[k]] = vertices_m[:, k], colors[:, k]
     faces["count"], faces["corners"], faces["plane"] = 3, triangles, planes
     path.write_bytes("\n".join(head).encode() + points.tobytes() + faces.tobytes())
 

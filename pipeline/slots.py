@@ -225,7 +225,7 @@ class ModelSlot(Protocol):
 
 
 class SurfaceSlot(Protocol, Generic[State]):
-    """A mesh of the scene; empty rather than None. A fold: `start` makes a state, `add` takes it one frame further (`map` where that frame changed it),
+    """A mesh of the scene; empty rather than None. A fold: `start` makes a state, `add` takes it one frame further (`map` where it changed then),
     `finish` hangs what was gathered on the final keyframes, as `trajectory.txt` does. Nothing reads it while the camera is tracked."""
 
     def start(self) -> State: ...

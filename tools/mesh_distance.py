@@ -21,7 +21,8 @@ def areas(vertices: F64, triangles: I32) -> F64:
 
 
 def sampled(vertices: F64, triangles: I32, spacing_m: float) -> tuple[F64, I32, F64]:
-    """Points (n, 3) on a regular barycentric grid of each triangle, at most about `spacing_m` apart, their triangles (n,), and the area (m²) each stands for."""
+    """Points (n, 3) on a regular barycentric grid of each triangle, at most about `spacing_m` apart, their triangles (n,), and the area (m²) each
+    stands for."""
     corners = vertices[triangles]
     longest = np.sqrt(np.max([((corners[:, k] - corners[:, k - 1]) ** 2).sum(axis=1) for k in range(3)], axis=0)) if len(triangles) else np.empty(0)
     parts = np.maximum(np.ceil(longest / spacing_m), 1).astype(np.int64)

@@ -19,6 +19,8 @@ def read_mesh(path: Path) -> tuple[F64, I32]:
     """Vertices (v, 3) and triangles (t, 3) of a PLY (ASCII or binary little-endian) or OBJ file; polygons become fans. Raises DataError."""
     if not path.is_file():
         raise DataError(str(path), "there is no such file", "run with outputs=[trajectory,surface] first")
+    vertices: F64 | list[list[float]]
+    polygons: I32 | list[list[int]]
     try:
         if path.suffix.lower() == ".obj":
             vertices, polygons = _obj(path)
@@ -30,7 +32,7 @@ def read_mesh(path: Path) -> tuple[F64, I32]:
         raise DataError(str(path), f"is not a mesh: {error}", "give a .ply or .obj file") from error
     triangles = [(p[0], p[k], p[k + 1]) for p in polygons for k in range(1, len(p) - 1)] if isinstance(polygons, list) else polygons
     found = np.asarray(triangles, np.int32).reshape(-1, 3)
-    if len(found) and not (0 <= found.min() and found.max() < len(vertices)):
+    if len(found) and (found.min() < 0 or found.max() >= len(vertices)):
         raise DataError(str(path), "a face names a vertex that is not there", "the file is damaged; write it again")
     return np.asarray(vertices, np.float64).reshape(-1, 3), found
 

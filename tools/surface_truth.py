@@ -69,7 +69,7 @@ def _of_depth(dataset: Any, trajectory: Trajectory, chosen: Any) -> Truth:
     points, normals = [], []
     for position in chosen:
         frame = dataset(int(position))
-        if frame is None or not np.abs(trajectory.stamps_ns - frame.stamp_ns).min() == 0:
+        if frame is None or np.abs(trajectory.stamps_ns - frame.stamp_ns).min() != 0:
             continue
         seen, directions = _with_normals(frame.depth_m.astype(np.float64), frame.camera, _pose(trajectory, frame.stamp_ns))
         points.append(seen)

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import numpy as np
-
 from trihedron.pipeline.registry import register
 from trihedron.pipeline.types import Map, Surface
 from trihedron.plugins.numerics.surfaces.assembly import free_surface

@@ -23,7 +23,8 @@ def vertex_normals(vertices: F64, triangles: I32) -> F64:
 
 
 def painted(points: F64, normals: F64, views: Sequence[tuple[View, F64]]) -> U8:
-    """(n, 3) RGB of points with unit normals (n, 3): the mean over the views that see them, those that see them large by far the most; grey if none."""
+    """(n, 3) RGB of points with unit normals (n, 3): the mean over the views that see them, those that see them large by far the most; grey if
+    none."""
     points, normals = np.ascontiguousarray(points, np.float32), np.ascontiguousarray(normals, np.float32)
     total = np.zeros((len(points), 4), np.float32)
     for view, T in views:

@@ -8,6 +8,7 @@ import numba
 import numpy as np
 
 from trihedron.pipeline.types import F64, I32, Map
+from trihedron.plugins.numerics.surfaces.bends import bends
 from trihedron.plugins.numerics.surfaces.half_edges import connected, triangle_areas
 
 
@@ -38,7 +39,8 @@ def map_planes(map: Map | None) -> tuple[I32, F64]:
 
 
 def planar_labels(vertices: F64, normals: F64, triangles: I32, opposite: I32, planes: F64, flat: Flatness) -> tuple[I32, F64]:
-    """(t,) row of the plane each triangle lies in, -1 for none, and the planes (p, 4): the given (n, 4), then those found in the mesh, fitted to it."""
+    """(t,) row of the plane each triangle lies in, -1 for none, and the planes (p, 4): the given (n, 4), then those found in the mesh, fitted to
+    it."""
     cosine = float(np.cos(np.radians(flat.angle_deg)))
     turned = normals[triangles].mean(axis=1)
     turned /= np.maximum(np.linalg.norm(turned, axis=1), 1e-12)[:, None]
@@ -97,7 +99,8 @@ def _steadiness(turned: F64, opposite: I32) -> F64:
 def _grown(
     seeds: I32, labels: I32, middle: F64, turned: F64, area: F64, opposite: I32, distance: float, cosine: float, least: float
 ) -> tuple[I32, F64]:  # fmt: skip
-    """Regions grown from seeds (t,) among the triangles without a label, about planes fitted each time they have doubled. Returns labels and the planes."""
+    """Regions grown from seeds (t,) among the triangles without a label, about planes fitted each time they have doubled. Returns labels and the
+    planes."""
     labels = labels.copy()
     first = labels.max() + 1 if len(labels) else 0
     found, count = np.empty((len(labels), 4)), 0
@@ -175,54 +178,8 @@ def _large(labels: I32, vertices: F64, triangles: I32, opposite: I32, area: F64,
     """The labels without the connected parts that are too small, or bent."""
     parts, count = connected(opposite, labels)
     total = np.bincount(parts, area, count)
-    bend = _bends(parts, count, labels, vertices[triangles].mean(axis=1), area, planes)
+    bend = bends(parts, count, labels, vertices[triangles].mean(axis=1), area, planes)
     return np.where((total[parts] >= flat.area_m2) & (bend[parts] <= flat.bend_per_m), labels, -1).astype(np.int32)
-
-
-@numba.njit(cache=True, nogil=True)
-def _bends(parts: I32, count: int, labels: I32, middle: F64, area: F64, planes: F64) -> F64:
-    """(count,) larger principal curvature (1/m) of the quadric of least squares over each part's plane; 0 for parts without one."""
-    centre, total = np.zeros((count, 3)), np.zeros(count)
-    for t in range(len(parts)):
-        centre[parts[t]] += area[t] * middle[t]
-        total[parts[t]] += area[t]
-    normal = np.zeros((count, 6, 6))
-    right = np.zeros((count, 6))
-    bend = np.zeros(count)
-    row = np.empty(6)
-    for t in range(len(parts)):
-        if labels[t] < 0:
-            continue
-        c, n = parts[t], planes[labels[t]]
-        p = middle[t] - centre[c] / total[c]
-        x, y = _flat(p, n)
-        z = np.dot(p, n[:3])
-        row[0], row[1], row[2], row[3], row[4], row[5] = 1.0, x, y, 0.5 * x * x, x * y, 0.5 * y * y
-        for i in range(6):
-            right[c, i] += area[t] * row[i] * z
-            for j in range(6):
-                normal[c, i, j] += area[t] * row[i] * row[j]
-    for c in range(count):
-        if normal[c, 0, 0] > 0.0:
-            for i in range(3, 6):
-                normal[c, i, i] += 1e-9 * total[c]  # a strip says nothing of its curvature across
-            q = np.linalg.solve(normal[c] + 1e-12 * np.eye(6), right[c])
-            mean, off = 0.5 * (q[3] + q[5]), np.sqrt(0.25 * (q[3] - q[5]) ** 2 + q[4] ** 2)
-            bend[c] = abs(mean) + off
-    return bend
-
-
-@numba.njit(cache=True, nogil=True, inline="always")
-def _flat(p: F64, n: F64) -> tuple[float, float]:
-    """Coordinates of p along two axes at right angles to n."""
-    if abs(n[0]) < 0.7:
-        a0, a1, a2 = 0.0, n[2], -n[1]
-    else:
-        a0, a1, a2 = -n[2], 0.0, n[0]
-    length = np.sqrt(a0 * a0 + a1 * a1 + a2 * a2)
-    a0, a1, a2 = a0 / length, a1 / length, a2 / length
-    b0, b1, b2 = n[1] * a2 - n[2] * a1, n[2] * a0 - n[0] * a2, n[0] * a1 - n[1] * a0
-    return p[0] * a0 + p[1] * a1 + p[2] * a2, p[0] * b0 + p[1] * b1 + p[2] * b2
 
 
 @numba.njit(cache=True, nogil=True)
@@ -246,7 +203,8 @@ def _with_rim(labels: I32, vertices: F64, triangles: I32, turned: F64, opposite:
 
 @numba.njit(cache=True, nogil=True)
 def _without_steps(labels: I32, triangles: I32, count: int, planes: F64, area: F64) -> I32:
-    """No vertex between two planes that are nearly parallel: triangles about it lose the label of the smaller one, and become the step between them."""
+    """No vertex between two planes that are nearly parallel: triangles about it lose the label of the smaller one, and become the step between
+    them."""
     largest = np.full(count, -1, np.int32)
     for t in range(len(labels)):
         for k in range(3):

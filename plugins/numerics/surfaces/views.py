@@ -1,6 +1,7 @@
 """Views: what a surface keeps of a frame, and which frames it keeps.
 
-A view is kept while it tells enough that is not known yet, so their number is bounded by the surface of the scene and not by the length of the sequence.
+A view is kept while it tells enough that is not known yet, so their number is bounded by the surface of the scene and not by the length of the
+sequence.
 """
 
 from __future__ import annotations
@@ -35,7 +36,8 @@ class View:
     submap: int
 
     def settled(self, map: Map | None) -> F64 | None:
-        """(4, 4) final pose: the keyframe's that the frame became, else hung on its reference keyframe; None when its sub-map is not tied to the first."""
+        """(4, 4) final pose: the keyframe's that the frame became, else hung on its reference keyframe; None when its sub-map is not tied to the
+        first."""
         row = self.keyframe if self.keyframe >= 0 else self.reference
         if map is None or row < 0:
             return self.T_world_camera if self.submap == 0 else None

@@ -1,7 +1,9 @@
 """A truncated signed distance field in blocks of 8 × 8 × 8 voxels (Curless and Levoy 1996; blocks: Nießner et al. 2013).
 
-A voxel holds the weighted mean of the distances at which views saw the surface before (+) or behind (-) it. A reading weighs with the inverse variance of its
-depth. Where a view has found a plane, the distance is that to the plane: least squares over a whole region, and right at grazing angles too, where the
+A voxel holds the weighted mean of the distances at which views saw the surface before (+) or behind (-) it. A reading weighs with the inverse
+variance of its
+depth. Where a view has found a plane, the distance is that to the plane: least squares over a whole region, and right at grazing angles too, where
+the
 distance along the ray is not."""
 
 from __future__ import annotations
