@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from trihedron.datasets.motion import Motion, camera_pose
-from trihedron.datasets.synthetic import Synthetic
+from trihedron.datasets.synthetic import Scene, Synthetic
 from trihedron.pipeline.geometry import invert, rotation_angle_deg
 from trihedron.pipeline.recording import Recording
 from trihedron.pipeline.registry import load_plugins, plugin_class
@@ -94,39 +94,67 @@ def test_what_is_seen_while_lost_becomes_a_sub_map_and_is_tied_when_the_turn_is_
 @pytest.mark.parametrize("texture", ["true", "false"])
 def test_views_of_the_room_are_recognised_where_they_were_mapped_and_nowhere_else(tmp_path, texture):
     """A map of five seconds (ten, where the room is bare) and views of the next minute, which turns once around: seen before when a keyframe looked
-    within 20° of the same way, never mapped when none looked within 75°, which is more than the field of view."""
+    within 20° of the same way, hardly mapped when none looked within 75°. A corner of those may be: what is recognised must be right."""
+    run(tmp_path / "run", "synthetic", {"texture": texture, "length": 30 * (5 if texture == "true" else 10)}, "")
+    dataset = Synthetic(length=1800, texture=texture == "true")
+    recording = Recording(tmp_path / "run" / "run.mcap")
+    *_, map = recording.values("map")
+    axes = map.keyframes.column("T_world_camera")[map.keyframes.column("alive"), :3, 2]
+    apart = {k: np.degrees(np.arccos(np.clip(axes @ T[:3, 2], -1.0, 1.0))).min() for k, T in enumerate(true_poses(dataset)) if k % 12 == 0}
+    known = recognised(recording, dataset, [index for index, degrees in apart.items() if degrees < 20.0])
+    unknown = recognised(recording, dataset, [index for index, degrees in apart.items() if degrees > 75.0])
+    print(f"texture={texture}: known views: {said(known)}; views hardly mapped: {said(unknown)}")
+    assert len(known) >= 30 and len(right(known)) >= 0.95 * len(known)
+    assert len(unknown) >= 50 and not wrong(unknown) and len(right(unknown)) <= 5
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("texture", ["true", "false"])
+def test_the_other_rooms_of_a_building_are_not_taken_for_the_mapped_one(tmp_path, texture):
+    """Ten rooms of one size with their doorways in one line, furnished differently; the first is mapped. The views of the others end before the walk
+    comes back to its door."""
+    run(tmp_path / "run", "synthetic", {"texture": texture, "scene": "rooms"}, "0:260")
+    recording, dataset = Recording(tmp_path / "run" / "run.mcap"), Synthetic(scene=Scene.rooms, texture=texture == "true")
+    known, unknown = recognised(recording, dataset, range(5, 260, 12)), recognised(recording, dataset, range(420, 2340, 24))
+    print(f"texture={texture}: the mapped room: {said(known)}; other rooms: {said(unknown)}")
+    assert len(right(known)) >= 0.95 * len(known) and not wrong(known)
+    assert len(unknown) >= 80 and not wrong(unknown)
+
+
+def true_poses(dataset):
+    """In the world of the first frame."""
+    truth = dataset.truth().poses
+    return invert(truth[0]) @ truth
+
+
+def right(errors):
+    return [e for e in errors if e is not None and e[0] < 0.02 and e[1] < 1.0]
+
+
+def wrong(errors):
+    return [e for e in errors if e is not None and e not in right(errors)]
+
+
+def said(errors):
+    return f"{len(right(errors))} of {len(errors)} recognised, {len(wrong(errors))} wrongly"
+
+
+def recognised(recording, dataset, frames):
+    """Errors (m, °) of the places at which a recording's last map recognises frames, each seen alone; None for one that is refused."""
     load_plugins()
-    seconds = 5 if texture == "true" else 10
-    run(tmp_path / "run", "synthetic", {"texture": texture, "length": 30 * seconds}, "")
-    known, unknown = recognised(tmp_path / "run" / "run.mcap", texture == "true", range(0, 1800, 12))
-    accepted = [e for e in known if e is not None]
-    right = [e for e in accepted if e[0] < 0.02 and e[1] < 1.0]
-    false = [e for e in unknown if e is not None]
-    print(f"texture={texture}: {len(accepted)} of {len(known)} recognised, {len(right)} of them right; {len(false)} of {len(unknown)} never mapped")
-    assert len(known) >= 30 and len(accepted) >= 0.8 * len(known) and len(right) >= 0.95 * len(accepted)
-    assert len(unknown) >= 50 and not false
-
-
-def recognised(path, texture, frames):
-    """Errors (m, °) of the views that a recording's last map has seen before and of those it has not; None for a view that was refused."""
-    recording, stages = Recording(path), {slot: plugin_class(slot, name)() for slot, name in FRONT.items()}
+    stages = {slot: plugin_class(slot, name)() for slot, name in FRONT.items()}
     *_, map = recording.values("map")
     *_, rotation = recording.values("rotation")
-    axes = map.keyframes.column("T_world_camera")[map.keyframes.column("alive"), :3, 2]
-    dataset, first = Synthetic(length=max(frames) + 1, texture=texture), camera_pose(Motion.walk, 0, 0.0)
-    known, unknown = [], []
+    truth, errors = true_poses(dataset), []
     for index in frames:
-        T = invert(first) @ camera_pose(Motion.walk, 0, index / 30.0)
-        apart = np.degrees(np.arccos(np.clip(axes @ T[:3, 2], -1.0, 1.0))).min()
-        if apart < 20.0 or apart > 75.0:
-            pose = answer(stages, dataset(index), rotation, map)
-            D = invert(T) @ pose.T_world_camera if pose is not None else None
-            (known if apart < 20.0 else unknown).append(None if D is None else (np.linalg.norm(D[:3, 3]), rotation_angle_deg(D[:3, :3])))
-    return known, unknown
+        pose = answer(stages, dataset(index), rotation, map)
+        D = invert(truth[index]) @ pose.T_world_camera
+        errors.append((np.linalg.norm(D[:3, 3]), rotation_angle_deg(D[:3, :3])) if pose.status == "ok" else None)
+    return errors
 
 
 def answer(stages, frame, rotation, map):
-    """What relocalisation says of one frame alone, the previous one having been lost."""
+    """The pose that relocalisation says of one frame alone, the previous one having been lost; lost when it refuses."""
     keypoints, lines = stages["keypoints"](frame), stages["lines"](frame)
     segments, normals = stages["segments"](frame, lines), stages["normals"](frame)
     planes = stages["planes"](frame, normals)

@@ -22,8 +22,9 @@ class Features:
     """Hypotheses from points that look alike (three by three, Procrustes) and, where these find nothing, from the layout of planes and lines (all 24
     ways round of each Manhattan frame in view); each is verified by searching the map from there and solving the pose with points, lines and planes.
 
-    A place is recognised when enough of the map agrees, details among it, and no other place explains the frame nearly as well: a room that looks the
-    same from two sides is refused, not guessed. A large map is looked through block by block, one a frame. Points need binary descriptors."""
+    A place is recognised when enough of the map agrees, details among it, a fair part of those that should be in view, nothing would hang in free
+    space, and no other place explains the frame nearly as well: a room that looks the same from two sides is refused, not guessed. A large map is
+    looked through block by block, one a frame. Points need binary descriptors."""
 
     block: int = 80  # keyframes looked at in one frame
     every: int = 5  # frames between looks at older sub-maps, while the camera is tracked in one that is not tied to them
@@ -34,9 +35,11 @@ class Features:
     by_points: int = 4  # hypotheses verified
     by_layout: int = 8
     near: int = 8  # keyframes taken from about a hypothesis, whose landmarks verify it
-    min_score: int = 40  # points + 2 lines + 5 planes that recognise a place (views never mapped reach 35 in the built-in room)
-    min_details: int = 25  # points + 3 lines among them (there at most 11)
+    min_score: int = 30  # points + 2 lines + 5 planes that recognise a place
+    min_details: int = 25  # points + 3 lines among them
     min_share: float = 0.5  # of the matches that must agree
+    min_found: float = 0.08  # of the details expected in view (rooms built alike: at most 0.05; the same place: at least 0.12)
+    max_through: float = 0.15  # of the surfaces in view that the camera may see through, as for a loop
     rival: float = 0.75  # of the best place's score, that makes another place as likely
     angle_px: float = 0.002  # rad, of a pixel
     floor_m: float = 0.01  # least error of a point's place
@@ -44,8 +47,10 @@ class Features:
     def __post_init__(self) -> None:
         if min(self.block, self.every, self.candidates, self.draws, self.by_points, self.by_layout, self.near, self.min_score, self.min_details) < 1:
             raise ValueError("block, every, candidates, draws, by_points, by_layout, near, min_score, min_details: must be at least 1")
-        if not 0.0 < self.ratio <= 1.0 or not 0.0 <= self.min_share <= 1.0 or not 0.0 < self.rival <= 1.0:
-            raise ValueError("ratio, min_share, rival: must be in (0, 1]")
+        if not 0.0 < self.ratio <= 1.0 or not 0.0 < self.rival <= 1.0:
+            raise ValueError("ratio, rival: must be in (0, 1]")
+        if not all(0.0 <= share <= 1.0 for share in (self.min_share, self.min_found, self.max_through)):
+            raise ValueError("min_share, min_found, max_through: must be in [0, 1]")
         if min(self.angle_px, self.floor_m) <= 0.0 or self.max_bits < 0:
             raise ValueError("angle_px, floor_m, max_bits: must be positive")
 
@@ -127,7 +132,8 @@ class Features:
         return None if rivals else best
 
     def _good(self, one: Recognised) -> bool:
-        return one.score >= self.min_score and one.details >= self.min_details and one.agreeing >= self.min_share
+        enough = one.score >= self.min_score and one.details >= self.min_details
+        return enough and one.agreeing >= self.min_share and one.found >= self.min_found and one.through <= self.max_through
 
     def _said(self, one: Recognised, frame: Frame, map: Map, submap: int, lost: bool) -> Pose:
         T, status = one.T_world_camera, OK if lost else DEGRADED

@@ -51,6 +51,16 @@ class World:
         depth = np.full((CAMERA.height // 8, CAMERA.width // 8), 2.5, np.float32)
         return Frame(index, index * 33_000_000, np.zeros((*depth.shape, 3), np.uint8), depth, CAMERA)
 
+    def seen(self, T, index, farther=1.0):
+        """The frame with the depth of the walls in every pixel, times `farther`."""
+        u, v = np.meshgrid(np.arange(CAMERA.width), np.arange(CAMERA.height))
+        rays = np.stack([(u - CAMERA.cx) / CAMERA.fx, (v - CAMERA.cy) / CAMERA.fy, np.ones(u.shape)], axis=-1)
+        local = transform_planes(invert(T), self.planes)
+        with np.errstate(divide="ignore"):
+            z = -local[:, 3] / (rays @ local[:, :3].T)
+        depth = farther * np.where(z > 0.0, z, np.inf).min(axis=-1)
+        return Frame(index, index * 33_000_000, np.zeros((*depth.shape, 3), np.uint8), depth.astype(np.float32), CAMERA)
+
     def rng(self, index):
         return np.random.default_rng([self.seed, 1, index])
 

@@ -44,14 +44,15 @@ def manhattan_of(T, index, turn=0):
     )  # fmt: skip
 
 
-def recognise(world, map, T, index, kinds=("points", "lines", "planes"), status=LOST, stage=None):
+def recognise(world, map, T, index, kinds=("points", "lines", "planes"), status=LOST, stage=None, farther=1.0):
     """What the stage says of the view from T, with the features of the given kinds."""
     keypoints, segments, planes = world.features(T, index)
     if "points" not in kinds:
         keypoints = dataclasses.replace(keypoints, **{f.name: getattr(keypoints, f.name)[:0] for f in dataclasses.fields(keypoints)[2:-1]})
     rng = np.random.default_rng(index)
     previous = pose_of(np.eye(4), index - 1, status)
-    found = (stage or Features())(world.frame(index), manhattan_of(T, index, index % 3), keypoints, segments, planes, map, previous, rng)
+    frame = world.seen(T, index, farther)
+    found = (stage or Features())(frame, manhattan_of(T, index, index % 3), keypoints, segments, planes, map, previous, rng)
     assert found is None or (found.index == index and (found.status != LOST or found.reason == "nothing was recognised"))
     return found if found is not None and found.status != LOST else None
 
@@ -152,6 +153,25 @@ def shifted(map, step):
     return tables
 
 
+def test_a_place_that_would_hang_in_free_space_is_refused(world, map):
+    """All features fit, but the camera sees twice as far as the walls that they are on."""
+    assert recognise(world, map, camera_at(31), 700) is not None
+    assert recognise(world, map, camera_at(31), 700, farther=2.0) is None
+    assert recognise(world, map, camera_at(31), 700, farther=2.0, stage=Features(max_through=1.0)) is not None
+
+
+def test_a_place_where_most_of_what_should_be_seen_is_not_is_refused(world, map):
+    """A room that has one point in twenty, one line in forty and the walls of the mapped one: what agrees is right, but little of what is expected."""
+    other = dataclasses.replace(world, seed=7)
+    same, marks = np.arange(0, 2000, 20), np.arange(0, len(world.lines), 40)
+    other.position[same], other.descriptor[same] = world.position[same], world.descriptor[same]
+    other.lines[marks], other.line_descriptor[marks] = world.lines[marks], world.line_descriptor[marks]
+    asked = Features(min_score=10, min_details=10)
+    assert recognise(other, map, camera_at(31), 800, stage=asked) is None
+    found = recognise(other, map, camera_at(31), 800, stage=dataclasses.replace(asked, min_found=0.0))
+    assert found is not None and error(found, camera_at(31))[0] < 0.05
+
+
 def test_it_runs_for_a_lost_camera_only(world, map):
     assert recognise(world, map, camera_at(31), 200, status="ok") is None
     assert recognise(world, None, camera_at(31), 200) is None
@@ -168,7 +188,7 @@ def test_a_camera_tracked_in_a_sub_map_is_sought_in_the_older_ones_every_few_fra
     T = camera_at(31)
     for index in (200, 201):
         found = Features(every=5)(
-            world.frame(index), manhattan_of(T, index), *world.features(T, index), both, dataclasses.replace(previous, index=index - 1),
+            world.seen(T, index), manhattan_of(T, index), *world.features(T, index), both, dataclasses.replace(previous, index=index - 1),
             np.random.default_rng(0),
         )  # fmt: skip
         assert (found is None) == (index == 201)
@@ -189,7 +209,7 @@ def test_a_large_map_is_looked_through_block_by_block(world, map):
     assert all(error(pose, camera_at(49))[0] < 0.02 for pose in found if pose is not None)
 
 
-@pytest.mark.parametrize("options", [{"block": 0}, {"ratio": 0.0}, {"rival": 1.5}, {"floor_m": 0.0}, {"min_share": 2.0}])
+@pytest.mark.parametrize("options", [{"block": 0}, {"ratio": 0.0}, {"rival": 1.5}, {"floor_m": 0.0}, {"min_share": 2.0}, {"min_found": -0.1}])
 def test_ranges_are_checked(options):
     with pytest.raises(ValueError, match=next(iter(options))):
         Features(**options)

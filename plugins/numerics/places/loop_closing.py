@@ -13,8 +13,8 @@ from trihedron.plugins.numerics.maps.keyframe_features import features_of
 from trihedron.plugins.numerics.maps.local_window import LocalWindow, observed_by
 from trihedron.plugins.numerics.maps.map_search import Guess, MapSearch
 from trihedron.plugins.numerics.maps.map_terms import line_terms, plane_terms, point_terms
-from trihedron.plugins.numerics.maps.visibility import in_image
 from trihedron.plugins.numerics.motion.pose_solver import PoseSolution, solve_pose
+from trihedron.plugins.numerics.places.free_space import seen_through
 from trihedron.plugins.numerics.places.loop_correction import Closure, Drift, close
 from trihedron.plugins.numerics.places.loop_hypotheses import alike, shift_of_planes, shift_of_points
 from trihedron.plugins.numerics.places.loop_places import Place, Reach, place_of
@@ -39,7 +39,7 @@ class LoopClosing:
     shared: int = 30  # points and lines already shared with a place, from which on no loop is open there
     min_score: int = 60  # points + 2 lines + 5 planes that must agree
     min_share: float = 0.5  # of the matches that must agree
-    max_through: float = 0.15  # of the place's points in view that the camera may see through
+    max_through: float = 0.15  # of the place's surfaces in view that the camera may see through
 
     def __post_init__(self) -> None:
         for name in ("every", "candidates", "shared", "min_score"):
@@ -98,7 +98,9 @@ class LoopClosing:
                 plane_terms(map, features[2], matches.planes, NOTHING, NOTHING, 1.0),
             )  # fmt: skip
             T = found.T_world_camera
-        if found is None or matches is None or not self._certain(found, matches, expected, T_before) or self._through(map, frame, place, T):
+        if found is None or matches is None or not self._certain(found, matches, expected, T_before):
+            return None
+        if seen_through(T, frame, map, place.seen) > self.max_through:
             return None
         return Closure(newest, place.keyframe, T, found.covariance)
 
@@ -129,18 +131,6 @@ class LoopClosing:
         possible = xi @ np.linalg.solve(expected + found.covariance, xi) < CHI2_6
         enough = np.dot(agreeing, (1, 2, 5)) >= self.min_score and np.dot(agreeing, (1, 2, 5)) >= self.min_share * np.dot(offered, (1, 2, 5))
         return bool(possible and enough and not found.unobservable.shape[1])
-
-    def _through(self, map: Map, frame: Frame, place: Place, T: F64) -> bool:
-        """Whether the camera sees through surfaces that the place has: points that would hang in free space."""
-        local = transform(invert(T), map.points.rows("position_m", place.seen.points))
-        local = local[local[:, 2] > 0.1]
-        pixels = frame.camera.project(local)
-        inside = in_image(pixels, frame.camera)
-        x, y = np.rint(pixels[inside]).astype(int).T
-        depth, z = frame.depth_m[y, x].astype(np.float64), local[inside, 2]
-        tolerance = 0.1 + 5.0 * frame.camera.depth_noise.sigma_m(depth)
-        through, met = (depth > 0.0) & (z < depth - tolerance), (depth > 0.0) & (np.abs(z - depth) <= tolerance)
-        return bool(np.count_nonzero(through) > self.max_through * (np.count_nonzero(through) + np.count_nonzero(met)))
 
 
 def _seen_alone(map: Map, keyframe: int, place: LocalWindow) -> LocalWindow:

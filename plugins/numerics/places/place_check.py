@@ -12,6 +12,7 @@ from trihedron.plugins.numerics.maps.local_window import LocalWindow, local_wind
 from trihedron.plugins.numerics.maps.map_search import Guess, MapSearch
 from trihedron.plugins.numerics.maps.map_terms import line_terms, plane_terms, point_terms
 from trihedron.plugins.numerics.motion.pose_solver import PoseSolution, solve_pose
+from trihedron.plugins.numerics.places.free_space import seen_through
 from trihedron.plugins.numerics.places.place_votes import apart
 
 SCORE = np.array([1, 2, 5])  # what a point, a line and a plane that agree count for a place
@@ -20,6 +21,7 @@ ABOUT_M, ABOUT_DEG = 2.0, 60.0  # keyframes taken from nearer than this have see
 WIDE, CLOSE = (0.05, 2.0), (0.005, 0.2)  # standard deviations (m, °) of a hypothesis, and of the pose solved from it
 PRIOR_M, PRIOR_DEG = 0.5, 10.0  # the data decide
 LINE_PX = 1.0  # of a segment's end point across it
+STRICT = {"max_distance": 50, "max_distance_l2": 200, "line_distance": 40}  # of descriptors (ORB-SLAM2: 50); strangers that lie right pass 80 often
 
 
 class View(NamedTuple):
@@ -33,13 +35,16 @@ class View(NamedTuple):
 
 @dataclass(frozen=True)
 class Recognised:
-    """A place after the check: the pose (4, 4) solved from what agrees, its covariance (6, 6), the points, lines and planes that agree, and the share
-    of all matches that these are."""
+    """A place after the check: the pose (4, 4) solved from what agrees, its covariance (6, 6), the points, lines and planes that agree, the share of
+    all matches that these are, the share of the details expected in view that were found and agree, and of surfaces that the camera would see
+    through."""
 
     T_world_camera: F64
     covariance: F64
     inliers: I32
     agreeing: float
+    found: float
+    through: float
 
     @property
     def score(self) -> float:
@@ -53,13 +58,14 @@ class Recognised:
 
 
 def check_place(T_world_camera: F64, view: View, map: Map, among: I32, near: int) -> Recognised | None:
-    """Search the map from a hypothesis (4, 4), widely, then closely from the pose solved, with what the `near` keyframes about it see; where there
-    are none, with what the keyframes `among` see, since a twin of a place must be able to compete. All are of
+    """Search the map from a hypothesis (4, 4), widely, then closely and for what looks very much alike from the pose solved, with what the `near`
+    keyframes about it see; where there are none, with what the keyframes `among` see, since a twin of a place must be able to compete. All are of
     the sub-map of these. None when the place does not hold."""
     T = T_world_camera
-    for sigma_m, sigma_deg in (WIDE, CLOSE):
+    for (sigma_m, sigma_deg), search in ((WIDE, MapSearch(enough=0)), (CLOSE, MapSearch(enough=0, **STRICT))):
         guess = Guess(T, sigma_m, float(np.radians(sigma_deg)), True)
-        matches = MapSearch(enough=0).search(view.frame, guess, view.keypoints, view.segments, view.planes, map, _window(map, T, among, near))
+        window = _window(map, T, among, near)
+        matches = search.search(view.frame, guess, view.keypoints, view.segments, view.planes, map, window)
         found = _solved(T, view, matches, map)
         if found.unobservable.shape[1]:
             return None
@@ -68,7 +74,9 @@ def check_place(T_world_camera: F64, view: View, map: Map, among: I32, near: int
         return None
     inliers = np.array([np.count_nonzero(found.points), np.count_nonzero(found.lines), np.count_nonzero(found.planes)], np.int32)
     sought = len(matches.keypoints) + len(matches.segments) + len(matches.planes)
-    return Recognised(T, found.covariance, inliers, float(inliers.sum() / max(sought, 1)))
+    expected = np.array([len(matches.visible_points), len(matches.visible_lines), 0])
+    share = float(inliers @ DETAILS / max(expected @ DETAILS, 1))
+    return Recognised(T, found.covariance, inliers, float(inliers.sum() / max(sought, 1)), share, seen_through(T, view.frame, map, window))
 
 
 def _window(map: Map, T: F64, among: I32, near: int) -> LocalWindow:
