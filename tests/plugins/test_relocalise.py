@@ -161,7 +161,7 @@ def test_a_place_that_would_hang_in_free_space_is_refused(world, map):
 
 
 def test_a_place_where_most_of_what_should_be_seen_is_not_is_refused(world, map):
-    """A room that has one point in twenty, one line in forty and the walls of the mapped one: what agrees is right, but little of what is expected."""
+    """One point in twenty, one line in forty and the walls of the mapped one: what agrees is right, but little of what is expected."""
     other = dataclasses.replace(world, seed=7)
     same, marks = np.arange(0, 2000, 20), np.arange(0, len(world.lines), 40)
     other.position[same], other.descriptor[same] = world.position[same], world.descriptor[same]
