@@ -24,6 +24,6 @@ def seen_through(T_world_camera: F64, frame: Frame, map: Map, seen: LocalWindow)
     x, y = np.rint(pixels[inside]).astype(int).T
     depth, z = frame.depth_m[y, x].astype(np.float64), local[inside, 2]
     tolerance = TOLERANCE_M + TOLERANCE_SIGMAS * frame.camera.depth_noise.sigma_m(depth)
-    through = np.count_nonzero((depth > 0.0) & (z < depth - tolerance))
-    met = np.count_nonzero((depth > 0.0) & (np.abs(z - depth) <= tolerance))
+    through = int(np.count_nonzero((depth > 0.0) & (z < depth - tolerance)))
+    met = int(np.count_nonzero((depth > 0.0) & (np.abs(z - depth) <= tolerance)))
     return through / max(through + met, 1)
