@@ -71,7 +71,8 @@ class Scheduler:
                 self._consumers[node.name].append((node.name, PREVIOUS))
         lagging = {name for name in self._nodes if self._consumers[name] and all(delay > 0 for _, delay in self._consumers[name])}
         self._prompt = [name for name in self._nodes if name not in lagging]
-        self._change = threading.Condition()
+        self._lock = threading.Lock()
+        self._work_there, self._frame_there = threading.Condition(self._lock), threading.Condition(self._lock)
         self._ready: list[tuple[int, int, str]] = []
         self._unmet: dict[tuple[str, int], int] = {}
         self._values: dict[str, dict[int, Any]] = {name: {} for name in self._nodes}
@@ -90,20 +91,20 @@ class Scheduler:
         try:
             self._count = count
             for position in range(count):
-                with self._change:
+                with self._lock:
                     self._consumed = position
                     self._admit()
                     while not self._settled(position):
-                        self._change.wait()
+                        self._frame_there.wait()
                     values = {name: self._values[name][position] for name in self._nodes if position in self._values[name]}
                     self._forget(position)
                 yield position, values
                 if self._failure is not None and self._failure.position <= position:
                     raise self._failure
         finally:
-            with self._change:
+            with self._lock:
                 self._stopped = True
-                self._change.notify_all()
+                self._work_there.notify_all()
             for worker in workers:
                 worker.join()
 
@@ -127,7 +128,8 @@ class Scheduler:
             for name in self._nodes:
                 self._offer(name, self._admitted)
             self._admitted += 1
-        self._change.notify_all()
+        if self._ready:
+            self._work_there.notify(len(self._ready))
 
     def _there(self, wire: Wire, position: int) -> bool:
         if wire.delay == PREVIOUS:
@@ -141,8 +143,8 @@ class Scheduler:
 
     def _work(self) -> None:
         while True:
-            with self._change:
-                self._change.wait_for(lambda: self._stopped or self._runnable())
+            with self._lock:
+                self._work_there.wait_for(lambda: self._stopped or self._runnable())
                 if self._stopped:
                     return
                 position, _, name = heapq.heappop(self._ready)
@@ -155,14 +157,15 @@ class Scheduler:
             except BaseException as error:  # handed to the main thread, which raises it
                 failure = NodeFailure(name, position)
                 failure.__cause__ = error
-            with self._change:
+            with self._lock:
                 self._running -= 1
                 if failure is None:
                     self._complete(name, position, value)
                     self._admit()
                 elif self._failure is None or (position, self._rank[name]) < (self._failure.position, self._rank[self._failure.node]):
                     self._failure = failure
-                self._change.notify_all()
+                if self._failure is not None or self._settled(self._consumed):
+                    self._frame_there.notify()
 
     def _input(self, wire: Wire, position: int) -> Any:
         if wire.delay == PREVIOUS:
