@@ -49,6 +49,7 @@ class RunOptions:
             {"dataset": "synthetic"},
             {"graph": "structural"},
             {"experiment": None},
+            {"without": None},
             {"override hydra/job_logging": "none"},
             {"override hydra/hydra_logging": "none"},
         ]
@@ -136,7 +137,7 @@ def rewritten(error: Exception) -> TrihedronError:
 
 
 def _unknown_option(group: str, name: str, options: list[str]) -> TrihedronError:
-    what = f"there is no {group} '{name}'" if group in ("graph", "experiment") else f"there is no plugin '{name}' for the slot '{group}'"
+    what = f"there is no {group} '{name}'" if group in ("graph", "experiment", "without") else f"there is no plugin '{name}' for the slot '{group}'"
     return ConfigError(group, what, did_you_mean(name, options))
 
 

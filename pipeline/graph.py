@@ -28,12 +28,14 @@ class Wire:
 
 @dataclass(frozen=True)
 class Stage:
-    """One plugin in the graph. `inputs` are the wires of the parameters it takes; `required` those whose None skips the stage."""
+    """One plugin in the graph. `inputs` are the wires of the parameters it takes; `required` those whose None skips the stage; `absent` the optional
+    ones that are wired to null: always None."""
 
     name: str  # slot, configuration group and topic
     plugin: Any
     inputs: Mapping[str, Wire]
     required: frozenset[str]
+    absent: frozenset[str]
     wants_rng: bool
 
     @property
@@ -70,8 +72,8 @@ def parse_wire(text: str, place: str) -> Wire:
     return Wire(match[1], 0 if delay is None else PREVIOUS if delay == "prev" else int(delay))
 
 
-def build_graph(wiring: Mapping[str, Mapping[str, str]], plugins: Mapping[str, Any], outputs: Iterable[str]) -> Graph:
-    """Join plugins (slot -> instance) by `wiring` (stage -> input -> wire) and keep what `outputs` need.
+def build_graph(wiring: Mapping[str, Mapping[str, str | None]], plugins: Mapping[str, Any], outputs: Iterable[str]) -> Graph:
+    """Join plugins (slot -> instance) by `wiring` (stage -> input -> wire, None = never) and keep what `outputs` need.
 
     Raises GraphError, one line each: a stage without plugin, an unknown input or topic, a missing wire, a type that does not fit, a delayed wire
     into an input that cannot be None, a cycle within one frame, an unknown output."""
@@ -84,7 +86,7 @@ def build_graph(wiring: Mapping[str, Mapping[str, str]], plugins: Mapping[str, A
     return Graph({name: stage for name, stage in graph.stages.items() if name in needed}, graph.outputs)
 
 
-def _stage(name: str, wires: Mapping[str, str], plugins: Mapping[str, Any]) -> Stage:
+def _stage(name: str, wires: Mapping[str, str | None], plugins: Mapping[str, Any]) -> Stage:
     place = f"graph.{name}"
     if name not in SLOTS:
         raise GraphError(place, f"there is no slot '{name}'", did_you_mean(name, SLOTS))
@@ -96,16 +98,18 @@ def _stage(name: str, wires: Mapping[str, str], plugins: Mapping[str, Any]) -> S
         if parameter not in given:
             raise GraphError(f"{place}.{parameter}", f"the slot '{name}' has no input '{parameter}'", did_you_mean(parameter, given))
     taken = parameters_of_method(name, type(plugin))
+    absent = frozenset(p for p in taken if p in wires and wires[p] is None and accepts_none(given[p]))
     inputs = {}
     for parameter in taken:
-        if parameter == "rng":
+        if parameter == "rng" or parameter in absent:
             continue
-        if wires.get(parameter) is None:
+        wire = wires.get(parameter)
+        if wire is None:
             cause = f"the input is not wired, and {type(plugin).__name__} takes it"
             raise GraphError(f"{place}.{parameter}", cause, f"give graph.{name}.{parameter}=TOPIC")
-        inputs[parameter] = parse_wire(wires[parameter], f"{place}.{parameter}")
+        inputs[parameter] = parse_wire(wire, f"{place}.{parameter}")
     required = frozenset(p for p in inputs if not accepts_none(given[p]))
-    return Stage(name, plugin, inputs, required, "rng" in taken)
+    return Stage(name, plugin, inputs, required, absent, "rng" in taken)
 
 
 def _check_wire(stage: Stage, parameter: str, wire: Wire, stages: Mapping[str, Stage]) -> None:

@@ -182,7 +182,7 @@ class Runner:
         """Skip, seed, time and check one call."""
         if any(values[parameter] is None for parameter in stage.required):
             return None
-        arguments = dict(values)
+        arguments = {**dict.fromkeys(stage.absent), **values}
         if stage.wants_rng:
             arguments["rng"] = np.random.default_rng([self.seed, self.indices[position], zlib.crc32(stage.name.encode())])
         if stage.name == "dataset":

@@ -1,8 +1,8 @@
 """Time a run per frame and stage, with its memory, beside a fixed reference workload of the same minute and frames.
 
 The machine's speed varies, so times are also given as multiples of the reference: OpenCV ORB (1000 features, 8 levels) and LSD on the same frames,
-one thread. `trihedron benchmark manhattan` compares the estimators of the Manhattan frame on rendered rooms instead, and `trihedron benchmark
-rotations` the runs of a sweep over them; their --help explains.
+one thread. Other comparisons, each with its --help: `trihedron benchmark manhattan` (estimators of the Manhattan frame on rendered rooms),
+`trihedron benchmark rotations` (the runs of a sweep over them), `trihedron benchmark runs` (the runs of any sweep as a table).
 
 Example: trihedron benchmark dataset=tum dataset.path=FOLDER dataset.frames=0:150 --json benchmark.json
 """
@@ -10,6 +10,7 @@ Example: trihedron benchmark dataset=tum dataset.path=FOLDER dataset.frames=0:15
 from __future__ import annotations
 
 import argparse
+import importlib
 import json
 import os
 import platform
@@ -24,19 +25,19 @@ from typing import Any
 from trihedron.pipeline.types import U8
 
 REFERENCE_FRAMES = 40
+COMPARISONS = {  # other words after `benchmark`, and whose `main` they stand for
+    "manhattan": "trihedron.tools.manhattan_family",
+    "rotations": "trihedron.tools.rotation_comparison",
+    "runs": "trihedron.tools.run_table",
+}
 
 
 def main(argv: list[str]) -> int:
     """Run `trihedron run` with the given overrides in a process of its own, then the reference; print a table and optionally write JSON.
-    The words `manhattan` and `rotations` hand over to the comparisons of estimators."""
-    if argv[:1] == ["manhattan"]:
-        from trihedron.tools import manhattan_family
-
-        return manhattan_family.main(argv[1:])
-    if argv[:1] == ["rotations"]:
-        from trihedron.tools import rotation_comparison
-
-        return rotation_comparison.main(argv[1:])
+    A word of COMPARISONS hands over to that."""
+    if argv[:1] and argv[0] in COMPARISONS:
+        comparison: Any = importlib.import_module(COMPARISONS[argv[0]])
+        return int(comparison.main(argv[1:]))
     parser = argparse.ArgumentParser(prog="trihedron benchmark", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("overrides", nargs="*", help="as for trihedron run")
     parser.add_argument("--json", metavar="FILE", help="write the figures too")

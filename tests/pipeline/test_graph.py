@@ -52,6 +52,14 @@ def message(outputs=("manhattan",), plugins=PLUGINS, **changes):
     return str(error.value)
 
 
+def test_an_optional_input_wired_to_null_is_none():
+    stage = build_graph({**WIRING, "manhattan": {"normals": "normals", "previous": None}}, PLUGINS, ["manhattan"]).stages["manhattan"]
+    assert stage.absent == {"previous"} and set(stage.inputs) == {"normals"}
+    assert message(manhattan={"normals": None}) == (
+        "graph.manhattan.normals: the input is not wired, and ManhattanStub takes it; give graph.manhattan.normals=TOPIC"
+    )
+
+
 def test_a_good_graph_keeps_only_what_its_outputs_need():
     graph = build_graph(WIRING, PLUGINS, ["manhattan"])
     assert list(graph.stages) == ["dataset", "normals", "manhattan"]  # the plugin does not take planes, so nobody needs them
