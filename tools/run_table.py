@@ -108,7 +108,8 @@ def as_text(rows: Sequence[dict[str, Any]]) -> str:
         ate = row["ATE mm"]["mean"]
         ratio = ate / first.setdefault(row["data"], ate)
         cells = [_cell(row[column], row["runs"], decimals) for column, (_, _, decimals) in FIGURES.items()]
-        out.append([*([row["data"] or "-"] if several else []), row["change"] or "-", row["runs"], *cells, f"{ratio:.2f}" if np.isfinite(ratio) else "-"])
+        shown = f"{ratio:.2f}" if np.isfinite(ratio) else "-"
+        out.append([*([row["data"] or "-"] if several else []), row["change"] or "-", row["runs"], *cells, shown])
     return table(out, ("ll" if several else "l") + "r" * (2 + len(FIGURES)))
 
 
