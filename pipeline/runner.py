@@ -269,7 +269,9 @@ class Runner:
     def _finish_fold(self, name: str, writer: RecordingWriter | None) -> None:
         plugin = self.graph.stages[name].plugin
         state = self._fold_states.pop(name) if name in self._fold_states else plugin.start()
+        began = time.perf_counter()
         value = plugin.finish(state, self.result.map)
+        self.timing.add_finish(name, 1e3 * (time.perf_counter() - began))
         self.result.folds[name] = value
         if writer is not None:
             writer.write(name, value)

@@ -14,10 +14,15 @@ class Timing:
     def __init__(self) -> None:
         self._calls: dict[str, list[float]] = defaultdict(list)
         self._frames_ms: list[float] = []
+        self._finish_ms: dict[str, float] = {}
 
     def add_call(self, stage: str, ms: float) -> None:
         """One call of a stage."""
         self._calls[stage].append(ms)
+
+    def add_finish(self, stage: str, ms: float) -> None:
+        """The end of a fold."""
+        self._finish_ms[stage] = ms
 
     def add_frame(self, ms: float) -> None:
         """One frame, from the moment it was handed over to its pose."""
@@ -27,10 +32,12 @@ class Timing:
         """Frames, wall time and percentiles; `fps` is the whole run's, with reading and recording; `startup_s` is imports and composition."""
         frames = len(self._frames_ms)
         p50, p95, largest = _percentiles(self._frames_ms)
-        stages = {}
+        stages: dict[str, dict[str, float]] = {}
         for name, calls in self._calls.items():
             half, high, _ = _percentiles(calls)
             stages[name] = {"calls": len(calls), "p50_ms": half, "p95_ms": high}
+        for name, ms in self._finish_ms.items():
+            stages.setdefault(name, {"calls": 0})["finish_ms"] = round(ms, 1)
         return {
             "frames": frames,
             "threads": threads,

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numba
 import numpy as np
 
-from trihedron.pipeline.types import F64, I32, Bool
+from trihedron.pipeline.types import F64, I32
 
 OPEN = -1  # beyond a half-edge: nothing, or more than one triangle
 
@@ -61,9 +61,15 @@ def triangle_areas(vertices: F64, triangles: I32) -> F64:
     return np.asarray(0.5 * np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1), np.float64)
 
 
-def compacted(vertices: F64, triangles: I32) -> tuple[F64, I32, Bool]:
-    """The mesh without vertices that no triangle uses, and which (v,) were used."""
+def without_crumbs(vertices: F64, triangles: I32, least_m2: float) -> I32:
+    """The triangles (n, 3) of those connected sets that have at least that area."""
+    parts, count = connected(opposite_half_edges(triangles), np.zeros(len(triangles), np.int32))
+    return triangles[np.bincount(parts, triangle_areas(vertices, triangles), count)[parts] >= least_m2]
+
+
+def compacted(vertices: F64, triangles: I32) -> tuple[F64, I32, I32]:
+    """The mesh without the vertices that no triangle uses, and the new numbers of the old vertices (v,)."""
     used = np.zeros(len(vertices), np.bool_)
     used[triangles] = True
-    renamed = np.cumsum(used, dtype=np.int32) - 1
-    return vertices[used], renamed[triangles].astype(np.int32), used
+    renamed = np.cumsum(used, dtype=np.int32) - np.int32(1)
+    return vertices[used], renamed[triangles], renamed

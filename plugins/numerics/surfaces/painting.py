@@ -7,11 +7,12 @@ from collections.abc import Sequence
 import numba
 import numpy as np
 
-from trihedron.pipeline.types import F32, F64, I32, U8
+from trihedron.pipeline.types import F32, F64, I32, U8, Bool
 from trihedron.plugins.numerics.surfaces.views import View
 
 NEAR_M, SIGMAS = 0.03, 3.0  # a point is seen where the depth read differs by no more than NEAR_M and SIGMAS standard deviations from its own
 UNSEEN = 128
+MOST = 64  # views; what one sees its neighbours see too
 
 
 def vertex_normals(vertices: F64, triangles: I32) -> F64:
@@ -22,18 +23,21 @@ def vertex_normals(vertices: F64, triangles: I32) -> F64:
     return total / np.maximum(np.linalg.norm(total, axis=1), 1e-12)[:, None]
 
 
-def painted(points: F64, normals: F64, views: Sequence[tuple[View, F64]]) -> U8:
-    """(n, 3) RGB of points with unit normals (n, 3): the mean over the views that see them, those that see them large by far the most; grey if
-    none."""
+def painted(points: F64, normals: F64, views: Sequence[tuple[View, F64]]) -> tuple[U8, Bool]:
+    """(n, 3) RGB of points with unit normals (n, 3), the mean over the views that see them, those that see them large by far the most; and whether
+    any
+    does: UNSEEN grey if none. Of more than MOST views as many are asked, evenly."""
     points, normals = np.ascontiguousarray(points, np.float32), np.ascontiguousarray(normals, np.float32)
     total = np.zeros((len(points), 4), np.float32)
-    for view, T in views:
+    for row in np.unique(np.linspace(0, max(len(views) - 1, 0), min(MOST, len(views))).round().astype(int)):
+        view, T = views[row]
         c = view.camera
         lens = np.array([c.fx, c.fy, c.cx, c.cy], np.float32)
         near = (NEAR_M + SIGMAS * c.depth_noise.sigma_m(np.arange(0.0, 16.0, 0.1))).astype(np.float32)
         _paint(points, normals, view.depth_m, view.color, T[:3, :3].T.astype(np.float32), T[:3, 3].astype(np.float32), lens, near, total)
+    seen = total[:, 3] > 0.0
     colors = np.rint(total[:, :3] / np.maximum(total[:, 3:], 1e-20))
-    return np.where(total[:, 3:] > 0.0, colors, UNSEEN).astype(np.uint8)
+    return np.where(seen[:, None], colors, UNSEEN).astype(np.uint8), seen
 
 
 @numba.njit(cache=True, nogil=True)

@@ -16,12 +16,12 @@ from trihedron.plugins.numerics.surfaces.half_edges import connected, triangle_a
 class Flatness:
     """What counts as flat."""
 
-    distance_m: float = 0.012  # of a vertex from its plane
-    angle_deg: float = 25.0  # between the mesh's normal there and the plane's
-    rim_m: float = 0.03  # of a vertex from its plane in the rounded rim about it
-    rim: int = 4  # triangles wide
-    area_m2: float = 0.02  # of the smallest planar part
-    bend_per_m: float = 0.8  # curvature above which a part is not flat
+    distance_m: float  # of a vertex from its plane
+    angle_deg: float  # between the mesh's normal there and the plane's
+    rim_m: float  # of a vertex from its plane in the rounded rim about it
+    rim: int  # triangles wide
+    area_m2: float  # of the smallest planar part
+    bend_per_m: float  # curvature above which a part is not flat
 
     def __post_init__(self) -> None:
         if not 0.0 < self.distance_m <= self.rim_m or not 0.0 < self.angle_deg < 90.0:
@@ -36,6 +36,12 @@ def map_planes(map: Map | None) -> tuple[I32, F64]:
         return np.empty(0, np.int32), np.empty((0, 4))
     ids = np.flatnonzero(map.planes.column("alive")).astype(np.int32)
     return ids, map.planes.rows("coefficients", ids)
+
+
+def numbered(ids: I32, count: int, map: Map | None) -> I32:
+    """Ids for `count` planes: the map's, then numbers that it has not given for those that are not in it."""
+    first = len(map.planes) if map is not None else 0
+    return np.concatenate([ids, np.arange(first, first + count - len(ids))]).astype(np.int32)
 
 
 def planar_labels(vertices: F64, normals: F64, triangles: I32, opposite: I32, planes: F64, flat: Flatness) -> tuple[I32, F64]:

@@ -15,6 +15,9 @@ from trihedron.plugins.numerics.surfaces.block_hash import I64, number_of
 from trihedron.plugins.numerics.surfaces.volume import CELLS, SIDE, Volume
 
 I8 = NDArray[np.int8]
+PASSES = 8  # at most, over all voxels, to untangle signs
+NEAR = 2.0  # voxels from the surface, within which signs can tangle
+TOUCHING_M = 1e-4  # distance given to a voxel whose sign is turned
 
 
 def zero_level(volume: Volume, least_weight: float) -> tuple[F64, I32]:
@@ -24,6 +27,10 @@ def zero_level(volume: Volume, least_weight: float) -> tuple[F64, I32]:
     around = _neighbours(volume.keys, volume.numbers, places)
     signs = np.zeros((n, CELLS), np.int8)
     _signs(distance, weight, least_weight, signs)
+    distance = distance.copy()
+    for _ in range(PASSES):
+        if not _untangled(distance, signs, around, NEAR * volume.voxel_m):
+            break
     cells = np.full((n, CELLS), -1, np.int32)
     vertices = _vertices(places, distance, signs, around, cells, volume.voxel_m)
     return vertices, _triangles(signs, around, cells, vertices)
@@ -46,6 +53,38 @@ def _signs(distance: F32, weight: F32, least: float, signs: I8) -> None:
         for i in range(CELLS):
             if weight[b, i] >= least:
                 signs[b, i] = 1 if distance[b, i] >= 0.0 else -1
+
+
+@numba.njit(cache=True, nogil=True)
+def _untangled(distance: F32, signs: I8, around: I32, near: float) -> int:
+    """Turn the sign of the voxel nearest to the surface wherever four in a square have signs like a chessboard's: noise, where the surface runs
+    along a
+    layer of voxels, and four triangles would meet in an edge. Returns how many were turned."""
+    turned = 0
+    block, at = np.empty(4, np.int32), np.empty(4, np.int32)
+    for b in range(len(signs)):
+        for cell in range(CELLS):
+            if signs[b, cell] == 0 or abs(distance[b, cell]) > near:
+                continue
+            x, y, z = cell // (SIDE * SIDE), cell // SIDE % SIDE, cell % SIDE
+            for axis in range(3):
+                for k in range(4):
+                    u, v = k & 1, k >> 1
+                    dx, dy, dz = (0, u, v) if axis == 0 else ((v, 0, u) if axis == 1 else (u, v, 0))
+                    block[k], at[k] = _at(around, b, x + dx, y + dy, z + dz)
+                if block[1] < 0 or block[2] < 0 or block[3] < 0:
+                    continue
+                s1, s2, s3 = signs[block[1], at[1]], signs[block[2], at[2]], signs[block[3], at[3]]
+                if s3 != signs[b, cell] or s1 != s2 or s1 != -s3:
+                    continue
+                least = 0
+                for k in range(1, 4):
+                    if abs(distance[block[k], at[k]]) < abs(distance[block[least], at[least]]):
+                        least = k
+                signs[block[least], at[least]] *= -1
+                distance[block[least], at[least]] = TOUCHING_M * signs[block[least], at[least]]
+                turned += 1
+    return turned
 
 
 @numba.njit(cache=True, nogil=True, inline="always")

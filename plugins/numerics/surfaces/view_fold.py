@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import ClassVar
 
 import numpy as np
 
-from trihedron.pipeline.types import F64, LOST, Frame, Map, Planes, Pose, Rotation
+from trihedron.pipeline.types import F64, I32, LOST, Frame, Map, Planes, Pose, Rotation
+from trihedron.plugins.numerics.surfaces.half_edges import without_crumbs
+from trihedron.plugins.numerics.surfaces.surface_nets import zero_level
 from trihedron.plugins.numerics.surfaces.views import Known, View, view_of
 from trihedron.plugins.numerics.surfaces.volume import Volume
 
@@ -89,22 +90,21 @@ class VolumeFold(ViewFold):
     truncation_m: float = 0.06
     max_error_m: float = 0.025  # standard deviation of a voxel's distance above which it is not known
     rebuild_m: float = 0.01  # motion of a view for which the volume is built again
-
-    planar: ClassVar[bool] = False  # whether planar regions are fused as planes
+    crumb_m2: float = 0.005  # a loose piece of the mesh that is smaller is left out
 
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.voxel_m <= 0.0 or self.truncation_m < 2.0 * self.voxel_m:
             raise ValueError("voxel_m, truncation_m: must be positive, and at least two voxels")
-        if self.max_error_m <= 0.0 or self.rebuild_m <= 0.0:
-            raise ValueError("max_error_m, rebuild_m: must be positive")
+        if self.max_error_m <= 0.0 or self.rebuild_m <= 0.0 or self.crumb_m2 < 0.0:
+            raise ValueError("max_error_m, rebuild_m, crumb_m2: must be positive, and not negative")
 
     def _kept(self, state: Gathered, view: View) -> None:
         """Fuse it, unless it stands in another world as yet."""
         if state.volume is None:
             state.volume = Volume(self.voxel_m, self.truncation_m)
         if view.submap == 0:
-            state.volume.integrate(view, view.T_world_camera, self.planar)
+            state.volume.integrate(view, view.T_world_camera)
         state.fused.append(view.T_world_camera if view.submap == 0 else None)
 
     def _volume(self, state: Gathered, map: Map | None) -> Volume:
@@ -115,12 +115,13 @@ class VolumeFold(ViewFold):
         volume = Volume(self.voxel_m, self.truncation_m)
         for view, T in zip(state.views, finals):
             if T is not None:
-                volume.integrate(view, T, self.planar)
+                volume.integrate(view, T)
         return volume
 
-    @property
-    def _least_weight(self) -> float:
-        return 1.0 / self.max_error_m**2
+    def _mesh(self, state: Gathered, map: Map | None) -> tuple[F64, I32]:
+        """Vertices (v, 3) and triangles (t, 3) of the zero level at the final poses, without crumbs."""
+        vertices, triangles = zero_level(self._volume(state, map), 1.0 / self.max_error_m**2)
+        return vertices, without_crumbs(vertices, triangles, self.crumb_m2)
 
 
 def _moved_m(said: F64 | None, final: F64 | None) -> float:

@@ -19,7 +19,7 @@ EDGE = 0.03  # a reading farther than the nearest of its block by more than this
 
 @dataclass(frozen=True)
 class View:
-    """A frame reduced to about `width` columns, and where it hangs. `labels` and `planes` are those of its planar regions, camera frame."""
+    """A frame reduced to about `width` columns, and where it hangs. `labels` and `coefficients` are those of its planar regions, camera frame."""
 
     index: int
     camera: Camera  # of the reduced images
@@ -27,8 +27,6 @@ class View:
     color: U8  # (h, w, 3)
     labels: U8  # (h, w), 0 = none, i + 1 = region i
     coefficients: F64  # (n, 4)
-    moments: F64  # (n, 4, 4), as types.Planes
-    samples_m: F32  # (n, s, 3)
     T_world_camera: F64  # as it was said
     T_reference_camera: F64
     reference: int  # keyframe, -1 = none
@@ -64,8 +62,8 @@ def view_of(frame: Frame, planes: Planes, pose: Pose, map: Map | None, width: in
     newest = len(map.keyframes) - 1 if map is not None else -1
     became = newest if map is not None and newest > pose.reference and map.keyframes.rows("index", np.array([newest]))[0] == frame.index else -1
     return View(
-        frame.index, small, depth, color, np.ascontiguousarray(labels), planes.coefficients, planes.moments, planes.samples_m,
-        pose.T_world_camera, pose.T_reference_camera, pose.reference, became, pose.submap,
+        frame.index, small, depth, color, np.ascontiguousarray(labels), planes.coefficients, pose.T_world_camera,
+        pose.T_reference_camera, pose.reference, became, pose.submap,
     )  # fmt: skip
 
 

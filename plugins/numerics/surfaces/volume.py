@@ -1,10 +1,7 @@
 """A truncated signed distance field in blocks of 8 × 8 × 8 voxels (Curless and Levoy 1996; blocks: Nießner et al. 2013).
 
-A voxel holds the weighted mean of the distances at which views saw the surface before (+) or behind (-) it. A reading weighs with the inverse
-variance of its
-depth. Where a view has found a plane, the distance is that to the plane: least squares over a whole region, and right at grazing angles too, where
-the
-distance along the ray is not."""
+A voxel holds the weighted mean of how far views saw it before (+) or behind (-) the surface, along their rays. A reading weighs with the inverse
+variance of its depth."""
 
 from __future__ import annotations
 
@@ -13,7 +10,7 @@ from dataclasses import dataclass, field
 import numba
 import numpy as np
 
-from trihedron.pipeline.types import F32, F64, I32, U8
+from trihedron.pipeline.types import F32, F64, I32
 from trihedron.plugins.numerics.surfaces.block_hash import FREE, I64, empty_table, key_of, roomy, slot_of
 from trihedron.plugins.numerics.surfaces.views import View
 
@@ -36,8 +33,8 @@ class Volume:
     distance: F32 = field(default_factory=lambda: np.zeros((0, CELLS), np.float32))
     weight: F32 = field(default_factory=lambda: np.zeros((0, CELLS), np.float32))
 
-    def integrate(self, view: View, T_world_camera: F64, planar: bool) -> None:
-        """Take in a view from a pose; `planar` says whether its planar regions are taken as the planes they are."""
+    def integrate(self, view: View, T_world_camera: F64) -> None:
+        """Take in a view from a pose."""
         c, T = view.camera, T_world_camera
         lens = np.array([c.fx, c.fy, c.cx, c.cy])
         touched, fresh = self._touched(view.depth_m, lens, T)
@@ -46,10 +43,9 @@ class Volume:
         self.count = int(_insert(self.keys, self.numbers, fresh, self.places, self.count))
         sigma = c.depth_noise.sigma_m(np.arange(0.0, 16.0, 0.01))
         weights = (1.0 / sigma**2).astype(np.float32)
-        labels = view.labels if planar else np.zeros_like(view.labels)
         _integrate(
-            self.keys, self.numbers, self.distance, self.weight, touched, view.depth_m, labels, view.coefficients, weights,
-            lens, np.ascontiguousarray(T[:3, :3].T), T[:3, 3].copy(), self.voxel_m, self.truncation_m,
+            self.keys, self.numbers, self.distance, self.weight, touched, view.depth_m, weights, lens,
+            np.ascontiguousarray(T[:3, :3].T), T[:3, 3].copy(), self.voxel_m, self.truncation_m,
         )  # fmt: skip
 
     def _touched(self, depth: F32, lens: F64, T: F64) -> tuple[I32, I32]:
@@ -125,8 +121,8 @@ def _insert(keys: I64, numbers: I32, fresh: I32, places: I32, count: int) -> int
 
 @numba.njit(cache=True, nogil=True)
 def _integrate(
-    keys: I64, numbers: I32, distance: F32, weight: F32, touched: I32, depth: F32, labels: U8, planes: F64, weights: F32,
-    lens: F64, R_camera_world: F64, position: F64, voxel: float, truncation: float,
+    keys: I64, numbers: I32, distance: F32, weight: F32, touched: I32, depth: F32, weights: F32, lens: F64,
+    R_camera_world: F64, position: F64, voxel: float, truncation: float,
 ) -> None:  # fmt: skip
     """Update the voxels of the blocks `touched` (n, 3), which are all in the table."""
     h, w = depth.shape
@@ -152,15 +148,13 @@ def _integrate(
                 d = depth[v, u]
                 if d <= 0.0:
                     continue
-                label = labels[v, u]
-                if label > 0:
-                    s = planes[label - 1, 0] * px + planes[label - 1, 1] * py + planes[label - 1, 2] * pz + planes[label - 1, 3]
-                else:
-                    s = (d - pz) * np.sqrt(px * px + py * py + pz * pz) * inverse
+                s = (d - pz) * np.sqrt(px * px + py * py + pz * pz) * inverse
                 if s < -truncation:
                     continue
                 s = min(s, truncation)
                 gain = weights[min(int(100.0 * d), len(weights) - 1)]
+                if s < -0.5 * truncation:  # what lies deep behind is read there only by readings that err that way
+                    gain *= 2.0 * (truncation + s) / truncation
                 cell = column * SIDE + k
                 total = weight[block, cell] + gain
                 distance[block, cell] += np.float32((s - distance[block, cell]) * gain / total)

@@ -1,0 +1,171 @@
+"""Planar parts of a mesh with as few vertices as their borders need: half-edge collapse that leaves the mesh a manifold and turns no triangle
+over."""
+
+from __future__ import annotations
+
+import numba
+import numpy as np
+
+from trihedron.pipeline.types import F64, I32, Bool
+
+ROUNDS = 30  # at most, over all vertices; most are gone after five
+FLAT_M2 = 1e-9  # a triangle with less area has none
+STEP = 0x9E3779B1  # visits vertices in an order without order, so that no vertex gathers all the others' triangles
+
+
+def decimated(vertices: F64, triangles: I32, labels: I32, planes: F64, border: I32, free: Bool, beside: I32) -> I32:
+    """The rows (t,) that stay, in triangles (t, 3) that are changed in place. Vertices of one plane's triangles alone go; those on a border (v,) go
+    when
+    they are `free` (v,), along it: `beside` (v, 2) are the neighbours there."""
+    order = np.argsort((np.arange(len(vertices), dtype=np.uint64) * np.uint64(STEP)) % np.uint64(1 << 32), kind="stable").astype(np.int32)
+    alive = np.ones(len(triangles), np.bool_)
+    _collapse_all(vertices, triangles, labels, planes[:, :3].copy(), border, free, beside.copy(), order, alive)
+    return np.flatnonzero(alive).astype(np.int32)
+
+
+@numba.njit(cache=True, nogil=True)
+def _collapse_all(
+    vertices: F64, triangles: I32, labels: I32, normals: F64, border: Bool, free: Bool, beside: I32, order: I32, alive: Bool
+) -> None:  # fmt: skip
+    n = len(vertices)
+    head, tail, after = np.full(n, -1, np.int32), np.full(n, -1, np.int32), np.full(3 * len(triangles), -1, np.int32)
+    for c in range(3 * len(triangles)):
+        v = triangles[c // 3, c % 3]
+        if head[v] < 0:
+            head[v] = c
+        else:
+            after[tail[v]] = c
+        tail[v] = c
+    mark, stamp = np.zeros(n, np.int64), 0
+    gone = np.zeros(n, np.bool_)
+    for _ in range(ROUNDS):
+        changed = 0
+        for u in order:
+            if gone[u] or head[u] < 0 or (border[u] and not free[u]):
+                continue
+            mine = _incident(u, triangles, alive, head, tail, after)
+            if len(mine) == 0 or labels[mine[0]] < 0:
+                continue
+            for v in _targets(u, mine, vertices, triangles, border, beside):
+                stamp += 2
+                if _allowed(u, v, mine, vertices, triangles, labels, normals, alive, head, tail, after, mark, stamp):
+                    _collapse(u, v, mine, triangles, alive, head, tail, after)
+                    if border[u]:
+                        other = beside[u, 0] if beside[u, 1] == v else beside[u, 1]
+                        _relink(beside, v, u, other)
+                        _relink(beside, other, u, v)
+                    gone[u] = True
+                    changed += 1
+                    break
+        if changed == 0:
+            break
+
+
+@numba.njit(cache=True, nogil=True)
+def _incident(v: int, triangles: I32, alive: Bool, head: I32, tail: I32, after: I32) -> I32:
+    """The living triangles about v; its list forgets the dead ones."""
+    count, c, last = 0, head[v], -1
+    while c >= 0:
+        if alive[c // 3]:
+            count += 1
+            last = c
+        elif last >= 0:
+            after[last] = after[c]
+        else:
+            head[v] = after[c]
+        c = after[c]
+    tail[v] = last
+    out, c = np.empty(count, np.int32), head[v]
+    for i in range(count):
+        out[i] = c // 3
+        c = after[c]
+    return out
+
+
+@numba.njit(cache=True, nogil=True)
+def _targets(u: int, mine: I32, vertices: F64, triangles: I32, border: Bool, beside: I32) -> I32:
+    """Where u may go, the nearest first: to its neighbours on the border, or to any."""
+    if border[u]:
+        found = beside[u].copy()
+    else:
+        found = np.empty(2 * len(mine), np.int32)
+        for i in range(len(mine)):
+            k = 0
+            while triangles[mine[i], k] != u:
+                k += 1
+            found[2 * i], found[2 * i + 1] = triangles[mine[i], (k + 1) % 3], triangles[mine[i], (k + 2) % 3]
+        found = np.unique(found)
+    far = np.empty(len(found))
+    for i in range(len(found)):
+        d = vertices[found[i]] - vertices[u]
+        far[i] = d[0] * d[0] + d[1] * d[1] + d[2] * d[2]
+    return found[np.argsort(far, kind="mergesort")]
+
+
+@numba.njit(cache=True, nogil=True)
+def _allowed(
+    u: int, v: int, mine: I32, vertices: F64, triangles: I32, labels: I32, normals: F64, alive: Bool, head: I32, tail: I32, after: I32,
+    mark: I32, stamp: int,
+) -> bool:  # fmt: skip
+    """Whether u may be drawn into v: the two have no common neighbours but those across from their edge (link condition), and no triangle turns
+    over."""
+    removed = 0
+    for t in mine:
+        has = triangles[t, 0] == v or triangles[t, 1] == v or triangles[t, 2] == v
+        removed += 1 if has else 0
+        for k in range(3):
+            mark[triangles[t, k]] = stamp
+    if removed == 0 or removed > 2:
+        return False
+    common = 0
+    for t in _incident(v, triangles, alive, head, tail, after):
+        for k in range(3):
+            w = triangles[t, k]
+            if w != u and w != v and mark[w] == stamp:
+                mark[w] = stamp + 1
+                common += 1
+    if common != removed:
+        return False
+    for t in mine:
+        if triangles[t, 0] == v or triangles[t, 1] == v or triangles[t, 2] == v:
+            continue
+        n = normals[labels[t]]
+        now = _signed(vertices, triangles[t, 0], triangles[t, 1], triangles[t, 2], n)
+        a, b, c = triangles[t, 0], triangles[t, 1], triangles[t, 2]
+        then = _signed(vertices, v if a == u else a, v if b == u else b, v if c == u else c, n)
+        if then < FLAT_M2 and then <= now:
+            return False
+    return True
+
+
+@numba.njit(cache=True, nogil=True, inline="always")
+def _signed(vertices: F64, a: int, b: int, c: int, n: F64) -> float:
+    """Area of a triangle seen against n, negative when it is seen from behind."""
+    x1, y1, z1 = vertices[b, 0] - vertices[a, 0], vertices[b, 1] - vertices[a, 1], vertices[b, 2] - vertices[a, 2]
+    x2, y2, z2 = vertices[c, 0] - vertices[a, 0], vertices[c, 1] - vertices[a, 1], vertices[c, 2] - vertices[a, 2]
+    return 0.5 * ((y1 * z2 - z1 * y2) * n[0] + (z1 * x2 - x1 * z2) * n[1] + (x1 * y2 - y1 * x2) * n[2])
+
+
+@numba.njit(cache=True, nogil=True)
+def _collapse(u: int, v: int, mine: I32, triangles: I32, alive: Bool, head: I32, tail: I32, after: I32) -> None:
+    for t in mine:
+        if triangles[t, 0] == v or triangles[t, 1] == v or triangles[t, 2] == v:
+            alive[t] = False
+        else:
+            for k in range(3):
+                if triangles[t, k] == u:
+                    triangles[t, k] = v
+    if tail[v] >= 0:
+        after[tail[v]] = head[u]
+    else:
+        head[v] = head[u]
+    tail[v] = tail[u]
+    head[u] = tail[u] = -1
+
+
+@numba.njit(cache=True, nogil=True, inline="always")
+def _relink(beside: I32, v: int, old: int, new: int) -> None:
+    if beside[v, 0] == old:
+        beside[v, 0] = new
+    elif beside[v, 1] == old:
+        beside[v, 1] = new

@@ -1,0 +1,95 @@
+"""Greedy triangulation of points in a plane: the shortest edges first, each that crosses none before it (after Marton, Rusu, Beetz, ICRA 2009)."""
+
+from __future__ import annotations
+
+import numba
+import numpy as np
+
+from trihedron.pipeline.types import F64, I32
+
+MOST = 96  # neighbours of a point that may be joined to it
+
+
+def greedy_triangles(points: F64, radius_m: float, multiplier: float) -> I32:
+    """Triangles (t, 3), anticlockwise, of points (n, 2). A point is joined to others within `multiplier` times the distance of its nearest
+    neighbour, and
+    within `radius_m`."""
+    from scipy.spatial import cKDTree
+
+    if len(points) < 3:
+        return np.empty((0, 3), np.int32)
+    tree = cKDTree(points)
+    distance, nearest = tree.query(points, k=min(MOST, len(points)))
+    reach = np.minimum(radius_m, multiplier * distance[:, 1])
+    row, column = np.nonzero((distance <= reach[:, None]) & (distance > 0.0))
+    other = nearest[row, column]
+    edges = np.unique(np.sort(np.stack([row, other], axis=1), axis=1), axis=0).astype(np.int32)
+    length = np.linalg.norm(points[edges[:, 1]] - points[edges[:, 0]], axis=1)
+    order = np.argsort(length, kind="stable")
+    return _faces(points, edges[order][_accepted(points, edges[order], length[order], distance, nearest.astype(np.int32))])
+
+
+@numba.njit(cache=True, nogil=True)
+def _accepted(points: F64, edges: I32, length: F64, distance: F64, nearest: I32) -> I32:
+    """Rows of the edges, shortest first, that cross no edge accepted before. One that does is no longer, so one of its ends is as near to an end of the
+    edge as that is long: among its neighbours (n, MOST), sorted by distance."""
+    partners = np.full((len(points), MOST), -1, np.int32)
+    degree = np.zeros(len(points), np.int32)
+    out, count, last = np.empty(len(edges), np.int32), 0, distance.shape[1] - 1
+    for e in range(len(edges)):
+        a, b = edges[e, 0], edges[e, 1]
+        free = degree[a] < MOST and degree[b] < MOST
+        for end in (a, b):
+            if last == MOST - 1 and distance[end, last] < length[e]:
+                free = False  # more neighbours than are known
+            for k in range(last + 1):
+                if not free or distance[end, k] > length[e]:
+                    break
+                free = not _any_crosses(points, a, b, nearest[end, k], partners, degree)
+        if free:
+            partners[a, degree[a]], partners[b, degree[b]] = b, a
+            degree[a] += 1
+            degree[b] += 1
+            out[count] = e
+            count += 1
+    return out[:count].copy()
+
+
+@numba.njit(cache=True, nogil=True)
+def _any_crosses(points: F64, a: int, b: int, c: int, partners: I32, degree: I32) -> bool:
+    """Whether an accepted edge from c crosses ab."""
+    for k in range(degree[c]):
+        d = partners[c, k]
+        if c != a and c != b and d != a and d != b and _crosses(points[a], points[b], points[c], points[d]):
+            return True
+    return False
+
+
+@numba.njit(cache=True, nogil=True, inline="always")
+def _turn(a: F64, b: F64, c: F64) -> float:
+    return (b[0] - a[0]) * (c[1] - a[1]) - (b[1] - a[1]) * (c[0] - a[0])
+
+
+@numba.njit(cache=True, nogil=True, inline="always")
+def _crosses(a: F64, b: F64, c: F64, d: F64) -> bool:
+    """Whether segments ab and cd cross or touch."""
+    return _turn(a, b, c) * _turn(a, b, d) <= 0.0 and _turn(c, d, a) * _turn(c, d, b) <= 0.0
+
+
+def _faces(points: F64, edges: I32) -> I32:
+    """The empty triangles of a graph without crossings: next neighbours round a vertex that are joined themselves."""
+    both = np.concatenate([edges, edges[:, ::-1]])
+    step = points[both[:, 1]] - points[both[:, 0]]
+    order = np.lexsort((np.arctan2(step[:, 1], step[:, 0]), both[:, 0]))
+    both = both[order]
+    starts = np.searchsorted(both[:, 0], np.arange(len(points) + 1))
+    following = np.arange(1, len(both) + 1)
+    ends = starts[both[:, 0] + 1]
+    following = np.where(following == ends, starts[both[:, 0]], following)
+    a, b, c = both[:, 0], both[:, 1], both[following, 1]
+    keys = np.sort(both[:, 0].astype(np.int64) * len(points) + both[:, 1])
+    wanted = b.astype(np.int64) * len(points) + c
+    joined = keys[np.minimum(np.searchsorted(keys, wanted), len(keys) - 1)] == wanted
+    u, v = points[b] - points[a], points[c] - points[a]
+    good = joined & (u[:, 0] * v[:, 1] - u[:, 1] * v[:, 0] > 0.0) & (a < b) & (a < c)
+    return np.stack([a, b, c], axis=1)[good].astype(np.int32)

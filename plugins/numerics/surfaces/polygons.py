@@ -1,0 +1,97 @@
+"""The planar parts of a mesh as polygons: their loops simplified, cut into few triangles, and joined to what is beside them vertex by vertex."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+
+from trihedron.pipeline.types import F64, I32
+from trihedron.plugins.numerics.surfaces.borders import REST, border_half_edges, fixed_vertices, kept_vertices, loops
+from trihedron.plugins.numerics.surfaces.decimation import decimated
+from trihedron.plugins.numerics.surfaces.half_edges import connected, opposite_half_edges
+from trihedron.plugins.numerics.surfaces.plane_axes import plane_axes
+from trihedron.plugins.numerics.surfaces.snapping import snapped
+
+
+@dataclass(frozen=True)
+class Flattened:
+    """A mesh (vertices (v, 3), some unused; triangles (t, 3)) with the plane of each triangle (t,), -1 = none, and the loops of the parts: (plane,
+    vertices round it), as `types.Surface`."""
+
+    vertices: F64
+    triangles: I32
+    labels: I32
+    loops: list[tuple[int, I32]]
+
+
+def flattened(vertices: F64, triangles: I32, opposite: I32, labels: I32, planes: F64, farthest_m: float, tolerance_m: float) -> Flattened:
+    """The mesh with each planar part on its plane and cut into few triangles, its outline within the tolerance. Where parts touch they share
+    vertices: on the
+    line where their planes meet, and along the triangles of no plane all of them."""
+    points = snapped(vertices, triangles, labels, planes, farthest_m)
+    parts, _ = connected(opposite, labels)
+    parts = np.where(labels >= 0, parts, REST).astype(np.int32)
+    border = border_half_edges(parts, opposite)
+    fixed = fixed_vertices(len(vertices), triangles, parts, opposite)
+    keep, beside = kept_vertices(points, triangles, parts, opposite, border, fixed, tolerance_m)
+    bordering = fixed.copy()
+    bordering[triangles.ravel()[border]] = bordering[triangles[:, [1, 2, 0]].ravel()[border]] = True
+    triangles = triangles.copy()
+    rows = decimated(points, triangles, labels, planes, bordering, bordering & ~keep & ~fixed, beside)
+    triangles, labels, parts = triangles[rows], labels[rows], parts[rows]
+    return _recut(points, triangles, labels, parts, planes)
+
+
+def _recut(points: F64, triangles: I32, labels: I32, parts: I32, planes: F64) -> Flattened:
+    """Each part whose outline does not cross itself as the Delaunay triangulation of its polygon."""
+    opposite = opposite_half_edges(triangles)
+    order, starts = loops(border_half_edges(parts, opposite), parts, opposite)
+    rings: dict[int, list[I32]] = {}
+    for a, b in pairwise(starts):
+        rings.setdefault(int(parts[order[a] // 3]), []).append(triangles.ravel()[order[a:b]])
+    first = {part: int(row) for part, row in zip(*np.unique(parts, return_index=True)) if part != REST}
+    cuts = {part: found for part, row in first.items() if (found := _cut(points, rings[part], planes[labels[row]])) is not None}
+    stay = ~np.isin(parts, list(cuts))
+    return Flattened(
+        points,
+        np.concatenate([triangles[stay], *cuts.values()]).astype(np.int32),
+        np.concatenate([labels[stay], *(np.full(len(found), labels[first[part]], np.int32) for part, found in cuts.items())]),
+        [(int(labels[row]), ring) for part, row in first.items() for ring in rings[part]],
+    )
+
+
+def _cut(points: F64, rings: list[I32], plane: F64) -> I32 | None:
+    """Triangles (t, 3) of the polygon with these loops, a constrained Delaunay triangulation; None when they cross or touch."""
+    import shapely
+
+    flat = [points[ring] @ plane_axes(plane) for ring in rings]
+    turned = np.array([_area(ring) for ring in flat])
+    outer = int(np.argmax(turned))
+    if turned[outer] <= 0.0 or (turned > 0.0).sum() > 1 or min(map(len, rings)) < 3:
+        return None
+    polygon = shapely.Polygon(flat[outer], [ring for k, ring in enumerate(flat) if k != outer])
+    if not polygon.is_valid:
+        return None
+    corners = shapely.get_coordinates(shapely.constrained_delaunay_triangles(polygon)).reshape(-1, 4, 2)[:, :3]
+    found = _numbered(corners.reshape(-1, 2), np.concatenate(flat), np.concatenate(rings))
+    triangles = found.reshape(-1, 3) if found is not None else None
+    if triangles is None:
+        return None
+    area = np.array([_area(corner) for corner in corners])
+    return np.where(area[:, None] > 0.0, triangles, triangles[:, ::-1]).astype(np.int32)
+
+
+def _area(ring: F64) -> float:
+    """Signed area of a polygon (n, 2), positive when anticlockwise."""
+    following = np.roll(ring, -1, axis=0)
+    return float(0.5 * (ring[:, 0] * following[:, 1] - ring[:, 1] * following[:, 0]).sum())
+
+
+def _numbered(corners: F64, flat: F64, numbers: I32) -> I32 | None:
+    """The number of each corner (n, 2), by its exact coordinates among `flat` (m, 2); None when one is new."""
+    order = np.lexsort((flat[:, 1], flat[:, 0]))
+    keys, wanted = (np.ascontiguousarray(a).view([("x", "f8"), ("y", "f8")]).ravel() for a in (flat[order], corners))
+    rows = np.minimum(np.searchsorted(keys, wanted), len(keys) - 1)
+    return numbers[order][rows] if (keys[rows] == wanted).all() else None

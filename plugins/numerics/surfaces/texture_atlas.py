@@ -1,0 +1,66 @@
+"""One picture for all planes of a surface: each plane's rectangle, seen from its front, in rows on a page."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from trihedron.pipeline.types import F32, F64, I32, U8
+from trihedron.plugins.numerics.surfaces.painting import painted
+from trihedron.plugins.numerics.surfaces.plane_axes import plane_axes
+from trihedron.plugins.numerics.surfaces.views import View
+
+MARGIN = 1  # texels about each rectangle, so that none bleeds into its neighbour
+NARROWEST = 256  # texels of a page
+
+
+@dataclass(frozen=True)
+class Atlas:
+    """(h, w, 3) RGB, (t, 3, 2) texels (x, y) of the corners of triangles, NaN for those of no plane, and the (p, 3) mean colours of the planes."""
+
+    image: U8
+    texels: F32
+    colors: U8
+
+
+def atlas_of(vertices: F64, triangles: I32, labels: I32, planes: F64, views: Sequence[tuple[View, F64]], texel_m: float) -> Atlas:
+    """Paint planes (p, 4) at `texel_m` a texel where their triangles are."""
+    texels = np.full((len(triangles), 3, 2), np.nan, np.float32)
+    axes = [plane_axes(plane) for plane in planes]
+    corners, sizes = [], []
+    for p, basis in enumerate(axes):
+        mine = labels == p
+        flat = vertices[triangles[mine]] @ basis / texel_m
+        low = np.floor(flat.reshape(-1, 2).min(axis=0)) - MARGIN if mine.any() else np.zeros(2)
+        texels[mine] = flat - low
+        corners.append(low)
+        sizes.append(np.ceil(texels[mine].reshape(-1, 2).max(axis=0)).astype(int) + 1 + MARGIN if mine.any() else np.zeros(2, int))
+    places, (width, height) = _packed(np.array(sizes, int).reshape(-1, 2))
+    image, colors = np.zeros((height, width, 3), np.uint8), np.zeros((len(planes), 3), np.uint8)
+    for p, (plane, basis) in enumerate(zip(planes, axes)):
+        (w, h), (x, y) = sizes[p], places[p]
+        if w == 0:
+            continue
+        grid = np.stack(np.meshgrid(np.arange(w), np.arange(h)), axis=-1).reshape(-1, 2) + corners[p]
+        points = grid * texel_m @ basis.T - plane[3] * plane[:3]
+        found, seen = painted(points, np.broadcast_to(plane[:3], points.shape), views)
+        image[y : y + h, x : x + w] = found.reshape(h, w, 3)
+        colors[p] = np.rint(found[seen].mean(axis=0)) if seen.any() else found[0]
+        texels[labels == p] += np.array([x, y], np.float32)
+    return Atlas(image, texels, colors)
+
+
+def _packed(sizes: I32) -> tuple[I32, tuple[int, int]]:
+    """Places (n, 2) of rectangles (n, 2) on a page about as wide as high, and its size: the highest first, from left to right in rows."""
+    if len(sizes) == 0:
+        return np.empty((0, 2), np.int32), (0, 0)
+    width = max(int(sizes[:, 0].max()), int(np.ceil(np.sqrt(1.2 * (sizes[:, 0] * sizes[:, 1]).sum()))), NARROWEST)
+    places, x, y, row = np.zeros_like(sizes), 0, 0, 0
+    for k in np.argsort(-sizes[:, 1], kind="stable"):
+        if x + sizes[k, 0] > width:
+            x, y, row = 0, y + row, 0
+        places[k] = x, y
+        x, row = x + int(sizes[k, 0]), max(row, int(sizes[k, 1]))
+    return places, (width, y + row)

@@ -1,0 +1,54 @@
+"""Plane instances meshed one by one from sparse points."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from trihedron.pipeline.registry import register
+from trihedron.pipeline.types import Map, Surface
+from trihedron.plugins.numerics.surfaces.assembly import pictured
+from trihedron.plugins.numerics.surfaces.greedy_triangulation import greedy_triangles
+from trihedron.plugins.numerics.surfaces.planar_parts import map_planes, numbered
+from trihedron.plugins.numerics.surfaces.plane_axes import plane_axes
+from trihedron.plugins.numerics.surfaces.view_fold import Gathered, ViewFold
+from trihedron.plugins.numerics.surfaces.view_planes import gathered_points, observed_planes
+
+
+@register("surface", "planar_greedy")
+@dataclass(frozen=True)
+class PlanarGreedy(ViewFold):
+    """Points of each plane of the map, found by a kd-tree and joined by greedy triangulation (paper, section V-B); in the plane's own axes."""
+
+    angle_deg: float = 10.0  # between a region and the plane it belongs to (paper)
+    distance_m: float = 0.05  # of its points from it, on average
+    spacing_m: float = 0.07  # between the points of a plane
+    radius_m: float = 5.0  # of the search for neighbours (paper)
+    multiplier: float = 5.0  # of a point's distance to its nearest neighbour, farther than which it is joined to none (paper)
+    pixel_step: int = 4  # px between the readings that are gathered
+    texel_m: float = 0.015  # of the picture of the planes
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if not 0.0 < self.angle_deg < 90.0 or self.distance_m <= 0.0 or self.pixel_step < 1:
+            raise ValueError("angle_deg, distance_m, pixel_step: an angle within 0 … 90, positive, and at least 1")
+        if self.spacing_m < 0.01 or self.radius_m <= 0.0 or self.multiplier <= 1.0 or self.texel_m < 0.001:
+            raise ValueError("spacing_m, radius_m, multiplier, texel_m: at least 0.01, positive, above 1, and at least 0.001")
+
+    def finish(self, state: Gathered, map: Map | None) -> Surface:
+        """One mesh for each plane that was seen."""
+        views = state.settled(map)
+        ids, known = map_planes(map)
+        found = observed_planes(views, known, self.angle_deg, self.distance_m)
+        axes = [plane_axes(plane) for plane in found.planes]
+        points = gathered_points(views, found, axes, self.spacing_m, self.pixel_step)
+        meshes = [greedy_triangles(flat, self.radius_m, self.multiplier) for flat in points]
+        first = np.cumsum([0, *(len(flat) for flat in points)])
+        vertices = [flat @ basis.T - plane[3] * plane[:3] for flat, basis, plane in zip(points, axes, found.planes)]
+        triangles = [mesh + np.int32(start) for mesh, start in zip(meshes, first)]
+        labels = [np.full(len(mesh), p, np.int32) for p, mesh in enumerate(meshes)]
+        return pictured(
+            state, map, np.concatenate([np.empty((0, 3)), *vertices]), np.concatenate([np.empty((0, 3), np.int32), *triangles]),
+            np.concatenate([np.empty(0, np.int32), *labels]), found.planes, numbered(ids, len(found.planes), map), [], self.texel_m,
+        )  # fmt: skip

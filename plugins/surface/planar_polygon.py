@@ -1,0 +1,20 @@
+"""Planes as polygons."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from trihedron.pipeline.registry import register
+from trihedron.pipeline.types import Map, Surface
+from trihedron.plugins.numerics.surfaces.planar_fold import PlanarFold
+from trihedron.plugins.numerics.surfaces.view_fold import Gathered
+
+
+@register("surface", "planar_polygon")
+@dataclass(frozen=True)
+class PlanarPolygon(PlanarFold):
+    """Planes alone, as polygons with holes that meet along the lines where their planes intersect; triangles by constrained Delaunay."""
+
+    def finish(self, state: Gathered, map: Map | None) -> Surface:
+        """The mesh at the final poses, coloured and pictured by the views."""
+        return self._surface(state, map, rest=False)
