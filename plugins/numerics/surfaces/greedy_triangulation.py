@@ -31,7 +31,8 @@ def greedy_triangles(points: F64, radius_m: float, multiplier: float) -> I32:
 
 @numba.njit(cache=True, nogil=True)
 def _accepted(points: F64, edges: I32, length: F64, distance: F64, nearest: I32) -> I32:
-    """Rows of the edges, shortest first, that cross no edge accepted before. One that does is no longer, so one of its ends is as near to an end of the
+    """Rows of the edges, shortest first, that cross no edge accepted before. One that does is no longer, so one of its ends is as near to an end of
+    the
     edge as that is long: among its neighbours (n, MOST), sorted by distance."""
     partners = np.full((len(points), MOST), -1, np.int32)
     degree = np.zeros(len(points), np.int32)

@@ -26,6 +26,7 @@ class Gathered:
     known: dict[int, Known] = field(default_factory=dict)
     fused: list[F64 | None] = field(default_factory=list)  # the pose each view has in the volume
     volume: Volume | None = None
+    surfels: list[F64] = field(default_factory=list)  # each view's own
     axes: F64 | None = None  # R_world_manhattan
     index: int = 0
     stamp_ns: int = 0

@@ -1,0 +1,58 @@
+"""Discs instead of a mesh."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from trihedron.pipeline.registry import register
+from trihedron.pipeline.types import Map, Surface
+from trihedron.plugins.numerics.surfaces.assembly import pictured
+from trihedron.plugins.numerics.surfaces.planar_parts import map_planes, numbered
+from trihedron.plugins.numerics.surfaces.superpixels import discs, fused, moved, superpixels
+from trihedron.plugins.numerics.surfaces.view_fold import Gathered, ViewFold
+from trihedron.plugins.numerics.surfaces.view_planes import observed_planes
+from trihedron.plugins.numerics.surfaces.views import View
+
+
+@register("surface", "surfels")
+@dataclass(frozen=True)
+class Surfels(ViewFold):
+    """Superpixels of the views fused to discs (Wang, Gao, Shen, ICRA 2019), but coarse where the view is planar: a wall needs few."""
+
+    side_px: int = 6  # of a superpixel, in the reduced view
+    coarse_px: int = 20  # in planar regions
+    angle_deg: float = 30.0  # between the normals of superpixels of one surfel
+    least: int = 3  # views that must agree on a surfel
+    region_deg: float = 10.0  # between a region and the plane it belongs to
+    region_m: float = 0.05  # of its points from it, on average
+    texel_m: float = 0.015  # of the picture of the planes
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if not 2 <= self.side_px <= self.coarse_px or not 0.0 < self.angle_deg < 90.0 or self.least < 1:
+            raise ValueError("side_px, coarse_px, angle_deg, least: 2 <= side_px <= coarse_px, an angle within 0 … 90, at least 1")
+        if not 0.0 < self.region_deg < 90.0 or self.region_m <= 0.0 or self.texel_m < 0.001:
+            raise ValueError("region_deg, region_m, texel_m: an angle within 0 … 90, positive, and at least 0.001")
+
+    def _kept(self, state: Gathered, view: View) -> None:
+        """Cut it."""
+        state.surfels.append(superpixels(view, self.side_px, self.coarse_px))
+
+    def finish(self, state: Gathered, map: Map | None) -> Surface:
+        """The surfels of all views at their final poses, as discs of six corners."""
+        views = state.settled(map)
+        ids, known = map_planes(map)
+        found = observed_planes(views, known, self.region_deg, self.region_m)
+        tied = [surfels for view, surfels in zip(state.views, state.surfels) if view.settled(map) is not None]
+        placed = [moved(surfels, T) for surfels, (_, T) in zip(tied, views)]
+        for surfels, planes in zip(placed, found.regions):
+            surfels[:, 11] = np.append(planes, -1)[surfels[:, 11].astype(int)]
+        agreed = fused(placed, float(np.cos(np.radians(self.angle_deg))))
+        agreed = agreed[agreed[:, 12] >= self.least]
+        vertices, triangles = discs(agreed)
+        labels = np.repeat(agreed[:, 11].astype(np.int32), len(triangles) // max(len(agreed), 1))
+        return pictured(
+            state, map, vertices, triangles, labels, found.planes, numbered(ids, len(found.planes), map), [], self.texel_m
+        )  # fmt: skip
