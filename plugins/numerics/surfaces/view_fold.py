@@ -10,10 +10,10 @@ import numpy as np
 from trihedron.pipeline.types import F64, I32, LOST, Frame, Map, Planes, Pose, Rotation
 from trihedron.plugins.numerics.surfaces.half_edges import without_crumbs
 from trihedron.plugins.numerics.surfaces.surface_nets import zero_level
-from trihedron.plugins.numerics.surfaces.views import Known, View, view_of
+from trihedron.plugins.numerics.surfaces.views import Known, View, readings, view_of
 from trihedron.plugins.numerics.surfaces.volume import Volume
 
-NEWS_STEP = 4  # px between the readings that are asked for news
+NEWS_STEP = 8  # px between the readings that are asked for news
 AHEAD_M = 2.0  # a pose has moved by as much as the camera and a point this far before it have
 CELL_M = 0.1  # of what is remembered to be known
 
@@ -51,8 +51,8 @@ class ViewFold:
 
     view_width: int = 320  # px, about, to which images are reduced
     max_sigma_m: float = 0.05  # depth less certain than this is not used; a Kinect's at 4.2 m
-    views: float = 8.0  # of its quality, after which a view has nothing new to tell of a place
-    news: float = 0.1  # share of new readings for which a view is kept
+    views: float = 6.0  # of its quality, after which a view has nothing new to tell of a place
+    news: float = 0.15  # share of new readings for which a view is kept
 
     def __post_init__(self) -> None:
         if not 16 <= self.view_width <= 4096:
@@ -71,10 +71,11 @@ class ViewFold:
             state.axes = rotation.R_world_manhattan[int(np.argmax(rotation.weights))]
         if pose.status == LOST:
             return state
-        view = view_of(frame, planes, pose, map, self.view_width, self.max_sigma_m)
+        points, weight = readings(frame, pose.T_world_camera, NEWS_STEP, self.max_sigma_m)
         known = state.known.setdefault(pose.submap, Known(CELL_M))
-        if known.news(view, NEWS_STEP, self.views) >= self.news:
-            known.learn(view, NEWS_STEP)
+        if len(points) and known.news(points, weight, self.views) >= self.news:
+            known.learn(points, weight)
+            view = view_of(frame, planes, pose, map, self.view_width, self.max_sigma_m)
             state.views.append(view)
             self._kept(state, view)
         return state

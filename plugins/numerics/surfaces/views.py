@@ -50,7 +50,7 @@ def view_of(frame: Frame, planes: Planes, pose: Pose, map: Map | None, width: in
     step = max(1, round(frame.camera.width / width))
     depth, color = _reduced(frame.depth_m, frame.color, step)
     camera, noise = frame.camera, frame.camera.depth_noise
-    depth[noise.sigma_m(depth) > max_sigma_m] = 0.0
+    depth[~(noise.sigma_m(depth) <= max_sigma_m)] = 0.0  # NaN too
     h, w = depth.shape
     offset = (step - 1) / 2.0
     small = Camera(
@@ -102,28 +102,29 @@ class Known:
     numbers: I32 = field(default_factory=lambda: empty_table(1 << 12)[1])
     information: F64 = field(default_factory=lambda: np.zeros(0))
 
-    def news(self, view: View, step: int, views: float) -> float:
-        """The share of the view's readings, every `step`-th, whose cell is not yet known as well as from `views` views like this one."""
-        points, weight = self._sampled(view, step)
+    def news(self, points: F64, weight: F64, views: float) -> float:
+        """The share of readings whose cell is not yet known as well as from `views` readings like it; of points (n, 3) with information (n,),
+        1/m²."""
         return float(_news(self.keys, self.numbers, self.information, points, weight, self.side_m, views)) / max(len(points), 1)
 
-    def learn(self, view: View, step: int) -> None:
-        """Gather the view's information; a cell takes that of one reading, however many fall into it."""
-        points, weight = self._sampled(view, step)
+    def learn(self, points: F64, weight: F64) -> None:
+        """Gather the readings of one view; a cell takes the information of one, however many fall into it."""
         self.keys, self.numbers = roomy(self.keys, self.numbers, len(points))
-        self.information = np.concatenate([self.information, np.zeros(len(points))])
-        count = int((self.keys != FREE).sum())
-        gained = np.zeros(len(self.information))
+        count = len(self.information)
+        gained = np.zeros(count + len(points))
         count = _learn(self.keys, self.numbers, gained, points, weight, self.side_m, count)
-        self.information = (self.information + gained)[:count]
+        gained[: len(self.information)] += self.information
+        self.information = gained[:count]
 
-    def _sampled(self, view: View, step: int) -> tuple[F64, F64]:
-        """(n, 3) points in the world and (n,) information of their depth."""
-        depth = view.depth_m[step // 2 :: step, step // 2 :: step].astype(np.float64)
-        r, c = np.nonzero(depth)
-        pixels = np.stack([c, r], axis=1) * step + step // 2
-        points = view.camera.back_project(pixels, depth[r, c]) @ view.T_world_camera[:3, :3].T + view.T_world_camera[:3, 3]
-        return points, 1.0 / view.camera.depth_noise.sigma_m(depth[r, c]) ** 2
+
+def readings(frame: Frame, T_world_camera: F64, step: int, max_sigma_m: float) -> tuple[F64, F64]:
+    """Every `step`-th reading of a frame that is as certain as that: points (n, 3) in the world, and information (n,) of their depth (1/m²)."""
+    depth = frame.depth_m[step // 2 :: step, step // 2 :: step].astype(np.float64)
+    sigma = frame.camera.depth_noise.sigma_m(depth)
+    r, c = np.nonzero((depth > 0.0) & (sigma <= max_sigma_m))
+    pixels = np.stack([c, r], axis=1) * step + step // 2
+    points = frame.camera.back_project(pixels, depth[r, c]) @ T_world_camera[:3, :3].T + T_world_camera[:3, 3]
+    return points, 1.0 / sigma[r, c] ** 2
 
 
 @numba.njit(cache=True, nogil=True)
