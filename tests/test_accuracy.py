@@ -76,3 +76,22 @@ def test_what_the_removal_of_each_kind_costs(ates, kind):
     whole, without = sum(ates(where, [])) / len(SEEDS), sum(ates(where, overrides)) / len(SEEDS)
     print(f"without {kind}: {without:.4f} m, {without / whole:.2f} times {whole:.4f} m, {'bare' if where else 'textured'} room")
     assert without > least * whole
+
+
+TEXTURES = ("dataset.texture=true", "dataset.texture=false")
+FAMILIES = [[], ["dataset.slanted=true"], ["dataset.motion=fast"]]
+
+
+@pytest.mark.slow
+def test_poses_are_as_uncertain_as_they_say(tmp_path):
+    """Normalised errors (NEES) of the pose in the map over the room's families, textured and bare: 6 on average and 95 % below χ²'s limit if honest.
+    Errors of neighbouring frames go together, so a single run may stray further than all of them."""
+    within, means = [], []
+    for i, family in enumerate([*family, texture, f"dataset.seed={seed}"] for family in FAMILIES for texture in TEXTURES for seed in SEEDS):
+        metrics = track(tmp_path / str(i), "dataset=synthetic", *family)
+        assert metrics["final"]["tracked_share"] == 1.0 and metrics["final"]["ate_rmse_m"] < 0.005
+        within.append(metrics["consistency"]["share_within_95"])
+        means.append(metrics["consistency"]["nees_mean"])
+        print(f"{' '.join(family)}: NEES {means[-1]:.2f}, {100 * within[-1]:.0f} % within 95 %, ATE {metrics['final']['ate_rmse_m']:.4f} m")
+    assert min(within) > 0.7 and sum(within) / len(within) > 0.9
+    assert 6.0 * 0.5 < sum(means) / len(means) < 6.0 * 1.2
