@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 
 from trihedron.pipeline.arrays import F32, F64, I32, U8, Bool, Shape, Value
 from trihedron.pipeline.camera import EXACT_DEPTH, Camera, DepthNoise
+from trihedron.pipeline.maps import Correction, Map
 from trihedron.pipeline.surface import PLANE_KINDS, Surface
 from trihedron.pipeline.table import Column, Table
 
@@ -246,42 +247,6 @@ class Pose(Value):
     reason: str
     submap: int = 0
     unrecognised: int = 0
-
-
-@dataclass(frozen=True)
-class Map(Value):
-    """Keyframes and landmarks; a row number is an id for good, dead rows have `alive` False. Columns are listed in `plugins.numerics.maps.landmarks`.
-
-    `revision` counts versions; `point_observations` and its siblings say which keyframe (row) saw which landmark, and what it measured."""
-
-    version: ClassVar[int] = 3
-    revision: int
-    keyframes: Table
-    points: Table
-    lines: Table
-    planes: Table
-    point_observations: Table
-    line_observations: Table
-    plane_observations: Table
-
-
-@dataclass(frozen=True)
-class Correction(Value):
-    """Moves keyframes and landmarks of the map, by id, as bundle adjustment or loop closing found them from revision `based_on`. `*_information`
-    (world, 1/m²; of each end of a line) and `plane_covariance`, of (a, b, d), replace what the map had gathered: no measurement is counted twice."""
-
-    based_on: int
-    keyframe_ids: Annotated[I32, Shape("k")]
-    T_world_keyframe: Annotated[F64, Shape("k", 4, 4)]
-    point_ids: Annotated[I32, Shape("n")]
-    points_m: Annotated[F64, Shape("n", 3)]
-    point_information: Annotated[F64, Shape("n", 3, 3)]
-    line_ids: Annotated[I32, Shape("m")]
-    endpoints_m: Annotated[F64, Shape("m", 2, 3)]
-    line_information: Annotated[F64, Shape("m", 2, 3, 3)]
-    plane_ids: Annotated[I32, Shape("p")]
-    coefficients: Annotated[F64, Shape("p", 4)]
-    plane_covariance: Annotated[F64, Shape("p", 3, 3)]
 
 
 @dataclass(frozen=True)
