@@ -1,0 +1,56 @@
+"""Write what a run has found in a format that other programs read.
+
+RUN is a run folder or its recording. Lengths are metres. Meshes are turned so that up, an axis of the Manhattan frame, is +z (ply, obj,
+planes.json) or +y
+(gltf, as its standard says), and what the first camera saw is ahead: +y, or -z.
+
+Example: trihedron export runs/latest --to gltf
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+from trihedron.pipeline.errors import DataError, UsageError, did_you_mean
+from trihedron.pipeline.recording import Recording
+from trihedron.tools.arguments import Parser
+
+RECORDING = "run.mcap"
+
+
+@dataclass(frozen=True)
+class Format:
+    """One format: `write` makes the file and says in one line what is in it."""
+
+    name: str  # as given to --to
+    file: str  # its default name, in the run folder
+    write: Callable[[Recording, Path], str]
+
+
+def formats() -> dict[str, Format]:
+    """Every format by name."""
+    from trihedron.tools import export_surface
+
+    return {format.name: format for format in export_surface.FORMATS}
+
+
+def main(argv: list[str]) -> int:
+    """Run the command; returns the exit code. Raises UsageError for wrong arguments, DataError for a run that lacks what is to be written."""
+    parser = Parser("export", __name__)
+    parser.add_argument("run", metavar="RUN", type=Path, help="a run folder or its recording")
+    parser.add_argument("--to", metavar="FORMAT", required=True, help=f"one of {', '.join(formats())}")
+    parser.add_argument("--out", metavar="FILE", type=Path, help="(default: in the run folder)")
+    arguments = parser.parse_args(argv)
+    if arguments.to not in formats():
+        raise UsageError("export", f"there is no format '{arguments.to}'", did_you_mean(arguments.to, formats()))
+    chosen = formats()[arguments.to]
+    recording: Path = arguments.run / RECORDING if arguments.run.is_dir() else arguments.run
+    out: Path = arguments.out or recording.parent / chosen.file
+    try:
+        said = chosen.write(Recording(recording), out)
+    except OSError as error:
+        raise DataError(str(out), f"cannot be written: {error.strerror}", "give another --out") from error
+    print(f"{out}: {said}")
+    return 0
