@@ -46,3 +46,12 @@ def test_wrong_use_is_refused():
         table.appended(x=np.zeros((2, 3)), n=np.zeros(1))
     with pytest.raises(ValueError, match="appended needs equally long columns"):
         table.appended(x=np.zeros((2, 3)))
+
+
+def test_several_columns_gathered_are_the_rows_of_each():
+    table, ids = Table.empty({"a": Column("f8", (3,)), "b": Column("i4")}).appended(a=np.random.rand(700, 3), b=np.arange(700))
+    for chosen in (ids[::7], ids[::-3], np.array([699, 0, 256, 255, 0]), ids[:0]):
+        a, b = table.gathered(chosen, "a", "b")
+        np.testing.assert_array_equal(a, table.column("a")[chosen])
+        np.testing.assert_array_equal(b, table.rows("b", chosen))
+        np.testing.assert_array_equal(b, chosen)

@@ -22,7 +22,7 @@ def cull(map: Map, keyframe: int, matches: Matches | None, trial: int, min_found
     for kind, visible in (("point", "visible_points"), ("line", "visible_lines")):
         table: Table = getattr(map, f"{kind}s")
         ids = np.union1d(observed_by(map, young, kind), getattr(matches, visible) if matches is not None else young[:0]).astype(np.int32)
-        found, seen, first = table.rows("found", ids), table.rows("visible", ids), table.rows("first", ids)
+        found, seen, first = table.gathered(ids, "found", "visible", "first")
         seldom = (found < min_found * seen) | ((first == keyframe - trial) & (found < trial) & (seen >= trial))
         ids = ids[seldom]
         changes[f"{kind}s"] = table.updated(ids, alive=np.zeros(len(ids), np.bool_))

@@ -14,9 +14,10 @@ EXTEND = 0.25  # a line's map end points may be moved outwards by this share of 
 def point_terms(map: Map, keypoints: Keypoints, pairs: I32) -> PointTerms:
     """Key points (rows `pairs[:, 0]`) and their landmarks (ids `pairs[:, 1]`)."""
     rows, ids = pairs[:, 0], pairs[:, 1]
+    positions, information = map.points.gathered(ids, "position_m", "information")
     return PointTerms(
-        map.points.rows("position_m", ids),
-        inverse(map.points.rows("information", ids)),
+        positions,
+        inverse(information),
         keypoints.pixels[rows].astype(np.float64),
         keypoints.points_m[rows, 2].astype(np.float64),
         keypoints.sigma_px[rows].astype(np.float64),
@@ -27,11 +28,11 @@ def point_terms(map: Map, keypoints: Keypoints, pairs: I32) -> PointTerms:
 def line_terms(map: Map, segments: Segments, pairs: I32, T_world_camera: F64, camera: Camera, sigma_px: float) -> LineTerms:
     """Segments and their map lines, each line given by its points opposite the segment's ends: what lies beyond them was not seen."""
     rows, ids = pairs[:, 0], pairs[:, 1]
-    endpoints, covariance = map.lines.rows("endpoints_m", ids), inverse(map.lines.rows("information", ids))
+    endpoints, information = map.lines.gathered(ids, "endpoints_m", "information")
     observed_px = segments.endpoints_px[rows].astype(np.float64)
     share = points_opposite(endpoints, observed_px, T_world_camera, camera)
     return LineTerms(
-        *points_along(endpoints, covariance, share),
+        *points_along(endpoints, inverse(information), share),
         observed_px,
         np.full(len(rows), sigma_px),
         segments.endpoints_m[rows].astype(np.float64),

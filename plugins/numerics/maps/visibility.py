@@ -25,7 +25,7 @@ class VisiblePoints:
 
 def visible_points(points: Table, ids: I32, T_world_camera: F64, camera: Camera, view_deg: float, octave_scale: float) -> VisiblePoints:
     """Those of the points `ids` that lie in the image, are seen from within `view_deg` of the last direction and at a similar distance."""
-    world, directions, distances, seen_at = (points.rows(name, ids) for name in ("position_m", "direction", "distance_m", "octave"))
+    world, directions, distances, seen_at = points.gathered(ids, "position_m", "direction", "distance_m", "octave")
     intrinsics = (float(camera.fx), float(camera.fy), float(camera.cx), float(camera.cy), camera.width, camera.height)
     cosine, log_scale = float(np.cos(np.radians(view_deg))), float(np.log(octave_scale))
     rows, pixels, depth, octaves = _seen(world, directions, distances, seen_at, T_world_camera, intrinsics, cosine, log_scale)
