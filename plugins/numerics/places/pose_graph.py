@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
-from scipy.sparse import bsr_matrix, diags
-from scipy.sparse.linalg import splu
 
 from trihedron.pipeline.geometry import exp_so3
 from trihedron.pipeline.types import F64, I32
 from trihedron.plugins.numerics.algebra.uncertainty import cross_matrices
+
+if TYPE_CHECKING:  # imported where it is needed: SciPy is slow to load, and most runs close no loop
+    from scipy.sparse import bsr_matrix
 
 ITERATIONS, CONVERGED = 20, 1e-9  # squared length of a step, metres and radians, below which nothing moves any more
 ROUGHEST = 1e8  # damping beyond which no step goes downhill
@@ -28,6 +30,9 @@ class Edges:
 def solve_pose_graph(poses: F64, edges: Edges, R_prior: F64, rotation_sigma: float) -> F64:
     """(n, 4, 4) `T_world_node` that minimise the squared error of the edges and of `R_prior` (n, 3, 3), the rotations known without drift to
     `rotation_sigma` (rad), starting from `poses`. Node 0 stays where it is."""
+    from scipy.sparse import diags
+    from scipy.sparse.linalg import splu
+
     damping, current = 1e-6, poses.copy()
     cost, H, g = _normal_equations(current, edges, R_prior, rotation_sigma)
     for _ in range(ITERATIONS):
@@ -91,6 +96,8 @@ def _normal_equations(poses: F64, edges: Edges, R_prior: F64, rotation_sigma: fl
 
 def _assembled(blocks: F64, rows: I32, columns: I32, n: int) -> bsr_matrix:
     """(6n, 6n) sum of 6 × 6 blocks at rows and columns of blocks."""
+    from scipy.sparse import bsr_matrix
+
     keys, where = np.unique(rows.astype(np.int64) * n + columns, return_inverse=True)
     total = np.zeros((len(keys), 6, 6))
     np.add.at(total, where, blocks)
