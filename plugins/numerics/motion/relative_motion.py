@@ -15,6 +15,7 @@ import numpy as np
 from trihedron.pipeline.geometry import tangent_basis
 from trihedron.pipeline.types import F64, Keypoints, Planes, Segments, Tracks
 from trihedron.plugins.numerics.algebra.small_linear import solve_positive, turn_left
+from trihedron.plugins.numerics.motion.place_pairs import line_pairs, point_pairs
 
 MOST = 400  # pairs of places used, about; more only cost time
 GATE2 = 9.0  # squared standard deviations at which a term counts a quarter, once the scale has come down
@@ -46,9 +47,10 @@ def motion_terms(tracks: Tracks, keypoints: Keypoints, segments: Segments, plane
     """What the tracks and the current features say about the motion. `rad_per_px` turns a key point's sigma_px into an angle; `floor_deg` is the
     least error of a plane's normal. Pairs that are not finite, or whose covariance is none, are left out."""
     step = max(-(-(len(tracks.keypoints) + 2 * len(tracks.segments)) // MOST), 1)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        points = _finite(*_point_pairs(tracks, keypoints, rad_per_px, step))
-        ends = _finite(*_line_pairs(tracks, segments, rad_per_px, step))
+    of_points = point_pairs(
+        tracks.keypoints[:, 1], tracks.points_m, tracks.sigma_m, keypoints.points_m, keypoints.sigma_px, keypoints.sigma_m, rad_per_px, step
+    )
+    of_lines = line_pairs(tracks.segments[:, 1], tracks.endpoints_m, segments.endpoints_m, segments.covariance_m2, rad_per_px, step)
     rows = tracks.planes[:, 1]
     covariance = planes.covariance[rows] + tracks.plane_covariance
     covariance[:, :2, :2] += np.eye(2) * np.radians(floor_deg) ** 2
@@ -59,43 +61,8 @@ def motion_terms(tracks: Tracks, keypoints: Keypoints, segments: Segments, plane
     basis[:, :3, :2] = tangent_basis(planes.coefficients[rows, :3])
     basis[:, 3, 2] = 1.0
     information = basis @ np.linalg.inv(covariance) @ np.swapaxes(basis, 1, 2) if len(rows) else np.zeros((0, 4, 4))
-    before, after, weight = (np.concatenate(pair) for pair in zip(points, ends))
+    before, after, weight = (np.concatenate(pair) for pair in zip(of_points, of_lines))
     return Terms(before, after, weight, coefficients, planes.coefficients[rows], information)
-
-
-def _finite(before: F64, after: F64, information: F64) -> tuple[F64, F64, F64]:
-    """The pairs (n, 3), (n, 3), (n, 3, 3) without those that are not finite."""
-    known = np.isfinite(before).all(axis=1) & np.isfinite(after).all(axis=1) & np.isfinite(information).all(axis=(1, 2))
-    return before[known], after[known], information[known]
-
-
-def _point_pairs(tracks: Tracks, keypoints: Keypoints, rad_per_px: float, step: int) -> tuple[F64, F64, F64]:
-    """One in `step` of the pairs of points with depth."""
-    rows = tracks.keypoints[:, 1]
-    known = np.flatnonzero(np.isfinite(tracks.points_m[:, 2]) & np.isfinite(keypoints.points_m[rows, 2]))[::step]
-    rows = rows[known]
-    before, after = tracks.points_m[known].astype(np.float64), keypoints.points_m[rows].astype(np.float64)
-    across = keypoints.sigma_px[rows].astype(np.float64) * rad_per_px * np.hypot(before[:, 2], after[:, 2])
-    depth = np.hypot(tracks.sigma_m[known], keypoints.sigma_m[rows]).astype(np.float64)
-    ray = after / after[:, 2:]
-    shrink = depth**2 / (across**2 + depth**2 * (ray * ray).sum(axis=1))  # Sherman–Morrison
-    return before, after, (np.eye(3) - shrink[:, None, None] * ray[:, :, None] * ray[:, None, :]) / (across**2)[:, None, None]
-
-
-def _line_pairs(tracks: Tracks, segments: Segments, rad_per_px: float, step: int) -> tuple[F64, F64, F64]:
-    """Both ends of one in `step` of the previous lines against the current ones, whose own noise serves for both."""
-    rows = tracks.segments[:, 1]
-    along = (segments.endpoints_m[rows, 1] - segments.endpoints_m[rows, 0]).astype(np.float64)
-    length = np.linalg.norm(along, axis=1)
-    known = np.flatnonzero(np.isfinite(tracks.endpoints_m).all(axis=(1, 2)) & np.isfinite(along).all(axis=1) & (length > 1e-3))[::step]
-    rows, direction = rows[known], (along / np.where(length > 0.0, length, 1.0)[:, None])[known]
-    basis = tangent_basis(direction)
-    before, start = tracks.endpoints_m[known].astype(np.float64), segments.endpoints_m[rows, 0].astype(np.float64)
-    covariance = 2.0 * segments.covariance_m2[rows].astype(np.float64).mean(axis=1)
-    floor = np.maximum(rad_per_px * start[:, 2], 1e-6) ** 2
-    across = np.swapaxes(basis, 1, 2) @ covariance @ basis + np.eye(2) * floor[:, None, None]
-    information = 0.5 * basis @ np.linalg.inv(across) @ np.swapaxes(basis, 1, 2)
-    return before.reshape(-1, 3), np.repeat(start, 2, axis=0), np.repeat(information, 2, axis=0)
 
 
 def solve_motion(terms: Terms, R: F64, sigma_deg: float, sigma_m: float) -> Motion:

@@ -1,0 +1,85 @@
+"""Pairs of places, one in each of two frames, with the information of their difference: of points and of the ends of lines."""
+
+from __future__ import annotations
+
+import numba
+import numpy as np
+
+from trihedron.pipeline.types import F32, F64, I32
+from trihedron.plugins.numerics.motion.pose_terms import basis
+
+SHORTEST_M = 1e-3  # line
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def point_pairs(
+    rows: I32, before: F32, before_sigma: F32, points: F32, sigma_px: F32, sigma_m: F32, rad_per_px: float, step: int
+) -> tuple[F64, F64, F64]:
+    """Previous and current places (m, 3) and information (m, 3, 3), 1/m², of one in `step` of those of n pairs that both have depth.
+
+    `before` (n, 3) and its σ of depth (n,) belong to the current `points[rows]`, whose σ are across the ray (px) and along it (m)."""
+    p, q, information, m, seen = np.empty((len(rows), 3)), np.empty((len(rows), 3)), np.empty((len(rows), 3, 3)), 0, 0
+    for i in range(len(rows)):
+        row = rows[i]
+        z = float(points[row, 2])
+        if not (np.isfinite(before[i, 2]) and np.isfinite(z)):
+            continue
+        seen += 1
+        if (seen - 1) % step:
+            continue
+        across = sigma_px[row] * rad_per_px * np.sqrt(float(before[i, 2]) ** 2 + z * z)
+        along2 = float(before_sigma[i]) ** 2 + float(sigma_m[row]) ** 2
+        for k in range(3):
+            p[m, k], q[m, k] = before[i, k], points[row, k]
+        x, y = q[m, 0] / z, q[m, 1] / z
+        shrink = along2 / (across * across + along2 * (x * x + y * y + 1.0))  # Sherman–Morrison
+        total = 0.0
+        for a in range(3):
+            for b in range(3):
+                ray = (x if a == 0 else y if a == 1 else 1.0) * (x if b == 0 else y if b == 1 else 1.0)
+                information[m, a, b] = ((1.0 if a == b else 0.0) - shrink * ray) / (across * across)
+                total += information[m, a, b]
+        m += np.isfinite(total)
+    return p[:m], q[:m], information[:m]
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def line_pairs(rows: I32, before: F32, endpoints: F32, covariance: F32, rad_per_px: float, step: int) -> tuple[F64, F64, F64]:
+    """Both ends of one in `step` of n previous lines `before` (n, 2, 3), each against the start of the current line `endpoints[rows]`, whose noise
+    `covariance` (·, 2, 3, 3), m², serves for both: places (2 m, 3) and information (2 m, 3, 3), which is zero along the line."""
+    n = len(rows)
+    p, q, information, m, seen = np.empty((2 * n, 3)), np.empty((2 * n, 3)), np.empty((2 * n, 3, 3)), 0, 0
+    direction, B, S = np.empty(3), np.empty((3, 2)), np.empty((2, 2))
+    for i in range(n):
+        row = rows[i]
+        length2, known = 0.0, 0.0
+        for k in range(3):
+            direction[k] = float(endpoints[row, 1, k]) - float(endpoints[row, 0, k])
+            length2 += direction[k] * direction[k]
+            known += before[i, 0, k] + before[i, 1, k]
+        if not (length2 > SHORTEST_M * SHORTEST_M and np.isfinite(length2) and np.isfinite(known)):
+            continue
+        seen += 1
+        if (seen - 1) % step:
+            continue
+        for k in range(3):
+            direction[k] /= np.sqrt(length2)
+        basis(direction, B)
+        floor = max(rad_per_px * float(endpoints[row, 0, 2]), 1e-6) ** 2
+        for a in range(2):
+            for b in range(2):
+                S[a, b] = floor if a == b else 0.0
+                for j in range(3):
+                    for k in range(3):
+                        S[a, b] += B[j, a] * (float(covariance[row, 0, j, k]) + float(covariance[row, 1, j, k])) * B[k, b]
+        det = S[0, 0] * S[1, 1] - S[0, 1] * S[1, 0]
+        if not (det > 0.0 and np.isfinite(det)):
+            continue
+        for end in range(2):
+            for a in range(3):
+                p[m + end, a], q[m + end, a] = before[i, end, a], endpoints[row, 0, a]
+                for b in range(3):
+                    first, second = S[1, 1] * B[b, 0] - S[0, 1] * B[b, 1], S[0, 0] * B[b, 1] - S[1, 0] * B[b, 0]
+                    information[m + end, a, b] = 0.5 * (B[a, 0] * first + B[a, 1] * second) / det
+        m += 2
+    return p[:m], q[:m], information[:m]
