@@ -9,7 +9,7 @@ import numpy as np
 
 from trihedron.pipeline.types import F32, F64, I32, PLANE_KINDS, U8, Map, Surface
 from trihedron.plugins.numerics.surfaces.half_edges import compacted, triangle_areas
-from trihedron.plugins.numerics.surfaces.painting import painted, vertex_normals
+from trihedron.plugins.numerics.surfaces.painting import painted, spread, vertex_normals
 from trihedron.plugins.numerics.surfaces.texture_atlas import atlas_of
 from trihedron.plugins.numerics.surfaces.view_fold import Gathered
 
@@ -21,7 +21,7 @@ def coloured(state: Gathered, map: Map | None, vertices: F64, triangles: I32) ->
     """A surface of triangles (t, 3) that belong to no plane."""
     views = state.settled(map)
     vertices, triangles, _ = compacted(vertices, triangles)
-    colors, _ = painted(vertices, vertex_normals(vertices, triangles), views)
+    colors = spread(vertices, *painted(vertices, vertex_normals(vertices, triangles), views))
     return replace(
         Surface.empty(state.index, state.stamp_ns),
         vertices_m=vertices.astype(np.float32),

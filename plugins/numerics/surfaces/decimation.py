@@ -133,7 +133,7 @@ def _allowed(
         now = _signed(vertices, triangles[t, 0], triangles[t, 1], triangles[t, 2], n)
         a, b, c = triangles[t, 0], triangles[t, 1], triangles[t, 2]
         then = _signed(vertices, v if a == u else a, v if b == u else b, v if c == u else c, n)
-        if then < FLAT_M2 and then <= now:
+        if then < FLAT_M2 and then < now - 1e-3 * FLAT_M2:  # one that has no area already may stay so
             return False
     return True
 

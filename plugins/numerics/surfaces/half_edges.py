@@ -55,6 +55,40 @@ def connected(opposite: I32, labels: I32) -> tuple[I32, int]:
     return parts, count
 
 
+def with_single_fans(vertices: F64, triangles: I32) -> tuple[F64, I32]:
+    """The mesh with a vertex of its own for each fan of triangles: none is shared by sheets that touch in a point alone."""
+    fans = _fans(opposite_half_edges(triangles))
+    corners = triangles.ravel()
+    _, first, number = np.unique(fans, return_index=True, return_inverse=True)
+    return vertices[corners[first]], number.reshape(-1, 3).astype(np.int32)
+
+
+@numba.njit(cache=True, nogil=True)
+def _join(root: I32, a: int, b: int) -> None:
+    while root[a] != a:
+        root[a] = root[root[a]]
+        a = root[a]
+    while root[b] != b:
+        root[b] = root[root[b]]
+        b = root[b]
+    root[max(a, b)] = min(a, b)
+
+
+@numba.njit(cache=True, nogil=True)
+def _fans(opposite: I32) -> I32:
+    """(3 t,) the least corner of the fan that each corner belongs to: corners at the two ends of an edge are those of the triangle beyond it."""
+    root = np.arange(len(opposite), dtype=np.int32)
+    for h in range(len(opposite)):
+        o = opposite[h]
+        if o > h:
+            _join(root, h, o - o % 3 + (o % 3 + 1) % 3)
+            _join(root, h - h % 3 + (h % 3 + 1) % 3, o)
+    for c in range(len(root)):
+        while root[root[c]] != root[c]:
+            root[c] = root[root[c]]
+    return root
+
+
 def triangle_areas(vertices: F64, triangles: I32) -> F64:
     """(t,) areas in m²."""
     corners = vertices[triangles]

@@ -40,6 +40,17 @@ def painted(points: F64, normals: F64, views: Sequence[tuple[View, F64]]) -> tup
     return np.where(seen[:, None], colors, UNSEEN).astype(np.uint8), seen
 
 
+def spread(points: F64, colors: U8, seen: Bool) -> U8:
+    """The colours (n, 3), those of points that are not seen (the image ends before their mesh does) from the nearest that is."""
+    from scipy.spatial import cKDTree
+
+    if seen.all() or not seen.any():
+        return colors
+    out = colors.copy()
+    out[~seen] = colors[seen][cKDTree(points[seen]).query(points[~seen])[1]]
+    return out
+
+
 @numba.njit(cache=True, nogil=True)
 def _paint(points: F32, normals: F32, depth: F32, color: U8, R: F32, position: F32, lens: F32, near: F32, total: F32) -> None:
     """Add the colours one view gives, times their weight, and the weight, to `total` (n, 4). R is `R_camera_world`."""

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 from trihedron.pipeline.types import Map, Surface
 from trihedron.plugins.numerics.surfaces.assembly import pictured
-from trihedron.plugins.numerics.surfaces.half_edges import opposite_half_edges
+from trihedron.plugins.numerics.surfaces.half_edges import opposite_half_edges, with_single_fans
 from trihedron.plugins.numerics.surfaces.painting import vertex_normals
 from trihedron.plugins.numerics.surfaces.planar_parts import Flatness, map_planes, numbered, planar_labels
 from trihedron.plugins.numerics.surfaces.polygons import flattened
@@ -24,14 +24,15 @@ class PlanarFold(VolumeFold):
     area_m2: float = 0.02  # of the smallest planar part
     bend_per_m: float = 0.8  # curvature above which a part is not flat
     snap_m: float = 0.05  # how far a vertex may be moved onto the line or the point where planes meet
-    outline_m: float = 0.015  # error allowed to an outline
+    outline_m: float = 0.02  # error allowed to an outline
+    hole_m2: float = 0.01  # a hole in a plane's mesh, with nothing in it, that is smaller is closed
     texel_m: float = 0.015  # of the picture of the planes
 
     def __post_init__(self) -> None:
         super().__post_init__()
         _ = self._flatness
-        if self.snap_m <= 0.0 or self.outline_m < 0.0 or self.texel_m < 0.001:
-            raise ValueError("snap_m, outline_m, texel_m: must be positive, not negative, and at least a millimetre")
+        if self.snap_m <= 0.0 or self.outline_m < 0.0 or self.hole_m2 < 0.0 or self.texel_m < 0.001:
+            raise ValueError("snap_m, outline_m, hole_m2, texel_m: must be positive, not negative twice, and at least a millimetre")
 
     @property
     def _flatness(self) -> Flatness:
@@ -44,9 +45,10 @@ class PlanarFold(VolumeFold):
         ids, known = map_planes(map)
         labels, planes = planar_labels(vertices, vertex_normals(vertices, triangles), triangles, opposite, known, self._flatness)
         if not rest:
-            triangles, labels = triangles[labels >= 0], labels[labels >= 0]
+            vertices, triangles = with_single_fans(vertices, triangles[labels >= 0])
+            labels = labels[labels >= 0]
             opposite = opposite_half_edges(triangles)
-        flat = flattened(vertices, triangles, opposite, labels, planes, self.snap_m, self.outline_m)
+        flat = flattened(vertices, triangles, opposite, labels, planes, self.snap_m, self.outline_m, self.hole_m2)
         return pictured(
             state, map, flat.vertices, flat.triangles, flat.labels, planes, numbered(ids, len(planes), map), flat.loops, self.texel_m
         )

@@ -26,31 +26,38 @@ class Flattened:
     loops: list[tuple[int, I32]]
 
 
-def flattened(vertices: F64, triangles: I32, opposite: I32, labels: I32, planes: F64, farthest_m: float, tolerance_m: float) -> Flattened:
+def flattened(
+    vertices: F64, triangles: I32, opposite: I32, labels: I32, planes: F64, farthest_m: float, tolerance_m: float, hole_m2: float
+) -> Flattened:  # fmt: skip
     """The mesh with each planar part on its plane and cut into few triangles, its outline within the tolerance. Where parts touch they share
-    vertices: on the
-    line where their planes meet, and along the triangles of no plane all of them."""
+    vertices: on the line where their planes meet, and along the triangles of no plane all of them."""
+    if not (labels >= 0).any():
+        return Flattened(vertices, triangles, labels, [])
     points = snapped(vertices, triangles, labels, planes, farthest_m)
     parts, _ = connected(opposite, labels)
     parts = np.where(labels >= 0, parts, REST).astype(np.int32)
     border = border_half_edges(parts, opposite)
     fixed = fixed_vertices(len(vertices), triangles, parts, opposite)
     keep, beside = kept_vertices(points, triangles, parts, opposite, border, fixed, tolerance_m)
-    bordering = fixed.copy()
-    bordering[triangles.ravel()[border]] = bordering[triangles[:, [1, 2, 0]].ravel()[border]] = True
+    on_border = np.zeros(len(vertices), np.bool_)
+    for ends in (triangles, triangles[:, [1, 2, 0]]):
+        on_border[ends.ravel()[border]] = True
     triangles = triangles.copy()
-    rows = decimated(points, triangles, labels, planes, bordering, bordering & ~keep & ~fixed, beside)
+    rows = decimated(points, triangles, labels, planes, on_border | fixed, on_border & ~keep & ~fixed, beside)
     triangles, labels, parts = triangles[rows], labels[rows], parts[rows]
-    return _recut(points, triangles, labels, parts, planes)
+    return _recut(points, triangles, labels, parts, planes, hole_m2)
 
 
-def _recut(points: F64, triangles: I32, labels: I32, parts: I32, planes: F64) -> Flattened:
-    """Each part whose outline does not cross itself as the Delaunay triangulation of its polygon."""
+def _recut(points: F64, triangles: I32, labels: I32, parts: I32, planes: F64, hole_m2: float) -> Flattened:
+    """Each part whose outline does not cross itself as the Delaunay triangulation of its polygon. Holes in the mesh of less than `hole_m2` are
+    closed."""
     opposite = opposite_half_edges(triangles)
     order, starts = loops(border_half_edges(parts, opposite), parts, opposite)
     rings: dict[int, list[I32]] = {}
     for a, b in pairwise(starts):
-        rings.setdefault(int(parts[order[a] // 3]), []).append(triangles.ravel()[order[a:b]])
+        ring = triangles.ravel()[order[a:b]]
+        hole = (opposite[order[a:b]] < 0).all() and 0.0 < -_area(points[ring] @ plane_axes(planes[labels[order[a] // 3]])) < hole_m2
+        rings.setdefault(int(parts[order[a] // 3]), []).extend([] if hole else [ring])
     first = {part: int(row) for part, row in zip(*np.unique(parts, return_index=True)) if part != REST}
     cuts = {part: found for part, row in first.items() if (found := _cut(points, rings[part], planes[labels[row]])) is not None}
     stay = ~np.isin(parts, list(cuts))

@@ -5,9 +5,10 @@ from __future__ import annotations
 import numba
 import numpy as np
 
-from trihedron.pipeline.types import F64, I32
+from trihedron.pipeline.types import F64, I32, Bool
 
 LEAST = 0.1  # share of the strongest direction below which planes do not say where a vertex is: two that differ by less than 26°
+ROUNDS = 20  # at most, to unfold what lies the wrong way round after it was moved
 
 
 def snapped(vertices: F64, triangles: I32, labels: I32, planes: F64, farthest_m: float) -> F64:
@@ -17,7 +18,12 @@ def snapped(vertices: F64, triangles: I32, labels: I32, planes: F64, farthest_m:
     size = len(planes) + 1
     keys = np.unique(triangles[planar].astype(np.int64) * size + labels[planar][:, None])
     starts = np.searchsorted(keys, np.arange(len(vertices) + 1, dtype=np.int64) * size)
-    return _snapped(vertices, (keys % size).astype(np.int32), starts.astype(np.int32), planes, farthest_m)
+    points = _snapped(vertices, (keys % size).astype(np.int32), starts.astype(np.int32), planes, farthest_m)
+    rows = np.flatnonzero(planar)
+    for _ in range(ROUNDS):
+        if not _unfold(points, triangles[rows], planes[labels[rows], :3], np.diff(starts) == 1):
+            break
+    return points
 
 
 @numba.njit(cache=True, nogil=True)
@@ -36,6 +42,30 @@ def _snapped(vertices: F64, rows: I32, starts: I32, planes: F64, farthest: float
             step, _ = _step(vertices[v], planes, rows[nearest : nearest + 1])
         out[v] += step
     return out
+
+
+@numba.njit(cache=True, nogil=True)
+def _unfold(points: F64, triangles: I32, normals: F64, single: Bool) -> int:
+    """Move vertices of one plane alone (v,) whose triangles (t, 3) lie the wrong way round to the middle of their neighbours; returns how many."""
+    folded = np.zeros(len(points), np.bool_)
+    for t in range(len(triangles)):
+        a, b, c = triangles[t, 0], triangles[t, 1], triangles[t, 2]
+        if np.dot(np.cross(points[b] - points[a], points[c] - points[a]), normals[t]) < 0.0:
+            for k in range(3):
+                folded[triangles[t, k]] = single[triangles[t, k]]
+    total = np.zeros((len(points), 4))
+    for t in range(len(triangles)):
+        for k in range(3):
+            if folded[triangles[t, k]]:
+                for other in (triangles[t, (k + 1) % 3], triangles[t, (k + 2) % 3]):
+                    total[triangles[t, k], :3] += points[other]
+                    total[triangles[t, k], 3] += 1.0
+    count = 0
+    for v in range(len(points)):
+        if folded[v]:
+            points[v] = total[v, :3] / total[v, 3]
+            count += 1
+    return count
 
 
 @numba.njit(cache=True, nogil=True, inline="always")

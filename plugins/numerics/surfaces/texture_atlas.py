@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from trihedron.pipeline.types import F32, F64, I32, U8
+from trihedron.pipeline.types import F32, F64, I32, U8, Bool
 from trihedron.plugins.numerics.surfaces.painting import painted
 from trihedron.plugins.numerics.surfaces.plane_axes import plane_axes
 from trihedron.plugins.numerics.surfaces.views import View
@@ -46,10 +46,20 @@ def atlas_of(vertices: F64, triangles: I32, labels: I32, planes: F64, views: Seq
         grid = np.stack(np.meshgrid(np.arange(w), np.arange(h)), axis=-1).reshape(-1, 2) + corners[p]
         points = grid * texel_m @ basis.T - plane[3] * plane[:3]
         found, seen = painted(points, np.broadcast_to(plane[:3], points.shape), views)
-        image[y : y + h, x : x + w] = found.reshape(h, w, 3)
+        image[y : y + h, x : x + w] = _spread(found.reshape(h, w, 3), seen.reshape(h, w))
         colors[p] = np.rint(found[seen].mean(axis=0)) if seen.any() else found[0]
         texels[labels == p] += np.array([x, y], np.float32)
     return Atlas(image, texels, colors)
+
+
+def _spread(picture: U8, seen: Bool) -> U8:
+    """(h, w, 3) with the colour of the nearest texel seen where none is: triangles reach a little beyond what the views show."""
+    from scipy.ndimage import distance_transform_edt
+
+    if seen.all() or not seen.any():
+        return picture
+    rows, columns = distance_transform_edt(~seen, return_distances=False, return_indices=True)
+    return picture[rows, columns]
 
 
 def _packed(sizes: I32) -> tuple[I32, tuple[int, int]]:

@@ -8,12 +8,12 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from trihedron.pipeline.types import F64, I32, LOST, Frame, Map, Planes, Pose, Rotation
-from trihedron.plugins.numerics.surfaces.half_edges import without_crumbs
+from trihedron.plugins.numerics.surfaces.half_edges import with_single_fans, without_crumbs
 from trihedron.plugins.numerics.surfaces.surface_nets import zero_level
 from trihedron.plugins.numerics.surfaces.views import Known, View, readings, view_of
 from trihedron.plugins.numerics.surfaces.volume import Volume
 
-NEWS_STEP = 8  # px between the readings that are asked for news
+NEWS_COLUMNS = 80  # of readings that are asked for news
 AHEAD_M = 2.0  # a pose has moved by as much as the camera and a point this far before it have
 CELL_M = 0.1  # of what is remembered to be known
 
@@ -71,7 +71,7 @@ class ViewFold:
             state.axes = rotation.R_world_manhattan[int(np.argmax(rotation.weights))]
         if pose.status == LOST:
             return state
-        points, weight = readings(frame, pose.T_world_camera, NEWS_STEP, self.max_sigma_m)
+        points, weight = readings(frame, pose.T_world_camera, max(1, frame.camera.width // NEWS_COLUMNS), self.max_sigma_m)
         known = state.known.setdefault(pose.submap, Known(CELL_M))
         if len(points) and known.news(points, weight, self.views) >= self.news:
             known.learn(points, weight)
@@ -123,7 +123,7 @@ class VolumeFold(ViewFold):
     def _mesh(self, state: Gathered, map: Map | None) -> tuple[F64, I32]:
         """Vertices (v, 3) and triangles (t, 3) of the zero level at the final poses, without crumbs."""
         vertices, triangles = zero_level(self._volume(state, map), 1.0 / self.max_error_m**2)
-        return vertices, without_crumbs(vertices, triangles, self.crumb_m2)
+        return with_single_fans(vertices, without_crumbs(vertices, triangles, self.crumb_m2))
 
 
 def _moved_m(said: F64 | None, final: F64 | None) -> float:

@@ -1,0 +1,259 @@
+"""Surfaces of scenes with known planes: where they are, that they are whole, and that nothing seen is no error."""
+
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+import trimesh
+
+from trihedron.pipeline.codec import Encoder
+from trihedron.pipeline.geometry import exp_so3, pose_matrix
+from trihedron.pipeline.ply import triangle_planes, write_ply
+from trihedron.pipeline.registry import load_plugins, plugin_class, plugins_of
+from trihedron.pipeline.types import EXACT_DEPTH, LOST, OK, PLANE_KINDS, Camera, Frame, Planes, Pose, Rotation
+from trihedron.plugins.numerics.maps.insertion import add_keyframe
+from trihedron.plugins.numerics.maps.landmarks import empty_map
+from trihedron.plugins.numerics.surfaces.half_edges import opposite_half_edges
+
+load_plugins()
+SURFACES = tuple(name for name in plugins_of("surface") if name != "none")
+CAMERA = Camera(160, 120, 130.0, 130.0, 79.5, 59.5, depth_noise=EXACT_DEPTH)
+FLOOR, LEFT, BACK = (0.0, -1.0, 0.0, 1.0), (1.0, 0.0, 0.0, 1.2), (0.0, 0.0, -1.0, 3.0)  # the corner of a room, seen from inside; y down
+BALL, RADIUS = np.array([0.5, 0.85, 2.2]), 0.4  # sunk into the floor
+
+
+def render(T, planes, ball=True, camera=CAMERA):
+    """Depth and the number of the plane (1 …, 0 = the ball or nothing) seen by a camera at T."""
+    v, u = np.mgrid[0 : camera.height, 0 : camera.width]
+    rays = np.stack([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, np.ones(u.shape)], axis=-1) @ T[:3, :3].T
+    depth, label = np.full(u.shape, np.inf), np.zeros(u.shape, np.uint8)
+    for k, plane in enumerate(planes, 1):
+        slope = rays @ np.array(plane[:3])
+        with np.errstate(divide="ignore"):
+            z = -(np.array(plane[:3]) @ T[:3, 3] + plane[3]) / slope
+        nearer = (slope < 0.0) & (z > 0.05) & (z < depth)
+        depth[nearer], label[nearer] = z[nearer], k
+    if ball:
+        a, b = (rays**2).sum(-1), rays @ (T[:3, 3] - BALL)
+        root = b * b - a * (((T[:3, 3] - BALL) ** 2).sum() - RADIUS**2)
+        z = np.where(root > 0.0, (-b - np.sqrt(np.maximum(root, 0.0))) / a, np.inf)
+        depth, label = np.minimum(depth, z), np.where(z < depth, 0, label).astype(np.uint8)
+    return np.where(np.isfinite(depth), depth, 0.0), label
+
+
+def seen(index, T, planes=(FLOOR, LEFT, BACK), ball=True, camera=CAMERA, status=OK, depth=None):
+    """What a surface is given of a frame: frame, planes, rotation, pose."""
+    z, label = render(T, planes, ball, camera)
+    z = z if depth is None else depth
+    stamp, n = index * 33_000_000, len(planes)
+    own = np.array([(*(T[:3, :3].T @ np.array(p[:3])), p[3] + np.array(p[:3]) @ T[:3, 3]) for p in planes]).reshape(-1, 4)
+    regions = Planes(
+        index, stamp, own, np.tile(np.eye(3) * 1e-6, (n, 1, 1)), np.zeros((n, 4, 4)), np.full(n, 4000, np.int32),
+        np.full((n, 32, 3), np.nan, np.float32), label, 1,
+    )  # fmt: skip
+    color = np.full((*z.shape, 3), (200, 100, 50), np.uint8)
+    frame = Frame(index, stamp, color, z.astype(np.float32), camera)
+    one = np.eye(3)[None]
+    rotation = Rotation(index, stamp, T[:3, :3], np.eye(3) * 1e-6, one, one, np.zeros(1, np.int32), np.ones(1), "manhattan")
+    return frame, regions, rotation, Pose(index, stamp, T, np.eye(6) * 1e-6, T, -1, np.zeros(3, np.int32), 0, status, "")
+
+
+def walk(count=8):
+    """Poses that look into the corner from different places."""
+    return [pose_matrix(exp_so3(np.array([-0.35, -0.45 + 0.06 * k, 0.0])), np.array([-0.3 + 0.1 * k, 0.02 * k, 0.03 * k])) for k in range(count)]
+
+
+def fold(plugin, inputs, map=None):
+    state = plugin.start()
+    for frame, planes, rotation, pose in inputs:
+        state = plugin.add(state, frame, planes, rotation, pose, None)
+    return plugin.finish(state, map)
+
+
+@cache
+def corner(name):
+    return fold(plugin_class("surface", name)(view_width=160), [seen(k, T) for k, T in enumerate(walk())])
+
+
+def off_truth(surface):
+    """Distances of the vertices from the corner's planes or the ball, whichever is nearest."""
+    points = surface.vertices_m.astype(float)
+    off = [abs(points @ np.array(p[:3]) + p[3]) for p in (FLOOR, LEFT, BACK)] + [abs(np.linalg.norm(points - BALL, axis=1) - RADIUS)]
+    return np.min(off, axis=0)
+
+
+@pytest.mark.parametrize(("name", "mean_m"), [("tsdf", 0.003), ("planar_tsdf", 0.003), ("planar_polygon", 0.001), ("planar_greedy", 0.001),
+("surfels", 0.02)])
+def test_a_corner_with_a_ball(name, mean_m):
+    surface = corner(name)
+    assert len(surface.triangles) > 10 and off_truth(surface).mean() < mean_m
+    assert (np.abs(surface.colors.astype(int) - (200, 100, 50)).max(axis=1) <= 1).mean() > 0.95
+    middles = surface.vertices_m[surface.triangles]
+    normals = np.cross(middles[:, 1] - middles[:, 0], middles[:, 2] - middles[:, 0])
+    towards = ((walk()[4][:3, 3] - middles.mean(axis=1)) * normals).sum(axis=1) > 0.0
+    assert np.average(towards, weights=np.linalg.norm(normals, axis=1)) > 0.995
+
+
+@pytest.mark.parametrize("name", ["planar_tsdf", "planar_polygon", "planar_greedy"])
+def test_planes_are_known_by_what_they_are(name):
+    surface = corner(name)
+    assert np.allclose(surface.up, [0.0, -1.0, 0.0])  # the Manhattan frame's, not the tilted camera's
+    kinds = {PLANE_KINDS[k]: row for row, k in enumerate(surface.kinds)}
+    assert set(kinds) == {"floor", "wall"} and len(surface.plane_ids) == 3 == len(set(surface.plane_ids))
+    for expected in (FLOOR, LEFT, BACK):
+        assert np.abs(surface.coefficients - expected).max(axis=1).min() < 0.004
+    corners = surface.vertices_m.astype(float)[surface.triangles]
+    area = 0.5 * np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
+    for row in range(3):
+        assert surface.areas_m2[row] == pytest.approx(area[surface.instances == row].sum(), rel=1e-4)
+    assert np.abs(surface.plane_colors.astype(int) - (200, 100, 50)).max() <= 1
+    texels = surface.texels[surface.instances >= 0]
+    assert np.isfinite(texels).all() and texels.min() >= 0.0 and (texels.max(axis=(0, 1)) < surface.atlas.shape[1::-1]).all()
+
+
+def faults(surface):
+    """(edges with more than two triangles or two that run the same way, vertices inside a border edge, planar triangles that face backwards)."""
+    t, points = surface.triangles, surface.vertices_m.astype(float)
+    begin, end = t.ravel(), t[:, [1, 2, 0]].ravel()
+    _, times = np.unique(np.sort(np.stack([begin, end], axis=1), axis=1), axis=0, return_counts=True)
+    open_ones = np.flatnonzero(opposite_half_edges(t) < 0)
+    a, b = points[begin[open_ones]], points[end[open_ones]]
+    rim = np.unique(np.concatenate([begin[open_ones], end[open_ones]]))
+    inside = 0
+    for p, q, first, second in zip(a, b, begin[open_ones], end[open_ones]):
+        share = (points[rim] - p) @ (q - p) / max(((q - p) ** 2).sum(), 1e-12)
+        off = np.linalg.norm(points[rim] - p - np.clip(share, 0, 1)[:, None] * (q - p), axis=1)
+        inside += ((off < 1e-4) & (share > 1e-3) & (share < 1 - 1e-3) & (rim != first) & (rim != second)).sum()
+    planar = surface.instances >= 0
+    corners = points[t[planar]]
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    back = (normals * surface.coefficients[surface.instances[planar], :3]).sum(axis=1) < -1e-7
+    return int((times > 2).sum()), int(inside), int(back.sum())
+
+
+@pytest.mark.parametrize("name", ["planar_tsdf", "planar_polygon"])
+def test_no_t_junctions_no_edges_of_three_triangles_nothing_turned_over(name):
+    assert faults(corner(name)) == (0, 0, 0)
+
+
+def test_the_counts_of_faults_see_faults():
+    surface = corner("planar_polygon")
+    turned = surface.triangles.copy()
+    turned[:5] = turned[:5, ::-1]
+    assert faults(replace(surface, triangles=turned))[2] >= 4
+    doubled = {name: np.concatenate([getattr(surface, name), getattr(surface, name)[:1]]) for name in ("triangles", "instances", "texels")}
+    assert faults(replace(surface, **doubled))[0] == 3
+
+
+@pytest.mark.parametrize("name", ["planar_tsdf", "planar_polygon"])
+def test_planes_meet_along_the_lines_where_they_intersect(name):
+    """The mesh is closed where floor and walls meet: shared edges, on both planes to 0.1 mm, as long as the seen part of the lines."""
+    surface = corner(name)
+    opposite, t = opposite_half_edges(surface.triangles), surface.triangles
+    h = np.flatnonzero(opposite >= 0)
+    one, other = surface.instances[h // 3], surface.instances[opposite[h] // 3]
+    between = h[(one >= 0) & (other >= 0) & (one < other)]
+    ends = surface.vertices_m.astype(float)[np.stack([t.ravel()[between], t[:, [1, 2, 0]].ravel()[between]], axis=1)]
+    for k in (0, 1):
+        for row in (one[np.isin(h, between)], other[np.isin(h, between)]):
+            plane = surface.coefficients[row]
+            assert np.abs((ends[:, k] * plane[:, :3]).sum(axis=1) + plane[:, 3]).max() < 1e-4
+    length = np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1)
+    pairs = np.sort(np.stack([one[np.isin(h, between)], other[np.isin(h, between)]], axis=1), axis=1)
+    total = {tuple(pair): length[(pairs == pair).all(axis=1)].sum() for pair in np.unique(pairs, axis=0)}
+    assert len(total) == 3 and min(total.values()) > 1.0  # metres
+
+
+def test_the_ball_is_joined_to_the_floor():
+    """planar_tsdf closes the seam: each triangle edge between a plane and the rest has exactly one triangle on either side."""
+    surface = corner("planar_tsdf")
+    opposite = opposite_half_edges(surface.triangles)
+    h = np.flatnonzero((opposite >= 0) & (surface.instances[np.arange(len(opposite)) // 3] < 0))
+    seam = h[surface.instances[opposite[h] // 3] >= 0]
+    assert len(seam) > 20
+    on_ball = np.abs(np.linalg.norm(surface.vertices_m[surface.triangles[surface.instances < 0]].astype(float) - BALL, axis=-1) - RADIUS)
+    assert np.median(on_ball) < 0.003
+
+
+def test_polygons_take_far_fewer_triangles():
+    assert len(corner("planar_polygon").triangles) < 0.02 * len(corner("tsdf").triangles)
+    for plane, begin, end in corner("planar_polygon").loops:
+        ring = corner("planar_polygon").vertices_m[corner("planar_polygon").loop_vertices[begin:end]].astype(float)
+        n = corner("planar_polygon").coefficients[plane]
+        assert len(ring) >= 3 and np.abs(ring @ n[:3] + n[3]).max() < 1e-4
+
+
+@pytest.mark.parametrize("name", SURFACES)
+def test_the_same_frames_give_the_same_bytes(name):
+    again = fold(plugin_class("surface", name)(view_width=160), [seen(k, T) for k, T in enumerate(walk())])
+    assert Encoder().encode(again).SerializeToString() == Encoder().encode(corner(name)).SerializeToString()
+
+
+@pytest.mark.parametrize("name", SURFACES)
+@pytest.mark.parametrize("case", ["nothing", "lost", "no depth", "NaN", "one plane", "edge-on", "a million points"])
+def test_degenerate_input_gives_a_valid_file(name, case, tmp_path):
+    T, large = np.eye(4), Camera(1280, 960, 1000.0, 1000.0, 639.5, 479.5, depth_noise=EXACT_DEPTH)
+    inputs = {
+        "nothing": [],
+        "lost": [seen(0, T, status=LOST)],
+        "no depth": [seen(0, T, (), ball=False)],
+        "NaN": [seen(0, T, depth=np.where(np.arange(160) % 2, np.nan, render(T, (FLOOR, LEFT, BACK))[0]))],
+        "one plane": [seen(k, T, (BACK,), ball=False) for k in range(3)],
+        "edge-on": [seen(k, T, ((0.0, -1.0, 0.0, 1e-4),), ball=False) for k in range(3)],
+        "a million points": [seen(0, T, (BACK,), ball=False, camera=large)],
+    }[case]
+    surface = fold(plugin_class("surface", name)(), inputs)
+    write_ply(tmp_path / "surface.ply", surface.vertices_m, surface.colors, surface.triangles, triangle_planes(surface), "")
+    if case in ("nothing", "lost", "no depth"):
+        assert len(surface.triangles) == len(surface.vertices_m) == len(surface.plane_ids) == 0
+    else:
+        read = trimesh.load(tmp_path / "surface.ply", process=False)
+        assert len(getattr(read, "faces", [])) == len(surface.triangles)
+        assert np.isfinite(surface.vertices_m).all()
+    if case in ("one plane", "a million points") and name != "surfels":
+        assert np.abs(surface.vertices_m[:, 2] - 3.0).max() < 0.002 and len(surface.triangles) >= 2
+        assert case == "one plane" or name == "tsdf" or len(surface.triangles) < 20_000
+
+
+@pytest.mark.parametrize("name", SURFACES)
+def test_what_was_gathered_follows_the_final_keyframes(name):
+    """Poses said 5 cm off, hung on a keyframe that the map puts right in the end."""
+    shift = np.array([0.05, 0.0, 0.0])
+    map = empty_map(0, 0, 32, 32, 32)
+    inputs = []
+    for k, T in enumerate(walk(4)):
+        frame, planes, rotation, pose = seen(k, T)
+        if k == 0:
+            map, _ = add_keyframe(map, pose, CAMERA)
+        wrong = pose_matrix(T[:3, :3], T[:3, 3] + shift)
+        inputs.append((frame, planes, rotation, replace(pose, T_world_camera=wrong, reference=0, T_reference_camera=np.linalg.inv(walk(1)[0]) @ T)))
+    surface = fold(plugin_class("surface", name)(view_width=160), inputs, map)
+    assert np.median(off_truth(surface)) < 0.01
+    unmoved = fold(plugin_class("surface", name)(view_width=160), inputs)
+    assert off_truth(unmoved).max() > 0.04
+
+
+def test_memory_is_bounded_by_the_room_not_by_the_sequence():
+    plugin = plugin_class("surface", "planar_tsdf")(view_width=160)
+    state, kept = plugin.start(), []
+    for k in range(60):
+        state = plugin.add(state, *seen(k, walk()[k % 8]), None)
+        kept.append(len(state.views))
+    assert kept[-1] == kept[40] <= 24 and state.volume.count < 4000
+
+
+@pytest.mark.parametrize(
+    ("name", "options", "said"),
+    [
+        ("tsdf", {"voxel_m": 0.0}, "voxel_m"),
+        ("planar_tsdf", {"rim_m": 0.001}, "rim_m"),
+        ("planar_polygon", {"snap_m": 0.0}, "snap_m"),
+        ("planar_greedy", {"multiplier": 1.0}, "multiplier"),
+        ("surfels", {"side_px": 30}, "side_px"),
+        ("surfels", {"news": 0.0}, "news"),
+    ],
+)
+def test_options_out_of_range_are_refused(name, options, said):
+    with pytest.raises(ValueError, match=said):
+        plugin_class("surface", name)(**options)
