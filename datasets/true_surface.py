@@ -9,7 +9,7 @@ import numpy as np
 from trihedron.datasets.room import BOX, CYLINDER, UP, Face, Room, Solid
 from trihedron.pipeline.types import F64, I32, Bool
 
-AROUND = 96  # facets of a circle; a cylinder of 0.25 m is met within 0.14 mm
+SAGITTA_M = 0.0002  # how far the facets of a circle are inside it
 
 
 @dataclass(frozen=True)
@@ -70,13 +70,14 @@ def _patches(solid: Solid) -> list[tuple[F64, I32]]:
     """One patch for each face of a solid."""
     if solid.kind == BOX:
         return [_fan(_rectangle(face)) for face in solid.faces]
-    turn = np.arange(AROUND) * 2.0 * np.pi / AROUND
+    around = 2 * int(np.ceil(0.5 * np.pi / np.sqrt(2.0 * SAGITTA_M / solid.half[0])))
+    turn = np.arange(around) * 2.0 * np.pi / around
     circle = np.stack([np.cos(turn), np.sin(turn), 0.0 * turn], axis=1)
     if solid.kind == CYLINDER:
         radius, half = solid.half[0], solid.half[2]
         low, high = (solid.centre + circle * radius + UP * level for level in (-half, half))
         return [_strips(np.stack([low, high])), _fan(low[::-1]), _fan(high)]
-    polar = np.linspace(np.pi, 0.0, AROUND // 2 + 1)
+    polar = np.linspace(np.pi, 0.0, around // 2 + 1)
     rings = circle[None] * np.sin(polar)[:, None, None] + UP * np.cos(polar)[:, None, None]
     return [_strips(solid.centre + solid.half[0] * rings)]
 

@@ -53,12 +53,12 @@ def _obj(path: Path) -> tuple[list[list[float]], list[list[int]]]:
 def _ply(data: bytes) -> tuple[F64, I32 | list[list[int]]]:
     head, _, body = data.partition(b"end_header\n")
     words = [line.split() for line in head.decode("ascii").splitlines()]
-    kind = next(w[1] for w in words if w[0] == "format")
+    kind = next((w[1] for w in words if w[:1] == ["format"] and len(w) > 1), "")
     elements: list[tuple[str, int, list[list[str]]]] = []
     for w in words:
-        if w[0] == "element":
+        if w[:1] == ["element"]:
             elements.append((w[1], int(w[2]), []))
-        elif w[0] == "property":
+        elif w[:1] == ["property"]:
             elements[-1][2].append(w[1:])
     if kind == "ascii":
         return _ascii(body.decode("ascii").splitlines(), elements)

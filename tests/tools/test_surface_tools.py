@@ -1,0 +1,188 @@
+"""Surfaces as files that others read, and judged by a known truth."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import trimesh
+
+from trihedron.datasets.synthetic import Synthetic
+from trihedron.pipeline.errors import DataError, UsageError
+from trihedron.pipeline.ply import write_ply
+from trihedron.pipeline.recording import RecordingWriter
+from trihedron.pipeline.types import Surface
+from trihedron.tools import evaluate_surface, export
+from trihedron.tools.evaluate_surface import judged
+from trihedron.tools.export_surface import upright
+from trihedron.tools.mesh_distance import FAR_M, NearestTriangle, sampled
+from trihedron.tools.mesh_files import read_mesh
+from trihedron.tools.surface_truth import Truth
+
+SQUARE = np.array([[0, 0, 0], [2, 0, 0], [2, 1, 0], [0, 1, 0]], float)
+TWO = np.array([[0, 1, 2], [0, 2, 3]], np.int32)
+
+
+def floor_and_rest(up=(0.0, -1.0, 0.0)):
+    """A floor of 2 × 1 m at y = 1 (y down), ahead of the first camera, and a loose triangle."""
+    corners = np.array([[-1, 1, 1], [1, 1, 1], [1, 1, 2], [-1, 1, 2], [0, 0, 3], [1, 0, 3], [0, -1, 3]], np.float32)
+    triangles = np.array([[0, 1, 2], [0, 2, 3], [4, 6, 5]], np.int32)
+    texels = np.array([[[0, 0], [20, 0], [20, 10]], [[0, 0], [20, 10], [0, 10]], [[np.nan] * 2] * 3], np.float32)
+    return Surface(
+        3, 99, corners, np.full((7, 3), (10, 20, 30), np.uint8), triangles, np.array([0, 0, -1], np.int32), np.array([17], np.int32),
+        np.array([[0.0, -1.0, 0.0, 1.0]]), np.array([1], np.uint8), np.array([2.0], np.float32), np.full((1, 3), (200, 0, 0), np.uint8),
+        np.array([[0, 0, 4]], np.int32), np.arange(4, dtype=np.int32), np.full((11, 21, 3), (200, 0, 0), np.uint8), texels, np.array(up),
+    )  # fmt: skip
+
+
+def recorded(folder, surface):
+    writer = RecordingWriter(folder / "run.mcap", {"overrides": "[]"})
+    writer.write("surface", surface)
+    writer.close()
+    return str(folder)
+
+
+@pytest.mark.parametrize(("to", "file", "axis"), [("ply", "surface_upright.ply", 2), ("obj", "surface.obj", 2), ("gltf", "surface.glb", 1)])
+def test_an_independent_reader_finds_the_mesh_upright_and_in_metres(tmp_path, to, file, axis, capsys):
+    assert export.main([recorded(tmp_path, floor_and_rest()), "--to", to]) == 0
+    assert "3 triangles, 1 planes" in capsys.readouterr().out
+    read = trimesh.load(tmp_path / file, process=False)
+    mesh = read.to_geometry() if isinstance(read, trimesh.Scene) else read
+    assert len(mesh.faces) == 3 and mesh.area == pytest.approx(2.5)
+    assert mesh.bounds[0, axis] == pytest.approx(-1.0) and mesh.bounds[1, axis] == pytest.approx(1.0)  # the floor is below
+    level = mesh.triangles[np.ptp(mesh.triangles[:, :, axis], axis=1) < 1e-6]
+    facing = np.cross(level[:, 1] - level[:, 0], level[:, 2] - level[:, 0])[:, axis]
+    assert len(level) == 2 and (facing < 0.0).all() == (np.cross([2, 0, 0], [2, 0, 1])[1] > 0)  # as wound in the run
+
+
+def test_gltf_keeps_each_plane_with_its_facts_and_its_picture(tmp_path):
+    export.main([recorded(tmp_path, floor_and_rest()), "--to", "gltf", "--out", str(tmp_path / "a.glb")])
+    scene = trimesh.load(tmp_path / "a.glb", process=False)
+    assert set(scene.geometry) == {"floor_17", "rest"}
+    floor = scene.geometry["floor_17"]
+    assert floor.visual.material.baseColorTexture.size == (21, 11)
+    assert np.ptp(floor.visual.uv, axis=0) == pytest.approx([20 / 21, 10 / 11]) and floor.visual.uv.min() > 0.0
+    assert (np.asarray(scene.geometry["rest"].visual.vertex_attributes["color"])[:, :3] == (10, 20, 30)).all()
+    data = (tmp_path / "a.glb").read_bytes()
+    document = json.loads(data[20 : 20 + int.from_bytes(data[12:16], "little")])
+    extras = next(node["extras"] for node in document["nodes"] if node["name"] == "floor_17")
+    assert extras["id"] == 17 and extras["kind"] == "floor" and extras["area_m2"] == 2.0 and extras["normal"] == [0.0, 1.0, 0.0]
+
+
+def test_planes_json_holds_identity_boundary_and_equation(tmp_path):
+    export.main([recorded(tmp_path, floor_and_rest()), "--to", "planes.json"])
+    plane = json.loads((tmp_path / "planes.json").read_text())["planes"][0]
+    assert (plane["id"], plane["kind"], plane["area_m2"], plane["color"]) == (17, "floor", 2.0, [200, 0, 0])
+    ring = np.array(plane["boundary"][0])
+    assert np.allclose(ring @ plane["normal"] + plane["d"], 0.0) and len(ring) == 4 and np.allclose(plane["normal"], [0, 0, 1])
+
+
+def test_up_is_the_manhattan_axis_or_said_to_be_a_guess(tmp_path, capsys):
+    for axis in ("y", "z"):
+        for up in (np.array([0.0, -1.0, 0.0]), np.array([0.1, -0.99, 0.05]), np.array([0.0, 0.0, -1.0])):
+            R = upright(up, axis)
+            assert np.allclose(R @ R.T, np.eye(3)) and np.linalg.det(R) == pytest.approx(1.0)
+            assert np.allclose(R @ up / np.linalg.norm(up), np.eye(3)["xyz".index(axis)])
+    export.main([recorded(tmp_path, floor_and_rest((np.nan,) * 3)), "--to", "ply"])
+    assert "first camera's up" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("to", ["ply", "obj", "gltf", "planes.json"])
+def test_an_empty_surface_is_a_valid_file_and_said_to_be_empty(tmp_path, to, capsys):
+    export.main([recorded(tmp_path, Surface.empty(0, 0)), "--to", to, "--out", str(tmp_path / "file")])
+    assert "empty" in capsys.readouterr().out and (tmp_path / "file").stat().st_size > 20
+
+
+def test_mistakes_of_export_are_one_line(tmp_path):
+    with pytest.raises(UsageError, match=r"planes\.json"):
+        export.main([str(tmp_path), "--to", "planesjson"])
+    writer = RecordingWriter(tmp_path / "run.mcap", {"overrides": "[]"})
+    writer.close()
+    with pytest.raises(DataError, match="holds no surface"):
+        export.main([str(tmp_path), "--to", "ply"])
+
+
+def square_truth():
+    nearest, seen = NearestTriangle(SQUARE, TWO), sampled(SQUARE, TWO, 0.02)[0]
+
+    def distance(points):
+        return nearest.query(points)[0], points[:, 0] > 1.0
+
+    return Truth(distance, seen, seen[:, 0] > 1.0, True)
+
+
+def test_figures_of_a_mesh_that_is_a_centimetre_off_and_half_there():
+    half = SQUARE * [0.5, 1.0, 1.0] + [0.0, 0.0, 0.01]
+    found = judged(half, TWO, square_truth())
+    assert found["triangles"] == 2 and found["area_m2"] == pytest.approx(1.0)
+    planar, curved, whole = (found["parts"][part] for part in ("planar", "curved", "all"))
+    for name in ("mean_m", "rmse_m", "p95_m"):
+        assert planar[name] == pytest.approx(0.01, abs=1e-9)
+    assert planar["within_2_cm"] == 1.0 and curved["mean_m"] is None
+    assert curved["within_5_cm"] == pytest.approx(0.05, abs=0.02) and whole["within_2_cm"] == pytest.approx(0.51, abs=0.02)
+
+
+def test_area_counts_not_the_number_of_triangles():
+    many = np.concatenate([SQUARE + np.array([0.0, 0.0, 0.03]), SQUARE * 0.1 + np.array([0.5, 0.5, 0.0])])
+    tiny = TWO + 4
+    found = judged(many, np.concatenate([TWO, *[tiny] * 50]), square_truth())["parts"]["all"]
+    assert found["mean_m"] == pytest.approx(0.03 * 2.0 / 3.0, rel=1e-3)
+
+
+def test_distances_to_triangles_are_exact():
+    rng = np.random.default_rng(0)
+    points = rng.uniform(-0.4, 0.4, (500, 3)) + np.array([1.0, 0.5, 0.0])
+    nearest = np.clip(points, [0, 0, 0], [2, 1, 0])
+    found, triangle = NearestTriangle(SQUARE, TWO).query(points)
+    assert np.allclose(found, np.linalg.norm(points - nearest, axis=1), atol=1e-12) and set(triangle) == {0, 1}
+    assert NearestTriangle(SQUARE, TWO).query(np.array([[9.0, 9.0, 9.0]]))[0][0] == FAR_M
+
+
+def test_an_empty_mesh_is_judged_too():
+    found = judged(np.empty((0, 3)), np.empty((0, 3), np.int32), square_truth())["parts"]["all"]
+    assert found["mean_m"] is None and found["within_5_cm"] == 0.0
+
+
+@pytest.mark.parametrize("suffix", ["ply", "obj"])
+def test_meshes_of_other_programs_are_read(tmp_path, suffix):
+    mesh = trimesh.Trimesh(SQUARE, TWO, process=False)
+    mesh.export(tmp_path / f"m.{suffix}")
+    vertices, triangles = read_mesh(tmp_path / f"m.{suffix}")
+    assert np.allclose(vertices, SQUARE) and np.array_equal(triangles, TWO)
+    (tmp_path / f"bad.{suffix}").write_text("ply\nnonsense")
+    if suffix == "ply":
+        with pytest.raises(DataError, match="is not a mesh"):
+            read_mesh(tmp_path / "bad.ply")
+
+
+def test_truth_that_cannot_be_had_is_one_line(tmp_path):
+    write_ply(tmp_path / "surface.ply", SQUARE.astype(np.float32), np.zeros((4, 3), np.uint8), TWO, np.zeros(2, np.int32), "")
+    (tmp_path / "trajectory.txt").write_text("0.0 0 0 0 0 0 0 1\n")
+    RecordingWriter(tmp_path / "run.mcap", {"overrides": "[]"}).close()
+    with pytest.raises(DataError, match="holds no ground truth"):
+        evaluate_surface.main([str(tmp_path)])
+    with pytest.raises(DataError, match="there is no such file"):
+        evaluate_surface.main([str(tmp_path / "none.ply"), str(tmp_path)])
+
+
+@pytest.mark.parametrize("curved", [False, True])
+def test_the_true_surface_of_the_room_is_what_its_depth_shows(curved):
+    dataset = Synthetic(width=80, height=60, noise=False, texture=False, curved=curved, length=300)
+    surface, frame, T = dataset.surface(), dataset(250), dataset.truth().poses[250]
+    depth, bent = dataset.true_view(250)
+    v, u = np.mgrid[0:60, 0:80].reshape(2, -1)
+    points = frame.camera.back_project(np.stack([u, v], axis=1), depth[v, u]) @ T[:3, :3].T + T[:3, 3]
+    off, triangle = NearestTriangle(surface.vertices_m, surface.triangles).query(points)
+    assert off.max() < 0.005 and (surface.curved[triangle] == bent[v, u]).mean() > 0.99
+    assert (bent.mean() > 0.2) == curved
+    assert np.array_equal(depth.astype(np.float32), frame.depth_m)
+
+
+def test_the_curved_pieces_are_for_the_room():
+    from trihedron.datasets.synthetic import Scene
+
+    with pytest.raises(ValueError, match="curved"):
+        Synthetic(scene=Scene.corridor, curved=True)
+    plain = Synthetic(width=80, height=60, length=5, texture=False)
+    more = replace(plain, curved=True)
+    assert len(more.surface().triangles) > len(plain.surface().triangles) and np.array_equal(plain.truth().poses, more.truth().poses)
