@@ -47,7 +47,8 @@ def test_without_surface_among_the_outputs_none_is_made(tmp_path):
 
 @pytest.mark.slow
 def test_the_figures_of_the_furnished_room(tmp_path):
-    """At most 0.8 cm on average and at least 90 % within 5 cm, curved parts 1.5 cm and 80 %; polygons under 2 % of the dense triangles and no worse."""
+    """At most 0.8 cm on average and at least 90 % within 5 cm, curved parts 1.5 cm and 80 %; polygons under 2 % of the dense triangles and no
+    worse."""
     trihedron("benchmark", "surface", "--frames", "300", "--json", "figures.json", cwd=tmp_path)
     figures = json.loads((tmp_path / "figures.json").read_text())["surfaces"]
     whole, curved = (figures["planar_tsdf"]["parts"][part] for part in ("all", "curved"))
