@@ -33,7 +33,12 @@ DAMAGE = (McapError, ValueError, EOFError, AssertionError, KeyError, struct.erro
 _close_chunk = methodcaller("_Writer__finalize_chunk")  # the library closes a chunk by size only, and a crash would lose a slow topic's last minutes
 TIMING_SCHEMA = {
     "type": "object",
-    "properties": {"index": {"type": "integer"}, "frame_ms": {"type": "number"}, "stage_ms": {"type": "object"}},
+    "properties": {
+        "index": {"type": "integer"},
+        "frame_ms": {"type": "number"},
+        "stage_ms": {"type": "object"},
+        "memory_mb": {"type": "number", "description": "resident, of the whole process"},
+    },
 }
 
 
@@ -74,13 +79,14 @@ class RecordingWriter:
             self._channels[channel] = self._writer.register_channel(channel, "protobuf", schema_id)
         self._add(channel, message.SerializeToString(), stamp_ns)
 
-    def write_timing(self, index: int, stamp_ns: int, frame_ms: float, stage_ms: Mapping[str, float]) -> None:
-        """Add a frame's times (JSON, so that any viewer plots them)."""
+    def write_timing(self, index: int, stamp_ns: int, frame_ms: float, stage_ms: Mapping[str, float], memory_mb: float) -> None:
+        """Add a frame's times, and the memory the process holds after it (JSON, so that any viewer plots them)."""
         if TIMING_TOPIC not in self._channels:
             schema_id = self._writer.register_schema("trihedron.Timing", "jsonschema", json.dumps(TIMING_SCHEMA).encode())
             self._channels[TIMING_TOPIC] = self._writer.register_channel(TIMING_TOPIC, "json", schema_id)
-        times = {"index": index, "frame_ms": round(frame_ms, 3), "stage_ms": {name: round(ms, 3) for name, ms in stage_ms.items()}}
-        self._add(TIMING_TOPIC, json.dumps(times).encode(), stamp_ns)
+        stages = {name: round(ms, 3) for name, ms in stage_ms.items()}
+        measured = {"index": index, "frame_ms": round(frame_ms, 3), "stage_ms": stages, "memory_mb": round(memory_mb, 2)}
+        self._add(TIMING_TOPIC, json.dumps(measured).encode(), stamp_ns)
 
     def _add(self, channel: str, data: bytes, stamp_ns: int) -> None:
         try:

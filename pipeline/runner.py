@@ -22,7 +22,7 @@ from trihedron.pipeline.recording import Recording, RecordingWriter, TopicReader
 from trihedron.pipeline.scheduler import Node, NodeFailure, Scheduler, single_threaded_libraries
 from trihedron.pipeline.slots import frame_range, output_of
 from trihedron.pipeline.state import Keeper, Memory, reaches, recorded_memory
-from trihedron.pipeline.timing import Timing
+from trihedron.pipeline.timing import Timing, resident_mb
 from trihedron.pipeline.types import Frame, FrameReference, Map, Pose, Value
 
 log = logging.getLogger("trihedron")
@@ -246,7 +246,7 @@ class Runner:
                     writer.write(name, value)
                 for channel, message in view.messages(value):
                     writer.write_message(channel, message, stamp)
-        writer.write_timing(self.indices[position], stamp, self._latency_ms[position], self._calls_ms[position])
+        writer.write_timing(self.indices[position], stamp, self._latency_ms[position], self._calls_ms[position], resident_mb())
 
     def _copy_reference(self, writer: RecordingWriter, index: int) -> None:
         assert self._references is not None

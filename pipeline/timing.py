@@ -1,8 +1,10 @@
-"""What the runner measures: how long each call took, and each frame from hand-over to pose."""
+"""What the runner measures: how long each call took, and each frame from hand-over to pose; the memory that is held."""
 
 from __future__ import annotations
 
+import os
 from collections import defaultdict
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -47,6 +49,12 @@ class Timing:
             "frame_ms": {"p50": p50, "p95": p95, "max": largest},
             "stages": stages,
         }
+
+
+def resident_mb() -> float:
+    """Memory (10⁶ bytes) this process holds now; 0 where the system does not say (Linux does)."""
+    statistics = Path("/proc/self/statm")
+    return int(statistics.read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE") / 1e6 if statistics.exists() else 0.0
 
 
 def _percentiles(values: list[float]) -> tuple[float, float, float]:

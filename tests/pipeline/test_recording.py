@@ -32,7 +32,7 @@ def write(path, indices, **metadata):
     writer = RecordingWriter(path, {"overrides": '["threads=1"]', **metadata})
     for i in indices:
         writer.write("keypoints", keypoints(i))
-        writer.write_timing(i, 1000 * i, 1.5, {"keypoints": 1.25})
+        writer.write_timing(i, 1000 * i, 1.5, {"keypoints": 1.25}, 250.0)
     writer.close()
     return path
 
@@ -84,7 +84,7 @@ def test_topics_and_values(tmp_path):
     frames = FrameReader(recording, "keypoints")
     assert [frames.at(1000 * i).index for i in (5, 0, 2)] == [5, 0, 2] and frames.at(4000) is None
     timing = [json.loads(m.data) for m in recording.messages("/timing")]
-    assert timing[1] == {"index": 1, "frame_ms": 1.5, "stage_ms": {"keypoints": 1.25}}
+    assert timing[1] == {"index": 1, "frame_ms": 1.5, "stage_ms": {"keypoints": 1.25}, "memory_mb": 250.0}
 
 
 def test_wrong_files_say_so_in_one_line(tmp_path):

@@ -16,7 +16,7 @@ def recording(tmp_path):
     writer = RecordingWriter(tmp_path / "run.mcap", {"version": "1"})
     for index in range(3):
         writer.write("frames", FrameReference(index, 1_000_000_000 + index * 500_000_000, CAMERA))
-        writer.write_timing(index, 1_000_000_000 + index * 500_000_000, 10.0, {"pose": 1.0})
+        writer.write_timing(index, 1_000_000_000 + index * 500_000_000, 10.0, {"pose": 1.0}, 250.0)
     writer.close()
     return tmp_path / "run.mcap"
 
