@@ -9,6 +9,7 @@ import numpy as np
 from trihedron.pipeline.registry import register
 from trihedron.pipeline.types import DEGRADED, F64, I32, LOST, OK, Frame, Keypoints, Map, Planes, Pose, Rotation, Segments
 from trihedron.plugins.numerics.maps.decoupled import reference_of
+from trihedron.plugins.numerics.maps.landmarks import empty_map
 from trihedron.plugins.numerics.maps.local_window import keyframes_of, observed_by
 from trihedron.plugins.numerics.maps.submaps import submap_of
 from trihedron.plugins.numerics.places.layout_poses import layout_poses
@@ -66,13 +67,14 @@ class Features:
         rng: np.random.Generator,
     ) -> Pose | None:
         """The pose; for a lost camera that is not recognised the lost one, and else None."""
+        view = View(frame, keypoints, segments, planes)
         if map is None or previous_pose is None:
+            self._in_nothing(view, rng)
             return None
         lost, submap = previous_pose.status == LOST, submap_of(previous_pose, map)
         submaps = self._sought(map, submap, lost, frame.index)
         if not len(submaps):
             return None
-        view = View(frame, keypoints, segments, planes)
         among = self._candidates(view, map, submaps[frame.index % len(submaps)])
         found = self._checked(self._by_points(view, map, among, rng), view, map, among)
         if not any(self._good(one) for one in found):  # points alone say more than any layout
@@ -81,6 +83,13 @@ class Features:
         if best is None:
             return replace(previous_pose, index=frame.index, stamp_ns=frame.stamp_ns, reason="nothing was recognised") if lost else None
         return self._said(best, frame, map, int(map.keyframes.rows("submap", among[:1])[0]), lost)
+
+    def _in_nothing(self, view: View, rng: np.random.Generator) -> None:
+        """Look for the first frame in an empty map: the kernels are compiled now, before the clock starts, and not when the camera is lost."""
+        bits, line_bits, samples = view.keypoints.descriptors.shape[1], view.segments.descriptors.shape[1], view.planes.samples_m.shape[1]
+        map, none = empty_map(view.frame.index, view.frame.stamp_ns, bits, line_bits, samples), np.empty(0, np.int32)
+        self._by_points(view, map, none, rng)
+        layout_poses(map, none, none, view.planes, view.segments, np.eye(3), np.eye(3))
 
     def _sought(self, map: Map, submap: int, lost: bool, index: int) -> I32:
         """Sub-maps to look in: all for a lost camera; now and then the older ones for one tracked in a sub-map that is not tied to the first."""
@@ -101,12 +110,10 @@ class Features:
             return np.empty((0, 4, 4))
         alike = lookalikes(seen.descriptors[rows], map.points.rows("descriptor", ids), self.max_bits, self.ratio)
         rows, ids = rows[alike >= 0], ids[alike[alike >= 0]]
-        if len(rows) < 3:
-            return np.empty((0, 4, 4))
         places = seen.points_m[rows].astype(np.float64)
         across = seen.sigma_px[rows] * self.angle_px * places[:, 2]
         sigma = np.sqrt(self.floor_m**2 + across**2 + seen.sigma_m[rows].astype(np.float64) ** 2)
-        draws = rng.integers(0, len(rows), (self.draws, 3)).astype(np.int32)
+        draws = rng.integers(0, max(len(rows), 1), (self.draws, 3)).astype(np.int32)
         return rigid_hypotheses(places, map.points.rows("position_m", ids), sigma, draws, self.by_points)
 
     def _by_layout(self, view: View, map: Map, among: I32, rotation: Rotation) -> F64:

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from trihedron.pipeline.types import F32, F64, I32, U8
+from trihedron.plugins.numerics.algebra.constant_arrays import constant
 
 U64 = NDArray[np.uint64]
 METRICS = ("hamming", "l2")
@@ -41,9 +42,9 @@ def match_near(
     mode = _mode(query_descriptors, train_descriptors, max_distance, metric)
     query, train = words_of(query_descriptors), words_of(train_descriptors)
     return _match_near(
-        np.ascontiguousarray(query_px, np.float32), query[0], query[1], np.ascontiguousarray(query_octaves, np.uint8),
-        np.ascontiguousarray(train_px, np.float32), train[0], train[1], np.ascontiguousarray(train_octaves, np.uint8),
-        np.ascontiguousarray(radius_px, np.float32), int(max_octave_step), mode, float(max_distance), float(ratio),
+        constant(query_px, np.float32), query[0], query[1], constant(query_octaves, np.uint8),
+        constant(train_px, np.float32), train[0], train[1], constant(train_octaves, np.uint8),
+        constant(radius_px, np.float32), int(max_octave_step), mode, float(max_distance), float(ratio),
     )  # fmt: skip
 
 
@@ -66,8 +67,8 @@ def match_lines(
     (b == 0 or `max_distance` < 0) offset, angle and overlap decide. Raises ValueError for unequal descriptor lengths."""
     mode = _mode(query_descriptors, train_descriptors, max_distance, "hamming")
     return _match_lines(
-        np.ascontiguousarray(query_endpoints_px, np.float32), words_of(query_descriptors)[0],
-        np.ascontiguousarray(train_endpoints_px, np.float32), words_of(train_descriptors)[0],
+        constant(query_endpoints_px, np.float32), words_of(query_descriptors)[0],
+        constant(train_endpoints_px, np.float32), words_of(train_descriptors)[0],
         float(np.sin(np.radians(max_angle_deg))), float(max_offset_px), float(min_overlap), mode, float(max_distance), float(ratio),
     )  # fmt: skip
 
@@ -83,10 +84,10 @@ def _mode(query: U8, train: U8, max_distance: int, metric: str) -> int:
 
 
 def words_of(descriptors: U8) -> tuple[U64, U8]:
-    """(n, b) bytes as (n, ⌈b/8⌉) words, zero padded, and the contiguous bytes."""
-    rows: Any = np.ascontiguousarray(descriptors, np.uint8)
+    """(n, b) bytes as (n, ⌈b/8⌉) words, zero padded, and the bytes, as constants."""
+    rows: Any = constant(descriptors, np.uint8)
     missing = -rows.shape[1] % 8
-    padded = np.pad(rows, ((0, 0), (0, missing))) if missing else rows
+    padded = constant(np.pad(rows, ((0, 0), (0, missing))), np.uint8) if missing else rows
     return padded.view(np.uint64).reshape(len(rows), padded.shape[1] // 8), rows
 
 

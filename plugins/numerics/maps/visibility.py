@@ -8,6 +8,7 @@ import numba
 import numpy as np
 
 from trihedron.pipeline.types import F32, F64, I32, U8, Bool, Camera, Table
+from trihedron.plugins.numerics.algebra.constant_arrays import constant
 
 NEAR_M = 0.1
 MAX_SCALE_CHANGE = 2.0  # of the distance; beyond, a point does not look the same
@@ -28,7 +29,7 @@ def visible_points(points: Table, ids: I32, T_world_camera: F64, camera: Camera,
     world, directions, distances, seen_at = points.gathered(ids, "position_m", "direction", "distance_m", "octave")
     intrinsics = (float(camera.fx), float(camera.fy), float(camera.cx), float(camera.cy), camera.width, camera.height)
     cosine, log_scale = float(np.cos(np.radians(view_deg))), float(np.log(octave_scale))
-    rows, pixels, depth, octaves = _seen(world, directions, distances, seen_at, T_world_camera, intrinsics, cosine, log_scale)
+    rows, pixels, depth, octaves = _seen(world, directions, distances, seen_at, constant(T_world_camera, np.float64), intrinsics, cosine, log_scale)
     return VisiblePoints(ids[rows], pixels, depth, octaves)
 
 

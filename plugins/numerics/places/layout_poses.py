@@ -84,8 +84,6 @@ def _places(seen: Layout, known: Layout) -> tuple[F64, F64]:
     """(n, 3) coordinates of the camera along the axes and (n,) the share of the frame explained there."""
     candidates = [_peaks(*_votes(seen, known, axis)) for axis in range(3)]
     grid = np.stack(np.meshgrid(*candidates, indexing="ij"), axis=-1).reshape(-1, 3)
-    if not len(grid):
-        return np.empty((0, 3)), np.empty(0)
     score = _explained(
         grid, seen.sides, seen.places_m, seen.areas / max(float(seen.areas.sum()), 1.0), seen.axes, seen.spans_m, seen.across_m,
         seen.lengths / max(float(seen.lengths.sum()), 1.0), known.sides, known.places_m, known.axes, known.spans_m, known.across_m,

@@ -6,6 +6,7 @@ import numba
 import numpy as np
 
 from trihedron.pipeline.types import F32, F64, I32
+from trihedron.plugins.numerics.algebra.constant_arrays import constant
 
 
 def associate_planes(
@@ -25,8 +26,8 @@ def associate_planes(
     planes that touch anywhere. Among those the one with the smallest `distance / max_distance_m + 1 - overlap` wins, overlap being the share of
     a's samples near samples of b. A row of a appears once; a row of b too, unless `many_to_one` (a wall seen in two pieces)."""
     return _associate(
-        np.ascontiguousarray(coefficients_a, np.float64), np.ascontiguousarray(samples_a, np.float32),
-        np.ascontiguousarray(coefficients_b, np.float64), np.ascontiguousarray(samples_b, np.float32),
+        constant(coefficients_a, np.float64), constant(samples_a, np.float32),
+        constant(coefficients_b, np.float64), constant(samples_b, np.float32),
         float(np.cos(np.radians(max_angle_deg))), float(max_distance_m), many_to_one,
     )  # fmt: skip
 

@@ -1,0 +1,241 @@
+"""Benchmark of the map: drift around a loop, recovery of a covered camera, growth on a long walk.
+
+Every run is a process of its own. loop: once round the built-in corridor with each loop closer; drift is the error of the motion from the first to
+the last pose, in % of the path. cover: the camera is covered for one second in the middle of a sequence; frames that stay lost are counted
+from the first one seen again, and the jump is the median error of the motions from the second before to the second after, beside that of the same
+frames never covered. growth: a walk through ten rooms; time and memory at frames 200 and 2000 by the straight line through the frames between,
+so that one room's furniture does not count, and what the map holds for each square metre of floor that it has landmarks over.
+
+Example: trihedron benchmark map --sequences tum:FOLDER,icl_nuim:FOLDER --json map.json
+"""
+
+from __future__ import annotations
+
+import json
+import tempfile
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from trihedron.datasets.trajectories import attached_truth, read_trajectory
+from trihedron.pipeline.errors import UsageError, did_you_mean
+from trihedron.pipeline.metrics import associate, relative_errors
+from trihedron.pipeline.recording import TIMING_TOPIC, Recording
+from trihedron.pipeline.types import F64, LOST, Map, Pose, Table, Trajectory
+from trihedron.tools.arguments import Parser, table
+
+LOOPS = ("none", "planes", "appearance")
+ROOMS = {"built-in room": {}, "built-in room, bare": {"texture": "false"}}
+ROOM_FRAMES = "0:150"
+SPAN = (200, 2000)  # frames of the long walk that are compared
+WALK = "0:2100"
+CELL_M = 0.5  # side of the squares in which floor is counted
+Rows = list[dict[str, Any]]
+Sequences = dict[str, tuple[str, dict[str, str]]]  # name -> data set's plugin and its options
+
+
+def main(argv: list[str]) -> int:
+    """Run the parts and print their tables; returns the exit code. Raises UsageError for an unknown part, TrihedronError when a run fails."""
+    from trihedron.tools.benchmark import machine
+
+    parser = Parser("benchmark map", __name__)
+    parser.add_argument("overrides", nargs="*", help="of every run, as for trihedron run")
+    parser.add_argument("--parts", default=",".join(PARTS), metavar="A,B", help=f"some of them (default: {','.join(PARTS)})")
+    parser.add_argument("--sequences", default="", metavar="KIND:FOLDER,...", help="to cover besides the built-in rooms, by plugin")
+    parser.add_argument("--json", type=Path, metavar="FILE", help="write the figures too")
+    options = parser.parse_args(argv)
+    figures: dict[str, Any] = {"machine": machine()}
+    parts = options.parts.split(",")
+    for part in parts:
+        if part not in PARTS:
+            raise UsageError("benchmark map", f"there is no part '{part}'", did_you_mean(part, PARTS))
+    with tempfile.TemporaryDirectory() as folder:
+        for part in parts:
+            measure, report = PARTS[part]
+            figures[part] = measure(Path(folder), _sequences(options.sequences), options.overrides)
+            print(report(figures[part]) + "\n", flush=True)
+    if options.json:
+        options.json.write_text(json.dumps(figures, indent=2) + "\n")
+    return 0
+
+
+def _sequences(text: str) -> Sequences:
+    """Those of `KIND:FOLDER,...`, the built-in rooms first."""
+    found: Sequences = {name: ("synthetic", options) for name, options in ROOMS.items()}
+    for word in filter(None, text.split(",")):
+        kind, colon, path = word.partition(":")
+        if not colon:
+            raise UsageError("benchmark map", f"--sequences {word} has no data set", "give it as KIND:FOLDER, for example tum:FOLDER")
+        found[Path(path).name] = kind, {"path": str(Path(path).resolve())}
+    return found
+
+
+def _run(out: Path, words: Sequence[str]) -> tuple[dict[str, Any], Trajectory, Trajectory]:
+    """Figures of one run, its final trajectory, and the truth."""
+    from trihedron.tools.benchmark import measure
+
+    figures = measure([*words, f"out={out}"], out)
+    truth = attached_truth(Recording(out / "run.mcap").attachments, str(out))
+    assert truth is not None  # every data set here has it
+    return figures, read_trajectory(out / "trajectory.txt"), truth
+
+
+# --- drift around a loop ------------------------------------------------------------------------------------------------------------------
+
+
+def measure_loop(folder: Path, _: Sequences, overrides: Sequence[str]) -> Rows:
+    """One row for each loop closer."""
+    rows = []
+    for loop in LOOPS:
+        words = ["dataset=synthetic", "dataset.scene=corridor", *overrides, f"loop={loop}"]
+        figures, estimate, truth = _run(folder / loop, words)
+        path_m, drift_m = end_drift(estimate, truth)
+        final = figures["metrics"]["final"]
+        rows.append({"loop": loop, "frames": figures["frames"], "path_m": path_m, "drift_m": drift_m})
+        rows[-1] |= {"drift_percent": 100.0 * drift_m / path_m, "ate_m": final["ate_rmse_m"], "tracked_share": final["tracked_share"]}
+    return rows
+
+
+def end_drift(estimate: Trajectory, truth: Trajectory) -> tuple[float, float]:
+    """Length of the true path and error of the motion from its first to its last pose, metres. The whole path must be tracked."""
+    pairs = associate(estimate.stamps_ns, truth.stamps_ns)
+    poses, true = estimate.poses[pairs[:, 0]], truth.poses[pairs[:, 1]]
+    ends = np.array([0]), np.array([len(pairs) - 1])
+    return float(np.linalg.norm(np.diff(truth.poses[:, :3, 3], axis=0), axis=1).sum()), float(relative_errors(poses, true, *ends)[0][0])
+
+
+def report_loop(rows: Rows) -> str:
+    """The table of the corridor."""
+    numbers = [(row["tracked_share"], 1e3 * row["drift_m"], row["drift_percent"], row["ate_m"]) for row in rows]
+    cells = [(row["loop"], row["frames"], *"{:.3f} {:.1f} {:.4f} {:.4f}".format(*some).split()) for row, some in zip(rows, numbers)]
+    head = ("loop", "frames", "tracked", "drift mm", "% of the path", "ATE m")
+    return f"Once round a corridor, {rows[0]['path_m']:.1f} m\n" + table([head, *cells], "lrrrrr")
+
+
+# --- recovery of a covered camera ---------------------------------------------------------------------------------------------------------
+
+
+def measure_cover(folder: Path, sequences: Sequences, overrides: Sequence[str]) -> Rows:
+    """One row for each sequence."""
+    rows = []
+    for number, (name, (kind, options)) in enumerate(sequences.items()):
+        words = ["dataset=faults", f"dataset.of={kind}", *(f"+dataset.options.{key}={value}" for key, value in options.items()), *overrides]
+        words += [f"dataset.frames={ROOM_FRAMES}"] if kind == "synthetic" else []
+        figures, estimate, truth = _run(folder / f"{number}_seen", words)
+        poses = _poses(folder / f"{number}_seen")
+        second = figures["metrics"]["final"]["rpe_second_frames"]
+        first = poses[(len(poses) - second) // 2].index
+        row = {"sequence": name, "frames": len(poses), "first": first, "second": second}
+        row |= {"ate_m": figures["metrics"]["final"]["ate_rmse_m"], **jump(poses, estimate, truth, first, second)}
+        figures, estimate, truth = _run(folder / f"{number}_covered", [*words, f"dataset.cover={first}:{first + second}"])
+        poses = _poses(folder / f"{number}_covered")
+        after = {"ate_m": figures["metrics"]["final"]["ate_rmse_m"], **jump(poses, estimate, truth, first, second)}
+        rows.append(row | recovery(poses, first, first + second) | {f"{key}_covered": value for key, value in after.items()})
+    return rows
+
+
+def _poses(out: Path) -> list[Pose]:
+    return [pose for pose in Recording(out / "run.mcap").values("pose") if isinstance(pose, Pose)]
+
+
+def recovery(poses: Sequence[Pose], first: int, stop: int) -> dict[str, int]:
+    """How many of the frames first..stop, covered, are said to be lost, how many after them until one is tracked, and how many elsewhere."""
+    lost = {pose.index for pose in poses if pose.status == LOST}
+    back = min((pose.index for pose in poses if pose.index >= stop and pose.index not in lost), default=poses[-1].index + 1)
+    return {
+        "lost_covered": sum(first <= index < stop for index in lost),
+        "lost_after": back - stop,
+        "lost_elsewhere": sum(index < first or index > back for index in lost),
+    }
+
+
+def jump(poses: Sequence[Pose], estimate: Trajectory, truth: Trajectory, first: int, second: int) -> dict[str, float]:
+    """Median error of the motions from the frames of the second before `first` to those two seconds later, as far as both are tracked."""
+    pairs = associate(estimate.stamps_ns, truth.stamps_ns)
+    rows = {int(estimate.stamps_ns[row]): k for k, row in enumerate(pairs[:, 0])}
+    stamps = {pose.index: pose.stamp_ns for pose in poses}
+    ends = [[rows.get(stamps.get(index, -1), -1) for index in (k, k + 2 * second)] for k in range(first - second, first)]
+    a, b = np.array([pair for pair in ends if min(pair) >= 0], np.int64).reshape(-1, 2).T
+    if not len(a):
+        return {"jump_m": float("inf"), "jump_deg": float("inf")}
+    error_m, error_deg = relative_errors(estimate.poses[pairs[:, 0]], truth.poses[pairs[:, 1]], a, b)
+    return {"jump_m": float(np.median(error_m)), "jump_deg": float(np.median(error_deg))}
+
+
+def report_cover(rows: Rows) -> str:
+    """The table of the covers."""
+    head = ("sequence", "frames", "covered", "lost there", "after", "elsewhere", "jump mm", "(seen)", "jump °", "(seen)", "ATE m", "(seen)")
+    cells = []
+    for row in rows:
+        counts = row["lost_covered"], row["lost_after"], row["lost_elsewhere"]
+        errors = [row[key + end] for key in ("jump_m", "jump_deg", "ate_m") for end in ("_covered", "")]
+        texts = "{:.1f} {:.1f} {:.3f} {:.3f} {:.4f} {:.4f}".format(1e3 * errors[0], 1e3 * errors[1], *errors[2:]).split()
+        cells.append((row["sequence"], row["frames"], f"{row['first']}:{row['first'] + row['second']}", *counts, *texts))
+    return "Covered for a second: frames that are lost, and what is left of it\n" + table([head, *cells], "l" + "r" * 11)
+
+
+# --- growth on a long walk ----------------------------------------------------------------------------------------------------------------
+
+
+def measure_growth(folder: Path, _: Sequences, overrides: Sequence[str]) -> Rows:
+    """One row for each quantity, with its value at both ends of SPAN; the map's with the floor it covers."""
+    out = folder / "growth"
+    truth = _run(out, ["dataset=synthetic", "dataset.scene=rooms", f"dataset.frames={WALK}", *overrides])[2]
+    timing = [json.loads(message.data) for message in Recording(out / "run.mcap").messages(TIMING_TOPIC)]
+    frames = np.array([row["index"] for row in timing])
+    stages = [{name: ms for name, ms in row["stage_ms"].items() if name != "dataset"} for row in timing]
+    versions = [map for map in Recording(out / "run.mcap").values("map") if isinstance(map, Map)]
+    newest = np.searchsorted([map.index for map in versions], frames, side="right") - 1
+    memory, map_mb = np.array([row["memory_mb"] for row in timing]), np.array([bytes_of(map) / 1e6 for map in versions])[newest]
+    quantities = {
+        "frame, hand-over to pose, ms": np.array([row["frame_ms"] for row in timing]),
+        "all stages, ms": np.array([sum(row.values()) for row in stages]),
+        "memory, MB": memory,
+        "map, MB": map_mb,
+        "memory without the map, MB": memory - map_mb,
+    }
+    rows: Rows = [{"quantity": name, "values": line(frames, values)} for name, values in quantities.items()]
+    floor = [floor_m2(versions[newest[np.searchsorted(frames, frame)]], truth.poses[0, :3, :3]) for frame in SPAN]
+    return [*rows, {"quantity": "floor with landmarks, m²", "values": floor}]
+
+
+def line(frames: NDArray[np.int64], values: F64) -> list[float]:
+    """Values at both ends of SPAN by the straight line of Theil and Sen through those between."""
+    from scipy.stats import theilslopes
+
+    inside = (frames >= SPAN[0]) & (frames <= SPAN[1])
+    slope, offset, *_ = theilslopes(values[inside], frames[inside])
+    return [float(offset + slope * frame) for frame in SPAN]
+
+
+def bytes_of(map: Map) -> int:
+    """What the tables of a map hold."""
+    tables = [table for table in vars(map).values() if isinstance(table, Table)]
+    return sum(chunk.nbytes for one in tables for chunks in one.chunks.values() for chunk in chunks)
+
+
+def floor_m2(map: Map, R_room_world: F64) -> float:
+    """Area of the squares of floor, CELL_M wide, that living points or planes of the map lie over; z of the room is up."""
+    samples = map.planes.column("samples_m")[map.planes.column("alive")].reshape(-1, 3)
+    places = np.concatenate([map.points.column("position_m")[map.points.column("alive")], samples[np.isfinite(samples[:, 0])]])
+    return CELL_M**2 * len(np.unique(np.floor(places @ R_room_world.T[:, :2] / CELL_M), axis=0))
+
+
+def report_growth(rows: Rows) -> str:
+    """The table of the long walk."""
+    values = {row["quantity"]: row["values"] for row in rows}
+    cells = [(name, f"{a:.1f}", f"{b:.1f}", f"{100.0 * (b / a - 1.0):+.1f} %") for name, (a, b) in values.items()]
+    new = np.diff(values["floor with landmarks, m²"])[0]
+    memory, own = np.diff(values["memory, MB"])[0], np.diff(values["map, MB"])[0]
+    last = f"Per new square metre of floor: {memory / new:.2f} MB of memory, {own / new:.2f} MB of it the map"
+    return "A walk through ten rooms\n" + table([("", *(f"frame {frame}" for frame in SPAN), "growth"), *cells], "lrrr") + "\n" + last
+
+
+PARTS: dict[str, tuple[Callable[[Path, Sequences, Sequence[str]], Rows], Callable[[Rows], str]]] = {
+    "loop": (measure_loop, report_loop),
+    "cover": (measure_cover, report_cover),
+    "growth": (measure_growth, report_growth),
+}
