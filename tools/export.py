@@ -31,9 +31,9 @@ class Format:
 
 def formats() -> dict[str, Format]:
     """Every format by name."""
-    from trihedron.tools import export_surface
+    from trihedron.tools import export_picture, export_surface
 
-    return {format.name: format for format in export_surface.FORMATS}
+    return {format.name: format for module in (export_surface, export_picture) for format in module.FORMATS}
 
 
 def main(argv: list[str]) -> int:
