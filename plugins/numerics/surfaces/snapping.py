@@ -50,7 +50,9 @@ def _unfold(points: F64, triangles: I32, normals: F64, single: Bool) -> int:
     folded = np.zeros(len(points), np.bool_)
     for t in range(len(triangles)):
         a, b, c = triangles[t, 0], triangles[t, 1], triangles[t, 2]
-        if np.dot(np.cross(points[b] - points[a], points[c] - points[a]), normals[t]) < 0.0:
+        x1, y1, z1 = points[b, 0] - points[a, 0], points[b, 1] - points[a, 1], points[b, 2] - points[a, 2]
+        x2, y2, z2 = points[c, 0] - points[a, 0], points[c, 1] - points[a, 1], points[c, 2] - points[a, 2]
+        if (y1 * z2 - z1 * y2) * normals[t, 0] + (z1 * x2 - x1 * z2) * normals[t, 1] + (x1 * y2 - y1 * x2) * normals[t, 2] < 0.0:
             for k in range(3):
                 folded[triangles[t, k]] = single[triangles[t, k]]
     total = np.zeros((len(points), 4))

@@ -5,10 +5,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 
 from trihedron.pipeline.types import F32, F64, I32, U8, Bool
-from trihedron.plugins.numerics.surfaces.painting import painted
+from trihedron.plugins.numerics.surfaces.painting import UNSEEN, painted
 from trihedron.plugins.numerics.surfaces.plane_axes import plane_axes
 from trihedron.plugins.numerics.surfaces.views import View
 
@@ -43,13 +44,24 @@ def atlas_of(vertices: F64, triangles: I32, labels: I32, planes: F64, views: Seq
         (w, h), (x, y) = sizes[p], places[p]
         if w == 0:
             continue
-        grid = np.stack(np.meshgrid(np.arange(w), np.arange(h)), axis=-1).reshape(-1, 2) + corners[p]
+        covered = _covered(texels[labels == p], w, h)
+        grid = np.stack(np.nonzero(covered)[::-1], axis=1) + corners[p]
         points = grid * texel_m @ basis.T - plane[3] * plane[:3]
         found, seen = painted(points, np.broadcast_to(plane[:3], points.shape), views)
-        image[y : y + h, x : x + w] = _spread(found.reshape(h, w, 3), seen.reshape(h, w))
-        colors[p] = np.rint(found[seen].mean(axis=0)) if seen.any() else found[0]
+        picture, known = np.full((h, w, 3), UNSEEN, np.uint8), np.zeros((h, w), np.bool_)
+        picture[covered], known[covered] = found, seen
+        image[y : y + h, x : x + w] = _spread(picture, known)
+        colors[p] = np.rint(found[seen].mean(axis=0)) if seen.any() else UNSEEN
         texels[labels == p] += np.array([x, y], np.float32)
     return Atlas(image, texels, colors)
+
+
+def _covered(triangles: F32, w: int, h: int) -> Bool:
+    """(h, w) the texels under triangles (t, 3, 2), and those beside them."""
+    mask = np.zeros((h, w), np.uint8)
+    for corners in np.rint(triangles).astype(np.int32):
+        cv2.fillConvexPoly(mask, corners, 1)
+    return np.asarray(cv2.dilate(mask, np.ones((3, 3), np.uint8)) > 0, np.bool_)
 
 
 def _spread(picture: U8, seen: Bool) -> U8:
