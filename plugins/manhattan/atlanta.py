@@ -11,7 +11,7 @@ from trihedron.pipeline.registry import register
 from trihedron.pipeline.types import F64, I32, ManhattanFrame, Normals, Planes, Segments
 from trihedron.plugins.numerics.axes.atlanta_fit import fit_shared_vertical, shared_covariance, shared_vertical
 from trihedron.plugins.numerics.axes.atlanta_modes import NONE, AtlantaFinder, AtlantaModes
-from trihedron.plugins.numerics.axes.axis_fit import NOTHING_KNOWN, AxisFit, gather_directions
+from trihedron.plugins.numerics.axes.axis_fit import NOTHING_KNOWN, AxisFit, gather_directions, variance_scale
 from trihedron.plugins.numerics.axes.frame_identities import missing, remembered
 from trihedron.plugins.numerics.axes.lost_frames import lost_frames
 from trihedron.plugins.numerics.axes.manhattan_modes import ModeFinder
@@ -111,7 +111,7 @@ class Atlanta:
         vectors, information, columns = self._fit.measured(R, modes.axes, normals, segments, planes)
         columns[(columns >= 0) & ~modes.seen[columns]] = -1
         rotations, H, chi2, components = fit_shared_vertical(vectors, information, columns, modes.rotations, 1e-6, self.gate, 5)
-        scale = max(chi2 / max(components - 2.0 - count, 1.0), 1.0)
+        scale = variance_scale(chi2, components - 2.0 - count)
         return rotations, shared_covariance(H / scale, rotations, NOTHING_KNOWN) + np.eye(3) * np.radians(self.floor_deg) ** 2
 
     @cached_property

@@ -8,7 +8,7 @@ import numpy as np
 
 from trihedron.pipeline.registry import register
 from trihedron.pipeline.types import F64, I32, ManhattanFrame, Planes
-from trihedron.plugins.numerics.axes.axis_fit import NOTHING_KNOWN
+from trihedron.plugins.numerics.axes.axis_fit import NOTHING_KNOWN, variance_scale
 from trihedron.plugins.numerics.axes.cube_symmetry import nearest_equivalent
 from trihedron.plugins.numerics.axes.minimal_frames import frames_through, same_axes, score_frames
 from trihedron.plugins.numerics.axes.sphere_modes import assign_axes
@@ -63,7 +63,7 @@ class PlaneSvd:
             axes, weights = np.where(alone, assign_axes(normals, start, np.pi), -1).astype(np.int32), 1.0 / variance
             R = procrustes(normals, weights, axes, start, PRIOR)
         square = square_angles(normals, axes, R)
-        scale = max(float((weights * square).sum()) / max(2.0 * np.count_nonzero(axes >= 0) - 3.0, 1.0), 1.0)
+        scale = variance_scale(float((weights * square).sum()), 2.0 * np.count_nonzero(axes >= 0) - 3.0)
         covariance = procrustes_covariance(spatial, weights, axes, R, PRIOR, scale) + np.eye(3) * np.radians(self.floor_deg) ** 2
         on = axes >= 0
         with np.errstate(invalid="ignore"):

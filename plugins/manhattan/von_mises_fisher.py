@@ -12,7 +12,8 @@ from trihedron.pipeline.types import F64, ManhattanFrame, Normals, Segments
 from trihedron.plugins.numerics.axes.axis_fit import HALF_SPHERE, NOTHING_KNOWN, gather_directions
 from trihedron.plugins.numerics.axes.cube_symmetry import nearest_equivalent
 from trihedron.plugins.numerics.axes.direction_information import isotropic_information
-from trihedron.plugins.numerics.axes.manhattan_modes import NORMALS_PER_SAMPLE, Directions, ModeFinder, Modes
+from trihedron.plugins.numerics.axes.manhattan_modes import Directions, ModeFinder, Modes
+from trihedron.plugins.numerics.axes.mode_tests import NORMALS_PER_SAMPLE
 from trihedron.plugins.numerics.axes.sphere_modes import mode_statistics, orthonormal, search_axes, shift_axes
 from trihedron.plugins.numerics.axes.von_mises_fisher import AxisMixture, broad_mixture, improved
 

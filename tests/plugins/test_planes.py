@@ -91,6 +91,19 @@ def test_small_step_stays_two_planes(plugin, analytic, noise):
     assert np.abs(np.sort(planes.coefficients[:, 3]) - [1.5, 1.53]).max() < 0.002
 
 
+@pytest.mark.parametrize("seed", range(3))
+def test_a_board_on_a_wall_within_the_noise_leans_neither(plugin, analytic, seed):
+    """4 cm are 3 σ at this distance: one plane through both would be 2° off."""
+    normal = unit((0.25, -0.3, -1))
+    wall, board = analytic.plane(normal, 2.1), analytic.plane(normal, 2.06)
+    depth = wall.copy()
+    depth[:, 300:] = board[:, 300:]
+    planes = detect(plugin, analytic.frame(analytic.noisy(depth, analytic.sensor, seed), analytic.sensor))
+    large = planes.coefficients[planes.pixels > 50000]
+    angles = np.degrees(np.arccos(np.minimum(large[:, :3] @ normal, 1.0)))
+    assert len(large) == 2 and angles.max() < 0.3 and np.abs(np.sort(large[:, 3]) - [2.06, 2.1]).max() < 0.008
+
+
 @pytest.mark.parametrize(("radius", "distance", "noise"), [(0.15, 1.2, False), (0.3, 1.5, False), (0.3, 1.5, True), (0.6, 2.0, True)])
 def test_cylinder_is_not_a_plane(plugin, analytic, radius, distance, noise):
     camera = analytic.sensor if noise else analytic.exact

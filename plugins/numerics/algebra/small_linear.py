@@ -54,3 +54,60 @@ def turn_left(phi: F64, R: F64) -> None:
         R[0, c] = u + a * p + b * (y * r - z * q)
         R[1, c] = v + a * q + b * (z * p - x * r)
         R[2, c] = w + a * r + b * (x * q - y * p)
+
+
+@numba.njit(cache=True, nogil=True)
+def polar_rotation(M: F64) -> F64:
+    """The rotation nearest to M (3, 3), as `geometry.nearest_rotation`: one-sided Jacobi rotations make the columns of `A = M V` orthogonal (Hestenes,
+    1958), and R takes the two largest of them from V to their directions, the third by the cross product. Small columns keep their precision."""
+    A, V = M.copy(), np.eye(3)
+    for _ in range(12):
+        largest = 0.0
+        for p, q in ((0, 1), (0, 2), (1, 2)):
+            a, b, c = 0.0, 0.0, 0.0
+            for k in range(3):
+                a, b, c = a + A[k, p] * A[k, p], b + A[k, q] * A[k, q], c + A[k, p] * A[k, q]
+            if c * c <= 1e-32 * a * b:
+                continue
+            largest = max(largest, c * c / (a * b))
+            tau = (b - a) / (2.0 * c)
+            t = (1.0 if tau >= 0.0 else -1.0) / (abs(tau) + np.sqrt(1.0 + tau * tau))
+            cosine = 1.0 / np.sqrt(1.0 + t * t)
+            for X in (A, V):
+                for k in range(3):
+                    u, v = X[k, p], X[k, q]
+                    X[k, p], X[k, q] = cosine * (u - t * v), cosine * (t * u + v)
+        if largest < 1e-28:
+            break
+    return _from_columns(A, V)
+
+
+@numba.njit(cache=True, nogil=True)
+def _from_columns(A: F64, V: F64) -> F64:
+    """The rotation that takes columns of V (3, 3), a rotation, to the directions of the same columns of A (3, 3), orthogonal and of any length."""
+    square = np.empty(3)
+    for k in range(3):
+        square[k] = A[0, k] ** 2 + A[1, k] ** 2 + A[2, k] ** 2
+    order = np.argsort(-square)
+    U, W = np.zeros((3, 3)), np.empty((3, 3))
+    for i in range(2):
+        W[:, i] = V[:, order[i]]
+        if square[order[i]] > 0.0:
+            U[:, i] = A[:, order[i]] / np.sqrt(square[order[i]])
+    if square[order[0]] == 0.0:
+        return np.eye(3)
+    if square[order[1]] == 0.0:  # any direction across
+        axis = np.argmin(np.abs(U[:, 0]))
+        U[axis, 1] = 1.0
+        U[:, 1] -= U[axis, 0] * U[:, 0]
+        U[:, 1] /= np.sqrt((U[:, 1] ** 2).sum())
+    for X in (U, W):
+        for k in range(3):
+            i, j = (k + 1) % 3, (k + 2) % 3
+            X[k, 2] = X[i, 0] * X[j, 1] - X[j, 0] * X[i, 1]
+    out = np.zeros((3, 3))
+    for i in range(3):
+        for j in range(3):
+            for k in range(3):
+                out[i, j] += U[i, k] * W[j, k]
+    return out

@@ -77,7 +77,7 @@ class AtlantaFinder:
         starts = densest(few.vectors, few.weights, HALF_SPHERE, self.finder.cone, 6)
         if len(starts) == 0:
             return NONE
-        modes = self._shifted(few, np.array(starts).T)
+        modes = self._shifted(few, np.ascontiguousarray(starts.T))
         crossed = [np.cross(modes[:, i], modes[:, j]) for i, j in combinations(range(min(modes.shape[1], CROSSED)), 2)]
         crossed = [c / np.linalg.norm(c) for c in crossed if np.linalg.norm(c) > 0.5]
         vertical = max([*modes.T, *crossed], key=lambda v: self._score(few, v, known is None))

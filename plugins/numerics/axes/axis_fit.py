@@ -4,27 +4,54 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import numba
 import numpy as np
 
 from trihedron.pipeline.types import F32, F64, I32, Bool, Planes, Segments
-from trihedron.plugins.numerics.axes.direction_information import isotropic_information, line_directions, plane_information
-from trihedron.plugins.numerics.axes.manhattan_modes import NORMALS_PER_SAMPLE, Directions
+from trihedron.plugins.numerics.axes.direction_information import measured_directions
+from trihedron.plugins.numerics.axes.manhattan_modes import Directions
+from trihedron.plugins.numerics.axes.mode_tests import NORMALS_PER_SAMPLE
 from trihedron.plugins.numerics.axes.sphere_modes import assign_axes, fit_rotation, subsample_normals
 
 NOTHING_KNOWN = np.radians(30.0) ** 2  # rad², variance of a rotation that was not measured
+BEFOREHAND = 2.0
+NO_NORMALS, NO_LINES_M, NO_LINES_PX = (np.zeros(shape, np.float32) for shape in ((0, 0, 3), (0, 2, 3), (0, 2, 2)))
 
 
 def gather_directions(normals: F32 | None, segments: Segments | None, samples: int, line_weight_per_px: float) -> Directions:
     """At most `samples` of a grid of normals (h, w, 3), each of weight 1, and the directions of the 3D lines, weighted by their image length."""
-    surface = np.zeros((0, 3)) if normals is None else subsample_normals(normals, samples)
-    if segments is None:
-        return Directions(surface, np.ones(len(surface)), len(surface))
-    along = (segments.endpoints_m[:, 1] - segments.endpoints_m[:, 0]).astype(np.float64)
-    length = np.linalg.norm(along, axis=1)
-    pixels = np.linalg.norm(segments.endpoints_px[:, 1] - segments.endpoints_px[:, 0], axis=1)
-    good = (length > 1e-6) & np.isfinite(length) & np.isfinite(pixels)
-    vectors = np.concatenate([surface, along[good] / length[good, None]])
-    return Directions(vectors, np.concatenate([np.ones(len(surface)), line_weight_per_px * pixels[good]]), len(surface))
+    grid = NO_NORMALS if normals is None else normals
+    ends_m, ends_px = (NO_LINES_M, NO_LINES_PX) if segments is None else (segments.endpoints_m, segments.endpoints_px)
+    return Directions(*_gathered(grid, ends_m, ends_px, samples, line_weight_per_px))
+
+
+@numba.njit(cache=True, nogil=True)
+def _gathered(normals: F32, ends_m: F32, ends_px: F32, samples: int, per_px: float) -> tuple[F64, F64, int]:
+    """The fields of `Directions`."""
+    surface = subsample_normals(normals, samples)
+    count = len(surface)
+    vectors, weights = np.empty((count + len(ends_m), 3)), np.ones(count + len(ends_m))
+    vectors[:count] = surface
+    n = count
+    for i in range(len(ends_m)):
+        square, pixels = 0.0, 0.0
+        for k in range(3):
+            vectors[n, k] = float(ends_m[i, 1, k]) - ends_m[i, 0, k]
+            square += vectors[n, k] ** 2
+        for k in range(2):
+            pixels += (float(ends_px[i, 1, k]) - ends_px[i, 0, k]) ** 2
+        if 1e-12 < square < np.inf and np.isfinite(pixels):
+            for k in range(3):
+                vectors[n, k] /= np.sqrt(square)
+            weights[n] = per_px * np.sqrt(pixels)
+            n += 1
+    return vectors[:n], weights[:n], count
+
+
+def variance_scale(chi2: float, freedom: float) -> float:
+    """Of the variances assumed, by the residuals' χ² with so many degrees of freedom. The assumption counts like BEFOREHAND more, so that a scene where
+    little is seen keeps it, and one with many planes and edges tells by itself how true its walls are."""
+    return (chi2 + BEFOREHAND) / (max(freedom, 0.0) + BEFOREHAND)
 
 
 @dataclass(frozen=True)
@@ -54,21 +81,27 @@ class AxisFit:
         measured, information, on_axis = self.measured(R, axes, normals, segments, planes)
         on_axis[(on_axis >= 0) & ~taking_part[on_axis]] = -1
         R, H, chi2, components = fit_rotation(measured, information, on_axis, R, self.gate, 5)
-        scale = max(chi2 / max(components - 3.0, 1.0), 1.0)
+        scale = variance_scale(chi2, components - 3.0)
         return R, np.linalg.inv(H / scale + np.eye(3) / NOTHING_KNOWN) + np.eye(3) * np.radians(self.floor_deg) ** 2
 
     def measured(self, R: F64, axes: F64, normals: F64, segments: Segments, planes: Planes) -> tuple[F64, F64, I32]:
         """Directions (n, 3) of planes, lines and the means of the normals, their information (n, 3, 3) and the column of R (3, m) that each
         belongs to (-1: none). `axes` (3, m) and `normals` (m, 4) as above."""
-        lines, line_weight, _ = line_directions(segments.endpoints_m, segments.covariance_m2, np.radians(self.line_floor_deg))
-        plane_weight = plane_information(planes.coefficients, planes.covariance, np.radians(self.plane_floor_deg))
         independent = np.maximum(normals[:, 0] / NORMALS_PER_SAMPLE, 1.0)
         sigma = np.sqrt(normals[:, 2] / (2.0 * independent) + np.radians(self.normals_floor_deg) ** 2)
-        measured = np.concatenate([planes.coefficients[:, :3], lines, axes.T])
-        information = np.concatenate([plane_weight, line_weight, isotropic_information(axes.T, sigma)])
+        measured, information = measured_directions(
+            planes.coefficients,
+            planes.covariance,
+            np.radians(self.plane_floor_deg),
+            segments.endpoints_m,
+            segments.covariance_m2,
+            np.radians(self.line_floor_deg),
+            np.ascontiguousarray(axes.T),
+            sigma,
+        )
         on_axis = assign_axes(measured, R, np.radians(self.cone_deg))
-        used = [self.use_planes] * len(plane_weight) + [self.use_lines] * len(lines) + list(normals[:, 0] > 0)
-        on_axis[~(np.array(used) & np.isfinite(measured).all(axis=1))] = -1
+        used = np.concatenate([np.repeat([self.use_planes, self.use_lines], [len(planes.pixels), len(segments.endpoints_m)]), normals[:, 0] > 0.0])
+        on_axis[~used] = -1
         return measured, information, on_axis
 
 

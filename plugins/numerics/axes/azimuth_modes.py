@@ -7,7 +7,8 @@ import numpy as np
 
 from trihedron.pipeline.geometry import exp_so3
 from trihedron.pipeline.types import F64, I32
-from trihedron.plugins.numerics.axes.manhattan_modes import NORMALS_PER_SAMPLE, Directions
+from trihedron.plugins.numerics.axes.manhattan_modes import Directions
+from trihedron.plugins.numerics.axes.mode_tests import NORMALS_PER_SAMPLE
 from trihedron.plugins.numerics.axes.sphere_modes import right_handed
 
 BINS = 90  # one degree each, of a quarter turn

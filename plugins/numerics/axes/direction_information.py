@@ -2,27 +2,50 @@
 
 from __future__ import annotations
 
+import numba
 import numpy as np
 
-from trihedron.pipeline.geometry import tangent_basis
 from trihedron.pipeline.types import F32, F64
 
 
-def plane_information(coefficients: F64, covariance: F64, floor: float) -> F64:
-    """Of the normals of planes (n, 4) with `covariance` (n, 3, 3) of (a, b, d), see `types.Planes`; `floor` (rad) is added in square."""
-    return _in_tangent_plane(coefficients[:, :3], covariance[:, :2, :2], floor)
-
-
-def line_directions(endpoints_m: F32, covariance_m2: F32, floor: float) -> tuple[F64, F64, F64]:
-    """Directions (n, 3), their information, and lengths (n,) of lines through end points (n, 2, 3) with covariances (n, 2, 3, 3); rows without a
-    line have NaN directions."""
-    along = (endpoints_m[:, 1] - endpoints_m[:, 0]).astype(np.float64)
-    length = np.linalg.norm(along, axis=1)
-    length[~(length > 1e-6)] = np.nan
-    directions = along / length[:, None]
-    basis = tangent_basis(directions)
-    spread = (covariance_m2[:, 0] + covariance_m2[:, 1]).astype(np.float64) / (length * length)[:, None, None]
-    return directions, _in_tangent_plane(directions, np.swapaxes(basis, 1, 2) @ spread @ basis, floor), length
+@numba.njit(cache=True, nogil=True)
+def measured_directions(
+    planes: F64, plane_covariance: F64, plane_floor: float, ends_m: F32, end_covariance: F32, line_floor: float, means: F64, mean_sigma: F64
+) -> tuple[F64, F64]:
+    """Directions (n, 3) and their information: the normals of planes (p, 4) with covariances (p, 3, 3) of (a, b, d), see `types.Planes`; lines
+    through end points (l, 2, 3) with covariances (l, 2, 3, 3) each; and `means` (m, 3) known to `mean_sigma` (m,) every way. The floors (rad) are
+    added in square. A row that is not finite tells nothing: its information is zero."""
+    p, lines = len(planes), len(ends_m)
+    vectors, information = np.empty((p + lines + len(means), 3)), np.zeros((p + lines + len(means), 3, 3))
+    C, a = np.empty((2, 2)), np.empty((2, 3))
+    for i in range(p):
+        vectors[i] = planes[i, :3] if np.isfinite(planes[i, :3]).all() else np.full(3, np.nan)
+        _tangent_basis(vectors[i], a)
+        _inverse_in_tangent_plane(plane_covariance[i], plane_floor * plane_floor, a, information[i])
+    for i in range(lines):
+        d = vectors[p + i]
+        length2 = 0.0
+        for k in range(3):
+            d[k] = float(ends_m[i, 1, k]) - ends_m[i, 0, k]
+            length2 += d[k] * d[k]
+        if not 1e-12 < length2 < np.inf:
+            d[:] = np.nan
+            continue
+        d /= np.sqrt(length2)
+        _tangent_basis(d, a)
+        C[:] = 0.0
+        for u in range(2):
+            for v in range(2):
+                for j in range(3):
+                    for k in range(3):
+                        C[u, v] += a[u, j] * (float(end_covariance[i, 0, j, k]) + end_covariance[i, 1, j, k]) * a[v, k] / length2
+        _inverse_in_tangent_plane(C, line_floor * line_floor, a, information[p + i])
+    for i in range(len(means)):
+        vectors[p + lines + i] = means[i]
+        for j in range(3):
+            for k in range(3):
+                information[p + lines + i, j, k] = (1.0 * (j == k) - means[i, j] * means[i, k]) / mean_sigma[i] ** 2
+    return vectors, information
 
 
 def isotropic_information(directions: F64, sigma: F64) -> F64:
@@ -30,11 +53,26 @@ def isotropic_information(directions: F64, sigma: F64) -> F64:
     return (np.eye(3) - directions[:, :, None] * directions[:, None, :]) / (sigma * sigma)[:, None, None]
 
 
-def _in_tangent_plane(directions: F64, covariance: F64, floor: float) -> F64:
-    """(n, 2, 2) covariance in `tangent_basis` -> information of the direction in 3D; zero where it is not finite."""
-    a, b, d = covariance[:, 0, 0] + floor * floor, covariance[:, 0, 1], covariance[:, 1, 1] + floor * floor
-    det = a * d - b * b
-    inverse = np.stack([np.stack([d, -b], -1), np.stack([-b, a], -1)], -2) / np.where(det > 0.0, det, np.nan)[:, None, None]
-    basis = tangent_basis(directions)
-    out = basis @ inverse @ np.swapaxes(basis, 1, 2)
-    return np.where(np.isfinite(out).all(axis=(1, 2), keepdims=True), out, 0.0)
+@numba.njit(cache=True, nogil=True)
+def _tangent_basis(n: F64, out: F64) -> None:
+    """Write the columns of `geometry.tangent_basis` of a unit vector to the rows of `out` (2, 3)."""
+    x, y, z = n[0], n[1], n[2]
+    sign = 1.0 if z >= 0.0 else -1.0
+    a = -1.0 / (sign + z)
+    b = x * y * a
+    out[0, 0], out[0, 1], out[0, 2] = 1.0 + sign * x * x * a, sign * b, -sign * x
+    out[1, 0], out[1, 1], out[1, 2] = b, sign + y * y * a, -y
+
+
+@numba.njit(cache=True, nogil=True)
+def _inverse_in_tangent_plane(C: F64, more: float, basis: F64, out: F64) -> None:
+    """Write the information (3, 3) of a direction with covariance C (2, 2) plus `more` in its tangent plane, the rows of `basis`; nothing where that
+    is no covariance."""
+    p, q, r = C[0, 0] + more, C[0, 1], C[1, 1] + more
+    det = p * r - q * q
+    if not (0.0 < det < np.inf and p > 0.0):
+        return
+    for j in range(3):
+        u, v = basis[0, j], basis[1, j]
+        for k in range(3):
+            out[j, k] = (r * u * basis[0, k] - q * (u * basis[1, k] + v * basis[0, k]) + p * v * basis[1, k]) / det

@@ -9,9 +9,8 @@ from __future__ import annotations
 import numba
 import numpy as np
 
-from trihedron.pipeline.geometry import nearest_rotation
 from trihedron.pipeline.types import F32, F64, I32
-from trihedron.plugins.numerics.algebra.small_linear import solve_positive, turn_left
+from trihedron.plugins.numerics.algebra.small_linear import polar_rotation, solve_positive, turn_left
 
 BINS = 90  # one degree each, of a quarter turn
 ROWS_APART = 4  # of those in which valid normals are counted
@@ -133,15 +132,21 @@ def density(directions: F64, weights: F64, axes: F64, bandwidth: float) -> float
     return total
 
 
+@numba.njit(cache=True, nogil=True)
 def orthonormal(axes: F64, weights: F64) -> F64:
-    """The rotation nearest to three axes, each counting by its weight: SVD of `Σ w_k a_k e_kᵀ` with determinant +1. An axis of weight 0
+    """The rotation nearest to three axes, each counting by its weight: the rotation in `Σ w_k a_k e_kᵀ`. An axis of weight 0
     becomes the cross product of the others; with fewer than two weights the remaining turn is arbitrary."""
-    return nearest_rotation(axes * weights)
+    return polar_rotation(axes * weights)
 
 
+@numba.njit(cache=True, nogil=True)
 def right_handed(first: F64) -> F64:
     """(3, 3) rotation whose first column is the unit vector `first`."""
-    return np.array([*first, *_across(first[0], first[1], first[2])]).reshape(3, 3).T
+    across = _across(first[0], first[1], first[2])
+    out = np.empty((3, 3))
+    for k in range(3):
+        out[k, 0], out[k, 1], out[k, 2] = first[k], across[k], across[3 + k]
+    return out
 
 
 @numba.njit(cache=True, nogil=True)
@@ -156,13 +161,18 @@ def _mass(directions: F64, weights: F64, starts: F64, cone: float) -> F64:
     return mass
 
 
-def densest(directions: F64, weights: F64, starts: F64, cone: float, count: int) -> list[F64]:
+@numba.njit(cache=True, nogil=True)
+def densest(directions: F64, weights: F64, starts: F64, cone: float, count: int) -> F64:
     """Of `starts` (m, 3) those with most weight within the cone, at least two cones apart; at most `count`, heaviest first."""
-    mass = _mass(directions, weights, starts, cone)
-    chosen: list[F64] = []
-    while len(chosen) < count and mass.max() > 0.0:
-        chosen.append(starts[int(np.argmax(mass))])
-        mass[np.abs(starts @ chosen[-1]) > np.cos(2.0 * cone)] = 0.0
+    mass, chosen, apart = _mass(directions, weights, starts, cone), np.empty((count, 3)), np.cos(2.0 * cone)
+    for n in range(count):
+        best = np.argmax(mass)
+        if mass[best] <= 0.0:
+            return chosen[:n]
+        chosen[n] = starts[best]
+        for s in range(len(starts)):
+            if abs(starts[s, 0] * chosen[n, 0] + starts[s, 1] * chosen[n, 1] + starts[s, 2] * chosen[n, 2]) > apart:
+                mass[s] = 0.0
     return chosen
 
 
@@ -193,17 +203,20 @@ def _quarter_turns(histogram: F64, count: int) -> F64:
     return turns
 
 
+@numba.njit(cache=True, nogil=True)
 def search_axes(directions: F64, weights: F64, starts: F64, cone: float, bandwidth: float, primaries: int, turns: int) -> F64:
     """The three orthogonal axes of greatest density, from nothing: each of the `primaries` densest directions with its `turns` fullest turns about it
     is refined and compared. `starts` (m, 3) are directions spread over the half sphere, less than a cone apart. (3, 3) rotation."""
     best, found = -1.0, np.eye(3)
-    for start in densest(directions, weights, starts, cone, primaries):
-        alone = np.zeros((3, 3))  # zero axes attract nothing
-        alone[:, 0] = start
+    chosen = densest(directions, weights, starts, cone, primaries)
+    for i in range(len(chosen)):
+        alone = np.ascontiguousarray(chosen[i : i + 1].T)
         frame = right_handed(shift_axes(directions, weights, alone, cone, bandwidth, 10, 1e-3)[:, 0])
         for turn in _quarter_turns(_histogram(directions, weights, frame, cone), turns):
             c, s = np.cos(turn), np.sin(turn)
-            R = frame @ np.array([[1.0, 0.0, 0.0], [0.0, c, -s], [0.0, s, c]])
+            R = frame.copy()
+            for k in range(3):
+                R[k, 1], R[k, 2] = c * frame[k, 1] + s * frame[k, 2], c * frame[k, 2] - s * frame[k, 1]
             axes = shift_axes(directions, weights, R, cone, bandwidth, 5, 1e-3)
             R = orthonormal(axes, np.sqrt(mode_statistics(directions, weights, axes, cone)[:, 1]) + 1e-9)
             score = density(directions, weights, R, bandwidth)

@@ -28,7 +28,7 @@ class PlanarRegions:
     gate: float = 3.0  # σ_z of a member's depth
     turn: float = 0.5  # a region whose normals turn by more than this share of the cone's half angle is curved
     border_px: int = 16  # grown into whatever the normals say
-    merge: float = 1.0  # rms distance, in σ_z, of a region from the common plane of the two
+    merge: float = 0.5  # rms distance, in σ_z, of a region from the common plane of the two
     gap_px: int = 8  # between regions that may be one
     min_pixels: int = 1000  # smallest region
     planes: int = 24  # most, the largest

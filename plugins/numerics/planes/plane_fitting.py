@@ -7,6 +7,7 @@ import numpy as np
 
 from trihedron.pipeline.types import F32, F64, I32, Bool
 from trihedron.plugins.numerics.depth.organised_grid import Grid, cells_by_component
+from trihedron.plugins.numerics.planes.parallel_planes import larger_surface
 from trihedron.plugins.numerics.planes.plane_curvature import linear_turn
 
 COARSE = 2000  # cells a component's first plane is estimated from
@@ -42,6 +43,7 @@ def fit_components(
         component = cells[starts[k] : starts[k + 1]]
         member = np.zeros(len(component), np.bool_)
         q, members = _fit_component(grid, component, np.cos(cone), gate, member)
+        q, members, _ = larger_surface(q, grid, component, member)
         if members < least or turn(q, grid, component, member, max(len(component) // COARSE, 1)) > curved:
             continue
         planes[found] = q
@@ -54,23 +56,26 @@ def fit_components(
 
 @numba.njit(cache=True, nogil=True)
 def fit_labelled(grid: Grid, labels: I32, planes: F64, cone: float, gate: float, least: int) -> tuple[I32, F64]:
-    """Fit a plane to each labelled region (h, w), starting from its q in `planes` (k, 3). Returns the labels of the members, and the q, of those that
-    have `least` members by the rules of `fit_cells`, largest first."""
-    out, fitted, found = np.zeros_like(labels), np.zeros_like(planes), 0
+    """Fit a plane to each labelled region (h, w), starting from its q in `planes` (k, 3), or two where it is two parallel surfaces. Returns the
+    labels of the members, and the q, of those that have `least` members by the rules of `fit_cells`, largest first."""
+    out, fitted, found = np.zeros_like(labels), np.zeros((2 * len(planes), 3)), 0
     cells, starts = cells_by_component(labels - 1, least)
     flat = out.ravel()
     for k in range(len(starts) - 1):
-        region = cells[starts[k] : starts[k + 1]]
+        region = cells[starts[k] : starts[k + 1]].copy()
         q = planes[labels[region[0] // labels.shape[1], region[0] % labels.shape[1]] - 1].copy()
-        member = np.zeros(len(region), np.bool_)
-        q, members = _trimmed(q, 1, grid, region, np.cos(cone), gate, member)
-        if members < least:
-            continue
-        fitted[found] = q
-        found += 1
-        for i in range(len(region)):
-            if member[i]:
-                flat[region[i]] = found
+        for _ in range(2):
+            member = np.zeros(len(region), np.bool_)
+            q, members = _trimmed(q, 1, grid, region, np.cos(cone), gate, member)
+            q, members, other = larger_surface(q, grid, region, member)
+            if members < least:
+                break
+            fitted[found] = q
+            found += 1
+            for i in range(len(region)):
+                if member[i]:
+                    flat[region[i]] = found
+            region, q = region[~member], other
     return out, fitted[:found]
 
 

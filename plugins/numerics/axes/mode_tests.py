@@ -1,0 +1,94 @@
+"""Whether modes of the sphere are peaks, and at right angles. Statistics (m, 4) are those of `mode_statistics`, angles in rad."""
+
+from __future__ import annotations
+
+import numba
+import numpy as np
+
+from trihedron.pipeline.types import F64, I32, Bool
+
+NORMALS_PER_SAMPLE = 20.0  # neighbouring normals share pixels and the sensor's errors: so many count as one
+
+
+@numba.njit(cache=True, nogil=True)
+def surface_peaks(axes: F64, normals: F64, count: int, least: float, widest: float, coefficients: F64, pixels: I32, area: float, cone: float) -> Bool:
+    """(m,) whether the share `least` of `count` normals stands on each axis (3, m), denser than directions without order would (mean square below
+    `widest`) or beside planes (p, 4) with that share of the image's `area`."""
+    peaks = np.zeros(len(normals), np.bool_)
+    for k in range(len(normals)):
+        dense = normals[k, 3] < widest
+        if not dense:
+            covered = 0.0
+            for i in range(len(coefficients)):
+                dot = coefficients[i, 0] * axes[0, k] + coefficients[i, 1] * axes[1, k] + coefficients[i, 2] * axes[2, k]
+                covered += pixels[i] * (np.cos(0.5 * cone) < abs(dot) < np.inf)
+            dense = covered >= least * area
+        peaks[k] = dense and normals[k, 1] >= least * max(count, 1)
+    return peaks
+
+
+@numba.njit(cache=True, nogil=True)
+def line_peaks(directions: F64, length: F64, axes: F64, lines: F64, number: int, share: float, widest: float, cone: float) -> Bool:
+    """(m,) whether `number` lines with `share` of the length of all stand on each axis (3, m), and on the axes together more than lines (n, 3), drawn
+    any way on one wall would.
+
+    An axis is measured against the lines that no heavier axis has: a few long ones along a corridor must not outweigh what is across it."""
+    peaks, left = np.zeros(len(lines), np.bool_), length.copy()
+    any_peak, on_peaks, widest_peak = False, 0.0, 0.0
+    for k in np.argsort(-lines[:, 1], kind="mergesort"):
+        if lines[k, 0] < number or not lines[k, 3] < widest:
+            continue
+        least = by_chance(lines[k, 3], cone, 2.0 / (np.pi - 2.0 * cone), left) if any_peak else 0.0
+        if lines[k, 1] >= max(share * left.sum(), least):
+            peaks[k], any_peak = True, True
+            on_peaks += lines[k, 1]
+            widest_peak = max(widest_peak, lines[k, 3])
+        for i in range(len(left)):
+            if abs(directions[i, 0] * axes[0, k] + directions[i, 1] * axes[1, k] + directions[i, 2] * axes[2, k]) > np.cos(cone):
+                left[i] = 0.0
+    if on_peaks <= by_chance(widest_peak, cone, 4.0 / np.pi, length):  # on one wall two axes gather four times their reach of 180° by chance
+        peaks[:] = False
+    return peaks
+
+
+@numba.njit(cache=True, nogil=True)
+def by_chance(mean_square: float, cone: float, per_reach: float, length: F64) -> float:
+    """The length that lines (n,) without order have within reach of an axis, give or take 3 sigma; reach is 3 standard deviations of those on it."""
+    share = per_reach * min(max(3.0 * np.sqrt(mean_square), np.radians(2.0)), cone)
+    return share * length.sum() + 3.0 * np.sqrt(share * (1.0 - share) * (length * length).sum())
+
+
+@numba.njit(cache=True, nogil=True)
+def perpendicular(axes: F64, normals: F64, lines: F64, skew: float) -> Bool:
+    """(m, m) whether two modes (3, m) are within `skew` of a right angle, as far as their own uncertainty can tell."""
+    count = len(normals)
+    variance, fits = np.empty(count), np.zeros((count, count), np.bool_)
+    for k in range(count):
+        square = normals[k, 1] * normals[k, 2] + lines[k, 1] * lines[k, 2]
+        independent = max(normals[k, 0] / NORMALS_PER_SAMPLE + lines[k, 0], 1.0)
+        variance[k] = square / max(normals[k, 1] + lines[k, 1], 1e-9) / (2.0 * independent)
+    for i in range(count):
+        for j in range(count):
+            cosine = axes[0, i] * axes[0, j] + axes[1, i] * axes[1, j] + axes[2, i] * axes[2, j]
+            fits[i, j] = np.arcsin(min(abs(cosine), 1.0)) <= skew + 2.0 * np.sqrt(variance[i] + variance[j])
+    return fits
+
+
+@numba.njit(cache=True, nogil=True)
+def largest_fitting(peaks: Bool, fits: Bool, weights: F64) -> Bool:
+    """(3,) the most, and of those the heaviest, of three peaks that fit each other."""
+    best, rank = np.zeros(3, np.bool_), 0.0
+    total = weights.sum() + 1.0
+    for chosen in (7, 3, 5, 6, 1, 2, 4):
+        good, number, weight = True, 0, 0.0
+        for i in range(3):
+            if chosen >> i & 1:
+                number, weight = number + 1, weight + weights[i]
+                good = good and peaks[i]
+                for j in range(i):
+                    good = good and (fits[i, j] or not chosen >> j & 1)
+        if good and number * total + weight > rank:
+            rank = number * total + weight
+            for i in range(3):
+                best[i] = chosen >> i & 1 == 1
+    return best

@@ -1,0 +1,154 @@
+"""Parallel surfaces a few centimetres apart (a door, a board on a wall) that noise lets pass for one plane, told by the normals and taken apart.
+
+The plane fitted to both leans from one to the other by degrees, while the mean of thousands of normals stays that of either: where the two disagree
+the depths are tried as two planes.
+"""
+
+from __future__ import annotations
+
+import numba
+import numpy as np
+
+from trihedron.pipeline.types import F64, I32, Bool
+from trihedron.plugins.numerics.algebra.small_linear import solve_positive
+from trihedron.plugins.numerics.depth.organised_grid import Grid
+
+LEAST = np.radians(0.4)  # disagreement of normals and plane that is looked into
+SOME = 2000
+WIDE, NARROW = np.cos(np.radians([15.0, 8.0]))  # normals further from their mean, then from that of these, are of a patch across a step
+SMALLER = 0.5  # each of the two planes must disagree by less than this share of what the one did
+SHARE = 0.1  # of the cells that the smaller of the two must have
+REACH = 2  # cells on each side that distances are averaged over
+ROUNDS = 10  # of two means
+
+
+@numba.njit(cache=True, nogil=True)
+def larger_surface(q: F64, grid: Grid, cells: I32, member: Bool) -> tuple[F64, int, F64]:
+    """Of the members of a region with plane q, when they are two parallel surfaces, the larger one: its q and number of members, which alone stay
+    marked, and the q of the other. Otherwise all is left as it is, and there is no other (zeros)."""
+    members, none = 0, np.zeros(3)
+    for k in range(len(cells)):
+        members += member[k]
+    normal = _mean_normal(q, grid, cells, member)
+    apart = _angle(q, normal)
+    if not apart > LEAST:
+        return q, members, none
+    further = _further(_smoothed(_distances(normal, grid, cells, member)), cells, member)
+    one, other = 0, 0
+    for k in range(len(cells)):
+        one += member[k] and further[k]
+        other += member[k] and not further[k]
+    if min(one, other) < SHARE * members:
+        return q, members, none
+    first, second = _fitted(grid, cells, member & further), _fitted(grid, cells, member & ~further)
+    if not max(_angle(first, normal), _angle(second, normal)) < SMALLER * apart:
+        return q, members, none
+    for k in range(len(cells)):
+        member[k] = member[k] and further[k] == (one >= other)
+    return (first, one, second) if one >= other else (second, other, first)
+
+
+@numba.njit(cache=True, nogil=True)
+def _angle(q: F64, normal: F64) -> float:
+    """Between the normal of a plane q and a unit vector; NaN for no plane or no normal."""
+    sine = 0.0
+    for k in range(3):
+        i, j = (k + 1) % 3, (k + 2) % 3
+        sine += (q[i] * normal[j] - q[j] * normal[i]) ** 2
+    square = float(q @ q)
+    return float(np.arcsin(min(np.sqrt(sine / square), 1.0))) if square > 0.0 else np.nan
+
+
+@numba.njit(cache=True, nogil=True)
+def _mean_normal(q: F64, grid: Grid, cells: I32, member: Bool) -> F64:
+    """Unit mean of the normals of (about SOME of) the members, those across a step left out; NaN without any."""
+    w, step = grid.rho.shape[1], max(len(cells) // SOME, 1)
+    mean, total = -q / np.sqrt(q @ q), np.empty(3)
+    for least in (WIDE, NARROW, NARROW):
+        total[:] = 0.0
+        for k in range(0, len(cells), step):
+            if member[k]:
+                n = grid.normals[cells[k] // w, cells[k] % w]
+                if n[0] * mean[0] + n[1] * mean[1] + n[2] * mean[2] > least:
+                    for j in range(3):
+                        total[j] += n[j]
+        mean = total / np.sqrt(total @ total)
+    return mean
+
+
+@numba.njit(cache=True, nogil=True)
+def _distances(normal: F64, grid: Grid, cells: I32, member: Bool) -> F64:
+    """(h, w) how far along the normal each member is from the camera, negative; 0 elsewhere."""
+    out, w = np.zeros(grid.rho.shape), grid.rho.shape[1]
+    for k in range(len(cells)):
+        if member[k]:
+            r, c = cells[k] // w, cells[k] % w
+            out[r, c] = (normal[0] * grid.rays_x[c] + normal[1] * grid.rays_y[r] + normal[2]) / grid.rho[r, c]
+    return out
+
+
+@numba.njit(cache=True, nogil=True)
+def _smoothed(values: F64) -> F64:
+    """(h, w) mean of the values that are not 0 in a square about each cell that has one."""
+    h, w = values.shape
+    sums, counts, out = np.zeros((h + 1, w + 1)), np.zeros((h + 1, w + 1), np.int32), np.zeros((h, w))
+    for r in range(h):
+        total, n = 0.0, 0
+        for c in range(w):
+            total += values[r, c]
+            n += values[r, c] != 0.0
+            sums[r + 1, c + 1], counts[r + 1, c + 1] = sums[r, c + 1] + total, counts[r, c + 1] + n
+    for r in range(h):
+        top, bottom = max(r - REACH, 0), min(r + REACH + 1, h)
+        for c in range(w):
+            if values[r, c] != 0.0:
+                left, right = max(c - REACH, 0), min(c + REACH + 1, w)
+                n = counts[bottom, right] - counts[top, right] - counts[bottom, left] + counts[top, left]
+                out[r, c] = (sums[bottom, right] - sums[top, right] - sums[bottom, left] + sums[top, left]) / n
+    return out
+
+
+@numba.njit(cache=True, nogil=True)
+def _further(distances: F64, cells: I32, member: Bool) -> Bool:
+    """(n,) which cells belong to the further of two distances (two means)."""
+    flat, out = distances.ravel(), np.zeros(len(cells), np.bool_)
+    total, square, n = 0.0, 0.0, 0
+    for k in range(len(cells)):
+        if member[k]:
+            n, total, square = n + 1, total + flat[cells[k]], square + flat[cells[k]] ** 2
+    spread = np.sqrt(max(square / n - (total / n) ** 2, 0.0))
+    near, far = total / n + spread, total / n - spread
+    for _ in range(ROUNDS):
+        sums, counts = np.zeros(2), np.zeros(2)
+        for k in range(len(cells)):
+            if member[k]:
+                out[k] = flat[cells[k]] < 0.5 * (near + far)
+                sums[int(out[k])] += flat[cells[k]]
+                counts[int(out[k])] += 1.0
+        if min(counts[0], counts[1]) == 0.0:
+            break
+        near, far = sums[0] / counts[0], sums[1] / counts[1]
+    return out
+
+
+@numba.njit(cache=True, nogil=True)
+def _fitted(grid: Grid, cells: I32, chosen: Bool) -> F64:
+    """q (3,) of the plane through the chosen cells, zeros when there is none."""
+    w = grid.rho.shape[1]
+    A, b, q = np.zeros((3, 3)), np.zeros(3), np.zeros(3)
+    for k in range(len(cells)):
+        if chosen[k]:
+            r, c = cells[k] // w, cells[k] % w
+            x, y, p, s = grid.rays_x[c], grid.rays_y[r], grid.rho[r, c], grid.sigma[r, c]
+            weight = grid.count[r, c] / (s * s)
+            A[0, 0] += weight * x * x
+            A[1, 0] += weight * x * y
+            A[2, 0] += weight * x
+            A[1, 1] += weight * y * y
+            A[2, 1] += weight * y
+            A[2, 2] += weight
+            b[0] += weight * x * p
+            b[1] += weight * y * p
+            b[2] += weight * p
+    solve_positive(A, b, q)
+    return q
