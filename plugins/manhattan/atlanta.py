@@ -51,7 +51,7 @@ class Atlanta:
     plane_floor_deg: float = 0.3  # a wall's deviation from the axis
     line_floor_deg: float = 0.5  # an edge's
     normals_floor_deg: float = 0.5  # error of an axis however many normals it has
-    floor_deg: float = 0.1  # of every rotation
+    floor_deg: float = 0.05  # of every rotation
     gate: float = 2.0  # σ at which a plane or line counts half
 
     def __post_init__(self) -> None:
@@ -110,7 +110,9 @@ class Atlanta:
         R = np.concatenate(list(modes.rotations), axis=1)
         vectors, information, columns = self._fit.measured(R, modes.axes, normals, segments, planes)
         columns[(columns >= 0) & ~modes.seen[columns]] = -1
-        rotations, H, chi2, components = fit_shared_vertical(vectors, information, columns, modes.rotations, 1e-6, self.gate, 5)
+        rotations, H, chi2, components = fit_shared_vertical(
+            vectors, information, columns, len(vectors) - 3 * count, modes.rotations, 1e-6, self.gate, 5
+        )
         scale = variance_scale(chi2, components - 2.0 - count)
         return rotations, shared_covariance(H / scale, rotations, NOTHING_KNOWN) + np.eye(3) * np.radians(self.floor_deg) ** 2
 

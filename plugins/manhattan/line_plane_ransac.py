@@ -39,7 +39,7 @@ class LinePlaneRansac:
     loyalty: float = 1.2  # a frame with other axes than the previous must score so many times more
     plane_floor_deg: float = 0.3  # a wall's deviation from the axis
     line_floor_deg: float = 0.5  # an edge's
-    floor_deg: float = 0.1  # of the whole rotation
+    floor_deg: float = 0.05  # of the whole rotation
     gate: float = 2.0  # σ at which a plane or line counts half
 
     def __post_init__(self) -> None:

@@ -49,7 +49,7 @@ class Mixture:
     plane_floor_deg: float = 0.3  # a wall's deviation from the axis
     line_floor_deg: float = 0.5  # an edge's
     normals_floor_deg: float = 0.5  # error of an axis however many normals it has
-    floor_deg: float = 0.1  # of the whole rotation
+    floor_deg: float = 0.05  # of the whole rotation
 
     def __post_init__(self) -> None:
         if not 1.0 <= self.cone_deg <= 30.0 or not 0.1 <= self.bandwidth_deg <= self.cone_deg:

@@ -34,7 +34,7 @@ class PlaneSvd:
     loyalty: float = 1.2  # a pair with other axes than the previous must explain so many times more
     gate: float = 3.0  # σ at which a plane counts half
     plane_floor_deg: float = 0.3  # a wall's deviation from the axis
-    floor_deg: float = 0.1  # of the whole rotation
+    floor_deg: float = 0.05  # of the whole rotation
 
     def __post_init__(self) -> None:
         if not 0.0 <= self.max_cos <= LARGEST_COS or not 0.5 <= self.reach_deg <= 20.0:

@@ -28,6 +28,7 @@ class VonMisesFisher:
     what the data say, not what a cone cuts out, and the covariance follows from it. Detected planes are not looked at."""
 
     samples: int = 1500  # most normals used
+    alike: float = 6.0  # neighbouring normals share pixels and the sensor's errors: of those used so many err as one
     max_iterations: int = 25
     tolerance_deg: float = 0.01  # of a step
     start_spread_deg: float = 10.0  # standard deviation about the axes assumed at first: how far EM can see
@@ -42,8 +43,8 @@ class VonMisesFisher:
     max_skew_deg: float = 3.0  # means further from a right angle do not belong to one Manhattan frame
     peak_spread_deg: float = 2.0  # kernel with which peaks are looked for
     max_shift_deg: float = 0.5  # from the mean of a wall's normals to their peak, beyond the uncertainty of the mean; two walls have more
-    axis_floor_deg: float = 0.2  # error of an axis however many directions it has
-    floor_deg: float = 0.1  # of the whole rotation
+    axis_floor_deg: float = 0.1  # error of an axis however many directions it has
+    floor_deg: float = 0.05  # of the whole rotation
     search_samples: int = 800  # most normals a search looks at
     max_age: int = 5  # frames; with an older result the search is from everywhere
 
@@ -52,8 +53,10 @@ class VonMisesFisher:
             raise ValueError("max_iterations, samples, search_samples, min_lines, max_age: at least 1, 10, 10, 1 and 1")
         if not 0.5 <= self.peak_spread_deg <= 10.0 or self.max_shift_deg <= 0.0:
             raise ValueError("peak_spread_deg, max_shift_deg: must be 0.5 to 10 and positive")
-        if min(self.tolerance_deg, self.prior, self.max_skew_deg, self.axis_floor_deg, self.floor_deg) <= 0.0 or self.line_weight_per_px < 0.0:
-            raise ValueError("tolerance_deg, prior, max_skew_deg, axis_floor_deg, floor_deg, line_weight_per_px: must be positive")
+        if min(self.tolerance_deg, self.prior, self.max_skew_deg, self.axis_floor_deg, self.floor_deg) <= 0.0:
+            raise ValueError("tolerance_deg, prior, max_skew_deg, axis_floor_deg, floor_deg: must be positive")
+        if self.line_weight_per_px < 0.0 or self.alike < 1.0:
+            raise ValueError("line_weight_per_px, alike: at least 0 and 1")
         if not all(0.5 <= spread <= 20.0 for spread in (self.start_spread_deg, self.prior_spread_deg, self.max_spread_deg)):
             raise ValueError("start_spread_deg, prior_spread_deg, max_spread_deg: must be 0.5 to 20")
         if not all(0.0 <= share <= 1.0 for share in (self.min_share, self.min_line_share, self.min_explained)):
@@ -122,7 +125,7 @@ class VonMisesFisher:
 
     def _rotation(self, mixture: AxisMixture, modes: Modes, R: F64) -> tuple[F64, F64]:
         """The most probable rotation of the axes seen, R where these are no Manhattan frame, and the covariance of phi (3, 3)."""
-        independent = self._strength(mixture) * mixture.number / np.array([[NORMALS_PER_SAMPLE], [1.0]])
+        independent = self._strength(mixture) * mixture.number / np.array([[self.alike], [1.0]])
         sigma2 = 1.0 / np.maximum(independent.sum(axis=0), 1e-9) + np.radians(self.axis_floor_deg) ** 2
         H = np.zeros((3, 3))
         if modes.seen.any() and (modes.supported or modes.seen.sum() < 2):

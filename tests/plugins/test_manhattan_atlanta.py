@@ -159,7 +159,7 @@ def test_fit_is_exact_and_its_information_right(directions):
     measured = np.array([truth[c // 3][:, c % 3] for c in columns])
     information = (np.eye(3) - measured[:, :, None] * measured[:, None, :]) / np.radians(0.5) ** 2
     start = exp_so3(np.radians([2.0, -1.0, 1.5])) @ truth
-    found, H, chi2, components = fit_shared_vertical(-measured, information, columns, start, 1e-6, 1e6, 8)
+    found, H, chi2, components = fit_shared_vertical(-measured, information, columns, 5, start, 1e-6, 1e6, 8)
     assert np.allclose(found, truth, atol=1e-6) and chi2 < 1e-6 and components == pytest.approx(10.0)
     turns = np.degrees(np.sqrt([truth[0][:, 2] @ C @ truth[0][:, 2] for C in shared_covariance(H, found, 1e6)]))
     assert np.allclose(turns, [0.5 / np.sqrt(2.0), 0.5, 0.5], rtol=0.01)  # two walls, one wall, one wall

@@ -58,8 +58,9 @@ def turn_left(phi: F64, R: F64) -> None:
 
 @numba.njit(cache=True, nogil=True)
 def polar_rotation(M: F64) -> F64:
-    """The rotation nearest to M (3, 3), as `geometry.nearest_rotation`: one-sided Jacobi rotations make the columns of `A = M V` orthogonal (Hestenes,
-    1958), and R takes the two largest of them from V to their directions, the third by the cross product. Small columns keep their precision."""
+    """The rotation nearest to M (3, 3), as `geometry.nearest_rotation`: one-sided Jacobi rotations make the columns of `A = M V` orthogonal
+    (Hestenes, 1958), and R takes the two largest of them from V to their directions, the third by the cross product. Small columns keep their
+    precision."""
     A, V = M.copy(), np.eye(3)
     for _ in range(12):
         largest = 0.0

@@ -11,14 +11,14 @@ from trihedron.plugins.numerics.algebra.small_linear import solve_positive, turn
 
 @numba.njit(cache=True, nogil=True)
 def fit_shared_vertical(
-    directions: F64, information: F64, columns: I32, rotations: F64, prior: float, gate: float, iterations: int
+    directions: F64, information: F64, columns: I32, counted: int, rotations: F64, prior: float, gate: float, iterations: int
 ) -> tuple[F64, F64, float, float]:
     """Rotations (k, 3, 3) with one and the same third axis that best fit measured directions (n, 3), signs free.
 
     `columns` (n,) is 3 frame + axis, -1 takes no part; `information` (n, 3, 3) in 1/rad², zero along the direction. Gauss–Newton with Cauchy weights,
     one half at `gate` σ, over the tilt of the vertical about the first frame's two other axes and a turn of each frame about the vertical; `prior`
-    (1/rad²) holds what nothing tells. Returns the rotations, the information (2 + k, 2 + k) of these numbers, the weighted χ² and the weighted
-    number of its components."""
+    (1/rad²) holds what nothing tells. Returns the rotations, the information (2 + k, 2 + k) of these numbers, and of the first `counted` rows
+    the weighted χ² and the weighted number of its components."""
     frames = len(rotations)
     rotations, size = rotations.copy(), 2 + frames
     H, g, x = np.zeros((size, size)), np.zeros(size), np.zeros(size)
@@ -53,8 +53,9 @@ def fit_shared_vertical(
                     column = m if m < 2 else 2 + frame
                     H[row, column] += w * (J[0, j] * LJ[0, m] + J[1, j] * LJ[1, m] + J[2, j] * LJ[2, m])
                 g[row] += w * (LJ[0, j] * r[0] + LJ[1, j] * r[1] + LJ[2, j] * r[2])
-            chi2 += w * m2
-            components += 2.0 * w
+            if i < counted:
+                chi2 += w * m2
+                components += 2.0 * w
         if remaining == 0:
             break
         for k in range(size):

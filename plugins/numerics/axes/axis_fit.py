@@ -14,7 +14,7 @@ from trihedron.plugins.numerics.axes.mode_tests import NORMALS_PER_SAMPLE
 from trihedron.plugins.numerics.axes.sphere_modes import assign_axes, fit_rotation, subsample_normals
 
 NOTHING_KNOWN = np.radians(30.0) ** 2  # rad², variance of a rotation that was not measured
-BEFOREHAND = 2.0
+BEFOREHAND = 3.0
 NO_NORMALS, NO_LINES_M, NO_LINES_PX = (np.zeros(shape, np.float32) for shape in ((0, 0, 3), (0, 2, 3), (0, 2, 2)))
 
 
@@ -49,8 +49,8 @@ def _gathered(normals: F32, ends_m: F32, ends_px: F32, samples: int, per_px: flo
 
 
 def variance_scale(chi2: float, freedom: float) -> float:
-    """Of the variances assumed, by the residuals' χ² with so many degrees of freedom. The assumption counts like BEFOREHAND more, so that a scene where
-    little is seen keeps it, and one with many planes and edges tells by itself how true its walls are."""
+    """Of the variances assumed, by the residuals' χ² with so many degrees of freedom. The assumption counts like BEFOREHAND more: a scene that shows
+    little keeps it, one with many planes and edges tells by itself how true its walls are."""
     return (chi2 + BEFOREHAND) / (max(freedom, 0.0) + BEFOREHAND)
 
 
@@ -62,7 +62,7 @@ class AxisFit:
     normals_floor_deg: float = 0.5  # error of an axis however many normals it has
     plane_floor_deg: float = 0.3  # a wall's deviation from the axis
     line_floor_deg: float = 0.5  # an edge's
-    floor_deg: float = 0.1  # of the whole rotation
+    floor_deg: float = 0.05  # of the whole rotation
     gate: float = 2.0  # σ at which a plane or line counts half
     use_planes: bool = True
     use_lines: bool = True
@@ -80,7 +80,7 @@ class AxisFit:
         `taking_part` (3,) are fitted."""
         measured, information, on_axis = self.measured(R, axes, normals, segments, planes)
         on_axis[(on_axis >= 0) & ~taking_part[on_axis]] = -1
-        R, H, chi2, components = fit_rotation(measured, information, on_axis, R, self.gate, 5)
+        R, H, chi2, components = fit_rotation(measured, information, on_axis, len(measured) - 3, R, self.gate, 5)
         scale = variance_scale(chi2, components - 3.0)
         return R, np.linalg.inv(H / scale + np.eye(3) / NOTHING_KNOWN) + np.eye(3) * np.radians(self.floor_deg) ** 2
 

@@ -35,7 +35,7 @@ class ModeOptions:
     normals_floor_deg: float = 0.5  # error of an axis however many normals it has
     plane_floor_deg: float = 0.3  # a wall's deviation from the axis
     line_floor_deg: float = 0.5  # an edge's
-    floor_deg: float = 0.1  # of the whole rotation
+    floor_deg: float = 0.05  # of the whole rotation
     gate: float = 2.0  # σ at which a plane or line counts half
 
     def __post_init__(self) -> None:

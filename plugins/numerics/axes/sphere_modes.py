@@ -239,10 +239,12 @@ def assign_axes(directions: F64, R: F64, cone: float) -> I32:
 
 
 @numba.njit(cache=True, nogil=True)
-def fit_rotation(directions: F64, information: F64, axes: I32, R: F64, gate: float, iterations: int) -> tuple[F64, F64, float, float]:
+def fit_rotation(
+    directions: F64, information: F64, axes: I32, counted: int, R: F64, gate: float, iterations: int
+) -> tuple[F64, F64, float, float]:
     """Rotation whose columns `axes[i]` best fit measured directions (n, 3), signs free; rows with axis -1 take no part. `information` is (n, 3, 3) in
     1/rad², zero along the direction. Gauss–Newton on `R <- Exp(phi) R` with Cauchy weights, one half at `gate` σ. Returns R, the information of
-    phi (3, 3), the weighted χ² and the weighted number of its components."""
+    phi (3, 3), and of the first `counted` rows the weighted χ² and the weighted number of its components."""
     R = R.copy()
     H, g, r, v, phi = np.zeros((3, 3)), np.zeros(3), np.zeros(3), np.zeros(3), np.zeros(3)
     chi2, components = 0.0, 0.0
@@ -268,8 +270,9 @@ def fit_rotation(directions: F64, information: F64, axes: I32, R: F64, gate: flo
                 for k in range(3):
                     v[k] = L[k, 0] * ex[0] + L[k, 1] * ex[1] + L[k, 2] * ex[2]
                 _add_cross(a, v, w, H[:, j])
-            chi2 += w * m2
-            components += 2.0 * w
+            if i < counted:
+                chi2 += w * m2
+                components += 2.0 * w
         if remaining == 0:
             break
         for k in range(3):
