@@ -11,10 +11,9 @@ import numpy as np
 from trihedron.pipeline.registry import register
 from trihedron.pipeline.types import F64, Bool, ManhattanFrame, Normals, Planes, Segments
 from trihedron.plugins.numerics.axes.axis_fit import AxisFit, gather_directions
-from trihedron.plugins.numerics.axes.cube_symmetry import nearest_equivalent
-from trihedron.plugins.numerics.axes.minimal_frames import frames_through, same_axes, score_frames
+from trihedron.plugins.numerics.axes.minimal_frames import best_frame, frames_through
 from trihedron.plugins.numerics.axes.sphere_modes import assign_axes
-from trihedron.plugins.numerics.motion.procrustes import procrustes, square_angles
+from trihedron.plugins.numerics.motion.procrustes import inliers_and_spread, procrustes, square_angles
 
 
 @register("manhattan", "line_plane_ransac")
@@ -64,16 +63,14 @@ class LinePlaneRansac:
         R, covariance = self._fit(R, R, np.zeros((3, 4)), seen, segments, planes)
         axes = assign_axes(features.vectors, R, reach)
         axes[(axes >= 0) & ~seen[axes]] = -1
-        on, square = axes >= 0, square_angles(features.vectors, axes, R)
-        with np.errstate(invalid="ignore"):
-            spread = np.sqrt(np.bincount(axes[on], (features.share * square)[on], 3) / np.bincount(axes[on], features.share[on], 3))
+        inliers, spread = inliers_and_spread(square_angles(features.vectors, axes, R), axes, features.share)
         return ManhattanFrame(
             index=normals.index,
             stamp_ns=normals.stamp_ns,
             rotations=R[None],
             ids=np.zeros(1, np.int32),
             covariance=covariance[None],
-            inliers=np.bincount(axes[on], minlength=3).astype(np.int32)[None],
+            inliers=inliers[None],
             spread=spread[None],
             supported=supported,
         )
@@ -87,10 +84,7 @@ class LinePlaneRansac:
             vectors = np.concatenate([features.vectors, surface])
             reach = np.radians(np.repeat([self.reach_deg, self.normals_reach_deg], [len(features.vectors), len(surface)]))
             weights = np.concatenate([features.share, np.full(len(surface), 1.0 / max(len(surface), 1))])
-            score = score_frames(frames, vectors, weights, reach)
-            if loyal:
-                score *= np.where(same_axes(frames, start), self.loyalty, 1.0)
-            R = nearest_equivalent(frames[int(np.argmax(score))], start)
+            R = best_frame(frames, vectors, weights, reach, start, self.loyalty if loyal else 1.0)
             seen, supported = self._judged(features, R)
             if supported:
                 return R, seen, True

@@ -9,10 +9,9 @@ import numpy as np
 from trihedron.pipeline.registry import register
 from trihedron.pipeline.types import F64, I32, ManhattanFrame, Planes
 from trihedron.plugins.numerics.axes.axis_fit import NOTHING_KNOWN, variance_scale
-from trihedron.plugins.numerics.axes.cube_symmetry import nearest_equivalent
-from trihedron.plugins.numerics.axes.minimal_frames import frames_through, same_axes, score_frames
+from trihedron.plugins.numerics.axes.plane_axes import Walls, area_on_axes, known_walls, perpendicular_pair, settled
 from trihedron.plugins.numerics.axes.sphere_modes import assign_axes
-from trihedron.plugins.numerics.motion.procrustes import normal_covariance, procrustes, procrustes_covariance, square_angles
+from trihedron.plugins.numerics.motion.procrustes import inliers_and_spread, procrustes, procrustes_covariance, square_angles
 
 PRIOR = 1.0 / NOTHING_KNOWN  # 1/rad², weight of the previous rotation: holds the angles that no plane tells
 LARGEST_COS = 0.2  # of planes taken as perpendicular, however uncertain they are
@@ -48,60 +47,39 @@ class PlaneSvd:
         """One rotation with id 0; `inliers` counts planes, `spread` is their angle to the axis. `supported` is False where no two axes have planes: a
         single plane still tells two of the three angles."""
         start = np.eye(3) if previous is None else previous.rotations[0]
-        normals, spatial, variance, area = self._usable(planes)
-        enough = area >= self.min_share * planes.labels.size * planes.stride**2
-        R, supported = self._perpendicular(normals, area, variance, planes, start, previous is not None and previous.supported)
+        walls = known_walls(planes.coefficients, planes.covariance, planes.pixels, np.radians(self.plane_floor_deg))
+        enough = self.min_share * planes.labels.size * planes.stride**2
+        R, supported = self._perpendicular(walls, enough, start, previous is not None and previous.supported)
         if supported:
-            axes = self._axes(normals, R)
-            weights = 1.0 / variance
-            for _ in range(2):
-                R = procrustes(normals, weights, axes, R, PRIOR)
-                axes = self._axes(normals, R)
-                weights = 1.0 / (variance + square_angles(normals, axes, R) / self.gate**2)
+            R, axes, weights = settled(walls, R, np.radians(self.reach_deg), self.gate, PRIOR, 2)
         else:
-            alone = enough & (enough.sum() == 1)
-            axes, weights = np.where(alone, assign_axes(normals, start, np.pi), -1).astype(np.int32), 1.0 / variance
-            R = procrustes(normals, weights, axes, start, PRIOR)
-        square = square_angles(normals, axes, R)
-        scale = variance_scale(float((weights * square).sum()), 2.0 * np.count_nonzero(axes >= 0) - 3.0)
-        covariance = procrustes_covariance(spatial, weights, axes, R, PRIOR, scale) + np.eye(3) * np.radians(self.floor_deg) ** 2
-        on = axes >= 0
-        with np.errstate(invalid="ignore"):
-            spread = np.sqrt(np.bincount(axes[on], (area * square)[on], 3) / np.bincount(axes[on], area[on], 3))
+            R, axes, weights = _alone(walls, enough, start)
+        square = square_angles(walls.normals, axes, R)
+        scale = variance_scale(float(weights @ square), 2.0 * np.count_nonzero(axes >= 0) - 3.0)
+        covariance = procrustes_covariance(walls.spatial, weights, axes, R, PRIOR, scale) + np.eye(3) * np.radians(self.floor_deg) ** 2
+        inliers, spread = inliers_and_spread(square, axes, walls.area)
         return ManhattanFrame(
             index=planes.index,
             stamp_ns=planes.stamp_ns,
             rotations=R[None],
             ids=np.zeros(1, np.int32),
             covariance=covariance[None],
-            inliers=np.bincount(axes[on], minlength=3).astype(np.int32)[None],
+            inliers=inliers[None],
             spread=spread[None],
             supported=supported,
         )
 
-    def _axes(self, normals: F64, R: F64) -> I32:
-        return assign_axes(normals, R, np.radians(self.reach_deg))
+    def _perpendicular(self, walls: Walls, enough: float, start: F64, loyal: bool) -> tuple[F64, bool]:
+        """The rotation through the best pair of walls, named as is nearest to `start`, and whether enough of the scene stands on its axes."""
+        reach = np.radians(self.reach_deg)
+        found, R = perpendicular_pair(walls, self.max_cos, LARGEST_COS, reach, start, self.loyalty if loyal else 1.0)
+        area = area_on_axes(walls, R, reach) if found else np.zeros(3)
+        return R, bool((area >= enough).sum() >= 2 and area.sum() >= self.min_explained * walls.area.sum())
 
-    def _usable(self, planes: Planes) -> tuple[F64, F64, F64, F64]:
-        """Normals (n, 3), their covariances (n, 3, 3) and variances (n,), rad², and areas (n,), px, of the planes whose normals are known."""
-        spatial = normal_covariance(planes.coefficients, planes.covariance, np.radians(self.plane_floor_deg))
-        variance = 0.5 * (spatial[:, 0, 0] + spatial[:, 1, 1] + spatial[:, 2, 2])
-        good = np.isfinite(variance) & (variance > 0.0) & (planes.pixels > 0)
-        return planes.coefficients[good, :3], spatial[good], variance[good], planes.pixels[good].astype(np.float64)
 
-    def _perpendicular(self, normals: F64, area: F64, variance: F64, planes: Planes, start: F64, loyal: bool) -> tuple[F64, bool]:
-        """The rotation through the best pair of planes, named as is nearest to `start`, and whether enough of the scene stands on its axes."""
-        cosine = np.abs(normals @ normals.T)
-        limit = np.minimum(self.max_cos + 2.0 * np.sqrt(variance[:, None] + variance[None]), LARGEST_COS)
-        first, second = np.nonzero(np.triu(cosine <= limit, 1))
-        if len(first) == 0:
-            return start, False
-        swap = variance[second] < variance[first]  # the first axis is the better known
-        frames = frames_through(normals[np.where(swap, second, first)], normals[np.where(swap, first, second)])
-        score = score_frames(frames, normals, area, np.full(len(normals), np.radians(self.reach_deg)))
-        if loyal:
-            score *= np.where(same_axes(frames, start), self.loyalty, 1.0)
-        R = nearest_equivalent(frames[int(np.argmax(score))], start)
-        on_axis = np.bincount(self._axes(normals, R) + 1, area, 4)[1:]
-        enough = self.min_share * planes.labels.size * planes.stride**2
-        return R, bool((on_axis >= enough).sum() >= 2 and on_axis.sum() >= self.min_explained * area.sum())
+def _alone(walls: Walls, enough: float, start: F64) -> tuple[F64, I32, F64]:
+    """The rotation from `start` to a single large wall, and the axes and weights of all walls; nothing else than that one counts."""
+    large = walls.area >= enough
+    axes = np.where(large & (large.sum() == 1), assign_axes(walls.normals, start, np.pi), -1).astype(np.int32)
+    weights = 1.0 / walls.variance
+    return procrustes(walls.normals, weights, axes, start, PRIOR), axes, weights

@@ -15,7 +15,7 @@ from trihedron.plugins.numerics.axes.direction_information import isotropic_info
 from trihedron.plugins.numerics.axes.manhattan_modes import Directions, ModeFinder, Modes
 from trihedron.plugins.numerics.axes.mode_tests import NORMALS_PER_SAMPLE
 from trihedron.plugins.numerics.axes.sphere_modes import mode_statistics, orthonormal, search_axes, shift_axes
-from trihedron.plugins.numerics.axes.von_mises_fisher import AxisMixture, broad_mixture, improved
+from trihedron.plugins.numerics.axes.von_mises_fisher import AxisMixture, broad_mixture, converged
 
 
 @register("manhattan", "von_mises_fisher")
@@ -111,13 +111,7 @@ class VonMisesFisher:
     def _converged(self, mixture: AxisMixture, directions: Directions, free: bool) -> AxisMixture:
         """After expectation–maximisation with axes at right angles or free."""
         prior = np.radians(self.prior_spread_deg) ** -2
-        for _ in range(self.max_iterations):
-            before = mixture
-            mixture = improved(before, directions.vectors, directions.weights, directions.first_line, self.prior, prior, free)
-            step = np.linalg.norm(mixture.R - before.R) / np.sqrt(2.0)
-            if step < np.radians(self.tolerance_deg) and np.all(np.abs(mixture.concentration / before.concentration - 1.0) < 0.01):
-                break
-        return mixture
+        return converged(mixture, *directions, self.prior, prior, free, self.max_iterations, np.radians(self.tolerance_deg))
 
     def _strength(self, mixture: AxisMixture) -> F64:
         """(2, 3) concentrations; 0 of those that are too wide to be an axis."""

@@ -39,6 +39,18 @@ def solve_positive(H: F64, g: F64, x: F64) -> bool:
 
 
 @numba.njit(cache=True, nogil=True)
+def inverse_positive(H: F64) -> F64:
+    """Inverse of a symmetric positive definite H (n, n); zeros where it is none."""
+    n = len(H)
+    out, unit = np.empty((n, n)), np.zeros(n)
+    for k in range(n):
+        unit[k] = 1.0
+        solve_positive(H, unit, out[k])
+        unit[k] = 0.0
+    return out
+
+
+@numba.njit(cache=True, nogil=True)
 def turn_left(phi: F64, R: F64) -> None:
     """`R <- Exp(phi) R` in place, for the first three numbers of phi (Rodrigues)."""
     x, y, z = phi[0], phi[1], phi[2]
@@ -54,6 +66,17 @@ def turn_left(phi: F64, R: F64) -> None:
         R[0, c] = u + a * p + b * (y * r - z * q)
         R[1, c] = v + a * q + b * (z * p - x * r)
         R[2, c] = w + a * r + b * (x * q - y * p)
+
+
+@numba.njit(cache=True, nogil=True)
+def fill_tangent_basis(n: F64, out: F64) -> None:
+    """Write the columns of `geometry.tangent_basis` of a unit vector to the rows of `out` (2, 3)."""
+    x, y, z = n[0], n[1], n[2]
+    sign = 1.0 if z >= 0.0 else -1.0
+    a = -1.0 / (sign + z)
+    b = x * y * a
+    out[0, 0], out[0, 1], out[0, 2] = 1.0 + sign * x * x * a, sign * b, -sign * x
+    out[1, 0], out[1, 1], out[1, 2] = b, sign + y * y * a, -y
 
 
 @numba.njit(cache=True, nogil=True)

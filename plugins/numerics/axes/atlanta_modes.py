@@ -92,7 +92,8 @@ class AtlantaFinder:
 
     def _azimuths(self, directions: Directions, vertical: F64) -> tuple[F64, F64]:
         least = self.min_azimuth * float(directions.weights.sum())
-        return azimuth_modes(directions, vertical, self.finder.cone, self.apart, self.max_azimuths, least)
+        vertical = np.ascontiguousarray(vertical)
+        return azimuth_modes(*directions, vertical, self.finder.cone, self.apart, self.max_azimuths, least)
 
     def _shifted(self, directions: Directions, axes: F64) -> F64:
         f = self.finder

@@ -7,37 +7,53 @@ import numpy as np
 
 from trihedron.pipeline.geometry import exp_so3
 from trihedron.pipeline.types import F64, I32
-from trihedron.plugins.numerics.axes.manhattan_modes import Directions
 from trihedron.plugins.numerics.axes.mode_tests import NORMALS_PER_SAMPLE
 from trihedron.plugins.numerics.axes.sphere_modes import right_handed
 
 BINS = 90  # one degree each, of a quarter turn
-WINDOW = np.arange(-4, 5)  # bins about an azimuth that belong to it
+WINDOW = 4  # bins on each side of an azimuth that belong to it
 CONTRAST, SIGMA = 2.5, 3.0  # a mode has so many times what directions without order would, and so many of their standard deviations more
 QUARTER = 0.5 * np.pi
 
 
-def azimuth_modes(directions: Directions, vertical: F64, cone: float, apart: int, most: int, least: float) -> tuple[F64, F64]:
+@numba.njit(cache=True, nogil=True)
+def azimuth_modes(
+    vectors: F64, weights: F64, first_line: int, vertical: F64, cone: float, apart: int, most: int, least: float
+) -> tuple[F64, F64]:
     """Rotations (k, 3, 3) with the vertical as third column and a horizontal mode as first, heaviest first, and their weights (k,).
 
     Of the directions within `cone` (rad) of the horizontal; at most `most` modes, `apart` bins from each other, each of a weight of at least `least`
     and standing out from a uniform distribution of all that the heavier ones leave."""
-    base = right_handed(vertical)[:, [1, 2, 0]]
-    histogram, squares = _histograms(*directions, base, np.sin(cone), NORMALS_PER_SAMPLE)
-    share, rotations = len(WINDOW) / BINS, []
-    masses: list[float] = []
+    frame = right_handed(vertical)
+    base = np.stack((frame[:, 1], frame[:, 2], frame[:, 0]), axis=1)
+    histogram, squares = _histograms(vectors, weights, first_line, base, np.sin(cone), NORMALS_PER_SAMPLE)
+    share, rotations, masses, found = (2.0 * WINDOW + 1.0) / BINS, np.empty((most, 3, 3)), np.empty(most), 0
     for peak in _peaks(histogram, apart):
-        inside = histogram[(peak + WINDOW) % BINS]
+        inside, moment = 0.0, 0.0
+        for k in range(-WINDOW, WINDOW + 1):
+            inside += histogram[(peak + k) % BINS]
+            moment += k * histogram[(peak + k) % BINS]
         expected = share * histogram.sum()
         chance = expected + SIGMA * np.sqrt(share * (1.0 - share) * squares.sum())
-        if len(masses) == most or inside.sum() < max(least, CONTRAST * expected, chance):
+        if inside <= 0.0 or inside < max(least, CONTRAST * expected, chance):
             continue
-        masses.append(float(inside.sum()))
-        angle = (peak + 0.5 + float(inside @ WINDOW) / masses[-1]) * QUARTER / BINS
-        rotations.append(exp_so3(angle * vertical) @ base)
-        taken = (peak + np.arange(-apart, apart + 1)) % BINS
-        histogram[taken], squares[taken] = 0.0, 0.0
-    return np.array(rotations).reshape(-1, 3, 3), np.array(masses)
+        angle = (peak + 0.5 + moment / inside) * QUARTER / BINS
+        masses[found], rotations[found] = inside, _turned(base, angle)
+        found += 1
+        if found == most:
+            break
+        for k in range(-apart, apart + 1):
+            histogram[(peak + k) % BINS], squares[(peak + k) % BINS] = 0.0, 0.0
+    return rotations[:found], masses[:found]
+
+
+@numba.njit(cache=True, nogil=True)
+def _turned(base: F64, angle: float) -> F64:
+    """`base` (3, 3) turned about its third column."""
+    out, c, s = base.copy(), np.cos(angle), np.sin(angle)
+    for k in range(3):
+        out[k, 0], out[k, 1] = c * base[k, 0] + s * base[k, 1], c * base[k, 1] - s * base[k, 0]
+    return out
 
 
 @numba.njit(cache=True, nogil=True)
@@ -49,19 +65,27 @@ def _histograms(vectors: F64, weights: F64, first_line: int, base: F64, limit: f
         x, y, z, w = vectors[i, 0], vectors[i, 1], vectors[i, 2], weights[i]
         if abs(x * base[0, 2] + y * base[1, 2] + z * base[2, 2]) < limit:
             angle = np.arctan2(x * base[0, 1] + y * base[1, 1] + z * base[2, 1], x * base[0, 0] + y * base[1, 0] + z * base[2, 0])
-            k = int(np.floor(angle * BINS / (0.5 * np.pi))) % BINS
+            k = int(np.floor(angle * BINS / QUARTER)) % BINS
             histogram[k] += w
             squares[k] += w * (alike if i < first_line else w)
     return histogram, squares
 
 
-def _peaks(histogram: F64, apart: int) -> list[int]:
+@numba.njit(cache=True, nogil=True)
+def _peaks(histogram: F64, apart: int) -> I32:
     """Bins where the smoothed histogram is largest within `apart`, fullest first."""
-    smooth = np.convolve(np.tile(histogram, 3), len(WINDOW) // 2 + 1.0 - np.abs(WINDOW), "same")
-    around = np.lib.stride_tricks.sliding_window_view(smooth, 2 * apart + 1)[BINS - apart : 2 * BINS - apart].max(axis=1)
-    smooth = smooth[BINS : 2 * BINS]
-    top = np.flatnonzero((smooth >= around) & (smooth > 0.0))
-    return [int(k) for k in top[np.argsort(-smooth[top], kind="stable")]]
+    smooth, tops, found = np.zeros(BINS), np.empty(BINS, np.int32), 0
+    for i in range(BINS):
+        for k in range(-WINDOW, WINDOW + 1):
+            smooth[i] += (WINDOW + 1.0 - abs(k)) * histogram[(i - k) % BINS]
+    for i in range(BINS):
+        top = smooth[i] > 0.0
+        for k in range(-apart, apart + 1):
+            top = top and smooth[i] >= smooth[(i + k) % BINS]
+        if top:
+            tops[found] = i
+            found += 1
+    return tops[:found][np.argsort(-smooth[tops[:found]], kind="mergesort")]
 
 
 def named_azimuths(found: F64, known: F64, limit: float, furthest: float) -> tuple[F64, I32]:

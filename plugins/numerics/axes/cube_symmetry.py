@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from itertools import permutations, product
 
+import numba
 import numpy as np
 
 from trihedron.pipeline.types import F64
@@ -25,6 +26,23 @@ def _cube_rotations() -> F64:
 CUBE = _cube_rotations()  # (24, 3, 3)
 
 
+@numba.njit(cache=True, nogil=True)
 def nearest_equivalent(R: F64, reference: F64) -> F64:
     """Of the 24 rotations `R @ S` with the same axes up to order and sign, the one nearest to `reference`; (3, 3) each."""
-    return np.asarray(R @ CUBE[int(np.argmax(np.einsum("ij,nji->n", reference.T @ R, CUBE)))])
+    best, highest, relative, out = 0, -4.0, np.zeros((3, 3)), np.zeros((3, 3))
+    for i in range(3):
+        for j in range(3):
+            for k in range(3):
+                relative[i, j] += reference[k, i] * R[k, j]
+    for n in range(24):
+        trace = 0.0
+        for i in range(3):
+            for j in range(3):
+                trace += relative[i, j] * CUBE[n, j, i]
+        if trace > highest:
+            best, highest = n, trace
+    for i in range(3):
+        for j in range(3):
+            for k in range(3):
+                out[i, j] += R[i, k] * CUBE[best, k, j]
+    return out

@@ -6,6 +6,7 @@ import numba
 import numpy as np
 
 from trihedron.pipeline.types import F32, F64
+from trihedron.plugins.numerics.algebra.small_linear import fill_tangent_basis
 
 
 @numba.njit(cache=True, nogil=True)
@@ -20,7 +21,7 @@ def measured_directions(
     C, a = np.empty((2, 2)), np.empty((2, 3))
     for i in range(p):
         vectors[i] = planes[i, :3] if np.isfinite(planes[i, :3]).all() else np.full(3, np.nan)
-        _tangent_basis(vectors[i], a)
+        fill_tangent_basis(vectors[i], a)
         _inverse_in_tangent_plane(plane_covariance[i], plane_floor * plane_floor, a, information[i])
     for i in range(lines):
         d = vectors[p + i]
@@ -32,7 +33,7 @@ def measured_directions(
             d[:] = np.nan
             continue
         d /= np.sqrt(length2)
-        _tangent_basis(d, a)
+        fill_tangent_basis(d, a)
         C[:] = 0.0
         for u in range(2):
             for v in range(2):
@@ -51,17 +52,6 @@ def measured_directions(
 def isotropic_information(directions: F64, sigma: F64) -> F64:
     """(n, 3) directions known to `sigma` (n,) rad every way."""
     return (np.eye(3) - directions[:, :, None] * directions[:, None, :]) / (sigma * sigma)[:, None, None]
-
-
-@numba.njit(cache=True, nogil=True)
-def _tangent_basis(n: F64, out: F64) -> None:
-    """Write the columns of `geometry.tangent_basis` of a unit vector to the rows of `out` (2, 3)."""
-    x, y, z = n[0], n[1], n[2]
-    sign = 1.0 if z >= 0.0 else -1.0
-    a = -1.0 / (sign + z)
-    b = x * y * a
-    out[0, 0], out[0, 1], out[0, 2] = 1.0 + sign * x * x * a, sign * b, -sign * x
-    out[1, 0], out[1, 1], out[1, 2] = b, sign + y * y * a, -y
 
 
 @numba.njit(cache=True, nogil=True)

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from trihedron.pipeline.geometry import rotation_angle_deg
 from trihedron.pipeline.types import F64, I32
 from trihedron.plugins.numerics.axes.cube_symmetry import CUBE
+
+FURTHEST = np.cos(np.radians(63.0))  # two frames are at most 62.8° apart under the nearest of their names
 
 
 def symmetric_angles(found: F64, known: F64) -> F64:
@@ -30,15 +31,15 @@ def identified(found: F64, expected: F64, limit: float) -> I32:
 def turn_between(found: F64, before: F64, limit: float) -> F64:
     """(3, 3) turn Q of the camera after which most of the frames `before` (k, 3, 3) are found (f, 3, 3) again within `limit` rad, the smallest of
     these turns: frames keep their angles to each other when the camera jumps. The identity when there are none."""
-    best, turn = (0, 0.0), np.eye(3)
+    best, turn = (0, -1.0), np.eye(3)
     for one in found:
         for known in before:
             for name in CUBE:
                 Q = one @ name @ known.T
-                angle = rotation_angle_deg(Q)
-                if angle > 63.0:  # some name is nearer: 62.8° is the furthest two frames can be apart
+                cosine = 0.5 * (np.trace(Q) - 1.0)
+                if cosine < FURTHEST:  # some name is nearer
                     continue
-                rank = (int((identified(found, Q @ before, limit) >= 0).sum()), -angle)
+                rank = (int((identified(found, Q @ before, limit) >= 0).sum()), cosine)
                 if rank > best:
                     best, turn = rank, Q
     return turn

@@ -70,7 +70,7 @@ class ModeFinder:
     def follow(self, directions: Directions, planes: Planes, start: F64) -> Modes:
         """Mean shift from three starting axes (3, 3), and what it found; axes that are no modes stay where they started."""
         shift = (self.cone, self.bandwidth, self.max_iterations, self.tolerance)
-        return Modes(*_followed(*directions, np.ascontiguousarray(start), shift, *self._surfaces(planes), self._rules))
+        return Modes(*_followed(*directions, np.array(start), shift, *self._surfaces(planes), self._rules))
 
     def judged(self, modes: Modes, directions: Directions, planes: Planes | None) -> Modes:
         """The modes with those `seen` that are peaks at right angles, and whether these make a Manhattan frame; `planes` where they may take part."""

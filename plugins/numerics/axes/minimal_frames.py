@@ -6,6 +6,7 @@ import numba
 import numpy as np
 
 from trihedron.pipeline.types import F64, Bool
+from trihedron.plugins.numerics.axes.cube_symmetry import nearest_equivalent
 
 NEAR = np.radians(15.0)  # a frame turned less than this from the previous axes is still the same
 
@@ -45,6 +46,24 @@ def score_frames(frames: F64, directions: F64, weights: F64, reach: F64) -> F64:
     return out
 
 
+@numba.njit(cache=True, nogil=True)
 def same_axes(frames: F64, R: F64) -> Bool:
     """(m,) whether each axis of R (3, 3) is within `NEAR` of one of the frame (m, 3, 3)."""
-    return np.asarray((np.abs(np.swapaxes(frames, 1, 2) @ R).max(axis=1) > np.cos(NEAR)).all(axis=1))
+    out = np.ones(len(frames), np.bool_)
+    for m in range(len(frames)):
+        for j in range(3):
+            best = 0.0
+            for k in range(3):
+                best = max(best, abs(frames[m, 0, k] * R[0, j] + frames[m, 1, k] * R[1, j] + frames[m, 2, k] * R[2, j]))
+            out[m] = out[m] and best > np.cos(NEAR)
+    return out
+
+
+@numba.njit(cache=True, nogil=True)
+def best_frame(frames: F64, directions: F64, weights: F64, reach: F64, before: F64, loyalty: float) -> F64:
+    """The frame (3, 3) with the highest `score_frames`, named as is nearest to the previous axes `before` (3, 3); frames with the same axes as these
+    count `loyalty` times."""
+    score = score_frames(frames, directions, weights, reach)
+    if loyalty != 1.0:
+        score *= np.where(same_axes(frames, before), loyalty, 1.0)
+    return nearest_equivalent(frames[np.argmax(score)], before)

@@ -7,8 +7,8 @@ from typing import NamedTuple
 import numba
 import numpy as np
 
-from trihedron.pipeline.geometry import nearest_rotation
 from trihedron.pipeline.types import F64
+from trihedron.plugins.numerics.algebra.small_linear import polar_rotation
 
 LEAST, MOST = 5.0, 20000.0  # concentrations: 26° and 0.4° of standard deviation; below, 1/(1 − r) is not the concentration
 FAR = -30.0  # exponent of a density that is nothing
@@ -29,9 +29,10 @@ class AxisMixture(NamedTuple):
 def broad_mixture(R: F64, concentration: float) -> AxisMixture:
     """Where to start: nothing belongs anywhere yet."""
     none = np.zeros((2, 3))
-    return AxisMixture(R, np.full((2, 3), concentration), np.full((2, 4), 0.25), np.zeros((2, 3, 3)), none, none)
+    return AxisMixture(np.array(R), np.full((2, 3), concentration), np.full((2, 4), 0.25), np.zeros((2, 3, 3)), none, none)
 
 
+@numba.njit(cache=True, nogil=True)
 def improved(
     mixture: AxisMixture, directions: F64, weights: F64, first_line: int, prior: float, concentration: float, free: bool = False
 ) -> AxisMixture:
@@ -41,15 +42,47 @@ def improved(
     ±x·a_k`. As a priori knowledge each axis counts `prior` more directions of the given concentration. With `free` axes each of them maximises its
     own sum, at whatever angles to the others."""
     sums = _belonging(directions, weights, first_line, mixture.R, mixture.concentration, mixture.share)
-    number, weight, off, resultant = sums[:, :, 0], sums[:, :, 1], sums[:, :, 2], np.swapaxes(sums[:, :, 3:], 1, 2)
-    total = np.array([weights[:first_line].sum(), weights[first_line:].sum()])
-    mean = total / np.maximum([first_line, len(weights) - first_line], 1)  # weight of a direction
-    more = prior * np.maximum(mean, 1e-12)[:, None]
-    kappa = np.clip((weight + more) / (off + more / concentration), LEAST, MOST)
-    share = np.concatenate([weight, (total - weight.sum(axis=1))[:, None]], axis=1) + more
-    R = (kappa[:, None, :] * resultant).sum(axis=0) + 1e-6 * mixture.R
-    R = R / np.linalg.norm(R, axis=0) if free else nearest_rotation(R)
-    return AxisMixture(R, kappa, share / share.sum(axis=1, keepdims=True), resultant, number, weight)
+    kappa, share, resultant, M = np.empty((2, 3)), np.empty((2, 4)), np.empty((2, 3, 3)), 1e-6 * mixture.R
+    for kind in range(2):
+        own = weights[:first_line] if kind == 0 else weights[first_line:]
+        total, more = own.sum(), prior * max(own.sum() / max(len(own), 1), 1e-12)
+        share[kind, 3] = total + more
+        for k in range(3):
+            weight, off = sums[kind, k, 1], sums[kind, k, 2]
+            kappa[kind, k] = min(max((weight + more) / (off + more / concentration), LEAST), MOST)
+            share[kind, k] = weight + more
+            share[kind, 3] -= weight
+            for j in range(3):
+                resultant[kind, j, k] = sums[kind, k, 3 + j]
+                M[j, k] += kappa[kind, k] * resultant[kind, j, k]
+        share[kind] /= share[kind].sum()
+    if free:
+        for k in range(3):
+            M[:, k] /= np.sqrt((M[:, k] ** 2).sum())
+    R = M if free else polar_rotation(M)
+    return AxisMixture(R, kappa, share, resultant, sums[:, :, 0].copy(), sums[:, :, 1].copy())
+
+
+@numba.njit(cache=True, nogil=True)
+def converged(
+    mixture: AxisMixture,
+    directions: F64,
+    weights: F64,
+    first_line: int,
+    prior: float,
+    concentration: float,
+    free: bool,
+    most: int,
+    tolerance: float,
+) -> AxisMixture:
+    """After at most `most` steps; the last one turned the axes by less than `tolerance` (rad) and changed no concentration by a hundredth."""
+    for _ in range(most):
+        before = mixture
+        mixture = improved(before, directions, weights, first_line, prior, concentration, free)
+        moved = np.sqrt(0.5 * ((mixture.R - before.R) ** 2).sum())
+        if moved < tolerance and np.abs(mixture.concentration / before.concentration - 1.0).max() < 0.01:
+            break
+    return mixture
 
 
 @numba.njit(cache=True, nogil=True)

@@ -5,30 +5,44 @@ from __future__ import annotations
 import numba
 import numpy as np
 
-from trihedron.pipeline.geometry import nearest_rotation, tangent_basis
 from trihedron.pipeline.types import F64, I32
+from trihedron.plugins.numerics.algebra.small_linear import fill_tangent_basis, inverse_positive, polar_rotation
 
 
+@numba.njit(cache=True, nogil=True)
 def procrustes(directions: F64, weights: F64, axes: I32, R: F64, prior: float) -> F64:
     """`argmin Σ w |±n − R e|² + prior/2 Σ |R_before e − R e|²` over rotations (3, 3): directions n (n, 3) with weights (n,), each on the column
     `axes[i]` of R, signs as R has them; -1 takes no part. The small prior keeps what no direction tells."""
-    return nearest_rotation(0.5 * prior * R + _sums(directions, weights, axes, R))
+    return polar_rotation(0.5 * prior * R + _sums(directions, weights, axes, R))
 
 
+@numba.njit(cache=True, nogil=True)
 def procrustes_covariance(covariance: F64, weights: F64, axes: I32, R: F64, prior: float, scale: float) -> F64:
     """(3, 3) of phi in `R <- Exp(phi) R` for R from `procrustes`, when the directions have the 3D covariance C (n, 3, 3), which need not be that of
     the weights: `A⁻¹ (scale Σ w² [a]× C [a]×ᵀ + prior) A⁻¹` with `A = Σ w (1 − a aᵀ) + prior` and a the axis of each."""
     A, B = _normal_equations(covariance, weights, axes, R)
-    inverse = np.linalg.inv(A + prior * np.eye(3))
-    out = inverse @ (scale * B + prior * np.eye(3)) @ inverse
-    return np.asarray(0.5 * (out + out.T))
+    inverse, out = inverse_positive(A + prior * np.eye(3)), np.zeros((3, 3))
+    for i in range(3):
+        for j in range(3):
+            for k in range(3):
+                for m in range(3):
+                    out[i, j] += inverse[i, k] * (scale * B[k, m] + prior * (k == m)) * inverse[m, j]
+    return 0.5 * (out + out.T)
 
 
+@numba.njit(cache=True, nogil=True)
 def normal_covariance(planes: F64, covariance: F64, floor: float) -> F64:
-    """(n, 3, 3) covariance in 3D, rad², of the normals of planes (n, 4) with `covariance` of (a, b, d), see `types.Planes`; `floor` (rad) is added in
-    square."""
-    basis = tangent_basis(planes[:, :3])
-    return np.asarray(basis @ (covariance[:, :2, :2] + floor * floor * np.eye(2)) @ np.swapaxes(basis, 1, 2))
+    """(n, 3, 3) covariance in 3D, rad², of the normals of planes (n, 4) with `covariance` (n, 3, 3) of (a, b, d), see `types.Planes`; `floor` (rad)
+    is added in square."""
+    out, basis = np.zeros((len(planes), 3, 3)), np.empty((2, 3))
+    for i in range(len(planes)):
+        fill_tangent_basis(planes[i], basis)
+        for j in range(3):
+            for k in range(3):
+                for u in range(2):
+                    for v in range(2):
+                        out[i, j, k] += basis[u, j] * (covariance[i, u, v] + floor * floor * (u == v)) * basis[v, k]
+    return out
 
 
 @numba.njit(cache=True, nogil=True)
@@ -41,6 +55,19 @@ def square_angles(directions: F64, axes: I32, R: F64) -> F64:
             dot = directions[i, 0] * R[0, k] + directions[i, 1] * R[1, k] + directions[i, 2] * R[2, k]
             out[i] = max(1.0 - dot * dot, 0.0)
     return out
+
+
+@numba.njit(cache=True, nogil=True)
+def inliers_and_spread(square: F64, axes: I32, weights: F64) -> tuple[I32, F64]:
+    """(3,) number of the directions on each axis, and their root mean square angle, rad, by weight; NaN on an axis without. `square` from
+    `square_angles`."""
+    counts, sums = np.zeros(3, np.int32), np.zeros((2, 3))
+    for i in range(len(axes)):
+        if axes[i] >= 0:
+            counts[axes[i]] += 1
+            sums[0, axes[i]] += weights[i]
+            sums[1, axes[i]] += weights[i] * square[i]
+    return counts, np.where(sums[0] > 0.0, np.sqrt(sums[1] / np.maximum(sums[0], 1e-300)), np.nan)
 
 
 @numba.njit(cache=True, nogil=True)
