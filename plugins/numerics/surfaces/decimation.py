@@ -88,13 +88,12 @@ def _targets(u: int, mine: I32, vertices: F64, triangles: I32, border: Bool, bes
     if border[u]:
         found = beside[u].copy()
     else:
-        found = np.empty(2 * len(mine), np.int32)
+        found = np.empty(len(mine), np.int32)  # each neighbour of an inner vertex follows it in one triangle
         for i in range(len(mine)):
             k = 0
             while triangles[mine[i], k] != u:
                 k += 1
-            found[2 * i], found[2 * i + 1] = triangles[mine[i], (k + 1) % 3], triangles[mine[i], (k + 2) % 3]
-        found = np.unique(found)
+            found[i] = triangles[mine[i], (k + 1) % 3]
     far = np.empty(len(found))
     for i in range(len(found)):
         d = vertices[found[i]] - vertices[u]

@@ -12,7 +12,7 @@ from trihedron.plugins.numerics.surfaces.views import View
 
 NEAR_M, SIGMAS = 0.03, 3.0  # a point is seen where the depth read differs by no more than NEAR_M and SIGMAS standard deviations from its own
 UNSEEN = 128
-MOST = 64  # views; what one sees its neighbours see too
+MOST = 48  # views; what one sees its neighbours see too
 
 
 def vertex_normals(vertices: F64, triangles: I32) -> F64:

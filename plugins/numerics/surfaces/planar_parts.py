@@ -50,19 +50,18 @@ def planar_labels(vertices: F64, normals: F64, triangles: I32, opposite: I32, pl
     cosine = float(np.cos(np.radians(flat.angle_deg)))
     turned = normals[triangles].mean(axis=1)
     turned /= np.maximum(np.linalg.norm(turned, axis=1), 1e-12)[:, None]
-    area = triangle_areas(vertices, triangles)
+    area, middle = triangle_areas(vertices, triangles), vertices[triangles].mean(axis=1)
     labels = _on_planes(vertices, triangles, turned, planes, flat.distance_m, cosine)
-    labels = _large(labels, vertices, triangles, opposite, area, planes, flat)
-    middle = vertices[triangles].mean(axis=1)
+    labels = _large(labels, middle, opposite, area, planes, flat)
     seeds = np.argsort(-np.abs(_steadiness(turned, opposite)), kind="stable")
     grown, found = _grown(seeds, labels, middle, turned, area, opposite, flat.distance_m, cosine, flat.area_m2)
     planes = np.concatenate([planes, found])
-    labels = _large(grown, vertices, triangles, opposite, area, planes, flat)
+    labels = _large(grown, middle, opposite, area, planes, flat)
     planes = _fitted(labels, middle, area, planes)
     for _ in range(flat.rim):
         labels = _with_rim(labels, vertices, triangles, turned, opposite, planes, flat.rim_m)
     labels = _without_steps(labels, triangles, len(vertices), planes, np.bincount(labels + 1, area, len(planes) + 1)[1:])
-    return _large(_filled(labels, vertices, triangles, opposite, planes, flat), vertices, triangles, opposite, area, planes, flat), planes
+    return _large(_filled(labels, vertices, triangles, opposite, planes, flat), middle, opposite, area, planes, flat), planes
 
 
 @numba.njit(cache=True, nogil=True)
@@ -180,11 +179,11 @@ def _fitted(labels: I32, middle: F64, area: F64, planes: F64) -> F64:
     return out
 
 
-def _large(labels: I32, vertices: F64, triangles: I32, opposite: I32, area: F64, planes: F64, flat: Flatness) -> I32:
+def _large(labels: I32, middle: F64, opposite: I32, area: F64, planes: F64, flat: Flatness) -> I32:
     """The labels without the connected parts that are too small, or bent."""
     parts, count = connected(opposite, labels)
     total = np.bincount(parts, area, count)
-    bend = bends(parts, count, labels, vertices[triangles].mean(axis=1), area, planes)
+    bend = bends(parts, count, labels, middle, area, planes)
     return np.where((total[parts] >= flat.area_m2) & (bend[parts] <= flat.bend_per_m), labels, -1).astype(np.int32)
 
 
