@@ -12,8 +12,8 @@ from trihedron.pipeline.registry import register
 from trihedron.pipeline.types import F64, Bool, ManhattanFrame, Normals, Planes, Segments
 from trihedron.plugins.numerics.axes.axis_fit import AxisFit, gather_directions
 from trihedron.plugins.numerics.axes.minimal_frames import best_frame, frames_through
+from trihedron.plugins.numerics.axes.procrustes import inliers_and_spread, procrustes, square_angles
 from trihedron.plugins.numerics.axes.sphere_modes import assign_axes
-from trihedron.plugins.numerics.motion.procrustes import inliers_and_spread, procrustes, square_angles
 
 
 @register("manhattan", "line_plane_ransac")

@@ -10,8 +10,8 @@ from trihedron.pipeline.registry import register
 from trihedron.pipeline.types import F64, I32, ManhattanFrame, Planes
 from trihedron.plugins.numerics.axes.axis_fit import NOTHING_KNOWN, variance_scale
 from trihedron.plugins.numerics.axes.plane_axes import Walls, area_on_axes, known_walls, perpendicular_pair, settled
+from trihedron.plugins.numerics.axes.procrustes import inliers_and_spread, procrustes, procrustes_covariance, square_angles
 from trihedron.plugins.numerics.axes.sphere_modes import assign_axes
-from trihedron.plugins.numerics.motion.procrustes import inliers_and_spread, procrustes, procrustes_covariance, square_angles
 
 PRIOR = 1.0 / NOTHING_KNOWN  # 1/rad², weight of the previous rotation: holds the angles that no plane tells
 LARGEST_COS = 0.2  # of planes taken as perpendicular, however uncertain they are

@@ -9,8 +9,8 @@ import numpy as np
 
 from trihedron.pipeline.types import F64, I32
 from trihedron.plugins.numerics.axes.minimal_frames import best_frame, frames_through
+from trihedron.plugins.numerics.axes.procrustes import normal_covariance, procrustes, square_angles
 from trihedron.plugins.numerics.axes.sphere_modes import assign_axes
-from trihedron.plugins.numerics.motion.procrustes import normal_covariance, procrustes, square_angles
 
 
 class Walls(NamedTuple):

@@ -47,10 +47,10 @@ def motion_terms(tracks: Tracks, keypoints: Keypoints, segments: Segments, plane
     """What the tracks and the current features say about the motion. `rad_per_px` turns a key point's sigma_px into an angle; `floor_deg` is the
     least error of a plane's normal. Pairs that are not finite, or whose covariance is none, are left out."""
     step = max(-(-(len(tracks.keypoints) + 2 * len(tracks.segments)) // MOST), 1)
-    of_points = point_pairs(
-        tracks.keypoints[:, 1], tracks.points_m, tracks.sigma_m, keypoints.points_m, keypoints.sigma_px, keypoints.sigma_m, rad_per_px, step
-    )
-    of_lines = line_pairs(tracks.segments[:, 1], tracks.endpoints_m, segments.endpoints_m, segments.covariance_m2, rad_per_px, step)
+    points = tracks.keypoints[:, 1], tracks.points_m, tracks.sigma_m, keypoints.points_m, keypoints.sigma_px, keypoints.sigma_m
+    lines = tracks.segments[:, 1], tracks.endpoints_m, segments.endpoints_m, segments.covariance_m2
+    of_points = point_pairs(*map(np.array, points), rad_per_px, step)  # copies are alike in memory, so that the kernels are compiled once
+    of_lines = line_pairs(*map(np.array, lines), rad_per_px, step)
     rows = tracks.planes[:, 1]
     covariance = planes.covariance[rows] + tracks.plane_covariance
     covariance[:, :2, :2] += np.eye(2) * np.radians(floor_deg) ** 2
