@@ -40,7 +40,7 @@ class MeanShift(ModeOptions):
 
     def _modes(self, directions: Directions, planes: Planes, previous: ManhattanFrame | None, index: int) -> Modes:
         """Near the previous axes; from everywhere when there are none, they are old or nothing supports them."""
-        finder, start = self.finder, np.eye(3) if previous is None else previous.rotations[0]
+        finder, start = self.finder, np.eye(3) if previous is None else np.array(previous.rotations[0])
         near = finder.follow(directions, planes, start)
         if previous is not None and previous.supported and near.supported and index - previous.index <= self.max_age:
             return near

@@ -55,7 +55,7 @@ class KnownFrames:
         for k in np.flatnonzero(manhattan.inliers.any(axis=1)):
             row = []
             for i, R_world_manhattan in enumerate(self.R_world_manhattan):
-                named = nearest_equivalent(manhattan.rotations[k], R_world_camera.T @ R_world_manhattan)
+                named = nearest_equivalent(np.array(manhattan.rotations[k]), np.array(R_world_camera.T @ R_world_manhattan))
                 row.append(Sighting(i, named, manhattan.covariance[k], log_so3(R_world_camera.T @ R_world_manhattan @ named.T)))
             found.append((int(k), row))
         return found
