@@ -47,10 +47,12 @@ def motion_terms(tracks: Tracks, keypoints: Keypoints, segments: Segments, plane
     """What the tracks and the current features say about the motion. `rad_per_px` turns a key point's sigma_px into an angle; `floor_deg` is the
     least error of a plane's normal. Pairs that are not finite, or whose covariance is none, are left out."""
     step = max(-(-(len(tracks.keypoints) + 2 * len(tracks.segments)) // MOST), 1)
-    points = tracks.keypoints[:, 1], tracks.points_m, tracks.sigma_m, keypoints.points_m, keypoints.sigma_px, keypoints.sigma_m
-    lines = tracks.segments[:, 1], tracks.endpoints_m, segments.endpoints_m, segments.covariance_m2
-    of_points = point_pairs(*map(np.array, points), rad_per_px, step)  # copies are alike in memory, so that the kernels are compiled once
-    of_lines = line_pairs(*map(np.array, lines), rad_per_px, step)
+    copy = np.array  # copies are alike in memory, so that the kernels are compiled once
+    before, sigma, pairs = copy(tracks.points_m), copy(tracks.sigma_m), copy(tracks.keypoints[:, 1])
+    now, sigma_px, sigma_m = copy(keypoints.points_m), copy(keypoints.sigma_px), copy(keypoints.sigma_m)
+    of_points = point_pairs(pairs, before, sigma, now, sigma_px, sigma_m, rad_per_px, step)
+    lines, endpoints, noise = copy(tracks.segments[:, 1]), copy(segments.endpoints_m), copy(segments.covariance_m2)
+    of_lines = line_pairs(lines, copy(tracks.endpoints_m), endpoints, noise, rad_per_px, step)
     rows = tracks.planes[:, 1]
     covariance = planes.covariance[rows] + tracks.plane_covariance
     covariance[:, :2, :2] += np.eye(2) * np.radians(floor_deg) ** 2
@@ -61,8 +63,8 @@ def motion_terms(tracks: Tracks, keypoints: Keypoints, segments: Segments, plane
     basis[:, :3, :2] = tangent_basis(planes.coefficients[rows, :3])
     basis[:, 3, 2] = 1.0
     information = basis @ np.linalg.inv(covariance) @ np.swapaxes(basis, 1, 2) if len(rows) else np.zeros((0, 4, 4))
-    before, after, weight = (np.concatenate(pair) for pair in zip(of_points, of_lines))
-    return Terms(before, after, weight, coefficients, planes.coefficients[rows], information)
+    places = [np.concatenate(pair) for pair in zip(of_points, of_lines)]
+    return Terms(places[0], places[1], places[2], coefficients, planes.coefficients[rows], information)
 
 
 def solve_motion(terms: Terms, R: F64, sigma_deg: float, sigma_m: float) -> Motion:
