@@ -77,7 +77,7 @@ def test_the_tables_say_what_was_measured():
     assert report_cover([cover]).splitlines()[-1].split() == expected
     names = {"frame, ms": (50.0, 51.0), "memory, MB": (400.0, 440.0), "map, MB": (5.0, 35.0), "floor with landmarks, m²": (20.0, 100.0)}
     lines = report_growth([{"quantity": name, "values": values} for name, values in names.items()]).splitlines()
-    assert lines[2].split() == ["frame,", "ms", "50.0", "51.0", "+2.0", "%"]
+    assert lines[2].split() == ["frame,", "ms", "50.00", "51.00", "+2.0", "%"]
     assert lines[-1] == "Per new square metre of floor: 0.50 MB of memory, 0.38 MB of it the map"
 
 
