@@ -102,6 +102,8 @@ def graph_of(config: DictConfig) -> Graph:
     plugins = {slot: make_plugin(slot, config[slot]) for slot in wiring if slot in SLOTS and config.get(slot) is not None}
     if config.localise_only and "map" in plugins:
         plugins["map"] = plugin_class("map", "none")()
+        if hasattr(plugins.get("pose"), "submap_after"):  # a camera that is only localised begins no map of its own: it stays lost
+            plugins["pose"] = dataclasses.replace(plugins["pose"], submap_after=0)
     return build_graph(wiring, plugins, list(config.outputs))
 
 

@@ -121,6 +121,8 @@ class Keeper:
 
 def load_map(path: str) -> SavedMap:
     """Read a map file, checked. Raises RecordingError when it is missing, damaged, of another version or not a map."""
+    if not Path(path).is_file():
+        raise RecordingError(path, "there is no such map", SAVE_ONE)
     recording = Recording(path)
     if recording.metadata.get("kind") != "map":
         raise RecordingError(path, "is a recording, not a saved map", SAVE_ONE)

@@ -15,9 +15,10 @@ from trihedron.plugins.numerics.maps.association import Associated, associate, e
 from trihedron.plugins.numerics.maps.correction import apply_correction
 from trihedron.plugins.numerics.maps.culling import cull, cull_keyframe
 from trihedron.plugins.numerics.maps.landmarks import empty_map
-from trihedron.plugins.numerics.maps.local_window import current_submap, keyframes_of, newest_keyframes
+from trihedron.plugins.numerics.maps.local_window import current_submap, keyframes_of, local_window, newest_keyframes
 from trihedron.plugins.numerics.maps.merging import merge_lines, merge_planes, merge_points
 from trihedron.plugins.numerics.maps.submaps import submap_of, tied
+from trihedron.plugins.numerics.maps.visibility import visible_planes
 
 STALE = 0.25  # of the view change of a keyframe, that makes one after max_frames: a camera at rest adds none
 
@@ -119,7 +120,8 @@ class Covisibility:
         found = associate(map, frame.camera, pose.T_world_camera, keypoints, segments, planes, matches, self.line_sigma_px)
         map, row = insertion.add_keyframe(map, pose, frame.camera)
         view = insertion.View(row, frame.camera, pose.T_world_camera, pose.covariance)
-        map = self._seen(map, matches)
+        expected = self._planes_in_view(map, frame, pose, matches)
+        map = self._seen(map, matches, expected)
         map = insertion.insert_points(map, view, keypoints, found.points, found.new_points, self.memory)
         map = insertion.insert_lines(map, view, segments, found.lines, self._long(segments, found), self.line_sigma_px, self.memory)
         map = insertion.insert_planes(map, view, planes, found.planes, found.new_planes, self.plane_memory)
@@ -127,15 +129,22 @@ class Covisibility:
             map = merge_points(map, view, matches.visible_points, keypoints.metric)
             map = merge_lines(map, view, matches.visible_lines)
         map = merge_planes(map, row, self.merge_deg, self.merge_m)
-        map = cull(map, row, matches, self.trial, self.min_found)
+        map = cull(map, row, matches, expected, self.trial, self.min_found)
         return cull_keyframe(map, self.redundant, self.redundant_share)
 
-    def _seen(self, map: Map, matches: Matches | None) -> Map:
+    def _planes_in_view(self, map: Map, frame: Frame, pose: Pose, matches: Matches | None) -> I32:
+        """Planes seen about here that should be seen now, those that are among them."""
+        if matches is None:
+            return np.empty(0, np.int32)
+        around = local_window(map, pose.T_world_camera, 2, 10, 3, submap=pose.submap).planes
+        return np.union1d(visible_planes(map.planes, around, pose.T_world_camera, frame), matches.planes[:, 1]).astype(np.int32)
+
+    def _seen(self, map: Map, matches: Matches | None, planes: I32) -> Map:
         if matches is None:
             return map
         points = insertion.count_visible(map.points, matches.visible_points)
         lines = insertion.count_visible(map.lines, matches.visible_lines)
-        return replace(map, points=points, lines=lines, planes=insertion.count_visible(map.planes, np.unique(matches.planes[:, 1])))
+        return replace(map, points=points, lines=lines, planes=insertion.count_visible(map.planes, planes))
 
     def _long(self, segments: Segments, found: Associated) -> I32:
         """New segments long enough to be found again."""

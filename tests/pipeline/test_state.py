@@ -25,6 +25,7 @@ JOBS = {
     "first": ["dataset.frames=0:8", "save_map=map.mcap"],
     "rest": ["dataset.frames=8:14", "load_map=map.mcap", "threads=1"],
     "elsewhere": ["dataset.frames=10:12", "load_map=map.mcap", "save_map=again.mcap", "dataset.length=900"],
+    "nowhere": ["dataset.scene=corridor", "dataset.frames=0:20", "load_map=map.mcap", "localise_only=true"],
     "only": ["dataset.frames=10:12", "load_map=map.mcap", "localise_only=true", "save_map=only.mcap"],
 }
 RUN = """
@@ -77,6 +78,15 @@ def test_localising_leaves_the_map_alone(runs):
     assert load_map(str(runs / "again.mcap")).frame == 11
 
 
+def test_a_camera_that_is_only_localised_stays_lost_where_the_map_does_not_reach(runs):
+    """It begins no sub-map, after however many frames: nobody would keep it."""
+    poses = list(Recording(runs / "nowhere" / "run.mcap").values("pose"))
+    assert len(poses) == 20 and {(pose.status, pose.submap) for pose in poses} == {("lost", 0)}
+    metrics = json.loads((runs / "nowhere" / "metrics.json").read_text())
+    assert metrics["untied"] == 0 and metrics["status"]["lost"] == 20
+    assert (runs / "nowhere" / "trajectory.txt").read_text().count("\n") <= 1
+
+
 def test_a_replay_loads_the_map_again_and_saves_none(runs):
     assert contents(runs / "replayed" / "run.mcap", "pose", 0) == contents(runs / "elsewhere" / "run.mcap", "pose", 0)
     assert (runs / "again.mcap").stat().st_mtime < (runs / "only.mcap").stat().st_mtime
@@ -123,7 +133,7 @@ def test_a_file_that_is_no_map_of_this_version_is_refused(tmp_path):
             load_map(written(tmp_path / "a.mcap", metadata))
         assert str(error.value).startswith(f"{path}: {cause}")
     assert load_map(written(tmp_path / "a.mcap", {})).map.revision == 0
-    with pytest.raises(RecordingError, match="cannot be read: No such file"):
+    with pytest.raises(RecordingError, match="there is no such map; save one with"):
         load_map(str(tmp_path / "missing.mcap"))
 
 

@@ -48,7 +48,7 @@ class World:
         self.position, self.lines = transform(INTO_CORNER, self.position), transform(INTO_CORNER, self.lines)
 
     def frame(self, index):
-        depth = np.full((CAMERA.height // 8, CAMERA.width // 8), 2.5, np.float32)
+        depth = np.full((CAMERA.height, CAMERA.width), 2.5, np.float32)
         return Frame(index, index * 33_000_000, np.zeros((*depth.shape, 3), np.uint8), depth, CAMERA)
 
     def seen(self, T, index, farther=1.0):

@@ -16,12 +16,12 @@ def pose_of(T, index, status="ok", inliers=(0, 0, 0)):
     return Pose(index, index * 33_000_000, T, np.eye(6) * 1e-10, T, -1, np.array(inliers, np.int32), 0, status, "")
 
 
-def step(stage, world, map, index, at=None, features=None, bundle=None, loop=None, recognised=None, **pose):
+def step(stage, world, map, index, at=None, features=None, bundle=None, loop=None, recognised=None, frame=None, **pose):
     """The map after frame `index`, whose camera stands at step `at` of the path and is known exactly; None when the stage says None."""
     T = camera_at(index if at is None else at)
-    features = features or world.features(T, index)
-    matches = LocalMap()(world.frame(index), rotation_of(T, index), translation_of(T, index), *features, map, None)
-    return stage(world.frame(index), pose_of(T, index, **pose), *features, matches, map, bundle, loop, recognised)
+    features, frame = features or world.features(T, index), frame or world.frame(index)
+    matches = LocalMap()(frame, rotation_of(T, index), translation_of(T, index), *features, map, None)
+    return stage(frame, pose_of(T, index, **pose), *features, matches, map, bundle, loop, recognised)
 
 
 def walk(world, count, stage=EVERY, stride=1):

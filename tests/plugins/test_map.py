@@ -160,6 +160,26 @@ def test_a_point_that_is_not_found_again_dies_and_the_others_live():
     assert after.points.rows("alive", after.point_observations.column("point")[-40:]).all()
 
 
+@pytest.mark.parametrize("hidden", [False, True])
+def test_a_plane_that_is_not_found_again_dies_unless_something_hides_it(hidden):
+    """A wall that is entered once more, at half its distance: the camera sees through it, or, in the second case, no farther than 0.3 m."""
+    world, map = World(), None
+    for index in range(8):
+        T = camera_at(index)
+        keypoints, segments, planes = world.features(T, index)
+        if index == 0:
+            scale = {"coefficients": np.array([1.0, 1.0, 1.0, 0.5]), "samples_m": np.float32(0.5)}
+            columns = {name: getattr(planes, name) for name in ("coefficients", "covariance", "moments", "pixels", "samples_m")}
+            columns = {name: np.concatenate([column, column[:1] * scale.get(name, 1)]) for name, column in columns.items()}
+            planes = dataclasses.replace(planes, **columns)
+        frame = world.seen(T, index)
+        frame = dataclasses.replace(frame, depth_m=np.full_like(frame.depth_m, 0.3)) if hidden else frame
+        map = step(EVERY, world, map, index, features=(keypoints, segments, planes), frame=frame)
+    count = len(world.features(camera_at(0), 0)[2].coefficients)
+    assert list(map.planes.column("alive")[: count + 1]) == [True] * count + [hidden]
+    assert (map.planes.column("found")[:count] >= 7).all() and (map.planes.column("visible")[count] == 1) == hidden
+
+
 def test_twins_are_joined_and_their_observations_go_to_the_older():
     """Every point of the first keyframe is entered twice, the copy under an id of its own; so is every line."""
     world = World(noise=0.3)

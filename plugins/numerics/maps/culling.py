@@ -14,9 +14,9 @@ FARTHER = 1.2  # a landmark seen from at most this many times as far is seen as 
 KEPT = 4  # newest keyframes that are never redundant yet: the newest one's landmarks are still on trial
 
 
-def cull(map: Map, keyframe: int, matches: Matches | None, trial: int, min_found: float) -> Map:
-    """Kill points and lines that were expected by this keyframe, or born `trial` keyframes ago, and are found too seldom. Costs what is in view,
-    not what is in the map."""
+def cull(map: Map, keyframe: int, matches: Matches | None, planes: I32, trial: int, min_found: float) -> Map:
+    """Kill points and lines that were expected by this keyframe, or born `trial` keyframes ago, and `planes`, expected by it, that are found too
+    seldom. Costs what is in view, not what is in the map."""
     young = np.array([keyframe - trial], np.int32) if keyframe >= trial else np.empty(0, np.int32)
     changes: dict[str, Any] = {}
     for kind, visible in (("point", "visible_points"), ("line", "visible_lines")):
@@ -26,6 +26,9 @@ def cull(map: Map, keyframe: int, matches: Matches | None, trial: int, min_found
         seldom = (found < min_found * seen) | ((first == keyframe - trial) & (found < trial) & (seen >= trial))
         ids = ids[seldom]
         changes[f"{kind}s"] = table.updated(ids, alive=np.zeros(len(ids), np.bool_))
+    found, seen = map.planes.gathered(planes, "found", "visible")
+    ids = planes[found < min_found * seen]
+    changes["planes"] = map.planes.updated(ids, alive=np.zeros(len(ids), np.bool_))
     return replace(map, **changes)
 
 

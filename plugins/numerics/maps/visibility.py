@@ -7,10 +7,12 @@ from dataclasses import dataclass
 import numba
 import numpy as np
 
-from trihedron.pipeline.types import F32, F64, I32, U8, Bool, Camera, Table
+from trihedron.pipeline.geometry import invert, transform
+from trihedron.pipeline.types import F32, F64, I32, U8, Bool, Camera, Frame, Table
 from trihedron.plugins.numerics.algebra.constant_arrays import constant
 
 NEAR_M = 0.1
+HIDDEN_M, HIDDEN_SIGMAS = 0.1, 5.0  # of depth, by which something is in front
 MAX_SCALE_CHANGE = 2.0  # of the distance; beyond, a point does not look the same
 
 
@@ -60,6 +62,20 @@ def _seen(
             levels[n] = min(max(np.rint(octaves[i] + np.log(change) / log_scale), 0.0), 255.0)
             n += 1
     return rows[:n], pixels[:n], depth[:n], levels[:n]
+
+
+def visible_planes(planes: Table, ids: I32, T_world_camera: F64, frame: Frame) -> I32:
+    """Those of the planes `ids` that the camera should see from the side they were seen from: half their samples, or more, lie in the image, and the
+    frame's depth does not hide them."""
+    coefficients, samples = planes.gathered(ids, "coefficients", "samples_m")
+    local = transform(invert(T_world_camera), samples.astype(np.float64))
+    pixels = frame.camera.project(local)
+    inside = (local[..., 2] > NEAR_M) & in_image(pixels, frame.camera)
+    x, y = np.rint(np.where(inside[..., None], pixels, 0.0)).astype(int).transpose(2, 0, 1)
+    depth = frame.depth_m[y, x].astype(np.float64)
+    open_to = inside & (depth > 0.0) & (local[..., 2] < depth + HIDDEN_M + HIDDEN_SIGMAS * frame.camera.depth_noise.sigma_m(depth))
+    facing = coefficients[:, :3] @ T_world_camera[:3, 3] + coefficients[:, 3] > 0.0
+    return np.asarray(ids[facing & (open_to.sum(axis=1) >= 0.5 * np.isfinite(samples[..., 0]).sum(axis=1))], np.int32)
 
 
 def in_image(pixels: F64, camera: Camera) -> Bool:
