@@ -3,9 +3,11 @@
 A room is rendered at uniformly random orientations and goes through the default feature stages, with exact depth and with a Kinect's. Each estimator
 is asked twice: with no previous frame, and with one up to 10° off. An answer is right when it is claimed (`supported`) and within 1° of the true
 axes, by whichever of their 24 names; of several frames in view the nearest counts. The median error is that of what was claimed. A view counts for a
-case only when it shows, by its exact normals, what the case asks for. The last table holds views that show no Manhattan frame: every claim is false.
-mean_shift is also tried with normals alone and with lines alone. Times are of whole views with noisy depth, and as multiples of the reference
-workload of `trihedron benchmark` (ORB and LSD) on the same views.
+case only when it shows, by its exact normals, what the case asks for. The third table is about the covariance: the squared error in units of it, the
+median over that of χ² with three degrees of freedom. It is 1 when the covariance is right; estimators expect walls to be off by tenths of a degree,
+and these are not. The last table holds views that show no Manhattan frame: every claim is false. mean_shift is also tried with normals alone and with
+lines alone. Times are of whole views with noisy depth, and as multiples of the reference workload of `trihedron benchmark` (ORB and LSD) on the same
+views.
 
 Example: trihedron benchmark manhattan --orientations 100 --json family.json
 """
@@ -22,7 +24,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from trihedron.pipeline.errors import UsageError, did_you_mean
-from trihedron.pipeline.geometry import exp_so3
+from trihedron.pipeline.geometry import exp_so3, log_so3
 from trihedron.pipeline.registry import load_plugins, plugin_class, plugins_of
 from trihedron.pipeline.types import F64, ManhattanFrame
 from trihedron.plugins.numerics.axes.cube_symmetry import CUBE
@@ -30,6 +32,7 @@ from trihedron.tools import manhattan_views as seen
 from trihedron.tools.arguments import Parser, table
 
 START_DEG, RIGHT_DEG = 10.0, 1.0
+CHI2_MEDIAN = 2.366  # of χ² with three degrees of freedom
 STARTS = ("none", "near")
 ORIENTATIONS = range(1, 10_001)
 VARIANTS: dict[str, dict[str, bool]] = {  # of mean_shift
@@ -42,6 +45,7 @@ class Answer(NamedTuple):
     """What an estimator said of one view."""
 
     error_deg: float
+    square: float  # the error's, in units of the covariance
     claimed: bool
     ms: float
 
@@ -115,12 +119,13 @@ def _warm_up(chosen: dict[str, Any], scene: seen.Scene) -> None:
 def _ask(answers: Answers, chosen: dict[str, Any], depth: str, case: str, view: seen.View) -> None:
     for name, estimator in chosen.items():
         for start in STARTS:
-            inputs: dict[str, Any] = {"normals": view.normals, "segments": view.segments, "planes": view.planes}
-            inputs["previous"] = None if start == "none" else _start(view)
+            given: dict[str, Any] = {"normals": view.normals, "segments": view.segments, "planes": view.planes}
+            given["previous"] = None if start == "none" else _start(view)
+            inputs = seen.inputs_of(estimator, "manhattan", view.normals.index, given)
             began = time.perf_counter()
-            found = seen.called(estimator, "manhattan", view.normals.index, inputs)
+            found = estimator(**inputs)
             ms = 1e3 * (time.perf_counter() - began)
-            answers[name, depth, case, start].append(Answer(error_deg(found, view.truth), found is not None and found.supported, ms))
+            answers[name, depth, case, start].append(Answer(*error_of(found, view.truth), found is not None and found.supported, ms))
 
 
 def _start(view: seen.View) -> ManhattanFrame:
@@ -133,20 +138,24 @@ def _start(view: seen.View) -> ManhattanFrame:
     return ManhattanFrame(view.normals.index - 1, view.normals.stamp_ns - 33_333_333, R[None], ids, known, counts, spread, True)
 
 
-def error_deg(found: ManhattanFrame | None, truth: F64) -> float:
-    """Angle to the nearest of the 24 names of the true axes, of the nearest frame in view; 180 for none."""
-    rotations = found.rotations[found.inliers.sum(axis=1) > 0] if found is not None else []
-    if len(rotations) == 0:
-        return 180.0
-    traces = np.einsum("kji,jm,nmi->kn", rotations, truth, CUBE)
-    return float(np.degrees(np.arccos(np.clip((traces.max() - 1.0) / 2.0, -1.0, 1.0))))
+def error_of(found: ManhattanFrame | None, truth: F64) -> tuple[float, float]:
+    """Angle (deg) to the nearest of the 24 names of the true axes, of the nearest frame in view, and its square in units of that one's covariance;
+    180° and NaN for none."""
+    rows = np.flatnonzero(found.inliers.any(axis=1)) if found is not None else np.zeros(0, np.intp)
+    if found is None or len(rows) == 0:
+        return 180.0, float("nan")
+    traces = np.einsum("kji,jm,nmi->kn", found.rotations[rows], truth, CUBE)
+    k, name = np.unravel_index(int(np.argmax(traces)), traces.shape)
+    phi = log_so3(truth @ CUBE[name] @ found.rotations[rows[k]].T)
+    square = float(phi @ np.linalg.solve(found.covariance[rows[k]], phi))
+    return float(np.degrees(np.linalg.norm(phi))), square
 
 
 def figures(answers: Answers) -> list[dict[str, Any]]:
     """One row for each estimator, depth, case and start: shares of the views, errors of what was claimed (None without claims), times."""
     rows = []
     for (name, depth, case, start), found in answers.items():
-        error, claimed, ms = (np.array(column) for column in zip(*found))
+        error, square, claimed, ms = (np.array(column) for column in zip(*found))
         known = error[claimed]
         rows.append(
             {
@@ -159,6 +168,7 @@ def figures(answers: Answers) -> list[dict[str, Any]]:
                 "within_1_deg": float(np.mean(claimed & (error <= RIGHT_DEG))),
                 "median_deg": float(np.median(known)) if len(known) else None,
                 "p95_deg": float(np.percentile(known, 95)) if len(known) else None,
+                "normalised": float(np.median(square[claimed]) / CHI2_MEDIAN) if len(known) else None,
                 "p50_ms": float(np.median(ms)),
                 "p95_ms": float(np.percentile(ms, 95)),
             }
@@ -178,6 +188,11 @@ def report(rows: Sequence[dict[str, Any]], reference_ms: float) -> str:
             lines = [[name, *(_accuracy([cells[name, depth, case, start] for start in STARTS]) for case in cases)] for name in names]
             title = f"{depth.capitalize()} depth: share within 1° from no start and from up to 10° off, median error in degrees (views)"
             parts.append(title + "\n" + table([["estimator", *heads], *lines], "l" + "r" * len(cases)))
+    cases = [case for case in seen.CASES if any(key[1:3] == ("noisy", case) for key in cells)]
+    if cases:
+        lines = [[name, *(_normalised([cells[name, "noisy", case, start] for start in STARTS]) for case in cases)] for name in names]
+        title = "Noisy depth: squared error in units of the covariance, 1 when that is right"
+        parts.append(title + "\n" + table([["estimator", *cases], *lines], "l" + "r" * len(cases)))
     keys = [(depth, case) for case in seen.WITHOUT_FRAME for depth in seen.DEPTHS if (names[0], depth, case, "none") in cells]
     heads = [f"{case}, {depth} ({cells[names[0], depth, case, 'none']['views']})" for depth, case in keys]
     lines = []
@@ -194,6 +209,11 @@ def _accuracy(pair: Sequence[dict[str, Any]]) -> str:
     medians = [row["median_deg"] for row in pair if row["median_deg"] is not None]
     error = f"{np.mean(medians):.2f}" if medians else "   -"
     return " ".join([*(f"{row['within_1_deg']:.3f}" for row in pair), error])
+
+
+def _normalised(pair: Sequence[dict[str, Any]]) -> str:
+    known = [row["normalised"] for row in pair if row["normalised"] is not None]
+    return f"{np.mean(known):.2f}" if known else "-"
 
 
 def _claims(pair: Sequence[dict[str, Any]]) -> str:

@@ -157,10 +157,15 @@ def _features(frame: Frame) -> tuple[Normals, Segments, Planes]:
     return values["normals"], values["segments"], values["planes"]
 
 
-def called(plugin: Any, slot: str, index: int, inputs: dict[str, Any]) -> Any:
+def called(plugin: Any, slot: str, index: int, given: dict[str, Any]) -> Any:
     """Call a stage with those of the inputs that it takes, and with the randomness of its frame."""
-    inputs = {**inputs, "rng": np.random.default_rng([0, index])}
-    return plugin(**{name: inputs[name] for name in parameters_of_method(slot, type(plugin))})
+    return plugin(**inputs_of(plugin, slot, index, given))
+
+
+def inputs_of(plugin: Any, slot: str, index: int, given: dict[str, Any]) -> dict[str, Any]:
+    """Those of the inputs that a stage takes, and the randomness of its frame if it asks for it."""
+    given = {**given, "rng": np.random.default_rng([0, index])}
+    return {name: given[name] for name in parameters_of_method(slot, type(plugin))}
 
 
 def case_of(view: View, case: str) -> View | None:

@@ -104,9 +104,9 @@ class Projection:
         if previous is not None and previous.index == previous_index and previous.index > previous.previous_index:
             share = gap / (previous.index - previous.previous_index)
             found.append(exp_so3(share * log_so3(previous.R_current_previous)))
-        if manhattan is not None and previous_manhattan is not None and manhattan.supported and previous_manhattan.supported:
-            relative = manhattan.rotations[0] @ previous_manhattan.rotations[0].T
-            if previous_manhattan.index == previous_index and all(rotation_angle_deg(relative @ R.T) > self.prior_deg for R in found):
+        if manhattan is not None and previous_manhattan is not None and previous_manhattan.index == previous_index:
+            relative = _turn(manhattan, previous_manhattan)
+            if relative is not None and all(rotation_angle_deg(relative @ R.T) > self.prior_deg for R in found):
                 found.append(relative)
         return found or [np.eye(3)]
 
@@ -180,6 +180,15 @@ class Projection:
             plane_covariance=before.planes.covariance[planes[:, 0]],
             R_current_previous=R,
         )
+
+
+def _turn(now: ManhattanFrame, before: ManhattanFrame) -> F64 | None:
+    """(3, 3) R_current_previous by the best supported Manhattan frame that both have in view, under the same id; None when there is none."""
+    if not (now.supported and before.supported):
+        return None
+    seen = {int(before.ids[k]): k for k in np.flatnonzero(before.inliers.any(axis=1))}
+    both = [k for k in np.flatnonzero(now.inliers.any(axis=1)) if int(now.ids[k]) in seen]
+    return now.rotations[both[0]] @ before.rotations[seen[int(now.ids[both[0]])]].T if both else None
 
 
 def _pairs(found: I32) -> I32:

@@ -85,6 +85,30 @@ def test_turn_of_nine_degrees_needs_a_prediction_and_any_will_do(room):
     assert all(rotation_angle_deg(found.R_current_previous @ T[:3, :3]) < 0.1 for found in guided)
 
 
+def test_of_several_manhattan_frames_those_with_one_id_are_compared(room):
+    world, rng = room(), np.random.default_rng(3)
+    T, other = pose([0.0, 9.0, 2.0], [0.02, 0.0, 0.01]), exp_so3(np.radians([0.0, 30.0, 0.0]))
+    nothing = world.see(T, 6, rng, points=False, lines=False, walls=False)
+    before = world.see(START, 5, rng)
+
+    def two(R, index, order, seen=(9, 9)):
+        frames = [world.manhattan(R, index, rng, 0.01), world.manhattan(R, index, rng, 0.01, axes=other)]
+        columns = {name: np.concatenate([getattr(frames[k], name) for k in order]) for name in ("rotations", "covariance", "spread")}
+        inliers = np.repeat(np.array(seen, np.int32)[list(order), None], 3, axis=1)
+        return replace(frames[0], **columns, inliers=inliers, ids=np.array(order, np.int32))
+
+    def off_deg(now, then):
+        return rotation_angle_deg(track(world, nothing, before, (now, then)).R_current_previous @ T[:3, :3])
+
+    for order in ((0, 1), (1, 0)):  # the best supported comes first
+        assert off_deg(two(T[:3, :3], 6, order), two(START[:3, :3], 5, (0, 1))) < 0.2
+    out_of_sight = two(START[:3, :3], 5, (0, 1), seen=(0, 9))
+    lied = replace(out_of_sight, rotations=out_of_sight.rotations[[1, 1]])
+    assert off_deg(two(T[:3, :3], 6, (0, 1)), lied) < 0.2
+    alone = two(T[:3, :3], 6, (0, 1), seen=(9, 0))
+    assert off_deg(alone, lied) == pytest.approx(rotation_angle_deg(T[:3, :3]), abs=1e-3)  # none in common: no turn
+
+
 def test_constant_velocity_is_scaled_to_the_gap(room):
     world, rng = room(), np.random.default_rng(4)
     step = exp_so3(np.radians([0.0, 2.0, 0.0]))

@@ -12,7 +12,7 @@ from trihedron.pipeline.types import ManhattanFrame
 from trihedron.plugins.manhattan.branch_and_bound import BranchAndBound
 from trihedron.plugins.numerics.axes.cube_symmetry import CUBE
 from trihedron.tools import manhattan_views as seen
-from trihedron.tools.manhattan_family import error_deg, estimators, figures, measure
+from trihedron.tools.manhattan_family import error_of, estimators, figures, measure
 
 
 def frame(*rotations, inliers=9):
@@ -32,9 +32,10 @@ def scenes():
 def test_the_error_knows_no_names_of_axes_and_only_frames_in_view():
     truth = exp_so3(np.array([0.3, -1.2, 0.4]))
     for S in CUBE:
-        assert error_deg(frame(exp_so3(np.radians([0.0, 2.0, 0.0])) @ truth @ S), truth) == pytest.approx(2.0, abs=1e-6)
-    assert error_deg(None, truth) == 180.0 == error_deg(frame(truth, inliers=0), truth)
-    assert error_deg(frame(np.eye(3), truth), truth) == pytest.approx(0.0, abs=1e-5)
+        degrees, square = error_of(frame(exp_so3(np.radians([0.0, 2.0, 0.0])) @ truth @ S), truth)
+        assert degrees == pytest.approx(2.0, abs=1e-6) and square == pytest.approx(np.radians(2.0) ** 2)  # its covariance is 1
+    assert error_of(None, truth)[0] == 180.0 == error_of(frame(truth, inliers=0), truth)[0]
+    assert error_of(frame(np.eye(3), truth), truth)[0] == pytest.approx(0.0, abs=1e-5)
 
 
 def test_no_two_surfaces_of_the_leaning_room_are_at_right_angles(scenes):
