@@ -13,8 +13,10 @@ from trihedron.plugins.numerics.axes.atlanta_fit import fit_shared_vertical, sha
 from trihedron.plugins.numerics.axes.atlanta_modes import NONE, AtlantaFinder, AtlantaModes
 from trihedron.plugins.numerics.axes.axis_fit import NOTHING_KNOWN, AxisFit, gather_directions, variance_scale
 from trihedron.plugins.numerics.axes.frame_identities import missing, remembered
-from trihedron.plugins.numerics.axes.lost_frames import lost_frames
-from trihedron.plugins.numerics.axes.manhattan_modes import ModeFinder
+from trihedron.plugins.numerics.axes.manhattan_modes import Directions, ModeFinder
+from trihedron.plugins.numerics.axes.several_frames import lost_frames, seen_frames
+
+NOBODY = np.zeros(0, np.int32)
 
 
 @register("manhattan", "atlanta")
@@ -70,37 +72,25 @@ class Atlanta:
         """Rotations with one vertical as their third column, the best supported first, then those known but out of sight: without inliers, with a
         covariance that says nothing. `supported` is False when no horizontal direction stands at right angles to the vertical or to another."""
         directions = gather_directions(normals.normals, segments, self.samples, self.line_weight_per_px)
-        known, ids = _sharing(previous)
         recent = previous is not None and previous.supported and normals.index - previous.index <= self.max_age
-        if previous is not None and recent and np.count_nonzero(previous.inliers.any(axis=1)) == 1:
-            known, ids = self._atlanta.better_vertical(directions, known, ids)
+        known, ids = self._known(directions, previous, recent)
         modes = self._atlanta.near(directions, planes, known) if recent else NONE
         if not modes.supported:
             modes = self._atlanta.search(directions, planes, None if previous is None else known)
         if not modes.supported:
             return lost_frames(self._atlanta.finder.follow(directions, planes, known[0]), self._fit, segments, planes, normals, known, ids)
         rotations, covariance = self._fitted(modes, segments, planes)
-        first = np.argsort(-modes.weights * np.where(modes.rows == 0, self.loyalty, 1.0), kind="stable")
-        rows, seen = modes.rows[first], len(first)
-        out = remembered(missing(rows, len(known)), ids, self.max_azimuths - seen) if previous is not None else np.zeros(0, np.int32)
-        again = int(np.argmax(rows >= 0))
-        turn = rotations[first[again]] @ known[max(rows[again], 0)].T  # keeps their angles to what is seen
-        unseen = (turn @ known)[out]
-        unseen = np.array([shared_vertical(rotations[0], R) for R in unseen]).reshape(-1, 3, 3)
-        square = modes.normals[:, 1] * modes.normals[:, 2] + modes.lines[:, 1] * modes.lines[:, 2]
-        spread = np.where(modes.seen, np.sqrt(square / np.maximum(modes.normals[:, 1] + modes.lines[:, 1], 1e-9)), np.nan).reshape(-1, 3)
-        inliers = np.where(modes.seen, modes.normals[:, 0] + modes.lines[:, 0], 0.0).reshape(-1, 3)
-        nothing = np.zeros((len(out), 3))
-        return ManhattanFrame(
-            index=normals.index,
-            stamp_ns=normals.stamp_ns,
-            rotations=np.concatenate([rotations[first], unseen]),
-            ids=np.concatenate([np.where(rows >= 0, ids[rows], ids.max() + np.cumsum(rows < 0)), ids[out]]).astype(np.int32),
-            covariance=np.concatenate([covariance[first], np.tile(np.eye(3) * NOTHING_KNOWN, (len(out), 1, 1))]),
-            inliers=np.concatenate([inliers[first], nothing]).astype(np.int32),
-            spread=np.concatenate([spread[first], nothing * np.nan]),
-            supported=True,
-        )
+        order = np.argsort(-modes.weights * np.where(modes.rows == 0, self.loyalty, 1.0), kind="stable")
+        rows, rotations = modes.rows[order], rotations[order]
+        unseen = remembered(missing(rows, len(known)), ids, self.max_azimuths - len(rows)) if previous is not None else NOBODY
+        expected = _beside(rotations, rows, known, unseen)
+        return seen_frames(normals, rotations, covariance[order], modes.inliers[order], modes.spread[order], rows, ids, unseen, expected)
+
+    def _known(self, directions: Directions, previous: ManhattanFrame | None, recent: bool) -> tuple[F64, I32]:
+        """The rotations (k, 3, 3) known and their ids; while a single one is in view another of its axes may turn out to be the vertical."""
+        known, ids = _sharing(previous)
+        alone = previous is not None and np.count_nonzero(previous.inliers.any(axis=1)) == 1
+        return self._atlanta.better_vertical(directions, known, ids) if alone and recent else (known, ids)
 
     def _fitted(self, modes: AtlantaModes, segments: Segments, planes: Planes) -> tuple[F64, F64]:
         """(k, 3, 3) rotations fitted together to all that stands on the axes seen, and the covariance of phi of each."""
@@ -148,3 +138,10 @@ def _sharing(previous: ManhattanFrame | None) -> tuple[F64, I32]:
     vertical = previous.rotations[:, :, 2]
     same = vertical @ vertical[0] > 1.0 - 1e-9  # another estimator's frames need not have it
     return previous.rotations[same], previous.ids[same]
+
+
+def _beside(rotations: F64, rows: I32, known: F64, unseen: I32) -> F64:
+    """(u, 3, 3) where those of the `known` that are out of sight must be: turned like the first one seen again, with the vertical of all."""
+    again = int(np.argmax(rows >= 0))
+    turn = rotations[again] @ known[max(rows[again], 0)].T
+    return np.array([shared_vertical(rotations[again], turn @ R) for R in known[unseen]]).reshape(-1, 3, 3)

@@ -4,18 +4,19 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 
 from trihedron.pipeline.registry import register
 from trihedron.pipeline.types import F64, ManhattanFrame, Normals, Planes, Segments
-from trihedron.plugins.numerics.axes.axis_fit import NOTHING_KNOWN, AxisFit, gather_directions
+from trihedron.plugins.numerics.axes.axis_fit import AxisFit, gather_directions
 from trihedron.plugins.numerics.axes.cube_symmetry import nearest_equivalent
 from trihedron.plugins.numerics.axes.frame_identities import identified, missing, remembered, turn_between
 from trihedron.plugins.numerics.axes.frame_mixture import Found, FrameMixture
-from trihedron.plugins.numerics.axes.lost_frames import lost_frames, mode_spread
 from trihedron.plugins.numerics.axes.manhattan_modes import ModeFinder
+from trihedron.plugins.numerics.axes.several_frames import lost_frames, mode_spread, seen_frames
+
+NOBODY = np.zeros(0, np.int32)
 
 
 @register("manhattan", "mixture")
@@ -76,23 +77,16 @@ class Mixture:
         found = self._recognised(found, turn @ known)
         if not found:
             return lost_frames(self._frames.finder.follow(directions, planes, known[0]), self._fit, segments, planes, normals, known, ids)
-        rows = np.array([one.row for one in found])
-        unseen: Any = [] if previous is None else remembered(missing(rows, len(known)), ids, self.max_frames - len(found))
+        rows = np.array([one.row for one in found], np.int32)
+        unseen = remembered(missing(rows, len(known)), ids, self.max_frames - len(found)) if previous is not None else NOBODY
         fits = [self._fit(one.R, one.modes.axes, one.modes.normals, np.ones(3, np.bool_), segments, planes) for one in found]
+        rotations, covariance = (np.array(values) for values in zip(*fits))
         if rows.max() >= 0:  # with the fitted rotation, so that what is out of sight keeps its angles to it over many frames
             again = int(np.argmax(rows >= 0))
-            turn = fits[again][0] @ known[rows[again]].T
-        nothing = np.zeros((len(unseen), 3))
-        return ManhattanFrame(
-            index=normals.index,
-            stamp_ns=normals.stamp_ns,
-            rotations=np.concatenate([[R for R, _ in fits], (turn @ known)[unseen]]),
-            ids=np.concatenate([np.where(rows >= 0, ids[rows], ids.max() + np.cumsum(rows < 0)), ids[unseen]]).astype(np.int32),
-            covariance=np.concatenate([[C for _, C in fits], np.tile(np.eye(3) * NOTHING_KNOWN, (len(unseen), 1, 1))]),
-            inliers=np.concatenate([[one.modes.normals[:, 0] + one.modes.lines[:, 0] for one in found], nothing]).astype(np.int32),
-            spread=np.concatenate([[mode_spread(one.modes) for one in found], nothing * np.nan]),
-            supported=True,
-        )
+            turn = rotations[again] @ known[rows[again]].T
+        inliers = np.array([one.modes.normals[:, 0] + one.modes.lines[:, 0] for one in found])
+        spread = np.array([mode_spread(one.modes) for one in found])
+        return seen_frames(normals, rotations, covariance, inliers, spread, rows, ids, unseen, (turn @ known)[unseen])
 
     def _turn(self, followed: list[Found], found: list[Found], known: F64) -> F64:
         """(3, 3) how the known frames (k, 3, 3) have turned: with the heaviest followed, unless another turn makes more of those found known ones."""

@@ -39,6 +39,18 @@ class AtlantaModes(NamedTuple):
         return np.asarray(((self.normals[:, 1] + self.lines[:, 1]) * self.seen).reshape(-1, 3)[:, :2].sum(axis=1))
 
 
+    @property
+    def inliers(self) -> F64:
+        """(k, 3) directions on each axis seen."""
+        return np.where(self.seen, self.normals[:, 0] + self.lines[:, 0], 0.0).reshape(-1, 3)
+
+    @property
+    def spread(self) -> F64:
+        """(k, 3) rad; NaN of axes that are not seen."""
+        weight, square = (self.normals[:, 1] + self.lines[:, 1], self.normals[:, 1] * self.normals[:, 2] + self.lines[:, 1] * self.lines[:, 2])
+        return np.where(self.seen, np.sqrt(square / np.maximum(weight, 1e-9)), np.nan).reshape(-1, 3)
+
+
 NONE = AtlantaModes(np.zeros((0, 3, 3)), np.zeros(0, np.int32), np.zeros((3, 0)), np.zeros((0, 4)), np.zeros((0, 4)), np.zeros(0, np.bool_))
 
 

@@ -1,4 +1,4 @@
-"""What is left of several frames when none of them is seen."""
+"""What an estimator of several frames says: of those it sees, and of those it knows but does not see."""
 
 from __future__ import annotations
 
@@ -29,6 +29,26 @@ def lost_frames(modes: Modes, fit: AxisFit, segments: Segments, planes: Planes, 
         inliers=inliers,
         spread=spread,
         supported=False,
+    )
+
+
+def seen_frames(
+    normals: Normals, rotations: F64, covariance: F64, inliers: F64, spread: F64, rows: I32, ids: I32, unseen: I32, expected: F64
+) -> ManhattanFrame:
+    """The frames seen, (k, 3, 3) with their covariances, inliers (k, 3) and spread (k, 3), then those out of sight, where they are `expected`
+    (u, 3, 3): without inliers, with a covariance that says nothing.
+
+    `rows` (k,) and `unseen` (u,) say which of the known frames, with `ids`, they are; -1 is a new one and gets a number of its own."""
+    nothing = np.zeros((len(unseen), 3))
+    return ManhattanFrame(
+        index=normals.index,
+        stamp_ns=normals.stamp_ns,
+        rotations=np.concatenate([rotations, expected.reshape(-1, 3, 3)]),
+        ids=np.concatenate([np.where(rows >= 0, ids[rows], ids.max() + np.cumsum(rows < 0)), ids[unseen]]).astype(np.int32),
+        covariance=np.concatenate([covariance, np.tile(np.eye(3) * NOTHING_KNOWN, (len(unseen), 1, 1))]),
+        inliers=np.concatenate([inliers, nothing]).astype(np.int32),
+        spread=np.concatenate([spread, nothing * np.nan]),
+        supported=True,
     )
 
 
