@@ -16,7 +16,7 @@ from trihedron.plugins.numerics.depth.organised_grid import Grid
 LEAST = np.radians(0.4)  # disagreement of normals and plane that is looked into
 SOME = 2000
 WIDE, NARROW = np.cos(np.radians([15.0, 8.0]))  # normals further from their mean, then from that of these, are of a patch across a step
-SMALLER = 0.5  # each of the two planes must disagree by less than this share of what the one did
+SMALLER = 0.5  # the larger of the two planes must disagree by less than this share of what the one did, the smaller by less at all
 SHARE = 0.1  # of the cells that the smaller of the two must have
 REACH = 2  # cells on each side that distances are averaged over
 ROUNDS = 10  # of two means
@@ -40,12 +40,13 @@ def larger_surface(q: F64, grid: Grid, cells: I32, member: Bool) -> tuple[F64, i
         other += member[k] and not further[k]
     if min(one, other) < SHARE * members:
         return q, members, none
-    first, second = _fitted(grid, cells, member & further), _fitted(grid, cells, member & ~further)
-    if not max(_angle(first, normal), _angle(second, normal)) < SMALLER * apart:
+    first = _fitted(grid, cells, member & (further == (one >= other)))
+    second = _fitted(grid, cells, member & (further != (one >= other)))
+    if not (_angle(first, normal) < SMALLER * apart and _angle(second, normal) < apart):
         return q, members, none
     for k in range(len(cells)):
         member[k] = member[k] and further[k] == (one >= other)
-    return (first, one, second) if one >= other else (second, other, first)
+    return first, max(one, other), second
 
 
 @numba.njit(cache=True, nogil=True)

@@ -28,7 +28,7 @@ class PlanarRegions:
     gate: float = 3.0  # σ_z of a member's depth
     turn: float = 0.5  # a region whose normals turn by more than this share of the cone's half angle is curved
     border_px: int = 16  # grown into whatever the normals say
-    merge: float = 0.5  # rms distance, in σ_z, of a region from the common plane of the two
+    merge: float = 0.3  # rms distance, in σ_z, of a region from the common plane of the two, noise apart
     gap_px: int = 8  # between regions that may be one
     min_pixels: int = 1000  # smallest region
     planes: int = 24  # most, the largest
@@ -65,7 +65,7 @@ class PlanarRegions:
         labels, gap = self._grow(core, q, grid, stride), max(self.gap_px // stride, 1)
         sums = regions.accumulate(core, len(q), grid)
         touch = regions.neighbours(labels, len(q), gap)
-        owner = regions.merge_regions(*sums, touch, self.merge)
+        owner = regions.merge_regions(*sums, touch, self.merge, self.correlation_px**2)
         if not flat:
             owner = self._flat(owner, labels, sums, grid, gap)
         return self._report(labels, core, owner, sums, grid, frame, stride)

@@ -9,6 +9,8 @@ from trihedron.pipeline.types import F32, F64, I32, U8
 from trihedron.plugins.numerics.depth.organised_grid import Grid
 from trihedron.plugins.numerics.planes.plane_fitting import solve_symmetric
 
+NOISE = 7.815  # χ² of a plane's three parameters, 95 %
+
 
 @numba.njit(cache=True, nogil=True)
 def grow_regions(labels: I32, planes: F64, grid: Grid, gate: float, reach: int, cos_cone: float) -> I32:
@@ -107,10 +109,11 @@ def neighbours(labels: I32, count: int, gap: int) -> F64:
 
 
 @numba.njit(cache=True, nogil=True)
-def merge_regions(A: F64, b: F64, moments: F64, n: I32, touch: F64, limit: float) -> I32:
+def merge_regions(A: F64, b: F64, moments: F64, n: I32, touch: F64, limit: float, alike: float) -> I32:
     """Which region each of k becomes part of, (k + 1,) by label; the sums (as from `accumulate`, with the neighbours' counts) are added up in place.
 
-    From the largest down a region takes in those smaller neighbours for which the common plane is within `limit` σ (rms) of each one's own."""
+    From the largest down a region takes in those smaller neighbours for which the common plane is within `limit` σ (rms) of each one's own, and what
+    noise moves these by when `alike` depths err as one."""
     k = len(n)
     owner = np.arange(k + 1).astype(np.int32)
     order = np.argsort(-n, kind="mergesort")
@@ -121,7 +124,7 @@ def merge_regions(A: F64, b: F64, moments: F64, n: I32, touch: F64, limit: float
             for j in range(k):
                 if touch[i, j] == 0.0 or j == i or owner[j + 1] != j + 1 or n[j] > n[i]:
                     continue
-                if not _one_plane(A[i], b[i], n[i], A[j], b[j], n[j], limit):
+                if not _one_plane(A[i], b[i], n[i], A[j], b[j], n[j], limit, NOISE * alike):
                     continue
                 A[i] += A[j]
                 b[i] += b[j]
@@ -136,13 +139,13 @@ def merge_regions(A: F64, b: F64, moments: F64, n: I32, touch: F64, limit: float
 
 
 @numba.njit(cache=True, nogil=True)
-def _one_plane(A: F64, b: F64, n: int, B: F64, c: F64, m: int, limit: float) -> bool:
-    """Whether the common plane of two regions lies within `limit` σ (rms) of each region's own."""
+def _one_plane(A: F64, b: F64, n: int, B: F64, c: F64, m: int, limit: float, noise: float) -> bool:
+    """Whether the common plane of two regions lies within `limit` σ (rms) of each region's own; `noise` is added to the sums of squares."""
     solved, common = solve_symmetric(A + B, b + c)
     first, p = solve_symmetric(A, b)
     second, q = solve_symmetric(B, c)
     e, f = common - p, common - q
-    return solved and first and second and e @ (A @ e) < limit * limit * n and f @ (B @ f) < limit * limit * m
+    return solved and first and second and e @ (A @ e) < limit * limit * n + noise and f @ (B @ f) < limit * limit * m + noise
 
 
 @numba.njit(cache=True, nogil=True)
