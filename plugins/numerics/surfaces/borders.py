@@ -9,6 +9,7 @@ import numba
 import numpy as np
 
 from trihedron.pipeline.types import F64, I32, Bool
+from trihedron.plugins.numerics.surfaces.half_edges import crowded
 
 REST = -1  # the part of triangles that lie in no plane
 
@@ -24,10 +25,8 @@ def fixed_vertices(count: int, triangles: I32, parts: I32, opposite: I32) -> Boo
     """(v,) vertices that stay whatever happens: those of triangles in no plane, and those of edges with more than two triangles."""
     fixed = np.zeros(count, np.bool_)
     fixed[triangles[parts == REST]] = True
-    alone = np.flatnonzero(opposite < 0)
-    ends = np.sort(np.stack([triangles.ravel()[alone], triangles[:, [1, 2, 0]].ravel()[alone]], axis=1), axis=1)
-    edges, times = np.unique(ends, axis=0, return_counts=True)
-    fixed[edges[times > 1]] = True
+    shared = crowded(triangles, opposite)
+    fixed[triangles.ravel()[shared]] = fixed[triangles[:, [1, 2, 0]].ravel()[shared]] = True
     return fixed
 
 

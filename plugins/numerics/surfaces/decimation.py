@@ -7,17 +7,21 @@ import numba
 import numpy as np
 
 from trihedron.pipeline.types import F64, I32, Bool
+from trihedron.plugins.numerics.surfaces.block_hash import I64
 
+MOST = 1024  # triangles about a vertex; one with more stays
 ROUNDS = 30  # at most, over all vertices; most are gone after five
 FLAT_M2 = 1e-9  # a triangle with less area has none
-STEP = 0x9E3779B1  # visits vertices in an order without order, so that no vertex gathers all the others' triangles
+STEP = 0x9E3779B1  # visits vertices in an order without order, so that no vertex gathers all the others' triangles,
+NEAR = 1024  # but so many that follow each other before the next: they are near each other, in memory too
 
 
 def decimated(vertices: F64, triangles: I32, labels: I32, planes: F64, border: I32, free: Bool, beside: I32) -> I32:
     """The rows (t,) that stay, in triangles (t, 3) that are changed in place. Vertices of one plane's triangles alone go; those on a border (v,) go
     when
     they are `free` (v,), along it: `beside` (v, 2) are the neighbours there."""
-    order = np.argsort((np.arange(len(vertices), dtype=np.uint64) * np.uint64(STEP)) % np.uint64(1 << 32), kind="stable").astype(np.int32)
+    number = np.arange(len(vertices), dtype=np.uint64)
+    order = np.lexsort((number * np.uint64(STEP) % np.uint64(1 << 32), number // np.uint64(NEAR))).astype(np.int32)
     alive = np.ones(len(triangles), np.bool_)
     _collapse_all(vertices, triangles, labels, planes[:, :3].copy(), border, free, beside.copy(), order, alive)
     return np.flatnonzero(alive).astype(np.int32)
@@ -38,18 +42,20 @@ def _collapse_all(
         tail[v] = c
     mark, stamp = np.zeros(n, np.int64), 0
     gone = np.zeros(n, np.bool_)
+    mine, theirs, targets, far = np.empty(MOST, np.int32), np.empty(MOST, np.int32), np.empty(MOST, np.int32), np.empty(MOST)
     for _ in range(ROUNDS):
         changed = 0
         for u in order:
             if gone[u] or head[u] < 0 or (border[u] and not free[u]):
                 continue
-            mine = _incident(u, triangles, alive, head, tail, after)
-            if len(mine) == 0 or labels[mine[0]] < 0:
+            count = _incident(u, alive, head, tail, after, mine)
+            if count == 0 or labels[mine[0]] < 0:
                 continue
-            for v in _targets(u, mine, vertices, triangles, border, beside):
+            for v in targets[: _targets(u, mine[:count], vertices, triangles, border, beside, targets, far)]:
                 stamp += 2
-                if _allowed(u, v, mine, vertices, triangles, labels, normals, alive, head, tail, after, mark, stamp):
-                    _collapse(u, v, mine, triangles, alive, head, tail, after)
+                size = _incident(v, alive, head, tail, after, theirs)
+                if _allowed(u, v, mine[:count], theirs[:size], vertices, triangles, labels, normals, mark, stamp):
+                    _collapse(u, v, mine[:count], triangles, alive, head, tail, after)
                     if border[u]:
                         other = beside[u, 0] if beside[u, 1] == v else beside[u, 1]
                         _relink(beside, v, u, other)
@@ -62,11 +68,13 @@ def _collapse_all(
 
 
 @numba.njit(cache=True, nogil=True)
-def _incident(v: int, triangles: I32, alive: Bool, head: I32, tail: I32, after: I32) -> I32:
-    """The living triangles about v; its list forgets the dead ones."""
+def _incident(v: int, alive: Bool, head: I32, tail: I32, after: I32, out: I32) -> int:
+    """Write the living triangles about v and return their number, 0 when they are too many; its list forgets the dead ones."""
     count, c, last = 0, head[v], -1
     while c >= 0:
         if alive[c // 3]:
+            if count < MOST:
+                out[count] = c // 3
             count += 1
             last = c
         elif last >= 0:
@@ -75,37 +83,32 @@ def _incident(v: int, triangles: I32, alive: Bool, head: I32, tail: I32, after: 
             head[v] = after[c]
         c = after[c]
     tail[v] = last
-    out, c = np.empty(count, np.int32), head[v]
+    return count if count <= MOST else 0
+
+
+@numba.njit(cache=True, nogil=True)
+def _targets(u: int, mine: I32, vertices: F64, triangles: I32, border: Bool, beside: I32, found: I32, far: F64) -> int:
+    """Write where u may go, the nearest first, and return their number: to its neighbours on the border, or to any."""
+    count = 2 if border[u] else len(mine)
     for i in range(count):
-        out[i] = c // 3
-        c = after[c]
-    return out
-
-
-@numba.njit(cache=True, nogil=True)
-def _targets(u: int, mine: I32, vertices: F64, triangles: I32, border: Bool, beside: I32) -> I32:
-    """Where u may go, the nearest first: to its neighbours on the border, or to any."""
-    if border[u]:
-        found = beside[u].copy()
-    else:
-        found = np.empty(len(mine), np.int32)  # each neighbour of an inner vertex follows it in one triangle
-        for i in range(len(mine)):
-            k = 0
-            while triangles[mine[i], k] != u:
+        if border[u]:
+            v = beside[u, i]
+        else:  # each neighbour of an inner vertex follows it in one triangle
+            t, k = mine[i], 0
+            while triangles[t, k] != u:
                 k += 1
-            found[i] = triangles[mine[i], (k + 1) % 3]
-    far = np.empty(len(found))
-    for i in range(len(found)):
-        d = vertices[found[i]] - vertices[u]
-        far[i] = d[0] * d[0] + d[1] * d[1] + d[2] * d[2]
-    return found[np.argsort(far, kind="mergesort")]
+            v = triangles[t, (k + 1) % 3]
+        x, y, z = vertices[v, 0] - vertices[u, 0], vertices[v, 1] - vertices[u, 1], vertices[v, 2] - vertices[u, 2]
+        squared, at = x * x + y * y + z * z, i
+        while at > 0 and far[at - 1] > squared:
+            found[at], far[at] = found[at - 1], far[at - 1]
+            at -= 1
+        found[at], far[at] = v, squared
+    return count
 
 
 @numba.njit(cache=True, nogil=True)
-def _allowed(
-    u: int, v: int, mine: I32, vertices: F64, triangles: I32, labels: I32, normals: F64, alive: Bool, head: I32, tail: I32, after: I32,
-    mark: I32, stamp: int,
-) -> bool:  # fmt: skip
+def _allowed(u: int, v: int, mine: I32, theirs: I32, vertices: F64, triangles: I32, labels: I32, normals: F64, mark: I64, stamp: int) -> bool:
     """Whether u may be drawn into v: the two have no common neighbours but those across from their edge (link condition), and no triangle turns
     over."""
     removed = 0
@@ -114,10 +117,10 @@ def _allowed(
         removed += 1 if has else 0
         for k in range(3):
             mark[triangles[t, k]] = stamp
-    if removed == 0 or removed > 2:
+    if removed == 0 or removed > 2 or len(theirs) == 0:
         return False
     common = 0
-    for t in _incident(v, triangles, alive, head, tail, after):
+    for t in theirs:
         for k in range(3):
             w = triangles[t, k]
             if w != u and w != v and mark[w] == stamp:
@@ -126,23 +129,22 @@ def _allowed(
     if common != removed:
         return False
     for t in mine:
-        if triangles[t, 0] == v or triangles[t, 1] == v or triangles[t, 2] == v:
-            continue
-        n = normals[labels[t]]
-        now = _signed(vertices, triangles[t, 0], triangles[t, 1], triangles[t, 2], n)
         a, b, c = triangles[t, 0], triangles[t, 1], triangles[t, 2]
-        then = _signed(vertices, v if a == u else a, v if b == u else b, v if c == u else c, n)
-        if then < FLAT_M2 and then < now - 1e-3 * FLAT_M2:  # one that has no area already may stay so
+        if a == v or b == v or c == v:
+            continue
+        x, y, z = normals[labels[t], 0], normals[labels[t], 1], normals[labels[t], 2]
+        then = _signed(vertices, v if a == u else a, v if b == u else b, v if c == u else c, x, y, z)
+        if then < FLAT_M2 and then < _signed(vertices, a, b, c, x, y, z) - 1e-3 * FLAT_M2:  # one that has no area already may stay so
             return False
     return True
 
 
 @numba.njit(cache=True, nogil=True, inline="always")
-def _signed(vertices: F64, a: int, b: int, c: int, n: F64) -> float:
-    """Area of a triangle seen against n, negative when it is seen from behind."""
+def _signed(vertices: F64, a: int, b: int, c: int, x: float, y: float, z: float) -> float:
+    """Area of a triangle seen against the normal (x, y, z), negative when it is seen from behind."""
     x1, y1, z1 = vertices[b, 0] - vertices[a, 0], vertices[b, 1] - vertices[a, 1], vertices[b, 2] - vertices[a, 2]
     x2, y2, z2 = vertices[c, 0] - vertices[a, 0], vertices[c, 1] - vertices[a, 1], vertices[c, 2] - vertices[a, 2]
-    return 0.5 * ((y1 * z2 - z1 * y2) * n[0] + (z1 * x2 - x1 * z2) * n[1] + (x1 * y2 - y1 * x2) * n[2])
+    return 0.5 * ((y1 * z2 - z1 * y2) * x + (z1 * x2 - x1 * z2) * y + (x1 * y2 - y1 * x2) * z)
 
 
 @numba.njit(cache=True, nogil=True)

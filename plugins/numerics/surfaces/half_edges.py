@@ -12,25 +12,43 @@ OPEN = -1  # beyond a half-edge: nothing, or more than one triangle
 
 def opposite_half_edges(triangles: I32) -> I32:
     """(3 t,) the half-edge that runs the other way along the same edge; OPEN where there is none, or the edge has more than two triangles."""
-    begin, end = triangles.ravel().astype(np.int64), triangles[:, [1, 2, 0]].ravel().astype(np.int64)
-    size = int(triangles.max()) + 1 if len(triangles) else 1
-    low, high = np.minimum(begin, end), np.maximum(begin, end)
-    order = np.argsort(low * size + high, kind="stable")
-    return _paired(order, (low * size + high)[order], begin)
+    return _paired(triangles, int(triangles.max()) + 1 if len(triangles) else 0)
 
 
 @numba.njit(cache=True, nogil=True)
-def _paired(order: I32, keys: I32, begin: I32) -> I32:
-    out = np.full(len(order), OPEN, np.int32)
-    i = 0
-    while i < len(order):
-        j = i + 1
-        while j < len(order) and keys[j] == keys[i]:
-            j += 1
-        if j - i == 2 and begin[order[i]] != begin[order[i + 1]]:
-            out[order[i]], out[order[i + 1]] = order[i + 1], order[i]
-        i = j
+def _paired(triangles: I32, count: int) -> I32:
+    """Half-edges sorted by the lower of their vertices, then compared with those of the same."""
+    size = 3 * len(triangles)
+    starts, high = np.zeros(count + 1, np.int32), np.empty(size, np.int32)
+    for h in range(size):
+        a, b = triangles[h // 3, h % 3], triangles[h // 3, (h + 1) % 3]
+        starts[min(a, b) + 1] += 1
+        high[h] = max(a, b)
+    for v in range(count):
+        starts[v + 1] += starts[v]
+    order, filled = np.empty(size, np.int32), starts[:-1].copy()
+    for h in range(size):
+        v = min(triangles[h // 3, h % 3], triangles[h // 3, (h + 1) % 3])
+        order[filled[v]] = h
+        filled[v] += 1
+    out = np.full(size, OPEN, np.int32)
+    for v in range(count):
+        for i in range(starts[v], starts[v + 1]):
+            h, other, found = order[i], OPEN, 0
+            for j in range(starts[v], starts[v + 1]):
+                if j != i and high[order[j]] == high[h]:
+                    other, found = order[j], found + 1
+            if found == 1 and triangles[other // 3, other % 3] != triangles[h // 3, h % 3]:
+                out[h] = other
     return out
+
+
+def crowded(triangles: I32, opposite: I32) -> I32:
+    """The half-edges (n,) along edges with more than two triangles, or with two that run along it the same way."""
+    alone = np.flatnonzero(opposite < 0)
+    ends = np.sort(np.stack([triangles.ravel()[alone], triangles[:, [1, 2, 0]].ravel()[alone]], axis=1), axis=1)
+    _, edge, times = np.unique(ends, axis=0, return_inverse=True, return_counts=True)
+    return np.asarray(alone[times[edge.ravel()] > 1], np.int32)
 
 
 @numba.njit(cache=True, nogil=True)
@@ -58,9 +76,9 @@ def connected(opposite: I32, labels: I32) -> tuple[I32, int]:
 def with_single_fans(vertices: F64, triangles: I32) -> tuple[F64, I32]:
     """The mesh with a vertex of its own for each fan of triangles: none is shared by sheets that touch in a point alone."""
     fans = _fans(opposite_half_edges(triangles))
-    corners = triangles.ravel()
-    _, first, number = np.unique(fans, return_index=True, return_inverse=True)
-    return vertices[corners[first]], number.reshape(-1, 3).astype(np.int32)
+    first = fans == np.arange(len(fans))
+    number = np.cumsum(first, dtype=np.int32) - np.int32(1)
+    return vertices[triangles.ravel()[first]], number[fans].reshape(-1, 3)
 
 
 @numba.njit(cache=True, nogil=True)
@@ -89,10 +107,36 @@ def _fans(opposite: I32) -> I32:
     return root
 
 
+@numba.njit(cache=True, nogil=True)
+def triangle_normals(vertices: F64, triangles: I32) -> F64:
+    """(t, 3) normals, as long as twice the area."""
+    out = np.empty((len(triangles), 3))
+    for t in range(len(triangles)):
+        a, b, c = triangles[t, 0], triangles[t, 1], triangles[t, 2]
+        x1, y1, z1 = vertices[b, 0] - vertices[a, 0], vertices[b, 1] - vertices[a, 1], vertices[b, 2] - vertices[a, 2]
+        x2, y2, z2 = vertices[c, 0] - vertices[a, 0], vertices[c, 1] - vertices[a, 1], vertices[c, 2] - vertices[a, 2]
+        out[t, 0], out[t, 1], out[t, 2] = y1 * z2 - z1 * y2, z1 * x2 - x1 * z2, x1 * y2 - y1 * x2
+    return out
+
+
 def triangle_areas(vertices: F64, triangles: I32) -> F64:
     """(t,) areas in m²."""
-    corners = vertices[triangles]
-    return np.asarray(0.5 * np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1), np.float64)
+    return np.asarray(0.5 * np.sqrt((triangle_normals(vertices, triangles) ** 2).sum(axis=1)), np.float64)
+
+
+def vertex_normals(vertices: F64, triangles: I32) -> F64:
+    """(v, 3) unit normals, the mean of those of the triangles (t, 3) about a vertex weighed by their areas; zero where there is none."""
+    total = np.zeros_like(vertices)
+    _gather(triangle_normals(vertices, triangles), triangles, total)
+    return total / np.maximum(np.sqrt((total**2).sum(axis=1)), 1e-12)[:, None]
+
+
+@numba.njit(cache=True, nogil=True)
+def _gather(normals: F64, triangles: I32, total: F64) -> None:
+    for t in range(len(triangles)):
+        for k in range(3):
+            for axis in range(3):
+                total[triangles[t, k], axis] += normals[t, axis]
 
 
 def without_crumbs(vertices: F64, triangles: I32, least_m2: float) -> I32:

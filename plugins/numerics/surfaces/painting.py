@@ -15,14 +15,6 @@ UNSEEN = 128
 MOST = 48  # views; what one sees its neighbours see too
 
 
-def vertex_normals(vertices: F64, triangles: I32) -> F64:
-    """(v, 3) unit normals, the mean of those of the triangles (t, 3) about a vertex weighed by their areas; zero where there is none."""
-    corners = vertices[triangles]
-    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    total = np.stack([np.bincount(triangles.ravel(), np.repeat(normals[:, k], 3), len(vertices)) for k in range(3)], axis=1)
-    return total / np.maximum(np.linalg.norm(total, axis=1), 1e-12)[:, None]
-
-
 def painted(points: F64, normals: F64, views: Sequence[tuple[View, F64]]) -> tuple[U8, Bool]:
     """(n, 3) RGB of points with unit normals (n, 3), the mean over the views that see them, those that see them large by far the most; and whether
     any

@@ -6,8 +6,7 @@ from dataclasses import dataclass
 
 from trihedron.pipeline.types import Map, Surface
 from trihedron.plugins.numerics.surfaces.assembly import pictured
-from trihedron.plugins.numerics.surfaces.half_edges import opposite_half_edges, with_single_fans
-from trihedron.plugins.numerics.surfaces.painting import vertex_normals
+from trihedron.plugins.numerics.surfaces.half_edges import opposite_half_edges, vertex_normals, with_single_fans
 from trihedron.plugins.numerics.surfaces.planar_parts import Flatness, map_planes, numbered, planar_labels
 from trihedron.plugins.numerics.surfaces.polygons import flattened
 from trihedron.plugins.numerics.surfaces.view_fold import Gathered, VolumeFold

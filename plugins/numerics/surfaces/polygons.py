@@ -10,7 +10,7 @@ import numpy as np
 from trihedron.pipeline.types import F64, I32
 from trihedron.plugins.numerics.surfaces.borders import REST, border_half_edges, fixed_vertices, kept_vertices, loops
 from trihedron.plugins.numerics.surfaces.decimation import decimated
-from trihedron.plugins.numerics.surfaces.half_edges import connected, opposite_half_edges
+from trihedron.plugins.numerics.surfaces.half_edges import connected, crowded, opposite_half_edges
 from trihedron.plugins.numerics.surfaces.plane_axes import plane_axes
 from trihedron.plugins.numerics.surfaces.snapping import snapped
 
@@ -49,24 +49,30 @@ def flattened(
 
 
 def _recut(points: F64, triangles: I32, labels: I32, parts: I32, planes: F64, hole_m2: float) -> Flattened:
-    """Each part whose outline does not cross itself as the Delaunay triangulation of its polygon. Holes in the mesh of less than `hole_m2` are
-    closed."""
+    """Each part whose outline does not cross itself as the Delaunay triangulation of its polygon, unless that joins two vertices which are joined
+    beside it already. Holes in the mesh of less than `hole_m2` are closed."""
     opposite = opposite_half_edges(triangles)
     order, starts = loops(border_half_edges(parts, opposite), parts, opposite)
     rings: dict[int, list[I32]] = {}
+    holes: dict[int, list[I32]] = {}
     for a, b in pairwise(starts):
         ring = triangles.ravel()[order[a:b]]
-        hole = (opposite[order[a:b]] < 0).all() and 0.0 < -_area(points[ring] @ plane_axes(planes[labels[order[a] // 3]])) < hole_m2
-        rings.setdefault(int(parts[order[a] // 3]), []).extend([] if hole else [ring])
+        closed = (opposite[order[a:b]] < 0).all() and 0.0 < -_area(points[ring] @ plane_axes(planes[labels[order[a] // 3]])) < hole_m2
+        (holes if closed else rings).setdefault(int(parts[order[a] // 3]), []).append(ring)
     first = {part: int(row) for part, row in zip(*np.unique(parts, return_index=True)) if part != REST}
     cuts = {part: found for part, row in first.items() if (found := _cut(points, rings[part], planes[labels[row]])) is not None}
-    stay = ~np.isin(parts, list(cuts))
-    return Flattened(
-        points,
-        np.concatenate([triangles[stay], *cuts.values()]).astype(np.int32),
-        np.concatenate([labels[stay], *(np.full(len(found), labels[first[part]], np.int32) for part, found in cuts.items())]),
-        [(int(labels[row]), ring) for part, row in first.items() for ring in rings[part]],
-    )
+    while True:
+        stay = ~np.isin(parts, list(cuts))
+        whole = np.concatenate([triangles[stay], *cuts.values()]).astype(np.int32)
+        owners = np.concatenate([parts[stay], *(np.full(len(found), part, np.int32) for part, found in cuts.items())])
+        doubled = set(owners[crowded(whole, opposite_half_edges(whole)) // 3].tolist()) & set(cuts)
+        if not doubled:
+            break
+        cuts = {part: found for part, found in cuts.items() if part not in doubled}
+    outlines = [(part, ring) for part in first for ring in rings[part] + (holes.get(part, []) if part not in cuts else [])]
+    plane_of = np.full(parts.max() + 2, REST, np.int32)  # the last is that of the rest
+    plane_of[parts] = labels
+    return Flattened(points, whole, plane_of[owners], [(int(plane_of[part]), ring) for part, ring in outlines])
 
 
 def _cut(points: F64, rings: list[I32], plane: F64) -> I32 | None:

@@ -14,16 +14,45 @@ ROUNDS = 20  # at most, to unfold what lies the wrong way round after it was mov
 def snapped(vertices: F64, triangles: I32, labels: I32, planes: F64, farthest_m: float) -> F64:
     """Vertices (v, 3), each moved to the nearest point that lies on all planes of the triangles about it, or, if that is too far, on the nearest
     plane."""
+    rows, starts = _planes_about(len(vertices), triangles, labels)
+    points = _snapped(vertices, rows, starts, planes, farthest_m)
     planar = labels >= 0
-    size = len(planes) + 1
-    keys = np.unique(triangles[planar].astype(np.int64) * size + labels[planar][:, None])
-    starts = np.searchsorted(keys, np.arange(len(vertices) + 1, dtype=np.int64) * size)
-    points = _snapped(vertices, (keys % size).astype(np.int32), starts.astype(np.int32), planes, farthest_m)
-    rows = np.flatnonzero(planar)
+    flat, normals = triangles[planar], planes[labels[planar], :3]
     for _ in range(ROUNDS):
-        if not _unfold(points, triangles[rows], planes[labels[rows], :3], np.diff(starts) == 1):
+        if not _unfold(points, flat, normals, rows, starts):
             break
     return points
+
+
+@numba.njit(cache=True, nogil=True)
+def _planes_about(count: int, triangles: I32, labels: I32) -> tuple[I32, I32]:
+    """The planes of the triangles about each vertex v, in ascending order and each once: rows[starts[v] : starts[v + 1]]."""
+    ends = np.zeros(count + 1, np.int32)
+    for t in range(len(triangles)):
+        if labels[t] >= 0:
+            for k in range(3):
+                ends[triangles[t, k] + 1] += 1
+    ends = np.cumsum(ends).astype(np.int32)
+    rows, filled = np.empty(ends[count], np.int32), ends[:-1].copy()
+    for t in range(len(triangles)):
+        if labels[t] >= 0:
+            for k in range(3):
+                v = triangles[t, k]
+                at = filled[v]
+                while at > ends[v] and rows[at - 1] > labels[t]:
+                    at -= 1
+                if at > ends[v] and rows[at - 1] == labels[t]:
+                    continue
+                rows[at + 1 : filled[v] + 1] = rows[at : filled[v]].copy()
+                rows[at] = labels[t]
+                filled[v] += 1
+    starts, size = np.zeros(count + 1, np.int32), 0
+    for v in range(count):
+        for k in range(ends[v], filled[v]):
+            rows[size] = rows[k]
+            size += 1
+        starts[v + 1] = size
+    return rows[:size].copy(), starts
 
 
 @numba.njit(cache=True, nogil=True)
@@ -45,29 +74,43 @@ def _snapped(vertices: F64, rows: I32, starts: I32, planes: F64, farthest: float
 
 
 @numba.njit(cache=True, nogil=True)
-def _unfold(points: F64, triangles: I32, normals: F64, single: Bool) -> int:
-    """Move vertices of one plane alone (v,) whose triangles (t, 3) lie the wrong way round to the middle of their neighbours; returns how many."""
+def _unfold(points: F64, triangles: I32, normals: F64, rows: I32, starts: I32) -> int:
+    """Move the vertices of triangles (t, 3) that lie the wrong way round to the middle of those neighbours that are on all their planes, so that each
+    stays on its plane or line; returns how many."""
     folded = np.zeros(len(points), np.bool_)
     for t in range(len(triangles)):
         a, b, c = triangles[t, 0], triangles[t, 1], triangles[t, 2]
         x1, y1, z1 = points[b, 0] - points[a, 0], points[b, 1] - points[a, 1], points[b, 2] - points[a, 2]
         x2, y2, z2 = points[c, 0] - points[a, 0], points[c, 1] - points[a, 1], points[c, 2] - points[a, 2]
         if (y1 * z2 - z1 * y2) * normals[t, 0] + (z1 * x2 - x1 * z2) * normals[t, 1] + (x1 * y2 - y1 * x2) * normals[t, 2] < 0.0:
-            for k in range(3):
-                folded[triangles[t, k]] = single[triangles[t, k]]
+            folded[a] = folded[b] = folded[c] = True
     total = np.zeros((len(points), 4))
     for t in range(len(triangles)):
         for k in range(3):
-            if folded[triangles[t, k]]:
+            v = triangles[t, k]
+            if folded[v]:
                 for other in (triangles[t, (k + 1) % 3], triangles[t, (k + 2) % 3]):
-                    total[triangles[t, k], :3] += points[other]
-                    total[triangles[t, k], 3] += 1.0
+                    if _includes(rows[starts[other] : starts[other + 1]], rows[starts[v] : starts[v + 1]]):
+                        total[v, :3] += points[other]
+                        total[v, 3] += 1.0
     count = 0
     for v in range(len(points)):
-        if folded[v]:
+        if total[v, 3] > 0.0:
             points[v] = total[v, :3] / total[v, 3]
             count += 1
     return count
+
+
+@numba.njit(cache=True, nogil=True, inline="always")
+def _includes(larger: I32, smaller: I32) -> bool:
+    """Whether an ascending list holds another."""
+    at = 0
+    for wanted in smaller:
+        while at < len(larger) and larger[at] < wanted:
+            at += 1
+        if at == len(larger) or larger[at] != wanted:
+            return False
+    return True
 
 
 @numba.njit(cache=True, nogil=True, inline="always")
