@@ -8,6 +8,8 @@ import pytest
 
 from trihedron.pipeline.geometry import tangent_basis
 from trihedron.plugins.normals.integral_image import IntegralImage
+from trihedron.plugins.numerics.depth.organised_grid import Grid
+from trihedron.plugins.numerics.planes.plane_fitting import fit_cells
 from trihedron.plugins.planes.ahc import Ahc
 from trihedron.plugins.planes.cape import Cape
 from trihedron.plugins.planes.connected_components import ConnectedComponents
@@ -203,6 +205,17 @@ def test_nothing_measured_gives_no_planes(plugin, analytic, value):
 def test_pure_noise_does_not_raise(plugin, analytic):
     depth = np.random.default_rng(0).uniform(0.0, 5.0, (480, 640))
     assert len(detect(plugin, analytic.frame(depth)).pixels) <= 24
+
+
+def test_cells_in_one_line_are_no_plane():
+    """Their fit is singular, and nothing is left marked as a member of it."""
+    w = 60
+    normals = np.tile(np.array([0, 0, -1], np.float32), (1, w, 1))
+    rho, sigma, count = np.full((1, w), 0.5, np.float32), np.full((1, w), 0.01, np.float32), np.ones((1, w), np.int32)
+    member = np.zeros(w, np.bool_)
+    grid = Grid(rho, sigma, count, np.linspace(-1.0, 1.0, w), np.zeros(1), normals)
+    q, members = fit_cells(np.array([0.0, 0.0, 0.5]), grid, np.arange(w, dtype=np.int32), 0.98, 3.0, member)
+    assert members == 0 and not member.any() and not q.any()
 
 
 def test_same_bytes_from_any_thread(plugin, analytic):

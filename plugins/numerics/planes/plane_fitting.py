@@ -156,7 +156,7 @@ def start_plane(normal: F64, grid: Grid, cells: I32, cos_cone: float) -> F64:
 @numba.njit(cache=True, nogil=True)
 def fit_cells(q: F64, grid: Grid, cells: I32, cos_cone: float, gate: float, member: Bool) -> tuple[F64, int]:
     """One round of trimmed weighted least squares: (q, number of members). A cell is a member when its normal is within the cone of q's and its depth
-    within `gate` σ of q's; `member` (per entry of `cells`) is written. A degenerate fit returns zeros."""
+    within `gate` σ of q's; `member` (per entry of `cells`) is written. A degenerate fit returns zeros, and nothing is a member."""
     rho, sigma, count, rays_x, rays_y, normals = grid
     w = rho.shape[1]
     length = np.sqrt(q @ q)
@@ -183,10 +183,11 @@ def fit_cells(q: F64, grid: Grid, cells: I32, cos_cone: float, gate: float, memb
         b[0] += weight * x * p
         b[1] += weight * y * p
         b[2] += weight * p
-    if found < 3:
-        return np.zeros(3), 0
     solved, q = solve_symmetric(A, b)
-    return q, found if solved else 0
+    if found < 3 or not solved:
+        member[:] = False
+        return np.zeros(3), 0
+    return q, found
 
 
 @numba.njit(cache=True, nogil=True)
