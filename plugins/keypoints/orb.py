@@ -2,22 +2,19 @@
 
 from __future__ import annotations
 
-import threading
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
 
-import cv2
 import numpy as np
 
 from trihedron.pipeline.registry import register
-from trihedron.pipeline.types import F32, I32, U8, Frame, Keypoints
+from trihedron.pipeline.types import F32, Frame, Keypoints
 from trihedron.plugins.numerics.depth.depth_sampling import local_depth, noise_coefficients
 from trihedron.plugins.numerics.images.image_pyramid import full_pixels, image_pyramid
 from trihedron.plugins.numerics.images.oriented_corners import oriented_corners
+from trihedron.plugins.numerics.images.steered_brief import brief_tests, steered_brief
 
 MARGIN_PX = 19  # of a level, within which its descriptors would reach over the border
-PATCH_PX = 31  # side of what a descriptor looks at (Rublee et al.)
 
 
 @register("keypoints", "orb")
@@ -58,7 +55,7 @@ class Orb:
         weights = np.asarray(self.scale ** (-self.fineness * np.arange(len(pyramid.shapes))), np.float64)
         thresholds = self.fast_threshold, self.fast_threshold_low
         cells, levels, angles = oriented_corners(pyramid, *thresholds, MARGIN_PX, self.cell_px, self.features, weights)
-        descriptors = self._describe(frame.gray, cells, levels, angles)
+        descriptors = steered_brief(pyramid, cells, levels, angles, self._tests)
         pixels = full_pixels(cells, levels, pyramid.shapes).astype(np.float32)
         noise = noise_coefficients(frame.camera.depth_noise)
         depth, sigma = local_depth(frame.depth_m, pixels, self.depth_radius_px, self.depth_share, noise, self.depth_gate, self.depth_edge)
@@ -74,28 +71,6 @@ class Orb:
             descriptors=descriptors,
         )
 
-    def _describe(self, gray: U8, cells: I32, levels: I32, angles: F32) -> U8:
-        """(n, 32) rotated BRIEF, by OpenCV, which wants a level's pixel x as x · s."""
-        scales = self.scale ** levels.astype(np.float64)
-        xs, ys = (cells * scales[:, None]).T.tolist()
-        points = [
-            cv2.KeyPoint(x, y, PATCH_PX * s, angle, 1.0, level, i)
-            for i, (x, y, s, angle, level) in enumerate(zip(xs, ys, scales.tolist(), angles.tolist(), levels.tolist()))
-        ]
-        out = np.zeros((len(points), 32), np.uint8)
-        if points:
-            kept, described = self._orb.compute(gray, points)
-            if described is not None:
-                out[[k.class_id for k in kept]] = described
-        return out
-
     @cached_property
-    def _local(self) -> threading.local:
-        return threading.local()
-
-    @property
-    def _orb(self) -> Any:
-        """This thread's descriptor: OpenCV's may not be shared between threads."""
-        if not hasattr(self._local, "orb"):
-            self._local.orb = cv2.ORB_create(self.features, self.scale, self.levels, edgeThreshold=MARGIN_PX)
-        return self._local.orb
+    def _tests(self) -> F32:
+        return brief_tests()
