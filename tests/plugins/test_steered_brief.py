@@ -33,7 +33,7 @@ def test_tests_lie_in_the_patch_and_are_short():
     x1, y1, x2, y2 = TESTS
     assert TESTS.shape == (4, BITS)
     assert max(np.hypot(x1, y1).max(), np.hypot(x2, y2).max()) <= REACH_PX
-    assert 1.0 <= np.hypot(x1 - x2, y1 - y2).min() and np.hypot(x1 - x2, y1 - y2).max() <= LONGEST_PX
+    assert np.hypot(x1 - x2, y1 - y2).min() >= 1.0 and np.hypot(x1 - x2, y1 - y2).max() <= LONGEST_PX
     assert np.abs(TESTS.mean(axis=1)).max() < 1.0  # all around the key point
 
 
