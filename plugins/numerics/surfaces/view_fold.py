@@ -9,6 +9,7 @@ import numpy as np
 
 from trihedron.pipeline.types import F64, I32, LOST, Frame, Map, Planes, Pose, Rotation
 from trihedron.plugins.numerics.surfaces.half_edges import with_single_fans, without_crumbs
+from trihedron.plugins.numerics.surfaces.measured_noise import with_measured_noise
 from trihedron.plugins.numerics.surfaces.surface_nets import zero_level
 from trihedron.plugins.numerics.surfaces.views import Known, View, readings, view_of
 from trihedron.plugins.numerics.surfaces.volume import Volume
@@ -50,7 +51,7 @@ class ViewFold:
     """Keeps the views that tell something new, at their final poses in the end."""
 
     view_width: int = 320  # px, about, to which images are reduced
-    max_sigma_m: float = 0.05  # depth less certain than this is not used; a Kinect's at 4.2 m
+    max_sigma_m: float = 0.05  # depth less certain than this is not used: a Kinect's beyond 4.2 m; a frame's planes say how certain it is
     views: float = 6.0  # of its quality, after which a view has nothing new to tell of a place
     news: float = 0.15  # share of new readings for which a view is kept
 
@@ -71,6 +72,7 @@ class ViewFold:
             state.axes = rotation.R_world_manhattan[int(np.argmax(rotation.weights))]
         if pose.status == LOST:
             return state
+        frame = with_measured_noise(frame, planes)
         points, weight = readings(frame, pose.T_world_camera, max(1, frame.camera.width // NEWS_COLUMNS), self.max_sigma_m)
         known = state.known.setdefault(pose.submap, Known(CELL_M))
         if len(points) and known.news(points, weight, self.views) >= self.news:
