@@ -54,7 +54,7 @@ def planar_labels(vertices: F64, normals: F64, triangles: I32, opposite: I32, pl
     labels = _on_planes(vertices, triangles, turned, planes, flat.distance_m, cosine)
     labels = _large(labels, middle, opposite, area, planes, flat)
     seeds = np.argsort(-np.abs(_steadiness(turned, opposite)), kind="stable")
-    grown, found = _grown(seeds, labels, middle, turned, area, opposite, flat.distance_m, cosine, flat.area_m2)
+    grown, found = _grown(seeds, labels, len(planes), middle, turned, area, opposite, flat.distance_m, cosine, flat.area_m2)
     planes = np.concatenate([planes, found])
     labels = _large(grown, middle, opposite, area, planes, flat)
     planes = _fitted(labels, middle, area, planes)
@@ -102,12 +102,11 @@ def _steadiness(turned: F64, opposite: I32) -> F64:
 
 @numba.njit(cache=True, nogil=True)
 def _grown(
-    seeds: I32, labels: I32, middle: F64, turned: F64, area: F64, opposite: I32, distance: float, cosine: float, least: float
+    seeds: I32, labels: I32, first: int, middle: F64, turned: F64, area: F64, opposite: I32, distance: float, cosine: float, least: float
 ) -> tuple[I32, F64]:  # fmt: skip
-    """Regions grown from seeds (t,) among the triangles without a label, about planes fitted each time they have doubled. Returns labels and the
-    planes."""
+    """Regions grown from seeds (t,) among the triangles without a label, about planes fitted each time they have doubled. Returns labels, from `first`
+    on for the new ones, and the new planes."""
     labels = labels.copy()
-    first = labels.max() + 1 if len(labels) else 0
     found, count = np.empty((len(labels), 4)), 0
     tried = np.zeros(len(labels), np.bool_)
     queue = np.empty(len(labels), np.int32)
