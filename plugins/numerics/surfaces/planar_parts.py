@@ -57,6 +57,7 @@ def planar_labels(vertices: F64, normals: F64, triangles: I32, opposite: I32, pl
     grown, found = _grown(seeds, labels, len(planes), middle, turned, area, opposite, flat.distance_m, cosine, flat.area_m2)
     planes = np.concatenate([planes, found])
     labels = _large(grown, middle, opposite, area, planes, flat)
+    labels = _joined(labels, middle, area, opposite, planes, flat.distance_m)
     planes = _fitted(labels, middle, area, planes)
     for _ in range(flat.rim):
         labels = _with_rim(labels, vertices, triangles, turned, opposite, planes, flat.rim_m)
@@ -164,6 +165,27 @@ def _plane_through(middle: F64, area: F64, rows: I32, like: F64) -> tuple[F64, f
     if np.dot(n, like) < 0.0:
         n = -n
     return n, -np.dot(n, centre)
+
+
+def _joined(labels: I32, middle: F64, area: F64, opposite: I32, planes: F64, distance: float) -> I32:
+    """Planes that touch, and of which the larger one fits the smaller one's triangles within half the distance (RMS), are one: a floor that was mapped
+    twice. The larger keeps its identity."""
+    h = np.flatnonzero(opposite >= 0)
+    pairs = np.unique(np.stack([labels[h // 3], labels[opposite[h] // 3]], axis=1), axis=0)
+    pairs = pairs[(pairs[:, 0] >= 0) & (pairs[:, 1] >= 0)]
+    total = np.bincount(labels + 1, area, len(planes) + 1)[1:]
+    out, stands_for = labels.copy(), np.arange(len(planes))
+    for small in np.argsort(total, kind="stable"):
+        beside = np.unique(stands_for[pairs[stands_for[pairs[:, 0]] == small, 1]])
+        rows = np.flatnonzero(out == small)
+        beside = beside[total[beside] >= total[small]]
+        for large in beside[np.argsort(-total[beside], kind="stable")]:
+            off = middle[rows] @ planes[large, :3] + planes[large, 3]
+            if large != small and planes[large, :3] @ planes[small, :3] > 0.9 and np.average(off**2, weights=area[rows]) <= (0.5 * distance) ** 2:
+                out[rows], stands_for[stands_for == small] = large, large
+                total[large] += total[small]
+                break
+    return out
 
 
 def _fitted(labels: I32, middle: F64, area: F64, planes: F64) -> F64:

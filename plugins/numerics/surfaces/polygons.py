@@ -10,7 +10,7 @@ import numpy as np
 from trihedron.pipeline.types import F64, I32
 from trihedron.plugins.numerics.surfaces.borders import REST, border_half_edges, fixed_vertices, kept_vertices, loops
 from trihedron.plugins.numerics.surfaces.decimation import decimated
-from trihedron.plugins.numerics.surfaces.half_edges import connected, crowded, opposite_half_edges
+from trihedron.plugins.numerics.surfaces.half_edges import connected, crowded, opposite_half_edges, triangle_normals
 from trihedron.plugins.numerics.surfaces.plane_axes import plane_axes
 from trihedron.plugins.numerics.surfaces.snapping import snapped
 
@@ -50,7 +50,7 @@ def flattened(
 
 def _recut(points: F64, triangles: I32, labels: I32, parts: I32, planes: F64, hole_m2: float) -> Flattened:
     """Each part whose outline does not cross itself as the Delaunay triangulation of its polygon, unless that joins two vertices which are joined
-    beside it already. Holes in the mesh of less than `hole_m2` are closed."""
+    beside it already. Holes in the mesh of less than `hole_m2` are closed. What is folded over for good belongs to no plane."""
     opposite = opposite_half_edges(triangles)
     order, starts = loops(border_half_edges(parts, opposite), parts, opposite)
     rings: dict[int, list[I32]] = {}
@@ -72,7 +72,10 @@ def _recut(points: F64, triangles: I32, labels: I32, parts: I32, planes: F64, ho
     outlines = [(part, ring) for part in first for ring in rings[part] + (holes.get(part, []) if part not in cuts else [])]
     plane_of = np.full(parts.max() + 2, REST, np.int32)  # the last is that of the rest
     plane_of[parts] = labels
-    return Flattened(points, whole, plane_of[owners], [(int(plane_of[part]), ring) for part, ring in outlines])
+    found = plane_of[owners]
+    backwards = np.einsum("ij,ij->i", triangle_normals(points, whole), np.append(planes, np.zeros((1, 4)), axis=0)[found, :3]) < 0.0
+    found[backwards] = REST
+    return Flattened(points, whole, found, [(int(plane_of[part]), ring) for part, ring in outlines])
 
 
 def _cut(points: F64, rings: list[I32], plane: F64) -> I32 | None:

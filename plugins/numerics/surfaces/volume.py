@@ -1,7 +1,7 @@
 """A truncated signed distance field in blocks of 8 × 8 × 8 voxels (Curless and Levoy 1996; blocks: Nießner et al. 2013).
 
-A voxel holds the weighted mean of how far views saw it before (+) or behind (-) the surface, along their rays. A reading weighs with the inverse
-variance of its depth."""
+A voxel holds the weighted mean of how far views saw it before (+) or behind (-) the surface: along the ray; where a plane was found, across the plane as it
+slants there but where the reading has it. A reading weighs with the inverse variance of its depth."""
 
 from __future__ import annotations
 
@@ -10,13 +10,15 @@ from dataclasses import dataclass, field
 import numba
 import numpy as np
 
-from trihedron.pipeline.types import F32, F64, I32
+from trihedron.pipeline.types import F32, F64, I32, U8
 from trihedron.plugins.numerics.surfaces.block_hash import FREE, I64, empty_table, key_of, roomy, slot_of
 from trihedron.plugins.numerics.surfaces.views import View
 
 SIDE = 8  # voxels along a block's edge
 CELLS = SIDE**3
 RAY_STEP = 2  # px between the rays along which blocks are made; they are far larger
+LEAST_COSINE = 0.3  # of the angle between ray and normal, 73°: behind a plane seen at less it is not known so far
+LEAST_M = 0.01  # distance of a plane from the camera, below which it is seen from its edge
 
 
 @dataclass
@@ -37,22 +39,23 @@ class Volume:
         """Take in a view from a pose."""
         c, T = view.camera, T_world_camera
         lens = np.array([c.fx, c.fy, c.cx, c.cy])
-        touched, fresh = self._touched(view.depth_m, lens, T)
+        slants = _slants(view.coefficients, lens)
+        touched, fresh = self._touched(view, slants, lens, T)
         self.keys, self.numbers = roomy(self.keys, self.numbers, len(fresh))
         self._grow(self.count + len(fresh))
         self.count = int(_insert(self.keys, self.numbers, fresh, self.places, self.count))
         sigma = c.depth_noise.sigma_m(np.arange(0.0, 16.0, 0.01))
         weights = (1.0 / sigma**2).astype(np.float32)
         _integrate(
-            self.keys, self.numbers, self.distance, self.weight, touched, view.depth_m, weights, lens,
+            self.keys, self.numbers, self.distance, self.weight, touched, view.depth_m, view.labels, slants, weights, lens,
             np.ascontiguousarray(T[:3, :3].T), T[:3, 3].copy(), self.voxel_m, self.truncation_m,
         )  # fmt: skip
 
-    def _touched(self, depth: F32, lens: F64, T: F64) -> tuple[I32, I32]:
+    def _touched(self, view: View, slants: F64, lens: F64, T: F64) -> tuple[I32, I32]:
         """Blocks (n, 3) within the truncation of a reading, and those of them that are new."""
         local, _ = empty_table(1 << 13)
         while True:
-            touched = _along_rays(local, depth, lens, T, self.voxel_m * SIDE, self.truncation_m)
+            touched = _across(local, view.depth_m, view.labels, slants, lens, T, self.voxel_m * SIDE, self.truncation_m)
             if touched is not None:
                 return touched, touched[_unknown(self.keys, touched)]
             local, _ = empty_table(4 * len(local))
@@ -66,9 +69,23 @@ class Volume:
             self.weight = np.concatenate([self.weight, np.zeros((more, CELLS), np.float32)])
 
 
+def _slants(planes: F64, lens: F64) -> F64:
+    """(n + 1, 5) for each label of a view: slope of the inverse depth along x and y (1/m a pixel), which is the same all over a plane, and the plane's
+    normal. The first, of no plane, is zero."""
+    slopes = -planes[:, :2] / lens[:2] / np.maximum(planes[:, 3:], LEAST_M)
+    return np.concatenate([np.zeros((1, 5)), np.concatenate([slopes, planes[:, :3]], axis=1)])
+
+
+@numba.njit(cache=True, nogil=True, inline="always")
+def _cosine(x: float, y: float, z: float, length: float, slant: F64) -> float:
+    """Of the angle between a ray (x, y, z) of that length and the plane's normal; 1 without a plane."""
+    n = slant[2] * x + slant[3] * y + slant[4] * z
+    return 1.0 if n >= 0.0 else max(-n / length, LEAST_COSINE)
+
+
 @numba.njit(cache=True, nogil=True)
-def _along_rays(local: I64, depth: F32, lens: F64, T: F64, block_m: float, truncation: float) -> I32 | None:
-    """Blocks (n, 3) met by the rays of the readings within the truncation; None when the table `local` is too small."""
+def _across(local: I64, depth: F32, labels: U8, slants: F64, lens: F64, T: F64, block_m: float, truncation: float) -> I32 | None:
+    """Blocks (n, 3) within the truncation of the readings, along their rays; None when the table `local` is too small."""
     h, w = depth.shape
     found, count, last = np.empty((len(local) // 2, 3), np.int32), 0, -1
     for r in range(0, h, RAY_STEP):
@@ -77,7 +94,8 @@ def _along_rays(local: I64, depth: F32, lens: F64, T: F64, block_m: float, trunc
             if z <= 0.0:
                 continue
             x, y = (c - lens[2]) / lens[0], (r - lens[3]) / lens[1]
-            reach = truncation / np.sqrt(x * x + y * y + 1.0)
+            length = np.sqrt(x * x + y * y + 1.0)
+            reach = truncation / (length * _cosine(x, y, 1.0, length, slants[labels[r, c]]))
             for k in range(-1, 2):
                 t = z + k * reach
                 i = int(np.floor((T[0, 0] * x * t + T[0, 1] * y * t + T[0, 2] * t + T[0, 3]) / block_m))
@@ -121,7 +139,7 @@ def _insert(keys: I64, numbers: I32, fresh: I32, places: I32, count: int) -> int
 
 @numba.njit(cache=True, nogil=True)
 def _integrate(
-    keys: I64, numbers: I32, distance: F32, weight: F32, touched: I32, depth: F32, weights: F32, lens: F64,
+    keys: I64, numbers: I32, distance: F32, weight: F32, touched: I32, depth: F32, labels: U8, slants: F64, weights: F32, lens: F64,
     R_camera_world: F64, position: F64, voxel: float, truncation: float,
 ) -> None:  # fmt: skip
     """Update the voxels of the blocks `touched` (n, 3), which are all in the table."""
@@ -142,13 +160,17 @@ def _integrate(
                 if pz < 0.1:
                     continue
                 inverse = 1.0 / pz
-                u, v = int(fx * px * inverse + cx + 0.5), int(fy * py * inverse + cy + 0.5)
-                if u < 0 or v < 0 or u >= w or v >= h:
+                across, down = fx * px * inverse + cx, fy * py * inverse + cy
+                u, v = int(across + 0.5), int(down + 0.5)
+                if u < 0 or v < 0 or u >= w or v >= h or depth[v, u] <= 0.0:
                     continue
-                d = depth[v, u]
-                if d <= 0.0:
-                    continue
-                s = (d - pz) * np.sqrt(px * px + py * py + pz * pz) * inverse
+                d, length = float(depth[v, u]), np.sqrt(px * px + py * py + pz * pz)
+                if labels[v, u] == 0:
+                    s = (d - pz) * length * inverse
+                else:
+                    slant = slants[labels[v, u]]
+                    d /= max(1.0 + d * (slant[0] * (across - u) + slant[1] * (down - v)), 0.5)
+                    s = (d - pz) * length * inverse * _cosine(px, py, pz, length, slant)
                 if s < -truncation:
                     continue
                 s = min(s, truncation)
