@@ -105,8 +105,8 @@ def _steadiness(turned: F64, opposite: I32) -> F64:
 def _grown(
     seeds: I32, labels: I32, first: int, middle: F64, turned: F64, area: F64, opposite: I32, distance: float, cosine: float, least: float
 ) -> tuple[I32, F64]:  # fmt: skip
-    """Regions grown from seeds (t,) among the triangles without a label, about planes fitted each time they have doubled. Returns labels, from `first`
-    on for the new ones, and the new planes."""
+    """Regions grown from seeds (t,) among the triangles without a label, about planes fitted each time they have doubled. Returns labels, those of
+    the new regions from `first` on, and the new planes."""
     labels = labels.copy()
     found, count = np.empty((len(labels), 4)), 0
     tried = np.zeros(len(labels), np.bool_)
@@ -168,8 +168,8 @@ def _plane_through(middle: F64, area: F64, rows: I32, like: F64) -> tuple[F64, f
 
 
 def _joined(labels: I32, middle: F64, area: F64, opposite: I32, planes: F64, distance: float) -> I32:
-    """Planes that touch, and of which the larger one fits the smaller one's triangles within half the distance (RMS), are one: a floor that was mapped
-    twice. The larger keeps its identity."""
+    """Planes that touch, and of which the larger one fits the smaller one's triangles within the distance (RMS), are one, such as a floor that was
+    mapped twice. The larger keeps its identity."""
     h = np.flatnonzero(opposite >= 0)
     pairs = np.unique(np.stack([labels[h // 3], labels[opposite[h] // 3]], axis=1), axis=0)
     pairs = pairs[(pairs[:, 0] >= 0) & (pairs[:, 1] >= 0)]
@@ -181,7 +181,7 @@ def _joined(labels: I32, middle: F64, area: F64, opposite: I32, planes: F64, dis
         beside = beside[total[beside] >= total[small]]
         for large in beside[np.argsort(-total[beside], kind="stable")]:
             off = middle[rows] @ planes[large, :3] + planes[large, 3]
-            if large != small and planes[large, :3] @ planes[small, :3] > 0.9 and np.average(off**2, weights=area[rows]) <= (0.5 * distance) ** 2:
+            if large != small and planes[large, :3] @ planes[small, :3] > 0.9 and np.average(off**2, weights=area[rows]) <= distance**2:
                 out[rows], stands_for[stands_for == small] = large, large
                 total[large] += total[small]
                 break

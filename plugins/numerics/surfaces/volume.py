@@ -1,7 +1,7 @@
 """A truncated signed distance field in blocks of 8 × 8 × 8 voxels (Curless and Levoy 1996; blocks: Nießner et al. 2013).
 
-A voxel holds the weighted mean of how far views saw it before (+) or behind (-) the surface: along the ray; where a plane was found, across the plane as it
-slants there but where the reading has it. A reading weighs with the inverse variance of its depth."""
+A voxel holds the weighted mean of how far views saw it before (+) or behind (-) the surface: along the ray; where a plane was found, across
+the plane at its slant, but through the reading. A reading weighs with the inverse variance of its depth."""
 
 from __future__ import annotations
 
@@ -70,16 +70,16 @@ class Volume:
 
 
 def _slants(planes: F64, lens: F64) -> F64:
-    """(n + 1, 5) for each label of a view: slope of the inverse depth along x and y (1/m a pixel), which is the same all over a plane, and the plane's
-    normal. The first, of no plane, is zero."""
+    """(n + 1, 5) for each label of a view: slope of the inverse depth along x and y (1/m a pixel), which is the same all over a plane, and the
+    plane's normal. The first, of no plane, is zero."""
     slopes = -planes[:, :2] / lens[:2] / np.maximum(planes[:, 3:], LEAST_M)
     return np.concatenate([np.zeros((1, 5)), np.concatenate([slopes, planes[:, :3]], axis=1)])
 
 
 @numba.njit(cache=True, nogil=True, inline="always")
-def _cosine(x: float, y: float, z: float, length: float, slant: F64) -> float:
+def _cosine(x: float, y: float, z: float, length: float, slants: F64, label: int) -> float:
     """Of the angle between a ray (x, y, z) of that length and the plane's normal; 1 without a plane."""
-    n = slant[2] * x + slant[3] * y + slant[4] * z
+    n = slants[label, 2] * x + slants[label, 3] * y + slants[label, 4] * z
     return 1.0 if n >= 0.0 else max(-n / length, LEAST_COSINE)
 
 
@@ -95,7 +95,7 @@ def _across(local: I64, depth: F32, labels: U8, slants: F64, lens: F64, T: F64, 
                 continue
             x, y = (c - lens[2]) / lens[0], (r - lens[3]) / lens[1]
             length = np.sqrt(x * x + y * y + 1.0)
-            reach = truncation / (length * _cosine(x, y, 1.0, length, slants[labels[r, c]]))
+            reach = truncation / (length * _cosine(x, y, 1.0, length, slants, labels[r, c]))
             for k in range(-1, 2):
                 t = z + k * reach
                 i = int(np.floor((T[0, 0] * x * t + T[0, 1] * y * t + T[0, 2] * t + T[0, 3]) / block_m))
@@ -145,6 +145,7 @@ def _integrate(
     """Update the voxels of the blocks `touched` (n, 3), which are all in the table."""
     h, w = depth.shape
     fx, fy, cx, cy = lens
+    farthest = truncation / LEAST_COSINE  # along a ray; nothing farther is within the truncation across a plane
     sx, sy, sz = voxel * R_camera_world[0, 2], voxel * R_camera_world[1, 2], voxel * R_camera_world[2, 2]  # one voxel along z
     for b in range(len(touched)):
         block = numbers[slot_of(keys, key_of(touched[b, 0], touched[b, 1], touched[b, 2]))]
@@ -155,8 +156,8 @@ def _integrate(
             x = R_camera_world[0, 0] * gx + R_camera_world[0, 1] * gy + R_camera_world[0, 2] * gz
             y = R_camera_world[1, 0] * gx + R_camera_world[1, 1] * gy + R_camera_world[1, 2] * gz
             z = R_camera_world[2, 0] * gx + R_camera_world[2, 1] * gy + R_camera_world[2, 2] * gz
-            for k in range(SIDE):
-                px, py, pz = x + k * sx, y + k * sy, z + k * sz
+            for i in range(SIDE):
+                px, py, pz = x + i * sx, y + i * sy, z + i * sz
                 if pz < 0.1:
                     continue
                 inverse = 1.0 / pz
@@ -164,20 +165,22 @@ def _integrate(
                 u, v = int(across + 0.5), int(down + 0.5)
                 if u < 0 or v < 0 or u >= w or v >= h or depth[v, u] <= 0.0:
                     continue
-                d, length = float(depth[v, u]), np.sqrt(px * px + py * py + pz * pz)
-                if labels[v, u] == 0:
-                    s = (d - pz) * length * inverse
-                else:
-                    slant = slants[labels[v, u]]
-                    d /= max(1.0 + d * (slant[0] * (across - u) + slant[1] * (down - v)), 0.5)
-                    s = (d - pz) * length * inverse * _cosine(px, py, pz, length, slant)
+                d = float(depth[v, u])
+                if d - pz < -farthest:
+                    continue
+                length = np.sqrt(px * px + py * py + pz * pz)
+                s = (d - pz) * length * inverse
+                if labels[v, u] > 0 and abs(s) < farthest:
+                    k = labels[v, u]
+                    d /= max(1.0 + d * (slants[k, 0] * (across - u) + slants[k, 1] * (down - v)), 0.5)
+                    s = (d - pz) * length * inverse * _cosine(px, py, pz, length, slants, k)
                 if s < -truncation:
                     continue
                 s = min(s, truncation)
                 gain = weights[min(int(100.0 * d), len(weights) - 1)]
                 if s < -0.5 * truncation:  # what lies deep behind is read there only by readings that err that way
                     gain *= 2.0 * (truncation + s) / truncation
-                cell = column * SIDE + k
+                cell = column * SIDE + i
                 total = weight[block, cell] + gain
                 distance[block, cell] += np.float32((s - distance[block, cell]) * gain / total)
                 weight[block, cell] = total
