@@ -28,13 +28,16 @@ from google.protobuf.duration_pb2 import Duration
 from google.protobuf.timestamp_pb2 import Timestamp
 
 from trihedron.pipeline.geometry import quaternion_from_rotation, tangent_basis
-from trihedron.pipeline.types import Frame, Map, Planes, Pose, Segments, Value
+from trihedron.pipeline.types import F32, I32, Frame, Map, Planes, Pose, Segments, Surface, Value
 
 WORLD, CAMERA = "world", "camera"
 IMAGE_PERIOD_NS = 100_000_000  # 10 Hz is enough to look at
 MAP_PERIOD_NS = 1_000_000_000
 JPEG_QUALITY = 80
+MOST_VERTICES = 30_000  # of a mesh, 70 bytes each
+COARSE_M = 0.02  # side of the cells whose vertices become one when there are more; doubled until there are not
 COLORS = ((0.12, 0.47, 0.71), (1.0, 0.5, 0.05), (0.17, 0.63, 0.17), (0.84, 0.15, 0.16), (0.58, 0.4, 0.74), (0.55, 0.34, 0.29), (0.89, 0.47, 0.76))
+IDENTITY = PoseMessage(position=Vector3(), orientation=Quaternion(w=1.0))
 
 
 class View:
@@ -57,6 +60,8 @@ class View:
             yield "/view/lines", _lines(value)
         elif isinstance(value, Map) and self._due("map", value.stamp_ns, MAP_PERIOD_NS):
             yield "/view/map_points", _map_points(value)
+        elif isinstance(value, Surface) and len(value.triangles):
+            yield "/view/surface", _surface(value)
 
     def _due(self, name: str, stamp_ns: int, period_ns: int) -> bool:
         last = self._last_ns.get(name)
@@ -144,5 +149,24 @@ def _point(p: Any) -> Point3:
 def _map_points(map: Map) -> PointCloud:
     points = map.points.column("position_m")[map.points.column("alive")].astype("<f4")
     fields = [PackedElementField(name=axis, offset=4 * i, type=PackedElementField.FLOAT32) for i, axis in enumerate("xyz")]
-    identity = PoseMessage(position=Vector3(), orientation=Quaternion(w=1.0))
-    return PointCloud(timestamp=_stamp(map), frame_id=WORLD, pose=identity, point_stride=12, fields=fields, data=points.tobytes())
+    return PointCloud(timestamp=_stamp(map), frame_id=WORLD, pose=IDENTITY, point_stride=12, fields=fields, data=points.tobytes())
+
+
+def _surface(surface: Surface) -> SceneUpdate:
+    """The mesh, coarser where it would be too large, in the world; it stays."""
+    first, triangles = _coarse(surface.vertices_m, surface.triangles)
+    points = [_point(p) for p in surface.vertices_m[first]]
+    colors = [Color(r=r, g=g, b=b, a=1.0) for r, g, b in (surface.colors[first] / 255.0).tolist()]
+    mesh = TriangleListPrimitive(pose=IDENTITY, points=points, colors=colors, indices=triangles.ravel().tolist())
+    return SceneUpdate(entities=[SceneEntity(timestamp=_stamp(surface), frame_id=WORLD, id="surface", triangles=[mesh])])
+
+
+def _coarse(vertices: F32, triangles: I32) -> tuple[I32, I32]:
+    """Rows (n,) of the vertices shown, MOST_VERTICES at most, and triangles (t, 3) of these: the first vertex of each cell stands for all in it."""
+    first, number, side = np.arange(len(vertices)), np.arange(len(vertices)), COARSE_M
+    while len(first) > MOST_VERTICES:
+        _, first, number = np.unique(np.floor(vertices / side).astype(np.int64), axis=0, return_index=True, return_inverse=True)
+        side *= 2.0
+    shown = number.ravel()[triangles]
+    whole = (shown != shown[:, [1, 2, 0]]).all(axis=1)
+    return first.astype(np.int32), shown[whole].astype(np.int32)

@@ -150,7 +150,7 @@ class Runner:
                     self.result.map = self._recorded_map()
                 for name in self.computed:
                     if self.graph.stages[name].fold:
-                        self._finish_fold(name, writer if name in topics else None)
+                        self._finish_fold(name, writer, view, name in topics)
         except NodeFailure as failure:
             raise self._explain(failure, writer) from failure.__cause__
 
@@ -266,7 +266,7 @@ class Runner:
         found = reader.at(self.indices[-1]) or reader.latest
         return found if isinstance(found, Map) else None
 
-    def _finish_fold(self, name: str, writer: RecordingWriter | None) -> None:
+    def _finish_fold(self, name: str, writer: RecordingWriter | None, view: View, recorded: bool) -> None:
         plugin = self.graph.stages[name].plugin
         state = self._fold_states.pop(name) if name in self._fold_states else plugin.start()
         began = time.perf_counter()
@@ -274,7 +274,10 @@ class Runner:
         self.timing.add_finish(name, 1e3 * (time.perf_counter() - began))
         self.result.folds[name] = value
         if writer is not None:
-            writer.write(name, value)
+            if recorded:
+                writer.write(name, value)
+            for channel, message in view.messages(value):
+                writer.write_message(channel, message, value.stamp_ns)
 
     def _explain(self, failure: NodeFailure, writer: RecordingWriter | None) -> TrihedronError:
         """The failure as one line: a user's mistake as it is, anything else with stage, frame and the command that repeats only that."""

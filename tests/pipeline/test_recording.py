@@ -3,6 +3,7 @@
 import io
 import json
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -16,9 +17,9 @@ from mcap_protobuf.decoder import DecoderFactory
 
 from trihedron.pipeline import recording as module
 from trihedron.pipeline.errors import RecordingError
-from trihedron.pipeline.foxglove import View
+from trihedron.pipeline.foxglove import MOST_VERTICES, View
 from trihedron.pipeline.recording import FrameReader, Recording, RecordingWriter, TopicReader
-from trihedron.pipeline.types import Planes, Segments
+from trihedron.pipeline.types import Planes, Segments, Surface
 
 sys.path.insert(0, str(Path(__file__).parent))
 from toys import ToyDataset, ToyKeypoints
@@ -115,6 +116,29 @@ def test_wrong_files_say_so_in_one_line(tmp_path):
     assert str(error.value).replace(str(tmp_path), "DIR") == "DIR/no/a.mcap: cannot be written: No such file or directory; give another out=FOLDER"
 
 
+def loose_mesh(index, vertices, triangles):
+    """A surface of triangles in no plane."""
+    t = len(triangles)
+    labels, texels = np.full(t, -1, np.int32), np.full((t, 3, 2), np.nan, np.float32)
+    white = np.full((len(vertices), 3), 255, np.uint8)
+    return replace(
+        Surface.empty(index, 1000 * index), vertices_m=vertices, colors=white, triangles=triangles, instances=labels, texels=texels
+    )  # fmt: skip
+
+
+def test_a_large_surface_is_shown_coarsely():
+    """A sheet of 400 x 400 vertices: at most as many as are allowed are shown, and they still cover it."""
+    x, y = np.meshgrid(np.arange(400), np.arange(400))
+    vertices = (0.005 * np.stack([x, y, 0 * x], axis=-1).reshape(-1, 3)).astype(np.float32)
+    corner = (400 * y + x)[:-1, :-1].ravel()
+    triangles = np.stack([corner, corner + 1, corner + 401], axis=1).astype(np.int32)
+    ((_, message),) = View().messages(loose_mesh(0, vertices, triangles))
+    shown = message.entities[0].triangles[0]
+    assert 5_000 < len(shown.points) <= MOST_VERTICES and message.ByteSize() < 5_000_000
+    corners = np.array([(p.x, p.y) for p in shown.points])[np.array(shown.indices).reshape(-1, 3)]
+    assert np.ptp(corners.reshape(-1, 2), axis=0) == pytest.approx(1.995, abs=0.1)
+
+
 def test_viewer_messages_are_decoded_by_their_own_schema(tmp_path):
     view, frame = View(), ToyDataset()(3)
     pixels, points, covariance = (np.zeros((2, 2, *shape), np.float32) for shape in ((2,), (3,), (3, 3)))
@@ -124,7 +148,9 @@ def test_viewer_messages_are_decoded_by_their_own_schema(tmp_path):
     front = np.array([[0, 0, -1.0, 2.0]])
     plane = Planes(3, 3000, front, np.zeros((1, 3, 3)), np.zeros((1, 4, 4)), np.ones(1, np.int32), square, labels, 2)
     writer = RecordingWriter(tmp_path / "a.mcap", {})
-    for value in (frame, lines, plane):
+    corners = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0]], np.float32)
+    mesh = loose_mesh(3, corners, np.array([[0, 1, 2]], np.int32))
+    for value in (frame, lines, plane, mesh, Surface.empty(3, 3000)):
         for channel, message in view.messages(value):
             writer.write_message(channel, message, value.stamp_ns)
     assert list(view.messages(frame)) == []  # the same tenth of a second
@@ -136,7 +162,10 @@ def test_viewer_messages_are_decoded_by_their_own_schema(tmp_path):
         "/view/camera": "foxglove.CameraCalibration",
         "/view/lines": "foxglove.SceneUpdate",
         "/view/planes": "foxglove.SceneUpdate",
+        "/view/surface": "foxglove.SceneUpdate",
     }
+    entity = found["/view/surface"][1].entities[0]
+    assert entity.frame_id == "world" and list(entity.triangles[0].indices) == [0, 1, 2] and len(entity.triangles[0].colors) == 3
     assert list(found["/view/camera"][1].K) == [2.0, 0, 1.5, 0, 2.0, 1.0, 0, 0, 1]
     assert len(found["/view/lines"][1].entities[0].lines[0].points) == 4
     assert len(found["/view/planes"][1].entities[0].triangles[0].points) == 6  # the square, without the point inside

@@ -1,74 +1,26 @@
 """Surfaces of scenes with known planes: where they are, that they are whole, and that nothing seen is no error."""
 
+import sys
 from dataclasses import replace
 from functools import cache
+from pathlib import Path
 
 import numpy as np
 import pytest
 import trimesh
 
+sys.path.insert(0, str(Path(__file__).parent))
+from surface_world import BACK, BALL, FLOOR, LEFT, RADIUS, fold, off_truth, render, seen, walk
+
+
 from trihedron.pipeline.codec import Encoder
-from trihedron.pipeline.geometry import exp_so3, pose_matrix
 from trihedron.pipeline.ply import triangle_planes, write_ply
 from trihedron.pipeline.registry import load_plugins, plugin_class, plugins_of
-from trihedron.pipeline.types import EXACT_DEPTH, LOST, OK, PLANE_KINDS, Camera, Frame, Planes, Pose, Rotation
-from trihedron.plugins.numerics.maps.insertion import add_keyframe
-from trihedron.plugins.numerics.maps.landmarks import empty_map
+from trihedron.pipeline.types import EXACT_DEPTH, LOST, PLANE_KINDS, Camera
 from trihedron.plugins.numerics.surfaces.half_edges import opposite_half_edges
 
 load_plugins()
 SURFACES = tuple(name for name in plugins_of("surface") if name != "none")
-CAMERA = Camera(160, 120, 130.0, 130.0, 79.5, 59.5, depth_noise=EXACT_DEPTH)
-FLOOR, LEFT, BACK = (0.0, -1.0, 0.0, 1.0), (1.0, 0.0, 0.0, 1.2), (0.0, 0.0, -1.0, 3.0)  # the corner of a room, seen from inside; y down
-BALL, RADIUS = np.array([0.5, 0.85, 2.2]), 0.4  # sunk into the floor
-
-
-def render(T, planes, ball=True, camera=CAMERA):
-    """Depth and the number of the plane (1 …, 0 = the ball or nothing) seen by a camera at T."""
-    v, u = np.mgrid[0 : camera.height, 0 : camera.width]
-    rays = np.stack([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, np.ones(u.shape)], axis=-1) @ T[:3, :3].T
-    depth, label = np.full(u.shape, np.inf), np.zeros(u.shape, np.uint8)
-    for k, plane in enumerate(planes, 1):
-        slope = rays @ np.array(plane[:3])
-        with np.errstate(divide="ignore"):
-            z = -(np.array(plane[:3]) @ T[:3, 3] + plane[3]) / slope
-        nearer = (slope < 0.0) & (z > 0.05) & (z < depth)
-        depth[nearer], label[nearer] = z[nearer], k
-    if ball:
-        a, b = (rays**2).sum(-1), rays @ (T[:3, 3] - BALL)
-        root = b * b - a * (((T[:3, 3] - BALL) ** 2).sum() - RADIUS**2)
-        z = np.where(root > 0.0, (-b - np.sqrt(np.maximum(root, 0.0))) / a, np.inf)
-        depth, label = np.minimum(depth, z), np.where(z < depth, 0, label).astype(np.uint8)
-    return np.where(np.isfinite(depth), depth, 0.0), label
-
-
-def seen(index, T, planes=(FLOOR, LEFT, BACK), ball=True, camera=CAMERA, status=OK, depth=None):
-    """What a surface is given of a frame: frame, planes, rotation, pose."""
-    z, label = render(T, planes, ball, camera)
-    z = z if depth is None else depth
-    stamp, n = index * 33_000_000, len(planes)
-    own = np.array([(*(T[:3, :3].T @ np.array(p[:3])), p[3] + np.array(p[:3]) @ T[:3, 3]) for p in planes]).reshape(-1, 4)
-    regions = Planes(
-        index, stamp, own, np.tile(np.eye(3) * 1e-6, (n, 1, 1)), np.zeros((n, 4, 4)), np.full(n, 4000, np.int32),
-        np.full((n, 32, 3), np.nan, np.float32), label, 1,
-    )  # fmt: skip
-    color = np.full((*z.shape, 3), (200, 100, 50), np.uint8)
-    frame = Frame(index, stamp, color, z.astype(np.float32), camera)
-    one = np.eye(3)[None]
-    rotation = Rotation(index, stamp, T[:3, :3], np.eye(3) * 1e-6, one, one, np.zeros(1, np.int32), np.ones(1), "manhattan")
-    return frame, regions, rotation, Pose(index, stamp, T, np.eye(6) * 1e-6, T, -1, np.zeros(3, np.int32), 0, status, "")
-
-
-def walk(count=8):
-    """Poses that look into the corner from different places."""
-    return [pose_matrix(exp_so3(np.array([-0.35, -0.45 + 0.06 * k, 0.0])), np.array([-0.3 + 0.1 * k, 0.02 * k, 0.03 * k])) for k in range(count)]
-
-
-def fold(plugin, inputs, map=None):
-    state = plugin.start()
-    for frame, planes, rotation, pose in inputs:
-        state = plugin.add(state, frame, planes, rotation, pose, None)
-    return plugin.finish(state, map)
 
 
 @cache
@@ -76,15 +28,9 @@ def corner(name):
     return fold(plugin_class("surface", name)(view_width=160), [seen(k, T) for k, T in enumerate(walk())])
 
 
-def off_truth(surface):
-    """Distances of the vertices from the corner's planes or the ball, whichever is nearest."""
-    points = surface.vertices_m.astype(float)
-    off = [abs(points @ np.array(p[:3]) + p[3]) for p in (FLOOR, LEFT, BACK)] + [abs(np.linalg.norm(points - BALL, axis=1) - RADIUS)]
-    return np.min(off, axis=0)
-
-
-@pytest.mark.parametrize(("name", "mean_m"), [("tsdf", 0.003), ("planar_tsdf", 0.003), ("planar_polygon", 0.001), ("planar_greedy", 0.001),
-("surfels", 0.02)])
+@pytest.mark.parametrize(
+    ("name", "mean_m"), [("tsdf", 0.003), ("planar_tsdf", 0.003), ("planar_polygon", 0.001), ("planar_greedy", 0.001), ("surfels", 0.02)]
+)
 def test_a_corner_with_a_ball(name, mean_m):
     surface = corner(name)
     assert len(surface.triangles) > 10 and off_truth(surface).mean() < mean_m
@@ -214,33 +160,6 @@ def test_degenerate_input_gives_a_valid_file(name, case, tmp_path):
     if case in ("one plane", "a million points") and name != "surfels":
         assert np.abs(surface.vertices_m[:, 2] - 3.0).max() < 0.002 and len(surface.triangles) >= 2
         assert case == "one plane" or name == "tsdf" or len(surface.triangles) < 20_000
-
-
-@pytest.mark.parametrize("name", SURFACES)
-def test_what_was_gathered_follows_the_final_keyframes(name):
-    """Poses said 5 cm off, hung on a keyframe that the map puts right in the end."""
-    shift = np.array([0.05, 0.0, 0.0])
-    map = empty_map(0, 0, 32, 32, 32)
-    inputs = []
-    for k, T in enumerate(walk(4)):
-        frame, planes, rotation, pose = seen(k, T)
-        if k == 0:
-            map, _ = add_keyframe(map, pose, CAMERA)
-        wrong = pose_matrix(T[:3, :3], T[:3, 3] + shift)
-        inputs.append((frame, planes, rotation, replace(pose, T_world_camera=wrong, reference=0, T_reference_camera=np.linalg.inv(walk(1)[0]) @ T)))
-    surface = fold(plugin_class("surface", name)(view_width=160), inputs, map)
-    assert np.median(off_truth(surface)) < 0.01
-    unmoved = fold(plugin_class("surface", name)(view_width=160), inputs)
-    assert off_truth(unmoved).max() > 0.04
-
-
-def test_memory_is_bounded_by_the_room_not_by_the_sequence():
-    plugin = plugin_class("surface", "planar_tsdf")(view_width=160)
-    state, kept = plugin.start(), []
-    for k in range(60):
-        state = plugin.add(state, *seen(k, walk()[k % 8]), None)
-        kept.append(len(state.views))
-    assert kept[-1] == kept[40] <= 24 and state.volume.count < 4000
 
 
 @pytest.mark.parametrize(
