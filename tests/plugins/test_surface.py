@@ -9,15 +9,14 @@ import numpy as np
 import pytest
 import trimesh
 
-sys.path.insert(0, str(Path(__file__).parent))
-from surface_world import BACK, BALL, FLOOR, LEFT, RADIUS, fold, off_truth, render, seen, walk
-
-
 from trihedron.pipeline.codec import Encoder
 from trihedron.pipeline.ply import triangle_planes, write_ply
 from trihedron.pipeline.registry import load_plugins, plugin_class, plugins_of
 from trihedron.pipeline.types import EXACT_DEPTH, LOST, PLANE_KINDS, Camera
 from trihedron.plugins.numerics.surfaces.half_edges import opposite_half_edges
+
+sys.path.insert(0, str(Path(__file__).parent))
+from surface_world import BACK, BALL, FLOOR, LEFT, RADIUS, fold, off_truth, render, seen, walk
 
 load_plugins()
 SURFACES = tuple(name for name in plugins_of("surface") if name != "none")

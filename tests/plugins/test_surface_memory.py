@@ -7,10 +7,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-sys.path.insert(0, str(Path(__file__).parent))
-from surface_world import CAMERA, FLOOR, fold, off_truth, seen, walk
-
-
 from trihedron.pipeline.geometry import pose_matrix
 from trihedron.pipeline.registry import load_plugins, plugin_class, plugins_of
 from trihedron.pipeline.types import Camera
@@ -20,6 +16,9 @@ from trihedron.plugins.numerics.surfaces.half_edges import opposite_half_edges
 from trihedron.plugins.numerics.surfaces.measured_noise import with_measured_noise
 from trihedron.plugins.numerics.surfaces.planar_parts import Flatness, planar_labels
 from trihedron.plugins.numerics.surfaces.views import readings
+
+sys.path.insert(0, str(Path(__file__).parent))
+from surface_world import CAMERA, FLOOR, fold, off_truth, seen, walk
 
 load_plugins()
 SURFACES = tuple(name for name in plugins_of("surface") if name != "none")
