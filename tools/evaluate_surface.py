@@ -2,12 +2,10 @@
 
 MESH is a run folder, whose surface.ply is judged, or a file (ply, obj) in the world of the trajectory beside it. TRUTH is the run's recording, or its
 folder: the truth is that of its data set, the exact surface of the synthetic scenes, rendered depth for ICL-NUIM. By default the mesh's own folder.
-The mesh
-is moved by the SE(3) that aligns trajectory.txt with the ground truth, never by itself.
+The mesh is moved by the SE(3) that aligns trajectory.txt with the ground truth, never by itself.
 
 Accuracy is the distance from the mesh to the truth, over its area. Completeness is the share of the truth that was seen, where a sensor reading
-fell, that is
-within 2 and 5 cm of the mesh; what cannot be seen counts for nothing.
+fell, that is within 2 and 5 cm of the mesh; what cannot be seen counts for nothing.
 
 Example: trihedron evaluate-surface runs/latest runs/latest/run.mcap
 """
@@ -90,8 +88,7 @@ def _dataset(recording: Any) -> Any:
 
 def judged(vertices: F64, triangles: I32, truth: Truth) -> dict[str, Any]:
     """The figures of a mesh in the world of the truth: triangles, and per part accuracy in metres (mean, RMSE, 95 %) and completeness within
-    WITHIN_M.
-    A point of the mesh belongs to the part that is nearest to it."""
+    WITHIN_M. A point of the mesh belongs to the part that is nearest to it."""
     import numpy as np
 
     from trihedron.tools.mesh_distance import NearestTriangle, sampled

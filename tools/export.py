@@ -1,8 +1,7 @@
 """Write what a run has found in a format that other programs read.
 
 RUN is a run folder or its recording. Lengths are metres. Meshes are turned so that up, an axis of the Manhattan frame, is +z (ply, obj,
-planes.json) or +y
-(gltf, as its standard says), and what the first camera saw is ahead: +y, or -z.
+planes.json) or +y (gltf, as its standard says), and what the first camera saw is ahead: +y, or -z.
 
 Example: trihedron export runs/latest --to gltf
 """

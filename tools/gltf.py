@@ -21,8 +21,7 @@ TEXTURED, PAINTED = 0, 1  # materials
 
 def glb(parts: Sequence[dict[str, Any]], atlas: U8) -> bytes:
     """A scene of meshes. A part has `name`, `positions` (n, 3), `indices` (3 t,), and `texels` (n, 2, 0..1) in the atlas (h, w, 3) with `normals`
-    (n, 3), or
-    `colors` (n, 3) RGB; `extras` are attached to its node."""
+    (n, 3), or `colors` (n, 3) RGB; `extras` are attached to its node."""
     buffer = _Buffer()
     document: dict[str, Any] = {
         "asset": {"version": "2.0", "generator": "trihedron"},

@@ -4,6 +4,7 @@ import numpy as np
 
 from trihedron.pipeline.geometry import exp_so3, pose_matrix
 from trihedron.pipeline.types import EXACT_DEPTH, OK, Camera, Frame, Planes, Pose, Rotation
+from trihedron.plugins.numerics.surfaces.half_edges import opposite_half_edges
 
 CAMERA = Camera(160, 120, 130.0, 130.0, 79.5, 59.5, depth_noise=EXACT_DEPTH)
 FLOOR, LEFT, BACK = (0.0, -1.0, 0.0, 1.0), (1.0, 0.0, 0.0, 1.2), (0.0, 0.0, -1.0, 3.0)  # the corner of a room, seen from inside; y down
@@ -63,3 +64,47 @@ def off_truth(surface):
     points = surface.vertices_m.astype(float)
     off = [abs(points @ np.array(p[:3]) + p[3]) for p in (FLOOR, LEFT, BACK)] + [abs(np.linalg.norm(points - BALL, axis=1) - RADIUS)]
     return np.min(off, axis=0)
+
+
+def faults(surface):
+    """What is wrong with a mesh, by name: edges of more than two triangles, edges that two triangles run along the same way, vertices inside an open
+    edge (T-junctions), open edges that lie upon each other (cracks), holes of less than 1 cm², planar triangles that face backwards."""
+    t, points = surface.triangles, surface.vertices_m.astype(float)
+    begin, end = t.ravel(), t[:, [1, 2, 0]].ravel()
+    _, times = np.unique(np.sort(np.stack([begin, end], axis=1), axis=1), axis=0, return_counts=True)
+    _, same_way = np.unique(np.stack([begin, end], axis=1), axis=0, return_counts=True)
+    open_ones = np.flatnonzero(opposite_half_edges(t) < 0)
+    a, b = points[begin[open_ones]], points[end[open_ones]]
+    rim = np.unique(np.concatenate([begin[open_ones], end[open_ones]]))
+    inside = 0
+    for p, q, first, second in zip(a, b, begin[open_ones], end[open_ones]):
+        share = (points[rim] - p) @ (q - p) / max(((q - p) ** 2).sum(), 1e-12)
+        off = np.linalg.norm(points[rim] - p - np.clip(share, 0, 1)[:, None] * (q - p), axis=1)
+        inside += ((off < 1e-4) & (share > 1e-3) & (share < 1 - 1e-3) & (rim != first) & (rim != second)).sum()
+    places = np.unique(np.rint(points * 1e5).astype(int), axis=0, return_inverse=True)[1].ravel()
+    _, upon = np.unique(np.sort(places[np.stack([begin, end])[:, open_ones]], axis=0), axis=1, return_counts=True)
+    planar = surface.instances >= 0
+    corners = points[t[planar]]
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    back = (normals * surface.coefficients[surface.instances[planar], :3]).sum(axis=1) < -1e-7
+    return {
+        "crowded": int((times > 2).sum()), "same way": int((same_way > 1).sum()), "T-junctions": int(inside), "cracks": int((upon > 1).sum()),
+        "holes": _pinholes(begin[open_ones], end[open_ones], points), "backwards": int(back.sum()),
+    }  # fmt: skip
+
+
+def _pinholes(begin, end, points):
+    """Rings of open edges that fit into a square centimetre."""
+    parents = {int(v): int(v) for v in np.concatenate([begin, end])}
+
+    def root(v):
+        while parents[v] != v:
+            v = parents[v]
+        return v
+
+    for u, v in zip(begin, end):
+        parents[root(int(u))] = root(int(v))
+    rings = {}
+    for v in parents:
+        rings.setdefault(root(v), []).append(v)
+    return sum(bool(np.ptp(points[ring], axis=0).max() < 0.01) for ring in rings.values())

@@ -16,7 +16,7 @@ from trihedron.pipeline.types import EXACT_DEPTH, LOST, PLANE_KINDS, Camera
 from trihedron.plugins.numerics.surfaces.half_edges import opposite_half_edges
 
 sys.path.insert(0, str(Path(__file__).parent))
-from surface_world import BACK, BALL, FLOOR, LEFT, RADIUS, fold, off_truth, render, seen, walk
+from surface_world import BACK, BALL, FLOOR, LEFT, RADIUS, faults, fold, off_truth, render, seen, walk
 
 load_plugins()
 SURFACES = tuple(name for name in plugins_of("surface") if name != "none")
@@ -57,38 +57,31 @@ def test_planes_are_known_by_what_they_are(name):
     assert np.isfinite(texels).all() and texels.min() >= 0.0 and (texels.max(axis=(0, 1)) < surface.atlas.shape[1::-1]).all()
 
 
-def faults(surface):
-    """(edges with more than two triangles or two that run the same way, vertices inside a border edge, planar triangles that face backwards)."""
-    t, points = surface.triangles, surface.vertices_m.astype(float)
-    begin, end = t.ravel(), t[:, [1, 2, 0]].ravel()
-    _, times = np.unique(np.sort(np.stack([begin, end], axis=1), axis=1), axis=0, return_counts=True)
-    open_ones = np.flatnonzero(opposite_half_edges(t) < 0)
-    a, b = points[begin[open_ones]], points[end[open_ones]]
-    rim = np.unique(np.concatenate([begin[open_ones], end[open_ones]]))
-    inside = 0
-    for p, q, first, second in zip(a, b, begin[open_ones], end[open_ones]):
-        share = (points[rim] - p) @ (q - p) / max(((q - p) ** 2).sum(), 1e-12)
-        off = np.linalg.norm(points[rim] - p - np.clip(share, 0, 1)[:, None] * (q - p), axis=1)
-        inside += ((off < 1e-4) & (share > 1e-3) & (share < 1 - 1e-3) & (rim != first) & (rim != second)).sum()
-    planar = surface.instances >= 0
-    corners = points[t[planar]]
-    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    back = (normals * surface.coefficients[surface.instances[planar], :3]).sum(axis=1) < -1e-7
-    return int((times > 2).sum()), int(inside), int(back.sum())
-
-
 @pytest.mark.parametrize("name", ["planar_tsdf", "planar_polygon"])
-def test_no_t_junctions_no_edges_of_three_triangles_nothing_turned_over(name):
-    assert faults(corner(name)) == (0, 0, 0)
+def test_the_mesh_is_whole_and_nothing_is_turned_over(name):
+    assert set(faults(corner(name)).values()) == {0}
 
 
 def test_the_counts_of_faults_see_faults():
     surface = corner("planar_polygon")
     turned = surface.triangles.copy()
     turned[:5] = turned[:5, ::-1]
-    assert faults(replace(surface, triangles=turned))[2] >= 4
+    assert faults(replace(surface, triangles=turned))["backwards"] >= 4
     doubled = {name: np.concatenate([getattr(surface, name), getattr(surface, name)[:1]]) for name in ("triangles", "instances", "texels")}
-    assert faults(replace(surface, **doubled))[0] == 3
+    assert faults(replace(surface, **doubled))["crowded"] == 3 == faults(replace(surface, **doubled))["same way"]
+    apart = {"vertices_m": surface.vertices_m[surface.triangles.ravel()], "colors": surface.colors[surface.triangles.ravel()]}
+    loose = replace(surface, **apart, triangles=np.arange(surface.triangles.size, dtype=np.int32).reshape(-1, 3))
+    shared = (opposite_half_edges(surface.triangles) >= 0).sum() // 2
+    assert faults(loose)["cracks"] == shared > 10
+    middle = surface.vertices_m[surface.triangles[0, :2]].mean(axis=0, keepdims=True)
+    begin, end, far = surface.triangles[0]
+    half = {name: np.concatenate([getattr(surface, name), getattr(surface, name)[:1]]) for name in ("instances", "texels")}
+    corner_of = np.concatenate([[[begin, len(surface.vertices_m), far]], surface.triangles[1:], [[len(surface.vertices_m), end, far]]])
+    cut = replace(
+        surface, **half, triangles=corner_of.astype(np.int32), vertices_m=np.concatenate([surface.vertices_m, middle]),
+        colors=np.concatenate([surface.colors, surface.colors[:1]]),
+    )  # fmt: skip
+    assert faults(cut)["T-junctions"] == (opposite_half_edges(surface.triangles)[0] >= 0)
 
 
 @pytest.mark.parametrize("name", ["planar_tsdf", "planar_polygon"])

@@ -34,8 +34,8 @@ def coloured(state: Gathered, map: Map | None, vertices: F64, triangles: I32) ->
 
 
 def pictured(
-    state: Gathered, map: Map | None, vertices: F64, triangles: I32, labels: I32, planes: F64, ids: I32, loops: Sequence[tuple[int, I32]], texel_m:
-    float
+    state: Gathered, map: Map | None, vertices: F64, triangles: I32, labels: I32, planes: F64, ids: I32, loops: Sequence[tuple[int, I32]],
+    texel_m: float,
 ) -> Surface:  # fmt: skip
     """A surface whose triangles (t, 3) lie in planes (p, 4) with ids (p,), or in none: `labels` (t,). Planes without a triangle are left out."""
     plain = coloured(state, map, vertices, triangles)

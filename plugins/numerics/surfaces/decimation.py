@@ -18,8 +18,7 @@ NEAR = 1024  # but so many that follow each other before the next: they are near
 
 def decimated(vertices: F64, triangles: I32, labels: I32, planes: F64, border: I32, free: Bool, beside: I32) -> I32:
     """The rows (t,) that stay, in triangles (t, 3) that are changed in place. Vertices of one plane's triangles alone go; those on a border (v,) go
-    when
-    they are `free` (v,), along it: `beside` (v, 2) are the neighbours there."""
+    when they are `free` (v,), along it: `beside` (v, 2) are the neighbours there."""
     number = np.arange(len(vertices), dtype=np.uint64)
     order = np.lexsort((number * np.uint64(STEP) % np.uint64(1 << 32), number // np.uint64(NEAR))).astype(np.int32)
     alive = np.ones(len(triangles), np.bool_)

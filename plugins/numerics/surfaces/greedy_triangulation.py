@@ -12,8 +12,7 @@ MOST = 96  # neighbours of a point that may be joined to it
 
 def greedy_triangles(points: F64, radius_m: float, multiplier: float) -> I32:
     """Triangles (t, 3), anticlockwise, of points (n, 2). A point is joined to others within `multiplier` times the distance of its nearest
-    neighbour, and
-    within `radius_m`."""
+    neighbour, and within `radius_m`."""
     from scipy.spatial import cKDTree
 
     if len(points) < 3:
@@ -32,8 +31,7 @@ def greedy_triangles(points: F64, radius_m: float, multiplier: float) -> I32:
 @numba.njit(cache=True, nogil=True)
 def _accepted(points: F64, edges: I32, length: F64, distance: F64, nearest: I32) -> I32:
     """Rows of the edges, shortest first, that cross no edge accepted before. One that does is no longer, so one of its ends is as near to an end of
-    the
-    edge as that is long: among its neighbours (n, MOST), sorted by distance."""
+    the edge as that is long: among its neighbours (n, MOST), sorted by distance."""
     partners = np.full((len(points), MOST), -1, np.int32)
     degree = np.zeros(len(points), np.int32)
     out, count, last = np.empty(len(edges), np.int32), 0, distance.shape[1] - 1

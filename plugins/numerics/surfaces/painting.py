@@ -17,8 +17,7 @@ MOST = 48  # views; what one sees its neighbours see too
 
 def painted(points: F64, normals: F64, views: Sequence[tuple[View, F64]]) -> tuple[U8, Bool]:
     """(n, 3) RGB of points with unit normals (n, 3), the mean over the views that see them, those that see them large by far the most; and whether
-    any
-    does: UNSEEN grey if none. Of more than MOST views as many are asked, evenly."""
+    any does: UNSEEN grey if none. Of more than MOST views as many are asked, evenly."""
     points, normals = np.ascontiguousarray(points, np.float32), np.ascontiguousarray(normals, np.float32)
     total = np.zeros((len(points), 4), np.float32)
     for row in np.unique(np.linspace(0, max(len(views) - 1, 0), min(MOST, len(views))).round().astype(int)):

@@ -46,8 +46,7 @@ def moved(surfels: F64, T_a_b: F64) -> F64:
 @numba.njit(cache=True, nogil=True)
 def _assigned(depth: F32, gray: F32, labels: U8, mask: U8, side: int) -> I32:
     """(h, w) number of the superpixel a pixel belongs to, -1 = none: the nearest of the centres about it in place, inverse depth and brightness,
-    and of the
-    same region (SLIC, Achanta et al. 2012)."""
+    and of the same region (SLIC, Achanta et al. 2012)."""
     h, w = depth.shape
     rows, columns = (h + side - 1) // side, (w + side - 1) // side
     centres = np.zeros((rows * columns, 5))  # y, x, inverse depth, brightness, region
@@ -100,48 +99,51 @@ def _surfels(depth: F32, color: U8, labels: U8, assigned: I32, lens: F64, side: 
     """(n, 13) one for each superpixel of at least a quarter of its square, camera frame: its mean point, and the plane of least squares through
     it."""
     h, w = depth.shape
-    total, scatter = np.zeros((count, 8)), np.zeros((count, 3, 3))
+    total, scatter = np.zeros((count, 7)), np.zeros((count, 3, 3))
     region = np.zeros(count, np.int32)
-    for turn in range(2):
-        for y in range(h):
-            for x in range(w):
-                k = assigned[y, x]
-                if k < 0:
-                    continue
+    for y in range(h):
+        for x in range(w):
+            k = assigned[y, x]
+            if k >= 0:
                 z = float(depth[y, x])
-                p = np.array([(x - lens[2]) / lens[0] * z, (y - lens[3]) / lens[1] * z, z])
-                if turn == 0:
-                    total[k, 0] += 1.0
-                    total[k, 1:4] += p
-                    total[k, 4] += color[y, x, 0]
-                    total[k, 5] += color[y, x, 1]
-                    total[k, 6] += color[y, x, 2]
-                    region[k] = labels[y, x]
-                else:
-                    p -= total[k, 1:4] / total[k, 0]
-                    for i in range(3):
-                        for j in range(3):
-                            scatter[k, i, j] += p[i] * p[j]
-    out, n = np.zeros((count, COLUMNS)), 0
+                total[k, 0] += 1.0
+                total[k, 1] += (x - lens[2]) / lens[0] * z
+                total[k, 2] += (y - lens[3]) / lens[1] * z
+                total[k, 3] += z
+                for i in range(3):
+                    total[k, 4 + i] += color[y, x, i]
+                region[k] = labels[y, x]
+    for y in range(h):
+        for x in range(w):
+            k = assigned[y, x]
+            if k >= 0:
+                n, z = total[k, 0], float(depth[y, x])
+                px, py, pz = (x - lens[2]) / lens[0] * z - total[k, 1] / n, (y - lens[3]) / lens[1] * z - total[k, 2] / n, z - total[k, 3] / n
+                scatter[k, 0, 0] += px * px
+                scatter[k, 1, 0] += py * px
+                scatter[k, 1, 1] += py * py
+                scatter[k, 2, 0] += pz * px
+                scatter[k, 2, 1] += pz * py
+                scatter[k, 2, 2] += pz * pz
+    out, found = np.zeros((count, COLUMNS)), 0
     for k in range(count):
         if total[k, 0] < 0.25 * side * side:
             continue
-        values, vectors = np.linalg.eigh(scatter[k] / total[k, 0])
+        values, vectors = np.linalg.eigh(scatter[k] / total[k, 0])  # reads the lower triangle
         mean, normal = total[k, 1:4] / total[k, 0], vectors[:, 0].copy()
         if np.dot(normal, mean) > 0.0:
             normal = -normal
-        out[n, :3], out[n, 3:6], out[n, 6:9] = mean, normal, total[k, 4:7] / total[k, 0]
-        out[n, 9] = 2.0 * np.sqrt(max(values[1], 0.25 * values[2]))  # of a disc with this scatter across, if not much longer than wide
-        out[n, 10] = values[0]
-        out[n, 11] = region[k] - 1
-        n += 1
-    return out[:n].copy()
+        out[found, :3], out[found, 3:6], out[found, 6:9] = mean, normal, total[k, 4:7] / total[k, 0]
+        out[found, 9] = 2.0 * np.sqrt(max(values[1], 0.25 * values[2]))  # of a disc with this scatter across, if not much longer than wide
+        out[found, 10] = values[0]
+        out[found, 11] = region[k] - 1
+        found += 1
+    return out[:found].copy()
 
 
 def fused(views: Sequence[F64], cosine: float) -> F64:
     """(m, 13) the surfels (n, 13) of all views, those of the same place and direction as one: nearer than half a radius along and across their
-    normals. Of
-    the fused ones the radius is the smallest seen, the plane that of the first."""
+    normals. Of the fused ones the radius is the smallest seen, the plane that of the first."""
     cells = max((len(s) for s in views), default=0)
     out = np.zeros((max(sum(map(len, views)), 1), COLUMNS))
     slots = 1 << 12

@@ -1,8 +1,7 @@
 """The zero level of a volume as triangles: naive surface nets (Gibson 1998).
 
 Each cell of eight voxels with both signs holds one vertex, the mean of where its edges cross zero; each voxel edge with both signs joins the four
-cells
-about it to two triangles. So neighbouring triangles share their vertices wherever all voxels are known."""
+cells about it to two triangles. So neighbouring triangles share their vertices wherever all voxels are known."""
 
 from __future__ import annotations
 
