@@ -16,11 +16,11 @@ PLANE_KINDS = ("plane", "floor", "ceiling", "wall", "horizontal", "vertical")  #
 class Surface(Value):
     """A triangle mesh in the world frame, anticlockwise seen from where it was seen, and the plane instances in it.
 
-    `instances` is the row of the plane a triangle lies in, -1 for none. Of plane i: `plane_ids` is its id in the map (beyond the map's if it is
-    not there), `coefficients` n·x + d = 0 with n towards the camera, `kinds` a row of PLANE_KINDS, `areas_m2` that of its triangles,
-    `plane_colors` its mean. Row k of `loops` is (plane, begin, end): `loop_vertices[begin:end]` go round it, anticlockwise about n; round a hole the other way.
-    `atlas` (RGB) pictures the planes: `texels` are the (x, y) of a triangle's corners in it, pixel centres at integers; NaN without a picture.
-    `up` points up in the world, along an axis of the Manhattan frame; NaN when nothing says so."""
+    `instances` is the row of the plane a triangle lies in, -1 for none. Of plane i: `plane_ids` is its id in the map (beyond the map's if it is not
+    there), `coefficients` n·x + d = 0 with n towards the camera, `kinds` a row of PLANE_KINDS, `areas_m2` that of its triangles, `plane_colors` its
+    mean. Row k of `loops` is (plane, begin, end): `loop_vertices[begin:end]` go round it, anticlockwise about n; round a hole the other way.
+    `atlas` (RGB) pictures the planes: `texels` are the (x, y) of a triangle's corners in it, pixel centres at integers; NaN without a picture. `up`
+    points up in the world, along an axis of the Manhattan frame; NaN when nothing says so."""
 
     version: ClassVar[int] = 2
 

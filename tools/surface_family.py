@@ -1,8 +1,9 @@
 """Compare every surface on one run of the noisy synthetic room, furnished with a column, a ball and a plant, at the poses that were estimated.
 
 The room is tracked once; then each surface gathers the recorded frames, planes and poses by itself, one thread. Accuracy is the mean distance of
-the mesh from the true surface, by its nearer part, planar or curved; completeness the share of the true surface that was seen which is within 5 cm of the mesh
-(`trihedron evaluate-surface` explains). Times: a frame (half of them take less, and 95 %), and the final mesh. Views are what a surface remembers.
+the mesh from the true surface, by its nearer part, planar or curved; completeness the share of the true surface that was seen which is within 5 cm
+of the mesh (`trihedron evaluate-surface` explains). Times: a frame (half of them take less, and 95 %), and the final mesh. Views are what a surface
+remembers.
 
 Example: trihedron benchmark surface --frames 500 --json surfaces.json
 """
