@@ -6,7 +6,20 @@ import pytest
 from trihedron.pipeline.cli import main
 from trihedron.pipeline.types import Pose, Trajectory
 from trihedron.plugins.numerics.maps.landmarks import empty_map
-from trihedron.tools.map_benchmark import bytes_of, end_drift, floor_m2, jump, line, recovery, report_cover, report_growth, report_loop
+from trihedron.tools.map_benchmark import (
+    MULTIPLE,
+    OWN,
+    TIME,
+    bytes_of,
+    end_drift,
+    floor_m2,
+    jump,
+    line,
+    recovery,
+    report_cover,
+    report_growth,
+    report_loop,
+)  # fmt: skip
 
 STEP_NS = 33_000_000
 
@@ -45,6 +58,8 @@ def test_the_jump_is_that_between_both_sides_of_the_cover():
     assert found == pytest.approx({"jump_m": 0.04, "jump_deg": 0.0}, abs=1e-9)
     assert jump(said, along((x + 0.5)[seen], seen), truth, 30, 10)["jump_m"] == pytest.approx(0.0, abs=1e-12)
     assert jump(said, along(x[:30]), truth, 30, 10)["jump_m"] == np.inf
+    short = jump(said[:46], along((x + 0.04 * (np.arange(70) > 35))[:46]), along(x[:46]), 30, 10)  # six frames after the cover
+    assert short == pytest.approx({"jump_m": 0.04, "jump_deg": 0.0}, abs=1e-9)
 
 
 def test_growth_is_that_of_a_straight_line_whatever_single_frames_do():
@@ -69,16 +84,27 @@ def test_floor_is_counted_in_squares_under_what_is_known():
 
 def test_the_tables_say_what_was_measured():
     loop = {"loop": "none", "frames": 1368, "path_m": 45.6, "drift_m": 0.0114, "drift_percent": 0.025, "ate_m": 0.0041, "tracked_share": 1.0}
-    assert report_loop([loop]).splitlines()[-1].split() == ["none", "1368", "1.000", "11.4", "0.0250", "0.0041"]
+    lines = report_loop([loop, loop | {"loop": "planes", "drift_percent": 0.06}]).splitlines()
+    assert lines[2].split() == ["none", "1368", "1.000", "11.4", "0.0250", "0.0041"]
+    assert lines[-2:] == [
+        "met: loop=none: a drift below 0.5 % of the path",
+        "NOT MET: loop=planes: a drift below 0.05 % of the path, an ATE below 0.025 m",
+    ]
     cover = {"sequence": "a", "frames": 150, "first": 60, "second": 30, "lost_covered": 30, "lost_after": 0, "lost_elsewhere": 0}
     for end, scale in (("", 1.0), ("_covered", 2.0)):
         cover |= {f"jump_m{end}": 0.001 * scale, f"jump_deg{end}": 0.02 * scale, f"ate_m{end}": 0.003 * scale}
     expected = ["a", "150", "60:90", "30", "0", "0", "2.0", "1.0", "0.040", "0.020", "0.0060", "0.0030"]
-    assert report_cover([cover]).splitlines()[-1].split() == expected
-    names = {"frame, ms": (50.0, 51.0), "memory, MB": (400.0, 440.0), "map, MB": (5.0, 35.0), "floor with landmarks, m²": (20.0, 100.0)}
+    lines = report_cover([cover]).splitlines()
+    assert lines[2].split() == expected
+    assert lines[-2:] == ["met: tracked again within 30 frames, and lost nowhere else", "NOT MET: no jump left"]
+    assert report_cover([cover | {"ate_m_covered": 0.004}]).splitlines()[-1] == "met: no jump left"
+    assert report_cover([cover | {"lost_after": 30}]).splitlines()[-2].startswith("NOT MET: tracked again")
+    names = {TIME: (50.0, 51.0), MULTIPLE: (0.7, 0.8), OWN: (395.0, 405.0)}
+    names |= {"memory, MB": (400.0, 440.0), "map, MB": (5.0, 35.0), "floor with landmarks, m²": (20.0, 100.0)}
     lines = report_growth([{"quantity": name, "values": values} for name, values in names.items()]).splitlines()
-    assert lines[2].split() == ["frame,", "ms", "50.00", "51.00", "+2.0", "%"]
-    assert lines[-1] == "Per new square metre of floor: 0.50 MB of memory, 0.38 MB of it the map"
+    assert lines[2].startswith(TIME) and lines[2].split()[-4:] == ["50.00", "51.00", "+2.0", "%"]
+    assert lines[-4] == "Per new square metre of floor: 0.50 MB of memory, 0.38 MB of it the map"
+    assert [line.split(":")[0] for line in lines[-3:]] == ["met", "NOT MET", "met"]
 
 
 @pytest.mark.parametrize(
