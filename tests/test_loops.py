@@ -57,8 +57,8 @@ def shift_m(map, correction):
 
 @pytest.mark.slow
 def test_two_identical_offices_stay_two(tmp_path):
-    """By the default graph. The trap springs for a closer that believes in a drift of any size; with the drift that can be it is refused, and the true
-    loop, where the walk ends, is closed."""
+    """By the default graph. The trap springs for a closer that believes in a drift of any size; with the drift that can be it is refused, and the
+    true loop, where the walk ends, is closed."""
     metrics = track(tmp_path / "run", Scene.offices)
     assert metrics["final"]["ate_rmse_m"] < 0.025 and metrics["final"]["tracked_share"] == 1.0
     load_plugins()
