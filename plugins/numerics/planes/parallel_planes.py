@@ -33,7 +33,7 @@ def larger_surface(q: F64, grid: Grid, cells: I32, member: Bool) -> tuple[F64, i
     apart = _angle(q, normal)
     if not apart > LEAST:
         return q, members, none
-    further = _further(_smoothed(_distances(normal, grid, cells, member)), cells, member)
+    further = _further(_distances(normal, grid, cells, member), member)
     one, other = 0, 0
     for k in range(len(cells)):
         one += member[k] and further[k]
@@ -79,56 +79,58 @@ def _mean_normal(q: F64, grid: Grid, cells: I32, member: Bool) -> F64:
 
 @numba.njit(cache=True, nogil=True)
 def _distances(normal: F64, grid: Grid, cells: I32, member: Bool) -> F64:
-    """(h, w) how far along the normal each member is from the camera, negative; 0 elsewhere."""
-    out, w = np.zeros(grid.rho.shape), grid.rho.shape[1]
+    """(n,) how far along the normal the members about each member are from the camera, negative, on average over a square; 0 for the others."""
+    w = grid.rho.shape[1]
+    top, left, height, width = _box(cells, w)
+    sums, counts = np.zeros((height + 1, width + 1)), np.zeros((height + 1, width + 1), np.int32)
     for k in range(len(cells)):
         if member[k]:
             r, c = cells[k] // w, cells[k] % w
-            out[r, c] = (normal[0] * grid.rays_x[c] + normal[1] * grid.rays_y[r] + normal[2]) / grid.rho[r, c]
-    return out
-
-
-@numba.njit(cache=True, nogil=True)
-def _smoothed(values: F64) -> F64:
-    """(h, w) mean of the values that are not 0 in a square about each cell that has one."""
-    h, w = values.shape
-    sums, counts, out = np.zeros((h + 1, w + 1)), np.zeros((h + 1, w + 1), np.int32), np.zeros((h, w))
-    for r in range(h):
+            sums[r - top + 1, c - left + 1] = (normal[0] * grid.rays_x[c] + normal[1] * grid.rays_y[r] + normal[2]) / grid.rho[r, c]
+            counts[r - top + 1, c - left + 1] = 1
+    for r in range(1, height + 1):
         total, n = 0.0, 0
-        for c in range(w):
-            total += values[r, c]
-            n += values[r, c] != 0.0
-            sums[r + 1, c + 1], counts[r + 1, c + 1] = sums[r, c + 1] + total, counts[r, c + 1] + n
-    for r in range(h):
-        top, bottom = max(r - REACH, 0), min(r + REACH + 1, h)
-        for c in range(w):
-            if values[r, c] != 0.0:
-                left, right = max(c - REACH, 0), min(c + REACH + 1, w)
-                n = counts[bottom, right] - counts[top, right] - counts[bottom, left] + counts[top, left]
-                out[r, c] = (sums[bottom, right] - sums[top, right] - sums[bottom, left] + sums[top, left]) / n
-    return out
-
-
-@numba.njit(cache=True, nogil=True)
-def _further(distances: F64, cells: I32, member: Bool) -> Bool:
-    """(n,) which cells belong to the further of two distances (two means)."""
-    flat, out = distances.ravel(), np.zeros(len(cells), np.bool_)
-    total, square, n = 0.0, 0.0, 0
+        for c in range(1, width + 1):
+            total, n = total + sums[r, c], n + counts[r, c]
+            sums[r, c], counts[r, c] = sums[r - 1, c] + total, counts[r - 1, c] + n
+    out = np.zeros(len(cells))
     for k in range(len(cells)):
         if member[k]:
-            n, total, square = n + 1, total + flat[cells[k]], square + flat[cells[k]] ** 2
+            r, c = cells[k] // w - top, cells[k] % w - left
+            a, b, d, e = max(r - REACH, 0), min(r + REACH + 1, height), max(c - REACH, 0), min(c + REACH + 1, width)
+            out[k] = (sums[b, e] - sums[a, e] - sums[b, d] + sums[a, d]) / (counts[b, e] - counts[a, e] - counts[b, d] + counts[a, d])
+    return out
+
+
+@numba.njit(cache=True, nogil=True)
+def _box(cells: I32, w: int) -> tuple[int, int, int, int]:
+    """Top, left, height and width of the rectangle about cells of a grid of w columns."""
+    top, bottom, left, right = cells[0] // w, 0, w, 0
+    for i in cells:
+        r, c = i // w, i % w
+        top, bottom, left, right = min(top, r), max(bottom, r), min(left, c), max(right, c)
+    return top, left, bottom - top + 1, right - left + 1
+
+
+@numba.njit(cache=True, nogil=True)
+def _further(distances: F64, member: Bool) -> Bool:
+    """(n,) which members have the further of two distances (two means)."""
+    out = np.zeros(len(distances), np.bool_)
+    total, square, n = 0.0, 0.0, 0
+    for k in range(len(distances)):
+        if member[k]:
+            n, total, square = n + 1, total + distances[k], square + distances[k] ** 2
     spread = np.sqrt(max(square / n - (total / n) ** 2, 0.0))
     near, far = total / n + spread, total / n - spread
     for _ in range(ROUNDS):
-        sums, counts = np.zeros(2), np.zeros(2)
-        for k in range(len(cells)):
-            if member[k]:
-                out[k] = flat[cells[k]] < 0.5 * (near + far)
-                sums[int(out[k])] += flat[cells[k]]
-                counts[int(out[k])] += 1.0
-        if min(counts[0], counts[1]) == 0.0:
+        middle, sums, count = 0.5 * (near + far), 0.0, 0
+        for k in range(len(distances)):
+            out[k] = distances[k] < middle
+            sums += distances[k] if out[k] else 0.0
+            count += out[k]
+        if count == 0 or count == n:
             break
-        near, far = sums[0] / counts[0], sums[1] / counts[1]
+        near, far = (total - sums) / (n - count), sums / count
     return out
 
 
