@@ -34,7 +34,8 @@ CHANGES = {
     "bundle": "bundle.keyframes=2",
 }
 RECORD = ["dataset=synthetic", f"dataset.frames=0:{FRAMES}", "dataset.width=320", "dataset.height=240"]
-RECORD += ["record.frames=true", "record.topics=[normals]", "bundle=local_window"]
+RECORD += ["record.frames=true", "record.topics=[normals]"]
+RECORD += ["loop.every=1", "loop.away_m=0.2", "loop.shared=1000", "loop.min_score=20", "loop.max_through=1", "loop.drift_share=0.05"]  # closes one
 REPLAY = """
 import json, sys
 from trihedron.pipeline.cli import main
@@ -79,7 +80,8 @@ def recorded(tmp_path_factory):
 def test_every_topic_has_the_same_bytes_for_one_thread_and_two(recorded):
     run([*RECORD, f"out={recorded}/one", "threads=1"], cwd=recorded)
     one, two = contents(recorded / "one" / "run.mcap"), contents(recorded / "two" / "run.mcap")
-    assert set(one) == set(two) >= {f"/{stage}" for stage in STAGES}
+    assert set(one) == set(two) >= {f"/{stage}" for stage in (*STAGES, "loop")}
+    assert min(log_time for log_time, _ in one["/loop"]) < (FRAMES - 10) / 30 * 1e9  # and the map has applied it
     assert [topic for topic in one if one[topic] != two[topic]] == []
     for name in ("trajectory.txt", "trajectory_causal.txt", "metrics.json"):
         assert (recorded / "one" / name).read_bytes() == (recorded / "two" / name).read_bytes()
