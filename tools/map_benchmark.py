@@ -259,7 +259,7 @@ def report_growth(rows: Rows) -> str:
     new = np.diff(values["floor with landmarks, m²"])[0]
     memory, own = np.diff(values["memory, MB"])[0], np.diff(values["map, MB"])[0]
     last = f"Per new square metre of floor: {memory / new:.2f} MB of memory, {own / new:.2f} MB of it the map"
-    of = [(f"less than {GROWTH:.0%} growth: {name}", values[name][1] < (1.0 + GROWTH) * values[name][0]) for name in BOUNDED]
+    of = [(f"less than {100.0 * GROWTH:.0f} % growth: {name}", values[name][1] < (1.0 + GROWTH) * values[name][0]) for name in BOUNDED]
     return "A walk through ten rooms\n" + table([("", *(f"frame {frame}" for frame in SPAN), "growth"), *cells], "lrrr") + "\n" + last + promises(*of)
 
 
