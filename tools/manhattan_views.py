@@ -31,6 +31,7 @@ AXIS_SHARE = 0.1  # of the image that surfaces along a visible axis cover; the e
 AXIS_LINES = 4  # lines that make an axis visible
 ON_AXIS_DEG = 5.0  # of a line detected
 ABSENT_SHARE, RIGHT_ANGLE_DEG = 0.02, 3.0
+CLUTTERED = 0.5  # of the normals and of the lines
 DEPTHS = ("clean", "noisy")
 WHOLE, CLUTTER, SLANTED, LEANING = "whole", "50 % clutter", "slanted", "leaning"
 CASES = (WHOLE, "three planes", "two planes", "one plane + lines", "lines only", CLUTTER)
@@ -61,10 +62,37 @@ class View:
     @cached_property
     def lines_on_axes(self) -> NDArray[np.int64]:
         """(3,) how many lines with depth run along each axis."""
+        return np.asarray(self._on_axes.sum(axis=0))
+
+    @cached_property
+    def length_on_axes(self) -> F64:
+        """(3,) share of the length (px) of all lines that runs along each axis."""
+        return np.asarray(self._length @ self._on_axes / max(self._length.sum(), 1e-9))
+
+    @cached_property
+    def lines_turned(self) -> bool:
+        """Whether lines at right angles to one axis, but along neither of the two others, are in all longer than those along these: a turned crate or
+        a slanted pattern that fills the view is a Manhattan frame too, and the better supported one."""
+        across = (self._cosines_of_lines <= np.sin(np.radians(ON_AXIS_DEG))) & ~self._on_axes.any(axis=1, keepdims=True)
+        along = self._length @ self._on_axes
+        return bool((self._length @ across >= along.sum() - along).any())
+
+    @property
+    def _on_axes(self) -> Bool:
+        """(n, 3) whether a line runs along an axis."""
+        return np.asarray(self._cosines_of_lines >= np.cos(np.radians(ON_AXIS_DEG)))
+
+    @property
+    def _length(self) -> F64:
+        """(n,) px."""
+        steps = self.segments.endpoints_px[:, 1] - self.segments.endpoints_px[:, 0]
+        return np.asarray(np.linalg.norm(steps, axis=1).astype(np.float64))
+
+    @property
+    def _cosines_of_lines(self) -> F64:
+        """(n, 3) of each line to each axis; NaN of those without depth."""
         steps = (self.segments.endpoints_m[:, 1] - self.segments.endpoints_m[:, 0]).astype(np.float64)
-        steps = steps[np.isfinite(steps).all(axis=1)]
-        cosine = np.abs(steps @ self.truth) / np.maximum(np.linalg.norm(steps, axis=1, keepdims=True), 1e-9)
-        return np.asarray((cosine >= np.cos(np.radians(ON_AXIS_DEG))).sum(axis=0))
+        return np.asarray(np.abs(steps @ self.truth) / np.maximum(np.linalg.norm(steps, axis=1, keepdims=True), 1e-9))
 
 
 @dataclass(frozen=True)
@@ -172,7 +200,8 @@ def case_of(view: View, case: str) -> View | None:
     """The view as the case has it, or None where it does not show what the case asks for (two visible axes, unless it names another number).
 
     Planes: only the surfaces along the two or three axes that cover most, no lines. One plane + lines: the largest, and lines that tell one more
-    axis. Lines only: on two axes. Clutter: half of the normals and half of the lines point any way, and planes have half their pixels."""
+    axis. Lines only: on two axes, each with AXIS_SHARE of the length, unless most are turned. Clutter: half of the normals and half of the lines
+    point any way, and planes have half their pixels; what is left of the visible axes must cover as much as without clutter."""
     visible, largest = view.covered >= AXIS_SHARE, np.argsort(-view.covered)
     if case in ("three planes", "two planes"):
         number = 3 if case == "three planes" else 2
@@ -185,7 +214,11 @@ def case_of(view: View, case: str) -> View | None:
             return None
         return _only(view, view.planes.labels == rows[0] + 1, np.arange(len(view.planes.pixels)) == rows[0])
     if case == "lines only":
-        return _only(view, np.zeros(view.axes.shape, np.bool_), np.zeros(len(view.planes.pixels), np.bool_)) if told.sum() >= 2 else None
+        if (told & (view.length_on_axes >= AXIS_SHARE)).sum() < 2 or view.lines_turned:
+            return None
+        return _only(view, np.zeros(view.axes.shape, np.bool_), np.zeros(len(view.planes.pixels), np.bool_))
+    if case == CLUTTER:
+        visible = view.covered * (1.0 - CLUTTERED) >= AXIS_SHARE
     if visible.sum() < 2:
         return None
     return _cluttered(view, np.random.default_rng([9, view.normals.index])) if case == CLUTTER else view
@@ -209,14 +242,14 @@ def _without_lines(view: View) -> View:
 def _cluttered(view: View, rng: np.random.Generator) -> View:
     """Half of all cells and lines turned any way; the lines about their middles."""
     normals, ends = view.normals.normals.copy(), view.segments.endpoints_m.copy()
-    cells = (rng.random(normals.shape[:2]) < 0.5) & np.isfinite(normals[..., 0])
+    cells = (rng.random(normals.shape[:2]) < CLUTTERED) & np.isfinite(normals[..., 0])
     normals[cells] = _spherical(rng, int(cells.sum()))
-    lines = rng.random(len(ends)) < 0.5
+    lines = rng.random(len(ends)) < CLUTTERED
     middle, step = ends[lines].mean(axis=1), ends[lines, 1] - ends[lines, 0]
     half = 0.5 * np.linalg.norm(step, axis=1, keepdims=True) * _spherical(rng, len(step))
     ends[lines] = np.stack([middle - half, middle + half], axis=1)
     labels = np.where(cells, 0, view.planes.labels).astype(np.uint8)
-    planes = replace(view.planes, labels=labels, pixels=view.planes.pixels // 2)
+    planes = replace(view.planes, labels=labels, pixels=(view.planes.pixels * (1.0 - CLUTTERED)).astype(np.int32))
     return replace(view, normals=replace(view.normals, normals=normals), segments=replace(view.segments, endpoints_m=ends), planes=planes)
 
 

@@ -2,7 +2,8 @@
 
 `trihedron run -m experiment=rotation_family` ends with this. The truth is the one rotation from the scene's axes to the world that the claims of all
 runs agree on best, carried into each camera by the ground truth of the poses. An error is that of the nearest frame in view; a claim more than 3°
-off is false. Times are those of the replay.
+off is false. `normalised` is the squared error of the others in units of their covariance, the median over that of χ²: 1 when that is right. Times are
+those of the replay.
 
 Example: trihedron benchmark rotations runs/family --frame 60
 """
@@ -21,11 +22,12 @@ from numpy.typing import NDArray
 
 from trihedron.datasets.trajectories import attached_truth
 from trihedron.pipeline.errors import DataError
-from trihedron.pipeline.geometry import nearest_pairs, nearest_rotation
+from trihedron.pipeline.geometry import log_so3, nearest_pairs, nearest_rotation
 from trihedron.pipeline.recording import Recording
 from trihedron.pipeline.types import F64, ManhattanFrame
 from trihedron.plugins.numerics.axes.cube_symmetry import CUBE, nearest_equivalent
 from trihedron.tools.arguments import Parser, table
+from trihedron.tools.manhattan_family import CHI2_MEDIAN
 
 RECORDING, TIMING, ERRORS_PNG = "run.mcap", "timing.json", "rotation_error.png"
 LARGEST_DIFFERENCE_NS = 20_000_000
@@ -44,17 +46,28 @@ class Run:
     p50_ms: float  # NaN where it was not timed
 
     @cached_property
-    def claims(self) -> tuple[NDArray[np.int64], F64]:
-        """(m,) rows of `found` that claim a frame, one for each frame in view, and (m, 3, 3) R_world_manhattan as each says."""
-        rows = [(i, R) for i, value in enumerate(self.found) if value.supported for R in in_view(value)]
-        number = np.array([i for i, _ in rows], np.int64)
-        return number, self.R_world_camera[number] @ np.array([R for _, R in rows]).reshape(-1, 3, 3)
+    def claims(self) -> tuple[NDArray[np.int64], F64, F64]:
+        """(m,) rows of `found` that claim a frame, one for each frame in view, (m, 3, 3) R_world_manhattan as each says, and its covariance in the
+        world."""
+        rows = [(i, R, C) for i, value in enumerate(self.found) if value.supported for R, C in zip(*in_view(value))]
+        number, (rotations, covariance) = np.array([i for i, _, _ in rows], np.int64), (np.array([row[k] for row in rows]) for k in (1, 2))
+        camera = self.R_world_camera[number]
+        return number, camera @ rotations.reshape(-1, 3, 3), camera @ covariance.reshape(-1, 3, 3) @ np.swapaxes(camera, 1, 2)
 
     def errors_deg(self, world: F64) -> F64:
         """(n,) error of each frame, NaN where none was claimed."""
-        errors, (rows, rotations) = np.full(len(self.found), np.inf), self.claims
+        errors, (rows, rotations, _) = np.full(len(self.found), np.inf), self.claims
         np.minimum.at(errors, rows, residuals_deg(rotations, world))
         return np.asarray(np.where(np.isfinite(errors), errors, np.nan))
+
+    def normalised(self, world: F64) -> float:
+        """Squared error of the claims that are not false, in units of their covariance: the median over that of χ²; NaN without any."""
+        squares = []
+        for R, covariance in zip(*self.claims[1:]):
+            phi = log_so3(nearest_equivalent(world, R) @ R.T)
+            if np.linalg.norm(phi) <= np.radians(FALSE_DEG):
+                squares.append(float(phi @ np.linalg.solve(covariance, phi)))
+        return float(np.median(squares) / CHI2_MEDIAN) if squares else float("nan")
 
 
 def main(argv: list[str]) -> int:
@@ -81,15 +94,17 @@ def compare(folder: Path, frame: int | None = None) -> str:
     written = [folder / ERRORS_PNG, folder / f"sphere_{frame}.png"]
     rotation_pictures.errors_figure(runs, errors, written[0])
     rotation_pictures.sphere_figure(runs, world, frame, written[1])
-    rows: list[list[str]] = [["estimator", "frames", "claimed", "within 1°", "false", "median (deg)", "p95 (deg)", "max (deg)", "p50 ms"]]
+    heads = ["estimator", "frames", "claimed", "within 1°", "false", "median (deg)", "p95 (deg)", "max (deg)", "normalised", "p50 ms"]
+    rows: list[list[str]] = []
     for run in runs:
         error = errors[run.name]
         known = error[np.isfinite(error)]
         shares = [np.isfinite(error), error <= RIGHT_DEG, error > FALSE_DEG]
         largest = [np.median(known), np.percentile(known, 95), known.max()] if len(known) else []
         cells = [*(f"{share.mean():.3f}" for share in shares), *([f"{x:.3f}" for x in largest] or ["-"] * 3)]
-        rows.append([run.name, str(len(error)), *cells, f"{run.p50_ms:.2f}" if np.isfinite(run.p50_ms) else "-"])
-    return "\n".join([table(rows, "lrrrrrrrr"), *(str(path) for path in written)])
+        last = [f"{x:.2f}" if np.isfinite(x) else "-" for x in (run.normalised(world), run.p50_ms)]
+        rows.append([run.name, str(len(error)), *cells, *last])
+    return "\n".join([table([heads, *rows], "lrrrrrrrrr"), *(str(path) for path in written)])
 
 
 def read_runs(folder: Path) -> list[Run]:
@@ -124,9 +139,10 @@ def config_of(recording: Recording) -> Any:
     return yaml.safe_load(recording.metadata["config"])
 
 
-def in_view(value: ManhattanFrame) -> F64:
-    """(k, 3, 3) the frames that are seen, not only remembered."""
-    return np.asarray(value.rotations[value.inliers.sum(axis=1) > 0])
+def in_view(value: ManhattanFrame) -> tuple[F64, F64]:
+    """(k, 3, 3) rotations and covariances of the frames that are seen, not only remembered."""
+    seen = value.inliers.sum(axis=1) > 0
+    return value.rotations[seen], value.covariance[seen]
 
 
 def residuals_deg(rotations: F64, reference: F64) -> F64:

@@ -104,7 +104,7 @@ def _draw_directions(ax: Any, features: dict[str, Any]) -> None:
 def _draw_axes(ax: Any, run: comparison.Run, row: int, truth: F64) -> str:
     """Rings around the axes of each frame in view, coloured as the nearest true axis; returns what was claimed and how far off that is."""
     value, errors = run.found[row], []
-    for number, R in enumerate(comparison.in_view(value)):
+    for number, R in enumerate(comparison.in_view(value)[0]):
         named = nearest_equivalent(R, truth)
         errors.append(rotation_angle_deg(truth.T @ named))
         for axis, color in zip(named.T, AXIS_COLORS):

@@ -262,3 +262,29 @@ def test_same_bytes_again_and_under_a_millisecond():
 def test_fields_out_of_range(wrong):
     with pytest.raises(ValueError, match=next(iter(wrong))):
         MeanShift(**wrong)
+
+
+def lesser_modes(estimator, directions):
+    """Near the previous axes a room, further round a room with more walls, and normals of no plane 8° from one axis: the modes near by are followed,
+    not the means, and nothing else is looked for."""
+    rng = np.random.default_rng(3)
+    for _ in range(10):
+        R = directions.rotation(rng)
+        other = R @ exp_so3(np.radians([0.0, 0.0, 40.0]))
+        surfaces, shares = [*R.T, *other.T[:2], *directions.circle(R, 8.0)], (0.17, 0.14, 0.12, 0.27, 0.2, 0.08)
+        value = directions.normals(rng, surfaces, shares, 2.0), directions.segments(rng), directions.planes(rng, surfaces[:5], shares[:5])
+        start = exp_so3(np.radians(4.0) * directions.spherical(rng, 1)[0]) @ R
+        found = directions.estimate(estimator, value, directions.frame(start))
+        assert found.supported and len(found.ids) == 1 and rotation_angle_deg(R.T @ found.rotations[0]) < 1.0
+
+
+def test_its_characteristic(directions):
+    lesser_modes(MeanShift(), directions)
+
+
+def test_others_lack_it(directions):
+    others = directions.others("mean_shift")
+    assert len(others) == 6
+    for other in others:
+        with pytest.raises(AssertionError):
+            lesser_modes(other, directions)

@@ -38,7 +38,6 @@ class AtlantaModes(NamedTuple):
         """(k,) of the directions on the horizontal axes seen."""
         return np.asarray(((self.normals[:, 1] + self.lines[:, 1]) * self.seen).reshape(-1, 3)[:, :2].sum(axis=1))
 
-
     @property
     def inliers(self) -> F64:
         """(k, 3) directions on each axis seen."""

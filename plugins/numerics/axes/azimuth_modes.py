@@ -17,9 +17,7 @@ QUARTER = 0.5 * np.pi
 
 
 @numba.njit(cache=True, nogil=True)
-def azimuth_modes(
-    vectors: F64, weights: F64, first_line: int, vertical: F64, cone: float, apart: int, most: int, least: float
-) -> tuple[F64, F64]:
+def azimuth_modes(vectors: F64, weights: F64, first_line: int, vertical: F64, cone: float, apart: int, most: int, least: float) -> tuple[F64, F64]:
     """Rotations (k, 3, 3) with the vertical as third column and a horizontal mode as first, heaviest first, and their weights (k,).
 
     Of the directions within `cone` (rad) of the horizontal; at most `most` modes, `apart` bins from each other, each of a weight of at least `least`

@@ -9,11 +9,12 @@ from typing import NamedTuple
 import numba
 import numpy as np
 
-from trihedron.pipeline.types import F64, I32, Bool, Planes
+from trihedron.pipeline.types import F64, Bool, Planes
 from trihedron.plugins.numerics.axes.mode_tests import largest_fitting, line_peaks, perpendicular, surface_peaks
 from trihedron.plugins.numerics.axes.sphere_modes import mode_statistics, shift_axes
 
-NO_PLANES, NO_PIXELS = np.zeros((0, 4)), np.zeros(0, np.int32)
+NO_PLANES = np.zeros((0, 5))
+SIGMAS = 2.0  # that a plane may be off
 
 
 class Directions(NamedTuple):
@@ -70,26 +71,31 @@ class ModeFinder:
     def follow(self, directions: Directions, planes: Planes, start: F64) -> Modes:
         """Mean shift from three starting axes (3, 3), and what it found; axes that are no modes stay where they started."""
         shift = (self.cone, self.bandwidth, self.max_iterations, self.tolerance)
-        return Modes(*_followed(*directions, np.array(start), shift, *self._surfaces(planes), self._rules))
+        return Modes(*_followed(*directions, np.array(start), shift, self._surfaces(planes), self._rules))
 
     def judged(self, modes: Modes, directions: Directions, planes: Planes | None) -> Modes:
         """The modes with those `seen` that are peaks at right angles, and whether these make a Manhattan frame; `planes` where they may take part."""
-        seen, supported = _judged(*directions, modes.axes, modes.normals, modes.lines, *self._surfaces(planes), self._rules)
+        seen, supported = _judged(*directions, modes.axes, modes.normals, modes.lines, self._surfaces(planes), self._rules)
         return modes._replace(seen=seen, supported=supported)
 
     def peaks(self, modes: Modes, directions: Directions, planes: Planes | None) -> Bool:
         """(m,) whether a plane, enough normals or enough lines stand on each axis, the latter two denser than directions without order would."""
-        return np.asarray(_peaks(*directions, modes.axes, modes.normals, modes.lines, *self._surfaces(planes), self._rules))
+        return np.asarray(_peaks(*directions, modes.axes, modes.normals, modes.lines, self._surfaces(planes), self._rules))
 
     def perpendicular(self, modes: Modes) -> Bool:
         """(m, m) whether two modes are at right angles, as far as their own uncertainty can tell."""
         return np.asarray(perpendicular(modes.axes, modes.normals, modes.lines, self.max_skew))
 
-    def _surfaces(self, planes: Planes | None) -> tuple[F64, I32, float]:
-        """Planes that may take part: coefficients (p, 4) and pixels (p,); and the pixels of the image."""
-        if planes is None or not self.use_planes:
-            return NO_PLANES, NO_PIXELS, 1.0
-        return planes.coefficients, planes.pixels, float(planes.labels.size * planes.stride**2)
+    def _surfaces(self, planes: Planes | None) -> F64:
+        """(p, 5) of the planes that may take part, for `surface_peaks`: normal, cosine of the reach, share of the image. They reach half a cone, and
+        as much further as they are uncertain, but no further than it."""
+        if planes is None or not self.use_planes or len(planes.pixels) == 0:
+            return NO_PLANES
+        sigma = np.sqrt(np.maximum(planes.covariance[:, 0, 0] + planes.covariance[:, 1, 1], 0.0))
+        reach = np.minimum(0.5 * self.cone + SIGMAS * sigma, self.cone)
+        share = planes.pixels / (planes.labels.size * planes.stride**2)
+        known = np.isfinite(planes.coefficients[:, :3]).all(axis=1) & np.isfinite(sigma)
+        return np.column_stack([planes.coefficients[:, :3], np.cos(reach), share])[known]
 
     @cached_property
     def _rules(self) -> Rules:
@@ -111,14 +117,14 @@ class Rules(NamedTuple):
 
 @numba.njit(cache=True, nogil=True)
 def _followed(
-    vectors: F64, weights: F64, first: int, start: F64, shift: tuple[float, float, int, float], planes: F64, pixels: I32, area: float, rules: Rules
+    vectors: F64, weights: F64, first: int, start: F64, shift: tuple[float, float, int, float], planes: F64, rules: Rules
 ) -> tuple[F64, F64, F64, Bool, bool]:
     """The fields of `Modes`."""
     cone, bandwidth, iterations, tolerance = shift
     axes = shift_axes(vectors, weights, start, cone, bandwidth, iterations, tolerance)
     normals = mode_statistics(vectors[:first], weights[:first], axes, cone)
     lines = mode_statistics(vectors[first:], weights[first:], axes, cone)
-    seen, supported = _judged(vectors, weights, first, axes, normals, lines, planes, pixels, area, rules)
+    seen, supported = _judged(vectors, weights, first, axes, normals, lines, planes, rules)
     for k in range(3):
         if not seen[k]:
             axes[:, k] = start[:, k]
@@ -126,11 +132,9 @@ def _followed(
 
 
 @numba.njit(cache=True, nogil=True)
-def _judged(
-    vectors: F64, weights: F64, first: int, axes: F64, normals: F64, lines: F64, planes: F64, pixels: I32, area: float, rules: Rules
-) -> tuple[Bool, bool]:
+def _judged(vectors: F64, weights: F64, first: int, axes: F64, normals: F64, lines: F64, planes: F64, rules: Rules) -> tuple[Bool, bool]:
     """(3,) which modes are seen, and whether they make a Manhattan frame."""
-    peaks = _peaks(vectors, weights, first, axes, normals, lines, planes, pixels, area, rules)
+    peaks = _peaks(vectors, weights, first, axes, normals, lines, planes, rules)
     on_axis = normals[:, 1] + lines[:, 1]
     seen = largest_fitting(peaks, perpendicular(axes, normals, lines, rules.max_skew), on_axis)
     explained = (on_axis * seen).sum() / max(weights.sum(), 1e-9)
@@ -138,10 +142,8 @@ def _judged(
 
 
 @numba.njit(cache=True, nogil=True)
-def _peaks(
-    vectors: F64, weights: F64, first: int, axes: F64, normals: F64, lines: F64, planes: F64, pixels: I32, area: float, rules: Rules
-) -> Bool:
+def _peaks(vectors: F64, weights: F64, first: int, axes: F64, normals: F64, lines: F64, planes: F64, rules: Rules) -> Bool:
     """(m,) which of the axes (3, m) are peaks."""
     cone, least, number, share, widest, _, _ = rules
-    surfaces = surface_peaks(axes, normals, first, least, widest, planes, pixels, area, cone)
+    surfaces = surface_peaks(axes, normals, first, least, widest, planes)
     return surfaces | line_peaks(vectors[first:], weights[first:], axes, lines, number, share, widest, cone)

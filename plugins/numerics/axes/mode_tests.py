@@ -5,25 +5,21 @@ from __future__ import annotations
 import numba
 import numpy as np
 
-from trihedron.pipeline.types import F64, I32, Bool
+from trihedron.pipeline.types import F64, Bool
 
 NORMALS_PER_SAMPLE = 20.0  # neighbouring normals share pixels and the sensor's errors: so many count as one
 
 
 @numba.njit(cache=True, nogil=True)
-def surface_peaks(axes: F64, normals: F64, count: int, least: float, widest: float, coefficients: F64, pixels: I32, area: float, cone: float) -> Bool:
+def surface_peaks(axes: F64, normals: F64, count: int, least: float, widest: float, planes: F64) -> Bool:
     """(m,) whether the share `least` of `count` normals stands on each axis (3, m), denser than directions without order would (mean square below
-    `widest`) or beside planes (p, 4) with that share of the image's `area`."""
+    `widest`) or beside planes with that share of the image. A plane is a row of (p, 5): its normal, the cosine of its reach, its share."""
     peaks = np.zeros(len(normals), np.bool_)
     for k in range(len(normals)):
-        dense = normals[k, 3] < widest
-        if not dense:
-            covered = 0.0
-            for i in range(len(coefficients)):
-                dot = coefficients[i, 0] * axes[0, k] + coefficients[i, 1] * axes[1, k] + coefficients[i, 2] * axes[2, k]
-                covered += pixels[i] * (np.cos(0.5 * cone) < abs(dot) < np.inf)
-            dense = covered >= least * area
-        peaks[k] = dense and normals[k, 1] >= least * max(count, 1)
+        covered = 0.0
+        for n in planes:
+            covered += n[4] * (abs(n[0] * axes[0, k] + n[1] * axes[1, k] + n[2] * axes[2, k]) > n[3])
+        peaks[k] = (normals[k, 3] < widest or covered >= least) and normals[k, 1] >= least * max(count, 1)
     return peaks
 
 

@@ -239,9 +239,7 @@ def assign_axes(directions: F64, R: F64, cone: float) -> I32:
 
 
 @numba.njit(cache=True, nogil=True)
-def fit_rotation(
-    directions: F64, information: F64, axes: I32, counted: int, R: F64, gate: float, iterations: int
-) -> tuple[F64, F64, float, float]:
+def fit_rotation(directions: F64, information: F64, axes: I32, counted: int, R: F64, gate: float, iterations: int) -> tuple[F64, F64, float, float]:
     """Rotation whose columns `axes[i]` best fit measured directions (n, 3), signs free; rows with axis -1 take no part. `information` is (n, 3, 3) in
     1/rad², zero along the direction. Gauss–Newton on `R <- Exp(phi) R` with Cauchy weights, one half at `gate` σ. Returns R, the information of
     phi (3, 3), and of the first `counted` rows the weighted χ² and the weighted number of its components."""

@@ -30,7 +30,7 @@ def larger_surface(q: F64, grid: Grid, cells: I32, member: Bool) -> tuple[F64, i
     for k in range(len(cells)):
         members += member[k]
     normal = _mean_normal(q, grid, cells, member)
-    apart = _angle(q, normal)
+    apart = angle_between(q, normal)
     if not apart > LEAST:
         return q, members, none
     further = _further(_distances(normal, grid, cells, member), member)
@@ -42,7 +42,7 @@ def larger_surface(q: F64, grid: Grid, cells: I32, member: Bool) -> tuple[F64, i
         return q, members, none
     first = _fitted(grid, cells, member & (further == (one >= other)))
     second = _fitted(grid, cells, member & (further != (one >= other)))
-    if not (_angle(first, normal) < SMALLER * apart and _angle(second, normal) < apart):
+    if not (angle_between(first, normal) < SMALLER * apart and angle_between(second, normal) < apart):
         return q, members, none
     for k in range(len(cells)):
         member[k] = member[k] and further[k] == (one >= other)
@@ -50,14 +50,14 @@ def larger_surface(q: F64, grid: Grid, cells: I32, member: Bool) -> tuple[F64, i
 
 
 @numba.njit(cache=True, nogil=True)
-def _angle(q: F64, normal: F64) -> float:
-    """Between the normal of a plane q and a unit vector; NaN for no plane or no normal."""
+def angle_between(q: F64, normal: F64) -> float:
+    """Acute angle (rad) between the normals of two planes, of any length; NaN for no plane or no normal."""
     sine = 0.0
     for k in range(3):
         i, j = (k + 1) % 3, (k + 2) % 3
         sine += (q[i] * normal[j] - q[j] * normal[i]) ** 2
-    square = float(q @ q)
-    return float(np.arcsin(min(np.sqrt(sine / square), 1.0))) if square > 0.0 else np.nan
+    squares = float(q @ q) * float(normal @ normal)
+    return float(np.arcsin(min(np.sqrt(sine / squares), 1.0))) if squares > 0.0 else np.nan
 
 
 @numba.njit(cache=True, nogil=True)

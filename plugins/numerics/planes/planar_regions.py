@@ -12,6 +12,8 @@ from trihedron.plugins.numerics.depth.depth_sampling import noise_coefficients
 from trihedron.plugins.numerics.depth.organised_grid import Grid, cell_inverse_depths, cell_rays
 from trihedron.plugins.numerics.planes import plane_regions as regions
 from trihedron.plugins.numerics.planes.plane_curvature import drop_engulfed, normals_of_regions
+from trihedron.plugins.numerics.planes.plane_fitting import solve_symmetric
+from trihedron.plugins.numerics.planes.region_merging import merge_regions, neighbours
 
 MOST = 254  # regions the labels can name
 EDGE, EDGE_M = 0.04, 0.02  # a step above EDGE z + EDGE_M within a cell's pixels: no depth there
@@ -64,8 +66,8 @@ class PlanarRegions:
         that did not ask the normals says that the regions need not be `flat`: curved ones are dropped."""
         labels, gap = self._grow(core, q, grid, stride), max(self.gap_px // stride, 1)
         sums = regions.accumulate(core, len(q), grid)
-        touch = regions.neighbours(labels, len(q), gap)
-        owner = regions.merge_regions(*sums, touch, self.merge, self.correlation_px**2)
+        touch = neighbours(labels, len(q), gap)
+        owner = merge_regions(*sums, touch, self.merge, self.correlation_px**2)
         if not flat:
             owner = self._flat(owner, labels, sums, grid, gap)
         return self._report(labels, core, owner, sums, grid, frame, stride)
@@ -75,7 +77,7 @@ class PlanarRegions:
         if np.isnan(grid.normals[..., 0]).all():
             return owner
         cone, merged = float(np.radians(self.cone_deg)), owner[labels]
-        q = np.array([regions.solve_symmetric(A, b)[1] for A, b in zip(sums[0], sums[1])]).reshape(-1, 3)
+        q = np.array([solve_symmetric(A, b)[1] for A, b in zip(sums[0], sums[1])]).reshape(-1, 3)
         turns, biases, share = normals_of_regions(merged, q, grid, float(np.cos(2.0 * cone)), 2)
         good = (share >= FACING) & (turns <= np.maximum(self.turn * cone, BIASES * biases))
         good = drop_engulfed(merged, grid.rho, good, gap)

@@ -1,4 +1,4 @@
-"""Labelled planar regions on a grid: growth to their borders, merging, and what is reported of them."""
+"""Labelled planar regions on a grid: growth to their borders, and what is reported of them."""
 
 from __future__ import annotations
 
@@ -7,9 +7,6 @@ import numpy as np
 
 from trihedron.pipeline.types import F32, F64, I32, U8
 from trihedron.plugins.numerics.depth.organised_grid import Grid
-from trihedron.plugins.numerics.planes.plane_fitting import solve_symmetric
-
-NOISE = 7.815  # χ² of a plane's three parameters, 95 %
 
 
 @numba.njit(cache=True, nogil=True)
@@ -77,75 +74,6 @@ def _border(labels: I32) -> I32:
                 out[n] = r * w + c
                 n += 1
     return out[:n]
-
-
-@numba.njit(cache=True, nogil=True)
-def neighbours(labels: I32, count: int, gap: int) -> F64:
-    """(count, count) number of places where regions lie within `gap` cells of each other in a row or column."""
-    h, w = labels.shape
-    touch = np.zeros((count, count))
-    for r in range(h):
-        for c in range(w):
-            a = labels[r, c]
-            if a == 0:
-                continue
-            for k in range(1, min(gap, w - 1 - c) + 1):
-                b = labels[r, c + k]
-                if b == a:
-                    break
-                if b > 0:
-                    touch[a - 1, b - 1] += 1.0
-                    touch[b - 1, a - 1] += 1.0
-                    break
-            for k in range(1, min(gap, h - 1 - r) + 1):
-                b = labels[r + k, c]
-                if b == a:
-                    break
-                if b > 0:
-                    touch[a - 1, b - 1] += 1.0
-                    touch[b - 1, a - 1] += 1.0
-                    break
-    return touch
-
-
-@numba.njit(cache=True, nogil=True)
-def merge_regions(A: F64, b: F64, moments: F64, n: I32, touch: F64, limit: float, alike: float) -> I32:
-    """Which region each of k becomes part of, (k + 1,) by label; the sums (as from `accumulate`, with the neighbours' counts) are added up in place.
-
-    From the largest down a region takes in those smaller neighbours for which the common plane is within `limit` σ (rms) of each one's own, and what
-    noise moves these by when `alike` depths err as one."""
-    k = len(n)
-    owner = np.arange(k + 1).astype(np.int32)
-    order = np.argsort(-n, kind="mergesort")
-    for i in order:
-        again = owner[i + 1] == i + 1
-        while again:
-            again = False
-            for j in range(k):
-                if touch[i, j] == 0.0 or j == i or owner[j + 1] != j + 1 or n[j] > n[i]:
-                    continue
-                if not _one_plane(A[i], b[i], n[i], A[j], b[j], n[j], limit, NOISE * alike):
-                    continue
-                A[i] += A[j]
-                b[i] += b[j]
-                moments[i] += moments[j]
-                n[i] += n[j]
-                touch[i] += touch[j]
-                again = True
-                for label in range(k + 1):
-                    if owner[label] == j + 1:
-                        owner[label] = i + 1
-    return owner
-
-
-@numba.njit(cache=True, nogil=True)
-def _one_plane(A: F64, b: F64, n: int, B: F64, c: F64, m: int, limit: float, noise: float) -> bool:
-    """Whether the common plane of two regions lies within `limit` σ (rms) of each region's own; `noise` is added to the sums of squares."""
-    solved, common = solve_symmetric(A + B, b + c)
-    first, p = solve_symmetric(A, b)
-    second, q = solve_symmetric(B, c)
-    e, f = common - p, common - q
-    return solved and first and second and e @ (A @ e) < limit * limit * n + noise and f @ (B @ f) < limit * limit * m + noise
 
 
 @numba.njit(cache=True, nogil=True)
