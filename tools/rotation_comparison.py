@@ -2,8 +2,8 @@
 
 `trihedron run -m experiment=rotation_family` ends with this. The truth is the one rotation from the scene's axes to the world that the claims of all
 runs agree on best, carried into each camera by the ground truth of the poses. An error is that of the nearest frame in view; a claim more than 3°
-off is false. `normalised` is the squared error of the others in units of their covariance, the median over that of χ²: 1 when that is right. Times are
-those of the replay.
+off is false. `normalised` is the squared error of the others in units of their covariance, the median over that of χ²: 1 when that is right. Times
+are those of the replay.
 
 Example: trihedron benchmark rotations runs/family --frame 60
 """

@@ -19,7 +19,7 @@ from trihedron.tools import rotation_comparison as comparison
 AXIS_COLORS = ("tab:red", "tab:green", "tab:blue")
 NORMAL_STEP = 3  # every third normal is drawn, in both directions of the grid
 LEAST_DEG, MOST_DEG = 1e-2, 50.0  # of the errors' axis
-COLUMNS = 3
+COLUMNS = 4
 RING: dict[str, Any] = {"marker": "o", "markersize": 13, "fillstyle": "none", "markeredgewidth": 1.5}
 MARKERS = "os^D"  # of several frames
 
