@@ -75,7 +75,7 @@ def _of_depth(dataset: Any, trajectory: Trajectory, chosen: Any) -> Truth:
         points.append(seen)
         normals.append(directions)
     if not points:
-        raise DataError("the data set", "has no frame with a true pose", "give a data set with ground truth")
+        raise DataError("the data set", "has no frame with a true pose of its very stamp, so its depth is no truth", "give a rendered data set")
     cloud, first = _thinned(np.concatenate(points), CELL_M / 2.0)
     about = np.concatenate(normals)[first]
     tree = cKDTree(cloud)

@@ -10,8 +10,8 @@ import pytest
 import trimesh
 
 from trihedron.pipeline.codec import Encoder
-from trihedron.pipeline.ply import triangle_planes, write_ply
 from trihedron.pipeline.registry import load_plugins, plugin_class, plugins_of
+from trihedron.pipeline.results import write_surface
 from trihedron.pipeline.types import EXACT_DEPTH, LOST, PLANE_KINDS, Camera
 from trihedron.plugins.numerics.surfaces.half_edges import opposite_half_edges
 
@@ -142,7 +142,8 @@ def test_degenerate_input_gives_a_valid_file(name, case, tmp_path):
         "a million points": [seen(0, T, (BACK,), ball=False, camera=large)],
     }[case]
     surface = fold(plugin_class("surface", name)(), inputs)
-    write_ply(tmp_path / "surface.ply", surface.vertices_m, surface.colors, surface.triangles, triangle_planes(surface), "")
+    said = write_surface(tmp_path, surface)
+    assert ("empty" in said) == (len(surface.triangles) == 0) and ("triangles" in said) == (len(surface.triangles) > 0)
     if case in ("nothing", "lost", "no depth"):
         assert len(surface.triangles) == len(surface.vertices_m) == len(surface.plane_ids) == 0
     else:
