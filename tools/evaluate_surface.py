@@ -1,8 +1,8 @@
 """Judge a mesh by the true surface: accuracy, completeness, triangles and bytes, planar and curved parts apart where the truth tells them.
 
-MESH is a run folder, whose surface.ply is judged, or a file (ply, obj) in the world of the trajectory beside it. TRUTH is the run's recording, or its
-folder: the truth is that of its data set, the exact surface of the synthetic scenes, rendered depth for ICL-NUIM. By default the mesh's own folder.
-The mesh is moved by the SE(3) that aligns trajectory.txt with the ground truth, never by itself.
+MESH is a run folder, whose surface.ply is judged, or a file (ply, obj) in the world of the trajectory beside it, or else beside TRUTH. TRUTH is the
+run's recording, or its folder: the truth is that of its data set, the exact surface of the synthetic scenes, rendered depth for ICL-NUIM. By
+default the mesh's own folder. The mesh is moved by the SE(3) that aligns trajectory.txt with the ground truth, never by itself.
 
 Accuracy is the distance from the mesh to the truth, over its area. Completeness is the share of the truth that was seen, where a sensor reading
 fell, that is within 2 and 5 cm of the mesh; what cannot be seen counts for nothing.
@@ -44,11 +44,12 @@ def main(argv: list[str]) -> int:
 
 
 def evaluate_files(mesh: Path, recording: Path) -> dict[str, Any]:
-    """The figures of `judged` for a mesh file beside its trajectory.txt. Raises DataError."""
+    """The figures of `judged` for a mesh file in the world of the trajectory.txt beside it, or beside the recording. Raises DataError."""
     from trihedron.tools.mesh_files import read_mesh
 
     vertices, triangles = read_mesh(mesh)
-    T, truth = prepared(mesh.parent / TRAJECTORY, recording)
+    beside = next((folder for folder in (mesh.parent, recording.parent) if (folder / TRAJECTORY).is_file()), mesh.parent)
+    T, truth = prepared(beside / TRAJECTORY, recording)
     return {**judged(vertices @ T[:3, :3].T + T[:3, 3], triangles, truth), "bytes": mesh.stat().st_size}
 
 

@@ -25,6 +25,7 @@ from trihedron.pipeline.types import Map, Surface
 from trihedron.tools.arguments import Parser, table
 
 SCENE = ("dataset=synthetic", "dataset.curved=true")
+MESHES = 2  # the faster one counts: other programs slow down the other
 WARM_UP = 3  # frames and a mesh before the clock starts: kernels are loaded by then
 HEADER = ["surface", "triangles", "kB", "planar cm", "< 5 cm", "curved cm", "< 5 cm", "all cm", "< 5 cm", "p50 ms", "p95 ms", "mesh s", "views", "MB"]
 
@@ -111,9 +112,11 @@ class _Fold:
         self.ms.append(1e3 * (time.perf_counter() - began))
 
     def finish(self, map: Map | None) -> None:
-        began = time.perf_counter()
-        self.surface = self.plugin.finish(self.state, map)
-        self.mesh_s = time.perf_counter() - began
+        self.mesh_s = float("inf")
+        for _ in range(MESHES):
+            began = time.perf_counter()
+            self.surface = self.plugin.finish(self.state, map)
+            self.mesh_s = min(self.mesh_s, time.perf_counter() - began)
 
     def cost(self) -> dict[str, Any]:
         """Times, size and memory."""

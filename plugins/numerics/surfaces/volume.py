@@ -85,7 +85,7 @@ def _cosine(x: float, y: float, z: float, length: float, slants: F64, label: int
 
 @numba.njit(cache=True, nogil=True)
 def _across(local: I64, depth: F32, labels: U8, slants: F64, lens: F64, T: F64, block_m: float, truncation: float) -> I32 | None:
-    """Blocks (n, 3) within the truncation of the readings, along their rays; None when the table `local` is too small."""
+    """Blocks (n, 3) within the truncation of the readings, along their rays or across their planes; None when the table `local` is too small."""
     h, w = depth.shape
     found, count, last = np.empty((len(local) // 2, 3), np.int32), 0, -1
     for r in range(0, h, RAY_STEP):
@@ -94,13 +94,17 @@ def _across(local: I64, depth: F32, labels: U8, slants: F64, lens: F64, T: F64, 
             if z <= 0.0:
                 continue
             x, y = (c - lens[2]) / lens[0], (r - lens[3]) / lens[1]
-            length = np.sqrt(x * x + y * y + 1.0)
-            reach = truncation / (length * _cosine(x, y, 1.0, length, slants, labels[r, c]))
-            for k in range(-1, 2):
-                t = z + k * reach
-                i = int(np.floor((T[0, 0] * x * t + T[0, 1] * y * t + T[0, 2] * t + T[0, 3]) / block_m))
-                j = int(np.floor((T[1, 0] * x * t + T[1, 1] * y * t + T[1, 2] * t + T[1, 3]) / block_m))
-                m = int(np.floor((T[2, 0] * x * t + T[2, 1] * y * t + T[2, 2] * t + T[2, 3]) / block_m))
+            k = labels[r, c]
+            if k > 0:
+                dx, dy, dz = -truncation * slants[k, 2], -truncation * slants[k, 3], -truncation * slants[k, 4]
+            else:
+                dz = truncation / np.sqrt(x * x + y * y + 1.0)
+                dx, dy = x * dz, y * dz
+            for side in range(-1, 2):
+                px, py, pz = x * z + side * dx, y * z + side * dy, z + side * dz
+                i = int(np.floor((T[0, 0] * px + T[0, 1] * py + T[0, 2] * pz + T[0, 3]) / block_m))
+                j = int(np.floor((T[1, 0] * px + T[1, 1] * py + T[1, 2] * pz + T[1, 3]) / block_m))
+                m = int(np.floor((T[2, 0] * px + T[2, 1] * py + T[2, 2] * pz + T[2, 3]) / block_m))
                 key = key_of(i, j, m)
                 if key == last:
                     continue
