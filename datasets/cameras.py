@@ -15,7 +15,7 @@ from trihedron.pipeline.types import EXACT_DEPTH, Camera, DepthNoise
 
 CAMERA_FILE = "camera.yaml"
 REQUIRED = ("width", "height", "fx", "fy", "cx", "cy", "depth_scale")
-OPTIONAL = ("distortion", "fps", "depth_noise")
+OPTIONAL = ("distortion", "fps", "depth_noise", "depth_offset")
 COEFFICIENTS = ("k1", "k2", "p1", "p2", "k3")
 NOISES = {"kinect": DepthNoise(), "exact": EXACT_DEPTH}
 SHORT = "give dataset.camera=tum_fr1, tum_fr2, tum_fr3, icl_nuim or a camera.yaml"
@@ -24,11 +24,12 @@ SHORT = "give dataset.camera=tum_fr1, tum_fr2, tum_fr3, icl_nuim or a camera.yam
 @dataclass(frozen=True)
 class Calibration:
     """The pinhole camera a reader hands out, and what turns the files into it: depth file value per metre, lens distortion of both images
-    (k1 k2 p1 p2 k3 of Brown's model, as OpenCV orders them; empty = none)."""
+    (k1 k2 p1 p2 k3 of Brown's model, as OpenCV orders them; empty = none), and what is added to inverse depths (1/m)."""
 
     camera: Camera
     depth_scale: float
     distortion: tuple[float, ...] = ()
+    depth_offset: float = 0.0
 
 
 def _vga(fx: float, fy: float, cx: float, cy: float, *distortion: float) -> Calibration:
@@ -71,7 +72,8 @@ def choose_calibration(folder: Path, choice: str, default: str = "") -> Calibrat
 
 
 def read_camera_file(path: Path) -> Calibration:
-    """Read a camera.yaml: `width height fx fy cx cy depth_scale [distortion k1 k2 p1 p2 k3] [fps] [depth_noise kinect|exact]`.
+    """Read a camera.yaml: `width height fx fy cx cy depth_scale [distortion k1 k2 p1 p2 k3] [fps]
+    [depth_noise kinect|exact] [depth_offset]`.
 
     Raises DataError naming file and key."""
     try:
@@ -94,7 +96,7 @@ def read_camera_file(path: Path) -> Calibration:
 
 
 def _calibration(path: Path, content: dict[str, Any]) -> Calibration:
-    values = {key: _number(path, key, content[key]) for key in (*REQUIRED, "fps") if key in content}
+    values = {key: _number(path, key, content[key]) for key in (*REQUIRED, "fps", "depth_offset") if key in content}
     if values["fy"] < 0.0:
         raise DataError(str(path), "fy is negative (y up)", "give it positive; dataset=icl_nuim reflects the published poses itself")
     for key in ("width", "height", "fx", "fy", "depth_scale", "fps"):
@@ -105,7 +107,7 @@ def _calibration(path: Path, content: dict[str, Any]) -> Calibration:
         raise DataError(str(path), f"depth_noise is '{noise}'", did_you_mean(str(noise), NOISES))
     fx, fy, cx, cy = (values[key] for key in ("fx", "fy", "cx", "cy"))
     camera = Camera(int(values["width"]), int(values["height"]), fx, fy, cx, cy, values.get("fps", Camera.fps), NOISES[noise])
-    return Calibration(camera, values["depth_scale"], _distortion(path, content.get("distortion")))
+    return Calibration(camera, values["depth_scale"], _distortion(path, content.get("distortion")), values.get("depth_offset", 0.0))
 
 
 def _distortion(path: Path, given: Any) -> tuple[float, ...]:

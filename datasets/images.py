@@ -33,8 +33,8 @@ def read_color(path: Path) -> U8:
     return np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2RGB if image.shape[2] == 3 else cv2.COLOR_BGRA2RGB), dtype=np.uint8)
 
 
-def read_depth(path: Path, depth_scale: float) -> F32:
-    """(h, w) metres, 0 = none, from a 16-bit image whose value divided by `depth_scale` is metres.
+def read_depth(path: Path, depth_scale: float, depth_offset: float = 0.0) -> F32:
+    """(h, w) metres, 0 = none, from a 16-bit image whose value divided by `depth_scale` is metres z, corrected to 1 / (1 / z + `depth_offset`).
 
     Raises UnreadableImage for a missing or damaged file, DataError for an image that is not 16-bit with one channel."""
     image = _decode(path, cv2.IMREAD_UNCHANGED)
@@ -43,7 +43,8 @@ def read_depth(path: Path, depth_scale: float) -> F32:
     if image.dtype != np.uint16:
         cure = "give 16-bit depth images (value = metres × depth_scale); a preview picture does not hold metres"
         raise DataError(str(path), f"has {8 * image.itemsize} bits a pixel where depth has 16", cure)
-    return image.astype(np.float32) / np.float32(depth_scale)
+    depth = image.astype(np.float32) / np.float32(depth_scale)
+    return depth / np.maximum(1.0 + np.float32(depth_offset) * depth, np.float32(0.1)) if depth_offset else depth
 
 
 def _decode(path: Path, flags: int) -> NDArray[Any]:

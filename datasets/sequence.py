@@ -59,7 +59,7 @@ class ImageSequence:
             raise UnreadableImage(f"{path}: {error}") from error
 
     def _read_depth(self, path: Path) -> F32:
-        return read_depth(path, self.calibration.depth_scale)
+        return read_depth(path, self.calibration.depth_scale, self.calibration.depth_offset)
 
     def _check_sizes(self, position: int, color: U8, depth: F32) -> None:
         camera, path = self.calibration.camera, self.color_files[position]

@@ -24,6 +24,7 @@ class Tum(SequenceReader):
     frames: str = ""  # part to read, half open: A:B, A:, :B; empty = all
     camera: str = ""  # preset or camera.yaml; empty = the folder's file, else its name
     max_difference_ms: float = 20.0  # of a pair's stamps; the benchmark's tools use the same
+    depth_delay_ms: float = 0.0  # depth is taken this much later than its stamps say; trihedron calibrate estimates it
     exact_depth: bool = False  # rendered without sensor noise; false = a Kinect's
 
     def __post_init__(self) -> None:
@@ -38,7 +39,8 @@ class Tum(SequenceReader):
             if not (folder / name).is_file():
                 raise DataError(str(folder / name), "is missing", f"it lists the {kind} images; without lists use dataset=folder")
         color, depth = read_file_list(folder / "rgb.txt"), read_file_list(folder / "depth.txt")
-        pairs = associate(color.stamps_ns, depth.stamps_ns, round(self.max_difference_ms * 1e6))
+        taken_ns = depth.stamps_ns + round(self.depth_delay_ms * 1e6)
+        pairs = associate(color.stamps_ns, taken_ns, round(self.max_difference_ms * 1e6))
         if not len(pairs):
             cause = f"no colour and depth image are within {self.max_difference_ms:g} ms of each other"
             raise DataError(str(folder), cause, "check the stamps in rgb.txt and depth.txt or raise dataset.max_difference_ms")
