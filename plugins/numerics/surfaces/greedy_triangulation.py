@@ -22,7 +22,8 @@ def greedy_triangles(points: F64, radius_m: float, multiplier: float) -> I32:
     reach = np.minimum(radius_m, multiplier * distance[:, 1])
     row, column = np.nonzero((distance <= reach[:, None]) & (distance > 0.0))
     other = nearest[row, column]
-    edges = np.unique(np.sort(np.stack([row, other], axis=1), axis=1), axis=0).astype(np.int32)
+    keys = np.unique(np.minimum(row, other) * len(points) + np.maximum(row, other))
+    edges = np.stack([keys // len(points), keys % len(points)], axis=1).astype(np.int32)
     length = np.linalg.norm(points[edges[:, 1]] - points[edges[:, 0]], axis=1)
     order = np.argsort(length, kind="stable")
     return _faces(points, edges[order][_accepted(points, edges[order], length[order], distance, nearest.astype(np.int32))])
