@@ -20,6 +20,7 @@ from trihedron.plugins.numerics.maps.merging import merge_lines, merge_planes, m
 from trihedron.plugins.numerics.maps.submaps import submap_of, tied
 from trihedron.plugins.numerics.maps.visibility import visible_planes
 
+NEARBY = {"newest": 2, "covisible": 10, "near": 3}  # keyframes whose planes should be seen again: as many as tracking searches
 STALE = 0.25  # of the view change of a keyframe, that makes one after max_frames: a camera at rest adds none
 
 
@@ -136,7 +137,7 @@ class Covisibility:
         """Planes seen about here that should be seen now, those that are among them."""
         if matches is None:
             return np.empty(0, np.int32)
-        around = local_window(map, pose.T_world_camera, 2, 10, 3, submap=pose.submap).planes
+        around = local_window(map, pose.T_world_camera, **NEARBY, submap=pose.submap).planes
         return np.union1d(visible_planes(map.planes, around, pose.T_world_camera, frame), matches.planes[:, 1]).astype(np.int32)
 
     def _seen(self, map: Map, matches: Matches | None, planes: I32) -> Map:

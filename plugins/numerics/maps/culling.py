@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from trihedron.pipeline.types import F64, I32, Bool, Map, Matches, Table
+from trihedron.pipeline.types import F64, I32, Map, Matches, Table
 from trihedron.plugins.numerics.maps.local_window import WEIGHTS, covisible_keyframes, newest_keyframes, observed_by
 
 FARTHER = 1.2  # a landmark seen from at most this many times as far is seen as well: a level of the key points' pyramid
@@ -39,23 +39,29 @@ def cull_keyframe(map: Map, others: int, share: float) -> Map:
     newest = newest_keyframes(map, KEPT)
     around = covisible_keyframes(map, newest, 2 * others) if len(newest) else newest
     around = np.sort(around[around > 0])
-    shares = np.array([_redundancy(map, int(k), others) for k in around])
+    shares = _redundancies(map, around, others)
     if not len(shares) or shares.max() <= share:
         return map
     gone = around[[int(np.argmax(shares))]]
     return replace(map, keyframes=map.keyframes.updated(gone, alive=np.zeros(1, np.bool_)))
 
 
-def _redundancy(map: Map, keyframe: int, others: int) -> float:
-    """Weighed share of a keyframe's living landmarks that at least so many other living keyframes saw from as near."""
-    seen, redundant = 0, 0
+def _redundancies(map: Map, keyframes: I32, others: int) -> F64:
+    """(n,) weighed share of each keyframe's living landmarks that at least so many other living keyframes saw from as near."""
+    seen, redundant = np.zeros(len(keyframes)), np.zeros(len(keyframes))
+    places = map.keyframes.rows("T_world_camera", keyframes)[:, :3, 3]
     for kind, weight in WEIGHTS.items():
-        ids = observed_by(map, np.array([keyframe], np.int32), kind)
         table: Table = getattr(map, f"{kind}s")
-        as_near = _as_near(map, keyframe, table.rows("observers", ids), _centres(table, kind, ids))
-        seen += weight * len(ids)
-        redundant += weight * int(np.count_nonzero(as_near.sum(axis=1) >= others))
-    return redundant / max(seen, 1)
+        ids = observed_by(map, keyframes, kind)  # what they share is read once
+        observers, centres = table.rows("observers", ids), _centres(table, kind, ids)
+        away = _distances(map, observers, centres)
+        for k, keyframe in enumerate(keyframes):
+            own = np.searchsorted(ids, observed_by(map, keyframes[k : k + 1], kind))
+            reach = FARTHER * np.linalg.norm(places[k] - centres[own], axis=-1)
+            as_near = (away[own] <= reach[:, None]) & (observers[own] != keyframe)
+            seen[k] += weight * len(own)
+            redundant[k] += weight * np.count_nonzero(as_near.sum(axis=1) >= others)
+    return redundant / np.maximum(seen, 1.0)
 
 
 def _centres(table: Table, kind: str, ids: I32) -> F64:
@@ -69,13 +75,10 @@ def _centres(table: Table, kind: str, ids: I32) -> F64:
     return np.asarray(np.where(known, samples, 0.0).sum(axis=1) / np.maximum(known.sum(axis=1), 1), np.float64)
 
 
-def _as_near(map: Map, keyframe: int, observers: I32, centres: F64) -> Bool:
-    """(n, OBSERVERS) which observers are living keyframes other than this one, from which a landmark is at most FARTHER times as far."""
+def _distances(map: Map, observers: I32, centres: F64) -> F64:
+    """(n, OBSERVERS) how far each observer was from the landmark, infinite where there is none or it lives no more."""
     rows = np.unique(observers[observers >= 0])
     place = np.searchsorted(rows, observers)  # of an empty one: 0, and not counted
     places = map.keyframes.rows("T_world_camera", rows)[:, :3, 3]
-    living = map.keyframes.rows("alive", rows) & (rows != keyframe)
-    away = np.linalg.norm(places[place] - centres[:, None], axis=-1)
-    own = map.keyframes.rows("T_world_camera", np.array([keyframe]))[0, :3, 3]
-    near: Bool = (observers >= 0) & living[place] & (away <= FARTHER * np.linalg.norm(own - centres, axis=-1)[:, None])
-    return near
+    living = (observers >= 0) & map.keyframes.rows("alive", rows)[place]
+    return np.where(living, np.linalg.norm(places[place] - centres[:, None], axis=-1), np.inf)
