@@ -29,7 +29,8 @@ from trihedron.tools.arguments import Parser, table
 
 EXACT = 1e-12  # variance of what is true, m² and rad²; positive, so that it can be inverted
 ROWS = ((), ("rotation",), ("translation",), ("rotation", "translation"), ("map",), ("rotation", "translation", "map"))
-AFTER = {"rotation": ("translation", "matches", "pose", "map"), "translation": ("matches", "pose", "map"), "map": ("matches", "pose")}
+LOOP = ("relocalise", "matches", "pose", "map", "bundle", "loop")  # corrections are of one map only: whoever changes it adjusts it again
+AFTER = {"rotation": ("translation", *LOOP), "translation": LOOP, "map": ("relocalise", "matches", "pose")}
 
 
 @dataclass(frozen=True)
@@ -99,7 +100,8 @@ def rerun(recording: Recording, truth: Truth, stages: tuple[str, ...], folder: P
     source, changed = folder / "source.mcap", {name: getattr(truth, name) for name in stages if name != "map"}
     if "map" in stages:
         rewrite(recording, source, {"pose": truth.pose})
-        replayed(source, ("map",), folder / "map")
+        correctors = [stage for stage in ("bundle", "loop") if stage in recording.topics]
+        replayed(source, ("map", *correctors), folder / "map", *(f"{stage}=none" for stage in correctors))
         changed["map"] = dict(enumerate(Recording(folder / "map" / "run.mcap").values("map")))
     rewrite(recording, source, changed)
     first = min(stages, key=list(AFTER).index, default="rotation")
@@ -119,13 +121,13 @@ def rewrite(recording: Recording, path: Path, changed: dict[str, Any]) -> None:
     writer.close()
 
 
-def replayed(source: Path, stages: tuple[str, ...], out: Path) -> dict[str, Any]:
-    """Run the stages again over the recording; the final metrics, empty when no pose is among them."""
+def replayed(source: Path, stages: tuple[str, ...], out: Path, *overrides: str) -> dict[str, Any]:
+    """Run the stages again over the recording, changed by `overrides`; the final metrics, empty when no pose is among them."""
     from trihedron.pipeline.cli import main as trihedron
 
     said = io.StringIO()
     with contextlib.redirect_stdout(said), contextlib.redirect_stderr(said):
-        code = trihedron(["run", f"replay={source}", f"only=[{','.join(stages)}]", f"out={out}"])
+        code = trihedron(["run", f"replay={source}", f"only=[{','.join(stages)}]", f"out={out}", *overrides])
     if code:
         raise StageError(f"replay of {', '.join(stages)}", (said.getvalue().strip().splitlines() or ["failed"])[-1], "run it alone to see more")
     metrics: dict[str, Any] = json.loads((out / "metrics.json").read_text())["final"] if "pose" in stages else {}

@@ -114,7 +114,7 @@ class Refine:
         self, start: Decoupled, frame: Frame, matches: Matches, keypoints: Keypoints, segments: Segments, planes: Planes, map: Map
     ) -> PoseSolution:
         T = start.T_world_camera
-        position = self.position_sigma_m**2 * np.eye(3) + (start.covariance[:3, :3] if start.status == LOST else 0.0)
+        position = self.position_sigma_m**2 * np.eye(3) + start.covariance[:3, :3]
         prior = np.zeros((6, 6))
         prior[:3, :3] = np.linalg.inv(position)
         prior[3:, 3:] = np.linalg.inv(start.covariance[3:, 3:] + np.radians(self.rotation_sigma_deg) ** 2 * np.eye(3))

@@ -138,6 +138,6 @@ class LevenbergMarquardt:
 
 
 def _unknown(previous: Pose) -> F64:
-    """(3, 3) covariance (world) that a lost pose hands on to what is put on top of it; a pose that was found hands on none."""
-    R = previous.T_world_camera[:3, :3]
-    return np.asarray(R @ previous.covariance[:3, :3] @ R.T) if previous.status == LOST else np.zeros((3, 3))
+    """(3, 3) covariance (world) that a pose which was lost, or held in some direction, hands on to what is put on top of it; others hand on none."""
+    R, known = previous.T_world_camera[:3, :3], previous.status != LOST and previous.unobservable == 0
+    return np.zeros((3, 3)) if known else np.asarray(R @ previous.covariance[:3, :3] @ R.T)
