@@ -171,17 +171,18 @@ def _joined(labels: I32, middle: F64, area: F64, opposite: I32, planes: F64, dis
     """Planes that touch, and of which the larger one fits the smaller one's triangles within the distance (RMS), are one, such as a floor that was
     mapped twice. The larger keeps its identity."""
     h = np.flatnonzero(opposite >= 0)
-    pairs = np.unique(np.stack([labels[h // 3], labels[opposite[h] // 3]], axis=1), axis=0)
-    pairs = pairs[(pairs[:, 0] >= 0) & (pairs[:, 1] >= 0)]
+    here, there = labels[h // 3], labels[opposite[h] // 3]
+    seams = (here >= 0) & (there >= 0) & (here != there)
+    pairs = np.unique(np.stack([here[seams], there[seams]], axis=1), axis=0)
     total = np.bincount(labels + 1, area, len(planes) + 1)[1:]
     out, stands_for = labels.copy(), np.arange(len(planes))
     for small in np.argsort(total, kind="stable"):
         beside = np.unique(stands_for[pairs[stands_for[pairs[:, 0]] == small, 1]])
         rows = np.flatnonzero(out == small)
-        beside = beside[total[beside] >= total[small]]
+        beside = beside[(total[beside] >= total[small]) & (beside != small)]
         for large in beside[np.argsort(-total[beside], kind="stable")]:
             off = middle[rows] @ planes[large, :3] + planes[large, 3]
-            if large != small and planes[large, :3] @ planes[small, :3] > 0.9 and np.average(off**2, weights=area[rows]) <= distance**2:
+            if planes[large, :3] @ planes[small, :3] > 0.9 and np.average(off**2, weights=area[rows]) <= distance**2:
                 out[rows], stands_for[stands_for == small] = large, large
                 total[large] += total[small]
                 break
