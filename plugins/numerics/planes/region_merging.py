@@ -10,6 +10,7 @@ from trihedron.plugins.numerics.planes.parallel_planes import LEAST, angle_betwe
 from trihedron.plugins.numerics.planes.plane_fitting import solve_symmetric
 
 NOISE = 7.815  # χ² of a plane's three parameters, 95 %
+PARALLEL = 4.0  # times less than the common plane is turned from either must two surfaces be turned from each other to be a step, not a bend
 
 
 @numba.njit(cache=True, nogil=True)
@@ -73,8 +74,8 @@ def merge_regions(A: F64, b: F64, moments: F64, n: I32, touch: F64, limit: float
 
 @numba.njit(cache=True, nogil=True)
 def _one_plane(A: F64, b: F64, n: int, B: F64, c: F64, m: int, limit: float, noise: float) -> bool:
-    """Whether the common plane of two regions lies within `limit` σ (rms) of each region's own; `noise` is added to the sums of squares. One that is
-    turned from both by more than they are from each other has one surface in front of the other."""
+    """Whether the common plane of two regions lies within `limit` σ (rms) of each region's own; `noise` is added to the sums of squares. Not when it
+    is turned from both while these are parallel: one surface is in front of the other."""
     solved, common = solve_symmetric(A + B, b + c)
     first, p = solve_symmetric(A, b)
     second, q = solve_symmetric(B, c)
@@ -82,5 +83,5 @@ def _one_plane(A: F64, b: F64, n: int, B: F64, c: F64, m: int, limit: float, noi
         return False
     e, f = common - p, common - q
     turned = min(angle_between(common, p), angle_between(common, q))
-    step = turned > LEAST and turned > angle_between(p, q)
+    step = turned > LEAST and turned > PARALLEL * angle_between(p, q)
     return not step and e @ (A @ e) < limit * limit * n + noise and f @ (B @ f) < limit * limit * m + noise
