@@ -14,6 +14,7 @@ from trihedron.pipeline.registry import load_plugins, plugin_class, plugins_of
 from trihedron.pipeline.results import write_surface
 from trihedron.pipeline.types import EXACT_DEPTH, LOST, PLANE_KINDS, Camera
 from trihedron.plugins.numerics.surfaces.half_edges import opposite_half_edges
+from trihedron.plugins.numerics.surfaces.pinholes import without_pinholes
 
 sys.path.insert(0, str(Path(__file__).parent))
 from surface_world import BACK, BALL, FLOOR, LEFT, RADIUS, faults, fold, off_truth, render, seen, walk
@@ -83,6 +84,20 @@ def test_the_counts_of_faults_see_faults():
         colors=np.concatenate([surface.colors, surface.colors[:1]]),
     )  # fmt: skip
     assert faults(cut)["T-junctions"] == (opposite[edge] >= 0) == 1
+
+
+def test_small_rings_of_open_edges_are_closed_and_large_ones_stay():
+    """A sheet of squares of 4 mm: a triangle and a square taken out are put back the right way round, the sheet's own rim stays."""
+    rows, columns = np.mgrid[0:9, 0:9]
+    points = np.stack([columns, rows, np.zeros_like(rows)], axis=-1).reshape(-1, 3) * 0.004
+    place = (rows * 9 + columns)[:8, :8].ravel()
+    sheet = np.concatenate([np.stack([place, place + 1, place + 10], 1), np.stack([place, place + 10, place + 9], 1)]).astype(np.int32)
+    holed = np.delete(sheet, [10, 36, 36 + 64], axis=0)
+    whole, owners = without_pinholes(points, holed, np.arange(len(holed), dtype=np.int32) // 64)
+    assert len(whole) == len(owners) == len(sheet) and set(owners.tolist()) == {0, 1}
+    normals = np.cross(points[whole[:, 1]] - points[whole[:, 0]], points[whole[:, 2]] - points[whole[:, 0]])
+    assert (normals[:, 2] > 0.0).all() and np.isclose(0.5 * normals[:, 2].sum(), 0.032**2)
+    assert (opposite_half_edges(whole) < 0).sum() == 32
 
 
 @pytest.mark.parametrize("name", ["planar_tsdf", "planar_polygon"])

@@ -8,6 +8,7 @@ from trihedron.pipeline.types import Map, Surface
 from trihedron.plugins.numerics.surfaces.assembly import pictured
 from trihedron.plugins.numerics.surfaces.borders import REST
 from trihedron.plugins.numerics.surfaces.half_edges import opposite_half_edges, vertex_normals, with_single_fans
+from trihedron.plugins.numerics.surfaces.pinholes import without_pinholes
 from trihedron.plugins.numerics.surfaces.planar_parts import Flatness, map_planes, numbered, planar_labels
 from trihedron.plugins.numerics.surfaces.polygons import flattened
 from trihedron.plugins.numerics.surfaces.view_fold import Gathered, VolumeFold
@@ -50,6 +51,5 @@ class PlanarFold(VolumeFold):
             opposite = opposite_half_edges(triangles)
         flat = flattened(vertices, triangles, opposite, labels, planes, self.snap_m, self.outline_m, self.hole_m2)
         shown = flat.labels >= (REST if rest else 0)
-        return pictured(
-            state, map, flat.vertices, flat.triangles[shown], flat.labels[shown], planes, numbered(ids, len(planes), map), flat.loops, self.texel_m
-        )  # fmt: skip
+        triangles, labels = without_pinholes(flat.vertices, flat.triangles[shown], flat.labels[shown])
+        return pictured(state, map, flat.vertices, triangles, labels, planes, numbered(ids, len(planes), map), flat.loops, self.texel_m)
