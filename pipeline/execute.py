@@ -21,6 +21,7 @@ from trihedron.pipeline import results
 from trihedron.pipeline.config import Feedback, graph_of
 from trihedron.pipeline.errors import ConfigError, TrihedronError, did_you_mean
 from trihedron.pipeline.graph import Graph
+from trihedron.pipeline.interrupts import held_interrupts
 from trihedron.pipeline.recording import Recording, RecordingWriter
 from trihedron.pipeline.runner import Replay, Runner, Step
 from trihedron.pipeline.slots import output_of
@@ -61,9 +62,10 @@ def execute(config: DictConfig, out: Path, overrides: list[str], began: float) -
             if config.save_map:
                 runner.keeper.save(Path(config.save_map).expanduser(), _metadata(config, overrides), source)
         finally:
-            writer.close()
-            metrics = _write(runner, attached_truth(attachments, str(writer.path)), out, started, began)
-            warnings.summarise()
+            with held_interrupts():
+                writer.close()
+                metrics = _write(runner, attached_truth(attachments, str(writer.path)), out, started, began)
+                warnings.summarise()
     _report(out, metrics, [results.write_surface(out, value) for value in runner.result.folds.values() if isinstance(value, Surface)])
     return metrics
 

@@ -18,6 +18,7 @@ import numpy as np
 from trihedron.pipeline.errors import DataError, RecordingError, StageError, TrihedronError
 from trihedron.pipeline.foxglove import View
 from trihedron.pipeline.graph import Graph, Stage, Wire
+from trihedron.pipeline.interrupts import held_interrupts
 from trihedron.pipeline.recording import Recording, RecordingWriter, TopicReader
 from trihedron.pipeline.scheduler import Node, NodeFailure, Scheduler, single_threaded_libraries
 from trihedron.pipeline.slots import frame_range, output_of
@@ -139,9 +140,10 @@ class Runner:
         try:
             with single_threaded_libraries():
                 for position, values in scheduler.run(len(self.indices)):
-                    self._account(position, values)
-                    if writer is not None:
-                        self._record(writer, view, position, values, topics, embed_frames)
+                    with held_interrupts():
+                        self._account(position, values)
+                        if writer is not None:
+                            self._record(writer, view, position, values, topics, embed_frames)
                     self._calls_ms.pop(position, None)
                     self._latency_ms.pop(position, None)
                     self._handed_over.pop(position, None)
@@ -153,8 +155,6 @@ class Runner:
                         self._finish_fold(name, writer, view, name in topics)
         except NodeFailure as failure:
             raise self._explain(failure, writer) from failure.__cause__
-
-    # --- what a node does -------------------------------------------------------------------------------------------------------------
 
     def _nodes(self) -> list[Node]:
         readers: dict[str, Node] = {}
@@ -203,8 +203,6 @@ class Runner:
         if value is not None:
             _check_value(value, output_of(stage.name), self.indices[position])
         return value
-
-    # --- what becomes of a finished frame ---------------------------------------------------------------------------------------------
 
     def _account(self, position: int, values: Mapping[str, Any]) -> None:
         self.keeper.see(self.indices[position], values)

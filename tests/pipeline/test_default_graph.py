@@ -35,7 +35,8 @@ CHANGES = {
 }
 RECORD = ["dataset=synthetic", f"dataset.frames=0:{FRAMES}", "dataset.width=320", "dataset.height=240"]
 RECORD += ["record.frames=true", "record.topics=[normals]"]
-RECORD += ["loop.every=1", "loop.away_m=0.2", "loop.shared=1000", "loop.min_score=20", "loop.max_through=1", "loop.drift_share=0.05"]  # closes one
+RECORD += ["loop.every=1", "loop.away_m=0.2", "loop.shared=1000", "loop.max_through=1", "loop.drift_share=0.05", "loop.candidates=20"]
+RECORD += ["loop.min_score=10", "loop.min_share=0.1"]  # closes some that are none
 REPLAY = """
 import json, sys
 from trihedron.pipeline.cli import main
