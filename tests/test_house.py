@@ -10,7 +10,7 @@ ROOT = Path(__file__).resolve().parents[1]
 ORDER = (
     "errors", "arrays", "camera", "table", "maps", "surface", "types", "geometry", "slots", "registry", "codec", "foxglove", "graph", "metrics",
     "consistency",
-    "plot", "ply", "timing", "recording", "scheduler", "state", "runner", "results", "config", "execute", "cli",
+    "plot", "ply", "timing", "recording", "scheduler", "interrupts", "state", "runner", "results", "config", "execute", "cli",
 )  # fmt: skip
 NUMERICS = ("algebra", "images", "depth", "planes", "axes", "motion", "maps", "bundle", "places", "surfaces")  # each imports those before it
 VOCABULARY = {"types", "geometry", "errors", "slots", "registry"}  # what plugins and data sets know of the machinery
