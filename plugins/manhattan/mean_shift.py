@@ -24,7 +24,7 @@ class MeanShift(ModeOptions):
     lines on the axes by their covariances, the mean of the normals on an axis counting like one more plane."""
 
     max_age: int = 10  # frames after which the previous axes are old
-    search_samples: int = 800  # most normals a search looks at
+    search_samples: int = 400  # most normals a search looks at
     primaries: int = 6  # directions a search starts from
     turns: int = 2  # and turns about each
 
@@ -41,10 +41,10 @@ class MeanShift(ModeOptions):
     def _modes(self, directions: Directions, planes: Planes, previous: ManhattanFrame | None, index: int) -> Modes:
         """Near the previous axes; from everywhere when there are none, they are old or nothing supports them."""
         finder, start = self.finder, np.eye(3) if previous is None else np.array(previous.rotations[0])
-        near = finder.follow(directions, planes, start)
-        if previous is not None and previous.supported and near.supported and index - previous.index <= self.max_age:
+        near = finder.follow(directions, planes, start) if previous is not None else None
+        if previous is not None and near is not None and previous.supported and near.supported and index - previous.index <= self.max_age:
             return near
         few = directions.thinned(self.search_samples)
         found = search_axes(few.vectors, few.weights, HALF_SPHERE, finder.cone, finder.bandwidth, self.primaries, self.turns)
         far = finder.follow(directions, planes, nearest_equivalent(found, start))
-        return far if far.supported or previous is None else near
+        return far if far.supported or near is None else near
