@@ -171,7 +171,8 @@ def test_a_sweep_goes_on_after_a_job_that_fails(capsys, tmp_path):
 
 def test_an_interrupt_leaves_a_recording_and_a_trajectory(tmp_path):
     words = ["run", "dataset=synthetic", "dataset.length=2000", "dataset.width=160", "dataset.height=120", "out=cut"]
-    code = f"import sys; from trihedron.pipeline.cli import main; sys.exit(main({words!r}))"
+    listen = "import signal; signal.signal(signal.SIGINT, signal.default_int_handler)"  # a shell's background jobs are born deaf to it
+    code = f"{listen}; import sys; from trihedron.pipeline.cli import main; sys.exit(main({words!r}))"
     process = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
     recording = tmp_path / "cut" / "run.mcap"
     for _ in range(600):
