@@ -9,8 +9,9 @@ Example: trihedron calibrate runs/a/run.mcap
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 
@@ -29,10 +30,11 @@ def main(argv: list[str]) -> int:
     parser = Parser("calibrate", __name__)
     parser.add_argument("recording", metavar="RUN.mcap", type=Path)
     recording = Recording(parser.parse_args(argv).recording)
-    missing = [topic for topic in NEEDED if topic not in recording.topics]
+    missing = next((topic for topic in NEEDED if topic not in recording.topics), None)
     if missing:
-        raise DataError(str(recording.path), f"holds no topic {missing[0]}", "record a run of graph=structural, or one that has this stage")
-    offset, delay = depth_offset_of(recording), depth_delay_of(recording)
+        raise DataError(str(recording.path), f"holds no topic {missing}", "record a run of graph=structural, or one that has this stage")
+    planes = planes_of(recording)
+    offset, delay = depth_offset_of(recording, planes), depth_delay_of(recording, planes)
     rows = [
         ["figure", "estimate", "standard deviation", "from"],
         ["depth_offset (1/m)", f"{offset.per_m:.5f}", f"{offset.sigma_per_m:.5f}", f"{offset.pairs} pairs of planes"],
@@ -42,21 +44,25 @@ def main(argv: list[str]) -> int:
     return 0
 
 
-def depth_offset_of(recording: Recording) -> DepthOffset:
-    """What to add to the inverse depths of the recording's sensor."""
+def planes_of(recording: Recording) -> dict[int, Planes]:
+    """The planes of each frame."""
+    return {value.index: value for value in _all(recording, "planes", Planes)}
+
+
+def depth_offset_of(recording: Recording, planes: Mapping[int, Planes]) -> DepthOffset:
+    """What to add to the inverse depths of the recording's sensor; `planes` by frame."""
     landmarks = {match.index: dict(match.planes.tolist()) for match in _all(recording, "matches", Matches)}
     pairs: dict[tuple[int, int], list[RightAngle]] = {}
-    for planes in _all(recording, "planes", Planes):
-        for ids, seen in right_angles(planes, landmarks.get(planes.index, {})).items():
+    for index, found in planes.items():
+        for ids, seen in right_angles(found, landmarks.get(index, {})).items():
             pairs.setdefault(ids, []).append(seen)
     return estimate_depth_offset(pairs)
 
 
-def depth_delay_of(recording: Recording) -> DepthDelay:
-    """How much later than its colour image a depth image of the recording was taken."""
+def depth_delay_of(recording: Recording, planes: Mapping[int, Planes]) -> DepthDelay:
+    """How much later than its colour image a depth image of the recording was taken; `planes` by frame."""
     camera = _all(recording, "frames", FrameReference)[0].camera
     keypoints = {value.index: value for value in _all(recording, "keypoints", Keypoints)}
-    planes = {value.index: value for value in _all(recording, "planes", Planes)}
     tracks = [t for t in _all(recording, "tracks", Tracks) if t.previous_index >= 0 and t.index in keypoints and t.index in planes]
     turns: list[Turn] = [turn for t in tracks if (turn := turn_of(t, keypoints[t.index], planes[t.index], camera)) is not None]
     stamps = np.array([t.stamp_ns for t in tracks], np.int64)
@@ -65,4 +71,4 @@ def depth_delay_of(recording: Recording) -> DepthDelay:
 
 def _all(recording: Recording, topic: str, kind: type[Any]) -> list[Any]:
     """A topic's values, in frame order."""
-    return [cast(Any, value) for value in recording.values(topic) if isinstance(value, kind)]
+    return [value for value in recording.values(topic) if isinstance(value, kind)]

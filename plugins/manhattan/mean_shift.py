@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from trihedron.pipeline.registry import register
-from trihedron.pipeline.types import ManhattanFrame, Normals, Planes, Segments
+from trihedron.pipeline.types import F64, ManhattanFrame, Normals, Planes, Segments
 from trihedron.plugins.numerics.axes.axis_fit import HALF_SPHERE
 from trihedron.plugins.numerics.axes.cube_symmetry import nearest_equivalent
 from trihedron.plugins.numerics.axes.manhattan_modes import Directions, Modes
@@ -40,11 +40,17 @@ class MeanShift(ModeOptions):
 
     def _modes(self, directions: Directions, planes: Planes, previous: ManhattanFrame | None, index: int) -> Modes:
         """Near the previous axes; from everywhere when there are none, they are old or nothing supports them."""
-        finder, start = self.finder, np.eye(3) if previous is None else np.array(previous.rotations[0])
-        near = finder.follow(directions, planes, start) if previous is not None else None
-        if previous is not None and near is not None and previous.supported and near.supported and index - previous.index <= self.max_age:
+        if previous is None:
+            return self._anywhere(directions, planes, np.eye(3))
+        start = np.array(previous.rotations[0])
+        near = self.finder.follow(directions, planes, start)
+        if previous.supported and near.supported and index - previous.index <= self.max_age:
             return near
-        few = directions.thinned(self.search_samples)
+        far = self._anywhere(directions, planes, start)
+        return far if far.supported else near
+
+    def _anywhere(self, directions: Directions, planes: Planes, names: F64) -> Modes:
+        """The densest axes of all, in the order and with the signs nearest to those of `names` (3, 3)."""
+        finder, few = self.finder, directions.thinned(self.search_samples)
         found = search_axes(few.vectors, few.weights, HALF_SPHERE, finder.cone, finder.bandwidth, self.primaries, self.turns)
-        far = finder.follow(directions, planes, nearest_equivalent(found, start))
-        return far if far.supported or near is None else near
+        return finder.follow(directions, planes, nearest_equivalent(found, names))

@@ -9,11 +9,12 @@ import yaml
 
 from trihedron.datasets.images import read_depth
 from trihedron.datasets.synthetic import Synthetic
+from trihedron.datasets.trajectories import write_trajectory
 from trihedron.pipeline.cli import main
 from trihedron.pipeline.recording import Recording
 from trihedron.plugins.numerics.depth.depth_offset import RightAngle, estimate_depth_offset
 from trihedron.plugins.numerics.motion.depth_delay import Turn, estimate_depth_delay
-from trihedron.tools.calibrate import depth_delay_of, depth_offset_of
+from trihedron.tools.calibrate import depth_delay_of, depth_offset_of, planes_of
 
 
 def write_tum(folder, frames, color_at, depth_at, offset=0.0):
@@ -91,15 +92,14 @@ def test_a_biased_sensor_is_found_out_and_put_right(tmp_path):
     """Inverse depths 0.012 / m too small (5 cm at 2 m): found to 3 σ; with the figure in camera.yaml the error is less than half."""
     room = Synthetic(frames="0:120")
     content = write_tum(tmp_path / "room", 120, room, room, offset=0.012)
-    truth = room.truth()
-    np.savetxt(tmp_path / "room" / "groundtruth.txt", truth_rows(truth), fmt="%.9f")
+    write_trajectory(tmp_path / "room" / "groundtruth.txt", room.truth())
     before = run(tmp_path / "room", tmp_path / "before")
-    found = depth_offset_of(before)
+    found = depth_offset_of(before, planes_of(before))
     print(f"offset 0.012 / m found as {found.per_m:.5f} ± {found.sigma_per_m:.5f}")
     assert abs(found.per_m - 0.012) < max(3.0 * found.sigma_per_m, 0.001) and found.sigma_per_m < 0.002
     (tmp_path / "room" / "camera.yaml").write_text(yaml.safe_dump(content | {"depth_offset": found.per_m}))
     after = run(tmp_path / "room", tmp_path / "after")
-    assert abs(depth_offset_of(after).per_m) < 0.002
+    assert abs(depth_offset_of(after, planes_of(after)).per_m) < 0.002
     errors = [json.loads((tmp_path / name / "metrics.json").read_text())["final"]["ate_rmse_m"] for name in ("before", "after")]
     print(f"ATE {1e3 * errors[0]:.2f} mm, with the offset {1e3 * errors[1]:.2f} mm")
     assert errors[1] < 0.5 * errors[0]
@@ -111,14 +111,6 @@ def test_late_depth_is_found_out(tmp_path):
     room = Synthetic(fps=60.0, length=260, motion="fast")
     write_tum(tmp_path / "late", 120, lambda k: room(2 * k), lambda k: room(2 * k + 1))
     recording = run(tmp_path / "late", tmp_path / "out")
-    found = depth_delay_of(recording)
+    found = depth_delay_of(recording, planes_of(recording))
     print(f"16.7 ms found as {1e3 * found.seconds:.1f} ± {1e3 * found.sigma_s:.1f} ms")
     assert abs(found.seconds - 1.0 / 60.0) < 3.0 * found.sigma_s and found.sigma_s < 0.004
-
-
-def truth_rows(truth):
-    """Rows of a TUM trajectory file."""
-    from scipy.spatial.transform import Rotation
-
-    quaternions = Rotation.from_matrix(truth.poses[:, :3, :3]).as_quat()
-    return np.column_stack([truth.stamps_ns * 1e-9, truth.poses[:, :3, 3], quaternions])

@@ -67,6 +67,22 @@ def cell_rays(h: int, w: int, stride: int, intrinsics: tuple[float, float, float
 
 
 @numba.njit(cache=True, nogil=True)
+def add_cell(grid: Grid, r: int, c: int, A: F64, b: F64) -> None:
+    """Adds a cell's weighted depths to the normal equations of q: A (3, 3), of which only the upper triangle is kept, and b (3,)."""
+    x, y, p, s = grid.rays_x[c], grid.rays_y[r], grid.rho[r, c], grid.sigma[r, c]
+    weight = grid.count[r, c] / (s * s)
+    A[0, 0] += weight * x * x
+    A[0, 1] += weight * x * y
+    A[0, 2] += weight * x
+    A[1, 1] += weight * y * y
+    A[1, 2] += weight * y
+    A[2, 2] += weight
+    b[0] += weight * x * p
+    b[1] += weight * y * p
+    b[2] += weight * p
+
+
+@numba.njit(cache=True, nogil=True)
 def coarser(grid: Grid, edge: float, edge_m: float) -> Grid:
     """The grid of 2 × 2 cells: mean inverse depth and mean normal of those that have one, none across a step of more than `edge` z + `edge_m`."""
     rho, sigma, count, rays_x, rays_y, normals = grid

@@ -19,6 +19,10 @@ class Pyramid(NamedTuple):
     starts: I32
     shapes: I32
 
+    def images(self) -> list[U8]:
+        """Each level (h, w), as a view of the pixels."""
+        return [self.pixels[start : start + h * w].reshape(h, w) for (h, w), start in zip(self.shapes.tolist(), self.starts.tolist())]
+
 
 def image_pyramid(gray: U8, scale: float, levels: int, least_px: int) -> Pyramid:
     """The image (h, w) at 1, 1/scale, 1/scale² …: at most `levels`, none but the first with a side below `least_px`."""
@@ -29,12 +33,12 @@ def image_pyramid(gray: U8, scale: float, levels: int, least_px: int) -> Pyramid
             break
         shapes.append(shape)
     starts = np.concatenate([[0], np.cumsum([h * w for h, w in shapes])]).astype(np.int32)
-    pixels = np.empty(starts[-1], np.uint8)
-    images = [pixels[start:end].reshape(shape) for start, end, shape in zip(starts, starts[1:], shapes)]
+    pyramid = Pyramid(np.empty(starts[-1], np.uint8), starts, np.array(shapes, np.int32))
+    images = pyramid.images()
     images[0][:] = gray
     for above, image in pairwise(images):
         cv2.resize(above, image.shape[::-1], dst=image, interpolation=cv2.INTER_LINEAR_EXACT)
-    return Pyramid(pixels, starts, np.array(shapes, np.int32))
+    return pyramid
 
 
 @numba.njit(cache=True, nogil=True)

@@ -31,24 +31,23 @@ def steered_brief(pyramid: Pyramid, cells: I32, levels: I32, angles_deg: F32, te
 
     Bit i is whether the mean about the first end of test i is darker than that about the second, the tests turned by the key point's angle
     (Calonder et al., ECCV 2010; Rublee et al., ICCV 2011)."""
-    smooth = np.empty_like(pyramid.pixels)
-    for (h, w), start in zip(pyramid.shapes.tolist(), pyramid.starts.tolist()):
-        level, blurred = (pixels[start : start + h * w].reshape(h, w) for pixels in (pyramid.pixels, smooth))
+    smooth = pyramid._replace(pixels=np.empty_like(pyramid.pixels))
+    for level, blurred in zip(pyramid.images(), smooth.images()):
         cv2.blur(level, (WINDOW_PX, WINDOW_PX), dst=blurred)
-    return _described(smooth, pyramid.starts, pyramid.shapes, cells, levels, angles_deg, tests)
+    return _described(smooth, cells, levels, angles_deg, tests)
 
 
 @numba.njit(cache=True, nogil=True)
-def _described(pixels: U8, starts: I32, shapes: I32, cells: I32, levels: I32, angles_deg: F32, tests: F32) -> U8:
-    """The tests of `steered_brief` on the smoothed pixels of all levels."""
+def _described(smooth: Pyramid, cells: I32, levels: I32, angles_deg: F32, tests: F32) -> U8:
+    """The tests of `steered_brief` on smoothed levels."""
     out = np.zeros((len(cells), BITS // 8), np.uint8)
     first, second = np.empty(BITS, np.int32), np.empty(BITS, np.int32)
     for i in range(len(cells)):
         angle = np.radians(angles_deg[i])
-        c, s, width = np.cos(angle), np.sin(angle), shapes[levels[i], 1]
+        c, s, width = np.cos(angle), np.sin(angle), smooth.shapes[levels[i], 1]
         _places(tests[0], tests[1], c, s, width, first)
         _places(tests[2], tests[3], c, s, width, second)
-        around = pixels[starts[levels[i]] + (cells[i, 1] - REACH_PX - 1) * width :]
+        around = smooth.pixels[smooth.starts[levels[i]] + (cells[i, 1] - REACH_PX - 1) * width :]
         centre = (REACH_PX + 1) * width + cells[i, 0]
         for byte in range(BITS // 8):
             bits = 0

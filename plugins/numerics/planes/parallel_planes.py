@@ -11,7 +11,7 @@ import numpy as np
 
 from trihedron.pipeline.types import F64, I32, Bool
 from trihedron.plugins.numerics.algebra.small_linear import solve_positive
-from trihedron.plugins.numerics.depth.organised_grid import Grid
+from trihedron.plugins.numerics.depth.organised_grid import Grid, add_cell
 
 LEAST = np.radians(0.4)  # disagreement of normals and plane that is looked into
 SOME = 2000
@@ -141,17 +141,6 @@ def _fitted(grid: Grid, cells: I32, chosen: Bool) -> F64:
     A, b, q = np.zeros((3, 3)), np.zeros(3), np.zeros(3)
     for k in range(len(cells)):
         if chosen[k]:
-            r, c = cells[k] // w, cells[k] % w
-            x, y, p, s = grid.rays_x[c], grid.rays_y[r], grid.rho[r, c], grid.sigma[r, c]
-            weight = grid.count[r, c] / (s * s)
-            A[0, 0] += weight * x * x
-            A[1, 0] += weight * x * y
-            A[2, 0] += weight * x
-            A[1, 1] += weight * y * y
-            A[2, 1] += weight * y
-            A[2, 2] += weight
-            b[0] += weight * x * p
-            b[1] += weight * y * p
-            b[2] += weight * p
-    solve_positive(A, b, q)
+            add_cell(grid, cells[k] // w, cells[k] % w, A, b)
+    solve_positive(A.T, b, q)
     return q

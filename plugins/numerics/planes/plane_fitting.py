@@ -6,7 +6,7 @@ import numba
 import numpy as np
 
 from trihedron.pipeline.types import F32, F64, I32, Bool
-from trihedron.plugins.numerics.depth.organised_grid import Grid, cells_by_component
+from trihedron.plugins.numerics.depth.organised_grid import Grid, add_cell, cells_by_component
 from trihedron.plugins.numerics.planes.parallel_planes import larger_surface
 from trihedron.plugins.numerics.planes.plane_curvature import linear_turn
 
@@ -157,7 +157,7 @@ def start_plane(normal: F64, grid: Grid, cells: I32, cos_cone: float) -> F64:
 def fit_cells(q: F64, grid: Grid, cells: I32, cos_cone: float, gate: float, member: Bool) -> tuple[F64, int]:
     """One round of trimmed weighted least squares: (q, number of members). A cell is a member when its normal is within the cone of q's and its depth
     within `gate` σ of q's; `member` (per entry of `cells`) is written. A degenerate fit returns zeros, and nothing is a member."""
-    rho, sigma, count, rays_x, rays_y, normals = grid
+    rho, sigma, _, rays_x, rays_y, normals = grid
     w = rho.shape[1]
     length = np.sqrt(q @ q)
     nx, ny, nz = -q[0] / length, -q[1] / length, -q[2] / length
@@ -168,21 +168,11 @@ def fit_cells(q: F64, grid: Grid, cells: I32, cos_cone: float, gate: float, memb
         member[k] = False
         if normals[r, c, 0] * nx + normals[r, c, 1] * ny + normals[r, c, 2] * nz < cos_cone:
             continue
-        x, y, p, s = rays_x[c], rays_y[r], rho[r, c], sigma[r, c]
-        if abs(q[0] * x + q[1] * y + q[2] - p) > gate * s:
+        if abs(q[0] * rays_x[c] + q[1] * rays_y[r] + q[2] - rho[r, c]) > gate * sigma[r, c]:
             continue
         member[k] = True
         found += 1
-        weight = count[r, c] / (s * s)
-        A[0, 0] += weight * x * x
-        A[0, 1] += weight * x * y
-        A[0, 2] += weight * x
-        A[1, 1] += weight * y * y
-        A[1, 2] += weight * y
-        A[2, 2] += weight
-        b[0] += weight * x * p
-        b[1] += weight * y * p
-        b[2] += weight * p
+        add_cell(grid, r, c, A, b)
     solved, q = solve_symmetric(A, b)
     if found < 3 or not solved:
         member[:] = False

@@ -23,22 +23,15 @@ def neighbours(labels: I32, count: int, gap: int) -> F64:
             a = labels[r, c]
             if a == 0:
                 continue
-            for k in range(1, min(gap, w - 1 - c) + 1):
-                b = labels[r, c + k]
-                if b == a:
-                    break
-                if b > 0:
-                    touch[a - 1, b - 1] += 1.0
-                    touch[b - 1, a - 1] += 1.0
-                    break
-            for k in range(1, min(gap, h - 1 - r) + 1):
-                b = labels[r + k, c]
-                if b == a:
-                    break
-                if b > 0:
-                    touch[a - 1, b - 1] += 1.0
-                    touch[b - 1, a - 1] += 1.0
-                    break
+            for down, right in ((0, 1), (1, 0)):
+                for k in range(1, min(gap, (h - 1 - r) * down + (w - 1 - c) * right) + 1):
+                    b = labels[r + k * down, c + k * right]
+                    if b == a:
+                        break
+                    if b > 0:
+                        touch[a - 1, b - 1] += 1.0
+                        touch[b - 1, a - 1] += 1.0
+                        break
     return touch
 
 
