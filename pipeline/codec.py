@@ -1,9 +1,9 @@
 """Values to bytes and back, without generated code: one protobuf message `trihedron.Value` holds any value as named arrays.
 
-Anyone can read it with the schema that stands in the file: `type, version, index, stamp_ns` and `{name, dtype, shape, encoding, data}` per
-field; nested fields have dotted names, scalars no shape. Images are PNG, float images byte planes under zstd (both lossless, so a replay sees
-the same bits). Tables (see `table`) are written as the chunks that changed since the topic's previous message, and whole every `FULL_EVERY`.
-Nothing here evaluates what it reads: no pickle, and an array's bytes must be as long as its shape says.
+Anyone can read it with the schema that stands in the file: `type, version, index, stamp_ns` and an array (`array_codec`) for each field; nested
+fields have dotted names, scalars no shape. Tables (see `table`) are written as the rows that changed since the topic's previous message, and
+whole every `FULL_EVERY`: `points#` is a JSON text with `size`, `full`, `schema` and, for each column that changed, the number k of its `points#rows<k>`,
+the row numbers; `points#position_m` holds these rows. Nothing here evaluates what it reads, and nothing is allocated that the file does not hold.
 """
 
 from __future__ import annotations
@@ -14,24 +14,20 @@ from collections.abc import Iterator, Mapping
 from functools import cache
 from typing import Any, get_type_hints
 
-import cv2
 import numpy as np
-import zstandard
 from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
 
 from trihedron.pipeline import types
+from trihedron.pipeline.array_codec import DAMAGED, get_array, put_array
 from trihedron.pipeline.arrays import array_specs
 from trihedron.pipeline.errors import RecordingError
 from trihedron.pipeline.table import CHUNK, Column, Table
 from trihedron.pipeline.types import Value
 
 FULL_EVERY = 50
-MAX_BYTES = 1 << 30  # of one decoded array
-_DAMAGED = "the file is damaged; record it again"
 _TYPES: dict[str, type[Value]] = {
     name: kind for name, kind in vars(types).items() if isinstance(kind, type) and issubclass(kind, Value) and kind is not Value
 }
-_SCALARS: dict[str, type[Any]] = {"bool": bool, "int": int, "float": float}
 
 
 def _message_class() -> Any:
@@ -68,10 +64,11 @@ class Encoder:
         self._count += 1
         for name, item, image in _items(value):
             if isinstance(item, Table):
-                _put_table(message, name, item, None if full else self._tables.get(name))
+                known = self._tables.get(name)
+                _put_table(message, name, item, None if full or known is None or known.schema != item.schema else known)
                 self._tables[name] = item
             else:
-                _put(message, name, item, image)
+                put_array(message, name, item, image)
         return message
 
 
@@ -88,7 +85,7 @@ class Decoder:
         try:
             message.ParseFromString(data)
         except Exception as error:
-            raise RecordingError(self.place, "holds a message that is not a trihedron.Value", _DAMAGED) from error
+            raise RecordingError(self.place, "holds a message that is not a trihedron.Value", DAMAGED) from error
         kind = _TYPES.get(message.type)
         if kind is None:
             raise RecordingError(self.place, f"holds the unknown type '{message.type}'", "read it with the version that wrote it")
@@ -96,18 +93,18 @@ class Decoder:
             cause = f"holds {message.type} version {message.version}, this program reads version {kind.version}"
             raise RecordingError(self.place, cause, "record again, or read it with the version that wrote it")
         arrays: dict[str, Any] = {}
-        chunks: dict[str, Any] = {}
+        tables: dict[str, Any] = {}
         for array in message.arrays:
-            (chunks if "[" in array.name or array.name.endswith("#") else arrays)[array.name] = _get(array, self.place)
+            (tables if "#" in array.name else arrays)[array.name] = get_array(array, self.place)
         try:
-            return self._build(kind, message, arrays, chunks)
+            return self._build(kind, message, arrays, tables)
         except (KeyError, ValueError, TypeError, IndexError) as error:
-            raise RecordingError(self.place, f"frame {message.index}: {message.type} does not fit: {error}", _DAMAGED) from error
+            raise RecordingError(self.place, f"frame {message.index}: {message.type} does not fit: {error}", DAMAGED) from error
 
-    def _build(self, kind: Any, message: Any, arrays: dict[str, Any], chunks: dict[str, Any]) -> Value:
+    def _build(self, kind: Any, message: Any, arrays: dict[str, Any], tables: dict[str, Any]) -> Value:
         for name, hint in _hints(kind).items():
             if hint is Table:
-                self._tables[name] = arrays[name] = _get_table(name, chunks, self._tables.get(name))
+                self._tables[name] = arrays[name] = _get_table(name, tables, self._tables.get(name))
         fields = {**arrays, "index": message.index, "stamp_ns": message.stamp_ns}
         value = _make(kind, fields, "")
         assert isinstance(value, Value)
@@ -147,77 +144,22 @@ def _make(kind: Any, fields: Mapping[str, Any], prefix: str) -> Any:
     return kind(**made)
 
 
-def _put(message: Any, name: str, item: Any, image: bool) -> None:
-    if isinstance(item, str):
-        message.arrays.add(name=name, dtype="str", data=item.encode())
-        return
-    scalar = type(item).__name__ if type(item).__name__ in _SCALARS else None
-    array = np.ascontiguousarray(item)
-    encoding, data = "raw", b""
-    if image and array.size and array.dtype == np.uint8:
-        encoding, data = "png", _png(array)
-    elif image and array.size:
-        planes = np.ascontiguousarray(array.reshape(-1).view(np.uint8).reshape(-1, array.itemsize).T)
-        encoding, data = "zstd_planes", zstandard.compress(planes.tobytes(), 1)
-    else:
-        data = array.tobytes()
-    message.arrays.add(name=name, dtype=scalar or array.dtype.str.lstrip("<|="), shape=() if scalar else array.shape, encoding=encoding, data=data)
-
-
-def _png(image: Any) -> bytes:
-    bgr = image[..., ::-1] if image.ndim == 3 else image
-    return bytes(cv2.imencode(".png", bgr, [cv2.IMWRITE_PNG_COMPRESSION, 1])[1])
-
-
-def _get(array: Any, place: str) -> Any:
-    """The content of one protobuf Array; its bytes must match its declared shape."""
-    if array.dtype == "str":
-        return array.data.decode("utf-8", "replace")
-    try:
-        dtype = np.dtype({"bool": "?", "int": "i8", "float": "f8"}.get(array.dtype, array.dtype))
-    except TypeError:
-        dtype = np.dtype(object)
-    shape = tuple(array.shape)
-    size = int(np.prod([float(n) for n in shape])) * dtype.itemsize if shape else dtype.itemsize
-    if dtype.hasobject or any(n < 0 for n in shape) or size > MAX_BYTES:
-        raise RecordingError(place, f"array '{array.name}' claims type {array.dtype!r} and shape {shape}", _DAMAGED)
-    data = _decompress(array, size)
-    if data is None or len(data) != size:
-        raise RecordingError(place, f"array '{array.name}' does not have the {size} bytes of its shape {shape}", _DAMAGED)
-    content = np.frombuffer(data, dtype).reshape(shape)
-    return _SCALARS[array.dtype](content[()]) if array.dtype in _SCALARS else content
-
-
-def _decompress(array: Any, size: int) -> bytes | None:
-    """The plain bytes of an array, or None when they cannot be had."""
-    if array.encoding == "png":
-        image = cv2.imdecode(np.frombuffer(array.data, np.uint8), cv2.IMREAD_UNCHANGED)
-        if image is None:
-            return None
-        return bytes((image[..., ::-1] if image.ndim == 3 else image).tobytes())
-    if array.encoding == "zstd_planes":
-        try:
-            planes = zstandard.ZstdDecompressor().decompress(array.data, max_output_size=max(size, 1))
-        except zstandard.ZstdError:
-            return None
-        item = np.dtype(array.dtype).itemsize
-        return np.ascontiguousarray(np.frombuffer(planes, np.uint8).reshape(item, -1).T).tobytes() if len(planes) == size else None
-    return bytes(array.data) if array.encoding in ("raw", "") else None
-
-
 def _put_table(message: Any, name: str, table: Table, previous: Table | None) -> None:
-    """`name#` describes the table; `name.column[i]` holds what `previous` does not have of a chunk: all of it, or the rows that `name.column[i]rows`
-    lists."""
-    header = {"size": table.size, "full": previous is None, "schema": {c: [s.dtype, list(s.shape)] for c, s in table.schema.items()}}
-    _put(message, f"{name}#", json.dumps(header), False)
+    """The rows of each column that `previous` does not have; columns whose rows are the same share the list of their numbers."""
+    changed: dict[str, int] = {}
+    numbers: dict[bytes, int] = {}
     for column, chunks in table.chunks.items():
         known = previous.chunks.get(column, ()) if previous is not None else ()
-        for i, chunk in enumerate(chunks):
-            rows = _changed(known[i], chunk) if i < len(known) else np.arange(len(chunk))
-            if 0 < len(rows) < len(chunk):
-                _put(message, f"{name}.{column}[{i}]rows", rows.astype(np.uint8), False)
-            if len(rows):
-                _put(message, f"{name}.{column}[{i}]", chunk[rows], False)
+        rows = [_changed(known[i], chunk) if i < len(known) else np.arange(len(chunk)) for i, chunk in enumerate(chunks)]
+        found = [i for i, those in enumerate(rows) if len(those)]
+        if found:
+            ids = np.concatenate([i * CHUNK + rows[i] for i in found]).astype(np.int32)
+            changed[column] = numbers.setdefault(ids.tobytes(), len(numbers))
+            put_array(message, f"{name}#{column}", np.concatenate([chunks[i][rows[i]] for i in found]), False)
+    for ids_bytes, k in numbers.items():
+        put_array(message, f"{name}#rows{k}", np.frombuffer(ids_bytes, np.int32), False)
+    schema = {c: [s.dtype, list(s.shape)] for c, s in table.schema.items()}
+    put_array(message, f"{name}#", json.dumps({"size": table.size, "full": previous is None, "schema": schema, "rows": changed}), False)
 
 
 def _changed(known: Any, chunk: Any) -> Any:
@@ -228,32 +170,29 @@ def _changed(known: Any, chunk: Any) -> Any:
     return np.concatenate([np.flatnonzero((before != after[: len(before)]).any(axis=1)), np.arange(len(before), len(after))])
 
 
-def _get_table(name: str, chunks: Mapping[str, Any], previous: Table | None) -> Table:
-    header = json.loads(chunks[f"{name}#"])
-    if not header["full"] and previous is None:
+def _get_table(name: str, tables: Mapping[str, Any], previous: Table | None) -> Table:
+    header = json.loads(tables[f"{name}#"])
+    schema = {column: _column(dtype, shape) for column, (dtype, shape) in header["schema"].items()}
+    table = Table.empty(schema) if header["full"] else previous
+    if table is None or table.schema != schema:
         raise ValueError(f"{name}: a change without the version before it")
-    schema = {column: Column(dtype, tuple(shape)) for column, (dtype, shape) in header["schema"].items()}
-    columns = {}
-    for column, spec in schema.items():
-        count = -(-int(header["size"]) // CHUNK)
-        known = previous.chunks[column] if previous is not None and not header["full"] else ()
-        parts = tuple(_get_chunk(f"{name}.{column}[{i}]", chunks, known[i : i + 1], int(header["size"]) - i * CHUNK) for i in range(count))
-        if any(part.dtype != np.dtype(spec.dtype) or part.shape[1:] != spec.shape for part in parts) or sum(map(len, parts)) != header["size"]:
+    size, known = int(header["size"]), table.size
+    added = {column: Table.empty(schema).column(column) for column in schema}
+    for column, k in header["rows"].items():
+        ids, values = tables[f"{name}#rows{k}"], tables[f"{name}#{column}"]
+        old = int(np.searchsorted(ids, known))
+        fits = values.dtype == np.dtype(schema[column].dtype) and values.shape == (len(ids), *schema[column].shape)
+        if not fits or ids.dtype != np.int32 or (ids[:1] < 0).any() or (np.diff(ids) <= 0).any():
             raise ValueError(f"{name}.{column}: rows of another size")
-        columns[column] = parts
-    return Table(schema, int(header["size"]), columns)
+        table, added[column] = table.updated(ids[:old], **{column: values[:old]}), values[old:]
+        if not np.array_equal(ids[old:], np.arange(known, size)):
+            raise ValueError(f"{name}.{column}: rows are missing")
+    if {len(rows) for rows in added.values()} - {size - known}:
+        raise ValueError(f"{name}: rows are missing")
+    return table.appended(**added)[0] if size > known else table
 
 
-def _get_chunk(key: str, chunks: Mapping[str, Any], known: tuple[Any, ...], left: int) -> Any:
-    """One chunk of a column, of the last `left` rows: the one known (none or one), changed by what the message says of it."""
-    if f"{key}rows" not in chunks:
-        return chunks[key] if key in chunks else known[0]
-    rows, size = chunks[f"{key}rows"], min(left, CHUNK)
-    before = known[0]
-    if len(np.union1d(rows, np.arange(len(before)))) != size:
-        raise ValueError(f"{key}: rows are missing")
-    chunk = np.empty((size, *before.shape[1:]), before.dtype)
-    chunk[: len(before)] = before
-    chunk[rows] = chunks[key]
-    chunk.flags.writeable = False
-    return chunk
+def _column(dtype: str, shape: list[int]) -> Column:
+    if np.dtype(dtype).hasobject:
+        raise ValueError(f"a column of type {dtype!r}")
+    return Column(dtype, tuple(shape))

@@ -23,7 +23,7 @@ from trihedron.pipeline.codec import Decoder, Encoder, ValueMessage
 from trihedron.pipeline.errors import RecordingError
 from trihedron.pipeline.types import Value
 
-FORMAT = "1"
+FORMAT = "2"
 METADATA = "trihedron"
 CHUNK_BYTES = 1 << 20
 CHUNK_SECONDS = 0.5
@@ -130,8 +130,9 @@ class Recording:
             raise RecordingError(str(path), "is an MCAP file, but not a recording of trihedron", "convert it with: trihedron convert SRC DST.mcap")
         self.metadata: dict[str, str] = dict(found[METADATA])
         if self.metadata.get("format") != FORMAT:
-            cause = f"has format {self.metadata.get('format')}, this program reads format {FORMAT}"
-            raise RecordingError(str(path), cause, "read it with the version that wrote it")
+            written = " ".join(["trihedron", self.metadata.get("version", ""), self.metadata.get("commit", "")[:7]]).strip()
+            cause = f"has format {self.metadata.get('format')} of {written}, this program reads format {FORMAT}: arrays and tables are laid out otherwise"
+            raise RecordingError(str(path), cause, "read it with the version that wrote it, or record again")
         counts = summary.statistics.channel_message_counts if summary.statistics else {}
         self.channels: dict[str, Channel] = {c.topic: c for c in summary.channels.values()}
         self.counts = {c.topic: counts.get(c.id, 0) for c in summary.channels.values()}

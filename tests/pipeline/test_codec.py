@@ -3,8 +3,10 @@
 import contextlib
 from dataclasses import replace
 
+import lz4.frame
 import numpy as np
 import pytest
+import zstandard
 
 from trihedron.pipeline.codec import FULL_EVERY, Decoder, Encoder, ValueMessage
 from trihedron.pipeline.errors import RecordingError
@@ -50,6 +52,30 @@ def test_arrays_scalars_text_and_nested_values():
     same(rotation, there_and_back(rotation))
 
 
+def test_large_arrays_of_every_element_type_and_shape():
+    """Those that are transposed, and those of one column, which have as many bytes a row as elements have."""
+    for n in (64, 1000):
+        value = keypoints(n)
+        message = Encoder().encode(value)
+        assert {a.name for a in message.arrays if a.encoding == "columns"} >= {"pixels", "points_m"}
+        same(value, there_and_back(value))
+    whole = next(iter(maps(1)))
+    table, _ = Table.empty({"i": Column("i8"), "m": Column("f8", (3, 3))}).appended(i=np.arange(600) - 300, m=RNG.random((600, 3, 3)))
+    same(replace(whole, points=table), there_and_back(replace(whole, points=table)))
+
+
+def test_symmetric_matrices_shrink():
+    """Equal columns are runs of equal bytes after transposition: a third less, and the high bytes less still."""
+    root = RNG.random((500, 3, 3))
+    data = next(a.data for a in Encoder().encode(planes(500, root @ np.swapaxes(root, 1, 2))).arrays if a.name == "covariance")
+    assert len(lz4.frame.compress(data)) < 0.7 * len(data) and len(data) == 500 * 72
+
+
+def planes(n, covariance):
+    f8, labels = np.zeros, np.zeros((2, 2), np.uint8)
+    return Planes(0, 0, f8((n, 4)), covariance, f8((n, 4, 4)), np.zeros(n, np.int32), np.zeros((n, 4, 3), np.float32), labels, 2)
+
+
 def test_label_images_are_stored_small():
     labels = np.zeros((240, 320), np.uint8)
     labels[50:150, 60:200] = 1
@@ -88,15 +114,16 @@ def test_of_a_touched_chunk_only_the_rows_that_changed_are_written():
     decoder.decode(encoder.encode(replace(whole, points=table)).SerializeToString())
     moved = table.updated(ids[[3, 77, 200]], x=np.full((3, 8), -1.0))
     grown, _ = moved.appended(x=np.zeros((20, 8)))  # fills the chunk and begins the next
-    for version, most in ((moved, 3 * 64), (grown, 20 * 64)):
+    for version, rows in ((moved, [3, 77, 200]), (grown, [*range(250, 270)])):
         message = encoder.encode(replace(whole, points=version))
-        written = {array.name: len(array.data) for array in message.arrays if array.name.startswith("points.")}
-        assert sum(size for name, size in written.items() if not name.endswith("rows")) == most
+        written = {array.name: array for array in message.arrays if array.name.startswith("points#")}
+        assert set(written) == {"points#", "points#x", "points#rows0"} and len(written["points#x"].data) == 64 * len(rows)
+        assert np.frombuffer(written["points#rows0"].data, np.int32).tolist() == rows
         same(replace(whole, points=version), decoder.decode(message.SerializeToString()))
     message = encoder.encode(replace(whole, points=grown.updated(ids[:1], x=np.ones((1, 8)))))
     for array in message.arrays:
-        if array.name.endswith("rows"):
-            array.dtype, array.data = "f4", bytes(4)
+        if array.name.endswith("rows0"):
+            array.data = b"\xff" * 4
     with pytest.raises(RecordingError, match="Map does not fit"):
         decoder.decode(message.SerializeToString())
 
@@ -143,9 +170,9 @@ def test_damaged_and_foreign_values_are_refused():
         "a.mcap: topic /keypoints: array 'pixels' claims type 'f4' and shape (1125899906842624, 2); the file is damaged; record it again"
     )
     message = message_of(keypoints())
-    message.arrays[0].shape[0] = 19
+    message.arrays[1].shape[0] = 19
     assert refusal(message) == (
-        "a.mcap: topic /keypoints: array 'pixels' does not have the 152 bytes of its shape (19, 2); the file is damaged; record it again"
+        "a.mcap: topic /keypoints: array 'points_m' does not have the 228 bytes of its shape (19, 3); the file is damaged; record it again"
     )
     message = message_of(keypoints())
     message.arrays[0].dtype = "O"
@@ -154,6 +181,19 @@ def test_damaged_and_foreign_values_are_refused():
     encoder = Encoder()
     encoder.encode(change[0])
     assert "keyframes: a change without the version before it" in refusal(encoder.encode(change[1]).SerializeToString())
+
+
+def test_an_image_that_claims_to_be_larger_than_its_shape_is_not_decoded():
+    color = RNG.integers(0, 255, (48, 64, 3), dtype=np.uint8)
+    frame = Frame(1, 2, color, np.zeros((48, 64), np.float32), Camera(64, 48, 50.0, 51.0, 31.5, 23.5))
+    message = message_of(frame)
+    image = next(a for a in message.arrays if a.name == "color")
+    image.data = image.data[:16] + (30_000).to_bytes(4, "big") * 2 + image.data[24:]
+    assert "array 'color' does not have the 9216 bytes of its shape (48, 64, 3)" in refusal(message)
+    message = message_of(frame)
+    depth = next(a for a in message.arrays if a.name == "depth_m")
+    depth.data = zstandard.compress(bytes(1 << 24))
+    assert "array 'depth_m' does not have the 12288 bytes" in refusal(message)
 
 
 def test_random_damage_never_raises_anything_else():

@@ -109,8 +109,11 @@ def test_wrong_files_say_so_in_one_line(tmp_path):
     assert refusal(tmp_path / "other.mcap") == (
         "DIR/other.mcap: is an MCAP file, but not a recording of trihedron; convert it with: trihedron convert SRC DST.mcap"
     )
-    write(tmp_path / "new.mcap", [0], format="7")
-    assert refusal(tmp_path / "new.mcap") == "DIR/new.mcap: has format 7, this program reads format 1; read it with the version that wrote it"
+    write(tmp_path / "old.mcap", [0], format="1", version="0.0.9", commit="0123456789")
+    assert refusal(tmp_path / "old.mcap") == (
+        "DIR/old.mcap: has format 1 of trihedron 0.0.9 0123456, this program reads format 2: arrays and tables are laid out otherwise; "
+        "read it with the version that wrote it, or record again"
+    )
     with pytest.raises(RecordingError) as error:
         RecordingWriter(tmp_path / "no" / "a.mcap", {})
     assert str(error.value).replace(str(tmp_path), "DIR") == "DIR/no/a.mcap: cannot be written: No such file or directory; give another out=FOLDER"
