@@ -2,8 +2,9 @@
 
 Anyone can read it with the schema that stands in the file: `type, version, index, stamp_ns` and an array (`array_codec`) for each field; nested
 fields have dotted names, scalars no shape. Tables (see `table`) are written as the rows that changed since the topic's previous message, and
-whole every `FULL_EVERY`: `points#` is a JSON text with `size`, `full`, `schema` and, for each column that changed, the number k of its `points#rows<k>`,
-the row numbers; `points#position_m` holds these rows. Nothing here evaluates what it reads, and nothing is allocated that the file does not hold.
+whole every `FULL_EVERY`: `points#` is a JSON text with `size`, `full`, `schema` and, for each column that changed, the number k of its list of
+rows, `points#rows<k>`; `points#position_m` holds these rows. Nothing here evaluates what it reads, and nothing is allocated that
+the file does not hold.
 """
 
 from __future__ import annotations

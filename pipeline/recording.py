@@ -131,7 +131,7 @@ class Recording:
         self.metadata: dict[str, str] = dict(found[METADATA])
         if self.metadata.get("format") != FORMAT:
             written = " ".join(["trihedron", self.metadata.get("version", ""), self.metadata.get("commit", "")[:7]]).strip()
-            cause = f"has format {self.metadata.get('format')} of {written}, this program reads format {FORMAT}: arrays and tables are laid out otherwise"
+            cause = f"has format {self.metadata.get('format')} of {written}, this program reads format {FORMAT}: other arrays and tables"
             raise RecordingError(str(path), cause, "read it with the version that wrote it, or record again")
         counts = summary.statistics.channel_message_counts if summary.statistics else {}
         self.channels: dict[str, Channel] = {c.topic: c for c in summary.channels.values()}

@@ -8,8 +8,8 @@ import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
 ORDER = (
-    "errors", "arrays", "camera", "table", "maps", "surface", "types", "geometry", "slots", "registry", "array_codec", "codec", "foxglove", "graph", "metrics",
-    "consistency",
+    "errors", "arrays", "camera", "table", "maps", "surface", "types", "geometry", "slots", "registry", "array_codec", "codec", "foxglove", "graph",
+    "metrics", "consistency",
     "plot", "ply", "timing", "recording", "scheduler", "interrupts", "state", "runner", "results", "config", "execute", "cli",
 )  # fmt: skip
 NUMERICS = ("algebra", "images", "depth", "planes", "axes", "motion", "maps", "bundle", "places", "surfaces")  # each imports those before it

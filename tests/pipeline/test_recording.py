@@ -111,7 +111,7 @@ def test_wrong_files_say_so_in_one_line(tmp_path):
     )
     write(tmp_path / "old.mcap", [0], format="1", version="0.0.9", commit="0123456789")
     assert refusal(tmp_path / "old.mcap") == (
-        "DIR/old.mcap: has format 1 of trihedron 0.0.9 0123456, this program reads format 2: arrays and tables are laid out otherwise; "
+        "DIR/old.mcap: has format 1 of trihedron 0.0.9 0123456, this program reads format 2: other arrays and tables; "
         "read it with the version that wrote it, or record again"
     )
     with pytest.raises(RecordingError) as error:
