@@ -94,6 +94,7 @@ class TracksSlot(Protocol):
     def __call__(
         self,
         frame: Frame,
+        previous_frame: Frame | None,
         keypoints: Keypoints,
         segments: Segments,
         planes: Planes,
@@ -108,8 +109,8 @@ class TracksSlot(Protocol):
 
 class RotationSlot(Protocol):
     """The camera's rotation in the world, drift-free where the scene is Manhattan (eq. 1), with the world–Manhattan rotation it maintains.
-    The world is the first frame's camera frame. `previous` is this stage's last output, `previous_pose` the refined pose before this frame, `map` the
-    map before this frame: a correction may have moved the pose's reference keyframe since it was said, and both move with it."""
+    `previous` is this stage's last output, `previous_pose` the refined pose before this frame, `map` the map before this frame: a correction may
+    have moved the pose's reference keyframe since it was said, and both move with it. The world is the first frame's camera frame."""
 
     def __call__(
         self,
@@ -135,8 +136,10 @@ class TranslationSlot(Protocol):
         keypoints: Keypoints,
         segments: Segments,
         planes: Planes,
+        previous_keypoints: Keypoints | None,
         previous_pose: Pose | None,
         earlier_pose: Pose | None,
+        previous: Translation | None,
         map: Map | None,
     ) -> Translation | None: ...
 
@@ -145,16 +148,9 @@ class MatchesSlot(Protocol):
     """Map landmarks found among this frame's features, searched around their projection at the decoupled, or recognised, pose (section III-B)."""
 
     def __call__(
-        self,
-        frame: Frame,
-        rotation: Rotation,
-        translation: Translation,
-        keypoints: Keypoints,
-        segments: Segments,
-        planes: Planes,
-        map: Map | None,
-        relocalise: Pose | None,
-    ) -> Matches | None: ...
+        self, frame: Frame, rotation: Rotation, translation: Translation, keypoints: Keypoints, segments: Segments, planes: Planes,
+        map: Map | None, relocalise: Pose | None,
+    ) -> Matches | None: ...  # fmt: skip
 
 
 class PoseSlot(Protocol):
@@ -219,9 +215,9 @@ class RelocaliseSlot(Protocol):
 
 
 class ModelSlot(Protocol):
-    """The view of a dense model from the current pose, for frame-to-model tracking."""
+    """The view of a dense model from the current pose, for frame-to-model tracking; `previous`, its last output, carries the model."""
 
-    def __call__(self, frame: Frame, pose: Pose, map: Map | None) -> PredictedView | None: ...
+    def __call__(self, frame: Frame, pose: Pose, map: Map | None, previous: PredictedView | None) -> PredictedView | None: ...
 
 
 class SurfaceSlot(Protocol, Generic[State]):

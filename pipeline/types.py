@@ -12,7 +12,7 @@ value is made, and the arrays become read-only.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Annotated, ClassVar
 
@@ -200,13 +200,18 @@ class Rotation(Value):
 @dataclass(frozen=True)
 class Translation(Value):
     """The camera's position for the given rotation. `unobservable` holds unit vectors (world) along which the prediction was kept;
-    `inliers` counts points, lines and planes; `estimated` is False when no measurement of this frame took part. Covariance in the world frame, m²."""
+    `inliers` counts points, lines and planes; `estimated` is False when no measurement of this frame took part. Covariance in the world frame, m².
+    A filter also says its state: planes (n, d) of the world that it keeps, and the covariance of (t_world_camera, d of each) together."""
+
+    version: ClassVar[int] = 2
 
     t_world_camera: Annotated[F64, Shape(3)]
     covariance: Annotated[F64, Shape(3, 3)]
     unobservable: Annotated[F64, Shape("u", 3)]
     inliers: Annotated[I32, Shape(3)]
     estimated: bool
+    filtered_planes: Annotated[F64, Shape("m", 4)] = field(default_factory=lambda: np.empty((0, 4)))
+    filtered_covariance: Annotated[F64, Shape("s", "s")] = field(default_factory=lambda: np.empty((0, 0)))  # s = 3 + m, m²
 
 
 @dataclass(frozen=True)
@@ -251,14 +256,17 @@ class Pose(Value):
 
 @dataclass(frozen=True)
 class PredictedView(Value):
-    """What a dense model would show from a pose: depth (0 = none), normals and colour."""
+    """What a dense model would show from a pose: depth (0 = none), normals (camera frame, NaN = none) and colour (black where the model has none),
+    of the frame's camera at a whole fraction of its size. `model` is the model itself, whose rows its plugin knows: the next view is made of it."""
 
+    version: ClassVar[int] = 2
     dense: ClassVar[bool] = True
 
     T_world_camera: Annotated[F64, Shape(4, 4)]
     depth_m: Annotated[F32, Shape("h", "w")]
     normals: Annotated[F32, Shape("h", "w", 3)]
     color: Annotated[U8, Shape("h", "w", 3)]
+    model: Table
 
 
 @dataclass(frozen=True)

@@ -12,18 +12,8 @@ from trihedron.pipeline.types import F64, I32, Camera, Frame, Keypoints, Manhatt
 from trihedron.plugins.numerics.images.descriptors import match_lines, match_near
 from trihedron.plugins.numerics.images.flow import offset_px, predict_pixels
 from trihedron.plugins.numerics.motion.relative_motion import Motion, motion_terms, solve_motion
+from trihedron.plugins.numerics.motion.track_pairs import NO_PAIRS, Features, rows_of_pairs, tracks_value
 from trihedron.plugins.numerics.planes.plane_association import associate_planes
-
-NO_PAIRS = np.zeros((0, 2), np.int32)
-
-
-@dataclass(frozen=True)
-class Features:
-    """What one frame shows."""
-
-    keypoints: Keypoints
-    segments: Segments
-    planes: Planes
 
 
 @register("tracks", "projection")
@@ -85,7 +75,7 @@ class Projection:
         gap = frame.index - previous_keypoints.index
         rotations = self._predictions(gap, before.keypoints.index, manhattan, previous_manhattan, previous)
         if gap > self.max_age:
-            return self._tracks(now, before, (NO_PAIRS, NO_PAIRS, NO_PAIRS), rotations[0])
+            return tracks_value(now, before, (NO_PAIRS, NO_PAIRS, NO_PAIRS), rotations[0])
         radius = self.radius_px * min(gap, 3)
         first = max((self._search(now, before, frame.camera, R, np.zeros(3), radius, self.plane_m) for R in rotations), key=_count)
         if len(first.keypoints) < min(self.enough, len(keypoints.pixels)):
@@ -119,7 +109,7 @@ class Projection:
         moved = transform_planes(T, before.planes.coefficients)
         samples = (before.planes.samples_m @ R.T + t).astype(np.float32)
         planes = associate_planes(now.planes.coefficients, now.planes.samples_m, moved, samples, self.plane_deg, plane_m, many_to_one=True)
-        return self._tracks(now, before, (_pairs(points), _pairs(lines), np.ascontiguousarray(planes[:, ::-1])), R)
+        return tracks_value(now, before, (rows_of_pairs(points), rows_of_pairs(lines), np.ascontiguousarray(planes[:, ::-1])), R)
 
     def _find_points(self, now: Keypoints, before: Keypoints, camera: Camera, R: F64, t: F64, radius_px: float) -> I32:
         predicted = predict_pixels(before.pixels, before.points_m, camera, R, t).astype(np.float32)
@@ -164,23 +154,6 @@ class Projection:
             R_current_previous=motion.R,
         )
 
-    def _tracks(self, now: Features, before: Features, pairs: tuple[I32, I32, I32], R: F64) -> Tracks:
-        points, lines, planes = pairs
-        return Tracks(
-            index=now.keypoints.index,
-            stamp_ns=now.keypoints.stamp_ns,
-            previous_index=before.keypoints.index,
-            keypoints=points,
-            points_m=before.keypoints.points_m[points[:, 0]],
-            sigma_m=before.keypoints.sigma_m[points[:, 0]],
-            segments=lines,
-            endpoints_m=before.segments.endpoints_m[lines[:, 0]],
-            planes=planes,
-            coefficients=before.planes.coefficients[planes[:, 0]],
-            plane_covariance=before.planes.covariance[planes[:, 0]],
-            R_current_previous=R,
-        )
-
 
 def _turn(now: ManhattanFrame, before: ManhattanFrame) -> F64 | None:
     """(3, 3) R_current_previous by the best supported Manhattan frame that both have in view, under the same id; None when there is none."""
@@ -189,12 +162,6 @@ def _turn(now: ManhattanFrame, before: ManhattanFrame) -> F64 | None:
     seen = {int(before.ids[k]): k for k in np.flatnonzero(before.inliers.any(axis=1))}
     both = [k for k in np.flatnonzero(now.inliers.any(axis=1)) if int(now.ids[k]) in seen]
     return now.rotations[both[0]] @ before.rotations[seen[int(now.ids[both[0]])]].T if both else None
-
-
-def _pairs(found: I32) -> I32:
-    """(n,) row of the current frame for each previous one, or -1 -> (k, 2)."""
-    rows = np.flatnonzero(found >= 0).astype(np.int32)
-    return np.stack([rows, found[rows]], axis=1)
 
 
 def _count(tracks: Tracks) -> int:

@@ -1,0 +1,51 @@
+"""The camera's rotation from the Manhattan frame alone."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from trihedron.pipeline.registry import register
+from trihedron.pipeline.types import F64, Keypoints, ManhattanFrame, Rotation
+from trihedron.plugins.numerics.axes.cube_symmetry import nearest_equivalent
+from trihedron.plugins.numerics.axes.manhattan_frames import KnownFrames
+from trihedron.plugins.numerics.motion.chained_rotation import Estimate, rotation_value
+
+UNSEEN = np.full((1, 3, 3), np.nan)
+
+
+@register("rotation", "manhattan")
+@dataclass(frozen=True)
+class ManhattanRotation:
+    """`R_world_camera = R_world_manhattan · R_camera_manhattanᵀ` (eq. 1) with the R_world_manhattan of the first frame that shows one, as OPVO (Kim,
+    Coltin, Kim, BMVC 2017), LPVO (ICRA 2018) and L-SLAM (ECCV 2018) have it: absolute, so it cannot drift.
+
+    Nothing else measures the rotation. Where no Manhattan frame is supported it is held, ever less certain, and says so (`source` prediction)."""
+
+    held_deg: float = 2.0  # error of a rotation that is held, per frame
+
+    def __post_init__(self) -> None:
+        if self.held_deg <= 0.0:
+            raise ValueError("held_deg: must be positive")
+
+    def __call__(self, manhattan: ManhattanFrame | None, keypoints: Keypoints, previous: Rotation | None) -> Rotation:
+        """The rotation of this frame; the identity for the first."""
+        index, known = keypoints.index, KnownFrames.none()
+        held = Estimate(np.eye(3), np.zeros((3, 3)), "prediction")
+        if previous is not None:
+            grown = np.eye(3) * np.radians(self.held_deg) ** 2 * max(index - previous.index, 1)
+            held = Estimate(previous.R_world_camera, previous.covariance + grown, "prediction")
+            known = KnownFrames(previous.R_world_manhattan, previous.ids, previous.weights)
+        if manhattan is None or not manhattan.supported:
+            return rotation_value(index, keypoints.stamp_ns, held, known, UNSEEN[: len(known.ids)].copy())
+        R_camera_manhattan = np.array(manhattan.rotations[0])
+        if not len(known.ids):
+            known = known.with_new(held.R @ R_camera_manhattan, 1.0)
+            return rotation_value(index, keypoints.stamp_ns, held, known, R_camera_manhattan[None])
+        named = nearest_equivalent(R_camera_manhattan, np.array(held.R.T @ known.R_world_manhattan[0]))
+        return rotation_value(index, keypoints.stamp_ns, _tied(known.R_world_manhattan[0], named, manhattan.covariance[0]), known, named[None])
+
+
+def _tied(R_world_manhattan: F64, R_camera_manhattan: F64, covariance: F64) -> Estimate:
+    return Estimate(R_world_manhattan @ R_camera_manhattan.T, covariance, "manhattan")

@@ -1,0 +1,88 @@
+"""Features of the previous frame found again by optical flow."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from trihedron.pipeline.geometry import exp_so3, log_so3
+from trihedron.pipeline.registry import register
+from trihedron.pipeline.types import F32, I32, Bool, Frame, Keypoints, Planes, Segments, Tracks
+from trihedron.plugins.numerics.images.flow import nearest_pixels
+from trihedron.plugins.numerics.motion.relative_motion import motion_terms, solve_motion
+from trihedron.plugins.numerics.motion.track_pairs import NO_PAIRS, Features, StructureGates, tracks_value
+
+
+@register("tracks", "optical_flow")
+@dataclass(frozen=True)
+class OpticalFlow:
+    """Follow the previous frame's key points by their image patches (Lucas and Kanade, 1981, on a pyramid: Bouguet, 2000), there and back, and take
+    this frame's key point where one ends: no descriptor is looked at, and points without depth stay. Lines and planes are then paired by the
+    points' motion."""
+
+    window_px: int = 15
+    levels: int = 3  # of the pyramid above the image
+    back_px: float = 1.0  # a point must come back to within this
+    snap_px: float = 1.5  # σ of the key point's own, between where the flow ends and the key point taken
+    max_age: int = 10  # frames; older features are not looked for
+    prior_deg: float = 2.0  # of the last rotation once more
+    prior_m: float = 0.1  # of no translation, per frame
+    angle_px: float = 0.002  # rad, of a pixel
+    plane_floor_deg: float = 0.3
+
+    def __post_init__(self) -> None:
+        if self.window_px < 3 or self.levels < 0 or self.max_age < 1:
+            raise ValueError("window_px, levels, max_age: must be at least 3, 0 and 1")
+        if min(self.back_px, self.snap_px, self.prior_deg, self.prior_m, self.angle_px, self.plane_floor_deg) <= 0.0:
+            raise ValueError("back_px, snap_px, prior_deg, prior_m, angle_px, plane_floor_deg: must be positive")
+
+    def __call__(
+        self,
+        frame: Frame,
+        previous_frame: Frame | None,
+        keypoints: Keypoints,
+        segments: Segments,
+        planes: Planes,
+        previous_keypoints: Keypoints | None,
+        previous_segments: Segments | None,
+        previous_planes: Planes | None,
+        previous: Tracks | None,
+    ) -> Tracks | None:
+        """Pairs with the previous frame; None for the first frame, no pairs when the previous features are too old."""
+        if previous_frame is None or previous_keypoints is None or previous_segments is None or previous_planes is None:
+            return None
+        now, before = Features(keypoints, segments, planes), Features(previous_keypoints, previous_segments, previous_planes)
+        gap, R = frame.index - previous_frame.index, np.eye(3)
+        if previous is not None and previous.index == previous_frame.index and previous.index > previous.previous_index:
+            R = exp_so3(gap / (previous.index - previous.previous_index) * log_so3(previous.R_current_previous))
+        if gap > self.max_age or before.keypoints.index != previous_frame.index:
+            return tracks_value(now, before, (NO_PAIRS, NO_PAIRS, NO_PAIRS), R)
+        points = self._points(frame, previous_frame, keypoints, before.keypoints)
+        tracks = tracks_value(now, before, (points, NO_PAIRS, NO_PAIRS), R)
+        terms = motion_terms(tracks, keypoints, segments, planes, self.angle_px, self.plane_floor_deg)
+        motion = solve_motion(terms, R, self.prior_deg * gap, self.prior_m * gap)
+        return tracks_value(now, before, (points, *StructureGates().pairs(now, before, frame.camera, motion.R, motion.t)), motion.R)
+
+    def _points(self, frame: Frame, previous_frame: Frame, now: Keypoints, before: Keypoints) -> I32:
+        """(n, 2) rows (previous, current), each key point at most once."""
+        if not (len(before.pixels) and len(now.pixels)):
+            return NO_PAIRS
+        there, found = self._flow(previous_frame, frame, before.pixels)
+        back, returned = self._flow(frame, previous_frame, there)
+        good = found & returned & (np.linalg.norm(back - before.pixels, axis=1) < self.back_px)
+        rows = np.flatnonzero(good).astype(np.int32)
+        nearest, distance = nearest_pixels(there[rows], np.array(now.pixels))
+        near = distance < self.snap_px * now.sigma_px[nearest]
+        rows, nearest, distance = rows[near], nearest[near], distance[near]
+        order = np.lexsort((rows, distance))
+        _, first = np.unique(nearest[order], return_index=True)
+        chosen = np.sort(order[first])
+        return np.stack([rows[chosen], nearest[chosen]], axis=1).astype(np.int32).reshape(-1, 2)
+
+    def _flow(self, start: Frame, end: Frame, pixels: F32) -> tuple[F32, Bool]:
+        """Where pixels (n, 2) of one frame are in the other, and (n,) whether they were found."""
+        window = (self.window_px, self.window_px)
+        moved, status, _ = cv2.calcOpticalFlowPyrLK(start.gray, end.gray, pixels[:, None], None, winSize=window, maxLevel=self.levels)
+        return moved[:, 0], status[:, 0] > 0

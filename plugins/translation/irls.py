@@ -1,0 +1,57 @@
+"""Position with the rotation fixed, by iteratively reweighted linear least squares."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from trihedron.pipeline.registry import register
+from trihedron.pipeline.types import LOST, Frame, Keypoints, Map, Pose, Rotation, Tracks, Translation
+from trihedron.plugins.numerics.maps.anchoring import anchored
+from trihedron.plugins.numerics.motion.derotated_points import point_rows, solve_step
+
+
+@register("translation", "irls")
+@dataclass(frozen=True)
+class Irls:
+    """The de-rotated reprojection error of tracked points, linear once the rotation is known: of those with depth (OPVO: Kim, Coltin, Kim, BMVC
+    2017), with `depthless` of those without as well (LPVO: the same, ICRA 2018; the paper's column "LPVO"). Lines and planes take no part.
+
+    What fewer than `min_points` agree on is no measurement: the camera is taken to stand still, and `estimated` is False."""
+
+    depthless: bool = True  # points without depth say in which plane the step lies
+    motion_sigma_m: float = 0.1  # of a step, per frame: a weak prior that holds what no point sees
+    min_points: int = 6
+
+    def __post_init__(self) -> None:
+        if self.motion_sigma_m <= 0.0 or self.min_points < 3:
+            raise ValueError("motion_sigma_m, min_points: must be positive, and at least 3")
+
+    def __call__(
+        self,
+        frame: Frame,
+        rotation: Rotation,
+        tracks: Tracks | None,
+        keypoints: Keypoints,
+        previous_keypoints: Keypoints | None,
+        previous_pose: Pose | None,
+        map: Map | None,
+    ) -> Translation:
+        """The position; the first frame's is the origin of the world."""
+        if previous_pose is None:
+            return Translation(frame.index, frame.stamp_ns, np.zeros(3), np.zeros((3, 3)), np.empty((0, 3)), np.zeros(3, np.int32), True)
+        before = anchored(previous_pose, map).T_world_camera
+        unknown = before[:3, :3] @ previous_pose.covariance[:3, :3] @ before[:3, :3].T if previous_pose.status == LOST else np.zeros((3, 3))
+        prior_m = self.motion_sigma_m * max(frame.index - previous_pose.index, 1)
+        R = rotation.R_world_camera
+        if tracks is not None and previous_keypoints is not None and tracks.previous_index == previous_pose.index == previous_keypoints.index:
+            rows = point_rows(tracks, keypoints, previous_keypoints, frame.camera, R.T @ before[:3, :3], self.depthless)
+            step = solve_step(rows, np.zeros(3), prior_m)
+            if step.inliers >= self.min_points:
+                inliers = np.array([step.inliers, 0, 0], np.int32)
+                covariance = R @ step.covariance @ R.T + unknown
+                held = np.ascontiguousarray(step.unobservable @ R.T)
+                return Translation(frame.index, frame.stamp_ns, before[:3, 3] - R @ step.s, covariance, held, inliers, True)
+        covariance = unknown + prior_m**2 * np.eye(3)
+        return Translation(frame.index, frame.stamp_ns, before[:3, 3].copy(), covariance, np.eye(3), np.zeros(3, np.int32), False)

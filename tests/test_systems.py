@@ -1,0 +1,142 @@
+"""The systems of the paper's table: each graph does what its publication says, no other graph does the same, and each is replayed bit for bit."""
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from trihedron.datasets.trajectories import read_trajectory
+from trihedron.pipeline.recording import Recording
+
+sys.path.insert(0, str(Path(__file__).parent / "pipeline"))
+from toys import contents
+
+ROOM = ["dataset=synthetic", "dataset.length=20", "dataset.width=320", "dataset.height=240"]
+MODEL = ["record.topics=[model]"]
+SYSTEMS = {  # graph -> what is recorded besides, the stages it adds to the default graph, and the limit of its ATE in the whole room
+    "plane_odometry": ([], ["tracks", "rotation", "translation"], 0.010),
+    "manhattan_odometry": ([], ["tracks", "rotation", "translation"], 0.010),
+    "manhattan_kalman": ([], ["tracks", "rotation", "translation"], 0.010),
+}
+OTHERS = ("structural", "structural_paper", "structural_no_refine", "points", "points_lines", "points_planes")
+JOBS = """
+import json, sys
+from trihedron.pipeline.cli import main
+sys.exit(max(main(["run", *job]) for job in json.loads(sys.argv[1])))
+"""
+
+
+def run(jobs):
+    """Several `trihedron run` in one fresh process."""
+    done = subprocess.run([sys.executable, "-c", JOBS, json.dumps(jobs)], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr[-2000:]
+
+
+class Seen:
+    """What a run did, by its recording."""
+
+    def __init__(self, folder):
+        self.folder, self.recording = folder, Recording(folder / "run.mcap")
+        self.topics = self.recording.topics - {"frames", "timing"}
+
+    def all(self, topic):
+        return list(self.recording.values(topic)) if topic in self.topics else []
+
+    @property
+    def positions(self):
+        return np.array([pose.T_world_camera[:3, 3] for pose in self.all("pose")])
+
+
+def manhattan_alone(seen):
+    """Rotations are those of one Manhattan frame that is never estimated again, times what is seen of it."""
+    rotations = [r for r in seen.all("rotation") if r.source == "manhattan"]
+    if len(rotations) < 10:
+        return False
+    first = rotations[0].R_world_manhattan[0]
+    fixed = all(np.array_equal(r.R_world_manhattan[0], first) for r in rotations)
+    return fixed and all(np.allclose(r.R_world_camera @ r.R_camera_manhattan[0], first) for r in rotations)
+
+
+def decoupled(seen):
+    """Positions are those of `translation`, and there is no map."""
+    steps = [t.t_world_camera for t in seen.all("translation")]
+    return len(steps) > 0 and np.array_equal(seen.positions, steps) and "map" not in seen.topics
+
+
+def measured_by(seen):
+    """Which kinds of features positions came from."""
+    return tuple(bool(sum(t.inliers[k] for t in seen.all("translation"))) for k in range(3))
+
+
+def lines_seen(seen):
+    return any(len(lines.endpoints_px) for lines in seen.all("lines"))
+
+
+def filtered(seen):
+    """A filter keeps offsets of axis-parallel planes with a covariance that goes with the position's, and knows those it sees again ever better."""
+    states = [t for t in seen.all("translation") if len(t.filtered_planes)]
+    if not states:
+        return False
+    axes = seen.all("rotation")[0].R_world_manhattan[0]
+    last = states[-1]
+    on_axes = np.abs(last.filtered_planes[:, :3] @ axes).max(axis=1) > 0.999
+    tied = np.abs(last.filtered_covariance[:3, 3:]).max() > 0.0 and np.array_equal(last.filtered_covariance[:3, :3], last.covariance)
+    return bool(on_axes.all()) and tied and last.filtered_covariance[3, 3] < states[0].filtered_covariance[3, 3]
+
+
+CHARACTER = {
+    "plane_odometry": lambda s: manhattan_alone(s) and decoupled(s) and not lines_seen(s) and measured_by(s) == (True, False, False),
+    "manhattan_odometry": lambda s: manhattan_alone(s) and decoupled(s) and lines_seen(s) and measured_by(s) == (True, False, False),
+    "manhattan_kalman": lambda s: manhattan_alone(s) and decoupled(s) and filtered(s),
+}
+
+
+@pytest.fixture(scope="module")
+def seen(tmp_path_factory):
+    """Each system on a short walk through the textured room, half size."""
+    folder = tmp_path_factory.mktemp("systems")
+    run([[*ROOM, f"graph={name}", *record, f"out={folder}/{name}"] for name, (record, _, _) in SYSTEMS.items()])
+    return {name: Seen(folder / name) for name in SYSTEMS}
+
+
+@pytest.mark.parametrize("name", SYSTEMS)
+def test_no_other_system_does_what_this_one_does(seen, name):
+    assert [other for other in SYSTEMS if CHARACTER[name](seen[other])] == [name]
+
+
+def test_every_frame_is_tracked_and_no_two_trajectories_are_alike(seen):
+    for name, system in seen.items():
+        metrics = json.loads((system.folder / "metrics.json").read_text())
+        assert metrics["final"]["tracked_share"] == 1.0 and metrics["final"]["ate_rmse_m"] < 0.02, name
+    assert apart(seen) > 1e-4
+
+
+def apart(seen):
+    """The least distance (m) between the trajectories of two systems, where they are farthest apart."""
+    paths = [read_trajectory(system.folder / "trajectory.txt").poses[:, :3, 3] for system in seen.values()]
+    return min(np.linalg.norm(a - b, axis=1).max() for i, a in enumerate(paths) for b in paths[:i])
+
+
+def test_each_new_stage_run_again_alone_gives_its_bytes(seen):
+    again = [(name, stage) for name, (_, stages, _) in SYSTEMS.items() for stage in stages]
+    folder = next(iter(seen.values())).folder.parent
+    run([[f"replay={folder}/{n}/run.mcap", f"only=[{s}]", "threads=1", *SYSTEMS[n][0], f"out={folder}/again/{n}/{s}"] for n, s in again])
+    for name, stage in again:
+        before, after = (contents(path / "run.mcap")[f"/{stage}"] for path in (folder / name, folder / "again" / name / stage))
+        assert len(after) > 10 and after == before, (name, stage)
+
+
+@pytest.mark.slow
+def test_the_whole_room_within_the_limit_and_unlike_every_other_graph(tmp_path):
+    graphs = (*SYSTEMS, *OTHERS)
+    run([["dataset=synthetic", f"graph={name}", f"out={tmp_path}/{name}"] for name in graphs])
+    for name, (_, _, limit_m) in SYSTEMS.items():
+        final = json.loads((tmp_path / name / "metrics.json").read_text())["final"]
+        assert final["tracked_share"] == 1.0 and final["ate_rmse_m"] < limit_m, name
+    whole = {name: Seen(tmp_path / name) for name in graphs}
+    assert apart(whole) > 1e-4
+    for name in SYSTEMS:
+        assert [other for other in graphs if CHARACTER[name](whole[other])] == [name]
