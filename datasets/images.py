@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import struct
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -12,8 +14,11 @@ from numpy.typing import NDArray
 from trihedron.pipeline.errors import DataError
 from trihedron.pipeline.types import F32, U8
 
+PNG, JPEG = b"\x89PNG", b"\xff\xd8\xff"
 # the end of a complete file; a decoder would fill the rest of a truncated JPEG with grey and say nothing
-END_MARKS = {b"\x89PNG": b"IEND", b"\xff\xd8\xff": b"\xff\xd9"}
+END_MARKS = {PNG: b"IEND", JPEG: b"\xff\xd9"}
+FRAME_MARKS = {*range(0xC0, 0xD0)} - {0xC4, 0xC8, 0xCC}  # of a JPEG: where its size is said
+PIXELS_PER_BYTE = 2048  # more than either format can pack: deflate makes 1032 bytes of one, a grey JPEG 512 pixels of one
 TAIL = 64  # bytes searched for the end mark: writers may pad
 
 
@@ -21,9 +26,19 @@ class UnreadableImage(Exception):
     """A file that cannot be opened or decoded; the message says why."""
 
 
+@dataclass(frozen=True)
+class PictureHeader:
+    """What a picture claims to be; `bits` are of one channel."""
+
+    width: int
+    height: int
+    bits: int
+    channels: int
+
+
 def read_color(path: Path) -> U8:
     """(h, w, 3) RGB. Raises UnreadableImage for a missing or damaged file, DataError for an image that is not 8-bit colour."""
-    image = _decode(path, cv2.IMREAD_UNCHANGED)
+    image = _decode(path)
     if image.dtype != np.uint8:
         cause = f"has {8 * image.itemsize} bits a channel where colour has 8"
         raise DataError(str(path), cause, "give 8-bit RGB images; are colour and depth swapped?")
@@ -37,7 +52,7 @@ def read_depth(path: Path, depth_scale: float, depth_offset: float = 0.0) -> F32
     """(h, w) metres, 0 = none, from a 16-bit image whose value divided by `depth_scale` is metres z, corrected to 1 / (1 / z + `depth_offset`).
 
     Raises UnreadableImage for a missing or damaged file, DataError for an image that is not 16-bit with one channel."""
-    image = _decode(path, cv2.IMREAD_UNCHANGED)
+    image = _decode(path)
     if image.ndim != 2:
         raise DataError(str(path), f"has {image.shape[2]} channels where depth has 1", "give 16-bit depth images with one channel")
     if image.dtype != np.uint16:
@@ -47,23 +62,50 @@ def read_depth(path: Path, depth_scale: float, depth_offset: float = 0.0) -> F32
     return depth / np.maximum(1.0 + np.float32(depth_offset) * depth, np.float32(0.1)) if depth_offset else depth
 
 
-def _decode(path: Path, flags: int) -> NDArray[Any]:
+def _decode(path: Path) -> NDArray[Any]:
     try:
         data = path.read_bytes()
     except OSError as error:
         raise UnreadableImage(f"cannot be opened ({error.strerror})") from error
     if not data:
         raise UnreadableImage("is empty")
-    for magic, end in END_MARKS.items():
-        if data.startswith(magic) and end not in data[-TAIL:]:
-            raise UnreadableImage("is truncated")
+    if data.startswith((PNG, JPEG)):
+        return decode_image(data)
+    return _decoded(data)
+
+
+def decode_image(data: bytes) -> NDArray[Any]:
+    """The pixels of a PNG or JPEG as OpenCV orders them. Raises UnreadableImage for what is cut off, damaged or larger than its bytes can hold."""
+    header = picture_header(data)
+    if header.width * header.height > PIXELS_PER_BYTE * len(data):
+        raise UnreadableImage(f"claims {header.width}×{header.height} pixels in {len(data)} bytes")
+    if not any(data.startswith(magic) and end in data[-TAIL:] for magic, end in END_MARKS.items()):
+        raise UnreadableImage("is truncated")
+    return _decoded(data)
+
+
+def _decoded(data: bytes) -> NDArray[Any]:
     try:
-        image = cv2.imdecode(np.frombuffer(data, dtype=np.uint8), flags)
+        image = cv2.imdecode(np.frombuffer(data, dtype=np.uint8), cv2.IMREAD_UNCHANGED)
     except cv2.error:
         image = None
     if image is None:
         raise UnreadableImage("is damaged or of an unknown format")
     return np.asarray(image)
+
+
+def picture_header(data: bytes) -> PictureHeader:
+    """What a PNG or JPEG says of itself. Raises UnreadableImage for another format or none."""
+    if data.startswith(PNG) and len(data) >= 26:
+        width, height, bits, color = struct.unpack_from(">IIBB", data, 16)
+        return PictureHeader(width, height, bits, {0: 1, 2: 3, 3: 3, 4: 2, 6: 4}.get(color, 3))
+    at = 2
+    while data.startswith(JPEG) and at + 10 <= len(data) and data[at] == 0xFF:
+        if data[at + 1] in FRAME_MARKS:
+            bits, height, width, channels = struct.unpack_from(">BHHB", data, at + 4)
+            return PictureHeader(width, height, bits, channels)
+        at += 1 if data[at + 1] == 0xFF else 2 + max(2, struct.unpack_from(">H", data, at + 2)[0])
+    raise UnreadableImage("is damaged or of an unknown format")
 
 
 def check_size(path: Path, image: NDArray[Any], width: int, height: int, reference: str, cure: str) -> None:
