@@ -48,7 +48,7 @@ class Registration:
         return _splat(depth_m, *self._rays, t, camera.fx, camera.fy, camera.cx, camera.cy, camera.height, camera.width)
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _splat(depth: F32, across: F32, down: F32, t: F32, fx: float, fy: float, cx: float, cy: float, height: int, width: int) -> F32:
     """The z-buffer of all readings, each a rectangle in the colour image between the middles of the sides of its pixel."""
     found = np.zeros((height, width), np.float32)
@@ -71,6 +71,6 @@ def _splat(depth: F32, across: F32, down: F32, t: F32, fx: float, fy: float, cx:
             Z = np.float32(0.5) * (Z_left + Z_right)
             for v in range(max(0, int(np.ceil(low_y))), min(height, int(np.ceil(high_y)))):
                 for u in range(max(0, int(np.ceil(low_x))), min(width, int(np.ceil(high_x)))):
-                    if found[v, u] == 0.0 or Z < found[v, u]:
+                    if found[v, u] == 0.0 or found[v, u] > Z:
                         found[v, u] = Z
     return found
