@@ -4,10 +4,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import cv2
 import numba
 import numpy as np
+from numpy.typing import NDArray
 
 from trihedron.pipeline.types import F32, F64, Camera
 
@@ -36,7 +38,7 @@ class Registration:
         columns, rows = np.arange(self.width + 1) - 0.5, np.arange(self.height + 1) - 0.5
         return self._turned(columns, rows[:-1] + 0.5), self._turned(columns[:-1] + 0.5, rows)
 
-    def _turned(self, columns: F64, rows: F64) -> F32:
+    def _turned(self, columns: NDArray[Any], rows: NDArray[Any]) -> F32:
         pixels = np.stack(np.meshgrid(columns, rows), axis=-1)
         rays = cv2.undistortPoints(pixels.reshape(-1, 1, 2), self.K, np.array(self.D) if self.D else None).reshape(pixels.shape)
         rays = np.concatenate([rays, np.ones((*rays.shape[:2], 1))], axis=2) @ self.T_color_depth[:3, :3].T
