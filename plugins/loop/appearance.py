@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from trihedron.pipeline.registry import register
-from trihedron.pipeline.types import I32, Correction, Frame, Map
+from trihedron.pipeline.types import I32, Map
 from trihedron.plugins.numerics.maps.local_window import observed_by
 from trihedron.plugins.numerics.places.binary_words import as_bits, nearest_words, similarities, train
 from trihedron.plugins.numerics.places.loop_closing import LoopClosing
@@ -38,11 +38,7 @@ class AppearanceLoop(LoopClosing):
         if not 0.0 <= self.min_likeness <= 1.0:
             raise ValueError("min_likeness: must be in [0, 1]")
 
-    def __call__(self, map: Map, frame: Frame) -> Correction | None:
-        """None unless the newest keyframe closes a loop."""
-        return self.closed(map, frame, self._ranked(map)) if self.due(map, frame) else None
-
-    def _ranked(self, map: Map) -> Iterator[tuple[int, float]]:
+    def ranked(self, map: Map) -> Iterator[tuple[int, float]]:
         """Keyframes within reach, the most alike first, with the way walked since."""
         rows, way = within_reach(map, self.reach)
         rows, way = rows[: self.looked_at], way[: self.looked_at]

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from trihedron.pipeline.registry import register
-from trihedron.pipeline.types import Correction, Frame, Map
+from trihedron.pipeline.types import Map
 from trihedron.plugins.numerics.maps.local_window import observed_by
 from trihedron.plugins.numerics.places.loop_closing import LoopClosing
 from trihedron.plugins.numerics.places.loop_hypotheses import shift_of_planes
@@ -30,11 +30,7 @@ class PlanesLoop(LoopClosing):
         if self.looked_at < 1 or self.min_layout < 0.0:
             raise ValueError("looked_at, min_layout: must be at least 1 and 0")
 
-    def __call__(self, map: Map, frame: Frame) -> Correction | None:
-        """None unless the newest keyframe closes a loop."""
-        return self.closed(map, frame, self._ranked(map)) if self.due(map, frame) else None
-
-    def _ranked(self, map: Map) -> Iterator[tuple[int, float]]:
+    def ranked(self, map: Map) -> Iterator[tuple[int, float]]:
         """Keyframes within reach, best layout first, with the way walked since."""
         rows, way = within_reach(map, self.reach)
         rows, way = rows[: self.looked_at], way[: self.looked_at]

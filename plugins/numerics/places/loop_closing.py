@@ -1,7 +1,8 @@
-"""What all loop closers share: when to look, how a place is recognised for certain, and what is then corrected."""
+"""What all loop closers share: when to look, how a place is recognised for certain, and what is corrected; and directions, recognised all along."""
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Iterable
 from dataclasses import dataclass
 
@@ -15,9 +16,10 @@ from trihedron.plugins.numerics.maps.map_search import Guess, MapSearch
 from trihedron.plugins.numerics.maps.map_terms import line_terms, plane_terms, point_terms
 from trihedron.plugins.numerics.motion.pose_solver import PoseSolution, solve_pose
 from trihedron.plugins.numerics.places.free_space import seen_through
-from trihedron.plugins.numerics.places.loop_correction import Closure, Drift, close
+from trihedron.plugins.numerics.places.loop_correction import Closure, Drift, close, straighten
 from trihedron.plugins.numerics.places.loop_hypotheses import alike, shift_of_planes, shift_of_points
 from trihedron.plugins.numerics.places.loop_places import Place, Reach, place_of
+from trihedron.plugins.numerics.places.map_compass import Trueness, compass_of
 
 CHI2_6 = 22.46  # 99.9 % of six degrees of freedom
 NOTHING = np.empty((0, 2), np.int32)
@@ -25,7 +27,7 @@ SEARCH = MapSearch(octave_step=3, relations=0)
 
 
 @dataclass(frozen=True)
-class LoopClosing:
+class LoopClosing(ABC):
     """Options of a loop closer, and the parts it is made of."""
 
     every: int = 2  # keyframes between two looks
@@ -35,6 +37,9 @@ class LoopClosing:
     drift_share: float = 0.01  # of the way walked: standard deviation of the position, and per root metre of the pose graph
     floor_m: float = 0.02  # added to it
     rotation_sigma_deg: float = 0.3  # of a keyframe; the Manhattan frame keeps it from growing
+    rotation_drift_deg: float = 0.05  # per root metre of the pose graph
+    straighten: int = 16  # keyframes between two looks at the directions of the whole map, twice as many with each doubling of it; 0 = never
+    straighten_deg: float = 0.05  # least turn of the newest keyframe that is worth it
     candidates: int = 5  # places looked at in one call, at most
     shared: int = 30  # points and lines already shared with a place, from which on no loop is open there
     min_score: int = 60  # points + 2 lines + 5 planes that must agree
@@ -45,9 +50,11 @@ class LoopClosing:
         for name in ("every", "candidates", "shared", "min_score"):
             if getattr(self, name) < 1:
                 raise ValueError(f"{name}: must be at least 1")
-        for name in ("away_m", "view_m", "drift_share", "floor_m", "rotation_sigma_deg"):
+        for name in ("away_m", "view_m", "drift_share", "floor_m", "rotation_sigma_deg", "rotation_drift_deg", "straighten_deg"):
             if getattr(self, name) <= 0.0:
                 raise ValueError(f"{name}: must be positive")
+        if self.straighten < 0:
+            raise ValueError("straighten: must not be negative")
         if not 0.0 < self.view_deg <= 90.0 or not 0.0 <= self.min_share <= 1.0 or not 0.0 <= self.max_through <= 1.0:
             raise ValueError("view_deg, min_share, max_through: must be in (0, 90], [0, 1] and [0, 1]")
 
@@ -56,15 +63,33 @@ class LoopClosing:
         """How far a place may be from where the camera thinks it is."""
         return Reach(self.away_m, self.view_m, self.view_deg, self.drift_share, self.floor_m)
 
-    def due(self, map: Map, frame: Frame) -> bool:
-        """Whether this frame made a keyframe, and one that is looked at."""
-        newest = np.array([len(map.keyframes) - 1])
-        if newest[0] < 0 or newest[0] % self.every or not map.keyframes.rows("alive", newest)[0]:
-            return False
-        return int(map.keyframes.rows("index", newest)[0]) == frame.index
+    @property
+    def drift(self) -> Drift:
+        """What the pose graph takes keyframes to be uncertain by."""
+        return Drift(self.drift_share, np.radians(self.rotation_drift_deg))
 
-    def closed(self, map: Map, frame: Frame, ranked: Iterable[tuple[int, float]]) -> Correction | None:
-        """The correction of the first of the ranked keyframes (row, way walked since) whose place is recognised."""
+    def __call__(self, map: Map, frame: Frame) -> Correction | None:
+        """None unless the newest keyframe closes a loop, or the directions of the map say that it has turned."""
+        newest = np.array([len(map.keyframes) - 1])
+        if newest[0] < 0 or map.keyframes.rows("index", newest)[0] != frame.index or not map.keyframes.rows("alive", newest)[0]:
+            return None
+        closed = self._closed(map, frame, self.ranked(map)) if newest[0] % self.every == 0 else None
+        return closed if closed is not None else self._straightened(map)
+
+    @abstractmethod
+    def ranked(self, map: Map) -> Iterable[tuple[int, float]]:
+        """Keyframes whose place the newest one may have come back to, the likeliest first, with the way walked since."""
+
+    def _straightened(self, map: Map) -> Correction | None:
+        """The map turned back to its own directions, when it is time to look and they tell."""
+        count = len(map.keyframes)
+        if not self.straighten or count % (self.straighten << (count // (16 * self.straighten)).bit_length()):
+            return None
+        compass = compass_of(map, Trueness())
+        return straighten(map, self.drift, compass, np.radians(self.straighten_deg)) if compass is not None else None
+
+    def _closed(self, map: Map, frame: Frame, ranked: Iterable[tuple[int, float]]) -> Correction | None:
+        """The correction of the first of the ranked keyframes whose place is recognised."""
         looked_at: set[int] = set()
         tried = 0
         for keyframe, way in ranked:
@@ -77,7 +102,7 @@ class LoopClosing:
             looked_at |= set(place.seen.keyframes.tolist())
             closure = self._recognised(map, frame, place) if place.found < self.shared else None
             if closure is not None:
-                return close(map, closure, Drift(self.drift_share, np.radians(self.rotation_sigma_deg)))
+                return close(map, closure, self.drift, compass_of(map, Trueness()) if self.straighten else None)
         return None
 
     def _recognised(self, map: Map, frame: Frame, place: Place) -> Closure | None:

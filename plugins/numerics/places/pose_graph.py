@@ -15,6 +15,7 @@ if TYPE_CHECKING:  # imported where it is needed: SciPy is slow to load, and mos
     from scipy.sparse import bsr_matrix
 
 ITERATIONS, CONVERGED = 20, 1e-9  # squared length of a step, metres and radians, below which nothing moves any more
+HELD = 1e12 * np.eye(6)  # information of a pose that stays
 ROUGHEST = 1e8  # damping beyond which no step goes downhill
 
 
@@ -27,20 +28,25 @@ class Edges:
     information: F64  # (e, 6, 6)
 
 
-def solve_pose_graph(poses: F64, edges: Edges, R_prior: F64, rotation_sigma: float) -> F64:
-    """(n, 4, 4) `T_world_node` that minimise the squared error of the edges and of `R_prior` (n, 3, 3), the rotations known without drift to
-    `rotation_sigma` (rad), starting from `poses`. Node 0 stays where it is."""
+def joined(*edges: Edges) -> Edges:
+    """All of them."""
+    pairs, measured, information = zip(*((e.pairs, e.measured, e.information) for e in edges))
+    return Edges(np.concatenate(pairs), np.concatenate(measured), np.concatenate(information))
+
+
+def solve_pose_graph(poses: F64, edges: Edges) -> F64:
+    """(n, 4, 4) `T_world_node` that minimise the squared error of the edges, starting from `poses`. Node 0 stays where it is."""
     from scipy.sparse import diags
     from scipy.sparse.linalg import splu
 
     damping, current = 1e-6, poses.copy()
-    cost, H, g = _normal_equations(current, edges, R_prior, rotation_sigma)
+    cost, H, g = _normal_equations(current, edges)
     for _ in range(ITERATIONS):
         scale = diags(H.diagonal())
         step = splu((H + damping * scale).tocsc()).solve(-g).reshape(-1, 6)
         step[0] = 0.0  # held by its weight but for rounding
         tried = _moved(current, step)
-        new_cost, new_H, new_g = _normal_equations(tried, edges, R_prior, rotation_sigma)
+        new_cost, new_H, new_g = _normal_equations(tried, edges)
         if new_cost <= cost:
             current, cost, H, g, damping = tried, new_cost, new_H, new_g, max(damping / 10.0, 1e-9)
             if float((step**2).sum(axis=1).max()) < CONVERGED:
@@ -68,7 +74,7 @@ def _rotation_vectors(R: F64) -> F64:
     return np.asarray(axis * np.where(sine > 1e-9, angle / np.maximum(sine, 1e-9), 1.0)[:, None])
 
 
-def _normal_equations(poses: F64, edges: Edges, R_prior: F64, rotation_sigma: float) -> tuple[float, bsr_matrix, F64]:
+def _normal_equations(poses: F64, edges: Edges) -> tuple[float, bsr_matrix, F64]:
     """Cost, (6n, 6n) approximate Hessian and (6n,) gradient of half the squared error."""
     a, b = edges.pairs.T
     R_a, R_b, R_z = poses[a, :3, :3], poses[b, :3, :3], edges.measured[:, :3, :3]
@@ -79,18 +85,13 @@ def _normal_equations(poses: F64, edges: Edges, R_prior: F64, rotation_sigma: fl
     J_a[:, :3, :3], J_a[:, :3, 3:], J_a[:, 3:, 3:] = -R_z_t, R_z_t @ cross_matrices(t_a_b), -np.swapaxes(R_b, 1, 2) @ R_a
     J_b[:, :3, :3], J_b[:, 3:, 3:] = R_z_t @ R_a_t @ R_b, np.eye(3)
     W_a, W_b = np.swapaxes(J_a, 1, 2) @ edges.information, np.swapaxes(J_b, 1, 2) @ edges.information
-    turned = _rotation_vectors(np.swapaxes(R_prior, 1, 2) @ poses[:, :3, :3])
-    n, weight = len(poses), 1.0 / rotation_sigma**2
-    diagonal = np.zeros((n, 6, 6))
-    diagonal[:, 3:, 3:] = weight * np.eye(3)
-    diagonal[0] += 1e12 * np.eye(6)
-    blocks = np.concatenate([W_a @ J_a, W_a @ J_b, W_b @ J_a, W_b @ J_b, diagonal])
-    rows, columns = np.concatenate([a, a, b, b, np.arange(n)]), np.concatenate([a, b, a, b, np.arange(n)])
+    n = len(poses)
+    blocks = np.concatenate([W_a @ J_a, W_a @ J_b, W_b @ J_a, W_b @ J_b, HELD[None]])
+    rows, columns = np.concatenate([a, a, b, b, [0]]), np.concatenate([a, b, a, b, [0]])
     g = np.zeros((n, 6))
     np.add.at(g, a, (W_a @ error[..., None])[..., 0])
     np.add.at(g, b, (W_b @ error[..., None])[..., 0])
-    g[:, 3:] += weight * turned
-    cost = float(np.einsum("ei,eij,ej->", error, edges.information, error) + weight * (turned**2).sum())
+    cost = float(np.einsum("ei,eij,ej->", error, edges.information, error))
     return cost, _assembled(blocks, rows, columns, n), g.ravel()
 
 
