@@ -69,7 +69,7 @@ def composed(*overrides):
 @pytest.mark.parametrize("graph", ["points", "points_lines", "points_planes"])
 def test_graphs_without_a_manhattan_frame_do_not_look_for_one(graph):
     stages = composed(f"graph={graph}").stages
-    assert "manhattan" not in stages
+    assert "manhattan" not in stages and stages["loop"].plugin.straighten == 0
     assert type(stages["rotation"].plugin).__name__ == "Procrustes"
     kinds = {slot: type(stages[slot].plugin).__name__.startswith("No") for slot in ("keypoints", "lines", "planes") if slot in stages}
     assert kinds == {"keypoints": False, "lines": graph != "points_lines", "planes": graph != "points_planes"}
@@ -77,6 +77,6 @@ def test_graphs_without_a_manhattan_frame_do_not_look_for_one(graph):
 
 def test_what_is_left_out_is_not_run():
     assert "manhattan" not in composed("without=manhattan").stages
-    assert composed("without=relations").stages["matches"].plugin.relations == 0
+    assert composed("without=manhattan").stages["loop"].plugin.straighten == 0
     assert type(composed("without=lines").stages["lines"].plugin).__name__ == "NoLines"
     assert set(composed("without=nothing").stages) == set(composed().stages)
