@@ -23,8 +23,8 @@ DRIFT = np.radians([0.1, 0.7, -0.2])  # at the end of the walk
 
 
 def corridor(drift, axes=(0, 1, 2), turned=0.0, wall_deg=0.1):
-    """A map of keyframes along a corridor whose rotations drift, each with three new walls that are true to `wall_deg`; those of the second half stand
-    on axes `turned` (rad) from the others. Returns the map and the rotations as they should be."""
+    """A map of keyframes along a corridor whose rotations drift, each with three new walls that are true to `wall_deg`; those of the second half
+    stand on axes `turned` (rad) from the others. Returns the map and the rotations as they should be."""
     rng, map = np.random.default_rng(0), empty_map(0, 0, 32, 32, 4)
     covariance = np.tile(np.diag([1e-7, 1e-7, 1e-6]), (3, 1, 1))
     look, wing = exp_so3(np.array([0.0, 0.3, 0.0])), AXES @ exp_so3(np.array([turned, 0.0, 0.0]))
