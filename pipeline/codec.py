@@ -112,6 +112,16 @@ class Decoder:
         return value
 
 
+def is_whole(data: bytes) -> bool:
+    """Whether a message can be decoded without those before it. Damaged bytes are: decoding says what is wrong with them."""
+    message = ValueMessage()
+    try:
+        message.ParseFromString(data)
+        return all(json.loads(array.data)["full"] for array in message.arrays if array.name.endswith("#"))
+    except Exception:
+        return True
+
+
 @cache
 def _hints(kind: Any) -> Mapping[str, Any]:
     hints = get_type_hints(kind)

@@ -19,7 +19,7 @@ from tqdm import tqdm
 from trihedron.datasets.trajectories import TRUTH, attached_truth, format_trajectory
 from trihedron.pipeline import results
 from trihedron.pipeline.config import Feedback, graph_of
-from trihedron.pipeline.errors import ConfigError, TrihedronError, did_you_mean
+from trihedron.pipeline.errors import ConfigError, DataError, RecordingError, TrihedronError, did_you_mean
 from trihedron.pipeline.graph import Graph
 from trihedron.pipeline.interrupts import held_interrupts
 from trihedron.pipeline.recording import Recording, RecordingWriter
@@ -63,11 +63,22 @@ def execute(config: DictConfig, out: Path, overrides: list[str], began: float) -
                 runner.keeper.save(Path(config.save_map).expanduser(), _metadata(config, overrides), source)
         finally:
             with held_interrupts():
-                writer.close()
+                failure = _closed(writer)
                 metrics = _write(runner, attached_truth(attachments, str(writer.path)), out, started, began)
                 warnings.summarise()
     _report(out, metrics, [results.write_surface(out, value) for value in runner.result.folds.values() if isinstance(value, Surface)])
+    if failure is not None:
+        raise failure
     return metrics
+
+
+def _closed(writer: RecordingWriter) -> RecordingError | None:
+    """Close the recording; what goes wrong must not cost the trajectory."""
+    try:
+        writer.close()
+    except RecordingError as error:
+        return error
+    return None
 
 
 def _remembered(config: DictConfig, graph: Graph) -> Callable[[int], Memory] | None:
@@ -178,10 +189,13 @@ def _progress(steps: Iterator[Step]) -> Iterator[Step]:
 def _write(runner: Runner, truth: Trajectory | None, out: Path, started: float, began: float) -> dict[str, Any]:
     """The files beside the recording. A trajectory is written only where poses were computed."""
     metrics: dict[str, Any] = {}
-    if "pose" in runner.computed:
-        metrics = results.write_results(out, runner.result, truth)
     wall_s = time.perf_counter() - started
-    results.write_json(out / results.TIMING, runner.timing.summary(runner.threads, wall_s, started - began))
+    try:
+        if "pose" in runner.computed:
+            metrics = results.write_results(out, runner.result, truth)
+        results.write_json(out / results.TIMING, runner.timing.summary(runner.threads, wall_s, started - began))
+    except OSError as error:
+        raise DataError(str(error.filename or out), f"cannot be written: {error.strerror}", "make room, or give another out=FOLDER") from error
     return metrics
 
 

@@ -20,11 +20,12 @@ import numpy as np
 from mcap.data_stream import ReadDataStream
 from mcap.exceptions import McapError
 from mcap.opcode import Opcode
-from mcap.records import Channel, ChunkIndex, Footer, Metadata, Schema
+from mcap.records import Attachment, Channel, ChunkIndex, Footer, Metadata, Schema, Statistics
 from numpy.typing import NDArray
 
 from trihedron.pipeline.errors import RecordingError
 from trihedron.pipeline.mcap_chunks import LAST_TIME, MESSAGE_HEADER, ChunkPlace, Damaged, message_at, messages_in, records, unpack
+from trihedron.pipeline.mcap_errors import damaged
 
 MAGIC = b"\x89MCAP0\r\n"
 FOOTER_BYTES = 9 + 20
@@ -62,10 +63,12 @@ class McapFile:
         except OSError as error:
             raise RecordingError(str(path), f"cannot be read: {error.strerror}", "give the path of an MCAP file") from error
         if head != MAGIC:
-            raise RecordingError(str(path), "is not an MCAP file", "give the path of a file that ends in .mcap")
+            raise damaged(path)
         self.channels: dict[int, Channel] = {}
         self.schemas: dict[int, Schema] = {}
         self.metadata: dict[str, dict[str, str]] = {}
+        self.attachments: dict[str, bytes] = {}
+        self.counts: dict[int, int] = {}  # channel -> messages, as the file says
         self.complete = self._size >= len(MAGIC) + FOOTER_BYTES and self._bytes(self._size - len(MAGIC), len(MAGIC)) == MAGIC
         self._indexes: list[ChunkIndex] = []
         self._scanned: dict[int, list[tuple[int, int, int]]] | None = None
@@ -73,6 +76,24 @@ class McapFile:
         self._lock = threading.Lock()
         if not (self.complete and self._read_summary()):
             self._scan()
+
+    @property
+    def indexed(self) -> bool:
+        """Whether no message had to be searched for."""
+        return not self._scanned
+
+    def chunks(self, channel: int) -> list[ChunkIndex]:
+        """The chunks that hold messages of a channel, in file order; of an indexed file whose chunks have indexes."""
+        return [index for index in self._indexes if channel in index.message_index_offsets]
+
+    def in_chunk(self, chunk: ChunkIndex, channel: int) -> list[tuple[int, bytes]]:
+        """(log time, content) of a channel's messages in a chunk. Raises RecordingError where they are damaged."""
+        try:
+            rows = self._chunk_rows(chunk, channel)
+            plain = self._plain(chunk.chunk_start_offset, self._chunk(chunk.chunk_start_offset)) if len(rows) else b""
+            return [(log_time, message_at(plain, offset, channel)) for log_time, _, offset in rows.tolist()]
+        except (Damaged, *_PARSING) as error:
+            raise self._damaged(channel, error) from error
 
     def schema_name(self, channel: int) -> str:
         """The name of the type of a channel's messages, empty where none is given."""
@@ -110,7 +131,8 @@ class McapFile:
 
     def _damaged(self, channel: int, error: Exception) -> RecordingError:
         topic = self.channels[channel].topic if channel in self.channels else f"number {channel}"
-        return RecordingError(str(self.path), f"channel {topic} is damaged: {error or type(error).__name__}", "record it again")
+        cure = f"rescue what is whole with: trihedron recover {self.path}"
+        return RecordingError(str(self.path), f"channel {topic} is damaged: {error or type(error).__name__}", cure)
 
     # bytes of the file
 
@@ -175,10 +197,15 @@ class McapFile:
         elif opcode == Opcode.METADATA:
             metadata = self._parsed(Metadata, start, length)
             self.metadata[metadata.name] = metadata.metadata
-        elif opcode == Opcode.METADATA_INDEX:
+        elif opcode == Opcode.ATTACHMENT:
+            attachment = self._parsed(Attachment, start, length)
+            self.attachments[attachment.name] = attachment.data
+        elif opcode == Opcode.STATISTICS:
+            self.counts = dict(self._parsed(Statistics, start, length).channel_message_counts)
+        elif opcode in (Opcode.METADATA_INDEX, Opcode.ATTACHMENT_INDEX):
             at = struct.unpack("<Q", self._bytes(start, 8))[0]
             opcode, start, length = self._record(at, self._size)
-            if opcode == Opcode.METADATA:
+            if opcode in (Opcode.METADATA, Opcode.ATTACHMENT):
                 self._describe(opcode, start, length)
 
     def _scan(self) -> None:

@@ -3,34 +3,25 @@
 from __future__ import annotations
 
 import json
-import struct
-import threading
-import time
 from collections import deque
 from collections.abc import Iterator, Mapping
-from operator import methodcaller
 from pathlib import Path
 from typing import Any
 
-import zstandard
-from mcap.exceptions import McapError
-from mcap.reader import make_reader
-from mcap.records import Channel, Message
-from mcap.writer import CompressionType, Writer
+from mcap.records import Channel, ChunkIndex
 from mcap_protobuf.schema import build_file_descriptor_set
 
-from trihedron.pipeline.codec import Decoder, Encoder, ValueMessage
+from trihedron.pipeline.chunk_writer import ChunkWriter
+from trihedron.pipeline.codec import Decoder, Encoder, ValueMessage, is_whole
 from trihedron.pipeline.errors import RecordingError
+from trihedron.pipeline.mcap_errors import damaged
+from trihedron.pipeline.mcap_file import McapFile
 from trihedron.pipeline.types import Value
 
 FORMAT = "2"
 METADATA = "trihedron"
-CHUNK_BYTES = 1 << 20
-CHUNK_SECONDS = 0.5
-MESSAGE_OVERHEAD = 64  # bytes of a message beside its data, generously
+FRAMES_TOPIC = "frames"  # one FrameReference a frame: what a replay iterates over
 TIMING_TOPIC = "/timing"
-DAMAGE = (McapError, ValueError, EOFError, AssertionError, KeyError, struct.error, zstandard.ZstdError, RuntimeError)  # by damaged bytes
-_close_chunk = methodcaller("_Writer__finalize_chunk")  # the library closes a chunk by size only, and a crash would lose a slow topic's last minutes
 TIMING_SCHEMA = {
     "type": "object",
     "properties": {
@@ -45,26 +36,18 @@ TIMING_SCHEMA = {
 class RecordingWriter:
     """Writes values, well-known messages and timings. `log_time` is the frame's stamp, so the same run gives the same messages.
 
-    Metadata goes first; a chunk is closed before it would exceed `CHUNK_BYTES` (a larger message has one of its own)
-    and after `CHUNK_SECONDS` of wall time, so that a crash loses little."""
+    Metadata goes first. Where the file cannot be written any more, a warning says so, and `close` raises RecordingError."""
 
     def __init__(self, path: Path, metadata: Mapping[str, str]) -> None:
         self.path = path
-        try:
-            self._file = open(path, "wb")
-        except OSError as error:
-            raise RecordingError(str(path), f"cannot be written: {error.strerror}", "give another out=FOLDER") from error
-        self._writer: Any = Writer(self._file, chunk_size=2 * CHUNK_BYTES, compression=CompressionType.LZ4)  # fast: most of it hardly shrinks
-        self._writer.start(library="trihedron")
-        self._writer.add_metadata(METADATA, {"format": FORMAT, **metadata})
-        self._file.flush()
+        self._file = ChunkWriter(path)
+        self._file.metadata(METADATA, {"format": FORMAT, **metadata})
         self._channels: dict[str, int] = {}
         self._encoders: dict[str, Encoder] = {}
-        self._chunk_began, self._chunk_bytes = time.monotonic(), 0
 
     def attach(self, name: str, text: str) -> None:
         """Add a text file, for example the ground truth."""
-        self._writer.add_attachment(create_time=0, log_time=0, name=name, media_type="text/plain", data=text.encode())
+        self._file.attach(name, text)
 
     def write(self, topic: str, value: Value) -> None:
         """Add a value to its topic (name without slash)."""
@@ -74,41 +57,22 @@ class RecordingWriter:
     def write_message(self, channel: str, message: Any, stamp_ns: int) -> None:
         """Add a protobuf message to a channel (with slash), made on first use."""
         if channel not in self._channels:
-            schema = build_file_descriptor_set(type(message)).SerializeToString()
-            schema_id = self._writer.register_schema(message.DESCRIPTOR.full_name, "protobuf", schema)
-            self._channels[channel] = self._writer.register_channel(channel, "protobuf", schema_id)
-        self._add(channel, message.SerializeToString(), stamp_ns)
+            definition = build_file_descriptor_set(type(message)).SerializeToString()
+            self._channels[channel] = self._file.channel(channel, message.DESCRIPTOR.full_name, "protobuf", definition, "protobuf")
+        self._file.add(self._channels[channel], stamp_ns, message.SerializeToString())
 
     def write_timing(self, index: int, stamp_ns: int, frame_ms: float, stage_ms: Mapping[str, float], memory_mb: float) -> None:
         """Add a frame's times, and the memory the process holds after it (JSON, so that any viewer plots them)."""
         if TIMING_TOPIC not in self._channels:
-            schema_id = self._writer.register_schema("trihedron.Timing", "jsonschema", json.dumps(TIMING_SCHEMA).encode())
-            self._channels[TIMING_TOPIC] = self._writer.register_channel(TIMING_TOPIC, "json", schema_id)
+            definition = json.dumps(TIMING_SCHEMA).encode()
+            self._channels[TIMING_TOPIC] = self._file.channel(TIMING_TOPIC, "trihedron.Timing", "jsonschema", definition, "json")
         stages = {name: round(ms, 3) for name, ms in stage_ms.items()}
         measured = {"index": index, "frame_ms": round(frame_ms, 3), "stage_ms": stages, "memory_mb": round(memory_mb, 2)}
-        self._add(TIMING_TOPIC, json.dumps(measured).encode(), stamp_ns)
-
-    def _add(self, channel: str, data: bytes, stamp_ns: int) -> None:
-        try:
-            if self._chunk_bytes + len(data) + MESSAGE_OVERHEAD > CHUNK_BYTES:
-                self._finish_chunk()
-            self._writer.add_message(self._channels[channel], log_time=stamp_ns, data=data, publish_time=stamp_ns)
-            self._chunk_bytes += len(data) + MESSAGE_OVERHEAD
-            if time.monotonic() - self._chunk_began > CHUNK_SECONDS:
-                self._finish_chunk()
-        except OSError as error:
-            raise RecordingError(str(self.path), f"cannot be written: {error.strerror}", "what was written before is kept") from error
-
-    def _finish_chunk(self) -> None:
-        _close_chunk(self._writer)
-        self._file.flush()
-        self._chunk_began, self._chunk_bytes = time.monotonic(), 0
+        self._file.add(self._channels[TIMING_TOPIC], stamp_ns, json.dumps(measured).encode())
 
     def close(self) -> None:
         """Write the index; the file is complete only then."""
-        if not self._file.closed:
-            self._writer.finish()
-            self._file.close()
+        self._file.close()
 
 
 class Recording:
@@ -116,62 +80,92 @@ class Recording:
 
     def __init__(self, path: Path | str) -> None:
         self.path = Path(path)
-        try:
-            with open(self.path, "rb") as file:
-                reader = make_reader(file)
-                summary = reader.get_summary()
-                found = {m.name: m.metadata for m in reader.iter_metadata()}
-                self.attachments = {a.name: a.data.decode("utf-8", "replace") for a in reader.iter_attachments()}
-        except OSError as error:
-            raise RecordingError(str(path), f"cannot be read: {error.strerror}", "give the path of a run.mcap") from error
-        except DAMAGE as error:
-            raise RecordingError(str(path), "is not a complete MCAP file", "the run that wrote it was cut off; record it again") from error
-        if METADATA not in found or summary is None:
+        self._file = McapFile(self.path)
+        if not self._file.complete or not self._file.indexed:
+            raise damaged(self.path)
+        if METADATA not in self._file.metadata:
             raise RecordingError(str(path), "is an MCAP file, but not a recording of trihedron", "convert it with: trihedron convert SRC DST.mcap")
-        self.metadata: dict[str, str] = dict(found[METADATA])
+        self.metadata = self._file.metadata[METADATA]
+        self.attachments = {name: data.decode("utf-8", "replace") for name, data in self._file.attachments.items()}
         if self.metadata.get("format") != FORMAT:
             written = " ".join(["trihedron", self.metadata.get("version", ""), self.metadata.get("commit", "")[:7]]).strip()
             cause = f"has format {self.metadata.get('format')} of {written}, this program reads format {FORMAT}: other arrays and tables"
             raise RecordingError(str(path), cause, "read it with the version that wrote it, or record again")
-        counts = summary.statistics.channel_message_counts if summary.statistics else {}
-        self.channels: dict[str, Channel] = {c.topic: c for c in summary.channels.values()}
-        self.counts = {c.topic: counts.get(c.id, 0) for c in summary.channels.values()}
-        schemas = {i for i, schema in summary.schemas.items() if schema.name == ValueMessage.DESCRIPTOR.full_name}
-        self.topics = {c.topic[1:] for c in self.channels.values() if c.schema_id in schemas}
+        self.channels: dict[str, Channel] = {c.topic: c for c in self._file.channels.values()}
+        self.counts = {c.topic: self._file.counts.get(c.id, 0) for c in self.channels.values()}
+        self.topics = {t[1:] for t, c in self.channels.items() if self._file.schema_name(c.id) == ValueMessage.DESCRIPTOR.full_name}
+        self._chunks: dict[str, list[ChunkIndex]] = {}
 
     def overrides(self) -> list[str]:
         """The overrides of the command that made the recording."""
         return [str(text) for text in json.loads(self.metadata.get("overrides", "[]"))]
 
-    def messages(self, channel: str) -> Iterator[Message]:
-        """The messages of one channel in the order they were written."""
-        try:
-            with open(self.path, "rb") as file:
-                for _, _, message in make_reader(file, validate_crcs=True).iter_messages(topics=[channel], log_time_order=False):
-                    yield message
-        except (OSError, *DAMAGE) as error:
-            raise RecordingError(str(self.path), f"channel {channel} is damaged", "record it again") from error
+    def messages(self, channel: str) -> Iterator[tuple[int, bytes]]:
+        """(log_time, data) of the messages of one channel (with slash), in the order they were written."""
+        for chunk in self._holding(channel):
+            yield from self._file.in_chunk(chunk, self.channels[channel].id)
 
     def values(self, topic: str) -> Iterator[Value]:
         """The values of a topic in frame order."""
-        decoder = Decoder(f"{self.path}: topic /{topic}")
-        for message in self.messages(f"/{topic}"):
-            yield decoder.decode(message.data)
+        decoder = self._decoder(topic)
+        for _, data in self.messages(f"/{topic}"):
+            yield decoder.decode(data)
+
+    def frame(self, index: int) -> dict[str, Value]:
+        """What every topic holds of one frame; empty when there is none of this number. Reads only the chunks it needs."""
+        reference = self._reference(index)
+        if reference is None:
+            return {}
+        found = {topic: self.value(topic, reference.stamp_ns) for topic in sorted(self.topics)}
+        return {topic: value for topic, value in found.items() if value is not None and value.index == index}
+
+    def value(self, topic: str, stamp_ns: int) -> Value | None:
+        """The value of a topic with this stamp, or None."""
+        chain: list[bytes] = []
+        for chunk in reversed(self._holding(f"/{topic}")):
+            if not chain and not chunk.message_start_time <= stamp_ns <= chunk.message_end_time:
+                continue
+            for log_time, data in reversed(self._file.in_chunk(chunk, self.channels[f"/{topic}"].id)):
+                if chain or log_time == stamp_ns:
+                    chain.append(data)
+                if chain and is_whole(chain[-1]):
+                    decoder = self._decoder(topic)
+                    return [decoder.decode(data) for data in reversed(chain)][-1]
+        return None
+
+    def _holding(self, channel: str) -> list[ChunkIndex]:
+        """The chunks with messages of a channel (with slash), in file order."""
+        if channel not in self._chunks:
+            self._chunks[channel] = self._file.chunks(self.channels[channel].id) if channel in self.channels else []
+        return self._chunks[channel]
+
+    def _decoder(self, topic: str) -> Decoder:
+        return Decoder(f"{self.path}: topic /{topic}")
+
+    def _reference(self, index: int) -> Value | None:
+        """The FrameReference of a frame, by bisection: frame numbers grow."""
+        channel, decoder = f"/{FRAMES_TOPIC}", self._decoder(FRAMES_TOPIC)
+        chunks = self._holding(channel)
+        low, high = 0, len(chunks)
+        while low < high:
+            middle = (low + high) // 2
+            found = [decoder.decode(data) for _, data in self._file.in_chunk(chunks[middle], self.channels[channel].id)]
+            for value in found:
+                if value.index == index:
+                    return value
+            low, high = (middle + 1, high) if not found or found[-1].index < index else (low, middle)
+        return None
 
 
 class FrameReader:
     """Values of one topic whose messages stand alone (frames), in any order and from any thread."""
 
     def __init__(self, recording: Recording, topic: str) -> None:
-        self._place, self._channel = f"{recording.path}: topic /{topic}", f"/{topic}"
-        self._lock = threading.Lock()
-        self._reader = make_reader(open(recording.path, "rb"))
+        self._recording, self._topic = recording, topic
 
     def at(self, stamp_ns: int) -> Value | None:
         """The value with this stamp, or None."""
-        with self._lock:
-            found = [m.data for _, _, m in self._reader.iter_messages([self._channel], starting_at=stamp_ns, ending_at=stamp_ns)]
-        return Decoder(self._place).decode(found[0]) if found else None
+        return self._recording.value(self._topic, stamp_ns)
 
 
 class TopicReader:

@@ -19,7 +19,7 @@ from trihedron.pipeline.errors import DataError, RecordingError, StageError, Tri
 from trihedron.pipeline.foxglove import View
 from trihedron.pipeline.graph import Graph, Stage, Wire
 from trihedron.pipeline.interrupts import held_interrupts
-from trihedron.pipeline.recording import Recording, RecordingWriter, TopicReader
+from trihedron.pipeline.recording import FRAMES_TOPIC, Recording, RecordingWriter, TopicReader
 from trihedron.pipeline.scheduler import Node, NodeFailure, Scheduler, single_threaded_libraries
 from trihedron.pipeline.slots import frame_range, output_of
 from trihedron.pipeline.state import Keeper, Memory, reaches, recorded_memory
@@ -27,7 +27,6 @@ from trihedron.pipeline.timing import Timing, resident_mb
 from trihedron.pipeline.types import Frame, FrameReference, Map, Pose, Value
 
 log = logging.getLogger("trihedron")
-FRAMES_TOPIC = "frames"  # one FrameReference a frame: what a replay iterates over
 RECORDED = "recorded:"  # prefix of the node that reads a topic from the file
 UNREADABLE_SHARE = 0.1
 

@@ -210,7 +210,7 @@ def measure_growth(folder: Path, _: Sequences, overrides: Sequence[str]) -> Rows
     """One row for each quantity, with its value at both ends of SPAN; the map's with the floor it covers."""
     out = folder / "growth"
     truth = _run(out, ["dataset=synthetic", "dataset.scene=rooms", f"dataset.frames={WALK}", *overrides])[2]
-    timing = [json.loads(message.data) for message in Recording(out / "run.mcap").messages(TIMING_TOPIC)]
+    timing = [json.loads(data) for _, data in Recording(out / "run.mcap").messages(TIMING_TOPIC)]
     frames = np.array([row["index"] for row in timing])
     features = np.array([sum(row["stage_ms"].get(name, 0.0) for name in FEATURES) for row in timing])
     others = np.array([sum(row["stage_ms"].values()) - row["stage_ms"]["dataset"] for row in timing]) - features

@@ -94,8 +94,8 @@ def _image(recording: Recording, stamp_ns: int, camera: Camera) -> Any:
     messages = list(recording.messages("/view/image"))
     if not messages:
         return np.full((camera.height, camera.width, 3), 255, np.uint8)
-    nearest = min(messages, key=lambda message: abs(message.log_time - stamp_ns))
-    data = CompressedImage.FromString(nearest.data).data
+    nearest = min(messages, key=lambda message: abs(message[0] - stamp_ns))
+    data = CompressedImage.FromString(nearest[1]).data
     small = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
     return cv2.cvtColor(cv2.resize(small, (camera.width, camera.height)), cv2.COLOR_BGR2RGB)
 

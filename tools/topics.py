@@ -11,7 +11,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import IO, Any
+from typing import Any
 
 from trihedron.pipeline.errors import RecordingError
 from trihedron.tools.arguments import Parser, table
@@ -63,33 +63,17 @@ def topics_of(path: Path) -> list[Topic]:
 @contextmanager
 def _opened(path: Path) -> Iterator[Any]:
     """A reader of the file; what goes wrong with the file inside the block becomes a RecordingError."""
-    from trihedron.pipeline.recording import DAMAGE
+    from mcap.reader import SeekingReader
+
+    from trihedron.pipeline.mcap_errors import DAMAGE, damaged
 
     try:
         with open(path, "rb") as file:
-            yield _reader(file, path)
-    except OSError as error:
+            yield SeekingReader(file, validate_crcs=True, record_size_limit=path.stat().st_size)
+    except FileNotFoundError as error:
         raise RecordingError(str(path), f"cannot be read: {error.strerror}", "give the path of an MCAP file") from error
-    except DAMAGE as error:
-        raise _damaged(path) from error
-
-
-def _reader(file: IO[bytes], path: Path) -> Any:
-    from mcap.reader import make_reader
-    from mcap.writer import MCAP0_MAGIC
-
-    if file.read(len(MCAP0_MAGIC)) != MCAP0_MAGIC:
-        raise RecordingError(str(path), "is not an MCAP file", "give a file that trihedron run or another MCAP writer wrote")
-    size = file.seek(0, 2)
-    file.seek(max(0, size - len(MCAP0_MAGIC)))
-    if size < 3 * len(MCAP0_MAGIC) or file.read() != MCAP0_MAGIC:
-        raise _damaged(path)
-    file.seek(0)
-    return make_reader(file)
-
-
-def _damaged(path: Path) -> RecordingError:
-    return RecordingError(str(path), "is not a complete MCAP file", "the run that wrote it was cut off; record it again")
+    except (OSError, *DAMAGE) as error:
+        raise damaged(path) from error
 
 
 def _value_type(data: bytes) -> str:

@@ -3,26 +3,27 @@
 import io
 import json
 import sys
+import time
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
-from mcap.exceptions import McapError
 from mcap.reader import make_reader
-from mcap.records import Chunk, Message, Metadata
+from mcap.records import Chunk, Metadata
 from mcap.stream_reader import StreamReader
 from mcap.writer import Writer
 from mcap_protobuf.decoder import DecoderFactory
 
-from trihedron.pipeline import recording as module
+from trihedron.pipeline import chunk_writer as module
 from trihedron.pipeline.errors import RecordingError
 from trihedron.pipeline.foxglove import MOST_VERTICES, View
 from trihedron.pipeline.recording import FrameReader, Recording, RecordingWriter, TopicReader
-from trihedron.pipeline.types import Planes, Segments, Surface
+from trihedron.pipeline.table import Column, Table
+from trihedron.pipeline.types import FrameReference, Map, Planes, Segments, Surface
 
 sys.path.insert(0, str(Path(__file__).parent))
-from toys import ToyDataset, ToyKeypoints
+from toys import CAMERA, ToyDataset, ToyKeypoints
 
 
 def keypoints(index):
@@ -57,21 +58,33 @@ def test_chunks_close_by_size_and_by_time(tmp_path, monkeypatch):
     many = chunks(write(tmp_path / "size.mcap", [i for _ in range(4) for i in range(38) if i % 5 != 4]))
     assert len(many) > 5 and max(c.uncompressed_size for c in many) < 5_000
     monkeypatch.setattr(module, "CHUNK_BYTES", 1 << 20)
-    monkeypatch.setattr(module, "CHUNK_SECONDS", 0.0)
-    assert len(chunks(write(tmp_path / "time.mcap", [0, 1, 2, 3]))) == 8
-
-
-def test_what_is_flushed_survives_a_cut(tmp_path, monkeypatch):
-    monkeypatch.setattr(module, "CHUNK_SECONDS", 0.0)
-    writer = RecordingWriter(tmp_path / "a.mcap", {})
+    monkeypatch.setattr(module, "CHUNK_SECONDS", 0.01)
+    writer = RecordingWriter(tmp_path / "time.mcap", {})
     for i in (0, 1, 2):
         writer.write("keypoints", keypoints(i))
-    stream = StreamReader(io.BytesIO((tmp_path / "a.mcap").read_bytes())).records
-    messages = 0
-    with pytest.raises(McapError):  # the end is missing, as after a kill
-        for record in stream:
-            messages += isinstance(record, Message)
-    assert messages == 3
+        time.sleep(0.1)
+    writer.close()
+    assert len(chunks(tmp_path / "time.mcap")) == 3
+
+
+def test_one_frame_is_read_alone(tmp_path, monkeypatch):
+    """Of a topic that is written as changes, with the messages it builds on; others are found by their stamps."""
+    monkeypatch.setattr(module, "CHUNK_BYTES", 3_000)
+    writer, empty = RecordingWriter(tmp_path / "a.mcap", {}), Table.empty({"x": Column("f8")})
+    points = Table.empty({"x": Column("f8")})
+    for i in range(60):
+        points, _ = points.appended(x=np.full(10, float(i)))
+        writer.write("frames", FrameReference(i, 1000 * i, CAMERA))
+        if i % 3:
+            writer.write("keypoints", keypoints(i if i % 5 != 4 else i - 1))
+        writer.write("map", Map(i, 1000 * i, i, empty, points, empty, empty, empty, empty, empty))
+    writer.close()
+    recording = Recording(tmp_path / "a.mcap")
+    for i in (0, 1, 30, 49, 50, 59):
+        frame = recording.frame(i)
+        assert set(frame) == {"frames", "map", *(["keypoints"] if i % 3 and i % 5 != 4 else [])} and all(v.index == i for v in frame.values())
+        assert frame["map"].points.column("x").tolist() == np.repeat(np.arange(i + 1.0), 10).tolist()
+    assert recording.frame(60) == {}
 
 
 def test_topics_and_values(tmp_path):
@@ -84,7 +97,7 @@ def test_topics_and_values(tmp_path):
     assert reader.at(5).index == 5 and reader.at(9) is None
     frames = FrameReader(recording, "keypoints")
     assert [frames.at(1000 * i).index for i in (5, 0, 2)] == [5, 0, 2] and frames.at(4000) is None
-    timing = [json.loads(m.data) for m in recording.messages("/timing")]
+    timing = [json.loads(data) for _, data in recording.messages("/timing")]
     assert timing[1] == {"index": 1, "frame_ms": 1.5, "stage_ms": {"keypoints": 1.25}, "memory_mb": 250.0}
 
 
@@ -94,14 +107,16 @@ def test_wrong_files_say_so_in_one_line(tmp_path):
             Recording(path)
         return str(error.value).replace(str(tmp_path), "DIR")
 
-    assert refusal(tmp_path / "no.mcap") == "DIR/no.mcap: cannot be read: No such file or directory; give the path of a run.mcap"
+    assert refusal(tmp_path / "no.mcap") == "DIR/no.mcap: cannot be read: No such file or directory; give the path of an MCAP file"
     whole = write(tmp_path / "a.mcap", range(4)).read_bytes()
     (tmp_path / "cut.mcap").write_bytes(whole[: len(whole) // 2])
-    assert refusal(tmp_path / "cut.mcap") == "DIR/cut.mcap: is not a complete MCAP file; the run that wrote it was cut off; record it again"
+    assert refusal(tmp_path / "cut.mcap") == (
+        "DIR/cut.mcap: is not a complete MCAP file: what wrote it was cut off; rescue what is whole with: trihedron recover DIR/cut.mcap"
+    )
     (tmp_path / "text.mcap").write_text("not an MCAP file")
-    assert refusal(tmp_path / "text.mcap").startswith("DIR/text.mcap: is not a complete MCAP file")
+    assert refusal(tmp_path / "text.mcap").startswith("DIR/text.mcap: is not an MCAP file")
     (tmp_path / "empty.mcap").write_bytes(b"")
-    assert refusal(tmp_path / "empty.mcap").startswith("DIR/empty.mcap: is not a complete MCAP file")
+    assert refusal(tmp_path / "empty.mcap").startswith("DIR/empty.mcap: is not an MCAP file")
     with open(tmp_path / "other.mcap", "wb") as file:
         other = Writer(file)
         other.start()

@@ -8,7 +8,7 @@ from trihedron.pipeline.recording import RecordingWriter
 from trihedron.pipeline.types import Camera, FrameReference
 
 CAMERA = Camera(640, 480, 525.0, 525.0, 320.0, 240.0)
-CUT = "is not a complete MCAP file; the run that wrote it was cut off; record it again"
+CUT = "is not a complete MCAP file: what wrote it was cut off; rescue what is whole with: trihedron recover"
 
 
 @pytest.fixture
@@ -50,7 +50,7 @@ def test_a_truncated_file(recording, capsys, share):
     data = recording.read_bytes()
     recording.write_bytes(data[: int(share * len(data))])
     assert main(["topics", str(recording)]) == 1
-    assert capsys.readouterr().err == f"trihedron: {recording}: {CUT}\n"
+    assert capsys.readouterr().err == f"trihedron: {recording}: {CUT} {recording}\n"
 
 
 def test_damage_in_the_middle(recording, capsys):
@@ -58,7 +58,7 @@ def test_damage_in_the_middle(recording, capsys):
     data[len(data) // 3 : len(data) // 3 + 200] = bytes(200)
     recording.write_bytes(data)
     assert main(["topics", str(recording)]) == 1
-    assert capsys.readouterr().err == f"trihedron: {recording}: {CUT}\n"
+    assert capsys.readouterr().err == f"trihedron: {recording}: is damaged; rescue what is whole with: trihedron recover {recording}\n"
 
 
 def test_other_files(tmp_path, capsys):

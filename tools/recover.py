@@ -1,0 +1,134 @@
+"""Give a recording that was cut off, or damaged, its index again: every message that is whole is kept, with metadata and attachments.
+
+Works on any MCAP file. Without --out the file itself is replaced, once the new one is complete.
+
+Example: trihedron recover runs/latest/run.mcap
+"""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import IO, Any
+
+from mcap.records import Attachment, Channel, Chunk, Message, Metadata, Schema
+from mcap.stream_reader import StreamReader, breakup_chunk
+from mcap.writer import MCAP0_MAGIC, CompressionType, Writer
+
+from trihedron.pipeline.chunk_writer import CHUNK_BYTES, is_being_written
+from trihedron.pipeline.errors import DataError, RecordingError
+from trihedron.pipeline.mcap_errors import DAMAGE, damaged
+from trihedron.tools.arguments import Parser
+
+
+@dataclass
+class Rescued:
+    """What was kept of a file, with log times in ns, and what was not: chunks that are damaged inside, bytes beyond the last record."""
+
+    messages: int = 0
+    topics: set[str] = field(default_factory=set)
+    first_ns: int = 0
+    last_ns: int = 0
+    damaged_chunks: int = 0
+    lost_bytes: int = 0
+
+    def __str__(self) -> str:
+        times = f", {self.first_ns / 1e9:.3f} to {self.last_ns / 1e9:.3f} s" if self.messages else ""
+        lost = [f"{self.damaged_chunks} damaged chunks"] if self.damaged_chunks else []
+        lost += [f"the last {self.lost_bytes} bytes"] if self.lost_bytes else []
+        return f"{self.messages} messages on {len(self.topics)} topics{times}" + (f"; lost: {', '.join(lost)}" if lost else "; nothing was lost")
+
+
+def main(argv: list[str]) -> int:
+    """Run the command; returns the exit code. Raises RecordingError for a file that is missing, in use or no MCAP, DataError where nothing can be
+    written."""
+    parser = Parser("recover", __name__)
+    parser.add_argument("file", metavar="FILE.mcap", type=Path)
+    parser.add_argument("--out", metavar="FILE", type=Path, help="write this file and leave the other as it is")
+    arguments = parser.parse_args(argv)
+    out: Path = arguments.out or arguments.file
+    print(f"{out}: {recover(arguments.file, out)}")
+    return 0
+
+
+def recover(path: Path, out: Path) -> Rescued:
+    """Write what is whole of the file `path` to `out`, which may be the same. Errors as of `main`."""
+    partial = out.with_name(out.name + ".part")
+    try:
+        source = open(path, "rb")
+    except OSError as error:
+        raise RecordingError(str(path), f"cannot be read: {error.strerror}", "give the path of an MCAP file") from error
+    with source:
+        if source.read(len(MCAP0_MAGIC)) != MCAP0_MAGIC or is_being_written(source.fileno()):
+            raise damaged(path)
+        source.seek(0)
+        try:
+            with open(partial, "wb") as file:
+                found = _copy(source, path.stat().st_size, file)
+            os.replace(partial, out)
+        except OSError as error:
+            partial.unlink(missing_ok=True)
+            raise DataError(str(out), f"cannot be written: {error.strerror}", "give another --out") from error
+    return found
+
+
+def _copy(source: IO[bytes], size: int, file: IO[bytes]) -> Rescued:
+    """Record after record, until one is not whole."""
+    writer: Any = Writer(file, chunk_size=CHUNK_BYTES, compression=CompressionType.LZ4)
+    writer.start(library="trihedron")
+    copy, end = _Copy(writer), 0
+    try:
+        for record in StreamReader(source, emit_chunks=True, record_size_limit=size).records:
+            end = source.tell()
+            copy.add(record)
+        end = size
+    except DAMAGE:
+        copy.found.lost_bytes = size - end
+    writer.finish()
+    return copy.found
+
+
+class _Copy:
+    """Writes records again, channels and schemas under the numbers of the new file."""
+
+    def __init__(self, writer: Any) -> None:
+        self._writer = writer
+        self._schemas: dict[int, Schema] = {}
+        self._channels: dict[int, Channel] = {}
+        self._schema_ids: dict[int, int] = {0: 0}
+        self._channel_ids: dict[int, int] = {}
+        self.found = Rescued()
+
+    def add(self, record: Any) -> None:
+        """Take one record; indexes, statistics and the like are made anew."""
+        if isinstance(record, Chunk):
+            try:
+                for inner in breakup_chunk(record, validate_crc=True):
+                    self.add(inner)
+            except DAMAGE:
+                self.found.damaged_chunks += 1
+        elif isinstance(record, Metadata):
+            self._writer.add_metadata(record.name, record.metadata)
+        elif isinstance(record, Attachment):
+            self._writer.add_attachment(record.create_time, record.log_time, record.name, record.media_type, record.data)
+        elif isinstance(record, Schema):
+            self._schemas[record.id] = record
+        elif isinstance(record, Channel):
+            self._channels[record.id] = record
+        elif isinstance(record, Message) and record.channel_id in self._channels:
+            self._message(record)
+
+    def _message(self, message: Message) -> None:
+        channel, found = self._channels[message.channel_id], self.found
+        if channel.schema_id not in self._schema_ids:
+            schema = self._schemas[channel.schema_id]
+            self._schema_ids[channel.schema_id] = self._writer.register_schema(schema.name, schema.encoding, schema.data)
+        if channel.id not in self._channel_ids:
+            schema_id = self._schema_ids[channel.schema_id]
+            self._channel_ids[channel.id] = self._writer.register_channel(channel.topic, channel.message_encoding, schema_id, channel.metadata)
+        self._writer.add_message(self._channel_ids[channel.id], message.log_time, message.data, message.publish_time, message.sequence)
+        found.first_ns = min(found.first_ns, message.log_time) if found.messages else message.log_time
+        found.last_ns = max(found.last_ns, message.log_time)
+        found.messages += 1
+        found.topics.add(channel.topic)
