@@ -91,7 +91,7 @@ class ChunkWriter:
                 self._handed.notify_all()
             if waiting:
                 with self._writing:
-                    self._guarded(lambda messages=waiting: self._write(messages))  # type: ignore[misc]
+                    self._guarded(lambda messages=waiting: self._write(messages))
 
     def _write(self, messages: list[tuple[int, int, bytes]]) -> None:
         for channel, stamp_ns, data in messages:
@@ -150,7 +150,7 @@ class _Descriptor:
         os.close(self._descriptor)
 
 
-def _locked(path: Path) -> _Descriptor:
+def _locked(path: Path) -> Any:
     """The file, emptied, for this process alone."""
     try:
         descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o666)
