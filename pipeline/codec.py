@@ -65,8 +65,10 @@ class Encoder:
         self._count += 1
         for name, item, image in _items(value):
             if isinstance(item, Table):
-                known = self._tables.get(name)
-                _put_table(message, name, item, None if full or known is None or known.schema != item.schema else known)
+                known = None if full else self._tables.get(name)
+                if known is not None and (known.schema != item.schema or known.size > item.size):  # another table
+                    known = None
+                _put_table(message, name, item, known)
                 self._tables[name] = item
             else:
                 put_array(message, name, item, image)

@@ -1,0 +1,98 @@
+"""Two recordings are compared value by value."""
+
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from trihedron.pipeline.cli import main
+from trihedron.pipeline.recording import RecordingWriter
+from trihedron.pipeline.table import Column, Table
+from trihedron.pipeline.types import FrameReference, Map, Pose
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "pipeline"))
+from toys import CAMERA
+
+
+def pose(index, **changes):
+    found = Pose(index, 1000 * index, np.eye(4), np.eye(6), np.eye(4), -1, np.zeros(3, np.int32), 0, "ok", "")
+    return replace(found, **changes)
+
+
+def version(index, rows):
+    empty = Table.empty({"x": Column("f8")})
+    points = empty.appended(x=np.array(rows, float))[0]
+    return Map(index, 1000 * index, index, empty, points, empty, empty, empty, empty, empty)
+
+
+def record(path, indices, poses=None, maps=None, topics=("pose", "map")):
+    writer = RecordingWriter(path, {})
+    for i in indices:
+        writer.write("frames", FrameReference(i, 1000 * i, CAMERA))
+        if "pose" in topics:
+            writer.write("pose", (poses or {}).get(i, pose(i)))
+        if "map" in topics and i % 2 == 0:
+            writer.write("map", (maps or {}).get(i, version(i, np.arange(i + 1))))
+    writer.close()
+    return str(path)
+
+
+def diff(capsys, *words):
+    code = main(["diff", *words])
+    said = capsys.readouterr()
+    return code, (said.out + said.err).splitlines()
+
+
+def test_equal_recordings_of_different_ranges_and_topics(tmp_path, capsys):
+    a, b = record(tmp_path / "a.mcap", range(10)), record(tmp_path / "b.mcap", range(4, 15))
+    assert diff(capsys, a, a) == (0, ["equal: 10 frames (0..9) of pose, map"])
+    assert diff(capsys, a, b) == (0, ["equal: 6 frames (4..9) of pose, map"])
+    c = record(tmp_path / "c.mcap", range(3), topics=("pose",))
+    assert diff(capsys, c, a) == (0, [f"{c} has no map", "equal: 3 frames (0..2) of pose"])
+
+
+def test_the_first_difference_is_named_with_its_size(tmp_path, capsys):
+    moved = np.eye(4)
+    moved[0, 3] = 0.25
+    poses = {5: pose(5, T_world_camera=moved), 7: pose(7, status="lost")}
+    a = record(tmp_path / "a.mcap", range(10))
+    b = record(tmp_path / "b.mcap", range(10), poses, {4: version(4, [0, 1, 2, 3, 4.5]), 6: version(6, np.arange(7) * 2)})
+    code, lines = diff(capsys, a, b)
+    assert code == 1 and lines[0] == "map, frame 4, points.x: up to 0.5 in 1 of 5, first at [4]"
+    assert lines[2].split() == ["pose", "5", "T_world_camera", "up", "to", "0.25", "in", "1", "of", "16,", "first", "at", "[0,", "3]", "2"]
+    assert lines[3].split() == ["map", "4", "points.x", "up", "to", "0.5", "in", "1", "of", "5,", "first", "at", "[4]", "2"]
+    code, lines = diff(capsys, a, b, "--topics", "pose")
+    assert code == 1 and lines[0] == "pose, frame 5, T_world_camera: up to 0.25 in 1 of 16, first at [0, 3]" and len(lines) == 3
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ({"status": "lost"}, "pose, frame 3, status: 'ok' and 'lost'"),
+        ({"reference": 4}, "pose, frame 3, reference: up to 5 in 1 of 1"),
+        ({"inliers": np.array([0, 2, 0], np.int32)}, "pose, frame 3, inliers: up to 2 in 1 of 3, first at [1]"),
+        ({"covariance": np.eye(6) + np.diag([0, 0, 1e-12, 0, 0, 0])}, "pose, frame 3, covariance: up to 1e-12 in 1 of 36, first at [2, 2]"),
+    ],
+)
+def test_fields(tmp_path, capsys, change, said):
+    a, b = record(tmp_path / "a.mcap", range(5)), record(tmp_path / "b.mcap", range(5), {3: pose(3, **change)})
+    code, lines = diff(capsys, a, b)
+    assert code == 1 and lines[0] == said
+
+
+def test_a_value_that_one_lacks_and_nothing_in_common(tmp_path, capsys):
+    a, b = record(tmp_path / "a.mcap", range(5)), record(tmp_path / "b.mcap", range(5), topics=("map",))
+    assert diff(capsys, a, b)[0] == 0
+    code, lines = diff(capsys, a, b, "--topics", "pose")
+    assert code == 1 and lines == ["trihedron: --topics pose: is not a topic of both recordings; known: map"]
+    c = record(tmp_path / "c.mcap", range(7, 9))
+    assert diff(capsys, a, c)[1] == [f"trihedron: {a}, {c}: have no frame in common; compare two runs over the same frames"]
+    writer = RecordingWriter(tmp_path / "d.mcap", {})
+    for i in range(5):
+        writer.write("frames", FrameReference(i, 1000 * i, CAMERA))
+        if i != 2:
+            writer.write("pose", pose(i))
+    writer.close()
+    assert diff(capsys, a, str(tmp_path / "d.mcap"))[1][1] == "pose, frame 2, value: only in the first"
