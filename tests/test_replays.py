@@ -1,4 +1,4 @@
-"""Replay as a promise: every stage of every graph that is shipped, run again alone, gives the recorded values, whatever the range and the feedback."""
+"""Replay as a promise: every stage of every graph that is shipped, run again alone, gives the recorded values, for any range and either feedback."""
 
 import json
 import subprocess
@@ -34,7 +34,8 @@ def run(*jobs, cwd):
 def test_every_stage_of_every_graph_gives_its_values_again(graph, tmp_path, capsys):
     """The whole recording with new and with recorded feedback byte for byte, a range of it value by value."""
     source = tmp_path / "run" / "run.mcap"
-    words = ["dataset=synthetic", f"dataset.length={FRAMES}", "dataset.width=320", "dataset.height=240", "record.frames=true", "record.topics=[normals]"]
+    words = ["dataset=synthetic", f"dataset.length={FRAMES}", "dataset.width=320", "dataset.height=240"]
+    words += ["record.frames=true", "record.topics=[normals]"]
     run([f"graph={graph}", *words, f"out={tmp_path}/run", "outputs=[trajectory,surface]"], cwd=tmp_path)
     recorded, stages = contents(source), sorted(Recording(source).topics - {"frames"})
     assert {"dataset", "pose"} <= set(stages) and len(recorded["/pose"]) == FRAMES
