@@ -41,6 +41,7 @@ PRESETS = {
     "tum_fr1": _vga(517.3, 516.5, 318.6, 255.3, 0.2624, -0.9531, -0.0054, 0.0026, 1.1633),
     "tum_fr2": _vga(520.9, 521.0, 325.1, 249.7, 0.2312, -0.7849, -0.0033, -0.0001, 0.9172),
     "tum_fr3": _vga(535.4, 539.2, 320.1, 247.6),
+    "seven_scenes": Calibration(Camera(640, 480, 585.0, 585.0, 320.0, 240.0), 1000.0),  # published with the data set
     "icl_nuim": _vga(481.2, 480.0, 319.5, 239.5),  # published with fy = -480; the reader reflects the poses instead
 }
 FOLDER_NAMES = {  # how the published archives are called

@@ -50,3 +50,17 @@ def associate(first_ns: Stamps, second_ns: Stamps, max_difference_ns: int) -> ND
     Returns the (n, 2) row numbers of the pairs, in order of time; the difference of a pair is below `max_difference_ns`. Ties go to the
     earlier row, so the result does not depend on anything but the stamps."""
     return nearest_pairs(first_ns, second_ns, max_difference_ns - 1)
+
+
+def listed_pairs(folder: Path, max_difference_ms: float, depth_delay_ms: float) -> tuple[Stamps, list[Path], list[Path]]:
+    """The pairs of rgb.txt and depth.txt, by time: stamps of colour, colour files, depth files. Depth is taken `depth_delay_ms` later than its
+    stamps say. Raises DataError where a list is missing or nothing pairs."""
+    for name, kind in (("rgb.txt", "colour"), ("depth.txt", "depth")):
+        if not (folder / name).is_file():
+            raise DataError(str(folder / name), "is missing", f"it lists the {kind} images; without lists use dataset=folder")
+    color, depth = read_file_list(folder / "rgb.txt"), read_file_list(folder / "depth.txt")
+    pairs = associate(color.stamps_ns, depth.stamps_ns + round(depth_delay_ms * 1e6), round(max_difference_ms * 1e6))
+    if not len(pairs):
+        cause = f"no colour and depth image are within {max_difference_ms:g} ms of each other"
+        raise DataError(str(folder), cause, "check the stamps in rgb.txt and depth.txt or raise dataset.max_difference_ms")
+    return color.stamps_ns[pairs[:, 0]], [color.files[i] for i in pairs[:, 0]], [depth.files[i] for i in pairs[:, 1]]

@@ -27,7 +27,8 @@ DepthReader = Callable[[Path], F32]
 @dataclass(frozen=True)
 class ImageSequence:
     """Pairs of files with their stamps, and what turns a pair into a Frame. `first` is the number of the first pair in the whole data set;
-    `depth_reader` replaces the reading of 16-bit images. Nothing is kept of a frame: memory does not grow with the sequence."""
+    `depth_reader` replaces the reading of 16-bit images, `color_reader` that of colour. Nothing is kept of a frame: memory does not grow with
+    the sequence."""
 
     stamps_ns: NDArray[np.int64]
     color_files: Sequence[Path]
@@ -36,6 +37,7 @@ class ImageSequence:
     truth: Trajectory | None = None
     first: int = 0
     depth_reader: DepthReader | None = None
+    color_reader: Callable[[Path], U8] = read_color
 
     def __len__(self) -> int:
         return len(self.stamps_ns)
@@ -43,7 +45,7 @@ class ImageSequence:
     def frame(self, position: int) -> Frame | None:
         """Read pair `position`, undistorted; None, after one warning, when a file cannot be read. Raises DataError for images of a wrong kind."""
         try:
-            color = self._read(self.color_files[position], read_color)
+            color = self._read(self.color_files[position], self.color_reader)
             depth = self._read(self.depth_files[position], self.depth_reader or self._read_depth)
         except UnreadableImage as error:
             log.warning("%s; frame %d is skipped", error, self.first + position)

@@ -6,10 +6,9 @@ from dataclasses import dataclass
 from functools import cached_property
 
 from trihedron.datasets.cameras import choose_calibration, with_noise
-from trihedron.datasets.lists import associate, read_file_list
+from trihedron.datasets.lists import listed_pairs
 from trihedron.datasets.sequence import ImageSequence, SequenceReader, open_folder, select_frames
 from trihedron.datasets.trajectories import TRUTH, read_trajectory
-from trihedron.pipeline.errors import DataError
 from trihedron.pipeline.registry import register
 from trihedron.pipeline.slots import frame_range
 
@@ -35,20 +34,9 @@ class Tum(SequenceReader):
     @cached_property
     def _sequence(self) -> ImageSequence:
         folder = open_folder(self.path)
-        for name, kind in (("rgb.txt", "colour"), ("depth.txt", "depth")):
-            if not (folder / name).is_file():
-                raise DataError(str(folder / name), "is missing", f"it lists the {kind} images; without lists use dataset=folder")
-        color, depth = read_file_list(folder / "rgb.txt"), read_file_list(folder / "depth.txt")
-        taken_ns = depth.stamps_ns + round(self.depth_delay_ms * 1e6)
-        pairs = associate(color.stamps_ns, taken_ns, round(self.max_difference_ms * 1e6))
-        if not len(pairs):
-            cause = f"no colour and depth image are within {self.max_difference_ms:g} ms of each other"
-            raise DataError(str(folder), cause, "check the stamps in rgb.txt and depth.txt or raise dataset.max_difference_ms")
         truth = folder / TRUTH
         whole = ImageSequence(
-            color.stamps_ns[pairs[:, 0]],
-            [color.files[i] for i in pairs[:, 0]],
-            [depth.files[i] for i in pairs[:, 1]],
+            *listed_pairs(folder, self.max_difference_ms, self.depth_delay_ms),
             with_noise(choose_calibration(folder, self.camera), self.exact_depth),
             read_trajectory(truth) if truth.is_file() else None,
         )

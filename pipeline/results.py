@@ -62,6 +62,8 @@ def write_results(out: Path, result: Result, truth: Trajectory | None) -> dict[s
         "untied": sum(pose.status != LOST and not is_tied(pose, result.map) for pose in result.poses),
         "status": {status: sum(pose.status == status for pose in result.poses) for status in (OK, DEGRADED, LOST)},
     }
+    if len(final):  # of a walk that ends where it began, the drift
+        metrics["start_to_end_m"] = float(np.linalg.norm(final.poses[-1, :3, 3] - final.poses[0, :3, 3]))
     if truth is not None:
         stamps = np.array(result.stamps_ns, np.int64)
         try:

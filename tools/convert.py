@@ -56,6 +56,12 @@ def layout_of(source: Path) -> str:
         return "tum"
     if (source / "associations.txt").is_file() or any(source.glob("*.freiburg")) or any(source.glob("scene_*.depth")):
         return "icl_nuim"
+    if any(source.glob("frame-*.color.png")):
+        return "seven_scenes"
+    if (source / "traj.txt").is_file() and (source / "results").is_dir():
+        return "replica"
+    if (source / "intrinsic" / "intrinsic_depth.txt").is_file():
+        return "scannet"
     return "folder"
 
 
