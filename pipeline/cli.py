@@ -36,6 +36,8 @@ Usage: trihedron run [-m] [key=value ...]
   replay=FILE.mcap only=[STAGE,...]  compute these stages again, read the rest from a recording
   save_map=FILE.mcap                 keep the map, to go on from    load_map=FILE.mcap  go on from it, or find the camera in it
   localise_only=true                 the loaded map stays as it is
+  live=true                          play the data set in real time; frames that come while it is busy are dropped, latency is reported
+  real_time=true                     the same without dropping any
   feedback=recorded                  delayed wires of recomputed stages see the recorded past
   -m                                 sweep over comma-separated values
   report=COMMAND                     what to do with the folder of a sweep at its end, for example: report="benchmark rotations"
@@ -154,7 +156,7 @@ def _with_recorded(words: list[str]) -> list[str]:
         return words
     from trihedron.pipeline.recording import Recording
 
-    own = ("out=", "replay=", "only=", "feedback=", "save_map=", "report=")  # of each run
+    own = ("out=", "replay=", "only=", "feedback=", "save_map=", "report=", "live=", "real_time=")  # of each run
     return [word for word in Recording(source).overrides() if not word.startswith(own)] + words
 
 

@@ -67,6 +67,8 @@ class RunOptions:
     save_map: str = ""  # write the map, and all that is needed to go on, to this file
     load_map: str = ""  # go on from such a file
     localise_only: bool = False  # the loaded map stays as it is
+    live: bool = False  # frames come at the camera's rate, and those for which the run comes too late are dropped
+    real_time: bool = False  # frames come at the camera's rate, none is dropped
     hydra: Any = dataclasses.field(
         default_factory=lambda: {"run": {"dir": "${out}"}, "sweep": {"dir": "${out}", "subdir": "${hydra.job.num}"}, "output_subdir": ".hydra"}
     )

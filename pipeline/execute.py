@@ -22,8 +22,10 @@ from trihedron.pipeline.config import Feedback, graph_of
 from trihedron.pipeline.errors import ConfigError, DataError, RecordingError, TrihedronError, did_you_mean
 from trihedron.pipeline.graph import Graph
 from trihedron.pipeline.interrupts import held_interrupts
+from trihedron.pipeline.live import Pace, is_camera
 from trihedron.pipeline.recording import Recording, RecordingWriter
-from trihedron.pipeline.runner import Replay, Runner, Step
+from trihedron.pipeline.runner import Runner
+from trihedron.pipeline.runs import Replay, Step
 from trihedron.pipeline.slots import output_of
 from trihedron.pipeline.state import Memory, load_map, reaches
 from trihedron.pipeline.types import Surface, Trajectory
@@ -44,7 +46,7 @@ def execute(config: DictConfig, out: Path, overrides: list[str], began: float) -
     replay = _replay(config, graph)
     frames = str(config.dataset.get("frames", "")) if config.dataset is not None else ""
     remembered, source = _remembered(config, graph), _source(config)
-    runner = Runner(graph, config.seed, config.threads, replay, frames, remembered)
+    runner = Runner(graph, config.seed, config.threads, replay, frames, remembered, _pace(config))
     topics = _recorded_topics(config, graph, replay)
     _announce(runner)
     with _Warnings() as warnings:
@@ -57,7 +59,7 @@ def execute(config: DictConfig, out: Path, overrides: list[str], began: float) -
             writer.attach(name, text)
         started = time.perf_counter()
         try:
-            for _ in _progress(runner.steps(writer, topics, embed_frames=config.record.frames)):
+            for _ in _progress(runner.steps(writer, topics, embed_frames="dataset" in topics)):
                 pass
             if config.save_map:
                 runner.keeper.save(Path(config.save_map).expanduser(), _metadata(config, overrides), source)
@@ -97,6 +99,14 @@ def _remembered(config: DictConfig, graph: Graph) -> Callable[[int], Memory] | N
     return lambda first: saved.memory(first, source)
 
 
+def _pace(config: DictConfig) -> Pace:
+    if (config.live or config.real_time) and config.replay:
+        raise ConfigError("live" if config.live else "real_time", "a replay has its frames already", "leave it out")
+    if config.live and config.real_time:
+        raise ConfigError("real_time", "a live run is in real time, and drops frames", "give one of the two")
+    return Pace.live if config.live else Pace.real_time if config.real_time else Pace.none
+
+
 def _source(config: DictConfig) -> str:
     """What is tracked, whichever part of it: the data set's options with absolute paths."""
     options: Any = OmegaConf.to_container(config.dataset, resolve=True, enum_to_str=True) if config.dataset is not None else {}
@@ -122,7 +132,7 @@ def _recorded_topics(config: DictConfig, graph: Graph, replay: Replay | None) ->
         if name not in graph.stages:
             raise ConfigError("record.topics", f"no stage writes '{name}'", did_you_mean(name, graph.stages))
     names = {name for name in graph.stages if not output_of(name).dense} | set(config.record.topics)
-    names |= {"dataset"} if config.record.frames else set()
+    names |= {"dataset"} if config.record.frames or is_camera(graph.stages["dataset"].plugin) else set()  # a camera shows no frame twice
     return frozenset(names if replay is None else names & set(replay.only))
 
 
@@ -162,7 +172,7 @@ def _commit() -> str:
 
 def _warm_up(runner: Runner) -> None:
     """Call every stage on the first frames so that kernels are loaded; what goes wrong here is reported by the run itself."""
-    runner.indices = runner.indices[:WARM_UP_FRAMES]
+    runner.count = min(runner.count, WARM_UP_FRAMES)
     try:
         for _ in runner.steps(None, frozenset()):
             pass

@@ -85,6 +85,14 @@ def parameters_of_method(slot: str, plugin: type) -> list[str]:
     return [name for name in names if name not in ("self", "state") and not (slot == "dataset" and name == "index")]
 
 
+def check_value(slot: str, value: Any, index: int) -> None:
+    """Raise TypeError or ValueError unless a plugin returned its slot's type, with the frame's index on it."""
+    if not isinstance(value, output_of(slot)):
+        raise TypeError(f"returned {type(value).__name__}, the slot's type is {output_of(slot).__name__}")
+    if value.index != index:
+        raise ValueError(f"returned a {type(value).__name__} of frame {value.index} at frame {index}")
+
+
 def plugin_class(slot: str, name: str) -> type[Any]:
     """The class registered under slot and name. Raises PluginError with the closest names otherwise."""
     if slot not in SLOTS:

@@ -14,7 +14,7 @@ from trihedron.pipeline.errors import DataError
 from trihedron.pipeline.metrics import associate, evaluate_trajectory
 from trihedron.pipeline.plot import trajectory_figure
 from trihedron.pipeline.ply import triangle_planes, write_ply
-from trihedron.pipeline.runner import Result
+from trihedron.pipeline.runs import Result
 from trihedron.pipeline.types import DEGRADED, LOST, OK, Map, Pose, Surface, Trajectory
 
 TRAJECTORY, CAUSAL, TIMING, METRICS, PLOT = "trajectory.txt", "trajectory_causal.txt", "timing.json", "metrics.json", "trajectory.png"

@@ -9,8 +9,8 @@ from __future__ import annotations
 import logging
 import time
 import zlib
-from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from typing import Any
 
 import numpy as np
@@ -19,9 +19,12 @@ from trihedron.pipeline.errors import DataError, RecordingError, StageError, Tri
 from trihedron.pipeline.foxglove import View
 from trihedron.pipeline.graph import Graph, Stage, Wire
 from trihedron.pipeline.interrupts import held_interrupts
-from trihedron.pipeline.recording import FRAMES_TOPIC, Recording, RecordingWriter, TopicReader
-from trihedron.pipeline.scheduler import Node, NodeFailure, Scheduler, single_threaded_libraries
-from trihedron.pipeline.slots import frame_range, output_of
+from trihedron.pipeline.live import Pace, feed_of, is_camera
+from trihedron.pipeline.recording import FRAMES_TOPIC, RecordingWriter, TopicReader
+from trihedron.pipeline.registry import check_value
+from trihedron.pipeline.runs import Replay, Result, Step
+from trihedron.pipeline.scheduler import Node, NodeFailure, NoMoreFrames, Scheduler, single_threaded_libraries
+from trihedron.pipeline.slots import frame_range
 from trihedron.pipeline.state import Keeper, Memory, reaches, recorded_memory
 from trihedron.pipeline.timing import Timing, resident_mb
 from trihedron.pipeline.types import Frame, FrameReference, Map, Pose, Value
@@ -29,38 +32,7 @@ from trihedron.pipeline.types import Frame, FrameReference, Map, Pose, Value
 log = logging.getLogger("trihedron")
 RECORDED = "recorded:"  # prefix of the node that reads a topic from the file
 UNREADABLE_SHARE = 0.1
-
-
-@dataclass(frozen=True)
-class Replay:
-    """A recording to read from, the stages to compute again, and whether delayed wires of those see the recorded past."""
-
-    recording: Recording
-    only: tuple[str, ...]
-    recorded_feedback: bool = False
-
-
-@dataclass
-class Result:
-    """What a run leaves in memory: poses in frame order, the last map, results of folds, counts."""
-
-    poses: list[Pose] = field(default_factory=list)
-    map: Map | None = None
-    loaded_keyframes: int = 0  # of another run, whose numbers say nothing here
-    folds: dict[str, Value] = field(default_factory=dict)
-    stamps_ns: list[int] = field(default_factory=list)  # of every readable frame
-    unreadable: int = 0
-    fps: float = 30.0  # nominal, of the camera
-
-
-@dataclass(frozen=True)
-class Step:
-    """One finished frame, as handed to whoever watches the run (progress, tests)."""
-
-    position: int
-    count: int
-    index: int
-    values: Mapping[str, Value | None]
+FRAME_TAKEN = "dataset:"  # input of every stage of a live run: which frame it is must be known first
 
 
 class Runner:
@@ -74,12 +46,15 @@ class Runner:
         replay: Replay | None = None,
         frames: str = "",
         remembered: Callable[[int], Memory] | None = None,
+        pace: Pace = Pace.none,
     ) -> None:
-        """`remembered` says what is known before the frame of a given number."""
+        """`remembered` says what is known before the frame of a given number, `pace` when frames may be asked for."""
         self.graph, self.seed, self.threads, self.replay = graph, seed, threads, replay
         self.result, self.timing = Result(), Timing()
         self.computed = self._computed()
+        self.feed = feed_of(graph.stages["dataset"].plugin, pace) if replay is None else None
         self.indices, self._stamps = self._frames(frames)
+        self.count = len(self.indices)  # of frames, at most
         self._first = frame_range(frames)[0]
         self._memory = remembered(self.indices[0]) if remembered is not None else Memory()
         reach = reaches(graph.stages[name] for name in self.computed)
@@ -106,14 +81,14 @@ class Runner:
                 pending += [w.topic for w in self.graph.stages[name].inputs.values() if w.topic not in recorded]
         return tuple(name for name in self.graph.stages if name in found)
 
-    def _frames(self, frames: str) -> tuple[list[int], dict[int, int]]:
+    def _frames(self, frames: str) -> tuple[Sequence[int], dict[int, int]]:
         """The frame numbers to go through, and the stamps known beforehand."""
         first, stop = frame_range(frames)
         if self.replay is not None and "dataset" in self.computed and "dataset" not in self.replay.only:
             self._check_frames_are_there(self.replay)
         if self.replay is None:
             count = len(self.graph.stages["dataset"].plugin)
-            return list(range(first, first + count)), {}
+            return range(first, first + count), {}
         references = [v for v in self.replay.recording.values(FRAMES_TOPIC) if isinstance(v, FrameReference)]
         known = {reference.index: reference.stamp_ns for reference in references}
         self.result.fps = references[0].camera.fps if references else self.result.fps
@@ -125,6 +100,8 @@ class Runner:
     def _check_frames_are_there(self, replay: Replay) -> None:
         """Raise RecordingError when a replay needs the images, the recording does not embed them, and the data set cannot be opened."""
         try:
+            if is_camera(self.graph.stages["dataset"].plugin):
+                raise DataError("dataset", "a camera shows no frame twice")
             len(self.graph.stages["dataset"].plugin)
         except DataError as error:
             cause = f"does not embed the frames that {' and '.join(replay.only)} must see, and the data set is gone ({error.place}: {error.cause})"
@@ -134,11 +111,12 @@ class Runner:
         """Run, yielding each finished frame; values of `topics` go to the writer. Raises TrihedronError (StageError names stage and frame)."""
         before, first = self._memory, self.indices[0]
         recent = {topic: {index - first: value for index, value in values.items()} for topic, values in before.recent.items()}
-        scheduler = Scheduler(self._nodes(), self.threads, self.threads, before.held, recent)
+        waiting = self.feed is not None  # one thread more, which waits for frames
+        scheduler = Scheduler(self._nodes(), self.threads + waiting, self.threads, before.held, recent)
         view = View()
         try:
-            with single_threaded_libraries():
-                for position, values in scheduler.run(len(self.indices)):
+            with single_threaded_libraries(), self._feeding():
+                for position, values in scheduler.run(self.count):
                     with held_interrupts():
                         self._account(position, values)
                         if writer is not None:
@@ -146,7 +124,7 @@ class Runner:
                     self._calls_ms.pop(position, None)
                     self._latency_ms.pop(position, None)
                     self._handed_over.pop(position, None)
-                    yield Step(position, len(self.indices), self.indices[position], values)
+                    yield Step(position, self.count, self.indices[position], values)
                 if "map" not in self.computed:
                     self.result.map = self._recorded_map()
                 for name in self.computed:
@@ -154,6 +132,19 @@ class Runner:
                         self._finish_fold(name, writer, view, name in topics)
         except NodeFailure as failure:
             raise self._explain(failure, writer) from failure.__cause__
+
+    @contextmanager
+    def _feeding(self) -> Iterator[None]:
+        """Frames of a camera are numbered as they are taken."""
+        if self.feed is None:
+            yield
+            return
+        self.feed.start()
+        self.indices = self.feed.numbers
+        try:
+            yield
+        finally:
+            self.feed.stop()
 
     def _nodes(self) -> list[Node]:
         readers: dict[str, Node] = {}
@@ -167,7 +158,9 @@ class Runner:
             inputs[parameter] = Wire(RECORDED + wire.topic, wire.delay) if from_file else wire
             if from_file and RECORDED + wire.topic not in readers:
                 readers[RECORDED + wire.topic] = self._reader_node(wire.topic)
-        return Node(stage.name, lambda position, values: self._call(stage, position, values), inputs, ordered=stage.fold)
+        if self.feed is not None and stage.name != "dataset":
+            inputs[FRAME_TAKEN] = Wire("dataset")
+        return Node(stage.name, lambda position, values: self._call(stage, position, values), inputs, stage.fold or stage.name == "dataset")
 
     def _recorded_feedback(self, topic: str) -> bool:
         return self.replay is not None and self.replay.recorded_feedback and topic in self.replay.recording.topics
@@ -179,6 +172,9 @@ class Runner:
 
     def _call(self, stage: Stage, position: int, values: Mapping[str, Any]) -> Value | None:
         """Skip, seed, time and check one call."""
+        if stage.name == "dataset" and self.feed is not None and self.feed.take() is None:
+            raise NoMoreFrames
+        values = {parameter: value for parameter, value in values.items() if parameter != FRAME_TAKEN}
         if any(values[parameter] is None for parameter in stage.required):
             return None
         arguments = {**dict.fromkeys(stage.absent), **values}
@@ -196,11 +192,11 @@ class Runner:
         ended = time.perf_counter()
         self._calls_ms.setdefault(position, {})[stage.name] = 1e3 * (ended - began)
         if stage.name == "dataset":
-            self._handed_over[position] = ended
+            self._handed_over[position] = ended if self.feed is None else self.feed.came_s[position]
         elif stage.name == "pose":
             self._latency_ms[position] = 1e3 * (ended - self._handed_over.get(position, began))
         if value is not None:
-            _check_value(value, output_of(stage.name), self.indices[position])
+            check_value(stage.name, value, self.indices[position])
         return value
 
     def _account(self, position: int, values: Mapping[str, Any]) -> None:
@@ -210,8 +206,8 @@ class Runner:
             self.timing.add_call(name, ms)
         if "dataset" in values and values["dataset"] is None:
             self.result.unreadable += 1
-            if self.result.unreadable > UNREADABLE_SHARE * len(self.indices):
-                cause = f"{self.result.unreadable} of {len(self.indices)} frames cannot be read"
+            if self.result.unreadable > UNREADABLE_SHARE * self.count:
+                cause = f"{self.result.unreadable} of {self.count} frames cannot be read"
                 raise DataError("dataset", cause, "see the warnings above for the first file; the data set is damaged")
             return
         self.timing.add_frame(self._latency_ms.setdefault(position, sum(calls.values())))
@@ -281,17 +277,9 @@ class Runner:
         error = failure.__cause__
         if isinstance(error, TrihedronError):
             return error
-        index, stage = self.indices[failure.position], failure.node
+        index, stage = [*self.indices[failure.position : failure.position + 1], failure.position][0], failure.node
         cure = ""
         if writer is not None:
             cure = f"repeat only that with: trihedron run replay={writer.path} only=[{stage}] dataset.frames={index}:{index + 1}"
         plugin = type(self.graph.stages[stage].plugin).__name__ if stage in self.graph.stages else "recording"
         return StageError(f"{stage} ({plugin}), frame {index}", f"{type(error).__name__}: {error}", cure)
-
-
-def _check_value(value: Any, kind: type[Value], index: int) -> None:
-    """A plugin must return its slot's type, and the frame's index on it."""
-    if not isinstance(value, kind):
-        raise TypeError(f"returned {type(value).__name__}, the slot's type is {kind.__name__}")
-    if value.index != index:
-        raise ValueError(f"returned a {kind.__name__} of frame {value.index} at frame {index}")

@@ -42,6 +42,10 @@ class NodeFailure(Exception):
         self.node, self.position = node, position
 
 
+class NoMoreFrames(Exception):
+    """A node says that there is no frame at this position, nor at any later one."""
+
+
 class Scheduler:
     """Nodes in topological order, `threads` workers, at most `lookahead` frames in flight.
 
@@ -83,8 +87,8 @@ class Scheduler:
         self._stopped = False
 
     def run(self, count: int) -> Iterator[tuple[int, dict[str, Any]]]:
-        """Yield (position, values by node) for 0..count-1 in order. After a failure the frames before it come, then what was done of that
-        frame, then NodeFailure is raised."""
+        """Yield (position, values by node) for 0..count-1 in order, fewer where a node raises NoMoreFrames. After a failure the frames before it
+        come, then what was done of that frame, then NodeFailure is raised."""
         workers = [threading.Thread(target=self._work, name=f"stage-{i}", daemon=True) for i in range(self._threads)]
         for worker in workers:
             worker.start()
@@ -96,6 +100,8 @@ class Scheduler:
                     self._admit()
                     while not self._settled(position):
                         self._frame_there.wait()
+                    if position >= self._count:
+                        return
                     values = {name: self._values[name][position] for name in self._nodes if position in self._values[name]}
                     self._forget(position)
                 yield position, values
@@ -112,10 +118,12 @@ class Scheduler:
         """Whether the frame is complete, or nothing more will become of it."""
         if all(position in values for values in self._values.values()):
             return True
+        if position >= self._count:
+            return not self._running
         return self._failure is not None and self._failure.position <= position and not self._running and not self._runnable()
 
     def _runnable(self) -> bool:
-        return bool(self._ready) and (self._failure is None or self._ready[0][0] <= self._failure.position)
+        return bool(self._ready) and self._ready[0][0] < self._count and (self._failure is None or self._ready[0][0] <= self._failure.position)
 
     def _admit(self) -> None:
         """Let frames in while few enough are in flight and the consumer keeps up."""
@@ -151,20 +159,24 @@ class Scheduler:
                 inputs = {parameter: self._input(wire, position) for parameter, wire in self._nodes[name].inputs.items()}
                 self._running += 1
             failure: NodeFailure | None = None
-            value = None
+            value, ended = None, False
             try:
                 value = self._nodes[name].call(position, inputs)
+            except NoMoreFrames:
+                ended = True
             except BaseException as error:  # handed to the main thread, which raises it
                 failure = NodeFailure(name, position)
                 failure.__cause__ = error
             with self._lock:
                 self._running -= 1
-                if failure is None:
+                if ended:
+                    self._count = min(self._count, position)
+                elif failure is None:
                     self._complete(name, position, value)
                     self._admit()
                 elif self._failure is None or (position, self._rank[name]) < (self._failure.position, self._rank[self._failure.node]):
                     self._failure = failure
-                if self._failure is not None or self._settled(self._consumed):
+                if self._failure is not None or self._count <= self._consumed or self._settled(self._consumed):
                     self._frame_there.notify()
 
     def _input(self, wire: Wire, position: int) -> Any:

@@ -18,7 +18,7 @@ import numpy as np
 
 from trihedron.pipeline.errors import RecordingError
 from trihedron.pipeline.graph import PREVIOUS, Stage
-from trihedron.pipeline.recording import Recording, RecordingWriter, TopicReader
+from trihedron.pipeline.recording import FRAMES_TOPIC, Recording, RecordingWriter, TopicReader
 from trihedron.pipeline.types import LOST, Map, Pose, Rotation, Table, Value
 
 MAP_VERSION = "1"
@@ -163,12 +163,13 @@ def recorded_memory(recording: Recording, reach: Mapping[str, int], first: int) 
     """What the wires of a run that begins with frame `first` would hold of the topics of a recording, had it run from the start."""
     held: dict[str, Value] = {}
     recent: dict[str, dict[int, Value]] = {}
+    frames = sorted({value.index for value in recording.values(FRAMES_TOPIC) if value.index < first})  # a live run did not take them all
     for topic in sorted(set(reach) & recording.topics):
         reader = TopicReader(recording, topic)
         recent[topic] = {}
-        for index in range(first - reach[topic], first):
-            if (value := reader.at(index)) is not None:
-                recent[topic][index] = value
+        for ago in range(min(reach[topic], len(frames)), 0, -1):
+            if (value := reader.at(frames[-ago])) is not None:
+                recent[topic][first - ago] = value
         reader.at(first)
         if (latest := recent[topic][max(recent[topic])] if recent[topic] else reader.latest) is not None:
             held[topic] = latest

@@ -9,7 +9,8 @@ import pytest
 
 from trihedron.pipeline.errors import DataError, RecordingError, StageError
 from trihedron.pipeline.recording import Recording, RecordingWriter
-from trihedron.pipeline.runner import Replay, Runner
+from trihedron.pipeline.runner import Runner
+from trihedron.pipeline.runs import Replay
 
 sys.path.insert(0, str(Path(__file__).parent))
 from toys import TOPICS, ToyDataset, ToyRotation, contents, toy_graph

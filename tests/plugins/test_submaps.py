@@ -9,7 +9,7 @@ import pytest
 
 from trihedron.pipeline.geometry import exp_se3, invert, transform
 from trihedron.pipeline.results import final_trajectory, is_tied
-from trihedron.pipeline.runner import Result
+from trihedron.pipeline.runs import Result
 from trihedron.pipeline.types import Pose
 from trihedron.plugins.map.covisibility import Covisibility
 from trihedron.plugins.matches.local_map import LocalMap

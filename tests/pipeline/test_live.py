@@ -1,0 +1,194 @@
+"""Runs in real time: frames are dropped, never queued; what was taken can be replayed."""
+
+import json
+import sys
+import time
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import pytest
+
+from trihedron.pipeline.cli import main
+from trihedron.pipeline.live import Arrival, Pace, Playback
+from trihedron.pipeline.recording import Recording, RecordingWriter
+from trihedron.pipeline.runner import Runner
+from trihedron.pipeline.runs import Replay
+from trihedron.pipeline.types import Frame, Keypoints, Map, Pose, Rotation
+
+sys.path.insert(0, str(Path(__file__).parent))
+from toys import CAMERA, TOPICS, ToyDataset, ToyKeypoints, ToyPose, contents, toy_graph
+
+FAST = replace(CAMERA, fps=200.0)
+
+
+@dataclass(frozen=True)
+class FastDataset(ToyDataset):
+    """200 frames a second, or as many as it is told."""
+
+    fps: float = 200.0
+
+    def __call__(self, index: int) -> Frame | None:
+        frame = super().__call__(index)
+        return replace(frame, camera=replace(CAMERA, fps=self.fps)) if frame is not None else None
+
+
+@dataclass(frozen=True)
+class SlowPose:
+    """Takes `seconds` a frame."""
+
+    seconds: float = 0.02
+
+    def __call__(self, frame: Frame, rotation: Rotation, previous: Pose | None, map: Map | None) -> Pose | None:
+        time.sleep(self.seconds)
+        return ToyPose()(frame, rotation, previous, map)
+
+
+def run(tmp_path: Path, pace: Pace, length: int = 60, topics: frozenset[str] = TOPICS, **plugins: object) -> tuple[Runner, Path, float]:
+    graph = toy_graph(**{"dataset": FastDataset(length), **plugins})
+    runner = Runner(graph, threads=2, pace=pace)
+    path = tmp_path / f"{pace.value}.mcap"
+    writer = RecordingWriter(path, {"overrides": "[]"})
+    began = time.perf_counter()
+    for _ in runner.steps(writer, topics, embed_frames="dataset" in topics):
+        pass
+    seconds = time.perf_counter() - began
+    writer.close()
+    return runner, path, seconds
+
+
+def taken(path: Path) -> list[int]:
+    return [value.index for value in Recording(path).values("frames")]
+
+
+def test_a_late_run_drops_frames_and_stays_on_time(tmp_path: Path) -> None:
+    """60 frames in 0.3 s for a stage that takes 20 ms: every fourth at best; each pose comes within the two frames in flight."""
+    runner, path, seconds = run(tmp_path, Pace.live, pose=SlowPose(0.02))
+    assert runner.feed is not None
+    numbers = taken(path)
+    assert numbers == runner.feed.numbers == sorted(set(numbers)) and numbers[0] == 0 and numbers[-1] == 59
+    summary = runner.feed.summary({})
+    assert summary["came"] == 60 and summary["taken"] == len(numbers) <= 30 and summary["dropped"] == 60 - len(numbers)
+    latency = runner.timing.summary(2, seconds, 0.0)["frame_ms"]
+    print(f"{summary}, latency {latency}, {seconds:.2f} s")
+    assert 20.0 <= latency["p50"] < 100.0  # a queue would end at 60 · 20 ms - 300 ms = 900 ms
+    assert [pose.index for pose in runner.result.poses] == [number for number in numbers if number % 5 != 4]  # where there are key points
+
+
+def test_a_run_in_time_takes_every_frame_when_it_comes(tmp_path: Path) -> None:
+    """Without load none is dropped; where the machine stalls some may be."""
+    runner, path, seconds = run(tmp_path, Pace.live, dataset=FastDataset(15, fps=20.0))
+    assert seconds >= 14 / 20.0
+    assert len(taken(path)) >= 10 and taken(path)[-1] == 14
+    assert runner.timing.summary(2, seconds, 0.0)["frame_ms"]["p50"] < 50.0
+
+
+def test_in_real_time_nothing_is_dropped_and_a_queue_grows(tmp_path: Path) -> None:
+    runner, path, seconds = run(tmp_path, Pace.real_time, length=30, pose=SlowPose(0.015))
+    assert taken(path) == list(range(30)) and seconds >= 24 * 0.015  # every fifth frame has no key points, so no pose
+    latency = runner.timing.summary(2, seconds, 0.0)["frame_ms"]
+    assert latency["max"] > 150.0  # the last frame came after 145 ms and was done after 360
+
+
+@pytest.mark.parametrize("threads", [1, 3])
+def test_what_was_taken_is_replayed_bit_for_bit(tmp_path: Path, threads: int) -> None:
+    """All stages from the embedded frames, and single ones, of the whole recording and of its second half."""
+    topics = TOPICS | {"dataset"}
+    _, path, _ = run(tmp_path, Pace.live, topics=topics, pose=SlowPose(0.012))
+    numbers = taken(path)
+    assert 5 < len(numbers) < 60
+    expected = contents(path)
+    for only, frames in ((tuple(TOPICS), ""), (("pose",), ""), (("rotation",), f"{numbers[len(numbers) // 2]}:")):
+        graph = toy_graph(dataset=FastDataset(60))
+        runner = Runner(graph, threads=threads, replay=Replay(Recording(path), only, recorded_feedback=bool(frames)), frames=frames)
+        again = tmp_path / "again.mcap"
+        writer = RecordingWriter(again, {"overrides": "[]"})
+        for _ in runner.steps(writer, frozenset(only)):
+            pass
+        writer.close()
+        found = contents(again)
+        for topic in only:
+            whole = expected[f"/{topic}"]
+            assert found[f"/{topic}"] == (whole[-len(found[f"/{topic}"]) :] if frames else whole), topic
+        assert len(found["/frames"]) == len(numbers) - (len(numbers) // 2 if frames else 0)
+
+
+@dataclass(frozen=True)
+class HalfDead:
+    """A camera that ends after three frames, at numbers 0, 3 and 5."""
+
+    asked: tuple[int, ...] = (0, 3, 5)
+
+    def __len__(self) -> int:
+        return 1 << 30
+
+    def __call__(self, index: int) -> Frame | None:
+        return replace(ToyDataset(100)(index), camera=FAST)
+
+    def truth(self) -> None:
+        return None
+
+    def start(self) -> None:
+        """Nothing to do."""
+
+    def stop(self) -> None:
+        """Nothing to do."""
+
+    def wait(self, after: int) -> Arrival | None:
+        later = [number for number in self.asked if number > after]
+        return Arrival(later[0], time.perf_counter()) if later else None
+
+
+def test_a_camera_that_ends_ends_the_run(tmp_path: Path) -> None:
+    runner = Runner(toy_graph(dataset=HalfDead()), threads=2)
+    assert [step.index for step in runner.steps(None, frozenset())] == [0, 3, 5]
+    assert [pose.index for pose in runner.result.poses] == [0, 3, 5]
+    assert [int(x) for x in runner.result.folds["surface"].vertices_m[:, 0]] == [0, 3, 5]
+    assert list(Runner(toy_graph(dataset=HalfDead(())), threads=2).steps(None, frozenset())) == []
+
+
+@dataclass(frozen=True)
+class FailingKeypoints(ToyKeypoints):
+    def __call__(self, frame: Frame) -> Keypoints | None:
+        raise ValueError("no memory")
+
+
+def test_a_stage_that_fails_is_named_with_the_frame_it_had(tmp_path: Path) -> None:
+    runner = Runner(toy_graph(dataset=HalfDead((7, 8)), keypoints=FailingKeypoints()), threads=2)
+    with pytest.raises(Exception, match=r"keypoints \(FailingKeypoints\), frame 7: ValueError: no memory"):
+        list(runner.steps(None, frozenset()))
+
+
+def test_playback_gives_the_newest_or_the_next() -> None:
+    playback = Playback(10, 100.0)
+    first = playback.wait(-1)
+    assert first is not None and first.number == 0
+    time.sleep(0.055)
+    late = playback.wait(0)
+    assert late is not None and late.number >= 5 and late.at_s - first.at_s == pytest.approx(late.number / 100.0)
+    assert playback.wait(9) is None
+    patient = Playback(10, 100.0, drop=False)
+    numbers = [arrival.number for arrival in map(patient.wait, range(-1, 9)) if arrival is not None]
+    assert numbers == list(range(10))
+    patient.start()
+    again = patient.wait(-1)
+    assert again is not None and again.number == 0
+
+
+def test_refusals(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["run", "live=true", "real_time=true", f"out={tmp_path / 'a'}"]) == 1
+    assert capsys.readouterr().err == "trihedron: real_time: a live run is in real time, and drops frames; give one of the two\n"
+
+
+@pytest.mark.slow
+def test_the_room_live_and_replayed(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """The default graph at the room's 30 frames/s: what it says, and the same bytes of every stage in a replay from the data set."""
+    live, again = tmp_path / "live", tmp_path / "again"
+    assert main(["run", "live=true", "dataset.frames=0:60", f"out={live}"]) == 0
+    said = capsys.readouterr().out
+    assert "live: 60 frames came, " in said and "dropped; a pose is ready " in said
+    timing = json.loads((live / "timing.json").read_text())
+    assert timing["live"]["taken"] + timing["live"]["dropped"] == 60 and timing["live"]["latency_ms"] == timing["frame_ms"]
+    assert main(["run", f"replay={live / 'run.mcap'}", f"out={again}"]) == 0
+    first, second = contents(live / "run.mcap"), contents(again / "run.mcap")
+    assert first.keys() == second.keys() and all(first[topic] == second[topic] for topic in first)
+    print(timing["live"], json.loads((live / "metrics.json").read_text())["final"]["ate_rmse_m"])
