@@ -57,16 +57,17 @@ def execute(config: DictConfig, out: Path, overrides: list[str], began: float) -
         attachments = _attachments(graph, replay)
         for name, text in attachments.items():
             writer.attach(name, text)
+        truth = attached_truth(attachments, str(writer.path))
         started = time.perf_counter()
         try:
-            for _ in _progress(runner.steps(writer, topics, embed_frames="dataset" in topics)):
+            for _ in _progress(runner.steps(writer, topics, embed_frames="dataset" in topics, truth=truth)):
                 pass
             if config.save_map:
                 runner.keeper.save(Path(config.save_map).expanduser(), _metadata(config, overrides), source)
         finally:
             with held_interrupts():
                 failure = _closed(writer)
-                metrics = _write(runner, attached_truth(attachments, str(writer.path)), out, started, began)
+                metrics = _write(runner, truth, out, started, began)
                 warnings.summarise()
     _report(out, metrics, [results.write_surface(out, value) for value in runner.result.folds.values() if isinstance(value, Surface)])
     if failure is not None:

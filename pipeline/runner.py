@@ -27,7 +27,7 @@ from trihedron.pipeline.scheduler import Node, NodeFailure, NoMoreFrames, Schedu
 from trihedron.pipeline.slots import frame_range
 from trihedron.pipeline.state import Keeper, Memory, reaches, recorded_memory
 from trihedron.pipeline.timing import Timing, resident_mb
-from trihedron.pipeline.types import Frame, FrameReference, Map, Pose, Value
+from trihedron.pipeline.types import Frame, FrameReference, Map, Pose, Trajectory, Value
 
 log = logging.getLogger("trihedron")
 RECORDED = "recorded:"  # prefix of the node that reads a topic from the file
@@ -107,13 +107,16 @@ class Runner:
             cause = f"does not embed the frames that {' and '.join(replay.only)} must see, and the data set is gone ({error.place}: {error.cause})"
             raise RecordingError(str(replay.recording.path), cause, "give its new place as dataset.path=FOLDER") from error
 
-    def steps(self, writer: RecordingWriter | None, topics: frozenset[str], embed_frames: bool = False) -> Iterator[Step]:
-        """Run, yielding each finished frame; values of `topics` go to the writer. Raises TrihedronError (StageError names stage and frame)."""
+    def steps(
+        self, writer: RecordingWriter | None, topics: frozenset[str], embed_frames: bool = False, truth: Trajectory | None = None
+    ) -> Iterator[Step]:
+        """Run, yielding each finished frame; values of `topics` go to the writer, with what viewers show, errors by `truth` too.
+        Raises TrihedronError (StageError names stage and frame)."""
         before, first = self._memory, self.indices[0]
         recent = {topic: {index - first: value for index, value in values.items()} for topic, values in before.recent.items()}
         waiting = self.feed is not None  # one thread more, which waits for frames
         scheduler = Scheduler(self._nodes(), self.threads + waiting, self.threads, before.held, recent)
-        view = View()
+        view = View(truth)
         try:
             with single_threaded_libraries(), self._feeding():
                 for position, values in scheduler.run(self.count):

@@ -17,10 +17,12 @@ from mcap_protobuf.decoder import DecoderFactory
 
 from trihedron.pipeline import chunk_writer as module
 from trihedron.pipeline.errors import RecordingError
-from trihedron.pipeline.foxglove import MOST_VERTICES, View
+from trihedron.pipeline.foxglove import View
+from trihedron.pipeline.foxglove_messages import MOST_VERTICES
+from trihedron.pipeline.geometry import exp_se3, exp_so3, rotation_from_quaternion
 from trihedron.pipeline.recording import FrameReader, Recording, RecordingWriter, TopicReader
 from trihedron.pipeline.table import Column, Table
-from trihedron.pipeline.types import FrameReference, Map, Planes, Segments, Surface
+from trihedron.pipeline.types import FrameReference, ManhattanFrame, Map, Planes, Pose, Segments, Surface, Trajectory
 
 sys.path.insert(0, str(Path(__file__).parent))
 from toys import CAMERA, ToyDataset, ToyKeypoints
@@ -157,6 +159,38 @@ def test_a_large_surface_is_shown_coarsely():
     assert np.ptp(corners.reshape(-1, 2), axis=0) == pytest.approx(1.995, abs=0.1)
 
 
+def test_errors_the_path_and_the_log_of_poses():
+    """The truth is another world's; the second pose is 0.1 m and 2 degrees off, the third lost."""
+    T_truth_world = exp_se3(np.array([1.0, -2.0, 0.5, 0.3, 0.2, -0.9]))
+    true = [exp_se3(np.array([0.1 * i, 0, 0, 0, 0.05 * i, 0])) for i in range(3)]
+    off = exp_se3(np.array([0, 0.1, 0, 0, 0, np.radians(2.0)]))
+    said = [true[0], true[1] @ off, true[2]]
+    stamps = 50_000_000 * np.arange(3)
+    view = View(Trajectory(stamps + 1_000_000, np.array([T_truth_world @ T for T in true])))
+    found = []
+    for i, (T, status) in enumerate(zip(said, ("ok", "degraded", "lost"))):
+        pose = Pose(i, int(stamps[i]), T, np.eye(6), T, -1, np.zeros(3, np.int32), 0, status, "why" if i else "")
+        found.append(dict(view.messages(pose)))
+    assert [set(messages) - {"/view/pose", "/tf"} for messages in found] == [
+        {"/view/path", "/view/truth", "/error"}, {"/view/truth", "/error", "/view/log"}, {"/view/log"}
+    ]  # fmt: skip
+    assert found[0]["/error"].translation_m < 1e-9 and found[0]["/error"].rotation_deg < 1e-5
+    assert found[1]["/error"].translation_m == pytest.approx(np.linalg.norm(off[:3, 3])) and found[1]["/error"].rotation_deg == pytest.approx(2.0)
+    position = found[1]["/view/truth"].pose.position
+    assert (position.x, position.y, position.z) == pytest.approx(true[1][:3, 3])
+    assert found[2]["/view/log"].message == "frame 2: lost, why"
+
+
+def test_axes_are_arrows_along_them():
+    R = exp_so3(np.array([0.3, -0.2, 0.5]))
+    axes = ManhattanFrame(0, 0, R[None], np.zeros(1, np.int32), np.zeros((1, 3, 3)), np.ones((1, 3), np.int32), np.zeros((1, 3)), True)
+    ((channel, message),) = View().messages(axes)
+    assert channel == "/view/axes"
+    for axis, arrow in zip(R.T, message.entities[0].arrows):
+        q = arrow.pose.orientation
+        assert rotation_from_quaternion(np.array([q.x, q.y, q.z, q.w]))[:, 0] == pytest.approx(axis)
+
+
 def test_viewer_messages_are_decoded_by_their_own_schema(tmp_path):
     view, frame = View(), ToyDataset()(3)
     pixels, points, covariance = (np.zeros((2, 2, *shape), np.float32) for shape in ((2,), (3,), (3, 3)))
@@ -178,6 +212,7 @@ def test_viewer_messages_are_decoded_by_their_own_schema(tmp_path):
     assert {topic: name for topic, (name, _) in found.items()} == {
         "/view/image": "foxglove.CompressedImage",
         "/view/camera": "foxglove.CameraCalibration",
+        "/view/features": "foxglove.ImageAnnotations",
         "/view/lines": "foxglove.SceneUpdate",
         "/view/planes": "foxglove.SceneUpdate",
         "/view/surface": "foxglove.SceneUpdate",
