@@ -12,9 +12,8 @@ import numba
 import numpy as np
 
 from trihedron.pipeline.types import F32, F64, I32, U8, Camera, Frame, Map, Planes, Pose
+from trihedron.plugins.numerics.depth.reduction import reduced
 from trihedron.plugins.numerics.surfaces.block_hash import FREE, I64, empty_table, key_of, roomy, slot_of
-
-EDGE = 0.03  # a reading farther than the nearest of its block by more than this share is behind an edge
 
 
 @dataclass(frozen=True)
@@ -48,7 +47,7 @@ class View:
 def view_of(frame: Frame, planes: Planes, pose: Pose, map: Map | None, width: int, max_sigma_m: float) -> View:
     """The frame as a view; depth whose standard deviation is above `max_sigma_m` is left out. `map` is that of this very frame, or None."""
     step = max(1, round(frame.camera.width / width))
-    depth, color = _reduced(frame.depth_m, frame.color, step)
+    depth, color = reduced(frame.depth_m, frame.color, step)
     camera, noise = frame.camera, frame.camera.depth_noise
     depth[~(noise.sigma_m(depth) <= max_sigma_m)] = 0.0  # NaN too
     h, w = depth.shape
@@ -65,32 +64,6 @@ def view_of(frame: Frame, planes: Planes, pose: Pose, map: Map | None, width: in
         frame.index, small, depth, color, np.ascontiguousarray(labels), planes.coefficients, pose.T_world_camera,
         pose.T_reference_camera, pose.reference, became, pose.submap,
     )  # fmt: skip
-
-
-@numba.njit(cache=True, nogil=True)
-def _reduced(depth: F32, color: U8, step: int) -> tuple[F32, U8]:
-    """Depth (h, w) and colour averaged over blocks of step × step pixels; of the depth only the readings that are not behind an edge."""
-    h, w = depth.shape[0] // step, depth.shape[1] // step
-    small, paint = np.zeros((h, w), np.float32), np.empty((h, w, 3), np.uint8)
-    for r in range(h):
-        for c in range(w):
-            near = np.inf
-            red, green, blue = 0, 0, 0
-            for y in range(r * step, (r + 1) * step):
-                for x in range(c * step, (c + 1) * step):
-                    red, green, blue = red + color[y, x, 0], green + color[y, x, 1], blue + color[y, x, 2]
-                    if depth[y, x] > 0.0 and depth[y, x] < near:
-                        near = depth[y, x]
-            n = step * step
-            paint[r, c, 0], paint[r, c, 1], paint[r, c, 2] = (2 * red + n) // (2 * n), (2 * green + n) // (2 * n), (2 * blue + n) // (2 * n)
-            total, count = 0.0, 0
-            for y in range(r * step, (r + 1) * step):
-                for x in range(c * step, (c + 1) * step):
-                    if depth[y, x] > 0.0 and depth[y, x] < near * (1.0 + EDGE):
-                        total, count = total + depth[y, x], count + 1
-            if count:
-                small[r, c] = total / count
-    return small, paint
 
 
 @dataclass

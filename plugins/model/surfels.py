@@ -1,0 +1,54 @@
+"""Surfels to track against."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from trihedron.pipeline.registry import register
+from trihedron.pipeline.types import LOST, Frame, Pose, PredictedView, Table
+from trihedron.plugins.numerics.depth.reduction import depth_normals, lens_of, reduced, smoothed, step_to
+from trihedron.plugins.numerics.surfaces.block_model import lens_at
+from trihedron.plugins.numerics.surfaces.surfel_model import SURFELS, Images, fused, shown
+
+
+@register("model", "surfels")
+@dataclass(frozen=True)
+class SurfelModel:
+    """A coloured disc for each pixel that showed something new, fused where it is seen again, and what the discs show from this frame's pose
+    (ElasticFusion: Whelan et al., RSS 2015; Keller et al., 3DV 2013; the paper's "ElasticFu").
+
+    Without the publication's deformation graph and its loops: nothing moves once it is fused. The surfels are the rows of the value's table, so that
+    the wire `model@prev` is the only memory."""
+
+    width: int = 213  # px, about, of the depth that is fused and of the view
+    apart: float = 3.0  # standard deviations of a depth, between a pixel and its surfel
+    most_deg: float = 40.0  # between their normals
+    most: float = 100.0  # views a surfel remembers
+    stable: float = 5.0  # views that make a surfel stable,
+    trial: int = 20  # frames after which one that is not is removed
+
+    def __post_init__(self) -> None:
+        if not 32 <= self.width <= 4096 or self.apart <= 0.0 or not 0.0 < self.most_deg < 90.0:
+            raise ValueError("width, apart, most_deg: 32 to 4096 px, positive, an angle within 0 … 90")
+        if not 1.0 <= self.stable <= self.most or self.trial < 1:
+            raise ValueError("stable, most, trial: 1 <= stable <= most, at least 1")
+
+    def __call__(self, frame: Frame, pose: Pose, previous: PredictedView | None) -> PredictedView | None:
+        """The view from this frame's pose; None, so that the last one stays, while the camera is lost."""
+        if pose.status == LOST:
+            return None
+        step = step_to(frame, self.width)
+        depth, color = reduced(frame.depth_m, frame.color, step)
+        lens = lens_of(frame, step)
+        camera = lens_at(lens, pose.T_world_camera)
+        smooth = smoothed(depth, 2)
+        images = Images(depth, depth_normals(smooth, lens, 2), color, frame.camera.depth_noise.sigma_m(np.arange(0.0, 16.0, 0.01)))
+        table = previous.model if previous is not None else Table.empty(SURFELS)
+        cosine = float(np.cos(np.radians(self.most_deg)))
+        table = fused(table, images, camera, frame.index, self.apart, cosine, self.most, self.trial, self.stable)
+        T = np.array(pose.T_world_camera)
+        depth, normals, mean = shown(table.column("surfel"), camera, depth.shape, self.stable)
+        normals = normals / np.maximum(np.linalg.norm(normals, axis=2, keepdims=True), np.float32(1e-6))
+        return PredictedView(frame.index, frame.stamp_ns, T, depth, normals, np.rint(mean).astype(np.uint8), table)

@@ -1,0 +1,45 @@
+"""A truncated signed distance field to track against."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from trihedron.pipeline.registry import register
+from trihedron.pipeline.types import LOST, Frame, Pose, PredictedView, Table
+from trihedron.plugins.numerics.depth.reduction import depth_normals, lens_of, reduced, smoothed, step_to
+from trihedron.plugins.numerics.surfaces.block_model import BLOCKS, fused, lens_at
+from trihedron.plugins.numerics.surfaces.raycasting import cast
+
+
+@register("model", "tsdf")
+@dataclass(frozen=True)
+class TsdfModel:
+    """Every frame fused into signed distances, and what they show from its pose (KinectFusion: Newcombe et al., ISMAR 2011; in hashed blocks as
+    InfiniTAM has them: Kähler et al., TVCG 2015; the paper's column "InfiniTAM"). It has no colour, and nothing in it moves once it is fused.
+
+    The blocks are the rows of the value's table, so that the wire `model@prev` is the only memory."""
+
+    width: int = 320  # px, about, of the depth that is fused and of the view
+    voxel_m: float = 0.02
+    truncation_m: float = 0.08
+    most: int = 100  # views a voxel remembers
+
+    def __post_init__(self) -> None:
+        if not 32 <= self.width <= 4096 or self.voxel_m <= 0.0 or self.truncation_m < 2.0 * self.voxel_m or not 1 <= self.most <= 255:
+            raise ValueError("width, voxel_m, truncation_m, most: 32 to 4096 px, positive, at least two voxels, 1 to 255")
+
+    def __call__(self, frame: Frame, pose: Pose, previous: PredictedView | None) -> PredictedView | None:
+        """The view from this frame's pose; None, so that the last one stays, while the camera is lost."""
+        if pose.status == LOST:
+            return None
+        step = step_to(frame, self.width)
+        depth, color = reduced(frame.depth_m, frame.color, step)
+        lens = lens_of(frame, step)
+        camera = lens_at(lens, pose.T_world_camera)
+        table = previous.model if previous is not None else Table.empty(BLOCKS)
+        table, seen = fused(table, depth, camera, self.voxel_m, self.truncation_m, self.most)
+        shown = cast(seen, camera, depth, self.voxel_m, self.truncation_m)
+        T = np.array(pose.T_world_camera)
+        return PredictedView(frame.index, frame.stamp_ns, T, shown, depth_normals(smoothed(shown, 2), lens, 3), np.zeros_like(color), table)

@@ -1,0 +1,161 @@
+"""Colour and depth images made smaller, and what dense alignment needs of them: intensities, gradients, normals."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numba
+import numpy as np
+
+from trihedron.pipeline.types import F32, F64, U8, Frame
+
+EDGE = 0.03  # a reading farther than the nearest of its block by more than this share is behind an edge
+LUMINANCE = (0.299, 0.587, 0.114)  # of red, green and blue (Rec. 601)
+
+
+@dataclass(frozen=True)
+class Level:
+    """An image of a pyramid: brightness (h, w) 0 … 255, depth (h, w), m, 0 = none, and (fx, fy, cx, cy)."""
+
+    gray: F32
+    depth_m: F32
+    lens: F64
+
+
+def step_to(frame: Frame, width: int) -> int:
+    """How many pixels of the frame are one of an image about `width` wide."""
+    return max(1, round(frame.camera.width / width))
+
+
+def lens_of(frame: Frame, step: int) -> F64:
+    """(fx, fy, cx, cy) of the frame reduced by `step`."""
+    c, offset = frame.camera, (step - 1) / 2.0
+    return np.array([c.fx / step, c.fy / step, (c.cx - offset) / step, (c.cy - offset) / step])
+
+
+def pyramid(frame: Frame, width: int, levels: int) -> list[Level]:
+    """The frame reduced to about `width` columns, and that halved again and again; the finest first."""
+    step = step_to(frame, width)
+    depth, color = reduced(frame.depth_m, frame.color, step)
+    return halvings(Level(brightness(color), depth, lens_of(frame, step)), levels)
+
+
+def halvings(finest: Level, levels: int) -> list[Level]:
+    """An image, and halves of halves of it."""
+    out = [finest]
+    for _ in range(levels - 1):
+        fx, fy, cx, cy = out[-1].lens
+        gray, depth = _halved(out[-1].gray, out[-1].depth_m)
+        out.append(Level(gray, depth, np.array([fx / 2.0, fy / 2.0, (cx - 0.5) / 2.0, (cy - 0.5) / 2.0])))
+    return out
+
+
+def brightness(color: U8) -> F32:
+    """(h, w, 3) RGB -> (h, w), 0 … 255."""
+    return np.asarray(color @ np.array(LUMINANCE, np.float32), np.float32)
+
+
+@numba.njit(cache=True, nogil=True)
+def _halved(gray: F32, depth: F32) -> tuple[F32, F32]:
+    h, w = gray.shape[0] // 2, gray.shape[1] // 2
+    out, small = np.empty((h, w), np.float32), np.zeros((h, w), np.float32)
+    for r in range(h):
+        for c in range(w):
+            out[r, c] = 0.25 * (gray[2 * r, 2 * c] + gray[2 * r, 2 * c + 1] + gray[2 * r + 1, 2 * c] + gray[2 * r + 1, 2 * c + 1])
+            near, total, count = np.inf, 0.0, 0
+            for k in range(4):
+                d = depth[2 * r + k // 2, 2 * c + k % 2]
+                if d > 0.0 and d < near:
+                    near = d
+            for k in range(4):
+                d = depth[2 * r + k // 2, 2 * c + k % 2]
+                if d > 0.0 and d < near * (1.0 + EDGE):
+                    total, count = total + d, count + 1
+            if count:
+                small[r, c] = total / count
+    return out, small
+
+
+@numba.njit(cache=True, nogil=True)
+def gradients(gray: F32) -> tuple[F32, F32]:
+    """Central differences along x and y, (h, w) each, a pixel; 0 at the border."""
+    h, w = gray.shape
+    x, y = np.zeros((h, w), np.float32), np.zeros((h, w), np.float32)
+    for r in range(1, h - 1):
+        for c in range(1, w - 1):
+            x[r, c] = 0.5 * (gray[r, c + 1] - gray[r, c - 1])
+            y[r, c] = 0.5 * (gray[r + 1, c] - gray[r - 1, c])
+    return x, y
+
+
+@numba.njit(cache=True, nogil=True)
+def smoothed(depth: F32, radius: int) -> F32:
+    """(h, w) means of the readings within `radius` pixels that are not across an edge; 0 stays 0."""
+    h, w = depth.shape
+    out = np.zeros((h, w), np.float32)
+    for r in range(h):
+        for c in range(w):
+            z = depth[r, c]
+            if z <= 0.0:
+                continue
+            total, count = 0.0, 0
+            for i in range(max(r - radius, 0), min(r + radius + 1, h)):
+                for j in range(max(c - radius, 0), min(c + radius + 1, w)):
+                    if abs(depth[i, j] - z) < EDGE * z:
+                        total, count = total + depth[i, j], count + 1
+            out[r, c] = total / count
+    return out
+
+
+@numba.njit(cache=True, nogil=True)
+def depth_normals(depth: F32, lens: F64, reach: int) -> F32:
+    """(h, w, 3) unit normals towards the camera from the points `reach` pixels to the left, right, above and below; NaN where one of them is missing
+    or lies behind an edge."""
+    h, w = depth.shape
+    out = np.full((h, w, 3), np.nan, np.float32)
+    for r in range(reach, h - reach):
+        for c in range(reach, w - reach):
+            z = depth[r, c]
+            left, right, up, down = depth[r, c - reach], depth[r, c + reach], depth[r - reach, c], depth[r + reach, c]
+            limit = (1.0 + 0.5 * reach) * EDGE * z
+            if not (z > 0.0 and left > 0.0 and right > 0.0 and up > 0.0 and down > 0.0):
+                continue
+            if abs(left - z) > limit or abs(right - z) > limit or abs(up - z) > limit or abs(down - z) > limit:
+                continue
+            ax = ((c + reach - lens[2]) * right - (c - reach - lens[2]) * left) / lens[0]
+            ay = (r - lens[3]) * (right - left) / lens[1]
+            az = right - left
+            bx = (c - lens[2]) * (down - up) / lens[0]
+            by = ((r + reach - lens[3]) * down - (r - reach - lens[3]) * up) / lens[1]
+            bz = down - up
+            nx, ny, nz = by * az - bz * ay, bz * ax - bx * az, bx * ay - by * ax
+            size = np.sqrt(nx * nx + ny * ny + nz * nz)
+            if size > 0.0:
+                out[r, c, 0], out[r, c, 1], out[r, c, 2] = nx / size, ny / size, nz / size
+    return out
+
+
+@numba.njit(cache=True, nogil=True)
+def reduced(depth: F32, color: U8, step: int) -> tuple[F32, U8]:
+    """Depth (h, w) and colour averaged over blocks of step × step pixels; of the depth only the readings that are not behind an edge."""
+    h, w = depth.shape[0] // step, depth.shape[1] // step
+    small, paint = np.zeros((h, w), np.float32), np.empty((h, w, 3), np.uint8)
+    for r in range(h):
+        for c in range(w):
+            near = np.inf
+            red, green, blue = 0, 0, 0
+            for y in range(r * step, (r + 1) * step):
+                for x in range(c * step, (c + 1) * step):
+                    red, green, blue = red + color[y, x, 0], green + color[y, x, 1], blue + color[y, x, 2]
+                    if depth[y, x] > 0.0 and depth[y, x] < near:
+                        near = depth[y, x]
+            n = step * step
+            paint[r, c, 0], paint[r, c, 1], paint[r, c, 2] = (2 * red + n) // (2 * n), (2 * green + n) // (2 * n), (2 * blue + n) // (2 * n)
+            total, count = 0.0, 0
+            for y in range(r * step, (r + 1) * step):
+                for x in range(c * step, (c + 1) * step):
+                    if depth[y, x] > 0.0 and depth[y, x] < near * (1.0 + EDGE):
+                        total, count = total + depth[y, x], count + 1
+            if count:
+                small[r, c] = total / count
+    return small, paint

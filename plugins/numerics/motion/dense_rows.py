@@ -1,0 +1,166 @@
+"""Residuals of one image's pixels warped into another: brightness, and distance from the surface there.
+
+A point p of the source, moved to `p' = R p + t`, falls on pixel (u, v) of the target. Its brightness residual is `I(u, v) - I_source`; its
+geometric one `k (Z(u, v) - p'_z)` with `k = n·ray`: how far it is from the target's tangent plane, of normal n, at that pixel. So the depth residual
+of direct methods (Kerl, Sturm, Cremers, IROS 2013) and the point-to-plane error of projective ICP (Newcombe et al., ISMAR 2011) are one up to k.
+Derivatives are with respect to `xi = (rho, phi)` in `p' <- p' + rho + phi × p'`.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+from trihedron.pipeline.types import F32, F64
+from trihedron.plugins.numerics.depth.reduction import EDGE, Level, depth_normals, gradients
+
+NEAREST_M = 0.1  # depth below which nothing is projected
+STEEPEST = 0.15  # cosine between ray and surface below which a reading says little
+
+
+class Source(NamedTuple):
+    """n points of an image."""
+
+    points_m: F64  # (n, 3)
+    normals: F32  # (n, 3), NaN = none
+    gray: F64  # (n,)
+    sigma_m: F64  # (n,) of their depth
+
+
+class Target(NamedTuple):
+    """An image they are warped into, (h, w)."""
+
+    gray: F32
+    gray_x: F32
+    gray_y: F32
+    depth_m: F32
+    normals: F32  # (h, w, 3)
+    lens: F64  # (fx, fy, cx, cy)
+
+
+class Rows(NamedTuple):
+    """Residuals of n points: (brightness, metres across the surface), with derivatives; `cosine` is k, 0 for a point that is not seen."""
+
+    r: F64  # (n, 2)
+    J: F64  # (n, 2, 6)
+    cosine: F64  # (n,)
+
+
+def source_of(level: Level, noise: NDArray[np.float64], stride: int, normals: F32) -> Source:
+    """Every `stride`-th pixel that has depth; `noise` is the standard deviation of a depth by centimetres."""
+    z = level.depth_m[::stride, ::stride]
+    r, c = np.nonzero(z > 0.0)
+    z = z[r, c].astype(np.float64)
+    fx, fy, cx, cy = level.lens
+    points = np.stack([(c * stride - cx) / fx * z, (r * stride - cy) / fy * z, z], axis=1)
+    sigma = noise[np.minimum((100.0 * z).astype(int), len(noise) - 1)]
+    at = r * stride, c * stride
+    return Source(points, np.ascontiguousarray(normals[at]), level.gray[at].astype(np.float64), sigma)
+
+
+def target_of(level: Level, reach: int, normals: F32 | None = None) -> Target:
+    """An image with its gradients and, where they are not given, normals over `reach` pixels."""
+    x, y = gradients(level.gray)
+    return Target(level.gray, x, y, level.depth_m, depth_normals(level.depth_m, level.lens, reach) if normals is None else normals, level.lens)
+
+
+def rows_for(source: Source) -> Rows:
+    """Room for the rows of a source."""
+    n = len(source.points_m)
+    return Rows(np.zeros((n, 2)), np.zeros((n, 2, 6)), np.zeros(n))
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def fill_rows(source: Source, target: Target, R: F64, t: F64, least_gradient: float, farthest_m: float, least_cosine: float, rows: Rows) -> None:
+    """Fill the rows at a motion. A brightness row needs a gradient of `least_gradient` a pixel, else it is zero: noise would make one. Points farther
+    than `farthest_m` from the surface, or turned from it beyond `least_cosine`, are not seen."""
+    h, w = target.depth_m.shape
+    fx, fy, cx, cy = target.lens
+    for i in range(len(source.points_m)):
+        rows.cosine[i] = 0.0
+        p = source.points_m[i]
+        x = R[0, 0] * p[0] + R[0, 1] * p[1] + R[0, 2] * p[2] + t[0]
+        y = R[1, 0] * p[0] + R[1, 1] * p[1] + R[1, 2] * p[2] + t[1]
+        z = R[2, 0] * p[0] + R[2, 1] * p[1] + R[2, 2] * p[2] + t[2]
+        if not z > NEAREST_M:
+            continue
+        u, v = fx * x / z + cx, fy * y / z + cy
+        if not (u >= 0.0 and v >= 0.0 and u < w - 1 and v < h - 1):
+            continue
+        c, r = int(u), int(v)
+        a, b = u - c, v - r
+        d00, d01, d10, d11 = target.depth_m[r, c], target.depth_m[r, c + 1], target.depth_m[r + 1, c], target.depth_m[r + 1, c + 1]
+        low, high = min(d00, d01, d10, d11), max(d00, d01, d10, d11)
+        if not low > 0.0 or high - low > EDGE * low:
+            continue
+        n = target.normals[r + (1 if b > 0.5 else 0), c + (1 if a > 0.5 else 0)]
+        k = (n[0] * x + n[1] * y) / z + n[2]
+        if not k < -STEEPEST:
+            continue
+        m = source.normals[i]
+        facing = 1.0
+        if least_cosine > -1.0:
+            facing = 0.0
+            for j in range(3):
+                facing += n[j] * (R[j, 0] * m[0] + R[j, 1] * m[1] + R[j, 2] * m[2])
+        if not facing > least_cosine:
+            continue
+        w00, w01, w10, w11 = (1.0 - a) * (1.0 - b), a * (1.0 - b), (1.0 - a) * b, a * b
+        off = k * (w00 * d00 + w01 * d01 + w10 * d10 + w11 * d11 - z)
+        if abs(off) > farthest_m:
+            continue
+        rows.cosine[i], rows.r[i, 1] = -k, off
+        _across(-n[0], -n[1], -n[2], x, y, z, rows.J[i, 1])
+        gx = w00 * target.gray_x[r, c] + w01 * target.gray_x[r, c + 1] + w10 * target.gray_x[r + 1, c] + w11 * target.gray_x[r + 1, c + 1]
+        gy = w00 * target.gray_y[r, c] + w01 * target.gray_y[r, c + 1] + w10 * target.gray_y[r + 1, c] + w11 * target.gray_y[r + 1, c + 1]
+        gray = w00 * target.gray[r, c] + w01 * target.gray[r, c + 1] + w10 * target.gray[r + 1, c] + w11 * target.gray[r + 1, c + 1]
+        rows.r[i, 0] = gray - source.gray[i]
+        if gx * gx + gy * gy < least_gradient * least_gradient:
+            gx, gy = 0.0, 0.0
+        ax, ay = gx * fx / z, gy * fy / z
+        _across(ax, ay, -(ax * x + ay * y) / z, x, y, z, rows.J[i, 0])
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy", inline="always")
+def _across(ax: float, ay: float, az: float, x: float, y: float, z: float, J: F64) -> None:
+    """The derivative `(a, p' × a)` of a residual with gradient a at p'."""
+    J[0], J[1], J[2] = ax, ay, az
+    J[3], J[4], J[5] = y * az - z * ay, z * ax - x * az, x * ay - y * ax
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def normal_equations(rows: Rows, W: F64) -> tuple[F64, F64]:
+    """H (6, 6) and g (6,) of half the squared error; W (n, 3) holds the weights of brightness², their product, and distance²."""
+    H, g = np.zeros((6, 6)), np.zeros(6)
+    for i in range(len(W)):
+        if rows.cosine[i] == 0.0:
+            continue
+        a, b, c = W[i]
+        e0, e1 = a * rows.r[i, 0] + b * rows.r[i, 1], b * rows.r[i, 0] + c * rows.r[i, 1]
+        for j in range(6):
+            p, q = rows.J[i, 0, j], rows.J[i, 1, j]
+            g[j] += p * e0 + q * e1
+            s0, s1 = a * p + b * q, b * p + c * q
+            for k in range(j + 1):
+                H[j, k] += s0 * rows.J[i, 0, k] + s1 * rows.J[i, 1, k]
+    for j in range(6):
+        for k in range(j):
+            H[k, j] = H[j, k]
+    return H, g
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def what_is_seen(rows: Rows, W: F64) -> tuple[F64, F64, int]:
+    """Mean of n nᵀ over the normals seen (3, 3), the brightness' information about the translation (3, 3), and how many points are seen."""
+    N, G, count = np.zeros((3, 3)), np.zeros((3, 3)), 0
+    for i in range(len(W)):
+        if rows.cosine[i] != 0.0:
+            count += 1
+            for j in range(3):
+                for k in range(3):
+                    N[j, k] += rows.J[i, 1, j] * rows.J[i, 1, k]
+                    G[j, k] += W[i, 0] * rows.J[i, 0, j] * rows.J[i, 0, k]
+    return N / max(count, 1), G, count

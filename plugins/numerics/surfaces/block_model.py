@@ -1,0 +1,186 @@
+"""A truncated signed distance field as the rows of a table, so that it can travel on a wire: a row is a block of 8 × 8 × 8 voxels.
+
+Versions of the table share the chunks that a frame does not touch, and a recording holds the changes. Distances are shares of the truncation in
+16 bits, weights numbers of views in 8, as in InfiniTAM (Kähler et al., TVCG 2015). Voxel i of block b is at (b · SIDE + i) · voxel_m in the world.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+from trihedron.pipeline.types import F32, F64, I32, U8, Bool, Column, Table
+from trihedron.plugins.numerics.surfaces.block_hash import FREE, I64, empty_table, key_of, number_of, slot_of
+from trihedron.plugins.numerics.surfaces.volume import CELLS, SIDE
+
+I16 = NDArray[np.int16]
+BLOCKS = {"place": Column("i4", (3,)), "distance": Column("i2", (CELLS,)), "weight": Column("u1", (CELLS,))}
+FULL = 32767  # of a distance
+NEAREST_M = 0.1
+
+
+class Lens(NamedTuple):
+    """Of an image, and where its camera is."""
+
+    lens: F64  # (fx, fy, cx, cy)
+    R_camera_world: F64
+    position_m: F64
+
+
+class Blocks(NamedTuple):
+    """Some blocks, by number."""
+
+    keys: I64  # hash table of their places
+    numbers: I32
+    places: I32  # (n, 3)
+    distance: I16  # (n, CELLS)
+    weight: U8  # (n, CELLS)
+
+
+def lens_at(lens: F64, T_world_camera: F64) -> Lens:
+    """A camera at a pose."""
+    return Lens(lens, np.ascontiguousarray(T_world_camera[:3, :3].T), T_world_camera[:3, 3].copy())
+
+
+def fused(table: Table, depth: F32, camera: Lens, voxel: float, truncation: float, most: int) -> tuple[Table, Blocks]:
+    """The table with one depth image (h, w) taken in, and those of its blocks that the camera may see. A voxel's weight ends at `most` views."""
+    touched = blocks_about(depth, camera, voxel * SIDE, truncation)
+    places = table.column("place")
+    known, _ = _hashed(places)
+    fresh = touched[_missing(known, touched)]
+    near = np.flatnonzero(_in_view(places, camera, depth.shape, voxel * SIDE)).astype(np.int32)
+    count = len(near)
+    distance = np.concatenate([table.rows("distance", near), np.zeros((len(fresh), CELLS), np.int16)])
+    weight = np.concatenate([table.rows("weight", near), np.zeros((len(fresh), CELLS), np.uint8)])
+    seen = Blocks(*_hashed(np.concatenate([places[near], fresh])), np.concatenate([places[near], fresh]), distance, weight)
+    changed = _integrate(seen, touched, depth, camera, voxel, truncation, most)
+    old = np.flatnonzero(changed[:count])
+    table = table.updated(near[old], distance=distance[old], weight=weight[old]) if len(old) else table
+    table, _ = table.appended(place=fresh, distance=distance[count:], weight=weight[count:])
+    return table, seen
+
+
+def _hashed(places: I32) -> tuple[I64, I32]:
+    """A hash table of places (n, 3) -> row."""
+    slots = 1 << 10
+    while slots < 3 * len(places):
+        slots *= 2
+    keys, numbers = empty_table(slots)
+    _insert(keys, numbers, places)
+    return keys, numbers
+
+
+@numba.njit(cache=True, nogil=True)
+def _insert(keys: I64, numbers: I32, places: I32) -> None:
+    for i in range(len(places)):
+        key = key_of(places[i, 0], places[i, 1], places[i, 2])
+        slot = slot_of(keys, key)
+        keys[slot], numbers[slot] = key, i
+
+
+def blocks_about(depth: F32, camera: Lens, block_m: float, truncation: float) -> I32:
+    """(n, 3) places of the blocks within the truncation of a reading, in the order in which they are met."""
+    slots = 1 << 13
+    while (found := _across(empty_table(slots)[0], depth, camera, block_m, truncation)) is None:
+        slots *= 4
+    return found
+
+
+@numba.njit(cache=True, nogil=True)
+def _across(local: I64, depth: F32, camera: Lens, block_m: float, truncation: float) -> I32 | None:
+    """None when the table `local` is too small."""
+    fx, fy, cx, cy = camera.lens
+    R, t = camera.R_camera_world, camera.position_m
+    found, count, last = np.empty((len(local) // 2, 3), np.int32), 0, -1
+    for r in range(0, depth.shape[0], 2):
+        for c in range(0, depth.shape[1], 2):
+            z = depth[r, c]
+            if z <= 0.0:
+                continue
+            x, y = (c - cx) / fx, (r - cy) / fy
+            along = truncation / np.sqrt(x * x + y * y + 1.0)
+            for side in range(-1, 2):
+                d = z + side * along
+                i = int(np.floor((R[0, 0] * x * d + R[1, 0] * y * d + R[2, 0] * d + t[0]) / block_m))
+                j = int(np.floor((R[0, 1] * x * d + R[1, 1] * y * d + R[2, 1] * d + t[1]) / block_m))
+                k = int(np.floor((R[0, 2] * x * d + R[1, 2] * y * d + R[2, 2] * d + t[2]) / block_m))
+                key = key_of(i, j, k)
+                if key == last:
+                    continue
+                last = key
+                slot = slot_of(local, key)
+                if local[slot] == FREE:
+                    if count == len(found):
+                        return None
+                    local[slot] = key
+                    found[count, 0], found[count, 1], found[count, 2] = i, j, k
+                    count += 1
+    return found[:count].copy()
+
+
+@numba.njit(cache=True, nogil=True)
+def _missing(keys: I64, places: I32) -> Bool:
+    out = np.empty(len(places), np.bool_)
+    for i in range(len(places)):
+        out[i] = keys[slot_of(keys, key_of(places[i, 0], places[i, 1], places[i, 2]))] == FREE
+    return out
+
+
+@numba.njit(cache=True, nogil=True)
+def _in_view(places: I32, camera: Lens, shape: tuple[int, int], block_m: float) -> Bool:
+    """(n,) whether the sphere around a block may fall into the image."""
+    fx, fy, cx, cy = camera.lens
+    R, t = camera.R_camera_world, camera.position_m
+    out, reach = np.zeros(len(places), np.bool_), 0.87 * block_m
+    for i in range(len(places)):
+        a, b, c = (places[i, 0] + 0.5) * block_m - t[0], (places[i, 1] + 0.5) * block_m - t[1], (places[i, 2] + 0.5) * block_m - t[2]
+        z = R[2, 0] * a + R[2, 1] * b + R[2, 2] * c
+        if z < -reach:
+            continue
+        d = max(z, NEAREST_M)
+        u, v = fx * (R[0, 0] * a + R[0, 1] * b + R[0, 2] * c) / d + cx, fy * (R[1, 0] * a + R[1, 1] * b + R[1, 2] * c) / d + cy
+        wide = 1.5 * fx * reach / max(d - reach, NEAREST_M)
+        out[i] = u > -wide and v > -wide and u < shape[1] + wide and v < shape[0] + wide
+    return out
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _integrate(blocks: Blocks, touched: I32, depth: F32, camera: Lens, voxel: float, truncation: float, most: int) -> Bool:
+    """Update the voxels of the blocks `touched` (n, 3), which are among the blocks; (m,) which of these changed."""
+    h, w = depth.shape
+    fx, fy, cx, cy = camera.lens
+    R, t = camera.R_camera_world, camera.position_m
+    changed = np.zeros(len(blocks.places), np.bool_)
+    distance, weight = blocks.distance, blocks.weight
+    sx, sy, sz = voxel * R[0, 2], voxel * R[1, 2], voxel * R[2, 2]  # one voxel along z
+    for n in range(len(touched)):
+        b = number_of(blocks.keys, blocks.numbers, touched[n, 0], touched[n, 1], touched[n, 2])
+        if b < 0:
+            continue
+        for column in range(SIDE * SIDE):
+            gx = (touched[n, 0] * SIDE + column // SIDE) * voxel - t[0]
+            gy = (touched[n, 1] * SIDE + column % SIDE) * voxel - t[1]
+            gz = touched[n, 2] * SIDE * voxel - t[2]
+            x = R[0, 0] * gx + R[0, 1] * gy + R[0, 2] * gz
+            y = R[1, 0] * gx + R[1, 1] * gy + R[1, 2] * gz
+            z = R[2, 0] * gx + R[2, 1] * gy + R[2, 2] * gz
+            for i in range(SIDE):
+                px, py, pz = x + i * sx, y + i * sy, z + i * sz
+                if pz < NEAREST_M:
+                    continue
+                u, v = int(fx * px / pz + cx + 0.5), int(fy * py / pz + cy + 0.5)
+                if u < 0 or v < 0 or u >= w or v >= h or depth[v, u] <= 0.0:
+                    continue
+                s = (depth[v, u] - pz) * np.sqrt(px * px + py * py + pz * pz) / pz
+                if s < -truncation:
+                    continue
+                cell = column * SIDE + i
+                old, count = distance[b, cell], weight[b, cell]
+                mean = (old * count + FULL * min(s / truncation, 1.0)) / (count + 1.0)
+                distance[b, cell] = np.int16(np.floor(mean + 0.5))
+                weight[b, cell] = min(count + 1, most)
+                changed[b] = True
+    return changed

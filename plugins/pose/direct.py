@@ -1,0 +1,63 @@
+"""All six degrees of freedom from the pixels of two frames."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from trihedron.pipeline.geometry import pose_matrix
+from trihedron.pipeline.registry import register
+from trihedron.pipeline.types import F64, Frame, Pose
+from trihedron.plugins.numerics.depth.reduction import pyramid
+from trihedron.plugins.numerics.maps.dense_pose import dense_pose, first_pose
+from trihedron.plugins.numerics.motion.dense_alignment import Gates, align, student_weights
+from trihedron.plugins.numerics.motion.dense_rows import Source, Target, source_of, target_of
+
+
+@register("pose", "direct")
+@dataclass(frozen=True)
+class Direct:
+    """The motion since the previous frame under which brightness and depth agree best, coarse to fine on a pyramid, each pixel weighed by a bivariate
+    t-distribution (Kerl, Sturm, Cremers, IROS 2013; the paper's column "DVO"). No feature is looked at.
+
+    Its odometry alone: the publication's keyframes and pose graph are not part of it. What neither brightness nor depth measures is held."""
+
+    width: int = 320  # px, about, of the finest level
+    levels: int = 3
+    most: int = 10000  # pixels of the finest level that are used, about
+    iterations: int = 10  # of a level, at most
+    least_gradient: float = 5.0  # of brightness, 0 … 255, a pixel; less is noise
+    farthest_m: float = 0.3  # from the surface, that a pixel may be
+    motion_sigma_m: float = 0.1  # of no motion, per frame: a weak prior
+    motion_sigma_deg: float = 5.0
+    min_share: float = 0.3  # of the pixels that must be seen again and agree
+
+    def __post_init__(self) -> None:
+        if self.width < 32 or self.levels < 1 or self.most < 100 or self.iterations < 1:
+            raise ValueError("width, levels, most, iterations: must be at least 32, 1, 100 and 1")
+        if min(self.least_gradient, self.farthest_m, self.motion_sigma_m, self.motion_sigma_deg) <= 0.0 or not 0.0 <= self.min_share <= 1.0:
+            raise ValueError("least_gradient, farthest_m, motion_sigma_m, motion_sigma_deg, min_share: must be positive, min_share at most 1")
+
+    def __call__(self, frame: Frame, previous_frame: Frame | None, previous: Pose | None) -> Pose:
+        """The pose with status and reason; the identity for the first frame."""
+        if previous is None or previous_frame is None:
+            return first_pose(frame)
+        gap = max(frame.index - previous_frame.index, 1)
+        prior = np.repeat([(self.motion_sigma_m * gap) ** -2, (np.radians(self.motion_sigma_deg) * gap) ** -2], 3)
+        found = align(
+            self._pairs(previous_frame, frame), np.eye(3), np.zeros(3), Gates(self.least_gradient, self.farthest_m, -1.0), student_weights, prior
+        )
+        T = previous.T_world_camera @ pose_matrix(found.R.T, -found.R.T @ found.t)
+        reaching = previous_frame.index == previous.index
+        return dense_pose(frame, previous, T, found, self.min_share if reaching else 2.0, "of the previous frame's pixels")
+
+    def _pairs(self, before: Frame, now: Frame) -> list[tuple[Source, Target, int]]:
+        """The previous frame's pixels and this frame's image on each level, the coarsest first."""
+        noise: F64 = before.camera.depth_noise.sigma_m(np.arange(0.0, 16.0, 0.01))
+        out = []
+        for a, b in zip(pyramid(before, self.width, self.levels), pyramid(now, self.width, self.levels)):
+            stride = max(1, round((a.gray.size / self.most) ** 0.5))
+            unused = np.empty((*a.gray.shape, 3), np.float32)
+            out.append((source_of(a, noise, stride, unused), target_of(b, 2), self.iterations))
+        return out[::-1]

@@ -1,0 +1,69 @@
+"""All six degrees of freedom against the view of a dense model."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from trihedron.pipeline.geometry import invert, pose_matrix
+from trihedron.pipeline.registry import register
+from trihedron.pipeline.types import F64, Frame, Pose, PredictedView
+from trihedron.plugins.numerics.depth.reduction import Level, brightness, depth_normals, halvings, lens_of, pyramid, smoothed
+from trihedron.plugins.numerics.maps.dense_pose import dense_pose, first_pose
+from trihedron.plugins.numerics.motion.dense_alignment import Gates, align, huber_weights
+from trihedron.plugins.numerics.motion.dense_rows import Source, Target, source_of, target_of
+
+
+@register("pose", "icp")
+@dataclass(frozen=True)
+class Icp:
+    """Frame to model: projective association and point-to-plane distances, coarse to fine (Newcombe et al., ISMAR 2011); with `photometric` the
+    brightness of the predicted view as well (Whelan et al., RSS 2015).
+
+    It starts where the camera was. The model is its map, so a lost camera that comes back to where it was lost is found again, by a stricter test."""
+
+    photometric: float = 0.0  # weight of brightness besides its noise; 0 = depth alone, colour is not looked at
+    levels: int = 3
+    most: int = 10000  # pixels of the finest level that are used, about
+    iterations: int = 8  # of a level, at most
+    farthest_m: float = 0.1  # from the surface, that a pixel may be (KinectFusion)
+    most_deg: float = 30.0  # between the normals of a pixel and of the surface
+    floor_m: float = 0.003  # error of the model's surface
+    least_gradient: float = 5.0  # of brightness, 0 … 255, a pixel; less is noise
+    motion_sigma_m: float = 0.1  # of no motion, per frame: a weak prior
+    motion_sigma_deg: float = 5.0
+    min_share: float = 0.3  # of the pixels that must fall on the model and agree
+
+    def __post_init__(self) -> None:
+        if self.photometric < 0.0 or self.levels < 1 or self.most < 100 or self.iterations < 1 or not 0.0 < self.most_deg < 90.0:
+            raise ValueError("photometric, levels, most, iterations, most_deg: not negative, at least 1, 100, 1, an angle within 0 … 90")
+        if min(self.farthest_m, self.floor_m, self.least_gradient, self.motion_sigma_m, self.motion_sigma_deg) <= 0.0:
+            raise ValueError("farthest_m, floor_m, least_gradient, motion_sigma_m, motion_sigma_deg: must be positive")
+        if not 0.0 <= self.min_share <= 1.0:
+            raise ValueError("min_share: must be a share, 0 to 1")
+
+    def __call__(self, frame: Frame, previous: Pose | None, model: PredictedView | None) -> Pose:
+        """The pose with status and reason; the identity for the first frame."""
+        if previous is None or model is None:
+            return first_pose(frame)
+        gap = max(frame.index - previous.index, 1)
+        prior = np.repeat([(self.motion_sigma_m * gap) ** -2, (np.radians(self.motion_sigma_deg) * gap) ** -2], 3)
+        start = invert(model.T_world_camera) @ previous.T_world_camera
+        gates = Gates(self.least_gradient, self.farthest_m, float(np.cos(np.radians(self.most_deg))))
+        found = align(self._pairs(frame, model), start[:3, :3], start[:3, 3], gates, huber_weights(self.photometric, self.floor_m), prior)
+        T = model.T_world_camera @ pose_matrix(found.R, found.t)
+        return dense_pose(frame, previous, T, found, self.min_share, "of the pixels and the model", ends_loss=True)
+
+    def _pairs(self, frame: Frame, model: PredictedView) -> list[tuple[Source, Target, int]]:
+        """The frame's pixels and the model's view on each level, the coarsest first."""
+        noise: F64 = frame.camera.depth_noise.sigma_m(np.arange(0.0, 16.0, 0.01))
+        width = model.depth_m.shape[1]
+        step = max(1, round(frame.camera.width / width))
+        views = halvings(Level(brightness(model.color), np.array(model.depth_m), lens_of(frame, step)), self.levels)
+        out = []
+        for i, (now, view) in enumerate(zip(pyramid(frame, width, self.levels), views)):
+            stride = max(1, round((now.gray.size / self.most) ** 0.5))
+            source = source_of(now, noise, stride, depth_normals(smoothed(now.depth_m, 2), now.lens, 3))
+            out.append((source, target_of(view, 3, np.array(model.normals) if i == 0 else None), self.iterations))
+        return out[::-1]
