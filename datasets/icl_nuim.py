@@ -16,7 +16,7 @@ import numpy as np
 from trihedron.datasets import povray
 from trihedron.datasets.cameras import Calibration, choose_calibration, with_noise
 from trihedron.datasets.images import read_depth
-from trihedron.datasets.lists import Stamps
+from trihedron.datasets.lists import Stamps, file_inside
 from trihedron.datasets.sequence import DepthReader, ImageSequence, SequenceReader, open_folder, select_frames
 from trihedron.datasets.trajectories import TRUTH, parse_stamp_ns, read_trajectory, table_lines
 from trihedron.pipeline.errors import DataError
@@ -86,8 +86,8 @@ def _associations(folder: Path) -> tuple[Stamps, list[Path], list[Path]]:
         if numbers and number <= numbers[-1]:
             raise DataError(place, f"image {words[0]} does not come after the one before", "sort the list and remove duplicates")
         numbers.append(number)
-        colors.append(folder / words[3 if depth_first else 1])
-        depths.append(folder / words[1 if depth_first else 3])
+        colors.append(file_inside(folder, words[3 if depth_first else 1], place))
+        depths.append(file_inside(folder, words[1 if depth_first else 3], place))
     if not numbers:
         raise DataError(str(path), "lists no images", "give a list with a line 'number depth/FILE number rgb/FILE' for each pair")
     return np.array(numbers, dtype=np.int64), colors, depths

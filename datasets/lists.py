@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -38,10 +39,18 @@ def read_file_list(path: Path) -> FileList:
         if stamps and stamp_ns <= stamps[-1]:
             raise DataError(place, f"the time stamp {words[0]} does not come after the one before", "sort the list and remove duplicates")
         stamps.append(stamp_ns)
-        files.append(path.parent / words[1])
+        files.append(file_inside(path.parent, words[1], place))
     if not stamps:
         raise DataError(str(path), "lists no images", "give a list with a line 'stamp file' for each image")
     return FileList(np.array(stamps, dtype=np.int64), tuple(files))
+
+
+def file_inside(folder: Path, name: str, place: str) -> Path:
+    """The file of a list that lies with its images. Raises DataError, naming `place`, for one that is somewhere else: a list comes with data of
+    others, and says nothing about the rest of the disk. (What a link in the folder points to is its owner's affair.)"""
+    if os.path.isabs(name) or os.path.normpath(name).split(os.sep)[0] == os.pardir:
+        raise DataError(place, f"the file '{name}' is outside the folder of the list", "put the images below that folder")
+    return folder / name
 
 
 def associate(first_ns: Stamps, second_ns: Stamps, max_difference_ns: int) -> NDArray[np.int64]:

@@ -8,6 +8,7 @@ from __future__ import annotations
 import importlib
 import inspect
 import os
+import re
 import shlex
 import sys
 import time
@@ -16,11 +17,13 @@ from importlib.metadata import EntryPoint, entry_points, version
 from pathlib import Path
 from typing import Any
 
-from trihedron.pipeline.errors import TrihedronError, UsageError, did_you_mean
+from trihedron.pipeline.errors import RecordingError, TrihedronError, UsageError, did_you_mean
 
 _BEGAN = time.perf_counter()
 COMMAND_GROUP = "trihedron.commands"
 RUN_FLAGS = ("-m", "--multirun")
+OWN = ("out=", "replay=", "only=", "feedback=", "save_map=", "report=", "live=", "real_time=")  # of each run: no replay takes them from a recording
+RECORDED = ("graph", "experiment", "without", "threads", "seed", "outputs", "record", "load_map", "localise_only")  # what it may take, besides slots
 RUN_HELP = """Track a sequence: compose the configuration, run the graph, write the run folder.
 
 Usage: trihedron run [-m] [key=value ...]
@@ -156,8 +159,20 @@ def _with_recorded(words: list[str]) -> list[str]:
         return words
     from trihedron.pipeline.recording import Recording
 
-    own = ("out=", "replay=", "only=", "feedback=", "save_map=", "report=", "live=", "real_time=")  # of each run
-    return [word for word in Recording(source).overrides() if not word.startswith(own)] + words
+    words_then = [word for word in Recording(source).overrides() if not word.startswith(OWN)]
+    for word in words_then:
+        _check_recorded(source, word)
+    return words_then + words
+
+
+def _check_recorded(source: str, word: str) -> None:
+    """A recording is data of others: it may choose stages, their options and wires, and nothing else of the program or of Hydra, which can be told
+    to write anywhere and to call anything. Raises RecordingError."""
+    from trihedron.pipeline.slots import SLOTS
+
+    key = re.match(r"\+{0,2}~?/?([\w]+)", word)
+    if key is None or key[1] not in (*SLOTS, *RECORDED) or "${" in word or "@" in word.partition("=")[0]:
+        raise RecordingError(source, f"was made with '{word}', which a recording has no say in", "give that on the command line if you trust it")
 
 
 def _point_latest(out: Path) -> None:

@@ -18,6 +18,7 @@ import numpy as np
 from trihedron.pipeline.errors import DataError, RecordingError, StageError, TrihedronError
 from trihedron.pipeline.foxglove import View
 from trihedron.pipeline.graph import Graph, Stage, Wire
+from trihedron.pipeline.intake import Intake
 from trihedron.pipeline.interrupts import held_interrupts
 from trihedron.pipeline.live import Pace, feed_of, is_camera
 from trihedron.pipeline.recording import FRAMES_TOPIC, RecordingWriter, TopicReader
@@ -64,6 +65,7 @@ class Runner:
         self.result.map = self._loaded_map()
         self.result.loaded_keyframes = len(self.result.map.keyframes) if self.result.map is not None else 0
         self._references = TopicReader(replay.recording, FRAMES_TOPIC) if replay is not None else None
+        self._intake = Intake(self._stamps.copy(), self.count if self.feed is None else 0)
         self._fold_states: dict[str, Any] = {}
         self._calls_ms: dict[int, dict[str, float]] = {}
         self._handed_over: dict[int, float] = {}
@@ -163,7 +165,9 @@ class Runner:
                 readers[RECORDED + wire.topic] = self._reader_node(wire.topic)
         if self.feed is not None and stage.name != "dataset":
             inputs[FRAME_TAKEN] = Wire("dataset")
-        return Node(stage.name, lambda position, values: self._call(stage, position, values), inputs, stage.fold or stage.name == "dataset")
+        if stage.name == "dataset":
+            return Node(stage.name, lambda p, _: self._intake(p, lambda at: self._call(stage, at, {}), lambda: self.indices[p]), inputs, True)
+        return Node(stage.name, lambda position, values: self._call(stage, position, values), inputs, stage.fold)
 
     def _recorded_feedback(self, topic: str) -> bool:
         return self.replay is not None and self.replay.recorded_feedback and topic in self.replay.recording.topics
@@ -208,7 +212,7 @@ class Runner:
         for name, ms in calls.items():
             self.timing.add_call(name, ms)
         if "dataset" in values and values["dataset"] is None:
-            self.result.unreadable += 1
+            self.result.unreadable += position not in self._intake.late
             if self.result.unreadable > UNREADABLE_SHARE * self.count:
                 cause = f"{self.result.unreadable} of {self.count} frames cannot be read"
                 raise DataError("dataset", cause, "see the warnings above for the first file; the data set is damaged")

@@ -1,0 +1,73 @@
+"""The same input and configuration give the same bytes on every topic but `/timing`: for any number of threads, again, elsewhere, under load."""
+
+import contextlib
+import os
+import subprocess
+import sys
+
+import pytest
+
+from trihedron.pipeline.cli import main
+from trihedron.pipeline.recording import Recording
+
+SMALL = ["dataset.width=160", "dataset.height=120", "outputs=[trajectory,surface]"]
+RUN = "import sys; from trihedron.pipeline.cli import main; sys.exit(main(['run', *sys.argv[1:]]))"
+
+
+def contents(file):
+    """channel -> its messages in order: time and bytes."""
+    recording = Recording(file)
+    channels = [channel for channel in recording.channels if channel != "/timing"]
+    return {channel: [(message.log_time, message.data) for message in recording.messages(channel)] for channel in channels}
+
+
+@contextlib.contextmanager
+def load(processes):
+    """Other programs that want the processors too."""
+    busy = [subprocess.Popen([sys.executable, "-c", "while True: pass"]) for _ in range(processes)]
+    try:
+        yield
+    finally:
+        for process in busy:
+            process.kill()
+            process.wait()
+
+
+def differing(one, other):
+    return sorted(channel for channel in one.keys() | other.keys() if one.get(channel) != other.get(channel))
+
+
+def test_threads_load_and_the_place_change_no_byte(tmp_path, monkeypatch):
+    """In one process, so that what an earlier run left behind would show too."""
+    words = ["run", *SMALL, "dataset.length=24"]
+    assert main([*words, "threads=1", f"out={tmp_path}/first"]) == 0
+    first = contents(tmp_path / "first" / "run.mcap")
+    assert {"/pose", "/map", "/keypoints", "/surface", "/view/pose"} <= set(first) and len(first["/pose"]) == 24
+    (tmp_path / "elsewhere").mkdir()
+    monkeypatch.chdir(tmp_path / "elsewhere")
+    with load(2):
+        for threads in (2, 4):
+            assert main([*words, f"threads={threads}", f"out={threads}"]) == 0
+            assert differing(first, contents(f"{threads}/run.mcap")) == []
+    assert main([*words, "dataset.seed=1", "threads=2", "out=other"]) == 0  # the comparison can fail
+    assert {"/pose", "/map", "/keypoints"} <= set(differing(first, contents("other/run.mcap")))
+
+
+@pytest.mark.slow
+def test_ten_runs_in_processes_of_their_own_are_one(tmp_path):
+    """1, 2 and 4 threads, every other one under load, each from a folder of its own with another seed of Python's hashes, over a loss and back."""
+    words = ["dataset=faults", "+dataset.options.width=320", "+dataset.options.height=240", "dataset.frames=0:90", "dataset.cover=40:50"]
+    first = None
+    for number in range(10):
+        folder = tmp_path / str(number)
+        folder.mkdir()
+        environment = {**os.environ, "PYTHONHASHSEED": str(number)}
+        with load(2 * (number % 2)):
+            command = [sys.executable, "-c", RUN, *words, f"threads={(1, 2, 4)[number % 3]}", "out=run"]
+            done = subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True)
+        assert done.returncode == 0, done.stderr[-1000:]
+        found = contents(folder / "run" / "run.mcap")
+        first = first or found
+        assert differing(first, found) == [], number
+        for name in ("trajectory.txt", "trajectory_causal.txt", "metrics.json"):
+            assert (folder / "run" / name).read_bytes() == (tmp_path / "0" / "run" / name).read_bytes()

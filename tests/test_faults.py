@@ -1,0 +1,157 @@
+"""What survives of the default graph on a bad day: every fault through the whole program, judged by the truth.
+
+Whatever comes in, the run ends well, every frame that is used has a pose that is finite and rigid, and its status says with a reason what it is
+worth: `lost` where nothing was seen, `ok` within twice what the covariance says, `degraded` otherwise."""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+import pytest
+from omegaconf import OmegaConf
+
+from trihedron.datasets.faults import Faults
+from trihedron.datasets.motion import Motion, camera_pose
+from trihedron.datasets.synthetic import Synthetic
+from trihedron.pipeline.cli import main
+from trihedron.pipeline.consistency import pose_consistency
+from trihedron.pipeline.geometry import invert, log_se3
+from trihedron.pipeline.recording import Recording
+from trihedron.pipeline.types import LOST, OK
+
+SMALL = {"width": 320, "height": 240}
+HONEST = 24.0  # median normalised error of the frames that are ok: their errors are within twice what they say (6 is exact)
+NOT_TOLD = np.inf  # nothing in the data tells this fault from a scene
+
+
+@dataclass(frozen=True)
+class Case:
+    """Options of `dataset=faults`, those of the room underneath, and what must come of it."""
+
+    faults: dict = field(default_factory=dict)
+    room: dict = field(default_factory=dict)
+    most_mm: float = 20.0  # error of any tracked pose, in the world of the first frame
+    lost: tuple = ()  # frames (arrived) that are lost, no others
+    lost_most: int = 0  # or how many at most, wherever
+    normalised: float = HONEST
+    said: str = ""  # in what the program says on the way
+
+
+MOTION = {"pan": Motion.pan, "still": Motion.still}
+CASES = {
+    "one frame dropped": Case({"drop": "20:21"}),
+    "ten frames dropped": Case({"drop": "20:30"}),
+    "a hundred frames dropped": Case({"drop": "20:120"}, {"length": 160}, 30.0, lost_most=15),
+    "repeated frames": Case({"freeze": "20:30"}),
+    "frames in the reverse order": Case({"reverse": "20:30"}, said="frame 21: its time is 33 ms before that of the frame before it; it is skipped"),
+    "a clock set back": Case({"jump": 30, "jump_s": -10.0}, said="frame 30: the clock was set back by 9.967 s; time goes on from the frame before"),
+    "a clock set forward": Case({"jump": 30, "jump_s": 3600.0}),
+    "black images": Case({"cover": "20:40", "covered": "color"}, most_mm=60.0),
+    "white images": Case({"cover": "20:40", "covered": "color", "cover_with": "white"}, most_mm=60.0),
+    "no depth": Case({"cover": "20:40", "covered": "depth"}),
+    "nine tenths of the depth missing": Case({"depth_holes": 0.9}, most_mm=100.0),
+    "depth that ends at 3 m": Case({"depth_limit_m": 3.0}, most_mm=60.0, said="depth readings say 3.000 m and none more, which is a limit"),
+    "depth that is not finite": Case({"not_finite": 0.1}, said="depth readings are negative or not finite; they count as missing"),
+    "a hand for two seconds": Case({"cover": "10:70", "cover_with": "hand"}, {"length": 90}, lost=tuple(range(10, 70))),
+    "depth of another size": Case({"depth_resize": 0.5, "during": "20:24"}, said="frame 20: depth is 160×120 while colour is 320×240"),
+    "another resolution from the middle on": Case({"resize": 0.5, "during": "30:"}, most_mm=60.0),
+    "focal lengths a fifth too long": Case({"focal_times": 1.2}, most_mm=500.0, normalised=NOT_TOLD),
+    "focal lengths a fifth too short": Case({"focal_times": 0.8}, most_mm=1000.0, normalised=NOT_TOLD),
+    "depth five times too far": Case({"depth_times": 5.0}, said="too large for a room; is the depth_scale of the camera right?"),
+    "depth five times too near": Case({"depth_times": 0.2}, said="too small for a room; is the depth_scale of the camera right?"),
+    "noisy depth": Case({"depth_noise": 2.0}, most_mm=50.0),
+    "motion blur": Case({"exposure_ms": 30.0}),
+    "rolling shutter": Case({"readout_ms": 10.0}, most_mm=30.0),
+    "5 Hz": Case({"every": 6}, {"length": 300}, 30.0),
+    "gamma": Case({"gamma": 2.2, "during": "30:"}),
+    "moving objects over 30 %": Case({"moving": 0.3}, most_mm=300.0, normalised=NOT_TOLD),
+    "mirrors and glass": Case({"reflecting": 0.2}, most_mm=80.0),
+    "turning on the spot, all round": Case({}, {"motion": "pan", "length": 545}, 30.0),
+}  # fmt: skip
+
+
+def words(case):
+    """The command line of a case; a clean room without faults is read as it is."""
+    room = {"length": 60, **SMALL, **case.room}
+    return ["dataset=faults", *(f"+dataset.options.{k}={v}" for k, v in room.items()), *(f"dataset.{k}={v}" for k, v in case.faults.items())]
+
+
+def run(tmp_path, capsys, case):
+    """Poses of the default graph, and the true poses of the frames as they arrived, in the world of the first one."""
+    assert main(["run", *words(case), f"out={tmp_path / 'run'}"]) == 0
+    recording = Recording(tmp_path / "run" / "run.mcap")
+    poses, said = list(recording.values("pose")), capsys.readouterr().err
+    used = OmegaConf.create(recording.metadata["config"]).dataset
+    dataset = Faults(of="synthetic", options=dict(used.options), drop=used.drop, every=used.every, reverse=used.reverse)
+    shown = [Faults(freeze=used.freeze)._delivery.shown(int(dataset._delivered[pose.index])) for pose in poses]
+    true = np.array([camera_pose(MOTION.get(used.options.get("motion"), Motion.walk), 0, number / 30.0) for number in shown])
+    true = invert(true[0]) @ true
+    true[:, :3, 3] *= used.depth_times  # a scale that is wrong is wrong for all
+    return poses, true, said
+
+
+def is_rigid(T):
+    """To rounding."""
+    return np.abs(T[:3, :3] @ T[:3, :3].T - np.eye(3)).max() < 1e-9 and np.linalg.det(T[:3, :3]) > 0.0 and (T[3] == [0.0, 0.0, 0.0, 1.0]).all()
+
+
+def check(case, poses, true, said):
+    """The promises of this file; prints what a run was like."""
+    assert all(np.isfinite(pose.T_world_camera).all() and is_rigid(pose.T_world_camera) and pose.reason for pose in poses)
+    assert all(np.isfinite(pose.covariance).all() and np.linalg.eigvalsh(pose.covariance)[0] > 0.0 for pose in poses)
+    lost = [pose.index for pose in poses if pose.status == LOST]
+    tracked = [k for k, pose in enumerate(poses) if pose.status != LOST and pose.submap == 0]
+    errors_mm = [1e3 * np.linalg.norm(log_se3(invert(poses[k].T_world_camera) @ true[k])[:3]) for k in tracked]
+    ok = [k for k in tracked if poses[k].status == OK and k > 0]
+    normalised = pose_consistency(*(np.array([getattr(poses[k], name) for k in ok]) for name in ("T_world_camera", "covariance")), true[ok])
+    print(f"{len(poses)} frames, {len(lost)} lost, {len(tracked) - len(ok) - 1} degraded; at most {max(errors_mm):.1f} mm off, "
+          f"median {np.median(errors_mm):.1f} mm; normalised error of those ok {normalised.nees_median:.1f}")  # fmt: skip
+    assert (tuple(lost) == case.lost) if not case.lost_most else len(lost) <= case.lost_most
+    assert max(errors_mm) < case.most_mm and normalised.nees_median < case.normalised
+    assert case.said in said and ("warning" in said) == bool(case.said)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", CASES)
+def test_what_survives(tmp_path, capsys, name):
+    check(CASES[name], *run(tmp_path, capsys, CASES[name]))
+
+
+def test_frames_that_come_late_again_or_not_at_all(tmp_path, capsys):
+    case = Case({"drop": "6:8", "reverse": "12:15", "jump": 20, "jump_s": -10.0, "freeze": "24:27"}, {"length": 34}, said="the clock was set back by")
+    poses, true, said = run(tmp_path, capsys, case)
+    check(case, poses, true, said)
+    assert len(poses) == 34 - 2 - 2 and "2 such warnings, the first: frame 11: its time is 33 ms before" in said
+    assert (np.diff([pose.stamp_ns for pose in poses]) > 0).all()
+
+
+def test_a_hand_over_a_sensor_that_reads_nonsense(tmp_path, capsys):
+    faults = {"cover": "12:20", "cover_with": "hand", "not_finite": 0.05, "gamma": 1.5, "depth_holes": 0.3}
+    case = Case(faults, {"length": 28}, lost=tuple(range(12, 20)), said="not finite; they count as missing")
+    check(case, *run(tmp_path, capsys, case))
+
+
+@pytest.mark.parametrize("times, said", [(5.0, "about 16 m, too large"), (0.2, "about 0.66 m, too small"), (1.0, "")])
+def test_a_wrong_scale_of_depth_is_recognised_and_said_in_one_line(tmp_path, capsys, times, said):
+    assert main(["run", *words(Case({"depth_times": times}, {"length": 12, "width": 160, "height": 120})), f"out={tmp_path / 'run'}"]) == 0
+    lines = capsys.readouterr().err.splitlines()
+    expected = f"trihedron: warning: the depth of the first frames is {said} for a room; is the depth_scale of the camera right?"
+    assert lines == ([expected] if said else [])
+
+
+@pytest.mark.slow
+def test_a_camera_at_rest_stays_where_it_is_and_its_map_as_large_as_it_was(tmp_path):
+    """A thousand frames of one view: no drift beyond a millimetre, and no more keyframes or landmarks than after the first second."""
+    assert main(["run", "dataset.motion=still", "dataset.length=1000", "dataset.width=320", "dataset.height=240", f"out={tmp_path / 'run'}"]) == 0
+    recording = Recording(tmp_path / "run" / "run.mcap")
+    poses, maps = list(recording.values("pose")), list(recording.values("map"))
+    places = np.array([pose.T_world_camera[:3, 3] for pose in poses])
+    drift_mm = 1e3 * np.linalg.norm(places[-100:].mean(axis=0) - places[10:110].mean(axis=0))
+    print(f"drift {drift_mm:.2f} mm, keyframes {len(maps[-1].keyframes)}, {np.count_nonzero(maps[-1].points.column('alive'))} points")
+    assert {pose.status for pose in poses} == {OK} and drift_mm < 1.0
+    assert len(maps[-1].keyframes) == 1 and maps[-1].index < 30
+
+
+def test_the_room_is_the_same_without_faults():
+    """`dataset=faults` without a fault changes nothing."""
+    plain, wrapped = Synthetic(**SMALL, length=3)(2), Faults(options={**SMALL, "length": 3})(2)
+    assert plain.stamp_ns == wrapped.stamp_ns and np.array_equal(plain.color, wrapped.color) and np.array_equal(plain.depth_m, wrapped.depth_m)
