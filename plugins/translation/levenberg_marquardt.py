@@ -6,13 +6,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from trihedron.pipeline.geometry import pose_matrix, transform, transform_planes
+from trihedron.pipeline.geometry import pose_matrix
 from trihedron.pipeline.registry import register
 from trihedron.pipeline.types import F64, LOST, Frame, Keypoints, Map, Planes, Pose, Rotation, Segments, Tracks, Translation
-from trihedron.plugins.numerics.algebra import uncertainty as un
 from trihedron.plugins.numerics.maps.anchoring import anchored
 from trihedron.plugins.numerics.motion.pose_solver import solve_pose
 from trihedron.plugins.numerics.motion.pose_terms import SAME, LineTerms, PlaneTerms, PointTerms
+from trihedron.plugins.numerics.motion.tracked_terms import placed_planes, placed_points
 
 
 @register("translation", "levenberg_marquardt")
@@ -90,16 +90,12 @@ class LevenbergMarquardt:
         """Tracked key points whose previous depth is known."""
         known = np.isfinite(tracks.points_m).all(axis=1)
         rows = tracks.keypoints[known, 1]
-        before = tracks.points_m[known].astype(np.float64)
-        sigma_px = keypoints.sigma_px[rows].astype(np.float64)
-        covariance = un.point_covariance(before, sigma_px, tracks.sigma_m[known].astype(np.float64), frame.camera)
-        covariance += un.turned_covariance(before, uncertain)
+        sigma_px = keypoints.sigma_px[rows]
         return PointTerms(
-            transform(T, before),
-            un.rotate_covariance(T[:3, :3], covariance),
+            *placed_points(tracks.points_m[known], sigma_px, tracks.sigma_m[known], frame.camera, T, uncertain),
             keypoints.pixels[rows].astype(np.float64),
             keypoints.points_m[rows, 2].astype(np.float64),
-            sigma_px,
+            sigma_px.astype(np.float64),
             keypoints.sigma_m[rows].astype(np.float64),
         )
 
@@ -107,15 +103,14 @@ class LevenbergMarquardt:
         """Tracked lines whose previous 3D end points are known."""
         known = np.isfinite(tracks.endpoints_m).all(axis=(1, 2))
         rows = tracks.segments[known, 1]
-        before = tracks.endpoints_m[known].astype(np.float64)
-        sigma_px = np.full(before.shape[:2], self.line_sigma_px)
-        covariance = un.point_covariance(before, sigma_px, frame.camera.depth_noise.sigma_m(before[..., 2]), frame.camera)
-        covariance += un.turned_covariance(before, uncertain)
+        ends = tracks.endpoints_m[known].reshape(-1, 3)
+        sigma_px, sigma_m = np.full(len(ends), self.line_sigma_px), frame.camera.depth_noise.sigma_m(ends[:, 2].astype(np.float64))
+        world, covariance = placed_points(ends, sigma_px, sigma_m, frame.camera, T, uncertain)
         return LineTerms(
-            transform(T, before),
-            un.rotate_covariance(T[:3, :3], covariance),
+            world.reshape(-1, 2, 3),
+            covariance.reshape(-1, 2, 3, 3),
             segments.endpoints_px[rows].astype(np.float64),
-            sigma_px[:, 0].copy(),
+            np.full(len(rows), self.line_sigma_px),
             segments.endpoints_m[rows].astype(np.float64),
             segments.covariance_m2[rows].astype(np.float64),
         )
@@ -123,15 +118,9 @@ class LevenbergMarquardt:
     def _planes(self, tracks: Tracks, planes: Planes, T: F64, uncertain: F64) -> PlaneTerms:
         """Tracked planes."""
         rows = tracks.planes[:, 1]
-        world = transform_planes(T, tracks.coefficients)
         observed = planes.coefficients[rows]
-        return PlaneTerms(
-            np.full(len(rows), SAME, np.int32),
-            world,
-            un.transform_plane_covariance(T, tracks.coefficients, world, tracks.plane_covariance),
-            observed,
-            planes.covariance[rows] + un.turned_plane_covariance(observed, uncertain),
-        )
+        world, covariance, turned = placed_planes(tracks.coefficients, tracks.plane_covariance, observed, T, uncertain)
+        return PlaneTerms(np.full(len(rows), SAME, np.int32), world, covariance, observed, planes.covariance[rows] + turned)
 
     def _said(self, frame: Frame, t: F64, covariance: F64, unobservable: F64, inliers: tuple[int, int, int], estimated: bool) -> Translation:
         return Translation(frame.index, frame.stamp_ns, t.copy(), covariance, unobservable, np.array(inliers, np.int32), estimated)

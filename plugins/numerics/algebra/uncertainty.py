@@ -35,12 +35,6 @@ def cross_matrices(points: F64) -> F64:
     return np.stack([np.stack([o, -z, y], -1), np.stack([z, o, -x], -1), np.stack([-y, x, o], -1)], -2)
 
 
-def turned_covariance(points: F64, rotation_covariance: F64) -> F64:
-    """(..., 3, 3): what a small rotation of the camera with the given covariance (3, 3) does to camera-frame points or normals (..., 3)."""
-    P = cross_matrices(points)
-    return P @ rotation_covariance @ np.swapaxes(P, -1, -2)
-
-
 def moved_covariance(points: F64, pose_covariance: F64) -> F64:
     """(..., 3, 3): what an uncertain pose, (6, 6) of xi = (rho, phi), does to camera-frame points (..., 3)."""
     J = np.concatenate([np.broadcast_to(np.eye(3), (*points.shape[:-1], 3, 3)), -cross_matrices(points)], axis=-1)
@@ -55,11 +49,3 @@ def transform_plane_covariance(T_a_b: F64, planes_b: F64, planes_a: F64, covaria
     F[:, 2, :2] = -T_a_b[:3, 3] @ turned
     F[:, 2, 2] = 1.0
     return F @ covariance_b @ np.swapaxes(F, -1, -2)
-
-
-def turned_plane_covariance(planes: F64, rotation_covariance: F64) -> F64:
-    """(n, 3, 3) covariance of (a, b, d) that a small rotation of the camera adds to observed planes (n, 4): to the normal only."""
-    B = tangent_basis(planes[:, :3])
-    added = np.zeros((len(planes), 3, 3))
-    added[:, :2, :2] = np.swapaxes(B, -1, -2) @ turned_covariance(planes[:, :3], rotation_covariance) @ B
-    return added

@@ -6,13 +6,33 @@ import numba
 import numpy as np
 
 from trihedron.pipeline.types import F32, F64, I32, Camera
+from trihedron.plugins.numerics.algebra.constant_arrays import constant
 
 
 def predict_pixels(pixels: F32, points_m: F32, camera: Camera, R: F64, t: F64) -> F64:
-    """Pixels (..., 2) of the previous image moved by (R, t); those without a 3D point (..., 3) as if they were infinitely far."""
-    far = camera.back_project(pixels.astype(np.float64), np.ones(pixels.shape[:-1])) @ R.T
-    near = points_m.astype(np.float64) @ R.T + t
-    return camera.project(np.where(np.isfinite(near).all(axis=-1, keepdims=True), near, far))
+    """Pixels (..., 2) of the previous image moved by (R, t), NaN behind the camera; those without a 3D point (..., 3) as if infinitely far."""
+    intrinsics = (float(camera.fx), float(camera.fy), float(camera.cx), float(camera.cy))
+    flat = constant(pixels.reshape(-1, 2), np.float32), constant(points_m.reshape(-1, 3), np.float32)
+    return np.asarray(_predicted(*flat, intrinsics, constant(R, np.float64), constant(t, np.float64)).reshape(pixels.shape))
+
+
+@numba.njit(cache=True, nogil=True)
+def _predicted(pixels: F32, points_m: F32, intrinsics: tuple[float, float, float, float], R: F64, t: F64) -> F64:
+    """`predict_pixels` of n."""
+    fx, fy, cx, cy = intrinsics
+    out = np.empty((len(pixels), 2))
+    for i in range(len(pixels)):
+        x, y, z = float(points_m[i, 0]), float(points_m[i, 1]), float(points_m[i, 2])
+        near = 1.0
+        if not np.isfinite(x + y + z):
+            x, y, z, near = (pixels[i, 0] - cx) / fx, (pixels[i, 1] - cy) / fy, 1.0, 0.0
+        depth = R[2, 0] * x + R[2, 1] * y + R[2, 2] * z + near * t[2]
+        if depth > 1e-6:
+            out[i, 0] = fx * (R[0, 0] * x + R[0, 1] * y + R[0, 2] * z + near * t[0]) / depth + cx
+            out[i, 1] = fy * (R[1, 0] * x + R[1, 1] * y + R[1, 2] * z + near * t[1]) / depth + cy
+        else:
+            out[i] = np.nan
+    return out
 
 
 def offset_px(predicted: F64, found: F32) -> F64:

@@ -1,4 +1,4 @@
-"""Pairs of places, one in each of two frames, with the information of their difference: of points and of the ends of lines."""
+"""Pairs of places and of planes, one in each of two frames, with the information of their difference; places are points and the ends of lines."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import numba
 import numpy as np
 
 from trihedron.pipeline.types import F32, F64, I32
+from trihedron.plugins.numerics.algebra.small_linear import inverse_positive
 from trihedron.plugins.numerics.motion.pose_terms import basis
 
 SHORTEST_M = 1e-3  # line
@@ -82,4 +83,40 @@ def line_pairs(rows: I32, before: F32, endpoints: F32, covariance: F32, rad_per_
                     first, second = S[1, 1] * B[b, 0] - S[0, 1] * B[b, 1], S[0, 0] * B[b, 1] - S[1, 0] * B[b, 0]
                     information[m + end, a, b] = 0.5 * (B[a, 0] * first + B[a, 1] * second) / det
         m += 2
+    return p[:m], q[:m], information[:m]
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def plane_pairs(rows: I32, before: F64, before_covariance: F64, planes: F64, covariance: F64, floor: float) -> tuple[F64, F64, F64]:
+    """Previous planes (m, 4), current ones, and the information (m, 4, 4) of their difference in (n, d), of those of p pairs that are known.
+
+    `before` (p, 4) and its covariances (p, 3, 3) of (a, b, d) belong to the current `planes[rows]`; `floor` (rad) is the least error of a normal."""
+    m, p, q, information = 0, np.empty((len(rows), 4)), np.empty((len(rows), 4)), np.zeros((len(rows), 4, 4))
+    B, C = np.empty((3, 2)), np.empty((3, 3))
+    for i in range(len(rows)):
+        row, total = rows[i], 0.0
+        for a in range(3):
+            for b in range(3):
+                C[a, b] = before_covariance[i, a, b] + covariance[row, a, b]
+                total += C[a, b]
+            C[a, a] += floor * floor if a < 2 else 0.0
+        for k in range(4):
+            p[m, k], q[m, k] = before[i, k], planes[row, k]
+            total += p[m, k] + q[m, k]
+        if not np.isfinite(total):
+            continue
+        A = inverse_positive(C)
+        if A[0, 0] == 0.0:
+            continue
+        basis(q[m, :3], B)
+        for a in range(3):
+            for b in range(3):
+                information[m, a, b] = 0.0
+                for u in range(2):
+                    for v in range(2):
+                        information[m, a, b] += B[a, u] * A[u, v] * B[b, v]
+            information[m, a, 3] = B[a, 0] * A[0, 2] + B[a, 1] * A[1, 2]
+            information[m, 3, a] = information[m, a, 3]
+        information[m, 3, 3] = A[2, 2]
+        m += 1
     return p[:m], q[:m], information[:m]

@@ -12,10 +12,9 @@ from typing import NamedTuple
 import numba
 import numpy as np
 
-from trihedron.pipeline.geometry import tangent_basis
 from trihedron.pipeline.types import F64, Keypoints, Planes, Segments, Tracks
 from trihedron.plugins.numerics.algebra.small_linear import solve_positive, turn_left
-from trihedron.plugins.numerics.motion.place_pairs import line_pairs, point_pairs
+from trihedron.plugins.numerics.motion.place_pairs import line_pairs, plane_pairs, point_pairs
 
 MOST = 400  # pairs of places used, about; more only cost time
 GATE2 = 9.0  # squared standard deviations at which a term counts a quarter, once the scale has come down
@@ -53,18 +52,12 @@ def motion_terms(tracks: Tracks, keypoints: Keypoints, segments: Segments, plane
     of_points = point_pairs(pairs, before, sigma, now, sigma_px, sigma_m, rad_per_px, step)
     lines, endpoints, noise = copy(tracks.segments[:, 1]), copy(segments.endpoints_m), copy(segments.covariance_m2)
     of_lines = line_pairs(lines, copy(tracks.endpoints_m), endpoints, noise, rad_per_px, step)
-    rows = tracks.planes[:, 1]
-    covariance = planes.covariance[rows] + tracks.plane_covariance
-    covariance[:, :2, :2] += np.eye(2) * np.radians(floor_deg) ** 2
-    known = np.isfinite(planes.coefficients[rows] + tracks.coefficients).all(axis=1) & np.isfinite(covariance).all(axis=(1, 2))
-    known[known] = np.linalg.det(covariance[known]) > 0.0
-    rows, covariance, coefficients = rows[known], covariance[known], tracks.coefficients[known]
-    basis = np.zeros((len(rows), 4, 3))
-    basis[:, :3, :2] = tangent_basis(planes.coefficients[rows, :3])
-    basis[:, 3, 2] = 1.0
-    information = basis @ np.linalg.inv(covariance) @ np.swapaxes(basis, 1, 2) if len(rows) else np.zeros((0, 4, 4))
+    of_planes = plane_pairs(
+        copy(tracks.planes[:, 1]), copy(tracks.coefficients), copy(tracks.plane_covariance), copy(planes.coefficients), copy(planes.covariance),
+        np.radians(floor_deg),
+    )  # fmt: skip
     places = [np.concatenate(pair) for pair in zip(of_points, of_lines)]
-    return Terms(places[0], places[1], places[2], coefficients, planes.coefficients[rows], information)
+    return Terms(*places, *of_planes)
 
 
 def solve_motion(terms: Terms, R: F64, sigma_deg: float, sigma_m: float) -> Motion:
@@ -117,19 +110,36 @@ def _plane_residual(before: F64, after: F64, R: F64, t: F64, e: F64) -> None:
 
 
 @numba.njit(cache=True, nogil=True)
-def _accumulate(e: F64, J: F64, L: F64, w: float, H: F64, g: F64) -> None:
-    """H += w JᵀLJ, g += w JᵀLe for J (rows, 6)."""
-    rows = len(e)
+def _add_place(e: F64, p: F64, L: F64, w: float, M: F64, H: F64, g: F64) -> None:
+    """Add w JᵀLJ to the lower triangle of H and w JᵀLe to g for a place at R p_previous = p, whose J is (-[p]×, I); M is scratch (3, 3)."""
+    for k in range(3):
+        M[0, k] = w * (p[1] * L[2, k] - p[2] * L[1, k])  # [p]× L
+        M[1, k] = w * (p[2] * L[0, k] - p[0] * L[2, k])
+        M[2, k] = w * (p[0] * L[1, k] - p[1] * L[0, k])
+    for i in range(3):
+        H[i, 0] += p[1] * M[i, 2] - p[2] * M[i, 1]
+        H[i, 1] += p[2] * M[i, 0] - p[0] * M[i, 2]
+        H[i, 2] += p[0] * M[i, 1] - p[1] * M[i, 0]
+        for k in range(3):
+            g[i] += M[i, k] * e[k]
+            g[3 + i] += w * L[i, k] * e[k]
+            H[3 + k, i] += M[i, k]
+            H[3 + i, 3 + k] += w * L[i, k]
+
+
+@numba.njit(cache=True, nogil=True)
+def _add_plane(e: F64, J: F64, L: F64, w: float, H: F64, g: F64) -> None:
+    """Add w JᵀLJ to the lower triangle of H and w JᵀLe to g for J (4, 6)."""
     LJ = np.zeros(6)
-    for i in range(rows):
+    for i in range(4):
         for b in range(6):
             LJ[b] = 0.0
-        for j in range(rows):
+        for j in range(4):
             for b in range(6):
                 LJ[b] += w * L[i, j] * J[j, b]
         for b in range(6):
             g[b] += LJ[b] * e[i]
-            for a in range(6):
+            for a in range(b, 6):
                 H[a, b] += J[i, a] * LJ[b]
 
 
@@ -138,19 +148,15 @@ def _normal_equations(terms: Terms, R: F64, t: F64, scale2: float, H: F64, g: F6
     """Fill H (6, 6) and g (6,) with Geman–McClure weights at the squared scale; returns the weighted χ² and the weighted number of components."""
     H[:], g[:] = 0.0, 0.0
     places, planes, moved = _residuals(terms, R, t)
-    e3, J3, e4, J4 = np.empty(3), np.zeros((3, 6)), np.empty(4), np.zeros((4, 6))
+    e3, M, e4, J4 = np.empty(3), np.empty((3, 3)), np.empty(4), np.zeros((4, 6))
     chi2, components = 0.0, 0.0
-    for k in range(3):
-        J3[k, 3 + k] = 1.0
     for i in range(len(places)):
         w = (scale2 / (scale2 + places[i])) ** 2
         chi2 += w * places[i]
         components += 3.0 * w
-        x, y, z = moved[i, 0], moved[i, 1], moved[i, 2]
-        J3[0, 1], J3[0, 2], J3[1, 0], J3[1, 2], J3[2, 0], J3[2, 1] = z, -y, -z, x, y, -x  # d(phi × p)/d phi
         for k in range(3):
             e3[k] = moved[i, k] + t[k] - terms.after_m[i, k]
-        _accumulate(e3, J3, terms.information[i], w, H, g)
+        _add_place(e3, moved[i], terms.information[i], w, M, H, g)
     for i in range(len(planes)):
         w = (scale2 / (scale2 + planes[i])) ** 2
         chi2 += w * planes[i]
@@ -160,7 +166,10 @@ def _normal_equations(terms: Terms, R: F64, t: F64, scale2: float, H: F64, g: F6
         J4[0, 1], J4[0, 2], J4[1, 0], J4[1, 2], J4[2, 0], J4[2, 1] = z, -y, -z, x, y, -x
         J4[3, 0], J4[3, 1], J4[3, 2] = t[1] * z - t[2] * y, t[2] * x - t[0] * z, t[0] * y - t[1] * x  # -(phi × n)·t = -phi·(n × t)
         J4[3, 3], J4[3, 4], J4[3, 5] = -x, -y, -z
-        _accumulate(e4, J4, terms.plane_information[i], w, H, g)
+        _add_plane(e4, J4, terms.plane_information[i], w, H, g)
+    for i in range(6):
+        for j in range(i):
+            H[j, i] = H[i, j]
     return chi2, components
 
 
