@@ -30,7 +30,8 @@ from trihedron.plugins.numerics.motion.pose_step import add_prior, moved, size, 
 from trihedron.plugins.numerics.motion.pose_terms import LineTerms, PlaneTerms, PointTerms
 
 ROUNDS, ITERATIONS, ROBUST_ROUNDS = 4, 10, 2  # as ORB-SLAM2 optimises a pose; Huber only in the first rounds
-CONVERGED = 1e-3  # squared length of a step in standard deviations below which a round has converged
+WEIGHED = (0, 1, ROUNDS)  # turns that begin with new weights: by then the pose has moved, or will not any more
+CONVERGED, ROUGHLY = 1e-3, 1e-2  # squared length of a step in standard deviations below which the last round, and the others, have converged
 MAX_DAMPING = 1e10
 PLANE_SLACK = 4.0  # when a direction would be lost with the planes beyond their gate, they are outliers only beyond this × it
 
@@ -171,7 +172,8 @@ def _solve(
 ) -> tuple[F64, F64, F64, float]:
     """The rounds; changes `flags`. Returns R, t, the data's information (6, 6) at the solution and the cost.
 
-    Every evaluation is the one call of `linearise`: the last turn takes no step and is only the information of the final inliers."""
+    Every evaluation is the one call of `linearise`, and a step too short to matter is taken without another. The last turn takes no step and is only
+    the information of the final inliers."""
     n, m, p = len(points.positions_m), len(lines.endpoints_m), len(planes.kinds)
     weights = Weights(np.empty((n, 3, 3)), np.empty((m, 2, 2)), np.empty((m, 2, 2)), np.empty((p, 3, 3)))
     chi2 = Chi2(np.empty(n), np.empty(m), np.empty(m), np.empty(p))
@@ -179,25 +181,30 @@ def _solve(
     data, trial_H, trial_g = np.zeros((6, 6)), np.zeros((6, 6)), np.zeros(6)
     cost = 0.0
     for turn in range(ROUNDS + 1):
-        cost, damping, accepted = np.inf, 1e-6, True
+        cost, damping = np.inf, 1e-6
         R_new, t_new = R, t
-        weigh(R, t, camera, points, lines, planes, weights)
-        for trial in range(ITERATIONS + 1 if turn < ROUNDS else 1):
+        if turn in WEIGHED:
+            weigh(R, t, camera, points, lines, planes, weights)
+        for trial in range(ITERATIONS + 1):
             new = linearise(R_new, t_new, camera, points, lines, planes, weights, flags, turn < ROBUST_ROUNDS, trial_H, trial_g, chi2)
             data[:] = trial_H
             new += add_prior(R_new, t_new, R_prior, t_prior, prior, trial_H, trial_g)
             accepted = trial == 0 or new <= cost
-            small = trial > 0 and not size(H, dx) > CONVERGED
             if accepted:
                 R, t, cost = R_new, t_new, new
                 H[:], g[:] = trial_H, trial_g
                 damping = max(0.1 * damping, 1e-9)
             else:
                 damping = max(10.0 * damping, 1e-3)
-            if small or damping > MAX_DAMPING:
+            if turn == ROUNDS or damping > MAX_DAMPING:
                 break
             step(H, g, damping, free, dx)
             R_new, t_new = moved(R, t, dx)
+            length = size(H, dx)
+            if not length > (CONVERGED if turn == ROUNDS - 1 else ROUGHLY):
+                if accepted and length >= 0.0:
+                    R, t = R_new, t_new
+                break
         if turn < ROUNDS:
             _classify(points, planes, chi2, flags, slack)
     return R, t, data, cost
