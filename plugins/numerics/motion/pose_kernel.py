@@ -15,13 +15,8 @@ from trihedron.plugins.numerics.motion.pose_terms import (
     PlaneTerms,
     PointTerms,
     basis,
-    chain_point,
     depth_direction,
-    line_depth_row,
-    line_row,
     plane_rows,
-    point_rows,
-    to_camera,
 )
 
 CHI2_1, CHI2_2, CHI2_3 = 3.841, 5.991, 7.815  # 95 % of χ² with 1, 2, 3 degrees of freedom
@@ -85,94 +80,138 @@ def _add(chi2: float, e: F64, J: F64, rows: int, W: F64, limit: float, robust: b
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def _add_point(p: F64, D: F64, W: F64, e: F64, w: float, A: F64, M: F64, H: F64, g: F64) -> None:
-    """Add a point's term with weight w: with A = DᵀWD, b = DᵀWr and P = [p]×, J = (-D, DP) gives the blocks A, PA, -PAP and -b, -p × b.
+def _add_points(R: F64, t: F64, camera: F64, terms: PointTerms, W: F64, flags: U8, robust: bool, H: F64, g: F64, chi2: F64) -> float:
+    """All points; `point_rows` written out in scalars, since points are most of the work.
 
-    A and M are scratch (3, 3). Written out because points are most of the work."""
-    a, b, x, y, z = w * D[0, 0], w * D[1, 1], D[0, 2], D[1, 2], D[2, 2]
-    A[0, 0] = a * D[0, 0] * W[0, 0]
-    A[1, 1] = b * D[1, 1] * W[1, 1]
-    A[0, 1] = A[1, 0] = a * D[1, 1] * W[0, 1]
-    A[0, 2] = A[2, 0] = a * (W[0, 0] * x + W[0, 1] * y + W[0, 2] * z)
-    A[1, 2] = A[2, 1] = b * (W[0, 1] * x + W[1, 1] * y + W[1, 2] * z)
-    A[2, 2] = w * (x * x * W[0, 0] + y * y * W[1, 1] + z * z * W[2, 2] + 2.0 * (x * y * W[0, 1] + x * z * W[0, 2] + y * z * W[1, 2]))
-    b0, b1, b2 = a * e[0], b * e[1], w * (x * e[0] + y * e[1] + z * e[2])
-    for j in range(3):
-        M[0, j] = p[1] * A[2, j] - p[2] * A[1, j]
-        M[1, j] = p[2] * A[0, j] - p[0] * A[2, j]
-        M[2, j] = p[0] * A[1, j] - p[1] * A[0, j]
-        for i in range(3):
-            H[i, j] += A[i, j]
-            H[3 + i, j] += M[i, j]
-    for i in range(3):
-        H[3 + i, 3] += p[1] * M[i, 2] - p[2] * M[i, 1]
-        H[3 + i, 4] += p[2] * M[i, 0] - p[0] * M[i, 2]
-        H[3 + i, 5] += p[0] * M[i, 1] - p[1] * M[i, 0]
-    g[0] -= b0
-    g[1] -= b1
-    g[2] -= b2
-    g[3] -= p[1] * b2 - p[2] * b1
-    g[4] -= p[2] * b0 - p[0] * b2
-    g[5] -= p[0] * b1 - p[1] * b0
+    With D = dr/dp, A = DᵀWD, b = DᵀWr and P = [p]×, J = (-D, DP) gives the blocks A, PA, -PAP and -b, -p × b."""
+    cost = 0.0
+    for i in range(len(terms.positions_m)):
+        x, y, z = terms.positions_m[i, 0] - t[0], terms.positions_m[i, 1] - t[1], terms.positions_m[i, 2] - t[2]
+        p0, p1, p2 = R[0, 0] * x + R[1, 0] * y + R[2, 0] * z, R[0, 1] * x + R[1, 1] * y + R[2, 1] * z, R[0, 2] * x + R[1, 2] * y + R[2, 2] * z
+        chi2[i] = np.inf
+        if not p2 > NEAR_M:
+            cost += BEHIND if flags[i] else 0.0
+            continue
+        iz = 1.0 / p2
+        d00, d11, d22, r2 = camera[0] * iz, camera[1] * iz, 0.0, 0.0
+        d02, d12 = -d00 * p0 * iz, -d11 * p1 * iz
+        r0, r1 = d00 * p0 + camera[2] - terms.pixels[i, 0], d11 * p1 + camera[3] - terms.pixels[i, 1]
+        if np.isfinite(terms.depth_m[i]):
+            r2, d22 = iz - 1.0 / terms.depth_m[i], -iz * iz
+        w00, w01, w02, w11, w12, w22 = W[i, 0, 0], W[i, 0, 1], W[i, 0, 2], W[i, 1, 1], W[i, 1, 2], W[i, 2, 2]
+        e0, e1, e2 = w00 * r0 + w01 * r1 + w02 * r2, w01 * r0 + w11 * r1 + w12 * r2, w02 * r0 + w12 * r1 + w22 * r2
+        value = e0 * r0 + e1 * r1 + e2 * r2
+        if not value < np.inf:  # NaN, or a noise that has no inverse
+            cost += BEHIND if flags[i] else 0.0
+            continue
+        chi2[i] = value
+        if not flags[i]:
+            continue
+        w, share = _huber(value, CHI2_3 if w22 > 0.0 else CHI2_2, robust)
+        cost += share
+        a00, a11, a01 = w * d00 * d00 * w00, w * d11 * d11 * w11, w * d00 * d11 * w01
+        a02 = w * d00 * (w00 * d02 + w01 * d12 + w02 * d22)
+        a12 = w * d11 * (w01 * d02 + w11 * d12 + w12 * d22)
+        a22 = w * (d02 * d02 * w00 + d12 * d12 * w11 + d22 * d22 * w22 + 2.0 * (d02 * d12 * w01 + d02 * d22 * w02 + d12 * d22 * w12))
+        b0, b1, b2 = w * d00 * e0, w * d11 * e1, w * (d02 * e0 + d12 * e1 + d22 * e2)
+        m00, m01, m02 = p1 * a02 - p2 * a01, p1 * a12 - p2 * a11, p1 * a22 - p2 * a12
+        m10, m11, m12 = p2 * a00 - p0 * a02, p2 * a01 - p0 * a12, p2 * a02 - p0 * a22
+        m20, m21, m22 = p0 * a01 - p1 * a00, p0 * a11 - p1 * a01, p0 * a12 - p1 * a02
+        H[0, 0] += a00
+        H[1, 0] += a01
+        H[1, 1] += a11
+        H[2, 0] += a02
+        H[2, 1] += a12
+        H[2, 2] += a22
+        H[3, 0] += m00
+        H[3, 1] += m01
+        H[3, 2] += m02
+        H[4, 0] += m10
+        H[4, 1] += m11
+        H[4, 2] += m12
+        H[5, 0] += m20
+        H[5, 1] += m21
+        H[5, 2] += m22
+        H[3, 3] += p1 * m02 - p2 * m01
+        H[4, 3] += p1 * m12 - p2 * m11
+        H[4, 4] += p2 * m10 - p0 * m12
+        H[5, 3] += p1 * m22 - p2 * m21
+        H[5, 4] += p2 * m20 - p0 * m22
+        H[5, 5] += p0 * m21 - p1 * m20
+        g[0] -= b0
+        g[1] -= b1
+        g[2] -= b2
+        g[3] -= p1 * b2 - p2 * b1
+        g[4] -= p2 * b0 - p0 * b2
+        g[5] -= p0 * b1 - p1 * b0
+    return cost
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def _add_points(R: F64, t: F64, camera: F64, terms: PointTerms, W: F64, flags: U8, robust: bool, H: F64, g: F64, chi2: F64) -> float:
-    cost = 0.0
-    p, r, e, D, A, M = np.empty(3), np.empty(3), np.empty(3), np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
-    for i in range(len(terms.positions_m)):
-        to_camera(R, t, terms.positions_m[i], p)
-        if not point_rows(p, terms.pixels[i], terms.depth_m[i], camera, r, D):
-            chi2[i] = np.inf
-            cost += BEHIND if flags[i] else 0.0
-            continue
-        for k in range(3):
-            e[k] = W[i, k, 0] * r[0] + W[i, k, 1] * r[1] + W[i, k, 2] * r[2]
-        chi2[i] = e[0] * r[0] + e[1] * r[1] + e[2] * r[2]
-        if not chi2[i] < np.inf:  # NaN, or a noise that has no inverse
-            chi2[i] = np.inf
-            cost += BEHIND if flags[i] else 0.0
-        elif flags[i]:
-            w, share = _huber(chi2[i], CHI2_3 if W[i, 2, 2] > 0.0 else CHI2_2, robust)
-            cost += share
-            _add_point(p, D, W[i], e, w, A, M, H, g)
-    return cost
+def _add_pair(r0: float, r1: float, W: F64, i: int, J: F64, counts: bool, robust: bool, H: F64, g: F64) -> tuple[float, float]:
+    """χ² and cost of term i with residuals r, derivatives J (2, 6) and weights W (·, 2, 2), added to the normal equations if it `counts`; χ² is inf,
+    and nothing is added, where it is none."""
+    w00, w01, w11 = W[i, 0, 0], W[i, 0, 1], W[i, 1, 1]
+    e0, e1 = w00 * r0 + w01 * r1, w01 * r0 + w11 * r1
+    chi2 = e0 * r0 + e1 * r1
+    if not chi2 < np.inf:  # NaN, or a noise that has no inverse
+        return np.inf, 0.0
+    if not counts:
+        return chi2, 0.0
+    w, cost = _huber(chi2, CHI2_2, robust)
+    for a in range(6):
+        x, y = w * (w00 * J[0, a] + w01 * J[1, a]), w * (w01 * J[0, a] + w11 * J[1, a])
+        g[a] += w * (e0 * J[0, a] + e1 * J[1, a])
+        for b in range(a + 1):
+            H[a, b] += x * J[0, b] + y * J[1, b]
+    return chi2, cost
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def _add_lines(
     R: F64, t: F64, camera: F64, terms: LineTerms, W: F64, V: F64, flags: U8, robust: bool, H: F64, g: F64, chi2: F64, depth_chi2: F64
 ) -> float:
+    """All lines: the distances of both ends from the segment in the image (`line_row`) and from the 3D one in depth (`line_depth_row`)."""
     cost = 0.0
-    p, r, e, D, J, m = np.empty((2, 3)), np.empty(3), np.empty(3), np.empty((2, 3)), np.empty((2, 6)), np.empty(3)
+    p, r, J, m = np.empty((2, 3)), np.empty(2), np.empty((2, 6)), np.empty(3)
     for i in range(len(terms.endpoints_m)):
-        to_camera(R, t, terms.endpoints_m[i, 0], p[0])
-        to_camera(R, t, terms.endpoints_m[i, 1], p[1])
+        for k in range(2):
+            x, y, z = terms.endpoints_m[i, k, 0] - t[0], terms.endpoints_m[i, k, 1] - t[1], terms.endpoints_m[i, k, 2] - t[2]
+            for a in range(3):
+                p[k, a] = R[0, a] * x + R[1, a] * y + R[2, a] * z
         chi2[i], depth_chi2[i] = np.inf, np.inf
         if not (p[0, 2] > NEAR_M and p[1, 2] > NEAR_M):
             cost += BEHIND if flags[i] else 0.0
             continue
+        u, v = terms.endpoints_px[i, 0, 0], terms.endpoints_px[i, 0, 1]
+        du, dv = terms.endpoints_px[i, 1, 0] - u, terms.endpoints_px[i, 1, 1] - v
+        length = max(np.sqrt(du * du + dv * dv), 1e-9)
+        nu, nv = -dv / length, du / length
         for k in range(2):
-            r[k] = line_row(p[k], terms.endpoints_px[i], camera, D[k])[0]
-            chain_point(D[k : k + 1], 1, p[k], J[k : k + 1])
-        chi2[i] = _chi2(r, W[i], 2, e)
-        if not chi2[i] < np.inf:
-            chi2[i] = np.inf
+            iz = 1.0 / p[k, 2]
+            r[k] = nu * (camera[0] * p[k, 0] * iz + camera[2] - u) + nv * (camera[1] * p[k, 1] * iz + camera[3] - v)
+            d0, d1 = nu * camera[0] * iz, nv * camera[1] * iz
+            _chain(d0, d1, -(d0 * p[k, 0] + d1 * p[k, 1]) * iz, p, k, J)
+        chi2[i], share = _add_pair(r[0], r[1], W, i, J, flags[i] != OUTLIER, robust, H, g)
+        cost += share
+        if chi2[i] == np.inf:
             cost += BEHIND if flags[i] else 0.0
-            continue
-        if flags[i]:
-            cost += _add(chi2[i], e, J, 2, W[i], CHI2_2, robust, H, g)
-        if depth_direction(terms.observed_m[i], m):
+        elif depth_direction(terms.observed_m[i], m):
             for k in range(2):
-                r[k] = line_depth_row(p[k], terms.observed_m[i], m)[0]
-                D[k] = m
-                chain_point(D[k : k + 1], 1, p[k], J[k : k + 1])
-            depth_chi2[i] = _chi2(r, V[i], 2, e)
-            if not depth_chi2[i] < np.inf:
-                depth_chi2[i] = np.inf
-            elif flags[i] == INLIER:
-                cost += _add(depth_chi2[i], e, J, 2, V[i], CHI2_2, robust, H, g)
+                r[k] = 0.0
+                for a in range(3):
+                    r[k] += m[a] * (p[k, a] - terms.observed_m[i, 0, a])
+                _chain(m[0], m[1], m[2], p, k, J)
+            depth_chi2[i], share = _add_pair(r[0], r[1], V, i, J, flags[i] == INLIER, robust, H, g)
+            cost += share
     return cost
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _chain(a: float, b: float, c: float, p: F64, k: int, J: F64) -> None:
+    """Row k of J (·, 6) from the derivative (a, b, c) with respect to the camera-frame point in row k of p, as `chain_point`."""
+    J[k, 0], J[k, 1], J[k, 2] = -a, -b, -c
+    J[k, 3], J[k, 4], J[k, 5] = b * p[k, 2] - c * p[k, 1], c * p[k, 0] - a * p[k, 2], a * p[k, 1] - b * p[k, 0]
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")

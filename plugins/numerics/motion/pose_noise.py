@@ -20,7 +20,6 @@ from trihedron.plugins.numerics.motion.pose_terms import (
     line_depth_row,
     line_row,
     plane_noise,
-    point_rows,
     to_camera,
 )
 
@@ -76,30 +75,40 @@ def _quadratic(d: F64, S: F64) -> float:
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def _weigh_points(R: F64, t: F64, camera: F64, terms: PointTerms, W: F64) -> None:
-    """Pixel and inverse-depth noise plus the landmark's own covariance, projected at this pose."""
-    p, r, D, S, E, F = np.empty(3), np.empty(3), np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
+    """Pixel and inverse-depth noise plus the landmark's own covariance, projected at this pose. In scalars, as `pose_kernel` has its points."""
     for i in range(len(terms.positions_m)):
-        to_camera(R, t, terms.positions_m[i], p)
-        z = terms.depth_m[i]
-        if not point_rows(p, terms.pixels[i], z, camera, r, D):
+        x, y, z = terms.positions_m[i, 0] - t[0], terms.positions_m[i, 1] - t[1], terms.positions_m[i, 2] - t[2]
+        p2 = R[0, 2] * x + R[1, 2] * y + R[2, 2] * z
+        if not p2 > NEAR_M:
             W[i] = 0.0
             continue
-        C = terms.covariance_m2[i]
-        for j in range(3):  # E = D Rᵀ, with the zeros of D left out
-            E[0, j] = D[0, 0] * R[j, 0] + D[0, 2] * R[j, 2]
-            E[1, j] = D[1, 1] * R[j, 1] + D[1, 2] * R[j, 2]
-            E[2, j] = D[2, 2] * R[j, 2]
-        for k in range(3):
-            for j in range(3):
-                F[k, j] = E[k, 0] * C[0, j] + E[k, 1] * C[1, j] + E[k, 2] * C[2, j]
-        for k in range(3):
-            for j in range(3):
-                S[k, j] = F[k, 0] * E[j, 0] + F[k, 1] * E[j, 1] + F[k, 2] * E[j, 2]
+        iz, depth = 1.0 / p2, terms.depth_m[i]
+        d00, d11 = camera[0] * iz, camera[1] * iz
+        d02 = -d00 * (R[0, 0] * x + R[1, 0] * y + R[2, 0] * z) * iz
+        d12 = -d11 * (R[0, 1] * x + R[1, 1] * y + R[2, 1] * z) * iz
+        d22 = -iz * iz if np.isfinite(depth) else 0.0
+        u0, u1, u2 = d00 * R[0, 0] + d02 * R[0, 2], d00 * R[1, 0] + d02 * R[1, 2], d00 * R[2, 0] + d02 * R[2, 2]  # rows of D Rᵀ
+        v0, v1, v2 = d11 * R[0, 1] + d12 * R[0, 2], d11 * R[1, 1] + d12 * R[1, 2], d11 * R[2, 1] + d12 * R[2, 2]
+        c00, c01, c02 = terms.covariance_m2[i, 0, 0], terms.covariance_m2[i, 0, 1], terms.covariance_m2[i, 0, 2]
+        c11, c12, c22 = terms.covariance_m2[i, 1, 1], terms.covariance_m2[i, 1, 2], terms.covariance_m2[i, 2, 2]
+        f0, f1, f2 = c00 * u0 + c01 * u1 + c02 * u2, c01 * u0 + c11 * u1 + c12 * u2, c02 * u0 + c12 * u1 + c22 * u2
+        g0, g1, g2 = c00 * v0 + c01 * v1 + c02 * v2, c01 * v0 + c11 * v1 + c12 * v2, c02 * v0 + c12 * v1 + c22 * v2
         noise = terms.sigma_px[i] * terms.sigma_px[i]
-        S[0, 0] += noise
-        S[1, 1] += noise
-        S[2, 2] += (terms.sigma_m[i] / (z * z)) ** 2
-        invert_small(S, 3 if np.isfinite(z) else 2, W[i])
+        s00, s01, s11 = u0 * f0 + u1 * f1 + u2 * f2 + noise, v0 * f0 + v1 * f1 + v2 * f2, v0 * g0 + v1 * g1 + v2 * g2 + noise
+        if d22 == 0.0:
+            det = s00 * s11 - s01 * s01
+            W[i] = 0.0
+            W[i, 0, 0], W[i, 1, 1], W[i, 0, 1], W[i, 1, 0] = s11 / det, s00 / det, -s01 / det, -s01 / det
+            continue
+        k0, k1, k2 = d22 * R[0, 2], d22 * R[1, 2], d22 * R[2, 2]
+        s02, s12 = k0 * f0 + k1 * f1 + k2 * f2, k0 * g0 + k1 * g1 + k2 * g2
+        s22 = k0 * (c00 * k0 + c01 * k1 + c02 * k2) + k1 * (c01 * k0 + c11 * k1 + c12 * k2) + k2 * (c02 * k0 + c12 * k1 + c22 * k2)
+        s22 += (terms.sigma_m[i] / (depth * depth)) ** 2
+        m00, m01, m02 = s11 * s22 - s12 * s12, s02 * s12 - s01 * s22, s01 * s12 - s02 * s11
+        det = s00 * m00 + s01 * m01 + s02 * m02
+        W[i, 0, 0], W[i, 1, 1], W[i, 2, 2] = m00 / det, (s00 * s22 - s02 * s02) / det, (s00 * s11 - s01 * s01) / det
+        W[i, 0, 1], W[i, 0, 2], W[i, 1, 2] = m01 / det, m02 / det, (s02 * s01 - s00 * s12) / det
+        W[i, 1, 0], W[i, 2, 0], W[i, 2, 1] = W[i, 0, 1], W[i, 0, 2], W[i, 1, 2]
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
