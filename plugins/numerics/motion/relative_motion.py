@@ -67,7 +67,7 @@ def solve_motion(terms: Terms, R: F64, sigma_deg: float, sigma_m: float) -> Moti
     may be wrong. Never raises: without terms the prediction is returned, with the covariance of the prior."""
     prior = np.repeat([1.0 / np.radians(sigma_deg) ** 2, 1.0 / sigma_m**2], 3)
     R, t = np.array(R, np.float64), np.zeros(3)
-    residuals = np.concatenate(_residuals(terms, R, t)[:2])
+    residuals = _residuals(terms, R, t)
     scale2 = max(2.0 * float(np.median(residuals)), GATE2) if len(residuals) else GATE2
     H, chi2, support = _solve(terms, R, t, prior, scale2)
     scale = max(chi2 / max(3.0 * support - 6.0, 1.0), 1.0)
@@ -75,28 +75,31 @@ def solve_motion(terms: Terms, R: F64, sigma_deg: float, sigma_m: float) -> Moti
 
 
 @numba.njit(cache=True, nogil=True)
-def _residuals(terms: Terms, R: F64, t: F64) -> tuple[F64, F64, F64]:
-    """Squared Mahalanobis distances of places (n,) and planes (p,), and the rotated and moved places (n, 3)."""
+def _residuals(terms: Terms, R: F64, t: F64) -> F64:
+    """(n + p,) squared Mahalanobis distances of places and planes."""
     n, p = len(terms.before_m), len(terms.planes_before)
-    places, planes, moved = np.empty(n), np.empty(p), np.empty((n, 3))
-    e = np.empty(4)
+    out, e = np.empty(n + p), np.empty(4)
     for i in range(n):
-        total = 0.0
-        for k in range(3):
-            moved[i, k] = R[k, 0] * terms.before_m[i, 0] + R[k, 1] * terms.before_m[i, 1] + R[k, 2] * terms.before_m[i, 2]
-            e[k] = moved[i, k] + t[k] - terms.after_m[i, k]
-        for j in range(3):
-            for k in range(3):
-                total += e[j] * terms.information[i, j, k] * e[k]
-        places[i] = total
+        x, y, z = terms.before_m[i, 0], terms.before_m[i, 1], terms.before_m[i, 2]
+        a = R[0, 0] * x + R[0, 1] * y + R[0, 2] * z + t[0] - terms.after_m[i, 0]
+        b = R[1, 0] * x + R[1, 1] * y + R[1, 2] * z + t[1] - terms.after_m[i, 1]
+        c = R[2, 0] * x + R[2, 1] * y + R[2, 2] * z + t[2] - terms.after_m[i, 2]
+        L = terms.information
+        out[i] = a * (L[i, 0, 0] * a + 2.0 * (L[i, 0, 1] * b + L[i, 0, 2] * c)) + b * (L[i, 1, 1] * b + 2.0 * L[i, 1, 2] * c) + c * c * L[i, 2, 2]
     for i in range(p):
         _plane_residual(terms.planes_before[i], terms.planes_after[i], R, t, e)
-        total = 0.0
-        for j in range(4):
-            for k in range(4):
-                total += e[j] * terms.plane_information[i, j, k] * e[k]
-        planes[i] = total
-    return places, planes, moved
+        out[n + i] = _plane_distance(e, terms.plane_information[i])
+    return out
+
+
+@numba.njit(cache=True, nogil=True)
+def _plane_distance(e: F64, L: F64) -> float:
+    """eᵀ L e of four numbers."""
+    total = 0.0
+    for j in range(4):
+        for k in range(4):
+            total += e[j] * L[j, k] * e[k]
+    return total
 
 
 @numba.njit(cache=True, nogil=True)
@@ -110,21 +113,52 @@ def _plane_residual(before: F64, after: F64, R: F64, t: F64, e: F64) -> None:
 
 
 @numba.njit(cache=True, nogil=True)
-def _add_place(e: F64, p: F64, L: F64, w: float, M: F64, H: F64, g: F64) -> None:
-    """Add w JᵀLJ to the lower triangle of H and w JᵀLe to g for a place at R p_previous = p, whose J is (-[p]×, I); M is scratch (3, 3)."""
-    for k in range(3):
-        M[0, k] = w * (p[1] * L[2, k] - p[2] * L[1, k])  # [p]× L
-        M[1, k] = w * (p[2] * L[0, k] - p[0] * L[2, k])
-        M[2, k] = w * (p[0] * L[1, k] - p[1] * L[0, k])
-    for i in range(3):
-        H[i, 0] += p[1] * M[i, 2] - p[2] * M[i, 1]
-        H[i, 1] += p[2] * M[i, 0] - p[0] * M[i, 2]
-        H[i, 2] += p[0] * M[i, 1] - p[1] * M[i, 0]
-        for k in range(3):
-            g[i] += M[i, k] * e[k]
-            g[3 + i] += w * L[i, k] * e[k]
-            H[3 + k, i] += M[i, k]
-            H[3 + i, 3 + k] += w * L[i, k]
+def _add_places(terms: Terms, R: F64, t: F64, scale2: float, H: F64, g: F64) -> tuple[float, float]:
+    """Add w JᵀLJ of all places to the lower triangle of H and w JᵀLe to g, with p = R p_previous and J = (-[p]×, I); in scalars, for places are most
+    of the work. Returns the weighted χ² and number of components."""
+    chi2, components, L = 0.0, 0.0, terms.information
+    for i in range(len(terms.before_m)):
+        x, y, z = terms.before_m[i, 0], terms.before_m[i, 1], terms.before_m[i, 2]
+        p0, p1, p2 = R[0, 0] * x + R[0, 1] * y + R[0, 2] * z, R[1, 0] * x + R[1, 1] * y + R[1, 2] * z, R[2, 0] * x + R[2, 1] * y + R[2, 2] * z
+        a, b, c = p0 + t[0] - terms.after_m[i, 0], p1 + t[1] - terms.after_m[i, 1], p2 + t[2] - terms.after_m[i, 2]
+        l00, l01, l02, l11, l12, l22 = L[i, 0, 0], L[i, 0, 1], L[i, 0, 2], L[i, 1, 1], L[i, 1, 2], L[i, 2, 2]
+        e0, e1, e2 = l00 * a + l01 * b + l02 * c, l01 * a + l11 * b + l12 * c, l02 * a + l12 * b + l22 * c
+        distance = a * e0 + b * e1 + c * e2
+        w = (scale2 / (scale2 + distance)) ** 2
+        chi2 += w * distance
+        components += 3.0 * w
+        l00, l01, l02, l11, l12, l22, e0, e1, e2 = w * l00, w * l01, w * l02, w * l11, w * l12, w * l22, w * e0, w * e1, w * e2
+        m00, m01, m02 = p1 * l02 - p2 * l01, p1 * l12 - p2 * l11, p1 * l22 - p2 * l12  # [p]× w L
+        m10, m11, m12 = p2 * l00 - p0 * l02, p2 * l01 - p0 * l12, p2 * l02 - p0 * l22
+        m20, m21, m22 = p0 * l01 - p1 * l00, p0 * l11 - p1 * l01, p0 * l12 - p1 * l02
+        H[0, 0] += p1 * m02 - p2 * m01
+        H[1, 0] += p1 * m12 - p2 * m11
+        H[1, 1] += p2 * m10 - p0 * m12
+        H[2, 0] += p1 * m22 - p2 * m21
+        H[2, 1] += p2 * m20 - p0 * m22
+        H[2, 2] += p0 * m21 - p1 * m20
+        H[3, 0] += m00
+        H[3, 1] += m10
+        H[3, 2] += m20
+        H[4, 0] += m01
+        H[4, 1] += m11
+        H[4, 2] += m21
+        H[5, 0] += m02
+        H[5, 1] += m12
+        H[5, 2] += m22
+        H[3, 3] += l00
+        H[4, 3] += l01
+        H[4, 4] += l11
+        H[5, 3] += l02
+        H[5, 4] += l12
+        H[5, 5] += l22
+        g[0] += p1 * e2 - p2 * e1
+        g[1] += p2 * e0 - p0 * e2
+        g[2] += p0 * e1 - p1 * e0
+        g[3] += e0
+        g[4] += e1
+        g[5] += e2
+    return chi2, components
 
 
 @numba.njit(cache=True, nogil=True)
@@ -147,21 +181,14 @@ def _add_plane(e: F64, J: F64, L: F64, w: float, H: F64, g: F64) -> None:
 def _normal_equations(terms: Terms, R: F64, t: F64, scale2: float, H: F64, g: F64) -> tuple[float, float]:
     """Fill H (6, 6) and g (6,) with Geman–McClure weights at the squared scale; returns the weighted χ² and the weighted number of components."""
     H[:], g[:] = 0.0, 0.0
-    places, planes, moved = _residuals(terms, R, t)
-    e3, M, e4, J4 = np.empty(3), np.empty((3, 3)), np.empty(4), np.zeros((4, 6))
-    chi2, components = 0.0, 0.0
-    for i in range(len(places)):
-        w = (scale2 / (scale2 + places[i])) ** 2
-        chi2 += w * places[i]
-        components += 3.0 * w
-        for k in range(3):
-            e3[k] = moved[i, k] + t[k] - terms.after_m[i, k]
-        _add_place(e3, moved[i], terms.information[i], w, M, H, g)
-    for i in range(len(planes)):
-        w = (scale2 / (scale2 + planes[i])) ** 2
-        chi2 += w * planes[i]
-        components += 3.0 * w
+    e4, J4 = np.empty(4), np.zeros((4, 6))
+    chi2, components = _add_places(terms, R, t, scale2, H, g)
+    for i in range(len(terms.planes_before)):
         _plane_residual(terms.planes_before[i], terms.planes_after[i], R, t, e4)
+        distance = _plane_distance(e4, terms.plane_information[i])
+        w = (scale2 / (scale2 + distance)) ** 2
+        chi2 += w * distance
+        components += 3.0 * w
         x, y, z = e4[0] + terms.planes_after[i, 0], e4[1] + terms.planes_after[i, 1], e4[2] + terms.planes_after[i, 2]
         J4[0, 1], J4[0, 2], J4[1, 0], J4[1, 2], J4[2, 0], J4[2, 1] = z, -y, -z, x, y, -x
         J4[3, 0], J4[3, 1], J4[3, 2] = t[1] * z - t[2] * y, t[2] * x - t[0] * z, t[0] * y - t[1] * x  # -(phi × n)·t = -phi·(n × t)
