@@ -8,7 +8,8 @@ import pytest
 
 from trihedron.pipeline.geometry import exp_se3, tangent_basis
 from trihedron.plugins.numerics.bundle import bundle_terms as terms
-from trihedron.plugins.numerics.bundle.bundle_kernel import line_basis
+from trihedron.plugins.numerics.bundle.bundle_kernel import SQUARES, NormalEquations, line_basis, linearise_bundle
+from trihedron.plugins.numerics.bundle.bundle_problem import BundleMeasurements, BundleState
 from trihedron.plugins.numerics.motion.pose_terms import PARALLEL, PERPENDICULAR, SAME, basis, depth_direction, plane_rows
 
 sys.path.insert(0, str(Path(__file__).parent))
@@ -37,18 +38,34 @@ def view():
 
 
 @pytest.mark.parametrize("depth_m", [2.6, np.nan])
-def test_the_derivatives_of_a_point(view, depth_m):
+def test_the_normal_equations_of_a_point(view, depth_m):
+    """JᵀWJ and JᵀWr with J by numeric derivatives of pixel and inverse depth."""
     T, x, _, segment = view
-    out = np.empty(3), np.empty((3, 6)), np.empty((3, 3)), np.empty((3, 3)), np.empty(3)
+    pixel, rows = segment[0], 3 if np.isfinite(depth_m) else 2
+    W = np.diag([1.0 / 0.8**2, 1.0 / 0.8**2, (depth_m**2 / 0.02) ** 2][:rows])
+    state = BundleState(T[None, :3, :3].copy(), T[None, :3, 3].copy(), x[None], np.zeros((0, 2, 3)), np.zeros((0, 4)))
+    one, none = np.zeros(1, np.int32), np.zeros(0, np.int32)
+    seen = BundleMeasurements(
+        1, INTRINSICS[None], np.array([0, 1], np.int32), one, pixel[None], np.array([depth_m]), np.array([0.8]), np.array([0.02]),
+        one, none, np.zeros((0, 2, 2)), np.zeros((0, 2, 3)), np.zeros((0, 2, 3, 3)), 1.0,
+        none, none, np.zeros((0, 4)), np.zeros((0, 3, 3)), np.zeros((0, 3), np.int32), np.zeros(0), True,
+    )  # fmt: skip
+    out = NormalEquations(np.empty((6, 6)), np.empty(6), np.empty((1, 4, 4)), np.empty((1, 4)), np.empty((1, 6, 4)))
 
-    def at(T, x):
-        assert terms.point_term(*parts(T), x, segment[0], depth_m, INTRINSICS, *out)
-        return out[0].copy()
+    def residual(T, x):
+        local = T[:3, :3].T @ (x - T[:3, 3])
+        return np.append(CAMERA.project(local) - pixel, 1.0 / local[2] - 1.0 / depth_m)[:rows]
 
-    at(T, x)
-    J_pose, J_point = out[1].copy(), out[2].copy()
-    assert np.allclose(J_pose, numeric(lambda d: at(shifted(T, d), x), 6), rtol=1e-6, atol=1e-5)
-    assert np.allclose(J_point, numeric(lambda d: at(T, x + d), 3), rtol=1e-6, atol=1e-5)
+    r, J = residual(T, x), np.hstack([numeric(lambda d: residual(shifted(T, d), x), 6), numeric(lambda d: residual(T, x + d), 3)])
+    assert linearise_bundle(state, seen, SQUARES, out) == pytest.approx(r @ W @ r)
+    H, g = J.T @ W @ J, J.T @ W @ r
+    for found, wanted in (
+        (np.tril(out.H), np.tril(H[:6, :6])),
+        (np.tril(out.V[0, :3, :3]), np.tril(H[6:, 6:])),
+        (out.W[0, :, :3], H[:6, 6:]),
+        (np.append(out.g, out.b[0, :3]), g),
+    ):
+        assert np.allclose(found, wanted, rtol=1e-5, atol=1e-6 * np.abs(wanted).max())
 
 
 @pytest.mark.parametrize("share", [0.2, 1.1])

@@ -9,7 +9,7 @@ import numpy as np
 
 from trihedron.pipeline.types import F64
 from trihedron.plugins.numerics.bundle.bundle_problem import BundleMeasurements, BundleState
-from trihedron.plugins.numerics.bundle.bundle_terms import by_plane, line_depth_term, line_term, point_term, relation_rows, share_opposite
+from trihedron.plugins.numerics.bundle.bundle_terms import by_plane, line_depth_term, line_term, relation_rows, share_opposite
 from trihedron.plugins.numerics.motion.pose_kernel import BEHIND, CHI2_1, CHI2_2, CHI2_3
 from trihedron.plugins.numerics.motion.pose_terms import NEAR_M, PARALLEL, SAME, basis, depth_direction, plane_rows
 
@@ -57,26 +57,81 @@ def _add_row(r: float, w: float, Jc: F64, Jl: F64, size: int, pose: int, H: F64,
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def _add_points(state: BundleState, seen: BundleMeasurements, loss: int, out: NormalEquations) -> float:
-    cost = 0.0
-    r, w, p, D = np.empty(3), np.empty(3), np.empty(3), np.empty((3, 3))
-    Jc, Jl = np.empty((3, 6)), np.empty((3, 3))
+    """All points: `point_rows` and its derivatives in scalars, since they are most of the work.
+
+    With D = dr/dp, A = DᵀWD and P = [p]×, those by the pose are (-D, DP) and that by the point is DRᵀ."""
+    cost, H, g, V, W = 0.0, out.H, out.g, out.V, out.W
+    E, B = np.empty((6, 3)), np.empty(3)
     for i in range(len(state.points)):
         for o in range(seen.point_starts[i], seen.point_starts[i + 1]):
-            k = seen.point_keyframes[o]
-            z = seen.depth_m[o]
-            deep = np.isfinite(z)
-            if not point_term(state.rotations[k], state.positions[k], state.points[i], seen.pixels[o], z, seen.intrinsics[k], r, Jc, Jl, D, p):
+            k, z = seen.point_keyframes[o], seen.depth_m[o]
+            R, deep = state.rotations[k], np.isfinite(z)
+            x, y = state.points[i, 0] - state.positions[k, 0], state.points[i, 1] - state.positions[k, 1]
+            d = state.points[i, 2] - state.positions[k, 2]
+            p0, p1, p2 = R[0, 0] * x + R[1, 0] * y + R[2, 0] * d, R[0, 1] * x + R[1, 1] * y + R[2, 1] * d, R[0, 2] * x + R[1, 2] * y + R[2, 2] * d
+            if not p2 > NEAR_M:
                 cost += BEHIND
                 continue
-            w[0] = 1.0 / seen.sigma_px[o] ** 2
-            w[1] = w[0]
-            w[2] = (z * z / seen.sigma_m[o]) ** 2 if deep else 0.0
-            chi2 = w[0] * r[0] * r[0] + w[1] * r[1] * r[1] + w[2] * r[2] * r[2]
-            weight, share = _loss(chi2, CHI2_3 if deep else CHI2_2, loss)
+            iz = 1.0 / p2
+            d00, d11, d22 = seen.intrinsics[k, 0] * iz, seen.intrinsics[k, 1] * iz, -iz * iz if deep else 0.0
+            d02, d12 = -d00 * p0 * iz, -d11 * p1 * iz
+            r0 = d00 * p0 + seen.intrinsics[k, 2] - seen.pixels[o, 0]
+            r1 = d11 * p1 + seen.intrinsics[k, 3] - seen.pixels[o, 1]
+            r2 = iz - 1.0 / z if deep else 0.0
+            w = 1.0 / seen.sigma_px[o] ** 2
+            v = (z * z / seen.sigma_m[o]) ** 2 if deep else 0.0
+            weight, share = _loss(w * (r0 * r0 + r1 * r1) + v * r2 * r2, CHI2_3 if deep else CHI2_2, loss)
             cost += share
-            pose = 6 * k if k < seen.free else -1
-            for a in range(3 if deep else 2):
-                _add_row(r[a], weight * w[a], Jc[a], Jl[a], 3, pose, out.H, out.g, out.V[i], out.b[i], out.W[o])
+            w, v = w * weight, v * weight
+            a00, a02, a11, a12 = w * d00 * d00, w * d00 * d02, w * d11 * d11, w * d11 * d12
+            a22 = w * (d02 * d02 + d12 * d12) + v * d22 * d22
+            b0, b1, b2 = w * d00 * r0, w * d11 * r1, w * (d02 * r0 + d12 * r1) + v * d22 * r2
+            for j in range(3):  # rows of A Rᵀ and of P A Rᵀ, and R b
+                e0 = a00 * R[j, 0] + a02 * R[j, 2]
+                e1 = a11 * R[j, 1] + a12 * R[j, 2]
+                e2 = a02 * R[j, 0] + a12 * R[j, 1] + a22 * R[j, 2]
+                E[0, j], E[1, j], E[2, j] = e0, e1, e2
+                E[3, j], E[4, j], E[5, j] = p1 * e2 - p2 * e1, p2 * e0 - p0 * e2, p0 * e1 - p1 * e0
+                B[j] = R[j, 0] * b0 + R[j, 1] * b1 + R[j, 2] * b2
+            for j in range(3):
+                out.b[i, j] += B[j]
+                for a in range(j + 1):
+                    V[i, j, a] += R[j, 0] * E[0, a] + R[j, 1] * E[1, a] + R[j, 2] * E[2, a]
+            if k >= seen.free:
+                continue
+            for a in range(6):
+                for j in range(3):
+                    W[o, a, j] -= E[a, j]
+            m00, m01, m02 = p1 * a02, p1 * a12 - p2 * a11, p1 * a22 - p2 * a12  # P A
+            m10, m11, m12 = p2 * a00 - p0 * a02, -p0 * a12, p2 * a02 - p0 * a22
+            m20, m21, m22 = -p1 * a00, p0 * a11, p0 * a12 - p1 * a02
+            f = 6 * k
+            H[f, f] += a00
+            H[f + 1, f + 1] += a11
+            H[f + 2, f] += a02
+            H[f + 2, f + 1] += a12
+            H[f + 2, f + 2] += a22
+            H[f + 3, f] += m00
+            H[f + 3, f + 1] += m01
+            H[f + 3, f + 2] += m02
+            H[f + 4, f] += m10
+            H[f + 4, f + 1] += m11
+            H[f + 4, f + 2] += m12
+            H[f + 5, f] += m20
+            H[f + 5, f + 1] += m21
+            H[f + 5, f + 2] += m22
+            H[f + 3, f + 3] += p1 * m02 - p2 * m01
+            H[f + 4, f + 3] += p1 * m12 - p2 * m11
+            H[f + 4, f + 4] += p2 * m10 - p0 * m12
+            H[f + 5, f + 3] += p1 * m22 - p2 * m21
+            H[f + 5, f + 4] += p2 * m20 - p0 * m22
+            H[f + 5, f + 5] += p0 * m21 - p1 * m20
+            g[f] -= b0
+            g[f + 1] -= b1
+            g[f + 2] -= b2
+            g[f + 3] -= p1 * b2 - p2 * b1
+            g[f + 4] -= p2 * b0 - p0 * b2
+            g[f + 5] -= p0 * b1 - p1 * b0
     return cost
 
 

@@ -1,4 +1,4 @@
-"""Residuals of bundle adjustment with their derivatives by the landmark; those by the pose are `pose_terms`'. For numba loops.
+"""Residuals of lines and planes in bundle adjustment with their derivatives by the landmark; those by the pose are `pose_terms`'. For numba loops.
 
 A line moves across itself only, by two tangent coordinates at each of its two points (four unknowns, as a line has); a plane moves by the tangent
 coordinates of its normal and d.
@@ -11,26 +11,7 @@ import numpy as np
 
 from trihedron.pipeline.types import F64
 from trihedron.plugins.numerics.maps.map_terms import EXTEND
-from trihedron.plugins.numerics.motion.pose_terms import PARALLEL, basis, chain_point, line_depth_row, line_row, point_rows, to_camera
-
-
-@numba.njit(cache=True, nogil=True, error_model="numpy")
-def by_point(D: F64, rows: int, R: F64, J: F64) -> None:
-    """J (rows, 3) = D Rᵀ: derivatives by the world point from those by the camera-frame point."""
-    for a in range(rows):
-        for j in range(3):
-            J[a, j] = D[a, 0] * R[j, 0] + D[a, 1] * R[j, 1] + D[a, 2] * R[j, 2]
-
-
-@numba.njit(cache=True, nogil=True, error_model="numpy")
-def point_term(R: F64, t: F64, point: F64, pixel: F64, depth_m: float, camera: F64, r: F64, J_pose: F64, J_point: F64, D: F64, p: F64) -> bool:
-    """Reprojection and inverse depth (`point_rows`): r (3,), J_pose (3, 6), J_point (3, 3). False when it cannot be projected. D, p: scratch."""
-    to_camera(R, t, point, p)
-    if not point_rows(p, pixel, depth_m, camera, r, D):
-        return False
-    chain_point(D, 3, p, J_pose)
-    by_point(D, 3, R, J_point)
-    return True
+from trihedron.plugins.numerics.motion.pose_terms import PARALLEL, basis, chain_point, line_depth_row, line_row, to_camera
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
