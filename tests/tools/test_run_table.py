@@ -78,5 +78,6 @@ def test_graphs_without_a_manhattan_frame_do_not_look_for_one(graph):
 def test_what_is_left_out_is_not_run():
     assert "manhattan" not in composed("without=manhattan").stages
     assert composed("without=manhattan").stages["loop"].plugin.straighten == 0
+    assert composed("without=relations").stages["matches"].plugin.relations == 0
     assert type(composed("without=lines").stages["lines"].plugin).__name__ == "NoLines"
     assert set(composed("without=nothing").stages) == set(composed().stages)

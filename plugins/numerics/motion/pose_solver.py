@@ -30,8 +30,7 @@ from trihedron.plugins.numerics.motion.pose_step import add_prior, moved, size, 
 from trihedron.plugins.numerics.motion.pose_terms import LineTerms, PlaneTerms, PointTerms
 
 ROUNDS, ITERATIONS, ROBUST_ROUNDS = 4, 10, 2  # as ORB-SLAM2 optimises a pose; Huber only in the first rounds
-WEIGHED = (0, 1, ROUNDS)  # turns that begin with new weights: by then the pose has moved, or will not any more
-CONVERGED, ROUGHLY = 1e-3, 1e-2  # squared length of a step in standard deviations below which the last round, and the others, have converged
+CONVERGED = 1e-3  # squared length of a step in standard deviations below which a round has converged
 MAX_DAMPING = 1e10
 PLANE_SLACK = 4.0  # when a direction would be lost with the planes beyond their gate, they are outliers only beyond this × it
 
@@ -183,8 +182,7 @@ def _solve(
     for turn in range(ROUNDS + 1):
         cost, damping = np.inf, 1e-6
         R_new, t_new = R, t
-        if turn in WEIGHED:
-            weigh(R, t, camera, points, lines, planes, weights)
+        weigh(R, t, camera, points, lines, planes, weights)
         for trial in range(ITERATIONS + 1):
             new = linearise(R_new, t_new, camera, points, lines, planes, weights, flags, turn < ROBUST_ROUNDS, trial_H, trial_g, chi2)
             data[:] = trial_H
@@ -201,7 +199,7 @@ def _solve(
             step(H, g, damping, free, dx)
             R_new, t_new = moved(R, t, dx)
             length = size(H, dx)
-            if not length > (CONVERGED if turn == ROUNDS - 1 else ROUGHLY):
+            if not length > CONVERGED:
                 if accepted and length >= 0.0:
                     R, t = R_new, t_new
                 break

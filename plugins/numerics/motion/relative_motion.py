@@ -56,8 +56,8 @@ def motion_terms(tracks: Tracks, keypoints: Keypoints, segments: Segments, plane
         copy(tracks.planes[:, 1]), copy(tracks.coefficients), copy(tracks.plane_covariance), copy(planes.coefficients), copy(planes.covariance),
         np.radians(floor_deg),
     )  # fmt: skip
-    places = [np.concatenate(pair) for pair in zip(of_points, of_lines)]
-    return Terms(*places, *of_planes)
+    before_m, after_m, information = (np.concatenate(pair) for pair in zip(of_points, of_lines))
+    return Terms(before_m, after_m, information, *of_planes)
 
 
 def solve_motion(terms: Terms, R: F64, sigma_deg: float, sigma_m: float) -> Motion:

@@ -13,8 +13,10 @@ from trihedron.plugins.numerics.motion.pose_terms import basis
 def placed_points(points_m: F32, sigma_px: F32, sigma_m: F32, camera: Camera, T_world_camera: F64, rotation_covariance: F64) -> tuple[F64, F64]:
     """Camera-frame points (n, 3) in the world, and their covariances (n, 3, 3) there: `sigma_px` (n,) across the ray, `sigma_m` (n,) of the depth,
     and what a rotation of the camera known to `rotation_covariance` (3, 3, rad²) adds."""
-    arrays = (constant(array, np.float32) for array in (points_m, sigma_px, sigma_m))
-    return _placed(*arrays, float(camera.fx), float(camera.fy), constant(T_world_camera, np.float64), constant(rotation_covariance, np.float64))
+    return _placed(
+        constant(points_m, np.float32), constant(sigma_px, np.float32), constant(sigma_m, np.float32),
+        float(camera.fx), float(camera.fy), constant(T_world_camera, np.float64), constant(rotation_covariance, np.float64),
+    )  # fmt: skip
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
@@ -54,7 +56,10 @@ def _sandwich(A: F64, C: F64, M: F64, out: F64) -> None:
 def placed_planes(planes: F64, covariance: F64, observed: F64, T_world_camera: F64, rotation_covariance: F64) -> tuple[F64, F64, F64]:
     """Camera-frame planes (n, 4) in the world, their covariances (n, 3, 3) of (a, b, d) there, and what a rotation of the camera known to
     `rotation_covariance` (3, 3, rad²) adds to the covariances of the `observed` ones (n, 4): to the normal only."""
-    return _placed_planes(*(constant(array, np.float64) for array in (planes, covariance, observed, T_world_camera, rotation_covariance)))
+    return _placed_planes(
+        constant(planes, np.float64), constant(covariance, np.float64), constant(observed, np.float64),
+        constant(T_world_camera, np.float64), constant(rotation_covariance, np.float64),
+    )  # fmt: skip
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
