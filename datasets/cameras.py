@@ -131,7 +131,7 @@ def _distortion(path: Path, given: Any) -> tuple[float, ...]:
 def _number(path: Path, key: str, value: Any) -> float:
     try:
         number = math.nan if isinstance(value, bool) else float(value)  # text too: YAML takes 5e2 for text
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         number = math.nan
     if not math.isfinite(number):
         raise DataError(str(path), f"{key} is '{value}'", "give a finite number")

@@ -12,11 +12,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from trihedron.pipeline.errors import DataError
+from trihedron.pipeline.png import is_whole_png
 from trihedron.pipeline.types import F32, U8
 
 PNG, JPEG = b"\x89PNG", b"\xff\xd8\xff"
-# the end of a complete file; a decoder would fill the rest of a truncated JPEG with grey and say nothing
-END_MARKS = {PNG: b"IEND", JPEG: b"\xff\xd9"}
+JPEG_END = b"\xff\xd9"  # of a complete file; a decoder would fill the rest of a truncated one with grey and say nothing
 FRAME_MARKS = {*range(0xC0, 0xD0)} - {0xC4, 0xC8, 0xCC}  # of a JPEG: where its size is said
 PIXELS_PER_BYTE = 2048  # more than either format can pack: deflate makes 1032 bytes of one, a grey JPEG 512 pixels of one
 TAIL = 64  # bytes searched for the end mark: writers may pad
@@ -79,7 +79,7 @@ def decode_image(data: bytes) -> NDArray[Any]:
     header = picture_header(data)
     if header.width * header.height > PIXELS_PER_BYTE * len(data):
         raise UnreadableImage(f"claims {header.width}×{header.height} pixels in {len(data)} bytes")
-    if not any(data.startswith(magic) and end in data[-TAIL:] for magic, end in END_MARKS.items()):
+    if not (is_whole_png(data) if data.startswith(PNG) else JPEG_END in data[-TAIL:]):
         raise UnreadableImage("is truncated")
     return _decoded(data)
 

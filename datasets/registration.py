@@ -41,7 +41,8 @@ class Registration:
     def _turned(self, columns: NDArray[Any], rows: NDArray[Any]) -> F32:
         pixels = np.stack(np.meshgrid(columns, rows), axis=-1)
         rays = cv2.undistortPoints(pixels.reshape(-1, 1, 2), self.K, np.array(self.D) if self.D else None).reshape(pixels.shape)
-        rays = np.concatenate([rays, np.ones((*rays.shape[:2], 1))], axis=2) @ self.T_color_depth[:3, :3].T
+        with np.errstate(invalid="ignore"):  # where the lens model has no inverse
+            rays = np.concatenate([rays, np.ones((*rays.shape[:2], 1))], axis=2) @ self.T_color_depth[:3, :3].T
         return np.ascontiguousarray(rays, np.float32)
 
     def __call__(self, depth_m: F32) -> F32:

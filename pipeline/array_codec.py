@@ -17,12 +17,13 @@ import numpy as np
 import zstandard
 
 from trihedron.pipeline.errors import RecordingError
+from trihedron.pipeline.mcap_chunks import MAX_RATIO
+from trihedron.pipeline.png import is_whole_png
 
 MAX_BYTES = 1 << 30  # of one decoded array
 DAMAGED = "the file is damaged; record it again"
 TRANSPOSED_BYTES = 512  # smaller arrays are left as they are
 PNG = [cv2.IMWRITE_PNG_COMPRESSION, 1, cv2.IMWRITE_PNG_FILTER, cv2.IMWRITE_PNG_FILTER_UP]  # two thirds of the time of the default, as small
-PNG_MAGIC = b"\x89PNG\r\n\x1a\n"
 SCALARS: dict[str, type[Any]] = {"bool": bool, "int": int, "float": float}
 
 
@@ -72,7 +73,8 @@ def _plain(array: Any, shape: tuple[int, ...], size: int) -> bytes | None:
     if array.encoding == "zstd":
         try:
             claimed = zstandard.frame_content_size(array.data)  # what would be allocated
-            return bytes(zstandard.ZstdDecompressor().decompress(array.data)) if claimed == size else None
+            possible = claimed == size <= MAX_RATIO["zstd"] * len(array.data)
+            return bytes(zstandard.ZstdDecompressor().decompress(array.data)) if possible else None
         except zstandard.ZstdError:
             return None
     if array.encoding == "columns":
@@ -84,7 +86,7 @@ def _plain(array: Any, shape: tuple[int, ...], size: int) -> bytes | None:
 
 def _image(data: bytes, shape: tuple[int, ...]) -> bytes | None:
     """The RGB bytes of a PNG of this shape; one whose header claims another is not decoded."""
-    if len(shape) != 3 or data[:8] != PNG_MAGIC or (int.from_bytes(data[20:24], "big"), int.from_bytes(data[16:20], "big"), 3) != shape:
+    if len(shape) != 3 or not is_whole_png(data) or (int.from_bytes(data[20:24], "big"), int.from_bytes(data[16:20], "big"), 3) != shape:
         return None
     try:
         image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR_RGB)

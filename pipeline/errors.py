@@ -17,7 +17,8 @@ class TrihedronError(Exception):
 
     def __init__(self, place: str, cause: str, cure: str = "") -> None:
         self.place, self.cause, self.cure = place, cause, cure
-        super().__init__(f"{place}: {cause}" + (f"; {cure}" if cure else ""))
+        text = f"{place}: {cause}" + (f"; {cure}" if cure else "")
+        super().__init__("".join(c if c.isprintable() else "?" for c in text))  # one line, whatever a file is called or says
 
 
 class UsageError(TrihedronError):

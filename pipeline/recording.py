@@ -97,8 +97,14 @@ class Recording:
         self._chunks: dict[str, list[ChunkIndex]] = {}
 
     def overrides(self) -> list[str]:
-        """The overrides of the command that made the recording."""
-        return [str(text) for text in json.loads(self.metadata.get("overrides", "[]"))]
+        """The overrides of the command that made the recording. Raises RecordingError where they are no list of texts."""
+        try:
+            found = json.loads(self.metadata.get("overrides", "[]"))
+        except (ValueError, RecursionError):
+            found = None
+        if not isinstance(found, list) or not all(isinstance(text, str) for text in found):
+            raise RecordingError(str(self.path), "does not say which command made it", "the file is damaged; record it again")
+        return found
 
     def messages(self, channel: str) -> Iterator[tuple[int, bytes]]:
         """(log_time, data) of the messages of one channel (with slash), in the order they were written."""

@@ -8,15 +8,16 @@ import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
 ORDER = (
-    "errors", "chunk_writer", "mcap_errors", "mcap_chunks", "mcap_file", "arrays", "camera", "table", "maps", "surface", "types", "geometry", "slots",
-    "registry", "array_codec", "codec", "foxglove_messages", "foxglove", "graph", "metrics", "consistency", "plot", "ply", "timing", "recording",
-    "live", "runs", "scheduler", "interrupts", "intake", "state", "runner", "results", "config", "execute", "cli",
+    "errors", "png", "chunk_writer", "mcap_errors", "mcap_chunks", "mcap_file", "arrays", "camera", "table", "maps", "surface", "types", "geometry",
+    "slots", "registry", "array_codec", "codec", "foxglove_messages", "foxglove", "graph", "metrics", "consistency", "plot", "ply", "timing",
+    "recording", "live", "runs", "scheduler", "interrupts", "intake", "state", "runner", "results", "config", "execute", "cli",
 )  # fmt: skip
 NUMERICS = ("algebra", "images", "depth", "planes", "axes", "motion", "maps", "bundle", "places", "surfaces")  # each imports those before it
 VOCABULARY = {"types", "geometry", "errors", "slots", "registry"}  # what plugins and data sets know of the machinery
 EXCEPTIONS = {
     ("datasets/mcap.py", "pipeline.recording"),  # reads what the machinery writes
     ("datasets/mcap.py", "pipeline.mcap_file"),
+    ("datasets/images.py", "pipeline.png"),
     ("datasets/robot_streams.py", "pipeline.mcap_file"),
     ("datasets/robot_recording.py", "pipeline.mcap_file"),
     ("pipeline/results.py", "datasets.trajectories"),  # the one text format of trajectories

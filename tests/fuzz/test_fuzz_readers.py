@@ -1,0 +1,27 @@
+"""No damaged file breaks a reader: a short round of the fuzzer, the same every time, and the long one."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+sys.path.insert(0, str(Path(__file__).parent))
+from fuzz_readers import FOUND, SEEDS, TARGETS, fuzz
+
+
+@pytest.mark.parametrize("name", TARGETS)
+def test_a_few_inputs(name):
+    tally = fuzz(name, 60, seed=3)
+    assert tally.inputs == 60 and not tally.broke, tally.broke[0]
+    seeds = len(list(SEEDS.glob(TARGETS[name][0])))
+    assert tally.read > 0 or name == "foxglove", seeds  # of those without truth, which the reader is also asked for
+
+
+@pytest.mark.slow
+def test_a_hundred_thousand_inputs():
+    """The command in a process of its own, which may map 2 GiB more than it has when it begins."""
+    command = [sys.executable, str(Path(__file__).parent / "fuzz_readers.py"), "--inputs", "100000"]
+    done = subprocess.run(command, capture_output=True, text=True)
+    print(done.stdout)
+    assert done.returncode == 0, f"inputs in {FOUND}: {done.stdout[-3000:]}"
