@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from decimal import Decimal, InvalidOperation
+from decimal import Decimal, DecimalException
 from pathlib import Path
 
 import numpy as np
@@ -23,7 +23,7 @@ def parse_stamp_ns(text: str) -> int:
         seconds = Decimal(text)
         if abs(seconds) < MAX_STAMP_S:
             return int((seconds * 1_000_000_000).to_integral_value())
-    except (InvalidOperation, ValueError) as error:
+    except (DecimalException, ValueError) as error:  # its exponent may be anything
         raise ValueError(f"the time stamp '{text}' is not a number of seconds") from error
     raise ValueError(f"the time stamp '{text}' is too large for seconds")
 

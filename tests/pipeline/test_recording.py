@@ -16,7 +16,6 @@ from mcap.writer import Writer
 from mcap_protobuf.decoder import DecoderFactory
 
 from trihedron.pipeline import chunk_writer as module
-from trihedron.pipeline.cli import main
 from trihedron.pipeline.errors import RecordingError
 from trihedron.pipeline.foxglove import View
 from trihedron.pipeline.foxglove_messages import MOST_VERTICES
