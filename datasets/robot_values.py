@@ -64,6 +64,6 @@ def intrinsics(frame_id: str, width: int, height: int, model: str, D: list[float
 def link(stamp_ns: int, parent: str, child: str, t: list[float], q: list[float]) -> Link:
     """A transform from a translation and a quaternion x y z w, checked. Raises UnreadableMessage for numbers that are none."""
     values = np.array([float(x) for x in (*t, *q)])
-    if not np.isfinite(values).all() or np.abs(values[:3]).max() > 1e9 or not 1e-3 < np.linalg.norm(values[3:]) < 1e3:
+    if not np.isfinite(values).all() or np.abs(values).max() > 1e9 or not 1e-3 < np.linalg.norm(values[3:]) < 1e3:
         raise UnreadableMessage("holds no pose")
     return Link(stamp_ns, parent.lstrip("/"), child.lstrip("/"), pose_matrix(rotation_from_quaternion(values[3:]), values[:3]))

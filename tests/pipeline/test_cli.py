@@ -66,7 +66,7 @@ MISTAKES = [
     (["dataset.frames=9:3"], 1, f"trihedron: dataset.frames: '9:3' is not a range of frames A:B with A < B; {SEE} dataset"),
     (["dataset=tums"], 1, "trihedron: dataset: there is no plugin 'tums' for the slot 'dataset'; did you mean 'tum'?"),
     (["only=[pose]"], 1, "trihedron: only: chooses stages of a replay, and there is none; give replay=FILE.mcap too"),
-    (["replay=no.mcap"], 1, "trihedron: no.mcap: cannot be read: No such file or directory; give the path of a run.mcap"),
+    (["replay=no.mcap"], 1, "trihedron: no.mcap: cannot be read: No such file or directory; give the path of an MCAP file"),
     (["record.topics=[normal]"], 1, "trihedron: record.topics: no stage writes 'normal'; did you mean 'normals'?"),
     (["feedback=old"], 1, "trihedron: feedback: Invalid value 'old', expected one of [new, recorded]; give a value of that type"),
     (["out=/proc/no"], 1, "trihedron: out: the folder cannot be made: No such file or directory: /proc/no; give another out=FOLDER"),
