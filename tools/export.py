@@ -1,9 +1,11 @@
 """Write what a run has found in a format that other programs read.
 
-RUN is a run folder or its recording. Lengths are metres. Meshes are turned so that up, an axis of the Manhattan frame, is +z (ply, obj,
+RUN is a run folder or its recording. Lengths are metres. tum and kitti are the final trajectory, csv is a row for each frame, colmap a model with its
+images, rerun what `trihedron view` shows, all in the world of trajectory.txt. Meshes are
+turned so that up, an axis of the Manhattan frame, is +z (ply, obj,
 planes.json) or +y (gltf, as its standard says), and what the first camera saw is ahead: +y, or -z.
 
-Example: trihedron export runs/latest --to gltf
+Example: trihedron export runs/latest --to colmap
 """
 
 from __future__ import annotations
@@ -30,9 +32,10 @@ class Format:
 
 def formats() -> dict[str, Format]:
     """Every format by name."""
-    from trihedron.tools import export_picture, export_surface
+    from trihedron.tools import export_colmap, export_picture, export_rerun, export_surface, export_trajectory
 
-    return {format.name: format for module in (export_surface, export_picture) for format in module.FORMATS}
+    modules = (export_trajectory, export_colmap, export_surface, export_picture, export_rerun)
+    return {format.name: format for module in modules for format in module.FORMATS}
 
 
 def main(argv: list[str]) -> int:

@@ -1,0 +1,103 @@
+"""What other programs read of a run: trajectories, tables, COLMAP models, rerun."""
+
+import csv
+import importlib.util
+import subprocess
+import sys
+
+import cv2
+import numpy as np
+import pytest
+
+from trihedron.datasets.trajectories import read_trajectory
+from trihedron.pipeline.cli import main
+from trihedron.pipeline.geometry import invert
+from trihedron.pipeline.recording import Recording
+from trihedron.tools import export_rerun
+from trihedron.tools.recorded import last_map
+
+RUN = "import sys; from trihedron.pipeline.cli import main; sys.exit(main(['run', *sys.argv[1:]]))"
+FRAMES = 24
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    """A short run over the built-in room, whose frames are rendered again where they are asked for."""
+    out = tmp_path_factory.mktemp("export") / "run"
+    words = ["dataset=synthetic", f"dataset.length={FRAMES}", "dataset.width=320", "dataset.height=240", f"out={out}"]
+    done = subprocess.run([sys.executable, "-c", RUN, *words], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    return out
+
+
+def test_trajectories(run, capsys):
+    for name in ("tum", "kitti"):
+        assert main(["export", str(run), "--to", name]) == 0
+    assert (run / "trajectory_final.txt").read_bytes() == (run / "trajectory.txt").read_bytes()
+    assert f"{FRAMES} poses" in capsys.readouterr().out
+    rows = np.loadtxt(run / "trajectory_kitti.txt")
+    assert rows.shape == (FRAMES, 12)
+    assert rows.reshape(-1, 3, 4) == pytest.approx(read_trajectory(run / "trajectory.txt").poses[:, :3], abs=1e-8)
+
+
+def test_a_row_for_each_frame(run):
+    assert main(["export", str(run), "--to", "csv"]) == 0
+    with open(run / "frames.csv", newline="", encoding="utf-8") as file:
+        rows = list(csv.DictReader(file))
+    poses = list(Recording(run / "run.mcap").values("pose"))
+    assert len(rows) == FRAMES and [int(row["index"]) for row in rows] == [pose.index for pose in poses]
+    for row, pose in zip(rows, poses):
+        assert [float(row[f"t{axis}"]) for axis in "xyz"] == pytest.approx(pose.T_world_camera[:3, 3], abs=1e-9)
+        assert float(row["var_rz"]) == pytest.approx(pose.covariance[5, 5], rel=1e-5) and row["status"] == pose.status
+        assert float(row["ms_pose"]) >= 0.0
+    found = {value.index: len(value.pixels) for value in Recording(run / "run.mcap").values("keypoints")}
+    assert [int(row["keypoints"]) for row in rows] == [found[pose.index] for pose in poses]
+
+
+def test_colmap_models_read_back(run, capsys):
+    import pycolmap
+
+    assert main(["export", str(run), "--to", "colmap"]) == 0
+    map, folder = last_map(Recording(run / "run.mcap")), run / "colmap" / "sparse" / "0"
+    keyframes = {f"{i:06d}.png": T for i, T in zip(map.keyframes.column("index"), map.keyframes.column("T_world_camera"))}
+    binary, text = pycolmap.Reconstruction(), pycolmap.Reconstruction()
+    binary.read_binary(str(folder))
+    text.read_text(str(folder))
+    positions = map.points.column("position_m")
+    for model in (binary, text):
+        assert model.num_images() == len(keyframes) > 1 and model.num_points3D() > 100
+        for image in model.images.values():
+            assert image.cam_from_world().matrix() == pytest.approx(invert(keyframes[image.name])[:3], abs=1e-6)
+            picture = cv2.imread(str(run / "colmap" / "images" / image.name))
+            assert picture.shape == (240, 320, 3)
+        for point in model.points3D.values():
+            assert np.abs(positions - point.xyz).sum(axis=1).min() < 1e-6 and point.track.length() >= 2
+        camera = model.cameras[1]
+        assert camera.model.name == "PINHOLE" and (camera.width, camera.height) == (320, 240)
+        model.update_point_3d_errors()
+        assert 0.0 < model.compute_mean_reprojection_error() < 1.5
+    grey = [point.color for point in binary.points3D.values()]
+    assert np.std(grey, axis=0).min() > 5.0  # of the images
+    assert "images," in capsys.readouterr().out
+
+
+def test_what_cannot_be_exported_is_one_line(run, tmp_path, monkeypatch, capsys):
+    assert main(["export", str(run), "--to", "colmpa"]) == 2
+    assert capsys.readouterr().err == "trihedron: export: there is no format 'colmpa'; did you mean 'colmap'?\n"
+    monkeypatch.setattr(export_rerun.importlib.util, "find_spec", lambda name: None)
+    for command in (["view", str(run)], ["export", str(run), "--to", "rerun", "--out", str(tmp_path / "a.rrd")]):
+        assert main(command) == 2
+        assert capsys.readouterr().err == "trihedron: rerun: is not installed; install it with: pip install trihedron[view]\n"
+
+
+@pytest.mark.skipif(importlib.util.find_spec("rerun") is None, reason="rerun is not installed (the extra `view`)")
+def test_a_file_for_rerun_is_whole_and_holds_everything(run):
+    assert main(["export", str(run), "--to", "rerun"]) == 0
+    command = [sys.executable, "-m", "rerun", "rrd"]
+    done = subprocess.run([*command, "verify", str(run / "run.rrd")], capture_output=True, text=True, env={"TELEMETRY_ENABLED": "0"})
+    assert done.returncode == 0 and "1 file verified without error" in done.stdout + done.stderr
+    done = subprocess.run([*command, "print", str(run / "run.rrd")], capture_output=True, text=True, env={"TELEMETRY_ENABLED": "0"})
+    said = done.stdout + done.stderr
+    parts = ["image", "keypoints", "lines", "planes", "axes"]
+    for path in [*(f"/world/camera/{part}" for part in parts), "/world/map/points", "/world/path", "/world/truth", "/error/position_m", "/status"]:
+        assert path in said, path

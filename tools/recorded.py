@@ -1,0 +1,74 @@
+"""What a recording says of a run as a whole: the frames themselves, the last map, the final trajectory."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from trihedron.pipeline.errors import DataError
+from trihedron.pipeline.recording import FRAMES_TOPIC, Recording
+from trihedron.pipeline.results import final_trajectory
+from trihedron.pipeline.runs import Result
+from trihedron.pipeline.slots import frame_range
+from trihedron.pipeline.types import Frame, FrameReference, Map, Pose, Trajectory
+
+
+def poses_of(recording: Recording) -> list[Pose]:
+    """The poses as they were said at the time. Raises DataError when there are none."""
+    poses = [value for value in recording.values("pose") if isinstance(value, Pose)] if "pose" in recording.topics else []
+    if not poses:
+        raise DataError(str(recording.path), "holds no poses", "record a run with outputs=[trajectory]")
+    return poses
+
+
+def last_map(recording: Recording) -> Map | None:
+    """The map at the end, or None."""
+    found = None
+    for value in recording.values("map") if "map" in recording.topics else ():
+        found = value if isinstance(value, Map) else found
+    return found
+
+
+def trajectory_of(recording: Recording) -> Trajectory:
+    """The final poses of all tracked frames, as trajectory.txt has them."""
+    return final_trajectory(Result(poses=poses_of(recording), map=last_map(recording)))
+
+
+def references_of(recording: Recording) -> dict[int, FrameReference]:
+    """Frame number -> camera and stamp."""
+    return {value.index: value for value in recording.values(FRAMES_TOPIC) if isinstance(value, FrameReference)}
+
+
+def frames_of(recording: Recording) -> Callable[[FrameReference], Frame | None]:
+    """How to get at a frame's images: those embedded, else those of the data set that was tracked. DataError when that is gone."""
+    if "dataset" in recording.topics:
+
+        def embedded(reference: FrameReference) -> Frame | None:
+            value = recording.value("dataset", reference.stamp_ns)
+            return value if isinstance(value, Frame) else None
+
+        return embedded
+    from hydra import compose, initialize_config_module
+
+    from trihedron.pipeline.config import make_plugin, register_configs
+    from trihedron.pipeline.registry import load_plugins
+
+    load_plugins()
+    register_configs()
+    with initialize_config_module("trihedron.conf", version_base="1.3"):
+        options = compose("root", overrides=recording.overrides()).dataset
+    dataset, first = make_plugin("dataset", options), frame_range(str(options.get("frames", "")))[0]
+    try:
+        len(dataset)
+    except DataError as error:
+        cause = f"does not embed its frames, and the data set is gone ({error.place}: {error.cause})"
+        raise DataError(str(recording.path), cause, "record with record.frames=true") from error
+    return lambda reference: dataset(reference.index - first)
+
+
+def colors_at(image: Any, pixels: Any) -> Any:
+    """(n, 3) RGB at pixels (n, 2), the nearest."""
+    x, y = np.rint(pixels).astype(int).T
+    return image[np.clip(y, 0, image.shape[0] - 1), np.clip(x, 0, image.shape[1] - 1)]

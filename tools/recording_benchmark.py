@@ -1,0 +1,130 @@
+"""What recording costs: time and bytes of a run beside the same run without, frames embedded a second, and how fast one frame of many is read.
+
+    recording   runs alternate with and without; the share is of CPU time, which waits do not count in, and bytes are those of the file
+    embedding   the frames of the run, written one after the other with record.frames=true
+    reading     a recording in which the run's topics repeat until there are --frames of them: opened, and every topic of one frame decoded
+
+Example: trihedron benchmark recording dataset=tum dataset.path=FOLDER dataset.frames=0:150
+"""
+
+from __future__ import annotations
+
+import tempfile
+import time
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from trihedron.pipeline.graph import Graph
+from trihedron.pipeline.recording import FRAMES_TOPIC, Recording, RecordingWriter
+from trihedron.pipeline.runner import Runner
+from trihedron.pipeline.slots import output_of
+from trihedron.pipeline.types import Frame, Value
+from trihedron.tools.arguments import Parser, table
+from trihedron.tools.topics import topics_of
+
+MOST_SHARE, MOST_KB, LEAST_FRAMES_S, MOST_OPEN_S = 0.05, 150.0, 60.0, 0.2
+IMAGES = "/view/image"
+
+
+def main(argv: list[str]) -> int:
+    """Run the command; returns 0, or 1 when a limit is not kept."""
+    parser = Parser("benchmark recording", __name__)
+    parser.add_argument("--frames", type=int, default=10_000, metavar="N", help="of the long recording (default 10000)")
+    parser.add_argument("--repeat", type=int, default=3, metavar="N", help="runs with and without (default 3)")
+    arguments, overrides = parser.parse_known_args(argv)
+    verdicts: list[tuple[str, bool]] = []
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        verdicts += _recording(overrides, folder, arguments.repeat)
+        verdicts += _embedding(overrides, folder)
+        verdicts += _reading(folder, arguments.frames)
+    for text, kept in verdicts:
+        print(f"{'met' if kept else 'NOT met'}: {text}")
+    return 0 if all(kept for _, kept in verdicts) else 1
+
+
+def _recording(overrides: Sequence[str], folder: Path, repeat: int) -> list[tuple[str, bool]]:
+    graph = _graph(overrides)
+    topics = frozenset(name for name in graph.stages if not output_of(name).dense)
+    seconds: dict[bool, list[tuple[float, float]]] = {False: [], True: []}
+    for round in range(-1, repeat):
+        for recorded in (False, True):
+            writer = RecordingWriter(folder / "run.mcap", {"overrides": "[]"}) if recorded else None
+            wall, cpu = time.perf_counter(), time.process_time()
+            runner = Runner(graph)
+            for _ in runner.steps(writer, topics):
+                pass
+            if writer is not None:
+                writer.close()
+            if round >= 0:  # the first compiles
+                seconds[recorded].append((time.perf_counter() - wall, time.process_time() - cpu))
+    count = len(runner.result.stamps_ns)
+    (wall, cpu), (wall_with, cpu_with) = (tuple(min(column) for column in zip(*seconds[recorded])) for recorded in (False, True))
+    share = cpu_with / cpu - 1.0
+    kb = _sizes(folder / "run.mcap", count)
+    print(f"{count} frames: {1e3 * cpu / count:.2f} ms CPU a frame without, {1e3 * cpu_with / count:.2f} ms with recording (+{100 * share:.1f} %);")
+    more = 100 * (wall_with / wall - 1.0)
+    print(f"wall {1e3 * wall / count:.2f} and {1e3 * wall_with / count:.2f} ms ({more:+.1f} %), the least of {repeat} runs each")
+    verdict = f"recording adds {100 * share:.1f} % to the run's CPU time, at most {100 * MOST_SHARE:.0f} %"
+    return [(verdict, share <= MOST_SHARE), (f"{kb:.1f} kB a frame beyond the images, at most {MOST_KB:.0f}", kb <= MOST_KB)]
+
+
+def _sizes(path: Path, count: int) -> float:
+    """Print kB a frame of each topic before compression; returns those of the file without the images."""
+    found = topics_of(path)
+    rows = [["topic", "kB a frame"]]
+    rows += [[topic.name, f"{topic.bytes / count / 1e3:.2f}"] for topic in sorted(found, key=lambda topic: -topic.bytes)]
+    rows.append(["together", f"{sum(topic.bytes for topic in found) / count / 1e3:.2f}"])
+    rows.append(["in the file, compressed", f"{path.stat().st_size / count / 1e3:.2f}"])
+    print(table(rows, "lr"))
+    images = sum(topic.bytes for topic in found if topic.name == IMAGES)
+    return (path.stat().st_size - images) / count / 1e3
+
+
+def _embedding(overrides: Sequence[str], folder: Path) -> list[tuple[str, bool]]:
+    dataset: Any = _graph(overrides).stages["dataset"].plugin
+    frames = [frame for i in range(min(60, len(dataset))) if isinstance(frame := dataset(i), Frame)]
+    began = time.perf_counter()
+    writer = RecordingWriter(folder / "frames.mcap", {})
+    for frame in frames:
+        writer.write("dataset", frame)
+    writer.close()
+    rate, size = len(frames) / (time.perf_counter() - began), (folder / "frames.mcap").stat().st_size / len(frames) / 1e3
+    text = f"{rate:.0f} embedded frames/s of {frames[0].camera.width} × {frames[0].camera.height}, {size:.0f} kB each, at least {LEAST_FRAMES_S:.0f}"
+    return [(text, rate >= LEAST_FRAMES_S)]
+
+
+def _reading(folder: Path, count: int) -> list[tuple[str, bool]]:
+    source, path = Recording(folder / "run.mcap"), folder / "long.mcap"
+    values: dict[int, list[tuple[str, Value]]] = {}
+    for topic in [FRAMES_TOPIC, *sorted(source.topics - {FRAMES_TOPIC})]:
+        for value in source.values(topic):
+            values.setdefault(value.index, []).append((topic, value))
+    of_frame = [values[index] for index in sorted(values)]
+    writer = RecordingWriter(path, {"overrides": "[]"})
+    for index in range(count):
+        for topic, value in of_frame[index % len(of_frame)]:
+            writer.write(topic, replace(value, index=index, stamp_ns=33_333_333 * index))
+    writer.close()
+    best, topics = float("inf"), 0
+    for _ in range(3):
+        began = time.perf_counter()
+        topics = len(Recording(path).frame(count * 2 // 3 // len(of_frame) * len(of_frame) + len(of_frame) // 2))
+        best = min(best, time.perf_counter() - began)
+    size = path.stat().st_size / 1e6
+    text = f"{count} frames, {size:.0f} MB: opened and the {topics} topics of one frame read in {best:.3f} s, under {MOST_OPEN_S} s"
+    return [(text, best < MOST_OPEN_S and topics > 1)]
+
+
+def _graph(overrides: Sequence[str]) -> Graph:
+    from hydra import compose, initialize_config_module
+
+    from trihedron.pipeline.config import graph_of, register_configs
+    from trihedron.pipeline.registry import load_plugins
+
+    load_plugins()
+    register_configs()
+    with initialize_config_module("trihedron.conf", version_base="1.3"):
+        return graph_of(compose("root", overrides=list(overrides)))

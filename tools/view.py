@@ -1,0 +1,30 @@
+"""Open a run in rerun: frames, features, planes, axes, the map, the surface and the estimate against the truth.
+
+Needs the extra `view`: pip install trihedron[view]. `trihedron export RUN --to rerun` writes the same to a file.
+
+Example: trihedron view runs/latest
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from trihedron.pipeline.recording import Recording
+from trihedron.tools.arguments import Parser
+from trihedron.tools.export import RECORDING
+
+
+def main(argv: list[str]) -> int:
+    """Run the command; returns the exit code. Raises UsageError where rerun is not installed, RecordingError for a file that cannot be read."""
+    from trihedron.tools.export_rerun import require_rerun, show
+
+    parser = Parser("view", __name__)
+    parser.add_argument("run", metavar="RUN", type=Path, help="a run folder or its recording")
+    run: Path = parser.parse_args(argv).run
+    rerun = require_rerun()
+    recording = Recording(run / RECORDING if run.is_dir() else run)
+    stream = rerun.RecordingStream("trihedron")
+    stream.spawn()
+    print(f"{show(recording, stream)} frames of {recording.path}")
+    stream.flush()
+    return 0
