@@ -93,7 +93,7 @@ class Decoder:
         if kind is None:
             raise RecordingError(self.place, f"holds the unknown type '{message.type}'", "read it with the version that wrote it")
         if kind.version != message.version:
-            cause = f"holds {message.type} version {message.version}, this program reads version {kind.version}"
+            cause = f"holds {message.type} version {message.version}, this program reads version {kind.version}{_other_fields(message, kind)}"
             raise RecordingError(self.place, cause, "record again, or read it with the version that wrote it")
         arrays: dict[str, Any] = {}
         tables: dict[str, Any] = {}
@@ -112,6 +112,15 @@ class Decoder:
         value = _make(kind, fields, "")
         assert isinstance(value, Value)
         return value
+
+
+def _other_fields(message: Any, kind: Any) -> str:
+    """The fields by which a recorded value differs from the type of today, as a part of a sentence."""
+    recorded = {array.name.partition("#")[0].partition(".")[0] for array in message.arrays}
+    expected = set(_hints(kind)) - {"index", "stamp_ns"}
+    lacks = ", ".join(f"'{name}'" for name in sorted(expected - recorded))
+    more = ", ".join(f"'{name}'" for name in sorted(recorded - expected))
+    return (f", with the field {lacks} that it lacks" if lacks else "") + (f", without its field {more}" if more else "")
 
 
 def is_whole(data: bytes) -> bool:

@@ -11,7 +11,7 @@ import zstandard
 from trihedron.pipeline.codec import FULL_EVERY, Decoder, Encoder, ValueMessage
 from trihedron.pipeline.errors import RecordingError
 from trihedron.pipeline.table import Column, Table
-from trihedron.pipeline.types import Camera, DepthNoise, Frame, Keypoints, Map, Planes, Rotation
+from trihedron.pipeline.types import Camera, DepthNoise, Frame, Keypoints, Map, Planes, Pose, Rotation
 
 RNG = np.random.default_rng(0)
 
@@ -181,6 +181,19 @@ def test_damaged_and_foreign_values_are_refused():
     encoder = Encoder()
     encoder.encode(change[0])
     assert "keyframes: a change without the version before it" in refusal(encoder.encode(change[1]).SerializeToString())
+
+
+def test_a_value_of_an_older_version_names_the_version_and_the_fields():
+    """As `Pose` was before sub-maps, with a field that there is no more."""
+    message = message_of(Pose(3, 4, np.eye(4), np.eye(6), np.eye(4), -1, np.zeros(3, np.int32), 0, "ok", ""))
+    message.version = 1
+    kept = [array for array in message.arrays if array.name not in ("submap", "unrecognised")]
+    del message.arrays[:]
+    message.arrays.extend([*kept, type(kept[0])(name="quality", dtype="float", encoding="raw", data=bytes(8))])
+    assert refusal(message) == (
+        "a.mcap: topic /keypoints: holds Pose version 1, this program reads version 2, with the field 'submap', 'unrecognised' that it lacks, "
+        "without its field 'quality'; record again, or read it with the version that wrote it"
+    )
 
 
 def test_an_image_that_claims_to_be_larger_than_its_shape_is_not_decoded():

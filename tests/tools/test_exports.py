@@ -94,9 +94,9 @@ def test_what_cannot_be_exported_is_one_line(run, tmp_path, monkeypatch, capsys)
 def test_a_file_for_rerun_is_whole_and_holds_everything(run):
     assert main(["export", str(run), "--to", "rerun"]) == 0
     command = [sys.executable, "-m", "rerun", "rrd"]
-    done = subprocess.run([*command, "verify", str(run / "run.rrd")], capture_output=True, text=True, env={"TELEMETRY_ENABLED": "0"})
+    done = subprocess.run([*command, "verify", str(run / "run.rrd")], capture_output=True, text=True)
     assert done.returncode == 0 and "1 file verified without error" in done.stdout + done.stderr
-    done = subprocess.run([*command, "print", str(run / "run.rrd")], capture_output=True, text=True, env={"TELEMETRY_ENABLED": "0"})
+    done = subprocess.run([*command, "print", str(run / "run.rrd")], capture_output=True, text=True)
     said = done.stdout + done.stderr
     parts = ["image", "keypoints", "lines", "planes", "axes"]
     for path in [*(f"/world/camera/{part}" for part in parts), "/world/map/points", "/world/path", "/world/truth", "/error/position_m", "/status"]:
