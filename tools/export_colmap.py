@@ -27,8 +27,7 @@ def write_colmap(recording: Recording, path: Path) -> str:
     import pycolmap
 
     map = last_map(recording)
-    rows = np.flatnonzero(map.keyframes.column("alive") & (map.keyframes.column("submap") == 0)) if map is not None else []
-    if map is None or not len(rows):
+    if map is None or not len(rows := _keyframes(map)):
         raise DataError(str(recording.path), "holds no keyframes", "record a run with a map")
     model, references, at = pycolmap.Reconstruction(), references_of(recording), frames_of(recording)
     folders = path / "images", path / "sparse" / "0"
@@ -52,6 +51,11 @@ def write_colmap(recording: Recording, path: Path) -> str:
     model.write_binary(str(folders[1]))
     model.write_text(str(folders[1]))
     return f"{model.num_images()} images, {model.num_points3D()} points with {model.compute_num_observations()} observations"
+
+
+def _keyframes(map: Map) -> I32:
+    """Rows (n,) of those that live in the world of the first."""
+    return np.flatnonzero(map.keyframes.column("alive") & (map.keyframes.column("submap") == 0)).astype(np.int32)
 
 
 def _observations(map: Map, keyframes: I32) -> Any:
