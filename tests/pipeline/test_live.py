@@ -67,10 +67,10 @@ def test_a_late_run_drops_frames_and_stays_on_time(tmp_path: Path) -> None:
     numbers = taken(path)
     assert numbers == runner.feed.numbers == sorted(set(numbers)) and numbers[0] == 0 and numbers[-1] == 59
     summary = runner.feed.summary({})
-    assert summary["came"] == 60 and summary["taken"] == len(numbers) <= 30 and summary["dropped"] == 60 - len(numbers)
+    assert summary["came"] == 60 and summary["taken"] == len(numbers) < 45 and summary["dropped"] == 60 - len(numbers)
     latency = runner.timing.summary(2, seconds, 0.0)["frame_ms"]
     print(f"{summary}, latency {latency}, {seconds:.2f} s")
-    assert 20.0 <= latency["p50"] < 100.0  # a queue would end at 60 · 20 ms - 300 ms = 900 ms
+    assert 20.0 <= latency["p50"] < 4 * 1e3 * seconds / len(numbers)  # the time of two frames on any machine; a queue would grow to that of dozens
     assert [pose.index for pose in runner.result.poses] == [number for number in numbers if number % 5 != 4]  # where there are key points
 
 
