@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Hashable
 from dataclasses import dataclass
-from typing import Annotated, ClassVar
+from functools import cached_property
+from typing import Annotated, Any, ClassVar
 
 from trihedron.pipeline.arrays import F64, I32, Shape, Value
 from trihedron.pipeline.table import Table
@@ -24,6 +26,11 @@ class Map(Value):
     point_observations: Table
     line_observations: Table
     plane_observations: Table
+
+    @cached_property
+    def memo(self) -> dict[Hashable, Any]:
+        """What was worked out of this version and is asked for frame after frame; gone with it, and no part of the value."""
+        return {}
 
 
 @dataclass(frozen=True)

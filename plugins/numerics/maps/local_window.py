@@ -72,6 +72,14 @@ def _votes(map: Map, keyframes: I32) -> I32:
 
 def covisible_keyframes(map: Map, keyframes: I32, count: int) -> I32:
     """At most `count` further living keyframes that share most landmarks with the given ones, most first and of equals the newest."""
+    key = "covisible", keyframes.tobytes(), count
+    if key not in map.memo:
+        map.memo[key] = _covisible(map, keyframes, count)
+    found: I32 = map.memo[key]
+    return found
+
+
+def _covisible(map: Map, keyframes: I32, count: int) -> I32:
     votes = _votes(map, keyframes)
     votes[keyframes] = 0
     votes[~map.keyframes.column("alive")] = 0
@@ -113,4 +121,8 @@ def local_window(
 
 def window_of(map: Map, keyframes: I32) -> LocalWindow:
     """The keyframes (sorted rows) and what they see."""
-    return LocalWindow(keyframes, observed_by(map, keyframes, "point"), observed_by(map, keyframes, "line"), observed_by(map, keyframes, "plane"))
+    key = "window", keyframes.tobytes()
+    if key not in map.memo:
+        map.memo[key] = LocalWindow(keyframes, *(observed_by(map, keyframes, kind) for kind in ("point", "line", "plane")))
+    window: LocalWindow = map.memo[key]
+    return window
