@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from enum import Enum
 from functools import cached_property
 from typing import Any, get_type_hints
@@ -13,7 +13,7 @@ import numpy as np
 from trihedron.datasets import fault_images as spoil
 from trihedron.datasets.fault_timing import Delivery, inside
 from trihedron.datasets.sequence import clip_range
-from trihedron.pipeline.errors import DataError
+from trihedron.pipeline.errors import DataError, did_you_mean
 from trihedron.pipeline.registry import plugin_class, register
 from trihedron.pipeline.slots import frame_range
 from trihedron.pipeline.types import F32, U8, Camera, Frame, Trajectory
@@ -183,6 +183,9 @@ class Faults:
     def _inner(self) -> Any:
         kind = plugin_class("dataset", self.of)
         hints = get_type_hints(kind)
+        known = [option.name for option in fields(kind)]
+        if (unknown := next((name for name in self.options if name not in known), None)) is not None:
+            raise ValueError(f"options: {self.of} has no option '{unknown}'; {did_you_mean(unknown, known)}")
         return kind(**{name: _as(hints.get(name), value) for name, value in self.options.items()})
 
 

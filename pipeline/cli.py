@@ -107,6 +107,8 @@ def _run(words: list[str]) -> int:
     for word in words:
         if word.startswith("-") and word not in RUN_FLAGS:
             raise UsageError(word, "is not an option of run", f"known: {', '.join(RUN_FLAGS)}; everything else is key=value")
+        if word.startswith("=") or word == "out=":
+            raise UsageError(word, "lacks a " + ("key" if word.startswith("=") else "folder"), "write key=value, for example out=runs/mine")
     os.environ["HYDRA_FULL_ERROR"] = "1"  # exceptions come to us instead of being printed
     import hydra
     from hydra.core.hydra_config import HydraConfig

@@ -101,6 +101,8 @@ def graph_of(config: DictConfig) -> Graph:
         if isinstance(config.get(slot), str):
             raise ConfigError(slot, "this graph has no such stage", "choose another graph or wire the stage in a graph file")
     wiring: Any = OmegaConf.to_container(config.graph, resolve=True)
+    if (stage := next((stage for stage, inputs in wiring.items() if not isinstance(inputs, dict)), None)) is not None:
+        raise ConfigError(f"graph.{stage}", f"'{wiring[stage]}' is not the wires of a stage", f"choose a plugin with {stage}=NAME")
     plugins = {slot: make_plugin(slot, config[slot]) for slot in wiring if slot in SLOTS and config.get(slot) is not None}
     if config.localise_only and "map" in plugins:
         plugins["map"] = plugin_class("map", "none")()
@@ -117,20 +119,24 @@ def make_plugin(slot: str, options: DictConfig) -> Any:
         return kind(**{name: tuple(value) if isinstance(value, list) else value for name, value in values.items()})
     except (ValueError, TypeError) as error:
         field, _, cause = str(error).partition(": ")
-        place = f"{slot}.{field}" if cause and field.isidentifier() else slot
-        raise ConfigError(place, cause or str(error), f"see trihedron plugins for the options of {slot}") from error
+        place, cause = (f"{slot}.{field}", cause) if cause and field.isidentifier() else (slot, str(error))
+        raise ConfigError(place, cause, f"see trihedron plugins for the options of {slot}") from error
 
 
 def rewritten(error: Exception) -> TrihedronError:
     """What Hydra and OmegaConf raise while they compose, as one line with place, cause and cure."""
     text = " ".join(str(error).split())
     cause: BaseException = error.__cause__ or error
+    if match := re.search(r"Ambiguous value for argument '([^=']*)=([^']*)'", text):
+        return UsageError(match[1], f"'{match[2]}' is several values", "add -m to run once with each, or write a list as [A,B]")
     if isinstance(error, OverrideParseException):
         return UsageError(error.override, "is not an override", "write key=value, for example threads=1 (quote lists: 'only=[pose]')")
     if isinstance(error, MissingConfigException) and (match := re.search(r"Could not find '(\w+)/([^']*)'", text)):
         return _unknown_option(match[1], match[2], list(error.options or []))
     if match := re.search(r"Could not override '([\w./]+)'", text):
         return _unknown_key(match[1])
+    if isinstance(cause, ValidationError) and "is not a ListConfig" in str(cause):
+        return ConfigError(str(getattr(cause, "full_key", "")), "is not a list", "write it as [A,B], quoted for the shell")
     if isinstance(cause, ValidationError):
         place = getattr(cause, "full_key", None) or text.partition("=")[0].rpartition(" ")[2]
         return ConfigError(str(place), " ".join(str(cause.msg or cause).split()).partition(" full_key")[0], "give a value of that type")

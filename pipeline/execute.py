@@ -42,6 +42,8 @@ def execute(config: DictConfig, out: Path, overrides: list[str], began: float) -
     Raises TrihedronError. Whatever happens after the first frame, the recording is closed and the trajectory so far is written."""
     if config.threads < 1:
         raise ConfigError("threads", f"{config.threads} is not a number of threads", "give 1 or more")
+    if config.seed < 0:
+        raise ConfigError("seed", f"{config.seed} is negative", "give 0 or more")
     graph = graph_of(config)
     replay = _replay(config, graph)
     frames = str(config.dataset.get("frames", "")) if config.dataset is not None else ""

@@ -1,0 +1,97 @@
+"""What a newcomer gets wrong: each mistake is one line with place, cause and cure, and the exit code that the README says; never a traceback."""
+
+import pytest
+
+from trihedron.pipeline.cli import main
+
+TYPE, SEE = "give a value of that type", "see trihedron plugins for the options of"
+WRITE = "write key=value, for example threads=1 (quote lists: 'only=[pose]')"
+MCAP = "is not an MCAP file; give a file that trihedron run or another MCAP writer wrote"
+MISTAKES = [  # words of the command, exit code, what is said after "trihedron: "
+    ("run threads=abc", 1, f"threads: Value 'abc' of type 'str' could not be converted to Integer; {TYPE}"),
+    ("run threads=", 1, f"threads: Value '' of type 'str' could not be converted to Integer; {TYPE}"),
+    ("run threads=-1", 1, "threads: -1 is not a number of threads; give 1 or more"),
+    ("run seed=-1", 1, "seed: -1 is negative; give 0 or more"),
+    ("run seed=x", 1, f"seed: Value 'x' of type 'str' could not be converted to Integer; {TYPE}"),
+    ("run keypoints=orb,sift", 2, "keypoints: 'orb,sift' is several values; add -m to run once with each, or write a list as [A,B]"),
+    ("run map=covisability", 1, "map: there is no plugin 'covisability' for the slot 'map'; did you mean 'covisibility'?"),
+    ("run map.min_frames=-1", 1, f"map.min_frames: must be at least 1 and at most max_frames; {SEE} map"),
+    ("run pose.min_share=2", 1, f"pose: min_inliers, min_share: must not be negative, min_share at most 1; {SEE} pose"),
+    ("run pose.min_share=high", 1, f"pose.min_share: Value 'high' of type 'str' could not be converted to Float; {TYPE}"),
+    ("run dataset.width=-5", 1, f"dataset.width: -5 is not within 16 … 8192; {SEE} dataset"),
+    ("run dataset.width=wide", 1, f"dataset.width: Value 'wide' of type 'str' could not be converted to Integer; {TYPE}"),
+    ("run dataset.width=3.5", 1, f"dataset.width: Value '3.5' of type 'float' could not be converted to Integer; {TYPE}"),
+    ("run dataset.motion=fly", 1, f"dataset.motion: Invalid value 'fly', expected one of [walk, fast, still, pan]; {TYPE}"),
+    ("run dataset.frames=5", 1, f"dataset.frames: '5' is not a range of frames A:B with A < B; {SEE} dataset"),
+    ("run dataset.frames=3:3", 1, f"dataset.frames: '3:3' is not a range of frames A:B with A < B; {SEE} dataset"),
+    ("run dataset.frames=500:", 1,
+     "dataset.frames: '500:' begins beyond the 150 frames of the synthetic room (dataset.length); give a range within 0:150"),
+    ("run dataset=tum dataset.path=empty", 1, "empty: is empty; give the folder that holds the images as dataset.path"),
+    ("run dataset=tum dataset.path=text.txt", 1, "text.txt: is not a folder; give the folder that holds the images as dataset.path"),
+    ("run dataset=folder dataset.path=nowhere", 1, "nowhere: does not exist; give an existing folder as dataset.path"),
+    ("run dataset=mcap dataset.path=junk.mcap", 1, f"junk.mcap: {MCAP}"),
+    ("run dataset=mcap dataset.path=nowhere.mcap", 1, "nowhere.mcap: cannot be read: No such file or directory; give the path of an MCAP file"),
+    ("run dataset=faults dataset.of=tums", 1, "dataset: there is no plugin 'tums' for the slot 'dataset'; did you mean 'tum'?"),
+    ("run dataset=faults dataset.cover=9:3", 1, f"dataset.cover: '9:3' is not a range of frames A:B with A < B; {SEE} dataset"),
+    ("run dataset=faults dataset.moving=3", 1, f"dataset.moving: 3.0 is not within 0 … 1; {SEE} dataset"),
+    ("run dataset=faults +dataset.options.widht=3", 1,
+     f"dataset.options: synthetic has no option 'widht'; did you mean 'width'?; {SEE} dataset"),
+    ("run graph=structual", 1, "graph: there is no graph 'structual'; did you mean 'structural'?"),
+    ("run graph.pose=none", 1, "graph.pose: 'none' is not the wires of a stage; choose a plugin with pose=NAME"),
+    ("run graph.pose.foo=pose", 1, "graph.pose.foo: there is no such key; see trihedron run --help"),
+    ("run outputs=trajectory", 1, "outputs: is not a list; write it as [A,B], quoted for the shell"),
+    ("run outputs=[surfce]", 1, "outputs: no stage writes 'surfce'; did you mean 'surface'?"),
+    ("run record.frames=maybe", 1, f"record.frames: Value 'maybe' is not a valid bool (type str); {TYPE}"),
+    ("run localise_only=perhaps", 1, f"localise_only: Value 'perhaps' is not a valid bool (type str); {TYPE}"),
+    ("run localise_only=true", 1, "localise_only: needs a map to find the camera in; give load_map=FILE.mcap too"),
+    ("run load_map=nowhere.mcap", 1, "nowhere.mcap: there is no such map; save one with: trihedron run save_map=FILE.mcap"),
+    ("run load_map=junk.mcap", 1, f"junk.mcap: {MCAP}"),
+    ("run load_map=small/run.mcap", 1, "small/run.mcap: is a recording, not a saved map; save one with: trihedron run save_map=FILE.mcap"),
+    ("run save_map=nowhere/map.mcap", 1, "save_map: the folder {here}/nowhere does not exist; make it first"),
+    ("run replay=junk.mcap", 1, f"junk.mcap: {MCAP}"),
+    ("run replay=small", 1, "small: cannot be read: Is a directory; give the path of an MCAP file"),
+    ("run replay=small/run.mcap only=[posse]", 1, "only: this graph has no stage 'posse'; did you mean 'pose'?"),
+    ("run replay=small/run.mcap dataset.frames=90:", 1, "small/run.mcap: has none of the frames '90:'; give another dataset.frames"),
+    ("run replay=small/run.mcap save_map=x.mcap", 1, "save_map: a replay makes no map to go on from; save the map of the run itself"),
+    ("run experiment=leave_on_out", 1, "experiment: there is no experiment 'leave_on_out'; did you mean 'leave_one_out'?"),
+    ("run without=legs", 1, "without: there is no without 'legs'; did you mean 'lines'?"),
+    ("run out=text.txt/x", 1, "out: the folder cannot be made: Not a directory: text.txt/x; give another out=FOLDER"),
+    ("run out=", 2, "out=: lacks a folder; write key=value, for example out=runs/mine"),
+    ("run =3", 2, "=3: lacks a key; write key=value, for example out=runs/mine"),
+    ("run a b", 2, f"a: is not an override; {WRITE}"),
+    ("run dataset.path", 2, f"dataset.path: is not an override; {WRITE}"),
+    ("run --verbose", 2, "--verbose: is not an option of run; known: -m, --multirun; everything else is key=value"),
+    ("rum", 2, "rum: there is no such command; did you mean 'run'?"),
+]  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def here(tmp_path_factory):
+    """A folder with things that are not what a newcomer takes them for, and a small run."""
+    folder = tmp_path_factory.mktemp("newcomer")
+    (folder / "empty").mkdir()
+    (folder / "text.txt").write_text("hello\n")
+    (folder / "junk.mcap").write_bytes(b"not an mcap file")
+    assert main(["run", "dataset.width=64", "dataset.height=48", "dataset.length=4", f"out={folder}/small"]) == 0
+    return folder
+
+
+@pytest.mark.parametrize("words, code, line", MISTAKES, ids=[words for words, *_ in MISTAKES])
+def test_a_mistake_is_one_line(here, monkeypatch, capsys, words, code, line):
+    monkeypatch.chdir(here)
+    assert main(words.split()) == code
+    printed = capsys.readouterr()
+    assert printed.err == f"trihedron: {line.format(here=here)}\n"
+    assert not printed.out
+
+
+def test_the_table_is_long_enough():
+    assert len(MISTAKES) >= 40 and len({words for words, *_ in MISTAKES}) == len(MISTAKES)
+    assert {code for _, code, _ in MISTAKES} == {1, 2}
+
+
+def test_debug_shows_where_an_error_comes_from(here, monkeypatch):
+    monkeypatch.chdir(here)
+    with pytest.raises(Exception, match="there is no graph 'structual'") as caught:
+        main(["run", "graph=structual", "--debug"])
+    assert any(entry.name == "rewritten" or "hydra" in str(entry.path) or entry.name == "_run" for entry in caught.traceback)
