@@ -61,6 +61,17 @@ MISTAKES = [  # words of the command, exit code, what is said after "trihedron: 
     ("run a b", 2, f"a: is not an override; {WRITE}"),
     ("run dataset.path", 2, f"dataset.path: is not an override; {WRITE}"),
     ("run --verbose", 2, "--verbose: is not an option of run; known: -m, --multirun; everything else is key=value"),
+    ("topics nowhere.mcap", 1, "nowhere.mcap: cannot be read: No such file or directory; give the path of an MCAP file"),
+    ("topics junk.mcap", 1, f"junk.mcap: {MCAP}"),
+    ("evaluate text.txt", 2, "evaluate: the following arguments are required: TRUTH; see trihedron evaluate --help"),
+    ("export small --to stl", 2, "export: there is no format 'stl'; known: gltf, obj, planes.json, ply, png"),
+    ("evaluate-surface small", 1, "small/surface.ply: there is no such file; run with outputs=[trajectory,surface] first"),
+    ("picture small/run.mcap --frame 99", 1, "small/run.mcap: has no frame 99; give one of 0..3"),
+    ("picture small/run.mcap --frame x", 2, "picture: argument --frame: invalid int value: 'x'; see trihedron picture --help"),
+    ("calibrate junk.mcap", 1, f"junk.mcap: {MCAP}"),
+    ("benchmark map --parts nothing", 2, "benchmark map: there is no part 'nothing'; known: cover, growth, loop"),
+    ("benchmark runs empty", 1,
+     "empty: holds no runs; give the out=FOLDER of a sweep, for example of: trihedron run -m experiment=leave_one_out"),
     ("rum", 2, "rum: there is no such command; did you mean 'run'?"),
 ]  # fmt: skip
 

@@ -5,9 +5,10 @@ Example: trihedron picture runs/latest/run.mcap --frame 60 --out picture.png
 
 from __future__ import annotations
 
-import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
+
+from trihedron.tools.arguments import Parser
 
 if TYPE_CHECKING:
     from trihedron.pipeline.recording import Recording
@@ -19,7 +20,7 @@ AXIS_LENGTH_PX = 60
 
 def main(argv: list[str]) -> int:
     """Write the picture and say where."""
-    parser = argparse.ArgumentParser(prog="trihedron picture", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = Parser("picture", __name__)
     parser.add_argument("recording", help="run.mcap")
     parser.add_argument("--frame", type=int, default=-1, metavar="N", help="frame number (default: the middle one)")
     parser.add_argument("--out", default="picture.png", metavar="FILE", help="default picture.png")
