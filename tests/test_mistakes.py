@@ -64,7 +64,6 @@ MISTAKES = [  # words of the command, exit code, what is said after "trihedron: 
     ("topics nowhere.mcap", 1, "nowhere.mcap: cannot be read: No such file or directory; give the path of an MCAP file"),
     ("topics junk.mcap", 1, f"junk.mcap: {MCAP}"),
     ("evaluate text.txt", 2, "evaluate: the following arguments are required: TRUTH; see trihedron evaluate --help"),
-    ("export small --to stl", 2, "export: there is no format 'stl'; known: gltf, obj, planes.json, ply, png"),
     ("evaluate-surface small", 1, "small/surface.ply: there is no such file; run with outputs=[trajectory,surface] first"),
     ("picture small/run.mcap --frame 99", 1, "small/run.mcap: has no frame 99; give one of 0..3"),
     ("picture small/run.mcap --frame x", 2, "picture: argument --frame: invalid int value: 'x'; see trihedron picture --help"),
