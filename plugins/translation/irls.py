@@ -46,7 +46,7 @@ class Irls:
         prior_m = self.motion_sigma_m * max(frame.index - previous_pose.index, 1)
         R = rotation.R_world_camera
         if tracks is not None and previous_keypoints is not None and tracks.previous_index == previous_pose.index == previous_keypoints.index:
-            rows = point_rows(tracks, keypoints, previous_keypoints, frame.camera, R.T @ before[:3, :3], self.depthless)
+            rows = point_rows(tracks, keypoints, previous_keypoints, frame.camera, R.T @ before[:3, :3], rotation.covariance, self.depthless)
             step = solve_step(rows, np.zeros(3), prior_m)
             if step.inliers >= self.min_points:
                 inliers = np.array([step.inliers, 0, 0], np.int32)

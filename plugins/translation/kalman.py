@@ -64,7 +64,7 @@ class Kalman:
         """The step of the position by the points (3,), its covariance (3, 3), both in the world, and how many points agree."""
         R, gap = rotation.R_world_camera, max(frame.index - pose.index, 1)
         if tracks is not None and before is not None and tracks.previous_index == pose.index == before.index:
-            rows = point_rows(tracks, keypoints, before, frame.camera, R.T @ pose.T_world_camera[:3, :3], True)
+            rows = point_rows(tracks, keypoints, before, frame.camera, R.T @ pose.T_world_camera[:3, :3], rotation.covariance, True)
             found = solve_step(rows, np.zeros(3), self.motion_sigma_m * gap)
             if found.inliers >= self.min_points:
                 return -R @ found.s, R @ found.covariance @ R.T + self.point_sigma_m**2 * np.eye(3), found.inliers

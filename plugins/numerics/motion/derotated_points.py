@@ -18,7 +18,7 @@ from trihedron.pipeline.types import F64, Camera, Keypoints, Tracks
 ITERATIONS = 15
 CAUCHY = 2.385  # 95 % efficiency where the noise is Gaussian
 GATE = 3.0  # standard deviations, beyond which a point does not agree
-FLOOR_M = 0.003  # of the step, below which points without depth say no more: their rows' noise is a share of it
+FLOOR_M = 0.01  # of the step, below which points without depth say no more: their rows' noise is a share of it
 SIGMAS = 0.849  # standard deviation in each of two directions, where the median length is 1
 ALONE = 4  # iterations of the points with depth alone: at a step of zero, those without depth agree with everything
 
@@ -42,8 +42,9 @@ class Step:
     unobservable: F64
 
 
-def point_rows(tracks: Tracks, now: Keypoints, before: Keypoints, camera: Camera, R_current_previous: F64, depthless: bool) -> Rows:
-    """The equations of the tracked points, those without depth where `depthless`."""
+def point_rows(tracks: Tracks, now: Keypoints, before: Keypoints, camera: Camera, R_current_previous: F64, turn: F64, depthless: bool) -> Rows:
+    """The equations of the tracked points, those without depth where `depthless`. The rotation's error, of covariance `turn` (3, 3), is the same for
+    all of the latter: together they are no surer of the direction than it."""
     i, j = tracks.keypoints.T
     x = camera.back_project(now.pixels[j].astype(np.float64), np.ones(len(j)))
     far = camera.back_project(before.pixels[i].astype(np.float64), np.ones(len(i))) @ R_current_previous.T
@@ -56,6 +57,7 @@ def point_rows(tracks: Tracks, now: Keypoints, before: Keypoints, camera: Camera
     A[~known], b[~known] = 0.0, 0.0
     A[~known, 0] = np.cross(far[~known], x[~known])
     sigma = np.hypot(now.sigma_px[j], before.sigma_px[i]).astype(np.float64) / camera.fx
+    sigma[~known] = np.sqrt(sigma[~known] ** 2 + np.count_nonzero(~known) * np.trace(turn) / 3.0)
     used = (known & (q[:, 2] > 0.1)) | (~known & depthless)
     return Rows(A[used], b[used], np.where(known, q[:, 2], np.nan)[used], sigma[used])
 

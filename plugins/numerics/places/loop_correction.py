@@ -46,7 +46,7 @@ def close(map: Map, closure: Closure, drift: Drift, compass: Compass | None) -> 
     place, keyframe = np.searchsorted(rows, [closure.place, closure.keyframe])
     measured = invert(before[place]) @ closure.T_world_camera
     closing = Edges(np.array([[place, keyframe]], np.int32), measured[None], np.linalg.inv(closure.covariance)[None])
-    return _correction(map, rows, before, _solved(before, joined(_odometry(map, rows, before, drift), closing), compass))
+    return moved_keyframes(map, rows, before, _solved(before, joined(_odometry(map, rows, before, drift), closing), compass))
 
 
 def straighten(map: Map, drift: Drift, compass: Compass, least: float) -> Correction | None:
@@ -60,7 +60,7 @@ def straighten(map: Map, drift: Drift, compass: Compass, least: float) -> Correc
     walked = np.linalg.norm(np.diff(before[:, :3, 3], axis=0), axis=1).sum()
     if turned[-1] < least or turned.max() > POSSIBLE * drift.rotation * np.sqrt(walked):
         return None
-    return _correction(map, rows, before, after)
+    return moved_keyframes(map, rows, before, after)
 
 
 def _solved(before: F64, edges: Edges, compass: Compass | None) -> F64:
@@ -87,8 +87,8 @@ def _odometry(map: Map, rows: I32, poses: F64, drift: Drift) -> Edges:
     return Edges(pairs.astype(np.int32), measured, np.linalg.inv(covariance))
 
 
-def _correction(map: Map, rows: I32, before: F64, after: F64) -> Correction:
-    """What moves where keyframes move: each landmark with the mean of those that saw it."""
+def moved_keyframes(map: Map, rows: I32, before: F64, after: F64) -> Correction:
+    """The correction that moves keyframes `rows` from poses (n, 4, 4) to others, and each landmark by the mean of those that saw it."""
     motions = np.broadcast_to(np.eye(4), (len(map.keyframes), 4, 4)).copy()
     motions[rows] = after @ invert(before)
     points, lines, planes = (_moving(table) for table in (map.points, map.lines, map.planes))

@@ -1,0 +1,78 @@
+"""Points of several keyframes found in this frame, wherever they are."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from trihedron.pipeline.geometry import invert, transform
+from trihedron.pipeline.registry import register
+from trihedron.pipeline.types import I32, Frame, Keypoints, Map, Matches, Rotation
+from trihedron.plugins.numerics.images.mutual_matches import mutual_matches
+from trihedron.plugins.numerics.maps.local_window import current_submap, keyframes_of, observed_by
+from trihedron.plugins.numerics.motion.rigid_consensus import consensus
+from trihedron.plugins.numerics.motion.tracked_places import place_sigma, rows_with_depth
+
+NO_PAIRS = np.zeros((0, 2), np.int32)
+
+
+@register("matches", "keyframes")
+@dataclass(frozen=True)
+class Keyframes:
+    """Edges of a pose graph: this frame against the newest keyframes and some drawn from all earlier ones, by descriptors alone, each verified by
+    the rigid motion that most pairs agree on (RGB-D SLAM: Endres et al., T-RO 2014). The pose is not asked, so that a loop of any length can close;
+    of two keyframes that have a point in common the one with more agreeing pairs has it."""
+
+    newest: int = 3
+    drawn: int = 3  # of the earlier ones, anew in every frame
+    ratio: float = 0.9  # best to second best descriptor
+    rounds: int = 150  # samples of three
+    gate: float = 3.0  # standard deviations within which a pair agrees
+    min_points: int = 25  # that must agree
+    min_share: float = 0.4  # of the pairs
+
+    def __post_init__(self) -> None:
+        if self.newest < 1 or self.drawn < 0 or self.rounds < 1 or self.min_points < 3 or self.gate <= 0.0:
+            raise ValueError("newest, drawn, rounds, min_points, gate: at least 1, 0, 1 and 3, and positive")
+        if not 0.0 < self.ratio <= 1.0 or not 0.0 <= self.min_share <= 1.0:
+            raise ValueError("ratio, min_share: must be shares")
+
+    def __call__(self, frame: Frame, rotation: Rotation, keypoints: Keypoints, map: Map | None, rng: np.random.Generator) -> Matches:
+        """Pairs of key points and the points of verified keyframes; what was offered and what was found count as visible."""
+        pairs = [self._verified(frame, keypoints, map, row, rng) for row in self._candidates(map, rng)] if map is not None else []
+        pairs = sorted(pairs, key=len, reverse=True)
+        found = np.concatenate([NO_PAIRS, *pairs])
+        for column in (0, 1):
+            _, first = np.unique(found[:, column], return_index=True)
+            found = found[np.sort(first)]
+        none = np.zeros(0, np.int32)
+        ids = np.unique(found[:, 1]).astype(np.int32)
+        revision = -1 if map is None else map.revision
+        return Matches(
+            frame.index, frame.stamp_ns, revision, np.ascontiguousarray(found), NO_PAIRS, NO_PAIRS, NO_PAIRS, NO_PAIRS, ids, none
+        )  # fmt: skip
+
+    def _candidates(self, map: Map, rng: np.random.Generator) -> list[int]:
+        """Rows of the keyframes that are tried."""
+        rows = keyframes_of(map, current_submap(map))
+        newest, earlier = rows[-self.newest :], rows[: -self.newest]
+        drawn = rng.choice(earlier, min(self.drawn, len(earlier)), replace=False) if len(earlier) else earlier
+        return [int(row) for row in (*newest, *np.sort(drawn))]
+
+    def _verified(self, frame: Frame, keypoints: Keypoints, map: Map, keyframe: int, rng: np.random.Generator) -> I32:
+        """(n, 2) rows of key points and ids of the keyframe's points that agree on one motion; none where too few do."""
+        ids, mine = observed_by(map, np.array([keyframe], np.int32), "point"), rows_with_depth(keypoints)
+        descriptors, positions = map.points.gathered(ids, "descriptor", "position_m")
+        found = mutual_matches(descriptors, keypoints.descriptors[mine], keypoints.metric, self.ratio)
+        if len(found) < self.min_points:
+            return NO_PAIRS
+        T_camera_world = invert(map.keyframes.rows("T_world_camera", np.array([keyframe]))[0])
+        there, rows = transform(T_camera_world, positions[found[:, 0]]), mine[found[:, 1]]
+        here = keypoints.points_m[rows].astype(np.float64)
+        known = frame.camera.depth_noise.sigma_m(there[:, 2])
+        sigma = place_sigma(there, here, known, keypoints.sigma_m[rows], keypoints.sigma_px[rows])
+        agree = consensus(there, here, sigma, self.gate, self.rounds, rng).agree
+        if agree.sum() < self.min_points or agree.sum() < self.min_share * len(found):
+            return NO_PAIRS
+        return np.stack([rows[agree], ids[found[agree, 0]]], axis=1).astype(np.int32)

@@ -1,0 +1,50 @@
+"""The camera's rotation from three tracked points at a time."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from trihedron.pipeline.registry import register
+from trihedron.pipeline.types import Keypoints, Map, Pose, Rotation, Tracks
+from trihedron.plugins.numerics.axes.manhattan_frames import KnownFrames
+from trihedron.plugins.numerics.maps.anchoring import anchored_before
+from trihedron.plugins.numerics.motion.chained_rotation import Estimate, rotation_before, rotation_value
+from trihedron.plugins.numerics.motion.rigid_consensus import consensus, fit_covariance
+from trihedron.plugins.numerics.motion.tracked_places import tracked_places
+
+
+@register("rotation", "ransac")
+@dataclass(frozen=True)
+class Ransac:
+    """The rotation of the rigid motion that most tracked points with depth in both frames agree on, on top of the previous pose (RGB-D SLAM: Endres
+    et al., T-RO 2014). Where too few agree it is held, and says so."""
+
+    rounds: int = 200  # samples of three
+    gate: float = 3.0  # standard deviations within which a point agrees
+    min_points: int = 12
+    held_deg: float = 2.0  # error of a rotation that is held, per frame
+    pose_floor_deg: float = 0.02  # least error of the previous pose
+
+    def __post_init__(self) -> None:
+        if self.rounds < 1 or self.min_points < 3 or min(self.gate, self.held_deg, self.pose_floor_deg) <= 0.0:
+            raise ValueError("rounds, min_points, gate, held_deg, pose_floor_deg: at least 1, at least 3, and positive")
+
+    def __call__(
+        self, tracks: Tracks | None, keypoints: Keypoints, previous: Rotation | None, previous_pose: Pose | None, map: Map | None,
+        rng: np.random.Generator,
+    ) -> Rotation:  # fmt: skip
+        """The rotation of this frame; the identity for the first."""
+        estimate = Estimate(np.eye(3), np.zeros((3, 3)), "prediction")
+        if previous is not None:
+            before, _ = rotation_before(*anchored_before(previous, previous_pose, map), self.pose_floor_deg)
+            held = before.covariance + np.eye(3) * np.radians(self.held_deg) ** 2
+            estimate = Estimate(before.R, held, "prediction")
+            if tracks is not None and tracks.previous_index == previous.index:
+                places, after, sigma = tracked_places(tracks, keypoints)
+                found = consensus(places, after, sigma, self.gate, self.rounds, rng)
+                if found.agree.sum() >= self.min_points:
+                    turned = fit_covariance(after[found.agree] - after[found.agree].mean(axis=0), sigma[found.agree])[3:, 3:]
+                    estimate = Estimate(before.R @ found.R.T, found.R @ before.covariance @ found.R.T + turned, "tracks")
+        return rotation_value(keypoints.index, keypoints.stamp_ns, estimate, KnownFrames.none(), np.zeros((0, 3, 3)))

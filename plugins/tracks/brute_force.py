@@ -1,0 +1,56 @@
+"""Features of the previous frame found again wherever they are."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from trihedron.pipeline.registry import register
+from trihedron.pipeline.types import Frame, Keypoints, Planes, Segments, Tracks
+from trihedron.plugins.numerics.images.mutual_matches import mutual_matches
+from trihedron.plugins.numerics.motion.relative_motion import motion_terms, solve_motion
+from trihedron.plugins.numerics.motion.track_pairs import NO_PAIRS, Features, StructureGates, tracks_value
+
+
+@register("tracks", "brute_force")
+@dataclass(frozen=True)
+class BruteForce:
+    """Key points whose descriptors are each other's nearest among all (as RGB-D SLAM matches them: Endres et al., T-RO 2014): no motion is
+    predicted, and wrong pairs are left to who uses them. Lines and planes are then paired by the points' motion."""
+
+    ratio: float = 0.9  # best to second best descriptor
+    max_age: int = 10  # frames; older features are not looked for
+    prior_deg: float = 10.0  # of no rotation, per frame
+    prior_m: float = 0.1  # of no translation, per frame
+    angle_px: float = 0.002  # rad, of a pixel
+    plane_floor_deg: float = 0.3
+
+    def __post_init__(self) -> None:
+        if not 0.0 < self.ratio <= 1.0 or self.max_age < 1:
+            raise ValueError("ratio, max_age: must be in (0, 1], and at least 1")
+        if min(self.prior_deg, self.prior_m, self.angle_px, self.plane_floor_deg) <= 0.0:
+            raise ValueError("prior_deg, prior_m, angle_px, plane_floor_deg: must be positive")
+
+    def __call__(
+        self,
+        frame: Frame,
+        keypoints: Keypoints,
+        segments: Segments,
+        planes: Planes,
+        previous_keypoints: Keypoints | None,
+        previous_segments: Segments | None,
+        previous_planes: Planes | None,
+    ) -> Tracks | None:
+        """Pairs with the previous frame; None for the first frame, no pairs when the previous features are too old."""
+        if previous_keypoints is None or previous_segments is None or previous_planes is None:
+            return None
+        now, before = Features(keypoints, segments, planes), Features(previous_keypoints, previous_segments, previous_planes)
+        gap = frame.index - before.keypoints.index
+        if gap > self.max_age:
+            return tracks_value(now, before, (NO_PAIRS, NO_PAIRS, NO_PAIRS), np.eye(3))
+        points = mutual_matches(before.keypoints.descriptors, keypoints.descriptors, keypoints.metric, self.ratio)
+        tracks = tracks_value(now, before, (points, NO_PAIRS, NO_PAIRS), np.eye(3))
+        terms = motion_terms(tracks, keypoints, segments, planes, self.angle_px, self.plane_floor_deg)
+        motion = solve_motion(terms, np.eye(3), self.prior_deg * gap, self.prior_m * gap)
+        return tracks_value(now, before, (points, *StructureGates().pairs(now, before, frame.camera, motion.R, motion.t)), motion.R)

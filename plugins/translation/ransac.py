@@ -1,0 +1,64 @@
+"""Position with the rotation fixed, from one tracked point at a time."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from trihedron.pipeline.registry import register
+from trihedron.pipeline.types import F64, LOST, Bool, Frame, Keypoints, Map, Pose, Rotation, Tracks, Translation
+from trihedron.plugins.numerics.maps.anchoring import anchored
+from trihedron.plugins.numerics.motion.tracked_places import tracked_places
+
+
+@register("translation", "ransac")
+@dataclass(frozen=True)
+class Ransac:
+    """With the rotation known every tracked point with depth in both frames says the whole step: the one most points agree with, then their weighted
+    mean (after RGB-D SLAM: Endres et al., T-RO 2014, whose samples of three give both). Fewer than `min_points` are no measurement."""
+
+    rounds: int = 100  # points tried
+    gate: float = 3.0  # standard deviations within which a point agrees
+    min_points: int = 12
+    motion_sigma_m: float = 0.1  # of a step that is not measured, per frame
+
+    def __post_init__(self) -> None:
+        if self.rounds < 1 or self.min_points < 1 or min(self.gate, self.motion_sigma_m) <= 0.0:
+            raise ValueError("rounds, min_points, gate, motion_sigma_m: at least 1, and positive")
+
+    def __call__(
+        self, frame: Frame, rotation: Rotation, tracks: Tracks | None, keypoints: Keypoints, previous_pose: Pose | None, map: Map | None,
+        rng: np.random.Generator,
+    ) -> Translation:  # fmt: skip
+        """The position; the first frame's is the origin of the world."""
+        none = np.zeros(3, np.int32)
+        if previous_pose is None:
+            return Translation(frame.index, frame.stamp_ns, np.zeros(3), np.zeros((3, 3)), np.empty((0, 3)), none, True)
+        T, R = anchored(previous_pose, map).T_world_camera, rotation.R_world_camera
+        unknown = T[:3, :3] @ previous_pose.covariance[:3, :3] @ T[:3, :3].T if previous_pose.status == LOST else np.zeros((3, 3))
+        if tracks is not None and tracks.previous_index == previous_pose.index:
+            before, after, sigma = tracked_places(tracks, keypoints)
+            steps = before @ T[:3, :3].T - after @ R.T
+            agree = self._agreeing(steps, sigma, rng)
+            if agree.sum() >= self.min_points:
+                w = 1.0 / sigma[agree] ** 2
+                covariance = np.eye(3) / w.sum() + unknown
+                inliers = np.array([agree.sum(), 0, 0], np.int32)
+                return Translation(frame.index, frame.stamp_ns, T[:3, 3] + w @ steps[agree] / w.sum(), covariance, np.empty((0, 3)), inliers, True)
+        covariance = unknown + (self.motion_sigma_m * max(frame.index - previous_pose.index, 1)) ** 2 * np.eye(3)
+        return Translation(frame.index, frame.stamp_ns, T[:3, 3].copy(), covariance, np.eye(3), none, False)
+
+    def _agreeing(self, steps: F64, sigma: F64, rng: np.random.Generator) -> Bool:
+        """(n,) whether each of the steps (n, 3) agrees with the one that most agree with, and then with their mean."""
+        if not len(steps):
+            return np.zeros(0, bool)
+        tried = steps[rng.integers(0, len(steps), self.rounds)]
+        within = np.linalg.norm(steps[None] - tried[:, None], axis=2) < self.gate * sigma
+        agree = within[int(np.argmax(within.sum(axis=1)))]
+        for _ in range(3):
+            if not agree.any():
+                break
+            mean = (steps[agree] / sigma[agree, None] ** 2).sum(axis=0) / (1.0 / sigma[agree] ** 2).sum()
+            agree = np.linalg.norm(steps - mean, axis=1) < self.gate * sigma
+        return np.asarray(agree)
