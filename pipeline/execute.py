@@ -28,6 +28,7 @@ from trihedron.pipeline.runner import Runner
 from trihedron.pipeline.runs import Replay, Step
 from trihedron.pipeline.slots import output_of
 from trihedron.pipeline.state import Memory, load_map, reaches
+from trihedron.pipeline.timing import forget_peak
 from trihedron.pipeline.types import Surface, Trajectory
 
 RECORDING = "run.mcap"
@@ -40,6 +41,7 @@ def execute(config: DictConfig, out: Path, overrides: list[str], began: float) -
     """Run the configuration into folder `out`; `began` is when the program started (perf_counter). Returns the metrics.
 
     Raises TrihedronError. Whatever happens after the first frame, the recording is closed and the trajectory so far is written."""
+    forget_peak()
     if config.threads < 1:
         raise ConfigError("threads", f"{config.threads} is not a number of threads", "give 1 or more")
     if config.seed < 0:

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import os
 from collections import defaultdict
+from contextlib import suppress
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -46,6 +48,7 @@ class Timing:
             "startup_s": round(startup_s, 3),
             "fps": round(frames / wall_s, 2) if wall_s > 0 else 0.0,
             "frame_ms": {"p50": p50, "p95": p95, "max": largest},
+            "peak_memory_mb": peak_mb(),
             "stages": stages,
         }
 
@@ -59,6 +62,19 @@ def resident_mb() -> float:
     statistics = os.read(file, 100)
     os.close(file)
     return int(statistics.split()[1]) * os.sysconf("SC_PAGE_SIZE") / 1e6
+
+
+def peak_mb() -> float | None:
+    """The most memory (10⁶ bytes) this process held since `forget_peak`; None where the system does not say (Linux does)."""
+    status = Path("/proc/self/status")
+    lines = status.read_text().splitlines() if status.exists() else []
+    return next((round(int(line.split()[1]) * 1.024e-3, 1) for line in lines if line.startswith("VmHWM:")), None)
+
+
+def forget_peak() -> None:
+    """Begin to measure the peak anew: a process may do several runs. Where that is not allowed the peak is the process's."""
+    with suppress(OSError):
+        Path("/proc/self/clear_refs").write_text("5")
 
 
 def _percentiles(values: list[float]) -> tuple[float, float, float]:

@@ -114,7 +114,7 @@ def test_a_recording_has_no_say_in_the_program_itself(tmp_path, capsys, monkeypa
     assert sorted(path.name for path in tmp_path.iterdir()) == ["hostile.mcap"]  # nothing was written
 
 
-@pytest.mark.parametrize("word", ["out=/tmp/elsewhere", "save_map=/tmp/elsewhere.mcap", "report=benchmark runs", "replay=other.mcap"])
+@pytest.mark.parametrize("word", ["out=/tmp/elsewhere", "save_map=/tmp/elsewhere.mcap", "report=compare", "replay=other.mcap"])
 def test_what_belongs_to_one_run_is_not_taken_from_a_recording(tmp_path, monkeypatch, word):
     monkeypatch.chdir(tmp_path)
     from trihedron.pipeline.cli import _with_recorded

@@ -2,9 +2,9 @@
 
 The machine's speed varies, so times are also given as multiples of the reference: OpenCV ORB (1000 features, 8 levels) and LSD on the same frames,
 one thread. Other comparisons, each with its --help: `trihedron benchmark manhattan` (estimators of the Manhattan frame on rendered rooms),
-`trihedron benchmark rotations` (the runs of a sweep over them), `trihedron benchmark runs` (the runs of any sweep as a table),
-`trihedron benchmark surface` (all surfaces, by the true one), `trihedron benchmark map` (drift, recovery and growth of the map),
-`trihedron benchmark recording` (what recording costs).
+`trihedron benchmark rotations` (the runs of a sweep over them), `trihedron benchmark surface` (all surfaces, by the true one),
+`trihedron benchmark map` (drift, recovery and growth of the map), `trihedron benchmark recording` (what recording costs). `trihedron compare` makes
+a table of the runs of any sweep.
 
 Example: trihedron benchmark dataset=tum dataset.path=FOLDER dataset.frames=0:150 --json benchmark.json
 """
@@ -32,7 +32,6 @@ COMPARISONS = {  # other words after `benchmark`, and whose `main` they stand fo
     "map": "trihedron.tools.map_benchmark",
     "recording": "trihedron.tools.recording_benchmark",
     "rotations": "trihedron.tools.rotation_comparison",
-    "runs": "trihedron.tools.run_table",
     "surface": "trihedron.tools.surface_family",
 }
 

@@ -2,7 +2,8 @@
 
 MESH is a run folder, whose surface.ply is judged, or a file (ply, obj) in the world of the trajectory beside it, or else beside TRUTH. TRUTH is the
 run's recording, or its folder: the truth is that of its data set, the exact surface of the synthetic scenes, rendered depth for ICL-NUIM. By
-default the mesh's own folder. The mesh is moved by the SE(3) that aligns trajectory.txt with the ground truth, never by itself.
+default the mesh's own folder, which then keeps the figures as surface.json. The mesh is moved by the SE(3) that aligns trajectory.txt with the
+ground truth, never by itself.
 
 Accuracy is the distance from the mesh to the truth, over its area. Completeness is the share of the truth that was seen, where a sensor reading
 fell, that is within 2 and 5 cm of the mesh; what cannot be seen counts for nothing.
@@ -24,6 +25,7 @@ if TYPE_CHECKING:
     from trihedron.tools.surface_truth import Truth
 
 SURFACE, TRAJECTORY, RECORDING = "surface.ply", "trajectory.txt", "run.mcap"
+FIGURES = "surface.json"  # what is found of a run by its own truth is kept beside it, for `trihedron compare`
 SAMPLE_M = 0.02  # between the points of the mesh that are judged
 WITHIN_M = (0.02, 0.05)
 PARTS = ("all", "planar", "curved")
@@ -39,6 +41,8 @@ def main(argv: list[str]) -> int:
     mesh: Path = arguments.mesh / SURFACE if arguments.mesh.is_dir() else arguments.mesh
     truth: Path = arguments.truth or mesh.parent
     figures = evaluate_files(mesh, truth / RECORDING if truth.is_dir() else truth)
+    if arguments.mesh.is_dir() and arguments.truth is None:
+        (arguments.mesh / FIGURES).write_text(json.dumps(figures, indent=2) + "\n")
     print(json.dumps(figures, indent=2) if arguments.json else report(figures))
     return 0
 

@@ -1,0 +1,123 @@
+"""The runs of a sweep as one table, and the graphs and omissions it is made for."""
+
+import csv
+import json
+
+import numpy as np
+import pytest
+from hydra import compose, initialize_config_module
+
+from trihedron.pipeline.cli import main
+from trihedron.pipeline.config import graph_of, register_configs
+from trihedron.pipeline.errors import UsageError
+from trihedron.pipeline.registry import load_plugins
+from trihedron.tools.compare import read_runs, rows_of
+from trihedron.tools.comparison_table import WRITERS, as_latex, as_markdown, as_text
+
+SMALL = ["dataset.width=160", "dataset.height=120", "dataset.length=4"]
+
+
+def write_run(folder, overrides, ate_m=None, p50=10.0, share=1.0):
+    (folder / ".hydra").mkdir(parents=True)
+    (folder / ".hydra" / "overrides.yaml").write_text("".join(f"- {text}\n" for text in overrides))
+    if ate_m is not None:
+        final = {"ate_rmse_m": ate_m, "tracked_share": share, "rpe_second_rmse_m": 0.002, "rpe_second_rmse_deg": 0.05}
+        (folder / "metrics.json").write_text(json.dumps({"final": final}))
+        (folder / "timing.json").write_text(json.dumps({"frame_ms": {"p50": p50}}))
+
+
+def test_rows_say_what_differs_and_seeds_share_one(tmp_path):
+    for i, (without, seed, ate) in enumerate([("nothing", 0, 0.002), ("nothing", 1, 0.004), ("lines", 0, 0.006), ("lines", 1, 0.006)]):
+        write_run(tmp_path / str(i), [f"without={without}", f"dataset.seed={seed}", "threads=2", f"out={tmp_path}"], ate, p50=10.0 + i)
+    assert as_text(rows_of(read_runs(tmp_path))).splitlines() == [
+        "change           runs   tracked %      ATE mm  RPE 1 s mm   RPE 1 s deg     p50 ms",
+        "without=nothing     2  100.0 ±0.0  3.00 ±1.00  2.00 ±0.00  0.050 ±0.000  10.5 ±0.5",
+        "without=lines       2  100.0 ±0.0  6.00 ±0.00  2.00 ±0.00  0.050 ±0.000  12.5 ±0.5",
+    ]
+
+
+def test_data_sets_stand_together_and_a_failed_run_says_why(tmp_path):
+    write_run(tmp_path / "a" / "0", ["dataset=tum", "dataset.path=/far/away/desk", "keypoints=orb"], 0.01)
+    write_run(tmp_path / "a" / "1", ["dataset=tum", "dataset.path=/far/away/desk", "keypoints=none"], 0.001)
+    (tmp_path / "a" / "1" / "job.json").write_text(json.dumps({"state": "failed", "error": "tum: no such folder"}))
+    write_run(tmp_path / "b" / "0", ["dataset=tum", "dataset.path=/far/away/door", "keypoints=orb"], 0.02)
+    lines = as_text(rows_of(read_runs(tmp_path / "a") + read_runs(tmp_path / "b"))).splitlines()
+    assert [line.split()[:3] for line in lines[1:]] == [
+        ["dataset.path=desk", "keypoints=orb", "1"],
+        ["dataset.path=desk", "keypoints=none", "1"],
+        ["dataset.path=door", "keypoints=orb", "1"],
+    ]
+    assert lines[2].split()[3:] == ["-"] * 5 + ["tum:", "no", "such", "folder"]
+
+
+def written(tmp_path):
+    """Two seeds of two graphs; the baseline is 1 and 3 mm worse."""
+    runs = [("structural", 0, 2, 1), ("structural", 1, 4, 1), ("points", 0, 3, 1), ("points", 1, 7, 1), ("direct", 0, 1, 0.3)]
+    for i, (graph, seed, ate, share) in enumerate(runs):
+        write_run(tmp_path / str(i), [f"graph={graph}", f"seed={seed}"], 1e-3 * ate, share=share)
+    return read_runs(tmp_path)
+
+
+def test_differences_are_paired_and_have_an_interval(tmp_path):
+    rows = rows_of(written(tmp_path), baseline="graph=points")
+    found = rows[0]["difference"]["ATE mm"]
+    half = 12.706 * np.sqrt(2.0) / np.sqrt(2.0)  # Student's t for one degree of freedom; differences -1 and -3
+    assert found["mean"] == pytest.approx(-2.0) and found["pairs"] == 2
+    assert (found["low"], found["high"]) == (pytest.approx(-2.0 - half, abs=1e-3), pytest.approx(-2.0 + half, abs=1e-3))
+    assert rows[1]["difference"] == {} and rows[2]["difference"]["ATE mm"]["low"] is None
+    with pytest.raises(UsageError, match="did you mean 'graph=points'"):
+        rows_of(written(tmp_path / "again"), baseline="graph=point")
+
+
+def test_the_best_is_bold_and_an_error_over_few_frames_is_not(tmp_path):
+    rows = rows_of(written(tmp_path))
+    assert as_markdown(rows).splitlines()[2].split(" | ")[2:4] == ["**100.0 ±0.0**", "**3.00 ±1.00**"]
+    assert "| 30.0 | 1.00 |" in as_markdown(rows).splitlines()[4]
+    assert r"graph=structural & 2 & \textbf{100.0 $\pm$0.0} & \textbf{3.00 $\pm$1.00}" in as_latex(rows)
+    assert "\033[1m3.00 ±1.00\033[0m" in as_text(rows, bold=True) and "\033" not in as_text(rows, bold=False)
+
+
+def test_files_hold_the_figures(tmp_path):
+    written(tmp_path / "runs")
+    files = {name: tmp_path / f"table.{name}" for name in WRITERS}
+    assert main(["compare", str(tmp_path / "runs"), *(word for name, file in files.items() for word in (f"--{name}", str(file)))]) == 0
+    assert json.loads(files["json"].read_text())[0]["figures"]["ATE mm"] == {"median": 3.0, "min": 2.0, "max": 4.0, "runs": 2}
+    table = list(csv.DictReader(files["csv"].open()))
+    assert [(row["change"], row["ATE mm median"]) for row in table] == [("graph=structural", "3.0"), ("graph=points", "5.0"), ("graph=direct", "1.0")]
+
+
+def test_a_sweep_ends_with_the_table(tmp_path, capsys):
+    sweep = ["run", "-m", "experiment=leave_one_out", "without=nothing,planes", *SMALL, f"out={tmp_path / 'sweep'}"]
+    assert main(sweep) == 0
+    said = capsys.readouterr().out
+    assert "\nchange " in said and "\nwithout=nothing " in said and "\nwithout=planes " in said
+
+
+def test_a_folder_without_runs(tmp_path, capsys):
+    assert main(["compare", str(tmp_path)]) == 1
+    cure = "give the out=FOLDER of a sweep, for example of: trihedron run -m experiment=leave_one_out"
+    assert capsys.readouterr().err == f"trihedron: {tmp_path}: holds no runs; {cure}\n"
+
+
+def composed(*overrides):
+    load_plugins()
+    register_configs()
+    with initialize_config_module("trihedron.conf", version_base="1.3"):
+        return graph_of(compose("root", overrides=list(overrides)))
+
+
+@pytest.mark.parametrize("graph", ["points", "points_lines", "points_planes"])
+def test_graphs_without_a_manhattan_frame_do_not_look_for_one(graph):
+    stages = composed(f"graph={graph}").stages
+    assert "manhattan" not in stages and stages["loop"].plugin.straighten == 0
+    assert type(stages["rotation"].plugin).__name__ == "Procrustes"
+    kinds = {slot: type(stages[slot].plugin).__name__.startswith("No") for slot in ("keypoints", "lines", "planes") if slot in stages}
+    assert kinds == {"keypoints": False, "lines": graph != "points_lines", "planes": graph != "points_planes"}
+
+
+def test_what_is_left_out_is_not_run():
+    assert "manhattan" not in composed("without=manhattan").stages
+    assert composed("without=manhattan").stages["loop"].plugin.straighten == 0
+    assert composed("without=relations").stages["matches"].plugin.relations == 0
+    assert type(composed("without=lines").stages["lines"].plugin).__name__ == "NoLines"
+    assert set(composed("without=nothing").stages) == set(composed().stages)

@@ -1,0 +1,204 @@
+"""The runs of sweeps, and single runs, as one table: what each one changed, what it tracked, its errors, its time and its memory.
+
+A row is what a run's overrides say that those of the others do not; runs that differ in their seed alone share a row, as median ± half the distance
+from the smallest to the largest. Rows of one data set stand together; the best of each column is bold, errors only among rows that tracked almost
+as much as the best. `end to start` is where a run without ground truth ends, seen from where it began: the drift of a walk that returns.
+`--baseline` adds the mean paired difference (same data, same seeds) with its 95 % interval by Student's t, per row and over all data. A job that
+failed, or has no errors, has a row that says why.
+
+Example: trihedron compare runs/table --baseline graph=points --markdown table.md
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+
+from trihedron.pipeline.errors import DataError, UsageError, did_you_mean
+from trihedron.tools import comparison_table as render
+from trihedron.tools.arguments import Parser
+from trihedron.tools.comparison_table import FIGURES
+
+SEEDS = ("seed", "dataset.seed")
+NOT_SHOWN = ("out", "report", "experiment", "sequences", *SEEDS)
+CONFIDENCE = 0.95
+SURFACE, SURFACE_FIGURES = "surface.ply", "surface.json"
+
+
+@dataclass(frozen=True)
+class Run:
+    """One run: its folder, its overrides (key -> value), its figures by column, NaN where there is none, and why, if it has to be said."""
+
+    folder: Path
+    overrides: dict[str, str]
+    figures: dict[str, float]
+    note: str = ""
+
+    @property
+    def seeds(self) -> tuple[str, ...]:
+        """What makes it a repeat of another run, and pairs it with one of the baseline."""
+        return tuple(self.overrides.get(key, "") for key in SEEDS)
+
+
+def main(argv: list[str]) -> int:
+    """Print the table; returns the exit code. Raises DataError when there are no runs, UsageError for an unknown baseline."""
+    parser = Parser("compare", __name__)
+    parser.add_argument("folders", nargs="+", type=Path, metavar="FOLDER", help="of sweeps, or of single runs")
+    parser.add_argument("--baseline", default="", metavar="CHANGE", help="the row, for example graph=points, the others are compared with")
+    parser.add_argument("--surfaces", action="store_true", help="judge each surface.ply that was not yet (as evaluate-surface does)")
+    for name in render.WRITERS:
+        parser.add_argument(f"--{name}", type=Path, metavar="FILE", help="write the table there too")
+    options = parser.parse_args(argv)
+    if options.surfaces:
+        _judge_surfaces(options.folders)
+    rows = rows_of([run for folder in options.folders for run in read_runs(folder)], options.baseline)
+    print(render.as_text(rows))
+    for name, write in render.WRITERS.items():
+        if getattr(options, name):
+            getattr(options, name).write_text(write(rows))
+    return 0
+
+
+def run_folders(folder: Path) -> list[Path]:
+    """The run folders in a folder, itself or the jobs of a sweep, by job number. Raises DataError when it holds none."""
+    files = [*folder.glob(".hydra/overrides.yaml"), *folder.glob("*/.hydra/overrides.yaml")]
+    if not files:
+        raise DataError(str(folder), "holds no runs", "give the out=FOLDER of a sweep, for example of: trihedron run -m experiment=leave_one_out")
+    return [file.parent.parent for file in sorted(files, key=lambda f: (len(str(f)), str(f)))]
+
+
+def read_runs(folder: Path) -> list[Run]:
+    """The runs in a folder. Raises DataError when it holds none."""
+    return [_run(found) for found in run_folders(folder)]
+
+
+def _run(folder: Path) -> Run:
+    overrides = dict(text.lstrip("+~").partition("=")[::2] for text in yaml.safe_load((folder / ".hydra" / "overrides.yaml").read_text()))
+    metrics, timing, job = _read(folder / "metrics.json"), _read(folder / "timing.json"), _read(folder / "job.json")
+    if job.get("state", "done") != "done":
+        return Run(folder, overrides, dict.fromkeys(FIGURES, np.nan), str(job.get("error") or "was stopped before its end"))
+    known = _known(metrics, timing, _read(folder / SURFACE_FIGURES))
+    figures = {name: np.nan if known.get(name) is None else figure.factor * float(known[name]) for name, figure in FIGURES.items()}
+    return Run(folder, overrides, figures, str(metrics.get("note", "")) if metrics or timing else "holds no results")
+
+
+def _known(metrics: dict[str, Any], timing: dict[str, Any], surface: dict[str, Any]) -> dict[str, Any]:
+    """Every figure a run's files have, by column, in SI units; too short a run has no RPE over a second, and few have a surface."""
+    final, frame, mesh = metrics.get("final") or {}, timing.get("frame_ms", {}), surface.get("parts", {}).get("all", {})
+    status = metrics.get("status", {})
+    tracked = sum(status.get(name, 0) for name in ("ok", "degraded")) / metrics["frames"] if status and metrics.get("frames") else None
+    return {
+        "tracked %": final.get("tracked_share", tracked),
+        "ATE mm": final.get("ate_rmse_m"),
+        "RPE 1 s mm": final.get("rpe_second_rmse_m"),
+        "RPE 1 s deg": final.get("rpe_second_rmse_deg"),
+        "end to start mm": None if final else metrics.get("start_to_end_m"),
+        "surface mm": mesh.get("mean_m"),
+        "within 5 cm %": mesh.get("within_5_cm"),
+        "p50 ms": frame.get("p50"),
+        "p95 ms": frame.get("p95"),
+        "memory MB": timing.get("peak_memory_mb"),
+    }
+
+
+def _read(file: Path) -> dict[str, Any]:
+    found: dict[str, Any] = json.loads(file.read_text()) if file.exists() else {}
+    return found
+
+
+def _judge_surfaces(folders: Sequence[Path]) -> None:
+    """Write surface.json beside each surface.ply that has none; one that cannot be judged is said, and left out."""
+    from trihedron.tools.evaluate_surface import evaluate_files
+
+    for folder in (run for given in folders for run in run_folders(given)):
+        if (folder / SURFACE).exists() and not (folder / SURFACE_FIGURES).exists():
+            try:
+                figures = evaluate_files(folder / SURFACE, folder / "run.mcap")
+            except DataError as error:
+                print(f"not judged: {error}")
+                continue
+            (folder / SURFACE_FIGURES).write_text(json.dumps(figures, indent=2) + "\n")
+
+
+def rows_of(runs: Sequence[Run], baseline: str = "") -> list[dict[str, Any]]:
+    """One row for each data set and change: `data`, `change`, `runs`, `note`, of each figure's runs median, smallest and largest, and with a baseline
+    the paired `difference` of each figure. Then, if there are several data sets, the differences over all of them, `data` = "all"."""
+    keys = {key for run in runs for key in run.overrides if key not in NOT_SHOWN}
+    varying = sorted(key for key in keys if len({run.overrides.get(key) for run in runs}) > 1)
+    groups: dict[tuple[str, str], list[Run]] = {}
+    for run in runs:
+        groups.setdefault((_said(run, [k for k in varying if _of_data(k)]), _said(run, [k for k in varying if not _of_data(k)])), []).append(run)
+    order = list(dict.fromkeys(data for data, _ in groups))
+    groups = dict(sorted(groups.items(), key=lambda group: order.index(group[0][0])))
+    _check_baseline(baseline, [change for _, change in groups])
+    rows = [_row(data, change, same, groups.get((data, baseline)) if change != baseline else None) for (data, change), same in groups.items()]
+    if baseline and len(order) > 1:
+        for other in dict.fromkeys(change for _, change in groups if change != baseline):
+            pairs = [pair for data in order for pair in _pairs(groups.get((data, other), []), groups.get((data, baseline), []))]
+            rows.append({"data": "all", "change": other, "runs": len(pairs), "figures": {}, "note": "", "difference": _differences(pairs)})
+    return rows
+
+
+def _row(data: str, change: str, same: Sequence[Run], base: Sequence[Run] | None) -> dict[str, Any]:
+    figures = {}
+    for name in FIGURES:
+        values = [run.figures[name] for run in same if np.isfinite(run.figures[name])]
+        if values:
+            figures[name] = {"median": float(np.median(values)), "min": min(values), "max": max(values), "runs": len(values)}
+    notes = dict.fromkeys(run.note for run in same if run.note)
+    return {
+        "data": data,
+        "change": change,
+        "runs": len(same),
+        "figures": figures,
+        "note": "; ".join(notes),
+        "difference": _differences(_pairs(same, base or [])),
+    }
+
+
+def _pairs(runs: Sequence[Run], base: Sequence[Run]) -> list[tuple[Run, Run]]:
+    """Runs with those of the baseline that have the same seeds."""
+    by_seeds = {run.seeds: run for run in base}
+    return [(run, by_seeds[run.seeds]) for run in runs if run.seeds in by_seeds]
+
+
+def _differences(pairs: Sequence[tuple[Run, Run]]) -> dict[str, dict[str, Any]]:
+    """Column -> mean difference, the ends of its confidence interval (None for a single pair) and the number of pairs."""
+    out = {}
+    for name in FIGURES:
+        differences = np.array([run.figures[name] - base.figures[name] for run, base in pairs])
+        differences = differences[np.isfinite(differences)]
+        if len(differences):
+            mean, half = float(differences.mean()), half_interval(differences)
+            low, high = (None, None) if half is None else (mean - half, mean + half)
+            out[name] = {"mean": mean, "low": low, "high": high, "pairs": len(differences)}
+    return out
+
+
+def half_interval(values: Any) -> float | None:
+    """Half the width of the confidence interval of the mean of values (n,), by Student's t; None for fewer than two."""
+    from scipy.stats import t
+
+    if len(values) < 2:
+        return None
+    return float(t.ppf(0.5 + 0.5 * CONFIDENCE, len(values) - 1) * np.std(values, ddof=1) / np.sqrt(len(values)))
+
+
+def _check_baseline(baseline: str, changes: Sequence[str]) -> None:
+    if baseline and baseline not in changes:
+        raise UsageError("--baseline", f"no row is '{baseline}'", did_you_mean(baseline, {change for change in changes if change}))
+
+
+def _of_data(key: str) -> bool:
+    return key.partition(".")[0] == "dataset"
+
+
+def _said(run: Run, keys: Sequence[str]) -> str:
+    """What a run's overrides say of these keys; of a path its last part."""
+    return " ".join(f"{key}={Path(run.overrides[key]).name}" for key in keys if run.overrides.get(key, "null") != "null")

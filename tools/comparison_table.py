@@ -1,0 +1,156 @@
+"""The rows of `trihedron compare` as text, Markdown, LaTeX, CSV and JSON."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+import sys
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+Row = dict[str, Any]
+TRACKED, COMPARED = "tracked %", "ATE mm"
+TRACKED_SLACK = 5.0  # percent of the frames: an error over fewer of them is no better
+LATEX = {"%": r"\%", "&": r"\&", "_": r"\_", "#": r"\#", "±": r"$\pm$", "°": r"$^\circ$"}
+
+
+@dataclass(frozen=True)
+class Figure:
+    """A column: what a value in SI units (or ms) is multiplied with, its decimals, and whether more is better."""
+
+    factor: float
+    decimals: int
+    more: bool = False
+    error: bool = False  # means nothing over a part of the frames
+
+
+FIGURES = {
+    TRACKED: Figure(100.0, 1, more=True),
+    COMPARED: Figure(1e3, 2, error=True),
+    "RPE 1 s mm": Figure(1e3, 2, error=True),
+    "RPE 1 s deg": Figure(1.0, 3, error=True),
+    "end to start mm": Figure(1e3, 1, error=True),
+    "surface mm": Figure(1e3, 2, error=True),
+    "within 5 cm %": Figure(100.0, 1, more=True),
+    "p50 ms": Figure(1.0, 1),
+    "p95 ms": Figure(1.0, 1),
+    "memory MB": Figure(1.0, 0),
+}
+
+
+@dataclass(frozen=True)
+class Cell:
+    """A text, and whether it is the best of its column."""
+
+    text: str
+    best: bool = False
+
+
+def cells_of(rows: Sequence[Row]) -> tuple[list[str], list[list[Cell]]]:
+    """Header and cells; columns in which no row has anything are left out."""
+    shown = [name for name in FIGURES if any(name in row["figures"] for row in rows)]
+    data, compared, notes = len({row["data"] for row in rows}) > 1, any(row["difference"] for row in rows), any(row["note"] for row in rows)
+    header = [*(["data"] if data else []), "change", "runs", *shown, *([f"{COMPARED} - baseline"] if compared else []), *(["note"] if notes else [])]
+    best = {(row["data"], name): _best([other for other in rows if other["data"] == row["data"]], name) for row in rows for name in shown}
+    cells = []
+    for row in rows:
+        line = [*([Cell(row["data"] or "-")] if data else []), Cell(row["change"] or "-"), Cell(str(row["runs"]))]
+        line += [_cell(row, name, best[row["data"], name]) for name in shown]
+        line += [Cell(_difference(row["difference"].get(COMPARED)))] if compared else []
+        cells.append([*line, Cell(row["note"])] if notes else line)
+    return header, cells
+
+
+def _best(rows: Sequence[Row], name: str) -> str | None:
+    """What the best of a column prints; None when fewer than two rows compete."""
+    figure = FIGURES[name]
+    competing = [row for row in rows if name in row["figures"]]
+    if figure.error:
+        most = max((row["figures"].get(TRACKED, {"median": 0.0})["median"] for row in competing), default=0.0)
+        competing = [row for row in competing if _tracked(row) >= most - TRACKED_SLACK]
+    medians = [row["figures"][name]["median"] for row in competing]
+    return f"{max(medians) if figure.more else min(medians):.{figure.decimals}f}" if len(medians) > 1 else None
+
+
+def _tracked(row: Row) -> float:
+    return float(row["figures"].get(TRACKED, {"median": 0.0})["median"])
+
+
+def _cell(row: Row, name: str, best: str | None) -> Cell:
+    if name not in row["figures"]:
+        return Cell("-")
+    found, figure = row["figures"][name], FIGURES[name]
+    text = f"{found['median']:.{figure.decimals}f}"
+    spread = f" ±{0.5 * (found['max'] - found['min']):.{figure.decimals}f}" if found["runs"] > 1 else ""
+    return Cell(text + spread, text == best)
+
+
+def _difference(found: dict[str, Any] | None) -> str:
+    if found is None:
+        return "-"
+    decimals = FIGURES[COMPARED].decimals
+    interval = "" if found["low"] is None else f" [{found['low']:+.{decimals}f}, {found['high']:+.{decimals}f}]"
+    return f"{found['mean']:+.{decimals}f}{interval}"
+
+
+def as_text(rows: Sequence[Row], bold: bool | None = None) -> str:
+    """Aligned columns; the best are bold on a terminal."""
+    header, cells = cells_of(rows)
+    bold = sys.stdout.isatty() if bold is None else bold
+    widths = [max(len(line[i]) for line in [header, *([cell.text for cell in row] for row in cells)]) for i in range(len(header))]
+    left = {i for i, name in enumerate(header) if name in ("data", "change", "note")}
+    lines = ["  ".join(_aligned(name, w, i in left) for i, (name, w) in enumerate(zip(header, widths))).rstrip()]
+    for row in cells:
+        padded = [_aligned(cell.text, w, i in left) for i, (cell, w) in enumerate(zip(row, widths))]
+        lines.append("  ".join(f"\033[1m{text}\033[0m" if cell.best and bold else text for cell, text in zip(row, padded)).rstrip())
+    return "\n".join(lines)
+
+
+def _aligned(text: str, width: int, left: bool) -> str:
+    return text.ljust(width) if left else text.rjust(width)
+
+
+def as_markdown(rows: Sequence[Row]) -> str:
+    """A table of Markdown, best in bold."""
+    header, cells = cells_of(rows)
+    rule = [":--" if name in ("data", "change", "note") else "--:" for name in header]
+    lines = [header, rule, *([f"**{cell.text}**" if cell.best else cell.text.replace("|", "\\|") for cell in row] for row in cells)]
+    return "".join("| " + " | ".join(line) + " |\n" for line in lines)
+
+
+def as_latex(rows: Sequence[Row]) -> str:
+    """A tabular of LaTeX, best in bold."""
+    header, cells = cells_of(rows)
+    columns = "".join("l" if name in ("data", "change", "note") else "r" for name in header)
+    body = [[_escaped(name) for name in header], *([rf"\textbf{{{_escaped(c.text)}}}" if c.best else _escaped(c.text) for c in row] for row in cells)]
+    lines = [" & ".join(line) + r" \\" for line in body]
+    return "\n".join([rf"\begin{{tabular}}{{{columns}}}", r"\hline", lines[0], r"\hline", *lines[1:], r"\hline", r"\end{tabular}", ""])
+
+
+def _escaped(text: str) -> str:
+    return "".join(LATEX.get(letter, letter) for letter in text)
+
+
+def as_csv(rows: Sequence[Row]) -> str:
+    """A line for each row: median, smallest and largest of each figure, and the differences with their intervals."""
+    out = io.StringIO()
+    writer = csv.writer(out, lineterminator="\n")
+    writer.writerow(
+        ["data", "change", "runs", "note", *(f"{name} {part}" for name in FIGURES for part in ("median", "min", "max"))]
+        + [f"{name} - baseline {part}" for name in FIGURES for part in ("mean", "low", "high")]
+    )
+    for row in rows:
+        figures = [row["figures"].get(name, {}).get(part, "") for name in FIGURES for part in ("median", "min", "max")]
+        differences = [row["difference"].get(name, {}).get(part) for name in FIGURES for part in ("mean", "low", "high")]
+        writer.writerow([row["data"], row["change"], row["runs"], row["note"], *figures, *("" if value is None else value for value in differences)])
+    return out.getvalue()
+
+
+def as_json(rows: Sequence[Row]) -> str:
+    """The rows as they are."""
+    return json.dumps(list(rows), indent=2) + "\n"
+
+
+WRITERS: dict[str, Callable[[Sequence[Row]], str]] = {"csv": as_csv, "markdown": as_markdown, "latex": as_latex, "json": as_json}
