@@ -69,7 +69,7 @@ MISTAKES = [  # words of the command, exit code, what is said after "trihedron: 
     ("picture small/run.mcap --frame x", 2, "picture: argument --frame: invalid int value: 'x'; see trihedron picture --help"),
     ("calibrate junk.mcap", 1, f"junk.mcap: {MCAP}"),
     ("benchmark map --parts nothing", 2, "benchmark map: there is no part 'nothing'; known: cover, growth, loop"),
-    ("benchmark runs empty", 1,
+    ("compare empty", 1,
      "empty: holds no runs; give the out=FOLDER of a sweep, for example of: trihedron run -m experiment=leave_one_out"),
     ("rum", 2, "rum: there is no such command; did you mean 'run'?"),
 ]  # fmt: skip
