@@ -11,8 +11,9 @@ from hypothesis import strategies as st
 from trihedron.pipeline import geometry as g
 from trihedron.plugins.numerics.bundle import bundle_terms
 from trihedron.plugins.numerics.bundle.bundle_kernel import line_basis
-from trihedron.plugins.numerics.motion import pose_terms, relative_motion
-from trihedron.plugins.numerics.motion.pose_solver import PlaneTerms, PointTerms, solve_pose
+from trihedron.plugins.numerics.motion import pose_kernel, pose_terms, relative_motion
+from trihedron.plugins.numerics.motion.pose_noise import Weights
+from trihedron.plugins.numerics.motion.pose_solver import NO_LINES, NO_PLANES, PlaneTerms, PointTerms, solve_pose
 from trihedron.plugins.numerics.motion.pose_terms import PARALLEL, PERPENDICULAR, SAME
 from trihedron.plugins.numerics.places import pose_graph
 
@@ -75,25 +76,32 @@ def test_a_motion_and_its_inverse_and_quaternions(rng, angle, scale_m):
 @MANY
 @given(numbers, angles, scales_m, st.booleans())
 def test_a_point_s_derivatives(rng, angle, scale_m, with_depth):
-    """By pose, and by the point itself (bundle adjustment), at depths from 10 cm to a kilometre."""
+    """By the pose, at depths from 10 cm to a kilometre; and the normal equations of tracking, which are written out, are those of them."""
     T, depth = pose(rng, angle, scale_m), max(scale_m, 0.1)
     local = np.array([0.3, -0.4, 1.0]) * depth * rng.uniform(0.7, 1.4)
     world, pixel, seen = g.transform(T, local), np.array([300.0, 200.0]), depth if with_depth else np.nan
-    out = np.empty(3), np.empty((3, 6)), np.empty((3, 3)), np.empty((3, 3)), np.empty(3)
-
-    def residual(T, world):
-        assert bundle_terms.point_term(*parts(T), world, pixel, seen, INTRINSICS, *out)
-        return out[0].copy()
-
-    residual(T, world)
-    J_pose, J_point = out[1].copy(), out[2].copy()
-    step = np.array([depth, depth, depth, 1.0, 1.0, 1.0])
-    assert agree(J_pose * step, numeric(lambda d: residual(T @ g.exp_se3(step * d), world), 6), 1e3)
-    assert agree(J_point * depth, numeric(lambda d: residual(T, world + depth * d), 3), 1e3)
     r, D, J = np.empty(3), np.empty((3, 3)), np.empty((3, 6))
-    assert pose_terms.point_rows(g.transform(g.invert(T), world), pixel, seen, INTRINSICS, r, D)
+
+    def residual(T):
+        assert pose_terms.point_rows(g.transform(g.invert(T), world), pixel, seen, INTRINSICS, r, D)
+        return r.copy()
+
+    residual(T)
     pose_terms.chain_point(D, 3, g.transform(g.invert(T), world), J)
-    assert np.allclose(J, J_pose, rtol=1e-6, atol=1e-6) and np.allclose(r, out[0], atol=1e-5)  # tracking and adjustment mean the same residual
+    step = np.array([depth, depth, depth, 1.0, 1.0, 1.0])
+    assert agree(J * step, numeric(lambda d: residual(T @ g.exp_se3(step * d)), 6), 1e3)
+    W = np.diag([1.0, 0.7, depth**2 if with_depth else 0.0])
+    W[0, 1] = W[1, 0] = 0.2
+    one, none = np.ones(1), (np.empty((0, 2, 2)), np.empty((0, 2, 2)), np.empty((0, 3, 3)))
+    terms = PointTerms(world[None], np.zeros((1, 3, 3)), pixel[None], np.array([seen]), one, one)
+    flags = pose_kernel.Flags(np.full(1, pose_kernel.INLIER, np.uint8), np.empty(0, np.uint8), np.empty(0, np.uint8))
+    H, gradient, chi2 = np.empty((6, 6)), np.empty(6), pose_kernel.Chi2(np.empty(1), np.empty(0), np.empty(0), np.empty(0))
+    weights = Weights(W[None], *none)
+    pose_kernel.linearise(*parts(T), INTRINSICS, terms, NO_LINES, NO_PLANES, weights, flags, False, H, gradient, chi2)
+    wanted = residual(T)
+    assert chi2.points[0] == pytest.approx(wanted @ W @ wanted, rel=1e-6)
+    assert np.allclose(np.tril(H * np.outer(step, step)), np.tril((J * step).T @ W @ (J * step)), rtol=1e-6, atol=1.0)
+    assert np.allclose(gradient * step, (J * step).T @ W @ wanted, rtol=1e-6, atol=1e-2)
 
 
 @MANY
@@ -159,8 +167,7 @@ def test_the_gradient_of_the_motion_between_two_frames(rng, angle, scale_m):
     relative_motion._normal_equations(terms, R, t, 1e30, H, gradient)
 
     def cost(d):
-        places, planes, _ = relative_motion._residuals(terms, np.ascontiguousarray(g.exp_so3(d[:3]) @ R), t + scale_m * d[3:])
-        return np.array([0.5 * (places.sum() + planes.sum())])
+        return np.array([0.5 * relative_motion._residuals(terms, np.ascontiguousarray(g.exp_so3(d[:3]) @ R), t + scale_m * d[3:]).sum()])
 
     step = np.repeat([1.0, scale_m], 3)
     assert agree(gradient * step, numeric(cost, 6)[0], 1e2)
