@@ -4,21 +4,17 @@ import contextlib
 import os
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 
 from trihedron.pipeline.cli import main
-from trihedron.pipeline.recording import Recording
+
+sys.path.insert(0, str(Path(__file__).parent / "pipeline"))
+from toys import contents
 
 SMALL = ["dataset.width=160", "dataset.height=120", "outputs=[trajectory,surface]"]
 RUN = "import sys; from trihedron.pipeline.cli import main; sys.exit(main(['run', *sys.argv[1:]]))"
-
-
-def contents(file):
-    """channel -> its messages in order: time and bytes."""
-    recording = Recording(file)
-    channels = [channel for channel in recording.channels if channel != "/timing"]
-    return {channel: [(message.log_time, message.data) for message in recording.messages(channel)] for channel in channels}
 
 
 @contextlib.contextmanager
