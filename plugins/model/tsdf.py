@@ -42,4 +42,4 @@ class TsdfModel:
         table, seen = fused(table, depth, camera, self.voxel_m, self.truncation_m, self.most)
         shown = cast(seen, camera, depth, self.voxel_m, self.truncation_m)
         T = np.array(pose.T_world_camera)
-        return PredictedView(frame.index, frame.stamp_ns, T, shown, depth_normals(smoothed(shown, 2), lens, 3), np.zeros_like(color), table)
+        return PredictedView(frame.index, frame.stamp_ns, T, shown, depth_normals(smoothed(shown, 3), lens, 4), np.zeros_like(color), table)

@@ -64,6 +64,6 @@ class Icp:
         out = []
         for i, (now, view) in enumerate(zip(pyramid(frame, width, self.levels), views)):
             stride = max(1, round((now.gray.size / self.most) ** 0.5))
-            source = source_of(now, noise, stride, depth_normals(smoothed(now.depth_m, 2), now.lens, 3))
+            source = source_of(now, noise, stride, depth_normals(smoothed(now.depth_m, 3), now.lens, 4))
             out.append((source, target_of(view, 3, np.array(model.normals) if i == 0 else None), self.iterations))
         return out[::-1]

@@ -85,7 +85,7 @@ def _cast(
             dx = (R[0, 0] * x + R[1, 0] * y + R[2, 0]) / voxel
             dy = (R[0, 1] * x + R[1, 1] * y + R[2, 1]) / voxel
             dz = (R[0, 2] * x + R[1, 2] * y + R[2, 2]) / voxel
-            before, last, block, u, v, w = False, 0.0, -2, 0, 0, 0
+            before, last, nearest, block, u, v, w = False, 0.0, 0.0, -2, 0, 0, 0
             while z <= far:
                 p, q, s = int(np.floor(dx * z + t[0] + 0.5)), int(np.floor(dy * z + t[1] + 0.5)), int(np.floor(dz * z + t[2] + 0.5))
                 if block == -2 or p >> 3 != u or q >> 3 != v or s >> 3 != w:
@@ -101,10 +101,12 @@ def _cast(
                     if before:
                         first = _between(keys, numbers, distance, weight, dx * last + t[0], dy * last + t[1], dz * last + t[2])
                         second = _between(keys, numbers, distance, weight, dx * z + t[0], dy * z + t[1], dz * z + t[2])
+                        if np.isnan(first) or np.isnan(second):  # at the rim of what is known: through the nearest voxels
+                            first, second = nearest, value
                         if first > second:
                             out[r, c] = last + (z - last) * min(max(first / (first - second), -1.0), 2.0)
                     break
                 if known:
-                    before, last = True, z
+                    before, last, nearest = True, z, value
                 z += max(0.8 * value * truncation, voxel) / length if known else voxel / length
     return out
