@@ -1,0 +1,179 @@
+"""Write one page of HTML about some runs: trajectories and surface in 3D, errors over time, times of the stages, what the configurations differ in,
+and a frame of each run with its features, planes and axes.
+
+The page needs no network: everything, the drawing library too, is in the file. FOLDER is a run, or a sweep.
+
+Example: trihedron report runs/a runs/b --out report.html
+"""
+
+from __future__ import annotations
+
+import base64
+import html
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from trihedron.datasets.trajectories import attached_truth, read_trajectory
+from trihedron.pipeline.errors import DataError, TrihedronError
+from trihedron.pipeline.geometry import transform, umeyama
+from trihedron.pipeline.metrics import aligned_errors, associate
+from trihedron.pipeline.recording import Recording
+from trihedron.pipeline.types import Trajectory
+from trihedron.tools import comparison_table
+from trihedron.tools.arguments import Parser
+from trihedron.tools.compare import SURFACE, Run, read_runs, rows_of
+
+MOST_PICTURES = 12  # a page of a large sweep would be too big to open
+MOST_TRIANGLES = 60_000
+STYLE = "body{font:15px sans-serif;margin:2em auto;max-width:1100px}td,th{padding:2px 8px;text-align:right}img{width:100%}"
+
+
+def main(argv: list[str]) -> int:
+    """Write the page and say where; returns the exit code. Raises DataError when there are no runs."""
+    parser = Parser("report", __name__)
+    parser.add_argument("folders", nargs="+", type=Path, metavar="FOLDER", help="of runs, or of a sweep")
+    parser.add_argument("--out", type=Path, default=Path("report.html"), metavar="FILE", help="default report.html")
+    options = parser.parse_args(argv)
+    runs = [run for folder in options.folders for run in read_runs(folder)]
+    options.out.write_text(page(runs), encoding="utf-8")
+    print(options.out)
+    return 0
+
+
+def page(runs: Sequence[Run]) -> str:
+    """The whole page. Raises DataError when no run has a trajectory."""
+    from plotly.offline import get_plotlyjs
+
+    drawn = {name: run for name, run in zip(_names(runs), runs) if (run.folder / "run.mcap").exists() and (run.folder / "trajectory.txt").exists()}
+    if not drawn:
+        raise DataError(str(runs[0].folder), "none of the runs has a trajectory", "run with outputs=[trajectory]")
+    paths, errors = _trajectories(drawn)
+    figures = {
+        "Trajectories and surface": (paths + _surface(drawn), {"scene": {"aspectmode": "data"}, "height": 600}),
+        "Position error over time": (errors, {"xaxis": {"title": {"text": "s"}}, "yaxis": {"title": {"text": "mm"}}, "height": 350}),
+        "Stages, median time": (_stages(drawn), {"barmode": "group", "yaxis": {"title": {"text": "ms"}}, "height": 350}),
+    }
+    body = [f"<h2>{title}</h2>{_figure(number, *figure)}" for number, (title, figure) in enumerate(figures.items()) if figure[0]]
+    parts = ["<h1>Trihedron</h1>", _table(runs), *body, "<h2>Configurations</h2>", _configurations(drawn), "<h2>Frames</h2>", *_pictures(drawn)]
+    head = f"<meta charset='utf-8'><title>Trihedron</title><link rel='icon' href='data:,'><style>{STYLE}</style><script>{get_plotlyjs()}</script>"
+    return f"<!doctype html><html><head>{head}</head><body>{''.join(parts)}</body></html>\n"
+
+
+def _names(runs: Sequence[Run]) -> list[str]:
+    """The folders' names, with those above them where one is not enough."""
+    names = [run.folder.resolve().name for run in runs]
+    return names if len(set(names)) == len(names) else ["/".join(run.folder.resolve().parts[-2:]) for run in runs]
+
+
+def _figure(number: int, traces: list[dict[str, Any]], layout: dict[str, Any]) -> str:
+    text = json.dumps([traces, {**layout, "margin": {"l": 50, "r": 10, "t": 10, "b": 40}}]).replace("</", "<\\/")
+    return f"<div id='figure{number}'></div><script>Plotly.newPlot('figure{number}', ...{text})</script>"
+
+
+def _table(runs: Sequence[Run]) -> str:
+    header, cells = comparison_table.cells_of(rows_of(runs))
+    lines = ["".join(f"<th>{html.escape(name)}</th>" for name in header)]
+    for row in cells:
+        texts = [f"<b>{html.escape(cell.text)}</b>" if cell.best else html.escape(cell.text) for cell in row]
+        lines.append("".join(f"<td>{text}</td>" for text in texts))
+    return "<table>" + "".join(f"<tr>{line}</tr>" for line in lines) + "</table>"
+
+
+def _trajectories(runs: dict[str, Run]) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
+    """Paths in the world of the first run, with the truth where there is one, and errors in mm over seconds."""
+    paths, errors = [], []
+    for name, run in runs.items():
+        estimate, truth = read_trajectory(run.folder / "trajectory.txt"), _truth(run)
+        paths.append(_path(name, estimate.poses[:, :3, 3]))
+        pairs = associate(estimate.stamps_ns, truth.stamps_ns) if truth is not None else np.zeros((0, 2), np.int64)
+        if truth is None or len(pairs) < 3:
+            continue
+        poses, expected = estimate.poses[pairs[:, 0]], truth.poses[pairs[:, 1]]
+        if len(paths) == 1:
+            T_world_truth = umeyama(expected[:, :3, 3], poses[:, :3, 3])
+            paths.append(_path("ground truth", transform(T_world_truth, expected[:, :3, 3]), dash="dash"))
+        seconds = (estimate.stamps_ns[pairs[:, 0]] - estimate.stamps_ns[0]) / 1e9
+        errors.append({"type": "scatter", "name": name, "x": seconds.tolist(), "y": (1e3 * aligned_errors(poses, expected)).round(3).tolist()})
+    return paths, errors
+
+
+def _truth(run: Run) -> Trajectory | None:
+    recording = Recording(run.folder / "run.mcap")
+    return attached_truth(recording.attachments, str(recording.path))
+
+
+def _path(name: str, positions: Any, dash: str = "solid") -> dict[str, Any]:
+    x, y, z = np.round(positions, 4).T.tolist()
+    return {"type": "scatter3d", "mode": "lines", "name": name, "x": x, "y": y, "z": z, "line": {"width": 4, "dash": dash}}
+
+
+def _surface(runs: dict[str, Run]) -> list[dict[str, Any]]:
+    """The mesh of the first run that has one, thinned where it is large."""
+    from trihedron.tools.mesh_files import read_mesh
+
+    file = next((run.folder / SURFACE for run in runs.values() if (run.folder / SURFACE).exists()), None)
+    if file is None:
+        return []
+    vertices, triangles = read_mesh(file)
+    triangles = triangles[:: max(1, -(-len(triangles) // MOST_TRIANGLES))]
+    (x, y, z), (i, j, k) = np.round(vertices, 3).T.tolist(), triangles.T.tolist()
+    return [{"type": "mesh3d", "name": "surface", "x": x, "y": y, "z": z, "i": i, "j": j, "k": k, "opacity": 0.4, "color": "lightgray"}]
+
+
+def _stages(runs: dict[str, Run]) -> list[dict[str, Any]]:
+    traces = []
+    for name, run in runs.items():
+        stages = json.loads((run.folder / "timing.json").read_text())["stages"]
+        shown = {stage: found["p50_ms"] for stage, found in stages.items() if "p50_ms" in found}
+        traces.append({"type": "bar", "name": name, "x": list(shown), "y": list(shown.values())})
+    return traces
+
+
+def _configurations(runs: dict[str, Run]) -> str:
+    """The values of the composed configurations that are not the same in all runs."""
+    flat = {name: dict(_flat(_config(run))) for name, run in runs.items()}
+    keys = sorted({key for values in flat.values() for key in values})
+    differing = [key for key in keys if len({repr(values.get(key)) for values in flat.values()}) > 1 and key != "out"]
+    if not differing:
+        return "<p>All the same.</p>"
+    lines = ["<th></th>" + "".join(f"<th>{html.escape(name)}</th>" for name in flat)]
+    for key in differing:
+        lines.append(f"<td>{html.escape(key)}</td>" + "".join(f"<td>{html.escape(str(values.get(key, '-')))}</td>" for values in flat.values()))
+    return "<table>" + "".join(f"<tr>{line}</tr>" for line in lines) + "</table>"
+
+
+def _config(run: Run) -> Any:
+    import yaml
+
+    return yaml.safe_load((run.folder / ".hydra" / "config.yaml").read_text())
+
+
+def _flat(values: Any, prefix: str = "") -> list[tuple[str, Any]]:
+    """Nested dictionaries as pairs of dotted name and value."""
+    if not isinstance(values, dict):
+        return [(prefix, values)]
+    return [pair for name, value in values.items() for pair in _flat(value, f"{prefix}.{name}".lstrip("."))]
+
+
+def _pictures(runs: dict[str, Run]) -> list[str]:
+    """The middle frame of each run, as `trihedron picture` draws it."""
+    import tempfile
+
+    from trihedron.tools.picture import draw
+
+    parts = []
+    with tempfile.TemporaryDirectory() as folder:
+        for name, run in list(runs.items())[:MOST_PICTURES]:
+            file = Path(folder) / "picture.png"
+            try:
+                draw(str(run.folder / "run.mcap"), -1, file)
+            except TrihedronError as error:
+                parts.append(f"<p>{html.escape(str(error))}</p>")
+                continue
+            data = base64.b64encode(file.read_bytes()).decode()
+            parts.append(f"<figure><figcaption>{html.escape(name)}</figcaption><img src='data:image/png;base64,{data}'></figure>")
+    return parts
