@@ -23,7 +23,6 @@ class LocalMap(MapSearch):
     newest: int = 2  # keyframes always in the window
     covisible: int = 10  # keyframes that share most landmarks with those
     near: int = 3  # further keyframes taken from about here
-    relations: int = 0  # parallel and perpendicular partners of an observed plane (eq. 8): they change nothing once there is a map
     recognised: int = 8  # keyframes taken from about the place where a lost camera was recognised
 
     def __post_init__(self) -> None:

@@ -100,7 +100,7 @@ def test_every_rotation_is_one(room, name, data):
     before, now = two.seen(np.eye(4), 0, kinds), two.seen(two.camera, 1, kinds)
     first = called(
         plugin, manhattan=two.world.manhattan(np.eye(3), 0, two.rng) if draw("first", True, False) else None, tracks=None, keypoints=before[0],
-        segments=before[1], planes=before[2], previous=None, previous_pose=None, map=None,
+        segments=before[1], planes=before[2], previous=None, previous_pose=None, map=None, rng=np.random.default_rng(0),
     )  # fmt: skip
     check(first)
     share, what = draw("share", 0.0, 0.3, 1.0), draw("with", np.nan, np.inf, 0.0)
@@ -123,6 +123,6 @@ def test_every_rotation_is_one(room, name, data):
         keypoints=two.broken(now[0], share, what, "points_m", "sigma_m"),
         segments=two.broken(now[1], share, what, "endpoints_m", "covariance_m2"),
         planes=two.broken(now[2], share, draw("planes with", 0.0, 1.0), "covariance"),
-        previous=first if draw("previous", True, False) else None, previous_pose=pose, map=None,
+        previous=first if draw("previous", True, False) else None, previous_pose=pose, map=None, rng=np.random.default_rng(1),
     )  # fmt: skip
     check(found)

@@ -34,7 +34,7 @@ def refined(world, map, step=5, off=OFF, keep=tuple(KINDS), **changes):
     guess = camera_at(step) @ exp_se3(np.asarray(off, float))
     rotation, translation = rotation_of(guess, step, 0.5), translation_of(guess, step, sigma_m=0.03)
     features = world.features(camera_at(step), step)
-    matches = LocalMap(relations=3)(world.frame(step), rotation, translation, *features, map, None)
+    matches = LocalMap()(world.frame(step), rotation, translation, *features, map, None)
     if matches is not None:
         dropped = {name: getattr(matches, name)[:0] for kind, name in KINDS.items() if kind not in keep}
         if "planes" not in keep:
@@ -145,7 +145,7 @@ def test_matches_that_contradict_each_other_are_not_called_ok():
     world = World(noise=0.0)
     map = first_map(world)
     guess = camera_at(5) @ exp_se3(OFF)
-    matches = LocalMap(relations=3)(world.frame(5), rotation_of(guess, 5), translation_of(guess, 5), *world.features(camera_at(5), 5), map, None)
+    matches = LocalMap()(world.frame(5), rotation_of(guess, 5), translation_of(guess, 5), *world.features(camera_at(5), 5), map, None)
     pairs = matches.keypoints.copy()
     pairs[:, 1] = np.random.default_rng(0).permutation(pairs[:, 1])
     none = matches.planes[:0]
@@ -159,7 +159,7 @@ def test_a_rotation_that_was_not_measured_needs_the_map():
     world = World(noise=0.0)
     map, features = first_map(world), world.features(camera_at(5), 5)
     guess = camera_at(5) @ exp_se3(OFF)
-    matches = LocalMap(relations=3)(world.frame(5), rotation_of(guess, 5), translation_of(guess, 5), *features, map, None)
+    matches = LocalMap()(world.frame(5), rotation_of(guess, 5), translation_of(guess, 5), *features, map, None)
     pairs, none = matches.keypoints.copy(), matches.planes[:0]
     pairs[:, 1] = np.random.default_rng(0).permutation(pairs[:, 1])
     wrong = dataclasses.replace(matches, keypoints=pairs, segments=none, planes=none, parallel=none, perpendicular=none)
@@ -175,7 +175,7 @@ def test_a_corridor_keeps_the_prediction_along_it():
     world = World(noise=0.0)
     map = first_map(world)
     guess = camera_at(5) @ exp_se3(OFF)
-    matches = LocalMap(relations=3)(world.frame(5), rotation_of(guess, 5), translation_of(guess, 5), *world.features(camera_at(5), 5), map, None)
+    matches = LocalMap()(world.frame(5), rotation_of(guess, 5), translation_of(guess, 5), *world.features(camera_at(5), 5), map, None)
     none = matches.keypoints[:0]
     one = dataclasses.replace(matches, keypoints=none, segments=none, planes=matches.planes[:1], parallel=none, perpendicular=none)
     pose = refined(world, map, matches=one)
@@ -201,7 +201,7 @@ def test_a_place_recognised_replaces_a_lost_pose():
     assert np.allclose(found.T_world_camera, camera_at(5)) and found.status == "ok"
     map, features = first_map(world), world.features(camera_at(5), 5)
     rotation, translation = rotation_of(held, 5), translation_of(held, 5)
-    matches = LocalMap(relations=3)(world.frame(5), rotation, translation, *features, map, recognised)
+    matches = LocalMap()(world.frame(5), rotation, translation, *features, map, recognised)
     pose = Refine()(world.frame(5), rotation, translation, None, matches, *features, lost, map, recognised)
     assert pose.status == "ok" and error(pose)[0] < 0.01
 

@@ -38,7 +38,7 @@ def test_with_nothing_replaced_the_default_graph_errs_as_it_did(tmp_path, capsys
     ("overrides", "message"),
     [
         (["outputs=[planes]"], "holds no poses with ground truth; record a run of a data set that has it"),
-        (None, "cannot be read: No such file or directory; give the path of a run.mcap"),
+        (None, "cannot be read: No such file or directory; give the path of an MCAP file"),
     ],
 )
 def test_what_it_cannot_judge(tmp_path, capsys, overrides, message):
