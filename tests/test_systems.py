@@ -24,6 +24,7 @@ SYSTEMS = {  # graph -> what is recorded besides, the stages it adds to the defa
     "icp_tsdf": (MODEL, ["pose", "model"], 0.010),
     "surfel": (MODEL, ["pose", "model"], 0.010),
     "pose_graph": ([], ["tracks", "rotation", "translation", "matches"], 0.015),
+    "superpixel_surfel": (["outputs=[trajectory,surface]"], ["tracks", "surface"], 0.010),
 }
 OTHERS = ("structural", "structural_paper", "structural_no_refine", "points", "points_lines", "points_planes")
 JOBS = """
@@ -109,6 +110,15 @@ def refined(seen):
     return not np.array_equal(seen.positions, [t.t_world_camera for t in seen.all("translation")])
 
 
+def discs(seen):
+    """A surface of loose flat hexagons that belong to no plane."""
+    surfaces = seen.all("surface")
+    if not surfaces or not len(surfaces[-1].triangles):
+        return False
+    triangles = surfaces[-1].triangles
+    return (surfaces[-1].instances == -1).all() and len(np.unique(triangles)) * 4 == len(triangles) * 6
+
+
 def colours(seen):
     return any(view.color.any() for view in seen.all("model"))
 
@@ -120,6 +130,7 @@ CHARACTER = {
     "direct": lambda s: s.topics == {"pose"},
     "icp_tsdf": lambda s: s.topics == {"pose", "model"} and dense_model(s) == {"place", "distance", "weight"} and not colours(s),
     "pose_graph": lambda s: points_alone(s) and not refined(s) and {r.source for r in s.all("rotation")[1:]} == {"tracks"},
+    "superpixel_surfel": lambda s: points_alone(s) and refined(s) and discs(s),
     "surfel": lambda s: s.topics == {"pose", "model"} and dense_model(s) == {"surfel", "seen"} and colours(s),
 }
 
