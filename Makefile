@@ -3,6 +3,9 @@
 VENV := .venv
 BIN := $(VENV)/bin
 OUT := runs/demo
+TABLE := runs/table
+COMMA := ,
+ROOM := "synthetic length=90","synthetic texture=false length=90"
 SEQUENCES := $(wildcard ../shared/data/*/)
 USABLE := 'import sys, venv, ensurepip; sys.exit(not (3, 10) <= sys.version_info[:2] <= (3, 14))'
 PYTHON := $(shell for p in python3.14 python3.13 python3.12 python3.11 python3.10 python3 python; do \
@@ -12,7 +15,7 @@ KEEP_KERNELS := mkdir -p build && find build -name '*.nb[ic]' -print0 | tar -cf 
 RESTORE_KERNELS := tar -xf $(VENV)/kernels.tar
 FOLDERS := conf datasets pipeline plugins tools
 
-.PHONY: demo test test-slow benchmark install clean FORCE
+.PHONY: demo test test-slow benchmark table install clean FORCE
 .DELETE_ON_ERROR:
 
 demo: install  ## track the built-in synthetic room
@@ -35,6 +38,11 @@ benchmark: install  ## time, memory and error on the synthetic room and the sequ
 	@set -e; for folder in $(SEQUENCES); do \
 		case $$folder in *icl_nuim*) kind=icl_nuim;; *) kind=tum;; esac; \
 		echo; echo "$$folder"; $(BIN)/trihedron benchmark dataset=$$kind dataset.path=$$folder; done
+
+table: install  ## every system on the synthetic room and on DATA="tum:FOLDER icl_nuim:FOLDER ..."; goes on where it was stopped
+	$(BIN)/trihedron run -m experiment=paper_table out=$(TABLE) 'sequences=[$(ROOM)$(foreach d,$(DATA),$(COMMA)"$(d)")]' || test $$? -eq 1
+	$(BIN)/trihedron compare $(TABLE) --baseline graph=points --csv $(TABLE)/table.csv --markdown $(TABLE)/table.md \
+		--latex $(TABLE)/table.tex --json $(TABLE)/table.json
 
 install: $(VENV)/checked $(VENV)/compiled
 

@@ -13,12 +13,18 @@ import shlex
 import sys
 import time
 from collections.abc import Callable
+from contextlib import redirect_stderr, redirect_stdout, suppress
+from functools import partial
 from importlib.metadata import EntryPoint, entry_points, version
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from trihedron.pipeline.errors import RecordingError, TrihedronError, UsageError, did_you_mean
 
+if TYPE_CHECKING:
+    from omegaconf import DictConfig
+
+_FAILURES: list[Exception] = []  # of this process's runs
 _BEGAN = time.perf_counter()
 COMMAND_GROUP = "trihedron.commands"
 RUN_FLAGS = ("-m", "--multirun")
@@ -42,7 +48,8 @@ Usage: trihedron run [-m] [key=value ...]
   live=true                          play the data set in real time; frames that come while it is busy are dropped, latency is reported
   real_time=true                     the same without dropping any
   feedback=recorded                  delayed wires of recomputed stages see the recorded past
-  -m                                 sweep over comma-separated values
+  -m                                 sweep over comma-separated values, on all cores; the same again does what is missing
+  sequences=[KIND:FOLDER,...]        of a sweep: several data sets, for example ["tum:/data/desk frames=0:300",synthetic]
   report=COMMAND                     what to do with the folder of a sweep at its end, for example: report="benchmark rotations"
 
 Example: trihedron run dataset=tum dataset.path=rgbd_dataset_freiburg3_structure_notexture_far
@@ -111,47 +118,66 @@ def _run(words: list[str]) -> int:
             raise UsageError(word, "lacks a " + ("key" if word.startswith("=") else "folder"), "write key=value, for example out=runs/mine")
     os.environ["HYDRA_FULL_ERROR"] = "1"  # exceptions come to us instead of being printed
     import hydra
-    from hydra.core.hydra_config import HydraConfig
-    from hydra.types import RunMode
-    from omegaconf import DictConfig
 
     from trihedron.pipeline.config import register_configs, rewritten
     from trihedron.pipeline.registry import load_plugins
+    from trihedron.pipeline.sweep import OUTCOMES, raise_failures, register_sweeper
 
     load_plugins()
     register_configs()
+    register_sweeper()
     overrides = _with_recorded(words)
-
-    failures: list[Exception] = []
-    reports: list[list[str]] = []  # the command of a sweep, once for each job that went well
-
-    def task(config: DictConfig) -> float | None:
-        from trihedron.pipeline.execute import execute
-
-        runtime = HydraConfig.get()
-        out = Path(runtime.runtime.output_dir)
-        try:
-            metrics: dict[str, Any] = execute(config, out, list(runtime.overrides.task), _BEGAN)
-        except Exception as error:  # one job of a sweep must not stop the others, and Hydra would print its overrides
-            failures.append(error)
-            if runtime.mode == RunMode.MULTIRUN:
-                print(f"trihedron: {error}", file=sys.stderr)
-            return None
-        if runtime.mode == RunMode.MULTIRUN and config.report:
-            reports.append([*shlex.split(config.report), runtime.sweep.dir])
-        _point_latest(out)
-        return metrics["final"]["ate_rmse_m"] if "final" in metrics else None
-
+    _FAILURES.clear()
+    OUTCOMES.clear()
     sys.argv = ["trihedron run", *sorted(overrides, key=lambda word: word not in RUN_FLAGS)]  # flags first
     try:
-        hydra.main(config_path="pkg://trihedron.conf", config_name="root", version_base="1.3")(task)()
+        hydra.main(config_path="pkg://trihedron.conf", config_name="root", version_base="1.3")(_task)()
     except Exception as error:
-        raise rewritten(error) from error
-    if reports:
-        _dispatch(reports[-1])
-    if failures:
-        raise failures[0]
+        raise error if isinstance(error, TrihedronError) else rewritten(error) from error
+    for outcome in OUTCOMES:
+        if outcome.report and len(outcome.failures) < outcome.jobs:
+            _dispatch([*shlex.split(outcome.report), str(outcome.folder)])
+        raise_failures(outcome)
+    if _FAILURES:
+        raise _FAILURES[0]
     return 0
+
+
+def _task(config: DictConfig) -> float | None:
+    """One run, or one job of a sweep, which may be in a process of its own. Returns the ATE in metres, for sweepers that search."""
+    from hydra.core.hydra_config import HydraConfig
+    from hydra.types import RunMode
+
+    from trihedron.pipeline.execute import execute
+
+    runtime = HydraConfig.get()
+    out = Path(runtime.runtime.output_dir)
+    work = partial(execute, config, out, list(runtime.overrides.task), _BEGAN)
+    try:
+        metrics: dict[str, Any] = _job(config, out, work) if runtime.mode == RunMode.MULTIRUN else work()
+    except Exception as error:  # one job of a sweep must not stop the others, and Hydra would print its overrides
+        _FAILURES.append(error)
+        return None
+    _point_latest(out)
+    return metrics["final"]["ate_rmse_m"] if "final" in metrics else None
+
+
+def _job(config: DictConfig, out: Path, work: Callable[[], dict[str, Any]]) -> dict[str, Any]:
+    """Do the work of a job, keeping what it prints in its folder, and how it ended in job.json."""
+    from trihedron.pipeline.jobs import DONE, FAILED, RUNNING, key_of, write_job
+    from trihedron.pipeline.registry import load_plugins
+
+    load_plugins()
+    key = key_of(config)
+    write_job(out, key, RUNNING)
+    try:
+        with (out / "log.txt").open("w") as log, redirect_stdout(log), redirect_stderr(log):
+            metrics = work()
+    except Exception as error:
+        write_job(out, key, FAILED, str(error) or type(error).__name__)
+        raise
+    write_job(out, key, DONE)
+    return metrics
 
 
 def _with_recorded(words: list[str]) -> list[str]:
@@ -184,4 +210,5 @@ def _point_latest(out: Path) -> None:
         link = runs / "latest"
         if link.is_symlink() or not link.exists():
             link.unlink(missing_ok=True)
-            link.symlink_to(out.relative_to(runs), target_is_directory=True)
+            with suppress(FileExistsError):  # another job of a sweep was quicker
+                link.symlink_to(out.relative_to(runs), target_is_directory=True)

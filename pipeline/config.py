@@ -52,6 +52,8 @@ class RunOptions:
             {"without": None},
             {"override hydra/job_logging": "none"},
             {"override hydra/hydra_logging": "none"},
+            {"override hydra/launcher": "joblib"},
+            {"override hydra/sweeper": "trihedron"},
         ]
     )
     graph: dict[str, Any] = dataclasses.field(default_factory=dict)  # graph=NAME chooses a file; graph.STAGE.INPUT=TOPIC changes a wire
@@ -63,6 +65,7 @@ class RunOptions:
     only: list[str] = dataclasses.field(default_factory=list)  # stages that a replay computes again; [] = all
     feedback: Feedback = Feedback.new
     report: str = ""  # a command that is given the folder of a sweep when all its jobs are done, for example: benchmark rotations
+    sequences: list[str] = dataclasses.field(default_factory=list)  # of a sweep: KIND:FOLDER and options after blanks, see sweep.words_of_sequence
     record: RecordOptions = dataclasses.field(default_factory=RecordOptions)
     save_map: str = ""  # write the map, and all that is needed to go on, to this file
     load_map: str = ""  # go on from such a file
@@ -81,6 +84,8 @@ def register_configs() -> None:
         for name, plugin in plugins_of(slot).items():
             store.store(group=slot, name=name, node=_option(name, plugin))
     slots = [(slot, Any, dataclasses.field(default=None)) for slot in SLOTS]
+    sweeper = {"_target_": "hydra_plugins.trihedron.Sweeper", "max_batch_size": None, "params": None}
+    store.store(group="hydra/sweeper", name="trihedron", node=sweeper, provider="trihedron")
     store.store(name="root", node=dataclasses.make_dataclass("Root", slots, bases=(RunOptions,)))
 
 

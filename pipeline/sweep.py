@@ -1,0 +1,167 @@
+"""Sweeps: every job of a cross product over given data sets, on all cores; what is done already is not done again.
+
+A job's folder keeps its number as long as its overrides are the same; it is computed again when its key (`jobs.key_of`) changed, or it did not come
+to its end. A job that fails, be it because its configuration is refused, leaves its reason in job.json and stops no other.
+"""
+
+from __future__ import annotations
+
+import sys
+import threading
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import yaml
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.core.plugins import Plugins
+from joblib.externals.loky import get_reusable_executor
+
+from trihedron.pipeline.config import rewritten
+from trihedron.pipeline.errors import TrihedronError
+from trihedron.pipeline.jobs import DONE, FAILED, RUNNING, key_of, read_job, write_job
+
+Plugins.instance()  # loads every plugin of Hydra anew, so that classes imported before are no longer theirs
+from hydra._internal.core_plugins.basic_sweeper import BasicSweeper  # noqa: E402
+
+SWEEPER = "hydra_plugins.trihedron.Sweeper"  # for `_target_`
+LOOK_SECONDS = 1.0  # between two looks at the jobs' folders
+Overrides = list[str]
+
+
+@dataclass
+class Outcome:
+    """A sweep that ended: its folder, the command that reports on it, how many jobs it has, and why some of them failed."""
+
+    folder: Path
+    report: str
+    jobs: int = 0
+    failures: list[str] = field(default_factory=list)
+
+
+OUTCOMES: list[Outcome] = []  # of the sweeps of this process; Hydra has no other way to hand one over
+
+
+class Sweeper(BasicSweeper):
+    """Hydra's sweeper over comma-separated values, with sequences, that goes on where it was stopped."""
+
+    def sweep(self, arguments: list[str]) -> Any:
+        """Run what is missing. Raises TrihedronError when no job can be composed."""
+        assert self.config is not None and self.launcher is not None
+        folder = Path(str(self.config.hydra.sweep.dir))
+        folder.mkdir(parents=True, exist_ok=True)
+        jobs = self._jobs(arguments)
+        numbers = _numbers(folder, jobs)
+        outcome = Outcome(folder, str(self.config.report), len(jobs))
+        missing, errors = [], []
+        for job, number in zip(jobs, numbers):
+            words = [*job, f"hydra.sweep.subdir={number}"]
+            try:
+                key = key_of(self.hydra_context.config_loader.load_sweep_config(self.config, words))  # type: ignore[union-attr]
+            except Exception as error:
+                errors.append(error if isinstance(error, TrihedronError) else rewritten(error))
+                _refused(folder / str(number), job, str(errors[-1]))
+                continue
+            if read_job(folder / str(number)) != {"key": key, "state": DONE, "error": ""}:
+                (folder / str(number) / "job.json").unlink(missing_ok=True)
+                missing.append((words, folder / str(number)))
+        if len(errors) == len(jobs):
+            raise errors[0]
+        if already := len(jobs) - len(errors) - len(missing):
+            print(f"sweep: {already} of {len(jobs)} jobs are done already", file=sys.stderr)
+        with _Progress([place for _, place in missing], len(jobs)):
+            returns = self.launcher.launch([words for words, _ in missing], initial_job_idx=0) if missing else []
+        if missing and self._parallel:
+            get_reusable_executor().shutdown()  # its processes would keep this folder and environment for the next sweep
+        ended = [read_job(folder / str(number)) for number in numbers]
+        outcome.failures = [str(state.get("error") or "was stopped before its end") for state in ended if state.get("state") != DONE]
+        OUTCOMES.append(outcome)
+        return [returns]
+
+    def _jobs(self, arguments: list[str]) -> list[Overrides]:
+        """The overrides of every job: the cross product of sequences and of all values given."""
+        assert self.hydra_context is not None and self.config is not None
+        parser = OverridesParser.create(config_loader=self.hydra_context.config_loader)
+        words = [word for word in [*self._parse_config(), *arguments] if not word.startswith("sequences=")]
+        words += [] if any(word.startswith("threads=") for word in words) else [f"threads={1 if self._parallel else 2}"]
+        sequences = [words_of_sequence(text) for text in self.config.sequences] or [[]]
+        products = [self.split_arguments(parser.parse_overrides([*sequence, *words]), None)[0] for sequence in sequences]
+        return [list(job) for product in products for job in product]
+
+    @property
+    def _parallel(self) -> bool:
+        return int(self.config.hydra.launcher.get("n_jobs", 1) or 1) != 1  # type: ignore[union-attr]
+
+
+def words_of_sequence(text: str) -> Overrides:
+    """`KIND`, `KIND:FOLDER`, and options after blanks, as overrides: "tum:/data/desk frames=0:100" is dataset=tum dataset.path=/data/desk
+    dataset.frames=0:100. Options of a data set underneath another (options.path=...) are added."""
+    kind, *options = text.split()
+    name, _, path = kind.partition(":")
+    return [f"dataset={name}", *([f"dataset.path={path}"] if path else []), *(f"{'+' * o.startswith('options.')}dataset.{o}" for o in options)]
+
+
+def _numbers(folder: Path, jobs: Sequence[Overrides]) -> list[int]:
+    """The folder of each job: the one that has its overrides, else the next free number."""
+    files = [file for file in folder.glob("*/.hydra/overrides.yaml") if file.parent.parent.name.isdigit()]
+    known = {tuple(yaml.safe_load(file.read_text()) or []): int(file.parent.parent.name) for file in files}
+    free = iter(range(max(known.values(), default=-1) + 1, len(jobs) + len(files) + max(known.values(), default=0) + 1))
+    return [known[tuple(job)] if tuple(job) in known else next(free) for job in jobs]
+
+
+def _refused(folder: Path, job: Overrides, error: str) -> None:
+    """The folder of a job whose configuration is refused: it has no run, but a reason."""
+    (folder / ".hydra").mkdir(parents=True, exist_ok=True)
+    (folder / ".hydra" / "overrides.yaml").write_text(yaml.safe_dump(job))
+    write_job(folder, "", FAILED, error)
+    print(f"trihedron: {error}", file=sys.stderr)
+
+
+class _Progress:
+    """Says on stderr how many jobs are done, which failed and why, and about how long the rest will take, as jobs end in other processes."""
+
+    def __init__(self, folders: list[Path], jobs: int) -> None:
+        self.waiting, self.missing, self.jobs = folders, len(folders), jobs
+        self.began, self.stop = time.perf_counter(), threading.Event()
+        self.thread = threading.Thread(target=self._watch, daemon=True)
+
+    def __enter__(self) -> None:
+        self.thread.start()
+
+    def __exit__(self, *exception: object) -> None:
+        self.stop.set()
+        self.thread.join()
+        self._look()
+
+    def _watch(self) -> None:
+        while not self.stop.wait(LOOK_SECONDS):
+            self._look()
+
+    def _look(self) -> None:
+        ended = [(place, job) for place in self.waiting if (job := read_job(place)).get("state", RUNNING) != RUNNING]
+        self.waiting = [place for place in self.waiting if place not in {place for place, _ in ended}]
+        for _, job in ended:
+            if job["error"]:
+                print(f"trihedron: {job['error']}", file=sys.stderr)
+        if ended:
+            done, seconds = self.missing - len(self.waiting), time.perf_counter() - self.began
+            left = seconds / done * len(self.waiting)
+            print(f"sweep: {self.jobs - len(self.waiting)} of {self.jobs} jobs done, {_time(seconds)}, about {_time(left)} left", file=sys.stderr)
+
+
+def _time(seconds: float) -> str:
+    return f"{seconds:.0f} s" if seconds < 120 else f"{seconds / 60:.0f} min" if seconds < 7200 else f"{seconds / 3600:.1f} h"
+
+
+def register_sweeper() -> None:
+    """Let Hydra know the sweeper; call before its main. Hydra takes only names in its own namespace."""
+    Plugins.instance().class_name_to_class[SWEEPER] = Sweeper
+
+
+def raise_failures(outcome: Outcome) -> None:
+    """Raise TrihedronError when a job failed."""
+    if outcome.failures:
+        cause = f"{len(outcome.failures)} of {outcome.jobs} jobs failed"
+        raise TrihedronError(str(outcome.folder), cause, "trihedron compare says why; the same command again runs those that are missing")

@@ -1,0 +1,72 @@
+"""Sweeps: keys of jobs, data sets by a word, what is done already is not done again, and a job that fails stops no other."""
+
+import json
+import os
+
+import pytest
+from hydra import compose, initialize_config_module
+
+from trihedron.pipeline.cli import main
+from trihedron.pipeline.config import register_configs
+from trihedron.pipeline.jobs import key_of
+from trihedron.pipeline.registry import load_plugins
+from trihedron.pipeline.sweep import words_of_sequence
+
+QUICK = ["dataset.width=64", "dataset.height=48", "dataset.length=4", "outputs=[keypoints]"]
+
+
+def key(*overrides):
+    load_plugins()
+    register_configs()
+    with initialize_config_module("trihedron.conf", version_base="1.3"):
+        return key_of(compose("root", overrides=list(overrides)))
+
+
+def test_a_key_is_of_what_is_computed(tmp_path):
+    assert key("out=a", "report=compare") == key("out=b")
+    assert key("seed=1") != key("seed=0") != key("seed=0", "keypoints.features=300")
+
+
+def test_a_key_is_of_the_files_that_are_read(tmp_path):
+    (tmp_path / "rgb").mkdir()
+    image = tmp_path / "rgb" / "0.png"
+    image.write_bytes(b"an image")
+    words = ("dataset=tum", f"dataset.path={tmp_path}")
+    first = key(*words)
+    assert key(*words) == first
+    from trihedron.pipeline import jobs
+
+    jobs._files.cache_clear()  # of one sweep
+    os.utime(image, ns=(1, 1))
+    assert key(*words) != first
+
+
+@pytest.mark.parametrize(
+    "text, words",
+    [
+        ("synthetic", ["dataset=synthetic"]),
+        ("tum:/data/desk frames=0:9", ["dataset=tum", "dataset.path=/data/desk", "dataset.frames=0:9"]),
+        ("faults of=tum options.path=/data", ["dataset=faults", "dataset.of=tum", "+dataset.options.path=/data"]),
+    ],
+)
+def test_a_word_is_a_data_set(text, words):
+    assert words_of_sequence(text) == words
+
+
+def test_a_sweep_goes_on_where_it_was_stopped(tmp_path, capfd):
+    words = ["run", "-m", *QUICK, 'sequences=["synthetic","synthetic texture=false"]', f"out={tmp_path}", "seed=0"]
+    assert main(words) == 0
+    assert "sweep: 2 of 2 jobs done" in capfd.readouterr().err
+    before = [(tmp_path / job / "run.mcap").stat().st_mtime_ns for job in ("0", "1")]
+    assert json.loads((tmp_path / "1" / "job.json").read_text())["state"] == "done"
+    assert "texture=False" in (tmp_path / "1" / ".hydra" / "overrides.yaml").read_text()
+    assert "threads: 1" in (tmp_path / "1" / ".hydra" / "config.yaml").read_text()
+    (tmp_path / "0" / "job.json").write_text(json.dumps({"key": "", "state": "running", "error": ""}))  # as one that was killed leaves it
+    more = [*words[:-1], "seed=0,9:0"]
+    assert main(more) == 1
+    said = capfd.readouterr().err
+    assert "sweep: 1 of 4 jobs are done already" in said and "2 of 4 jobs failed" in said
+    after = [(tmp_path / job / "run.mcap").stat().st_mtime_ns for job in ("0", "1")]
+    assert after[0] > before[0] and after[1] == before[1]
+    assert main(["compare", str(tmp_path)]) == 0
+    assert capfd.readouterr().out.count("9:0") >= 2
