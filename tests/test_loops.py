@@ -58,9 +58,9 @@ def shift_m(map, correction):
 @pytest.mark.slow
 def test_two_identical_offices_stay_two(tmp_path):
     """By the default graph. The trap springs for a closer that believes in a drift of any size; with the drift that can be it is refused, and the
-    true loop, where the walk ends, is closed."""
+    walk ends where it began: what is left of its drift is below a centimetre and a half."""
     metrics = track(tmp_path / "run", Scene.offices)
-    assert metrics["final"]["ate_rmse_m"] < 0.025 and metrics["final"]["tracked_share"] == 1.0
+    assert metrics["final"]["ate_rmse_m"] < 0.01 and metrics["final"]["tracked_share"] == 1.0
     load_plugins()
     recording, dataset, truth = Recording(tmp_path / "run" / "run.mcap"), Synthetic(scene=Scene.offices), Synthetic(scene=Scene.offices).truth().poses
     maps = {map.index: map for map in recording.values("map")}
@@ -69,8 +69,8 @@ def test_two_identical_offices_stay_two(tmp_path):
     map, correction = loops[-1]
     true = (invert(truth[0]) @ truth[map.index])[:3, 3]
     before, after = (np.linalg.norm(T[-1, :3, 3] - true) for T in (map.keyframes.column("T_world_camera"), correction.T_world_keyframe))
-    print(f"back at the start: {1e3 * before:.1f} mm off, {1e3 * after:.1f} mm when the loop is closed")
-    assert np.linalg.norm(truth[map.index, :3, 3] - truth[0, :3, 3]) < 1.5 and after < 0.5 * before
+    print(f"back at the start: {1e3 * before:.1f} mm off, {1e3 * after:.1f} mm after the last correction")
+    assert np.linalg.norm(truth[map.index, :3, 3] - truth[0, :3, 3]) < 1.5 and after < 0.015
     cautious = (PlanesLoop(every=1, candidates=20), AppearanceLoop(every=1, candidates=20))
     trapped = [0, 0]
     for map in maps.values():

@@ -8,7 +8,7 @@ import numpy as np
 from trihedron.pipeline.types import F64
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def solve_positive(H: F64, g: F64, x: F64) -> bool:
     """x (n,) with `H x = g` for a symmetric positive definite H (n, n), by Cholesky; False, and x zero, when H is not positive definite."""
     n = len(g)
@@ -38,7 +38,7 @@ def solve_positive(H: F64, g: F64, x: F64) -> bool:
     return True
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def inverse_positive(H: F64) -> F64:
     """Inverse of a symmetric positive definite H (n, n); zeros where it is none."""
     n = len(H)
@@ -50,7 +50,7 @@ def inverse_positive(H: F64) -> F64:
     return out
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def turn_left(phi: F64, R: F64) -> None:
     """`R <- Exp(phi) R` in place, for the first three numbers of phi (Rodrigues)."""
     x, y, z = phi[0], phi[1], phi[2]
@@ -68,7 +68,7 @@ def turn_left(phi: F64, R: F64) -> None:
         R[2, c] = w + a * r + b * (x * q - y * p)
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def fill_tangent_basis(n: F64, out: F64) -> None:
     """Write the columns of `geometry.tangent_basis` of a unit vector to the rows of `out` (2, 3)."""
     x, y, z = n[0], n[1], n[2]
@@ -79,7 +79,7 @@ def fill_tangent_basis(n: F64, out: F64) -> None:
     out[1, 0], out[1, 1], out[1, 2] = b, sign + y * y * a, -y
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def polar_rotation(M: F64) -> F64:
     """The rotation nearest to M (3, 3), as `geometry.nearest_rotation`: one-sided Jacobi rotations make the columns of `A = M V` orthogonal
     (Hestenes, 1958), and R takes the two largest of them from V to their directions, the third by the cross product. Small columns keep their
@@ -106,7 +106,7 @@ def polar_rotation(M: F64) -> F64:
     return _from_columns(A, V)
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _from_columns(A: F64, V: F64) -> F64:
     """The rotation that takes columns of V (3, 3), a rotation, to the directions of the same columns of A (3, 3), orthogonal and of any length."""
     square = np.empty(3)

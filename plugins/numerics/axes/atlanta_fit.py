@@ -9,7 +9,7 @@ from trihedron.pipeline.types import F64, I32
 from trihedron.plugins.numerics.algebra.small_linear import solve_positive, turn_left
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def fit_shared_vertical(
     directions: F64, information: F64, columns: I32, counted: int, rotations: F64, prior: float, gate: float, iterations: int
 ) -> tuple[F64, F64, float, float]:
@@ -71,7 +71,7 @@ def fit_shared_vertical(
     return rotations, H, chi2, components
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def shared_vertical(first: F64, R: F64) -> F64:
     """R (3, 3) with the third column of `first` (3, 3), its first column staying as near as it can."""
     out = np.empty((3, 3))

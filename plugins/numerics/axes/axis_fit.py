@@ -25,7 +25,7 @@ def gather_directions(normals: F32 | None, segments: Segments | None, samples: i
     return Directions(*_gathered(grid, ends_m, ends_px, samples, line_weight_per_px))
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _gathered(normals: F32, ends_m: F32, ends_px: F32, samples: int, per_px: float) -> tuple[F64, F64, int]:
     """The fields of `Directions`."""
     surface = subsample_normals(normals, samples)

@@ -16,7 +16,7 @@ CONTRAST, SIGMA = 2.5, 3.0  # a mode has so many times what directions without o
 QUARTER = 0.5 * np.pi
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def azimuth_modes(vectors: F64, weights: F64, first_line: int, vertical: F64, cone: float, apart: int, most: int, least: float) -> tuple[F64, F64]:
     """Rotations (k, 3, 3) with the vertical as third column and a horizontal mode as first, heaviest first, and their weights (k,).
 
@@ -45,7 +45,7 @@ def azimuth_modes(vectors: F64, weights: F64, first_line: int, vertical: F64, co
     return rotations[:found], masses[:found]
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _turned(base: F64, angle: float) -> F64:
     """`base` (3, 3) turned about its third column."""
     out, c, s = base.copy(), np.cos(angle), np.sin(angle)
@@ -54,7 +54,7 @@ def _turned(base: F64, angle: float) -> F64:
     return out
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _histograms(vectors: F64, weights: F64, first_line: int, base: F64, limit: float, alike: float) -> tuple[F64, F64]:
     """(BINS,) weight of the directions near the plane of the first two columns of `base`, by their turn, and the squares of what errs independently;
     `alike` normals of weight 1 err alike."""
@@ -69,7 +69,7 @@ def _histograms(vectors: F64, weights: F64, first_line: int, base: F64, limit: f
     return histogram, squares
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _peaks(histogram: F64, apart: int) -> I32:
     """Bins where the smoothed histogram is largest within `apart`, fullest first."""
     smooth, tops, found = np.zeros(BINS), np.empty(BINS, np.int32), 0

@@ -36,13 +36,13 @@ class Near(NamedTuple):
     value: float  # what the others do add at the centre
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def curvature(beta: float) -> float:
     """κ(β) = cos β (1 - cos β), the second derivative when ω is midway between d and r; for every other ω it is less."""
     return np.cos(beta) * (1.0 - np.cos(beta))
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def near_rotation(groups: Groups, R: F64, radius: float, inlier: float) -> Near:
     """What directions add within `radius` of R, `inlier` being τ; inlier + radius < 45°, so that no direction is near two axes.
 
@@ -77,7 +77,7 @@ def near_rotation(groups: Groups, R: F64, radius: float, inlier: float) -> Near:
     return Near(sure, torque, constant, value)
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _nearest_axis(x: float, y: float, z: float, R: F64) -> tuple[int, float]:
     axis, dot = 0, x * R[0, 0] + y * R[1, 0] + z * R[2, 0]
     for k in range(1, 3):
@@ -87,7 +87,7 @@ def _nearest_axis(x: float, y: float, z: float, R: F64) -> tuple[int, float]:
     return axis, dot
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _add_cross(out: F64, factor: float, R: F64, k: int, x: float, y: float, z: float) -> None:
     """out += factor · r_k × (x, y, z)."""
     out[0] += factor * (R[1, k] * z - R[2, k] * y)
@@ -95,7 +95,7 @@ def _add_cross(out: F64, factor: float, R: F64, k: int, x: float, y: float, z: f
     out[2] += factor * (R[0, k] * y - R[1, k] * x)
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _pulls(sure: F64, R: F64) -> F64:
     """(3, 3) columns M_k r_k: half the derivative of r_kᵀ M_k r_k by r_k."""
     out = np.empty((3, 3))
@@ -107,7 +107,7 @@ def _pulls(sure: F64, R: F64) -> F64:
     return out
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _first_order(near: Near, R: F64, pulls: F64, gradient: F64) -> tuple[float, float, float]:
     """At R: Σ r_kᵀ M_k r_k and the weight of the sure inliers. Writes the derivative by phi of that, and of the bound on the others, to `gradient`
     (3,), and returns its length last."""
@@ -121,7 +121,7 @@ def _first_order(near: Near, R: F64, pulls: F64, gradient: F64) -> tuple[float, 
     return total, weight, np.sqrt(gradient[0] ** 2 + gradient[1] ** 2 + gradient[2] ** 2)
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def consensus_bound(groups: Groups, R: F64, radius: float, inlier: float) -> tuple[float, float]:
     """C(R), and an upper bound of C for all rotations within `radius` of R."""
     near = near_rotation(groups, R, radius, inlier)
@@ -132,7 +132,7 @@ def consensus_bound(groups: Groups, R: F64, radius: float, inlier: float) -> tup
     return (total + near.value) / s2, (total + near.constant + rise) / s2 + ROUNDING * groups.total
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def climb(groups: Groups, R: F64, inlier: float, steps: int) -> tuple[F64, float]:
     """The rotation at the top of the slope on which R is, and its consensus, which no step lowers.
 
@@ -159,7 +159,7 @@ def climb(groups: Groups, R: F64, inlier: float, steps: int) -> tuple[F64, float
     return top, max(best, 0.0) / np.sin(inlier) ** 2
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def summit_radius(groups: Groups, R: F64, best: float, inner: float, inlier: float) -> float:
     """The largest angle found such that no rotation from `inner` to it off R has more consensus than `best`; `inner` when nothing is proven.
 
@@ -183,7 +183,7 @@ def summit_radius(groups: Groups, R: F64, best: float, inner: float, inlier: flo
     return reach
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _hessian(sure: F64, R: F64, pulls: F64, out: F64) -> None:
     """Second derivative of Σ r_kᵀ M_k r_k by phi: Σ 2 [r]×ᵀ M [r]× + r (M r)ᵀ + (M r) rᵀ - 2 rᵀ M r I."""
     for a in range(3):
@@ -201,7 +201,7 @@ def _hessian(sure: F64, R: F64, pulls: F64, out: F64) -> None:
                 out[a, b] += 2.0 * (u * p + v * q + w * r) + R[a, k] * pulls[b, k] + pulls[a, k] * R[b, k]
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _moved(R: F64, k: int, a: int) -> tuple[float, float, float]:
     """e_a × r_k: how the axis moves with phi_a."""
     if a == 0:

@@ -26,7 +26,7 @@ def _cube_rotations() -> F64:
 CUBE = _cube_rotations()  # (24, 3, 3)
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def nearest_equivalent(R: F64, reference: F64) -> F64:
     """Of the 24 rotations `R @ S` with the same axes up to order and sign, the one nearest to `reference`; (3, 3) each."""
     best, highest, relative, out = 0, -4.0, np.zeros((3, 3)), np.zeros((3, 3))

@@ -24,7 +24,7 @@ class Groups(NamedTuple):
     total: float  # of the weights
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def group_directions(vectors: F64, weights: F64) -> Groups:
     """Group unit directions (n, 3) with positive weights (n,) by cells of the sphere; d and -d are the same."""
     n = CELLS
@@ -56,7 +56,7 @@ def group_directions(vectors: F64, weights: F64) -> Groups:
     return Groups(in_order, in_order_weights, first, means, moments, total)
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _summarise(vectors: F64, weights: F64, begin: int, end: int, mean: F64, moments: F64) -> None:
     """Fill a row of `Groups.means` and of `Groups.moments`."""
     for i in range(begin, end):
@@ -72,7 +72,7 @@ def _summarise(vectors: F64, weights: F64, begin: int, end: int, mean: F64, mome
     mean[4] = np.sqrt(max(1.0 - mean[3] ** 2, 0.0))
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def add_moments(moments: F64, w: float, x: float, y: float, z: float) -> None:
     """Add a direction to a row of `Groups.moments`."""
     moments[0] += w * x * x

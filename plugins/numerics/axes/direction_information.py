@@ -9,7 +9,7 @@ from trihedron.pipeline.types import F32, F64
 from trihedron.plugins.numerics.algebra.small_linear import fill_tangent_basis
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def measured_directions(
     planes: F64, plane_covariance: F64, plane_floor: float, ends_m: F32, end_covariance: F32, line_floor: float, means: F64, mean_sigma: F64
 ) -> tuple[F64, F64]:
@@ -54,7 +54,7 @@ def isotropic_information(directions: F64, sigma: F64) -> F64:
     return (np.eye(3) - directions[:, :, None] * directions[:, None, :]) / (sigma * sigma)[:, None, None]
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _inverse_in_tangent_plane(C: F64, more: float, basis: F64, out: F64) -> None:
     """Write the information (3, 3) of a direction with covariance C (2, 2) plus `more` in its tangent plane, the rows of `basis`; nothing where that
     is no covariance."""

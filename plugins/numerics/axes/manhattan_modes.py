@@ -115,7 +115,7 @@ class Rules(NamedTuple):
     max_skew: float
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _followed(
     vectors: F64, weights: F64, first: int, start: F64, shift: tuple[float, float, int, float], planes: F64, rules: Rules
 ) -> tuple[F64, F64, F64, Bool, bool]:
@@ -131,7 +131,7 @@ def _followed(
     return axes, normals, lines, seen, supported
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _judged(vectors: F64, weights: F64, first: int, axes: F64, normals: F64, lines: F64, planes: F64, rules: Rules) -> tuple[Bool, bool]:
     """(3,) which modes are seen, and whether they make a Manhattan frame."""
     peaks = _peaks(vectors, weights, first, axes, normals, lines, planes, rules)
@@ -141,7 +141,7 @@ def _judged(vectors: F64, weights: F64, first: int, axes: F64, normals: F64, lin
     return seen, seen.sum() >= 2 and explained >= rules.min_explained
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _peaks(vectors: F64, weights: F64, first: int, axes: F64, normals: F64, lines: F64, planes: F64, rules: Rules) -> Bool:
     """(m,) which of the axes (3, m) are peaks."""
     cone, least, number, share, widest, _, _ = rules

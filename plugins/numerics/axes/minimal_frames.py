@@ -11,7 +11,7 @@ from trihedron.plugins.numerics.axes.cube_symmetry import nearest_equivalent
 NEAR = np.radians(15.0)  # a frame turned less than this from the previous axes is still the same
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def frames_through(first: F64, second: F64) -> F64:
     """(m, 3, 3) rotations whose first columns are the unit vectors `first` (m, 3), and whose second lie in the plane of these and `second` (m, 3),
     which must not be parallel to them."""
@@ -30,7 +30,7 @@ def frames_through(first: F64, second: F64) -> F64:
     return out
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def score_frames(frames: F64, directions: F64, weights: F64, reach: F64) -> F64:
     """(m,) weight of the directions (n, 3) near an axis of each frame (m, 3, 3), falling off with the squared angle to 0 at `reach` (n,) rad (MSAC:
     Torr and Zisserman 2000)."""
@@ -46,7 +46,7 @@ def score_frames(frames: F64, directions: F64, weights: F64, reach: F64) -> F64:
     return out
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def same_axes(frames: F64, R: F64) -> Bool:
     """(m,) whether each axis of R (3, 3) is within `NEAR` of one of the frame (m, 3, 3)."""
     out = np.ones(len(frames), np.bool_)
@@ -59,7 +59,7 @@ def same_axes(frames: F64, R: F64) -> Bool:
     return out
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def best_frame(frames: F64, directions: F64, weights: F64, reach: F64, before: F64, loyalty: float) -> F64:
     """The frame (3, 3) with the highest `score_frames`, named as is nearest to the previous axes `before` (3, 3); frames with the same axes as these
     count `loyalty` times."""

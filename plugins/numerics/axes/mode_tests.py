@@ -10,7 +10,7 @@ from trihedron.pipeline.types import F64, Bool
 NORMALS_PER_SAMPLE = 20.0  # neighbouring normals share pixels and the sensor's errors: so many count as one
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def surface_peaks(axes: F64, normals: F64, count: int, least: float, widest: float, planes: F64) -> Bool:
     """(m,) whether the share `least` of `count` normals stands on each axis (3, m), denser than directions without order would (mean square below
     `widest`) or beside planes with that share of the image. A plane is a row of (p, 5): its normal, the cosine of its reach, its share."""
@@ -23,7 +23,7 @@ def surface_peaks(axes: F64, normals: F64, count: int, least: float, widest: flo
     return peaks
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def line_peaks(directions: F64, length: F64, axes: F64, lines: F64, number: int, share: float, widest: float, cone: float) -> Bool:
     """(m,) whether `number` lines with `share` of the length of all stand on each axis (3, m), and on the axes together more than lines (n, 3), drawn
     any way on one wall would.
@@ -47,14 +47,14 @@ def line_peaks(directions: F64, length: F64, axes: F64, lines: F64, number: int,
     return peaks
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def by_chance(mean_square: float, cone: float, per_reach: float, length: F64) -> float:
     """The length that lines (n,) without order have within reach of an axis, give or take 3 sigma; reach is 3 standard deviations of those on it."""
     share = per_reach * min(max(3.0 * np.sqrt(mean_square), np.radians(2.0)), cone)
     return share * length.sum() + 3.0 * np.sqrt(share * (1.0 - share) * (length * length).sum())
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def perpendicular(axes: F64, normals: F64, lines: F64, skew: float) -> Bool:
     """(m, m) whether two modes (3, m) are within `skew` of a right angle, as far as their own uncertainty can tell."""
     count = len(normals)
@@ -70,7 +70,7 @@ def perpendicular(axes: F64, normals: F64, lines: F64, skew: float) -> Bool:
     return fits
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def largest_fitting(peaks: Bool, fits: Bool, weights: F64) -> Bool:
     """(3,) the most, and of those the heaviest, of three peaks that fit each other."""
     best, rank = np.zeros(3, np.bool_), 0.0

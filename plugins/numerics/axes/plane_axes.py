@@ -22,7 +22,7 @@ class Walls(NamedTuple):
     area: F64  # (n,) px
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def known_walls(planes: F64, covariance: F64, pixels: I32, floor: float) -> Walls:
     """Of planes (n, 4) with `covariance` (n, 3, 3) of (a, b, d) those whose normals are known; `floor` (rad) is added in square."""
     spatial = normal_covariance(planes, covariance, floor)
@@ -33,7 +33,7 @@ def known_walls(planes: F64, covariance: F64, pixels: I32, floor: float) -> Wall
     return Walls(np.ascontiguousarray(planes[good, :3]), spatial[good], variance[good], pixels[good].astype(np.float64))
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def perpendicular_pair(walls: Walls, max_cos: float, largest_cos: float, reach: float, before: F64, loyalty: float) -> tuple[bool, F64]:
     """Whether two walls stand at right angles (`max_cos` and twice their uncertainty, at most `largest_cos`), and the rotation through the pair that
     explains most area within `reach`, see `best_frame`."""
@@ -53,7 +53,7 @@ def perpendicular_pair(walls: Walls, max_cos: float, largest_cos: float, reach: 
     return True, best_frame(frames, walls.normals, walls.area, np.full(n, reach), before, loyalty)
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def area_on_axes(walls: Walls, R: F64, reach: float) -> F64:
     """(3,) of the walls within `reach` of each column of R."""
     out, axes = np.zeros(3), assign_axes(walls.normals, R, reach)
@@ -63,7 +63,7 @@ def area_on_axes(walls: Walls, R: F64, reach: float) -> F64:
     return out
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def settled(walls: Walls, R: F64, reach: float, gate: float, prior: float, rounds: int) -> tuple[F64, I32, F64]:
     """From R the rotation nearest to the walls within `reach` of its axes, again with new axes and with Cauchy weights, one half at `gate` σ: the
     rotation, the axis of each wall (n,), -1 for none, and its weight (n,), 1/rad²."""

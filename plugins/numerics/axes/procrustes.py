@@ -9,14 +9,14 @@ from trihedron.pipeline.types import F64, I32
 from trihedron.plugins.numerics.algebra.small_linear import fill_tangent_basis, inverse_positive, polar_rotation
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def procrustes(directions: F64, weights: F64, axes: I32, R: F64, prior: float) -> F64:
     """`argmin Σ w |±n − R e|² + prior/2 Σ |R_before e − R e|²` over rotations (3, 3): directions n (n, 3) with weights (n,), each on the column
     `axes[i]` of R, signs as R has them; -1 takes no part. The small prior keeps what no direction tells."""
     return polar_rotation(0.5 * prior * R + _sums(directions, weights, axes, R))
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def procrustes_covariance(covariance: F64, weights: F64, axes: I32, R: F64, prior: float, scale: float) -> F64:
     """(3, 3) of phi in `R <- Exp(phi) R` for R from `procrustes`, when the directions have the 3D covariance C (n, 3, 3), which need not be that of
     the weights: `A⁻¹ (scale Σ w² [a]× C [a]×ᵀ + prior) A⁻¹` with `A = Σ w (1 − a aᵀ) + prior` and a the axis of each."""
@@ -30,7 +30,7 @@ def procrustes_covariance(covariance: F64, weights: F64, axes: I32, R: F64, prio
     return 0.5 * (out + out.T)
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def normal_covariance(planes: F64, covariance: F64, floor: float) -> F64:
     """(n, 3, 3) covariance in 3D, rad², of the normals of planes (n, 4) with `covariance` (n, 3, 3) of (a, b, d), see `types.Planes`; `floor` (rad)
     is added in square."""
@@ -45,7 +45,7 @@ def normal_covariance(planes: F64, covariance: F64, floor: float) -> F64:
     return out
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def square_angles(directions: F64, axes: I32, R: F64) -> F64:
     """(n,) squared sine of the angle between each direction and its column of R; 0 without one."""
     out = np.zeros(len(directions))
@@ -57,7 +57,7 @@ def square_angles(directions: F64, axes: I32, R: F64) -> F64:
     return out
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def inliers_and_spread(square: F64, axes: I32, weights: F64) -> tuple[I32, F64]:
     """(3,) number of the directions on each axis, and their root mean square angle, rad, by weight; NaN on an axis without. `square` from
     `square_angles`."""
@@ -70,7 +70,7 @@ def inliers_and_spread(square: F64, axes: I32, weights: F64) -> tuple[I32, F64]:
     return counts, np.where(sums[0] > 0.0, np.sqrt(sums[1] / np.maximum(sums[0], 1e-300)), np.nan)
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _sums(directions: F64, weights: F64, axes: I32, R: F64) -> F64:
     """(3, 3) `Σ w ±n eᵀ`."""
     M = np.zeros((3, 3))
@@ -84,7 +84,7 @@ def _sums(directions: F64, weights: F64, axes: I32, R: F64) -> F64:
     return M
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _normal_equations(covariance: F64, weights: F64, axes: I32, R: F64) -> tuple[F64, F64]:
     """(3, 3) `Σ w (1 − a aᵀ)` and (3, 3) `Σ w² [a]× C [a]×ᵀ`."""
     A, B, row = np.zeros((3, 3)), np.zeros((3, 3)), np.zeros((3, 3))

@@ -95,7 +95,7 @@ def _usable(vectors: F64, weights: F64) -> tuple[F64, F64]:
     return vectors[good] / length[good, None], weights[good]
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _image(vectors: F64, weights: F64, grid: SphereGrid, cones: Neighbours, inlier: float) -> F64:
     """(cells,) upper bound of the consensus of one axis anywhere in a cell: directions count by their angle to the cell, not to its centre."""
     out, face, steep = np.zeros(len(grid.radii)), int(np.sqrt(len(grid.radii) / 3.0) + 0.5), 1.0 / np.sin(inlier) ** 2
@@ -114,7 +114,7 @@ def _image(vectors: F64, weights: F64, grid: SphereGrid, cones: Neighbours, inli
     return out
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _look_up(values: F64, R: F64) -> float:
     """Sum of a map over the cells in which the axes of R lie."""
     face, total = int(np.sqrt(len(values) / 3.0) + 0.5), 0.0
@@ -123,7 +123,7 @@ def _look_up(values: F64, R: F64) -> float:
     return total
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def angle_to_equivalent(R: F64, Q: F64) -> float:
     """Angle between R and the nearest of the 24 equivalents of Q, exact when below 45° and else at least that."""
     trace = 0.0
@@ -135,7 +135,7 @@ def angle_to_equivalent(R: F64, Q: F64) -> float:
     return np.arccos(min(max(0.5 * (trace - 1.0), -1.0), 1.0))
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _split(cubes: F64, half: float) -> F64:
     """Centres (8 n, 3) of the eighths of cubes (n, 3), `half` being the half side of the eighths."""
     out = np.empty((8 * len(cubes), 3))
@@ -145,7 +145,7 @@ def _split(cubes: F64, half: float) -> F64:
     return out
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _first_cubes() -> F64:
     cubes, half = np.zeros((1, 3)), HALF_WIDTH
     while len(cubes) < FIRST**3:
@@ -154,7 +154,7 @@ def _first_cubes() -> F64:
     return cubes
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _centre(cube: F64, start: F64, R: F64) -> None:
     """Write the rotation in the middle of a cube, `R_start Exp(v)`, to R."""
     for k in range(9):
@@ -165,7 +165,7 @@ def _centre(cube: F64, start: F64, R: F64) -> None:
             R[i, j], R[j, i] = R[j, i], R[i, j]
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _bounds(groups: Groups, maps: Maps, cubes: F64, level: int, radius: float, start: F64, inlier: float, best: float) -> tuple[F64, F64]:
     """For each cube an upper bound of its consensus, and the consensus of its centre: -1 when the bound is not above `best`, on the map's levels a
     guess."""
@@ -183,7 +183,7 @@ def _bounds(groups: Groups, maps: Maps, cubes: F64, level: int, radius: float, s
     return uppers, values
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _climb_promising(groups: Groups, cubes: F64, values: F64, start: F64, inlier: float, top: F64, best: float, exact: bool) -> tuple[F64, float]:
     """The best summit: `top` or that of a slope on which one of the most promising centres is. `values` is used up."""
     R = np.empty((3, 3))
@@ -203,7 +203,7 @@ def _climb_promising(groups: Groups, cubes: F64, values: F64, start: F64, inlier
     return top, best
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _search(
     groups: Groups, maps: Maps, start: F64, inlier: float, certificate: float, slack: float, max_cubes: int
 ) -> tuple[F64, float, float, int, int]:

@@ -50,7 +50,7 @@ def _on_faces(u: F64, v: F64) -> F64:
     return out.reshape(-1, 3)
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def cell_of(x: float, y: float, z: float, n: int) -> int:
     """The cell of a direction, which may have any length but 0."""
     if abs(x) >= abs(y) and abs(x) >= abs(z):
@@ -63,7 +63,7 @@ def cell_of(x: float, y: float, z: float, n: int) -> int:
     return (face * n + i) * n + j
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def neighbours(grid: SphereGrid, reach: float) -> Neighbours:
     """For each cell those with a point within `reach` (rad) of one of its own."""
     centres, radii = grid
@@ -88,7 +88,7 @@ def neighbours(grid: SphereGrid, reach: float) -> Neighbours:
     return Neighbours(first, cells)
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def largest_near(values: F64, near: Neighbours) -> F64:
     """For each cell the largest of `values` (cells,) on its neighbours."""
     out = np.empty(len(values))
@@ -100,7 +100,7 @@ def largest_near(values: F64, near: Neighbours) -> F64:
     return out
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def coarser(values: F64, n: int) -> F64:
     """The largest of each 2 by 2 cells: values on the grid of n / 2, n being even."""
     half = n // 2

@@ -16,7 +16,7 @@ BINS = 90  # one degree each, of a quarter turn
 ROWS_APART = 4  # of those in which valid normals are counted
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def subsample_normals(normals: F32, most: int) -> F64:
     """At most `most` of the finite normals of a grid (h, w, 3), on a regular sub-grid: (n, 3)."""
     h, w = normals.shape[:2]
@@ -36,7 +36,7 @@ def subsample_normals(normals: F32, most: int) -> F64:
     return out[:n]
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def shift_axes(directions: F64, weights: F64, axes: F64, cone: float, bandwidth: float, iterations: int, tolerance: float) -> F64:
     """Move each of m axes (3, m) to the Gaussian-weighted mean of the directions within `cone` (rad) of it, in its tangent plane, until none moves by
     more than `tolerance` (rad). A direction goes to its nearest axis only; an axis without directions stays. Returns the axes (Zhou et al. 2016)."""
@@ -76,7 +76,7 @@ def shift_axes(directions: F64, weights: F64, axes: F64, cone: float, bandwidth:
     return axes
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _across(x: float, y: float, z: float) -> tuple[float, float, float, float, float, float]:
     """Two unit vectors at right angles to the unit vector (x, y, z) and to each other."""
     if abs(x) < 0.7:
@@ -88,7 +88,7 @@ def _across(x: float, y: float, z: float) -> tuple[float, float, float, float, f
     return u[0], u[1], u[2], y * u[2] - z * u[1], z * u[0] - x * u[2], x * u[1] - y * u[0]
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def mode_statistics(directions: F64, weights: F64, axes: F64, cone: float) -> F64:
     """(m, 4) for each of m axes (3, m): number and weight of the directions within the cone which have none nearer, their mean squared angle (rad²),
     and the mean square of its component across the axis where that is largest. Without order the latter is cone² / 4, and cone² / 3 when all
@@ -120,7 +120,7 @@ def mode_statistics(directions: F64, weights: F64, axes: F64, cone: float) -> F6
     return out
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def density(directions: F64, weights: F64, axes: F64, bandwidth: float) -> float:
     """Sum of the weights, each times a Gaussian of the angle to its nearest axis."""
     total = 0.0
@@ -132,14 +132,14 @@ def density(directions: F64, weights: F64, axes: F64, bandwidth: float) -> float
     return total
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def orthonormal(axes: F64, weights: F64) -> F64:
     """The rotation nearest to three axes, each counting by its weight: the rotation in `Σ w_k a_k e_kᵀ`. An axis of weight 0
     becomes the cross product of the others; with fewer than two weights the remaining turn is arbitrary."""
     return polar_rotation(axes * weights)
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def right_handed(first: F64) -> F64:
     """(3, 3) rotation whose first column is the unit vector `first`."""
     across = _across(first[0], first[1], first[2])
@@ -149,7 +149,7 @@ def right_handed(first: F64) -> F64:
     return out
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _mass(directions: F64, weights: F64, starts: F64, cone: float) -> F64:
     """(m,) weight of the directions within the cone of each start, falling off towards its rim."""
     mass, floor = np.zeros(len(starts)), np.cos(cone)
@@ -161,7 +161,7 @@ def _mass(directions: F64, weights: F64, starts: F64, cone: float) -> F64:
     return mass
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def densest(directions: F64, weights: F64, starts: F64, cone: float, count: int) -> F64:
     """Of `starts` (m, 3) those with most weight within the cone, at least two cones apart; at most `count`, heaviest first."""
     mass, chosen, apart = _mass(directions, weights, starts, cone), np.empty((count, 3)), np.cos(2.0 * cone)
@@ -176,7 +176,7 @@ def densest(directions: F64, weights: F64, starts: F64, cone: float, count: int)
     return chosen
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _histogram(directions: F64, weights: F64, frame: F64, cone: float) -> F64:
     """(BINS,) weight of the directions normal to the first column of `frame` by their turn from its second to its third, modulo a quarter turn."""
     histogram, limit = np.zeros(BINS), np.sin(cone)
@@ -188,7 +188,7 @@ def _histogram(directions: F64, weights: F64, frame: F64, cone: float) -> F64:
     return histogram
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _quarter_turns(histogram: F64, count: int) -> F64:
     """(count,) the fullest turns (rad, modulo a quarter turn), 10° apart."""
     smooth, turns = np.zeros(BINS), np.empty(count)
@@ -203,7 +203,7 @@ def _quarter_turns(histogram: F64, count: int) -> F64:
     return turns
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def search_axes(directions: F64, weights: F64, starts: F64, cone: float, bandwidth: float, primaries: int, turns: int) -> F64:
     """The three orthogonal axes of greatest density, from nothing: each of the `primaries` densest directions with its `turns` fullest turns about it
     is refined and compared. `starts` (m, 3) are directions spread over the half sphere, less than a cone apart. (3, 3) rotation."""
@@ -225,7 +225,7 @@ def search_axes(directions: F64, weights: F64, starts: F64, cone: float, bandwid
     return found
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def assign_axes(directions: F64, R: F64, cone: float) -> I32:
     """(n,) column of R (3, m) nearest to each direction, antipodes being one; -1 further than `cone` (rad) from all, or NaN."""
     out = np.full(len(directions), -1, np.int32)
@@ -238,7 +238,7 @@ def assign_axes(directions: F64, R: F64, cone: float) -> I32:
     return out
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def fit_rotation(directions: F64, information: F64, axes: I32, counted: int, R: F64, gate: float, iterations: int) -> tuple[F64, F64, float, float]:
     """Rotation whose columns `axes[i]` best fit measured directions (n, 3), signs free; rows with axis -1 take no part. `information` is (n, 3, 3) in
     1/rad², zero along the direction. Gauss–Newton on `R <- Exp(phi) R` with Cauchy weights, one half at `gate` σ. Returns R, the information of
@@ -280,7 +280,7 @@ def fit_rotation(directions: F64, information: F64, axes: I32, counted: int, R: 
     return R, H, chi2, components
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _add_cross(a: F64, v: F64, w: float, out: F64) -> None:
     """out += w (a × v)."""
     out[0] += w * (a[1] * v[2] - a[2] * v[1])

@@ -32,7 +32,7 @@ def broad_mixture(R: F64, concentration: float) -> AxisMixture:
     return AxisMixture(np.array(R), np.full((2, 3), concentration), np.full((2, 4), 0.25), np.zeros((2, 3, 3)), none, none)
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def improved(
     mixture: AxisMixture, directions: F64, weights: F64, first_line: int, prior: float, concentration: float, free: bool = False
 ) -> AxisMixture:
@@ -63,7 +63,7 @@ def improved(
     return AxisMixture(R, kappa, share, resultant, sums[:, :, 0].copy(), sums[:, :, 1].copy())
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def converged(
     mixture: AxisMixture,
     directions: F64,
@@ -85,7 +85,7 @@ def converged(
     return mixture
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _belonging(directions: F64, weights: F64, first_line: int, R: F64, concentration: F64, share: F64) -> F64:
     """(2, 3, 6) per population and axis: number, weight, `Σ w (1 − |x·a|)` and `Σ w ±x` of the directions, each as far as it belongs to the axis."""
     out = np.zeros((2, 3, 6))

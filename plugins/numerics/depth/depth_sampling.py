@@ -13,14 +13,14 @@ def noise_coefficients(noise: DepthNoise) -> tuple[float, float, float, float]:
     return float(noise.a_m), float(noise.b), float(noise.c_per_m), float(noise.floor_m)
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def sigma_z(z: float, noise: tuple[float, float, float, float]) -> float:
     """Standard deviation of a depth reading z, metres."""
     a, b, c, floor = noise
     return max(floor, a + b * z + c * z * z)
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def local_depth(
     depth: F32, pixels: F32, radius: int, share: float, noise: tuple[float, float, float, float], gate: float, edge: float
 ) -> tuple[F32, F32]:
@@ -49,7 +49,7 @@ def local_depth(
     return out, sigma
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _linear_fit(depth: F32, u: float, v: float, radius: int) -> tuple[int, float, float]:
     """Count, value at (u, v) and largest residual of the least-squares linear surface through the neighbourhood's depths."""
     rows, cols = depth.shape
@@ -88,7 +88,7 @@ def _linear_fit(depth: F32, u: float, v: float, radius: int) -> tuple[int, float
     return int(n), z0, worst
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _nearest_mean(depth: F32, u: float, v: float) -> tuple[float, float, float]:
     """Weight, bilinear mean and spread of the (up to four) depths around (u, v)."""
     rows, cols = depth.shape

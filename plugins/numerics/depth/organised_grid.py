@@ -27,7 +27,7 @@ class Grid(NamedTuple):
     normals: F32
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def cell_inverse_depths(
     depth: F32, stride: int, edge: float, edge_m: float, noise: tuple[float, float, float, float]
 ) -> tuple[F32, F32, I32]:
@@ -58,7 +58,7 @@ def cell_inverse_depths(
     return rho, sigma, count
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def cell_rays(h: int, w: int, stride: int, intrinsics: tuple[float, float, float, float]) -> tuple[F64, F64]:
     """x/z of each column (w,) and y/z of each row (h,) at the centres of the cells' blocks."""
     fx, fy, cx, cy = intrinsics
@@ -66,7 +66,7 @@ def cell_rays(h: int, w: int, stride: int, intrinsics: tuple[float, float, float
     return (np.arange(w) * stride + centre - cx) / fx, (np.arange(h) * stride + centre - cy) / fy
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def add_cell(grid: Grid, r: int, c: int, A: F64, b: F64) -> None:
     """Adds a cell's weighted depths to the normal equations of q: A (3, 3), of which only the upper triangle is kept, and b (3,)."""
     x, y, p, s = grid.rays_x[c], grid.rays_y[r], grid.rho[r, c], grid.sigma[r, c]
@@ -82,7 +82,7 @@ def add_cell(grid: Grid, r: int, c: int, A: F64, b: F64) -> None:
     b[2] += weight * p
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def coarser(grid: Grid, edge: float, edge_m: float) -> Grid:
     """The grid of 2 × 2 cells: mean inverse depth and mean normal of those that have one, none across a step of more than `edge` z + `edge_m`."""
     rho, sigma, count, rays_x, rays_y, normals = grid
@@ -116,7 +116,7 @@ def coarser(grid: Grid, edge: float, edge_m: float) -> Grid:
     return Grid(rho2, sigma2, count2, x2, y2, normals2)
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def smooth_links(grid: Grid, cos_angle: float, gate: float) -> U8:
     """(h, w) bits: 1 = the cell lies on one smooth surface with its left neighbour, 2 = with the upper one.
 
@@ -151,7 +151,7 @@ def smooth_links(grid: Grid, cos_angle: float, gate: float) -> U8:
     return links
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _root(parent: I32, i: int) -> int:
     while parent[i] != i:
         parent[i] = parent[parent[i]]
@@ -159,7 +159,7 @@ def _root(parent: I32, i: int) -> int:
     return i
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def connected_components(links: U8, free: Bool) -> I32:
     """Component number of each cell (h, w), the number of its first cell; -1 for cells that are not `free`. `links` as from `smooth_links`."""
     h, w = links.shape
@@ -186,7 +186,7 @@ def connected_components(links: U8, free: Bool) -> I32:
     return parent.reshape(h, w)
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def cells_by_component(component: I32, least: int) -> tuple[I32, I32]:
     """Flat cell numbers grouped by component, for components of `least` cells or more, largest first; and the (k + 1,) starts of the groups."""
     flat = component.ravel()

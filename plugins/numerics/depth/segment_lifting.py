@@ -15,7 +15,7 @@ from trihedron.plugins.numerics.depth.depth_sampling import sigma_z
 STRATA = 8  # hypotheses come from every pair of 8 stretches of the segment: 28 of them, no randomness
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def lift_segments(
     depth: F32,
     endpoints_px: F32,
@@ -82,7 +82,7 @@ def lift_segments(
     return points, covariance
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _point_covariance(rx: float, ry: float, z: float, along: float, across: float, out: F32) -> None:
     """Covariance of the point z (rx, ry, 1): variance `along` of z on the ray, `across` in each direction normal to it."""
     ray = (rx, ry, 1.0)
@@ -92,7 +92,7 @@ def _point_covariance(rx: float, ry: float, z: float, along: float, across: floa
             out[j, k] = ray[j] * ray[k] * (along - across / norm2) + (across if j == k else 0.0)
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _depth_at(depth: F32, x: float, y: float) -> float:
     """Depth of the nearest pixel; 0 outside and where there is none."""
     c, r = int(np.rint(x)), int(np.rint(y))
@@ -102,7 +102,7 @@ def _depth_at(depth: F32, x: float, y: float) -> float:
     return z if 0.0 < z < np.inf else 0.0
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _sample(
     depth: F32, x: float, y: float, ux: float, uy: float, reach: int, noise: tuple[float, float, float, float], gate: float, edge: float
 ) -> tuple[float, float, float]:
@@ -123,7 +123,7 @@ def _sample(
     return z, np.sqrt(s * s + ((0.5 + 0.5 * abs(offset)) * slope) ** 2), shift
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _interpolated(depth: F32, x: float, y: float) -> tuple[bool, float, float]:
     """Whether the four depths around (x, y) exist, their bilinear value, and their spread."""
     c, r = np.floor(x), np.floor(y)
@@ -136,7 +136,7 @@ def _interpolated(depth: F32, x: float, y: float) -> tuple[bool, float, float]:
     return True, (a * (1.0 - u) + b * u) * (1.0 - v) + (d * (1.0 - u) + e * u) * v, max(max(a, b), max(d, e)) - low
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _nearer_surface(
     depth: F32, x: float, y: float, nx: float, ny: float, reach: int, noise: tuple[float, float, float, float], gate: float, edge: float
 ) -> tuple[float, int, float]:
@@ -165,7 +165,7 @@ def _nearer_surface(
     return best, best_offset, best_slope
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _best_line(t: F64, rho: F64, sigma: F64, gate: float) -> tuple[float, float, int]:
     """The line rho = a + b t with most samples within `gate` sigma, of those through the medians of two stretches of the segment."""
     n = len(t)
@@ -190,7 +190,7 @@ def _best_line(t: F64, rho: F64, sigma: F64, gate: float) -> tuple[float, float,
     return best_a, best_b, best
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _median_place(values: F64) -> int:
     """Index of the (upper) median of a handful of values, the first of equals."""
     n = len(values)
@@ -204,7 +204,7 @@ def _median_place(values: F64) -> int:
     return 0
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _refit(t: F64, rho: F64, sigma: F64, a: float, b: float, gate: float, inlier: Bool) -> tuple[float, float, int, tuple[float, float, float]]:
     """Weighted least squares on the inliers of (a, b), twice; marks the inliers and returns (a, b), their number and the covariance (aa, ab, bb)."""
     found = 0

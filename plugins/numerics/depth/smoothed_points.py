@@ -9,7 +9,7 @@ import numpy as np
 from trihedron.pipeline.types import F32, F64, I32, U8
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def smooth_cells(rho: F32, count: I32, full: int, jump: float, jump_m: float) -> U8:
     """(h, w) 1 where a cell's inverse depth rho is that of its centre, because all its `full` readings are there, and no neighbour in its row or
     column differs from it by more than `jump` z + `jump_m`."""
@@ -33,7 +33,7 @@ def clearance(smooth: U8) -> F32:
     return np.asarray(cv2.distanceTransform(smooth, cv2.DIST_C, 3), np.float32)
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def smoothed_points(rho: F32, clear: F32, radii: I32, rays_x: F64, rays_y: F64) -> F64:
     """(h, w, 4) points of the cells, inverse depth averaged over a square around each; NaN where there is none, the last number is 0.
 
@@ -61,7 +61,7 @@ def smoothed_points(rho: F32, clear: F32, radii: I32, rays_x: F64, rays_y: F64) 
     return out
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def trusted_normals(normals: F64, rho: F32, clear: F32, radii: I32, reach: int, border: int, rays_x: F64, rays_y: F64) -> F32:
     """(h, w, 3) the first three of (h, w, 4) numbers, turned towards the camera; NaN where they are no direction, within `border` cells of the
     image's border or `reach` of a cell that is not smooth, or where either left less than half of the square of `smoothed_points`."""

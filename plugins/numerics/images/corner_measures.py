@@ -12,7 +12,7 @@ BLOCK = 3  # half side of the window of gradients
 PATCH = 15  # radius of the disc the orientation is taken from (Rublee et al., ICCV 2011)
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def harris_scores(image: U8, corners: I32) -> F32:
     """(n,) Harris measure `det - k trace²` of the gradients (Sobel) in the 7 × 7 window around (n, 2) pixels (x, y).
 
@@ -39,7 +39,7 @@ def harris_scores(image: U8, corners: I32) -> F32:
     return out
 
 
-@numba.njit(cache=True, nogil=True, fastmath={"reassoc"})  # the sums are of small integers: exact in any order
+@numba.njit(cache=True, nogil=True, error_model="numpy", fastmath={"reassoc"})  # the sums are of small integers: exact in any order
 def centroid_angles_deg(image: U8, corners: I32) -> F32:
     """(n,) direction from each (n, 2) pixel to the intensity centroid of the disc around it, degrees in [0, 360), x right and y down."""
     rows, cols = image.shape

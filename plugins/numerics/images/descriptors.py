@@ -91,7 +91,7 @@ def words_of(descriptors: U8) -> tuple[U64, U8]:
     return padded.view(np.uint64).reshape(len(rows), padded.shape[1] // 8), rows
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def hamming(a: U64, b: U64) -> int:
     """Number of differing bits of two rows of words."""
     total = np.uint64(0)
@@ -104,7 +104,7 @@ def hamming(a: U64, b: U64) -> int:
     return int(total)
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _euclidean(a: U8, b: U8) -> float:
     total = 0
     for k in range(len(a)):
@@ -113,7 +113,7 @@ def _euclidean(a: U8, b: U8) -> float:
     return float(np.sqrt(total))
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _buckets(px: F32, cell: float, cols: int, rows: int, x0: float, y0: float) -> tuple[I32, I32]:
     """Counting sort of points into a grid: (cols·rows + 1,) starts and the row numbers in cell order; points with NaN are left out."""
     start = np.zeros(cols * rows + 1, np.int32)
@@ -133,7 +133,7 @@ def _buckets(px: F32, cell: float, cols: int, rows: int, x0: float, y0: float) -
     return start, order
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _bounds(px: F32) -> tuple[float, float, float, float]:
     """Smallest and largest finite x, y; (0, 0, -1, -1) when there is none."""
     x0, y0, x1, y1 = np.inf, np.inf, -np.inf, -np.inf
@@ -144,7 +144,7 @@ def _bounds(px: F32) -> tuple[float, float, float, float]:
     return (x0, y0, x1, y1) if x1 >= x0 else (0.0, 0.0, -1.0, -1.0)
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _match_near(
     qpx: F32, qwords: U64, qbytes: U8, qoct: U8, tpx: F32, twords: U64, tbytes: U8, toct: U8,
     radius: F32, step: int, mode: int, limit: float, ratio: float,
@@ -194,7 +194,7 @@ def _match_near(
     return out
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _directions(segments: F32) -> F64:
     """(n, 5): middle x, y, direction x, y, length; NaN for a segment without length or with NaN."""
     out = np.full((len(segments), 5), np.nan)
@@ -207,7 +207,7 @@ def _directions(segments: F32) -> F64:
     return out
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _beside(q: F64, t: F64) -> tuple[float, float]:
     """Offset (px) beside q in the middle of the overlap, and overlap as a share of the shorter segment (negative: apart)."""
     mx, my = t[0] - q[0], t[1] - q[1]
@@ -219,7 +219,7 @@ def _beside(q: F64, t: F64) -> tuple[float, float]:
     return abs(beside + (0.5 * (low + high) - along) * slope), (high - low) / min(q[4], t[4])
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _match_lines(
     query: F32, qwords: U64, train: F32, twords: U64, sine_max: float, offset_px: float, overlap_min: float, mode: int, limit: float, ratio: float
 ) -> I32:
@@ -254,7 +254,7 @@ def _match_lines(
     return out
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _ambiguous(t: F64, cost: F64, best: int, ratio: float) -> bool:
     """Whether another edge (not a collinear piece of the best one) is nearly as similar."""
     for j in range(len(t)):

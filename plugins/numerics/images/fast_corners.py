@@ -10,7 +10,7 @@ from trihedron.pipeline.types import I32, U8
 RADIUS = 3  # px of the circle compared with
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def fast_corners(image: U8, threshold: int, margin: int) -> tuple[I32, I32]:
     """FAST-9 corners (Rosten & Drummond, ECCV 2006) of an image (h, w), in rows: pixels (n, 2) and strengths (n,).
 
@@ -39,7 +39,7 @@ def fast_corners(image: U8, threshold: int, margin: int) -> tuple[I32, I32]:
     return pixels[:n].copy(), strengths[:n].copy()
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _strengths(image: U8, y: int, first: int, out: U8) -> None:
     """Writes the strength of a row's pixels from column `first`: (width,). Straight bytes, so that the compiler takes 32 pixels at a time."""
     left, right = first - RADIUS, first + len(out) + RADIUS
@@ -61,7 +61,7 @@ def _strengths(image: U8, y: int, first: int, out: U8) -> None:
         out[i] = np.uint8(max(more, np.uint8(1)) - 1)
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _arc(
     p0: int, p1: int, p2: int, p3: int, p4: int, p5: int, p6: int, p7: int,
     p8: int, p9: int, p10: int, p11: int, p12: int, p13: int, p14: int, p15: int,
@@ -84,7 +84,7 @@ def _arc(
     return max(max(max(r0, r2), max(r4, r6)), max(max(r8, r10), max(r12, r14)))
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _peaks(above: U8, here: U8, below: U8, threshold: int, out: U8) -> None:
     """Writes into `out` (width,) the strengths of a row that reach the threshold and exceed their eight neighbours', else 0."""
     least = np.uint8(threshold)

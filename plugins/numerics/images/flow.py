@@ -16,7 +16,7 @@ def predict_pixels(pixels: F32, points_m: F32, camera: Camera, R: F64, t: F64) -
     return np.asarray(_predicted(*flat, intrinsics, constant(R, np.float64), constant(t, np.float64)).reshape(pixels.shape))
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _predicted(pixels: F32, points_m: F32, intrinsics: tuple[float, float, float, float], R: F64, t: F64) -> F64:
     """`predict_pixels` of n."""
     fx, fy, cx, cy = intrinsics
@@ -42,7 +42,7 @@ def offset_px(predicted: F64, found: F32) -> F64:
     return np.asarray(np.abs(((predicted - found[:, :1]) * normal[:, None]).sum(axis=2)).mean(axis=1))
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def nearest_pixels(pixels: F32, among: F32) -> tuple[I32, F64]:
     """(n,) rows of the nearest of `among` (m, 2), m > 0, to each of the pixels (n, 2), the first of equals, and their distances (n,), px."""
     rows, distances = np.zeros(len(pixels), np.int32), np.empty(len(pixels))

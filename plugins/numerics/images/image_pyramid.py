@@ -41,14 +41,14 @@ def image_pyramid(gray: U8, scale: float, levels: int, least_px: int) -> Pyramid
     return pyramid
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def level_of(pyramid: Pyramid, level: int) -> U8:
     """(h, w) one level."""
     h, w = pyramid.shapes[level]
     return pyramid.pixels[pyramid.starts[level] : pyramid.starts[level + 1]].reshape((h, w))
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def full_pixels(cells: I32, levels: I32, shapes: I32) -> F64:
     """(n, 2) positions in the full image of pixels (n, 2) of their levels (n,), pixel centres at integers: x is centred at (x + ½) s − ½."""
     out = np.empty((len(cells), 2))

@@ -17,7 +17,7 @@ def band_pairs() -> U8:
     return np.array(pairs[:BYTES], dtype=np.uint8)
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def line_band_descriptors(gradient_x: F32, gradient_y: F32, lines: F32, scale: float, band_px: int, step_px: float, pairs: U8) -> U8:
     """(n, 32) binary descriptors of directed segments (n, 2, 2), from image gradients taken at `scale` of the segments' resolution.
 
@@ -42,7 +42,7 @@ def line_band_descriptors(gradient_x: F32, gradient_y: F32, lines: F32, scale: f
     return out
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _row_sums(gx: F32, gy: F32, x0: float, y0: float, x1: float, y1: float, step_px: float, weights: F64, rows: F64) -> None:
     """Sums along each row parallel to the segment of the gradient's positive and negative parts, across and along it, per sample and
     weighted by the row."""
@@ -67,7 +67,7 @@ def _row_sums(gx: F32, gy: F32, x0: float, y0: float, x1: float, y1: float, step
         rows[r, 0], rows[r, 1], rows[r, 2], rows[r, 3] = weight * a, weight * b, weight * c, weight * d
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _bands(rows: F64, band_px: int, weights: F64) -> F64:
     """(9, 8): mean and standard deviation of the row sums of each band and its neighbours, weighted (3 · band_px,); both parts normalised over the
     line."""

@@ -8,7 +8,7 @@ import numpy as np
 from trihedron.pipeline.types import F32, F64, U8
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def bilinear(image: U8, x: float, y: float) -> float:
     """Grey level at a sub-pixel position; positions outside take the border's."""
     rows, cols = image.shape
@@ -19,7 +19,7 @@ def bilinear(image: U8, x: float, y: float) -> float:
     return top * (1.0 - b) + (image[r + 1, c] * (1.0 - a) + image[r + 1, c + 1] * a) * b
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def merge_collinear(lines: F64, angle: float, offset_px: float, gap_px: float) -> F64:
     """Join directed segments (n, 4) of rows (x0, y0, x1, y1) that continue each other: directions within `angle` rad, ends within `offset_px` of the
     longer one's line, at most `gap_px` apart along it. Returns (m, 4), longest first; ties by position, so the order of the input does not matter."""
@@ -64,7 +64,7 @@ def merge_collinear(lines: F64, angle: float, offset_px: float, gap_px: float) -
     return out[:m][np.argsort(final, kind="mergesort")]
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def refine_on_edge(image: U8, lines: F64, reach_px: int, step_px: float) -> F32:
     """Move directed segments (n, 4) onto the grey-level edge and direct them with the bright side on the right, (n, 2, 2).
 
@@ -101,7 +101,7 @@ def refine_on_edge(image: U8, lines: F64, reach_px: int, step_px: float) -> F32:
     return out
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _edge_across(image: U8, x: float, y: float, nx: float, ny: float, slope: F64) -> tuple[bool, float, float]:
     """Offset along (nx, ny) of the steepest rise, and its slope; False when the steepest is at the end of the reach or there is no rise."""
     reach = len(slope) // 2
@@ -122,7 +122,7 @@ def _edge_across(image: U8, x: float, y: float, nx: float, ny: float, slope: F64
     return True, best - reach + shift, b
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _robust_line(t: F64, o: F64, strength: F64) -> tuple[float, float]:
     """Offset a and slope b of o ≈ a + b t, by least squares reweighted with w = strength / (1 + (r / ½ px)²), starting from the median offset."""
     a, b = np.median(o), 0.0

@@ -21,7 +21,7 @@ class LevelLines(NamedTuple):
     free: U8
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def line_support_segments(image: U8, tolerance: float, quantisation: float, density: float) -> F64:
     """(n, 4) end points (x, y, x, y) of the segments of an image (h, w), pixel centres at integers, strongest seed first.
 
@@ -51,7 +51,7 @@ def line_support_segments(image: U8, tolerance: float, quantisation: float, dens
     return out[:n].copy()
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _level_lines(image: U8, threshold: float) -> LevelLines:
     """Of the gradients over 2 × 2 pixels; the image's border is not free."""
     h, w = image.shape
@@ -71,7 +71,7 @@ def _level_lines(image: U8, threshold: float) -> LevelLines:
     return LevelLines(x.ravel(), y.ravel(), magnitude.ravel(), free.ravel())
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _by_strength(lines: LevelLines) -> I32:
     """Free pixels from the largest gradient to the smallest, in classes of about equal magnitude."""
     magnitude, free = lines.magnitude, lines.free
@@ -91,7 +91,7 @@ def _by_strength(lines: LevelLines) -> I32:
     return order
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _grow(region: I32, seed: int, w: int, cosine: float, lines: LevelLines) -> tuple[int, float, float]:
     """Takes the pixels connected to a seed whose level lines are within an angle of the region's mean; (number, unit vector x, y of the mean)."""
     xs, ys, free = lines.x, lines.y, lines.free
@@ -116,7 +116,7 @@ def _grow(region: I32, seed: int, w: int, cosine: float, lines: LevelLines) -> t
     return size, x / length, y / length
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _fit_rectangle(region: I32, w: int, x: float, y: float, magnitude: F32, out: F64) -> None:
     """Rectangle of a region about its weighted principal axis, directed like (x, y): end points (4), width, share of it that is filled."""
     total, cx, cy = 0.0, 0.0, 0.0
@@ -147,7 +147,7 @@ def _fit_rectangle(region: I32, w: int, x: float, y: float, magnitude: F32, out:
     out[5] = len(region) / (max(last - first, 1.0) * out[4])
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _refine(region: I32, size: int, w: int, x: float, y: float, density: float, lines: LevelLines, rectangle: F64) -> int:
     """Grows a sparse region anew with the tolerance that the level lines about its seed show, then cuts it shorter until it fills its rectangle."""
     sx, sy, turn, square, near = region[0, 0], region[0, 1], 0.0, 0.0, 0

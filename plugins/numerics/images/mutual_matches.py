@@ -22,7 +22,7 @@ def mutual_matches(before: U8, now: U8, metric: str, ratio: float) -> I32:
     return np.stack([kept, forth[kept]], axis=1).astype(np.int32)
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _bits(a: U64, b: U64) -> F32:
     """(n, m) numbers of bits that differ."""
     out = np.empty((len(a), len(b)), np.float32)

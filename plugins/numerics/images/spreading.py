@@ -8,7 +8,7 @@ import numpy as np
 from trihedron.pipeline.types import F32, I32, Bool
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def spread_over_grid(pixels: F32, order: I32, width: int, height: int, cell_px: int, wanted: int) -> Bool:
     """Which of n features to keep, (n,): each grid cell gives its best in turn until `wanted` are kept.
 

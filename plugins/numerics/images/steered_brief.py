@@ -37,7 +37,7 @@ def steered_brief(pyramid: Pyramid, cells: I32, levels: I32, angles_deg: F32, te
     return _described(smooth, cells, levels, angles_deg, tests)
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _described(smooth: Pyramid, cells: I32, levels: I32, angles_deg: F32, tests: F32) -> U8:
     """The tests of `steered_brief` on smoothed levels."""
     out = np.zeros((len(cells), BITS // 8), np.uint8)
@@ -57,7 +57,7 @@ def _described(smooth: Pyramid, cells: I32, levels: I32, angles_deg: F32, tests:
     return out
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _places(x: F32, y: F32, c: float, s: float, width: int, out: I32) -> None:
     """Writes how many pixels after the centre the turned ends (n,) lie, in rows of `width`."""
     for k in range(len(out)):

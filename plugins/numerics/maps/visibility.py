@@ -35,7 +35,7 @@ def visible_points(points: Table, ids: I32, T_world_camera: F64, camera: Camera,
     return VisiblePoints(ids[rows], pixels, depth, octaves)
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _seen(
     points: F64, directions: F32, distances: F32, octaves: U8, T_world_camera: F64, intrinsics: tuple[float, float, float, float, int, int],
     cosine: float, log_scale: float,

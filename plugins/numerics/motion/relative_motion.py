@@ -74,7 +74,7 @@ def solve_motion(terms: Terms, R: F64, sigma_deg: float, sigma_m: float) -> Moti
     return Motion(R, t, np.asarray(np.linalg.inv(H / scale + np.diag(prior)), np.float64), support)
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _residuals(terms: Terms, R: F64, t: F64) -> F64:
     """(n + p,) squared Mahalanobis distances of places and planes."""
     n, p = len(terms.before_m), len(terms.planes_before)
@@ -92,7 +92,7 @@ def _residuals(terms: Terms, R: F64, t: F64) -> F64:
     return out
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _plane_distance(e: F64, L: F64) -> float:
     """eᵀ L e of four numbers."""
     total = 0.0
@@ -102,7 +102,7 @@ def _plane_distance(e: F64, L: F64) -> float:
     return total
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _plane_residual(before: F64, after: F64, R: F64, t: F64, e: F64) -> None:
     """The previous plane moved into the current frame less the current one, (4,)."""
     e[3] = before[3] - after[3]
@@ -112,7 +112,7 @@ def _plane_residual(before: F64, after: F64, R: F64, t: F64, e: F64) -> None:
         e[3] -= n * t[k]
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _add_places(terms: Terms, R: F64, t: F64, scale2: float, H: F64, g: F64) -> tuple[float, float]:
     """Add w JᵀLJ of all places to the lower triangle of H and w JᵀLe to g, with p = R p_previous and J = (-[p]×, I); in scalars, for places are most
     of the work. Returns the weighted χ² and number of components."""
@@ -161,7 +161,7 @@ def _add_places(terms: Terms, R: F64, t: F64, scale2: float, H: F64, g: F64) -> 
     return chi2, components
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _add_plane(e: F64, J: F64, L: F64, w: float, H: F64, g: F64) -> None:
     """Add w JᵀLJ to the lower triangle of H and w JᵀLe to g for J (4, 6)."""
     LJ = np.zeros(6)
@@ -177,7 +177,7 @@ def _add_plane(e: F64, J: F64, L: F64, w: float, H: F64, g: F64) -> None:
                 H[a, b] += J[i, a] * LJ[b]
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _normal_equations(terms: Terms, R: F64, t: F64, scale2: float, H: F64, g: F64) -> tuple[float, float]:
     """Fill H (6, 6) and g (6,) with Geman–McClure weights at the squared scale; returns the weighted χ² and the weighted number of components."""
     H[:], g[:] = 0.0, 0.0
@@ -200,7 +200,7 @@ def _normal_equations(terms: Terms, R: F64, t: F64, scale2: float, H: F64, g: F6
     return chi2, components
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _solve(terms: Terms, R: F64, t: F64, prior: F64, scale2: float) -> tuple[F64, float, float]:
     """Moves R and t, with a prior (6,) information on the way moved; returns H (6, 6), the weighted χ² and the summed weights."""
     H, A, g = np.zeros((6, 6)), np.zeros((6, 6)), np.zeros(6)

@@ -59,7 +59,7 @@ def _off(before: F64, after: F64, R: F64, t: F64) -> F64:
     return np.asarray(np.linalg.norm(before @ R.T + t - after, axis=1))
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _frame(a: F64, b: F64, c: F64, out: F64) -> bool:
     """Axes (columns) that three places span; False when they are too near to each other or to a line."""
     u, v = b - a, c - a
@@ -73,7 +73,7 @@ def _frame(a: F64, b: F64, c: F64, out: F64) -> bool:
     return True
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _best(before: F64, after: F64, reach: F64, samples: I32) -> tuple[F64, F64]:
     best, R_best, t_best = -1, np.eye(3), np.zeros(3)
     A, B, R, t = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3)), np.empty(3)

@@ -38,7 +38,7 @@ def train(bits: U64, words: int, rounds: int) -> U64:
     return vocabulary
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def nearest_words(bits: U64, vocabulary: U64) -> I32:
     """(n,) row of the nearest word of each descriptor, the first of equally near ones."""
     out = np.zeros(len(bits), np.int32)

@@ -126,7 +126,7 @@ def _peaks(values: F64, weights: F64) -> F64:
     return np.array([np.average(values[here], weights=weights[here]) for here in near])
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _explained(
     places: F64, sides: I32, offsets: F64, areas: F64, axes: I32, spans: F64, across: F64, lengths: F64,
     known_sides: I32, known_offsets: F64, known_axes: I32, known_spans: F64, known_across: F64,

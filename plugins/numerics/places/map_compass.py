@@ -93,7 +93,7 @@ def _axes(planes: F64, covariance: F64, views: I32, trueness: Trueness) -> F64 |
     return settled_R
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _turns(vectors: F64, information: F64, places: I32, R_world_manhattan: F64, poses: F64, least_cos: float, gate: float) -> tuple[F64, F64]:
     """(k, 3) and (k, 3, 3), see `Compass`, from world directions (n, 3) with their information, seen at the keyframes `places` (n,).
 

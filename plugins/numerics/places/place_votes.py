@@ -16,7 +16,7 @@ def lookalikes(query: U8, train: U8, max_bits: int, ratio: float) -> I32:
     return _lookalikes(words_of(query)[0], words_of(train)[0], max_bits, ratio)
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _lookalikes(query: U64, train: U64, max_bits: int, ratio: float) -> I32:
     out = np.full(len(query), -1, np.int32)
     for i in range(len(query)):
@@ -82,7 +82,7 @@ def apart(T: F64, other: F64) -> bool:
     return bool(np.linalg.norm(T[:3, 3] - other[:3, 3]) > 0.1 or cosine < np.cos(np.radians(5.0)))
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _consensus(camera_m: F64, world_m: F64, limit: F64, draws: I32) -> tuple[F64, I32]:
     """Pose and number of agreeing pairs of each draw; 0 for one whose triangles differ."""
     poses, support = np.zeros((len(draws), 4, 4)), np.zeros(len(draws), np.int32)

@@ -9,7 +9,7 @@ from trihedron.pipeline.types import F64, I32
 from trihedron.plugins.numerics.planes.plane_blocks import SUMS, block_mse, block_plane
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def cluster_blocks(sums: F64, block_limit: float, limit: float, excess: float, least: float) -> tuple[I32, F64]:
     """Labels (rows, cols) of the blocks, 0 = none, and q (k, 3) of their clusters.
 
@@ -68,7 +68,7 @@ def cluster_blocks(sums: F64, block_limit: float, limit: float, excess: float, l
     return _labelled(parent, finished, flat, rows, cols)
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _labelled(parent: I32, finished: np.ndarray, flat: F64, rows: int, cols: int) -> tuple[I32, F64]:
     """Labels of the blocks and q of the clusters that are finished, in the order of their first blocks."""
     n = rows * cols
@@ -87,7 +87,7 @@ def _labelled(parent: I32, finished: np.ndarray, flat: F64, rows: int, cols: int
     return labels.reshape(rows, cols), planes
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _root(parent: I32, i: int) -> int:
     while parent[i] != i:
         parent[i] = parent[parent[i]]
@@ -95,7 +95,7 @@ def _root(parent: I32, i: int) -> int:
     return i
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _links(closed: np.ndarray, rows: int, cols: int) -> tuple[I32, I32, I32, I32]:
     """Linked lists of each node's neighbours in its row and column: first and last edge of a node, the edge after an edge, and where it leads."""
     n = rows * cols
@@ -117,7 +117,7 @@ def _links(closed: np.ndarray, rows: int, cols: int) -> tuple[I32, I32, I32, I32
     return first, last, following, other
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _unlink(first: I32, last: I32, following: I32, i: int, before: int, edge: int) -> int:
     """Take an edge out of the list of node i; returns the edge before it."""
     if before < 0:
@@ -129,7 +129,7 @@ def _unlink(first: I32, last: I32, following: I32, i: int, before: int, edge: in
     return before
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _append(first: I32, last: I32, following: I32, i: int, j: int) -> None:
     """Hang the list of node j behind that of node i."""
     if first[j] < 0:
@@ -141,7 +141,7 @@ def _append(first: I32, last: I32, following: I32, i: int, j: int) -> None:
     last[i] = last[j]
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _push(heap: F64, size: int, mse: float, i: int, version: int) -> int:
     """Put an entry into the heap (least mse on top, then least number); returns the new size."""
     k = size
@@ -155,7 +155,7 @@ def _push(heap: F64, size: int, mse: float, i: int, version: int) -> int:
     return size + 1
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _pop(heap: F64, size: int) -> int:
     """Take the top off the heap; returns the new size."""
     size -= 1
@@ -172,12 +172,12 @@ def _pop(heap: F64, size: int) -> int:
     return size
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _before(heap: F64, k: int, m: int) -> bool:
     return heap[k, 0] < heap[m, 0] or (heap[k, 0] == heap[m, 0] and heap[k, 1] < heap[m, 1])
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _swap(heap: F64, k: int, m: int) -> None:
     for i in range(3):
         heap[k, i], heap[m, i] = heap[m, i], heap[k, i]

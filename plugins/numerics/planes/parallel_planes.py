@@ -22,7 +22,7 @@ REACH = 2  # cells on each side that distances are averaged over
 ROUNDS = 10  # of two means
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def larger_surface(q: F64, grid: Grid, cells: I32, member: Bool) -> tuple[F64, int, F64]:
     """Of the members of a region with plane q, when they are two parallel surfaces, the larger one: its q and number of members, which alone stay
     marked, and the q of the other. Otherwise all is left as it is, and there is no other (zeros)."""
@@ -49,7 +49,7 @@ def larger_surface(q: F64, grid: Grid, cells: I32, member: Bool) -> tuple[F64, i
     return first, max(one, other), second
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def angle_between(q: F64, normal: F64) -> float:
     """Acute angle (rad) between the normals of two planes, of any length; NaN for no plane or no normal."""
     sine = 0.0
@@ -60,24 +60,28 @@ def angle_between(q: F64, normal: F64) -> float:
     return float(np.arcsin(min(np.sqrt(sine / squares), 1.0))) if squares > 0.0 else np.nan
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _mean_normal(q: F64, grid: Grid, cells: I32, member: Bool) -> F64:
     """Unit mean of the normals of (about SOME of) the members, those across a step left out; NaN without any."""
-    w, step = grid.rho.shape[1], max(len(cells) // SOME, 1)
-    mean, total = -q / np.sqrt(q @ q), np.empty(3)
+    normals, w, step = grid.normals, grid.rho.shape[1], max(len(cells) // SOME, 1)
+    length = np.sqrt(q @ q)
+    x, y, z = -q[0] / length, -q[1] / length, -q[2] / length
     for least in (WIDE, NARROW, NARROW):
-        total[:] = 0.0
+        a, b, c = 0.0, 0.0, 0.0
         for k in range(0, len(cells), step):
             if member[k]:
-                n = grid.normals[cells[k] // w, cells[k] % w]
-                if n[0] * mean[0] + n[1] * mean[1] + n[2] * mean[2] > least:
-                    for j in range(3):
-                        total[j] += n[j]
-        mean = total / np.sqrt(total @ total)
-    return mean
+                row, column = cells[k] // w, cells[k] % w
+                nx, ny, nz = normals[row, column, 0], normals[row, column, 1], normals[row, column, 2]
+                if nx * x + ny * y + nz * z > least:
+                    a += nx
+                    b += ny
+                    c += nz
+        length = np.sqrt(a * a + b * b + c * c)
+        x, y, z = a / length, b / length, c / length
+    return np.array([x, y, z])
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _distances(normal: F64, grid: Grid, cells: I32, member: Bool) -> F64:
     """(n,) how far along the normal the members about each member are from the camera, negative, on average over a square; 0 for the others."""
     w = grid.rho.shape[1]
@@ -102,7 +106,7 @@ def _distances(normal: F64, grid: Grid, cells: I32, member: Bool) -> F64:
     return out
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _box(cells: I32, w: int) -> tuple[int, int, int, int]:
     """Top, left, height and width of the rectangle about cells of a grid of w columns."""
     top, bottom, left, right = cells[0] // w, 0, w, 0
@@ -112,7 +116,7 @@ def _box(cells: I32, w: int) -> tuple[int, int, int, int]:
     return top, left, bottom - top + 1, right - left + 1
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _further(distances: F64, member: Bool) -> Bool:
     """(n,) which members have the further of two distances (two means)."""
     out = np.zeros(len(distances), np.bool_)
@@ -134,7 +138,7 @@ def _further(distances: F64, member: Bool) -> Bool:
     return out
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _fitted(grid: Grid, cells: I32, chosen: Bool) -> F64:
     """q (3,) of the plane through the chosen cells, zeros when there is none."""
     w = grid.rho.shape[1]

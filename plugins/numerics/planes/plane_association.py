@@ -32,7 +32,7 @@ def associate_planes(
     )  # fmt: skip
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def mean_distance(plane: F64, samples: F32) -> float:
     """Mean |n·x + d| over the finite rows of (s, 3) samples; inf without any."""
     total, count = 0.0, 0
@@ -44,7 +44,7 @@ def mean_distance(plane: F64, samples: F32) -> float:
     return total / count if count else np.inf
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _spacing(samples: F32) -> float:
     """Mean distance from a sample to its nearest neighbour, metres; 0 with fewer than two."""
     total, count = 0.0, 0
@@ -59,14 +59,14 @@ def _spacing(samples: F32) -> float:
     return total / count if count else 0.0
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _apart2(a: F32, b: F32) -> float:
     """Squared distance of two points; inf with NaN."""
     squared = (a[0] - b[0]) ** 2 + (a[1] - b[1]) ** 2 + (a[2] - b[2]) ** 2
     return squared if squared >= 0.0 else np.inf
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def overlap(samples_a: F32, samples_b: F32, reach_m: float) -> float:
     """Share of the finite samples of a that have a sample of b within `reach_m`."""
     near, count = 0, 0
@@ -81,7 +81,7 @@ def overlap(samples_a: F32, samples_b: F32, reach_m: float) -> float:
     return near / count if count else 0.0
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _associate(a: F64, samples_a: F32, b: F64, samples_b: F32, cosine: float, limit: float, many_to_one: bool) -> I32:
     n, m = len(a), len(b)
     cost = np.full((n, m), np.inf)

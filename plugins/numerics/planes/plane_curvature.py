@@ -9,7 +9,7 @@ from trihedron.pipeline.types import F32, F64, I32, Bool
 from trihedron.plugins.numerics.depth.organised_grid import Grid
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def linear_turn(C: F64, D: F64, mean_x: F64, mean_n: F64, normal: F64) -> float:
     """Width (rad) of the spread of a region's normals n that is linear in position x, from the means of x xᵀ, n xᵀ, x and n: the part of their
     covariance that a linear map explains, as the width of a uniform spread. Directions the region does not extend in carry no information."""
@@ -22,7 +22,7 @@ def linear_turn(C: F64, D: F64, mean_x: F64, mean_n: F64, normal: F64) -> float:
     return np.sqrt(12.0 * max(np.linalg.eigvalsh(0.5 * (explained + explained.T))[2], 0.0))
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def normals_of_regions(labels: I32, planes: F64, grid: Grid, cos_cone: float, step: int) -> tuple[F64, F64, F64]:
     """What the normals of each region's cells say, (k,) each; those within the cone of the region's own count, in every `step`th row and column.
 
@@ -64,7 +64,7 @@ def normals_of_regions(labels: I32, planes: F64, grid: Grid, cos_cone: float, st
     return turns, biases, facing / np.maximum(cells, 1.0)
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def drop_engulfed(labels: I32, rho: F32, good: Bool, gap: int) -> Bool:
     """`good` (k,) less the regions at least half of whose border, where depth goes on, is within `gap` cells of regions that are not: a strip between
     strips of a curved surface is one of it, though too narrow to show."""

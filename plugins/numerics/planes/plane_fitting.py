@@ -13,7 +13,7 @@ from trihedron.plugins.numerics.planes.plane_curvature import linear_turn
 COARSE = 2000  # cells a component's first plane is estimated from
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def solve_symmetric(A: F64, b: F64) -> tuple[bool, F64]:
     """Solution (3,) of a symmetric positive definite 3 × 3 system by cofactors; False, and zeros, when it is singular."""
     c00, c01, c02 = A[1, 1] * A[2, 2] - A[1, 2] * A[1, 2], A[0, 2] * A[1, 2] - A[0, 1] * A[2, 2], A[0, 1] * A[1, 2] - A[0, 2] * A[1, 1]
@@ -28,7 +28,7 @@ def solve_symmetric(A: F64, b: F64) -> tuple[bool, F64]:
     return True, x
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def fit_components(
     grid: Grid, cells: I32, starts: I32, cone: float, gate: float, curved: float, least: int, labels: I32, planes: F64, found: int
 ) -> int:
@@ -54,7 +54,7 @@ def fit_components(
     return found
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def fit_labelled(grid: Grid, labels: I32, planes: F64, cone: float, gate: float, least: int) -> tuple[I32, F64]:
     """Fit a plane to each labelled region (h, w), starting from its q in `planes` (k, 3), or two where it is two parallel surfaces. Returns the
     labels of the members, and the q, of those that have `least` members by the rules of `fit_cells`, largest first."""
@@ -79,7 +79,7 @@ def fit_labelled(grid: Grid, labels: I32, planes: F64, cone: float, gate: float,
     return out, fitted[:found]
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _fit_component(grid: Grid, component: I32, cos_cone: float, gate: float, member: Bool) -> tuple[F64, int]:
     """q of the plane that most of a component belongs to and its number of members, which are marked; zeros when there is none."""
     some = component[:: max(len(component) // COARSE, 1)].copy()
@@ -87,7 +87,7 @@ def _fit_component(grid: Grid, component: I32, cos_cone: float, gate: float, mem
     return _trimmed(start_plane(normal, grid, some, cos_cone), 0, grid, component, cos_cone, gate, member)
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _trimmed(q: F64, first: int, grid: Grid, component: I32, cos_cone: float, gate: float, member: Bool) -> tuple[F64, int]:
     """Rounds of `fit_cells` with a narrowing gate, the `first` of them left out, on some of the cells and last on all: (q, number of members), which
     are marked."""
@@ -104,37 +104,40 @@ def _trimmed(q: F64, first: int, grid: Grid, component: I32, cos_cone: float, ga
     return q, members
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def dominant_normal(normals: F32, cells: I32, cos_cone: float) -> F64:
     """The commonest direction among the cells' normals: the fullest bin of a coarse grid over (n_x, n_y), then three mean shifts within the cone."""
     count, sums = np.zeros((21, 21), np.int32), np.zeros((21, 21, 3))
     w = normals.shape[1]
     for i in cells:
-        a, b, c = normals[i // w, i % w]
+        r, c = i // w, i % w
+        a, b, d = normals[r, c, 0], normals[r, c, 1], normals[r, c, 2]
         u, v = int(np.rint(10.0 * a)) + 10, int(np.rint(10.0 * b)) + 10
         count[u, v] += 1
         sums[u, v, 0] += a
         sums[u, v, 1] += b
-        sums[u, v, 2] += c
+        sums[u, v, 2] += d
     best = int(np.argmax(count))
     n = sums[best // 21, best % 21]
-    n = n / max(np.sqrt(n @ n), 1e-9)
+    length = max(np.sqrt(n @ n), 1e-9)
+    x, y, z = n[0] / length, n[1] / length, n[2] / length
     for _ in range(3):
-        total = np.zeros(3)
+        p, q, s = 0.0, 0.0, 0.0
         for i in cells:
-            a, b, c = normals[i // w, i % w]
-            if a * n[0] + b * n[1] + c * n[2] > cos_cone:
-                total[0] += a
-                total[1] += b
-                total[2] += c
-        length = np.sqrt(total @ total)
+            r, c = i // w, i % w
+            a, b, d = normals[r, c, 0], normals[r, c, 1], normals[r, c, 2]
+            if a * x + b * y + d * z > cos_cone:
+                p += a
+                q += b
+                s += d
+        length = np.sqrt(p * p + q * q + s * s)
         if length < 1e-9:
             break
-        n = total / length
-    return n
+        x, y, z = p / length, q / length, s / length
+    return np.array([x, y, z])
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def start_plane(normal: F64, grid: Grid, cells: I32, cos_cone: float) -> F64:
     """q of the plane with this normal at the median distance of (at most 400 of) the cells that face its way."""
     rho, rays_x, rays_y, normals = grid.rho, grid.rays_x, grid.rays_y, grid.normals
@@ -153,7 +156,7 @@ def start_plane(normal: F64, grid: Grid, cells: I32, cos_cone: float) -> F64:
     return -normal / d if d > 1e-6 else np.zeros(3)
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def fit_cells(q: F64, grid: Grid, cells: I32, cos_cone: float, gate: float, member: Bool) -> tuple[F64, int]:
     """One round of trimmed weighted least squares: (q, number of members). A cell is a member when its normal is within the cone of q's and its depth
     within `gate` σ of q's; `member` (per entry of `cells`) is written. A degenerate fit returns zeros, and nothing is a member."""
@@ -180,29 +183,31 @@ def fit_cells(q: F64, grid: Grid, cells: I32, cos_cone: float, gate: float, memb
     return q, found
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def turn(q: F64, grid: Grid, cells: I32, member: Bool, step: int) -> float:
     """How far the normals turn across the members (one in `step`), rad: about 0 for a plane whatever its noise, all of the angle seen for a cylinder.
     Members without a normal do not count."""
     rho, rays_x, rays_y, normals = grid.rho, grid.rays_x, grid.rays_y, grid.normals
     w = rho.shape[1]
-    C, D, mean_x, mean_n = np.zeros((3, 3)), np.zeros((3, 3)), np.zeros(3), np.zeros(3)
     m = 0
-    x, n = np.empty(3), np.empty(3)
+    cxx, cxy, cxz, cyy, cyz, czz = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0  # sums of x xᵀ, of n xᵀ, of x and of n
+    dxx, dxy, dxz, dyx, dyy, dyz, dzx, dzy, dzz = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+    sx, sy, sz, tx, ty, tz = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
     for k in range(0, len(cells), step):
         r, c = cells[k] // w, cells[k] % w
         if member[k] and not np.isnan(normals[r, c, 0]):
             z = 1.0 / rho[r, c]
-            x[0], x[1], x[2] = rays_x[c] * z, rays_y[r] * z, z
-            for a in range(3):
-                n[a] = normals[r, c, a]
+            x, y = rays_x[c] * z, rays_y[r] * z
+            nx, ny, nz = float(normals[r, c, 0]), float(normals[r, c, 1]), float(normals[r, c, 2])
             m += 1
-            for a in range(3):
-                mean_x[a] += x[a]
-                mean_n[a] += n[a]
-                for b in range(3):
-                    C[a, b] += x[a] * x[b]
-                    D[a, b] += n[a] * x[b]
+            sx, sy, sz = sx + x, sy + y, sz + z
+            tx, ty, tz = tx + nx, ty + ny, tz + nz
+            cxx, cxy, cxz, cyy, cyz, czz = cxx + x * x, cxy + x * y, cxz + x * z, cyy + y * y, cyz + y * z, czz + z * z
+            dxx, dxy, dxz = dxx + nx * x, dxy + nx * y, dxz + nx * z
+            dyx, dyy, dyz = dyx + ny * x, dyy + ny * y, dyz + ny * z
+            dzx, dzy, dzz = dzx + nz * x, dzy + nz * y, dzz + nz * z
     if m < 3:
         return 0.0
-    return linear_turn(C / m, D / m, mean_x / m, mean_n / m, -q / np.sqrt(q @ q))
+    C = np.array([[cxx, cxy, cxz], [cxy, cyy, cyz], [cxz, cyz, czz]]) / m
+    D = np.array([[dxx, dxy, dxz], [dyx, dyy, dyz], [dzx, dzy, dzz]]) / m
+    return linear_turn(C, D, np.array([sx, sy, sz]) / m, np.array([tx, ty, tz]) / m, -q / np.sqrt(q @ q))

@@ -64,7 +64,7 @@ def onto(samples: F32, planes: F64) -> F32:
     return np.asarray(samples - distance[..., None] * planes[:, None, :3], np.float32)
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def spread(points: F32, count: int) -> F32:
     """(count, 3) of the finite rows of points (n, 3), each the one farthest from those before it; NaN-padded."""
     out = np.full((count, 3), np.nan, np.float32)

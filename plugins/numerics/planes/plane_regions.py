@@ -9,7 +9,7 @@ from trihedron.pipeline.types import F32, F64, I32, U8
 from trihedron.plugins.numerics.depth.organised_grid import Grid
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def grow_regions(labels: I32, planes: F64, grid: Grid, gate: float, reach: int, cos_cone: float) -> I32:
     """Labels (h, w), grown ring by ring into unlabelled cells whose depth is within `gate` σ of the neighbouring region's q; returns a copy.
 
@@ -56,7 +56,7 @@ def grow_regions(labels: I32, planes: F64, grid: Grid, gate: float, reach: int, 
     return out
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _border(labels: I32) -> I32:
     """Flat numbers of the labelled cells beside unlabelled ones."""
     h, w = labels.shape
@@ -76,7 +76,7 @@ def _border(labels: I32) -> I32:
     return out[:n]
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def accumulate(labels: I32, regions: int, grid: Grid) -> tuple[F64, F64, F64, I32]:
     """Sums over each region's cells, weighted by their number of depths: the normal equations of q (k, 3, 3) and (k, 3) with `σ = σ_z / z²`, the
     moments `Σ [x;1][x;1]ᵀ / σ_z²` (k, 4, 4), and the number of depths (k,)."""
@@ -93,26 +93,26 @@ def accumulate(labels: I32, regions: int, grid: Grid) -> tuple[F64, F64, F64, I3
             z = 1.0 / p
             weight = count[r, c] / (float(sigma[r, c]) * sigma[r, c])
             moment = weight * p * p * p * p
-            px, py, s = x * z, y * z, sums[k]
-            s[0] += weight * x * x
-            s[1] += weight * x * y
-            s[2] += weight * x
-            s[3] += weight * y * y
-            s[4] += weight * y
-            s[5] += weight
-            s[6] += weight * x * p
-            s[7] += weight * y * p
-            s[8] += weight * p
-            s[9] += moment * px * px
-            s[10] += moment * px * py
-            s[11] += moment * px * z
-            s[12] += moment * px
-            s[13] += moment * py * py
-            s[14] += moment * py * z
-            s[15] += moment * py
-            s[16] += moment * z * z
-            s[17] += moment * z
-            s[18] += moment
+            px, py = x * z, y * z
+            sums[k, 0] += weight * x * x
+            sums[k, 1] += weight * x * y
+            sums[k, 2] += weight * x
+            sums[k, 3] += weight * y * y
+            sums[k, 4] += weight * y
+            sums[k, 5] += weight
+            sums[k, 6] += weight * x * p
+            sums[k, 7] += weight * y * p
+            sums[k, 8] += weight * p
+            sums[k, 9] += moment * px * px
+            sums[k, 10] += moment * px * py
+            sums[k, 11] += moment * px * z
+            sums[k, 12] += moment * px
+            sums[k, 13] += moment * py * py
+            sums[k, 14] += moment * py * z
+            sums[k, 15] += moment * py
+            sums[k, 16] += moment * z * z
+            sums[k, 17] += moment * z
+            sums[k, 18] += moment
             n[k] += count[r, c]
     A, b, M = np.empty((regions, 3, 3)), sums[1:, 6:9].copy(), np.empty((regions, 4, 4))
     for k in range(regions):
@@ -121,7 +121,7 @@ def accumulate(labels: I32, regions: int, grid: Grid) -> tuple[F64, F64, F64, I3
     return A, b, M, n[1:].copy()
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _symmetric(upper: F64, out: F64) -> None:
     """Fill a square matrix from its upper triangle, row by row."""
     k = 0
@@ -131,7 +131,7 @@ def _symmetric(upper: F64, out: F64) -> None:
             k += 1
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def areas(labels: I32, count: I32, regions: int) -> I32:
     """(k,) number of depths in each region's cells."""
     out = np.zeros(regions + 1, np.int32)
@@ -141,7 +141,7 @@ def areas(labels: I32, count: I32, regions: int) -> I32:
     return out[1:]
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def spread_samples(labels: U8, planes: F64, rays_x: F64, rays_y: F64, wanted: int, most: int) -> F32:
     """(k, wanted, 3) points of each plane, on its q and spread over its region by farthest-point choice among (about) `most` cells; NaN-padded."""
     regions = len(planes)
@@ -151,7 +151,7 @@ def spread_samples(labels: U8, planes: F64, rays_x: F64, rays_y: F64, wanted: in
         for c in range(w):
             size[labels[r, c]] += 1
     out = np.full((regions, wanted, 3), np.nan, np.float32)
-    points, used, seen = np.empty((regions, most + 1, 3)), np.zeros(regions, np.int32), np.zeros(regions, np.int32)
+    points, used, seen = np.empty((regions, 3, most + 1)), np.zeros(regions, np.int32), np.zeros(regions, np.int32)
     for r in range(h):
         for c in range(w):
             k = labels[r, c] - 1
@@ -162,31 +162,32 @@ def spread_samples(labels: U8, planes: F64, rays_x: F64, rays_y: F64, wanted: in
                 continue
             p = planes[k, 0] * rays_x[c] + planes[k, 1] * rays_y[r] + planes[k, 2]
             if p > 1e-6:
-                points[k, used[k], 0], points[k, used[k], 1], points[k, used[k], 2] = rays_x[c] / p, rays_y[r] / p, 1.0 / p
+                points[k, 0, used[k]], points[k, 1, used[k]], points[k, 2, used[k]] = rays_x[c] / p, rays_y[r] / p, 1.0 / p
                 used[k] += 1
     for k in range(regions):
-        _farthest_points(points[k, : used[k]], out[k])
+        _farthest_points(points[k, 0, : used[k]], points[k, 1, : used[k]], points[k, 2, : used[k]], out[k])
     return out
 
 
-@numba.njit(cache=True, nogil=True)
-def _farthest_points(points: F64, out: F32) -> None:
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _farthest_points(xs: F64, ys: F64, zs: F64, out: F32) -> None:
     """Fill the rows of `out`, each the point farthest from those before it, beginning at the middle of the list."""
-    n = len(points)
+    n = len(xs)
     distance = np.full(n, np.inf)
     chosen = n // 2
     for k in range(min(n, len(out))):
-        x, y, z = points[chosen]
+        x, y, z = xs[chosen], ys[chosen], zs[chosen]
         out[k, 0], out[k, 1], out[k, 2] = x, y, z
+        for i in range(n):
+            e = (xs[i] - x) ** 2 + (ys[i] - y) ** 2 + (zs[i] - z) ** 2
+            distance[i] = min(distance[i], e)
         best = -1.0
         for i in range(n):
-            e = (points[i, 0] - x) ** 2 + (points[i, 1] - y) ** 2 + (points[i, 2] - z) ** 2
-            distance[i] = min(distance[i], e)
             if distance[i] > best:
                 best, chosen = distance[i], i
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def excess_variance(labels: I32, planes: F64, grid: Grid, tiles: int, expected: float, weight: float) -> F64:
     """(k,) variance of the mean of a patch of each region over what independent depths with the noise model's σ would give.
 
@@ -207,11 +208,17 @@ def excess_variance(labels: I32, planes: F64, grid: Grid, tiles: int, expected: 
     for k in range(regions):
         start[k + 1] = start[k] + across[k] * (int(h / side[k]) + 1)
     total, information = np.zeros(start[-1]), np.zeros(start[-1])
+    column, row = np.empty((regions, w), np.int64), np.empty(regions, np.int64)  # tiles of each column, and of the row begun
+    for k in range(regions):
+        for c in range(w):
+            column[k, c] = int(c / side[k])
     for r in range(h):
+        for k in range(regions):
+            row[k] = start[k] + int(r / side[k]) * across[k]
         for c in range(w):
             k = labels[r, c] - 1
             if k >= 0 and rho[r, c] > 0.0:
-                t = start[k] + int(r / side[k]) * across[k] + int(c / side[k])
+                t = row[k] + column[k, c]
                 inverse = count[r, c] / (float(sigma[r, c]) * sigma[r, c])
                 total[t] += inverse * (rho[r, c] - planes[k, 0] * rays_x[c] - planes[k, 1] * rays_y[r] - planes[k, 2])
                 information[t] += inverse

@@ -13,7 +13,7 @@ NOISE = 7.815  # χ² of a plane's three parameters, 95 %
 PARALLEL = 4.0  # times less than the common plane is turned from either must two surfaces be turned from each other to be a step, not a bend
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def neighbours(labels: I32, count: int, gap: int) -> F64:
     """(count, count) number of places where regions lie within `gap` cells of each other in a row or column."""
     h, w = labels.shape
@@ -35,7 +35,7 @@ def neighbours(labels: I32, count: int, gap: int) -> F64:
     return touch
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def merge_regions(A: F64, b: F64, moments: F64, n: I32, touch: F64, limit: float, alike: float) -> I32:
     """Which region each of k becomes part of, (k + 1,) by label; the sums (as from `accumulate`, with the neighbours' counts) are added up in place.
 
@@ -65,7 +65,7 @@ def merge_regions(A: F64, b: F64, moments: F64, n: I32, touch: F64, limit: float
     return owner
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _one_plane(A: F64, b: F64, n: int, B: F64, c: F64, m: int, limit: float, noise: float) -> bool:
     """Whether the common plane of two regions lies within `limit` σ (rms) of each region's own; `noise` is added to the sums of squares. Not when it
     is turned from both while these are parallel: one surface is in front of the other."""

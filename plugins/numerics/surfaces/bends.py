@@ -15,7 +15,7 @@ def bends(parts: I32, count: int, labels: I32, middle: F64, area: F64, planes: F
     return _bends(parts, count, labels, middle, area, frames)
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _bends(parts: I32, count: int, labels: I32, middle: F64, area: F64, frames: F64) -> F64:
     centre, total = np.zeros((count, 3)), np.zeros(count)
     for t in range(len(parts)):

@@ -17,13 +17,13 @@ FREE = -1
 FULLEST = 0.5  # share of slots taken, above which a table is made twice as large
 
 
-@numba.njit(cache=True, nogil=True, inline="always")
+@numba.njit(cache=True, nogil=True, error_model="numpy", inline="always")
 def key_of(x: int, y: int, z: int) -> int:
     """The cell as one number, at least 0."""
     return ((x + HALF) << (2 * BITS)) | ((y + HALF) << BITS) | (z + HALF)
 
 
-@numba.njit(cache=True, nogil=True, inline="always")
+@numba.njit(cache=True, nogil=True, error_model="numpy", inline="always")
 def slot_of(keys: I64, key: int) -> int:
     """The slot that holds the key, or the free one where it belongs. There must be a free one."""
     mask = len(keys) - 1
@@ -34,7 +34,7 @@ def slot_of(keys: I64, key: int) -> int:
     return slot
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def number_of(keys: I64, numbers: I32, x: int, y: int, z: int) -> int:
     """The cell's number, -1 when it is not in the table."""
     slot = slot_of(keys, key_of(x, y, z))
@@ -59,7 +59,7 @@ def roomy(keys: I64, numbers: I32, more: int) -> tuple[I64, I32]:
     return larger
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _copy(keys: I64, numbers: I32, to_keys: I64, to_numbers: I32) -> None:
     for i in range(len(keys)):
         if keys[i] != FREE:

@@ -73,7 +73,7 @@ def _hashed(places: I32) -> tuple[I64, I32]:
     return keys, numbers
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _insert(keys: I64, numbers: I32, places: I32) -> None:
     for i in range(len(places)):
         key = key_of(places[i, 0], places[i, 1], places[i, 2])
@@ -89,7 +89,7 @@ def blocks_about(depth: F32, camera: Lens, block_m: float, truncation: float) ->
     return found
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _across(local: I64, depth: F32, camera: Lens, block_m: float, truncation: float) -> I32 | None:
     """None when the table `local` is too small."""
     fx, fy, cx, cy = camera.lens
@@ -121,7 +121,7 @@ def _across(local: I64, depth: F32, camera: Lens, block_m: float, truncation: fl
     return found[:count].copy()
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _missing(keys: I64, places: I32) -> Bool:
     out = np.empty(len(places), np.bool_)
     for i in range(len(places)):
@@ -129,7 +129,7 @@ def _missing(keys: I64, places: I32) -> Bool:
     return out
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _in_view(places: I32, camera: Lens, shape: tuple[int, int], block_m: float) -> Bool:
     """(n,) whether the sphere around a block may fall into the image."""
     fx, fy, cx, cy = camera.lens

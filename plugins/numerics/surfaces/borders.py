@@ -41,7 +41,7 @@ def kept_vertices(vertices: F64, triangles: I32, parts: I32, opposite: I32, bord
     return _kept(vertices, begin.astype(np.int32), end.astype(np.int32), kinds, fixed, tolerance_m)
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _kept(vertices: F64, begin: I32, end: I32, kinds: I32, fixed: Bool, tolerance: float) -> tuple[Bool, I32]:
     n = len(vertices)
     degree, kind, beside = np.zeros(n, np.int32), np.zeros(n, np.int64), np.full((n, 2), -1, np.int32)
@@ -70,7 +70,7 @@ def _kept(vertices: F64, begin: I32, end: I32, kinds: I32, fixed: Bool, toleranc
     return keep, beside
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _walk(first: int, second: int, beside: I32, junction: Bool, done: Bool, chain: I32) -> int:
     """Follow a chain from `first` by `second` up to the next junction, or back to where it began; returns its length, both ends included."""
     chain[0], chain[1], length = first, second, 2
@@ -82,7 +82,7 @@ def _walk(first: int, second: int, beside: I32, junction: Bool, done: Bool, chai
     return length
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _simplify(vertices: F64, chain: I32, keep: Bool, tolerance: float) -> None:
     """Mark what the chain between its two ends needs."""
     stack, top = np.empty((len(chain), 2), np.int32), 1
@@ -102,7 +102,7 @@ def _simplify(vertices: F64, chain: I32, keep: Bool, tolerance: float) -> None:
             top += 2
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _simplify_ring(vertices: F64, chain: I32, keep: Bool, tolerance: float) -> None:
     """A closed chain, whose last vertex is the first: in halves between two that are far apart."""
     half, farthest = 0, 0.0
@@ -115,7 +115,7 @@ def _simplify_ring(vertices: F64, chain: I32, keep: Bool, tolerance: float) -> N
     _simplify(vertices, chain[half:], keep, tolerance)
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _off_segment(p: F64, a: F64, b: F64) -> float:
     d = b - a
     squared = np.dot(d, d)
@@ -124,7 +124,7 @@ def _off_segment(p: F64, a: F64, b: F64) -> float:
     return np.sqrt(np.dot(off, off))
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def loops(border: I32, parts: I32, opposite: I32) -> tuple[I32, I32]:
     """The border half-edges (n,) in the order in which they go round their parts, and where each loop begins (l + 1,)."""
     position = np.full(3 * len(parts), -1, np.int32)

@@ -26,7 +26,7 @@ def decimated(vertices: F64, triangles: I32, labels: I32, planes: F64, border: I
     return np.flatnonzero(alive).astype(np.int32)
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _collapse_all(
     vertices: F64, triangles: I32, labels: I32, normals: F64, border: Bool, free: Bool, beside: I32, order: I32, alive: Bool
 ) -> None:  # fmt: skip
@@ -66,7 +66,7 @@ def _collapse_all(
             break
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _incident(v: int, alive: Bool, head: I32, tail: I32, after: I32, out: I32) -> int:
     """Write the living triangles about v and return their number, 0 when they are too many; its list forgets the dead ones."""
     count, c, last = 0, head[v], -1
@@ -85,7 +85,7 @@ def _incident(v: int, alive: Bool, head: I32, tail: I32, after: I32, out: I32) -
     return count if count <= MOST else 0
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _targets(u: int, mine: I32, vertices: F64, triangles: I32, border: Bool, beside: I32, found: I32, far: F64) -> int:
     """Write where u may go, the nearest first, and return their number: to its neighbours on the border, or to any."""
     count = 2 if border[u] else len(mine)
@@ -106,7 +106,7 @@ def _targets(u: int, mine: I32, vertices: F64, triangles: I32, border: Bool, bes
     return count
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _allowed(u: int, v: int, mine: I32, theirs: I32, vertices: F64, triangles: I32, labels: I32, normals: F64, mark: I64, stamp: int) -> bool:
     """Whether u may be drawn into v: the two have no common neighbours but those across from their edge (link condition), and no triangle turns
     over."""
@@ -138,7 +138,7 @@ def _allowed(u: int, v: int, mine: I32, theirs: I32, vertices: F64, triangles: I
     return True
 
 
-@numba.njit(cache=True, nogil=True, inline="always")
+@numba.njit(cache=True, nogil=True, error_model="numpy", inline="always")
 def _signed(vertices: F64, a: int, b: int, c: int, x: float, y: float, z: float) -> float:
     """Area of a triangle seen against the normal (x, y, z), negative when it is seen from behind."""
     x1, y1, z1 = vertices[b, 0] - vertices[a, 0], vertices[b, 1] - vertices[a, 1], vertices[b, 2] - vertices[a, 2]
@@ -146,7 +146,7 @@ def _signed(vertices: F64, a: int, b: int, c: int, x: float, y: float, z: float)
     return 0.5 * ((y1 * z2 - z1 * y2) * x + (z1 * x2 - x1 * z2) * y + (x1 * y2 - y1 * x2) * z)
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _collapse(u: int, v: int, mine: I32, triangles: I32, alive: Bool, head: I32, tail: I32, after: I32) -> None:
     for t in mine:
         if triangles[t, 0] == v or triangles[t, 1] == v or triangles[t, 2] == v:
@@ -163,7 +163,7 @@ def _collapse(u: int, v: int, mine: I32, triangles: I32, alive: Bool, head: I32,
     head[u] = tail[u] = -1
 
 
-@numba.njit(cache=True, nogil=True, inline="always")
+@numba.njit(cache=True, nogil=True, error_model="numpy", inline="always")
 def _relink(beside: I32, v: int, old: int, new: int) -> None:
     if beside[v, 0] == old:
         beside[v, 0] = new

@@ -29,7 +29,7 @@ def greedy_triangles(points: F64, radius_m: float, multiplier: float) -> I32:
     return _faces(points, edges[order][_accepted(points, edges[order], length[order], distance, nearest.astype(np.int32))])
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _accepted(points: F64, edges: I32, length: F64, distance: F64, nearest: I32) -> I32:
     """Rows of the edges, shortest first, that cross no edge accepted before. One that does is no longer, so one of its ends is as near to an end of
     the edge as that is long: among its neighbours (n, MOST), sorted by distance."""
@@ -55,7 +55,7 @@ def _accepted(points: F64, edges: I32, length: F64, distance: F64, nearest: I32)
     return out[:count].copy()
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _any_crosses(points: F64, a: int, b: int, c: int, partners: I32, degree: I32) -> bool:
     """Whether an accepted edge from c crosses ab."""
     for k in range(degree[c]):
@@ -65,12 +65,12 @@ def _any_crosses(points: F64, a: int, b: int, c: int, partners: I32, degree: I32
     return False
 
 
-@numba.njit(cache=True, nogil=True, inline="always")
+@numba.njit(cache=True, nogil=True, error_model="numpy", inline="always")
 def _turn(a: F64, b: F64, c: F64) -> float:
     return (b[0] - a[0]) * (c[1] - a[1]) - (b[1] - a[1]) * (c[0] - a[0])
 
 
-@numba.njit(cache=True, nogil=True, inline="always")
+@numba.njit(cache=True, nogil=True, error_model="numpy", inline="always")
 def _crosses(a: F64, b: F64, c: F64, d: F64) -> bool:
     """Whether segments ab and cd cross or touch."""
     return _turn(a, b, c) * _turn(a, b, d) <= 0.0 and _turn(c, d, a) * _turn(c, d, b) <= 0.0

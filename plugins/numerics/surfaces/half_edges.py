@@ -15,7 +15,7 @@ def opposite_half_edges(triangles: I32) -> I32:
     return _paired(triangles, int(triangles.max()) + 1 if len(triangles) else 0)
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _paired(triangles: I32, count: int) -> I32:
     """Half-edges sorted by the lower of their vertices, then compared with those of the same."""
     size = 3 * len(triangles)
@@ -51,7 +51,7 @@ def crowded(triangles: I32, opposite: I32) -> I32:
     return np.asarray(alone[times[edge.ravel()] > 1], np.int32)
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def connected(opposite: I32, labels: I32) -> tuple[I32, int]:
     """(t,) numbers of the connected sets of triangles of equal label, from 0 in the order of their first triangle, and their count."""
     n = len(labels)
@@ -81,7 +81,7 @@ def with_single_fans(vertices: F64, triangles: I32) -> tuple[F64, I32]:
     return vertices[triangles.ravel()[first]], number[fans].reshape(-1, 3)
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _join(root: I32, a: int, b: int) -> None:
     while root[a] != a:
         root[a] = root[root[a]]
@@ -92,7 +92,7 @@ def _join(root: I32, a: int, b: int) -> None:
     root[max(a, b)] = min(a, b)
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _fans(opposite: I32) -> I32:
     """(3 t,) the least corner of the fan that each corner belongs to: corners at the two ends of an edge are those of the triangle beyond it."""
     root = np.arange(len(opposite), dtype=np.int32)
@@ -107,7 +107,7 @@ def _fans(opposite: I32) -> I32:
     return root
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def triangle_normals(vertices: F64, triangles: I32) -> F64:
     """(t, 3) normals, as long as twice the area."""
     out = np.empty((len(triangles), 3))
@@ -131,7 +131,7 @@ def vertex_normals(vertices: F64, triangles: I32) -> F64:
     return total / np.maximum(np.sqrt((total**2).sum(axis=1)), 1e-12)[:, None]
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _gather(normals: F64, triangles: I32, total: F64) -> None:
     for t in range(len(triangles)):
         for k in range(3):

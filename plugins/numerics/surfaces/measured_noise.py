@@ -27,7 +27,7 @@ def with_measured_noise(frame: Frame, planes: Planes) -> Frame:
     return replace(frame, camera=replace(camera, depth_noise=DepthNoise(scale * noise.a_m, scale * noise.b, scale * noise.c_per_m, noise.floor_m)))
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _off_planes(depth: F32, labels: U8, planes: F64, stride: int, step: int, lens: F64) -> tuple[F64, F64]:
     """How far readings (n,) are from their planes along their rays, and their depth."""
     h, w = labels.shape

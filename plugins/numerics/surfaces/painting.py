@@ -42,7 +42,7 @@ def spread(points: F64, colors: U8, seen: Bool) -> U8:
     return out
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _paint(points: F32, normals: F32, depth: F32, color: U8, R: F32, position: F32, lens: F32, near: F32, total: F32) -> None:
     """Add the colours one view gives, times their weight, and the weight, to `total` (n, 4). R is `R_camera_world`."""
     h, w = depth.shape

@@ -65,7 +65,7 @@ def planar_labels(vertices: F64, normals: F64, triangles: I32, opposite: I32, pl
     return _large(_filled(labels, vertices, triangles, opposite, planes, flat), middle, opposite, area, planes, flat), planes
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _on_planes(vertices: F64, triangles: I32, turned: F64, planes: F64, distance: float, cosine: float) -> I32:
     """The plane that is nearest to all corners of a triangle and looks the same way."""
     labels = np.full(len(triangles), -1, np.int32)
@@ -80,7 +80,7 @@ def _on_planes(vertices: F64, triangles: I32, turned: F64, planes: F64, distance
     return labels
 
 
-@numba.njit(cache=True, nogil=True, inline="always")
+@numba.njit(cache=True, nogil=True, error_model="numpy", inline="always")
 def _farthest(vertices: F64, corners: I32, plane: F64) -> float:
     off = 0.0
     for k in range(3):
@@ -89,7 +89,7 @@ def _farthest(vertices: F64, corners: I32, plane: F64) -> float:
     return off
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _steadiness(turned: F64, opposite: I32) -> F64:
     """(t,) least cosine between a triangle's normal and its neighbours'; 0 at a border."""
     out = np.ones(len(turned))
@@ -101,7 +101,7 @@ def _steadiness(turned: F64, opposite: I32) -> F64:
     return out
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _grown(
     seeds: I32, labels: I32, first: int, middle: F64, turned: F64, area: F64, opposite: I32, distance: float, cosine: float, least: float
 ) -> tuple[I32, F64]:  # fmt: skip
@@ -147,7 +147,7 @@ def _grown(
     return labels, found[:count].copy()
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _plane_through(middle: F64, area: F64, rows: I32, like: F64) -> tuple[F64, float]:
     """Least squares plane through the middles of triangles, weighed by area, facing as `like` does."""
     centre, total = np.zeros(3), 0.0
@@ -209,7 +209,7 @@ def _large(labels: I32, middle: F64, opposite: I32, area: F64, planes: F64, flat
     return np.where((total[parts] >= flat.area_m2) & (bend[parts] <= flat.bend_per_m), labels, -1).astype(np.int32)
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _with_rim(labels: I32, vertices: F64, triangles: I32, turned: F64, opposite: I32, planes: F64, reach: float) -> I32:
     """One ring more: a triangle beside labelled ones gets the label of the plane nearest to it, if that is near and it does not face away."""
     out = labels.copy()
@@ -228,7 +228,7 @@ def _with_rim(labels: I32, vertices: F64, triangles: I32, turned: F64, opposite:
     return out
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _without_steps(labels: I32, triangles: I32, count: int, planes: F64, area: F64) -> I32:
     """No vertex between two planes that are nearly parallel: triangles about it lose the label of the smaller one, and become the step between
     them."""
@@ -264,7 +264,7 @@ def _filled(labels: I32, vertices: F64, triangles: I32, opposite: I32, planes: F
     return out
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _enclosing(parts: I32, count: int, labels: I32, opposite: I32) -> I32:
     """(count,) the one label about each part without label; -1 when there are several, or none, or the part reaches the mesh's border."""
     around = np.full(count, -2, np.int32)

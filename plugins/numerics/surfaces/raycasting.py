@@ -21,7 +21,7 @@ def cast(blocks: Blocks, camera: Lens, depth: F32, voxel: float, truncation: flo
     return np.asarray(_cast(blocks.keys, blocks.numbers, blocks.distance, blocks.weight, camera, ranges, depth, voxel, truncation))
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _ranges(blocks: Blocks, camera: Lens, shape: tuple[int, int], block_m: float) -> F32:
     """(rows, columns, 2) nearest and farthest depth of a block in each tile; (inf, 0) without one."""
     fx, fy, cx, cy = camera.lens
@@ -49,7 +49,7 @@ def _ranges(blocks: Blocks, camera: Lens, shape: tuple[int, int], block_m: float
     return out
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _between(keys: I64, numbers: I32, distance: I16, weight: U8, x: float, y: float, z: float) -> float:
     """The distance at a place (voxels) as a share of the truncation, trilinear; NaN where one of the eight voxels about it is not known."""
     i, j, k = int(np.floor(x)), int(np.floor(y)), int(np.floor(z))

@@ -24,7 +24,7 @@ def snapped(vertices: F64, triangles: I32, labels: I32, planes: F64, farthest_m:
     return points
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _planes_about(count: int, triangles: I32, labels: I32) -> tuple[I32, I32]:
     """The planes of the triangles about each vertex v, in ascending order and each once: rows[starts[v] : starts[v + 1]]."""
     ends = np.zeros(count + 1, np.int32)
@@ -55,7 +55,7 @@ def _planes_about(count: int, triangles: I32, labels: I32) -> tuple[I32, I32]:
     return rows[:size].copy(), starts
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _snapped(vertices: F64, rows: I32, starts: I32, planes: F64, farthest: float) -> F64:
     out = vertices.copy()
     for v in range(len(vertices)):
@@ -73,7 +73,7 @@ def _snapped(vertices: F64, rows: I32, starts: I32, planes: F64, farthest: float
     return out
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _unfold(points: F64, triangles: I32, normals: F64, rows: I32, starts: I32) -> int:
     """Move the vertices of triangles (t, 3) that lie the wrong way round to the middle of those neighbours that are on all their planes, so that each
     stays on its plane or line; returns how many."""
@@ -101,7 +101,7 @@ def _unfold(points: F64, triangles: I32, normals: F64, rows: I32, starts: I32) -
     return count
 
 
-@numba.njit(cache=True, nogil=True, inline="always")
+@numba.njit(cache=True, nogil=True, error_model="numpy", inline="always")
 def _includes(larger: I32, smaller: I32) -> bool:
     """Whether an ascending list holds another."""
     at = 0
@@ -113,12 +113,12 @@ def _includes(larger: I32, smaller: I32) -> bool:
     return True
 
 
-@numba.njit(cache=True, nogil=True, inline="always")
+@numba.njit(cache=True, nogil=True, error_model="numpy", inline="always")
 def _height(p: F64, plane: F64) -> float:
     return p[0] * plane[0] + p[1] * plane[1] + p[2] * plane[2] + plane[3]
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _step(p: F64, planes: F64, rows: I32) -> tuple[F64, float]:
     """The shortest step onto the planes, by least squares within the directions that they determine, and its length."""
     if len(rows) == 1:

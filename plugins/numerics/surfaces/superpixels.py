@@ -43,7 +43,7 @@ def moved(surfels: F64, T_a_b: F64) -> F64:
     return out
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _assigned(depth: F32, gray: F32, labels: U8, mask: U8, side: int) -> I32:
     """(h, w) number of the superpixel a pixel belongs to, -1 = none: the nearest of the centres about it in place, inverse depth and brightness,
     and of the same region (SLIC, Achanta et al. 2012)."""
@@ -94,7 +94,7 @@ def _assigned(depth: F32, gray: F32, labels: U8, mask: U8, side: int) -> I32:
     return out
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _surfels(depth: F32, color: U8, labels: U8, assigned: I32, lens: F64, side: int, count: int) -> F64:
     """(n, 13) one for each superpixel of at least a quarter of its square, camera frame: its mean point, and the plane of least squares through
     it."""
@@ -160,7 +160,7 @@ def fused(views: Sequence[F64], cosine: float) -> F64:
 CELL_M = 0.15  # surfels farther apart than this are never one
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _fuse(surfels: F64, out: F64, keys: I64, heads: I32, after: I32, count: int, cosine: float) -> int:
     before = count
     for i in range(len(surfels)):

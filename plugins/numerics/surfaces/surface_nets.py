@@ -35,7 +35,7 @@ def zero_level(volume: Volume, least_weight: float) -> tuple[F64, I32]:
     return vertices, _triangles(signs, around, cells, vertices)
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _neighbours(keys: I64, numbers: I32, places: I32) -> I32:
     """(n, 27) the blocks around each, -1 = none; (dx + 1) · 9 + (dy + 1) · 3 + dz + 1."""
     out = np.empty((len(places), 27), np.int32)
@@ -45,7 +45,7 @@ def _neighbours(keys: I64, numbers: I32, places: I32) -> I32:
     return out
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _signs(distance: F32, weight: F32, least: float, signs: I8) -> None:
     """1 before the surface, -1 behind it, 0 where that is not known."""
     for b in range(len(distance)):
@@ -54,7 +54,7 @@ def _signs(distance: F32, weight: F32, least: float, signs: I8) -> None:
                 signs[b, i] = 1 if distance[b, i] >= 0.0 else -1
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _untangled(distance: F32, signs: I8, around: I32, near: float) -> int:
     """Wherever four in a square have signs like a chessboard's, put the one less far behind before the surface: noise, where that runs along a layer
     of voxels, and four triangles would meet in an edge. Always that way, so it comes to an end. Returns how many were turned."""
@@ -86,14 +86,14 @@ def _untangled(distance: F32, signs: I8, around: I32, near: float) -> int:
     return turned
 
 
-@numba.njit(cache=True, nogil=True, inline="always")
+@numba.njit(cache=True, nogil=True, error_model="numpy", inline="always")
 def _at(around: I32, b: int, x: int, y: int, z: int) -> tuple[int, int]:
     """Block and cell of the voxel (x, y, z) of block b, each in -1 … SIDE; block -1 where there is none."""
     block = around[b, ((x + SIDE) // SIDE) * 9 + ((y + SIDE) // SIDE) * 3 + (z + SIDE) // SIDE]
     return block, ((x + SIDE) % SIDE) * SIDE * SIDE + ((y + SIDE) % SIDE) * SIDE + (z + SIDE) % SIDE
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _vertices(places: I32, distance: F32, signs: I8, around: I32, cells: I32, voxel: float) -> F64:
     """(v, 3) vertices; `cells` gets their numbers."""
     out, count = np.empty((1024, 3)), 0
@@ -135,7 +135,7 @@ def _vertices(places: I32, distance: F32, signs: I8, around: I32, cells: I32, vo
     return out[:count].copy()
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _triangles(signs: I8, around: I32, cells: I32, vertices: F64) -> I32:
     """(t, 3): two for each voxel edge with both signs whose four cells have vertices, cut along the shorter diagonal."""
     out, count = np.empty((4096, 3), np.int32), 0
@@ -177,7 +177,7 @@ def _triangles(signs: I8, around: I32, cells: I32, vertices: F64) -> I32:
     return out[:count].copy()
 
 
-@numba.njit(cache=True, nogil=True, inline="always")
+@numba.njit(cache=True, nogil=True, error_model="numpy", inline="always")
 def _squared(vertices: F64, i: int, j: int) -> float:
     x, y, z = vertices[i, 0] - vertices[j, 0], vertices[i, 1] - vertices[j, 1], vertices[i, 2] - vertices[j, 2]
     return x * x + y * y + z * z

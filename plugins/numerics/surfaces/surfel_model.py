@@ -54,7 +54,7 @@ def _at(rows: I32, count: int) -> Bool:
     return out
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _in_camera(s: F32, camera: Lens) -> tuple[float, float, float]:
     """A surfel's place in the camera's axes."""
     R, t = camera.R_camera_world, camera.position_m
@@ -62,7 +62,7 @@ def _in_camera(s: F32, camera: Lens) -> tuple[float, float, float]:
     return R[0, 0] * a + R[0, 1] * b + R[0, 2] * c, R[1, 0] * a + R[1, 1] * b + R[1, 2] * c, R[2, 0] * a + R[2, 1] * b + R[2, 2] * c
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _index_map(surfels: F32, camera: Lens, shape: tuple[int, int]) -> I32:
     """(h, w) row of the nearest surfel whose centre falls on a pixel, -1 = none; those seen from behind do not count."""
     fx, fy, cx, cy = camera.lens
@@ -86,7 +86,7 @@ def _index_map(surfels: F32, camera: Lens, shape: tuple[int, int]) -> I32:
     return out
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _fuse(
     surfels: F32, seen: I32, pixels: I32, images: Images, camera: Lens, index: int, apart: float, cosine: float, most: float
 ) -> tuple[Bool, F32]:  # fmt: skip
@@ -143,7 +143,7 @@ def _fuse(
     return changed, fresh[:count].copy()
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def shown(surfels: F32, camera: Lens, shape: tuple[int, int], stable: float) -> tuple[F32, F32, F32]:
     """Depth (h, w), normals (h, w, 3) in the camera's axes and colour (h, w, 3) of the surfels drawn as discs, the nearest surface in front; those
     of a confidence below `stable` only where there is no other."""

@@ -100,7 +100,7 @@ def readings(frame: Frame, T_world_camera: F64, step: int, max_sigma_m: float) -
     return points, 1.0 / sigma[r, c] ** 2
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _news(keys: I64, numbers: I32, information: F64, points: F64, weight: F64, side: float, views: float) -> int:
     fresh = 0
     for i in range(len(points)):
@@ -110,7 +110,7 @@ def _news(keys: I64, numbers: I32, information: F64, points: F64, weight: F64, s
     return fresh
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _learn(keys: I64, numbers: I32, gained: F64, points: F64, weight: F64, side: float, count: int) -> int:
     for i in range(len(points)):
         key = key_of(int(np.floor(points[i, 0] / side)), int(np.floor(points[i, 1] / side)), int(np.floor(points[i, 2] / side)))

@@ -76,14 +76,14 @@ def _slants(planes: F64, lens: F64) -> F64:
     return np.concatenate([np.zeros((1, 5)), np.concatenate([slopes, planes[:, :3]], axis=1)])
 
 
-@numba.njit(cache=True, nogil=True, inline="always")
+@numba.njit(cache=True, nogil=True, error_model="numpy", inline="always")
 def _cosine(x: float, y: float, z: float, length: float, slants: F64, label: int) -> float:
     """Of the angle between a ray (x, y, z) of that length and the plane's normal; 1 without a plane."""
     n = slants[label, 2] * x + slants[label, 3] * y + slants[label, 4] * z
     return 1.0 if n >= 0.0 else max(-n / length, LEAST_COSINE)
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _across(local: I64, depth: F32, labels: U8, slants: F64, lens: F64, T: F64, block_m: float, truncation: float) -> I32 | None:
     """Blocks (n, 3) within the truncation of the readings, along their rays or across their planes; None when the table `local` is too small."""
     h, w = depth.shape
@@ -119,7 +119,7 @@ def _across(local: I64, depth: F32, labels: U8, slants: F64, lens: F64, T: F64, 
     return found[:count].copy()
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _unknown(keys: I64, places: I32) -> I32:
     """The rows of the blocks (n, 3) that are not in the table."""
     rows, count = np.empty(len(places), np.int32), 0
@@ -130,7 +130,7 @@ def _unknown(keys: I64, places: I32) -> I32:
     return rows[:count].copy()
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _insert(keys: I64, numbers: I32, fresh: I32, places: I32, count: int) -> int:
     for i in range(len(fresh)):
         key = key_of(fresh[i, 0], fresh[i, 1], fresh[i, 2])
@@ -141,7 +141,7 @@ def _insert(keys: I64, numbers: I32, fresh: I32, places: I32, count: int) -> int
     return count
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _integrate(
     keys: I64, numbers: I32, distance: F32, weight: F32, touched: I32, depth: F32, labels: U8, slants: F64, weights: F32, lens: F64,
     R_camera_world: F64, position: F64, voxel: float, truncation: float,
