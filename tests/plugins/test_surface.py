@@ -166,7 +166,7 @@ def test_degenerate_input_gives_a_valid_file(name, case, tmp_path):
         read = trimesh.load(tmp_path / "surface.ply", process=False)
         assert len(getattr(read, "faces", [])) == len(surface.triangles)
         assert np.isfinite(surface.vertices_m).all()
-    if case in ("one plane", "a million points") and name != "surfels":
+    if case in ("one plane", "a million points") and name not in ("surfels", "superpixels"):  # one view is none to them
         assert np.abs(surface.vertices_m[:, 2] - 3.0).max() < 0.002 and len(surface.triangles) >= 2
         assert case == "one plane" or name == "tsdf" or len(surface.triangles) < 20_000
 

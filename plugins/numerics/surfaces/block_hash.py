@@ -41,6 +41,17 @@ def number_of(keys: I64, numbers: I32, x: int, y: int, z: int) -> int:
     return numbers[slot] if keys[slot] != FREE else -1
 
 
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def absent(keys: I64, cells: I32) -> I32:
+    """The rows of the cells (n, 3) that are not in the table."""
+    rows, count = np.empty(len(cells), np.int32), 0
+    for i in range(len(cells)):
+        if keys[slot_of(keys, key_of(cells[i, 0], cells[i, 1], cells[i, 2]))] == FREE:
+            rows[count] = i
+            count += 1
+    return rows[:count].copy()
+
+
 def empty_table(slots: int) -> tuple[I64, I32]:
     """Keys and numbers of a table without cells; `slots` is a power of two."""
     return np.full(slots, FREE, np.int64), np.empty(slots, np.int32)

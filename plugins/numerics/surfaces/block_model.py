@@ -13,8 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from trihedron.pipeline.types import F32, F64, I32, U8, Bool, Column, Table
-from trihedron.plugins.numerics.surfaces.block_hash import FREE, I64, empty_table, key_of, number_of, slot_of
-from trihedron.plugins.numerics.surfaces.volume import CELLS, SIDE
+from trihedron.plugins.numerics.surfaces.block_hash import I64, absent, empty_table, key_of, number_of, slot_of
+from trihedron.plugins.numerics.surfaces.volume import CELLS, SIDE, blocks_about
 
 I16 = NDArray[np.int16]
 BLOCKS = {"place": Column("i4", (3,)), "distance": Column("i2", (CELLS,)), "weight": Column("u1", (CELLS,))}
@@ -47,10 +47,11 @@ def lens_at(lens: F64, T_world_camera: F64) -> Lens:
 
 def fused(table: Table, depth: F32, camera: Lens, voxel: float, truncation: float, most: int) -> tuple[Table, Blocks]:
     """The table with one depth image (h, w) taken in, and those of its blocks that the camera may see. A voxel's weight ends at `most` views."""
-    touched = blocks_about(depth, camera, voxel * SIDE, truncation)
+    T, no_plane = np.column_stack([camera.R_camera_world.T, camera.position_m]), np.zeros(depth.shape, np.uint8)
+    touched = blocks_about(depth, no_plane, np.zeros((1, 5)), camera.lens, T, voxel * SIDE, truncation)
     places = table.column("place")
     known, _ = _hashed(places)
-    fresh = touched[_missing(known, touched)]
+    fresh = touched[absent(known, touched)]
     near = np.flatnonzero(_in_view(places, camera, depth.shape, voxel * SIDE)).astype(np.int32)
     count = len(near)
     distance = np.concatenate([table.rows("distance", near), np.zeros((len(fresh), CELLS), np.int16)])
@@ -79,54 +80,6 @@ def _insert(keys: I64, numbers: I32, places: I32) -> None:
         key = key_of(places[i, 0], places[i, 1], places[i, 2])
         slot = slot_of(keys, key)
         keys[slot], numbers[slot] = key, i
-
-
-def blocks_about(depth: F32, camera: Lens, block_m: float, truncation: float) -> I32:
-    """(n, 3) places of the blocks within the truncation of a reading, in the order in which they are met."""
-    slots = 1 << 13
-    while (found := _across(empty_table(slots)[0], depth, camera, block_m, truncation)) is None:
-        slots *= 4
-    return found
-
-
-@numba.njit(cache=True, nogil=True, error_model="numpy")
-def _across(local: I64, depth: F32, camera: Lens, block_m: float, truncation: float) -> I32 | None:
-    """None when the table `local` is too small."""
-    fx, fy, cx, cy = camera.lens
-    R, t = camera.R_camera_world, camera.position_m
-    found, count, last = np.empty((len(local) // 2, 3), np.int32), 0, -1
-    for r in range(0, depth.shape[0], 2):
-        for c in range(0, depth.shape[1], 2):
-            z = depth[r, c]
-            if z <= 0.0:
-                continue
-            x, y = (c - cx) / fx, (r - cy) / fy
-            along = truncation / np.sqrt(x * x + y * y + 1.0)
-            for side in range(-1, 2):
-                d = z + side * along
-                i = int(np.floor((R[0, 0] * x * d + R[1, 0] * y * d + R[2, 0] * d + t[0]) / block_m))
-                j = int(np.floor((R[0, 1] * x * d + R[1, 1] * y * d + R[2, 1] * d + t[1]) / block_m))
-                k = int(np.floor((R[0, 2] * x * d + R[1, 2] * y * d + R[2, 2] * d + t[2]) / block_m))
-                key = key_of(i, j, k)
-                if key == last:
-                    continue
-                last = key
-                slot = slot_of(local, key)
-                if local[slot] == FREE:
-                    if count == len(found):
-                        return None
-                    local[slot] = key
-                    found[count, 0], found[count, 1], found[count, 2] = i, j, k
-                    count += 1
-    return found[:count].copy()
-
-
-@numba.njit(cache=True, nogil=True, error_model="numpy")
-def _missing(keys: I64, places: I32) -> Bool:
-    out = np.empty(len(places), np.bool_)
-    for i in range(len(places)):
-        out[i] = keys[slot_of(keys, key_of(places[i, 0], places[i, 1], places[i, 2]))] == FREE
-    return out
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")

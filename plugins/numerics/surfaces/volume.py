@@ -11,7 +11,7 @@ import numba
 import numpy as np
 
 from trihedron.pipeline.types import F32, F64, I32, U8
-from trihedron.plugins.numerics.surfaces.block_hash import FREE, I64, empty_table, key_of, roomy, slot_of
+from trihedron.plugins.numerics.surfaces.block_hash import FREE, I64, absent, empty_table, key_of, roomy, slot_of
 from trihedron.plugins.numerics.surfaces.views import View
 
 SIDE = 8  # voxels along a block's edge
@@ -40,7 +40,8 @@ class Volume:
         c, T = view.camera, T_world_camera
         lens = np.array([c.fx, c.fy, c.cx, c.cy])
         slants = _slants(view.coefficients, lens)
-        touched, fresh = self._touched(view, slants, lens, T)
+        touched = blocks_about(view.depth_m, view.labels, slants, lens, T, self.voxel_m * SIDE, self.truncation_m)
+        fresh = touched[absent(self.keys, touched)]
         self.keys, self.numbers = roomy(self.keys, self.numbers, len(fresh))
         self._grow(self.count + len(fresh))
         self.count = int(_insert(self.keys, self.numbers, fresh, self.places, self.count))
@@ -50,15 +51,6 @@ class Volume:
             self.keys, self.numbers, self.distance, self.weight, touched, view.depth_m, view.labels, slants, weights, lens,
             np.ascontiguousarray(T[:3, :3].T), T[:3, 3].copy(), self.voxel_m, self.truncation_m,
         )  # fmt: skip
-
-    def _touched(self, view: View, slants: F64, lens: F64, T: F64) -> tuple[I32, I32]:
-        """Blocks (n, 3) within the truncation of a reading, and those of them that are new."""
-        local, _ = empty_table(1 << 13)
-        while True:
-            touched = _across(local, view.depth_m, view.labels, slants, lens, T, self.voxel_m * SIDE, self.truncation_m)
-            if touched is not None:
-                return touched, touched[_unknown(self.keys, touched)]
-            local, _ = empty_table(4 * len(local))
 
     def _grow(self, count: int) -> None:
         """Room for so many blocks; by half as many again, so that the copies cost no more than the blocks."""
@@ -81,6 +73,15 @@ def _cosine(x: float, y: float, z: float, length: float, slants: F64, label: int
     """Of the angle between a ray (x, y, z) of that length and the plane's normal; 1 without a plane."""
     n = slants[label, 2] * x + slants[label, 3] * y + slants[label, 4] * z
     return 1.0 if n >= 0.0 else max(-n / length, LEAST_COSINE)
+
+
+def blocks_about(depth: F32, labels: U8, slants: F64, lens: F64, T_world_camera: F64, block_m: float, truncation: float) -> I32:
+    """(n, 3) places of the blocks within the truncation of a reading, in the order in which they are met; along its ray, or across its plane at the
+    slant of its label."""
+    slots = 1 << 13
+    while (found := _across(empty_table(slots)[0], depth, labels, slants, lens, T_world_camera, block_m, truncation)) is None:
+        slots *= 4
+    return found
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
@@ -117,17 +118,6 @@ def _across(local: I64, depth: F32, labels: U8, slants: F64, lens: F64, T: F64, 
                     found[count, 0], found[count, 1], found[count, 2] = i, j, m
                     count += 1
     return found[:count].copy()
-
-
-@numba.njit(cache=True, nogil=True, error_model="numpy")
-def _unknown(keys: I64, places: I32) -> I32:
-    """The rows of the blocks (n, 3) that are not in the table."""
-    rows, count = np.empty(len(places), np.int32), 0
-    for i in range(len(places)):
-        if keys[slot_of(keys, key_of(places[i, 0], places[i, 1], places[i, 2]))] == FREE:
-            rows[count] = i
-            count += 1
-    return rows[:count].copy()
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
