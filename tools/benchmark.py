@@ -1,17 +1,19 @@
 """Time a run per frame and stage, with its memory, beside a fixed reference workload of the same minute and frames.
 
 The machine's speed varies, so times are also given as multiples of the reference: OpenCV ORB (1000 features, 8 levels) and LSD on the same frames,
-one thread. Other comparisons, each with its --help: `trihedron benchmark manhattan` (estimators of the Manhattan frame on rendered rooms),
-`trihedron benchmark rotations` (the runs of a sweep over them), `trihedron benchmark surface` (all surfaces, by the true one),
-`trihedron benchmark map` (drift, recovery and growth of the map), `trihedron benchmark recording` (what recording costs). `trihedron compare` makes
-a table of the runs of any sweep.
+one thread. --paced runs the frames a second time at the camera's own rate: latency is then from asking for a frame's files to its pose, and the time
+it waits behind others does not count. --cold runs three frames with an empty kernel cache. --compare says what became slower since a --json file.
+
+Other comparisons, each with its --help: `trihedron benchmark scaling` (threads, image size, features, length), `trihedron benchmark manhattan`
+(estimators of the Manhattan frame on rendered rooms), `trihedron benchmark rotations` (the runs of a sweep over them), `trihedron benchmark surface`
+(all surfaces, by the true one), `trihedron benchmark map` (drift, recovery and growth of the map), `trihedron benchmark recording` (what recording
+costs). `trihedron compare` makes a table of the runs of any sweep.
 
 Example: trihedron benchmark dataset=tum dataset.path=FOLDER dataset.frames=0:150 --json benchmark.json
 """
 
 from __future__ import annotations
 
-import argparse
 import importlib
 import json
 import os
@@ -21,17 +23,23 @@ import sys
 import tempfile
 import time
 from collections.abc import Sequence
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
+from trihedron.pipeline.errors import UsageError, did_you_mean
 from trihedron.pipeline.types import U8
+from trihedron.tools.arguments import Parser
+from trihedron.tools.benchmark_comparison import compared, read_figures, times
 
+PROGRAM = (sys.executable, "-c", "import sys; from trihedron.pipeline.cli import main; sys.exit(main(sys.argv[1:]))")
 REFERENCE_FRAMES = 40
 COMPARISONS = {  # other words after `benchmark`, and whose `main` they stand for
     "manhattan": "trihedron.tools.manhattan_family",
     "map": "trihedron.tools.map_benchmark",
     "recording": "trihedron.tools.recording_benchmark",
     "rotations": "trihedron.tools.rotation_comparison",
+    "scaling": "trihedron.tools.scaling_benchmark",
     "surface": "trihedron.tools.surface_family",
 }
 
@@ -42,28 +50,46 @@ def main(argv: list[str]) -> int:
     if argv[:1] and argv[0] in COMPARISONS:
         comparison: Any = importlib.import_module(COMPARISONS[argv[0]])
         return int(comparison.main(argv[1:]))
-    parser = argparse.ArgumentParser(prog="trihedron benchmark", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = Parser("benchmark", __name__)
     parser.add_argument("overrides", nargs="*", help="as for trihedron run")
-    parser.add_argument("--json", metavar="FILE", help="write the figures too")
+    parser.add_argument("--json", type=Path, metavar="FILE", help="write the figures too")
+    parser.add_argument("--compare", type=Path, metavar="OLD.json", help="say what became slower since then")
+    parser.add_argument("--paced", action="store_true", help="a second run at the camera's own rate")
+    parser.add_argument("--cold", action="store_true", help="time the first frames with an empty kernel cache (a minute or two)")
     options, rest = parser.parse_known_args(argv)
     overrides = [*options.overrides, *rest]
+    _checked(overrides)
+    old = read_figures(options.compare) if options.compare else None
     with tempfile.TemporaryDirectory() as folder:
         figures = measure([*overrides, f"out={folder}/run"], Path(folder) / "run")
-    figures["reference_ms"] = reference_ms(first_images(overrides))
+        figures["reference_ms"] = reference_ms(first_images(overrides))
+        figures["cli_cpu_s"] = _cpu_of(["--help"])
+        if options.paced:
+            figures["paced"] = measure([*overrides, "real_time=true", f"out={folder}/paced"], Path(folder) / "paced")["frame_ms"]
+        if options.cold:
+            figures["cold_first_frames_s"] = _cold(overrides, Path(folder))
     figures["machine"] = machine()
-    print(table(figures))
+    print(report(figures))
+    if old is not None:
+        print("\n" + compared(old, figures))
     if options.json:
-        Path(options.json).write_text(json.dumps(figures, indent=2) + "\n")
+        options.json.write_text(json.dumps(figures, indent=2) + "\n")
     return 0
 
 
-def measure(overrides: list[str], out: Path) -> dict[str, Any]:
+def _checked(overrides: list[str]) -> None:
+    """Raise UsageError for a word that is no override: it may be a comparison misspelt."""
+    for word in overrides:
+        if "=" not in word:
+            raise UsageError("benchmark", f"'{word}' is neither key=value nor a comparison", did_you_mean(word, COMPARISONS))
+
+
+def measure(overrides: list[str], out: Path, environment: dict[str, str] | None = None) -> dict[str, Any]:
     """`timing.json` and metrics of one run in its own process, with its peak resident memory in MB. Raises TrihedronError when it fails."""
     from trihedron.pipeline.errors import StageError
 
     began = time.perf_counter()
-    command = [sys.executable, "-c", "import sys; from trihedron.pipeline.cli import main; sys.exit(main(['run', *sys.argv[1:]]))", *overrides]
-    process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True)
+    process = subprocess.Popen([*PROGRAM, "run", *overrides], stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True, env=environment)
     assert process.stderr is not None
     errors = process.stderr.read()
     _, status, usage = os.wait4(process.pid, 0)
@@ -79,9 +105,30 @@ def measure(overrides: list[str], out: Path) -> dict[str, Any]:
     return figures
 
 
+def _cpu_of(words: list[str]) -> float:
+    """Seconds of CPU of a command that prints and ends."""
+    process = subprocess.Popen([*PROGRAM, *words], stdout=subprocess.DEVNULL)
+    _, _, usage = os.wait4(process.pid, 0)
+    return round(usage.ru_utime + usage.ru_stime, 2)
+
+
+def _cold(overrides: list[str], folder: Path) -> float:
+    """Seconds from the command to the end of a run of three frames that finds no compiled kernel."""
+    words = [word for word in overrides if not word.startswith("dataset.frames=")]
+    environment = {**os.environ, "NUMBA_CACHE_DIR": str(folder / "kernels")}
+    seconds: float = measure([*words, "dataset.frames=0:3", f"out={folder}/cold"], folder / "cold", environment)["process_s"]
+    return seconds
+
+
 def machine() -> dict[str, Any]:
-    """What the figures were measured on."""
-    return {"system": platform.platform(), "python": platform.python_version(), "cpus": os.cpu_count()}
+    """What the figures were measured on, and with which versions."""
+    cpuinfo = Path("/proc/cpuinfo").read_text() if Path("/proc/cpuinfo").exists() else ""
+    models = [line.partition(":")[2].strip() for line in cpuinfo.splitlines() if line.startswith("model name")]
+    packages = {name: version(name) for name in ("trihedron", "numpy", "numba", "opencv-contrib-python-headless")}
+    return {
+        "system": platform.platform(), "cpu": models[0] if models else platform.processor(), "cpus": os.cpu_count(),
+        "python": platform.python_version(), "packages": packages,
+    }  # fmt: skip
 
 
 def first_images(overrides: list[str]) -> list[U8]:
@@ -115,20 +162,24 @@ def reference_ms(images: Sequence[U8]) -> float:
     return round(float(np.median(times)), 2)
 
 
-def table(figures: dict[str, Any]) -> str:
+def report(figures: dict[str, Any]) -> str:
     """The figures as text."""
-    reference = figures["reference_ms"]
-    frame = figures["frame_ms"]
+    reference, of = figures["reference_ms"], figures["machine"]
     per_frame = 1e3 / figures["fps"] if figures["fps"] else 0.0
     lines = [
+        f"{of['cpu']}, {of['cpus']} CPUs, Python {of['python']}, " + ", ".join(f"{name} {number}" for name, number in of["packages"].items()),
         f"{figures['frames']} frames, {figures['threads']} threads, reference workload {reference:.1f} ms",
         f"{'':14} {'p50 ms':>8} {'p95 ms':>8} {'x reference':>12}",
-        f"{'frame':14} {frame['p50']:8.1f} {frame['p95']:8.1f} {frame['p50'] / reference:12.2f}",
-        f"{'throughput':14} {per_frame:8.1f} {'':8} {per_frame / reference:12.2f}   ({figures['fps']:.1f} frames/s)",
     ]
-    for name, stage in figures["stages"].items():
-        lines.append(f"  {name:12} {stage['p50_ms']:8.2f} {stage['p95_ms']:8.2f} {stage['p50_ms'] / reference:12.2f}")
-    lines.append(f"start-up {figures['startup_s']:.1f} s, CPU {figures['cpu_s']:.1f} s, peak memory {figures['peak_memory_mb']} MB")
+    for name, (p50, p95) in times(figures).items():
+        lines.append(f"{name:14} {p50:8.2f} {p95:8.2f} {p50 / reference:12.2f}")
+    used = figures["cpu_s"] / figures["process_s"]
+    lines += [
+        f"throughput {figures['fps']:.1f} frames/s: {per_frame:.1f} ms a frame, {per_frame / reference:.2f} x reference",
+        f"start-up {figures['startup_s']:.1f} s, --help {figures['cli_cpu_s']:.2f} s of CPU"
+        + (f", three frames without compiled kernels {figures['cold_first_frames_s']:.0f} s" if "cold_first_frames_s" in figures else ""),
+        f"CPU {figures['cpu_s']:.1f} s ({used:.2f} cores), peak memory {figures['peak_memory_mb']} MB",
+    ]
     final = figures.get("metrics", {}).get("final")
     if final:
         lines.append(f"ATE {final['ate_rmse_m']:.4f} m")

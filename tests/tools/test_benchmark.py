@@ -1,0 +1,71 @@
+"""The benchmark's tables on known figures, and the commands on tiny runs."""
+
+import copy
+import json
+
+import pytest
+
+from trihedron.pipeline.cli import main
+from trihedron.tools.benchmark_comparison import compared
+
+FIGURES = {
+    "frames": 10, "threads": 2, "fps": 50.0, "frame_ms": {"p50": 20.0, "p95": 30.0}, "reference_ms": 10.0,
+    "stages": {"planes": {"p50_ms": 5.0, "p95_ms": 6.0}, "loop": {"p50_ms": 0.05, "p95_ms": 0.1}},
+}  # fmt: skip
+TINY = ["dataset.width=160", "dataset.height=120", "dataset.length=6"]
+
+
+def test_a_slower_machine_makes_nothing_slower():
+    slow = copy.deepcopy(FIGURES)
+    slow["reference_ms"], slow["fps"], slow["frame_ms"]["p50"] = 20.0, 25.0, 40.0
+    for stage in slow["stages"].values():
+        stage["p50_ms"] *= 2.0
+    said = compared(FIGURES, slow)
+    assert "nothing became slower" in said and said.count("+0 %") == 4
+
+
+def test_what_became_slower_is_named_and_tiny_stages_are_not():
+    new = copy.deepcopy(FIGURES)
+    new["stages"]["planes"]["p50_ms"], new["stages"]["loop"]["p50_ms"] = 6.0, 0.1
+    new["stages"]["lines"] = {"p50_ms": 1.0, "p95_ms": 1.0}
+    said = compared(FIGURES, new)
+    assert said.splitlines()[-1] == "slower: planes"
+    assert "+20 %" in said and "new" in said
+
+
+def test_the_benchmark_writes_what_it_compares_with(tmp_path, capsys):
+    file = tmp_path / "old.json"
+    assert main(["benchmark", *TINY, "--json", str(file)]) == 0
+    figures = json.loads(file.read_text())
+    assert figures["frames"] == 6 and figures["cli_cpu_s"] > 0.0 and set(figures["machine"]["packages"]) >= {"numpy", "numba"}
+    assert f"reference workload {figures['reference_ms']:.1f} ms" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    "words, said",
+    [
+        (["maps"], "benchmark: 'maps' is neither key=value nor a comparison; did you mean 'map'?"),
+        (["--compare", "none.json"], "none.json: cannot be read (No such file or directory); give a file written by trihedron benchmark --json"),
+        (["scaling", "--parts", "thread"], "benchmark scaling: there is no part 'thread'; did you mean 'threads'?"),
+        (["scaling", "--lengths", "few"], "benchmark scaling: --lengths 'few' is not a list of numbers of frames; write 100,1000,5000"),
+    ],
+)
+def test_mistakes_take_one_line(words, said, capsys, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert main(["benchmark", *words]) != 0
+    assert said in capsys.readouterr().err
+
+
+def test_another_file_is_no_benchmark(capsys, tmp_path):
+    (tmp_path / "other.json").write_text("{}")
+    assert main(["benchmark", "--compare", str(tmp_path / "other.json")]) != 0
+    assert "holds no figures of a benchmark" in capsys.readouterr().err
+
+
+@pytest.mark.slow
+def test_scaling_prints_and_plots(tmp_path, capsys):
+    png, file = tmp_path / "scaling.png", tmp_path / "scaling.json"
+    assert main(["benchmark", "scaling", *TINY, "--parts", "threads,length", "--lengths", "4,6", "--png", str(png), "--json", str(file)]) == 0
+    figures = json.loads(file.read_text())
+    assert [row["frames"] for row in figures["length"]] == [4, 6] and png.stat().st_size > 1000
+    assert "key points" not in capsys.readouterr().out
