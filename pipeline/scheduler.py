@@ -2,13 +2,15 @@
 
 A task is one node at one frame. It is ready when what its wires name is there: a value of the same frame, of exactly k frames ago, or, for
 `@prev`, all earlier frames of that topic. Ready tasks run oldest frame first, so tracking goes before features of later frames; how many frames
-may be in flight is bounded. Nodes see only their inputs, so the order in which tasks happen to run cannot change a value.
+may be in flight is bounded. What only later frames ask for has a thread of its own at a lower priority, so that no pose waits for it. Nodes see only
+their inputs, so the order in which tasks happen to run cannot change a value.
 """
 
 from __future__ import annotations
 
 import contextlib
 import heapq
+import os
 import sys
 import threading
 from collections import defaultdict
@@ -22,6 +24,7 @@ from threadpoolctl import threadpool_limits
 from trihedron.pipeline.graph import PREVIOUS, Wire
 
 SWITCH_S = 0.0005  # of Python's usual 5 ms
+NICE = 10  # of the thread for what may lag; where the system has no such thing for threads, it is a thread like the others
 
 
 @dataclass(frozen=True)
@@ -49,7 +52,8 @@ class NoMoreFrames(Exception):
 class Scheduler:
     """Nodes in topological order, `threads` workers, at most `lookahead` frames in flight.
 
-    A node read only through `@k` wires may lag k frames behind; it does not hold back the others. `initial` holds what `@prev` sees before the first
+    A node read only through `@k` wires may lag k frames behind; it does not hold back the others, and with more than one worker another, of lower
+    priority, takes it. `initial` holds what `@prev` sees before the first
     frame, `recent` what `@k` does: node -> position (-1: one frame before the first) -> value."""
 
     def __init__(
@@ -75,9 +79,11 @@ class Scheduler:
                 self._consumers[node.name].append((node.name, PREVIOUS))
         lagging = {name for name in self._nodes if self._consumers[name] and all(delay > 0 for _, delay in self._consumers[name])}
         self._prompt = [name for name in self._nodes if name not in lagging]
+        self._background = lagging if threads > 1 else set()
         self._lock = threading.Lock()
-        self._work_there, self._frame_there = threading.Condition(self._lock), threading.Condition(self._lock)
-        self._ready: list[tuple[int, int, str]] = []
+        self._frame_there = threading.Condition(self._lock)
+        self._work_there = {background: threading.Condition(self._lock) for background in (False, True)}
+        self._ready: dict[bool, list[tuple[int, int, str]]] = {False: [], True: []}
         self._unmet: dict[tuple[str, int], int] = {}
         self._values: dict[str, dict[int, Any]] = {name: {} for name in self._nodes}
         self._held: dict[str, dict[int, Any]] = {name: {} for name in self._nodes}
@@ -89,7 +95,8 @@ class Scheduler:
     def run(self, count: int) -> Iterator[tuple[int, dict[str, Any]]]:
         """Yield (position, values by node) for 0..count-1 in order, fewer where a node raises NoMoreFrames. After a failure the frames before it
         come, then what was done of that frame, then NodeFailure is raised."""
-        workers = [threading.Thread(target=self._work, name=f"stage-{i}", daemon=True) for i in range(self._threads)]
+        backgrounds = [False] * self._threads + [True] * bool(self._background)
+        workers = [threading.Thread(target=self._work, args=(b,), name=f"stage-{i}", daemon=True) for i, b in enumerate(backgrounds)]
         for worker in workers:
             worker.start()
         try:
@@ -110,7 +117,8 @@ class Scheduler:
         finally:
             with self._lock:
                 self._stopped = True
-                self._work_there.notify_all()
+                for there in self._work_there.values():
+                    there.notify_all()
             for worker in workers:
                 worker.join()
 
@@ -120,10 +128,12 @@ class Scheduler:
             return True
         if position >= self._count:
             return not self._running
-        return self._failure is not None and self._failure.position <= position and not self._running and not self._runnable()
+        idle = not self._running and not any(self._runnable(background) for background in self._ready)
+        return self._failure is not None and self._failure.position <= position and idle
 
-    def _runnable(self) -> bool:
-        return bool(self._ready) and self._ready[0][0] < self._count and (self._failure is None or self._ready[0][0] <= self._failure.position)
+    def _runnable(self, background: bool) -> bool:
+        ready = self._ready[background]
+        return bool(ready) and ready[0][0] < self._count and (self._failure is None or ready[0][0] <= self._failure.position)
 
     def _admit(self) -> None:
         """Let frames in while few enough are in flight and the consumer keeps up."""
@@ -136,8 +146,9 @@ class Scheduler:
             for name in self._nodes:
                 self._offer(name, self._admitted)
             self._admitted += 1
-        if self._ready:
-            self._work_there.notify(len(self._ready))
+        for background, ready in self._ready.items():
+            if ready:
+                self._work_there[background].notify(len(ready))
 
     def _there(self, wire: Wire, position: int) -> bool:
         if wire.delay == PREVIOUS:
@@ -147,15 +158,18 @@ class Scheduler:
 
     def _offer(self, name: str, position: int) -> None:
         if self._unmet[name, position] == 0:
-            heapq.heappush(self._ready, (position, self._rank[name], name))
+            heapq.heappush(self._ready[name in self._background], (position, self._rank[name], name))
 
-    def _work(self) -> None:
+    def _work(self, background: bool) -> None:
+        if background:
+            with contextlib.suppress(OSError, AttributeError):  # Linux has a priority for each thread
+                os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), NICE)
         while True:
             with self._lock:
-                self._work_there.wait_for(lambda: self._stopped or self._runnable())
+                self._work_there[background].wait_for(lambda: self._stopped or self._runnable(background))
                 if self._stopped:
                     return
-                position, _, name = heapq.heappop(self._ready)
+                position, _, name = heapq.heappop(self._ready[background])
                 inputs = {parameter: self._input(wire, position) for parameter, wire in self._nodes[name].inputs.items()}
                 self._running += 1
             failure: NodeFailure | None = None

@@ -119,3 +119,20 @@ def test_memory_is_bounded_by_the_reach_of_the_wires():
     for _ in scheduler.run(200):
         largest = max(largest, *(len(values) for values in scheduler._values.values()), *(len(held) for held in scheduler._held.values()))
     assert largest <= 4 + 3 + 5
+
+
+def test_what_may_lag_takes_none_of_the_workers():
+    """Two workers and the lagging node meet, which they can only on three threads."""
+    meeting = threading.Barrier(3, timeout=20.0)
+
+    def meets(k, v):
+        if k == 2:
+            meeting.wait()
+        return k
+
+    nodes = [
+        Node("left", meets, {"x": Wire("late", 2)}),
+        Node("right", meets, {}),
+        Node("late", lambda k, v: meets(k + 1, v), {"x": Wire("right")}),
+    ]
+    assert [values["left"] for values in run(nodes, 5)] == [0, 1, 2, 3, 4]
