@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import struct
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -11,29 +9,15 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from trihedron.datasets.picture_headers import JPEG, PNG, UnreadableImage, picture_header
 from trihedron.pipeline.errors import DataError
 from trihedron.pipeline.png import is_whole_png
 from trihedron.pipeline.types import F32, U8
 
-PNG, JPEG = b"\x89PNG", b"\xff\xd8\xff"
 JPEG_END = b"\xff\xd9"  # of a complete file; a decoder would fill the rest of a truncated one with grey and say nothing
-FRAME_MARKS = {*range(0xC0, 0xD0)} - {0xC4, 0xC8, 0xCC}  # of a JPEG: where its size is said
-PIXELS_PER_BYTE = 2048  # more than either format can pack: deflate makes 1032 bytes of one, a grey JPEG 512 pixels of one
+PIXELS_PER_BYTE = 2048  # more than a picture can pack: deflate makes 1032 bytes of one, a grey JPEG 512 pixels of one
+MOST_PIXELS = 1 << 26  # more than any camera has that sees depth
 TAIL = 64  # bytes searched for the end mark: writers may pad
-
-
-class UnreadableImage(Exception):
-    """A file that cannot be opened or decoded; the message says why."""
-
-
-@dataclass(frozen=True)
-class PictureHeader:
-    """What a picture claims to be; `bits` are of one channel."""
-
-    width: int
-    height: int
-    bits: int
-    channels: int
 
 
 def read_color(path: Path) -> U8:
@@ -69,22 +53,17 @@ def _decode(path: Path) -> NDArray[Any]:
         raise UnreadableImage(f"cannot be opened ({error.strerror})") from error
     if not data:
         raise UnreadableImage("is empty")
-    if data.startswith((PNG, JPEG)):
-        return decode_image(data)
-    return _decoded(data)
+    return decode_image(data)
 
 
 def decode_image(data: bytes) -> NDArray[Any]:
-    """The pixels of a PNG or JPEG as OpenCV orders them. Raises UnreadableImage for what is cut off, damaged or larger than its bytes can hold."""
+    """The pixels of a picture as OpenCV orders them. Raises UnreadableImage for another format (see `picture_headers`) and for what is cut off,
+    damaged or larger than its bytes can hold."""
     header = picture_header(data)
-    if header.width * header.height > PIXELS_PER_BYTE * len(data):
+    if header.cells > min(PIXELS_PER_BYTE * len(data), MOST_PIXELS):
         raise UnreadableImage(f"claims {header.width}×{header.height} pixels in {len(data)} bytes")
-    if not (is_whole_png(data) if data.startswith(PNG) else JPEG_END in data[-TAIL:]):
+    if (data.startswith(PNG) and not is_whole_png(data)) or (data.startswith(JPEG) and JPEG_END not in data[-TAIL:]):
         raise UnreadableImage("is truncated")
-    return _decoded(data)
-
-
-def _decoded(data: bytes) -> NDArray[Any]:
     try:
         image = cv2.imdecode(np.frombuffer(data, dtype=np.uint8), cv2.IMREAD_UNCHANGED)
     except cv2.error:
@@ -92,20 +71,6 @@ def _decoded(data: bytes) -> NDArray[Any]:
     if image is None:
         raise UnreadableImage("is damaged or of an unknown format")
     return np.asarray(image)
-
-
-def picture_header(data: bytes) -> PictureHeader:
-    """What a PNG or JPEG says of itself. Raises UnreadableImage for another format or none."""
-    if data.startswith(PNG) and len(data) >= 26:
-        width, height, bits, color = struct.unpack_from(">IIBB", data, 16)
-        return PictureHeader(width, height, bits, {0: 1, 2: 3, 3: 3, 4: 2, 6: 4}.get(color, 3))
-    at = 2
-    while data.startswith(JPEG) and at + 10 <= len(data) and data[at] == 0xFF:
-        if data[at + 1] in FRAME_MARKS:
-            bits, height, width, channels = struct.unpack_from(">BHHB", data, at + 4)
-            return PictureHeader(width, height, bits, channels)
-        at += 1 if data[at + 1] == 0xFF else 2 + max(2, struct.unpack_from(">H", data, at + 2)[0])
-    raise UnreadableImage("is damaged or of an unknown format")
 
 
 def check_size(path: Path, image: NDArray[Any], width: int, height: int, reference: str, cure: str) -> None:

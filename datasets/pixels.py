@@ -10,7 +10,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from trihedron.datasets.images import UnreadableImage, decode_image, picture_header
+from trihedron.datasets.images import decode_image
+from trihedron.datasets.picture_headers import UnreadableImage, picture_header
 from trihedron.datasets.robot_values import Picture
 from trihedron.pipeline.types import F32, U8
 

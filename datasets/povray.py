@@ -11,8 +11,8 @@ from pathlib import Path
 
 import numpy as np
 
-from trihedron.datasets.images import UnreadableImage
 from trihedron.datasets.lists import Stamps
+from trihedron.datasets.picture_headers import UnreadableImage
 from trihedron.datasets.sequence import DepthReader
 from trihedron.pipeline.errors import DataError
 from trihedron.pipeline.geometry import pose_matrix

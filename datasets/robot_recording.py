@@ -11,8 +11,8 @@ from typing import Any
 import cv2
 import numpy as np
 
-from trihedron.datasets.images import UnreadableImage
 from trihedron.datasets.lists import Stamps, associate
+from trihedron.datasets.picture_headers import UnreadableImage
 from trihedron.datasets.pixels import Kind, color_of, depth_of
 from trihedron.datasets.registration import Registration
 from trihedron.datasets.robot_streams import Role, Stream, Streams

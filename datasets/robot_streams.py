@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from trihedron.datasets import foxglove_messages, ros_messages
-from trihedron.datasets.images import UnreadableImage
+from trihedron.datasets.picture_headers import UnreadableImage
 from trihedron.datasets.pixels import Kind, kind_of
 from trihedron.datasets.robot_values import Intrinsics, Picture, UnreadableMessage
 from trihedron.pipeline.errors import DataError, did_you_mean

@@ -10,8 +10,9 @@ import cv2
 import numpy as np
 
 from trihedron.datasets.cameras import Calibration
-from trihedron.datasets.images import UnreadableImage, read_color, read_depth
+from trihedron.datasets.images import read_color, read_depth
 from trihedron.datasets.matrices import frame_stamps, numbered, read_matrix, trajectory_of
+from trihedron.datasets.picture_headers import UnreadableImage
 from trihedron.datasets.sequence import ImageSequence, SequenceReader, open_folder, select_frames
 from trihedron.pipeline.errors import DataError
 from trihedron.pipeline.registry import register

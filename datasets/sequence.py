@@ -15,7 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from trihedron.datasets.cameras import Calibration
-from trihedron.datasets.images import UnreadableImage, check_size, read_color, read_depth
+from trihedron.datasets.images import check_size, read_color, read_depth
+from trihedron.datasets.picture_headers import UnreadableImage
 from trihedron.pipeline.errors import DataError
 from trihedron.pipeline.slots import frame_range
 from trihedron.pipeline.types import F32, U8, Frame, Trajectory

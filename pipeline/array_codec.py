@@ -20,6 +20,7 @@ from trihedron.pipeline.errors import RecordingError
 from trihedron.pipeline.mcap_chunks import MAX_RATIO
 from trihedron.pipeline.png import is_whole_png
 
+ENCODINGS = ("raw", "columns", "png", "zstd")
 MAX_BYTES = 1 << 30  # of one decoded array
 DAMAGED = "the file is damaged; record it again"
 TRANSPOSED_BYTES = 512  # smaller arrays are left as they are
@@ -59,6 +60,9 @@ def get_array(array: Any, place: str) -> Any:
     size = int(np.prod([float(n) for n in shape])) * dtype.itemsize if shape else dtype.itemsize
     if dtype.hasobject or any(n < 0 for n in shape) or size > MAX_BYTES:
         raise RecordingError(place, f"array '{array.name}' claims type {array.dtype!r} and shape {shape}", DAMAGED)
+    if array.encoding not in ENCODINGS:
+        cause = f"array '{array.name}' has the encoding '{array.encoding[:40]}', this program reads {', '.join(ENCODINGS)}"
+        raise RecordingError(place, cause, "read it with the version that wrote it")
     data = _plain(array, shape, size)
     if data is None or len(data) != size:
         raise RecordingError(place, f"array '{array.name}' does not have the {size} bytes of its shape {shape}", DAMAGED)
@@ -81,7 +85,7 @@ def _plain(array: Any, shape: tuple[int, ...], size: int) -> bytes | None:
         if len(array.data) != size or not size:
             return None
         return bytes(cv2.transpose(np.frombuffer(array.data, np.uint8).reshape(-1, shape[0])).tobytes())
-    return bytes(array.data) if array.encoding == "raw" else None
+    return bytes(array.data)
 
 
 def _image(data: bytes, shape: tuple[int, ...]) -> bytes | None:

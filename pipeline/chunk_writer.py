@@ -34,7 +34,7 @@ class ChunkWriter:
         self._file = _locked(path)
         self._whole = 0  # bytes up to the end of the last whole record
         self._chunk_bytes = 0
-        self._writer: Any = Writer(self._file, chunk_size=2 * CHUNK_BYTES, compression=CompressionType.LZ4)  # fast; much hardly shrinks
+        self._writer: Any = Writer(self._file, chunk_size=2 * CHUNK_BYTES, compression=CompressionType.ZSTD)  # a tenth smaller than LZ4
         self._guarded(lambda: self._writer.start(library="trihedron"))
         self._waiting: list[tuple[int, int, bytes]] = []
         self._waiting_bytes, self._closing = 0, False

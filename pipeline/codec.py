@@ -121,6 +121,8 @@ def _other_fields(message: Any, kind: Any) -> str:
     expected = set(_hints(kind)) - {"index", "stamp_ns"}
     lacks = ", ".join(f"'{name}'" for name in sorted(expected - recorded))
     more = ", ".join(f"'{name}'" for name in sorted(recorded - expected))
+    if not lacks and not more and Table in _hints(kind).values():
+        return ", whose tables have other columns"
     return (f", with the field {lacks} that it lacks" if lacks else "") + (f", without its field {more}" if more else "")
 
 

@@ -159,7 +159,9 @@ def _unknown_option(group: str, name: str, options: list[str]) -> TrihedronError
 def _unknown_key(key: str) -> TrihedronError:
     group, _, option = key.rpartition(".")
     if group in SLOTS:
-        known = {f.name for plugin in plugins_of(group).values() for f in options_of(plugin)}
-        return ConfigError(key, f"the chosen plugin has no option '{option}'", did_you_mean(option, known))
+        owners = {name: {f.name for f in options_of(plugin)} for name, plugin in plugins_of(group).items()}
+        having = sorted(name for name, options in owners.items() if option in options)
+        cure = f"it belongs to {group}={' or '.join(having)}" if having else did_you_mean(option, set().union(*owners.values()))
+        return ConfigError(key, f"the chosen plugin has no option '{option}'", cure)
     known = {f.name for f in dataclasses.fields(RunOptions) if f.name not in ("defaults", "hydra")} | set(SLOTS)
     return ConfigError(key, "there is no such key", did_you_mean(key, known) if not group else "see trihedron run --help")

@@ -71,9 +71,9 @@ def execute(config: DictConfig, out: Path, overrides: list[str], began: float) -
         finally:
             with held_interrupts():
                 failure = _closed(writer)
-                metrics = _write(runner, truth, out, started, began)
+                metrics, timing = _write(runner, truth, out, started, began)
                 warnings.summarise()
-    _report(out, metrics, [results.write_surface(out, value) for value in runner.result.folds.values() if isinstance(value, Surface)])
+    _report(out, metrics, timing, [results.write_surface(out, value) for value in runner.result.folds.values() if isinstance(value, Surface)])
     if failure is not None:
         raise failure
     return metrics
@@ -133,10 +133,11 @@ def _replay(config: DictConfig, graph: Graph) -> Replay | None:
 
 def _recorded_topics(config: DictConfig, graph: Graph, replay: Replay | None) -> frozenset[str]:
     """All computed topics that are not dense, and the dense ones that were named."""
+    known = set(graph.stages) | (replay.recording.topics if replay is not None else set())  # a replay may leave out stages of the run
     for name in config.record.topics:
-        if name not in graph.stages:
-            raise ConfigError("record.topics", f"no stage writes '{name}'", did_you_mean(name, graph.stages))
-    names = {name for name in graph.stages if not output_of(name).dense} | set(config.record.topics)
+        if name not in known:
+            raise ConfigError("record.topics", f"no stage writes '{name}'", did_you_mean(name, known))
+    names = {name for name in graph.stages if not output_of(name).dense} | (set(config.record.topics) & set(graph.stages))
     names |= {"dataset"} if config.record.frames or is_camera(graph.stages["dataset"].plugin) else set()  # a camera shows no frame twice
     return frozenset(names if replay is None else names & set(replay.only))
 
@@ -201,17 +202,19 @@ def _progress(steps: Iterator[Step]) -> Iterator[Step]:
         bar.close()
 
 
-def _write(runner: Runner, truth: Trajectory | None, out: Path, started: float, began: float) -> dict[str, Any]:
-    """The files beside the recording. A trajectory is written only where poses were computed."""
+def _write(runner: Runner, truth: Trajectory | None, out: Path, started: float, began: float) -> tuple[dict[str, Any], dict[str, Any]]:
+    """The files beside the recording; returns metrics and times. A trajectory is written only where poses were computed."""
     metrics: dict[str, Any] = {}
-    wall_s = time.perf_counter() - started
+    timing = runner.timing.summary(runner.threads, time.perf_counter() - started, started - began)
+    if runner.feed is not None:
+        timing["live"] = runner.feed.summary(timing["frame_ms"])
     try:
         if "pose" in runner.computed:
             metrics = results.write_results(out, runner.result, truth)
-        results.write_json(out / results.TIMING, runner.timing.summary(runner.threads, wall_s, started - began))
+        results.write_json(out / results.TIMING, timing)
     except OSError as error:
         raise DataError(str(error.filename or out), f"cannot be written: {error.strerror}", "make room, or give another out=FOLDER") from error
-    return metrics
+    return metrics, timing
 
 
 def _attachments(graph: Graph, replay: Replay | None) -> dict[str, str]:
@@ -222,10 +225,14 @@ def _attachments(graph: Graph, replay: Replay | None) -> dict[str, str]:
     return {TRUTH: format_trajectory(truth)} if truth is not None else {}
 
 
-def _report(out: Path, metrics: dict[str, Any], surfaces: list[str]) -> None:
+def _report(out: Path, metrics: dict[str, Any], timing: dict[str, Any], surfaces: list[str]) -> None:
     status = metrics.get("status", {})
     if status:
         print("frames: " + ", ".join(f"{count} {name}" for name, count in status.items() if count))
+    if live := timing.get("live"):
+        late = live["latency_ms"]
+        said = f"{live['came']} frames came, {live['taken']} were taken, {live['dropped']} dropped"
+        print(f"live: {said}; a pose is ready {late['p50']:.0f} ms after its frame came (median; at most {late['max']:.0f} ms)")
     if "final" in metrics:
         print(f"ATE {metrics['final']['ate_rmse_m']:.4f} m (as tracked {metrics['causal']['ate_rmse_m']:.4f} m)")
     for line in surfaces:

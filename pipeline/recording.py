@@ -87,14 +87,26 @@ class Recording:
             raise RecordingError(str(path), "is an MCAP file, but not a recording of trihedron", "convert it with: trihedron convert SRC DST.mcap")
         self.metadata = self._file.metadata[METADATA]
         self.attachments = {name: data.decode("utf-8", "replace") for name, data in self._file.attachments.items()}
-        if self.metadata.get("format") != FORMAT:
-            written = " ".join(["trihedron", self.metadata.get("version", ""), self.metadata.get("commit", "")[:7]]).strip()
-            cause = f"has format {self.metadata.get('format')} of {written}, this program reads format {FORMAT}: other arrays and tables"
-            raise RecordingError(str(path), cause, "read it with the version that wrote it, or record again")
         self.channels: dict[str, Channel] = {c.topic: c for c in self._file.channels.values()}
         self.counts = {c.topic: self._file.counts.get(c.id, 0) for c in self.channels.values()}
         self.topics = {t[1:] for t, c in self.channels.items() if self._file.schema_name(c.id) == ValueMessage.DESCRIPTOR.full_name}
         self._chunks: dict[str, list[ChunkIndex]] = {}
+        if self.metadata.get("format") != FORMAT:
+            written = " ".join(["trihedron", self.metadata.get("version", ""), self.metadata.get("commit", "")[:7]]).strip()
+            cause = f"has format {self.metadata.get('format')} of {written}, this program reads format {FORMAT}: {self._difference()}"
+            raise RecordingError(str(path), cause, "read it with the version that wrote it, or record again")
+
+    def _difference(self) -> str:
+        """Of a recording of another format: what its first messages hold that this program does not read, types with other fields first."""
+        causes = []
+        for topic in sorted(self.topics):
+            try:
+                next(self.values(topic), None)
+            except RecordingError as error:
+                causes.append(f"topic /{topic} {error.cause}")
+        causes.sort(key=lambda cause: "the field" not in cause)
+        more = f", and {len(causes) - 1} more of its topics are others" if len(causes) > 1 else ""
+        return causes[0] + more if causes else "its arrays and tables are packed otherwise"
 
     def overrides(self) -> list[str]:
         """The overrides of the command that made the recording. Raises RecordingError where they are no list of texts."""

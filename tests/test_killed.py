@@ -93,13 +93,13 @@ def test_a_killed_writer_loses_less_than_a_second(tmp_path, capsys):
 
 @pytest.mark.slow
 def test_twenty_runs_killed_at_random_moments(tmp_path, capsys):
-    rng = np.random.default_rng()
+    rng, lines = np.random.default_rng(), []
     for i in range(20):
         out = tmp_path / str(i)
         process = subprocess.Popen([sys.executable, "-c", TRACKED, str(out)], stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True)
         recorded = killed(process, process.stderr, rng.uniform(0.1, 6.0))
         lost = check(out / "run.mcap", recorded, capsys)
-        print(f"killed after {len(recorded)} frames: {lost} lost")
+        lines.append(f"killed after {len(recorded)} frames: {lost} lost")
         if i % 5 == 0 and len(recorded) > lost:
             again = tmp_path / f"again{i}"
             words = [f"replay={out}/run.mcap", "only=[rotation]", f"out={again}"]
@@ -107,6 +107,7 @@ def test_twenty_runs_killed_at_random_moments(tmp_path, capsys):
             done = subprocess.run([sys.executable, "-c", run, *words], capture_output=True, text=True)
             assert done.returncode == 0, done.stderr
             assert contents(again / "run.mcap").get("/rotation") == contents(out / "run.mcap").get("/rotation")
+    print("\n".join(lines))
 
 
 def recording(path, count, writer=None):

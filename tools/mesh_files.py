@@ -28,13 +28,16 @@ def read_mesh(path: Path) -> tuple[F64, I32]:
             vertices, polygons = _ply(path.read_bytes())
         else:
             raise DataError(str(path), f"'{path.suffix}' is not a mesh file this program reads", "give a .ply or .obj file")
-    except (ValueError, IndexError, KeyError, UnicodeDecodeError) as error:
-        raise DataError(str(path), f"is not a mesh: {error}", "give a .ply or .obj file") from error
-    triangles = [(p[0], p[k], p[k + 1]) for p in polygons for k in range(1, len(p) - 1)] if isinstance(polygons, list) else polygons
-    found = np.asarray(triangles, np.int32).reshape(-1, 3)
-    if len(found) and (found.min() < 0 or found.max() >= len(vertices)):
+        points = np.asarray(vertices, np.float64).reshape(len(vertices), 3)
+        triangles = [(p[0], p[k], p[k + 1]) for p in polygons for k in range(1, len(p) - 1)] if isinstance(polygons, list) else polygons
+        found = np.asarray(triangles, np.int32).reshape(-1, 3)
+    except (ValueError, IndexError, KeyError, OverflowError) as error:
+        raise DataError(str(path), f"is not a mesh: {' '.join(str(error).split())}", "give a .ply or .obj file") from error
+    if not np.isfinite(points).all():
+        raise DataError(str(path), "has a vertex that is not finite", "the file is damaged; write it again")
+    if len(found) and (found.min() < 0 or found.max() >= len(points)):
         raise DataError(str(path), "a face names a vertex that is not there", "the file is damaged; write it again")
-    return np.asarray(vertices, np.float64).reshape(-1, 3), found
+    return points, found
 
 
 def _obj(path: Path) -> tuple[list[list[float]], list[list[int]]]:

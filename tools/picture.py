@@ -87,6 +87,10 @@ def _image(recording: Recording, stamp_ns: int, camera: Camera) -> Any:
     import numpy as np
     from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
 
+    from trihedron.datasets.picture_headers import UnreadableImage
+    from trihedron.datasets.pixels import color_of
+    from trihedron.datasets.robot_values import Picture
+    from trihedron.pipeline.errors import RecordingError
     from trihedron.pipeline.recording import FrameReader
 
     whole: Any = FrameReader(recording, "dataset").at(stamp_ns) if "dataset" in recording.topics else None
@@ -97,8 +101,11 @@ def _image(recording: Recording, stamp_ns: int, camera: Camera) -> Any:
         return np.full((camera.height, camera.width, 3), 255, np.uint8)
     nearest = min(messages, key=lambda message: abs(message[0] - stamp_ns))
     data = CompressedImage.FromString(nearest[1]).data
-    small = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
-    return cv2.cvtColor(cv2.resize(small, (camera.width, camera.height)), cv2.COLOR_BGR2RGB)
+    try:
+        small = color_of(Picture(nearest[0], "", "jpeg", data, compressed=True))
+    except UnreadableImage as error:
+        raise RecordingError(str(recording.path), f"topic /view/image: an image {error}", "the file is damaged; record it again") from error
+    return cv2.resize(small, (camera.width, camera.height))
 
 
 def _tinted(image: Any, planes: Planes) -> Any:

@@ -75,7 +75,7 @@ def recover(path: Path, out: Path) -> Rescued:
 
 def _copy(source: IO[bytes], size: int, file: IO[bytes]) -> Rescued:
     """Record after record, until one is not whole."""
-    writer: Any = Writer(file, chunk_size=CHUNK_BYTES, compression=CompressionType.LZ4)
+    writer: Any = Writer(file, chunk_size=CHUNK_BYTES, compression=CompressionType.ZSTD)
     writer.start(library="trihedron")
     copy, end = _Copy(writer), 0
     try:

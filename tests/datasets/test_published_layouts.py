@@ -183,6 +183,7 @@ def test_scannet_says_what_is_missing(scannet: Path) -> None:
         len(ScanNet(str(scannet)))
 
 
+@pytest.mark.slow
 def test_a_room_in_each_layout_is_tracked(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """Eight frames of the built-in room, written in the three layouts, are tracked to a centimetre by the layout's own truth."""
     room = Synthetic(length=120, frames="0:8")

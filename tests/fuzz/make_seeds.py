@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import struct
 import sys
 from pathlib import Path
 
@@ -15,6 +16,7 @@ from trihedron.datasets import foxglove_messages
 from trihedron.datasets.robot_streams import ROS
 from trihedron.datasets.trajectories import TRUTH
 from trihedron.pipeline.geometry import exp_se3
+from trihedron.pipeline.ply import write_ply
 from trihedron.pipeline.recording import RecordingWriter
 from trihedron.pipeline.runner import Runner
 from trihedron.plugins.numerics.maps.landmarks import empty_map
@@ -41,13 +43,36 @@ def make_seeds(folder: Path) -> None:
     (folder / "cam_params.json").write_text(json.dumps({"camera": camera}))
     (folder / "trajectory.txt").write_text(f"# stamp tx ty tz qx qy qz qw\n{TRUE_POSES}")
     (folder / "matrix.txt").write_text("\n".join(" ".join(f"{x:.6f}" for x in row) for row in exp_se3(np.arange(6) / 10)))
-    (folder / "picture_color.png").write_bytes(encoded(".png", SMALL.color()))
-    (folder / "picture_color.jpg").write_bytes(encoded(".jpg", SMALL.color()))
-    (folder / "picture_depth.png").write_bytes(encoded(".png", np.rint(SMALL.depth_in_color() * 1000).astype(np.uint16)))
+    _pictures_and_meshes(folder)
     _robots(folder)
     _foxglove(folder)
     _own(folder)
     _messages(folder)
+
+
+def _pictures_and_meshes(folder: Path) -> None:
+    color, depth = SMALL.color(), np.rint(SMALL.depth_in_color() * 1000).astype(np.uint16)
+    for extension in (".png", ".jpg", ".bmp", ".ppm", ".tif"):
+        (folder / f"picture_color{extension}").write_bytes(encoded(extension, color))
+    for extension in (".png", ".pgm", ".tif"):
+        (folder / f"picture_depth{extension}").write_bytes(encoded(extension, depth))
+    (folder / "picture_tiled.tif").write_bytes(_tiled(np.pad(depth, ((0, 4), (0, 0)))))
+    corners, triangles = np.eye(4, 3, dtype=np.float32), np.array([[0, 1, 2], [0, 2, 3]], np.int32)
+    write_ply(folder / "mesh_binary.ply", corners, np.zeros((4, 3), np.uint8), triangles, np.array([0, -1], np.int32), "seed")
+    vertex = "element vertex 4\nproperty float x\nproperty float y\nproperty float z\n"
+    head = f"ply\nformat ascii 1.0\n{vertex}element face 2\nproperty list uchar int vertex_indices\nend_header\n"
+    rows = ["{:g} {:g} {:g}".format(*corner) for corner in corners.tolist()]
+    faces = [" ".join(map(str, row)) for row in triangles.tolist()]
+    (folder / "mesh_ascii.ply").write_text(head + "\n".join([*rows, *(f"3 {face}" for face in faces)]) + "\n")
+    text = [*(f"v {row}" for row in rows), "f 1/1 2/2 3/3", "f -4 -2 -1"]
+    (folder / "mesh.obj").write_text("\n".join(text) + "\n")
+
+
+def _tiled(depth: np.ndarray) -> bytes:
+    """A TIFF of one tile of 16 × 16 pixels of 16 bits."""
+    tags = [(256, 16), (257, 16), (258, 16), (259, 1), (262, 1), (277, 1), (322, 16), (323, 16), (324, 8), (325, 512)]
+    entries = b"".join(struct.pack("<HHII", tag, 4, 1, value) for tag, value in tags)
+    return struct.pack("<2sHI", b"II", 42, 520) + depth.astype("<u2").tobytes() + struct.pack("<H", len(tags)) + entries + bytes(4)
 
 
 def _robots(folder: Path) -> None:

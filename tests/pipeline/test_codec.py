@@ -158,8 +158,7 @@ def test_damaged_and_foreign_values_are_refused():
     message = message_of(keypoints())
     message.version = 9
     assert refusal(message) == (
-        "a.mcap: topic /keypoints: holds Keypoints version 9, this program reads version 1; "
-        "record again, or read it with the version that wrote it"
+        "a.mcap: topic /keypoints: holds Keypoints version 9, this program reads version 1; record again, or read it with the version that wrote it"
     )
     message = message_of(keypoints())
     del message.arrays[2]
@@ -173,6 +172,12 @@ def test_damaged_and_foreign_values_are_refused():
     message.arrays[1].shape[0] = 19
     assert refusal(message) == (
         "a.mcap: topic /keypoints: array 'points_m' does not have the 228 bytes of its shape (19, 3); the file is damaged; record it again"
+    )
+    message = message_of(keypoints())
+    message.arrays[0].encoding = "zstd_planes"
+    assert refusal(message) == (
+        "a.mcap: topic /keypoints: array 'pixels' has the encoding 'zstd_planes', this program reads raw, columns, png, zstd; "
+        "read it with the version that wrote it"
     )
     message = message_of(keypoints())
     message.arrays[0].dtype = "O"

@@ -16,6 +16,7 @@ from mcap.writer import Writer
 from mcap_protobuf.decoder import DecoderFactory
 
 from trihedron.pipeline import chunk_writer as module
+from trihedron.pipeline.cli import main
 from trihedron.pipeline.errors import RecordingError
 from trihedron.pipeline.foxglove import View
 from trihedron.pipeline.foxglove_messages import MOST_VERTICES
@@ -126,14 +127,27 @@ def test_wrong_files_say_so_in_one_line(tmp_path):
     assert refusal(tmp_path / "other.mcap") == (
         "DIR/other.mcap: is an MCAP file, but not a recording of trihedron; convert it with: trihedron convert SRC DST.mcap"
     )
-    write(tmp_path / "old.mcap", [0], format="1", version="0.0.9", commit="0123456789")
-    assert refusal(tmp_path / "old.mcap") == (
-        "DIR/old.mcap: has format 1 of trihedron 0.0.9 0123456, this program reads format 2: other arrays and tables; "
+    write(tmp_path / "new.mcap", [0], format="9", version="0.0.9", commit="0123456789")
+    assert refusal(tmp_path / "new.mcap") == (
+        "DIR/new.mcap: has format 9 of trihedron 0.0.9 0123456, this program reads format 2: its arrays and tables are packed otherwise; "
         "read it with the version that wrote it, or record again"
     )
     with pytest.raises(RecordingError) as error:
         RecordingWriter(tmp_path / "no" / "a.mcap", {})
     assert str(error.value).replace(str(tmp_path), "DIR") == "DIR/no/a.mcap: cannot be written: No such file or directory; give another out=FOLDER"
+
+
+def test_a_recording_of_an_older_program_names_version_and_field(capsys):
+    """Three frames that the first version of this program wrote, in format 1; whatever is asked of them."""
+    path = Path(__file__).parent / "recordings" / "format_1.mcap"
+    line = (
+        f"trihedron: {path}: has format 1 of trihedron 0.0.1 ad955b7, this program reads format 2: topic /pose holds Pose version 1, this program "
+        "reads version 2, with the field 'submap', 'unrecognised' that it lacks, and 1 more of its topics are others; "
+        "read it with the version that wrote it, or record again\n"
+    )
+    for words in (["run", f"replay={path}", "only=[pose]"], ["diff", str(path), str(path)], ["export", str(path), "--to", "tum"]):
+        assert main(words) == 1
+        assert capsys.readouterr().err == line
 
 
 def loose_mesh(index, vertices, triangles):

@@ -1,0 +1,98 @@
+"""What a picture says of itself before it is decoded: a decoder allocates what the header claims.
+
+PNG, JPEG, BMP, PNM (PBM, PGM, PPM) and TIFF; other formats are refused, so that no decoder sees a file whose size was not looked at."""
+
+from __future__ import annotations
+
+import re
+import struct
+from dataclasses import dataclass
+
+PNG, JPEG, BMP = b"\x89PNG", b"\xff\xd8\xff", b"BM"
+TIFFS = {b"II*\0": "<", b"MM\0*": ">"}  # little and big endian
+PNM = re.compile(rb"P([1-6])(?:\s+|#[^\n]*\n)+(\d{1,9})(?:\s+|#[^\n]*\n)+(\d{1,9})(?:(?:\s+|#[^\n]*\n)+(\d{1,9}))?\s")
+PNM_HEAD = 4096  # bytes in which the header of a PNM, with its comments, ends
+FRAME_MARKS = {*range(0xC0, 0xD0)} - {0xC4, 0xC8, 0xCC}  # of a JPEG: where its size is said
+TIFF_WIDTH, TIFF_HEIGHT, TIFF_BITS, TIFF_SAMPLES, TIFF_TILE_WIDTH, TIFF_TILE_HEIGHT = 256, 257, 258, 277, 322, 323
+TIFF_FORMATS = {1: "B", 3: "H", 4: "I"}
+
+
+class UnreadableImage(Exception):
+    """A file that cannot be opened or decoded; the message says why."""
+
+
+@dataclass(frozen=True)
+class PictureHeader:
+    """What a picture claims to be; `bits` are of one channel. `cells` are the pixels of its largest part: of the picture, or of a tile of it."""
+
+    width: int
+    height: int
+    bits: int
+    channels: int
+    tile: int = 0
+
+    @property
+    def cells(self) -> int:
+        """Pixels that a decoder makes room for at once."""
+        return max(self.width * self.height, self.tile)
+
+
+def picture_header(data: bytes) -> PictureHeader:
+    """What the bytes of a picture say of themselves. Raises UnreadableImage for another format or none."""
+    readers = {PNG: _png, JPEG: _jpeg, BMP: _bmp, **dict.fromkeys(TIFFS, _tiff)}
+    reader = next((reader for magic, reader in readers.items() if data.startswith(magic)), _pnm)
+    try:
+        header = reader(data)
+    except struct.error:
+        header = None
+    if header is None or header.width < 1 or header.height < 1:
+        raise UnreadableImage("is damaged or of an unknown format")
+    return header
+
+
+def _png(data: bytes) -> PictureHeader:
+    width, height, bits, color = struct.unpack_from(">IIBB", data, 16)
+    return PictureHeader(width, height, bits, {0: 1, 2: 3, 3: 3, 4: 2, 6: 4}.get(color, 3))
+
+
+def _jpeg(data: bytes) -> PictureHeader | None:
+    at = 2
+    while at + 10 <= len(data) and data[at] == 0xFF:
+        if data[at + 1] in FRAME_MARKS:
+            bits, height, width, channels = struct.unpack_from(">BHHB", data, at + 4)
+            return PictureHeader(width, height, bits, channels)
+        at += 1 if data[at + 1] == 0xFF else 2 + max(2, struct.unpack_from(">H", data, at + 2)[0])
+    return None
+
+
+def _bmp(data: bytes) -> PictureHeader:
+    if struct.unpack_from("<I", data, 14)[0] == 12:  # of OS/2
+        width, height, _, bits = struct.unpack_from("<HHHH", data, 18)
+    else:
+        width, height, _, bits = struct.unpack_from("<iiHH", data, 18)
+    return PictureHeader(abs(width), abs(height), 8, max(1, bits // 8))  # rows from the top have a negative height
+
+
+def _pnm(data: bytes) -> PictureHeader | None:
+    found = PNM.match(data[:PNM_HEAD])
+    if found is None:
+        return None
+    kind, width, height, most = (int(word or 0) for word in found.groups())
+    if kind in (1, 4):
+        return PictureHeader(width, height, 1, 1)
+    return PictureHeader(width, height, 16 if most > 255 else 8, 3 if kind in (3, 6) else 1)
+
+
+def _tiff(data: bytes) -> PictureHeader | None:
+    order = TIFFS[data[:4]]
+    at = struct.unpack_from(order + "I", data, 4)[0]
+    found = {TIFF_BITS: 1, TIFF_SAMPLES: 1, TIFF_TILE_WIDTH: 0, TIFF_TILE_HEIGHT: 0, TIFF_WIDTH: 0, TIFF_HEIGHT: 0}
+    for row in range(struct.unpack_from(order + "H", data, at)[0]):
+        place = at + 2 + 12 * row
+        tag, form, count = struct.unpack_from(order + "HHI", data, place)
+        if tag in found and form in TIFF_FORMATS:
+            element = order + TIFF_FORMATS[form]
+            far = struct.calcsize(element) * count > 4  # the values stand elsewhere
+            found[tag] = struct.unpack_from(element, data, struct.unpack_from(order + "I", data, place + 8)[0] if far else place + 8)[0]
+    tile = found[TIFF_TILE_WIDTH] * found[TIFF_TILE_HEIGHT]
+    return PictureHeader(found[TIFF_WIDTH], found[TIFF_HEIGHT], found[TIFF_BITS], found[TIFF_SAMPLES], tile)
