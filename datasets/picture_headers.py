@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import re
 import struct
+from collections.abc import Callable
 from dataclasses import dataclass
 
 PNG, JPEG, BMP = b"\x89PNG", b"\xff\xd8\xff", b"BM"
@@ -39,8 +40,7 @@ class PictureHeader:
 
 def picture_header(data: bytes) -> PictureHeader:
     """What the bytes of a picture say of themselves. Raises UnreadableImage for another format or none."""
-    readers = {PNG: _png, JPEG: _jpeg, BMP: _bmp, **dict.fromkeys(TIFFS, _tiff)}
-    reader = next((reader for magic, reader in readers.items() if data.startswith(magic)), _pnm)
+    reader = next((reader for magic, reader in READERS.items() if data.startswith(magic)), _pnm)
     try:
         header = reader(data)
     except struct.error:
@@ -96,3 +96,6 @@ def _tiff(data: bytes) -> PictureHeader | None:
             found[tag] = struct.unpack_from(element, data, struct.unpack_from(order + "I", data, place + 8)[0] if far else place + 8)[0]
     tile = found[TIFF_TILE_WIDTH] * found[TIFF_TILE_HEIGHT]
     return PictureHeader(found[TIFF_WIDTH], found[TIFF_HEIGHT], found[TIFF_BITS], found[TIFF_SAMPLES], tile)
+
+
+READERS: dict[bytes, Callable[[bytes], PictureHeader | None]] = {PNG: _png, JPEG: _jpeg, BMP: _bmp, **dict.fromkeys(TIFFS, _tiff)}

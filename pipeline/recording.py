@@ -98,7 +98,7 @@ class Recording:
 
     def _difference(self) -> str:
         """Of a recording of another format: what its first messages hold that this program does not read, types with other fields first."""
-        causes = []
+        causes: list[str] = []
         for topic in sorted(self.topics):
             try:
                 next(self.values(topic), None)
