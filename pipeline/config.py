@@ -161,7 +161,8 @@ def _unknown_key(key: str) -> TrihedronError:
     if group in SLOTS:
         owners = {name: {f.name for f in options_of(plugin)} for name, plugin in plugins_of(group).items()}
         having = sorted(name for name, options in owners.items() if option in options)
-        cure = f"it belongs to {group}={' or '.join(having)}" if having else did_you_mean(option, {known for options in owners.values() for known in options})
+        all_options = {known for options in owners.values() for known in options}
+        cure = f"it belongs to {group}={' or '.join(having)}" if having else did_you_mean(option, all_options)
         return ConfigError(key, f"the chosen plugin has no option '{option}'", cure)
     known = {f.name for f in dataclasses.fields(RunOptions) if f.name not in ("defaults", "hydra")} | set(SLOTS)
     return ConfigError(key, "there is no such key", did_you_mean(key, known) if not group else "see trihedron run --help")
