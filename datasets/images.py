@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from trihedron.datasets.picture_headers import JPEG, PNG, UnreadableImage, picture_header
+from trihedron.datasets.png_decoder import decode_png
 from trihedron.pipeline.errors import DataError
 from trihedron.pipeline.png import is_whole_png
 from trihedron.pipeline.types import F32, U8
@@ -64,6 +65,12 @@ def decode_image(data: bytes) -> NDArray[Any]:
         raise UnreadableImage(f"claims {header.width}×{header.height} pixels in {len(data)} bytes")
     if (data.startswith(PNG) and not is_whole_png(data)) or (data.startswith(JPEG) and JPEG_END not in data[-TAIL:]):
         raise UnreadableImage("is truncated")
+    try:
+        image = decode_png(data) if data.startswith(PNG) else None
+    except ValueError as error:
+        raise UnreadableImage(f"is damaged: {error}") from error
+    if image is not None:
+        return image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_RGB2BGR)
     try:
         image = cv2.imdecode(np.frombuffer(data, dtype=np.uint8), cv2.IMREAD_UNCHANGED)
     except cv2.error:

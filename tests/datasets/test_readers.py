@@ -57,7 +57,7 @@ def test_an_unreadable_image_is_one_warning_and_no_frame(tum_folder: Path, caplo
     data = file.read_bytes()
     causes = {
         "truncated": (data[: len(data) // 2], "is truncated"),
-        "garbled": (data[:40] + bytes(30) + data[70:], "is damaged or of an unknown format"),
+        "garbled": (data[:40] + bytes(30) + data[70:], "is damaged: it holds fewer pixels than it claims"),
         "empty": (b"", "is empty"),
         "truncated jpeg": (cv2.imencode(".jpg", np.zeros((24, 32, 3), dtype=np.uint8))[1].tobytes()[:-40], "is truncated"),
         "missing": (b"", "cannot be opened (No such file or directory)"),
