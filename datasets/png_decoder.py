@@ -107,29 +107,29 @@ def _nearest(a: int, b: int, c: int) -> int:
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def _paeth(line: U8, above: U8, pixel: int, here: U8) -> None:
     for i in range(len(here)):
-        a = np.int32(here[i - pixel]) if i >= pixel else np.int32(0)
-        c = np.int32(above[i - pixel]) if i >= pixel else np.int32(0)
-        here[i] = line[i] + _nearest(a, np.int32(above[i]), c)
+        a = int(here[i - pixel]) if i >= pixel else 0
+        c = int(above[i - pixel]) if i >= pixel else 0
+        here[i] = line[i] + _nearest(a, int(above[i]), c)
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def _paeth_2(line: U8, above: U8, here: U8) -> None:
     """Two bytes a pixel: two chains, which a processor follows at once."""
-    a0, a1, c0, c1 = np.int32(0), np.int32(0), np.int32(0), np.int32(0)
+    a0, a1, c0, c1 = 0, 0, 0, 0
     for i in range(0, len(here), 2):
-        b0, b1 = np.int32(above[i]), np.int32(above[i + 1])
-        a0 = (line[i] + _nearest(a0, b0, c0)) & 255
-        a1 = (line[i + 1] + _nearest(a1, b1, c1)) & 255
+        b0, b1 = int(above[i]), int(above[i + 1])
+        a0 = (int(line[i]) + _nearest(a0, b0, c0)) & 255
+        a1 = (int(line[i + 1]) + _nearest(a1, b1, c1)) & 255
         here[i], here[i + 1], c0, c1 = a0, a1, b0, b1
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def _paeth_3(line: U8, above: U8, here: U8) -> None:
     """Three bytes a pixel."""
-    a0, a1, a2, c0, c1, c2 = np.int32(0), np.int32(0), np.int32(0), np.int32(0), np.int32(0), np.int32(0)
+    a0, a1, a2, c0, c1, c2 = 0, 0, 0, 0, 0, 0
     for i in range(0, len(here), 3):
-        b0, b1, b2 = np.int32(above[i]), np.int32(above[i + 1]), np.int32(above[i + 2])
-        a0 = (line[i] + _nearest(a0, b0, c0)) & 255
-        a1 = (line[i + 1] + _nearest(a1, b1, c1)) & 255
-        a2 = (line[i + 2] + _nearest(a2, b2, c2)) & 255
+        b0, b1, b2 = int(above[i]), int(above[i + 1]), int(above[i + 2])
+        a0 = (int(line[i]) + _nearest(a0, b0, c0)) & 255
+        a1 = (int(line[i + 1]) + _nearest(a1, b1, c1)) & 255
+        a2 = (int(line[i + 2]) + _nearest(a2, b2, c2)) & 255
         here[i], here[i + 1], here[i + 2], c0, c1, c2 = a0, a1, a2, b0, b1, b2
