@@ -34,7 +34,7 @@ def decode_png(data: bytes) -> NDArray[Any] | None:
     inflate = zlib_ng.decompressobj()
     try:
         lines = inflate.decompress(packed, size)
-    except zlib_ng.error as error:
+    except zlib_ng.error as error:  # type: ignore[misc]  # its hints take the class for an instance
         raise ValueError("its bytes do not unpack") from error
     if len(lines) != size:
         raise ValueError("it holds fewer pixels than it claims")
