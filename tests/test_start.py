@@ -1,0 +1,46 @@
+"""Starting costs: the help is quick, and compiled kernels survive where the package cannot be written to."""
+
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+import trihedron.pipeline.cli
+
+PROGRAM = (sys.executable, "-c", "import sys; from trihedron.pipeline.cli import main; sys.exit(main(sys.argv[1:]))")
+PACKAGE = Path(trihedron.pipeline.cli.__file__).parents[1]
+
+
+def cpu_seconds(*words):
+    process = subprocess.Popen([*PROGRAM, *words], stdout=subprocess.DEVNULL)
+    _, status, usage = os.wait4(process.pid, 0)
+    assert status == 0
+    return usage.ru_utime + usage.ru_stime
+
+
+def test_the_help_takes_half_a_second_of_cpu():
+    assert min(cpu_seconds("--help") for _ in range(3)) < 0.5
+
+
+@pytest.mark.slow
+def test_kernels_survive_in_the_users_cache_when_the_package_is_read_only(tmp_path):
+    """A file in the place of every __pycache__ folder: nothing can be kept beside the sources, whoever asks."""
+    package, cache = tmp_path / "site" / "trihedron", tmp_path / "cache"
+    shutil.copytree(PACKAGE, package, ignore=shutil.ignore_patterns("__pycache__"))
+    for folder in [package, *(path for path in package.rglob("*") if path.is_dir())]:
+        (folder / "__pycache__").touch()
+    environment = {name: value for name, value in os.environ.items() if name != "NUMBA_CACHE_DIR"}
+    environment |= {"PYTHONPATH": str(package.parent), "XDG_CACHE_HOME": str(cache), "HOME": str(tmp_path)}
+
+    def run(name):
+        words = ["run", "dataset.width=160", "dataset.height=120", "dataset.length=3", f"out={tmp_path / name}"]
+        done = subprocess.run([*PROGRAM, *words], env=environment, capture_output=True, text=True, cwd=tmp_path)
+        assert done.returncode == 0, done.stderr[-1000:]
+        return {file: file.stat().st_mtime_ns for file in cache.rglob("*.nb[ic]")}
+
+    compiled = run("first")
+    assert len(compiled) > 100
+    assert run("second") == compiled
