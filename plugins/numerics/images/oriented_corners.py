@@ -18,15 +18,12 @@ def oriented_corners(
 ) -> tuple[I32, I32, F32]:
     """At most `wanted` corners in order of level, row and column: pixels (n, 2) of their levels (n,) and directions (n,) in degrees.
 
-    FAST finds them at the high threshold, and at the low one in those cells of the full image that would have less than twice their share. Twice as
-    many as wanted are kept by their strength, and of these the strongest by Harris measure, times their level's weight, each time spread over the
-    cells (Rublee et al., ICCV 2011)."""
+    FAST finds them at the high threshold, and at the low one in those cells of the full image that would have less than twice their share; the
+    strongest by Harris measure, times their level's weight, are kept, spread over the cells (Rublee et al., ICCV 2011)."""
     cells, levels, strengths = _candidates(pyramid, threshold_low, margin)
     height, width = pyramid.shapes[0]
     full = full_pixels(cells, levels, pyramid.shapes).astype(np.float32)
     kept = (strengths >= threshold) | _in_poor_cells(full, strengths >= threshold, width, height, cell_px, wanted)
-    cells, levels, full, strengths = cells[kept], levels[kept], full[kept], strengths[kept]
-    kept = spread_over_grid(full, _strongest(strengths, levels, weights), width, height, cell_px, 2 * wanted)
     cells, levels, full = cells[kept], levels[kept], full[kept]
     order = np.argsort(-_measured(pyramid, cells, levels, weights), kind="mergesort").astype(np.int32)
     kept = spread_over_grid(full, order, width, height, cell_px, wanted)
@@ -59,24 +56,6 @@ def _in_poor_cells(full: F32, strong: Bool, width: int, height: int, cell_px: in
         place[i] = int(full[i, 1]) // cell_px * across + int(full[i, 0]) // cell_px
         count[place[i]] += strong[i]
     return count[place] < 2.0 * wanted / (across * down)
-
-
-@numba.njit(cache=True, nogil=True, error_model="numpy")
-def _strongest(strengths: I32, levels: I32, weights: F64) -> I32:
-    """(n,) rows from the strongest to the weakest, in sixteenths of a grey level; a Harris measure goes with the fourth power of the contrast, so its
-    weights count here by their fourth root."""
-    scale = 16.0 * weights**0.25
-    rank, first = np.empty(len(strengths), np.int32), np.zeros(16 * 256 + 1, np.int32)
-    for i in range(len(strengths)):
-        rank[i] = 16 * 255 - int(min(strengths[i] * scale[levels[i]], 16.0 * 255.0))
-        first[rank[i] + 1] += 1
-    for k in range(1, len(first)):
-        first[k] += first[k - 1]
-    order = np.empty(len(strengths), np.int32)
-    for i in range(len(strengths)):
-        order[first[rank[i]]] = i
-        first[rank[i]] += 1
-    return order
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
