@@ -50,6 +50,7 @@ Usage: trihedron run [-m] [key=value ...]
   feedback=recorded                  delayed wires of recomputed stages see the recorded past
   -m                                 sweep over comma-separated values, on all cores; the same again does what is missing
   sequences=[KIND:FOLDER,...]        of a sweep: several data sets, for example ["tum:/data/desk frames=0:300",synthetic]
+  hydra/launcher=dask                of a sweep: on a cluster; hydra/sweeper=optuna: a search (README)
   report=COMMAND                     what to do with the folder of a sweep at its end, for example: report="benchmark rotations"
 
 Example: trihedron run dataset=tum dataset.path=rgbd_dataset_freiburg3_structure_notexture_far
@@ -120,12 +121,13 @@ def _run(words: list[str]) -> int:
     import hydra
 
     from trihedron.pipeline.config import register_configs, rewritten
+    from trihedron.pipeline.engines import register_engines
     from trihedron.pipeline.registry import load_plugins
-    from trihedron.pipeline.sweep import OUTCOMES, raise_failures, register_sweeper
+    from trihedron.pipeline.sweep import OUTCOMES, raise_failures
 
     load_plugins()
     register_configs()
-    register_sweeper()
+    register_engines()
     overrides = _with_recorded(words)
     _FAILURES.clear()
     OUTCOMES.clear()
@@ -138,7 +140,7 @@ def _run(words: list[str]) -> int:
         if outcome.report and len(outcome.failures) < outcome.jobs:
             _dispatch([*shlex.split(outcome.report), str(outcome.folder)])
         raise_failures(outcome)
-    if _FAILURES:
+    if _FAILURES and not OUTCOMES:
         raise _FAILURES[0]
     return 0
 

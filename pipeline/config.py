@@ -22,6 +22,7 @@ from trihedron.pipeline.registry import options_of, plugin_class, plugins_of
 from trihedron.pipeline.slots import SLOTS
 
 PLUGIN_KEY = "plugin"  # which plugin a slot's configuration belongs to
+SWEEPER, SEARCH, DASK = (f"hydra_plugins.trihedron.{name}" for name in ("Sweeper", "Search", "Dask"))  # `_target_` of Hydra's groups
 
 
 class Feedback(Enum):
@@ -77,6 +78,19 @@ class RunOptions:
     )
 
 
+@dataclasses.dataclass
+class SearchOptions:
+    """hydra.sweeper of `hydra/sweeper=optuna`: see pipeline/search.py."""
+
+    _target_: str = SEARCH
+    trials: int = 30  # besides the default configuration
+    batch: int = 2  # trials chosen at once, without knowing each other's value, and so run side by side
+    objective: str = "final.ate_rmse_m"  # a key of metrics.json
+    direction: str = "minimize"  # or maximize
+    seed: int = 0  # of the sampler
+    params: Any = None  # overrides, as of any sweeper
+
+
 def register_configs() -> None:
     """Put every loaded plugin and the root into Hydra's ConfigStore; call `registry.load_plugins` first."""
     store = ConfigStore.instance()
@@ -84,8 +98,9 @@ def register_configs() -> None:
         for name, plugin in plugins_of(slot).items():
             store.store(group=slot, name=name, node=_option(name, plugin))
     slots = [(slot, Any, dataclasses.field(default=None)) for slot in SLOTS]
-    sweeper = {"_target_": "hydra_plugins.trihedron.Sweeper", "max_batch_size": None, "params": None}
-    store.store(group="hydra/sweeper", name="trihedron", node=sweeper, provider="trihedron")
+    store.store(group="hydra/sweeper", name="trihedron", node={"_target_": SWEEPER, "max_batch_size": None, "params": None})
+    store.store(group="hydra/sweeper", name="optuna", node=SearchOptions)
+    store.store(group="hydra/launcher", name="dask", node={"_target_": DASK, "address": ""})
     store.store(name="root", node=dataclasses.make_dataclass("Root", slots, bases=(RunOptions,)))
 
 
@@ -136,7 +151,7 @@ def rewritten(error: Exception) -> TrihedronError:
         return UsageError(match[1], f"'{match[2]}' is several values", "add -m to run once with each, or write a list as [A,B]")
     if isinstance(error, OverrideParseException):
         return UsageError(error.override, "is not an override", "write key=value, for example threads=1 (quote lists: 'only=[pose]')")
-    if isinstance(error, MissingConfigException) and (match := re.search(r"Could not find '(\w+)/([^']*)'", text)):
+    if isinstance(error, MissingConfigException) and (match := re.search(r"Could not find '([\w/]+)/([^'/]*)'", text)):
         return _unknown_option(match[1], match[2], list(error.options or []))
     if match := re.search(r"Could not override '([\w./]+)'", text):
         return _unknown_key(match[1])
@@ -152,7 +167,9 @@ def rewritten(error: Exception) -> TrihedronError:
 
 
 def _unknown_option(group: str, name: str, options: list[str]) -> TrihedronError:
-    what = f"there is no {group} '{name}'" if group in ("graph", "experiment", "without") else f"there is no plugin '{name}' for the slot '{group}'"
+    if name.startswith("submitit"):
+        return ConfigError(group, f"{name} is not installed", "pip install 'trihedron[cluster]'")
+    what = f"there is no plugin '{name}' for the slot '{group}'" if group in SLOTS else f"there is no {group} '{name}'"
     return ConfigError(group, what, did_you_mean(name, options))
 
 

@@ -12,12 +12,12 @@ import time
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
 import yaml
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.plugins import Plugins
 from joblib.externals.loky import get_reusable_executor
+from omegaconf import DictConfig
 
 from trihedron.pipeline.config import rewritten
 from trihedron.pipeline.errors import TrihedronError
@@ -26,7 +26,6 @@ from trihedron.pipeline.jobs import DONE, FAILED, RUNNING, key_of, read_job, wri
 Plugins.instance()  # loads every plugin of Hydra anew, so that classes imported before are no longer theirs
 from hydra._internal.core_plugins.basic_sweeper import BasicSweeper  # noqa: E402
 
-SWEEPER = "hydra_plugins.trihedron.Sweeper"  # for `_target_`
 LOOK_SECONDS = 1.0  # between two looks at the jobs' folders
 Overrides = list[str]
 
@@ -47,52 +46,78 @@ OUTCOMES: list[Outcome] = []  # of the sweeps of this process; Hydra has no othe
 class Sweeper(BasicSweeper):
     """Hydra's sweeper over comma-separated values, with sequences, that goes on where it was stopped."""
 
-    def sweep(self, arguments: list[str]) -> Any:
+    def sweep(self, arguments: list[str]) -> None:
         """Run what is missing. Raises TrihedronError when no job can be composed."""
-        assert self.config is not None and self.launcher is not None
-        folder = Path(str(self.config.hydra.sweep.dir))
-        folder.mkdir(parents=True, exist_ok=True)
-        jobs = self._jobs(arguments)
-        numbers = _numbers(folder, jobs)
-        outcome = Outcome(folder, str(self.config.report), len(jobs))
+        jobs = self.jobs(arguments)
+        folders = self.run(jobs, len(jobs))
+        failures = [why for folder in folders if (why := failure_of(folder))]
+        OUTCOMES.append(Outcome(self.folder, str(self.config.report), len(jobs), failures))  # type: ignore[union-attr]
+
+    @property
+    def folder(self) -> Path:
+        """The folder of the sweep."""
+        return Path(str(self.config.hydra.sweep.dir))  # type: ignore[union-attr]
+
+    def run(self, jobs: Sequence[Overrides], total: int, before: int = 0) -> list[Path]:
+        """Run those of the jobs that are not done, after `before` others of `total`; returns the folders of all. Raises TrihedronError when none
+        can be composed, or the launcher fails."""
+        self.folder.mkdir(parents=True, exist_ok=True)
+        folders = [self.folder / str(number) for number in _numbers(self.folder, jobs)]
         missing, errors = [], []
-        for job, number in zip(jobs, numbers):
-            words = [*job, f"hydra.sweep.subdir={number}"]
+        for job, folder in zip(jobs, folders):
+            words = [*job, f"hydra.sweep.subdir={folder.name}"]
             try:
-                key = key_of(self.hydra_context.config_loader.load_sweep_config(self.config, words))  # type: ignore[union-attr]
+                key = key_of(self.composed(words))
             except Exception as error:
                 errors.append(error if isinstance(error, TrihedronError) else rewritten(error))
-                _refused(folder / str(number), job, str(errors[-1]))
+                _refused(folder, job, str(errors[-1]))
                 continue
-            if read_job(folder / str(number)) != {"key": key, "state": DONE, "error": ""}:
-                (folder / str(number) / "job.json").unlink(missing_ok=True)
-                missing.append((words, folder / str(number)))
+            if read_job(folder) != {"key": key, "state": DONE, "error": ""}:
+                (folder / "job.json").unlink(missing_ok=True)
+                missing.append((words, folder))
         if len(errors) == len(jobs):
             raise errors[0]
         if already := len(jobs) - len(errors) - len(missing):
             print(f"sweep: {already} of {len(jobs)} jobs are done already", file=sys.stderr)
-        with _Progress([place for _, place in missing], len(jobs)):
-            returns = self.launcher.launch([words for words, _ in missing], initial_job_idx=0) if missing else []
-        if missing and self._parallel:
-            get_reusable_executor().shutdown()  # its processes would keep this folder and environment for the next sweep
-        ended = [read_job(folder / str(number)) for number in numbers]
-        outcome.failures = [str(state.get("error") or "was stopped before its end") for state in ended if state.get("state") != DONE]
-        OUTCOMES.append(outcome)
-        return [returns]
+        if missing:
+            with _Progress([place for _, place in missing], before + len(jobs) - len(missing), total):
+                self._launch([words for words, _ in missing])
+        return folders
 
-    def _jobs(self, arguments: list[str]) -> list[Overrides]:
+    def composed(self, words: Overrides) -> DictConfig:
+        """The configuration of a job."""
+        config: DictConfig = self.hydra_context.config_loader.load_sweep_config(self.config, words)  # type: ignore[union-attr]
+        return config
+
+    def _launch(self, jobs: list[Overrides]) -> None:
+        """Hand the jobs to the launcher, and wait until they have ended."""
+        assert self.launcher is not None and self.config is not None
+        try:
+            self.launcher.launch(jobs, initial_job_idx=0)
+        except TrihedronError:
+            raise
+        except Exception as error:  # of the engine; a job that fails says so in its folder
+            cause = next(iter(str(error).splitlines()), type(error).__name__)
+            raise TrihedronError("hydra.launcher", cause, "what is done is kept; the same command again runs the rest") from error
+        if self.config.hydra.launcher.get("n_jobs", 1) != 1:
+            get_reusable_executor().shutdown()  # its processes would keep this folder and environment for the next sweep
+
+    def jobs(self, arguments: list[str]) -> list[Overrides]:
         """The overrides of every job: the cross product of sequences and of all values given."""
         assert self.hydra_context is not None and self.config is not None
         parser = OverridesParser.create(config_loader=self.hydra_context.config_loader)
         words = [word for word in [*self._parse_config(), *arguments] if not word.startswith("sequences=")]
-        words += [] if any(word.startswith("threads=") for word in words) else [f"threads={1 if self._parallel else 2}"]
+        words += [] if any(word.startswith("threads=") for word in words) else [f"threads={self._threads}"]
         sequences = [words_of_sequence(text) for text in self.config.sequences] or [[]]
         products = [self.split_arguments(parser.parse_overrides([*sequence, *words]), None)[0] for sequence in sequences]
         return [list(job) for product in products for job in product]
 
     @property
-    def _parallel(self) -> bool:
-        return int(self.config.hydra.launcher.get("n_jobs", 1) or 1) != 1  # type: ignore[union-attr]
+    def _threads(self) -> int:
+        """Of a job: what the cluster is asked for, two where jobs come one by one, else one."""
+        launcher = self.config.hydra.launcher  # type: ignore[union-attr]
+        one_by_one = launcher.get("n_jobs") == 1 or str(launcher.get("_target_")).endswith("BasicLauncher")
+        return int(launcher.get("cpus_per_task") or (2 if one_by_one else 1))
 
 
 def words_of_sequence(text: str) -> Overrides:
@@ -111,6 +136,12 @@ def _numbers(folder: Path, jobs: Sequence[Overrides]) -> list[int]:
     return [known[tuple(job)] if tuple(job) in known else next(free) for job in jobs]
 
 
+def failure_of(folder: Path) -> str:
+    """Why the job of a folder came to no end; empty for one that did."""
+    job = read_job(folder)
+    return "" if job.get("state") == DONE else str(job.get("error") or "was stopped before its end")
+
+
 def _refused(folder: Path, job: Overrides, error: str) -> None:
     """The folder of a job whose configuration is refused: it has no run, but a reason."""
     (folder / ".hydra").mkdir(parents=True, exist_ok=True)
@@ -122,8 +153,9 @@ def _refused(folder: Path, job: Overrides, error: str) -> None:
 class _Progress:
     """Says on stderr how many jobs are done, which failed and why, and about how long the rest will take, as jobs end in other processes."""
 
-    def __init__(self, folders: list[Path], jobs: int) -> None:
-        self.waiting, self.missing, self.jobs = folders, len(folders), jobs
+    def __init__(self, folders: list[Path], before: int, total: int) -> None:
+        """`before` jobs of `total` are done, those of `folders` will be."""
+        self.waiting, self.missing, self.before, self.total = folders, len(folders), before, total
         self.began, self.stop = time.perf_counter(), threading.Event()
         self.thread = threading.Thread(target=self._watch, daemon=True)
 
@@ -147,17 +179,12 @@ class _Progress:
                 print(f"trihedron: {job['error']}", file=sys.stderr)
         if ended:
             done, seconds = self.missing - len(self.waiting), time.perf_counter() - self.began
-            left = seconds / done * len(self.waiting)
-            print(f"sweep: {self.jobs - len(self.waiting)} of {self.jobs} jobs done, {_time(seconds)}, about {_time(left)} left", file=sys.stderr)
+            now, left = self.before + done, seconds / done * (self.total - self.before - done)
+            print(f"sweep: {now} of {self.total} jobs done, {_time(seconds)}, about {_time(left)} left", file=sys.stderr)
 
 
 def _time(seconds: float) -> str:
     return f"{seconds:.0f} s" if seconds < 120 else f"{seconds / 60:.0f} min" if seconds < 7200 else f"{seconds / 3600:.1f} h"
-
-
-def register_sweeper() -> None:
-    """Let Hydra know the sweeper; call before its main. Hydra takes only names in its own namespace."""
-    Plugins.instance().class_name_to_class[SWEEPER] = Sweeper
 
 
 def raise_failures(outcome: Outcome) -> None:

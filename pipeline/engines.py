@@ -1,0 +1,13 @@
+"""What Hydra runs sweeps with, of ours: its plugins by the names under which the configuration has them."""
+
+from __future__ import annotations
+
+from trihedron.pipeline.cluster import Dask
+from trihedron.pipeline.config import DASK, SEARCH, SWEEPER
+from trihedron.pipeline.search import Search
+from trihedron.pipeline.sweep import Plugins, Sweeper
+
+
+def register_engines() -> None:
+    """Let Hydra know sweepers and launcher; call before its main. Hydra takes only names in its own namespace."""
+    Plugins.instance().class_name_to_class.update({SWEEPER: Sweeper, SEARCH: Search, DASK: Dask})
