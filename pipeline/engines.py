@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from hydra.core.plugins import Plugins
+
 from trihedron.pipeline.cluster import Dask
 from trihedron.pipeline.config import DASK, SEARCH, SWEEPER
 from trihedron.pipeline.search import Search
-from trihedron.pipeline.sweep import Plugins, Sweeper
+from trihedron.pipeline.sweep import Sweeper
 
 
 def register_engines() -> None:

@@ -86,8 +86,8 @@ class Sweeper(BasicSweeper):
 
     def composed(self, words: Overrides) -> DictConfig:
         """The configuration of a job."""
-        config: DictConfig = self.hydra_context.config_loader.load_sweep_config(self.config, words)  # type: ignore[union-attr]
-        return config
+        assert self.hydra_context is not None and self.config is not None
+        return self.hydra_context.config_loader.load_sweep_config(self.config, words)
 
     def _launch(self, jobs: list[Overrides]) -> None:
         """Hand the jobs to the launcher, and wait until they have ended."""
