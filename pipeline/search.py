@@ -119,7 +119,7 @@ class Search(Sweeper):
     def _conclude(self, tried: list[Trial], words: Overrides) -> None:
         """Write search.json, and say what was found."""
         valued = [(trial.objective, trial) for trial in tried if trial.objective is not None]
-        best = (min if self.direction == "minimize" else max)(valued, key=lambda pair: pair[0])[1]  # the first of equals
+        best = sorted(valued, key=lambda pair: pair[0], reverse=self.direction == "maximize")[0][1]  # the first of equals
         content = {"objective": self.objective, "direction": self.direction, "seed": self.seed, "overrides": words}
         content |= {"best": asdict(best), "default": asdict(tried[0]), "trials": [asdict(trial) for trial in tried[1:]]}
         (self.folder / SEARCH_FILE).write_text(json.dumps(content, indent=2) + "\n")
