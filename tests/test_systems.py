@@ -178,7 +178,7 @@ def test_the_new_stages_run_again_from_the_recording_give_its_bytes(seen):
 
 @pytest.mark.slow
 def test_no_other_graph_does_what_a_system_does(seen, tmp_path):
-    run([[*ROOM, f"graph={name}", *MODEL, "outputs=[trajectory,surface]", f"out={tmp_path}/{name}"] for name in OTHERS])
+    run([[*ROOM, f"graph={name}", "outputs=[trajectory,surface]", f"out={tmp_path}/{name}"] for name in OTHERS])
     others = {name: Seen(tmp_path / name) for name in OTHERS}
     assert [(name, other) for name in SYSTEMS for other in others if CHARACTER[name](others[other])] == []
 
