@@ -22,14 +22,22 @@ from trihedron.pipeline.errors import DataError, TrihedronError
 from trihedron.pipeline.geometry import transform, umeyama
 from trihedron.pipeline.metrics import aligned_errors, associate
 from trihedron.pipeline.recording import Recording
-from trihedron.pipeline.types import Trajectory
+from trihedron.pipeline.types import F64, Trajectory
 from trihedron.tools import comparison_table
 from trihedron.tools.arguments import Parser
-from trihedron.tools.compare import SURFACE, Run, read_runs, rows_of
+from trihedron.tools.compare import Run, read_runs, rows_of
+from trihedron.tools.export_surface import surface_of
 
 MOST_PICTURES = 12  # a page of a large sweep would be too big to open
 MOST_TRIANGLES = 60_000
-STYLE = "body{font:15px sans-serif;margin:2em auto;max-width:1100px}td,th{padding:2px 8px;text-align:right}img{width:100%}"
+STYLE = (
+    "body{font:15px sans-serif;margin:2em auto;max-width:1100px;color:#222}h2{margin:1.6em 0 .4em;font-size:1.15em}table{border-collapse:collapse}"
+    "td,th{padding:3px 10px;text-align:right;border-bottom:1px solid #ddd}td:first-child,th:first-child{text-align:left}"
+    "figure{margin:1em 0}img{width:100%}"
+)
+COLORS = ("#1f77b4", "#d62728", "#2ca02c", "#9467bd", "#ff7f0e", "#17becf", "#8c564b", "#e377c2")  # of the runs, in all figures
+LEGEND = {"orientation": "h", "x": 0.0, "y": 1.0, "yanchor": "bottom"}
+EYE = (0.5, 0.9, -1.2)  # to the right of, above and behind what the first camera sees, in sizes of the scene
 
 
 def main(argv: list[str]) -> int:
@@ -51,11 +59,13 @@ def page(runs: Sequence[Run]) -> str:
     drawn = {name: run for name, run in zip(_names(runs), runs) if (run.folder / "run.mcap").exists() and (run.folder / "trajectory.txt").exists()}
     if not drawn:
         raise DataError(str(runs[0].folder), "none of the runs has a trajectory", "run with outputs=[trajectory]")
-    paths, errors = _trajectories(drawn)
+    colors = {name: COLORS[number % len(COLORS)] for number, name in enumerate(drawn)}
+    paths, errors = _trajectories(drawn, colors)
+    surface, up = _surface(drawn)
     figures = {
-        "Trajectories and surface": (paths + _surface(drawn), {"scene": {"aspectmode": "data"}, "height": 600}),
-        "Position error over time": (errors, {"xaxis": {"title": {"text": "s"}}, "yaxis": {"title": {"text": "mm"}}, "height": 350}),
-        "Stages, median time": (_stages(drawn), {"barmode": "group", "yaxis": {"title": {"text": "ms"}}, "height": 350}),
+        "Trajectories and surface": (paths + surface, {"scene": _scene(up), "height": 560}),
+        "Position error over time": (errors, {"xaxis": {"title": {"text": "s"}}, "yaxis": {"title": {"text": "mm"}}, "height": 320}),
+        "Stages, median time": (_stages(drawn, colors), {"barmode": "group", "yaxis": {"title": {"text": "ms"}}, "height": 320}),
     }
     body = [f"<h2>{title}</h2>{_figure(number, *figure)}" for number, (title, figure) in enumerate(figures.items()) if figure[0]]
     parts = ["<h1>Trihedron</h1>", _table(runs), *body, "<h2>Configurations</h2>", _configurations(drawn), "<h2>Frames</h2>", *_pictures(drawn)]
@@ -70,7 +80,8 @@ def _names(runs: Sequence[Run]) -> list[str]:
 
 
 def _figure(number: int, traces: list[dict[str, Any]], layout: dict[str, Any]) -> str:
-    text = json.dumps([traces, {**layout, "margin": {"l": 50, "r": 10, "t": 10, "b": 40}}]).replace("</", "<\\/")
+    layout = {**layout, "margin": {"l": 50, "r": 10, "t": 30, "b": 40}, "legend": LEGEND, "showlegend": True}
+    text = json.dumps([traces, layout, {"displaylogo": False, "responsive": True}]).replace("</", "<\\/")
     return f"<div id='figure{number}'></div><script>Plotly.newPlot('figure{number}', ...{text})</script>"
 
 
@@ -83,21 +94,22 @@ def _table(runs: Sequence[Run]) -> str:
     return "<table>" + "".join(f"<tr>{line}</tr>" for line in lines) + "</table>"
 
 
-def _trajectories(runs: dict[str, Run]) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
+def _trajectories(runs: dict[str, Run], colors: dict[str, str]) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
     """Paths in the world of the first run, with the truth where there is one, and errors in mm over seconds."""
     paths, errors = [], []
     for name, run in runs.items():
         estimate, truth = read_trajectory(run.folder / "trajectory.txt"), _truth(run)
-        paths.append(_path(name, estimate.poses[:, :3, 3]))
+        paths.append(_path(name, estimate.poses[:, :3, 3], colors[name]))
         pairs = associate(estimate.stamps_ns, truth.stamps_ns) if truth is not None else np.zeros((0, 2), np.int64)
         if truth is None or len(pairs) < 3:
             continue
         poses, expected = estimate.poses[pairs[:, 0]], truth.poses[pairs[:, 1]]
         if len(paths) == 1:
             T_world_truth = umeyama(expected[:, :3, 3], poses[:, :3, 3])
-            paths.append(_path("ground truth", transform(T_world_truth, expected[:, :3, 3]), dash="dash"))
+            paths.append(_path("ground truth", transform(T_world_truth, expected[:, :3, 3]), "black", dash="dash"))
         seconds = (estimate.stamps_ns[pairs[:, 0]] - estimate.stamps_ns[0]) / 1e9
-        errors.append({"type": "scatter", "name": name, "x": seconds.tolist(), "y": (1e3 * aligned_errors(poses, expected)).round(3).tolist()})
+        y = (1e3 * aligned_errors(poses, expected)).round(3).tolist()
+        errors.append({"type": "scatter", "name": name, "x": seconds.tolist(), "y": y, "line": {"color": colors[name], "width": 1.5}})
     return paths, errors
 
 
@@ -106,38 +118,53 @@ def _truth(run: Run) -> Trajectory | None:
     return attached_truth(recording.attachments, str(recording.path))
 
 
-def _path(name: str, positions: Any, dash: str = "solid") -> dict[str, Any]:
+def _path(name: str, positions: Any, color: str, dash: str = "solid") -> dict[str, Any]:
     x, y, z = np.round(positions, 4).T.tolist()
-    return {"type": "scatter3d", "mode": "lines", "name": name, "x": x, "y": y, "z": z, "line": {"width": 4, "dash": dash}}
+    return {"type": "scatter3d", "mode": "lines", "name": name, "x": x, "y": y, "z": z, "line": {"width": 5, "dash": dash, "color": color}}
 
 
-def _surface(runs: dict[str, Run]) -> list[dict[str, Any]]:
-    """The mesh of the first run that has one, thinned where it is large."""
-    from trihedron.tools.mesh_files import read_mesh
-
-    file = next((run.folder / SURFACE for run in runs.values() if (run.folder / SURFACE).exists()), None)
-    if file is None:
-        return []
-    vertices, triangles = read_mesh(file)
-    triangles = triangles[:: max(1, -(-len(triangles) // MOST_TRIANGLES))]
-    (x, y, z), (i, j, k) = np.round(vertices, 3).T.tolist(), triangles.T.tolist()
-    return [{"type": "mesh3d", "name": "surface", "x": x, "y": y, "z": z, "i": i, "j": j, "k": k, "opacity": 0.4, "color": "lightgray"}]
+def _scene(up: F64) -> dict[str, Any]:
+    """Seen from behind and above the first camera, which looks along z with x to its right."""
+    ahead = np.array([0.0, 0.0, 1.0]) - up[2] * up
+    ahead /= max(float(np.linalg.norm(ahead)), 1e-9)
+    eye = EYE[0] * np.cross(ahead, up) + EYE[1] * up + EYE[2] * ahead
+    camera = {"up": dict(zip("xyz", up.tolist())), "eye": dict(zip("xyz", eye.tolist())), "projection": {"type": "perspective"}}
+    axis = {"showbackground": False, "title": {"text": ""}, "showspikes": False}
+    return {"aspectmode": "data", "camera": camera, **{f"{name}axis": axis for name in "xyz"}}
 
 
-def _stages(runs: dict[str, Run]) -> list[dict[str, Any]]:
+def _surface(runs: dict[str, Run]) -> tuple[list[dict[str, Any]], F64]:
+    """The mesh of the first run that has one, thinned where it is large, and which way is up."""
+    up = np.array([0.0, -1.0, 0.0])  # of a camera held upright
+    recording = next((found for run in runs.values() if "surface" in (found := Recording(run.folder / "run.mcap")).topics), None)
+    if recording is None:
+        return [], up
+    surface = surface_of(recording)
+    triangles = surface.triangles[:: max(1, -(-len(surface.triangles) // MOST_TRIANGLES))]
+    (x, y, z), (i, j, k) = np.round(surface.vertices_m, 3).T.tolist(), triangles.T.tolist()
+    colors = [f"rgb({r},{g},{b})" for r, g, b in surface.colors.tolist()]
+    mesh = {"type": "mesh3d", "name": "surface", "x": x, "y": y, "z": z, "i": i, "j": j, "k": k, "vertexcolor": colors, "opacity": 0.7}
+    flat = {"lighting": {"ambient": 0.9, "diffuse": 0.2, "specular": 0.0}, "hoverinfo": "skip", "showlegend": False}
+    return [mesh | flat], surface.up.astype(np.float64) if np.isfinite(surface.up).all() else up
+
+
+def _stages(runs: dict[str, Run], colors: dict[str, str]) -> list[dict[str, Any]]:
     traces = []
     for name, run in runs.items():
         stages = json.loads((run.folder / "timing.json").read_text())["stages"]
         shown = {stage: found["p50_ms"] for stage, found in stages.items() if "p50_ms" in found}
-        traces.append({"type": "bar", "name": name, "x": list(shown), "y": list(shown.values())})
+        traces.append({"type": "bar", "name": name, "x": list(shown), "y": list(shown.values()), "marker": {"color": colors[name]}})
     return traces
 
 
 def _configurations(runs: dict[str, Run]) -> str:
-    """The values of the composed configurations that are not the same in all runs."""
+    """The values of the composed configurations that are not the same in all runs. Of a stage with different plugins only these are said: their
+    options have nothing to do with each other."""
     flat = {name: dict(_flat(_config(run))) for name, run in runs.items()}
     keys = sorted({key for values in flat.values() for key in values})
     differing = [key for key in keys if len({repr(values.get(key)) for values in flat.values()}) > 1 and key != "out"]
+    others = {key.removesuffix("plugin") for key in differing if key.endswith(".plugin")}
+    differing = [key for key in differing if key.endswith(".plugin") or not key.startswith(tuple(others))]
     if not differing:
         return "<p>All the same.</p>"
     lines = ["<th></th>" + "".join(f"<th>{html.escape(name)}</th>" for name in flat)]
