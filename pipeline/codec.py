@@ -3,8 +3,8 @@
 Anyone can read it with the schema that stands in the file: `type, version, index, stamp_ns` and an array (`array_codec`) for each field; nested
 fields have dotted names, scalars no shape. Tables (see `table`) are written as the rows that changed since the topic's previous message, and
 whole every `FULL_EVERY`: `points#` is a JSON text with `size`, `full`, `schema` and, for each column that changed, the number k of its list of
-rows, `points#rows<k>`; `points#position_m` holds these rows. Nothing here evaluates what it reads, and nothing is allocated that
-the file does not hold.
+rows, `points#rows<k>`; `points#position_m` holds these rows, and `points#emptied` the numbers of the chunks that were given back. Nothing here
+evaluates what it reads, and nothing is allocated that the file does not hold.
 """
 
 from __future__ import annotations
@@ -27,6 +27,7 @@ from trihedron.pipeline.table import CHUNK, Column, Table
 from trihedron.pipeline.types import Value
 
 FULL_EVERY = 50
+NO_ROWS = np.empty(0, np.intp)
 _TYPES: dict[str, type[Value]] = {
     name: kind for name, kind in vars(types).items() if isinstance(kind, type) and issubclass(kind, Value) and kind is not Value
 }
@@ -173,9 +174,12 @@ def _put_table(message: Any, name: str, table: Table, previous: Table | None) ->
     """The rows of each column that `previous` does not have; columns whose rows are the same share the list of their numbers."""
     changed: dict[str, int] = {}
     numbers: dict[bytes, int] = {}
+    count = -(-table.size // CHUNK)
+    empty = [table.is_empty(number) for number in range(count)]
+    emptied = [i for i in range(count) if empty[i] and not (previous is not None and i * CHUNK < previous.size and previous.is_empty(i))]
     for column, chunks in table.chunks.items():
         known = previous.chunks.get(column, ()) if previous is not None else ()
-        rows = [_changed(known[i], chunk) if i < len(known) else np.arange(len(chunk)) for i, chunk in enumerate(chunks)]
+        rows = [NO_ROWS if empty[i] else _changed(known[i], chunk) if i < len(known) else np.arange(len(chunk)) for i, chunk in enumerate(chunks)]
         found = [i for i, those in enumerate(rows) if len(those)]
         if found:
             ids = np.concatenate([i * CHUNK + rows[i] for i in found]).astype(np.int32)
@@ -183,6 +187,8 @@ def _put_table(message: Any, name: str, table: Table, previous: Table | None) ->
             put_array(message, f"{name}#{column}", np.concatenate([chunks[i][rows[i]] for i in found]), False)
     for ids_bytes, k in numbers.items():
         put_array(message, f"{name}#rows{k}", np.frombuffer(ids_bytes, np.int32), False)
+    if emptied:
+        put_array(message, f"{name}#emptied", np.array(emptied, np.int32), False)
     schema = {c: [s.dtype, list(s.shape)] for c, s in table.schema.items()}
     put_array(message, f"{name}#", json.dumps({"size": table.size, "full": previous is None, "schema": schema, "rows": changed}), False)
 
@@ -190,7 +196,7 @@ def _put_table(message: Any, name: str, table: Table, previous: Table | None) ->
 def _changed(known: Any, chunk: Any) -> Any:
     """Rows of a chunk, CHUNK at most, that the one known, no longer than this, does not have. They are compared by their bytes: NaN is no change."""
     if known is chunk:
-        return np.empty(0, np.intp)
+        return NO_ROWS
     word = math.gcd(chunk.itemsize * math.prod(chunk.shape[1:]), 8)  # bytes compared at once
     before, after = (np.ascontiguousarray(part).reshape(len(part), -1).view(f"u{word}").reshape(len(part), -1) for part in (known, chunk))
     return np.concatenate([np.flatnonzero((before != after[: len(before)]).any(axis=1)), np.arange(len(before), len(after))])
@@ -202,7 +208,10 @@ def _get_table(name: str, tables: Mapping[str, Any], previous: Table | None) -> 
     table = Table.empty(schema) if header["full"] else previous
     if table is None or table.schema != schema:
         raise ValueError(f"{name}: a change without the version before it")
-    size, known = int(header["size"]), table.size
+    size, known, empty = int(header["size"]), table.size, tables.get(f"{name}#emptied", np.empty(0, np.int32))
+    if empty.dtype != np.int32 or empty.ndim != 1 or (empty[:1] < 0).any() or (np.diff(empty) <= 0).any() or (empty >= size // CHUNK).any():
+        raise ValueError(f"{name}: chunks that are not there")
+    count = size - known - int(np.minimum(np.maximum((empty.astype(np.int64) + 1) * CHUNK - known, 0), CHUNK).sum())  # of new rows that are there
     added = {column: Table.empty(schema).column(column) for column in schema}
     for column, k in header["rows"].items():
         ids, values = tables[f"{name}#rows{k}"], tables[f"{name}#{column}"]
@@ -211,11 +220,17 @@ def _get_table(name: str, tables: Mapping[str, Any], previous: Table | None) -> 
         if not fits or ids.dtype != np.int32 or (ids[:1] < 0).any() or (np.diff(ids) <= 0).any():
             raise ValueError(f"{name}.{column}: rows of another size")
         table, added[column] = table.updated(ids[:old], **{column: values[:old]}), values[old:]
-        if not np.array_equal(ids[old:], np.arange(known, size)):
+        if len(ids) - old != count or not np.array_equal(ids[old:], _there(known, size, empty)):
             raise ValueError(f"{name}.{column}: rows are missing")
-    if {len(rows) for rows in added.values()} - {size - known}:
+    if {len(rows) for rows in added.values()} - {count}:
         raise ValueError(f"{name}: rows are missing")
-    return table.appended(**added)[0] if size > known else table
+    return table.extended(size, empty, **added)
+
+
+def _there(known: int, size: int, empty: Any) -> Any:
+    """Rows known..size-1 but for those of the empty chunks."""
+    rows = np.arange(known, size)
+    return rows[~np.isin(rows // CHUNK, empty)]
 
 
 def _column(dtype: str, shape: list[int]) -> Column:

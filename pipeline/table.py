@@ -1,13 +1,15 @@
 """A persistent table: columns cut into chunks that successive versions share.
 
 A map grows by a few hundred rows a keyframe and changes a few hundred more. Copying it each time, or writing it whole into the recording, would
-cost the square of its size; here a new version copies only the chunks it touches, and the recording holds only those.
+cost the square of its size; here a new version copies only the chunks it touches, and the recording holds only those. Chunks whose rows are all
+dead are given back: in their place stands one chunk of zeros, the same for all, so that rows keep their numbers.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
+from functools import cache
 from itertools import pairwise
 from typing import Any
 
@@ -78,26 +80,59 @@ class Table:
             chunks[name] = tuple(parts)
         return Table(self.schema, self.size, chunks)
 
+    def emptied(self, numbers: Array) -> Table:
+        """A version whose full chunks of these numbers hold zeros, and no memory."""
+        fresh = [int(number) for number in numbers if not self.is_empty(int(number))]
+        if not fresh:
+            return self
+        chunks = {}
+        for name, parts in self.chunks.items():
+            left = list(parts)
+            for number in fresh:
+                left[number] = empty_chunk(self.schema[name])
+            chunks[name] = tuple(left)
+        return Table(self.schema, self.size, chunks)
+
+    def is_empty(self, number: int) -> bool:
+        """Whether this chunk was given back."""
+        return all(parts[number] is empty_chunk(self.schema[name]) for name, parts in self.chunks.items())
+
     def appended(self, **columns: Array) -> tuple[Table, Array]:
         """A version with more rows, and their ids; every column must be given, all of one length. Raises ValueError otherwise."""
         lengths = {name: len(values) for name, values in columns.items()}
         if set(lengths) != set(self.schema) or len(set(lengths.values())) != 1:
             raise ValueError(f"appended needs equally long columns {sorted(self.schema)}, got {lengths}")
         count = next(iter(lengths.values()))
-        chunks = dict(self.chunks)
-        room = -self.size % CHUNK
-        for name, values in columns.items():
-            column = self.schema[name]
-            values = np.asarray(values, column.dtype).reshape(count, *column.shape)
-            parts = list(chunks[name])
-            if room and count:
-                parts[-1] = np.concatenate([parts[-1], values[:room]])
-            parts += [values[i : i + CHUNK].copy() for i in range(room, count, CHUNK)]
-            for part in parts:
-                part.flags.writeable = False
-            chunks[name] = tuple(parts)
+        rows = {name: np.asarray(values, self.schema[name].dtype).reshape(count, *self.schema[name].shape) for name, values in columns.items()}
         ids = np.arange(self.size, self.size + count, dtype=np.int32)
-        return Table(self.schema, self.size + count, chunks), ids
+        return self.extended(self.size + count, ids[:0], **rows), ids
+
+    def extended(self, size: int, empty: Array, **columns: Array) -> Table:
+        """A version of `size` rows in which the chunks `empty` hold nothing; the columns, of the schema's types, are the other new rows."""
+        without, chunks = set(empty.tolist()), {}
+        for name, values in columns.items():
+            parts, taken = list(self.chunks[name]), 0
+            for number in range(self.size // CHUNK, -(-size // CHUNK)):
+                known = parts[number : number + 1]  # begun already
+                count = 0 if number in without else min(size, (number + 1) * CHUNK) - max(self.size, number * CHUNK)
+                part = np.concatenate([*known, values[taken : taken + count]])
+                part.flags.writeable = False
+                parts[number : number + 1] = [empty_chunk(self.schema[name]) if number in without else part]
+                taken += count
+            chunks[name] = tuple(parts)
+        return Table(self.schema, size, chunks).emptied(empty)
+
+
+@cache
+def _zeros(dtype: str, shape: tuple[int, ...]) -> Array:
+    chunk = np.zeros((CHUNK, *shape), dtype)
+    chunk.flags.writeable = False
+    return chunk
+
+
+def empty_chunk(column: Column) -> Array:
+    """The one chunk of zeros of all columns of this kind."""
+    return _zeros(column.dtype, column.shape)
 
 
 def _by_chunk(ids: Array) -> Iterator[tuple[int, Any, Array]]:

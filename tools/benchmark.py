@@ -6,8 +6,8 @@ it waits behind others does not count. --cold runs three frames with an empty ke
 
 Other comparisons, each with its --help: `trihedron benchmark scaling` (threads, image size, features, length), `trihedron benchmark manhattan`
 (estimators of the Manhattan frame on rendered rooms), `trihedron benchmark rotations` (the runs of a sweep over them), `trihedron benchmark surface`
-(all surfaces, by the true one), `trihedron benchmark map` (drift, recovery and growth of the map), `trihedron benchmark recording` (what recording
-costs). `trihedron compare` makes a table of the runs of any sweep.
+(all surfaces, by the true one), `trihedron benchmark map` (drift, recovery and growth of the map), `trihedron benchmark long` (what a long run leaves
+behind), `trihedron benchmark recording` (what recording costs). `trihedron compare` makes a table of the runs of any sweep.
 
 Example: trihedron benchmark dataset=tum dataset.path=FOLDER dataset.frames=0:150 --json benchmark.json
 """
@@ -35,6 +35,7 @@ from trihedron.tools.benchmark_comparison import compared, read_figures, times
 PROGRAM = (sys.executable, "-c", "import sys; from trihedron.pipeline.cli import main; sys.exit(main(sys.argv[1:]))")
 REFERENCE_FRAMES = 40
 COMPARISONS = {  # other words after `benchmark`, and whose `main` they stand for
+    "long": "trihedron.tools.long_benchmark",
     "manhattan": "trihedron.tools.manhattan_family",
     "map": "trihedron.tools.map_benchmark",
     "recording": "trihedron.tools.recording_benchmark",

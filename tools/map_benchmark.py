@@ -240,9 +240,10 @@ def line(frames: NDArray[np.int64], values: F64) -> list[float]:
 
 
 def bytes_of(map: Map) -> int:
-    """What the tables of a map hold."""
+    """What the tables of a map hold, chunks that stand in several places once."""
     tables = [table for table in vars(map).values() if isinstance(table, Table)]
-    return sum(chunk.nbytes for one in tables for chunks in one.chunks.values() for chunk in chunks)
+    held = {id(chunk): chunk.nbytes for one in tables for chunks in one.chunks.values() for chunk in chunks}
+    return sum(held.values())
 
 
 def floor_m2(map: Map, R_room_world: F64) -> float:

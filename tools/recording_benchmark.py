@@ -46,7 +46,7 @@ def main(argv: list[str]) -> int:
 
 
 def _recording(overrides: Sequence[str], folder: Path, repeat: int) -> list[tuple[str, bool]]:
-    graph = _graph(overrides)
+    graph = graph_of_words(overrides)
     topics = frozenset(name for name in graph.stages if not output_of(name).dense)
     seconds: dict[bool, list[tuple[float, float]]] = {False: [], True: []}
     for round in range(-1, repeat):
@@ -84,7 +84,7 @@ def _sizes(path: Path, count: int) -> float:
 
 
 def _embedding(overrides: Sequence[str], folder: Path) -> list[tuple[str, bool]]:
-    dataset: Any = _graph(overrides).stages["dataset"].plugin
+    dataset: Any = graph_of_words(overrides).stages["dataset"].plugin
     frames = [frame for i in range(min(60, len(dataset))) if isinstance(frame := dataset(i), Frame)]
     began, cpu = time.perf_counter(), time.process_time()
     writer = RecordingWriter(folder / "frames.mcap", {})
@@ -120,7 +120,8 @@ def _reading(folder: Path, count: int) -> list[tuple[str, bool]]:
     return [(text, best < MOST_OPEN_S and topics > 1)]
 
 
-def _graph(overrides: Sequence[str]) -> Graph:
+def graph_of_words(overrides: Sequence[str]) -> Graph:
+    """The graph that `trihedron run` would make of these overrides."""
     from hydra import compose, initialize_config_module
 
     from trihedron.pipeline.config import graph_of, register_configs

@@ -13,10 +13,11 @@ from trihedron.plugins.numerics.maps import insertion
 from trihedron.plugins.numerics.maps.anchoring import anchored
 from trihedron.plugins.numerics.maps.association import Associated, associate, existing
 from trihedron.plugins.numerics.maps.correction import apply_correction
-from trihedron.plugins.numerics.maps.culling import cull, cull_keyframe
+from trihedron.plugins.numerics.maps.culling import cull, cull_keyframe, cull_repeated
 from trihedron.plugins.numerics.maps.landmarks import empty_map
 from trihedron.plugins.numerics.maps.local_window import current_submap, keyframes_of, local_window, newest_keyframes
 from trihedron.plugins.numerics.maps.merging import merge_lines, merge_planes, merge_points
+from trihedron.plugins.numerics.maps.retiring import released
 from trihedron.plugins.numerics.maps.submaps import submap_of, tied
 from trihedron.plugins.numerics.maps.visibility import visible_planes
 
@@ -104,14 +105,17 @@ class Covisibility:
         if 0 <= frames < self.min_frames:  # less than 0: a keyframe of another sequence
             return False
         T = np.linalg.inv(map.keyframes.rows("T_world_camera", newest)[0]) @ pose.T_world_camera
-        depth = frame.depth_m[::8, ::8]
-        median = float(np.median(depth[depth > 0.0])) if (depth > 0.0).any() else 1.0
-        moved = max(float(np.linalg.norm(T[:3, 3])) / (self.min_shift * median), rotation_angle_deg(T[:3, :3]) / self.min_turn_deg)
+        moved = max(float(np.linalg.norm(T[:3, 3])) / self._shift_m(frame), rotation_angle_deg(T[:3, :3]) / self.min_turn_deg)
         spans = np.array([map.keyframes.rows(kind, newest)[0] for kind in ("points", "lines", "planes")])
         poor = bool((pose.inliers @ [1, 5, 20]) < self.min_share * ((spans[:, 1] - spans[:, 0]) @ [1, 5, 20]))
         known = matches.planes[:, 0] if matches is not None else np.empty(0, np.int32)
         unknown = np.setdiff1d(np.flatnonzero(planes.pixels > self.new_plane_px), known)
         return moved > 1.0 or poor or len(unknown) > 0 or (frames >= self.max_frames and moved > STALE)
+
+    def _shift_m(self, frame: Frame) -> float:
+        """Way that makes a keyframe."""
+        depth = frame.depth_m[::8, ::8]
+        return self.min_shift * (float(np.median(depth[depth > 0.0])) if (depth > 0.0).any() else 1.0)
 
     def _inserted(
         self, map: Map, frame: Frame, pose: Pose, keypoints: Keypoints, segments: Segments, planes: Planes, matches: Matches | None
@@ -131,7 +135,8 @@ class Covisibility:
             map = merge_lines(map, view, matches.visible_lines)
         map = merge_planes(map, row, self.merge_deg, self.merge_m)
         map = cull(map, row, matches, expected, self.trial, self.min_found)
-        return cull_keyframe(map, self.redundant, self.redundant_share)
+        map = cull_keyframe(map, self.redundant, self.redundant_share)
+        return released(cull_repeated(map, STALE * self._shift_m(frame), STALE * self.min_turn_deg, self.min_share))
 
     def _planes_in_view(self, map: Map, frame: Frame, pose: Pose, matches: Matches | None) -> I32:
         """Planes seen about here that should be seen now, those that are among them."""

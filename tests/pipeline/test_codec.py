@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 import zstandard
 
+from trihedron.pipeline.array_codec import put_array
 from trihedron.pipeline.codec import FULL_EVERY, Decoder, Encoder, ValueMessage
 from trihedron.pipeline.errors import RecordingError
-from trihedron.pipeline.table import Column, Table
+from trihedron.pipeline.table import CHUNK, Column, Table
 from trihedron.pipeline.types import Camera, DepthNoise, Frame, Keypoints, Map, Planes, Pose, Rotation
 
 RNG = np.random.default_rng(0)
@@ -105,6 +106,31 @@ def test_tables_are_written_as_changes_and_rebuilt():
         same(value, decoder.decode(message.SerializeToString()))
     assert max(sizes[20:FULL_EVERY]) < 25_000  # a chunk or two, however large the map
     assert sizes[FULL_EVERY] > 100_000  # whole again
+
+
+def test_chunks_that_were_given_back_are_not_written_and_stay_given_back():
+    """A table of which all but the newest 600 rows are dead, however many there were; one chunk was begun, filled and given back between messages."""
+    encoder, decoder = Encoder(), Decoder("file: topic /map")
+    table, sizes = Table.empty({"x": Column("f8", (3,)), "alive": Column("?")}), []
+    for count in (*range(100, 2 * FULL_EVERY + 100), 3 * CHUNK, 5):
+        table, _ = table.appended(x=RNG.random((count, 3)), alive=np.ones(count, bool))
+        table = table.emptied(np.arange(max(len(table) - 600, 0) // CHUNK))
+        value = replace(next(iter(maps(1))), points=table)
+        message = encoder.encode(value)
+        sizes.append(message.ByteSize())
+        found = decoder.decode(message.SerializeToString())
+        same(value, found)
+        assert [found.points.is_empty(k) for k in range(len(table) // CHUNK)] == [table.is_empty(k) for k in range(len(table) // CHUNK)]
+        same(value, there_and_back(value))  # whole
+    assert len(table) > 14_000 and max(sizes) < 35_000
+    for wrong in ([0, 0], [-1], [len(table) // CHUNK]):
+        message = Encoder().encode(value)
+        kept = [array for array in message.arrays if array.name != "points#emptied"]
+        del message.arrays[:]
+        message.arrays.extend(kept)
+        put_array(message, "points#emptied", np.array(wrong, np.int32), False)
+        with pytest.raises(RecordingError, match="does not fit"):
+            Decoder("x").decode(message.SerializeToString())
 
 
 def test_of_a_touched_chunk_only_the_rows_that_changed_are_written():

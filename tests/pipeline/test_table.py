@@ -55,3 +55,17 @@ def test_several_columns_gathered_are_the_rows_of_each():
         np.testing.assert_array_equal(a, table.column("a")[chosen])
         np.testing.assert_array_equal(b, table.rows("b", chosen))
         np.testing.assert_array_equal(b, chosen)
+
+
+def test_empty_chunks_hold_zeros_and_no_memory():
+    before, _ = Table.empty(SCHEMA).appended(**rows(3 * CHUNK + 7))
+    after = before.emptied(np.array([0, 2]))
+    assert [after.is_empty(number) for number in range(4)] == [True, False, True, False] and not before.is_empty(0)
+    assert all(parts[0] is parts[2] for parts in after.chunks.values())
+    assert after.rows("n", np.array([0, CHUNK, 2 * CHUNK, 3 * CHUNK])).tolist() == [0, CHUNK, 0, 3 * CHUNK]
+    longer, ids = after.appended(**rows(CHUNK, 3 * CHUNK + 7))
+    assert longer.rows("n", ids).tolist() == ids.tolist() and longer.is_empty(2)
+    assert after.emptied(np.array([0])) is after
+    whole = longer.extended(6 * CHUNK + 2, np.array([1, 4]), **rows(CHUNK + 2, 5 * CHUNK))  # a chunk that was begun is filled and given back at once
+    assert [whole.is_empty(number) for number in range(7)] == [True, True, True, False, True, False, False]
+    assert whole.rows("n", np.array([5 * CHUNK - 1, 5 * CHUNK, 6 * CHUNK + 1])).tolist() == [0, 5 * CHUNK, 6 * CHUNK + 1]

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from trihedron.pipeline.geometry import exp_se3, transform, transform_planes
-from trihedron.plugins.numerics.maps.local_window import local_window
+from trihedron.pipeline.table import CHUNK
+from trihedron.plugins.numerics.maps.local_window import local_window, observed_by
 from trihedron.plugins.numerics.planes import plane_fusion
 
 sys.path.insert(0, str(Path(__file__).parent))
@@ -90,6 +91,26 @@ def test_keyframes_that_others_make_redundant_are_retired():
     assert np.array_equal(map.keyframes.column("T_world_camera"), poses)
     window = local_window(map, poses[-1], 2, 10, 3)
     assert alive[window.keyframes].all() and len(window.points) > 50
+
+
+def test_a_way_gone_again_and_again_leaves_the_map_as_it_was_after_the_first_time():
+    """To and fro eight times, a keyframe a step: no more of them than after the first time, nor of landmarks; memory is given back."""
+    world, map, held = World(), None, []
+    for index in range(120):
+        there = 4 * (index % 30)
+        map = step(dataclasses.replace(EVERY, min_shift=0.06), world, map, index, at=min(there, 120 - there)) or map
+        if index % 30 == 29:
+            landmarks = sum(np.count_nonzero(table.column("alive")) for table in (map.points, map.lines, map.planes))
+            seen = map.point_observations
+            held.append((int(map.keyframes.column("alive").sum()), landmarks, sum(not seen.is_empty(k) for k in range(-(-len(seen) // CHUNK)))))
+    keyframes, landmarks, chunks = (np.array(column) for column in zip(*held))
+    assert len(map.keyframes) == 120 and len(map.point_observations) > 6000  # rows keep their numbers
+    assert keyframes.max() <= keyframes[0] + 2 < 20 and landmarks.max() < 1.1 * landmarks[0] and chunks.max() < 9
+    alive = np.flatnonzero(map.keyframes.column("alive")).astype(np.int32)
+    assert {0, 1, 2} <= set(alive) and (alive[-4:] == np.arange(116, 120)).all()
+    for kind, table in (("point", map.points), ("line", map.lines)):  # what lives is seen by what lives
+        assert np.array_equal(observed_by(map, alive, kind), np.flatnonzero(table.column("alive")))
+        assert np.isin(table.column("observers")[table.column("alive")], [*alive, -1]).all()
 
 
 def test_a_keyframe_is_not_redundant_when_the_others_are_far_behind_or_see_something_else():

@@ -17,7 +17,7 @@ from trihedron.plugins.numerics.planes import plane_fusion
 def apply_correction(map: Map, correction: Correction) -> Map:
     """Move keyframes and landmarks to where the correction says, known as well as it says. Rows that died since are left out; keyframes inserted
     since the correction's revision, and landmarks first seen by them, move with the newest keyframe that was corrected; culled keyframes, on which
-    poses still hang, move with the living one before them. A measurement made since of a landmark that is corrected is forgotten; its row remains
+    poses still hang, move with the living one nearest to them. A measurement made since of a landmark that is corrected is forgotten; its row remains
     for the next adjustment."""
     known = correction.keyframe_ids < len(map.keyframes)
     ids, poses = correction.keyframe_ids[known], correction.T_world_keyframe[known]
@@ -42,18 +42,22 @@ def _living(table: Table, ids: I32) -> Bool:
 
 
 def _carry_culled(map: Map, ids: I32, poses: F64) -> Map:
-    """Move each culled keyframe that the correction does not name, and that is not newer than all it names, along with the last living one before
-    it."""
-    alive = map.keyframes.column("alive")
-    before = np.maximum.accumulate(np.where(alive, np.arange(len(alive)), 0))
-    rows = np.arange(len(alive), dtype=np.int32)
-    culled = rows[~alive & np.isin(before, ids) & ~np.isin(rows, ids) & (rows < ids.max())]
-    if not len(culled):
+    """Move each culled keyframe that the correction does not name, and that is not newer than all it names, along with the living one of its sub-map
+    that is nearest in place and direction: it was culled because others show what it did."""
+    alive, submap, T_world = (map.keyframes.column(name) for name in ("alive", "submap", "T_world_camera"))
+    culled = np.flatnonzero(~alive[: ids.max()]).astype(np.int32)
+    culled = culled[~np.isin(culled, ids)]
+    living = np.flatnonzero(alive)
+    if not len(culled) or not len(living):
         return map
+    away = np.linalg.norm(T_world[culled, None, :3, 3] - T_world[living, :3, 3], axis=-1) - T_world[culled, :3, 2] @ T_world[living, :3, 2].T
+    nearest = living[np.argmin(np.where(submap[culled, None] == submap[living], away, np.inf), axis=1)]
+    moving = np.isin(nearest, ids) & (submap[nearest] == submap[culled])
+    culled, nearest = culled[moving], nearest[moving]
     order = np.argsort(ids)
-    parent = order[np.searchsorted(ids[order], before[culled])]
-    T = poses[parent] @ invert(map.keyframes.rows("T_world_camera", ids[parent]))
-    return replace(map, keyframes=map.keyframes.updated(culled, T_world_camera=T @ map.keyframes.rows("T_world_camera", culled)))
+    place = order[np.searchsorted(ids[order], nearest)]
+    T = poses[place] @ invert(T_world[nearest])
+    return replace(map, keyframes=map.keyframes.updated(culled, T_world_camera=T @ T_world[culled]))
 
 
 def _carry(map: Map, correction: Correction, newest: int, T_corrected: F64) -> Map:

@@ -1,4 +1,4 @@
-"""Removing landmarks that are not found again, and keyframes that others make redundant."""
+"""Removing landmarks that are not found again, and keyframes that others make redundant or that show a place once more."""
 
 from __future__ import annotations
 
@@ -7,8 +7,10 @@ from typing import Any
 
 import numpy as np
 
+from trihedron.pipeline.geometry import invert
 from trihedron.pipeline.types import F64, I32, Map, Matches, Table
-from trihedron.plugins.numerics.maps.local_window import WEIGHTS, covisible_keyframes, newest_keyframes, observed_by
+from trihedron.plugins.numerics.maps.local_window import WEIGHTS, covisible_keyframes, keyframes_of, newest_keyframes, observed_by
+from trihedron.plugins.numerics.maps.retiring import retired
 
 FARTHER = 1.2  # a landmark seen from at most this many times as far is seen as well: a level of the key points' pyramid
 KEPT = 4  # newest keyframes that are never redundant yet: the newest one's landmarks are still on trial
@@ -34,16 +36,39 @@ def cull(map: Map, keyframe: int, matches: Matches | None, planes: I32, trial: i
 
 def cull_keyframe(map: Map, others: int, share: float) -> Map:
     """Retire the one keyframe about the newest whose landmarks most are seen as well by at least `others` further ones, if these are more than
-    `share` of them (ORB-SLAM: 90 % by three), all kinds weighed as in co-visibility. Its pose and its measurements stay, for what hangs on them; it
-    is no longer part of any window. The first keyframe, which is the world, and the newest few are spared."""
+    `share` of them (ORB-SLAM: 90 % by three), all kinds weighed as in co-visibility. The first keyframe, which is the world, and the newest few are
+    spared."""
     newest = newest_keyframes(map, KEPT)
     around = covisible_keyframes(map, newest, 2 * others) if len(newest) else newest
     around = np.sort(around[around > 0])
     shares = _redundancies(map, around, others)
     if not len(shares) or shares.max() <= share:
         return map
-    gone = around[[int(np.argmax(shares))]]
-    return replace(map, keyframes=map.keyframes.updated(gone, alive=np.zeros(1, np.bool_)))
+    return retired(map, int(around[np.argmax(shares)]))
+
+
+def cull_repeated(map: Map, shift_m: float, turn_deg: float, share: float) -> Map:
+    """Retire the keyframe that has just left the newest few if beside an older one it would not have been made: within `shift_m` and `turn_deg` of
+    it, no plane its own, and at least `share` of its landmarks, weighed as in co-visibility, known from there. It is the younger one that goes: a
+    room that is seen again and again has as many keyframes as after the first time, and is held in its place by those."""
+    newest = newest_keyframes(map, KEPT + 1)
+    if len(newest) <= KEPT or newest[0] == 0:
+        return map
+    keyframe = newest[:1]
+    older = keyframes_of(map, int(map.keyframes.rows("submap", keyframe)[0]))
+    older = older[older < keyframe[0]]
+    T = invert(map.keyframes.rows("T_world_camera", keyframe)) @ map.keyframes.rows("T_world_camera", older)
+    cosine = 0.5 * (np.trace(T[:, :3, :3], axis1=1, axis2=2) - 1.0)
+    near = older[(np.linalg.norm(T[:, :3, 3], axis=1) <= shift_m) & (cosine >= np.cos(np.radians(turn_deg)))]
+    seen, known = 0, 0
+    for kind, weight in WEIGHTS.items():
+        own = observed_by(map, keyframe, kind)
+        seen += weight * len(own)
+        known += weight * np.count_nonzero(np.isin(own, observed_by(map, near, kind)))
+    planes = observed_by(map, keyframe, "plane")
+    if not len(near) or known < share * seen or not np.isin(planes, observed_by(map, older, "plane")).all():
+        return map
+    return retired(map, int(keyframe[0]))
 
 
 def _redundancies(map: Map, keyframes: I32, others: int) -> F64:
