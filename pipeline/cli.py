@@ -120,7 +120,7 @@ def _run(words: list[str]) -> int:
     os.environ["HYDRA_FULL_ERROR"] = "1"  # exceptions come to us instead of being printed
     import hydra
 
-    from trihedron.pipeline.config import register_configs, rewritten
+    from trihedron.pipeline.config import check_added, register_configs, rewritten
     from trihedron.pipeline.engines import register_engines
     from trihedron.pipeline.registry import load_plugins
     from trihedron.pipeline.sweep import OUTCOMES, raise_failures

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 import re
+from collections.abc import Iterable
 from enum import Enum
 from typing import Any, get_type_hints
 
@@ -141,6 +142,15 @@ def make_plugin(slot: str, options: DictConfig) -> Any:
         field, _, cause = str(error).partition(": ")
         place, cause = (f"{slot}.{field}", cause) if cause and field.isidentifier() else (slot, str(error))
         raise ConfigError(place, cause, f"see trihedron plugins for the options of {slot}") from error
+
+
+def check_added(overrides: Iterable[str]) -> None:
+    """Hydra lets `+key=value` add any key, and nobody would read it. Raises UsageError for a key that no run has."""
+    known = {f.name for f in dataclasses.fields(RunOptions) if f.name != "defaults"} | set(SLOTS) | {"experiment", "without"}
+    for word in overrides:
+        if (added := re.match(r"\+{1,2}([^=@]*)", word)) is not None and (root := re.split(r"[./]", added[1])[0]) not in known:
+            cure = did_you_mean(root, known)
+            raise UsageError(added[1], "there is no such key to add to", cure if cure.startswith("did") else "see trihedron run --help")
 
 
 def rewritten(error: Exception) -> TrihedronError:
