@@ -128,6 +128,7 @@ def _run(words: list[str]) -> int:
     load_plugins()
     register_configs()
     register_engines()
+    check_added(words)
     overrides = _with_recorded(words)
     _FAILURES.clear()
     OUTCOMES.clear()

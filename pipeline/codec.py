@@ -12,7 +12,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from functools import cache
 from typing import Any, get_type_hints
 
@@ -27,7 +27,6 @@ from trihedron.pipeline.table import CHUNK, Column, Table
 from trihedron.pipeline.types import Value
 
 FULL_EVERY = 50
-NO_ROWS = np.empty(0, np.intp)
 _TYPES: dict[str, type[Value]] = {
     name: kind for name, kind in vars(types).items() if isinstance(kind, type) and issubclass(kind, Value) and kind is not Value
 }
@@ -174,13 +173,14 @@ def _put_table(message: Any, name: str, table: Table, previous: Table | None) ->
     """The rows of each column that `previous` does not have; columns whose rows are the same share the list of their numbers."""
     changed: dict[str, int] = {}
     numbers: dict[bytes, int] = {}
-    count = -(-table.size // CHUNK)
-    empty = [table.is_empty(number) for number in range(count)]
-    emptied = [i for i in range(count) if empty[i] and not (previous is not None and i * CHUNK < previous.size and previous.is_empty(i))]
+    before = {column: previous.chunks.get(column, ()) if previous is not None else () for column in table.chunks}
+    touched = {column: _others(before[column], chunks) for column, chunks in table.chunks.items()}
+    emptied = {i for i in set().union(*touched.values()) if table.is_empty(i)}
     for column, chunks in table.chunks.items():
-        known = previous.chunks.get(column, ()) if previous is not None else ()
-        rows = [NO_ROWS if empty[i] else _changed(known[i], chunk) if i < len(known) else np.arange(len(chunk)) for i, chunk in enumerate(chunks)]
-        found = [i for i, those in enumerate(rows) if len(those)]
+        known = before[column]
+        here = [i for i in touched[column] if i not in emptied]
+        rows = {i: _changed(known[i], chunks[i]) if i < len(known) else np.arange(len(chunks[i])) for i in here}
+        found = [i for i in here if len(rows[i])]
         if found:
             ids = np.concatenate([i * CHUNK + rows[i] for i in found]).astype(np.int32)
             changed[column] = numbers.setdefault(ids.tobytes(), len(numbers))
@@ -188,15 +188,19 @@ def _put_table(message: Any, name: str, table: Table, previous: Table | None) ->
     for ids_bytes, k in numbers.items():
         put_array(message, f"{name}#rows{k}", np.frombuffer(ids_bytes, np.int32), False)
     if emptied:
-        put_array(message, f"{name}#emptied", np.array(emptied, np.int32), False)
+        put_array(message, f"{name}#emptied", np.array(sorted(emptied), np.int32), False)
     schema = {c: [s.dtype, list(s.shape)] for c, s in table.schema.items()}
     put_array(message, f"{name}#", json.dumps({"size": table.size, "full": previous is None, "schema": schema, "rows": changed}), False)
 
 
+def _others(known: Sequence[Any], chunks: Sequence[Any]) -> list[int]:
+    """Numbers of the chunks that are not the very ones known."""
+    same = min(len(known), len(chunks))
+    return [i for i in range(same) if known[i] is not chunks[i]] + list(range(same, len(chunks)))
+
+
 def _changed(known: Any, chunk: Any) -> Any:
     """Rows of a chunk, CHUNK at most, that the one known, no longer than this, does not have. They are compared by their bytes: NaN is no change."""
-    if known is chunk:
-        return NO_ROWS
     word = math.gcd(chunk.itemsize * math.prod(chunk.shape[1:]), 8)  # bytes compared at once
     before, after = (np.ascontiguousarray(part).reshape(len(part), -1).view(f"u{word}").reshape(len(part), -1) for part in (known, chunk))
     return np.concatenate([np.flatnonzero((before != after[: len(before)]).any(axis=1)), np.arange(len(before), len(after))])

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
-from functools import cache
 from itertools import pairwise
 from typing import Any
 
@@ -81,8 +80,10 @@ class Table:
         return Table(self.schema, self.size, chunks)
 
     def emptied(self, numbers: Array) -> Table:
-        """A version whose full chunks of these numbers hold zeros, and no memory."""
-        fresh = [int(number) for number in numbers if not self.is_empty(int(number))]
+        """A version whose full chunks of these numbers hold zeros, and no memory. One given back before is known by its first column."""
+        name, column = next(iter(self.schema.items()))
+        known, nothing = self.chunks[name], empty_chunk(column)
+        fresh = [number for number in numbers.tolist() if known[number] is not nothing]
         if not fresh:
             return self
         chunks = {}
@@ -123,16 +124,17 @@ class Table:
         return Table(self.schema, size, chunks).emptied(empty)
 
 
-@cache
-def _zeros(dtype: str, shape: tuple[int, ...]) -> Array:
-    chunk = np.zeros((CHUNK, *shape), dtype)
-    chunk.flags.writeable = False
-    return chunk
+_EMPTY: dict[tuple[str, tuple[int, ...]], Array] = {}
 
 
 def empty_chunk(column: Column) -> Array:
-    """The one chunk of zeros of all columns of this kind."""
-    return _zeros(column.dtype, column.shape)
+    """The one chunk of zeros of all columns of this kind, for whichever thread asks first."""
+    key = column.dtype, column.shape
+    if key not in _EMPTY:
+        zeros = np.zeros((CHUNK, *column.shape), column.dtype)
+        zeros.flags.writeable = False
+        _EMPTY.setdefault(key, zeros)
+    return _EMPTY[key]
 
 
 def _by_chunk(ids: Array) -> Iterator[tuple[int, Any, Array]]:
