@@ -61,7 +61,8 @@ def _keyframes(map: Map) -> I32:
 def _observations(map: Map, keyframes: I32) -> Any:
     """(n, 3) keyframe, point, row of `point_observations`: of these keyframes and living points, each pair once, of points seen often enough."""
     keyframe, point = map.point_observations.column("keyframe"), map.point_observations.column("point")
-    row = np.flatnonzero(np.isin(keyframe, keyframes) & map.points.column("alive")[point])
+    row = np.concatenate([np.empty(0, np.int64), *(np.arange(first, stop) for first, stop in map.keyframes.rows("points", keyframes))])
+    row = row[map.points.column("alive")[point[row]]]
     _, once = np.unique(np.stack([keyframe[row], point[row]], axis=1), axis=0, return_index=True)
     row = row[np.sort(once)]
     views = np.bincount(point[row], minlength=len(map.points))
