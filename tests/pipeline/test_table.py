@@ -69,3 +69,6 @@ def test_empty_chunks_hold_zeros_and_no_memory():
     whole = longer.extended(6 * CHUNK + 2, np.array([1, 4]), **rows(CHUNK + 2, 5 * CHUNK))  # a chunk that was begun is filled and given back at once
     assert [whole.is_empty(number) for number in range(7)] == [True, True, True, False, True, False, False]
     assert whole.rows("n", np.array([5 * CHUNK - 1, 5 * CHUNK, 6 * CHUNK + 1])).tolist() == [0, 5 * CHUNK, 6 * CHUNK + 1]
+    kept = before.keeping(np.array([[CHUNK - 1, CHUNK + 1], [5, 5]]))  # the last chunk is not full
+    assert [kept.is_empty(number) for number in range(4)] == [False, False, True, False]
+    assert [before.keeping(np.empty((0, 2), int)).is_empty(number) for number in range(4)] == [True, True, True, False]

@@ -7,8 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from trihedron.pipeline.table import CHUNK
-from trihedron.pipeline.types import I32, Map, Table
+from trihedron.pipeline.types import Map, Table
 from trihedron.plugins.numerics.maps.local_window import observed_by
 
 KINDS = ("point", "line", "plane")
@@ -33,23 +32,10 @@ def retired(map: Map, keyframe: int) -> Map:
 def released(map: Map) -> Map:
     """The same map with the chunks given back in which no landmark lives, or no living keyframe has a measurement; rows keep their numbers."""
     changes: dict[str, Table] = {}
+    held = map.keyframes.column("alive")
     for kind in KINDS:
-        landmarks: Table = getattr(map, f"{kind}s")
-        changes[f"{kind}s"] = landmarks.emptied(_unused(landmarks, np.flatnonzero(landmarks.column("alive"))))
-        measured: Table = getattr(map, f"{kind}_observations")
-        changes[f"{kind}_observations"] = measured.emptied(_unused(measured, _held(map, kind)))
+        landmarks, measured = getattr(map, f"{kind}s"), getattr(map, f"{kind}_observations")
+        ids = np.flatnonzero(landmarks.column("alive"))
+        changes[f"{kind}s"] = landmarks.keeping(np.stack([ids, ids + 1], axis=1))
+        changes[f"{kind}_observations"] = measured.keeping(map.keyframes.column(f"{kind}s")[held])
     return replace(map, **changes)
-
-
-def _held(map: Map, kind: str) -> I32:
-    """A row of each chunk of the observation table in which a living keyframe has some."""
-    spans = map.keyframes.column(f"{kind}s")[map.keyframes.column("alive")]
-    spans = spans[spans[:, 0] < spans[:, 1]]
-    chunks = [np.arange(first // CHUNK, (stop - 1) // CHUNK + 1) for first, stop in spans]
-    return np.unique(np.concatenate(chunks)).astype(np.int32) * CHUNK if chunks else np.empty(0, np.int32)
-
-
-def _unused(table: Table, rows: I32) -> I32:
-    """Numbers of the full chunks that hold none of the rows."""
-    used = np.bincount(rows // CHUNK, minlength=-(-len(table) // CHUNK))
-    return np.flatnonzero(used[: len(table) // CHUNK] == 0).astype(np.int32)
