@@ -141,11 +141,10 @@ def _row(first: int, timing: list[dict[str, Any]], held: tuple[int, int, int, in
     others = np.array([sum(row["stage_ms"].values()) - row["stage_ms"]["dataset"] for row in timing]) - features
     inside = slice(first, first + len(timing))
     handles, threads, keyframes, landmarks, map_mb = held
-    return Row(
-        first + len(timing), timing[-1]["memory_mb"], handles, threads, keyframes, landmarks, round(map_mb, 2),
-        *np.round(np.percentile(frame_ms, [50, 95]), 2).tolist(), round(float(np.median(others / features)), 3),
-        round(float(errors_mm[inside].max()), 2), int(not_ok[inside].sum()),
-    )  # fmt: skip
+    p50, p95 = np.percentile(frame_ms, [50, 95])
+    times = round(float(p50), 2), round(float(p95), 2), round(float(np.median(others / features)), 3)
+    off_mm, count = round(float(errors_mm[inside].max()), 2), int(not_ok[inside].sum())
+    return Row(first + len(timing), timing[-1]["memory_mb"], handles, threads, keyframes, landmarks, round(map_mb, 2), *times, off_mm, count)
 
 
 def report(rows: list[Row], warm_up: int) -> tuple[str, bool]:
