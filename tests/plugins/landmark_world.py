@@ -6,7 +6,7 @@ import numpy as np
 
 from trihedron.pipeline.camera import Camera
 from trihedron.pipeline.geometry import exp_se3, invert, pose_matrix, tangent_basis, transform, transform_planes
-from trihedron.pipeline.types import Frame, Keypoints, Planes, Rotation, Segments, Translation
+from trihedron.pipeline.types import Frame, Keypoints, Planes, Pose, Rotation, Segments, Tracks, Translation
 from trihedron.plugins.numerics.algebra.uncertainty import point_covariance
 from trihedron.plugins.numerics.maps.visibility import clip_segments
 
@@ -162,3 +162,19 @@ def translation_of(T, index, off_m=(0.0, 0.0, 0.0), sigma_m=0.01, estimated=True
 def camera_at(step):
     """A path through the middle of the room, 2 cm and 0.6° a step; the identity at 0."""
     return pose_matrix(exp_se3(np.radians([0, 0, 0, 0.2, 0.6, 0.1]) * step)[:3, :3], np.array([0.02, 0.004, 0.012]) * step)
+
+
+def pose_of(T, index):
+    return Pose(index, index * 33_000_000, T, np.eye(6) * 1e-8, T, -1, np.zeros(3, np.int32), 0, "ok", "")
+
+
+def tracks_of(world, before, now, depth=True, most=None):
+    """Key points of two camera steps and the true tracks between them, without the previous depth unless `depth`."""
+    (a, rows_a), (b, rows_b) = world.keypoints(camera_at(before), before), world.keypoints(camera_at(now), now)
+    _, i, j = np.intersect1d(rows_a, rows_b, return_indices=True)
+    pairs = np.stack([i, j], axis=1).astype(np.int32)[:most]
+    points = a.points_m[pairs[:, 0]] if depth else np.full((len(pairs), 3), np.nan, np.float32)
+    none, n3 = np.zeros((0, 2), np.int32), np.zeros((0, 3, 3))
+    R = np.eye(3)
+    tracks = Tracks(now, now, before, pairs, points, a.sigma_m[pairs[:, 0]], none, np.zeros((0, 2, 3), np.float32), none, np.zeros((0, 4)), n3, R)
+    return tracks, a, b

@@ -8,29 +8,12 @@ import numpy as np
 import pytest
 
 from trihedron.pipeline.codec import Decoder, Encoder
-from trihedron.pipeline.types import Pose, Tracks
 from trihedron.plugins.rotation.manhattan import ManhattanRotation
 from trihedron.plugins.translation.irls import Irls
 from trihedron.plugins.translation.kalman import Kalman
 
 sys.path.insert(0, str(Path(__file__).parent))
-from landmark_world import INTO_CORNER, World, camera_at, rotation_of
-
-
-def pose_of(T, index):
-    return Pose(index, index * 33_000_000, T, np.eye(6) * 1e-8, T, -1, np.zeros(3, np.int32), 0, "ok", "")
-
-
-def tracks_of(world, before, now, depth=True, most=None):
-    """Key points of two camera steps and the true tracks between them, without the previous depth unless `depth`."""
-    (a, rows_a), (b, rows_b) = world.keypoints(camera_at(before), before), world.keypoints(camera_at(now), now)
-    _, i, j = np.intersect1d(rows_a, rows_b, return_indices=True)
-    pairs = np.stack([i, j], axis=1).astype(np.int32)[:most]
-    points = a.points_m[pairs[:, 0]] if depth else np.full((len(pairs), 3), np.nan, np.float32)
-    none, n3 = np.zeros((0, 2), np.int32), np.zeros((0, 3, 3))
-    R = np.eye(3)
-    tracks = Tracks(now, now, before, pairs, points, a.sigma_m[pairs[:, 0]], none, np.zeros((0, 2, 3), np.float32), none, np.zeros((0, 4)), n3, R)
-    return tracks, a, b
+from landmark_world import INTO_CORNER, World, camera_at, pose_of, rotation_of, tracks_of
 
 
 def irls(world, tracks, a, b, now, before, **options):
