@@ -136,9 +136,11 @@ def test_a_model_shows_a_wall_from_elsewhere_and_nothing_where_none_was_seen(nam
 @pytest.mark.parametrize("name", MODELS)
 def test_what_is_seen_twice_is_averaged_and_a_lost_camera_says_nothing(name):
     """A wall read at 3.00 m and then at 3.02 m, well within the noise of a sensor, stands at 3.01 m."""
-    camera, model = replace(CAMERA, depth_noise=DepthNoise()), None
+    camera, model, rows = replace(CAMERA, depth_noise=DepthNoise()), None, []
     for index, z in enumerate((3.0, 3.02)):
         model = MODELS[name](*view(index, np.eye(4), ((0.0, 0.0, -1.0, z),), ball=False, camera=camera), model)
+        rows.append(len(model.model))
+    assert rows[1] < 1.1 * rows[0]  # it is one wall
     assert abs(np.median(model.depth_m[model.depth_m > 0.0]) - 3.01) < 1e-3 and (model.depth_m > 0.0).mean() > 0.9
     assert MODELS[name](*view(2, np.eye(4), WALL, ball=False, status="lost"), model) is None
 

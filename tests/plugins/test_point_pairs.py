@@ -112,6 +112,9 @@ def test_ambiguous_and_foreign_descriptors_are_refused():
     both = np.intersect1d(rows_before, rows_now)
     assert np.isin(twin, both).sum() >= 10 and not np.isin(found, twin).any()
     assert len(found) >= 0.97 * np.count_nonzero(~np.isin(both, twin))
+    twice = taken(before, np.concatenate([np.arange(len(rows_before)), np.arange(len(rows_before))]))
+    pairs = brute_force(world, now, twice).keypoints  # a feature of this frame is nearest to two, and goes to one
+    assert len(np.unique(pairs[:, 0])) == len(np.unique(pairs[:, 1])) == len(pairs) >= 0.97 * len(both)
     foreign = replace(now, descriptors=rng().integers(0, 256, now.descriptors.shape, dtype=np.uint8))
     assert len(brute_force(world, foreign, before).keypoints) < 0.1 * len(both)
 
@@ -164,11 +167,11 @@ def test_keyframes_that_do_not_agree_are_not_matched():
 
 
 def true_pose(index):
-    """Once round a square, looking ahead by the end of each side; the last pose is the first."""
+    """Once round a square, turning all the way; the last pose stands where the first did, 11 degrees short of its direction."""
     corners = np.array([[0, 0, 0], [1, 0, 0], [1, 0, 1], [0, 0, 1], [0, 0, 0]]) * SIDE_M
     side, along = divmod(4.0 * index / SQUARE, 1.0)
     a, b = corners[int(side) % 4], corners[int(side) % 4 + 1]
-    return pose_matrix(exp_so3(np.array([0.0, 2.0 * np.pi * index / SQUARE, 0.0])), a + along * (b - a))
+    return pose_matrix(exp_so3(np.array([0.0, np.radians(349.0) * index / SQUARE, 0.0])), a + along * (b - a))
 
 
 @cache
@@ -193,7 +196,7 @@ def test_a_pose_graph_corrects_the_drift_around_a_square():
     drift, left = (np.linalg.norm(T[:, :3, 3] - truth[:, :3, 3], axis=1) for T in (before, after))
     turn = [rotation_angle_deg(T.T @ R) for T, R in zip(after[:, :3, :3], truth[:, :3, :3])]
     assert drift[-1] > 0.23 and left[-1] < 0.1 * drift[-1] and left.max() < 0.2 * drift.max()
-    assert max(turn) < 1.0  # of 4.2 degrees
+    assert max(turn) < 1.3  # of 4.2 degrees; the loop edge is known to about 0.5
     assert np.array_equal(after[0], before[0]) and correction.based_on == map.revision
     assert np.array_equal(correction.point_ids, np.flatnonzero(map.points.column("alive")))
 
