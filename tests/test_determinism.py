@@ -19,8 +19,9 @@ RUN = "import sys; from trihedron.pipeline.cli import main; sys.exit(main(['run'
 
 @contextlib.contextmanager
 def load(processes):
-    """Other programs that want the processors too."""
-    busy = [subprocess.Popen([sys.executable, "-c", "while True: pass"]) for _ in range(processes)]
+    """Other programs that want the processors too, as long as this one lives."""
+    wait = f"import os\nwhile os.getppid() == {os.getpid()}: pass"
+    busy = [subprocess.Popen([sys.executable, "-c", wait]) for _ in range(processes)]
     try:
         yield
     finally:
