@@ -5,7 +5,8 @@ BIN := $(VENV)/bin
 OUT := runs/demo
 TABLE := runs/table
 COMMA := ,
-ROOM := "synthetic length=90","synthetic texture=false length=90"
+BARE := synthetic length=90 texture=false
+ROOMS := $(foreach s,0 1 2,"synthetic length=90 seed=$(s)"$(COMMA))"$(BARE) seed=0"$(foreach s,1 2,$(COMMA)"$(BARE) seed=$(s)")
 SEQUENCES := $(wildcard ../shared/data/*/)
 USABLE := 'import sys, venv, ensurepip; sys.exit(not (3, 10) <= sys.version_info[:2] <= (3, 14))'
 PYTHON := $(shell for p in python3.14 python3.13 python3.12 python3.11 python3.10 python3 python; do \
@@ -40,7 +41,7 @@ benchmark: install  ## time, memory and error on the synthetic room and the sequ
 		echo; echo "$$folder"; $(BIN)/trihedron benchmark dataset=$$kind dataset.path=$$folder; done
 
 table: install  ## every system on the synthetic room and on DATA="tum:FOLDER icl_nuim:FOLDER ..."; goes on where it was stopped
-	$(BIN)/trihedron run -m experiment=paper_table out=$(TABLE) 'sequences=[$(ROOM)$(foreach d,$(DATA),$(COMMA)"$(d)")]' || test $$? -eq 1
+	$(BIN)/trihedron run -m experiment=paper_table out=$(TABLE) 'sequences=[$(foreach d,$(DATA),"$(d)"$(COMMA))$(ROOMS)]' || test $$? -eq 1
 	$(BIN)/trihedron compare $(TABLE) --baseline graph=points --csv $(TABLE)/table.csv --markdown $(TABLE)/table.md \
 		--latex $(TABLE)/table.tex --json $(TABLE)/table.json
 
