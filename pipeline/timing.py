@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import os
+from array import array
 from collections import defaultdict
+from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -15,8 +17,8 @@ class Timing:
     """Collects milliseconds per stage and per frame; `summary` is `timing.json`."""
 
     def __init__(self) -> None:
-        self._calls: dict[str, list[float]] = defaultdict(list)
-        self._frames_ms: list[float] = []
+        self._calls: dict[str, array[float]] = defaultdict(lambda: array("d"))
+        self._frames_ms = array("d")
         self._finish_ms: dict[str, float] = {}
 
     def add_call(self, stage: str, ms: float) -> None:
@@ -77,7 +79,7 @@ def forget_peak() -> None:
         Path("/proc/self/clear_refs").write_text("5")
 
 
-def _percentiles(values: list[float]) -> tuple[float, float, float]:
+def _percentiles(values: Sequence[float]) -> tuple[float, float, float]:
     if not values:
         return 0.0, 0.0, 0.0
     p50, p95 = np.percentile(values, [50, 95])

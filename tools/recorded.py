@@ -10,7 +10,7 @@ import numpy as np
 from trihedron.pipeline.errors import DataError
 from trihedron.pipeline.recording import FRAMES_TOPIC, Recording
 from trihedron.pipeline.results import final_trajectory
-from trihedron.pipeline.runs import Result
+from trihedron.pipeline.runs import Poses, Result
 from trihedron.pipeline.slots import frame_range
 from trihedron.pipeline.types import Frame, FrameReference, Map, Pose, Trajectory
 
@@ -33,7 +33,7 @@ def last_map(recording: Recording) -> Map | None:
 
 def trajectory_of(recording: Recording) -> Trajectory:
     """The final poses of all tracked frames, as trajectory.txt has them."""
-    return final_trajectory(Result(poses=poses_of(recording), map=last_map(recording)))
+    return final_trajectory(Result(poses=Poses(poses_of(recording)), map=last_map(recording)))
 
 
 def references_of(recording: Recording) -> dict[int, FrameReference]:

@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from trihedron.pipeline.types import Camera, DepthNoise, Keypoints, LineSegments
+from trihedron.pipeline.runs import Poses
+from trihedron.pipeline.types import Camera, DepthNoise, Keypoints, LineSegments, Pose
 
 
 def test_wrong_arrays_are_named():
@@ -37,3 +38,15 @@ def test_depth_noise_has_a_floor():
     noise = DepthNoise()
     assert noise.sigma_m(0.2) == 0.001  # the polynomial is negative below 0.35 m
     assert noise.sigma_m(4.0) == pytest.approx(0.00273 * 16 + 0.00074 * 4 - 0.00058)
+
+
+def test_poses_of_a_run_come_back_as_they_were():
+    rng = np.random.default_rng(0)
+    matrices, counts = [[rng.random((size, size)) for size in (4, 6, 4)] for _ in range(5)], np.array([5, 2, 3], np.int32)
+    said = [Pose(3 * k, 2**60 + k, *matrices[k], k - 1, counts + k, 1, "ok", f"why {k}", k, 7) for k in range(5)]
+    kept = Poses(said)
+    assert len(kept) == 5 and [pose.index for pose in kept[1:4]] == [3, 6, 9] and kept[-1].reason == "why 4"
+    for pose, again in zip(said, kept):
+        assert all(np.array_equal(getattr(pose, name), getattr(again, name)) for name in vars(pose)) and again.inliers.dtype == np.int32
+    with pytest.raises(IndexError):
+        kept[5]

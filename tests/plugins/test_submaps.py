@@ -9,7 +9,7 @@ import pytest
 
 from trihedron.pipeline.geometry import exp_se3, invert, transform
 from trihedron.pipeline.results import final_trajectory, is_tied
-from trihedron.pipeline.runs import Result
+from trihedron.pipeline.runs import Poses, Result
 from trihedron.pipeline.types import Pose
 from trihedron.plugins.map.covisibility import Covisibility
 from trihedron.plugins.matches.local_map import LocalMap
@@ -82,9 +82,9 @@ def test_a_sub_map_is_tied_where_the_camera_is_recognised(both):
 def test_frames_of_a_sub_map_count_once_it_is_tied(both):
     _, map = both
     poses = [pose_of(camera_at(0), 0, reference=0), pose_of(AWAY, 20, "degraded", submap=1, reference=8), pose_of(AWAY, 21, "lost", reference=8)]
-    assert [is_tied(pose, map) for pose in poses] == [True, False, False] and len(final_trajectory(Result(poses, map))) == 1
+    assert [is_tied(pose, map) for pose in poses] == [True, False, False] and len(final_trajectory(Result(Poses(poses), map))) == 1
     tied = dataclasses.replace(map, keyframes=map.keyframes.updated(np.arange(6, 12), submap=np.zeros(6, np.int32)))
-    assert [is_tied(pose, tied) for pose in poses] == [True, True, False] and len(final_trajectory(Result(poses, tied))) == 2
+    assert [is_tied(pose, tied) for pose in poses] == [True, True, False] and len(final_trajectory(Result(Poses(poses), tied))) == 2
 
 
 def test_a_new_sub_map_begins_after_as_many_frames_as_were_sought_in_vain():
