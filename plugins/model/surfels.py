@@ -8,8 +8,8 @@ import numpy as np
 
 from trihedron.pipeline.registry import register
 from trihedron.pipeline.types import LOST, Frame, Pose, PredictedView, Table
-from trihedron.plugins.numerics.depth.reduction import depth_normals, lens_of, reduced, smoothed, step_to
-from trihedron.plugins.numerics.surfaces.block_model import lens_at
+from trihedron.plugins.numerics.depth.reduction import depth_normals, smoothed
+from trihedron.plugins.numerics.surfaces.model_sight import sight_of
 from trihedron.plugins.numerics.surfaces.surfel_model import SURFELS, Images, fused, shown
 
 
@@ -39,10 +39,7 @@ class SurfelModel:
         """The view from this frame's pose; None, so that the last one stays, while the camera is lost."""
         if pose.status == LOST:
             return None
-        step = step_to(frame, self.width)
-        depth, color = reduced(frame.depth_m, frame.color, step)
-        lens = lens_of(frame, step)
-        camera = lens_at(lens, pose.T_world_camera)
+        depth, color, lens, camera = sight_of(frame, pose, self.width)
         smooth = smoothed(depth, 2)
         images = Images(depth, depth_normals(smooth, lens, 2), color, frame.camera.depth_noise.sigma_m(np.arange(0.0, 16.0, 0.01)))
         table = previous.model if previous is not None else Table.empty(SURFELS)

@@ -8,8 +8,9 @@ import numpy as np
 
 from trihedron.pipeline.registry import register
 from trihedron.pipeline.types import LOST, Frame, Pose, PredictedView, Table
-from trihedron.plugins.numerics.depth.reduction import depth_normals, lens_of, reduced, smoothed, step_to
-from trihedron.plugins.numerics.surfaces.block_model import BLOCKS, fused, lens_at
+from trihedron.plugins.numerics.depth.reduction import depth_normals, smoothed
+from trihedron.plugins.numerics.surfaces.block_model import BLOCKS, fused
+from trihedron.plugins.numerics.surfaces.model_sight import sight_of
 from trihedron.plugins.numerics.surfaces.raycasting import cast
 
 
@@ -34,10 +35,7 @@ class TsdfModel:
         """The view from this frame's pose; None, so that the last one stays, while the camera is lost."""
         if pose.status == LOST:
             return None
-        step = step_to(frame, self.width)
-        depth, color = reduced(frame.depth_m, frame.color, step)
-        lens = lens_of(frame, step)
-        camera = lens_at(lens, pose.T_world_camera)
+        depth, color, lens, camera = sight_of(frame, pose, self.width)
         table = previous.model if previous is not None else Table.empty(BLOCKS)
         table, seen = fused(table, depth, camera, self.voxel_m, self.truncation_m, self.most)
         shown = cast(seen, camera, depth, self.voxel_m, self.truncation_m)

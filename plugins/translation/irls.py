@@ -7,9 +7,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from trihedron.pipeline.registry import register
-from trihedron.pipeline.types import LOST, Frame, Keypoints, Map, Pose, Rotation, Tracks, Translation
+from trihedron.pipeline.types import Frame, Keypoints, Map, Pose, Rotation, Tracks, Translation
 from trihedron.plugins.numerics.maps.anchoring import anchored
 from trihedron.plugins.numerics.motion.derotated_points import point_rows, solve_step
+from trihedron.plugins.numerics.motion.positions import handed_on, origin, unmeasured
 
 
 @register("translation", "irls")
@@ -40,9 +41,9 @@ class Irls:
     ) -> Translation:
         """The position; the first frame's is the origin of the world."""
         if previous_pose is None:
-            return Translation(frame.index, frame.stamp_ns, np.zeros(3), np.zeros((3, 3)), np.empty((0, 3)), np.zeros(3, np.int32), True)
-        before = anchored(previous_pose, map).T_world_camera
-        unknown = before[:3, :3] @ previous_pose.covariance[:3, :3] @ before[:3, :3].T if previous_pose.status == LOST else np.zeros((3, 3))
+            return origin(frame)
+        pose = anchored(previous_pose, map)
+        before, unknown = pose.T_world_camera, handed_on(pose)
         prior_m = self.motion_sigma_m * max(frame.index - previous_pose.index, 1)
         R = rotation.R_world_camera
         if tracks is not None and previous_keypoints is not None and tracks.previous_index == previous_pose.index == previous_keypoints.index:
@@ -53,5 +54,4 @@ class Irls:
                 covariance = R @ step.covariance @ R.T + unknown
                 held = np.ascontiguousarray(step.unobservable @ R.T)
                 return Translation(frame.index, frame.stamp_ns, before[:3, 3] - R @ step.s, covariance, held, inliers, True)
-        covariance = unknown + prior_m**2 * np.eye(3)
-        return Translation(frame.index, frame.stamp_ns, before[:3, 3].copy(), covariance, np.eye(3), np.zeros(3, np.int32), False)
+        return unmeasured(frame, before[:3, 3].copy(), unknown + prior_m**2 * np.eye(3))

@@ -8,10 +8,11 @@ import numpy as np
 
 from trihedron.pipeline.geometry import pose_matrix
 from trihedron.pipeline.registry import register
-from trihedron.pipeline.types import F64, LOST, Frame, Keypoints, Map, Planes, Pose, Rotation, Segments, Tracks, Translation
+from trihedron.pipeline.types import F64, Frame, Keypoints, Map, Planes, Pose, Rotation, Segments, Tracks, Translation
 from trihedron.plugins.numerics.maps.anchoring import anchored
 from trihedron.plugins.numerics.motion.pose_solver import solve_pose
 from trihedron.plugins.numerics.motion.pose_terms import SAME, LineTerms, PlaneTerms, PointTerms
+from trihedron.plugins.numerics.motion.positions import handed_on, origin, unmeasured
 from trihedron.plugins.numerics.motion.tracked_terms import placed_planes, placed_points
 
 
@@ -50,7 +51,7 @@ class LevenbergMarquardt:
     ) -> Translation:
         """The position; the first frame's is the origin of the world."""
         if previous_pose is None:
-            return self._said(frame, np.zeros(3), np.zeros((3, 3)), np.empty((0, 3)), (0, 0, 0), True)
+            return origin(frame)
         previous_pose = anchored(previous_pose, map)
         earlier_pose = anchored(earlier_pose, map) if earlier_pose is not None else None
         start = pose_matrix(rotation.R_world_camera, previous_pose.T_world_camera[:3, 3])
@@ -73,18 +74,18 @@ class LevenbergMarquardt:
         if not (found.points.any() or found.lines.any() or found.planes.any()):
             return self._predicted(frame, previous_pose, earlier_pose, frames)
         R = rotation.R_world_camera
-        inliers = (int(np.count_nonzero(found.points)), int(np.count_nonzero(found.lines)), int(np.count_nonzero(found.planes)))
+        inliers = np.array([np.count_nonzero(kind) for kind in (found.points, found.lines, found.planes)], np.int32)
         unobservable = np.ascontiguousarray((R @ found.unobservable).T)
-        covariance = R @ found.covariance @ R.T + _unknown(previous_pose)
-        return self._said(frame, found.T_world_camera[:3, 3], covariance, unobservable, inliers, True)
+        covariance = R @ found.covariance @ R.T + handed_on(previous_pose, held_too=True)
+        return Translation(frame.index, frame.stamp_ns, found.T_world_camera[:3, 3].copy(), covariance, unobservable, inliers, True)
 
     def _predicted(self, frame: Frame, previous: Pose, earlier: Pose | None, frames: int) -> Translation:
         """Where the camera is if it goes on as before, for as long as that may be said, else where it was."""
-        t, before = previous.T_world_camera[:3, 3].copy(), _unknown(previous)
+        t, before = previous.T_world_camera[:3, 3].copy(), handed_on(previous, held_too=True)
         lately = np.trace(before) / 3.0 < self.predict_frames * self.motion_sigma_m**2
         if earlier is not None and lately:
             t += (t - earlier.T_world_camera[:3, 3]) * frames / (previous.index - earlier.index)
-        return self._said(frame, t, before + (self.motion_sigma_m * frames) ** 2 * np.eye(3), np.eye(3), (0, 0, 0), False)
+        return unmeasured(frame, t, before + (self.motion_sigma_m * frames) ** 2 * np.eye(3))
 
     def _points(self, tracks: Tracks, keypoints: Keypoints, T: F64, frame: Frame, uncertain: F64) -> PointTerms:
         """Tracked key points whose previous depth is known."""
@@ -121,12 +122,3 @@ class LevenbergMarquardt:
         observed = planes.coefficients[rows]
         world, covariance, turned = placed_planes(tracks.coefficients, tracks.plane_covariance, observed, T, uncertain)
         return PlaneTerms(np.full(len(rows), SAME, np.int32), world, covariance, observed, planes.covariance[rows] + turned)
-
-    def _said(self, frame: Frame, t: F64, covariance: F64, unobservable: F64, inliers: tuple[int, int, int], estimated: bool) -> Translation:
-        return Translation(frame.index, frame.stamp_ns, t.copy(), covariance, unobservable, np.array(inliers, np.int32), estimated)
-
-
-def _unknown(previous: Pose) -> F64:
-    """(3, 3) covariance (world) that a pose which was lost, or held in some direction, hands on to what is put on top of it; others hand on none."""
-    R, known = previous.T_world_camera[:3, :3], previous.status != LOST and previous.unobservable == 0
-    return np.zeros((3, 3)) if known else np.asarray(R @ previous.covariance[:3, :3] @ R.T)

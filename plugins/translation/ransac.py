@@ -7,8 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from trihedron.pipeline.registry import register
-from trihedron.pipeline.types import F64, LOST, Bool, Frame, Keypoints, Map, Pose, Rotation, Tracks, Translation
+from trihedron.pipeline.types import F64, Bool, Frame, Keypoints, Map, Pose, Rotation, Tracks, Translation
 from trihedron.plugins.numerics.maps.anchoring import anchored
+from trihedron.plugins.numerics.motion.positions import handed_on, origin, unmeasured
 from trihedron.plugins.numerics.motion.tracked_places import tracked_places
 
 
@@ -32,11 +33,10 @@ class Ransac:
         rng: np.random.Generator,
     ) -> Translation:  # fmt: skip
         """The position; the first frame's is the origin of the world."""
-        none = np.zeros(3, np.int32)
         if previous_pose is None:
-            return Translation(frame.index, frame.stamp_ns, np.zeros(3), np.zeros((3, 3)), np.empty((0, 3)), none, True)
-        T, R = anchored(previous_pose, map).T_world_camera, rotation.R_world_camera
-        unknown = T[:3, :3] @ previous_pose.covariance[:3, :3] @ T[:3, :3].T if previous_pose.status == LOST else np.zeros((3, 3))
+            return origin(frame)
+        pose, R = anchored(previous_pose, map), rotation.R_world_camera
+        T, unknown = pose.T_world_camera, handed_on(pose)
         if tracks is not None and tracks.previous_index == previous_pose.index:
             before, after, sigma = tracked_places(tracks, keypoints)
             steps = before @ T[:3, :3].T - after @ R.T
@@ -46,8 +46,8 @@ class Ransac:
                 covariance = np.eye(3) / w.sum() + unknown
                 inliers = np.array([agree.sum(), 0, 0], np.int32)
                 return Translation(frame.index, frame.stamp_ns, T[:3, 3] + w @ steps[agree] / w.sum(), covariance, np.empty((0, 3)), inliers, True)
-        covariance = unknown + (self.motion_sigma_m * max(frame.index - previous_pose.index, 1)) ** 2 * np.eye(3)
-        return Translation(frame.index, frame.stamp_ns, T[:3, 3].copy(), covariance, np.eye(3), none, False)
+        prior_m = self.motion_sigma_m * max(frame.index - previous_pose.index, 1)
+        return unmeasured(frame, T[:3, 3].copy(), unknown + prior_m**2 * np.eye(3))
 
     def _agreeing(self, steps: F64, sigma: F64, rng: np.random.Generator) -> Bool:
         """(n,) whether each of the steps (n, 3) agrees with the one that most agree with, and then with their mean."""
