@@ -16,6 +16,7 @@ from trihedron.plugins.numerics.maps.correction import apply_correction
 from trihedron.plugins.numerics.places.loop_correction import moved_keyframes
 from trihedron.plugins.rotation.ransac import Ransac as RotationRansac
 from trihedron.plugins.tracks.brute_force import BruteForce
+from trihedron.plugins.translation.irls import Irls
 from trihedron.plugins.translation.ransac import Ransac as TranslationRansac
 
 sys.path.insert(0, str(Path(__file__).parent))
@@ -75,6 +76,20 @@ def test_too_few_pairs_or_none_alike_are_no_measurement():
         assert rotation.source == "prediction" and np.allclose(rotation.R_world_camera, camera_at(1)[:3, :3])
     assert TranslationRansac()(World().frame(0), rotation_of(np.eye(4), 0), None, now, None, None, rng()).estimated
     assert np.array_equal(RotationRansac()(None, now, None, None, None, rng()).R_world_camera, np.eye(3))
+
+
+def test_a_lost_pose_hands_on_how_uncertain_it_is():
+    """What is put on top of it is as uncertain, in the world's axes, whether the step was measured or not."""
+    tracks, before, now = tracks_of(World(4000), 1, 4)
+    T, own = camera_at(1), np.diag([0.5, 0.2, 0.1, 1e-8, 1e-8, 1e-8])
+    sure, world = pose_of(T, 1), T[:3, :3] @ own[:3, :3] @ T[:3, :3].T
+    lost = replace(sure, status="lost", covariance=own)
+    rotation, frame = rotation_of(camera_at(4), 4), World().frame(4)
+    for pairs in (tracks, None):
+        ransac = [TranslationRansac()(frame, rotation, pairs, now, pose, None, rng()) for pose in (sure, lost)]
+        irls = [Irls()(frame, rotation, pairs, now, before, pose, None) for pose in (sure, lost)]
+        for one, other in (ransac, irls):
+            assert np.allclose(other.covariance - one.covariance, world) and np.array_equal(other.t_world_camera, one.t_world_camera)
 
 
 def brute_force(world, now, before, step=4):
