@@ -40,6 +40,7 @@ class Covisibility:
     new_plane_px: int = 4000  # a plane this large that is not in the map makes a keyframe
     memory: float = 30.0  # measurements a point or line remembers
     plane_memory: float = 30.0  # keyframes a plane remembers
+    judge: bool = True  # matches by the final pose; false where they were verified among themselves and a loop may be longer than the pose is sure
     line_sigma_px: float = 1.0  # of a segment's end point across it
     min_line_px: float = 30.0  # shortest segment that becomes a landmark
     trial: int = 3  # keyframes after which a landmark seen by fewer of those that should have seen it is removed
@@ -122,7 +123,7 @@ class Covisibility:
     ) -> Map:
         """The map with this frame as its newest keyframe."""
         matches = matches if len(keyframes_of(map, pose.submap)) else None  # a new sub-map knows nothing yet
-        found = associate(map, frame.camera, pose.T_world_camera, keypoints, segments, planes, matches, self.line_sigma_px)
+        found = associate(map, frame.camera, pose.T_world_camera, keypoints, segments, planes, matches, self.line_sigma_px, self.judge)
         map, row = insertion.add_keyframe(map, pose, frame.camera)
         view = insertion.View(row, frame.camera, pose.T_world_camera, pose.covariance)
         expected = self._planes_in_view(map, frame, pose, matches)

@@ -221,3 +221,19 @@ def test_a_pose_graph_without_a_cycle_says_nothing():
     assert PoseGraph()(map, world.frame(SQUARE + 1)) is None and PoseGraph(every=5)(map, world.frame(SQUARE)) is None
     assert PoseGraph(min_points=5000)(map, world.frame(SQUARE)) is None
     assert PoseGraph(least_m=1.0)(map, world.frame(SQUARE)) is None
+
+
+@pytest.mark.parametrize("judge", [True, False])
+def test_a_loop_closes_however_far_the_pose_has_drifted(judge):
+    """Where the map judges matches by the drifted pose the edge is lost, as in tracking it should be."""
+    world, map, stage = World(2500), None, replace(EVERY, trial=SQUARE, judge=judge)
+    for index in range(SQUARE + 1):
+        T = exp_se3(DRIFT * index / SQUARE) @ true_pose(index)
+        features = world.features(true_pose(index), index)
+        matches = Keyframes(newest=SQUARE)(world.frame(index), rotation_of(T, index), features[0], map, rng()) if index == SQUARE else None
+        map = stage(world.frame(index), pose_of(T, index), *features, matches, map, None, None, None)
+    correction = PoseGraph()(map, world.frame(SQUARE))
+    assert (correction is None) == judge
+    if not judge:
+        left = np.linalg.norm(apply_correction(map, correction).keyframes.column("T_world_camera")[-1, :3, 3] - true_pose(SQUARE)[:3, 3])
+        assert left < 0.1 * np.linalg.norm(map.keyframes.column("T_world_camera")[-1, :3, 3] - true_pose(SQUARE)[:3, 3])
