@@ -25,6 +25,7 @@ from trihedron.pipeline.types import (
 )
 from trihedron.plugins.numerics.maps.anchoring import anchored
 from trihedron.plugins.numerics.maps.decoupled import FIRST_SIGMA, Decoupled, decoupled_pose, reference_of
+from trihedron.plugins.numerics.maps.focal_check import wrong_focal
 from trihedron.plugins.numerics.maps.foundations import SCORE, foundation_sigma_m
 from trihedron.plugins.numerics.maps.map_terms import line_terms, plane_terms, point_terms
 from trihedron.plugins.numerics.maps.submaps import submap_of
@@ -49,6 +50,8 @@ class Refine:
     found_inliers: int = 30  # points + 2 lines + 5 planes that find a lost pose again
     found_share: float = 0.5  # of the matches that must agree for that
     weak_foundation: float = 3.0  # times its own standard deviation that the map's keyframes about here may have before a pose is called degraded
+    focal_off: float = 0.1  # share by which the focal lengths are off, beyond which a pose is called degraded, if the map's newest keyframes
+    focal_worse: float = 0.2  # fit by this share worse for it
     submap_after: int = 15  # frames that show a place that is not known, after which a lost camera begins a new sub-map; 0 = never
 
     def __post_init__(self) -> None:
@@ -59,6 +62,8 @@ class Refine:
             raise ValueError("min_inliers, min_share: must not be negative, min_share at most 1")
         if self.weak_foundation <= 0.0:
             raise ValueError("weak_foundation: must be positive")
+        if self.focal_off <= 0.0 or self.focal_worse <= 0.0:
+            raise ValueError("focal_off, focal_worse: must be positive")
         if self.submap_after < 0:
             raise ValueError("submap_after: must not be negative")
         if self.found_inliers < self.min_inliers or not self.min_share <= self.found_share <= 1.0:
@@ -150,13 +155,15 @@ class Refine:
         return OK, f"{inliers[0]} points, {inliers[1]} lines and {inliers[2]} planes of the map"
 
     def _judge_foundation(self, found: PoseSolution, matches: Matches, map: Map, reason: str) -> tuple[str, str]:
-        """A pose is not better known than the keyframes behind what it was found from: after a loss, or planes alone, these may be poor."""
+        """A pose is not better known than the keyframes behind what it was found from: after a loss, of planes alone, or under wrong
+        focal lengths, which squeeze the world, these may be poor."""
         points, lines = matches.keypoints[found.points > 0, 1], matches.segments[found.lines > 0, 1]
         planes = matches.planes[found.planes[: len(matches.planes)] > 0, 1]
         sigma_m = foundation_sigma_m(map, points, lines, planes)
         if sigma_m > self.weak_foundation * np.sqrt(np.linalg.eigvalsh(found.covariance[:3, :3])[-1]):
             return DEGRADED, f"what is seen hangs on keyframes that are known to {1e3 * sigma_m:.0f} mm"
-        return OK, reason
+        squeezed = wrong_focal(map, self.focal_off, self.focal_worse)
+        return (DEGRADED, squeezed) if squeezed else (OK, reason)
 
 
 def _inliers(found: PoseSolution, same: int) -> I32:
