@@ -38,7 +38,7 @@ def wrong_focal(map: Map, off: float, worse: float) -> str:
 
 
 def focal_check(map: Map) -> FocalCheck | None:
-    """What the newest keyframes say; None while they are too few, or share too little."""
+    """What the newest keyframes say; None while they are too few, share too little, or see it all from one place."""
     if "focal" not in map.memo:
         map.memo["focal"] = _checked(map)
     found: FocalCheck | None = map.memo["focal"]
@@ -52,15 +52,17 @@ def _checked(map: Map) -> FocalCheck | None:
         return None
     total = np.sum(costs, axis=0)
     best = int(np.argmin(total))
-    middle = min(max(best, 1), len(FACTORS) - 2)
-    a, b, c = total[middle - 1 : middle + 2]
+    if not 0 < best < len(FACTORS) - 1:  # no least one: views from one place say nothing, and noise the rest
+        return None
+    a, b, c = total[best - 1 : best + 2]
     step = 0.5 * (a - c) / max(a - 2.0 * b + c, 1e-9)  # of the parabola through the least and its neighbours
-    factor = float(FACTORS[middle] * (FACTORS[1] / FACTORS[0]) ** np.clip(step, -1.0, 1.0))
+    factor = float(FACTORS[best] * (FACTORS[1] / FACTORS[0]) ** step)
     return FocalCheck(factor, float(total[len(FACTORS) // 2] / total[best]))
 
 
 def _measured(map: Map, keyframe: int) -> tuple[I32, F64, F64]:
-    """Ids (n,) of the points that a keyframe measured with depth, sorted; rays times depth under each factor (f, n, 3); σ (n,), m."""
+    """Ids (n,) of the points that a keyframe measured with depth, sorted; rays times depth under each factor (f, n, 3), and their σ
+    (f, n), m."""
     first, end = map.keyframes.rows("points", np.array([keyframe]))[0]
     fx, fy, cx, cy = map.keyframes.rows("intrinsics", np.array([keyframe]))[0]
     ids, pixel, depth, sigma = map.point_observations.gathered(np.arange(first, end), "point", "pixel", "depth_m", "sigma_m")
@@ -69,7 +71,7 @@ def _measured(map: Map, keyframe: int) -> tuple[I32, F64, F64]:
     u, z = pixel[known].astype(np.float64), depth[known].astype(np.float64)
     flat = np.stack([(u[:, 0] - cx) / fx * z, (u[:, 1] - cy) / fy * z], axis=-1)
     places = np.concatenate([flat / FACTORS[:, None, None], np.broadcast_to(z[:, None], (len(FACTORS), len(z), 1))], axis=-1)
-    return ids[known], places, np.hypot(sigma[known].astype(np.float64), PIXEL * z / fx)
+    return ids[known], places, np.hypot(sigma[known].astype(np.float64), PIXEL * z / (fx * FACTORS[:, None]))
 
 
 def _cost(a: tuple[I32, F64, F64], b: tuple[I32, F64, F64]) -> F64 | None:
@@ -79,8 +81,8 @@ def _cost(a: tuple[I32, F64, F64], b: tuple[I32, F64, F64]) -> F64 | None:
         return None
     every = -(-len(i) // MOST_POINTS)
     i, j = i[::every], j[::every]
-    p, q, sigma = a[1][:, i], b[1][:, j], np.hypot(a[2][i], b[2][j])
-    weights = np.broadcast_to(1.0 / sigma**2, p.shape[:2])
+    p, q, sigma = a[1][:, i], b[1][:, j], np.hypot(a[2][:, i], b[2][:, j])
+    weights = 1.0 / sigma**2
     square = np.zeros(p.shape[:2])
     for _ in range(3):
         square = (_residuals(p, q, weights) / (CUT * sigma)) ** 2
