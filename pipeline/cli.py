@@ -24,6 +24,8 @@ from trihedron.pipeline.errors import RecordingError, TrihedronError, UsageError
 if TYPE_CHECKING:
     from omegaconf import DictConfig
 
+    from trihedron.pipeline.sweep import Outcome
+
 _FAILURES: list[Exception] = []  # of this process's runs
 _BEGAN = time.perf_counter()
 COMMAND_GROUP = "trihedron.commands"
@@ -121,29 +123,35 @@ def _run(words: list[str]) -> int:
     import hydra
 
     from trihedron.pipeline.config import check_added, register_configs, rewritten
-    from trihedron.pipeline.engines import register_engines
     from trihedron.pipeline.registry import load_plugins
-    from trihedron.pipeline.sweep import OUTCOMES, raise_failures
 
     load_plugins()
     register_configs()
-    register_engines()
     check_added(words)
     overrides = _with_recorded(words)
+    outcomes = _swept(words)
     _FAILURES.clear()
-    OUTCOMES.clear()
     sys.argv = ["trihedron run", *sorted(overrides, key=lambda word: word not in RUN_FLAGS)]  # flags first
     try:
         hydra.main(config_path="pkg://trihedron.conf", config_name="root", version_base="1.3")(_task)()
     except Exception as error:
         raise error if isinstance(error, TrihedronError) else rewritten(error) from error
-    for outcome in OUTCOMES:
+    for outcome in outcomes:
         if outcome.report and len(outcome.failures) < outcome.jobs:
             _dispatch([*shlex.split(outcome.report), str(outcome.folder)])
-        raise_failures(outcome)
-    if _FAILURES and not OUTCOMES:
+        outcome.raise_failures()
+    if _FAILURES and not outcomes:
         raise _FAILURES[0]
     return 0
+
+
+def _swept(words: list[str]) -> list[Outcome]:
+    """Where the outcomes of the sweeps that the words ask for will be; a single run does not wait for the engines of sweeps to be imported."""
+    if not any(word in RUN_FLAGS or word.lstrip("+").startswith("hydra.mode=") for word in words):
+        return []
+    from trihedron.pipeline.engines import register_engines
+
+    return register_engines()
 
 
 def _task(config: DictConfig) -> float | None:

@@ -7,9 +7,12 @@ from hydra.core.plugins import Plugins
 from trihedron.pipeline.cluster import Dask
 from trihedron.pipeline.config import DASK, SEARCH, SWEEPER
 from trihedron.pipeline.search import Search
-from trihedron.pipeline.sweep import Sweeper
+from trihedron.pipeline.sweep import OUTCOMES, Outcome, Sweeper
 
 
-def register_engines() -> None:
-    """Let Hydra know sweepers and launcher; call before its main. Hydra takes only names in its own namespace."""
+def register_engines() -> list[Outcome]:
+    """Let Hydra know sweepers and launcher; call before its main. Hydra takes only names in its own namespace. Returns the list, emptied, that
+    takes what its sweeps come to."""
+    OUTCOMES.clear()
     Plugins.instance().class_name_to_class.update({SWEEPER: Sweeper, SEARCH: Search, DASK: Dask})
+    return OUTCOMES

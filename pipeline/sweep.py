@@ -39,6 +39,12 @@ class Outcome:
     jobs: int = 0
     failures: list[str] = field(default_factory=list)
 
+    def raise_failures(self) -> None:
+        """Raise TrihedronError when a job failed."""
+        if self.failures:
+            cause = f"{len(self.failures)} of {self.jobs} jobs failed"
+            raise TrihedronError(str(self.folder), cause, "trihedron compare says why; the same command again runs those that are missing")
+
 
 OUTCOMES: list[Outcome] = []  # of the sweeps of this process; Hydra has no other way to hand one over
 
@@ -185,10 +191,3 @@ class _Progress:
 
 def _time(seconds: float) -> str:
     return f"{seconds:.0f} s" if seconds < 120 else f"{seconds / 60:.0f} min" if seconds < 7200 else f"{seconds / 3600:.1f} h"
-
-
-def raise_failures(outcome: Outcome) -> None:
-    """Raise TrihedronError when a job failed."""
-    if outcome.failures:
-        cause = f"{len(outcome.failures)} of {outcome.jobs} jobs failed"
-        raise TrihedronError(str(outcome.folder), cause, "trihedron compare says why; the same command again runs those that are missing")

@@ -2,6 +2,8 @@
 
 import json
 import os
+import subprocess
+import sys
 
 import pytest
 from hydra import compose, initialize_config_module
@@ -70,3 +72,15 @@ def test_a_sweep_goes_on_where_it_was_stopped(tmp_path, capfd):
     assert after[0] > before[0] and after[1] == before[1]
     assert main(["compare", str(tmp_path)]) == 0
     assert capfd.readouterr().out.count("9:0") >= 2
+
+
+def test_hydras_own_word_for_a_sweep_sweeps_as_well(tmp_path, capfd):
+    words = ["run", "hydra.mode=MULTIRUN", "hydra/launcher=basic", *QUICK, "graph.keypoints.frame=nothing", f"out={tmp_path}"]
+    assert main(words) == 1
+    assert "1 of 1 jobs failed" in capfd.readouterr().err
+
+
+def test_a_single_run_imports_no_engine_of_sweeps(tmp_path):
+    program = f"from trihedron.pipeline.cli import main; main(['run', 'graph=structurel', 'out={tmp_path}']); import sys; print(*sys.modules)"
+    loaded = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True).stdout.split()
+    assert "hydra" in loaded and not {"joblib", "trihedron.pipeline.sweep"} & set(loaded)
