@@ -6,6 +6,7 @@ to its end. A job that fails, be it because its configuration is refused, leaves
 
 from __future__ import annotations
 
+import itertools
 import sys
 import threading
 import time
@@ -138,7 +139,7 @@ def _numbers(folder: Path, jobs: Sequence[Overrides]) -> list[int]:
     """The folder of each job: the one that has its overrides, else the next free number."""
     files = [file for file in folder.glob("*/.hydra/overrides.yaml") if file.parent.parent.name.isdigit()]
     known = {tuple(yaml.safe_load(file.read_text()) or []): int(file.parent.parent.name) for file in files}
-    free = iter(range(max(known.values(), default=-1) + 1, len(jobs) + len(files) + max(known.values(), default=0) + 1))
+    free = itertools.count(max(known.values(), default=-1) + 1)
     return [known[tuple(job)] if tuple(job) in known else next(free) for job in jobs]
 
 
