@@ -78,7 +78,7 @@ class Search(Sweeper):
 
     def _split(self, arguments: list[str]) -> tuple[dict[str, Override], Overrides]:
         """What is searched, by key, and all other words; a later word takes the place of an earlier one of its key."""
-        parser = OverridesParser.create(config_loader=self.hydra_context.config_loader)  # type: ignore[union-attr]
+        parser = OverridesParser.create(config_loader=self.loader)
         words, self.params = [*self._parse_config(), *arguments], {}
         parsed = {override.get_key_element(): (override, word) for word, override in zip(words, parser.parse_overrides(words))}
         searched = {key: override for key, (override, _) in parsed.items() if _is_searched(override)}
@@ -127,7 +127,7 @@ class Search(Sweeper):
         print(f"search: {len(tried) - 1} trials{f', {failed} of them without a value' * bool(failed)}; {self.folder / SEARCH_FILE}")
         print(f"default  {self.objective} {tried[0].objective:.6g}  {' '.join(_words(tried[0].values))}")
         print(f"best     {self.objective} {best.objective:.6g}  {' '.join(_words(best.values))}")
-        OUTCOMES.append(Outcome(self.folder, str(self.config.report), len(tried)))  # type: ignore[union-attr]
+        OUTCOMES.append(Outcome(self.folder, str(self.options.report), len(tried)))
 
 
 def _judged(trial: Trial, default: Trial) -> Trial:

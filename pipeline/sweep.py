@@ -15,6 +15,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import yaml
+from hydra.core.config_loader import ConfigLoader
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.plugins import Plugins
 from joblib.externals.loky import get_reusable_executor
@@ -58,12 +59,24 @@ class Sweeper(BasicSweeper):
         jobs = self.jobs(arguments)
         folders = self.run(jobs, len(jobs))
         failures = [why for folder in folders if (why := failure_of(folder))]
-        OUTCOMES.append(Outcome(self.folder, str(self.config.report), len(jobs), failures))  # type: ignore[union-attr]
+        OUTCOMES.append(Outcome(self.folder, str(self.options.report), len(jobs), failures))
+
+    @property
+    def options(self) -> DictConfig:
+        """The configuration that all jobs begin with; Hydra sets it before it calls `sweep`."""
+        assert self.config is not None
+        return self.config
+
+    @property
+    def loader(self) -> ConfigLoader:
+        """What composes configurations, from Hydra too."""
+        assert self.hydra_context is not None
+        return self.hydra_context.config_loader
 
     @property
     def folder(self) -> Path:
         """The folder of the sweep."""
-        return Path(str(self.config.hydra.sweep.dir))  # type: ignore[union-attr]
+        return Path(str(self.options.hydra.sweep.dir))
 
     def run(self, jobs: Sequence[Overrides], total: int, before: int = 0) -> list[Path]:
         """Run those of the jobs that are not done, after `before` others of `total`; returns the folders of all. Raises TrihedronError when none
@@ -93,12 +106,11 @@ class Sweeper(BasicSweeper):
 
     def composed(self, words: Overrides) -> DictConfig:
         """The configuration of a job."""
-        assert self.hydra_context is not None and self.config is not None
-        return self.hydra_context.config_loader.load_sweep_config(self.config, words)
+        return self.loader.load_sweep_config(self.options, words)
 
     def _launch(self, jobs: list[Overrides]) -> None:
         """Hand the jobs to the launcher, and wait until they have ended."""
-        assert self.launcher is not None and self.config is not None
+        assert self.launcher is not None
         try:
             self.launcher.launch(jobs, initial_job_idx=0)
         except TrihedronError:
@@ -106,24 +118,23 @@ class Sweeper(BasicSweeper):
         except Exception as error:  # of the engine; a job that fails says so in its folder
             cause = next(iter(str(error).splitlines()), type(error).__name__)
             raise TrihedronError("hydra.launcher", cause, "what is done is kept; the same command again runs the rest") from error
-        if self.config.hydra.launcher.get("n_jobs", 1) != 1:
+        if self.options.hydra.launcher.get("n_jobs", 1) != 1:
             get_reusable_executor().shutdown()  # its processes would keep this folder and environment for the next sweep
 
     def jobs(self, arguments: list[str]) -> list[Overrides]:
         """The overrides of every job: the cross product of sequences and of all values given."""
-        assert self.hydra_context is not None and self.config is not None
-        parser = OverridesParser.create(config_loader=self.hydra_context.config_loader)
+        parser = OverridesParser.create(config_loader=self.loader)
         words = [word for word in [*self._parse_config(), *arguments] if not word.startswith("sequences=")]
         words += [] if any(word.startswith("threads=") for word in words) else [f"threads={self._threads}"]
-        sequences = [words_of_sequence(text) for text in self.config.sequences] or [[]]
+        sequences = [words_of_sequence(text) for text in self.options.sequences] or [[]]
         products = [self.split_arguments(parser.parse_overrides([*sequence, *words]), None)[0] for sequence in sequences]
         return [list(job) for product in products for job in product]
 
     @property
     def _threads(self) -> int:
         """Of a job: what the cluster is asked for, two where jobs come one by one, else one."""
-        launcher = self.config.hydra.launcher  # type: ignore[union-attr]
-        one_by_one = launcher.get("n_jobs") == 1 or self.config.hydra.runtime.choices["hydra/launcher"] == "basic"  # type: ignore[union-attr]
+        launcher = self.options.hydra.launcher
+        one_by_one = launcher.get("n_jobs") == 1 or self.options.hydra.runtime.choices["hydra/launcher"] == "basic"
         return int(launcher.get("cpus_per_task") or (2 if one_by_one else 1))
 
 
