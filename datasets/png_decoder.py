@@ -14,16 +14,16 @@ import numpy as np
 from numpy.typing import NDArray
 from zlib_ng import zlib_ng
 
+from trihedron.pipeline.png import PNG_MAGIC, chunks
 from trihedron.pipeline.types import U8
 
 CHANNELS = {0: 1, 2: 3}  # of the colour types that are read here
-FIRST = 8  # byte of the first chunk
 LEFT, ABOVE, MEAN, PAETH = 1, 2, 3, 4  # filters (PNG specification, section 9)
 
 
 def decode_png(data: bytes) -> NDArray[Any] | None:
     """(h, w) or (h, w, 3), RGB, of 8 or 16 bits; None for what is not read here. Raises ValueError for damaged bytes."""
-    width, height, bits, color, compression, filtering, interlaced = struct.unpack_from(">IIBBBBB", data, FIRST + 8)
+    width, height, bits, color, compression, filtering, interlaced = struct.unpack_from(">IIBBBBB", data, len(PNG_MAGIC) + 8)
     if color not in CHANNELS or bits not in (8, 16) or compression or filtering or interlaced:
         return None
     packed = _packed(data)
@@ -47,18 +47,15 @@ def decode_png(data: bytes) -> NDArray[Any] | None:
 
 def _packed(data: bytes) -> bytes | None:
     """The compressed lines; None when a palette or transparency belongs to them. Raises ValueError for a damaged chunk."""
-    parts, at = [], FIRST
-    while at + 12 <= len(data):
-        length, name = struct.unpack_from(">I4s", data, at)
-        body = memoryview(data)[at + 4 : at + 8 + length]
+    parts = []
+    for name, first, end in chunks(data):
         if name in (b"PLTE", b"tRNS"):
             return None
         if name in (b"IHDR", b"IDAT"):
-            if zlib_ng.crc32(body) != struct.unpack_from(">I", data, at + 8 + length)[0]:
+            if zlib_ng.crc32(memoryview(data)[first - 4 : end]) != struct.unpack_from(">I", data, end)[0]:
                 raise ValueError("a checksum is wrong")
             if name == b"IDAT":
-                parts.append(body[4:])
-        at += 12 + length
+                parts.append(memoryview(data)[first:end])
     return b"".join(parts)
 
 
