@@ -99,3 +99,11 @@ def _consistency(result: Result, truth: Trajectory) -> dict[str, Any]:
 def write_json(path: Path, content: dict[str, Any]) -> None:
     """Write a dictionary as indented JSON."""
     path.write_text(json.dumps(content, indent=2) + "\n")
+
+
+def dotted(values: dict[str, Any], prefix: str = "") -> dict[str, Any]:
+    """The values of nested dictionaries by dotted name, as `final.ate_rmse_m`."""
+    flat: dict[str, Any] = {}
+    for name, value in values.items():
+        flat |= dotted(value, f"{prefix}{name}.") if isinstance(value, dict) else {prefix + name: value}
+    return flat

@@ -24,7 +24,7 @@ from omegaconf import DictConfig, OmegaConf
 from trihedron.pipeline.config import PLUGIN_KEY, graph_of
 from trihedron.pipeline.errors import ConfigError, UsageError, did_you_mean
 from trihedron.pipeline.graph import Graph
-from trihedron.pipeline.results import METRICS
+from trihedron.pipeline.results import METRICS, dotted
 from trihedron.pipeline.sweep import OUTCOMES, Outcome, Overrides, Sweeper, failure_of
 
 SEARCH_FILE = "search.json"
@@ -109,7 +109,7 @@ class Search(Sweeper):
         jobs = [folder.name for folder in folders]
         if why := next((why for folder in folders if (why := failure_of(folder))), ""):
             return Trial(values, None, jobs, why)
-        metrics = [dict(_flat(json.loads((folder / METRICS).read_text()))) for folder in folders if (folder / METRICS).exists()]
+        metrics = [_figures(folder / METRICS) for folder in folders if (folder / METRICS).exists()]
         if len(metrics) < len(folders) or any(self.objective not in found for found in metrics):
             known = did_you_mean(self.objective, metrics[0]) if metrics else "no pose was computed"
             return Trial(values, None, jobs, f"no {self.objective} in {METRICS}, {known}")
@@ -208,12 +208,6 @@ def _words(values: Mapping[str, Any]) -> Overrides:
     return [f"{key}={value}" for key, value in values.items()]
 
 
-def _flat(values: Mapping[str, Any], prefix: str = "") -> list[tuple[str, float]]:
-    """The numbers of nested dictionaries, by dotted name."""
-    pairs: list[tuple[str, float]] = []
-    for name, value in values.items():
-        if isinstance(value, dict):
-            pairs += _flat(value, f"{prefix}{name}.")
-        elif isinstance(value, (int, float)):
-            pairs.append((prefix + name, float(value)))
-    return pairs
+def _figures(file: Path) -> dict[str, float]:
+    """The numbers of a job's metrics, by dotted name."""
+    return {name: value for name, value in dotted(json.loads(file.read_text())).items() if isinstance(value, (int, float))}

@@ -22,6 +22,7 @@ from trihedron.pipeline.errors import DataError, TrihedronError
 from trihedron.pipeline.geometry import transform, umeyama
 from trihedron.pipeline.metrics import aligned_errors, associate
 from trihedron.pipeline.recording import Recording
+from trihedron.pipeline.results import dotted
 from trihedron.pipeline.types import F64, Trajectory
 from trihedron.tools import comparison_table
 from trihedron.tools.arguments import Parser
@@ -160,7 +161,7 @@ def _stages(runs: dict[str, Run], colors: dict[str, str]) -> list[dict[str, Any]
 def _configurations(runs: dict[str, Run]) -> str:
     """The values of the composed configurations that are not the same in all runs. Of a stage with different plugins only these are said: their
     options have nothing to do with each other."""
-    flat = {name: dict(_flat(_config(run))) for name, run in runs.items()}
+    flat = {name: dotted(_config(run)) for name, run in runs.items()}
     keys = sorted({key for values in flat.values() for key in values})
     differing = [key for key in keys if len({repr(values.get(key)) for values in flat.values()}) > 1 and key != "out"]
     others = {key.removesuffix("plugin") for key in differing if key.endswith(".plugin")}
@@ -177,13 +178,6 @@ def _config(run: Run) -> Any:
     import yaml
 
     return yaml.safe_load((run.folder / ".hydra" / "config.yaml").read_text())
-
-
-def _flat(values: Any, prefix: str = "") -> list[tuple[str, Any]]:
-    """Nested dictionaries as pairs of dotted name and value."""
-    if not isinstance(values, dict):
-        return [(prefix, values)]
-    return [pair for name, value in values.items() for pair in _flat(value, f"{prefix}.{name}".lstrip("."))]
 
 
 def _pictures(runs: dict[str, Run]) -> list[str]:
