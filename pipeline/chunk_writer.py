@@ -17,7 +17,7 @@ from mcap.writer import CompressionType, Writer
 from trihedron.pipeline.errors import RecordingError
 
 log = logging.getLogger("trihedron")
-CHUNK_BYTES = 1 << 20
+CHUNK_BYTES = 4 << 20  # an entry of the index, which waits in memory for the end, is worth more messages
 CHUNK_SECONDS = 0.4
 MESSAGE_OVERHEAD = 64  # bytes of a message beside its data, generously
 MOST_WAITING = 64 << 20  # bytes; who writes faster than the disk waits from there on

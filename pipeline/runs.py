@@ -10,7 +10,7 @@ from typing import overload
 import numpy as np
 
 from trihedron.pipeline.recording import Recording
-from trihedron.pipeline.types import Map, Pose, Value
+from trihedron.pipeline.types import DEGRADED, LOST, OK, Map, Pose, Value
 
 
 @dataclass(frozen=True)
@@ -23,26 +23,29 @@ class Replay:
 
 
 class Poses(Sequence[Pose]):
-    """Poses in frame order, kept as numbers: as values they take twice the memory, and of a long run there are many."""
+    """Poses in frame order, kept as numbers, without those that a rigid motion and a symmetric covariance imply: of a long run there are many."""
 
-    _REALS, _WHOLE = 16 + 36 + 16, 9  # numbers a pose
+    _REALS, _WHOLE = 12 + 12 + 21, 11  # numbers a pose
+    _STATUSES = (OK, DEGRADED, LOST)
+    _UPPER = np.triu_indices(6)
+    _LAST_ROW = np.array([0.0, 0.0, 0.0, 1.0])
 
     def __init__(self, poses: Iterable[Pose] = ()) -> None:
-        self._reals, self._whole = array("d"), array("q")
-        self._said: list[tuple[str, str]] = []
+        self._reals, self._whole, self._reasons = array("d"), array("q"), bytearray()
         for pose in poses:
             self.append(pose)
 
     def append(self, pose: Pose) -> None:
         """One more."""
-        for matrix in (pose.T_world_camera, pose.covariance, pose.T_reference_camera):
-            self._reals.frombytes(matrix.tobytes())
+        for numbers in (pose.T_world_camera[:3], pose.T_reference_camera[:3], pose.covariance[self._UPPER]):
+            self._reals.frombytes(numbers.tobytes())
+        self._reasons += pose.reason.encode()
         counts = pose.inliers.tolist()
         self._whole.extend((pose.index, pose.stamp_ns, pose.reference, *counts, pose.unobservable, pose.submap, pose.unrecognised))
-        self._said.append((pose.status, pose.reason))
+        self._whole.extend((self._STATUSES.index(pose.status), len(self._reasons)))
 
     def __len__(self) -> int:
-        return len(self._said)
+        return len(self._whole) // self._WHOLE
 
     @overload
     def __getitem__(self, at: int) -> Pose: ...
@@ -54,12 +57,14 @@ class Poses(Sequence[Pose]):
         """The pose, or poses, at a place."""
         if isinstance(at, slice):
             return [self[k] for k in range(*at.indices(len(self)))]
-        status, reason = self._said[at]
-        k = at % len(self)
+        k = range(len(self))[at]
         reals = np.array(self._reals[k * self._REALS : (k + 1) * self._REALS])
-        index, stamp_ns, reference, *inliers, unobservable, submap, unrecognised = self._whole[k * self._WHOLE : (k + 1) * self._WHOLE]
-        T, covariance, T_reference = reals[:16].reshape(4, 4), reals[16:52].reshape(6, 6), reals[52:].reshape(4, 4)
-        counts = np.array(inliers, np.int32)
+        T, T_reference = (np.vstack([rows.reshape(3, 4), self._LAST_ROW]) for rows in (reals[:12], reals[12:24]))
+        covariance = np.empty((6, 6))
+        covariance[self._UPPER] = covariance.T[self._UPPER] = reals[24:]
+        index, stamp_ns, reference, *inliers, unobservable, submap, unrecognised, state, end = self._whole[k * self._WHOLE : (k + 1) * self._WHOLE]
+        counts, reason = np.array(inliers, np.int32), self._reasons[self._whole[k * self._WHOLE - 1] if k else 0 : end].decode()
+        status = self._STATUSES[state]
         return Pose(index, stamp_ns, T, covariance, T_reference, reference, counts, unobservable, status, reason, submap, unrecognised)
 
 
@@ -71,7 +76,7 @@ class Result:
     map: Map | None = None
     loaded_keyframes: int = 0  # of another run, whose numbers say nothing here
     folds: dict[str, Value] = field(default_factory=dict)
-    stamps_ns: list[int] = field(default_factory=list)  # of every readable frame
+    stamps_ns: array[int] = field(default_factory=lambda: array("q"))  # of every readable frame
     unreadable: int = 0
     fps: float = 30.0  # nominal, of the camera
 

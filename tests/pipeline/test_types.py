@@ -3,8 +3,9 @@
 import numpy as np
 import pytest
 
+from trihedron.pipeline.geometry import exp_se3
 from trihedron.pipeline.runs import Poses
-from trihedron.pipeline.types import Camera, DepthNoise, Keypoints, LineSegments, Pose
+from trihedron.pipeline.types import DEGRADED, LOST, OK, Camera, DepthNoise, Keypoints, LineSegments, Pose
 
 
 def test_wrong_arrays_are_named():
@@ -42,10 +43,13 @@ def test_depth_noise_has_a_floor():
 
 def test_poses_of_a_run_come_back_as_they_were():
     rng = np.random.default_rng(0)
-    matrices, counts = [[rng.random((size, size)) for size in (4, 6, 4)] for _ in range(5)], np.array([5, 2, 3], np.int32)
-    said = [Pose(3 * k, 2**60 + k, *matrices[k], k - 1, counts + k, 1, "ok", f"why {k}", k, 7) for k in range(5)]
+    motions, counts = [[exp_se3(xi) for xi in pair] for pair in rng.random((5, 2, 6))], np.array([5, 2, 3], np.int32)
+    covariances = [half @ half.T for half in rng.random((5, 6, 6))]
+    status = (OK, DEGRADED, LOST, OK, OK)
+    matrices = [(T, C, R) for (T, R), C in zip(motions, covariances)]
+    said = [Pose(3 * k, 2**60 + k, *matrices[k], k - 1, counts + k, 1, status[k], f"wherefore é {k}", k, 7) for k in range(5)]
     kept = Poses(said)
-    assert len(kept) == 5 and [pose.index for pose in kept[1:4]] == [3, 6, 9] and kept[-1].reason == "why 4"
+    assert len(kept) == 5 and [pose.index for pose in kept[1:4]] == [3, 6, 9] and kept[-1].reason == "wherefore é 4"
     for pose, again in zip(said, kept):
         assert all(np.array_equal(getattr(pose, name), getattr(again, name)) for name in vars(pose)) and again.inliers.dtype == np.int32
     with pytest.raises(IndexError):
