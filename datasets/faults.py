@@ -92,7 +92,7 @@ class Faults:
                 raise ValueError(f"{name}: {getattr(self, name)} is negative")
         if self.of == "faults" or "frames" in self.options:
             raise ValueError("of, options: another data set, its frames chosen by dataset.frames")
-        self._inner  # noqa: B018  an option out of range is refused now
+        _ = self._inner  # whose options are refused now when they are out of range
 
     def __len__(self) -> int:
         first, stop = self._range
