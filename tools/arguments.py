@@ -5,10 +5,10 @@ from __future__ import annotations
 import argparse
 import inspect
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import NoReturn
 
-from trihedron.pipeline.errors import UsageError
+from trihedron.pipeline.errors import UsageError, did_you_mean
 
 
 class Parser(argparse.ArgumentParser):
@@ -17,6 +17,19 @@ class Parser(argparse.ArgumentParser):
     def __init__(self, command: str, module: str) -> None:
         text = inspect.getdoc(sys.modules[module])
         super().__init__(f"trihedron {command}", description=text, formatter_class=argparse.RawDescriptionHelpFormatter, allow_abbrev=False)
+
+    def add_parts(self, parts: Iterable[str]) -> None:
+        """Add --parts A,B: which of `parts` to run, as a list; all by default. Another word raises UsageError."""
+        known = list(parts)
+
+        def some(text: str) -> list[str]:
+            for part in text.split(","):
+                if part not in known:
+                    raise UsageError(self.prog.removeprefix("trihedron "), f"there is no part '{part}'", did_you_mean(part, known))
+            return text.split(",")
+
+        every = ",".join(known)
+        self.add_argument("--parts", type=some, default=every, metavar="A,B", help=f"some of them (default: {every})")
 
     def error(self, message: str) -> NoReturn:
         """Raise UsageError, with the command's own help as the cure."""

@@ -25,7 +25,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from trihedron.datasets.trajectories import attached_truth, read_trajectory
-from trihedron.pipeline.errors import UsageError, did_you_mean
+from trihedron.pipeline.errors import UsageError
 from trihedron.pipeline.metrics import associate, relative_errors
 from trihedron.pipeline.recording import TIMING_TOPIC, Recording
 from trihedron.pipeline.types import F64, LOST, Map, Pose, Table, Trajectory
@@ -54,17 +54,13 @@ def main(argv: list[str]) -> int:
 
     parser = Parser("benchmark map", __name__)
     parser.add_argument("overrides", nargs="*", help="of every run, as for trihedron run")
-    parser.add_argument("--parts", default=",".join(PARTS), metavar="A,B", help=f"some of them (default: {','.join(PARTS)})")
+    parser.add_parts(PARTS)
     parser.add_argument("--sequences", default="", metavar="KIND:FOLDER,...", help="to cover besides the built-in rooms, by plugin")
     parser.add_argument("--json", type=Path, metavar="FILE", help="write the figures too")
     options = parser.parse_args(argv)
     figures: dict[str, Any] = {"machine": machine()}
-    parts = options.parts.split(",")
-    for part in parts:
-        if part not in PARTS:
-            raise UsageError("benchmark map", f"there is no part '{part}'", did_you_mean(part, PARTS))
     with tempfile.TemporaryDirectory() as folder:
-        for part in parts:
+        for part in options.parts:
             measure, report = PARTS[part]
             figures[part] = measure(Path(folder), _sequences(options.sequences), options.overrides)
             print(report(figures[part]) + "\n", flush=True)

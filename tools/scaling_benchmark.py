@@ -16,7 +16,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from trihedron.pipeline.errors import DataError, UsageError, did_you_mean
+from trihedron.pipeline.errors import DataError, UsageError
 from trihedron.tools.arguments import Parser, table
 from trihedron.tools.benchmark import first_images, machine, measure, reference_ms
 
@@ -34,12 +34,12 @@ def main(argv: list[str]) -> int:
     """Run the parts and print a table of each. Raises UsageError for an unknown part, TrihedronError when a run fails."""
     parser = Parser("benchmark scaling", __name__)
     parser.add_argument("overrides", nargs="*", help="of every run, as for trihedron run")
-    parser.add_argument("--parts", default=",".join(PARTS), metavar="A,B", help=f"some of them (default: {','.join(PARTS)})")
+    parser.add_parts(PARTS)
     parser.add_argument("--lengths", default="", metavar="N,N", help="of the walk, in frames (default: 100,300,1000)")
     parser.add_argument("--png", type=Path, metavar="FILE", help="plot the tables")
     parser.add_argument("--json", type=Path, metavar="FILE", help="write the figures too")
     options = parser.parse_args(argv)
-    parts = {part: _rows(part, options.lengths) for part in options.parts.split(",")}
+    parts = {part: _rows(part, options.lengths) for part in options.parts}
     figures: dict[str, Any] = {"machine": machine()}
     for part, rows in parts.items():
         figures[part] = [_measured(name, [*options.overrides, *overrides]) for name, overrides in rows.items()]
@@ -52,8 +52,6 @@ def main(argv: list[str]) -> int:
 
 
 def _rows(part: str, lengths: str) -> dict[str, list[str]]:
-    if part not in PARTS:
-        raise UsageError("benchmark scaling", f"there is no part '{part}'", did_you_mean(part, PARTS))
     if part != "length" or not lengths:
         return PARTS[part]
     if not all(word.isdigit() and int(word) > 0 for word in lengths.split(",")):
