@@ -3,14 +3,13 @@
 import os
 import shutil
 import subprocess
-import sys
 from pathlib import Path
 
 import pytest
 
 import trihedron.pipeline.cli
+from trihedron.tools.benchmark import PROGRAM
 
-PROGRAM = (sys.executable, "-c", "import sys; from trihedron.pipeline.cli import main; sys.exit(main(sys.argv[1:]))")
 PACKAGE = Path(trihedron.pipeline.cli.__file__).parents[1]
 
 

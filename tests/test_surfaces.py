@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 
 from trihedron.pipeline.recording import Recording
+from trihedron.tools.benchmark import PROGRAM
 
 sys.path.insert(0, str(Path(__file__).parent / "plugins"))
 from surface_world import faults
@@ -17,8 +18,7 @@ ROOM = ("dataset.curved=true", "dataset.width=320", "dataset.height=240", "outpu
 
 
 def trihedron(*words, cwd):
-    code = "import sys; from trihedron.pipeline.cli import main; sys.exit(main(sys.argv[1:]))"
-    done = subprocess.run([sys.executable, "-c", code, *words], cwd=cwd, env=dict(os.environ), capture_output=True, text=True)
+    done = subprocess.run([*PROGRAM, *words], cwd=cwd, env=dict(os.environ), capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
     return done.stdout
 

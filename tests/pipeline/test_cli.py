@@ -17,6 +17,7 @@ from trihedron.datasets.synthetic import Synthetic
 from trihedron.datasets.trajectories import read_trajectory
 from trihedron.pipeline.cli import main
 from trihedron.pipeline.recording import Recording
+from trihedron.tools.benchmark import PROGRAM
 
 SMALL = ["dataset=synthetic", "dataset.width=160", "dataset.height=120", "dataset.length=12"]
 
@@ -202,11 +203,10 @@ def test_the_plugin_package_of_the_readme_is_one_word_away(tmp_path):
     site = tmp_path / "site"
     install = [sys.executable, "-m", "pip", "install", "-q", "--no-deps", "--no-build-isolation", "--no-index", "--target", str(site), str(package)]
     subprocess.run(install, check=True, capture_output=True)
-    code = "import sys; from trihedron.pipeline.cli import main; sys.exit(main(sys.argv[1:]))"
     environment = {**os.environ, "PYTHONPATH": str(site)}
 
     def trihedron(*words):
-        return subprocess.run([sys.executable, "-c", code, *words], env=environment, capture_output=True, text=True)
+        return subprocess.run([*PROGRAM, *words], env=environment, capture_output=True, text=True)
 
     done = trihedron("run", *SMALL, "keypoints=shi_tomasi", "keypoints.features=200", "out=corners_run")
     assert done.returncode == 0, done.stderr
