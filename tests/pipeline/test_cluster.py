@@ -1,6 +1,10 @@
 """Sweeps on a cluster: the same jobs, progress, reasons and resumption as here, by submitit and by a Dask scheduler."""
 
+import getpass
 import json
+import os
+import shutil
+import socket
 import subprocess
 import sys
 import time
@@ -10,6 +14,29 @@ import yaml
 
 from trihedron.pipeline.cli import main
 
+SLURM = """
+ClusterName=here
+SlurmctldHost=localhost(127.0.0.1)
+SlurmctldPort={ports[0]}
+SlurmdPort={ports[1]}
+SlurmUser={user}
+SlurmdUser={user}
+AuthType=auth/munge
+AuthInfo=socket={folder}/munge
+CredType=cred/munge
+StateSaveLocation={folder}/state
+SlurmdSpoolDir={folder}/spool
+SlurmctldPidFile={folder}/slurmctld.pid
+SlurmdPidFile={folder}/slurmd.pid
+ProctrackType=proctrack/linuxproc
+TaskPlugin=task/none
+SelectType=select/cons_tres
+SelectTypeParameters=CR_CPU
+JobAcctGatherType=jobacct_gather/none
+AccountingStorageType=accounting_storage/none
+NodeName=here NodeAddr=127.0.0.1 NodeHostname={host} CPUs={cpus}
+PartitionName=cpu Nodes=here Default=YES
+"""
 QUICK = ["dataset.width=64", "dataset.height=48", "dataset.length=4", "outputs=[keypoints]"]
 
 
@@ -59,6 +86,65 @@ def test_submitit_runs_the_jobs_as_it_would_on_slurm(tmp_path, capfd):
     said = capfd.readouterr().err
     assert "seed: -1 is negative" in said and "sweep: 2 of 2 jobs done" in said
     assert json.loads((tmp_path / "0" / "job.json").read_text())["state"] == "done" and threads_of(tmp_path / "0") == 2
+
+
+def free_port():
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        return server.getsockname()[1]
+
+
+@pytest.fixture(scope="module")
+def slurm(tmp_path_factory):
+    """The folder of a SLURM of this machine alone, on the loopback interface: its own key, controller and one node."""
+    pytest.importorskip("submitit", reason="needs trihedron[cluster]")
+    programs = [shutil.which(name, path=os.environ["PATH"] + ":/usr/sbin") for name in ("munged", "slurmctld", "slurmd", "sbatch")]
+    if not all(programs):
+        pytest.skip("needs SLURM: apt-get install slurm-wlm munge")
+    munged, controller, node, _ = programs
+    folder = tmp_path_factory.mktemp("slurm")
+    (folder / "key").write_bytes(os.urandom(64))
+    (folder / "key").chmod(0o600)
+    ports = [free_port(), free_port()]
+    machine = {"user": getpass.getuser(), "host": socket.gethostname(), "cpus": os.cpu_count()}
+    (folder / "slurm.conf").write_text(SLURM.format(folder=folder, ports=ports, **machine))
+    environment = {**os.environ, "SLURM_CONF": str(folder / "slurm.conf")}
+    key = [f"--socket={folder}/munge", f"--key-file={folder}/key", f"--pid-file={folder}/munged.pid", f"--seed-file={folder}/seed"]
+    ours = []
+    with (folder / "log").open("w") as log:
+        for words in ([munged, "--foreground", "--force", *key], [controller, "-D"], [node, "-D", "-N", "here"]):
+            ours.append(subprocess.Popen(words, stdout=log, stderr=log, env=environment))
+            time.sleep(1.0)  # the others ask it when they begin
+
+        def said(*words, wanted):
+            """Ask until the answer is the wanted one."""
+            until = time.monotonic() + 60
+            while (answer := subprocess.run(words, env=environment, capture_output=True, text=True).stdout.strip()) != wanted:
+                assert time.monotonic() < until, (answer, (folder / "log").read_text()[-2000:])
+                time.sleep(0.5)
+
+        said("sinfo", "-h", "-o", "%t", wanted="idle")
+        yield folder
+        said("squeue", "-h", wanted="")  # a step that outlives its controller waits for it
+        for process in reversed(ours):
+            process.terminate()
+            process.wait(60)
+
+
+@pytest.mark.slow
+def test_slurm_runs_what_is_missing_and_a_job_that_fails_stops_no_other(slurm, tmp_path, capfd, monkeypatch):
+    monkeypatch.setenv("SLURM_CONF", str(slurm / "slurm.conf"))
+    asked = ["hydra.launcher.partition=cpu", "hydra.launcher.cpus_per_task=1"]
+    words = ["run", "-m", *QUICK, "hydra/launcher=submitit_slurm", *asked, f"out={tmp_path}"]
+    assert main([*words, "seed=0,-1"]) == 1
+    said = capfd.readouterr().err
+    assert "seed: -1 is negative" in said and "sweep: 2 of 2 jobs done" in said and "1 of 2 jobs failed" in said
+    [batch] = tmp_path.glob(".submitit/*/*_submission.sh")
+    assert "#SBATCH --partition=cpu" in batch.read_text() and "#SBATCH --array=0-1" in batch.read_text()
+    assert threads_of(tmp_path / "0") == 1
+    before = (tmp_path / "0" / "run.mcap").stat().st_mtime_ns
+    assert main([*words, "seed=0,1"]) == 0
+    assert "sweep: 1 of 2 jobs are done already" in capfd.readouterr().err
+    assert (tmp_path / "0" / "run.mcap").stat().st_mtime_ns == before
 
 
 @pytest.mark.parametrize(
