@@ -6,9 +6,11 @@ view, and no rigid motion takes one view to the other. So the keyframes' own mea
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from itertools import combinations
 
+import numba
 import numpy as np
 
 from trihedron.pipeline.types import F64, I32, Map
@@ -47,53 +49,80 @@ def focal_check(map: Map) -> FocalCheck | None:
 
 def _checked(map: Map) -> FocalCheck | None:
     seen = [_measured(map, int(row)) for row in newest_keyframes(map, KEYFRAMES)]
-    costs = [cost for a, b in combinations(seen, 2) if (cost := _cost(a, b)) is not None]
-    if len(costs) < LEAST_PAIRS:
+    pairs = [pair for a, b in combinations(seen, 2) if (pair := _shared(a, b)) is not None]
+    if len(pairs) < LEAST_PAIRS:
+        _cost(np.empty((0, 5)), np.empty((0, 5)), 1.0)  # compiled on the first keyframe, before the clock starts
         return None
-    total = np.sum(costs, axis=0)
+    total = np.full(len(FACTORS), np.inf)
+    middle = len(FACTORS) // 2
+    total[middle - 1 : middle + 2] = [_total(pairs, factor) for factor in FACTORS[middle - 1 : middle + 2]]
+    if np.argmin(total) != middle:  # rarely; the farther ones are needed then
+        total[[0, -1]] = [_total(pairs, factor) for factor in FACTORS[[0, -1]]]
     best = int(np.argmin(total))
     if not 0 < best < len(FACTORS) - 1:  # no least one: views from one place say nothing, and noise the rest
         return None
     a, b, c = total[best - 1 : best + 2]
     step = 0.5 * (a - c) / max(a - 2.0 * b + c, 1e-9)  # of the parabola through the least and its neighbours
     factor = float(FACTORS[best] * (FACTORS[1] / FACTORS[0]) ** step)
-    return FocalCheck(factor, float(total[len(FACTORS) // 2] / total[best]))
+    return FocalCheck(factor, float(total[middle] / total[best]))
 
 
-def _measured(map: Map, keyframe: int) -> tuple[I32, F64, F64]:
-    """Ids (n,) of the points that a keyframe measured with depth, sorted; rays times depth under each factor (f, n, 3), and their σ
-    (f, n), m."""
+def _measured(map: Map, keyframe: int) -> tuple[I32, F64]:
+    """Ids (n,) of the points that a keyframe measured with depth, sorted; and (n, 5) x, y, z, and the σ of depth and of a pixel there, m."""
     first, end = map.keyframes.rows("points", np.array([keyframe]))[0]
     fx, fy, cx, cy = map.keyframes.rows("intrinsics", np.array([keyframe]))[0]
     ids, pixel, depth, sigma = map.point_observations.gathered(np.arange(first, end), "point", "pixel", "depth_m", "sigma_m")
     known = np.flatnonzero(np.isfinite(depth))
     known = known[np.unique(ids[known], return_index=True)[1]]
     u, z = pixel[known].astype(np.float64), depth[known].astype(np.float64)
-    flat = np.stack([(u[:, 0] - cx) / fx * z, (u[:, 1] - cy) / fy * z], axis=-1)
-    places = np.concatenate([flat / FACTORS[:, None, None], np.broadcast_to(z[:, None], (len(FACTORS), len(z), 1))], axis=-1)
-    return ids[known], places, np.hypot(sigma[known].astype(np.float64), PIXEL * z / (fx * FACTORS[:, None]))
+    return ids[known], np.stack([(u[:, 0] - cx) / fx * z, (u[:, 1] - cy) / fy * z, z, sigma[known], PIXEL * z / fx], axis=-1)
 
 
-def _cost(a: tuple[I32, F64, F64], b: tuple[I32, F64, F64]) -> F64 | None:
-    """(f,) robust cost of the best rigid motion between two views under each factor; None where they share too few points."""
+def _shared(a: tuple[I32, F64], b: tuple[I32, F64]) -> tuple[F64, F64] | None:
+    """What two keyframes measured of the same points; None where these are too few."""
     _, i, j = np.intersect1d(a[0], b[0], assume_unique=True, return_indices=True)
-    if len(i) < LEAST_POINTS:
-        return None
     every = -(-len(i) // MOST_POINTS)
-    i, j = i[::every], j[::every]
-    p, q, sigma = a[1][:, i], b[1][:, j], np.hypot(a[2][:, i], b[2][:, j])
-    weights = 1.0 / sigma**2
-    square = np.zeros(p.shape[:2])
+    return (a[1][i[::every]], b[1][j[::every]]) if len(i) >= LEAST_POINTS else None
+
+
+def _total(pairs: list[tuple[F64, F64]], factor: float) -> float:
+    """What the best rigid motions between views leave under focal lengths that are `factor` times as long."""
+    return sum(_cost(a, b, factor) for a, b in pairs)
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _cost(a: F64, b: F64, factor: float) -> float:
+    """Robust cost, 0 to 1, of the best rigid motion (Procrustes, reweighted) between n points measured twice, (n, 5) as of `_measured`."""
+    n = len(a)
+    p, q, sigma, weight, cost = np.empty((n, 3)), np.empty((n, 3)), np.empty(n), np.empty(n), 0.0
+    for k in range(n):
+        p[k, 0], p[k, 1], p[k, 2] = a[k, 0] / factor, a[k, 1] / factor, a[k, 2]
+        q[k, 0], q[k, 1], q[k, 2] = b[k, 0] / factor, b[k, 1] / factor, b[k, 2]
+        sigma[k] = math.sqrt(a[k, 3] ** 2 + b[k, 3] ** 2 + (a[k, 4] ** 2 + b[k, 4] ** 2) / factor**2)
+        weight[k] = 1.0 / sigma[k] ** 2
     for _ in range(3):
-        square = (_residuals(p, q, weights) / (CUT * sigma)) ** 2
-        weights = 1.0 / (sigma * (1.0 + square)) ** 2
-    return np.asarray((square / (1.0 + square)).mean(axis=1), np.float64)
-
-
-def _residuals(p: F64, q: F64, weights: F64) -> F64:
-    """(f, n) distances left by the rigid motions (Procrustes) of points p onto q, (f, n, 3)."""
-    share = (weights / weights.sum(axis=1, keepdims=True))[..., None]
-    p, q = p - (share * p).sum(axis=1, keepdims=True), q - (share * q).sum(axis=1, keepdims=True)
-    U, _, Vt = np.linalg.svd(np.swapaxes(share * p, 1, 2) @ q)
-    U[..., 2] *= np.sign(np.linalg.det(U @ Vt))[:, None]
-    return np.asarray(np.linalg.norm(p @ (U @ Vt) - q, axis=-1), np.float64)
+        share = weight / weight.sum()
+        middles, products = np.zeros((2, 3)), np.zeros((3, 3))
+        for k in range(n):
+            for c in range(3):
+                middles[0, c] += share[k] * p[k, c]
+                middles[1, c] += share[k] * q[k, c]
+        for k in range(n):
+            for r in range(3):
+                for c in range(3):
+                    products[r, c] += share[k] * (p[k, r] - middles[0, r]) * (q[k, c] - middles[1, c])
+        U, _, Vt = np.linalg.svd(products)
+        if np.linalg.det(U) * np.linalg.det(Vt) < 0.0:
+            U[:, 2] *= -1.0
+        R, cost = U @ Vt, 0.0
+        for k in range(n):
+            left = 0.0
+            for c in range(3):
+                at = -(q[k, c] - middles[1, c])
+                for r in range(3):
+                    at += (p[k, r] - middles[0, r]) * R[r, c]
+                left += at * at
+            square = left / (CUT * sigma[k]) ** 2
+            cost += square / (1.0 + square)
+            weight[k] = 1.0 / (sigma[k] * (1.0 + square)) ** 2
+    return cost / n
