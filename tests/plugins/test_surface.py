@@ -58,6 +58,15 @@ def test_planes_are_known_by_what_they_are(name):
     assert np.isfinite(texels).all() and texels.min() >= 0.0 and (texels.max(axis=(0, 1)) < surface.atlas.shape[1::-1]).all()
 
 
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("name", ["planar_tsdf", "planar_polygon", "planar_greedy"])
+def test_without_a_manhattan_frame_nobody_knows_what_is_a_floor(name):
+    inputs = [(frame, planes, None, pose) for frame, planes, _, pose in (seen(k, T) for k, T in enumerate(walk()))]
+    surface = fold(plugin_class("surface", name)(view_width=160), inputs)
+    assert np.isnan(surface.up).all() and len(surface.plane_ids) == 3
+    assert [PLANE_KINDS[k] for k in surface.kinds] == ["plane"] * 3
+
+
 @pytest.mark.parametrize("name", ["planar_tsdf", "planar_polygon"])
 def test_the_mesh_is_whole_and_nothing_is_turned_over(name):
     assert set(faults(corner(name)).values()) == {0}

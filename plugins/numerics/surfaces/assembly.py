@@ -52,7 +52,7 @@ def pictured(
         instances=rows.astype(np.int32),
         plane_ids=ids[used],
         coefficients=planes,
-        kinds=_kinds(planes, areas, _heights(points, plain.triangles, rows, len(used), plain.up), plain.up),
+        kinds=_kinds(planes, areas, points[plain.triangles] @ plain.up, rows, plain.up),
         areas_m2=areas,
         plane_colors=atlas.colors,
         loops=np.array([(plane, a, b) for (plane, _), a, b in zip(rings, ends[:-1], ends[1:])], np.int32).reshape(-1, 3),
@@ -62,21 +62,22 @@ def pictured(
     )
 
 
-def _heights(points: F64, triangles: I32, rows: I32, count: int, up: F64) -> F64:
-    """(p, 2) lowest and highest place of each plane along `up`."""
-    height = points[triangles] @ up
+def _heights(corners: F64, rows: I32, count: int) -> F64:
+    """(p, 2) lowest and highest place of each plane, by the heights (t, 3) of its triangles' corners."""
     out = np.tile([np.inf, -np.inf], (count, 1))
     planar = rows >= 0
-    np.minimum.at(out[:, 0], rows[planar], height[planar].min(axis=1))
-    np.maximum.at(out[:, 1], rows[planar], height[planar].max(axis=1))
+    np.minimum.at(out[:, 0], rows[planar], corners[planar].min(axis=1))
+    np.maximum.at(out[:, 1], rows[planar], corners[planar].max(axis=1))
     return out
 
 
-def _kinds(planes: F64, areas: F32, heights: F64, up: F64) -> U8:
-    """(p,) rows of PLANE_KINDS."""
-    leaning = np.nan_to_num(planes[:, :3] @ up, nan=0.5)
-    level, upright = np.cos(np.radians(LEVEL_DEG)), np.sin(np.radians(LEVEL_DEG))
+def _kinds(planes: F64, areas: F32, corners: F64, rows: I32, up: F64) -> U8:
+    """(p,) rows of PLANE_KINDS; the most general one for all when nobody knows which way is up."""
     kinds = np.full(len(planes), PLANE_KINDS.index("plane"), np.uint8)
+    if not np.isfinite(up).all():
+        return kinds
+    leaning, heights = planes[:, :3] @ up, _heights(corners, rows, len(planes))
+    level, upright = np.cos(np.radians(LEVEL_DEG)), np.sin(np.radians(LEVEL_DEG))
     kinds[np.abs(leaning) > level] = PLANE_KINDS.index("horizontal")
     kinds[np.abs(leaning) < upright] = PLANE_KINDS.index("vertical")
     wide, middle = areas >= WIDE_M2, heights.mean(axis=1)
