@@ -3,6 +3,7 @@
 import numpy as np
 from landmark_world import camera_at, rotation_of, translation_of
 
+from trihedron.pipeline.arrays import array_specs
 from trihedron.pipeline.types import Correction, Pose
 from trihedron.plugins.map.covisibility import Covisibility
 from trihedron.plugins.matches.local_map import LocalMap
@@ -45,5 +46,6 @@ def correction(map, **changes):
         "coefficients": np.empty((0, 4)),
     }  # fmt: skip
     given = {**none, **changes}
-    known = {name: np.tile(np.eye(3), (len(given[ids]), *shape, 1, 1)) * scale for name, ids, shape, scale in KNOWN}
+    of = {spec.name: spec.dtype for spec in array_specs(Correction)}
+    known = {name: np.tile(np.eye(3) * scale, (len(given[ids]), *shape, 1, 1)).astype(of[name]) for name, ids, shape, scale in KNOWN}
     return Correction(map.index, map.stamp_ns, **known, **given)

@@ -74,11 +74,12 @@ class Shove:
         if len(map.keyframes) != 3 or map.keyframes.column("index")[-1] != map.index:
             return None
         R, planes = self.shift[:3, :3], transform_planes(self.shift, map.planes.column("coefficients"))
+        turned = [(R @ table.column("information") @ R.T).astype(np.float32) for table in (map.points, map.lines)]
         ids = [np.arange(len(table), dtype=np.int32) for table in (map.keyframes, map.points, map.lines, map.planes)]
         return Correction(
             map.index, map.stamp_ns, map.revision, ids[0], self.shift @ map.keyframes.column("T_world_camera"),
-            ids[1], transform(self.shift, map.points.column("position_m")), R @ map.points.column("information") @ R.T,
-            ids[2], transform(self.shift, map.lines.column("endpoints_m")), R @ map.lines.column("information") @ R.T, ids[3], planes,
+            ids[1], transform(self.shift, map.points.column("position_m")), turned[0],
+            ids[2], transform(self.shift, map.lines.column("endpoints_m")), turned[1], ids[3], planes,
             transform_plane_covariance(self.shift, map.planes.column("coefficients"), planes, map.planes.column("covariance")),
         )  # fmt: skip
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from trihedron.pipeline.geometry import tangent_basis
-from trihedron.pipeline.types import F64, Camera
+from trihedron.pipeline.types import F32, F64, Camera
 
 
 def point_covariance(points_m: F64, sigma_px: F64, sigma_m: F64, camera: Camera) -> F64:
@@ -18,9 +18,9 @@ def point_covariance(points_m: F64, sigma_px: F64, sigma_m: F64, camera: Camera)
     return covariance
 
 
-def inverse(matrices: F64) -> F64:
+def inverse(matrices: F32 | F64) -> F64:
     """(..., k, k) inverses: covariances of information matrices and the other way round. Raises LinAlgError for a singular one."""
-    return np.asarray(np.linalg.inv(matrices), np.float64)
+    return np.asarray(np.linalg.inv(matrices.astype(np.float64)), np.float64)
 
 
 def rotate_covariance(R_a_b: F64, covariance_b: F64) -> F64:

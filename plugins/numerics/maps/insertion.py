@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from trihedron.pipeline.geometry import tangent_basis, transform, transform_planes
-from trihedron.pipeline.types import F64, I32, Camera, Keypoints, Map, Planes, Pose, Segments, Table
+from trihedron.pipeline.types import F32, F64, I32, Camera, Keypoints, Map, Planes, Pose, Segments, Table
 from trihedron.plugins.numerics.algebra.uncertainty import inverse, moved_covariance, point_covariance, rotate_covariance
 from trihedron.plugins.numerics.maps.fusion import fuse_lines, fuse_points
 from trihedron.plugins.numerics.maps.landmarks import OBSERVERS
@@ -82,7 +82,7 @@ def insert_points(map: Map, view: View, keypoints: Keypoints, pairs: I32, new: I
     """Measure the points `pairs` (row, id) again and make landmarks of the rows `new`, which have depth."""
     rows, ids = pairs[:, 0], pairs[:, 1]
     table = map.points
-    position, information = table.rows("position_m", ids), table.rows("information", ids)
+    position, information = table.rows("position_m", ids), table.rows("information", ids).astype(np.float64)
     sigma_px, sigma_m = keypoints.sigma_px.astype(np.float64), keypoints.sigma_m.astype(np.float64)
     pixels, depth = keypoints.pixels.astype(np.float64), keypoints.points_m[:, 2].astype(np.float64)
     fuse_points(
@@ -129,7 +129,7 @@ def insert_lines(map: Map, view: View, segments: Segments, pairs: I32, new: I32,
     """Measure the lines `pairs` (row, id) again, lengthen them to what is seen, and make landmarks of the rows `new`, which have a 3D line."""
     rows, ids = pairs[:, 0], pairs[:, 1]
     table = map.lines
-    endpoints, information = table.rows("endpoints_m", ids), table.rows("information", ids)
+    endpoints, information = table.rows("endpoints_m", ids), table.rows("information", ids).astype(np.float64)
     observed, covariance = segments.endpoints_m.astype(np.float64), segments.covariance_m2.astype(np.float64)
     fuse_lines(
         view.T_world_camera, view.covariance, view.intrinsics, endpoints, information,
@@ -160,7 +160,7 @@ def insert_lines(map: Map, view: View, segments: Segments, pairs: I32, new: I32,
     )
 
 
-def lengthened(endpoints: F64, information: F64, observed: F64) -> tuple[F64, F64]:
+def lengthened(endpoints: F64, information: F32 | F64, observed: F64) -> tuple[F64, F64]:
     """Lines (n, 2, 3) made to reach as far as the observed ends (n, 2, 3; NaN = unknown), along their own direction."""
     direction = endpoints[:, 1] - endpoints[:, 0]
     share = np.einsum("nkj,nj->nk", observed - endpoints[:, :1], direction) / np.maximum((direction**2).sum(-1), 1e-12)[:, None]

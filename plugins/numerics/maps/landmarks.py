@@ -21,10 +21,11 @@ KEYFRAMES = {
 
 
 def point_columns(descriptor_bytes: int) -> dict[str, Column]:
-    """`information` is the inverse covariance of the position (world, 1/m²); `distance_m` and `octave` say at which range and scale it was seen."""
+    """`information` is the inverse covariance of the position (world, 1/m²), good to a few digits and kept as such; `distance_m` and `octave` say at
+    which range and scale it was seen."""
     return {
         "position_m": Column("f8", (3,)),
-        "information": Column("f8", (3, 3)),
+        "information": Column("f4", (3, 3)),
         "descriptor": Column("u1", (descriptor_bytes,)),
         "direction": Column("f4", (3,)),  # unit, from the point to the camera that saw it last
         "distance_m": Column("f4"),
@@ -37,7 +38,7 @@ def line_columns(descriptor_bytes: int) -> dict[str, Column]:
     """End points in the world with the inverse covariance of each."""
     return {
         "endpoints_m": Column("f8", (2, 3)),
-        "information": Column("f8", (2, 3, 3)),
+        "information": Column("f4", (2, 3, 3)),
         "descriptor": Column("u1", (descriptor_bytes,)),
         **_life(),
     }

@@ -41,7 +41,7 @@ def merge_points(map: Map, view: View, visible: I32, metric: str) -> Map:
     found = match_near(*sides[0], *sides[1], np.full(len(idle), NEAR_PX, np.float32), 1, limit, 1.0, metric)
     pairs = np.stack([idle[found >= 0], seen[found[found >= 0]]], axis=-1)
     position, information = map.points.rows("position_m", pairs.ravel()).reshape(-1, 2, 3), map.points.rows("information", pairs.ravel())
-    information = information.reshape(-1, 2, 3, 3)
+    information = information.reshape(-1, 2, 3, 3).astype(np.float64)
     apart = position[:, 1] - position[:, 0]
     covariance = inverse(information).sum(axis=1)
     same: Bool = np.einsum("ni,nij,nj->n", apart, inverse(covariance), apart) <= CHI2_3

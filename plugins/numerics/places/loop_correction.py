@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from trihedron.pipeline.geometry import exp_so3, invert, pose_matrix
-from trihedron.pipeline.types import F64, I32, Correction, Map, Table
+from trihedron.pipeline.types import F32, F64, I32, Correction, Map, Table
 from trihedron.plugins.numerics.algebra.uncertainty import inverse
 from trihedron.plugins.numerics.maps.local_window import current_submap, keyframes_of
 from trihedron.plugins.numerics.places.map_compass import Compass
@@ -134,9 +134,9 @@ def _moved(T: F64, points: F64) -> F64:
     return points @ np.swapaxes(T[:, :3, :3], 1, 2) + T[:, None, :3, 3]
 
 
-def _turned(T: F64, information: F64) -> F64:
+def _turned(T: F64, information: F32) -> F32:
     """(..., 4, 4) and (..., 3, 3): what is known of a place, turned with it."""
-    return np.asarray(T[..., :3, :3] @ information @ np.swapaxes(T[..., :3, :3], -1, -2), np.float64)
+    return np.asarray(T[..., :3, :3] @ information @ np.swapaxes(T[..., :3, :3], -1, -2), np.float32)
 
 
 def _moved_planes(T: F64, planes: F64) -> F64:
