@@ -189,7 +189,7 @@ def _put_table(message: Any, name: str, table: Table, previous: Table | None) ->
         put_array(message, f"{name}#rows{k}", np.frombuffer(ids_bytes, np.int32), False)
     if emptied:
         put_array(message, f"{name}#emptied", np.array(sorted(emptied), np.int32), False)
-    schema = {c: [s.dtype, list(s.shape)] for c, s in table.schema.items()}
+    schema = {c: [s.dtype, list(s.shape), s.step] for c, s in table.schema.items()}
     put_array(message, f"{name}#", json.dumps({"size": table.size, "full": previous is None, "schema": schema, "rows": changed}), False)
 
 
@@ -208,7 +208,7 @@ def _changed(known: Any, chunk: Any) -> Any:
 
 def _get_table(name: str, tables: Mapping[str, Any], previous: Table | None) -> Table:
     header = json.loads(tables[f"{name}#"])
-    schema = {column: _column(dtype, shape) for column, (dtype, shape) in header["schema"].items()}
+    schema = {column: _column(*said) for column, said in header["schema"].items()}
     table = Table.empty(schema) if header["full"] else previous
     if table is None or table.schema != schema:
         raise ValueError(f"{name}: a change without the version before it")
@@ -237,7 +237,9 @@ def _there(known: int, size: int, empty: Any) -> Any:
     return rows[~np.isin(rows // CHUNK, empty)]
 
 
-def _column(dtype: str, shape: list[int]) -> Column:
+def _column(dtype: str, shape: list[int], step: float = 0.0) -> Column:
     if np.dtype(dtype).hasobject:
         raise ValueError(f"a column of type {dtype!r}")
-    return Column(dtype, tuple(shape))
+    if not (np.isfinite(step) and step >= 0.0):
+        raise ValueError(f"a column in steps of {step!r}")
+    return Column(dtype, tuple(shape), step)

@@ -21,10 +21,16 @@ CHUNK = 256  # rows; small enough that a touched chunk is cheap to copy, large e
 
 @dataclass(frozen=True)
 class Column:
-    """Element type, and shape of one row."""
+    """Element type, shape of one row and, unless 0, the step: a power of two of which all values are multiples. Digits that nobody can know take as
+    much of a recording as those that are known."""
 
     dtype: str
     shape: tuple[int, ...] = ()
+    step: float = 0.0
+
+    def rounded(self, values: Array) -> Array:
+        """Values to the nearest multiples of the step, of this type."""
+        return np.asarray(np.rint(values / self.step) * self.step if self.step else values, self.dtype)
 
 
 @dataclass(frozen=True)
@@ -69,8 +75,8 @@ class Table:
         """A version in which rows `ids` (distinct) of the given columns hold new values; other chunks are shared."""
         chunks = dict(self.chunks)
         touched = list(_by_chunk(np.asarray(ids)))
-        for name, values in columns.items():
-            parts = list(chunks[name])
+        for name, given in columns.items():
+            parts, values = list(chunks[name]), self.schema[name].rounded(given)
             for chunk, here, offset in touched:
                 part = parts[chunk].copy()
                 part[offset] = values[here]
@@ -110,7 +116,7 @@ class Table:
         if set(lengths) != set(self.schema) or len(set(lengths.values())) != 1:
             raise ValueError(f"appended needs equally long columns {sorted(self.schema)}, got {lengths}")
         count = next(iter(lengths.values()))
-        rows = {name: np.asarray(values, self.schema[name].dtype).reshape(count, *self.schema[name].shape) for name, values in columns.items()}
+        rows = {name: self.schema[name].rounded(values).reshape(count, *self.schema[name].shape) for name, values in columns.items()}
         ids = np.arange(self.size, self.size + count, dtype=np.int32)
         return self.extended(self.size + count, ids[:0], **rows), ids
 

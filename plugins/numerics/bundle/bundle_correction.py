@@ -9,6 +9,7 @@ from trihedron.pipeline.types import F64, I32, Correction, Map
 from trihedron.plugins.numerics.algebra.uncertainty import inverse, transform_plane_covariance
 from trihedron.plugins.numerics.bundle.bundle_problem import BundleMeasurements, BundleState, BundleWindow
 from trihedron.plugins.numerics.bundle.bundle_solver import BundleSolution
+from trihedron.plugins.numerics.maps.landmarks import ENDS, PLACE
 
 
 def bundle_correction(map: Map, window: BundleWindow, found: BundleSolution) -> Correction:
@@ -26,10 +27,10 @@ def bundle_correction(map: Map, window: BundleWindow, found: BundleSolution) -> 
         keyframe_ids=window.free,
         T_world_keyframe=poses,
         point_ids=window.points,
-        points_m=state.points,
+        points_m=PLACE.rounded(state.points),
         point_information=_symmetric(inverse(points)).astype(np.float32),
         line_ids=window.lines,
-        endpoints_m=state.lines,
+        endpoints_m=ENDS.rounded(state.lines),
         line_information=_symmetric(inverse(ends)).astype(np.float32),
         plane_ids=window.planes,
         coefficients=state.planes,
@@ -68,10 +69,10 @@ def carried_correction(map: Map, window: BundleWindow, seen: BundleMeasurements,
         keyframe_ids=window.free,
         T_world_keyframe=poses,
         point_ids=window.points,
-        points_m=points,
+        points_m=PLACE.rounded(points),
         point_information=(R @ map.points.rows("information", window.points) @ np.swapaxes(R, -1, -2)).astype(np.float32),
         line_ids=window.lines,
-        endpoints_m=_moved(T_line, map.lines.rows("endpoints_m", window.lines)),
+        endpoints_m=ENDS.rounded(_moved(T_line, map.lines.rows("endpoints_m", window.lines))),
         line_information=(Q @ map.lines.rows("information", window.lines) @ np.swapaxes(Q, -1, -2)).astype(np.float32),
         plane_ids=window.planes,
         coefficients=np.array(moved, np.float64).reshape(-1, 4),

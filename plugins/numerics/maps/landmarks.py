@@ -4,6 +4,9 @@ from __future__ import annotations
 
 from trihedron.pipeline.types import Column, Map, Table
 
+PLACE = Column("f8", (3,), 2.0**-20)  # in the world, to a micrometre: a thousandth of what is known of any
+ENDS = Column("f8", (2, 3), PLACE.step)
+SHOWN = 2.0**-10  # 1 mm, or 0.06°: what is only compared with limits of centimetres and degrees
 OBSERVERS = 16  # most recent keyframes remembered by a landmark, enough for co-visibility; -1 = empty
 
 KEYFRAMES = {
@@ -24,11 +27,11 @@ def point_columns(descriptor_bytes: int) -> dict[str, Column]:
     """`information` is the inverse covariance of the position (world, 1/m²), good to a few digits and kept as such; `distance_m` and `octave` say at
     which range and scale it was seen."""
     return {
-        "position_m": Column("f8", (3,)),
+        "position_m": PLACE,
         "information": Column("f4", (3, 3)),
         "descriptor": Column("u1", (descriptor_bytes,)),
-        "direction": Column("f4", (3,)),  # unit, from the point to the camera that saw it last
-        "distance_m": Column("f4"),
+        "direction": Column("f4", (3,), SHOWN),  # unit, from the point to the camera that saw it last
+        "distance_m": Column("f4", step=SHOWN),
         "octave": Column("u1"),
         **_life(),
     }
@@ -37,7 +40,7 @@ def point_columns(descriptor_bytes: int) -> dict[str, Column]:
 def line_columns(descriptor_bytes: int) -> dict[str, Column]:
     """End points in the world with the inverse covariance of each."""
     return {
-        "endpoints_m": Column("f8", (2, 3)),
+        "endpoints_m": ENDS,
         "information": Column("f4", (2, 3, 3)),
         "descriptor": Column("u1", (descriptor_bytes,)),
         **_life(),
@@ -51,7 +54,7 @@ def plane_columns(samples: int) -> dict[str, Column]:
         "coefficients": Column("f8", (4,)),
         "covariance": Column("f8", (3, 3)),  # of (a, b, d), see types.Planes
         "moments": Column("f8", (4, 4)),
-        "samples_m": Column("f4", (samples, 3)),
+        "samples_m": Column("f4", (samples, 3), SHOWN),
         **_life(),
     }
 

@@ -9,6 +9,7 @@ import numpy as np
 from trihedron.pipeline.geometry import exp_so3, invert, pose_matrix
 from trihedron.pipeline.types import F32, F64, I32, Correction, Map, Table
 from trihedron.plugins.numerics.algebra.uncertainty import inverse
+from trihedron.plugins.numerics.maps.landmarks import ENDS, PLACE
 from trihedron.plugins.numerics.maps.local_window import current_submap, keyframes_of
 from trihedron.plugins.numerics.places.map_compass import Compass
 from trihedron.plugins.numerics.places.pose_graph import Edges, joined, solve_pose_graph
@@ -101,10 +102,10 @@ def moved_keyframes(map: Map, rows: I32, before: F64, after: F64) -> Correction:
         rows,
         after,
         points[0],
-        _moved(T_points, map.points.rows("position_m", points[0])[:, None])[:, 0],
+        PLACE.rounded(_moved(T_points, map.points.rows("position_m", points[0])[:, None])[:, 0]),
         _turned(T_points, map.points.rows("information", points[0])),
         lines[0],
-        _moved(T_lines, map.lines.rows("endpoints_m", lines[0])),
+        ENDS.rounded(_moved(T_lines, map.lines.rows("endpoints_m", lines[0]))),
         _turned(T_lines[:, None], map.lines.rows("information", lines[0])),
         planes[0],
         coefficients,

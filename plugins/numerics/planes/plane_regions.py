@@ -8,6 +8,8 @@ import numpy as np
 from trihedron.pipeline.types import F32, F64, I32, U8
 from trihedron.plugins.numerics.depth.organised_grid import Grid
 
+STEP_M = 2.0**-10  # samples of planes say where a plane is, to within centimetres: fewer digits, shorter recordings
+
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def grow_regions(labels: I32, planes: F64, grid: Grid, gate: float, reach: int, cos_cone: float) -> I32:
@@ -143,7 +145,8 @@ def areas(labels: I32, count: I32, regions: int) -> I32:
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def spread_samples(labels: U8, planes: F64, rays_x: F64, rays_y: F64, wanted: int, most: int) -> F32:
-    """(k, wanted, 3) points of each plane, on its q and spread over its region by farthest-point choice among (about) `most` cells; NaN-padded."""
+    """(k, wanted, 3) points of each plane, on its q to half a millimetre, and spread over its region by farthest-point choice among (about) `most`
+    cells; NaN-padded."""
     regions = len(planes)
     h, w = labels.shape
     size = np.zeros(regions + 1, np.int32)
@@ -177,7 +180,7 @@ def _farthest_points(xs: F64, ys: F64, zs: F64, out: F32) -> None:
     chosen = n // 2
     for k in range(min(n, len(out))):
         x, y, z = xs[chosen], ys[chosen], zs[chosen]
-        out[k, 0], out[k, 1], out[k, 2] = x, y, z
+        out[k, 0], out[k, 1], out[k, 2] = np.rint(x / STEP_M) * STEP_M, np.rint(y / STEP_M) * STEP_M, np.rint(z / STEP_M) * STEP_M
         for i in range(n):
             e = (xs[i] - x) ** 2 + (ys[i] - y) ** 2 + (zs[i] - z) ** 2
             distance[i] = min(distance[i], e)
