@@ -117,10 +117,14 @@ class Decoder:
 
 def _other_fields(message: Any, kind: Any) -> str:
     """The fields by which a recorded value differs from the type of today, as a part of a sentence."""
+    types = {spec.name: spec.dtype.str.lstrip("<|=") for spec in array_specs(kind)}
     recorded = {array.name.partition("#")[0].partition(".")[0] for array in message.arrays}
     expected = set(_hints(kind)) - {"index", "stamp_ns"}
     lacks = ", ".join(f"'{name}'" for name in sorted(expected - recorded))
     more = ", ".join(f"'{name}'" for name in sorted(recorded - expected))
+    others = ", ".join(f"'{array.name}' of type {array.dtype}" for array in message.arrays if array.dtype != types.get(array.name, array.dtype))
+    if others:
+        return f", with its field {others}"
     if not lacks and not more and Table in _hints(kind).values():
         return ", whose tables have other columns"
     return (f", with the field {lacks} that it lacks" if lacks else "") + (f", without its field {more}" if more else "")

@@ -18,7 +18,7 @@ from trihedron.pipeline.mcap_errors import damaged
 from trihedron.pipeline.mcap_file import McapFile
 from trihedron.pipeline.types import Value
 
-FORMAT = "2"
+FORMAT = "3"
 METADATA = "trihedron"
 FRAMES_TOPIC = "frames"  # one FrameReference a frame: what a replay iterates over
 TIMING_TOPIC = "/timing"

@@ -88,6 +88,37 @@ def test_label_images_are_stored_small():
     assert differing(planes, there_and_back(planes)) == []
 
 
+def test_a_colour_image_is_stored_by_the_steps_between_its_rows():
+    """Of a shade that goes on downwards almost nothing is left; any image comes back; bytes that do not fit the shape are refused."""
+    camera, depth = Camera(64, 48, 50.0, 51.0, 31.5, 23.5, 15.0), np.ones((48, 64), np.float32)
+    shade = (RNG.integers(0, 255, (1, 64, 3)) + 7 * np.arange(48)[:, None, None]).astype(np.uint8)  # past 255 and on from 0
+    sizes = []
+    for color in (shade, RNG.integers(0, 255, (48, 64, 3), dtype=np.uint8)):
+        value = Frame(1, 2, color, depth, camera)
+        same(value, there_and_back(value))
+        message = message_of(value)
+        (array,) = (array for array in message.arrays if array.name == "color")
+        sizes.append(len(array.data))
+        for shape in ((48, 64, 4), (47, 64, 3), (48 * 64 * 3,), (48, 64)):
+            array.shape[:] = shape
+            assert "array 'color' does not have the" in refusal(message)
+    assert array.encoding == "rows" and sizes[0] < 400 and sizes[1] > 9000
+
+
+def test_a_column_s_step_is_told():
+    whole = next(iter(maps(1)))
+    table, _ = Table.empty({"x": Column("f8", (3,), 2.0**-20)}).appended(x=RNG.random((300, 3)))
+    value = replace(whole, points=table)
+    found = there_and_back(value)
+    same(value, found)
+    assert found.points.schema == table.schema
+    for wrong in ("-1.0", "NaN", '"0.5"', "0.5, 2"):
+        message = message_of(value)
+        (head,) = (array for array in message.arrays if array.name == "points#")
+        head.data = head.data.replace(b"9.5367431640625e-07", wrong.encode())
+        assert "Map does not fit: " in refusal(message)
+
+
 def maps(count):
     """Successive versions of a map whose points grow and change."""
     empty = Table.empty({"x": Column("f8")})
@@ -204,7 +235,7 @@ def test_damaged_and_foreign_values_are_refused():
     message = message_of(keypoints())
     message.arrays[0].encoding = "zstd_planes"
     assert refusal(message) == (
-        "a.mcap: topic /keypoints: array 'pixels' has the encoding 'zstd_planes', this program reads raw, columns, png, zstd; "
+        "a.mcap: topic /keypoints: array 'pixels' has the encoding 'zstd_planes', this program reads raw, columns, zstd, rows; "
         "read it with the version that wrote it"
     )
     message = message_of(keypoints())
@@ -232,14 +263,12 @@ def test_a_value_of_an_older_version_names_the_version_and_the_fields():
 def test_an_image_that_claims_to_be_larger_than_its_shape_is_not_decoded():
     color = RNG.integers(0, 255, (48, 64, 3), dtype=np.uint8)
     frame = Frame(1, 2, color, np.zeros((48, 64), np.float32), Camera(64, 48, 50.0, 51.0, 31.5, 23.5))
-    message = message_of(frame)
-    image = next(a for a in message.arrays if a.name == "color")
-    image.data = image.data[:16] + (30_000).to_bytes(4, "big") * 2 + image.data[24:]
-    assert "array 'color' does not have the 9216 bytes of its shape (48, 64, 3)" in refusal(message)
-    message = message_of(frame)
-    depth = next(a for a in message.arrays if a.name == "depth_m")
-    depth.data = zstandard.compress(bytes(1 << 24))
-    assert "array 'depth_m' does not have the 12288 bytes" in refusal(message)
+    for name, size in (("color", 9216), ("depth_m", 12288)):
+        for data in (zstandard.compress(bytes(1 << 24)), zstandard.compress(bytes(16)), b"no frame of zstd", b""):
+            message = message_of(frame)
+            (image,) = (array for array in message.arrays if array.name == name)
+            image.data = data
+            assert f"array '{name}' does not have the {size} bytes" in refusal(message)
 
 
 @pytest.mark.parametrize("cut", [False, True])

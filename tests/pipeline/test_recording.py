@@ -129,7 +129,7 @@ def test_wrong_files_say_so_in_one_line(tmp_path):
     )
     write(tmp_path / "new.mcap", [0], format="9", version="0.0.9", commit="0123456789")
     assert refusal(tmp_path / "new.mcap") == (
-        "DIR/new.mcap: has format 9 of trihedron 0.0.9 0123456, this program reads format 2: its arrays and tables are packed otherwise; "
+        "DIR/new.mcap: has format 9 of trihedron 0.0.9 0123456, this program reads format 3: its arrays and tables are packed otherwise; "
         "read it with the version that wrote it, or record again"
     )
     with pytest.raises(RecordingError) as error:
@@ -137,12 +137,27 @@ def test_wrong_files_say_so_in_one_line(tmp_path):
     assert str(error.value).replace(str(tmp_path), "DIR") == "DIR/no/a.mcap: cannot be written: No such file or directory; give another out=FOLDER"
 
 
-def test_a_recording_of_an_older_program_names_version_and_field(capsys):
-    """Three frames that the first version of this program wrote, in format 1; whatever is asked of them."""
-    path = Path(__file__).parent / "recordings" / "format_1.mcap"
+OLDER = [  # format, commit, what differs
+    (
+        1,
+        "ad955b7",
+        "topic /pose holds Pose version 1, this program reads version 2, with the field 'submap', 'unrecognised' that it lacks, and 1 more",
+    ),
+    (
+        2,
+        "509b7cf",
+        "topic /bundle holds Correction version 1, this program reads version 2, with its field 'point_information' of type f8, 'line_information' "
+        "of type f8, and 2 more",
+    ),
+]
+
+
+@pytest.mark.parametrize("form, commit, differs", OLDER)
+def test_a_recording_of_an_older_program_names_version_and_field(form, commit, differs, capsys):
+    """Three frames that an earlier version of this program wrote; whatever is asked of them."""
+    path = Path(__file__).parent / "recordings" / f"format_{form}.mcap"
     line = (
-        f"trihedron: {path}: has format 1 of trihedron 0.0.1 ad955b7, this program reads format 2: topic /pose holds Pose version 1, this program "
-        "reads version 2, with the field 'submap', 'unrecognised' that it lacks, and 1 more of its topics are others; "
+        f"trihedron: {path}: has format {form} of trihedron 0.0.1 {commit}, this program reads format 3: {differs} of its topics are others; "
         "read it with the version that wrote it, or record again\n"
     )
     for words in (["run", f"replay={path}", "only=[pose]"], ["diff", str(path), str(path)], ["export", str(path), "--to", "tum"]):

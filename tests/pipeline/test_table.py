@@ -5,6 +5,7 @@ import pytest
 
 from trihedron.pipeline.table import CHUNK, Column, Table
 
+RNG = np.random.default_rng(0)
 SCHEMA = {"x": Column("f8", (3,)), "n": Column("i4")}
 
 
@@ -34,6 +35,18 @@ def test_update_copies_only_touched_chunks_and_columns():
     assert all(a is b for a, b in zip(before.chunks["x"], after.chunks["x"]))
     with pytest.raises(ValueError, match="read-only"):
         after.chunks["n"][0][0] = 3
+
+
+def test_a_column_with_a_step_holds_multiples_of_it():
+    """The nearest ones; columns without a step hold what they are given, and what is rounded already stays."""
+    step, given = 2.0**-10, 3.0 + RNG.random((CHUNK + 5, 3))
+    table, ids = Table.empty({"x": Column("f4", (3,), step), "y": Column("f8", (3,))}).appended(x=given, y=given)
+    assert np.array_equal(table.column("x"), np.rint(given / step) * step) and np.array_equal(table.column("y"), given)
+    assert np.abs(table.column("x") - given).max() <= 0.5 * step
+    moved = table.updated(ids[-3:], x=given[:3], y=given[:3])
+    assert np.array_equal(moved.rows("x", ids[-3:]), table.rows("x", ids[:3])) and np.array_equal(moved.rows("y", ids[-3:]), given[:3])
+    again = moved.updated(ids, x=moved.column("x"))
+    assert np.array_equal(again.column("x"), moved.column("x"))
 
 
 def test_wrong_use_is_refused():

@@ -60,4 +60,5 @@ for await (const part of handle.createReadStream({ start: 0, autoClose: false })
 }
 await handle.close();
 const counts = Object.fromEntries(Object.entries(topics).map(([name, topic]) => [name, { ...topic, last: topic.last.toString() }]));
-console.log(JSON.stringify({ chunks: reader.chunkIndexes.length, statistics: Number(reader.statistics?.messageCount ?? -1), streamed, topics: counts, problems }));
+const compressions = [...new Set(reader.chunkIndexes.map((chunk) => chunk.compression))];
+console.log(JSON.stringify({ chunks: reader.chunkIndexes.length, compressions, statistics: Number(reader.statistics?.messageCount ?? -1), streamed, topics: counts, problems }));

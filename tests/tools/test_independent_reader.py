@@ -85,7 +85,7 @@ def recorded(path, count=12):
 
 
 def check(found):
-    assert found["problems"] == [] and found["chunks"] > 0
+    assert found["problems"] == [] and found["chunks"] > 0 and found["compressions"] == ["zstd"]
     assert found["streamed"] == found["statistics"] == sum(topic["messages"] for topic in found["topics"].values()) > 0
 
 
