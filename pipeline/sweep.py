@@ -11,6 +11,7 @@ import sys
 import threading
 import time
 from collections.abc import Sequence
+from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -83,7 +84,8 @@ class Sweeper(BasicSweeper):
         can be composed, or the launcher fails."""
         self.folder.mkdir(parents=True, exist_ok=True)
         folders = [self.folder / str(number) for number in _numbers(self.folder, jobs)]
-        missing, errors = [], []
+        missing: list[tuple[Overrides, Path]] = []
+        errors: list[TrihedronError] = []
         for job, folder in zip(jobs, folders):
             words = [*job, f"hydra.sweep.subdir={folder.name}"]
             try:
@@ -101,25 +103,40 @@ class Sweeper(BasicSweeper):
             print(f"sweep: {already} of {len(jobs)} jobs are done already", file=sys.stderr)
         if missing:
             with _Progress([place for _, place in missing], before + len(jobs) - len(missing), total):
-                self._launch([words for words, _ in missing])
+                self._launch(missing)
         return folders
 
     def composed(self, words: Overrides) -> DictConfig:
         """The configuration of a job."""
         return self.loader.load_sweep_config(self.options, words)
 
-    def _launch(self, jobs: list[Overrides]) -> None:
-        """Hand the jobs to the launcher, and wait until they have ended."""
+    def _launch(self, missing: list[tuple[Overrides, Path]]) -> None:
+        """Hand the jobs and their folders to the launcher, and wait until they have ended."""
         assert self.launcher is not None
         try:
-            self.launcher.launch(jobs, initial_job_idx=0)
+            self.launcher.launch([words for words, _ in missing], initial_job_idx=0)
+        except BrokenProcessPool as error:
+            self._launch_apart(missing, error)
         except TrihedronError:
             raise
         except Exception as error:  # of the engine; a job that fails says so in its folder
-            cause = next(iter(str(error).splitlines()), type(error).__name__)
-            raise TrihedronError("hydra.launcher", cause, "what is done is kept; the same command again runs the rest") from error
+            raise _given_up(error) from error
         if self.options.hydra.launcher.get("n_jobs", 1) != 1:
             get_reusable_executor().shutdown()  # its processes would keep this folder and environment for the next sweep
+
+    def _launch_apart(self, missing: list[tuple[Overrides, Path]], error: Exception) -> None:
+        """A process that died took those beside it along. What had begun is run again, one at a time, so that only the job at fault fails; then
+        what had not."""
+        if len(missing) == 1:
+            write_job(missing[0][1], "", FAILED, f"{missing[0][1]}: its process died; it crashed, or memory ran out")
+            return
+        begun = [job for job in missing if read_job(job[1]).get("state") == RUNNING]
+        if not begun:
+            raise _given_up(error) from error
+        for job in begun:
+            self._launch([job])
+        if waiting := [job for job in missing if not read_job(job[1])]:
+            self._launch(waiting)
 
     def jobs(self, arguments: list[str]) -> list[Overrides]:
         """The overrides of every job: the cross product of sequences and of all values given."""
@@ -152,6 +169,12 @@ def _numbers(folder: Path, jobs: Sequence[Overrides]) -> list[int]:
     known = {tuple(yaml.safe_load(file.read_text()) or []): int(file.parent.parent.name) for file in files}
     free = itertools.count(max(known.values(), default=-1) + 1)
     return [known[tuple(job)] if tuple(job) in known else next(free) for job in jobs]
+
+
+def _given_up(error: Exception) -> TrihedronError:
+    """What an engine of Hydra's failed with, as one line."""
+    cause = next(iter(str(error).splitlines()), type(error).__name__)
+    return TrihedronError("hydra.launcher", cause, "what is done is kept; the same command again runs the rest")
 
 
 def failure_of(folder: Path) -> str:

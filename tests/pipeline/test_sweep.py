@@ -13,6 +13,7 @@ from trihedron.pipeline.config import register_configs
 from trihedron.pipeline.jobs import key_of
 from trihedron.pipeline.registry import load_plugins
 from trihedron.pipeline.sweep import words_of_sequence
+from trihedron.tools.benchmark import PROGRAM
 
 QUICK = ["dataset.width=64", "dataset.height=48", "dataset.length=4", "outputs=[keypoints]"]
 
@@ -72,6 +73,36 @@ def test_a_sweep_goes_on_where_it_was_stopped(tmp_path, capfd):
     assert after[0] > before[0] and after[1] == before[1]
     assert main(["compare", str(tmp_path)]) == 0
     assert capfd.readouterr().out.count("9:0") >= 2
+
+
+KILLED = """
+import os, signal
+from dataclasses import dataclass
+from trihedron.pipeline.registry import register
+from trihedron.pipeline.types import Frame, Keypoints
+
+@register("keypoints", "killed")
+@dataclass(frozen=True)
+class Killed:
+    def __call__(self, frame: Frame) -> Keypoints:
+        os.kill(os.getpid(), signal.SIGKILL)
+"""
+
+
+@pytest.mark.slow
+def test_a_job_whose_process_dies_fails_alone(tmp_path):
+    (tmp_path / "killed.py").write_text(KILLED)
+    about = tmp_path / "killed-1.dist-info"
+    about.mkdir()
+    (about / "METADATA").write_text("Name: killed\nVersion: 1\n")
+    (about / "entry_points.txt").write_text("[trihedron.plugins]\nkilled = killed\n")
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(tmp_path), os.environ.get("PYTHONPATH", "")])}
+    words = ["run", "-m", *QUICK, "keypoints=orb,killed,none", "seed=0,1", f"out={tmp_path / 'sweep'}"]
+    done = subprocess.run([*PROGRAM, *words], env=environment, capture_output=True, text=True)
+    assert done.returncode == 1 and "2 of 6 jobs failed" in done.stderr and "sweep: 6 of 6 jobs done" in done.stderr, done.stderr
+    jobs = [json.loads((tmp_path / "sweep" / str(number) / "job.json").read_text()) for number in range(6)]
+    assert [job["state"] for job in jobs] == ["done", "done", "failed", "failed", "done", "done"]
+    assert jobs[2]["error"] == f"{tmp_path / 'sweep' / '2'}: its process died; it crashed, or memory ran out"
 
 
 def test_hydras_own_word_for_a_sweep_sweeps_as_well(tmp_path, capfd):
