@@ -9,13 +9,15 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from trihedron.pipeline.errors import UsageError
 from trihedron.pipeline.recording import Recording
 from trihedron.tools.arguments import Parser
 from trihedron.tools.export import RECORDING
 
 
 def main(argv: list[str]) -> int:
-    """Run the command; returns the exit code. Raises UsageError where rerun is not installed, RecordingError for a file that cannot be read."""
+    """Run the command; returns the exit code. Raises UsageError where rerun is not installed or its window does not open, RecordingError for a file
+    that cannot be read."""
     from trihedron.tools.export_rerun import require_rerun, show
 
     parser = Parser("view", __name__)
@@ -24,7 +26,11 @@ def main(argv: list[str]) -> int:
     rerun = require_rerun()
     recording = Recording(run / RECORDING if run.is_dir() else run)
     stream = rerun.RecordingStream("trihedron")
-    stream.spawn()
-    print(f"{show(recording, stream)} frames of {recording.path}")
-    stream.flush()
+    try:
+        stream.spawn()
+        count = show(recording, stream)
+        stream.flush()
+    except RuntimeError as error:  # there is no display, for example
+        raise UsageError("rerun", f"its window does not open: {error}", f"write a file instead: trihedron export {run} --to rerun") from error
+    print(f"{count} frames of {recording.path}")
     return 0

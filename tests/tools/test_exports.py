@@ -90,6 +90,29 @@ def test_what_cannot_be_exported_is_one_line(run, tmp_path, monkeypatch, capsys)
         assert capsys.readouterr().err == "trihedron: rerun: is not installed; install it with: pip install trihedron[view]\n"
 
 
+class Windowless:
+    """rerun where there is no display: the stream takes everything, and cannot hand it over."""
+
+    class RecordingStream:
+        def __init__(self, name):
+            pass
+
+        def spawn(self):
+            pass
+
+        def flush(self):
+            raise RuntimeError("gRPC has been unable to connect for 7s")
+
+
+def test_a_viewer_that_does_not_open_is_one_line(run, monkeypatch, capsys):
+    monkeypatch.setattr(export_rerun, "require_rerun", lambda: Windowless)
+    monkeypatch.setattr(export_rerun, "show", lambda recording, stream: 9)
+    assert main(["view", str(run)]) == 2
+    printed = capsys.readouterr()
+    line = f"its window does not open: gRPC has been unable to connect for 7s; write a file instead: trihedron export {run} --to rerun"
+    assert printed.err == f"trihedron: rerun: {line}\n" and printed.out == ""
+
+
 @pytest.mark.skipif(importlib.util.find_spec("rerun") is None, reason="rerun is not installed (the extra `view`)")
 def test_a_file_for_rerun_is_whole_and_holds_everything(run):
     assert main(["export", str(run), "--to", "rerun"]) == 0
