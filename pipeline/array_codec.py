@@ -58,7 +58,7 @@ def get_array(array: Any, place: str) -> Any:
         dtype = np.dtype(object)
     shape = tuple(array.shape)
     size = int(np.prod([float(n) for n in shape])) * dtype.itemsize if shape else dtype.itemsize
-    if dtype.hasobject or any(n < 0 for n in shape) or size > MAX_BYTES:
+    if dtype.hasobject or any(n < 0 for n in shape) or size > MAX_BYTES or (shape and array.dtype in SCALARS):
         raise RecordingError(place, f"array '{array.name}' claims type {array.dtype!r} and shape {shape}", DAMAGED)
     if array.encoding not in ENCODINGS:
         cause = f"array '{array.name}' has the encoding '{array.encoding[:40]}', this program reads {', '.join(ENCODINGS)}"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import cache
 from typing import Any
 
 import cv2
@@ -113,12 +114,18 @@ def _in_world(value: Value, name: str, **primitives: Any) -> SceneUpdate:
 def _filled(message: Any, field: str, rows: Any) -> Any:
     """Add rows (n, k) to a field that repeats messages of k doubles (points, colours): their bytes at once, not object by object."""
     rows = np.asarray(rows, np.float64).reshape(-1, rows.shape[-1])
-    packed = np.zeros(len(rows), [("tag", "u1"), ("size", "u1"), *((f"{part}{i}", kind) for i in range(rows.shape[1]) for part, kind in _DOUBLE)])
+    packed = np.zeros(len(rows), _packed(rows.shape[1]))
     packed["tag"], packed["size"] = message.DESCRIPTOR.fields_by_name[field].number << 3 | 2, 9 * rows.shape[1]
     for i in range(rows.shape[1]):
         packed[f"key{i}"], packed[f"value{i}"] = (i + 1) << 3 | 1, rows[:, i]
     message.MergeFromString(packed.tobytes())
     return message
+
+
+@cache
+def _packed(doubles: int) -> np.dtype[Any]:
+    """The bytes of a message of so many doubles in a field."""
+    return np.dtype([("tag", "u1"), ("size", "u1"), *((f"{part}{i}", kind) for i in range(doubles) for part, kind in _DOUBLE)])
 
 
 _DOUBLE = (("key", "u1"), ("value", "<f8"))
@@ -145,11 +152,11 @@ def _half(pixels: F32) -> F64:
 def planes(planes: Planes) -> SceneUpdate:
     """Each region as the convex hull of its samples, in the camera frame."""
     triangles = []
-    for i, plane in enumerate(planes.coefficients):
+    for i, basis in enumerate(tangent_basis(planes.coefficients[:, :3])):
         samples = planes.samples_m[i][np.isfinite(planes.samples_m[i, :, 0])]
         if len(samples) < 3:
             continue
-        flat = (samples @ tangent_basis(plane[:3])).astype(np.float32)
+        flat = (samples @ basis).astype(np.float32)
         hull = samples[cv2.convexHull(flat, returnPoints=False)[:, 0]]
         middle = np.arange(1, len(hull) - 1)
         fan = hull[np.stack([0 * middle, middle, middle + 1], axis=1).ravel()]
