@@ -7,6 +7,7 @@ import json
 import logging
 import subprocess
 import sys
+import threading
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator
@@ -35,6 +36,7 @@ RECORDING = "run.mcap"
 PATH_KEYS = ("dataset.path", "dataset.camera", "load_map")
 WARM_UP_FRAMES = 3  # enough for every stage to have been called, so that compilation is not measured
 PLAIN_PROGRESS_SECONDS = 5.0
+SILENT_SECONDS = 5.0  # before it is said why no frame is seen yet; with compiled kernels the first frames take less
 
 
 def execute(config: DictConfig, out: Path, overrides: list[str], began: float) -> dict[str, Any]:
@@ -179,11 +181,17 @@ def _commit() -> str:
 def _warm_up(runner: Runner) -> None:
     """Call every stage on the first frames so that kernels are loaded; what goes wrong here is reported by the run itself."""
     runner.count = min(runner.count, WARM_UP_FRAMES)
+    why = "preparing: what computes is compiled for this machine, once (up to two minutes), then loaded"
+    said = threading.Timer(SILENT_SECONDS, print, [why], {"file": sys.stderr, "flush": True})
+    said.daemon = True
+    said.start()
     try:
         for _ in runner.steps(None, frozenset()):
             pass
     except TrihedronError:
         pass
+    finally:
+        said.cancel()
 
 
 def _progress(steps: Iterator[Step]) -> Iterator[Step]:
