@@ -109,13 +109,17 @@ class Keeper:
             raise RecordingError(str(path), "cannot be saved: the run made no map", "choose a graph with a map")
         partial = path.with_name(path.name + ".part")
         described = {"kind": "map", "map_version": MAP_VERSION, "frame": str(self.frame), "source": source}
-        writer = RecordingWriter(partial, {**metadata, **described})
         try:
-            for topic in sorted(self._values):
-                for value in self._values[topic].values():
-                    writer.write(topic, value)
-        finally:
-            writer.close()
+            writer = RecordingWriter(partial, {**metadata, **described})
+            try:
+                for topic in sorted(self._values):
+                    for value in self._values[topic].values():
+                        writer.write(topic, value)
+            finally:
+                writer.close()
+        except RecordingError as error:
+            partial.unlink(missing_ok=True)
+            raise RecordingError(str(path), error.cause, "give another save_map=FILE.mcap") from error
         os.replace(partial, path)
 
 

@@ -1,6 +1,8 @@
 """Saved maps: a run cut in two gives what one run gives, another day only the map is used, and no file is trusted."""
 
+import errno
 import json
+import os
 import subprocess
 import sys
 from dataclasses import replace
@@ -9,6 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from trihedron.pipeline import chunk_writer
 from trihedron.pipeline.codec import Encoder
 from trihedron.pipeline.errors import RecordingError
 from trihedron.pipeline.recording import Recording, RecordingWriter
@@ -113,6 +116,23 @@ def test_wires_of_any_delay_are_remembered():
 def test_the_reach_of_a_topic_is_its_longest_delay():
     stages = toy_graph().stages
     assert reaches(stages.values()) == {"rotation": 1, "pose": 1, "map": 1}
+
+
+def test_a_map_that_cannot_be_written_is_one_line_and_leaves_nothing(runs, tmp_path, monkeypatch):
+    keeper = Keeper({"map": 1}, Memory(), 0)
+    keeper.see(3, {"map": load_map(str(runs / "map.mcap")).map})
+    with pytest.raises(RecordingError) as error:
+        keeper.save(tmp_path / "no" / "a.mcap", {}, "{}")
+    assert str(error.value) == f"{tmp_path}/no/a.mcap: cannot be written: No such file or directory; give another save_map=FILE.mcap"
+    monkeypatch.setattr(chunk_writer._Descriptor, "write", full_disk)
+    with pytest.raises(RecordingError) as error:
+        keeper.save(tmp_path / "a.mcap", {}, "{}")
+    assert str(error.value) == f"{tmp_path}/a.mcap: cannot be written: No space left on device; give another save_map=FILE.mcap"
+    assert list(tmp_path.iterdir()) == []
+
+
+def full_disk(descriptor, data):
+    raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
 
 def written(path, metadata, map=None):
