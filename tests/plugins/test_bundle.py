@@ -198,6 +198,18 @@ def test_a_window_without_some_kinds_stays_sane(room, kinds):
         assert np.isfinite(value).all()
 
 
+def test_what_is_said_is_what_the_map_then_holds(room):
+    """Bit for bit, to a micrometre: the correction is rounded as the map's columns are, and so is what is recorded of both."""
+    map = room[1]
+    found = LocalWindow()(map)
+    after = apply_correction(map, found)
+    assert np.array_equal(after.points.rows("position_m", found.point_ids), found.points_m)
+    assert np.array_equal(after.points.rows("information", found.point_ids), found.point_information)
+    assert np.array_equal(after.lines.rows("endpoints_m", found.line_ids), found.endpoints_m)
+    micrometres = found.points_m * 2.0**20
+    assert len(micrometres) > 100 and np.array_equal(micrometres, np.rint(micrometres))
+
+
 def test_two_walls_leave_the_motion_along_them_where_it_was(room):
     _, map = room
     bare = without_kinds(map, "points", "lines")
