@@ -64,7 +64,8 @@ CASES = {
     "rolling shutter": Case({"readout_ms": 10.0}, most_mm=30.0),
     "5 Hz": Case({"every": 6}, {"length": 300}, 30.0),
     "gamma": Case({"gamma": 2.2, "during": "30:"}),
-    "moving objects over 30 %": Case({"moving": 0.3}, most_mm=300.0, normalised=NOT_TOLD),
+    "moving objects over 30 %": Case({"moving": 0.3}, most_mm=60.0),
+    "moving objects over half": Case({"moving": 0.5}, most_mm=80.0),
     "mirrors and glass": Case({"reflecting": 0.2}, most_mm=80.0),
     "turning on the spot, all round": Case({}, {"motion": "pan", "length": 545}, 30.0),
 }  # fmt: skip

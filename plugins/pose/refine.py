@@ -9,6 +9,7 @@ import numpy as np
 from trihedron.pipeline.registry import register
 from trihedron.pipeline.types import (
     DEGRADED,
+    F64,
     I32,
     LOST,
     OK,
@@ -28,8 +29,10 @@ from trihedron.plugins.numerics.maps.decoupled import FIRST_SIGMA, Decoupled, de
 from trihedron.plugins.numerics.maps.focal_check import wrong_focal
 from trihedron.plugins.numerics.maps.foundations import SCORE, foundation_sigma_m
 from trihedron.plugins.numerics.maps.map_terms import line_terms, plane_terms, point_terms
+from trihedron.plugins.numerics.maps.proven import LEAST, distance2, proven
 from trihedron.plugins.numerics.maps.submaps import submap_of
-from trihedron.plugins.numerics.motion.pose_solver import PoseSolution, solve_pose
+from trihedron.plugins.numerics.motion.pose_solver import PoseSolution, classify_terms, solve_pose
+from trihedron.plugins.numerics.motion.pose_terms import LineTerms, PlaneTerms, PointTerms
 
 
 @register("pose", "refine")
@@ -39,7 +42,8 @@ class Refine:
 
     The decoupled rotation is a prior with its own covariance; the decoupled position only says where to start (`position_sigma_m`), since the same
     features made it. Without a map the decoupled pose stands. A lost pose is only where to look: it is found again when enough of the map agrees on a
-    place that all directions are measured of, else it stays lost; and what neither the previous frame nor the map agrees with is lost."""
+    place that all directions are measured of, else it stays lost; and what neither the previous frame nor the map agrees with is lost. Where
+    something moves, landmarks that two keyframes measured in one place say the pose (`numerics/maps/proven`)."""
 
     position_sigma_m: float = 0.05  # of the decoupled position, a weak prior
     rotation_sigma_deg: float = 0.2  # added to the rotation's own: no scene is exactly Manhattan
@@ -52,6 +56,9 @@ class Refine:
     weak_foundation: float = 3.0  # times its own standard deviation that the map's keyframes about here may have before a pose is called degraded
     focal_off: float = 0.1  # share by which the focal lengths are off, beyond which a pose is called degraded, if the map's newest keyframes
     focal_worse: float = 0.2  # fit by this share worse for it
+    moving_share: float = 0.15  # by which the shares of new and of proven points that disagree may differ; beyond, something may move
+    moving_gate: float = 2.2  # squared standard deviations (the lowest tenth of χ²) from the pose by what is proven alone, beyond which that is taken
+    moving_most: float = 0.4  # of all matches that must agree with it then, else the pose is called degraded
     submap_after: int = 15  # frames that show a place that is not known, after which a lost camera begins a new sub-map; 0 = never
 
     def __post_init__(self) -> None:
@@ -64,6 +71,8 @@ class Refine:
             raise ValueError("weak_foundation: must be positive")
         if self.focal_off <= 0.0 or self.focal_worse <= 0.0:
             raise ValueError("focal_off, focal_worse: must be positive")
+        if not 0.0 < self.moving_share <= 1.0 or self.moving_gate <= 0.0 or not 0.0 <= self.moving_most <= 1.0:
+            raise ValueError("moving_share, moving_gate, moving_most: must be positive, the shares at most 1")
         if self.submap_after < 0:
             raise ValueError("submap_after: must not be negative")
         if self.found_inliers < self.min_inliers or not self.min_share <= self.found_share <= 1.0:
@@ -90,6 +99,7 @@ class Refine:
             return start.said(frame, map)
         submap = relocalise.submap if relocalise is not None and relocalise.status == OK else submap_of(previous, map)
         found = self._solve(start, frame, matches, keypoints, segments, planes, map)
+        found, moving = self._at_rest(found, start, frame, matches, keypoints, segments, planes, map)
         inliers = _inliers(found, len(matches.planes))
         sought = len(matches.keypoints) + len(matches.segments) + len(matches.planes)
         if start.status == LOST and not self._found_again(found, inliers, sought):
@@ -101,6 +111,8 @@ class Refine:
         if not inliers.any():
             return start.said(frame, map, "nothing of the map was found, pose from the previous frame", submap)
         status, reason = self._judge(found, inliers, sought, rotation)
+        if moving:
+            status, reason = self._judge_moving(inliers, sought, status, reason)
         if status == OK:
             status, reason = self._judge_foundation(found, matches, map, reason)
         if submap:
@@ -122,20 +134,48 @@ class Refine:
     def _solve(
         self, start: Decoupled, frame: Frame, matches: Matches, keypoints: Keypoints, segments: Segments, planes: Planes, map: Map
     ) -> PoseSolution:
-        T = start.T_world_camera
         position = self.position_sigma_m**2 * np.eye(3) + start.covariance[:3, :3]
         prior = np.zeros((6, 6))
         prior[:3, :3] = np.linalg.inv(position)
         prior[3:, 3:] = np.linalg.inv(start.covariance[3:, 3:] + np.radians(self.rotation_sigma_deg) ** 2 * np.eye(3))
-        return solve_pose(
-            T,
-            frame.camera,
-            T,
-            prior,
+        T = start.T_world_camera
+        return solve_pose(T, frame.camera, T, prior, *self._terms(T, frame, matches, keypoints, segments, planes, map))
+
+    def _terms(
+        self, T_world_camera: F64, frame: Frame, matches: Matches, keypoints: Keypoints, segments: Segments, planes: Planes, map: Map
+    ) -> tuple[PointTerms, LineTerms, PlaneTerms]:
+        """All matches as terms, lines taken as they are seen from a pose."""
+        return (
             point_terms(map, keypoints, matches.keypoints),
-            line_terms(map, segments, matches.segments, T, frame.camera, self.line_sigma_px),
+            line_terms(map, segments, matches.segments, T_world_camera, frame.camera, self.line_sigma_px),
             plane_terms(map, planes, matches.planes, matches.parallel, matches.perpendicular, self.relation_sigma_deg),
         )
+
+    def _at_rest(
+        self,
+        found: PoseSolution,
+        start: Decoupled,
+        frame: Frame,
+        matches: Matches,
+        keypoints: Keypoints,
+        segments: Segments,
+        planes: Planes,
+        map: Map,
+    ) -> tuple[PoseSolution, bool]:
+        """The solution as it is; where new landmarks or most planes contradict what is proven and pull the pose away, that of what is proven alone,
+        with all matches judged by it, and True."""
+        known = proven(map, matches)
+        walls = np.count_nonzero(found.planes[: len(matches.planes)])
+        if start.status == LOST or np.count_nonzero(known.points) < LEAST:
+            return found, False
+        if known.contradicted(found.points) < self.moving_share and 2 * walls >= len(matches.planes):
+            return found, False
+        alone = self._solve(start, frame, known.only(matches), keypoints, segments, planes, map)
+        if alone.unobservable.shape[1] or distance2(alone, found) < self.moving_gate:
+            return found, False
+        T = alone.T_world_camera
+        flags = classify_terms(T, frame.camera, *self._terms(T, frame, matches, keypoints, segments, planes, map))
+        return replace(alone, points=flags.points, lines=flags.lines, planes=flags.planes), True
 
     def _found_again(self, found: PoseSolution, inliers: I32, sought: int) -> bool:
         """Whether the map alone says where a lost camera is."""
@@ -153,6 +193,12 @@ class Refine:
         if rotation.source == "prediction":
             return DEGRADED, "the rotation was predicted, not measured, before refinement"
         return OK, f"{inliers[0]} points, {inliers[1]} lines and {inliers[2]} planes of the map"
+
+    def _judge_moving(self, inliers: I32, sought: int, status: str, reason: str) -> tuple[str, str]:
+        """The same, of what is proven; where the larger part of all that is seen disagrees it may be the scene that does not move."""
+        if status == OK and inliers.sum() < self.moving_most * sought:
+            return DEGRADED, f"something moves: only {inliers.sum()} of {sought} matches agree with what is proven"
+        return status, f"{reason}, by what is proven alone"
 
     def _judge_foundation(self, found: PoseSolution, matches: Matches, map: Map, reason: str) -> tuple[str, str]:
         """A pose is not better known than the keyframes behind what it was found from: after a loss, of planes alone, or under wrong

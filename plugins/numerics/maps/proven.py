@@ -1,0 +1,50 @@
+"""What moves, told by what stayed: landmarks that two keyframes measured in the same place are part of the scene, newer ones may be anything.
+
+A walking person has thousands of corners, near and therefore measured better than any wall, and from one frame to the next all of them tell of one
+A walking person has thousands of corners, near and therefore measured better than any wall, and from one frame to the next all of them tell of one
+two keyframes. So where new landmarks contradict proven ones, the proven ones are right.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from trihedron.pipeline.geometry import invert, log_se3
+from trihedron.pipeline.types import U8, Bool, Map, Matches
+from trihedron.plugins.numerics.motion.pose_solver import PoseSolution
+
+AGREED = 2  # keyframes that measured a landmark in the same place, with which it is proven
+LEAST = 30  # points of each kind below which shares of them say nothing
+
+
+@dataclass(frozen=True)
+class Proven:
+    """Which of a frame's matches are with proven landmarks: points (n,) and lines (m,). Planes are: what moves is seldom flat and large."""
+
+    points: Bool
+    lines: Bool
+
+    def only(self, matches: Matches) -> Matches:
+        """The matches with proven landmarks."""
+        return replace(matches, keypoints=matches.keypoints[self.points], segments=matches.segments[self.lines])
+
+    def contradicted(self, points: U8) -> float:
+        """By how much larger a share (0 … 1) of the new points than of the proven ones are outliers (flags (n,)), or the other way round; 0 where
+        either are too few."""
+        new, old = points[~self.points] == 0, points[self.points] == 0
+        return float(abs(new.mean() - old.mean())) if min(len(new), len(old)) >= LEAST else 0.0
+
+
+def proven(map: Map, matches: Matches) -> Proven:
+    """Which matches are with landmarks that at least two keyframes agree on."""
+    points, lines = (table.rows("found", pairs[:, 1]) >= AGREED for table, pairs in ((map.points, matches.keypoints), (map.lines, matches.segments)))
+    return Proven(points, lines)
+
+
+def distance2(one: PoseSolution, other: PoseSolution) -> float:
+    """Squared standard deviations of the first solution between it and another one, which was found from more (Hausman, Econometrica 1978,
+    whose covariance is the first's less the other's: this one is on the safe side)."""
+    xi = log_se3(invert(one.T_world_camera) @ other.T_world_camera)
+    return float(xi @ np.linalg.solve(one.covariance, xi))

@@ -1,0 +1,108 @@
+"""What moves is told by landmarks that stayed where they were."""
+
+import dataclasses
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from trihedron.pipeline.geometry import exp_se3
+from trihedron.plugins.matches.local_map import LocalMap
+from trihedron.plugins.numerics.maps.proven import LEAST, Proven, distance2, proven
+from trihedron.plugins.numerics.motion.pose_solver import PoseSolution
+from trihedron.plugins.pose.refine import Refine
+
+sys.path.insert(0, str(Path(__file__).parent))
+from landmark_world import World, camera_at, rotation_of, translation_of
+from map_steps import EVERY, pose_of, walk
+from test_pose import OFF, error
+
+STEP = 8  # of the camera's path, where the map of steps 0 … 6 is looked for
+SWAY = np.array([0.02, 0.01, 0.0])  # m, what moves has gone
+
+
+@pytest.fixture(scope="module")
+def world():
+    return World(2000)
+
+
+@pytest.fixture(scope="module")
+def map(world):
+    return walk(world, 4, EVERY, stride=2)
+
+
+def matched(world, map):
+    """The features of a frame, and its matches from a decoupled pose 3 cm and half a degree off."""
+    guess, features = camera_at(STEP) @ exp_se3(OFF), world.features(camera_at(STEP), STEP)
+    start = rotation_of(guess, STEP, 0.5), translation_of(guess, STEP, sigma_m=0.03)
+    return start, features, LocalMap()(world.frame(STEP), *start, *features, map, None)
+
+
+def with_movers(map, matches, share, shift_m):
+    """The map in which a share of the points that are matched were met once, and have moved since."""
+    ids = matches.keypoints[:, 1]
+    ids = ids[np.random.default_rng(0).random(len(ids)) < share]
+    place = map.points.rows("position_m", ids) + shift_m
+    return dataclasses.replace(map, points=map.points.updated(ids, position_m=place, found=np.ones(len(ids), np.int32)))
+
+
+def refined(world, map, share, shift_m=SWAY, **options):
+    start, features, matches = matched(world, map)
+    moved = with_movers(map, matches, share, shift_m)
+    return Refine(**options)(world.frame(STEP), *start, None, matches, *features, pose_of(camera_at(STEP - 1), STEP - 1), moved, None)
+
+
+def test_a_landmark_that_two_keyframes_measured_is_proven(world, map):
+    _, _, matches = matched(world, map)
+    found = proven(map, matches)
+    for ids, known, table, kind in (
+        (matches.keypoints[:, 1], found.points, map.point_observations, "point"),
+        (matches.segments[:, 1], found.lines, map.line_observations, "line"),
+    ):
+        seen = np.bincount(table.column(kind), minlength=ids.max() + 1)[ids]
+        assert (seen[known] >= 2).all() and (known == (seen >= 2)).mean() > 0.98  # two rows of one corner that became one were seen once each
+    kept = found.only(matches)
+    assert np.array_equal(kept.keypoints, matches.keypoints[found.points]) and np.array_equal(kept.planes, matches.planes)
+
+
+def test_new_points_contradict_proven_ones_by_the_difference_of_their_shares():
+    known = Proven(np.arange(200) < 100, np.empty(0, bool))
+    agree = np.ones(200, np.uint8)
+    assert known.contradicted(agree) == 0.0
+    agree[:10], agree[100:140] = 0, 0  # 10 % of the proven, 40 % of the new
+    assert known.contradicted(agree) == pytest.approx(0.3) and Proven(~known.points, known.lines).contradicted(agree) == pytest.approx(0.3)
+    assert Proven(np.arange(200) < LEAST - 1, known.lines).contradicted(agree) == 0.0
+
+
+def test_the_distance_is_in_standard_deviations_of_the_first():
+    sigma = np.array([0.01, 0.02, 0.04, 0.001, 0.002, 0.004])
+    none = np.empty(0, np.uint8)
+    first = PoseSolution(camera_at(3), np.diag(sigma**2), np.empty((6, 0)), none, none, none, 0.0)
+    other = dataclasses.replace(first, T_world_camera=camera_at(3) @ exp_se3(2.0 * sigma), covariance=1e6 * np.eye(6))
+    assert distance2(first, other) == pytest.approx(24.0, rel=0.01) and distance2(first, first) < 1e-12
+
+
+@pytest.mark.parametrize("share", [0.3, 0.6])
+def test_what_moves_does_not_pull_the_pose(world, map, share):
+    pose, pulled = refined(world, map, share), refined(world, map, share, moving_gate=1e9)
+    still = refined(world, map, share, np.zeros(3))
+    print(f"{share:.0%} moving: {error(pose, STEP)}, all alike {error(pulled, STEP)}, at rest {error(still, STEP)} (m, deg)")
+    assert error(pose, STEP)[0] < 0.006 and pose.status == "ok" and pose.reason.endswith("by what is proven alone")
+    assert error(pulled, STEP)[0] > 2.0 * error(pose, STEP)[0]
+
+
+def test_where_most_contradicts_what_is_proven_the_pose_is_degraded(world, map):
+    pose = refined(world, map, 0.75, 2.5 * SWAY)
+    assert pose.status == "degraded" and "something moves" in pose.reason
+
+
+def test_new_points_at_rest_count_like_the_others(world, map):
+    pose, alike = refined(world, map, 0.5, np.zeros(3)), refined(world, map, 0.5, np.zeros(3), moving_share=1.0, moving_gate=1e9)
+    assert np.array_equal(pose.T_world_camera, alike.T_world_camera) and pose.reason == alike.reason and pose.status == "ok"
+
+
+@pytest.mark.parametrize("field", ["moving_share", "moving_gate"])
+def test_ranges_are_checked(field):
+    with pytest.raises(ValueError, match=field):
+        Refine(**{field: 0.0})
