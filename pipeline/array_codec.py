@@ -11,6 +11,7 @@
 
 from __future__ import annotations
 
+import re
 from typing import Any
 
 import cv2
@@ -52,10 +53,7 @@ def get_array(array: Any, place: str) -> Any:
     """The content of one protobuf Array. Raises RecordingError, beginning with `place`, unless its bytes match its declared shape."""
     if array.dtype == "str":
         return array.data.decode("utf-8", "replace")
-    try:
-        dtype = np.dtype({"bool": "?", "int": "i8", "float": "f8"}.get(array.dtype, array.dtype))
-    except TypeError:
-        dtype = np.dtype(object)
+    dtype = element_type({"bool": "?", "int": "i8", "float": "f8"}.get(array.dtype, array.dtype))
     shape = tuple(array.shape)
     size = int(np.prod([float(n) for n in shape])) * dtype.itemsize if shape else dtype.itemsize
     if dtype.hasobject or any(n < 0 for n in shape) or size > MAX_BYTES or (shape and array.dtype in SCALARS):
@@ -68,6 +66,11 @@ def get_array(array: Any, place: str) -> Any:
         raise RecordingError(place, f"array '{array.name}' does not have the {size} bytes of its shape {shape}", DAMAGED)
     content = np.frombuffer(data, dtype).reshape(shape)
     return SCALARS[array.dtype](content[()]) if array.dtype in SCALARS else content
+
+
+def element_type(name: str) -> np.dtype[Any]:
+    """The type of that name, `object` for any but numbers and truth values: NumPy would read more into a text."""
+    return np.dtype(name if re.fullmatch(r"\?|b1|[iu][1248]|f[248]", name) else object)
 
 
 def _plain(array: Any, shape: tuple[int, ...], size: int) -> bytes | None:

@@ -20,7 +20,7 @@ import numpy as np
 from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
 
 from trihedron.pipeline import types
-from trihedron.pipeline.array_codec import DAMAGED, get_array, put_array
+from trihedron.pipeline.array_codec import DAMAGED, element_type, get_array, put_array
 from trihedron.pipeline.arrays import array_specs
 from trihedron.pipeline.errors import RecordingError
 from trihedron.pipeline.table import CHUNK, Column, Table
@@ -242,7 +242,7 @@ def _there(known: int, size: int, empty: Any) -> Any:
 
 
 def _column(dtype: str, shape: list[int], step: float = 0.0) -> Column:
-    if np.dtype(dtype).hasobject:
+    if element_type(dtype).hasobject:
         raise ValueError(f"a column of type {dtype!r}")
     if not (np.isfinite(step) and step >= 0.0):
         raise ValueError(f"a column in steps of {step!r}")

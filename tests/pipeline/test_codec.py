@@ -1,6 +1,7 @@
 """Values come back bit for bit; damaged bytes are refused in one line."""
 
 import contextlib
+import json
 from dataclasses import replace
 
 import lz4.frame
@@ -230,6 +231,14 @@ def test_damaged_and_foreign_values_are_refused():
     (stride,) = (array for array in message.arrays if array.name == "stride")
     stride.shape[:], stride.data = (2,), bytes(16)
     assert "array 'stride' claims type 'int' and shape (2,)" in refusal(message)
+    for text in (",1", "f4,f4", "i4, (2)f8", "O", "M8[ns]", "V16", "(2,)f4"):  # some of which NumPy evaluates
+        message = message_of(keypoints())
+        message.arrays[0].dtype = text
+        assert f"array 'pixels' claims type '{text}' and shape (20, 2)" in refusal(message)
+        message = message_of(next(iter(maps(1))))
+        (head,) = (array for array in message.arrays if array.name == "points#")
+        head.data = head.data.replace(b'"?"', json.dumps(text).encode())
+        assert f"a column of type {text!r}" in refusal(message)
     message = message_of(keypoints())
     message.arrays[1].shape[0] = 19
     assert refusal(message) == (
