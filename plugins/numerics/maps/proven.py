@@ -1,8 +1,8 @@
 """What moves, told by what stayed: landmarks that two keyframes measured in the same place are part of the scene, newer ones may be anything.
 
-A walking person has thousands of corners, near and therefore measured better than any wall, and from one frame to the next all of them tell of one
-A walking person has thousands of corners, near and therefore measured better than any wall, and from one frame to the next all of them tell of one
-two keyframes. So where new landmarks contradict proven ones, the proven ones are right.
+Somebody who walks past has many corners, near and therefore measured better than any wall, and from one frame to the next they all tell of one
+motion, which may not be the camera's. By the next keyframe they are elsewhere, so few of the landmarks that two keyframes measured are theirs. Where
+new landmarks contradict proven ones, the proven ones are right.
 """
 
 from __future__ import annotations
