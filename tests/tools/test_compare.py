@@ -2,11 +2,13 @@
 
 import csv
 import json
+from pathlib import Path
 
 import numpy as np
 import pytest
 from hydra import compose, initialize_config_module
 
+import trihedron.conf
 from trihedron.pipeline.cli import main
 from trihedron.pipeline.config import graph_of, register_configs
 from trihedron.pipeline.errors import UsageError
@@ -14,6 +16,7 @@ from trihedron.pipeline.registry import load_plugins
 from trihedron.tools.compare import read_runs, rows_of
 from trihedron.tools.comparison_table import WRITERS, as_latex, as_markdown, as_text
 
+GRAPHS = Path(trihedron.conf.__file__).parent / "graph"
 SMALL = ["dataset.width=160", "dataset.height=120", "dataset.length=4"]
 
 
@@ -91,6 +94,22 @@ def test_a_sweep_ends_with_the_table(tmp_path, capsys):
     assert main(sweep) == 0
     said = capsys.readouterr().out
     assert said.startswith("change ") and "\nwithout=nothing " in said and "\nwithout=planes " in said
+
+
+@pytest.mark.slow
+def test_every_system_computed_again_has_the_same_figures(tmp_path):
+    """The table of all graphs twice from nothing, the second time with other threads: equal figures, and the same bytes of each surface."""
+    words = ["run", "-m", "experiment=paper_table", "outputs=[trajectory,surface]", 'sequences=["synthetic length=12 width=320 height=240"]']
+    found = []
+    for folder, threads in (("once", "threads=1"), ("again", "threads=2")):
+        assert main([*words, threads, f"out={tmp_path / folder}"]) == 0
+        runs = {run.overrides["graph"]: run.folder for run in read_runs(tmp_path / folder)}
+        metrics = {graph: json.loads((run / "metrics.json").read_text()) for graph, run in runs.items()}
+        found.append({graph: (metrics[graph], (run / "surface.ply").read_bytes()) for graph, run in runs.items()})
+    print("\n".join(f"{graph}: {1e3 * metrics['final']['ate_rmse_m']:.3f} mm" for graph, (metrics, _) in found[0].items()))
+    assert [graph for graph in found[0] if found[0][graph] != found[1][graph]] == []
+    assert len(found[0]) == len(found[1]) == len(list(GRAPHS.glob("*.yaml")))
+    assert all(np.isfinite(metrics["final"]["ate_rmse_m"]) for metrics, _ in found[0].values())
 
 
 def test_a_folder_without_runs(tmp_path, capsys):
