@@ -181,14 +181,11 @@ def _put_table(message: Any, name: str, table: Table, previous: Table | None) ->
     touched = {column: _others(before[column], chunks) for column, chunks in table.chunks.items()}
     emptied = {i for i in set().union(*touched.values()) if table.is_empty(i)}
     for column, chunks in table.chunks.items():
-        known = before[column]
         here = [i for i in touched[column] if i not in emptied]
-        rows = {i: _changed(known[i], chunks[i]) if i < len(known) else np.arange(len(chunks[i])) for i in here}
-        found = [i for i in here if len(rows[i])]
-        if found:
-            ids = np.concatenate([i * CHUNK + rows[i] for i in found]).astype(np.int32)
+        ids, values = _changed(before[column], chunks, here)
+        if len(ids):
             changed[column] = numbers.setdefault(ids.tobytes(), len(numbers))
-            put_array(message, f"{name}#{column}", np.concatenate([chunks[i][rows[i]] for i in found]), False)
+            put_array(message, f"{name}#{column}", values, False)
     for ids_bytes, k in numbers.items():
         put_array(message, f"{name}#rows{k}", np.frombuffer(ids_bytes, np.int32), False)
     if emptied:
@@ -203,11 +200,24 @@ def _others(known: Sequence[Any], chunks: Sequence[Any]) -> list[int]:
     return [i for i in range(same) if known[i] is not chunks[i]] + list(range(same, len(chunks)))
 
 
-def _changed(known: Any, chunk: Any) -> Any:
-    """Rows of a chunk, CHUNK at most, that the one known, no longer than this, does not have. They are compared by their bytes: NaN is no change."""
-    word = math.gcd(chunk.itemsize * math.prod(chunk.shape[1:]), 8)  # bytes compared at once
-    before, after = (np.ascontiguousarray(part).reshape(len(part), -1).view(f"u{word}").reshape(len(part), -1) for part in (known, chunk))
-    return np.concatenate([np.flatnonzero((before != after[: len(before)]).any(axis=1)), np.arange(len(before), len(after))])
+def _changed(known: Sequence[Any], chunks: Sequence[Any], here: list[int]) -> tuple[Any, Any]:
+    """Numbers and values of the rows of the chunks `here` that those known, none longer than these, do not have. They are compared by their bytes:
+    NaN is no change."""
+    if not here:
+        return np.empty(0, np.int32), chunks
+    rows, before = np.concatenate([chunks[i] for i in here]), [known[i] for i in here if i < len(known)]
+    differ = np.ones(len(rows), np.bool_)
+    if before:  # all but the last are full, so that these are the first rows
+        old = np.concatenate(before)
+        differ[: len(old)] = (_words(old) != _words(rows[: len(old)])).any(axis=1)
+    numbers = (np.array(here, np.int32)[:, None] * CHUNK + np.arange(CHUNK, dtype=np.int32)).reshape(-1)[: len(rows)]
+    return numbers[differ], rows[differ]
+
+
+def _words(rows: Any) -> Any:
+    """Rows as the largest whole numbers that they are made of."""
+    word = math.gcd(rows.itemsize * math.prod(rows.shape[1:]), 8)
+    return rows.reshape(len(rows), -1).view(f"u{word}").reshape(len(rows), -1)
 
 
 def _get_table(name: str, tables: Mapping[str, Any], previous: Table | None) -> Table:
