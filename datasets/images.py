@@ -10,9 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from trihedron.datasets.picture_headers import JPEG, PNG, UnreadableImage, picture_header
+from trihedron.datasets.png_chunks import is_whole_png
 from trihedron.datasets.png_decoder import decode_png
 from trihedron.pipeline.errors import DataError
-from trihedron.pipeline.png import is_whole_png
 from trihedron.pipeline.types import F32, U8
 
 JPEG_END = b"\xff\xd9"  # of a complete file; a decoder would fill the rest of a truncated one with grey and say nothing

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from zlib_ng import zlib_ng
 
-from trihedron.pipeline.png import PNG_MAGIC, chunks
+from trihedron.datasets.png_chunks import PNG_MAGIC, chunks
 from trihedron.pipeline.types import U8
 
 CHANNELS = {0: 1, 2: 3}  # of the colour types that are read here

@@ -18,7 +18,6 @@ VOCABULARY = {"types", "geometry", "errors", "slots", "registry"}  # what plugin
 EXCEPTIONS = {
     ("datasets/mcap.py", "pipeline.recording"),  # reads what the machinery writes
     ("datasets/mcap.py", "pipeline.mcap_file"),
-    ("datasets/images.py", "pipeline.png"),
     ("datasets/robot_streams.py", "pipeline.mcap_file"),
     ("datasets/robot_recording.py", "pipeline.mcap_file"),
     ("pipeline/results.py", "datasets.trajectories"),  # the one text format of trajectories

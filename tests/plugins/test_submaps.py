@@ -75,7 +75,7 @@ def test_a_sub_map_is_tied_where_the_camera_is_recognised(both):
     moved = np.flatnonzero(map.points.column("alive") & (map.points.column("first") >= 6))[:50]
     untouched = np.isclose(after.points.rows("found", moved), map.points.rows("found", moved))  # not measured again by the frame itself
     expected = transform(invert(AWAY), map.points.rows("position_m", moved))
-    assert np.allclose(after.points.rows("position_m", moved)[untouched], expected[untouched], atol=1e-9)
+    assert np.allclose(after.points.rows("position_m", moved)[untouched], expected[untouched], atol=2.0**-20)  # the steps of places
     assert len(set(local_window(after, camera_at(20), 2, 10, 5).keyframes) & set(range(6))) >= 3
 
 
