@@ -8,7 +8,7 @@ import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
 ORDER = (
-    "errors", "png", "chunk_writer", "mcap_errors", "mcap_chunks", "mcap_file", "arrays", "camera", "table", "maps", "surface", "types", "geometry",
+    "errors", "chunk_writer", "mcap_errors", "mcap_chunks", "mcap_file", "arrays", "camera", "table", "maps", "surface", "types", "geometry",
     "slots", "registry", "array_codec", "codec", "foxglove_messages", "foxglove", "graph", "metrics", "consistency", "plot", "ply", "timing",
     "recording", "live", "runs", "scheduler", "interrupts", "intake", "state", "runner", "results", "config", "jobs", "sweep", "search",
     "cluster", "engines", "execute", "cli",
