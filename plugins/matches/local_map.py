@@ -9,7 +9,7 @@ import numpy as np
 from trihedron.pipeline.geometry import pose_matrix
 from trihedron.pipeline.registry import register
 from trihedron.pipeline.types import F64, OK, Frame, Keypoints, Map, Matches, Planes, Pose, Rotation, Segments, Translation
-from trihedron.plugins.numerics.maps.local_window import local_window
+from trihedron.plugins.numerics.maps.local_window import living_keyframes, local_window
 from trihedron.plugins.numerics.maps.map_search import Guess, MapSearch
 from trihedron.plugins.numerics.places.place_check import ABOUT_DEG, ABOUT_M
 
@@ -42,7 +42,7 @@ class LocalMap(MapSearch):
         relocalise: Pose | None,
     ) -> Matches | None:
         """None while there is no map."""
-        if map is None or not map.keyframes.column("alive").any():
+        if map is None or not len(living_keyframes(map)):
             return None
         guess = self._guess(rotation, translation, relocalise)
         if relocalise is not None and relocalise.status == OK:  # the newest keyframes may be far from there

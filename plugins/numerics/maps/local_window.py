@@ -30,9 +30,18 @@ def newest_keyframes(map: Map, count: int) -> I32:
     return rows[submaps == submaps[-1]][-count:] if len(rows) else rows
 
 
+def living_keyframes(map: Map) -> I32:
+    """All living keyframes, oldest first; on a long run most are retired, so that what is asked of these alone costs little."""
+    if "living" not in map.memo:
+        map.memo["living"] = np.flatnonzero(map.keyframes.column("alive")).astype(np.int32)
+    found: I32 = map.memo["living"]
+    return found
+
+
 def keyframes_of(map: Map, submap: int) -> I32:
     """The living keyframes of a sub-map."""
-    return np.flatnonzero(map.keyframes.column("alive") & (map.keyframes.column("submap") == submap)).astype(np.int32)
+    living = living_keyframes(map)
+    return living[map.keyframes.rows("submap", living) == submap]
 
 
 def current_submap(map: Map) -> int:
@@ -80,21 +89,20 @@ def covisible_keyframes(map: Map, keyframes: I32, count: int) -> I32:
 
 
 def _covisible(map: Map, keyframes: I32, count: int) -> I32:
-    votes = _votes(map, keyframes)
-    votes[keyframes] = 0
-    votes[~map.keyframes.column("alive")] = 0
+    living = living_keyframes(map)
+    votes = np.where(np.isin(living, keyframes), 0, _votes(map, keyframes)[living])
     order = len(votes) - 1 - np.argsort(-votes[::-1], kind="stable")[:count]
-    return order[votes[order] > 0].astype(np.int32)
+    return living[order[votes[order] > 0]]
 
 
 def _near(map: Map, T_world_camera: F64, near_m: float, near_deg: float, submap: int) -> I32:
     """Living keyframes of the sub-map taken from about here in about this direction, nearest first."""
-    poses = map.keyframes.column("T_world_camera")
+    living = keyframes_of(map, submap)
+    poses = map.keyframes.rows("T_world_camera", living)
     distance = np.linalg.norm(poses[:, :3, 3] - T_world_camera[:3, 3], axis=1)
     cosine = poses[:, :3, 2] @ T_world_camera[:3, 2]
-    good = map.keyframes.column("alive") & (map.keyframes.column("submap") == submap) & (distance < near_m) & (cosine > np.cos(np.radians(near_deg)))
-    rows = np.flatnonzero(good)
-    return rows[np.argsort(distance[rows] / near_m + (1.0 - cosine[rows]), kind="stable")].astype(np.int32)
+    near = np.flatnonzero((distance < near_m) & (cosine > np.cos(np.radians(near_deg))))
+    return living[near[np.argsort(distance[near] / near_m + (1.0 - cosine[near]), kind="stable")]]
 
 
 def local_window(
