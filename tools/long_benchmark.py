@@ -2,8 +2,8 @@
 
 A walk of --loop frames is made once and shown forwards and backwards until there are --frames of them, so that the map is complete after the first
 --warm-up and what grows from there on is a leak. It runs and is recorded as by `trihedron run`, 320×240 unless told otherwise. Each row is a thousand
-frames (--span): what the process holds over them (median), the map's living rows, times from hand-over to pose, the largest error of a position. Times are
-also given as multiples of those of the feature stages in the same frames, whatever else the machine does.
+frames (--span): what the process holds (median), the map's living rows, times from hand-over to pose, the largest error of a position. Times are also
+given as multiples of those of the feature stages in the same frames, whatever else the machine does.
 
 Example: trihedron benchmark long --frames 20000 --json long.json
 """
