@@ -182,6 +182,8 @@ def _put_table(message: Any, name: str, table: Table, previous: Table | None) ->
     emptied = {i for i in set().union(*touched.values()) if table.is_empty(i)}
     for column, chunks in table.chunks.items():
         here = [i for i in touched[column] if i not in emptied]
+        if not here:
+            continue
         ids, values = _changed(before[column], chunks, here)
         if len(ids):
             changed[column] = numbers.setdefault(ids.tobytes(), len(numbers))
@@ -203,8 +205,6 @@ def _others(known: Sequence[Any], chunks: Sequence[Any]) -> list[int]:
 def _changed(known: Sequence[Any], chunks: Sequence[Any], here: list[int]) -> tuple[Any, Any]:
     """Numbers and values of the rows of the chunks `here` that those known, none longer than these, do not have. They are compared by their bytes:
     NaN is no change."""
-    if not here:
-        return np.empty(0, np.int32), chunks
     rows, before = np.concatenate([chunks[i] for i in here]), [known[i] for i in here if i < len(known)]
     differ = np.ones(len(rows), np.bool_)
     if before:  # all but the last are full, so that these are the first rows
@@ -251,7 +251,7 @@ def _there(known: int, size: int, empty: Any) -> Any:
     return rows[~np.isin(rows // CHUNK, empty)]
 
 
-def _column(dtype: str, shape: list[int], step: float = 0.0) -> Column:
+def _column(dtype: str, shape: list[int], step: float) -> Column:
     if element_type(dtype).hasobject:
         raise ValueError(f"a column of type {dtype!r}")
     if not (np.isfinite(step) and step >= 0.0):

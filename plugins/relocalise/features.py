@@ -10,7 +10,7 @@ from trihedron.pipeline.registry import register
 from trihedron.pipeline.types import DEGRADED, F64, I32, LOST, OK, Frame, Keypoints, Map, Planes, Pose, Rotation, Segments
 from trihedron.plugins.numerics.maps.decoupled import reference_of
 from trihedron.plugins.numerics.maps.landmarks import empty_map
-from trihedron.plugins.numerics.maps.local_window import keyframes_of, observed_by
+from trihedron.plugins.numerics.maps.local_window import keyframes_of, living_keyframes, observed_by
 from trihedron.plugins.numerics.maps.submaps import submap_of
 from trihedron.plugins.numerics.places.layout_poses import layout_poses
 from trihedron.plugins.numerics.places.place_check import Recognised, View, check_place
@@ -93,7 +93,7 @@ class Features:
 
     def _sought(self, map: Map, submap: int, lost: bool, index: int) -> I32:
         """Sub-maps to look in: all for a lost camera; now and then the older ones for one tracked in a sub-map that is not tied to the first."""
-        known = np.unique(map.keyframes.column("submap")[map.keyframes.column("alive")]).astype(np.int32)
+        known = np.unique(map.keyframes.rows("submap", living_keyframes(map))).astype(np.int32)
         return known if lost else known[known < submap] if index % self.every == 0 else known[:0]
 
     def _candidates(self, view: View, map: Map, submap: int) -> I32:

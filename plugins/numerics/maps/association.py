@@ -40,21 +40,22 @@ def associate(
     nor new: a second copy of a wall would do more harm than a lost measurement. New points and lines need a 3D position."""
     pairs = (matches.keypoints, matches.segments, matches.planes) if matches is not None else (NOTHING, NOTHING, NOTHING)
     points, lines, same = (kept[_alive(map, kind, kept[:, 1])] for kept, kind in zip(pairs, ("points", "lines", "planes")))
-    flags = classify_terms(
-        T_world_camera,
-        camera,
-        point_terms(map, keypoints, points),
-        line_terms(map, segments, lines, T_world_camera, camera, line_sigma_px),
-        plane_terms(map, planes, same, NOTHING, NOTHING, 1.0),
-    )
+    agreeing = same
     if judged:
-        points, lines = points[flags.points > 0], lines[flags.lines > 0]
+        flags = classify_terms(
+            T_world_camera,
+            camera,
+            point_terms(map, keypoints, points),
+            line_terms(map, segments, lines, T_world_camera, camera, line_sigma_px),
+            plane_terms(map, planes, same, NOTHING, NOTHING, 1.0),
+        )
+        points, lines, agreeing = points[flags.points > 0], lines[flags.lines > 0], same[flags.planes > 0]
     return Associated(
         points,
         _others(_known(keypoints.points_m), points[:, 0]),
         lines,
         _others(_known(segments.endpoints_m), lines[:, 0]),
-        same[flags.planes > 0] if judged else same,
+        agreeing,
         _others(np.ones(len(planes.coefficients), np.bool_), same[:, 0]),
     )
 

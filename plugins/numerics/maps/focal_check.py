@@ -14,6 +14,7 @@ import numba
 import numpy as np
 
 from trihedron.pipeline.types import F64, I32, Map
+from trihedron.plugins.numerics.maps.keyframe_features import measured_points
 from trihedron.plugins.numerics.maps.local_window import newest_keyframes
 
 KEYFRAMES, LEAST_POINTS, LEAST_PAIRS, MOST_POINTS = 8, 30, 3, 100
@@ -69,13 +70,9 @@ def _checked(map: Map) -> FocalCheck | None:
 
 def _measured(map: Map, keyframe: int) -> tuple[I32, F64]:
     """Ids (n,) of the points that a keyframe measured with depth, sorted; and (n, 5) x, y, z, and the σ of depth and of a pixel there, m."""
-    first, end = map.keyframes.rows("points", np.array([keyframe]))[0]
-    fx, fy, cx, cy = map.keyframes.rows("intrinsics", np.array([keyframe]))[0]
-    ids, pixel, depth, sigma = map.point_observations.gathered(np.arange(first, end), "point", "pixel", "depth_m", "sigma_m")
-    known = np.flatnonzero(np.isfinite(depth))
-    known = known[np.unique(ids[known], return_index=True)[1]]
-    u, z = pixel[known].astype(np.float64), depth[known].astype(np.float64)
-    return ids[known], np.stack([(u[:, 0] - cx) / fx * z, (u[:, 1] - cy) / fy * z, z, sigma[known], PIXEL * z / fx], axis=-1)
+    ids, places, sigma_m, _ = measured_points(map, keyframe)
+    fx = map.keyframes.rows("intrinsics", np.array([keyframe]))[0, 0]
+    return ids, np.column_stack([places, sigma_m, PIXEL * places[:, 2] / fx])
 
 
 def _shared(a: tuple[I32, F64], b: tuple[I32, F64]) -> tuple[F64, F64] | None:

@@ -20,6 +20,20 @@ def features_of(map: Map, camera: Camera, T_world_camera: F64, seen: LocalWindow
     return _points(map, camera, T, seen.points), _lines(map, camera, T, seen.lines), _planes(map, T, seen.planes)
 
 
+def measured_points(map: Map, keyframe: int) -> tuple[I32, F64, F64, F64]:
+    """Ids (n,) of the points a keyframe measured with depth, sorted, their places (n, 3) in its axes by its own measurements, and σ of their depths
+    (m) and pixels."""
+    first, end = map.keyframes.rows("points", np.array([keyframe]))[0]
+    fx, fy, cx, cy = map.keyframes.rows("intrinsics", np.array([keyframe]))[0]
+    names = ("point", "pixel", "depth_m", "sigma_m", "sigma_px")
+    ids, pixel, depth, sigma_m, sigma_px = map.point_observations.gathered(np.arange(first, end), *names)
+    pixel, depth = pixel.astype(np.float64), depth.astype(np.float64)
+    places = np.stack([(pixel[:, 0] - cx) / fx * depth, (pixel[:, 1] - cy) / fy * depth, depth], axis=1)
+    known = np.flatnonzero(np.isfinite(depth))
+    known = known[np.unique(ids[known], return_index=True)[1]]
+    return ids[known], places[known], sigma_m[known].astype(np.float64), sigma_px[known].astype(np.float64)
+
+
 def _points(map: Map, camera: Camera, T_camera_world: F64, ids: I32) -> Keypoints:
     local = transform(T_camera_world, map.points.rows("position_m", ids))
     front = local[:, 2] > 0.1

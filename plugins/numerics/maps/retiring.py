@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from trihedron.pipeline.types import Map, Table
-from trihedron.plugins.numerics.maps.local_window import observed_by
+from trihedron.plugins.numerics.maps.local_window import living_keyframes, observed_by
 
 KINDS = ("point", "line", "plane")
 
@@ -32,10 +32,10 @@ def retired(map: Map, keyframe: int) -> Map:
 def released(map: Map) -> Map:
     """The same map with the chunks given back in which no landmark lives, or no living keyframe has a measurement; rows keep their numbers."""
     changes: dict[str, Table] = {}
-    held = map.keyframes.column("alive")
+    held = living_keyframes(map)
     for kind in KINDS:
         landmarks, measured = getattr(map, f"{kind}s"), getattr(map, f"{kind}_observations")
         ids = np.flatnonzero(landmarks.column("alive"))
         changes[f"{kind}s"] = landmarks.keeping(np.stack([ids, ids + 1], axis=1))
-        changes[f"{kind}_observations"] = measured.keeping(map.keyframes.column(f"{kind}s")[held])
+        changes[f"{kind}_observations"] = measured.keeping(map.keyframes.rows(f"{kind}s", held))
     return replace(map, **changes)

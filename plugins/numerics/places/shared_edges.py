@@ -6,6 +6,7 @@ import numpy as np
 
 from trihedron.pipeline.geometry import invert, pose_matrix
 from trihedron.pipeline.types import F64, I32, Map
+from trihedron.plugins.numerics.maps.keyframe_features import measured_points
 from trihedron.plugins.numerics.motion.rigid_consensus import fit_covariance, fitted
 from trihedron.plugins.numerics.motion.tracked_places import place_sigma
 from trihedron.plugins.numerics.places.pose_graph import Edges
@@ -17,7 +18,7 @@ LOOSE_M, LOOSE = 0.05, 0.02  # of keyframes that follow each other and share too
 def shared_edges(map: Map, rows: I32, poses: F64, least: int, gate: float) -> tuple[Edges, int]:
     """Edges between all of the keyframes `rows` (sorted), at `poses` (n, 4, 4), that saw at least `least` of the same points and agree on a motion;
     and the longest of them, in keyframes. Neighbours in time that share less stay as they stand, loosely."""
-    seen = [_measured(map, int(row)) for row in rows]
+    seen = [measured_points(map, int(row)) for row in rows]
     pairs, measured, information = [], [], []
     for b in range(len(rows)):
         for a in range(b):
@@ -30,19 +31,6 @@ def shared_edges(map: Map, rows: I32, poses: F64, least: int, gate: float) -> tu
                 information.append(np.linalg.inv(edge[1]))
     longest = max((b - a for a, b in pairs), default=0)
     return Edges(np.array(pairs, np.int32).reshape(-1, 2), np.array(measured), np.array(information)), longest
-
-
-def _measured(map: Map, keyframe: int) -> tuple[I32, F64, F64, F64]:
-    """Ids (n,) of the points a keyframe measured with depth, sorted, their places (n, 3) in its axes, and σ of their depths (m) and pixels."""
-    first, end = map.keyframes.rows("points", np.array([keyframe]))[0]
-    fx, fy, cx, cy = map.keyframes.rows("intrinsics", np.array([keyframe]))[0]
-    names = ("point", "pixel", "depth_m", "sigma_m", "sigma_px")
-    ids, pixel, depth, sigma_m, sigma_px = map.point_observations.gathered(np.arange(first, end), *names)
-    pixel, depth = pixel.astype(np.float64), depth.astype(np.float64)
-    places = np.stack([(pixel[:, 0] - cx) / fx * depth, (pixel[:, 1] - cy) / fy * depth, depth], axis=1)
-    known = np.flatnonzero(np.isfinite(depth))
-    known = known[np.unique(ids[known], return_index=True)[1]]
-    return ids[known], places[known], sigma_m[known].astype(np.float64), sigma_px[known].astype(np.float64)
 
 
 def _edge(a: tuple[I32, F64, F64, F64], b: tuple[I32, F64, F64, F64], least: int, gate: float) -> tuple[F64, F64] | None:
