@@ -1,5 +1,7 @@
 """Scenes that cannot tell every direction, by the whole default graph: what is seen is measured, what is not is held, and the status says so."""
 
+from pathlib import Path
+
 import cv2
 import numpy as np
 import pytest
@@ -7,6 +9,7 @@ import pytest
 from trihedron.pipeline.cli import main
 from trihedron.pipeline.recording import Recording
 
+GRAPHS = Path(__file__).parent.parent / "conf" / "graph"
 FRAMES, WIDTH, HEIGHT, FOCAL = 16, 320, 240, 260.0
 
 
@@ -70,3 +73,14 @@ def test_what_is_seen_is_measured_and_the_rest_is_held(tmp_path, name):
     assert {pose.reason for pose in later} <= REASONS
     sigmas = np.sqrt([np.diag(pose.covariance)[:3] for pose in (poses[4], poses[-1])])
     assert (sigmas[1][unseen] > 1.5 * sigmas[0][unseen]).all() and sigmas[1][seen].max() < 0.02  # and it is known to be unknown
+
+
+@pytest.mark.parametrize("graph", sorted(path.stem for path in GRAPHS.glob("*.yaml")))
+def test_no_system_is_sure_of_itself_in_front_of_one_bare_wall(tmp_path, graph):
+    """Points on a textureless wall, and whatever else must fail there: it is said."""
+    depth_of, step, *_ = SCENES["single wall"]
+    write_folder(tmp_path / "scene", depth_of, [k * step for k in range(6)])
+    assert main(["run", f"graph={graph}", "dataset=folder", f"dataset.path={tmp_path / 'scene'}", f"out={tmp_path / 'out'}", "record.topics=[]"]) == 0
+    poses = list(Recording(tmp_path / "out" / "run.mcap").values("pose"))
+    assert len(poses) == 6 and poses[0].status == "ok"
+    assert all(pose.status in ("degraded", "lost") and pose.unobservable and pose.reason for pose in poses[1:]), [pose.status for pose in poses]

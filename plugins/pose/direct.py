@@ -9,10 +9,12 @@ import numpy as np
 from trihedron.pipeline.geometry import pose_matrix
 from trihedron.pipeline.registry import register
 from trihedron.pipeline.types import F64, Frame, Pose
-from trihedron.plugins.numerics.depth.reduction import pyramid
+from trihedron.plugins.numerics.depth.reduction import depth_normals, pyramid
 from trihedron.plugins.numerics.maps.dense_pose import dense_pose, first_pose
 from trihedron.plugins.numerics.motion.dense_alignment import Gates, align, student_weights
 from trihedron.plugins.numerics.motion.dense_rows import Source, Target, source_of, target_of
+
+REACH = 2  # px, to the readings a normal is made of
 
 
 @register("pose", "direct")
@@ -58,6 +60,6 @@ class Direct:
         out = []
         for a, b in zip(pyramid(before, self.width, self.levels), pyramid(now, self.width, self.levels)):
             stride = max(1, round((a.gray.size / self.most) ** 0.5))
-            unused = np.empty((*a.gray.shape, 3), np.float32)
-            out.append((source_of(a, noise, stride, unused), target_of(b, 2), self.iterations))
+            source = source_of(a, noise, stride, depth_normals(a.depth_m, a.lens, REACH))
+            out.append((source, target_of(b, REACH), self.iterations))
         return out[::-1]

@@ -60,7 +60,8 @@ class Icp:
         noise: F64 = frame.camera.depth_noise.sigma_m(np.arange(0.0, 16.0, 0.01))
         width = model.depth_m.shape[1]
         step = max(1, round(frame.camera.width / width))
-        views = halvings(Level(brightness(model.color), np.array(model.depth_m), lens_of(frame, step)), self.levels)
+        gray = np.where(model.depth_m > 0.0, brightness(model.color), np.float32(np.nan))
+        views = halvings(Level(gray, np.array(model.depth_m), lens_of(frame, step)), self.levels)
         out = []
         for i, (now, view) in enumerate(zip(pyramid(frame, width, self.levels), views)):
             stride = max(1, round((now.gray.size / self.most) ** 0.5))

@@ -72,6 +72,15 @@ def test_direct_sees_along_a_wall_by_its_paint():
     assert np.abs(bare.T_world_camera[:3, 3] - [0.0, 0.0, 0.02]).max() < 1e-3
 
 
+@pytest.mark.parametrize("sigma_m", [0.004, 0.012])
+def test_direct_does_not_take_noise_for_a_surface_across_a_wall(sigma_m):
+    """Noise turns a wall's normals every way: by 3 to 10 degrees here. It measures nothing."""
+    rng, depth = np.random.default_rng(0), render(np.eye(4), WALL, ball=False)[0]
+    (then, pose), (now, _) = (view(i, np.eye(4), WALL, ball=False, paint=False, depth=depth + rng.normal(0.0, sigma_m, depth.shape)) for i in (0, 1))
+    found = Direct(width=160)(now, then, pose)
+    assert (found.status, found.unobservable) == ("degraded", 2)
+
+
 def test_direct_is_lost_where_nothing_can_be_aligned_and_stays_so():
     T = START
     away = T @ exp_se3(np.array([0.0, 0.0, 0.0, 0.0, np.pi, 0.0]))

@@ -15,7 +15,7 @@ LUMINANCE = (0.299, 0.587, 0.114)  # of red, green and blue (Rec. 601)
 
 @dataclass(frozen=True)
 class Level:
-    """An image of a pyramid: brightness (h, w) 0 … 255, depth (h, w), m, 0 = none, and (fx, fy, cx, cy)."""
+    """An image of a pyramid: brightness (h, w) 0 … 255, NaN = none, depth (h, w), m, 0 = none, and (fx, fy, cx, cy)."""
 
     gray: F32
     depth_m: F32
@@ -61,8 +61,12 @@ def _halved(gray: F32, depth: F32) -> tuple[F32, F32]:
     out, small = np.empty((h, w), np.float32), np.zeros((h, w), np.float32)
     for r in range(h):
         for c in range(w):
-            out[r, c] = 0.25 * (gray[2 * r, 2 * c] + gray[2 * r, 2 * c + 1] + gray[2 * r + 1, 2 * c] + gray[2 * r + 1, 2 * c + 1])
-            near, total, count = np.inf, 0.0, 0
+            near, total, count, light, lit = np.inf, 0.0, 0, 0.0, 0
+            for k in range(4):
+                g = gray[2 * r + k // 2, 2 * c + k % 2]
+                if not np.isnan(g):
+                    light, lit = light + g, lit + 1
+            out[r, c] = light / lit if lit else np.nan
             for k in range(4):
                 d = depth[2 * r + k // 2, 2 * c + k % 2]
                 if d > 0.0 and d < near:
@@ -78,13 +82,14 @@ def _halved(gray: F32, depth: F32) -> tuple[F32, F32]:
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def gradients(gray: F32) -> tuple[F32, F32]:
-    """Central differences along x and y, (h, w) each, a pixel; 0 at the border."""
+    """Central differences along x and y, (h, w) each, a pixel; 0 at the border and beside what is not known."""
     h, w = gray.shape
     x, y = np.zeros((h, w), np.float32), np.zeros((h, w), np.float32)
     for r in range(1, h - 1):
         for c in range(1, w - 1):
-            x[r, c] = 0.5 * (gray[r, c + 1] - gray[r, c - 1])
-            y[r, c] = 0.5 * (gray[r + 1, c] - gray[r - 1, c])
+            across, down = 0.5 * (gray[r, c + 1] - gray[r, c - 1]), 0.5 * (gray[r + 1, c] - gray[r - 1, c])
+            if not (np.isnan(across) or np.isnan(down)):
+                x[r, c], y[r, c] = across, down
     return x, y
 
 

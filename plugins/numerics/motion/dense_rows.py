@@ -42,11 +42,13 @@ class Target(NamedTuple):
 
 
 class Rows(NamedTuple):
-    """Residuals of n points: (brightness, metres across the surface), with derivatives; `cosine` is k, 0 for a point that is not seen."""
+    """Residuals of n points: (brightness, metres across the surface), with derivatives; `cosine` is k, 0 for a point that is not seen; `turned` the
+    source's normal in the target's frame where that and a surface to compare it with are known, seen or not."""
 
     r: F64  # (n, 2)
     J: F64  # (n, 2, 6)
     cosine: F64  # (n,)
+    turned: F64  # (n, 3), NaN = none
 
 
 def source_of(level: Level, noise: NDArray[np.float64], stride: int, normals: F32) -> Source:
@@ -70,7 +72,7 @@ def target_of(level: Level, reach: int, normals: F32 | None = None) -> Target:
 def rows_for(source: Source) -> Rows:
     """Room for the rows of a source."""
     n = len(source.points_m)
-    return Rows(np.zeros((n, 2)), np.zeros((n, 2, 6)), np.zeros(n))
+    return Rows(np.zeros((n, 2)), np.zeros((n, 2, 6)), np.zeros(n), np.zeros((n, 3)))
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
@@ -80,7 +82,7 @@ def fill_rows(source: Source, target: Target, R: F64, t: F64, least_gradient: fl
     h, w = target.depth_m.shape
     fx, fy, cx, cy = target.lens
     for i in range(len(source.points_m)):
-        rows.cosine[i] = 0.0
+        rows.cosine[i], rows.turned[i, 0] = 0.0, np.nan
         p = source.points_m[i]
         x = R[0, 0] * p[0] + R[0, 1] * p[1] + R[0, 2] * p[2] + t[0]
         y = R[1, 0] * p[0] + R[1, 1] * p[1] + R[1, 2] * p[2] + t[1]
@@ -100,20 +102,19 @@ def fill_rows(source: Source, target: Target, R: F64, t: F64, least_gradient: fl
         k = (n[0] * x + n[1] * y) / z + n[2]
         if not k < -STEEPEST:
             continue
-        m = source.normals[i]
-        facing = 1.0
-        if least_cosine > -1.0:
-            facing = 0.0
-            for j in range(3):
-                facing += n[j] * (R[j, 0] * m[0] + R[j, 1] * m[1] + R[j, 2] * m[2])
-        if not facing > least_cosine:
-            continue
         w00, w01, w10, w11 = (1.0 - a) * (1.0 - b), a * (1.0 - b), (1.0 - a) * b, a * b
         off = k * (w00 * d00 + w01 * d01 + w10 * d10 + w11 * d11 - z)
         if abs(off) > farthest_m:
             continue
-        rows.cosine[i], rows.r[i, 1] = -k, off
         _across(-n[0], -n[1], -n[2], x, y, z, rows.J[i, 1])
+        m = source.normals[i]
+        facing = 0.0
+        for j in range(3):
+            rows.turned[i, j] = R[j, 0] * m[0] + R[j, 1] * m[1] + R[j, 2] * m[2]
+            facing += n[j] * rows.turned[i, j]
+        if least_cosine > -1.0 and not facing > least_cosine:
+            continue
+        rows.cosine[i], rows.r[i, 1] = -k, off
         gx = w00 * target.gray_x[r, c] + w01 * target.gray_x[r, c + 1] + w10 * target.gray_x[r + 1, c] + w11 * target.gray_x[r + 1, c + 1]
         gy = w00 * target.gray_y[r, c] + w01 * target.gray_y[r, c + 1] + w10 * target.gray_y[r + 1, c] + w11 * target.gray_y[r + 1, c + 1]
         gray = w00 * target.gray[r, c] + w01 * target.gray[r, c + 1] + w10 * target.gray[r + 1, c] + w11 * target.gray[r + 1, c + 1]
@@ -154,13 +155,19 @@ def normal_equations(rows: Rows, W: F64) -> tuple[F64, F64]:
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def what_is_seen(rows: Rows, W: F64) -> tuple[F64, F64, int]:
-    """Mean of n nᵀ over the normals seen (3, 3), the brightness' information about the translation (3, 3), and how many points are seen."""
-    N, G, count = np.zeros((3, 3)), np.zeros((3, 3)), 0
+    """Mean of n mᵀ over the normals n of the target and m of the source at one place (3, 3), the brightness' information about the translation
+    (3, 3), and how many points are seen. The noise of the two is not alike and drops out of the products, also of normals that do not face each
+    other; in the mean of n nᵀ it would spread the normals of a wall, and a direction along it would pass for one that is measured."""
+    N, G, count, pairs = np.zeros((3, 3)), np.zeros((3, 3)), 0, 0
     for i in range(len(W)):
+        if not np.isnan(rows.turned[i, 0]):
+            pairs += 1
+            for j in range(3):
+                for k in range(3):
+                    N[j, k] -= 0.5 * (rows.J[i, 1, j] * rows.turned[i, k] + rows.J[i, 1, k] * rows.turned[i, j])
         if rows.cosine[i] != 0.0:
             count += 1
             for j in range(3):
                 for k in range(3):
-                    N[j, k] += rows.J[i, 1, j] * rows.J[i, 1, k]
                     G[j, k] += W[i, 0] * rows.J[i, 0, j] * rows.J[i, 0, k]
-    return N / max(count, 1), G, count
+    return N / max(pairs, 1), G, count
