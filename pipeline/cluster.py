@@ -1,4 +1,4 @@
-"""A sweep's jobs on a Dask scheduler, by its address; and, as a program, one such job on a worker's machine.
+"""A sweep's jobs on other machines: on a Dask scheduler, by its address, and what SLURM's launcher lacks; as a program, one job on a Dask worker.
 
 Each job is a process of its own on the worker, so that what it does to libraries, or a crash, reaches no other. The sweep's folder and the data
 sets are at the same paths on all machines; what comes back are the files, through the file system.
@@ -8,7 +8,8 @@ from __future__ import annotations
 
 import subprocess
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -78,6 +79,30 @@ def run_apart(job: bytes, folder: str, working_folder: str) -> None:
     if done.returncode and read_job(Path(folder)).get("state") not in (DONE, FAILED):
         last = next(iter(reversed(done.stderr.decode(errors="replace").strip().splitlines())), "")
         write_job(Path(folder), "", FAILED, f"{folder}: the job's process ended with {done.returncode}: {last}")
+
+
+@contextmanager
+def all_awaited() -> Iterator[None]:
+    """Within it submitit, through which Hydra asks SLURM, waits for all jobs of a sweep; else it leaves at the first whose process died."""
+    try:
+        from submitit import Job
+        from submitit.core.utils import UncompletedJobError
+    except ImportError:
+        yield
+        return
+    results = Job.results
+
+    def results_or_none(job: Any) -> list[Any]:
+        try:
+            return list(results(job))
+        except UncompletedJobError:
+            return [None]
+
+    Job.results = results_or_none
+    try:
+        yield
+    finally:
+        Job.results = results
 
 
 def main() -> None:

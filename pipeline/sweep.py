@@ -22,6 +22,7 @@ from hydra.core.plugins import Plugins
 from joblib.externals.loky import get_reusable_executor
 from omegaconf import DictConfig
 
+from trihedron.pipeline.cluster import all_awaited
 from trihedron.pipeline.config import rewritten
 from trihedron.pipeline.errors import TrihedronError
 from trihedron.pipeline.jobs import DONE, FAILED, RUNNING, key_of, read_job, write_job
@@ -92,7 +93,8 @@ class Sweeper(BasicSweeper):
                 key = key_of(self.composed(words))
             except Exception as error:
                 errors.append(error if isinstance(error, TrihedronError) else rewritten(error))
-                _refused(folder, job, str(errors[-1]))
+                _failed(folder, job, str(errors[-1]))
+                print(f"trihedron: {errors[-1]}", file=sys.stderr)
                 continue
             if read_job(folder) != {"key": key, "state": DONE, "error": ""}:
                 (folder / "job.json").unlink(missing_ok=True)
@@ -114,13 +116,17 @@ class Sweeper(BasicSweeper):
         """Hand the jobs and their folders to the launcher, and wait until they have ended."""
         assert self.launcher is not None
         try:
-            self.launcher.launch([words for words, _ in missing], initial_job_idx=0)
+            with all_awaited():
+                self.launcher.launch([words for words, _ in missing], initial_job_idx=0)
         except BrokenProcessPool as error:
             self._launch_apart(missing, error)
         except TrihedronError:
             raise
         except Exception as error:  # of the engine; a job that fails says so in its folder
             raise _given_up(error) from error
+        for words, folder in missing:
+            if read_job(folder).get("state") not in (DONE, FAILED):
+                _died(words, folder)
         if self.options.hydra.launcher.get("n_jobs", 1) != 1:
             get_reusable_executor().shutdown()  # its processes would keep this folder and environment for the next sweep
 
@@ -128,7 +134,7 @@ class Sweeper(BasicSweeper):
         """A process that died took those beside it along. What had begun is run again, one at a time, so that only the job at fault fails; then
         what had not."""
         if len(missing) == 1:
-            write_job(missing[0][1], "", FAILED, f"{missing[0][1]}: its process died; it crashed, or memory ran out")
+            _died(*missing[0])
             return
         begun = [job for job in missing if read_job(job[1]).get("state") == RUNNING]
         if not begun:
@@ -183,12 +189,16 @@ def failure_of(folder: Path) -> str:
     return "" if job.get("state") == DONE else str(job.get("error") or "was stopped before its end")
 
 
-def _refused(folder: Path, job: Overrides, error: str) -> None:
-    """The folder of a job whose configuration is refused: it has no run, but a reason."""
+def _failed(folder: Path, job: Overrides, error: str) -> None:
+    """The folder of a job that cannot say so itself: it may have no run, but has a reason."""
     (folder / ".hydra").mkdir(parents=True, exist_ok=True)
     (folder / ".hydra" / "overrides.yaml").write_text(yaml.safe_dump(job))
     write_job(folder, "", FAILED, error)
-    print(f"trihedron: {error}", file=sys.stderr)
+
+
+def _died(words: Overrides, folder: Path) -> None:
+    """Say so of a job; the last of its words is its folder's name."""
+    _failed(folder, words[:-1], f"{folder}: its process died; it crashed, or memory ran out")
 
 
 class _Progress:

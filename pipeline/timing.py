@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import ctypes
+import gc
 import os
 from array import array
 from collections import defaultdict
@@ -74,7 +76,10 @@ def peak_mb() -> float | None:
 
 
 def forget_peak() -> None:
-    """Begin to measure the peak anew: a process may do several runs. Where that is not allowed the peak is the process's."""
+    """Begin to measure the peak anew, without what earlier runs of this process left. Where that is not allowed the peak is the process's."""
+    gc.collect()
+    with suppress(OSError, AttributeError):  # of GNU's C library
+        ctypes.CDLL(None).malloc_trim(0)
     with suppress(OSError):
         Path("/proc/self/clear_refs").write_text("5")
 

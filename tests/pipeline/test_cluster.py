@@ -4,10 +4,14 @@ import getpass
 import json
 import os
 import shutil
+import signal
 import socket
 import subprocess
 import sys
+import threading
 import time
+from contextlib import suppress
+from pathlib import Path
 
 import pytest
 import yaml
@@ -86,6 +90,31 @@ def test_submitit_runs_the_jobs_as_it_would_on_slurm(tmp_path, capfd):
     said = capfd.readouterr().err
     assert "seed: -1 is negative" in said and "sweep: 2 of 2 jobs done" in said
     assert json.loads((tmp_path / "0" / "job.json").read_text())["state"] == "done" and threads_of(tmp_path / "0") == 2
+
+
+@pytest.mark.slow
+def test_a_job_whose_process_dies_is_waited_for_by_no_other_and_stops_none(tmp_path, capfd):
+    pytest.importorskip("submitit", reason="needs trihedron[cluster]")
+
+    def kill_one():
+        until = time.monotonic() + 120
+        while time.monotonic() < until:
+            for process in Path("/proc").glob("[0-9]*"):
+                with suppress(OSError):
+                    words = (process / "cmdline").read_text()
+                    if "submitit.core._submit" in words and str(tmp_path) in words:
+                        return os.kill(int(process.name), signal.SIGKILL)
+            time.sleep(0.1)
+
+    killer = threading.Thread(target=kill_one)
+    killer.start()
+    assert main(["run", "-m", *QUICK, "hydra/launcher=submitit_local", f"out={tmp_path}", "seed=0,1"]) == 1
+    killer.join()
+    assert "1 of 2 jobs failed" in capfd.readouterr().err
+    said = sorted(json.loads((tmp_path / name / "job.json").read_text())["state"] for name in "01")
+    assert said == ["done", "failed"]
+    main(["compare", str(tmp_path)])
+    assert "its process died; it crashed, or memory ran out" in capfd.readouterr().out
 
 
 def free_port():
