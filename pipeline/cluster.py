@@ -85,11 +85,12 @@ def run_apart(job: bytes, folder: str, working_folder: str) -> None:
 def all_awaited() -> Iterator[None]:
     """Within it submitit, through which Hydra asks SLURM, waits for all jobs of a sweep; else it leaves at the first whose process died."""
     try:
-        from submitit import Job
+        import submitit
         from submitit.core.utils import UncompletedJobError
     except ImportError:
         yield
         return
+    Job: Any = submitit.Job
     results = Job.results
 
     def results_or_none(job: Any) -> list[Any]:
