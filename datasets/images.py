@@ -15,6 +15,7 @@ from trihedron.datasets.png_decoder import decode_png
 from trihedron.pipeline.errors import DataError
 from trihedron.pipeline.types import F32, U8
 
+RGB = cv2.IMREAD_COLOR_RGB | cv2.IMREAD_IGNORE_ORIENTATION
 JPEG_END = b"\xff\xd9"  # of a complete file; a decoder would fill the rest of a truncated one with grey and say nothing
 PIXELS_PER_BYTE = 2048  # more than a picture can pack: deflate makes 1032 bytes of one, a grey JPEG 512 pixels of one
 MOST_PIXELS = 1 << 26  # more than any camera has that sees depth
@@ -30,7 +31,7 @@ def read_color(path: Path) -> U8:
     if image.ndim != 3 or image.shape[2] not in (3, 4):
         channels = 1 if image.ndim == 2 else image.shape[2]
         raise DataError(str(path), f"has {channels} channel{'s' * (channels != 1)} where colour has 3", "convert it to an RGB image")
-    return np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2RGB if image.shape[2] == 3 else cv2.COLOR_BGRA2RGB), dtype=np.uint8)
+    return np.asarray(image if image.shape[2] == 3 else cv2.cvtColor(image, cv2.COLOR_RGBA2RGB), dtype=np.uint8)
 
 
 def read_depth(path: Path, depth_scale: float, depth_offset: float = 0.0) -> F32:
@@ -58,8 +59,8 @@ def _decode(path: Path) -> NDArray[Any]:
 
 
 def decode_image(data: bytes) -> NDArray[Any]:
-    """The pixels of a picture as OpenCV orders them. Raises UnreadableImage for another format (see `picture_headers`) and for what is cut off,
-    damaged or larger than its bytes can hold."""
+    """The pixels of a picture: (h, w), (h, w, 3) RGB or (h, w, 4) RGBA. Raises UnreadableImage for another format (see `picture_headers`) and for
+    what is cut off, damaged or larger than its bytes can hold."""
     header = picture_header(data)
     if header.cells > min(PIXELS_PER_BYTE * len(data), MOST_PIXELS):
         raise UnreadableImage(f"claims {header.width}×{header.height} pixels in {len(data)} bytes")
@@ -70,14 +71,17 @@ def decode_image(data: bytes) -> NDArray[Any]:
     except ValueError as error:
         raise UnreadableImage(f"is damaged: {error}") from error
     if image is not None:
-        return image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_RGB2BGR)
+        return image
+    at_once = data.startswith(JPEG) and header.channels == 3
     try:
-        image = cv2.imdecode(np.frombuffer(data, dtype=np.uint8), cv2.IMREAD_UNCHANGED)
+        image = cv2.imdecode(np.frombuffer(data, dtype=np.uint8), RGB if at_once else cv2.IMREAD_UNCHANGED)
     except cv2.error:
         image = None
     if image is None:
         raise UnreadableImage("is damaged or of an unknown format")
-    return np.asarray(image)
+    if image.ndim == 2 or at_once:
+        return np.asarray(image)
+    return np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2RGB if image.shape[2] == 3 else cv2.COLOR_BGRA2RGBA))
 
 
 def check_size(path: Path, image: NDArray[Any], width: int, height: int, reference: str, cure: str) -> None:

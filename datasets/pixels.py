@@ -61,7 +61,7 @@ def color_of(picture: Picture) -> U8:
         if image.dtype != np.uint8:
             raise UnreadableImage(f"has {8 * image.itemsize} bits a channel where colour has 8")
         channels = 1 if image.ndim == 2 else image.shape[2]
-        code: int | None = {1: cv2.COLOR_GRAY2RGB, 3: cv2.COLOR_BGR2RGB, 4: cv2.COLOR_BGRA2RGB}[channels]
+        code: int | None = {1: cv2.COLOR_GRAY2RGB, 3: None, 4: cv2.COLOR_RGBA2RGB}[channels]
     else:
         if picture.encoding not in COLORS:
             raise UnreadableImage(f"has the encoding '{picture.encoding[:40]}'; known for colour: {', '.join(COLORS)}")

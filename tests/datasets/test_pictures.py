@@ -29,10 +29,18 @@ def test_colour_in_every_format_is_the_same(extension: str) -> None:
     data = encoded(extension, COLOR)
     header = picture_header(data)
     assert (header.width, header.height, header.bits, header.channels) == (16, 12, 8, 3)
-    np.testing.assert_array_equal(decode_image(data), COLOR)
+    np.testing.assert_array_equal(decode_image(data), COLOR[..., ::-1])
     for size in (20, len(data) // 2, len(data) - 1):
         with pytest.raises(UnreadableImage):
             decode_image(data[:size])
+
+
+def test_a_jpeg_is_decoded_as_opencv_does_it_whichever_way_the_camera_was_held() -> None:
+    turned = b"\xff\xe1\x00\x22Exif\0\0MM\0*\0\0\0\x08\0\x01\x01\x12\0\x03\0\0\0\x01\0\x06\0\0\0\0\0\0"
+    plain = encoded(".jpg", COLOR)
+    for data in (plain, plain[:2] + turned + plain[2:]):
+        expected = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
+        np.testing.assert_array_equal(decode_image(data), expected[..., ::-1])
 
 
 @pytest.mark.parametrize("extension", [".png", ".pgm", ".tif"])
