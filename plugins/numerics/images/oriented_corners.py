@@ -6,6 +6,7 @@ import numba
 import numpy as np
 
 from trihedron.pipeline.types import F32, F64, I32, Bool
+from trihedron.plugins.numerics.algebra.ranking import descending
 from trihedron.plugins.numerics.images.corner_measures import centroid_angles_deg, harris_scores
 from trihedron.plugins.numerics.images.fast_corners import fast_corners
 from trihedron.plugins.numerics.images.image_pyramid import Pyramid, full_pixels, level_of
@@ -25,7 +26,7 @@ def oriented_corners(
     full = full_pixels(cells, levels, pyramid.shapes).astype(np.float32)
     kept = (strengths >= threshold) | _in_poor_cells(full, strengths >= threshold, width, height, cell_px, wanted)
     cells, levels, full = cells[kept], levels[kept], full[kept]
-    order = np.argsort(-_measured(pyramid, cells, levels, weights), kind="mergesort").astype(np.int32)
+    order = descending(_measured(pyramid, cells, levels, weights))
     kept = spread_over_grid(full, order, width, height, cell_px, wanted)
     cells, levels = cells[kept], levels[kept]
     angles = np.empty(len(cells), np.float32)
