@@ -116,8 +116,7 @@ class Runner:
         Raises TrihedronError (StageError names stage and frame)."""
         before, first = self._memory, self.indices[0]
         recent = {topic: {index - first: value for index, value in values.items()} for topic, values in before.recent.items()}
-        waiting = self.feed is not None  # one thread more, which waits for frames
-        scheduler = Scheduler(self._nodes(), self.threads + waiting, self.threads, before.held, recent)
+        scheduler = Scheduler(self._nodes(), self.threads, self.threads, before.held, recent)
         view = View(truth)
         try:
             with single_threaded_libraries(), self._feeding():
@@ -166,7 +165,8 @@ class Runner:
         if self.feed is not None and stage.name != "dataset":
             inputs[FRAME_TAKEN] = Wire("dataset")
         if stage.name == "dataset":
-            return Node(stage.name, lambda p, _: self._intake(p, lambda at: self._call(stage, at, {}), lambda: self.indices[p]), inputs, True)
+            waits = self.feed is not None
+            return Node(stage.name, lambda p, _: self._intake(p, lambda at: self._call(stage, at, {}), lambda: self.indices[p]), inputs, True, waits)
         return Node(stage.name, lambda position, values: self._call(stage, position, values), inputs, stage.fold)
 
     def _recorded_feedback(self, topic: str) -> bool:

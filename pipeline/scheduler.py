@@ -2,8 +2,8 @@
 
 A task is one node at one frame. It is ready when what its wires name is there: a value of the same frame, of exactly k frames ago, or, for
 `@prev`, all earlier frames of that topic. Ready tasks run oldest frame first, so tracking goes before features of later frames; how many frames
-may be in flight is bounded. What only later frames ask for has a thread of its own at a lower priority, so that no pose waits for it. Nodes see only
-their inputs, so the order in which tasks happen to run cannot change a value.
+may be in flight is bounded. What only later frames ask for has a thread of its own at a lower priority, so that no pose waits for it, and so has what
+waits for frames that have not come. Nodes see only their inputs, so the order in which tasks happen to run cannot change a value.
 """
 
 from __future__ import annotations
@@ -16,6 +16,7 @@ import threading
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
+from enum import Enum
 from typing import Any
 
 import cv2
@@ -29,12 +30,22 @@ NICE = 10  # of the thread for what may lag; where the system has no such thing 
 
 @dataclass(frozen=True)
 class Node:
-    """`call(position, inputs)` computes a value or None; `ordered` nodes (folds, topics of a file) never run two frames out of order."""
+    """`call(position, inputs)` computes a value or None; `ordered` nodes (folds, topics of a file) never run two frames out of order; one that
+    `waits` for something outside, as for a camera, keeps no worker meanwhile."""
 
     name: str
     call: Callable[[int, Mapping[str, Any]], Any]
     inputs: Mapping[str, Wire]
     ordered: bool = False
+    waits: bool = False
+
+
+class Lane(Enum):
+    """Which threads a task is for: the workers, the one for what may lag, or the one that waits."""
+
+    prompt = 0
+    lagging = 1
+    waiting = 2
 
 
 class NodeFailure(Exception):
@@ -79,11 +90,13 @@ class Scheduler:
                 self._consumers[node.name].append((node.name, PREVIOUS))
         lagging = {name for name in self._nodes if self._consumers[name] and all(delay > 0 for _, delay in self._consumers[name])}
         self._prompt = [name for name in self._nodes if name not in lagging]
-        self._background = lagging if threads > 1 else set()
+        self._lanes = dict.fromkeys(self._nodes, Lane.prompt)
+        self._lanes.update(dict.fromkeys(lagging if threads > 1 else (), Lane.lagging))
+        self._lanes.update(dict.fromkeys((node.name for node in nodes if node.waits), Lane.waiting))
         self._lock = threading.Lock()
         self._frame_there = threading.Condition(self._lock)
-        self._work_there = {background: threading.Condition(self._lock) for background in (False, True)}
-        self._ready: dict[bool, list[tuple[int, int, str]]] = {False: [], True: []}
+        self._work_there = {lane: threading.Condition(self._lock) for lane in Lane}
+        self._ready: dict[Lane, list[tuple[int, int, str]]] = {lane: [] for lane in Lane}
         self._unmet: dict[tuple[str, int], int] = {}
         self._values: dict[str, dict[int, Any]] = {name: {} for name in self._nodes}
         self._held: dict[str, dict[int, Any]] = {name: {} for name in self._nodes}
@@ -95,8 +108,8 @@ class Scheduler:
     def run(self, count: int) -> Iterator[tuple[int, dict[str, Any]]]:
         """Yield (position, values by node) for 0..count-1 in order, fewer where a node raises NoMoreFrames. After a failure the frames before it
         come, then what was done of that frame, then NodeFailure is raised."""
-        backgrounds = [False] * self._threads + [True] * bool(self._background)
-        workers = [threading.Thread(target=self._work, args=(b,), name=f"stage-{i}", daemon=True) for i, b in enumerate(backgrounds)]
+        lanes = [Lane.prompt] * self._threads + [lane for lane in (Lane.lagging, Lane.waiting) if lane in self._lanes.values()]
+        workers = [threading.Thread(target=self._work, args=(lane,), name=f"stage-{i}", daemon=True) for i, lane in enumerate(lanes)]
         for worker in workers:
             worker.start()
         try:
@@ -128,11 +141,11 @@ class Scheduler:
             return True
         if position >= self._count:
             return not self._running
-        idle = not self._running and not any(self._runnable(background) for background in self._ready)
+        idle = not self._running and not any(self._runnable(lane) for lane in Lane)
         return self._failure is not None and self._failure.position <= position and idle
 
-    def _runnable(self, background: bool) -> bool:
-        ready = self._ready[background]
+    def _runnable(self, lane: Lane) -> bool:
+        ready = self._ready[lane]
         return bool(ready) and ready[0][0] < self._count and (self._failure is None or ready[0][0] <= self._failure.position)
 
     def _admit(self) -> None:
@@ -146,9 +159,9 @@ class Scheduler:
             for name in self._nodes:
                 self._offer(name, self._admitted)
             self._admitted += 1
-        for background, ready in self._ready.items():
+        for lane, ready in self._ready.items():
             if ready:
-                self._work_there[background].notify(len(ready))
+                self._work_there[lane].notify(len(ready))
 
     def _there(self, wire: Wire, position: int) -> bool:
         if wire.delay == PREVIOUS:
@@ -158,18 +171,18 @@ class Scheduler:
 
     def _offer(self, name: str, position: int) -> None:
         if self._unmet[name, position] == 0:
-            heapq.heappush(self._ready[name in self._background], (position, self._rank[name], name))
+            heapq.heappush(self._ready[self._lanes[name]], (position, self._rank[name], name))
 
-    def _work(self, background: bool) -> None:
-        if background:
+    def _work(self, lane: Lane) -> None:
+        if lane is Lane.lagging:
             with contextlib.suppress(OSError, AttributeError):  # Linux has a priority for each thread
                 os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), NICE)
         while True:
             with self._lock:
-                self._work_there[background].wait_for(lambda: self._stopped or self._runnable(background))
+                self._work_there[lane].wait_for(lambda: self._stopped or self._runnable(lane))
                 if self._stopped:
                     return
-                position, _, name = heapq.heappop(self._ready[background])
+                position, _, name = heapq.heappop(self._ready[lane])
                 inputs = {parameter: self._input(wire, position) for parameter, wire in self._nodes[name].inputs.items()}
                 self._running += 1
             failure: NodeFailure | None = None

@@ -136,3 +136,23 @@ def test_what_may_lag_takes_none_of_the_workers():
         Node("late", lambda k, v: meets(k + 1, v), {"x": Wire("right")}),
     ]
     assert [values["left"] for values in run(nodes, 5)] == [0, 1, 2, 3, 4]
+
+
+def test_what_waits_for_a_frame_takes_none_of_the_workers():
+    """While frame 1 has not come, both workers meet at frame 0: it comes only after they did."""
+    meeting, met = threading.Barrier(2, timeout=5.0), threading.Event()
+
+    def camera(k, v):
+        if k:
+            assert met.wait(5.0)
+        return k
+
+    def meet(k, v):
+        if k == 0:
+            time.sleep(0.05)  # by then frame 1 is asked for
+            meeting.wait()
+            met.set()
+        return k
+
+    nodes = [Node("camera", camera, {}, ordered=True, waits=True), *(Node(name, meet, {"x": Wire("camera")}) for name in "ab")]
+    assert run(nodes, threads=2, lookahead=2, count=3) == [dict.fromkeys(("camera", "a", "b"), k) for k in range(3)]
