@@ -149,10 +149,10 @@ def test_what_waits_for_a_frame_takes_none_of_the_workers():
 
     def meet(k, v):
         if k == 0:
-            time.sleep(0.05)  # by then frame 1 is asked for
             meeting.wait()
             met.set()
         return k
 
-    nodes = [Node("camera", camera, {}, ordered=True, waits=True), *(Node(name, meet, {"x": Wire("camera")}) for name in "ab")]
-    assert run(nodes, threads=2, lookahead=2, count=3) == [dict.fromkeys(("camera", "a", "b"), k) for k in range(3)]
+    first = Node("first", lambda k, v: (time.sleep(0.05), k)[1], {"x": Wire("camera")})  # by its end frame 1 is asked for
+    nodes = [Node("camera", camera, {}, ordered=True, waits=True), first, *(Node(name, meet, {"x": Wire("first")}) for name in "ab")]
+    assert run(nodes, threads=2, lookahead=2, count=3) == [dict.fromkeys(("camera", "first", "a", "b"), k) for k in range(3)]
