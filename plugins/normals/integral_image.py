@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
 
 from trihedron.pipeline.registry import register
@@ -43,9 +42,8 @@ class IntegralImage:
         """Normals on a grid of ceil(h / stride) × ceil(w / stride) cells."""
         camera = frame.camera
         sums, smooth = block_sums(frame.depth_m, self.stride, self.patch_px, self.jump, self.jump_m)
-        clearance = cv2.distanceTransform(smooth, cv2.DIST_C, 3)
         intrinsics = (float(camera.fx), float(camera.fy), float(camera.cx), float(camera.cy))
-        normals = patch_normals(sums, clearance, self._radii(camera), self.share * self.stride**2, intrinsics)
+        normals = patch_normals(sums, smooth, self._radii(camera), self.share * self.stride**2, intrinsics)
         return Normals(index=frame.index, stamp_ns=frame.stamp_ns, normals=normals, stride=self.stride)
 
     def _radii(self, camera: Camera) -> I32:

@@ -2,132 +2,238 @@
 
 from __future__ import annotations
 
+from functools import lru_cache
+
 import numba
 import numpy as np
+from numpy.typing import NDArray
 
 from trihedron.pipeline.types import F32, F64, I32, U8, Camera
 
-Sums = tuple[float, float, float, float]  # count, Σz, Σuz, Σvz
+SUMS = np.dtype([("n", "f8"), ("z", "f8"), ("uz", "f8"), ("vz", "f8")])  # over pixels with depth: their count, Σz, Σuz and Σvz
+VECTOR = np.dtype([("x", "f4"), ("y", "f4"), ("z", "f4")])
+Records = NDArray[np.void]  # of SUMS or VECTOR: their size is known when a kernel is compiled, so that it takes several at once
 
 
+@lru_cache(maxsize=16)
 def patch_sides(camera: Camera, noise_deg: float, least_px: float, most_px: float) -> F64:
-    """(100,) side in px of the patch whose normal has a predicted standard deviation of `noise_deg`, for depths of 0.1, 0.2 … 10 m, within bounds.
+    """(100,) side in px of the patch whose normal has a predicted standard deviation of `noise_deg`, for depths of 0.1, 0.2 … 10 m, within bounds;
+    read-only.
 
     The tangents of n × n px with independent depth noise σ at z have slopes of σ f / z · √12 / n² (least squares, to 7 %)."""
     z = np.arange(1, 101) * 0.1
     slope = camera.depth_noise.sigma_m(z) * camera.fx / z
-    side = np.sqrt(np.sqrt(12.0) * slope / np.radians(noise_deg))
-    return np.asarray(np.clip(side, least_px, most_px))
+    side = np.asarray(np.clip(np.sqrt(np.sqrt(12.0) * slope / np.radians(noise_deg)), least_px, most_px))
+    side.flags.writeable = False
+    return side
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def block_sums(depth: F32, stride: int, reach: int, jump: float, jump_m: float) -> tuple[F64, U8]:
+def block_sums(depth: F32, stride: int, reach: int, jump: float, jump_m: float) -> tuple[Records, U8]:
     """Sums over blocks of stride × stride pixels, as integral images, and which blocks are free of depth edges.
 
-    Returns (h+1, w+1, 4) integral images of (count, Σz, Σuz, Σvz) over pixels with depth, and (h, w) 0 where a block holds a depth edge, else 1.
+    Returns integral images (h+1, w+1) of SUMS over pixels with depth, and (h, w) 0 where a block holds a depth edge, else 1.
     An edge is two pixels in a row or column, `reach` px apart at most and nothing measured between, that differ by more than `jump·z + jump_m`."""
     rows, cols = depth.shape
     h, w = (rows + stride - 1) // stride, (cols + stride - 1) // stride
-    sums = np.zeros((h + 1, w + 1, 4))
-    smooth = np.ones((h, w), np.uint8)
-    above = np.zeros(cols, np.float32)
-    above_row = np.full(cols, -reach - 1, np.int32)
-    for y in range(rows):
-        r = y // stride
-        left = np.float32(0.0)
-        left_col = -reach - 1
-        for c in range(w):
-            n, total, along, down = sums[r + 1, c + 1, 0], sums[r + 1, c + 1, 1], sums[r + 1, c + 1, 2], sums[r + 1, c + 1, 3]
-            for x in range(c * stride, min((c + 1) * stride, cols)):
-                z = depth[y, x]
-                if not (z > 0.0 and z < np.inf):
-                    continue
-                n += 1.0
-                total += z
-                along += x * z
-                down += y * z
-                if x - left_col <= reach and abs(z - left) > jump * min(z, left) + jump_m:
-                    smooth[r, c] = 0
-                    smooth[r, left_col // stride] = 0
-                if y - above_row[x] <= reach and abs(z - above[x]) > jump * min(z, above[x]) + jump_m:
-                    smooth[r, c] = 0
-                    smooth[above_row[x] // stride, c] = 0
-                left, left_col, above[x], above_row[x] = z, x, z, y
-            sums[r + 1, c + 1, 0], sums[r + 1, c + 1, 1], sums[r + 1, c + 1, 2], sums[r + 1, c + 1, 3] = n, total, along, down
-    _integrate(sums)
+    sums, smooth = np.empty((h + 1, w + 1), SUMS), np.ones((h, w), np.uint8)
+    sums[0].view(np.float64)[:] = 0.0
+    strip, block = np.zeros((stride, w * stride), np.float32), np.empty((4, w))  # the depths of a row of blocks, 0 = none, and their sums
+    above, above_row, marks = np.zeros(cols, np.float32), np.full(cols, -reach - 1, np.int32), np.empty(cols, np.uint8)
+    for r in range(h):
+        strip[:] = 0.0
+        for y in range(r * stride, min((r + 1) * stride, rows)):
+            z = strip[y - r * stride, :cols]
+            if _marked(depth[y], z, above, above_row, y, reach, jump, jump_m, marks):
+                _spoil(z, above_row, y, reach, jump, jump_m, marks, stride, smooth)
+            _remember(z, above, above_row, y)
+        if stride == 2:  # a constant lets the compiler take several blocks at once
+            _block_row(strip, 2, r, block)
+        else:
+            _block_row(strip, stride, r, block)
+        _integrate(block, sums[r], sums[r + 1])
     return sums, smooth
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def _integrate(sums: F64) -> None:
-    """Running sums along both axes, in place."""
-    h, w = sums.shape[:2]
-    for r in range(1, h):
+def _step(z: float, other: float, jump: float, jump_m: float) -> bool:
+    return abs(z - other) > jump * min(z, other) + jump_m
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _marked(depth: F32, z: F32, above: F32, above_row: I32, y: int, reach: int, jump: float, jump_m: float, marks: U8) -> bool:
+    """Copies a row of depths to `z`, 0 = none, and marks in it: 1 = a step from the depth above, 2 = from the pixel on the left, 4 = nothing is
+    measured there. Returns whether there are any."""
+    for x in range(len(z)):
+        z[x] = depth[x] if depth[x] > 0.0 and depth[x] < np.inf else np.float32(0.0)
+    for x in range(len(z)):
+        marks[x] = (z[x] > 0.0) & (y - above_row[x] <= reach) & _step(z[x], above[x], jump, jump_m)
+    here, left, after = z[1:], z[:-1], marks[1:]
+    some = marks[0]
+    for x in range(len(here)):
+        across = np.uint8(2) * _step(here[x], left[x], jump, jump_m) if left[x] > 0.0 else np.uint8(4)
+        after[x] |= across if here[x] > 0.0 else np.uint8(0)
+    for x in range(len(z)):
+        some |= marks[x]
+    return some > 0
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _spoil(z: F32, above_row: I32, y: int, reach: int, jump: float, jump_m: float, marks: U8, stride: int, smooth: U8) -> None:
+    """Writes 0 to the blocks on both sides of a row's edges."""
+    r = y // stride
+    for x in range(len(z)):
+        if marks[x] == 0:
+            continue
+        if marks[x] & 1:
+            smooth[r, x // stride] = smooth[above_row[x] // stride, x // stride] = 0
+        left = x - 1
+        if marks[x] & 4:
+            while left >= 0 and x - left <= reach and z[left] == 0.0:
+                left -= 1
+            if left < 0 or x - left > reach or not _step(z[x], z[left], jump, jump_m):
+                continue
+        if marks[x] & 6:
+            smooth[r, x // stride] = smooth[r, left // stride] = 0
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _remember(z: F32, above: F32, above_row: I32, y: int) -> None:
+    """The last depth measured in each column, and its row."""
+    for x in range(len(z)):
+        above[x] = z[x] if z[x] > 0.0 else above[x]
+        above_row[x] = y if z[x] > 0.0 else above_row[x]
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _block_row(strip: F32, stride: int, r: int, out: F64) -> None:
+    """Count, Σz, Σuz and Σvz (4, w) of the blocks of a strip (stride, w · stride)."""
+    counts, totals, alongs, downs = out[0], out[1], out[2], out[3]
+    for c in range(len(counts)):
         n, total, along, down = 0.0, 0.0, 0.0, 0.0
-        for c in range(1, w):
-            n, total, along, down = n + sums[r, c, 0], total + sums[r, c, 1], along + sums[r, c, 2], down + sums[r, c, 3]
-            sums[r, c, 0], sums[r, c, 1] = sums[r - 1, c, 0] + n, sums[r - 1, c, 1] + total
-            sums[r, c, 2], sums[r, c, 3] = sums[r - 1, c, 2] + along, sums[r - 1, c, 3] + down
+        for i in range(stride):
+            for j in range(stride):
+                z = float(strip[i, c * stride + j])
+                n += z > 0.0
+                total += z
+                along += (c * stride + j) * z
+                down += (r * stride + i) * z
+        counts[c], totals[c], alongs[c], downs[c] = n, total, along, down
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def _box(sums: F64, a: int, b: int, c: int, d: int) -> Sums:
-    """The sums over a box of blocks, given by its corners' places in the flat `sums`: a − b − c + d."""
-    return (
-        sums[a] - sums[b] - sums[c] + sums[d],
-        sums[a + 1] - sums[b + 1] - sums[c + 1] + sums[d + 1],
-        sums[a + 2] - sums[b + 2] - sums[c + 2] + sums[d + 2],
-        sums[a + 3] - sums[b + 3] - sums[c + 3] + sums[d + 3],
-    )
+def _integrate(block: F64, above: Records, out: Records) -> None:
+    """The next row (w + 1,) of the integral images."""
+    n, total, along, down = 0.0, 0.0, 0.0, 0.0
+    out[0]["n"], out[0]["z"], out[0]["uz"], out[0]["vz"] = n, total, along, down
+    for c in range(block.shape[1]):
+        n, total, along, down = n + block[0, c], total + block[1, c], along + block[2, c], down + block[3, c]
+        i = c + 1
+        out[i]["n"], out[i]["z"], out[i]["uz"], out[i]["vz"] = above[i]["n"] + n, above[i]["z"] + total, above[i]["uz"] + along, above[i]["vz"] + down
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def _tangent(p: Sums, q: Sums) -> tuple[float, float, float]:
-    """Mean (z, uz, vz) of one box less that of another, times the product of their counts."""
-    return p[1] * q[0] - q[1] * p[0], p[2] * q[0] - q[2] * p[0], p[3] * q[0] - q[3] * p[0]
+def _clear_rings(smooth: U8, most: int) -> U8:
+    """(h, w) how many rings of blocks about each, `most` at most, are free of depth edges, as it is itself; what is outside the image is free."""
+    h, w = smooth.shape
+    free, across, out = np.ones((h, w + 2), np.uint8), np.ones((h + 2, w), np.uint8), np.zeros((h, w), np.uint8)
+    free[:, 1:-1] = smooth
+    for _ in range(most):
+        for r in range(h):
+            for c in range(w):
+                across[r + 1, c] = free[r, c] & free[r, c + 1] & free[r, c + 2]
+        for r in range(h):
+            for c in range(w):
+                free[r, c + 1] = across[r, c] & across[r + 1, c] & across[r + 2, c]
+            for c in range(w):
+                out[r, c] += free[r, c + 1]
+    return out
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def patch_normals(sums: F64, clearance: F32, radii: I32, least: float, intrinsics: tuple[float, float, float, float]) -> F32:
+def _decimetres(above: Records, below: Records, out: I32) -> None:
+    """Mean depth (w,) of the blocks between two rows (w + 1,) of the integral images, in whole decimetres; -1 without depth."""
+    for c in range(len(out)):
+        n = below[c + 1]["n"] - above[c + 1]["n"] - below[c]["n"] + above[c]["n"]
+        z = (below[c + 1]["z"] - above[c + 1]["z"] - below[c]["z"] + above[c]["z"]) / max(n, 1.0)
+        out[c] = np.int32(min(10.0 * z, 1e6)) if n > 0.5 else -1
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _boxes(flat: F64, a: int, b: int, c: int, d: int, out: F64, first: int, n: int) -> None:
+    """Sums over boxes side by side, given by the places of their corners in the flat integral images: a − b − c + d. Numbers that cannot be negative
+    need no test for indices that count from the end, so the compiler takes several at once."""
+    i, j, k, m, o = np.uint64(a), np.uint64(b), np.uint64(c), np.uint64(d), np.uint64(first)
+    for t in range(np.uint64(n)):
+        out[o + t] = flat[i + t] - flat[j + t] - flat[k + t] + flat[m + t]
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def patch_normals(sums: Records, smooth: U8, radii: I32, least: float, intrinsics: tuple[float, float, float, float]) -> F32:
     """(h, w, 3) unit normals towards the camera; NaN where a block has no depth or no patch free of depth edges.
 
-    `clearance` (h, w) is the chessboard distance to the nearest block with a depth edge; `radii[i]` the patch's half-width in blocks at a depth of
-    i decimetres (the last entry serves beyond); `least` points are needed per block of half a patch, on average. Any difference of mean points of a
-    plane lies in the plane, so missing pixels do not bias the normal. The mean of a patch's right half less that of its left half is the mean of
-    its horizontal tangents, likewise for the vertical ones."""
-    h, w = clearance.shape
+    `sums` and `smooth` as from `block_sums`; `radii[i]` is the patch's half-width in blocks at a depth of i decimetres (the last entry serves
+    beyond); `least` points are needed per block of half a patch, on average. Any difference of mean points of a plane lies in the plane, so missing
+    pixels do not bias the normal. The mean of a patch's right half less that of its left half is the mean of its horizontal tangents, likewise for
+    the vertical ones. Neighbouring blocks with patches of one size are taken at once."""
+    h, w = smooth.shape
+    out, rings = np.empty((h, w), VECTOR), _clear_rings(smooth, radii.max())
+    size, last = np.empty(w, np.int32), len(radii) - 1
+    halves, needed = np.empty((4, w), SUMS), np.empty((2, w))  # sums over each patch's east, west, south and north half, and the points these need
+    flat, flat_halves = sums.reshape(-1).view(np.float64), halves.reshape(-1).view(np.float64)
+    flat_halves[:] = 0.0
+    for r in range(h):
+        _decimetres(sums[r], sums[r + 1], size)
+        for c in range(w):
+            size[c] = min(radii[min(size[c], last)], rings[r, c]) if size[c] >= 0 else 0
+        needed[:] = np.inf
+        c = 0
+        while c < w:
+            k, first = size[c], c
+            c += 1
+            if k == 0:
+                continue
+            if first >= k:
+                while c < w - k and size[c] == k:
+                    c += 1
+            _halves(flat, h, w, r, first, c, k, least, flat_halves, needed)
+        _normals_of_row(halves[0], halves[1], halves[2], halves[3], needed, intrinsics, out[r])
+    return out.reshape(-1).view(np.float32).reshape(h, w, 3)
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _halves(flat: F64, h: int, w: int, r: int, first: int, end: int, k: int, least: float, halves: F64, needed: F64) -> None:
+    """The halves of the patches, k blocks to each side, of the blocks first … end of a row; only that of a single block may be cut by the image."""
+    row, side, place, n = 4 * (w + 1), 4 * w, 4 * first, 4 * (end - first)
+    r0, r1, c0, c1 = max(r - k, 0), min(r + k + 1, h), max(first - k, 0), min(first + k + 1, w)
+    a, b = (r1 - r0) // 2, (c1 - c0) // 2
+    nw, ne, sw, se = r0 * row + 4 * c0, r0 * row + 4 * c1, r1 * row + 4 * c0, r1 * row + 4 * c1
+    s, t = a * row, 4 * b
+    _boxes(flat, se, ne, se - t, ne - t, halves, place, n)
+    _boxes(flat, sw + t, nw + t, sw, nw, halves, place + side, n)
+    _boxes(flat, se, se - s, sw, sw - s, halves, place + 2 * side, n)
+    _boxes(flat, ne + s, ne, nw + s, nw, halves, place + 3 * side, n)
+    for c in range(first, end):
+        needed[0, c] = max(least * (r1 - r0) * b, 1.0)
+        needed[1, c] = max(least * (c1 - c0) * a, 1.0)
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _normals_of_row(
+    east: Records, west: Records, south: Records, north: Records, needed: F64, intrinsics: tuple[float, float, float, float], out: Records
+) -> None:
+    """Unit normals (w,) of a row of patches: vertical × horizontal tangent, each the difference of two mean points times their counts."""
     fx, fy, cx, cy = intrinsics
     fx, fy = 1.0 / fx, 1.0 / fy
-    out = np.full((h, w, 3), np.nan, np.float32)
-    flat, row = sums.reshape(-1), 4 * (w + 1)
-    for r in range(h):
-        for c in range(w):
-            i = r * row + 4 * c
-            n = flat[i + row + 4] - flat[i + 4] - flat[i + row] + flat[i]
-            if n < 0.5:
-                continue
-            z = (flat[i + row + 5] - flat[i + 5] - flat[i + row + 1] + flat[i + 1]) / n
-            k = min(radii[min(int(10.0 * z), len(radii) - 1)], int(clearance[r, c]) - 1)
-            if k <= 0:
-                continue
-            r0, r1, c0, c1 = max(r - k, 0), min(r + k + 1, h), max(c - k, 0), min(c + k + 1, w)
-            a, b = (r1 - r0) // 2, (c1 - c0) // 2
-            nw, ne, sw, se = r0 * row + 4 * c0, r0 * row + 4 * c1, r1 * row + 4 * c0, r1 * row + 4 * c1
-            s, t = a * row, 4 * b
-            east = _box(flat, se, ne, se - t, ne - t)
-            west = _box(flat, sw + t, nw + t, sw, nw)
-            if min(east[0], west[0]) < max(least * (r1 - r0) * b, 1.0):
-                continue
-            south = _box(flat, se, se - s, sw, sw - s)
-            north = _box(flat, ne + s, ne, nw + s, nw)
-            if min(south[0], north[0]) < max(least * (c1 - c0) * a, 1.0):
-                continue
-            zu, xu, yu = _tangent(east, west)
-            zv, xv, yv = _tangent(south, north)
-            xu, yu, xv, yv = (xu - cx * zu) * fx, (yu - cy * zu) * fy, (xv - cx * zv) * fx, (yv - cy * zv) * fy
-            nx, ny, nz = yv * zu - zv * yu, zv * xu - xv * zu, xv * yu - yv * xu  # vertical × horizontal: towards the camera
-            length = np.sqrt(nx * nx + ny * ny + nz * nz)
-            if length > 0.0:
-                length = 1.0 / length
-                out[r, c, 0], out[r, c, 1], out[r, c, 2] = nx * length, ny * length, nz * length
-    return out
+    across, down = needed[0], needed[1]
+    for c in range(len(out)):
+        p, q, s, t = east[c]["n"], west[c]["n"], south[c]["n"], north[c]["n"]
+        zu, zv = east[c]["z"] * q - west[c]["z"] * p, south[c]["z"] * t - north[c]["z"] * s
+        xu, xv = east[c]["uz"] * q - west[c]["uz"] * p, south[c]["uz"] * t - north[c]["uz"] * s
+        yu, yv = east[c]["vz"] * q - west[c]["vz"] * p, south[c]["vz"] * t - north[c]["vz"] * s
+        xu, yu, xv, yv = (xu - cx * zu) * fx, (yu - cy * zu) * fy, (xv - cx * zv) * fx, (yv - cy * zv) * fy
+        nx, ny, nz = yv * zu - zv * yu, zv * xu - xv * zu, xv * yu - yv * xu
+        length = np.sqrt(nx * nx + ny * ny + nz * nz)
+        found = (min(p, q) >= across[c]) & (min(s, t) >= down[c]) & (length > 0.0)
+        scale = 1.0 / length if found else np.nan
+        out[c]["x"], out[c]["y"], out[c]["z"] = nx * scale, ny * scale, nz * scale
