@@ -9,7 +9,7 @@ import numpy as np
 
 from trihedron.pipeline.geometry import invert
 from trihedron.pipeline.types import F64, I32, Map, Matches, Table
-from trihedron.plugins.numerics.maps.local_window import WEIGHTS, covisible_keyframes, keyframes_of, newest_keyframes, observed_by
+from trihedron.plugins.numerics.maps.local_window import WEIGHTS, covisible_keyframes, keyframes_of, newest_keyframes, observed_by, observed_by_each
 from trihedron.plugins.numerics.maps.retiring import retired
 
 FARTHER = 1.2  # a landmark seen from at most this many times as far is seen as well: a level of the key points' pyramid
@@ -77,11 +77,10 @@ def _redundancies(map: Map, keyframes: I32, others: int) -> F64:
     places = map.keyframes.rows("T_world_camera", keyframes)[:, :3, 3]
     for kind, weight in WEIGHTS.items():
         table: Table = getattr(map, f"{kind}s")
-        ids = observed_by(map, keyframes, kind)  # what they share is read once
+        ids, observed = observed_by_each(map, keyframes, kind)
         observers, centres = table.rows("observers", ids), _centres(table, kind, ids)
         away = _distances(map, observers, centres)
-        for k, keyframe in enumerate(keyframes):
-            own = np.searchsorted(ids, observed_by(map, keyframes[k : k + 1], kind))
+        for k, (keyframe, own) in enumerate(zip(keyframes, observed)):
             reach = FARTHER * np.linalg.norm(places[k] - centres[own], axis=-1)
             as_near = (away[own] <= reach[:, None]) & (observers[own] != keyframe)
             seen[k] += weight * len(own)

@@ -52,10 +52,29 @@ def current_submap(map: Map) -> int:
 
 def observed_by(map: Map, keyframes: I32, kind: str) -> I32:
     """Ids of the living `kind` landmarks ('point', 'line', 'plane') that the keyframes saw, sorted."""
-    table: Table = getattr(map, f"{kind}_observations")
+    return _living(map, _observed(map, keyframes, kind)[0], kind)
+
+
+def observed_by_each(map: Map, keyframes: I32, kind: str) -> tuple[I32, list[I32]]:
+    """`observed_by` all the keyframes, and for each of them which of those, as sorted rows."""
+    observed, ends = _observed(map, keyframes, kind)
+    ids = _living(map, observed, kind)
+    seen = [_distinct(part) for part in np.split(observed, ends[:-1])]
+    rows = [np.minimum(np.searchsorted(ids, own), max(len(ids) - 1, 0)) for own in seen]
+    return ids, [row[ids[row] == own] if len(ids) else row[:0] for row, own in zip(rows, seen)]
+
+
+def _observed(map: Map, keyframes: I32, kind: str) -> tuple[I32, I32]:
+    """Ids of what each keyframe in turn saw, dead or alive, and where what it saw ends, (n,)."""
     ranges = map.keyframes.rows(f"{kind}s", keyframes)
     rows = np.concatenate([np.arange(a, b, dtype=np.int32) for a, b in ranges]) if len(ranges) else np.empty(0, np.int32)
-    ids = _distinct(table.rows(kind, rows))
+    table: Table = getattr(map, f"{kind}_observations")
+    return table.rows(kind, rows), np.cumsum(ranges[:, 1] - ranges[:, 0])
+
+
+def _living(map: Map, ids: I32, kind: str) -> I32:
+    """Those of the ids that live, once each and sorted."""
+    ids = _distinct(ids)
     alive: Bool = getattr(map, f"{kind}s").rows("alive", ids)
     return ids[alive]
 
