@@ -1,9 +1,10 @@
 """Runs a graph over frames on several threads, with the same values whatever their number.
 
 A task is one node at one frame. It is ready when what its wires name is there: a value of the same frame, of exactly k frames ago, or, for
-`@prev`, all earlier frames of that topic. Ready tasks run oldest frame first, so tracking goes before features of later frames; how many frames
-may be in flight is bounded. What only later frames ask for has a thread of its own at a lower priority, so that no pose waits for it, and so has what
-waits for frames that have not come. Nodes see only their inputs, so the order in which tasks happen to run cannot change a value.
+`@prev`, all earlier frames of that topic. Ready tasks run oldest frame first, so tracking goes before features of later frames; of one frame, that
+first after which most remains to be done, by what calls took so far. How many frames may be in flight is bounded. What only later frames ask for has
+a thread of its own at a lower priority, so that no pose waits for it, and so has what waits for frames that have not come. Nodes see only their
+inputs, so the order in which tasks happen to run cannot change a value.
 """
 
 from __future__ import annotations
@@ -13,6 +14,7 @@ import heapq
 import os
 import sys
 import threading
+import time
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
@@ -24,6 +26,7 @@ from threadpoolctl import threadpool_limits
 
 from trihedron.pipeline.graph import PREVIOUS, Wire
 
+LATEST = 0.1  # share of the latest call in what a node is thought to take
 SWITCH_S = 0.0005  # of Python's usual 5 ms
 NICE = 10  # of the thread for what may lag; where the system has no such thing for threads, it is a thread like the others
 
@@ -77,6 +80,8 @@ class Scheduler:
     ) -> None:
         self._nodes = {node.name: node for node in nodes}
         self._rank = {node.name: i for i, node in enumerate(nodes)}
+        self._seconds = dict.fromkeys(self._nodes, 0.0)  # of a call
+        self._urgency = dict.fromkeys(self._nodes, 0.0)  # seconds from a node's beginning to the end of its frame, at best
         self._threads, self._initial, self._recent = threads, initial, recent or {}
         delays = [wire.delay for node in nodes for wire in node.inputs.values()]
         self._reach = max([1, *delays])
@@ -96,7 +101,7 @@ class Scheduler:
         self._lock = threading.Lock()
         self._frame_there = threading.Condition(self._lock)
         self._work_there = {lane: threading.Condition(self._lock) for lane in Lane}
-        self._ready: dict[Lane, list[tuple[int, int, str]]] = {lane: [] for lane in Lane}
+        self._ready: dict[Lane, list[tuple[int, float, int, str]]] = {lane: [] for lane in Lane}
         self._unmet: dict[tuple[str, int], int] = {}
         self._values: dict[str, dict[int, Any]] = {name: {} for name in self._nodes}
         self._held: dict[str, dict[int, Any]] = {name: {} for name in self._nodes}
@@ -153,6 +158,7 @@ class Scheduler:
         in_flight_until = min(self._frontier[name] for name in self._prompt) + self._lookahead
         limit = min(self._count, in_flight_until, self._consumed + self._lookahead + self._reach)
         while self._admitted < limit:
+            self._judge_urgency()
             for name, node in self._nodes.items():
                 wires = [*node.inputs.values(), *([Wire(name, PREVIOUS)] if node.ordered else [])]
                 self._unmet[name, self._admitted] = sum(not self._there(wire, self._admitted) for wire in wires)
@@ -163,6 +169,12 @@ class Scheduler:
             if ready:
                 self._work_there[lane].notify(len(ready))
 
+    def _judge_urgency(self) -> None:
+        """The upward rank of list scheduling (Topcuoglu, Hariri, Wu: HEFT, 2002)."""
+        for name in reversed(self._nodes):
+            after = max((self._urgency[consumer] for consumer, delay in self._consumers[name] if delay == 0), default=0.0)
+            self._urgency[name] = self._seconds[name] + after
+
     def _there(self, wire: Wire, position: int) -> bool:
         if wire.delay == PREVIOUS:
             return self._frontier[wire.topic] >= position
@@ -171,7 +183,7 @@ class Scheduler:
 
     def _offer(self, name: str, position: int) -> None:
         if self._unmet[name, position] == 0:
-            heapq.heappush(self._ready[self._lanes[name]], (position, self._rank[name], name))
+            heapq.heappush(self._ready[self._lanes[name]], (position, -self._urgency[name], self._rank[name], name))
 
     def _work(self, lane: Lane) -> None:
         if lane is Lane.lagging:
@@ -182,11 +194,11 @@ class Scheduler:
                 self._work_there[lane].wait_for(lambda: self._stopped or self._runnable(lane))
                 if self._stopped:
                     return
-                position, _, name = heapq.heappop(self._ready[lane])
+                position, *_, name = heapq.heappop(self._ready[lane])
                 inputs = {parameter: self._input(wire, position) for parameter, wire in self._nodes[name].inputs.items()}
                 self._running += 1
             failure: NodeFailure | None = None
-            value, ended = None, False
+            value, ended, began = None, False, time.perf_counter()
             try:
                 value = self._nodes[name].call(position, inputs)
             except NoMoreFrames:
@@ -196,6 +208,7 @@ class Scheduler:
                 failure.__cause__ = error
             with self._lock:
                 self._running -= 1
+                self._seconds[name] += LATEST * (time.perf_counter() - began - self._seconds[name])
                 if ended:
                     self._count = min(self._count, position)
                 elif failure is None:

@@ -138,6 +138,18 @@ def test_what_may_lag_takes_none_of_the_workers():
     assert [values["left"] for values in run(nodes, 5)] == [0, 1, 2, 3, 4]
 
 
+def test_of_a_frame_that_comes_first_after_which_most_remains():
+    """`alone`, named first, takes longer than `first`, but after `first` comes `long`: learned from the frames before."""
+    seconds, order = {"alone": 0.004, "first": 0.001, "long": 0.02}, []
+
+    def takes(name):
+        return lambda k, v: (order.append((k, name)), time.sleep(seconds[name]))[0]
+
+    nodes = [Node("alone", takes("alone"), {}), Node("first", takes("first"), {}), Node("long", takes("long"), {"x": Wire("first")})]
+    run(nodes, 4, threads=1, lookahead=1)
+    assert next(name for k, name in order if k == 0) == "alone" and [name for k, name in order if k == 3] == ["first", "long", "alone"]
+
+
 def test_what_waits_for_a_frame_takes_none_of_the_workers():
     """While frame 1 has not come, both workers meet at frame 0: it comes only after they did."""
     meeting, met = threading.Barrier(2, timeout=5.0), threading.Event()
