@@ -37,25 +37,37 @@ def cell_inverse_depths(
     rows, cols = depth.shape
     h, w = (rows + stride - 1) // stride, (cols + stride - 1) // stride
     rho, sigma, count = np.zeros((h, w), np.float32), np.zeros((h, w), np.float32), np.zeros((h, w), np.int32)
-    n, total, low, high = np.empty(w, np.int32), np.empty(w), np.empty(w, np.float32), np.empty(w, np.float32)
+    strip = np.zeros((stride, w * stride), np.float32)  # the depths of a row of blocks, 0 = none
     for r in range(h):
-        n[:], total[:], low[:], high[:] = 0, 0.0, np.inf, 0.0
+        strip[:] = 0.0
         for y in range(r * stride, min((r + 1) * stride, rows)):
-            c, left = 0, stride
             for x in range(cols):
-                if left == 0:
-                    c, left = c + 1, stride
-                left -= 1
-                z = depth[y, x]
-                if 0.0 < z < np.inf:
-                    n[c] += 1
-                    total[c] += z
-                    low[c], high[c] = min(low[c], z), max(high[c], z)
-        for c in range(w):
-            if n[c] > 0 and high[c] - low[c] <= edge * low[c] + edge_m:
-                z = total[c] / n[c]
-                rho[r, c], sigma[r, c], count[r, c] = 1.0 / z, sigma_z(z, noise) / (z * z), n[c]
+                strip[y - r * stride, x] = depth[y, x] if 0.0 < depth[y, x] < np.inf else np.float32(0.0)
+        if stride == 2:  # a constant lets the compiler take several cells at once
+            _cells_of_strip(strip, 2, edge, edge_m, noise, rho[r], sigma[r], count[r])
+        else:
+            _cells_of_strip(strip, stride, edge, edge_m, noise, rho[r], sigma[r], count[r])
     return rho, sigma, count
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _cells_of_strip(
+    strip: F32, stride: int, edge: float, edge_m: float, noise: tuple[float, float, float, float], rho: F32, sigma: F32, count: I32
+) -> None:
+    """A row of `cell_inverse_depths` from its depths (stride, w · stride), 0 = none."""
+    for c in range(len(rho)):
+        n, total, low, high = 0, 0.0, np.float32(np.inf), np.float32(0.0)
+        for i in range(stride):
+            for j in range(stride):
+                z = strip[i, c * stride + j]
+                n += z > 0.0
+                total += z
+                low, high = min(low, z if z > 0.0 else np.float32(np.inf)), max(high, z)
+        whole = (n > 0) & (high - low <= edge * low + edge_m)
+        mean = total / n
+        rho[c] = 1.0 / mean if whole else 0.0
+        sigma[c] = sigma_z(mean, noise) / (mean * mean) if whole else 0.0
+        count[c] = n if whole else 0
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
@@ -89,31 +101,59 @@ def coarser(grid: Grid, edge: float, edge_m: float) -> Grid:
     rows, cols = rho.shape
     h, w = (rows + 1) // 2, (cols + 1) // 2
     rho2, sigma2, count2 = np.zeros((h, w), np.float32), np.zeros((h, w), np.float32), np.zeros((h, w), np.int32)
-    normals2, x2, y2 = np.full((h, w, 3), np.nan, np.float32), np.empty(w), np.empty(h)
+    normals2, x2, y2 = np.empty((h, w, 3), np.float32), np.empty(w), np.empty(h)
+    for c in range(w):
+        x2[c] = 0.5 * (rays_x[2 * c] + rays_x[min(2 * c + 1, cols - 1)])
+    depths, counts, around = np.zeros((2, 2, 2 * w), np.float32), np.zeros((2, 2 * w), np.int32), np.zeros((3, 2, 2 * w), np.float32)  # of two rows
+    normal = np.empty((3, w), np.float32)
     for r in range(h):
         y2[r] = 0.5 * (rays_y[2 * r] + rays_y[min(2 * r + 1, rows - 1)])
+        for i in range(2):
+            if 2 * r + i == rows:
+                depths[:, 1], counts[1], around[:, 1] = 0.0, 0, 0.0
+                continue
+            here = normals[2 * r + i]
+            for c in range(cols):
+                depths[0, i, c], depths[1, i, c], counts[i, c] = rho[2 * r + i, c], sigma[2 * r + i, c], count[2 * r + i, c]
+            for c in range(cols):
+                known = (depths[0, i, c] > 0.0) & (here[c, 0] == here[c, 0])
+                for k in range(3):
+                    around[k, i, c] = here[c, k] if known else np.float32(0.0)
+        _mean_depths(depths[0], depths[1], counts, edge, edge_m, rho2[r], sigma2[r], count2[r])
+        _mean_normals(around[0], around[1], around[2], count2[r], normal[0], normal[1], normal[2])
         for c in range(w):
-            x2[c] = 0.5 * (rays_x[2 * c] + rays_x[min(2 * c + 1, cols - 1)])
-            n, total, error, low, high, nx, ny, nz = 0, 0.0, 0.0, np.inf, 0.0, 0.0, 0.0, 0.0
-            for i in range(2 * r, min(2 * r + 2, rows)):
-                for j in range(2 * c, min(2 * c + 2, cols)):
-                    p = rho[i, j]
-                    if p <= 0.0:
-                        continue
-                    n += count[i, j]
-                    total += count[i, j] * p
-                    error += count[i, j] * sigma[i, j]
-                    low, high = min(low, p), max(high, p)
-                    if not np.isnan(normals[i, j, 0]):
-                        nx += normals[i, j, 0]
-                        ny += normals[i, j, 1]
-                        nz += normals[i, j, 2]
-            if n > 0 and 1.0 / low - 1.0 / high <= edge / high + edge_m:
-                rho2[r, c], sigma2[r, c], count2[r, c] = total / n, error / n, n
-                length = np.sqrt(nx * nx + ny * ny + nz * nz)
-                if length > 0.0:
-                    normals2[r, c, 0], normals2[r, c, 1], normals2[r, c, 2] = nx / length, ny / length, nz / length
+            for k in range(3):
+                normals2[r, c, k] = normal[k, c]
     return Grid(rho2, sigma2, count2, x2, y2, normals2)
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _mean_depths(rho: F32, sigma: F32, count: I32, edge: float, edge_m: float, rho2: F32, sigma2: F32, count2: I32) -> None:
+    """A row (w,) of the depths of `coarser` from two rows (2, 2 w), 0 = none."""
+    for c in range(len(rho2)):
+        n, total, error, low, high = 0, 0.0, 0.0, np.inf, 0.0
+        for i in range(2):
+            for j in range(2):
+                p, m = rho[i, 2 * c + j], count[i, 2 * c + j]
+                n += m
+                total += m * p
+                error += m * sigma[i, 2 * c + j]
+                low, high = min(low, p if p > 0.0 else np.inf), max(high, p)
+        whole = (n > 0) & (1.0 / low - 1.0 / high <= edge / high + edge_m)
+        rho2[c], sigma2[c], count2[c] = total / n if whole else 0.0, error / n if whole else 0.0, n if whole else 0
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _mean_normals(x: F32, y: F32, z: F32, count: I32, x2: F32, y2: F32, z2: F32) -> None:
+    """A row (w,) of the normals of `coarser` from two rows (2, 2 w), 0 = none."""
+    for c in range(len(count)):
+        nx, ny, nz = 0.0, 0.0, 0.0
+        for i in range(2):
+            for j in range(2):
+                nx, ny, nz = nx + x[i, 2 * c + j], ny + y[i, 2 * c + j], nz + z[i, 2 * c + j]
+        length = np.sqrt(nx * nx + ny * ny + nz * nz)
+        length = length if (length > 0.0) & (count[c] > 0) else np.nan
+        x2[c], y2[c], z2[c] = nx / length, ny / length, nz / length
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
@@ -124,31 +164,47 @@ def smooth_links(grid: Grid, cos_angle: float, gate: float) -> U8:
     rho, sigma, rays_x, rays_y, normals = grid.rho, grid.sigma, grid.rays_x, grid.rays_y, grid.normals
     h, w = rho.shape
     links = np.zeros((h, w), np.uint8)
-    here, above = np.zeros((w, 5)), np.zeros((w, 5))  # point, offset n·x of the tangent plane, limit of the offsets; the limit is 0 without depth
+    here, above = np.zeros((5, w)), np.zeros((5, w))  # point, offset n·x of the tangent plane, limit of the offsets; the limit is 0 without depth
+    normal, upper, bits = np.empty((3, w), np.float32), np.empty((3, w), np.float32), np.zeros(w, np.uint8)
     for r in range(h):
-        here, above = above, here
+        here, above, normal, upper = above, here, upper, normal
         for c in range(w):
-            here[c, 4] = 0.0
-            a, b, d = normals[r, c, 0], normals[r, c, 1], normals[r, c, 2]
-            if rho[r, c] <= 0.0 or np.isnan(a):
-                continue
-            z = 1.0 / rho[r, c]
-            x, y = rays_x[c] * z, rays_y[r] * z
-            offset, limit = a * x + b * y + d * z, gate * sigma[r, c] * z * z
-            here[c, 0], here[c, 1], here[c, 2], here[c, 3], here[c, 4] = x, y, z, offset, limit
-            if c > 0 and here[c - 1, 4] > 0.0:
-                e, f, g = normals[r, c - 1, 0], normals[r, c - 1, 1], normals[r, c - 1, 2]
-                if a * e + b * f + d * g > cos_angle:
-                    left = here[c - 1]
-                    if abs(a * left[0] + b * left[1] + d * left[2] - offset) < limit and abs(e * x + f * y + g * z - left[3]) < limit:
-                        links[r, c] |= 1
-            if r > 0 and above[c, 4] > 0.0:
-                e, f, g = normals[r - 1, c, 0], normals[r - 1, c, 1], normals[r - 1, c, 2]
-                if a * e + b * f + d * g > cos_angle:
-                    up = above[c]
-                    if abs(a * up[0] + b * up[1] + d * up[2] - offset) < limit and abs(e * x + f * y + g * z - up[3]) < limit:
-                        links[r, c] |= 2
+            for k in range(3):
+                normal[k, c] = normals[r, c, k]
+        _tangent_planes(rho[r], sigma[r], rays_x, rays_y[r], normal, gate, here)
+        if r > 0:
+            _joined(here, normal, above, upper, cos_angle, bits)
+            for c in range(w):
+                links[r, c] = 2 * bits[c]
+        _joined(here[:, 1:], normal[:, 1:], here[:, :-1], normal[:, :-1], cos_angle, bits[1:])
+        for c in range(1, w):
+            links[r, c] |= bits[c]
     return links
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _tangent_planes(rho: F32, sigma: F32, rays_x: F64, ray_y: float, normal: F32, gate: float, out: F64) -> None:
+    """Point, offset of the tangent plane and limit (5, w) of a row of cells, as in `smooth_links`."""
+    xs, ys, zs, offsets, limits, a, b, d = out[0], out[1], out[2], out[3], out[4], normal[0], normal[1], normal[2]
+    for c in range(len(rho)):
+        z = 1.0 / rho[c]
+        x, y = rays_x[c] * z, ray_y * z
+        xs[c], ys[c], zs[c] = x, y, z
+        offsets[c] = a[c] * x + b[c] * y + d[c] * z
+    for c in range(len(rho)):
+        limits[c] = gate * sigma[c] * zs[c] * zs[c] if (rho[c] > 0.0) & (a[c] == a[c]) else 0.0
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _joined(one: F64, normal: F32, other: F64, normal2: F32, cos_angle: float, out: U8) -> None:
+    """1 where cells lie on one smooth surface with others, whose offsets may be as far off as the limit of the ones."""
+    for c in range(out.size):
+        a, b, d, e, f, g = normal[0, c], normal[1, c], normal[2, c], normal2[0, c], normal2[1, c], normal2[2, c]
+        limit = one[4, c]
+        there = a * other[0, c] + b * other[1, c] + d * other[2, c] - one[3, c]
+        here = e * one[0, c] + f * one[1, c] + g * one[2, c] - other[3, c]
+        alike = (limit > 0.0) & (other[4, c] > 0.0) & (a * e + b * f + d * g > cos_angle)
+        out[c] = alike & (abs(there) < limit) & (abs(here) < limit)
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
