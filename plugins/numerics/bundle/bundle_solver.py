@@ -23,11 +23,10 @@ CONVERGED = 1e-2  # squared length of a pose's or plane's step in standard devia
 
 @dataclass(frozen=True)
 class BundleSolution:
-    """The state found, with costs at the start and at the end under the last loss. Covariances are marginal, given the held keyframes: (6 free + 3
+    """The state found, with its cost under the last loss. Covariances are marginal, given the held keyframes: (6 free + 3
     p, ...) of poses (xi) and planes (a, b, d), and (n + m, 4, 4) of points (the first three) and of lines in `line_basis` at both ends."""
 
     state: BundleState
-    initial_cost: float
     cost: float
     iterations: int
     covariance: F64
@@ -40,7 +39,7 @@ def solve_bundle(state: BundleState, seen: BundleMeasurements, iterations: int) 
     losses = (HUBER, TRUNCATED) if seen.robust else (SQUARES,)
     now, trial = _empty(state, seen), _empty(state, seen)
     S, y, inverses = np.empty(now.H.shape), np.empty(len(now.g)), np.empty_like(now.V)
-    initial, used, cost = float(linearise_bundle(state, seen, losses[-1], now)), 0, 0.0
+    used, cost = 0, 0.0
     for loss in losses:
         state, cost, steps, now, trial = _minimised(state, seen, loss, iterations, now, trial)
         used += steps
@@ -48,7 +47,7 @@ def solve_bundle(state: BundleState, seen: BundleMeasurements, iterations: int) 
     covariance = inverse(S)
     landmarks = np.empty_like(now.V)
     marginals(now, seen, inverses, covariance, landmarks)
-    return BundleSolution(state, initial, cost, used, covariance, landmarks)
+    return BundleSolution(state, cost, used, covariance, landmarks)
 
 
 def _minimised(
