@@ -12,6 +12,9 @@
 from __future__ import annotations
 
 import re
+import struct
+import threading
+from functools import cache, lru_cache
 from typing import Any
 
 import cv2
@@ -21,6 +24,7 @@ from numpy.typing import NDArray
 
 from trihedron.pipeline.errors import RecordingError
 from trihedron.pipeline.mcap_chunks import MAX_RATIO
+from trihedron.pipeline.wire_format import bytes_field, head, varint
 
 ENCODINGS = ("raw", "columns", "zstd", "rows")
 MAX_BYTES = 1 << 30  # of one decoded array
@@ -29,24 +33,54 @@ TRANSPOSED_BYTES = 512  # smaller arrays are left as they are
 SCALARS: dict[str, type[Any]] = {"bool": bool, "int": int, "float": float}
 
 
-def put_array(message: Any, name: str, item: Any, image: bool) -> None:
-    """Add an array, text or number to `message.arrays`; `image`: its first axes are height and width."""
-    if isinstance(item, str):
-        message.arrays.add(name=name, dtype="str", data=item.encode())
-        return
-    scalar = type(item).__name__ if type(item).__name__ in SCALARS else None
+def array_parts(name: str, item: Any, image: bool) -> tuple[bytes, Any]:
+    """An array, text or number as a field of `trihedron.Value`: what stands before its data, and these. Of an image the first axes are height and
+    width."""
+    kind = item.__class__
+    if kind in _PACKED:
+        data: Any = _PACKED[kind](item)
+        return _head(name, kind.__name__, (), "raw", len(data)), data
+    if kind is str:
+        data = item.encode()
+        return _head(name, "str", (), "", len(data)), data
     array = np.ascontiguousarray(item)
-    shape = () if scalar else array.shape
-    encoding, data = "raw", b""
-    if image and array.size and array.dtype == np.uint8 and array.ndim == 3:
-        encoding, data = "rows", zstandard.compress(_row_steps(array).data, 1)
-    elif image and array.size:
-        encoding, data = "zstd", zstandard.compress(array.data, 1)
-    elif array.nbytes >= TRANSPOSED_BYTES and array.itemsize > 1:
-        encoding, data = "columns", cv2.transpose(array.reshape(-1).view(np.uint8).reshape(len(array), -1)).tobytes()
-    else:
-        data = array.tobytes()
-    message.arrays.add(name=name, dtype=scalar or array.dtype.str.lstrip("<|="), shape=shape, encoding=encoding, data=data)
+    encoding, data, size = _encoded(array, image)
+    return _head(name, _type_name(array.dtype), array.shape, encoding, size), data
+
+
+def _encoded(array: NDArray[Any], image: bool) -> tuple[str, Any, int]:
+    """Encoding, data (anything that has bytes) and their number."""
+    if image and array.size:
+        steps = array.dtype == np.uint8 and array.ndim == 3
+        data = _compressor().compress(_row_steps(array).data if steps else array.data)
+        return "rows" if steps else "zstd", data, len(data)
+    if array.nbytes >= TRANSPOSED_BYTES and array.itemsize > 1:
+        return "columns", cv2.transpose(array.reshape(-1).view(np.uint8).reshape(len(array), -1)).data, array.nbytes
+    return "raw", array.data, array.nbytes
+
+
+@lru_cache(4096)
+def _head(name: str, dtype: str, shape: tuple[int, ...], encoding: str, size: int) -> bytes:
+    """A field `arrays` up to its data; most arrays of a run are as large as one before."""
+    texts = bytes_field(1, name.encode()) + bytes_field(2, dtype.encode())
+    inner = texts + bytes_field(3, b"".join(map(varint, shape))) + bytes_field(4, encoding.encode()) + (head(5, size) if size else b"")
+    return head(5, len(inner) + size) + inner
+
+
+@cache
+def _type_name(dtype: np.dtype[Any]) -> str:
+    return dtype.str.lstrip("<|=")
+
+
+_PACKED: dict[type[Any], Any] = {bool: struct.Struct("?").pack, int: struct.Struct("<q").pack, float: struct.Struct("<d").pack}
+_kept = threading.local()
+
+
+def _compressor() -> Any:
+    """One of this thread, which keeps its tables."""
+    if not hasattr(_kept, "compressor"):
+        _kept.compressor = zstandard.ZstdCompressor(level=1)
+    return _kept.compressor
 
 
 def get_array(array: Any, place: str) -> Any:

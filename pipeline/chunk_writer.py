@@ -1,7 +1,8 @@
-"""An MCAP file that loses little: messages are handed over, and a thread of its own closes chunks by size and by time and puts them on the disk.
+"""An MCAP file that loses little: what makes messages is handed over, and a thread of its own closes chunks by size and by time and puts them on the
+disk.
 
 A process that is killed, or a plug that is pulled, costs what was handed over since the last chunk, `CHUNK_SECONDS` or two; the rest is whole, and
-`trihedron recover` gives it its index. Compression and the disk wait beside the run, not in it."""
+`trihedron recover` gives it its index. Encoding, compression and the disk wait beside the run, not in it."""
 
 from __future__ import annotations
 
@@ -9,18 +10,20 @@ import fcntl
 import logging
 import os
 import threading
+from collections import deque
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
 
-from mcap.writer import CompressionType, Writer
-
 from trihedron.pipeline.errors import RecordingError
+from trihedron.pipeline.mcap_writer import McapWriter
 
 log = logging.getLogger("trihedron")
+Messages = Iterable[tuple[int, int, bytes]]  # channel, log time in ns, content
 CHUNK_BYTES = 4 << 20  # an entry of the index, which waits in memory for the end, is worth more messages
 CHUNK_SECONDS = 0.4
 MESSAGE_OVERHEAD = 64  # bytes of a message beside its data, generously
-MOST_WAITING = 64 << 20  # bytes; who writes faster than the disk waits from there on
+MOST_WAITING = 64 << 20  # bytes in memory; who writes faster than the disk waits from there on
 
 
 class ChunkWriter:
@@ -34,11 +37,14 @@ class ChunkWriter:
         self._file = _locked(path)
         self._whole = 0  # bytes up to the end of the last whole record
         self._chunk_bytes = 0
-        self._writer: Any = Writer(self._file, chunk_size=2 * CHUNK_BYTES, compression=CompressionType.ZSTD)  # a tenth smaller than LZ4
+        self._writer = McapWriter(self._file)
+        self._chunk: list[tuple[int, int, bytes]] = []
         self._guarded(lambda: self._writer.start(library="trihedron"))
-        self._waiting: list[tuple[int, int, bytes]] = []
-        self._waiting_bytes, self._closing = 0, False
-        self._handed, self._writing = threading.Condition(), threading.Lock()
+        self._waiting: deque[tuple[int, Callable[[], Messages]]] = deque()
+        self._handed_bytes, self._taken_bytes = 0, 0  # each of one thread alone, so that a message handed over takes no lock
+        self._closing = False
+        self._mistake: BaseException | None = None  # of what makes messages
+        self._enough, self._room, self._writing = threading.Event(), threading.Event(), threading.Lock()
         self._thread = threading.Thread(target=self._work, name=f"writer of {path.name}", daemon=True)
         self._thread.start()
 
@@ -47,37 +53,41 @@ class ChunkWriter:
     def metadata(self, name: str, content: dict[str, str]) -> None:
         """Add a metadata record."""
         with self._writing:
-            self._guarded(lambda: self._writer.add_metadata(name, content))
+            self._guarded(lambda: self._writer.metadata(name, content))
 
     def attach(self, name: str, text: str) -> None:
         """Add a text file."""
         with self._writing:
-            self._guarded(lambda: self._writer.add_attachment(0, 0, name, "text/plain", text.encode()))
+            self._guarded(lambda: self._writer.attachment(name, "text/plain", text.encode()))
 
     def channel(self, topic: str, schema: str, encoding: str, definition: bytes, message_encoding: str) -> int:
-        """Declare a channel with a schema of its own; returns its number."""
-        with self._writing:
-            schema_id = self._writer.register_schema(schema, encoding, definition)
-            return int(self._writer.register_channel(topic, message_encoding, schema_id))
+        """Declare a channel with a schema of its own; returns its number. For what was handed over to call: between chunks no other thread writes."""
+        return self._writer.channel(topic, schema, encoding, definition, message_encoding)
 
-    def add(self, channel: int, stamp_ns: int, data: bytes) -> None:
-        """Hand a message over."""
-        with self._handed:
-            self._waiting.append((channel, stamp_ns, data))
-            self._waiting_bytes += len(data) + MESSAGE_OVERHEAD
-            if self._waiting_bytes > CHUNK_BYTES:
-                self._handed.notify_all()
-            self._handed.wait_for(lambda: self._waiting_bytes < MOST_WAITING)
+    def add(self, size: int, made: Callable[[], Messages]) -> None:
+        """Hand over what makes messages, and how many bytes of memory wait for it, about. It is called in the writer's thread, in the order of the
+        calls; what it raises is raised by the next call, or by `close`, and ends the file there."""
+        if self._mistake is not None:
+            raise self._mistake
+        self._handed_bytes += size + MESSAGE_OVERHEAD
+        self._waiting.append((size + MESSAGE_OVERHEAD, made))
+        if self._handed_bytes - self._taken_bytes > CHUNK_BYTES:
+            self._enough.set()
+            self._room.clear()
+            while self._handed_bytes - self._taken_bytes > MOST_WAITING:
+                self._room.wait(CHUNK_SECONDS)
+                self._room.clear()
 
     def close(self) -> None:
         """Write what waits, and the index; the file is complete only then. Raises RecordingError when that, or anything before, failed."""
         if not self._file.closed:
-            with self._handed:
-                self._closing = True
-                self._handed.notify_all()
+            self._closing = True
+            self._enough.set()
             self._thread.join()
             self._guarded(self._writer.finish)
             self._file.close()
+            if self._mistake is not None:
+                raise self._mistake
             if self.failure is not None:
                 cure = f"what was written before is kept; index it with: trihedron recover {self.path}"
                 raise RecordingError(str(self.path), f"cannot be written: {self.failure.strerror}", cure) from self.failure
@@ -85,26 +95,48 @@ class ChunkWriter:
     def _work(self) -> None:
         closing = False
         while not closing:
-            with self._handed:
-                self._handed.wait_for(lambda: self._closing or self._waiting_bytes > CHUNK_BYTES, timeout=CHUNK_SECONDS)
-                waiting, self._waiting, self._waiting_bytes, closing = self._waiting, [], 0, self._closing
-                self._handed.notify_all()
-            if waiting:
+            self._enough.wait(CHUNK_SECONDS)
+            self._enough.clear()
+            closing = self._closing
+            if self._waiting:
                 with self._writing:
-                    self._guarded(lambda messages=waiting: self._write(messages))
+                    self._guarded(self._write)
+            self._forget()
 
-    def _write(self, messages: list[tuple[int, int, bytes]]) -> None:
-        for channel, stamp_ns, data in messages:
-            if self._chunk_bytes + len(data) + MESSAGE_OVERHEAD > CHUNK_BYTES:
-                self._end_chunk()
-            self._writer.add_message(channel, log_time=stamp_ns, data=data, publish_time=stamp_ns)
-            self._chunk_bytes += len(data) + MESSAGE_OVERHEAD
+    def _write(self) -> None:
+        """What waits now, as chunks."""
+        for _ in range(len(self._waiting)):
+            for message in self._made():
+                size = len(message[2]) + MESSAGE_OVERHEAD
+                if self._chunk_bytes + size > CHUNK_BYTES:
+                    self._end_chunk()
+                self._chunk.append(message)
+                self._chunk_bytes += size
         self._end_chunk()
         self._file.sync()
 
+    def _made(self) -> Messages:
+        """The messages of what was handed over first."""
+        size, make = self._waiting.popleft()
+        try:
+            made = list(make()) if self._mistake is None else []
+        except Exception as error:
+            self._mistake, made = error, []
+        self._taken_bytes += size
+        self._room.set()
+        return made
+
+    def _forget(self) -> None:
+        """What waits when nothing can be written any more."""
+        while self._waiting and (self.failure is not None or self._mistake is not None):
+            self._taken_bytes += self._waiting.popleft()[0]
+        self._room.set()
+
     def _end_chunk(self) -> None:
-        self._writer.flush()
-        self._whole, self._chunk_bytes = self._file.tell(), 0
+        chunk, self._chunk, self._chunk_bytes = self._chunk, [], 0
+        if chunk:
+            self._writer.chunk(chunk)
+            self._whole = self._file.tell()
 
     def _guarded(self, action: Any) -> None:
         """Do it; if the disk refuses, keep why, and cut the file after its last whole record."""

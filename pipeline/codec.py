@@ -12,19 +12,22 @@ from __future__ import annotations
 import dataclasses
 import json
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from functools import cache
+from operator import attrgetter
 from typing import Any, get_type_hints
 
 import numpy as np
 from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
 
 from trihedron.pipeline import types
-from trihedron.pipeline.array_codec import DAMAGED, element_type, get_array, put_array
+from trihedron.pipeline.array_codec import DAMAGED, array_parts, element_type, get_array
 from trihedron.pipeline.arrays import array_specs
 from trihedron.pipeline.errors import RecordingError
 from trihedron.pipeline.table import CHUNK, Column, Table
 from trihedron.pipeline.types import Value
+from trihedron.pipeline.wire_format import bytes_field, number_field
 
 FULL_EVERY = 50
 _TYPES: dict[str, type[Value]] = {
@@ -59,21 +62,54 @@ class Encoder:
         self._tables: dict[str, Table] = {}
         self._count = 0
 
-    def encode(self, value: Value) -> Any:
-        """The protobuf message of a value; tables relative to the previous call's."""
-        message = ValueMessage(type=type(value).__name__, version=value.version, index=value.index, stamp_ns=value.stamp_ns)
+    def encode(self, value: Value) -> bytes:
+        """A value as the bytes of a `trihedron.Value`; tables relative to the previous call's."""
+        kind: Any = value.__class__
+        layout = _layout(kind)
+        parts = [layout.head, number_field(3, value.index), number_field(4, value.stamp_ns)]
+        for name, image, item in zip(layout.names, layout.images, layout.content(value)):
+            parts += array_parts(name, item, image)
         full = self._count % FULL_EVERY == 0
         self._count += 1
-        for name, item, image in _items(value):
-            if isinstance(item, Table):
-                known = None if full else self._tables.get(name)
-                if known is not None and (known.schema != item.schema or known.size > item.size):  # another table
-                    known = None
-                _put_table(message, name, item, known)
-                self._tables[name] = item
-            else:
-                put_array(message, name, item, image)
-        return message
+        for name in layout.tables:
+            table: Table = getattr(value, name)
+            known = None if full else self._tables.get(name)
+            if known is not None and (known.schema != table.schema or known.size > table.size):  # another table
+                known = None
+            parts += _table_parts(name, table, known)
+            self._tables[name] = table
+        return b"".join(parts)
+
+
+@dataclass(frozen=True)
+class _Layout:
+    """What the message of a type is made of: its first bytes, the dotted names of all but tables, which of these are images, and what reads them."""
+
+    head: bytes
+    names: tuple[str, ...]
+    images: tuple[bool, ...]
+    tables: tuple[str, ...]
+    content: Callable[[Value], Sequence[Any]]
+
+
+@cache
+def _layout(kind: Any) -> _Layout:
+    names, images = zip(*_names(kind, ""))
+    tables = tuple(name for name, hint in _hints(kind).items() if hint is Table)
+    read = attrgetter(*names, names[0])  # of one name alone it would give no tuple
+    return _Layout(bytes_field(1, kind.__name__.encode()) + number_field(2, kind.version), names, images, tables, read)
+
+
+def _names(kind: Any, prefix: str) -> Iterator[tuple[str, bool]]:
+    """(dotted name, whether an image) of each field but index, stamp and tables."""
+    images = {spec.name for spec in array_specs(kind) if spec.shape.axes[:2] == ("h", "w")}  # its first axes are height and width
+    for name, hint in _hints(kind).items():
+        if hint is Table or (prefix == "" and name in ("index", "stamp_ns")):
+            continue
+        if _is_nested(hint):
+            yield from _names(hint, f"{prefix}{name}.")
+        else:
+            yield prefix + name, name in images
 
 
 class Decoder:
@@ -146,35 +182,21 @@ def _hints(kind: Any) -> Mapping[str, Any]:
     return {f.name: hints[f.name] for f in dataclasses.fields(kind)}
 
 
-@cache
-def _images(kind: Any) -> frozenset[str]:
-    """Array fields that are images: their first axes are height and width."""
-    return frozenset(spec.name for spec in array_specs(kind) if spec.shape.axes[:2] == ("h", "w"))
-
-
-def _items(value: Any, prefix: str = "") -> Iterator[tuple[str, Any, bool]]:
-    """(name, content, whether an image) of each field but index and stamp; nested values flattened."""
-    for name in _hints(value.__class__):
-        item = getattr(value, name)
-        if prefix == "" and name in ("index", "stamp_ns"):
-            continue
-        if dataclasses.is_dataclass(item) and not isinstance(item, Table):
-            yield from _items(item, f"{prefix}{name}.")
-        else:
-            yield prefix + name, item, name in _images(value.__class__)
+def _is_nested(hint: Any) -> bool:
+    return dataclasses.is_dataclass(hint) and hint is not Table and isinstance(hint, type)
 
 
 def _make(kind: Any, fields: Mapping[str, Any], prefix: str) -> Any:
     """Rebuild a (nested) dataclass from dotted fields."""
     made = {}
     for name, hint in _hints(kind).items():
-        nested = dataclasses.is_dataclass(hint) and hint is not Table
-        made[name] = _make(hint, fields, f"{prefix}{name}.") if nested and isinstance(hint, type) else fields[prefix + name]
+        made[name] = _make(hint, fields, f"{prefix}{name}.") if _is_nested(hint) else fields[prefix + name]
     return kind(**made)
 
 
-def _put_table(message: Any, name: str, table: Table, previous: Table | None) -> None:
+def _table_parts(name: str, table: Table, previous: Table | None) -> list[Any]:
     """The rows of each column that `previous` does not have; columns whose rows are the same share the list of their numbers."""
+    parts: list[Any] = []
     changed: dict[str, int] = {}
     numbers: dict[bytes, int] = {}
     before = {column: previous.chunks.get(column, ()) if previous is not None else () for column in table.chunks}
@@ -187,13 +209,14 @@ def _put_table(message: Any, name: str, table: Table, previous: Table | None) ->
         ids, values = _changed(before[column], chunks, here)
         if len(ids):
             changed[column] = numbers.setdefault(ids.tobytes(), len(numbers))
-            put_array(message, f"{name}#{column}", values, False)
+            parts += array_parts(f"{name}#{column}", values, False)
     for ids_bytes, k in numbers.items():
-        put_array(message, f"{name}#rows{k}", np.frombuffer(ids_bytes, np.int32), False)
+        parts += array_parts(f"{name}#rows{k}", np.frombuffer(ids_bytes, np.int32), False)
     if emptied:
-        put_array(message, f"{name}#emptied", np.array(sorted(emptied), np.int32), False)
+        parts += array_parts(f"{name}#emptied", np.array(sorted(emptied), np.int32), False)
     schema = {c: [s.dtype, list(s.shape), s.step] for c, s in table.schema.items()}
-    put_array(message, f"{name}#", json.dumps({"size": table.size, "full": previous is None, "schema": schema, "rows": changed}), False)
+    parts += array_parts(f"{name}#", json.dumps({"size": table.size, "full": previous is None, "schema": schema, "rows": changed}), False)
+    return parts
 
 
 def _others(known: Sequence[Any], chunks: Sequence[Any]) -> list[int]:
@@ -205,13 +228,21 @@ def _others(known: Sequence[Any], chunks: Sequence[Any]) -> list[int]:
 def _changed(known: Sequence[Any], chunks: Sequence[Any], here: list[int]) -> tuple[Any, Any]:
     """Numbers and values of the rows of the chunks `here` that those known, none longer than these, do not have. They are compared by their bytes:
     NaN is no change."""
-    rows, before = np.concatenate([chunks[i] for i in here]), [known[i] for i in here if i < len(known)]
+    rows, before = _joined([chunks[i] for i in here]), [known[i] for i in here if i < len(known)]
+    numbers = (np.array(here, np.int32)[:, None] * CHUNK + _IN_CHUNK).reshape(-1)[: len(rows)]
+    if not before:
+        return numbers, rows
     differ = np.ones(len(rows), np.bool_)
-    if before:  # all but the last are full, so that these are the first rows
-        old = np.concatenate(before)
-        differ[: len(old)] = (_words(old) != _words(rows[: len(old)])).any(axis=1)
-    numbers = (np.array(here, np.int32)[:, None] * CHUNK + np.arange(CHUNK, dtype=np.int32)).reshape(-1)[: len(rows)]
+    old = _joined(before)  # all but the last are full, so that these are the first rows
+    differ[: len(old)] = (_words(old) != _words(rows[: len(old)])).any(axis=1)
     return numbers[differ], rows[differ]
+
+
+_IN_CHUNK = np.arange(CHUNK, dtype=np.int32)
+
+
+def _joined(parts: list[Any]) -> Any:
+    return parts[0] if len(parts) == 1 else np.concatenate(parts)
 
 
 def _words(rows: Any) -> Any:

@@ -21,7 +21,7 @@ from trihedron.pipeline import foxglove_messages as show
 from trihedron.pipeline.geometry import invert, rotation_angle_deg
 from trihedron.pipeline.types import F64, LOST, OK, Frame, Keypoints, ManhattanFrame, Map, Planes, Pose, Segments, Surface, Trajectory, Value
 
-IMAGE_PERIOD_NS = 100_000_000  # 10 Hz is enough to look at
+IMAGE_PERIOD_NS = 200_000_000  # 5 Hz is enough to look at; drawing what was found takes a millisecond or two
 MAP_PERIOD_NS = 1_000_000_000
 TRUTH_NS = 20_000_000  # a true pose this near in time is that of the frame
 

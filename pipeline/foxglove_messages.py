@@ -7,7 +7,6 @@ from typing import Any
 
 import cv2
 import numpy as np
-from foxglove_schemas_protobuf.ArrowPrimitive_pb2 import ArrowPrimitive
 from foxglove_schemas_protobuf.CameraCalibration_pb2 import CameraCalibration
 from foxglove_schemas_protobuf.Color_pb2 import Color
 from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
@@ -22,7 +21,6 @@ from foxglove_schemas_protobuf.PoseInFrame_pb2 import PoseInFrame
 from foxglove_schemas_protobuf.Quaternion_pb2 import Quaternion
 from foxglove_schemas_protobuf.SceneEntity_pb2 import SceneEntity
 from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
-from foxglove_schemas_protobuf.TriangleListPrimitive_pb2 import TriangleListPrimitive
 from foxglove_schemas_protobuf.Vector3_pb2 import Vector3
 from google.protobuf.duration_pb2 import Duration
 from google.protobuf.timestamp_pb2 import Timestamp
@@ -44,7 +42,7 @@ from trihedron.pipeline.types import (
 )  # fmt: skip
 
 WORLD, CAMERA = "world", "camera"
-LIFETIME_NS = 200_000_000  # of what belongs to a frame
+LIFETIME_NS = 400_000_000  # of what belongs to a frame
 JPEG_QUALITY = 80
 MOST_VERTICES = 30_000  # of a mesh, 70 bytes each
 COARSE_M = 0.02  # side of the cells whose vertices become one when there are more; doubled until there are not
@@ -101,17 +99,19 @@ def image(frame: Frame) -> CompressedImage:
     return CompressedImage(timestamp=stamp(frame), frame_id=CAMERA, data=data.tobytes(), format="jpeg")
 
 
-def _scene(value: Value, name: str, **primitives: Any) -> SceneUpdate:
-    lifetime = Duration(nanos=LIFETIME_NS)
-    return SceneUpdate(entities=[SceneEntity(timestamp=stamp(value), frame_id=CAMERA, id=name, lifetime=lifetime, **primitives)])
+def _scene(value: Value, name: str) -> tuple[SceneUpdate, SceneEntity]:
+    """A scene, and what it holds, to be filled in place: what a message is made of is copied."""
+    update = SceneUpdate()
+    return update, update.entities.add(timestamp=stamp(value), frame_id=CAMERA, id=name, lifetime=Duration(nanos=LIFETIME_NS))
 
 
-def _in_world(value: Value, name: str, **primitives: Any) -> SceneUpdate:
-    """What stays until another of this name comes."""
-    return SceneUpdate(entities=[SceneEntity(timestamp=stamp(value), frame_id=WORLD, id=name, **primitives)])
+def _in_world(value: Value, name: str) -> tuple[SceneUpdate, SceneEntity]:
+    """As `_scene`, of what stays until another of this name comes."""
+    update = SceneUpdate()
+    return update, update.entities.add(timestamp=stamp(value), frame_id=WORLD, id=name)
 
 
-def _filled(message: Any, field: str, rows: Any) -> Any:
+def _fill(message: Any, field: str, rows: Any) -> None:
     """Add rows (n, k) to a field that repeats messages of k doubles (points, colours): their bytes at once, not object by object."""
     rows = np.asarray(rows, np.float64).reshape(-1, rows.shape[-1])
     packed = np.zeros(len(rows), _packed(rows.shape[1]))
@@ -119,7 +119,6 @@ def _filled(message: Any, field: str, rows: Any) -> Any:
     for i in range(rows.shape[1]):
         packed[f"key{i}"], packed[f"value{i}"] = (i + 1) << 3 | 1, rows[:, i]
     message.MergeFromString(packed.tobytes())
-    return message
 
 
 @cache
@@ -133,16 +132,16 @@ _DOUBLE = (("key", "u1"), ("value", "<f8"))
 
 def features(segments: Segments, keypoints: Keypoints | None) -> ImageAnnotations:
     """Key points and segments, to a quarter of a pixel, on the half-size image."""
-    drawn = []
+    when = stamp(segments)
+    drawn = ImageAnnotations(timestamp=when)
     if keypoints is not None:
         green = Color(r=0.0, g=0.9, b=0.47, a=1.0)
-        drawn.append(_filled(PointsAnnotation(type=PointsAnnotation.POINTS, outline_color=green, thickness=2.0), "points", _half(keypoints.pixels)))
+        points = drawn.points.add(timestamp=when, type=PointsAnnotation.POINTS, outline_color=green, thickness=2.0)
+        _fill(points, "points", _half(keypoints.pixels))
     yellow = Color(r=1.0, g=0.9, b=0.0, a=1.0)
-    lines = PointsAnnotation(type=PointsAnnotation.LINE_LIST, outline_color=yellow, thickness=1.0)
-    drawn.append(_filled(lines, "points", _half(segments.endpoints_px)))
-    for annotation in drawn:
-        annotation.timestamp.CopyFrom(stamp(segments))
-    return ImageAnnotations(timestamp=stamp(segments), points=drawn)
+    lines = drawn.points.add(timestamp=when, type=PointsAnnotation.LINE_LIST, outline_color=yellow, thickness=1.0)
+    _fill(lines, "points", _half(segments.endpoints_px))
+    return drawn
 
 
 def _half(pixels: F32) -> F64:
@@ -151,9 +150,10 @@ def _half(pixels: F32) -> F64:
 
 def planes(planes: Planes) -> SceneUpdate:
     """Each region as the convex hull of its samples, in the camera frame."""
-    triangles = []
+    update, entity = _scene(planes, "planes")
+    finite = np.isfinite(planes.samples_m[:, :, 0])
     for i, basis in enumerate(tangent_basis(planes.coefficients[:, :3])):
-        samples = planes.samples_m[i][np.isfinite(planes.samples_m[i, :, 0])]
+        samples = planes.samples_m[i][finite[i]]
         if len(samples) < 3:
             continue
         flat = (samples @ basis).astype(np.float32)
@@ -161,25 +161,26 @@ def planes(planes: Planes) -> SceneUpdate:
         middle = np.arange(1, len(hull) - 1)
         fan = hull[np.stack([0 * middle, middle, middle + 1], axis=1).ravel()]
         r, g, b = COLORS[i % len(COLORS)]
-        triangles.append(_filled(TriangleListPrimitive(color=Color(r=r, g=g, b=b, a=0.5)), "points", fan))
-    return _scene(planes, "planes", triangles=triangles)
+        _fill(entity.triangles.add(color=Color(r=r, g=g, b=b, a=0.5)), "points", fan)
+    return update
 
 
 def lines(segments: Segments) -> SceneUpdate:
     """The segments that have depth, in the camera frame."""
     seen = np.isfinite(segments.endpoints_m).all(axis=(1, 2))
-    return _scene(segments, "lines", lines=[_line_list(segments.endpoints_m[seen], (0.9, 0.2, 0.2))])
+    update, entity = _scene(segments, "lines")
+    _add_line(entity, segments.endpoints_m[seen], (0.9, 0.2, 0.2))
+    return update
 
 
-def _line_list(endpoints_m: Any, color: tuple[float, float, float], kind: Any = LinePrimitive.LINE_LIST) -> LinePrimitive:
+def _add_line(entity: SceneEntity, endpoints_m: Any, color: tuple[float, float, float], kind: Any = LinePrimitive.LINE_LIST) -> None:
     r, g, b = color
-    line = LinePrimitive(type=kind, thickness=2.0, scale_invariant=True, color=Color(r=r, g=g, b=b, a=1.0))
-    return _filled(line, "points", endpoints_m)  # type: ignore[no-any-return]
+    _fill(entity.lines.add(type=kind, thickness=2.0, scale_invariant=True, color=Color(r=r, g=g, b=b, a=1.0)), "points", endpoints_m)
 
 
 def axes(found: ManhattanFrame) -> SceneUpdate:
     """The axes of the first Manhattan frame as arrows half a metre long, a metre and a half before the camera; none when it is not supported."""
-    arrows = []
+    update, entity = _scene(found, "axes")
     for (r, g, b), axis in zip(AXES, found.rotations[0].T if found.supported and len(found.rotations) else ()):
         turned = np.column_stack([axis, tangent_basis(axis)])  # an arrow points along its own x
         turned[:, 2] *= np.sign(np.linalg.det(turned))
@@ -188,19 +189,22 @@ def axes(found: ManhattanFrame) -> SceneUpdate:
         position, orientation = _position_and_quaternion(T)
         pose = PoseMessage(position=position, orientation=orientation)
         color = Color(r=r, g=g, b=b, a=1.0)
-        arrows.append(ArrowPrimitive(pose=pose, shaft_length=0.4, shaft_diameter=0.02, head_length=0.1, head_diameter=0.05, color=color))
-    return _scene(found, "axes", arrows=arrows)
+        entity.arrows.add(pose=pose, shaft_length=0.4, shaft_diameter=0.02, head_length=0.1, head_diameter=0.05, color=color)
+    return update
 
 
 def path(pose: Pose, positions: list[F64]) -> SceneUpdate:
     """Where the camera was since the last piece."""
-    line = _line_list(np.array(positions), (0.86, 0.08, 0.24), LinePrimitive.LINE_STRIP)
-    return _in_world(pose, f"path until {pose.index}", lines=[line])
+    update, entity = _in_world(pose, f"path until {pose.index}")
+    _add_line(entity, np.array(positions), (0.86, 0.08, 0.24), LinePrimitive.LINE_STRIP)
+    return update
 
 
 def map_lines(map: Map) -> SceneUpdate:
     """The living lines of the map."""
-    return _in_world(map, "map lines", lines=[_line_list(map.lines.column("endpoints_m")[map.lines.column("alive")], (0.12, 0.47, 0.71))])
+    update, entity = _in_world(map, "map lines")
+    _add_line(entity, map.lines.column("endpoints_m")[map.lines.column("alive")], (0.12, 0.47, 0.71))
+    return update
 
 
 def map_points(map: Map) -> PointCloud:
@@ -213,10 +217,11 @@ def map_points(map: Map) -> PointCloud:
 def surface(surface: Surface) -> SceneUpdate:
     """The mesh, coarser where it would be too large, in the world; it stays."""
     first, triangles = _coarse(surface.vertices_m, surface.triangles)
-    mesh = TriangleListPrimitive(pose=IDENTITY, indices=triangles.ravel().tolist())
-    _filled(mesh, "points", surface.vertices_m[first])
-    _filled(mesh, "colors", np.column_stack([surface.colors[first] / 255.0, np.ones(len(first))]))
-    return _in_world(surface, "surface", triangles=[mesh])
+    update, entity = _in_world(surface, "surface")
+    mesh = entity.triangles.add(pose=IDENTITY, indices=triangles.ravel().tolist())
+    _fill(mesh, "points", surface.vertices_m[first])
+    _fill(mesh, "colors", np.column_stack([surface.colors[first] / 255.0, np.ones(len(first))]))
+    return update
 
 
 def _coarse(vertices: F32, triangles: I32) -> tuple[I32, I32]:

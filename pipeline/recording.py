@@ -8,12 +8,14 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from mcap.records import Channel, ChunkIndex
 from mcap_protobuf.schema import build_file_descriptor_set
 
 from trihedron.pipeline.chunk_writer import ChunkWriter
 from trihedron.pipeline.codec import Decoder, Encoder, ValueMessage, is_whole
 from trihedron.pipeline.errors import RecordingError
+from trihedron.pipeline.foxglove import View
 from trihedron.pipeline.mcap_errors import damaged
 from trihedron.pipeline.mcap_file import McapFile
 from trihedron.pipeline.types import Value
@@ -51,28 +53,50 @@ class RecordingWriter:
 
     def write(self, topic: str, value: Value) -> None:
         """Add a value to its topic (name without slash)."""
-        message = self._encoders.setdefault(topic, Encoder()).encode(value)
-        self.write_message(f"/{topic}", message, value.stamp_ns)
+        self._file.add(_bytes_of(value), lambda: self._encoded(topic, value))
+
+    def show(self, view: View, value: Value, stamp_ns: int) -> None:
+        """Add what viewers show of a value. Values are shown in the order of the calls, after their turn in the file has come."""
+        self._file.add(0, lambda: [self._message(channel, message, stamp_ns) for channel, message in view.messages(value)])
 
     def write_message(self, channel: str, message: Any, stamp_ns: int) -> None:
         """Add a protobuf message to a channel (with slash), made on first use."""
-        if channel not in self._channels:
-            definition = build_file_descriptor_set(type(message)).SerializeToString()
-            self._channels[channel] = self._file.channel(channel, message.DESCRIPTOR.full_name, "protobuf", definition, "protobuf")
-        self._file.add(self._channels[channel], stamp_ns, message.SerializeToString())
+        self._file.add(message.ByteSize(), lambda: [self._message(channel, message, stamp_ns)])
 
     def write_timing(self, index: int, stamp_ns: int, frame_ms: float, stage_ms: Mapping[str, float], memory_mb: float) -> None:
         """Add a frame's times, and the memory the process holds after it (JSON, so that any viewer plots them)."""
+        stages = {name: round(ms, 3) for name, ms in stage_ms.items()}
+        measured = {"index": index, "frame_ms": round(frame_ms, 3), "stage_ms": stages, "memory_mb": round(memory_mb, 2)}
+        self._file.add(0, lambda: [(self._timing_channel(), stamp_ns, json.dumps(measured).encode())])
+
+    def _encoded(self, topic: str, value: Value) -> list[tuple[int, int, bytes]]:
+        if topic not in self._encoders:
+            self._encoders[topic] = Encoder()
+        return [(self._channel(f"/{topic}", ValueMessage), value.stamp_ns, self._encoders[topic].encode(value))]
+
+    def _message(self, channel: str, message: Any, stamp_ns: int) -> tuple[int, int, bytes]:
+        return self._channel(channel, type(message)), stamp_ns, message.SerializeToString()
+
+    def _channel(self, channel: str, kind: Any) -> int:
+        if channel not in self._channels:
+            definition = build_file_descriptor_set(kind).SerializeToString()
+            self._channels[channel] = self._file.channel(channel, kind.DESCRIPTOR.full_name, "protobuf", definition, "protobuf")
+        return self._channels[channel]
+
+    def _timing_channel(self) -> int:
         if TIMING_TOPIC not in self._channels:
             definition = json.dumps(TIMING_SCHEMA).encode()
             self._channels[TIMING_TOPIC] = self._file.channel(TIMING_TOPIC, "trihedron.Timing", "jsonschema", definition, "json")
-        stages = {name: round(ms, 3) for name, ms in stage_ms.items()}
-        measured = {"index": index, "frame_ms": round(frame_ms, 3), "stage_ms": stages, "memory_mb": round(memory_mb, 2)}
-        self._file.add(self._channels[TIMING_TOPIC], stamp_ns, json.dumps(measured).encode())
+        return self._channels[TIMING_TOPIC]
 
     def close(self) -> None:
         """Write the index; the file is complete only then."""
         self._file.close()
+
+
+def _bytes_of(value: Value) -> int:
+    """Bytes of the arrays of a value; its tables are shared with others."""
+    return sum(item.nbytes for item in vars(value).values() if item.__class__ is np.ndarray)
 
 
 class Recording:

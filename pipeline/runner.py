@@ -244,8 +244,7 @@ class Runner:
             if isinstance(value, Value):
                 if name in topics and (name != "dataset" or embed_frames):
                     writer.write(name, value)
-                for channel, message in view.messages(value):
-                    writer.write_message(channel, message, stamp)
+                writer.show(view, value, stamp)
         writer.write_timing(self.indices[position], stamp, self._latency_ms[position], self._calls_ms[position], resident_mb())
 
     def _copy_reference(self, writer: RecordingWriter, index: int) -> None:
@@ -276,8 +275,7 @@ class Runner:
         if writer is not None:
             if recorded:
                 writer.write(name, value)
-            for channel, message in view.messages(value):
-                writer.write_message(channel, message, value.stamp_ns)
+            writer.show(view, value, value.stamp_ns)
 
     def _explain(self, failure: NodeFailure, writer: RecordingWriter | None) -> TrihedronError:
         """The failure as one line: a user's mistake as it is, anything else with stage, frame and the command that repeats only that."""

@@ -70,6 +70,37 @@ def test_chunks_close_by_size_and_by_time(tmp_path, monkeypatch):
     assert len(chunks(tmp_path / "time.mcap")) == 3
 
 
+def test_what_cannot_be_encoded_or_shown_is_said_and_what_came_before_is_kept(tmp_path):
+    """In the writer's thread, after the call: the next one raises it, or closing."""
+
+    class Broken(View):
+        def messages(self, value):
+            raise ZeroDivisionError(f"frame {value.index}")
+
+    writer = RecordingWriter(tmp_path / "a.mcap", {"overrides": "[]"})
+    writer.write("keypoints", keypoints(0))
+    writer.show(Broken(), keypoints(1), 1000)
+    writer.write("keypoints", keypoints(2))
+    time.sleep(2.5 * module.CHUNK_SECONDS)
+    with pytest.raises(ZeroDivisionError, match="frame 1"):
+        writer.write("keypoints", keypoints(3))
+    with pytest.raises(ZeroDivisionError, match="frame 1"):
+        writer.close()
+    assert [value.index for value in Recording(tmp_path / "a.mcap").values("keypoints")] == [0]
+
+
+def test_a_writer_that_is_faster_than_the_disk_waits(tmp_path, monkeypatch):
+    """At most MOST_WAITING bytes wait in memory, and all of them arrive."""
+    monkeypatch.setattr(module, "CHUNK_BYTES", 10_000)
+    monkeypatch.setattr(module, "MOST_WAITING", 50_000)
+    writer, most = RecordingWriter(tmp_path / "a.mcap", {"overrides": "[]"}), 0
+    for i in range(400):
+        writer.write("keypoints", replace(keypoints(0), index=i, stamp_ns=1000 * i))
+        most = max(most, writer._file._handed_bytes - writer._file._taken_bytes)
+    writer.close()
+    assert most <= 50_000 and [value.index for value in Recording(tmp_path / "a.mcap").values("keypoints")] == list(range(400))
+
+
 def test_one_frame_is_read_alone(tmp_path, monkeypatch):
     """Of a topic that is written as changes, with the messages it builds on; others are found by their stamps."""
     monkeypatch.setattr(module, "CHUNK_BYTES", 3_000)
@@ -232,10 +263,9 @@ def test_viewer_messages_are_decoded_by_their_own_schema(tmp_path):
     corners = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0]], np.float32)
     mesh = loose_mesh(3, corners, np.array([[0, 1, 2]], np.int32))
     for value in (frame, lines, plane, mesh, Surface.empty(3, 3000)):
-        for channel, message in view.messages(value):
-            writer.write_message(channel, message, value.stamp_ns)
-    assert list(view.messages(frame)) == []  # the same tenth of a second
+        writer.show(view, value, value.stamp_ns)
     writer.close()
+    assert list(view.messages(frame)) == []  # the same fifth of a second
     with open(tmp_path / "a.mcap", "rb") as file:
         found = {c.topic: (s.name, m) for s, c, _, m in make_reader(file, decoder_factories=[DecoderFactory()]).iter_decoded_messages()}
     assert {topic: name for topic, (name, _) in found.items()} == {

@@ -106,7 +106,7 @@ def test_the_state_is_a_joint_gaussian_and_survives_recording():
     assert found[-1].filtered_covariance[3, 3] < found[0].filtered_covariance[3, 3]  # a wall seen again is known better
     error = found[-1].t_world_camera - camera_at(14)[:3, 3]
     assert error @ np.linalg.solve(found[-1].covariance, error) < 16.3  # 99.9 % of three degrees of freedom
-    back = Decoder("file").decode(Encoder().encode(found[-1]).SerializeToString())
+    back = Decoder("file").decode(Encoder().encode(found[-1]))
     assert np.array_equal(back.filtered_covariance, found[-1].filtered_covariance)
 
 

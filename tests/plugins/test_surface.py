@@ -150,7 +150,7 @@ def test_polygons_take_far_fewer_triangles():
 @pytest.mark.parametrize("name", SURFACES)
 def test_the_same_frames_give_the_same_bytes(name):
     again = fold(plugin_class("surface", name)(view_width=160), [seen(k, T) for k, T in enumerate(walk())])
-    assert Encoder().encode(again).SerializeToString() == Encoder().encode(corner(name)).SerializeToString()
+    assert Encoder().encode(again) == Encoder().encode(corner(name))
 
 
 @pytest.mark.parametrize("name", SURFACES)
