@@ -27,12 +27,15 @@ from trihedron.pipeline.types import (
 from trihedron.plugins.numerics.maps.anchoring import anchored
 from trihedron.plugins.numerics.maps.decoupled import FIRST_SIGMA, Decoupled, decoupled_pose, reference_of
 from trihedron.plugins.numerics.maps.focal_check import wrong_focal
+from trihedron.plugins.numerics.maps.focal_motion import focal_motion
 from trihedron.plugins.numerics.maps.foundations import SCORE, foundation_sigma_m
 from trihedron.plugins.numerics.maps.map_terms import line_terms, plane_terms, point_terms
-from trihedron.plugins.numerics.maps.proven import LEAST, distance2, proven
+from trihedron.plugins.numerics.maps.proven import LEAST, distance2, position_distance2, proven
 from trihedron.plugins.numerics.maps.submaps import submap_of
 from trihedron.plugins.numerics.motion.pose_solver import PoseSolution, classify_terms, solve_pose
 from trihedron.plugins.numerics.motion.pose_terms import LineTerms, PlaneTerms, PointTerms
+
+PROVEN, PLANES = "what is proven", "the planes"  # what is taken to be at rest where something moves
 
 
 @register("pose", "refine")
@@ -43,7 +46,8 @@ class Refine:
     The decoupled rotation is a prior with its own covariance; the decoupled position only says where to start (`position_sigma_m`), since the same
     features made it. Without a map the decoupled pose stands. A lost pose is only where to look: it is found again when enough of the map agrees on a
     place that all directions are measured of, else it stays lost; and what neither the previous frame nor the map agrees with is lost. Where
-    something moves, landmarks that two keyframes measured in one place say the pose (`numerics/maps/proven`)."""
+    something moves, landmarks that two keyframes measured in one place say the pose, before there are any the planes (`numerics/maps/proven`). What
+    moves as under other focal lengths is degraded (`numerics/maps/focal_motion`, and `focal_check` of the keyframes)."""
 
     position_sigma_m: float = 0.05  # of the decoupled position, a weak prior
     rotation_sigma_deg: float = 0.2  # added to the rotation's own: no scene is exactly Manhattan
@@ -56,9 +60,12 @@ class Refine:
     weak_foundation: float = 3.0  # times its own standard deviation that the map's keyframes about here may have before a pose is called degraded
     focal_off: float = 0.1  # share by which the focal lengths are off, beyond which a pose is called degraded, if the map's newest keyframes
     focal_worse: float = 0.2  # fit by this share worse for it
+    focal_sure: float = 2.0  # or, while these are few, standard deviations by which the points that move tell so
     moving_share: float = 0.15  # by which the shares of new and of proven points that disagree may differ; beyond, something may move
     moving_gate: float = 2.2  # squared standard deviations (the lowest tenth of χ²) from the pose by what is proven alone, beyond which that is taken
-    moving_most: float = 0.4  # of all matches that must agree with it then, else the pose is called degraded
+    moving_sure: float = 13.9  # the same of the position (0.997 of χ²), beyond which it is taken although the new and the proven disagree alike
+    moving_unproven: float = 9.0  # the same from the position by planes alone, beyond which those are taken while nothing else is proven
+    moving_most: float = 0.4  # of all matches that must agree with what is proven then, else the pose is called degraded
     submap_after: int = 15  # frames that show a place that is not known, after which a lost camera begins a new sub-map; 0 = never
 
     def __post_init__(self) -> None:
@@ -69,10 +76,12 @@ class Refine:
             raise ValueError("min_inliers, min_share: must not be negative, min_share at most 1")
         if self.weak_foundation <= 0.0:
             raise ValueError("weak_foundation: must be positive")
-        if self.focal_off <= 0.0 or self.focal_worse <= 0.0:
-            raise ValueError("focal_off, focal_worse: must be positive")
-        if not 0.0 < self.moving_share <= 1.0 or self.moving_gate <= 0.0 or not 0.0 <= self.moving_most <= 1.0:
-            raise ValueError("moving_share, moving_gate, moving_most: must be positive, the shares at most 1")
+        if min(self.focal_off, self.focal_worse, self.focal_sure) <= 0.0:
+            raise ValueError("focal_off, focal_worse, focal_sure: must be positive")
+        if not 0.0 < self.moving_share <= 1.0 or not 0.0 <= self.moving_most <= 1.0:
+            raise ValueError("moving_share, moving_most: must be positive and at most 1")
+        if min(self.moving_gate, self.moving_sure, self.moving_unproven) <= 0.0:
+            raise ValueError("moving_gate, moving_sure, moving_unproven: must be positive")
         if self.submap_after < 0:
             raise ValueError("submap_after: must not be negative")
         if self.found_inliers < self.min_inliers or not self.min_share <= self.found_share <= 1.0:
@@ -112,9 +121,11 @@ class Refine:
             return start.said(frame, map, "nothing of the map was found, pose from the previous frame", submap)
         status, reason = self._judge(found, inliers, sought, rotation)
         if moving:
-            status, reason = self._judge_moving(inliers, sought, status, reason)
+            status, reason = self._judge_moving(inliers, sought, moving, status, reason)
         if status == OK:
             status, reason = self._judge_foundation(found, matches, map, reason)
+        if status == OK:
+            status, reason = self._judge_camera(found, frame, keypoints, matches, map, reason)
         if submap:
             status, reason = DEGRADED, f"in sub-map {submap}, which is not tied to the first yet: {reason}"
         T, held = found.T_world_camera, found.unobservable.shape[1]
@@ -161,21 +172,26 @@ class Refine:
         segments: Segments,
         planes: Planes,
         map: Map,
-    ) -> tuple[PoseSolution, bool]:
-        """The solution as it is; where new landmarks or most planes contradict what is proven and pull the pose away, that of what is proven alone,
-        with all matches judged by it, and True."""
-        known = proven(map, matches)
-        walls = np.count_nonzero(found.planes[: len(matches.planes)])
-        if start.status == LOST or np.count_nonzero(known.points) < LEAST:
-            return found, False
-        if known.contradicted(found.points) < self.moving_share and 2 * walls >= len(matches.planes):
-            return found, False
-        alone = self._solve(start, frame, known.only(matches), keypoints, segments, planes, map)
-        if alone.unobservable.shape[1] or distance2(alone, found) < self.moving_gate:
-            return found, False
+    ) -> tuple[PoseSolution, str]:
+        """The solution as it is and ''; or, where something moves and pulls the pose away, that of what is at rest, with all matches judged by it,
+        and what that is: what is proven, and while too little is, the planes (what moves is seldom flat and large)."""
+        if start.status == LOST:
+            return found, ""
+        known, same = proven(map, matches), len(matches.planes)
+        rest = PROVEN if np.count_nonzero(known.points) >= LEAST else PLANES
+        walls = np.count_nonzero(found.planes[:same])
+        contradicted = rest == PROVEN and (known.contradicted(found.points) >= self.moving_share or 2 * walls < same)
+        disagree = 1.0 - _inliers(found, same).sum() / max(len(found.points) + len(found.lines) + same, 1)
+        if not contradicted and (disagree < self.moving_share or same == 0):
+            return found, ""
+        alone = self._solve(start, frame, known.only(matches) if rest == PROVEN else known.none(matches), keypoints, segments, planes, map)
+        far = self.moving_sure if rest == PROVEN else self.moving_unproven
+        pulled = distance2(alone, found) >= self.moving_gate if contradicted else position_distance2(alone, found) > far
+        if not pulled or (rest == PROVEN and alone.unobservable.shape[1]):
+            return found, ""
         T = alone.T_world_camera
         flags = classify_terms(T, frame.camera, *self._terms(T, frame, matches, keypoints, segments, planes, map))
-        return replace(alone, points=flags.points, lines=flags.lines, planes=flags.planes), True
+        return replace(alone, points=flags.points, lines=flags.lines, planes=flags.planes), rest
 
     def _found_again(self, found: PoseSolution, inliers: I32, sought: int) -> bool:
         """Whether the map alone says where a lost camera is."""
@@ -194,22 +210,27 @@ class Refine:
             return DEGRADED, "the rotation was predicted, not measured, before refinement"
         return OK, f"{inliers[0]} points, {inliers[1]} lines and {inliers[2]} planes of the map"
 
-    def _judge_moving(self, inliers: I32, sought: int, status: str, reason: str) -> tuple[str, str]:
-        """The same, of what is proven; where the larger part of all that is seen disagrees it may be the scene that does not move."""
-        if status == OK and inliers.sum() < self.moving_most * sought:
-            return DEGRADED, f"something moves: only {inliers.sum()} of {sought} matches agree with what is proven"
-        return status, f"{reason}, by what is proven alone"
+    def _judge_moving(self, inliers: I32, sought: int, rest: str, status: str, reason: str) -> tuple[str, str]:
+        """The same, of what is at rest; where the larger part of all that is seen disagrees, or nothing is proven yet, it may be something else."""
+        if rest == PLANES or (status == OK and inliers.sum() < self.moving_most * sought):
+            return DEGRADED, f"something moves: only {inliers.sum()} of {sought} matches agree with {rest}"
+        return status, f"{reason}, by {rest} alone"
 
     def _judge_foundation(self, found: PoseSolution, matches: Matches, map: Map, reason: str) -> tuple[str, str]:
-        """A pose is not better known than the keyframes behind what it was found from: after a loss, of planes alone, or under wrong
-        focal lengths, which squeeze the world, these may be poor."""
+        """A pose is not better known than the keyframes behind what it was found from: after a loss, or of planes alone, these may be poor."""
         points, lines = matches.keypoints[found.points > 0, 1], matches.segments[found.lines > 0, 1]
         planes = matches.planes[found.planes[: len(matches.planes)] > 0, 1]
         sigma_m = foundation_sigma_m(map, points, lines, planes)
         if sigma_m > self.weak_foundation * np.sqrt(np.linalg.eigvalsh(found.covariance[:3, :3])[-1]):
             return DEGRADED, f"what is seen hangs on keyframes that are known to {1e3 * sigma_m:.0f} mm"
-        squeezed = wrong_focal(map, self.focal_off, self.focal_worse)
-        return (DEGRADED, squeezed) if squeezed else (OK, reason)
+        return OK, reason
+
+    def _judge_camera(self, found: PoseSolution, frame: Frame, keypoints: Keypoints, matches: Matches, map: Map, reason: str) -> tuple[str, str]:
+        """Under wrong focal lengths, which squeeze the world, nothing is known as well as it seems."""
+        doubt = wrong_focal(map, self.focal_off, self.focal_worse)
+        if not doubt and (motion := focal_motion(map, frame, keypoints, matches, found.points, found.T_world_camera)) is not None:
+            doubt = motion.doubt(self.focal_off, self.focal_sure)
+        return (DEGRADED, doubt) if doubt else (OK, reason)
 
 
 def _inliers(found: PoseSolution, same: int) -> I32:

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from trihedron.pipeline.geometry import exp_se3
+from trihedron.pipeline.geometry import exp_se3, invert, log_se3
 from trihedron.plugins.matches.local_map import LocalMap
 from trihedron.plugins.numerics.maps.proven import LEAST, Proven, distance2, proven
 from trihedron.plugins.numerics.motion.pose_solver import PoseSolution
@@ -30,6 +30,12 @@ def world():
 @pytest.fixture(scope="module")
 def map(world):
     return walk(world, 4, EVERY, stride=2)
+
+
+@pytest.fixture(scope="module")
+def single(world):
+    """Of one keyframe, a step away."""
+    return walk(world, 1, EVERY, stride=2)
 
 
 def matched(world, map):
@@ -102,7 +108,26 @@ def test_new_points_at_rest_count_like_the_others(world, map):
     assert np.array_equal(pose.T_world_camera, alike.T_world_camera) and pose.reason == alike.reason and pose.status == "ok"
 
 
-@pytest.mark.parametrize("field", ["moving_share", "moving_gate"])
+@pytest.mark.parametrize("field", ["moving_share", "moving_gate", "moving_sure", "moving_unproven"])
 def test_ranges_are_checked(field):
     with pytest.raises(ValueError, match=field):
         Refine(**{field: 0.0})
+
+
+def judged(world, single, share, **options):
+    """A pose by the map of one keyframe, and its squared error in standard deviations."""
+    pose = refined(world, single, share, 2.0 * SWAY, **options)
+    xi = log_se3(invert(pose.T_world_camera) @ camera_at(STEP))
+    return pose, float(xi @ np.linalg.solve(pose.covariance, xi))
+
+
+def test_while_nothing_is_proven_the_planes_tell_what_moves(world, single):
+    (pose, squared), (pulled, beyond) = judged(world, single, 0.6), judged(world, single, 0.6, moving_unproven=1e9)
+    print(f"by the planes {error(pose, STEP)} ({squared:.1f}), by all {error(pulled, STEP)} ({beyond:.1f}) (m, deg); {pose.reason}")
+    assert pose.status == "degraded" and pose.reason.endswith("agree with the planes") and squared < 24.0
+    assert pulled.status == "ok" and beyond > 24.0 and error(pulled, STEP)[0] > 3.0 * error(pose, STEP)[0]
+
+
+def test_at_rest_one_keyframe_is_enough(world, single):
+    pose, squared = judged(world, single, 0.0)
+    assert pose.status == "ok" and "alone" not in pose.reason and squared < 24.0

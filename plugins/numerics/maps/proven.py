@@ -30,6 +30,10 @@ class Proven:
         """The matches with proven landmarks."""
         return replace(matches, keypoints=matches.keypoints[self.points], segments=matches.segments[self.lines])
 
+    def none(self, matches: Matches) -> Matches:
+        """The matches with planes alone."""
+        return replace(matches, keypoints=matches.keypoints[:0], segments=matches.segments[:0])
+
     def contradicted(self, points: U8) -> float:
         """By how much larger a share (0 … 1) of the new points than of the proven ones are outliers (flags (n,)), or the other way round; 0 where
         either are too few."""
@@ -48,3 +52,9 @@ def distance2(one: PoseSolution, other: PoseSolution) -> float:
     whose covariance is the first's less the other's: this one is on the safe side)."""
     xi = log_se3(invert(one.T_world_camera) @ other.T_world_camera)
     return float(xi @ np.linalg.solve(one.covariance, xi))
+
+
+def position_distance2(one: PoseSolution, other: PoseSolution) -> float:
+    """The same of the positions alone, whatever the rotations: walls are not quite true, and what they say of a rotation is half a degree off."""
+    rho = log_se3(invert(one.T_world_camera) @ other.T_world_camera)[:3]
+    return float(rho @ np.linalg.solve(one.covariance[:3, :3], rho))

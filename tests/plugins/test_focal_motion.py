@@ -1,0 +1,79 @@
+"""Wrong focal lengths are told from what a frame sees again of the first keyframe, as soon as the camera has turned."""
+
+import dataclasses
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from trihedron.pipeline.geometry import exp_se3
+from trihedron.plugins.matches.local_map import LocalMap
+from trihedron.plugins.numerics.maps.focal_check import KEYFRAMES, LEAST_POINTS
+from trihedron.plugins.numerics.maps.focal_motion import FocalMotion, focal_motion
+
+sys.path.insert(0, str(Path(__file__).parent))
+from landmark_world import CAMERA, World, camera_at, rotation_of, translation_of
+from map_steps import EVERY, walk
+
+OFF, SURE = 0.1, 2.0
+FRAME = 20  # its noise is another than that of the keyframes
+
+
+def told(world, map, wrong, turned_deg, keep=10**9):
+    """What a frame says that is turned about an oblique axis and 4 cm away, where all were told focal lengths wrong by a factor."""
+    intrinsics = np.tile([wrong * CAMERA.fx, wrong * CAMERA.fy, CAMERA.cx, CAMERA.cy], (len(map.keyframes), 1))
+    misled = dataclasses.replace(map, keyframes=map.keyframes.updated(np.arange(len(intrinsics)), intrinsics=intrinsics))
+    axis = np.array([0.8, 0.6, 0.0]) * np.radians(turned_deg)
+    T = camera_at(0) @ exp_se3(np.concatenate([[0.04, 0.0, 0.0], axis]))
+    features, frame = world.features(T, FRAME), world.frame(FRAME)
+    matches = LocalMap()(frame, rotation_of(T, FRAME), translation_of(T, FRAME), *features, map, None)
+    matches = dataclasses.replace(matches, keypoints=matches.keypoints[:keep])
+    camera = dataclasses.replace(CAMERA, fx=wrong * CAMERA.fx, fy=wrong * CAMERA.fy)
+    agreed = np.ones(len(matches.keypoints), np.uint8)
+    return focal_motion(misled, dataclasses.replace(frame, camera=camera), features[0], matches, agreed, T)
+
+
+@pytest.fixture(scope="module")
+def world():
+    return World(3000)
+
+
+@pytest.fixture(scope="module")
+def map(world):
+    return walk(world, 1, EVERY)
+
+
+@pytest.mark.parametrize("wrong", [0.8, 0.95, 1.0, 1.05, 1.2])
+def test_the_factor_is_found_within_its_deviation(world, map, wrong):
+    found = told(world, map, wrong, 4.0)
+    print(wrong, found)
+    assert abs(np.log(found.factor * wrong)) < 3.0 * found.sigma < 0.15
+    assert ("focal lengths" in found.doubt(OFF, SURE)) == (wrong in (0.8, 1.2))
+
+
+def test_a_camera_that_does_not_turn_tells_nothing(world, map):
+    turned, still = told(world, map, 1.2, 4.0), told(world, map, 1.2, 0.0)
+    assert still.sigma > 5.0 * turned.sigma and still.doubt(OFF, SURE) == ""
+
+
+def test_deviations_are_honest():
+    """Over twelve noises of keyframe and frame, and turns of 1° to 5°, the error is about one of them."""
+    errors = []
+    for seed, turned_deg in enumerate(np.linspace(1.0, 5.0, 12)):
+        world = World(1500, seed=seed)
+        found = told(world, walk(world, 1, EVERY), 1.0, turned_deg)
+        errors.append(np.log(found.factor) / found.sigma)
+    print(np.round(errors, 1))
+    assert 0.5 < np.sqrt(np.mean(np.square(errors))) < 1.5
+
+
+def test_what_is_within_the_doubt_is_not_said():
+    assert FocalMotion(1.2, 0.03).doubt(OFF, SURE).startswith("what is seen moves as under focal lengths 1.20 times")
+    assert FocalMotion(1.2, 0.06).doubt(OFF, SURE) == "" and FocalMotion(1.08, 0.001).doubt(OFF, SURE) == ""
+    assert "0.80 times" in FocalMotion(0.8, 0.01).doubt(OFF, SURE)
+
+
+def test_too_few_points_or_enough_keyframes_say_nothing(world, map):
+    assert told(world, map, 1.2, 4.0, keep=LEAST_POINTS - 1) is None
+    assert told(world, walk(world, KEYFRAMES, EVERY), 1.2, 4.0) is None
