@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from trihedron.pipeline.geometry import invert, transform
-from trihedron.pipeline.types import F64, I32, Bool, Map, Table
+from trihedron.pipeline.types import I32, Bool, Map, Table
 from trihedron.plugins.numerics.algebra.uncertainty import inverse
 from trihedron.plugins.numerics.images.descriptors import match_lines, match_near
 from trihedron.plugins.numerics.maps.insertion import View, lengthened
@@ -91,32 +91,34 @@ def merge_planes(map: Map, keyframe: int, max_deg: float, max_m: float) -> Map:
     fresh = observed_by(map, np.array([keyframe], np.int32), "plane")
     around = observed_by(map, newest_keyframes(map, 5), "plane")
     for b in around[::-1]:
-        for a in around[around < b]:
-            if (a in fresh or b in fresh) and _are_one(map.planes, int(a), int(b), float(np.cos(np.radians(max_deg))), max_m):
-                map = _join(map, int(a), int(b))
-                break
+        older = around[around < b]
+        map = _joined_with_first(map, older if b in fresh else older[np.isin(older, fresh)], int(b), max_deg, max_m)
     return map
 
 
 def fuse_planes(map: Map, older: I32, newer: I32, max_deg: float, max_m: float) -> Map:
     """Join each of the planes `newer` with the first of the planes `older` that is the same one, both given by id."""
     for b in newer:
-        for a in older:
-            if _are_one(map.planes, int(min(a, b)), int(max(a, b)), float(np.cos(np.radians(max_deg))), max_m):
-                map = _join(map, int(min(a, b)), int(max(a, b)))
-                break
+        map = _joined_with_first(map, older, int(b), max_deg, max_m)
     return map
 
 
-def _are_one(planes: Table, a: int, b: int, cosine: float, max_m: float) -> bool:
-    """Whether two living planes, seen from the same side, lie within `max_m` of each other on average, both ways, and overlap."""
+def _joined_with_first(map: Map, among: I32, plane: int, max_deg: float, max_m: float) -> Map:
+    """Join a plane with the first of these that is the same one, if any is."""
+    cosine = float(np.cos(np.radians(max_deg)))
+    normals = map.planes.rows("coefficients", np.append(among, plane).astype(np.int32))[:, :3]
+    for other in among[normals[:-1] @ normals[-1] >= cosine].tolist():
+        if _are_one(map.planes, min(other, plane), max(other, plane), max_m):
+            return _join(map, min(other, plane), max(other, plane))
+    return map
+
+
+def _are_one(planes: Table, a: int, b: int, max_m: float) -> bool:
+    """Whether two living planes that look one way lie within `max_m` of each other on average, both ways, and overlap."""
     ids = np.array([a, b], np.int32)
-    if not planes.rows("alive", ids).all():
+    alive, coefficients, samples = planes.gathered(ids, "alive", "coefficients", "samples_m")
+    if not alive.all():
         return False
-    coefficients: F64 = planes.rows("coefficients", ids)
-    if coefficients[0, :3] @ coefficients[1, :3] < cosine:
-        return False
-    samples = planes.rows("samples_m", ids)
     apart = max(mean_distance(coefficients[0], samples[1]), mean_distance(coefficients[1], samples[0]))
     return apart < max_m and max(overlap(samples[0], samples[1], 0.3), overlap(samples[1], samples[0], 0.3)) > 0.3
 
