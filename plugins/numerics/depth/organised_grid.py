@@ -79,19 +79,20 @@ def cell_rays(h: int, w: int, stride: int, intrinsics: tuple[float, float, float
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def add_cell(grid: Grid, r: int, c: int, A: F64, b: F64) -> None:
-    """Adds a cell's weighted depths to the normal equations of q: A (3, 3), of which only the upper triangle is kept, and b (3,)."""
-    x, y, p, s = grid.rays_x[c], grid.rays_y[r], grid.rho[r, c], grid.sigma[r, c]
-    weight = grid.count[r, c] / (s * s)
-    A[0, 0] += weight * x * x
-    A[0, 1] += weight * x * y
-    A[0, 2] += weight * x
-    A[1, 1] += weight * y * y
-    A[1, 2] += weight * y
-    A[2, 2] += weight
-    b[0] += weight * x * p
-    b[1] += weight * y * p
-    b[2] += weight * p
+def normal_equations(grid: Grid, cells: I32, chosen: Bool) -> tuple[F64, F64]:
+    """Of q, from the weighted depths of the chosen cells: A (3, 3), of which only the upper triangle is filled, and b (3,)."""
+    rho, sigma, count, rays_x, rays_y, w = grid.rho.ravel(), grid.sigma.ravel(), grid.count.ravel(), grid.rays_x, grid.rays_y, len(grid.rays_x)
+    xx, xy, x1, yy, y1, one, xp, yp, p1 = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+    for k in range(len(cells)):
+        if chosen[k]:
+            i = cells[k]
+            r = i // w
+            x, y, p, s = rays_x[i - r * w], rays_y[r], rho[i], sigma[i]
+            weight = count[i] / (s * s)
+            xx, xy, x1 = xx + weight * x * x, xy + weight * x * y, x1 + weight * x
+            yy, y1, one = yy + weight * y * y, y1 + weight * y, one + weight
+            xp, yp, p1 = xp + weight * x * p, yp + weight * y * p, p1 + weight * p
+    return np.array([[xx, xy, x1], [0.0, yy, y1], [0.0, 0.0, one]]), np.array([xp, yp, p1])
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")

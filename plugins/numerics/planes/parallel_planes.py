@@ -11,7 +11,7 @@ import numpy as np
 
 from trihedron.pipeline.types import F64, I32, Bool
 from trihedron.plugins.numerics.algebra.small_linear import solve_positive
-from trihedron.plugins.numerics.depth.organised_grid import Grid, add_cell
+from trihedron.plugins.numerics.depth.organised_grid import Grid, normal_equations
 
 LEAST = np.radians(0.4)  # disagreement of normals and plane that is looked into
 SOME = 2000
@@ -63,15 +63,15 @@ def angle_between(q: F64, normal: F64) -> float:
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def _mean_normal(q: F64, grid: Grid, cells: I32, member: Bool) -> F64:
     """Unit mean of the normals of (about SOME of) the members, those across a step left out; NaN without any."""
-    normals, w, step = grid.normals, grid.rho.shape[1], max(len(cells) // SOME, 1)
+    normals, step = grid.normals.reshape(-1, 3), max(len(cells) // SOME, 1)
     length = np.sqrt(q @ q)
     x, y, z = -q[0] / length, -q[1] / length, -q[2] / length
     for least in (WIDE, NARROW, NARROW):
         a, b, c = 0.0, 0.0, 0.0
         for k in range(0, len(cells), step):
             if member[k]:
-                row, column = cells[k] // w, cells[k] % w
-                nx, ny, nz = normals[row, column, 0], normals[row, column, 1], normals[row, column, 2]
+                i = cells[k]
+                nx, ny, nz = normals[i, 0], normals[i, 1], normals[i, 2]
                 if nx * x + ny * y + nz * z > least:
                     a += nx
                     b += ny
@@ -141,10 +141,7 @@ def _further(distances: F64, member: Bool) -> Bool:
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def _fitted(grid: Grid, cells: I32, chosen: Bool) -> F64:
     """q (3,) of the plane through the chosen cells, zeros when there is none."""
-    w = grid.rho.shape[1]
-    A, b, q = np.zeros((3, 3)), np.zeros(3), np.zeros(3)
-    for k in range(len(cells)):
-        if chosen[k]:
-            add_cell(grid, cells[k] // w, cells[k] % w, A, b)
+    q = np.zeros(3)
+    A, b = normal_equations(grid, cells, chosen)
     solve_positive(A.T, b, q)
     return q

@@ -96,7 +96,7 @@ class PlanarRegions:
         ranked = np.array([i for i in np.argsort(-area, kind="stable") if area[i] >= self.min_pixels][: self.planes], dtype=np.intp)
         number = np.zeros(k + 1, np.uint8)
         number[ranked + 1] = np.arange(1, len(ranked) + 1)
-        numbered, numbered_core = number[owner][labels], number[owner][core]
+        numbered, numbered_core = regions.renumbered(labels, number[owner]), regions.renumbered(core, number[owner])
         A, b, moments, n = (total[ranked] for total in sums)
         q = np.linalg.solve(A, b[..., None])[..., 0]
         distance = 1.0 / np.maximum(np.linalg.norm(q, axis=-1), 1e-12)

@@ -6,7 +6,7 @@ import numba
 import numpy as np
 
 from trihedron.pipeline.types import F32, F64, I32, Bool
-from trihedron.plugins.numerics.depth.organised_grid import Grid, add_cell, cells_by_component
+from trihedron.plugins.numerics.depth.organised_grid import Grid, cells_by_component, normal_equations
 from trihedron.plugins.numerics.planes.parallel_planes import larger_surface
 from trihedron.plugins.numerics.planes.plane_curvature import linear_turn
 
@@ -108,10 +108,9 @@ def _trimmed(q: F64, first: int, grid: Grid, component: I32, cos_cone: float, ga
 def dominant_normal(normals: F32, cells: I32, cos_cone: float) -> F64:
     """The commonest direction among the cells' normals: the fullest bin of a coarse grid over (n_x, n_y), then three mean shifts within the cone."""
     count, sums = np.zeros((21, 21), np.int32), np.zeros((21, 21, 3))
-    w = normals.shape[1]
+    flat = normals.reshape(-1, 3)
     for i in cells:
-        r, c = i // w, i % w
-        a, b, d = normals[r, c, 0], normals[r, c, 1], normals[r, c, 2]
+        a, b, d = flat[i, 0], flat[i, 1], flat[i, 2]
         u, v = int(np.rint(10.0 * a)) + 10, int(np.rint(10.0 * b)) + 10
         count[u, v] += 1
         sums[u, v, 0] += a
@@ -124,8 +123,7 @@ def dominant_normal(normals: F32, cells: I32, cos_cone: float) -> F64:
     for _ in range(3):
         p, q, s = 0.0, 0.0, 0.0
         for i in cells:
-            r, c = i // w, i % w
-            a, b, d = normals[r, c, 0], normals[r, c, 1], normals[r, c, 2]
+            a, b, d = flat[i, 0], flat[i, 1], flat[i, 2]
             if a * x + b * y + d * z > cos_cone:
                 p += a
                 q += b
@@ -160,22 +158,19 @@ def start_plane(normal: F64, grid: Grid, cells: I32, cos_cone: float) -> F64:
 def fit_cells(q: F64, grid: Grid, cells: I32, cos_cone: float, gate: float, member: Bool) -> tuple[F64, int]:
     """One round of trimmed weighted least squares: (q, number of members). A cell is a member when its normal is within the cone of q's and its depth
     within `gate` σ of q's; `member` (per entry of `cells`) is written. A degenerate fit returns zeros, and nothing is a member."""
-    rho, sigma, _, rays_x, rays_y, normals = grid
-    w = rho.shape[1]
-    length = np.sqrt(q @ q)
-    nx, ny, nz = -q[0] / length, -q[1] / length, -q[2] / length
-    A, b = np.zeros((3, 3)), np.zeros(3)
+    rho, sigma, normals = grid.rho.ravel(), grid.sigma.ravel(), grid.normals.reshape(-1, 3)
+    rays_x, rays_y, w = grid.rays_x, grid.rays_y, len(grid.rays_x)
+    length, u, v, one = np.sqrt(q @ q), q[0], q[1], q[2]
+    nx, ny, nz = -u / length, -v / length, -one / length
     found = 0
     for k in range(len(cells)):
-        r, c = cells[k] // w, cells[k] % w
-        member[k] = False
-        if normals[r, c, 0] * nx + normals[r, c, 1] * ny + normals[r, c, 2] * nz < cos_cone:
-            continue
-        if abs(q[0] * rays_x[c] + q[1] * rays_y[r] + q[2] - rho[r, c]) > gate * sigma[r, c]:
-            continue
-        member[k] = True
-        found += 1
-        add_cell(grid, r, c, A, b)
+        i = cells[k]
+        r = i // w
+        aside = normals[i, 0] * nx + normals[i, 1] * ny + normals[i, 2] * nz < cos_cone
+        off = abs(u * rays_x[i - r * w] + v * rays_y[r] + one - rho[i]) > gate * sigma[i]
+        member[k] = not (aside or off)
+        found += member[k]
+    A, b = normal_equations(grid, cells, member)
     solved, q = solve_symmetric(A, b)
     if found < 3 or not solved:
         member[:] = False

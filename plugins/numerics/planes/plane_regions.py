@@ -23,7 +23,7 @@ def grow_regions(labels: I32, planes: F64, grid: Grid, gate: float, reach: int, 
     offered = np.zeros((h, w), np.int32)
     residual = np.empty((h, w), np.float32)
     frontier = _border(labels)
-    nearby = np.empty(4 * h * w, np.int32)
+    nearby = np.empty(h * w, np.int32)
     unit = np.empty_like(planes)
     for k in range(len(planes)):
         unit[k] = -planes[k] / max(np.sqrt(planes[k] @ planes[k]), 1e-12)
@@ -85,16 +85,18 @@ def accumulate(labels: I32, regions: int, grid: Grid) -> tuple[F64, F64, F64, I3
     rho, sigma, count, rays_x, rays_y, _ = grid
     sums, n = np.zeros((regions + 1, 19)), np.zeros(regions + 1, np.int32)  # upper triangles of A and M, row by row, and b between them
     h, w = labels.shape
+    depth, weights, moments = np.empty(w), np.empty(w), np.empty(w)  # of a row: divisions, several at once
     for r in range(h):
         y = rays_y[r]
+        _weigh_cells(sigma[r], count[r], weights)
+        for c in range(w):
+            p = float(rho[r, c])
+            depth[c], moments[c] = 1.0 / p, weights[c] * p * p * p * p
         for c in range(w):
             k = labels[r, c]
             if k <= 0 or rho[r, c] <= 0.0:
                 continue
-            x, p = rays_x[c], float(rho[r, c])
-            z = 1.0 / p
-            weight = count[r, c] / (float(sigma[r, c]) * sigma[r, c])
-            moment = weight * p * p * p * p
+            x, p, z, weight, moment = rays_x[c], float(rho[r, c]), depth[c], weights[c], moments[c]
             px, py = x * z, y * z
             sums[k, 0] += weight * x * x
             sums[k, 1] += weight * x * y
@@ -124,6 +126,13 @@ def accumulate(labels: I32, regions: int, grid: Grid) -> tuple[F64, F64, F64, I3
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
+def _weigh_cells(sigma: F32, count: I32, out: F64) -> None:
+    """Weights (w,) of a row's inverse depths, inf or NaN without any."""
+    for c in range(len(out)):
+        out[c] = count[c] / (float(sigma[c]) * sigma[c])
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _symmetric(upper: F64, out: F64) -> None:
     """Fill a square matrix from its upper triangle, row by row."""
     k = 0
@@ -136,11 +145,38 @@ def _symmetric(upper: F64, out: F64) -> None:
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def areas(labels: I32, count: I32, regions: int) -> I32:
     """(k,) number of depths in each region's cells."""
-    out = np.zeros(regions + 1, np.int32)
-    for r in range(labels.shape[0]):
-        for c in range(labels.shape[1]):
-            out[labels[r, c]] += count[r, c]
+    out, flat, counts = np.zeros(regions + 1, np.int32), labels.ravel(), count.ravel()
+    label, n = 0, 0  # of the stretch of one region: a sum in memory would wait for the one before
+    for i in range(len(flat)):
+        if flat[i] != label:
+            out[label] += n
+            label, n = flat[i], 0
+        n += counts[i]
+    out[label] += n
     return out[1:]
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _sizes(labels: U8, regions: int) -> I32:
+    """(k + 1,) number of cells with each label."""
+    out, flat = np.zeros(regions + 1, np.int32), labels.ravel()
+    label, first = 0, 0
+    for i in range(len(flat)):
+        if flat[i] != label:
+            out[label] += i - first
+            label, first = flat[i], i
+    out[label] += len(flat) - first
+    return out
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def renumbered(labels: I32, number: U8) -> U8:
+    """Labels (h, w) by the number (k + 1,) of each, 0 = none."""
+    out, old = np.empty(labels.shape, np.uint8), labels.ravel()
+    new = out.ravel()
+    for i in range(len(old)):
+        new[i] = number[old[i]]
+    return out
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
@@ -149,10 +185,7 @@ def spread_samples(labels: U8, planes: F64, rays_x: F64, rays_y: F64, wanted: in
     cells; NaN-padded."""
     regions = len(planes)
     h, w = labels.shape
-    size = np.zeros(regions + 1, np.int32)
-    for r in range(h):
-        for c in range(w):
-            size[labels[r, c]] += 1
+    size = _sizes(labels, regions)
     out = np.full((regions, wanted, 3), np.nan, np.float32)
     points, used, seen = np.empty((regions, 3, most + 1)), np.zeros(regions, np.int32), np.zeros(regions, np.int32)
     for r in range(h):
@@ -177,6 +210,7 @@ def _farthest_points(xs: F64, ys: F64, zs: F64, out: F32) -> None:
     """Fill the rows of `out`, each the point farthest from those before it, beginning at the middle of the list."""
     n = len(xs)
     distance = np.full(n, np.inf)
+    ordered = distance.view(np.int64)  # numbers above 0 are ordered like their bits, and of integers the compiler compares several at once
     chosen = n // 2
     for k in range(min(n, len(out))):
         x, y, z = xs[chosen], ys[chosen], zs[chosen]
@@ -184,10 +218,12 @@ def _farthest_points(xs: F64, ys: F64, zs: F64, out: F32) -> None:
         for i in range(n):
             e = (xs[i] - x) ** 2 + (ys[i] - y) ** 2 + (zs[i] - z) ** 2
             distance[i] = min(distance[i], e)
-        best = -1.0
+        best = ordered[0]
         for i in range(n):
-            if distance[i] > best:
-                best, chosen = distance[i], i
+            best = max(best, ordered[i])
+        chosen = 0
+        while ordered[chosen] < best:
+            chosen += 1
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
@@ -200,31 +236,32 @@ def excess_variance(labels: I32, planes: F64, grid: Grid, tiles: int, expected: 
     rho, sigma, count, rays_x, rays_y, _ = grid
     h, w = labels.shape
     regions = len(planes)
-    cells = np.zeros(regions)
-    for r in range(h):
-        for c in range(w):
-            if labels[r, c] > 0:
-                cells[labels[r, c] - 1] += 1.0
-    side = np.maximum(np.sqrt(cells / tiles), 2.0)
+    side = np.maximum(np.sqrt(_sizes(labels, regions)[1:] / tiles), 2.0)
     across = (w / side).astype(np.int64) + 1
     start = np.zeros(regions + 1, np.int64)
     for k in range(regions):
         start[k + 1] = start[k] + across[k] * (int(h / side[k]) + 1)
-    total, information = np.zeros(start[-1]), np.zeros(start[-1])
+    total, information = np.zeros(start[-1] + 1), np.zeros(start[-1] + 1)
     column, row = np.empty((regions, w), np.int64), np.empty(regions, np.int64)  # tiles of each column, and of the row begun
     for k in range(regions):
         for c in range(w):
             column[k, c] = int(c / side[k])
+    weights = np.empty(w)
     for r in range(h):
+        _weigh_cells(sigma[r], count[r], weights)
         for k in range(regions):
             row[k] = start[k] + int(r / side[k]) * across[k]
+        tile, residual, inverse = 0, total[0], information[0]  # of the tile that the cells before lie in
         for c in range(w):
             k = labels[r, c] - 1
             if k >= 0 and rho[r, c] > 0.0:
                 t = row[k] + column[k, c]
-                inverse = count[r, c] / (float(sigma[r, c]) * sigma[r, c])
-                total[t] += inverse * (rho[r, c] - planes[k, 0] * rays_x[c] - planes[k, 1] * rays_y[r] - planes[k, 2])
-                information[t] += inverse
+                if t != tile:
+                    total[tile], information[tile] = residual, inverse
+                    tile, residual, inverse = t, total[t], information[t]
+                residual += weights[c] * (rho[r, c] - planes[k, 0] * rays_x[c] - planes[k, 1] * rays_y[r] - planes[k, 2])
+                inverse += weights[c]
+        total[tile], information[tile] = residual, inverse
     out = np.full(regions, expected)
     for k in range(regions):
         a, b, c = 0.0, 0.0, 0.0

@@ -23,6 +23,8 @@ def neighbours(labels: I32, count: int, gap: int) -> F64:
             a = labels[r, c]
             if a == 0:
                 continue
+            if r < h - 1 and c < w - 1 and labels[r, c + 1] == a and labels[r + 1, c] == a:
+                continue
             for down, right in ((0, 1), (1, 0)):
                 for k in range(1, min(gap, (h - 1 - r) * down + (w - 1 - c) * right) + 1):
                     b = labels[r + k * down, c + k * right]
