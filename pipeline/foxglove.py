@@ -25,6 +25,8 @@ IMAGE_PERIOD_NS = 200_000_000  # 5 Hz is enough to look at; drawing what was fou
 MAP_PERIOD_NS = 1_000_000_000
 TRUTH_NS = 20_000_000  # a true pose this near in time is that of the frame
 
+SHOWN = (Pose, Keypoints, Segments, ManhattanFrame, Frame, Planes, Map, Surface)
+
 
 def _error_class() -> Any:
     """The protobuf class of `trihedron.Error`: how far a pose is from the truth."""
@@ -53,6 +55,10 @@ class View:
 
     _T_world_truth: F64 | None
 
+    def looks_at(self, value: Value) -> bool:
+        """Whether values of this type are shown, or change how others are."""
+        return isinstance(value, SHOWN)
+
     def messages(self, value: Value) -> Iterator[tuple[str, Any]]:
         """(channel, message) pairs of one value; none for values nobody looks at."""
         if isinstance(value, Pose):
@@ -78,8 +84,9 @@ class View:
             yield "/view/surface", show.surface(value)
 
     def _pose_messages(self, pose: Pose) -> Iterator[tuple[str, Any]]:
-        yield "/view/pose", show.in_frame(pose)
-        yield "/tf", show.transform(pose)
+        placed = show.in_frame(pose)
+        yield "/view/pose", placed
+        yield "/tf", show.transform(pose, placed)
         self._path.append(pose.T_world_camera[:3, 3])
         if self._due("path", pose.stamp_ns, MAP_PERIOD_NS):
             yield "/view/path", show.path(pose, self._path)

@@ -69,9 +69,9 @@ def in_frame(pose: Pose, T: F64 | None = None) -> PoseInFrame:
     return PoseInFrame(timestamp=stamp(pose), frame_id=WORLD, pose=PoseMessage(position=position, orientation=orientation))
 
 
-def transform(pose: Pose) -> FrameTransform:
-    """From the world to the camera."""
-    position, orientation = _position_and_quaternion(pose.T_world_camera)
+def transform(pose: Pose, placed: PoseInFrame) -> FrameTransform:
+    """From the world to the camera, which is placed by `in_frame`."""
+    position, orientation = placed.pose.position, placed.pose.orientation
     return FrameTransform(timestamp=stamp(pose), parent_frame_id=WORLD, child_frame_id=CAMERA, translation=position, rotation=orientation)
 
 

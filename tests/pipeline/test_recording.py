@@ -74,6 +74,9 @@ def test_what_cannot_be_encoded_or_shown_is_said_and_what_came_before_is_kept(tm
     """In the writer's thread, after the call: the next one raises it, or closing."""
 
     class Broken(View):
+        def looks_at(self, value):
+            return True
+
         def messages(self, value):
             raise ZeroDivisionError(f"frame {value.index}")
 
