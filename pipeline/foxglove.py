@@ -24,8 +24,10 @@ from trihedron.pipeline.types import F64, LOST, OK, Frame, Keypoints, ManhattanF
 IMAGE_PERIOD_NS = 200_000_000  # 5 Hz is enough to look at; drawing what was found takes a millisecond or two
 MAP_PERIOD_NS = 1_000_000_000
 TRUTH_NS = 20_000_000  # a true pose this near in time is that of the frame
-
-SHOWN = (Pose, Keypoints, Segments, ManhattanFrame, Frame, Planes, Map, Surface)
+PERIODS_NS: dict[type[Value], int] = {  # of what is shown, and 0 for what is always
+    Pose: 0, Keypoints: 0, Surface: 0, Segments: IMAGE_PERIOD_NS, ManhattanFrame: IMAGE_PERIOD_NS, Frame: IMAGE_PERIOD_NS, Planes: IMAGE_PERIOD_NS,
+    Map: MAP_PERIOD_NS,
+}  # fmt: skip
 
 
 def _error_class() -> Any:
@@ -55,28 +57,32 @@ class View:
 
     _T_world_truth: F64 | None
 
-    def looks_at(self, value: Value) -> bool:
-        """Whether values of this type are shown, or change how others are."""
-        return isinstance(value, SHOWN)
-
     def messages(self, value: Value) -> Iterator[tuple[str, Any]]:
         """(channel, message) pairs of one value; none for values nobody looks at."""
+        return self.drawn(value) if self.wants(value) else iter(())
+
+    def wants(self, value: Value) -> bool:
+        """Whether the value is to be drawn. Asked once of each, in order, and soon, so that what is not wanted need not be kept."""
+        period = PERIODS_NS.get(value.__class__)
+        return period is not None and (period == 0 or self._due(type(value).__name__, value.stamp_ns, period))
+
+    def drawn(self, value: Value) -> Iterator[tuple[str, Any]]:
+        """The messages of a value that is wanted."""
         if isinstance(value, Pose):
             yield from self._pose_messages(value)
         elif isinstance(value, Keypoints):
             self._pixels = {"keypoints": value}
         elif isinstance(value, Segments):
-            if self._due("features", value.stamp_ns, IMAGE_PERIOD_NS):
-                yield "/view/features", show.features(value, self._pixels.get("keypoints"))
-                yield "/view/lines", show.lines(value)
-        elif isinstance(value, ManhattanFrame) and self._due("axes", value.stamp_ns, IMAGE_PERIOD_NS):
+            yield "/view/features", show.features(value, self._pixels.get("keypoints"))
+            yield "/view/lines", show.lines(value)
+        elif isinstance(value, ManhattanFrame):
             yield "/view/axes", show.axes(value)
-        elif isinstance(value, Frame) and self._due("image", value.stamp_ns, IMAGE_PERIOD_NS):
+        elif isinstance(value, Frame):
             yield "/view/camera", show.calibration(value)
             yield "/view/image", show.image(value)
-        elif isinstance(value, Planes) and self._due("planes", value.stamp_ns, IMAGE_PERIOD_NS):
+        elif isinstance(value, Planes):
             yield "/view/planes", show.planes(value)
-        elif isinstance(value, Map) and self._due("map", value.stamp_ns, MAP_PERIOD_NS):
+        elif isinstance(value, Map):
             yield "/view/map_points", show.map_points(value)
             if len(value.lines):
                 yield "/view/map_lines", show.map_lines(value)

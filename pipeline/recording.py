@@ -56,9 +56,9 @@ class RecordingWriter:
         self._file.add(_bytes_of(value), lambda: self._encoded(topic, value))
 
     def show(self, view: View, value: Value, stamp_ns: int) -> None:
-        """Add what viewers show of a value. Values are shown in the order of the calls, after their turn in the file has come."""
-        if view.looks_at(value):
-            self._file.add(0, lambda: [self._message(channel, message, stamp_ns) for channel, message in view.messages(value)])
+        """Add what viewers show of a value. Values are drawn when their turn in the file has come."""
+        if view.wants(value):
+            self._file.add(_bytes_of(value), lambda: [self._message(channel, message, stamp_ns) for channel, message in view.drawn(value)])
 
     def write_message(self, channel: str, message: Any, stamp_ns: int) -> None:
         """Add a protobuf message to a channel (with slash), made on first use."""

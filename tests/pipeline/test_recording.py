@@ -74,10 +74,10 @@ def test_what_cannot_be_encoded_or_shown_is_said_and_what_came_before_is_kept(tm
     """In the writer's thread, after the call: the next one raises it, or closing."""
 
     class Broken(View):
-        def looks_at(self, value):
+        def wants(self, value):
             return True
 
-        def messages(self, value):
+        def drawn(self, value):
             raise ZeroDivisionError(f"frame {value.index}")
 
     writer = RecordingWriter(tmp_path / "a.mcap", {"overrides": "[]"})
