@@ -237,6 +237,8 @@ def _report(out: Path, metrics: dict[str, Any], timing: dict[str, Any], surfaces
     status = metrics.get("status", {})
     if status:
         print("frames: " + ", ".join(f"{count} {name}" for name, count in status.items() if count))
+    for name, reason in metrics.get("reasons", {}).items():
+        print(f"{name}, most of them: {reason}")
     if live := timing.get("live"):
         late = live["latency_ms"]
         said = f"{live['came']} frames came, {live['taken']} were taken, {live['dropped']} dropped"

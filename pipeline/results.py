@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import json
+import re
+from collections import Counter
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -61,6 +64,7 @@ def write_results(out: Path, result: Result, truth: Trajectory | None) -> dict[s
         "unreadable": result.unreadable,
         "untied": sum(pose.status != LOST and not is_tied(pose, result.map) for pose in result.poses),
         "status": {status: sum(pose.status == status for pose in result.poses) for status in (OK, DEGRADED, LOST)},
+        "reasons": {status: said for status in (DEGRADED, LOST) if (said := _commonest_reason(result.poses, status))},
     }
     if len(final):  # of a walk that ends where it began, the drift
         metrics["start_to_end_m"] = float(np.linalg.norm(final.poses[-1, :3, 3] - final.poses[0, :3, 3]))
@@ -76,6 +80,14 @@ def write_results(out: Path, result: Result, truth: Trajectory | None) -> dict[s
     if len(final):
         trajectory_figure(final, truth, out / PLOT, [(pose.stamp_ns, pose.status) for pose in result.poses])
     return metrics
+
+
+def _commonest_reason(poses: Iterable[Pose], status: str) -> str:
+    """Why most frames of a status have it, in the words of the last of them; reasons that differ in numbers alone are one. '' without such frames."""
+    reasons = [pose.reason for pose in poses if pose.status == status]
+    alike = [re.sub(r"\d+(\.\d+)?", "0", reason) for reason in reasons]
+    commonest = Counter(alike).most_common(1)
+    return next((reason for reason, kind in zip(reversed(reasons), reversed(alike)) if kind == commonest[0][0]), "")
 
 
 def write_surface(out: Path, surface: Surface) -> str:

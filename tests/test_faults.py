@@ -3,6 +3,7 @@
 Whatever comes in, the run ends well, every frame that is used has a pose that is finite and rigid, and its status says with a reason what it is
 worth: `lost` where nothing was seen, `ok` within twice what the covariance says (no single frame beyond six times), `degraded` otherwise."""
 
+import json
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -152,6 +153,15 @@ def test_a_wrong_scale_of_depth_is_recognised_and_said_in_one_line(tmp_path, cap
     lines = capsys.readouterr().err.splitlines()
     expected = f"trihedron: warning: the depth of the first frames is {said} for a room; is the depth_scale of the camera right?"
     assert lines == ([expected] if said else [])
+
+
+def test_what_most_frames_suffer_from_is_said_at_the_end(tmp_path, capsys):
+    assert main(["run", *words(Case({"focal_times": 0.7}, {"length": 12})), f"out={tmp_path / 'run'}"]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[0].startswith("frames: ") and lines[0].endswith(" degraded")
+    assert lines[1].startswith("degraded, most of them: what is seen moves as under focal lengths 1.") and lines[1].endswith("is the camera right?")
+    reasons = json.loads((tmp_path / "run" / "metrics.json").read_text())["reasons"]
+    assert list(reasons) == ["degraded"] and lines[1].endswith(reasons["degraded"])
 
 
 @pytest.mark.slow

@@ -71,6 +71,7 @@ def test_deviations_are_honest():
 def test_what_is_within_the_doubt_is_not_said():
     assert FocalMotion(1.2, 0.03).doubt(OFF, SURE).startswith("what is seen moves as under focal lengths 1.20 times")
     assert FocalMotion(1.2, 0.06).doubt(OFF, SURE) == "" and FocalMotion(1.08, 0.001).doubt(OFF, SURE) == ""
+    assert FocalMotion(1.9, 0.1).doubt(OFF, SURE) == "what is seen does not move as one thing at rest"
     assert "0.80 times" in FocalMotion(0.8, 0.01).doubt(OFF, SURE)
 
 

@@ -15,7 +15,7 @@ import numpy as np
 from trihedron.pipeline.geometry import invert
 from trihedron.pipeline.types import F64, U8, Frame, Keypoints, Map, Matches
 from trihedron.plugins.numerics.algebra.small_linear import turn_left
-from trihedron.plugins.numerics.maps.focal_check import KEYFRAMES, LEAST_POINTS
+from trihedron.plugins.numerics.maps.focal_check import FACTORS, KEYFRAMES, LEAST_POINTS
 from trihedron.plugins.numerics.maps.keyframe_features import measured_points
 from trihedron.plugins.numerics.maps.local_window import newest_keyframes
 
@@ -32,9 +32,12 @@ class FocalMotion:
     sigma: float
 
     def doubt(self, off: float, sure: float) -> str:
-        """Why to doubt, where the factor is more than a share `off` away from one by `sure` standard deviations; else ''."""
+        """Why to doubt, where the factor is more than a share `off` away from one by `sure` standard deviations; else ''. No camera is told focal
+        lengths as wrong as `FACTORS` end; a factor beyond is of a scene that moves."""
         if abs(np.log(self.factor)) - np.log1p(off) <= sure * self.sigma:
             return ""
+        if not FACTORS[0] < self.factor < FACTORS[-1]:
+            return "what is seen does not move as one thing at rest"
         return f"what is seen moves as under focal lengths {self.factor:.2f} times as long; is the camera right?"
 
 
