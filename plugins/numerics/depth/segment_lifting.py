@@ -41,7 +41,7 @@ def lift_segments(
     covariance = np.full((n, 2, 3, 3), np.nan, np.float32)
     fx, fy, cx, cy = intrinsics
     t, rho, sigma = np.empty(most), np.empty(most), np.empty(most)
-    inlier = np.empty(most, np.bool_)
+    inlier, profile = np.empty(most, np.bool_), np.empty(2 * side_px + 1)
     for i in range(n):
         x0, y0, x1, y1 = endpoints_px[i, 0, 0], endpoints_px[i, 0, 1], endpoints_px[i, 1, 0], endpoints_px[i, 1, 1]
         length = np.hypot(x1 - x0, y1 - y0)
@@ -52,7 +52,7 @@ def lift_segments(
         m = 0
         for k in range(count):
             s = length * k / (count - 1.0)
-            z, error, shift = _sample(depth, x0 + s * ux, y0 + s * uy, ux, uy, side_px, noise, gate, edge)
+            z, error, shift = _sample(depth, x0 + s * ux, y0 + s * uy, ux, uy, noise, gate, edge, profile)
             if z > 0.0:
                 t[m], rho[m], sigma[m] = s + shift, 1.0 / z, error / (z * z)
                 m += 1
@@ -93,24 +93,15 @@ def _point_covariance(rx: float, ry: float, z: float, along: float, across: floa
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def _depth_at(depth: F32, x: float, y: float) -> float:
-    """Depth of the nearest pixel; 0 outside and where there is none."""
-    c, r = int(np.rint(x)), int(np.rint(y))
-    if not (0 <= c < depth.shape[1] and 0 <= r < depth.shape[0]):
-        return 0.0
-    z = float(depth[r, c])
-    return z if 0.0 < z < np.inf else 0.0
-
-
-@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _sample(
-    depth: F32, x: float, y: float, ux: float, uy: float, reach: int, noise: tuple[float, float, float, float], gate: float, edge: float
+    depth: F32, x: float, y: float, ux: float, uy: float, noise: tuple[float, float, float, float], gate: float, edge: float, profile: F64
 ) -> tuple[float, float, float]:
     """Depth of the nearer surface at (x, y) on a segment of direction (ux, uy), its standard deviation, and where it was read along the segment
     (px from (x, y)). A depth of 0 means none.
 
     On a smooth surface depth is interpolated, on a border read from the nearest pixel; being off the line by a part of a pixel adds to the error."""
-    z, offset, slope = _nearer_surface(depth, x, y, -uy, ux, reach, noise, gate, edge)
+    _depths_across(depth, x, y, -uy, ux, profile)
+    z, offset, slope = _nearer_surface(profile, noise, gate, edge)
     if z <= 0.0:
         return 0.0, 0.0, 0.0
     s = sigma_z(z, noise)
@@ -126,28 +117,46 @@ def _sample(
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def _interpolated(depth: F32, x: float, y: float) -> tuple[bool, float, float]:
     """Whether the four depths around (x, y) exist, their bilinear value, and their spread."""
-    c, r = np.floor(x), np.floor(y)
-    a, b = _depth_at(depth, c, r), _depth_at(depth, c + 1.0, r)
-    d, e = _depth_at(depth, c, r + 1.0), _depth_at(depth, c + 1.0, r + 1.0)
-    low = min(min(a, b), min(d, e))
-    if low <= 0.0:
+    c, r = int(np.floor(x)), int(np.floor(y))
+    if not ((c >= 0) & (c < depth.shape[1] - 1) & (r >= 0) & (r < depth.shape[0] - 1)):
+        return False, 0.0, 0.0
+    a, b, d, e = float(depth[r, c]), float(depth[r, c + 1]), float(depth[r + 1, c]), float(depth[r + 1, c + 1])
+    low, high = min(min(a, b), min(d, e)), max(max(a, b), max(d, e))
+    if not ((a > 0.0) & (b > 0.0) & (d > 0.0) & (e > 0.0) & (high < np.inf)):
         return False, 0.0, 0.0
     u, v = x - c, y - r
-    return True, (a * (1.0 - u) + b * u) * (1.0 - v) + (d * (1.0 - u) + e * u) * v, max(max(a, b), max(d, e)) - low
+    return True, (a * (1.0 - u) + b * u) * (1.0 - v) + (d * (1.0 - u) + e * u) * v, high - low
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def _nearer_surface(
-    depth: F32, x: float, y: float, nx: float, ny: float, reach: int, noise: tuple[float, float, float, float], gate: float, edge: float
-) -> tuple[float, int, float]:
-    """Depth of the nearest surface that shows within `reach` px of (x, y) across the line, in the direction (nx, ny); 0 when there is none.
+def _depths_across(depth: F32, x: float, y: float, nx: float, ny: float, out: F64) -> None:
+    """Depths (2 reach + 1,) of the pixels nearest to (x, y) + k (nx, ny), k = -reach … reach; 0 outside and where there is none."""
+    reach = len(out) // 2
+    h, w = depth.shape
+    for k in range(-reach, reach + 1):
+        c, r, z = int(np.rint(x + k * nx)), int(np.rint(y + k * ny)), 0.0
+        if (c >= 0) & (c < w) & (r >= 0) & (r < h):
+            z = float(depth[r, c])
+        out[k + reach] = z if 0.0 < z < np.inf else 0.0
 
-    The profile is parted into runs without a step; of the runs with two depths or more the nearest to the camera counts, at its place closest to
-    (x, y). Returns the depth there, the place (px) and the run's slope (m per px, absolute)."""
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _nearer_surface(depths: F64, noise: tuple[float, float, float, float], gate: float, edge: float) -> tuple[float, int, float]:
+    """Depth of the nearest surface that shows in a profile (2 reach + 1,) of depths across the line, 1 px apart; 0 when there is none.
+
+    The profile is parted into runs without a step; of the runs with two depths or more the nearest to the camera counts, at its place closest to the
+    middle. Returns the depth there, the place (px from the middle) and the run's slope (m per px, absolute)."""
+    reach = len(depths) // 2
+    steps = not depths[0] > 0.0
+    for i in range(2 * reach):
+        low = min(depths[i + 1], depths[i])
+        steps |= (low <= 0.0) | (abs(depths[i + 1] - depths[i]) > gate * sigma_z(low, noise) + edge * low)
+    if not steps:  # most often
+        return depths[reach], 0, abs(depths[2 * reach] - depths[0]) / max(2 * reach, 1)
     best, best_offset, best_slope = 0.0, 0, 0.0
     run, closest, offset, first, start, previous, last = 0, 0.0, 0, 0.0, 0, 0.0, 0
     for k in range(-reach, reach + 2):
-        value = _depth_at(depth, x + k * nx, y + k * ny) if k <= reach else 0.0
+        value = depths[k + reach] if k <= reach else 0.0
         if k <= reach and value == 0.0:
             continue
         step = gate * sigma_z(min(value, previous), noise) + edge * min(value, previous)
