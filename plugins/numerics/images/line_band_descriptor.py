@@ -51,13 +51,17 @@ def _row_sums(gx: F32, gy: F32, x0: float, y0: float, x1: float, y1: float, step
     ux, uy = (x1 - x0) / max(length, 1e-9), (y1 - y0) / max(length, 1e-9)
     count = max(int(length / step_px), 2)
     centre = 0.5 * (len(rows) - 1)
+    xs, ys = np.empty(count), np.empty(count)
+    for k in range(count):
+        t = length * (k + 0.5) / count
+        xs[k], ys[k] = x0 + t * ux, y0 + t * uy
     for r in range(len(rows)):
         o = r - centre
+        right, down = o * uy, o * ux
         a, b, c, d = 0.0, 0.0, 0.0, 0.0
         for k in range(count):
-            t = length * (k + 0.5) / count
-            x, y = int(np.rint(x0 + t * ux - o * uy)), int(np.rint(y0 + t * uy + o * ux))
-            if 0 <= x < w and 0 <= y < h:
+            x, y = int(np.rint(xs[k] - right)), int(np.rint(ys[k] + down))
+            if (x >= 0) & (x < w) & (y >= 0) & (y < h):
                 across, along = gx[y, x] * -uy + gy[y, x] * ux, gx[y, x] * ux + gy[y, x] * uy
                 a += max(across, 0.0)
                 b += max(-across, 0.0)
