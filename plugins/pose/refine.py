@@ -30,7 +30,7 @@ from trihedron.plugins.numerics.maps.focal_check import wrong_focal
 from trihedron.plugins.numerics.maps.focal_motion import focal_motion
 from trihedron.plugins.numerics.maps.foundations import SCORE, foundation_sigma_m
 from trihedron.plugins.numerics.maps.map_terms import line_terms, plane_terms, point_terms
-from trihedron.plugins.numerics.maps.proven import LEAST, distance2, position_distance2, proven
+from trihedron.plugins.numerics.maps.proven import AGREED, LEAST, distance2, position_distance2, proven
 from trihedron.plugins.numerics.maps.submaps import submap_of
 from trihedron.plugins.numerics.motion.pose_solver import PoseSolution, classify_terms, solve_pose
 from trihedron.plugins.numerics.motion.pose_terms import LineTerms, PlaneTerms, PointTerms
@@ -64,7 +64,7 @@ class Refine:
     moving_share: float = 0.15  # by which the shares of new and of proven points that disagree may differ; beyond, something may move
     moving_gate: float = 2.2  # squared standard deviations (the lowest tenth of χ²) from the pose by what is proven alone, beyond which that is taken
     moving_sure: float = 13.9  # the same of the position (0.997 of χ²), beyond which it is taken although the new and the proven disagree alike
-    moving_unproven: float = 9.0  # the same from the position by planes alone, beyond which those are taken while nothing else is proven
+    moving_unproven: float = 9.0  # the same from the position by planes alone, beyond which those are taken while nothing can be proven
     moving_most: float = 0.4  # of all matches that must agree with what is proven then, else the pose is called degraded
     submap_after: int = 15  # frames that show a place that is not known, after which a lost camera begins a new sub-map; 0 = never
 
@@ -174,11 +174,13 @@ class Refine:
         map: Map,
     ) -> tuple[PoseSolution, str]:
         """The solution as it is and ''; or, where something moves and pulls the pose away, that of what is at rest, with all matches judged by it,
-        and what that is: what is proven, and while too little is, the planes (what moves is seldom flat and large)."""
+        and what that is: what is proven, and before anything can be, the planes (what moves is seldom flat and large)."""
         if start.status == LOST:
             return found, ""
         known, same = proven(map, matches), len(matches.planes)
         rest = PROVEN if np.count_nonzero(known.points) >= LEAST else PLANES
+        if rest == PLANES and len(map.keyframes) > AGREED:
+            return found, ""
         walls = np.count_nonzero(found.planes[:same])
         contradicted = rest == PROVEN and (known.contradicted(found.points) >= self.moving_share or 2 * walls < same)
         disagree = 1.0 - _inliers(found, same).sum() / max(len(found.points) + len(found.lines) + same, 1)
