@@ -30,11 +30,11 @@ from trihedron.plugins.numerics.maps.focal_check import wrong_focal
 from trihedron.plugins.numerics.maps.focal_motion import focal_motion
 from trihedron.plugins.numerics.maps.foundations import SCORE, foundation_sigma_m
 from trihedron.plugins.numerics.maps.map_terms import line_terms, plane_terms, point_terms
-from trihedron.plugins.numerics.maps.proven import AGREED, LEAST, distance2, position_distance2, proven
+from trihedron.plugins.numerics.maps.proven import AGREED, LEAST, distance2, position_chi2, position_distance2, proven
 from trihedron.plugins.numerics.maps.submaps import submap_of
-from trihedron.plugins.numerics.motion.pose_solver import PoseSolution, classify_terms, solve_pose
-from trihedron.plugins.numerics.motion.pose_terms import LineTerms, PlaneTerms, PointTerms
+from trihedron.plugins.numerics.motion.pose_solver import NO_LINES, NO_POINTS, PoseSolution, Terms, classify_terms, first_step, solve_pose
 
+FIRST_SHARE = 0.5  # of the limit that a first step must reach before the rest is solved for by itself
 PROVEN, PLANES = "what is proven", "the planes"  # what is taken to be at rest where something moves
 
 
@@ -107,8 +107,7 @@ class Refine:
         if map is None or matches is None or previous is None:
             return start.said(frame, map)
         submap = relocalise.submap if relocalise is not None and relocalise.status == OK else submap_of(previous, map)
-        found = self._solve(start, frame, matches, keypoints, segments, planes, map)
-        found, moving = self._at_rest(found, start, frame, matches, keypoints, segments, planes, map)
+        found, moving = self._solved(start, frame, matches, keypoints, segments, planes, map)
         inliers = _inliers(found, len(matches.planes))
         sought = len(matches.keypoints) + len(matches.segments) + len(matches.planes)
         if start.status == LOST and not self._found_again(found, inliers, sought):
@@ -142,19 +141,16 @@ class Refine:
         new = replace(start, covariance=FIRST_SIGMA**2 * np.eye(6), status=DEGRADED, reason=reason)
         return new.said(frame, map, submap=number)
 
-    def _solve(
-        self, start: Decoupled, frame: Frame, matches: Matches, keypoints: Keypoints, segments: Segments, planes: Planes, map: Map
-    ) -> PoseSolution:
-        position = self.position_sigma_m**2 * np.eye(3) + start.covariance[:3, :3]
+    def _prior(self, start: Decoupled) -> F64:
+        """Information (6, 6) of the decoupled pose."""
         prior = np.zeros((6, 6))
-        prior[:3, :3] = np.linalg.inv(position)
+        prior[:3, :3] = np.linalg.inv(self.position_sigma_m**2 * np.eye(3) + start.covariance[:3, :3])
         prior[3:, 3:] = np.linalg.inv(start.covariance[3:, 3:] + np.radians(self.rotation_sigma_deg) ** 2 * np.eye(3))
-        T = start.T_world_camera
-        return solve_pose(T, frame.camera, T, prior, *self._terms(T, frame, matches, keypoints, segments, planes, map))
+        return prior
 
     def _terms(
         self, T_world_camera: F64, frame: Frame, matches: Matches, keypoints: Keypoints, segments: Segments, planes: Planes, map: Map
-    ) -> tuple[PointTerms, LineTerms, PlaneTerms]:
+    ) -> Terms:
         """All matches as terms, lines taken as they are seen from a pose."""
         return (
             point_terms(map, keypoints, matches.keypoints),
@@ -162,19 +158,14 @@ class Refine:
             plane_terms(map, planes, matches.planes, matches.parallel, matches.perpendicular, self.relation_sigma_deg),
         )
 
-    def _at_rest(
-        self,
-        found: PoseSolution,
-        start: Decoupled,
-        frame: Frame,
-        matches: Matches,
-        keypoints: Keypoints,
-        segments: Segments,
-        planes: Planes,
-        map: Map,
+    def _solved(
+        self, start: Decoupled, frame: Frame, matches: Matches, keypoints: Keypoints, segments: Segments, planes: Planes, map: Map
     ) -> tuple[PoseSolution, str]:
-        """The solution as it is and ''; or, where something moves and pulls the pose away, that of what is at rest, with all matches judged by it,
-        and what that is: what is proven, and before anything can be, the planes (what moves is seldom flat and large)."""
+        """The solution by all matches and ''; or, where something moves and pulls the pose away, that of what is at rest, with all matches judged by
+        it, and what that is: what is proven, and before anything can be, the planes (what moves is seldom flat and large)."""
+        prior, T = (frame.camera, start.T_world_camera, self._prior(start)), start.T_world_camera
+        terms = self._terms(T, frame, matches, keypoints, segments, planes, map)
+        found = solve_pose(T, *prior, *terms)
         if start.status == LOST:
             return found, ""
         known, same = proven(map, matches), len(matches.planes)
@@ -186,8 +177,11 @@ class Refine:
         disagree = 1.0 - _inliers(found, same).sum() / max(len(found.points) + len(found.lines) + same, 1)
         if not contradicted and (disagree < self.moving_share or same == 0):
             return found, ""
-        alone = self._solve(start, frame, known.only(matches) if rest == PROVEN else known.none(matches), keypoints, segments, planes, map)
+        at_rest = known.only(terms) if rest == PROVEN else (NO_POINTS, NO_LINES, terms[2])
         far = self.moving_sure if rest == PROVEN else self.moving_unproven
+        if not contradicted and position_chi2(*first_step(found.T_world_camera, *prior, at_rest)) < FIRST_SHARE * far:
+            return found, ""
+        alone = solve_pose(T, *prior, *at_rest)
         pulled = distance2(alone, found) >= self.moving_gate if contradicted else position_distance2(alone, found) > far
         if not pulled or (rest == PROVEN and alone.unobservable.shape[1]):
             return found, ""

@@ -11,6 +11,7 @@ from trihedron.pipeline.geometry import exp_se3, invert, log_se3
 from trihedron.plugins.matches.local_map import LocalMap
 from trihedron.plugins.numerics.maps.proven import LEAST, Proven, distance2, proven
 from trihedron.plugins.numerics.motion.pose_solver import PoseSolution
+from trihedron.plugins.numerics.motion.pose_terms import LineTerms, PointTerms
 from trihedron.plugins.pose.refine import Refine
 
 sys.path.insert(0, str(Path(__file__).parent))
@@ -68,8 +69,9 @@ def test_a_landmark_that_two_keyframes_measured_is_proven(world, map):
     ):
         seen = np.bincount(table.column(kind), minlength=ids.max() + 1)[ids]
         assert (seen[known] >= 2).all() and (known == (seen >= 2)).mean() > 0.98  # two rows of one corner that became one were seen once each
-    kept = found.only(matches)
-    assert np.array_equal(kept.keypoints, matches.keypoints[found.points]) and np.array_equal(kept.planes, matches.planes)
+    points, lines, planes = found.only((PointTerms(*[matches.keypoints] * 6), LineTerms(*[matches.segments] * 6), matches.planes))
+    assert all(np.array_equal(column, matches.keypoints[found.points]) for column in points) and planes is matches.planes
+    assert all(np.array_equal(column, matches.segments[found.lines]) for column in lines)
 
 
 def test_new_points_contradict_proven_ones_by_the_difference_of_their_shares():

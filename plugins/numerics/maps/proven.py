@@ -7,13 +7,14 @@ new landmarks contradict proven ones, the proven ones are right.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
 from trihedron.pipeline.geometry import invert, log_se3
-from trihedron.pipeline.types import U8, Bool, Map, Matches
-from trihedron.plugins.numerics.motion.pose_solver import PoseSolution
+from trihedron.pipeline.types import F64, U8, Bool, Map, Matches
+from trihedron.plugins.numerics.motion.pose_solver import PoseSolution, Terms
+from trihedron.plugins.numerics.motion.pose_terms import LineTerms, PointTerms
 
 AGREED = 2  # keyframes that measured a landmark in the same place, with which it is proven
 LEAST = 30  # points of each kind below which shares of them say nothing
@@ -26,13 +27,10 @@ class Proven:
     points: Bool
     lines: Bool
 
-    def only(self, matches: Matches) -> Matches:
-        """The matches with proven landmarks."""
-        return replace(matches, keypoints=matches.keypoints[self.points], segments=matches.segments[self.lines])
-
-    def none(self, matches: Matches) -> Matches:
-        """The matches with planes alone."""
-        return replace(matches, keypoints=matches.keypoints[:0], segments=matches.segments[:0])
+    def only(self, terms: Terms) -> Terms:
+        """Those of the matches' terms that are of proven landmarks."""
+        points, lines, planes = terms
+        return PointTerms(*(column[self.points] for column in points)), LineTerms(*(column[self.lines] for column in lines)), planes
 
     def contradicted(self, points: U8) -> float:
         """By how much larger a share (0 … 1) of the new points than of the proven ones are outliers (flags (n,)), or the other way round; 0 where
@@ -56,5 +54,9 @@ def distance2(one: PoseSolution, other: PoseSolution) -> float:
 
 def position_distance2(one: PoseSolution, other: PoseSolution) -> float:
     """The same of the positions alone, whatever the rotations: walls are not quite true, and what they say of a rotation is half a degree off."""
-    rho = log_se3(invert(one.T_world_camera) @ other.T_world_camera)[:3]
-    return float(rho @ np.linalg.solve(one.covariance[:3, :3], rho))
+    return position_chi2(log_se3(invert(one.T_world_camera) @ other.T_world_camera), one.covariance)
+
+
+def position_chi2(xi: F64, covariance: F64) -> float:
+    """Squared standard deviations of the position's part of xi."""
+    return float(xi[:3] @ np.linalg.solve(covariance[:3, :3], xi[:3]))

@@ -34,6 +34,7 @@ CONVERGED = 1e-3  # squared length of a step in standard deviations below which 
 MAX_DAMPING = 1e10
 PLANE_SLACK = 4.0  # when a direction would be lost with the planes beyond their gate, they are outliers only beyond this × it
 
+Terms = tuple[PointTerms, LineTerms, PlaneTerms]
 NO_POINTS = PointTerms(np.empty((0, 3)), np.empty((0, 3, 3)), np.empty((0, 2)), np.empty(0), np.empty(0), np.empty(0))
 NO_LINES = LineTerms(
     np.empty((0, 2, 3)), np.empty((0, 2, 3, 3)), np.empty((0, 2, 2)), np.empty(0), np.empty((0, 2, 3)), np.empty((0, 2, 3, 3))
@@ -82,7 +83,7 @@ def _solved(
     camera: Camera,
     T_prior: F64,
     prior_information: F64,
-    terms: tuple[PointTerms, LineTerms, PlaneTerms],
+    terms: Terms,
     fixed_rotation: bool,
     slack: float,
 ) -> PoseSolution:
@@ -103,14 +104,31 @@ def _solved(
     return PoseSolution(T, _inverse(data + prior), _unobservable(data, prior), *flags, cost)
 
 
+def first_step(T_world_camera: F64, camera: Camera, T_prior: F64, prior_information: F64, terms: Terms) -> tuple[F64, F64]:
+    """Where `solve_pose` would go at first from `T_world_camera`, all terms with Huber's cost: xi (6,), and its covariance (6, 6)."""
+    flags, weights, chi2 = _rooms(terms)
+    R, t = T_world_camera[:3, :3].copy(), T_world_camera[:3, 3].copy()
+    intrinsics, H, g = np.array([camera.fx, camera.fy, camera.cx, camera.cy]), np.empty((6, 6)), np.empty(6)
+    weigh(R, t, intrinsics, *terms, weights)
+    linearise(R, t, intrinsics, *terms, weights, flags, True, H, g, chi2)
+    add_prior(R, t, T_prior[:3, :3].copy(), T_prior[:3, 3].copy(), np.ascontiguousarray(prior_information, np.float64), H, g)
+    covariance = _inverse(np.tril(H) + np.tril(H, -1).T)
+    return -covariance @ g, covariance
+
+
+def _rooms(terms: Terms) -> tuple[Flags, Weights, Chi2]:
+    """Room for what is said of each term: all inliers, weights, χ²."""
+    n, m, p = len(terms[0].positions_m), len(terms[1].endpoints_m), len(terms[2].kinds)
+    flags = Flags(*(np.full(count, INLIER, np.uint8) for count in (n, m, p)))
+    weights = Weights(np.empty((n, 3, 3)), np.empty((m, 2, 2)), np.empty((m, 2, 2)), np.empty((p, 3, 3)))
+    return flags, weights, Chi2(np.empty(n), np.empty(m), np.empty(m), np.empty(p))
+
+
 def classify_terms(
     T_world_camera: F64, camera: Camera, points: PointTerms = NO_POINTS, lines: LineTerms = NO_LINES, planes: PlaneTerms = NO_PLANES
 ) -> Flags:
     """OUTLIER, INLIER or NO_DEPTH of every term at a given pose."""
-    n, m, p = len(points.positions_m), len(lines.endpoints_m), len(planes.kinds)
-    flags = Flags(*(np.full(count, INLIER, np.uint8) for count in (n, m, p)))
-    weights = Weights(np.empty((n, 3, 3)), np.empty((m, 2, 2)), np.empty((m, 2, 2)), np.empty((p, 3, 3)))
-    chi2 = Chi2(np.empty(n), np.empty(m), np.empty(m), np.empty(p))
+    flags, weights, chi2 = _rooms((points, lines, planes))
     R, t = T_world_camera[:3, :3].copy(), T_world_camera[:3, 3].copy()
     intrinsics = np.array([camera.fx, camera.fy, camera.cx, camera.cy])
     weigh(R, t, intrinsics, points, lines, planes, weights)
