@@ -46,6 +46,11 @@ class Camera:
         """(3, 3) calibration matrix."""
         return np.array([[self.fx, 0.0, self.cx], [0.0, self.fy, self.cy], [0.0, 0.0, 1.0]])
 
+    @property
+    def intrinsics(self) -> F64:
+        """(4,) fx, fy, cx, cy in pixels, as compiled loops and the map take them."""
+        return np.array([self.fx, self.fy, self.cx, self.cy])
+
     def project(self, points_m: F64) -> F64:
         """(n, 3) points in the camera frame -> (n, 2) pixels; points behind the camera give NaN."""
         z = np.where(points_m[..., 2] > 1e-6, points_m[..., 2], np.nan)

@@ -88,12 +88,13 @@ class Sweeper(BasicSweeper):
         missing: list[tuple[Overrides, Path]] = []
         errors: list[TrihedronError] = []
         for job, folder in zip(jobs, folders):
-            words = [*job, f"hydra.sweep.subdir={folder.name}"]
+            words = [*job, f"hydra.sweep.subdir={folder.name}"]  # the last is its own alone
             try:
                 key = key_of(self.composed(words))
             except Exception as error:
                 errors.append(error if isinstance(error, TrihedronError) else rewritten(error))
-                _failed(folder, job, str(errors[-1]))
+                _keep_overrides(folder, job)
+                write_job(folder, "", FAILED, str(errors[-1]))
                 print(f"trihedron: {errors[-1]}", file=sys.stderr)
                 continue
             if read_job(folder) != {"key": key, "state": DONE, "error": ""}:
@@ -125,8 +126,9 @@ class Sweeper(BasicSweeper):
         except Exception as error:  # of the engine; a job that fails says so in its folder
             raise _given_up(error) from error
         for words, folder in missing:
+            _keep_overrides(folder, words[:-1])
             if read_job(folder).get("state") not in (DONE, FAILED):
-                _died(words, folder)
+                _died(folder)
         if self.options.hydra.launcher.get("n_jobs", 1) != 1:
             get_reusable_executor().shutdown()  # its processes would keep this folder and environment for the next sweep
 
@@ -134,7 +136,7 @@ class Sweeper(BasicSweeper):
         """A process that died took those beside it along. What had begun is run again, one at a time, so that only the job at fault fails; then
         what had not."""
         if len(missing) == 1:
-            _died(*missing[0])
+            _died(missing[0][1])
             return
         begun = [job for job in missing if read_job(job[1]).get("state") == RUNNING]
         if not begun:
@@ -189,16 +191,17 @@ def failure_of(folder: Path) -> str:
     return "" if job.get("state") == DONE else str(job.get("error") or "was stopped before its end")
 
 
-def _failed(folder: Path, job: Overrides, error: str) -> None:
-    """The folder of a job that cannot say so itself: it may have no run, but has a reason."""
-    (folder / ".hydra").mkdir(parents=True, exist_ok=True)
-    (folder / ".hydra" / "overrides.yaml").write_text(yaml.safe_dump(job))
-    write_job(folder, "", FAILED, error)
+def _keep_overrides(folder: Path, job: Overrides) -> None:
+    """What tells a job from the others, where it came to no end before it could say so itself: it has no run then, but a reason."""
+    file = folder / ".hydra" / "overrides.yaml"
+    if not file.exists():
+        file.parent.mkdir(parents=True, exist_ok=True)
+        file.write_text(yaml.safe_dump(job))
 
 
-def _died(words: Overrides, folder: Path) -> None:
-    """Say so of a job; the last of its words is its folder's name."""
-    _failed(folder, words[:-1], f"{folder}: its process died; it crashed, or memory ran out")
+def _died(folder: Path) -> None:
+    """Say so of a job that cannot."""
+    write_job(folder, "", FAILED, f"{folder}: its process died; it crashed, or memory ran out")
 
 
 class _Progress:

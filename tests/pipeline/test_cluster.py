@@ -92,29 +92,39 @@ def test_submitit_runs_the_jobs_as_it_would_on_slurm(tmp_path, capfd):
     assert json.loads((tmp_path / "0" / "job.json").read_text())["state"] == "done" and threads_of(tmp_path / "0") == 2
 
 
+def kill_one(program, folder):
+    """The first process that runs `program` in the folder, or with it among its words."""
+    until = time.monotonic() + 120
+    while time.monotonic() < until:
+        for process in Path("/proc").glob("[0-9]*"):
+            with suppress(OSError):
+                words = (process / "cmdline").read_text()
+                if program in words and (str(folder) in words or (process / "cwd").resolve() == folder):
+                    return os.kill(int(process.name), signal.SIGKILL)
+        time.sleep(0.05)
+
+
 @pytest.mark.slow
-def test_a_job_whose_process_dies_is_waited_for_by_no_other_and_stops_none(tmp_path, capfd):
+@pytest.mark.parametrize("engine", ["submitit", "dask"])
+def test_a_job_whose_process_dies_is_waited_for_by_no_other_and_stops_none(engine, request, tmp_path, capfd, monkeypatch):
+    """It dies before it could say anything, and has its row."""
     pytest.importorskip("submitit", reason="needs trihedron[cluster]")
-
-    def kill_one():
-        until = time.monotonic() + 120
-        while time.monotonic() < until:
-            for process in Path("/proc").glob("[0-9]*"):
-                with suppress(OSError):
-                    words = (process / "cmdline").read_text()
-                    if "submitit.core._submit" in words and str(tmp_path) in words:
-                        return os.kill(int(process.name), signal.SIGKILL)
-            time.sleep(0.1)
-
-    killer = threading.Thread(target=kill_one)
+    monkeypatch.chdir(tmp_path)
+    if engine == "dask":
+        program, cause = "trihedron.pipeline.cluster", "the job's process ended with -9"
+        launcher = ["hydra/launcher=dask", f"hydra.launcher.address={request.getfixturevalue('scheduler')}"]
+    else:
+        program, cause = "submitit.core._submit", "its process died; it crashed, or memory ran out"
+        launcher = ["hydra/launcher=submitit_local"]
+    killer = threading.Thread(target=kill_one, args=(program, tmp_path))
     killer.start()
-    assert main(["run", "-m", *QUICK, "hydra/launcher=submitit_local", f"out={tmp_path}", "seed=0,1"]) == 1
+    assert main(["run", "-m", *QUICK, *launcher, f"out={tmp_path}", "seed=0,1"]) == 1
     killer.join()
     assert "1 of 2 jobs failed" in capfd.readouterr().err
     said = sorted(json.loads((tmp_path / name / "job.json").read_text())["state"] for name in "01")
     assert said == ["done", "failed"]
     main(["compare", str(tmp_path)])
-    assert "its process died; it crashed, or memory ran out" in capfd.readouterr().out
+    assert cause in capfd.readouterr().out
 
 
 def free_port():

@@ -58,13 +58,12 @@ def focal_motion(map: Map, frame: Frame, keypoints: Keypoints, matches: Matches,
     if len(now) < LEAST_POINTS:
         return None
     camera = frame.camera
-    told = np.array([camera.fx, camera.fy, camera.cx, camera.cy])
     seen = np.column_stack([keypoints.pixels[now], keypoints.points_m[now, 2]]).astype(np.float64)
     zoom = camera.fx / map.keyframes.rows("intrinsics", np.array([row]))[0, 0]  # 1 unless the resolution has changed
     noise_px = (zoom * sigma_px[at]) ** 2 + keypoints.sigma_px[now].astype(np.float64) ** 2
     noise_m = sigma_m[at] ** 2 + keypoints.sigma_m[now].astype(np.float64) ** 2
     T = invert(T_world_camera) @ map.keyframes.rows("T_world_camera", np.array([row]))[0]
-    return FocalMotion(*_solve(places[at], seen, noise_px, noise_m, told, T[:3, :3].copy(), T[:3, 3].copy()))
+    return FocalMotion(*_solve(places[at], seen, noise_px, noise_m, camera.intrinsics, T[:3, :3].copy(), T[:3, 3].copy()))
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")

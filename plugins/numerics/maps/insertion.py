@@ -27,10 +27,6 @@ class View:
     T_world_camera: F64
     covariance: F64  # (6, 6)
 
-    @property
-    def intrinsics(self) -> F64:
-        return np.array([self.camera.fx, self.camera.fy, self.camera.cx, self.camera.cy])
-
 
 def add_keyframe(map: Map, pose: Pose, camera: Camera) -> tuple[Map, int]:
     """A version with one more keyframe, whose observation rows are still to come, and its row."""
@@ -40,7 +36,7 @@ def add_keyframe(map: Map, pose: Pose, camera: Camera) -> tuple[Map, int]:
         stamp_ns=np.array([pose.stamp_ns]),
         T_world_camera=pose.T_world_camera[None],
         covariance=pose.covariance[None],
-        intrinsics=np.array([[camera.fx, camera.fy, camera.cx, camera.cy]]),
+        intrinsics=camera.intrinsics[None],
         points=empty,
         lines=empty,
         planes=empty,
@@ -86,7 +82,7 @@ def insert_points(map: Map, view: View, keypoints: Keypoints, pairs: I32, new: I
     sigma_px, sigma_m = keypoints.sigma_px.astype(np.float64), keypoints.sigma_m.astype(np.float64)
     pixels, depth = keypoints.pixels.astype(np.float64), keypoints.points_m[:, 2].astype(np.float64)
     fuse_points(
-        view.T_world_camera, view.covariance, view.intrinsics, position, information,
+        view.T_world_camera, view.covariance, view.camera.intrinsics, position, information,
         pixels[rows], depth[rows], sigma_px[rows], sigma_m[rows], memory,
     )  # fmt: skip
     looks = _look(view, keypoints, rows, position)
@@ -132,7 +128,7 @@ def insert_lines(map: Map, view: View, segments: Segments, pairs: I32, new: I32,
     endpoints, information = table.rows("endpoints_m", ids), table.rows("information", ids).astype(np.float64)
     observed, covariance = segments.endpoints_m.astype(np.float64), segments.covariance_m2.astype(np.float64)
     fuse_lines(
-        view.T_world_camera, view.covariance, view.intrinsics, endpoints, information,
+        view.T_world_camera, view.covariance, view.camera.intrinsics, endpoints, information,
         segments.endpoints_px[rows].astype(np.float64), observed[rows], covariance[rows], sigma_px, memory,
     )  # fmt: skip
     endpoints, information = lengthened(endpoints, information, transform(view.T_world_camera, observed[rows]))

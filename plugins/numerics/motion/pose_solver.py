@@ -89,12 +89,11 @@ def _solved(
 ) -> PoseSolution:
     """`solve_pose` with the planes' gates multiplied by `slack`."""
     free = 3 if fixed_rotation else 6
-    intrinsics = np.array([camera.fx, camera.fy, camera.cx, camera.cy])
     points, lines, planes = terms
-    flags = Flags(*(np.full(count, INLIER, np.uint8) for count in (len(points.positions_m), len(lines.endpoints_m), len(planes.kinds))))
+    flags = _all_inliers(terms)
     R, t, H_data, cost = _solve(
         T_world_camera[:3, :3].copy(), T_world_camera[:3, 3].copy(), T_prior[:3, :3].copy(), T_prior[:3, 3].copy(),
-        np.ascontiguousarray(prior_information, np.float64), intrinsics, points, lines, planes, flags, free, slack,
+        np.ascontiguousarray(prior_information, np.float64), camera.intrinsics, points, lines, planes, flags, free, slack,
     )  # fmt: skip
     T = np.eye(4)
     T[:3, :3], T[:3, 3] = R, t
@@ -108,7 +107,7 @@ def first_step(T_world_camera: F64, camera: Camera, T_prior: F64, prior_informat
     """Where `solve_pose` would go at first from `T_world_camera`, all terms with Huber's cost: xi (6,), and its covariance (6, 6)."""
     flags, weights, chi2 = _rooms(terms)
     R, t = T_world_camera[:3, :3].copy(), T_world_camera[:3, 3].copy()
-    intrinsics, H, g = np.array([camera.fx, camera.fy, camera.cx, camera.cy]), np.empty((6, 6)), np.empty(6)
+    intrinsics, H, g = camera.intrinsics, np.empty((6, 6)), np.empty(6)
     weigh(R, t, intrinsics, *terms, weights)
     linearise(R, t, intrinsics, *terms, weights, flags, True, H, g, chi2)
     add_prior(R, t, T_prior[:3, :3].copy(), T_prior[:3, 3].copy(), np.ascontiguousarray(prior_information, np.float64), H, g)
@@ -116,10 +115,15 @@ def first_step(T_world_camera: F64, camera: Camera, T_prior: F64, prior_informat
     return -covariance @ g, covariance
 
 
+def _all_inliers(terms: Terms) -> Flags:
+    points, lines, planes = terms
+    return Flags(*(np.full(count, INLIER, np.uint8) for count in (len(points.positions_m), len(lines.endpoints_m), len(planes.kinds))))
+
+
 def _rooms(terms: Terms) -> tuple[Flags, Weights, Chi2]:
     """Room for what is said of each term: all inliers, weights, χ²."""
-    n, m, p = len(terms[0].positions_m), len(terms[1].endpoints_m), len(terms[2].kinds)
-    flags = Flags(*(np.full(count, INLIER, np.uint8) for count in (n, m, p)))
+    flags = _all_inliers(terms)
+    n, m, p = (len(kind) for kind in flags)
     weights = Weights(np.empty((n, 3, 3)), np.empty((m, 2, 2)), np.empty((m, 2, 2)), np.empty((p, 3, 3)))
     return flags, weights, Chi2(np.empty(n), np.empty(m), np.empty(m), np.empty(p))
 
@@ -130,7 +134,7 @@ def classify_terms(
     """OUTLIER, INLIER or NO_DEPTH of every term at a given pose."""
     flags, weights, chi2 = _rooms((points, lines, planes))
     R, t = T_world_camera[:3, :3].copy(), T_world_camera[:3, 3].copy()
-    intrinsics = np.array([camera.fx, camera.fy, camera.cx, camera.cy])
+    intrinsics = camera.intrinsics
     weigh(R, t, intrinsics, points, lines, planes, weights)
     linearise(R, t, intrinsics, points, lines, planes, weights, flags, False, np.empty((6, 6)), np.empty(6), chi2)
     _classify(points, planes, chi2, flags, 1.0)

@@ -18,7 +18,7 @@ def with_measured_noise(frame: Frame, planes: Planes) -> Frame:
     """The frame with its camera's depth noise scaled to what half of the readings on planes show of it; never above the camera's own, and never below
     its floor."""
     camera, noise = frame.camera, frame.camera.depth_noise
-    lens = np.array([camera.fx, camera.fy, camera.cx, camera.cy])
+    lens = camera.intrinsics
     step = max(1, planes.labels.shape[1] // COLUMNS)
     off, depth = _off_planes(frame.depth_m, planes.labels, planes.coefficients, planes.stride, step, lens)
     if len(off) < LEAST:

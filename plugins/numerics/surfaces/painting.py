@@ -23,7 +23,7 @@ def painted(points: F64, normals: F64, views: Sequence[tuple[View, F64]]) -> tup
     for row in np.unique(np.linspace(0, max(len(views) - 1, 0), min(MOST, len(views))).round().astype(int)):
         view, T = views[row]
         c = view.camera
-        lens = np.array([c.fx, c.fy, c.cx, c.cy], np.float32)
+        lens = c.intrinsics.astype(np.float32)
         near = (NEAR_M + SIGMAS * c.depth_noise.sigma_m(np.arange(0.0, 16.0, 0.1))).astype(np.float32)
         _paint(points, normals, view.depth_m, view.color, T[:3, :3].T.astype(np.float32), T[:3, 3].astype(np.float32), lens, near, total)
     seen = total[:, 3] > 0.0

@@ -22,7 +22,7 @@ def superpixels(view: View, side_px: int, coarse_px: int) -> F64:
     views, 1. The side of a superpixel is `coarse_px` in planar regions and `side_px` elsewhere."""
     gray = view.color.astype(np.float32).mean(axis=2)
     c = view.camera
-    lens = np.array([c.fx, c.fy, c.cx, c.cy])
+    lens = c.intrinsics
     found = []
     for planar, side in ((True, coarse_px), (False, side_px)):
         mask = (view.depth_m > 0.0) & ((view.labels > 0) == planar)

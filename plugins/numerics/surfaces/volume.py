@@ -38,7 +38,7 @@ class Volume:
     def integrate(self, view: View, T_world_camera: F64) -> None:
         """Take in a view from a pose."""
         c, T = view.camera, T_world_camera
-        lens = np.array([c.fx, c.fy, c.cx, c.cy])
+        lens = c.intrinsics
         slants = _slants(view.coefficients, lens)
         touched = blocks_about(view.depth_m, view.labels, slants, lens, T, self.voxel_m * SIDE, self.truncation_m)
         fresh = touched[absent(self.keys, touched)]
