@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import json
 import sys
-from base64 import b64encode
 from pathlib import Path
 from typing import Any
 
@@ -15,12 +13,11 @@ from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
 from foxglove_schemas_protobuf.FrameTransform_pb2 import FrameTransform
 from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
 from google.protobuf.timestamp_pb2 import Timestamp
-from mcap.writer import Writer
-from mcap_protobuf.writer import Writer as ProtobufWriter
 
 from trihedron.datasets.mcap import McapDataset
 
 sys.path.insert(0, str(Path(__file__).parent))
+from foxglove_files import write_json, write_protobuf
 from robot_files import SECOND, encoded
 from robot_scene import BEGIN, STEP, WALL, check_registered, millimetres
 
@@ -44,43 +41,11 @@ def foxglove_values(k: int) -> list[tuple[str, Any]]:
     ]
 
 
-def as_json(value: Any) -> dict[str, Any]:
-    """Foxglove's JSON: times as sec and nsec, bytes as base64."""
-    found: dict[str, Any] = {}
-    for field in value.DESCRIPTOR.fields:
-        content = getattr(value, field.name)
-        if field.name == "timestamp":
-            content = {"sec": content.seconds, "nsec": content.nanos}
-        elif isinstance(content, bytes):
-            content = b64encode(content).decode()
-        elif field.message_type is not None:
-            content = as_json(content)
-        elif not isinstance(content, (str, int, float)):
-            content = list(content)
-        found[field.name] = content
-    return found
-
-
 @pytest.mark.parametrize("encoding", ["protobuf", "json"])
 def test_foxglove_schemas(tmp_path: Path, encoding: str) -> None:
     path = tmp_path / "foxglove.mcap"
-    with open(path, "wb") as file:
-        if encoding == "protobuf":
-            with ProtobufWriter(file) as writer:
-                for k in range(4):
-                    for topic, value in foxglove_values(k):
-                        writer.write_message(topic, value, BEGIN + k * STEP, BEGIN + k * STEP)
-        else:
-            plain = Writer(file)
-            plain.start()
-            channels: dict[str, int] = {}
-            for k in range(4):
-                for topic, value in foxglove_values(k):
-                    if topic not in channels:
-                        schema = plain.register_schema(value.DESCRIPTOR.full_name, "jsonschema", b"{}")
-                        channels[topic] = plain.register_channel(topic, "json", schema)
-                    plain.add_message(channels[topic], BEGIN + k * STEP, json.dumps(as_json(value)).encode(), BEGIN + k * STEP)
-            plain.finish()
+    messages = [(topic, BEGIN + k * STEP, value) for k in range(4) for topic, value in foxglove_values(k)]
+    (write_protobuf if encoding == "protobuf" else write_json)(path, messages)
     check_registered(McapDataset(str(path)))
     truth = McapDataset(str(path), truth_from="world").truth()
     assert truth is not None

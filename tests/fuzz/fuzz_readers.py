@@ -81,8 +81,9 @@ def fuzz(name: str, count: int, seed: int) -> Tally:
             path.write_bytes(data)
             try:
                 with limited_time():
-                    reader(path)
-                tally.read += 1
+                    read = reader(path)
+                tally.read += read > 0
+                tally.refused["nothing in it"] += not read
             except DECLARED as error:
                 tally.refused[type(error).__name__] += 1
                 if "\n" in str(error):
@@ -134,7 +135,7 @@ def main(argv: list[str]) -> int:
     broke = total = 0
     for name in chosen:
         tally = fuzz(name, -(-int(arguments.inputs * TARGETS[name][2] * 1e6 / share) // 1_000_000), arguments.seed)
-        refused = ", ".join(f"{count} {kind}" for kind, count in tally.refused.most_common())
+        refused = ", ".join(f"{count} {kind}" for kind, count in tally.refused.most_common() if count)
         print(
             f"{name:13} {tally.inputs:6} inputs: {tally.read} read, {refused or 'none refused'}, {len(tally.broke)} broke it; {tally.seconds:.1f} s",
             flush=True,

@@ -5,17 +5,28 @@ from __future__ import annotations
 import json
 import struct
 import sys
+from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+from foxglove_schemas_protobuf.CameraCalibration_pb2 import CameraCalibration
+from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
+from foxglove_schemas_protobuf.FrameTransform_pb2 import FrameTransform
+from foxglove_schemas_protobuf.FrameTransforms_pb2 import FrameTransforms
+from foxglove_schemas_protobuf.Pose_pb2 import Pose
+from foxglove_schemas_protobuf.PoseInFrame_pb2 import PoseInFrame
+from foxglove_schemas_protobuf.Quaternion_pb2 import Quaternion
+from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
+from foxglove_schemas_protobuf.Vector3_pb2 import Vector3
+from google.protobuf.timestamp_pb2 import Timestamp
 from mcap.reader import make_reader
 from mcap.writer import CompressionType
-from mcap_protobuf.writer import Writer as ProtobufWriter
 
 from trihedron.datasets import foxglove_messages
 from trihedron.datasets.robot_streams import ROS
 from trihedron.datasets.trajectories import TRUTH
-from trihedron.pipeline.geometry import exp_se3
+from trihedron.pipeline.geometry import exp_se3, quaternion_from_rotation
 from trihedron.pipeline.ply import write_ply
 from trihedron.pipeline.recording import RecordingWriter
 from trihedron.pipeline.runner import Runner
@@ -23,7 +34,24 @@ from trihedron.plugins.numerics.maps.landmarks import empty_map
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "datasets"))
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "pipeline"))
-from robot_files import COLOR, DEPTH, Message, Wall, camera_info, compressed, encoded, image, transforms, write_file
+from foxglove_files import write_json, write_protobuf
+from robot_files import (
+    COLOR,
+    DEPTH,
+    SECOND,
+    Message,
+    Wall,
+    camera_info,
+    compressed,
+    encoded,
+    header,
+    image,
+    make,
+    message,
+    pose,
+    transforms,
+    write_file,
+)  # fmt: skip
 from toys import TOPICS, ToyDataset, toy_graph
 
 SMALL = Wall((16, 12), np.array([[15.0, 0, 7.5], [0, 15.0, 5.5], [0, 0, 1]]), (12, 9), np.array([[10.0, 0, 5.5], [0, 10.0, 4.0], [0, 0, 1]]))
@@ -86,7 +114,8 @@ def _robots(folder: Path) -> None:
         infos = [camera_info("/c/camera_info", stamp, COLOR, SMALL.size, SMALL.K, [0.1, 0, 0, 0, 0])]
         infos.append(camera_info("/d/camera_info", stamp, DEPTH, SMALL.depth_size, SMALL.depth_K))
         moved = transforms("/tf", [(stamp, "map", "base", exp_se3(np.array([0.1 * k, 0, 0, 0, 0, 0])))])
-        raw += [*infos, moved, image("/c/image_raw", stamp, COLOR, "bgr8", SMALL.color()), image("/d/image_raw", stamp, DEPTH, "32FC1", depth)]
+        raw += [*infos, *_said(stamp), image("/c/image_raw", stamp, COLOR, "bgr8", SMALL.color())]
+        raw += [image("/d/image_raw", stamp, DEPTH, "32FC1", depth)]
         small += [*infos, moved, compressed("/c/image_raw/compressed", stamp, COLOR, "bgr8; jpeg compressed bgr8", encoded(".jpg", SMALL.color()))]
         small += [compressed("/d/image_raw/compressedDepth", stamp, DEPTH, "16UC1; compressedDepth png", packed)]
     write_file(folder / "ros_raw.mcap", raw, compression=CompressionType.NONE, enable_crcs=False, chunk_size=4_000)
@@ -94,21 +123,73 @@ def _robots(folder: Path) -> None:
     write_file(folder / "ros_loose.mcap", small, use_chunking=False)
 
 
-def _foxglove(folder: Path) -> None:
-    from foxglove_schemas_protobuf.CameraCalibration_pb2 import CameraCalibration
-    from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
-    from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
-    from google.protobuf.timestamp_pb2 import Timestamp
+def _said(stamp_ns: int) -> list[Message]:
+    """A pose in each type of message that says one."""
+    head, at = header(stamp_ns, "map"), pose(exp_se3(np.array([0.1, 0.2, 0, 0, 0, 0.3])))
+    zero = make("geometry_msgs/msg/Vector3", x=0.0, y=0.0, z=0.0)
+    covariance = make("geometry_msgs/msg/PoseWithCovariance", pose=at, covariance=np.zeros(36))
+    still = make("geometry_msgs/msg/Twist", linear=zero, angular=zero)
+    twist = make("geometry_msgs/msg/TwistWithCovariance", twist=still, covariance=np.zeros(36))
+    moved = make("geometry_msgs/msg/Transform", translation=zero, rotation=at.orientation)
+    kinds = {
+        "/pose": ("geometry_msgs/msg/PoseStamped", {"pose": at}),
+        "/pose_covariance": ("geometry_msgs/msg/PoseWithCovarianceStamped", {"pose": covariance}),
+        "/odom": ("nav_msgs/msg/Odometry", {"child_frame_id": "base", "pose": covariance, "twist": twist}),
+        "/body": ("geometry_msgs/msg/TransformStamped", {"child_frame_id": "base", "transform": moved}),
+    }
+    return [message(topic, kind, stamp_ns, make(kind, header=head, **fields)) for topic, (kind, fields) in kinds.items()]
 
-    depth, K = np.rint(SMALL.depth_in_color() * 1000).astype(np.uint16), SMALL.K.reshape(-1)
-    with open(folder / "foxglove.mcap", "wb") as file, ProtobufWriter(file, compression=CompressionType.NONE, enable_crcs=False) as writer:
-        for k in range(3):
-            stamp = Timestamp(seconds=100, nanos=k * STEP)
-            picture = CompressedImage(timestamp=stamp, frame_id="c", data=encoded(".png", SMALL.color()), format="png")
-            raw = RawImage(timestamp=stamp, frame_id="c", width=16, height=12, encoding="16UC1", step=32, data=depth.tobytes())
-            writer.write_message("/info", CameraCalibration(timestamp=stamp, frame_id="c", width=16, height=12, K=K, P=np.zeros(12)), k, k)
-            writer.write_message("/color", picture, k, k)
-            writer.write_message("/depth", raw, k, k)
+
+def _foxglove(folder: Path) -> None:
+    """Protobuf with depth in the colour camera; protobuf with a depth camera and a lens of its own; JSON with poses. Each with the truth."""
+    plain, turned = np.eye(4), exp_se3(np.array([0.03, 0.0, 0.0, 0.01, 0.0, 0.0]))
+    one, own, told = [], [], []
+    for k in range(3):
+        stamp, moved = BEGIN + k * STEP, exp_se3(np.array([0.1 * k, 0, 0, 0, 0, 0]))
+        registered = _raw_image(stamp, COLOR, "16UC1", np.rint(SMALL.depth_in_color() * 1000).astype(np.uint16))
+        picture = CompressedImage(timestamp=_stamp(stamp), frame_id=COLOR, data=encoded(".png", SMALL.color()), format="png")
+        info = _calibration(stamp, COLOR, SMALL.size, SMALL.K)
+        one += [("/info", info), ("/color", picture), ("/depth", registered), ("/tf", _transform(stamp, "map", COLOR, moved))]
+        links = FrameTransforms(transforms=[_transform(stamp, "map", "base", moved), _transform(stamp, "base", COLOR, turned)])
+        own += [("/c/info", _calibration(stamp, COLOR, SMALL.size, SMALL.K, [0.1, 0, 0, 0, 0])), ("/tf", links)]
+        own += [("/c/image", _raw_image(stamp, COLOR, "rgb8", SMALL.color())), ("/tf_static", _transform(stamp, "base", DEPTH, plain))]
+        depth = _raw_image(stamp, DEPTH, "32FC1", SMALL.depth().astype(np.float32))
+        own += [("/d/info", _calibration(stamp, DEPTH, SMALL.depth_size, SMALL.depth_K)), ("/d/image", depth)]
+        pose = PoseInFrame(timestamp=_stamp(stamp), frame_id="map", pose=_pose(moved))
+        told += [("/info", info), ("/color", picture), ("/depth", registered), ("/pose", pose)]
+    write_protobuf(folder / "foxglove_registered.mcap", _timed(one), compression=CompressionType.NONE, enable_crcs=False)
+    write_protobuf(folder / "foxglove_own_depth.mcap", _timed(own), compression=CompressionType.NONE, enable_crcs=False, chunk_size=4_000)
+    write_json(folder / "foxglove_json.mcap", _timed(told), compression=CompressionType.LZ4)
+
+
+def _timed(messages: list[tuple[str, Any]]) -> list[tuple[str, int, Any]]:
+    return [(topic, BEGIN + k * 1_000_000, value) for k, (topic, value) in enumerate(messages)]
+
+
+def _stamp(stamp_ns: int) -> Timestamp:
+    return Timestamp(seconds=stamp_ns // SECOND, nanos=stamp_ns % SECOND)
+
+
+def _raw_image(stamp_ns: int, frame_id: str, encoding: str, pixels: np.ndarray) -> RawImage:
+    fields = {"width": pixels.shape[1], "height": pixels.shape[0], "step": pixels[0].nbytes, "data": pixels.tobytes()}
+    return RawImage(timestamp=_stamp(stamp_ns), frame_id=frame_id, encoding=encoding, **fields)
+
+
+def _calibration(stamp_ns: int, frame_id: str, size: tuple[int, int], K: np.ndarray, D: Sequence[float] = ()) -> CameraCalibration:
+    fields = {"width": size[0], "height": size[1], "K": K.reshape(-1), "P": np.column_stack([K, np.zeros(3)]).reshape(-1), "D": D}
+    return CameraCalibration(timestamp=_stamp(stamp_ns), frame_id=frame_id, distortion_model="plumb_bob", R=np.eye(3).reshape(-1), **fields)
+
+
+def _pose(T: np.ndarray) -> Pose:
+    x, y, z, w = quaternion_from_rotation(T[:3, :3]).tolist()
+    return Pose(position=Vector3(x=T[0, 3], y=T[1, 3], z=T[2, 3]), orientation=Quaternion(x=x, y=y, z=z, w=w))
+
+
+def _transform(stamp_ns: int, parent: str, child: str, T: np.ndarray) -> FrameTransform:
+    at = _pose(T)
+    return FrameTransform(
+        timestamp=_stamp(stamp_ns), parent_frame_id=parent, child_frame_id=child, translation=at.position, rotation=at.orientation
+    )  # fmt: skip
 
 
 def _own(folder: Path) -> None:
@@ -120,30 +201,19 @@ def _own(folder: Path) -> None:
     writer.close()
     writer = RecordingWriter(folder / "map.mcap", {"kind": "map", "map_version": "1", "frame": "4", "source": "{}"})
     writer.write("map", empty_map(4, 4_000, 32, 32, 8))
-    for pose in runner.result.poses[-1:]:
-        writer.write("pose", pose)
+    writer.write("pose", runner.result.poses[-1])
     writer.close()
 
 
 def _messages(folder: Path) -> None:
-    """One message of each type, behind a byte that says which."""
-    kinds = [*ROS, *(name for kind in foxglove_messages.READERS for name in (kind, f"{kind} json")), "trihedron.Value"]
-    for name in ("ros_raw", "ros_compressed", "foxglove", "own"):
+    """One message of each topic, behind a byte that says of which type."""
+    kinds = [*ROS, *(f"{kind} {encoding}" for kind in foxglove_messages.READERS for encoding in ("protobuf", "json")), "trihedron.Value"]
+    for name in ("ros_raw", "ros_compressed", "foxglove_registered", "foxglove_own_depth", "foxglove_json", "own"):
         seen: set[str] = set()
         with open(folder / f"{name}.mcap", "rb") as file:
-            for schema, channel, message in make_reader(file).iter_messages():
+            for schema, channel, sent in make_reader(file).iter_messages():
                 assert schema is not None
-                if schema.name in kinds and channel.topic not in seen:
+                kind = f"{schema.name} {channel.message_encoding}" if schema.name in foxglove_messages.READERS else schema.name
+                if kind in kinds and channel.topic not in seen:
                     seen.add(channel.topic)
-                    (folder / f"message_{name}{channel.topic.replace('/', '_')}").write_bytes(bytes([kinds.index(schema.name)]) + message.data)
-    stamp = {"sec": 1, "nsec": 2}
-    link = {
-        "timestamp": stamp,
-        "parent_frame_id": "a",
-        "child_frame_id": "b",
-        "translation": {"x": 0, "y": 0, "z": 1},
-        "rotation": {"x": 0, "y": 0, "z": 0, "w": 1},
-    }
-    raw = {"timestamp": stamp, "frame_id": "a", "width": 1, "height": 1, "encoding": "mono8", "step": 1, "data": "AA=="}
-    for kind, content in (("foxglove.FrameTransform json", link), ("foxglove.RawImage json", raw)):
-        (folder / f"message_{kind.split('.')[1].split()[0]}_json").write_bytes(bytes([kinds.index(kind)]) + json.dumps(content).encode())
+                    (folder / f"message_{name}{channel.topic.replace('/', '_')}").write_bytes(bytes([kinds.index(kind)]) + sent.data)

@@ -33,67 +33,82 @@ DECLARED = (TrihedronError, UnreadableImage, UnreadableMessage)
 BESIDE = {"associations.txt", "mesh.ply", "mesh.obj", "recovered.mcap"}  # what a target may write beside its input
 
 
-def lists(path: Path) -> None:
+def lists(path: Path) -> int:
     """rgb.txt and depth.txt of the TUM layout."""
-    read_file_list(path)
+    return len(read_file_list(path).files)
 
 
-def associations(path: Path) -> None:
+def associations(path: Path) -> int:
     """The associations of ICL-NUIM, with a folder about them."""
     (path.parent / "associations.txt").write_bytes(path.read_bytes())
-    len(IclNuim(str(path.parent)))
+    return len(IclNuim(str(path.parent)))
 
 
-def matrices(path: Path) -> None:
+def cameras(path: Path) -> int:
+    """camera.yaml beside a folder of images."""
+    return read_camera_file(path).camera.width
+
+
+def parameters(path: Path) -> int:
+    """cam_params.json of Replica."""
+    return read_parameters(path).camera.width
+
+
+def trajectories(path: Path) -> int:
+    """Poses in TUM format."""
+    return len(read_trajectory(path))
+
+
+def matrices(path: Path) -> int:
     """Poses as 4 × 4 numbers."""
-    trajectory_of(np.array([0]), [read_matrix(path)], [str(path)])
+    return len(trajectory_of(np.array([0]), [read_matrix(path)], [str(path)]) or ())
 
 
-def frames(path: Path) -> None:
-    """dataset=mcap, whoever recorded it."""
-    dataset = McapDataset(str(path))
-    for index in range(min(len(dataset), 3)):
-        dataset(index)
-    dataset.truth()
-    if METADATA not in McapFile(path).metadata:
-        McapDataset(str(path), truth_from="map").truth()
+def frames(path: Path) -> int:
+    """dataset=mcap, whoever recorded it. The truth of a robot is a topic of poses, else the transforms."""
+    dataset, file = McapDataset(str(path)), McapFile(path)
+    read = sum(dataset(index) is not None for index in range(min(len(dataset), 3)))
+    if METADATA not in file.metadata:
+        told = any(channel.topic == "/pose" for channel in file.channels.values())
+        dataset = McapDataset(str(path), truth_from="/pose" if told else "map")
+    truth = dataset.truth()
+    return 0 if truth is None or not len(truth) else read
 
 
-def recording(path: Path) -> None:
+def recording(path: Path) -> int:
     """All topics of a recording, and one frame."""
     opened = Recording(path)
     opened.overrides()
-    for topic in sorted(opened.topics):
-        for _ in opened.values(topic):
-            pass
-    opened.frame(2)
+    read = sum(1 for topic in sorted(opened.topics) for _ in opened.values(topic))
+    return min(read, len(opened.frame(2)))
 
 
-def meshes(path: Path) -> None:
+def saved_map(path: Path) -> int:
+    """A map to go on in."""
+    return len(load_map(str(path)).values)
+
+
+def meshes(path: Path) -> int:
     """PLY, ASCII and binary, and OBJ."""
     data = path.read_bytes()
     mesh = path.with_name("mesh.ply" if data[:2] == b"pl" else "mesh.obj")
     mesh.write_bytes(data)
-    read_mesh(mesh)
+    return len(read_mesh(mesh)[1])
 
 
-def damaged(path: Path) -> None:
+def damaged(path: Path) -> int:
     """trihedron recover, and what it has written."""
     recovered = path.with_name("recovered.mcap")
     recover(path, recovered)
-    McapFile(recovered)
+    return len(McapFile(recovered).channels)
 
 
-def pictures(path: Path) -> None:
+def pictures(path: Path) -> int:
     """PNG, JPEG, BMP, PNM and TIFF, as colour and as depth, from a file and from a message."""
-    for read in (read_color, lambda file: read_depth(file, 1000.0), lambda file: decode_image(file.read_bytes())):
-        try:
-            read(path)
-        except DECLARED:
-            continue
+    return _one_of(path, read_color, lambda file: read_depth(file, 1000.0), lambda file: decode_image(file.read_bytes()))
 
 
-def message(path: Path) -> None:
+def message(path: Path) -> int:
     """One message: the first byte says of which type; images go on to their pixels."""
     data = path.read_bytes()
     readers: list[Callable[[bytes], Any]] = [decode for _, decode in ROS.values()]
@@ -101,26 +116,36 @@ def message(path: Path) -> None:
     readers += [Decoder("message").decode]
     value = readers[data[0] % len(readers)](data[1:]) if data else None
     if isinstance(value, Picture):
-        for use in (kind_of, color_of, lambda picture: depth_of(picture, 1000.0)):
-            try:
-                use(value)
-            except DECLARED:
-                continue
+        return _one_of(value, kind_of, color_of, lambda picture: depth_of(picture, 1000.0))
+    return value is not None
 
 
-TARGETS: dict[str, tuple[str, Callable[[Path], Any], float]] = {  # name -> pattern of its seeds, reader, share of the inputs
+def _one_of(given: Any, *uses: Callable[[Any], Any]) -> int:
+    """How many of the uses are not refused; a picture of depth is none of colours."""
+    done = 0
+    for use in uses:
+        try:
+            use(given)
+            done += 1
+        except DECLARED:
+            continue
+    return done
+
+
+Reader = Callable[[Path], int]  # how much was read: 0 is nothing
+TARGETS: dict[str, tuple[str, Reader, float]] = {  # name -> pattern of its seeds, reader, share of the inputs
     "lists": ("list*.txt", lists, 0.1),
     "associations": ("associations*.txt", associations, 0.03),
-    "cameras": ("camera*.yaml", read_camera_file, 0.07),
-    "parameters": ("cam_params*.json", read_parameters, 0.05),
-    "trajectories": ("trajectory*.txt", read_trajectory, 0.1),
+    "cameras": ("camera*.yaml", cameras, 0.07),
+    "parameters": ("cam_params*.json", parameters, 0.05),
+    "trajectories": ("trajectory*.txt", trajectories, 0.1),
     "matrices": ("matrix*.txt", matrices, 0.05),
     "meshes": ("mesh*", meshes, 0.05),
     "pictures": ("picture*", pictures, 0.15),
     "messages": ("message*", message, 0.18),
     "recordings": ("own*.mcap", recording, 0.05),
     "frames": ("own*.mcap", frames, 0.03),
-    "map": ("map*.mcap", load_map, 0.03),
+    "map": ("map*.mcap", saved_map, 0.03),
     "ros": ("ros*.mcap", frames, 0.06),
     "foxglove": ("foxglove*.mcap", frames, 0.03),
     "damaged": ("own*.mcap", damaged, 0.02),
