@@ -86,7 +86,9 @@ def _checked(overrides: list[str]) -> None:
 
 
 def measure(overrides: list[str], out: Path, environment: dict[str, str] | None = None) -> dict[str, Any]:
-    """`timing.json` and metrics of one run in its own process, with its peak resident memory in MB. Raises TrihedronError when it fails."""
+    """`timing.json` and metrics of one run in its own process. Raises TrihedronError when it fails.
+
+    The peak of its memory is the one it has measured itself: what the system counts of a child begins with what its parent held."""
     from trihedron.pipeline.errors import StageError
 
     began = time.perf_counter()
@@ -98,12 +100,17 @@ def measure(overrides: list[str], out: Path, environment: dict[str, str] | None 
         said = errors.strip().splitlines()[-1].removeprefix("trihedron: ") if errors.strip() else "without a word"
         raise StageError("benchmark", f"the run failed: {said}", "mend that first")
     figures: dict[str, Any] = json.loads((out / "timing.json").read_text())
-    figures["peak_memory_mb"] = round(usage.ru_maxrss / 1024)
     figures["cpu_s"] = round(usage.ru_utime + usage.ru_stime, 2)
     figures["process_s"] = round(time.perf_counter() - began, 2)
     if (out / "metrics.json").exists():
         figures["metrics"] = json.loads((out / "metrics.json").read_text())
     return figures
+
+
+def memory_text(figures: dict[str, Any]) -> str:
+    """The peak in MB (10⁶ bytes), or "?" where the system does not say."""
+    peak = figures["peak_memory_mb"]
+    return "?" if peak is None else f"{peak:.0f}"
 
 
 def _cpu_of(words: list[str]) -> float:
@@ -179,7 +186,7 @@ def report(figures: dict[str, Any]) -> str:
         f"throughput {figures['fps']:.1f} frames/s: {per_frame:.1f} ms a frame, {per_frame / reference:.2f} x reference",
         f"start-up {figures['startup_s']:.1f} s, --help {figures['cli_cpu_s']:.2f} s of CPU"
         + (f", three frames without compiled kernels {figures['cold_first_frames_s']:.0f} s" if "cold_first_frames_s" in figures else ""),
-        f"CPU {figures['cpu_s']:.1f} s ({used:.2f} cores), peak memory {figures['peak_memory_mb']} MB",
+        f"CPU {figures['cpu_s']:.1f} s ({used:.2f} cores), peak memory {memory_text(figures)} MB",
     ]
     final = figures.get("metrics", {}).get("final")
     if final:

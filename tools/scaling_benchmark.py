@@ -18,7 +18,7 @@ from typing import Any
 
 from trihedron.pipeline.errors import DataError, UsageError
 from trihedron.tools.arguments import Parser, table
-from trihedron.tools.benchmark import first_images, machine, measure, reference_ms
+from trihedron.tools.benchmark import first_images, machine, measure, memory_text, reference_ms
 
 PARTS: dict[str, dict[str, list[str]]] = {  # part -> what a row is called -> its overrides
     "threads": {str(n): [f"threads={n}"] for n in (1, 2, 4, 8) if n <= (os.cpu_count() or 1)},
@@ -78,7 +78,7 @@ def report(part: str, rows: Rows) -> str:
     for row in rows:
         ate = f"{1e3 * row['ate_m']:.2f}" if row["ate_m"] is not None else ""
         multiple = f"{row['frame_ms'] / row['reference_ms']:.2f}"
-        cells.append((row["name"], f"{row['frame_ms']:.1f}", multiple, f"{row['fps']:.1f}", f"{row['peak_memory_mb']}", ate))
+        cells.append((row["name"], f"{row['frame_ms']:.1f}", multiple, f"{row['fps']:.1f}", memory_text(row), ate))
     return table(cells, "rrrrrr")
 
 

@@ -3,9 +3,11 @@
 import copy
 import json
 
+import numpy as np
 import pytest
 
 from trihedron.pipeline.cli import main
+from trihedron.tools.benchmark import measure
 from trihedron.tools.benchmark_comparison import compared
 
 FIGURES = {
@@ -39,6 +41,13 @@ def test_the_benchmark_writes_what_it_compares_with(tmp_path, capsys):
     figures = json.loads(file.read_text())
     assert figures["frames"] == 6 and figures["cli_cpu_s"] > 0.0 and set(figures["machine"]["packages"]) >= {"numpy", "numba"}
     assert f"reference workload {figures['reference_ms']:.1f} ms" in capsys.readouterr().out
+
+
+def test_the_memory_of_a_run_is_not_that_of_who_measures_it(tmp_path):
+    """It is about what importing takes, though 700 MB are held here."""
+    held = np.ones(700 << 20, np.uint8)
+    figures = measure([*TINY, f"out={tmp_path / 'run'}"], tmp_path / "run")
+    assert 100 < figures["peak_memory_mb"] < 0.9 * held.nbytes / 1e6
 
 
 @pytest.mark.parametrize(
