@@ -3,7 +3,8 @@
 `encoding` is one of
 - raw: the elements, row by row;
 - columns: the bytes of the rows as a matrix (row, byte), transposed. The high bytes of neighbours are alike, and equal columns (of a symmetric
-  matrix, say) become equal runs, which the compression of the file's chunks finds;
+  matrix, say) become equal runs, which the compression of the file's chunks finds. Not of `COPIED` fields: what is found in keypoints and segments
+  goes on into tracks and the map row by row, and stays in rows, so that it is found again;
 - zstd: the elements under zstd (images);
 - rows: an image of three channels under zstd, its first row and then what each adds to the one above, modulo 256. A PNG that is as large takes five
   times as long.
@@ -30,6 +31,7 @@ ENCODINGS = ("raw", "columns", "zstd", "rows")
 MAX_BYTES = 1 << 30  # of one decoded array
 DAMAGED = "the file is damaged; record it again"
 TRANSPOSED_BYTES = 512  # smaller arrays are left as they are
+COPIED = {"points_m", "sigma_m", "endpoints_m"}  # in float32; what is worked out of them is not
 SCALARS: dict[str, type[Any]] = {"bool": bool, "int": int, "float": float}
 
 
@@ -44,17 +46,17 @@ def array_parts(name: str, item: Any, image: bool) -> tuple[bytes, Any]:
         data = item.encode()
         return _head(name, "str", (), "", len(data)), data
     array = np.ascontiguousarray(item)
-    encoding, data, size = _encoded(array, image)
+    encoding, data, size = _encoded(array, image, array.itemsize == 4 and name.rpartition("#")[2] in COPIED)
     return _head(name, _type_name(array.dtype), array.shape, encoding, size), data
 
 
-def _encoded(array: NDArray[Any], image: bool) -> tuple[str, Any, int]:
+def _encoded(array: NDArray[Any], image: bool, copied: bool) -> tuple[str, Any, int]:
     """Encoding, data (anything that has bytes) and their number."""
     if image and array.size:
         steps = array.dtype == np.uint8 and array.ndim == 3
         data = _compressor().compress(_row_steps(array).data if steps else array.data)
         return "rows" if steps else "zstd", data, len(data)
-    if array.nbytes >= TRANSPOSED_BYTES and array.itemsize > 1:
+    if array.nbytes >= TRANSPOSED_BYTES and array.itemsize > 1 and not copied:
         return "columns", cv2.transpose(array.reshape(-1).view(np.uint8).reshape(len(array), -1)).data, array.nbytes
     return "raw", array.data, array.nbytes
 

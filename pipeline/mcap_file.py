@@ -10,7 +10,6 @@ import os
 import struct
 import threading
 from collections import OrderedDict, defaultdict
-from collections.abc import Iterator
 from dataclasses import dataclass
 from io import BytesIO
 from pathlib import Path
@@ -95,6 +94,13 @@ class McapFile:
         except (Damaged, *_PARSING) as error:
             raise self._damaged(channel, error) from error
 
+    def count_in_chunk(self, chunk: ChunkIndex, channel: int) -> int:
+        """How many of a channel's messages are in a chunk, by its index alone. Raises RecordingError where that is damaged."""
+        try:
+            return len(self._chunk_rows(chunk, channel))
+        except (Damaged, *_PARSING) as error:
+            raise self._damaged(channel, error) from error
+
     def schema_name(self, channel: int) -> str:
         """The name of the type of a channel's messages, empty where none is given."""
         schema = self.schemas.get(self.channels[channel].schema_id)
@@ -123,11 +129,6 @@ class McapFile:
             return message_at(self._plain(chunk, place), offset, index.channel)
         except (Damaged, *_PARSING) as error:
             raise self._damaged(index.channel, error) from error
-
-    def messages(self, channel: int) -> Iterator[bytes]:
-        """The messages of a channel in the order they were written."""
-        index = self.locate(channel)
-        return (self.read(index, row) for row in range(len(index)))
 
     def _damaged(self, channel: int, error: Exception) -> RecordingError:
         topic = self.channels[channel].topic if channel in self.channels else f"number {channel}"

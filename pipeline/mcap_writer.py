@@ -29,12 +29,17 @@ from mcap.records import (
 )
 from mcap.writer import MCAP0_MAGIC
 
-LEVEL = 2  # of zstd; 3 takes half as long again and makes 3 % less, 1 a fifth less time and 6 % more
+LEVEL = 2  # of zstd
+WINDOW_LOG, HASH_LOG = 22, 17  # a whole chunk is searched, with twice the table: a tenth more time than level 2 alone, and 4 % less bytes
 ZSTD = b"zstd"
 _MESSAGE = struct.Struct("<BQHIQQ")  # opcode, length, channel, sequence, log time, publish time
 _CHUNK = struct.Struct(f"<BQQQQII{len(ZSTD)}sQ")  # opcode, length, first and last time, plain size, CRC, length of the name, name, packed size
 _INDEX = struct.Struct("<BQHI")  # opcode, length, channel, bytes of its entries
 _RECORD_HEAD = 9  # bytes of opcode and length
+
+
+def _parameters() -> Any:
+    return zstandard.ZstdCompressionParameters.from_level(LEVEL, window_log=WINDOW_LOG, hash_log=HASH_LOG)
 
 
 class McapWriter:
@@ -49,7 +54,7 @@ class McapWriter:
         self._metadata: list[MetadataIndex] = []
         self._attachments: list[AttachmentIndex] = []
         self._counts: Counter[int] = Counter()
-        self._compressor = zstandard.ZstdCompressor(level=LEVEL)
+        self._compressor = zstandard.ZstdCompressor(compression_params=_parameters())
 
     def start(self, library: str) -> None:
         """The beginning of the file."""

@@ -13,14 +13,15 @@ from mcap.records import Channel, ChunkIndex
 from mcap_protobuf.schema import build_file_descriptor_set
 
 from trihedron.pipeline.chunk_writer import ChunkWriter
-from trihedron.pipeline.codec import Decoder, Encoder, ValueMessage, is_whole
+from trihedron.pipeline.codec import Decoder, Encoder, ValueMessage, builds_on
 from trihedron.pipeline.errors import RecordingError
 from trihedron.pipeline.foxglove import View
 from trihedron.pipeline.mcap_errors import damaged
 from trihedron.pipeline.mcap_file import McapFile
 from trihedron.pipeline.types import Value
 
-FORMAT = "3"
+FORMAT = "4"
+READ = ("3", FORMAT)  # 3: a table was always changed from the message before
 METADATA = "trihedron"
 FRAMES_TOPIC = "frames"  # one FrameReference a frame: what a replay iterates over
 TIMING_TOPIC = "/timing"
@@ -116,9 +117,9 @@ class Recording:
         self.counts = {c.topic: self._file.counts.get(c.id, 0) for c in self.channels.values()}
         self.topics = {t[1:] for t, c in self.channels.items() if self._file.schema_name(c.id) == ValueMessage.DESCRIPTOR.full_name}
         self._chunks: dict[str, list[ChunkIndex]] = {}
-        if self.metadata.get("format") != FORMAT:
+        if self.metadata.get("format") not in READ:
             written = " ".join(["trihedron", self.metadata.get("version", ""), self.metadata.get("commit", "")[:7]]).strip()
-            cause = f"has format {self.metadata.get('format')} of {written}, this program reads format {FORMAT}: {self._difference()}"
+            cause = f"has format {self.metadata.get('format')} of {written}, this program reads formats {' and '.join(READ)}: {self._difference()}"
             raise RecordingError(str(path), cause, "read it with the version that wrote it, or record again")
 
     def _difference(self) -> str:
@@ -164,16 +165,22 @@ class Recording:
 
     def value(self, topic: str, stamp_ns: int) -> Value | None:
         """The value of a topic with this stamp, or None."""
-        chain: list[bytes] = []
-        for chunk in reversed(self._holding(f"/{topic}")):
+        channel, chain, skipped = f"/{topic}", [], 0
+        for chunk in reversed(self._holding(channel)):
             if not chain and not chunk.message_start_time <= stamp_ns <= chunk.message_end_time:
                 continue
-            for log_time, data in reversed(self._file.in_chunk(chunk, self.channels[f"/{topic}"].id)):
-                if chain or log_time == stamp_ns:
+            if skipped and skipped >= (count := self._file.count_in_chunk(chunk, self.channels[channel].id)):
+                skipped -= count
+                continue
+            for log_time, data in reversed(self._file.in_chunk(chunk, self.channels[channel].id)):
+                if skipped:
+                    skipped -= 1
+                elif chain or log_time == stamp_ns:
                     chain.append(data)
-                if chain and is_whole(chain[-1]):
-                    decoder = self._decoder(topic)
-                    return [decoder.decode(data) for data in reversed(chain)][-1]
+                    back = builds_on(data)
+                    if back == 0:
+                        return self._decoder(topic).decode_last(chain[::-1])
+                    skipped = back - 1
         return None
 
     def _holding(self, channel: str) -> list[ChunkIndex]:

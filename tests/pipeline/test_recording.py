@@ -163,7 +163,7 @@ def test_wrong_files_say_so_in_one_line(tmp_path):
     )
     write(tmp_path / "new.mcap", [0], format="9", version="0.0.9", commit="0123456789")
     assert refusal(tmp_path / "new.mcap") == (
-        "DIR/new.mcap: has format 9 of trihedron 0.0.9 0123456, this program reads format 3: its arrays and tables are packed otherwise; "
+        "DIR/new.mcap: has format 9 of trihedron 0.0.9 0123456, this program reads formats 3 and 4: its arrays and tables are packed otherwise; "
         "read it with the version that wrote it, or record again"
     )
     with pytest.raises(RecordingError) as error:
@@ -191,12 +191,30 @@ def test_a_recording_of_an_older_program_names_version_and_field(form, commit, d
     """Three frames that an earlier version of this program wrote; whatever is asked of them."""
     path = Path(__file__).parent / "recordings" / f"format_{form}.mcap"
     line = (
-        f"trihedron: {path}: has format {form} of trihedron 0.0.1 {commit}, this program reads format 3: {differs} of its topics are others; "
+        f"trihedron: {path}: has format {form} of trihedron 0.0.1 {commit}, this program reads formats 3 and 4: {differs} of its topics are others; "
         "read it with the version that wrote it, or record again\n"
     )
     for words in (["run", f"replay={path}", "only=[pose]"], ["diff", str(path), str(path)], ["export", str(path), "--to", "tum"]):
         assert main(words) == 1
         assert capsys.readouterr().err == line
+
+
+def test_a_recording_of_format_3_is_read(capsys):
+    """Sixty versions of a map, each changed from the one before, whole every fifty, as an earlier version of this program wrote them."""
+    path = Path(__file__).parent / "recordings" / "format_3.mcap"
+    recording = Recording(path)
+    for i, value in enumerate(recording.values("map")):
+        expected = np.repeat(np.arange(i + 1.0), 10)
+        expected[: i + 1] = -1.0
+        if i >= 55:
+            expected[256:512] = 0.0
+        assert value.points.column("x").tolist() == expected.tolist()
+        alone = recording.frame(i)["map"].points
+        assert alone.column("x").tolist() == expected.tolist()
+        assert len(alone) < 512 or alone.is_empty(1) == (i >= 55)
+    assert i == 59 and recording.metadata["format"] == "3"
+    assert main(["diff", str(path), str(path)]) == 0
+    assert "equal: 60 frames" in capsys.readouterr().out
 
 
 def loose_mesh(index, vertices, triangles):
