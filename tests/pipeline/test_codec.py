@@ -153,7 +153,7 @@ def chain(messages, last):
 
 
 def test_a_value_is_read_from_few_messages():
-    """Of 4000 versions any is had from those since its checkpoint and a checkpoint each 64 before; where nothing is new, the whole stands in between."""
+    """Of 4000 versions any is had from those since its checkpoint, and the checkpoints since the whole."""
     values, encoder = [], Encoder()
     table, ids = Table.empty({"x": Column("f8", (2,)), "alive": Column("?")}).appended(x=RNG.random((3000, 2)), alive=np.ones(3000, bool))
     for k in range(4000):
