@@ -145,7 +145,7 @@ class Decoder:
         kind = _TYPES[message.type]
         arrays, tables = self._arrays(message)
         try:
-            made = {name: table(name, tables) for name, hint in _hints(kind).items() if hint is Table}
+            made = {name: table(name, tables) for name in _layout(kind).tables}
             value = _make(kind, {**arrays, **made, "index": message.index, "stamp_ns": message.stamp_ns}, "")
         except (KeyError, ValueError, TypeError, IndexError) as error:
             raise RecordingError(self.place, f"frame {message.index}: {message.type} does not fit: {error}", DAMAGED) from error

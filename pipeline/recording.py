@@ -165,7 +165,8 @@ class Recording:
 
     def value(self, topic: str, stamp_ns: int) -> Value | None:
         """The value of a topic with this stamp, or None."""
-        channel, chain, skipped = f"/{topic}", [], 0
+        chain: list[bytes] = []
+        channel, skipped = f"/{topic}", 0
         for chunk in reversed(self._holding(channel)):
             if not chain and not chunk.message_start_time <= stamp_ns <= chunk.message_end_time:
                 continue
