@@ -142,7 +142,7 @@ class Decoder:
 
     def _made(self, message: Any, table: Callable[[str, dict[str, Any]], Table]) -> Value:
         """The value of a message, whose tables are made of their arrays."""
-        kind = _TYPES[message.type]
+        kind: Any = _TYPES[message.type]
         arrays, tables = self._arrays(message)
         try:
             made = {name: table(name, tables) for name in _layout(kind).tables}
