@@ -23,6 +23,7 @@ from trihedron.pipeline.types import F64, LOST, OK, Frame, Keypoints, ManhattanF
 
 IMAGE_PERIOD_NS = 200_000_000  # 5 Hz is enough to look at; drawing what was found takes a millisecond or two
 MAP_PERIOD_NS = 1_000_000_000
+MAP_POINTS = 5000  # a map of twice as many is shown half as often
 TRUTH_NS = 20_000_000  # a true pose this near in time is that of the frame
 PERIODS_NS: dict[type[Value], int] = {  # of what is shown, and 0 for what is always
     Pose: 0, Keypoints: 0, Surface: 0, Segments: IMAGE_PERIOD_NS, ManhattanFrame: IMAGE_PERIOD_NS, Frame: IMAGE_PERIOD_NS, Planes: IMAGE_PERIOD_NS,
@@ -64,6 +65,8 @@ class View:
     def wants(self, value: Value) -> bool:
         """Whether the value is to be drawn. Asked once of each, in order, and soon, so that what is not wanted need not be kept."""
         period = PERIODS_NS.get(value.__class__)
+        if isinstance(value, Map):
+            period = MAP_PERIOD_NS * max(1, len(value.points) // MAP_POINTS)
         return period is not None and (period == 0 or self._due(type(value).__name__, value.stamp_ns, period))
 
     def drawn(self, value: Value) -> Iterator[tuple[str, Any]]:

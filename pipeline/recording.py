@@ -47,13 +47,31 @@ class RecordingWriter:
         self._file.metadata(METADATA, {"format": FORMAT, **metadata})
         self._channels: dict[str, int] = {}
         self._encoders: dict[str, Encoder] = {}
+        self._held: dict[str, deque[tuple[int, Value]]] = {}  # topic -> the frame before which it is due, and what
+        self._frames = 0
 
     def attach(self, name: str, text: str) -> None:
         """Add a text file, for example the ground truth."""
         self._file.attach(name, text)
 
-    def write(self, topic: str, value: Value) -> None:
-        """Add a value to its topic (name without slash)."""
+    def write(self, topic: str, value: Value, after: int = 0) -> None:
+        """Add a value to its topic (name without slash); so many frames later, if it is only asked for then: what was made of it, often the same
+        bytes, stands beside it then."""
+        if topic == FRAMES_TOPIC:
+            self._frames += 1
+            self._release(self._frames)
+        if after:
+            self._held.setdefault(topic, deque()).append((self._frames + after, value))
+        else:
+            self._add(topic, value)
+
+    def _release(self, frame: int | None) -> None:
+        """Add what was held back until this frame; None: whatever was."""
+        for topic, values in self._held.items():
+            while values and (frame is None or values[0][0] <= frame):
+                self._add(topic, values.popleft()[1])
+
+    def _add(self, topic: str, value: Value) -> None:
         self._file.add(_bytes_of(value), lambda: self._encoded(topic, value))
 
     def show(self, view: View, value: Value, stamp_ns: int) -> None:
@@ -93,7 +111,10 @@ class RecordingWriter:
 
     def close(self) -> None:
         """Write the index; the file is complete only then."""
-        self._file.close()
+        try:
+            self._release(None)
+        finally:
+            self._file.close()
 
 
 def _bytes_of(value: Value) -> int:

@@ -65,6 +65,7 @@ class Runner:
         self.result.map = self._loaded_map()
         self.result.loaded_keyframes = len(self.result.map.keyframes) if self.result.map is not None else 0
         self._references = TopicReader(replay.recording, FRAMES_TOPIC) if replay is not None else None
+        self._asked_after = {name: _asked_after(graph, name) for name in self.computed}
         self._intake = Intake(self._stamps.copy(), self.count if self.feed is None else 0)
         self._fold_states: dict[str, Any] = {}
         self._calls_ms: dict[int, dict[str, float]] = {}
@@ -243,7 +244,7 @@ class Runner:
             value = values.get(name)
             if isinstance(value, Value):
                 if name in topics and (name != "dataset" or embed_frames):
-                    writer.write(name, value)
+                    writer.write(name, value, self._asked_after[name])
                 writer.show(view, value, stamp)
         writer.write_timing(self.indices[position], stamp, self._latency_ms[position], self._calls_ms[position], resident_mb())
 
@@ -288,3 +289,9 @@ class Runner:
             cure = f"repeat only that with: trihedron run replay={writer.path} only=[{stage}] dataset.frames={index}:{index + 1}"
         plugin = type(self.graph.stages[stage].plugin).__name__ if stage in self.graph.stages else "recording"
         return StageError(f"{stage} ({plugin}), frame {index}", f"{type(error).__name__}: {error}", cure)
+
+
+def _asked_after(graph: Graph, name: str) -> int:
+    """How many frames after it a stage's value is first asked for, 0 where that is at once or at no fixed time."""
+    delays = [wire.delay for stage in graph.stages.values() for wire in stage.inputs.values() if wire.topic == name]
+    return max(0, min(delays, default=0))

@@ -2,7 +2,8 @@
 
     recording   runs alternate with and without; the share is of CPU time, which waits do not count in, and bytes are those of the file
     embedding   the frames of the run, written one after the other with record.frames=true
-    reading     a recording in which the run's topics repeat until there are --frames of them: opened, and every topic of one frame decoded
+    reading     a recording in which the run's topics repeat until there are --frames of them: opened, and every topic of one frame decoded; of
+                ten frames spread over the run the one that takes longest, for a map is built on messages before it
 
 Example: trihedron benchmark recording dataset=tum dataset.path=FOLDER dataset.frames=0:150
 """
@@ -15,6 +16,8 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
+
+import numpy as np
 
 from trihedron.pipeline.graph import Graph
 from trihedron.pipeline.recording import FRAMES_TOPIC, Recording, RecordingWriter
@@ -110,14 +113,21 @@ def _reading(folder: Path, count: int) -> list[tuple[str, bool]]:
         for topic, value in of_frame[index % len(of_frame)]:
             writer.write(topic, replace(value, index=index, stamp_ns=33_333_333 * index))
     writer.close()
-    best, topics = float("inf"), 0
-    for _ in range(3):
-        began = time.perf_counter()
-        topics = len(Recording(path).frame(count * 2 // 3 // len(of_frame) * len(of_frame) + len(of_frame) // 2))
-        best = min(best, time.perf_counter() - began)
+    begin = count * 2 // 3 // len(of_frame) * len(of_frame)
+    longest, topics = 0.0, 0
+    for frame in np.linspace(begin, min(begin + len(of_frame), count) - 1, 10).astype(int).tolist():
+        seconds, topics = min(_opened(path, frame) for _ in range(3))
+        longest = max(longest, seconds)
     size = path.stat().st_size / 1e6
-    text = f"{count} frames, {size:.0f} MB: opened and the {topics} topics of one frame read in {best:.3f} s, under {MOST_OPEN_S} s"
-    return [(text, best < MOST_OPEN_S and topics > 1)]
+    text = f"{count} frames, {size:.0f} MB: opened and the {topics} topics of one frame read in {longest:.3f} s, under {MOST_OPEN_S} s"
+    return [(text, longest < MOST_OPEN_S and topics > 1)]
+
+
+def _opened(path: Path, frame: int) -> tuple[float, int]:
+    """Seconds for opening a recording and reading a frame, and the number of its topics."""
+    began = time.perf_counter()
+    topics = len(Recording(path).frame(frame))
+    return time.perf_counter() - began, topics
 
 
 def graph_of_words(overrides: Sequence[str]) -> Graph:

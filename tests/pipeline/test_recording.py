@@ -124,6 +124,20 @@ def test_one_frame_is_read_alone(tmp_path, monkeypatch):
     assert recording.frame(60) == {}
 
 
+def test_what_is_asked_for_later_is_written_then(tmp_path):
+    """Two frames later, and at the end what is left; a topic's order, and what is read of a frame, stay."""
+    writer = RecordingWriter(tmp_path / "a.mcap", {"overrides": "[]"})
+    for i in range(8):
+        writer.write("frames", FrameReference(i, 1000 * i, CAMERA))
+        writer.write("keypoints", keypoints(min(i, 3)), after=2)
+    writer.close()
+    with open(tmp_path / "a.mcap", "rb") as file:
+        found = [channel.topic for _, channel, _ in make_reader(file).iter_messages(log_time_order=False)]
+    assert found == ["/frames"] * 2 + ["/keypoints", "/frames"] * 6 + ["/keypoints"] * 2
+    assert [value.index for value in Recording(tmp_path / "a.mcap").values("keypoints")] == [0, 1, 2, 3, 3, 3, 3, 3]
+    assert set(Recording(tmp_path / "a.mcap").frame(2)) == {"frames", "keypoints"}
+
+
 def test_topics_and_values(tmp_path):
     recording = Recording(write(tmp_path / "a.mcap", [0, 1, 2, 3, 5]))
     assert recording.topics == {"keypoints"} and recording.counts == {"/keypoints": 5, "/timing": 5}
@@ -215,6 +229,17 @@ def test_a_recording_of_format_3_is_read(capsys):
     assert i == 59 and recording.metadata["format"] == "3"
     assert main(["diff", str(path), str(path)]) == 0
     assert "equal: 60 frames" in capsys.readouterr().out
+
+
+def test_a_large_map_is_shown_more_seldom():
+    """12 000 points each other second, 100 each second: what viewers are shown does not grow with the square of the map."""
+    columns = {"position_m": Column("f8", (3,)), "alive": Column("?")}
+    empty = Table.empty({"x": Column("f8")})
+    for count, seconds in ((100, [0, 1, 2, 3, 4]), (12_000, [0, 2, 4])):
+        points, _ = Table.empty(columns).appended(position_m=np.zeros((count, 3)), alive=np.ones(count, bool))
+        view = View()
+        stamps = [k * 500_000_000 for k in range(10)]
+        assert [s for s in stamps if view.wants(Map(0, s, 0, empty, points, empty, empty, empty, empty, empty))] == [s * 10**9 for s in seconds]
 
 
 def loose_mesh(index, vertices, triangles):
