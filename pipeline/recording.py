@@ -18,6 +18,7 @@ from trihedron.pipeline.errors import RecordingError
 from trihedron.pipeline.foxglove import View
 from trihedron.pipeline.mcap_errors import damaged
 from trihedron.pipeline.mcap_file import McapFile
+from trihedron.pipeline.slots import SLOTS
 from trihedron.pipeline.types import Value
 
 FORMAT = "4"
@@ -30,7 +31,7 @@ TIMING_SCHEMA = {
     "properties": {
         "index": {"type": "integer"},
         "frame_ms": {"type": "number"},
-        "stage_ms": {"type": "object"},
+        "stage_ms": {"type": "object", "properties": {slot: {"type": "number"} for slot in SLOTS}},  # viewers read no object without properties
         "memory_mb": {"type": "number", "description": "resident, of the whole process"},
     },
 }

@@ -19,7 +19,11 @@ for (const schema of reader.schemasById.values()) {
     root.resolveAll();
     types.set(schema.id, root.lookupType(schema.name));
   } else if (schema.encoding === "jsonschema") {
-    JSON.parse(new TextDecoder().decode(schema.data));
+    const pending = [JSON.parse(new TextDecoder().decode(schema.data))];
+    for (const part of pending) {
+      if (part.type === "object" && !part.properties) problems.push(`schema ${schema.name} has an object without properties: no viewer reads it`);
+      pending.push(...Object.values(part.properties ?? {}));
+    }
   } else {
     problems.push(`schema ${schema.name} has encoding '${schema.encoding}'`);
   }
