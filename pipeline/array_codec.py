@@ -64,9 +64,15 @@ def _encoded(array: NDArray[Any], image: bool, copied: bool) -> tuple[str, Any, 
 @lru_cache(4096)
 def _head(name: str, dtype: str, shape: tuple[int, ...], encoding: str, size: int) -> bytes:
     """A field `arrays` up to its data; most arrays of a run are as large as one before."""
-    texts = bytes_field(1, name.encode()) + bytes_field(2, dtype.encode())
-    inner = texts + bytes_field(3, b"".join(map(varint, shape))) + bytes_field(4, encoding.encode()) + (head(5, size) if size else b"")
+    before, after = _texts(name, dtype, encoding)
+    inner = before + bytes_field(3, b"".join(map(varint, shape))) + after + (head(5, size) if size else b"")
     return head(5, len(inner) + size) + inner
+
+
+@cache
+def _texts(name: str, dtype: str, encoding: str) -> tuple[bytes, bytes]:
+    """The fields before and after the shape."""
+    return bytes_field(1, name.encode()) + bytes_field(2, dtype.encode()), bytes_field(4, encoding.encode())
 
 
 @cache

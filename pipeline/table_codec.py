@@ -15,7 +15,7 @@ import json
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cache, lru_cache
 from typing import Any
 
 import numpy as np
@@ -105,9 +105,12 @@ def _changed(known: Sequence[Any], chunks: Sequence[Any], here: list[int]) -> tu
     numbers = (np.array(here, np.int32)[:, None] * CHUNK + _IN_CHUNK).reshape(-1)[: len(rows)]
     if not before:
         return numbers, rows
-    differ = np.ones(len(rows), np.bool_)
-    old = _joined(before)  # all but the last are full, so that these are the first rows
-    differ[: len(old)] = (_words(old) != _words(rows[: len(old)])).any(axis=1)
+    old, word = _joined(before), _word(rows.dtype, rows.shape[1:])
+    same = len(old)  # all known but the last are full, so that these are the first rows
+    apart = old.view(word).reshape(same, -1) != rows[:same].view(word).reshape(same, -1)
+    differ = np.arange(len(rows)) >= same
+    for k in range(apart.shape[1]):  # a third of the time of any(axis=1)
+        differ[:same] |= apart[:, k]
     return numbers[differ], rows[differ]
 
 
@@ -115,10 +118,10 @@ def _joined(parts: list[Any]) -> Any:
     return parts[0] if len(parts) == 1 else np.concatenate(parts)
 
 
-def _words(rows: Any) -> Any:
-    """Rows as the largest whole numbers that they are made of."""
-    word = math.gcd(rows.itemsize * math.prod(rows.shape[1:]), 8)
-    return rows.reshape(len(rows), -1).view(f"u{word}").reshape(len(rows), -1)
+@cache
+def _word(dtype: np.dtype[Any], shape: tuple[int, ...]) -> str:
+    """The type of the largest whole numbers that rows of this kind are made of, one by one along their last axis."""
+    return f"u{math.gcd(dtype.itemsize * (shape[-1] if shape else 1), 8)}"
 
 
 @dataclass(frozen=True)

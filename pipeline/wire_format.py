@@ -4,12 +4,15 @@ of the library is filled and then read again."""
 from __future__ import annotations
 
 _VARINT, _LENGTH = 0, 2  # types of a field on the wire
+_SHORT = [bytes((number,)) for number in range(0x80)]
 
 
 def varint(number: int) -> bytes:
     """Seven bits a byte, the lowest first; a negative number as the one of 64 bits that has its bits."""
     if 0 <= number < 0x80:
-        return number.to_bytes(1, "little")
+        return _SHORT[number]
+    if 0 < number < 0x4000:
+        return bytes((number & 0x7F | 0x80, number >> 7))
     number &= (1 << 64) - 1
     digits = bytearray()
     while number > 0x7F:
