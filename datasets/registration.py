@@ -41,9 +41,9 @@ class Registration:
     def _turned(self, columns: NDArray[Any], rows: NDArray[Any]) -> F32:
         pixels = np.stack(np.meshgrid(columns, rows), axis=-1)
         rays = cv2.undistortPoints(pixels.reshape(-1, 1, 2), self.K, np.array(self.D) if self.D else None).reshape(pixels.shape)
-        with np.errstate(invalid="ignore"):  # where the lens model has no inverse
+        with np.errstate(invalid="ignore", over="ignore"):  # where the lens model has no inverse, or the focal length is next to none
             rays = np.concatenate([rays, np.ones((*rays.shape[:2], 1))], axis=2) @ self.T_color_depth[:3, :3].T
-        return np.ascontiguousarray(rays, np.float32)
+            return np.ascontiguousarray(rays, np.float32)
 
     def __call__(self, depth_m: F32) -> F32:
         """(h, w) metres of the depth camera, 0 = none -> (color.height, color.width) metres z of the colour camera, 0 = none."""

@@ -20,6 +20,7 @@ import sys
 import tempfile
 import time
 import traceback
+import warnings
 from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass, field
@@ -70,6 +71,7 @@ def fuzz(name: str, count: int, seed: int) -> Tally:
     log = logging.getLogger("trihedron")
     level = log.level
     log.setLevel(logging.CRITICAL)
+    warnings.simplefilter("error", RuntimeWarning)  # of NumPy: a number that is none went unseen
     rng = np.random.default_rng([seed, *name.encode()])
     began = time.process_time()
     with tempfile.TemporaryDirectory(dir="/dev/shm" if Path("/dev/shm").is_dir() else None) as folder:
