@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from trihedron.pipeline.geometry import exp_se3, invert, log_se3, skew
+from trihedron.pipeline.geometry import adjoint, exp_se3, invert, log_se3
 from trihedron.pipeline.types import F64
 
 LIMIT_95 = 12.592  # χ² with 6 degrees of freedom
@@ -58,17 +58,9 @@ def _errors(poses: F64, true_poses: F64, T_truth_world: F64) -> F64:
 def _gauge(poses: F64, information: F64, true_poses: F64) -> F64:
     """(4, 4) rigid motion of the world into the truth's that makes the weighted errors least (Gauss–Newton)."""
     T = true_poses[0] @ invert(poses[0])
-    J = _adjoints(invert(poses))
+    J = adjoint(invert(poses))
     H = np.einsum("nji,njk,nkl->il", J, information, J)
     for _ in range(ITERATIONS):
         gradient = np.einsum("nji,njk,nk->i", J, information, _errors(poses, true_poses, T))
         T = T @ exp_se3(np.linalg.solve(H, gradient))
     return np.asarray(T)
-
-
-def _adjoints(T: F64) -> F64:
-    """(n, 6, 6) with `T Exp(xi) T⁻¹ = Exp(Ad xi)`, translation first."""
-    out = np.zeros((len(T), 6, 6))
-    out[:, :3, :3] = out[:, 3:, 3:] = T[:, :3, :3]
-    out[:, :3, 3:] = np.array([skew(t) for t in T[:, :3, 3]]) @ T[:, :3, :3]
-    return out

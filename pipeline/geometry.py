@@ -58,6 +58,15 @@ def log_se3(T: F64) -> F64:
     return np.concatenate([np.linalg.solve(left_jacobian_so3(phi), T[:3, 3]), phi])
 
 
+def adjoint(T: F64) -> F64:
+    """(..., 4, 4) rigid motions -> (..., 6, 6) with `T Exp(xi) T⁻¹ = Exp(Ad xi)`, translation first."""
+    R, t = T[..., :3, :3], T[..., :3, 3]
+    out = np.zeros((*T.shape[:-2], 6, 6))
+    out[..., :3, :3] = out[..., 3:, 3:] = R
+    out[..., :3, 3:] = -np.cross(R, t[..., None], axisa=-2, axisb=-2, axisc=-2)
+    return out
+
+
 def pose_matrix(R: F64, t: F64) -> F64:
     """Rotation (3, 3) and translation (3,) -> (4, 4)."""
     T = np.eye(4)

@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from trihedron.pipeline.geometry import invert
 from trihedron.pipeline.registry import register
 from trihedron.pipeline.types import (
     DEGRADED,
@@ -13,6 +14,7 @@ from trihedron.pipeline.types import (
     I32,
     LOST,
     OK,
+    Camera,
     Frame,
     Keypoints,
     Map,
@@ -25,17 +27,30 @@ from trihedron.pipeline.types import (
     Translation,
 )
 from trihedron.plugins.numerics.maps.anchoring import anchored
+from trihedron.plugins.numerics.maps.at_rest import (
+    LEAST,
+    ON_PLANES,
+    PLANES,
+    PROVEN,
+    AtRest,
+    at_rest,
+    distance2,
+    planes_alone,
+    position_chi2,
+    position_distance2,
+    spread_about,
+)
 from trihedron.plugins.numerics.maps.decoupled import FIRST_SIGMA, Decoupled, decoupled_pose, reference_of
-from trihedron.plugins.numerics.maps.focal_check import wrong_focal
+from trihedron.plugins.numerics.maps.focal_check import focal_check
 from trihedron.plugins.numerics.maps.focal_motion import focal_motion
-from trihedron.plugins.numerics.maps.foundations import SCORE, foundation_sigma_m
+from trihedron.plugins.numerics.maps.foundations import SCORE, foundation
+from trihedron.plugins.numerics.maps.local_window import current_submap, keyframes_of
 from trihedron.plugins.numerics.maps.map_terms import line_terms, plane_terms, point_terms
-from trihedron.plugins.numerics.maps.proven import AGREED, LEAST, distance2, position_chi2, position_distance2, proven
 from trihedron.plugins.numerics.maps.submaps import submap_of
-from trihedron.plugins.numerics.motion.pose_solver import NO_LINES, NO_POINTS, PoseSolution, Terms, classify_terms, first_step, solve_pose
+from trihedron.plugins.numerics.motion.pose_solver import PoseSolution, Terms, classify_terms, first_step, solve_pose
 
 FIRST_SHARE = 0.5  # of the limit that a first step must reach before the rest is solved for by itself
-PROVEN, PLANES = "what is proven", "the planes"  # what is taken to be at rest where something moves
+ALL = "all"  # nothing that is at rest says more than all matches do
 
 
 @register("pose", "refine")
@@ -46,7 +61,7 @@ class Refine:
     The decoupled rotation is a prior with its own covariance; the decoupled position only says where to start (`position_sigma_m`), since the same
     features made it. Without a map the decoupled pose stands. A lost pose is only where to look: it is found again when enough of the map agrees on a
     place that all directions are measured of, else it stays lost; and what neither the previous frame nor the map agrees with is lost. Where
-    something moves, landmarks that two keyframes measured in one place say the pose, before there are any the planes (`numerics/maps/proven`). What
+    something moves, what is at rest says the pose: what lies on planes, or was measured by two keyframes in one place (`numerics/maps/at_rest`). What
     moves as under other focal lengths is degraded (`numerics/maps/focal_motion`, and `focal_check` of the keyframes)."""
 
     position_sigma_m: float = 0.05  # of the decoupled position, a weak prior
@@ -65,7 +80,7 @@ class Refine:
     moving_gate: float = 2.2  # squared standard deviations (the lowest tenth of χ²) from the pose by what is proven alone, beyond which that is taken
     moving_sure: float = 13.9  # the same of the position (0.997 of χ²), beyond which it is taken although the new and the proven disagree alike
     moving_unproven: float = 9.0  # the same from the position by planes alone, beyond which those are taken while nothing can be proven
-    moving_most: float = 0.4  # of all matches that must agree with what is proven then, else the pose is called degraded
+    moving_most: float = 0.4  # of all matches that must agree, half if no more of the planes do, else the pose is degraded, known as planes say
     submap_after: int = 15  # frames that show a place that is not known, after which a lost camera begins a new sub-map; 0 = never
 
     def __post_init__(self) -> None:
@@ -120,16 +135,16 @@ class Refine:
             return start.said(frame, map, "nothing of the map was found, pose from the previous frame", submap)
         status, reason = self._judge(found, inliers, sought, rotation)
         if moving:
-            status, reason = self._judge_moving(inliers, sought, moving, status, reason)
+            status, reason = self._judge_moving(inliers, matches, moving, status, reason)
+        covariance = found.covariance
         if status == OK:
-            status, reason = self._judge_foundation(found, matches, map, reason)
-        if status == OK:
-            status, reason = self._judge_camera(found, frame, keypoints, matches, map, reason)
+            said = self._judge_foundation(found, matches, map, reason)
+            status, reason, covariance = self._judge_camera(found, frame, keypoints, matches, map, *said)
         if submap:
             status, reason = DEGRADED, f"in sub-map {submap}, which is not tied to the first yet: {reason}"
         T, held = found.T_world_camera, found.unobservable.shape[1]
         reference, T_reference_camera = reference_of(map, T, submap)
-        return Pose(frame.index, frame.stamp_ns, T, found.covariance, T_reference_camera, reference, inliers, held, status, reason, submap)
+        return Pose(frame.index, frame.stamp_ns, T, covariance, T_reference_camera, reference, inliers, held, status, reason, submap)
 
     def _unknown_place(self, start: Decoupled, frame: Frame, previous: Pose, sought: bool, map: Map, submap: int) -> Pose:
         """Lost; or, once what is seen was `sought` in vain for long enough, the first pose of a new sub-map, exact by definition."""
@@ -162,32 +177,39 @@ class Refine:
         self, start: Decoupled, frame: Frame, matches: Matches, keypoints: Keypoints, segments: Segments, planes: Planes, map: Map
     ) -> tuple[PoseSolution, str]:
         """The solution by all matches and ''; or, where something moves and pulls the pose away, that of what is at rest, with all matches judged by
-        it, and what that is: what is proven, and before anything can be, the planes (what moves is seldom flat and large)."""
+        it, and what that is. Where most disagree even so, no more is known than the planes say."""
         prior, T = (frame.camera, start.T_world_camera, self._prior(start)), start.T_world_camera
-        terms = self._terms(T, frame, matches, keypoints, segments, planes, map)
-        found = solve_pose(T, *prior, *terms)
+        terms, same = self._terms(T, frame, matches, keypoints, segments, planes, map), len(matches.planes)
+        sought = len(matches.keypoints) + len(matches.segments) + same
+        found, by = solve_pose(T, *prior, *terms), ""
         if start.status == LOST:
-            return found, ""
-        known, same = proven(map, matches), len(matches.planes)
-        rest = PROVEN if np.count_nonzero(known.points) >= LEAST else PLANES
-        if rest == PLANES and len(map.keyframes) > AGREED:
-            return found, ""
-        walls = np.count_nonzero(found.planes[:same])
-        contradicted = rest == PROVEN and (known.contradicted(found.points) >= self.moving_share or 2 * walls < same)
-        disagree = 1.0 - _inliers(found, same).sum() / max(len(found.points) + len(found.lines) + same, 1)
-        if not contradicted and (disagree < self.moving_share or same == 0):
-            return found, ""
-        at_rest = known.only(terms) if rest == PROVEN else (NO_POINTS, NO_LINES, terms[2])
-        far = self.moving_sure if rest == PROVEN else self.moving_unproven
-        if not contradicted and position_chi2(*first_step(found.T_world_camera, *prior, at_rest)) < FIRST_SHARE * far:
-            return found, ""
-        alone = solve_pose(T, *prior, *at_rest)
+            return found, by
+        for rest in at_rest(map, matches, keypoints, segments, planes):
+            alone = self._alone(found, T, prior, terms, rest, same)
+            if alone is not None:
+                again = self._terms(alone.T_world_camera, frame, matches, keypoints, segments, planes, map)
+                flags = classify_terms(alone.T_world_camera, frame.camera, *again)
+                found, by = replace(alone, points=flags.points, lines=flags.lines, planes=flags.planes), rest.name
+                break
+        if by != ON_PLANES and len(found.points) >= LEAST and self._denied(_inliers(found, same), sought, same):
+            by = by or ALL
+            found = replace(found, covariance=spread_about(found, solve_pose(T, *prior, *planes_alone(matches).only(terms))))
+        return found, by
+
+    def _alone(self, found: PoseSolution, T: F64, prior: tuple[Camera, F64, F64], terms: Terms, rest: AtRest, same: int) -> PoseSolution | None:
+        """The solution from T by what is at rest alone, where all the others pull the pose away from it."""
+        contradicted, far = rest.contradicted(found.points) >= self.moving_share, self.moving_unproven if rest.name == PLANES else self.moving_sure
+        contradicted |= rest.name == PROVEN and 2 * int(np.count_nonzero(found.planes[:same])) < same
+        if not contradicted and (1.0 - _agreed(found, same) < self.moving_share or same == 0):
+            return None
+        only = rest.only(terms)
+        if not contradicted and position_chi2(*first_step(found.T_world_camera, *prior, only)) < FIRST_SHARE * far:
+            return None
+        alone = solve_pose(T, *prior, *only)
+        if rest.name == ON_PLANES and 2 * np.count_nonzero(alone.planes[:same]) < same:  # planes that disagree with each other say nothing
+            return None
         pulled = distance2(alone, found) >= self.moving_gate if contradicted else position_distance2(alone, found) > far
-        if not pulled or (rest == PROVEN and alone.unobservable.shape[1]):
-            return found, ""
-        T = alone.T_world_camera
-        flags = classify_terms(T, frame.camera, *self._terms(T, frame, matches, keypoints, segments, planes, map))
-        return replace(alone, points=flags.points, lines=flags.lines, planes=flags.planes), rest
+        return alone if pulled and (rest.name == PLANES or not alone.unobservable.shape[1]) else None
 
     def _found_again(self, found: PoseSolution, inliers: I32, sought: int) -> bool:
         """Whether the map alone says where a lost camera is."""
@@ -206,27 +228,50 @@ class Refine:
             return DEGRADED, "the rotation was predicted, not measured, before refinement"
         return OK, f"{inliers[0]} points, {inliers[1]} lines and {inliers[2]} planes of the map"
 
-    def _judge_moving(self, inliers: I32, sought: int, rest: str, status: str, reason: str) -> tuple[str, str]:
-        """The same, of what is at rest; where the larger part of all that is seen disagrees, or nothing is proven yet, it may be something else."""
-        if rest == PLANES or (status == OK and inliers.sum() < self.moving_most * sought):
-            return DEGRADED, f"something moves: only {inliers.sum()} of {sought} matches agree with {rest}"
-        return status, f"{reason}, by {rest} alone"
+    def _denied(self, inliers: I32, sought: int, same: int) -> bool:
+        """Whether most of all that is seen disagrees with a pose; if of the planes as well, the larger part is enough."""
+        agreed = int(inliers.sum())
+        return agreed < self.moving_most * sought or (2 * agreed < sought and 2 * int(inliers[2]) <= same)
 
-    def _judge_foundation(self, found: PoseSolution, matches: Matches, map: Map, reason: str) -> tuple[str, str]:
-        """A pose is not better known than the keyframes behind what it was found from: after a loss, or of planes alone, these may be poor."""
+    def _judge_moving(self, inliers: I32, matches: Matches, by: str, status: str, reason: str) -> tuple[str, str]:
+        """The same, of what is at rest; where most of what is seen denies it, or the planes alone agree, it may be something else."""
+        same = len(matches.planes)
+        sought = len(matches.keypoints) + len(matches.segments) + same
+        if by == PLANES or (by != ON_PLANES and status == OK and self._denied(inliers, sought, same)):
+            return DEGRADED, f"something moves: only {inliers.sum()} of {sought} matches agree" + (f" with {by}" if by != ALL else "")
+        return status, f"{reason}, by {by} alone" if by != ALL else reason
+
+    def _judge_foundation(self, found: PoseSolution, matches: Matches, map: Map, reason: str) -> tuple[str, str, F64]:
+        """Status, reason and covariance. A pose is not better known than the keyframes behind what it was found from, which may be poor: after a
+        loss, or where planes alone said where they are."""
         points, lines = matches.keypoints[found.points > 0, 1], matches.segments[found.lines > 0, 1]
-        planes = matches.planes[found.planes[: len(matches.planes)] > 0, 1]
-        sigma_m = foundation_sigma_m(map, points, lines, planes)
-        if sigma_m > self.weak_foundation * np.sqrt(np.linalg.eigvalsh(found.covariance[:3, :3])[-1]):
-            return DEGRADED, f"what is seen hangs on keyframes that are known to {1e3 * sigma_m:.0f} mm"
-        return OK, reason
+        base = foundation(map, points, lines, matches.planes[found.planes[: len(matches.planes)] > 0, 1])
+        if base.sigma_m <= self.weak_foundation * np.sqrt(np.linalg.eigvalsh(found.covariance[:3, :3])[-1]):
+            return OK, reason, found.covariance
+        covariance = found.covariance + base.covariance(map, found.T_world_camera)
+        return DEGRADED, f"what is seen hangs on keyframes that are known to {1e3 * base.sigma_m:.0f} mm", covariance
 
-    def _judge_camera(self, found: PoseSolution, frame: Frame, keypoints: Keypoints, matches: Matches, map: Map, reason: str) -> tuple[str, str]:
-        """Under wrong focal lengths, which squeeze the world, nothing is known as well as it seems."""
-        doubt = wrong_focal(map, self.focal_off, self.focal_worse)
-        if not doubt and (motion := focal_motion(map, frame, keypoints, matches, found.points, found.T_world_camera)) is not None:
-            doubt = motion.doubt(self.focal_off, self.focal_sure)
-        return (DEGRADED, doubt) if doubt else (OK, reason)
+    def _judge_camera(
+        self, found: PoseSolution, frame: Frame, keypoints: Keypoints, matches: Matches, map: Map, status: str, reason: str, covariance: F64
+    ) -> tuple[str, str, F64]:
+        """The same under focal lengths that may be wrong, which squeeze the world: nothing is known as well as it seems then, nor while the data do
+        not say yet that they are right."""
+        if (check := focal_check(map)) is not None and (doubt := check.doubt(self.focal_off, self.focal_worse)):
+            first = map.keyframes.rows("T_world_camera", keyframes_of(map, current_submap(map))[:1])[0]
+            depths_m = keypoints.points_m[matches.keypoints[:, 0], 2]
+            return DEGRADED, doubt, covariance + check.covariance(invert(first) @ found.T_world_camera, depths_m)
+        motion = focal_motion(map, frame, keypoints, matches, found.points, found.T_world_camera)
+        if motion is None or motion.verified(self.focal_off, self.focal_sure):
+            return status, reason, covariance
+        doubt = motion.doubt(self.focal_off, self.focal_sure)
+        if not doubt and len(map.keyframes) > 1:  # keyframes would hand it on to landmarks, as if it were the error of each
+            return status, reason, covariance
+        return DEGRADED if doubt else status, doubt or reason, covariance + motion.covariance(self.focal_off)
+
+
+def _agreed(found: PoseSolution, same: int) -> float:
+    """Share of all matches that agree with the pose."""
+    return float(_inliers(found, same).sum() / max(len(found.points) + len(found.lines) + same, 1))
 
 
 def _inliers(found: PoseSolution, same: int) -> I32:

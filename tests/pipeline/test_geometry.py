@@ -58,6 +58,12 @@ def test_inverse_and_transform():
     assert np.allclose(g.transform(g.invert(T)[0], g.transform(T[0], points)), points)
 
 
+def test_the_adjoint_moves_a_twist_to_the_other_side():
+    T, xi = np.stack([random_pose(), random_pose()]), RNG.normal(size=(2, 6)) * 0.1
+    for one, twist, moved in zip(T, xi, g.adjoint(T)):
+        assert np.allclose(g.exp_se3(moved @ twist), one @ g.exp_se3(twist) @ g.invert(one))
+
+
 def test_tangent_basis_is_orthonormal_everywhere():
     n = np.vstack([RNG.normal(size=(500, 3)), np.eye(3), -np.eye(3)])
     n /= np.linalg.norm(n, axis=1, keepdims=True)

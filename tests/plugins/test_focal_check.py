@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from trihedron.plugins.numerics.maps.focal_check import focal_check, wrong_focal
+from trihedron.plugins.numerics.maps.focal_check import focal_check
 
 sys.path.insert(0, str(Path(__file__).parent))
 from landmark_world import CAMERA, World
@@ -27,7 +27,7 @@ def test_the_factor_is_found(map, wrong):
     found = focal_check(misled)
     print(wrong, found)
     assert found.factor == pytest.approx(1.0 / wrong, rel=0.03) and found.worse >= 1.0
-    assert ("focal lengths" in wrong_focal(misled, 0.1, 0.2)) == (wrong in (0.8, 1.2))
+    assert ("focal lengths" in found.doubt(0.1, 0.2)) == (wrong in (0.8, 1.2))
 
 
 def test_two_keyframes_are_too_few():

@@ -13,7 +13,8 @@ from itertools import combinations
 import numba
 import numpy as np
 
-from trihedron.pipeline.types import F64, I32, Map
+from trihedron.pipeline.geometry import rotation_angle_deg
+from trihedron.pipeline.types import F32, F64, I32, Map
 from trihedron.plugins.numerics.maps.keyframe_features import measured_points
 from trihedron.plugins.numerics.maps.local_window import newest_keyframes
 
@@ -31,13 +32,20 @@ class FocalCheck:
     worse: float
 
 
-def wrong_focal(map: Map, off: float, worse: float) -> str:
-    """Why to doubt, where the newest keyframes fit by a share `worse` worse under the focal lengths told than
-    under others, a share `off` away; else ''."""
-    found = focal_check(map)
-    if found is None or abs(np.log(found.factor)) <= np.log1p(off) or found.worse <= 1.0 + worse:
-        return ""
-    return f"keyframes fit each other with focal lengths {found.factor:.2f} times as long; is the camera right?"
+    def doubt(self, off: float, worse: float) -> str:
+        """Why to doubt, where the keyframes fit by a share `worse` worse under the focal lengths told than under others, a share `off` away;
+        else ''."""
+        if abs(np.log(self.factor)) <= np.log1p(off) or self.worse <= 1.0 + worse:
+            return ""
+        return f"keyframes fit each other with focal lengths {self.factor:.2f} times as long; is the camera right?"
+
+    def covariance(self, T_first_camera: F64, depths_m: F32) -> F64:
+        """(6, 6) about what the factor does to a pose T_first_camera (4, 4) from the first keyframe that sees points at these depths (NaN: none): a
+        turn is wrong by that share of it, and so is a shift, which at a distance a turn is mistaken for."""
+        seen = depths_m[np.isfinite(depths_m)]
+        wrong, angle = np.log(self.factor), np.radians(rotation_angle_deg(T_first_camera[:3, :3]))
+        shift_m = float(np.linalg.norm(T_first_camera[:3, 3])) + (float(np.median(seen)) if len(seen) else 0.0) * angle
+        return np.diag(np.repeat([(wrong * shift_m) ** 2, (wrong * angle) ** 2], 3))
 
 
 def focal_check(map: Map) -> FocalCheck | None:

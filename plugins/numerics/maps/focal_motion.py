@@ -2,7 +2,8 @@
 
 A turn by θ moves a point at depth z by θ z across and by θ x in depth. Under focal lengths that are wrong by a factor the one is stretched and the
 other squeezed, so that no rigid motion is both. The factor is one more unknown of the motion, found with its standard deviation: at first, before
-the camera has turned, it is anything, and after some degrees it is known to a few per cent.
+the camera has turned, it is anything, and after some degrees it is known to a few per cent. Until then the motion is known only as well as the
+factor is: its covariance is the marginal one over the factor, of which a camera's calibration says something beforehand.
 """
 
 from __future__ import annotations
@@ -26,10 +27,12 @@ STEPS = 4  # of Gauss and Newton, from a pose that is nearly right
 
 @dataclass(frozen=True)
 class FocalMotion:
-    """By which factor the focal lengths told are too short, and the standard deviation of its logarithm."""
+    """By which factor the focal lengths told are too short, the standard deviation of its logarithm, and the effect (6,) of that logarithm: how xi of
+    the pose changes with it."""
 
     factor: float
     sigma: float
+    effect: F64
 
     def doubt(self, off: float, sure: float) -> str:
         """Why to doubt, where the factor is more than a share `off` away from one by `sure` standard deviations; else ''. No camera is told focal
@@ -39,6 +42,18 @@ class FocalMotion:
         if not FACTORS[0] < self.factor < FACTORS[-1]:
             return "what is seen does not move as one thing at rest"
         return f"what is seen moves as under focal lengths {self.factor:.2f} times as long; is the camera right?"
+
+    def verified(self, off: float, sure: float) -> bool:
+        """Whether the factor is less than a share `off` away from one by `sure` standard deviations."""
+        return float(abs(np.log(self.factor))) + sure * self.sigma < np.log1p(off)
+
+    def covariance(self, off: float) -> F64:
+        """(6, 6) what the factor adds to that of the pose found under the focal lengths told, which are off by about a share `off` beforehand: the
+        second moment of its logarithm, since the pose stays where it is."""
+        data = self.sigma**-2 - PRIOR**-2
+        variance = 1.0 / (data + np.log1p(off) ** -2)
+        mean = variance * np.log(self.factor) * self.sigma**-2
+        return np.asarray((variance + mean**2) * np.outer(self.effect, self.effect))
 
 
 def focal_motion(map: Map, frame: Frame, keypoints: Keypoints, matches: Matches, agreed: U8, T_world_camera: F64) -> FocalMotion | None:
@@ -63,12 +78,15 @@ def focal_motion(map: Map, frame: Frame, keypoints: Keypoints, matches: Matches,
     noise_px = (zoom * sigma_px[at]) ** 2 + keypoints.sigma_px[now].astype(np.float64) ** 2
     noise_m = sigma_m[at] ** 2 + keypoints.sigma_m[now].astype(np.float64) ** 2
     T = invert(T_world_camera) @ map.keyframes.rows("T_world_camera", np.array([row]))[0]
-    return FocalMotion(*_solve(places[at], seen, noise_px, noise_m, camera.intrinsics, T[:3, :3].copy(), T[:3, 3].copy()))
+    t = T[:3, 3].copy()
+    factor, sigma, turned, shifted = _solve(places[at], seen, noise_px, noise_m, camera.intrinsics, T[:3, :3].copy(), t)
+    return FocalMotion(factor, sigma, np.concatenate([np.cross(turned, t) - shifted, -turned]))
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def _solve(before: F64, seen: F64, noise_px: F64, noise_m: F64, told: F64, R: F64, t: F64) -> tuple[float, float]:
-    """The factor, and the deviation of its logarithm, from places (n, 3) seen again at pixels and depths (n, 3) after the motion R, t, or nearly."""
+def _solve(before: F64, seen: F64, noise_px: F64, noise_m: F64, told: F64, R: F64, t: F64) -> tuple[float, float, F64, F64]:
+    """The factor, the deviation of its logarithm, and how that turns and shifts (3,) the motion, from places (n, 3) seen again at pixels and depths
+    (n, 3) after the motion R, t, or nearly, which is made exact."""
     H, g, J, Jp, x = np.zeros((7, 7)), np.zeros(7), np.zeros((3, 7)), np.zeros((3, 3)), np.zeros(7)
     e, log_factor = np.zeros(3), 0.0
     for _ in range(STEPS):
@@ -111,4 +129,5 @@ def _solve(before: F64, seen: F64, noise_px: F64, noise_m: F64, told: F64, R: F6
         for i in range(3):
             t[i] += x[3 + i]
         log_factor += x[6]
-    return np.exp(log_factor), np.sqrt(np.linalg.inv(H)[6, 6])
+    effect = -np.linalg.solve(H[:6, :6].copy(), H[:6, 6].copy())
+    return np.exp(log_factor), np.sqrt(np.linalg.inv(H)[6, 6]), effect[:3], effect[3:]

@@ -2,21 +2,39 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 
+from trihedron.pipeline.geometry import adjoint, invert
 from trihedron.pipeline.types import F64, I32, Map
 
 SCORE = np.array([1, 2, 5])  # what a point, a line and a plane count
 
 
-def foundation_sigma_m(map: Map, points: I32, lines: I32, planes: I32) -> float:
-    """Standard deviation (m, in the worst direction) of the keyframes that these landmarks (ids) were first seen from: the median over landmarks.
+@dataclass(frozen=True)
+class Foundation:
+    """The keyframe (a row, -1: none) that a pose hangs on, and its standard deviation (m, in the worst direction)."""
+
+    keyframe: int
+    sigma_m: float
+
+    def covariance(self, map: Map, T_world_camera: F64) -> F64:
+        """(6, 6) of xi of a camera that goes with the keyframe."""
+        T, covariance = (map.keyframes.rows(name, np.array([self.keyframe]))[0] for name in ("T_world_camera", "covariance"))
+        moved = adjoint(invert(T_world_camera) @ T)
+        return np.asarray(moved @ covariance @ moved.T)
+
+
+def foundation(map: Map, points: I32, lines: I32, planes: I32) -> Foundation:
+    """Of the keyframes that these landmarks (ids) were first seen from, the one that is known no better than half of the landmarks' are.
 
     A landmark's covariance holds its first keyframe's, but a pose found from hundreds of them averages what is common to all as if it were not."""
     seen = (map.points, points), (map.lines, lines), (map.planes, planes)
     first = np.concatenate([np.repeat(table.rows("first", ids), count) for (table, ids), count in zip(seen, SCORE)])
     if not len(first):
-        return 0.0
+        return Foundation(-1, 0.0)
     keyframes, times = np.unique(first, return_inverse=True)
-    covariance: F64 = map.keyframes.rows("covariance", keyframes)[:, :3, :3]
-    return float(np.median(np.sqrt(np.linalg.eigvalsh(covariance)[:, -1])[times]))
+    sigma_m = np.sqrt(np.linalg.eigvalsh(map.keyframes.rows("covariance", keyframes)[:, :3, :3])[:, -1])
+    middle = times[np.argsort(sigma_m[times], kind="stable")[len(times) // 2]]
+    return Foundation(int(keyframes[middle]), float(sigma_m[middle]))

@@ -1,0 +1,110 @@
+"""What is at rest whatever else moves: what lies on planes that the map knows, and landmarks that two keyframes measured in the same place.
+
+Somebody who walks past has many corners, near and therefore measured better than any wall, and from one frame to the next they all tell of one
+motion, which may not be the camera's: near and far agree on a wrong one, a turn with a shift. But what moves is seldom flat and large, so corners
+within walls, floors and furniture's sides are the scene's, from the first frame on. And by the next keyframe what moves is elsewhere, so few of
+the landmarks that two keyframes measured are of it. Where the others contradict these, these are right.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numba
+import numpy as np
+
+from trihedron.pipeline.geometry import invert, log_se3
+from trihedron.pipeline.types import F32, F64, U8, Bool, Keypoints, Map, Matches, Planes, Segments
+from trihedron.plugins.numerics.motion.pose_solver import PoseSolution, Terms
+from trihedron.plugins.numerics.motion.pose_terms import LineTerms, PointTerms
+
+AGREED = 2  # keyframes that measured a landmark in the same place, with which it is proven
+LEAST = 30  # points of each kind below which shares of them say nothing
+ALONG = np.array([0.1, 0.3, 0.5, 0.7, 0.9], np.float32)[:, None]  # where it is asked on what a segment lies
+ON_PLANES, PROVEN, PLANES = "what lies on planes", "what is proven", "the planes"
+
+
+@dataclass(frozen=True)
+class AtRest:
+    """Which of a frame's matches are with what is at rest, points (n,) and lines (m,), and how it is called. Planes always are."""
+
+    name: str
+    points: Bool
+    lines: Bool
+
+    def only(self, terms: Terms) -> Terms:
+        """Those of the matches' terms that are of what is at rest."""
+        points, lines, planes = terms
+        return PointTerms(*(column[self.points] for column in points)), LineTerms(*(column[self.lines] for column in lines)), planes
+
+    def contradicted(self, points: U8) -> float:
+        """By how much larger a share (0 … 1) of the other points than of these are outliers (flags (n,)), or the other way round; 0 where
+        either are too few."""
+        other, these = points[~self.points] == 0, points[self.points] == 0
+        return float(abs(other.mean() - these.mean())) if min(len(other), len(these)) >= LEAST else 0.0
+
+
+def at_rest(map: Map, matches: Matches, keypoints: Keypoints, segments: Segments, planes: Planes) -> list[AtRest]:
+    """What a frame's pose can be found from alone, the surest first: of points on planes and of proven landmarks where there are enough; and, while
+    nothing can be proven, until a third keyframe, of the planes themselves."""
+    kinds = on_planes(matches, keypoints, segments, planes), proven(map, matches)
+    enough = [kind for kind in kinds if np.count_nonzero(kind.points) >= LEAST]
+    return enough if len(map.keyframes) > AGREED or any(kind.name == PROVEN for kind in enough) else [*enough, planes_alone(matches)]
+
+
+def planes_alone(matches: Matches) -> AtRest:
+    """No point and no line."""
+    return AtRest(PLANES, np.zeros(len(matches.keypoints), np.bool_), np.zeros(len(matches.segments), np.bool_))
+
+
+def proven(map: Map, matches: Matches) -> AtRest:
+    """Matches with landmarks that at least two keyframes agree on."""
+    points, lines = (table.rows("found", pairs[:, 1]) >= AGREED for table, pairs in ((map.points, matches.keypoints), (map.lines, matches.segments)))
+    return AtRest(PROVEN, points, lines)
+
+
+def on_planes(matches: Matches, keypoints: Keypoints, segments: Segments, planes: Planes) -> AtRest:
+    """Matches of what lies on planes that are matched as well, and not at the border of something else."""
+    known = np.zeros(256, np.bool_)
+    known[matches.planes[:, 0] + 1] = True
+    ends = segments.endpoints_px[matches.segments[:, 0]]
+    along = ((1.0 - ALONG) * ends[:, None, 0] + ALONG * ends[:, None, 1]).astype(np.float32)
+    points = _inside(planes.labels, known, planes.stride, keypoints.pixels[matches.keypoints[:, 0]])
+    lines = _inside(planes.labels, known, planes.stride, along.reshape(-1, 2))
+    return AtRest(ON_PLANES, points, lines.reshape(-1, len(ALONG)).all(axis=1))
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _inside(labels: U8, known: Bool, stride: int, pixels: F32) -> Bool:
+    """Whether all nine cells about each pixel (n, 2) have labels that are `known` (256,)."""
+    h, w = labels.shape
+    inside = np.ones(len(pixels), np.bool_)
+    for k in range(len(pixels)):
+        x, y = round(pixels[k, 0] / stride), round(pixels[k, 1] / stride)
+        for i in range(y - 1, y + 2):
+            for j in range(x - 1, x + 2):
+                inside[k] &= known[labels[min(max(i, 0), h - 1), min(max(j, 0), w - 1)]]
+    return inside
+
+
+def distance2(one: PoseSolution, other: PoseSolution) -> float:
+    """Squared standard deviations of the first solution between it and another one, which was found from more (Hausman, Econometrica 1978,
+    whose covariance is the first's less the other's: this one is on the safe side)."""
+    xi = log_se3(invert(one.T_world_camera) @ other.T_world_camera)
+    return float(xi @ np.linalg.solve(one.covariance, xi))
+
+
+def position_distance2(one: PoseSolution, other: PoseSolution) -> float:
+    """The same of the positions alone, whatever the rotations: walls are not quite true, and what they say of a rotation is half a degree off."""
+    return position_chi2(log_se3(invert(one.T_world_camera) @ other.T_world_camera), one.covariance)
+
+
+def position_chi2(xi: F64, covariance: F64) -> float:
+    """Squared standard deviations of the position's part of xi."""
+    return float(xi[:3] @ np.linalg.solve(covariance[:3, :3], xi[:3]))
+
+
+def spread_about(one: PoseSolution, sure: PoseSolution) -> F64:
+    """Second moment (6, 6) about the first solution of a pose of which no more is known than the other says."""
+    xi = log_se3(invert(one.T_world_camera) @ sure.T_world_camera)
+    return sure.covariance + np.outer(xi, xi)
