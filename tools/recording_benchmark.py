@@ -67,7 +67,7 @@ def _recording(overrides: Sequence[str], folder: Path, repeat: int) -> list[tupl
     (wall, cpu), (wall_with, cpu_with) = (tuple(min(column) for column in zip(*seconds[recorded])) for recorded in (False, True))
     share = cpu_with / cpu - 1.0
     kb = _sizes(folder / "run.mcap", count)
-    print(f"{count} frames: {1e3 * cpu / count:.2f} ms CPU a frame without, {1e3 * cpu_with / count:.2f} ms with recording (+{100 * share:.1f} %);")
+    print(f"{count} frames: {1e3 * cpu / count:.2f} ms CPU a frame without, {1e3 * cpu_with / count:.2f} ms with recording ({100 * share:+.1f} %);")
     more = 100 * (wall_with / wall - 1.0)
     print(f"wall {1e3 * wall / count:.2f} and {1e3 * wall_with / count:.2f} ms ({more:+.1f} %), the least of {repeat} runs each")
     verdict = f"recording adds {100 * share:.1f} % to the run's CPU time, at most {100 * MOST_SHARE:.0f} %"
