@@ -23,6 +23,7 @@ from trihedron.pipeline.config import Feedback, graph_of
 from trihedron.pipeline.errors import ConfigError, DataError, RecordingError, TrihedronError, did_you_mean
 from trihedron.pipeline.graph import Graph
 from trihedron.pipeline.interrupts import held_interrupts
+from trihedron.pipeline.kernels import compiled_beside
 from trihedron.pipeline.live import Pace, is_camera
 from trihedron.pipeline.recording import Recording, RecordingWriter
 from trihedron.pipeline.runner import Runner
@@ -57,7 +58,8 @@ def execute(config: DictConfig, out: Path, overrides: list[str], began: float) -
     _announce(runner)
     with _Warnings() as warnings:
         warnings.muted = True
-        _warm_up(Runner(graph, config.seed, config.threads, replay, frames, remembered))
+        with compiled_beside():
+            _warm_up(Runner(graph, config.seed, config.threads, replay, frames, remembered))
         warnings.muted = False
         writer = RecordingWriter(out / RECORDING, _metadata(config, overrides))
         attachments = _attachments(graph, replay)
