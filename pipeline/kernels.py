@@ -17,11 +17,14 @@ import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from subprocess import DEVNULL
 from typing import Any
 
-from numba import types
+import numba
 from numba.core import event
 
+types: Any = numba.types  # which says little of its classes
+Kind = Any  # one of those types
 LISTED = Path(__file__).with_name("kernels.json")
 EVENT = "numba:compile"  # begins for each kernel that no cache has, also for those called by one that is being compiled
 COLD = 3  # of these, and nothing is taken to be cached
@@ -34,7 +37,7 @@ class Misses(event.Listener):
     """Which kernels were compiled since, in order of their first call by the interpreter: (module:name, types of the arguments)."""
 
     def __init__(self) -> None:
-        self.kernels: list[tuple[str, tuple[types.Type, ...]]] = []
+        self.kernels: list[tuple[str, tuple[Kind, ...]]] = []
         self._depth = threading.local()
 
     def on_start(self, compiled: event.Event) -> None:
@@ -81,8 +84,8 @@ def cores() -> int:
 
 def begin_shares(count: int) -> list[subprocess.Popen[bytes]]:
     """Processes that compile what is listed, each its share."""
-    quiet = {"stdin": subprocess.DEVNULL, "stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
-    return [subprocess.Popen([sys.executable, "-c", PROGRAM.format(share, count)], **quiet) for share in range(count)]
+    commands = [[sys.executable, "-c", PROGRAM.format(share, count)] for share in range(count)]
+    return [subprocess.Popen(command, stdin=DEVNULL, stdout=DEVNULL, stderr=DEVNULL) for command in commands]
 
 
 def compile_share(share: int, of: int) -> int:
@@ -97,7 +100,7 @@ def compile_share(share: int, of: int) -> int:
     return len(mine)
 
 
-def listed(kernels: list[tuple[str, tuple[types.Type, ...]]]) -> list[list[Any]]:
+def listed(kernels: list[tuple[str, tuple[Kind, ...]]]) -> list[list[Any]]:
     """What `kernels.json` holds of kernels: [module:name, [argument, ...]]; those of the project whose arguments have a word."""
     found = []
     for kernel, arguments in kernels:
@@ -109,7 +112,7 @@ def listed(kernels: list[tuple[str, tuple[types.Type, ...]]]) -> list[list[Any]]
     return found
 
 
-def _word_of(kind: types.Type) -> Any:
+def _word_of(kind: Kind) -> Any:
     """A type as JSON: 'float64', 'readonly float32[2C]', [items of a tuple], {module:class of a named tuple: [items]}; TypeError for any other."""
     if isinstance(kind, types.Array) and kind.aligned and isinstance(kind.dtype, types.Number | types.Boolean):
         return f"{'' if kind.mutable else 'readonly '}{kind.dtype}[{kind.ndim}{kind.layout}]"
@@ -123,7 +126,7 @@ def _word_of(kind: types.Type) -> Any:
     raise TypeError(f"no word for {kind}")
 
 
-def _type_of(word: Any) -> types.Type:
+def _type_of(word: Any) -> Kind:
     """The type that `_word_of` wrote down."""
     if isinstance(word, list):
         return types.BaseTuple.from_types([_type_of(item) for item in word])
