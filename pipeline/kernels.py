@@ -15,7 +15,7 @@ import subprocess
 import sys
 import threading
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
 from subprocess import DEVNULL
 from typing import Any
@@ -26,8 +26,7 @@ from numba.core import event
 types: Any = numba.types  # which says little of its classes
 Kind = Any  # one of those types
 LISTED = Path(__file__).with_name("kernels.json")
-EVENT = "numba:compile"  # begins for each kernel that no cache has, also for those called by one that is being compiled
-COLD = 3  # of these, and nothing is taken to be cached
+COLD = 3  # kernels that no cache has, and nothing is taken to be cached
 MOST = 8  # processes; each takes 250 MB
 ARRAY = re.compile(r"(readonly )?(\w+)(?:\[(\d+)([CFA])\])?")
 PROGRAM = "from trihedron.pipeline.kernels import compile_share; compile_share({}, {})"
@@ -50,6 +49,13 @@ class Misses(event.Listener):
         self._depth.value -= 1
 
 
+def watched(misses: Misses) -> AbstractContextManager[None]:
+    """While `misses` is told of each kernel that is compiled."""
+    install: Any = event.install_listener
+    context: AbstractContextManager[None] = install("numba:compile", misses)  # none begins for what a cache has
+    return context
+
+
 class _Helpers(Misses):
     """Begins to compile beside at the third kernel that must be compiled."""
 
@@ -67,11 +73,10 @@ class _Helpers(Misses):
 def compiled_beside() -> Iterator[None]:
     """Use the other cores where it turns out that kernels must be compiled; whatever is not done at the end is left."""
     helpers = _Helpers()
-    event.register(EVENT, helpers)
     try:
-        yield
+        with watched(helpers):
+            yield
     finally:
-        event.unregister(EVENT, helpers)
         for process in helpers.processes:
             process.terminate()
             process.wait()

@@ -17,7 +17,7 @@ from contextlib import redirect_stdout
 
 from trihedron.pipeline.cli import main as command
 from trihedron.pipeline.errors import TrihedronError
-from trihedron.pipeline.kernels import EVENT, Misses, begin_shares, cores, listed
+from trihedron.pipeline.kernels import Misses, begin_shares, cores, listed, watched
 from trihedron.tools.arguments import Parser
 
 TYPICAL = ("dataset.width=160", "dataset.height=120", "dataset.length=40", "outputs=[trajectory,surface]")
@@ -40,12 +40,8 @@ def main(argv: list[str]) -> int:
 
 def compiled_by_a_run() -> str:
     """JSON, a kernel a line."""
-    from numba.core import event
-
     os.sched_setaffinity(0, sorted(os.sched_getaffinity(0))[:1])  # so that no other process compiles beside
     misses = Misses()
-    event.register(EVENT, misses)
-    with tempfile.TemporaryDirectory() as folder, redirect_stdout(sys.stderr):
+    with tempfile.TemporaryDirectory() as folder, redirect_stdout(sys.stderr), watched(misses):
         command(["run", *TYPICAL, f"out={folder}/run"])
-    event.unregister(EVENT, misses)
     return "[\n" + ",\n".join(json.dumps(kernel) for kernel in listed(misses.kernels)) + "\n]"
