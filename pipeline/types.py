@@ -3,7 +3,8 @@
 Conventions, said once. Camera frame: x right, y down, z forward, metres. Pixel centres at integers. Depth in metres, 0 = none.
 `T_a_b` maps points of frame b into frame a: `p_a = T_a_b @ p_b`; `R_a_b`, `t_a_b` likewise. A plane is `n·x + d = 0` with `|n| = 1`;
 in the camera frame `d >= 0`, so n points towards the camera. Angles are radians unless the name says `_deg`.
-A pose covariance is that of `xi = (rho, phi)` in `T_world_camera = T_estimate · Exp(xi)` (camera frame, translation first).
+A pose covariance is that of `xi = (rho, phi)` in `T_world_camera = T_estimate · Exp(xi)` (camera frame, translation first),
+in the map about it: relative to the keyframe that the pose names; how far that has drifted from the first frame is not in it.
 
 Every value is a frozen dataclass with `index` (frame number in the data set) and `stamp_ns`. Array fields declare element type and shape
 with `Shape`; a letter stands for a length that is the same wherever the letter appears in one value. They are checked, in O(1), when the
