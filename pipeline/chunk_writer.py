@@ -123,7 +123,8 @@ class ChunkWriter:
         except Exception as error:
             self._mistake, made = error, []
         self._taken_bytes += size
-        self._room.set()
+        if not self._room.is_set():  # which asks for no lock
+            self._room.set()
         return made
 
     def _forget(self) -> None:

@@ -103,6 +103,7 @@ class Scheduler:
         self._work_there = {lane: threading.Condition(self._lock) for lane in Lane}
         self._ready: dict[Lane, list[tuple[int, float, int, str]]] = {lane: [] for lane in Lane}
         self._unmet: dict[tuple[str, int], int] = {}
+        self._undone: dict[int, int] = {}  # how many nodes a frame still waits for
         self._values: dict[str, dict[int, Any]] = {name: {} for name in self._nodes}
         self._held: dict[str, dict[int, Any]] = {name: {} for name in self._nodes}
         self._frontier = dict.fromkeys(self._nodes, 0)  # frames done without a gap
@@ -142,7 +143,7 @@ class Scheduler:
 
     def _settled(self, position: int) -> bool:
         """Whether the frame is complete, or nothing more will become of it."""
-        if all(position in values for values in self._values.values()):
+        if self._undone.get(position) == 0:
             return True
         if position >= self._count:
             return not self._running
@@ -159,6 +160,7 @@ class Scheduler:
         limit = min(self._count, in_flight_until, self._consumed + self._lookahead + self._reach)
         while self._admitted < limit:
             self._judge_urgency()
+            self._undone[self._admitted] = len(self._nodes)
             for name, node in self._nodes.items():
                 wires = [*node.inputs.values(), *([Wire(name, PREVIOUS)] if node.ordered else [])]
                 self._unmet[name, self._admitted] = sum(not self._there(wire, self._admitted) for wire in wires)
@@ -227,6 +229,7 @@ class Scheduler:
 
     def _complete(self, name: str, position: int, value: Any) -> None:
         self._values[name][position] = value
+        self._undone[position] -= 1
         for consumer, delay in self._consumers[name]:
             if delay != PREVIOUS:
                 self._meet(consumer, position + delay)
@@ -248,6 +251,7 @@ class Scheduler:
 
     def _forget(self, position: int) -> None:
         """Drop what no later frame can ask for once `position` is complete."""
+        self._undone.pop(position, None)
         for name in self._nodes:
             self._unmet.pop((name, position), None)
             self._values[name].pop(position - self._reach, None)
