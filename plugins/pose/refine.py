@@ -229,9 +229,10 @@ class Refine:
         return OK, f"{inliers[0]} points, {inliers[1]} lines and {inliers[2]} planes of the map"
 
     def _denied(self, inliers: I32, sought: int, same: int) -> bool:
-        """Whether most of all that is seen disagrees with a pose; if of the planes as well, the larger part is enough."""
+        """Whether most of all that is seen disagrees with a pose; if of the planes as well, the larger part is enough, by more than one standard
+        deviation of such a count."""
         agreed = int(inliers.sum())
-        return agreed < self.moving_most * sought or (2 * agreed < sought and 2 * int(inliers[2]) <= same)
+        return agreed < self.moving_most * sought or (2.0 * agreed < sought - sought**0.5 and 2 * int(inliers[2]) <= same)
 
     def _judge_moving(self, inliers: I32, matches: Matches, by: str, status: str, reason: str) -> tuple[str, str]:
         """The same, of what is at rest; where most of what is seen denies it, or the planes alone agree, it may be something else."""
