@@ -1,8 +1,8 @@
-"""How time and memory grow with threads, image size, number of features and length of the walk, on the built-in room.
+"""How time and memory grow with threads, image size, number of features, size of the map and length of the walk, on the built-in room.
 
 Each row is a run of its own. A frame's time is that of its stages, one after another, without the rendering of the frame; the throughput contains
-it. Everything else is as by default, and further overrides hold for all runs. The reference workload is that of `trihedron benchmark`, on images of
-the row's size.
+it. Everything else is as by default, and further overrides hold for all runs; for the map, 150 frames go on from the map that so many frames have
+made. The reference workload is that of `trihedron benchmark`, on images of the row's size.
 
 Example: trihedron benchmark scaling --parts threads,image --png scaling.png --json scaling.json
 """
@@ -24,9 +24,11 @@ PARTS: dict[str, dict[str, list[str]]] = {  # part -> what a row is called -> it
     "threads": {str(n): [f"threads={n}"] for n in (1, 2, 4, 8) if n <= (os.cpu_count() or 1)},
     "image": {f"{w}x{3 * w // 4}": [f"dataset.width={w}", f"dataset.height={3 * w // 4}"] for w in (320, 640, 960, 1280)},
     "features": {str(n): [f"keypoints.features={n}"] for n in (250, 500, 1000, 2000)},
+    "map": {str(n): [f"dataset.length={n}"] for n in (150, 600, 2400)},  # of the run that makes the map
     "length": {str(n): [f"dataset.length={n}"] for n in (100, 300, 1000)},
 }
-LABELS = {"threads": "threads", "image": "image size", "features": "key points", "length": "frames"}
+LABELS = {"threads": "threads", "image": "image size", "features": "key points", "map": "frames mapped", "length": "frames"}
+GOING_ON = "dataset.length=150"  # what is measured with a map
 Rows = list[dict[str, Any]]
 
 
@@ -42,7 +44,7 @@ def main(argv: list[str]) -> int:
     parts = {part: _rows(part, options.lengths) for part in options.parts}
     figures: dict[str, Any] = {"machine": machine()}
     for part, rows in parts.items():
-        figures[part] = [_measured(name, [*options.overrides, *overrides]) for name, overrides in rows.items()]
+        figures[part] = [(_with_map if part == "map" else _measured)(name, [*options.overrides, *overrides]) for name, overrides in rows.items()]
         print(report(part, figures[part]) + "\n", flush=True)
     if options.json:
         options.json.write_text(json.dumps(figures, indent=2) + "\n")
@@ -57,6 +59,14 @@ def _rows(part: str, lengths: str) -> dict[str, list[str]]:
     if not all(word.isdigit() and int(word) > 0 for word in lengths.split(",")):
         raise UsageError("benchmark scaling", f"--lengths '{lengths}' is not a list of numbers of frames", "write 100,1000,5000")
     return {word: [f"dataset.length={word}"] for word in lengths.split(",")}
+
+
+def _with_map(name: str, overrides: Sequence[str]) -> dict[str, Any]:
+    """Two runs: one that makes a map, and the one measured, which goes on in it."""
+    with tempfile.TemporaryDirectory() as folder:
+        out, map = Path(folder) / "run", Path(folder) / "map.mcap"
+        measure([*overrides, "record.topics=[]", f"save_map={map}", f"out={out}"], out)
+        return _measured(name, [*overrides, GOING_ON, f"load_map={map}"])
 
 
 def _measured(name: str, overrides: Sequence[str]) -> dict[str, Any]:

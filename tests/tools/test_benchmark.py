@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from trihedron.pipeline.cli import main
+from trihedron.tools import scaling_benchmark
 from trihedron.tools.benchmark import measure
 from trihedron.tools.benchmark_comparison import compared
 
@@ -72,9 +73,12 @@ def test_another_file_is_no_benchmark(capsys, tmp_path):
 
 
 @pytest.mark.slow
-def test_scaling_prints_and_plots(tmp_path, capsys):
+def test_scaling_prints_and_plots(tmp_path, capsys, monkeypatch):
+    monkeypatch.setitem(scaling_benchmark.PARTS, "map", {"8": ["dataset.length=8"]})
     png, file = tmp_path / "scaling.png", tmp_path / "scaling.json"
-    assert main(["benchmark", "scaling", *TINY, "--parts", "threads,length", "--lengths", "4,6", "--png", str(png), "--json", str(file)]) == 0
+    words = ["--parts", "threads,map,length", "--lengths", "4,6", "--png", str(png), "--json", str(file)]
+    assert main(["benchmark", "scaling", *TINY, *words]) == 0
     figures = json.loads(file.read_text())
+    assert [(row["name"], row["frames"]) for row in figures["map"]] == [("8", 150)]
     assert [row["frames"] for row in figures["length"]] == [4, 6] and png.stat().st_size > 1000
     assert "key points" not in capsys.readouterr().out
