@@ -7,13 +7,16 @@ dead are given back: in their place stands one chunk of zeros, the same for all,
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
 from itertools import pairwise
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+
+from trihedron.pipeline.gathering import addresses_of, gather
 
 Array = NDArray[Any]
 CHUNK = 256  # rows; small enough that a touched chunk is cheap to copy, large enough that gathering is
@@ -28,6 +31,11 @@ class Column:
     shape: tuple[int, ...] = ()
     step: float = 0.0
 
+    @property
+    def row_bytes(self) -> int:
+        """Bytes of a row."""
+        return np.dtype(self.dtype).itemsize * math.prod(self.shape)
+
     def rounded(self, values: Array) -> Array:
         """Values to the nearest multiples of the step, of this type."""
         return np.asarray(np.rint(values / self.step) * self.step if self.step else values, self.dtype)
@@ -40,6 +48,7 @@ class Table:
     schema: Mapping[str, Column]
     size: int
     chunks: Mapping[str, tuple[Array, ...]]
+    _addresses: dict[str, Array] = field(default_factory=dict, repr=False, compare=False)  # of the chunks, once asked for
 
     @staticmethod
     def empty(schema: Mapping[str, Column]) -> Table:
@@ -70,11 +79,16 @@ class Table:
         if most // CHUNK == first:
             offset = ids - first * CHUNK
             return [self.chunks[name][first][offset] for name in names]
-        number = ids // CHUNK - first
-        touched = np.bincount(number) > 0
-        row = ids + ((np.cumsum(touched) - 1 - np.arange(len(touched))) * CHUNK - first * CHUNK)[number]  # in the touched chunks, joined
-        numbers = (np.flatnonzero(touched) + first).tolist()
-        return [np.concatenate([self.chunks[name][chunk] for chunk in numbers])[row] for name in names]
+        return [self._scattered(np.ascontiguousarray(ids), name) for name in names]
+
+    def _scattered(self, ids: Array, name: str) -> Array:
+        """Rows of more than one chunk."""
+        if name not in self._addresses:
+            self._addresses[name] = addresses_of(self.chunks[name], self.schema[name].row_bytes)
+        column = self.schema[name]
+        rows = np.empty((len(ids), *column.shape), column.dtype)
+        gather(self._addresses[name], ids, CHUNK, rows.view(np.uint8).reshape(len(ids), -1))
+        return rows
 
     def updated(self, ids: Array, **columns: Array) -> Table:
         """A version in which rows `ids` (distinct) of the given columns hold new values; other chunks are shared."""
@@ -88,7 +102,7 @@ class Table:
                 part.flags.writeable = False
                 parts[chunk] = part
             chunks[name] = tuple(parts)
-        return Table(self.schema, self.size, chunks)
+        return self._changed(self.size, chunks, [chunk for chunk, *_ in touched])
 
     def keeping(self, spans: Array) -> Table:
         """A version that gives back the full chunks in which none of these rows lie, (n, 2) half open."""
@@ -109,7 +123,7 @@ class Table:
             for number in fresh:
                 left[number] = empty_chunk(self.schema[name])
             chunks[name] = tuple(left)
-        return Table(self.schema, self.size, chunks)
+        return self._changed(self.size, chunks, fresh)
 
     def is_empty(self, number: int) -> bool:
         """Whether this chunk was given back."""
@@ -127,10 +141,10 @@ class Table:
 
     def extended(self, size: int, empty: Array, **columns: Array) -> Table:
         """A version of `size` rows in which the chunks `empty` hold nothing; the columns, of the schema's types, are the other new rows."""
-        without, chunks = set(empty.tolist()), {}
+        without, chunks, numbers = set(empty.tolist()), {}, range(self.size // CHUNK, -(-size // CHUNK))
         for name, values in columns.items():
             parts, taken = list(self.chunks[name]), 0
-            for number in range(self.size // CHUNK, -(-size // CHUNK)):
+            for number in numbers:
                 known = parts[number : number + 1]  # begun already
                 count = 0 if number in without else min(size, (number + 1) * CHUNK) - max(self.size, number * CHUNK)
                 part = np.concatenate([*known, values[taken : taken + count]])
@@ -138,7 +152,16 @@ class Table:
                 parts[number : number + 1] = [empty_chunk(self.schema[name]) if number in without else part]
                 taken += count
             chunks[name] = tuple(parts)
-        return Table(self.schema, size, chunks).emptied(empty)
+        return self._changed(size, chunks, numbers).emptied(empty)
+
+    def _changed(self, size: int, chunks: Mapping[str, tuple[Array, ...]], numbers: Sequence[int]) -> Table:
+        """A version with other chunks of these numbers, which knows where the others are."""
+        addresses = dict(self._addresses)
+        for name, known in self._addresses.items():
+            if chunks[name] is not self.chunks[name]:
+                addresses[name] = np.resize(known, len(chunks[name]))
+                addresses[name][numbers] = addresses_of([chunks[name][number] for number in numbers], self.schema[name].row_bytes)
+        return Table(self.schema, size, chunks, addresses)
 
 
 _EMPTY: dict[tuple[str, tuple[int, ...]], Array] = {}

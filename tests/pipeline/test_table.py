@@ -10,7 +10,7 @@ SCHEMA = {"x": Column("f8", (3,)), "n": Column("i4")}
 
 
 def rows(count, start=0):
-    return {"x": np.arange(3 * count, dtype=float).reshape(count, 3) + start, "n": np.arange(count) + start}
+    return {"x": np.arange(3 * count, dtype=float).reshape(count, 3) + start, "n": np.arange(start, start + count, dtype=np.int32)}
 
 
 def test_append_and_read_across_chunks():
@@ -24,6 +24,36 @@ def test_append_and_read_across_chunks():
     ids = np.array([700, 0, 5, 5, len(table) - 1])
     assert np.array_equal(table.rows("x", ids), whole[ids])
     assert table.rows("x", np.empty(0, int)).shape == (0, 3)
+
+
+def test_rows_are_found_in_every_version_once_asked_for_in_one():
+    """What a version knows of where its chunks lie is handed on, but of those that changed."""
+    rng = np.random.default_rng(1)
+    table, plain = Table.empty(SCHEMA), rows(0)
+    for step in range(30):
+        count = int(rng.integers(0, 2 * CHUNK))
+        table, _ = table.appended(**rows(count, len(table)))
+        plain = {name: np.concatenate([values, rows(count, len(values))[name]]) for name, values in plain.items()}
+        if len(table):
+            ids = rng.choice(len(table), min(len(table), 40), replace=False)
+            values = rng.normal(size=(len(ids), 3))
+            table, plain["x"][ids] = table.updated(ids, x=values), values
+        if step % 5 == 4:
+            dead = rng.choice(len(table) // CHUNK, 1)
+            table = table.emptied(dead)
+            for values in plain.values():
+                values[int(dead[0]) * CHUNK : (int(dead[0]) + 1) * CHUNK] = 0
+        for ids in (rng.permutation(len(table)), np.arange(0, len(table), 3, dtype=np.int32), np.arange(len(table))[::-2]):
+            for name, values in zip(SCHEMA, table.gathered(ids, *SCHEMA)):
+                np.testing.assert_array_equal(values, plain[name][ids])
+                assert values.dtype == SCHEMA[name].dtype
+
+
+def test_a_chunk_of_another_type_is_refused_rather_than_read():
+    table, _ = Table.empty(SCHEMA).appended(**rows(2 * CHUNK))
+    wrong = table.extended(3 * CHUNK, np.empty(0, int), **rows(CHUNK) | {"n": np.arange(CHUNK, dtype=np.int64)})
+    with pytest.raises(ValueError, match="the rows of a piece are not 4 bytes each"):
+        wrong.rows("n", np.array([0, 2 * CHUNK + 1]))
 
 
 def test_update_copies_only_touched_chunks_and_columns():

@@ -1,0 +1,43 @@
+"""Rows out of an array that lies in pieces, by the pieces' addresses.
+
+Joining the pieces first, to index them as one, copies all of their rows; taking rows piece by piece is a call of Python each. Here a row costs some
+nanoseconds wherever it lies."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numba
+import numpy as np
+from numba.extending import intrinsic
+from numpy.typing import NDArray
+
+
+def addresses_of(pieces: Sequence[NDArray[Any]], size: int) -> NDArray[np.int64]:
+    """(n,) where the rows of each piece begin. Raises ValueError for one whose rows are not of `size` bytes, one after another."""
+    if not all(piece.flags.c_contiguous and piece.nbytes == len(piece) * size for piece in pieces):
+        raise ValueError(f"the rows of a piece are not {size} bytes each, one after another")
+    return np.array([piece.__array_interface__["data"][0] for piece in pieces], np.int64)
+
+
+types: Any = numba.types
+
+
+@intrinsic
+def _at(typing: Any, address: Any) -> Any:
+    """The bytes at an address."""
+    signature = types.CPointer(types.uint8)(types.int64)
+    return signature, lambda context, builder, signature, values: builder.inttoptr(values[0], context.get_value_type(signature.return_type))
+
+
+@numba.njit(cache=True, nogil=True)
+def gather(addresses: NDArray[np.int64], rows: NDArray[np.int32], piece: int, out: NDArray[np.uint8]) -> None:
+    """Copy the bytes of `rows` (n,) into `out` (n, bytes of a row). Every `piece` rows lie at one of the addresses; the caller holds the pieces, and
+    has seen to it that they have these rows."""
+    n, size = out.shape
+    for i in range(n):
+        row = rows[i]
+        source = numba.carray(_at(addresses[row // piece] + (row % piece) * size), (size,))  # type: ignore[call-arg]  # numba gives the first
+        for k in range(size):
+            out[i, k] = source[k]
