@@ -75,17 +75,13 @@ class Table:
         least, most = int(ids.min()), int(ids.max())
         if least < 0 or most >= self.size:
             raise IndexError(f"row {most if most >= self.size else least} of a table of {self.size}")
-        first = least // CHUNK
-        if most // CHUNK == first:
-            offset = ids - first * CHUNK
-            return [self.chunks[name][first][offset] for name in names]
-        return [self._scattered(np.ascontiguousarray(ids), name) for name in names]
+        rows = np.array(ids, np.int32)  # of one type, so that one kernel does for all
+        return [self._gathered(rows, name) for name in names]
 
-    def _scattered(self, ids: Array, name: str) -> Array:
-        """Rows of more than one chunk."""
-        if name not in self._addresses:
-            self._addresses[name] = addresses_of(self.chunks[name], self.schema[name].row_bytes)
+    def _gathered(self, ids: Array, name: str) -> Array:
         column = self.schema[name]
+        if name not in self._addresses:
+            self._addresses[name] = addresses_of(self.chunks[name], column.row_bytes)
         rows = np.empty((len(ids), *column.shape), column.dtype)
         gather(self._addresses[name], ids, CHUNK, rows.view(np.uint8).reshape(len(ids), -1))
         return rows
