@@ -5,21 +5,12 @@ nanoseconds wherever it lies."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import Any
 
 import numba
 import numpy as np
 from numba.extending import intrinsic
 from numpy.typing import NDArray
-
-
-def addresses_of(pieces: Sequence[NDArray[Any]], size: int) -> NDArray[np.int64]:
-    """(n,) where the rows of each piece begin. Raises ValueError for one whose rows are not of `size` bytes, one after another."""
-    if not all(piece.flags.c_contiguous and piece.nbytes == len(piece) * size for piece in pieces):
-        raise ValueError(f"the rows of a piece are not {size} bytes each, one after another")
-    return np.array([piece.__array_interface__["data"][0] for piece in pieces], np.int64)
-
 
 types: Any = numba.types
 

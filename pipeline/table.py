@@ -16,8 +16,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from trihedron.pipeline.gathering import addresses_of, gather
-
 Array = NDArray[Any]
 CHUNK = 256  # rows; small enough that a touched chunk is cheap to copy, large enough that gathering is
 
@@ -31,14 +29,16 @@ class Column:
     shape: tuple[int, ...] = ()
     step: float = 0.0
 
-    @property
-    def row_bytes(self) -> int:
-        """Bytes of a row."""
-        return np.dtype(self.dtype).itemsize * math.prod(self.shape)
-
     def rounded(self, values: Array) -> Array:
         """Values to the nearest multiples of the step, of this type."""
         return np.asarray(np.rint(values / self.step) * self.step if self.step else values, self.dtype)
+
+    def addresses_of(self, chunks: Sequence[Array]) -> Array:
+        """(n,) where the rows of each chunk begin. Raises ValueError for one whose rows are not as large as this column's, one after another."""
+        size = np.dtype(self.dtype).itemsize * math.prod(self.shape)
+        if not all(chunk.flags.c_contiguous and chunk.nbytes == len(chunk) * size for chunk in chunks):
+            raise ValueError(f"the rows of a chunk are not {size} bytes each, one after another")
+        return np.array([chunk.__array_interface__["data"][0] for chunk in chunks], np.int64)
 
 
 @dataclass(frozen=True)
@@ -79,9 +79,11 @@ class Table:
         return [self._gathered(rows, name) for name in names]
 
     def _gathered(self, ids: Array, name: str) -> Array:
+        from trihedron.pipeline.gathering import gather  # not before: numba takes 0.2 s, which a command's help need not
+
         column = self.schema[name]
         if name not in self._addresses:
-            self._addresses[name] = addresses_of(self.chunks[name], column.row_bytes)
+            self._addresses[name] = column.addresses_of(self.chunks[name])
         rows = np.empty((len(ids), *column.shape), column.dtype)
         gather(self._addresses[name], ids, CHUNK, rows.view(np.uint8).reshape(len(ids), -1))
         return rows
@@ -156,7 +158,7 @@ class Table:
         for name, known in self._addresses.items():
             if chunks[name] is not self.chunks[name]:
                 addresses[name] = np.resize(known, len(chunks[name]))
-                addresses[name][numbers] = addresses_of([chunks[name][number] for number in numbers], self.schema[name].row_bytes)
+                addresses[name][numbers] = self.schema[name].addresses_of([chunks[name][number] for number in numbers])
         return Table(self.schema, size, chunks, addresses)
 
 

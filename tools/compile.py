@@ -17,7 +17,6 @@ from contextlib import redirect_stdout
 
 from trihedron.pipeline.cli import main as command
 from trihedron.pipeline.errors import TrihedronError
-from trihedron.pipeline.kernels import Misses, begin_shares, cores, listed, watched
 from trihedron.tools.arguments import Parser
 
 TYPICAL = ("dataset.width=160", "dataset.height=120", "dataset.length=40", "outputs=[trajectory,surface]")
@@ -30,6 +29,8 @@ def main(argv: list[str]) -> int:
     if parser.parse_args(argv).list:
         print(compiled_by_a_run())
         return 0
+    from trihedron.pipeline.kernels import begin_shares, cores
+
     began, count = time.perf_counter(), cores()
     codes = [process.wait() for process in begin_shares(count)]
     if any(codes):
@@ -40,6 +41,8 @@ def main(argv: list[str]) -> int:
 
 def compiled_by_a_run() -> str:
     """JSON, a kernel a line."""
+    from trihedron.pipeline.kernels import Misses, listed, watched
+
     os.sched_setaffinity(0, sorted(os.sched_getaffinity(0))[:1])  # so that no other process compiles beside
     misses = Misses()
     with tempfile.TemporaryDirectory() as folder, redirect_stdout(sys.stderr), watched(misses):

@@ -52,7 +52,7 @@ def test_rows_are_found_in_every_version_once_asked_for_in_one():
 def test_a_chunk_of_another_type_is_refused_rather_than_read():
     table, _ = Table.empty(SCHEMA).appended(**rows(2 * CHUNK))
     wrong = table.extended(3 * CHUNK, np.empty(0, int), **rows(CHUNK) | {"n": np.arange(CHUNK, dtype=np.int64)})
-    with pytest.raises(ValueError, match="the rows of a piece are not 4 bytes each"):
+    with pytest.raises(ValueError, match="the rows of a chunk are not 4 bytes each"):
         wrong.rows("n", np.array([0, 2 * CHUNK + 1]))
 
 
