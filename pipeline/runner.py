@@ -27,12 +27,13 @@ from trihedron.pipeline.runs import Replay, Result, Step
 from trihedron.pipeline.scheduler import Node, NodeFailure, NoMoreFrames, Scheduler, single_threaded_libraries
 from trihedron.pipeline.slots import frame_range
 from trihedron.pipeline.state import Keeper, Memory, reaches, recorded_memory
-from trihedron.pipeline.timing import Timing, resident_mb
+from trihedron.pipeline.timing import Timing, give_back, resident_mb
 from trihedron.pipeline.types import Frame, FrameReference, Map, Pose, Trajectory, Value
 
 log = logging.getLogger("trihedron")
 RECORDED = "recorded:"  # prefix of the node that reads a topic from the file
 UNREADABLE_SHARE = 0.1
+GIVE_BACK_EVERY = 1000  # frames; it takes some 10 ms
 FRAME_TAKEN = "dataset:"  # input of every stage of a live run: which frame it is must be known first
 
 
@@ -129,6 +130,8 @@ class Runner:
                     self._calls_ms.pop(position, None)
                     self._latency_ms.pop(position, None)
                     self._handed_over.pop(position, None)
+                    if (position + 1) % GIVE_BACK_EVERY == 0:
+                        give_back()
                     yield Step(position, self.count, self.indices[position], values)
                 if "map" not in self.computed:
                     self.result.map = self._recorded_map()
