@@ -87,16 +87,21 @@ def _inside(labels: U8, known: Bool, stride: int, pixels: F32) -> Bool:
     return inside
 
 
+def _between(one: PoseSolution, other: PoseSolution) -> F64:
+    """xi (6,) from the first pose to the other."""
+    return log_se3(invert(one.T_world_camera) @ other.T_world_camera)
+
+
 def distance2(one: PoseSolution, other: PoseSolution) -> float:
     """Squared standard deviations of the first solution between it and another one, which was found from more (Hausman, Econometrica 1978,
     whose covariance is the first's less the other's: this one is on the safe side)."""
-    xi = log_se3(invert(one.T_world_camera) @ other.T_world_camera)
+    xi = _between(one, other)
     return float(xi @ np.linalg.solve(one.covariance, xi))
 
 
 def position_distance2(one: PoseSolution, other: PoseSolution) -> float:
     """The same of the positions alone, whatever the rotations: walls are not quite true, and what they say of a rotation is half a degree off."""
-    return position_chi2(log_se3(invert(one.T_world_camera) @ other.T_world_camera), one.covariance)
+    return position_chi2(_between(one, other), one.covariance)
 
 
 def position_chi2(xi: F64, covariance: F64) -> float:
@@ -106,5 +111,5 @@ def position_chi2(xi: F64, covariance: F64) -> float:
 
 def spread_about(one: PoseSolution, sure: PoseSolution) -> F64:
     """Second moment (6, 6) about the first solution of a pose of which no more is known than the other says."""
-    xi = log_se3(invert(one.T_world_camera) @ sure.T_world_camera)
+    xi = _between(one, sure)
     return sure.covariance + np.outer(xi, xi)

@@ -7,9 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from trihedron.pipeline.geometry import adjoint, invert
-from trihedron.pipeline.types import F64, I32, Map
-
-SCORE = np.array([1, 2, 5])  # what a point, a line and a plane count
+from trihedron.pipeline.types import DEGRADED, F64, I32, Map
+from trihedron.plugins.numerics.maps.map_alignment import SCORE, MapAlignment, Verdict
+from trihedron.plugins.numerics.motion.pose_solver import PoseSolution
 
 
 @dataclass(frozen=True)
@@ -38,3 +38,22 @@ def foundation(map: Map, points: I32, lines: I32, planes: I32) -> Foundation:
     sigma_m = np.sqrt(np.linalg.eigvalsh(map.keyframes.rows("covariance", keyframes)[:, :3, :3])[:, -1])
     middle = times[np.argsort(sigma_m[times], kind="stable")[len(times) // 2]]
     return Foundation(int(keyframes[middle]), float(sigma_m[middle]))
+
+
+@dataclass(frozen=True)
+class Foundations:
+    """How much worse than a pose the keyframes behind it may be known: after a loss, or where planes alone said where they are, they are poor."""
+
+    weak_foundation: float = 3.0  # times its own standard deviation that the map's keyframes about here may have before a pose is called degraded
+
+    def __post_init__(self) -> None:
+        if self.weak_foundation <= 0.0:
+            raise ValueError("weak_foundation: must be positive")
+
+    def judged_by_foundation(self, found: PoseSolution, problem: MapAlignment, said: Verdict) -> Verdict:
+        """What is said of a pose, which is not better known than the keyframes behind what it was found from."""
+        base = foundation(problem.map, *problem.landmarks(found))
+        if base.sigma_m <= self.weak_foundation * np.sqrt(np.linalg.eigvalsh(found.covariance[:3, :3])[-1]):
+            return said
+        reason = f"what is seen hangs on keyframes that are known to {1e3 * base.sigma_m:.0f} mm"
+        return Verdict(DEGRADED, reason, said.covariance + base.covariance(problem.map, found.T_world_camera))

@@ -98,8 +98,7 @@ def _solved(
     T = np.eye(4)
     T[:3, :3], T[:3, 3] = R, t
     prior = np.ascontiguousarray(prior_information[:free, :free])
-    H_data = np.tril(H_data) + np.tril(H_data, -1).T
-    data = _gate_efficiency(_rows(points, planes, flags), free) * H_data[:free, :free]
+    data = _gate_efficiency(_rows(points, planes, flags), free) * _symmetric(H_data)[:free, :free]
     return PoseSolution(T, _inverse(data + prior), _unobservable(data, prior), *flags, cost)
 
 
@@ -111,7 +110,7 @@ def first_step(T_world_camera: F64, camera: Camera, T_prior: F64, prior_informat
     weigh(R, t, intrinsics, *terms, weights)
     linearise(R, t, intrinsics, *terms, weights, flags, True, H, g, chi2)
     add_prior(R, t, T_prior[:3, :3].copy(), T_prior[:3, 3].copy(), np.ascontiguousarray(prior_information, np.float64), H, g)
-    covariance = _inverse(np.tril(H) + np.tril(H, -1).T)
+    covariance = _inverse(_symmetric(H))
     return -covariance @ g, covariance
 
 
@@ -161,6 +160,11 @@ def _gate_efficiency(rows: int, unknowns: int) -> float:
     tail = math.sqrt(half / math.pi) * math.exp(-half)
     kept = math.erf(math.sqrt(half)) - 2.0 * tail  # F_3, the incomplete gamma function of 3/2; that of 5/2 follows by its recurrence
     return (kept - 4.0 / 3.0 * half * tail) / kept
+
+
+def _symmetric(lower: F64) -> F64:
+    """The whole of a matrix of which `linearise` fills the lower half."""
+    return np.tril(lower) + np.tril(lower, -1).T
 
 
 def _inverse(H: F64) -> F64:
