@@ -10,6 +10,7 @@ import pytest
 from trihedron.pipeline.geometry import exp_se3, invert, tangent_basis, transform, transform_planes
 from trihedron.plugins.map.covisibility import Covisibility
 from trihedron.plugins.map.none import NoMap
+from trihedron.plugins.numerics.maps.fusion import fuse_lines
 from trihedron.plugins.numerics.planes import plane_fusion
 
 sys.path.insert(0, str(Path(__file__).parent))
@@ -121,6 +122,20 @@ def test_lines_converge_and_grow_to_what_was_seen():
         lengths.append(np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1).mean())
     assert errors[1] < 0.5 * errors[0] and errors[1] < 0.02
     assert lengths[1] >= lengths[0]
+
+
+def test_what_is_known_along_a_line_is_not_forgotten():
+    """No segment says anything of it. After some hundred frames it was less than what rounding leaves of the rest, and the matrix no information."""
+    ends = np.array([[[-0.7, 0.3, 2.0], [0.6, -0.4, 3.1]]])
+    direction = (ends[0, 1] - ends[0, 0]) / np.linalg.norm(ends[0, 1] - ends[0, 0])
+    pixels = ends[..., :2] / ends[..., 2:] * 500.0 + 320.0
+    information = np.tile(1e4 * np.eye(3), (1, 2, 1, 1))
+    for _ in range(1000):
+        information = information.astype(np.float32).astype(np.float64)  # as the map keeps it
+        noise = np.tile(1e-5 * np.eye(3), (1, 2, 1, 1))
+        fuse_lines(np.eye(4), 1e-8 * np.eye(6), np.array([500.0, 500.0, 320.0, 320.0]), ends, information, pixels, ends.copy(), noise, 1.0, 30.0)
+    assert np.allclose(direction @ information @ direction, 1e4, rtol=0.05)
+    assert (np.linalg.eigvalsh(information) > 9e3).all() and (np.linalg.eigvalsh(information)[..., 1:] > 1e5).all()
 
 
 def test_planes_converge_to_the_truth_and_keep_their_side():

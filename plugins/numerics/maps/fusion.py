@@ -42,6 +42,24 @@ def _update(position: F64, information: F64, R: F64, D: F64, r: F64, S: F64, row
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
+def _fade_across(information: F64, ends: F64, share: float) -> None:
+    """Information (3, 3) of a line's end times `share` across the line, in place. Along it, where no segment says anything, it stays: forgotten and
+    never measured again it would vanish beside the other, and a rounded matrix is then no information any more, but has a negative eigenvalue."""
+    length, u, row, along, root = 0.0, np.empty(3), np.empty(3), 0.0, np.sqrt(share)
+    for k in range(3):
+        u[k] = ends[1, k] - ends[0, k]
+        length += u[k] * u[k]
+    u /= max(np.sqrt(length), 1e-12)
+    for i in range(3):
+        row[i] = information[i, 0] * u[0] + information[i, 1] * u[1] + information[i, 2] * u[2]
+        along += u[i] * row[i]
+    for i in range(3):  # S information S with S = root · 1 + (1 - root) u uᵀ
+        for j in range(3):
+            mixed = root * (1.0 - root) * (row[i] * u[j] + u[i] * row[j]) + (1.0 - root) ** 2 * along * u[i] * u[j]
+            information[i, j] = share * information[i, j] + mixed
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def fuse_points(
     T_world_camera: F64,
     pose_covariance: F64,
@@ -113,5 +131,5 @@ def fuse_lines(
             S[0, 0] += noise
             if deep:
                 S[1, 1] += (1.0 - s) ** 2 * ends[0] + s * s * ends[1]
-            information[i, k] *= 1.0 - 1.0 / memory
+            _fade_across(information[i, k], endpoints[i], 1.0 - 1.0 / memory)
             _update(endpoints[i, k], information[i, k], R, D, r, S, rows)
