@@ -19,6 +19,7 @@ from importlib.metadata import EntryPoint, entry_points, version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from trihedron.pipeline import heap
 from trihedron.pipeline.errors import RecordingError, TrihedronError, UsageError, did_you_mean
 
 if TYPE_CHECKING:
@@ -61,6 +62,7 @@ Example: trihedron run replay=runs/latest/run.mcap only=[manhattan,rotation] man
 
 def main(argv: list[str] | None = None) -> int:
     """Entry point of the command; returns the exit code."""
+    heap.share()
     words = list(sys.argv[1:] if argv is None else argv)
     debug = "--debug" in words
     words = [word for word in words if word != "--debug"]

@@ -50,7 +50,9 @@ class McapWriter:
         self._schemas: list[Schema] = []
         self._channels: list[Channel] = []
         self._undeclared: list[McapRecord] = []  # schemas and channels that the next chunk begins with
-        self._chunks: list[ChunkIndex] = []
+        self._chunks = bytearray()  # their records in the summary: as objects those of a long run would be ten times as large
+        self._chunk_count = 0
+        self._times: tuple[int, ...] = ()  # of the first message and of the last
         self._metadata: list[MetadataIndex] = []
         self._attachments: list[AttachmentIndex] = []
         self._counts: Counter[int] = Counter()
@@ -106,29 +108,28 @@ class McapWriter:
             self._counts[channel] += len(pairs) // 2
         self._file.write(b"".join([head, packed, *indexes]))
         self._undeclared = []
-        self._chunks.append(
-            ChunkIndex(size, begin, ZSTD.decode(), len(packed), times[1], end - begin - size, offsets, times[0], len(plain))
-        )  # fmt: skip
+        self._chunks += _bytes_of(ChunkIndex(size, begin, ZSTD.decode(), len(packed), times[1], end - begin - size, offsets, times[0], len(plain)))
+        self._chunk_count += 1
+        self._times = min(*self._times, *times), max(*self._times, *times)
 
     def finish(self) -> None:
         """The summary and the end mark."""
         self._file.write(_bytes_of(DataEnd(0)))
         begin, at = self._file.tell(), 0
-        groups: list[tuple[int, Sequence[McapRecord]]] = [
-            (Opcode.SCHEMA, self._schemas),
-            (Opcode.CHANNEL, self._channels),
-            (Opcode.STATISTICS, [self._statistics()]),
+        groups: list[tuple[int, bytes | bytearray]] = [
+            (Opcode.SCHEMA, _bytes_of(*self._schemas)),
+            (Opcode.CHANNEL, _bytes_of(*self._channels)),
+            (Opcode.STATISTICS, _bytes_of(self._statistics())),
             (Opcode.CHUNK_INDEX, self._chunks),
-            (Opcode.ATTACHMENT_INDEX, self._attachments),
-            (Opcode.METADATA_INDEX, self._metadata),
+            (Opcode.ATTACHMENT_INDEX, _bytes_of(*self._attachments)),
+            (Opcode.METADATA_INDEX, _bytes_of(*self._metadata)),
         ]
-        parts, offsets = [], []
+        offsets = []
         for opcode, records in groups:
             if records:
-                parts.append(_bytes_of(*records))
-                offsets.append(SummaryOffset(opcode, begin + at, len(parts[-1])))
-                at += len(parts[-1])
-        summary = b"".join(parts) + _bytes_of(*offsets)
+                offsets.append(SummaryOffset(opcode, begin + at, len(records)))
+                at += len(records)
+        summary = b"".join(records for _, records in groups) + _bytes_of(*offsets)
         footer = _bytes_of(Footer(begin, begin + at, 0))
         crc = zlib.crc32(footer[:-4], zlib.crc32(summary))
         self._file.write(summary + footer[:-4] + struct.pack("<I", crc) + MCAP0_MAGIC)
@@ -138,10 +139,10 @@ class McapWriter:
             attachment_count=len(self._attachments),
             channel_count=len(self._channels),
             channel_message_counts=dict(self._counts),
-            chunk_count=len(self._chunks),
+            chunk_count=self._chunk_count,
             message_count=self._counts.total(),
-            message_end_time=max((chunk.message_end_time for chunk in self._chunks), default=0),
-            message_start_time=min((chunk.message_start_time for chunk in self._chunks), default=0),
+            message_end_time=max(self._times, default=0),
+            message_start_time=min(self._times, default=0),
             metadata_count=len(self._metadata),
             schema_count=len(self._schemas),
         )

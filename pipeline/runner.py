@@ -18,6 +18,7 @@ import numpy as np
 from trihedron.pipeline.errors import DataError, RecordingError, StageError, TrihedronError
 from trihedron.pipeline.foxglove import View
 from trihedron.pipeline.graph import Graph, Stage, Wire
+from trihedron.pipeline.heap import give_back
 from trihedron.pipeline.intake import Intake
 from trihedron.pipeline.interrupts import held_interrupts
 from trihedron.pipeline.live import Pace, feed_of, is_camera
@@ -27,7 +28,7 @@ from trihedron.pipeline.runs import Replay, Result, Step
 from trihedron.pipeline.scheduler import Node, NodeFailure, NoMoreFrames, Scheduler, single_threaded_libraries
 from trihedron.pipeline.slots import frame_range
 from trihedron.pipeline.state import Keeper, Memory, reaches, recorded_memory
-from trihedron.pipeline.timing import Timing, give_back, resident_mb
+from trihedron.pipeline.timing import Timing, resident_mb
 from trihedron.pipeline.types import Frame, FrameReference, Map, Pose, Trajectory, Value
 
 log = logging.getLogger("trihedron")
@@ -52,8 +53,7 @@ class Runner:
     ) -> None:
         """`remembered` says what is known before the frame of a given number, `pace` when frames may be asked for."""
         self.graph, self.seed, self.threads, self.replay = graph, seed, threads, replay
-        self.result, self.timing = Result(), Timing()
-        self.computed = self._computed()
+        self.result, self.timing, self.computed = Result(), Timing(), self._computed()
         self.feed = feed_of(graph.stages["dataset"].plugin, pace) if replay is None else None
         self.indices, self._stamps = self._frames(frames)
         self.count = len(self.indices)  # of frames, at most
@@ -127,9 +127,9 @@ class Runner:
                         self._account(position, values)
                         if writer is not None:
                             self._record(writer, view, position, values, topics, embed_frames)
-                    self._calls_ms.pop(position, None)
-                    self._latency_ms.pop(position, None)
-                    self._handed_over.pop(position, None)
+                    for times in (self._calls_ms, self._latency_ms, self._handed_over):
+                        times.pop(position, None)
+                    self._stamps.pop(self.indices[position], None)
                     if (position + 1) % GIVE_BACK_EVERY == 0:
                         give_back()
                     yield Step(position, self.count, self.indices[position], values)

@@ -93,6 +93,7 @@ class Scheduler:
                 self._consumers[wire.topic].append((node.name, wire.delay))
             if node.ordered:
                 self._consumers[node.name].append((node.name, PREVIOUS))
+        self._kept = {name: max([0, *(delay for _, delay in self._consumers[name])]) for name in self._nodes}  # how many frames a value is asked for
         lagging = {name for name in self._nodes if self._consumers[name] and all(delay > 0 for _, delay in self._consumers[name])}
         self._prompt = [name for name in self._nodes if name not in lagging]
         self._lanes = dict.fromkeys(self._nodes, Lane.prompt)
@@ -254,7 +255,7 @@ class Scheduler:
         self._undone.pop(position, None)
         for name in self._nodes:
             self._unmet.pop((name, position), None)
-            self._values[name].pop(position - self._reach, None)
+            self._values[name].pop(position - self._kept[name], None)
             self._held[name].pop(position - 1, None)
 
 

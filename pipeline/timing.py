@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import ctypes
 import gc
 import os
 from array import array
@@ -15,6 +14,8 @@ from typing import Any
 
 import numpy as np
 
+from trihedron.pipeline.heap import give_back
+
 _PAGE_MB = os.sysconf("SC_PAGE_SIZE") / 1e6
 
 
@@ -22,7 +23,7 @@ class Timing:
     """Collects milliseconds per stage and per frame; `summary` is `timing.json`."""
 
     def __init__(self) -> None:
-        self._calls: dict[str, array[float]] = defaultdict(lambda: array("d"))
+        self._calls: dict[str, array[float]] = defaultdict(lambda: array("f"))
         self._frames_ms = array("d")
         self._finish_ms: dict[str, float] = {}
 
@@ -88,12 +89,6 @@ def forget_peak() -> None:
     give_back()
     with suppress(OSError):
         Path("/proc/self/clear_refs").write_text("5")
-
-
-def give_back() -> None:
-    """Give the system the memory that is free but lies between what is not: on a long run that becomes a tenth of all."""
-    with suppress(OSError, AttributeError):  # of GNU's C library
-        ctypes.CDLL(None).malloc_trim(0)
 
 
 def _percentiles(values: Sequence[float]) -> tuple[float, float, float]:

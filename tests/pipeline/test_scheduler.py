@@ -116,7 +116,8 @@ def test_later_frames_that_fail_too_do_not_hang():
 def test_memory_is_bounded_by_the_reach_of_the_wires():
     scheduler = Scheduler([Node("a", lambda k, v: k, {}), Node("b", lambda k, v: k, {"x": Wire("a", 4), "y": Wire("a", PREVIOUS)})], 2, 3, {})
     largest = 0
-    for _ in scheduler.run(200):
+    for position, _ in scheduler.run(200):
+        assert min(scheduler._values["a"]) > position - 4 and position not in scheduler._values["b"]  # which nobody asks for later
         largest = max(largest, *(len(values) for values in scheduler._values.values()), *(len(held) for held in scheduler._held.values()))
     assert largest <= 4 + 3 + 5
 
