@@ -18,12 +18,11 @@ from omegaconf import DictConfig, OmegaConf
 from tqdm import tqdm
 
 from trihedron.datasets.trajectories import TRUTH, attached_truth, format_trajectory
-from trihedron.pipeline import results
+from trihedron.pipeline import kernels, results
 from trihedron.pipeline.config import Feedback, graph_of
 from trihedron.pipeline.errors import ConfigError, DataError, RecordingError, TrihedronError, did_you_mean
 from trihedron.pipeline.graph import Graph
 from trihedron.pipeline.interrupts import held_interrupts
-from trihedron.pipeline.kernels import compiled_beside
 from trihedron.pipeline.live import Pace, is_camera
 from trihedron.pipeline.recording import Recording, RecordingWriter
 from trihedron.pipeline.runner import Runner
@@ -58,8 +57,8 @@ def execute(config: DictConfig, out: Path, overrides: list[str], began: float) -
     _announce(runner)
     with _Warnings() as warnings:
         warnings.muted = True
-        with compiled_beside():
-            _warm_up(Runner(graph, config.seed, config.threads, replay, frames, remembered))
+        _compile(graph)
+        _warm_up(Runner(graph, config.seed, config.threads, replay, frames, remembered))
         warnings.muted = False
         writer = RecordingWriter(out / RECORDING, _metadata(config, overrides))
         attachments = _attachments(graph, replay)
@@ -180,10 +179,20 @@ def _commit() -> str:
     return head.stdout.strip() if top.returncode == 0 else ""
 
 
+def _compile(graph: Graph) -> None:
+    """Compile on all cores what the stages may call and no cache has, and say so: it is once an installation."""
+    rows = kernels.missing(kernels.used_by(stage.plugin for stage in graph.stages.values()))
+    if len(rows) > kernels.FEW:
+        print(f"compiling {len(rows)} functions for this machine, once ...", file=sys.stderr, flush=True)
+        with tqdm(total=len(rows), disable=not sys.stderr.isatty(), leave=False) as bar:
+            for finished in kernels.compile_rows(rows, kernels.cores()):
+                bar.update(finished - bar.n)
+
+
 def _warm_up(runner: Runner) -> None:
     """Call every stage on the first frames so that kernels are loaded; what goes wrong here is reported by the run itself."""
     runner.count = min(runner.count, WARM_UP_FRAMES)
-    why = "preparing: what computes is compiled for this machine, once (up to two minutes), then loaded"
+    why = "preparing: what else computes is compiled for this machine, once, then loaded"
     said = threading.Timer(SILENT_SECONDS, print, [why], {"file": sys.stderr, "flush": True})
     said.daemon = True
     said.start()

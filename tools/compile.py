@@ -9,7 +9,6 @@ Example: trihedron compile
 from __future__ import annotations
 
 import json
-import os
 import sys
 import tempfile
 import time
@@ -25,26 +24,29 @@ TYPICAL = ("dataset.width=160", "dataset.height=120", "dataset.length=40", "outp
 def main(argv: list[str]) -> int:
     """Run the command; returns the exit code. Raises TrihedronError where a process is ended from outside."""
     parser = Parser("compile", __name__)
-    parser.add_argument("--list", action="store_true", help="print what a short run still has to compile, in the form of pipeline/kernels.json")
-    if parser.parse_args(argv).list:
-        print(compiled_by_a_run())
+    parser.add_argument("--list", action="store_true", help="print what a short run, and one of the given words, compile, for pipeline/kernels.json")
+    parser.add_argument("overrides", nargs="*", help="with --list: words of a run, as dataset=tum dataset.path=FOLDER")
+    options = parser.parse_args(argv)
+    if options.list:
+        print(compiled_by_runs(options.overrides))
         return 0
-    from trihedron.pipeline.kernels import begin_shares, cores
+    from trihedron.pipeline.kernels import compile_rows, cores, missing
 
-    began, count = time.perf_counter(), cores()
-    codes = [process.wait() for process in begin_shares(count)]
-    if any(codes):
-        raise TrihedronError("compile", f"{sum(map(bool, codes))} of {count} processes were ended", "see that there is memory, 250 MB a process")
-    print(f"ready after {time.perf_counter() - began:.0f} s on {count} cores")
+    began, rows = time.perf_counter(), missing()
+    finished = max(compile_rows(rows, cores()), default=0) if rows else 0
+    if finished < len(rows):
+        raise TrihedronError("compile", f"{len(rows) - finished} of {len(rows)} kernels were not compiled", "see that there is memory, 300 MB a core")
+    print(f"ready after {time.perf_counter() - began:.0f} s on {cores()} cores")
     return 0
 
 
-def compiled_by_a_run() -> str:
-    """JSON, a kernel a line."""
-    from trihedron.pipeline.kernels import Misses, listed, watched
+def compiled_by_runs(overrides: list[str]) -> str:
+    """JSON, a kernel a line, of what these runs find in no cache."""
+    from trihedron.pipeline import kernels
 
-    os.sched_setaffinity(0, sorted(os.sched_getaffinity(0))[:1])  # so that no other process compiles beside
-    misses = Misses()
-    with tempfile.TemporaryDirectory() as folder, redirect_stdout(sys.stderr), watched(misses):
-        command(["run", *TYPICAL, f"out={folder}/run"])
-    return "[\n" + ",\n".join(json.dumps(kernel) for kernel in listed(misses.kernels)) + "\n]"
+    kernels.alone = True
+    misses = kernels.Misses()
+    with tempfile.TemporaryDirectory() as folder, redirect_stdout(sys.stderr), kernels.watched(misses):
+        for number, words in enumerate([TYPICAL, overrides][: 2 if overrides else 1]):
+            command(["run", *words, f"out={folder}/{number}"])
+    return "[\n" + ",\n".join(json.dumps(kernel) for kernel in kernels.listed(misses)) + "\n]"

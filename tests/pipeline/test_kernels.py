@@ -11,8 +11,9 @@ import numpy as np
 import pytest
 from numba import typeof, types
 
+from trihedron.datasets.synthetic import Synthetic
 from trihedron.pipeline import kernels
-from trihedron.pipeline.kernels import LISTED, _type_of, _word_of, listed
+from trihedron.pipeline.kernels import LISTED, type_of, word_of
 from trihedron.plugins.numerics.motion.pose_kernel import Flags
 
 ENTRIES = json.loads(LISTED.read_text())
@@ -24,7 +25,7 @@ def test_what_is_listed_is_a_kernel_and_takes_so_many_arguments(entry):
     module, name = kernel.split(":")
     function = getattr(importlib.import_module(module), name)
     assert function.py_func.__code__.co_argcount >= len(arguments)
-    assert [_word_of(_type_of(word)) for word in arguments] == arguments
+    assert [word_of(type_of(word)) for word in arguments] == arguments
 
 
 def test_types_come_back_from_their_words():
@@ -38,21 +39,60 @@ def test_types_come_back_from_their_words():
         (True, "bool"),
         ((1, 2.0), ["int64", "float64"]),
         (flags, {"trihedron.plugins.numerics.motion.pose_kernel:Flags": ["uint8[1C]"] * 3}),
+        (np.zeros((2, 3), [("n", "f8"), ("z", "f4")]), {"[2C]": [["n", "<f8"], ["z", "<f4"]]}),
     ):
-        assert _word_of(typeof(value)) == word and _type_of(word) == typeof(value), word
-    assert listed([("trihedron.x:y", (types.unicode_type,)), ("numba.x:y", (types.int64,))]) == []
+        assert word_of(typeof(value)) == word and type_of(word) == typeof(value), word
 
 
-def test_other_cores_begin_with_the_third_kernel_that_no_cache_has(monkeypatch):
-    begun = []
-    monkeypatch.setattr(kernels, "begin_shares", lambda count: begun.append(count) or [subprocess.Popen([sys.executable, "-c", "input()"])])
-    monkeypatch.setattr(kernels, "cores", lambda: 5)
-    with kernels.compiled_beside():
-        for compiled in range(4):
-            assert begun == [4] * (compiled >= kernels.COLD)
-            numba.njit(lambda x: x + 1)(1)
-    numba.njit(lambda x: x + 2)(1)
-    assert begun == [4]
+def test_the_longest_are_listed_first_and_others_kernels_never():
+    misses = kernels.Misses()
+    misses.kernels = [("trihedron.x:short", (types.int64,)), ("numba.x:y", (types.int64,)), ("trihedron.x:long", (types.float64,))]
+    misses.kernels.append(("trihedron.x:text", (types.unicode_type,)))
+    misses.seconds = [1.0, 9.0, 2.0, 9.0]
+    assert kernels.listed(misses) == [["trihedron.x:long", ["float64"]], ["trihedron.x:short", ["int64"]]]
+
+
+def test_what_is_called_belongs_to_the_kernel_that_python_calls():
+    inner = numba.njit(lambda x: x + 1)
+    outer = numba.njit(lambda x: inner(x) + 1)
+    misses = kernels.Misses()
+    with kernels.watched(misses):
+        outer(1)
+    assert len(misses.kernels) == len(misses.seconds) == 1 and misses.seconds[0] > 0.0
+
+
+def test_a_graph_uses_the_modules_that_its_plugins_take_something_from():
+    used = kernels.used_by([Synthetic()])
+    assert {"trihedron.datasets.raytracing", "trihedron.pipeline.gathering"} <= used
+    assert "trihedron.plugins.numerics.planes.plane_fitting" not in used
+
+
+PROGRAM = """
+import json, sys
+import numpy as np
+from trihedron.datasets.synthetic import Synthetic
+from trihedron.pipeline import kernels
+from trihedron.plugins.numerics.axes.sphere_modes import fit_rotation, orthonormal
+
+names = ("sphere_modes:orthonormal", "sphere_modes:fit_rotation")
+rows = [row for row, (kernel, _) in enumerate(json.loads(kernels.LISTED.read_text())) if kernel.endswith(names)]
+modules = {"trihedron.plugins.numerics.axes.sphere_modes"}
+before = kernels.missing(modules)
+if sys.argv[1] == "ahead":
+    assert list(kernels.compile_rows(rows, 1)) == [1, 2]
+    assert set(before) - set(kernels.missing(modules)) == set(rows)
+print(orthonormal(np.arange(9.0).reshape(3, 3) ** 2 % 7, np.ones(3)).tolist())
+"""
+
+
+@pytest.mark.slow
+def test_a_kernel_that_another_calls_is_compiled_whole_and_to_the_same_bits(tmp_path):
+    """`fit_rotation`, which is compiled first, has `orthonormal` as a part."""
+    printed = []
+    for way in ("ahead", "when called"):
+        environment = os.environ | {"NUMBA_CACHE_DIR": str(tmp_path / way)}
+        printed.append(subprocess.run([sys.executable, "-c", PROGRAM, way], env=environment, capture_output=True, text=True, check=True).stdout)
+    assert printed[0] == printed[1] != ""
 
 
 @pytest.mark.slow

@@ -112,19 +112,31 @@ def _from_columns(A: F64, V: F64) -> F64:
     square = np.empty(3)
     for k in range(3):
         square[k] = A[0, k] ** 2 + A[1, k] ** 2 + A[2, k] ** 2
-    order = np.argsort(-square)
-    U, W = np.zeros((3, 3)), np.empty((3, 3))
-    for i in range(2):
-        W[:, i] = V[:, order[i]]
-        if square[order[i]] > 0.0:
-            U[:, i] = A[:, order[i]] / np.sqrt(square[order[i]])
-    if square[order[0]] == 0.0:
+    first, second = 0, 1  # the longest columns
+    for k in range(1, 3):
+        if square[k] > square[first]:
+            first, second = k, first
+        elif k == 2 and square[k] > square[second]:
+            second = k
+    if square[first] == 0.0:
         return np.eye(3)
-    if square[order[1]] == 0.0:  # any direction across
-        axis = np.argmin(np.abs(U[:, 0]))
-        U[axis, 1] = 1.0
-        U[:, 1] -= U[axis, 0] * U[:, 0]
-        U[:, 1] /= np.sqrt((U[:, 1] ** 2).sum())
+    U, W = np.zeros((3, 3)), np.empty((3, 3))
+    for i, k in ((0, first), (1, second)):
+        length = np.sqrt(square[k])
+        for r in range(3):
+            W[r, i] = V[r, k]
+            U[r, i] = A[r, k] / length if length > 0.0 else 0.0
+    if square[second] == 0.0:  # any direction across
+        axis = 0
+        for r in range(1, 3):
+            if abs(U[r, 0]) < abs(U[axis, 0]):
+                axis = r
+        along = U[axis, 0]
+        for r in range(3):
+            U[r, 1] = (1.0 if r == axis else 0.0) - along * U[r, 0]
+        length = np.sqrt(U[0, 1] ** 2 + U[1, 1] ** 2 + U[2, 1] ** 2)
+        for r in range(3):
+            U[r, 1] /= length
     for X in (U, W):
         for k in range(3):
             i, j = (k + 1) % 3, (k + 2) % 3

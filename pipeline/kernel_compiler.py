@@ -1,0 +1,96 @@
+"""The program of a process that compiles kernels for numba's cache and does nothing else; it is told which on its input, see `kernels.py`.
+
+Whatever a kernel calls numba optimises, translates and keeps for itself, and then once more as a part of the kernel. Here what is called is linked
+into its caller and no more, since nobody calls it here; that saves two fifths. A function that Python calls as well is listed, and gets its turn.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import gc
+import importlib
+import json
+import os
+from typing import Any
+
+from numba.core import caching, codegen, cpu
+
+from trihedron.pipeline.kernels import LISTED, ROW, type_of
+
+GARBAGE = 100_000  # new objects between two looks for what is not used any more; of those of a compilation nearly all are
+make_function: Any = importlib.import_module("numba._dynfunc").make_function
+LIBRARY: Any = codegen.JITCodeLibrary
+CONTEXT: Any = cpu.CPUContext
+CACHE: Any = caching.CompileResultCacheImpl
+
+
+class LinkedParts:
+    """numba's steps for the library of one kernel, and those in their place for the libraries of what it calls."""
+
+    def __init__(self) -> None:
+        self.name = ("", "")  # of the kernel: module and qualified name
+        self.library: Any = None  # of the kernel
+        self._optimize, self._finalize = LIBRARY._optimize_functions, LIBRARY.finalize
+        self._executable, self._cachable = CONTEXT.get_executable, CACHE.check_cachable
+
+    def install(self) -> None:
+        """From now on numba takes these steps, in this process."""
+        LIBRARY._optimize_functions = lambda library, module: self.optimize(library, module)
+        LIBRARY.finalize = lambda library: self.finalize(library)
+        CONTEXT.get_executable = lambda context, *of: self.executable(context, *of)
+        CACHE.check_cachable = lambda cache, result: not is_part(result) and self._cachable(cache, result)
+
+    def compile(self, dispatcher: Any, arguments: tuple[Any, ...]) -> None:
+        """Compile a kernel unless a cache has it, whole even where it has been part of another."""
+        if arguments in dispatcher.overloads and is_part(dispatcher.overloads[arguments]):
+            del dispatcher.overloads[arguments]
+        self.name = dispatcher.__module__, dispatcher.py_func.__qualname__
+        dispatcher.compile(arguments)
+
+    def optimize(self, library: Any, module: Any) -> None:
+        """Make functions small and simple before others are linked to them; parts are simplified where they end up."""
+        if library.name == self.name[1]:
+            self._optimize(library, module)
+        else:
+            module.data_layout = library._codegen._data_layout
+
+    def finalize(self, library: Any) -> None:
+        """Link what is called into a library; the kernel's is then optimised and translated, too."""
+        if library is self.library:
+            self._finalize(library)
+            return
+        for called in dict.fromkeys(library._linking_libraries):
+            library._reload_init.update(called._reload_init)
+            library._final_module.link_in(called._get_module_for_linking(), preserve=True)
+        library.is_part = library._finalized = True
+
+    def executable(self, context: Any, library: Any, function: Any, environment: Any) -> Any:
+        """What Python would call; of a part it is never called, and leads nowhere."""
+        if (function.modname, function.qualname) == self.name:
+            self.library = library
+            return self._executable(context, library, function, environment)
+        library._ensure_finalized()
+        return make_function(function.lookup_module(), function.qualname, "part of a kernel", 0, environment, (library,))
+
+
+def is_part(result: Any) -> bool:
+    """Whether the result of a compilation was made to be linked only."""
+    return getattr(result.library, "is_part", False)
+
+
+def main() -> None:
+    """Compile what is listed in the rows that come on standard input, with a byte on standard output for each done."""
+    gc.freeze()
+    gc.set_threshold(GARBAGE, 10, 10)
+    parts, kernels = LinkedParts(), json.loads(LISTED.read_text())
+    parts.install()
+    while row := os.read(0, ROW):
+        kernel, arguments = kernels[int.from_bytes(row, "little")]
+        module, name = kernel.split(":")
+        with contextlib.suppress(Exception):  # what is not as listed is left to the run
+            parts.compile(getattr(importlib.import_module(module), name), tuple(type_of(argument) for argument in arguments))
+        os.write(1, b"\n")
+
+
+if __name__ == "__main__":
+    main()
