@@ -35,7 +35,8 @@ class Case:
     lost: tuple = ()  # frames (arrived) that are lost, no others
     lost_most: int = 0  # or how many at most, wherever
     normalised: float = HONEST
-    worst: float = WORST
+    worst: float = WORST  # from the keyframe of each
+    drift: float = WORST  # from the first frame, of the first ones
     told: tuple = ()  # the frame from which on every pose is degraded, and what its reason says
     said: str = ""  # in what the program says on the way
 
@@ -67,9 +68,9 @@ CASES = {
     "rolling shutter": Case({"readout_ms": 10.0}, most_mm=30.0),
     "5 Hz": Case({"every": 6}, {"length": 300}, 30.0),
     "gamma": Case({"gamma": 2.2, "during": "30:"}),
-    **{f"moving objects over 30 %, paths {seed}": Case({"moving": 0.3, "seed": seed}, most_mm=30.0) for seed in range(9)},
-    # one of 540 frames, of paths 8, is off by more than six standard deviations
-    **{f"moving objects over half, paths {seed}": Case({"moving": 0.5, "seed": seed}, most_mm=100.0, worst=324.0) for seed in range(9)},
+    # half as much again as the worst of paths 0 … 8: 34.5 from the keyframe and 57 from the first frame; over half 38 and 152
+    **{f"moving objects over 30 %, paths {seed}": Case({"moving": 0.3, "seed": seed}, most_mm=30.0, worst=52.0, drift=86.0) for seed in range(9)},
+    **{f"moving objects over half, paths {seed}": Case({"moving": 0.5, "seed": seed}, most_mm=100.0, worst=57.0, drift=228.0) for seed in range(9)},
     "mirrors and glass": Case({"reflecting": 0.2}, most_mm=80.0),
     "turning on the spot, all round": Case({}, {"motion": "pan", "length": 545}, 30.0),
 }  # fmt: skip
@@ -131,7 +132,7 @@ def check(case, poses, true, said, keyframes):
           f"from the keyframe of each up to {local:.1f}")  # fmt: skip
     assert (tuple(lost) == case.lost) if not case.lost_most else len(lost) <= case.lost_most
     assert max(errors_mm) < case.most_mm * case.faults.get("depth_times", 1.0)
-    assert normalised.nees_median < case.normalised and worst < case.worst and local < case.worst
+    assert normalised.nees_median < case.normalised and worst < case.drift and local < case.worst
     if case.told:
         first, reason = case.told
         assert all(pose.status == DEGRADED and reason in pose.reason for pose in poses[first:])

@@ -92,7 +92,7 @@ class Refine(TrackingQuality, MovingObjects, Foundations, FocalLengths):
             return start.said(frame, map, "nothing of the map was found, pose from the previous frame", submap)
         said = self.judged(found, seen, rotation)
         if by:
-            said = self.judged_at_rest(seen, by, said)
+            said = self.judged_at_rest(found, problem, by, said)
         if said.status == OK:
             said = self.judged_by_focal_lengths(found, problem, self.judged_by_foundation(found, problem, said))
         if submap:

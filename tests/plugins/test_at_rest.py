@@ -9,7 +9,9 @@ import pytest
 
 from trihedron.pipeline.geometry import exp_se3, invert, log_se3
 from trihedron.plugins.matches.local_map import LocalMap
-from trihedron.plugins.numerics.maps.at_rest import LEAST, AtRest, at_rest, distance2, on_planes, proven, spread_about
+from trihedron.plugins.numerics.maps.at_rest import LEAST, AtRest, at_rest, distance2, on_planes, proven, proven_planes, spread_about
+from trihedron.plugins.numerics.maps.map_alignment import MapAlignment, Verdict
+from trihedron.plugins.numerics.maps.moving_objects import MovingObjects
 from trihedron.plugins.numerics.motion.pose_solver import PoseSolution
 from trihedron.plugins.numerics.motion.pose_terms import LineTerms, PointTerms
 from trihedron.plugins.pose.refine import Refine
@@ -88,6 +90,30 @@ def test_what_lies_within_planes_that_are_matched_is_at_rest(world, map):
     border = dataclasses.replace(planes, labels=np.where(np.indices(planes.labels.shape).sum(0) % 3 == 0, 0, planes.labels).astype(np.uint8))
     assert not on_planes(matches, keypoints, segments, border).points.any()  # something else within a cell of each
     assert [kind.name for kind in at_rest(map, matches, keypoints, segments, planes)] == ["what lies on planes", "what is proven"]
+
+
+def test_a_plane_met_once_is_not_known_to_be_at_rest_unless_there_is_but_one_keyframe(world, map, single):
+    matches = matched(world, map)[2]
+    young = dataclasses.replace(map, planes=map.planes.updated(matches.planes[:1, 1], found=np.array([1])))
+    assert proven_planes(map, matches).all() and proven_planes(single, matched(world, single)[2]).all()
+    assert np.array_equal(proven_planes(young, matches), matches.planes[:, 1] != matches.planes[0, 1])
+
+
+def denied(world, map, points, planes):
+    """Whether a pose by what lies on planes is, with which so many of the points and planes agree."""
+    (rotation, _), features, matches = matched(world, map)
+    problem = MapAlignment(rotation.R_world_camera, np.eye(6), world.frame(STEP), matches, *features, map, 1.0, 0.5)
+    counts = (len(matches.keypoints), int(points * len(matches.keypoints))), (len(matches.segments), 0), (len(matches.planes), planes)
+    flags = [(np.arange(count) < agree).astype(np.uint8) for count, agree in counts]
+    found = PoseSolution(camera_at(STEP), 1e-6 * np.eye(6), np.empty((6, 0)), *flags, 0.0)
+    said = MovingObjects().judged_at_rest(found, problem, "what lies on planes", Verdict("ok", "", found.covariance))
+    assert said.status == "ok" or said.reason.startswith("something moves")
+    return said.status == "degraded"
+
+
+def test_a_pose_by_what_lies_on_planes_is_denied_by_most_of_what_is_seen_and_half_of_the_planes(world, map):
+    assert denied(world, map, 0.2, 1)
+    assert not denied(world, map, 0.9, 1) and not denied(world, map, 0.2, 3)
 
 
 def test_new_points_contradict_proven_ones_by_the_difference_of_their_shares():

@@ -63,6 +63,11 @@ def proven(map: Map, matches: Matches) -> AtRest:
     return AtRest(PROVEN, points, lines)
 
 
+def proven_planes(map: Map, matches: Matches) -> Bool:
+    """(k,) which of the same planes at least two keyframes agree on, all while there is but one: the side of what walks past is a plane as well."""
+    return np.asarray(map.planes.rows("found", matches.planes[:, 1]) >= min(AGREED, len(map.keyframes)), np.bool_)
+
+
 def on_planes(matches: Matches, keypoints: Keypoints, segments: Segments, planes: Planes) -> AtRest:
     """Matches of what lies on planes that are matched as well, and not at the border of something else."""
     known = np.zeros(256, np.bool_)

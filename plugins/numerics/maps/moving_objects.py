@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
+import numpy as np
+
 from trihedron.pipeline.types import DEGRADED, OK
 from trihedron.plugins.numerics.maps.at_rest import (
     LEAST,
@@ -16,9 +18,10 @@ from trihedron.plugins.numerics.maps.at_rest import (
     planes_alone,
     position_chi2,
     position_distance2,
+    proven_planes,
     spread_about,
 )
-from trihedron.plugins.numerics.maps.map_alignment import Agreement, MapAlignment, Verdict
+from trihedron.plugins.numerics.maps.map_alignment import MapAlignment, Verdict
 from trihedron.plugins.numerics.motion.pose_solver import PoseSolution, Terms
 
 FIRST_SHARE = 0.5  # of the limit that a first step must reach before the rest is solved for by itself
@@ -51,15 +54,16 @@ class MovingObjects:
             if alone is not None:
                 found, by = problem.judged(alone), rest.name
                 break
-        if by != ON_PLANES and len(found.points) >= LEAST and self._denied(problem.agreement(found)):
+        if len(found.points) >= LEAST and self._denied(problem, found, by):
             by = by or ALL
             found = replace(found, covariance=spread_about(found, problem.solved(planes_alone(problem.matches).only(terms))))
         return found, by
 
-    def judged_at_rest(self, seen: Agreement, by: str, said: Verdict) -> Verdict:
+    def judged_at_rest(self, found: PoseSolution, problem: MapAlignment, by: str, said: Verdict) -> Verdict:
         """What is said of a pose found by what is at rest; where most of what is seen denies it, or the planes alone agree, it may be something
         else."""
-        if by == PLANES or (by != ON_PLANES and said.status == OK and self._denied(seen)):
+        if by == PLANES or (said.status == OK and self._denied(problem, found, by)):
+            seen = problem.agreement(found)
             reason = f"something moves: only {seen.agreed} of {seen.matches} matches agree" + (f" with {by}" if by != ALL else "")
             return replace(said, status=DEGRADED, reason=reason)
         return replace(said, reason=f"{said.reason}, by {by} alone") if by != ALL else said
@@ -79,8 +83,13 @@ class MovingObjects:
         pulled = distance2(alone, found) >= self.moving_gate if contradicted else position_distance2(alone, found) > far
         return alone if pulled and (rest.name == PLANES or not alone.unobservable.shape[1]) else None
 
-    def _denied(self, seen: Agreement) -> bool:
+    def _denied(self, problem: MapAlignment, found: PoseSolution, by: str) -> bool:
         """Whether most of all that is seen disagrees with a pose; if of the planes as well, the larger part is enough, by more than one standard
-        deviation of such a count."""
-        agreed, sought, planes = seen.agreed, seen.matches, seen.inliers[2]
-        return agreed < self.moving_most * sought or (2.0 * agreed < sought - sought**0.5 and bool(2 * planes <= seen.sought[2]))
+        deviation of such a count. One by what lies on planes is denied by most and those planes that were met before: what is flat may move too."""
+        seen = problem.agreement(found)
+        agreed, sought, planes, same = seen.agreed, seen.matches, seen.inliers[2], seen.sought[2]
+        by_larger = 2.0 * agreed < sought - sought**0.5
+        if by == ON_PLANES:
+            known = proven_planes(problem.map, problem.matches)
+            return by_larger and bool(2 * np.count_nonzero(found.planes[:same][known]) <= np.count_nonzero(known))
+        return agreed < self.moving_most * sought or (by_larger and bool(2 * planes <= same))
