@@ -68,7 +68,7 @@ CASES = {
     "rolling shutter": Case({"readout_ms": 10.0}, most_mm=30.0),
     "5 Hz": Case({"every": 6}, {"length": 300}, 30.0),
     "gamma": Case({"gamma": 2.2, "during": "30:"}),
-    # half as much again as the worst of paths 0 … 8: 34.5 from the keyframe and 57 from the first frame; over half 38 and 152; medians are 6.5 at most
+    # half as much again as the worst of paths 0 … 8: 34.5 from the keyframe and 57 from the first frame; over half 38 and 152; median 6.5 of any
     **{f"moving objects over 30 %, paths {seed}": Case({"moving": 0.3, "seed": seed}, {}, 30.0, (), 0, 10.0, 52.0, 86.0) for seed in range(9)},
     **{f"moving objects over half, paths {seed}": Case({"moving": 0.5, "seed": seed}, {}, 100.0, (), 0, 10.0, 57.0, 228.0) for seed in range(9)},
     "mirrors and glass": Case({"reflecting": 0.2}, most_mm=80.0),
