@@ -124,8 +124,7 @@ class Runner:
             with single_threaded_libraries(), self._feeding():
                 for position, values in scheduler.run(self.count):
                     with held_interrupts():
-                        self._account(position, values)
-                        if writer is not None:
+                        if self._account(position, values) and writer is not None:
                             self._record(writer, view, position, values, topics, embed_frames)
                     for times in (self._calls_ms, self._latency_ms, self._handed_over):
                         times.pop(position, None)
@@ -210,7 +209,8 @@ class Runner:
             check_value(stage.name, value, self.indices[position])
         return value
 
-    def _account(self, position: int, values: Mapping[str, Any]) -> None:
+    def _account(self, position: int, values: Mapping[str, Any]) -> bool:
+        """Take what a frame gave into the results; False where it cannot be read."""
         self.keeper.see(self.indices[position], values)
         calls = self._calls_ms.setdefault(position, {})
         for name, ms in calls.items():
@@ -220,7 +220,7 @@ class Runner:
             if self.result.unreadable > UNREADABLE_SHARE * self.count:
                 cause = f"{self.result.unreadable} of {self.count} frames cannot be read"
                 raise DataError("dataset", cause, "see the warnings above for the first file; the data set is damaged")
-            return
+            return False
         self.timing.add_frame(self._latency_ms.setdefault(position, sum(calls.values())))
         first = next((v for v in values.values() if isinstance(v, Value) and v.index == self.indices[position]), None)
         self._stamps.setdefault(self.indices[position], first.stamp_ns if first is not None else 0)
@@ -231,14 +231,12 @@ class Runner:
             self.result.poses.append(pose)
         if isinstance(map := values.get("map"), Map):
             self.result.map = map
+        return True
 
     def _record(
         self, writer: RecordingWriter, view: View, position: int, values: Mapping[str, Any], topics: frozenset[str], embed_frames: bool
     ) -> None:
-        stamp = self._stamps.get(self.indices[position])
-        if stamp is None:
-            return
-        frame = values.get("dataset")
+        stamp, frame = self._stamps[self.indices[position]], values.get("dataset")
         if isinstance(frame, Frame):
             writer.write(FRAMES_TOPIC, FrameReference(frame.index, frame.stamp_ns, frame.camera))
         elif self._references is not None:

@@ -158,6 +158,14 @@ def test_unreadable_frames_are_skipped_and_counted(tmp_path):
     assert [v.index for v in Recording(tmp_path / "a.mcap").values("frames")] == [i for i in range(30) if i not in (7, 9, 12)]
 
 
+def test_a_frame_that_has_become_unreadable_is_skipped_in_a_replay(tmp_path):
+    record(tmp_path / "a.mcap", toy_graph(dataset=ToyDataset(length=30)))
+    replay = Replay(Recording(tmp_path / "a.mcap"), ("keypoints",))
+    record(tmp_path / "b.mcap", toy_graph(dataset=ToyDataset(length=30, unreadable=(7,))), replay=replay, topics=frozenset({"keypoints"}))
+    before, after = ([v.index for v in Recording(tmp_path / name).values("keypoints")] for name in ("a.mcap", "b.mcap"))
+    assert 7 in before and after == [index for index in before if index != 7]
+
+
 def test_more_than_a_tenth_unreadable_is_an_error(tmp_path):
     with pytest.raises(DataError) as error:
         record(tmp_path / "a.mcap", toy_graph(dataset=ToyDataset(length=20, unreadable=(7, 9, 12))))
