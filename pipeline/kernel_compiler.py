@@ -60,7 +60,7 @@ class LinkedParts:
             self._finalize(library)
             return
         for called in dict.fromkeys(library._linking_libraries):
-            if hasattr(called, "_reload_init"):  # since numba 0.61
+            if hasattr(called, "_reload_init"):  # of newer numba
                 library._reload_init.update(called._reload_init)
             library._final_module.link_in(called._get_module_for_linking(), preserve=True)
         library.is_part = library._finalized = True
