@@ -8,17 +8,16 @@ from __future__ import annotations
 
 import contextlib
 import gc
-import importlib
 import json
 import os
 from typing import Any
 
+from numba import _dynfunc  # type: ignore[attr-defined]  # compiled, without types
 from numba.core import caching, codegen, cpu
 
-from trihedron.pipeline.kernels import LISTED, ROW, type_of
+from trihedron.pipeline.kernels import LISTED, ROW, kernel_of
 
 GARBAGE = 100_000  # new objects between two looks for what is not used any more; of those of a compilation nearly all are
-make_function: Any = importlib.import_module("numba._dynfunc").make_function
 LIBRARY: Any = codegen.JITCodeLibrary
 CONTEXT: Any = cpu.CPUContext
 CACHE: Any = caching.CompileResultCacheImpl
@@ -71,7 +70,7 @@ class LinkedParts:
             self.library = library
             return self._executable(context, library, function, environment)
         library._ensure_finalized()
-        return make_function(function.lookup_module(), function.qualname, "part of a kernel", 0, environment, (library,))
+        return _dynfunc.make_function(function.lookup_module(), function.qualname, "part of a kernel", 0, environment, (library,))
 
 
 def is_part(result: Any) -> bool:
@@ -86,10 +85,8 @@ def main() -> None:
     parts, kernels = LinkedParts(), json.loads(LISTED.read_text())
     parts.install()
     while row := os.read(0, ROW):
-        kernel, arguments = kernels[int.from_bytes(row, "little")]
-        module, name = kernel.split(":")
         with contextlib.suppress(Exception):  # what is not as listed is left to the run
-            parts.compile(getattr(importlib.import_module(module), name), tuple(type_of(argument) for argument in arguments))
+            parts.compile(*kernel_of(*kernels[int.from_bytes(row, "little")]))
         os.write(1, b"\n")
 
 

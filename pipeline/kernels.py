@@ -84,15 +84,21 @@ def missing(modules: Collection[str] | None = None) -> list[int]:
     install: Any = event.install_listener
     with install("numba:compile", _Refusal()):
         for row, (kernel, arguments) in enumerate(json.loads(LISTED.read_text())):
-            module, name = kernel.split(":")
-            if modules is None or module in modules:
+            if modules is None or kernel.partition(":")[0] in modules:
                 try:
-                    getattr(importlib.import_module(module), name).compile(tuple(type_of(argument) for argument in arguments))
+                    dispatcher, kinds = kernel_of(kernel, arguments)
+                    dispatcher.compile(kinds)
                 except _Missing:
                     rows.append(row)
                 except Exception:  # it is not as listed, which costs the run time and nothing else
                     continue
     return rows
+
+
+def kernel_of(kernel: str, arguments: list[Any]) -> tuple[Any, tuple[Kind, ...]]:
+    """What numba made of a listed function, and the types to compile it for; any exception where these are not as listed."""
+    module, name = kernel.split(":")
+    return getattr(importlib.import_module(module), name), tuple(type_of(argument) for argument in arguments)
 
 
 def used_by(objects: Iterable[Any]) -> set[str]:
