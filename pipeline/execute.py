@@ -57,7 +57,7 @@ def execute(config: DictConfig, out: Path, overrides: list[str], began: float) -
     _announce(runner)
     with _Warnings() as warnings:
         warnings.muted = True
-        _compile(graph)
+        _compile(runner)
         _warm_up(Runner(graph, config.seed, config.threads, replay, frames, remembered))
         warnings.muted = False
         writer = RecordingWriter(out / RECORDING, _metadata(config, overrides))
@@ -179,9 +179,9 @@ def _commit() -> str:
     return head.stdout.strip() if top.returncode == 0 else ""
 
 
-def _compile(graph: Graph) -> None:
-    """Compile on all cores what the stages may call and no cache has, and say so: it is once an installation."""
-    rows = kernels.missing(kernels.used_by(stage.plugin for stage in graph.stages.values()))
+def _compile(runner: Runner) -> None:
+    """Compile on all cores what the stages that run may call and no cache has, and say so: it is once an installation."""
+    rows = kernels.missing(kernels.used_by(runner.graph.stages[name].plugin for name in runner.computed))
     if len(rows) > kernels.FEW:
         print(f"compiling {len(rows)} functions for this machine, once ...", file=sys.stderr, flush=True)
         with tqdm(total=len(rows), disable=not sys.stderr.isatty(), leave=False) as bar:

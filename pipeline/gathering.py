@@ -15,11 +15,13 @@ from numpy.typing import NDArray
 types: Any = numba.types
 
 
-@intrinsic
-def _at(typing: Any, address: Any) -> Any:
+def _pointer(typing: Any, address: Any) -> Any:
     """The bytes at an address."""
     signature = types.CPointer(types.uint8)(types.int64)
     return signature, lambda context, builder, signature, values: builder.inttoptr(values[0], context.get_value_type(signature.return_type))
+
+
+_at: Any = intrinsic(_pointer)
 
 
 @numba.njit(cache=True, nogil=True)
@@ -29,6 +31,6 @@ def gather(addresses: NDArray[np.int64], rows: NDArray[np.int32], piece: int, ou
     n, size = out.shape
     for i in range(n):
         row = rows[i]
-        source = numba.carray(_at(addresses[row // piece] + (row % piece) * size), (size,))  # type: ignore[call-arg]  # numba gives the first
+        source = numba.carray(_at(addresses[row // piece] + (row % piece) * size), (size,))
         for k in range(size):
             out[i, k] = source[k]

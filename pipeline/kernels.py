@@ -28,7 +28,7 @@ types: Any = numba.types  # which says little of its classes
 Kind = Any  # one of those types
 LISTED = Path(__file__).with_name("kernels.json")
 FEW = 3  # kernels, which the run compiles itself as it comes to them
-MOST = 8  # processes; each takes 300 MB
+MOST = 8  # processes; one alone comes to 1.1 GB, several divide what is to be compiled
 ROW = 2  # bytes of a row's number
 ARRAY = re.compile(r"(readonly )?(\w+)(?:\[(\d+)([CFA])\])?")
 
@@ -52,10 +52,10 @@ class Misses(event.Listener):
             self.seconds.append(time.perf_counter() - began)
 
 
-def watched(misses: Misses) -> AbstractContextManager[None]:
-    """While `misses` is told of each kernel that is compiled."""
+def watched(listener: event.Listener) -> AbstractContextManager[None]:
+    """While the listener is told of each kernel that is compiled."""
     install: Any = event.install_listener
-    context: AbstractContextManager[None] = install("numba:compile", misses)  # none begins for what a cache has
+    context: AbstractContextManager[None] = install("numba:compile", listener)  # none begins for what a cache has
     return context
 
 
@@ -81,8 +81,7 @@ def missing(modules: Collection[str] | None = None) -> list[int]:
     rows: list[int] = []
     if alone:
         return rows
-    install: Any = event.install_listener
-    with install("numba:compile", _Refusal()):
+    with watched(_Refusal()):
         for row, (kernel, arguments) in enumerate(json.loads(LISTED.read_text())):
             if modules is None or kernel.partition(":")[0] in modules:
                 try:
@@ -107,7 +106,7 @@ def used_by(objects: Iterable[Any]) -> set[str]:
     pending = {type(item).__module__ for item in objects}
     while pending:
         found |= pending
-        content = [value for name in pending for value in vars(sys.modules[name]).values()]
+        content = [value for name in pending & sys.modules.keys() for value in vars(sys.modules[name]).values()]
         owners = {value.__name__ if isinstance(value, ModuleType) else getattr(value, "__module__", None) for value in content}
         pending = {owner for owner in owners if isinstance(owner, str) and owner.startswith("trihedron.")} - found
     return found

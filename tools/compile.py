@@ -35,7 +35,7 @@ def main(argv: list[str]) -> int:
     began, rows = time.perf_counter(), missing()
     finished = max(compile_rows(rows, cores()), default=0) if rows else 0
     if finished < len(rows):
-        raise TrihedronError("compile", f"{len(rows) - finished} of {len(rows)} kernels were not compiled", "see that there is memory, 300 MB a core")
+        raise TrihedronError("compile", f"{len(rows) - finished} of {len(rows)} kernels were not compiled", "see that 1.2 GB of memory are free")
     print(f"ready after {time.perf_counter() - began:.0f} s on {cores()} cores")
     return 0
 

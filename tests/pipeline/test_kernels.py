@@ -67,6 +67,11 @@ def test_a_graph_uses_the_modules_that_its_plugins_take_something_from():
     assert "trihedron.plugins.numerics.planes.plane_fitting" not in used
 
 
+def test_a_plugin_whose_module_only_another_process_knows_uses_what_can_be_seen():
+    unknown = type("Sent", (), {"__module__": "nowhere.to_be_found"})()
+    assert "trihedron.datasets.raytracing" in kernels.used_by([unknown, Synthetic()])
+
+
 PROGRAM = """
 import json, sys
 import numpy as np
