@@ -6,7 +6,7 @@ import signal
 import subprocess
 import sys
 import time
-from importlib.metadata import version
+from importlib.metadata import EntryPoint, version
 from pathlib import Path
 
 import cv2
@@ -101,6 +101,13 @@ def test_unknown_command_and_help(capsys):
     assert text.count("Example: trihedron ") >= 6
     assert main(["run", "--help"]) == 0 and "replay=FILE.mcap" in capsys.readouterr().out
     assert main(["--version"]) == 0 and capsys.readouterr().out.strip() == f"trihedron {version('trihedron')}"
+
+
+def test_a_command_that_cannot_be_loaded_does_not_take_the_help_with_it(capsys, monkeypatch):
+    broken = EntryPoint("weave", "no_such_package.weave:main", "trihedron.commands")
+    monkeypatch.setattr("trihedron.pipeline.cli.entry_points", lambda group: [broken])
+    assert main(["--help"]) == 0
+    assert "  weave        cannot be loaded: No module named 'no_such_package'" in capsys.readouterr().out
 
 
 def test_debug_shows_the_traceback():
