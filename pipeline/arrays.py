@@ -58,15 +58,17 @@ def check_arrays(value: Any) -> None:
     lengths: dict[str, int] = {}
     for spec in array_specs(value.__class__):
         array = getattr(value, spec.name)
-        where = f"{type(value).__name__}.{spec.name}"
         if not isinstance(array, np.ndarray) or array.dtype != spec.dtype:
-            raise ValueError(f"{where}: expected an array of {spec.dtype}, got {getattr(array, 'dtype', type(array).__name__)}")
-        fits = array.ndim == len(spec.shape.axes) and all(
-            size == (axis if isinstance(axis, int) else lengths.setdefault(axis, size)) for size, axis in zip(array.shape, spec.shape.axes)
-        )
+            given = getattr(array, "dtype", type(array).__name__)
+            raise ValueError(f"{type(value).__name__}.{spec.name}: expected an array of {spec.dtype}, got {given}")
+        shape, axes = array.shape, spec.shape.axes
+        fits = len(shape) == len(axes)
+        for size, axis in zip(shape, axes):
+            fits = fits and size == (lengths.setdefault(axis, size) if axis.__class__ is str else axis)
         if not fits:
-            raise ValueError(f"{where}: expected shape {spec.shape}, got {array.shape}" + (f" with {lengths}" if lengths else ""))
-        array.flags.writeable = False
+            known = f" with {lengths}" if lengths else ""
+            raise ValueError(f"{type(value).__name__}.{spec.name}: expected shape {spec.shape}, got {shape}{known}")
+        array.setflags(write=False)
 
 
 @dataclass(frozen=True)
