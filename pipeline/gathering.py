@@ -24,13 +24,26 @@ def _pointer(typing: Any, address: Any) -> Any:
 _at: Any = intrinsic(_pointer)
 
 
-@numba.njit(cache=True, nogil=True)
-def gather(addresses: NDArray[np.int64], rows: NDArray[np.int32], piece: int, out: NDArray[np.uint8]) -> None:
-    """Copy the bytes of `rows` (n,) into `out` (n, bytes of a row). Every `piece` rows lie at one of the addresses; the caller holds the pieces, and
-    has seen to it that they have these rows."""
+@numba.njit(cache=True)  # these two keep the interpreter's lock: to hand it over takes longer
+def gather(addresses: NDArray[np.int64], rows: NDArray[np.int32], piece: int, count: int, out: NDArray[np.uint8]) -> int:
+    """Copy the bytes of `rows` (n,) into `out` (n, bytes of a row), up to the first that is not one of 0..count-1, whose place in `rows` is returned;
+    -1 when all are. Every `piece` rows lie at one of the addresses; the caller holds the pieces."""
     n, size = out.shape
     for i in range(n):
         row = rows[i]
+        if row < 0 or row >= count:
+            return i
         source = numba.carray(_at(addresses[row // piece] + (row % piece) * size), (size,))
         for k in range(size):
             out[i, k] = source[k]
+    return -1
+
+
+@numba.njit(cache=True)
+def scatter(addresses: NDArray[np.int64], rows: NDArray[np.int32], piece: int, values: NDArray[np.uint8]) -> None:
+    """Write the bytes of `values` (n, bytes of a row) to `rows` (n,), the other way round; the caller has seen to it that there are such rows."""
+    n, size = values.shape
+    for i in range(n):
+        target = numba.carray(_at(addresses[rows[i] // piece] + (rows[i] % piece) * size), (size,))
+        for k in range(size):
+            target[k] = values[i, k]

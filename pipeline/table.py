@@ -8,9 +8,10 @@ dead are given back: in their place stands one chunk of zeros, the same for all,
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping
+from ctypes import addressof, c_char
 from dataclasses import dataclass, field
-from itertools import pairwise
+from functools import cache, cached_property
 from typing import Any
 
 import numpy as np
@@ -29,16 +30,34 @@ class Column:
     shape: tuple[int, ...] = ()
     step: float = 0.0
 
+    @cached_property
+    def element(self) -> np.dtype[Any]:
+        """Type of one number."""
+        return np.dtype(self.dtype)
+
+    @cached_property
+    def row_bytes(self) -> int:
+        """Of one row."""
+        return self.element.itemsize * math.prod(self.shape)
+
     def rounded(self, values: Array) -> Array:
         """Values to the nearest multiples of the step, of this type."""
-        return np.asarray(np.rint(values / self.step) * self.step if self.step else values, self.dtype)
+        return np.asarray(np.rint(values / self.step) * self.step if self.step else values, self.element)
 
-    def addresses_of(self, chunks: Sequence[Array]) -> Array:
-        """(n,) where the rows of each chunk begin. Raises ValueError for one whose rows are not as large as this column's, one after another."""
-        size = np.dtype(self.dtype).itemsize * math.prod(self.shape)
-        if not all(chunk.flags.c_contiguous and chunk.nbytes == len(chunk) * size for chunk in chunks):
-            raise ValueError(f"the rows of a chunk are not {size} bytes each, one after another")
-        return np.array([chunk.__array_interface__["data"][0] for chunk in chunks], np.int64)
+    def address_of(self, chunk: Array) -> int:
+        """Where the rows of a chunk begin. Raises ValueError for one whose rows are not as large as this column's, one after another."""
+        if not chunk.flags.c_contiguous or chunk.nbytes != len(chunk) * self.row_bytes:
+            raise ValueError(f"the rows of a chunk are not {self.row_bytes} bytes each, one after another")
+        address: int = chunk.__array_interface__["data"][0]
+        return address
+
+
+@cache
+def _kernels() -> Any:
+    """What copies rows; not before it is needed: numba takes 0.2 s, which a command's help need not."""
+    from trihedron.pipeline import gathering
+
+    return gathering
 
 
 @dataclass(frozen=True)
@@ -70,37 +89,49 @@ class Table:
 
     def gathered(self, ids: Array, *names: str) -> list[Array]:
         """Rows `ids` of several columns, like `rows` of each."""
-        if len(ids) == 0:
-            return [np.empty((0, *self.schema[name].shape), self.schema[name].dtype) for name in names]
-        least, most = int(ids.min()), int(ids.max())
-        if least < 0 or most >= self.size:
-            raise IndexError(f"row {most if most >= self.size else least} of a table of {self.size}")
-        rows = np.array(ids, np.int32)  # of one type, so that one kernel does for all
-        return [self._gathered(rows, name) for name in names]
+        gather, numbers, found = _kernels().gather, np.array(ids, np.int32), []  # of one type, so that one kernel does for all
+        for name in names:
+            column = self.schema[name]
+            rows = np.empty((len(numbers), column.row_bytes), np.uint8)
+            outside = gather(self._addresses_of(name), numbers, CHUNK, self.size, rows)
+            if outside >= 0:
+                raise IndexError(f"row {ids[outside]} of a table of {self.size}")
+            found.append(rows.view(column.element).reshape(len(numbers), *column.shape))
+        return found
 
-    def _gathered(self, ids: Array, name: str) -> Array:
-        from trihedron.pipeline.gathering import gather  # not before: numba takes 0.2 s, which a command's help need not
+    def row(self, name: str, number: int) -> Any:
+        """One row of a column, which cannot be written. Raises IndexError for a number outside 0..size-1."""
+        if not 0 <= number < self.size:
+            raise IndexError(f"row {number} of a table of {self.size}")
+        return self.chunks[name][number // CHUNK][number % CHUNK]
 
-        column = self.schema[name]
+    def _addresses_of(self, name: str) -> Array:
         if name not in self._addresses:
-            self._addresses[name] = column.addresses_of(self.chunks[name])
-        rows = np.empty((len(ids), *column.shape), column.dtype)
-        gather(self._addresses[name], ids, CHUNK, rows.view(np.uint8).reshape(len(ids), -1))
-        return rows
+            column = self.schema[name]
+            self._addresses[name] = np.array([column.address_of(chunk) for chunk in self.chunks[name]], np.int64)
+        return self._addresses[name]
 
     def updated(self, ids: Array, **columns: Array) -> Table:
-        """A version in which rows `ids` (distinct) of the given columns hold new values; other chunks are shared."""
-        chunks = dict(self.chunks)
-        touched = list(_by_chunk(np.asarray(ids)))
+        """A version in which rows `ids` (distinct) of the given columns hold new values; other chunks are shared. Raises IndexError for an id outside
+        0..size-1."""
+        if len(ids) == 0:
+            return self
+        rows = np.array(ids, np.int32)
+        if rows.min() < 0 or rows.max() >= self.size:
+            raise IndexError(f"rows {rows.min()} to {rows.max()} of a table of {self.size}")
+        touched = np.flatnonzero(np.bincount(rows // CHUNK)).tolist()
+        chunks, addresses = dict(self.chunks), dict(self._addresses)
         for name, given in columns.items():
-            parts, values = list(chunks[name]), self.schema[name].rounded(given)
-            for chunk, here, offset in touched:
-                part = parts[chunk].copy()
-                part[offset] = values[here]
-                part.flags.writeable = False
-                parts[chunk] = part
-            chunks[name] = tuple(parts)
-        return self._changed(self.size, chunks, [chunk for chunk, *_ in touched])
+            column, parts, known = self.schema[name], list(chunks[name]), self._addresses_of(name).copy()
+            for number in touched:
+                parts[number] = part = parts[number].copy()
+                known[number] = _address_of(part)
+            values = np.ascontiguousarray(column.rounded(given)).reshape(len(rows), *column.shape)
+            _kernels().scatter(known, rows, CHUNK, _bytes(values, column.row_bytes))
+            for number in touched:
+                parts[number].flags.writeable = False
+            chunks[name], addresses[name] = tuple(parts), known
+        return Table(self.schema, self.size, chunks, addresses)
 
     def keeping(self, spans: Array) -> Table:
         """A version that gives back the full chunks in which none of these rows lie, (n, 2) half open."""
@@ -152,13 +183,15 @@ class Table:
             chunks[name] = tuple(parts)
         return self._changed(size, chunks, numbers).emptied(empty)
 
-    def _changed(self, size: int, chunks: Mapping[str, tuple[Array, ...]], numbers: Sequence[int]) -> Table:
+    def _changed(self, size: int, chunks: Mapping[str, tuple[Array, ...]], numbers: Iterable[int]) -> Table:
         """A version with other chunks of these numbers, which knows where the others are."""
         addresses = dict(self._addresses)
         for name, known in self._addresses.items():
             if chunks[name] is not self.chunks[name]:
-                addresses[name] = np.resize(known, len(chunks[name]))
-                addresses[name][numbers] = self.schema[name].addresses_of([chunks[name][number] for number in numbers])
+                addresses[name] = np.empty(len(chunks[name]), np.int64)
+                addresses[name][: len(known)] = known
+                for number in numbers:
+                    addresses[name][number] = self.schema[name].address_of(chunks[name][number])
         return Table(self.schema, size, chunks, addresses)
 
 
@@ -175,14 +208,13 @@ def empty_chunk(column: Column) -> Array:
     return _EMPTY[key]
 
 
-def _by_chunk(ids: Array) -> Iterator[tuple[int, Any, Array]]:
-    """For each chunk that holds some of the rows `ids` (n,): its number, which of the ids they are, and their rows in it."""
-    number, offset = ids // CHUNK, ids % CHUNK
-    ascending = bool((number[1:] >= number[:-1]).all())
-    order = None if ascending else np.argsort(number, kind="stable")
-    ranked = number if order is None else number[order]
-    edges = [0, *(np.flatnonzero(ranked[1:] != ranked[:-1]) + 1).tolist(), len(ids)]
-    for first, end in pairwise(edges):
-        if end > first:
-            here = slice(first, end) if order is None else order[first:end]
-            yield int(ranked[first]), here, offset[here]
+def _address_of(chunk: Array) -> int:
+    """Of a chunk that can be written; of others it takes longer to say."""
+    return addressof(c_char.from_buffer(chunk.data)) if chunk.nbytes else 0
+
+
+def _bytes(rows: Array, count: int) -> Array:
+    """(n, ...) rows as (n, count) bytes that cannot be written: to a kernel a type of its own."""
+    view = rows.view(np.uint8).reshape(len(rows), count)
+    view.flags.writeable = False
+    return view

@@ -24,6 +24,7 @@ def test_append_and_read_across_chunks():
     ids = np.array([700, 0, 5, 5, len(table) - 1])
     assert np.array_equal(table.rows("x", ids), whole[ids])
     assert table.rows("x", np.empty(0, int)).shape == (0, 3)
+    assert np.array_equal(table.row("x", 700), whole[700]) and not table.row("x", 700).flags.writeable
 
 
 def test_rows_are_found_in_every_version_once_asked_for_in_one():
@@ -85,6 +86,11 @@ def test_wrong_use_is_refused():
         table.rows("x", np.array([0, 3]))
     with pytest.raises(IndexError, match="row -1 of a table of 3"):
         table.rows("x", np.array([0, -1]))
+    with pytest.raises(IndexError, match="row 3 of a table of 3"):
+        table.row("x", 3)
+    for outside in (-1, 3):
+        with pytest.raises(IndexError, match="of a table of 3"):
+            table.updated(np.array([0, outside]), n=np.zeros(2))
     with pytest.raises(ValueError, match="appended needs equally long columns"):
         table.appended(x=np.zeros((2, 3)), n=np.zeros(1))
     with pytest.raises(ValueError, match="appended needs equally long columns"):
@@ -98,6 +104,14 @@ def test_several_columns_gathered_are_the_rows_of_each():
         np.testing.assert_array_equal(a, table.column("a")[chosen])
         np.testing.assert_array_equal(b, table.rows("b", chosen))
         np.testing.assert_array_equal(b, chosen)
+
+
+def test_columns_may_have_no_bytes_and_ids_any_order():
+    table, ids = Table.empty({"a": Column("u1", (0,)), "b": Column("?")}).appended(a=np.zeros((700, 0)), b=np.zeros(700))
+    chosen = ids[::-7]
+    after = table.updated(chosen, a=np.zeros((len(chosen), 0)), b=np.ones(len(chosen)))
+    assert after.rows("a", chosen).shape == (100, 0) and np.array_equal(np.flatnonzero(after.column("b")), chosen[::-1])
+    assert after.updated(ids[:0], b=np.zeros(0)) is after
 
 
 def test_empty_chunks_hold_zeros_and_no_memory():
