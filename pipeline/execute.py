@@ -22,7 +22,7 @@ from trihedron.pipeline import kernels, results
 from trihedron.pipeline.config import Feedback, graph_of
 from trihedron.pipeline.errors import ConfigError, DataError, RecordingError, TrihedronError, did_you_mean
 from trihedron.pipeline.graph import Graph
-from trihedron.pipeline.interrupts import held_interrupts
+from trihedron.pipeline.interrupts import Interrupts
 from trihedron.pipeline.live import Pace, is_camera
 from trihedron.pipeline.recording import Recording, RecordingWriter
 from trihedron.pipeline.runner import Runner
@@ -72,7 +72,7 @@ def execute(config: DictConfig, out: Path, overrides: list[str], began: float) -
             if config.save_map:
                 runner.keeper.save(Path(config.save_map).expanduser(), _metadata(config, overrides), source)
         finally:
-            with held_interrupts():
+            with Interrupts() as interrupts, interrupts.held():
                 failure = _closed(writer)
                 metrics, timing = _write(runner, truth, out, started, began)
                 warnings.summarise()

@@ -20,7 +20,7 @@ from trihedron.pipeline.foxglove import View
 from trihedron.pipeline.graph import Graph, Stage, Wire
 from trihedron.pipeline.heap import give_back
 from trihedron.pipeline.intake import Intake
-from trihedron.pipeline.interrupts import held_interrupts
+from trihedron.pipeline.interrupts import Interrupts
 from trihedron.pipeline.live import Pace, feed_of, is_camera
 from trihedron.pipeline.recording import FRAMES_TOPIC, RecordingWriter, TopicReader
 from trihedron.pipeline.registry import check_value
@@ -121,9 +121,9 @@ class Runner:
         scheduler = Scheduler(self._nodes(), self.threads, self.threads, before.held, recent)
         view = View(truth)
         try:
-            with single_threaded_libraries(), self._feeding():
+            with single_threaded_libraries(), self._feeding(), Interrupts() as interrupts:
                 for position, values in scheduler.run(self.count):
-                    with held_interrupts():
+                    with interrupts.held():
                         if self._account(position, values) and writer is not None:
                             self._record(writer, view, position, values, topics, embed_frames)
                     for times in (self._calls_ms, self._latency_ms, self._handed_over):

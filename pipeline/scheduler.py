@@ -18,7 +18,7 @@ import time
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
-from enum import Enum
+from enum import IntEnum
 from typing import Any
 
 import cv2
@@ -43,7 +43,7 @@ class Node:
     waits: bool = False
 
 
-class Lane(Enum):
+class Lane(IntEnum):
     """Which threads a task is for: the workers, the one for what may lag, or the one that waits."""
 
     prompt = 0
@@ -95,7 +95,7 @@ class Scheduler:
                 self._consumers[node.name].append((node.name, PREVIOUS))
         self._kept = {name: max([0, *(delay for _, delay in self._consumers[name])]) for name in self._nodes}  # how many frames a value is asked for
         lagging = {name for name in self._nodes if self._consumers[name] and all(delay > 0 for _, delay in self._consumers[name])}
-        self._prompt = [name for name in self._nodes if name not in lagging]
+        self._prompt = set(self._nodes) - lagging
         self._lanes = dict.fromkeys(self._nodes, Lane.prompt)
         self._lanes.update(dict.fromkeys(lagging if threads > 1 else (), Lane.lagging))
         self._lanes.update(dict.fromkeys((node.name for node in nodes if node.waits), Lane.waiting))
@@ -105,6 +105,8 @@ class Scheduler:
         self._ready: dict[Lane, list[tuple[int, float, int, str]]] = {lane: [] for lane in Lane}
         self._unmet: dict[tuple[str, int], int] = {}
         self._undone: dict[int, int] = {}  # how many nodes a frame still waits for
+        self._prompt_undone: dict[int, int] = {}  # how many of these may not lag
+        self._in_flight = 0  # the first frame that still waits for one which may not lag
         self._values: dict[str, dict[int, Any]] = {name: {} for name in self._nodes}
         self._held: dict[str, dict[int, Any]] = {name: {} for name in self._nodes}
         self._frontier = dict.fromkeys(self._nodes, 0)  # frames done without a gap
@@ -155,13 +157,12 @@ class Scheduler:
         ready = self._ready[lane]
         return bool(ready) and ready[0][0] < self._count and (self._failure is None or ready[0][0] <= self._failure.position)
 
-    def _admit(self) -> None:
-        """Let frames in while few enough are in flight and the consumer keeps up."""
-        in_flight_until = min(self._frontier[name] for name in self._prompt) + self._lookahead
-        limit = min(self._count, in_flight_until, self._consumed + self._lookahead + self._reach)
+    def _admit(self, mine: Lane | None = None) -> None:
+        """Let frames in while few enough are in flight and the consumer keeps up, and wake who can work, for one task less in the caller's lane."""
+        limit = min(self._count, self._in_flight + self._lookahead, self._consumed + self._lookahead + self._reach)
         while self._admitted < limit:
             self._judge_urgency()
-            self._undone[self._admitted] = len(self._nodes)
+            self._undone[self._admitted], self._prompt_undone[self._admitted] = len(self._nodes), len(self._prompt)
             for name, node in self._nodes.items():
                 wires = [*node.inputs.values(), *([Wire(name, PREVIOUS)] if node.ordered else [])]
                 self._unmet[name, self._admitted] = sum(not self._there(wire, self._admitted) for wire in wires)
@@ -169,8 +170,8 @@ class Scheduler:
                 self._offer(name, self._admitted)
             self._admitted += 1
         for lane, ready in self._ready.items():
-            if ready:
-                self._work_there[lane].notify(len(ready))
+            if len(ready) > (lane is mine):
+                self._work_there[lane].notify(len(ready) - (lane is mine))
 
     def _judge_urgency(self) -> None:
         """The upward rank of list scheduling (Topcuoglu, Hariri, Wu: HEFT, 2002)."""
@@ -216,7 +217,7 @@ class Scheduler:
                     self._count = min(self._count, position)
                 elif failure is None:
                     self._complete(name, position, value)
-                    self._admit()
+                    self._admit(lane)
                 elif self._failure is None or (position, self._rank[name]) < (self._failure.position, self._rank[self._failure.node]):
                     self._failure = failure
                 if self._failure is not None or self._count <= self._consumed or self._settled(self._consumed):
@@ -231,6 +232,11 @@ class Scheduler:
     def _complete(self, name: str, position: int, value: Any) -> None:
         self._values[name][position] = value
         self._undone[position] -= 1
+        if name in self._prompt:
+            self._prompt_undone[position] -= 1
+        while self._prompt_undone.get(self._in_flight) == 0:
+            del self._prompt_undone[self._in_flight]
+            self._in_flight += 1
         for consumer, delay in self._consumers[name]:
             if delay != PREVIOUS:
                 self._meet(consumer, position + delay)
