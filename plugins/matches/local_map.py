@@ -53,11 +53,12 @@ class LocalMap(MapSearch):
 
     def _guess(self, rotation: Rotation, translation: Translation, relocalise: Pose | None) -> Guess:
         if relocalise is not None and relocalise.status == OK:
-            return Guess(relocalise.T_world_camera, _sigma(relocalise.covariance[:3, :3]), _sigma(relocalise.covariance[3:, 3:]), True)
+            return Guess(relocalise.T_world_camera, *_sigmas(relocalise.covariance[:3, :3], relocalise.covariance[3:, 3:]), True)
         T = pose_matrix(rotation.R_world_camera, translation.t_world_camera)
-        return Guess(T, _sigma(translation.covariance), _sigma(rotation.covariance), translation.estimated)
+        return Guess(T, *_sigmas(translation.covariance, rotation.covariance), translation.estimated)
 
 
-def _sigma(covariance: F64) -> float:
-    """The largest standard deviation."""
-    return float(np.sqrt(np.linalg.norm(covariance, 2)))
+def _sigmas(position: F64, rotation: F64) -> tuple[float, float]:
+    """The largest standard deviation of each."""
+    sigma_m, sigma_rad = np.sqrt(np.linalg.svd(np.array([position, rotation]), compute_uv=False)[:, 0]).tolist()
+    return sigma_m, sigma_rad

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
+import numba
 import numpy as np
+from numpy.typing import NDArray
 
 from trihedron.pipeline.geometry import invert, transform, transform_planes
-from trihedron.pipeline.types import F32, F64, I32, U8, Bool, Camera, Frame, Keypoints, Map, Matches, Planes, Segments
+from trihedron.pipeline.types import F64, I32, U8, Camera, Frame, Keypoints, Map, Matches, Planes, Segments
 from trihedron.plugins.numerics.images.descriptors import match_lines, match_near
 from trihedron.plugins.numerics.maps.local_window import LocalWindow
 from trihedron.plugins.numerics.maps.visibility import VisiblePoints, clip_segments, visible_points
@@ -61,26 +64,24 @@ class MapSearch:
 
     def search(self, frame: Frame, guess: Guess, keypoints: Keypoints, segments: Segments, planes: Planes, map: Map, window: LocalWindow) -> Matches:
         """Landmarks of the window found around the guess."""
-        T = guess.T_world_camera
+        T_camera_world = invert(guess.T_world_camera)
         pairs, visible = self._points(frame.camera, guess, keypoints, map, window)
-        line_pairs, visible_lines = self._lines(frame.camera, T, segments, map, window)
-        same, parallel, perpendicular = self._planes(T, planes, map, window)
+        line_pairs, visible_lines = self._lines(frame.camera, T_camera_world, segments, map, window)
+        same, parallel, perpendicular = self._planes(T_camera_world, planes, map, window)
         return Matches(frame.index, frame.stamp_ns, map.revision, pairs, line_pairs, same, parallel, perpendicular, visible, visible_lines)
 
     def _radius(self, camera: Camera, z: F64, guess: Guess) -> F64:
         """Search radius (px at level 0) for points at depth z: three standard deviations of the guess."""
         moved = guess.sigma_m / np.maximum(z, 0.1)
-        return np.clip(self.radius_px + 3.0 * camera.fx * np.hypot(moved, guess.sigma_rad), self.radius_px, self.max_radius_px)
+        return np.minimum(self.radius_px + 3.0 * camera.fx * np.hypot(moved, guess.sigma_rad), self.max_radius_px)
 
     def _points(self, camera: Camera, guess: Guess, keypoints: Keypoints, map: Map, window: LocalWindow) -> tuple[I32, I32]:
         """Pairs (row, id) and the ids expected in view."""
         seen = visible_points(map.points, window.points, guess.T_world_camera, camera, self.view_deg, self.octave_scale)
         descriptors = map.points.rows("descriptor", seen.ids)
-        found = np.empty(0, np.int32)
-        for radius in (self._radius(camera, seen.depth_m, guess), np.full(len(seen.ids), self.wide_radius_px)):
-            found = self._near(seen, descriptors, keypoints, radius)
-            if guess.measured and np.count_nonzero(found >= 0) >= min(self.enough, len(seen.ids), len(keypoints.pixels)):
-                break
+        found = self._near(seen, descriptors, keypoints, self._radius(camera, seen.depth_m, guess))
+        if not guess.measured or np.count_nonzero(found >= 0) < min(self.enough, len(seen.ids), len(keypoints.pixels)):
+            found = self._near(seen, descriptors, keypoints, np.full(len(seen.ids), self.wide_radius_px))
         return _pairs(found, seen.ids), seen.ids
 
     def _near(self, seen: VisiblePoints, descriptors: U8, keypoints: Keypoints, radius_px: F64) -> I32:
@@ -99,8 +100,8 @@ class MapSearch:
             keypoints.metric,
         )
 
-    def _lines(self, camera: Camera, T: F64, segments: Segments, map: Map, window: LocalWindow) -> tuple[I32, I32]:
-        pixels, inside = clip_segments(transform(invert(T), map.lines.rows("endpoints_m", window.lines)), camera)
+    def _lines(self, camera: Camera, T_camera_world: F64, segments: Segments, map: Map, window: LocalWindow) -> tuple[I32, I32]:
+        pixels, inside = clip_segments(transform(T_camera_world, map.lines.rows("endpoints_m", window.lines)), camera)
         ids = window.lines[inside]
         found = match_lines(
             pixels[inside].astype(np.float32),
@@ -115,35 +116,50 @@ class MapSearch:
         )
         return _pairs(found, ids), ids
 
-    def _planes(self, T: F64, planes: Planes, map: Map, window: LocalWindow) -> tuple[I32, I32, I32]:
+    def _planes(self, T_camera_world: F64, planes: Planes, map: Map, window: LocalWindow) -> tuple[I32, I32, I32]:
         """Pairs (row, id) of the same plane, of parallel and of perpendicular ones."""
-        T_camera_world = invert(T)
-        known = transform_planes(T_camera_world, map.planes.rows("coefficients", window.planes))
-        samples: F32 = transform(T_camera_world, map.planes.rows("samples_m", window.planes)).astype(np.float32)
+        world, samples, covariance = map.planes.gathered(window.planes, "coefficients", "samples_m", "covariance")
+        known = transform_planes(T_camera_world, world)
+        samples = transform(T_camera_world, samples).astype(np.float32)
         same = associate_planes(planes.coefficients, planes.samples_m, known, samples, self.plane_angle_deg, self.plane_distance_m, True)
-        cosine = planes.coefficients[:, :3] @ known[:, :3].T
-        other = np.ones(cosine.shape, np.bool_)
-        other[same[:, 0], same[:, 1]] = False
-        limit = np.radians(self.parallel_deg)
-        trace = np.trace(map.planes.rows("covariance", window.planes)[:, :2, :2], axis1=1, axis2=2)
-        parallel = self._best(other & (np.abs(cosine) > np.cos(limit)), trace)
-        perpendicular = self._best(other & (np.abs(cosine) < np.sin(limit)), trace)
-        return _named(same, window.planes), _named(parallel, window.planes), _named(perpendicular, window.planes)
+        order = (covariance[:, 0, 0] + covariance[:, 1, 1]).argsort(kind="stable")  # those whose normals are known best first
+        limit = math.radians(self.parallel_deg)
+        parallel, perpendicular = _related(
+            planes.coefficients, known, same, order, window.planes, math.cos(limit), math.sin(limit), self.relations
+        )
+        same[:, 1] = window.planes[same[:, 1]]
+        return same, parallel, perpendicular
 
-    def _best(self, related: Bool, trace: F64) -> I32:
-        """For each observed plane (row) the `relations` related map planes (columns) whose normals are known best."""
-        order = np.argsort(trace, kind="stable")
-        ranked = related[:, order]
-        rows, columns = np.nonzero(ranked & (np.cumsum(ranked, axis=1) <= self.relations))
-        return np.stack([rows, order[columns]], axis=-1).astype(np.int32)
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _related(
+    planes: F64, known: F64, same: I32, order: NDArray[np.int64], ids: I32, parallel_above: float, perpendicular_below: float, most: int
+) -> tuple[I32, I32]:
+    """Pairs (row, id) of each plane and the `most` known ones, first in order, that are parallel to it, and perpendicular, but for the same ones."""
+    n, one = len(planes), np.full(len(planes), -1, np.int32)
+    parallel, perpendicular = np.empty((n * most, 2), np.int32), np.empty((n * most, 2), np.int32)
+    p, q = 0, 0
+    for k in range(len(same)):
+        one[same[k, 0]] = same[k, 1]
+    for i in range(n):
+        p_end, q_end = p + most, q + most
+        for j in order:
+            cosine = abs(planes[i, 0] * known[j, 0] + planes[i, 1] * known[j, 1] + planes[i, 2] * known[j, 2])
+            if j == one[i]:
+                continue
+            if cosine > parallel_above and p < p_end:
+                parallel[p, 0], parallel[p, 1] = i, ids[j]
+                p += 1
+            if cosine < perpendicular_below and q < q_end:
+                perpendicular[q, 0], perpendicular[q, 1] = i, ids[j]
+                q += 1
+    return parallel[:p], perpendicular[:q]
 
 
 def _pairs(found: I32, ids: I32) -> I32:
     """Row found for each landmark (-1 = none) -> (n, 2) pairs (row, id) sorted by row."""
     hit = np.flatnonzero(found >= 0)
-    pairs = np.stack([found[hit], ids[hit]], axis=-1).astype(np.int32)
-    return pairs[np.argsort(pairs[:, 0], kind="stable")]
-
-
-def _named(pairs: I32, ids: I32) -> I32:
-    return np.stack([pairs[:, 0], ids[pairs[:, 1]]], axis=-1).astype(np.int32)
+    hit = hit[found[hit].argsort(kind="stable")]
+    pairs = np.empty((len(hit), 2), np.int32)
+    pairs[:, 0], pairs[:, 1] = found[hit], ids[hit]
+    return pairs

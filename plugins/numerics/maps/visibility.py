@@ -29,10 +29,15 @@ class VisiblePoints:
 def visible_points(points: Table, ids: I32, T_world_camera: F64, camera: Camera, view_deg: float, octave_scale: float) -> VisiblePoints:
     """Those of the points `ids` that lie in the image, are seen from within `view_deg` of the last direction and at a similar distance."""
     world, directions, distances, seen_at = points.gathered(ids, "position_m", "direction", "distance_m", "octave")
-    intrinsics = (float(camera.fx), float(camera.fy), float(camera.cx), float(camera.cy), camera.width, camera.height)
     cosine, log_scale = float(np.cos(np.radians(view_deg))), float(np.log(octave_scale))
-    rows, pixels, depth, octaves = _seen(world, directions, distances, seen_at, constant(T_world_camera, np.float64), intrinsics, cosine, log_scale)
+    T, pinhole = constant(T_world_camera, np.float64), _pinhole(camera)
+    rows, pixels, depth, octaves = _seen(world, directions, distances, seen_at, T, pinhole, cosine, log_scale)
     return VisiblePoints(ids[rows], pixels, depth, octaves)
+
+
+def _pinhole(camera: Camera) -> tuple[float, float, float, float, int, int]:
+    """The camera as kernels take it."""
+    return float(camera.fx), float(camera.fy), float(camera.cx), float(camera.cy), camera.width, camera.height
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
@@ -90,18 +95,35 @@ def clip_segments(endpoints_m: F64, camera: Camera) -> tuple[F64, Bool]:
     """Project camera-frame segments (n, 2, 3), cut where they pass behind the camera or leave the image.
 
     Returns (n, 2, 2) pixels and (n,) whether anything (more than a pixel) is left (Liang–Barsky)."""
-    a, b = endpoints_m[:, 0], endpoints_m[:, 1]
-    step = np.where(np.abs(b[:, 2] - a[:, 2]) < 1e-9, 1e-9, b[:, 2] - a[:, 2])
-    cut = ((NEAR_M - a[:, 2]) / step)[:, None]
-    start = np.where((a[:, 2] < NEAR_M)[:, None], a + cut * (b - a), a)
-    end = np.where((b[:, 2] < NEAR_M)[:, None], a + cut * (b - a), b)
-    front = (a[:, 2] >= NEAR_M) | (b[:, 2] >= NEAR_M)
-    p, q = camera.project(start), camera.project(end)
-    low, high = np.zeros(len(p)), np.ones(len(p))
-    for axis, size in ((0, camera.width), (1, camera.height)):
-        delta = np.where(np.abs(q[:, axis] - p[:, axis]) < 1e-9, 1e-9, q[:, axis] - p[:, axis])
-        first, last = (-0.5 - p[:, axis]) / delta, (size - 0.5 - p[:, axis]) / delta
-        low, high = np.maximum(low, np.minimum(first, last)), np.minimum(high, np.maximum(first, last))
-    pixels = np.stack([p + low[:, None] * (q - p), p + high[:, None] * (q - p)], axis=1)
-    length = (high - low) * np.linalg.norm(q - p, axis=1)
-    return pixels, front & (length > 1.0)
+    pixels, left = _clipped(constant(endpoints_m, np.float64), _pinhole(camera))
+    return pixels, left
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _clipped(endpoints: F64, intrinsics: tuple[float, float, float, float, int, int]) -> tuple[F64, Bool]:
+    fx, fy, cx, cy, width, height = intrinsics
+    pixels, left = np.empty((len(endpoints), 2, 2)), np.zeros(len(endpoints), np.bool_)
+    for i in range(len(endpoints)):
+        start, end = endpoints[i, 0, 2], endpoints[i, 1, 2]
+        cut = (NEAR_M - start) / (1e-9 if abs(end - start) < 1e-9 else end - start)
+        for k in range(2):
+            x, y, z = endpoints[i, k, 0], endpoints[i, k, 1], endpoints[i, k, 2]
+            if z < NEAR_M:
+                x = endpoints[i, 0, 0] + cut * (endpoints[i, 1, 0] - endpoints[i, 0, 0])
+                y = endpoints[i, 0, 1] + cut * (endpoints[i, 1, 1] - endpoints[i, 0, 1])
+                z = start + cut * (end - start)
+            pixels[i, k, 0], pixels[i, k, 1] = fx * x / z + cx, fy * y / z + cy
+        low, high = 0.0, 1.0
+        for axis, size in ((0, width), (1, height)):
+            p = pixels[i, 0, axis]
+            delta = pixels[i, 1, axis] - p
+            if abs(delta) < 1e-9:
+                delta = 1e-9
+            first, last = (-0.5 - p) / delta, (size - 0.5 - p) / delta
+            low, high = max(low, min(first, last)), min(high, max(first, last))
+        u, v = pixels[i, 0, 0], pixels[i, 0, 1]
+        du, dv = pixels[i, 1, 0] - u, pixels[i, 1, 1] - v
+        pixels[i, 0, 0], pixels[i, 0, 1] = u + low * du, v + low * dv
+        pixels[i, 1, 0], pixels[i, 1, 1] = u + high * du, v + high * dv
+        left[i] = (start >= NEAR_M or end >= NEAR_M) and (high - low) * np.sqrt(du * du + dv * dv) > 1.0
+    return pixels, left
