@@ -6,6 +6,7 @@ import numba
 import numpy as np
 
 from trihedron.pipeline.types import F64, I32, U8, Keypoints, Map, Segments
+from trihedron.plugins.numerics.algebra.small_linear import polar_rotation
 from trihedron.plugins.numerics.images.descriptors import U64, hamming, words_of
 from trihedron.plugins.numerics.maps.local_window import WEIGHTS, observed_by
 
@@ -83,33 +84,46 @@ def apart(T: F64, other: F64) -> bool:
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
+def _as_long(camera_m: F64, world_m: F64, limit: F64, i: int, j: int) -> bool:
+    """Whether two pairs of places are as far apart here as there, and far enough to tell a direction."""
+    here, there = 0.0, 0.0
+    for r in range(3):
+        here += (camera_m[i, r] - camera_m[j, r]) ** 2
+        there += (world_m[i, r] - world_m[j, r]) ** 2
+    return here > 0.1**2 and abs(np.sqrt(here) - np.sqrt(there)) <= limit[i] + limit[j]
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _consensus(camera_m: F64, world_m: F64, limit: F64, draws: I32) -> tuple[F64, I32]:
     """Pose and number of agreeing pairs of each draw; 0 for one whose triangles differ."""
     poses, support = np.zeros((len(draws), 4, 4)), np.zeros(len(draws), np.int32)
+    M, p, q, t = np.empty((3, 3)), np.empty(3), np.empty(3), np.empty(3)
     for k in range(len(draws)):
         a, b, c = draws[k, 0], draws[k, 1], draws[k, 2]
         if a in (b, c) or b == c:
             continue
-        same = True
-        for i, j in ((a, b), (b, c), (c, a)):
-            before, after = np.linalg.norm(camera_m[i] - camera_m[j]), np.linalg.norm(world_m[i] - world_m[j])
-            same &= before > 0.1 and abs(before - after) <= limit[i] + limit[j]
-        if not same:
+        if not (_as_long(camera_m, world_m, limit, a, b) and _as_long(camera_m, world_m, limit, b, c) and _as_long(camera_m, world_m, limit, c, a)):
             continue
-        p, q = np.empty((3, 3)), np.empty((3, 3))
-        for i, row in enumerate((a, b, c)):
-            p[i], q[i] = camera_m[row], world_m[row]
-        middle_p, middle_q = (p[0] + p[1] + p[2]) / 3.0, (q[0] + q[1] + q[2]) / 3.0
-        U, _, Vt = np.linalg.svd(np.ascontiguousarray((q - middle_q).T) @ (p - middle_p))
-        if np.linalg.det(U) * np.linalg.det(Vt) < 0.0:
-            U[:, 2] = -U[:, 2]
-        R = U @ Vt
-        t = middle_q - R @ middle_p
+        for r in range(3):
+            p[r] = (camera_m[a, r] + camera_m[b, r] + camera_m[c, r]) / 3.0
+            q[r] = (world_m[a, r] + world_m[b, r] + world_m[c, r]) / 3.0
+        for r in range(3):
+            for s in range(3):
+                M[r, s] = 0.0
+                for i in (a, b, c):
+                    M[r, s] += (world_m[i, r] - q[r]) * (camera_m[i, s] - p[s])
+        R = polar_rotation(M)
+        for r in range(3):
+            t[r] = q[r] - (R[r, 0] * p[0] + R[r, 1] * p[1] + R[r, 2] * p[2])
         for i in range(len(camera_m)):
             square = 0.0
             for r in range(3):
                 e = R[r, 0] * camera_m[i, 0] + R[r, 1] * camera_m[i, 1] + R[r, 2] * camera_m[i, 2] + t[r] - world_m[i, r]
                 square += e * e
             support[k] += square <= limit[i] * limit[i]
-        poses[k, :3, :3], poses[k, :3, 3], poses[k, 3, 3] = R, t, 1.0
+        for r in range(3):
+            poses[k, r, 3] = t[r]
+            for s in range(3):
+                poses[k, r, s] = R[r, s]
+        poses[k, 3, 3] = 1.0
     return poses, support
