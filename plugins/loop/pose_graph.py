@@ -34,7 +34,7 @@ class PoseGraph:
     def __call__(self, map: Map, frame: Frame) -> Correction | None:
         """The correction of all keyframes; None unless the newest one is due and closes a cycle."""
         newest = len(map.keyframes) - 1
-        if newest < 2 or newest % self.every or int(map.keyframes.rows("index", np.array([newest]))[0]) != frame.index:
+        if newest < 2 or newest % self.every or map.keyframes.row("index", newest) != frame.index:
             return None
         rows = keyframes_of(map, current_submap(map))
         before = map.keyframes.rows("T_world_camera", rows)

@@ -2,20 +2,21 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 
 import numpy as np
 
-from trihedron.pipeline.geometry import rotation_angle_deg
+from trihedron.pipeline.geometry import invert
 from trihedron.pipeline.registry import register
-from trihedron.pipeline.types import DEGRADED, I32, LOST, Correction, Frame, Keypoints, Map, Matches, Planes, Pose, Segments
+from trihedron.pipeline.types import DEGRADED, F32, I32, LOST, Correction, Frame, Keypoints, Map, Matches, Planes, Pose, Segments
 from trihedron.plugins.numerics.maps import insertion
 from trihedron.plugins.numerics.maps.anchoring import anchored
 from trihedron.plugins.numerics.maps.association import Associated, associate, existing
 from trihedron.plugins.numerics.maps.correction import apply_correction
 from trihedron.plugins.numerics.maps.culling import cull, cull_keyframe, cull_repeated
 from trihedron.plugins.numerics.maps.landmarks import empty_map
-from trihedron.plugins.numerics.maps.local_window import current_submap, keyframes_of, local_window, newest_keyframes
+from trihedron.plugins.numerics.maps.local_window import WEIGHTS, keyframes_of, local_window, newest_keyframes
 from trihedron.plugins.numerics.maps.merging import merge_lines, merge_planes, merge_points
 from trihedron.plugins.numerics.maps.retiring import released
 from trihedron.plugins.numerics.maps.submaps import submap_of, tied
@@ -79,13 +80,14 @@ class Covisibility:
         corrected = self._corrected(map, bundle, loop)
         if corrected is not None and relocalise is not None and relocalise.status == DEGRADED and pose.status != LOST:
             corrected = tied(corrected, anchored(pose, corrected), anchored(relocalise, corrected), self.merge_deg, self.merge_m)
-        pose = replace(anchored(pose, corrected), submap=submap_of(pose, corrected))
-        matches = existing(matches, corrected) if matches is not None and corrected is not None else None
+        pose = _in_its_submap(anchored(pose, corrected), corrected)
         if corrected is None:
+            matches = None
             lengths = keypoints.descriptors.shape[1], segments.descriptors.shape[1], planes.samples_m.shape[1]
             corrected = empty_map(frame.index, frame.stamp_ns, *lengths)
         elif pose.status == LOST or not self._wanted(frame, pose, planes, matches, corrected):
             return None if corrected is map else self._version(corrected, frame)
+        matches = existing(matches, corrected) if matches is not None else None
         return self._version(self._inserted(corrected, frame, pose, keypoints, segments, planes, matches), frame)
 
     def _corrected(self, map: Map | None, *corrections: Correction | None) -> Map | None:
@@ -99,24 +101,26 @@ class Covisibility:
 
     def _wanted(self, frame: Frame, pose: Pose, planes: Planes, matches: Matches | None, map: Map) -> bool:
         """Whether this frame shows enough that is new."""
-        newest = newest_keyframes(map, 1)
-        if not len(newest) or current_submap(map) != pose.submap:
+        keyframes, newest = map.keyframes, newest_keyframes(map, 1).tolist()
+        if not newest or keyframes.row("submap", newest[0]) != pose.submap:
             return True
-        frames = frame.index - int(map.keyframes.rows("index", newest)[0])
+        frames = frame.index - int(keyframes.row("index", newest[0]))
         if 0 <= frames < self.min_frames:  # less than 0: a keyframe of another sequence
             return False
-        T = np.linalg.inv(map.keyframes.rows("T_world_camera", newest)[0]) @ pose.T_world_camera
-        moved = max(float(np.linalg.norm(T[:3, 3])) / self._shift_m(frame), rotation_angle_deg(T[:3, :3]) / self.min_turn_deg)
-        spans = np.array([map.keyframes.rows(kind, newest)[0] for kind in ("points", "lines", "planes")])
-        poor = bool((pose.inliers @ [1, 5, 20]) < self.min_share * ((spans[:, 1] - spans[:, 0]) @ [1, 5, 20]))
-        known = matches.planes[:, 0] if matches is not None else np.empty(0, np.int32)
-        unknown = np.setdiff1d(np.flatnonzero(planes.pixels > self.new_plane_px), known)
-        return moved > 1.0 or poor or len(unknown) > 0 or (frames >= self.max_frames and moved > STALE)
+        T = invert(keyframes.row("T_world_camera", newest[0])) @ pose.T_world_camera
+        turned_deg = math.degrees(math.acos(min(max(0.5 * (T.trace() - 2.0), -1.0), 1.0)))
+        moved = max(math.hypot(*T[:3, 3].tolist()) / self._shift_m(frame), turned_deg / self.min_turn_deg)
+        spans = [keyframes.row(kind, newest[0]).tolist() for kind in ("points", "lines", "planes")]
+        poor = _weighed(pose.inliers.tolist()) < self.min_share * _weighed([end - begin for begin, end in spans])
+        unknown = planes.pixels > self.new_plane_px
+        if matches is not None:
+            unknown[matches.planes[matches.planes[:, 1] < len(map.planes), 0]] = False
+        return moved > 1.0 or poor or bool(unknown.any()) or (frames >= self.max_frames and moved > STALE)
 
     def _shift_m(self, frame: Frame) -> float:
         """Way that makes a keyframe."""
         depth = frame.depth_m[::8, ::8]
-        return self.min_shift * (float(np.median(depth[depth > 0.0])) if (depth > 0.0).any() else 1.0)
+        return self.min_shift * _median(depth[depth > 0.0], 1.0)
 
     def _inserted(
         self, map: Map, frame: Frame, pose: Pose, keypoints: Keypoints, segments: Segments, planes: Planes, matches: Matches | None
@@ -157,3 +161,22 @@ class Covisibility:
         """New segments long enough to be found again."""
         ends = segments.endpoints_px[found.new_lines]
         return found.new_lines[np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1) >= self.min_line_px]
+
+
+def _in_its_submap(pose: Pose, map: Map | None) -> Pose:
+    """The pose, said in the sub-map that its reference keyframe belongs to by now."""
+    submap = submap_of(pose, map)
+    return pose if submap == pose.submap else replace(pose, submap=submap)
+
+
+def _weighed(counts: list[int]) -> int:
+    """Points, lines and planes as one number, weighed as in co-visibility."""
+    return sum(weight * count for weight, count in zip(WEIGHTS.values(), counts))
+
+
+def _median(values: F32, default: float) -> float:
+    """As NumPy's, of values without NaN; the default of none."""
+    if not len(values):
+        return default
+    middle = [(len(values) - 1) // 2, len(values) // 2]
+    return float(np.partition(values, middle)[middle].mean())

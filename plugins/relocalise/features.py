@@ -82,7 +82,7 @@ class Features:
         best = self._only_one(found)
         if best is None:
             return replace(previous_pose, index=frame.index, stamp_ns=frame.stamp_ns, reason="nothing was recognised") if lost else None
-        return self._said(best, frame, map, int(map.keyframes.rows("submap", among[:1])[0]), lost)
+        return self._said(best, frame, map, int(map.keyframes.row("submap", int(among[0]))), lost)
 
     def _in_nothing(self, view: View, rng: np.random.Generator) -> None:
         """Look for the first frame in an empty map: the kernels are compiled now, before the clock starts, and not when the camera is lost."""

@@ -20,7 +20,7 @@ def anchored(pose: Pose, map: Map | None) -> Pose:
     """The pose hung on its reference keyframe's newest `T_world_camera`; the very pose that was said when that has not moved, or there is none."""
     if map is None or not 0 <= pose.reference < len(map.keyframes):
         return pose
-    T_world_keyframe = map.keyframes.rows("T_world_camera", np.array([pose.reference]))[0]
+    T_world_keyframe = map.keyframes.row("T_world_camera", pose.reference)
     relative = invert(T_world_keyframe) @ pose.T_world_camera
     if np.abs(relative - pose.T_reference_camera).max() < UNMOVED:
         return pose

@@ -66,7 +66,7 @@ def _carry(map: Map, correction: Correction, newest: int, T_corrected: F64) -> M
     later = later[map.keyframes.rows("submap", later) == map.keyframes.rows("submap", np.array([newest]))]
     if not len(later):
         return map
-    T = T_corrected @ invert(map.keyframes.rows("T_world_camera", np.array([newest]))[0])
+    T = T_corrected @ invert(map.keyframes.row("T_world_camera", newest))
     points = _born_after(map, "point", newest, later, correction.point_ids)
     lines = _born_after(map, "line", newest, later, correction.line_ids)
     return carried(map, T, later, points, lines, _born_after(map, "plane", newest, later, correction.plane_ids))

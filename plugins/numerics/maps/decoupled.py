@@ -77,4 +77,4 @@ def reference_of(map: Map | None, T_world_camera: F64, submap: int = 0) -> tuple
     newest = keyframes_of(map, submap)[-1:] if map is not None else np.empty(0, np.int32)
     if map is None or len(newest) == 0:
         return -1, T_world_camera
-    return int(newest[0]), invert(map.keyframes.rows("T_world_camera", newest)[0]) @ T_world_camera
+    return int(newest[0]), invert(map.keyframes.row("T_world_camera", int(newest[0]))) @ T_world_camera

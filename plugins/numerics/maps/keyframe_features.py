@@ -23,8 +23,8 @@ def features_of(map: Map, camera: Camera, T_world_camera: F64, seen: LocalWindow
 def measured_points(map: Map, keyframe: int) -> tuple[I32, F64, F64, F64]:
     """Ids (n,) of the points a keyframe measured with depth, sorted, their places (n, 3) in its axes by its own measurements, and σ of their depths
     (m) and pixels."""
-    first, end = map.keyframes.rows("points", np.array([keyframe]))[0]
-    fx, fy, cx, cy = map.keyframes.rows("intrinsics", np.array([keyframe]))[0]
+    first, end = map.keyframes.row("points", keyframe)
+    fx, fy, cx, cy = map.keyframes.row("intrinsics", keyframe)
     names = ("point", "pixel", "depth_m", "sigma_m", "sigma_px")
     ids, pixel, depth, sigma_m, sigma_px = map.point_observations.gathered(np.arange(first, end), *names)
     pixel, depth = pixel.astype(np.float64), depth.astype(np.float64)

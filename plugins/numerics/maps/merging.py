@@ -90,24 +90,33 @@ def merge_planes(map: Map, keyframe: int, max_deg: float, max_m: float) -> Map:
     """Join planes seen by this keyframe, or by those before it, that have become the same one. The older id lives on."""
     fresh = observed_by(map, np.array([keyframe], np.int32), "plane")
     around = observed_by(map, newest_keyframes(map, 5), "plane")
-    for b in around[::-1]:
-        older = around[around < b]
-        map = _joined_with_first(map, older if b in fresh else older[np.isin(older, fresh)], int(b), max_deg, max_m)
+    is_fresh, alike = np.isin(around, fresh), _alike(map.planes, around, max_deg)
+    for k in range(len(around) - 1, 0, -1):
+        older = alike[k, :k] if is_fresh[k] else alike[k, :k] & is_fresh[:k]
+        joined = _joined_with_first(map, around[:k][older], int(around[k]), max_m)
+        if joined is not map:
+            map, alike = joined, _alike(joined.planes, around, max_deg)
     return map
 
 
 def fuse_planes(map: Map, older: I32, newer: I32, max_deg: float, max_m: float) -> Map:
     """Join each of the planes `newer` with the first of the planes `older` that is the same one, both given by id."""
-    for b in newer:
-        map = _joined_with_first(map, older, int(b), max_deg, max_m)
+    for b in newer.tolist():
+        alike = _alike(map.planes, np.append(older, b), max_deg)[-1, :-1]
+        map = _joined_with_first(map, older[alike], b, max_m)
     return map
 
 
-def _joined_with_first(map: Map, among: I32, plane: int, max_deg: float, max_m: float) -> Map:
-    """Join a plane with the first of these that is the same one, if any is."""
-    cosine = float(np.cos(np.radians(max_deg)))
-    normals = map.planes.rows("coefficients", np.append(among, plane).astype(np.int32))[:, :3]
-    for other in among[normals[:-1] @ normals[-1] >= cosine].tolist():
+def _alike(planes: Table, ids: I32, max_deg: float) -> Bool:
+    """(n, n) which of the planes look one way."""
+    normals = planes.rows("coefficients", ids)[:, :3]
+    alike: Bool = normals @ normals.T >= np.cos(np.radians(max_deg))
+    return alike
+
+
+def _joined_with_first(map: Map, among: I32, plane: int, max_m: float) -> Map:
+    """Join a plane with the first of these, which look the same way, that is the same one, if any is."""
+    for other in among.tolist():
         if _are_one(map.planes, min(other, plane), max(other, plane), max_m):
             return _join(map, min(other, plane), max(other, plane))
     return map

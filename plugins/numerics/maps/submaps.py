@@ -18,7 +18,7 @@ def submap_of(pose: Pose, map: Map | None) -> int:
     """The sub-map a pose is in: that which its reference keyframe belongs to by now."""
     if map is None or not 0 <= pose.reference < len(map.keyframes):
         return pose.submap
-    return int(map.keyframes.rows("submap", np.array([pose.reference]))[0])
+    return int(map.keyframes.row("submap", pose.reference))
 
 
 def tied(map: Map, pose: Pose, recognised: Pose, max_deg: float, max_m: float) -> Map:

@@ -70,10 +70,10 @@ class LoopClosing(ABC):
 
     def __call__(self, map: Map, frame: Frame) -> Correction | None:
         """None unless the newest keyframe closes a loop, or the directions of the map say that it has turned."""
-        newest = np.array([len(map.keyframes) - 1])
-        if newest[0] < 0 or map.keyframes.rows("index", newest)[0] != frame.index or not map.keyframes.rows("alive", newest)[0]:
+        keyframes, newest = map.keyframes, len(map.keyframes) - 1
+        if newest < 0 or keyframes.row("index", newest) != frame.index or not keyframes.row("alive", newest):
             return None
-        closed = self._closed(map, frame, self.ranked(map)) if newest[0] % self.every == 0 else None
+        closed = self._closed(map, frame, self.ranked(map)) if newest % self.every == 0 else None
         return closed if closed is not None else self._straightened(map)
 
     @abstractmethod
@@ -108,7 +108,7 @@ class LoopClosing(ABC):
     def _recognised(self, map: Map, frame: Frame, place: Place) -> Closure | None:
         """The newest keyframe's pose by what the place's keyframes saw, or None when that is not certain."""
         newest = len(map.keyframes) - 1
-        T_before = map.keyframes.rows("T_world_camera", np.array([newest]))[0]
+        T_before = map.keyframes.row("T_world_camera", newest)
         expected = self._expected(place.walked_m)
         here = _seen_alone(map, newest, place.seen)
         features = features_of(map, frame.camera, T_before, here)

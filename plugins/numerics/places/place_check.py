@@ -80,7 +80,7 @@ def check_place(T_world_camera: F64, view: View, map: Map, among: I32, near: int
 
 
 def _window(map: Map, T: F64, among: I32, near: int) -> LocalWindow:
-    window = local_window(map, T, 0, 0, near, ABOUT_M, ABOUT_DEG, int(map.keyframes.rows("submap", among[:1])[0]))
+    window = local_window(map, T, 0, 0, near, ABOUT_M, ABOUT_DEG, int(map.keyframes.row("submap", int(among[0]))))
     return window if len(window.keyframes) else window_of(map, among)
 
 

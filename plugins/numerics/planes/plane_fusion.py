@@ -49,8 +49,9 @@ def fit_planes(moments: F64, like: F64) -> tuple[F64, F64]:
 
 def motion_between(old: F64, new: F64, centre: F64) -> F64:
     """(4, 4) smallest motion that takes the plane `old` (4,) to `new` (4,), turning about the point `centre` of the old one."""
-    axis = np.cross(old[:3], new[:3])
-    sine, cosine = float(np.linalg.norm(axis)), float(old[:3] @ new[:3])
+    (a, b, c), (x, y, z) = old[:3].tolist(), new[:3].tolist()
+    axis = np.array([b * z - c * y, c * x - a * z, a * y - b * x])
+    sine, cosine = float(np.sqrt(axis @ axis)), float(old[:3] @ new[:3])
     R = exp_so3(axis / sine * np.arctan2(sine, cosine)) if sine > 1e-12 else np.eye(3)
     T = np.eye(4)
     T[:3, :3] = R
