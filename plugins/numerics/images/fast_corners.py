@@ -16,15 +16,23 @@ def fast_corners(image: U8, threshold: int, margin: int) -> tuple[I32, I32]:
 
     A pixel's strength is the largest threshold at which it is a corner; only those of at least `threshold`, stronger than their eight neighbours
     and not nearer than `margin` (at least 4) px to the border are given. So the corners at a higher threshold are those of that strength."""
+    pixels, strengths = np.empty((image.size // 4, 2), np.int32), np.empty(image.size // 4, np.int32)
+    n = find_corners(image, threshold, margin, pixels, strengths, 0)
+    return pixels[:n].copy(), strengths[:n].copy()
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def find_corners(image: U8, threshold: int, margin: int, pixels: I32, strengths: I32, n: int) -> int:
+    """Writes the corners of `fast_corners` to `pixels` and `strengths` from row n on; returns the row after the last. A quarter of the image's pixels
+    cannot be more of them."""
     rows, cols = image.shape
     first = max(margin, RADIUS + 1) - 1  # neighbours are compared with beyond the margin
     width = cols - 2 * first
     if width < 3 or rows - 2 * first < 3:
-        return np.zeros((0, 2), np.int32), np.zeros(0, np.int32)
+        return n
     strength = np.zeros((3, width), np.uint8)  # of the last three rows
     peaks = np.zeros(-(-width // 8) * 8, np.uint8)  # of a row, looked through eight at a time
     eights = peaks.view(np.uint64)
-    pixels, strengths, n = np.empty((rows * cols // 4, 2), np.int32), np.empty(rows * cols // 4, np.int32), 0
     for y in range(first, rows - first):
         _strengths(image, y, first, strength[y % 3])
         if y < first + 2:
@@ -36,7 +44,7 @@ def fast_corners(image: U8, threshold: int, margin: int) -> tuple[I32, I32]:
                     if peaks[i] != 0:
                         pixels[n, 0], pixels[n, 1], strengths[n] = first + i, y - 1, peaks[i]
                         n += 1
-    return pixels[:n].copy(), strengths[:n].copy()
+    return n
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")

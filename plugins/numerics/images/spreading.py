@@ -5,28 +5,22 @@ from __future__ import annotations
 import numba
 import numpy as np
 
-from trihedron.pipeline.types import F32, I32, Bool
+from trihedron.pipeline.types import I32, Bool
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def spread_over_grid(pixels: F32, order: I32, width: int, height: int, cell_px: int, wanted: int) -> Bool:
-    """Which of n features to keep, (n,): each grid cell gives its best in turn until `wanted` are kept.
+def spread_over_cells(cells: I32, number: int, order: I32, wanted: int) -> Bool:
+    """Which of n features to keep, (n,): each of a `number` of cells of the image gives its best in turn until `wanted` are kept.
 
-    `pixels` (n, 2); `order` lists the rows from best to worst. The quota per cell is the largest that keeps the total within `wanted`,
-    and the best of the rest fill up, so a rich corner cannot take everything and an even image keeps its best."""
-    n = len(pixels)
-    keep = np.zeros(n, np.bool_)
+    `cells` (n,) says where each feature lies; `order` lists the rows from best to worst. The quota per cell is the largest that keeps the total
+    within `wanted`, and the best of the rest fill up, so a rich corner cannot take everything and an even image keeps its best."""
+    n = len(cells)
     if n <= wanted:
-        keep[:] = True
-        return keep
-    across, down = (width + cell_px - 1) // cell_px, (height + cell_px - 1) // cell_px
-    rank = np.zeros(n, np.int32)  # place within the cell
-    count = np.zeros(across * down, np.int32)
+        return np.ones(n, np.bool_)
+    keep, rank, count = np.zeros(n, np.bool_), np.zeros(n, np.int32), np.zeros(number, np.int32)  # rank: place within the cell
     for i in order:
-        c = min(max(int(pixels[i, 0]) // cell_px, 0), across - 1)
-        r = min(max(int(pixels[i, 1]) // cell_px, 0), down - 1)
-        rank[i] = count[r * across + c]
-        count[r * across + c] += 1
+        rank[i] = count[cells[i]]
+        count[cells[i]] += 1
     quota, total = 0, 0
     while True:
         more = 0
