@@ -9,7 +9,7 @@ import numpy as np
 from trihedron.pipeline.registry import register
 from trihedron.pipeline.types import Frame, Keypoints, Planes, Segments, Tracks
 from trihedron.plugins.numerics.images.mutual_matches import mutual_matches
-from trihedron.plugins.numerics.motion.relative_motion import motion_terms, solve_motion
+from trihedron.plugins.numerics.motion.relative_motion import solve_motion
 from trihedron.plugins.numerics.motion.track_pairs import NO_PAIRS, Features, StructureGates, tracks_value
 
 
@@ -51,6 +51,5 @@ class BruteForce:
             return tracks_value(now, before, (NO_PAIRS, NO_PAIRS, NO_PAIRS), np.eye(3))
         points = mutual_matches(before.keypoints.descriptors, keypoints.descriptors, keypoints.metric, self.ratio)
         tracks = tracks_value(now, before, (points, NO_PAIRS, NO_PAIRS), np.eye(3))
-        terms = motion_terms(tracks, keypoints, segments, planes, self.angle_px, self.plane_floor_deg)
-        motion = solve_motion(terms, np.eye(3), self.prior_deg * gap, self.prior_m * gap)
+        motion = solve_motion(tracks, keypoints, segments, planes, self.angle_px, self.plane_floor_deg, self.prior_deg * gap, self.prior_m * gap)
         return tracks_value(now, before, (points, *StructureGates().pairs(now, before, frame.camera, motion.R, motion.t)), motion.R)

@@ -11,7 +11,7 @@ from trihedron.pipeline.geometry import exp_so3, log_so3
 from trihedron.pipeline.registry import register
 from trihedron.pipeline.types import F32, I32, Bool, Frame, Keypoints, Planes, Segments, Tracks
 from trihedron.plugins.numerics.images.flow import nearest_pixels
-from trihedron.plugins.numerics.motion.relative_motion import motion_terms, solve_motion
+from trihedron.plugins.numerics.motion.relative_motion import solve_motion
 from trihedron.plugins.numerics.motion.track_pairs import NO_PAIRS, Features, StructureGates, tracks_value
 
 
@@ -61,8 +61,7 @@ class OpticalFlow:
             return tracks_value(now, before, (NO_PAIRS, NO_PAIRS, NO_PAIRS), R)
         points = self._points(frame, previous_frame, keypoints, before.keypoints)
         tracks = tracks_value(now, before, (points, NO_PAIRS, NO_PAIRS), R)
-        terms = motion_terms(tracks, keypoints, segments, planes, self.angle_px, self.plane_floor_deg)
-        motion = solve_motion(terms, R, self.prior_deg * gap, self.prior_m * gap)
+        motion = solve_motion(tracks, keypoints, segments, planes, self.angle_px, self.plane_floor_deg, self.prior_deg * gap, self.prior_m * gap)
         return tracks_value(now, before, (points, *StructureGates().pairs(now, before, frame.camera, motion.R, motion.t)), motion.R)
 
     def _points(self, frame: Frame, previous_frame: Frame, now: Keypoints, before: Keypoints) -> I32:

@@ -11,7 +11,7 @@ from trihedron.pipeline.registry import register
 from trihedron.pipeline.types import F64, I32, Camera, Frame, Keypoints, ManhattanFrame, Planes, Segments, Tracks
 from trihedron.plugins.numerics.images.descriptors import match_lines, match_near
 from trihedron.plugins.numerics.images.flow import offset_px, predict_pixels
-from trihedron.plugins.numerics.motion.relative_motion import Motion, motion_terms, solve_motion
+from trihedron.plugins.numerics.motion.relative_motion import Motion, solve_motion
 from trihedron.plugins.numerics.motion.track_pairs import NO_PAIRS, Features, rows_of_pairs, tracks_value
 from trihedron.plugins.numerics.planes.plane_association import associate_planes
 
@@ -125,8 +125,8 @@ class Projection:
         )
 
     def _motion(self, tracks: Tracks, now: Features, gap: int) -> Motion:
-        terms = motion_terms(tracks, now.keypoints, now.segments, now.planes, self.angle_px, self.plane_floor_deg)
-        return solve_motion(terms, tracks.R_current_previous, self.prior_deg * gap, self.prior_m * gap)
+        seen = now.keypoints, now.segments, now.planes
+        return solve_motion(tracks, *seen, self.angle_px, self.plane_floor_deg, self.prior_deg * gap, self.prior_m * gap)
 
     def _agreeing(self, tracks: Tracks, now: Features, before: Features, motion: Motion, camera: Camera) -> Tracks:
         """Without the key points and lines that the motion puts elsewhere than they were found, and key points that never had a depth."""

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from trihedron.plugins.numerics.algebra.ranking import descending
+from trihedron.plugins.numerics.algebra.ranking import descending, median
 
 RNG = np.random.default_rng(0)
 VALUES = {
@@ -20,3 +20,10 @@ def test_the_largest_comes_first_and_equals_keep_their_order(values):
     order = descending(values)
     assert order.dtype == np.int32
     np.testing.assert_array_equal(order, np.argsort(-values, kind="stable"))
+
+
+@pytest.mark.parametrize("count", (1, 2, 3, 10, 999, 1000))
+@pytest.mark.parametrize("steps", (1e9, 3.0))  # all different; many equals
+def test_the_median_is_numpys(count, steps):
+    values = np.rint(steps * RNG.normal(size=count))
+    assert median(values.copy()) == np.median(values)

@@ -8,7 +8,7 @@ import pytest
 
 from trihedron.pipeline.geometry import exp_so3, invert, pose_matrix, rotation_angle_deg
 from trihedron.pipeline.types import Frame, Tracks
-from trihedron.plugins.numerics.motion.relative_motion import motion_terms, solve_motion
+from trihedron.plugins.numerics.motion.relative_motion import solve_motion
 from trihedron.plugins.tracks.projection import Projection
 
 START = pose_matrix(np.eye(3), np.zeros(3))
@@ -156,8 +156,7 @@ def test_motion_covariance_is_realistic(room):
         kinds = [{}, {"points": False}, {"lines": False}][seed % 3]
         before, now = world.see(START, 0, rng, **kinds), world.see(T, 1, rng, **kinds)
         found = track(world, now, before)
-        terms = motion_terms(found, *now, 0.001, 0.01)
-        motion = solve_motion(terms, found.R_current_previous, 2.0, 0.1)
+        motion = solve_motion(found, *now, 0.001, 0.01, 2.0, 0.1)
         truth = invert(T)
         e = np.concatenate([_vector(truth[:3, :3] @ motion.R.T), truth[:3, 3] - motion.t])
         errors.append(e @ np.linalg.solve(motion.covariance, e) / 6.0)
@@ -171,10 +170,10 @@ def _vector(R):
 def test_motion_without_terms_is_the_prediction_with_the_prior(room):
     none = Tracks(
         1, 1, 0, np.zeros((0, 2), np.int32), np.zeros((0, 3), np.float32), np.zeros(0, np.float32), np.zeros((0, 2), np.int32),
-        np.zeros((0, 2, 3), np.float32), np.zeros((0, 2), np.int32), np.zeros((0, 4)), np.zeros((0, 3, 3)), np.eye(3),
+        np.zeros((0, 2, 3), np.float32), np.zeros((0, 2), np.int32), np.zeros((0, 4)), np.zeros((0, 3, 3)), exp_so3(np.array([0.1, 0.0, 0.0])),
     )  # fmt: skip
     world, rng = room(), np.random.default_rng(7)
-    motion = solve_motion(motion_terms(none, *world.see(START, 1, rng), 0.002, 0.3), exp_so3(np.array([0.1, 0.0, 0.0])), 2.0, 0.1)
+    motion = solve_motion(none, *world.see(START, 1, rng), 0.002, 0.3, 2.0, 0.1)
     assert np.allclose(motion.R, exp_so3(np.array([0.1, 0.0, 0.0]))) and np.allclose(motion.t, 0.0) and motion.support == 0.0
     assert np.allclose(np.sqrt(np.diag(motion.covariance)), np.repeat([np.radians(2.0), 0.1], 3))
 

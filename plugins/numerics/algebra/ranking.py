@@ -32,3 +32,26 @@ def descending(values: F64) -> I32:
             count[digit] += 1
         keys, sorted_keys, order, other = sorted_keys, keys, other, order
     return order
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def median(values: F64) -> float:
+    """Of (n,) numbers, n > 0, which it puts into another order (Hoare's selection)."""
+    middle, low, high = len(values) // 2, 0, len(values) - 1
+    while low < high:
+        pivot, i, j = values[(low + high) // 2], low, high
+        while i <= j:
+            while values[i] < pivot:
+                i += 1
+            while values[j] > pivot:
+                j -= 1
+            if i <= j:
+                values[i], values[j] = values[j], values[i]
+                i, j = i + 1, j - 1
+        low, high = i if j < middle else low, j if middle < i else high
+    if len(values) % 2:
+        return float(values[middle])
+    below = values[0]
+    for i in range(1, middle):
+        below = max(below, values[i])
+    return float(0.5 * (below + values[middle]))

@@ -9,7 +9,7 @@ import numpy as np
 from trihedron.pipeline.geometry import nearest_rotation
 from trihedron.pipeline.types import F64, LOST, Keypoints, Planes, Pose, Rotation, Segments, Tracks
 from trihedron.plugins.numerics.axes.manhattan_frames import KnownFrames
-from trihedron.plugins.numerics.motion.relative_motion import motion_terms, solve_motion
+from trihedron.plugins.numerics.motion.relative_motion import solve_motion
 
 
 @dataclass(frozen=True)
@@ -49,8 +49,7 @@ class TrackedRotation:
         gap = max(keypoints.index - previous_index, 1)
         if tracks is None or tracks.previous_index != previous_index:
             return Estimate(before.R, before.covariance + np.eye(3) * np.radians(self.prior_deg * gap) ** 2, "prediction")
-        terms = motion_terms(tracks, keypoints, segments, planes, self.angle_px, self.plane_floor_deg)
-        motion = solve_motion(terms, tracks.R_current_previous, self.prior_deg * gap, self.prior_m * gap)
+        motion = solve_motion(tracks, keypoints, segments, planes, self.angle_px, self.plane_floor_deg, self.prior_deg * gap, self.prior_m * gap)
         turned = motion.covariance[:3, :3]
         long_ago = np.trace(before.covariance) / 3.0 >= self.predict_frames * np.radians(self.prior_deg) ** 2
         if motion.support == 0.0 and long_ago:

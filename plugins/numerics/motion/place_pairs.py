@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numba
 import numpy as np
 
@@ -12,16 +14,44 @@ from trihedron.plugins.numerics.motion.pose_terms import basis
 SHORTEST_M = 1e-3  # line
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
-def point_pairs(
-    rows: I32, before: F32, before_sigma: F32, points: F32, sigma_px: F32, sigma_m: F32, rad_per_px: float, step: int
-) -> tuple[F64, F64, F64]:
-    """Previous and current places (m, 3) and information (m, 3, 3), 1/m², of one in `step` of those of n pairs that both have depth.
+class PointPairs(NamedTuple):
+    """n points of the previous frame, and which of the current ones they are."""
 
-    `before` (n, 3) and its σ of depth (n,) belong to the current `points[rows]`, whose σ are across the ray (px) and along it (m)."""
-    p, q, information, m, seen = np.empty((len(rows), 3)), np.empty((len(rows), 3)), np.empty((len(rows), 3, 3)), 0, 0
+    rows: I32  # (n, 2) previous, current
+    before: F32  # (n, 3)
+    before_sigma: F32  # (n,) of their depth
+    points: F32  # (k, 3) current
+    sigma_px: F32  # (k,) across the ray
+    sigma_m: F32  # (k,) along it
+
+
+class LinePairs(NamedTuple):
+    """n lines of the previous frame, and which of the current ones they are."""
+
+    rows: I32  # (n, 2) previous, current
+    before: F32  # (n, 2, 3)
+    endpoints: F32  # (k, 2, 3) current
+    covariance: F32  # (k, 2, 3, 3)
+
+
+class PlanePairs(NamedTuple):
+    """n planes of the previous frame, and which of the current ones they are."""
+
+    rows: I32  # (n, 2) previous, current
+    before: F64  # (n, 4)
+    before_covariance: F64  # (n, 3, 3) of (a, b, d)
+    planes: F64  # (k, 4) current
+    covariance: F64  # (k, 3, 3)
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def point_pairs(pairs: PointPairs, rad_per_px: float, step: int, p: F64, q: F64, information: F64) -> int:
+    """Write previous and current places (m, 3) and information (m, 3, 3), 1/m², of one in `step` of those of n pairs that both have depth; returns
+    their number m."""
+    rows, before, before_sigma, points, sigma_px, sigma_m = pairs
+    m, seen = 0, 0
     for i in range(len(rows)):
-        row = rows[i]
+        row = rows[i, 1]
         z = float(points[row, 2])
         if not (np.isfinite(before[i, 2]) and np.isfinite(z)):
             continue
@@ -41,18 +71,17 @@ def point_pairs(
                 information[m, a, b] = ((1.0 if a == b else 0.0) - shrink * ray) / (across * across)
                 total += information[m, a, b]
         m += np.isfinite(total)
-    return p[:m], q[:m], information[:m]
+    return m
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def line_pairs(rows: I32, before: F32, endpoints: F32, covariance: F32, rad_per_px: float, step: int) -> tuple[F64, F64, F64]:
-    """Both ends of one in `step` of n previous lines `before` (n, 2, 3), each against the start of the current line `endpoints[rows]`, whose noise
-    `covariance` (·, 2, 3, 3), m², serves for both: places (2 m, 3) and information (2 m, 3, 3), which is zero along the line."""
-    n = len(rows)
-    p, q, information, m, seen = np.empty((2 * n, 3)), np.empty((2 * n, 3)), np.empty((2 * n, 3, 3)), 0, 0
-    direction, B, S = np.empty(3), np.empty((3, 2)), np.empty((2, 2))
-    for i in range(n):
-        row = rows[i]
+def line_pairs(pairs: LinePairs, rad_per_px: float, step: int, m: int, p: F64, q: F64, information: F64) -> int:
+    """Write both ends of one in `step` of n previous lines, each against the start of the current line, whose noise serves for both: places and
+    information from row m on, which is zero along the line. Returns the next row."""
+    rows, before, endpoints, covariance = pairs
+    seen, direction, B, S = 0, np.empty(3), np.empty((3, 2)), np.empty((2, 2))
+    for i in range(len(rows)):
+        row = rows[i, 1]
         length2, known = 0.0, 0.0
         for k in range(3):
             direction[k] = float(endpoints[row, 1, k]) - float(endpoints[row, 0, k])
@@ -83,18 +112,18 @@ def line_pairs(rows: I32, before: F32, endpoints: F32, covariance: F32, rad_per_
                     first, second = S[1, 1] * B[b, 0] - S[0, 1] * B[b, 1], S[0, 0] * B[b, 1] - S[1, 0] * B[b, 0]
                     information[m + end, a, b] = 0.5 * (B[a, 0] * first + B[a, 1] * second) / det
         m += 2
-    return p[:m], q[:m], information[:m]
+    return m
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def plane_pairs(rows: I32, before: F64, before_covariance: F64, planes: F64, covariance: F64, floor: float) -> tuple[F64, F64, F64]:
-    """Previous planes (m, 4), current ones, and the information (m, 4, 4) of their difference in (n, d), of those of p pairs that are known.
-
-    `before` (p, 4) and its covariances (p, 3, 3) of (a, b, d) belong to the current `planes[rows]`; `floor` (rad) is the least error of a normal."""
+def plane_pairs(pairs: PlanePairs, floor: float) -> tuple[F64, F64, F64]:
+    """Previous planes (m, 4), current ones, and the information (m, 4, 4) of their difference in (n, d), of those of n pairs that are known;
+    `floor` (rad) is the least error of a normal."""
+    rows, before, before_covariance, planes, covariance = pairs
     m, p, q, information = 0, np.empty((len(rows), 4)), np.empty((len(rows), 4)), np.zeros((len(rows), 4, 4))
     B, C = np.empty((3, 2)), np.empty((3, 3))
     for i in range(len(rows)):
-        row, total = rows[i], 0.0
+        row, total = rows[i, 1], 0.0
         for a in range(3):
             for b in range(3):
                 C[a, b] = before_covariance[i, a, b] + covariance[row, a, b]

@@ -13,8 +13,9 @@ import numba
 import numpy as np
 
 from trihedron.pipeline.types import F64, Keypoints, Planes, Segments, Tracks
-from trihedron.plugins.numerics.algebra.small_linear import solve_positive, turn_left
-from trihedron.plugins.numerics.motion.place_pairs import line_pairs, plane_pairs, point_pairs
+from trihedron.plugins.numerics.algebra.ranking import median
+from trihedron.plugins.numerics.algebra.small_linear import inverse_positive, solve_positive, turn_left
+from trihedron.plugins.numerics.motion.place_pairs import LinePairs, PlanePairs, PointPairs, line_pairs, plane_pairs, point_pairs
 
 MOST = 400  # pairs of places used, about; more only cost time
 GATE2 = 9.0  # squared standard deviations at which a term counts a quarter, once the scale has come down
@@ -42,36 +43,53 @@ class Motion:
     support: float
 
 
-def motion_terms(tracks: Tracks, keypoints: Keypoints, segments: Segments, planes: Planes, rad_per_px: float, floor_deg: float) -> Terms:
-    """What the tracks and the current features say about the motion. `rad_per_px` turns a key point's sigma_px into an angle; `floor_deg` is the
-    least error of a plane's normal. Pairs that are not finite, or whose covariance is none, are left out."""
-    step = max(-(-(len(tracks.keypoints) + 2 * len(tracks.segments)) // MOST), 1)
-    copy = np.array  # copies are alike in memory, so that the kernels are compiled once
-    before, sigma, pairs = copy(tracks.points_m), copy(tracks.sigma_m), copy(tracks.keypoints[:, 1])
-    now, sigma_px, sigma_m = copy(keypoints.points_m), copy(keypoints.sigma_px), copy(keypoints.sigma_m)
-    of_points = point_pairs(pairs, before, sigma, now, sigma_px, sigma_m, rad_per_px, step)
-    lines, endpoints, noise = copy(tracks.segments[:, 1]), copy(segments.endpoints_m), copy(segments.covariance_m2)
-    of_lines = line_pairs(lines, copy(tracks.endpoints_m), endpoints, noise, rad_per_px, step)
-    of_planes = plane_pairs(
-        copy(tracks.planes[:, 1]), copy(tracks.coefficients), copy(tracks.plane_covariance), copy(planes.coefficients), copy(planes.covariance),
-        np.radians(floor_deg),
-    )  # fmt: skip
-    before_m, after_m, information = (np.concatenate(pair) for pair in zip(of_points, of_lines))
-    return Terms(before_m, after_m, information, *of_planes)
+def solve_motion(
+    tracks: Tracks, keypoints: Keypoints, segments: Segments, planes: Planes, rad_per_px: float, floor_deg: float, sigma_deg: float, sigma_m: float
+) -> Motion:
+    """The motion that most of the tracks agree on, near their rotation, known to `sigma_deg`, and no translation, known to `sigma_m`.
+
+    `rad_per_px` turns a key point's sigma_px into an angle; `floor_deg` is the least error of a plane's normal. Pairs that are not finite, or whose
+    covariance is none, are left out. Graduated non-convexity (Yang et al., RA-L 2020): the Geman–McClure scale comes down from the median residual,
+    so that up to half of the terms may be wrong. Never raises: without terms the prediction is returned, with the covariance of the prior."""
+    points = PointPairs(tracks.keypoints, tracks.points_m, tracks.sigma_m, keypoints.points_m, keypoints.sigma_px, keypoints.sigma_m)
+    lines = LinePairs(tracks.segments, tracks.endpoints_m, segments.endpoints_m, segments.covariance_m2)
+    walls = PlanePairs(tracks.planes, tracks.coefficients, tracks.plane_covariance, planes.coefficients, planes.covariance)
+    noise = float(rad_per_px), float(np.radians(floor_deg)), float(np.radians(sigma_deg)), float(sigma_m)
+    return Motion(*_motion(points, lines, walls, tracks.R_current_previous, noise))
 
 
-def solve_motion(terms: Terms, R: F64, sigma_deg: float, sigma_m: float) -> Motion:
-    """The motion that most of the terms agree on, near the predicted rotation R (3, 3), known to `sigma_deg`, and no translation, known to `sigma_m`.
-
-    Graduated non-convexity (Yang et al., RA-L 2020): the Geman–McClure scale comes down from the median residual, so that up to half of the terms
-    may be wrong. Never raises: without terms the prediction is returned, with the covariance of the prior."""
-    prior = np.repeat([1.0 / np.radians(sigma_deg) ** 2, 1.0 / sigma_m**2], 3)
-    R, t = np.array(R, np.float64), np.zeros(3)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _motion(
+    points: PointPairs, lines: LinePairs, walls: PlanePairs, start: F64, noise: tuple[float, float, float, float]
+) -> tuple[F64, F64, F64, float]:
+    """The fields of `Motion`."""
+    rad_per_px, floor, sigma, sigma_m = noise
+    terms = _terms(points, lines, walls, rad_per_px, floor)
+    R, t, prior, A = np.empty((3, 3)), np.zeros(3), np.empty(6), np.empty((6, 6))
+    for i in range(3):
+        prior[i], prior[3 + i] = 1.0 / sigma**2, 1.0 / sigma_m**2
+        for j in range(3):
+            R[i, j] = start[i, j]
     residuals = _residuals(terms, R, t)
-    scale2 = max(2.0 * float(np.median(residuals)), GATE2) if len(residuals) else GATE2
+    scale2 = max(2.0 * median(residuals), GATE2) if len(residuals) else GATE2
     H, chi2, support = _solve(terms, R, t, prior, scale2)
     scale = max(chi2 / max(3.0 * support - 6.0, 1.0), 1.0)
-    return Motion(R, t, np.asarray(np.linalg.inv(H / scale + np.diag(prior)), np.float64), support)
+    for i in range(6):
+        for j in range(6):
+            A[i, j] = H[i, j] / scale + (prior[i] if i == j else 0.0)
+    return R, t, inverse_positive(A), support
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _terms(points: PointPairs, lines: LinePairs, walls: PlanePairs, rad_per_px: float, floor: float) -> Terms:
+    """What the pairs say about the motion, of places about MOST at most."""
+    n, m = len(points.rows), len(lines.rows)
+    step = max((n + 2 * m + MOST - 1) // MOST, 1)
+    before, after, information = np.empty((n + 2 * m, 3)), np.empty((n + 2 * m, 3)), np.empty((n + 2 * m, 3, 3))
+    count = point_pairs(points, rad_per_px, step, before, after, information)
+    count = line_pairs(lines, rad_per_px, step, count, before, after, information)
+    planes_before, planes_after, plane_information = plane_pairs(walls, floor)
+    return Terms(before[:count], after[:count], information[:count], planes_before, planes_after, plane_information)
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
