@@ -2,18 +2,19 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
-from trihedron.pipeline.geometry import exp_so3, log_so3, rotation_angle_deg, transform_planes
+from trihedron.pipeline.geometry import exp_so3, log_so3, rotation_angle_deg
 from trihedron.pipeline.registry import register
-from trihedron.pipeline.types import F64, I32, Camera, Frame, Keypoints, ManhattanFrame, Planes, Segments, Tracks
-from trihedron.plugins.numerics.images.descriptors import match_lines, match_near
-from trihedron.plugins.numerics.images.flow import offset_px, predict_pixels
+from trihedron.pipeline.types import F64, Frame, Keypoints, ManhattanFrame, Planes, Segments, Tracks
+from trihedron.plugins.numerics.images.descriptors import compared_by
 from trihedron.plugins.numerics.motion.relative_motion import Motion, solve_motion
-from trihedron.plugins.numerics.motion.track_pairs import NO_PAIRS, Features, rows_of_pairs, tracks_value
-from trihedron.plugins.numerics.planes.plane_association import associate_planes
+from trihedron.plugins.numerics.motion.track_pairs import NO_PAIRS, Features, tracks_value
+from trihedron.plugins.numerics.motion.track_search import Gates, Search
+
+NOT_MOVED = np.zeros(3)
 
 
 @register("tracks", "projection")
@@ -76,15 +77,15 @@ class Projection:
         rotations = self._predictions(gap, before.keypoints.index, manhattan, previous_manhattan, previous)
         if gap > self.max_age:
             return tracks_value(now, before, (NO_PAIRS, NO_PAIRS, NO_PAIRS), rotations[0])
+        search = Search(before, now, frame.camera, self._gates(now, before))
         radius = self.radius_px * min(gap, 3)
-        first = max((self._search(now, before, frame.camera, R, np.zeros(3), radius, self.plane_m) for R in rotations), key=_count)
+        first = max((search(R, NOT_MOVED, radius, self.plane_m) for R in rotations), key=_count)
         if len(first.keypoints) < min(self.enough, len(keypoints.pixels)):
-            first = self._search(now, before, frame.camera, first.R_current_previous, np.zeros(3), 2.0 * radius, self.plane_m)
+            first = search(first.R_current_previous, NOT_MOVED, 2.0 * radius, self.plane_m)
         motion = self._motion(first, now, gap)
-        again = self._search(now, before, frame.camera, motion.R, motion.t, self.near_px, self.plane_near_m)
+        again = search(motion.R, motion.t, self.near_px, self.plane_near_m)
         again = again if _count(again) >= 0.7 * _count(first) else first
-        motion = self._motion(again, now, gap)
-        return self._agreeing(again, now, before, motion, frame.camera)
+        return search.agreeing(again, self._motion(again, now, gap), self.error_px)
 
     def _predictions(
         self, gap: int, previous_index: int, manhattan: ManhattanFrame | None, previous_manhattan: ManhattanFrame | None, previous: Tracks | None
@@ -100,59 +101,24 @@ class Projection:
                 found.append(relative)
         return found or [np.eye(3)]
 
-    def _search(self, now: Features, before: Features, camera: Camera, R: F64, t: F64, radius_px: float, plane_m: float) -> Tracks:
-        """All pairs found around the motion (R, t)."""
-        points = self._find_points(now.keypoints, before.keypoints, camera, R, t, radius_px)
-        lines = self._find_lines(now.segments, before.segments, camera, R, t, radius_px)
-        T = np.eye(4)
-        T[:3, :3], T[:3, 3] = R, t
-        moved = transform_planes(T, before.planes.coefficients)
-        samples = (before.planes.samples_m @ R.T + t).astype(np.float32)
-        planes = associate_planes(now.planes.coefficients, now.planes.samples_m, moved, samples, self.plane_deg, plane_m, many_to_one=True)
-        return tracks_value(now, before, (rows_of_pairs(points), rows_of_pairs(lines), np.ascontiguousarray(planes[:, ::-1])), R)
-
-    def _find_points(self, now: Keypoints, before: Keypoints, camera: Camera, R: F64, t: F64, radius_px: float) -> I32:
-        predicted = predict_pixels(before.pixels, before.points_m, camera, R, t).astype(np.float32)
-        radius = np.full(len(predicted), radius_px, np.float32)
-        limit = self.max_bits if now.metric == "hamming" else self.max_l2
-        described = before.descriptors, before.octaves, now.pixels, now.descriptors, now.octaves
-        return match_near(predicted, *described, radius, self.octave_step, limit, self.ratio, now.metric)
-
-    def _find_lines(self, now: Segments, before: Segments, camera: Camera, R: F64, t: F64, offset_px: float) -> I32:
-        predicted = predict_pixels(before.endpoints_px, before.endpoints_m, camera, R, t).astype(np.float32)
-        return match_lines(
-            predicted, before.descriptors, now.endpoints_px, now.descriptors, self.line_deg, offset_px, self.line_overlap, self.line_bits, self.ratio
+    def _gates(self, now: Features, before: Features) -> Gates:
+        described, lines_described = now.keypoints.descriptors, now.segments.descriptors
+        limit = self.max_bits if now.keypoints.metric == "hamming" else self.max_l2
+        return Gates(
+            self.octave_step,
+            compared_by(before.keypoints.descriptors, described, limit, now.keypoints.metric),
+            float(limit),
+            self.ratio,
+            float(np.sin(np.radians(self.line_deg))),
+            self.line_overlap,
+            compared_by(before.segments.descriptors, lines_described, self.line_bits, "hamming"),
+            float(self.line_bits),
+            float(np.cos(np.radians(self.plane_deg))),
         )
 
     def _motion(self, tracks: Tracks, now: Features, gap: int) -> Motion:
         seen = now.keypoints, now.segments, now.planes
         return solve_motion(tracks, *seen, self.angle_px, self.plane_floor_deg, self.prior_deg * gap, self.prior_m * gap)
-
-    def _agreeing(self, tracks: Tracks, now: Features, before: Features, motion: Motion, camera: Camera) -> Tracks:
-        """Without the key points and lines that the motion puts elsewhere than they were found, and key points that never had a depth."""
-        i, j = tracks.keypoints.T
-        forth = predict_pixels(before.keypoints.pixels[i], tracks.points_m, camera, motion.R, motion.t) - now.keypoints.pixels[j]
-        points_m = now.keypoints.points_m[j]
-        back = predict_pixels(now.keypoints.pixels[j], points_m, camera, motion.R.T, -motion.R.T @ motion.t) - before.keypoints.pixels[i]
-        then, since = np.isfinite(tracks.points_m[:, 2]), np.isfinite(points_m[:, 2])
-        error = np.linalg.norm(np.where(then[:, None], forth, back), axis=1)
-        depth = np.fmin(tracks.points_m[:, 2], points_m[:, 2])
-        unsure = camera.fx * np.sqrt(np.linalg.eigvalsh(motion.covariance[3:, 3:])[-1]) / np.where(depth > 0.0, depth, np.inf)
-        points = (then | since) & (error <= self.error_px * (now.keypoints.sigma_px[j] + unsure))
-        i, j = tracks.segments.T
-        moved = predict_pixels(before.segments.endpoints_px[i], tracks.endpoints_m, camera, motion.R, motion.t)
-        depth = tracks.endpoints_m[:, :, 2].min(axis=1)
-        unsure = camera.fx * np.sqrt(np.linalg.eigvalsh(motion.covariance[3:, 3:])[-1]) / np.where(depth > 0.0, depth, 1.0)
-        lines = offset_px(moved, now.segments.endpoints_px[j]) <= self.error_px * (1.0 + unsure)
-        return replace(
-            tracks,
-            keypoints=tracks.keypoints[points],
-            points_m=tracks.points_m[points],
-            sigma_m=tracks.sigma_m[points],
-            segments=tracks.segments[lines],
-            endpoints_m=tracks.endpoints_m[lines],
-            R_current_previous=motion.R,
-        )
 
 
 def _turn(now: ManhattanFrame, before: ManhattanFrame) -> F64 | None:

@@ -39,12 +39,12 @@ def match_near(
     query's radius and `max_octave_step` octaves and is at most `max_distance` away (bits, or Euclidean for `metric` l2). The best must be nearer
     than `ratio` × the second best of its own octave (1 or more: no such test). A train row goes to its best query. Without descriptors (b == 0 or
     `max_distance` < 0) the nearest pixel is taken. NaN matches nothing. Raises ValueError for an unknown metric or unequal descriptors."""
-    mode = _mode(query_descriptors, train_descriptors, max_distance, metric)
+    mode = compared_by(query_descriptors, train_descriptors, max_distance, metric)
     query, train = words_of(query_descriptors), words_of(train_descriptors)
-    return _match_near(
-        constant(query_px, np.float32), query[0], query[1], constant(query_octaves, np.uint8),
+    return near_matches(
+        np.array(query_px, np.float32, order="C"), query[0], query[1], constant(query_octaves, np.uint8),
         constant(train_px, np.float32), train[0], train[1], constant(train_octaves, np.uint8),
-        constant(radius_px, np.float32), int(max_octave_step), mode, float(max_distance), float(ratio),
+        np.array(radius_px, np.float32, order="C"), int(max_octave_step), mode, float(max_distance), float(ratio),
     )  # fmt: skip
 
 
@@ -65,15 +65,16 @@ def match_lines(
     the query along its direction by `min_overlap` of the shorter of the two, and is at most `max_offset_px` beside it there; descriptors as in
     `match_near` (Hamming). The second best for `ratio` is the best one that is not a piece of the same edge as the best. Without descriptors
     (b == 0 or `max_distance` < 0) offset, angle and overlap decide. Raises ValueError for unequal descriptor lengths."""
-    mode = _mode(query_descriptors, train_descriptors, max_distance, "hamming")
-    return _match_lines(
-        constant(query_endpoints_px, np.float32), words_of(query_descriptors)[0],
+    mode = compared_by(query_descriptors, train_descriptors, max_distance, "hamming")
+    return line_matches(
+        np.array(query_endpoints_px, np.float32, order="C"), words_of(query_descriptors)[0],
         constant(train_endpoints_px, np.float32), words_of(train_descriptors)[0],
         float(np.sin(np.radians(max_angle_deg))), float(max_offset_px), float(min_overlap), mode, float(max_distance), float(ratio),
     )  # fmt: skip
 
 
-def _mode(query: U8, train: U8, max_distance: int, metric: str) -> int:
+def compared_by(query: U8, train: U8, max_distance: int, metric: str) -> int:
+    """How kernels compare these descriptors. Raises ValueError where they cannot."""
     if metric not in METRICS:
         raise ValueError(f"metric: '{metric}' is not one of {', '.join(METRICS)}")
     if len(query) and len(train) and query.shape[1] != train.shape[1]:
@@ -92,23 +93,38 @@ def words_of(descriptors: U8) -> tuple[U64, U8]:
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
+def _ones(x: int) -> int:
+    """Number of bits set in a word."""
+    x = x - ((x >> np.uint64(1)) & np.uint64(0x5555555555555555))
+    x = (x & np.uint64(0x3333333333333333)) + ((x >> np.uint64(2)) & np.uint64(0x3333333333333333))
+    x = (x + (x >> np.uint64(4))) & np.uint64(0x0F0F0F0F0F0F0F0F)
+    return (x * np.uint64(0x0101010101010101)) >> np.uint64(56)
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def hamming(a: U64, b: U64) -> int:
     """Number of differing bits of two rows of words."""
     total = np.uint64(0)
     for k in range(len(a)):
-        x = a[k] ^ b[k]
-        x = x - ((x >> np.uint64(1)) & np.uint64(0x5555555555555555))
-        x = (x & np.uint64(0x3333333333333333)) + ((x >> np.uint64(2)) & np.uint64(0x3333333333333333))
-        x = (x + (x >> np.uint64(4))) & np.uint64(0x0F0F0F0F0F0F0F0F)
-        total += (x * np.uint64(0x0101010101010101)) >> np.uint64(56)
+        total += _ones(a[k] ^ b[k])
     return int(total)
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def _euclidean(a: U8, b: U8) -> float:
+def _bits_apart(a: U64, i: int, b: U64, j: int) -> int:
+    """`hamming` of row i of a and row j of b: for inner loops, where to slice them takes longer."""
+    total = np.uint64(0)
+    for k in range(a.shape[1]):
+        total += _ones(a[i, k] ^ b[j, k])
+    return int(total)
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _euclidean(a: U8, i: int, b: U8, j: int) -> float:
+    """Distance of row i of a and row j of b."""
     total = 0
-    for k in range(len(a)):
-        step = int(a[k]) - int(b[k])
+    for k in range(a.shape[1]):
+        step = int(a[i, k]) - int(b[j, k])
         total += step * step
     return float(np.sqrt(total))
 
@@ -145,7 +161,7 @@ def _bounds(px: F32) -> tuple[float, float, float, float]:
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def _match_near(
+def near_matches(
     qpx: F32, qwords: U64, qbytes: U8, qoct: U8, tpx: F32, twords: U64, tbytes: U8, toct: U8,
     radius: F32, step: int, mode: int, limit: float, ratio: float,
 ) -> I32:  # fmt: skip
@@ -172,9 +188,9 @@ def _match_near(
                 if apart2 > r * r or abs(np.int64(toct[t]) - np.int64(qoct[i])) > step:
                     continue
                 if mode == HAMMING:
-                    distance = float(hamming(qwords[i], twords[t]))
+                    distance = float(_bits_apart(qwords, i, twords, t))
                 elif mode == L2:
-                    distance = _euclidean(qbytes[i], tbytes[t])
+                    distance = _euclidean(qbytes, i, tbytes, t)
                 else:
                     distance = np.sqrt(apart2)
                 near[count], apart[count] = t, distance
@@ -208,19 +224,19 @@ def _directions(segments: F32) -> F64:
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def _beside(q: F64, t: F64) -> tuple[float, float]:
-    """Offset (px) beside q in the middle of the overlap, and overlap as a share of the shorter segment (negative: apart)."""
-    mx, my = t[0] - q[0], t[1] - q[1]
-    along, beside = mx * q[2] + my * q[3], my * q[2] - mx * q[3]
-    cosine = q[2] * t[2] + q[3] * t[3]
-    half = 0.5 * t[4] * abs(cosine)
-    low, high = max(along - half, -0.5 * q[4]), min(along + half, 0.5 * q[4])
-    slope = (q[2] * t[3] - q[3] * t[2]) / cosine if abs(cosine) > 1e-6 else 0.0
-    return abs(beside + (0.5 * (low + high) - along) * slope), (high - low) / min(q[4], t[4])
+def _beside(q: F64, i: int, t: F64, j: int) -> tuple[float, float]:
+    """Offset (px) beside row i of q in the middle of the overlap with row j of t, and overlap as a share of the shorter segment (negative: apart)."""
+    mx, my, dx, dy, length = t[j, 0] - q[i, 0], t[j, 1] - q[i, 1], q[i, 2], q[i, 3], q[i, 4]
+    along, beside = mx * dx + my * dy, my * dx - mx * dy
+    cosine = dx * t[j, 2] + dy * t[j, 3]
+    half = 0.5 * t[j, 4] * abs(cosine)
+    low, high = max(along - half, -0.5 * length), min(along + half, 0.5 * length)
+    slope = (dx * t[j, 3] - dy * t[j, 2]) / cosine if abs(cosine) > 1e-6 else 0.0
+    return abs(beside + (0.5 * (low + high) - along) * slope), (high - low) / min(length, t[j, 4])
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def _match_lines(
+def line_matches(
     query: F32, qwords: U64, train: F32, twords: U64, sine_max: float, offset_px: float, overlap_min: float, mode: int, limit: float, ratio: float
 ) -> I32:
     q, t = _directions(query), _directions(train)
@@ -235,13 +251,13 @@ def _match_lines(
             sine = abs(q[i, 2] * t[j, 3] - q[i, 3] * t[j, 2])
             if not sine <= sine_max:  # most pairs end here
                 continue
-            offset, overlap = _beside(q[i], t[j])
+            offset, overlap = _beside(q, i, t, j)
             if not (offset <= offset_px and overlap >= overlap_min):
                 continue
             if mode == NONE:
                 cost[j] = offset / max(offset_px, 1e-9) + sine / max(sine_max, 1e-9) + 1.0 - overlap
             else:
-                cost[j] = float(hamming(qwords[i], twords[j]))
+                cost[j] = float(_bits_apart(qwords, i, twords, j))
             if best < 0 or cost[j] < cost[best]:
                 best = j
         if best < 0 or (mode != NONE and cost[best] > limit) or cost[best] >= held[best]:

@@ -19,27 +19,26 @@ def predict_pixels(pixels: F32, points_m: F32, camera: Camera, R: F64, t: F64) -
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def _predicted(pixels: F32, points_m: F32, intrinsics: tuple[float, float, float, float], R: F64, t: F64) -> F64:
     """`predict_pixels` of n."""
-    fx, fy, cx, cy = intrinsics
     out = np.empty((len(pixels), 2))
     for i in range(len(pixels)):
-        x, y, z = float(points_m[i, 0]), float(points_m[i, 1]), float(points_m[i, 2])
-        near = 1.0
-        if not np.isfinite(x + y + z):
-            x, y, z, near = (pixels[i, 0] - cx) / fx, (pixels[i, 1] - cy) / fy, 1.0, 0.0
-        depth = R[2, 0] * x + R[2, 1] * y + R[2, 2] * z + near * t[2]
-        if depth > 1e-6:
-            out[i, 0] = fx * (R[0, 0] * x + R[0, 1] * y + R[0, 2] * z + near * t[0]) / depth + cx
-            out[i, 1] = fy * (R[1, 0] * x + R[1, 1] * y + R[1, 2] * z + near * t[1]) / depth + cy
-        else:
-            out[i] = np.nan
+        out[i, 0], out[i, 1] = moved_pixel(pixels[i, 0], pixels[i, 1], points_m[i, 0], points_m[i, 1], points_m[i, 2], intrinsics, R, t)
     return out
 
 
-def offset_px(predicted: F64, found: F32) -> F64:
-    """(n,) mean distance (px) of the ends of predicted segments (n, 2, 2) from the lines found."""
-    along = (found[:, 1] - found[:, 0]).astype(np.float64)
-    normal = np.stack([-along[:, 1], along[:, 0]], axis=1) / np.maximum(np.linalg.norm(along, axis=1), 1e-9)[:, None]
-    return np.asarray(np.abs(((predicted - found[:, :1]) * normal[:, None]).sum(axis=2)).mean(axis=1))
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def moved_pixel(u: float, v: float, x: float, y: float, z: float, camera: tuple[float, float, float, float], R: F64, t: F64) -> tuple[float, float]:
+    """`predict_pixels` of the pixel (u, v) with the point (x, y, z)."""
+    fx, fy, cx, cy = camera
+    near = 1.0
+    x, y, z = float(x), float(y), float(z)
+    if not np.isfinite(x + y + z):
+        x, y, z, near = (u - cx) / fx, (v - cy) / fy, 1.0, 0.0
+    depth = R[2, 0] * x + R[2, 1] * y + R[2, 2] * z + near * t[2]
+    if not depth > 1e-6:
+        return np.nan, np.nan
+    column = fx * (R[0, 0] * x + R[0, 1] * y + R[0, 2] * z + near * t[0]) / depth + cx
+    row = fy * (R[1, 0] * x + R[1, 1] * y + R[1, 2] * z + near * t[1]) / depth + cy
+    return column, row
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")

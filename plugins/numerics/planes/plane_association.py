@@ -25,9 +25,9 @@ def associate_planes(
     region to the other plane, the better-conditioned way round, is at most `max_distance_m`; the minimum over points would merge parallel
     planes that touch anywhere. Among those the one with the smallest `distance / max_distance_m + 1 - overlap` wins, overlap being the share of
     a's samples near samples of b. A row of a appears once; a row of b too, unless `many_to_one` (a wall seen in two pieces)."""
-    return _associate(
+    return associated(
         constant(coefficients_a, np.float64), constant(samples_a, np.float32),
-        constant(coefficients_b, np.float64), constant(samples_b, np.float32),
+        np.array(coefficients_b, np.float64, order="C"), np.array(samples_b, np.float32, order="C"),
         float(np.cos(np.radians(max_angle_deg))), float(max_distance_m), many_to_one,
     )  # fmt: skip
 
@@ -35,9 +35,10 @@ def associate_planes(
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def mean_distance(plane: F64, samples: F32) -> float:
     """Mean |n·x + d| over the finite rows of (s, 3) samples; inf without any."""
+    nx, ny, nz, d = plane[0], plane[1], plane[2], plane[3]
     total, count = 0.0, 0
     for k in range(len(samples)):
-        x = plane[0] * samples[k, 0] + plane[1] * samples[k, 1] + plane[2] * samples[k, 2] + plane[3]
+        x = nx * samples[k, 0] + ny * samples[k, 1] + nz * samples[k, 2] + d
         if np.isfinite(x):
             total += abs(x)
             count += 1
@@ -48,22 +49,20 @@ def mean_distance(plane: F64, samples: F32) -> float:
 def _spacing(samples: F32) -> float:
     """Mean distance from a sample to its nearest neighbour, metres; 0 with fewer than two."""
     total, count = 0.0, 0
+    nearest = np.full(len(samples), np.inf, np.float32)
     for i in range(len(samples)):
-        nearest = np.inf
-        for j in range(len(samples)):
-            if j != i:
-                nearest = min(nearest, _apart2(samples[i], samples[j]))
-        if nearest < np.inf:
-            total += np.sqrt(nearest)
+        x, y, z = samples[i, 0], samples[i, 1], samples[i, 2]
+        for j in range(i):
+            squared = (x - samples[j, 0]) ** 2 + (y - samples[j, 1]) ** 2 + (z - samples[j, 2]) ** 2
+            if squared < nearest[i]:  # not with NaN
+                nearest[i] = squared
+            if squared < nearest[j]:
+                nearest[j] = squared
+    for i in range(len(samples)):
+        if nearest[i] < np.inf:
+            total += np.sqrt(float(nearest[i]))
             count += 1
     return total / count if count else 0.0
-
-
-@numba.njit(cache=True, nogil=True, error_model="numpy")
-def _apart2(a: F32, b: F32) -> float:
-    """Squared distance of two points; inf with NaN."""
-    squared = (a[0] - b[0]) ** 2 + (a[1] - b[1]) ** 2 + (a[2] - b[2]) ** 2
-    return squared if squared >= 0.0 else np.inf
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
@@ -71,18 +70,19 @@ def overlap(samples_a: F32, samples_b: F32, reach_m: float) -> float:
     """Share of the finite samples of a that have a sample of b within `reach_m`."""
     near, count = 0, 0
     for i in range(len(samples_a)):
-        if not np.isfinite(samples_a[i, 0]):
+        x, y, z = samples_a[i, 0], samples_a[i, 1], samples_a[i, 2]
+        if not np.isfinite(x):
             continue
         count += 1
         for j in range(len(samples_b)):
-            if _apart2(samples_a[i], samples_b[j]) <= reach_m * reach_m:
+            if (x - samples_b[j, 0]) ** 2 + (y - samples_b[j, 1]) ** 2 + (z - samples_b[j, 2]) ** 2 <= reach_m * reach_m:  # not with NaN
                 near += 1
                 break
     return near / count if count else 0.0
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def _associate(a: F64, samples_a: F32, b: F64, samples_b: F32, cosine: float, limit: float, many_to_one: bool) -> I32:
+def associated(a: F64, samples_a: F32, b: F64, samples_b: F32, cosine: float, limit: float, many_to_one: bool) -> I32:
     n, m = len(a), len(b)
     cost = np.full((n, m), np.inf)
     reach = np.full(m, -1.0)
