@@ -15,6 +15,7 @@ from trihedron.plugins.numerics.maps.anchoring import anchored
 from trihedron.plugins.numerics.maps.association import Associated, associate, existing
 from trihedron.plugins.numerics.maps.correction import apply_correction
 from trihedron.plugins.numerics.maps.culling import cull, cull_keyframe, cull_repeated
+from trihedron.plugins.numerics.maps.id_sets import union
 from trihedron.plugins.numerics.maps.landmarks import empty_map
 from trihedron.plugins.numerics.maps.local_window import WEIGHTS, keyframes_of, local_window, newest_keyframes
 from trihedron.plugins.numerics.maps.merging import merge_lines, merge_planes, merge_points
@@ -148,7 +149,7 @@ class Covisibility:
         if matches is None:
             return np.empty(0, np.int32)
         around = local_window(map, pose.T_world_camera, **NEARBY, submap=pose.submap).planes
-        return np.union1d(visible_planes(map.planes, around, pose.T_world_camera, frame), matches.planes[:, 1]).astype(np.int32)
+        return union(visible_planes(map.planes, around, pose.T_world_camera, frame), matches.planes[:, 1])
 
     def _seen(self, map: Map, matches: Matches | None, planes: I32) -> Map:
         if matches is None:

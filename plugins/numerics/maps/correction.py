@@ -10,6 +10,7 @@ import numpy as np
 from trihedron.pipeline.geometry import invert, transform, transform_planes
 from trihedron.pipeline.types import F64, I32, Bool, Correction, Map, Table
 from trihedron.plugins.numerics.algebra.uncertainty import transform_plane_covariance
+from trihedron.plugins.numerics.maps.id_sets import among
 from trihedron.plugins.numerics.maps.local_window import observed_by
 from trihedron.plugins.numerics.planes import plane_fusion
 
@@ -46,7 +47,7 @@ def _carry_culled(map: Map, ids: I32, poses: F64) -> Map:
     that is nearest in place and direction: it was culled because others show what it did."""
     alive, submap, T_world = (map.keyframes.column(name) for name in ("alive", "submap", "T_world_camera"))
     culled = np.flatnonzero(~alive[: ids.max()]).astype(np.int32)
-    culled = culled[~np.isin(culled, ids)]
+    culled = culled[~among(culled, ids)]
     living = np.flatnonzero(alive)
     if not len(culled) or not len(living):
         return map
@@ -93,7 +94,7 @@ def _born_after(map: Map, kind: str, keyframe: int, later: I32, corrected: I32) 
     """Living landmarks first seen after the keyframe, by one of those later, but for those the correction moves itself."""
     ids = observed_by(map, later, kind)
     ids = ids[getattr(map, f"{kind}s").rows("first", ids) > keyframe]
-    return ids[~np.isin(ids, corrected)]
+    return ids[~among(ids, corrected)]
 
 
 def _moved_planes(table: Table, ids: I32, coefficients: F64, covariance: F64, T: F64 | None = None) -> Table:

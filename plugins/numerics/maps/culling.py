@@ -5,10 +5,13 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import Any
 
+import numba
 import numpy as np
+from numpy.typing import NDArray
 
 from trihedron.pipeline.geometry import invert
-from trihedron.pipeline.types import F64, I32, Map, Matches, Table
+from trihedron.pipeline.types import F64, I32, Bool, Map, Matches, Table
+from trihedron.plugins.numerics.maps.id_sets import among, union
 from trihedron.plugins.numerics.maps.local_window import WEIGHTS, covisible_keyframes, keyframes_of, newest_keyframes, observed_by, observed_by_each
 from trihedron.plugins.numerics.maps.retiring import retired
 
@@ -23,7 +26,7 @@ def cull(map: Map, keyframe: int, matches: Matches | None, planes: I32, trial: i
     changes: dict[str, Any] = {}
     for kind, visible in (("point", "visible_points"), ("line", "visible_lines")):
         table: Table = getattr(map, f"{kind}s")
-        ids = np.union1d(observed_by(map, young, kind), getattr(matches, visible) if matches is not None else young[:0]).astype(np.int32)
+        ids = union(observed_by(map, young, kind), getattr(matches, visible) if matches is not None else young[:0])
         found, seen, first = table.gathered(ids, "found", "visible", "first")
         seldom = (found < min_found * seen) | ((first == keyframe - trial) & (found < trial) & (seen >= trial))
         ids = ids[seldom]
@@ -64,9 +67,9 @@ def cull_repeated(map: Map, shift_m: float, turn_deg: float, share: float) -> Ma
     for kind, weight in WEIGHTS.items():
         own = observed_by(map, keyframe, kind)
         seen += weight * len(own)
-        known += weight * np.count_nonzero(np.isin(own, observed_by(map, near, kind)))
+        known += weight * np.count_nonzero(among(own, observed_by(map, near, kind)))
     planes = observed_by(map, keyframe, "plane")
-    if not len(near) or known < share * seen or not np.isin(planes, observed_by(map, older, "plane")).all():
+    if not len(near) or known < share * seen or not among(planes, observed_by(map, older, "plane")).all():
         return map
     return retired(map, int(keyframe[0]))
 
@@ -74,18 +77,43 @@ def cull_repeated(map: Map, shift_m: float, turn_deg: float, share: float) -> Ma
 def _redundancies(map: Map, keyframes: I32, others: int) -> F64:
     """(n,) weighed share of each keyframe's living landmarks that at least so many other living keyframes saw from as near."""
     seen, redundant = np.zeros(len(keyframes)), np.zeros(len(keyframes))
-    places = map.keyframes.rows("T_world_camera", keyframes)[:, :3, 3]
+    poses = map.keyframes.rows("T_world_camera", keyframes)
     for kind, weight in WEIGHTS.items():
         table: Table = getattr(map, f"{kind}s")
         ids, observed = observed_by_each(map, keyframes, kind)
         observers, centres = table.rows("observers", ids), _centres(table, kind, ids)
-        away = _distances(map, observers, centres)
-        for k, (keyframe, own) in enumerate(zip(keyframes, observed)):
-            reach = FARTHER * np.linalg.norm(places[k] - centres[own], axis=-1)
-            as_near = (away[own] <= reach[:, None]) & (observers[own] != keyframe)
+        rows = union(observers[observers >= 0], keyframes)
+        known, alive = map.keyframes.gathered(rows, "T_world_camera", "alive")
+        for k, (keyframe, own) in enumerate(zip(keyframes.tolist(), observed)):
             seen[k] += weight * len(own)
-            redundant[k] += weight * np.count_nonzero(as_near.sum(axis=1) >= others)
+            redundant[k] += weight * _seen_as_near(own, keyframe, poses[k], observers, centres, rows, known, alive, others)
     return redundant / np.maximum(seen, 1.0)
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _seen_as_near(
+    own: NDArray[np.int64], keyframe: int, T_world_keyframe: F64, observers: I32, centres: F64, rows: I32, poses: F64, alive: Bool, others: int
+) -> int:
+    """How many landmarks `own` of a keyframe at least so many others that live saw from as near: `observers` (n, OBSERVERS) and `centres` (n, 3) of
+    all landmarks, `poses` (k, 4, 4) and `alive` (k,) of the keyframes `rows`, sorted, among which all observers are."""
+    place = np.empty(rows[-1] + 1, np.int32)
+    for k in range(len(rows)):
+        place[rows[k]] = k
+    found = 0
+    for i in own:
+        reach, count = FARTHER * _away(T_world_keyframe, centres[i]), 0
+        for row in observers[i]:
+            if row >= 0 and row != keyframe and alive[place[row]]:
+                count += _away(poses[place[row]], centres[i]) <= reach
+        found += count >= others
+    return found
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _away(T: F64, p: F64) -> float:
+    """How far a point is from a camera."""
+    x, y, z = T[0, 3] - p[0], T[1, 3] - p[1], T[2, 3] - p[2]
+    return np.sqrt(x * x + y * y + z * z)
 
 
 def _centres(table: Table, kind: str, ids: I32) -> F64:
@@ -97,12 +125,3 @@ def _centres(table: Table, kind: str, ids: I32) -> F64:
     samples = table.rows("samples_m", ids).astype(np.float64)
     known = np.isfinite(samples).all(axis=2, keepdims=True)
     return np.asarray(np.where(known, samples, 0.0).sum(axis=1) / np.maximum(known.sum(axis=1), 1), np.float64)
-
-
-def _distances(map: Map, observers: I32, centres: F64) -> F64:
-    """(n, OBSERVERS) how far each observer was from the landmark, infinite where there is none or it lives no more."""
-    rows = np.unique(observers[observers >= 0])
-    place = np.searchsorted(rows, observers)  # of an empty one: 0, and not counted
-    places = map.keyframes.rows("T_world_camera", rows)[:, :3, 3]
-    living = (observers >= 0) & map.keyframes.rows("alive", rows)[place]
-    return np.where(living, np.linalg.norm(places[place] - centres[:, None], axis=-1), np.inf)

@@ -11,6 +11,7 @@ from trihedron.pipeline.geometry import invert, transform
 from trihedron.pipeline.types import I32, Bool, Map, Table
 from trihedron.plugins.numerics.algebra.uncertainty import inverse
 from trihedron.plugins.numerics.images.descriptors import match_lines, match_near
+from trihedron.plugins.numerics.maps.id_sets import among
 from trihedron.plugins.numerics.maps.insertion import View, lengthened
 from trihedron.plugins.numerics.maps.landmarks import OBSERVERS
 from trihedron.plugins.numerics.maps.local_window import newest_keyframes, observed_by
@@ -28,20 +29,19 @@ LINE_DEG, LINE_OVERLAP, LINE_BITS = 2.0, 0.3, 60
 def merge_points(map: Map, view: View, visible: I32, metric: str) -> Map:
     """Join points that were expected by this keyframe and not found with those it did find or make, where pixel, descriptor and place agree."""
     seen = observed_by(map, np.array([view.keyframe], np.int32), "point")
-    idle = np.setdiff1d(visible[map.points.rows("alive", visible)], seen).astype(np.int32)
-    sides = [
-        (
-            view.camera.project(transform(invert(view.T_world_camera), map.points.rows("position_m", ids))).astype(np.float32),
-            map.points.rows("descriptor", ids),
-            map.points.rows("octave", ids),
-        )
-        for ids in (idle, seen)
-    ]
+    idle = visible[map.points.rows("alive", visible) & ~among(visible, seen)]
+    sides = []
+    for ids in (idle, seen):
+        position, descriptors, octaves = map.points.gathered(ids, "position_m", "descriptor", "octave")
+        pixels = view.camera.project(transform(invert(view.T_world_camera), position)).astype(np.float32)
+        sides.append((pixels, descriptors, octaves))
     limit = TWIN_BITS if metric == "hamming" else TWIN_L2
     found = match_near(*sides[0], *sides[1], np.full(len(idle), NEAR_PX, np.float32), 1, limit, 1.0, metric)
     pairs = np.stack([idle[found >= 0], seen[found[found >= 0]]], axis=-1)
-    position, information = map.points.rows("position_m", pairs.ravel()).reshape(-1, 2, 3), map.points.rows("information", pairs.ravel())
-    information = information.reshape(-1, 2, 3, 3).astype(np.float64)
+    if not len(pairs):
+        return map
+    position, information = map.points.gathered(pairs.ravel(), "position_m", "information")
+    position, information = position.reshape(-1, 2, 3), information.reshape(-1, 2, 3, 3).astype(np.float64)
     apart = position[:, 1] - position[:, 0]
     covariance = inverse(information).sum(axis=1)
     same: Bool = np.einsum("ni,nij,nj->n", apart, inverse(covariance), apart) <= CHI2_3
@@ -49,15 +49,16 @@ def merge_points(map: Map, view: View, visible: I32, metric: str) -> Map:
     total = information.sum(axis=1)
     joined = np.linalg.solve(total, np.einsum("nkij,nkj->ni", information, position)[..., None])[..., 0]
     kept, gone = pairs.min(axis=1), pairs.max(axis=1)
-    looks: dict[str, Any] = {name: map.points.rows(name, pairs[:, 1]) for name in ("descriptor", "direction", "distance_m", "octave")}
-    points = map.points.updated(kept, position_m=joined, information=0.5 * total, **looks)  # half: both knew some of the same frames
+    names = ("descriptor", "direction", "distance_m", "octave")
+    newer: dict[str, Any] = dict(zip(names, map.points.gathered(pairs[:, 1], *names)))
+    points = map.points.updated(kept, position_m=joined, information=0.5 * total, **newer)  # half: both knew some of the same frames
     return _buried(replace(map, points=points), "point", kept, gone)
 
 
 def merge_lines(map: Map, view: View, visible: I32) -> Map:
     """Join lines that were expected by this keyframe and not found with those it did find or make, where image, descriptor and place agree."""
     seen = observed_by(map, np.array([view.keyframe], np.int32), "line")
-    idle = np.setdiff1d(visible[map.lines.rows("alive", visible)], seen).astype(np.int32)
+    idle = visible[map.lines.rows("alive", visible) & ~among(visible, seen)]
     sides = []
     for ids in (idle, seen):
         pixels, inside = clip_segments(transform(invert(view.T_world_camera), map.lines.rows("endpoints_m", ids)), view.camera)
@@ -65,22 +66,24 @@ def merge_lines(map: Map, view: View, visible: I32) -> Map:
         sides.append((pixels.astype(np.float32), map.lines.rows("descriptor", ids)))
     found = match_lines(*sides[0], *sides[1], LINE_DEG, NEAR_PX, LINE_OVERLAP, LINE_BITS, 1.0)
     pairs = np.sort(np.stack([idle[found >= 0], seen[found[found >= 0]]], axis=-1), axis=1)
-    pairs = pairs[_collinear(map.lines, pairs[:, 0], pairs[:, 1])]
+    pairs = pairs[_collinear(map.lines, pairs[:, 0], pairs[:, 1])] if len(pairs) else pairs
+    if not len(pairs):
+        return map
     kept, gone = pairs[:, 0], pairs[:, 1]
-    endpoints, information = lengthened(
-        map.lines.rows("endpoints_m", kept), map.lines.rows("information", kept), map.lines.rows("endpoints_m", gone)
-    )
-    lines = map.lines.updated(kept, endpoints_m=endpoints, information=information, descriptor=map.lines.rows("descriptor", gone))
+    reach, descriptor = map.lines.gathered(gone, "endpoints_m", "descriptor")
+    endpoints, information = map.lines.gathered(kept, "endpoints_m", "information")
+    endpoints, information = lengthened(endpoints, information, reach)
+    lines = map.lines.updated(kept, endpoints_m=endpoints, information=information, descriptor=descriptor)
     return _buried(replace(map, lines=lines), "line", kept, gone)
 
 
 def _collinear(lines: Table, a: I32, b: I32) -> Bool:
     """(n,) whether both ends of line b lie on line a, as far as is known of either."""
-    ends, on = lines.rows("endpoints_m", b), lines.rows("endpoints_m", a)
+    (on, known), (ends, other) = (lines.gathered(ids, "endpoints_m", "information") for ids in (a, b))
     direction = on[:, 1] - on[:, 0]
     share = np.einsum("nkj,nj->nk", ends - on[:, :1], direction) / np.maximum((direction**2).sum(-1), 1e-12)[:, None]
-    foot, covariance = points_along(on, inverse(lines.rows("information", a)), share)
-    covariance += inverse(lines.rows("information", b))
+    foot, covariance = points_along(on, inverse(known), share)
+    covariance += inverse(other)
     chi2 = np.einsum("nki,nkij,nkj->nk", ends - foot, inverse(covariance), ends - foot)
     good: Bool = (chi2 <= CHI2_2).all(axis=1)
     return good
@@ -90,7 +93,7 @@ def merge_planes(map: Map, keyframe: int, max_deg: float, max_m: float) -> Map:
     """Join planes seen by this keyframe, or by those before it, that have become the same one. The older id lives on."""
     fresh = observed_by(map, np.array([keyframe], np.int32), "plane")
     around = observed_by(map, newest_keyframes(map, 5), "plane")
-    is_fresh, alike = np.isin(around, fresh), _alike(map.planes, around, max_deg)
+    is_fresh, alike = among(around, fresh), _alike(map.planes, around, max_deg)
     for k in range(len(around) - 1, 0, -1):
         older = alike[k, :k] if is_fresh[k] else alike[k, :k] & is_fresh[:k]
         joined = _joined_with_first(map, around[:k][older], int(around[k]), max_m)
@@ -114,9 +117,9 @@ def _alike(planes: Table, ids: I32, max_deg: float) -> Bool:
     return alike
 
 
-def _joined_with_first(map: Map, among: I32, plane: int, max_m: float) -> Map:
+def _joined_with_first(map: Map, others: I32, plane: int, max_m: float) -> Map:
     """Join a plane with the first of these, which look the same way, that is the same one, if any is."""
-    for other in among.tolist():
+    for other in others.tolist():
         if _are_one(map.planes, min(other, plane), max(other, plane), max_m):
             return _join(map, min(other, plane), max(other, plane))
     return map
@@ -147,14 +150,15 @@ def _join(map: Map, a: int, b: int) -> Map:
 def _buried(map: Map, kind: str, kept: I32, gone: I32) -> Map:
     """Landmarks `gone` die; their observers, counts and observations pass to the distinct ids `kept`."""
     table: Table = getattr(map, f"{kind}s")
-    both = np.concatenate([table.rows("observers", kept), table.rows("observers", gone)], axis=1)
+    mine, theirs = (table.gathered(ids, "observers", "found", "visible") for ids in (kept, gone))
+    both = np.concatenate([mine[0], theirs[0]], axis=1)
     both = -np.sort(-both, axis=1)
     both[:, 1:][both[:, 1:] == both[:, :-1]] = -1  # seen by the same keyframe
     table = table.updated(
         kept,
         observers=-np.sort(-both, axis=1)[:, :OBSERVERS],
-        found=np.maximum(table.rows("found", kept), table.rows("found", gone)),
-        visible=np.maximum(table.rows("visible", kept), table.rows("visible", gone)),
+        found=np.maximum(mine[1], theirs[1]),
+        visible=np.maximum(mine[2], theirs[2]),
     )
     observations = _renamed(map, kind, kept, gone)
     changes: dict[str, Any] = {f"{kind}s": table.updated(gone, alive=np.zeros(len(gone), np.bool_)), f"{kind}_observations": observations}

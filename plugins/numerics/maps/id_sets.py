@@ -1,0 +1,27 @@
+"""Sets of ids, as sorted rows. Ids lie close together, so marking them beats sorting them."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from trihedron.pipeline.types import I32, Bool
+
+
+def union(a: I32, b: I32) -> I32:
+    """(n,) the ids of both, once each and sorted."""
+    marked = np.zeros(_end(a, b), np.bool_)
+    marked[a] = True
+    marked[b] = True
+    return np.flatnonzero(marked).astype(np.int32)
+
+
+def among(ids: I32, others: I32) -> Bool:
+    """(n,) which of the ids are among the others."""
+    marked = np.zeros(_end(ids, others), np.bool_)
+    marked[others] = True
+    found: Bool = marked[ids]
+    return found
+
+
+def _end(*parts: I32) -> int:
+    return max((int(part.max()) + 1 for part in parts if len(part)), default=0)
