@@ -51,6 +51,19 @@ def inverse_positive(H: F64) -> F64:
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
+def invert_symmetric(S: F64, out: F64) -> float:
+    """Inverse of a symmetric S (3, 3), in single precision too, into `out`, by cofactors; returns the determinant."""
+    a, b, c = np.float64(S[0, 0]), np.float64(S[0, 1]), np.float64(S[0, 2])
+    d, e, f = np.float64(S[1, 1]), np.float64(S[1, 2]), np.float64(S[2, 2])
+    u, v, w = d * f - e * e, c * e - b * f, b * e - c * d
+    determinant = a * u + b * v + c * w
+    out[0, 0], out[1, 1], out[2, 2] = u / determinant, (a * f - c * c) / determinant, (a * d - b * b) / determinant
+    out[0, 1], out[0, 2], out[1, 2] = v / determinant, w / determinant, (b * c - a * e) / determinant
+    out[1, 0], out[2, 0], out[2, 1] = out[0, 1], out[0, 2], out[1, 2]
+    return determinant
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def turn_left(phi: F64, R: F64) -> None:
     """`R <- Exp(phi) R` in place, for the first three numbers of phi (Rodrigues)."""
     x, y, z = phi[0], phi[1], phi[2]

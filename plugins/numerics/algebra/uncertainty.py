@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import numba
 import numpy as np
 
 from trihedron.pipeline.geometry import tangent_basis
 from trihedron.pipeline.types import F32, F64, Camera
+from trihedron.plugins.numerics.algebra.small_linear import invert_symmetric
 
 
 def point_covariance(points_m: F64, sigma_px: F64, sigma_m: F64, camera: Camera) -> F64:
@@ -19,8 +21,22 @@ def point_covariance(points_m: F64, sigma_px: F64, sigma_m: F64, camera: Camera)
 
 
 def inverse(matrices: F32 | F64) -> F64:
-    """(..., k, k) inverses: covariances of information matrices and the other way round. Raises LinAlgError for a singular one."""
-    return np.asarray(np.linalg.inv(matrices.astype(np.float64)), np.float64)
+    """(..., k, k) inverses of symmetric matrices: covariances of information matrices or the other way round. LinAlgError if one is singular."""
+    if matrices.shape[-1] != 3:
+        return np.asarray(np.linalg.inv(matrices.astype(np.float64)), np.float64)
+    out = np.array(matrices, np.float64, order="C")
+    if not _invert_each(out.reshape(-1, 3, 3)):
+        raise np.linalg.LinAlgError("Singular matrix")
+    return out
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _invert_each(matrices: F64) -> bool:
+    """Put the inverses of (n, 3, 3) symmetric matrices in their place; False when one is singular."""
+    regular = True
+    for k in range(len(matrices)):
+        regular &= invert_symmetric(matrices[k], matrices[k]) != 0.0
+    return regular
 
 
 def rotate_covariance(R_a_b: F64, covariance_b: F64) -> F64:
