@@ -12,6 +12,7 @@ from collections.abc import Iterable, Mapping
 from ctypes import addressof, c_char
 from dataclasses import dataclass, field
 from functools import cache, cached_property
+from itertools import accumulate
 from typing import Any
 
 import numpy as np
@@ -171,16 +172,16 @@ class Table:
     def extended(self, size: int, empty: Array, **columns: Array) -> Table:
         """A version of `size` rows in which the chunks `empty` hold nothing; the columns, of the schema's types, are the other new rows."""
         without, chunks, numbers = set(empty.tolist()), {}, range(self.size // CHUNK, -(-size // CHUNK))
+        held = [number for number in numbers if number not in without]
+        counts = [min(size, (number + 1) * CHUNK) - max(self.size, number * CHUNK) for number in held]
+        taken = list(zip(held, accumulate(counts, initial=0), accumulate(counts)))
         for name, values in columns.items():
-            parts, taken = list(self.chunks[name]), 0
-            for number in numbers:
-                known = parts[number : number + 1]  # begun already
-                count = 0 if number in without else min(size, (number + 1) * CHUNK) - max(self.size, number * CHUNK)
-                part = np.concatenate([*known, values[taken : taken + count]])
+            known, added = self.chunks[name], dict.fromkeys(numbers, empty_chunk(self.schema[name]))
+            for number, first, end in taken:
+                part = values[first:end]
+                added[number] = part = np.concatenate([known[number], part]) if number < len(known) else part.copy()
                 part.flags.writeable = False
-                parts[number : number + 1] = [empty_chunk(self.schema[name]) if number in without else part]
-                taken += count
-            chunks[name] = tuple(parts)
+            chunks[name] = (*known[: numbers.start], *added.values())
         return self._changed(size, chunks, numbers).emptied(empty)
 
     def _changed(self, size: int, chunks: Mapping[str, tuple[Array, ...]], numbers: Iterable[int]) -> Table:

@@ -8,6 +8,7 @@ import numpy as np
 
 from trihedron.pipeline.registry import register
 from trihedron.pipeline.types import DEGRADED, F64, I32, LOST, OK, Frame, Keypoints, Map, Planes, Pose, Rotation, Segments
+from trihedron.plugins.numerics.axes.cube_symmetry import CUBE
 from trihedron.plugins.numerics.maps.decoupled import reference_of
 from trihedron.plugins.numerics.maps.landmarks import empty_map
 from trihedron.plugins.numerics.maps.local_window import keyframes_of, living_keyframes, observed_by
@@ -89,7 +90,7 @@ class Features:
         bits, line_bits, samples = view.keypoints.descriptors.shape[1], view.segments.descriptors.shape[1], view.planes.samples_m.shape[1]
         map, none = empty_map(view.frame.index, view.frame.stamp_ns, bits, line_bits, samples), np.empty(0, np.int32)
         self._by_points(view, map, none, rng)
-        layout_poses(map, none, none, view.planes, view.segments, np.eye(3), np.eye(3))
+        layout_poses(map, none, none, view.planes, view.segments, np.eye(3), np.eye(3), CUBE[:1])
 
     def _sought(self, map: Map, submap: int, lost: bool, index: int) -> I32:
         """Sub-maps to look in: all for a lost camera; now and then the older ones for one tracked in a sub-map that is not tied to the first."""

@@ -287,7 +287,7 @@ def test_the_motion_between_two_planes_is_the_smallest():
     old[:3] /= np.linalg.norm(old[:3])
     new = transform_planes(exp_se3(rng.normal(size=6) * 0.1), old[None])[0]
     centre = -old[3] * old[:3] + tangent_basis(old[:3]) @ [0.4, -0.3]
-    T = plane_fusion.motion_between(old, new, centre)
+    T = plane_fusion.motions_between(old[None], new[None], centre[None])[0]
     assert np.allclose(transform_planes(T, old[None])[0], new)
     across = transform(T, centre) - centre
     assert np.allclose(across - new[:3] * (new[:3] @ across), 0.0, atol=1e-12)

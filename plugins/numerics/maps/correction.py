@@ -100,9 +100,11 @@ def _born_after(map: Map, kind: str, keyframe: int, later: I32, corrected: I32) 
 def _moved_planes(table: Table, ids: I32, coefficients: F64, covariance: F64, T: F64 | None = None) -> Table:
     """Give planes new coefficients and covariance, as if they were one measurement. Their samples are carried along by T, or by the smallest motion
     between old and new plane."""
-    old, samples, moments = table.rows("coefficients", ids), table.rows("samples_m", ids), table.rows("moments", ids)
-    for k in range(len(ids)):
-        motion = plane_fusion.motion_between(old[k], coefficients[k], moments[k, :3, 3] / moments[k, 3, 3]) if T is None else T
-        samples[k] = transform(motion, samples[k])
+    old, samples, moments = table.gathered(ids, "coefficients", "samples_m", "moments")
+    if T is None:
+        motions = plane_fusion.motions_between(old, coefficients, moments[:, :3, 3] / moments[:, 3, 3:])
+    else:
+        motions = np.broadcast_to(T, (len(ids), 4, 4))
+    samples = samples @ np.swapaxes(motions[:, :3, :3], 1, 2) + motions[:, None, :3, 3]
     moments = plane_fusion.equivalent_moments(coefficients, covariance)
     return table.updated(ids, coefficients=coefficients, covariance=covariance, moments=moments, samples_m=samples)

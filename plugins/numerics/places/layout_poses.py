@@ -56,9 +56,11 @@ def layout_of(coefficients: F64, areas: F64, endpoints_m: F64, lengths: F64, R: 
     return Layout(sides, places, areas[good], line_axis[order].astype(np.int32), ends[order], across[order], lengths[straight][order])
 
 
-def layout_poses(map: Map, plane_ids: I32, line_ids: I32, planes: Planes, segments: Segments, R_world: F64, R_camera: F64) -> tuple[F64, F64]:
+def layout_poses(
+    map: Map, plane_ids: I32, line_ids: I32, planes: Planes, segments: Segments, R_world: F64, R_camera: F64, ways: F64 = CUBE
+) -> tuple[F64, F64]:
     """(n, 4, 4) poses `T_world_camera` and (n,) how much of the frame's planes and lines they explain (0..2), best first, for axes seen as the
-    columns of `R_camera` and known as those of `R_world`, whichever of the 24 ways round."""
+    columns of `R_camera` and known as those of `R_world`, whichever of the `ways` (n, 3, 3) round."""
     known = layout_of(
         map.planes.rows("coefficients", plane_ids), np.ones(len(plane_ids)), map.lines.rows("endpoints_m", line_ids), np.ones(len(line_ids)), R_world
     )
@@ -66,7 +68,7 @@ def layout_poses(map: Map, plane_ids: I32, line_ids: I32, planes: Planes, segmen
     ends, pixels = segments.endpoints_m[solid].astype(np.float64), segments.endpoints_px[solid]
     lengths = np.linalg.norm(pixels[:, 1] - pixels[:, 0], axis=1).astype(np.float64)
     poses, scores = [], []
-    for S in CUBE:
+    for S in ways:
         named = R_camera @ S
         seen = layout_of(planes.coefficients, planes.pixels.astype(np.float64), ends, lengths, named)
         t, score = _places(seen, known)

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numba
 import numpy as np
 
-from trihedron.pipeline.geometry import exp_so3, tangent_basis
+from trihedron.pipeline.geometry import tangent_basis
 from trihedron.pipeline.types import F32, F64
-from trihedron.plugins.numerics.algebra.uncertainty import inverse
+from trihedron.plugins.numerics.algebra.uncertainty import cross_matrices, inverse
 
 
 def information_of(moments: F64, coefficients: F64) -> F64:
@@ -47,15 +47,17 @@ def fit_planes(moments: F64, like: F64) -> tuple[F64, F64]:
     return planes, inverse(information_of(moments, planes))
 
 
-def motion_between(old: F64, new: F64, centre: F64) -> F64:
-    """(4, 4) smallest motion that takes the plane `old` (4,) to `new` (4,), turning about the point `centre` of the old one."""
-    (a, b, c), (x, y, z) = old[:3].tolist(), new[:3].tolist()
-    axis = np.array([b * z - c * y, c * x - a * z, a * y - b * x])
-    sine, cosine = float(np.sqrt(axis @ axis)), float(old[:3] @ new[:3])
-    R = exp_so3(axis / sine * np.arctan2(sine, cosine)) if sine > 1e-12 else np.eye(3)
-    T = np.eye(4)
-    T[:3, :3] = R
-    T[:3, 3] = centre - R @ centre - (new[:3] @ centre + new[3]) * new[:3]
+def motions_between(old: F64, new: F64, centres: F64) -> F64:
+    """(n, 4, 4) smallest motions that take the planes `old` (n, 4) to `new` (n, 4), turning about the points `centres` (n, 3) of the old ones.
+
+    With v = a × b and c = a · b of the two normals the rotation is `1 + [v] + [v]² / (1 + c)`."""
+    K = cross_matrices(np.cross(old[:, :3], new[:, :3]))
+    cosine = np.einsum("ij,ij->i", old[:, :3], new[:, :3])
+    T = np.zeros((len(old), 4, 4))
+    T[:, :3, :3] = R = np.eye(3) + K + K @ K / np.maximum(1.0 + cosine, 1e-12)[:, None, None]
+    away = np.einsum("ij,ij->i", new[:, :3], centres) + new[:, 3]
+    T[:, :3, 3] = centres - np.einsum("nij,nj->ni", R, centres) - away[:, None] * new[:, :3]
+    T[:, 3, 3] = 1.0
     return T
 
 
