@@ -129,9 +129,9 @@ class Covisibility:
         """The map with this frame as its newest keyframe."""
         matches = matches if len(keyframes_of(map, pose.submap)) else None  # a new sub-map knows nothing yet
         found = associate(map, frame.camera, pose.T_world_camera, keypoints, segments, planes, matches, self.line_sigma_px, self.judge)
+        expected = self._planes_in_view(map, frame, pose, matches)
         map, row = insertion.add_keyframe(map, pose, frame.camera)
         view = insertion.View(row, frame.camera, pose.T_world_camera, pose.covariance)
-        expected = self._planes_in_view(map, frame, pose, matches)
         map = self._seen(map, matches, expected)
         map = insertion.insert_points(map, view, keypoints, found.points, found.new_points, self.memory)
         map = insertion.insert_lines(map, view, segments, found.lines, self._long(segments, found), self.line_sigma_px, self.memory)
