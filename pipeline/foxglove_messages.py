@@ -21,6 +21,7 @@ from foxglove_schemas_protobuf.PoseInFrame_pb2 import PoseInFrame
 from foxglove_schemas_protobuf.Quaternion_pb2 import Quaternion
 from foxglove_schemas_protobuf.SceneEntity_pb2 import SceneEntity
 from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
+from foxglove_schemas_protobuf.TriangleListPrimitive_pb2 import TriangleListPrimitive
 from foxglove_schemas_protobuf.Vector3_pb2 import Vector3
 from google.protobuf.duration_pb2 import Duration
 from google.protobuf.timestamp_pb2 import Timestamp
@@ -113,12 +114,17 @@ def _in_world(value: Value, name: str) -> tuple[SceneUpdate, SceneEntity]:
 
 def _fill(message: Any, field: str, rows: Any) -> None:
     """Add rows (n, k) to a field that repeats messages of k doubles (points, colours): their bytes at once, not object by object."""
+    message.MergeFromString(_repeated(message, field, rows).tobytes())
+
+
+def _repeated(message: Any, field: str, rows: Any) -> Any:
+    """Rows (n, k) as bytes (n,) of a field that repeats messages of k doubles."""
     rows = np.asarray(rows, np.float64).reshape(-1, rows.shape[-1])
     packed = np.zeros(len(rows), _packed(rows.shape[1]))
     packed["tag"], packed["size"] = message.DESCRIPTOR.fields_by_name[field].number << 3 | 2, 9 * rows.shape[1]
     for i in range(rows.shape[1]):
         packed[f"key{i}"], packed[f"value{i}"] = (i + 1) << 3 | 1, rows[:, i]
-    message.MergeFromString(packed.tobytes())
+    return packed
 
 
 @cache
@@ -151,18 +157,24 @@ def _half(pixels: F32) -> F64:
 def planes(planes: Planes) -> SceneUpdate:
     """Each region as the convex hull of its samples, in the camera frame."""
     update, entity = _scene(planes, "planes")
-    finite = np.isfinite(planes.samples_m[:, :, 0])
-    for i, basis in enumerate(tangent_basis(planes.coefficients[:, :3])):
-        samples = planes.samples_m[i][finite[i]]
-        if len(samples) < 3:
+    samples, points = planes.samples_m, _repeated(TriangleListPrimitive, "points", planes.samples_m).reshape(planes.samples_m.shape[:2])
+    flat = (samples @ tangent_basis(planes.coefficients[:, :3])).astype(np.float32)
+    for i, finite in enumerate(np.isfinite(samples[:, :, 0])):
+        seen = np.flatnonzero(finite)
+        if len(seen) < 3:
             continue
-        flat = (samples @ basis).astype(np.float32)
-        hull = samples[cv2.convexHull(flat, returnPoints=False)[:, 0]]
-        middle = np.arange(1, len(hull) - 1)
-        fan = hull[np.stack([0 * middle, middle, middle + 1], axis=1).ravel()]
+        hull = cv2.convexHull(flat[i, seen], returnPoints=False)[:, 0]
         r, g, b = COLORS[i % len(COLORS)]
-        _fill(entity.triangles.add(color=Color(r=r, g=g, b=b, a=0.5)), "points", fan)
+        triangles = entity.triangles.add(color=Color(r=r, g=g, b=b, a=0.5))
+        triangles.MergeFromString(points[i, seen[hull[_fan(len(hull))]]].tobytes())
     return update
+
+
+@cache
+def _fan(corners: int) -> Any:
+    """The triangles of a convex polygon: numbers of its corners."""
+    middle = np.arange(1, corners - 1)
+    return np.stack([0 * middle, middle, middle + 1], axis=1).ravel()
 
 
 def lines(segments: Segments) -> SceneUpdate:
