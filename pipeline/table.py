@@ -127,10 +127,9 @@ class Table:
             for number in touched:
                 parts[number] = part = parts[number].copy()
                 known[number] = _address_of(part)
+                part.flags.writeable = False  # for all but the kernel, which is given its address
             values = np.ascontiguousarray(column.rounded(given)).reshape(len(rows), *column.shape)
             _kernels().scatter(known, rows, CHUNK, _bytes(values, column.row_bytes))
-            for number in touched:
-                parts[number].flags.writeable = False
             chunks[name], addresses[name] = tuple(parts), known
         return Table(self.schema, self.size, chunks, addresses)
 

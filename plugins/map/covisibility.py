@@ -120,7 +120,7 @@ class Covisibility:
 
     def _shift_m(self, frame: Frame) -> float:
         """Way that makes a keyframe."""
-        depth = frame.depth_m[::8, ::8]
+        depth = frame.depth_m[::8, ::8].ravel()
         return self.min_shift * _median(depth[depth > 0.0], 1.0)
 
     def _inserted(
