@@ -9,11 +9,13 @@ import numpy as np
 from trihedron.pipeline.geometry import pose_matrix
 from trihedron.pipeline.registry import register
 from trihedron.pipeline.types import F64, Frame, Keypoints, Map, Planes, Pose, Rotation, Segments, Tracks, Translation
+from trihedron.plugins.numerics.algebra.constant_arrays import constant
+from trihedron.plugins.numerics.depth.depth_sampling import noise_coefficients
 from trihedron.plugins.numerics.maps.anchoring import anchored
-from trihedron.plugins.numerics.motion.pose_solver import solve_pose
-from trihedron.plugins.numerics.motion.pose_terms import SAME, LineTerms, PlaneTerms, PointTerms
+from trihedron.plugins.numerics.motion.place_pairs import pairs_of
+from trihedron.plugins.numerics.motion.pose_solver import Terms, solve_pose
 from trihedron.plugins.numerics.motion.positions import handed_on, origin, unmeasured
-from trihedron.plugins.numerics.motion.tracked_terms import placed_planes, placed_points
+from trihedron.plugins.numerics.motion.tracked_terms import tracked_lines, tracked_planes, tracked_points
 
 
 @register("translation", "levenberg_marquardt")
@@ -53,72 +55,37 @@ class LevenbergMarquardt:
         if previous_pose is None:
             return origin(frame)
         previous_pose = anchored(previous_pose, map)
-        earlier_pose = anchored(earlier_pose, map) if earlier_pose is not None else None
-        start = pose_matrix(rotation.R_world_camera, previous_pose.T_world_camera[:3, 3])
         frames = max(frame.index - previous_pose.index, 1)
-        prior = np.diag(np.repeat([(self.motion_sigma_m * frames) ** -2, 1.0], 3))
         if tracks is None or tracks.previous_index != previous_pose.index:
-            return self._predicted(frame, previous_pose, earlier_pose, frames)
-        T = previous_pose.T_world_camera
+            return self._predicted(frame, previous_pose, earlier_pose, map, frames)
+        T, R = previous_pose.T_world_camera, rotation.R_world_camera
+        start = pose_matrix(R, T[:3, 3])
+        prior = np.diag(np.repeat([(self.motion_sigma_m * frames) ** -2, 1.0], 3))
         uncertain = rotation.covariance + np.radians(self.rotation_sigma_deg) ** 2 * np.eye(3)
-        found = solve_pose(
-            start,
-            frame.camera,
-            start,
-            prior,
-            self._points(tracks, keypoints, T, frame, uncertain),
-            self._lines(tracks, segments, T, frame, uncertain),
-            self._planes(tracks, planes, T, uncertain),
-            fixed_rotation=True,
-        )
+        terms = self._terms(tracks, keypoints, segments, planes, frame, T, uncertain)
+        found = solve_pose(start, frame.camera, start, prior, *terms, fixed_rotation=True)
         if not (found.points.any() or found.lines.any() or found.planes.any()):
-            return self._predicted(frame, previous_pose, earlier_pose, frames)
-        R = rotation.R_world_camera
+            return self._predicted(frame, previous_pose, earlier_pose, map, frames)
         inliers = np.array([np.count_nonzero(kind) for kind in (found.points, found.lines, found.planes)], np.int32)
         unobservable = np.ascontiguousarray((R @ found.unobservable).T)
         covariance = R @ found.covariance @ R.T + handed_on(previous_pose, held_too=True)
         return Translation(frame.index, frame.stamp_ns, found.T_world_camera[:3, 3].copy(), covariance, unobservable, inliers, True)
 
-    def _predicted(self, frame: Frame, previous: Pose, earlier: Pose | None, frames: int) -> Translation:
+    def _predicted(self, frame: Frame, previous: Pose, earlier: Pose | None, map: Map | None, frames: int) -> Translation:
         """Where the camera is if it goes on as before, for as long as that may be said, else where it was."""
         t, before = previous.T_world_camera[:3, 3].copy(), handed_on(previous, held_too=True)
         lately = np.trace(before) / 3.0 < self.predict_frames * self.motion_sigma_m**2
         if earlier is not None and lately:
-            t += (t - earlier.T_world_camera[:3, 3]) * frames / (previous.index - earlier.index)
+            t += (t - anchored(earlier, map).T_world_camera[:3, 3]) * frames / (previous.index - earlier.index)
         return unmeasured(frame, t, before + (self.motion_sigma_m * frames) ** 2 * np.eye(3))
 
-    def _points(self, tracks: Tracks, keypoints: Keypoints, T: F64, frame: Frame, uncertain: F64) -> PointTerms:
-        """Tracked key points whose previous depth is known."""
-        known = np.isfinite(tracks.points_m).all(axis=1)
-        rows = tracks.keypoints[known, 1]
-        sigma_px = keypoints.sigma_px[rows]
-        return PointTerms(
-            *placed_points(tracks.points_m[known], sigma_px, tracks.sigma_m[known], frame.camera, T, uncertain),
-            keypoints.pixels[rows].astype(np.float64),
-            keypoints.points_m[rows, 2].astype(np.float64),
-            sigma_px.astype(np.float64),
-            keypoints.sigma_m[rows].astype(np.float64),
+    def _terms(self, tracks: Tracks, keypoints: Keypoints, segments: Segments, planes: Planes, frame: Frame, T: F64, uncertain: F64) -> Terms:
+        """The tracks, placed in the world by the previous pose T (4, 4) and a rotation of covariance `uncertain` (3, 3)."""
+        points, lines, walls = pairs_of(tracks, keypoints, segments, planes)
+        camera, T, uncertain = frame.camera, constant(T, np.float64), constant(uncertain, np.float64)
+        fx, fy, noise = float(camera.fx), float(camera.fy), noise_coefficients(camera.depth_noise)
+        return (
+            tracked_points(points, keypoints.pixels, fx, fy, T, uncertain),
+            tracked_lines(lines, segments.endpoints_px, self.line_sigma_px, noise, fx, fy, T, uncertain),
+            tracked_planes(walls, T, uncertain),
         )
-
-    def _lines(self, tracks: Tracks, segments: Segments, T: F64, frame: Frame, uncertain: F64) -> LineTerms:
-        """Tracked lines whose previous 3D end points are known."""
-        known = np.isfinite(tracks.endpoints_m).all(axis=(1, 2))
-        rows = tracks.segments[known, 1]
-        ends = tracks.endpoints_m[known].reshape(-1, 3)
-        sigma_px, sigma_m = np.full(len(ends), self.line_sigma_px), frame.camera.depth_noise.sigma_m(ends[:, 2].astype(np.float64))
-        world, covariance = placed_points(ends, sigma_px, sigma_m, frame.camera, T, uncertain)
-        return LineTerms(
-            world.reshape(-1, 2, 3),
-            covariance.reshape(-1, 2, 3, 3),
-            segments.endpoints_px[rows].astype(np.float64),
-            np.full(len(rows), self.line_sigma_px),
-            segments.endpoints_m[rows].astype(np.float64),
-            segments.covariance_m2[rows].astype(np.float64),
-        )
-
-    def _planes(self, tracks: Tracks, planes: Planes, T: F64, uncertain: F64) -> PlaneTerms:
-        """Tracked planes."""
-        rows = tracks.planes[:, 1]
-        observed = planes.coefficients[rows]
-        world, covariance, turned = placed_planes(tracks.coefficients, tracks.plane_covariance, observed, T, uncertain)
-        return PlaneTerms(np.full(len(rows), SAME, np.int32), world, covariance, observed, planes.covariance[rows] + turned)

@@ -22,7 +22,7 @@ def test_points():
     pixels, z = rng.uniform(0, 480, (20, 2)), rng.uniform(0.5, 5.0, 20)
     points = CAMERA.back_project(pixels, z).astype(np.float32)
     sigma_px, sigma_m = rng.uniform(0.5, 2.0, 20).astype(np.float32), rng.uniform(0.001, 0.05, 20).astype(np.float32)
-    world, covariance = placed_points(points, sigma_px, sigma_m, CAMERA, T, TURNED)
+    world, covariance = placed_points(points, sigma_px, sigma_m, CAMERA.fx, CAMERA.fy, T, TURNED)
     np.testing.assert_allclose(world, transform(T, points.astype(np.float64)), atol=1e-12)
     for i in range(20):
         across = z[i] / np.array([CAMERA.fx, CAMERA.fy])  # of a pixel, where the ray is

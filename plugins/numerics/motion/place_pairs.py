@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numba
 import numpy as np
 
-from trihedron.pipeline.types import F32, F64, I32
+from trihedron.pipeline.types import F32, F64, I32, Keypoints, Planes, Segments, Tracks
 from trihedron.plugins.numerics.algebra.small_linear import inverse_positive
 from trihedron.plugins.numerics.motion.pose_terms import basis
 
@@ -42,6 +42,15 @@ class PlanePairs(NamedTuple):
     before_covariance: F64  # (n, 3, 3) of (a, b, d)
     planes: F64  # (k, 4) current
     covariance: F64  # (k, 3, 3)
+
+
+def pairs_of(tracks: Tracks, keypoints: Keypoints, segments: Segments, planes: Planes) -> tuple[PointPairs, LinePairs, PlanePairs]:
+    """The tracks with the current features."""
+    return (
+        PointPairs(tracks.keypoints, tracks.points_m, tracks.sigma_m, keypoints.points_m, keypoints.sigma_px, keypoints.sigma_m),
+        LinePairs(tracks.segments, tracks.endpoints_m, segments.endpoints_m, segments.covariance_m2),
+        PlanePairs(tracks.planes, tracks.coefficients, tracks.plane_covariance, planes.coefficients, planes.covariance),
+    )
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")

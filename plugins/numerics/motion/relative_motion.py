@@ -15,7 +15,7 @@ import numpy as np
 from trihedron.pipeline.types import F64, Keypoints, Planes, Segments, Tracks
 from trihedron.plugins.numerics.algebra.ranking import median
 from trihedron.plugins.numerics.algebra.small_linear import inverse_positive, solve_positive, turn_left
-from trihedron.plugins.numerics.motion.place_pairs import LinePairs, PlanePairs, PointPairs, line_pairs, plane_pairs, point_pairs
+from trihedron.plugins.numerics.motion.place_pairs import LinePairs, PlanePairs, PointPairs, line_pairs, pairs_of, plane_pairs, point_pairs
 
 MOST = 400  # pairs of places used, about; more only cost time
 GATE2 = 9.0  # squared standard deviations at which a term counts a quarter, once the scale has come down
@@ -51,11 +51,8 @@ def solve_motion(
     `rad_per_px` turns a key point's sigma_px into an angle; `floor_deg` is the least error of a plane's normal. Pairs that are not finite, or whose
     covariance is none, are left out. Graduated non-convexity (Yang et al., RA-L 2020): the Geman–McClure scale comes down from the median residual,
     so that up to half of the terms may be wrong. Never raises: without terms the prediction is returned, with the covariance of the prior."""
-    points = PointPairs(tracks.keypoints, tracks.points_m, tracks.sigma_m, keypoints.points_m, keypoints.sigma_px, keypoints.sigma_m)
-    lines = LinePairs(tracks.segments, tracks.endpoints_m, segments.endpoints_m, segments.covariance_m2)
-    walls = PlanePairs(tracks.planes, tracks.coefficients, tracks.plane_covariance, planes.coefficients, planes.covariance)
     noise = float(rad_per_px), float(np.radians(floor_deg)), float(np.radians(sigma_deg)), float(sigma_m)
-    return Motion(*_motion(points, lines, walls, tracks.R_current_previous, noise))
+    return Motion(*_motion(*pairs_of(tracks, keypoints, segments, planes), tracks.R_current_previous, noise))
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
