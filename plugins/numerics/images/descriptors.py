@@ -175,6 +175,9 @@ def near_matches(
     owner = np.full(len(tpx), -1, np.int32)
     held = np.full(len(tpx), np.inf)
     near, apart = np.empty(len(tpx), np.int32), np.empty(len(tpx))
+    places, octaves = np.empty((len(order), 2), np.float32), np.empty(len(order), np.int64)  # in the order of the grid
+    for k in range(len(order)):
+        places[k, 0], places[k, 1], octaves[k] = tpx[order[k], 0], tpx[order[k], 1], toct[order[k]]
     for i in range(len(qpx)):
         x, y, r = qpx[i, 0], qpx[i, 1], radius[i]
         if not (np.isfinite(x) and np.isfinite(y) and r >= 0.0) or x + r < x0 or x - r > x1 or y + r < y0 or y - r > y1:
@@ -183,10 +186,10 @@ def near_matches(
         for row in range(max(int((y - r - y0) / cell), 0), min(int((y + r - y0) / cell), rows - 1) + 1):
             c0, c1 = max(int((x - r - x0) / cell), 0), min(int((x + r - x0) / cell), cols - 1)
             for k in range(start[row * cols + c0], start[row * cols + c1 + 1]):
-                t = order[k]
-                apart2 = (tpx[t, 0] - x) ** 2 + (tpx[t, 1] - y) ** 2
-                if apart2 > r * r or abs(np.int64(toct[t]) - np.int64(qoct[i])) > step:
+                apart2 = (places[k, 0] - x) ** 2 + (places[k, 1] - y) ** 2
+                if (apart2 > r * r) | (abs(octaves[k] - np.int64(qoct[i])) > step):
                     continue
+                t = order[k]
                 if mode == HAMMING:
                     distance = float(_bits_apart(qwords, i, twords, t))
                 elif mode == L2:
@@ -243,12 +246,14 @@ def line_matches(
     out = np.full(len(q), -1, np.int32)
     owner = np.full(len(t), -1, np.int32)
     held = np.full(len(t), np.inf)
-    cost = np.full(len(t), np.inf)
+    x, y = t[:, 2].copy(), t[:, 3].copy()
+    cost, sines = np.empty(len(t)), np.empty(len(t))
     for i in range(len(q)):
-        best = -1
+        best, dx, dy = -1, q[i, 2], q[i, 3]
+        for j in range(len(t)):  # several at once
+            cost[j], sines[j] = np.inf, abs(dx * y[j] - dy * x[j])
         for j in range(len(t)):
-            cost[j] = np.inf
-            sine = abs(q[i, 2] * t[j, 3] - q[i, 3] * t[j, 2])
+            sine = sines[j]
             if not sine <= sine_max:  # most pairs end here
                 continue
             offset, overlap = _beside(q, i, t, j)
