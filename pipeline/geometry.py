@@ -1,6 +1,8 @@
-"""Rotations, rigid motions, planes, and numbers on a line: small, exact, NumPy only. Frames and signs as in `types`."""
+"""Rotations, rigid motions, planes, and numbers on a line: small, exact, NumPy and plain numbers only. Frames and signs as in `types`."""
 
 from __future__ import annotations
+
+import math
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,25 +17,24 @@ def skew(v: F64) -> F64:
 
 def exp_so3(phi: F64) -> F64:
     """(3,) rotation vector (rad) -> (3, 3) rotation (Rodrigues)."""
-    angle2 = float(phi @ phi)
-    angle = np.sqrt(angle2)
+    x, y, z = phi.tolist()  # plain numbers: NumPy takes five times as long for so few
+    angle2 = x * x + y * y + z * z
     if angle2 < 1e-12:
         a, b = 1.0 - angle2 / 6.0, 0.5 - angle2 / 24.0
     else:
-        a, b = np.sin(angle) / angle, (1.0 - np.cos(angle)) / angle2
-    K = skew(phi)
-    return np.eye(3) + a * K + b * (K @ K)
+        angle = math.sqrt(angle2)
+        a, b = math.sin(angle) / angle, (1.0 - math.cos(angle)) / angle2
+    xy, xz, yz = b * (x * y), b * (x * z), b * (y * z)
+    x2, y2, z2, x, y, z = x * x, y * y, z * z, a * x, a * y, a * z
+    return np.array([[1.0 - b * (y2 + z2), xy - z, xz + y], [xy + z, 1.0 - b * (x2 + z2), yz - x], [xz - y, yz + x, 1.0 - b * (x2 + y2)]])
 
 
 def log_so3(R: F64) -> F64:
     """(3, 3) rotation -> (3,) rotation vector with angle in [0, π]; inverse of `exp_so3`."""
-    q = quaternion_from_rotation(R)
-    v, w = q[:3], q[3]
-    if w < 0.0:
-        v, w = -v, -w
-    s = float(np.linalg.norm(v))
-    factor = 2.0 / w if s < 1e-9 else 2.0 * np.arctan2(s, w) / s
-    return np.asarray(factor * v, np.float64)
+    x, y, z, w = _quaternion(R)
+    s = math.sqrt(x * x + y * y + z * z)
+    factor = 2.0 / w if s < 1e-9 else 2.0 * math.atan2(s, w) / s
+    return np.array([factor * x, factor * y, factor * z])
 
 
 def left_jacobian_so3(phi: F64) -> F64:
@@ -111,30 +112,34 @@ def tangent_basis(n: F64) -> F64:
 def nearest_rotation(M: F64) -> F64:
     """(3, 3) -> the rotation nearest in the Frobenius norm (SVD with determinant +1)."""
     U, _, Vt = np.linalg.svd(M)
-    return np.asarray(U @ np.diag([1.0, 1.0, np.linalg.det(U @ Vt)]) @ Vt, np.float64)
+    U[:, 2] *= np.linalg.det(U @ Vt)
+    return np.asarray(U @ Vt, np.float64)
 
 
 def rotation_angle_deg(R: F64) -> float:
     """Angle of a rotation in degrees, accurate near 0."""
-    return float(np.degrees(np.linalg.norm(log_so3(R))))
+    return math.degrees(math.hypot(*log_so3(R).tolist()))
 
 
 def quaternion_from_rotation(R: F64) -> F64:
     """(3, 3) rotation -> unit quaternion (x, y, z, w) with w >= 0, by the largest diagonal term (no cancellation)."""
-    trace = R[0, 0] + R[1, 1] + R[2, 2]
-    candidates = np.array([R[0, 0], R[1, 1], R[2, 2], trace])
-    i = int(np.argmax(candidates))
-    if i == 3:
-        q = np.array([R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1], 1.0 + trace])
+    return np.array(_quaternion(R))
+
+
+def _quaternion(R: F64) -> tuple[float, float, float, float]:
+    (a, b, c), (d, e, f), (g, h, i) = R.tolist()
+    trace = a + e + i
+    largest = max(a, e, i, trace)
+    if largest == a:
+        x, y, z, w = 1.0 + a - e - i, b + d, c + g, h - f
+    elif largest == e:
+        x, y, z, w = b + d, 1.0 + e - i - a, f + h, c - g
+    elif largest == i:
+        x, y, z, w = c + g, f + h, 1.0 + i - a - e, d - b
     else:
-        j, k = (i + 1) % 3, (i + 2) % 3
-        q = np.empty(4)
-        q[i] = 1.0 + R[i, i] - R[j, j] - R[k, k]
-        q[j] = R[j, i] + R[i, j]
-        q[k] = R[k, i] + R[i, k]
-        q[3] = R[k, j] - R[j, k]
-    q /= np.linalg.norm(q)
-    return q if q[3] >= 0.0 else -q
+        x, y, z, w = h - f, c - g, d - b, 1.0 + trace
+    norm = math.copysign(math.sqrt(x * x + y * y + z * z + w * w), w)
+    return x / norm, y / norm, z / norm, w / norm
 
 
 def rotation_from_quaternion(q: F64) -> F64:
