@@ -7,17 +7,7 @@ import numpy as np
 
 from trihedron.pipeline.types import F32, F64, U8
 
-
-@numba.njit(cache=True, nogil=True, error_model="numpy")
-def bilinear(image: U8, x: float, y: float) -> float:
-    """Grey level at a sub-pixel position; positions outside take the border's."""
-    rows, cols = image.shape
-    x, y = min(max(x, 0.0), cols - 1.001), min(max(y, 0.0), rows - 1.001)
-    c, r = int(x), int(y)
-    a, b = x - c, y - r
-    top = image[r, c] * (1.0 - a) + image[r, c + 1] * a
-    return top * (1.0 - b) + (image[r + 1, c] * (1.0 - a) + image[r + 1, c + 1] * a) * b
-
+MOST = 2056  # samples of a segment; rows of a power of two would all lie in the same part of a cache
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def merge_collinear(lines: F64, angle: float, offset_px: float, gap_px: float) -> F64:
@@ -71,49 +61,64 @@ def refine_on_edge(image: U8, lines: F64, reach_px: int, step_px: float) -> F32:
     Across the segment, every `step_px`, the steepest slope of its polarity within `reach_px` is found to a fraction of a pixel (parabola), and a
     line is fitted to these positions, weighted by slope, reweighted against outliers. A segment with fewer than 4 positions stays as it is."""
     out = np.empty((len(lines), 2, 2), np.float32)
-    most = 2048
-    along, across, weight = np.empty(most), np.empty(most), np.empty(most)
-    slope = np.empty(2 * reach_px + 1)
+    along, across, weight, levels = np.empty(MOST), np.empty(MOST), np.empty(MOST), np.empty((2 * reach_px + 3, MOST))
+    scratch, slope = np.empty((4, MOST)), np.empty(2 * reach_px + 1)
     for i in range(len(lines)):
-        x0, y0, x1, y1 = lines[i]
+        x0, y0, x1, y1 = lines[i, 0], lines[i, 1], lines[i, 2], lines[i, 3]
         length = max(np.hypot(x1 - x0, y1 - y0), 1e-6)
         ux, uy = (x1 - x0) / length, (y1 - y0) / length
         nx, ny = -uy, ux  # to the right of the direction (y points down)
-        count = min(int(length / step_px) + 1, most)
+        count = min(int(length / step_px) + 1, MOST)
+        for k in range(count):
+            t = length * (k + 0.5) / count
+            scratch[0, k], scratch[1, k] = x0 + t * ux, y0 + t * uy
+        for j in range(len(levels)):
+            _levels_beside(image, scratch, (j - reach_px - 1) * nx, (j - reach_px - 1) * ny, levels[j, :count])
         contrast = 0.0
         for k in range(count):
-            t = length * (k + 0.5) / count
-            contrast += bilinear(image, x0 + t * ux + nx, y0 + t * uy + ny) - bilinear(image, x0 + t * ux - nx, y0 + t * uy - ny)
-        sign = 1.0 if contrast >= 0.0 else -1.0
+            contrast += levels[reach_px + 2, k] - levels[reach_px, k]
+        sign = 1 if contrast >= 0.0 else -1
         m = 0
         for k in range(count):
-            t = length * (k + 0.5) / count
-            found, offset, strength = _edge_across(image, x0 + t * ux, y0 + t * uy, nx * sign, ny * sign, slope)
+            found, offset, strength = _steepest(levels, k, sign, slope)
             if found:
-                along[m], across[m], weight[m] = t, offset * sign, strength
+                along[m], across[m], weight[m] = length * (k + 0.5) / count, offset * sign, strength
                 m += 1
         if m >= 4:
             a, b = _robust_line(along[:m], across[:m], weight[:m])
             x0, y0, x1, y1 = x0 + a * nx, y0 + a * ny, x1 + (a + b * length) * nx, y1 + (a + b * length) * ny
-        if sign < 0.0:
+        if sign < 0:
             x0, y0, x1, y1 = x1, y1, x0, y0
         out[i, 0, 0], out[i, 0, 1], out[i, 1, 0], out[i, 1, 1] = x0, y0, x1, y1
     return out
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def _edge_across(image: U8, x: float, y: float, nx: float, ny: float, slope: F64) -> tuple[bool, float, float]:
-    """Offset along (nx, ny) of the steepest rise, and its slope; False when the steepest is at the end of the reach or there is no rise."""
-    reach = len(slope) // 2
-    before = bilinear(image, x - (reach + 1) * nx, y - (reach + 1) * ny)
-    here = bilinear(image, x - reach * nx, y - reach * ny)
-    best = 0
-    for k in range(len(slope)):
-        after = bilinear(image, x + (k + 1 - reach) * nx, y + (k + 1 - reach) * ny)
-        slope[k] = 0.5 * (after - before)
-        before, here = here, after
-        if slope[k] > slope[best]:
-            best = k
+def _levels_beside(image: U8, scratch: F64, right: float, down: float, out: F64) -> None:
+    """Writes grey levels (n,), bilinear, so far from the positions in the first two rows of `scratch`; those outside the image are the border's."""
+    rows, cols = image.shape
+    flat, xs, ys, place, aside = image.ravel(), scratch[0], scratch[1], scratch[2].view(np.int64), scratch[3]
+    for k in range(len(out)):
+        x, y = min(max(xs[k] + right, 0.0), cols - 1.001), min(max(ys[k] + down, 0.0), rows - 1.001)
+        c, r = int(x), int(y)
+        place[k], aside[k], out[k] = r * cols + c, x - c, y - r
+    for k in range(len(out)):
+        a, b, p = aside[k], out[k], np.uint64(place[k])
+        q = p + np.uint64(cols)
+        top = flat[p] * (1.0 - a) + flat[p + np.uint64(1)] * a
+        out[k] = top * (1.0 - b) + (flat[q] * (1.0 - a) + flat[q + np.uint64(1)] * a) * b
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _steepest(levels: F64, k: int, sign: int, slope: F64) -> tuple[bool, float, float]:
+    """Of the grey levels across sample k, one more on each side than there are slopes: offset of the steepest rise, counted along `sign`, and its
+    slope; False when the steepest is at the end of the reach or there is no rise."""
+    reach, best = len(slope) // 2, 0
+    for j in range(len(slope)):
+        here = (reach + 1) + sign * (j - reach)
+        slope[j] = 0.5 * (levels[here + sign, k] - levels[here - sign, k])
+        if slope[j] > slope[best]:
+            best = j
     if best == 0 or best == len(slope) - 1 or slope[best] <= 1.0:
         return False, 0.0, 0.0
     a, b, c = slope[best - 1], slope[best], slope[best + 1]

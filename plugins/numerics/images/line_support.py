@@ -13,12 +13,12 @@ BINS = 1024  # of gradient magnitude, by which pixels are taken in order
 
 
 class LevelLines(NamedTuple):
-    """Flat over an image (h · w,): unit vectors along the level lines (dark on the right), gradient magnitudes, and 1 where a pixel may be taken."""
+    """Of an image (h, w): x and y (2 h · w,) of unit vectors along the level lines (dark on the right) of the pixels that are free to be taken, NaN
+    of others, and gradient magnitudes (h · w,)."""
 
-    x: F32
-    y: F32
+    image: U8
+    free: F32
     magnitude: F32
-    free: U8
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
@@ -31,15 +31,16 @@ def line_support_segments(image: U8, tolerance: float, quantisation: float, dens
     h, w = image.shape
     if h < 3 or w < 3:
         return np.zeros((0, 4))
-    lines = _level_lines(image, quantisation / np.sin(tolerance))
+    threshold = quantisation / np.sin(tolerance)
+    lines = _level_lines(image, threshold)
     tests = 2.5 * (np.log10(w) + np.log10(h)) + np.log10(11.0)
     least = int(-tests / np.log10(tolerance / np.pi))
-    region, rectangle = np.empty((h * w, 2), np.int32), np.empty(6)
+    region, rectangle, cosine = np.empty((h * w, 2), np.int32), np.empty(6), np.cos(tolerance)
     out, n = np.empty((h * w // max(least, 1) + 1, 4)), 0
-    for seed in _by_strength(lines):
-        if not lines.free[seed]:
+    for seed in _by_strength(lines.magnitude, threshold, region.ravel()):
+        if np.isnan(lines.free[2 * seed]):
             continue
-        size, x, y = _grow(region, seed, w, np.cos(tolerance), lines)
+        size, x, y = _grow(region, seed, w, cosine, lines.free)
         if size < least:
             continue
         _fit_rectangle(region[:size], w, x, y, lines.magnitude, rectangle)
@@ -55,65 +56,71 @@ def line_support_segments(image: U8, tolerance: float, quantisation: float, dens
 def _level_lines(image: U8, threshold: float) -> LevelLines:
     """Of the gradients over 2 × 2 pixels; the image's border is not free."""
     h, w = image.shape
-    x, y, magnitude = np.zeros((h, w), np.float32), np.zeros((h, w), np.float32), np.zeros((h, w), np.float32)
-    free = np.zeros((h, w), np.uint8)
-    limit, tiny = np.float32(threshold), np.float32(1e-6)
+    free, magnitude = np.full(2 * h * w, np.nan, np.float32), np.zeros(h * w, np.float32)
+    limit, none = np.float32(threshold), np.float32(np.nan)
     for r in range(1, h - 1):
         a, b, c, d = image[r, 1 : w - 1], image[r, 2:], image[r + 1, 1 : w - 1], image[r + 1, 2:]
-        xs, ys, ms, fs = x[r, 1 : w - 1], y[r, 1 : w - 1], magnitude[r, 1 : w - 1], free[r, 1 : w - 1]
+        first, end = r * w + 1, r * w + w - 1
+        lines, ms = free[2 * first : 2 * end], magnitude[first:end]
         for i in range(w - 2):
-            falling, rising = np.int32(d[i]) - np.int32(a[i]), np.int32(b[i]) - np.int32(c[i])
-            gx, gy = np.float32(0.5) * np.float32(falling + rising), np.float32(0.5) * np.float32(falling - rising)
-            m = np.sqrt(gx * gx + gy * gy)
-            inverse = np.float32(1.0) / max(m, tiny)
-            xs[i], ys[i], ms[i] = -gy * inverse, gx * inverse, m
-            fs[i] = m > limit
-    return LevelLines(x.ravel(), y.ravel(), magnitude.ravel(), free.ravel())
+            x, y, ms[i] = _level_line(a[i], b[i], c[i], d[i])
+            lines[2 * i], lines[2 * i + 1] = x if ms[i] > limit else none, y if ms[i] > limit else none
+    return LevelLines(image, free, magnitude)
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def _by_strength(lines: LevelLines) -> I32:
-    """Free pixels from the largest gradient to the smallest, in classes of about equal magnitude."""
-    magnitude, free = lines.magnitude, lines.free
-    scale = (BINS - 1) / max(magnitude.max(), np.float32(1e-6))
-    start = np.zeros(BINS + 1, np.int32)
-    for i in range(len(free)):
-        if free[i]:
-            start[BINS - int(magnitude[i] * scale)] += 1
+def _level_line(a: int, b: int, c: int, d: int) -> tuple[float, float, float]:
+    """Unit vector and magnitude of the gradient over two rows of two grey levels each."""
+    falling, rising = np.int32(d) - np.int32(a), np.int32(b) - np.int32(c)
+    gx, gy = np.float32(0.5) * np.float32(falling + rising), np.float32(0.5) * np.float32(falling - rising)
+    m = np.sqrt(gx * gx + gy * gy)
+    inverse = np.float32(1.0) / max(m, np.float32(1e-6))
+    return -gy * inverse, gx * inverse, m
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _by_strength(magnitude: F32, threshold: float, strong: I32) -> I32:
+    """Pixels whose gradient is above a threshold, from the largest to the smallest, in classes of about equal magnitude. `strong` is overwritten."""
+    limit, scale = np.float32(threshold), (BINS - 1) / max(magnitude.max(), np.float32(1e-6))
+    n = 0
+    for i in range(len(magnitude)):
+        strong[n] = i
+        n += magnitude[i] > limit
+    order, start = np.empty(n, np.int32), np.zeros(BINS + 1, np.int32)
+    for j in range(n):
+        start[BINS - int(magnitude[strong[j]] * scale)] += 1
     for k in range(BINS):
         start[k + 1] += start[k]
-    order = np.empty(start[BINS], np.int32)
-    for i in range(len(free)):
-        if free[i]:
-            k = BINS - 1 - int(magnitude[i] * scale)
-            order[start[k]] = i
-            start[k] += 1
+    for j in range(n):
+        k = BINS - 1 - int(magnitude[strong[j]] * scale)
+        order[start[k]] = strong[j]
+        start[k] += 1
     return order
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def _grow(region: I32, seed: int, w: int, cosine: float, lines: LevelLines) -> tuple[int, float, float]:
-    """Takes the pixels connected to a seed whose level lines are within an angle of the region's mean; (number, unit vector x, y of the mean)."""
-    xs, ys, free = lines.x, lines.y, lines.free
+def _grow(region: I32, seed: int, w: int, cosine: float, free: F32) -> tuple[int, float, float]:
+    """Takes the free pixels connected to a seed whose level lines are within an angle of the region's mean; (number, x, y along the mean)."""
     region[0, 0], region[0, 1], size, done = seed % w, seed // w, 1, 0
-    free[seed] = 0
-    x, y = xs[seed], ys[seed]
+    x, y = free[2 * seed], free[2 * seed + 1]
+    free[2 * seed] = np.nan
     limit = np.float32(cosine)  # times the length of the sum (x, y)
     while done < size:
-        column, row = region[done]
+        column, row = region[done, 0], region[done, 1]
         done += 1
         for r in range(row - 1, row + 2):
+            q = np.uint64(2 * (r * w + column - 1))
             for c in range(column - 1, column + 2):
-                q = r * w + c
-                if free[q] and x * xs[q] + y * ys[q] >= limit:
-                    free[q] = 0
+                a, b = free[q], free[q + np.uint64(1)]
+                if x * a + y * b >= limit:  # not of NaN
+                    free[q] = np.nan
                     region[size, 0], region[size, 1] = c, r
                     size += 1
-                    x += xs[q]
-                    y += ys[q]
+                    x += a
+                    y += b
                     limit = np.float32(cosine) * np.sqrt(x * x + y * y)
-    length = np.sqrt(x * x + y * y)
-    return size, x / length, y / length
+                q += np.uint64(2)
+    return size, x, y
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
@@ -151,18 +158,17 @@ def _fit_rectangle(region: I32, w: int, x: float, y: float, magnitude: F32, out:
 def _refine(region: I32, size: int, w: int, x: float, y: float, density: float, lines: LevelLines, rectangle: F64) -> int:
     """Grows a sparse region anew with the tolerance that the level lines about its seed show, then cuts it shorter until it fills its rectangle."""
     sx, sy, turn, square, near = region[0, 0], region[0, 1], 0.0, 0.0, 0
-    seed = sy * w + sx
+    seed_x, seed_y = _release(lines, sx, sy)
     for k in range(size):
-        p = region[k, 1] * w + region[k, 0]
-        lines.free[p] = 1
+        x, y = _release(lines, region[k, 0], region[k, 1])
         if (region[k, 0] - sx) ** 2 + (region[k, 1] - sy) ** 2 < rectangle[4] ** 2:
-            angle = np.arctan2(lines.x[seed] * lines.y[p] - lines.y[seed] * lines.x[p], lines.x[seed] * lines.x[p] + lines.y[seed] * lines.y[p])
+            angle = np.arctan2(seed_x * y - seed_y * x, seed_x * x + seed_y * y)
             turn += angle
             square += angle * angle
             near += 1
     mean = turn / near
     spread = np.sqrt(max(square / near - mean * mean, 0.0))
-    size, x, y = _grow(region, seed, w, np.cos(min(2.0 * spread, 0.5 * np.pi)), lines)
+    size, x, y = _grow(region, sy * w + sx, w, np.cos(min(2.0 * spread, 0.5 * np.pi)), lines.free)
     if size < 2:
         return size
     _fit_rectangle(region[:size], w, x, y, lines.magnitude, rectangle)
@@ -175,8 +181,18 @@ def _refine(region: I32, size: int, w: int, x: float, y: float, density: float, 
                 region[kept] = region[k]
                 kept += 1
             else:
-                lines.free[region[k, 1] * w + region[k, 0]] = 1
+                _release(lines, region[k, 0], region[k, 1])
         size = kept
         if size >= 2:
             _fit_rectangle(region[:size], w, x, y, lines.magnitude, rectangle)
     return size
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _release(lines: LevelLines, c: int, r: int) -> tuple[float, float]:
+    """Makes a pixel free to be taken again; its level line."""
+    image = lines.image
+    x, y, _ = _level_line(image[r, c], image[r, c + 1], image[r + 1, c], image[r + 1, c + 1])
+    place = 2 * (r * image.shape[1] + c)
+    lines.free[place], lines.free[place + 1] = x, y
+    return x, y

@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 
 from trihedron.pipeline.types import F32, F64, U8, Bool, Frame, LineSegments
-from trihedron.plugins.numerics.images.line_band_descriptor import band_pairs, line_band_descriptors
+from trihedron.plugins.numerics.images.line_band_descriptor import line_band_descriptors
 from trihedron.plugins.numerics.images.line_refinement import merge_collinear, refine_on_edge
 
 SMALLEST = 8  # px, side of an image a detector is asked to look at; some fail on less
@@ -72,8 +72,7 @@ class StraightEdges:
         return np.asarray((np.hypot(x[:, 1] - x[:, 0], y[:, 1] - y[:, 0]) >= self.min_length_px) & ~border)
 
     def _described(self, small: U8, endpoints: F32) -> U8:
-        gx, gy = cv2.Sobel(small, cv2.CV_32F, 1, 0), cv2.Sobel(small, cv2.CV_32F, 0, 1)
-        return line_band_descriptors(gx, gy, endpoints, self.scale, self.band_px, 2.0, band_pairs())
+        return line_band_descriptors(small, endpoints, self.scale, self.band_px, 2.0)
 
     @cached_property
     def _local(self) -> threading.local:
