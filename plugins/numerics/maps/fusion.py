@@ -49,7 +49,9 @@ def _fade_across(information: F64, ends: F64, share: float) -> None:
     for k in range(3):
         u[k] = ends[1, k] - ends[0, k]
         length += u[k] * u[k]
-    u /= max(np.sqrt(length), 1e-12)
+    length = max(np.sqrt(length), 1e-12)
+    for k in range(3):
+        u[k] /= length
     for i in range(3):
         row[i] = information[i, 0] * u[0] + information[i, 1] * u[1] + information[i, 2] * u[2]
         along += u[i] * row[i]
@@ -57,6 +59,17 @@ def _fade_across(information: F64, ends: F64, share: float) -> None:
         for j in range(3):
             mixed = root * (1.0 - root) * (row[i] * u[j] + u[i] * row[j]) + (1.0 - root) ** 2 * along * u[i] * u[j]
             information[i, j] = share * information[i, j] + mixed
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _split(T: F64) -> tuple[F64, F64]:
+    """Rotation and translation of T (4, 4)."""
+    R, t = np.empty((3, 3)), np.empty(3)
+    for i in range(3):
+        t[i] = T[i, 3]
+        for j in range(3):
+            R[i, j] = T[i, j]
+    return R, t
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
@@ -75,7 +88,7 @@ def fuse_points(
     """Update positions (n, 3) and information (n, 3, 3), in place, by pixels (n, 2) and depths (n,; NaN = none) seen from an uncertain pose.
 
     The old information is first multiplied by `1 - 1/memory`: it stays that of at most `memory` measurements, so that a landmark can still move."""
-    R, t = np.ascontiguousarray(T_world_camera[:3, :3]), np.ascontiguousarray(T_world_camera[:3, 3])
+    R, t = _split(T_world_camera)
     p, r, D, J, S = np.empty(3), np.empty(3), np.empty((3, 3)), np.empty((3, 6)), np.empty((3, 3))
     for i in range(len(positions)):
         to_camera(R, t, positions[i], p)
@@ -87,7 +100,9 @@ def fuse_points(
         S[1, 1] += sigma_px[i] ** 2
         if rows == 3:
             S[2, 2] += (sigma_m[i] / depth_m[i] ** 2) ** 2
-        information[i] *= 1.0 - 1.0 / memory
+        for a in range(3):
+            for b in range(3):
+                information[i, a, b] *= 1.0 - 1.0 / memory
         _update(positions[i], information[i], R, D, r, S, rows)
 
 
@@ -106,7 +121,7 @@ def fuse_lines(
 ) -> None:
     """Update both ends (n, 2, 3) of lines and their information (n, 2, 3, 3), in place, across the line only: in the image by the distance from the
     segment seen, in depth by that from its 3D line where it has one (NaN = none)."""
-    R, t = np.ascontiguousarray(T_world_camera[:3, :3]), np.ascontiguousarray(T_world_camera[:3, 3])
+    R, t = _split(T_world_camera)
     p, r, D, J, m, S = np.empty(3), np.empty(2), np.empty((2, 3)), np.empty((2, 6)), np.empty(3), np.empty((2, 2))
     ends = np.empty(2)
     for i in range(len(endpoints)):
@@ -120,13 +135,13 @@ def fuse_lines(
             to_camera(R, t, endpoints[i, k], p)
             if not p[2] > NEAR_M:
                 continue
-            rows, D[1], r[1] = 1, 0.0, 0.0
+            rows, r[1], D[1, 0], D[1, 1], D[1, 2] = 1, 0.0, 0.0, 0.0, 0.0
             r[0], s = line_row(p, endpoints_px[i], camera, D[0])
             noise = sigma_px**2 * ((1.0 - s) ** 2 + s * s)
             if deep:
                 rows = 2
                 r[1], s = line_depth_row(p, observed_m[i], m)
-                D[1] = m
+                D[1, 0], D[1, 1], D[1, 2] = m[0], m[1], m[2]
             _noise(D, p, pose_covariance, rows, J, S)
             S[0, 0] += noise
             if deep:
