@@ -15,6 +15,7 @@ import numpy as np
 
 from trihedron.pipeline.geometry import invert, log_se3
 from trihedron.pipeline.types import F32, F64, U8, Bool, Keypoints, Map, Matches, Planes, Segments
+from trihedron.plugins.numerics.motion.pose_kernel import Flags
 from trihedron.plugins.numerics.motion.pose_solver import PoseSolution, Terms
 from trihedron.plugins.numerics.motion.pose_terms import LineTerms, PointTerms
 
@@ -36,6 +37,10 @@ class AtRest:
         """Those of the matches' terms that are of what is at rest."""
         points, lines, planes = terms
         return PointTerms(*(column[self.points] for column in points)), LineTerms(*(column[self.lines] for column in lines)), planes
+
+    def flags(self, terms: Terms) -> Flags:
+        """The same as flags of all terms: the others are outliers."""
+        return Flags(self.points.astype(np.uint8), self.lines.astype(np.uint8), np.ones(len(terms[2].kinds), np.uint8))
 
     def contradicted(self, points: U8) -> float:
         """By how much larger a share (0 … 1) of the other points than of these are outliers (flags (n,)), or the other way round; 0 where

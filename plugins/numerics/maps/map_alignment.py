@@ -8,6 +8,7 @@ import numpy as np
 
 from trihedron.pipeline.types import F64, I32, Frame, Keypoints, Map, Matches, Planes, Segments
 from trihedron.plugins.numerics.maps.map_terms import line_terms, plane_terms, point_terms
+from trihedron.plugins.numerics.motion.pose_kernel import Flags
 from trihedron.plugins.numerics.motion.pose_solver import PoseSolution, Terms, classify_terms, first_step, solve_pose
 
 SCORE = np.array([1, 2, 5])  # what a point, a line and a plane count
@@ -69,9 +70,9 @@ class MapAlignment:
         """The pose by these terms and the prior."""
         return solve_pose(self.T_start, self.frame.camera, self.T_start, self.information, *terms)
 
-    def first_step(self, T_world_camera: F64, terms: Terms) -> tuple[F64, F64]:
-        """Where these terms and the prior would move a pose at first, xi (6,), with its covariance (6, 6)."""
-        return first_step(T_world_camera, self.frame.camera, self.T_start, self.information, terms)
+    def first_step(self, T_world_camera: F64, terms: Terms, flags: Flags) -> tuple[F64, F64]:
+        """Where these terms, without outliers, and the prior would move a pose at first, xi (6,), with its covariance (6, 6)."""
+        return first_step(T_world_camera, self.frame.camera, self.T_start, self.information, terms, flags)
 
     def judged(self, found: PoseSolution) -> PoseSolution:
         """The solution with the flags of all matches, whatever it was found from."""

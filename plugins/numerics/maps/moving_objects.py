@@ -74,10 +74,9 @@ class MovingObjects:
         contradicted = rest.contradicted(found.points) >= self.moving_share or (rest.name == PROVEN and seen.fewer_planes)
         if not contradicted and (1.0 - seen.agreed / max(seen.matches, 1) < self.moving_share or seen.sought[2] == 0):
             return None
-        only = rest.only(terms)
-        if not contradicted and position_chi2(*problem.first_step(found.T_world_camera, only)) < FIRST_SHARE * far:
+        if not contradicted and position_chi2(*problem.first_step(found.T_world_camera, terms, rest.flags(terms))) < FIRST_SHARE * far:
             return None
-        alone = problem.solved(only)
+        alone = problem.solved(rest.only(terms))
         if rest.name == ON_PLANES and problem.agreement(alone).fewer_planes:  # planes that disagree with each other say nothing
             return None
         pulled = distance2(alone, found) >= self.moving_gate if contradicted else position_distance2(alone, found) > far

@@ -13,7 +13,7 @@ import numba
 import numpy as np
 
 from trihedron.pipeline.types import F64, U8, Camera
-from trihedron.plugins.numerics.algebra.uncertainty import inverse
+from trihedron.plugins.numerics.algebra.small_linear import inverse_positive, solve_positive
 from trihedron.plugins.numerics.motion.pose_kernel import (
     CHI2_2,
     CHI2_3,
@@ -88,30 +88,21 @@ def _solved(
     slack: float,
 ) -> PoseSolution:
     """`solve_pose` with the planes' gates multiplied by `slack`."""
-    free = 3 if fixed_rotation else 6
-    points, lines, planes = terms
-    flags = _all_inliers(terms)
-    R, t, H_data, cost = _solve(
-        T_world_camera[:3, :3].copy(), T_world_camera[:3, 3].copy(), T_prior[:3, :3].copy(), T_prior[:3, 3].copy(),
-        np.ascontiguousarray(prior_information, np.float64), camera.intrinsics, points, lines, planes, flags, free, slack,
-    )  # fmt: skip
-    T = np.eye(4)
-    T[:3, :3], T[:3, 3] = R, t
-    prior = np.ascontiguousarray(prior_information[:free, :free])
-    data = _gate_efficiency(_rows(points, planes, flags), free) * _symmetric(H_data)[:free, :free]
-    return PoseSolution(T, _inverse(data + prior), _unobservable(data, prior), *flags, cost)
+    free, flags = 3 if fixed_rotation else 6, _all_inliers(terms)
+    prior = np.array(prior_information, np.float64)
+    T, covariance, data, _, cost, complete = _solve(np.array([T_world_camera, T_prior]), prior, camera.intrinsics, *terms, flags, free, ROUNDS, slack)
+    unobservable = np.empty((free, 0)) if complete else _unobservable(data, prior[:free, :free])
+    return PoseSolution(T, covariance, unobservable, *flags, cost)
 
 
-def first_step(T_world_camera: F64, camera: Camera, T_prior: F64, prior_information: F64, terms: Terms) -> tuple[F64, F64]:
-    """Where `solve_pose` would go at first from `T_world_camera`, all terms with Huber's cost: xi (6,), and its covariance (6, 6)."""
-    flags, weights, chi2 = _rooms(terms)
-    R, t = T_world_camera[:3, :3].copy(), T_world_camera[:3, 3].copy()
-    intrinsics, H, g = camera.intrinsics, np.empty((6, 6)), np.empty(6)
-    weigh(R, t, intrinsics, *terms, weights)
-    linearise(R, t, intrinsics, *terms, weights, flags, True, H, g, chi2)
-    add_prior(R, t, T_prior[:3, :3].copy(), T_prior[:3, 3].copy(), np.ascontiguousarray(prior_information, np.float64), H, g)
-    covariance = _inverse(_symmetric(H))
-    return -covariance @ g, covariance
+def first_step(
+    T_world_camera: F64, camera: Camera, T_prior: F64, prior_information: F64, terms: Terms, flags: Flags | None = None
+) -> tuple[F64, F64]:
+    """Where `solve_pose` would go at first from `T_world_camera`, by the terms not flagged OUTLIER, with Huber's cost: xi (6,), and its
+    covariance (6, 6). Changes the flags."""
+    poses, flags = np.array([T_world_camera, T_prior]), _all_inliers(terms) if flags is None else flags
+    _, covariance, _, xi, _, _ = _solve(poses, np.array(prior_information, np.float64), camera.intrinsics, *terms, flags, 6, 0, 1.0)
+    return xi, covariance
 
 
 def _all_inliers(terms: Terms) -> Flags:
@@ -119,57 +110,14 @@ def _all_inliers(terms: Terms) -> Flags:
     return Flags(*(np.full(count, INLIER, np.uint8) for count in (len(points.positions_m), len(lines.endpoints_m), len(planes.kinds))))
 
 
-def _rooms(terms: Terms) -> tuple[Flags, Weights, Chi2]:
-    """Room for what is said of each term: all inliers, weights, χ²."""
-    flags = _all_inliers(terms)
-    n, m, p = (len(kind) for kind in flags)
-    weights = Weights(np.empty((n, 3, 3)), np.empty((m, 2, 2)), np.empty((m, 2, 2)), np.empty((p, 3, 3)))
-    return flags, weights, Chi2(np.empty(n), np.empty(m), np.empty(m), np.empty(p))
-
-
 def classify_terms(
     T_world_camera: F64, camera: Camera, points: PointTerms = NO_POINTS, lines: LineTerms = NO_LINES, planes: PlaneTerms = NO_PLANES
 ) -> Flags:
     """OUTLIER, INLIER or NO_DEPTH of every term at a given pose."""
-    flags, weights, chi2 = _rooms((points, lines, planes))
-    R, t = T_world_camera[:3, :3].copy(), T_world_camera[:3, 3].copy()
-    intrinsics = camera.intrinsics
-    weigh(R, t, intrinsics, points, lines, planes, weights)
-    linearise(R, t, intrinsics, points, lines, planes, weights, flags, False, np.empty((6, 6)), np.empty(6), chi2)
-    _classify(points, planes, chi2, flags, 1.0)
+    terms = points, lines, planes
+    flags = _all_inliers(terms)
+    _solve(np.array([T_world_camera, T_world_camera]), np.eye(6), camera.intrinsics, *terms, flags, 6, 0, 1.0)
     return flags
-
-
-def _rows(points: PointTerms, planes: PlaneTerms, flags: Flags) -> int:
-    """Number of residuals of the inliers."""
-    with_depth = np.isfinite(points.depth_m)
-    rows = np.array([3, 2, 1])[planes.kinds]
-    of_points = 2 * flags.points.sum() + flags.points[with_depth].sum()
-    of_lines = 4 * (flags.lines == INLIER).sum() + 2 * (flags.lines == NO_DEPTH).sum()
-    return int(of_points + of_lines + rows @ flags.planes)
-
-
-def _gate_efficiency(rows: int, unknowns: int) -> float:
-    """Share of the information that is left when terms are chosen by a hard 95 % gate on their own residuals.
-
-    A mean of samples cut at the gate c varies by 1 / F_{k+2}(c), F_k being the distribution of χ², where counting the F_k(c) kept samples promises
-    1 / F_k(c); with few redundant rows the residuals are smaller than the noise and the gate bites less. The tests check the normalised error."""
-    if rows <= unknowns:
-        return 1.0
-    half = 0.5 * CHI2_3 / (1.0 - unknowns / rows)
-    tail = math.sqrt(half / math.pi) * math.exp(-half)
-    kept = math.erf(math.sqrt(half)) - 2.0 * tail  # F_3, the incomplete gamma function of 3/2; that of 5/2 follows by its recurrence
-    return (kept - 4.0 / 3.0 * half * tail) / kept
-
-
-def _symmetric(lower: F64) -> F64:
-    """The whole of a matrix of which `linearise` fills the lower half."""
-    return np.tril(lower) + np.tril(lower, -1).T
-
-
-def _inverse(H: F64) -> F64:
-    full = inverse(H)
-    return 0.5 * (full + full.T)
 
 
 def _unobservable(H_data: F64, H_prior: F64) -> F64:
@@ -182,10 +130,7 @@ def _unobservable(H_data: F64, H_prior: F64) -> F64:
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def _solve(
-    R: F64,
-    t: F64,
-    R_prior: F64,
-    t_prior: F64,
+    poses: F64,
     prior: F64,
     camera: F64,
     points: PointTerms,
@@ -193,19 +138,22 @@ def _solve(
     planes: PlaneTerms,
     flags: Flags,
     free: int,
+    rounds: int,
     slack: float,
-) -> tuple[F64, F64, F64, float]:
-    """The rounds; changes `flags`. Returns R, t, the data's information (6, 6) at the solution and the cost.
+) -> tuple[F64, F64, F64, F64, float, bool]:
+    """The rounds from the first of the poses (2, 4, 4), the other one being the prior's; changes `flags`. Returns the pose, its covariance, the
+    data's information, the step (6,) that would be next, the cost, and whether the data say more than the prior in all directions.
 
     Every evaluation is the one call of `linearise`, and a step too short to matter is taken without another. The last turn takes no step and is only
-    the information of the final inliers."""
+    the information of the final inliers. In no rounds all terms are judged at the first pose."""
     n, m, p = len(points.positions_m), len(lines.endpoints_m), len(planes.kinds)
     weights = Weights(np.empty((n, 3, 3)), np.empty((m, 2, 2)), np.empty((m, 2, 2)), np.empty((p, 3, 3)))
     chi2 = Chi2(np.empty(n), np.empty(m), np.empty(m), np.empty(p))
+    (R, t), (R_prior, t_prior) = _parts(poses[0]), _parts(poses[1])
     H, g, dx = np.zeros((6, 6)), np.zeros(6), np.zeros(6)
     data, trial_H, trial_g = np.zeros((6, 6)), np.zeros((6, 6)), np.zeros(6)
     cost = 0.0
-    for turn in range(ROUNDS + 1):
+    for turn in range(rounds + 1):
         cost, damping = np.inf, 1e-6
         R_new, t_new = R, t
         weigh(R, t, camera, points, lines, planes, weights)
@@ -220,7 +168,7 @@ def _solve(
                 damping = max(0.1 * damping, 1e-9)
             else:
                 damping = max(10.0 * damping, 1e-3)
-            if turn == ROUNDS or damping > MAX_DAMPING:
+            if turn == rounds or damping > MAX_DAMPING:
                 break
             step(H, g, damping, free, dx)
             R_new, t_new = moved(R, t, dx)
@@ -229,9 +177,75 @@ def _solve(
                 if accepted and length >= 0.0:
                     R, t = R_new, t_new
                 break
-        if turn < ROUNDS:
+        if turn < rounds or rounds == 0:
             _classify(points, planes, chi2, flags, slack)
-    return R, t, data, cost
+    step(H, g, 0.0, free, dx)
+    share = gate_efficiency(_rows(points, planes, flags), free) if rounds else 1.0
+    covariance, information, complete = _spread(data, share, prior, free)
+    T = np.zeros((4, 4))
+    for i in range(3):
+        T[i, 3] = t[i]
+        for j in range(3):
+            T[i, j] = R[i, j]
+    T[3, 3] = 1.0
+    return T, covariance, information, dx, cost, complete
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _parts(T: F64) -> tuple[F64, F64]:
+    """Rotation and translation."""
+    R, t = np.empty((3, 3)), np.empty(3)
+    for i in range(3):
+        t[i] = T[i, 3]
+        for j in range(3):
+            R[i, j] = T[i, j]
+    return R, t
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _spread(data: F64, share: float, prior: F64, free: int) -> tuple[F64, F64, bool]:
+    """Covariance of the `free` unknowns by a share of the data's information (lower triangle) and the prior's; that share of the data's; and
+    whether it is the larger one in all directions."""
+    information, total, more = np.empty((free, free)), np.empty((free, free)), np.empty((free, free))
+    for i in range(free):
+        for j in range(i + 1):
+            information[i, j] = information[j, i] = share * data[i, j]
+            total[i, j], more[i, j] = information[i, j] + prior[i, j], information[i, j] - prior[i, j]
+    covariance = inverse_positive(total)
+    for i in range(free):
+        for j in range(i):
+            covariance[i, j] = covariance[j, i] = 0.5 * (covariance[i, j] + covariance[j, i])
+    return covariance, information, solve_positive(more, np.zeros(free), np.empty(free))
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _rows(points: PointTerms, planes: PlaneTerms, flags: Flags) -> int:
+    """Number of residuals of the inliers."""
+    rows = 0
+    for i in range(len(flags.points)):
+        if flags.points[i]:
+            rows += 3 if np.isfinite(points.depth_m[i]) else 2
+    for i in range(len(flags.lines)):
+        if flags.lines[i]:
+            rows += 4 if flags.lines[i] == INLIER else 2
+    for i in range(len(flags.planes)):
+        if flags.planes[i]:
+            rows += rows_of(planes.kinds[i])
+    return rows
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def gate_efficiency(rows: int, unknowns: int) -> float:
+    """Share of the information that is left when terms are chosen by a hard 95 % gate on their own residuals.
+
+    A mean of samples cut at the gate c varies by 1 / F_{k+2}(c), F_k being the distribution of χ², where counting the F_k(c) kept samples promises
+    1 / F_k(c); with few redundant rows the residuals are smaller than the noise and the gate bites less. The tests check the normalised error."""
+    if rows <= unknowns:
+        return 1.0
+    half = 0.5 * CHI2_3 / (1.0 - unknowns / rows)
+    tail = math.sqrt(half / math.pi) * math.exp(-half)
+    kept = math.erf(math.sqrt(half)) - 2.0 * tail  # F_3, the incomplete gamma function of 3/2; that of 5/2 follows by its recurrence
+    return (kept - 4.0 / 3.0 * half * tail) / kept
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
