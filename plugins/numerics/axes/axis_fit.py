@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
+from typing import NamedTuple
 
 import numba
 import numpy as np
 
 from trihedron.pipeline.types import F32, F64, I32, Bool, Planes, Segments
+from trihedron.plugins.numerics.algebra.small_linear import inverse_positive
 from trihedron.plugins.numerics.axes.direction_information import measured_directions
 from trihedron.plugins.numerics.axes.manhattan_modes import Directions
 from trihedron.plugins.numerics.axes.mode_tests import NORMALS_PER_SAMPLE
@@ -48,6 +51,7 @@ def _gathered(normals: F32, ends_m: F32, ends_px: F32, samples: int, per_px: flo
     return vectors[:n], weights[:n], count
 
 
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def variance_scale(chi2: float, freedom: float) -> float:
     """Of the variances assumed, by the residuals' χ² with so many degrees of freedom. The assumption counts like BEFOREHAND more: a scene that shows
     little keeps it, one with many planes and edges tells by itself how true its walls are."""
@@ -78,31 +82,73 @@ class AxisFit:
 
         `axes` (3, 3) are the means of the normals on each axis, `normals` (3, 4) their statistics about these (`mode_statistics`); only the axes
         `taking_part` (3,) are fitted."""
-        measured, information, on_axis = self.measured(R, axes, normals, segments, planes)
-        on_axis[(on_axis >= 0) & ~taking_part[on_axis]] = -1
-        R, H, chi2, components = fit_rotation(measured, information, on_axis, len(measured) - 3, R, self.gate, 5)
-        scale = variance_scale(chi2, components - 3.0)
-        return R, np.linalg.inv(H / scale + np.eye(3) / NOTHING_KNOWN) + np.eye(3) * np.radians(self.floor_deg) ** 2
+        features = planes.coefficients, planes.covariance, segments.endpoints_m, segments.covariance_m2
+        return _fitted(R, axes, normals, taking_part, *features, self._rules, self.gate, float(np.radians(self.floor_deg)))  # type: ignore[no-any-return]
 
     def measured(self, R: F64, axes: F64, normals: F64, segments: Segments, planes: Planes) -> tuple[F64, F64, I32]:
         """Directions (n, 3) of planes, lines and the means of the normals, their information (n, 3, 3) and the column of R (3, m) that each
         belongs to (-1: none). `axes` (3, m) and `normals` (m, 4) as above."""
-        independent = np.maximum(normals[:, 0] / NORMALS_PER_SAMPLE, 1.0)
-        sigma = np.sqrt(normals[:, 2] / (2.0 * independent) + np.radians(self.normals_floor_deg) ** 2)
-        measured, information = measured_directions(
-            planes.coefficients,
-            planes.covariance,
-            np.radians(self.plane_floor_deg),
-            segments.endpoints_m,
-            segments.covariance_m2,
-            np.radians(self.line_floor_deg),
-            np.ascontiguousarray(axes.T),
-            sigma,
-        )
-        on_axis = assign_axes(measured, R, np.radians(self.cone_deg))
-        used = np.concatenate([np.repeat([self.use_planes, self.use_lines], [len(planes.pixels), len(segments.endpoints_m)]), normals[:, 0] > 0.0])
-        on_axis[~used] = -1
-        return measured, information, on_axis
+        features = planes.coefficients, planes.covariance, segments.endpoints_m, segments.covariance_m2
+        return _measured(R, axes, normals, *features, self._rules)  # type: ignore[no-any-return]
+
+    @cached_property
+    def _rules(self) -> Rules:
+        angles = self.cone_deg, self.normals_floor_deg, self.plane_floor_deg, self.line_floor_deg
+        cone, normals, planes, lines = (float(np.radians(angle)) for angle in angles)
+        return Rules(cone, normals, planes, lines, self.use_planes, self.use_lines)
+
+
+class Rules(NamedTuple):
+    """Of `AxisFit`, for the kernels; angles in rad."""
+
+    cone: float
+    normals_floor: float
+    plane_floor: float
+    line_floor: float
+    use_planes: bool
+    use_lines: bool
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _fitted(
+    R: F64, axes: F64, normals: F64, taking_part: Bool, planes: F64, plane_covariance: F64, ends_m: F32, end_covariance: F32,
+    rules: Rules, gate: float, floor: float,
+) -> tuple[F64, F64]:  # fmt: skip
+    """`AxisFit` as a kernel."""
+    measured, information, on_axis = _measured(R, axes, normals, planes, plane_covariance, ends_m, end_covariance, rules)
+    for i in range(len(on_axis)):
+        if on_axis[i] >= 0 and not taking_part[on_axis[i]]:
+            on_axis[i] = -1
+    R, H, chi2, components = fit_rotation(measured, information, on_axis, len(measured) - 3, R, gate, 5)
+    scale = variance_scale(chi2, components - 3.0)
+    for i in range(3):
+        for j in range(3):
+            H[i, j] = H[i, j] / scale + (1.0 / NOTHING_KNOWN if i == j else 0.0)
+    covariance = inverse_positive(H)
+    for i in range(3):
+        covariance[i, i] += floor * floor
+    return R, covariance
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _measured(
+    R: F64, axes: F64, normals: F64, planes: F64, plane_covariance: F64, ends_m: F32, end_covariance: F32, rules: Rules
+) -> tuple[F64, F64, I32]:
+    """`AxisFit.measured` as a kernel."""
+    p, lines, m = len(planes), len(ends_m), len(normals)
+    means, sigma = np.empty((m, 3)), np.empty(m)
+    for k in range(m):
+        independent = max(normals[k, 0] / NORMALS_PER_SAMPLE, 1.0)
+        sigma[k] = np.sqrt(normals[k, 2] / (2.0 * independent) + rules.normals_floor**2)
+        for a in range(3):
+            means[k, a] = axes[a, k]
+    measured, information = measured_directions(planes, plane_covariance, rules.plane_floor, ends_m, end_covariance, rules.line_floor, means, sigma)
+    on_axis = assign_axes(measured, R, rules.cone)
+    for i in range(len(on_axis)):
+        used = rules.use_planes if i < p else rules.use_lines if i < p + lines else normals[i - p - lines, 0] > 0.0
+        if not used:
+            on_axis[i] = -1
+    return measured, information, on_axis
 
 
 def _half_sphere(count: int) -> F64:

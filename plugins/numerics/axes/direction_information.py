@@ -20,7 +20,9 @@ def measured_directions(
     vectors, information = np.empty((p + lines + len(means), 3)), np.zeros((p + lines + len(means), 3, 3))
     C, a = np.empty((2, 2)), np.empty((2, 3))
     for i in range(p):
-        vectors[i] = planes[i, :3] if np.isfinite(planes[i, :3]).all() else np.full(3, np.nan)
+        known = np.isfinite(planes[i, 0] + planes[i, 1] + planes[i, 2])
+        for k in range(3):
+            vectors[i, k] = planes[i, k] if known else np.nan
         fill_tangent_basis(vectors[i], a)
         _inverse_in_tangent_plane(plane_covariance[i], plane_floor * plane_floor, a, information[i])
     for i in range(lines):
@@ -29,21 +31,22 @@ def measured_directions(
         for k in range(3):
             d[k] = float(ends_m[i, 1, k]) - ends_m[i, 0, k]
             length2 += d[k] * d[k]
-        if not 1e-12 < length2 < np.inf:
-            d[:] = np.nan
+        known = 1e-12 < length2 < np.inf
+        for k in range(3):
+            d[k] = d[k] / np.sqrt(length2) if known else np.nan
+        if not known:
             continue
-        d /= np.sqrt(length2)
         fill_tangent_basis(d, a)
-        C[:] = 0.0
         for u in range(2):
             for v in range(2):
+                C[u, v] = 0.0
                 for j in range(3):
                     for k in range(3):
                         C[u, v] += a[u, j] * (float(end_covariance[i, 0, j, k]) + end_covariance[i, 1, j, k]) * a[v, k] / length2
         _inverse_in_tangent_plane(C, line_floor * line_floor, a, information[p + i])
     for i in range(len(means)):
-        vectors[p + lines + i] = means[i]
         for j in range(3):
+            vectors[p + lines + i, j] = means[i, j]
             for k in range(3):
                 information[p + lines + i, j, k] = (1.0 * (j == k) - means[i, j] * means[i, k]) / mean_sigma[i] ** 2
     return vectors, information

@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numba
 import numpy as np
 
-from trihedron.pipeline.types import F64, Bool, Planes
+from trihedron.pipeline.types import F64, I32, Bool, Planes
 from trihedron.plugins.numerics.axes.mode_tests import largest_fitting, line_peaks, perpendicular, surface_peaks
 from trihedron.plugins.numerics.axes.sphere_modes import mode_statistics, shift_axes
 
@@ -91,11 +91,8 @@ class ModeFinder:
         as much further as they are uncertain, but no further than it."""
         if planes is None or not self.use_planes or len(planes.pixels) == 0:
             return NO_PLANES
-        sigma = np.sqrt(np.maximum(planes.covariance[:, 0, 0] + planes.covariance[:, 1, 1], 0.0))
-        reach = np.minimum(0.5 * self.cone + SIGMAS * sigma, self.cone)
-        share = planes.pixels / (planes.labels.size * planes.stride**2)
-        known = np.isfinite(planes.coefficients[:, :3]).all(axis=1) & np.isfinite(sigma)
-        return np.column_stack([planes.coefficients[:, :3], np.cos(reach), share])[known]
+        image = float(planes.labels.size * planes.stride**2)
+        return np.asarray(_surfaces(planes.coefficients, planes.covariance, planes.pixels, image, self.cone))
 
     @cached_property
     def _rules(self) -> Rules:
@@ -113,6 +110,21 @@ class Rules(NamedTuple):
     widest: float
     min_explained: float
     max_skew: float
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _surfaces(planes: F64, covariance: F64, pixels: I32, image: float, cone: float) -> F64:
+    """`ModeFinder._surfaces` of those planes (p, 4) that are known; `image` has so many pixels."""
+    out, n = np.empty((len(planes), 5)), 0
+    for i in range(len(planes)):
+        variance = covariance[i, 0, 0] + covariance[i, 1, 1]
+        if np.isfinite(variance + planes[i, 0] + planes[i, 1] + planes[i, 2]):
+            for k in range(3):
+                out[n, k] = planes[i, k]
+            out[n, 3] = np.cos(min(0.5 * cone + SIGMAS * np.sqrt(max(variance, 0.0)), cone))
+            out[n, 4] = pixels[i] / image
+            n += 1
+    return out[:n]
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")

@@ -247,8 +247,10 @@ def fit_rotation(directions: F64, information: F64, axes: I32, counted: int, R: 
     H, g, r, v, phi = np.zeros((3, 3)), np.zeros(3), np.zeros(3), np.zeros(3), np.zeros(3)
     chi2, components = 0.0, 0.0
     for remaining in range(iterations, -1, -1):
-        H[:] = 0.0
-        g[:] = 0.0
+        for j in range(3):
+            g[j] = 0.0
+            for k in range(3):
+                H[j, k] = 0.0
         chi2, components = 0.0, 0.0
         for i in range(len(directions)):
             if axes[i] < 0:
