@@ -10,10 +10,11 @@ import contextlib
 import gc
 import json
 import os
+from functools import cache
 from typing import Any
 
 from numba import _dynfunc  # type: ignore[attr-defined]  # compiled, without types
-from numba.core import caching, codegen, cpu
+from numba.core import caching, codegen, cpu, targetconfig
 
 from trihedron.pipeline.kernels import LISTED, ROW, kernel_of
 
@@ -21,6 +22,7 @@ GARBAGE = 100_000  # new objects between two looks for what is not used any more
 LIBRARY: Any = codegen.JITCodeLibrary
 CONTEXT: Any = cpu.CPUContext
 CACHE: Any = caching.CompileResultCacheImpl
+OPTIONS: Any = targetconfig.TargetConfig
 
 
 class LinkedParts:
@@ -38,6 +40,7 @@ class LinkedParts:
         LIBRARY.finalize = lambda library: self.finalize(library)
         CONTEXT.get_executable = lambda context, *of: self.executable(context, *of)
         CACHE.check_cachable = lambda cache, result: not is_part(result) and self._cachable(cache, result)
+        OPTIONS.values = lambda options: _defaults(options.__class__) | options._values  # asked for at each call that is compiled
 
     def compile(self, dispatcher: Any, arguments: tuple[Any, ...]) -> None:
         """Compile a kernel unless a cache has it, whole even where it has been part of another."""
@@ -71,6 +74,12 @@ class LinkedParts:
             return self._executable(context, library, function, environment)
         library._ensure_finalized()
         return _dynfunc.make_function(function.lookup_module(), function.qualname, "part of a kernel", 0, environment, (library,))
+
+
+@cache
+def _defaults(kind: Any) -> dict[str, Any]:
+    """Of numba's options."""
+    return {name: option.default for name, option in kind.options.items()}
 
 
 def is_part(result: Any) -> bool:

@@ -124,7 +124,8 @@ def compile_rows(rows: list[int], count: int) -> Iterator[int]:
     os.write(given, b"".join(row.to_bytes(ROW, "little") for row in rows))
     os.close(given)
     done, said = os.pipe()
-    processes = [subprocess.Popen(program, stdin=taken, stdout=said, stderr=subprocess.DEVNULL) for _ in range(count)]
+    plain = os.environ | {"NUMBA_DISABLE_ERROR_MESSAGE_HIGHLIGHTING": "1"}  # of errors that nobody sees, and which are many
+    processes = [subprocess.Popen(program, stdin=taken, stdout=said, stderr=subprocess.DEVNULL, env=plain) for _ in range(count)]
     os.close(taken)
     os.close(said)
     finished = 0
