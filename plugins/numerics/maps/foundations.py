@@ -30,13 +30,16 @@ def foundation(map: Map, points: I32, lines: I32, planes: I32) -> Foundation:
     """Of the keyframes that these landmarks (ids) were first seen from, the one that is known no better than half of the landmarks' are.
 
     A landmark's covariance holds its first keyframe's, but a pose found from hundreds of them averages what is common to all as if it were not."""
-    seen = (map.points, points), (map.lines, lines), (map.planes, planes)
-    first = np.concatenate([np.repeat(table.rows("first", ids), count) for (table, ids), count in zip(seen, SCORE)])
-    if not len(first):
+    weights = np.zeros(len(map.keyframes), np.int64)
+    for table, ids, score in zip((map.points, map.lines, map.planes), (points, lines, planes), SCORE):
+        weights += score * np.bincount(table.rows("first", ids), minlength=len(weights))
+    keyframes = np.flatnonzero(weights)
+    if not len(keyframes):
         return Foundation(-1, 0.0)
-    keyframes, times = np.unique(first, return_inverse=True)
     sigma_m = np.sqrt(np.linalg.eigvalsh(map.keyframes.rows("covariance", keyframes)[:, :3, :3])[:, -1])
-    middle = times[np.argsort(sigma_m[times], kind="stable")[len(times) // 2]]
+    order = np.argsort(sigma_m, kind="stable")
+    known = np.cumsum(weights[keyframes[order]])  # how much is known as well as this keyframe or better
+    middle = order[np.searchsorted(known, known[-1] // 2, side="right")]
     return Foundation(int(keyframes[middle]), float(sigma_m[middle]))
 
 
