@@ -77,9 +77,9 @@ import json, sys
 import numpy as np
 from trihedron.datasets.synthetic import Synthetic
 from trihedron.pipeline import kernels
-from trihedron.plugins.numerics.axes.sphere_modes import fit_rotation, orthonormal
+from trihedron.plugins.numerics.axes.sphere_modes import orthonormal
 
-names = ("sphere_modes:orthonormal", "sphere_modes:fit_rotation")
+names = ("sphere_modes:orthonormal", "sphere_modes:search_axes")
 rows = [row for row, (kernel, _) in enumerate(json.loads(kernels.LISTED.read_text())) if kernel.endswith(names)]
 modules = {"trihedron.plugins.numerics.axes.sphere_modes"}
 before = kernels.missing(modules)
@@ -92,7 +92,7 @@ print(orthonormal(np.arange(9.0).reshape(3, 3) ** 2 % 7, np.ones(3)).tolist())
 
 @pytest.mark.slow
 def test_a_kernel_that_another_calls_is_compiled_whole_and_to_the_same_bits(tmp_path):
-    """`fit_rotation`, which is compiled first, has `orthonormal` as a part."""
+    """`search_axes`, which is compiled first, has `orthonormal` as a part."""
     printed = []
     for way in ("ahead", "when called"):
         environment = os.environ | {"NUMBA_CACHE_DIR": str(tmp_path / way)}
