@@ -63,7 +63,7 @@ Example: trihedron run replay=runs/latest/run.mcap only=[manhattan,rotation] man
 
 def main(argv: list[str] | None = None) -> int:
     """Entry point of the command; returns the exit code."""
-    heap.share()
+    heap.settle()
     words = list(sys.argv[1:] if argv is None else argv)
     debug = "--debug" in words
     words = [word for word in words if word != "--debug"]
