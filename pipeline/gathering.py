@@ -24,10 +24,8 @@ def _pointer(typing: Any, address: Any) -> Any:
 _at: Any = intrinsic(_pointer)
 
 
-@numba.njit(cache=True)  # these two keep the interpreter's lock: to hand it over takes longer
-def gather(addresses: NDArray[np.int64], rows: NDArray[np.int32], piece: int, count: int, out: NDArray[np.uint8]) -> int:
-    """Copy the bytes of `rows` (n,) into `out` (n, bytes of a row), up to the first that is not one of 0..count-1, whose place in `rows` is returned;
-    -1 when all are. Every `piece` rows lie at one of the addresses; the caller holds the pieces."""
+@numba.njit(cache=True)
+def _gathered(addresses: NDArray[np.int64], rows: NDArray[np.int32], piece: int, count: int, out: NDArray[np.uint8]) -> int:
     n, size = out.shape
     for i in range(n):
         row = rows[i]
@@ -37,6 +35,19 @@ def gather(addresses: NDArray[np.int64], rows: NDArray[np.int32], piece: int, co
         for k in range(size):
             out[i, k] = source[k]
     return -1
+
+
+@numba.njit(cache=True)  # this and `scatter` keep the interpreter's lock: to hand it over takes longer
+def gather(addresses: NDArray[np.int64], rows: NDArray[np.int32], piece: int, count: int, out: NDArray[np.uint8]) -> int:
+    """Copy the bytes of `rows` (n,) into `out` (n, bytes of a row), up to the first that is not one of 0..count-1, whose place in `rows` is returned;
+    -1 when all are. Every `piece` rows lie at one of the addresses; the caller holds the pieces."""
+    return int(_gathered(addresses, rows, piece, count, out))
+
+
+@numba.njit(cache=True, nogil=True)
+def gather_many(addresses: NDArray[np.int64], rows: NDArray[np.int32], piece: int, count: int, out: NDArray[np.uint8]) -> int:
+    """As `gather`, while others may run."""
+    return int(_gathered(addresses, rows, piece, count, out))
 
 
 @numba.njit(cache=True)

@@ -25,6 +25,7 @@ FORMAT = "4"
 READ = ("3", FORMAT)  # 3: a table was always changed from the message before
 METADATA = "trihedron"
 FRAMES_TOPIC = "frames"  # one FrameReference a frame: what a replay iterates over
+FEW_BYTES = 1 << 15  # what a value of a topic that is not dense is taken to hold
 TIMING_TOPIC = "/timing"
 TIMING_SCHEMA = {
     "type": "object",
@@ -119,8 +120,8 @@ class RecordingWriter:
 
 
 def _bytes_of(value: Value) -> int:
-    """Bytes of the arrays of a value; its tables are shared with others."""
-    return sum(item.nbytes for item in vars(value).values() if item.__class__ is np.ndarray)
+    """Of memory that a value holds, about; its tables are shared with others."""
+    return sum(item.nbytes for item in vars(value).values() if item.__class__ is np.ndarray) if value.dense else FEW_BYTES
 
 
 class Recording:

@@ -182,15 +182,17 @@ class Runner:
 
     def _call(self, stage: Stage, position: int, values: Mapping[str, Any]) -> Value | None:
         """Skip, seed, time and check one call."""
-        if stage.name == "dataset" and self.feed is not None and self.feed.take() is None:
+        reads_frames = stage.name == "dataset"
+        if reads_frames and self.feed is not None and self.feed.take() is None:
             raise NoMoreFrames
-        values = {parameter: value for parameter, value in values.items() if parameter != FRAME_TAKEN}
-        if any(values[parameter] is None for parameter in stage.required):
-            return None
+        for parameter in stage.required:
+            if values[parameter] is None:
+                return None
         arguments = {**dict.fromkeys(stage.absent), **values}
+        arguments.pop(FRAME_TAKEN, None)
         if stage.wants_rng:
             arguments["rng"] = np.random.default_rng([self.seed, self.indices[position], zlib.crc32(stage.name.encode())])
-        if stage.name == "dataset":
+        if reads_frames:
             arguments["index"] = self.indices[position] - self._first
         began = time.perf_counter()
         if stage.fold:
@@ -201,7 +203,7 @@ class Runner:
             value = stage.plugin(**arguments)
         ended = time.perf_counter()
         self._calls_ms.setdefault(position, {})[stage.name] = 1e3 * (ended - began)
-        if stage.name == "dataset":
+        if reads_frames:
             self._handed_over[position] = ended if self.feed is None else self.feed.came_s[position]
         elif stage.name == "pose":
             self._latency_ms[position] = 1e3 * (ended - self._handed_over.get(position, began))

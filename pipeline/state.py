@@ -91,6 +91,7 @@ class Keeper:
         for topic in reach:
             if (held := before.held.get(topic)) is not None:
                 self._values[topic][min(held.index, first - 1)] = held  # of another sequence, its number says nothing here
+            self._values[topic] = dict(sorted(self._values[topic].items()))
         self.frame = first - 1
 
     def see(self, index: int, values: Mapping[str, Any]) -> None:
@@ -100,8 +101,8 @@ class Keeper:
             kept = self._values[topic]
             if isinstance(value := values.get(topic), Value):
                 kept[index] = value
-            newest = max(kept, default=index)
-            self._values[topic] = {i: kept[i] for i in sorted(kept) if i > index - reach or i == newest}
+            while len(kept) > 1 and (oldest := next(iter(kept))) <= index - reach:
+                del kept[oldest]
 
     def save(self, path: Path, metadata: Mapping[str, str], source: str) -> None:
         """Write the file, whole or not at all. Raises RecordingError when there is no map or the file cannot be written."""

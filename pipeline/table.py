@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 Array = NDArray[Any]
+MANY_BYTES = 1 << 15  # to copy as many takes some ten microseconds
 CHUNK = 256  # rows; small enough that a touched chunk is cheap to copy, large enough that gathering is
 
 
@@ -90,10 +91,11 @@ class Table:
 
     def gathered(self, ids: Array, *names: str) -> list[Array]:
         """Rows `ids` of several columns, like `rows` of each."""
-        gather, numbers, found = _kernels().gather, np.array(ids, np.int32), []  # of one type, so that one kernel does for all
+        kernels, numbers, found = _kernels(), np.array(ids, np.int32), []  # of one type, so that one kernel does for all
         for name in names:
             column = self.schema[name]
             rows = np.empty((len(numbers), column.row_bytes), np.uint8)
+            gather = kernels.gather if rows.nbytes < MANY_BYTES else kernels.gather_many
             outside = gather(self._addresses_of(name), numbers, CHUNK, self.size, rows)
             if outside >= 0:
                 raise IndexError(f"row {ids[outside]} of a table of {self.size}")
