@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import numba
 import numpy as np
 
 from trihedron.pipeline.geometry import pose_matrix, transform_planes
@@ -49,10 +50,15 @@ class StructureGates:
         return rows_of_pairs(lines), np.ascontiguousarray(planes[:, ::-1])
 
 
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def rows_of_pairs(found: I32) -> I32:
     """(n,) row of the current frame for each previous one, or -1 -> (k, 2)."""
-    rows = np.flatnonzero(found >= 0).astype(np.int32)
-    return np.stack([rows, found[rows]], axis=1)
+    out, k = np.empty((len(found), 2), np.int32), 0
+    for i in range(len(found)):
+        if found[i] >= 0:
+            out[k, 0], out[k, 1] = i, found[i]
+            k += 1
+    return out[:k]
 
 
 def tracks_value(now: Features, before: Features, pairs: tuple[I32, I32, I32], R_current_previous: F64) -> Tracks:

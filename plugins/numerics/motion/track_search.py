@@ -14,26 +14,20 @@ from trihedron.plugins.numerics.algebra.constant_arrays import constant
 from trihedron.plugins.numerics.images.descriptors import U64, line_matches, near_matches, words_of
 from trihedron.plugins.numerics.images.flow import moved_pixel
 from trihedron.plugins.numerics.motion.relative_motion import Motion
-from trihedron.plugins.numerics.motion.track_pairs import Features, tracks_value
+from trihedron.plugins.numerics.motion.track_pairs import Features, rows_of_pairs, tracks_value
 from trihedron.plugins.numerics.planes.plane_association import associated
 
 Intrinsics = tuple[float, float, float, float]
 
 
-class Shown(NamedTuple):
-    """What kernels read of the `Features` of a frame."""
+class Places(NamedTuple):
+    """Where a frame shows its points and lines, as kernels read it."""
 
     pixels: F32  # (n, 2)
     points_m: F32  # (n, 3)
     sigma_px: F32  # (n,)
-    octaves: U8  # (n,)
-    words: U64  # (n, w) descriptors
-    bytes: U8  # (n, b)
     endpoints_px: F32  # (m, 2, 2)
     endpoints_m: F32  # (m, 2, 3)
-    line_words: U64  # (m, v)
-    planes: F64  # (p, 4)
-    samples_m: F32  # (p, s, 3)
 
 
 class Gates(NamedTuple):
@@ -61,54 +55,71 @@ class Search:
 
     def __call__(self, R: F64, t: F64, radius_px: float, plane_m: float) -> Tracks:
         """All pairs found around the motion `p_current = R p_previous + t`: points and lines within `radius_px`, planes within `plane_m`."""
-        pairs = _found_near(*self._shown, constant(R, np.float64), constant(t, np.float64), float(radius_px), plane_m, self.gates)
-        return tracks_value(self.now, self.before, pairs, R)
+        gates, walls, seen, found = self.gates, self.before.planes, self.now.planes, self._now
+        motion = constant(R, np.float64), constant(t, np.float64)
+        pixels, ends, planes, samples = _moved(self._before, walls.coefficients, walls.samples_m, self._camera, *motion)
+        (words, line_words), (words_now, line_words_now) = self._words
+        points = near_matches(
+            pixels, *words, self.before.keypoints.octaves, found.pixels, *words_now, self.now.keypoints.octaves,
+            np.full(len(pixels), radius_px, np.float32), gates.octave_step, gates.compared_by, gates.distance, gates.ratio,
+        )  # fmt: skip
+        lines = line_matches(
+            ends, line_words, found.endpoints_px, line_words_now,
+            gates.line_sine, float(radius_px), gates.line_overlap, gates.lines_compared_by, gates.line_bits, gates.ratio,
+        )  # fmt: skip
+        same = associated(seen.coefficients, seen.samples_m, planes, samples, gates.plane_cosine, plane_m, True)
+        return tracks_value(self.now, self.before, (rows_of_pairs(points), rows_of_pairs(lines), np.ascontiguousarray(same[:, ::-1])), R)
 
     def agreeing(self, tracks: Tracks, motion: Motion, error_px: float) -> Tracks:
         """Without the key points and lines that the motion puts elsewhere than they were found, by more than `error_px` σ, and key points that never
         had a depth."""
         R, t = constant(motion.R, np.float64), constant(motion.t, np.float64)
         unsure_px = float(self.camera.fx * np.sqrt(np.linalg.eigvalsh(motion.covariance[3:, 3:])[-1]))
-        points, lines = _agreeing(tracks.keypoints, tracks.segments, *self._shown, R, t, unsure_px, error_px)
+        points, lines = _agreeing(tracks.keypoints, tracks.segments, self._before, self._now, self._camera, R, t, unsure_px, error_px)
         return tracks_value(self.now, self.before, (points, lines, tracks.planes), motion.R)
 
     @cached_property
-    def _shown(self) -> tuple[Shown, Shown, Intrinsics]:
-        camera = self.camera
-        return _shown(self.before), _shown(self.now), (float(camera.fx), float(camera.fy), float(camera.cx), float(camera.cy))
+    def _camera(self) -> Intrinsics:
+        return float(self.camera.fx), float(self.camera.fy), float(self.camera.cx), float(self.camera.cy)
+
+    @cached_property
+    def _before(self) -> Places:
+        return _places(self.before)
+
+    @cached_property
+    def _now(self) -> Places:
+        return _places(self.now)
+
+    @cached_property
+    def _words(self) -> tuple[tuple[tuple[U64, U8], U64], tuple[tuple[U64, U8], U64]]:
+        """Of both frames the descriptors of points, as words and bytes, and of lines, as words."""
+        before, now = ((words_of(of.keypoints.descriptors), words_of(of.segments.descriptors)[0]) for of in (self.before, self.now))
+        return before, now
 
 
-def _shown(features: Features) -> Shown:
-    points, lines, planes = features.keypoints, features.segments, features.planes
-    return Shown(
-        points.pixels, points.points_m, points.sigma_px, points.octaves, *words_of(points.descriptors),
-        lines.endpoints_px, lines.endpoints_m, words_of(lines.descriptors)[0], planes.coefficients, planes.samples_m,
-    )  # fmt: skip
+def _places(features: Features) -> Places:
+    points, lines = features.keypoints, features.segments
+    return Places(points.pixels, points.points_m, points.sigma_px, lines.endpoints_px, lines.endpoints_m)
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def _found_near(
-    before: Shown, now: Shown, camera: Intrinsics, R: F64, t: F64, radius_px: float, plane_m: float, gates: Gates
-) -> tuple[I32, I32, I32]:
-    """Pairs of points, lines and planes, rows (previous, current), around the motion `p_current = R p_previous + t`."""
-    step, by, distance, ratio, sine, overlap, lines_by, line_bits, cosine = gates
-    pixels, radius = np.empty((len(before.pixels), 2), np.float32), np.empty(len(before.pixels), np.float32)
+def _moved(before: Places, planes: F64, samples_m: F32, camera: Intrinsics, R: F64, t: F64) -> tuple[F32, F32, F64, F32]:
+    """Pixels (n, 2) and ends of lines (m, 2, 2) of the previous frame, its planes (p, 4) and points on them (p, s, 3), where the motion puts them."""
+    pixels, ends = np.empty((len(before.pixels), 2), np.float32), np.empty((len(before.endpoints_px), 2, 2), np.float32)
     for i in range(len(pixels)):
         pixels[i, 0], pixels[i, 1] = _there(before.pixels, before.points_m, i, camera, R, t)
-        radius[i] = radius_px
-    points = near_matches(
-        pixels, before.words, before.bytes, before.octaves, now.pixels, now.words, now.bytes, now.octaves, radius, step, by, distance, ratio
-    )
-    ends = np.empty((len(before.endpoints_px), 2, 2), np.float32)
     for i in range(len(ends)):
         for e in range(2):
             ends[i, e, 0], ends[i, e, 1] = _end_there(before, i, e, camera, R, t)
-    lines = line_matches(ends, before.line_words, now.endpoints_px, now.line_words, sine, radius_px, overlap, lines_by, line_bits, ratio)
-    planes, samples = _moved_planes(before.planes, before.samples_m, R, t)
-    same = associated(now.planes, now.samples_m, planes, samples, cosine, plane_m, True)
-    for k in range(len(same)):
-        same[k, 0], same[k, 1] = same[k, 1], same[k, 0]
-    return _rows(points), _rows(lines), same
+    coefficients, samples = np.empty((len(planes), 4)), np.empty((len(planes), samples_m.shape[1], 3), np.float32)
+    for i in range(len(planes)):
+        coefficients[i, 3] = planes[i, 3]
+        for a in range(3):
+            coefficients[i, a] = R[a, 0] * planes[i, 0] + R[a, 1] * planes[i, 1] + R[a, 2] * planes[i, 2]
+            coefficients[i, 3] -= coefficients[i, a] * t[a]
+            for k in range(samples_m.shape[1]):
+                samples[i, k, a] = R[a, 0] * samples_m[i, k, 0] + R[a, 1] * samples_m[i, k, 1] + R[a, 2] * samples_m[i, k, 2] + t[a]
+    return pixels, ends, coefficients, samples
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
@@ -118,40 +129,15 @@ def _there(pixels: F32, points_m: F32, i: int, camera: Intrinsics, R: F64, t: F6
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def _end_there(shown: Shown, i: int, end: int, camera: Intrinsics, R: F64, t: F64) -> tuple[float, float]:
+def _end_there(shown: Places, i: int, end: int, camera: Intrinsics, R: F64, t: F64) -> tuple[float, float]:
     """An end of line i where the motion puts it."""
     px, m = shown.endpoints_px, shown.endpoints_m
     return moved_pixel(px[i, end, 0], px[i, end, 1], m[i, end, 0], m[i, end, 1], m[i, end, 2], camera, R, t)
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def _moved_planes(planes: F64, samples_m: F32, R: F64, t: F64) -> tuple[F64, F32]:
-    """Planes (p, 4) and points on them (p, s, 3) in the current frame."""
-    coefficients, samples = np.empty(planes.shape), np.empty(samples_m.shape, np.float32)
-    for i in range(len(planes)):
-        coefficients[i, 3] = planes[i, 3]
-        for a in range(3):
-            coefficients[i, a] = R[a, 0] * planes[i, 0] + R[a, 1] * planes[i, 1] + R[a, 2] * planes[i, 2]
-            coefficients[i, 3] -= coefficients[i, a] * t[a]
-            for k in range(samples_m.shape[1]):
-                samples[i, k, a] = R[a, 0] * samples_m[i, k, 0] + R[a, 1] * samples_m[i, k, 1] + R[a, 2] * samples_m[i, k, 2] + t[a]
-    return coefficients, samples
-
-
-@numba.njit(cache=True, nogil=True, error_model="numpy")
-def _rows(found: I32) -> I32:
-    """(n,) row of the current frame for each previous one, or -1 -> (k, 2)."""
-    out, k = np.empty((len(found), 2), np.int32), 0
-    for i in range(len(found)):
-        if found[i] >= 0:
-            out[k, 0], out[k, 1] = i, found[i]
-            k += 1
-    return out[:k]
-
-
-@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _agreeing(
-    points: I32, lines: I32, before: Shown, now: Shown, camera: Intrinsics, R: F64, t: F64, unsure_px: float, error_px: float
+    points: I32, lines: I32, before: Places, now: Places, camera: Intrinsics, R: F64, t: F64, unsure_px: float, error_px: float
 ) -> tuple[I32, I32]:
     """The pairs (previous, current) of points and lines that agree with a motion, which leaves `unsure_px` open of what is at depth 1."""
     good_points, good_lines, n, m = np.empty((len(points), 2), np.int32), np.empty((len(lines), 2), np.int32), 0, 0
