@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Hashable
 from dataclasses import dataclass
+from typing import TypeVar
 
 import numpy as np
 
 from trihedron.pipeline.types import F64, I32, Bool, Map, Table
 
+T = TypeVar("T")
 WEIGHTS = {"point": 1, "line": 5, "plane": 20}  # how strongly a shared one ties keyframes: a bare room has few landmarks, all of them large
 
 
@@ -21,8 +24,20 @@ class LocalWindow:
     planes: I32
 
 
+def _once(map: Map, key: Hashable, find: Callable[[], T]) -> T:
+    """What is asked of one version of the map, frame after frame, is found once."""
+    if key not in map.memo:
+        map.memo[key] = find()
+    found: T = map.memo[key]
+    return found
+
+
 def newest_keyframes(map: Map, count: int) -> I32:
     """The last `count` living keyframes of the sub-map of the newest, oldest first."""
+    return _once(map, ("newest", count), lambda: _newest(map, count))
+
+
+def _newest(map: Map, count: int) -> I32:
     start = max(len(map.keyframes) - 4 * count, 0)
     rows = np.arange(start, len(map.keyframes), dtype=np.int32)
     rows = rows[map.keyframes.rows("alive", rows)]
@@ -32,16 +47,13 @@ def newest_keyframes(map: Map, count: int) -> I32:
 
 def living_keyframes(map: Map) -> I32:
     """All living keyframes, oldest first; on a long run most are retired, so that what is asked of these alone costs little."""
-    if "living" not in map.memo:
-        map.memo["living"] = np.flatnonzero(map.keyframes.column("alive")).astype(np.int32)
-    found: I32 = map.memo["living"]
-    return found
+    return _once(map, "living", lambda: np.flatnonzero(map.keyframes.column("alive")).astype(np.int32))
 
 
 def keyframes_of(map: Map, submap: int) -> I32:
     """The living keyframes of a sub-map."""
     living = living_keyframes(map)
-    return living[map.keyframes.rows("submap", living) == submap]
+    return _once(map, ("living", submap), lambda: living[map.keyframes.rows("submap", living) == submap])
 
 
 def current_submap(map: Map) -> int:
@@ -100,11 +112,7 @@ def _votes(map: Map, keyframes: I32) -> I32:
 
 def covisible_keyframes(map: Map, keyframes: I32, count: int) -> I32:
     """At most `count` further living keyframes that share most landmarks with the given ones, most first and of equals the newest."""
-    key = "covisible", keyframes.tobytes(), count
-    if key not in map.memo:
-        map.memo[key] = _covisible(map, keyframes, count)
-    found: I32 = map.memo[key]
-    return found
+    return _once(map, ("covisible", keyframes.tobytes(), count), lambda: _covisible(map, keyframes, count))
 
 
 def _covisible(map: Map, keyframes: I32, count: int) -> I32:
@@ -117,7 +125,7 @@ def _covisible(map: Map, keyframes: I32, count: int) -> I32:
 def _near(map: Map, T_world_camera: F64, near_m: float, near_deg: float, submap: int) -> I32:
     """Living keyframes of the sub-map taken from about here in about this direction, nearest first."""
     living = keyframes_of(map, submap)
-    poses = map.keyframes.rows("T_world_camera", living)
+    poses = _once(map, ("poses", submap), lambda: map.keyframes.rows("T_world_camera", living))
     distance = np.linalg.norm(poses[:, :3, 3] - T_world_camera[:3, 3], axis=1)
     cosine = poses[:, :3, 2] @ T_world_camera[:3, 2]
     near = np.flatnonzero((distance < near_m) & (cosine > np.cos(np.radians(near_deg))))
@@ -137,9 +145,8 @@ def local_window(
     """The `newest` keyframes, the `covisible` ones that share most landmarks with them, and up to `near` further ones taken from about
     `T_world_camera` (within `near_m` and `near_deg`): a place seen again after its landmarks' last observers were forgotten.
     All are of one sub-map: that of the newest keyframe, or the one given."""
-    chosen = newest_keyframes(map, max(newest, 1))
     submap = current_submap(map) if submap is None else submap
-    chosen = chosen[map.keyframes.rows("submap", chosen) == submap][:newest]
+    chosen = newest_keyframes(map, max(newest, 1))[:newest] if submap == current_submap(map) else np.empty(0, np.int32)
     chosen = np.concatenate([chosen, covisible_keyframes(map, chosen, covisible)])
     beside = _near(map, T_world_camera, near_m, near_deg, submap)
     beside = beside[~np.isin(beside, chosen)][:near]
@@ -148,8 +155,7 @@ def local_window(
 
 def window_of(map: Map, keyframes: I32) -> LocalWindow:
     """The keyframes (sorted rows) and what they see."""
-    key = "window", keyframes.tobytes()
-    if key not in map.memo:
-        map.memo[key] = LocalWindow(keyframes, *(observed_by(map, keyframes, kind) for kind in ("point", "line", "plane")))
-    window: LocalWindow = map.memo[key]
-    return window
+    def seen() -> LocalWindow:
+        return LocalWindow(keyframes, *(observed_by(map, keyframes, kind) for kind in ("point", "line", "plane")))
+
+    return _once(map, ("window", keyframes.tobytes()), seen)
