@@ -9,6 +9,7 @@ import pytest
 from trihedron.pipeline.geometry import tangent_basis
 from trihedron.plugins.normals.integral_image import IntegralImage
 from trihedron.plugins.numerics.depth.organised_grid import Grid
+from trihedron.plugins.numerics.planes.cell_columns import columns_of
 from trihedron.plugins.numerics.planes.plane_fitting import fit_cells
 from trihedron.plugins.planes.ahc import Ahc
 from trihedron.plugins.planes.cape import Cape
@@ -214,7 +215,7 @@ def test_cells_in_one_line_are_no_plane():
     rho, sigma, count = np.full((1, w), 0.5, np.float32), np.full((1, w), 0.01, np.float32), np.ones((1, w), np.int32)
     member = np.zeros(w, np.bool_)
     grid = Grid(rho, sigma, count, np.linspace(-1.0, 1.0, w), np.zeros(1), normals)
-    q, members = fit_cells(np.array([0.0, 0.0, 0.5]), grid, np.arange(w, dtype=np.int32), 0.98, 3.0, member)
+    q, members = fit_cells(np.array([0.0, 0.0, 0.5]), columns_of(grid, np.arange(w, dtype=np.int32)), 0.98, 3.0, member)
     assert members == 0 and not member.any() and not q.any()
 
 

@@ -12,6 +12,7 @@ import numba
 import numpy as np
 
 from trihedron.pipeline.types import F32, F64, I32, U8, Bool
+from trihedron.plugins.numerics.algebra.ranking import descending
 from trihedron.plugins.numerics.depth.depth_sampling import sigma_z
 
 
@@ -76,23 +77,6 @@ def cell_rays(h: int, w: int, stride: int, intrinsics: tuple[float, float, float
     fx, fy, cx, cy = intrinsics
     centre = 0.5 * (stride - 1)
     return (np.arange(w) * stride + centre - cx) / fx, (np.arange(h) * stride + centre - cy) / fy
-
-
-@numba.njit(cache=True, nogil=True, error_model="numpy")
-def normal_equations(grid: Grid, cells: I32, chosen: Bool) -> tuple[F64, F64]:
-    """Of q, from the weighted depths of the chosen cells: A (3, 3), of which only the upper triangle is filled, and b (3,)."""
-    rho, sigma, count, rays_x, rays_y, w = grid.rho.ravel(), grid.sigma.ravel(), grid.count.ravel(), grid.rays_x, grid.rays_y, len(grid.rays_x)
-    xx, xy, x1, yy, y1, one, xp, yp, p1 = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
-    for k in range(len(cells)):
-        if chosen[k]:
-            i = cells[k]
-            r = i // w
-            x, y, p, s = rays_x[i - r * w], rays_y[r], rho[i], sigma[i]
-            weight = count[i] / (s * s)
-            xx, xy, x1 = xx + weight * x * x, xy + weight * x * y, x1 + weight * x
-            yy, y1, one = yy + weight * y * y, y1 + weight * y, one + weight
-            xp, yp, p1 = xp + weight * x * p, yp + weight * y * p, p1 + weight * p
-    return np.array([[xx, xy, x1], [0.0, yy, y1], [0.0, 0.0, one]]), np.array([xp, yp, p1])
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
@@ -252,7 +236,7 @@ def cells_by_component(component: I32, least: int) -> tuple[I32, I32]:
         if i >= 0:
             size[i] += 1
     roots = np.flatnonzero(size >= least)
-    roots = roots[np.argsort(-size[roots], kind="mergesort")]
+    roots = roots[descending(size[roots].astype(np.float64))]
     starts = np.zeros(len(roots) + 1, np.int32)
     place = np.full(len(flat), -1, np.int32)
     for k in range(len(roots)):

@@ -165,6 +165,8 @@ def near_matches(
     qpx: F32, qwords: U64, qbytes: U8, qoct: U8, tpx: F32, twords: U64, tbytes: U8, toct: U8,
     radius: F32, step: int, mode: int, limit: float, ratio: float,
 ) -> I32:  # fmt: skip
+    """For each feature of q the row (n,) of the one of t within its radius, at most `step` octaves apart, that is most alike by `mode`; -1 without,
+    where the distance is above `limit`, where another of its octave is alike by `ratio`, and where another of q is nearer to it."""
     out = np.full(len(qpx), -1, np.int32)
     x0, y0, x1, y1 = _bounds(tpx)
     if x1 < x0:
@@ -242,6 +244,8 @@ def _beside(q: F64, i: int, t: F64, j: int) -> tuple[float, float]:
 def line_matches(
     query: F32, qwords: U64, train: F32, twords: U64, sine_max: float, offset_px: float, overlap_min: float, mode: int, limit: float, ratio: float
 ) -> I32:
+    """For each segment of `query` the row (n,) of the one of `train` beside it that is most alike by `mode`; -1 without, where the distance is above
+    `limit`, where another edge is alike by `ratio`, and where another segment of `query` is nearer to it."""
     q, t = _directions(query), _directions(train)
     out = np.full(len(q), -1, np.int32)
     owner = np.full(len(t), -1, np.int32)

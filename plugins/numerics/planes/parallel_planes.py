@@ -11,7 +11,8 @@ import numpy as np
 
 from trihedron.pipeline.types import F64, I32, Bool
 from trihedron.plugins.numerics.algebra.small_linear import solve_positive
-from trihedron.plugins.numerics.depth.organised_grid import Grid, normal_equations
+from trihedron.plugins.numerics.depth.organised_grid import Grid
+from trihedron.plugins.numerics.planes.cell_columns import normal_equations, sum_within
 
 LEAST = np.radians(0.4)  # disagreement of normals and plane that is looked into
 SOME = 2000
@@ -23,13 +24,13 @@ ROUNDS = 10  # of two means
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def larger_surface(q: F64, grid: Grid, cells: I32, member: Bool) -> tuple[F64, int, F64]:
+def larger_surface(q: F64, grid: Grid, cells: I32, columns: F64, member: Bool) -> tuple[F64, int, F64]:
     """Of the members of a region with plane q, when they are two parallel surfaces, the larger one: its q and number of members, which alone stay
     marked, and the q of the other. Otherwise all is left as it is, and there is no other (zeros)."""
     members, none = 0, np.zeros(3)
     for k in range(len(cells)):
         members += member[k]
-    normal = _mean_normal(q, grid, cells, member)
+    normal = _mean_normal(q, columns, member)
     apart = angle_between(q, normal)
     if not apart > LEAST:
         return q, members, none
@@ -40,8 +41,8 @@ def larger_surface(q: F64, grid: Grid, cells: I32, member: Bool) -> tuple[F64, i
         other += member[k] and not further[k]
     if min(one, other) < SHARE * members:
         return q, members, none
-    first = _fitted(grid, cells, member & (further == (one >= other)))
-    second = _fitted(grid, cells, member & (further != (one >= other)))
+    first = _fitted(columns, member & (further == (one >= other)))
+    second = _fitted(columns, member & (further != (one >= other)))
     if not (angle_between(first, normal) < SMALLER * apart and angle_between(second, normal) < apart):
         return q, members, none
     for k in range(len(cells)):
@@ -52,30 +53,22 @@ def larger_surface(q: F64, grid: Grid, cells: I32, member: Bool) -> tuple[F64, i
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def angle_between(q: F64, normal: F64) -> float:
     """Acute angle (rad) between the normals of two planes, of any length; NaN for no plane or no normal."""
-    sine = 0.0
+    sine, one, other = 0.0, 0.0, 0.0
     for k in range(3):
         i, j = (k + 1) % 3, (k + 2) % 3
         sine += (q[i] * normal[j] - q[j] * normal[i]) ** 2
-    squares = float(q @ q) * float(normal @ normal)
+        one, other = one + q[k] * q[k], other + normal[k] * normal[k]
+    squares = one * other
     return float(np.arcsin(min(np.sqrt(sine / squares), 1.0))) if squares > 0.0 else np.nan
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def _mean_normal(q: F64, grid: Grid, cells: I32, member: Bool) -> F64:
+def _mean_normal(q: F64, columns: F64, member: Bool) -> F64:
     """Unit mean of the normals of (about SOME of) the members, those across a step left out; NaN without any."""
-    normals, step = grid.normals.reshape(-1, 3), max(len(cells) // SOME, 1)
-    length = np.sqrt(q @ q)
+    length = np.sqrt(q[0] * q[0] + q[1] * q[1] + q[2] * q[2])
     x, y, z = -q[0] / length, -q[1] / length, -q[2] / length
     for least in (WIDE, NARROW, NARROW):
-        a, b, c = 0.0, 0.0, 0.0
-        for k in range(0, len(cells), step):
-            if member[k]:
-                i = cells[k]
-                nx, ny, nz = normals[i, 0], normals[i, 1], normals[i, 2]
-                if nx * x + ny * y + nz * z > least:
-                    a += nx
-                    b += ny
-                    c += nz
+        a, b, c = sum_within(columns, member, max(len(member) // SOME, 1), x, y, z, least)
         length = np.sqrt(a * a + b * b + c * c)
         x, y, z = a / length, b / length, c / length
     return np.array([x, y, z])
@@ -139,9 +132,9 @@ def _further(distances: F64, member: Bool) -> Bool:
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def _fitted(grid: Grid, cells: I32, chosen: Bool) -> F64:
+def _fitted(columns: F64, chosen: Bool) -> F64:
     """q (3,) of the plane through the chosen cells, zeros when there is none."""
     q = np.zeros(3)
-    A, b = normal_equations(grid, cells, chosen)
+    A, b = normal_equations(columns, chosen)
     solve_positive(A.T, b, q)
     return q

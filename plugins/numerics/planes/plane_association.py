@@ -83,6 +83,7 @@ def overlap(samples_a: F32, samples_b: F32, reach_m: float) -> float:
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def associated(a: F64, samples_a: F32, b: F64, samples_b: F32, cosine: float, limit: float, many_to_one: bool) -> I32:
+    """`associate_planes` by the cosine of its angle and its distance (m): the pair that costs least, then the next among the rows that are left."""
     n, m = len(a), len(b)
     cost = np.full((n, m), np.inf)
     reach = np.full(m, -1.0)

@@ -7,6 +7,7 @@ import numpy as np
 
 from trihedron.pipeline.types import F64, I32, U8, Bool
 from trihedron.plugins.numerics.depth.organised_grid import Grid, cells_by_component, connected_components
+from trihedron.plugins.numerics.planes.cell_columns import columns_of
 from trihedron.plugins.numerics.planes.plane_fitting import fit_cells
 
 SCORED = 800  # cells a hypothesis is scored on, spread over those that are left
@@ -35,7 +36,7 @@ def consensus_planes(grid: Grid, draws: F64, gate: float, cos_cone: float, least
                 break
             region = _connected_inliers(grid, q, cells, links, gate, cos_cone)
             member = np.zeros(len(region), np.bool_)
-            q, _ = fit_cells(q, grid, region, cos_cone, gate, member)
+            q, _ = fit_cells(q, columns_of(grid, region), cos_cone, gate, member)
         accepted = len(region) >= least and q.any()
         if accepted:
             planes[found] = q
@@ -116,7 +117,7 @@ def _score(grid: Grid, q: F64, cells: I32, gate: float, cos_cone: float) -> floa
 def _connected_inliers(grid: Grid, q: F64, cells: I32, links: U8, gate: float, cos_cone: float) -> I32:
     """The largest connected region of inliers among the cells."""
     member, inlier = np.zeros(len(cells), np.bool_), np.zeros(grid.rho.shape, np.bool_)
-    fit_cells(q, grid, cells, cos_cone, gate, member)
+    fit_cells(q, columns_of(grid, cells), cos_cone, gate, member)
     w = grid.rho.shape[1]
     for k in range(len(cells)):
         if member[k]:

@@ -6,20 +6,53 @@ import numba
 import numpy as np
 
 from trihedron.pipeline.types import F32, F64, I32, Bool
+from trihedron.plugins.numerics.algebra.small_linear import inverse_positive
 from trihedron.plugins.numerics.depth.organised_grid import Grid
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def linear_turn(C: F64, D: F64, mean_x: F64, mean_n: F64, normal: F64) -> float:
-    """Width (rad) of the spread of a region's normals n that is linear in position x, from the means of x xᵀ, n xᵀ, x and n: the part of their
-    covariance that a linear map explains, as the width of a uniform spread. Directions the region does not extend in carry no information."""
-    C, D = C - np.outer(mean_x, mean_x), D - np.outer(mean_n, mean_x)
-    size = np.trace(C) + 1e-12
-    C += np.outer(normal, normal) * size
-    for a in range(3):
-        C[a, a] += 1e-9 * size
-    explained = D @ np.linalg.inv(C) @ D.T
-    return np.sqrt(12.0 * max(np.linalg.eigvalsh(0.5 * (explained + explained.T))[2], 0.0))
+def linear_turn(C: F64, D: F64, sum_x: F64, sum_n: F64, count: float, normal: F64) -> float:
+    """Width (rad) of the spread of a region's normals n that is linear in position x, from the sums of x xᵀ, n xᵀ, x and n over its cells: the part
+    of their covariance that a linear map explains, as the width of a uniform spread. Directions the region does not extend in say nothing."""
+    spread, joint, explained = covariance(C, sum_x, sum_x, count), covariance(D, sum_n, sum_x, count), np.zeros((3, 3))
+    size = spread[0, 0] + spread[1, 1] + spread[2, 2] + 1e-12
+    square = normal[0] * normal[0] + normal[1] * normal[1] + normal[2] * normal[2]
+    for i in range(3):
+        for j in range(3):
+            spread[i, j] += normal[i] * normal[j] / square * size + (1e-9 * size if i == j else 0.0)
+    inverse = inverse_positive(spread)
+    for i in range(3):
+        for j in range(3):
+            for k in range(3):
+                for m in range(3):
+                    explained[i, j] += joint[i, k] * inverse[k, m] * joint[j, m]
+    return np.sqrt(12.0 * max(eigenvalues(explained)[0], 0.0))
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def covariance(products: F64, one: F64, other: F64, count: float) -> F64:
+    """(3, 3) from the sums of a bᵀ, a and b over `count` pairs."""
+    out = np.empty((3, 3))
+    for i in range(3):
+        for j in range(3):
+            out[i, j] = products[i, j] / count - one[i] / count * (other[j] / count)
+    return out
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def eigenvalues(S: F64) -> tuple[float, float]:
+    """The two largest of a symmetric S (3, 3), by the angle of its cubic (Smith, 1961)."""
+    mean, p, K = (S[0, 0] + S[1, 1] + S[2, 2]) / 3.0, 0.0, S.copy()
+    for i in range(3):
+        K[i, i] -= mean
+        for j in range(3):
+            p += K[i, j] * K[i, j] / 6.0
+    if p == 0.0:
+        return mean, mean
+    half = 0.5 * (K[0, 0] * (K[1, 1] * K[2, 2] - K[1, 2] * K[1, 2]) - K[0, 1] * (K[0, 1] * K[2, 2] - K[1, 2] * K[0, 2]))
+    half += 0.5 * K[0, 2] * (K[0, 1] * K[1, 2] - K[1, 1] * K[0, 2])
+    angle, width = np.arccos(min(max(half / (p * np.sqrt(p)), -1.0), 1.0)) / 3.0, 2.0 * np.sqrt(p)
+    return mean + width * np.cos(angle), mean + width * np.cos(angle - 2.0 * np.pi / 3.0)
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
@@ -32,7 +65,7 @@ def normals_of_regions(labels: I32, planes: F64, grid: Grid, cos_cone: float, st
     regions = len(planes)
     cells, facing, error = np.zeros(regions), np.zeros(regions), np.zeros(regions)
     unit, C, D = np.empty((regions, 3)), np.zeros((regions, 3, 3)), np.zeros((regions, 3, 3))
-    mean_x, mean_n, x = np.zeros((regions, 3)), np.zeros((regions, 3)), np.empty(3)
+    sum_x, sum_n, x = np.zeros((regions, 3)), np.zeros((regions, 3)), np.empty(3)
     for k in range(regions):
         unit[k] = -planes[k] / max(np.sqrt(planes[k] @ planes[k]), 1e-12)
     for r in range(0, h, step):
@@ -49,8 +82,8 @@ def normals_of_regions(labels: I32, planes: F64, grid: Grid, cos_cone: float, st
             error[k] += sigma[r, c] * z * z
             x[0], x[1], x[2] = rays_x[c] * z, rays_y[r] * z, z
             for a in range(3):
-                mean_x[k, a] += x[a]
-                mean_n[k, a] += n[a]
+                sum_x[k, a] += x[a]
+                sum_n[k, a] += n[a]
                 for b in range(3):
                     C[k, a, b] += x[a] * x[b]
                     D[k, a, b] += n[a] * x[b]
@@ -58,8 +91,8 @@ def normals_of_regions(labels: I32, planes: F64, grid: Grid, cos_cone: float, st
     for k in range(regions):
         m = facing[k]
         if m >= 3.0:
-            turns[k] = linear_turn(C[k] / m, D[k] / m, mean_x[k] / m, mean_n[k] / m, unit[k])
-            lesser = np.linalg.eigvalsh(C[k] / m - np.outer(mean_x[k] / m, mean_x[k] / m))[1]
+            turns[k] = linear_turn(C[k], D[k], sum_x[k], sum_n[k], m, unit[k])
+            lesser = eigenvalues(covariance(C[k], sum_x[k], sum_x[k], m))[1]
             biases[k] = error[k] / m / np.sqrt(12.0 * max(lesser, 1e-9))
     return turns, biases, facing / np.maximum(cells, 1.0)
 

@@ -6,6 +6,7 @@ import numba
 import numpy as np
 
 from trihedron.pipeline.types import F64, I32
+from trihedron.plugins.numerics.algebra.ranking import descending
 from trihedron.plugins.numerics.planes.parallel_planes import LEAST, angle_between
 from trihedron.plugins.numerics.planes.plane_fitting import solve_symmetric
 
@@ -45,8 +46,7 @@ def merge_regions(A: F64, b: F64, moments: F64, n: I32, touch: F64, limit: float
     noise moves these by when `alike` depths err as one."""
     k = len(n)
     owner = np.arange(k + 1).astype(np.int32)
-    order = np.argsort(-n, kind="mergesort")
-    for i in order:
+    for i in descending(n.astype(np.float64)):
         again = owner[i + 1] == i + 1
         while again:
             again = False
