@@ -11,12 +11,14 @@ from trihedron.plugins.numerics.depth.organised_grid import Grid
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def columns_of(grid: Grid, cells: I32) -> F64:
-    """(8, n) of the cells: x/z and y/z, inverse depth, its σ, its weight `count / σ²`, and the normal."""
+    """(8, n) of the cells, whose numbers ascend: x/z and y/z, inverse depth, its σ, its weight `count / σ²`, and the normal."""
     rho, sigma, count, normals = grid.rho.ravel(), grid.sigma.ravel(), grid.count.ravel(), grid.normals.reshape(-1, 3)
     out, w = np.empty((8, len(cells))), len(grid.rays_x)
+    r = 0
     for k in range(len(cells)):
         i = cells[k]
-        r = i // w
+        while i >= (r + 1) * w:
+            r += 1
         out[0, k], out[1, k], out[2, k], out[3, k] = grid.rays_x[i - r * w], grid.rays_y[r], rho[i], sigma[i]
         out[4, k], out[5, k], out[6, k], out[7, k] = count[i] / (sigma[i] * sigma[i]), normals[i, 0], normals[i, 1], normals[i, 2]
     return out

@@ -2,18 +2,19 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
 
-from trihedron.pipeline.geometry import tangent_basis
-from trihedron.pipeline.types import F64, I32, U8, Frame, Normals, Planes
+from trihedron.pipeline.types import F64, I32, Frame, Normals, Planes
 from trihedron.plugins.numerics.depth.depth_sampling import noise_coefficients
 from trihedron.plugins.numerics.depth.organised_grid import Grid, cell_inverse_depths, cell_rays
-from trihedron.plugins.numerics.planes import plane_regions as regions
 from trihedron.plugins.numerics.planes.plane_curvature import drop_engulfed, normals_of_regions
 from trihedron.plugins.numerics.planes.plane_fitting import solve_symmetric
-from trihedron.plugins.numerics.planes.region_merging import merge_regions, neighbours
+from trihedron.plugins.numerics.planes.plane_regions import largest_regions
+from trihedron.plugins.numerics.planes.plane_report import plane_report
+from trihedron.plugins.numerics.planes.region_merging import grown_and_merged
 
 MOST = 254  # regions the labels can name
 EDGE, EDGE_M = 0.04, 0.02  # a step above EDGE z + EDGE_M within a cell's pixels: no depth there
@@ -64,10 +65,10 @@ class PlanarRegions:
     def _complete(self, core: I32, q: F64, grid: Grid, frame: Frame, stride: int, flat: bool = True) -> Planes:
         """Planes of the regions whose core cells are labelled (h, w) and whose planes are q (k, 3): grown, merged, fitted to their cores. A detector
         that did not ask the normals says that the regions need not be `flat`: curved ones are dropped."""
-        labels, gap = self._grow(core, q, grid, stride), max(self.gap_px // stride, 1)
-        sums = regions.accumulate(core, len(q), grid)
-        touch = neighbours(labels, len(q), gap)
-        owner = merge_regions(*sums, touch, self.merge, self.correlation_px**2)
+        gap, cos_cone = max(self.gap_px // stride, 1), math.cos(2.0 * math.radians(self.cone_deg))
+        labels, owner, sums = grown_and_merged(
+            core, q, grid, self.gate, self.border_px // stride, cos_cone, gap, self.merge, self.correlation_px**2
+        )
         if not flat:
             owner = self._flat(owner, labels, sums, grid, gap)
         return self._report(labels, core, owner, sums, grid, frame, stride)
@@ -83,44 +84,23 @@ class PlanarRegions:
         good = drop_engulfed(merged, grid.rho, good, gap)
         return np.where(np.concatenate([[False], good])[owner], owner, 0).astype(np.int32)
 
-    def _grow(self, core: I32, q: F64, grid: Grid, stride: int) -> I32:
-        cos_cone = float(np.cos(2.0 * np.radians(self.cone_deg)))
-        return regions.grow_regions(core, q, grid, self.gate, self.border_px // stride, cos_cone)
-
     def _report(self, labels: I32, core: I32, owner: I32, sums: Sums, grid: Grid, frame: Frame, stride: int) -> Planes:
         """The largest regions as a value, largest first; `owner` says which one a label belongs to, 0 = none."""
-        k = len(sums[3])
-        area = np.zeros(k + 1, np.int32)
-        np.add.at(area, owner[1:], regions.areas(labels, grid.count, k))
-        area = area[1:]
-        ranked = np.array([i for i in np.argsort(-area, kind="stable") if area[i] >= self.min_pixels][: self.planes], dtype=np.intp)
-        number = np.zeros(k + 1, np.uint8)
-        number[ranked + 1] = np.arange(1, len(ranked) + 1)
-        numbered, numbered_core = regions.renumbered(labels, number[owner]), regions.renumbered(core, number[owner])
+        numbered, numbered_core, ranked, area = largest_regions(labels, core, owner, grid.count, self.min_pixels, self.planes)
         A, b, moments, n = (total[ranked] for total in sums)
         q = np.linalg.solve(A, b[..., None])[..., 0]
-        distance = 1.0 / np.maximum(np.linalg.norm(q, axis=-1), 1e-12)
+        coefficients, J, excess, samples = plane_report(
+            numbered, numbered_core, q, grid, self.tiles, self.correlation_px**2, 2.0, self.samples, 400
+        )
+        variance = excess + self.bias**2 * n  # over that of the least-squares fit to n independent depths, `A⁻¹`
         return Planes(
             index=frame.index,
             stamp_ns=frame.stamp_ns,
-            coefficients=np.concatenate([-q * distance[:, None], distance[:, None]], axis=-1),
-            covariance=self._covariance(A, q, self._variance(numbered_core, q, n, grid)),
+            coefficients=coefficients,
+            covariance=J @ (np.linalg.inv(A) * variance[:, None, None]) @ np.swapaxes(J, -1, -2),
             moments=moments,
-            pixels=area[ranked],
-            samples_m=regions.spread_samples(numbered, q, grid.rays_x, grid.rays_y, self.samples, 400),
+            pixels=area,
+            samples_m=samples,
             labels=numbered,
             stride=stride,
         )
-
-    def _variance(self, core: U8, q: F64, n: I32, grid: Grid) -> F64:
-        """(k,) variance of a region's estimates over that of the least-squares fit to n independent depths."""
-        expected = self.correlation_px**2
-        excess = regions.excess_variance(core, q, grid, self.tiles, expected, 2.0)
-        return excess + self.bias**2 * n
-
-    def _covariance(self, A: F64, q: F64, variance: F64) -> F64:
-        """Covariance (k, 3, 3) of (a, b, d): that of q, `variance · A⁻¹`, through `n = -q/|q|`, `d = 1/|q|`."""
-        d = 1.0 / np.maximum(np.linalg.norm(q, axis=-1), 1e-12)[:, None, None]
-        normal = -q[..., None] * d
-        J = np.concatenate([-d * np.swapaxes(tangent_basis(normal[..., 0]), -1, -2), d * d * np.swapaxes(normal, -1, -2)], axis=-2)
-        return J @ (np.linalg.inv(A) * variance[:, None, None]) @ np.swapaxes(J, -1, -2)

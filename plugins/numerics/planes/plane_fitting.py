@@ -173,18 +173,22 @@ def fit_cells(q: F64, columns: F64, cos_cone: float, gate: float, member: Bool) 
 def turn(q: F64, columns: F64, member: Bool, step: int) -> float:
     """How far the normals turn across the members (one in `step`), rad: about 0 for a plane whatever its noise, all of the angle seen for a cylinder.
     Members without a normal do not count."""
-    m, x, n = 0, np.empty(3), np.empty(3)
-    C, D, sum_x, sum_n = np.zeros((3, 3)), np.zeros((3, 3)), np.zeros(3), np.zeros(3)
+    m = 0
+    cxx, cxy, cxz, cyy, cyz, czz = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0  # sums of x xᵀ, of n xᵀ, of x and of n
+    dxx, dxy, dxz, dyx, dyy, dyz, dzx, dzy, dzz = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+    sx, sy, sz, tx, ty, tz = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
     for k in range(0, len(member), step):
-        if member[k] and columns[5, k] == columns[5, k]:
+        nx, ny, nz = columns[5, k], columns[6, k], columns[7, k]
+        if member[k] and nx == nx:
             z = 1.0 / columns[2, k]
-            x[0], x[1], x[2] = columns[0, k] * z, columns[1, k] * z, z
+            x, y = columns[0, k] * z, columns[1, k] * z
             m += 1
-            for i in range(3):
-                n[i] = columns[5 + i, k]
-                sum_x[i] += x[i]
-                sum_n[i] += n[i]
-                for j in range(3):
-                    C[i, j] += x[i] * x[j]
-                    D[i, j] += n[i] * x[j]
-    return linear_turn(C, D, sum_x, sum_n, m, -q) if m >= 3 else 0.0
+            sx, sy, sz = sx + x, sy + y, sz + z
+            tx, ty, tz = tx + nx, ty + ny, tz + nz
+            cxx, cxy, cxz, cyy, cyz, czz = cxx + x * x, cxy + x * y, cxz + x * z, cyy + y * y, cyz + y * z, czz + z * z
+            dxx, dxy, dxz = dxx + nx * x, dxy + nx * y, dxz + nx * z
+            dyx, dyy, dyz = dyx + ny * x, dyy + ny * y, dyz + ny * z
+            dzx, dzy, dzz = dzx + nz * x, dzy + nz * y, dzz + nz * z
+    C = np.array([[cxx, cxy, cxz], [cxy, cyy, cyz], [cxz, cyz, czz]])
+    D = np.array([[dxx, dxy, dxz], [dyx, dyy, dyz], [dzx, dzy, dzz]])
+    return linear_turn(C, D, np.array([sx, sy, sz]), np.array([tx, ty, tz]), m, -q) if m >= 3 else 0.0

@@ -6,6 +6,7 @@ import numba
 import numpy as np
 
 from trihedron.pipeline.types import F32, F64, I32, U8
+from trihedron.plugins.numerics.algebra.ranking import descending
 from trihedron.plugins.numerics.depth.organised_grid import Grid
 
 STEP_M = 2.0**-10  # samples of planes say where a plane is, to within centimetres: fewer digits, shorter recordings
@@ -85,44 +86,46 @@ def accumulate(labels: I32, regions: int, grid: Grid) -> tuple[F64, F64, F64, I3
     rho, sigma, count, rays_x, rays_y, _ = grid
     sums, n = np.zeros((regions + 1, 19)), np.zeros(regions + 1, np.int32)  # upper triangles of A and M, row by row, and b between them
     h, w = labels.shape
-    depth, weights, moments = np.empty(w), np.empty(w), np.empty(w)  # of a row: divisions, several at once
+    row, weights = np.empty((5, w)), np.empty(w)  # x/z, inverse depth, depth and weights, 0 = no depth
+    row[0] = rays_x
     for r in range(h):
-        y = rays_y[r]
         _weigh_cells(sigma[r], count[r], weights)
         for c in range(w):
             p = float(rho[r, c])
-            depth[c], moments[c] = 1.0 / p, weights[c] * p * p * p * p
-        for c in range(w):
-            k = labels[r, c]
-            if k <= 0 or rho[r, c] <= 0.0:
-                continue
-            x, p, z, weight, moment = rays_x[c], float(rho[r, c]), depth[c], weights[c], moments[c]
-            px, py = x * z, y * z
-            sums[k, 0] += weight * x * x
-            sums[k, 1] += weight * x * y
-            sums[k, 2] += weight * x
-            sums[k, 3] += weight * y * y
-            sums[k, 4] += weight * y
-            sums[k, 5] += weight
-            sums[k, 6] += weight * x * p
-            sums[k, 7] += weight * y * p
-            sums[k, 8] += weight * p
-            sums[k, 9] += moment * px * px
-            sums[k, 10] += moment * px * py
-            sums[k, 11] += moment * px * z
-            sums[k, 12] += moment * px
-            sums[k, 13] += moment * py * py
-            sums[k, 14] += moment * py * z
-            sums[k, 15] += moment * py
-            sums[k, 16] += moment * z * z
-            sums[k, 17] += moment * z
-            sums[k, 18] += moment
-            n[k] += count[r, c]
+            known = p > 0.0
+            row[1, c], row[2, c], row[3, c] = p, 1.0 / p if known else 0.0, weights[c] if known else 0.0
+            row[4, c] = weights[c] * p * p * p * p if known else 0.0
+        c = 0
+        while c < w:
+            k, first = labels[r, c], c
+            while c < w and labels[r, c] == k:
+                n[k] += count[r, c]
+                c += 1
+            if k > 0:
+                _add_stretch(row, first, c, rays_y[r], sums[k])
     A, b, M = np.empty((regions, 3, 3)), sums[1:, 6:9].copy(), np.empty((regions, 4, 4))
     for k in range(regions):
         _symmetric(sums[k + 1, :6], A[k])
         _symmetric(sums[k + 1, 9:], M[k])
     return A, b, M, n[1:].copy()
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _add_stretch(row: F64, first: int, end: int, y: float, sums: F64) -> None:
+    """Add the cells first … end of a row to the sums (19,) of their region, which do not go through memory meanwhile."""
+    xx, xy, x1, yy, y1, one, xp, yp, p1 = sums[0], sums[1], sums[2], sums[3], sums[4], sums[5], sums[6], sums[7], sums[8]
+    XX, XY, XZ, X1, YY, YZ, Y1, ZZ, Z1, ONE = sums[9], sums[10], sums[11], sums[12], sums[13], sums[14], sums[15], sums[16], sums[17], sums[18]
+    for c in range(first, end):
+        x, p, z, weight, moment = row[0, c], row[1, c], row[2, c], row[3, c], row[4, c]
+        px, py = x * z, y * z
+        xx, xy, x1 = xx + weight * x * x, xy + weight * x * y, x1 + weight * x
+        yy, y1, one = yy + weight * y * y, y1 + weight * y, one + weight
+        xp, yp, p1 = xp + weight * x * p, yp + weight * y * p, p1 + weight * p
+        XX, XY, XZ, X1 = XX + moment * px * px, XY + moment * px * py, XZ + moment * px * z, X1 + moment * px
+        YY, YZ, Y1 = YY + moment * py * py, YZ + moment * py * z, Y1 + moment * py
+        ZZ, Z1, ONE = ZZ + moment * z * z, Z1 + moment * z, ONE + moment
+    sums[0], sums[1], sums[2], sums[3], sums[4], sums[5], sums[6], sums[7], sums[8] = xx, xy, x1, yy, y1, one, xp, yp, p1
+    sums[9], sums[10], sums[11], sums[12], sums[13], sums[14], sums[15], sums[16], sums[17], sums[18] = XX, XY, XZ, X1, YY, YZ, Y1, ZZ, Z1, ONE
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
@@ -170,13 +173,24 @@ def _sizes(labels: U8, regions: int) -> I32:
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def renumbered(labels: I32, number: U8) -> U8:
-    """Labels (h, w) by the number (k + 1,) of each, 0 = none."""
-    out, old = np.empty(labels.shape, np.uint8), labels.ravel()
-    new = out.ravel()
-    for i in range(len(old)):
-        new[i] = number[old[i]]
-    return out
+def largest_regions(labels: I32, core: I32, owner: I32, count: I32, least: int, most: int) -> tuple[U8, U8, I32, I32]:
+    """The regions of at least `least` depths, `most` at most, as 1 … k from the largest: `labels` and `core` (h, w) by these numbers, 0 = none, which
+    of the regions each is, and its number of depths. `owner` (k + 1,) says which region a label belongs to, 0 = none."""
+    area, single = np.zeros(len(owner)), areas(labels, count, len(owner) - 1)
+    for k in range(1, len(owner)):
+        area[owner[k]] += single[k - 1]
+    ranked, size, number = np.empty(most, np.int32), np.empty(most, np.int32), np.zeros(len(owner), np.uint8)
+    found = 0
+    for k in descending(area[1:].copy()):
+        if found < most and area[k + 1] >= least:
+            ranked[found], size[found], number[k + 1] = k, np.int32(area[k + 1]), found + 1
+            found += 1
+    number = number[owner]
+    out, middle = np.empty(labels.shape, np.uint8), np.empty(labels.shape, np.uint8)
+    for old, new in ((labels.ravel(), out.ravel()), (core.ravel(), middle.ravel())):
+        for i in range(len(old)):
+            new[i] = number[old[i]]
+    return out, middle, ranked[:found].copy(), size[:found].copy()
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")

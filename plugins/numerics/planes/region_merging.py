@@ -7,11 +7,23 @@ import numpy as np
 
 from trihedron.pipeline.types import F64, I32
 from trihedron.plugins.numerics.algebra.ranking import descending
+from trihedron.plugins.numerics.depth.organised_grid import Grid
 from trihedron.plugins.numerics.planes.parallel_planes import LEAST, angle_between
 from trihedron.plugins.numerics.planes.plane_fitting import solve_symmetric
+from trihedron.plugins.numerics.planes.plane_regions import accumulate, grow_regions
 
 NOISE = 7.815  # χ² of a plane's three parameters, 95 %
 PARALLEL = 4.0  # times less than the common plane is turned from either must two surfaces be turned from each other to be a step, not a bend
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def grown_and_merged(
+    core: I32, planes: F64, grid: Grid, gate: float, reach: int, cos_cone: float, gap: int, limit: float, alike: float
+) -> tuple[I32, I32, tuple[F64, F64, F64, I32]]:
+    """Labels (h, w) grown from the `core` of each region as by `grow_regions`, which region each one becomes part of as by `merge_regions` where they
+    come within `gap` cells of each other, and the sums over the cores."""
+    labels, sums = grow_regions(core, planes, grid, gate, reach, cos_cone), accumulate(core, len(planes), grid)
+    return labels, merge_regions(*sums, neighbours(labels, len(planes), gap), limit, alike), sums
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
