@@ -2,12 +2,58 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numba
 import numpy as np
 
 from trihedron.pipeline.types import F32, F64, U8
+from trihedron.plugins.numerics.algebra.ranking import descending, median
 
 MOST = 2056  # samples of a segment; rows of a power of two would all lie in the same part of a cache
+
+
+class Placing(NamedTuple):
+    """How segments are joined and which are kept: the difference of direction (rad) of fragments of one edge, their distance across and along, the
+    shortest segment, how near to the image's border all along a segment is the border, and how far across it its edge is searched, px."""
+
+    angle: float
+    offset_px: float
+    gap_px: float
+    least_px: float
+    border_px: float
+    reach_px: int
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def placed_segments(image: U8, found: F64, scale: float, placing: Placing, most: int) -> F32:
+    """(n, 2, 2) the longest of the segments (m, 4) `found` on the image at `scale`, joined and placed on the edge of the image; twice, because
+    fragments of one edge become collinear when placed."""
+    angle, offset_px, gap_px, least_px, border_px, reach_px = placing
+    lines, out = np.empty((len(found), 4)), np.empty((0, 2, 2), np.float32)
+    for i in range(len(found)):
+        for j in range(4):
+            lines[i, j] = (found[i, j] + 0.5) / scale - 0.5
+    for share in (1.0, 0.5):
+        lines = merge_collinear(lines, share * angle, share * offset_px, gap_px)[: 2 * most]
+        out = refine_on_edge(image, _worthy(lines, least_px, border_px, image.shape[1], image.shape[0]), reach_px, 2.0)
+        lines = out.astype(np.float64).reshape(-1, 4)
+    return out[:most].copy()
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _worthy(lines: F64, least_px: float, border_px: float, width: int, height: int) -> F64:
+    """Those that are long enough, and not the border of the image (or of what the sensor's registration left of it)."""
+    out, n = np.empty((len(lines), 4)), 0
+    right, bottom = width - 1 - border_px, height - 1 - border_px
+    for i in range(len(lines)):
+        x0, y0, x1, y1 = lines[i, 0], lines[i, 1], lines[i, 2], lines[i, 3]
+        inside = not (max(x0, x1) < border_px or min(x0, x1) > right or max(y0, y1) < border_px or min(y0, y1) > bottom)
+        if inside and np.hypot(x1 - x0, y1 - y0) >= least_px:
+            out[n, 0], out[n, 1], out[n, 2], out[n, 3] = x0, y0, x1, y1
+            n += 1
+    return out[:n]
+
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def merge_collinear(lines: F64, angle: float, offset_px: float, gap_px: float) -> F64:
@@ -18,9 +64,9 @@ def merge_collinear(lines: F64, angle: float, offset_px: float, gap_px: float) -
     key = np.empty(n)
     for i in range(n):
         length[i] = np.hypot(lines[i, 2] - lines[i, 0], lines[i, 3] - lines[i, 1])
-        key[i] = -length[i] + 1e-9 * (lines[i, 0] + 1e-3 * lines[i, 1])
-    order = np.argsort(key, kind="mergesort")
-    out = np.empty((n, 4))
+        key[i] = length[i] - 1e-9 * (lines[i, 0] + 1e-3 * lines[i, 1])
+    order = descending(key)
+    out, joined = np.empty((n, 4)), np.empty(n)
     used = np.zeros(n, np.bool_)
     m = 0
     least = np.cos(angle)
@@ -48,10 +94,10 @@ def merge_collinear(lines: F64, angle: float, offset_px: float, gap_px: float) -
                     continue
                 used[j], grown = True, True
                 low, high = min(low, a), max(high, b)
-        out[m] = x + low * ux, y + low * uy, x + high * ux, y + high * uy
+        out[m, 0], out[m, 1], out[m, 2], out[m, 3] = x + low * ux, y + low * uy, x + high * ux, y + high * uy
+        joined[m] = np.sqrt((out[m, 2] - out[m, 0]) ** 2 + (out[m, 3] - out[m, 1]) ** 2)
         m += 1
-    final = -np.sqrt((out[:m, 2] - out[:m, 0]) ** 2 + (out[:m, 3] - out[:m, 1]) ** 2)
-    return out[:m][np.argsort(final, kind="mergesort")]
+    return out[descending(joined[:m])]
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
@@ -130,7 +176,7 @@ def _steepest(levels: F64, k: int, sign: int, slope: F64) -> tuple[bool, float, 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def _robust_line(t: F64, o: F64, strength: F64) -> tuple[float, float]:
     """Offset a and slope b of o ≈ a + b t, by least squares reweighted with w = strength / (1 + (r / ½ px)²), starting from the median offset."""
-    a, b = np.median(o), 0.0
+    a, b = median(o.copy()), 0.0
     for _ in range(5):
         s, st, so, stt, sto = 1e-12, 0.0, 0.0, 0.0, 0.0
         for k in range(len(t)):

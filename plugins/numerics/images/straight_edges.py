@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import threading
 from dataclasses import dataclass
 from functools import cached_property
@@ -9,9 +10,9 @@ from functools import cached_property
 import cv2
 import numpy as np
 
-from trihedron.pipeline.types import F32, F64, U8, Bool, Frame, LineSegments
+from trihedron.pipeline.types import F32, F64, U8, Frame, LineSegments
 from trihedron.plugins.numerics.images.line_band_descriptor import line_band_descriptors
-from trihedron.plugins.numerics.images.line_refinement import merge_collinear, refine_on_edge
+from trihedron.plugins.numerics.images.line_refinement import Placing, placed_segments
 
 SMALLEST = 8  # px, side of an image a detector is asked to look at; some fail on less
 
@@ -53,23 +54,14 @@ class StraightEdges:
 
     def _segments(self, frame: Frame, small: U8, found: F32 | F64 | None) -> LineSegments:
         """The longest segments, longest first, with (n, 32) binary descriptors, of those `found` on the reduced image: n × 4 numbers in any shape."""
-        lines = np.zeros((0, 4)) if found is None else np.asarray((found.reshape(-1, 4).astype(np.float64) + 0.5) / self.scale - 0.5)
-        endpoints = self._refined(frame.gray, lines)
+        lines = np.zeros((0, 4)) if found is None else np.asarray(found, np.float64).reshape(-1, 4)
+        endpoints = placed_segments(frame.gray, lines, self.scale, self._placing, self.segments)
         return LineSegments(index=frame.index, stamp_ns=frame.stamp_ns, endpoints_px=endpoints, descriptors=self._described(small, endpoints))
 
-    def _refined(self, gray: U8, lines: F64) -> F32:
-        """(n, 2, 2) the longest segments, joined and placed on the edge; twice, because fragments of one edge become collinear when placed."""
-        for share in (1.0, 0.5):
-            lines = merge_collinear(lines, share * np.radians(self.merge_deg), share * self.merge_offset_px, self.merge_gap_px)
-            kept = lines[: 2 * self.segments][self._worthy(lines[: 2 * self.segments], gray.shape[1], gray.shape[0])]
-            lines = refine_on_edge(gray, kept, self.reach_px, 2.0).astype(np.float64).reshape(-1, 4)
-        return lines[: self.segments].astype(np.float32).reshape(-1, 2, 2)
-
-    def _worthy(self, lines: F64, width: int, height: int) -> Bool:
-        """Long enough, and not the border of the image (or of what the sensor's registration left of it)."""
-        x, y, margin = lines[:, 0::2], lines[:, 1::2], self.border_px
-        border = (x < margin).all(1) | (x > width - 1 - margin).all(1) | (y < margin).all(1) | (y > height - 1 - margin).all(1)
-        return np.asarray((np.hypot(x[:, 1] - x[:, 0], y[:, 1] - y[:, 0]) >= self.min_length_px) & ~border)
+    @cached_property
+    def _placing(self) -> Placing:
+        angle, least_px, border_px = math.radians(self.merge_deg), float(self.min_length_px), float(self.border_px)
+        return Placing(angle, float(self.merge_offset_px), float(self.merge_gap_px), least_px, border_px, self.reach_px)
 
     def _described(self, small: U8, endpoints: F32) -> U8:
         return line_band_descriptors(small, endpoints, self.scale, self.band_px, 2.0)
