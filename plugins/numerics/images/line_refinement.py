@@ -108,7 +108,7 @@ def refine_on_edge(image: U8, lines: F64, reach_px: int, step_px: float) -> F32:
     line is fitted to these positions, weighted by slope, reweighted against outliers. A segment with fewer than 4 positions stays as it is."""
     out = np.empty((len(lines), 2, 2), np.float32)
     along, across, weight, levels = np.empty(MOST), np.empty(MOST), np.empty(MOST), np.empty((2 * reach_px + 3, MOST))
-    scratch, slope = np.empty((4, MOST)), np.empty(2 * reach_px + 1)
+    scratch, slopes = np.empty((4, MOST)), np.empty((2 * reach_px + 1, MOST))
     for i in range(len(lines)):
         x0, y0, x1, y1 = lines[i, 0], lines[i, 1], lines[i, 2], lines[i, 3]
         length = max(np.hypot(x1 - x0, y1 - y0), 1e-6)
@@ -124,11 +124,15 @@ def refine_on_edge(image: U8, lines: F64, reach_px: int, step_px: float) -> F32:
         for k in range(count):
             contrast += levels[reach_px + 2, k] - levels[reach_px, k]
         sign = 1 if contrast >= 0.0 else -1
+        _steepest(levels, sign, slopes, scratch[0, :count], scratch[1, :count])
         m = 0
         for k in range(count):
-            found, offset, strength = _steepest(levels, k, sign, slope)
-            if found:
-                along[m], across[m], weight[m] = length * (k + 0.5) / count, offset * sign, strength
+            strength, row = scratch[0, k], int(scratch[1, k])
+            if 0 < row < len(slopes) - 1 and strength > 1.0:  # not at the end of the reach, and a rise
+                before, after = slopes[row - 1, k], slopes[row + 1, k]
+                bend = before - 2.0 * strength + after
+                shift = 0.5 * (before - after) / bend if bend < -1e-9 else 0.0
+                along[m], across[m], weight[m] = length * (k + 0.5) / count, (row - reach_px + shift) * sign, strength
                 m += 1
         if m >= 4:
             a, b = _robust_line(along[:m], across[:m], weight[:m])
@@ -156,21 +160,18 @@ def _levels_beside(image: U8, scratch: F64, right: float, down: float, out: F64)
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def _steepest(levels: F64, k: int, sign: int, slope: F64) -> tuple[bool, float, float]:
-    """Of the grey levels across sample k, one more on each side than there are slopes: offset of the steepest rise, counted along `sign`, and its
-    slope; False when the steepest is at the end of the reach or there is no rise."""
-    reach, best = len(slope) // 2, 0
-    for j in range(len(slope)):
-        here = (reach + 1) + sign * (j - reach)
-        slope[j] = 0.5 * (levels[here + sign, k] - levels[here - sign, k])
-        if slope[j] > slope[best]:
-            best = j
-    if best == 0 or best == len(slope) - 1 or slope[best] <= 1.0:
-        return False, 0.0, 0.0
-    a, b, c = slope[best - 1], slope[best], slope[best + 1]
-    bend = a - 2.0 * b + c
-    shift = 0.5 * (a - c) / bend if bend < -1e-9 else 0.0
-    return True, best - reach + shift, b
+def _steepest(levels: F64, sign: int, slopes: F64, top: F64, row: F64) -> None:
+    """From the grey levels across samples, two rows more than there are of `slopes`: the slopes, counted along `sign`, the steepest rise (n,) of each
+    sample and its row. All samples of a row at once."""
+    reach, n = len(slopes) // 2, len(top)
+    for j in range(len(slopes)):
+        here = reach + 1 + sign * (j - reach)
+        after, before, slope = levels[here + sign, :n], levels[here - sign, :n], slopes[j, :n]
+        for k in range(n):
+            slope[k] = 0.5 * (after[k] - before[k])
+        for k in range(n):
+            more = (slope[k] > top[k]) | (j == 0)
+            top[k], row[k] = slope[k] if more else top[k], float(j) if more else row[k]
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
