@@ -4,11 +4,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import numpy as np
-
 from trihedron.pipeline.registry import register
-from trihedron.pipeline.types import I32, Camera, Frame, Normals
-from trihedron.plugins.numerics.depth.patch_normals import block_sums, patch_normals, patch_sides
+from trihedron.pipeline.types import Frame, Normals
+from trihedron.plugins.numerics.depth.patch_normals import block_sums, patch_normals, patch_radii
 
 
 @register("normals", "integral_image")
@@ -43,10 +41,6 @@ class IntegralImage:
         camera = frame.camera
         sums, smooth = block_sums(frame.depth_m, self.stride, self.patch_px, self.jump, self.jump_m)
         intrinsics = (float(camera.fx), float(camera.fy), float(camera.cx), float(camera.cy))
-        normals = patch_normals(sums, smooth, self._radii(camera), self.share * self.stride**2, intrinsics)
+        radii = patch_radii(camera, self.noise_deg, self.patch_px, self.max_patch_px, self.stride)
+        normals = patch_normals(sums, smooth, radii, self.share * self.stride**2, intrinsics)
         return Normals(index=frame.index, stamp_ns=frame.stamp_ns, normals=normals, stride=self.stride)
-
-    def _radii(self, camera: Camera) -> I32:
-        """Half-width of the patch in cells for depths of 0, 0.1 … 10 m."""
-        side = patch_sides(camera, self.noise_deg, self.patch_px, self.max_patch_px)
-        return np.maximum(np.round((side / self.stride - 1.0) / 2.0), 1).astype(np.int32)

@@ -28,6 +28,14 @@ def patch_sides(camera: Camera, noise_deg: float, least_px: float, most_px: floa
     return side
 
 
+@lru_cache(maxsize=16)
+def patch_radii(camera: Camera, noise_deg: float, least_px: float, most_px: float, stride: int) -> I32:
+    """(100,) half-widths of the patches of `patch_sides` in cells of `stride` pixels, at least 1; read-only."""
+    radii = np.maximum(np.round((patch_sides(camera, noise_deg, least_px, most_px) / stride - 1.0) / 2.0), 1).astype(np.int32)
+    radii.flags.writeable = False
+    return radii
+
+
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def block_sums(depth: F32, stride: int, reach: int, jump: float, jump_m: float) -> tuple[Records, U8]:
     """Sums over blocks of stride × stride pixels, as integral images, and which blocks are free of depth edges.
@@ -169,6 +177,16 @@ def _boxes(flat: F64, a: int, b: int, c: int, d: int, out: F64, first: int, n: i
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
+def _box(flat: F64, a: int, b: int, c: int, d: int, out: F64, first: int) -> None:
+    """`_boxes` of one box."""
+    i, j, k, m, o = np.uint64(a), np.uint64(b), np.uint64(c), np.uint64(d), np.uint64(first)
+    one, two, three = np.uint64(1), np.uint64(2), np.uint64(3)
+    out[o], out[o + one] = flat[i] - flat[j] - flat[k] + flat[m], flat[i + one] - flat[j + one] - flat[k + one] + flat[m + one]
+    out[o + two] = flat[i + two] - flat[j + two] - flat[k + two] + flat[m + two]
+    out[o + three] = flat[i + three] - flat[j + three] - flat[k + three] + flat[m + three]
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def patch_normals(sums: Records, smooth: U8, radii: I32, least: float, intrinsics: tuple[float, float, float, float]) -> F32:
     """(h, w, 3) unit normals towards the camera; NaN where a block has no depth or no patch free of depth edges.
 
@@ -209,10 +227,16 @@ def _halves(flat: F64, h: int, w: int, r: int, first: int, end: int, k: int, lea
     a, b = (r1 - r0) // 2, (c1 - c0) // 2
     nw, ne, sw, se = r0 * row + 4 * c0, r0 * row + 4 * c1, r1 * row + 4 * c0, r1 * row + 4 * c1
     s, t = a * row, 4 * b
-    _boxes(flat, se, ne, se - t, ne - t, halves, place, n)
-    _boxes(flat, sw + t, nw + t, sw, nw, halves, place + side, n)
-    _boxes(flat, se, se - s, sw, sw - s, halves, place + 2 * side, n)
-    _boxes(flat, ne + s, ne, nw + s, nw, halves, place + 3 * side, n)
+    if n == 4:  # a single block, as most stretches are: nothing to prepare for many
+        _box(flat, se, ne, se - t, ne - t, halves, place)
+        _box(flat, sw + t, nw + t, sw, nw, halves, place + side)
+        _box(flat, se, se - s, sw, sw - s, halves, place + 2 * side)
+        _box(flat, ne + s, ne, nw + s, nw, halves, place + 3 * side)
+    else:
+        _boxes(flat, se, ne, se - t, ne - t, halves, place, n)
+        _boxes(flat, sw + t, nw + t, sw, nw, halves, place + side, n)
+        _boxes(flat, se, se - s, sw, sw - s, halves, place + 2 * side, n)
+        _boxes(flat, ne + s, ne, nw + s, nw, halves, place + 3 * side, n)
     for c in range(first, end):
         needed[0, c] = max(least * (r1 - r0) * b, 1.0)
         needed[1, c] = max(least * (c1 - c0) * a, 1.0)
