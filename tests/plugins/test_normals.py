@@ -5,6 +5,7 @@ import pytest
 
 from trihedron.plugins.normals.integral_image import IntegralImage
 from trihedron.plugins.normals.none import NoNormals
+from trihedron.plugins.numerics.depth.patch_normals import patch_radii
 
 
 def errors_deg(normals, truth):
@@ -62,7 +63,7 @@ def test_patch_grows_where_the_sensor_is_noisy(analytic):
         depth = analytic.noisy(np.full((480, 640), z))
         rms = [np.sqrt(np.mean(errors_deg(n(analytic.frame(depth, analytic.sensor)).normals, np.array([0, 0, -1.0])) ** 2)) for n in (small, grown)]
         assert rms[1] < limit and (z < 1.2 or rms[1] < 0.3 * rms[0])
-    assert set(grown._radii(analytic.exact)[11:]) == {2}  # 10 px on exact depth
+    assert set(patch_radii(analytic.exact, grown.noise_deg, grown.patch_px, grown.max_patch_px, grown.stride)[11:]) == {2}  # 10 px on exact depth
 
 
 @pytest.mark.parametrize("value", [0.0, np.nan, np.inf, -1.0])
