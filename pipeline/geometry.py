@@ -77,10 +77,10 @@ def pose_matrix(R: F64, t: F64) -> F64:
 
 def invert(T: F64) -> F64:
     """(..., 4, 4) rigid motions -> their inverses."""
-    R = np.swapaxes(T[..., :3, :3], -1, -2)
-    out = np.zeros_like(T)
+    R = T[..., :3, :3].swapaxes(-1, -2)
+    out = np.zeros(T.shape)
     out[..., :3, :3] = R
-    out[..., :3, 3] = -(R @ T[..., :3, 3:])[..., 0]
+    out[..., :3, 3:] = -(R @ T[..., :3, 3:])
     out[..., 3, 3] = 1.0
     return out
 
@@ -104,9 +104,10 @@ def tangent_basis(n: F64) -> F64:
     sign = np.where(z >= 0.0, 1.0, -1.0)
     a = -1.0 / (sign + z)
     b = x * y * a
-    first = np.stack([1.0 + sign * x * x * a, sign * b, -sign * x], axis=-1)
-    second = np.stack([b, sign + y * y * a, -y], axis=-1)
-    return np.stack([first, second], axis=-1)
+    out = np.empty((*n.shape, 2))
+    out[..., 0, 0], out[..., 1, 0], out[..., 2, 0] = 1.0 + sign * x * x * a, sign * b, -sign * x
+    out[..., 0, 1], out[..., 1, 1], out[..., 2, 1] = b, sign + y * y * a, -y
+    return out
 
 
 def nearest_rotation(M: F64) -> F64:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -9,9 +10,10 @@ import numpy as np
 from trihedron.pipeline.geometry import exp_so3, log_so3
 from trihedron.pipeline.registry import register
 from trihedron.pipeline.types import F64, Keypoints, ManhattanFrame, Map, Planes, Pose, Rotation, Segments, Tracks
+from trihedron.plugins.numerics.algebra.small_linear import inverse_positive, solve_positive
 from trihedron.plugins.numerics.axes.manhattan_frames import KnownFrames, Sighting
 from trihedron.plugins.numerics.maps.anchoring import anchored_before
-from trihedron.plugins.numerics.motion.chained_rotation import Estimate, TrackedRotation, rotation_before, rotation_value
+from trihedron.plugins.numerics.motion.chained_rotation import IDENTITY, Estimate, TrackedRotation, rotation_before, rotation_value
 
 
 @register("rotation", "drift_free")
@@ -69,7 +71,7 @@ class DriftFree:
             before, refined = rotation_before(previous, previous_pose, self.pose_floor_deg)
             known = KnownFrames(previous.R_world_manhattan, previous.ids, previous.weights)
             if refined:
-                known = known.seen_from(previous, before.R, self.max_weight, self.gate * np.radians(self.gate_floor_deg))
+                known = known.seen_from(previous, before.R, self.max_weight, self.gate * math.radians(self.gate_floor_deg))
             tracked = TrackedRotation(self.prior_deg, self.prior_m, self.measured_deg, self.angle_px, self.plane_floor_deg, self.predict_frames)
             predicted = tracked(before, previous.index, tracks, keypoints, segments, planes)
         known, estimate, seen = self._tied(known, predicted, manhattan)
@@ -80,13 +82,14 @@ class DriftFree:
         estimate = predicted
         sightings: dict[int, F64] = {}
         for k, row in known.sightings(manhattan, predicted.R):
-            distances = [self._distance(s, known, predicted) for s in row]
-            best = int(np.argmin(distances)) if row else -1
+            noises = [self._noise(s, known) for s in row]
+            distances = [self._distance(s.delta, noise, predicted) for s, noise in zip(row, noises, strict=True)]
+            best = min(range(len(row)), key=distances.__getitem__, default=-1)
             if row and distances[best] < self.gate and best not in sightings:
-                estimate = self._combined(estimate, predicted, row[best], known)
+                estimate = self._combined(estimate, predicted, row[best].delta, noises[best])
                 sightings[best] = row[best].R_camera_manhattan
             elif manhattan is not None and len(known.ids) < self.max_frames:
-                certain = np.radians(self.unit_deg) ** 2 / (np.trace(predicted.covariance + manhattan.covariance[k]) / 3.0 + 1e-12)
+                certain = math.radians(self.unit_deg) ** 2 / (np.trace(predicted.covariance + manhattan.covariance[k]) / 3.0 + 1e-12)
                 known = known.with_new(predicted.R @ manhattan.rotations[k], min(certain, 1.0))
                 sightings[len(known.ids) - 1] = manhattan.rotations[k]
         keep = [i for i in range(len(known.ids)) if i in sightings or known.weights[i] >= self.min_observations]
@@ -97,24 +100,23 @@ class DriftFree:
         """Covariance (3, 3) of the rotation that a sighting says: its own and that of R_world_manhattan."""
         weight = known.weights[sighting.row]
         independent = max(weight / self.correlation, min(weight, 1.0))
-        axes = np.radians(self.unit_deg) ** 2 / independent + np.radians(self.axis_floor_deg) ** 2
-        return sighting.covariance + axes * np.eye(3)
+        axes = math.radians(self.unit_deg) ** 2 / independent + math.radians(self.axis_floor_deg) ** 2
+        return sighting.covariance + axes * IDENTITY
 
-    def _distance(self, sighting: Sighting, known: KnownFrames, predicted: Estimate) -> float:
+    def _distance(self, delta: F64, noise: F64, predicted: Estimate) -> float:
         """Standard deviations between a sighting and the prediction."""
-        S = self._noise(sighting, known) + predicted.covariance + np.eye(3) * np.radians(self.gate_floor_deg) ** 2
-        return float(np.sqrt(sighting.delta @ np.linalg.solve(S, sighting.delta)))
+        whitened = np.empty(3)
+        solve_positive(noise + predicted.covariance + IDENTITY * math.radians(self.gate_floor_deg) ** 2, delta, whitened)
+        return math.sqrt(delta @ whitened)
 
-    def _combined(self, estimate: Estimate, predicted: Estimate, sighting: Sighting, known: KnownFrames) -> Estimate:
+    def _combined(self, estimate: Estimate, predicted: Estimate, delta: F64, noise: F64) -> Estimate:
         """Kalman update of the estimate by a sighting; both covariances are of rotations of the camera."""
-        noise = self._noise(sighting, known)
-        gain = estimate.covariance @ np.linalg.inv(estimate.covariance + noise)
-        delta = log_so3(estimate.R.T @ predicted.R @ exp_so3(sighting.delta))
-        rest = np.eye(3) - gain
-        covariance = rest @ estimate.covariance @ rest.T + gain @ noise @ gain.T
-        step = gain @ delta
-        if predicted.source == "tracks":  # what lies beyond the limit is left for the next frames, and is not yet known
-            taken = step * min(np.radians(self.step_deg) / max(float(np.linalg.norm(step)), 1e-12), 1.0)
-            covariance = covariance + np.outer(step - taken, step - taken)
-            step = taken
+        gain = estimate.covariance @ inverse_positive(estimate.covariance + noise)
+        covariance = gain @ noise
+        step = gain @ log_so3(estimate.R.T @ predicted.R @ exp_so3(delta))
+        length = math.hypot(*step.tolist())
+        limit = math.radians(self.step_deg)
+        if predicted.source == "tracks" and length > limit:  # what lies beyond the limit is left for the next frames, and is not yet known
+            rest = (1.0 - limit / length) * step
+            covariance, step = covariance + rest[:, None] * rest, step - rest
         return Estimate(estimate.R @ exp_so3(step), covariance, "manhattan")

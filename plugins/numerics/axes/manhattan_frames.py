@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
 
-from trihedron.pipeline.geometry import exp_so3, log_so3, nearest_rotation
+from trihedron.pipeline.geometry import exp_so3, log_so3
 from trihedron.pipeline.types import F64, I32, ManhattanFrame, Rotation
+from trihedron.plugins.numerics.algebra.small_linear import polar_rotation
 from trihedron.plugins.numerics.axes.cube_symmetry import nearest_equivalent
 
 
@@ -41,9 +43,9 @@ class KnownFrames:
         rotations, weights = self.R_world_manhattan.copy(), self.weights.copy()
         for i in np.flatnonzero(np.isfinite(previous.R_camera_manhattan[:, 0, 0])):
             step = log_so3(rotations[i].T @ R_world_camera @ previous.R_camera_manhattan[i])
-            if np.linalg.norm(step) < gate:
+            if math.hypot(*step.tolist()) < gate:
                 weights[i] = min(weights[i] + 1.0, cap)
-                rotations[i] = nearest_rotation(rotations[i] @ exp_so3(step / weights[i]))
+                rotations[i] = polar_rotation(rotations[i] @ exp_so3(step / weights[i]))
         return KnownFrames(rotations, self.ids, weights)
 
     def sightings(self, manhattan: ManhattanFrame | None, R_world_camera: F64) -> list[tuple[int, list[Sighting]]]:

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
 
-from trihedron.pipeline.geometry import nearest_rotation
 from trihedron.pipeline.types import F64, LOST, Keypoints, Planes, Pose, Rotation, Segments, Tracks
+from trihedron.plugins.numerics.algebra.small_linear import polar_rotation, solve_positive
 from trihedron.plugins.numerics.axes.manhattan_frames import KnownFrames
 from trihedron.plugins.numerics.motion.relative_motion import solve_motion
+
+IDENTITY = np.eye(3)
 
 
 @dataclass(frozen=True)
@@ -25,7 +28,7 @@ def rotation_before(previous: Rotation, previous_pose: Pose | None, floor_deg: f
     """The previous frame's rotation, and whether it is its refined pose's; `floor_deg` is the least error of that, since the map it was refined
     against drifts, which its covariance does not know."""
     if previous_pose is not None and previous_pose.index == previous.index and previous_pose.status != LOST:
-        floor = np.eye(3) * np.radians(floor_deg) ** 2
+        floor = IDENTITY * math.radians(floor_deg) ** 2
         return Estimate(previous_pose.T_world_camera[:3, :3], previous_pose.covariance[3:, 3:] + floor, previous.source), True
     return Estimate(previous.R_world_camera, previous.covariance, previous.source), False
 
@@ -48,13 +51,12 @@ class TrackedRotation:
         """The rotation of the frame of `keypoints`; that of frame `previous_index`, less certain, when the tracks do not reach it."""
         gap = max(keypoints.index - previous_index, 1)
         if tracks is None or tracks.previous_index != previous_index:
-            return Estimate(before.R, before.covariance + np.eye(3) * np.radians(self.prior_deg * gap) ** 2, "prediction")
+            return Estimate(before.R, before.covariance + IDENTITY * math.radians(self.prior_deg * gap) ** 2, "prediction")
         motion = solve_motion(tracks, keypoints, segments, planes, self.angle_px, self.plane_floor_deg, self.prior_deg * gap, self.prior_m * gap)
         turned = motion.covariance[:3, :3]
-        long_ago = np.trace(before.covariance) / 3.0 >= self.predict_frames * np.radians(self.prior_deg) ** 2
-        if motion.support == 0.0 and long_ago:
+        if motion.support == 0.0 and before.covariance.trace() / 3.0 >= self.predict_frames * math.radians(self.prior_deg) ** 2:  # long ago
             return Estimate(before.R, before.covariance + turned, "prediction")
-        measured = bool(np.linalg.eigvalsh(turned)[-1] < np.radians(self.measured_deg) ** 2)
+        measured = solve_positive(IDENTITY * math.radians(self.measured_deg) ** 2 - turned, np.zeros(3), np.empty(3))  # smaller along every axis
         return Estimate(before.R @ motion.R.T, motion.R @ before.covariance @ motion.R.T + turned, "tracks" if measured else "prediction")
 
 
@@ -63,7 +65,7 @@ def rotation_value(index: int, stamp_ns: int, estimate: Estimate, known: KnownFr
     return Rotation(
         index=index,
         stamp_ns=stamp_ns,
-        R_world_camera=nearest_rotation(estimate.R),
+        R_world_camera=polar_rotation(np.array(estimate.R)),
         covariance=0.5 * (estimate.covariance + estimate.covariance.T),
         R_world_manhattan=known.R_world_manhattan,
         R_camera_manhattan=seen,
