@@ -219,8 +219,8 @@ def _add_planes(state: BundleState, seen: BundleMeasurements, loss: int, out: No
     r, B, Jc, Jp = np.empty(3), np.empty((3, 2)), np.empty((3, 6)), np.empty((3, 3))
     for o in range(len(seen.plane_keyframes)):
         k, i = seen.plane_keyframes[o], seen.plane_rows[o]
-        basis(seen.observed_planes[o, :3], B)
-        plane_rows(SAME, state.rotations[k], state.positions[k], state.planes[i], seen.observed_planes[o], B, r, Jc)
+        basis(seen.observed_planes[o], B)
+        plane_rows(np.int32(SAME), state.rotations[k], state.positions[k], state.planes[i], seen.observed_planes[o], B, r, Jc)
         by_plane(state.rotations[k], state.positions[k], state.planes[i], B, Jp)
         L, chi2 = seen.plane_information[o], 0.0
         for a in range(3):

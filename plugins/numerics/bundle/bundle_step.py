@@ -8,7 +8,7 @@ import numpy as np
 from trihedron.pipeline.types import F64, I32
 from trihedron.plugins.numerics.bundle.bundle_kernel import NormalEquations, line_basis
 from trihedron.plugins.numerics.bundle.bundle_problem import BundleMeasurements, BundleState
-from trihedron.plugins.numerics.motion.pose_step import moved
+from trihedron.plugins.numerics.motion.pose_step import move
 from trihedron.plugins.numerics.motion.pose_terms import basis
 
 # Trust: a step is a little dearer than the data say, so that what no observation sees stays where it is. Per unknown, 1/m² and 1/rad².
@@ -116,8 +116,7 @@ def moved_bundle(state: BundleState, free: int, dx: F64, steps: F64) -> BundleSt
     """The state after the steps of poses and planes, and of points and lines."""
     out = BundleState(state.rotations.copy(), state.positions.copy(), state.points.copy(), state.lines.copy(), state.planes.copy())
     for k in range(free):
-        R, t = moved(state.rotations[k], state.positions[k], dx[6 * k : 6 * k + 6])
-        out.rotations[k], out.positions[k] = R, t
+        move(state.rotations[k], state.positions[k], dx[6 * k : 6 * k + 6], out.rotations[k], out.positions[k])
     n, N = len(out.points), np.empty((3, 2))
     for i in range(n):
         for j in range(3):

@@ -64,7 +64,7 @@ def line_depth_term(R: F64, N: F64, share: float, observed_m: F64, m: F64, J_pos
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def _line_chain(R: F64, N: F64, share: float, J_pose: F64, J_line: F64, D: F64, p: F64) -> None:
     J = np.empty((1, 6))
-    chain_point(D, 1, p, J)
+    chain_point(D, len(J), p, J)
     J_pose[:] = J[0]
     J_line[:] = 0.0
     for j in range(3):

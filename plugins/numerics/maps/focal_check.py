@@ -15,6 +15,7 @@ import numpy as np
 
 from trihedron.pipeline.geometry import rotation_angle_deg
 from trihedron.pipeline.types import F32, F64, I32, Map
+from trihedron.plugins.numerics.algebra.small_linear import polar_rotation
 from trihedron.plugins.numerics.maps.keyframe_features import measured_points
 from trihedron.plugins.numerics.maps.local_window import newest_keyframes
 
@@ -106,20 +107,19 @@ def _cost(a: F64, b: F64, factor: float) -> float:
         sigma[k] = math.sqrt(a[k, 3] ** 2 + b[k, 3] ** 2 + (a[k, 4] ** 2 + b[k, 4] ** 2) / factor**2)
         weight[k] = 1.0 / sigma[k] ** 2
     for _ in range(3):
-        share = weight / weight.sum()
-        middles, products = np.zeros((2, 3)), np.zeros((3, 3))
+        total, middles, products = 0.0, np.zeros((2, 3)), np.zeros((3, 3))
         for k in range(n):
+            total += weight[k]
+        for k in range(n):
+            weight[k] /= total
             for c in range(3):
-                middles[0, c] += share[k] * p[k, c]
-                middles[1, c] += share[k] * q[k, c]
+                middles[0, c] += weight[k] * p[k, c]
+                middles[1, c] += weight[k] * q[k, c]
         for k in range(n):
             for r in range(3):
                 for c in range(3):
-                    products[r, c] += share[k] * (p[k, r] - middles[0, r]) * (q[k, c] - middles[1, c])
-        U, _, Vt = np.linalg.svd(products)
-        if np.linalg.det(U) * np.linalg.det(Vt) < 0.0:
-            U[:, 2] *= -1.0
-        R, cost = U @ Vt, 0.0
+                    products[r, c] += weight[k] * (p[k, r] - middles[0, r]) * (q[k, c] - middles[1, c])
+        R, cost = polar_rotation(products), 0.0
         for k in range(n):
             left = 0.0
             for c in range(3):

@@ -15,7 +15,7 @@ import numpy as np
 
 from trihedron.pipeline.geometry import invert
 from trihedron.pipeline.types import F64, U8, Frame, Keypoints, Map, Matches
-from trihedron.plugins.numerics.algebra.small_linear import turn_left
+from trihedron.plugins.numerics.algebra.small_linear import solve_positive, turn_left
 from trihedron.plugins.numerics.maps.focal_check import FACTORS, KEYFRAMES, LEAST_POINTS
 from trihedron.plugins.numerics.maps.keyframe_features import measured_points
 from trihedron.plugins.numerics.maps.local_window import newest_keyframes
@@ -90,7 +90,10 @@ def _solve(before: F64, seen: F64, noise_px: F64, noise_m: F64, told: F64, R: F6
     H, g, J, Jp, x = np.zeros((7, 7)), np.zeros(7), np.zeros((3, 7)), np.zeros((3, 3)), np.zeros(7)
     e, log_factor = np.zeros(3), 0.0
     for _ in range(STEPS):
-        H[:], g[:] = 0.0, 0.0
+        for a in range(7):
+            g[a] = 0.0
+            for b in range(7):
+                H[a, b] = 0.0
         squeeze = np.exp(-log_factor)
         fx, fy = told[0] / squeeze, told[1] / squeeze
         for k in range(len(before)):
@@ -124,10 +127,16 @@ def _solve(before: F64, seen: F64, noise_px: F64, noise_m: F64, told: F64, R: F6
                 H[b, a] = H[a, b]
         H[6, 6] += 1.0 / PRIOR**2
         g[6] -= log_factor / PRIOR**2
-        x = np.linalg.solve(H, g)
-        turn_left(x[:3], R)
+        solve_positive(H, g, x)
+        turn_left(x, R)
         for i in range(3):
             t[i] += x[3 + i]
         log_factor += x[6]
-    effect = -np.linalg.solve(H[:6, :6].copy(), H[:6, 6].copy())
-    return np.exp(log_factor), np.sqrt(np.linalg.inv(H)[6, 6]), effect[:3], effect[3:]
+    for a in range(7):
+        g[a] = 1.0 if a == 6 else 0.0
+    turned, shifted = np.zeros(3), np.zeros(3)
+    if not solve_positive(H, g, x):  # points that say nothing
+        return np.exp(log_factor), PRIOR, turned, shifted
+    for i in range(3):  # x is the covariance of all unknowns with the factor's logarithm
+        turned[i], shifted[i] = x[i] / x[6], x[3 + i] / x[6]
+    return np.exp(log_factor), np.sqrt(x[6]), turned, shifted

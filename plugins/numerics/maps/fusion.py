@@ -36,7 +36,7 @@ def _update(position: F64, information: F64, R: F64, D: F64, r: F64, S: F64, row
                 g[i] += E[a, i] * W[a, b] * r[b]
                 for j in range(3):
                     information[i, j] += E[a, i] * W[a, b] * E[b, j]
-    invert_small(information, 3, C)
+    invert_small(information, len(information), C)
     for i in range(3):
         position[i] -= C[i, 0] * g[0] + C[i, 1] * g[1] + C[i, 2] * g[2]
 

@@ -65,17 +65,14 @@ def _huber(chi2: float, limit: float, robust: bool) -> tuple[float, float]:
 def _add(chi2: float, e: F64, J: F64, rows: int, W: F64, limit: float, robust: bool, H: F64, g: F64) -> float:
     """Add one term to the normal equations `H dx = -g` (Huber beyond `limit` when robust); returns its cost."""
     w, cost = _huber(chi2, limit, robust)
-    row = np.empty(6)
     for i in range(rows):
         for b in range(6):
-            row[b] = 0.0
-        for j in range(rows):
-            for b in range(6):
-                row[b] += w * W[i, j] * J[j, b]
-        for a in range(6):
-            g[a] += w * e[i] * J[i, a]
-            for b in range(a + 1):
-                H[a, b] += J[i, a] * row[b]
+            WJ = 0.0
+            for j in range(rows):
+                WJ += w * W[i, j] * J[j, b]
+            g[b] += w * e[i] * J[i, b]
+            for a in range(b, 6):
+                H[a, b] += J[i, a] * WJ
     return cost
 
 
@@ -225,7 +222,7 @@ def _add_planes(R: F64, t: F64, terms: PlaneTerms, W: F64, flags: U8, H: F64, g:
     cost = 0.0
     r, e, J, B = np.empty(3), np.empty(3), np.empty((3, 6)), np.empty((3, 2))
     for i in range(len(terms.kinds)):
-        basis(terms.observed[i, :3], B)
+        basis(terms.observed[i], B)
         rows = plane_rows(terms.kinds[i], R, t, terms.coefficients[i], terms.observed[i], B, r, J)
         chi2[i] = _chi2(r, W[i], rows, e)
         if not chi2[i] < np.inf:
@@ -252,7 +249,10 @@ def linearise(
     chi2: Chi2,
 ) -> float:
     """Normal equations (H lower triangle of (6, 6), g (6,)) of all terms but the outliers, and the χ² of every term; returns the cost."""
-    H[:], g[:] = 0.0, 0.0
+    for a in range(6):
+        g[a] = 0.0
+        for b in range(6):
+            H[a, b] = 0.0
     cost = _add_points(R, t, camera, points, weights.points, flags.points, robust, H, g, chi2.points)
     cost += _add_lines(R, t, camera, lines, weights.lines, weights.line_depths, flags.lines, robust, H, g, chi2.lines, chi2.line_depths)
     return cost + _add_planes(R, t, planes, weights.planes, flags.planes, H, g, chi2.planes)

@@ -19,7 +19,7 @@ from trihedron.plugins.numerics.motion.pose_terms import (
     depth_direction,
     line_depth_row,
     line_row,
-    plane_noise,
+    plane_slopes,
     to_camera,
 )
 
@@ -36,7 +36,9 @@ class Weights(NamedTuple):
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def invert_small(S: F64, rows: int, W: F64) -> None:
     """Inverse of the leading block of 1, 2 or 3 rows of a symmetric matrix into W; the rest 0."""
-    W[:] = 0.0
+    for i in range(len(W)):
+        for j in range(len(W)):
+            W[i, j] = 0.0
     if rows == 1:
         W[0, 0] = 1.0 / S[0, 0]
         return
@@ -51,7 +53,10 @@ def invert_small(S: F64, rows: int, W: F64) -> None:
     W[1, 2] = S[0, 2] * S[1, 0] - S[0, 0] * S[1, 2]
     W[2, 2] = S[0, 0] * S[1, 1] - S[0, 1] * S[1, 0]
     W[1, 0], W[2, 0], W[2, 1] = W[0, 1], W[0, 2], W[1, 2]
-    W /= S[0, 0] * W[0, 0] + S[0, 1] * W[1, 0] + S[0, 2] * W[2, 0]
+    det = S[0, 0] * W[0, 0] + S[0, 1] * W[1, 0] + S[0, 2] * W[2, 0]
+    for i in range(3):
+        for j in range(3):
+            W[i, j] /= det
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
@@ -79,8 +84,10 @@ def _weigh_points(R: F64, t: F64, camera: F64, terms: PointTerms, W: F64) -> Non
     for i in range(len(terms.positions_m)):
         x, y, z = terms.positions_m[i, 0] - t[0], terms.positions_m[i, 1] - t[1], terms.positions_m[i, 2] - t[2]
         p2 = R[0, 2] * x + R[1, 2] * y + R[2, 2] * z
+        for a in range(3):
+            for b in range(3):
+                W[i, a, b] = 0.0
         if not p2 > NEAR_M:
-            W[i] = 0.0
             continue
         iz, depth = 1.0 / p2, terms.depth_m[i]
         d00, d11 = camera[0] * iz, camera[1] * iz
@@ -97,7 +104,6 @@ def _weigh_points(R: F64, t: F64, camera: F64, terms: PointTerms, W: F64) -> Non
         s00, s01, s11 = u0 * f0 + u1 * f1 + u2 * f2 + noise, v0 * f0 + v1 * f1 + v2 * f2, v0 * g0 + v1 * g1 + v2 * g2 + noise
         if d22 == 0.0:
             det = s00 * s11 - s01 * s01
-            W[i] = 0.0
             W[i, 0, 0], W[i, 1, 1], W[i, 0, 1], W[i, 1, 0] = s11 / det, s00 / det, -s01 / det, -s01 / det
             continue
         k0, k1, k2 = d22 * R[0, 2], d22 * R[1, 2], d22 * R[2, 2]
@@ -124,7 +130,9 @@ def _weigh_lines(R: F64, t: F64, camera: F64, terms: LineTerms, W: F64, V: F64) 
     """Noise of the segment's ends, extrapolated to where the map's end points fall, plus that of the map's end points."""
     p, D, m, S = np.empty((2, 3)), np.empty((2, 3)), np.empty(3), np.empty((2, 2))
     for i in range(len(terms.endpoints_m)):
-        W[i], V[i] = 0.0, 0.0
+        for a in range(2):
+            for b in range(2):
+                W[i, a, b] = V[i, a, b] = 0.0
         to_camera(R, t, terms.endpoints_m[i, 0], p[0])
         to_camera(R, t, terms.endpoints_m[i, 1], p[1])
         if not (p[0, 2] > NEAR_M and p[1, 2] > NEAR_M):
@@ -133,13 +141,13 @@ def _weigh_lines(R: F64, t: F64, camera: F64, terms: LineTerms, W: F64, V: F64) 
         s1 = line_row(p[1], terms.endpoints_px[i], camera, D[1])[1]
         C, noise = terms.covariance_m2[i], terms.sigma_px[i] ** 2
         _pair_noise(s0, s1, noise, noise, _spread(D[0], R, C[0]), _spread(D[1], R, C[1]), S)
-        invert_small(S, 2, W[i])
+        invert_small(S, len(S), W[i])
         if depth_direction(terms.observed_m[i], m):
             s0 = line_depth_row(p[0], terms.observed_m[i], m)[1]
             s1 = line_depth_row(p[1], terms.observed_m[i], m)[1]
             Q = terms.observed_covariance_m2[i]
             _pair_noise(s0, s1, _quadratic(m, Q[0]), _quadratic(m, Q[1]), _spread(m, R, C[0]), _spread(m, R, C[1]), S)
-            invert_small(S, 2, V[i])
+            invert_small(S, len(S), V[i])
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
@@ -150,10 +158,18 @@ def rows_of(kind: int) -> int:
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def _weigh_planes(R: F64, t: F64, terms: PlaneTerms, W: F64) -> None:
-    B, S = np.empty((3, 2)), np.empty((3, 3))
+    """Noise of the observed planes plus that of the map's."""
+    Bw, B, F, G, S = np.empty((3, 2)), np.empty((3, 2)), np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
     for i in range(len(terms.kinds)):
-        basis(terms.observed[i, :3], B)
-        plane_noise(terms.kinds[i], R, t, terms.coefficients[i], terms.covariance[i], terms.observed[i], terms.observed_covariance[i], B, S)
+        basis(terms.coefficients[i], Bw)
+        basis(terms.observed[i], B)
+        plane_slopes(terms.kinds[i], R, t, terms.coefficients[i], terms.observed[i], Bw, B, F, G)
+        for a in range(3):
+            for b in range(3):
+                S[a, b] = 0.0
+                for j in range(3):
+                    for k in range(3):
+                        S[a, b] += F[a, j] * terms.covariance[i, j, k] * F[b, k] + G[a, j] * terms.observed_covariance[i, j, k] * G[b, k]
         invert_small(S, rows_of(terms.kinds[i]), W[i])
 
 

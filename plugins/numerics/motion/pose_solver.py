@@ -26,7 +26,7 @@ from trihedron.plugins.numerics.motion.pose_kernel import (
     linearise,
 )
 from trihedron.plugins.numerics.motion.pose_noise import Weights, rows_of, weigh
-from trihedron.plugins.numerics.motion.pose_step import add_prior, moved, size, step
+from trihedron.plugins.numerics.motion.pose_step import add_prior, move, size, step
 from trihedron.plugins.numerics.motion.pose_terms import LineTerms, PlaneTerms, PointTerms
 
 ROUNDS, ITERATIONS, ROBUST_ROUNDS = 4, 10, 2  # as ORB-SLAM2 optimises a pose; Huber only in the first rounds
@@ -149,33 +149,34 @@ def _solve(
     n, m, p = len(points.positions_m), len(lines.endpoints_m), len(planes.kinds)
     weights = Weights(np.empty((n, 3, 3)), np.empty((m, 2, 2)), np.empty((m, 2, 2)), np.empty((p, 3, 3)))
     chi2 = Chi2(np.empty(n), np.empty(m), np.empty(m), np.empty(p))
-    (R, t), (R_prior, t_prior) = _parts(poses[0]), _parts(poses[1])
+    (R, t), (R_new, t_new), (R_prior, t_prior) = _parts(poses[0]), _parts(poses[0]), _parts(poses[1])
     H, g, dx = np.zeros((6, 6)), np.zeros(6), np.zeros(6)
-    data, trial_H, trial_g = np.zeros((6, 6)), np.zeros((6, 6)), np.zeros(6)
+    data, data_g, trial_H, trial_g = np.zeros((6, 6)), np.zeros(6), np.zeros((6, 6)), np.zeros(6)
     cost = 0.0
     for turn in range(rounds + 1):
         cost, damping = np.inf, 1e-6
-        R_new, t_new = R, t
+        _copy(R, t, R_new, t_new)
         weigh(R, t, camera, points, lines, planes, weights)
         for trial in range(ITERATIONS + 1):
             new = linearise(R_new, t_new, camera, points, lines, planes, weights, flags, turn < ROBUST_ROUNDS, trial_H, trial_g, chi2)
-            data[:] = trial_H
+            _copy(trial_H, trial_g, data, data_g)
             new += add_prior(R_new, t_new, R_prior, t_prior, prior, trial_H, trial_g)
             accepted = trial == 0 or new <= cost
             if accepted:
-                R, t, cost = R_new, t_new, new
-                H[:], g[:] = trial_H, trial_g
+                cost = new
+                _copy(R_new, t_new, R, t)
+                _copy(trial_H, trial_g, H, g)
                 damping = max(0.1 * damping, 1e-9)
             else:
                 damping = max(10.0 * damping, 1e-3)
             if turn == rounds or damping > MAX_DAMPING:
                 break
             step(H, g, damping, free, dx)
-            R_new, t_new = moved(R, t, dx)
+            move(R, t, dx, R_new, t_new)
             length = size(H, dx)
             if not length > CONVERGED:
                 if accepted and length >= 0.0:
-                    R, t = R_new, t_new
+                    _copy(R_new, t_new, R, t)
                 break
         if turn < rounds or rounds == 0:
             _classify(points, planes, chi2, flags, slack)
@@ -200,6 +201,15 @@ def _parts(T: F64) -> tuple[F64, F64]:
         for j in range(3):
             R[i, j] = T[i, j]
     return R, t
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _copy(A: F64, a: F64, B: F64, b: F64) -> None:
+    """A matrix (n, n) and a vector (n,), of a pose or of normal equations, into others."""
+    for i in range(len(a)):
+        b[i] = a[i]
+        for j in range(len(a)):
+            B[i, j] = A[i, j]
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numba
 import numpy as np
 
@@ -9,15 +11,14 @@ from trihedron.pipeline.types import F64
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def _rotation(phi: F64) -> F64:
-    """Exp(phi), Rodrigues."""
-    angle2 = phi[0] ** 2 + phi[1] ** 2 + phi[2] ** 2
+def _rotation(x: float, y: float, z: float) -> F64:
+    """Exp(phi) of phi = (x, y, z), Rodrigues."""
+    angle2 = x * x + y * y + z * z
     if angle2 < 1e-12:
         a, b = 1.0 - angle2 / 6.0, 0.5 - angle2 / 24.0
     else:
         angle = np.sqrt(angle2)
         a, b = np.sin(angle) / angle, (1.0 - np.cos(angle)) / angle2
-    x, y, z = phi
     E = np.empty((3, 3))
     E[0, 0], E[1, 1], E[2, 2] = 1.0 - b * (y * y + z * z), 1.0 - b * (x * x + z * z), 1.0 - b * (x * x + y * y)
     E[0, 1], E[0, 2], E[1, 2] = b * x * y - a * z, b * x * z + a * y, b * y * z - a * x
@@ -26,22 +27,23 @@ def _rotation(phi: F64) -> F64:
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def _rotation_vector(R: F64) -> F64:
+def _rotation_vector(R: F64) -> tuple[float, float, float]:
     """Log(R) for angles below π (a prior is never that far)."""
-    sine = 0.5 * np.array([R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]])
-    s, c = np.sqrt(sine[0] ** 2 + sine[1] ** 2 + sine[2] ** 2), 0.5 * (R[0, 0] + R[1, 1] + R[2, 2] - 1.0)
-    return sine * (np.arctan2(s, c) / s) if s > 1e-9 else sine
+    x, y, z = 0.5 * (R[2, 1] - R[1, 2]), 0.5 * (R[0, 2] - R[2, 0]), 0.5 * (R[1, 0] - R[0, 1])
+    s, c = math.sqrt(x * x + y * y + z * z), 0.5 * (R[0, 0] + R[1, 1] + R[2, 2] - 1.0)
+    scale = math.atan2(s, c) / s if s > 1e-9 else 1.0
+    return x * scale, y * scale, z * scale
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def moved(R: F64, t: F64, dx: F64) -> tuple[F64, F64]:
-    """The pose after the step (rho, phi): t + R rho, R Exp(phi); agrees with Exp(xi) to first order, which is what covariances mean."""
-    turned, shifted, E = np.zeros((3, 3)), np.empty(3), _rotation(dx[3:])
+def move(R: F64, t: F64, dx: F64, turned: F64, shifted: F64) -> None:
+    """The pose after the step (rho, phi) into the last two: R Exp(phi), t + R rho; agrees with Exp(xi) to first order, which is what covariances
+    mean."""
+    E = _rotation(dx[3], dx[4], dx[5])
     for i in range(3):
         shifted[i] = t[i] + R[i, 0] * dx[0] + R[i, 1] * dx[1] + R[i, 2] * dx[2]
         for j in range(3):
             turned[i, j] = R[i, 0] * E[0, j] + R[i, 1] * E[1, j] + R[i, 2] * E[2, j]
-    return turned, shifted
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
@@ -53,7 +55,7 @@ def add_prior(R: F64, t: F64, R_prior: F64, t_prior: F64, prior: F64, H: F64, g:
             r[i] += R_prior[k, i] * (t[k] - t_prior[k])
             for j in range(3):
                 delta[i, j] += R_prior[k, i] * R[k, j]
-    r[3:] = _rotation_vector(delta)
+    r[3], r[4], r[5] = _rotation_vector(delta)
     for i in range(3):
         J[3 + i, 3 + i] = 1.0  # with the terms below the inverse right Jacobian, first order
         for j in range(3):
@@ -78,7 +80,8 @@ def add_prior(R: F64, t: F64, R_prior: F64, t_prior: F64, prior: F64, H: F64, g:
 def step(H: F64, g: F64, damping: float, free: int, dx: F64) -> None:
     """dx (6,): solution of (H + damping · diag H) dx = -g over the first `free` unknowns, by Cholesky; zero if H is not positive definite."""
     L = np.zeros((6, 6))
-    dx[:] = 0.0
+    for i in range(6):
+        dx[i] = 0.0
     for i in range(free):
         for j in range(i + 1):
             total = H[i, j] * (1.0 + damping if i == j else 1.0)

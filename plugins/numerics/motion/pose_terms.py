@@ -114,7 +114,8 @@ def depth_direction(observed_m: F64, m: F64) -> bool:
     size = np.sqrt(m[0] * m[0] + m[1] * m[1] + m[2] * m[2])
     if not size > 1e-9:
         return False
-    m /= size
+    for k in range(3):
+        m[k] /= size
     return True
 
 
@@ -142,42 +143,36 @@ def plane_rows(kind: int, R: F64, t: F64, world: F64, observed: F64, B: F64, r: 
 
     SAME: the predicted normal in the tangent plane of the observed one, and d (3 rows; regular at every normal, unlike azimuth and elevation).
     PARALLEL: the tangent rows alone, for either orientation. PERPENDICULAR: the product of the normals."""
-    n = np.empty(3)
+    n0 = R[0, 0] * world[0] + R[1, 0] * world[1] + R[2, 0] * world[2]
+    n1 = R[0, 1] * world[0] + R[1, 1] * world[1] + R[2, 1] * world[2]
+    n2 = R[0, 2] * world[0] + R[1, 2] * world[1] + R[2, 2] * world[2]
+    dot = n0 * observed[0] + n1 * observed[1] + n2 * observed[2]
     for k in range(3):
-        n[k] = R[0, k] * world[0] + R[1, k] * world[1] + R[2, k] * world[2]
-    dot = n[0] * observed[0] + n[1] * observed[1] + n[2] * observed[2]
-    J[:] = 0.0
+        for b in range(6):
+            J[k, b] = 0.0
     if kind == PERPENDICULAR:
         r[0] = dot
-        _cross_row(observed[0], observed[1], observed[2], n, J[0])
+        o0, o1, o2 = observed[0], observed[1], observed[2]
+        J[0, 3], J[0, 4], J[0, 5] = o1 * n2 - o2 * n1, o2 * n0 - o0 * n2, o0 * n1 - o1 * n0
         return 1
     sign = -1.0 if kind == PARALLEL and dot < 0.0 else 1.0
     for k in range(2):
         b0, b1, b2 = sign * B[0, k], sign * B[1, k], sign * B[2, k]
-        r[k] = b0 * n[0] + b1 * n[1] + b2 * n[2]
-        _cross_row(b0, b1, b2, n, J[k])
+        r[k] = b0 * n0 + b1 * n1 + b2 * n2
+        J[k, 3], J[k, 4], J[k, 5] = b1 * n2 - b2 * n1, b2 * n0 - b0 * n2, b0 * n1 - b1 * n0  # bᵀ [n]×, when the camera turns
     if kind == PARALLEL:
         return 2
     r[2] = world[3] + world[0] * t[0] + world[1] * t[1] + world[2] * t[2] - observed[3]
-    J[2, 0], J[2, 1], J[2, 2] = n[0], n[1], n[2]
+    J[2, 0], J[2, 1], J[2, 2] = n0, n1, n2
     return 3
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def _cross_row(a: float, b: float, c: float, n: F64, row: F64) -> None:
-    """row[3:] = (a, b, c)ᵀ [n]×, the derivative of (a, b, c)·n when the camera turns."""
-    row[3] = b * n[2] - c * n[1]
-    row[4] = c * n[0] - a * n[2]
-    row[5] = a * n[1] - b * n[0]
-
-
-@numba.njit(cache=True, nogil=True, error_model="numpy")
-def plane_noise(kind: int, R: F64, t: F64, world: F64, world_covariance: F64, observed: F64, observed_covariance: F64, B: F64, S: F64) -> None:
-    """S (3, 3): covariance of `plane_rows`, observation plus map plane; rows the kind lacks are left 0."""
-    Bw = np.empty((3, 2))
-    basis(world, Bw)
-    F = np.zeros((3, 3))  # derivative of the prediction by the map plane's (a, b, d)
-    G = np.zeros((3, 3))  # and by the observed plane's
+def plane_slopes(kind: int, R: F64, t: F64, world: F64, observed: F64, Bw: F64, B: F64, F: F64, G: F64) -> None:
+    """Derivatives (3, 3) of `plane_rows` by the (a, b, d) of the map plane, F, and of the observed one, G, of bases Bw and B; signs apart."""
+    for i in range(3):
+        for j in range(3):
+            F[i, j] = G[i, j] = 0.0
     if kind == PERPENDICULAR:
         for j in range(2):
             for i in range(3):
@@ -194,9 +189,3 @@ def plane_noise(kind: int, R: F64, t: F64, world: F64, world_covariance: F64, ob
                 F[2, j] = t[0] * Bw[0, j] + t[1] * Bw[1, j] + t[2] * Bw[2, j]
         if kind == SAME:
             F[2, 2] = G[2, 2] = 1.0
-    S[:] = 0.0
-    for a in range(3):
-        for b in range(3):
-            for i in range(3):
-                for j in range(3):
-                    S[a, b] += F[a, i] * world_covariance[i, j] * F[b, j] + G[a, i] * observed_covariance[i, j] * G[b, j]

@@ -179,23 +179,23 @@ def _add_places(terms: Terms, R: F64, t: F64, scale2: float, H: F64, g: F64) -> 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def _add_plane(e: F64, J: F64, L: F64, w: float, H: F64, g: F64) -> None:
     """Add w JᵀLJ to the lower triangle of H and w JᵀLe to g for J (4, 6)."""
-    LJ = np.zeros(6)
     for i in range(4):
         for b in range(6):
-            LJ[b] = 0.0
-        for j in range(4):
-            for b in range(6):
-                LJ[b] += w * L[i, j] * J[j, b]
-        for b in range(6):
-            g[b] += LJ[b] * e[i]
+            LJ = 0.0
+            for j in range(4):
+                LJ += w * L[i, j] * J[j, b]
+            g[b] += LJ * e[i]
             for a in range(b, 6):
-                H[a, b] += J[i, a] * LJ[b]
+                H[a, b] += J[i, a] * LJ
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def _normal_equations(terms: Terms, R: F64, t: F64, scale2: float, H: F64, g: F64) -> tuple[float, float]:
     """Fill H (6, 6) and g (6,) with Geman–McClure weights at the squared scale; returns the weighted χ² and the weighted number of components."""
-    H[:], g[:] = 0.0, 0.0
+    for i in range(6):
+        g[i] = 0.0
+        for j in range(6):
+            H[i, j] = 0.0
     e4, J4 = np.empty(4), np.zeros((4, 6))
     chi2, components = _add_places(terms, R, t, scale2, H, g)
     for i in range(len(terms.planes_before)):
