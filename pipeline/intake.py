@@ -17,7 +17,7 @@ LATE_NS = 1_000_000_000  # a frame that comes this late or later was not late: t
 SATURATED, CROWDED = 0.02, 3.0  # a limit: share of the image that says it, and times the readings of any other depth
 AWAY_S = 0.5  # to a frame that shows surfaces at other distances
 JUDGED = 10  # readable frames after which the scale of depth is judged
-SAMPLED_PX = 8  # apart are the readings it is judged by
+SAMPLED_PX = 8  # apart are the readings by which scale and limit are judged
 NEAR_M, FAR_M = 0.7, 8.0  # half of the readings nearer, or farther: no room of a house is seen like that (a Kinect measures 0.4 to 8 m)
 
 
@@ -50,8 +50,8 @@ def without_limit(frame: Frame | None, look: Callable[[float], Any]) -> Frame | 
 
 def _crowded_maximum(depth_m: F32) -> float:
     """The largest depth where many readings, and many more than of any other depth, say exactly that; 0 elsewhere."""
-    farthest = float(depth_m.max(initial=0.0))
-    if not 0.0 < farthest < np.inf or np.count_nonzero(depth_m == farthest) < SATURATED * depth_m.size:
+    farthest, sampled = float(depth_m.max(initial=0.0)), depth_m[::SAMPLED_PX, ::SAMPLED_PX]
+    if not 0.0 < farthest < np.inf or np.count_nonzero(sampled == farthest) < SATURATED * sampled.size:
         return 0.0
     _, counts = np.unique(depth_m[depth_m > 0.0], return_counts=True)
     return farthest if counts[-1] > CROWDED * counts[:-1].max(initial=0) else 0.0
