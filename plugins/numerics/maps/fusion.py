@@ -7,7 +7,16 @@ import numpy as np
 
 from trihedron.pipeline.types import F64
 from trihedron.plugins.numerics.motion.pose_noise import invert_small
-from trihedron.plugins.numerics.motion.pose_terms import NEAR_M, chain_point, depth_direction, line_depth_row, line_row, point_rows, to_camera
+from trihedron.plugins.numerics.motion.pose_terms import (
+    NEAR_M,
+    chain_point,
+    depth_direction,
+    line_depth_row,
+    line_row,
+    point_rows,
+    rotation_and_translation,
+    to_camera,
+)
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
@@ -62,17 +71,6 @@ def _fade_across(information: F64, ends: F64, share: float) -> None:
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def _split(T: F64) -> tuple[F64, F64]:
-    """Rotation and translation of T (4, 4)."""
-    R, t = np.empty((3, 3)), np.empty(3)
-    for i in range(3):
-        t[i] = T[i, 3]
-        for j in range(3):
-            R[i, j] = T[i, j]
-    return R, t
-
-
-@numba.njit(cache=True, nogil=True, error_model="numpy")
 def fuse_points(
     T_world_camera: F64,
     pose_covariance: F64,
@@ -88,7 +86,7 @@ def fuse_points(
     """Update positions (n, 3) and information (n, 3, 3), in place, by pixels (n, 2) and depths (n,; NaN = none) seen from an uncertain pose.
 
     The old information is first multiplied by `1 - 1/memory`: it stays that of at most `memory` measurements, so that a landmark can still move."""
-    R, t = _split(T_world_camera)
+    R, t = rotation_and_translation(T_world_camera)
     p, r, D, J, S = np.empty(3), np.empty(3), np.empty((3, 3)), np.empty((3, 6)), np.empty((3, 3))
     for i in range(len(positions)):
         to_camera(R, t, positions[i], p)
@@ -121,7 +119,7 @@ def fuse_lines(
 ) -> None:
     """Update both ends (n, 2, 3) of lines and their information (n, 2, 3, 3), in place, across the line only: in the image by the distance from the
     segment seen, in depth by that from its 3D line where it has one (NaN = none)."""
-    R, t = _split(T_world_camera)
+    R, t = rotation_and_translation(T_world_camera)
     p, r, D, J, m, S = np.empty(3), np.empty(2), np.empty((2, 3)), np.empty((2, 6)), np.empty(3), np.empty((2, 2))
     ends = np.empty(2)
     for i in range(len(endpoints)):

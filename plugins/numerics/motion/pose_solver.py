@@ -27,7 +27,7 @@ from trihedron.plugins.numerics.motion.pose_kernel import (
 )
 from trihedron.plugins.numerics.motion.pose_noise import Weights, rows_of, weigh
 from trihedron.plugins.numerics.motion.pose_step import add_prior, move, size, step
-from trihedron.plugins.numerics.motion.pose_terms import LineTerms, PlaneTerms, PointTerms
+from trihedron.plugins.numerics.motion.pose_terms import LineTerms, PlaneTerms, PointTerms, rotation_and_translation
 
 ROUNDS, ITERATIONS, ROBUST_ROUNDS = 4, 10, 2  # as ORB-SLAM2 optimises a pose; Huber only in the first rounds
 CONVERGED = 1e-3  # squared length of a step in standard deviations below which a round has converged
@@ -149,7 +149,7 @@ def _solve(
     n, m, p = len(points.positions_m), len(lines.endpoints_m), len(planes.kinds)
     weights = Weights(np.empty((n, 3, 3)), np.empty((m, 2, 2)), np.empty((m, 2, 2)), np.empty((p, 3, 3)))
     chi2 = Chi2(np.empty(n), np.empty(m), np.empty(m), np.empty(p))
-    (R, t), (R_new, t_new), (R_prior, t_prior) = _parts(poses[0]), _parts(poses[0]), _parts(poses[1])
+    (R, t), (R_new, t_new), (R_prior, t_prior) = rotation_and_translation(poses[0]), rotation_and_translation(poses[0]), rotation_and_translation(poses[1])
     H, g, dx = np.zeros((6, 6)), np.zeros(6), np.zeros(6)
     data, data_g, trial_H, trial_g = np.zeros((6, 6)), np.zeros(6), np.zeros((6, 6)), np.zeros(6)
     cost = 0.0
@@ -190,17 +190,6 @@ def _solve(
             T[i, j] = R[i, j]
     T[3, 3] = 1.0
     return T, covariance, information, dx, cost, complete
-
-
-@numba.njit(cache=True, nogil=True, error_model="numpy")
-def _parts(T: F64) -> tuple[F64, F64]:
-    """Rotation and translation."""
-    R, t = np.empty((3, 3)), np.empty(3)
-    for i in range(3):
-        t[i] = T[i, 3]
-        for j in range(3):
-            R[i, j] = T[i, j]
-    return R, t
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")

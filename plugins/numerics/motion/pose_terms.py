@@ -50,6 +50,17 @@ class PlaneTerms(NamedTuple):
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
+def rotation_and_translation(T: F64) -> tuple[F64, F64]:
+    """Rotation and translation of T (4, 4)."""
+    R, t = np.empty((3, 3)), np.empty(3)
+    for i in range(3):
+        t[i] = T[i, 3]
+        for j in range(3):
+            R[i, j] = T[i, j]
+    return R, t
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def to_camera(R: F64, t: F64, world: F64, out: F64) -> None:
     """`out = Rᵀ (world - t)`."""
     x, y, z = world[0] - t[0], world[1] - t[1], world[2] - t[2]
