@@ -149,7 +149,8 @@ def _solve(
     n, m, p = len(points.positions_m), len(lines.endpoints_m), len(planes.kinds)
     weights = Weights(np.empty((n, 3, 3)), np.empty((m, 2, 2)), np.empty((m, 2, 2)), np.empty((p, 3, 3)))
     chi2 = Chi2(np.empty(n), np.empty(m), np.empty(m), np.empty(p))
-    (R, t), (R_new, t_new), (R_prior, t_prior) = rotation_and_translation(poses[0]), rotation_and_translation(poses[0]), rotation_and_translation(poses[1])
+    (R, t), (R_new, t_new) = rotation_and_translation(poses[0]), rotation_and_translation(poses[0])
+    R_prior, t_prior = rotation_and_translation(poses[1])
     H, g, dx = np.zeros((6, 6)), np.zeros(6), np.zeros(6)
     data, data_g, trial_H, trial_g = np.zeros((6, 6)), np.zeros(6), np.zeros((6, 6)), np.zeros(6)
     cost = 0.0
