@@ -7,6 +7,16 @@ import numpy as np
 from trihedron.pipeline.types import I32, Bool
 
 
+def distinct(ids: I32) -> I32:
+    """(n,) the different ids, sorted."""
+    if len(ids) == 0:
+        return ids
+    first = ids.min()
+    marked = np.zeros(ids.max() - first + 1, np.bool_)
+    marked[ids - first] = True
+    return (np.flatnonzero(marked) + first).astype(np.int32)
+
+
 def union(a: I32, b: I32) -> I32:
     """(n,) the ids of both, once each and sorted."""
     marked = np.zeros(_end(a, b), np.bool_)

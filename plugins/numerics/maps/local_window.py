@@ -9,6 +9,7 @@ from typing import TypeVar
 import numpy as np
 
 from trihedron.pipeline.types import F64, I32, Bool, Map, Table
+from trihedron.plugins.numerics.maps.id_sets import among, distinct
 
 T = TypeVar("T")
 WEIGHTS = {"point": 1, "line": 5, "plane": 20}  # how strongly a shared one ties keyframes: a bare room has few landmarks, all of them large
@@ -71,7 +72,7 @@ def observed_by_each(map: Map, keyframes: I32, kind: str) -> tuple[I32, list[I32
     """`observed_by` all the keyframes, and for each of them which of those, as sorted rows."""
     observed, ends = _observed(map, keyframes, kind)
     ids = _living(map, observed, kind)
-    seen = [_distinct(part) for part in np.split(observed, ends[:-1])]
+    seen = [distinct(part) for part in np.split(observed, ends[:-1])]
     rows = [np.minimum(np.searchsorted(ids, own), max(len(ids) - 1, 0)) for own in seen]
     return ids, [row[ids[row] == own] if len(ids) else row[:0] for row, own in zip(rows, seen)]
 
@@ -86,19 +87,9 @@ def _observed(map: Map, keyframes: I32, kind: str) -> tuple[I32, I32]:
 
 def _living(map: Map, ids: I32, kind: str) -> I32:
     """Those of the ids that live, once each and sorted."""
-    ids = _distinct(ids)
+    ids = distinct(ids)
     alive: Bool = getattr(map, f"{kind}s").rows("alive", ids)
     return ids[alive]
-
-
-def _distinct(ids: I32) -> I32:
-    """The different ids, sorted; they lie close together, so marking them beats sorting them."""
-    if len(ids) == 0:
-        return ids
-    first = ids.min()
-    marked = np.zeros(ids.max() - first + 1, np.bool_)
-    marked[ids - first] = True
-    return (np.flatnonzero(marked) + first).astype(np.int32)
 
 
 def _votes(map: Map, keyframes: I32) -> I32:
@@ -117,7 +108,7 @@ def covisible_keyframes(map: Map, keyframes: I32, count: int) -> I32:
 
 def _covisible(map: Map, keyframes: I32, count: int) -> I32:
     living = living_keyframes(map)
-    votes = np.where(np.isin(living, keyframes), 0, _votes(map, keyframes)[living])
+    votes = np.where(among(living, keyframes), 0, _votes(map, keyframes)[living])
     order = len(votes) - 1 - np.argsort(-votes[::-1], kind="stable")[:count]
     return living[order[votes[order] > 0]]
 
@@ -149,7 +140,7 @@ def local_window(
     chosen = newest_keyframes(map, max(newest, 1))[:newest] if submap == current_submap(map) else np.empty(0, np.int32)
     chosen = np.concatenate([chosen, covisible_keyframes(map, chosen, covisible)])
     beside = _near(map, T_world_camera, near_m, near_deg, submap)
-    beside = beside[~np.isin(beside, chosen)][:near]
+    beside = beside[~among(beside, chosen)][:near]
     return window_of(map, np.sort(np.concatenate([chosen, beside])).astype(np.int32))
 
 
