@@ -16,6 +16,7 @@ from typing import Any
 from numba import _dynfunc  # type: ignore[attr-defined]  # compiled, without types
 from numba.core import caching, codegen, cpu, targetconfig
 
+from trihedron.pipeline import compiler_shortcuts
 from trihedron.pipeline.kernels import LISTED, ROW, kernel_of
 
 GARBAGE = 100_000  # new objects between two looks for what is not used any more; of those of a compilation nearly all are
@@ -33,12 +34,15 @@ class LinkedParts:
         self.library: Any = None  # of the kernel
         self._optimize, self._finalize = LIBRARY._optimize_functions, LIBRARY.finalize
         self._executable, self._cachable = CONTEXT.get_executable, CACHE.check_cachable
+        self._wrappers = CONTEXT.create_cpython_wrapper, CONTEXT.create_cfunc_wrapper
 
     def install(self) -> None:
         """From now on numba takes these steps, in this process."""
         LIBRARY._optimize_functions = lambda library, module: self.optimize(library, module)
         LIBRARY.finalize = lambda library: self.finalize(library)
         CONTEXT.get_executable = lambda context, *of: self.executable(context, *of)
+        CONTEXT.create_cpython_wrapper = lambda *of, **how: self.wrap(self._wrappers[0], *of, **how)
+        CONTEXT.create_cfunc_wrapper = lambda *of, **how: self.wrap(self._wrappers[1], *of, **how)
         CACHE.check_cachable = lambda cache, result: not is_part(result) and self._cachable(cache, result)
         OPTIONS.values = lambda options: _defaults(options.__class__) | options._values  # asked for at each call that is compiled
 
@@ -57,23 +61,40 @@ class LinkedParts:
             module.data_layout = library._codegen._data_layout
 
     def finalize(self, library: Any) -> None:
-        """Link what is called into a library; the kernel's is then optimised and translated, too."""
+        """Link everything that is called to the kernel's library, which is then optimised and translated; parts wait until then."""
         if library is self.library:
+            library._linking_libraries = list(_called(library, {}))[::-1]  # of what none has called yet, none is linked
             self._finalize(library)
-            return
-        for called in dict.fromkeys(library._linking_libraries):
-            if hasattr(called, "_reload_init"):  # of newer numba
-                library._reload_init.update(called._reload_init)
-            library._final_module.link_in(called._get_module_for_linking(), preserve=True)
-        library.is_part = library._finalized = True
+        else:
+            library.is_part = library._finalized = True
 
     def executable(self, context: Any, library: Any, function: Any, environment: Any) -> Any:
         """What Python would call; of a part it is never called, and leads nowhere."""
-        if (function.modname, function.qualname) == self.name:
+        if self.is_kernel(function):
             self.library = library
             return self._executable(context, library, function, environment)
         library._ensure_finalized()
         return _dynfunc.make_function(function.lookup_module(), function.qualname, "part of a kernel", 0, environment, (library,))
+
+    def wrap(self, make: Any, context: Any, library: Any, function: Any, *of: Any, **how: Any) -> None:
+        """Add what Python, or a pointer, would call to a kernel's library; nothing calls a part so."""
+        if self.is_kernel(function):
+            make(context, library, function, *of, **how)
+
+    def is_kernel(self, function: Any) -> bool:
+        """By numba's description of it."""
+        return (function.modname, function.qualname) == self.name
+
+
+def _called(library: Any, found: dict[Any, None]) -> dict[Any, None]:
+    """Libraries of all that a library's functions call, and that its parts do, each after those that it needs itself."""
+    for called in library._linking_libraries:
+        if called not in found:
+            found[called] = None
+            if getattr(called, "is_part", False):
+                _called(called, found)
+            found[called] = found.pop(called)
+    return found
 
 
 @cache
@@ -93,6 +114,7 @@ def main() -> None:
     gc.set_threshold(GARBAGE, 10, 10)
     parts, kernels = LinkedParts(), json.loads(LISTED.read_text())
     parts.install()
+    compiler_shortcuts.install()
     while row := os.read(0, ROW):
         with contextlib.suppress(Exception):  # what is not as listed is left to the run
             parts.compile(*kernel_of(*kernels[int.from_bytes(row, "little")]))

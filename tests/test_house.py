@@ -11,7 +11,7 @@ ORDER = (
     "errors", "mcap_writer", "chunk_writer", "mcap_errors", "mcap_chunks", "mcap_file", "arrays", "camera", "gathering", "table", "maps", "surface",
     "types", "geometry", "slots", "registry", "wire_format", "array_codec", "table_codec", "codec", "foxglove_messages", "foxglove", "graph",
     "metrics", "consistency", "plot", "ply", "heap", "timing", "recording", "live", "runs", "scheduler", "interrupts", "intake", "state", "runner",
-    "results", "config", "jobs", "cluster", "sweep", "search", "engines", "kernels", "kernel_compiler", "execute", "cli",
+    "results", "config", "jobs", "cluster", "sweep", "search", "engines", "kernels", "compiler_shortcuts", "kernel_compiler", "execute", "cli",
 )  # fmt: skip
 NUMERICS = ("algebra", "images", "depth", "planes", "axes", "motion", "maps", "bundle", "places", "surfaces")  # each imports those before it
 VOCABULARY = {"types", "geometry", "errors", "slots", "registry"}  # what plugins and data sets know of the machinery
