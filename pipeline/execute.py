@@ -22,6 +22,7 @@ from trihedron.pipeline import kernels, results
 from trihedron.pipeline.config import Feedback, graph_of
 from trihedron.pipeline.errors import ConfigError, DataError, RecordingError, TrihedronError, did_you_mean
 from trihedron.pipeline.graph import Graph
+from trihedron.pipeline.heap import give_back
 from trihedron.pipeline.interrupts import Interrupts
 from trihedron.pipeline.live import Pace, is_camera
 from trihedron.pipeline.recording import Recording, RecordingWriter
@@ -59,6 +60,7 @@ def execute(config: DictConfig, out: Path, overrides: list[str], began: float) -
         warnings.muted = True
         _compile(runner)
         _warm_up(Runner(graph, config.seed, config.threads, replay, frames, remembered))
+        give_back()  # what the data set and the kernels needed to begin with: else the frames grow into it, unseen in what the run says it holds
         warnings.muted = False
         writer = RecordingWriter(out / RECORDING, _metadata(config, overrides))
         attachments = _attachments(graph, replay)
