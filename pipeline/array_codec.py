@@ -12,6 +12,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 import struct
 import threading
@@ -46,24 +47,42 @@ def array_parts(name: str, item: Any, image: bool) -> tuple[bytes, Any]:
         data = item.encode()
         return _head(name, "str", (), "", len(data)), data
     array = np.ascontiguousarray(item)
-    encoding, data, size = _encoded(array, image, array.itemsize == 4 and name.rpartition("#")[2] in COPIED)
-    return _head(name, _type_name(array.dtype), array.shape, encoding, size), data
-
-
-def _encoded(array: NDArray[Any], image: bool, copied: bool) -> tuple[str, Any, int]:
-    """Encoding, data (anything that has bytes) and their number."""
     if image and array.size:
         steps = array.dtype == np.uint8 and array.ndim == 3
         data = _compressor().compress(_row_steps(array).data if steps else array.data)
-        return "rows" if steps else "zstd", data, len(data)
-    if array.nbytes >= TRANSPOSED_BYTES and array.itemsize > 1 and not copied:
-        return "columns", cv2.transpose(array.reshape(-1).view(np.uint8).reshape(len(array), -1)).data, array.nbytes
-    return "raw", array.data, array.nbytes
+        return _head(name, _type_name(array.dtype), array.shape, "rows" if steps else "zstd", len(data)), data
+    head, turned = plain_head(name, array.dtype, array.shape)
+    return head, _turned(array) if turned else array.data
+
+
+@lru_cache(4096)
+def plain_head(name: str, dtype: np.dtype[Any], shape: tuple[int, ...]) -> tuple[bytes, bool]:
+    """What stands before the data of an array that is no image, and whether the bytes of its rows are transposed; most arrays of a run are as large
+    as one before."""
+    size = dtype.itemsize * math.prod(shape)
+    copied = dtype.itemsize == 4 and name.rpartition("#")[2] in COPIED
+    turned = size >= TRANSPOSED_BYTES and dtype.itemsize > 1 and not copied
+    return _head(name, _type_name(dtype), shape, "columns" if turned else "raw", size), turned
+
+
+def _turned(array: NDArray[Any]) -> Any:
+    """The bytes of rows that lie one after another, transposed."""
+    out = np.empty(array.nbytes, np.uint8)
+    row_kernels().turn(array.__array_interface__["data"][0], len(array), array.nbytes // len(array), out)
+    return out.data
+
+
+@cache
+def row_kernels() -> Any:
+    """What goes through rows; not before it is needed: a command's help need not wait for numba."""
+    from trihedron.pipeline import row_kernels
+
+    return row_kernels
 
 
 @lru_cache(4096)
 def _head(name: str, dtype: str, shape: tuple[int, ...], encoding: str, size: int) -> bytes:
-    """A field `arrays` up to its data; most arrays of a run are as large as one before."""
+    """A field `arrays` up to its data."""
     before, after = _texts(name, dtype, encoding)
     inner = before + bytes_field(3, b"".join(map(varint, shape))) + after + (head(5, size) if size else b"")
     return head(5, len(inner) + size) + inner

@@ -15,13 +15,17 @@ from numpy.typing import NDArray
 types: Any = numba.types
 
 
-def _pointer(typing: Any, address: Any) -> Any:
-    """The bytes at an address."""
-    signature = types.CPointer(types.uint8)(types.int64)
-    return signature, lambda context, builder, signature, values: builder.inttoptr(values[0], context.get_value_type(signature.return_type))
+def _pointer(kind: Any) -> Any:
+    """What reads and writes numbers of this type at an address."""
+
+    def pointer(typing: Any, address: Any) -> Any:
+        signature = types.CPointer(kind)(types.int64)
+        return signature, lambda context, builder, signature, values: builder.inttoptr(values[0], context.get_value_type(signature.return_type))
+
+    return intrinsic(pointer)
 
 
-_at: Any = intrinsic(_pointer)
+bytes_at, words_at = _pointer(types.uint8), _pointer(types.uint32)
 
 
 @numba.njit(cache=True)
@@ -31,7 +35,7 @@ def _gathered(addresses: NDArray[np.int64], rows: NDArray[np.int32], piece: int,
         row = rows[i]
         if row < 0 or row >= count:
             return i
-        source = numba.carray(_at(addresses[row // piece] + (row % piece) * size), (size,))
+        source = numba.carray(bytes_at(addresses[row // piece] + (row % piece) * size), (size,))
         for k in range(size):
             out[i, k] = source[k]
     return -1
@@ -55,6 +59,6 @@ def scatter(addresses: NDArray[np.int64], rows: NDArray[np.int32], piece: int, v
     """Write the bytes of `values` (n, bytes of a row) to `rows` (n,), the other way round; the caller has seen to it that there are such rows."""
     n, size = values.shape
     for i in range(n):
-        target = numba.carray(_at(addresses[rows[i] // piece] + (rows[i] % piece) * size), (size,))
+        target = numba.carray(bytes_at(addresses[rows[i] // piece] + (rows[i] % piece) * size), (size,))
         for k in range(size):
             target[k] = values[i, k]

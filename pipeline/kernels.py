@@ -102,7 +102,7 @@ def kernel_of(kernel: str, arguments: list[Any]) -> tuple[Any, tuple[Kind, ...]]
 
 def used_by(objects: Iterable[Any]) -> set[str]:
     """The project's modules that these objects' modules take something from, and so on."""
-    found = {"trihedron.pipeline.gathering"}  # which tables import when they first need it
+    found = {"trihedron.pipeline.gathering", "trihedron.pipeline.row_kernels"}  # which tables and recordings import when they first need them
     pending = {type(item).__module__ for item in objects}
     while pending:
         found |= pending

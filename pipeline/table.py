@@ -8,7 +8,7 @@ dead are given back: in their place stands one chunk of zeros, the same for all,
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Collection, Mapping
 from ctypes import addressof, c_char
 from dataclasses import dataclass, field
 from functools import cache, cached_property
@@ -108,6 +108,23 @@ class Table:
             raise IndexError(f"row {number} of a table of {self.size}")
         return self.chunks[name][number // CHUNK][number % CHUNK]
 
+    def addresses(self, name: str, before: Table | None = None, others: Collection[int] = ()) -> Array:
+        """Where the chunks of a column lie, (chunks,) int64, for a kernel; the caller holds the table. All but the `others` are known of the version
+        before, where that is given."""
+        if before is not None and name not in self._addresses and name in before._addresses:
+            self._addresses[name] = self._moved(name, before._addresses[name], others)
+        return self._addresses_of(name)
+
+    def _moved(self, name: str, known: Array, others: Collection[int]) -> Array:
+        """Addresses of the chunks of a column of which these were others."""
+        if not others:
+            return known
+        addresses = np.empty(len(self.chunks[name]), np.int64)
+        addresses[: len(known)] = known
+        for number in others:
+            addresses[number] = self.schema[name].address_of(self.chunks[name][number])
+        return addresses
+
     def _addresses_of(self, name: str) -> Array:
         if name not in self._addresses:
             column = self.schema[name]
@@ -185,16 +202,12 @@ class Table:
             chunks[name] = (*known[: numbers.start], *added.values())
         return self._changed(size, chunks, numbers).emptied(empty)
 
-    def _changed(self, size: int, chunks: Mapping[str, tuple[Array, ...]], numbers: Iterable[int]) -> Table:
+    def _changed(self, size: int, chunks: Mapping[str, tuple[Array, ...]], numbers: Collection[int]) -> Table:
         """A version with other chunks of these numbers, which knows where the others are."""
-        addresses = dict(self._addresses)
-        for name, known in self._addresses.items():
-            if chunks[name] is not self.chunks[name]:
-                addresses[name] = np.empty(len(chunks[name]), np.int64)
-                addresses[name][: len(known)] = known
-                for number in numbers:
-                    addresses[name][number] = self.schema[name].address_of(chunks[name][number])
-        return Table(self.schema, size, chunks, addresses)
+        table = Table(self.schema, size, chunks)
+        for name, known in dict(self._addresses).items():  # a copy: other threads may ask for more of them
+            table._addresses[name] = table._moved(name, known, numbers if chunks[name] is not self.chunks[name] else ())
+        return table
 
 
 _EMPTY: dict[tuple[str, tuple[int, ...]], Array] = {}

@@ -12,21 +12,21 @@ numbers of the chunks that were given back.
 from __future__ import annotations
 
 import json
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import cache, lru_cache
+from functools import lru_cache
+from itertools import compress
+from operator import is_not
 from typing import Any
 
 import numpy as np
 
-from trihedron.pipeline.array_codec import array_parts, element_type
+from trihedron.pipeline.array_codec import array_parts, element_type, plain_head, row_kernels
 from trihedron.pipeline.table import CHUNK, Column, Table, empty_chunk
 
 CHECKPOINT_EVERY = 64  # messages; of a walk through what is new a checkpoint adds a third to what the changes take, however far apart they are
 MOST_CHECKPOINTS = 16  # that build on each other: reading one frame reads them all
 WORTH = 2 / 3  # of the bytes of the whole, which a checkpoint must not exceed
-_IN_CHUNK = np.arange(CHUNK, dtype=np.int32)
 
 
 class TableWriter:
@@ -72,17 +72,25 @@ def _table_parts(name: str, table: Table, previous: Table | None, back: int) -> 
     parts: list[Any] = []
     changed: dict[str, int] = {}
     numbers: dict[bytes, int] = {}
-    before = {column: previous.chunks[column] if previous is not None else () for column in table.chunks}
-    touched = {column: _others(before[column], chunks) for column, chunks in table.chunks.items()}
+    before = previous if previous is not None else Table.empty(table.schema)
+    touched = {column: _others(before.chunks[column], chunks) for column, chunks in table.chunks.items()}
     emptied = {i for i in set().union(*touched.values()) if table.is_empty(i)}
-    for column, chunks in table.chunks.items():
-        here = [i for i in touched[column] if i not in emptied]
+    for column, others in touched.items():
+        addresses = table.addresses(column, before, others)
+        here = [i for i in others if i not in emptied] if emptied else others
         if not here:
             continue
-        ids, values = _changed(before[column], chunks, here)
-        if len(ids):
+        ids = np.empty(len(here) * CHUNK, np.int32)
+        chunks = np.array(here, np.int32)
+        row_bytes, shape = table.schema[column].row_bytes, table.schema[column].shape
+        count = row_kernels().differing(before.addresses(column), addresses, chunks, CHUNK, before.size, table.size, row_bytes, ids)
+        if count:
+            ids = ids[:count]
             changed[column] = numbers.setdefault(ids.tobytes(), len(numbers))
-            parts += array_parts(f"{name}#{column}", values, False)
+            head, turned = plain_head(f"{name}#{column}", table.schema[column].element, (count, *shape))
+            rows = np.empty(count * row_bytes, np.uint8)
+            row_kernels().take(addresses, ids, CHUNK, row_bytes, turned, rows)
+            parts += head, rows.data
     for ids_bytes, k in numbers.items():
         parts += array_parts(f"{name}#rows{k}", np.frombuffer(ids_bytes, np.int32), False)
     if emptied:
@@ -94,34 +102,9 @@ def _table_parts(name: str, table: Table, previous: Table | None, back: int) -> 
 
 def _others(known: Sequence[Any], chunks: Sequence[Any]) -> list[int]:
     """Numbers of the chunks that are not the very ones known."""
-    same = min(len(known), len(chunks))
-    return [i for i in range(same) if known[i] is not chunks[i]] + list(range(same, len(chunks)))
-
-
-def _changed(known: Sequence[Any], chunks: Sequence[Any], here: list[int]) -> tuple[Any, Any]:
-    """Numbers and values of the rows of the chunks `here` that those known, none longer than these, do not have. They are compared by their bytes:
-    NaN is no change."""
-    rows, before = _joined([chunks[i] for i in here]), [known[i] for i in here if i < len(known)]
-    numbers = (np.array(here, np.int32)[:, None] * CHUNK + _IN_CHUNK).reshape(-1)[: len(rows)]
-    if not before:
-        return numbers, rows
-    old, word = _joined(before), _word(rows.dtype, rows.shape[1:])
-    same = len(old)  # all known but the last are full, so that these are the first rows
-    apart = old.view(word).reshape(same, -1) != rows[:same].view(word).reshape(same, -1)
-    differ = np.arange(len(rows)) >= same
-    for k in range(apart.shape[1]):  # a third of the time of any(axis=1)
-        differ[:same] |= apart[:, k]
-    return numbers[differ], rows[differ]
-
-
-def _joined(parts: list[Any]) -> Any:
-    return parts[0] if len(parts) == 1 else np.concatenate(parts)
-
-
-@cache
-def _word(dtype: np.dtype[Any], shape: tuple[int, ...]) -> str:
-    """The type of the largest whole numbers that rows of this kind are made of, one by one along their last axis."""
-    return f"u{math.gcd(dtype.itemsize * (shape[-1] if shape else 1), 8)}"
+    if known is chunks:
+        return []
+    return [*compress(range(len(known)), map(is_not, known, chunks)), *range(min(len(known), len(chunks)), len(chunks))]
 
 
 @dataclass(frozen=True)

@@ -63,7 +63,7 @@ def test_what_is_called_belongs_to_the_kernel_that_python_calls():
 
 def test_a_graph_uses_the_modules_that_its_plugins_take_something_from():
     used = kernels.used_by([Synthetic()])
-    assert {"trihedron.datasets.raytracing", "trihedron.pipeline.gathering"} <= used
+    assert {"trihedron.datasets.raytracing", "trihedron.pipeline.gathering", "trihedron.pipeline.row_kernels"} <= used
     assert "trihedron.plugins.numerics.planes.plane_fitting" not in used
 
 
