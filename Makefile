@@ -83,7 +83,7 @@ $(VENV)/checked: $(VENV)/linked
 # The kernels of the default graph; what is compiled stays in build/ until its source changes.
 $(VENV)/compiled: $(VENV)/installed | $(VENV)/linked
 	@echo "Compiling the kernels (a minute or two, once)"
-	@$(BIN)/trihedron run dataset.frames=0:3 out=$(VENV)/first_run >$(VENV)/compile.log 2>&1 || true
+	@$(BIN)/trihedron compile >$(VENV)/compile.log 2>&1 || true
 	@touch $@
 
 FORCE:

@@ -7,10 +7,10 @@ import json
 import logging
 import subprocess
 import sys
-import threading
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
@@ -18,13 +18,13 @@ from omegaconf import DictConfig, OmegaConf
 from tqdm import tqdm
 
 from trihedron.datasets.trajectories import TRUTH, attached_truth, format_trajectory
-from trihedron.pipeline import kernels, results
+from trihedron.pipeline import results
 from trihedron.pipeline.config import Feedback, graph_of
-from trihedron.pipeline.errors import ConfigError, DataError, RecordingError, TrihedronError, did_you_mean
+from trihedron.pipeline.errors import ConfigError, DataError, RecordingError, did_you_mean
 from trihedron.pipeline.graph import Graph
-from trihedron.pipeline.heap import give_back
 from trihedron.pipeline.interrupts import Interrupts
 from trihedron.pipeline.live import Pace, is_camera
+from trihedron.pipeline.preparation import prepared
 from trihedron.pipeline.recording import Recording, RecordingWriter
 from trihedron.pipeline.runner import Runner
 from trihedron.pipeline.runs import Replay, Step
@@ -35,9 +35,7 @@ from trihedron.pipeline.types import Surface, Trajectory
 
 RECORDING = "run.mcap"
 PATH_KEYS = ("dataset.path", "dataset.camera", "load_map")
-WARM_UP_FRAMES = 3  # enough for every stage to have been called, so that compilation is not measured
 PLAIN_PROGRESS_SECONDS = 5.0
-SILENT_SECONDS = 5.0  # before it is said why no frame is seen yet; with compiled kernels the first frames take less
 
 
 def execute(config: DictConfig, out: Path, overrides: list[str], began: float) -> dict[str, Any]:
@@ -56,11 +54,9 @@ def execute(config: DictConfig, out: Path, overrides: list[str], began: float) -
     runner = Runner(graph, config.seed, config.threads, replay, frames, remembered, _pace(config))
     topics = _recorded_topics(config, graph, replay)
     _announce(runner)
-    with _Warnings() as warnings:
+    with _Warnings() as warnings, ExitStack() as stack:
         warnings.muted = True
-        _compile(runner)
-        _warm_up(Runner(graph, config.seed, config.threads, replay, frames, remembered))
-        give_back()  # what the data set and the kernels needed to begin with: else the frames grow into it, unseen in what the run says it holds
+        waited = stack.enter_context(prepared(runner, lambda: Runner(graph, config.seed, config.threads, replay, frames, remembered)))
         warnings.muted = False
         writer = RecordingWriter(out / RECORDING, _metadata(config, overrides))
         attachments = _attachments(graph, replay)
@@ -76,7 +72,7 @@ def execute(config: DictConfig, out: Path, overrides: list[str], began: float) -
         finally:
             with Interrupts() as interrupts, interrupts.held():
                 failure = _closed(writer)
-                metrics, timing = _write(runner, truth, out, started, began)
+                metrics, timing = _write(runner, truth, out, started + waited(), began)
                 warnings.summarise()
     _report(out, metrics, timing, [results.write_surface(out, value) for value in runner.result.folds.values() if isinstance(value, Surface)])
     if failure is not None:
@@ -179,32 +175,6 @@ def _commit() -> str:
     except (OSError, subprocess.TimeoutExpired):
         return ""
     return head.stdout.strip() if top.returncode == 0 else ""
-
-
-def _compile(runner: Runner) -> None:
-    """Compile on all cores what the stages that run may call and no cache has, and say so: it is once an installation."""
-    rows = kernels.missing(kernels.used_by(runner.graph.stages[name].plugin for name in runner.computed))
-    if len(rows) > kernels.FEW:
-        print(f"compiling {len(rows)} functions for this machine, once ...", file=sys.stderr, flush=True)
-        with tqdm(total=len(rows), disable=not sys.stderr.isatty(), leave=False) as bar:
-            for finished in kernels.compile_rows(rows, kernels.cores()):
-                bar.update(finished - bar.n)
-
-
-def _warm_up(runner: Runner) -> None:
-    """Call every stage on the first frames so that kernels are loaded; what goes wrong here is reported by the run itself."""
-    runner.count = min(runner.count, WARM_UP_FRAMES)
-    why = "preparing: what else computes is compiled for this machine, once, then loaded"
-    said = threading.Timer(SILENT_SECONDS, print, [why], {"file": sys.stderr, "flush": True})
-    said.daemon = True
-    said.start()
-    try:
-        for _ in runner.steps(None, frozenset()):
-            pass
-    except TrihedronError:
-        pass
-    finally:
-        said.cancel()
 
 
 def _progress(steps: Iterator[Step]) -> Iterator[Step]:

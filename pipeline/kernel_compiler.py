@@ -109,7 +109,7 @@ def is_part(result: Any) -> bool:
 
 
 def main() -> None:
-    """Compile what is listed in the rows that come on standard input, with a byte on standard output for each done."""
+    """Compile what is listed in the rows that come on standard input, each written to standard output when it is done."""
     gc.freeze()
     gc.set_threshold(GARBAGE, 10, 10)
     parts, kernels = LinkedParts(), json.loads(LISTED.read_text())
@@ -118,7 +118,7 @@ def main() -> None:
     while row := os.read(0, ROW):
         with contextlib.suppress(Exception):  # what is not as listed is left to the run
             parts.compile(*kernel_of(*kernels[int.from_bytes(row, "little")]))
-        os.write(1, b"\n")
+        os.write(1, row)
 
 
 if __name__ == "__main__":

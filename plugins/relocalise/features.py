@@ -8,9 +8,7 @@ import numpy as np
 
 from trihedron.pipeline.registry import register
 from trihedron.pipeline.types import DEGRADED, F64, I32, LOST, OK, Frame, Keypoints, Map, Planes, Pose, Rotation, Segments
-from trihedron.plugins.numerics.axes.cube_symmetry import CUBE
 from trihedron.plugins.numerics.maps.decoupled import reference_of
-from trihedron.plugins.numerics.maps.landmarks import empty_map
 from trihedron.plugins.numerics.maps.local_window import keyframes_of, living_keyframes, observed_by
 from trihedron.plugins.numerics.maps.submaps import submap_of
 from trihedron.plugins.numerics.places.layout_poses import layout_poses
@@ -68,10 +66,9 @@ class Features:
         rng: np.random.Generator,
     ) -> Pose | None:
         """The pose; for a lost camera that is not recognised the lost one, and else None."""
-        view = View(frame, keypoints, segments, planes)
         if map is None or previous_pose is None:
-            self._in_nothing(view, rng)
             return None
+        view = View(frame, keypoints, segments, planes)
         lost, submap = previous_pose.status == LOST, submap_of(previous_pose, map)
         submaps = self._sought(map, submap, lost, frame.index)
         if not len(submaps):
@@ -84,13 +81,6 @@ class Features:
         if best is None:
             return replace(previous_pose, index=frame.index, stamp_ns=frame.stamp_ns, reason="nothing was recognised") if lost else None
         return self._said(best, frame, map, int(map.keyframes.row("submap", int(among[0]))), lost)
-
-    def _in_nothing(self, view: View, rng: np.random.Generator) -> None:
-        """Look for the first frame in an empty map: the kernels are compiled now, before the clock starts, and not when the camera is lost."""
-        bits, line_bits, samples = view.keypoints.descriptors.shape[1], view.segments.descriptors.shape[1], view.planes.samples_m.shape[1]
-        map, none = empty_map(view.frame.index, view.frame.stamp_ns, bits, line_bits, samples), np.empty(0, np.int32)
-        self._by_points(view, map, none, rng)
-        layout_poses(map, none, none, view.planes, view.segments, np.eye(3), np.eye(3), CUBE[:1])
 
     def _sought(self, map: Map, submap: int, lost: bool, index: int) -> I32:
         """Sub-maps to look in: all for a lost camera; now and then the older ones for one tracked in a sub-map that is not tied to the first."""

@@ -134,9 +134,9 @@ def test_a_run_folder_is_complete(capsys, tmp_path):
 
 def test_a_long_preparation_is_explained(capsys, tmp_path, monkeypatch):
     words = ["run", *SMALL, "dataset.frames=0:4", "outputs=[keypoints]"]
-    monkeypatch.setattr("trihedron.pipeline.execute.SILENT_SECONDS", 60.0)
+    monkeypatch.setattr("trihedron.pipeline.preparation.SILENT_SECONDS", 60.0)
     assert main([*words, f"out={tmp_path / 'quick'}"]) == 0 and "preparing" not in capsys.readouterr().err
-    monkeypatch.setattr("trihedron.pipeline.execute.SILENT_SECONDS", 0.0)
+    monkeypatch.setattr("trihedron.pipeline.preparation.SILENT_SECONDS", 0.0)
     assert main([*words, f"out={tmp_path / 'long'}"]) == 0 and "compiled for this machine, once" in capsys.readouterr().err
 
 

@@ -3,8 +3,12 @@
 import importlib
 import json
 import os
+import re
+import signal
 import subprocess
 import sys
+import time
+from concurrent.futures import ThreadPoolExecutor
 
 import numba
 import numpy as np
@@ -15,6 +19,7 @@ from trihedron.datasets.synthetic import Synthetic
 from trihedron.pipeline import kernels
 from trihedron.pipeline.kernels import LISTED, type_of, word_of
 from trihedron.plugins.numerics.motion.pose_kernel import Flags
+from trihedron.tools.compile import RUNS
 
 ENTRIES = json.loads(LISTED.read_text())
 
@@ -45,20 +50,27 @@ def test_types_come_back_from_their_words():
 
 
 def test_the_longest_are_listed_first_and_others_kernels_never():
-    misses = kernels.Misses()
-    misses.kernels = [("trihedron.x:short", (types.int64,)), ("numba.x:y", (types.int64,)), ("trihedron.x:long", (types.float64,))]
-    misses.kernels.append(("trihedron.x:text", (types.unicode_type,)))
-    misses.seconds = [1.0, 9.0, 2.0, 9.0]
-    assert kernels.listed(misses) == [["trihedron.x:long", ["float64"]], ["trihedron.x:short", ["int64"]]]
+    called = kernels.Called()
+    called.kernels = {("trihedron.x:short", (types.int64,)): 1.0, ("numba.x:y", (types.int64,)): 9.0, ("trihedron.x:long", (types.float64,)): 2.0}
+    called.kernels["trihedron.x:text", (types.unicode_type,)] = 9.0
+    assert kernels.listed(called) == [["trihedron.x:long", ["float64"]], ["trihedron.x:short", ["int64"]]]
 
 
-def test_what_is_called_belongs_to_the_kernel_that_python_calls():
-    inner = numba.njit(lambda x: x + 1)
-    outer = numba.njit(lambda x: inner(x) + 1)
-    misses = kernels.Misses()
-    with kernels.watched(misses):
-        outer(1)
-    assert len(misses.kernels) == len(misses.seconds) == 1 and misses.seconds[0] > 0.0
+def test_what_is_called_is_what_the_interpreter_calls():
+    @numba.njit
+    def inner(x):
+        return x + 1
+
+    @numba.njit
+    def outer(x):
+        return inner(x) + 1
+
+    with kernels.Called() as called:
+        assert outer(1) == 3 and outer(2) == 4
+        assert len(called.kernels) == 1 and min(called.kernels.values()) > 0.0
+        assert inner(1) == 2  # which was a part before
+        assert len(called.kernels) == 2
+    assert outer(1.0) == 3.0 and len(called.kernels) == 2
 
 
 def test_a_graph_uses_the_modules_that_its_plugins_take_something_from():
@@ -84,10 +96,72 @@ rows = [row for row, (kernel, _) in enumerate(json.loads(kernels.LISTED.read_tex
 modules = {"trihedron.plugins.numerics.axes.sphere_modes"}
 before = kernels.missing(modules)
 if sys.argv[1] == "ahead":
-    assert list(kernels.compile_rows(rows, 1)) == [1, 2]
+    kernels.cores = lambda: 1
+    with kernels.Compilation(rows) as compilation:
+        assert list(compilation) == rows
     assert set(before) - set(kernels.missing(modules)) == set(rows)
 print(orthonormal(np.arange(9.0).reshape(3, 3) ** 2 % 7, np.ones(3)).tolist())
 """
+
+
+@pytest.fixture
+def listed_kernel(tmp_path, monkeypatch):
+    """A kernel that no process has compiled yet, in the list's only row."""
+    (tmp_path / "halves.py").write_text("import numba\n\n\n@numba.njit(cache=True)\ndef half(x):\n    return 0.5 * x\n")
+    (tmp_path / "kernels.json").write_text('[["halves:half", ["float64"]]]')
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.setattr(kernels, "LISTED", tmp_path / "kernels.json")
+    yield importlib.import_module("halves").half
+    del sys.modules["halves"]
+
+
+def test_a_call_waits_for_what_is_compiled_elsewhere_and_is_told_for_how_long(listed_kernel):
+    with kernels.Awaited([0]) as awaited, ThreadPoolExecutor() as others:
+        answer = others.submit(listed_kernel, 3.0)
+        with pytest.raises(TimeoutError):
+            answer.result(0.3)
+        awaited.done(0)
+        assert answer.result(60.0) == 1.5 and awaited.seconds > 0.25
+    assert kernels.DISPATCHER._compile_for_args.__name__ == "_compile_for_args"
+
+
+def test_where_nothing_more_is_compiled_the_call_compiles(listed_kernel):
+    with kernels.Awaited([0]) as awaited:
+        awaited.end()
+        assert listed_kernel(3.0) == 1.5 and awaited.seconds == 0.0
+
+
+def test_ctrl_c_ends_the_waiting(listed_kernel):
+    with kernels.Awaited([0]) as awaited, ThreadPoolExecutor() as others:
+        answer = others.submit(listed_kernel, 3.0)
+        time.sleep(0.1)
+        awaited.end(interrupted=True)
+        assert isinstance(answer.exception(60.0), KeyboardInterrupt)
+
+
+def test_processes_that_are_interrupted_say_so():
+    with kernels.Compilation([0]) as compilation:
+        for process in compilation._processes:
+            process.send_signal(signal.SIGINT)
+        assert list(compilation) == [] and compilation.interrupted()
+    with kernels.Compilation([0]) as compilation:
+        compilation.give_up()
+        assert list(compilation) == [] and not compilation.interrupted()
+
+
+@pytest.mark.slow
+def test_the_first_frame_does_not_wait_for_what_later_ones_need(tmp_path):
+    environment = os.environ | {"NUMBA_CACHE_DIR": str(tmp_path / "cache")}
+    program = [sys.executable, "-c", "import sys; from trihedron.pipeline.cli import main; sys.exit(main(sys.argv[1:]))", "run"]
+    words = ["dataset.width=160", "dataset.height=120", "outputs=[trajectory]"]
+    said = []
+    for number, frames in enumerate(("0:1", "0:20", "0:20")):
+        run = subprocess.run([*program, *words, f"dataset.frames={frames}", f"out={tmp_path / str(number)}"], env=environment, capture_output=True)
+        assert run.returncode == 0, run.stderr
+        said.append(int(match[1]) if (match := re.search(rb"compiling (\d+) functions", run.stderr)) else 0)
+    assert said[0] > said[1] > kernels.FEW and said[2] <= kernels.FEW
+    tracked = [(tmp_path / number / "trajectory.txt").read_bytes() for number in "12"]
+    assert tracked[0] == tracked[1]
 
 
 @pytest.mark.slow
@@ -104,9 +178,12 @@ def test_a_kernel_that_another_calls_is_compiled_whole_and_to_the_same_bits(tmp_
 def test_a_run_after_compiling_ahead_compiles_nothing(tmp_path):
     environment = os.environ | {"NUMBA_CACHE_DIR": str(tmp_path / "cache")}
 
-    def compile(*words):
-        program = [sys.executable, "-c", "import sys; from trihedron.tools.compile import main; sys.exit(main(sys.argv[1:]))", *words]
-        return subprocess.run(program, env=environment, capture_output=True, text=True, check=True, cwd=tmp_path).stdout
+    def compiled(*words):
+        program = [sys.executable, "-c", "import sys; from trihedron.pipeline.cli import main; sys.exit(main(sys.argv[1:]))", *words]
+        subprocess.run(program, env=environment, capture_output=True, check=True, cwd=tmp_path)
+        return {file: file.stat().st_mtime_ns for file in (tmp_path / "cache").rglob("*.nbi")}
 
-    assert compile().startswith("ready after ")
-    assert json.loads(compile("--list")) == []
+    ahead = compiled("compile")
+    assert len(ahead) > 90
+    for number, words in enumerate(RUNS):
+        assert compiled("run", *words, f"out={number}") == ahead

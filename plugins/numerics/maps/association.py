@@ -41,7 +41,7 @@ def associate(
     pairs = (matches.keypoints, matches.segments, matches.planes) if matches is not None else (NOTHING, NOTHING, NOTHING)
     points, lines, same = (kept[_alive(map, kind, kept[:, 1])] for kept, kind in zip(pairs, ("points", "lines", "planes")))
     agreeing = same
-    if judged:
+    if judged and matches is not None:
         flags = classify_terms(
             T_world_camera,
             camera,
