@@ -8,19 +8,11 @@ import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
 ORDER = (
-<<<<<<< HEAD
     "errors", "mcap_writer", "chunk_writer", "mcap_errors", "mcap_chunks", "mcap_file", "arrays", "camera", "gathering", "row_kernels", "table",
     "maps", "surface", "types", "geometry", "slots", "registry", "wire_format", "array_codec", "table_codec", "codec", "foxglove_messages",
     "foxglove", "graph", "metrics", "consistency", "plot", "ply", "heap", "timing", "recording", "live", "runs", "scheduler", "interrupts", "intake",
     "state", "runner", "results", "config", "jobs", "cluster", "sweep", "search", "engines", "kernels", "compiler_shortcuts", "kernel_compiler",
-    "execute", "cli",
-=======
-    "errors", "mcap_writer", "chunk_writer", "mcap_errors", "mcap_chunks", "mcap_file", "arrays", "camera", "gathering", "table", "maps", "surface",
-    "types", "geometry", "slots", "registry", "wire_format", "array_codec", "table_codec", "codec", "foxglove_messages", "foxglove", "graph",
-    "metrics", "consistency", "plot", "ply", "heap", "timing", "recording", "live", "runs", "scheduler", "interrupts", "intake", "state", "runner",
-    "results", "config", "jobs", "cluster", "sweep", "search", "engines", "kernels", "compiler_shortcuts", "kernel_compiler", "preparation", "execute",
-    "cli",
->>>>>>> 0b30e92 (The run begins while its kernels are compiled: what the first frame calls comes first, and a call waits for no more than its own)
+    "preparation", "execute", "cli",
 )  # fmt: skip
 NUMERICS = ("algebra", "images", "depth", "planes", "axes", "motion", "maps", "bundle", "places", "surfaces")  # each imports those before it
 VOCABULARY = {"types", "geometry", "errors", "slots", "registry"}  # what plugins and data sets know of the machinery
