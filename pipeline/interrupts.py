@@ -13,6 +13,8 @@ class Interrupts:
     """While this is entered, a Ctrl-C that comes in a `with self.held():` raises KeyboardInterrupt at the block's end, and any other at once, as
     always. Entering asks the system, holding does not. Off the main thread, and where others handle Ctrl-C, nothing changes."""
 
+    count = 0  # of those that came to this process, for threads that wait for something
+
     def __init__(self) -> None:
         self._holding = self._came = self._handling = False
 
@@ -27,6 +29,7 @@ class Interrupts:
             signal.signal(signal.SIGINT, signal.default_int_handler)
 
     def _handle(self, *_: Any) -> None:
+        Interrupts.count += 1
         if not self._holding:
             raise KeyboardInterrupt
         self._came = True

@@ -12,7 +12,6 @@ import importlib
 import json
 import os
 import re
-import signal
 import subprocess
 import sys
 import threading
@@ -28,6 +27,8 @@ import numpy as np
 from numba.core import event
 from numba.core.dispatcher import Dispatcher, OmittedArg
 
+from trihedron.pipeline.interrupts import Interrupts
+
 types: Any = numba.types  # which says little of its classes
 DISPATCHER: Any = Dispatcher
 Kind = Any  # one of those types
@@ -35,6 +36,7 @@ LISTED = Path(__file__).with_name("kernels.json")
 FEW = 3  # kernels, which the run compiles itself as it comes to them
 MOST = 8  # processes; one alone comes to 1.1 GB, several divide what is to be compiled
 ROW = 2  # bytes of a row's number
+LOOK_S = 0.2  # between two looks of a call that waits, whether a Ctrl-C came
 ARRAY = re.compile(r"(readonly )?(\w+)(?:\[(\d+)([CFA])\])?")
 
 
@@ -169,10 +171,6 @@ class Compilation:
             process.terminate()
             process.wait()
 
-    def interrupted(self) -> bool:
-        """Whether they were ended by Ctrl-C, which reaches all programs of a terminal. Waits for their end."""
-        return any(process.wait() == -signal.SIGINT for process in self._processes)
-
 
 class Awaited:
     """Kernels that are being compiled elsewhere: while this is entered, a call of one of them waits until it is there."""
@@ -182,7 +180,7 @@ class Awaited:
         self._pending = {_key(*kernel_of(*listed[row])): row for row in rows}
         self._change = threading.Condition()
         self._compile = DISPATCHER._compile_for_args
-        self._waiting, self._began, self._interrupted = 0, 0.0, False
+        self._waiting, self._began = 0, 0.0
         self.seconds = 0.0  # in which any call waited
 
     def __enter__(self) -> Awaited:
@@ -199,10 +197,10 @@ class Awaited:
             self._pending = {key: other for key, other in self._pending.items() if other != row}
             self._change.notify_all()
 
-    def end(self, interrupted: bool = False) -> None:
-        """None need be: who waits compiles it, or is interrupted."""
+    def end(self) -> None:
+        """None need be: who waits compiles it."""
         with self._change:
-            self._pending, self._interrupted = {}, interrupted
+            self._pending = {}
             self._change.notify_all()
 
     def _called(self, dispatcher: Any, *arguments: Any) -> Any:
@@ -213,12 +211,13 @@ class Awaited:
         return self._compile(dispatcher, *arguments)
 
     def _wait(self, key: tuple[Any, ...]) -> None:
-        self._began = self._began if self._waiting else time.perf_counter()
+        self._began, interrupts = self._began if self._waiting else time.perf_counter(), Interrupts.count
         self._waiting += 1
-        self._change.wait_for(lambda: key not in self._pending)
+        while key in self._pending and Interrupts.count == interrupts:
+            self._change.wait(LOOK_S)
         self._waiting -= 1
         self.seconds += 0.0 if self._waiting else time.perf_counter() - self._began
-        if self._interrupted:
+        if Interrupts.count > interrupts:
             raise KeyboardInterrupt
 
 

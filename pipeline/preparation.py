@@ -53,7 +53,7 @@ def _follow(compilation: Compilation, awaited: Awaited, bar: tqdm[None]) -> None
     for row in compilation:
         awaited.done(row)
         bar.update()
-    awaited.end(compilation.interrupted())
+    awaited.end()
 
 
 def _warm_up(runner: Runner) -> None:
