@@ -59,8 +59,8 @@ def stamp(value: Value) -> Timestamp:
 
 
 def _position_and_quaternion(T: F64) -> tuple[Vector3, Quaternion]:
-    x, y, z = map(float, T[:3, 3])
-    qx, qy, qz, qw = map(float, quaternion_from_rotation(T[:3, :3]))
+    x, y, z = T[:3, 3].tolist()
+    qx, qy, qz, qw = quaternion_from_rotation(T[:3, :3]).tolist()
     return Vector3(x=x, y=y, z=z), Quaternion(x=qx, y=qy, z=qz, w=qw)
 
 

@@ -50,11 +50,15 @@ def differing(before: Ints, after: Ints, pieces: Ints, piece: int, known: int, s
 
 @numba.njit(cache=True)
 def take(addresses: Ints, rows: Ints, piece: int, row_bytes: int, turned: bool, out: Bytes) -> None:
-    """Copy rows (n,) into `out` (n * row_bytes,): row by row or, turned, the first byte of all, then the second. Every `piece` rows lie at one of the
-    addresses."""
-    count = len(rows)
+    """Copy rows (n,), whose numbers grow, into `out` (n * row_bytes,): row by row or, turned, the first byte of all, then the second. Every `piece`
+    rows lie at one of the addresses."""
+    count, first, end = len(rows), 0, 0
+    address = addresses[0]
     for i in range(count):
-        source = bytes_at(addresses[rows[i] // piece] + rows[i] % piece * row_bytes)
+        if rows[i] >= end:
+            first = rows[i] // piece * piece
+            address, end = addresses[first // piece], first + piece
+        source = bytes_at(address + (rows[i] - first) * row_bytes)
         if turned:
             for k in range(row_bytes):
                 out[k * count + i] = source[k]

@@ -95,9 +95,16 @@ def _table_parts(name: str, table: Table, previous: Table | None, back: int) -> 
         parts += array_parts(f"{name}#rows{k}", np.frombuffer(ids_bytes, np.int32), False)
     if emptied:
         parts += array_parts(f"{name}#emptied", np.array(sorted(emptied), np.int32), False)
-    schema = {c: [s.dtype, list(s.shape), s.step] for c, s in table.schema.items()}
-    parts += array_parts(f"{name}#", json.dumps({"size": table.size, "back": back, "schema": schema, "rows": changed}), False)
+    schema = ", ".join(_column_text(column, kind) for column, kind in table.schema.items())
+    header = f'{{"size": {table.size}, "back": {back}, "schema": {{{schema}}}, "rows": {json.dumps(changed)}}}'
+    parts += array_parts(f"{name}#", header, False)
     return parts
+
+
+@lru_cache(256)
+def _column_text(name: str, column: Column) -> str:
+    """A column in the schema of a table, as JSON."""
+    return f"{json.dumps(name)}: {json.dumps([column.dtype, column.shape, column.step])}"
 
 
 def _others(known: Sequence[Any], chunks: Sequence[Any]) -> list[int]:
