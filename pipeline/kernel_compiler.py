@@ -32,13 +32,13 @@ class LinkedParts:
     def __init__(self) -> None:
         self.name = ("", "")  # of the kernel: module and qualified name
         self.library: Any = None  # of the kernel
-        self._optimize, self._finalize = LIBRARY._optimize_functions, LIBRARY.finalize
+        self._finalize = LIBRARY.finalize
         self._executable, self._cachable = CONTEXT.get_executable, CACHE.check_cachable
         self._wrappers = CONTEXT.create_cpython_wrapper, CONTEXT.create_cfunc_wrapper
 
     def install(self) -> None:
         """From now on numba takes these steps, in this process."""
-        LIBRARY._optimize_functions = lambda library, module: self.optimize(library, module)
+        LIBRARY._optimize_functions = _simplify_later
         LIBRARY.finalize = lambda library: self.finalize(library)
         CONTEXT.get_executable = lambda context, *of: self.executable(context, *of)
         CONTEXT.create_cpython_wrapper = lambda *of, **how: self.wrap(self._wrappers[0], *of, **how)
@@ -52,13 +52,6 @@ class LinkedParts:
             del dispatcher.overloads[arguments]
         self.name = dispatcher.__module__, dispatcher.py_func.__qualname__
         dispatcher.compile(arguments)
-
-    def optimize(self, library: Any, module: Any) -> None:
-        """Make functions small and simple before others are linked to them; parts are simplified where they end up."""
-        if library.name == self.name[1]:
-            self._optimize(library, module)
-        else:
-            module.data_layout = library._codegen._data_layout
 
     def finalize(self, library: Any) -> None:
         """Link everything that is called to the kernel's library, which is then optimised and translated; parts wait until then."""
@@ -84,6 +77,11 @@ class LinkedParts:
     def is_kernel(self, function: Any) -> bool:
         """By numba's description of it."""
         return (function.modname, function.qualname) == self.name
+
+
+def _simplify_later(library: Any, module: Any) -> None:
+    """Leave functions to the kernel's optimisation, which simplifies them again and to the same code."""
+    module.data_layout = library._codegen._data_layout
 
 
 def _called(library: Any, found: dict[Any, None]) -> dict[Any, None]:
@@ -119,6 +117,7 @@ def main() -> None:
         with contextlib.suppress(Exception):  # what is not as listed is left to the run
             parts.compile(*kernel_of(*kernels[int.from_bytes(row, "little")]))
         os.write(1, row)
+        gc.freeze()  # what is left numba keeps
 
 
 if __name__ == "__main__":

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from trihedron.plugins.numerics.algebra.ranking import descending, median
+from trihedron.plugins.numerics.algebra.ranking import descending, few_descending, median
 
 RNG = np.random.default_rng(0)
 VALUES = {
@@ -16,8 +16,9 @@ VALUES = {
 
 
 @pytest.mark.parametrize("values", VALUES.values(), ids=VALUES)
-def test_the_largest_comes_first_and_equals_keep_their_order(values):
-    order = descending(values)
+@pytest.mark.parametrize("ranked", (descending, few_descending))
+def test_the_largest_comes_first_and_equals_keep_their_order(ranked, values):
+    order = ranked(values)
     assert order.dtype == np.int32
     np.testing.assert_array_equal(order, np.argsort(-values, kind="stable"))
 

@@ -6,6 +6,7 @@ import numba
 import numpy as np
 
 from trihedron.pipeline.types import F64, Bool
+from trihedron.plugins.numerics.algebra.ranking import few_descending
 
 NORMALS_PER_SAMPLE = 20.0  # neighbouring normals share pixels and the sensor's errors: so many count as one
 
@@ -31,7 +32,7 @@ def line_peaks(directions: F64, length: F64, axes: F64, lines: F64, number: int,
     An axis is measured against the lines that no heavier axis has: a few long ones along a corridor must not outweigh what is across it."""
     peaks, left = np.zeros(len(lines), np.bool_), length.copy()
     any_peak, on_peaks, widest_peak = False, 0.0, 0.0
-    for k in np.argsort(-lines[:, 1], kind="mergesort"):
+    for k in few_descending(lines[:, 1]):
         if lines[k, 0] < number or not lines[k, 3] < widest:
             continue
         least = by_chance(lines[k, 3], cone, 2.0 / (np.pi - 2.0 * cone), left) if any_peak else 0.0
