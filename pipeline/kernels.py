@@ -36,6 +36,7 @@ LISTED = Path(__file__).with_name("kernels.json")
 FEW = 3  # kernels, which the run compiles itself as it comes to them
 MOST = 8  # processes; one alone comes to 1.1 GB, several divide what is to be compiled
 ROW = 2  # bytes of a row's number
+RECORDING = "trihedron.pipeline.row_kernels:"
 LOOK_S = 0.2  # between two looks of a call that waits, whether a Ctrl-C came
 ARRAY = re.compile(r"(readonly )?(\w+)(?:\[(\d+)([CFA])\])?")
 
@@ -231,9 +232,10 @@ def _kinds(dispatcher: Any, arguments: Iterable[Any]) -> tuple[Kind, ...]:
 
 
 def listed(called: Called) -> list[list[Any]]:
-    """Kernels as `kernels.json` holds them: [module:name, [argument, ...]]; those of the project whose arguments have a word, the longest first."""
+    """Kernels as `kernels.json` holds them: [module:name, [argument, ...]]; those of the project whose arguments have a word: what the
+    recording begins with, then the longest first."""
     found = []
-    for (kernel, arguments), _ in sorted(called.kernels.items(), key=lambda one: -one[1]):
+    for (kernel, arguments), _ in sorted(called.kernels.items(), key=lambda one: (not one[0][0].startswith(RECORDING), -one[1])):
         if kernel.startswith("trihedron."):
             try:
                 found.append([kernel, [word_of(argument) for argument in arguments]])

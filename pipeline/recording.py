@@ -12,6 +12,7 @@ import numpy as np
 from mcap.records import Channel, ChunkIndex
 from mcap_protobuf.schema import build_file_descriptor_set
 
+from trihedron.pipeline.array_codec import row_kernels
 from trihedron.pipeline.chunk_writer import ChunkWriter
 from trihedron.pipeline.codec import Decoder, Encoder, ValueMessage, builds_on
 from trihedron.pipeline.errors import RecordingError
@@ -45,6 +46,7 @@ class RecordingWriter:
 
     def __init__(self, path: Path, metadata: Mapping[str, str]) -> None:
         self.path = path
+        row_kernels().ready()
         self._file = ChunkWriter(path)
         self._file.metadata(METADATA, {"format": FORMAT, **metadata})
         self._channels: dict[str, int] = {}

@@ -85,3 +85,11 @@ def turn(address: int, count: int, row_bytes: int, out: Bytes) -> None:
         for k in range(row_bytes):
             for i in range(count):
                 out[k * count + i] = single[i * row_bytes + k]
+
+
+def ready() -> None:
+    """Load what is here, or compile it: before there is a message that would wait for it, and be lost with the process."""
+    addresses, rows, out = np.zeros(1, np.int64), np.empty(0, np.int32), np.empty(0, np.uint8)
+    differing(addresses, addresses, rows, 1, 0, 0, 1, rows)
+    take(addresses, rows, 1, 1, False, out)
+    turn(0, 0, 1, out)
