@@ -2,7 +2,7 @@
 
 The machine's speed varies, so times are also given as multiples of the reference: OpenCV ORB (1000 features, 8 levels) and LSD on the same frames,
 one thread. --paced runs the frames a second time at the camera's own rate: latency is then from asking for a frame's files to its pose, and the time
-it waits behind others does not count. --cold runs three frames with an empty kernel cache. --compare says what became slower since a --json file.
+it waits behind others does not count. --cold runs one frame with an empty kernel cache. --compare says what became slower since a --json file.
 
 Other comparisons, each with its --help: `trihedron benchmark scaling` (threads, image size, features, length), `trihedron benchmark manhattan`
 (estimators of the Manhattan frame on rendered rooms), `trihedron benchmark rotations` (the runs of a sweep over them), `trihedron benchmark surface`
@@ -56,7 +56,7 @@ def main(argv: list[str]) -> int:
     parser.add_argument("--json", type=Path, metavar="FILE", help="write the figures too")
     parser.add_argument("--compare", type=Path, metavar="OLD.json", help="say what became slower since then")
     parser.add_argument("--paced", action="store_true", help="a second run at the camera's own rate")
-    parser.add_argument("--cold", action="store_true", help="time the first frames with an empty kernel cache (a minute or two)")
+    parser.add_argument("--cold", action="store_true", help="time the first frame with an empty kernel cache, too (half a minute)")
     options, rest = parser.parse_known_args(argv)
     overrides = [*options.overrides, *rest]
     _checked(overrides)
@@ -68,7 +68,7 @@ def main(argv: list[str]) -> int:
         if options.paced:
             figures["paced"] = measure([*overrides, "real_time=true", f"out={folder}/paced"], Path(folder) / "paced")["frame_ms"]
         if options.cold:
-            figures["cold_first_frames_s"] = _cold(overrides, Path(folder))
+            figures["cold_first_frame_s"] = _cold(overrides, Path(folder))
     figures["machine"] = machine()
     print(report(figures))
     if old is not None:
@@ -121,10 +121,10 @@ def _cpu_of(words: list[str]) -> float:
 
 
 def _cold(overrides: list[str], folder: Path) -> float:
-    """Seconds from the command to the end of a run of three frames that finds no compiled kernel."""
+    """Seconds from the command to the end of a run of one frame that finds no compiled kernel."""
     words = [word for word in overrides if not word.startswith("dataset.frames=")]
     environment = {**os.environ, "NUMBA_CACHE_DIR": str(folder / "kernels")}
-    seconds: float = measure([*words, "dataset.frames=0:3", f"out={folder}/cold"], folder / "cold", environment)["process_s"]
+    seconds: float = measure([*words, "dataset.frames=0:1", f"out={folder}/cold"], folder / "cold", environment)["process_s"]
     return seconds
 
 
@@ -185,7 +185,7 @@ def report(figures: dict[str, Any]) -> str:
     lines += [
         f"throughput {figures['fps']:.1f} frames/s: {per_frame:.1f} ms a frame, {per_frame / reference:.2f} x reference",
         f"start-up {figures['startup_s']:.1f} s, --help {figures['cli_cpu_s']:.2f} s of CPU"
-        + (f", three frames without compiled kernels {figures['cold_first_frames_s']:.0f} s" if "cold_first_frames_s" in figures else ""),
+        + (f", the first frame without compiled kernels {figures['cold_first_frame_s']:.0f} s" if "cold_first_frame_s" in figures else ""),
         f"CPU {figures['cpu_s']:.1f} s ({used:.2f} cores), peak memory {memory_text(figures)} MB",
     ]
     final = figures.get("metrics", {}).get("final")
