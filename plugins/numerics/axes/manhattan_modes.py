@@ -139,7 +139,8 @@ def _followed(
     seen, supported = _judged(vectors, weights, first, axes, normals, lines, planes, rules)
     for k in range(3):
         if not seen[k]:
-            axes[:, k] = start[:, k]
+            for j in range(3):
+                axes[j, k] = start[j, k]
     return axes, normals, lines, seen, supported
 
 

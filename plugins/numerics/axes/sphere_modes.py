@@ -169,7 +169,8 @@ def densest(directions: F64, weights: F64, starts: F64, cone: float, count: int)
         best = np.argmax(mass)
         if mass[best] <= 0.0:
             return chosen[:n]
-        chosen[n] = starts[best]
+        for k in range(3):
+            chosen[n, k] = starts[best, k]
         for s in range(len(starts)):
             if abs(starts[s, 0] * chosen[n, 0] + starts[s, 1] * chosen[n, 1] + starts[s, 2] * chosen[n, 2]) > apart:
                 mass[s] = 0.0
@@ -207,10 +208,11 @@ def _quarter_turns(histogram: F64, count: int) -> F64:
 def search_axes(directions: F64, weights: F64, starts: F64, cone: float, bandwidth: float, primaries: int, turns: int) -> F64:
     """The three orthogonal axes of greatest density, from nothing: each of the `primaries` densest directions with its `turns` fullest turns about it
     is refined and compared. `starts` (m, 3) are directions spread over the half sphere, less than a cone apart. (3, 3) rotation."""
-    best, found = -1.0, np.eye(3)
+    best, found, alone = -1.0, np.eye(3), np.empty((3, 1))
     chosen = densest(directions, weights, starts, cone, primaries)
     for i in range(len(chosen)):
-        alone = np.ascontiguousarray(chosen[i : i + 1].T)
+        for k in range(3):
+            alone[k, 0] = chosen[i, k]
         frame = right_handed(shift_axes(directions, weights, alone, cone, bandwidth, 10, 1e-3)[:, 0])
         for turn in _quarter_turns(_histogram(directions, weights, frame, cone), turns):
             c, s = np.cos(turn), np.sin(turn)

@@ -145,7 +145,9 @@ def _clear_rings(smooth: U8, most: int) -> U8:
     """(h, w) how many rings of blocks about each, `most` at most, are free of depth edges, as it is itself; what is outside the image is free."""
     h, w = smooth.shape
     free, across, out = np.ones((h, w + 2), np.uint8), np.ones((h + 2, w), np.uint8), np.zeros((h, w), np.uint8)
-    free[:, 1:-1] = smooth
+    for r in range(h):
+        for c in range(w):
+            free[r, c + 1] = smooth[r, c]
     for _ in range(most):
         for r in range(h):
             for c in range(w):

@@ -48,7 +48,7 @@ def fit_components(
         q, members, _ = larger_surface(q, grid, component, columns, member)
         if members < least or turn(q, columns, member, max(len(component) // COARSE, 1)) > curved:
             continue
-        planes[found] = q
+        planes[found, 0], planes[found, 1], planes[found, 2] = q[0], q[1], q[2]
         found += 1
         for i in range(len(component)):
             if member[i]:

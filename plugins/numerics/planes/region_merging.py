@@ -57,6 +57,7 @@ def merge_regions(A: F64, b: F64, moments: F64, n: I32, touch: F64, limit: float
     From the largest down a region takes in those smaller neighbours for which the common plane is within `limit` σ (rms) of each one's own, and what
     noise moves these by when `alike` depths err as one."""
     k = len(n)
+    sums = A.reshape(k, 9), b, moments.reshape(k, 16), touch
     owner = np.arange(k + 1).astype(np.int32)
     for i in descending(n.astype(np.float64)):
         again = owner[i + 1] == i + 1
@@ -67,11 +68,10 @@ def merge_regions(A: F64, b: F64, moments: F64, n: I32, touch: F64, limit: float
                     continue
                 if not _one_plane(A[i], b[i], n[i], A[j], b[j], n[j], limit, NOISE * alike):
                     continue
-                A[i] += A[j]
-                b[i] += b[j]
-                moments[i] += moments[j]
+                for rows in sums:
+                    for c in range(rows.shape[1]):
+                        rows[i, c] += rows[j, c]
                 n[i] += n[j]
-                touch[i] += touch[j]
                 again = True
                 for label in range(k + 1):
                     if owner[label] == j + 1:
