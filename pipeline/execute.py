@@ -58,12 +58,12 @@ def execute(config: DictConfig, out: Path, overrides: list[str], began: float) -
         warnings.muted = True
         waited = stack.enter_context(prepared(runner, lambda: Runner(graph, config.seed, config.threads, replay, frames, remembered)))
         warnings.muted = False
-        started = time.perf_counter()
         writer = RecordingWriter(out / RECORDING, _metadata(config, overrides))
         attachments = _attachments(graph, replay)
         for name, text in attachments.items():
             writer.attach(name, text)
         truth = attached_truth(attachments, str(writer.path))
+        started = time.perf_counter() - waited()  # so far, for what the recording computes with
         try:
             for _ in _progress(runner.steps(writer, topics, embed_frames="dataset" in topics, truth=truth)):
                 pass
