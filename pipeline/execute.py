@@ -10,7 +10,7 @@ import sys
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -54,9 +54,8 @@ def execute(config: DictConfig, out: Path, overrides: list[str], began: float) -
     runner = Runner(graph, config.seed, config.threads, replay, frames, remembered, _pace(config))
     topics = _recorded_topics(config, graph, replay)
     _announce(runner)
-    with _Warnings() as warnings, ExitStack() as stack:
-        warnings.muted = True
-        waited = stack.enter_context(prepared(runner, lambda: Runner(graph, config.seed, config.threads, replay, frames, remembered)))
+    trial = partial(Runner, graph, config.seed, config.threads, replay, frames, remembered)
+    with _Warnings() as warnings, prepared(runner, trial) as waited:
         warnings.muted = False
         writer = RecordingWriter(out / RECORDING, _metadata(config, overrides))
         attachments = _attachments(graph, replay)
@@ -236,13 +235,13 @@ def _report(out: Path, metrics: dict[str, Any], timing: dict[str, Any], surfaces
 
 
 class _Warnings(logging.Handler):
-    """Collects the warnings of a run: the first of each kind is shown when it comes, all are counted at the end."""
+    """Collects the warnings of a run, once it is no longer `muted`: the first of each kind is shown when it comes, all are counted at the end."""
 
     def __init__(self) -> None:
         super().__init__(logging.WARNING)
         self.counts: Counter[str] = Counter()
         self.first: dict[str, str] = {}
-        self.muted = False
+        self.muted = True
 
     def emit(self, record: logging.LogRecord) -> None:
         if not self.muted:

@@ -20,7 +20,7 @@ from collections.abc import Collection, Iterable, Iterator, Sequence
 from contextlib import AbstractContextManager
 from pathlib import Path
 from types import ModuleType
-from typing import Any
+from typing import Any, TypeVar
 
 import numba
 import numpy as np
@@ -32,6 +32,7 @@ from trihedron.pipeline.interrupts import Interrupts
 types: Any = numba.types  # which says little of its classes
 DISPATCHER: Any = Dispatcher
 Kind = Any  # one of those types
+Kin = TypeVar("Kin", bound="_FirstCalls")
 LISTED = Path(__file__).with_name("kernels.json")
 FEW = 3  # kernels, which the run compiles itself as it comes to them
 MOST = 8  # processes; one alone comes to 1.1 GB, several divide what is to be compiled
@@ -41,21 +42,31 @@ LOOK_S = 0.2  # between two looks of a call that waits, whether a Ctrl-C came
 ARRAY = re.compile(r"(readonly )?(\w+)(?:\[(\d+)([CFA])\])?")
 
 
-class Called(event.Listener):
-    """While this is entered: which kernels the interpreter calls for the first time, (module:name, types of the arguments), and the seconds until
-    each can run. What is compiled as a part of one is forgotten by numba, so that a call of its own is seen too."""
+class _FirstCalls:
+    """While this is entered, `_called` takes the place of what numba does when the interpreter calls a kernel with types it has not met."""
 
     def __init__(self) -> None:
-        self.kernels: dict[tuple[str, tuple[Kind, ...]], float] = {}
         self._compile = DISPATCHER._compile_for_args
-        self._compiled: list[Any] = []
 
-    def __enter__(self) -> Called:
+    def __enter__(self: Kin) -> Kin:
         DISPATCHER._compile_for_args = lambda dispatcher, *arguments: self._called(dispatcher, *arguments)
         return self
 
     def __exit__(self, *_: Any) -> None:
         DISPATCHER._compile_for_args = self._compile
+
+    def _called(self, dispatcher: Any, *arguments: Any) -> Any:
+        raise NotImplementedError
+
+
+class Called(_FirstCalls, event.Listener):
+    """While this is entered: which kernels the interpreter calls for the first time, (module:name, types of the arguments), and the seconds until
+    each can run. What is compiled as a part of one is forgotten by numba, so that a call of its own is seen too."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.kernels: dict[tuple[str, tuple[Kind, ...]], float] = {}
+        self._compiled: list[Any] = []
 
     def on_start(self, compiled: event.Event) -> None:
         self._compiled.append(compiled.data["dispatcher"])
@@ -173,24 +184,20 @@ class Compilation:
             process.wait()
 
 
-class Awaited:
+class Awaited(_FirstCalls):
     """Kernels that are being compiled elsewhere: while this is entered, a call of one of them waits until it is there."""
 
     def __init__(self, rows: Sequence[int]) -> None:
+        super().__init__()
         listed = json.loads(LISTED.read_text())
         self._pending = {_key(*kernel_of(*listed[row])): row for row in rows}
         self._change = threading.Condition()
-        self._compile = DISPATCHER._compile_for_args
         self._waiting, self._began = 0, 0.0
         self.seconds = 0.0  # in which any call waited
 
-    def __enter__(self) -> Awaited:
-        DISPATCHER._compile_for_args = lambda dispatcher, *arguments: self._called(dispatcher, *arguments)
-        return self
-
     def __exit__(self, *_: Any) -> None:
         self.end()
-        DISPATCHER._compile_for_args = self._compile
+        super().__exit__()
 
     def done(self, row: int) -> None:
         """A row need not be waited for any more."""

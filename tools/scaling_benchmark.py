@@ -68,13 +68,13 @@ def main(argv: list[str]) -> int:
     if options.draw:
         figures = read(options.draw)
         print("\n\n".join(report(part, figures[part]) for part in options.parts if part in figures))
+        _write(figures, options.json)
     else:
         for part, rows in {part: _rows(part, options.lengths) for part in options.parts}.items():
             words = [*OF_PART.get(part, []), *options.overrides]
             figures[part] = [_measured(part, name, [*words, *overrides]) for name, overrides in rows.items()]
             print(report(part, figures[part]) + "\n", flush=True)
             _write(figures, options.json)
-    _write(figures, options.json)
     if options.png:
         plot({part: figures[part] for part in options.parts if part in figures}, options.png)
     return 0
