@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 from trihedron.pipeline.registry import register
 from trihedron.pipeline.types import Frame, Normals
-from trihedron.plugins.numerics.depth.patch_normals import block_sums, patch_normals, patch_radii
+from trihedron.plugins.numerics.depth.patch_normals import patch_normals, patch_radii
 
 
 @register("normals", "integral_image")
@@ -39,8 +39,7 @@ class IntegralImage:
     def __call__(self, frame: Frame) -> Normals:
         """Normals on a grid of ceil(h / stride) × ceil(w / stride) cells."""
         camera = frame.camera
-        sums, smooth = block_sums(frame.depth_m, self.stride, self.patch_px, self.jump, self.jump_m)
         intrinsics = (float(camera.fx), float(camera.fy), float(camera.cx), float(camera.cy))
         radii = patch_radii(camera, self.noise_deg, self.patch_px, self.max_patch_px, self.stride)
-        normals = patch_normals(sums, smooth, radii, self.share * self.stride**2, intrinsics)
+        normals = patch_normals(frame.depth_m, self.stride, (self.patch_px, self.jump, self.jump_m), radii, self.share, intrinsics)
         return Normals(index=frame.index, stamp_ns=frame.stamp_ns, normals=normals, stride=self.stride)

@@ -37,30 +37,88 @@ def patch_radii(camera: Camera, noise_deg: float, least_px: float, most_px: floa
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def block_sums(depth: F32, stride: int, reach: int, jump: float, jump_m: float) -> tuple[Records, U8]:
-    """Sums over blocks of stride × stride pixels, as integral images, and which blocks are free of depth edges.
+def patch_normals(
+    depth: F32, stride: int, edge: tuple[int, float, float], radii: I32, share: float, intrinsics: tuple[float, float, float, float]
+) -> F32:
+    """(h, w, 3) unit normals towards the camera of blocks of stride × stride pixels; NaN where a block has no depth or no patch free of depth edges.
 
-    Returns integral images (h+1, w+1) of SUMS over pixels with depth, and (h, w) 0 where a block holds a depth edge, else 1.
-    An edge is two pixels in a row or column, `reach` px apart at most and nothing measured between, that differ by more than `jump·z + jump_m`."""
+    `edge` is as in `_smooth_blocks`; `radii[i]` is the patch's half-width in blocks at a depth of i decimetres (the last entry serves beyond);
+    `share` of the pixels of half a patch must have depth. Any difference of mean points of a plane lies in the plane, so missing pixels do not bias
+    the normal. The mean of a patch's right half less that of its left half is the mean of its horizontal tangents, likewise for the vertical ones.
+    Neighbouring blocks with patches of one size are taken at once. Of the integral images only the rows that patches reach are kept, one after
+    another in the same place: they stay in the processor's caches, where whole ones take twice the time."""
     rows, cols = depth.shape
-    h, w = (rows + stride - 1) // stride, (cols + stride - 1) // stride
-    sums, smooth = np.empty((h + 1, w + 1), SUMS), np.ones((h, w), np.uint8)
+    h, w, most = (rows + stride - 1) // stride, (cols + stride - 1) // stride, radii.max()
+    out, rings = np.empty((h, w), VECTOR), _clear_rings(_smooth_blocks(depth, stride, edge), most)
+    size, last, least, kept = np.empty(w, np.int32), len(radii) - 1, share * stride**2, 2 * most + 2
+    sums, strip, block = np.empty((kept, w + 1), SUMS), np.zeros((stride, w * stride), np.float32), np.empty((4, w))
+    halves, needed = np.empty((4, w), SUMS), np.empty((2, w))  # sums over each patch's east, west, south and north half, and the points these need
+    flat, flat_halves = sums.reshape(-1).view(np.float64), halves.reshape(-1).view(np.float64)
     sums[0].view(np.float64)[:] = 0.0
-    strip, block = np.zeros((stride, w * stride), np.float32), np.empty((4, w))  # the depths of a row of blocks, 0 = none, and their sums
-    above, above_row, marks = np.zeros(cols, np.float32), np.full(cols, -reach - 1, np.int32), np.empty(cols, np.uint8)
+    flat_halves[:] = 0.0
+    done = 0
     for r in range(h):
-        strip[:] = 0.0
-        for y in range(r * stride, min((r + 1) * stride, rows)):
-            z = strip[y - r * stride, :cols]
-            if _marked(depth[y], z, above, above_row, y, reach, jump, jump_m, marks):
-                _spoil(z, above_row, y, reach, jump, jump_m, marks, stride, smooth)
-            _remember(z, above, above_row, y)
-        if stride == 2:  # a constant lets the compiler take several blocks at once
-            _block_row(strip, 2, r, block)
+        while done < min(r + most + 1, h):
+            _strip_of(depth, done * stride, strip)
+            if stride == 2:  # a constant lets the compiler take several blocks at once
+                _block_row(strip, 2, done, block)
+            else:
+                _block_row(strip, stride, done, block)
+            _integrate(block, sums[done % kept], sums[(done + 1) % kept])
+            done += 1
+        _decimetres(sums[r % kept], sums[(r + 1) % kept], size)
+        for c in range(w):
+            size[c] = min(radii[min(size[c], last)], rings[r, c]) if size[c] >= 0 else 0
+        needed[:] = np.inf
+        c = 0
+        while c < w:
+            k, first = size[c], c
+            c += 1
+            if k == 0:
+                continue
+            if first >= k:
+                while c < w - k and size[c] == k:
+                    c += 1
+            _halves(flat, kept, h, w, r, first, c, k, least, flat_halves, needed)
+        _normals_of_row(halves[0], halves[1], halves[2], halves[3], needed, intrinsics, out[r])
+    return out.reshape(-1).view(np.float32).reshape(h, w, 3)
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _smooth_blocks(depth: F32, stride: int, edge: tuple[int, float, float]) -> U8:
+    """(h, w) 0 where a block of stride × stride pixels holds a depth edge, else 1.
+
+    An edge (reach, jump, jump_m) is two pixels in a row or column, `reach` px apart at most and nothing measured between, that differ by more than
+    `jump·z + jump_m`."""
+    rows, cols = depth.shape
+    reach, jump, jump_m = edge
+    smooth = np.ones(((rows + stride - 1) // stride, (cols + stride - 1) // stride), np.uint8)
+    z, marks = np.empty(cols, np.float32), np.empty(cols, np.uint8)
+    above, above_row = np.zeros(cols, np.float32), np.full(cols, -reach - 1, np.int32)
+    for y in range(rows):
+        _known(depth[y], z)
+        if _marked(z, above, above_row, y, reach, jump, jump_m, marks):
+            _spoil(z, above_row, y, reach, jump, jump_m, marks, stride, smooth)
+        _remember(z, above, above_row, y)
+    return smooth
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _known(depth: F32, z: F32) -> None:
+    """Copies a row of depths, 0 = none."""
+    for x in range(len(depth)):
+        z[x] = depth[x] if depth[x] > 0.0 and depth[x] < np.inf else np.float32(0.0)
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _strip_of(depth: F32, first: int, strip: F32) -> None:
+    """The depths of a row of blocks (stride, w · stride), 0 = none."""
+    rows, cols = depth.shape
+    for i in range(len(strip)):
+        if first + i < rows:
+            _known(depth[first + i], strip[i, :cols])
         else:
-            _block_row(strip, stride, r, block)
-        _integrate(block, sums[r], sums[r + 1])
-    return sums, smooth
+            strip[i] = 0.0
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
@@ -69,11 +127,9 @@ def _step(z: float, other: float, jump: float, jump_m: float) -> bool:
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def _marked(depth: F32, z: F32, above: F32, above_row: I32, y: int, reach: int, jump: float, jump_m: float, marks: U8) -> bool:
-    """Copies a row of depths to `z`, 0 = none, and marks in it: 1 = a step from the depth above, 2 = from the pixel on the left, 4 = nothing is
-    measured there. Returns whether there are any."""
-    for x in range(len(z)):
-        z[x] = depth[x] if depth[x] > 0.0 and depth[x] < np.inf else np.float32(0.0)
+def _marked(z: F32, above: F32, above_row: I32, y: int, reach: int, jump: float, jump_m: float, marks: U8) -> bool:
+    """Marks in a row of depths, 0 = none: 1 = a step from the depth above, 2 = from the pixel on the left, 4 = nothing is measured there. Returns
+    whether there are any."""
     for x in range(len(z)):
         marks[x] = (z[x] > 0.0) & (y - above_row[x] <= reach) & _step(z[x], above[x], jump, jump_m)
     here, left, after = z[1:], z[:-1], marks[1:]
@@ -171,8 +227,8 @@ def _decimetres(above: Records, below: Records, out: I32) -> None:
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def _boxes(flat: F64, a: int, b: int, c: int, d: int, out: F64, first: int, n: int) -> None:
-    """Sums over boxes side by side, given by the places of their corners in the flat integral images: a − b − c + d. Numbers that cannot be negative
-    need no test for indices that count from the end, so the compiler takes several at once."""
+    """Sums over boxes side by side, given by the places of their corners in the flat rows of the integral images: a − b − c + d. Numbers that cannot
+    be negative need no test for indices that count from the end, so the compiler takes several at once."""
     i, j, k, m, o = np.uint64(a), np.uint64(b), np.uint64(c), np.uint64(d), np.uint64(first)
     for t in range(np.uint64(n)):
         out[o + t] = flat[i + t] - flat[j + t] - flat[k + t] + flat[m + t]
@@ -189,56 +245,23 @@ def _box(flat: F64, a: int, b: int, c: int, d: int, out: F64, first: int) -> Non
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def patch_normals(sums: Records, smooth: U8, radii: I32, least: float, intrinsics: tuple[float, float, float, float]) -> F32:
-    """(h, w, 3) unit normals towards the camera; NaN where a block has no depth or no patch free of depth edges.
-
-    `sums` and `smooth` as from `block_sums`; `radii[i]` is the patch's half-width in blocks at a depth of i decimetres (the last entry serves
-    beyond); `least` points are needed per block of half a patch, on average. Any difference of mean points of a plane lies in the plane, so missing
-    pixels do not bias the normal. The mean of a patch's right half less that of its left half is the mean of its horizontal tangents, likewise for
-    the vertical ones. Neighbouring blocks with patches of one size are taken at once."""
-    h, w = smooth.shape
-    out, rings = np.empty((h, w), VECTOR), _clear_rings(smooth, radii.max())
-    size, last = np.empty(w, np.int32), len(radii) - 1
-    halves, needed = np.empty((4, w), SUMS), np.empty((2, w))  # sums over each patch's east, west, south and north half, and the points these need
-    flat, flat_halves = sums.reshape(-1).view(np.float64), halves.reshape(-1).view(np.float64)
-    flat_halves[:] = 0.0
-    for r in range(h):
-        _decimetres(sums[r], sums[r + 1], size)
-        for c in range(w):
-            size[c] = min(radii[min(size[c], last)], rings[r, c]) if size[c] >= 0 else 0
-        needed[:] = np.inf
-        c = 0
-        while c < w:
-            k, first = size[c], c
-            c += 1
-            if k == 0:
-                continue
-            if first >= k:
-                while c < w - k and size[c] == k:
-                    c += 1
-            _halves(flat, h, w, r, first, c, k, least, flat_halves, needed)
-        _normals_of_row(halves[0], halves[1], halves[2], halves[3], needed, intrinsics, out[r])
-    return out.reshape(-1).view(np.float32).reshape(h, w, 3)
-
-
-@numba.njit(cache=True, nogil=True, error_model="numpy")
-def _halves(flat: F64, h: int, w: int, r: int, first: int, end: int, k: int, least: float, halves: F64, needed: F64) -> None:
+def _halves(flat: F64, kept: int, h: int, w: int, r: int, first: int, end: int, k: int, least: float, halves: F64, needed: F64) -> None:
     """The halves of the patches, k blocks to each side, of the blocks first … end of a row; only that of a single block may be cut by the image."""
     row, side, place, n = 4 * (w + 1), 4 * w, 4 * first, 4 * (end - first)
     r0, r1, c0, c1 = max(r - k, 0), min(r + k + 1, h), max(first - k, 0), min(first + k + 1, w)
     a, b = (r1 - r0) // 2, (c1 - c0) // 2
-    nw, ne, sw, se = r0 * row + 4 * c0, r0 * row + 4 * c1, r1 * row + 4 * c0, r1 * row + 4 * c1
-    s, t = a * row, 4 * b
+    top, bottom, upper, lower = row * (r0 % kept), row * (r1 % kept), row * ((r0 + a) % kept), row * ((r1 - a) % kept)
+    west, east, t = 4 * c0, 4 * c1, 4 * b
     if n == 4:  # a single block, as most stretches are: nothing to prepare for many
-        _box(flat, se, ne, se - t, ne - t, halves, place)
-        _box(flat, sw + t, nw + t, sw, nw, halves, place + side)
-        _box(flat, se, se - s, sw, sw - s, halves, place + 2 * side)
-        _box(flat, ne + s, ne, nw + s, nw, halves, place + 3 * side)
+        _box(flat, bottom + east, top + east, bottom + east - t, top + east - t, halves, place)
+        _box(flat, bottom + west + t, top + west + t, bottom + west, top + west, halves, place + side)
+        _box(flat, bottom + east, lower + east, bottom + west, lower + west, halves, place + 2 * side)
+        _box(flat, upper + east, top + east, upper + west, top + west, halves, place + 3 * side)
     else:
-        _boxes(flat, se, ne, se - t, ne - t, halves, place, n)
-        _boxes(flat, sw + t, nw + t, sw, nw, halves, place + side, n)
-        _boxes(flat, se, se - s, sw, sw - s, halves, place + 2 * side, n)
-        _boxes(flat, ne + s, ne, nw + s, nw, halves, place + 3 * side, n)
+        _boxes(flat, bottom + east, top + east, bottom + east - t, top + east - t, halves, place, n)
+        _boxes(flat, bottom + west + t, top + west + t, bottom + west, top + west, halves, place + side, n)
+        _boxes(flat, bottom + east, lower + east, bottom + west, lower + west, halves, place + 2 * side, n)
+        _boxes(flat, upper + east, top + east, upper + west, top + west, halves, place + 3 * side, n)
     for c in range(first, end):
         needed[0, c] = max(least * (r1 - r0) * b, 1.0)
         needed[1, c] = max(least * (c1 - c0) * a, 1.0)
