@@ -100,7 +100,9 @@ def _sixteen_bits(data: bytes) -> NDArray[Any]:
 def _metres(values: NDArray[Any], depth_scale: float) -> F32:
     if values.dtype.kind == "f":
         return np.where(np.isfinite(values) & (values > 0), values, 0).astype(np.float32)
-    return values.astype(np.float32) / np.float32(depth_scale)
+    depth = values.astype(np.float32)
+    depth /= np.float32(depth_scale)
+    return depth
 
 
 def _rows(picture: Picture, element: np.dtype[Any], channels: int) -> NDArray[Any]:
