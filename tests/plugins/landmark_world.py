@@ -85,7 +85,7 @@ class World:
         """Segments in view, and the world's row of each."""
         rng = self.rng(index)
         local = transform(invert(T), self.lines)
-        px, inside = clip_segments(local, CAMERA)
+        px, inside = clip_segments(self.lines, invert(T), CAMERA)
         seen = np.flatnonzero(inside & (np.linalg.norm(px[:, 1] - px[:, 0], axis=1) > 40.0))
         ends = np.array([[self._on_line(local[i], pixel) for pixel in px[i]] for i in seen]).reshape(-1, 2, 3)
         sigma = CAMERA.depth_noise.sigma_m(ends[..., 2])

@@ -156,7 +156,7 @@ def test_segments_are_cut_at_the_image_and_at_the_camera():
     through = np.array([[0.0, 0.2, 2.0], [0.0, 0.2, -2.0]])  # passes below the camera and behind it
     behind = np.array([[0.0, 0.2, -1.0], [0.0, 0.4, -2.0]])
     beside = np.array([[5.0, 0.0, 2.0], [6.0, 0.0, 2.0]])
-    pixels, left = clip_segments(np.array([inside, through, behind, beside]), CAMERA)
+    pixels, left = clip_segments(np.array([inside, through, behind, beside]), np.eye(4), CAMERA)
     assert list(left) == [True, True, False, False]
     assert np.allclose(pixels[0], CAMERA.project(inside))
     assert np.allclose(pixels[1, 0], CAMERA.project(through[0])) and np.allclose(pixels[1, 1], [CAMERA.cx, CAMERA.height - 0.5])

@@ -56,9 +56,9 @@ def _points(map: Map, camera: Camera, T_camera_world: F64, ids: I32) -> Keypoint
 
 
 def _lines(map: Map, camera: Camera, T_camera_world: F64, ids: I32) -> Segments:
-    local = transform(T_camera_world, map.lines.rows("endpoints_m", ids))
-    pixels, inside = clip_segments(local, camera)
-    ids, local, pixels = ids[inside], local[inside], pixels[inside]
+    world = map.lines.rows("endpoints_m", ids)
+    pixels, inside = clip_segments(world, T_camera_world, camera)
+    ids, local, pixels = ids[inside], transform(T_camera_world, world[inside]), pixels[inside]
     covariance = rotate_covariance(T_camera_world[:3, :3], inverse(map.lines.rows("information", ids)))
     descriptors = map.lines.rows("descriptor", ids)
     return Segments(map.index, map.stamp_ns, pixels.astype(np.float32), local.astype(np.float32), covariance.astype(np.float32), descriptors)

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Hashable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TypeVar
 
 import numpy as np
 
+from trihedron.pipeline.table import Array
 from trihedron.pipeline.types import F64, I32, Bool, Map, Table
 from trihedron.plugins.numerics.maps.id_sets import among, distinct
 
@@ -23,6 +24,15 @@ class LocalWindow:
     points: I32
     lines: I32
     planes: I32
+    _held: dict[tuple[str, ...], list[Array]] = field(default_factory=dict, repr=False, compare=False)
+
+    def columns(self, map: Map, kind: str, *names: str) -> list[Array]:
+        """What the map that this is a part of holds of all landmarks of a kind ('points', 'lines', 'planes'), in columns: gathered once, since a
+        window stays the same from frame to frame until a keyframe comes."""
+        asked = (kind, *names)
+        if asked not in self._held:
+            self._held[asked] = getattr(map, kind).gathered(getattr(self, kind), *names)
+        return self._held[asked]
 
 
 def _once(map: Map, key: Hashable, find: Callable[[], T]) -> T:

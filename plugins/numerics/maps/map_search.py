@@ -9,12 +9,13 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from trihedron.pipeline.geometry import invert, transform, transform_planes
+from trihedron.pipeline.geometry import invert
 from trihedron.pipeline.types import F64, I32, U8, Camera, Frame, Keypoints, Map, Matches, Planes, Segments
+from trihedron.plugins.numerics.algebra.constant_arrays import constant
 from trihedron.plugins.numerics.images.descriptors import match_lines, match_near
 from trihedron.plugins.numerics.maps.local_window import LocalWindow
-from trihedron.plugins.numerics.maps.visibility import VisiblePoints, clip_segments, visible_points
-from trihedron.plugins.numerics.planes.plane_association import associate_planes
+from trihedron.plugins.numerics.maps.visibility import POINT_COLUMNS, VisiblePoints, clip_segments, visible_points
+from trihedron.plugins.numerics.planes.plane_association import associate_planes, moved_planes
 
 
 @dataclass(frozen=True)
@@ -70,24 +71,22 @@ class MapSearch:
         same, parallel, perpendicular = self._planes(T_camera_world, planes, map, window)
         return Matches(frame.index, frame.stamp_ns, map.revision, pairs, line_pairs, same, parallel, perpendicular, visible, visible_lines)
 
-    def _radius(self, camera: Camera, z: F64, guess: Guess) -> F64:
-        """Search radius (px at level 0) for points at depth z: three standard deviations of the guess."""
-        moved = guess.sigma_m / np.maximum(z, 0.1)
-        return np.minimum(self.radius_px + 3.0 * camera.fx * np.hypot(moved, guess.sigma_rad), self.max_radius_px)
-
     def _points(self, camera: Camera, guess: Guess, keypoints: Keypoints, map: Map, window: LocalWindow) -> tuple[I32, I32]:
         """Pairs (row, id) and the ids expected in view."""
-        seen = visible_points(map.points, window.points, guess.T_world_camera, camera, self.view_deg, self.octave_scale)
-        descriptors = map.points.rows("descriptor", seen.ids)
-        found = self._near(seen, descriptors, keypoints, self._radius(camera, seen.depth_m, guess))
-        if not guess.measured or np.count_nonzero(found >= 0) < min(self.enough, len(seen.ids), len(keypoints.pixels)):
-            found = self._near(seen, descriptors, keypoints, np.full(len(seen.ids), self.wide_radius_px))
-        return _pairs(found, seen.ids), seen.ids
+        known = window.columns(map, "points", *POINT_COLUMNS, "descriptor")
+        seen = visible_points(known[:-1], guess.T_world_camera, camera, self.view_deg, self.octave_scale)
+        ids, descriptors = window.points[seen.rows], known[-1][seen.rows]
+        moved = guess.sigma_m / np.maximum(seen.depth_m, 0.1)  # how far the guess may be off: three standard deviations of it are searched
+        radius = np.minimum(self.radius_px + 3.0 * camera.fx * np.hypot(moved, guess.sigma_rad), self.max_radius_px)
+        found = self._near(seen, descriptors, keypoints, radius)
+        if not guess.measured or np.count_nonzero(found >= 0) < min(self.enough, len(ids), len(keypoints.pixels)):
+            found = self._near(seen, descriptors, keypoints, self.wide_radius_px)
+        return _pairs(found, ids, len(keypoints.pixels)), ids
 
-    def _near(self, seen: VisiblePoints, descriptors: U8, keypoints: Keypoints, radius_px: F64) -> I32:
-        """The row found for each point expected in view, or -1; `radius_px` (n,) at level 0."""
+    def _near(self, seen: VisiblePoints, descriptors: U8, keypoints: Keypoints, radius_px: F64 | float) -> I32:
+        """The row found for each point expected in view, or -1; `radius_px` at level 0."""
         return match_near(
-            seen.pixels.astype(np.float32),
+            seen.pixels,
             descriptors,
             seen.octaves,
             keypoints.pixels,
@@ -101,11 +100,12 @@ class MapSearch:
         )
 
     def _lines(self, camera: Camera, T_camera_world: F64, segments: Segments, map: Map, window: LocalWindow) -> tuple[I32, I32]:
-        pixels, inside = clip_segments(transform(T_camera_world, map.lines.rows("endpoints_m", window.lines)), camera)
+        endpoints, descriptors = window.columns(map, "lines", "endpoints_m", "descriptor")
+        pixels, inside = clip_segments(endpoints, T_camera_world, camera)
         ids = window.lines[inside]
         found = match_lines(
             pixels[inside].astype(np.float32),
-            map.lines.rows("descriptor", ids),
+            descriptors[inside],
             segments.endpoints_px,
             segments.descriptors,
             self.line_angle_deg,
@@ -114,13 +114,12 @@ class MapSearch:
             self.line_distance,
             self.line_ratio,
         )
-        return _pairs(found, ids), ids
+        return _pairs(found, ids, len(segments.endpoints_px)), ids
 
     def _planes(self, T_camera_world: F64, planes: Planes, map: Map, window: LocalWindow) -> tuple[I32, I32, I32]:
         """Pairs (row, id) of the same plane, of parallel and of perpendicular ones."""
-        world, samples, covariance = map.planes.gathered(window.planes, "coefficients", "samples_m", "covariance")
-        known = transform_planes(T_camera_world, world)
-        samples = transform(T_camera_world, samples).astype(np.float32)
+        world, samples, covariance = window.columns(map, "planes", "coefficients", "samples_m", "covariance")
+        known, samples = moved_planes(world, samples, constant(T_camera_world[:3, :3], np.float64), constant(T_camera_world[:3, 3], np.float64))
         same = associate_planes(planes.coefficients, planes.samples_m, known, samples, self.plane_angle_deg, self.plane_distance_m, True)
         order = (covariance[:, 0, 0] + covariance[:, 1, 1]).argsort(kind="stable")  # those whose normals are known best first
         limit = math.radians(self.parallel_deg)
@@ -156,10 +155,15 @@ def _related(
     return parallel[:p], perpendicular[:q]
 
 
-def _pairs(found: I32, ids: I32) -> I32:
-    """Row found for each landmark (-1 = none) -> (n, 2) pairs (row, id) sorted by row."""
-    hit = np.flatnonzero(found >= 0)
-    hit = hit[found[hit].argsort(kind="stable")]
-    pairs = np.empty((len(hit), 2), np.int32)
-    pairs[:, 0], pairs[:, 1] = found[hit], ids[hit]
-    return pairs
+@numba.njit(cache=True, error_model="numpy")
+def _pairs(found: I32, ids: I32, count: int) -> I32:
+    """Of `count` rows the one found for each landmark (-1 = none), no row for two -> (n, 2) pairs (row, id) sorted by row."""
+    owner, pairs, n = np.full(count, -1, np.int32), np.empty((len(found), 2), np.int32), 0
+    for i in range(len(found)):
+        if found[i] >= 0:
+            owner[found[i]] = ids[i]
+    for row in range(count):
+        if owner[row] >= 0:
+            pairs[n, 0], pairs[n, 1] = row, owner[row]
+            n += 1
+    return pairs[:n]

@@ -61,7 +61,7 @@ def merge_lines(map: Map, view: View, visible: I32) -> Map:
     idle = visible[map.lines.rows("alive", visible) & ~among(visible, seen)]
     sides = []
     for ids in (idle, seen):
-        pixels, inside = clip_segments(transform(invert(view.T_world_camera), map.lines.rows("endpoints_m", ids)), view.camera)
+        pixels, inside = clip_segments(map.lines.rows("endpoints_m", ids), invert(view.T_world_camera), view.camera)
         pixels[~inside] = np.nan
         sides.append((pixels.astype(np.float32), map.lines.rows("descriptor", ids)))
     found = match_lines(*sides[0], *sides[1], LINE_DEG, NEAR_PX, LINE_OVERLAP, LINE_BITS, 1.0)

@@ -2,37 +2,42 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import math
+from collections.abc import Sequence
+from typing import NamedTuple
 
 import numba
 import numpy as np
 
 from trihedron.pipeline.geometry import invert, transform
+from trihedron.pipeline.table import Array
 from trihedron.pipeline.types import F32, F64, I32, U8, Bool, Camera, Frame, Table
 from trihedron.plugins.numerics.algebra.constant_arrays import constant
 
+POINT_COLUMNS = "position_m", "direction", "distance_m", "octave"  # what says whether a point is to be seen
 NEAR_M = 0.1
 HIDDEN_M, HIDDEN_SIGMAS = 0.1, 5.0  # of depth, by which something is in front
 MAX_SCALE_CHANGE = 2.0  # of the distance; beyond, a point does not look the same
 
 
-@dataclass(frozen=True)
-class VisiblePoints:
-    """Landmark ids (n,) with pixel (n, 2), depth (n,) and predicted octave (n,)."""
+class VisiblePoints(NamedTuple):
+    """Rows (n,) of the points asked for with pixel (n, 2), depth (n,) and predicted octave (n,)."""
 
-    ids: I32
-    pixels: F64
+    rows: I32
+    pixels: F32
     depth_m: F64
     octaves: U8
 
 
-def visible_points(points: Table, ids: I32, T_world_camera: F64, camera: Camera, view_deg: float, octave_scale: float) -> VisiblePoints:
-    """Those of the points `ids` that lie in the image, are seen from within `view_deg` of the last direction and at a similar distance."""
-    world, directions, distances, seen_at = points.gathered(ids, "position_m", "direction", "distance_m", "octave")
-    cosine, log_scale = float(np.cos(np.radians(view_deg))), float(np.log(octave_scale))
-    T, pinhole = constant(T_world_camera, np.float64), _pinhole(camera)
-    rows, pixels, depth, octaves = _seen(world, directions, distances, seen_at, T, pinhole, cosine, log_scale)
-    return VisiblePoints(ids[rows], pixels, depth, octaves)
+def visible_points(
+    points: Sequence[Array], T_world_camera: F64, camera: Camera, view_deg: float, octave_scale: float
+) -> VisiblePoints:
+    """Those of the points, given by their columns `POINT_COLUMNS`, that lie in the image, are seen from within `view_deg` of the last direction and
+    at a similar distance."""
+    cosine, log_scale = math.cos(math.radians(view_deg)), math.log(octave_scale)
+    position, direction, distance, octave = points
+    T = constant(T_world_camera, np.float64)
+    return VisiblePoints(*_seen(position, direction, distance, octave, T, _pinhole(camera), cosine, log_scale))
 
 
 def _pinhole(camera: Camera) -> tuple[float, float, float, float, int, int]:
@@ -44,11 +49,11 @@ def _pinhole(camera: Camera) -> tuple[float, float, float, float, int, int]:
 def _seen(
     points: F64, directions: F32, distances: F32, octaves: U8, T_world_camera: F64, intrinsics: tuple[float, float, float, float, int, int],
     cosine: float, log_scale: float,
-) -> tuple[I32, F64, F64, U8]:  # fmt: skip
-    """Rows of the points that should be seen, their pixels (n, 2), depths and octaves (n,)."""
+) -> tuple[I32, F32, F64, U8]:  # fmt: skip
+    """The fields of `VisiblePoints`."""
     fx, fy, cx, cy, width, height = intrinsics
     rows, n = np.empty(len(points), np.int32), 0
-    pixels, depth, levels = np.empty((len(points), 2)), np.empty(len(points)), np.empty(len(points), np.uint8)
+    pixels, depth, levels = np.empty((len(points), 2), np.float32), np.empty(len(points)), np.empty(len(points), np.uint8)
     R, t = T_world_camera[:3, :3], T_world_camera[:3, 3]
     for i in range(len(points)):
         x, y, z = points[i, 0] - t[0], points[i, 1] - t[1], points[i, 2] - t[2]
@@ -91,26 +96,29 @@ def in_image(pixels: F64, camera: Camera) -> Bool:
     return inside
 
 
-def clip_segments(endpoints_m: F64, camera: Camera) -> tuple[F64, Bool]:
-    """Project camera-frame segments (n, 2, 3), cut where they pass behind the camera or leave the image.
+def clip_segments(endpoints_m: F64, T_camera_world: F64, camera: Camera) -> tuple[F64, Bool]:
+    """Project segments (n, 2, 3) of the world, cut where they pass behind the camera or leave the image.
 
     Returns (n, 2, 2) pixels and (n,) whether anything (more than a pixel) is left (Liang–Barsky)."""
-    pixels, left = _clipped(constant(endpoints_m, np.float64), _pinhole(camera))
+    pixels, left = _clipped(constant(endpoints_m, np.float64), constant(T_camera_world, np.float64), _pinhole(camera))
     return pixels, left
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def _clipped(endpoints: F64, intrinsics: tuple[float, float, float, float, int, int]) -> tuple[F64, Bool]:
+def _clipped(world: F64, T: F64, intrinsics: tuple[float, float, float, float, int, int]) -> tuple[F64, Bool]:
     fx, fy, cx, cy, width, height = intrinsics
-    pixels, left = np.empty((len(endpoints), 2, 2)), np.zeros(len(endpoints), np.bool_)
-    for i in range(len(endpoints)):
-        start, end = endpoints[i, 0, 2], endpoints[i, 1, 2]
+    pixels, left, local = np.empty((len(world), 2, 2)), np.zeros(len(world), np.bool_), np.empty((2, 3))
+    for i in range(len(world)):
+        for k in range(2):
+            for a in range(3):
+                local[k, a] = T[a, 0] * world[i, k, 0] + T[a, 1] * world[i, k, 1] + T[a, 2] * world[i, k, 2] + T[a, 3]
+        start, end = local[0, 2], local[1, 2]
         cut = (NEAR_M - start) / (1e-9 if abs(end - start) < 1e-9 else end - start)
         for k in range(2):
-            x, y, z = endpoints[i, k, 0], endpoints[i, k, 1], endpoints[i, k, 2]
+            x, y, z = local[k, 0], local[k, 1], local[k, 2]
             if z < NEAR_M:
-                x = endpoints[i, 0, 0] + cut * (endpoints[i, 1, 0] - endpoints[i, 0, 0])
-                y = endpoints[i, 0, 1] + cut * (endpoints[i, 1, 1] - endpoints[i, 0, 1])
+                x = local[0, 0] + cut * (local[1, 0] - local[0, 0])
+                y = local[0, 1] + cut * (local[1, 1] - local[0, 1])
                 z = start + cut * (end - start)
             pixels[i, k, 0], pixels[i, k, 1] = fx * x / z + cx, fy * y / z + cy
         low, high = 0.0, 1.0

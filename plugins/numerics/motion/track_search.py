@@ -15,7 +15,7 @@ from trihedron.plugins.numerics.images.descriptors import U64, line_matches, nea
 from trihedron.plugins.numerics.images.flow import moved_pixel
 from trihedron.plugins.numerics.motion.relative_motion import Motion
 from trihedron.plugins.numerics.motion.track_pairs import Features, rows_of_pairs, tracks_value
-from trihedron.plugins.numerics.planes.plane_association import associated
+from trihedron.plugins.numerics.planes.plane_association import associated, moved_planes
 
 Intrinsics = tuple[float, float, float, float]
 
@@ -111,14 +111,7 @@ def _moved(before: Places, planes: F64, samples_m: F32, camera: Intrinsics, R: F
     for i in range(len(ends)):
         for e in range(2):
             ends[i, e, 0], ends[i, e, 1] = _end_there(before, i, e, camera, R, t)
-    coefficients, samples = np.empty((len(planes), 4)), np.empty((len(planes), samples_m.shape[1], 3), np.float32)
-    for i in range(len(planes)):
-        coefficients[i, 3] = planes[i, 3]
-        for a in range(3):
-            coefficients[i, a] = R[a, 0] * planes[i, 0] + R[a, 1] * planes[i, 1] + R[a, 2] * planes[i, 2]
-            coefficients[i, 3] -= coefficients[i, a] * t[a]
-            for k in range(samples_m.shape[1]):
-                samples[i, k, a] = R[a, 0] * samples_m[i, k, 0] + R[a, 1] * samples_m[i, k, 1] + R[a, 2] * samples_m[i, k, 2] + t[a]
+    coefficients, samples = moved_planes(planes, samples_m, R, t)
     return pixels, ends, coefficients, samples
 
 

@@ -115,3 +115,17 @@ def associated(a: F64, samples_a: F32, b: F64, samples_b: F32, cosine: float, li
     for k in range(len(rows)):
         out[k, 0], out[k, 1] = rows[k], pairs[rows[k]]
     return out
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def moved_planes(planes: F64, samples_m: F32, R: F64, t: F64) -> tuple[F64, F32]:
+    """Planes (p, 4) and points on them (p, s, 3) where the motion `p -> R p + t` puts them."""
+    coefficients, samples = np.empty((len(planes), 4)), np.empty((len(planes), samples_m.shape[1], 3), np.float32)
+    for i in range(len(planes)):
+        coefficients[i, 3] = planes[i, 3]
+        for a in range(3):
+            coefficients[i, a] = R[a, 0] * planes[i, 0] + R[a, 1] * planes[i, 1] + R[a, 2] * planes[i, 2]
+            coefficients[i, 3] -= coefficients[i, a] * t[a]
+            for k in range(samples_m.shape[1]):
+                samples[i, k, a] = R[a, 0] * samples_m[i, k, 0] + R[a, 1] * samples_m[i, k, 1] + R[a, 2] * samples_m[i, k, 2] + t[a]
+    return coefficients, samples
