@@ -50,7 +50,7 @@ def inverse_positive(H: F64) -> F64:
     return out
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@numba.njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
 def invert_symmetric(S: F64, out: F64) -> float:
     """Inverse of a symmetric S (3, 3), in single precision too, into `out`, by cofactors; returns the determinant."""
     a, b, c = np.float64(S[0, 0]), np.float64(S[0, 1]), np.float64(S[0, 2])

@@ -63,7 +63,7 @@ def _line_terms(
     return LineTerms(points, covariance, seen_px, sigmas_px, seen_m, noise)
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@numba.njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
 def _share_opposite(line_m: F64, pixel: F64, T: F64, camera: F64) -> float:
     """Where along a world line (2, 3; 0 = start, 1 = end) lies the point nearest to the ray through a pixel, from the camera's pose T (4, 4). With d
     along the line and r the ray, `r × (d × r) = d (r·r) - r (r·d)` is normal to the ray in the plane it spans with the line."""

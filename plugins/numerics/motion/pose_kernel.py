@@ -41,7 +41,7 @@ class Chi2(NamedTuple):
     planes: F64
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@numba.njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
 def _chi2(r: F64, W: F64, rows: int, e: F64) -> float:
     """rᵀ W r, with `e = W r` left for `_add`."""
     chi2 = 0.0
@@ -53,7 +53,7 @@ def _chi2(r: F64, W: F64, rows: int, e: F64) -> float:
     return chi2
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@numba.njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
 def _huber(chi2: float, limit: float, robust: bool) -> tuple[float, float]:
     """Weight and cost of a term whose χ² may lie beyond the limit."""
     if robust and chi2 > limit:
@@ -61,12 +61,13 @@ def _huber(chi2: float, limit: float, robust: bool) -> tuple[float, float]:
     return 1.0, chi2
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
-def _add(chi2: float, e: F64, J: F64, rows: int, W: F64, limit: float, robust: bool, H: F64, g: F64) -> float:
-    """Add one term to the normal equations `H dx = -g` (Huber beyond `limit` when robust); returns its cost."""
+@numba.njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
+def _add(chi2: float, e: F64, J: F64, rows: int, W: F64, limit: float, robust: bool, first: int, H: F64, g: F64) -> float:
+    """Add one term, which does not know of the unknowns before the `first`, to the normal equations `H dx = -g` (Huber beyond `limit` when
+    robust); returns its cost."""
     w, cost = _huber(chi2, limit, robust)
     for i in range(rows):
-        for b in range(6):
+        for b in range(first, 6):
             WJ = 0.0
             for j in range(rows):
                 WJ += w * W[i, j] * J[j, b]
@@ -144,7 +145,7 @@ def _add_points(R: F64, t: F64, camera: F64, terms: PointTerms, W: F64, flags: U
     return cost
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@numba.njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
 def _add_pair(r0: float, r1: float, W: F64, i: int, J: F64, counts: bool, robust: bool, H: F64, g: F64) -> tuple[float, float]:
     """χ² and cost of term i with residuals r, derivatives J (2, 6) and weights W (·, 2, 2), added to the normal equations if it `counts`; χ² is inf,
     and nothing is added, where it is none."""
@@ -204,14 +205,14 @@ def _add_lines(
     return cost
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@numba.njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
 def _chain(a: float, b: float, c: float, p: F64, k: int, J: F64) -> None:
     """Row k of J (·, 6) from the derivative (a, b, c) with respect to the camera-frame point in row k of p, as `chain_point`."""
     J[k, 0], J[k, 1], J[k, 2] = -a, -b, -c
     J[k, 3], J[k, 4], J[k, 5] = b * p[k, 2] - c * p[k, 1], c * p[k, 0] - a * p[k, 2], a * p[k, 1] - b * p[k, 0]
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@numba.njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
 def gate(rows: int) -> float:
     """95 % of χ² with 1, 2 or 3 degrees of freedom."""
     return CHI2_3 if rows == 3 else (CHI2_2 if rows == 2 else CHI2_1)
@@ -229,7 +230,7 @@ def _add_planes(R: F64, t: F64, terms: PlaneTerms, W: F64, flags: U8, H: F64, g:
             chi2[i] = np.inf
             cost += BEHIND if flags[i] else 0.0
         elif flags[i]:
-            cost += _add(chi2[i], e, J, rows, W[i], gate(rows), True, H, g)
+            cost += _add(chi2[i], e, J, rows, W[i], gate(rows), True, 0 if rows == 3 else 3, H, g)
     return cost
 
 

@@ -33,7 +33,7 @@ class Weights(NamedTuple):
     planes: F64  # (p, 3, 3)
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@numba.njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
 def invert_small(S: F64, rows: int, W: F64) -> None:
     """Inverse of the leading block of 1, 2 or 3 rows of a symmetric matrix into W; the rest 0."""
     for i in range(len(W)):
@@ -59,17 +59,18 @@ def invert_small(S: F64, rows: int, W: F64) -> None:
             W[i, j] /= det
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@numba.njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
 def _spread(d: F64, R: F64, S: F64) -> float:
     """Variance along the camera-frame direction d of a world covariance S."""
-    total = 0.0
-    for i in range(3):
-        for j in range(3):
-            total += (R[i, 0] * d[0] + R[i, 1] * d[1] + R[i, 2] * d[2]) * S[i, j] * (R[j, 0] * d[0] + R[j, 1] * d[1] + R[j, 2] * d[2])
-    return total
+    x = R[0, 0] * d[0] + R[0, 1] * d[1] + R[0, 2] * d[2]
+    y = R[1, 0] * d[0] + R[1, 1] * d[1] + R[1, 2] * d[2]
+    z = R[2, 0] * d[0] + R[2, 1] * d[1] + R[2, 2] * d[2]
+    total = x * S[0, 0] * x + x * S[0, 1] * y + x * S[0, 2] * z
+    total = total + y * S[1, 0] * x + y * S[1, 1] * y + y * S[1, 2] * z
+    return total + z * S[2, 0] * x + z * S[2, 1] * y + z * S[2, 2] * z
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@numba.njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
 def _quadratic(d: F64, S: F64) -> float:
     total = 0.0
     for i in range(3):
@@ -117,7 +118,7 @@ def _weigh_points(R: F64, t: F64, camera: F64, terms: PointTerms, W: F64) -> Non
         W[i, 1, 0], W[i, 2, 0], W[i, 2, 1] = W[i, 0, 1], W[i, 0, 2], W[i, 1, 2]
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@numba.njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
 def _pair_noise(s0: float, s1: float, at_start: float, at_end: float, map0: float, map1: float, S: F64) -> None:
     """Covariance of the distances at parameters s0, s1 along a segment whose ends have the given variances, plus those of the map's points."""
     S[0, 0] = (1.0 - s0) ** 2 * at_start + s0 * s0 * at_end + map0
@@ -150,7 +151,7 @@ def _weigh_lines(R: F64, t: F64, camera: F64, terms: LineTerms, W: F64, V: F64) 
             invert_small(S, len(S), V[i])
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@numba.njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
 def rows_of(kind: int) -> int:
     """Number of residuals of a kind of plane term."""
     return 3 if kind == SAME else (1 if kind == PERPENDICULAR else 2)
@@ -164,13 +165,15 @@ def _weigh_planes(R: F64, t: F64, terms: PlaneTerms, W: F64) -> None:
         basis(terms.coefficients[i], Bw)
         basis(terms.observed[i], B)
         plane_slopes(terms.kinds[i], R, t, terms.coefficients[i], terms.observed[i], Bw, B, F, G)
-        for a in range(3):
-            for b in range(3):
-                S[a, b] = 0.0
-                for j in range(3):
-                    for k in range(3):
-                        S[a, b] += F[a, j] * terms.covariance[i, j, k] * F[b, k] + G[a, j] * terms.observed_covariance[i, j, k] * G[b, k]
-        invert_small(S, rows_of(terms.kinds[i]), W[i])
+        rows, numbers = rows_of(terms.kinds[i]), 3 if terms.kinds[i] == SAME else 2  # of how far away walls are, relations say nothing
+        for a in range(rows):
+            for b in range(rows):
+                total = 0.0
+                for j in range(numbers):
+                    for k in range(numbers):
+                        total += F[a, j] * terms.covariance[i, j, k] * F[b, k] + G[a, j] * terms.observed_covariance[i, j, k] * G[b, k]
+                S[a, b] = total
+        invert_small(S, rows, W[i])
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")

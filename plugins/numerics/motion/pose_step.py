@@ -68,10 +68,10 @@ def add_prior(R: F64, t: F64, R_prior: F64, t_prior: F64, prior: F64, H: F64, g:
             e[a] += prior[a, b] * r[b]
         cost += e[a] * r[a]
     for a in range(6):
-        for k in range(6):
+        for k in range(a // 3 * 3, a // 3 * 3 + 3):  # J is two blocks
             g[a] += J[k, a] * e[k]
             for b in range(a + 1):
-                for j in range(6):
+                for j in range(b // 3 * 3, b // 3 * 3 + 3):
                     H[a, b] += J[k, a] * prior[k, j] * J[j, b]
     return cost
 

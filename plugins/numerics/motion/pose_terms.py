@@ -2,6 +2,9 @@
 
 The pose is `R, t` of `T_world_camera`; derivatives are with respect to `xi = (rho, phi)` in `T_world_camera · Exp(xi)`, so that a camera-frame
 point p moves with `dp/drho = -I`, `dp/dphi = [p]×`. `camera` is (fx, fy, cx, cy).
+
+What is called for each term is made part of its caller (`forceinline`): to hand over an array takes numba seven numbers and a count of references,
+as long as what is done with it here.
 """
 
 from __future__ import annotations
@@ -60,7 +63,7 @@ def rotation_and_translation(T: F64) -> tuple[F64, F64]:
     return R, t
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@numba.njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
 def to_camera(R: F64, t: F64, world: F64, out: F64) -> None:
     """`out = Rᵀ (world - t)`."""
     x, y, z = world[0] - t[0], world[1] - t[1], world[2] - t[2]
@@ -99,7 +102,7 @@ def point_rows(p: F64, pixel: F64, depth_m: float, camera: F64, r: F64, D: F64) 
     return True
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@numba.njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
 def line_row(p: F64, segment_px: F64, camera: F64, D: F64) -> tuple[float, float]:
     """Signed distance (px) of the projection of camera-frame point p from the line through `segment_px` (2, 2), and where along the segment
     it falls (0 = start, 1 = end). D (3,) is the distance's derivative. The line is normalised by √(a² + b²). p must be in front."""
@@ -114,7 +117,7 @@ def line_row(p: F64, segment_px: F64, camera: F64, D: F64) -> tuple[float, float
     return a * x + b * y, (dx * x + dy * y) / (length * length)
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@numba.njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
 def depth_direction(observed_m: F64, m: F64) -> bool:
     """m (3,): the unit vector normal to an observed 3D segment (2, 3) within the plane through it and the camera centre, the direction the image
     cannot see. False when the segment has NaN or points at the camera."""
@@ -130,7 +133,7 @@ def depth_direction(observed_m: F64, m: F64) -> bool:
     return True
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@numba.njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
 def line_depth_row(p: F64, observed_m: F64, m: F64) -> tuple[float, float]:
     """Distance (m) of camera-frame point p from an observed 3D segment along m (its derivative), and where along the segment it falls."""
     x, y, z = p[0] - observed_m[0, 0], p[1] - observed_m[0, 1], p[2] - observed_m[0, 2]
@@ -138,7 +141,7 @@ def line_depth_row(p: F64, observed_m: F64, m: F64) -> tuple[float, float]:
     return m[0] * x + m[1] * y + m[2] * z, (dx * x + dy * y + dz * z) / max(dx * dx + dy * dy + dz * dz, 1e-12)
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@numba.njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
 def basis(n: F64, B: F64) -> None:
     """B (3, 2): `geometry.tangent_basis` of the unit vector n."""
     s = 1.0 if n[2] >= 0.0 else -1.0
@@ -148,7 +151,7 @@ def basis(n: F64, B: F64) -> None:
     B[0, 1], B[1, 1], B[2, 1] = b, s + n[1] * n[1] * a, -n[1]
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@numba.njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
 def plane_rows(kind: int, R: F64, t: F64, world: F64, observed: F64, B: F64, r: F64, J: F64) -> int:
     """Residual r (3,) and J (3, 6) of a plane pair; returns the number of rows. B is `basis` of the observed normal.
 
@@ -178,7 +181,7 @@ def plane_rows(kind: int, R: F64, t: F64, world: F64, observed: F64, B: F64, r: 
     return 3
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@numba.njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
 def plane_slopes(kind: int, R: F64, t: F64, world: F64, observed: F64, Bw: F64, B: F64, F: F64, G: F64) -> None:
     """Derivatives (3, 3) of `plane_rows` by the (a, b, d) of the map plane, F, and of the observed one, G, of bases Bw and B; signs apart."""
     for i in range(3):

@@ -103,7 +103,7 @@ def placed_points(points: F32, sigma_px: F32, sigma_m: F32, fx: float, fy: float
     return world, covariance
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@numba.njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
 def _sandwich(A: F64, C: F64, M: F64, out: F64) -> None:
     """`out = A C Aᵀ`, all (3, 3); M is scratch."""
     for a in range(3):
