@@ -73,20 +73,20 @@ def test_the_derivatives_of_a_line(view, share):
     T, _, line, segment = view
     N, m = np.empty((3, 2)), np.empty(3)
     line_basis(line, N)
-    J_pose, J_line, D, p = np.empty(6), np.empty(4), np.empty((1, 3)), np.empty(3)
+    J, p = np.empty(10), np.empty(3)
     observed = np.array([[0.7, -0.2, 2.3], [0.0, -0.1, 2.8]])
     assert depth_direction(observed, m)
 
     def image(T, line):
-        return np.array([terms.line_term(*parts(T), line, N, share, segment, INTRINSICS, J_pose, J_line, D, p)[0]])
+        return np.array([terms.line_term(*parts(T), line, N, share, segment, INTRINSICS, J, p)[0]])
 
     def depth(T, line):
         image(T, line)
-        return np.array([terms.line_depth_term(parts(T)[0], N, share, observed, m, J_pose, J_line, D, p)[0]])
+        return np.array([terms.line_depth_term(parts(T)[0], N, share, observed, m, J, p)[0]])
 
     for residual in (image, depth):
         residual(T, line)
-        by_pose, by_line = J_pose.copy(), J_line.copy()
+        by_pose, by_line = J[:6].copy(), J[6:].copy()
         assert np.allclose(by_pose, numeric(lambda d, f=residual: f(shifted(T, d), line), 6)[0], rtol=1e-6, atol=1e-5)
         by_hand = numeric(lambda d, f=residual: f(T, line + np.stack([N @ d[:2], N @ d[2:]])), 4)[0]
         assert np.allclose(by_line, by_hand, rtol=1e-6, atol=1e-5)

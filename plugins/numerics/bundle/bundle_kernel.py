@@ -38,25 +38,15 @@ def _loss(chi2: float, limit: float, loss: int) -> tuple[float, float]:
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def _add_row(r: float, w: float, Jc: F64, Jl: F64, size: int, pose: int, H: F64, g: F64, V: F64, b: F64, W: F64) -> None:
-    """Add one residual of weight w; `pose` is where its keyframe's unknowns begin, negative for a held one; `size` unknowns of the landmark."""
-    for i in range(size):
-        b[i] += w * Jl[i] * r
-        for j in range(i + 1):
-            V[i, j] += w * Jl[i] * Jl[j]
-    if pose < 0:
-        return
+def _clear(W: F64) -> None:
+    """A block (6, 4) of W that nothing is known of."""
     for i in range(6):
-        wj = w * Jc[i]
-        g[pose + i] += wj * r
-        for j in range(i + 1):
-            H[pose + i, pose + j] += wj * Jc[j]
-        for j in range(size):
-            W[i, j] += wj * Jl[j]
+        for j in range(4):
+            W[i, j] = 0.0
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def _add_points(state: BundleState, seen: BundleMeasurements, loss: int, out: NormalEquations) -> float:
+def _add_points(state: BundleState, seen: BundleMeasurements, loss: int, out: NormalEquations, filled: bool) -> float:
     """All points: `point_rows` and its derivatives in scalars, since they are most of the work.
 
     With D = dr/dp, A = DᵀWD and P = [p]×, those by the pose are (-D, DP) and that by the point is DRᵀ."""
@@ -71,6 +61,7 @@ def _add_points(state: BundleState, seen: BundleMeasurements, loss: int, out: No
             p0, p1, p2 = R[0, 0] * x + R[1, 0] * y + R[2, 0] * d, R[0, 1] * x + R[1, 1] * y + R[2, 1] * d, R[0, 2] * x + R[1, 2] * y + R[2, 2] * d
             if not p2 > NEAR_M:
                 cost += BEHIND
+                _clear(out.W[o])
                 continue
             iz = 1.0 / p2
             d00, d11, d22 = seen.intrinsics[k, 0] * iz, seen.intrinsics[k, 1] * iz, -iz * iz if deep else 0.0
@@ -82,6 +73,8 @@ def _add_points(state: BundleState, seen: BundleMeasurements, loss: int, out: No
             v = (z * z / seen.sigma_m[o]) ** 2 if deep else 0.0
             weight, share = _loss(w * (r0 * r0 + r1 * r1) + v * r2 * r2, CHI2_3 if deep else CHI2_2, loss)
             cost += share
+            if not filled:
+                continue
             w, v = w * weight, v * weight
             a00, a02, a11, a12 = w * d00 * d00, w * d00 * d02, w * d11 * d11, w * d11 * d12
             a22 = w * (d02 * d02 + d12 * d12) + v * d22 * d22
@@ -100,8 +93,7 @@ def _add_points(state: BundleState, seen: BundleMeasurements, loss: int, out: No
             if k >= seen.free:
                 continue
             for a in range(6):
-                for j in range(3):
-                    W[o, a, j] -= E[a, j]
+                W[o, a, 0], W[o, a, 1], W[o, a, 2], W[o, a, 3] = -E[a, 0], -E[a, 1], -E[a, 2], 0.0
             m00, m01, m02 = p1 * a02, p1 * a12 - p2 * a11, p1 * a22 - p2 * a12  # P A
             m10, m11, m12 = p2 * a00 - p0 * a02, -p0 * a12, p2 * a02 - p0 * a22
             m20, m21, m22 = -p1 * a00, p0 * a11, p0 * a12 - p1 * a02
@@ -136,40 +128,63 @@ def _add_points(state: BundleState, seen: BundleMeasurements, loss: int, out: No
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def _add_lines(state: BundleState, seen: BundleMeasurements, loss: int, out: NormalEquations) -> float:
-    """Both ends of each observed segment against the points of the line opposite to them, in the image and, where the segment has a 3D line, in
-    depth."""
+def _add_lines(state: BundleState, seen: BundleMeasurements, loss: int, out: NormalEquations, filled: bool) -> float:
+    """Both ends of each observed segment against the points of the line opposite to them, in the image (rows 0 and 1) and, where the segment has a
+    3D line, in depth (rows 2 and 3)."""
     cost, points, observations = 0.0, len(state.points), len(seen.point_keyframes)
-    N, D, m, p = np.empty((3, 2)), np.empty((1, 3)), np.empty(3), np.empty((2, 3))
-    r, w, q, v, Jc, Jl = np.empty(2), np.empty(2), np.empty(2), np.empty(2), np.empty((4, 6)), np.empty((4, 4))
+    N, m, p, r, w, J = np.empty((3, 2)), np.empty(3), np.empty((2, 3)), np.zeros(4), np.zeros(4), np.zeros((4, 10))
     for i in range(len(state.lines)):
         line = state.lines[i]
         line_basis(line, N)
         for o in range(seen.line_starts[i], seen.line_starts[i + 1]):
             k = seen.line_keyframes[o]
             R, t, camera = state.rotations[k], state.positions[k], seen.intrinsics[k]
-            deep = depth_direction(seen.observed_m[o], m)
+            segment_px, observed_m = seen.endpoints_px[o], seen.observed_m[o]
+            deep = depth_direction(observed_m, m)
             for a in range(2):
-                share = share_opposite(R, t, line, seen.endpoints_px[o, a], camera)
-                r[a], s = line_term(R, t, line, N, share, seen.endpoints_px[o], camera, Jc[a], Jl[a], D, p[a])
+                share = share_opposite(R, t, line, segment_px[a], camera)
+                r[a], s = line_term(R, t, line, N, share, segment_px, camera, J[a], p[a])
                 w[a] = 1.0 / (seen.line_sigma_px**2 * ((1.0 - s) ** 2 + s * s))
                 if deep:
-                    q[a], s = line_depth_term(R, N, share, seen.observed_m[o], m, Jc[2 + a], Jl[2 + a], D, p[a])
-                    v[a] = 1.0 / _end_variance(s, m, seen.observed_covariance_m2[o])
+                    r[2 + a], s = line_depth_term(R, N, share, observed_m, m, J[2 + a], p[a])
+                    w[2 + a] = 1.0 / _end_variance(s, m, seen.observed_covariance_m2[o])
+            x = observations + o
             if not (p[0, 2] > NEAR_M and p[1, 2] > NEAR_M):
                 cost += BEHIND
+                _clear(out.W[x])
                 continue
-            weight, share = _loss(w[0] * r[0] ** 2 + w[1] * r[1] ** 2, CHI2_2, loss)
-            cost += share
-            pose, at, x = 6 * k if k < seen.free else -1, points + i, observations + o
-            for a in range(2):
-                _add_row(r[a], weight * w[a], Jc[a], Jl[a], 4, pose, out.H, out.g, out.V[at], out.b[at], out.W[x])
-            if deep:
-                weight, share = _loss(v[0] * q[0] ** 2 + v[1] * q[1] ** 2, CHI2_2, loss)
+            for a in range(2 if deep else 1):
+                weight, share = _loss(w[2 * a] * r[2 * a] ** 2 + w[2 * a + 1] * r[2 * a + 1] ** 2, CHI2_2, loss)
                 cost += share
-                for a in range(2):
-                    _add_row(q[a], weight * v[a], Jc[2 + a], Jl[2 + a], 4, pose, out.H, out.g, out.V[at], out.b[at], out.W[x])
+                w[2 * a] *= weight
+                w[2 * a + 1] *= weight
+            if not filled:
+                continue
+            if not deep:
+                w[2:], r[2:], J[2:] = 0.0, 0.0, 0.0
+            _add_rows(r, w, J, 6 * k if k < seen.free else -1, out.H, out.g, out.V[points + i], out.b[points + i], out.W[x])
     return cost
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _add_rows(r: F64, w: F64, J: F64, pose: int, H: F64, g: F64, V: F64, b: F64, W: F64) -> None:
+    """Add four residuals r of weights w with derivatives J (4, 10) of a line seen by the keyframe whose unknowns begin at `pose`, negative for a held
+    one; W (6, 4) is theirs alone. Number by number, so that none is loaded and stored four times."""
+    r0, r1, r2, r3 = r[0], r[1], r[2], r[3]
+    for i in range(4):
+        a0, a1, a2, a3 = w[0] * J[0, 6 + i], w[1] * J[1, 6 + i], w[2] * J[2, 6 + i], w[3] * J[3, 6 + i]
+        b[i] = b[i] + a0 * r0 + a1 * r1 + a2 * r2 + a3 * r3
+        for j in range(6, 7 + i):
+            V[i, j - 6] = V[i, j - 6] + a0 * J[0, j] + a1 * J[1, j] + a2 * J[2, j] + a3 * J[3, j]
+    if pose < 0:
+        return
+    for i in range(6):
+        a0, a1, a2, a3 = w[0] * J[0, i], w[1] * J[1, i], w[2] * J[2, i], w[3] * J[3, i]
+        g[pose + i] = g[pose + i] + a0 * r0 + a1 * r1 + a2 * r2 + a3 * r3
+        for j in range(i + 1):
+            H[pose + i, pose + j] = H[pose + i, pose + j] + a0 * J[0, j] + a1 * J[1, j] + a2 * J[2, j] + a3 * J[3, j]
+        for j in range(4):
+            W[i, j] = a0 * J[0, 6 + j] + a1 * J[1, 6 + j] + a2 * J[2, 6 + j] + a3 * J[3, 6 + j]
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
@@ -242,10 +257,10 @@ def _add_planes(state: BundleState, seen: BundleMeasurements, loss: int, out: No
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def linearise_bundle(state: BundleState, seen: BundleMeasurements, loss: int, out: NormalEquations) -> float:
+def linearise_bundle(state: BundleState, seen: BundleMeasurements, loss: int, out: NormalEquations, filled: bool = True) -> float:
     """Fill the normal equations at a state; returns the cost under a loss: SQUARES, HUBER beyond the 95 % gate of each term, or TRUNCATED there (for
-    planes and their relations HUBER still: they are few, and 5 % would be too many to lose)."""
-    out.H[:], out.g[:], out.V[:], out.b[:], out.W[:] = 0.0, 0.0, 0.0, 0.0, 0.0
-    cost = _add_points(state, seen, loss, out)
-    cost += _add_lines(state, seen, loss, out)
+    planes and their relations HUBER still: they are few, and 5 % would be too many to lose). Where they need not be `filled` they are spoilt."""
+    out.H[:], out.g[:], out.V[:], out.b[:] = 0.0, 0.0, 0.0, 0.0
+    cost = _add_points(state, seen, loss, out, filled)
+    cost += _add_lines(state, seen, loss, out, filled)
     return cost + _add_planes(state, seen, loss, out)

@@ -41,7 +41,7 @@ def solve_bundle(state: BundleState, seen: BundleMeasurements, iterations: int) 
     S, y, inverses = np.empty(now.H.shape), np.empty(len(now.g)), np.empty_like(now.V)
     used, cost = 0, 0.0
     for loss in losses:
-        state, cost, steps, now, trial = _minimised(state, seen, loss, iterations, now, trial)
+        state, cost, steps, now, trial = _minimised(state, seen, loss, iterations, now, trial, loss == losses[-1])
         used += steps
     reduce_bundle(now, seen, 0.0, S, y, inverses)
     covariance = inverse(S)
@@ -51,11 +51,11 @@ def solve_bundle(state: BundleState, seen: BundleMeasurements, iterations: int) 
 
 
 def _minimised(
-    state: BundleState, seen: BundleMeasurements, loss: int, iterations: int, now: NormalEquations, trial: NormalEquations
+    state: BundleState, seen: BundleMeasurements, loss: int, iterations: int, now: NormalEquations, trial: NormalEquations, last: bool
 ) -> tuple[BundleState, float, int, NormalEquations, NormalEquations]:
-    """Levenberg–Marquardt under one loss. Returns the state, its cost, the steps tried and the room for the normal equations, those at the state
-    first."""
-    cost = linearise_bundle(state, seen, loss, now)
+    """Levenberg–Marquardt under one loss. Returns the state, its cost, the steps tried and the room for the normal equations, after the `last` loss
+    those at the state first; before it they are not needed any more."""
+    cost = linearise_bundle(state, seen, loss, now, True)
     S, y, inverses = np.empty(now.H.shape), np.empty(len(now.g)), np.empty_like(now.V)
     dx, steps, damping = np.empty(len(now.g)), np.empty((len(now.V), 4)), DAMPING
     for used in range(iterations):
@@ -65,7 +65,8 @@ def _minimised(
             continue
         landmark_steps(now, seen, inverses, dx, steps)
         moved = moved_bundle(state, seen.free, dx, steps)
-        new, length = linearise_bundle(moved, seen, loss, trial), float(dx @ S @ dx) / max(len(dx), 1)
+        length = float(dx @ S @ dx) / max(len(dx), 1)
+        new = linearise_bundle(moved, seen, loss, trial, last or not length < CONVERGED)
         if new < cost:
             state, cost, damping = moved, new, max(0.1 * damping, MIN_DAMPING)
             now, trial = trial, now

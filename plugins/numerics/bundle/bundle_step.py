@@ -47,26 +47,29 @@ def trusted(H: F64, free: int, damping: float, S: F64) -> None:
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def _eliminate(A: F64, b: F64, W: F64, keyframes: I32, begin: int, end: int, free: int, S: F64, y: F64) -> None:
-    """Subtract one landmark, whose inverse block is A and whose observations are begin to end, from the reduced system."""
-    Y = np.empty((6, 4))
+def _eliminate(A: F64, b: F64, W: F64, point: bool, keyframes: I32, begin: int, end: int, free: int, Y: F64, S: F64, y: F64) -> None:
+    """Subtract one landmark, whose inverse block is A and whose observations are begin to end, from the lower triangle of the reduced system. Of a
+    `point` the fourth unknown is left out. Y (6, 4): room."""
     for o in range(begin, end):
         k = keyframes[o]
         if k >= free:
             continue
         for i in range(6):
-            for j in range(4):
-                Y[i, j] = W[o, i, 0] * A[0, j] + W[o, i, 1] * A[1, j] + W[o, i, 2] * A[2, j] + W[o, i, 3] * A[3, j]
-            y[6 * k + i] += Y[i, 0] * b[0] + Y[i, 1] * b[1] + Y[i, 2] * b[2] + Y[i, 3] * b[3]
+            w0, w1, w2, w3 = W[o, i, 0], W[o, i, 1], W[o, i, 2], W[o, i, 3]
+            for j in range(3 if point else 4):
+                share = w0 * A[0, j] + w1 * A[1, j] + w2 * A[2, j]
+                Y[i, j] = share if point else share + w3 * A[3, j]
+            share = Y[i, 0] * b[0] + Y[i, 1] * b[1] + Y[i, 2] * b[2]
+            y[6 * k + i] += share if point else share + Y[i, 3] * b[3]
         for other in range(begin, end):
             q = keyframes[other]
             if q > k or q >= free:
                 continue
             for i in range(6):
-                for j in range(6):
-                    S[6 * k + i, 6 * q + j] -= (
-                        Y[i, 0] * W[other, j, 0] + Y[i, 1] * W[other, j, 1] + Y[i, 2] * W[other, j, 2] + Y[i, 3] * W[other, j, 3]
-                    )
+                y0, y1, y2, y3 = Y[i, 0], Y[i, 1], Y[i, 2], Y[i, 3]
+                for j in range(i + 1 if other == o else 6):
+                    share = y0 * W[other, j, 0] + y1 * W[other, j, 1] + y2 * W[other, j, 2]
+                    S[6 * k + i, 6 * q + j] -= share if point else share + y3 * W[other, j, 3]
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
@@ -75,15 +78,15 @@ def reduce_bundle(normal: NormalEquations, seen: BundleMeasurements, damping: fl
     trusted(normal.H, seen.free, damping, S)
     for i in range(len(y)):
         y[i] = -normal.g[i]
-    n, first = len(seen.point_starts) - 1, len(seen.point_keyframes)
+    n, first, Y = len(seen.point_starts) - 1, len(seen.point_keyframes), np.zeros((6, 4))
     for i in range(len(inverses)):
         _invert_block(normal.V[i], damping, inverses[i])
         if i < n:
             begin, end = seen.point_starts[i], seen.point_starts[i + 1]
-            _eliminate(inverses[i], normal.b[i], normal.W, seen.point_keyframes, begin, end, seen.free, S, y)
+            _eliminate(inverses[i], normal.b[i], normal.W, True, seen.point_keyframes, begin, end, seen.free, Y, S, y)
         else:
             begin, end = seen.line_starts[i - n], seen.line_starts[i - n + 1]
-            _eliminate(inverses[i], normal.b[i], normal.W[first:], seen.line_keyframes, begin, end, seen.free, S, y)
+            _eliminate(inverses[i], normal.b[i], normal.W[first:], False, seen.line_keyframes, begin, end, seen.free, Y, S, y)
     for i in range(len(S)):
         for j in range(i):
             S[j, i] = S[i, j]
@@ -143,35 +146,47 @@ def moved_bundle(state: BundleState, free: int, dx: F64, steps: F64) -> BundleSt
 def marginals(normal: NormalEquations, seen: BundleMeasurements, inverses: F64, covariance: F64, out: F64) -> None:
     """out (l, 4, 4): covariance of each point and line with that of the poses, (c, c), in it: `A + A Wᵀ Σ W A`, A being its inverse block."""
     n, first = len(seen.point_starts) - 1, len(seen.point_keyframes)
-    M, P, Q = np.empty((4, 4)), np.empty((6, 4)), np.empty((4, 4))
+    M, Q = np.empty((4, 4)), np.zeros((4, 4))
     for i in range(len(out)):
         M[:] = 0.0
-        begin, end = (seen.point_starts[i], seen.point_starts[i + 1]) if i < n else (seen.line_starts[i - n], seen.line_starts[i - n + 1])
-        for o in range(begin, end):
-            k = seen.point_keyframes[o] if i < n else seen.line_keyframes[o]
-            if k >= seen.free:
-                continue
-            P[:] = 0.0  # row k of Σ W
-            for other in range(begin, end):
-                q = seen.point_keyframes[other] if i < n else seen.line_keyframes[other]
-                if q < seen.free:
-                    block = normal.W[other] if i < n else normal.W[first + other]
-                    for a in range(6):
-                        for b in range(6):
-                            for j in range(4):
-                                P[a, j] += covariance[6 * k + a, 6 * q + b] * block[b, j]
-            block = normal.W[o] if i < n else normal.W[first + o]
-            for a in range(4):
-                for j in range(4):
-                    for b in range(6):
-                        M[a, j] += block[b, a] * P[b, j]
+        if i < n:
+            _between(normal.W, True, seen.point_keyframes, seen.point_starts[i], seen.point_starts[i + 1], seen.free, covariance, M)
+        else:
+            _between(normal.W[first:], False, seen.line_keyframes, seen.line_starts[i - n], seen.line_starts[i - n + 1], seen.free, covariance, M)
+        size = 3 if i < n else 4
+        for a in range(size):
+            for j in range(size):
+                Q[a, j] = M[a, 0] * inverses[i, 0, j] + M[a, 1] * inverses[i, 1, j] + M[a, 2] * inverses[i, 2, j] + M[a, 3] * inverses[i, 3, j]
         for a in range(4):
-            for j in range(4):
-                Q[a, j] = 0.0
-                for b in range(4):
-                    Q[a, j] += M[a, b] * inverses[i, b, j]
-        for a in range(4):
+            b0, b1, b2, b3 = inverses[i, a, 0], inverses[i, a, 1], inverses[i, a, 2], inverses[i, a, 3]
             for j in range(4):
                 out[i, a, j] = inverses[i, a, j]
-                for b in range(4):
-                    out[i, a, j] += inverses[i, a, b] * Q[b, j]
+            for j in range(size):
+                out[i, a, j] = out[i, a, j] + b0 * Q[0, j] + b1 * Q[1, j] + b2 * Q[2, j] + b3 * Q[3, j]
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _between(W: F64, point: bool, keyframes: I32, begin: int, end: int, free: int, covariance: F64, M: F64) -> None:
+    """Add `Wᵀ Σ W` of one landmark to M (4, 4), row by row of Σ W; of a `point` the fourth row and column are left out."""
+    for o in range(begin, end):
+        k = keyframes[o]
+        if k >= free:
+            continue
+        for a in range(6):
+            p0, p1, p2, p3 = 0.0, 0.0, 0.0, 0.0
+            for other in range(begin, end):
+                q = keyframes[other]
+                if q < free:
+                    for b in range(6):
+                        known = covariance[6 * k + a, 6 * q + b]
+                        p0 += known * W[other, b, 0]
+                        p1 += known * W[other, b, 1]
+                        p2 += known * W[other, b, 2]
+                        if not point:
+                            p3 += known * W[other, b, 3]
+            for j in range(3 if point else 4):
+                w = W[o, a, j]
+                M[j, 0] += w * p0
+                M[j, 1] += w * p1
+                M[j, 2] += w * p2
+                M[j, 3] += w * p3

@@ -11,67 +11,53 @@ import numpy as np
 
 from trihedron.pipeline.types import F64
 from trihedron.plugins.numerics.maps.map_terms import EXTEND
-from trihedron.plugins.numerics.motion.pose_terms import PARALLEL, basis, chain_point, line_depth_row, line_row, to_camera
+from trihedron.plugins.numerics.motion.pose_terms import PARALLEL, basis, line_depth_row, line_row
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def share_opposite(R: F64, t: F64, line: F64, pixel: F64, camera: F64) -> float:
     """Where along a world line (2, 3; 0 = start, 1 = end) lies the point nearest to the ray through a pixel; at most EXTEND beyond its ends."""
-    ray, along, to_start = np.empty(3), np.empty(3), np.empty(3)
     x, y = (pixel[0] - camera[2]) / camera[0], (pixel[1] - camera[3]) / camera[1]
-    rr, ra, rs = 0.0, 0.0, 0.0
-    for j in range(3):
-        ray[j] = R[j, 0] * x + R[j, 1] * y + R[j, 2]
-        along[j] = line[1, j] - line[0, j]
-        to_start[j] = line[0, j] - t[j]
-        rr += ray[j] * ray[j]
-        ra += ray[j] * along[j]
-        rs += ray[j] * to_start[j]
-    top, bottom = 0.0, 0.0
-    for j in range(3):
-        normal = along[j] * rr - ray[j] * ra  # across the ray, in the plane it spans with the line
-        top -= to_start[j] * normal
-        bottom += along[j] * normal
+    r0, r1, r2 = R[0, 0] * x + R[0, 1] * y + R[0, 2], R[1, 0] * x + R[1, 1] * y + R[1, 2], R[2, 0] * x + R[2, 1] * y + R[2, 2]
+    a0, a1, a2 = line[1, 0] - line[0, 0], line[1, 1] - line[0, 1], line[1, 2] - line[0, 2]
+    rr, ra = r0 * r0 + r1 * r1 + r2 * r2, r0 * a0 + r1 * a1 + r2 * a2
+    n0, n1, n2 = a0 * rr - r0 * ra, a1 * rr - r1 * ra, a2 * rr - r2 * ra  # across the ray, in the plane it spans with the line
+    top = -(line[0, 0] - t[0]) * n0 - (line[0, 1] - t[1]) * n1 - (line[0, 2] - t[2]) * n2
+    bottom = a0 * n0 + a1 * n1 + a2 * n2
     share = top / bottom if bottom > 1e-12 else 0.0
     return min(max(share, -EXTEND), 1.0 + EXTEND)
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def line_term(
-    R: F64, t: F64, line: F64, N: F64, share: float, segment_px: F64, camera: F64, J_pose: F64, J_line: F64, D: F64, p: F64
-) -> tuple[float, float]:
-    """Distance (px) of the line's point at `share` from the observed segment (2, 2), and where along that it falls; NaN behind the camera. J_pose
-    (6,), J_line (4,) by the coordinates in N (3, 2) of the first and of the second point. D (1, 3), p (3,): p is left as the camera-frame point."""
-    x = np.empty(3)
-    for j in range(3):
-        x[j] = (1.0 - share) * line[0, j] + share * line[1, j]
-    to_camera(R, t, x, p)
-    r, along = line_row(p, segment_px, camera, D[0])
-    _line_chain(R, N, share, J_pose, J_line, D, p)
+def line_term(R: F64, t: F64, line: F64, N: F64, share: float, segment_px: F64, camera: F64, J: F64, p: F64) -> tuple[float, float]:
+    """Distance (px) of the line's point at `share` from the observed segment (2, 2), and where along that it falls; NaN behind the camera. J (10,):
+    by the pose, and by the coordinates in N (3, 2) of the line's first and of its second point. p (3,) is left as the camera-frame point."""
+    x = (1.0 - share) * line[0, 0] + share * line[1, 0] - t[0]
+    y = (1.0 - share) * line[0, 1] + share * line[1, 1] - t[1]
+    z = (1.0 - share) * line[0, 2] + share * line[1, 2] - t[2]
+    for k in range(3):
+        p[k] = R[0, k] * x + R[1, k] * y + R[2, k] * z
+    r, along = line_row(p, segment_px, camera, J)
+    _line_chain(R, N, share, J[0], J[1], J[2], p, J)
     return r, along
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def line_depth_term(R: F64, N: F64, share: float, observed_m: F64, m: F64, J_pose: F64, J_line: F64, D: F64, p: F64) -> tuple[float, float]:
+def line_depth_term(R: F64, N: F64, share: float, observed_m: F64, m: F64, J: F64, p: F64) -> tuple[float, float]:
     """As `line_term` for the distance (m) of the camera-frame point p from the observed 3D segment (2, 3) along m (3,)."""
-    r, along = line_depth_row(p, observed_m, m)
-    for j in range(3):
-        D[0, j] = m[j]
-    _line_chain(R, N, share, J_pose, J_line, D, p)
-    return r, along
+    _line_chain(R, N, share, m[0], m[1], m[2], p, J)
+    return line_depth_row(p, observed_m, m)
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def _line_chain(R: F64, N: F64, share: float, J_pose: F64, J_line: F64, D: F64, p: F64) -> None:
-    J = np.empty((1, 6))
-    chain_point(D, len(J), p, J)
-    J_pose[:] = J[0]
-    J_line[:] = 0.0
-    for j in range(3):
-        d = D[0, 0] * R[j, 0] + D[0, 1] * R[j, 1] + D[0, 2] * R[j, 2]
-        for a in range(2):
-            J_line[a] += (1.0 - share) * d * N[j, a]
-            J_line[2 + a] += share * d * N[j, a]
+def _line_chain(R: F64, N: F64, share: float, a: float, b: float, c: float, p: F64, J: F64) -> None:
+    """J (10,) of `line_term` from the derivatives by the camera-frame point p."""
+    J[0], J[1], J[2] = -a, -b, -c
+    J[3], J[4], J[5] = b * p[2] - c * p[1], c * p[0] - a * p[2], a * p[1] - b * p[0]
+    d0, d1, d2 = a * R[0, 0] + b * R[0, 1] + c * R[0, 2], a * R[1, 0] + b * R[1, 1] + c * R[1, 2], a * R[2, 0] + b * R[2, 1] + c * R[2, 2]
+    for k in range(2):
+        J[6 + k] = (1.0 - share) * d0 * N[0, k] + (1.0 - share) * d1 * N[1, k] + (1.0 - share) * d2 * N[2, k]
+        J[8 + k] = share * d0 * N[0, k] + share * d1 * N[1, k] + share * d2 * N[2, k]
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
