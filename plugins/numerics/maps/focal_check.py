@@ -8,20 +8,20 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from itertools import combinations
 
 import numba
 import numpy as np
+from numpy.typing import NDArray
 
 from trihedron.pipeline.geometry import rotation_angle_deg
 from trihedron.pipeline.types import F32, F64, I32, Map
 from trihedron.plugins.numerics.algebra.small_linear import polar_rotation
-from trihedron.plugins.numerics.maps.keyframe_features import measured_points
 from trihedron.plugins.numerics.maps.local_window import newest_keyframes
 
 KEYFRAMES, LEAST_POINTS, LEAST_PAIRS, MOST_POINTS = 8, 30, 3, 100
 PIXEL = 1.0  # standard deviation of a point, px
 CUT = 3.0  # standard deviations at which a point counts half (Geman and McClure)
+ROW_BITS, VIEW_BITS = 20, 51  # of a number that is sorted by view, id and row
 FACTORS = np.exp(np.linspace(np.log(0.7), -np.log(0.7), 5))
 
 
@@ -58,16 +58,16 @@ def focal_check(map: Map) -> FocalCheck | None:
 
 
 def _checked(map: Map) -> FocalCheck | None:
-    seen = [_measured(map, int(row)) for row in newest_keyframes(map, KEYFRAMES)]
-    pairs = [pair for a, b in combinations(seen, 2) if (pair := _shared(a, b)) is not None]
-    if len(pairs) < LEAST_PAIRS:
-        _cost(np.empty((0, 5)), np.empty((0, 5)), 1.0)  # compiled on the first keyframe, before the clock starts
+    keyframes = newest_keyframes(map, KEYFRAMES)
+    if not len(keyframes):
         return None
+    seen, middle = _measured(map, keyframes), len(FACTORS) // 2
     total = np.full(len(FACTORS), np.inf)
-    middle = len(FACTORS) // 2
-    total[middle - 1 : middle + 2] = [_total(pairs, factor) for factor in FACTORS[middle - 1 : middle + 2]]
+    total[middle - 1 : middle + 2], pairs = _totals(*seen, FACTORS[middle - 1 : middle + 2].copy())
+    if pairs < LEAST_PAIRS:
+        return None
     if np.argmin(total) != middle:  # rarely; the farther ones are needed then
-        total[[0, -1]] = [_total(pairs, factor) for factor in FACTORS[[0, -1]]]
+        total[[0, -1]] = _totals(*seen, FACTORS[[0, -1]])[0]
     best = int(np.argmin(total))
     if not 0 < best < len(FACTORS) - 1:  # no least one: views from one place say nothing, and noise the rest
         return None
@@ -77,23 +77,71 @@ def _checked(map: Map) -> FocalCheck | None:
     return FocalCheck(factor, float(total[middle] / total[best]))
 
 
-def _measured(map: Map, keyframe: int) -> tuple[I32, F64]:
-    """Ids (n,) of the points that a keyframe measured with depth, sorted; and (n, 5) x, y, z, and the σ of depth and of a pixel there, m."""
-    ids, places, sigma_m, _ = measured_points(map, keyframe)
-    fx = map.keyframes.rows("intrinsics", np.array([keyframe]))[0, 0]
-    return ids, np.column_stack([places, sigma_m, PIXEL * places[:, 2] / fx])
+def _measured(map: Map, keyframes: I32) -> tuple[NDArray[np.int64], I32, F64]:
+    """What the keyframes (k,) saw, n rows in all: which rows are which points, a number of keyframe, id and row each (`ROW_BITS`), sorted; the ids
+    (n,); and (n, 5) x, y, z, and the σ of depth and of a pixel there, m, NaN without depth."""
+    ranges, intrinsics = map.keyframes.gathered(keyframes, "points", "intrinsics")
+    rows, views = np.concatenate([np.arange(first, end) for first, end in ranges]), np.repeat(np.arange(len(ranges)), ranges[:, 1] - ranges[:, 0])
+    ids, pixels, depths_m, sigmas_m = map.point_observations.gathered(rows, "point", "pixel", "depth_m", "sigma_m")
+    order = np.sort((views << VIEW_BITS) + (ids.astype(np.int64) << ROW_BITS) + np.arange(len(ids)))
+    return order, ids, _places(views, pixels, depths_m, sigmas_m, intrinsics)
 
 
-def _shared(a: tuple[I32, F64], b: tuple[I32, F64]) -> tuple[F64, F64] | None:
-    """What two keyframes measured of the same points; None where these are too few."""
-    _, i, j = np.intersect1d(a[0], b[0], assume_unique=True, return_indices=True)
-    every = -(-len(i) // MOST_POINTS)
-    return (a[1][i[::every]], b[1][j[::every]]) if len(i) >= LEAST_POINTS else None
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _places(views: NDArray[np.int64], pixels: F32, depths_m: F32, sigmas_m: F32, intrinsics: F64) -> F64:
+    """(n, 5) measurements of `_measured`, of what the `views` (n,) with intrinsics (k, 4) saw at pixels (n, 2)."""
+    out = np.empty((len(views), 5))
+    for i in range(len(views)):
+        view, depth = views[i], float(depths_m[i])
+        fx, fy, cx, cy = intrinsics[view, 0], intrinsics[view, 1], intrinsics[view, 2], intrinsics[view, 3]
+        out[i, 0], out[i, 1], out[i, 2] = (pixels[i, 0] - cx) / fx * depth, (pixels[i, 1] - cy) / fy * depth, depth
+        out[i, 3], out[i, 4] = sigmas_m[i], PIXEL * depth / fx
+    return out
 
 
-def _total(pairs: list[tuple[F64, F64]], factor: float) -> float:
-    """What the best rigid motions between views leave under focal lengths that are `factor` times as long."""
-    return sum(_cost(a, b, factor) for a, b in pairs)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _totals(order: NDArray[np.int64], ids: I32, seen: F64, factors: F64) -> tuple[F64, int]:
+    """What the best rigid motions between the views leave under focal lengths that are by these factors as long, and how many pairs of views saw
+    enough of the same points."""
+    rows, starts = _distinct(order, seen)
+    views = len(starts) - 1
+    totals, pairs = np.zeros(len(factors)), 0
+    left, right = np.empty(len(rows), np.int64), np.empty(len(rows), np.int64)
+    for a in range(views):
+        for b in range(a + 1, views):
+            shared, i, j = 0, starts[a], starts[b]
+            while i < starts[a + 1] and j < starts[b + 1]:
+                one, other = ids[rows[i]], ids[rows[j]]
+                if one == other:
+                    left[shared], right[shared] = rows[i], rows[j]
+                    shared += 1
+                i, j = i + (one <= other), j + (other <= one)
+            if shared < LEAST_POINTS:
+                continue
+            every, pairs = -(-shared // MOST_POINTS), pairs + 1
+            p, q = np.empty((-(-shared // every), 5)), np.empty((-(-shared // every), 5))
+            for k in range(len(p)):
+                for c in range(5):
+                    p[k, c], q[k, c] = seen[left[k * every], c], seen[right[k * every], c]
+            for k in range(len(factors)):
+                totals[k] += _cost(p, q, factors[k])
+    return totals, pairs
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _distinct(order: NDArray[np.int64], seen: F64) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """The first row with depth of each point of each view, by views and ids, and where the views' rows begin and the last one's end."""
+    views = (order[-1] >> VIEW_BITS) + 1 if len(order) else 0
+    rows, starts, count, last = np.empty(len(order), np.int64), np.zeros(views + 1, np.int64), 0, -1
+    for number in order:
+        row, point = number & ((1 << ROW_BITS) - 1), number >> ROW_BITS
+        if point != last and np.isfinite(seen[row, 2]):
+            rows[count], last = row, point
+            count += 1
+            starts[(number >> VIEW_BITS) + 1] = count
+    for view in range(views):  # of views without any
+        starts[view + 1] = max(starts[view + 1], starts[view])
+    return rows, starts
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
@@ -106,26 +154,29 @@ def _cost(a: F64, b: F64, factor: float) -> float:
         q[k, 0], q[k, 1], q[k, 2] = b[k, 0] / factor, b[k, 1] / factor, b[k, 2]
         sigma[k] = math.sqrt(a[k, 3] ** 2 + b[k, 3] ** 2 + (a[k, 4] ** 2 + b[k, 4] ** 2) / factor**2)
         weight[k] = 1.0 / sigma[k] ** 2
+    S = np.empty((3, 3))
     for _ in range(3):
-        total, middles, products = 0.0, np.zeros((2, 3)), np.zeros((3, 3))
+        total, p0, p1, p2, q0, q1, q2 = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
         for k in range(n):
             total += weight[k]
         for k in range(n):
             weight[k] /= total
-            for c in range(3):
-                middles[0, c] += weight[k] * p[k, c]
-                middles[1, c] += weight[k] * q[k, c]
+            w = weight[k]
+            p0, p1, p2 = p0 + w * p[k, 0], p1 + w * p[k, 1], p2 + w * p[k, 2]
+            q0, q1, q2 = q0 + w * q[k, 0], q1 + w * q[k, 1], q2 + w * q[k, 2]
+        s00, s01, s02, s10, s11, s12, s20, s21, s22 = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
         for k in range(n):
-            for r in range(3):
-                for c in range(3):
-                    products[r, c] += weight[k] * (p[k, r] - middles[0, r]) * (q[k, c] - middles[1, c])
-        R, cost = polar_rotation(products), 0.0
+            w, x, y, z = weight[k], q[k, 0] - q0, q[k, 1] - q1, q[k, 2] - q2
+            u, v, w = w * (p[k, 0] - p0), w * (p[k, 1] - p1), w * (p[k, 2] - p2)
+            s00, s01, s02 = s00 + u * x, s01 + u * y, s02 + u * z
+            s10, s11, s12 = s10 + v * x, s11 + v * y, s12 + v * z
+            s20, s21, s22 = s20 + w * x, s21 + w * y, s22 + w * z
+        S[0, 0], S[0, 1], S[0, 2], S[1, 0], S[1, 1], S[1, 2], S[2, 0], S[2, 1], S[2, 2] = s00, s01, s02, s10, s11, s12, s20, s21, s22
+        R, cost = polar_rotation(S), 0.0
         for k in range(n):
-            left = 0.0
+            u, v, w, left = p[k, 0] - p0, p[k, 1] - p1, p[k, 2] - p2, 0.0
             for c in range(3):
-                at = -(q[k, c] - middles[1, c])
-                for r in range(3):
-                    at += (p[k, r] - middles[0, r]) * R[r, c]
+                at = -(q[k, c] - (q0 if c == 0 else q1 if c == 1 else q2)) + u * R[0, c] + v * R[1, c] + w * R[2, c]
                 left += at * at
             square = left / (CUT * sigma[k]) ** 2
             cost += square / (1.0 + square)
