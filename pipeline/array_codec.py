@@ -16,6 +16,7 @@ import math
 import re
 import struct
 import threading
+from collections.abc import Mapping, Sequence
 from functools import cache, lru_cache
 from typing import Any
 
@@ -31,28 +32,50 @@ from trihedron.pipeline.wire_format import bytes_field, head, varint
 ENCODINGS = ("raw", "columns", "zstd", "rows")
 MAX_BYTES = 1 << 30  # of one decoded array
 DAMAGED = "the file is damaged; record it again"
-TRANSPOSED_BYTES = 1536  # smaller arrays are left as they are: of a frame's recording they would spare half a percent
+TRANSPOSED_BYTES = 8192  # smaller arrays are left as they are: it would cost more than it spares
 COPIED = {"points_m", "sigma_m", "endpoints_m"}  # in float32; what is worked out of them is not
 SCALARS: dict[str, type[Any]] = {"bool": bool, "int": int, "float": float}
 
 
-def array_parts(name: str, item: Any, image: bool) -> tuple[bytes, Any]:
-    """An array, text or number as a field of `trihedron.Value`: what stands before its data, and these. Of an image the first axes are height and
-    width."""
-    kind = item.__class__
-    if kind in _PACKED:
-        data: Any = _PACKED[kind](item)
-        return _head(name, kind.__name__, (), "raw", len(data)), data
-    if kind is str:
-        data = item.encode()
-        return _head(name, "str", (), "", len(data)), data
+def array_parts(name: str, item: Any) -> tuple[bytes, Any]:
+    """An array as a field of `trihedron.Value`: what stands before its data, and these."""
     array = np.ascontiguousarray(item)
-    if image and array.size:
-        steps = array.dtype == np.uint8 and array.ndim == 3
-        data = _compressor().compress(_row_steps(array).data if steps else array.data)
-        return _head(name, _type_name(array.dtype), array.shape, "rows" if steps else "zstd", len(data)), data
     head, turned = plain_head(name, array.dtype, array.shape)
-    return head, _turned(array) if turned else array.data
+    return head, _turned(array) if turned else array
+
+
+def image_parts(name: str, item: Any) -> tuple[bytes, Any]:
+    """The same of an image, whose first axes are height and width."""
+    array = np.ascontiguousarray(item)
+    if not array.size:
+        return array_parts(name, array)
+    steps = array.dtype == np.uint8 and array.ndim == 3
+    data = _compressor().compress(_row_steps(array).data if steps else array.data)
+    return _head(name, _type_name(array.dtype), array.shape, "rows" if steps else "zstd", len(data)), data
+
+
+@lru_cache(256)
+def text_field(name: str, text: str) -> bytes:
+    """A text as a field; most are said again and again."""
+    data = text.encode()
+    return _head(name, "str", (), "", len(data)) + data
+
+
+class Numbers:
+    """Truth values and numbers, each a field: what stands before it never changes, so that all of them are packed at once."""
+
+    def __init__(self, kinds: Mapping[str, type[Any]]) -> None:
+        """`kinds` is of SCALARS, by name."""
+        codes = [_CODES[kind] for kind in kinds.values()]
+        heads = [_head(name, kind.__name__, (), "raw", struct.calcsize(code)) for (name, kind), code in zip(kinds.items(), codes)]
+        self._blank: list[Any] = [part for head in heads for part in (head, 0)]
+        self._struct = struct.Struct("<" + "".join(f"{len(head)}s{code}" for head, code in zip(heads, codes)))
+
+    def fields(self, numbers: Sequence[Any]) -> bytes:
+        """Of as many numbers."""
+        filled = self._blank.copy()
+        filled[1::2] = numbers
+        return self._struct.pack(*filled)
 
 
 @lru_cache(4096)
@@ -80,7 +103,6 @@ def row_kernels() -> Any:
     return row_kernels
 
 
-@lru_cache(4096)
 def _head(name: str, dtype: str, shape: tuple[int, ...], encoding: str, size: int) -> bytes:
     """A field `arrays` up to its data."""
     before, after = _texts(name, dtype, encoding)
@@ -99,7 +121,7 @@ def _type_name(dtype: np.dtype[Any]) -> str:
     return dtype.str.lstrip("<|=")
 
 
-_PACKED: dict[type[Any], Any] = {bool: struct.Struct("?").pack, int: struct.Struct("<q").pack, float: struct.Struct("<d").pack}
+_CODES: dict[type[Any], str] = {bool: "?", int: "q", float: "d"}  # of `struct`
 _kept = threading.local()
 
 

@@ -12,14 +12,14 @@ import json
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, lru_cache
 from operator import attrgetter
 from typing import Any, get_type_hints
 
 from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
 
 from trihedron.pipeline import types
-from trihedron.pipeline.array_codec import DAMAGED, array_parts, get_array
+from trihedron.pipeline.array_codec import DAMAGED, SCALARS, Numbers, array_parts, get_array, image_parts, text_field
 from trihedron.pipeline.arrays import array_specs
 from trihedron.pipeline.errors import RecordingError
 from trihedron.pipeline.table import Table
@@ -62,43 +62,75 @@ class Encoder:
         """A value as the bytes of a `trihedron.Value`; tables relative to those of an earlier call."""
         kind: Any = value.__class__
         layout = _layout(kind)
-        parts = [layout.head, number_field(3, value.index), number_field(4, value.stamp_ns)]
-        for name, image, item in zip(layout.names, layout.images, layout.content(value)):
-            parts += array_parts(name, item, image)
+        parts = [layout.head, _when(value.index, value.stamp_ns)]
+        for name, item in zip(layout.arrays, layout.array_values(value)):
+            parts += array_parts(name, item)
+        for name, item in zip(layout.images, layout.image_values(value)):
+            parts += image_parts(name, item)
+        if layout.numbers is not None:
+            parts.append(layout.numbers.fields(layout.number_values(value)))
+        parts += map(text_field, layout.texts, layout.text_values(value))
         if layout.tables:
             parts += self._tables.parts({name: getattr(value, name) for name in layout.tables})
         return b"".join(parts)
 
 
+@lru_cache(64)
+def _when(index: int, stamp_ns: int) -> bytes:
+    """The fields that all values of a frame share."""
+    return number_field(3, index) + number_field(4, stamp_ns)
+
+
+Read = Callable[[Value], Sequence[Any]]
+
+
 @dataclass(frozen=True)
 class _Layout:
-    """What the message of a type is made of: its first bytes, the dotted names of all but tables, which of these are images, and what reads them."""
+    """What the message of a type is made of: its first bytes, and the dotted names of what follows, by kinds, with what reads them of a value."""
 
     head: bytes
-    names: tuple[str, ...]
-    images: tuple[bool, ...]
+    numbers: Numbers | None
+    number_values: Read
+    texts: tuple[str, ...]
+    text_values: Read
+    arrays: tuple[str, ...]
+    array_values: Read
+    images: tuple[str, ...]
+    image_values: Read
     tables: tuple[str, ...]
-    content: Callable[[Value], Sequence[Any]]
 
 
 @cache
 def _layout(kind: Any) -> _Layout:
-    names, images = zip(*_names(kind, ""))
+    fields = dict(_fields(kind, ""))
+    numbers = {name: hint for name, hint in fields.items() if hint in SCALARS.values()}
     tables = tuple(name for name, hint in _hints(kind).items() if hint is Table)
-    read = attrgetter(*names, names[0])  # of one name alone it would give no tuple
-    return _Layout(bytes_field(1, kind.__name__.encode()) + number_field(2, kind.version), names, images, tables, read)
+    texts = tuple(name for name, hint in fields.items() if hint is str)
+    seen = {spec.name for spec in array_specs(kind) if spec.shape.axes[:2] == ("h", "w")}  # images: their first axes are height and width
+    arrays = tuple(name for name in fields if name not in numbers and name not in texts and name not in seen)
+    images = tuple(name for name in fields if name in seen)
+    head = bytes_field(1, kind.__name__.encode()) + number_field(2, kind.version)
+    packed = Numbers(numbers) if numbers else None
+    return _Layout(head, packed, _reader(*numbers), texts, _reader(*texts), arrays, _reader(*arrays), images, _reader(*images), tables)
 
 
-def _names(kind: Any, prefix: str) -> Iterator[tuple[str, bool]]:
-    """(dotted name, whether an image) of each field but index, stamp and tables."""
-    images = {spec.name for spec in array_specs(kind) if spec.shape.axes[:2] == ("h", "w")}  # its first axes are height and width
+def _reader(*names: str) -> Read:
+    """What gives the values of fields."""
+    if not names:
+        return lambda value: ()
+    read = attrgetter(*names)
+    return read if len(names) > 1 else lambda value: (read(value),)  # of one name alone it would give no tuple
+
+
+def _fields(kind: Any, prefix: str) -> Iterator[tuple[str, Any]]:
+    """(dotted name, type) of each field but index, stamp and tables."""
     for name, hint in _hints(kind).items():
         if hint is Table or (prefix == "" and name in ("index", "stamp_ns")):
             continue
         if _is_nested(hint):
-            yield from _names(hint, f"{prefix}{name}.")
+            yield from _fields(hint, f"{prefix}{name}.")
         else:
-            yield prefix + name, name in images
+            yield prefix + name, hint
 
 
 class Decoder:

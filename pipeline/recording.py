@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from collections import deque
 from collections.abc import Iterator, Mapping
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -89,9 +90,7 @@ class RecordingWriter:
 
     def write_timing(self, index: int, stamp_ns: int, frame_ms: float, stage_ms: Mapping[str, float], memory_mb: float) -> None:
         """Add a frame's times, and the memory the process holds after it (JSON, so that any viewer plots them)."""
-        stages = {name: round(ms, 3) for name, ms in stage_ms.items()}
-        measured = {"index": index, "frame_ms": round(frame_ms, 3), "stage_ms": stages, "memory_mb": round(memory_mb, 2)}
-        self._file.add(0, lambda: [(self._timing_channel(), stamp_ns, json.dumps(measured).encode())])
+        self._file.add(0, lambda: [(self._timing_channel(), stamp_ns, _timing(index, frame_ms, stage_ms, memory_mb))])
 
     def _encoded(self, topic: str, value: Value) -> list[tuple[int, int, bytes]]:
         if topic not in self._encoders:
@@ -124,6 +123,15 @@ class RecordingWriter:
 def _bytes_of(value: Value) -> int:
     """Of memory that a value holds, about; its tables are shared with others."""
     return sum(item.nbytes for item in vars(value).values() if item.__class__ is np.ndarray) if value.dense else FEW_BYTES
+
+
+def _timing(index: int, frame_ms: float, stage_ms: Mapping[str, float], memory_mb: float) -> bytes:
+    """A message of TIMING_SCHEMA."""
+    stages = ", ".join([f"{_quoted(name)}: {ms:.3f}" for name, ms in stage_ms.items()])
+    return f'{{"index": {index}, "frame_ms": {frame_ms:.3f}, "stage_ms": {{{stages}}}, "memory_mb": {memory_mb:.2f}}}'.encode()
+
+
+_quoted = cache(json.dumps)  # names of stages
 
 
 class Recording:

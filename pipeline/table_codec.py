@@ -21,7 +21,7 @@ from typing import Any
 
 import numpy as np
 
-from trihedron.pipeline.array_codec import array_parts, element_type, plain_head, row_kernels
+from trihedron.pipeline.array_codec import array_parts, element_type, plain_head, row_kernels, text_field
 from trihedron.pipeline.table import CHUNK, Column, Table, empty_chunk
 
 CHECKPOINT_EVERY = 64  # messages; of a walk through what is new a checkpoint adds a third to what the changes take, however far apart they are
@@ -92,12 +92,12 @@ def _table_parts(name: str, table: Table, previous: Table | None, back: int) -> 
             row_kernels().take(addresses, ids, CHUNK, row_bytes, turned, rows)
             parts += head, rows.data
     for ids_bytes, k in numbers.items():
-        parts += array_parts(f"{name}#rows{k}", np.frombuffer(ids_bytes, np.int32), False)
+        parts += array_parts(f"{name}#rows{k}", np.frombuffer(ids_bytes, np.int32))
     if emptied:
-        parts += array_parts(f"{name}#emptied", np.array(sorted(emptied), np.int32), False)
+        parts += array_parts(f"{name}#emptied", np.array(sorted(emptied), np.int32))
     schema = ", ".join(_column_text(column, kind) for column, kind in table.schema.items())
     header = f'{{"size": {table.size}, "back": {back}, "schema": {{{schema}}}, "rows": {json.dumps(changed)}}}'
-    parts += array_parts(f"{name}#", header, False)
+    parts.append(text_field(f"{name}#", header))
     return parts
 
 

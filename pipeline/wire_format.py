@@ -5,6 +5,7 @@ from __future__ import annotations
 
 _VARINT, _LENGTH = 0, 2  # types of a field on the wire
 _SHORT = [bytes((number,)) for number in range(0x80)]
+_TAGS = [bytes((field << 3 | _LENGTH,)) for field in range(16)]  # of what a length stands before
 
 
 def varint(number: int) -> bytes:
@@ -28,8 +29,8 @@ def number_field(field: int, number: int) -> bytes:
 
 
 def head(field: int, size: int) -> bytes:
-    """What stands before the `size` bytes of a text, of bytes, of a message or of packed numbers."""
-    return varint(field << 3 | _LENGTH) + varint(size)
+    """What stands before the `size` bytes of a text, of bytes, of a message or of packed numbers, in one of the fields 1..15."""
+    return _TAGS[field] + varint(size)
 
 
 def bytes_field(field: int, content: bytes) -> bytes:

@@ -58,7 +58,7 @@ def test_arrays_scalars_text_and_nested_values():
 
 def test_large_arrays_of_every_element_type_and_shape():
     """Those that are transposed, and those of one column, which have as many bytes a row as elements have."""
-    for n in (192, 1000):
+    for n in (1024, 2000):
         value = keypoints(n)
         message = message_of(value)
         assert {a.name for a in message.arrays if a.encoding == "columns"} >= {"pixels"}
