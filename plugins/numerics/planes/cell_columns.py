@@ -8,6 +8,8 @@ import numpy as np
 from trihedron.pipeline.types import F64, I32, Bool
 from trihedron.plugins.numerics.depth.organised_grid import Grid
 
+SOME = 2000  # cells that show where most of a region is
+
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def columns_of(grid: Grid, cells: I32) -> F64:
@@ -25,8 +27,9 @@ def columns_of(grid: Grid, cells: I32) -> F64:
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def thinned(columns: F64, step: int) -> F64:
-    """One cell in `step`."""
+def thinned(columns: F64) -> F64:
+    """One cell in as many as leave at least SOME."""
+    step = max(columns.shape[1] // SOME, 1)
     if step == 1:
         return columns
     out = np.empty((8, (columns.shape[1] + step - 1) // step))
@@ -34,6 +37,12 @@ def thinned(columns: F64, step: int) -> F64:
         for k in range(out.shape[1]):
             out[j, k] = columns[j, k * step]
     return out
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def thinned_marks(marks: Bool) -> Bool:
+    """The marks (n,) of the cells that `thinned` leaves."""
+    return marks[:: max(len(marks) // SOME, 1)].copy()
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
@@ -53,11 +62,22 @@ def normal_equations(columns: F64, chosen: Bool) -> tuple[F64, F64]:
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def sum_within(columns: F64, chosen: Bool, step: int, x: float, y: float, z: float, least: float) -> tuple[float, float, float]:
-    """Sum of the normals of the chosen among one cell in `step` whose cosine with (x, y, z) is above `least`."""
+def mark_within(columns: F64, chosen: Bool, x: float, y: float, z: float, least: float, inside: Bool) -> bool:
+    """Mark the chosen cells whose normal's cosine with (x, y, z) is above `least`; whether these are others than were marked."""
+    nx, ny, nz = columns[5], columns[6], columns[7]
+    changed = 0
+    for k in range(len(inside)):
+        counts = chosen[k] & (nx[k] * x + ny[k] * y + nz[k] * z > least)
+        changed += counts != inside[k]
+        inside[k] = counts
+    return changed > 0
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def sum_marked(columns: F64, inside: Bool) -> tuple[float, float, float]:
+    """Sum of the normals of the marked cells."""
     nx, ny, nz = columns[5], columns[6], columns[7]
     a, b, c = 0.0, 0.0, 0.0
-    for k in range(0, len(nx), step):
-        counts = chosen[k] & (nx[k] * x + ny[k] * y + nz[k] * z > least)
-        a, b, c = a + (nx[k] if counts else 0.0), b + (ny[k] if counts else 0.0), c + (nz[k] if counts else 0.0)
+    for k in range(len(inside)):
+        a, b, c = a + (nx[k] if inside[k] else 0.0), b + (ny[k] if inside[k] else 0.0), c + (nz[k] if inside[k] else 0.0)
     return a, b, c

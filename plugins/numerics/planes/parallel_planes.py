@@ -12,10 +12,9 @@ import numpy as np
 from trihedron.pipeline.types import F64, I32, Bool
 from trihedron.plugins.numerics.algebra.small_linear import solve_positive
 from trihedron.plugins.numerics.depth.organised_grid import Grid
-from trihedron.plugins.numerics.planes.cell_columns import normal_equations, sum_within
+from trihedron.plugins.numerics.planes.cell_columns import mark_within, normal_equations, sum_marked, thinned_marks
 
 LEAST = np.radians(0.4)  # disagreement of normals and plane that is looked into
-SOME = 2000
 WIDE, NARROW = np.cos(np.radians([15.0, 8.0]))  # normals further from their mean, then from that of these, are of a patch across a step
 SMALLER = 0.5  # the larger of the two planes must disagree by less than this share of what the one did, the smaller by less at all
 SHARE = 0.1  # of the cells that the smaller of the two must have
@@ -24,13 +23,13 @@ ROUNDS = 10  # of two means
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def larger_surface(q: F64, grid: Grid, cells: I32, columns: F64, member: Bool) -> tuple[F64, int, F64]:
+def larger_surface(q: F64, grid: Grid, cells: I32, columns: F64, some: F64, member: Bool) -> tuple[F64, int, F64]:
     """Of the members of a region with plane q, when they are two parallel surfaces, the larger one: its q and number of members, which alone stay
-    marked, and the q of the other. Otherwise all is left as it is, and there is no other (zeros)."""
+    marked, and the q of the other. Otherwise all is left as it is, and there is no other (zeros). `some` of the columns show whether they may be."""
     members, none = 0, np.zeros(3)
     for k in range(len(cells)):
         members += member[k]
-    normal = _mean_normal(q, columns, member)
+    normal = _mean_normal(q, some, thinned_marks(member))
     apart = angle_between(q, normal)
     if not apart > LEAST:
         return q, members, none
@@ -64,11 +63,14 @@ def angle_between(q: F64, normal: F64) -> float:
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def _mean_normal(q: F64, columns: F64, member: Bool) -> F64:
-    """Unit mean of the normals of (about SOME of) the members, those across a step left out; NaN without any."""
+    """Unit mean of the normals of the members, those across a step left out; NaN without any."""
     length = np.sqrt(q[0] * q[0] + q[1] * q[1] + q[2] * q[2])
     x, y, z = -q[0] / length, -q[1] / length, -q[2] / length
-    for least in (WIDE, NARROW, NARROW):
-        a, b, c = sum_within(columns, member, max(len(member) // SOME, 1), x, y, z, least)
+    inside = np.zeros(len(member), np.bool_)
+    for k, least in enumerate((WIDE, NARROW, NARROW)):
+        if not mark_within(columns, member, x, y, z, least, inside) and k > 0:
+            break  # the same normals as before, and so the same mean
+        a, b, c = sum_marked(columns, inside)
         length = np.sqrt(a * a + b * b + c * c)
         x, y, z = a / length, b / length, c / length
     return np.array([x, y, z])
@@ -82,7 +84,8 @@ def _distances(normal: F64, grid: Grid, cells: I32, member: Bool) -> F64:
     sums, counts = np.zeros((height + 1, width + 1)), np.zeros((height + 1, width + 1), np.int32)
     for k in range(len(cells)):
         if member[k]:
-            r, c = cells[k] // w, cells[k] % w
+            r = cells[k] // w
+            c = cells[k] - r * w
             sums[r - top + 1, c - left + 1] = (normal[0] * grid.rays_x[c] + normal[1] * grid.rays_y[r] + normal[2]) / grid.rho[r, c]
             counts[r - top + 1, c - left + 1] = 1
     for r in range(1, height + 1):
@@ -93,7 +96,8 @@ def _distances(normal: F64, grid: Grid, cells: I32, member: Bool) -> F64:
     out = np.zeros(len(cells))
     for k in range(len(cells)):
         if member[k]:
-            r, c = cells[k] // w - top, cells[k] % w - left
+            r = cells[k] // w
+            r, c = r - top, cells[k] - r * w - left
             a, b, d, e = max(r - REACH, 0), min(r + REACH + 1, height), max(c - REACH, 0), min(c + REACH + 1, width)
             out[k] = (sums[b, e] - sums[a, e] - sums[b, d] + sums[a, d]) / (counts[b, e] - counts[a, e] - counts[b, d] + counts[a, d])
     return out
@@ -104,7 +108,8 @@ def _box(cells: I32, w: int) -> tuple[int, int, int, int]:
     """Top, left, height and width of the rectangle about cells of a grid of w columns."""
     top, bottom, left, right = cells[0] // w, 0, w, 0
     for i in cells:
-        r, c = i // w, i % w
+        r = i // w
+        c = i - r * w
         top, bottom, left, right = min(top, r), max(bottom, r), min(left, c), max(right, c)
     return top, left, bottom - top + 1, right - left + 1
 
@@ -120,13 +125,16 @@ def _further(distances: F64, member: Bool) -> Bool:
     spread = np.sqrt(max(square / n - (total / n) ** 2, 0.0))
     near, far = total / n + spread, total / n - spread
     for _ in range(ROUNDS):
-        middle, sums, count = 0.5 * (near + far), 0.0, 0
+        middle, sums, count, changed = 0.5 * (near + far), 0.0, 0, 0
         for k in range(len(distances)):
-            out[k] = distances[k] < middle
-            sums += distances[k] if out[k] else 0.0
-            count += out[k]
-        if count == 0 or count == n:
+            further = distances[k] < middle
+            count += further
+            changed += further != out[k]
+            out[k] = further
+        if count == 0 or count == n or changed == 0:
             break
+        for k in range(len(distances)):
+            sums += distances[k] if out[k] else 0.0
         near, far = (total - sums) / (n - count), sums / count
     return out
 

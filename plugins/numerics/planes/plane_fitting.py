@@ -8,11 +8,9 @@ import numpy as np
 from trihedron.pipeline.types import F64, I32, Bool
 from trihedron.plugins.numerics.algebra.ranking import median
 from trihedron.plugins.numerics.depth.organised_grid import Grid, cells_by_component
-from trihedron.plugins.numerics.planes.cell_columns import columns_of, normal_equations, sum_within, thinned
+from trihedron.plugins.numerics.planes.cell_columns import columns_of, mark_within, normal_equations, sum_marked, thinned, thinned_marks
 from trihedron.plugins.numerics.planes.parallel_planes import larger_surface
 from trihedron.plugins.numerics.planes.plane_curvature import linear_turn
-
-COARSE = 2000  # cells a component's first plane is estimated from
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
@@ -44,9 +42,10 @@ def fit_components(
             break
         component = cells[starts[k] : starts[k + 1]]
         columns, member = columns_of(grid, component), np.zeros(len(component), np.bool_)
-        q, members = _fit_component(columns, np.cos(cone), gate, member)
-        q, members, _ = larger_surface(q, grid, component, columns, member)
-        if members < least or turn(q, columns, member, max(len(component) // COARSE, 1)) > curved:
+        some = thinned(columns)
+        q, members = _fit_component(columns, some, np.cos(cone), gate, member)
+        q, members, _ = larger_surface(q, grid, component, columns, some, member)
+        if members < least or turn(q, some, thinned_marks(member)) > curved:
             continue
         planes[found, 0], planes[found, 1], planes[found, 2] = q[0], q[1], q[2]
         found += 1
@@ -68,8 +67,9 @@ def fit_labelled(grid: Grid, labels: I32, planes: F64, cone: float, gate: float,
         q = planes[labels[region[0] // labels.shape[1], region[0] % labels.shape[1]] - 1].copy()
         for _ in range(2):
             columns, member = columns_of(grid, region), np.zeros(len(region), np.bool_)
-            q, members = _trimmed(q, 1, columns, np.cos(cone), gate, member)
-            q, members, other = larger_surface(q, grid, region, columns, member)
+            some = thinned(columns)
+            q, members = _trimmed(q, 1, columns, some, np.cos(cone), gate, member)
+            q, members, other = larger_surface(q, grid, region, columns, some, member)
             if members < least:
                 break
             fitted[found] = q
@@ -82,24 +82,24 @@ def fit_labelled(grid: Grid, labels: I32, planes: F64, cone: float, gate: float,
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def _fit_component(columns: F64, cos_cone: float, gate: float, member: Bool) -> tuple[F64, int]:
+def _fit_component(columns: F64, some: F64, cos_cone: float, gate: float, member: Bool) -> tuple[F64, int]:
     """q of the plane that most of a component belongs to and its number of members, which are marked; zeros when there is none."""
-    some = thinned(columns, max(len(member) // COARSE, 1))
-    return _trimmed(start_plane(dominant_normal(some, cos_cone), some, cos_cone), 0, columns, cos_cone, gate, member)
+    return _trimmed(start_plane(dominant_normal(some, cos_cone), some, cos_cone), 0, columns, some, cos_cone, gate, member)
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def _trimmed(q: F64, first: int, columns: F64, cos_cone: float, gate: float, member: Bool) -> tuple[F64, int]:
-    """Rounds of `fit_cells` with a narrowing gate, the `first` of them left out, on some of the cells and last on all: (q, number of members), which
-    are marked."""
-    some = thinned(columns, max(len(member) // COARSE, 1))
-    marks = np.zeros(some.shape[1], np.bool_)
+def _trimmed(q: F64, first: int, columns: F64, some: F64, cos_cone: float, gate: float, member: Bool) -> tuple[F64, int]:
+    """Rounds of trimmed weighted least squares with a narrowing gate, the `first` of them left out, on some of the cells and last on all: (q, number
+    of members), which are marked. A round that marks the same members has the plane of the one before."""
+    marks = member if some.shape[1] == len(member) else np.zeros(some.shape[1], np.bool_)
     members = 0
     for step in range(first, 4):
         if q[0] == 0.0 and q[1] == 0.0 and q[2] == 0.0:
             return q, 0
-        last = step == 3
-        q, members = fit_cells(q, columns if last else some, cos_cone, gate * (4.0, 2.0, 1.0, 1.0)[step], member if last else marks)
+        cells, marked = (columns, member) if step == 3 else (some, marks)
+        members, changed = _mark_members(q, cells, cos_cone, gate * (4.0, 2.0, 1.0, 1.0)[step], marked)
+        if changed or step == first or (step == 3 and len(marks) < len(member)):
+            q, members = _fit_members(cells, marked, members)
     return q, members
 
 
@@ -108,21 +108,25 @@ def dominant_normal(columns: F64, cos_cone: float) -> F64:
     """The commonest direction among the cells' normals: the fullest bin of a coarse grid over (n_x, n_y), then three mean shifts within the cone."""
     sums = np.zeros((21 * 21, 4))  # number and sum of the normals in each bin
     nx, ny, nz = columns[5], columns[6], columns[7]
+    bin, count, x, y, z = 0, 0.0, 0.0, 0.0, 0.0  # of the cells before: sums in memory would wait for each other
     for i in range(len(nx)):
-        bin = 21 * (int(np.rint(10.0 * nx[i])) + 10) + int(np.rint(10.0 * ny[i])) + 10
-        sums[bin, 0] += 1.0
-        sums[bin, 1] += nx[i]
-        sums[bin, 2] += ny[i]
-        sums[bin, 3] += nz[i]
+        here = 21 * (int(np.rint(10.0 * nx[i])) + 10) + int(np.rint(10.0 * ny[i])) + 10
+        if here != bin:
+            sums[bin, 0], sums[bin, 1], sums[bin, 2], sums[bin, 3] = count, x, y, z
+            bin, count, x, y, z = here, sums[here, 0], sums[here, 1], sums[here, 2], sums[here, 3]
+        count, x, y, z = count + 1.0, x + nx[i], y + ny[i], z + nz[i]
+    sums[bin, 0], sums[bin, 1], sums[bin, 2], sums[bin, 3] = count, x, y, z
     best = 0
     for bin in range(len(sums)):
         best = bin if sums[bin, 0] > sums[best, 0] else best
     x, y, z = sums[best, 1], sums[best, 2], sums[best, 3]
     length = max(np.sqrt(x * x + y * y + z * z), 1e-9)
     x, y, z = x / length, y / length, z / length
-    everyone = np.ones(len(nx), np.bool_)
-    for _ in range(3):
-        p, q, s = sum_within(columns, everyone, 1, x, y, z, cos_cone)
+    everyone, inside = np.ones(len(nx), np.bool_), np.zeros(len(nx), np.bool_)
+    for k in range(3):
+        if not mark_within(columns, everyone, x, y, z, cos_cone, inside) and k > 0:
+            break
+        p, q, s = sum_marked(columns, inside)
         length = np.sqrt(p * p + q * q + s * s)
         if length < 1e-9:
             break
@@ -151,17 +155,31 @@ def start_plane(normal: F64, columns: F64, cos_cone: float) -> F64:
 def fit_cells(q: F64, columns: F64, cos_cone: float, gate: float, member: Bool) -> tuple[F64, int]:
     """One round of trimmed weighted least squares: (q, number of members). A cell is a member when its normal is within the cone of q's and its depth
     within `gate` σ of q's; `member` (per cell) is written. A degenerate fit returns zeros, and nothing is a member."""
+    found, _ = _mark_members(q, columns, cos_cone, gate, member)
+    return _fit_members(columns, member, found)
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _mark_members(q: F64, columns: F64, cos_cone: float, gate: float, member: Bool) -> tuple[int, bool]:
+    """Write which cells are members as in `fit_cells`: how many are, and whether these are others than were marked."""
     xs, ys, rho, sigma, nx, ny, nz = columns[0], columns[1], columns[2], columns[3], columns[5], columns[6], columns[7]
     u, v, one = q[0], q[1], q[2]
     length = np.sqrt(u * u + v * v + one * one)
     a, b, c = -u / length, -v / length, -one / length
+    found, changed = 0, 0
     for k in range(len(member)):
         aside = nx[k] * a + ny[k] * b + nz[k] * c < cos_cone
         off = abs(u * xs[k] + v * ys[k] + one - rho[k]) > gate * sigma[k]
-        member[k] = not (aside | off)
-    found = 0
-    for k in range(len(member)):
-        found += member[k]
+        inside = not (aside | off)
+        changed += inside != member[k]
+        found += inside
+        member[k] = inside
+    return found, changed > 0
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _fit_members(columns: F64, member: Bool, found: int) -> tuple[F64, int]:
+    """(q, number of members) by weighted least squares to the marked cells; (zeros, 0) when they are degenerate, and nothing stays marked."""
     solved, q = solve_symmetric(*normal_equations(columns, member))
     if found < 3 or not solved:
         member[:] = False
@@ -170,14 +188,14 @@ def fit_cells(q: F64, columns: F64, cos_cone: float, gate: float, member: Bool) 
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def turn(q: F64, columns: F64, member: Bool, step: int) -> float:
-    """How far the normals turn across the members (one in `step`), rad: about 0 for a plane whatever its noise, all of the angle seen for a cylinder.
+def turn(q: F64, columns: F64, member: Bool) -> float:
+    """How far the normals turn across the members, rad: about 0 for a plane whatever its noise, all of the angle seen for a cylinder.
     Members without a normal do not count."""
     m = 0
     cxx, cxy, cxz, cyy, cyz, czz = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0  # sums of x xᵀ, of n xᵀ, of x and of n
     dxx, dxy, dxz, dyx, dyy, dyz, dzx, dzy, dzz = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
     sx, sy, sz, tx, ty, tz = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
-    for k in range(0, len(member), step):
+    for k in range(len(member)):
         nx, ny, nz = columns[5, k], columns[6, k], columns[7, k]
         if member[k] and nx == nx:
             z = 1.0 / columns[2, k]
