@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -31,6 +32,8 @@ from trihedron.plugins.numerics.maps.map_alignment import MapAlignment
 from trihedron.plugins.numerics.maps.moving_objects import MovingObjects
 from trihedron.plugins.numerics.maps.submaps import submap_of
 from trihedron.plugins.numerics.maps.tracking_quality import TrackingQuality
+
+EYE = np.eye(3)
 
 
 @register("pose", "refine")
@@ -97,17 +100,19 @@ class Refine(TrackingQuality, MovingObjects, Foundations, FocalLengths):
             said = self.judged_by_focal_lengths(found, problem, self.judged_by_foundation(found, problem, said))
         if submap:
             said = replace(said, status=DEGRADED, reason=f"in sub-map {submap}, which is not tied to the first yet: {said.reason}")
-        T, held = found.T_world_camera, found.unobservable.shape[1]
+        T, held, inliers = found.T_world_camera, found.unobservable.shape[1], np.array(seen.inliers, np.int32)
         reference, T_reference_camera = reference_of(map, T, submap)
         return Pose(
-            frame.index, frame.stamp_ns, T, said.covariance, T_reference_camera, reference, seen.inliers, held, said.status, said.reason, submap
+            frame.index, frame.stamp_ns, T, said.covariance, T_reference_camera, reference, inliers, held, said.status, said.reason, submap
         )
 
     def _information(self, start: Decoupled) -> F64:
         """(6, 6) of the decoupled pose as a prior."""
         information = np.zeros((6, 6))
-        information[:3, :3] = np.linalg.inv(self.position_sigma_m**2 * np.eye(3) + start.covariance[:3, :3])
-        information[3:, 3:] = np.linalg.inv(start.covariance[3:, 3:] + np.radians(self.rotation_sigma_deg) ** 2 * np.eye(3))
+        both = np.array([start.covariance[:3, :3], start.covariance[3:, 3:]])
+        both[0] += self.position_sigma_m**2 * EYE
+        both[1] += math.radians(self.rotation_sigma_deg) ** 2 * EYE
+        information[:3, :3], information[3:, 3:] = np.linalg.inv(both)
         return information
 
     def _unknown_place(self, start: Decoupled, frame: Frame, previous: Pose, sought: bool, map: Map, submap: int) -> Pose:

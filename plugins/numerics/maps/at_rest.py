@@ -14,14 +14,14 @@ import numba
 import numpy as np
 
 from trihedron.pipeline.geometry import invert, log_se3
-from trihedron.pipeline.types import F32, F64, U8, Bool, Keypoints, Map, Matches, Planes, Segments
+from trihedron.pipeline.types import F32, F64, I32, U8, Bool, Keypoints, Map, Matches, Planes, Segments
 from trihedron.plugins.numerics.motion.pose_kernel import Flags
 from trihedron.plugins.numerics.motion.pose_solver import PoseSolution, Terms
 from trihedron.plugins.numerics.motion.pose_terms import LineTerms, PointTerms
 
 AGREED = 2  # keyframes that measured a landmark in the same place, with which it is proven
 LEAST = 30  # points of each kind below which shares of them say nothing
-ALONG = np.array([0.1, 0.3, 0.5, 0.7, 0.9], np.float32)[:, None]  # where it is asked on what a segment lies
+ALONG = np.array([0.1, 0.3, 0.5, 0.7, 0.9], np.float32)  # where it is asked on what a segment lies
 ON_PLANES, PROVEN, PLANES = "what lies on planes", "what is proven", "the planes"
 
 
@@ -36,7 +36,8 @@ class AtRest:
     def only(self, terms: Terms) -> Terms:
         """Those of the matches' terms that are of what is at rest."""
         points, lines, planes = terms
-        return PointTerms(*(column[self.points] for column in points)), LineTerms(*(column[self.lines] for column in lines)), planes
+        rows, line_rows = np.flatnonzero(self.points), np.flatnonzero(self.lines)
+        return PointTerms(*(column.take(rows, 0) for column in points)), LineTerms(*(column.take(line_rows, 0) for column in lines)), planes
 
     def flags(self, terms: Terms) -> Flags:
         """The same as flags of all terms: the others are outliers."""
@@ -45,8 +46,9 @@ class AtRest:
     def contradicted(self, points: U8) -> float:
         """By how much larger a share (0 … 1) of the other points than of these are outliers (flags (n,)), or the other way round; 0 where
         either are too few."""
-        other, these = points[~self.points] == 0, points[self.points] == 0
-        return float(abs(other.mean() - these.mean())) if min(len(other), len(these)) >= LEAST else 0.0
+        count, agreed = np.count_nonzero(self.points), np.count_nonzero(points)
+        others, these = len(points) - count, np.count_nonzero(points[self.points])
+        return float(abs((others - agreed + these) / others - (count - these) / count)) if min(others, count) >= LEAST else 0.0
 
 
 def at_rest(map: Map, matches: Matches, keypoints: Keypoints, segments: Segments, planes: Planes) -> list[AtRest]:
@@ -75,26 +77,37 @@ def proven_planes(map: Map, matches: Matches) -> Bool:
 
 def on_planes(matches: Matches, keypoints: Keypoints, segments: Segments, planes: Planes) -> AtRest:
     """Matches of what lies on planes that are matched as well, and not at the border of something else."""
-    known = np.zeros(256, np.bool_)
-    known[matches.planes[:, 0] + 1] = True
-    ends = segments.endpoints_px[matches.segments[:, 0]]
-    along = ((1.0 - ALONG) * ends[:, None, 0] + ALONG * ends[:, None, 1]).astype(np.float32)
-    points = _inside(planes.labels, known, planes.stride, keypoints.pixels[matches.keypoints[:, 0]])
-    lines = _inside(planes.labels, known, planes.stride, along.reshape(-1, 2))
-    return AtRest(ON_PLANES, points, lines.reshape(-1, len(ALONG)).all(axis=1))
+    same, points, lines = matches.planes.copy(), matches.keypoints.copy(), matches.segments.copy()
+    return AtRest(ON_PLANES, *_on_planes(planes.labels, same, planes.stride, keypoints.pixels, points, segments.endpoints_px, lines))
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def _inside(labels: U8, known: Bool, stride: int, pixels: F32) -> Bool:
-    """Whether all nine cells about each pixel (n, 2) have labels that are `known` (256,)."""
+def _on_planes(labels: U8, planes: I32, stride: int, pixels: F32, points: I32, ends: F32, lines: I32) -> tuple[Bool, Bool]:
+    """Which of the matched points (n, 2) and lines (m, 2), some of those at pixels (·, 2) and ends (·, 2, 2), lie within matched planes (p, 2)."""
+    known, flat, straight = np.zeros(256, np.bool_), np.zeros(len(points), np.bool_), np.ones(len(lines), np.bool_)
+    for i in range(len(planes)):
+        known[planes[i, 0] + 1] = True
+    for i in range(len(points)):
+        flat[i] = _inside(labels, known, stride, pixels[points[i, 0], 0], pixels[points[i, 0], 1])
+    for i in range(len(lines)):
+        row = lines[i, 0]
+        for share in ALONG:
+            rest = np.float32(1.0) - share
+            x, y = rest * ends[row, 0, 0] + share * ends[row, 1, 0], rest * ends[row, 0, 1] + share * ends[row, 1, 1]
+            straight[i] = straight[i] and _inside(labels, known, stride, x, y)
+    return flat, straight
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _inside(labels: U8, known: Bool, stride: int, u: float, v: float) -> bool:
+    """Whether all nine cells about a pixel have labels that are `known` (256,)."""
     h, w = labels.shape
-    inside = np.ones(len(pixels), np.bool_)
-    for k in range(len(pixels)):
-        x, y = round(pixels[k, 0] / stride), round(pixels[k, 1] / stride)
-        for i in range(y - 1, y + 2):
-            for j in range(x - 1, x + 2):
-                inside[k] &= known[labels[min(max(i, 0), h - 1), min(max(j, 0), w - 1)]]
-    return inside
+    x, y = round(u / stride), round(v / stride)
+    for i in range(y - 1, y + 2):
+        for j in range(x - 1, x + 2):
+            if not known[labels[min(max(i, 0), h - 1), min(max(j, 0), w - 1)]]:
+                return False
+    return True
 
 
 def _between(one: PoseSolution, other: PoseSolution) -> F64:

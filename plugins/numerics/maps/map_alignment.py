@@ -11,35 +11,35 @@ from trihedron.plugins.numerics.maps.map_terms import line_terms, plane_terms, p
 from trihedron.plugins.numerics.motion.pose_kernel import Flags
 from trihedron.plugins.numerics.motion.pose_solver import PoseSolution, Terms, classify_terms, first_step, solve_pose
 
-SCORE = np.array([1, 2, 5])  # what a point, a line and a plane count
+SCORE = 1, 2, 5  # what a point, a line and a plane count
 
 
 @dataclass(frozen=True)
 class Agreement:
-    """How many points, lines and planes (3,) were sought in a frame, relations between planes not counted, and how many agree with a pose."""
+    """How many points, lines and planes were sought in a frame, relations between planes not counted, and how many agree with a pose."""
 
-    inliers: I32
-    sought: I32
+    inliers: tuple[int, int, int]
+    sought: tuple[int, int, int]
 
     @property
     def agreed(self) -> int:
         """Matches that agree, of any kind."""
-        return int(self.inliers.sum())
+        return sum(self.inliers)
 
     @property
     def matches(self) -> int:
         """All of them."""
-        return int(self.sought.sum())
+        return sum(self.sought)
 
     @property
     def score(self) -> int:
         """Matches that agree, by what each is worth."""
-        return int(self.inliers @ SCORE)
+        return sum(count * score for count, score in zip(self.inliers, SCORE))
 
     @property
     def fewer_planes(self) -> bool:
         """Whether less than half of the planes agree."""
-        return bool(2 * self.inliers[2] < self.sought[2])
+        return 2 * self.inliers[2] < self.sought[2]
 
 
 @dataclass(frozen=True)
@@ -83,9 +83,8 @@ class MapAlignment:
     def agreement(self, found: PoseSolution) -> Agreement:
         """Of a solution with the flags of all matches."""
         same = len(self.matches.planes)
-        kinds = found.points, found.lines, found.planes[:same]
-        sought = np.array([len(self.matches.keypoints), len(self.matches.segments), same], np.int32)
-        return Agreement(np.array([np.count_nonzero(kind) for kind in kinds], np.int32), sought)
+        inliers = np.count_nonzero(found.points), np.count_nonzero(found.lines), np.count_nonzero(found.planes[:same])
+        return Agreement(inliers, (len(self.matches.keypoints), len(self.matches.segments), same))
 
     def landmarks(self, found: PoseSolution) -> tuple[I32, I32, I32]:
         """Ids of the points, lines and planes that agree with a solution."""

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numba
 import numpy as np
 
@@ -90,12 +92,30 @@ def plane_terms(map: Map, planes: Planes, same: I32, parallel: I32, perpendicula
 
     An observed normal that takes part in k relations has its covariance multiplied by k in each: it was measured once."""
     pairs = np.concatenate([same, parallel, perpendicular])
-    kinds = np.repeat(np.array([SAME, PARALLEL, PERPENDICULAR], np.int32), [len(same), len(parallel), len(perpendicular)])
-    covariance = map.planes.rows("covariance", pairs[:, 1])
-    observed = planes.covariance[pairs[:, 0]]
-    related = kinds != SAME
-    uses = np.bincount(pairs[related, 0], minlength=len(planes.coefficients))
-    observed[related] *= uses[pairs[related, 0], None, None]
-    covariance[related, 0, 0] += np.radians(relation_sigma_deg) ** 2
-    covariance[related, 1, 1] += np.radians(relation_sigma_deg) ** 2
-    return PlaneTerms(kinds, map.planes.rows("coefficients", pairs[:, 1]), covariance, planes.coefficients[pairs[:, 0]], observed)
+    coefficients, covariance = map.planes.gathered(pairs[:, 1], "coefficients", "covariance")
+    extra = math.radians(relation_sigma_deg) ** 2
+    kinds, observed, noise = _plane_terms(covariance, pairs, len(same), len(same) + len(parallel), planes.coefficients, planes.covariance, extra)
+    return PlaneTerms(kinds, coefficients, covariance, observed, noise)
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _plane_terms(
+    covariance: F64, pairs: I32, parallel: int, perpendicular: int, coefficients: F64, noise: F64, extra: float
+) -> tuple[I32, F64, F64]:
+    """Kinds, observed planes and their covariances of pairs (p, 2), the first the same, then from `parallel` and from `perpendicular` on walls that
+    are related, to whose map covariances (p, 3, 3) `extra` (rad²) is added."""
+    n = len(pairs)
+    kinds, observed, of_observed, uses = np.full(n, SAME, np.int32), np.empty((n, 4)), np.empty((n, 3, 3)), np.zeros(len(coefficients))
+    for i in range(parallel, n):
+        kinds[i] = PARALLEL if i < perpendicular else PERPENDICULAR
+        uses[pairs[i, 0]] += 1.0
+        covariance[i, 0, 0] += extra
+        covariance[i, 1, 1] += extra
+    for i in range(n):
+        row = pairs[i, 0]
+        for a in range(4):
+            observed[i, a] = coefficients[row, a]
+        for a in range(3):
+            for b in range(3):
+                of_observed[i, a, b] = noise[row, a, b] * (uses[row] if i >= parallel else 1.0)
+    return kinds, observed, of_observed

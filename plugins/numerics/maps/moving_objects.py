@@ -21,7 +21,7 @@ from trihedron.plugins.numerics.maps.at_rest import (
     proven_planes,
     spread_about,
 )
-from trihedron.plugins.numerics.maps.map_alignment import MapAlignment, Verdict
+from trihedron.plugins.numerics.maps.map_alignment import Agreement, MapAlignment, Verdict
 from trihedron.plugins.numerics.motion.pose_solver import PoseSolution, Terms
 
 FIRST_SHARE = 0.5  # of the limit that a first step must reach before the rest is solved for by itself
@@ -49,8 +49,9 @@ class MovingObjects:
         it, and what that is. Where most disagree even so, no more is known than the planes say."""
         terms = problem.terms(problem.T_start)
         found, by = problem.solved(terms), ""
+        seen = problem.agreement(found)
         for rest in at_rest(problem.map, problem.matches, problem.keypoints, problem.segments, problem.planes):
-            alone = self._alone(found, problem, terms, rest)
+            alone = self._alone(found, seen, problem, terms, rest)
             if alone is not None:
                 found, by = problem.judged(alone), rest.name
                 break
@@ -68,9 +69,9 @@ class MovingObjects:
             return replace(said, status=DEGRADED, reason=reason)
         return replace(said, reason=f"{said.reason}, by {by} alone") if by != ALL else said
 
-    def _alone(self, found: PoseSolution, problem: MapAlignment, terms: Terms, rest: AtRest) -> PoseSolution | None:
-        """The solution by what is at rest alone, where all the others pull the pose away from it."""
-        seen, far = problem.agreement(found), self.moving_unproven if rest.name == PLANES else self.moving_sure
+    def _alone(self, found: PoseSolution, seen: Agreement, problem: MapAlignment, terms: Terms, rest: AtRest) -> PoseSolution | None:
+        """The solution by what is at rest alone, where all the others pull the pose away from the one found, which is agreed on as `seen`."""
+        far = self.moving_unproven if rest.name == PLANES else self.moving_sure
         contradicted = rest.contradicted(found.points) >= self.moving_share or (rest.name == PROVEN and seen.fewer_planes)
         if not contradicted and (1.0 - seen.agreed / max(seen.matches, 1) < self.moving_share or seen.sought[2] == 0):
             return None
