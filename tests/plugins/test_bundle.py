@@ -41,10 +41,11 @@ def disturbed(map, window, sigma=(0.01, 0.005), seed=0):
 
 
 def small_problem(room, lines=6):
-    """Few landmarks of every kind, so that dense algebra is quick."""
+    """Few landmarks of every kind, so that dense algebra is quick, the points measured more than once: others are not in H and g."""
     _, map = room
     window = bundle_window(map, 4, 3)
-    window = dataclasses.replace(window, points=window.points[:40], lines=window.lines[:lines])
+    twice = window.points[np.diff(bundle_problem(map, window)[1].point_starts) > 1]
+    window = dataclasses.replace(window, points=twice[:40], lines=window.lines[:lines])
     state, seen = bundle_problem(disturbed(map, window), window)
     return state, seen
 
@@ -104,6 +105,22 @@ def test_the_schur_complement_gives_the_covariance_of_the_whole(room):
         assert np.allclose(found.landmark_covariance[row], covariance[block, block], rtol=1e-6, atol=1e-12)
     step = covariance @ gradient
     assert step @ H @ step < 0.1 * c  # at the minimum: what is left to go is small against the standard deviations
+
+
+def test_a_point_measured_once_follows_its_keyframe_and_says_nothing_of_it(room):
+    _, map = room
+    window = bundle_window(map, 4, 3)
+    map = disturbed(map, window)
+    once = np.diff(bundle_problem(map, window)[1].point_starts) == 1
+    others = dataclasses.replace(window, points=window.points[~once])
+    _, seen = bundle_problem(map, window)
+    found, without = (solve_bundle(*bundle_problem(map, points), 10) for points in (window, others))
+    assert once.sum() > 10
+    assert np.allclose(found.state.rotations, without.state.rotations, atol=1e-12)
+    assert np.allclose(found.covariance, without.covariance, rtol=1e-9)
+    k, pixels = (column[seen.point_starts[:-1][once]] for column in (seen.point_keyframes, seen.pixels))
+    local = np.einsum("nij,ni->nj", found.state.rotations[k], found.state.points[once] - found.state.positions[k])
+    assert np.allclose(CAMERA.project(local), pixels, atol=1e-2)
 
 
 def errors_of(world, window, found):

@@ -39,31 +39,31 @@ def view():
 
 @pytest.mark.parametrize("depth_m", [2.6, np.nan])
 def test_the_normal_equations_of_a_point(view, depth_m):
-    """JᵀWJ and JᵀWr with J by numeric derivatives of pixel and inverse depth."""
+    """JᵀWJ and JᵀWr with J by numeric derivatives of pixel and inverse depth. A held keyframe measured the same: of one alone H knows nothing."""
     T, x, _, segment = view
     pixel, rows = segment[0], 3 if np.isfinite(depth_m) else 2
     W = np.diag([1.0 / 0.8**2, 1.0 / 0.8**2, (depth_m**2 / 0.02) ** 2][:rows])
-    state = BundleState(T[None, :3, :3].copy(), T[None, :3, 3].copy(), x[None], np.zeros((0, 2, 3)), np.zeros((0, 4)))
-    one, none = np.zeros(1, np.int32), np.zeros(0, np.int32)
+    state = BundleState(np.stack([T[:3, :3]] * 2), np.stack([T[:3, 3]] * 2), x[None], np.zeros((0, 2, 3)), np.zeros((0, 4)))
+    both, none, pixels = np.arange(2, dtype=np.int32), np.zeros(0, np.int32), np.stack([pixel] * 2)
     seen = BundleMeasurements(
-        1, INTRINSICS[None], np.array([0, 1], np.int32), one, pixel[None], np.array([depth_m]), np.array([0.8]), np.array([0.02]),
-        one, none, np.zeros((0, 2, 2)), np.zeros((0, 2, 3)), np.zeros((0, 2, 3, 3)), 1.0,
+        1, np.stack([INTRINSICS] * 2), np.array([0, 2], np.int32), both, pixels, np.full(2, depth_m), np.full(2, 0.8), np.full(2, 0.02),
+        both[:1], none, np.zeros((0, 2, 2)), np.zeros((0, 2, 3)), np.zeros((0, 2, 3, 3)), 1.0,
         none, none, np.zeros((0, 4)), np.zeros((0, 3, 3)), np.zeros((0, 3), np.int32), np.zeros(0), True,
     )  # fmt: skip
-    out = NormalEquations(np.empty((6, 6)), np.empty(6), np.empty((1, 4, 4)), np.empty((1, 4)), np.empty((1, 6, 4)))
+    out = NormalEquations(np.empty((6, 6)), np.empty(6), np.empty((1, 4, 4)), np.empty((1, 4)), np.empty((2, 6, 4)))
 
     def residual(T, x):
         local = T[:3, :3].T @ (x - T[:3, 3])
         return np.append(CAMERA.project(local) - pixel, 1.0 / local[2] - 1.0 / depth_m)[:rows]
 
     r, J = residual(T, x), np.hstack([numeric(lambda d: residual(shifted(T, d), x), 6), numeric(lambda d: residual(T, x + d), 3)])
-    assert linearise_bundle(state, seen, SQUARES, out) == pytest.approx(r @ W @ r)
+    assert linearise_bundle(state, seen, SQUARES, out) == pytest.approx(2.0 * r @ W @ r)
     H, g = J.T @ W @ J, J.T @ W @ r
     for found, wanted in (
         (np.tril(out.H), np.tril(H[:6, :6])),
-        (np.tril(out.V[0, :3, :3]), np.tril(H[6:, 6:])),
+        (np.tril(out.V[0, :3, :3]), 2.0 * np.tril(H[6:, 6:])),
         (out.W[0, :, :3], H[:6, 6:]),
-        (np.append(out.g, out.b[0, :3]), g),
+        (np.append(out.g, 0.5 * out.b[0, :3]), g),
     ):
         assert np.allclose(found, wanted, rtol=1e-5, atol=1e-6 * np.abs(wanted).max())
 

@@ -18,7 +18,10 @@ SQUARES, HUBER, TRUNCATED = 0, 1, 2
 
 class NormalEquations(NamedTuple):
     """`[H W; Wᵀ V] dx = -[g; b]`: H (lower triangle) and g over the free poses (6 each) and the planes (3 each); a 4 × 4 block V for each
-    point (padded) and line, and a block of W for each of their observations, points first. Blocks of held keyframes are not used."""
+    point (padded) and line, and a block of W for each of their observations, points first. Blocks of held keyframes are not used.
+
+    A point that was measured once goes wherever its keyframe goes and says nothing of the pose: its term is not in H and g, nor does the Schur
+    complement take it from them."""
 
     H: F64  # (c, c)
     g: F64  # (c,)
@@ -94,6 +97,8 @@ def _add_points(state: BundleState, seen: BundleMeasurements, loss: int, out: No
                 continue
             for a in range(6):
                 W[o, a, 0], W[o, a, 1], W[o, a, 2], W[o, a, 3] = -E[a, 0], -E[a, 1], -E[a, 2], 0.0
+            if seen.point_starts[i + 1] - seen.point_starts[i] == 1:
+                continue
             m00, m01, m02 = p1 * a02, p1 * a12 - p2 * a11, p1 * a22 - p2 * a12  # P A
             m10, m11, m12 = p2 * a00 - p0 * a02, -p0 * a12, p2 * a02 - p0 * a22
             m20, m21, m22 = -p1 * a00, p0 * a11, p0 * a12 - p1 * a02

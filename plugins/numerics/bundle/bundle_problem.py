@@ -9,6 +9,7 @@ import numpy as np
 
 from trihedron.pipeline.types import F64, I32, Map, Table
 from trihedron.plugins.numerics.algebra.uncertainty import inverse
+from trihedron.plugins.numerics.maps.id_sets import places
 from trihedron.plugins.numerics.maps.local_window import covisible_keyframes, newest_keyframes, observed_by
 from trihedron.plugins.numerics.motion.pose_terms import PARALLEL, PERPENDICULAR
 
@@ -128,12 +129,11 @@ def _observations(map: Map, kind: str, keyframes: I32, ids: I32) -> tuple[I32, I
     spans = map.keyframes.rows(f"{kind}s", keyframes)
     rows = np.concatenate([np.empty(0, np.int32), *(np.arange(a, b, dtype=np.int32) for a, b in spans)])
     who = np.repeat(np.arange(len(keyframes), dtype=np.int32), spans[:, 1] - spans[:, 0])
-    seen = table.rows(kind, rows)
-    place = np.searchsorted(ids, seen)
-    known = place < len(ids)
-    known[known] = ids[place[known]] == seen[known]
-    rows, who, place = rows[known], who[known], place[known]
-    order = np.argsort(place, kind="stable")
+    place = places(table.rows(kind, rows), ids)
+    known = np.flatnonzero(place >= 0)
+    place = place[known]
+    short = place.astype(np.uint16) if len(ids) < 1 << 16 else place  # numbers of two bytes NumPy sorts in a third of the time
+    order = known[np.argsort(short, kind="stable")]
     starts = np.concatenate([[0], np.cumsum(np.bincount(place, minlength=len(ids)))]).astype(np.int32)
     return rows[order], who[order], starts
 

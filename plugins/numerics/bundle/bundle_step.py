@@ -6,6 +6,7 @@ import numba
 import numpy as np
 
 from trihedron.pipeline.types import F64, I32
+from trihedron.plugins.numerics.algebra.small_linear import invert_symmetric
 from trihedron.plugins.numerics.bundle.bundle_kernel import NormalEquations, line_basis
 from trihedron.plugins.numerics.bundle.bundle_problem import BundleMeasurements, BundleState
 from trihedron.plugins.numerics.motion.pose_step import move
@@ -16,12 +17,17 @@ TRUST_M, TRUST_RAD, TRUST_LANDMARK = 1.0 / 0.1**2, 1.0 / np.radians(2.0) ** 2, 1
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def _invert_block(V: F64, damping: float, A: F64) -> None:
-    """A (4, 4): inverse of the damped block V (lower triangle) with the trust added, by Gauss and Jordan (it is positive definite: no pivots)."""
+def _invert_block(V: F64, damping: float, point: bool, A: F64) -> None:
+    """A (4, 4): inverse of the damped block V (lower triangle) with the trust added; that of a line, which is positive definite, by Gauss and Jordan
+    without pivots."""
     for i in range(4):
         for j in range(i + 1):
             A[i, j] = A[j, i] = V[i, j]
         A[i, i] += damping * V[i, i] + TRUST_LANDMARK
+    if point:
+        invert_symmetric(A, A)
+        A[3, 3] = 1.0 / A[3, 3]
+        return
     for k in range(4):
         pivot = 1.0 / A[k, k]
         A[k, k] = 1.0
@@ -74,16 +80,18 @@ def _eliminate(A: F64, b: F64, W: F64, point: bool, keyframes: I32, begin: int, 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def reduce_bundle(normal: NormalEquations, seen: BundleMeasurements, damping: float, S: F64, y: F64, inverses: F64) -> None:
-    """The reduced system `S dx = y` of poses and planes (S full) and the inverse blocks of points and lines (l, 4, 4)."""
+    """The reduced system `S dx = y` of poses and planes (S full) and the inverse blocks of points and lines (l, 4, 4). What a point that was measured
+    once says of the pose, and takes back when it is eliminated, is in neither."""
     trusted(normal.H, seen.free, damping, S)
     for i in range(len(y)):
         y[i] = -normal.g[i]
     n, first, Y = len(seen.point_starts) - 1, len(seen.point_keyframes), np.zeros((6, 4))
     for i in range(len(inverses)):
-        _invert_block(normal.V[i], damping, inverses[i])
+        _invert_block(normal.V[i], damping, i < n, inverses[i])
         if i < n:
             begin, end = seen.point_starts[i], seen.point_starts[i + 1]
-            _eliminate(inverses[i], normal.b[i], normal.W, True, seen.point_keyframes, begin, end, seen.free, Y, S, y)
+            if end - begin > 1:
+                _eliminate(inverses[i], normal.b[i], normal.W, True, seen.point_keyframes, begin, end, seen.free, Y, S, y)
         else:
             begin, end = seen.line_starts[i - n], seen.line_starts[i - n + 1]
             _eliminate(inverses[i], normal.b[i], normal.W[first:], False, seen.line_keyframes, begin, end, seen.free, Y, S, y)

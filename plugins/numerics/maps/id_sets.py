@@ -33,5 +33,15 @@ def among(ids: I32, others: I32) -> Bool:
     return found
 
 
+def places(ids: I32, others: I32) -> I32:
+    """(n,) the row of each id among the others, which are sorted, -1 where it is none of them."""
+    if not len(others):
+        return np.full(len(ids), -1, np.int32)
+    first = others[0] - 1
+    rows = np.full(others[-1] - first + 2, -1, np.int32)
+    rows[others - first] = np.arange(len(others), dtype=np.int32)
+    return np.asarray(rows[np.clip(ids - first, 0, len(rows) - 1)], np.int32)
+
+
 def _end(*parts: I32) -> int:
     return max((int(part.max()) + 1 for part in parts if len(part)), default=0)
