@@ -15,6 +15,7 @@ import numpy as np
 
 from trihedron.pipeline.geometry import invert, log_se3
 from trihedron.pipeline.types import F32, F64, I32, U8, Bool, Keypoints, Map, Matches, Planes, Segments
+from trihedron.plugins.numerics.algebra.small_linear import solve_positive
 from trihedron.plugins.numerics.motion.pose_kernel import Flags
 from trihedron.plugins.numerics.motion.pose_solver import PoseSolution, Terms
 from trihedron.plugins.numerics.motion.pose_terms import LineTerms, PointTerms
@@ -118,8 +119,7 @@ def _between(one: PoseSolution, other: PoseSolution) -> F64:
 def distance2(one: PoseSolution, other: PoseSolution) -> float:
     """Squared standard deviations of the first solution between it and another one, which was found from more (Hausman, Econometrica 1978,
     whose covariance is the first's less the other's: this one is on the safe side)."""
-    xi = _between(one, other)
-    return float(xi @ np.linalg.solve(one.covariance, xi))
+    return _chi2(_between(one, other), one.covariance, 6)
 
 
 def position_distance2(one: PoseSolution, other: PoseSolution) -> float:
@@ -129,7 +129,20 @@ def position_distance2(one: PoseSolution, other: PoseSolution) -> float:
 
 def position_chi2(xi: F64, covariance: F64) -> float:
     """Squared standard deviations of the position's part of xi."""
-    return float(xi[:3] @ np.linalg.solve(covariance[:3, :3], xi[:3]))
+    return _chi2(xi, covariance, 3)
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _chi2(xi: F64, covariance: F64, count: int) -> float:
+    """Squared standard deviations of the first numbers of xi."""
+    S, x, total = np.empty((count, count)), np.empty(count), 0.0
+    for i in range(count):
+        for j in range(count):
+            S[i, j] = covariance[i, j]
+    solve_positive(S, xi[:count], x)
+    for i in range(count):
+        total += xi[i] * x[i]
+    return total
 
 
 def spread_about(one: PoseSolution, sure: PoseSolution) -> F64:

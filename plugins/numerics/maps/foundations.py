@@ -36,11 +36,22 @@ def foundation(map: Map, points: I32, lines: I32, planes: I32) -> Foundation:
     keyframes = np.flatnonzero(weights)
     if not len(keyframes):
         return Foundation(-1, 0.0)
-    sigma_m = np.sqrt(np.linalg.eigvalsh(map.keyframes.rows("covariance", keyframes)[:, :3, :3])[:, -1])
-    order = np.argsort(sigma_m, kind="stable")
-    known = np.cumsum(weights[keyframes[order]])  # how much is known as well as this keyframe or better
-    middle = order[np.searchsorted(known, known[-1] // 2, side="right")]
-    return Foundation(int(keyframes[middle]), float(sigma_m[middle]))
+    sigmas_m, half = _sigmas_m(map, keyframes.tolist()), int(weights.sum()) // 2
+    known = 0  # how much is known as well as a keyframe or better
+    for keyframe in sorted(keyframes.tolist(), key=sigmas_m.__getitem__):
+        known += int(weights[keyframe])
+        if known > half:
+            break
+    return Foundation(keyframe, sigmas_m[keyframe])
+
+
+def _sigmas_m(map: Map, keyframes: list[int]) -> dict[int, float]:
+    """Standard deviations of the keyframes' positions in their worst directions, and of others; found once in a version of the map."""
+    found: dict[int, float] = map.memo.setdefault("sigmas_m", {})
+    if new := [keyframe for keyframe in keyframes if keyframe not in found]:
+        covariances = map.keyframes.rows("covariance", np.array(new))
+        found.update(zip(new, np.sqrt(np.linalg.eigvalsh(covariances[:, :3, :3])[:, -1]).tolist()))
+    return found
 
 
 @dataclass(frozen=True)

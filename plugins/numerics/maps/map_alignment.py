@@ -89,7 +89,7 @@ class MapAlignment:
     def landmarks(self, found: PoseSolution) -> tuple[I32, I32, I32]:
         """Ids of the points, lines and planes that agree with a solution."""
         points, lines, planes = self.matches.keypoints, self.matches.segments, self.matches.planes
-        return points[found.points > 0, 1], lines[found.lines > 0, 1], planes[found.planes[: len(planes)] > 0, 1]
+        return points[:, 1][found.points > 0], lines[:, 1][found.lines > 0], planes[:, 1][found.planes[: len(planes)] > 0]
 
 
 @dataclass(frozen=True)
