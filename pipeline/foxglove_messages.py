@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from functools import cache
 from typing import Any
 
@@ -141,17 +142,17 @@ def features(segments: Segments, keypoints: Keypoints | None) -> ImageAnnotation
     when = stamp(segments)
     drawn = ImageAnnotations(timestamp=when)
     if keypoints is not None:
-        green = Color(r=0.0, g=0.9, b=0.47, a=1.0)
+        green = _color((0.0, 0.9, 0.47), 1.0)
         points = drawn.points.add(timestamp=when, type=PointsAnnotation.POINTS, outline_color=green, thickness=2.0)
         _fill(points, "points", _half(keypoints.pixels))
-    yellow = Color(r=1.0, g=0.9, b=0.0, a=1.0)
+    yellow = _color((1.0, 0.9, 0.0), 1.0)
     lines = drawn.points.add(timestamp=when, type=PointsAnnotation.LINE_LIST, outline_color=yellow, thickness=1.0)
     _fill(lines, "points", _half(segments.endpoints_px))
     return drawn
 
 
 def _half(pixels: F32) -> F64:
-    return np.asarray(np.round(4.0 * ((pixels.astype(np.float64) + 0.5) / 2.0 - 0.5)) / 4.0)
+    return np.asarray(np.rint(2.0 * pixels.astype(np.float64) - 1.0) / 4.0)
 
 
 def planes(planes: Planes) -> SceneUpdate:
@@ -164,8 +165,7 @@ def planes(planes: Planes) -> SceneUpdate:
         if len(seen) < 3:
             continue
         hull = cv2.convexHull(flat[i, seen], returnPoints=False)[:, 0]
-        r, g, b = COLORS[i % len(COLORS)]
-        triangles = entity.triangles.add(color=Color(r=r, g=g, b=b, a=0.5))
+        triangles = entity.triangles.add(color=_color(COLORS[i % len(COLORS)], 0.5))
         triangles.MergeFromString(points[i, seen[hull[_fan(len(hull))]]].tobytes())
     return update
 
@@ -186,23 +186,30 @@ def lines(segments: Segments) -> SceneUpdate:
 
 
 def _add_line(entity: SceneEntity, endpoints_m: Any, color: tuple[float, float, float], kind: Any = LinePrimitive.LINE_LIST) -> None:
-    r, g, b = color
-    _fill(entity.lines.add(type=kind, thickness=2.0, scale_invariant=True, color=Color(r=r, g=g, b=b, a=1.0)), "points", endpoints_m)
+    _fill(entity.lines.add(type=kind, thickness=2.0, scale_invariant=True, color=_color(color, 1.0)), "points", endpoints_m)
+
+
+@cache
+def _color(rgb: tuple[float, float, float], opacity: float) -> Color:
+    r, g, b = rgb
+    return Color(r=r, g=g, b=b, a=opacity)
 
 
 def axes(found: ManhattanFrame) -> SceneUpdate:
     """The axes of the first Manhattan frame as arrows half a metre long, a metre and a half before the camera; none when it is not supported."""
     update, entity = _scene(found, "axes")
-    for (r, g, b), axis in zip(AXES, found.rotations[0].T if found.supported and len(found.rotations) else ()):
-        turned = np.column_stack([axis, tangent_basis(axis)])  # an arrow points along its own x
-        turned[:, 2] *= np.sign(np.linalg.det(turned))
-        T = np.eye(4)
-        T[:3, :3], T[:3, 3] = turned, (0.0, 0.0, 1.5)
-        position, orientation = _position_and_quaternion(T)
-        pose = PoseMessage(position=position, orientation=orientation)
-        color = Color(r=r, g=g, b=b, a=1.0)
-        entity.arrows.add(pose=pose, shaft_length=0.4, shaft_diameter=0.02, head_length=0.1, head_diameter=0.05, color=color)
+    for color, axis in zip(AXES, found.rotations[0].T.tolist() if found.supported and len(found.rotations) else ()):
+        pose = PoseMessage(position=Vector3(z=1.5), orientation=_turn_of_x(*axis))
+        entity.arrows.add(pose=pose, shaft_length=0.4, shaft_diameter=0.02, head_length=0.1, head_diameter=0.05, color=_color(color, 1.0))
     return update
+
+
+def _turn_of_x(x: float, y: float, z: float) -> Quaternion:
+    """The shortest turn that lays the x-axis on a unit vector: an arrow points along its own x."""
+    if x < -1.0 + 1e-9:
+        return Quaternion(z=1.0)
+    w = math.sqrt(0.5 + 0.5 * x)  # cosine of half the angle
+    return Quaternion(y=-0.5 * z / w, z=0.5 * y / w, w=w)
 
 
 def path(pose: Pose, positions: list[F64]) -> SceneUpdate:

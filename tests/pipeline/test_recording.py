@@ -287,8 +287,8 @@ def test_errors_the_path_and_the_log_of_poses():
     assert found[2]["/view/log"].message == "frame 2: lost, why"
 
 
-def test_axes_are_arrows_along_them():
-    R = exp_so3(np.array([0.3, -0.2, 0.5]))
+@pytest.mark.parametrize("R", [exp_so3(np.array([0.3, -0.2, 0.5])), np.diag([-1.0, -1.0, 1.0])])
+def test_axes_are_arrows_along_them(R):
     axes = ManhattanFrame(0, 0, R[None], np.zeros(1, np.int32), np.zeros((1, 3, 3)), np.ones((1, 3), np.int32), np.zeros((1, 3)), True)
     ((channel, message),) = View().messages(axes)
     assert channel == "/view/axes"
