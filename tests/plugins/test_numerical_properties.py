@@ -97,7 +97,7 @@ def test_a_point_s_derivatives(rng, angle, scale_m, with_depth):
     flags = pose_kernel.Flags(np.full(1, pose_kernel.INLIER, np.uint8), np.empty(0, np.uint8), np.empty(0, np.uint8))
     H, gradient, chi2 = np.empty((6, 6)), np.empty(6), pose_kernel.Chi2(np.empty(1), np.empty(0), np.empty(0), np.empty(0))
     weights = Weights(W[None], *none)
-    pose_kernel.linearise(*parts(T), INTRINSICS, terms, NO_LINES, NO_PLANES, weights, flags, False, H, gradient, chi2)
+    pose_kernel.linearise(*parts(T), INTRINSICS, terms, NO_LINES, NO_PLANES, weights, flags, False, 6, H, gradient, chi2)
     wanted = residual(T)
     assert chi2.points[0] == pytest.approx(wanted @ W @ wanted, rel=1e-6)
     assert np.allclose(np.tril(H * np.outer(step, step)), np.tril((J * step).T @ W @ (J * step)), rtol=1e-6, atol=1.0)

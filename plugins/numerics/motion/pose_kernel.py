@@ -78,7 +78,9 @@ def _add(chi2: float, e: F64, J: F64, rows: int, W: F64, limit: float, robust: b
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def _add_points(R: F64, t: F64, camera: F64, terms: PointTerms, W: F64, flags: U8, robust: bool, H: F64, g: F64, chi2: F64) -> float:
+def _add_points(
+    R: F64, t: F64, camera: F64, terms: PointTerms, W: F64, flags: U8, robust: bool, free: int, H: F64, g: F64, chi2: F64
+) -> float:
     """All points; `point_rows` written out in scalars, since points are most of the work.
 
     With D = dr/dp, A = DᵀWD, b = DᵀWr and P = [p]×, J = (-D, DP) gives the blocks A, PA, -PAP and -b, -p × b."""
@@ -112,15 +114,20 @@ def _add_points(R: F64, t: F64, camera: F64, terms: PointTerms, W: F64, flags: U
         a12 = w * d11 * (w01 * d02 + w11 * d12 + w12 * d22)
         a22 = w * (d02 * d02 * w00 + d12 * d12 * w11 + d22 * d22 * w22 + 2.0 * (d02 * d12 * w01 + d02 * d22 * w02 + d12 * d22 * w12))
         b0, b1, b2 = w * d00 * e0, w * d11 * e1, w * (d02 * e0 + d12 * e1 + d22 * e2)
-        m00, m01, m02 = p1 * a02 - p2 * a01, p1 * a12 - p2 * a11, p1 * a22 - p2 * a12
-        m10, m11, m12 = p2 * a00 - p0 * a02, p2 * a01 - p0 * a12, p2 * a02 - p0 * a22
-        m20, m21, m22 = p0 * a01 - p1 * a00, p0 * a11 - p1 * a01, p0 * a12 - p1 * a02
         H[0, 0] += a00
         H[1, 0] += a01
         H[1, 1] += a11
         H[2, 0] += a02
         H[2, 1] += a12
         H[2, 2] += a22
+        g[0] -= b0
+        g[1] -= b1
+        g[2] -= b2
+        if free == 3:
+            continue
+        m00, m01, m02 = p1 * a02 - p2 * a01, p1 * a12 - p2 * a11, p1 * a22 - p2 * a12
+        m10, m11, m12 = p2 * a00 - p0 * a02, p2 * a01 - p0 * a12, p2 * a02 - p0 * a22
+        m20, m21, m22 = p0 * a01 - p1 * a00, p0 * a11 - p1 * a01, p0 * a12 - p1 * a02
         H[3, 0] += m00
         H[3, 1] += m01
         H[3, 2] += m02
@@ -136,9 +143,6 @@ def _add_points(R: F64, t: F64, camera: F64, terms: PointTerms, W: F64, flags: U
         H[5, 3] += p1 * m22 - p2 * m21
         H[5, 4] += p2 * m20 - p0 * m22
         H[5, 5] += p0 * m21 - p1 * m20
-        g[0] -= b0
-        g[1] -= b1
-        g[2] -= b2
         g[3] -= p1 * b2 - p2 * b1
         g[4] -= p2 * b0 - p0 * b2
         g[5] -= p0 * b1 - p1 * b0
@@ -245,15 +249,17 @@ def linearise(
     weights: Weights,
     flags: Flags,
     robust: bool,
+    free: int,
     H: F64,
     g: F64,
     chi2: Chi2,
 ) -> float:
-    """Normal equations (H lower triangle of (6, 6), g (6,)) of all terms but the outliers, and the χ² of every term; returns the cost."""
+    """Normal equations (H lower triangle of (6, 6), g (6,)) of all terms but the outliers, and the χ² of every term; returns the cost. With 3
+    `free` unknowns only what concerns the position is whole."""
     for a in range(6):
         g[a] = 0.0
         for b in range(6):
             H[a, b] = 0.0
-    cost = _add_points(R, t, camera, points, weights.points, flags.points, robust, H, g, chi2.points)
+    cost = _add_points(R, t, camera, points, weights.points, flags.points, robust, free, H, g, chi2.points)
     cost += _add_lines(R, t, camera, lines, weights.lines, weights.line_depths, flags.lines, robust, H, g, chi2.lines, chi2.line_depths)
     return cost + _add_planes(R, t, planes, weights.planes, flags.planes, H, g, chi2.planes)

@@ -159,7 +159,7 @@ def _solve(
         _copy(R, t, R_new, t_new)
         weigh(R, t, camera, points, lines, planes, weights)
         for trial in range(ITERATIONS + 1):
-            new = linearise(R_new, t_new, camera, points, lines, planes, weights, flags, turn < ROBUST_ROUNDS, trial_H, trial_g, chi2)
+            new = linearise(R_new, t_new, camera, points, lines, planes, weights, flags, turn < ROBUST_ROUNDS, free, trial_H, trial_g, chi2)
             _copy(trial_H, trial_g, data, data_g)
             new += add_prior(R_new, t_new, R_prior, t_prior, prior, trial_H, trial_g)
             accepted = trial == 0 or new <= cost
