@@ -44,8 +44,8 @@ def cull_keyframe(map: Map, others: int, share: float) -> Map:
     newest = newest_keyframes(map, KEPT)
     around = covisible_keyframes(map, newest, 2 * others) if len(newest) else newest
     around = np.sort(around[around > 0])
-    shares = _redundancies(map, around, others)
-    if not len(shares) or shares.max() <= share:
+    shares = _redundancies(map, around, others) if len(around) else np.zeros(1)
+    if shares.max() <= share:
         return map
     return retired(map, int(around[np.argmax(shares)]))
 
@@ -77,36 +77,43 @@ def cull_repeated(map: Map, shift_m: float, turn_deg: float, share: float) -> Ma
 def _redundancies(map: Map, keyframes: I32, others: int) -> F64:
     """(n,) weighed share of each keyframe's living landmarks that at least so many other living keyframes saw from as near."""
     seen, redundant = np.zeros(len(keyframes)), np.zeros(len(keyframes))
-    poses = map.keyframes.rows("T_world_camera", keyframes)
     for kind, weight in WEIGHTS.items():
         table: Table = getattr(map, f"{kind}s")
-        ids, observed = observed_by_each(map, keyframes, kind)
+        ids, observed, ends = observed_by_each(map, keyframes, kind)
         observers, centres = table.rows("observers", ids), _centres(table, kind, ids)
         rows = union(observers[observers >= 0], keyframes)
         known, alive = map.keyframes.gathered(rows, "T_world_camera", "alive")
-        for k, (keyframe, own) in enumerate(zip(keyframes.tolist(), observed)):
-            seen[k] += weight * len(own)
-            redundant[k] += weight * _seen_as_near(own, keyframe, poses[k], observers, centres, rows, known, alive, others)
+        counts = _seen_as_near(observed, ends, keyframes, observers, centres, rows, known, alive, others)
+        seen += weight * counts[0]
+        redundant += weight * counts[1]
     return redundant / np.maximum(seen, 1.0)
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def _seen_as_near(
-    own: NDArray[np.int64], keyframe: int, T_world_keyframe: F64, observers: I32, centres: F64, rows: I32, poses: F64, alive: Bool, others: int
-) -> int:
-    """How many landmarks `own` of a keyframe at least so many others that live saw from as near: `observers` (n, OBSERVERS) and `centres` (n, 3) of
-    all landmarks, `poses` (k, 4, 4) and `alive` (k,) of the keyframes `rows`, sorted, among which all observers are."""
-    place = np.empty(rows[-1] + 1, np.int32)
+    observed: I32, ends: NDArray[np.int64], keyframes: I32, observers: I32, centres: F64, rows: I32, poses: F64, alive: Bool, others: int
+) -> NDArray[np.int64]:
+    """(2, n) how many landmarks each keyframe saw, and how many of them at least so many others that live saw from as near: `observed` those of each
+    keyframe in turn up to its end, -1 what does not count, `observers` (m, OBSERVERS) and `centres` (m, 3) of the landmarks, `poses` (k, 4, 4) and
+    `alive` (k,) of the keyframes `rows`, sorted, among which all observers are."""
+    place, counts = np.empty(rows[-1] + 1, np.int32), np.zeros((2, len(keyframes)), np.int64)
     for k in range(len(rows)):
         place[rows[k]] = k
-    found = 0
-    for i in own:
-        reach, count = FARTHER * _away(T_world_keyframe, centres[i]), 0
-        for row in observers[i]:
-            if row >= 0 and row != keyframe and alive[place[row]]:
-                count += _away(poses[place[row]], centres[i]) <= reach
-        found += count >= others
-    return found
+    counted, begin = np.full(len(centres), -1), 0  # the last keyframe that a landmark was counted for
+    for k in range(len(keyframes)):
+        for o in range(begin, ends[k]):
+            i = observed[o]
+            if i < 0 or counted[i] == k:
+                continue
+            counted[i] = k
+            reach, count = FARTHER * _away(poses[place[keyframes[k]]], centres[i]), 0
+            for row in observers[i]:
+                if row >= 0 and row != keyframes[k] and alive[place[row]]:
+                    count += _away(poses[place[row]], centres[i]) <= reach
+            counts[0, k] += 1
+            counts[1, k] += count >= others
+        begin = ends[k]
+    return counts
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")

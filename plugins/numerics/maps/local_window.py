@@ -7,10 +7,11 @@ from dataclasses import dataclass, field
 from typing import TypeVar
 
 import numpy as np
+from numpy.typing import NDArray
 
 from trihedron.pipeline.table import Array
 from trihedron.pipeline.types import F64, I32, Bool, Map, Table
-from trihedron.plugins.numerics.maps.id_sets import among, distinct
+from trihedron.plugins.numerics.maps.id_sets import among, distinct, places
 
 T = TypeVar("T")
 WEIGHTS = {"point": 1, "line": 5, "plane": 20}  # how strongly a shared one ties keyframes: a bare room has few landmarks, all of them large
@@ -78,16 +79,14 @@ def observed_by(map: Map, keyframes: I32, kind: str) -> I32:
     return _living(map, _observed(map, keyframes, kind)[0], kind)
 
 
-def observed_by_each(map: Map, keyframes: I32, kind: str) -> tuple[I32, list[I32]]:
-    """`observed_by` all the keyframes, and for each of them which of those, as sorted rows."""
+def observed_by_each(map: Map, keyframes: I32, kind: str) -> tuple[I32, I32, NDArray[np.int64]]:
+    """`observed_by` all the keyframes, the rows among those of what each of them in turn saw (-1: dead by now), and where what it saw ends, (n,)."""
     observed, ends = _observed(map, keyframes, kind)
     ids = _living(map, observed, kind)
-    seen = [distinct(part) for part in np.split(observed, ends[:-1])]
-    rows = [np.minimum(np.searchsorted(ids, own), max(len(ids) - 1, 0)) for own in seen]
-    return ids, [row[ids[row] == own] if len(ids) else row[:0] for row, own in zip(rows, seen)]
+    return ids, places(observed, ids), ends
 
 
-def _observed(map: Map, keyframes: I32, kind: str) -> tuple[I32, I32]:
+def _observed(map: Map, keyframes: I32, kind: str) -> tuple[I32, NDArray[np.int64]]:
     """Ids of what each keyframe in turn saw, dead or alive, and where what it saw ends, (n,)."""
     ranges = map.keyframes.rows(f"{kind}s", keyframes)
     rows = np.concatenate([np.arange(a, b, dtype=np.int32) for a, b in ranges]) if len(ranges) else np.empty(0, np.int32)
