@@ -8,7 +8,8 @@ from dataclasses import dataclass
 from trihedron.pipeline.registry import register
 from trihedron.pipeline.types import Frame, Normals, Planes
 from trihedron.plugins.numerics.planes.planar_components import planar_components
-from trihedron.plugins.numerics.planes.planar_regions import EDGE, EDGE_M, MOST, PlanarRegions
+from trihedron.plugins.numerics.planes.planar_regions import EDGE, EDGE_M, PlanarRegions
+from trihedron.plugins.numerics.planes.plane_fitting import MOST
 
 
 @register("planes", "connected_components")

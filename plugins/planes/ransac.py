@@ -9,9 +9,9 @@ import numpy as np
 from trihedron.pipeline.registry import register
 from trihedron.pipeline.types import Frame, Normals, Planes
 from trihedron.plugins.numerics.depth.organised_grid import coarser
-from trihedron.plugins.numerics.planes.planar_regions import EDGE, EDGE_M, MOST, PlanarRegions
+from trihedron.plugins.numerics.planes.planar_regions import EDGE, EDGE_M, PlanarRegions
 from trihedron.plugins.numerics.planes.plane_consensus import consensus_planes
-from trihedron.plugins.numerics.planes.plane_fitting import fit_labelled
+from trihedron.plugins.numerics.planes.plane_fitting import MOST, fit_labelled
 
 
 @register("planes", "ransac")

@@ -22,7 +22,7 @@ class Grid(NamedTuple):
 
     rho: F32
     sigma: F32
-    count: I32
+    count: U8 | I32
     rays_x: F64
     rays_y: F64
     normals: F32
@@ -31,13 +31,13 @@ class Grid(NamedTuple):
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def cell_inverse_depths(
     depth: F32, stride: int, edge: float, edge_m: float, noise: tuple[float, float, float, float]
-) -> tuple[F32, F32, I32]:
-    """Inverse of the mean depth (h, w) of each block of stride × stride pixels, the σ of one reading of it, and the number of readings.
+) -> tuple[F32, F32, U8]:
+    """Inverse of the mean depth (h, w) of each block of stride × stride pixels, the σ of one reading of it, and the number of readings (255 at most).
 
     Where a block has no depth or a step of more than `edge` z + `edge_m` all three are 0."""
     rows, cols = depth.shape
     h, w = (rows + stride - 1) // stride, (cols + stride - 1) // stride
-    rho, sigma, count = np.zeros((h, w), np.float32), np.zeros((h, w), np.float32), np.zeros((h, w), np.int32)
+    rho, sigma, count = np.empty((h, w), np.float32), np.empty((h, w), np.float32), np.empty((h, w), np.uint8)
     strip = np.zeros((stride, w * stride), np.float32)  # the depths of a row of blocks, 0 = none
     for r in range(h):
         strip[:] = 0.0
@@ -53,7 +53,7 @@ def cell_inverse_depths(
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def _cells_of_strip(
-    strip: F32, stride: int, edge: float, edge_m: float, noise: tuple[float, float, float, float], rho: F32, sigma: F32, count: I32
+    strip: F32, stride: int, edge: float, edge_m: float, noise: tuple[float, float, float, float], rho: F32, sigma: F32, count: U8
 ) -> None:
     """A row of `cell_inverse_depths` from its depths (stride, w · stride), 0 = none."""
     for c in range(len(rho)):
@@ -211,7 +211,9 @@ def connected_components(links: U8, free: Bool) -> I32:
                 continue
             i = r * w + c
             left, up = links[r, c] & 1 and free[r, c - 1], links[r, c] & 2 and free[r - 1, c]
-            if left and up:
+            if left and up and parent[i - 1] == parent[i - w]:
+                parent[i] = parent[i - 1]
+            elif left and up:
                 a, b = _root(parent, i - 1), _root(parent, i - w)
                 parent[i] = min(a, b)
                 parent[max(a, b)] = min(a, b)

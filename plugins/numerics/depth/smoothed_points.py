@@ -10,7 +10,7 @@ from trihedron.pipeline.types import F32, F64, I32, U8
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def smooth_cells(rho: F32, count: I32, full: int, jump: float, jump_m: float) -> U8:
+def smooth_cells(rho: F32, count: U8, full: int, jump: float, jump_m: float) -> U8:
     """(h, w) 1 where a cell's inverse depth rho is that of its centre, because all its `full` readings are there, and no neighbour in its row or
     column differs from it by more than `jump` z + `jump_m`."""
     h, w = rho.shape

@@ -22,7 +22,7 @@ def columns_of(grid: Grid, cells: I32) -> F64:
         while i >= (r + 1) * w:
             r += 1
         out[0, k], out[1, k], out[2, k], out[3, k] = grid.rays_x[i - r * w], grid.rays_y[r], rho[i], sigma[i]
-        out[4, k], out[5, k], out[6, k], out[7, k] = count[i] / (sigma[i] * sigma[i]), normals[i, 0], normals[i, 1], normals[i, 2]
+        out[4, k], out[5, k], out[6, k], out[7, k] = np.int32(count[i]) / (sigma[i] * sigma[i]), normals[i, 0], normals[i, 1], normals[i, 2]
     return out
 
 

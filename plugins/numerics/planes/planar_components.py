@@ -5,7 +5,7 @@ from __future__ import annotations
 import numba
 import numpy as np
 
-from trihedron.pipeline.types import F32, F64, I32
+from trihedron.pipeline.types import F32, F64, U8
 from trihedron.plugins.numerics.depth.organised_grid import Grid, cells_by_component, coarser, connected_components, smooth_links
 from trihedron.plugins.numerics.planes.plane_fitting import fit_components
 
@@ -13,7 +13,7 @@ from trihedron.plugins.numerics.planes.plane_fitting import fit_components
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def planar_components(
     grid: Grid, edge: tuple[float, float], bend: float, gate: float, cone: float, turn: float, rounds: int, least: int, most: int
-) -> tuple[I32, F64]:
+) -> tuple[U8, F64]:
     """Labels (h, w) of the cells that make up each plane, 0 = none, and the planes' q (k, 3), `most` at most.
 
     Components of `least` cells or more, whose normals differ from their neighbours' by less than `bend` (rad), are sought on cells of twice the size
@@ -21,7 +21,7 @@ def planar_components(
     (rad) in each further round. The normals of a plane lie within the cone and turn by no more than `turn` cones."""
     coarse = coarser(grid, edge[0], edge[1])
     h, w = coarse.rho.shape
-    labels, planes, found, before = np.zeros((h, w), np.int32), np.zeros((most, 3)), 0, -1
+    labels, planes, found, before = np.zeros((h, w), np.uint8), np.zeros((most, 3)), 0, -1
     links, free = smooth_links(coarse, np.cos(bend), gate), np.empty((h, w), np.bool_)
     cells, starts = np.empty(0, np.int32), np.zeros(1, np.int32)
     for _ in range(rounds):
@@ -37,11 +37,14 @@ def planar_components(
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def _finer(labels: I32, rho: F32) -> I32:
+def _finer(labels: U8, rho: F32) -> U8:
     """Labels (h, w) of cells by those of cells of twice the size; 0 without depth."""
     h, w = rho.shape
-    out = np.empty((h, w), np.int32)
+    out, wide = np.empty((h, w), np.uint8), np.empty(2 * labels.shape[1], np.uint8)
     for r in range(h):
+        if r % 2 == 0:
+            for c in range(labels.shape[1]):
+                wide[2 * c] = wide[2 * c + 1] = labels[r // 2, c]
         for c in range(w):
-            out[r, c] = labels[r // 2, c // 2] if rho[r, c] > 0.0 else 0
+            out[r, c] = wide[c] if rho[r, c] > 0.0 else 0
     return out

@@ -7,16 +7,15 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from trihedron.pipeline.types import F64, I32, Frame, Normals, Planes
+from trihedron.pipeline.types import F64, I32, U8, Frame, Normals, Planes
 from trihedron.plugins.numerics.depth.depth_sampling import noise_coefficients
 from trihedron.plugins.numerics.depth.organised_grid import Grid, cell_inverse_depths, cell_rays
 from trihedron.plugins.numerics.planes.plane_curvature import drop_engulfed, normals_of_regions
-from trihedron.plugins.numerics.planes.plane_fitting import solve_symmetric
+from trihedron.plugins.numerics.planes.plane_fitting import MOST, solve_symmetric
 from trihedron.plugins.numerics.planes.plane_regions import largest_regions
 from trihedron.plugins.numerics.planes.plane_report import plane_report
 from trihedron.plugins.numerics.planes.region_merging import grown_and_merged
 
-MOST = 254  # regions the labels can name
 EDGE, EDGE_M = 0.04, 0.02  # a step above EDGE z + EDGE_M within a cell's pixels: no depth there
 FACING = 0.5  # share of a region's cells that must have a normal within two cones of its own
 BIASES = 4.5  # biases of one σ_z across a region that its normals may turn by at any rate
@@ -62,7 +61,7 @@ class PlanarRegions:
         """Cells a region's core must have: half of what the smallest region covers."""
         return self.min_pixels // (2 * stride * stride) + 1
 
-    def _complete(self, core: I32, q: F64, grid: Grid, frame: Frame, stride: int, flat: bool = True) -> Planes:
+    def _complete(self, core: U8, q: F64, grid: Grid, frame: Frame, stride: int, flat: bool = True) -> Planes:
         """Planes of the regions whose core cells are labelled (h, w) and whose planes are q (k, 3): grown, merged, fitted to their cores. A detector
         that did not ask the normals says that the regions need not be `flat`: curved ones are dropped."""
         gap, cos_cone = max(self.gap_px // stride, 1), math.cos(2.0 * math.radians(self.cone_deg))
@@ -73,7 +72,7 @@ class PlanarRegions:
             owner = self._flat(owner, labels, sums, grid, gap)
         return self._report(labels, core, owner, sums, grid, frame, stride)
 
-    def _flat(self, owner: I32, labels: I32, sums: Sums, grid: Grid, gap: int) -> I32:
+    def _flat(self, owner: I32, labels: U8, sums: Sums, grid: Grid, gap: int) -> I32:
         """Which region each one became part of, (k + 1,) by label; 0 where the normals, if there are any, say that it is no plane."""
         if np.isnan(grid.normals[..., 0]).all():
             return owner
@@ -84,13 +83,13 @@ class PlanarRegions:
         good = drop_engulfed(merged, grid.rho, good, gap)
         return np.where(np.concatenate([[False], good])[owner], owner, 0).astype(np.int32)
 
-    def _report(self, labels: I32, core: I32, owner: I32, sums: Sums, grid: Grid, frame: Frame, stride: int) -> Planes:
+    def _report(self, labels: U8, core: U8, owner: I32, sums: Sums, grid: Grid, frame: Frame, stride: int) -> Planes:
         """The largest regions as a value, largest first; `owner` says which one a label belongs to, 0 = none."""
-        numbered, numbered_core, ranked, area = largest_regions(labels, core, owner, grid.count, self.min_pixels, self.planes)
+        numbered, number, ranked, area = largest_regions(labels, owner, grid.count, self.min_pixels, self.planes)
         A, b, moments, n = (total[ranked] for total in sums)
         q = np.linalg.solve(A, b[..., None])[..., 0]
         coefficients, J, excess, samples = plane_report(
-            numbered, numbered_core, q, grid, self.tiles, self.correlation_px**2, 2.0, self.samples, 400
+            numbered, core, number, q, grid, self.tiles, self.correlation_px**2, 2.0, self.samples, 400
         )
         variance = excess + self.bias**2 * n  # over that of the least-squares fit to n independent depths, `A⁻¹`
         return Planes(

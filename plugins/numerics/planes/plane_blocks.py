@@ -31,7 +31,7 @@ def block_sums(grid: Grid, side: int, share: float) -> F64:
                 continue
             s = sums[r // side, c // side]
             cells[r // side, c // side] += 1
-            x, weight = rays_x[c], count[r, c] / (float(sigma[r, c]) * sigma[r, c])
+            x, weight = rays_x[c], np.int32(count[r, c]) / (float(sigma[r, c]) * sigma[r, c])
             wx, wy, wp = weight * x, weight * y, weight * p
             s[0] += wx * x
             s[1] += wx * y

@@ -5,12 +5,14 @@ from __future__ import annotations
 import numba
 import numpy as np
 
-from trihedron.pipeline.types import F64, I32, Bool
+from trihedron.pipeline.types import F64, I32, U8, Bool
 from trihedron.plugins.numerics.algebra.ranking import median
 from trihedron.plugins.numerics.depth.organised_grid import Grid, cells_by_component
 from trihedron.plugins.numerics.planes.cell_columns import columns_of, mark_within, normal_equations, sum_marked, thinned, thinned_marks
 from trihedron.plugins.numerics.planes.parallel_planes import larger_surface
 from trihedron.plugins.numerics.planes.plane_curvature import linear_turn
+
+MOST = 254  # regions the labels can name
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
@@ -30,7 +32,7 @@ def solve_symmetric(A: F64, b: F64) -> tuple[bool, F64]:
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def fit_components(
-    grid: Grid, cells: I32, starts: I32, cone: float, gate: float, curved: float, least: int, labels: I32, planes: F64, found: int
+    grid: Grid, cells: I32, starts: I32, cone: float, gate: float, curved: float, least: int, labels: U8, planes: F64, found: int
 ) -> int:
     """Fit one plane to each component (`cells` and `starts` as from `cells_by_component`); returns how many planes there are now.
 
@@ -56,10 +58,10 @@ def fit_components(
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def fit_labelled(grid: Grid, labels: I32, planes: F64, cone: float, gate: float, least: int) -> tuple[I32, F64]:
+def fit_labelled(grid: Grid, labels: I32, planes: F64, cone: float, gate: float, least: int) -> tuple[U8, F64]:
     """Fit a plane to each labelled region (h, w), starting from its q in `planes` (k, 3), or two where it is two parallel surfaces. Returns the
-    labels of the members, and the q, of those that have `least` members by the rules of `fit_cells`, largest first."""
-    out, fitted, found = np.zeros_like(labels), np.zeros((2 * len(planes), 3)), 0
+    labels of the members, and the q, of those that have `least` members by the rules of `fit_cells`, largest first and MOST at most."""
+    out, fitted, found = np.zeros(labels.shape, np.uint8), np.zeros((min(2 * len(planes), MOST), 3)), 0
     cells, starts = cells_by_component(labels - 1, least)
     flat = out.ravel()
     for k in range(len(starts) - 1):
@@ -70,7 +72,7 @@ def fit_labelled(grid: Grid, labels: I32, planes: F64, cone: float, gate: float,
             some = thinned(columns)
             q, members = _trimmed(q, 1, columns, some, np.cos(cone), gate, member)
             q, members, other = larger_surface(q, grid, region, columns, some, member)
-            if members < least:
+            if members < least or found == len(fitted):
                 break
             fitted[found] = q
             found += 1

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numba
 import numpy as np
 
-from trihedron.pipeline.types import F64, I32
+from trihedron.pipeline.types import F64, I32, U8
 from trihedron.plugins.numerics.algebra.ranking import descending
 from trihedron.plugins.numerics.depth.organised_grid import Grid
 from trihedron.plugins.numerics.planes.parallel_planes import LEAST, angle_between
@@ -18,8 +18,8 @@ PARALLEL = 4.0  # times less than the common plane is turned from either must tw
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def grown_and_merged(
-    core: I32, planes: F64, grid: Grid, gate: float, reach: int, cos_cone: float, gap: int, limit: float, alike: float
-) -> tuple[I32, I32, tuple[F64, F64, F64, I32]]:
+    core: U8, planes: F64, grid: Grid, gate: float, reach: int, cos_cone: float, gap: int, limit: float, alike: float
+) -> tuple[U8, I32, tuple[F64, F64, F64, I32]]:
     """Labels (h, w) grown from the `core` of each region as by `grow_regions`, which region each one becomes part of as by `merge_regions` where they
     come within `gap` cells of each other, and the sums over the cores."""
     labels, sums = grow_regions(core, planes, grid, gate, reach, cos_cone), accumulate(core, len(planes), grid)
@@ -27,17 +27,20 @@ def grown_and_merged(
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def neighbours(labels: I32, count: int, gap: int) -> F64:
+def neighbours(labels: U8, count: int, gap: int) -> F64:
     """(count, count) number of places where regions lie within `gap` cells of each other in a row or column."""
     h, w = labels.shape
-    touch = np.zeros((count, count))
+    touch, last = np.zeros((count, count)), np.empty(w, np.bool_)
     for r in range(h):
+        here, below = labels[r], labels[min(r + 1, h - 1)]
         for c in range(w):
-            a = labels[r, c]
-            if a == 0:
+            last[c] = (here[c] > 0) & (below[c] != here[c])
+        for c in range(w - 1):
+            last[c] |= (here[c] > 0) & (here[c + 1] != here[c])
+        for c in range(w):
+            if not last[c]:
                 continue
-            if r < h - 1 and c < w - 1 and labels[r, c + 1] == a and labels[r + 1, c] == a:
-                continue
+            a = here[c]
             for down, right in ((0, 1), (1, 0)):
                 for k in range(1, min(gap, (h - 1 - r) * down + (w - 1 - c) * right) + 1):
                     b = labels[r + k * down, c + k * right]
