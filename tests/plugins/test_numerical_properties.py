@@ -111,21 +111,21 @@ def test_a_line_s_derivatives(rng, angle, scale_m):
     T, depth = pose(rng, angle, scale_m), max(scale_m, 0.1)
     local = np.array([[0.3, -0.2, 1.0], [-0.4, 0.1, 1.2]]) * depth * rng.uniform(0.8, 1.2, (2, 1))
     line, segment, observed = g.transform(T, local), np.array([[380.0, 160.0], [210.0, 260.0]]), local * rng.uniform(0.95, 1.05, (2, 1))
-    N, m, J_pose, J_line, D, p = np.empty((3, 2)), np.empty(3), np.empty(6), np.empty(4), np.empty((1, 3)), np.empty(3)
+    N, m, J, p = np.empty((3, 2)), np.empty(3), np.empty(10), np.empty(3)
     line_basis(line, N)
     assert pose_terms.depth_direction(observed, m)
 
     def image(T, line):
-        return np.array([bundle_terms.line_term(*parts(T), line, N, 0.3, segment, INTRINSICS, J_pose, J_line, D, p)[0]])
+        return np.array([bundle_terms.line_term(*parts(T), line, N, 0.3, segment, INTRINSICS, J, p)[0]])
 
     def depths(T, line):
         image(T, line)
-        return np.array([bundle_terms.line_depth_term(parts(T)[0], N, 0.3, observed, m, J_pose, J_line, D, p)[0]]) / depth
+        return np.array([bundle_terms.line_depth_term(parts(T)[0], N, 0.3, observed, m, J, p)[0]]) / depth
 
     step = np.array([depth, depth, depth, 1.0, 1.0, 1.0])
     for residual, unit, size in ((image, 1.0, 1e3), (depths, depth, 1.0)):
         residual(T, line)
-        by_pose, by_line = J_pose * step / unit, J_line * depth / unit
+        by_pose, by_line = J[:6] * step / unit, J[6:] * depth / unit
         assert agree(by_pose, numeric(lambda d, f=residual: f(T @ g.exp_se3(step * d), line), 6)[0], size)
         assert agree(by_line, numeric(lambda d, f=residual: f(T, line + depth * np.stack([N @ d[:2], N @ d[2:]])), 4)[0], size)
 
