@@ -4,12 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Callable, Hashable
 from dataclasses import dataclass, field
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from trihedron.pipeline.table import Array
 from trihedron.pipeline.types import F64, I32, Bool, Map, Table
 from trihedron.plugins.numerics.maps.id_sets import among, distinct, places
 
@@ -25,9 +24,9 @@ class LocalWindow:
     points: I32
     lines: I32
     planes: I32
-    _held: dict[tuple[str, ...], list[Array]] = field(default_factory=dict, repr=False, compare=False)
+    _held: dict[tuple[str, ...], list[NDArray[Any]]] = field(default_factory=dict, repr=False, compare=False)
 
-    def columns(self, map: Map, kind: str, *names: str) -> list[Array]:
+    def columns(self, map: Map, kind: str, *names: str) -> list[NDArray[Any]]:
         """What the map that this is a part of holds of all landmarks of a kind ('points', 'lines', 'planes'), in columns: gathered once, since a
         window stays the same from frame to frame until a keyframe comes."""
         asked = (kind, *names)

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numba
 import numpy as np
+from numpy.typing import NDArray
 
 from trihedron.pipeline.geometry import invert, transform
-from trihedron.pipeline.table import Array
 from trihedron.pipeline.types import F32, F64, I32, U8, Bool, Camera, Frame, Table
 from trihedron.plugins.numerics.algebra.constant_arrays import constant
 
@@ -30,7 +30,7 @@ class VisiblePoints(NamedTuple):
 
 
 def visible_points(
-    points: Sequence[Array], T_world_camera: F64, camera: Camera, view_deg: float, octave_scale: float
+    points: Sequence[NDArray[Any]], T_world_camera: F64, camera: Camera, view_deg: float, octave_scale: float
 ) -> VisiblePoints:
     """Those of the points, given by their columns `POINT_COLUMNS`, that lie in the image, are seen from within `view_deg` of the last direction and
     at a similar distance."""
