@@ -32,7 +32,7 @@ from trihedron.pipeline.wire_format import bytes_field, head, varint
 ENCODINGS = ("raw", "columns", "zstd", "rows")
 MAX_BYTES = 1 << 30  # of one decoded array
 DAMAGED = "the file is damaged; record it again"
-TRANSPOSED_BYTES = 8192  # smaller arrays are left as they are: it would cost more than it spares
+TRANSPOSED_BYTES = 1536  # smaller arrays are left as they are: of a frame's recording they would spare half a percent
 COPIED = {"points_m", "sigma_m", "endpoints_m"}  # in float32; what is worked out of them is not
 SCALARS: dict[str, type[Any]] = {"bool": bool, "int": int, "float": float}
 

@@ -29,8 +29,10 @@ from mcap.records import (
 from mcap.writer import MCAP0_MAGIC
 from zlib_ng import zlib_ng
 
-LEVEL = -3  # of zstd: numbers that repeat nothing stay as they are; half the time of level 2 for a tenth more bytes
-WINDOW_LOG, HASH_LOG = 22, 15  # a whole chunk is searched, with a table that leaves the cache of a processor to the run
+WINDOW_LOG = 22  # a whole chunk is searched for repeats
+QUICK = {"level": -3, "hash_log": 15}  # of zstd: numbers that repeat nothing stay as they are; the table leaves the cache of a processor to the run
+THOROUGH = {"level": 2, "hash_log": 17, "min_match": 5, "target_length": 1}  # twice the time for a tenth less bytes
+LARGE_BYTES = 200_000  # a frame: where as much comes, as on a walk where all is new, it is packed thoroughly
 ZSTD = b"zstd"
 _MESSAGE = struct.Struct("<BQHIQQ")  # opcode, length, channel, sequence, log time, publish time
 _CHUNK = struct.Struct(f"<BQQQQII{len(ZSTD)}sQ")  # opcode, length, first and last time, plain size, CRC, length of the name, name, packed size
@@ -38,8 +40,8 @@ _INDEX = struct.Struct("<BQHI")  # opcode, length, channel, bytes of its entries
 _RECORD_HEAD = 9  # bytes of opcode and length
 
 
-def _parameters() -> Any:
-    return zstandard.ZstdCompressionParameters.from_level(LEVEL, window_log=WINDOW_LOG, hash_log=HASH_LOG)
+def _compressor(level: int, **options: int) -> Any:
+    return zstandard.ZstdCompressor(compression_params=zstandard.ZstdCompressionParameters.from_level(level, window_log=WINDOW_LOG, **options))
 
 
 class McapWriter:
@@ -56,7 +58,7 @@ class McapWriter:
         self._metadata: list[MetadataIndex] = []
         self._attachments: list[AttachmentIndex] = []
         self._counts: Counter[int] = Counter()
-        self._compressor = zstandard.ZstdCompressor(compression_params=_parameters())
+        self._quick, self._thorough = _compressor(**QUICK), _compressor(**THOROUGH)
 
     def start(self, library: str) -> None:
         """The beginning of the file."""
@@ -93,8 +95,8 @@ class McapWriter:
             parts += (head, data)
             at += _MESSAGE.size + len(data)
         plain = b"".join(parts)
-        packed = self._compressor.compress(plain)
-        stamps = [stamp_ns for _, stamp_ns, _ in messages]
+        stamps = {stamp_ns for _, stamp_ns, _ in messages}
+        packed = (self._thorough if len(plain) > LARGE_BYTES * len(stamps) else self._quick).compress(plain)
         times = min(stamps), max(stamps)
         length = _CHUNK.size - _RECORD_HEAD + len(packed)
         head = _CHUNK.pack(Opcode.CHUNK, length, *times, len(plain), zlib_ng.crc32(plain), len(ZSTD), ZSTD, len(packed))

@@ -72,8 +72,7 @@ def _add_points(state: BundleState, seen: BundleMeasurements, loss: int, out: No
             r0 = d00 * p0 + seen.intrinsics[k, 2] - seen.pixels[o, 0]
             r1 = d11 * p1 + seen.intrinsics[k, 3] - seen.pixels[o, 1]
             r2 = iz - 1.0 / z if deep else 0.0
-            w = 1.0 / seen.sigma_px[o] ** 2
-            v = (z * z / seen.sigma_m[o]) ** 2 if deep else 0.0
+            w, v = 1.0 / seen.sigma_px[o] ** 2, (z * z / seen.sigma_m[o]) ** 2 if deep else 0.0
             weight, share = _loss(w * (r0 * r0 + r1 * r1) + v * r2 * r2, CHI2_3 if deep else CHI2_2, loss)
             cost += share
             if not filled:
