@@ -38,7 +38,6 @@ class LinkedParts:
 
     def install(self) -> None:
         """From now on numba takes these steps, in this process."""
-        LIBRARY._optimize_functions = _simplify_later
         LIBRARY.finalize = lambda library: self.finalize(library)
         CONTEXT.get_executable = lambda context, *of: self.executable(context, *of)
         CONTEXT.create_cpython_wrapper = lambda *of, **how: self.wrap(self._wrappers[0], *of, **how)
@@ -77,11 +76,6 @@ class LinkedParts:
     def is_kernel(self, function: Any) -> bool:
         """By numba's description of it."""
         return (function.modname, function.qualname) == self.name
-
-
-def _simplify_later(library: Any, module: Any) -> None:
-    """Leave functions to the kernel's optimisation, which simplifies them again and to the same code."""
-    module.data_layout = library._codegen._data_layout
 
 
 def _called(library: Any, found: dict[Any, None]) -> dict[Any, None]:
