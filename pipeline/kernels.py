@@ -16,6 +16,7 @@ import subprocess
 import sys
 import threading
 import time
+from abc import ABC, abstractmethod
 from collections.abc import Collection, Iterable, Iterator, Sequence
 from contextlib import AbstractContextManager
 from pathlib import Path
@@ -42,7 +43,7 @@ LOOK_S = 0.2  # between two looks of a call that waits, whether a Ctrl-C came
 ARRAY = re.compile(r"(readonly )?(\w+)(?:\[(\d+)([CFA])\])?")
 
 
-class _FirstCalls:
+class _FirstCalls(ABC):
     """While this is entered, `_called` takes the place of what numba does when the interpreter calls a kernel with types it has not met."""
 
     def __init__(self) -> None:
@@ -55,8 +56,8 @@ class _FirstCalls:
     def __exit__(self, *_: Any) -> None:
         DISPATCHER._compile_for_args = self._compile
 
-    def _called(self, dispatcher: Any, *arguments: Any) -> Any:
-        raise NotImplementedError
+    @abstractmethod
+    def _called(self, dispatcher: Any, *arguments: Any) -> Any: ...
 
 
 class Called(_FirstCalls, event.Listener):
