@@ -44,9 +44,15 @@ def read_depth(path: Path, depth_scale: float, depth_offset: float = 0.0) -> F32
     if image.dtype != np.uint16:
         cure = "give 16-bit depth images (value = metres × depth_scale); a preview picture does not hold metres"
         raise DataError(str(path), f"has {8 * image.itemsize} bits a pixel where depth has 16", cure)
-    depth = image.astype(np.float32)
-    depth /= np.float32(depth_scale)
+    depth = metres(image, depth_scale)
     return depth / np.maximum(1.0 + np.float32(depth_offset) * depth, np.float32(0.1)) if depth_offset else depth
+
+
+def metres(values: NDArray[Any], depth_scale: float) -> F32:
+    """Whole numbers divided by `depth_scale`, (h, w) float32."""
+    depth: F32 = values.astype(np.float32)
+    depth /= np.float32(depth_scale)
+    return depth
 
 
 def _decode(path: Path) -> NDArray[Any]:

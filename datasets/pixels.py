@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from trihedron.datasets.images import decode_image
+from trihedron.datasets.images import decode_image, metres
 from trihedron.datasets.picture_headers import UnreadableImage, picture_header
 from trihedron.datasets.robot_values import Picture
 from trihedron.pipeline.types import F32, U8
@@ -100,9 +100,7 @@ def _sixteen_bits(data: bytes) -> NDArray[Any]:
 def _metres(values: NDArray[Any], depth_scale: float) -> F32:
     if values.dtype.kind == "f":
         return np.where(np.isfinite(values) & (values > 0), values, 0).astype(np.float32)
-    depth = values.astype(np.float32)
-    depth /= np.float32(depth_scale)
-    return depth
+    return metres(values, depth_scale)
 
 
 def _rows(picture: Picture, element: np.dtype[Any], channels: int) -> NDArray[Any]:

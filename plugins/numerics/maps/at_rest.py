@@ -15,6 +15,7 @@ import numpy as np
 
 from trihedron.pipeline.geometry import invert, log_se3
 from trihedron.pipeline.types import F32, F64, I32, U8, Bool, Keypoints, Map, Matches, Planes, Segments
+from trihedron.plugins.numerics.algebra.constant_arrays import constant
 from trihedron.plugins.numerics.algebra.small_linear import solve_positive
 from trihedron.plugins.numerics.motion.pose_kernel import Flags
 from trihedron.plugins.numerics.motion.pose_solver import PoseSolution, Terms
@@ -78,7 +79,7 @@ def proven_planes(map: Map, matches: Matches) -> Bool:
 
 def on_planes(matches: Matches, keypoints: Keypoints, segments: Segments, planes: Planes) -> AtRest:
     """Matches of what lies on planes that are matched as well, and not at the border of something else."""
-    same, points, lines = matches.planes.copy(), matches.keypoints.copy(), matches.segments.copy()
+    same, points, lines = (constant(pairs, np.int32) for pairs in (matches.planes, matches.keypoints, matches.segments))
     return AtRest(ON_PLANES, *_on_planes(planes.labels, same, planes.stride, keypoints.pixels, points, segments.endpoints_px, lines))
 
 

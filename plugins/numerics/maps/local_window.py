@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Hashable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any, TypeVar
 
 import numpy as np
@@ -24,15 +24,12 @@ class LocalWindow:
     points: I32
     lines: I32
     planes: I32
-    _held: dict[tuple[str, ...], list[NDArray[Any]]] = field(default_factory=dict, repr=False, compare=False)
 
     def columns(self, map: Map, kind: str, *names: str) -> list[NDArray[Any]]:
-        """What the map that this is a part of holds of all landmarks of a kind ('points', 'lines', 'planes'), in columns: gathered once, since a
-        window stays the same from frame to frame until a keyframe comes."""
-        asked = (kind, *names)
-        if asked not in self._held:
-            self._held[asked] = getattr(map, kind).gathered(getattr(self, kind), *names)
-        return self._held[asked]
+        """What the map holds of all landmarks of a kind ('points', 'lines', 'planes'), in columns: a window stays the same from frame to frame until
+        a keyframe comes."""
+        ids: I32 = getattr(self, kind)
+        return _once(map, (kind, names, ids.tobytes()), lambda: getattr(map, kind).gathered(ids, *names))
 
 
 def _once(map: Map, key: Hashable, find: Callable[[], T]) -> T:
