@@ -1,7 +1,7 @@
 """Time a run per frame and stage, with its memory, beside a fixed reference workload of the same minute and frames.
 
 The machine's speed varies, so times are also given as multiples of the reference: OpenCV ORB (1000 features, 8 levels) and LSD on the same frames,
-one thread. --paced runs the frames a second time at the camera's own rate: latency is then from asking for a frame's files to its pose, and the time
+one thread, measured before and after each run. --paced runs the frames a second time at the camera's own rate: latency is then from asking for a frame's files to its pose, and the time
 it waits behind others does not count. --cold runs one frame with an empty kernel cache. --compare says what became slower since a --json file.
 
 Other comparisons, each with its --help: `trihedron benchmark scaling` (threads, image size, features, length), `trihedron benchmark manhattan`
@@ -18,6 +18,7 @@ import importlib
 import json
 import os
 import platform
+import statistics
 import subprocess
 import sys
 import tempfile
@@ -62,11 +63,15 @@ def main(argv: list[str]) -> int:
     _checked(overrides)
     old = read_figures(options.compare) if options.compare else None
     with tempfile.TemporaryDirectory() as folder:
+        images = sample_images(overrides)
+        reference = [reference_ms(images)]
         figures = measure([*overrides, f"out={folder}/run"], Path(folder) / "run")
-        figures["reference_ms"] = reference_ms(first_images(overrides))
+        reference.append(reference_ms(images))
         figures["cli_cpu_s"] = _cpu_of(["--help"])
         if options.paced:
             figures["paced"] = measure([*overrides, "real_time=true", f"out={folder}/paced"], Path(folder) / "paced")["frame_ms"]
+            reference.append(reference_ms(images))
+        figures["reference_ms"], figures["reference_each_ms"] = round(statistics.mean(reference), 2), reference
         if options.cold:
             figures["cold_first_frame_s"] = _cold(overrides, Path(folder))
     figures["machine"] = machine()
@@ -139,8 +144,8 @@ def machine() -> dict[str, Any]:
     }  # fmt: skip
 
 
-def first_images(overrides: list[str]) -> list[U8]:
-    """Grey images (h, w) of the run's first frames."""
+def sample_images(overrides: list[str]) -> list[U8]:
+    """Grey images (h, w) of frames spread over the run."""
     from hydra import compose, initialize_config_module
 
     from trihedron.pipeline.config import make_plugin, register_configs
@@ -151,7 +156,7 @@ def first_images(overrides: list[str]) -> list[U8]:
     with initialize_config_module("trihedron.conf", version_base="1.3"):
         config = compose("root", overrides=overrides)
     dataset = make_plugin("dataset", config.dataset)
-    frames = [dataset(i) for i in range(min(REFERENCE_FRAMES, len(dataset)))]
+    frames = [dataset(i) for i in sorted({len(dataset) * k // REFERENCE_FRAMES for k in range(REFERENCE_FRAMES)})]
     return [frame.gray for frame in frames if frame is not None]
 
 
@@ -176,7 +181,8 @@ def report(figures: dict[str, Any]) -> str:
     per_frame = 1e3 / figures["fps"] if figures["fps"] else 0.0
     lines = [
         f"{of['cpu']}, {of['cpus']} CPUs, Python {of['python']}, " + ", ".join(f"{name} {number}" for name, number in of["packages"].items()),
-        f"{figures['frames']} frames, {figures['threads']} threads, reference workload {reference:.1f} ms",
+        f"{figures['frames']} frames, {figures['threads']} threads, reference workload {reference:.1f} ms"
+        f" (before, between and after: {', '.join(f'{ms:.1f}' for ms in figures['reference_each_ms'])})",
         f"{'':14} {'p50 ms':>8} {'p95 ms':>8} {'x reference':>12}",
     ]
     for name, (p50, p95) in times(figures).items():

@@ -26,7 +26,7 @@ from trihedron.pipeline.errors import DataError, UsageError
 from trihedron.pipeline.recording import TIMING_TOPIC, Recording
 from trihedron.pipeline.types import Map
 from trihedron.tools.arguments import Parser, table
-from trihedron.tools.benchmark import first_images, machine, measure, reference_ms
+from trihedron.tools.benchmark import sample_images, machine, measure, reference_ms
 from trihedron.tools.map_benchmark import FEATURES
 from trihedron.tools.recorded import last_map
 from trihedron.tools.scaling_plot import plot
@@ -111,7 +111,7 @@ def _measured(part: str, name: str, overrides: Sequence[str]) -> dict[str, Any]:
     if part == "map":
         timing, overrides = timing[FIRST - STOP :], [*overrides, f"dataset.frames={FIRST}:{STOP}"]
     return {
-        "name": name, "frames": run["frames"], **measures(timing), "reference_ms": reference_ms(first_images(list(overrides))),
+        "name": name, "frames": run["frames"], **measures(timing), "reference_ms": reference_ms(sample_images(list(overrides))),
         "fps": run["fps"], "points": _living(map), "ate_m": run.get("metrics", {}).get("final", {}).get("ate_rmse_m"),
     }  # fmt: skip
 

@@ -42,6 +42,8 @@ def test_the_benchmark_writes_what_it_compares_with(tmp_path, capsys):
     figures = json.loads(file.read_text())
     assert figures["frames"] == 6 and figures["cli_cpu_s"] > 0.0 and set(figures["machine"]["packages"]) >= {"numpy", "numba"}
     assert f"reference workload {figures['reference_ms']:.1f} ms" in capsys.readouterr().out
+    before, after = figures["reference_each_ms"]
+    assert min(before, after) <= figures["reference_ms"] <= max(before, after)
 
 
 def test_the_memory_of_a_run_is_not_that_of_who_measures_it(tmp_path):
