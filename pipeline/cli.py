@@ -129,13 +129,14 @@ def _run(words: list[str]) -> int:
         if word.startswith("=") or word == "out=":
             raise UsageError(word, "lacks a " + ("key" if word.startswith("=") else "folder"), "write key=value, for example out=runs/mine")
     os.environ["HYDRA_FULL_ERROR"] = "1"  # exceptions come to us instead of being printed
-    import hydra
+    with heap.growing():
+        import hydra
 
-    from trihedron.pipeline.config import check_added, register_configs, rewritten
-    from trihedron.pipeline.registry import load_plugins
+        from trihedron.pipeline.config import check_added, register_configs, rewritten
+        from trihedron.pipeline.registry import load_plugins
 
-    load_plugins()
-    register_configs()
+        load_plugins()
+        register_configs()
     check_added(words)
     overrides = _with_recorded(words)
     outcomes = _swept(words)

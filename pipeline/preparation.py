@@ -10,7 +10,7 @@ from contextlib import contextmanager
 from tqdm import tqdm
 
 from trihedron.pipeline.errors import TrihedronError
-from trihedron.pipeline.heap import give_back
+from trihedron.pipeline.heap import give_back, growing
 from trihedron.pipeline.kernels import FEW, Awaited, Compilation, missing, used_by
 from trihedron.pipeline.runner import Runner
 
@@ -25,7 +25,8 @@ def prepared(runner: Runner, trial: Callable[[], Runner]) -> Iterator[Callable[[
     Where a cache has them, the first frames of `trial`, a runner as this one, are run and thrown away: no frame waits for what is loaded or allocated
     once. Else other processes compile beside the run, and a call waits for what is not there yet, which is once an installation. What is
     fed in real time does not begin before all is there."""
-    rows = missing(used_by(runner.graph.stages[name].plugin for name in runner.computed))
+    with growing():
+        rows = missing(used_by(runner.graph.stages[name].plugin for name in runner.computed))
     if len(rows) <= FEW:
         _warm_up(trial())
         yield lambda: 0.0

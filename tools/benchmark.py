@@ -1,8 +1,9 @@
 """Time a run per frame and stage, with its memory, beside a fixed reference workload of the same minute and frames.
 
 The machine's speed varies, so times are also given as multiples of the reference: OpenCV ORB (1000 features, 8 levels) and LSD on the same frames,
-one thread, measured before and after each run. --paced runs the frames a second time at the camera's own rate: latency is then from asking for a frame's files to its pose, and the time
-it waits behind others does not count. --cold runs one frame with an empty kernel cache. --compare says what became slower since a --json file.
+one thread, measured before and after each run. --paced runs the frames a second time at the camera's own rate: latency is then from asking for a
+frame's files to its pose, and the time it waits behind others does not count. --cold runs one frame with an empty kernel cache. --compare says what
+became slower since a --json file.
 
 Other comparisons, each with its --help: `trihedron benchmark scaling` (threads, image size, features, length), `trihedron benchmark manhattan`
 (estimators of the Manhattan frame on rendered rooms), `trihedron benchmark rotations` (the runs of a sweep over them), `trihedron benchmark surface`

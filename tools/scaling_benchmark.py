@@ -26,7 +26,7 @@ from trihedron.pipeline.errors import DataError, UsageError
 from trihedron.pipeline.recording import TIMING_TOPIC, Recording
 from trihedron.pipeline.types import Map
 from trihedron.tools.arguments import Parser, table
-from trihedron.tools.benchmark import sample_images, machine, measure, reference_ms
+from trihedron.tools.benchmark import machine, measure, reference_ms, sample_images
 from trihedron.tools.map_benchmark import FEATURES
 from trihedron.tools.recorded import last_map
 from trihedron.tools.scaling_plot import plot
