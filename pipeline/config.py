@@ -12,6 +12,7 @@ from collections.abc import Iterable
 from enum import Enum
 from typing import Any, get_type_hints
 
+from hydra import compose, initialize_config_module
 from hydra.core.config_store import ConfigStore
 from hydra.errors import MissingConfigException, OverrideParseException
 from omegaconf import DictConfig, OmegaConf
@@ -19,7 +20,7 @@ from omegaconf.errors import ValidationError
 
 from trihedron.pipeline.errors import ConfigError, TrihedronError, UsageError, did_you_mean
 from trihedron.pipeline.graph import Graph, build_graph
-from trihedron.pipeline.registry import options_of, plugin_class, plugins_of
+from trihedron.pipeline.registry import load_plugins, options_of, plugin_class, plugins_of
 from trihedron.pipeline.slots import SLOTS
 
 PLUGIN_KEY = "plugin"  # which plugin a slot's configuration belongs to
@@ -151,6 +152,17 @@ def check_added(overrides: Iterable[str]) -> None:
         if (added := re.match(r"\+{1,2}([^=@]*)", word)) is not None and (root := re.split(r"[./]", added[1])[0]) not in known:
             cure = did_you_mean(root, known)
             raise UsageError(added[1], "there is no such key to add to", cure if cure.startswith("did") else "see trihedron run --help")
+
+
+def composed(overrides: Iterable[str]) -> DictConfig:
+    """The configuration that `trihedron run` would make of these overrides. Raises TrihedronError, one line, as that does."""
+    load_plugins()
+    register_configs()
+    try:
+        with initialize_config_module("trihedron.conf", version_base="1.3"):
+            return compose("root", overrides=list(overrides))
+    except Exception as error:
+        raise rewritten(error) from error
 
 
 def rewritten(error: Exception) -> TrihedronError:

@@ -35,7 +35,7 @@ from trihedron.tools.arguments import Parser
 from trihedron.tools.benchmark_comparison import compared, read_figures, times
 
 PROGRAM = (sys.executable, "-c", "import sys; from trihedron.pipeline.cli import main; sys.exit(main(sys.argv[1:]))")
-REFERENCE_FRAMES = 40
+REFERENCE_FRAMES = 40  # at most
 COMPARISONS = {  # other words after `benchmark`, and whose `main` they stand for
     "long": "trihedron.tools.long_benchmark",
     "manhattan": "trihedron.tools.manhattan_family",
@@ -147,17 +147,10 @@ def machine() -> dict[str, Any]:
 
 def sample_images(overrides: list[str]) -> list[U8]:
     """Grey images (h, w) of frames spread over the run."""
-    from hydra import compose, initialize_config_module
+    from trihedron.pipeline.config import composed, make_plugin
 
-    from trihedron.pipeline.config import make_plugin, register_configs
-    from trihedron.pipeline.registry import load_plugins
-
-    load_plugins()
-    register_configs()
-    with initialize_config_module("trihedron.conf", version_base="1.3"):
-        config = compose("root", overrides=overrides)
-    dataset = make_plugin("dataset", config.dataset)
-    frames = [dataset(i) for i in sorted({len(dataset) * k // REFERENCE_FRAMES for k in range(REFERENCE_FRAMES)})]
+    dataset = make_plugin("dataset", composed(overrides).dataset)
+    frames = [dataset(i) for i in range(0, len(dataset), max(-(-len(dataset) // REFERENCE_FRAMES), 1))]
     return [frame.gray for frame in frames if frame is not None]
 
 
@@ -183,7 +176,7 @@ def report(figures: dict[str, Any]) -> str:
     lines = [
         f"{of['cpu']}, {of['cpus']} CPUs, Python {of['python']}, " + ", ".join(f"{name} {number}" for name, number in of["packages"].items()),
         f"{figures['frames']} frames, {figures['threads']} threads, reference workload {reference:.1f} ms"
-        f" (before, between and after: {', '.join(f'{ms:.1f}' for ms in figures['reference_each_ms'])})",
+        f" ({', '.join(f'{ms:.1f}' for ms in figures['reference_each_ms'])} before and after each run)",
         f"{'':14} {'p50 ms':>8} {'p95 ms':>8} {'x reference':>12}",
     ]
     for name, (p50, p95) in times(figures).items():

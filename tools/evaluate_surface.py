@@ -78,17 +78,9 @@ def prepared(trajectory: Path, recording: Path) -> tuple[F64, Truth]:
 
 def _dataset(recording: Any) -> Any:
     """The data set of a run, from the overrides in its recording."""
-    from hydra import compose, initialize_config_module
+    from trihedron.pipeline.config import composed, make_plugin
 
-    from trihedron.pipeline.config import make_plugin, register_configs
-    from trihedron.pipeline.registry import load_plugins
-
-    load_plugins()
-    register_configs()
-    chosen = [word for word in recording.overrides() if word.startswith("dataset")]
-    with initialize_config_module("trihedron.conf", version_base="1.3"):
-        config = compose("root", overrides=chosen)
-    return make_plugin("dataset", config.dataset)
+    return make_plugin("dataset", composed(word for word in recording.overrides() if word.startswith("dataset")).dataset)
 
 
 def judged(vertices: F64, triangles: I32, truth: Truth) -> dict[str, Any]:

@@ -50,15 +50,9 @@ def frames_of(recording: Recording) -> Callable[[FrameReference], Frame | None]:
             return value if isinstance(value, Frame) else None
 
         return embedded
-    from hydra import compose, initialize_config_module
+    from trihedron.pipeline.config import composed, make_plugin
 
-    from trihedron.pipeline.config import make_plugin, register_configs
-    from trihedron.pipeline.registry import load_plugins
-
-    load_plugins()
-    register_configs()
-    with initialize_config_module("trihedron.conf", version_base="1.3"):
-        options = compose("root", overrides=recording.overrides()).dataset
+    options = composed(recording.overrides()).dataset
     dataset, first = make_plugin("dataset", options), frame_range(str(options.get("frames", "")))[0]
     try:
         len(dataset)

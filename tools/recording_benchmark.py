@@ -133,12 +133,6 @@ def _opened(path: Path, frame: int) -> tuple[float, int]:
 
 def graph_of_words(overrides: Sequence[str]) -> Graph:
     """The graph that `trihedron run` would make of these overrides."""
-    from hydra import compose, initialize_config_module
+    from trihedron.pipeline.config import composed, graph_of
 
-    from trihedron.pipeline.config import graph_of, register_configs
-    from trihedron.pipeline.registry import load_plugins
-
-    load_plugins()
-    register_configs()
-    with initialize_config_module("trihedron.conf", version_base="1.3"):
-        return graph_of(compose("root", overrides=list(overrides)))
+    return graph_of(composed(overrides))

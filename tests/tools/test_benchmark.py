@@ -77,3 +77,10 @@ def test_another_file_is_no_benchmark(capsys, tmp_path):
     (tmp_path / "other.json").write_text("{}")
     assert main(["benchmark", "--compare", str(tmp_path / "other.json")]) != 0
     assert "holds no figures of a benchmark" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(("word", "place"), [("dataset=nope", "dataset"), ("dataset.nope=3", "dataset.nope")])
+def test_a_run_that_cannot_be_composed_is_one_line(word, place, capsys):
+    assert main(["benchmark", word]) == 1
+    said = capsys.readouterr().err.strip()
+    assert said.startswith(f"trihedron: {place}: ") and "\n" not in said
