@@ -11,12 +11,8 @@ SEQUENCES := $(wildcard ../shared/data/*/)
 USABLE := 'import sys, venv, ensurepip; sys.exit(not (3, 10) <= sys.version_info[:2] <= (3, 14))'
 PYTHON := $(shell for p in python3.14 python3.13 python3.12 python3.11 python3.10 python3 python; do \
 	$$p -c $(USABLE) >/dev/null 2>&1 && echo $$p && break; done)
-# An editable install empties its folder; what numba compiled there takes a minute or two to make again.
-KEEP_KERNELS := mkdir -p build && find build -name '*.nb[ic]' -print0 | tar -cf $(VENV)/kernels.tar --null -T -
-RESTORE_KERNELS := tar -xf $(VENV)/kernels.tar
-FOLDERS := conf datasets pipeline plugins tools
 
-.PHONY: demo test test-slow benchmark table install clean FORCE
+.PHONY: demo test test-slow benchmark table install clean
 .DELETE_ON_ERROR:
 
 demo: install  ## track the built-in synthetic room
@@ -48,42 +44,25 @@ table: install  ## every system on the synthetic room and on DATA="tum:FOLDER ic
 install: $(VENV)/checked $(VENV)/compiled
 
 clean:  ## remove what make made; runs/ stays
-	rm -rf $(VENV) build dist trihedron.egg-info .mypy_cache .ruff_cache .pytest_cache
+	rm -rf $(VENV) build dist src/*.egg-info .mypy_cache .ruff_cache .pytest_cache
 
 $(VENV)/created:
 	@test -n "$(PYTHON)" || { echo "trihedron: needs Python 3.10 to 3.14 with venv; install it with: apt-get install python3 python3-venv" >&2; exit 1; }
 	$(PYTHON) -m venv $(VENV)
 	@touch $@
 
-# The dependencies change with pyproject.toml only.
 $(VENV)/installed: $(VENV)/created pyproject.toml
 	@echo "Installing into $(VENV) (about 1.5 GB to download the first time)"
 	$(BIN)/python -m pip install --upgrade --quiet pip
-	@$(KEEP_KERNELS)
-	$(BIN)/python -m pip install -C editable_mode=strict -e ".[dev]"
-	@$(RESTORE_KERNELS)
-	@find $(FOLDERS) -name '*.py' -o -name '*.yaml' | LC_ALL=C sort > $(VENV)/files
-	@touch $(VENV)/linked $@
-
-# A strict editable install links file by file, so a new file needs the links made again.
-$(VENV)/files: FORCE | $(VENV)/installed
-	@find $(FOLDERS) -name '*.py' -o -name '*.yaml' | LC_ALL=C sort | cmp -s - $@ || find $(FOLDERS) -name '*.py' -o -name '*.yaml' | LC_ALL=C sort > $@
-
-$(VENV)/linked: $(VENV)/files | $(VENV)/installed
-	@$(KEEP_KERNELS)
-	@$(BIN)/python -m pip install --no-deps --no-build-isolation -C editable_mode=strict -e . >$(VENV)/link.log 2>&1 \
-		|| { cat $(VENV)/link.log >&2; exit 1; }
-	@$(RESTORE_KERNELS)
+	$(BIN)/python -m pip install -e ".[dev]"
 	@touch $@
 
 # 3: a library that only some stages use is missing; said each time, until it is there.
-$(VENV)/checked: $(VENV)/linked
+$(VENV)/checked: $(VENV)/installed
 	@$(BIN)/python -m trihedron.tools.system_check && touch $@ || test $$? -eq 3
 
-# The kernels of the default graph; what is compiled stays in build/ until its source changes.
-$(VENV)/compiled: $(VENV)/installed | $(VENV)/linked
+# The kernels of the default graph; what is compiled stays beside the sources until they change.
+$(VENV)/compiled: $(VENV)/installed
 	@echo "Compiling the kernels (a minute or two, once)"
 	@$(BIN)/trihedron compile >$(VENV)/compile.log 2>&1 || true
 	@touch $@
-
-FORCE:

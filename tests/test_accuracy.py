@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from trihedron.datasets.trajectories import attached_truth
-from trihedron.pipeline.geometry import nearest_pairs, rotation_angle_deg
-from trihedron.pipeline.recording import Recording
+from trihedron.pipeline.core.geometry import nearest_pairs, rotation_angle_deg
+from trihedron.pipeline.record.recording import Recording
+from trihedron.pipeline.record.trajectories import attached_truth
 
 DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
 SEQUENCES = {
@@ -20,7 +20,7 @@ SEQUENCES = {
     "bare room": (["dataset=synthetic", "dataset.texture=false"], 0.006),
     "office": (["dataset=tum", f"dataset.path={DATA}/icl_office_rendered"], 0.004),
 }
-RUN = "import sys; from trihedron.pipeline.cli import main; sys.exit(main(['run', *sys.argv[1:]]))"
+RUN = "import sys; from trihedron.pipeline.app.cli import main; sys.exit(main(['run', *sys.argv[1:]]))"
 
 
 def track(out, *overrides):

@@ -8,13 +8,13 @@ from pathlib import Path
 
 import pytest
 
-from trihedron.pipeline.cli import main
+from trihedron.pipeline.app.cli import main
 
 sys.path.insert(0, str(Path(__file__).parent / "pipeline"))
 from toys import contents
 
 SMALL = ["dataset.width=160", "dataset.height=120", "outputs=[trajectory,surface]"]
-RUN = "import sys; from trihedron.pipeline.cli import main; sys.exit(main(['run', *sys.argv[1:]]))"
+RUN = "import sys; from trihedron.pipeline.app.cli import main; sys.exit(main(['run', *sys.argv[1:]]))"
 
 
 @contextlib.contextmanager

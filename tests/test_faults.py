@@ -11,14 +11,14 @@ import numpy as np
 import pytest
 from omegaconf import OmegaConf
 
-from trihedron.datasets.faults import Faults
-from trihedron.datasets.motion import Motion, camera_pose
-from trihedron.datasets.synthetic import Synthetic
-from trihedron.pipeline.cli import main
-from trihedron.pipeline.consistency import pose_consistency
-from trihedron.pipeline.geometry import invert, log_se3
-from trihedron.pipeline.recording import Recording
-from trihedron.pipeline.types import DEGRADED, LOST, OK
+from trihedron.datasets.faults.faults import Faults
+from trihedron.datasets.simulation.motion import Motion, camera_pose
+from trihedron.datasets.simulation.synthetic import Synthetic
+from trihedron.pipeline.app.cli import main
+from trihedron.pipeline.core.geometry import invert, log_se3
+from trihedron.pipeline.core.types import DEGRADED, LOST, OK
+from trihedron.pipeline.record.recording import Recording
+from trihedron.pipeline.run.consistency import pose_consistency
 
 SMALL = {"width": 320, "height": 240}
 HONEST = 24.0  # median normalised error of the frames that are ok: their errors are within twice what they say (6 is exact)

@@ -13,11 +13,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from trihedron.pipeline import chunk_writer
-from trihedron.pipeline.cli import main
-from trihedron.pipeline.errors import RecordingError
-from trihedron.pipeline.recording import Recording, RecordingWriter
-from trihedron.pipeline.types import FrameReference
+from trihedron.pipeline.app.cli import main
+from trihedron.pipeline.core.errors import RecordingError
+from trihedron.pipeline.core.types import FrameReference
+from trihedron.pipeline.record import chunk_writer
+from trihedron.pipeline.record.recording import Recording, RecordingWriter
 
 sys.path.insert(0, str(Path(__file__).parent / "pipeline"))
 from toys import CAMERA, contents
@@ -25,9 +25,9 @@ from toys import CAMERA, contents
 PACED = """
 import sys, time
 from pathlib import Path
-from trihedron.pipeline.camera import Camera
-from trihedron.pipeline.recording import RecordingWriter
-from trihedron.pipeline.types import FrameReference, LineSegments
+from trihedron.pipeline.core.types import Camera
+from trihedron.pipeline.record.recording import RecordingWriter
+from trihedron.pipeline.core.types import FrameReference, LineSegments
 import numpy as np
 writer, lines = RecordingWriter(Path(sys.argv[1]), {}), np.random.default_rng(0).random((2000, 2, 2), dtype=np.float32)
 for i in range(3000):
@@ -38,8 +38,8 @@ for i in range(3000):
 """
 TRACKED = """
 import sys, time
-from trihedron.pipeline.cli import main
-from trihedron.pipeline.runner import Runner
+from trihedron.pipeline.app.cli import main
+from trihedron.pipeline.run.runner import Runner
 record = Runner._record
 def reported(self, writer, view, position, *rest):
     record(self, writer, view, position, *rest)
@@ -103,7 +103,7 @@ def test_twenty_runs_killed_at_random_moments(tmp_path, capsys):
         if i % 5 == 0 and len(recorded) > lost:
             again = tmp_path / f"again{i}"
             words = [f"replay={out}/run.mcap", "only=[rotation]", f"out={again}"]
-            run = "import sys; from trihedron.pipeline.cli import main; sys.exit(main(['run', *sys.argv[1:]]))"
+            run = "import sys; from trihedron.pipeline.app.cli import main; sys.exit(main(['run', *sys.argv[1:]]))"
             done = subprocess.run([sys.executable, "-c", run, *words], capture_output=True, text=True)
             assert done.returncode == 0, done.stderr
             assert contents(again / "run.mcap").get("/rotation") == contents(out / "run.mcap").get("/rotation")
@@ -193,7 +193,7 @@ def test_a_disk_that_fills_up_costs_the_last_chunk(tmp_path, monkeypatch):
 @pytest.mark.slow
 def test_a_run_without_room_for_its_recording_still_tracks(tmp_path):
     """The file may not grow beyond 5 MB, a few chunks; trajectory and metrics are smaller."""
-    code = "import sys; from trihedron.pipeline.cli import main; sys.exit(main(['run', *sys.argv[1:]]))"
+    code = "import sys; from trihedron.pipeline.app.cli import main; sys.exit(main(['run', *sys.argv[1:]]))"
     words = ["dataset=synthetic", "dataset.length=90", "dataset.width=160", "dataset.height=120", "record.frames=true", f"out={tmp_path}/run"]
     limit = (5_000_000, resource.RLIM_INFINITY)
     done = subprocess.run(
@@ -212,7 +212,7 @@ def test_a_run_without_room_for_its_recording_still_tracks(tmp_path):
 
 
 def test_a_folder_that_cannot_be_made_is_one_line(tmp_path):
-    code = "import sys; from trihedron.pipeline.cli import main; sys.exit(main(['run', *sys.argv[1:]]))"
+    code = "import sys; from trihedron.pipeline.app.cli import main; sys.exit(main(['run', *sys.argv[1:]]))"
     words = ["dataset=synthetic", "dataset.length=2", "outputs=[keypoints]", "out=/proc/nowhere"]
     done = subprocess.run([sys.executable, "-c", code, *words], capture_output=True, text=True, cwd=tmp_path)
     assert done.returncode == 1 and len(done.stderr.strip().splitlines()) == 1 and done.stderr.startswith("trihedron: "), done.stderr

@@ -8,15 +8,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from trihedron.datasets.synthetic import Scene, Synthetic
-from trihedron.datasets.trajectories import read_trajectory
-from trihedron.pipeline.geometry import invert
-from trihedron.pipeline.recording import Recording
-from trihedron.pipeline.registry import load_plugins
+from trihedron.datasets.simulation.synthetic import Scene, Synthetic
+from trihedron.pipeline.core.geometry import invert
+from trihedron.pipeline.core.registry import load_plugins
+from trihedron.pipeline.record.recording import Recording
+from trihedron.pipeline.record.trajectories import read_trajectory
 from trihedron.plugins.loop.appearance import AppearanceLoop
 from trihedron.plugins.loop.planes import PlanesLoop
 
-RUN = "import sys; from trihedron.pipeline.cli import main; sys.exit(main(['run', *sys.argv[1:]]))"
+RUN = "import sys; from trihedron.pipeline.app.cli import main; sys.exit(main(['run', *sys.argv[1:]]))"
 
 
 def track(out, scene, *overrides):

@@ -9,15 +9,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from trihedron.datasets.motion import Motion, camera_pose
-from trihedron.datasets.synthetic import Scene, Synthetic
-from trihedron.pipeline.geometry import invert, rotation_angle_deg
-from trihedron.pipeline.recording import Recording
-from trihedron.pipeline.registry import load_plugins, plugin_class
-from trihedron.pipeline.types import Pose
+from trihedron.datasets.simulation.motion import Motion, camera_pose
+from trihedron.datasets.simulation.synthetic import Scene, Synthetic
+from trihedron.pipeline.core.geometry import invert, rotation_angle_deg
+from trihedron.pipeline.core.registry import load_plugins, plugin_class
+from trihedron.pipeline.core.types import Pose
+from trihedron.pipeline.record.recording import Recording
 
 DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
-RUN = "import sys; from trihedron.pipeline.cli import main; sys.exit(main(['run', *sys.argv[1:]]))"
+RUN = "import sys; from trihedron.pipeline.app.cli import main; sys.exit(main(['run', *sys.argv[1:]]))"
 SEQUENCES = {  # name -> data set, options of it, frames, frames covered for one second, margin of the ATE against the run without a cover
     "textured room": ("synthetic", {}, "0:130", (60, 90)),
     "bare room": ("synthetic", {"texture": "false"}, "0:130", (60, 90)),
@@ -49,7 +49,7 @@ def test_a_small_camera_covered_for_ten_frames_is_lost_just_then(tmp_path):
 COMPILED = """
 import sys
 from numba.core.dispatcher import Dispatcher
-from trihedron.pipeline.cli import main
+from trihedron.pipeline.app.cli import main
 def compiled():
     modules = [module for name, module in sys.modules.items() if name.startswith("trihedron.")]
     kernels = {kernel for module in modules for kernel in vars(module).values() if isinstance(kernel, Dispatcher)}

@@ -2,7 +2,7 @@
 
 import pytest
 
-from trihedron.pipeline.cli import main
+from trihedron.pipeline.app.cli import main
 
 TYPE, SEE = "give a value of that type", "see trihedron plugins for the options of"
 WRITE = "write key=value, for example threads=1 (quote lists: 'only=[pose]')"

@@ -89,7 +89,7 @@ def run(command: Path, *words: str, folder: Path) -> str:
 def check_installation(programs: Path, folder: Path) -> None:
     """Use the installed program from another folder; no top-level name but `trihedron` may have come with it."""
     folder.mkdir()
-    where = run(programs / "python", "-c", "import trihedron.pipeline.cli as m; print(m.__file__)", folder=folder)
+    where = run(programs / "python", "-c", "import trihedron.pipeline.app.cli as m; print(m.__file__)", folder=folder)
     assert Path(where.strip()).is_relative_to(programs.parent.resolve())
     for name in (*FOLDERS, "tests"):
         assert not list(programs.parent.glob(f"lib/*/site-packages/{name}")), name

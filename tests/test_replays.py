@@ -8,11 +8,11 @@ from pathlib import Path
 import pytest
 from hydra import compose, initialize_config_module
 
-from trihedron.pipeline.cli import main
-from trihedron.pipeline.config import graph_of, register_configs
-from trihedron.pipeline.recording import Recording
-from trihedron.pipeline.registry import load_plugins, plugin_class
-from trihedron.pipeline.slots import output_of
+from trihedron.pipeline.app.cli import main
+from trihedron.pipeline.core.config import graph_of, register_configs
+from trihedron.pipeline.core.registry import load_plugins, plugin_class
+from trihedron.pipeline.core.slots import output_of
+from trihedron.pipeline.record.recording import Recording
 
 sys.path.insert(0, str(Path(__file__).parent / "pipeline"))
 from toys import contents
@@ -32,7 +32,7 @@ MAY_BE_SILENT = {
 }  # on so short a way no loop is to close
 JOBS = """
 import json, sys
-from trihedron.pipeline.cli import main
+from trihedron.pipeline.app.cli import main
 sys.exit(max(main(["run", *job]) for job in json.loads(sys.argv[1])))
 """
 

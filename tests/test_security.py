@@ -9,12 +9,12 @@ from pathlib import Path
 import pytest
 from mcap.writer import Writer
 
-from trihedron.datasets.icl_nuim import IclNuim
-from trihedron.datasets.tum import Tum
-from trihedron.pipeline.cli import main
-from trihedron.pipeline.errors import DataError
-from trihedron.pipeline.recording import FORMAT, METADATA
-from trihedron.pipeline.types import FrameReference
+from trihedron.datasets.readers.icl_nuim import IclNuim
+from trihedron.datasets.readers.tum import Tum
+from trihedron.pipeline.app.cli import main
+from trihedron.pipeline.core.errors import DataError
+from trihedron.pipeline.core.types import FrameReference
+from trihedron.pipeline.record.recording import FORMAT, METADATA
 
 ROOT = Path(__file__).resolve().parents[1]
 FOLDERS = ("pipeline", "plugins", "datasets", "tools", "conf")
@@ -120,7 +120,7 @@ def test_a_recording_has_no_say_in_the_program_itself(tmp_path, capsys, monkeypa
 @pytest.mark.parametrize("word", ["out=/tmp/elsewhere", "save_map=/tmp/elsewhere.mcap", "report=compare", "replay=other.mcap"])
 def test_what_belongs_to_one_run_is_not_taken_from_a_recording(tmp_path, monkeypatch, word):
     monkeypatch.chdir(tmp_path)
-    from trihedron.pipeline.cli import _with_recorded
+    from trihedron.pipeline.app.cli import _with_recorded
 
     file = recording(tmp_path / "hostile.mcap", "dataset.seed=3", word)
     assert _with_recorded([f"replay={file}"]) == ["dataset.seed=3", f"replay={file}"]

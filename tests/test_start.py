@@ -7,10 +7,10 @@ from pathlib import Path
 
 import pytest
 
-import trihedron.pipeline.cli
+import trihedron.pipeline.app.cli
 from trihedron.tools.benchmark import PROGRAM
 
-PACKAGE = Path(trihedron.pipeline.cli.__file__).parents[1]
+PACKAGE = Path(trihedron.pipeline.app.cli.__file__).parents[1]
 
 
 def cpu_seconds(*words):

@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from trihedron.datasets.trajectories import read_trajectory
-from trihedron.pipeline.recording import Recording
+from trihedron.pipeline.record.recording import Recording
+from trihedron.pipeline.record.trajectories import read_trajectory
 
 sys.path.insert(0, str(Path(__file__).parent / "pipeline"))
 from toys import contents
@@ -32,7 +32,7 @@ OTHERS = {  # graphs that are tested elsewhere too -> the same limit
 }
 JOBS = """
 import json, sys
-from trihedron.pipeline.cli import main
+from trihedron.pipeline.app.cli import main
 sys.exit(max(main(["run", *job]) for job in json.loads(sys.argv[1])))
 """
 

@@ -8,7 +8,7 @@ import sys
 from collections.abc import Iterable, Sequence
 from typing import NoReturn
 
-from trihedron.pipeline.errors import UsageError, did_you_mean
+from trihedron.pipeline.core.errors import UsageError, did_you_mean
 
 
 class Parser(argparse.ArgumentParser):

@@ -29,21 +29,21 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-from trihedron.pipeline.errors import UsageError, did_you_mean
-from trihedron.pipeline.types import U8
+from trihedron.pipeline.core.errors import UsageError, did_you_mean
+from trihedron.pipeline.core.types import U8
 from trihedron.tools.arguments import Parser
-from trihedron.tools.benchmark_comparison import compared, read_figures, times
+from trihedron.tools.benchmarks.paired import compared, read_figures, times
 
-PROGRAM = (sys.executable, "-c", "import sys; from trihedron.pipeline.cli import main; sys.exit(main(sys.argv[1:]))")
+PROGRAM = (sys.executable, "-c", "import sys; from trihedron.pipeline.app.cli import main; sys.exit(main(sys.argv[1:]))")
 REFERENCE_FRAMES = 40  # at most
 COMPARISONS = {  # other words after `benchmark`, and whose `main` they stand for
-    "long": "trihedron.tools.long_benchmark",
-    "manhattan": "trihedron.tools.manhattan_family",
-    "map": "trihedron.tools.map_benchmark",
-    "recording": "trihedron.tools.recording_benchmark",
-    "rotations": "trihedron.tools.rotation_comparison",
-    "scaling": "trihedron.tools.scaling_benchmark",
-    "surface": "trihedron.tools.surface_family",
+    "long": "trihedron.tools.benchmarks.long_run",
+    "manhattan": "trihedron.tools.benchmarks.manhattan_family",
+    "map": "trihedron.tools.benchmarks.map_benchmark",
+    "recording": "trihedron.tools.benchmarks.recording_benchmark",
+    "rotations": "trihedron.tools.benchmarks.rotation_comparison",
+    "scaling": "trihedron.tools.benchmarks.scaling_benchmark",
+    "surface": "trihedron.tools.benchmarks.surface_family",
 }
 
 
@@ -95,7 +95,7 @@ def measure(overrides: list[str], out: Path, environment: dict[str, str] | None 
     """`timing.json` and metrics of one run in its own process. Raises TrihedronError when it fails.
 
     The peak of its memory is the one it has measured itself: what the system counts of a child begins with what its parent held."""
-    from trihedron.pipeline.errors import StageError
+    from trihedron.pipeline.core.errors import StageError
 
     began = time.perf_counter()
     process = subprocess.Popen([*PROGRAM, "run", *overrides], stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True, env=environment)
@@ -147,7 +147,7 @@ def machine() -> dict[str, Any]:
 
 def sample_images(overrides: list[str]) -> list[U8]:
     """Grey images (h, w) of frames spread over the run."""
-    from trihedron.pipeline.config import composed, make_plugin
+    from trihedron.pipeline.core.config import composed, make_plugin
 
     dataset = make_plugin("dataset", composed(overrides).dataset)
     frames = [dataset(i) for i in range(0, len(dataset), max(-(-len(dataset) // REFERENCE_FRAMES), 1))]

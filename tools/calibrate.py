@@ -15,9 +15,9 @@ from typing import Any
 
 import numpy as np
 
-from trihedron.pipeline.errors import DataError
-from trihedron.pipeline.recording import Recording
-from trihedron.pipeline.types import FrameReference, Keypoints, Matches, Planes, Tracks
+from trihedron.pipeline.core.errors import DataError
+from trihedron.pipeline.core.types import FrameReference, Keypoints, Matches, Planes, Tracks
+from trihedron.pipeline.record.recording import Recording
 from trihedron.plugins.numerics.depth.depth_offset import DepthOffset, RightAngle, estimate_depth_offset, right_angles
 from trihedron.plugins.numerics.motion.depth_delay import DepthDelay, Turn, estimate_depth_delay, turn_of
 from trihedron.tools.arguments import Parser, table

@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 import yaml
 
-from trihedron.pipeline.errors import DataError, UsageError, did_you_mean
+from trihedron.pipeline.core.errors import DataError, UsageError, did_you_mean
 from trihedron.tools import comparison_table as render
 from trihedron.tools.arguments import Parser
 from trihedron.tools.comparison_table import FIGURES

@@ -14,8 +14,8 @@ import tempfile
 import time
 from contextlib import redirect_stdout
 
-from trihedron.pipeline.cli import main as command
-from trihedron.pipeline.errors import TrihedronError
+from trihedron.pipeline.app.cli import main as command
+from trihedron.pipeline.core.errors import TrihedronError
 from trihedron.tools.arguments import Parser
 
 SMALL = ("width=160", "height=120")
@@ -38,7 +38,7 @@ def main(argv: list[str]) -> int:
     if options.list:
         print(compiled_by_runs(options.overrides))
         return 0
-    from trihedron.pipeline.kernels import Compilation, cores, missing
+    from trihedron.pipeline.run.kernels import Compilation, cores, missing
 
     began, rows = time.perf_counter(), missing()
     with Compilation(rows) as compilation:
@@ -51,7 +51,7 @@ def main(argv: list[str]) -> int:
 
 def compiled_by_runs(overrides: list[str]) -> str:
     """JSON, a kernel a line, of what these runs call: first what their first frames need, and what takes longest, which only an empty cache tells."""
-    from trihedron.pipeline import kernels
+    from trihedron.pipeline.run import kernels
 
     kernels.alone = True
     runs = [*RUNS, *([tuple(overrides)] if overrides else [])]

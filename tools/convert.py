@@ -14,11 +14,11 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from trihedron.pipeline.errors import ConfigError, DataError, UsageError
+from trihedron.pipeline.core.errors import ConfigError, DataError, UsageError
 from trihedron.tools.arguments import Parser
 
 if TYPE_CHECKING:
-    from trihedron.pipeline.recording import RecordingWriter
+    from trihedron.pipeline.record.recording import RecordingWriter
 
 SUFFIX = ".mcap"
 
@@ -69,11 +69,11 @@ def convert(dataset: str, options: dict[str, str | None], destination: Path) -> 
     """Write the recording; a file of that name is replaced only when all is done. Returns how many frames are in it and how many were unreadable.
 
     Raises DataError when the data set cannot be read, ConfigError for options it does not have."""
-    from trihedron.datasets.trajectories import TRUTH, format_trajectory
-    from trihedron.pipeline.graph import build_graph
-    from trihedron.pipeline.recording import RecordingWriter
-    from trihedron.pipeline.registry import load_plugins, plugin_class
-    from trihedron.pipeline.runner import Runner
+    from trihedron.pipeline.core.graph import build_graph
+    from trihedron.pipeline.core.registry import load_plugins, plugin_class
+    from trihedron.pipeline.record.recording import RecordingWriter
+    from trihedron.pipeline.record.trajectories import TRUTH, format_trajectory
+    from trihedron.pipeline.run.runner import Runner
 
     load_plugins()
     plugin = _plugin(plugin_class("dataset", dataset), dataset, options)

@@ -14,9 +14,9 @@ from typing import Any
 
 import numpy as np
 
-from trihedron.pipeline.errors import DataError, did_you_mean
-from trihedron.pipeline.recording import FRAMES_TOPIC, Recording, TopicReader
-from trihedron.pipeline.types import Table, Value
+from trihedron.pipeline.core.errors import DataError, did_you_mean
+from trihedron.pipeline.core.types import Table, Value
+from trihedron.pipeline.record.recording import FRAMES_TOPIC, Recording, TopicReader
 from trihedron.tools.arguments import Parser, table
 
 

@@ -19,12 +19,12 @@ from typing import Any
 
 import numpy as np
 
-from trihedron.datasets.trajectories import attached_truth
-from trihedron.pipeline.errors import DataError, StageError
-from trihedron.pipeline.geometry import nearest_pairs, nearest_rotation
-from trihedron.pipeline.metrics import MAX_DIFFERENCE_NS
-from trihedron.pipeline.recording import Recording, RecordingWriter
-from trihedron.pipeline.types import F64, OK, Pose, Rotation, Translation, Value
+from trihedron.pipeline.core.errors import DataError, StageError
+from trihedron.pipeline.core.geometry import nearest_pairs, nearest_rotation
+from trihedron.pipeline.core.types import F64, OK, Pose, Rotation, Translation, Value
+from trihedron.pipeline.record.recording import Recording, RecordingWriter
+from trihedron.pipeline.record.trajectories import attached_truth
+from trihedron.pipeline.run.metrics import MAX_DIFFERENCE_NS
 from trihedron.tools.arguments import Parser, table
 
 EXACT = 1e-12  # variance of what is true, m² and rad²; positive, so that it can be inverted
@@ -123,7 +123,7 @@ def rewrite(recording: Recording, path: Path, changed: dict[str, Any]) -> None:
 
 def replayed(source: Path, stages: tuple[str, ...], out: Path, *overrides: str) -> dict[str, Any]:
     """Run the stages again over the recording, changed by `overrides`; the final metrics, empty when no pose is among them."""
-    from trihedron.pipeline.cli import main as trihedron
+    from trihedron.pipeline.app.cli import main as trihedron
 
     said = io.StringIO()
     with contextlib.redirect_stdout(said), contextlib.redirect_stderr(said):

@@ -14,12 +14,12 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from trihedron.pipeline.errors import DataError, RecordingError, UsageError
+from trihedron.pipeline.core.errors import DataError, RecordingError, UsageError
 from trihedron.tools.arguments import Parser, table
 
 if TYPE_CHECKING:
-    from trihedron.pipeline.metrics import I64
-    from trihedron.pipeline.types import Trajectory
+    from trihedron.pipeline.core.types import Trajectory
+    from trihedron.pipeline.run.metrics import I64
 
 RECORDING = "run.mcap"
 LARGEST_DIFFERENCE_MS = 1000.0
@@ -58,10 +58,10 @@ def evaluate_files(
 ) -> tuple[dict[str, Any], float | None]:
     """The figures of `pipeline.metrics.Metrics` for two files, and the RMSE of the rotation from frame to frame (degrees) against the truth
     mirrored once more: by it a wrong handedness is seen. Raises DataError."""
-    from trihedron.datasets.icl_nuim import reflect
-    from trihedron.datasets.trajectories import read_trajectory
-    from trihedron.pipeline.metrics import evaluate_trajectory
-    from trihedron.pipeline.types import Trajectory
+    from trihedron.datasets.readers.icl_nuim import reflect
+    from trihedron.pipeline.core.types import Trajectory
+    from trihedron.pipeline.record.trajectories import read_trajectory
+    from trihedron.pipeline.run.metrics import evaluate_trajectory
 
     estimate, expected = read_trajectory(trajectory), _read_truth(truth)
     stamps, nominal_fps = read_frames(frames, estimate) if frames is not None else _frames_beside(trajectory, estimate)
@@ -74,8 +74,8 @@ def evaluate_files(
 
 
 def _read_truth(path: Path) -> Trajectory:
-    from trihedron.datasets.trajectories import attached_truth, read_trajectory
-    from trihedron.pipeline.recording import Recording
+    from trihedron.pipeline.record.recording import Recording
+    from trihedron.pipeline.record.trajectories import attached_truth, read_trajectory
 
     if path.suffix != ".mcap":
         return read_trajectory(path)
@@ -99,10 +99,10 @@ def read_frames(path: Path, estimate: Trajectory) -> tuple[I64, float | None]:
     text file. Stamps that differ by rounding become the estimate's. Raises DataError when the estimate has a stamp that is no frame's."""
     import numpy as np
 
-    from trihedron.datasets.trajectories import parse_stamp_ns, table_lines
-    from trihedron.pipeline.metrics import associate
-    from trihedron.pipeline.recording import Recording
-    from trihedron.pipeline.types import FrameReference
+    from trihedron.pipeline.core.types import FrameReference
+    from trihedron.pipeline.record.recording import Recording
+    from trihedron.pipeline.record.trajectories import parse_stamp_ns, table_lines
+    from trihedron.pipeline.run.metrics import associate
 
     fps = None
     if path.suffix == ".mcap":

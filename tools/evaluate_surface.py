@@ -17,11 +17,11 @@ import json
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from trihedron.pipeline.errors import DataError
+from trihedron.pipeline.core.errors import DataError
 from trihedron.tools.arguments import Parser, table
 
 if TYPE_CHECKING:
-    from trihedron.pipeline.types import F64, I32
+    from trihedron.pipeline.core.types import F64, I32
     from trihedron.tools.surface_truth import Truth
 
 SURFACE, TRAJECTORY, RECORDING = "surface.ply", "trajectory.txt", "run.mcap"
@@ -59,10 +59,10 @@ def evaluate_files(mesh: Path, recording: Path) -> dict[str, Any]:
 
 def prepared(trajectory: Path, recording: Path) -> tuple[F64, Truth]:
     """(4, 4) `T_truth_world` that aligns the trajectory with the recording's ground truth, and the true surface of its data set. Raises DataError."""
-    from trihedron.datasets.trajectories import attached_truth, read_trajectory
-    from trihedron.pipeline.geometry import umeyama
-    from trihedron.pipeline.metrics import associate
-    from trihedron.pipeline.recording import Recording
+    from trihedron.pipeline.core.geometry import umeyama
+    from trihedron.pipeline.record.recording import Recording
+    from trihedron.pipeline.record.trajectories import attached_truth, read_trajectory
+    from trihedron.pipeline.run.metrics import associate
     from trihedron.tools.surface_truth import truth_of
 
     estimate, opened = read_trajectory(trajectory), Recording(recording)
@@ -78,7 +78,7 @@ def prepared(trajectory: Path, recording: Path) -> tuple[F64, Truth]:
 
 def _dataset(recording: Any) -> Any:
     """The data set of a run, from the overrides in its recording."""
-    from trihedron.pipeline.config import composed, make_plugin
+    from trihedron.pipeline.core.config import composed, make_plugin
 
     return make_plugin("dataset", composed(word for word in recording.overrides() if word.startswith("dataset")).dataset)
 

@@ -14,8 +14,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-from trihedron.pipeline.errors import DataError, UsageError, did_you_mean
-from trihedron.pipeline.recording import Recording
+from trihedron.pipeline.core.errors import DataError, UsageError, did_you_mean
+from trihedron.pipeline.record.recording import Recording
 from trihedron.tools.arguments import Parser
 
 RECORDING = "run.mcap"

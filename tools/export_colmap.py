@@ -11,10 +11,10 @@ from typing import Any
 import cv2
 import numpy as np
 
-from trihedron.pipeline.errors import DataError
-from trihedron.pipeline.geometry import invert
-from trihedron.pipeline.recording import Recording
-from trihedron.pipeline.types import I32, U8, FrameReference, Map
+from trihedron.pipeline.core.errors import DataError
+from trihedron.pipeline.core.geometry import invert
+from trihedron.pipeline.core.types import I32, U8, FrameReference, Map
+from trihedron.pipeline.record.recording import Recording
 from trihedron.tools.export import Format
 from trihedron.tools.recorded import colors_at, frames_of, last_map, references_of
 

@@ -11,12 +11,12 @@ from typing import Any
 import numpy as np
 from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
 
-from trihedron.datasets.trajectories import attached_truth
-from trihedron.pipeline.errors import DataError, UsageError
-from trihedron.pipeline.foxglove import View
-from trihedron.pipeline.foxglove_messages import AXES, COLORS
-from trihedron.pipeline.recording import Recording
-from trihedron.pipeline.types import Camera, Keypoints, ManhattanFrame, Map, Planes, Pose, Segments, Surface
+from trihedron.pipeline.core.errors import DataError, UsageError
+from trihedron.pipeline.core.types import Camera, Keypoints, ManhattanFrame, Map, Planes, Pose, Segments, Surface
+from trihedron.pipeline.record.foxglove import View
+from trihedron.pipeline.record.foxglove_messages import AXES, COLORS
+from trihedron.pipeline.record.recording import Recording
+from trihedron.pipeline.record.trajectories import attached_truth
 from trihedron.tools.export import Format
 from trihedron.tools.recorded import references_of
 

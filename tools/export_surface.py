@@ -10,10 +10,10 @@ from typing import Any
 
 import numpy as np
 
-from trihedron.pipeline.errors import DataError
-from trihedron.pipeline.ply import triangle_planes, write_ply
-from trihedron.pipeline.recording import Recording
-from trihedron.pipeline.types import F64, PLANE_KINDS, Surface
+from trihedron.pipeline.core.errors import DataError
+from trihedron.pipeline.core.types import F64, PLANE_KINDS, Surface
+from trihedron.pipeline.record.recording import Recording
+from trihedron.pipeline.run.ply import triangle_planes, write_ply
 from trihedron.tools.export import Format
 from trihedron.tools.gltf import glb
 

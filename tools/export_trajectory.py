@@ -9,10 +9,10 @@ from typing import Any
 
 import numpy as np
 
-from trihedron.datasets.trajectories import format_stamp, write_trajectory
-from trihedron.pipeline.geometry import quaternion_from_rotation
-from trihedron.pipeline.recording import TIMING_TOPIC, Recording
-from trihedron.pipeline.types import Pose
+from trihedron.pipeline.core.geometry import quaternion_from_rotation
+from trihedron.pipeline.core.types import Pose
+from trihedron.pipeline.record.recording import TIMING_TOPIC, Recording
+from trihedron.pipeline.record.trajectories import format_stamp, write_trajectory
 from trihedron.tools.export import Format
 from trihedron.tools.recorded import poses_of, trajectory_of
 

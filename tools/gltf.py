@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from trihedron.pipeline.types import U8
+from trihedron.pipeline.core.types import U8
 
 MAGIC, VERSION, JSON_CHUNK, BINARY_CHUNK = 0x46546C67, 2, 0x4E4F534A, 0x004E4942
 FLOAT, UNSIGNED_INT, UNSIGNED_BYTE = 5126, 5125, 5121

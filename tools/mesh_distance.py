@@ -6,7 +6,7 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from trihedron.pipeline.types import F64, I32
+from trihedron.pipeline.core.types import F64, I32
 
 I64 = NDArray[np.int64]
 SPACING_M = 0.02  # between the samples that say which triangles are near

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import numpy as np
 
-from trihedron.pipeline.errors import DataError
-from trihedron.pipeline.types import F64, I32
+from trihedron.pipeline.core.errors import DataError
+from trihedron.pipeline.core.types import F64, I32
 
 PLY_TYPES = {
     "char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1", "short": "<i2", "int16": "<i2", "ushort": "<u2", "uint16": "<u2",

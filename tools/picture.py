@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Any
 from trihedron.tools.arguments import Parser
 
 if TYPE_CHECKING:
-    from trihedron.pipeline.recording import Recording
-    from trihedron.pipeline.types import Camera, Map, Planes
+    from trihedron.pipeline.core.types import Camera, Map, Planes
+    from trihedron.pipeline.record.recording import Recording
 
 AXIS_COLORS = ((220, 50, 50), (50, 170, 50), (60, 90, 230))
 AXIS_LENGTH_PX = 60
@@ -37,8 +37,8 @@ def draw(path: str, frame: int, out: Path) -> None:
     matplotlib.use("Agg")
     from matplotlib import pyplot
 
-    from trihedron.pipeline.errors import RecordingError
-    from trihedron.pipeline.recording import Recording
+    from trihedron.pipeline.core.errors import RecordingError
+    from trihedron.pipeline.record.recording import Recording
 
     recording = Recording(path)
     poses = list(recording.values("pose"))
@@ -87,11 +87,11 @@ def _image(recording: Recording, stamp_ns: int, camera: Camera) -> Any:
     import numpy as np
     from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
 
-    from trihedron.datasets.picture_headers import UnreadableImage
-    from trihedron.datasets.pixels import color_of
-    from trihedron.datasets.robot_values import Picture
-    from trihedron.pipeline.errors import RecordingError
-    from trihedron.pipeline.recording import FrameReader
+    from trihedron.datasets.readers.picture_headers import UnreadableImage
+    from trihedron.datasets.readers.pixels import color_of
+    from trihedron.datasets.readers.robot_values import Picture
+    from trihedron.pipeline.core.errors import RecordingError
+    from trihedron.pipeline.record.recording import FrameReader
 
     whole: Any = FrameReader(recording, "dataset").at(stamp_ns) if "dataset" in recording.topics else None
     if whole is not None:

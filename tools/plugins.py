@@ -16,7 +16,7 @@ import tokenize
 from enum import Enum
 from typing import Any
 
-from trihedron.pipeline.errors import UsageError, did_you_mean
+from trihedron.pipeline.core.errors import UsageError, did_you_mean
 from trihedron.tools.arguments import Parser, table
 
 
@@ -26,8 +26,8 @@ def main(argv: list[str]) -> int:
     parser.add_argument("slot", metavar="SLOT", nargs="?", help="only this slot")
     parser.add_argument("--json", action="store_true", help="print everything as JSON")
     arguments = parser.parse_args(argv)
-    from trihedron.pipeline.registry import load_plugins
-    from trihedron.pipeline.slots import SLOTS
+    from trihedron.pipeline.core.registry import load_plugins
+    from trihedron.pipeline.core.slots import SLOTS
 
     if arguments.slot is not None and arguments.slot not in SLOTS:
         raise UsageError("plugins", f"there is no slot '{arguments.slot}'", did_you_mean(arguments.slot, SLOTS))
@@ -39,8 +39,8 @@ def main(argv: list[str]) -> int:
 
 def describe_slot(slot: str) -> dict[str, Any]:
     """A slot as plain data: its contract and its plugins, ready for JSON."""
-    from trihedron.pipeline.registry import plugins_of
-    from trihedron.pipeline.slots import FOLDS, SLOTS, inputs_of, output_of, summary
+    from trihedron.pipeline.core.registry import plugins_of
+    from trihedron.pipeline.core.slots import FOLDS, SLOTS, inputs_of, output_of, summary
 
     default = default_plugins().get(slot)
     return {
@@ -58,7 +58,7 @@ def describe_plugin(slot: str, name: str, plugin: type[Any]) -> dict[str, Any]:
     """A plugin as plain data: what it takes, its parameters with type, default and comment, ready for JSON."""
     from typing import get_type_hints
 
-    from trihedron.pipeline.registry import options_of, parameters_of_method
+    from trihedron.pipeline.core.registry import options_of, parameters_of_method
 
     hints, comments = get_type_hints(plugin), field_comments(plugin)
     options = []
@@ -105,7 +105,7 @@ def default_plugins() -> dict[str, str]:
 
     from omegaconf import OmegaConf
 
-    from trihedron.pipeline.config import RunOptions
+    from trihedron.pipeline.core.config import RunOptions
 
     graph: Any = OmegaConf.create((files("trihedron.conf") / "graph" / "structural.yaml").read_text())
     chosen = [*RunOptions().defaults, *graph.defaults]
@@ -117,7 +117,7 @@ def type_name(hint: Any) -> str:
     if isinstance(hint, type) and not hasattr(hint, "__args__"):
         return hint.__name__
     text = str(hint)
-    for module in ("trihedron.pipeline.types.", "numpy.random._generator.", "typing."):
+    for module in ("trihedron.pipeline.core.types.", "numpy.random._generator.", "typing."):
         text = text.replace(module, "")
     return text
 

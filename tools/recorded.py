@@ -7,12 +7,12 @@ from typing import Any
 
 import numpy as np
 
-from trihedron.pipeline.errors import DataError
-from trihedron.pipeline.recording import FRAMES_TOPIC, Recording
-from trihedron.pipeline.results import final_trajectory
-from trihedron.pipeline.runs import Poses, Result
-from trihedron.pipeline.slots import frame_range
-from trihedron.pipeline.types import Frame, FrameReference, Map, Pose, Trajectory
+from trihedron.pipeline.core.errors import DataError
+from trihedron.pipeline.core.slots import frame_range
+from trihedron.pipeline.core.types import Frame, FrameReference, Map, Pose, Trajectory
+from trihedron.pipeline.record.recording import FRAMES_TOPIC, Recording
+from trihedron.pipeline.run.replay import Poses, Result
+from trihedron.pipeline.run.results import final_trajectory
 
 
 def poses_of(recording: Recording) -> list[Pose]:
@@ -50,7 +50,7 @@ def frames_of(recording: Recording) -> Callable[[FrameReference], Frame | None]:
             return value if isinstance(value, Frame) else None
 
         return embedded
-    from trihedron.pipeline.config import composed, make_plugin
+    from trihedron.pipeline.core.config import composed, make_plugin
 
     options = composed(recording.overrides()).dataset
     dataset, first = make_plugin("dataset", options), frame_range(str(options.get("frames", "")))[0]

@@ -16,9 +16,9 @@ from mcap.records import Attachment, Channel, Chunk, Message, Metadata, Schema
 from mcap.stream_reader import StreamReader, breakup_chunk
 from mcap.writer import MCAP0_MAGIC, CompressionType, Writer
 
-from trihedron.pipeline.chunk_writer import CHUNK_BYTES, is_being_written
-from trihedron.pipeline.errors import DataError, RecordingError
-from trihedron.pipeline.mcap_errors import DAMAGE, damaged
+from trihedron.pipeline.core.errors import DataError, RecordingError
+from trihedron.pipeline.record.chunk_writer import CHUNK_BYTES, is_being_written
+from trihedron.pipeline.record.mcap_errors import DAMAGE, damaged
 from trihedron.tools.arguments import Parser
 
 

@@ -17,13 +17,13 @@ from typing import Any
 
 import numpy as np
 
-from trihedron.datasets.trajectories import attached_truth, read_trajectory
-from trihedron.pipeline.errors import DataError, TrihedronError
-from trihedron.pipeline.geometry import transform, umeyama
-from trihedron.pipeline.metrics import aligned_errors, associate
-from trihedron.pipeline.recording import Recording
-from trihedron.pipeline.results import dotted
-from trihedron.pipeline.types import F64, Trajectory
+from trihedron.pipeline.core.errors import DataError, TrihedronError
+from trihedron.pipeline.core.geometry import transform, umeyama
+from trihedron.pipeline.core.types import F64, Trajectory
+from trihedron.pipeline.record.recording import Recording
+from trihedron.pipeline.record.trajectories import attached_truth, read_trajectory
+from trihedron.pipeline.run.metrics import aligned_errors, associate
+from trihedron.pipeline.run.results import dotted
 from trihedron.tools import comparison_table
 from trihedron.tools.arguments import Parser
 from trihedron.tools.compare import Run, read_runs, rows_of

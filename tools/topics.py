@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from trihedron.pipeline.errors import RecordingError
+from trihedron.pipeline.core.errors import RecordingError
 from trihedron.tools.arguments import Parser, table
 
 VALUE_SCHEMA = "trihedron.Value"
@@ -65,7 +65,7 @@ def _opened(path: Path) -> Iterator[Any]:
     """A reader of the file; what goes wrong with the file inside the block becomes a RecordingError."""
     from mcap.reader import SeekingReader
 
-    from trihedron.pipeline.mcap_errors import DAMAGE, damaged
+    from trihedron.pipeline.record.mcap_errors import DAMAGE, damaged
 
     try:
         with open(path, "rb") as file:
@@ -78,6 +78,6 @@ def _opened(path: Path) -> Iterator[Any]:
 
 def _value_type(data: bytes) -> str:
     """The type of value in a message of ours, for example Pose."""
-    from trihedron.pipeline.codec import ValueMessage
+    from trihedron.pipeline.record.codec import ValueMessage
 
     return f"trihedron.{ValueMessage.FromString(data).type}"

@@ -9,8 +9,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from trihedron.pipeline.errors import UsageError
-from trihedron.pipeline.recording import Recording
+from trihedron.pipeline.core.errors import UsageError
+from trihedron.pipeline.record.recording import Recording
 from trihedron.tools.arguments import Parser
 from trihedron.tools.export import RECORDING
 

@@ -7,9 +7,9 @@ from typing import Any
 
 import numpy as np
 
-from trihedron.pipeline.geometry import invert, pose_matrix
-from trihedron.pipeline.registry import register
-from trihedron.pipeline.types import Correction, Map
+from trihedron.pipeline.core.geometry import invert, pose_matrix
+from trihedron.pipeline.core.registry import register
+from trihedron.pipeline.core.types import Correction, Map
 from trihedron.plugins.numerics.bundle.bundle_correction import carried_correction
 from trihedron.plugins.numerics.bundle.bundle_problem import BundleMeasurements, BundleState, bundle_problem, bundle_window
 from trihedron.plugins.numerics.maps.local_window import newest_keyframes

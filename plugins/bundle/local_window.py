@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from trihedron.pipeline.registry import register
-from trihedron.pipeline.types import Correction, Map
+from trihedron.pipeline.core.registry import register
+from trihedron.pipeline.core.types import Correction, Map
 from trihedron.plugins.numerics.bundle.bundle_correction import bundle_correction
 from trihedron.plugins.numerics.bundle.bundle_problem import bundle_problem, bundle_window
 from trihedron.plugins.numerics.bundle.bundle_solver import solve_bundle

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from trihedron.pipeline.registry import register
-from trihedron.pipeline.types import Correction, Map
+from trihedron.pipeline.core.registry import register
+from trihedron.pipeline.core.types import Correction, Map
 
 
 @register("bundle", "none")

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from trihedron.pipeline.registry import register
-from trihedron.pipeline.types import Frame, Keypoints
+from trihedron.pipeline.core.registry import register
+from trihedron.pipeline.core.types import Frame, Keypoints
 
 
 @register("keypoints", "none")

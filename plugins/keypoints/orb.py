@@ -7,8 +7,8 @@ from functools import cached_property
 
 import numpy as np
 
-from trihedron.pipeline.registry import register
-from trihedron.pipeline.types import F32, Frame, Keypoints
+from trihedron.pipeline.core.registry import register
+from trihedron.pipeline.core.types import F32, Frame, Keypoints
 from trihedron.plugins.numerics.depth.depth_sampling import local_depth, noise_coefficients
 from trihedron.plugins.numerics.images.image_pyramid import full_pixels, image_pyramid
 from trihedron.plugins.numerics.images.oriented_corners import oriented_corners

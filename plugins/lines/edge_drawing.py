@@ -7,8 +7,8 @@ from typing import Any
 
 import cv2
 
-from trihedron.pipeline.registry import register
-from trihedron.pipeline.types import Frame, LineSegments
+from trihedron.pipeline.core.registry import register
+from trihedron.pipeline.core.types import Frame, LineSegments
 from trihedron.plugins.numerics.images.straight_edges import SMALLEST, StraightEdges
 
 

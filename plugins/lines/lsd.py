@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from trihedron.pipeline.registry import register
-from trihedron.pipeline.types import Frame, LineSegments
+from trihedron.pipeline.core.registry import register
+from trihedron.pipeline.core.types import Frame, LineSegments
 from trihedron.plugins.numerics.images.line_support import line_support_segments
 from trihedron.plugins.numerics.images.straight_edges import StraightEdges
 

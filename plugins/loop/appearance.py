@@ -7,8 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from trihedron.pipeline.registry import register
-from trihedron.pipeline.types import I32, Map
+from trihedron.pipeline.core.registry import register
+from trihedron.pipeline.core.types import I32, Map
 from trihedron.plugins.numerics.maps.local_window import observed_by
 from trihedron.plugins.numerics.places.binary_words import as_bits, nearest_words, similarities, train
 from trihedron.plugins.numerics.places.loop_closing import LoopClosing

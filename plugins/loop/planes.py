@@ -7,8 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from trihedron.pipeline.registry import register
-from trihedron.pipeline.types import Map
+from trihedron.pipeline.core.registry import register
+from trihedron.pipeline.core.types import Map
 from trihedron.plugins.numerics.maps.local_window import observed_by
 from trihedron.plugins.numerics.places.loop_closing import LoopClosing
 from trihedron.plugins.numerics.places.loop_hypotheses import shift_of_planes

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from trihedron.pipeline.registry import register
-from trihedron.pipeline.types import Correction, Frame, Map
+from trihedron.pipeline.core.registry import register
+from trihedron.pipeline.core.types import Correction, Frame, Map
 from trihedron.plugins.numerics.maps.local_window import current_submap, keyframes_of
 from trihedron.plugins.numerics.places.loop_correction import moved_keyframes
 from trihedron.plugins.numerics.places.pose_graph import solve_pose_graph

@@ -7,8 +7,8 @@ from functools import cached_property
 
 import numpy as np
 
-from trihedron.pipeline.registry import register
-from trihedron.pipeline.types import F64, I32, ManhattanFrame, Normals, Planes, Segments
+from trihedron.pipeline.core.registry import register
+from trihedron.pipeline.core.types import F64, I32, ManhattanFrame, Normals, Planes, Segments
 from trihedron.plugins.numerics.axes.atlanta_fit import fit_shared_vertical, shared_covariance, shared_vertical
 from trihedron.plugins.numerics.axes.atlanta_modes import NONE, AtlantaFinder, AtlantaModes
 from trihedron.plugins.numerics.axes.axis_fit import NOTHING_KNOWN, AxisFit, gather_directions, variance_scale

@@ -7,8 +7,8 @@ from functools import cached_property
 
 import numpy as np
 
-from trihedron.pipeline.registry import register
-from trihedron.pipeline.types import F64, ManhattanFrame, Normals, Planes, Segments
+from trihedron.pipeline.core.registry import register
+from trihedron.pipeline.core.types import F64, ManhattanFrame, Normals, Planes, Segments
 from trihedron.plugins.numerics.axes.cube_symmetry import nearest_equivalent
 from trihedron.plugins.numerics.axes.manhattan_modes import Directions
 from trihedron.plugins.numerics.axes.mode_options import ModeOptions

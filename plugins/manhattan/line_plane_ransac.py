@@ -8,8 +8,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from trihedron.pipeline.registry import register
-from trihedron.pipeline.types import F64, Bool, ManhattanFrame, Normals, Planes, Segments
+from trihedron.pipeline.core.registry import register
+from trihedron.pipeline.core.types import F64, Bool, ManhattanFrame, Normals, Planes, Segments
 from trihedron.plugins.numerics.axes.axis_fit import AxisFit, gather_directions
 from trihedron.plugins.numerics.axes.minimal_frames import best_frame, frames_through
 from trihedron.plugins.numerics.axes.procrustes import inliers_and_spread, procrustes, square_angles

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from trihedron.pipeline.registry import register
-from trihedron.pipeline.types import F64, ManhattanFrame, Normals, Planes, Segments
+from trihedron.pipeline.core.registry import register
+from trihedron.pipeline.core.types import F64, ManhattanFrame, Normals, Planes, Segments
 from trihedron.plugins.numerics.axes.axis_fit import HALF_SPHERE
 from trihedron.plugins.numerics.axes.cube_symmetry import nearest_equivalent
 from trihedron.plugins.numerics.axes.manhattan_modes import Directions, Modes

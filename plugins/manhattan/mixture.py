@@ -7,8 +7,8 @@ from functools import cached_property
 
 import numpy as np
 
-from trihedron.pipeline.registry import register
-from trihedron.pipeline.types import F64, ManhattanFrame, Normals, Planes, Segments
+from trihedron.pipeline.core.registry import register
+from trihedron.pipeline.core.types import F64, ManhattanFrame, Normals, Planes, Segments
 from trihedron.plugins.numerics.axes.axis_fit import AxisFit, gather_directions
 from trihedron.plugins.numerics.axes.cube_symmetry import nearest_equivalent
 from trihedron.plugins.numerics.axes.frame_identities import identified, missing, remembered, turn_between

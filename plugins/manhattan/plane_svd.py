@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from trihedron.pipeline.registry import register
-from trihedron.pipeline.types import F64, I32, ManhattanFrame, Planes
+from trihedron.pipeline.core.registry import register
+from trihedron.pipeline.core.types import F64, I32, ManhattanFrame, Planes
 from trihedron.plugins.numerics.axes.axis_fit import NOTHING_KNOWN, variance_scale
 from trihedron.plugins.numerics.axes.plane_axes import Walls, area_on_axes, known_walls, perpendicular_pair, settled
 from trihedron.plugins.numerics.axes.procrustes import inliers_and_spread, procrustes, procrustes_covariance, square_angles

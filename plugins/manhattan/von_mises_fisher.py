@@ -7,8 +7,8 @@ from functools import cached_property
 
 import numpy as np
 
-from trihedron.pipeline.registry import register
-from trihedron.pipeline.types import F64, ManhattanFrame, Normals, Segments
+from trihedron.pipeline.core.registry import register
+from trihedron.pipeline.core.types import F64, ManhattanFrame, Normals, Segments
 from trihedron.plugins.numerics.axes.axis_fit import HALF_SPHERE, NOTHING_KNOWN, gather_directions
 from trihedron.plugins.numerics.axes.cube_symmetry import nearest_equivalent
 from trihedron.plugins.numerics.axes.direction_information import isotropic_information

@@ -7,9 +7,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from trihedron.pipeline.geometry import invert
-from trihedron.pipeline.registry import register
-from trihedron.pipeline.types import DEGRADED, F32, I32, LOST, Correction, Frame, Keypoints, Map, Matches, Planes, Pose, Segments
+from trihedron.pipeline.core.geometry import invert
+from trihedron.pipeline.core.registry import register
+from trihedron.pipeline.core.types import DEGRADED, F32, I32, LOST, Correction, Frame, Keypoints, Map, Matches, Planes, Pose, Segments
 from trihedron.plugins.numerics.maps import insertion
 from trihedron.plugins.numerics.maps.anchoring import anchored
 from trihedron.plugins.numerics.maps.association import Associated, associate, existing

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from trihedron.pipeline.registry import register
-from trihedron.pipeline.types import Frame, Map, Pose
+from trihedron.pipeline.core.registry import register
+from trihedron.pipeline.core.types import Frame, Map, Pose
 
 
 @register("map", "none")

@@ -6,9 +6,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from trihedron.pipeline.geometry import invert, transform
-from trihedron.pipeline.registry import register
-from trihedron.pipeline.types import I32, Frame, Keypoints, Map, Matches, Rotation
+from trihedron.pipeline.core.geometry import invert, transform
+from trihedron.pipeline.core.registry import register
+from trihedron.pipeline.core.types import I32, Frame, Keypoints, Map, Matches, Rotation
 from trihedron.plugins.numerics.images.mutual_matches import mutual_matches
 from trihedron.plugins.numerics.maps.local_window import current_submap, keyframes_of, observed_by
 from trihedron.plugins.numerics.motion.rigid_consensus import consensus

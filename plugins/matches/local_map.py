@@ -6,9 +6,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from trihedron.pipeline.geometry import pose_matrix
-from trihedron.pipeline.registry import register
-from trihedron.pipeline.types import F64, OK, Frame, Keypoints, Map, Matches, Planes, Pose, Rotation, Segments, Translation
+from trihedron.pipeline.core.geometry import pose_matrix
+from trihedron.pipeline.core.registry import register
+from trihedron.pipeline.core.types import F64, OK, Frame, Keypoints, Map, Matches, Planes, Pose, Rotation, Segments, Translation
 from trihedron.plugins.numerics.maps.local_window import living_keyframes, local_window
 from trihedron.plugins.numerics.maps.map_search import Guess, MapSearch
 from trihedron.plugins.numerics.places.place_check import ABOUT_DEG, ABOUT_M

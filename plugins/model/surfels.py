@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from trihedron.pipeline.registry import register
-from trihedron.pipeline.types import LOST, Frame, Pose, PredictedView, Table
+from trihedron.pipeline.core.registry import register
+from trihedron.pipeline.core.types import LOST, Frame, Pose, PredictedView, Table
 from trihedron.plugins.numerics.depth.reduction import depth_normals, smoothed
 from trihedron.plugins.numerics.surfaces.model_sight import sight_of
 from trihedron.plugins.numerics.surfaces.surfel_model import SURFELS, Images, fused, shown

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 import cv2
 
-from trihedron.pipeline.registry import register
-from trihedron.pipeline.types import Frame, Normals
+from trihedron.pipeline.core.registry import register
+from trihedron.pipeline.core.types import Frame, Normals
 from trihedron.plugins.numerics.depth.cloud_normals import CloudNormals
 
 

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from trihedron.pipeline.registry import register
-from trihedron.pipeline.types import Frame, Normals
+from trihedron.pipeline.core.registry import register
+from trihedron.pipeline.core.types import Frame, Normals
 from trihedron.plugins.numerics.depth.patch_normals import patch_normals, patch_radii
 
 

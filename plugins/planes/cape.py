@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from trihedron.pipeline.registry import register
-from trihedron.pipeline.types import Frame, Normals, Planes
+from trihedron.pipeline.core.registry import register
+from trihedron.pipeline.core.types import Frame, Normals, Planes
 from trihedron.plugins.numerics.planes.block_growing import grow_blocks
 from trihedron.plugins.numerics.planes.planar_regions import PlanarRegions
 from trihedron.plugins.numerics.planes.plane_blocks import block_planes, block_sums, blocks_to_cells

@@ -5,8 +5,8 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-from trihedron.pipeline.registry import register
-from trihedron.pipeline.types import Frame, Normals, Planes
+from trihedron.pipeline.core.registry import register
+from trihedron.pipeline.core.types import Frame, Normals, Planes
 from trihedron.plugins.numerics.planes.planar_components import planar_components
 from trihedron.plugins.numerics.planes.planar_regions import EDGE, EDGE_M, PlanarRegions
 from trihedron.plugins.numerics.planes.plane_fitting import MOST

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from trihedron.pipeline.registry import register
-from trihedron.pipeline.types import Frame, Normals, Planes
+from trihedron.pipeline.core.registry import register
+from trihedron.pipeline.core.types import Frame, Normals, Planes
 from trihedron.plugins.numerics.depth.organised_grid import coarser
 from trihedron.plugins.numerics.planes.planar_regions import EDGE, EDGE_M, PlanarRegions
 from trihedron.plugins.numerics.planes.plane_consensus import consensus_planes

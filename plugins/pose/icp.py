@@ -6,9 +6,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from trihedron.pipeline.geometry import invert, pose_matrix
-from trihedron.pipeline.registry import register
-from trihedron.pipeline.types import F64, Frame, Pose, PredictedView
+from trihedron.pipeline.core.geometry import invert, pose_matrix
+from trihedron.pipeline.core.registry import register
+from trihedron.pipeline.core.types import F64, Frame, Pose, PredictedView
 from trihedron.plugins.numerics.depth.reduction import Level, brightness, depth_normals, halvings, lens_of, pyramid, smoothed
 from trihedron.plugins.numerics.maps.dense_pose import dense_pose, first_pose
 from trihedron.plugins.numerics.motion.dense_alignment import Gates, align, huber_weights

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from trihedron.pipeline.registry import register
-from trihedron.pipeline.types import Frame, Map, Pose, Rotation, Translation
+from trihedron.pipeline.core.registry import register
+from trihedron.pipeline.core.types import Frame, Map, Pose, Rotation, Translation
 from trihedron.plugins.numerics.maps.anchoring import anchored
 from trihedron.plugins.numerics.maps.decoupled import decoupled_pose
 

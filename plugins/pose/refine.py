@@ -7,8 +7,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from trihedron.pipeline.registry import register
-from trihedron.pipeline.types import (
+from trihedron.pipeline.core.registry import register
+from trihedron.pipeline.core.types import (
     DEGRADED,
     F64,
     LOST,

@@ -6,8 +6,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from trihedron.pipeline.registry import register
-from trihedron.pipeline.types import DEGRADED, F64, I32, LOST, OK, Frame, Keypoints, Map, Planes, Pose, Rotation, Segments
+from trihedron.pipeline.core.registry import register
+from trihedron.pipeline.core.types import DEGRADED, F64, I32, LOST, OK, Frame, Keypoints, Map, Planes, Pose, Rotation, Segments
 from trihedron.plugins.numerics.maps.decoupled import reference_of
 from trihedron.plugins.numerics.maps.local_window import keyframes_of, living_keyframes, observed_by
 from trihedron.plugins.numerics.maps.submaps import submap_of

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from trihedron.pipeline.registry import register
-from trihedron.pipeline.types import Keypoints, Map, Pose, Rotation, Tracks
+from trihedron.pipeline.core.registry import register
+from trihedron.pipeline.core.types import Keypoints, Map, Pose, Rotation, Tracks
 from trihedron.plugins.numerics.axes.manhattan_frames import KnownFrames
 from trihedron.plugins.numerics.maps.anchoring import anchored_before
 from trihedron.plugins.numerics.motion.chained_rotation import Estimate, rotation_before, rotation_value

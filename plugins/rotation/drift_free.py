@@ -7,9 +7,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from trihedron.pipeline.geometry import exp_so3, log_so3
-from trihedron.pipeline.registry import register
-from trihedron.pipeline.types import F64, Keypoints, ManhattanFrame, Map, Planes, Pose, Rotation, Segments, Tracks
+from trihedron.pipeline.core.geometry import exp_so3, log_so3
+from trihedron.pipeline.core.registry import register
+from trihedron.pipeline.core.types import F64, Keypoints, ManhattanFrame, Map, Planes, Pose, Rotation, Segments, Tracks
 from trihedron.plugins.numerics.algebra.small_linear import inverse_positive, solve_positive
 from trihedron.plugins.numerics.axes.manhattan_frames import KnownFrames, Sighting
 from trihedron.plugins.numerics.maps.anchoring import anchored_before

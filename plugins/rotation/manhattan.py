@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from trihedron.pipeline.registry import register
-from trihedron.pipeline.types import F64, Keypoints, ManhattanFrame, Rotation
+from trihedron.pipeline.core.registry import register
+from trihedron.pipeline.core.types import F64, Keypoints, ManhattanFrame, Rotation
 from trihedron.plugins.numerics.axes.cube_symmetry import nearest_equivalent
 from trihedron.plugins.numerics.axes.manhattan_frames import KnownFrames
 from trihedron.plugins.numerics.motion.chained_rotation import Estimate, rotation_value

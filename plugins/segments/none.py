@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from trihedron.pipeline.registry import register
-from trihedron.pipeline.types import LineSegments, Segments
+from trihedron.pipeline.core.registry import register
+from trihedron.pipeline.core.types import LineSegments, Segments
 
 
 @register("segments", "none")

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from trihedron.pipeline.registry import register
-from trihedron.pipeline.types import Frame, LineSegments, Segments
+from trihedron.pipeline.core.registry import register
+from trihedron.pipeline.core.types import Frame, LineSegments, Segments
 from trihedron.plugins.numerics.depth.depth_sampling import noise_coefficients
 from trihedron.plugins.numerics.depth.segment_lifting import lift_segments
 

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from trihedron.pipeline.registry import register
-from trihedron.pipeline.types import Map, Pose, Surface
+from trihedron.pipeline.core.registry import register
+from trihedron.pipeline.core.types import Map, Pose, Surface
 
 
 @register("surface", "none")

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from trihedron.pipeline.registry import register
-from trihedron.pipeline.types import Map, Surface
+from trihedron.pipeline.core.registry import register
+from trihedron.pipeline.core.types import Map, Surface
 from trihedron.plugins.numerics.surfaces.assembly import pictured
 from trihedron.plugins.numerics.surfaces.greedy_triangulation import greedy_triangles
 from trihedron.plugins.numerics.surfaces.planar_parts import map_planes, numbered

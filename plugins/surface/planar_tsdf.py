@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from trihedron.pipeline.registry import register
-from trihedron.pipeline.types import Map, Surface
+from trihedron.pipeline.core.registry import register
+from trihedron.pipeline.core.types import Map, Surface
 from trihedron.plugins.numerics.surfaces.planar_fold import PlanarFold
 from trihedron.plugins.numerics.surfaces.view_fold import Gathered
 

@@ -6,8 +6,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from trihedron.pipeline.registry import register
-from trihedron.pipeline.types import Map, Surface
+from trihedron.pipeline.core.registry import register
+from trihedron.pipeline.core.types import Map, Surface
 from trihedron.plugins.numerics.surfaces.assembly import coloured
 from trihedron.plugins.numerics.surfaces.superpixels import discs, fused, moved, superpixels
 from trihedron.plugins.numerics.surfaces.view_fold import Gathered, ViewFold

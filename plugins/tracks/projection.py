@@ -6,9 +6,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from trihedron.pipeline.geometry import exp_so3, log_so3, rotation_angle_deg
-from trihedron.pipeline.registry import register
-from trihedron.pipeline.types import F64, Frame, Keypoints, ManhattanFrame, Planes, Segments, Tracks
+from trihedron.pipeline.core.geometry import exp_so3, log_so3, rotation_angle_deg
+from trihedron.pipeline.core.registry import register
+from trihedron.pipeline.core.types import F64, Frame, Keypoints, ManhattanFrame, Planes, Segments, Tracks
 from trihedron.plugins.numerics.images.descriptors import compared_by
 from trihedron.plugins.numerics.motion.relative_motion import Motion, solve_motion
 from trihedron.plugins.numerics.motion.track_pairs import NO_PAIRS, Features, tracks_value

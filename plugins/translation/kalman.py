@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from trihedron.pipeline.registry import register
-from trihedron.pipeline.types import F64, Frame, Keypoints, Planes, Pose, Rotation, Tracks, Translation
+from trihedron.pipeline.core.registry import register
+from trihedron.pipeline.core.types import F64, Frame, Keypoints, Planes, Pose, Rotation, Tracks, Translation
 from trihedron.plugins.numerics.motion.derotated_points import point_rows, solve_step
 from trihedron.plugins.numerics.motion.offset_filter import OffsetFilter, Sight, axis_sights, first_filter
 

@@ -6,9 +6,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from trihedron.pipeline.geometry import pose_matrix
-from trihedron.pipeline.registry import register
-from trihedron.pipeline.types import F64, Frame, Keypoints, Map, Planes, Pose, Rotation, Segments, Tracks, Translation
+from trihedron.pipeline.core.geometry import pose_matrix
+from trihedron.pipeline.core.registry import register
+from trihedron.pipeline.core.types import F64, Frame, Keypoints, Map, Planes, Pose, Rotation, Segments, Tracks, Translation
 from trihedron.plugins.numerics.algebra.constant_arrays import constant
 from trihedron.plugins.numerics.depth.depth_sampling import noise_coefficients
 from trihedron.plugins.numerics.maps.anchoring import anchored

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from trihedron.pipeline.registry import register
-from trihedron.pipeline.types import F64, Bool, Frame, Keypoints, Map, Pose, Rotation, Tracks, Translation
+from trihedron.pipeline.core.registry import register
+from trihedron.pipeline.core.types import F64, Bool, Frame, Keypoints, Map, Pose, Rotation, Tracks, Translation
 from trihedron.plugins.numerics.maps.anchoring import anchored
 from trihedron.plugins.numerics.motion.positions import handed_on, origin, unmeasured
 from trihedron.plugins.numerics.motion.tracked_places import tracked_places

@@ -9,8 +9,8 @@ import cv2
 import numpy as np
 import pytest
 
-from trihedron.pipeline.geometry import invert, transform
-from trihedron.pipeline.types import F64, Frame
+from trihedron.pipeline.core.geometry import invert, transform
+from trihedron.pipeline.core.types import F64, Frame
 
 WIDTH, HEIGHT = 32, 24
 CAMERA = f"width: {WIDTH}\nheight: {HEIGHT}\nfx: 30.0\nfy: 30.0\ncx: 15.5\ncy: 11.5\ndepth_scale: 1000\n"

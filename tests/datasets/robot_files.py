@@ -15,7 +15,7 @@ from rosbags.rosbag2 import Writer as BagWriter
 from rosbags.rosbag2.enums import CompressionFormat, CompressionMode
 from rosbags.typesys import Stores, get_typestore
 
-from trihedron.pipeline.geometry import quaternion_from_rotation
+from trihedron.pipeline.core.geometry import quaternion_from_rotation
 
 STORE = get_typestore(Stores.ROS2_HUMBLE)
 SECOND = 1_000_000_000

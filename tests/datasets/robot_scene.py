@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from trihedron.datasets.mcap import McapDataset
+from trihedron.datasets.readers.mcap import McapDataset
 
 sys.path.insert(0, str(Path(__file__).parent))
 from robot_files import COLOR, SECOND, Message, Wall, camera_info, image

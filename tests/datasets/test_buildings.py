@@ -9,14 +9,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from trihedron.datasets.buildings import Building
-from trihedron.datasets.raytracing import geometry_of
-from trihedron.datasets.room import all_faces
-from trihedron.datasets.shading import render
-from trihedron.datasets.synthetic import BUILDINGS, Scene, Synthetic
-from trihedron.datasets.textures import bake
-from trihedron.pipeline.geometry import rotation_angle_deg
-from trihedron.pipeline.types import Camera
+from trihedron.datasets.simulation.buildings import Building
+from trihedron.datasets.simulation.raytracing import geometry_of
+from trihedron.datasets.simulation.room import all_faces
+from trihedron.datasets.simulation.shading import render
+from trihedron.datasets.simulation.synthetic import BUILDINGS, Scene, Synthetic
+from trihedron.datasets.simulation.textures import bake
+from trihedron.pipeline.core.geometry import rotation_angle_deg
+from trihedron.pipeline.core.types import Camera
 
 sys.path.insert(0, str(Path(__file__).parent))
 from test_synthetic_room import first_hit

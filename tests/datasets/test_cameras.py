@@ -6,9 +6,9 @@ from pathlib import Path
 
 import pytest
 
-from trihedron.datasets.cameras import PRESETS, choose_calibration, read_camera_file
-from trihedron.pipeline.errors import DataError
-from trihedron.pipeline.types import EXACT_DEPTH, DepthNoise
+from trihedron.datasets.readers.cameras import PRESETS, choose_calibration, read_camera_file
+from trihedron.pipeline.core.errors import DataError
+from trihedron.pipeline.core.types import EXACT_DEPTH, DepthNoise
 
 GOOD = "width: 640\nheight: 480\nfx: 500\nfy: 501.5\ncx: 320\ncy: 240\ndepth_scale: 1000\n"
 KEYS = "give width height fx fy cx cy depth_scale"

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from trihedron.datasets.faults import Covered, Faults
-from trihedron.datasets.motion import Motion
-from trihedron.datasets.synthetic import Synthetic
+from trihedron.datasets.faults.faults import Covered, Faults
+from trihedron.datasets.simulation.motion import Motion
+from trihedron.datasets.simulation.synthetic import Synthetic
 
 SMALL = {"width": 64, "height": 48, "motion": "pan"}
 

@@ -14,7 +14,7 @@ from foxglove_schemas_protobuf.FrameTransform_pb2 import FrameTransform
 from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
 from google.protobuf.timestamp_pb2 import Timestamp
 
-from trihedron.datasets.mcap import McapDataset
+from trihedron.datasets.readers.mcap import McapDataset
 
 sys.path.insert(0, str(Path(__file__).parent))
 from foxglove_files import write_json, write_protobuf

@@ -7,10 +7,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from trihedron.datasets.lists import associate
-from trihedron.datasets.trajectories import format_stamp, parse_stamp_ns, read_trajectory, write_trajectory
-from trihedron.pipeline.geometry import exp_se3
-from trihedron.pipeline.types import Trajectory
+from trihedron.datasets.readers.association import associate
+from trihedron.pipeline.core.geometry import exp_se3
+from trihedron.pipeline.core.types import Trajectory
+from trihedron.pipeline.record.trajectories import format_stamp, parse_stamp_ns, read_trajectory, write_trajectory
 
 
 def greedy(first: np.ndarray, second: np.ndarray, limit: int) -> list[list[int]]:

@@ -12,8 +12,8 @@ import cv2
 import numpy as np
 import pytest
 
-from trihedron.datasets.images import decode_image
-from trihedron.datasets.picture_headers import UnreadableImage, picture_header
+from trihedron.datasets.readers.images import decode_image
+from trihedron.datasets.readers.picture_headers import UnreadableImage, picture_header
 
 COLOR = np.random.default_rng(0).integers(0, 255, (12, 16, 3), dtype=np.uint8)
 DEPTH = np.random.default_rng(1).integers(0, 65535, (12, 16), dtype=np.uint16)
@@ -119,7 +119,7 @@ def test_a_small_file_of_many_pixels_is_refused_in_little_memory() -> None:
     """A PNG may well pack a thousand pixels into a byte: 20 000 × 20 000 of them, whole and true, in 50 kB."""
     code = """
 import resource, struct, sys, zlib
-from trihedron.datasets.images import decode_image
+from trihedron.datasets.readers.images import decode_image
 def chunk(name, data):
     return struct.pack(">I", len(data)) + name + data + struct.pack(">I", zlib.crc32(name + data))
 pack = zlib.compressobj(9)

@@ -7,8 +7,8 @@ import cv2
 import numpy as np
 import pytest
 
-from trihedron.datasets.images import UnreadableImage, decode_image
-from trihedron.datasets.png_decoder import decode_png
+from trihedron.datasets.readers.images import UnreadableImage, decode_image
+from trihedron.datasets.readers.png_decoder import decode_png
 
 FILTERS = {"none": 0, "left": 1, "above": 2, "mean": 3, "Paeth": 4}
 

@@ -9,15 +9,15 @@ import cv2
 import numpy as np
 import pytest
 
-from trihedron.datasets.replica import Replica
-from trihedron.datasets.scannet import ScanNet
-from trihedron.datasets.seven_scenes import SevenScenes
-from trihedron.datasets.synthetic import Synthetic
-from trihedron.datasets.tamu import Tamu
-from trihedron.pipeline.cli import main
-from trihedron.pipeline.errors import DataError
-from trihedron.pipeline.geometry import exp_se3
-from trihedron.pipeline.types import EXACT_DEPTH, F64, DepthNoise
+from trihedron.datasets.readers.replica import Replica
+from trihedron.datasets.readers.scannet import ScanNet
+from trihedron.datasets.readers.seven_scenes import SevenScenes
+from trihedron.datasets.readers.tamu import Tamu
+from trihedron.datasets.simulation.synthetic import Synthetic
+from trihedron.pipeline.app.cli import main
+from trihedron.pipeline.core.errors import DataError
+from trihedron.pipeline.core.geometry import exp_se3
+from trihedron.pipeline.core.types import EXACT_DEPTH, F64, DepthNoise
 from trihedron.tools.convert import layout_of
 
 POSES = [exp_se3(np.array([0.1 * k, 0.2, -0.1, 0.0, 0.3 * k, 0.05])) for k in range(4)]

@@ -10,10 +10,10 @@ import cv2
 import numpy as np
 import pytest
 
-from trihedron.datasets.folder import Folder
-from trihedron.datasets.icl_nuim import IclNuim
-from trihedron.datasets.tum import Tum
-from trihedron.pipeline.errors import DataError
+from trihedron.datasets.readers.folder import Folder
+from trihedron.datasets.readers.icl_nuim import IclNuim
+from trihedron.datasets.readers.tum import Tum
+from trihedron.pipeline.core.errors import DataError
 
 Change = Callable[[Path], Any]
 

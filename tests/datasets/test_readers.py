@@ -10,11 +10,11 @@ import cv2
 import numpy as np
 import pytest
 
-from trihedron.datasets.folder import Folder
-from trihedron.datasets.icl_nuim import IclNuim, reflect
-from trihedron.datasets.tum import Tum
-from trihedron.pipeline.geometry import exp_se3
-from trihedron.pipeline.types import EXACT_DEPTH, DepthNoise
+from trihedron.datasets.readers.folder import Folder
+from trihedron.datasets.readers.icl_nuim import IclNuim, reflect
+from trihedron.datasets.readers.tum import Tum
+from trihedron.pipeline.core.geometry import exp_se3
+from trihedron.pipeline.core.types import EXACT_DEPTH, DepthNoise
 
 
 def test_tum_pairs_by_time_and_keeps_the_stamp_of_colour(tum_folder: Path) -> None:
@@ -149,8 +149,8 @@ def made_up_icl() -> tuple[np.ndarray, list[np.ndarray]]:
 
 def write_tum_compatible(folder: Path, poses: np.ndarray, depths: list[np.ndarray]) -> None:
     """Images 0, 1, 2 of which 1 and 2 have a pose, as published: y up, keyed by number."""
-    from trihedron.datasets.trajectories import write_trajectory
-    from trihedron.pipeline.types import Trajectory
+    from trihedron.pipeline.core.types import Trajectory
+    from trihedron.pipeline.record.trajectories import write_trajectory
 
     for number, depth in enumerate([depths[0], *depths]):
         for name, image in (("rgb", np.zeros((48, 64, 3), dtype=np.uint8)), ("depth", np.rint(depth * 5000).astype(np.uint16))):

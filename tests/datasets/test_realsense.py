@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from trihedron.datasets.realsense import RealSense
-from trihedron.pipeline.errors import DataError
-from trihedron.pipeline.live import is_camera
+from trihedron.datasets.readers.realsense import RealSense
+from trihedron.pipeline.core.errors import DataError
+from trihedron.pipeline.run.live import is_camera
 
 SPACE_S = 0.01
 

@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 from mcap.writer import CompressionType, IndexType
 
-from trihedron.datasets.mcap import McapDataset
-from trihedron.pipeline.errors import DataError, RecordingError
-from trihedron.pipeline.geometry import exp_se3, invert
+from trihedron.datasets.readers.mcap import McapDataset
+from trihedron.pipeline.core.errors import DataError, RecordingError
+from trihedron.pipeline.core.geometry import exp_se3, invert
 
 sys.path.insert(0, str(Path(__file__).parent))
 from robot_files import COLOR, camera_info, compressed, encoded, header, image, make, message, pose, transforms, write_bag, write_file

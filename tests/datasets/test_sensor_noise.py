@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from trihedron.datasets.motion import camera_pose
-from trihedron.datasets.noise import IMAGE_SIGMA, kinect_depth, noisy_color
-from trihedron.datasets.shading import render
-from trihedron.datasets.synthetic import Synthetic
-from trihedron.pipeline.types import DepthNoise
+from trihedron.datasets.simulation.depth_noise import IMAGE_SIGMA, kinect_depth, noisy_color
+from trihedron.datasets.simulation.motion import camera_pose
+from trihedron.datasets.simulation.shading import render
+from trihedron.datasets.simulation.synthetic import Synthetic
+from trihedron.pipeline.core.types import DepthNoise
 
 NOISE = DepthNoise()
 

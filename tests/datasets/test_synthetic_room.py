@@ -11,15 +11,15 @@ import cv2
 import numpy as np
 import pytest
 
-from trihedron.datasets.motion import Motion, camera_pose
-from trihedron.datasets.raytracing import geometry_of
-from trihedron.datasets.room import CYLINDER, SPHERE, Face, Room, Solid, all_faces, furnished_room
-from trihedron.datasets.shading import render
-from trihedron.datasets.synthetic import Scene, Synthetic
-from trihedron.datasets.textures import bake
-from trihedron.pipeline.errors import DataError
-from trihedron.pipeline.geometry import rotation_angle_deg, transform
-from trihedron.pipeline.types import EXACT_DEPTH, Camera, DepthNoise
+from trihedron.datasets.simulation.motion import Motion, camera_pose
+from trihedron.datasets.simulation.raytracing import geometry_of
+from trihedron.datasets.simulation.room import CYLINDER, SPHERE, Face, Room, Solid, all_faces, furnished_room
+from trihedron.datasets.simulation.shading import render
+from trihedron.datasets.simulation.synthetic import Scene, Synthetic
+from trihedron.datasets.simulation.textures import bake
+from trihedron.pipeline.core.errors import DataError
+from trihedron.pipeline.core.geometry import rotation_angle_deg, transform
+from trihedron.pipeline.core.types import EXACT_DEPTH, Camera, DepthNoise
 
 SMALL = Camera(320, 240, 262.5, 262.5, 159.5, 119.5)
 

@@ -23,13 +23,13 @@ from google.protobuf.timestamp_pb2 import Timestamp
 from mcap.reader import make_reader
 from mcap.writer import CompressionType
 
-from trihedron.datasets import foxglove_messages
-from trihedron.datasets.robot_streams import ROS
-from trihedron.datasets.trajectories import TRUTH
-from trihedron.pipeline.geometry import exp_se3, quaternion_from_rotation
-from trihedron.pipeline.ply import write_ply
-from trihedron.pipeline.recording import RecordingWriter
-from trihedron.pipeline.runner import Runner
+from trihedron.datasets.readers import foxglove_messages
+from trihedron.datasets.readers.robot_streams import ROS
+from trihedron.pipeline.core.geometry import exp_se3, quaternion_from_rotation
+from trihedron.pipeline.record.recording import RecordingWriter
+from trihedron.pipeline.record.trajectories import TRUTH
+from trihedron.pipeline.run.ply import write_ply
+from trihedron.pipeline.run.runner import Runner
 from trihedron.plugins.numerics.maps.landmarks import empty_map
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "datasets"))

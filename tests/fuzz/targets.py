@@ -8,24 +8,24 @@ from typing import Any
 
 import numpy as np
 
-from trihedron.datasets import foxglove_messages
-from trihedron.datasets.cameras import read_camera_file
-from trihedron.datasets.icl_nuim import IclNuim
-from trihedron.datasets.images import decode_image, read_color, read_depth
-from trihedron.datasets.lists import read_file_list
-from trihedron.datasets.matrices import read_matrix, trajectory_of
-from trihedron.datasets.mcap import McapDataset
-from trihedron.datasets.picture_headers import UnreadableImage
-from trihedron.datasets.pixels import color_of, depth_of, kind_of
-from trihedron.datasets.replica import read_parameters
-from trihedron.datasets.robot_streams import ROS
-from trihedron.datasets.robot_values import Picture, UnreadableMessage
-from trihedron.datasets.trajectories import read_trajectory
-from trihedron.pipeline.codec import Decoder
-from trihedron.pipeline.errors import TrihedronError
-from trihedron.pipeline.mcap_file import McapFile
-from trihedron.pipeline.recording import METADATA, Recording
-from trihedron.pipeline.state import load_map
+from trihedron.datasets.readers import foxglove_messages
+from trihedron.datasets.readers.association import read_file_list
+from trihedron.datasets.readers.cameras import read_camera_file
+from trihedron.datasets.readers.icl_nuim import IclNuim
+from trihedron.datasets.readers.images import decode_image, read_color, read_depth
+from trihedron.datasets.readers.matrices import read_matrix, trajectory_of
+from trihedron.datasets.readers.mcap import McapDataset
+from trihedron.datasets.readers.picture_headers import UnreadableImage
+from trihedron.datasets.readers.pixels import color_of, depth_of, kind_of
+from trihedron.datasets.readers.replica import read_parameters
+from trihedron.datasets.readers.robot_streams import ROS
+from trihedron.datasets.readers.robot_values import Picture, UnreadableMessage
+from trihedron.pipeline.core.errors import TrihedronError
+from trihedron.pipeline.record.codec import Decoder
+from trihedron.pipeline.record.mcap_file import McapFile
+from trihedron.pipeline.record.recording import METADATA, Recording
+from trihedron.pipeline.record.trajectories import read_trajectory
+from trihedron.pipeline.run.state import load_map
 from trihedron.tools.mesh_files import read_mesh
 from trihedron.tools.recover import recover
 

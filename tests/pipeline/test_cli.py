@@ -13,10 +13,10 @@ import cv2
 import numpy as np
 import pytest
 
-from trihedron.datasets.synthetic import Synthetic
-from trihedron.datasets.trajectories import read_trajectory
-from trihedron.pipeline.cli import main
-from trihedron.pipeline.recording import Recording
+from trihedron.datasets.simulation.synthetic import Synthetic
+from trihedron.pipeline.app.cli import main
+from trihedron.pipeline.record.recording import Recording
+from trihedron.pipeline.record.trajectories import read_trajectory
 from trihedron.tools.benchmark import PROGRAM
 
 SMALL = ["dataset=synthetic", "dataset.width=160", "dataset.height=120", "dataset.length=12"]
@@ -105,7 +105,7 @@ def test_unknown_command_and_help(capsys):
 
 def test_a_command_that_cannot_be_loaded_does_not_take_the_help_with_it(capsys, monkeypatch):
     broken = EntryPoint("weave", "no_such_package.weave:main", "trihedron.commands")
-    monkeypatch.setattr("trihedron.pipeline.cli.entry_points", lambda group: [broken])
+    monkeypatch.setattr("trihedron.pipeline.app.cli.entry_points", lambda group: [broken])
     assert main(["--help"]) == 0
     assert "  weave        cannot be loaded: No module named 'no_such_package'" in capsys.readouterr().out
 
@@ -134,9 +134,9 @@ def test_a_run_folder_is_complete(capsys, tmp_path):
 
 def test_a_long_preparation_is_explained(capsys, tmp_path, monkeypatch):
     words = ["run", *SMALL, "dataset.frames=0:4", "outputs=[keypoints]"]
-    monkeypatch.setattr("trihedron.pipeline.preparation.SILENT_SECONDS", 60.0)
+    monkeypatch.setattr("trihedron.pipeline.run.warm_up.SILENT_SECONDS", 60.0)
     assert main([*words, f"out={tmp_path / 'quick'}"]) == 0 and "preparing" not in capsys.readouterr().err
-    monkeypatch.setattr("trihedron.pipeline.preparation.SILENT_SECONDS", 0.0)
+    monkeypatch.setattr("trihedron.pipeline.run.warm_up.SILENT_SECONDS", 0.0)
     assert main([*words, f"out={tmp_path / 'long'}"]) == 0 and "compiled for this machine, once" in capsys.readouterr().err
 
 
@@ -188,7 +188,7 @@ def test_a_sweep_goes_on_after_a_job_that_fails(capsys, tmp_path):
 def test_an_interrupt_leaves_a_recording_and_a_trajectory(tmp_path):
     words = ["run", "dataset=synthetic", "dataset.length=2000", "dataset.width=160", "dataset.height=120", "out=cut"]
     listen = "import signal; signal.signal(signal.SIGINT, signal.default_int_handler)"  # a shell's background jobs are born deaf to it
-    code = f"{listen}; import sys; from trihedron.pipeline.cli import main; sys.exit(main({words!r}))"
+    code = f"{listen}; import sys; from trihedron.pipeline.app.cli import main; sys.exit(main({words!r}))"
     process = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
     recording = tmp_path / "cut" / "run.mcap"
     for _ in range(600):

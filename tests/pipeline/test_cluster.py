@@ -16,7 +16,7 @@ from pathlib import Path
 import pytest
 import yaml
 
-from trihedron.pipeline.cli import main
+from trihedron.pipeline.app.cli import main
 
 SLURM = """
 ClusterName=here
@@ -111,7 +111,7 @@ def test_a_job_whose_process_dies_is_waited_for_by_no_other_and_stops_none(engin
     pytest.importorskip("submitit", reason="needs trihedron[cluster]")
     monkeypatch.chdir(tmp_path)
     if engine == "dask":
-        program, cause = "trihedron.pipeline.cluster", "the job's process ended with -9"
+        program, cause = "trihedron.pipeline.sweep.cluster", "the job's process ended with -9"
         launcher = ["hydra/launcher=dask", f"hydra.launcher.address={request.getfixturevalue('scheduler')}"]
     else:
         program, cause = "submitit.core._submit", "its process died; it crashed, or memory ran out"

@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 import zstandard
 
-from trihedron.pipeline.codec import Decoder, Encoder, ValueMessage, builds_on
-from trihedron.pipeline.errors import RecordingError
-from trihedron.pipeline.table import CHUNK, Column, Table
-from trihedron.pipeline.table_codec import CHECKPOINT_EVERY, MOST_CHECKPOINTS
-from trihedron.pipeline.types import Camera, DepthNoise, Frame, Keypoints, Map, Planes, Pose, Rotation
+from trihedron.pipeline.core.errors import RecordingError
+from trihedron.pipeline.core.table import CHUNK, Column, Table
+from trihedron.pipeline.core.types import Camera, DepthNoise, Frame, Keypoints, Map, Planes, Pose, Rotation
+from trihedron.pipeline.record.codec import Decoder, Encoder, ValueMessage, builds_on
+from trihedron.pipeline.record.table_codec import CHECKPOINT_EVERY, MOST_CHECKPOINTS
 
 RNG = np.random.default_rng(0)
 

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from trihedron.pipeline.consistency import pose_consistency
-from trihedron.pipeline.geometry import exp_se3
+from trihedron.pipeline.core.geometry import exp_se3
+from trihedron.pipeline.run.consistency import pose_consistency
 
 SOMEWHERE = exp_se3(np.array([3.0, -1.0, 2.0, 0.4, -2.0, 1.0]))
 

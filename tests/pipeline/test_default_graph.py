@@ -39,7 +39,7 @@ RECORD += ["loop.every=1", "loop.away_m=0.2", "loop.shared=1000", "loop.max_thro
 RECORD += ["loop.min_score=10", "loop.min_share=0.1"]  # closes some that are none
 REPLAY = """
 import json, sys
-from trihedron.pipeline.cli import main
+from trihedron.pipeline.app.cli import main
 jobs = json.loads(sys.argv[1])
 sys.exit(max(main(["run", *job]) for job in jobs))
 """

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from trihedron.pipeline import geometry as g
+from trihedron.pipeline.core import geometry as g
 
 RNG = np.random.default_rng(0)
 ANGLES = [0.0, 1e-10, 1e-6, 1e-3, 0.5, 2.0, 3.1, np.pi - 1e-6]

@@ -4,9 +4,9 @@ from dataclasses import dataclass
 
 import pytest
 
-from trihedron.pipeline.errors import GraphError
-from trihedron.pipeline.graph import build_graph
-from trihedron.pipeline.types import Frame, Keypoints, ManhattanFrame, Normals, Planes, Pose, Rotation, Segments, Tracks
+from trihedron.pipeline.core.errors import GraphError
+from trihedron.pipeline.core.graph import build_graph
+from trihedron.pipeline.core.types import Frame, Keypoints, ManhattanFrame, Normals, Planes, Pose, Rotation, Segments, Tracks
 
 
 @dataclass(frozen=True)

@@ -14,9 +14,9 @@ import numpy as np
 import pytest
 from numba import typeof, types
 
-from trihedron.datasets.synthetic import Synthetic
-from trihedron.pipeline import kernels
-from trihedron.pipeline.kernels import LISTED, type_of, word_of
+from trihedron.datasets.simulation.synthetic import Synthetic
+from trihedron.pipeline.run import kernels
+from trihedron.pipeline.run.kernels import LISTED, type_of, word_of
 from trihedron.plugins.numerics.motion.pose_kernel import Flags
 from trihedron.tools.compile import RUNS
 
@@ -74,19 +74,19 @@ def test_what_is_called_is_what_the_interpreter_calls():
 
 def test_a_graph_uses_the_modules_that_its_plugins_take_something_from():
     used = kernels.used_by([Synthetic()])
-    assert {"trihedron.datasets.raytracing", "trihedron.pipeline.gathering", "trihedron.pipeline.row_kernels"} <= used
+    assert {"trihedron.datasets.simulation.raytracing", "trihedron.pipeline.core.gathering", "trihedron.pipeline.record.row_kernels"} <= used
     assert "trihedron.plugins.numerics.planes.plane_fitting" not in used
 
 
 def test_a_plugin_whose_module_only_another_process_knows_uses_what_can_be_seen():
     unknown = type("Sent", (), {"__module__": "nowhere.to_be_found"})()
-    assert "trihedron.datasets.raytracing" in kernels.used_by([unknown, Synthetic()])
+    assert "trihedron.datasets.simulation.raytracing" in kernels.used_by([unknown, Synthetic()])
 
 
 PROGRAM = """
 import json, sys
 import numpy as np
-from trihedron.datasets.synthetic import Synthetic
+from trihedron.datasets.simulation.synthetic import Synthetic
 from trihedron.pipeline import kernels
 from trihedron.plugins.numerics.axes.sphere_modes import orthonormal
 
@@ -107,7 +107,7 @@ import json, sys, time
 import numpy as np
 from trihedron.pipeline import kernels
 from trihedron.plugins.normals.integral_image import IntegralImage
-from trihedron.datasets.synthetic import Synthetic
+from trihedron.datasets.simulation.synthetic import Synthetic
 
 if sys.argv[1] == "ahead":
     kernels.cores = lambda: 1
@@ -166,7 +166,7 @@ def test_what_is_given_up_ends():
 @pytest.mark.slow
 def test_the_first_frame_does_not_wait_for_what_later_ones_need(tmp_path):
     environment = os.environ | {"NUMBA_CACHE_DIR": str(tmp_path / "cache")}
-    program = [sys.executable, "-c", "import sys; from trihedron.pipeline.cli import main; sys.exit(main(sys.argv[1:]))", "run"]
+    program = [sys.executable, "-c", "import sys; from trihedron.pipeline.app.cli import main; sys.exit(main(sys.argv[1:]))", "run"]
     words = ["dataset.width=160", "dataset.height=120", "outputs=[trajectory]"]
     said = []
     for number, frames in enumerate(("0:1", "0:20", "0:20")):
@@ -203,7 +203,7 @@ def test_a_run_after_compiling_ahead_compiles_nothing(tmp_path):
     environment = os.environ | {"NUMBA_CACHE_DIR": str(tmp_path / "cache")}
 
     def compiled(*words):
-        program = [sys.executable, "-c", "import sys; from trihedron.pipeline.cli import main; sys.exit(main(sys.argv[1:]))", *words]
+        program = [sys.executable, "-c", "import sys; from trihedron.pipeline.app.cli import main; sys.exit(main(sys.argv[1:]))", *words]
         subprocess.run(program, env=environment, capture_output=True, check=True, cwd=tmp_path)
         return {file: file.stat().st_mtime_ns for file in (tmp_path / "cache").rglob("*.nbi")}
 

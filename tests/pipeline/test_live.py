@@ -8,12 +8,12 @@ from pathlib import Path
 
 import pytest
 
-from trihedron.pipeline.cli import main
-from trihedron.pipeline.live import Arrival, Pace, Playback
-from trihedron.pipeline.recording import Recording, RecordingWriter
-from trihedron.pipeline.runner import Runner
-from trihedron.pipeline.runs import Replay
-from trihedron.pipeline.types import Frame, Keypoints, Map, Pose, Rotation
+from trihedron.pipeline.app.cli import main
+from trihedron.pipeline.core.types import Frame, Keypoints, Map, Pose, Rotation
+from trihedron.pipeline.record.recording import Recording, RecordingWriter
+from trihedron.pipeline.run.live import Arrival, Pace, Playback
+from trihedron.pipeline.run.replay import Replay
+from trihedron.pipeline.run.runner import Runner
 
 sys.path.insert(0, str(Path(__file__).parent))
 from toys import CAMERA, TOPICS, ToyDataset, ToyKeypoints, ToyPose, contents, toy_graph

@@ -5,11 +5,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from trihedron.datasets.trajectories import read_trajectory
-from trihedron.pipeline.errors import DataError
-from trihedron.pipeline.geometry import exp_se3, exp_so3, pose_matrix
-from trihedron.pipeline.metrics import associate, evaluate_trajectory
-from trihedron.pipeline.types import Trajectory
+from trihedron.pipeline.core.errors import DataError
+from trihedron.pipeline.core.geometry import exp_se3, exp_so3, pose_matrix
+from trihedron.pipeline.core.types import Trajectory
+from trihedron.pipeline.record.trajectories import read_trajectory
+from trihedron.pipeline.run.metrics import associate, evaluate_trajectory
 
 SHARED = Path(__file__).resolve().parents[2].parent / "shared" / "data"
 MS = 1_000_000

@@ -4,10 +4,10 @@ import cv2
 import numpy as np
 import pytest
 
-from trihedron.pipeline import plot
-from trihedron.pipeline.errors import DataError
-from trihedron.pipeline.geometry import exp_se3, exp_so3, pose_matrix
-from trihedron.pipeline.types import DEGRADED, LOST, OK, Trajectory
+from trihedron.pipeline.core.errors import DataError
+from trihedron.pipeline.core.geometry import exp_se3, exp_so3, pose_matrix
+from trihedron.pipeline.core.types import DEGRADED, LOST, OK, Trajectory
+from trihedron.pipeline.run import plot
 
 
 def circle(count: int = 90) -> Trajectory:

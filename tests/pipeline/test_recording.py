@@ -15,15 +15,15 @@ from mcap.stream_reader import StreamReader
 from mcap.writer import Writer
 from mcap_protobuf.decoder import DecoderFactory
 
-from trihedron.pipeline import chunk_writer as module
-from trihedron.pipeline.cli import main
-from trihedron.pipeline.errors import RecordingError
-from trihedron.pipeline.foxglove import View
-from trihedron.pipeline.foxglove_messages import MOST_VERTICES
-from trihedron.pipeline.geometry import exp_se3, exp_so3, rotation_from_quaternion
-from trihedron.pipeline.recording import FrameReader, Recording, RecordingWriter, TopicReader
-from trihedron.pipeline.table import Column, Table
-from trihedron.pipeline.types import FrameReference, ManhattanFrame, Map, Planes, Pose, Segments, Surface, Trajectory
+from trihedron.pipeline.app.cli import main
+from trihedron.pipeline.core.errors import RecordingError
+from trihedron.pipeline.core.geometry import exp_se3, exp_so3, rotation_from_quaternion
+from trihedron.pipeline.core.table import Column, Table
+from trihedron.pipeline.core.types import FrameReference, ManhattanFrame, Map, Planes, Pose, Segments, Surface, Trajectory
+from trihedron.pipeline.record import chunk_writer as module
+from trihedron.pipeline.record.foxglove import View
+from trihedron.pipeline.record.foxglove_messages import MOST_VERTICES
+from trihedron.pipeline.record.recording import FrameReader, Recording, RecordingWriter, TopicReader
 
 sys.path.insert(0, str(Path(__file__).parent))
 from toys import CAMERA, ToyDataset, ToyKeypoints

@@ -5,10 +5,10 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 
-from trihedron.pipeline import registry
-from trihedron.pipeline.errors import PluginError
-from trihedron.pipeline.registry import plugin_class, plugins_of, register
-from trihedron.pipeline.types import Frame, Keypoints, Map, Normals, Surface
+from trihedron.pipeline.core import registry
+from trihedron.pipeline.core.errors import PluginError
+from trihedron.pipeline.core.registry import plugin_class, plugins_of, register
+from trihedron.pipeline.core.types import Frame, Keypoints, Map, Normals, Surface
 
 
 @pytest.fixture(autouse=True)

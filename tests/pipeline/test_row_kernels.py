@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from trihedron.pipeline.row_kernels import differing, take, turn
-from trihedron.pipeline.table import CHUNK, Column, Table
+from trihedron.pipeline.core.table import CHUNK, Column, Table
+from trihedron.pipeline.record.row_kernels import differing, take, turn
 
 KINDS = [Column("?"), Column("u1", (3,)), Column("i2"), Column("f4", (3,)), Column("f8", (2, 3)), Column("u1", (32,))]
 

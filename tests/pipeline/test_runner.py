@@ -7,10 +7,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from trihedron.pipeline.errors import DataError, RecordingError, StageError
-from trihedron.pipeline.recording import Recording, RecordingWriter
-from trihedron.pipeline.runner import Runner
-from trihedron.pipeline.runs import Replay
+from trihedron.pipeline.core.errors import DataError, RecordingError, StageError
+from trihedron.pipeline.record.recording import Recording, RecordingWriter
+from trihedron.pipeline.run.replay import Replay
+from trihedron.pipeline.run.runner import Runner
 
 sys.path.insert(0, str(Path(__file__).parent))
 from toys import TOPICS, ToyDataset, ToyRotation, contents, toy_graph

@@ -6,8 +6,8 @@ import time
 
 import pytest
 
-from trihedron.pipeline.graph import PREVIOUS, Wire
-from trihedron.pipeline.scheduler import Node, NodeFailure, Scheduler
+from trihedron.pipeline.core.graph import PREVIOUS, Wire
+from trihedron.pipeline.run.scheduler import Node, NodeFailure, Scheduler
 
 
 def run(nodes, count, threads=2, lookahead=3, initial=None):

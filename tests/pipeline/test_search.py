@@ -7,11 +7,11 @@ import pytest
 from hydra import compose, initialize_config_module
 from hydra.core.override_parser.overrides_parser import OverridesParser
 
-from trihedron.pipeline.cli import main
-from trihedron.pipeline.config import graph_of, register_configs
-from trihedron.pipeline.errors import UsageError
-from trihedron.pipeline.registry import load_plugins
-from trihedron.pipeline.search import Trial, _distribution, _is_searched, _judged, followers
+from trihedron.pipeline.app.cli import main
+from trihedron.pipeline.core.config import graph_of, register_configs
+from trihedron.pipeline.core.errors import UsageError
+from trihedron.pipeline.core.registry import load_plugins
+from trihedron.pipeline.sweep.search import Trial, _distribution, _is_searched, _judged, followers
 
 pytest.importorskip("optuna", reason="needs trihedron[search]")
 ROOM = ["dataset.width=160", "dataset.height=120", "dataset.length=8"]

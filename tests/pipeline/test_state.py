@@ -11,12 +11,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from trihedron.pipeline import chunk_writer
-from trihedron.pipeline.codec import Encoder
-from trihedron.pipeline.errors import RecordingError
-from trihedron.pipeline.recording import Recording, RecordingWriter
-from trihedron.pipeline.runner import Runner
-from trihedron.pipeline.state import Keeper, Memory, load_map, reaches
+from trihedron.pipeline.core.errors import RecordingError
+from trihedron.pipeline.record import chunk_writer
+from trihedron.pipeline.record.codec import Encoder
+from trihedron.pipeline.record.recording import Recording, RecordingWriter
+from trihedron.pipeline.run.runner import Runner
+from trihedron.pipeline.run.state import Keeper, Memory, load_map, reaches
 from trihedron.plugins.numerics.maps.landmarks import empty_map
 
 sys.path.insert(0, str(Path(__file__).parent))
@@ -33,7 +33,7 @@ JOBS = {
 }
 RUN = """
 import json, sys
-from trihedron.pipeline.cli import main
+from trihedron.pipeline.app.cli import main
 sys.exit(max(main(["run", *job]) for job in json.loads(sys.argv[1])))
 """
 

@@ -8,11 +8,11 @@ import sys
 import pytest
 from hydra import compose, initialize_config_module
 
-from trihedron.pipeline.cli import main
-from trihedron.pipeline.config import register_configs
-from trihedron.pipeline.jobs import key_of
-from trihedron.pipeline.registry import load_plugins
-from trihedron.pipeline.sweep import words_of_sequence
+from trihedron.pipeline.app.cli import main
+from trihedron.pipeline.core.config import register_configs
+from trihedron.pipeline.core.registry import load_plugins
+from trihedron.pipeline.sweep.jobs import key_of
+from trihedron.pipeline.sweep.sweep import words_of_sequence
 from trihedron.tools.benchmark import PROGRAM
 
 QUICK = ["dataset.width=64", "dataset.height=48", "dataset.length=4", "outputs=[keypoints]"]
@@ -37,7 +37,7 @@ def test_a_key_is_of_the_files_that_are_read(tmp_path):
     words = ("dataset=tum", f"dataset.path={tmp_path}")
     first = key(*words)
     assert key(*words) == first
-    from trihedron.pipeline import jobs
+    from trihedron.pipeline.sweep import jobs
 
     jobs._files.cache_clear()  # of one sweep
     os.utime(image, ns=(1, 1))
@@ -78,8 +78,8 @@ def test_a_sweep_goes_on_where_it_was_stopped(tmp_path, capfd):
 KILLED = """
 import os, signal
 from dataclasses import dataclass
-from trihedron.pipeline.registry import register
-from trihedron.pipeline.types import Frame, Keypoints
+from trihedron.pipeline.core.registry import register
+from trihedron.pipeline.core.types import Frame, Keypoints
 
 @register("keypoints", "killed")
 @dataclass(frozen=True)
@@ -112,6 +112,6 @@ def test_hydras_own_word_for_a_sweep_sweeps_as_well(tmp_path, capfd):
 
 
 def test_a_single_run_imports_no_engine_of_sweeps(tmp_path):
-    program = f"from trihedron.pipeline.cli import main; main(['run', 'graph=structurel', 'out={tmp_path}']); import sys; print(*sys.modules)"
+    program = f"from trihedron.pipeline.app.cli import main; main(['run', 'graph=structurel', 'out={tmp_path}']); import sys; print(*sys.modules)"
     loaded = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True).stdout.split()
-    assert "hydra" in loaded and not {"joblib", "trihedron.pipeline.sweep"} & set(loaded)
+    assert "hydra" in loaded and not {"joblib", "trihedron.pipeline.sweep.sweep"} & set(loaded)

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from trihedron.pipeline.table import CHUNK, Column, Table
+from trihedron.pipeline.core.table import CHUNK, Column, Table
 
 RNG = np.random.default_rng(0)
 SCHEMA = {"x": Column("f8", (3,)), "n": Column("i4")}

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from trihedron.pipeline.geometry import exp_se3
-from trihedron.pipeline.runs import Poses
-from trihedron.pipeline.types import DEGRADED, LOST, OK, Camera, DepthNoise, Keypoints, LineSegments, Pose
+from trihedron.pipeline.core.geometry import exp_se3
+from trihedron.pipeline.core.types import DEGRADED, LOST, OK, Camera, DepthNoise, Keypoints, LineSegments, Pose
+from trihedron.pipeline.run.replay import Poses
 
 
 def test_wrong_arrays_are_named():

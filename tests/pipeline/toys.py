@@ -6,9 +6,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from mcap.reader import make_reader
 
-from trihedron.pipeline.graph import build_graph
-from trihedron.pipeline.table import Column, Table
-from trihedron.pipeline.types import Camera, Frame, Keypoints, Map, Normals, Pose, Rotation, Surface
+from trihedron.pipeline.core.graph import build_graph
+from trihedron.pipeline.core.table import Column, Table
+from trihedron.pipeline.core.types import Camera, Frame, Keypoints, Map, Normals, Pose, Rotation, Surface
 
 CAMERA = Camera(8, 6, 4.0, 4.0, 3.5, 2.5)
 EMPTY = Table.empty({"position_m": Column("f8", (3,)), "alive": Column("?")})

@@ -7,9 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from trihedron.pipeline.camera import EXACT_DEPTH, Camera, DepthNoise
-from trihedron.pipeline.geometry import exp_so3, invert, tangent_basis, transform, transform_planes
-from trihedron.pipeline.types import Frame, Keypoints, ManhattanFrame, Planes, Segments
+from trihedron.pipeline.core.geometry import exp_so3, invert, tangent_basis, transform, transform_planes
+from trihedron.pipeline.core.types import EXACT_DEPTH, Camera, DepthNoise, Frame, Keypoints, ManhattanFrame, Planes, Segments
 from trihedron.plugins.numerics.axes.cube_symmetry import CUBE
 
 sys.path.insert(0, str(Path(__file__).parent))

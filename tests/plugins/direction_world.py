@@ -9,9 +9,9 @@ import numpy as np
 from hypothesis import strategies as st
 
 import trihedron.plugins.manhattan
-from trihedron.pipeline.geometry import exp_so3, log_so3, rotation_angle_deg, tangent_basis
-from trihedron.pipeline.registry import parameters_of_method, plugins_of
-from trihedron.pipeline.types import ManhattanFrame, Normals, Planes, Segments
+from trihedron.pipeline.core.geometry import exp_so3, log_so3, rotation_angle_deg, tangent_basis
+from trihedron.pipeline.core.registry import parameters_of_method, plugins_of
+from trihedron.pipeline.core.types import ManhattanFrame, Normals, Planes, Segments
 from trihedron.plugins.numerics.axes.cube_symmetry import nearest_equivalent
 
 

@@ -4,9 +4,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from trihedron.pipeline.camera import Camera
-from trihedron.pipeline.geometry import exp_se3, invert, pose_matrix, tangent_basis, transform, transform_planes
-from trihedron.pipeline.types import Frame, Keypoints, Planes, Pose, Rotation, Segments, Tracks, Translation
+from trihedron.pipeline.core.geometry import exp_se3, invert, pose_matrix, tangent_basis, transform, transform_planes
+from trihedron.pipeline.core.types import Camera, Frame, Keypoints, Planes, Pose, Rotation, Segments, Tracks, Translation
 from trihedron.plugins.numerics.algebra.uncertainty import point_covariance
 from trihedron.plugins.numerics.maps.visibility import clip_segments
 

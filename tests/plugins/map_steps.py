@@ -3,8 +3,8 @@
 import numpy as np
 from landmark_world import camera_at, rotation_of, translation_of
 
-from trihedron.pipeline.arrays import array_specs
-from trihedron.pipeline.types import Correction, Pose
+from trihedron.pipeline.core.arrays import array_specs
+from trihedron.pipeline.core.types import Correction, Pose
 from trihedron.plugins.map.covisibility import Covisibility
 from trihedron.plugins.matches.local_map import LocalMap
 

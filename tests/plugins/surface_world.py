@@ -2,8 +2,8 @@
 
 import numpy as np
 
-from trihedron.pipeline.geometry import exp_so3, pose_matrix
-from trihedron.pipeline.types import EXACT_DEPTH, OK, Camera, Frame, Planes, Pose, Rotation
+from trihedron.pipeline.core.geometry import exp_so3, pose_matrix
+from trihedron.pipeline.core.types import EXACT_DEPTH, OK, Camera, Frame, Planes, Pose, Rotation
 from trihedron.plugins.numerics.surfaces.half_edges import opposite_half_edges
 
 CAMERA = Camera(160, 120, 130.0, 130.0, 79.5, 59.5, depth_noise=EXACT_DEPTH)

@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 from hydra import compose, initialize_config_module
 
-from trihedron.pipeline.config import graph_of, register_configs
-from trihedron.pipeline.geometry import exp_se3, exp_so3, invert, log_se3, pose_matrix, rotation_angle_deg, transform, transform_planes
-from trihedron.pipeline.registry import load_plugins
-from trihedron.pipeline.results import causal_trajectory, final_trajectory
-from trihedron.pipeline.runner import Runner
-from trihedron.pipeline.types import LOST, Correction, Map, Pose, Rotation
+from trihedron.pipeline.core.config import graph_of, register_configs
+from trihedron.pipeline.core.geometry import exp_se3, exp_so3, invert, log_se3, pose_matrix, rotation_angle_deg, transform, transform_planes
+from trihedron.pipeline.core.registry import load_plugins
+from trihedron.pipeline.core.types import LOST, Correction, Map, Pose, Rotation
+from trihedron.pipeline.run.results import causal_trajectory, final_trajectory
+from trihedron.pipeline.run.runner import Runner
 from trihedron.plugins.numerics.algebra.uncertainty import transform_plane_covariance
 from trihedron.plugins.numerics.maps.anchoring import anchored, anchored_before
 from trihedron.plugins.numerics.maps.landmarks import KEYFRAMES, empty_map

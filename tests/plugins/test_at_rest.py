@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from trihedron.pipeline.geometry import exp_se3, invert, log_se3
+from trihedron.pipeline.core.geometry import exp_se3, invert, log_se3
 from trihedron.plugins.matches.local_map import LocalMap
 from trihedron.plugins.numerics.maps.at_rest import LEAST, AtRest, at_rest, distance2, on_planes, proven, proven_planes, spread_about
 from trihedron.plugins.numerics.maps.map_alignment import MapAlignment, Verdict

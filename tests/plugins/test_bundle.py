@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from trihedron.pipeline.geometry import exp_se3, invert, log_se3, pose_matrix, tangent_basis
-from trihedron.pipeline.table import Table
+from trihedron.pipeline.core.geometry import exp_se3, invert, log_se3, pose_matrix, tangent_basis
+from trihedron.pipeline.core.table import Table
 from trihedron.plugins.bundle.colmap import Colmap, solve_colmap
 from trihedron.plugins.bundle.local_window import LocalWindow
 from trihedron.plugins.bundle.none import NoBundle

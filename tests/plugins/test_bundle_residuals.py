@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from trihedron.pipeline.geometry import exp_se3, tangent_basis
+from trihedron.pipeline.core.geometry import exp_se3, tangent_basis
 from trihedron.plugins.numerics.bundle import bundle_terms as terms
 from trihedron.plugins.numerics.bundle.bundle_kernel import SQUARES, NormalEquations, line_basis, linearise_bundle
 from trihedron.plugins.numerics.bundle.bundle_problem import BundleMeasurements, BundleState

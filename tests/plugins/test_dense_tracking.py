@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from trihedron.pipeline.camera import DepthNoise
-from trihedron.pipeline.geometry import exp_se3, invert, rotation_angle_deg, transform
+from trihedron.pipeline.core.geometry import exp_se3, invert, rotation_angle_deg, transform
+from trihedron.pipeline.core.types import DepthNoise
 from trihedron.plugins.model.surfels import SurfelModel
 from trihedron.plugins.model.tsdf import TsdfModel
 from trihedron.plugins.pose.direct import Direct

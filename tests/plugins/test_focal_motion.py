@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.optimize import least_squares
 
-from trihedron.pipeline.geometry import exp_se3, transform
+from trihedron.pipeline.core.geometry import exp_se3, transform
 from trihedron.plugins.matches.local_map import LocalMap
 from trihedron.plugins.numerics.maps.focal_check import KEYFRAMES, LEAST_POINTS
 from trihedron.plugins.numerics.maps.focal_motion import FocalMotion, _solve, focal_motion

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from stopwatch import fastest_ms
 
-from trihedron.datasets.synthetic import Synthetic
+from trihedron.datasets.simulation.synthetic import Synthetic
 from trihedron.plugins.numerics.images.line_support import line_support_segments
 
 TOLERANCE = np.radians(22.5)

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from trihedron.pipeline.codec import Decoder, Encoder
+from trihedron.pipeline.record.codec import Decoder, Encoder
 from trihedron.plugins.rotation.manhattan import ManhattanRotation
 from trihedron.plugins.translation.irls import Irls
 from trihedron.plugins.translation.kalman import Kalman

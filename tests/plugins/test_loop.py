@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from trihedron.pipeline.geometry import exp_se3, invert, pose_matrix
-from trihedron.pipeline.types import Frame, Pose
+from trihedron.pipeline.core.geometry import exp_se3, invert, pose_matrix
+from trihedron.pipeline.core.types import Frame, Pose
 from trihedron.plugins.loop.appearance import AppearanceLoop
 from trihedron.plugins.loop.planes import PlanesLoop
 from trihedron.plugins.map.covisibility import Covisibility

@@ -6,8 +6,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from trihedron.pipeline.geometry import exp_so3, log_so3, rotation_angle_deg, tangent_basis
-from trihedron.pipeline.types import Normals, Planes, Segments
+from trihedron.pipeline.core.geometry import exp_so3, log_so3, rotation_angle_deg, tangent_basis
+from trihedron.pipeline.core.types import Normals, Planes, Segments
 from trihedron.plugins.manhattan.mean_shift import MeanShift
 from trihedron.plugins.numerics.axes.cube_symmetry import CUBE, nearest_equivalent
 

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from trihedron.pipeline.geometry import exp_so3, log_so3, rotation_angle_deg
+from trihedron.pipeline.core.geometry import exp_so3, log_so3, rotation_angle_deg
 from trihedron.plugins.manhattan.atlanta import Atlanta
 from trihedron.plugins.numerics.axes.atlanta_fit import fit_shared_vertical, shared_covariance
 from trihedron.plugins.numerics.axes.azimuth_modes import named_azimuths

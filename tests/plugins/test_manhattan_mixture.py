@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from trihedron.pipeline.geometry import exp_so3, rotation_angle_deg
+from trihedron.pipeline.core.geometry import exp_so3, rotation_angle_deg
 from trihedron.plugins.manhattan.mixture import Mixture
 from trihedron.plugins.numerics.axes.cube_symmetry import CUBE, nearest_equivalent
 from trihedron.plugins.numerics.axes.frame_identities import identified, symmetric_angles, turn_between

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from trihedron.pipeline.geometry import exp_se3, invert, tangent_basis, transform, transform_planes
+from trihedron.pipeline.core.geometry import exp_se3, invert, tangent_basis, transform, transform_planes
 from trihedron.plugins.map.covisibility import Covisibility
 from trihedron.plugins.map.none import NoMap
 from trihedron.plugins.numerics.maps.fusion import fuse_lines

@@ -5,9 +5,8 @@ import dataclasses
 import numpy as np
 import pytest
 
-from trihedron.pipeline.camera import Camera
-from trihedron.pipeline.geometry import exp_so3, log_so3, pose_matrix, transform_planes
-from trihedron.pipeline.types import Frame, Pose
+from trihedron.pipeline.core.geometry import exp_so3, log_so3, pose_matrix, transform_planes
+from trihedron.pipeline.core.types import Camera, Frame, Pose
 from trihedron.plugins.loop.appearance import AppearanceLoop
 from trihedron.plugins.loop.planes import PlanesLoop
 from trihedron.plugins.numerics.maps.correction import apply_correction

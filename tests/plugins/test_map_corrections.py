@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from trihedron.pipeline.geometry import exp_se3, transform, transform_planes
-from trihedron.pipeline.table import CHUNK
+from trihedron.pipeline.core.geometry import exp_se3, transform, transform_planes
+from trihedron.pipeline.core.table import CHUNK
 from trihedron.plugins.numerics.maps.local_window import local_window, observed_by
 from trihedron.plugins.numerics.planes import plane_fusion
 

@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from trihedron.pipeline.geometry import exp_se3
-from trihedron.pipeline.types import Keypoints, Pose
+from trihedron.pipeline.core.geometry import exp_se3
+from trihedron.pipeline.core.types import Keypoints, Pose
 from trihedron.plugins.map.covisibility import Covisibility
 from trihedron.plugins.matches.local_map import LocalMap
 from trihedron.plugins.numerics.maps.local_window import local_window, observed_by

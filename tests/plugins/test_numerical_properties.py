@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from trihedron.pipeline import geometry as g
+from trihedron.pipeline.core import geometry as g
 from trihedron.plugins.numerics.bundle import bundle_terms
 from trihedron.plugins.numerics.bundle.bundle_kernel import line_basis
 from trihedron.plugins.numerics.motion import pose_kernel, pose_terms, relative_motion

@@ -5,7 +5,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from trihedron.pipeline.geometry import exp_so3, log_so3, nearest_rotation, rotation_angle_deg
+from trihedron.pipeline.core.geometry import exp_so3, log_so3, nearest_rotation, rotation_angle_deg
 from trihedron.plugins.numerics.axes import rotation_search
 from trihedron.plugins.numerics.axes.consensus import climb, consensus_bound, curvature, summit_radius
 from trihedron.plugins.numerics.axes.cube_symmetry import CUBE, nearest_equivalent

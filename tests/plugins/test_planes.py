@@ -6,7 +6,7 @@ from functools import partial
 import numpy as np
 import pytest
 
-from trihedron.pipeline.geometry import tangent_basis
+from trihedron.pipeline.core.geometry import tangent_basis
 from trihedron.plugins.normals.integral_image import IntegralImage
 from trihedron.plugins.numerics.depth.organised_grid import Grid
 from trihedron.plugins.numerics.planes.cell_columns import columns_of

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from trihedron.pipeline.camera import DepthNoise
+from trihedron.pipeline.core.types import DepthNoise
 from trihedron.plugins.normals.integral_image import IntegralImage
 from trihedron.plugins.normals.none import NoNormals
 from trihedron.plugins.numerics.depth.depth_sampling import noise_coefficients

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from trihedron.pipeline.geometry import exp_se3, exp_so3, pose_matrix, rotation_angle_deg
+from trihedron.pipeline.core.geometry import exp_se3, exp_so3, pose_matrix, rotation_angle_deg
 from trihedron.plugins.loop.pose_graph import PoseGraph
 from trihedron.plugins.matches.keyframes import Keyframes
 from trihedron.plugins.numerics.maps.correction import apply_correction

@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from trihedron.pipeline.geometry import exp_se3, invert, log_se3, rotation_angle_deg
-from trihedron.pipeline.types import Pose
+from trihedron.pipeline.core.geometry import exp_se3, invert, log_se3, rotation_angle_deg
+from trihedron.pipeline.core.types import Pose
 from trihedron.plugins.map.covisibility import Covisibility
 from trihedron.plugins.matches.local_map import LocalMap
 from trihedron.plugins.pose.none import NoRefinement

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from trihedron.pipeline.camera import Camera
-from trihedron.pipeline.geometry import exp_se3, exp_so3, invert, log_se3, pose_matrix, tangent_basis, transform, transform_planes
+from trihedron.pipeline.core.geometry import exp_se3, exp_so3, invert, log_se3, pose_matrix, tangent_basis, transform, transform_planes
+from trihedron.pipeline.core.types import Camera
 from trihedron.plugins.numerics.motion import pose_terms as terms
 from trihedron.plugins.numerics.motion.pose_solver import NO_LINES, NO_PLANES, NO_POINTS, classify_terms, first_step, solve_pose
 from trihedron.plugins.numerics.motion.pose_terms import PARALLEL, PERPENDICULAR, SAME, LineTerms, PlaneTerms, PointTerms

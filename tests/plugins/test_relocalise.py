@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from trihedron.pipeline.geometry import exp_se3, exp_so3, invert, pose_matrix, rotation_angle_deg
-from trihedron.pipeline.types import LOST, Pose
+from trihedron.pipeline.core.geometry import exp_se3, exp_so3, invert, pose_matrix, rotation_angle_deg
+from trihedron.pipeline.core.types import LOST, Pose
 from trihedron.plugins.map.covisibility import Covisibility
 from trihedron.plugins.matches.local_map import LocalMap
 from trihedron.plugins.relocalise.features import Features

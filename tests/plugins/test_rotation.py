@@ -5,8 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from trihedron.pipeline.geometry import exp_so3, log_so3, pose_matrix, rotation_angle_deg
-from trihedron.pipeline.types import LOST, OK, Frame, Pose
+from trihedron.pipeline.core.geometry import exp_so3, log_so3, pose_matrix, rotation_angle_deg
+from trihedron.pipeline.core.types import LOST, OK, Frame, Pose
 from trihedron.plugins.numerics.axes.cube_symmetry import nearest_equivalent
 from trihedron.plugins.numerics.axes.manhattan_frames import KnownFrames
 from trihedron.plugins.rotation.constant_velocity import ConstantVelocity

@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 from hydra.core.config_store import ConfigStore
 
-from trihedron.datasets.trajectories import attached_truth
-from trihedron.pipeline import registry
-from trihedron.pipeline.cli import main
-from trihedron.pipeline.geometry import log_so3
-from trihedron.pipeline.recording import Recording
-from trihedron.pipeline.types import ManhattanFrame, Normals, Planes, Segments
+from trihedron.pipeline.app.cli import main
+from trihedron.pipeline.core import registry
+from trihedron.pipeline.core.geometry import log_so3
+from trihedron.pipeline.core.types import ManhattanFrame, Normals, Planes, Segments
+from trihedron.pipeline.record.recording import Recording
+from trihedron.pipeline.record.trajectories import attached_truth
 from trihedron.plugins.manhattan.mean_shift import MeanShift
 
 FIRST, LAST, LENGTH = 40, 80, 110

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from trihedron.pipeline.types import LineSegments
+from trihedron.pipeline.core.types import LineSegments
 from trihedron.plugins.segments.none import NoSegments
 from trihedron.plugins.segments.ransac import Ransac
 

@@ -7,10 +7,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from trihedron.pipeline.geometry import exp_se3, invert, transform
-from trihedron.pipeline.results import final_trajectory, is_tied
-from trihedron.pipeline.runs import Poses, Result
-from trihedron.pipeline.types import Pose
+from trihedron.pipeline.core.geometry import exp_se3, invert, transform
+from trihedron.pipeline.core.types import Pose
+from trihedron.pipeline.run.replay import Poses, Result
+from trihedron.pipeline.run.results import final_trajectory, is_tied
 from trihedron.plugins.map.covisibility import Covisibility
 from trihedron.plugins.matches.local_map import LocalMap
 from trihedron.plugins.numerics.maps.local_window import current_submap, local_window, newest_keyframes

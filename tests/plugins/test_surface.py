@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 import trimesh
 
-from trihedron.pipeline.codec import Encoder
-from trihedron.pipeline.registry import load_plugins, plugin_class, plugins_of
-from trihedron.pipeline.results import write_surface
-from trihedron.pipeline.types import EXACT_DEPTH, LOST, PLANE_KINDS, Camera
+from trihedron.pipeline.core.registry import load_plugins, plugin_class, plugins_of
+from trihedron.pipeline.core.types import EXACT_DEPTH, LOST, PLANE_KINDS, Camera
+from trihedron.pipeline.record.codec import Encoder
+from trihedron.pipeline.run.results import write_surface
 from trihedron.plugins.numerics.surfaces.half_edges import opposite_half_edges
 from trihedron.plugins.numerics.surfaces.pinholes import without_pinholes
 

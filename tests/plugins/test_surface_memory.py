@@ -7,9 +7,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from trihedron.pipeline.geometry import pose_matrix
-from trihedron.pipeline.registry import load_plugins, plugin_class, plugins_of
-from trihedron.pipeline.types import Camera
+from trihedron.pipeline.core.geometry import pose_matrix
+from trihedron.pipeline.core.registry import load_plugins, plugin_class, plugins_of
+from trihedron.pipeline.core.types import Camera
 from trihedron.plugins.numerics.maps.insertion import add_keyframe
 from trihedron.plugins.numerics.maps.landmarks import empty_map
 from trihedron.plugins.numerics.surfaces.half_edges import opposite_half_edges

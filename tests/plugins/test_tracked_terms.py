@@ -2,8 +2,8 @@
 
 import numpy as np
 
-from trihedron.pipeline.camera import Camera
-from trihedron.pipeline.geometry import exp_se3, exp_so3, tangent_basis, transform, transform_planes
+from trihedron.pipeline.core.geometry import exp_se3, exp_so3, tangent_basis, transform, transform_planes
+from trihedron.pipeline.core.types import Camera
 from trihedron.plugins.numerics.motion.tracked_terms import placed_planes, placed_points
 
 CAMERA = Camera(640, 480, 525.0, 520.0, 319.5, 239.5)

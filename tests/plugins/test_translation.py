@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from trihedron.pipeline.geometry import invert, pose_matrix, transform_planes
-from trihedron.pipeline.types import Planes, Pose, Tracks
+from trihedron.pipeline.core.geometry import invert, pose_matrix, transform_planes
+from trihedron.pipeline.core.types import Planes, Pose, Tracks
 from trihedron.plugins.translation.levenberg_marquardt import LevenbergMarquardt
 
 sys.path.insert(0, str(Path(__file__).parent))

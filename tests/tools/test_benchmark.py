@@ -6,10 +6,10 @@ import json
 import numpy as np
 import pytest
 
-from trihedron.pipeline.cli import main
-from trihedron.pipeline.recording import TIMING_TOPIC, Recording
+from trihedron.pipeline.app.cli import main
+from trihedron.pipeline.record.recording import TIMING_TOPIC, Recording
 from trihedron.tools.benchmark import measure
-from trihedron.tools.benchmark_comparison import compared
+from trihedron.tools.benchmarks.paired import compared
 
 FIGURES = {
     "frames": 10, "threads": 2, "fps": 50.0, "frame_ms": {"p50": 20.0, "p95": 30.0}, "reference_ms": 10.0,

@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 import yaml
 
-from trihedron.datasets.images import read_depth
-from trihedron.datasets.synthetic import Synthetic
-from trihedron.datasets.trajectories import write_trajectory
-from trihedron.pipeline.cli import main
-from trihedron.pipeline.recording import Recording
+from trihedron.datasets.readers.images import read_depth
+from trihedron.datasets.simulation.synthetic import Synthetic
+from trihedron.pipeline.app.cli import main
+from trihedron.pipeline.record.recording import Recording
+from trihedron.pipeline.record.trajectories import write_trajectory
 from trihedron.plugins.numerics.depth.depth_offset import RightAngle, estimate_depth_offset
 from trihedron.plugins.numerics.motion.depth_delay import Turn, estimate_depth_delay
 from trihedron.tools.calibrate import depth_delay_of, depth_offset_of, planes_of

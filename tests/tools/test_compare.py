@@ -9,10 +9,10 @@ import pytest
 from hydra import compose, initialize_config_module
 
 import trihedron.conf
-from trihedron.pipeline.cli import main
-from trihedron.pipeline.config import graph_of, register_configs
-from trihedron.pipeline.errors import UsageError
-from trihedron.pipeline.registry import load_plugins
+from trihedron.pipeline.app.cli import main
+from trihedron.pipeline.core.config import graph_of, register_configs
+from trihedron.pipeline.core.errors import UsageError
+from trihedron.pipeline.core.registry import load_plugins
 from trihedron.tools.compare import read_runs, rows_of
 from trihedron.tools.comparison_table import WRITERS, as_latex, as_markdown, as_text
 

@@ -7,10 +7,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from trihedron.pipeline.cli import main
-from trihedron.pipeline.recording import RecordingWriter
-from trihedron.pipeline.table import Column, Table
-from trihedron.pipeline.types import FrameReference, Map, Pose
+from trihedron.pipeline.app.cli import main
+from trihedron.pipeline.core.table import Column, Table
+from trihedron.pipeline.core.types import FrameReference, Map, Pose
+from trihedron.pipeline.record.recording import RecordingWriter
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "pipeline"))
 from toys import CAMERA

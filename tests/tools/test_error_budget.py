@@ -4,7 +4,7 @@ import json
 
 import pytest
 
-from trihedron.pipeline.cli import main
+from trihedron.pipeline.app.cli import main
 
 ROOM = ["dataset.length=14", "dataset.width=320", "dataset.height=240", "threads=1"]
 

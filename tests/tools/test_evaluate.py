@@ -5,12 +5,12 @@ import json
 import numpy as np
 import pytest
 
-from trihedron.datasets.trajectories import TRUTH, format_trajectory, write_trajectory
-from trihedron.pipeline.cli import main
-from trihedron.pipeline.geometry import exp_se3
-from trihedron.pipeline.metrics import evaluate_trajectory
-from trihedron.pipeline.recording import RecordingWriter
-from trihedron.pipeline.types import Camera, FrameReference, Trajectory
+from trihedron.pipeline.app.cli import main
+from trihedron.pipeline.core.geometry import exp_se3
+from trihedron.pipeline.core.types import Camera, FrameReference, Trajectory
+from trihedron.pipeline.record.recording import RecordingWriter
+from trihedron.pipeline.record.trajectories import TRUTH, format_trajectory, write_trajectory
+from trihedron.pipeline.run.metrics import evaluate_trajectory
 
 PERIOD_NS = 33_333_333
 

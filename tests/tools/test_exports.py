@@ -9,14 +9,14 @@ import cv2
 import numpy as np
 import pytest
 
-from trihedron.datasets.trajectories import read_trajectory
-from trihedron.pipeline.cli import main
-from trihedron.pipeline.geometry import invert
-from trihedron.pipeline.recording import Recording
+from trihedron.pipeline.app.cli import main
+from trihedron.pipeline.core.geometry import invert
+from trihedron.pipeline.record.recording import Recording
+from trihedron.pipeline.record.trajectories import read_trajectory
 from trihedron.tools import export_rerun
 from trihedron.tools.recorded import last_map
 
-RUN = "import sys; from trihedron.pipeline.cli import main; sys.exit(main(['run', *sys.argv[1:]]))"
+RUN = "import sys; from trihedron.pipeline.app.cli import main; sys.exit(main(['run', *sys.argv[1:]]))"
 FRAMES = 24
 
 

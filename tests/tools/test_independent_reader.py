@@ -11,9 +11,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from trihedron.pipeline.foxglove import View
-from trihedron.pipeline.recording import RecordingWriter
-from trihedron.pipeline.types import Frame, FrameReference, ManhattanFrame, Planes, Pose, Segments, Trajectory
+from trihedron.pipeline.core.types import Frame, FrameReference, ManhattanFrame, Planes, Pose, Segments, Trajectory
+from trihedron.pipeline.record.foxglove import View
+from trihedron.pipeline.record.recording import RecordingWriter
 from trihedron.tools.recover import recover
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "pipeline"))
@@ -22,7 +22,7 @@ from toys import ToyDataset, ToyKeypoints
 ROOT = Path(__file__).resolve().parents[2]
 SCRIPT = Path(__file__).with_name("read_mcap.mjs")
 PACKAGES = ["@mcap/core@2.2.2", "@mcap/nodejs@1.0.2", "@mcap/support@1.1.0", "protobufjs@8.8.1"]
-RUN = "import sys; from trihedron.pipeline.cli import main; sys.exit(main(['run', *sys.argv[1:]]))"
+RUN = "import sys; from trihedron.pipeline.app.cli import main; sys.exit(main(['run', *sys.argv[1:]]))"
 
 
 @pytest.fixture(scope="module")

@@ -6,8 +6,8 @@ import re
 import numpy as np
 import pytest
 
-from trihedron.pipeline.cli import main
-from trihedron.tools.long_benchmark import BackAndForth, Row, report
+from trihedron.pipeline.app.cli import main
+from trihedron.tools.benchmarks.long_run import BackAndForth, Row, report
 
 SMALL = ["dataset.width=160", "dataset.height=120"]
 

@@ -5,14 +5,14 @@ import json
 import numpy as np
 import pytest
 
-from trihedron.pipeline.cli import main
-from trihedron.pipeline.geometry import exp_so3
-from trihedron.pipeline.registry import load_plugins
-from trihedron.pipeline.types import ManhattanFrame
+from trihedron.pipeline.app.cli import main
+from trihedron.pipeline.core.geometry import exp_so3
+from trihedron.pipeline.core.registry import load_plugins
+from trihedron.pipeline.core.types import ManhattanFrame
 from trihedron.plugins.manhattan.branch_and_bound import BranchAndBound
 from trihedron.plugins.numerics.axes.cube_symmetry import CUBE
-from trihedron.tools import manhattan_views as seen
-from trihedron.tools.manhattan_family import error_of, estimators, figures, measure
+from trihedron.tools.benchmarks import manhattan_views as seen
+from trihedron.tools.benchmarks.manhattan_family import error_of, estimators, figures, measure
 
 
 def frame(*rotations, inliers=9):

@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
-from trihedron.pipeline.cli import main
-from trihedron.pipeline.types import Pose, Trajectory
+from trihedron.pipeline.app.cli import main
+from trihedron.pipeline.core.types import Pose, Trajectory
 from trihedron.plugins.numerics.maps.landmarks import empty_map
-from trihedron.tools.map_benchmark import (
+from trihedron.tools.benchmarks.map_benchmark import (  # fmt: skip
     MULTIPLE,
     OWN,
     TIME,
@@ -19,7 +19,7 @@ from trihedron.tools.map_benchmark import (
     report_cover,
     report_growth,
     report_loop,
-)  # fmt: skip
+)
 
 STEP_NS = 33_000_000
 

@@ -7,9 +7,9 @@ from enum import Enum
 
 import pytest
 
-from trihedron.pipeline.cli import main
-from trihedron.pipeline.slots import SLOTS
-from trihedron.pipeline.types import Frame, Normals
+from trihedron.pipeline.app.cli import main
+from trihedron.pipeline.core.slots import SLOTS
+from trihedron.pipeline.core.types import Frame, Normals
 from trihedron.tools.plugins import describe_plugin, field_comments, first_sentence
 
 

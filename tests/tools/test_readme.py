@@ -6,8 +6,8 @@ from pathlib import Path
 
 import yaml
 
-from trihedron.pipeline.registry import load_plugins, plugins_of
-from trihedron.pipeline.slots import SLOTS, summary
+from trihedron.pipeline.core.registry import load_plugins, plugins_of
+from trihedron.pipeline.core.slots import SLOTS, summary
 
 ROOT = Path(__file__).parents[2]
 README = (ROOT / "README.md").read_text()

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 import pytest
 
-from trihedron.pipeline.cli import main
+from trihedron.pipeline.app.cli import main
 
 LEGEND_PX = 50  # at the top of a figure
 ROOM = ["dataset.width=160", "dataset.height=120", "dataset.length=8"]

@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 from hydra.core.config_store import ConfigStore
 
-from trihedron.pipeline import registry
-from trihedron.pipeline.cli import main
-from trihedron.pipeline.geometry import exp_so3
-from trihedron.pipeline.types import ManhattanFrame, Normals
+from trihedron.pipeline.app.cli import main
+from trihedron.pipeline.core import registry
+from trihedron.pipeline.core.geometry import exp_so3
+from trihedron.pipeline.core.types import ManhattanFrame, Normals
 from trihedron.plugins.numerics.axes.cube_symmetry import CUBE
-from trihedron.tools.rotation_comparison import common_world, read_runs, residuals_deg
+from trihedron.tools.benchmarks.rotation_comparison import common_world, read_runs, residuals_deg
 
 SMALL = ["dataset=synthetic", "dataset.width=160", "dataset.height=120", "dataset.length=5", "outputs=[manhattan]"]
 

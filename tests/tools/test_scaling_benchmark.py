@@ -7,10 +7,10 @@ import matplotlib.colors
 import numpy as np
 import pytest
 
-from trihedron.pipeline.cli import main
-from trihedron.tools import scaling_benchmark, scaling_plot
-from trihedron.tools.scaling_benchmark import FIRST, PARTS, STOP, measures, report
-from trihedron.tools.scaling_plot import figure_of
+from trihedron.pipeline.app.cli import main
+from trihedron.tools.benchmarks import scaling_benchmark, scaling_plot
+from trihedron.tools.benchmarks.scaling_benchmark import FIRST, PARTS, STOP, measures, report
+from trihedron.tools.benchmarks.scaling_plot import figure_of
 
 TINY = ["dataset.width=160", "dataset.height=120"]
 

@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 import trimesh
 
-from trihedron.datasets.synthetic import Synthetic
-from trihedron.pipeline.errors import DataError, UsageError
-from trihedron.pipeline.ply import write_ply
-from trihedron.pipeline.recording import RecordingWriter
-from trihedron.pipeline.types import Surface
+from trihedron.datasets.simulation.synthetic import Synthetic
+from trihedron.pipeline.core.errors import DataError, UsageError
+from trihedron.pipeline.core.types import Surface
+from trihedron.pipeline.record.recording import RecordingWriter
+from trihedron.pipeline.run.ply import write_ply
 from trihedron.tools import evaluate_surface, export
 from trihedron.tools.evaluate_surface import judged
 from trihedron.tools.export_surface import upright
@@ -179,7 +179,7 @@ def test_the_true_surface_of_the_room_is_what_its_depth_shows(curved):
 
 
 def test_the_curved_pieces_are_for_the_room():
-    from trihedron.datasets.synthetic import Scene
+    from trihedron.datasets.simulation.synthetic import Scene
 
     with pytest.raises(ValueError, match="curved"):
         Synthetic(scene=Scene.corridor, curved=True)

@@ -3,9 +3,9 @@
 import pytest
 from mcap.writer import Writer
 
-from trihedron.pipeline.cli import main
-from trihedron.pipeline.recording import RecordingWriter
-from trihedron.pipeline.types import Camera, FrameReference
+from trihedron.pipeline.app.cli import main
+from trihedron.pipeline.core.types import Camera, FrameReference
+from trihedron.pipeline.record.recording import RecordingWriter
 
 CAMERA = Camera(640, 480, 525.0, 525.0, 320.0, 240.0)
 CUT = "is not a complete MCAP file: what wrote it was cut off; rescue what is whole with: trihedron recover"

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numba
 import numpy as np
 
-from trihedron.pipeline.types import F64, I32
+from trihedron.pipeline.core.types import F64, I32
 
 DIGIT = 11  # bits sorted by at a time: six digits of a double, whose counts stay in the nearest cache
 

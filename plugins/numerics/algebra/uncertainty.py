@@ -5,8 +5,8 @@ from __future__ import annotations
 import numba
 import numpy as np
 
-from trihedron.pipeline.geometry import tangent_basis
-from trihedron.pipeline.types import F32, F64, Camera
+from trihedron.pipeline.core.geometry import tangent_basis
+from trihedron.pipeline.core.types import F32, F64, Camera
 from trihedron.plugins.numerics.algebra.small_linear import invert_symmetric
 
 

@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from trihedron.pipeline.types import F64, I32, Bool, Planes
+from trihedron.pipeline.core.types import F64, I32, Bool, Planes
 from trihedron.plugins.numerics.axes.axis_fit import HALF_SPHERE
 from trihedron.plugins.numerics.axes.azimuth_modes import azimuth_modes, named_azimuths
 from trihedron.plugins.numerics.axes.manhattan_modes import Directions, ModeFinder, Modes

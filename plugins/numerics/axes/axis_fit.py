@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numba
 import numpy as np
 
-from trihedron.pipeline.types import F32, F64, I32, Bool, Planes, Segments
+from trihedron.pipeline.core.types import F32, F64, I32, Bool, Planes, Segments
 from trihedron.plugins.numerics.algebra.small_linear import inverse_positive
 from trihedron.plugins.numerics.axes.direction_information import measured_directions
 from trihedron.plugins.numerics.axes.manhattan_modes import Directions

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numba
 import numpy as np
 
-from trihedron.pipeline.geometry import exp_so3
-from trihedron.pipeline.types import F64, I32
+from trihedron.pipeline.core.geometry import exp_so3
+from trihedron.pipeline.core.types import F64, I32
 from trihedron.plugins.numerics.axes.mode_tests import NORMALS_PER_SAMPLE
 from trihedron.plugins.numerics.axes.sphere_modes import right_handed
 

@@ -19,7 +19,7 @@ from typing import NamedTuple
 import numba
 import numpy as np
 
-from trihedron.pipeline.types import F64
+from trihedron.pipeline.core.types import F64
 from trihedron.plugins.numerics.algebra.small_linear import solve_positive, turn_left
 from trihedron.plugins.numerics.axes.direction_groups import Groups, add_moments
 

@@ -7,7 +7,7 @@ from itertools import permutations, product
 import numba
 import numpy as np
 
-from trihedron.pipeline.types import F64
+from trihedron.pipeline.core.types import F64
 
 
 def _cube_rotations() -> F64:

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numba
 import numpy as np
 
-from trihedron.pipeline.types import F64, I32
+from trihedron.pipeline.core.types import F64, I32
 from trihedron.plugins.numerics.axes.sphere_grid import cell_of
 
 CELLS = 64  # a face of the sphere's grid: groups reach 1.3° from their mean at most

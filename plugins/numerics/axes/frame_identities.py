@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from trihedron.pipeline.types import F64, I32
+from trihedron.pipeline.core.types import F64, I32
 from trihedron.plugins.numerics.axes.cube_symmetry import CUBE
 
 FURTHEST = np.cos(np.radians(63.0))  # two frames are at most 62.8° apart under the nearest of their names

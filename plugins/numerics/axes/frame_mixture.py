@@ -7,8 +7,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from trihedron.pipeline.geometry import rotation_angle_deg
-from trihedron.pipeline.types import F64, Bool, Planes
+from trihedron.pipeline.core.geometry import rotation_angle_deg
+from trihedron.pipeline.core.types import F64, Bool, Planes
 from trihedron.plugins.numerics.axes.axis_fit import HALF_SPHERE
 from trihedron.plugins.numerics.axes.cube_symmetry import nearest_equivalent
 from trihedron.plugins.numerics.axes.frame_identities import symmetric_angles

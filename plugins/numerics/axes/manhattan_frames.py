@@ -7,8 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from trihedron.pipeline.geometry import exp_so3, log_so3
-from trihedron.pipeline.types import F64, I32, ManhattanFrame, Rotation
+from trihedron.pipeline.core.geometry import exp_so3, log_so3
+from trihedron.pipeline.core.types import F64, I32, ManhattanFrame, Rotation
 from trihedron.plugins.numerics.algebra.small_linear import polar_rotation
 from trihedron.plugins.numerics.axes.cube_symmetry import nearest_equivalent
 

@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numba
 import numpy as np
 
-from trihedron.pipeline.types import F64, I32, Bool, Planes
+from trihedron.pipeline.core.types import F64, I32, Bool, Planes
 from trihedron.plugins.numerics.axes.mode_tests import largest_fitting, line_peaks, perpendicular, surface_peaks
 from trihedron.plugins.numerics.axes.sphere_modes import mode_statistics, shift_axes
 

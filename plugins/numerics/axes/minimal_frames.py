@@ -5,7 +5,7 @@ from __future__ import annotations
 import numba
 import numpy as np
 
-from trihedron.pipeline.types import F64, Bool
+from trihedron.pipeline.core.types import F64, Bool
 from trihedron.plugins.numerics.axes.cube_symmetry import nearest_equivalent
 
 NEAR = np.radians(15.0)  # a frame turned less than this from the previous axes is still the same

@@ -7,7 +7,7 @@ from functools import cached_property
 
 import numpy as np
 
-from trihedron.pipeline.types import F64, ManhattanFrame, Normals, Planes, Segments
+from trihedron.pipeline.core.types import F64, ManhattanFrame, Normals, Planes, Segments
 from trihedron.plugins.numerics.axes.axis_fit import NOTHING_KNOWN, AxisFit, gather_directions
 from trihedron.plugins.numerics.axes.manhattan_modes import Directions, ModeFinder, Modes
 from trihedron.plugins.numerics.axes.sphere_modes import orthonormal

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numba
 import numpy as np
 
-from trihedron.pipeline.types import F64, Bool
+from trihedron.pipeline.core.types import F64, Bool
 from trihedron.plugins.numerics.algebra.ranking import few_descending
 
 NORMALS_PER_SAMPLE = 20.0  # neighbouring normals share pixels and the sensor's errors: so many count as one

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numba
 import numpy as np
 
-from trihedron.pipeline.types import F64, I32
+from trihedron.pipeline.core.types import F64, I32
 from trihedron.plugins.numerics.axes.minimal_frames import best_frame, frames_through
 from trihedron.plugins.numerics.axes.procrustes import normal_covariance, procrustes, square_angles
 from trihedron.plugins.numerics.axes.sphere_modes import assign_axes

@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numba
 import numpy as np
 
-from trihedron.pipeline.types import F64
+from trihedron.pipeline.core.types import F64
 from trihedron.plugins.numerics.algebra.small_linear import turn_left
 from trihedron.plugins.numerics.axes.consensus import ROUNDING, climb, consensus_bound, summit_radius
 from trihedron.plugins.numerics.axes.direction_groups import Groups, group_directions

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from trihedron.pipeline.types import F64, I32, ManhattanFrame, Normals, Planes, Segments
+from trihedron.pipeline.core.types import F64, I32, ManhattanFrame, Normals, Planes, Segments
 from trihedron.plugins.numerics.axes.axis_fit import NOTHING_KNOWN, AxisFit
 from trihedron.plugins.numerics.axes.manhattan_modes import Modes
 from trihedron.plugins.numerics.axes.sphere_modes import orthonormal

@@ -9,7 +9,7 @@ from __future__ import annotations
 import numba
 import numpy as np
 
-from trihedron.pipeline.types import F32, F64, I32
+from trihedron.pipeline.core.types import F32, F64, I32
 from trihedron.plugins.numerics.algebra.small_linear import polar_rotation, solve_positive, turn_left
 
 BINS = 90  # one degree each, of a quarter turn

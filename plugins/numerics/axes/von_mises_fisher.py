@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numba
 import numpy as np
 
-from trihedron.pipeline.types import F64
+from trihedron.pipeline.core.types import F64
 from trihedron.plugins.numerics.algebra.small_linear import polar_rotation
 
 LEAST, MOST = 5.0, 20000.0  # concentrations: 26° and 0.4° of standard deviation; below, 1/(1 − r) is not the concentration

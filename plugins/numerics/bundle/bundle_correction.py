@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from trihedron.pipeline.geometry import invert, tangent_basis, transform_planes
-from trihedron.pipeline.types import F64, I32, Correction, Map
+from trihedron.pipeline.core.geometry import invert, tangent_basis, transform_planes
+from trihedron.pipeline.core.types import F64, I32, Correction, Map
 from trihedron.plugins.numerics.algebra.uncertainty import inverse, transform_plane_covariance
 from trihedron.plugins.numerics.bundle.bundle_problem import BundleMeasurements, BundleState, BundleWindow
 from trihedron.plugins.numerics.bundle.bundle_solver import BundleSolution

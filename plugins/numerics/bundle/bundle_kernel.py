@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numba
 import numpy as np
 
-from trihedron.pipeline.types import F64
+from trihedron.pipeline.core.types import F64
 from trihedron.plugins.numerics.bundle.bundle_problem import BundleMeasurements, BundleState
 from trihedron.plugins.numerics.bundle.bundle_terms import by_plane, line_depth_term, line_term, relation_rows, share_opposite
 from trihedron.plugins.numerics.motion.pose_kernel import BEHIND, CHI2_1, CHI2_2, CHI2_3

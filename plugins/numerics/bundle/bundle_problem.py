@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from trihedron.pipeline.types import F64, I32, Map, Table
+from trihedron.pipeline.core.types import F64, I32, Map, Table
 from trihedron.plugins.numerics.algebra.uncertainty import inverse
 from trihedron.plugins.numerics.maps.id_sets import places
 from trihedron.plugins.numerics.maps.local_window import covisible_keyframes, newest_keyframes, observed_by

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from trihedron.pipeline.types import F64
+from trihedron.pipeline.core.types import F64
 from trihedron.plugins.numerics.algebra.small_linear import solve_positive
 from trihedron.plugins.numerics.algebra.uncertainty import inverse
 from trihedron.plugins.numerics.bundle.bundle_kernel import HUBER, SQUARES, TRUNCATED, NormalEquations, linearise_bundle

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numba
 import numpy as np
 
-from trihedron.pipeline.types import F64, I32
+from trihedron.pipeline.core.types import F64, I32
 from trihedron.plugins.numerics.algebra.small_linear import invert_symmetric
 from trihedron.plugins.numerics.bundle.bundle_kernel import NormalEquations, line_basis
 from trihedron.plugins.numerics.bundle.bundle_problem import BundleMeasurements, BundleState

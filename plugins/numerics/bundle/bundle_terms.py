@@ -9,7 +9,7 @@ from __future__ import annotations
 import numba
 import numpy as np
 
-from trihedron.pipeline.types import F64
+from trihedron.pipeline.core.types import F64
 from trihedron.plugins.numerics.maps.map_terms import EXTEND
 from trihedron.plugins.numerics.motion.pose_terms import PARALLEL, basis, line_depth_row, line_row
 

@@ -10,7 +10,7 @@ from typing import Any
 import cv2
 import numpy as np
 
-from trihedron.pipeline.types import F64, I32, Camera, Frame, Normals
+from trihedron.pipeline.core.types import F64, I32, Camera, Frame, Normals
 from trihedron.plugins.numerics.depth.depth_sampling import noise_coefficients
 from trihedron.plugins.numerics.depth.organised_grid import cell_inverse_depths, cell_rays
 from trihedron.plugins.numerics.depth.patch_normals import patch_sides

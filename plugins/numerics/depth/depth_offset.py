@@ -11,8 +11,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from trihedron.pipeline.geometry import tangent_basis
-from trihedron.pipeline.types import F64, Planes
+from trihedron.pipeline.core.geometry import tangent_basis
+from trihedron.pipeline.core.types import F64, Planes
 
 RIGHT_DEG = 8.0  # planes that meet within this of a right angle are meant to
 BUILT_DEG = 0.5  # standard deviation of what builders mean by a right angle

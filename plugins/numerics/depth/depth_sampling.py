@@ -5,7 +5,7 @@ from __future__ import annotations
 import numba
 import numpy as np
 
-from trihedron.pipeline.types import F32, DepthNoise
+from trihedron.pipeline.core.types import F32, DepthNoise
 
 
 def noise_coefficients(noise: DepthNoise) -> tuple[float, float, float, float]:

@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numba
 import numpy as np
 
-from trihedron.pipeline.types import F32, F64, I32, U8, Bool
+from trihedron.pipeline.core.types import F32, F64, I32, U8, Bool
 from trihedron.plugins.numerics.algebra.ranking import descending
 from trihedron.plugins.numerics.depth.depth_sampling import sigma_z
 

@@ -8,7 +8,7 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from trihedron.pipeline.types import F32, F64, I32, U8, Camera
+from trihedron.pipeline.core.types import F32, F64, I32, U8, Camera
 
 SUMS = np.dtype([("n", "f8"), ("z", "f8"), ("uz", "f8"), ("vz", "f8")])  # over pixels with depth: their count, Σz, Σuz and Σvz
 VECTOR = np.dtype([("x", "f4"), ("y", "f4"), ("z", "f4")])

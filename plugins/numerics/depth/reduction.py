@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numba
 import numpy as np
 
-from trihedron.pipeline.types import F32, F64, U8, Frame
+from trihedron.pipeline.core.types import F32, F64, U8, Frame
 
 EDGE = 0.03  # a reading farther than the nearest of its block by more than this share is behind an edge
 LUMINANCE = (0.299, 0.587, 0.114)  # of red, green and blue (Rec. 601)

@@ -9,7 +9,7 @@ from __future__ import annotations
 import numba
 import numpy as np
 
-from trihedron.pipeline.types import F32, F64, Bool
+from trihedron.pipeline.core.types import F32, F64, Bool
 from trihedron.plugins.numerics.depth.depth_sampling import sigma_z
 
 STRATA = 8  # hypotheses come from every pair of 8 stretches of the segment: 28 of them, no randomness

@@ -6,7 +6,7 @@ import cv2
 import numba
 import numpy as np
 
-from trihedron.pipeline.types import F32, F64, I32, U8
+from trihedron.pipeline.core.types import F32, F64, I32, U8
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")

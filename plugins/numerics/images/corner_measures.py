@@ -5,7 +5,7 @@ from __future__ import annotations
 import numba
 import numpy as np
 
-from trihedron.pipeline.types import F32, U8
+from trihedron.pipeline.core.types import F32, U8
 
 HARRIS_K = 0.04  # Harris & Stephens (1988), the usual value
 BLOCK = 3  # half side of the window of gradients

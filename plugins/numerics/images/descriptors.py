@@ -12,7 +12,7 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from trihedron.pipeline.types import F32, F64, I32, U8
+from trihedron.pipeline.core.types import F32, F64, I32, U8
 from trihedron.plugins.numerics.algebra.constant_arrays import constant
 
 U64 = NDArray[np.uint64]

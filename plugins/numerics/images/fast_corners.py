@@ -5,7 +5,7 @@ from __future__ import annotations
 import numba
 import numpy as np
 
-from trihedron.pipeline.types import I32, U8
+from trihedron.pipeline.core.types import I32, U8
 
 RADIUS = 3  # px of the circle compared with
 

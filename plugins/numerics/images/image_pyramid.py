@@ -9,7 +9,7 @@ import cv2
 import numba
 import numpy as np
 
-from trihedron.pipeline.types import F64, I32, U8
+from trihedron.pipeline.core.types import F64, I32, U8
 
 
 class Pyramid(NamedTuple):

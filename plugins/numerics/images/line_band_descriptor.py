@@ -5,7 +5,7 @@ from __future__ import annotations
 import numba
 import numpy as np
 
-from trihedron.pipeline.types import F32, F64, U8
+from trihedron.pipeline.core.types import F32, F64, U8
 
 BANDS = 9
 BYTES = 32

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numba
 import numpy as np
 
-from trihedron.pipeline.types import F32, F64, U8
+from trihedron.pipeline.core.types import F32, F64, U8
 from trihedron.plugins.numerics.algebra.ranking import descending, median
 
 MOST = 2056  # samples of a segment; rows of a power of two would all lie in the same part of a cache

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numba
 import numpy as np
 
-from trihedron.pipeline.types import F32, F64, I32, U8
+from trihedron.pipeline.core.types import F32, F64, I32, U8
 
 BINS = 1024  # of gradient magnitude, by which pixels are taken in order
 

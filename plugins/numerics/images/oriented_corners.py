@@ -5,7 +5,7 @@ from __future__ import annotations
 import numba
 import numpy as np
 
-from trihedron.pipeline.types import F32, F64, I32, Bool
+from trihedron.pipeline.core.types import F32, F64, I32, Bool
 from trihedron.plugins.numerics.algebra.ranking import descending
 from trihedron.plugins.numerics.images.corner_measures import centroid_angle, half_disc, harris_score
 from trihedron.plugins.numerics.images.fast_corners import find_corners

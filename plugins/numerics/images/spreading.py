@@ -5,7 +5,7 @@ from __future__ import annotations
 import numba
 import numpy as np
 
-from trihedron.pipeline.types import I32, Bool
+from trihedron.pipeline.core.types import I32, Bool
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")

@@ -10,7 +10,7 @@ from functools import cached_property
 import cv2
 import numpy as np
 
-from trihedron.pipeline.types import F32, F64, U8, Frame, LineSegments
+from trihedron.pipeline.core.types import F32, F64, U8, Frame, LineSegments
 from trihedron.plugins.numerics.images.line_band_descriptor import line_band_descriptors
 from trihedron.plugins.numerics.images.line_refinement import Placing, placed_segments
 

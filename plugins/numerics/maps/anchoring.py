@@ -10,8 +10,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from trihedron.pipeline.geometry import invert
-from trihedron.pipeline.types import Map, Pose, Rotation
+from trihedron.pipeline.core.geometry import invert
+from trihedron.pipeline.core.types import Map, Pose, Rotation
 
 UNMOVED = 1e-12  # rad and m: rounding; a keyframe that moved by less leaves the pose exactly as it was said
 

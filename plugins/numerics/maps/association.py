@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from trihedron.pipeline.types import F32, F64, I32, Bool, Camera, Keypoints, Map, Matches, Planes, Segments
+from trihedron.pipeline.core.types import F32, F64, I32, Bool, Camera, Keypoints, Map, Matches, Planes, Segments
 from trihedron.plugins.numerics.maps.map_terms import line_terms, plane_terms, point_terms
 from trihedron.plugins.numerics.motion.pose_solver import classify_terms
 

@@ -13,8 +13,8 @@ from dataclasses import dataclass
 import numba
 import numpy as np
 
-from trihedron.pipeline.geometry import invert, log_se3
-from trihedron.pipeline.types import F32, F64, I32, U8, Bool, Keypoints, Map, Matches, Planes, Segments
+from trihedron.pipeline.core.geometry import invert, log_se3
+from trihedron.pipeline.core.types import F32, F64, I32, U8, Bool, Keypoints, Map, Matches, Planes, Segments
 from trihedron.plugins.numerics.algebra.constant_arrays import constant
 from trihedron.plugins.numerics.algebra.small_linear import solve_positive
 from trihedron.plugins.numerics.motion.pose_kernel import Flags

@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from trihedron.pipeline.geometry import invert, transform, transform_planes
-from trihedron.pipeline.types import F64, I32, Bool, Correction, Map, Table
+from trihedron.pipeline.core.geometry import invert, transform, transform_planes
+from trihedron.pipeline.core.types import F64, I32, Bool, Correction, Map, Table
 from trihedron.plugins.numerics.algebra.uncertainty import transform_plane_covariance
 from trihedron.plugins.numerics.maps.id_sets import among
 from trihedron.plugins.numerics.maps.local_window import observed_by

@@ -9,8 +9,8 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from trihedron.pipeline.geometry import invert
-from trihedron.pipeline.types import F64, I32, Bool, Map, Matches, Table
+from trihedron.pipeline.core.geometry import invert
+from trihedron.pipeline.core.types import F64, I32, Bool, Map, Matches, Table
 from trihedron.plugins.numerics.maps.id_sets import among, union
 from trihedron.plugins.numerics.maps.local_window import WEIGHTS, covisible_keyframes, keyframes_of, newest_keyframes, observed_by, observed_by_each
 from trihedron.plugins.numerics.maps.retiring import retired

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from trihedron.pipeline.geometry import invert, pose_matrix
-from trihedron.pipeline.types import DEGRADED, F64, I32, LOST, OK, Frame, Map, Pose, Rotation, Translation
+from trihedron.pipeline.core.geometry import invert, pose_matrix
+from trihedron.pipeline.core.types import DEGRADED, F64, I32, LOST, OK, Frame, Map, Pose, Rotation, Translation
 from trihedron.plugins.numerics.maps.local_window import keyframes_of
 
 FIRST_SIGMA = 1e-6  # the first pose is exact by definition; positive, so that covariances stay invertible

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from trihedron.pipeline.geometry import invert, nearest_rotation, pose_matrix
-from trihedron.pipeline.types import DEGRADED, F64, LOST, OK, Frame, Pose
+from trihedron.pipeline.core.geometry import invert, nearest_rotation, pose_matrix
+from trihedron.pipeline.core.types import DEGRADED, F64, LOST, OK, Frame, Pose
 from trihedron.plugins.numerics.maps.decoupled import FIRST_SIGMA, Decoupled
 from trihedron.plugins.numerics.motion.dense_alignment import Alignment
 

@@ -13,8 +13,8 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from trihedron.pipeline.geometry import rotation_angle_deg
-from trihedron.pipeline.types import F32, F64, I32, Map
+from trihedron.pipeline.core.geometry import rotation_angle_deg
+from trihedron.pipeline.core.types import F32, F64, I32, Map
 from trihedron.plugins.numerics.algebra.small_linear import polar_rotation
 from trihedron.plugins.numerics.maps.local_window import newest_keyframes
 

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
-from trihedron.pipeline.geometry import invert
-from trihedron.pipeline.types import DEGRADED
+from trihedron.pipeline.core.geometry import invert
+from trihedron.pipeline.core.types import DEGRADED
 from trihedron.plugins.numerics.maps.focal_check import focal_check
 from trihedron.plugins.numerics.maps.focal_motion import focal_motion
 from trihedron.plugins.numerics.maps.local_window import current_submap, keyframes_of

@@ -13,8 +13,8 @@ from dataclasses import dataclass
 import numba
 import numpy as np
 
-from trihedron.pipeline.geometry import invert
-from trihedron.pipeline.types import F64, U8, Frame, Keypoints, Map, Matches
+from trihedron.pipeline.core.geometry import invert
+from trihedron.pipeline.core.types import F64, U8, Frame, Keypoints, Map, Matches
 from trihedron.plugins.numerics.algebra.small_linear import solve_positive, turn_left
 from trihedron.plugins.numerics.maps.focal_check import FACTORS, KEYFRAMES, LEAST_POINTS
 from trihedron.plugins.numerics.maps.keyframe_features import measured_points

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from trihedron.pipeline.geometry import adjoint, invert
-from trihedron.pipeline.types import DEGRADED, F64, I32, Map
+from trihedron.pipeline.core.geometry import adjoint, invert
+from trihedron.pipeline.core.types import DEGRADED, F64, I32, Map
 from trihedron.plugins.numerics.maps.map_alignment import SCORE, MapAlignment, Verdict
 from trihedron.plugins.numerics.motion.pose_solver import PoseSolution
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numba
 import numpy as np
 
-from trihedron.pipeline.types import F64
+from trihedron.pipeline.core.types import F64
 from trihedron.plugins.numerics.motion.pose_noise import invert_small
 from trihedron.plugins.numerics.motion.pose_terms import (
     NEAR_M,

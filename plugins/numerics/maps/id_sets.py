@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from trihedron.pipeline.types import I32, Bool
+from trihedron.pipeline.core.types import I32, Bool
 
 
 def distinct(ids: I32) -> I32:

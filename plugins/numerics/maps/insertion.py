@@ -9,8 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from trihedron.pipeline.geometry import tangent_basis, transform, transform_planes
-from trihedron.pipeline.types import F32, F64, I32, Camera, Keypoints, Map, Planes, Pose, Segments, Table
+from trihedron.pipeline.core.geometry import tangent_basis, transform, transform_planes
+from trihedron.pipeline.core.types import F32, F64, I32, Camera, Keypoints, Map, Planes, Pose, Segments, Table
 from trihedron.plugins.numerics.algebra.uncertainty import inverse, moved_covariance, point_covariance, rotate_covariance
 from trihedron.plugins.numerics.maps.fusion import fuse_lines, fuse_points
 from trihedron.plugins.numerics.maps.landmarks import OBSERVERS

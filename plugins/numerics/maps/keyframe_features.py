@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from trihedron.pipeline.geometry import invert, transform, transform_planes
-from trihedron.pipeline.types import F64, I32, Camera, Keypoints, Map, Planes, Segments
+from trihedron.pipeline.core.geometry import invert, transform, transform_planes
+from trihedron.pipeline.core.types import F64, I32, Camera, Keypoints, Map, Planes, Segments
 from trihedron.plugins.numerics.algebra.uncertainty import inverse, rotate_covariance, transform_plane_covariance
 from trihedron.plugins.numerics.maps.local_window import LocalWindow
 from trihedron.plugins.numerics.maps.visibility import clip_segments

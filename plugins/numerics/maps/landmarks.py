@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from trihedron.pipeline.types import Column, Map, Table
+from trihedron.pipeline.core.types import Column, Map, Table
 
 PLACE = Column("f8", (3,), 2.0**-20)  # in the world, to a micrometre: a thousandth of what is known of any
 ENDS = Column("f8", (2, 3), PLACE.step)

@@ -9,7 +9,7 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from trihedron.pipeline.types import F64, I32, Bool, Map, Table
+from trihedron.pipeline.core.types import F64, I32, Bool, Map, Table
 from trihedron.plugins.numerics.maps.id_sets import among, distinct, places
 
 T = TypeVar("T")

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from trihedron.pipeline.types import F64, I32, Frame, Keypoints, Map, Matches, Planes, Segments
+from trihedron.pipeline.core.types import F64, I32, Frame, Keypoints, Map, Matches, Planes, Segments
 from trihedron.plugins.numerics.maps.map_terms import line_terms, plane_terms, point_terms
 from trihedron.plugins.numerics.motion.pose_kernel import Flags
 from trihedron.plugins.numerics.motion.pose_solver import PoseSolution, Terms, classify_terms, first_step, solve_pose

@@ -9,8 +9,8 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from trihedron.pipeline.geometry import invert
-from trihedron.pipeline.types import F64, I32, U8, Camera, Frame, Keypoints, Map, Matches, Planes, Segments
+from trihedron.pipeline.core.geometry import invert
+from trihedron.pipeline.core.types import F64, I32, U8, Camera, Frame, Keypoints, Map, Matches, Planes, Segments
 from trihedron.plugins.numerics.algebra.constant_arrays import constant
 from trihedron.plugins.numerics.images.descriptors import match_lines, match_near
 from trihedron.plugins.numerics.maps.local_window import LocalWindow

@@ -7,7 +7,7 @@ import math
 import numba
 import numpy as np
 
-from trihedron.pipeline.types import F32, F64, I32, Camera, Keypoints, Map, Planes, Segments
+from trihedron.pipeline.core.types import F32, F64, I32, Camera, Keypoints, Map, Planes, Segments
 from trihedron.plugins.numerics.algebra.small_linear import invert_symmetric
 from trihedron.plugins.numerics.motion.pose_terms import PARALLEL, PERPENDICULAR, SAME, LineTerms, PlaneTerms, PointTerms
 

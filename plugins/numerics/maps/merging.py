@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from trihedron.pipeline.geometry import invert, transform
-from trihedron.pipeline.types import I32, Bool, Map, Table
+from trihedron.pipeline.core.geometry import invert, transform
+from trihedron.pipeline.core.types import I32, Bool, Map, Table
 from trihedron.plugins.numerics.algebra.uncertainty import inverse
 from trihedron.plugins.numerics.images.descriptors import match_lines, match_near
 from trihedron.plugins.numerics.maps.id_sets import among

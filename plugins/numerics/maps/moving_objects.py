@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from trihedron.pipeline.types import DEGRADED, OK
+from trihedron.pipeline.core.types import DEGRADED, OK
 from trihedron.plugins.numerics.maps.at_rest import (
     LEAST,
     ON_PLANES,

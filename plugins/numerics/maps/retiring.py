@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from trihedron.pipeline.types import Map, Table
+from trihedron.pipeline.core.types import Map, Table
 from trihedron.plugins.numerics.maps.local_window import living_keyframes, observed_by
 
 KINDS = ("point", "line", "plane")

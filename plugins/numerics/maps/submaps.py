@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from trihedron.pipeline.geometry import invert
-from trihedron.pipeline.types import F64, I32, Map, Pose, Table
+from trihedron.pipeline.core.geometry import invert
+from trihedron.pipeline.core.types import F64, I32, Map, Pose, Table
 from trihedron.plugins.numerics.maps.correction import carried
 from trihedron.plugins.numerics.maps.local_window import keyframes_of
 from trihedron.plugins.numerics.maps.merging import fuse_planes

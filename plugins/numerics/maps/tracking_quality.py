@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from trihedron.pipeline.types import DEGRADED, OK, Rotation
+from trihedron.pipeline.core.types import DEGRADED, OK, Rotation
 from trihedron.plugins.numerics.maps.map_alignment import Agreement, Verdict
 from trihedron.plugins.numerics.motion.pose_solver import PoseSolution
 

@@ -10,8 +10,8 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from trihedron.pipeline.geometry import invert, transform
-from trihedron.pipeline.types import F32, F64, I32, U8, Bool, Camera, Frame, Table
+from trihedron.pipeline.core.geometry import invert, transform
+from trihedron.pipeline.core.types import F32, F64, I32, U8, Bool, Camera, Frame, Table
 from trihedron.plugins.numerics.algebra.constant_arrays import constant
 
 POINT_COLUMNS = "position_m", "direction", "distance_m", "octave"  # what says whether a point is to be seen

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from trihedron.pipeline.types import F64, LOST, Keypoints, Planes, Pose, Rotation, Segments, Tracks
+from trihedron.pipeline.core.types import F64, LOST, Keypoints, Planes, Pose, Rotation, Segments, Tracks
 from trihedron.plugins.numerics.algebra.small_linear import polar_rotation, solve_positive
 from trihedron.plugins.numerics.axes.manhattan_frames import KnownFrames
 from trihedron.plugins.numerics.motion.relative_motion import solve_motion

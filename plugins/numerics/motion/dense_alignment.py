@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import numba
 import numpy as np
 
-from trihedron.pipeline.geometry import exp_so3, nearest_rotation
-from trihedron.pipeline.types import F64
+from trihedron.pipeline.core.geometry import exp_so3, nearest_rotation
+from trihedron.pipeline.core.types import F64
 from trihedron.plugins.numerics.motion.dense_rows import Rows, Source, Target, fill_rows, normal_equations, rows_for, what_is_seen
 
 FREEDOM = 5.0  # degrees of freedom of the t-distribution (Kerl et al.)

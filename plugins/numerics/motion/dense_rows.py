@@ -14,7 +14,7 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from trihedron.pipeline.types import F32, F64
+from trihedron.pipeline.core.types import F32, F64
 from trihedron.plugins.numerics.depth.reduction import EDGE, Level, depth_normals, gradients
 
 NEAREST_M = 0.1  # depth below which nothing is projected

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from trihedron.pipeline.geometry import exp_so3, log_so3
-from trihedron.pipeline.types import F64, Camera, Keypoints, Planes, Tracks
+from trihedron.pipeline.core.geometry import exp_so3, log_so3
+from trihedron.pipeline.core.types import F64, Camera, Keypoints, Planes, Tracks
 
 LEAST_POINTS = 20
 REPROJECTION_PX = 2.0

@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from trihedron.pipeline.types import F64, Camera, Keypoints, Tracks
+from trihedron.pipeline.core.types import F64, Camera, Keypoints, Tracks
 
 ITERATIONS = 15
 CAUCHY = 2.385  # 95 % efficiency where the noise is Gaussian

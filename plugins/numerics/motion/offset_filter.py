@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from trihedron.pipeline.types import F64, Planes, Rotation
+from trihedron.pipeline.core.types import F64, Planes, Rotation
 
 SAME_AXIS = 0.99  # cosine between the normals of one plane, seen twice
 SLACK_M = 0.01  # that a plane may be off besides: two that are this near are one

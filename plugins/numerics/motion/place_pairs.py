@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numba
 import numpy as np
 
-from trihedron.pipeline.types import F32, F64, I32, Keypoints, Planes, Segments, Tracks
+from trihedron.pipeline.core.types import F32, F64, I32, Keypoints, Planes, Segments, Tracks
 from trihedron.plugins.numerics.algebra.small_linear import inverse_positive
 from trihedron.plugins.numerics.motion.pose_terms import basis
 

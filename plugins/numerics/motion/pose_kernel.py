@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numba
 import numpy as np
 
-from trihedron.pipeline.types import F64, U8
+from trihedron.pipeline.core.types import F64, U8
 from trihedron.plugins.numerics.motion.pose_noise import Weights
 from trihedron.plugins.numerics.motion.pose_terms import (
     NEAR_M,

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numba
 import numpy as np
 
-from trihedron.pipeline.types import F64, U8, Camera
+from trihedron.pipeline.core.types import F64, U8, Camera
 from trihedron.plugins.numerics.algebra.small_linear import inverse_positive, solve_positive
 from trihedron.plugins.numerics.motion.pose_kernel import (
     CHI2_2,

@@ -7,7 +7,7 @@ import math
 import numba
 import numpy as np
 
-from trihedron.pipeline.types import F64
+from trihedron.pipeline.core.types import F64
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")

@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numba
 import numpy as np
 
-from trihedron.pipeline.types import F64, I32
+from trihedron.pipeline.core.types import F64, I32
 
 SAME, PARALLEL, PERPENDICULAR = 0, 1, 2  # kinds of plane terms
 NEAR_M = 0.05  # a point nearer than this to the image plane is not projected

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from trihedron.pipeline.types import F64, LOST, Frame, Pose, Translation
+from trihedron.pipeline.core.types import F64, LOST, Frame, Pose, Translation
 
 
 def origin(frame: Frame) -> Translation:

@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numba
 import numpy as np
 
-from trihedron.pipeline.types import F64, Keypoints, Planes, Segments, Tracks
+from trihedron.pipeline.core.types import F64, Keypoints, Planes, Segments, Tracks
 from trihedron.plugins.numerics.algebra.ranking import median
 from trihedron.plugins.numerics.algebra.small_linear import inverse_positive, solve_positive, turn_left
 from trihedron.plugins.numerics.motion.place_pairs import LinePairs, PlanePairs, PointPairs, line_pairs, pairs_of, plane_pairs, point_pairs

@@ -7,8 +7,8 @@ from typing import NamedTuple
 import numba
 import numpy as np
 
-from trihedron.pipeline.geometry import nearest_rotation
-from trihedron.pipeline.types import F64, I32, Bool
+from trihedron.pipeline.core.geometry import nearest_rotation
+from trihedron.pipeline.core.types import F64, I32, Bool
 
 LEAST_M = 0.05  # between the three places of a sample
 REFINEMENTS = 3

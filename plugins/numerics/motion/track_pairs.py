@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numba
 import numpy as np
 
-from trihedron.pipeline.geometry import pose_matrix, transform_planes
-from trihedron.pipeline.types import F64, I32, Camera, Keypoints, Planes, Segments, Tracks
+from trihedron.pipeline.core.geometry import pose_matrix, transform_planes
+from trihedron.pipeline.core.types import F64, I32, Camera, Keypoints, Planes, Segments, Tracks
 from trihedron.plugins.numerics.images.descriptors import match_lines
 from trihedron.plugins.numerics.images.flow import predict_pixels
 from trihedron.plugins.numerics.planes.plane_association import associate_planes

@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numba
 import numpy as np
 
-from trihedron.pipeline.types import F32, F64, I32, U8, Camera, Tracks
+from trihedron.pipeline.core.types import F32, F64, I32, U8, Camera, Tracks
 from trihedron.plugins.numerics.algebra.constant_arrays import constant
 from trihedron.plugins.numerics.images.descriptors import U64, line_matches, near_matches, words_of
 from trihedron.plugins.numerics.images.flow import moved_pixel

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from trihedron.pipeline.types import F32, F64, I32, Keypoints, Tracks
+from trihedron.pipeline.core.types import F32, F64, I32, Keypoints, Tracks
 
 RAD_PER_PX = 0.002  # of a pixel, about: 1/fx of a common camera
 

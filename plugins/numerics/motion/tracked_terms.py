@@ -5,7 +5,7 @@ from __future__ import annotations
 import numba
 import numpy as np
 
-from trihedron.pipeline.types import F32, F64
+from trihedron.pipeline.core.types import F32, F64
 from trihedron.plugins.numerics.depth.depth_sampling import sigma_z
 from trihedron.plugins.numerics.motion.place_pairs import LinePairs, PlanePairs, PointPairs
 from trihedron.plugins.numerics.motion.pose_terms import SAME, LineTerms, PlaneTerms, PointTerms, basis

@@ -9,7 +9,7 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from trihedron.pipeline.types import F64, I32, U8
+from trihedron.pipeline.core.types import F64, I32, U8
 from trihedron.plugins.numerics.images.descriptors import hamming, words_of
 
 U64 = NDArray[np.uint64]

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from trihedron.pipeline.geometry import invert, transform
-from trihedron.pipeline.types import F64, Frame, Map
+from trihedron.pipeline.core.geometry import invert, transform
+from trihedron.pipeline.core.types import F64, Frame, Map
 from trihedron.plugins.numerics.maps.local_window import LocalWindow
 from trihedron.plugins.numerics.maps.visibility import NEAR_M, in_image
 

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numba
 import numpy as np
 
-from trihedron.pipeline.types import F64, I32, Map, Planes, Segments
+from trihedron.pipeline.core.types import F64, I32, Map, Planes, Segments
 from trihedron.plugins.numerics.axes.cube_symmetry import CUBE
 
 ON_AXIS = np.cos(np.radians(8.0))

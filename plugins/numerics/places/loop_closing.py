@@ -8,8 +8,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from trihedron.pipeline.geometry import invert, log_se3, pose_matrix, transform
-from trihedron.pipeline.types import F64, I32, Correction, Frame, Map, Matches
+from trihedron.pipeline.core.geometry import invert, log_se3, pose_matrix, transform
+from trihedron.pipeline.core.types import F64, I32, Correction, Frame, Map, Matches
 from trihedron.plugins.numerics.maps.keyframe_features import features_of
 from trihedron.plugins.numerics.maps.local_window import LocalWindow, observed_by
 from trihedron.plugins.numerics.maps.map_search import Guess, MapSearch

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from trihedron.pipeline.geometry import exp_so3, invert, pose_matrix
-from trihedron.pipeline.types import F32, F64, I32, Correction, Map, Table
+from trihedron.pipeline.core.geometry import exp_so3, invert, pose_matrix
+from trihedron.pipeline.core.types import F32, F64, I32, Correction, Map, Table
 from trihedron.plugins.numerics.algebra.uncertainty import inverse
 from trihedron.plugins.numerics.maps.landmarks import ENDS, PLACE
 from trihedron.plugins.numerics.maps.local_window import current_submap, keyframes_of

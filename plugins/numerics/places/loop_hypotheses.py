@@ -6,8 +6,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from trihedron.pipeline.geometry import invert, transform, umeyama
-from trihedron.pipeline.types import F64, I32, Bool, Camera, Keypoints, Map
+from trihedron.pipeline.core.geometry import invert, transform, umeyama
+from trihedron.pipeline.core.types import F64, I32, Bool, Camera, Keypoints, Map
 from trihedron.plugins.numerics.images.descriptors import match_near
 from trihedron.plugins.numerics.planes.plane_association import associate_planes, overlap
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from trihedron.pipeline.types import F64, I32, Map
+from trihedron.pipeline.core.types import F64, I32, Map
 from trihedron.plugins.numerics.maps.local_window import LocalWindow, current_submap, keyframes_of, observed_by
 
 

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numba
 import numpy as np
 
-from trihedron.pipeline.types import F64, I32, Map, Table
+from trihedron.pipeline.core.types import F64, I32, Map, Table
 from trihedron.plugins.numerics.algebra.uncertainty import inverse
 from trihedron.plugins.numerics.axes.direction_information import measured_directions
 from trihedron.plugins.numerics.axes.plane_axes import Walls, area_on_axes, known_walls, perpendicular_pair, settled

@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from trihedron.pipeline.types import F64, I32, Frame, Keypoints, Map, Matches, Planes, Segments
+from trihedron.pipeline.core.types import F64, I32, Frame, Keypoints, Map, Matches, Planes, Segments
 from trihedron.plugins.numerics.maps.local_window import LocalWindow, local_window, window_of
 from trihedron.plugins.numerics.maps.map_search import Guess, MapSearch
 from trihedron.plugins.numerics.maps.map_terms import line_terms, plane_terms, point_terms

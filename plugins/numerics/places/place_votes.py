@@ -5,7 +5,7 @@ from __future__ import annotations
 import numba
 import numpy as np
 
-from trihedron.pipeline.types import F64, I32, U8, Keypoints, Map, Segments
+from trihedron.pipeline.core.types import F64, I32, U8, Keypoints, Map, Segments
 from trihedron.plugins.numerics.algebra.small_linear import polar_rotation
 from trihedron.plugins.numerics.images.descriptors import U64, hamming, words_of
 from trihedron.plugins.numerics.maps.local_window import WEIGHTS, observed_by

@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from trihedron.pipeline.geometry import exp_so3
-from trihedron.pipeline.types import F64, I32
+from trihedron.pipeline.core.geometry import exp_so3
+from trihedron.pipeline.core.types import F64, I32
 from trihedron.plugins.numerics.algebra.uncertainty import cross_matrices
 
 if TYPE_CHECKING:  # imported where it is needed: SciPy is slow to load, and most runs close no loop

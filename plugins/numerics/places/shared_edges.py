@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from trihedron.pipeline.geometry import invert, pose_matrix
-from trihedron.pipeline.types import F64, I32, Map
+from trihedron.pipeline.core.geometry import invert, pose_matrix
+from trihedron.pipeline.core.types import F64, I32, Map
 from trihedron.plugins.numerics.maps.keyframe_features import measured_points
 from trihedron.plugins.numerics.motion.rigid_consensus import fit_covariance, fitted
 from trihedron.plugins.numerics.motion.tracked_places import place_sigma

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numba
 import numpy as np
 
-from trihedron.pipeline.types import F64, I32, Bool
+from trihedron.pipeline.core.types import F64, I32, Bool
 from trihedron.plugins.numerics.planes.plane_blocks import SUMS, block_mse, block_plane
 
 BINS = 20  # of the polar and of the azimuth angle in the histogram of directions, Proença & Gao

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numba
 import numpy as np
 
-from trihedron.pipeline.types import F64, I32, Bool
+from trihedron.pipeline.core.types import F64, I32, Bool
 from trihedron.plugins.numerics.depth.organised_grid import Grid
 
 SOME = 2000  # cells that show where most of a region is

@@ -9,7 +9,7 @@ from __future__ import annotations
 import numba
 import numpy as np
 
-from trihedron.pipeline.types import F64, I32, Bool
+from trihedron.pipeline.core.types import F64, I32, Bool
 from trihedron.plugins.numerics.algebra.small_linear import solve_positive
 from trihedron.plugins.numerics.depth.organised_grid import Grid
 from trihedron.plugins.numerics.planes.cell_columns import mark_within, normal_equations, sum_marked, thinned_marks

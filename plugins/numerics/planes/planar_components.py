@@ -5,7 +5,7 @@ from __future__ import annotations
 import numba
 import numpy as np
 
-from trihedron.pipeline.types import F32, F64, U8
+from trihedron.pipeline.core.types import F32, F64, U8
 from trihedron.plugins.numerics.depth.organised_grid import Grid, cells_by_component, coarser, connected_components, smooth_links
 from trihedron.plugins.numerics.planes.plane_fitting import fit_components
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from trihedron.pipeline.types import F64, I32, U8, Frame, Normals, Planes
+from trihedron.pipeline.core.types import F64, I32, U8, Frame, Normals, Planes
 from trihedron.plugins.numerics.depth.depth_sampling import noise_coefficients
 from trihedron.plugins.numerics.depth.organised_grid import Grid, cell_inverse_depths, cell_rays
 from trihedron.plugins.numerics.planes.plane_curvature import drop_engulfed, normals_of_regions

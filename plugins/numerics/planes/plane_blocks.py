@@ -10,7 +10,7 @@ from __future__ import annotations
 import numba
 import numpy as np
 
-from trihedron.pipeline.types import F32, F64, I32
+from trihedron.pipeline.core.types import F32, F64, I32
 from trihedron.plugins.numerics.depth.organised_grid import Grid
 
 SUMS = 11

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numba
 import numpy as np
 
-from trihedron.pipeline.types import F32, F64, I32, Bool
+from trihedron.pipeline.core.types import F32, F64, I32, Bool
 from trihedron.plugins.numerics.algebra.small_linear import inverse_positive
 from trihedron.plugins.numerics.depth.organised_grid import Grid
 

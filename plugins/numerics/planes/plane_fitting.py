@@ -5,7 +5,7 @@ from __future__ import annotations
 import numba
 import numpy as np
 
-from trihedron.pipeline.types import F64, I32, U8, Bool
+from trihedron.pipeline.core.types import F64, I32, U8, Bool
 from trihedron.plugins.numerics.algebra.ranking import median
 from trihedron.plugins.numerics.depth.organised_grid import Grid, cells_by_component
 from trihedron.plugins.numerics.planes.cell_columns import columns_of, mark_within, normal_equations, sum_marked, thinned, thinned_marks

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numba
 import numpy as np
 
-from trihedron.pipeline.geometry import tangent_basis
-from trihedron.pipeline.types import F32, F64
+from trihedron.pipeline.core.geometry import tangent_basis
+from trihedron.pipeline.core.types import F32, F64
 from trihedron.plugins.numerics.algebra.uncertainty import cross_matrices, inverse
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numba
 import numpy as np
 
-from trihedron.pipeline.types import F64, I32, U8
+from trihedron.pipeline.core.types import F64, I32, U8
 from trihedron.plugins.numerics.algebra.ranking import descending
 from trihedron.plugins.numerics.depth.organised_grid import Grid
 from trihedron.plugins.numerics.planes.parallel_planes import LEAST, angle_between

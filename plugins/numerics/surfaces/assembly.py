@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from trihedron.pipeline.types import F32, F64, I32, PLANE_KINDS, U8, Map, Surface
+from trihedron.pipeline.core.types import F32, F64, I32, PLANE_KINDS, U8, Map, Surface
 from trihedron.plugins.numerics.surfaces.half_edges import compacted, triangle_areas, vertex_normals
 from trihedron.plugins.numerics.surfaces.painting import painted, spread
 from trihedron.plugins.numerics.surfaces.texture_atlas import atlas_of

@@ -9,7 +9,7 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from trihedron.pipeline.types import I32
+from trihedron.pipeline.core.types import I32
 
 I64 = NDArray[np.int64]
 BITS, HALF = 21, 1 << 20  # of a coordinate, that may be -HALF … HALF - 1

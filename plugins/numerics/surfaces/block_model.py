@@ -12,7 +12,7 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from trihedron.pipeline.types import F32, F64, I32, U8, Bool, Column, Table
+from trihedron.pipeline.core.types import F32, F64, I32, U8, Bool, Column, Table
 from trihedron.plugins.numerics.surfaces.block_hash import I64, absent, empty_table, key_of, number_of, slot_of
 from trihedron.plugins.numerics.surfaces.volume import CELLS, SIDE, blocks_about
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 import numba
 import numpy as np
 
-from trihedron.pipeline.types import F64, I32, Bool
+from trihedron.pipeline.core.types import F64, I32, Bool
 from trihedron.plugins.numerics.surfaces.half_edges import crowded
 
 REST = -1  # the part of triangles that lie in no plane

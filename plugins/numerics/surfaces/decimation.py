@@ -6,7 +6,7 @@ from __future__ import annotations
 import numba
 import numpy as np
 
-from trihedron.pipeline.types import F64, I32, Bool
+from trihedron.pipeline.core.types import F64, I32, Bool
 from trihedron.plugins.numerics.surfaces.block_hash import I64
 
 MOST = 1024  # triangles about a vertex; one with more stays

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numba
 import numpy as np
 
-from trihedron.pipeline.types import F64, I32
+from trihedron.pipeline.core.types import F64, I32
 
 OPEN = -1  # beyond a half-edge: nothing, or more than one triangle
 

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numba
 import numpy as np
 
-from trihedron.pipeline.types import F32, F64, U8, DepthNoise, Frame, Planes
+from trihedron.pipeline.core.types import F32, F64, U8, DepthNoise, Frame, Planes
 
 COLUMNS = 160  # of readings that are asked
 LEAST = 500  # of them on planes, below which the camera's model is believed

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-from trihedron.pipeline.types import F32, F64, U8, Frame, Pose
+from trihedron.pipeline.core.types import F32, F64, U8, Frame, Pose
 from trihedron.plugins.numerics.depth.reduction import lens_of, reduced, step_to
 from trihedron.plugins.numerics.surfaces.block_model import Lens, lens_at
 

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numba
 import numpy as np
 
-from trihedron.pipeline.types import F32, F64, U8, Bool
+from trihedron.pipeline.core.types import F32, F64, U8, Bool
 from trihedron.plugins.numerics.surfaces.views import View
 
 NEAR_M, SIGMAS = 0.03, 3.0  # a point is seen where the depth read differs by no more than NEAR_M and SIGMAS standard deviations from its own

@@ -6,7 +6,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from trihedron.pipeline.types import F64, I32
+from trihedron.pipeline.core.types import F64, I32
 from trihedron.plugins.numerics.surfaces.borders import border_half_edges, loops
 from trihedron.plugins.numerics.surfaces.half_edges import opposite_half_edges
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from trihedron.pipeline.types import Map, Surface
+from trihedron.pipeline.core.types import Map, Surface
 from trihedron.plugins.numerics.surfaces.assembly import pictured
 from trihedron.plugins.numerics.surfaces.borders import REST
 from trihedron.plugins.numerics.surfaces.half_edges import opposite_half_edges, vertex_normals, with_single_fans

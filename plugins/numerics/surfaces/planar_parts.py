@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numba
 import numpy as np
 
-from trihedron.pipeline.types import F64, I32, Map
+from trihedron.pipeline.core.types import F64, I32, Map
 from trihedron.plugins.numerics.surfaces.bends import bends
 from trihedron.plugins.numerics.surfaces.half_edges import connected, triangle_areas
 

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from trihedron.pipeline.geometry import tangent_basis
-from trihedron.pipeline.types import F64
+from trihedron.pipeline.core.geometry import tangent_basis
+from trihedron.pipeline.core.types import F64
 
 
 def plane_axes(plane: F64) -> F64:

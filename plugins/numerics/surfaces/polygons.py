@@ -7,7 +7,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from trihedron.pipeline.types import F64, I32
+from trihedron.pipeline.core.types import F64, I32
 from trihedron.plugins.numerics.surfaces.borders import REST, border_half_edges, fixed_vertices, kept_vertices, loops
 from trihedron.plugins.numerics.surfaces.decimation import decimated
 from trihedron.plugins.numerics.surfaces.half_edges import connected, crowded, opposite_half_edges, triangle_normals

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numba
 import numpy as np
 
-from trihedron.pipeline.types import F32, I32, U8
+from trihedron.pipeline.core.types import F32, I32, U8
 from trihedron.plugins.numerics.surfaces.block_hash import I64, number_of
 from trihedron.plugins.numerics.surfaces.block_model import FULL, I16, NEAREST_M, Blocks, Lens
 from trihedron.plugins.numerics.surfaces.volume import SIDE

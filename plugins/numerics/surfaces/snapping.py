@@ -5,7 +5,7 @@ from __future__ import annotations
 import numba
 import numpy as np
 
-from trihedron.pipeline.types import F64, I32
+from trihedron.pipeline.core.types import F64, I32
 
 LEAST = 0.1  # share of the strongest direction below which planes do not say where a vertex is: two that differ by less than 26°
 ROUNDS = 20  # at most, to unfold what lies the wrong way round after it was moved

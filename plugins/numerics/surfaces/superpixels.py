@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numba
 import numpy as np
 
-from trihedron.pipeline.types import F32, F64, I32, U8
+from trihedron.pipeline.core.types import F32, F64, I32, U8
 from trihedron.plugins.numerics.surfaces.block_hash import I64, empty_table, key_of, slot_of
 from trihedron.plugins.numerics.surfaces.views import View
 

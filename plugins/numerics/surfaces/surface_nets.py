@@ -9,7 +9,7 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from trihedron.pipeline.types import F32, F64, I32
+from trihedron.pipeline.core.types import F32, F64, I32
 from trihedron.plugins.numerics.surfaces.block_hash import I64, number_of
 from trihedron.plugins.numerics.surfaces.volume import CELLS, SIDE, Volume
 

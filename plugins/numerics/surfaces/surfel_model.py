@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numba
 import numpy as np
 
-from trihedron.pipeline.types import F32, F64, I32, U8, Bool, Column, Table
+from trihedron.pipeline.core.types import F32, F64, I32, U8, Bool, Column, Table
 from trihedron.plugins.numerics.surfaces.block_model import NEAREST_M, Lens
 
 SURFELS = {

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from trihedron.pipeline.types import F32, F64, I32, U8, Bool
+from trihedron.pipeline.core.types import F32, F64, I32, U8, Bool
 from trihedron.plugins.numerics.surfaces.painting import UNSEEN, painted
 from trihedron.plugins.numerics.surfaces.plane_axes import plane_axes
 from trihedron.plugins.numerics.surfaces.views import View

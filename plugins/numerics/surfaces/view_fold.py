@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from trihedron.pipeline.types import F64, I32, LOST, Frame, Map, Planes, Pose, Rotation
+from trihedron.pipeline.core.types import F64, I32, LOST, Frame, Map, Planes, Pose, Rotation
 from trihedron.plugins.numerics.surfaces.half_edges import with_single_fans, without_crumbs
 from trihedron.plugins.numerics.surfaces.measured_noise import with_measured_noise
 from trihedron.plugins.numerics.surfaces.surface_nets import zero_level

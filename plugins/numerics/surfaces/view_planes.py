@@ -7,8 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from trihedron.pipeline.geometry import transform_planes
-from trihedron.pipeline.types import F64, I32
+from trihedron.pipeline.core.geometry import transform_planes
+from trihedron.pipeline.core.types import F64, I32
 from trihedron.plugins.numerics.surfaces.views import View
 
 SAMPLE_STEP = 4  # px between the points that a region is compared by

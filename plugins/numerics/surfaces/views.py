@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 import numba
 import numpy as np
 
-from trihedron.pipeline.types import F32, F64, I32, U8, Camera, Frame, Map, Planes, Pose
+from trihedron.pipeline.core.types import F32, F64, I32, U8, Camera, Frame, Map, Planes, Pose
 from trihedron.plugins.numerics.depth.reduction import reduced
 from trihedron.plugins.numerics.surfaces.block_hash import FREE, I64, empty_table, key_of, roomy, slot_of
 

@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 import numba
 import numpy as np
 
-from trihedron.pipeline.types import F32, F64, I32, U8
+from trihedron.pipeline.core.types import F32, F64, I32, U8
 from trihedron.plugins.numerics.surfaces.block_hash import FREE, I64, absent, empty_table, key_of, roomy, slot_of
 from trihedron.plugins.numerics.surfaces.views import View
 

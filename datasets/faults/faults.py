@@ -1,0 +1,212 @@
+"""Another data set with what goes wrong in the field: for tests of what a system says and does then, and for experiments with noise."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field, fields, replace
+from enum import Enum
+from functools import cached_property
+from typing import Any, get_type_hints
+
+import numpy as np
+
+from trihedron.datasets.faults import images as spoil
+from trihedron.datasets.faults.timing import Delivery, inside
+from trihedron.datasets.readers.sequence import clip_range
+from trihedron.pipeline.core.errors import DataError, did_you_mean
+from trihedron.pipeline.core.registry import plugin_class, register
+from trihedron.pipeline.core.slots import frame_range
+from trihedron.pipeline.core.types import F32, U8, Camera, Frame, Trajectory
+
+
+class Covered(Enum):
+    """Which of the two images a cover blinds; depth turns 0."""
+
+    both = "both"
+    color = "color"
+    depth = "depth"
+
+
+class Cover(Enum):
+    """What colour shows of a cover: nothing, the light that blinds it, or a hand."""
+
+    black = "black"
+    white = "white"
+    hand = "hand"
+
+
+RANGES = ("cover", "drop", "freeze", "reverse", "during")
+SHARES = ("drop_share", "depth_holes", "not_finite", "moving", "reflecting")
+POSITIVE = ("every", "depth_times", "focal_times", "resize", "depth_resize", "gamma")
+LENGTHS = ("jump", "depth_noise", "depth_limit_m", "exposure_ms", "readout_ms", "seed")
+EACH, ALL = 5, 6  # streams of random numbers: one a frame, one for all frames
+
+
+@register("dataset", "faults")
+@dataclass(frozen=True)
+class Faults:
+    """The data set `of` as a bad day would deliver it. Frames are numbered as they arrive; ranges are of the numbers in the data set underneath.
+    What is random depends on the seed and the frame alone."""
+
+    frames: str = ""  # part to read, half open: A:B, A:, :B; empty = all
+    of: str = "synthetic"  # the data set underneath
+    options: dict[str, Any] = field(default_factory=dict)  # its options: +dataset.options.path=FOLDER
+    cover: str = ""  # frames A:B for which the camera is covered; empty = never
+    covered: Covered = Covered.both  # both | color | depth
+    cover_with: Cover = Cover.black  # black | white | hand: what colour shows then
+    drop: str = ""  # frames A:B that are not delivered
+    drop_share: float = 0.0  # of the others, here and there
+    every: int = 1  # only one in so many is delivered: 6 makes 5 Hz of 30
+    freeze: str = ""  # frames A:B that show what A does
+    reverse: str = ""  # frames A:B that are delivered last first
+    jump: int = 0  # frame from which on the clock is wrong by jump_s
+    jump_s: float = 0.0
+    during: str = ""  # frames A:B with the faults below; empty = all
+    depth_noise: float = 0.0  # added, times the sensor's standard deviation
+    depth_holes: float = 0.0  # share of the depth image that is missing, in blobs
+    depth_limit_m: float = 0.0  # readings beyond say this; 0 = none
+    not_finite: float = 0.0  # share of the readings that are NaN or infinite
+    depth_times: float = 1.0  # depth is wrong by this factor
+    depth_resize: float = 1.0  # size of the depth image, times that of colour
+    focal_times: float = 1.0  # the focal lengths told are wrong by this factor
+    resize: float = 1.0  # resolution, times what it was; the camera told is right
+    gamma: float = 1.0  # of colour
+    exposure_ms: float = 0.0  # motion blur of colour
+    readout_ms: float = 0.0  # from the first row to the last: rolling shutter
+    moving: float = 0.0  # share of the image covered by what moves
+    reflecting: float = 0.0  # share of the image with mirrors and glass
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        frame_range(self.frames)
+        for name in RANGES:
+            _check_range(name, getattr(self, name))
+        for name in SHARES:
+            if not 0.0 <= getattr(self, name) <= 1.0:
+                raise ValueError(f"{name}: {getattr(self, name)} is not within 0 … 1")
+        for name in POSITIVE:
+            if not getattr(self, name) > 0:
+                raise ValueError(f"{name}: {getattr(self, name)} is not positive")
+        for name in LENGTHS:
+            if not getattr(self, name) >= 0:
+                raise ValueError(f"{name}: {getattr(self, name)} is negative")
+        if self.of == "faults" or "frames" in self.options:
+            raise ValueError("of, options: another data set, its frames chosen by dataset.frames")
+        _ = self._inner  # whose options are refused now when they are out of range
+
+    def __len__(self) -> int:
+        first, stop = self._range
+        return stop - first
+
+    def __call__(self, index: int) -> Frame | None:
+        """Frame `index` of the selection. Raises DataError where depth and colour differ in size."""
+        arrived = self._range[0] + index
+        number = int(self._delivered[arrived])
+        shown = self._delivery.shown(number)
+        frame: Frame | None = self._inner(shown)
+        timed: Frame | None = frame if shown == number else self._inner(number)
+        if frame is None or timed is None:
+            return None
+        color, depth, camera = self._covered(number, *self._spoilt(shown, frame))
+        return Frame(arrived, self._delivery.stamp_ns(timed.stamp_ns, number), color, depth, camera)
+
+    def truth(self) -> Trajectory | None:
+        """That of the data set underneath, at the true times."""
+        truth: Trajectory | None = self._inner.truth()
+        return truth
+
+    def _covered(self, number: int, color: U8, depth: F32, camera: Camera) -> tuple[U8, F32, Camera]:
+        if not inside(self.cover, np.array([number]))[0]:
+            return color, depth, camera
+        if self.covered is not Covered.depth:
+            hidden = spoil.hand(color.shape, self._rng(EACH, number)) if self.cover_with is Cover.hand else np.zeros_like(color)
+            color = np.full_like(color, 255) if self.cover_with is Cover.white else hidden
+        return color, depth if self.covered is Covered.color else np.zeros_like(depth), camera
+
+    def _spoilt(self, number: int, frame: Frame) -> tuple[U8, F32, Camera]:
+        """Colour, depth and camera of a frame with the faults of `during`: first the scene's, then the sensor's, then what is told of it."""
+        color, depth, camera = frame.color, frame.depth_m, frame.camera
+        if self.during and not inside(self.during, np.array([number]))[0]:
+            return color, depth, camera
+        rng, at_s = self._rng(EACH, number), number / camera.fps
+        if self.moving:
+            color, depth = spoil.with_moving_objects(color, depth, self.moving, at_s, self._rng(ALL, 0))
+        if self.reflecting:
+            color, depth = spoil.with_reflections(color, depth, self.reflecting, self._rng(ALL, 1))
+        if (self.exposure_ms or self.readout_ms) and (flow := self._flow(number, frame)) is not None:
+            period_ms = 1e3 / camera.fps
+            color = spoil.blurred(color, flow, self.exposure_ms / period_ms) if self.exposure_ms else color
+            color, depth = spoil.rolled(color, depth, flow, self.readout_ms / period_ms) if self.readout_ms else (color, depth)
+        color = spoil.with_gamma(color, self.gamma) if self.gamma != 1.0 else color
+        if self.resize != 1.0:
+            color, depth, camera = spoil.resized(color, depth, camera, self.resize)
+        if self.depth_resize != 1.0:
+            _refuse_sizes(number, depth, self.depth_resize)
+        return color, self._wrong_depth(depth, camera, rng), replace(camera, fx=camera.fx * self.focal_times, fy=camera.fy * self.focal_times)
+
+    def _wrong_depth(self, depth: F32, camera: Camera, rng: np.random.Generator) -> F32:
+        steps: list[tuple[float, Callable[[F32], F32]]] = [
+            (self.depth_noise, lambda z: spoil.noisy(z, self.depth_noise, camera, rng)),
+            (self.depth_holes, lambda z: spoil.with_holes(z, self.depth_holes, rng)),
+            (self.depth_limit_m, lambda z: np.minimum(z, np.float32(self.depth_limit_m))),
+            (self.depth_times != 1.0, lambda z: z * np.float32(self.depth_times)),
+            (self.not_finite, lambda z: spoil.not_finite(z, self.not_finite, rng)),
+        ]
+        for wanted, step in steps:
+            depth = step(depth) if wanted else depth
+        return depth
+
+    def _flow(self, number: int, frame: Frame) -> F32 | None:
+        """(h, w, 2) pixels by which the image moves until the next frame, or did since the one before where there is no next."""
+        later = number + 1 < len(self._inner)
+        other: Frame | None = self._inner(number + (1 if later else -1)) if len(self._inner) > 1 else None
+        if other is None:
+            return None
+        return spoil.flow_px(frame.gray, other.gray) * np.float32(1.0 if later else -1.0)
+
+    def _rng(self, stream: int, number: int) -> np.random.Generator:
+        return np.random.default_rng([self.seed, stream, number])
+
+    @cached_property
+    def _delivery(self) -> Delivery:
+        return Delivery(self.drop, self.drop_share, self.every, self.freeze, self.reverse, self.jump, self.jump_s)
+
+    @cached_property
+    def _delivered(self) -> Any:
+        return self._delivery.delivered(len(self._inner), self.seed)
+
+    @cached_property
+    def _range(self) -> tuple[int, int]:
+        return clip_range(self.frames, len(self._delivered), f"the {self.of} data set, as far as they are delivered")
+
+    @cached_property
+    def _inner(self) -> Any:
+        kind = plugin_class("dataset", self.of)
+        hints = get_type_hints(kind)
+        known = [option.name for option in fields(kind)]
+        if (unknown := next((name for name in self.options if name not in known), None)) is not None:
+            raise ValueError(f"options: {self.of} has no option '{unknown}'; {did_you_mean(unknown, known)}")
+        return kind(**{name: _as(hints.get(name), value) for name, value in self.options.items()})
+
+
+def _check_range(name: str, text: str) -> None:
+    """Raise ValueError naming the field unless `text` is empty or a range."""
+    try:
+        frame_range(text)
+    except ValueError as error:
+        raise ValueError(str(error).replace("frames:", f"{name}:", 1)) from error
+
+
+def _refuse_sizes(number: int, depth: F32, times: float) -> None:
+    h, w = depth.shape
+    cause = f"depth is {round(times * w)}×{round(times * h)} while colour is {w}×{h}"
+    raise DataError(f"frame {number}", cause, "register depth to colour first")
+
+
+def _as(hint: Any, value: Any) -> Any:
+    """A name as the member of an enumeration where one is wanted. Raises ValueError for a name it has not."""
+    if isinstance(hint, type) and issubclass(hint, Enum) and not isinstance(value, hint):
+        if value not in hint.__members__:
+            raise ValueError(f"options: '{value}' is not one of {', '.join(hint.__members__)}")
+        return hint[value]
+    return value

@@ -1,0 +1,75 @@
+"""Time-stamped lists of image files, and the association of two of them."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from trihedron.pipeline.core.errors import DataError
+from trihedron.pipeline.core.geometry import nearest_pairs
+from trihedron.pipeline.record.trajectories import parse_stamp_ns, table_lines
+
+Stamps = NDArray[np.int64]
+
+
+@dataclass(frozen=True)
+class FileList:
+    """Image files with their (n,) stamps in ns, strictly increasing."""
+
+    stamps_ns: Stamps
+    files: tuple[Path, ...]
+
+
+def read_file_list(path: Path) -> FileList:
+    """Read `stamp file` lines (TUM's rgb.txt, depth.txt); files are relative to the list's folder. Raises DataError naming file and line."""
+    stamps: list[int] = []
+    files: list[Path] = []
+    for number, words in table_lines(path):
+        place = f"{path}:{number}"
+        if len(words) < 2:
+            raise DataError(place, f"has {len(words)} column instead of 2", "each line holds 'stamp file'; correct or remove this one")
+        try:
+            stamp_ns = parse_stamp_ns(words[0])
+        except ValueError as error:
+            raise DataError(place, str(error), "each line holds 'stamp file'; correct or remove this one") from error
+        if stamps and stamp_ns <= stamps[-1]:
+            raise DataError(place, f"the time stamp {words[0]} does not come after the one before", "sort the list and remove duplicates")
+        stamps.append(stamp_ns)
+        files.append(file_inside(path.parent, words[1], place))
+    if not stamps:
+        raise DataError(str(path), "lists no images", "give a list with a line 'stamp file' for each image")
+    return FileList(np.array(stamps, dtype=np.int64), tuple(files))
+
+
+def file_inside(folder: Path, name: str, place: str) -> Path:
+    """The file of a list that lies with its images. Raises DataError, naming `place`, for one that is somewhere else: a list comes with data of
+    others, and says nothing about the rest of the disk. (What a link in the folder points to is its owner's affair.)"""
+    if os.path.isabs(name) or os.path.normpath(name).split(os.sep)[0] == os.pardir:
+        raise DataError(place, f"the file '{name}' is outside the folder of the list", "put the images below that folder")
+    return folder / name
+
+
+def associate(first_ns: Stamps, second_ns: Stamps, max_difference_ns: int) -> NDArray[np.int64]:
+    """Pair two increasing lists of stamps, each entry at most once, the closest pairs first (the rule of the TUM benchmark's tools).
+
+    Returns the (n, 2) row numbers of the pairs, in order of time; the difference of a pair is below `max_difference_ns`. Ties go to the
+    earlier row, so the result does not depend on anything but the stamps."""
+    return nearest_pairs(first_ns, second_ns, max_difference_ns - 1)
+
+
+def listed_pairs(folder: Path, max_difference_ms: float, depth_delay_ms: float) -> tuple[Stamps, list[Path], list[Path]]:
+    """The pairs of rgb.txt and depth.txt, by time: stamps of colour, colour files, depth files. Depth is taken `depth_delay_ms` later than its
+    stamps say. Raises DataError where a list is missing or nothing pairs."""
+    for name, kind in (("rgb.txt", "colour"), ("depth.txt", "depth")):
+        if not (folder / name).is_file():
+            raise DataError(str(folder / name), "is missing", f"it lists the {kind} images; without lists use dataset=folder")
+    color, depth = read_file_list(folder / "rgb.txt"), read_file_list(folder / "depth.txt")
+    pairs = associate(color.stamps_ns, depth.stamps_ns + round(depth_delay_ms * 1e6), round(max_difference_ms * 1e6))
+    if not len(pairs):
+        cause = f"no colour and depth image are within {max_difference_ms:g} ms of each other"
+        raise DataError(str(folder), cause, "check the stamps in rgb.txt and depth.txt or raise dataset.max_difference_ms")
+    return color.stamps_ns[pairs[:, 0]], [color.files[i] for i in pairs[:, 0]], [depth.files[i] for i in pairs[:, 1]]

@@ -1,0 +1,143 @@
+"""Camera files, published calibrations, and which of them belongs to a folder."""
+
+from __future__ import annotations
+
+import math
+import re
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from trihedron.pipeline.core.errors import DataError, did_you_mean
+from trihedron.pipeline.core.types import EXACT_DEPTH, Camera, DepthNoise
+
+CAMERA_FILE = "camera.yaml"
+REQUIRED = ("width", "height", "fx", "fy", "cx", "cy", "depth_scale")
+OPTIONAL = ("distortion", "fps", "depth_noise", "depth_offset")
+COEFFICIENTS = ("k1", "k2", "p1", "p2", "k3")
+NOISES = {"kinect": DepthNoise(), "exact": EXACT_DEPTH}
+SHORT = "give dataset.camera=tum_fr1, tum_fr2, tum_fr3, icl_nuim or a camera.yaml"
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """The pinhole camera a reader hands out, and what turns the files into it: depth file value per metre, lens distortion of both images
+    (k1 k2 p1 p2 k3 of Brown's model, as OpenCV orders them; empty = none), and what is added to inverse depths (1/m)."""
+
+    camera: Camera
+    depth_scale: float
+    distortion: tuple[float, ...] = ()
+    depth_offset: float = 0.0
+
+
+def _vga(fx: float, fy: float, cx: float, cy: float, *distortion: float) -> Calibration:
+    return Calibration(Camera(640, 480, fx, fy, cx, cy), 5000.0, distortion)
+
+
+PRESETS = {
+    # TUM RGB-D benchmark, "Intrinsic Camera Calibration of the Kinect", colour camera; its depth images are registered to colour
+    "tum_fr1": _vga(517.3, 516.5, 318.6, 255.3, 0.2624, -0.9531, -0.0054, 0.0026, 1.1633),
+    "tum_fr2": _vga(520.9, 521.0, 325.1, 249.7, 0.2312, -0.7849, -0.0033, -0.0001, 0.9172),
+    "tum_fr3": _vga(535.4, 539.2, 320.1, 247.6),
+    "seven_scenes": Calibration(Camera(640, 480, 585.0, 585.0, 320.0, 240.0), 1000.0),  # published with the data set
+    "icl_nuim": _vga(481.2, 480.0, 319.5, 239.5),  # published with fy = -480; the reader reflects the poses instead
+}
+FOLDER_NAMES = {  # how the published archives are called
+    "tum_fr1": r"freiburg1|(^|[^a-z])fr1",
+    "tum_fr2": r"freiburg2|(^|[^a-z])fr2",
+    "tum_fr3": r"freiburg3|(^|[^a-z])fr3",
+    "icl_nuim": r"(^|[^a-z])icl|living_?room_?traj|office_?traj|traj\d_frei|(^|[^a-z])(of|lr)[-_]?kt\d",
+}
+
+
+def choose_calibration(folder: Path, choice: str, default: str = "") -> Calibration:
+    """The calibration of a folder of images: `choice` (a preset's name or a camera file), else the folder's camera.yaml, else the preset
+    its name speaks of, else the preset `default`. Raises DataError when none fits or the file is wrong."""
+    if choice in PRESETS:
+        return PRESETS[choice]
+    if choice:
+        given = Path(choice).expanduser()
+        if not given.exists():
+            raise DataError("dataset.camera", f"'{choice}' is neither a file nor a preset", did_you_mean(choice, PRESETS))
+        return read_camera_file(given / CAMERA_FILE if given.is_dir() else given)
+    if (folder / CAMERA_FILE).is_file():
+        return read_camera_file(folder / CAMERA_FILE)
+    name = folder.resolve().name.lower()
+    matching = (preset for preset, pattern in FOLDER_NAMES.items() if re.search(pattern, name))
+    preset = next(matching, default)
+    if not preset:
+        raise DataError(str(folder), f"has no {CAMERA_FILE} and its name speaks of no known camera", SHORT)
+    return PRESETS[preset]
+
+
+def read_camera_file(path: Path) -> Calibration:
+    """Read a camera.yaml: `width height fx fy cx cy depth_scale [distortion k1 k2 p1 p2 k3] [fps]
+    [depth_noise kinect|exact] [depth_offset]`.
+
+    Raises DataError naming file and key."""
+    try:
+        content = yaml.safe_load(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise DataError(str(path), f"cannot be read ({error.strerror})", "check the path and its permissions") from error
+    except (yaml.YAMLError, UnicodeDecodeError) as error:
+        mark = getattr(error, "problem_mark", None)
+        place = f"{path}:{mark.line + 1}" if mark else str(path)
+        raise DataError(place, "is not YAML", "write one 'key: value' a line") from error
+    if not isinstance(content, dict):
+        raise DataError(str(path), "holds no keys", f"give {' '.join(REQUIRED)}, one 'key: value' a line")
+    unknown = next((key for key in content if key not in REQUIRED + OPTIONAL), None)
+    if unknown is not None:
+        raise DataError(str(path), f"unknown key '{unknown}'", did_you_mean(str(unknown), REQUIRED + OPTIONAL))
+    missing = next((key for key in REQUIRED if key not in content), None)
+    if missing is not None:
+        raise DataError(str(path), f"the key '{missing}' is missing", f"give {' '.join(REQUIRED)}")
+    return _calibration(path, content)
+
+
+def _calibration(path: Path, content: dict[str, Any]) -> Calibration:
+    values = {key: _number(path, key, content[key]) for key in (*REQUIRED, "fps", "depth_offset") if key in content}
+    if values["fy"] < 0.0:
+        raise DataError(str(path), "fy is negative (y up)", "give it positive; dataset=icl_nuim reflects the published poses itself")
+    for key in ("width", "height", "fx", "fy", "depth_scale", "fps"):
+        if values.get(key, 1.0) <= 0.0 or (key in ("width", "height") and values[key] % 1.0):
+            raise DataError(str(path), f"{key} is {content[key]}", f"give a positive {'whole ' if key in ('width', 'height') else ''}number")
+    noise = content.get("depth_noise", "kinect")
+    if not isinstance(noise, str) or noise not in NOISES:
+        raise DataError(str(path), f"depth_noise is '{noise}'", did_you_mean(str(noise), NOISES))
+    fx, fy, cx, cy = (values[key] for key in ("fx", "fy", "cx", "cy"))
+    camera = Camera(int(values["width"]), int(values["height"]), fx, fy, cx, cy, values.get("fps", Camera.fps), NOISES[noise])
+    return Calibration(camera, values["depth_scale"], _distortion(path, content.get("distortion")), values.get("depth_offset", 0.0))
+
+
+def _distortion(path: Path, given: Any) -> tuple[float, ...]:
+    """A mapping k1 k2 p1 p2 k3 (absent ones are 0), a list of the five, or one line of text with the five -> tuple, empty when all are zero."""
+    if given is None:
+        return ()
+    if isinstance(given, dict):
+        unknown = next((key for key in given if key not in COEFFICIENTS), None)
+        if unknown is not None:
+            raise DataError(str(path), f"unknown key 'distortion.{unknown}'", did_you_mean(str(unknown), COEFFICIENTS))
+        given = [given.get(key, 0.0) for key in COEFFICIENTS]
+    if isinstance(given, str):
+        given = given.replace(",", " ").split()
+    if not isinstance(given, list) or len(given) != len(COEFFICIENTS):
+        raise DataError(str(path), "distortion does not hold 5 numbers", "give k1 k2 p1 p2 k3 as a mapping or a list")
+    values = tuple(_number(path, f"distortion.{key}", value) for key, value in zip(COEFFICIENTS, given))
+    return values if any(values) else ()
+
+
+def _number(path: Path, key: str, value: Any) -> float:
+    try:
+        number = math.nan if isinstance(value, bool) else float(value)  # text too: YAML takes 5e2 for text
+    except (TypeError, ValueError, OverflowError):
+        number = math.nan
+    if not math.isfinite(number):
+        raise DataError(str(path), f"{key} is '{value}'", "give a finite number")
+    return number
+
+
+def with_noise(calibration: Calibration, exact_depth: bool) -> Calibration:
+    """The calibration with the depth noise of exact depth when asked for, else unchanged."""
+    return replace(calibration, camera=replace(calibration.camera, depth_noise=EXACT_DEPTH)) if exact_depth else calibration

@@ -1,0 +1,98 @@
+"""Frames out of an MCAP file: a recording of this program, or one of a robot."""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+from trihedron.datasets.readers.robot_recording import RobotRecording, Topics
+from trihedron.datasets.readers.sequence import clip_range
+from trihedron.pipeline.core.errors import DataError
+from trihedron.pipeline.core.registry import register
+from trihedron.pipeline.core.slots import frame_range
+from trihedron.pipeline.core.types import Frame, Trajectory
+from trihedron.pipeline.record.mcap_file import McapFile
+from trihedron.pipeline.record.recording import METADATA, FrameReader, Recording
+from trihedron.pipeline.record.trajectories import attached_truth
+
+log = logging.getLogger("trihedron")
+
+
+@register("dataset", "mcap")
+@dataclass(frozen=True)
+class McapDataset:
+    """A recording of this program (`record.frames=true`, or `trihedron convert`), whose frames come bit for bit with the ground truth attached
+    to it, or one of a robot: ROS 2 messages (sensor_msgs Image, CompressedImage, compressedDepth, CameraInfo; tf2_msgs) or Foxglove's schemas.
+
+    Of a robot's recording the topics are chosen by their type; where several fit, one is named. Colour is undistorted, and paired with the depth
+    nearest in time, which is registered to colour from both intrinsics and the transforms. Without index, or cut off, it is read as far as it is
+    whole. Raises DataError when the file holds no frames, RecordingError when it is missing, damaged or not MCAP."""
+
+    path: str = ""  # FILE.mcap
+    frames: str = ""  # half-open range of frame numbers "A:B"
+    color_topic: str = ""  # of a robot's recording; empty = the only one with colour images
+    depth_topic: str = ""  # empty = the only one with depth images
+    color_info_topic: str = ""  # intrinsics; empty = those beside the images, else of the same coordinate frame
+    depth_info_topic: str = ""  # likewise of depth
+    truth_from: str = ""  # a topic of poses (/mocap/pose), or the frame the transforms of the camera begin from (map); empty = no truth
+    max_difference_ms: float = 20.0  # of the stamps of a pair of colour and depth
+    depth_delay_ms: float = 0.0  # depth is taken this much later than its stamps say; trihedron calibrate estimates it
+    depth_scale: float = 1000.0  # of 16-bit depth: values per metre
+
+    def __post_init__(self) -> None:
+        frame_range(self.frames)
+        for name in ("max_difference_ms", "depth_scale"):
+            if getattr(self, name) <= 0.0:
+                raise ValueError(f"{name}: {getattr(self, name)} is not positive")
+
+    @cached_property
+    def _frames(self) -> _Recorded | RobotRecording:
+        if not self.path:
+            raise DataError("dataset.path", "is not set", "give dataset.path=FILE.mcap")
+        file = McapFile(self.path)
+        if METADATA in file.metadata:
+            return _Recorded(Recording(self.path))
+        if not file.complete:
+            log.warning("%s is cut off; what is whole of it is read", self.path)
+        topics = Topics(self.color_topic, self.depth_topic, self.color_info_topic, self.depth_info_topic, self.truth_from)
+        return RobotRecording(file, topics, round(self.max_difference_ms * 1e6), round(self.depth_delay_ms * 1e6), self.depth_scale)
+
+    @cached_property
+    def _range(self) -> tuple[int, int]:
+        return clip_range(self.frames, len(self._frames), self.path)
+
+    def __len__(self) -> int:
+        first, stop = self._range
+        return stop - first
+
+    def __call__(self, index: int) -> Frame | None:
+        """Frame `index` of the selection, or None, after a warning, where it cannot be read."""
+        number = self._range[0] + index
+        return self._frames.frame(number)
+
+    def truth(self) -> Trajectory | None:
+        """The attached ground truth, or that of `truth_from`."""
+        return self._frames.truth()
+
+
+class _Recorded:
+    """The embedded frames of a recording of this program; a frame's number is its place in it."""
+
+    def __init__(self, recording: Recording) -> None:
+        if "dataset" not in recording.topics:
+            raise DataError(str(recording.path), "holds no frames", "record them with record.frames=true, or use trihedron convert")
+        self._recording, self._reader = recording, FrameReader(recording, "dataset")
+        self._stamps = [value.stamp_ns for value in recording.values("frames")]
+
+    def __len__(self) -> int:
+        return len(self._stamps)
+
+    def frame(self, position: int) -> Frame | None:
+        """The frame at a place, as it was."""
+        value = self._reader.at(self._stamps[position])
+        return replace(value, index=position) if isinstance(value, Frame) else None
+
+    def truth(self) -> Trajectory | None:
+        """The attached ground truth."""
+        return attached_truth(self._recording.attachments, str(self._recording.path))

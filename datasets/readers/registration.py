@@ -1,0 +1,79 @@
+"""Depth seen by a camera of its own -> depth in the colour camera."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import cv2
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+from trihedron.pipeline.core.types import F32, F64, Camera
+
+WIDEST = 32  # pixels of colour that one pixel of depth may cover
+NEAREST_M = 1e-3
+MARGIN_PX = 0.05  # between readings on a slanted surface, parallax opens gaps of some hundredths of a pixel
+
+
+@dataclass(frozen=True)
+class Registration:
+    """Registers depth images of `width` × `height` (intrinsics `K`, lens `D` as OpenCV orders it) to the undistorted camera `color`.
+
+    Each reading covers the pixels whose centres its own pixel covers, the nearest one on top: no holes where colour is the finer one."""
+
+    width: int
+    height: int
+    K: F64
+    D: tuple[float, ...]
+    T_color_depth: F64
+    color: Camera
+
+    @cached_property
+    def _rays(self) -> tuple[F32, F32]:
+        """Directions (x, y, z), turned into the colour camera, of the middles of the left and right sides of the pixels (h, w + 1, 3) and of the
+        upper and lower ones (h + 1, w, 3); pixel centres at integers."""
+        columns, rows = np.arange(self.width + 1) - 0.5, np.arange(self.height + 1) - 0.5
+        return self._turned(columns, rows[:-1] + 0.5), self._turned(columns[:-1] + 0.5, rows)
+
+    def _turned(self, columns: NDArray[Any], rows: NDArray[Any]) -> F32:
+        pixels = np.stack(np.meshgrid(columns, rows), axis=-1)
+        rays = cv2.undistortPoints(pixels.reshape(-1, 1, 2), self.K, np.array(self.D) if self.D else None).reshape(pixels.shape)
+        with np.errstate(invalid="ignore", over="ignore"):  # where the lens model has no inverse, or the focal length is next to none
+            rays = np.concatenate([rays, np.ones((*rays.shape[:2], 1))], axis=2) @ self.T_color_depth[:3, :3].T
+            return np.ascontiguousarray(rays, np.float32)
+
+    def __call__(self, depth_m: F32) -> F32:
+        """(h, w) metres of the depth camera, 0 = none -> (color.height, color.width) metres z of the colour camera, 0 = none."""
+        camera, t = self.color, self.T_color_depth[:3, 3].astype(np.float32)
+        return _splat(depth_m, *self._rays, t, camera.fx, camera.fy, camera.cx, camera.cy, camera.height, camera.width)
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _splat(depth: F32, across: F32, down: F32, t: F32, fx: float, fy: float, cx: float, cy: float, height: int, width: int) -> F32:
+    """The z-buffer of all readings, each a rectangle in the colour image between the middles of the sides of its pixel."""
+    found = np.zeros((height, width), np.float32)
+    for row in range(depth.shape[0]):
+        for column in range(depth.shape[1]):
+            z = depth[row, column]
+            if not z > 0.0:
+                continue
+            Z_left, Z_right = z * across[row, column, 2] + t[2], z * across[row, column + 1, 2] + t[2]
+            Z_top, Z_bottom = z * down[row, column, 2] + t[2], z * down[row + 1, column, 2] + t[2]
+            if not min(Z_left, Z_right, Z_top, Z_bottom) > NEAREST_M:
+                continue
+            left, right = fx * (z * across[row, column, 0] + t[0]) / Z_left + cx, fx * (z * across[row, column + 1, 0] + t[0]) / Z_right + cx
+            top, bottom = fy * (z * down[row, column, 1] + t[1]) / Z_top + cy, fy * (z * down[row + 1, column, 1] + t[1]) / Z_bottom + cy
+            low_x, high_x = min(left, right) - MARGIN_PX, max(left, right) + MARGIN_PX
+            low_y, high_y = min(top, bottom) - MARGIN_PX, max(top, bottom) + MARGIN_PX
+            inside = high_x > -1.0 and low_x < width and high_y > -1.0 and low_y < height
+            if not (inside and high_x - low_x <= WIDEST and high_y - low_y <= WIDEST):
+                continue
+            Z = np.float32(0.5) * (Z_left + Z_right)
+            for v in range(max(0, int(np.ceil(low_y))), min(height, int(np.ceil(high_y)))):
+                for u in range(max(0, int(np.ceil(low_x))), min(width, int(np.ceil(high_x)))):
+                    if found[v, u] == 0.0 or found[v, u] > Z:
+                        found[v, u] = Z
+    return found

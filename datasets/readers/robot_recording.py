@@ -1,0 +1,274 @@
+"""Frames out of a robot's recording: ROS 2 messages or Foxglove's schemas in an MCAP file."""
+
+from __future__ import annotations
+
+import logging
+import re
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import cv2
+import numpy as np
+
+from trihedron.datasets.readers.association import Stamps, associate
+from trihedron.datasets.readers.picture_headers import UnreadableImage
+from trihedron.datasets.readers.pixels import Kind, color_of, depth_of
+from trihedron.datasets.readers.registration import Registration
+from trihedron.datasets.readers.robot_streams import Role, Stream, Streams
+from trihedron.datasets.readers.robot_values import Intrinsics, Link, Picture, UnreadableMessage
+from trihedron.datasets.readers.transform_tree import TransformTree
+from trihedron.pipeline.core.errors import DataError, RecordingError
+from trihedron.pipeline.core.types import F32, F64, U8, Camera, Frame, Trajectory
+from trihedron.pipeline.record.mcap_file import McapFile
+
+log = logging.getLogger("trihedron")
+RECTIFIED = re.compile(r"(^|[_/])rect")  # in the name of a topic, by the convention of image_proc
+LENSES = {"", "plumb_bob", "rational_polynomial", "thin_prism"}  # whose coefficients OpenCV takes in this order
+COEFFICIENTS = (0, 4, 5, 8, 12, 14)
+LARGEST = 1 << 14  # pixels of a side
+
+
+@dataclass(frozen=True)
+class Topics:
+    """What the user chose; an empty topic is chosen by its type."""
+
+    color: str = ""
+    depth: str = ""
+    color_info: str = ""
+    depth_info: str = ""
+    truth: str = ""  # a topic of poses of the camera, or the name of the frame whose transforms lead to the camera
+
+
+@dataclass(frozen=True)
+class _Sample:
+    """What the first image of a topic says of all: whose it is, and its height and width."""
+
+    frame_id: str
+    shape: tuple[int, int]
+
+
+@dataclass(frozen=True)
+class RobotRecording:
+    """The frames of a recording, in any order and from any thread: colour paired with the nearest depth, undistorted, depth registered to colour."""
+
+    file: McapFile
+    topics: Topics
+    max_difference_ns: int
+    depth_delay_ns: int
+    depth_scale: float
+
+    def __len__(self) -> int:
+        return len(self._pairs)
+
+    def stamp_ns(self, position: int) -> int:
+        """Of a frame: that of its colour image."""
+        return int(self._pairs[position, 0])
+
+    def frame(self, position: int) -> Frame | None:
+        """The pair at a place; None, after a warning, where one of its images cannot be decoded."""
+        stamp_ns, color_row, depth_row = self._pairs[position].tolist()
+        try:
+            color = self._decoded(self._color, color_row, self._first_color.shape)
+            depth = self._decoded(self._depth, depth_row, self._first_depth.shape)
+        except (UnreadableImage, UnreadableMessage, RecordingError) as error:
+            log.warning("%s; frame %d is skipped", error, position)
+            return None
+        return Frame(position, stamp_ns, self._undistorted(color), self._registered(depth), self.camera)
+
+    def truth(self) -> Trajectory | None:
+        """`T_world_camera` from the poses or transforms that were chosen. Raises DataError where they say nothing."""
+        if not self.topics.truth:
+            return None
+        links = self._pose_links() if self.topics.truth.startswith("/") else self._frame_links()
+        poses = {link.stamp_ns: link.T_parent_child for link in links}
+        if not poses:
+            raise DataError("dataset.truth_from", f"'{self.topics.truth}' says nothing of the camera at the times of the frames", "leave it out")
+        stamps = sorted(poses)
+        return Trajectory(np.array(stamps, np.int64), np.array([poses[stamp] for stamp in stamps]))
+
+    @cached_property
+    def camera(self) -> Camera:
+        """The colour camera, undistorted."""
+        found, K = self._color_intrinsics, _matrix(self._color_intrinsics, self._color.topic)
+        steps = np.diff(self._pairs[:, 0])
+        fps = round(1e9 / float(np.median(steps)), 3) if len(steps) else Camera.fps
+        return Camera(found.width, found.height, float(K[0, 0]), float(K[1, 1]), float(K[0, 2]), float(K[1, 2]), fps)
+
+    # which topics
+
+    @cached_property
+    def _streams(self) -> Streams:
+        return Streams(self.file)
+
+    @cached_property
+    def _color(self) -> Stream:
+        return self._streams.images(Kind.color, "color_topic", self.topics.color)
+
+    @cached_property
+    def _depth(self) -> Stream:
+        return self._streams.images(Kind.depth, "depth_topic", self.topics.depth)
+
+    @cached_property
+    def _pairs(self) -> Stamps:
+        """(n, 3) stamp, row of colour, row of depth; in order of time."""
+        color, depth = _ordered(self._color.stamps_ns()), _ordered(self._depth.stamps_ns())
+        pairs = associate(color[:, 0], depth[:, 0] + self.depth_delay_ns, self.max_difference_ns)
+        if not len(pairs):
+            cause = f"no image of {self._color.topic} is within {self.max_difference_ns / 1e6:g} ms of one of {self._depth.topic}"
+            raise DataError(str(self.file.path), cause, "raise dataset.max_difference_ms or give dataset.depth_delay_ms")
+        return np.column_stack([color[pairs[:, 0]], depth[pairs[:, 1], 1]])
+
+    @cached_property
+    def _color_intrinsics(self) -> Intrinsics:
+        first = self._first_color
+        found = self._streams.calibration(self._color, first.frame_id, "color_info_topic", self.topics.color_info)
+        if found is None:
+            there = ", ".join(stream.topic for stream in self._streams.of(Role.intrinsics))
+            cure = f"choose one with dataset.color_info_topic=TOPIC: {there}" if there else "record the camera's calibration too"
+            raise DataError(str(self.file.path), f"holds no camera intrinsics for {self._color.topic}", cure)
+        _check(found, self._color.topic, first.shape, str(self.file.path))
+        return found
+
+    @cached_property
+    def _depth_intrinsics(self) -> Intrinsics | None:
+        """Those of a depth camera of its own, None where depth is in the colour camera already."""
+        color, first = self._color_intrinsics, self._first_depth
+        found = self._streams.calibration(self._depth, first.frame_id, "depth_info_topic", self.topics.depth_info)
+        if found is None:
+            if first.shape != (color.height, color.width):
+                cause = f"holds no camera intrinsics for {self._depth.topic}, whose images differ in size from {self._color.topic}"
+                raise DataError(str(self.file.path), cause, "choose them with dataset.depth_info_topic=TOPIC")
+            return None
+        _check(found, self._depth.topic, first.shape, str(self.file.path))
+        same = (found.width, found.height) == (color.width, color.height) and np.allclose(found.K, color.K, rtol=1e-6, atol=1e-6)
+        T = self._T_color_depth
+        return None if same and (T is None or np.allclose(T, np.eye(4), atol=1e-6)) else found
+
+    @cached_property
+    def _first_color(self) -> _Sample:
+        return self._first(self._color)
+
+    @cached_property
+    def _first_depth(self) -> _Sample:
+        return self._first(self._depth)
+
+    def _first(self, stream: Stream) -> _Sample:
+        """Of the first image that can be decoded. Raises DataError where there is none."""
+        why = "it is empty"
+        for row in range(len(stream.index)):
+            try:
+                shape = self._decoded(stream, row).shape
+                return _Sample(stream.at(row).frame_id, (shape[0], shape[1]))
+            except (UnreadableImage, UnreadableMessage, RecordingError) as error:
+                why = str(error)
+        raise DataError(str(self.file.path), f"no image of {stream.topic} can be read: {why}", "record them again, or name another topic")
+
+    def _decoded(self, stream: Stream, row: int, shape: tuple[int, int] | None = None) -> Any:
+        try:
+            picture: Picture = stream.at(row)
+            pixels = color_of(picture) if stream is self._color else depth_of(picture, self.depth_scale)
+            if shape is not None and pixels.shape[:2] != shape:
+                raise UnreadableImage(f"is {pixels.shape[1]}×{pixels.shape[0]} while the first is {shape[1]}×{shape[0]}")
+        except (UnreadableImage, UnreadableMessage) as error:
+            raise UnreadableImage(f"{self.file.path}: image {row} of {stream.topic} {error}") from error
+        return pixels
+
+    # geometry
+
+    @cached_property
+    def _tree(self) -> TransformTree:
+        """All transforms of the recording; those of topics that are called static hold for good."""
+        fixed: list[Link] = []
+        moving: list[Link] = []
+        for stream in self._streams.of(Role.links):
+            said = [link for value in stream.values() for link in value]
+            (fixed if "static" in stream.topic else moving).extend(said)
+        return TransformTree(fixed, moving)
+
+    @cached_property
+    def _T_color_depth(self) -> F64 | None:
+        color, depth = self._first_color.frame_id, self._first_depth.frame_id
+        return np.eye(4) if color.lstrip("/") == depth.lstrip("/") else self._tree.lookup(color, depth)
+
+    @cached_property
+    def _registration(self) -> Registration | None:
+        found = self._depth_intrinsics
+        if found is None:
+            return None
+        if self._T_color_depth is None:
+            color, depth = self._first_color.frame_id, self._first_depth.frame_id
+            cause = f"holds no transform from '{depth}' to '{color}', which registering depth to colour needs"
+            raise DataError(str(self.file.path), cause, "record /tf_static too, or the topic of registered depth")
+        K = _matrix(found, self._depth.topic)
+        return Registration(found.width, found.height, K, _lens(found, self._depth.topic), self._T_color_depth, self.camera)
+
+    def _registered(self, depth: F32) -> F32:
+        if self._registration is not None:
+            return self._registration(depth)
+        if self._maps is None:
+            return depth
+        return np.asarray(cv2.remap(depth, *self._maps, cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT), np.float32)
+
+    def _undistorted(self, color: U8) -> U8:
+        if self._maps is None:
+            return color
+        return np.asarray(cv2.remap(color, *self._maps, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE), np.uint8)
+
+    @cached_property
+    def _maps(self) -> tuple[F32, F32] | None:
+        """Where each pixel of the undistorted colour image comes from; None without distortion."""
+        lens = _lens(self._color_intrinsics, self._color.topic)
+        if not lens:
+            return None
+        K = self.camera.K
+        x, y = cv2.initUndistortRectifyMap(K, np.array(lens), np.eye(3), K, (self.camera.width, self.camera.height), cv2.CV_32FC1)
+        return np.asarray(x), np.asarray(y)
+
+    # truth
+
+    def _frame_links(self) -> list[Link]:
+        """The camera in the frame that was named, at each colour image where the transforms say it."""
+        world, camera = self.topics.truth, self._first_color.frame_id
+        stamps = self._pairs[:, 0].tolist()
+        found = [(stamp, self._tree.lookup(world, camera, stamp)) for stamp in stamps]
+        return [Link(stamp, world, camera, T) for stamp, T in found if T is not None]
+
+    def _pose_links(self) -> list[Link]:
+        """The poses of a topic, carried on to the camera where the transforms say how it sits on what moves."""
+        camera, found = self._first_color.frame_id, []
+        for value in self._streams.named(self.topics.truth, "truth_from", Role.pose).values():
+            for link in value:
+                mount = self._tree.lookup(link.child, camera) if link.child else None
+                found.append(link if mount is None else Link(link.stamp_ns, link.parent, camera, link.T_parent_child @ mount))
+        return found
+
+
+def _ordered(stamps: Stamps) -> Stamps:
+    """(n, 2) stamp and row of the messages that have a stamp, increasing, of equal stamps the first."""
+    unique, rows = np.unique(stamps, return_index=True)
+    return np.column_stack([unique, rows])[unique >= 0]
+
+
+def _is_rectified(found: Intrinsics, topic: str) -> bool:
+    return bool(RECTIFIED.search(topic)) and bool(found.P[0, 0] > 0 and found.P[1, 1] > 0)
+
+
+def _matrix(found: Intrinsics, topic: str) -> F64:
+    """(3, 3) of the images of a topic: rectified ones have another."""
+    return np.asarray(found.P[:, :3] if _is_rectified(found, topic) else found.K)
+
+
+def _lens(found: Intrinsics, topic: str) -> tuple[float, ...]:
+    return found.D if any(found.D) and not _is_rectified(found, topic) else ()
+
+
+def _check(found: Intrinsics, topic: str, shape: tuple[int, ...], place: str) -> None:
+    """Raise DataError for intrinsics that the images, or OpenCV, cannot go with."""
+    if (found.height, found.width) != shape[:2] or max(shape[:2]) > LARGEST:
+        cause = f"the images of {topic} are {shape[1]}×{shape[0]}, their intrinsics are of {found.width}×{found.height}"
+        raise DataError(place, cause, "choose the intrinsics of these images")
+    lens = _lens(found, topic)
+    if lens and (found.model not in LENSES or len(lens) not in COEFFICIENTS):
+        cause = f"the lens model '{found.model[:40]}' of {topic} with {len(lens)} coefficients is not known"
+        raise DataError(place, cause, f"known: {', '.join(sorted(LENSES - {''}))}; rectify the images first")

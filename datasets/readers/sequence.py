@@ -1,0 +1,146 @@
+"""A sequence of colour and depth files: what the readers of folders have in common."""
+
+from __future__ import annotations
+
+import logging
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from trihedron.datasets.readers.cameras import Calibration
+from trihedron.datasets.readers.images import check_size, read_color, read_depth
+from trihedron.datasets.readers.picture_headers import UnreadableImage
+from trihedron.pipeline.core.errors import DataError
+from trihedron.pipeline.core.slots import frame_range
+from trihedron.pipeline.core.types import F32, U8, Frame, Trajectory
+
+log = logging.getLogger("trihedron")
+DepthReader = Callable[[Path], F32]
+
+
+@dataclass(frozen=True)
+class ImageSequence:
+    """Pairs of files with their stamps, and what turns a pair into a Frame. `first` is the number of the first pair in the whole data set;
+    `depth_reader` replaces the reading of 16-bit images, `color_reader` that of colour. Nothing is kept of a frame: memory does not grow with
+    the sequence."""
+
+    stamps_ns: NDArray[np.int64]
+    color_files: Sequence[Path]
+    depth_files: Sequence[Path]
+    calibration: Calibration
+    truth: Trajectory | None = None
+    first: int = 0
+    depth_reader: DepthReader | None = None
+    color_reader: Callable[[Path], U8] = read_color
+
+    def __len__(self) -> int:
+        return len(self.stamps_ns)
+
+    def frame(self, position: int) -> Frame | None:
+        """Read pair `position`, undistorted; None, after one warning, when a file cannot be read. Raises DataError for images of a wrong kind."""
+        try:
+            color = self._read(self.color_files[position], self.color_reader)
+            depth = self._read(self.depth_files[position], self.depth_reader or self._read_depth)
+        except UnreadableImage as error:
+            log.warning("%s; frame %d is skipped", error, self.first + position)
+            return None
+        self._check_sizes(position, color, depth)
+        color, depth = self._undistort(color, depth)
+        return Frame(self.first + position, int(self.stamps_ns[position]), color, depth, self.calibration.camera)
+
+    def _read(self, path: Path, reader: Callable[[Path], Any]) -> Any:
+        try:
+            return reader(path)
+        except UnreadableImage as error:
+            raise UnreadableImage(f"{path}: {error}") from error
+
+    def _read_depth(self, path: Path) -> F32:
+        return read_depth(path, self.calibration.depth_scale, self.calibration.depth_offset)
+
+    def _check_sizes(self, position: int, color: U8, depth: F32) -> None:
+        camera, path = self.calibration.camera, self.color_files[position]
+        height, width = color.shape[:2]
+        check_size(self.depth_files[position], depth, width, height, f"its colour image {path.name}", "register depth to colour first")
+        check_size(path, color, camera.width, camera.height, "the camera", "give the dataset.camera of these images")
+
+    @cached_property
+    def _maps(self) -> tuple[F32, F32] | None:
+        """Where each pixel of the undistorted image comes from: (h, w) x and y; None without distortion."""
+        if not self.calibration.distortion:
+            return None
+        camera = self.calibration.camera
+        lens = np.array(self.calibration.distortion)
+        x, y = cv2.initUndistortRectifyMap(camera.K, lens, np.eye(3), camera.K, (camera.width, camera.height), cv2.CV_32FC1)
+        return np.asarray(x), np.asarray(y)
+
+    def _undistort(self, color: U8, depth: F32) -> tuple[U8, F32]:
+        """Colour bilinear; depth nearest, since a mean across an edge is a point that does not exist. Outside the image colour repeats the
+        border, which makes no edge, and depth is 0."""
+        if self._maps is None:
+            return color, depth
+        color = np.asarray(cv2.remap(color, *self._maps, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE), dtype=np.uint8)
+        return color, np.asarray(cv2.remap(depth, *self._maps, cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT), dtype=np.float32)
+
+
+class SequenceReader(ABC):
+    """A data set that is an ImageSequence: what the readers of folders share. Frames are numbered as in the whole data set."""
+
+    @property
+    @abstractmethod
+    def _sequence(self) -> ImageSequence:
+        """The chosen part of the folder, opened once. Raises DataError when the folder cannot be used."""
+
+    def __len__(self) -> int:
+        return len(self._sequence)
+
+    def __call__(self, index: int) -> Frame | None:
+        """Frame `index` of the selection, or None when one of its files cannot be read. Raises DataError for images of a wrong kind."""
+        return self._sequence.frame(index)
+
+    def truth(self) -> Trajectory | None:
+        """The ground truth that lies with the images, as published but with y down."""
+        return self._sequence.truth
+
+
+def open_folder(path: str) -> Path:
+    """The data set's folder. Raises DataError when the path is not set, missing, a file or empty."""
+    if not path:
+        raise DataError("dataset.path", "is not set", "give dataset.path=FOLDER")
+    folder = Path(path).expanduser()
+    if not folder.exists():
+        raise DataError(str(folder), "does not exist", "give an existing folder as dataset.path")
+    if not folder.is_dir():
+        raise DataError(str(folder), "is not a folder", "give the folder that holds the images as dataset.path")
+    if not any(folder.iterdir()):
+        raise DataError(str(folder), "is empty", "give the folder that holds the images as dataset.path")
+    return folder
+
+
+def select_frames(sequence: ImageSequence, frames: str, place: str) -> ImageSequence:
+    """The half-open part `frames` ("A:B") of a whole sequence; B beyond the end means the end. Raises DataError when A is beyond it."""
+    begin, end = clip_range(frames, len(sequence), place)
+    part = slice(begin, end)
+    return replace(
+        sequence,
+        stamps_ns=sequence.stamps_ns[part],
+        color_files=sequence.color_files[part],
+        depth_files=sequence.depth_files[part],
+        first=begin,
+    )
+
+
+def clip_range(frames: str, count: int, place: str) -> tuple[int, int]:
+    """Start and stop of the field `frames` in a data set of `count` frames. Raises DataError when nothing is left."""
+    begin, end = frame_range(frames)
+    if begin >= count:
+        raise DataError("dataset.frames", f"'{frames}' begins beyond the {count} frames of {place}", f"give a range within 0:{count}")
+    if end is not None and end > count:
+        log.warning("dataset.frames: '%s' ends beyond the %d frames of %s", frames, count, place)
+    return begin, min(count, count if end is None else end)

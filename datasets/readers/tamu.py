@@ -1,0 +1,37 @@
+"""Sequences of the TAMU RGB-D data set."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+from trihedron.datasets.readers.association import listed_pairs
+from trihedron.datasets.readers.cameras import choose_calibration
+from trihedron.datasets.readers.sequence import ImageSequence, SequenceReader, open_folder, select_frames
+from trihedron.pipeline.core.registry import register
+from trihedron.pipeline.core.slots import frame_range
+
+
+@register("dataset", "tamu")
+@dataclass(frozen=True)
+class Tamu(SequenceReader):
+    """Folder with rgb.txt and depth.txt, as in the TUM benchmark, and a camera.yaml (Lu and Song 2015). Long walks through corridors, an entry
+    hall and a staircase, without true poses: a walk ends where it began, so that `start_to_end_m` of metrics.json is its drift."""
+
+    path: str = ""  # folder of the sequence
+    frames: str = ""  # part to read, half open: A:B, A:, :B; empty = all
+    camera: str = ""  # preset or camera.yaml; empty = the folder's file
+    max_difference_ms: float = 20.0  # of a pair's stamps
+    depth_delay_ms: float = 0.0  # depth is taken this much later than its stamps say; trihedron calibrate estimates it
+
+    def __post_init__(self) -> None:
+        frame_range(self.frames)
+        if self.max_difference_ms <= 0.0:
+            raise ValueError(f"max_difference_ms: {self.max_difference_ms} is not positive")
+
+    @cached_property
+    def _sequence(self) -> ImageSequence:
+        folder = open_folder(self.path)
+        calibration = choose_calibration(folder, self.camera)
+        whole = ImageSequence(*listed_pairs(folder, self.max_difference_ms, self.depth_delay_ms), calibration)
+        return select_frames(whole, self.frames, str(folder))

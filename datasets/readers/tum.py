@@ -1,0 +1,43 @@
+"""Sequences of the TUM RGB-D benchmark."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+from trihedron.datasets.readers.association import listed_pairs
+from trihedron.datasets.readers.cameras import choose_calibration, with_noise
+from trihedron.datasets.readers.sequence import ImageSequence, SequenceReader, open_folder, select_frames
+from trihedron.pipeline.core.registry import register
+from trihedron.pipeline.core.slots import frame_range
+from trihedron.pipeline.record.trajectories import TRUTH, read_trajectory
+
+
+@register("dataset", "tum")
+@dataclass(frozen=True)
+class Tum(SequenceReader):
+    """Folder with rgb.txt, depth.txt and, where there is truth, groundtruth.txt (Sturm et al. 2012). Colour and depth are separate streams,
+    paired by time; a frame carries the stamp of its colour image. fr1 and fr2 are undistorted at reading."""
+
+    path: str = ""  # folder of the sequence
+    frames: str = ""  # part to read, half open: A:B, A:, :B; empty = all
+    camera: str = ""  # preset or camera.yaml; empty = the folder's file, else its name
+    max_difference_ms: float = 20.0  # of a pair's stamps; the benchmark's tools use the same
+    depth_delay_ms: float = 0.0  # depth is taken this much later than its stamps say; trihedron calibrate estimates it
+    exact_depth: bool = False  # rendered without sensor noise; false = a Kinect's
+
+    def __post_init__(self) -> None:
+        frame_range(self.frames)
+        if self.max_difference_ms <= 0.0:
+            raise ValueError(f"max_difference_ms: {self.max_difference_ms} is not positive")
+
+    @cached_property
+    def _sequence(self) -> ImageSequence:
+        folder = open_folder(self.path)
+        truth = folder / TRUTH
+        whole = ImageSequence(
+            *listed_pairs(folder, self.max_difference_ms, self.depth_delay_ms),
+            with_noise(choose_calibration(folder, self.camera), self.exact_depth),
+            read_trajectory(truth) if truth.is_file() else None,
+        )
+        return select_frames(whole, self.frames, str(folder))

@@ -1,0 +1,157 @@
+"""Scenes of several rooms, each with the walk that shows it: a convex shell that walls, which are boxes, divide. Metres, z up.
+
+Walls come first among the solids: the ray tracer then passes over what they hide."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+from trihedron.datasets.simulation.furniture import furnished
+from trihedron.datasets.simulation.room import HEIGHT_M, Room, Solid, Wall, box, shell, walls_of
+from trihedron.datasets.simulation.walks import Walk
+
+DOORWAY_M = (0.9, 2.1)  # width and height
+DETAIL = 0.7  # of the textures: those of a building take as much memory as those of a few rooms
+WALL_M = 0.1
+
+
+@dataclass(frozen=True)
+class Building:
+    """What stands where, and the walk through it."""
+
+    room: Room
+    walk: Walk
+
+
+def _rectangle(x: tuple[float, float], y: tuple[float, float]) -> tuple[tuple[float, float], ...]:
+    """Its corners, anticlockwise."""
+    return (x[0], y[0]), (x[1], y[0]), (x[1], y[1]), (x[0], y[1])
+
+
+def _skirting(wall: Wall) -> Solid:
+    return wall.mounted(wall.length_m / 2.0, (0.0, 0.08), wall.length_m, 0.015, "plastic")
+
+
+def _lamps(places: list[tuple[float, float]]) -> tuple[list[Solid], tuple[tuple[float, float, float], ...]]:
+    """Flat lamps on the ceiling, and where their light comes from."""
+    solids = [box((x - 0.3, x + 0.3), (y - 0.3, y + 0.3), (HEIGHT_M - 0.1, HEIGHT_M), "plastic") for x, y in places]
+    return solids, tuple((x, y, HEIGHT_M - 0.25) for x, y in places)
+
+
+def _building(x: float, y: float, solids: list[Solid], lamps: list[tuple[float, float]], walk: Walk) -> Building:
+    planes, faces = shell(_rectangle((0.0, x), (0.0, y)))
+    hanging, lights = _lamps(lamps)
+    return Building(Room(planes, faces, (*solids, *hanging), lights, DETAIL), walk)
+
+
+def corridor() -> Building:
+    """A corridor 2 m wide around a block: 45.6 m along its middle, back to where it began."""
+    x, y = 15.7, 11.1
+    south, east, north, west = walls_of(_rectangle((0.0, x), (0.0, y)))
+    inner_west, inner_north, inner_east, inner_south = walls_of(((2.0, 2.0), (2.0, y - 2.0), (x - 2.0, y - 2.0), (x - 2.0, 2.0)))
+    solids = [box((2.0, x - 2.0), (2.0, y - 2.0), (0.0, HEIGHT_M), "wall")]
+    solids += [_skirting(wall) for wall in (south, east, north, west, inner_west, inner_north, inner_east, inner_south)]
+    solids += furnished(south, "door 2.6, picture 4.1, cabinet 5.6, portrait 7.0, door 8.4, bin 9.4, picture 10.6, crates 12.0, door 13.9")
+    solids += furnished(east, "window 1.6, portrait 3.3, door 4.6, bench 6.2, picture 7.6, pilaster 8.6, door 9.8")
+    solids += furnished(north, "picture 1.0, shelf 2.6, door 4.3, portrait 5.6, window 7.2, globe 9.1, door 10.8, picture 12.2, locker 13.6")
+    solids += furnished(west, "door 1.3, picture 2.7, locker 4.2, portrait 5.3, door 6.5, crates 7.6, window 9.4")
+    solids += furnished(inner_south, "pilaster 1.1, picture 2.4, door 4.0, portrait 5.3, bench 6.6, picture 7.9, door 9.5, pilaster 10.7")
+    solids += furnished(inner_east, "portrait 0.8, door 2.2, pilaster 3.4, picture 4.6, door 6.0")
+    solids += furnished(inner_north, "door 1.5, picture 3.2, pilaster 4.4, cabinet 5.8, picture 7.4, door 9.0, portrait 10.5")
+    solids += furnished(inner_west, "picture 1.0, pilaster 2.2, door 3.6, picture 5.2, bin 6.3")
+    lamps = [(1.0, 1.0), (5.5, 1.0), (10.0, 1.0), (14.7, 1.0), (14.7, 5.5), (14.7, 10.1), (10.0, 10.1), (5.5, 10.1), (1.0, 10.1), (1.0, 5.5)]
+    path = ((6.0, 1.0), (x - 1.0, 1.0), (x - 1.0, y - 1.0), (1.0, y - 1.0), (1.0, 1.0))
+    return _building(x, y, solids, lamps, Walk(path, 1.0, 1.0))
+
+
+def _doorway(along_x: bool, across: tuple[float, float], span: tuple[float, float], at: float) -> list[Solid]:
+    """A wall with a doorway `at`: left, right, and above it. `across` is its thickness, `span` its extent, along x or along y."""
+    left, right = (span[0], at - DOORWAY_M[0] / 2.0), (at + DOORWAY_M[0] / 2.0, span[1])
+    pieces = [(left, (0.0, HEIGHT_M)), (right, (0.0, HEIGHT_M)), ((left[1], right[0]), (DOORWAY_M[1], HEIGHT_M))]
+    return [box(part, across, z, "wall") if along_x else box(across, part, z, "wall") for part, z in pieces]
+
+
+def _office(west: float) -> list[Solid]:
+    """A room of 4 × 4 m north of a corridor, with its own floor and ceiling: one office looks as any other to the last texel."""
+    x, y = (west, west + 4.0), (2.1, 6.1)
+    solids = _doorway(True, (2.0, 2.1), (x[0] - WALL_M, x[1] + WALL_M), west + 2.0)
+    solids += [box(side, (2.1, 6.2), (0.0, HEIGHT_M), "wall") for side in ((x[0] - WALL_M, x[0]), (x[1], x[1] + WALL_M))]
+    solids += [box(x, (6.1, 6.2), (0.0, HEIGHT_M), "wall")]
+    solids += [box(x, y, (0.0, 0.004), "floor"), box(x, y, (HEIGHT_M - 0.004, HEIGHT_M), "ceiling")]
+    south, to_east, north, to_west = walls_of(_rectangle(x, y))
+    solids += furnished(south, "portrait 0.8, bin 3.6") + furnished(to_east, "shelf 1.5, picture 3.1")
+    solids += furnished(north, "desk 1.4, window 1.4, globe 3.2") + furnished(to_west, "picture 1.0, sofa 2.7")
+    return [_looking(solid, number) for number, solid in enumerate(solids)]
+
+
+def _looking(solid: Solid, number: int) -> Solid:
+    """The solid with its faces' textures named, so that another of the same number has the same."""
+    return replace(solid, faces=tuple(replace(face, look=8 * number + k) for k, face in enumerate(solid.faces)))
+
+
+def offices() -> Building:
+    """Two identical offices on one corridor; the walk visits one, then the other, and returns to where it began."""
+    x, first, second = 14.0, 1.6, 8.4
+    gaps = ((0.0, first - WALL_M), (first + 4.0 + WALL_M, second - WALL_M), (second + 4.0 + WALL_M, x))
+    blocks = [box(gap, (2.0, 6.2), (0.0, HEIGHT_M), "wall") for gap in gaps]
+    south, east, _, west = walls_of(_rectangle((0.0, x), (0.0, 2.0)))
+    solids = [*blocks, *_office(first), *_office(second), _skirting(south), _skirting(east), _skirting(west)]
+    solids += furnished(south, "door 1.2, picture 2.7, portrait 4.4, door 6.0, picture 7.4, door 9.4, portrait 10.6, picture 11.8, door 13.2")
+    solids += furnished(east, "window 1.0") + furnished(west, "picture 1.0")
+    lamps = [(3.6, 1.0), (10.4, 1.0), (7.0, 1.0), (first + 2.0, 4.1), (second + 2.0, 4.1)]
+    path = [(2.2, 0.85)]
+    for door in (first + 2.0, second + 2.0):
+        inside = [(door, 3.1), (door + 0.8, 3.7), (door + 0.6, 4.7), (door - 0.6, 4.7), (door - 0.8, 3.7), (door, 3.1)]
+        path += [(door, 0.85), *inside, (door, 0.85)]
+    path += [(12.8, 0.85), (12.8, 1.2), (1.0, 1.2), (1.0, 0.85)]
+    return _building(x, 6.2, solids, lamps, Walk(tuple(path), 0.7, 1.1))
+
+
+ROOMS = (  # south row from west to east: plans of the outer, the east, the inner and the west wall; then the north row
+    ("cabinet 1.0, window 2.9", "picture 1.0", "picture 1.3", "portrait 1.4, bin 3.4"),
+    ("shelf 1.2, shelf 2.9, picture 4.1", "portrait 1.1", "window 2.3", "portrait 2.9"),
+    ("desk 1.2, window 1.2, locker 3.4", "crates 0.5", "pilaster 1.0, picture 3.4", "picture 2.9"),
+    ("sofa 2.3, picture 2.3", "locker 0.6", "portrait 1.1, door 3.3", "bin 3.7"),
+    ("globe 1.0, shelf 3.2", "desk 1.1, picture 2.6", "picture 3.1", "portrait 3.2"),
+    ("window 1.2, sofa 3.2", "portrait 3.2", "picture 2.2", "door 1.6, crates 3.2"),
+    ("desk 1.0, desk 3.4, picture 2.2", "picture 3.1", "portrait 1.5, door 3.5", "crates 0.6"),
+    ("pilaster 0.9, cabinet 2.3, pilaster 3.7", "bin 3.6", "picture 1.2, window 3.2", "portrait 1.0"),
+    ("shelf 0.9, crates 2.4, locker 3.8", "portrait 3.4", "door 1.4, picture 3.4", "picture 0.9"),
+    ("sofa 1.4, globe 3.5", "window 1.3, bench 3.0", "picture 1.5", "portrait 0.9"),
+)
+ROOM_M = (4.6, 4.0)
+
+
+def rooms() -> Building:
+    """Ten different rooms in two rows of five, joined by doorways to a circuit."""
+    (width, depth), pitch = ROOM_M, ROOM_M[0] + WALL_M
+    x, y = 5 * pitch - WALL_M, 2 * depth + WALL_M
+    middle, doors = (depth, depth + WALL_M), (2.5, y - 2.5)
+    openings = (1.2, x - 1.2)  # in the wall between the rows, at its two ends
+    solids = [*_doorway(True, middle, (0.0, 5.0), openings[0]), *_doorway(True, middle, (x - 5.0, x), openings[1])]
+    solids.append(box((5.0, x - 5.0), middle, (0.0, HEIGHT_M), "wall"))
+    for row, at in enumerate(doors):
+        span = (0.0, depth) if row == 0 else (depth + WALL_M, y)
+        for k in range(1, 5):
+            solids += _doorway(False, (k * pitch - WALL_M, k * pitch), span, at)
+    for number, plans in enumerate(ROOMS):
+        row, k = divmod(number, 5)
+        south, east, north, west = walls_of(_rectangle((k * pitch, k * pitch + width), (row * (depth + WALL_M), row * (depth + WALL_M) + depth)))
+        sides = (south, east, north, west) if row == 0 else (north, east, south, west)  # the furniture stands along the outer wall
+        for wall, plan in zip(sides, plans):
+            solids += furnished(wall, plan)
+    centres = [(k * pitch + width / 2.0, at) for at in (2.0, y - 2.0) for k in range(5)]
+    return _building(x, y, solids, centres, Walk(_circuit(pitch, doors, openings), 0.62, 0.6))
+
+
+def _circuit(pitch: float, doors: tuple[float, float], openings: tuple[float, float]) -> tuple[tuple[float, float], ...]:
+    """East through the south row, west through the north row, with a bow in every room."""
+    there, back = [], []
+    for k in range(5):
+        left, right, centre = k * pitch + 0.5, (k + 1) * pitch - 0.6, (k + 0.5) * pitch
+        bow = 0.45 if k % 2 else 0.9
+        there += [(left, doors[0]), (centre, doors[0] - bow), (right, doors[0])]
+        back += [(left, doors[1]), (centre, doors[1] + bow), (right, doors[1])]
+    there[0], there[-1] = (openings[0], 2.2), (openings[1], 2.2)
+    back[0], back[-1] = (openings[0], doors[1] + 0.3), (openings[1], doors[1] + 0.3)
+    return (*there, *back[::-1])

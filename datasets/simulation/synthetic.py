@@ -1,0 +1,145 @@
+"""The built-in synthetic scenes: exact truth, textured or bare, with or without a sensor's noise."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from enum import Enum
+from functools import cached_property
+
+import numpy as np
+
+from trihedron.datasets.readers.sequence import clip_range
+from trihedron.datasets.simulation import buildings
+from trihedron.datasets.simulation.buildings import Building
+from trihedron.datasets.simulation.depth_noise import kinect_depth, noisy_color
+from trihedron.datasets.simulation.furniture import curved_pieces
+from trihedron.datasets.simulation.motion import Motion, camera_pose
+from trihedron.datasets.simulation.raytracing import Geometry, geometry_of
+from trihedron.datasets.simulation.room import BOX, Room, all_faces, furnished_room
+from trihedron.datasets.simulation.shading import Atlas, render
+from trihedron.datasets.simulation.textures import bake
+from trihedron.datasets.simulation.true_surface import TrueSurface, surface_of
+from trihedron.pipeline.core.registry import register
+from trihedron.pipeline.core.slots import frame_range
+from trihedron.pipeline.core.types import EXACT_DEPTH, F64, Bool, Camera, DepthNoise, Frame, Trajectory
+
+
+class Scene(Enum):
+    """Where the camera is: one furnished room, a corridor that ends where it began, two identical offices on a corridor, ten rooms in a circuit."""
+
+    room = "room"
+    corridor = "corridor"
+    offices = "offices"
+    rooms = "rooms"
+
+
+BUILDINGS = {Scene.corridor: buildings.corridor, Scene.offices: buildings.offices, Scene.rooms: buildings.rooms}
+ROOM_FRAMES = 150  # of the room, whose walk never ends
+FOCAL_PER_WIDTH = 525.0 / 640.0  # a Kinect's nominal colour camera
+
+
+@register("dataset", "synthetic")
+@dataclass(frozen=True)
+class Synthetic:
+    """A furnished room of 5 × 4 × 2.7 m, or a building, ray traced when a frame is asked for. Frame i depends on the fields and i alone."""
+
+    frames: str = ""  # part to make, half open: A:B, A:, :B; empty = all
+    scene: Scene = Scene.room  # room | corridor | offices | rooms
+    length: int = 0  # frames; 0 = the scene's own: 150 of the room, once round a building (a longer walk goes on)
+    fps: float = 30.0
+    seed: int = 0  # of textures, path and noise
+    texture: bool = True  # false = plain surfaces: edges, but hardly a corner
+    noise: bool = True  # a Kinect's depth and image noise; false = exact
+    width: int = 640
+    height: int = 480
+    motion: Motion = Motion.walk  # walk | fast | still | pan; in a building only walk
+    slanted: bool = False  # turns two of the room's walls by about 10°
+    curved: bool = False  # adds a column, a ball and a plant to the room
+
+    def __post_init__(self) -> None:
+        frame_range(self.frames)
+        if self.length < 0:
+            raise ValueError(f"length: {self.length} is negative")
+        if self.fps <= 0:
+            raise ValueError(f"fps: {self.fps} is not positive")
+        for name in ("width", "height"):
+            if not 16 <= getattr(self, name) <= 8192:
+                raise ValueError(f"{name}: {getattr(self, name)} is not within 16 … 8192")
+        if self.seed < 0:
+            raise ValueError(f"seed: {self.seed} is negative")
+        if self.scene is not Scene.room and self.motion is not Motion.walk:
+            raise ValueError(f"motion: {self.motion.name} is for the room, a building is walked through")
+        if self.scene is not Scene.room and self.slanted:
+            raise ValueError("slanted: only the room has slanted walls")
+        if self.scene is not Scene.room and self.curved:
+            raise ValueError("curved: only the room has these pieces")
+
+    def __len__(self) -> int:
+        first, stop = self._range
+        return stop - first
+
+    def __call__(self, index: int) -> Frame | None:
+        """Frame `index` of the selection."""
+        number = self._range[0] + index
+        geometry, atlas = self._scene
+        color, exact, _, cosine = render(geometry, atlas, self._camera, self._pose(number))
+        depth = exact.astype(np.float32)
+        if self.noise:
+            rng = np.random.default_rng([self.seed, 3, number])
+            depth = kinect_depth(exact, cosine, self._camera.fx, self._camera.depth_noise, rng)
+            color = noisy_color(color, rng)
+        return Frame(number, self._stamp_ns(number), color, depth, self._camera)
+
+    def truth(self) -> Trajectory | None:
+        """The exact pose of every frame 0 … length - 1 in the scene's frame (corner of the floor, z up)."""
+        numbers = range(self._length)
+        return Trajectory(np.array([self._stamp_ns(number) for number in numbers], dtype=np.int64), np.array([self._pose(n) for n in numbers]))
+
+    def surface(self) -> TrueSurface:
+        """The exact surface of the scene, in the frame of `truth`."""
+        return surface_of(self._room)
+
+    def true_view(self, index: int) -> tuple[F64, Bool]:
+        """(h, w) exact depth in metres of frame `index` of the selection, and (h, w) whether what is seen there is curved."""
+        geometry, atlas = self._scene
+        _, depth, faces, _ = render(geometry, atlas, self._camera, self._pose(self._range[0] + index))
+        return depth, np.array([face.curved != BOX for face in all_faces(self._room)])[faces]
+
+    def _pose(self, number: int) -> F64:
+        """(4, 4) `T_world_camera` of a frame."""
+        if self._building is not None:
+            return self._building.walk.pose(self.seed, number / self.fps)
+        return camera_pose(self.motion, self.seed, number / self.fps)
+
+    def _stamp_ns(self, number: int) -> int:
+        return round(number * 1e9 / self.fps)
+
+    @cached_property
+    def _building(self) -> Building | None:
+        return BUILDINGS[self.scene]() if self.scene in BUILDINGS else None
+
+    @cached_property
+    def _length(self) -> int:
+        natural = ROOM_FRAMES if self._building is None else round(self._building.walk.duration_s * self.fps)
+        return self.length or natural
+
+    @cached_property
+    def _range(self) -> tuple[int, int]:
+        return clip_range(self.frames, self._length, f"the synthetic {self.scene.name} (dataset.length)")
+
+    @cached_property
+    def _camera(self) -> Camera:
+        focal = FOCAL_PER_WIDTH * self.width
+        noise = DepthNoise() if self.noise else EXACT_DEPTH
+        return Camera(self.width, self.height, focal, focal, (self.width - 1) / 2.0, (self.height - 1) / 2.0, self.fps, noise)
+
+    @cached_property
+    def _scene(self) -> tuple[Geometry, Atlas]:
+        return geometry_of(self._room), bake(all_faces(self._room), self.texture, self.seed, self._room.detail)
+
+    @cached_property
+    def _room(self) -> Room:
+        if self._building is not None:
+            return self._building.room
+        room = furnished_room(self.slanted)
+        return replace(room, solids=(*room.solids, *curved_pieces())) if self.curved else room

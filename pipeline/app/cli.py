@@ -1,0 +1,235 @@
+"""The command `trihedron`: `run` here, every other command from the entry-point group `trihedron.commands`.
+
+Exit codes: 0 done, 1 an error in configuration, data or a stage, 2 wrong usage, 130 interrupted. Errors are one line; `--debug` shows the traceback.
+"""
+
+from __future__ import annotations
+
+import ast
+import os
+import re
+import shlex
+import sys
+import time
+from collections.abc import Callable
+from contextlib import redirect_stderr, redirect_stdout, suppress
+from functools import partial
+from importlib.abc import InspectLoader
+from importlib.metadata import EntryPoint, entry_points, version
+from importlib.util import find_spec
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from trihedron.pipeline.core.errors import RecordingError, TrihedronError, UsageError, did_you_mean
+from trihedron.pipeline.run import memory
+
+if TYPE_CHECKING:
+    from omegaconf import DictConfig
+
+    from trihedron.pipeline.sweep.sweep import Outcome
+
+_FAILURES: list[Exception] = []  # of this process's runs
+_BEGAN = time.perf_counter()
+COMMAND_GROUP = "trihedron.commands"
+RUN_FLAGS = ("-m", "--multirun")
+OWN = ("out=", "replay=", "only=", "feedback=", "save_map=", "report=", "live=", "real_time=")  # of each run: no replay takes them from a recording
+RECORDED = ("graph", "experiment", "without", "threads", "seed", "outputs", "record", "load_map", "localise_only")  # what it may take, besides slots
+RUN_HELP = """Track a sequence: compose the configuration, run the graph, write the run folder.
+
+Usage: trihedron run [-m] [key=value ...]
+
+  dataset=NAME dataset.path=FOLDER   what to track: tum, icl_nuim, folder, mcap, synthetic (default)
+  dataset.frames=A:B                 half-open range of frames       dataset.camera=PRESET|FILE  the camera
+  graph=NAME                         structural (default), structural_paper, structural_no_refine
+  STAGE=PLUGIN STAGE.OPTION=VALUE    swap a method, set its options (trihedron plugins lists them all)
+  graph.STAGE.INPUT=TOPIC            change a wire: topic, topic@prev or topic@5
+  outputs=[trajectory]               what must be computed           threads=2  seed=0
+  out=FOLDER                         the run folder (default runs/<date>/<time>; runs/latest points at the newest)
+  record.topics=[normals]            record dense topics too         record.frames=true  embed the input frames
+  replay=FILE.mcap only=[STAGE,...]  compute these stages again, read the rest from a recording
+  save_map=FILE.mcap                 keep the map, to go on from    load_map=FILE.mcap  go on from it, or find the camera in it
+  localise_only=true                 the loaded map stays as it is
+  live=true                          play the data set in real time; frames that come while it is busy are dropped, latency is reported
+  real_time=true                     the same without dropping any
+  feedback=recorded                  delayed wires of recomputed stages see the recorded past
+  -m                                 sweep over comma-separated values, on all cores; the same again does what is missing
+  sequences=[KIND:FOLDER,...]        of a sweep: several data sets, for example ["tum:/data/desk frames=0:300",synthetic]
+  hydra/launcher=dask                of a sweep: on a cluster; hydra/sweeper=optuna: a search (README)
+  report=COMMAND                     what to do with the folder of a sweep at its end, for example: report="benchmark rotations"
+
+Example: trihedron run dataset=tum dataset.path=rgbd_dataset_freiburg3_structure_notexture_far
+Example: trihedron run replay=runs/latest/run.mcap only=[manhattan,rotation] manhattan.cone_deg=8"""
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Entry point of the command; returns the exit code."""
+    memory.settle()
+    words = list(sys.argv[1:] if argv is None else argv)
+    debug = "--debug" in words
+    words = [word for word in words if word != "--debug"]
+    try:
+        return _dispatch(words)
+    except TrihedronError as error:
+        if debug:
+            raise
+        print(f"trihedron: {error}", file=sys.stderr)
+        return error.exit_code
+    except KeyboardInterrupt:
+        print("trihedron: interrupted; what was done is kept", file=sys.stderr)
+        return 130
+    except BrokenPipeError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 0
+
+
+def _dispatch(words: list[str]) -> int:
+    commands = {entry.name: entry for entry in entry_points(group=COMMAND_GROUP)}
+    if not words or words[0] in ("-h", "--help", "help"):
+        print(_help(commands))
+        return 0
+    if words[0] == "--version":
+        print(f"trihedron {version('trihedron')}")
+        return 0
+    name, rest = words[0], words[1:]
+    if name == "run":
+        return _run(rest)
+    if name not in commands:
+        raise UsageError(name, "there is no such command", did_you_mean(name, ["run", *commands]))
+    command: Callable[[list[str]], int] = commands[name].load()
+    return command(rest)
+
+
+def _help(commands: dict[str, EntryPoint]) -> str:
+    lines = ["RGB-D SLAM for man-made scenes: swappable stages, recorded topics, single-stage replay.", "", "Usage: trihedron COMMAND ...", ""]
+    documents = {"run": RUN_HELP} | {name: _document(entry) for name, entry in sorted(commands.items())}
+    for name, text in documents.items():
+        lines.append(f"  {name:12} {text.splitlines()[0] if text else ''}")
+        lines += [f"               {line.strip()}" for line in text.splitlines() if line.strip().startswith("Example: ")][:1]
+    return "\n".join([*lines, "", "trihedron COMMAND --help explains a command; --debug shows the traceback of an error."])
+
+
+def _document(entry: EntryPoint) -> str:
+    """The docstring of the command's module, read and not run: importing what all commands need takes half a second."""
+    try:
+        spec = find_spec(entry.module)
+    except ImportError as error:
+        return f"cannot be loaded: {error}"
+    source = spec.loader.get_source(entry.module) if spec and isinstance(spec.loader, InspectLoader) else None
+    return ast.get_docstring(ast.parse(source or "")) or ""
+
+
+def _run(words: list[str]) -> int:
+    """Compose with Hydra and execute; Hydra writes `.hydra/` and carries sweeps."""
+    if "-h" in words or "--help" in words:
+        print(RUN_HELP)
+        return 0
+    for word in words:
+        if word.startswith("-") and word not in RUN_FLAGS:
+            raise UsageError(word, "is not an option of run", f"known: {', '.join(RUN_FLAGS)}; everything else is key=value")
+        if word.startswith("=") or word == "out=":
+            raise UsageError(word, "lacks a " + ("key" if word.startswith("=") else "folder"), "write key=value, for example out=runs/mine")
+    os.environ["HYDRA_FULL_ERROR"] = "1"  # exceptions come to us instead of being printed
+    with memory.growing():
+        import hydra
+
+        from trihedron.pipeline.core.config import check_added, register_configs, rewritten
+        from trihedron.pipeline.core.registry import load_plugins
+
+        load_plugins()
+        register_configs()
+    check_added(words)
+    overrides = _with_recorded(words)
+    outcomes = _swept(words)
+    _FAILURES.clear()
+    sys.argv = ["trihedron run", *sorted(overrides, key=lambda word: word not in RUN_FLAGS)]  # flags first
+    try:
+        hydra.main(config_path="pkg://trihedron.conf", config_name="root", version_base="1.3")(_task)()
+    except Exception as error:
+        raise error if isinstance(error, TrihedronError) else rewritten(error) from error
+    for outcome in outcomes:
+        if outcome.report and len(outcome.failures) < outcome.jobs:
+            _dispatch([*shlex.split(outcome.report), str(outcome.folder)])
+        outcome.raise_failures()
+    if _FAILURES and not outcomes:
+        raise _FAILURES[0]
+    return 0
+
+
+def _swept(words: list[str]) -> list[Outcome]:
+    """Where the outcomes of the sweeps that the words ask for will be; a single run does not wait for the engines of sweeps to be imported."""
+    if not any(word in RUN_FLAGS or word.lstrip("+").startswith("hydra.mode=") for word in words):
+        return []
+    from trihedron.pipeline.sweep.engines import register_engines
+
+    return register_engines()
+
+
+def _task(config: DictConfig) -> float | None:
+    """One run, or one job of a sweep, which may be in a process of its own. Returns the ATE in metres, for sweepers that search."""
+    from hydra.core.hydra_config import HydraConfig
+    from hydra.types import RunMode
+
+    from trihedron.pipeline.app.execute import execute
+
+    runtime = HydraConfig.get()
+    out = Path(runtime.runtime.output_dir)
+    work = partial(execute, config, out, list(runtime.overrides.task), _BEGAN)
+    try:
+        metrics: dict[str, Any] = _job(config, out, work) if runtime.mode == RunMode.MULTIRUN else work()
+    except Exception as error:  # one job of a sweep must not stop the others, and Hydra would print its overrides
+        _FAILURES.append(error)
+        return None
+    _point_latest(out)
+    return metrics["final"]["ate_rmse_m"] if "final" in metrics else None
+
+
+def _job(config: DictConfig, out: Path, work: Callable[[], dict[str, Any]]) -> dict[str, Any]:
+    """Do the work of a job, keeping what it prints in its folder, and how it ended in job.json."""
+    from trihedron.pipeline.core.registry import load_plugins
+    from trihedron.pipeline.sweep.jobs import DONE, FAILED, RUNNING, key_of, write_job
+
+    load_plugins()
+    key = key_of(config)
+    write_job(out, key, RUNNING)
+    try:
+        with (out / "log.txt").open("w") as log, redirect_stdout(log), redirect_stderr(log):
+            metrics = work()
+    except Exception as error:
+        write_job(out, key, FAILED, str(error) or type(error).__name__)
+        raise
+    write_job(out, key, DONE)
+    return metrics
+
+
+def _with_recorded(words: list[str]) -> list[str]:
+    """In a replay, the recording's own overrides come first and the command line on top; `out` is always new."""
+    source = next((word.partition("=")[2] for word in words if word.startswith("replay=")), "")
+    if not source:
+        return words
+    from trihedron.pipeline.record.recording import Recording
+
+    words_then = [word for word in Recording(source).overrides() if not word.startswith(OWN)]
+    for word in words_then:
+        _check_recorded(source, word)
+    return words_then + words
+
+
+def _check_recorded(source: str, word: str) -> None:
+    """A recording is data of others: it may choose stages, their options and wires, and nothing else of the program or of Hydra, which can be told
+    to write anywhere and to call anything. Raises RecordingError."""
+    from trihedron.pipeline.core.slots import SLOTS
+
+    key = re.match(r"\+{0,2}~?/?([\w]+)", word)
+    if key is None or key[1] not in (*SLOTS, *RECORDED) or "${" in word or "@" in word.partition("=")[0]:
+        raise RecordingError(source, f"was made with '{word}', which a recording has no say in", "give that on the command line if you trust it")
+
+
+def _point_latest(out: Path) -> None:
+    """`runs/latest` beside dated run folders points at the newest."""
+    runs = next((parent for parent in out.parents if parent.name == "runs"), None)
+    if runs is not None:
+        link = runs / "latest"
+        if link.is_symlink() or not link.exists():
+            link.unlink(missing_ok=True)
+            with suppress(FileExistsError):  # another job of a sweep was quicker
+                link.symlink_to(out.relative_to(runs), target_is_directory=True)

@@ -1,0 +1,267 @@
+"""From a composed configuration to a finished run folder: what `trihedron run` does."""
+
+from __future__ import annotations
+
+import importlib.metadata
+import json
+import logging
+import subprocess
+import sys
+import time
+from collections import Counter
+from collections.abc import Callable, Iterator
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from omegaconf import DictConfig, OmegaConf
+from tqdm import tqdm
+
+from trihedron.pipeline.core.config import Feedback, graph_of
+from trihedron.pipeline.core.errors import ConfigError, DataError, RecordingError, did_you_mean
+from trihedron.pipeline.core.graph import Graph
+from trihedron.pipeline.core.slots import output_of
+from trihedron.pipeline.core.types import Surface, Trajectory
+from trihedron.pipeline.record.recording import Recording, RecordingWriter
+from trihedron.pipeline.record.trajectories import TRUTH, attached_truth, format_trajectory
+from trihedron.pipeline.run import results
+from trihedron.pipeline.run.interrupts import Interrupts
+from trihedron.pipeline.run.live import Pace, is_camera
+from trihedron.pipeline.run.replay import Replay, Step
+from trihedron.pipeline.run.runner import Runner
+from trihedron.pipeline.run.state import Memory, load_map, reaches
+from trihedron.pipeline.run.timing import forget_peak
+from trihedron.pipeline.run.warm_up import prepared
+
+RECORDING = "run.mcap"
+PATH_KEYS = ("dataset.path", "dataset.camera", "load_map")
+PLAIN_PROGRESS_SECONDS = 5.0
+
+
+def execute(config: DictConfig, out: Path, overrides: list[str], began: float) -> dict[str, Any]:
+    """Run the configuration into folder `out`; `began` is when the program started (perf_counter). Returns the metrics.
+
+    Raises TrihedronError. Whatever happens after the first frame, the recording is closed and the trajectory so far is written."""
+    forget_peak()
+    if config.threads < 1:
+        raise ConfigError("threads", f"{config.threads} is not a number of threads", "give 1 or more")
+    if config.seed < 0:
+        raise ConfigError("seed", f"{config.seed} is negative", "give 0 or more")
+    graph = graph_of(config)
+    replay = _replay(config, graph)
+    frames = str(config.dataset.get("frames", "")) if config.dataset is not None else ""
+    remembered, source = _remembered(config, graph), _source(config)
+    runner = Runner(graph, config.seed, config.threads, replay, frames, remembered, _pace(config))
+    topics = _recorded_topics(config, graph, replay)
+    _announce(runner)
+    trial = partial(Runner, graph, config.seed, config.threads, replay, frames, remembered)
+    with _Warnings() as warnings, prepared(runner, trial) as waited:
+        warnings.muted = False
+        writer = RecordingWriter(out / RECORDING, _metadata(config, overrides))
+        attachments = _attachments(graph, replay)
+        for name, text in attachments.items():
+            writer.attach(name, text)
+        truth = attached_truth(attachments, str(writer.path))
+        started = time.perf_counter() - waited()  # so far, for what the recording computes with
+        try:
+            for _ in _progress(runner.steps(writer, topics, embed_frames="dataset" in topics, truth=truth)):
+                pass
+            if config.save_map:
+                runner.keeper.save(Path(config.save_map).expanduser(), _metadata(config, overrides), source)
+        finally:
+            with Interrupts() as interrupts, interrupts.held():
+                failure = _closed(writer)
+                metrics, timing = _write(runner, truth, out, started + waited(), began)
+                warnings.summarise()
+    _report(out, metrics, timing, [results.write_surface(out, value) for value in runner.result.folds.values() if isinstance(value, Surface)])
+    if failure is not None:
+        raise failure
+    return metrics
+
+
+def _closed(writer: RecordingWriter) -> RecordingError | None:
+    """Close the recording; what goes wrong must not cost the trajectory."""
+    try:
+        writer.close()
+    except RecordingError as error:
+        return error
+    return None
+
+
+def _remembered(config: DictConfig, graph: Graph) -> Callable[[int], Memory] | None:
+    """What a run begins with: nothing, or the map file it goes on from."""
+    if config.save_map and config.replay:
+        raise ConfigError("save_map", "a replay makes no map to go on from", "save the map of the run itself")
+    if config.save_map and not (folder := Path(config.save_map).expanduser().absolute().parent).is_dir():
+        raise ConfigError("save_map", f"the folder {folder} does not exist", "make it first")
+    if not config.load_map:
+        if config.localise_only:
+            raise ConfigError("localise_only", "needs a map to find the camera in", "give load_map=FILE.mcap too")
+        return None
+    if "map" not in reaches(graph.stages.values()):
+        raise ConfigError("load_map", "no stage of this graph reads a map", "choose another graph")
+    saved, source = load_map(config.load_map), _source(config)
+    return lambda first: saved.memory(first, source)
+
+
+def _pace(config: DictConfig) -> Pace:
+    if (config.live or config.real_time) and config.replay:
+        raise ConfigError("live" if config.live else "real_time", "a replay has its frames already", "leave it out")
+    if config.live and config.real_time:
+        raise ConfigError("real_time", "a live run is in real time, and drops frames", "give one of the two")
+    return Pace.live if config.live else Pace.real_time if config.real_time else Pace.none
+
+
+def _source(config: DictConfig) -> str:
+    """What is tracked, whichever part of it: the data set's options with absolute paths."""
+    options: Any = OmegaConf.to_container(config.dataset, resolve=True, enum_to_str=True) if config.dataset is not None else {}
+    options = {name: _absolute(f"dataset.{name}={value}").partition("=")[2] for name, value in options.items() if name != "frames"}
+    return json.dumps(options, sort_keys=True)
+
+
+def _replay(config: DictConfig, graph: Graph) -> Replay | None:
+    if not config.replay:
+        if config.only:
+            raise ConfigError("only", "chooses stages of a replay, and there is none", "give replay=FILE.mcap too")
+        return None
+    for name in config.only:
+        if name not in graph.stages:
+            raise ConfigError("only", f"this graph has no stage '{name}'", did_you_mean(name, graph.stages))
+    only = tuple(config.only) or tuple(graph.stages)
+    return Replay(Recording(config.replay), only, config.feedback is Feedback.recorded)
+
+
+def _recorded_topics(config: DictConfig, graph: Graph, replay: Replay | None) -> frozenset[str]:
+    """All computed topics that are not dense, and the dense ones that were named."""
+    known = set(graph.stages) | (replay.recording.topics if replay is not None else set())  # a replay may leave out stages of the run
+    for name in config.record.topics:
+        if name not in known:
+            raise ConfigError("record.topics", f"no stage writes '{name}'", did_you_mean(name, known))
+    names = {name for name in graph.stages if not output_of(name).dense} | (set(config.record.topics) & set(graph.stages))
+    names |= {"dataset"} if config.record.frames or is_camera(graph.stages["dataset"].plugin) else set()  # a camera shows no frame twice
+    return frozenset(names if replay is None else names & set(replay.only))
+
+
+def _announce(runner: Runner) -> None:
+    """Say which topics a replay lacks and computes after all."""
+    if runner.replay is not None:
+        extra = [name for name in runner.computed if name not in runner.replay.only]
+        if extra:
+            print(f"not in {runner.replay.recording.path}, computed again: {', '.join(extra)}")
+
+
+def _metadata(config: DictConfig, overrides: list[str]) -> dict[str, str]:
+    return {
+        "version": importlib.metadata.version("trihedron"),
+        "commit": _commit(),
+        "overrides": json.dumps([_absolute(word) for word in overrides]),
+        "config": OmegaConf.to_yaml(config, resolve=True),
+    }
+
+
+def _absolute(override: str) -> str:
+    """A path of the data set as seen from anywhere, so that a replay finds it from another folder."""
+    key, _, value = override.partition("=")
+    return f"{key}={Path(value).expanduser().resolve()}" if key in PATH_KEYS and value and Path(value).expanduser().exists() else override
+
+
+def _commit() -> str:
+    """The git commit of the source tree, or nothing for an installed package."""
+    folder = Path(__file__).resolve().parent
+    try:
+        top = subprocess.run(["git", "-C", str(folder), "ls-files", "--error-unmatch", __file__], capture_output=True, timeout=5)
+        head = subprocess.run(["git", "-C", str(folder), "rev-parse", "HEAD"], capture_output=True, text=True, timeout=5)
+    except (OSError, subprocess.TimeoutExpired):
+        return ""
+    return head.stdout.strip() if top.returncode == 0 else ""
+
+
+def _progress(steps: Iterator[Step]) -> Iterator[Step]:
+    """A bar with the frame rate on a terminal, a plain line every few seconds elsewhere."""
+    bar: Any = None
+    began = said = time.perf_counter()
+    for step in steps:
+        if sys.stderr.isatty():
+            bar = bar or tqdm(total=step.count, unit="frame", dynamic_ncols=True)
+            bar.update()
+        elif time.perf_counter() - said > PLAIN_PROGRESS_SECONDS:
+            said = time.perf_counter()
+            print(f"frame {step.position + 1}/{step.count}, {(step.position + 1) / (said - began):.1f} frames/s", flush=True)
+        yield step
+    if bar is not None:
+        bar.close()
+
+
+def _write(runner: Runner, truth: Trajectory | None, out: Path, started: float, began: float) -> tuple[dict[str, Any], dict[str, Any]]:
+    """The files beside the recording; returns metrics and times. A trajectory is written only where poses were computed."""
+    metrics: dict[str, Any] = {}
+    timing = runner.timing.summary(runner.threads, time.perf_counter() - started, started - began)
+    if runner.feed is not None:
+        timing["live"] = runner.feed.summary(timing["frame_ms"])
+    try:
+        if "pose" in runner.computed:
+            metrics = results.write_results(out, runner.result, truth)
+        results.write_json(out / results.TIMING, timing)
+    except OSError as error:
+        raise DataError(str(error.filename or out), f"cannot be written: {error.strerror}", "make room, or give another out=FOLDER") from error
+    return metrics, timing
+
+
+def _attachments(graph: Graph, replay: Replay | None) -> dict[str, str]:
+    """The ground truth as text: of the recording that is replayed, else of the data set. A run is judged by that text, so a replay agrees."""
+    if replay is not None:
+        return replay.recording.attachments
+    truth: Trajectory | None = graph.stages["dataset"].plugin.truth()
+    return {TRUTH: format_trajectory(truth)} if truth is not None else {}
+
+
+def _report(out: Path, metrics: dict[str, Any], timing: dict[str, Any], surfaces: list[str]) -> None:
+    status = metrics.get("status", {})
+    if status:
+        print("frames: " + ", ".join(f"{count} {name}" for name, count in status.items() if count))
+    for name, reason in metrics.get("reasons", {}).items():
+        print(f"{name}, most of them: {reason}")
+    if live := timing.get("live"):
+        late = live["latency_ms"]
+        said = f"{live['came']} frames came, {live['taken']} were taken, {live['dropped']} dropped"
+        print(f"live: {said}; a pose is ready {late['p50']:.0f} ms after its frame came (median; at most {late['max']:.0f} ms)")
+    if "final" in metrics:
+        print(f"ATE {metrics['final']['ate_rmse_m']:.4f} m (as tracked {metrics['causal']['ate_rmse_m']:.4f} m)")
+    for line in surfaces:
+        print(line)
+    for path in sorted(out.iterdir()):
+        if path.is_file():
+            print(f"  {path}")
+
+
+class _Warnings(logging.Handler):
+    """Collects the warnings of a run, once it is no longer `muted`: the first of each kind is shown when it comes, all are counted at the end."""
+
+    def __init__(self) -> None:
+        super().__init__(logging.WARNING)
+        self.counts: Counter[str] = Counter()
+        self.first: dict[str, str] = {}
+        self.muted = True
+
+    def emit(self, record: logging.LogRecord) -> None:
+        if not self.muted:
+            kind = str(record.msg)
+            if kind not in self.first:
+                self.first[kind] = record.getMessage()
+                print(f"trihedron: warning: {self.first[kind]}", file=sys.stderr)
+            self.counts[kind] += 1
+
+    def summarise(self) -> None:
+        """Print the count of each kind that came more than once."""
+        for kind, count in self.counts.items():
+            if count > 1:
+                print(f"trihedron: {count} such warnings, the first: {self.first[kind]}", file=sys.stderr)
+
+    def __enter__(self) -> _Warnings:
+        logger = logging.getLogger("trihedron")
+        logger.addHandler(self)
+        logger.propagate = False
+        return self
+
+    def __exit__(self, *exception: object) -> None:
+        logging.getLogger("trihedron").removeHandler(self)

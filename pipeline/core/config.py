@@ -1,0 +1,207 @@
+"""Configuration by Hydra: the plugins' own fields, the graph files in `conf/`, and the root keys of a run.
+
+Every registered plugin becomes an option `slot=name` of a typed group; its fields are validated by OmegaConf and once more by the plugin itself.
+Hydra's many-line errors are rewritten as one line.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import re
+from collections.abc import Iterable
+from enum import Enum
+from typing import Any, get_type_hints
+
+from hydra import compose, initialize_config_module
+from hydra.core.config_store import ConfigStore
+from hydra.errors import MissingConfigException, OverrideParseException
+from omegaconf import DictConfig, OmegaConf
+from omegaconf.errors import ValidationError
+
+from trihedron.pipeline.core.errors import ConfigError, TrihedronError, UsageError, did_you_mean
+from trihedron.pipeline.core.graph import Graph, build_graph
+from trihedron.pipeline.core.registry import load_plugins, options_of, plugin_class, plugins_of
+from trihedron.pipeline.core.slots import SLOTS
+
+PLUGIN_KEY = "plugin"  # which plugin a slot's configuration belongs to
+SWEEPER, SEARCH, DASK = (f"hydra_plugins.trihedron.{name}" for name in ("Sweeper", "Search", "Dask"))  # `_target_` of Hydra's groups
+
+
+class Feedback(Enum):
+    """What a recomputed stage's delayed wires see in a replay: the new values, or those of the recording."""
+
+    new = "new"
+    recorded = "recorded"
+
+
+@dataclasses.dataclass
+class RecordOptions:
+    """`topics`: names of dense topics to record besides all others. `frames` embeds the input frames, lossless."""
+
+    topics: list[str] = dataclasses.field(default_factory=list)
+    frames: bool = False
+
+
+@dataclasses.dataclass
+class RunOptions:
+    """The root keys of a run, besides one group for each slot (`trihedron plugins` lists them)."""
+
+    defaults: list[Any] = dataclasses.field(
+        default_factory=lambda: [
+            "_self_",
+            {"dataset": "synthetic"},
+            {"graph": "structural"},
+            {"experiment": None},
+            {"without": None},
+            {"override hydra/job_logging": "none"},
+            {"override hydra/hydra_logging": "none"},
+            {"override hydra/launcher": "joblib"},
+            {"override hydra/sweeper": "trihedron"},
+        ]
+    )
+    graph: dict[str, Any] = dataclasses.field(default_factory=dict)  # graph=NAME chooses a file; graph.STAGE.INPUT=TOPIC changes a wire
+    out: str = "runs/${now:%Y-%m-%d}/${now:%H-%M-%S}"  # the run folder
+    threads: int = 2
+    seed: int = 0
+    outputs: list[str] = dataclasses.field(default_factory=lambda: ["trajectory"])
+    replay: str = ""  # a recording to read topics from
+    only: list[str] = dataclasses.field(default_factory=list)  # stages that a replay computes again; [] = all
+    feedback: Feedback = Feedback.new
+    report: str = ""  # a command that is given the folder of a sweep when all its jobs are done, for example: benchmark rotations
+    sequences: list[str] = dataclasses.field(default_factory=list)  # of a sweep: KIND:FOLDER and options after blanks, see sweep.words_of_sequence
+    record: RecordOptions = dataclasses.field(default_factory=RecordOptions)
+    save_map: str = ""  # write the map, and all that is needed to go on, to this file
+    load_map: str = ""  # go on from such a file
+    localise_only: bool = False  # the loaded map stays as it is
+    live: bool = False  # frames come at the camera's rate, and those for which the run comes too late are dropped
+    real_time: bool = False  # frames come at the camera's rate, none is dropped
+    hydra: Any = dataclasses.field(
+        default_factory=lambda: {"run": {"dir": "${out}"}, "sweep": {"dir": "${out}", "subdir": "${hydra.job.num}"}, "output_subdir": ".hydra"}
+    )
+
+
+@dataclasses.dataclass
+class SearchOptions:
+    """hydra.sweeper of `hydra/sweeper=optuna`: see pipeline/search.py."""
+
+    _target_: str = SEARCH
+    trials: int = 30  # besides the default configuration
+    batch: int = 2  # trials chosen at once, without knowing each other's value, and so run side by side
+    objective: str = "final.ate_rmse_m"  # a key of metrics.json
+    direction: str = "minimize"  # or maximize
+    seed: int = 0  # of the sampler
+    params: Any = None  # overrides, as of any sweeper
+
+
+def register_configs() -> None:
+    """Put every loaded plugin and the root into Hydra's ConfigStore; call `registry.load_plugins` first."""
+    store = ConfigStore.instance()
+    for slot in SLOTS:
+        for name, plugin in plugins_of(slot).items():
+            store.store(group=slot, name=name, node=_option(name, plugin))
+    slots = [(slot, Any, dataclasses.field(default=None)) for slot in SLOTS]
+    store.store(group="hydra/sweeper", name="trihedron", node={"_target_": SWEEPER, "max_batch_size": None, "params": None})
+    store.store(group="hydra/sweeper", name="optuna", node=SearchOptions)
+    store.store(group="hydra/launcher", name="dask", node={"_target_": DASK, "address": ""})
+    store.store(name="root", node=dataclasses.make_dataclass("Root", slots, bases=(RunOptions,)))
+
+
+def _option(name: str, plugin: type[Any]) -> type[Any]:
+    """The unfrozen twin of a plugin that Hydra wants (a frozen dataclass would be a read-only node), with the plugin's name."""
+    hints = get_type_hints(plugin)
+    fields: list[Any] = [(PLUGIN_KEY, str, dataclasses.field(default=name))]
+    for option in options_of(plugin):
+        made = option.default_factory is not dataclasses.MISSING
+        default = dataclasses.field(default_factory=option.default_factory) if made else dataclasses.field(default=option.default)
+        fields.append((option.name, hints[option.name], default))
+    return dataclasses.make_dataclass(plugin.__name__, fields)
+
+
+def graph_of(config: DictConfig) -> Graph:
+    """The checked graph of a composed configuration, its plugins made. Raises ConfigError or GraphError, one line each."""
+    for slot in SLOTS:
+        if isinstance(config.get(slot), str):
+            raise ConfigError(slot, "this graph has no such stage", "choose another graph or wire the stage in a graph file")
+    wiring: Any = OmegaConf.to_container(config.graph, resolve=True)
+    if (stage := next((stage for stage, inputs in wiring.items() if not isinstance(inputs, dict)), None)) is not None:
+        raise ConfigError(f"graph.{stage}", f"'{wiring[stage]}' is not the wires of a stage", f"choose a plugin with {stage}=NAME")
+    plugins = {slot: make_plugin(slot, config[slot]) for slot in wiring if slot in SLOTS and config.get(slot) is not None}
+    if config.localise_only and "map" in plugins:
+        plugins["map"] = plugin_class("map", "none")()
+        if hasattr(plugins.get("pose"), "submap_after"):  # a camera that is only localised begins no map of its own: it stays lost
+            plugins["pose"] = dataclasses.replace(plugins["pose"], submap_after=0)
+    return build_graph(wiring, plugins, list(config.outputs))
+
+
+def make_plugin(slot: str, options: DictConfig) -> Any:
+    """The plugin a slot's options describe; lists become tuples. Raises ConfigError naming the option that is out of range."""
+    values: Any = OmegaConf.to_container(options, resolve=True)
+    kind = plugin_class(slot, values.pop(PLUGIN_KEY))
+    try:
+        return kind(**{name: tuple(value) if isinstance(value, list) else value for name, value in values.items()})
+    except (ValueError, TypeError) as error:
+        field, _, cause = str(error).partition(": ")
+        place, cause = (f"{slot}.{field}", cause) if cause and field.isidentifier() else (slot, str(error))
+        raise ConfigError(place, cause, f"see trihedron plugins for the options of {slot}") from error
+
+
+def check_added(overrides: Iterable[str]) -> None:
+    """Hydra lets `+key=value` add any key, and nobody would read it. Raises UsageError for a key that no run has."""
+    known = {f.name for f in dataclasses.fields(RunOptions) if f.name != "defaults"} | set(SLOTS) | {"experiment", "without"}
+    for word in overrides:
+        if (added := re.match(r"\+{1,2}([^=@]*)", word)) is not None and (root := re.split(r"[./]", added[1])[0]) not in known:
+            cure = did_you_mean(root, known)
+            raise UsageError(added[1], "there is no such key to add to", cure if cure.startswith("did") else "see trihedron run --help")
+
+
+def composed(overrides: Iterable[str]) -> DictConfig:
+    """The configuration that `trihedron run` would make of these overrides. Raises TrihedronError, one line, as that does."""
+    load_plugins()
+    register_configs()
+    try:
+        with initialize_config_module("trihedron.conf", version_base="1.3"):
+            return compose("root", overrides=list(overrides))
+    except Exception as error:
+        raise rewritten(error) from error
+
+
+def rewritten(error: Exception) -> TrihedronError:
+    """What Hydra and OmegaConf raise while they compose, as one line with place, cause and cure."""
+    text = " ".join(str(error).split())
+    cause: BaseException = error.__cause__ or error
+    if match := re.search(r"Ambiguous value for argument '([^=']*)=([^']*)'", text):
+        return UsageError(match[1], f"'{match[2]}' is several values", "add -m to run once with each, or write a list as [A,B]")
+    if isinstance(error, OverrideParseException):
+        return UsageError(error.override, "is not an override", "write key=value, for example threads=1 (quote lists: 'only=[pose]')")
+    if isinstance(error, MissingConfigException) and (match := re.search(r"Could not find '([\w/]+)/([^'/]*)'", text)):
+        return _unknown_option(match[1], match[2], list(error.options or []))
+    if match := re.search(r"Could not override '([\w./]+)'", text):
+        return _unknown_key(match[1])
+    if isinstance(cause, ValidationError) and "is not a ListConfig" in str(cause):
+        return ConfigError(str(getattr(cause, "full_key", "")), "is not a list", "write it as [A,B], quoted for the shell")
+    if isinstance(cause, ValidationError):
+        place = getattr(cause, "full_key", None) or text.partition("=")[0].rpartition(" ")[2]
+        return ConfigError(str(place), " ".join(str(cause.msg or cause).split()).partition(" full_key")[0], "give a value of that type")
+    if isinstance(error, OSError):
+        return ConfigError("out", f"the folder cannot be made: {error.strerror}: {error.filename}", "give another out=FOLDER")
+    place = str(getattr(cause, "full_key", "") or "configuration")
+    return ConfigError(place, text.partition(" full_key")[0], "see trihedron run --help")
+
+
+def _unknown_option(group: str, name: str, options: list[str]) -> TrihedronError:
+    if name.startswith("submitit"):
+        return ConfigError(group, f"{name} is not installed", "pip install 'trihedron[cluster]'")
+    what = f"there is no plugin '{name}' for the slot '{group}'" if group in SLOTS else f"there is no {group} '{name}'"
+    return ConfigError(group, what, did_you_mean(name, options))
+
+
+def _unknown_key(key: str) -> TrihedronError:
+    group, _, option = key.rpartition(".")
+    if group in SLOTS:
+        owners = {name: {f.name for f in options_of(plugin)} for name, plugin in plugins_of(group).items()}
+        having = sorted(name for name, options in owners.items() if option in options)
+        all_options = {known for options in owners.values() for known in options}
+        cure = f"it belongs to {group}={' or '.join(having)}" if having else did_you_mean(option, all_options)
+        return ConfigError(key, f"the chosen plugin has no option '{option}'", cure)
+    known = {f.name for f in dataclasses.fields(RunOptions) if f.name not in ("defaults", "hydra")} | set(SLOTS)
+    return ConfigError(key, "there is no such key", did_you_mean(key, known) if not group else "see trihedron run --help")

@@ -1,0 +1,166 @@
+"""The graph: stages and the wires between them, checked whole before a frame is read."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from trihedron.pipeline.core.errors import GraphError, did_you_mean
+from trihedron.pipeline.core.registry import parameters_of_method
+from trihedron.pipeline.core.slots import FOLDS, SLOTS, accepts_none, inputs_of, output_of, strip_none
+
+TRAJECTORY = "trajectory"  # the output made of the topics `pose` and `map`
+PREVIOUS = -1  # delay of `topic@prev`
+
+
+@dataclass(frozen=True)
+class Wire:
+    """Where an input comes from: a topic of the same frame (delay 0), of exactly `delay` frames ago, or its latest earlier value (PREVIOUS)."""
+
+    topic: str
+    delay: int = 0
+
+    def __str__(self) -> str:
+        return self.topic + ("" if self.delay == 0 else "@prev" if self.delay == PREVIOUS else f"@{self.delay}")
+
+
+@dataclass(frozen=True)
+class Stage:
+    """One plugin in the graph. `inputs` are the wires of the parameters it takes; `required` those whose None skips the stage; `absent` the optional
+    ones that are wired to null: always None."""
+
+    name: str  # slot, configuration group and topic
+    plugin: Any
+    inputs: Mapping[str, Wire]
+    required: frozenset[str]
+    absent: frozenset[str]
+    wants_rng: bool
+
+    @property
+    def fold(self) -> bool:
+        """Whether the stage gathers frames into a result written at the end."""
+        return self.name in FOLDS
+
+
+@dataclass(frozen=True)
+class Graph:
+    """Stages in an order in which each comes after those whose value of the same frame it reads."""
+
+    stages: Mapping[str, Stage]
+    outputs: tuple[str, ...]
+
+    def needed(self, targets: Iterable[str]) -> set[str]:
+        """The stages that `targets` depend on, delayed wires included, and the targets."""
+        found: set[str] = set()
+        pending = list(targets)
+        while pending:
+            name = pending.pop()
+            if name not in found:
+                found.add(name)
+                pending += [wire.topic for wire in self.stages[name].inputs.values()]
+        return found
+
+
+def parse_wire(text: str, place: str) -> Wire:
+    """`topic`, `topic@prev` or `topic@5`. Raises GraphError for anything else."""
+    match = re.fullmatch(r"(\w+)(?:@(prev|[1-9]\d*))?", str(text))
+    if not match:
+        raise GraphError(place, f"'{text}' is not a wire", "write topic, topic@prev or topic@5")
+    delay = match[2]
+    return Wire(match[1], 0 if delay is None else PREVIOUS if delay == "prev" else int(delay))
+
+
+def build_graph(wiring: Mapping[str, Mapping[str, str | None]], plugins: Mapping[str, Any], outputs: Iterable[str]) -> Graph:
+    """Join plugins (slot -> instance) by `wiring` (stage -> input -> wire, None = never) and keep what `outputs` need.
+
+    Raises GraphError, one line each: a stage without plugin, an unknown input or topic, a missing wire, a type that does not fit, a delayed wire
+    into an input that cannot be None, a cycle within one frame, an unknown output."""
+    stages = {name: _stage(name, wiring[name] or {}, plugins) for name in wiring}
+    for stage in stages.values():
+        for parameter, wire in stage.inputs.items():
+            _check_wire(stage, parameter, wire, stages)
+    graph = Graph({name: stages[name] for name in _sorted(stages)}, tuple(outputs))
+    needed = graph.needed(_targets(graph))
+    return Graph({name: stage for name, stage in graph.stages.items() if name in needed}, graph.outputs)
+
+
+def _stage(name: str, wires: Mapping[str, str | None], plugins: Mapping[str, Any]) -> Stage:
+    place = f"graph.{name}"
+    if name not in SLOTS:
+        raise GraphError(place, f"there is no slot '{name}'", did_you_mean(name, SLOTS))
+    plugin = plugins.get(name)
+    if plugin is None:
+        raise GraphError(place, "no plugin is chosen for this stage", f"give {name}=PLUGIN (see trihedron plugins)")
+    given = inputs_of(name)
+    for parameter in wires:
+        if parameter not in given:
+            raise GraphError(f"{place}.{parameter}", f"the slot '{name}' has no input '{parameter}'", did_you_mean(parameter, given))
+    taken = parameters_of_method(name, type(plugin))
+    absent = frozenset(p for p in taken if p in wires and wires[p] is None and accepts_none(given[p]))
+    inputs = {}
+    for parameter in taken:
+        if parameter == "rng" or parameter in absent:
+            continue
+        wire = wires.get(parameter)
+        if wire is None:
+            cause = f"the input is not wired, and {type(plugin).__name__} takes it"
+            raise GraphError(f"{place}.{parameter}", cause, f"give graph.{name}.{parameter}=TOPIC")
+        inputs[parameter] = parse_wire(wire, f"{place}.{parameter}")
+    required = frozenset(p for p in inputs if not accepts_none(given[p]))
+    return Stage(name, plugin, inputs, required, absent, "rng" in taken)
+
+
+def _check_wire(stage: Stage, parameter: str, wire: Wire, stages: Mapping[str, Stage]) -> None:
+    place = f"graph.{stage.name}.{parameter}"
+    if wire.topic not in stages:
+        raise GraphError(place, f"no stage writes topic '{wire.topic}'", did_you_mean(wire.topic, stages))
+    expected, written = strip_none(inputs_of(stage.name)[parameter]), output_of(wire.topic)
+    if expected is not written:
+        fitting = [name for name in stages if output_of(name) is expected]
+        cure = f"wire it to {' or '.join(fitting)}" if fitting else f"no stage of this graph writes {expected.__name__}"
+        raise GraphError(place, f"topic '{wire.topic}' is {written.__name__}, the input takes {expected.__name__}", cure)
+    if wire.delay and parameter in stage.required:
+        cause = f"'{wire}' is None at first, and the input cannot be None"
+        raise GraphError(place, cause, f"wire it to '{wire.topic}', or take the input as optional")
+
+
+def _sorted(stages: Mapping[str, Stage]) -> list[str]:
+    """Topological order by the wires within a frame, ties in the order of the slots. Raises GraphError naming a cycle."""
+    order: list[str] = []
+    waiting = [name for name in SLOTS if name in stages]
+    while waiting:
+        ready = [n for n in waiting if all(w.delay or w.topic in order for w in stages[n].inputs.values())]
+        if not ready:
+            cycle = _cycle(waiting[0], stages, set(waiting))
+            raise GraphError("graph", f"{' -> '.join(cycle)} need each other within one frame", "put @prev on one of these wires")
+        order.append(ready[0])
+        waiting.remove(ready[0])
+    return order
+
+
+def _cycle(start: str, stages: Mapping[str, Stage], among: set[str]) -> list[str]:
+    path = [start]
+    while True:
+        following = next(w.topic for w in stages[path[-1]].inputs.values() if not w.delay and w.topic in among)
+        if following in path:
+            return [*path[path.index(following) :], following]
+        path.append(following)
+
+
+def _targets(graph: Graph) -> list[str]:
+    """The stages behind the outputs."""
+    targets = []
+    for output in graph.outputs:
+        if output == TRAJECTORY:
+            if "pose" not in graph.stages:
+                raise GraphError("outputs", "a trajectory needs the stage 'pose', which this graph lacks", "leave it out or add the stage")
+            targets += [name for name in ("pose", "map") if name in graph.stages]
+        elif output in graph.stages:
+            targets.append(output)
+        else:
+            raise GraphError("outputs", f"no stage writes '{output}'", did_you_mean(output, [TRAJECTORY, *graph.stages]))
+    if not targets:
+        raise GraphError("outputs", "is empty, so nothing would run", "give outputs=[trajectory]")
+    return targets

@@ -1,0 +1,128 @@
+"""Plugins by slot and name, checked against their slot's contract when they register."""
+
+from __future__ import annotations
+
+import dataclasses
+import importlib
+import inspect
+import pkgutil
+from collections.abc import Callable
+from importlib.metadata import entry_points
+from typing import Any, TypeVar, get_type_hints
+
+import numpy as np
+
+from trihedron.pipeline.core.errors import PluginError, did_you_mean
+from trihedron.pipeline.core.slots import FOLDS, SLOTS, inputs_of, method_of, output_of, strip_none
+
+Plugin = TypeVar("Plugin", bound=type)
+_PLUGINS: dict[str, dict[str, type[Any]]] = {slot: {} for slot in SLOTS}
+_BUILT_IN = ("trihedron.datasets", "trihedron.plugins")
+ENTRY_POINT_GROUP = "trihedron.plugins"
+
+
+def register(slot: str, name: str) -> Callable[[Plugin], Plugin]:
+    """Class decorator: make a frozen dataclass the plugin `name` of `slot`.
+
+    Raises PluginError, naming the plugin and its file, when the slot is unknown, the name is taken, the class is not a frozen dataclass,
+    or its method's parameters or return type are not the slot's.
+    """
+
+    def decorate(plugin: Plugin) -> Plugin:
+        place = f"plugin {slot}={name} ({_source_of(plugin)})"
+        if slot not in SLOTS:
+            raise PluginError(place, f"there is no slot '{slot}'", did_you_mean(slot, SLOTS))
+        known = _PLUGINS[slot].get(name)
+        if known is not None and (known.__module__, known.__qualname__) != (plugin.__module__, plugin.__qualname__):
+            raise PluginError(place, f"the name is taken by {_source_of(known)}", "register it under another name")
+        params = getattr(plugin, "__dataclass_params__", None)
+        if params is None or not params.frozen:
+            raise PluginError(place, "is not a frozen dataclass", "put @dataclass(frozen=True) under @register")
+        _check_contract(slot, plugin, place)
+        _PLUGINS[slot][name] = plugin
+        return plugin
+
+    return decorate
+
+
+def _source_of(plugin: type) -> str:
+    try:
+        return inspect.getsourcefile(plugin) or plugin.__module__
+    except TypeError:
+        return plugin.__module__
+
+
+def _check_contract(slot: str, plugin: type, place: str) -> None:
+    """Compare the plugin's method with the slot's: a subset of its parameters (and rng), equal types, the slot's return type."""
+    for method in ("start", "add", "finish") if slot in FOLDS else ("__call__",):
+        if not any(method in vars(base) for base in plugin.__mro__):
+            raise PluginError(place, f"has no method {method}", f"the slot '{slot}' needs it")
+    method = method_of(slot)
+    try:
+        hints = get_type_hints(getattr(plugin, method))
+    except NameError as error:
+        raise PluginError(place, f"type hint of {method} not found: {error}", "import it outside TYPE_CHECKING") from error
+    allowed = {**inputs_of(slot), "rng": np.random.Generator}
+    for name in parameters_of_method(slot, plugin):
+        if name not in allowed:
+            raise PluginError(place, f"{method} takes '{name}', which the slot '{slot}' does not give", did_you_mean(name, allowed))
+        if hints.get(name) != allowed[name]:
+            raise PluginError(place, f"{method} takes '{name}' as {_show(hints.get(name))}", f"the slot gives {_show(allowed[name])}")
+    returned = get_type_hints(getattr(plugin, "finish" if slot in FOLDS else "__call__")).get("return")
+    if strip_none(returned) != output_of(slot):
+        raise PluginError(place, f"returns {_show(returned)}", f"the slot '{slot}' returns {_show(output_of(slot))}")
+
+
+def _show(hint: Any) -> str:
+    if hint is None:
+        return "nothing declared"
+    return hint.__name__ if isinstance(hint, type) else str(hint).replace("trihedron.pipeline.core.types.", "")
+
+
+def parameters_of_method(slot: str, plugin: type) -> list[str]:
+    """The inputs a plugin asks for, `rng` included, in its own order."""
+    names = inspect.signature(getattr(plugin, method_of(slot))).parameters
+    return [name for name in names if name not in ("self", "state") and not (slot == "dataset" and name == "index")]
+
+
+def check_value(slot: str, value: Any, index: int) -> None:
+    """Raise TypeError or ValueError unless a plugin returned its slot's type, with the frame's index on it."""
+    if not isinstance(value, output_of(slot)):
+        raise TypeError(f"returned {type(value).__name__}, the slot's type is {output_of(slot).__name__}")
+    if value.index != index:
+        raise ValueError(f"returned a {type(value).__name__} of frame {value.index} at frame {index}")
+
+
+def plugin_class(slot: str, name: str) -> type[Any]:
+    """The class registered under slot and name. Raises PluginError with the closest names otherwise."""
+    if slot not in SLOTS:
+        raise PluginError(slot, f"there is no slot '{slot}'", did_you_mean(slot, SLOTS))
+    if name not in _PLUGINS[slot]:
+        raise PluginError(slot, f"there is no plugin '{name}' for the slot '{slot}'", did_you_mean(name, _PLUGINS[slot]))
+    return _PLUGINS[slot][name]
+
+
+def plugins_of(slot: str) -> dict[str, type[Any]]:
+    """Name -> class of a slot's registered plugins, sorted by name."""
+    return dict(sorted(_PLUGINS[slot].items()))
+
+
+def options_of(plugin: type[Any]) -> list[dataclasses.Field[Any]]:
+    """The configuration fields of a plugin."""
+    return list(dataclasses.fields(plugin))
+
+
+def load_plugins() -> None:
+    """Import every built-in plugin and each module of the entry-point group `trihedron.plugins`. Raises PluginError for one that does not load."""
+    for package in _BUILT_IN:
+        root = importlib.import_module(package)
+        for module in pkgutil.walk_packages(root.__path__, package + "."):
+            importlib.import_module(module.name)
+    for entry in entry_points(group=ENTRY_POINT_GROUP):
+        try:
+            entry.load()
+        except PluginError:
+            raise
+        except Exception as error:
+            place = f"plugin package {entry.dist.name if entry.dist else entry.name} ({entry.value})"
+            raise PluginError(place, f"does not load: {type(error).__name__}: {error}", "mend it or uninstall it") from error

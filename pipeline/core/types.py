@@ -1,0 +1,421 @@
+"""The values that travel between stages.
+
+Conventions, said once. Camera frame: x right, y down, z forward, metres. Pixel centres at integers. Depth in metres, 0 = none.
+`T_a_b` maps points of frame b into frame a: `p_a = T_a_b @ p_b`; `R_a_b`, `t_a_b` likewise. A plane is `n·x + d = 0` with `|n| = 1`;
+in the camera frame `d >= 0`, so n points towards the camera. Angles are radians unless the name says `_deg`.
+A pose covariance is that of `xi = (rho, phi)` in `T_world_camera = T_estimate · Exp(xi)` (camera frame, translation first),
+in the map about it: relative to the keyframe that the pose names; how far that has drifted from the first frame is not in it.
+
+Every value is a frozen dataclass with `index` (frame number in the data set) and `stamp_ns`. Array fields declare element type and shape
+with `Shape`; a letter stands for a length that is the same wherever the letter appears in one value. They are checked, in O(1), when the
+value is made, and the arrays become read-only.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Hashable
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Annotated, Any, ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from trihedron.pipeline.core.arrays import F32, F64, I32, U8, Bool, Shape, Value
+from trihedron.pipeline.core.table import Column, Table
+
+__all__ = [
+    "DEGRADED",
+    "EXACT_DEPTH",
+    "F32",
+    "F64",
+    "I32",
+    "LOST",
+    "OK",
+    "PLANE_KINDS",
+    "U8",
+    "Bool",
+    "Camera",
+    "Column",
+    "Correction",
+    "DepthNoise",
+    "Frame",
+    "FrameReference",
+    "Keypoints",
+    "LineSegments",
+    "ManhattanFrame",
+    "Map",
+    "Matches",
+    "Normals",
+    "Planes",
+    "Pose",
+    "PredictedView",
+    "Rotation",
+    "Segments",
+    "Shape",
+    "Surface",
+    "Table",
+    "Tracks",
+    "Trajectory",
+    "Translation",
+    "Value",
+]  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Frame(Value):
+    """One registered colour and depth image: RGB and metres (0 = none)."""
+
+    dense: ClassVar[bool] = True
+    color: Annotated[U8, Shape("h", "w", 3)]
+    depth_m: Annotated[F32, Shape("h", "w")]
+    camera: Camera
+
+    @cached_property
+    def gray(self) -> U8:
+        """(h, w) luminance."""
+        import cv2
+
+        return np.asarray(cv2.cvtColor(self.color, cv2.COLOR_RGB2GRAY), dtype=np.uint8)
+
+
+@dataclass(frozen=True)
+class FrameReference(Value):
+    """Stands for a frame in a recording that does not embed it (topic `frames`)."""
+
+    camera: Camera
+
+
+@dataclass(frozen=True)
+class Normals(Value):
+    """Unit surface normals towards the camera on a grid: cell (r, c) belongs to pixel (x = c·stride, y = r·stride); NaN = none."""
+
+    dense: ClassVar[bool] = True
+
+    normals: Annotated[F32, Shape("h", "w", 3)]
+    stride: int
+
+
+@dataclass(frozen=True)
+class Keypoints(Value):
+    """Points of interest. `points_m` is the back-projection (camera frame), NaN without a trustworthy depth; `sigma_px` grows with the octave."""
+
+    pixels: Annotated[F32, Shape("n", 2)]
+    points_m: Annotated[F32, Shape("n", 3)]
+    sigma_px: Annotated[F32, Shape("n")]
+    sigma_m: Annotated[F32, Shape("n")]  # of the depth, NaN where points_m is
+    octaves: Annotated[U8, Shape("n")]
+    angles_deg: Annotated[F32, Shape("n")]
+    descriptors: Annotated[U8, Shape("n", "b")]
+    metric: str = "hamming"  # distance between descriptors: hamming | l2
+
+
+@dataclass(frozen=True)
+class LineSegments(Value):
+    """Straight edges of the image: end points (start, end) × (x, y), and binary descriptors."""
+
+    endpoints_px: Annotated[F32, Shape("n", 2, 2)]
+    descriptors: Annotated[U8, Shape("n", "b")]
+
+
+@dataclass(frozen=True)
+class Segments(Value):
+    """The image's line segments lifted to 3D. `endpoints_m` are the extreme inliers along the fitted line, in the order of `endpoints_px`
+    (camera frame); NaN where depth supports no line. `covariance_m2` is that of each 3D end point."""
+
+    endpoints_px: Annotated[F32, Shape("n", 2, 2)]
+    endpoints_m: Annotated[F32, Shape("n", 2, 3)]
+    covariance_m2: Annotated[F32, Shape("n", 2, 3, 3)]
+    descriptors: Annotated[U8, Shape("n", "b")]
+
+
+@dataclass(frozen=True)
+class Planes(Value):
+    """Planar regions, largest first. `covariance` is that of (a, b, d): the normal's tangent coordinates in `geometry.tangent_basis(n)` and d.
+    `moments` is `Σ w [x;1][x;1]ᵀ` over the region's points with `w = 1/σ_z²`. `samples_m` spreads points over the region (NaN-padded), for overlap.
+    `labels` is on the grid of the normals: 0 = none, i + 1 = plane i."""
+
+    coefficients: Annotated[F64, Shape("n", 4)]  # (n, d), d >= 0
+    covariance: Annotated[F64, Shape("n", 3, 3)]
+    moments: Annotated[F64, Shape("n", 4, 4)]
+    pixels: Annotated[I32, Shape("n")]  # image pixels covered
+    samples_m: Annotated[F32, Shape("n", "s", 3)]
+    labels: Annotated[U8, Shape("h", "w")]
+    stride: int
+
+
+@dataclass(frozen=True)
+class ManhattanFrame(Value):
+    """Orthogonal directions of the scene: k rotations `R_camera_manhattan` whose columns are the axes seen from the camera.
+
+    `supported` says whether the scene shows a Manhattan frame at all; `ids` name the frames across time. `covariance` is that of the small
+    rotation phi in `R = Exp(phi) R_estimate` (camera frame, rad²); `inliers` and `spread` (rad, NaN = axis not seen) are per axis;
+    `gap` is the relative distance to a proven optimum (NaN when none is proven)."""
+
+    rotations: Annotated[F64, Shape("k", 3, 3)]
+    ids: Annotated[I32, Shape("k")]
+    covariance: Annotated[F64, Shape("k", 3, 3)]
+    inliers: Annotated[I32, Shape("k", 3)]
+    spread: Annotated[F64, Shape("k", 3)]
+    supported: bool
+    gap: float = float("nan")
+
+
+@dataclass(frozen=True)
+class Tracks(Value):
+    """Features of this frame found in the previous one. Pairs are rows (previous, current).
+
+    The previous geometry is copied, in the previous camera frame, so that motion can be solved from Tracks and the current features alone.
+    `R_current_previous` is the rotation that said where to look, corrected by what was found."""
+
+    previous_index: int
+    keypoints: Annotated[I32, Shape("n", 2)]
+    points_m: Annotated[F32, Shape("n", 3)]  # previous; NaN without depth
+    sigma_m: Annotated[F32, Shape("n")]  # of their depth
+    segments: Annotated[I32, Shape("m", 2)]
+    endpoints_m: Annotated[F32, Shape("m", 2, 3)]  # previous; NaN without depth
+    planes: Annotated[I32, Shape("p", 2)]
+    coefficients: Annotated[F64, Shape("p", 4)]  # previous
+    plane_covariance: Annotated[F64, Shape("p", 3, 3)]
+    R_current_previous: Annotated[F64, Shape(3, 3)]
+
+
+@dataclass(frozen=True)
+class Rotation(Value):
+    """The camera's rotation and the world–Manhattan rotations it is tied to. `source` is manhattan | tracks | prediction.
+
+    `covariance` is that of phi in `R_world_camera = R_estimate · Exp(phi)` (camera frame, rad²); `R_world_manhattan[i]` belongs to Manhattan frame
+    `ids[i]`, with `weights[i]` observations behind it, and `R_camera_manhattan[i]` is this frame's observation of it (NaN = not seen)."""
+
+    R_world_camera: Annotated[F64, Shape(3, 3)]
+    covariance: Annotated[F64, Shape(3, 3)]
+    R_world_manhattan: Annotated[F64, Shape("k", 3, 3)]
+    R_camera_manhattan: Annotated[F64, Shape("k", 3, 3)]
+    ids: Annotated[I32, Shape("k")]
+    weights: Annotated[F64, Shape("k")]
+    source: str
+
+
+@dataclass(frozen=True)
+class Translation(Value):
+    """The camera's position for the given rotation. `unobservable` holds unit vectors (world) along which the prediction was kept;
+    `inliers` counts points, lines and planes; `estimated` is False when no measurement of this frame took part. Covariance in the world frame, m².
+    A filter also says its state: planes (n, d) of the world that it keeps, and the covariance of (t_world_camera, d of each) together."""
+
+    version: ClassVar[int] = 2
+
+    t_world_camera: Annotated[F64, Shape(3)]
+    covariance: Annotated[F64, Shape(3, 3)]
+    unobservable: Annotated[F64, Shape("u", 3)]
+    inliers: Annotated[I32, Shape(3)]
+    estimated: bool
+    filtered_planes: Annotated[F64, Shape("m", 4)] = field(default_factory=lambda: np.empty((0, 4)))
+    filtered_covariance: Annotated[F64, Shape("s", "s")] = field(default_factory=lambda: np.empty((0, 0)))  # s = 3 + m, m²
+
+
+@dataclass(frozen=True)
+class Matches(Value):
+    """This frame's features found in the map: pairs (row of the feature, id of the landmark). `parallel` and `perpendicular` pair plane rows
+    with map planes that are not the same plane. `visible_*` are the landmarks that were expected in view, found or not."""
+
+    map_revision: int
+    keypoints: Annotated[I32, Shape("n", 2)]
+    segments: Annotated[I32, Shape("m", 2)]
+    planes: Annotated[I32, Shape("p", 2)]
+    parallel: Annotated[I32, Shape("a", 2)]
+    perpendicular: Annotated[I32, Shape("b", 2)]
+    visible_points: Annotated[I32, Shape("v")]
+    visible_lines: Annotated[I32, Shape("w")]
+
+
+OK, DEGRADED, LOST = "ok", "degraded", "lost"
+
+
+@dataclass(frozen=True)
+class Pose(Value):
+    """Where the camera is. A frame counts as tracked only with status ok or degraded, which need measurements of that very frame.
+
+    `reference` is the keyframe the pose is expressed against (-1: none yet) and `T_reference_camera` the pose relative to it. `inliers` counts
+    points, lines and planes; `unobservable` the directions held at the prediction. `submap` is the part of the map the pose is said in (0: the first;
+    others have a world of their own until they are tied to it), `unrecognised` how many frames of a lost camera showed a place that is not known."""
+
+    version: ClassVar[int] = 2
+
+    T_world_camera: Annotated[F64, Shape(4, 4)]
+    covariance: Annotated[F64, Shape(6, 6)]
+    T_reference_camera: Annotated[F64, Shape(4, 4)]
+    reference: int
+    inliers: Annotated[I32, Shape(3)]
+    unobservable: int
+    status: str  # ok | degraded | lost
+    reason: str
+    submap: int = 0
+    unrecognised: int = 0
+
+
+@dataclass(frozen=True)
+class PredictedView(Value):
+    """What a dense model would show from a pose: depth (0 = none), normals (camera frame, NaN = none) and colour (black where the model has none),
+    of the frame's camera at a whole fraction of its size. `model` is the model itself, whose rows its plugin knows: the next view is made of it."""
+
+    version: ClassVar[int] = 2
+    dense: ClassVar[bool] = True
+
+    T_world_camera: Annotated[F64, Shape(4, 4)]
+    depth_m: Annotated[F32, Shape("h", "w")]
+    normals: Annotated[F32, Shape("h", "w", 3)]
+    color: Annotated[U8, Shape("h", "w", 3)]
+    model: Table
+
+
+@dataclass(frozen=True)
+class Trajectory:
+    """Poses over time: (n,) stamps in ns, strictly increasing, and (n, 4, 4) `T_world_camera`."""
+
+    stamps_ns: NDArray[np.int64]
+    poses: F64
+
+    def __len__(self) -> int:
+        return len(self.stamps_ns)
+
+
+# The pinhole camera and its depth noise.
+
+@dataclass(frozen=True)
+class DepthNoise:
+    """Standard deviation of a depth reading: `max(floor_m, a + b z + c z²)` metres at z metres. Belongs to the sensor, so to the data set."""
+
+    a_m: float = -0.00058
+    b: float = 0.00074
+    c_per_m: float = 0.00273
+    floor_m: float = 0.001
+
+    def sigma_m(self, depth_m: Any) -> Any:
+        """Standard deviation in metres for depth(s) in metres; same shape."""
+        return np.maximum(self.floor_m, self.a_m + self.b * depth_m + self.c_per_m * depth_m * depth_m)
+
+
+EXACT_DEPTH = DepthNoise(a_m=0.0, b=0.0, c_per_m=0.0, floor_m=0.001)
+
+
+@dataclass(frozen=True)
+class Camera:
+    """An undistorted pinhole camera; readers undistort before they hand a frame over. `fps` is nominal."""
+
+    width: int
+    height: int
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    fps: float = 30.0
+    depth_noise: DepthNoise = field(default_factory=DepthNoise)
+
+    @property
+    def K(self) -> F64:
+        """(3, 3) calibration matrix."""
+        return np.array([[self.fx, 0.0, self.cx], [0.0, self.fy, self.cy], [0.0, 0.0, 1.0]])
+
+    @property
+    def intrinsics(self) -> F64:
+        """(4,) fx, fy, cx, cy in pixels, as compiled loops and the map take them."""
+        return np.array([self.fx, self.fy, self.cx, self.cy])
+
+    def project(self, points_m: F64) -> F64:
+        """(n, 3) points in the camera frame -> (n, 2) pixels; points behind the camera give NaN."""
+        z = np.where(points_m[..., 2] > 1e-6, points_m[..., 2], np.nan)
+        return np.stack([self.fx * points_m[..., 0] / z + self.cx, self.fy * points_m[..., 1] / z + self.cy], axis=-1)
+
+    def back_project(self, pixels: NDArray[Any], depth_m: NDArray[Any]) -> NDArray[Any]:
+        """(n, 2) pixels with (n,) depths -> (n, 3) points in the camera frame."""
+        x = (pixels[..., 0] - self.cx) / self.fx * depth_m
+        y = (pixels[..., 1] - self.cy) / self.fy * depth_m
+        return np.stack([x, y, depth_m], axis=-1)
+
+
+# The types of the topics `map`, `bundle` and `loop`: the map and what corrects it.
+
+@dataclass(frozen=True)
+class Map(Value):
+    """Keyframes and landmarks; a row number is an id for good, dead rows have `alive` False. Columns are listed in `plugins.numerics.maps.landmarks`.
+
+    `revision` counts versions; `point_observations` and its siblings say which keyframe (row) saw which landmark, and what it measured."""
+
+    version: ClassVar[int] = 4
+    revision: int
+    keyframes: Table
+    points: Table
+    lines: Table
+    planes: Table
+    point_observations: Table
+    line_observations: Table
+    plane_observations: Table
+
+    @cached_property
+    def memo(self) -> dict[Hashable, Any]:
+        """What was worked out of this version and is asked for frame after frame; gone with it, and no part of the value."""
+        return {}
+
+
+@dataclass(frozen=True)
+class Correction(Value):
+    """Moves keyframes and landmarks of the map, by id, as bundle adjustment or loop closing found them from revision `based_on`. `*_information`
+    (world, 1/m²; of each end of a line) and `plane_covariance`, of (a, b, d), replace what the map had gathered: no measurement is counted twice."""
+
+    version: ClassVar[int] = 2
+
+    based_on: int
+    keyframe_ids: Annotated[I32, Shape("k")]
+    T_world_keyframe: Annotated[F64, Shape("k", 4, 4)]
+    point_ids: Annotated[I32, Shape("n")]
+    points_m: Annotated[F64, Shape("n", 3)]
+    point_information: Annotated[F32, Shape("n", 3, 3)]
+    line_ids: Annotated[I32, Shape("m")]
+    endpoints_m: Annotated[F64, Shape("m", 2, 3)]
+    line_information: Annotated[F32, Shape("m", 2, 3, 3)]
+    plane_ids: Annotated[I32, Shape("p")]
+    coefficients: Annotated[F64, Shape("p", 4)]
+    plane_covariance: Annotated[F64, Shape("p", 3, 3)]
+
+
+# The type of the topic `surface`: a triangle mesh with plane instances.
+
+PLANE_KINDS = ("plane", "floor", "ceiling", "wall", "horizontal", "vertical")  # a plane is none of the others when it slants, or up is not known
+
+
+@dataclass(frozen=True)
+class Surface(Value):
+    """A triangle mesh in the world frame, anticlockwise seen from where it was seen, and the plane instances in it.
+
+    `instances` is the row of the plane a triangle lies in, -1 for none. Of plane i: `plane_ids` is its id in the map (beyond the map's if it is not
+    there), `coefficients` n·x + d = 0 with n towards the camera, `kinds` a row of PLANE_KINDS, `areas_m2` that of its triangles, `plane_colors` its
+    mean. Row k of `loops` is (plane, begin, end): `loop_vertices[begin:end]` go round it, anticlockwise about n; round a hole the other way.
+    `atlas` (RGB) pictures the planes: `texels` are the (x, y) of a triangle's corners in it, pixel centres at integers; NaN without a picture. `up`
+    points up in the world, along an axis of the Manhattan frame; NaN when nothing says so."""
+
+    version: ClassVar[int] = 2
+
+    vertices_m: Annotated[F32, Shape("v", 3)]
+    colors: Annotated[U8, Shape("v", 3)]
+    triangles: Annotated[I32, Shape("t", 3)]
+    instances: Annotated[I32, Shape("t")]
+    plane_ids: Annotated[I32, Shape("p")]
+    coefficients: Annotated[F64, Shape("p", 4)]
+    kinds: Annotated[U8, Shape("p")]
+    areas_m2: Annotated[F32, Shape("p")]
+    plane_colors: Annotated[U8, Shape("p", 3)]
+    loops: Annotated[I32, Shape("l", 3)]
+    loop_vertices: Annotated[I32, Shape("k")]
+    atlas: Annotated[U8, Shape("h", "w", 3)]
+    texels: Annotated[F32, Shape("t", 3, 2)]
+    up: Annotated[F64, Shape(3)]
+
+    @staticmethod
+    def empty(index: int, stamp_ns: int) -> Surface:
+        """A mesh without triangles and planes."""
+        none, no_number, no_color = np.empty((0, 3), np.float32), np.empty(0, np.int32), np.empty((0, 3), np.uint8)
+        atlas, texels = np.empty((0, 0, 3), np.uint8), np.empty((0, 3, 2), np.float32)
+        return Surface(
+            index, stamp_ns, none, no_color, np.empty((0, 3), np.int32), no_number, no_number.copy(), np.empty((0, 4)), np.empty(0, np.uint8),
+            np.empty(0, np.float32), no_color.copy(), np.empty((0, 3), np.int32), no_number.copy(), atlas, texels, np.full(3, np.nan),
+        )  # fmt: skip

@@ -1,0 +1,121 @@
+"""The files a run leaves behind, besides the recording: trajectories, timing, metrics, the plot."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections import Counter
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from trihedron.pipeline.core.errors import DataError
+from trihedron.pipeline.core.types import DEGRADED, LOST, OK, Map, Pose, Surface, Trajectory
+from trihedron.pipeline.record.trajectories import write_trajectory
+from trihedron.pipeline.run.consistency import pose_consistency
+from trihedron.pipeline.run.metrics import associate, evaluate_trajectory
+from trihedron.pipeline.run.plot import trajectory_figure
+from trihedron.pipeline.run.ply import triangle_planes, write_ply
+from trihedron.pipeline.run.replay import Result
+
+TRAJECTORY, CAUSAL, TIMING, METRICS, PLOT = "trajectory.txt", "trajectory_causal.txt", "timing.json", "metrics.json", "trajectory.png"
+SURFACE = "surface.ply"
+WORLD = "metres; the world of trajectory.txt: the first camera's frame, x right, y down, z forward"
+
+
+def causal_trajectory(result: Result) -> Trajectory:
+    """The tracked poses as they were said at the time, but for those in a sub-map, which were said in another world."""
+    poses = [pose for pose in result.poses if pose.status != LOST and pose.submap == 0]
+    return _trajectory([pose.stamp_ns for pose in poses], [pose.T_world_camera for pose in poses])
+
+
+def final_trajectory(result: Result) -> Trajectory:
+    """The tracked poses hung on the final keyframes: keyframe pose × relative pose, so corrections of the map reach every frame. A frame that became
+    a keyframe is where that is. Frames of sub-maps are among them once these are tied to the first."""
+    poses = [pose for pose in result.poses if is_tied(pose, result.map)]
+    if result.map is None:
+        return causal_trajectory(result)
+    keyframes = result.map.keyframes.column("T_world_camera")
+    own = dict(list(zip(result.map.keyframes.column("index").tolist(), keyframes))[result.loaded_keyframes :])
+    hung = [pose.T_world_camera if pose.reference < 0 else keyframes[pose.reference] @ pose.T_reference_camera for pose in poses]
+    return _trajectory([pose.stamp_ns for pose in poses], [own.get(pose.index, T) for pose, T in zip(poses, hung)])
+
+
+def is_tied(pose: Pose, map: Map | None) -> bool:
+    """Whether the pose was tracked and stands, in the end, in the world of the first frame."""
+    if pose.status == LOST or map is None or pose.reference < 0:
+        return pose.status != LOST and pose.submap == 0
+    return bool(map.keyframes.rows("submap", np.array([pose.reference]))[0] == 0)
+
+
+def _trajectory(stamps_ns: list[int], poses: list[Any]) -> Trajectory:
+    return Trajectory(np.array(stamps_ns, np.int64), np.array(poses, np.float64).reshape(-1, 4, 4))
+
+
+def write_results(out: Path, result: Result, truth: Trajectory | None) -> dict[str, Any]:
+    """Write trajectories, plot and, with ground truth, metrics; return the metrics. Statuses are counted in any case."""
+    final, causal = final_trajectory(result), causal_trajectory(result)
+    write_trajectory(out / TRAJECTORY, final)
+    write_trajectory(out / CAUSAL, causal)
+    metrics: dict[str, Any] = {
+        "frames": len(result.stamps_ns),
+        "unreadable": result.unreadable,
+        "untied": sum(pose.status != LOST and not is_tied(pose, result.map) for pose in result.poses),
+        "status": {status: sum(pose.status == status for pose in result.poses) for status in (OK, DEGRADED, LOST)},
+        "reasons": {status: said for status in (DEGRADED, LOST) if (said := _commonest_reason(result.poses, status))},
+    }
+    if len(final):  # of a walk that ends where it began, the drift
+        metrics["start_to_end_m"] = float(np.linalg.norm(final.poses[-1, :3, 3] - final.poses[0, :3, 3]))
+    if truth is not None:
+        stamps = np.array(result.stamps_ns, np.int64)
+        try:
+            for name, trajectory in (("final", final), ("causal", causal)):
+                metrics[name] = evaluate_trajectory(trajectory, truth, fps=result.fps, frame_stamps_ns=stamps).to_dict()
+            metrics["consistency"] = _consistency(result, truth)
+        except DataError as error:
+            metrics["note"] = str(error)
+    write_json(out / METRICS, metrics)
+    if len(final):
+        trajectory_figure(final, truth, out / PLOT, [(pose.stamp_ns, pose.status) for pose in result.poses])
+    return metrics
+
+
+def _commonest_reason(poses: Iterable[Pose], status: str) -> str:
+    """Why most frames of a status have it, in the words of the last of them; reasons that differ in numbers alone are one. '' without such frames."""
+    reasons = [pose.reason for pose in poses if pose.status == status]
+    alike = [re.sub(r"\d+(\.\d+)?", "0", reason) for reason in reasons]
+    commonest = Counter(alike).most_common(1)
+    return next((reason for reason, kind in zip(reversed(reasons), reversed(alike)) if kind == commonest[0][0]), "")
+
+
+def write_surface(out: Path, surface: Surface) -> str:
+    """Write surface.ply, in the world of trajectory.txt, and say in one line what is in it."""
+    write_ply(out / SURFACE, surface.vertices_m, surface.colors, surface.triangles, triangle_planes(surface), WORLD)
+    if len(surface.triangles) == 0:
+        return "the surface is empty: no tracked frame showed enough of one"
+    planar, planes = surface.instances >= 0, len(surface.plane_ids)
+    return f"surface: {len(surface.triangles)} triangles, {planar.sum()} of them in {planes} planes of {surface.areas_m2.sum():.1f} m²"
+
+
+def _consistency(result: Result, truth: Trajectory) -> dict[str, Any]:
+    """Of the tracked poses but the first, which is exact by definition."""
+    poses = [pose for pose in result.poses if pose.status != LOST][1:]
+    pairs = associate(np.array([pose.stamp_ns for pose in poses], np.int64), truth.stamps_ns)
+    known = [poses[row] for row, _ in pairs]
+    covariances = np.array([pose.covariance for pose in known])
+    return pose_consistency(np.array([pose.T_world_camera for pose in known]), covariances, truth.poses[pairs[:, 1]]).to_dict()
+
+
+def write_json(path: Path, content: dict[str, Any]) -> None:
+    """Write a dictionary as indented JSON."""
+    path.write_text(json.dumps(content, indent=2) + "\n")
+
+
+def dotted(values: dict[str, Any], prefix: str = "") -> dict[str, Any]:
+    """The values of nested dictionaries by dotted name, as `final.ate_rmse_m`."""
+    flat: dict[str, Any] = {}
+    for name, value in values.items():
+        flat |= dotted(value, f"{prefix}{name}.") if isinstance(value, dict) else {prefix + name: value}
+    return flat

@@ -1,0 +1,98 @@
+"""What the runner measures: how long each call took, and each frame from hand-over to pose; the memory that is held."""
+
+from __future__ import annotations
+
+import gc
+import os
+from array import array
+from collections import defaultdict
+from collections.abc import Sequence
+from contextlib import suppress
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from trihedron.pipeline.run.memory import give_back
+
+_PAGE_MB = os.sysconf("SC_PAGE_SIZE") / 1e6
+
+
+class Timing:
+    """Collects milliseconds per stage and per frame; `summary` is `timing.json`."""
+
+    def __init__(self) -> None:
+        self._calls: dict[str, array[float]] = defaultdict(lambda: array("f"))
+        self._frames_ms = array("d")
+        self._finish_ms: dict[str, float] = {}
+
+    def add_call(self, stage: str, ms: float) -> None:
+        """One call of a stage."""
+        self._calls[stage].append(ms)
+
+    def add_finish(self, stage: str, ms: float) -> None:
+        """The end of a fold."""
+        self._finish_ms[stage] = ms
+
+    def add_frame(self, ms: float) -> None:
+        """One frame, from the moment it was handed over to its pose."""
+        self._frames_ms.append(ms)
+
+    def summary(self, threads: int, wall_s: float, startup_s: float) -> dict[str, Any]:
+        """Frames, wall time and percentiles; `fps` is the whole run's, with reading and recording; `startup_s` is imports and composition."""
+        frames = len(self._frames_ms)
+        p50, p95, largest = _percentiles(self._frames_ms)
+        stages: dict[str, dict[str, float]] = {}
+        for name, calls in self._calls.items():
+            half, high, _ = _percentiles(calls)
+            stages[name] = {"calls": len(calls), "p50_ms": half, "p95_ms": high}
+        for name, ms in self._finish_ms.items():
+            stages.setdefault(name, {"calls": 0})["finish_ms"] = round(ms, 1)
+        return {
+            "frames": frames,
+            "threads": threads,
+            "wall_s": round(wall_s, 3),
+            "startup_s": round(startup_s, 3),
+            "fps": round(frames / wall_s, 2) if wall_s > 0 else 0.0,
+            "frame_ms": {"p50": p50, "p95": p95, "max": largest},
+            "peak_memory_mb": peak_mb(),
+            "stages": stages,
+        }
+
+
+def resident_mb() -> float:
+    """Memory (10⁶ bytes) this process holds now; 0 where the system does not say (Linux does). Asked for each frame, so the file stays open."""
+    file = _statistics(os.getpid())
+    return int(os.pread(file, 100, 0).split()[1]) * _PAGE_MB if file is not None else 0.0
+
+
+@cache
+def _statistics(process: int) -> int | None:
+    """The file, opened by this process: one that was forked would read of the other."""
+    try:
+        return os.open("/proc/self/statm", os.O_RDONLY | os.O_CLOEXEC)
+    except OSError:
+        return None
+
+
+def peak_mb() -> float | None:
+    """The most memory (10⁶ bytes) this process held since `forget_peak`; None where the system does not say (Linux does)."""
+    status = Path("/proc/self/status")
+    lines = status.read_text().splitlines() if status.exists() else []
+    return next((round(int(line.split()[1]) * 1.024e-3, 1) for line in lines if line.startswith("VmHWM:")), None)
+
+
+def forget_peak() -> None:
+    """Begin to measure the peak anew, without what earlier runs of this process left. Where that is not allowed the peak is the process's."""
+    gc.collect()
+    give_back()
+    with suppress(OSError):
+        Path("/proc/self/clear_refs").write_text("5")
+
+
+def _percentiles(values: Sequence[float]) -> tuple[float, float, float]:
+    if not values:
+        return 0.0, 0.0, 0.0
+    p50, p95 = np.percentile(values, [50, 95])
+    return round(float(p50), 3), round(float(p95), 3), round(max(values), 3)

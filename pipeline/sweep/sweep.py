@@ -1,0 +1,241 @@
+"""Sweeps: every job of a cross product over given data sets, on all cores; what is done already is not done again.
+
+A job's folder keeps its number as long as its overrides are the same; it is computed again when its key (`jobs.key_of`) changed, or it did not come
+to its end. A job that fails, be it because its configuration is refused, leaves its reason in job.json and stops no other.
+"""
+
+from __future__ import annotations
+
+import itertools
+import sys
+import threading
+import time
+from collections.abc import Sequence
+from concurrent.futures.process import BrokenProcessPool
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import yaml
+from hydra.core.config_loader import ConfigLoader
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.core.plugins import Plugins
+from joblib.externals.loky import get_reusable_executor
+from omegaconf import DictConfig
+
+from trihedron.pipeline.core.config import rewritten
+from trihedron.pipeline.core.errors import TrihedronError
+from trihedron.pipeline.sweep.cluster import all_awaited
+from trihedron.pipeline.sweep.jobs import DONE, FAILED, RUNNING, key_of, read_job, write_job
+
+Plugins.instance()  # loads every plugin of Hydra anew, so that classes imported before are no longer theirs
+from hydra._internal.core_plugins.basic_sweeper import BasicSweeper  # noqa: E402
+
+LOOK_SECONDS = 1.0  # between two looks at the jobs' folders
+Overrides = list[str]
+
+
+@dataclass
+class Outcome:
+    """A sweep that ended: its folder, the command that reports on it, how many jobs it has, and why some of them failed."""
+
+    folder: Path
+    report: str
+    jobs: int = 0
+    failures: list[str] = field(default_factory=list)
+
+    def raise_failures(self) -> None:
+        """Raise TrihedronError when a job failed."""
+        if self.failures:
+            cause = f"{len(self.failures)} of {self.jobs} jobs failed"
+            raise TrihedronError(str(self.folder), cause, "trihedron compare says why; the same command again runs those that are missing")
+
+
+OUTCOMES: list[Outcome] = []  # of the sweeps of this process; Hydra has no other way to hand one over
+
+
+class Sweeper(BasicSweeper):
+    """Hydra's sweeper over comma-separated values, with sequences, that goes on where it was stopped."""
+
+    def sweep(self, arguments: list[str]) -> None:
+        """Run what is missing. Raises TrihedronError when no job can be composed."""
+        jobs = self.jobs(arguments)
+        folders = self.run(jobs, len(jobs))
+        failures = [why for folder in folders if (why := failure_of(folder))]
+        OUTCOMES.append(Outcome(self.folder, str(self.options.report), len(jobs), failures))
+
+    @property
+    def options(self) -> DictConfig:
+        """The configuration that all jobs begin with; Hydra sets it before it calls `sweep`."""
+        assert self.config is not None
+        return self.config
+
+    @property
+    def loader(self) -> ConfigLoader:
+        """What composes configurations, from Hydra too."""
+        assert self.hydra_context is not None
+        return self.hydra_context.config_loader
+
+    @property
+    def folder(self) -> Path:
+        """The folder of the sweep."""
+        return Path(str(self.options.hydra.sweep.dir))
+
+    def run(self, jobs: Sequence[Overrides], total: int, before: int = 0) -> list[Path]:
+        """Run those of the jobs that are not done, after `before` others of `total`; returns the folders of all. Raises TrihedronError when none
+        can be composed, or the launcher fails."""
+        self.folder.mkdir(parents=True, exist_ok=True)
+        folders = [self.folder / str(number) for number in _numbers(self.folder, jobs)]
+        missing: list[tuple[Overrides, Path]] = []
+        errors: list[TrihedronError] = []
+        for job, folder in zip(jobs, folders):
+            words = [*job, f"hydra.sweep.subdir={folder.name}"]  # the last is its own alone
+            try:
+                key = key_of(self.composed(words))
+            except Exception as error:
+                errors.append(error if isinstance(error, TrihedronError) else rewritten(error))
+                _keep_overrides(folder, job)
+                write_job(folder, "", FAILED, str(errors[-1]))
+                print(f"trihedron: {errors[-1]}", file=sys.stderr)
+                continue
+            if read_job(folder) != {"key": key, "state": DONE, "error": ""}:
+                (folder / "job.json").unlink(missing_ok=True)
+                missing.append((words, folder))
+        if len(errors) == len(jobs):
+            raise errors[0]
+        if already := len(jobs) - len(errors) - len(missing):
+            print(f"sweep: {already} of {len(jobs)} jobs are done already", file=sys.stderr)
+        if missing:
+            with _Progress([place for _, place in missing], before + len(jobs) - len(missing), total):
+                self._launch(missing)
+        return folders
+
+    def composed(self, words: Overrides) -> DictConfig:
+        """The configuration of a job."""
+        return self.loader.load_sweep_config(self.options, words)
+
+    def _launch(self, missing: list[tuple[Overrides, Path]]) -> None:
+        """Hand the jobs and their folders to the launcher, and wait until they have ended."""
+        assert self.launcher is not None
+        try:
+            with all_awaited():
+                self.launcher.launch([words for words, _ in missing], initial_job_idx=0)
+        except BrokenProcessPool as error:
+            self._launch_apart(missing, error)
+        except TrihedronError:
+            raise
+        except Exception as error:  # of the engine; a job that fails says so in its folder
+            raise _given_up(error) from error
+        for words, folder in missing:
+            _keep_overrides(folder, words[:-1])
+            if read_job(folder).get("state") not in (DONE, FAILED):
+                _died(folder)
+        if self.options.hydra.launcher.get("n_jobs", 1) != 1:
+            get_reusable_executor().shutdown()  # its processes would keep this folder and environment for the next sweep
+
+    def _launch_apart(self, missing: list[tuple[Overrides, Path]], error: Exception) -> None:
+        """A process that died took those beside it along. What had begun is run again, one at a time, so that only the job at fault fails; then
+        what had not."""
+        if len(missing) == 1:
+            _died(missing[0][1])
+            return
+        begun = [job for job in missing if read_job(job[1]).get("state") == RUNNING]
+        if not begun:
+            raise _given_up(error) from error
+        for job in begun:
+            self._launch([job])
+        if waiting := [job for job in missing if not read_job(job[1])]:
+            self._launch(waiting)
+
+    def jobs(self, arguments: list[str]) -> list[Overrides]:
+        """The overrides of every job: the cross product of sequences and of all values given."""
+        parser = OverridesParser.create(config_loader=self.loader)
+        words = [word for word in [*self._parse_config(), *arguments] if not word.startswith("sequences=")]
+        words += [] if any(word.startswith("threads=") for word in words) else [f"threads={self._threads}"]
+        sequences = [words_of_sequence(text) for text in self.options.sequences] or [[]]
+        products = [self.split_arguments(parser.parse_overrides([*sequence, *words]), None)[0] for sequence in sequences]
+        return [list(job) for product in products for job in product]
+
+    @property
+    def _threads(self) -> int:
+        """Of a job: what the cluster is asked for, two where jobs come one by one, else one."""
+        launcher = self.options.hydra.launcher
+        one_by_one = launcher.get("n_jobs") == 1 or self.options.hydra.runtime.choices["hydra/launcher"] == "basic"
+        return int(launcher.get("cpus_per_task") or (2 if one_by_one else 1))
+
+
+def words_of_sequence(text: str) -> Overrides:
+    """`KIND`, `KIND:FOLDER`, and options after blanks, as overrides: "tum:/data/desk frames=0:100" is dataset=tum dataset.path=/data/desk
+    dataset.frames=0:100. Options of a data set underneath another (options.path=...) are added."""
+    kind, *options = text.split()
+    name, _, path = kind.partition(":")
+    return [f"dataset={name}", *([f"dataset.path={path}"] if path else []), *(f"{'+' * o.startswith('options.')}dataset.{o}" for o in options)]
+
+
+def _numbers(folder: Path, jobs: Sequence[Overrides]) -> list[int]:
+    """The folder of each job: the one that has its overrides, else the next free number."""
+    files = [file for file in folder.glob("*/.hydra/overrides.yaml") if file.parent.parent.name.isdigit()]
+    known = {tuple(yaml.safe_load(file.read_text()) or []): int(file.parent.parent.name) for file in files}
+    free = itertools.count(max(known.values(), default=-1) + 1)
+    return [known[tuple(job)] if tuple(job) in known else next(free) for job in jobs]
+
+
+def _given_up(error: Exception) -> TrihedronError:
+    """What an engine of Hydra's failed with, as one line."""
+    cause = next(iter(str(error).splitlines()), type(error).__name__)
+    return TrihedronError("hydra.launcher", cause, "what is done is kept; the same command again runs the rest")
+
+
+def failure_of(folder: Path) -> str:
+    """Why the job of a folder came to no end; empty for one that did."""
+    job = read_job(folder)
+    return "" if job.get("state") == DONE else str(job.get("error") or "was stopped before its end")
+
+
+def _keep_overrides(folder: Path, job: Overrides) -> None:
+    """What tells a job from the others, where it came to no end before it could say so itself: it has no run then, but a reason."""
+    file = folder / ".hydra" / "overrides.yaml"
+    if not file.exists():
+        file.parent.mkdir(parents=True, exist_ok=True)
+        file.write_text(yaml.safe_dump(job))
+
+
+def _died(folder: Path) -> None:
+    """Say so of a job that cannot."""
+    write_job(folder, "", FAILED, f"{folder}: its process died; it crashed, or memory ran out")
+
+
+class _Progress:
+    """Says on stderr how many jobs are done, which failed and why, and about how long the rest will take, as jobs end in other processes."""
+
+    def __init__(self, folders: list[Path], before: int, total: int) -> None:
+        """`before` jobs of `total` are done, those of `folders` will be."""
+        self.waiting, self.missing, self.before, self.total = folders, len(folders), before, total
+        self.began, self.stop = time.perf_counter(), threading.Event()
+        self.thread = threading.Thread(target=self._watch, daemon=True)
+
+    def __enter__(self) -> None:
+        self.thread.start()
+
+    def __exit__(self, *exception: object) -> None:
+        self.stop.set()
+        self.thread.join()
+        self._look()
+
+    def _watch(self) -> None:
+        while not self.stop.wait(LOOK_SECONDS):
+            self._look()
+
+    def _look(self) -> None:
+        ended = [(place, job) for place in self.waiting if (job := read_job(place)).get("state", RUNNING) != RUNNING]
+        self.waiting = [place for place in self.waiting if place not in {place for place, _ in ended}]
+        for _, job in ended:
+            if job["error"]:
+                print(f"trihedron: {job['error']}", file=sys.stderr)
+        if ended:
+            done, seconds = self.missing - len(self.waiting), time.perf_counter() - self.began
+            now, left = self.before + done, seconds / done * (self.total - self.before - done)
+            print(f"sweep: {now} of {self.total} jobs done, {_time(seconds)}, about {_time(left)} left", file=sys.stderr)
+
+
+def _time(seconds: float) -> str:
+    return f"{seconds:.0f} s" if seconds < 120 else f"{seconds / 60:.0f} min" if seconds < 7200 else f"{seconds / 3600:.1f} h"

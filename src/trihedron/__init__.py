@@ -1,0 +1,1 @@
+"""RGB-D SLAM for man-made scenes: swappable stages, recorded topics, single-stage replay."""
