@@ -18,9 +18,8 @@ import numpy as np
 from trihedron.pipeline.core.errors import DataError
 from trihedron.pipeline.core.types import FrameReference, Keypoints, Matches, Planes, Tracks
 from trihedron.pipeline.record.recording import Recording
-from trihedron.plugins.numerics.depth.depth_offset import DepthOffset, RightAngle, estimate_depth_offset, right_angles
-from trihedron.plugins.numerics.motion.depth_delay import DepthDelay, Turn, estimate_depth_delay, turn_of
 from trihedron.tools.arguments import Parser, table
+from trihedron.tools.calibration import DepthDelay, DepthOffset, RightAngle, Turn, estimate_depth_delay, estimate_depth_offset, right_angles, turn_of
 
 NEEDED = ("frames", "keypoints", "planes", "tracks", "matches")
 

@@ -10,9 +10,9 @@ import numpy as np
 from trihedron.pipeline.core.geometry import invert, pose_matrix
 from trihedron.pipeline.core.registry import register
 from trihedron.pipeline.core.types import Correction, Map
-from trihedron.plugins.numerics.bundle.bundle_correction import carried_correction
-from trihedron.plugins.numerics.bundle.bundle_problem import BundleMeasurements, BundleState, bundle_problem, bundle_window
-from trihedron.plugins.numerics.maps.local_window import newest_keyframes
+from trihedron.plugins.bundle.common import bundle_problem, bundle_window, carried_correction
+from trihedron.plugins.bundle.common_kernels import BundleMeasurements, BundleState
+from trihedron.plugins.mapping.covisibility_graph import newest_keyframes
 
 
 @register("bundle", "colmap")

@@ -6,10 +6,8 @@ from dataclasses import dataclass
 
 from trihedron.pipeline.core.registry import register
 from trihedron.pipeline.core.types import Correction, Map
-from trihedron.plugins.numerics.bundle.bundle_correction import bundle_correction
-from trihedron.plugins.numerics.bundle.bundle_problem import bundle_problem, bundle_window
-from trihedron.plugins.numerics.bundle.bundle_solver import solve_bundle
-from trihedron.plugins.numerics.maps.local_window import newest_keyframes
+from trihedron.plugins.bundle.common import bundle_correction, bundle_problem, bundle_window, solve_bundle
+from trihedron.plugins.mapping.covisibility_graph import newest_keyframes
 
 
 @register("bundle", "local_window")

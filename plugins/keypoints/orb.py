@@ -4,15 +4,16 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import pairwise
 
+import cv2
 import numpy as np
 
 from trihedron.pipeline.core.registry import register
-from trihedron.pipeline.core.types import F32, Frame, Keypoints
-from trihedron.plugins.numerics.depth.depth_sampling import local_depth, noise_coefficients
-from trihedron.plugins.numerics.images.image_pyramid import full_pixels, image_pyramid
-from trihedron.plugins.numerics.images.oriented_corners import oriented_corners
-from trihedron.plugins.numerics.images.steered_brief import brief_tests, steered_brief
+from trihedron.pipeline.core.types import F32, U8, Frame, Keypoints
+from trihedron.plugins.keypoints.orb_kernels import BITS, REACH_PX, Pyramid, full_pixels, oriented_corners, steered_brief
+from trihedron.plugins.shared.depth_image import noise_coefficients
+from trihedron.plugins.shared.depth_image_kernels import local_depth
 
 MARGIN_PX = 19  # of a level, within which its descriptors would reach over the border
 
@@ -74,3 +75,34 @@ class Orb:
     @cached_property
     def _tests(self) -> F32:
         return brief_tests()
+
+
+def image_pyramid(gray: U8, scale: float, levels: int, least_px: int) -> Pyramid:
+    """The image (h, w) at 1, 1/scale, 1/scale² …: at most `levels`, none but the first with a side below `least_px`."""
+    shapes = [gray.shape]
+    for level in range(1, levels):
+        shape = (round(gray.shape[0] / scale**level), round(gray.shape[1] / scale**level))
+        if min(shape) < least_px:
+            break
+        shapes.append(shape)
+    starts = np.concatenate([[0], np.cumsum([h * w for h, w in shapes])]).astype(np.int32)
+    pyramid = Pyramid(np.empty(starts[-1], np.uint8), starts, np.array(shapes, np.int32))
+    images = pyramid.images()
+    images[0][:] = gray
+    for above, image in pairwise(images):
+        cv2.resize(above, image.shape[::-1], dst=image, interpolation=cv2.INTER_LINEAR_EXACT)
+    return pyramid
+
+
+LONGEST_PX = 9.0  # between a test's ends: as many bits differ between images of one place, and of two, as with tests that were learned
+
+
+def brief_tests(seed: int = 0) -> F32:
+    """(4, 256) ends (x1, y1, x2, y2) in px about the key point: drawn evenly from the disc, not further apart than `LONGEST_PX`."""
+    rng = np.random.default_rng(seed)
+    tests: list[F32] = []
+    while len(tests) < BITS:
+        x1, y1, x2, y2 = np.round(rng.uniform(-REACH_PX, REACH_PX, 4))
+        if max(np.hypot(x1, y1), np.hypot(x2, y2)) <= REACH_PX and 1.0 <= np.hypot(x1 - x2, y1 - y2) <= LONGEST_PX:
+            tests.append(np.array([x1, y1, x2, y2], np.float32))
+    return np.stack(tests, axis=1)

@@ -9,7 +9,7 @@ import cv2
 
 from trihedron.pipeline.core.registry import register
 from trihedron.pipeline.core.types import Frame, LineSegments
-from trihedron.plugins.numerics.images.straight_edges import SMALLEST, StraightEdges
+from trihedron.plugins.lines.common import SMALLEST, StraightEdges
 
 
 @register("lines", "edge_drawing")

@@ -8,8 +8,8 @@ import numpy as np
 
 from trihedron.pipeline.core.registry import register
 from trihedron.pipeline.core.types import Frame, LineSegments
-from trihedron.plugins.numerics.images.line_support import line_support_segments
-from trihedron.plugins.numerics.images.straight_edges import StraightEdges
+from trihedron.plugins.lines.common import StraightEdges
+from trihedron.plugins.lines.lsd_kernels import line_support_segments
 
 
 @register("lines", "lsd")

@@ -8,11 +8,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from trihedron.pipeline.core.registry import register
-from trihedron.pipeline.core.types import I32, Map
-from trihedron.plugins.numerics.maps.local_window import observed_by
-from trihedron.plugins.numerics.places.binary_words import as_bits, nearest_words, similarities, train
-from trihedron.plugins.numerics.places.loop_closing import LoopClosing
-from trihedron.plugins.numerics.places.loop_places import walked, within_reach
+from trihedron.pipeline.core.types import F64, I32, U8, Map
+from trihedron.plugins.loop.appearance_kernels import U64, nearest_words
+from trihedron.plugins.loop.common import LoopClosing, walked, within_reach
+from trihedron.plugins.mapping.covisibility_graph import observed_by
+from trihedron.plugins.shared.descriptors import words_of
 
 
 @register("loop", "appearance")
@@ -62,3 +62,37 @@ class AppearanceLoop(LoopClosing):
         vocabulary = train(bits[chosen], self.words, self.rounds)
         words = nearest_words(bits, vocabulary)
         return similarities([words[np.searchsorted(known, one)] for one in ids], len(vocabulary))
+
+
+HISTOGRAM = 128  # bytes: a descriptor this long is a histogram (SIFT), and its bits are the bins above the median
+
+
+def as_bits(descriptors: U8) -> U64:
+    """(n, b) descriptors -> (n, w) machine words of bits."""
+    if descriptors.shape[1] == HISTOGRAM:
+        descriptors = np.packbits(descriptors > np.median(descriptors, axis=1, keepdims=True), axis=1)
+    return words_of(descriptors)[0]
+
+
+def train(bits: U64, words: int, rounds: int) -> U64:
+    """(k, w) vocabulary of at most `words` from (n, w) descriptors: evenly chosen ones, then rounds of assignment and majority. Deterministic."""
+    chosen = np.unique(np.linspace(0, len(bits) - 1, min(words, len(bits))).round().astype(int))
+    vocabulary = bits[chosen]
+    single = np.unpackbits(bits.view(np.uint8), axis=1)
+    for _ in range(rounds):
+        nearest = nearest_words(bits, vocabulary)
+        members = np.bincount(nearest, minlength=len(vocabulary))
+        votes = np.zeros((len(vocabulary), single.shape[1]), np.int64)
+        np.add.at(votes, nearest, single)
+        majority = np.packbits(2 * votes > members[:, None], axis=1).view(np.uint64)
+        vocabulary = np.where(members[:, None] > 0, majority, vocabulary)
+    return vocabulary
+
+
+def similarities(bags: list[I32], words: int) -> F64:
+    """(m - 1,) how alike the last of m bags of words is to each other one: 1 for the same words, 0 for none in common."""
+    counts = np.array([np.bincount(bag, minlength=words) for bag in bags], np.float64).reshape(len(bags), words)
+    idf = np.log(len(bags) / np.maximum(np.count_nonzero(counts, axis=0), 1))
+    weighed = counts * np.maximum(idf, 1e-6)
+    weighed /= np.maximum(weighed.sum(axis=1, keepdims=True), 1e-12)
+    return np.asarray(1.0 - 0.5 * np.abs(weighed[:-1] - weighed[-1]).sum(axis=1))

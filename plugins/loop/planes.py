@@ -9,10 +9,8 @@ import numpy as np
 
 from trihedron.pipeline.core.registry import register
 from trihedron.pipeline.core.types import Map
-from trihedron.plugins.numerics.maps.local_window import observed_by
-from trihedron.plugins.numerics.places.loop_closing import LoopClosing
-from trihedron.plugins.numerics.places.loop_hypotheses import shift_of_planes
-from trihedron.plugins.numerics.places.loop_places import within_reach
+from trihedron.plugins.loop.common import LoopClosing, shift_of_planes, within_reach
+from trihedron.plugins.mapping.covisibility_graph import observed_by
 
 
 @register("loop", "planes")

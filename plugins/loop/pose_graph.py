@@ -6,12 +6,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from trihedron.pipeline.core.geometry import invert, pose_matrix
 from trihedron.pipeline.core.registry import register
-from trihedron.pipeline.core.types import Correction, Frame, Map
-from trihedron.plugins.numerics.maps.local_window import current_submap, keyframes_of
-from trihedron.plugins.numerics.places.loop_correction import moved_keyframes
-from trihedron.plugins.numerics.places.pose_graph import solve_pose_graph
-from trihedron.plugins.numerics.places.shared_edges import shared_edges
+from trihedron.pipeline.core.types import F64, I32, Correction, Frame, Map
+from trihedron.plugins.loop.common_pose_graph import Edges, moved_keyframes, solve_pose_graph
+from trihedron.plugins.mapping.covisibility_graph import current_submap, keyframes_of
+from trihedron.plugins.mapping.keyframe_features import measured_points
+from trihedron.plugins.shared.rigid_alignment import fit_covariance, fitted, place_sigma
 
 
 @register("loop", "pose_graph")
@@ -44,3 +45,45 @@ class PoseGraph:
         after = solve_pose_graph(before, edges)
         moved = float(np.linalg.norm(after[:, :3, 3] - before[:, :3, 3], axis=1).max())
         return moved_keyframes(map, rows, before, after) if moved >= self.least_m else None
+
+
+# The edges of a pose graph: how keyframes that saw the same points stand to each other, by their own measurements of these.
+
+FLOOR_M, FLOOR = 2e-3, 1e-3  # least standard deviations of an edge, m and rad
+LOOSE_M, LOOSE = 0.05, 0.02  # of keyframes that follow each other and share too little
+
+
+def shared_edges(map: Map, rows: I32, poses: F64, least: int, gate: float) -> tuple[Edges, int]:
+    """Edges between all of the keyframes `rows` (sorted), at `poses` (n, 4, 4), that saw at least `least` of the same points and agree on a motion;
+    and the longest of them, in keyframes. Neighbours in time that share less stay as they stand, loosely."""
+    seen = [measured_points(map, int(row)) for row in rows]
+    pairs, measured, information = [], [], []
+    for b in range(len(rows)):
+        for a in range(b):
+            edge = _edge(seen[a], seen[b], least, gate)
+            if edge is None and a == b - 1:
+                edge = invert(poses[a]) @ poses[b], np.diag(np.repeat([LOOSE_M**2, LOOSE**2], 3))
+            if edge is not None:
+                pairs.append((a, b))
+                measured.append(edge[0])
+                information.append(np.linalg.inv(edge[1]))
+    longest = max((b - a for a, b in pairs), default=0)
+    return Edges(np.array(pairs, np.int32).reshape(-1, 2), np.array(measured), np.array(information)), longest
+
+
+def _edge(a: tuple[I32, F64, F64, F64], b: tuple[I32, F64, F64, F64], least: int, gate: float) -> tuple[F64, F64] | None:
+    """`T_a_b` (4, 4) and the covariance (6, 6) of xi in `T_a_b · Exp(xi)`, or None."""
+    _, i, j = np.intersect1d(a[0], b[0], assume_unique=True, return_indices=True)
+    if len(i) < least:
+        return None
+    there, here = a[1][i], b[1][j]
+    sigma = place_sigma(there, here, a[2][i], b[2][j], b[3][j])
+    agree = np.ones(len(i), bool)
+    R, t = np.eye(3), np.zeros(3)
+    for _ in range(3):
+        R, t = fitted(here[agree], there[agree], sigma[agree])
+        agree = np.linalg.norm(here @ R.T + t - there, axis=1) < gate * sigma
+        if agree.sum() < least:
+            return None
+    covariance = fit_covariance(here[agree], sigma[agree]) + np.diag(np.repeat([FLOOR_M**2, FLOOR**2], 3))
+    return pose_matrix(R, t), covariance

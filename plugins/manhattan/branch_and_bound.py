@@ -4,15 +4,27 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 
 from trihedron.pipeline.core.registry import register
 from trihedron.pipeline.core.types import F64, ManhattanFrame, Normals, Planes, Segments
-from trihedron.plugins.numerics.axes.cube_symmetry import nearest_equivalent
-from trihedron.plugins.numerics.axes.manhattan_modes import Directions
-from trihedron.plugins.numerics.axes.mode_options import ModeOptions
-from trihedron.plugins.numerics.axes.rotation_search import RotationSearch
+from trihedron.plugins.manhattan.branch_and_bound_kernels import (
+    FIRST,
+    HALF_WIDTH,
+    Maps,
+    Neighbours,
+    SphereGrid,
+    coarser,
+    group_directions,
+    image,
+    largest_near,
+    neighbours,
+    search,
+)
+from trihedron.plugins.manhattan.common import Directions, ModeOptions
+from trihedron.plugins.shared.manhattan_frames_kernels import nearest_equivalent
 
 
 @register("manhattan", "branch_and_bound")
@@ -66,3 +78,92 @@ class BranchAndBound(ModeOptions):
     @cached_property
     def _search(self) -> RotationSearch:
         return RotationSearch(np.radians(self.inlier_deg), np.radians(self.certificate_deg), self.max_gap, self.max_cubes)
+
+
+FACE = (12, 24, 48)  # cells a face of the maps for the first levels, whose cubes are 9.7°, 4.9° and 2.4° in radius
+
+
+class Optimum(NamedTuple):
+    """What a search found and proved."""
+
+    R: F64  # (3, 3)
+    consensus: float
+    upper: float  # no rotation has more
+    cubes: int  # looked at
+    open: int  # left undecided at the work limit: 0 when nothing further than the certificate from R is better
+
+
+@dataclass(frozen=True)
+class RotationSearch:
+    """Best rotation for weighted directions, from anywhere, with a proof. Angles in rad.
+
+    The rotations are covered by cubes of rotation vectors `v` in `R_start Exp(v)`, of half side σ; every rotation of a cube is within √3 σ of its
+    centre (Hartley and Kahl). Level by level a cube is dropped when even its upper bound is not above the best consensus found, else split in eight.
+    The first bounds are three look-ups in maps on the sphere, the later ones sums over all directions (`consensus_bound`)."""
+
+    inlier: float  # τ of the consensus
+    certificate: float  # rotations this near to the best one need not be told from it
+    slack: float  # share of the best consensus by which another must be better to count
+    max_cubes: int  # work limit
+
+    def __call__(self, vectors: F64, weights: F64, start: F64) -> Optimum:
+        """The optimum for directions (n, 3) of any length but 0 and weights (n,); rows that are not finite or weigh nothing are left out. `start`
+        (3, 3) is the first guess and the middle of the search; the result is proven whatever it is."""
+        unit, weights = _usable(vectors, weights)
+        if len(unit) == 0:
+            return Optimum(start, 0.0, 0.0, 0, 0)
+        cells = image(unit, weights, self._grid, self._cones, self.inlier)
+        middle = coarser(cells, FACE[2])
+        near = [largest_near(values, reach) for values, reach in zip((coarser(middle, FACE[1]), middle, cells), self._reaches)]
+        maps = Maps(cells, (near[0], near[1], near[2]))
+        found = search(group_directions(unit, weights), maps, start, self.inlier, self.certificate, self.slack, self.max_cubes)
+        return Optimum(*found)
+
+    def consensus(self, vectors: F64, weights: F64, R: F64) -> float:
+        """C(R) of the same directions."""
+        unit, weights = _usable(vectors, weights)
+        square = np.max((unit @ R) ** 2, axis=1, initial=0.0)
+        return float(weights @ np.maximum(square - np.cos(self.inlier) ** 2, 0.0)) / np.sin(self.inlier) ** 2
+
+    @cached_property
+    def _grid(self) -> SphereGrid:
+        return sphere_grid(FACE[2])
+
+    @cached_property
+    def _cones(self) -> Neighbours:
+        """Cells within τ of each."""
+        return neighbours(self._grid, self.inlier)
+
+    @cached_property
+    def _reaches(self) -> list[Neighbours]:
+        """For each level the cells within the radius of its cubes of each."""
+        return [neighbours(sphere_grid(face), np.sqrt(3.0) * HALF_WIDTH / FIRST / 2**level) for level, face in enumerate(FACE)]
+
+
+def _usable(vectors: F64, weights: F64) -> tuple[F64, F64]:
+    """The finite directions, made unit, with positive weights."""
+    length = np.linalg.norm(vectors, axis=1)
+    good = np.isfinite(length) & (length > 1e-6) & np.isfinite(weights) & (weights > 0.0)
+    return vectors[good] / length[good, None], weights[good]
+
+
+def sphere_grid(n: int) -> SphereGrid:
+    """The grid with n by n cells a face."""
+    edges = np.linspace(-1.0, 1.0, n + 1)
+    middles = 0.5 * (edges[1:] + edges[:-1])
+    centres = _on_faces(middles, middles)
+    # a cell is a convex quadrangle, so its corners are furthest from any of its points
+    corners = [_on_faces(u, v) for u in (edges[:-1], edges[1:]) for v in (edges[:-1], edges[1:])]
+    radii = [np.arccos(np.clip((centres * corner).sum(axis=1), -1.0, 1.0)) for corner in corners]
+    return SphereGrid(centres, np.max(radii, axis=0))
+
+
+def _on_faces(u: F64, v: F64) -> F64:
+    """(3 · len(u) · len(v), 3) unit directions at every (u, v) of the three faces."""
+    out = np.empty((3, len(u), len(v), 3))
+    for face in range(3):
+        out[face, :, :, face] = 1.0
+        out[face, :, :, (face + 1) % 3] = u[:, None]
+        out[face, :, :, (face + 2) % 3] = v
+    out /= np.linalg.norm(out, axis=-1, keepdims=True)
+    return out.reshape(-1, 3)

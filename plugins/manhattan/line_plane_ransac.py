@@ -10,10 +10,8 @@ import numpy as np
 
 from trihedron.pipeline.core.registry import register
 from trihedron.pipeline.core.types import F64, Bool, ManhattanFrame, Normals, Planes, Segments
-from trihedron.plugins.numerics.axes.axis_fit import AxisFit, gather_directions
-from trihedron.plugins.numerics.axes.minimal_frames import best_frame, frames_through
-from trihedron.plugins.numerics.axes.procrustes import inliers_and_spread, procrustes, square_angles
-from trihedron.plugins.numerics.axes.sphere_modes import assign_axes
+from trihedron.plugins.manhattan.common import AxisFit, gather_directions
+from trihedron.plugins.shared.manhattan_frames_kernels import assign_axes, best_frame, frames_through, inliers_and_spread, procrustes, square_angles
 
 
 @register("manhattan", "line_plane_ransac")

@@ -8,11 +8,9 @@ import numpy as np
 
 from trihedron.pipeline.core.registry import register
 from trihedron.pipeline.core.types import F64, ManhattanFrame, Normals, Planes, Segments
-from trihedron.plugins.numerics.axes.axis_fit import HALF_SPHERE
-from trihedron.plugins.numerics.axes.cube_symmetry import nearest_equivalent
-from trihedron.plugins.numerics.axes.manhattan_modes import Directions, Modes
-from trihedron.plugins.numerics.axes.mode_options import ModeOptions
-from trihedron.plugins.numerics.axes.sphere_modes import search_axes
+from trihedron.plugins.manhattan.common import HALF_SPHERE, Directions, ModeOptions, Modes
+from trihedron.plugins.manhattan.common_kernels import search_axes
+from trihedron.plugins.shared.manhattan_frames_kernels import nearest_equivalent
 
 
 @register("manhattan", "mean_shift")

@@ -8,10 +8,19 @@ import numpy as np
 
 from trihedron.pipeline.core.registry import register
 from trihedron.pipeline.core.types import F64, I32, ManhattanFrame, Planes
-from trihedron.plugins.numerics.axes.axis_fit import NOTHING_KNOWN, variance_scale
-from trihedron.plugins.numerics.axes.plane_axes import Walls, area_on_axes, known_walls, perpendicular_pair, settled
-from trihedron.plugins.numerics.axes.procrustes import inliers_and_spread, procrustes, procrustes_covariance, square_angles
-from trihedron.plugins.numerics.axes.sphere_modes import assign_axes
+from trihedron.plugins.manhattan.common_kernels import NOTHING_KNOWN, variance_scale
+from trihedron.plugins.shared.manhattan_frames_kernels import (
+    Walls,
+    area_on_axes,
+    assign_axes,
+    inliers_and_spread,
+    known_walls,
+    perpendicular_pair,
+    procrustes,
+    procrustes_covariance,
+    settled,
+    square_angles,
+)
 
 PRIOR = 1.0 / NOTHING_KNOWN  # 1/rad², weight of the previous rotation: holds the angles that no plane tells
 LARGEST_COS = 0.2  # of planes taken as perpendicular, however uncertain they are

@@ -9,13 +9,11 @@ import numpy as np
 
 from trihedron.pipeline.core.registry import register
 from trihedron.pipeline.core.types import F64, ManhattanFrame, Normals, Segments
-from trihedron.plugins.numerics.axes.axis_fit import HALF_SPHERE, NOTHING_KNOWN, gather_directions
-from trihedron.plugins.numerics.axes.cube_symmetry import nearest_equivalent
-from trihedron.plugins.numerics.axes.direction_information import isotropic_information
-from trihedron.plugins.numerics.axes.manhattan_modes import Directions, ModeFinder, Modes
-from trihedron.plugins.numerics.axes.mode_tests import NORMALS_PER_SAMPLE
-from trihedron.plugins.numerics.axes.sphere_modes import mode_statistics, orthonormal, search_axes, shift_axes
-from trihedron.plugins.numerics.axes.von_mises_fisher import AxisMixture, broad_mixture, converged
+from trihedron.plugins.manhattan.common import HALF_SPHERE, Directions, ModeFinder, Modes, gather_directions
+from trihedron.plugins.manhattan.common_kernels import NORMALS_PER_SAMPLE, NOTHING_KNOWN, mode_statistics, orthonormal, search_axes, shift_axes
+from trihedron.plugins.manhattan.von_mises_fisher_kernels import AxisMixture, converged
+from trihedron.plugins.shared.manhattan_frames import isotropic_information
+from trihedron.plugins.shared.manhattan_frames_kernels import nearest_equivalent
 
 
 @register("manhattan", "von_mises_fisher")
@@ -135,3 +133,9 @@ class VonMisesFisher:
         return ModeFinder(
             widest, widest, 1, 1.0, self.min_share, self.min_lines, self.min_line_share, 1.0, self.min_explained, np.radians(self.max_skew_deg), False
         )
+
+
+def broad_mixture(R: F64, concentration: float) -> AxisMixture:
+    """Where to start: nothing belongs anywhere yet."""
+    none = np.zeros((2, 3))
+    return AxisMixture(np.array(R), np.full((2, 3), concentration), np.full((2, 4), 0.25), np.zeros((2, 3, 3)), none, none)

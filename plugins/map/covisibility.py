@@ -10,18 +10,16 @@ import numpy as np
 from trihedron.pipeline.core.geometry import invert
 from trihedron.pipeline.core.registry import register
 from trihedron.pipeline.core.types import DEGRADED, F32, I32, LOST, Correction, Frame, Keypoints, Map, Matches, Planes, Pose, Segments
-from trihedron.plugins.numerics.maps import insertion
-from trihedron.plugins.numerics.maps.anchoring import anchored
-from trihedron.plugins.numerics.maps.association import Associated, associate, existing
-from trihedron.plugins.numerics.maps.correction import apply_correction
-from trihedron.plugins.numerics.maps.culling import cull, cull_keyframe, cull_repeated
-from trihedron.plugins.numerics.maps.id_sets import union
-from trihedron.plugins.numerics.maps.landmarks import empty_map
-from trihedron.plugins.numerics.maps.local_window import WEIGHTS, keyframes_of, local_window, newest_keyframes
-from trihedron.plugins.numerics.maps.merging import merge_lines, merge_planes, merge_points
-from trihedron.plugins.numerics.maps.retiring import released
-from trihedron.plugins.numerics.maps.submaps import submap_of, tied
-from trihedron.plugins.numerics.maps.visibility import visible_planes
+from trihedron.plugins.mapping import insertion
+from trihedron.plugins.mapping.correction import apply_correction
+from trihedron.plugins.mapping.covisibility_graph import WEIGHTS, keyframes_of, local_window, newest_keyframes
+from trihedron.plugins.mapping.culling import cull, cull_keyframe, cull_repeated, released
+from trihedron.plugins.mapping.insertion import Associated, associate, existing
+from trihedron.plugins.mapping.landmarks import empty_map, union
+from trihedron.plugins.mapping.merging import merge_lines, merge_planes, merge_points
+from trihedron.plugins.mapping.reference_keyframe import anchored
+from trihedron.plugins.mapping.submaps import submap_of, tied
+from trihedron.plugins.mapping.visibility import visible_planes
 
 NEARBY = {"newest": 2, "covisible": 10, "near": 3}  # keyframes whose planes should be seen again: as many as tracking searches
 STALE = 0.25  # of the view change of a keyframe, that makes one after max_frames: a camera at rest adds none
@@ -131,7 +129,7 @@ class Covisibility:
         found = associate(map, frame.camera, pose.T_world_camera, keypoints, segments, planes, matches, self.line_sigma_px, self.judge)
         expected = self._planes_in_view(map, frame, pose, matches)
         map, row = insertion.add_keyframe(map, pose, frame.camera)
-        view = insertion.View(row, frame.camera, pose.T_world_camera, pose.covariance)
+        view = insertion.Observations(row, frame.camera, pose.T_world_camera, pose.covariance)
         map = self._seen(map, matches, expected)
         map = insertion.insert_points(map, view, keypoints, found.points, found.new_points, self.memory)
         map = insertion.insert_lines(map, view, segments, found.lines, self._long(segments, found), self.line_sigma_px, self.memory)

@@ -9,10 +9,9 @@ import numpy as np
 from trihedron.pipeline.core.geometry import invert, transform
 from trihedron.pipeline.core.registry import register
 from trihedron.pipeline.core.types import I32, Frame, Keypoints, Map, Matches, Rotation
-from trihedron.plugins.numerics.images.mutual_matches import mutual_matches
-from trihedron.plugins.numerics.maps.local_window import current_submap, keyframes_of, observed_by
-from trihedron.plugins.numerics.motion.rigid_consensus import consensus
-from trihedron.plugins.numerics.motion.tracked_places import place_sigma, rows_with_depth
+from trihedron.plugins.mapping.covisibility_graph import current_submap, keyframes_of, observed_by
+from trihedron.plugins.shared.descriptors import mutual_matches
+from trihedron.plugins.shared.rigid_alignment import consensus, place_sigma, rows_with_depth
 
 NO_PAIRS = np.zeros((0, 2), np.int32)
 

@@ -9,9 +9,9 @@ import numpy as np
 from trihedron.pipeline.core.geometry import pose_matrix
 from trihedron.pipeline.core.registry import register
 from trihedron.pipeline.core.types import F64, OK, Frame, Keypoints, Map, Matches, Planes, Pose, Rotation, Segments, Translation
-from trihedron.plugins.numerics.maps.local_window import living_keyframes, local_window
-from trihedron.plugins.numerics.maps.map_search import Guess, MapSearch
-from trihedron.plugins.numerics.places.place_check import ABOUT_DEG, ABOUT_M
+from trihedron.plugins.mapping.covisibility_graph import living_keyframes, local_window
+from trihedron.plugins.mapping.data_association import Guess, MapSearch
+from trihedron.plugins.places.verification import ABOUT_DEG, ABOUT_M
 
 
 @register("matches", "local_map")

@@ -7,10 +7,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from trihedron.pipeline.core.registry import register
-from trihedron.pipeline.core.types import LOST, Frame, Pose, PredictedView, Table
-from trihedron.plugins.numerics.depth.reduction import depth_normals, smoothed
-from trihedron.plugins.numerics.surfaces.model_sight import sight_of
-from trihedron.plugins.numerics.surfaces.surfel_model import SURFELS, Images, fused, shown
+from trihedron.pipeline.core.types import I32, LOST, Bool, Column, Frame, Pose, PredictedView, Table
+from trihedron.plugins.model.common import sight_of
+from trihedron.plugins.model.common_kernels import Lens
+from trihedron.plugins.model.surfels_kernels import Images, fuse, index_map, shown
+from trihedron.plugins.shared.image_reduction_kernels import depth_normals, smoothed
 
 
 @register("model", "surfels")
@@ -49,3 +50,36 @@ class SurfelModel:
         depth, normals, mean = shown(table.column("surfel"), camera, depth.shape, self.stable)
         normals = normals / np.maximum(np.linalg.norm(normals, axis=2, keepdims=True), np.float32(1e-6))
         return PredictedView(frame.index, frame.stamp_ns, T, depth, normals, np.rint(mean).astype(np.uint8), table)
+
+
+# Surfels as the rows of a table, so that they can travel on a wire: one for each pixel that showed something new, fused where it was seen again.
+#
+# Point-based fusion (Keller et al., 3DV 2013) as in ElasticFusion (Whelan et al., RSS 2015). A row whose confidence is 0 is free, and is given to
+# the next surfel. Versions of the table share the chunks that a frame does not touch.
+
+SURFELS = {
+    "surfel": Column("f4", (11,)),  # position, unit normal, RGB, radius (m), confidence
+    "seen": Column("i4"),  # the last frame it was measured in
+}
+
+
+def fused(table: Table, images: Images, camera: Lens, index: int, apart: float, cosine: float, most: float, trial: int, stable: float) -> Table:
+    """The table with a frame taken in. A pixel is fused with the surfel nearest to its ray within `apart` standard deviations and `cosine` of its
+    normal, else it becomes one. Confidence is the number of views, up to `most`; one not `stable` after `trial` frames out of sight is removed."""
+    surfels, seen = table.column("surfel"), table.column("seen")
+    pixels = index_map(surfels, camera, images.depth_m.shape)
+    changed, fresh = fuse(surfels, seen, pixels, images, camera, index, apart, cosine, most)
+    removed = (surfels[:, 10] > 0.0) & (surfels[:, 10] < stable) & (index - seen > trial)
+    surfels[removed, 10] = 0.0
+    free = np.flatnonzero(surfels[:, 10] == 0.0)[: len(fresh)]
+    surfels[free], seen[free] = fresh[: len(free)], index
+    rows = np.flatnonzero(changed | removed | _at(free, len(surfels))).astype(np.int32)
+    table = table.updated(rows, surfel=surfels[rows], seen=seen[rows]) if len(rows) else table
+    left = fresh[len(free) :]
+    return table.appended(surfel=left, seen=np.full(len(left), index, np.int32))[0]
+
+
+def _at(rows: I32, count: int) -> Bool:
+    out = np.zeros(count, bool)
+    out[rows] = True
+    return out

@@ -7,11 +7,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from trihedron.pipeline.core.registry import register
-from trihedron.pipeline.core.types import LOST, Frame, Pose, PredictedView, Table
-from trihedron.plugins.numerics.depth.reduction import depth_normals, smoothed
-from trihedron.plugins.numerics.surfaces.block_model import BLOCKS, fused
-from trihedron.plugins.numerics.surfaces.model_sight import sight_of
-from trihedron.plugins.numerics.surfaces.raycasting import cast
+from trihedron.pipeline.core.types import F32, LOST, Frame, Pose, PredictedView, Table
+from trihedron.plugins.model.common import BLOCKS, fused, sight_of
+from trihedron.plugins.model.common_kernels import Blocks, Lens
+from trihedron.plugins.model.tsdf_kernels import cast_kernel, ranges_kernel
+from trihedron.plugins.shared.image_reduction_kernels import depth_normals, smoothed
+from trihedron.plugins.shared.tsdf_volume_kernels import SIDE
 
 
 @register("model", "tsdf")
@@ -41,3 +42,10 @@ class TsdfModel:
         shown = cast(seen, camera, depth, self.voxel_m, self.truncation_m)
         T = np.array(pose.T_world_camera)
         return PredictedView(frame.index, frame.stamp_ns, T, shown, depth_normals(smoothed(shown, 3), lens, 4), np.zeros_like(color), table)
+
+
+def cast(blocks: Blocks, camera: Lens, depth: F32, voxel: float, truncation: float) -> F32:
+    """(h, w) depth of the zero level, 0 = none, through the given blocks, into which `depth` (h, w) was fused: up to shortly before a reading the
+    ray has just been seen to be free."""
+    ranges = ranges_kernel(blocks, camera, depth.shape, voxel * SIDE)
+    return np.asarray(cast_kernel(blocks.keys, blocks.numbers, blocks.distance, blocks.weight, camera, ranges, depth, voxel, truncation))

@@ -8,7 +8,7 @@ import cv2
 
 from trihedron.pipeline.core.registry import register
 from trihedron.pipeline.core.types import Frame, Normals
-from trihedron.plugins.numerics.depth.cloud_normals import CloudNormals
+from trihedron.plugins.normals.common import CloudNormals
 
 
 @register("normals", "cross_product")

@@ -6,7 +6,8 @@ from dataclasses import dataclass
 
 from trihedron.pipeline.core.registry import register
 from trihedron.pipeline.core.types import Frame, Normals
-from trihedron.plugins.numerics.depth.patch_normals import patch_normals, patch_radii
+from trihedron.plugins.normals.common import patch_radii
+from trihedron.plugins.normals.common_kernels import patch_normals
 
 
 @register("normals", "integral_image")

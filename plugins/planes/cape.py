@@ -8,10 +8,10 @@ import numpy as np
 
 from trihedron.pipeline.core.registry import register
 from trihedron.pipeline.core.types import Frame, Normals, Planes
-from trihedron.plugins.numerics.planes.block_growing import grow_blocks
-from trihedron.plugins.numerics.planes.planar_regions import PlanarRegions
-from trihedron.plugins.numerics.planes.plane_blocks import block_planes, block_sums, blocks_to_cells
-from trihedron.plugins.numerics.planes.plane_fitting import fit_labelled
+from trihedron.plugins.planes.cape_kernels import grow_blocks
+from trihedron.plugins.planes.common import PlanarRegions
+from trihedron.plugins.planes.common_blocks_kernels import block_planes, block_sums, blocks_to_cells
+from trihedron.plugins.planes.common_kernels import fit_labelled
 
 
 @register("planes", "cape")

@@ -7,9 +7,9 @@ from dataclasses import dataclass
 
 from trihedron.pipeline.core.registry import register
 from trihedron.pipeline.core.types import Frame, Normals, Planes
-from trihedron.plugins.numerics.planes.planar_components import planar_components
-from trihedron.plugins.numerics.planes.planar_regions import EDGE, EDGE_M, PlanarRegions
-from trihedron.plugins.numerics.planes.plane_fitting import MOST
+from trihedron.plugins.planes.common import EDGE, EDGE_M, PlanarRegions
+from trihedron.plugins.planes.common_kernels import MOST
+from trihedron.plugins.planes.connected_components_kernels import planar_components
 
 
 @register("planes", "connected_components")

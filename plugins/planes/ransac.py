@@ -8,10 +8,10 @@ import numpy as np
 
 from trihedron.pipeline.core.registry import register
 from trihedron.pipeline.core.types import Frame, Normals, Planes
-from trihedron.plugins.numerics.depth.organised_grid import coarser
-from trihedron.plugins.numerics.planes.planar_regions import EDGE, EDGE_M, PlanarRegions
-from trihedron.plugins.numerics.planes.plane_consensus import consensus_planes
-from trihedron.plugins.numerics.planes.plane_fitting import MOST, fit_labelled
+from trihedron.plugins.planes.common import EDGE, EDGE_M, PlanarRegions
+from trihedron.plugins.planes.common_kernels import MOST, fit_labelled
+from trihedron.plugins.planes.ransac_kernels import consensus_planes
+from trihedron.plugins.shared.depth_image_kernels import coarser
 
 
 @register("planes", "ransac")

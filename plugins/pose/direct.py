@@ -9,10 +9,10 @@ import numpy as np
 from trihedron.pipeline.core.geometry import pose_matrix
 from trihedron.pipeline.core.registry import register
 from trihedron.pipeline.core.types import F64, Frame, Pose
-from trihedron.plugins.numerics.depth.reduction import depth_normals, pyramid
-from trihedron.plugins.numerics.maps.dense_pose import dense_pose, first_pose
-from trihedron.plugins.numerics.motion.dense_alignment import Gates, align, student_weights
-from trihedron.plugins.numerics.motion.dense_rows import Source, Target, source_of, target_of
+from trihedron.plugins.pose.common import Gates, align, dense_pose, first_pose, source_of, student_weights, target_of
+from trihedron.plugins.pose.common_kernels import Source, Target
+from trihedron.plugins.shared.image_reduction import pyramid
+from trihedron.plugins.shared.image_reduction_kernels import depth_normals
 
 REACH = 2  # px, to the readings a normal is made of
 

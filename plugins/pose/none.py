@@ -6,8 +6,7 @@ from dataclasses import dataclass
 
 from trihedron.pipeline.core.registry import register
 from trihedron.pipeline.core.types import Frame, Map, Pose, Rotation, Translation
-from trihedron.plugins.numerics.maps.anchoring import anchored
-from trihedron.plugins.numerics.maps.decoupled import decoupled_pose
+from trihedron.plugins.mapping.reference_keyframe import anchored, decoupled_pose
 
 
 @register("pose", "none")

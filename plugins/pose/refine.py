@@ -1,4 +1,4 @@
-"""All six degrees of freedom against the local map."""
+"""Whether enough of the map was found for a pose to be believed."""
 
 from __future__ import annotations
 
@@ -7,10 +7,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from trihedron.pipeline.core.geometry import adjoint, invert
 from trihedron.pipeline.core.registry import register
 from trihedron.pipeline.core.types import (
     DEGRADED,
     F64,
+    I32,
     LOST,
     OK,
     Frame,
@@ -24,14 +26,117 @@ from trihedron.pipeline.core.types import (
     Tracks,
     Translation,
 )
-from trihedron.plugins.numerics.maps.anchoring import anchored
-from trihedron.plugins.numerics.maps.decoupled import FIRST_SIGMA, Decoupled, decoupled_pose, reference_of
-from trihedron.plugins.numerics.maps.focal_lengths import FocalLengths
-from trihedron.plugins.numerics.maps.foundations import Foundations
-from trihedron.plugins.numerics.maps.map_alignment import MapAlignment
-from trihedron.plugins.numerics.maps.moving_objects import MovingObjects
-from trihedron.plugins.numerics.maps.submaps import submap_of
-from trihedron.plugins.numerics.maps.tracking_quality import TrackingQuality
+from trihedron.plugins.mapping.reference_keyframe import FIRST_SIGMA, Decoupled, anchored, decoupled_pose, reference_of
+from trihedron.plugins.mapping.submaps import submap_of
+from trihedron.plugins.pose.dynamic_objects import MovingObjects
+from trihedron.plugins.pose.focal_length import FocalLengths
+from trihedron.plugins.pose.map_alignment import SCORE, Agreement, MapAlignment, Verdict
+from trihedron.plugins.shared.pose_optimizer import PoseSolution
+
+
+@dataclass(frozen=True)
+class TrackingQuality:
+    """How much of what is sought must agree with a pose; and with the first one after a loss, which has nothing else to go by."""
+
+    min_inliers: int = 10  # points + 2 lines + 5 planes below which the pose is called degraded
+    min_share: float = 0.25  # of the matches that must agree, else it is called degraded
+    found_inliers: int = 30  # points + 2 lines + 5 planes that find a lost pose again
+    found_share: float = 0.5  # of the matches that must agree for that
+
+    def __post_init__(self) -> None:
+        if self.min_inliers < 0 or not 0.0 <= self.min_share <= 1.0:
+            raise ValueError("min_inliers, min_share: must not be negative, min_share at most 1")
+        if self.found_inliers < self.min_inliers or not self.min_share <= self.found_share <= 1.0:
+            raise ValueError("found_inliers, found_share: must be at least min_inliers and min_share, found_share at most 1")
+
+    def enough(self, seen: Agreement) -> bool:
+        """Whether this much is believed of a camera that was tracked."""
+        return seen.score >= self.min_inliers and seen.agreed >= self.min_share * seen.matches
+
+    def found_again(self, found: PoseSolution, seen: Agreement) -> bool:
+        """Whether the map alone says where a lost camera is."""
+        enough = seen.score >= self.found_inliers and seen.agreed >= self.found_share * seen.matches
+        return enough and found.unobservable.shape[1] == 0
+
+    def judged(self, found: PoseSolution, seen: Agreement, rotation: Rotation) -> Verdict:
+        """What is said of a refined pose."""
+        points, lines, planes = seen.inliers
+        status, reason = OK, f"{points} points, {lines} lines and {planes} planes of the map"
+        if found.unobservable.shape[1]:
+            status, reason = DEGRADED, f"{found.unobservable.shape[1]} directions of motion cannot be seen, held at the prediction"
+        elif seen.score < self.min_inliers:
+            status, reason = DEGRADED, f"only {points} points, {lines} lines and {planes} planes of the map were found"
+        elif seen.agreed < self.min_share * seen.matches:
+            status, reason = DEGRADED, f"only {seen.agreed} of {seen.matches} matches with the map agree"
+        elif rotation.source == "prediction":
+            status, reason = DEGRADED, "the rotation was predicted, not measured, before refinement"
+        return Verdict(status, reason, found.covariance)
+
+
+# How well the part of a map that a pose was found in is known itself.
+
+@dataclass(frozen=True)
+class Foundation:
+    """The keyframe (a row, -1: none) that a pose hangs on, and its standard deviation (m, in the worst direction)."""
+
+    keyframe: int
+    sigma_m: float
+
+    def covariance(self, map: Map, T_world_camera: F64) -> F64:
+        """(6, 6) of xi of a camera that goes with the keyframe."""
+        T, covariance = (map.keyframes.rows(name, np.array([self.keyframe]))[0] for name in ("T_world_camera", "covariance"))
+        moved = adjoint(invert(T_world_camera) @ T)
+        return np.asarray(moved @ covariance @ moved.T)
+
+
+def foundation(map: Map, points: I32, lines: I32, planes: I32) -> Foundation:
+    """Of the keyframes that these landmarks (ids) were first seen from, the one that is known no better than half of the landmarks' are.
+
+    A landmark's covariance holds its first keyframe's, but a pose found from hundreds of them averages what is common to all as if it were not."""
+    weights = np.zeros(len(map.keyframes), np.int64)
+    for table, ids, score in zip((map.points, map.lines, map.planes), (points, lines, planes), SCORE):
+        weights += score * np.bincount(table.rows("first", ids), minlength=len(weights))
+    keyframes = np.flatnonzero(weights)
+    if not len(keyframes):
+        return Foundation(-1, 0.0)
+    sigmas_m, half = _sigmas_m(map, keyframes.tolist()), int(weights.sum()) // 2
+    known = 0  # how much is known as well as a keyframe or better
+    for keyframe in sorted(keyframes.tolist(), key=sigmas_m.__getitem__):
+        known += int(weights[keyframe])
+        if known > half:
+            break
+    return Foundation(keyframe, sigmas_m[keyframe])
+
+
+def _sigmas_m(map: Map, keyframes: list[int]) -> dict[int, float]:
+    """Standard deviations of the keyframes' positions in their worst directions, and of others; found once in a version of the map."""
+    found: dict[int, float] = map.memo.setdefault("sigmas_m", {})
+    if new := [keyframe for keyframe in keyframes if keyframe not in found]:
+        covariances = map.keyframes.rows("covariance", np.array(new))
+        found.update(zip(new, np.sqrt(np.linalg.eigvalsh(covariances[:, :3, :3])[:, -1]).tolist()))
+    return found
+
+
+@dataclass(frozen=True)
+class Foundations:
+    """How much worse than a pose the keyframes behind it may be known: after a loss, or where planes alone said where they are, they are poor."""
+
+    weak_foundation: float = 3.0  # times its own standard deviation that the map's keyframes about here may have before a pose is called degraded
+
+    def __post_init__(self) -> None:
+        if self.weak_foundation <= 0.0:
+            raise ValueError("weak_foundation: must be positive")
+
+    def judged_by_foundation(self, found: PoseSolution, problem: MapAlignment, said: Verdict) -> Verdict:
+        """What is said of a pose, which is not better known than the keyframes behind what it was found from."""
+        base = foundation(problem.map, *problem.landmarks(found))
+        if base.sigma_m <= self.weak_foundation * np.sqrt(np.linalg.eigvalsh(found.covariance[:3, :3])[-1]):
+            return said
+        reason = f"what is seen hangs on keyframes that are known to {1e3 * base.sigma_m:.0f} mm"
+        return Verdict(DEGRADED, reason, said.covariance + base.covariance(problem.map, found.T_world_camera))
+
+
+# All six degrees of freedom against the local map.
 
 EYE = np.eye(3)
 

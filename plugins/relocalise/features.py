@@ -8,12 +8,13 @@ import numpy as np
 
 from trihedron.pipeline.core.registry import register
 from trihedron.pipeline.core.types import DEGRADED, F64, I32, LOST, OK, Frame, Keypoints, Map, Planes, Pose, Rotation, Segments
-from trihedron.plugins.numerics.maps.decoupled import reference_of
-from trihedron.plugins.numerics.maps.local_window import keyframes_of, living_keyframes, observed_by
-from trihedron.plugins.numerics.maps.submaps import submap_of
-from trihedron.plugins.numerics.places.layout_poses import layout_poses
-from trihedron.plugins.numerics.places.place_check import Recognised, View, check_place
-from trihedron.plugins.numerics.places.place_votes import apart, block_of, distinct, likely_keyframes, lookalikes, rigid_hypotheses
+from trihedron.plugins.mapping.covisibility_graph import keyframes_of, living_keyframes, observed_by
+from trihedron.plugins.mapping.reference_keyframe import reference_of
+from trihedron.plugins.mapping.submaps import submap_of
+from trihedron.plugins.places.recognition import apart, block_of, distinct, likely_keyframes, lookalikes, rigid_hypotheses
+from trihedron.plugins.places.verification import FrameFeatures, Recognised, check_place
+from trihedron.plugins.relocalise.features_kernels import BIN_M, NEAR_M, explained
+from trihedron.plugins.shared.manhattan_frames_kernels import CUBE
 
 
 @register("relocalise", "features")
@@ -68,7 +69,7 @@ class Features:
         """The pose; for a lost camera that is not recognised the lost one, and else None."""
         if map is None or previous_pose is None:
             return None
-        view = View(frame, keypoints, segments, planes)
+        view = FrameFeatures(frame, keypoints, segments, planes)
         lost, submap = previous_pose.status == LOST, submap_of(previous_pose, map)
         submaps = self._sought(map, submap, lost, frame.index)
         if not len(submaps):
@@ -87,12 +88,12 @@ class Features:
         known = np.unique(map.keyframes.rows("submap", living_keyframes(map))).astype(np.int32)
         return known if lost else known[known < submap] if index % self.every == 0 else known[:0]
 
-    def _candidates(self, view: View, map: Map, submap: int) -> I32:
+    def _candidates(self, view: FrameFeatures, map: Map, submap: int) -> I32:
         """Keyframes of a sub-map whose landmarks look like what is seen."""
         among = block_of(keyframes_of(map, submap), self.block, view.frame.index)
         return likely_keyframes(map, view.keypoints, view.segments, among, self.candidates, self.max_bits)
 
-    def _by_points(self, view: View, map: Map, among: I32, rng: np.random.Generator) -> F64:
+    def _by_points(self, view: FrameFeatures, map: Map, among: I32, rng: np.random.Generator) -> F64:
         """(n, 4, 4) poses by points that look like those of the map, best first."""
         seen = view.keypoints
         ids = observed_by(map, among, "point")
@@ -107,7 +108,7 @@ class Features:
         draws = rng.integers(0, max(len(rows), 1), (self.draws, 3)).astype(np.int32)
         return rigid_hypotheses(places, map.points.rows("position_m", ids), sigma, draws, self.by_points)
 
-    def _by_layout(self, view: View, map: Map, among: I32, rotation: Rotation) -> F64:
+    def _by_layout(self, view: FrameFeatures, map: Map, among: I32, rotation: Rotation) -> F64:
         """(n, 4, 4) poses by the layout of planes and lines about each known Manhattan frame in view, best first."""
         found, scores = np.empty((0, 4, 4)), np.empty(0)
         plane_ids, line_ids = observed_by(map, among, "plane"), observed_by(map, among, "line")
@@ -117,7 +118,7 @@ class Features:
                 found, scores = np.concatenate([found, poses]), np.concatenate([scores, values])
         return distinct(found[np.argsort(-scores, kind="stable")], self.by_layout)
 
-    def _checked(self, poses: F64, view: View, map: Map, among: I32) -> list[Recognised]:
+    def _checked(self, poses: F64, view: FrameFeatures, map: Map, among: I32) -> list[Recognised]:
         found = [check_place(T, view, map, among, self.near) for T in poses]
         return [one for one in found if one is not None]
 
@@ -138,3 +139,120 @@ class Features:
         reference, T_reference_camera = reference_of(map, T, submap)
         reason = "recognised by {} points, {} lines and {} planes of the map".format(*one.inliers)
         return Pose(frame.index, frame.stamp_ns, T, one.covariance, T_reference_camera, reference, one.inliers, 0, status, reason, submap)
+
+
+# Poses at which the planes and lines of a frame lie on those of the map, for a scene whose axes are known: no descriptor and no prediction needed.
+#
+# With the rotation fixed a plane says where the camera is along its normal (`n·t = d_camera - d_world`) and a line where it is across itself. So each
+# axis of the scene has a handful of likely coordinates, found by votes, and their combinations are counted out.
+
+ON_AXIS = np.cos(np.radians(8.0))
+PEAKS = 8  # coordinates kept on each axis
+
+
+@dataclass(frozen=True)
+class Layout:
+    """Planes and lines along three axes, in the coordinates of these. Planes: side they face (0..5: +x +y +z -x -y -z), place along that axis, area.
+    Lines: axis, ends along it (low, high), the two other coordinates in cyclic order, length; sorted by axis, then by the first of these."""
+
+    sides: I32
+    places_m: F64
+    areas: F64
+    axes: I32
+    spans_m: F64
+    across_m: F64
+    lengths: F64
+
+
+def layout_of(coefficients: F64, areas: F64, endpoints_m: F64, lengths: F64, R: F64) -> Layout:
+    """What of planes (n, 4) and lines (m, 2, 3) lies along the columns of R (3, 3), which are in their frame."""
+    along = coefficients[:, :3] @ R
+    axis = np.abs(along).argmax(axis=1)
+    dot = along[np.arange(len(axis)), axis]
+    good = np.abs(dot) > ON_AXIS
+    sides = (axis + 3 * (dot < 0.0))[good].astype(np.int32)
+    places = -(np.sign(dot) * coefficients[:, 3])[good]  # n·x + d = 0 with n = ±axis
+    local = endpoints_m @ R
+    step = local[:, 1] - local[:, 0]
+    size = np.linalg.norm(step, axis=1)
+    line_axis = np.abs(step).argmax(axis=1)
+    straight = np.abs(step[np.arange(len(step)), line_axis]) > ON_AXIS * np.maximum(size, 1e-9)
+    local, line_axis = local[straight], line_axis[straight]
+    rows = np.arange(len(local))
+    ends = np.sort(local[rows, :, line_axis], axis=1)
+    middle = local.mean(axis=1)
+    across = np.stack([middle[rows, (line_axis + 1) % 3], middle[rows, (line_axis + 2) % 3]], axis=-1)
+    order = np.lexsort((across[:, 0], line_axis))
+    return Layout(sides, places, areas[good], line_axis[order].astype(np.int32), ends[order], across[order], lengths[straight][order])
+
+
+def layout_poses(
+    map: Map, plane_ids: I32, line_ids: I32, planes: Planes, segments: Segments, R_world: F64, R_camera: F64, ways: F64 = CUBE
+) -> tuple[F64, F64]:
+    """(n, 4, 4) poses `T_world_camera` and (n,) how much of the frame's planes and lines they explain (0..2), best first, for axes seen as the
+    columns of `R_camera` and known as those of `R_world`, whichever of the `ways` (n, 3, 3) round."""
+    known = layout_of(
+        map.planes.rows("coefficients", plane_ids), np.ones(len(plane_ids)), map.lines.rows("endpoints_m", line_ids), np.ones(len(line_ids)), R_world
+    )
+    solid = np.isfinite(segments.endpoints_m).all(axis=(1, 2))
+    ends, pixels = segments.endpoints_m[solid].astype(np.float64), segments.endpoints_px[solid]
+    lengths = np.linalg.norm(pixels[:, 1] - pixels[:, 0], axis=1).astype(np.float64)
+    poses, scores = [], []
+    for S in ways:
+        named = R_camera @ S
+        seen = layout_of(planes.coefficients, planes.pixels.astype(np.float64), ends, lengths, named)
+        t, score = _places(seen, known)
+        R = R_world @ named.T
+        for place, value in zip(t, score):
+            T = np.eye(4)
+            T[:3, :3], T[:3, 3] = R, R_world @ place
+            poses.append(T)
+            scores.append(value)
+    order = np.argsort(-np.array(scores), kind="stable")
+    return np.array(poses).reshape(-1, 4, 4)[order], np.array(scores)[order]
+
+
+def _places(seen: Layout, known: Layout) -> tuple[F64, F64]:
+    """(n, 3) coordinates of the camera along the axes and (n,) the share of the frame explained there."""
+    candidates = [_peaks(*_votes(seen, known, axis)) for axis in range(3)]
+    grid = np.stack(np.meshgrid(*candidates, indexing="ij"), axis=-1).reshape(-1, 3)
+    score = explained(
+        grid, seen.sides, seen.places_m, seen.areas / max(float(seen.areas.sum()), 1.0), seen.axes, seen.spans_m, seen.across_m,
+        seen.lengths / max(float(seen.lengths.sum()), 1.0), known.sides, known.places_m, known.axes, known.spans_m, known.across_m,
+    )  # fmt: skip
+    best = np.argsort(-score, kind="stable")[:3]
+    return grid[best], score[best]
+
+
+def _votes(seen: Layout, known: Layout, axis: int) -> tuple[F64, F64]:
+    """Coordinates of the camera along an axis that pairs of planes or lines would mean, and what each counts."""
+    values, weights = [], []
+    for side in (axis, axis + 3):
+        ours, theirs = np.flatnonzero(seen.sides == side), np.flatnonzero(known.sides == side)
+        values.append((known.places_m[theirs][None] - seen.places_m[ours][:, None]).ravel())
+        weights.append(np.repeat(2.0 * np.sqrt(seen.areas[ours] / max(float(seen.areas.max(initial=1.0)), 1.0)), len(theirs)))
+    for k in range(2):
+        line_axis = (axis - 1 - k) % 3  # whose coordinate k across is this axis
+        ours, theirs = np.flatnonzero(seen.axes == line_axis), np.flatnonzero(known.axes == line_axis)
+        values.append((known.across_m[theirs, k][None] - seen.across_m[ours, k][:, None]).ravel())
+        weights.append(np.repeat(np.sqrt(seen.lengths[ours] / max(float(seen.lengths.max(initial=1.0)), 1.0)), len(theirs)))
+    return np.concatenate(values), np.concatenate(weights)
+
+
+def _peaks(values: F64, weights: F64) -> F64:
+    """The coordinates with most votes, at most PEAKS."""
+    if not len(values):
+        return np.empty(0)
+    bins = np.floor(values / BIN_M).astype(np.int64)
+    low = bins.min() - 1
+    histogram = np.bincount(bins - low, weights, bins.max() - low + 2)
+    smooth = histogram + 0.5 * (np.roll(histogram, 1) + np.roll(histogram, -1))
+    found: list[float] = []
+    for b in np.argsort(-smooth, kind="stable"):
+        centre = (b + low + 0.5) * BIN_M
+        if smooth[b] <= 0.0 or len(found) == PEAKS:
+            break
+        if all(abs(centre - other) > 2.0 * BIN_M for other in found):
+            found.append(float(centre))
+    near = [np.abs(values - centre) < NEAR_M for centre in found]
+    return np.array([np.average(values[here], weights=weights[here]) for here in near])

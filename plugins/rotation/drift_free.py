@@ -10,10 +10,9 @@ import numpy as np
 from trihedron.pipeline.core.geometry import exp_so3, log_so3
 from trihedron.pipeline.core.registry import register
 from trihedron.pipeline.core.types import F64, Keypoints, ManhattanFrame, Map, Planes, Pose, Rotation, Segments, Tracks
-from trihedron.plugins.numerics.algebra.small_linear import inverse_positive, solve_positive
-from trihedron.plugins.numerics.axes.manhattan_frames import KnownFrames, Sighting
-from trihedron.plugins.numerics.maps.anchoring import anchored_before
-from trihedron.plugins.numerics.motion.chained_rotation import IDENTITY, Estimate, TrackedRotation, rotation_before, rotation_value
+from trihedron.plugins.mapping.reference_keyframe import anchored_before
+from trihedron.plugins.rotation.common import IDENTITY, Estimate, KnownFrames, Sighting, TrackedRotation, rotation_before, rotation_value
+from trihedron.plugins.shared.linalg_kernels import inverse_positive, solve_positive
 
 
 @register("rotation", "drift_free")

@@ -8,9 +8,8 @@ import numpy as np
 
 from trihedron.pipeline.core.registry import register
 from trihedron.pipeline.core.types import F64, Keypoints, ManhattanFrame, Rotation
-from trihedron.plugins.numerics.axes.cube_symmetry import nearest_equivalent
-from trihedron.plugins.numerics.axes.manhattan_frames import KnownFrames
-from trihedron.plugins.numerics.motion.chained_rotation import Estimate, rotation_value
+from trihedron.plugins.rotation.common import Estimate, KnownFrames, rotation_value
+from trihedron.plugins.shared.manhattan_frames_kernels import nearest_equivalent
 
 UNSEEN = np.full((1, 3, 3), np.nan)
 

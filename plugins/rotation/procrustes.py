@@ -8,9 +8,8 @@ import numpy as np
 
 from trihedron.pipeline.core.registry import register
 from trihedron.pipeline.core.types import Keypoints, Map, Planes, Pose, Rotation, Segments, Tracks
-from trihedron.plugins.numerics.axes.manhattan_frames import KnownFrames
-from trihedron.plugins.numerics.maps.anchoring import anchored_before
-from trihedron.plugins.numerics.motion.chained_rotation import Estimate, TrackedRotation, rotation_before, rotation_value
+from trihedron.plugins.mapping.reference_keyframe import anchored_before
+from trihedron.plugins.rotation.common import Estimate, KnownFrames, TrackedRotation, rotation_before, rotation_value
 
 
 @register("rotation", "procrustes")

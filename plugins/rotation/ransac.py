@@ -8,11 +8,9 @@ import numpy as np
 
 from trihedron.pipeline.core.registry import register
 from trihedron.pipeline.core.types import Keypoints, Map, Pose, Rotation, Tracks
-from trihedron.plugins.numerics.axes.manhattan_frames import KnownFrames
-from trihedron.plugins.numerics.maps.anchoring import anchored_before
-from trihedron.plugins.numerics.motion.chained_rotation import Estimate, rotation_before, rotation_value
-from trihedron.plugins.numerics.motion.rigid_consensus import consensus, fit_covariance
-from trihedron.plugins.numerics.motion.tracked_places import tracked_places
+from trihedron.plugins.mapping.reference_keyframe import anchored_before
+from trihedron.plugins.rotation.common import Estimate, KnownFrames, rotation_before, rotation_value
+from trihedron.plugins.shared.rigid_alignment import consensus, fit_covariance, tracked_places
 
 
 @register("rotation", "ransac")

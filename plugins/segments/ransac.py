@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 from trihedron.pipeline.core.registry import register
 from trihedron.pipeline.core.types import Frame, LineSegments, Segments
-from trihedron.plugins.numerics.depth.depth_sampling import noise_coefficients
-from trihedron.plugins.numerics.depth.segment_lifting import lift_segments
+from trihedron.plugins.segments.ransac_kernels import lift_segments
+from trihedron.plugins.shared.depth_image import noise_coefficients
 
 
 @register("segments", "ransac")

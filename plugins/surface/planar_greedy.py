@@ -7,13 +7,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from trihedron.pipeline.core.registry import register
-from trihedron.pipeline.core.types import Map, Surface
-from trihedron.plugins.numerics.surfaces.assembly import pictured
-from trihedron.plugins.numerics.surfaces.greedy_triangulation import greedy_triangles
-from trihedron.plugins.numerics.surfaces.planar_parts import map_planes, numbered
-from trihedron.plugins.numerics.surfaces.plane_axes import plane_axes
-from trihedron.plugins.numerics.surfaces.view_fold import Gathered, ViewFold
-from trihedron.plugins.numerics.surfaces.view_planes import gathered_points, observed_planes
+from trihedron.pipeline.core.types import F64, I32, Map, Surface
+from trihedron.plugins.surface.common import Gathered, ViewFold, pictured
+from trihedron.plugins.surface.common_meshes import plane_axes
+from trihedron.plugins.surface.common_planar import map_planes, numbered
+from trihedron.plugins.surface.common_superpixels import gathered_points, observed_planes
+from trihedron.plugins.surface.planar_greedy_kernels import MOST, accepted
 
 
 @register("surface", "planar_greedy")
@@ -52,3 +51,41 @@ class PlanarGreedy(ViewFold):
             state, map, np.concatenate([np.empty((0, 3)), *vertices]), np.concatenate([np.empty((0, 3), np.int32), *triangles]),
             np.concatenate([np.empty(0, np.int32), *labels]), found.planes, numbered(ids, len(found.planes), map), [], self.texel_m,
         )  # fmt: skip
+
+
+def greedy_triangles(points: F64, radius_m: float, multiplier: float) -> I32:
+    """Triangles (t, 3), anticlockwise, of points (n, 2). A point is joined to others within `multiplier` times the distance of its nearest
+    neighbour, and within `radius_m`."""
+    from scipy.spatial import cKDTree
+
+    if len(points) < 3:
+        return np.empty((0, 3), np.int32)
+    tree = cKDTree(points)
+    distance, nearest = tree.query(points, k=min(MOST, len(points)))
+    reach = np.minimum(radius_m, multiplier * distance[:, 1])
+    row, column = np.nonzero((distance <= reach[:, None]) & (distance > 0.0))
+    other = nearest[row, column]
+    keys = np.unique(np.minimum(row, other) * len(points) + np.maximum(row, other))
+    edges = np.stack([keys // len(points), keys % len(points)], axis=1).astype(np.int32)
+    length = np.linalg.norm(points[edges[:, 1]] - points[edges[:, 0]], axis=1)
+    order = np.argsort(length, kind="stable")
+    return _faces(points, edges[order][accepted(points, edges[order], length[order], distance, nearest.astype(np.int32))])
+
+
+def _faces(points: F64, edges: I32) -> I32:
+    """The empty triangles of a graph without crossings: next neighbours round a vertex that are joined themselves."""
+    both = np.concatenate([edges, edges[:, ::-1]])
+    step = points[both[:, 1]] - points[both[:, 0]]
+    order = np.lexsort((np.arctan2(step[:, 1], step[:, 0]), both[:, 0]))
+    both = both[order]
+    starts = np.searchsorted(both[:, 0], np.arange(len(points) + 1))
+    following = np.arange(1, len(both) + 1)
+    ends = starts[both[:, 0] + 1]
+    following = np.where(following == ends, starts[both[:, 0]], following)
+    a, b, c = both[:, 0], both[:, 1], both[following, 1]
+    keys = np.sort(both[:, 0].astype(np.int64) * len(points) + both[:, 1])
+    wanted = b.astype(np.int64) * len(points) + c
+    joined = keys[np.minimum(np.searchsorted(keys, wanted), len(keys) - 1)] == wanted
+    u, v = points[b] - points[a], points[c] - points[a]
+    good = joined & (u[:, 0] * v[:, 1] - u[:, 1] * v[:, 0] > 0.0) & (a < b) & (a < c)
+    return np.stack([a, b, c], axis=1)[good].astype(np.int32)

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 from trihedron.pipeline.core.registry import register
 from trihedron.pipeline.core.types import Map, Surface
-from trihedron.plugins.numerics.surfaces.planar_fold import PlanarFold
-from trihedron.plugins.numerics.surfaces.view_fold import Gathered
+from trihedron.plugins.surface.common import Gathered
+from trihedron.plugins.surface.common_planar import PlanarFold
 
 
 @register("surface", "planar_polygon")

@@ -8,10 +8,9 @@ import numpy as np
 
 from trihedron.pipeline.core.registry import register
 from trihedron.pipeline.core.types import Map, Surface
-from trihedron.plugins.numerics.surfaces.assembly import coloured
-from trihedron.plugins.numerics.surfaces.superpixels import discs, fused, moved, superpixels
-from trihedron.plugins.numerics.surfaces.view_fold import Gathered, ViewFold
-from trihedron.plugins.numerics.surfaces.views import View
+from trihedron.plugins.shared.keyframe_views import KeyframeView
+from trihedron.plugins.surface.common import Gathered, ViewFold, coloured
+from trihedron.plugins.surface.common_superpixels import discs, fused, moved, superpixels
 
 
 @register("surface", "superpixels")
@@ -29,7 +28,7 @@ class Superpixels(ViewFold):
         if self.side_px < 2 or not 0.0 < self.angle_deg < 90.0 or self.least < 1:
             raise ValueError("side_px, angle_deg, least: at least 2, an angle within 0 … 90, at least 1")
 
-    def _kept(self, state: Gathered, view: View) -> None:
+    def _kept(self, state: Gathered, view: KeyframeView) -> None:
         """Cut it, as if it had no planes."""
         state.surfels.append(superpixels(replace(view, labels=np.zeros_like(view.labels)), self.side_px, self.side_px))
 

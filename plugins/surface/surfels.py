@@ -8,12 +8,10 @@ import numpy as np
 
 from trihedron.pipeline.core.registry import register
 from trihedron.pipeline.core.types import Map, Surface
-from trihedron.plugins.numerics.surfaces.assembly import pictured
-from trihedron.plugins.numerics.surfaces.planar_parts import map_planes, numbered
-from trihedron.plugins.numerics.surfaces.superpixels import discs, fused, moved, superpixels
-from trihedron.plugins.numerics.surfaces.view_fold import Gathered, ViewFold
-from trihedron.plugins.numerics.surfaces.view_planes import observed_planes
-from trihedron.plugins.numerics.surfaces.views import View
+from trihedron.plugins.shared.keyframe_views import KeyframeView
+from trihedron.plugins.surface.common import Gathered, ViewFold, pictured
+from trihedron.plugins.surface.common_planar import map_planes, numbered
+from trihedron.plugins.surface.common_superpixels import discs, fused, moved, observed_planes, superpixels
 
 
 @register("surface", "surfels")
@@ -36,7 +34,7 @@ class Surfels(ViewFold):
         if not 0.0 < self.region_deg < 90.0 or self.region_m <= 0.0 or self.texel_m < 0.001:
             raise ValueError("region_deg, region_m, texel_m: an angle within 0 … 90, positive, and at least 0.001")
 
-    def _kept(self, state: Gathered, view: View) -> None:
+    def _kept(self, state: Gathered, view: KeyframeView) -> None:
         """Cut it."""
         state.surfels.append(superpixels(view, self.side_px, self.coarse_px))
 

@@ -6,8 +6,7 @@ from dataclasses import dataclass
 
 from trihedron.pipeline.core.registry import register
 from trihedron.pipeline.core.types import Map, Surface
-from trihedron.plugins.numerics.surfaces.assembly import coloured
-from trihedron.plugins.numerics.surfaces.view_fold import Gathered, VolumeFold
+from trihedron.plugins.surface.common import Gathered, VolumeFold, coloured
 
 
 @register("surface", "tsdf")

@@ -8,9 +8,9 @@ import numpy as np
 
 from trihedron.pipeline.core.registry import register
 from trihedron.pipeline.core.types import Frame, Keypoints, Planes, Segments, Tracks
-from trihedron.plugins.numerics.images.mutual_matches import mutual_matches
-from trihedron.plugins.numerics.motion.relative_motion import solve_motion
-from trihedron.plugins.numerics.motion.track_pairs import NO_PAIRS, Features, StructureGates, tracks_value
+from trihedron.plugins.shared.descriptors import mutual_matches
+from trihedron.plugins.shared.relative_motion import solve_motion
+from trihedron.plugins.tracks.common import NO_PAIRS, Features, StructureGates, tracks_value
 
 
 @register("tracks", "brute_force")

@@ -10,9 +10,9 @@ import numpy as np
 from trihedron.pipeline.core.geometry import exp_so3, log_so3
 from trihedron.pipeline.core.registry import register
 from trihedron.pipeline.core.types import F32, I32, Bool, Frame, Keypoints, Planes, Segments, Tracks
-from trihedron.plugins.numerics.images.flow import nearest_pixels
-from trihedron.plugins.numerics.motion.relative_motion import solve_motion
-from trihedron.plugins.numerics.motion.track_pairs import NO_PAIRS, Features, StructureGates, tracks_value
+from trihedron.plugins.shared.relative_motion import solve_motion
+from trihedron.plugins.tracks.common import NO_PAIRS, Features, StructureGates, tracks_value
+from trihedron.plugins.tracks.common_kernels import nearest_pixels
 
 
 @register("tracks", "optical_flow")

@@ -3,16 +3,22 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 
 from trihedron.pipeline.core.geometry import exp_so3, log_so3, rotation_angle_deg
 from trihedron.pipeline.core.registry import register
-from trihedron.pipeline.core.types import F64, Frame, Keypoints, ManhattanFrame, Planes, Segments, Tracks
-from trihedron.plugins.numerics.images.descriptors import compared_by
-from trihedron.plugins.numerics.motion.relative_motion import Motion, solve_motion
-from trihedron.plugins.numerics.motion.track_pairs import NO_PAIRS, Features, tracks_value
-from trihedron.plugins.numerics.motion.track_search import Gates, Search
+from trihedron.pipeline.core.types import F64, U8, Camera, Frame, Keypoints, ManhattanFrame, Planes, Segments, Tracks
+from trihedron.plugins.shared.descriptors import compared_by, words_of
+from trihedron.plugins.shared.descriptors_kernels import U64, line_matches, near_matches
+from trihedron.plugins.shared.linalg import constant
+from trihedron.plugins.shared.plane_association_kernels import associated
+from trihedron.plugins.shared.relative_motion import Motion, solve_motion
+from trihedron.plugins.tracks.common import NO_PAIRS, Features, tracks_value
+from trihedron.plugins.tracks.common_kernels import rows_of_pairs
+from trihedron.plugins.tracks.projection_kernels import Intrinsics, Places, agreeing_kernel, moved
 
 NOT_MOVED = np.zeros(3)
 
@@ -132,3 +138,75 @@ def _turn(now: ManhattanFrame, before: ManhattanFrame) -> F64 | None:
 
 def _count(tracks: Tracks) -> int:
     return len(tracks.keypoints) + len(tracks.segments) + len(tracks.planes)
+
+
+class Gates(NamedTuple):
+    """How much the features of a pair may differ, apart from their place; see `match_near`, `match_lines` and `associate_planes`."""
+
+    octave_step: int
+    compared_by: int
+    distance: float  # of descriptors
+    ratio: float
+    line_sine: float
+    line_overlap: float
+    lines_compared_by: int
+    line_bits: float
+    plane_cosine: float
+
+
+@dataclass(frozen=True)
+class Search:
+    """Looks for the features of one frame in the next."""
+
+    before: Features
+    now: Features
+    camera: Camera
+    gates: Gates
+
+    def __call__(self, R: F64, t: F64, radius_px: float, plane_m: float) -> Tracks:
+        """All pairs found around the motion `p_current = R p_previous + t`: points and lines within `radius_px`, planes within `plane_m`."""
+        gates, walls, seen, found = self.gates, self.before.planes, self.now.planes, self._now
+        motion = constant(R, np.float64), constant(t, np.float64)
+        pixels, ends, planes, samples = moved(self._before, walls.coefficients, walls.samples_m, self._camera, *motion)
+        (words, line_words), (words_now, line_words_now) = self._words
+        points = near_matches(
+            pixels, *words, self.before.keypoints.octaves, found.pixels, *words_now, self.now.keypoints.octaves,
+            np.full(len(pixels), radius_px, np.float32), gates.octave_step, gates.compared_by, gates.distance, gates.ratio,
+        )  # fmt: skip
+        lines = line_matches(
+            ends, line_words, found.endpoints_px, line_words_now,
+            gates.line_sine, float(radius_px), gates.line_overlap, gates.lines_compared_by, gates.line_bits, gates.ratio,
+        )  # fmt: skip
+        same = associated(seen.coefficients, seen.samples_m, planes, samples, gates.plane_cosine, plane_m, True)
+        return tracks_value(self.now, self.before, (rows_of_pairs(points), rows_of_pairs(lines), np.ascontiguousarray(same[:, ::-1])), R)
+
+    def agreeing(self, tracks: Tracks, motion: Motion, error_px: float) -> Tracks:
+        """Without the key points and lines that the motion puts elsewhere than they were found, by more than `error_px` σ, and key points that never
+        had a depth."""
+        R, t = constant(motion.R, np.float64), constant(motion.t, np.float64)
+        unsure_px = float(self.camera.fx * np.sqrt(np.linalg.eigvalsh(motion.covariance[3:, 3:])[-1]))
+        points, lines = agreeing_kernel(tracks.keypoints, tracks.segments, self._before, self._now, self._camera, R, t, unsure_px, error_px)
+        return tracks_value(self.now, self.before, (points, lines, tracks.planes), motion.R)
+
+    @cached_property
+    def _camera(self) -> Intrinsics:
+        return float(self.camera.fx), float(self.camera.fy), float(self.camera.cx), float(self.camera.cy)
+
+    @cached_property
+    def _before(self) -> Places:
+        return _places(self.before)
+
+    @cached_property
+    def _now(self) -> Places:
+        return _places(self.now)
+
+    @cached_property
+    def _words(self) -> tuple[tuple[tuple[U64, U8], U64], tuple[tuple[U64, U8], U64]]:
+        """Of both frames the descriptors of points, as words and bytes, and of lines, as words."""
+        before, now = ((words_of(of.keypoints.descriptors), words_of(of.segments.descriptors)[0]) for of in (self.before, self.now))
+        return before, now
+
+
+def _places(features: Features) -> Places:
+    points, lines = features.keypoints, features.segments
+    return Places(points.pixels, points.points_m, points.sigma_px, lines.endpoints_px, lines.endpoints_m)

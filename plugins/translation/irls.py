@@ -8,9 +8,8 @@ import numpy as np
 
 from trihedron.pipeline.core.registry import register
 from trihedron.pipeline.core.types import Frame, Keypoints, Map, Pose, Rotation, Tracks, Translation
-from trihedron.plugins.numerics.maps.anchoring import anchored
-from trihedron.plugins.numerics.motion.derotated_points import point_rows, solve_step
-from trihedron.plugins.numerics.motion.positions import handed_on, origin, unmeasured
+from trihedron.plugins.mapping.reference_keyframe import anchored
+from trihedron.plugins.translation.common import handed_on, origin, point_rows, solve_step, unmeasured
 
 
 @register("translation", "irls")

@@ -9,13 +9,13 @@ import numpy as np
 from trihedron.pipeline.core.geometry import pose_matrix
 from trihedron.pipeline.core.registry import register
 from trihedron.pipeline.core.types import F64, Frame, Keypoints, Map, Planes, Pose, Rotation, Segments, Tracks, Translation
-from trihedron.plugins.numerics.algebra.constant_arrays import constant
-from trihedron.plugins.numerics.depth.depth_sampling import noise_coefficients
-from trihedron.plugins.numerics.maps.anchoring import anchored
-from trihedron.plugins.numerics.motion.place_pairs import pairs_of
-from trihedron.plugins.numerics.motion.pose_solver import Terms, solve_pose
-from trihedron.plugins.numerics.motion.positions import handed_on, origin, unmeasured
-from trihedron.plugins.numerics.motion.tracked_terms import tracked_lines, tracked_planes, tracked_points
+from trihedron.plugins.mapping.reference_keyframe import anchored
+from trihedron.plugins.shared.depth_image import noise_coefficients
+from trihedron.plugins.shared.linalg import constant
+from trihedron.plugins.shared.pose_optimizer import Terms, solve_pose
+from trihedron.plugins.shared.relative_motion import pairs_of
+from trihedron.plugins.translation.common import handed_on, origin, unmeasured
+from trihedron.plugins.translation.levenberg_marquardt_kernels import tracked_lines, tracked_planes, tracked_points
 
 
 @register("translation", "levenberg_marquardt")

@@ -8,9 +8,9 @@ import numpy as np
 
 from trihedron.pipeline.core.registry import register
 from trihedron.pipeline.core.types import F64, Bool, Frame, Keypoints, Map, Pose, Rotation, Tracks, Translation
-from trihedron.plugins.numerics.maps.anchoring import anchored
-from trihedron.plugins.numerics.motion.positions import handed_on, origin, unmeasured
-from trihedron.plugins.numerics.motion.tracked_places import tracked_places
+from trihedron.plugins.mapping.reference_keyframe import anchored
+from trihedron.plugins.shared.rigid_alignment import tracked_places
+from trihedron.plugins.translation.common import handed_on, origin, unmeasured
 
 
 @register("translation", "ransac")

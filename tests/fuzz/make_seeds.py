@@ -30,7 +30,7 @@ from trihedron.pipeline.record.recording import RecordingWriter
 from trihedron.pipeline.record.trajectories import TRUTH
 from trihedron.pipeline.run.ply import write_ply
 from trihedron.pipeline.run.runner import Runner
-from trihedron.plugins.numerics.maps.landmarks import empty_map
+from trihedron.plugins.mapping.landmarks import empty_map
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "datasets"))
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "pipeline"))

@@ -17,7 +17,7 @@ from numba import typeof, types
 from trihedron.datasets.simulation.synthetic import Synthetic
 from trihedron.pipeline.run import kernels
 from trihedron.pipeline.run.kernels import LISTED, type_of, word_of
-from trihedron.plugins.numerics.motion.pose_kernel import Flags
+from trihedron.plugins.shared.pose_optimizer_kernels import Flags
 from trihedron.tools.compile import RUNS
 
 ENTRIES = json.loads(LISTED.read_text())
@@ -42,7 +42,7 @@ def test_types_come_back_from_their_words():
         (np.zeros(4, bool), "bool[1C]"),
         (True, "bool"),
         ((1, 2.0), ["int64", "float64"]),
-        (flags, {"trihedron.plugins.numerics.motion.pose_kernel:Flags": ["uint8[1C]"] * 3}),
+        (flags, {"trihedron.plugins.shared.pose_optimizer_kernels:Flags": ["uint8[1C]"] * 3}),
         (np.zeros((2, 3), [("n", "f8"), ("z", "f4")]), {"[2C]": [["n", "<f8"], ["z", "<f4"]]}),
     ):
         assert word_of(typeof(value)) == word and type_of(word) == typeof(value), word
@@ -75,7 +75,7 @@ def test_what_is_called_is_what_the_interpreter_calls():
 def test_a_graph_uses_the_modules_that_its_plugins_take_something_from():
     used = kernels.used_by([Synthetic()])
     assert {"trihedron.datasets.simulation.raytracing", "trihedron.pipeline.core.gathering", "trihedron.pipeline.record.row_kernels"} <= used
-    assert "trihedron.plugins.numerics.planes.plane_fitting" not in used
+    assert "trihedron.plugins.planes.common" not in used
 
 
 def test_a_plugin_whose_module_only_another_process_knows_uses_what_can_be_seen():
@@ -92,7 +92,7 @@ from trihedron.plugins.numerics.axes.sphere_modes import orthonormal
 
 names = ("sphere_modes:orthonormal", "sphere_modes:search_axes")
 rows = [row for row, (kernel, _) in enumerate(json.loads(kernels.LISTED.read_text())) if kernel.endswith(names)]
-modules = {"trihedron.plugins.numerics.axes.sphere_modes"}
+modules = {"trihedron.plugins.manhattan.common"}
 before = kernels.missing(modules)
 if sys.argv[1] == "ahead":
     kernels.cores = lambda: 1

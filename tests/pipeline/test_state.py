@@ -17,7 +17,7 @@ from trihedron.pipeline.record.codec import Encoder
 from trihedron.pipeline.record.recording import Recording, RecordingWriter
 from trihedron.pipeline.run.runner import Runner
 from trihedron.pipeline.run.state import Keeper, Memory, load_map, reaches
-from trihedron.plugins.numerics.maps.landmarks import empty_map
+from trihedron.plugins.mapping.landmarks import empty_map
 
 sys.path.insert(0, str(Path(__file__).parent))
 from toys import ToyDataset, toy_graph

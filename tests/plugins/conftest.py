@@ -9,7 +9,7 @@ import pytest
 
 from trihedron.pipeline.core.geometry import exp_so3, invert, tangent_basis, transform, transform_planes
 from trihedron.pipeline.core.types import EXACT_DEPTH, Camera, DepthNoise, Frame, Keypoints, ManhattanFrame, Planes, Segments
-from trihedron.plugins.numerics.axes.cube_symmetry import CUBE
+from trihedron.plugins.shared.manhattan_frames_kernels import CUBE
 
 sys.path.insert(0, str(Path(__file__).parent))
 from direction_world import Directions

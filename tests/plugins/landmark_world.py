@@ -6,8 +6,8 @@ import numpy as np
 
 from trihedron.pipeline.core.geometry import exp_se3, invert, pose_matrix, tangent_basis, transform, transform_planes
 from trihedron.pipeline.core.types import Camera, Frame, Keypoints, Planes, Pose, Rotation, Segments, Tracks, Translation
-from trihedron.plugins.numerics.algebra.uncertainty import point_covariance
-from trihedron.plugins.numerics.maps.visibility import clip_segments
+from trihedron.plugins.mapping.visibility import clip_segments
+from trihedron.plugins.shared.linalg import point_covariance
 
 CAMERA = Camera(640, 480, 525.0, 520.0, 319.5, 239.5)
 SIZE = np.array([5.0, 3.0, 6.0])  # of the room; its axes are not the world's

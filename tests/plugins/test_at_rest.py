@@ -9,12 +9,11 @@ import pytest
 
 from trihedron.pipeline.core.geometry import exp_se3, invert, log_se3
 from trihedron.plugins.matches.local_map import LocalMap
-from trihedron.plugins.numerics.maps.at_rest import LEAST, AtRest, at_rest, distance2, on_planes, proven, proven_planes, spread_about
-from trihedron.plugins.numerics.maps.map_alignment import MapAlignment, Verdict
-from trihedron.plugins.numerics.maps.moving_objects import MovingObjects
-from trihedron.plugins.numerics.motion.pose_solver import PoseSolution
-from trihedron.plugins.numerics.motion.pose_terms import LineTerms, PointTerms
+from trihedron.plugins.pose.dynamic_objects import LEAST, AtRest, MovingObjects, at_rest, distance2, on_planes, proven, proven_planes, spread_about
+from trihedron.plugins.pose.map_alignment import MapAlignment, Verdict
 from trihedron.plugins.pose.refine import Refine
+from trihedron.plugins.shared.pose_optimizer import PoseSolution
+from trihedron.plugins.shared.pose_optimizer_kernels import LineTerms, PointTerms
 
 sys.path.insert(0, str(Path(__file__).parent))
 from landmark_world import World, camera_at, rotation_of, translation_of

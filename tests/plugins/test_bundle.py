@@ -10,13 +10,20 @@ import pytest
 from trihedron.pipeline.core.geometry import exp_se3, invert, log_se3, pose_matrix, tangent_basis
 from trihedron.pipeline.core.table import Table
 from trihedron.plugins.bundle.colmap import Colmap, solve_colmap
+from trihedron.plugins.bundle.common import bundle_problem, bundle_window, solve_bundle
+from trihedron.plugins.bundle.common_kernels import (
+    HUBER,
+    SQUARES,
+    TRUNCATED,
+    TRUST_LANDMARK,
+    NormalEquations,
+    linearise_bundle,
+    moved_bundle,
+    trusted,
+)
 from trihedron.plugins.bundle.local_window import LocalWindow
 from trihedron.plugins.bundle.none import NoBundle
-from trihedron.plugins.numerics.bundle.bundle_kernel import HUBER, SQUARES, TRUNCATED, NormalEquations, linearise_bundle
-from trihedron.plugins.numerics.bundle.bundle_problem import bundle_problem, bundle_window
-from trihedron.plugins.numerics.bundle.bundle_solver import solve_bundle
-from trihedron.plugins.numerics.bundle.bundle_step import TRUST_LANDMARK, moved_bundle, trusted
-from trihedron.plugins.numerics.maps.correction import apply_correction
+from trihedron.plugins.mapping.correction import apply_correction
 
 sys.path.insert(0, str(Path(__file__).parent))
 from derivatives import numeric

@@ -7,10 +7,9 @@ import numpy as np
 import pytest
 
 from trihedron.pipeline.core.geometry import exp_se3, tangent_basis
-from trihedron.plugins.numerics.bundle import bundle_terms as terms
-from trihedron.plugins.numerics.bundle.bundle_kernel import SQUARES, NormalEquations, line_basis, linearise_bundle
-from trihedron.plugins.numerics.bundle.bundle_problem import BundleMeasurements, BundleState
-from trihedron.plugins.numerics.motion.pose_terms import PARALLEL, PERPENDICULAR, SAME, basis, depth_direction, plane_rows
+from trihedron.plugins.bundle import common_kernels as terms_kernels
+from trihedron.plugins.bundle.common_kernels import SQUARES, BundleMeasurements, BundleState, NormalEquations, line_basis, linearise_bundle
+from trihedron.plugins.shared.pose_optimizer_kernels import PARALLEL, PERPENDICULAR, SAME, basis, depth_direction, plane_rows
 
 sys.path.insert(0, str(Path(__file__).parent))
 from derivatives import numeric
@@ -78,11 +77,11 @@ def test_the_derivatives_of_a_line(view, share):
     assert depth_direction(observed, m)
 
     def image(T, line):
-        return np.array([terms.line_term(*parts(T), line, N, share, segment, INTRINSICS, J, p)[0]])
+        return np.array([terms_kernels.line_term(*parts(T), line, N, share, segment, INTRINSICS, J, p)[0]])
 
     def depth(T, line):
         image(T, line)
-        return np.array([terms.line_depth_term(parts(T)[0], N, share, observed, m, J, p)[0]])
+        return np.array([terms_kernels.line_depth_term(parts(T)[0], N, share, observed, m, J, p)[0]])
 
     for residual in (image, depth):
         residual(T, line)
@@ -117,7 +116,7 @@ def test_the_derivatives_of_a_plane(view):
 
     at(T, first)
     by_pose = J_pose.copy()
-    terms.by_plane(*parts(T), first, B, J_plane)
+    terms_kernels.by_plane(*parts(T), first, B, J_plane)
     assert np.allclose(by_pose, numeric(lambda d: at(shifted(T, d), first), 6), atol=1e-8)
     assert np.allclose(J_plane, numeric(lambda d: at(T, moved_plane(first, d)), 3), atol=1e-8)
 
@@ -130,7 +129,7 @@ def test_the_derivatives_of_a_relation(kind, other):
     basis(b, B)
 
     def at(a, b):
-        rows = terms.relation_rows(kind, a, b, B, r, J_a, J_b)
+        rows = terms_kernels.relation_rows(kind, a, b, B, r, J_a, J_b)
         return r[:rows].copy()
 
     rows = len(at(a, b))

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from stopwatch import fastest_ms
 
-from trihedron.plugins.numerics.images.fast_corners import fast_corners
+from trihedron.plugins.keypoints.orb_kernels import fast_corners
 
 MARGIN = 4
 

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from trihedron.plugins.numerics.maps.focal_check import focal_check
+from trihedron.plugins.pose.focal_length import focal_check
 
 sys.path.insert(0, str(Path(__file__).parent))
 from landmark_world import CAMERA, World

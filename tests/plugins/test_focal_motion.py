@@ -10,8 +10,8 @@ from scipy.optimize import least_squares
 
 from trihedron.pipeline.core.geometry import exp_se3, transform
 from trihedron.plugins.matches.local_map import LocalMap
-from trihedron.plugins.numerics.maps.focal_check import KEYFRAMES, LEAST_POINTS
-from trihedron.plugins.numerics.maps.focal_motion import FocalMotion, _solve, focal_motion
+from trihedron.plugins.pose.focal_length import FocalMotion, focal_motion
+from trihedron.plugins.pose.focal_length_kernels import KEYFRAMES, LEAST_POINTS, solve
 
 sys.path.insert(0, str(Path(__file__).parent))
 from landmark_world import CAMERA, World, camera_at, rotation_of, translation_of
@@ -96,7 +96,7 @@ def test_the_effect_is_that_of_other_focal_lengths_on_the_pose():
 
     seen, noise_px, noise_m = projected(T, 1.0), np.full(60, 0.25), np.full(60, 1e-4)
     t = T[:3, 3].copy()
-    factor, _, turned, shifted = _solve(before, seen, noise_px, noise_m, told, T[:3, :3].copy(), t)
+    factor, _, turned, shifted = solve(before, seen, noise_px, noise_m, told, T[:3, :3].copy(), t)
     effect = np.concatenate([np.cross(turned, t) - shifted, -turned])
 
     def left(xi, factor):  # as motion of the camera in its keyframe's world

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from trihedron.plugins.numerics.maps.id_sets import among, distinct, union
+from trihedron.plugins.mapping.landmarks import among, distinct, union
 
 
 @pytest.mark.parametrize("a, b", [([5, 2, 9], [9, 1]), ([], [3]), ([3], []), ([], []), ([0], [0, 0])])

@@ -6,7 +6,7 @@ import pytest
 from stopwatch import fastest_ms
 
 from trihedron.datasets.simulation.synthetic import Synthetic
-from trihedron.plugins.numerics.images.line_support import line_support_segments
+from trihedron.plugins.lines.lsd_kernels import line_support_segments
 
 TOLERANCE = np.radians(22.5)
 

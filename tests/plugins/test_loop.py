@@ -10,11 +10,11 @@ import pytest
 from trihedron.pipeline.core.geometry import exp_se3, invert, pose_matrix
 from trihedron.pipeline.core.types import Frame, Pose
 from trihedron.plugins.loop.appearance import AppearanceLoop
+from trihedron.plugins.loop.common_pose_graph import Edges, solve_pose_graph
 from trihedron.plugins.loop.planes import PlanesLoop
 from trihedron.plugins.map.covisibility import Covisibility
+from trihedron.plugins.mapping.correction import apply_correction
 from trihedron.plugins.matches.local_map import LocalMap
-from trihedron.plugins.numerics.maps.correction import apply_correction
-from trihedron.plugins.numerics.places.pose_graph import Edges, solve_pose_graph
 
 sys.path.insert(0, str(Path(__file__).parent))
 from landmark_world import CAMERA, World, rotation_of, translation_of

@@ -9,7 +9,7 @@ import pytest
 from trihedron.pipeline.core.geometry import exp_so3, log_so3, rotation_angle_deg, tangent_basis
 from trihedron.pipeline.core.types import Normals, Planes, Segments
 from trihedron.plugins.manhattan.mean_shift import MeanShift
-from trihedron.plugins.numerics.axes.cube_symmetry import CUBE, nearest_equivalent
+from trihedron.plugins.shared.manhattan_frames_kernels import CUBE, nearest_equivalent
 
 ROWS, COLS, STRIDE = 120, 160, 4
 

@@ -9,10 +9,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from trihedron.pipeline.core.geometry import exp_so3, log_so3, rotation_angle_deg
-from trihedron.plugins.manhattan.atlanta import Atlanta
-from trihedron.plugins.numerics.axes.atlanta_fit import fit_shared_vertical, shared_covariance
-from trihedron.plugins.numerics.axes.azimuth_modes import named_azimuths
-from trihedron.plugins.numerics.axes.cube_symmetry import nearest_equivalent
+from trihedron.plugins.manhattan.atlanta import Atlanta, named_azimuths, shared_covariance
+from trihedron.plugins.manhattan.atlanta_kernels import fit_shared_vertical
+from trihedron.plugins.shared.manhattan_frames_kernels import nearest_equivalent
 
 KINDS = [
     ("three planes, clean", 0.99, 0.4),

@@ -8,9 +8,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from trihedron.pipeline.core.geometry import exp_so3, rotation_angle_deg
+from trihedron.plugins.manhattan.common import identified, symmetric_angles, turn_between
 from trihedron.plugins.manhattan.mixture import Mixture
-from trihedron.plugins.numerics.axes.cube_symmetry import CUBE, nearest_equivalent
-from trihedron.plugins.numerics.axes.frame_identities import identified, symmetric_angles, turn_between
+from trihedron.plugins.shared.manhattan_frames_kernels import CUBE, nearest_equivalent
 
 KINDS = [
     ("three planes, clean", 0.99, 0.4),

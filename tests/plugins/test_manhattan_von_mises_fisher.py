@@ -8,8 +8,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from trihedron.pipeline.core.geometry import exp_so3, rotation_angle_deg
-from trihedron.plugins.manhattan.von_mises_fisher import VonMisesFisher
-from trihedron.plugins.numerics.axes.von_mises_fisher import broad_mixture, improved
+from trihedron.plugins.manhattan.von_mises_fisher import VonMisesFisher, broad_mixture
+from trihedron.plugins.manhattan.von_mises_fisher_kernels import improved
 
 KINDS = [
     ("three planes, clean", 0.99, 0.1),

@@ -10,8 +10,8 @@ import pytest
 from trihedron.pipeline.core.geometry import exp_se3, invert, tangent_basis, transform, transform_planes
 from trihedron.plugins.map.covisibility import Covisibility
 from trihedron.plugins.map.none import NoMap
-from trihedron.plugins.numerics.maps.fusion import fuse_lines
-from trihedron.plugins.numerics.planes import plane_fusion
+from trihedron.plugins.mapping import plane_fusion
+from trihedron.plugins.mapping.insertion_kernels import fuse_lines
 
 sys.path.insert(0, str(Path(__file__).parent))
 from landmark_world import World, camera_at

@@ -8,12 +8,12 @@ import pytest
 from trihedron.pipeline.core.geometry import exp_so3, log_so3, pose_matrix, transform_planes
 from trihedron.pipeline.core.types import Camera, Frame, Pose
 from trihedron.plugins.loop.appearance import AppearanceLoop
+from trihedron.plugins.loop.common_pose_graph import Trueness, compass_of
 from trihedron.plugins.loop.planes import PlanesLoop
-from trihedron.plugins.numerics.maps.correction import apply_correction
-from trihedron.plugins.numerics.maps.insertion import add_keyframe
-from trihedron.plugins.numerics.maps.landmarks import OBSERVERS, empty_map
-from trihedron.plugins.numerics.places.map_compass import Trueness, compass_of
-from trihedron.plugins.numerics.planes import plane_fusion
+from trihedron.plugins.mapping import plane_fusion
+from trihedron.plugins.mapping.correction import apply_correction
+from trihedron.plugins.mapping.insertion import add_keyframe
+from trihedron.plugins.mapping.landmarks import OBSERVERS, empty_map
 
 CAMERA = Camera(640, 480, 525.0, 520.0, 319.5, 239.5)
 KEYFRAMES, STEP_M = 64, 0.5

@@ -9,8 +9,8 @@ import pytest
 
 from trihedron.pipeline.core.geometry import exp_se3, transform, transform_planes
 from trihedron.pipeline.core.table import CHUNK
-from trihedron.plugins.numerics.maps.local_window import local_window, observed_by
-from trihedron.plugins.numerics.planes import plane_fusion
+from trihedron.plugins.mapping import plane_fusion
+from trihedron.plugins.mapping.covisibility_graph import local_window, observed_by
 
 sys.path.insert(0, str(Path(__file__).parent))
 from landmark_world import World, camera_at

@@ -10,9 +10,9 @@ import pytest
 from trihedron.pipeline.core.geometry import exp_se3
 from trihedron.pipeline.core.types import Keypoints, Pose
 from trihedron.plugins.map.covisibility import Covisibility
+from trihedron.plugins.mapping.covisibility_graph import local_window, observed_by
+from trihedron.plugins.mapping.visibility import clip_segments
 from trihedron.plugins.matches.local_map import LocalMap
-from trihedron.plugins.numerics.maps.local_window import local_window, observed_by
-from trihedron.plugins.numerics.maps.visibility import clip_segments
 
 sys.path.insert(0, str(Path(__file__).parent))
 from landmark_world import CAMERA, World, camera_at, rotation_of, translation_of

@@ -9,13 +9,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from trihedron.pipeline.core import geometry as g
-from trihedron.plugins.numerics.bundle import bundle_terms
-from trihedron.plugins.numerics.bundle.bundle_kernel import line_basis
-from trihedron.plugins.numerics.motion import pose_kernel, pose_terms, relative_motion
-from trihedron.plugins.numerics.motion.pose_noise import Weights
-from trihedron.plugins.numerics.motion.pose_solver import NO_LINES, NO_PLANES, PlaneTerms, PointTerms, solve_pose
-from trihedron.plugins.numerics.motion.pose_terms import PARALLEL, PERPENDICULAR, SAME
-from trihedron.plugins.numerics.places import pose_graph
+from trihedron.plugins.bundle import common_kernels
+from trihedron.plugins.bundle.common_kernels import line_basis
+from trihedron.plugins.loop import common_pose_graph
+from trihedron.plugins.shared import pose_optimizer, pose_optimizer_kernels, relative_motion_kernels
+from trihedron.plugins.shared.pose_optimizer import NO_LINES, NO_PLANES, solve_pose
+from trihedron.plugins.shared.pose_optimizer_kernels import PARALLEL, PERPENDICULAR, SAME, PlaneTerms, PointTerms, Weights
 
 sys.path.insert(0, str(Path(__file__).parent))
 from derivatives import numeric
@@ -83,21 +82,21 @@ def test_a_point_s_derivatives(rng, angle, scale_m, with_depth):
     r, D, J = np.empty(3), np.empty((3, 3)), np.empty((3, 6))
 
     def residual(T):
-        assert pose_terms.point_rows(g.transform(g.invert(T), world), pixel, seen, INTRINSICS, r, D)
+        assert pose_optimizer_kernels.point_rows(g.transform(g.invert(T), world), pixel, seen, INTRINSICS, r, D)
         return r.copy()
 
     residual(T)
-    pose_terms.chain_point(D, 3, g.transform(g.invert(T), world), J)
+    pose_optimizer_kernels.chain_point(D, 3, g.transform(g.invert(T), world), J)
     step = np.array([depth, depth, depth, 1.0, 1.0, 1.0])
     assert agree(J * step, numeric(lambda d: residual(T @ g.exp_se3(step * d)), 6), 1e3)
     W = np.diag([1.0, 0.7, depth**2 if with_depth else 0.0])
     W[0, 1] = W[1, 0] = 0.2
     one, none = np.ones(1), (np.empty((0, 2, 2)), np.empty((0, 2, 2)), np.empty((0, 3, 3)))
     terms = PointTerms(world[None], np.zeros((1, 3, 3)), pixel[None], np.array([seen]), one, one)
-    flags = pose_kernel.Flags(np.full(1, pose_kernel.INLIER, np.uint8), np.empty(0, np.uint8), np.empty(0, np.uint8))
-    H, gradient, chi2 = np.empty((6, 6)), np.empty(6), pose_kernel.Chi2(np.empty(1), np.empty(0), np.empty(0), np.empty(0))
+    flags = pose_optimizer.Flags(np.full(1, pose_optimizer.INLIER, np.uint8), np.empty(0, np.uint8), np.empty(0, np.uint8))
+    H, gradient, chi2 = np.empty((6, 6)), np.empty(6), pose_optimizer_kernels.Chi2(np.empty(1), np.empty(0), np.empty(0), np.empty(0))
     weights = Weights(W[None], *none)
-    pose_kernel.linearise(*parts(T), INTRINSICS, terms, NO_LINES, NO_PLANES, weights, flags, False, 6, H, gradient, chi2)
+    pose_optimizer_kernels.linearise(*parts(T), INTRINSICS, terms, NO_LINES, NO_PLANES, weights, flags, False, 6, H, gradient, chi2)
     wanted = residual(T)
     assert chi2.points[0] == pytest.approx(wanted @ W @ wanted, rel=1e-6)
     assert np.allclose(np.tril(H * np.outer(step, step)), np.tril((J * step).T @ W @ (J * step)), rtol=1e-6, atol=1.0)
@@ -113,14 +112,14 @@ def test_a_line_s_derivatives(rng, angle, scale_m):
     line, segment, observed = g.transform(T, local), np.array([[380.0, 160.0], [210.0, 260.0]]), local * rng.uniform(0.95, 1.05, (2, 1))
     N, m, J, p = np.empty((3, 2)), np.empty(3), np.empty(10), np.empty(3)
     line_basis(line, N)
-    assert pose_terms.depth_direction(observed, m)
+    assert pose_optimizer_kernels.depth_direction(observed, m)
 
     def image(T, line):
-        return np.array([bundle_terms.line_term(*parts(T), line, N, 0.3, segment, INTRINSICS, J, p)[0]])
+        return np.array([common_kernels.line_term(*parts(T), line, N, 0.3, segment, INTRINSICS, J, p)[0]])
 
     def depths(T, line):
         image(T, line)
-        return np.array([bundle_terms.line_depth_term(parts(T)[0], N, 0.3, observed, m, J, p)[0]]) / depth
+        return np.array([common_kernels.line_depth_term(parts(T)[0], N, 0.3, observed, m, J, p)[0]]) / depth
 
     step = np.array([depth, depth, depth, 1.0, 1.0, 1.0])
     for residual, unit, size in ((image, 1.0, 1e3), (depths, depth, 1.0)):
@@ -142,7 +141,7 @@ def test_a_plane_s_derivatives(rng, angle, scale_m, kind):
 
     def residual(T, J=None):
         r, J = np.empty(3), np.empty((3, 6)) if J is None else J
-        assert pose_terms.plane_rows(kind, *parts(T), world, observed, B, r, J) == rows
+        assert pose_optimizer_kernels.plane_rows(kind, *parts(T), world, observed, B, r, J) == rows
         return r[:rows] / np.array([1.0, 1.0, scale_m])[:rows]
 
     J, step = np.empty((3, 6)), np.repeat([scale_m, 1.0], 3)
@@ -162,12 +161,12 @@ def test_the_gradient_of_the_motion_between_two_frames(rng, angle, scale_m):
     planes = np.array([np.append(direction(rng), scale_m) for _ in range(2)])
     seen = g.transform_planes(g.pose_matrix(R, t), planes) + 0.02 * np.array([1.0, 1.0, 1.0, scale_m])
     weight = np.diag([1.0, 1.0, 1.0, scale_m**-2])
-    terms = relative_motion.Terms(before, after, A @ np.swapaxes(A, 1, 2) / scale_m**2, planes, seen, np.tile(weight, (2, 1, 1)))
+    terms = relative_motion_kernels.Terms(before, after, A @ np.swapaxes(A, 1, 2) / scale_m**2, planes, seen, np.tile(weight, (2, 1, 1)))
     H, gradient = np.zeros((6, 6)), np.zeros(6)
-    relative_motion._normal_equations(terms, R, t, 1e30, H, gradient)
+    relative_motion_kernels._normal_equations(terms, R, t, 1e30, H, gradient)
 
     def cost(d):
-        return np.array([0.5 * relative_motion._residuals(terms, np.ascontiguousarray(g.exp_so3(d[:3]) @ R), t + scale_m * d[3:]).sum()])
+        return np.array([0.5 * relative_motion_kernels._residuals(terms, np.ascontiguousarray(g.exp_so3(d[:3]) @ R), t + scale_m * d[3:]).sum()])
 
     step = np.repeat([1.0, scale_m], 3)
     assert agree(gradient * step, numeric(cost, 6)[0], 1e2)
@@ -181,13 +180,16 @@ def test_the_gradient_of_a_graph_of_poses(rng, angle, scale_m):
     pairs = np.array([[0, 1], [1, 2], [0, 2]], np.int32)
     measured = np.array([g.invert(poses[a]) @ poses[b] @ g.exp_se3(noise * rng.normal(size=6)) for a, b in pairs])
     information = np.tile(np.diag(noise**-2.0), (3, 1, 1))
-    edges = pose_graph.Edges(pairs, measured, information)
-    gradient = pose_graph._normal_equations(poses, edges)[2].reshape(3, 6)
+    edges = common_pose_graph.Edges(pairs, measured, information)
+    gradient = common_pose_graph._normal_equations(poses, edges)[2].reshape(3, 6)
     unit = np.repeat([scale_m, 1.0], 3)
-    found = numeric(lambda d: np.array([0.5 * pose_graph._normal_equations(pose_graph._moved(poses, unit * d.reshape(3, 6)), edges)[0]]), 18, 1e-7)
+    def half_cost(d):
+        return np.array([0.5 * common_pose_graph._normal_equations(common_pose_graph._retract(poses, unit * d.reshape(3, 6)), edges)[0]])
+
+    found = numeric(half_cost, 18, 1e-7)
     assert np.allclose(gradient * unit, found.reshape(3, 6), rtol=1e-3, atol=1e-3 * np.abs(found).max())
     moved = pose(rng, 2.0, 1.0) @ poses  # the gauge: where the world is does not matter
-    assert pose_graph._normal_equations(moved, edges)[0] == pytest.approx(pose_graph._normal_equations(poses, edges)[0], rel=1e-3)
+    assert common_pose_graph._normal_equations(moved, edges)[0] == pytest.approx(common_pose_graph._normal_equations(poses, edges)[0], rel=1e-3)
 
 
 def measured(rng, T, n):

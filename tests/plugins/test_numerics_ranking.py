@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from trihedron.plugins.numerics.algebra.ranking import descending, few_descending, median
+from trihedron.plugins.shared.linalg_kernels import descending, few_descending, median
 
 RNG = np.random.default_rng(0)
 VALUES = {

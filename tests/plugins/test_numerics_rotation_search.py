@@ -6,12 +6,21 @@ import numpy as np
 import pytest
 
 from trihedron.pipeline.core.geometry import exp_so3, log_so3, nearest_rotation, rotation_angle_deg
-from trihedron.plugins.numerics.axes import rotation_search
-from trihedron.plugins.numerics.axes.consensus import climb, consensus_bound, curvature, summit_radius
-from trihedron.plugins.numerics.axes.cube_symmetry import CUBE, nearest_equivalent
-from trihedron.plugins.numerics.axes.direction_groups import group_directions
-from trihedron.plugins.numerics.axes.rotation_search import FACE, RotationSearch, angle_to_equivalent
-from trihedron.plugins.numerics.axes.sphere_grid import cell_of, coarser, largest_near, neighbours, sphere_grid
+from trihedron.plugins.manhattan import branch_and_bound, branch_and_bound_kernels
+from trihedron.plugins.manhattan.branch_and_bound import FACE, RotationSearch, sphere_grid
+from trihedron.plugins.manhattan.branch_and_bound_kernels import (
+    angle_to_equivalent,
+    cell_of,
+    climb,
+    coarser,
+    consensus_bound,
+    curvature,
+    group_directions,
+    largest_near,
+    neighbours,
+    summit_radius,
+)
+from trihedron.plugins.shared.manhattan_frames_kernels import CUBE, nearest_equivalent
 
 INLIER = np.radians(12.0)
 SEARCH = RotationSearch(INLIER, np.radians(1.0), 0.0, 200_000)
@@ -130,10 +139,10 @@ def test_every_rotation_has_an_equivalent_in_the_first_cube(directions):
     R_start = directions.rotation(rng)
     furthest = max(min(np.abs(log_so3(R_start.T @ R @ S)).max() for S in CUBE) for R in (directions.rotation(rng) for _ in range(1500)))
     assert np.degrees(furthest) <= 45.0
-    assert np.abs(rotation_search._first_cubes()).max() + rotation_search.HALF_WIDTH / rotation_search.FIRST == pytest.approx(np.pi / 4.0)
+    assert np.abs(branch_and_bound_kernels._first_cubes()).max() + branch_and_bound.HALF_WIDTH / branch_and_bound.FIRST == pytest.approx(np.pi / 4.0)
     R = np.empty((3, 3))
     v = np.array([0.3, -0.2, 0.5])
-    rotation_search._centre(v, R_start, R)
+    branch_and_bound_kernels._centre(v, R_start, R)
     assert np.allclose(R, R_start @ exp_so3(v))
 
 
@@ -209,7 +218,7 @@ def test_derivatives_are_bounded_and_the_bounds_attained(directions):
 def test_maps_hold_wherever_the_axes_are_in_their_cells(directions):
     rng = np.random.default_rng(12)
     R, vectors, weights = walls(directions, rng, (0.3, 0.2, 0.1))
-    cells = rotation_search._image(vectors, weights, SEARCH._grid, SEARCH._cones, INLIER)
+    cells = branch_and_bound_kernels.image(vectors, weights, SEARCH._grid, SEARCH._cones, INLIER)
     middle = coarser(cells, FACE[2])
     maps = (coarser(middle, FACE[1]), middle, cells)
     for level, radius_deg in enumerate((9.742, 4.871, 2.435)):
@@ -217,8 +226,8 @@ def test_maps_hold_wherever_the_axes_are_in_their_cells(directions):
         for _ in range(300):
             centre = R @ exp_so3(np.radians(rng.uniform(0.0, 20.0)) * directions.spherical(rng, 1)[0])
             turned = exp_so3(np.radians(radius_deg) * directions.spherical(rng, 1)[0]) @ centre
-            assert rotation_search._look_up(near, centre) >= consensus(vectors, weights, turned)[0]
-            assert rotation_search._look_up(cells, turned) >= consensus(vectors, weights, turned)[0]
+            assert branch_and_bound_kernels._look_up(near, centre) >= consensus(vectors, weights, turned)[0]
+            assert branch_and_bound_kernels._look_up(cells, turned) >= consensus(vectors, weights, turned)[0]
 
 
 def test_cells_of_the_sphere(directions):

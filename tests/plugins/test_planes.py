@@ -8,14 +8,13 @@ import pytest
 
 from trihedron.pipeline.core.geometry import tangent_basis
 from trihedron.plugins.normals.integral_image import IntegralImage
-from trihedron.plugins.numerics.depth.organised_grid import Grid
-from trihedron.plugins.numerics.planes.cell_columns import columns_of
-from trihedron.plugins.numerics.planes.plane_fitting import fit_cells
 from trihedron.plugins.planes.ahc import Ahc
 from trihedron.plugins.planes.cape import Cape
+from trihedron.plugins.planes.common_kernels import columns_of, fit_cells
 from trihedron.plugins.planes.connected_components import ConnectedComponents
 from trihedron.plugins.planes.none import NoPlanes
 from trihedron.plugins.planes.ransac import Ransac
+from trihedron.plugins.shared.depth_image_kernels import Grid
 
 CORNER = (((0.6, 0.0, -0.8), 2.2), ((-0.6, 0.0, -0.8), 2.2), ((0.0, -0.96, -0.28), 1.2))  # two walls and the floor
 

@@ -8,14 +8,14 @@ import pytest
 from trihedron.pipeline.core.types import DepthNoise
 from trihedron.plugins.normals.integral_image import IntegralImage
 from trihedron.plugins.normals.none import NoNormals
-from trihedron.plugins.numerics.depth.depth_sampling import noise_coefficients
-from trihedron.plugins.numerics.depth.organised_grid import Grid, cell_inverse_depths, cell_rays
-from trihedron.plugins.numerics.planes.block_clustering import cluster_blocks
-from trihedron.plugins.numerics.planes.plane_blocks import block_mse, block_plane, block_planes, block_sums
-from trihedron.plugins.numerics.planes.plane_curvature import drop_engulfed, normals_of_regions
 from trihedron.plugins.planes.ahc import Ahc
+from trihedron.plugins.planes.ahc_kernels import cluster_blocks
 from trihedron.plugins.planes.cape import Cape
+from trihedron.plugins.planes.common_blocks_kernels import block_mse, block_plane, block_planes, block_sums
+from trihedron.plugins.planes.common_kernels import drop_engulfed, normals_of_regions
 from trihedron.plugins.planes.ransac import Ransac
+from trihedron.plugins.shared.depth_image import noise_coefficients
+from trihedron.plugins.shared.depth_image_kernels import Grid, cell_inverse_depths, cell_rays
 
 CORNER = (((0.6, 0.0, -0.8), 2.2), ((-0.6, 0.0, -0.8), 2.2), ((0.0, -0.96, -0.28), 1.2))
 each = pytest.mark.parametrize("plugin", [Ahc, Cape, Ransac], ids=lambda plugin: plugin.__name__)

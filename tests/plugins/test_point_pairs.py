@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 
 from trihedron.pipeline.core.geometry import exp_se3, exp_so3, pose_matrix, rotation_angle_deg
+from trihedron.plugins.loop.common_pose_graph import moved_keyframes
 from trihedron.plugins.loop.pose_graph import PoseGraph
+from trihedron.plugins.mapping.correction import apply_correction
 from trihedron.plugins.matches.keyframes import Keyframes
-from trihedron.plugins.numerics.maps.correction import apply_correction
-from trihedron.plugins.numerics.places.loop_correction import moved_keyframes
 from trihedron.plugins.rotation.ransac import Ransac as RotationRansac
 from trihedron.plugins.tracks.brute_force import BruteForce
 from trihedron.plugins.translation.irls import Irls

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from trihedron.plugins.numerics.planes.region_merging import merge_regions, neighbours
+from trihedron.plugins.planes.common_kernels import merge_regions, neighbours
 
 
 def sums(normal, d, left, right, sigma_m):

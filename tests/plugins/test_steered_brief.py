@@ -4,9 +4,8 @@ import cv2
 import numpy as np
 from stopwatch import fastest_ms
 
-from trihedron.plugins.numerics.images.image_pyramid import image_pyramid
-from trihedron.plugins.numerics.images.oriented_corners import oriented_corners
-from trihedron.plugins.numerics.images.steered_brief import BITS, LONGEST_PX, REACH_PX, WINDOW_PX, brief_tests, steered_brief
+from trihedron.plugins.keypoints.orb import LONGEST_PX, brief_tests, image_pyramid
+from trihedron.plugins.keypoints.orb_kernels import BITS, REACH_PX, WINDOW_PX, oriented_corners, steered_brief
 
 TESTS = brief_tests()
 MARGIN = 19

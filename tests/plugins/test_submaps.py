@@ -12,8 +12,8 @@ from trihedron.pipeline.core.types import Pose
 from trihedron.pipeline.run.replay import Poses, Result
 from trihedron.pipeline.run.results import final_trajectory, is_tied
 from trihedron.plugins.map.covisibility import Covisibility
+from trihedron.plugins.mapping.covisibility_graph import current_submap, local_window, newest_keyframes
 from trihedron.plugins.matches.local_map import LocalMap
-from trihedron.plugins.numerics.maps.local_window import current_submap, local_window, newest_keyframes
 from trihedron.plugins.pose.refine import Refine
 
 sys.path.insert(0, str(Path(__file__).parent))

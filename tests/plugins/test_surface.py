@@ -13,8 +13,7 @@ from trihedron.pipeline.core.registry import load_plugins, plugin_class, plugins
 from trihedron.pipeline.core.types import EXACT_DEPTH, LOST, PLANE_KINDS, Camera
 from trihedron.pipeline.record.codec import Encoder
 from trihedron.pipeline.run.results import write_surface
-from trihedron.plugins.numerics.surfaces.half_edges import opposite_half_edges
-from trihedron.plugins.numerics.surfaces.pinholes import without_pinholes
+from trihedron.plugins.surface.common_meshes import opposite_half_edges, without_pinholes
 
 sys.path.insert(0, str(Path(__file__).parent))
 from surface_world import BACK, BALL, FLOOR, LEFT, RADIUS, faults, fold, off_truth, render, seen, walk

@@ -8,7 +8,7 @@ import pytest
 
 from trihedron.pipeline.core.geometry import exp_so3, invert, pose_matrix, rotation_angle_deg
 from trihedron.pipeline.core.types import Frame, Tracks
-from trihedron.plugins.numerics.motion.relative_motion import solve_motion
+from trihedron.plugins.shared.relative_motion import solve_motion
 from trihedron.plugins.tracks.projection import Projection
 
 START = pose_matrix(np.eye(3), np.zeros(3))

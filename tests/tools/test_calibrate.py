@@ -12,9 +12,8 @@ from trihedron.datasets.simulation.synthetic import Synthetic
 from trihedron.pipeline.app.cli import main
 from trihedron.pipeline.record.recording import Recording
 from trihedron.pipeline.record.trajectories import write_trajectory
-from trihedron.plugins.numerics.depth.depth_offset import RightAngle, estimate_depth_offset
-from trihedron.plugins.numerics.motion.depth_delay import Turn, estimate_depth_delay
 from trihedron.tools.calibrate import depth_delay_of, depth_offset_of, planes_of
+from trihedron.tools.calibration import RightAngle, Turn, estimate_depth_delay, estimate_depth_offset
 
 
 def write_tum(folder, frames, color_at, depth_at, offset=0.0):

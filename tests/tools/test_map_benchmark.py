@@ -5,7 +5,7 @@ import pytest
 
 from trihedron.pipeline.app.cli import main
 from trihedron.pipeline.core.types import Pose, Trajectory
-from trihedron.plugins.numerics.maps.landmarks import empty_map
+from trihedron.plugins.mapping.landmarks import empty_map
 from trihedron.tools.benchmarks.map_benchmark import (  # fmt: skip
     MULTIPLE,
     OWN,

@@ -10,7 +10,7 @@ from trihedron.pipeline.app.cli import main
 from trihedron.pipeline.core import registry
 from trihedron.pipeline.core.geometry import exp_so3
 from trihedron.pipeline.core.types import ManhattanFrame, Normals
-from trihedron.plugins.numerics.axes.cube_symmetry import CUBE
+from trihedron.plugins.shared.manhattan_frames_kernels import CUBE
 from trihedron.tools.benchmarks.rotation_comparison import common_world, read_runs, residuals_deg
 
 SMALL = ["dataset=synthetic", "dataset.width=160", "dataset.height=120", "dataset.length=5", "outputs=[manhattan]"]

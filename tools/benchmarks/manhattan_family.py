@@ -27,7 +27,7 @@ from trihedron.pipeline.core.errors import UsageError, did_you_mean
 from trihedron.pipeline.core.geometry import exp_so3, log_so3
 from trihedron.pipeline.core.registry import load_plugins, plugin_class, plugins_of
 from trihedron.pipeline.core.types import F64, ManhattanFrame
-from trihedron.plugins.numerics.axes.cube_symmetry import CUBE
+from trihedron.plugins.shared.manhattan_frames_kernels import CUBE
 from trihedron.tools.arguments import Parser, table
 from trihedron.tools.benchmarks import manhattan_views as seen
 

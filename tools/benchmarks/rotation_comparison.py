@@ -25,7 +25,7 @@ from trihedron.pipeline.core.geometry import log_so3, nearest_pairs, nearest_rot
 from trihedron.pipeline.core.types import F64, ManhattanFrame
 from trihedron.pipeline.record.recording import Recording
 from trihedron.pipeline.record.trajectories import attached_truth
-from trihedron.plugins.numerics.axes.cube_symmetry import CUBE, nearest_equivalent
+from trihedron.plugins.shared.manhattan_frames_kernels import CUBE, nearest_equivalent
 from trihedron.tools.arguments import Parser, table
 from trihedron.tools.benchmarks.manhattan_family import CHI2_MEDIAN
 

@@ -1,0 +1,49 @@
+"""Numba kernels of `data_association.py`."""
+# mypy: disable-error-code="arg-type, assignment, index, return-value"
+
+from __future__ import annotations
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+from trihedron.pipeline.core.types import F64, I32
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def related(
+    planes: F64, known: F64, same: I32, order: NDArray[np.int64], ids: I32, parallel_above: float, perpendicular_below: float, most: int
+) -> tuple[I32, I32]:
+    """Pairs (row, id) of each plane and the `most` known ones, first in order, that are parallel to it, and perpendicular, but for the same ones."""
+    n, one = len(planes), np.full(len(planes), -1, np.int32)
+    parallel, perpendicular = np.empty((n * most, 2), np.int32), np.empty((n * most, 2), np.int32)
+    p, q = 0, 0
+    for k in range(len(same)):
+        one[same[k, 0]] = same[k, 1]
+    for i in range(n):
+        p_end, q_end = p + most, q + most
+        for j in order:
+            cosine = abs(planes[i, 0] * known[j, 0] + planes[i, 1] * known[j, 1] + planes[i, 2] * known[j, 2])
+            if j == one[i]:
+                continue
+            if cosine > parallel_above and p < p_end:
+                parallel[p, 0], parallel[p, 1] = i, ids[j]
+                p += 1
+            if cosine < perpendicular_below and q < q_end:
+                perpendicular[q, 0], perpendicular[q, 1] = i, ids[j]
+                q += 1
+    return parallel[:p], perpendicular[:q]
+
+
+@numba.njit(cache=True, error_model="numpy")
+def pairs_kernel(found: I32, ids: I32, count: int) -> I32:
+    """Of `count` rows the one found for each landmark (-1 = none), no row for two -> (n, 2) pairs (row, id) sorted by row."""
+    owner, pairs, n = np.full(count, -1, np.int32), np.empty((len(found), 2), np.int32), 0
+    for i in range(len(found)):
+        if found[i] >= 0:
+            owner[found[i]] = ids[i]
+    for row in range(count):
+        if owner[row] >= 0:
+            pairs[n, 0], pairs[n, 1] = row, owner[row]
+            n += 1
+    return pairs[:n]

@@ -1,0 +1,108 @@
+"""Numba kernels of `tsdf.py`."""
+# mypy: disable-error-code="arg-type, assignment, index, return-value"
+
+from __future__ import annotations
+
+import numba
+import numpy as np
+
+from trihedron.pipeline.core.types import F32, I32, U8
+from trihedron.plugins.model.common_kernels import FULL, I16, NEAREST_M, Blocks, Lens
+from trihedron.plugins.shared.tsdf_volume_kernels import SIDE
+from trihedron.plugins.shared.voxel_hash_kernels import I64, number_of
+
+# What a truncated signed distance field shows from a pose: rays walked to where the sign changes (Newcombe et al., ISMAR 2011).
+
+BEFORE = 1.5  # truncations before a reading, where the search begins
+TILE = 8  # pixels that share the range of depths in which there are blocks
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def ranges_kernel(blocks: Blocks, camera: Lens, shape: tuple[int, int], block_m: float) -> F32:
+    """(rows, columns, 2) nearest and farthest depth of a block in each tile; (inf, 0) without one."""
+    fx, fy, cx, cy = camera.lens
+    R, t = camera.R_camera_world, camera.position_m
+    rows, columns = -(-shape[0] // TILE), -(-shape[1] // TILE)
+    out = np.zeros((rows, columns, 2), np.float32)
+    out[:, :, 0] = np.inf
+    for n in range(len(blocks.places)):
+        near, far, left, right, top, bottom = np.inf, 0.0, np.inf, -np.inf, np.inf, -np.inf
+        for corner in range(8):
+            a = (blocks.places[n, 0] + (corner & 1)) * block_m - t[0]
+            b = (blocks.places[n, 1] + (corner >> 1 & 1)) * block_m - t[1]
+            c = (blocks.places[n, 2] + (corner >> 2)) * block_m - t[2]
+            z = R[2, 0] * a + R[2, 1] * b + R[2, 2] * c
+            d = max(z, NEAREST_M)
+            u, v = fx * (R[0, 0] * a + R[0, 1] * b + R[0, 2] * c) / d + cx, fy * (R[1, 0] * a + R[1, 1] * b + R[1, 2] * c) / d + cy
+            near, far = min(near, d), max(far, z)
+            left, right, top, bottom = min(left, u), max(right, u), min(top, v), max(bottom, v)
+        if far <= NEAREST_M:
+            continue
+        first, last = max(int(np.floor(left / TILE)), 0), min(int(np.floor(right / TILE)), columns - 1)
+        for i in range(max(int(np.floor(top / TILE)), 0), min(int(np.floor(bottom / TILE)), rows - 1) + 1):
+            for j in range(first, last + 1):
+                out[i, j, 0], out[i, j, 1] = min(out[i, j, 0], near), max(out[i, j, 1], far)
+    return out
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _between(keys: I64, numbers: I32, distance: I16, weight: U8, x: float, y: float, z: float) -> float:
+    """The distance at a place (voxels) as a share of the truncation, trilinear; NaN where one of the eight voxels about it is not known."""
+    i, j, k = int(np.floor(x)), int(np.floor(y)), int(np.floor(z))
+    a, b, c = x - i, y - j, z - k
+    total, block, u, v, w = 0.0, -2, 0, 0, 0
+    for corner in range(8):
+        p, q, s = i + (corner & 1), j + (corner >> 1 & 1), k + (corner >> 2)
+        if block == -2 or p >> 3 != u or q >> 3 != v or s >> 3 != w:
+            u, v, w = p >> 3, q >> 3, s >> 3  # SIDE is 8
+            block = number_of(keys, numbers, u, v, w)
+        cell = ((p & 7) * SIDE + (q & 7)) * SIDE + (s & 7)
+        if block < 0 or weight[block, cell] == 0:
+            return np.nan
+        share = (a if corner & 1 else 1.0 - a) * (b if corner >> 1 & 1 else 1.0 - b) * (c if corner >> 2 else 1.0 - c)
+        total += share * distance[block, cell] / FULL
+    return total
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def cast_kernel(
+    keys: I64, numbers: I32, distance: I16, weight: U8, camera: Lens, ranges: F32, depth: F32, voxel: float, truncation: float
+) -> F32:  # fmt: skip
+    """Steps along each ray by what is known of the distance, through nearest voxels; then between two of these, trilinear."""
+    fx, fy, cx, cy = camera.lens
+    R, t = camera.R_camera_world, camera.position_m / voxel
+    out = np.zeros(depth.shape, np.float32)
+    for r in range(depth.shape[0]):
+        for c in range(depth.shape[1]):
+            z, far = ranges[r // TILE, c // TILE, 0], ranges[r // TILE, c // TILE, 1]
+            x, y = (c - cx) / fx, (r - cy) / fy
+            length = np.sqrt(x * x + y * y + 1.0)
+            z = max(z, depth[r, c] - BEFORE * truncation)
+            dx = (R[0, 0] * x + R[1, 0] * y + R[2, 0]) / voxel
+            dy = (R[0, 1] * x + R[1, 1] * y + R[2, 1]) / voxel
+            dz = (R[0, 2] * x + R[1, 2] * y + R[2, 2]) / voxel
+            before, last, nearest, block, u, v, w = False, 0.0, 0.0, -2, 0, 0, 0
+            while z <= far:
+                p, q, s = int(np.floor(dx * z + t[0] + 0.5)), int(np.floor(dy * z + t[1] + 0.5)), int(np.floor(dz * z + t[2] + 0.5))
+                if block == -2 or p >> 3 != u or q >> 3 != v or s >> 3 != w:
+                    u, v, w = p >> 3, q >> 3, s >> 3
+                    block = number_of(keys, numbers, u, v, w)
+                if block < 0:
+                    before = False
+                    z += 2.0 * voxel / length
+                    continue
+                cell = ((p & 7) * SIDE + (q & 7)) * SIDE + (s & 7)
+                known, value = weight[block, cell] > 0, distance[block, cell] / FULL
+                if known and value <= 0.0:
+                    if before:
+                        first = _between(keys, numbers, distance, weight, dx * last + t[0], dy * last + t[1], dz * last + t[2])
+                        second = _between(keys, numbers, distance, weight, dx * z + t[0], dy * z + t[1], dz * z + t[2])
+                        if np.isnan(first) or np.isnan(second):  # at the rim of what is known: through the nearest voxels
+                            first, second = nearest, value
+                        if first > second:
+                            out[r, c] = last + (z - last) * min(max(first / (first - second), -1.0), 2.0)
+                    break
+                if known:
+                    before, last, nearest = True, z, value
+                z += max(0.8 * value * truncation, voxel) / length if known else voxel / length
+    return out

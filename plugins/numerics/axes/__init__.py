@@ -1,1 +1,0 @@
-"""The directions of a Manhattan or Atlanta world: modes, searches, fits, identities."""

@@ -1,1 +1,0 @@
-"""Bundle adjustment of a window of keyframes."""

@@ -1,1 +1,0 @@
-"""Depth images: sampling, noise, normals, 3D lines."""

@@ -1,1 +1,0 @@
-"""Key points and lines of an image, and matching by descriptors."""

@@ -1,1 +1,0 @@
-"""The map: its columns, what a keyframe adds, what is searched in it, how it is corrected."""

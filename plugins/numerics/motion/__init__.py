@@ -1,1 +1,0 @@
-"""Motion between frames and the pose solver."""

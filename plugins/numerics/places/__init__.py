@@ -1,1 +1,0 @@
-"""Places seen before: hypotheses, checks, pose graphs."""

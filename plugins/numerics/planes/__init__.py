@@ -1,1 +1,0 @@
-"""Planar regions: growing, fitting, merging, associating."""

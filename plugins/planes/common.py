@@ -1,0 +1,109 @@
+"""What every detector of planes ends in: regions grown to their borders, merged, fitted by weighted least squares, reported with covariance."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from trihedron.pipeline.core.types import F64, I32, U8, Frame, Normals, Planes
+from trihedron.plugins.planes.common_kernels import (
+    MOST,
+    drop_engulfed,
+    grown_and_merged,
+    largest_regions,
+    normals_of_regions,
+    plane_report,
+    solve_symmetric,
+)
+from trihedron.plugins.shared.depth_image import noise_coefficients
+from trihedron.plugins.shared.depth_image_kernels import Grid, cell_inverse_depths, cell_rays
+
+EDGE, EDGE_M = 0.04, 0.02  # a step above EDGE z + EDGE_M within a cell's pixels: no depth there
+FACING = 0.5  # share of a region's cells that must have a normal within two cones of its own
+BIASES = 4.5  # biases of one σ_z across a region that its normals may turn by at any rate
+Sums = tuple[F64, F64, F64, I32]  # of each region's core, as from `accumulate`
+
+
+@dataclass(frozen=True)
+class PlanarRegions:
+    """Base of the plugins of `planes`: a plugin finds the core of each region, `_complete` makes Planes of them."""
+
+    cone_deg: float = 15.0  # normals of one plane lie within this of it
+    gate: float = 3.0  # σ_z of a member's depth
+    turn: float = 0.5  # a region whose normals turn by more than this share of the cone's half angle is curved
+    border_px: int = 16  # grown into whatever the normals say
+    merge: float = 0.3  # rms distance, in σ_z, of a region from the common plane of the two, noise apart
+    gap_px: int = 8  # between regions that may be one
+    min_pixels: int = 1000  # smallest region
+    planes: int = 24  # most, the largest
+    samples: int = 48  # points spread over a region
+    correlation_px: float = 8.0  # side of the square that counts as one independent depth, where the residuals cannot tell
+    tiles: int = 16  # squares a region is cut into to see how its residuals are correlated
+    bias: float = 0.1  # σ_z common to all depths of a region: a real sensor's depth is bent (fr3 of TUM: 0.1 to 0.3 track best)
+
+    def __post_init__(self) -> None:
+        if not 0.0 < self.cone_deg <= 45.0:
+            raise ValueError("cone_deg: must be above 0 and at most 45")
+        if self.gate <= 0.0 or self.turn <= 0.0 or self.merge < 0.0:
+            raise ValueError("gate, turn, merge: must be positive")
+        if self.border_px < 0 or self.gap_px < 0 or self.min_pixels < 16 or not 1 <= self.planes <= MOST:
+            raise ValueError(f"border_px, gap_px, min_pixels, planes: at least 0, 0, 16, and 1 to {MOST}")
+        if self.samples < 1 or self.correlation_px < 1.0 or self.tiles < 4 or self.bias < 0.0:
+            raise ValueError("samples, correlation_px, tiles, bias: must be at least 1, 1 px, 4 and 0")
+
+    def _grid(self, frame: Frame, normals: Normals) -> Grid:
+        """The frame's depths on the grid of the normals."""
+        camera = frame.camera
+        rho, sigma, count = cell_inverse_depths(frame.depth_m, normals.stride, EDGE, EDGE_M, noise_coefficients(camera.depth_noise))
+        intrinsics = (float(camera.fx), float(camera.fy), float(camera.cx), float(camera.cy))
+        rays_x, rays_y = cell_rays(rho.shape[0], rho.shape[1], normals.stride, intrinsics)
+        return Grid(rho, sigma, count, rays_x, rays_y, normals.normals)
+
+    def _least(self, stride: int) -> int:
+        """Cells a region's core must have: half of what the smallest region covers."""
+        return self.min_pixels // (2 * stride * stride) + 1
+
+    def _complete(self, core: U8, q: F64, grid: Grid, frame: Frame, stride: int, flat: bool = True) -> Planes:
+        """Planes of the regions whose core cells are labelled (h, w) and whose planes are q (k, 3): grown, merged, fitted to their cores. A detector
+        that did not ask the normals says that the regions need not be `flat`: curved ones are dropped."""
+        gap, cos_cone = max(self.gap_px // stride, 1), math.cos(2.0 * math.radians(self.cone_deg))
+        labels, owner, sums = grown_and_merged(
+            core, q, grid, self.gate, self.border_px // stride, cos_cone, gap, self.merge, self.correlation_px**2
+        )
+        if not flat:
+            owner = self._flat(owner, labels, sums, grid, gap)
+        return self._report(labels, core, owner, sums, grid, frame, stride)
+
+    def _flat(self, owner: I32, labels: U8, sums: Sums, grid: Grid, gap: int) -> I32:
+        """Which region each one became part of, (k + 1,) by label; 0 where the normals, if there are any, say that it is no plane."""
+        if np.isnan(grid.normals[..., 0]).all():
+            return owner
+        cone, merged = float(np.radians(self.cone_deg)), owner[labels]
+        q = np.array([solve_symmetric(A, b)[1] for A, b in zip(sums[0], sums[1])]).reshape(-1, 3)
+        turns, biases, share = normals_of_regions(merged, q, grid, float(np.cos(2.0 * cone)), 2)
+        good = (share >= FACING) & (turns <= np.maximum(self.turn * cone, BIASES * biases))
+        good = drop_engulfed(merged, grid.rho, good, gap)
+        return np.where(np.concatenate([[False], good])[owner], owner, 0).astype(np.int32)
+
+    def _report(self, labels: U8, core: U8, owner: I32, sums: Sums, grid: Grid, frame: Frame, stride: int) -> Planes:
+        """The largest regions as a value, largest first; `owner` says which one a label belongs to, 0 = none."""
+        numbered, number, ranked, area = largest_regions(labels, owner, grid.count, self.min_pixels, self.planes)
+        A, b, moments, n = (total[ranked] for total in sums)
+        q = np.linalg.solve(A, b[..., None])[..., 0]
+        coefficients, J, excess, samples = plane_report(
+            numbered, core, number, q, grid, self.tiles, self.correlation_px**2, 2.0, self.samples, 400
+        )
+        variance = excess + self.bias**2 * n  # over that of the least-squares fit to n independent depths, `A⁻¹`
+        return Planes(
+            index=frame.index,
+            stamp_ns=frame.stamp_ns,
+            coefficients=coefficients,
+            covariance=J @ (np.linalg.inv(A) * variance[:, None, None]) @ np.swapaxes(J, -1, -2),
+            moments=moments,
+            pixels=area,
+            samples_m=samples,
+            labels=numbered,
+            stride=stride,
+        )

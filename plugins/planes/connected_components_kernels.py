@@ -1,0 +1,52 @@
+"""Numba kernels of `connected_components.py`."""
+# mypy: disable-error-code="arg-type, assignment, index, return-value"
+
+from __future__ import annotations
+
+import numba
+import numpy as np
+
+from trihedron.pipeline.core.types import F32, F64, U8
+from trihedron.plugins.planes.common_kernels import fit_components
+from trihedron.plugins.shared.depth_image_kernels import Grid, cells_by_component, coarser, connected_components, smooth_links
+
+# Planes among the connected components of a grid's normals (Trevor et al., SPME 2013; paper, section III-A).
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def planar_components(
+    grid: Grid, edge: tuple[float, float], bend: float, gate: float, cone: float, turn: float, rounds: int, least: int, most: int
+) -> tuple[U8, F64]:
+    """Labels (h, w) of the cells that make up each plane, 0 = none, and the planes' q (k, 3), `most` at most.
+
+    Components of `least` cells or more, whose normals differ from their neighbours' by less than `bend` (rad), are sought on cells of twice the size
+    (a quarter of the work) without a step of more than `edge` (share of z, and m), and again among what is left: `rounds` times, with half the `cone`
+    (rad) in each further round. The normals of a plane lie within the cone and turn by no more than `turn` cones."""
+    coarse = coarser(grid, edge[0], edge[1])
+    h, w = coarse.rho.shape
+    labels, planes, found, before = np.zeros((h, w), np.uint8), np.zeros((most, 3)), 0, -1
+    links, free = smooth_links(coarse, np.cos(bend), gate), np.empty((h, w), np.bool_)
+    cells, starts = np.empty(0, np.int32), np.zeros(1, np.int32)
+    for _ in range(rounds):
+        if found > before:
+            for r in range(h):
+                for c in range(w):
+                    free[r, c] = (coarse.rho[r, c] > 0.0) & (coarse.normals[r, c, 0] == coarse.normals[r, c, 0]) & (labels[r, c] == 0)
+            cells, starts = cells_by_component(connected_components(links, free), least)
+        before = found
+        found = fit_components(coarse, cells, starts, cone, gate, turn * cone, least, labels, planes, found)
+        cone /= 2.0
+    return _finer(labels, grid.rho), planes[:found]
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _finer(labels: U8, rho: F32) -> U8:
+    """Labels (h, w) of cells by those of cells of twice the size; 0 without depth."""
+    h, w = rho.shape
+    out, wide = np.empty((h, w), np.uint8), np.empty(2 * labels.shape[1], np.uint8)
+    for r in range(h):
+        if r % 2 == 0:
+            for c in range(labels.shape[1]):
+                wide[2 * c] = wide[2 * c + 1] = labels[r // 2, c]
+        for c in range(w):
+            out[r, c] = wide[c] if rho[r, c] > 0.0 else 0
+    return out

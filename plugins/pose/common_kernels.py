@@ -1,0 +1,175 @@
+"""Numba kernels of `common.py`."""
+# mypy: disable-error-code="arg-type, assignment, index, return-value"
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numba
+import numpy as np
+
+from trihedron.pipeline.core.types import F32, F64
+from trihedron.plugins.shared.image_reduction_kernels import EDGE
+
+NEAREST_M = 0.1  # depth below which nothing is projected
+STEEPEST = 0.15  # cosine between ray and surface below which a reading says little
+
+
+class Source(NamedTuple):
+    """n points of an image."""
+
+    points_m: F64  # (n, 3)
+    normals: F32  # (n, 3), NaN = none
+    gray: F64  # (n,)
+    sigma_m: F64  # (n,) of their depth
+
+
+class Target(NamedTuple):
+    """An image they are warped into, (h, w)."""
+
+    gray: F32
+    gray_x: F32
+    gray_y: F32
+    depth_m: F32
+    normals: F32  # (h, w, 3)
+    lens: F64  # (fx, fy, cx, cy)
+
+
+class Rows(NamedTuple):
+    """Residuals of n points: (brightness, metres across the surface), with derivatives; `cosine` is k, 0 for a point that is not seen; `turned` the
+    source's normal in the target's frame where that and a surface to compare it with are known, seen or not."""
+
+    r: F64  # (n, 2)
+    J: F64  # (n, 2, 6)
+    cosine: F64  # (n,)
+    turned: F64  # (n, 3), NaN = none
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def fill_rows(source: Source, target: Target, R: F64, t: F64, least_gradient: float, farthest_m: float, least_cosine: float, rows: Rows) -> None:
+    """Fill the rows at a motion. A brightness row needs a gradient of `least_gradient` a pixel, else it is zero: noise would make one. Points farther
+    than `farthest_m` from the surface, or turned from it beyond `least_cosine`, are not seen."""
+    h, w = target.depth_m.shape
+    fx, fy, cx, cy = target.lens
+    for i in range(len(source.points_m)):
+        rows.cosine[i], rows.turned[i, 0] = 0.0, np.nan
+        p = source.points_m[i]
+        x = R[0, 0] * p[0] + R[0, 1] * p[1] + R[0, 2] * p[2] + t[0]
+        y = R[1, 0] * p[0] + R[1, 1] * p[1] + R[1, 2] * p[2] + t[1]
+        z = R[2, 0] * p[0] + R[2, 1] * p[1] + R[2, 2] * p[2] + t[2]
+        if not z > NEAREST_M:
+            continue
+        u, v = fx * x / z + cx, fy * y / z + cy
+        if not (u >= 0.0 and v >= 0.0 and u < w - 1 and v < h - 1):
+            continue
+        c, r = int(u), int(v)
+        a, b = u - c, v - r
+        d00, d01, d10, d11 = target.depth_m[r, c], target.depth_m[r, c + 1], target.depth_m[r + 1, c], target.depth_m[r + 1, c + 1]
+        low, high = min(d00, d01, d10, d11), max(d00, d01, d10, d11)
+        if not low > 0.0 or high - low > EDGE * low:
+            continue
+        n = target.normals[r + (1 if b > 0.5 else 0), c + (1 if a > 0.5 else 0)]
+        k = (n[0] * x + n[1] * y) / z + n[2]
+        if not k < -STEEPEST:
+            continue
+        w00, w01, w10, w11 = (1.0 - a) * (1.0 - b), a * (1.0 - b), (1.0 - a) * b, a * b
+        off = k * (w00 * d00 + w01 * d01 + w10 * d10 + w11 * d11 - z)
+        if abs(off) > farthest_m:
+            continue
+        _across(-n[0], -n[1], -n[2], x, y, z, rows.J[i, 1])
+        m = source.normals[i]
+        facing = 0.0
+        for j in range(3):
+            rows.turned[i, j] = R[j, 0] * m[0] + R[j, 1] * m[1] + R[j, 2] * m[2]
+            facing += n[j] * rows.turned[i, j]
+        if least_cosine > -1.0 and not facing > least_cosine:
+            continue
+        rows.cosine[i], rows.r[i, 1] = -k, off
+        gx = w00 * target.gray_x[r, c] + w01 * target.gray_x[r, c + 1] + w10 * target.gray_x[r + 1, c] + w11 * target.gray_x[r + 1, c + 1]
+        gy = w00 * target.gray_y[r, c] + w01 * target.gray_y[r, c + 1] + w10 * target.gray_y[r + 1, c] + w11 * target.gray_y[r + 1, c + 1]
+        gray = w00 * target.gray[r, c] + w01 * target.gray[r, c + 1] + w10 * target.gray[r + 1, c] + w11 * target.gray[r + 1, c + 1]
+        rows.r[i, 0] = gray - source.gray[i]
+        if gx * gx + gy * gy < least_gradient * least_gradient:
+            gx, gy = 0.0, 0.0
+        ax, ay = gx * fx / z, gy * fy / z
+        _across(ax, ay, -(ax * x + ay * y) / z, x, y, z, rows.J[i, 0])
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy", inline="always")
+def _across(ax: float, ay: float, az: float, x: float, y: float, z: float, J: F64) -> None:
+    """The derivative `(a, p' × a)` of a residual with gradient a at p'."""
+    J[0], J[1], J[2] = ax, ay, az
+    J[3], J[4], J[5] = y * az - z * ay, z * ax - x * az, x * ay - y * ax
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def normal_equations(rows: Rows, W: F64) -> tuple[F64, F64]:
+    """H (6, 6) and g (6,) of half the squared error; W (n, 3) holds the weights of brightness², their product, and distance²."""
+    H, g = np.zeros((6, 6)), np.zeros(6)
+    for i in range(len(W)):
+        if rows.cosine[i] == 0.0:
+            continue
+        a, b, c = W[i]
+        e0, e1 = a * rows.r[i, 0] + b * rows.r[i, 1], b * rows.r[i, 0] + c * rows.r[i, 1]
+        for j in range(6):
+            p, q = rows.J[i, 0, j], rows.J[i, 1, j]
+            g[j] += p * e0 + q * e1
+            s0, s1 = a * p + b * q, b * p + c * q
+            for k in range(j + 1):
+                H[j, k] += s0 * rows.J[i, 0, k] + s1 * rows.J[i, 1, k]
+    for j in range(6):
+        for k in range(j):
+            H[k, j] = H[j, k]
+    return H, g
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def what_is_seen(rows: Rows, W: F64) -> tuple[F64, F64, int]:
+    """Mean of n mᵀ over the normals n of the target and m of the source at one place (3, 3), the brightness' information about the translation
+    (3, 3), and how many points are seen. The noise of the two is not alike and drops out of the products, also of normals that do not face each
+    other; in the mean of n nᵀ it would spread the normals of a wall, and a direction along it would pass for one that is measured."""
+    N, G, count, pairs = np.zeros((3, 3)), np.zeros((3, 3)), 0, 0
+    for i in range(len(W)):
+        if not np.isnan(rows.turned[i, 0]):
+            pairs += 1
+            for j in range(3):
+                for k in range(3):
+                    N[j, k] -= 0.5 * (rows.J[i, 1, j] * rows.turned[i, k] + rows.J[i, 1, k] * rows.turned[i, j])
+        if rows.cosine[i] != 0.0:
+            count += 1
+            for j in range(3):
+                for k in range(3):
+                    G[j, k] += W[i, 0] * rows.J[i, 0, j] * rows.J[i, 0, k]
+    return N / max(pairs, 1), G, count
+
+
+# The motion between two images by all their pixels, coarse to fine; see `dense_rows` for the residuals.
+
+FREEDOM = 5.0  # degrees of freedom of the t-distribution (Kerl et al.)
+SCALE_ROUNDS = 4
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def student(r: F64, cosine: F64, sigma: F64) -> F64:
+    n = len(r)
+    a, b, c = 1.0 / 25.0, 0.0, 1.0  # the inverse of the scale: of brightness and depth in σ
+    for _ in range(SCALE_ROUNDS):
+        saa, sab, sbb, count = 0.0, 0.0, 0.0, 0
+        for i in range(n):
+            if cosine[i] > 0.0:
+                e0, e1 = r[i, 0], r[i, 1] / (cosine[i] * sigma[i])
+                w = (FREEDOM + 2.0) / (FREEDOM + a * e0 * e0 + 2.0 * b * e0 * e1 + c * e1 * e1)
+                saa, sab, sbb, count = saa + w * e0 * e0, sab + w * e0 * e1, sbb + w * e1 * e1, count + 1
+        if count < 10:
+            break
+        saa, sab, sbb = saa / count + 0.25, sab / count, sbb / count + 0.01
+        det = saa * sbb - sab * sab
+        a, b, c = sbb / det, -sab / det, saa / det
+    W = np.zeros((n, 3))
+    for i in range(n):
+        if cosine[i] > 0.0:
+            s = 1.0 / (cosine[i] * sigma[i])
+            e0, e1 = r[i, 0], r[i, 1] * s
+            w = (FREEDOM + 2.0) / (FREEDOM + a * e0 * e0 + 2.0 * b * e0 * e1 + c * e1 * e1)
+            W[i, 0], W[i, 1], W[i, 2] = w * a, w * b * s, w * c * s * s
+    return W

@@ -1,0 +1,861 @@
+"""Numba kernels of `pose_optimizer.py`."""
+# mypy: disable-error-code="arg-type, assignment, index, return-value"
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numba
+import numpy as np
+
+from trihedron.pipeline.core.types import F64, I32, U8
+from trihedron.plugins.shared.linalg_kernels import inverse_positive, solve_positive
+
+SAME, PARALLEL, PERPENDICULAR = 0, 1, 2  # kinds of plane terms
+NEAR_M = 0.05  # a point nearer than this to the image plane is not projected
+
+
+class PointTerms(NamedTuple):
+    """n world points and what was measured of them; `depth_m` NaN = pixel only."""
+
+    positions_m: F64  # (n, 3) world
+    covariance_m2: F64  # (n, 3, 3) world, of the positions
+    pixels: F64  # (n, 2)
+    depth_m: F64  # (n,)
+    sigma_px: F64  # (n,)
+    sigma_m: F64  # (n,) of the depth
+
+
+class LineTerms(NamedTuple):
+    """m world lines by two points each, and the segments seen; `observed_m` NaN = image only."""
+
+    endpoints_m: F64  # (m, 2, 3) world
+    covariance_m2: F64  # (m, 2, 3, 3) world
+    endpoints_px: F64  # (m, 2, 2)
+    sigma_px: F64  # (m,) of an end point across the segment
+    observed_m: F64  # (m, 2, 3) camera
+    observed_covariance_m2: F64  # (m, 2, 3, 3) camera
+
+
+class PlaneTerms(NamedTuple):
+    """p pairs of a world plane and an observed one. Covariances are of (a, b, d), see `types.Planes`."""
+
+    kinds: I32  # (p,) SAME, PARALLEL or PERPENDICULAR
+    coefficients: F64  # (p, 4) world
+    covariance: F64  # (p, 3, 3)
+    observed: F64  # (p, 4) camera
+    observed_covariance: F64  # (p, 3, 3)
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def rotation_and_translation(T: F64) -> tuple[F64, F64]:
+    """Rotation and translation of T (4, 4)."""
+    R, t = np.empty((3, 3)), np.empty(3)
+    for i in range(3):
+        t[i] = T[i, 3]
+        for j in range(3):
+            R[i, j] = T[i, j]
+    return R, t
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
+def to_camera(R: F64, t: F64, world: F64, out: F64) -> None:
+    """`out = Rᵀ (world - t)`."""
+    x, y, z = world[0] - t[0], world[1] - t[1], world[2] - t[2]
+    for k in range(3):
+        out[k] = R[0, k] * x + R[1, k] * y + R[2, k] * z
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def chain_point(D: F64, rows: int, p: F64, J: F64) -> None:
+    """J (rows, 6) from the derivatives D (rows, 3) with respect to the camera-frame point p."""
+    for k in range(rows):
+        a, b, c = D[k, 0], D[k, 1], D[k, 2]
+        J[k, 0], J[k, 1], J[k, 2] = -a, -b, -c
+        J[k, 3] = b * p[2] - c * p[1]
+        J[k, 4] = c * p[0] - a * p[2]
+        J[k, 5] = a * p[1] - b * p[0]
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def point_rows(p: F64, pixel: F64, depth_m: float, camera: F64, r: F64, D: F64) -> bool:
+    """Reprojection (px) and inverse depth (1/m) of camera-frame point p: residual r (3,) and D = dr/dp (3, 3); without depth the third row is 0.
+
+    The inverse-depth row is the stereo-like row of RGB-D SLAM up to the baseline. False when p is not in front of the camera, or NaN."""
+    if not p[2] > NEAR_M:
+        return False
+    iz = 1.0 / p[2]
+    fx, fy = camera[0] * iz, camera[1] * iz
+    r[0] = fx * p[0] + camera[2] - pixel[0]
+    r[1] = fy * p[1] + camera[3] - pixel[1]
+    D[0, 0], D[0, 1], D[0, 2] = fx, 0.0, -fx * p[0] * iz
+    D[1, 0], D[1, 1], D[1, 2] = 0.0, fy, -fy * p[1] * iz
+    D[2, 0], D[2, 1], D[2, 2], r[2] = 0.0, 0.0, 0.0, 0.0
+    if np.isfinite(depth_m):
+        r[2] = iz - 1.0 / depth_m
+        D[2, 2] = -iz * iz
+    return True
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
+def line_row(p: F64, segment_px: F64, camera: F64, D: F64) -> tuple[float, float]:
+    """Signed distance (px) of the projection of camera-frame point p from the line through `segment_px` (2, 2), and where along the segment
+    it falls (0 = start, 1 = end). D (3,) is the distance's derivative. The line is normalised by √(a² + b²). p must be in front."""
+    iz = 1.0 / p[2]
+    u, v = camera[0] * p[0] * iz + camera[2], camera[1] * p[1] * iz + camera[3]
+    dx, dy = segment_px[1, 0] - segment_px[0, 0], segment_px[1, 1] - segment_px[0, 1]
+    length = max(np.sqrt(dx * dx + dy * dy), 1e-9)
+    a, b = -dy / length, dx / length
+    x, y = u - segment_px[0, 0], v - segment_px[0, 1]
+    D[0], D[1] = a * camera[0] * iz, b * camera[1] * iz
+    D[2] = -(D[0] * p[0] + D[1] * p[1]) * iz
+    return a * x + b * y, (dx * x + dy * y) / (length * length)
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
+def depth_direction(observed_m: F64, m: F64) -> bool:
+    """m (3,): the unit vector normal to an observed 3D segment (2, 3) within the plane through it and the camera centre, the direction the image
+    cannot see. False when the segment has NaN or points at the camera."""
+    o, e = observed_m[0], observed_m[1]
+    dx, dy, dz = e[0] - o[0], e[1] - o[1], e[2] - o[2]
+    nx, ny, nz = o[1] * e[2] - o[2] * e[1], o[2] * e[0] - o[0] * e[2], o[0] * e[1] - o[1] * e[0]
+    m[0], m[1], m[2] = ny * dz - nz * dy, nz * dx - nx * dz, nx * dy - ny * dx
+    size = np.sqrt(m[0] * m[0] + m[1] * m[1] + m[2] * m[2])
+    if not size > 1e-9:
+        return False
+    for k in range(3):
+        m[k] /= size
+    return True
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
+def line_depth_row(p: F64, observed_m: F64, m: F64) -> tuple[float, float]:
+    """Distance (m) of camera-frame point p from an observed 3D segment along m (its derivative), and where along the segment it falls."""
+    x, y, z = p[0] - observed_m[0, 0], p[1] - observed_m[0, 1], p[2] - observed_m[0, 2]
+    dx, dy, dz = observed_m[1, 0] - observed_m[0, 0], observed_m[1, 1] - observed_m[0, 1], observed_m[1, 2] - observed_m[0, 2]
+    return m[0] * x + m[1] * y + m[2] * z, (dx * x + dy * y + dz * z) / max(dx * dx + dy * dy + dz * dz, 1e-12)
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
+def basis(n: F64, B: F64) -> None:
+    """B (3, 2): `geometry.tangent_basis` of the unit vector n."""
+    s = 1.0 if n[2] >= 0.0 else -1.0
+    a = -1.0 / (s + n[2])
+    b = n[0] * n[1] * a
+    B[0, 0], B[1, 0], B[2, 0] = 1.0 + s * n[0] * n[0] * a, s * b, -s * n[0]
+    B[0, 1], B[1, 1], B[2, 1] = b, s + n[1] * n[1] * a, -n[1]
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
+def plane_rows(kind: int, R: F64, t: F64, world: F64, observed: F64, B: F64, r: F64, J: F64) -> int:
+    """Residual r (3,) and J (3, 6) of a plane pair; returns the number of rows. B is `basis` of the observed normal.
+
+    SAME: the predicted normal in the tangent plane of the observed one, and d (3 rows; regular at every normal, unlike azimuth and elevation).
+    PARALLEL: the tangent rows alone, for either orientation. PERPENDICULAR: the product of the normals."""
+    n0 = R[0, 0] * world[0] + R[1, 0] * world[1] + R[2, 0] * world[2]
+    n1 = R[0, 1] * world[0] + R[1, 1] * world[1] + R[2, 1] * world[2]
+    n2 = R[0, 2] * world[0] + R[1, 2] * world[1] + R[2, 2] * world[2]
+    dot = n0 * observed[0] + n1 * observed[1] + n2 * observed[2]
+    for k in range(3):
+        for b in range(6):
+            J[k, b] = 0.0
+    if kind == PERPENDICULAR:
+        r[0] = dot
+        o0, o1, o2 = observed[0], observed[1], observed[2]
+        J[0, 3], J[0, 4], J[0, 5] = o1 * n2 - o2 * n1, o2 * n0 - o0 * n2, o0 * n1 - o1 * n0
+        return 1
+    sign = -1.0 if kind == PARALLEL and dot < 0.0 else 1.0
+    for k in range(2):
+        b0, b1, b2 = sign * B[0, k], sign * B[1, k], sign * B[2, k]
+        r[k] = b0 * n0 + b1 * n1 + b2 * n2
+        J[k, 3], J[k, 4], J[k, 5] = b1 * n2 - b2 * n1, b2 * n0 - b0 * n2, b0 * n1 - b1 * n0  # bᵀ [n]×, when the camera turns
+    if kind == PARALLEL:
+        return 2
+    r[2] = world[3] + world[0] * t[0] + world[1] * t[1] + world[2] * t[2] - observed[3]
+    J[2, 0], J[2, 1], J[2, 2] = n0, n1, n2
+    return 3
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
+def plane_slopes(kind: int, R: F64, t: F64, world: F64, observed: F64, Bw: F64, B: F64, F: F64, G: F64) -> None:
+    """Derivatives (3, 3) of `plane_rows` by the (a, b, d) of the map plane, F, and of the observed one, G, of bases Bw and B; signs apart."""
+    for i in range(3):
+        for j in range(3):
+            F[i, j] = G[i, j] = 0.0
+    if kind == PERPENDICULAR:
+        for j in range(2):
+            for i in range(3):
+                turned = R[i, 0] * observed[0] + R[i, 1] * observed[1] + R[i, 2] * observed[2]
+                F[0, j] += turned * Bw[i, j]
+                G[0, j] += (R[0, i] * world[0] + R[1, i] * world[1] + R[2, i] * world[2]) * B[i, j]
+    else:
+        for j in range(2):
+            for k in range(2):
+                for i in range(3):
+                    F[k, j] += B[i, k] * (R[0, i] * Bw[0, j] + R[1, i] * Bw[1, j] + R[2, i] * Bw[2, j])
+            G[j, j] = 1.0
+            if kind == SAME:
+                F[2, j] = t[0] * Bw[0, j] + t[1] * Bw[1, j] + t[2] * Bw[2, j]
+        if kind == SAME:
+            F[2, 2] = G[2, 2] = 1.0
+
+
+# The noise of the pose solver's residuals: of the measurement and of the landmark, at a given pose.
+
+class Weights(NamedTuple):
+    """Inverse covariances of the residuals, held during a round."""
+
+    points: F64  # (n, 3, 3)
+    lines: F64  # (m, 2, 2) image distances
+    line_depths: F64  # (m, 2, 2)
+    planes: F64  # (p, 3, 3)
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
+def invert_small(S: F64, rows: int, W: F64) -> None:
+    """Inverse of the leading block of 1, 2 or 3 rows of a symmetric matrix into W; the rest 0."""
+    for i in range(len(W)):
+        for j in range(len(W)):
+            W[i, j] = 0.0
+    if rows == 1:
+        W[0, 0] = 1.0 / S[0, 0]
+        return
+    if rows == 2:
+        det = S[0, 0] * S[1, 1] - S[0, 1] * S[1, 0]
+        W[0, 0], W[1, 1], W[0, 1], W[1, 0] = S[1, 1] / det, S[0, 0] / det, -S[0, 1] / det, -S[1, 0] / det
+        return
+    W[0, 0] = S[1, 1] * S[2, 2] - S[1, 2] * S[2, 1]
+    W[0, 1] = S[0, 2] * S[2, 1] - S[0, 1] * S[2, 2]
+    W[0, 2] = S[0, 1] * S[1, 2] - S[0, 2] * S[1, 1]
+    W[1, 1] = S[0, 0] * S[2, 2] - S[0, 2] * S[2, 0]
+    W[1, 2] = S[0, 2] * S[1, 0] - S[0, 0] * S[1, 2]
+    W[2, 2] = S[0, 0] * S[1, 1] - S[0, 1] * S[1, 0]
+    W[1, 0], W[2, 0], W[2, 1] = W[0, 1], W[0, 2], W[1, 2]
+    det = S[0, 0] * W[0, 0] + S[0, 1] * W[1, 0] + S[0, 2] * W[2, 0]
+    for i in range(3):
+        for j in range(3):
+            W[i, j] /= det
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
+def _offset_variance(d: F64, R: F64, S: F64) -> float:
+    """Variance along the camera-frame direction d of a world covariance S."""
+    x = R[0, 0] * d[0] + R[0, 1] * d[1] + R[0, 2] * d[2]
+    y = R[1, 0] * d[0] + R[1, 1] * d[1] + R[1, 2] * d[2]
+    z = R[2, 0] * d[0] + R[2, 1] * d[1] + R[2, 2] * d[2]
+    total = x * S[0, 0] * x + x * S[0, 1] * y + x * S[0, 2] * z
+    total = total + y * S[1, 0] * x + y * S[1, 1] * y + y * S[1, 2] * z
+    return total + z * S[2, 0] * x + z * S[2, 1] * y + z * S[2, 2] * z
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
+def _quadratic(d: F64, S: F64) -> float:
+    total = 0.0
+    for i in range(3):
+        for j in range(3):
+            total += d[i] * S[i, j] * d[j]
+    return total
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _weigh_points(R: F64, t: F64, camera: F64, terms: PointTerms, W: F64) -> None:
+    """Pixel and inverse-depth noise plus the landmark's own covariance, projected at this pose. In scalars, as `pose_kernel` has its points."""
+    for i in range(len(terms.positions_m)):
+        x, y, z = terms.positions_m[i, 0] - t[0], terms.positions_m[i, 1] - t[1], terms.positions_m[i, 2] - t[2]
+        p2 = R[0, 2] * x + R[1, 2] * y + R[2, 2] * z
+        for a in range(3):
+            for b in range(3):
+                W[i, a, b] = 0.0
+        if not p2 > NEAR_M:
+            continue
+        iz, depth = 1.0 / p2, terms.depth_m[i]
+        d00, d11 = camera[0] * iz, camera[1] * iz
+        d02 = -d00 * (R[0, 0] * x + R[1, 0] * y + R[2, 0] * z) * iz
+        d12 = -d11 * (R[0, 1] * x + R[1, 1] * y + R[2, 1] * z) * iz
+        d22 = -iz * iz if np.isfinite(depth) else 0.0
+        u0, u1, u2 = d00 * R[0, 0] + d02 * R[0, 2], d00 * R[1, 0] + d02 * R[1, 2], d00 * R[2, 0] + d02 * R[2, 2]  # rows of D Rᵀ
+        v0, v1, v2 = d11 * R[0, 1] + d12 * R[0, 2], d11 * R[1, 1] + d12 * R[1, 2], d11 * R[2, 1] + d12 * R[2, 2]
+        c00, c01, c02 = terms.covariance_m2[i, 0, 0], terms.covariance_m2[i, 0, 1], terms.covariance_m2[i, 0, 2]
+        c11, c12, c22 = terms.covariance_m2[i, 1, 1], terms.covariance_m2[i, 1, 2], terms.covariance_m2[i, 2, 2]
+        f0, f1, f2 = c00 * u0 + c01 * u1 + c02 * u2, c01 * u0 + c11 * u1 + c12 * u2, c02 * u0 + c12 * u1 + c22 * u2
+        g0, g1, g2 = c00 * v0 + c01 * v1 + c02 * v2, c01 * v0 + c11 * v1 + c12 * v2, c02 * v0 + c12 * v1 + c22 * v2
+        noise = terms.sigma_px[i] * terms.sigma_px[i]
+        s00, s01, s11 = u0 * f0 + u1 * f1 + u2 * f2 + noise, v0 * f0 + v1 * f1 + v2 * f2, v0 * g0 + v1 * g1 + v2 * g2 + noise
+        if d22 == 0.0:
+            det = s00 * s11 - s01 * s01
+            W[i, 0, 0], W[i, 1, 1], W[i, 0, 1], W[i, 1, 0] = s11 / det, s00 / det, -s01 / det, -s01 / det
+            continue
+        k0, k1, k2 = d22 * R[0, 2], d22 * R[1, 2], d22 * R[2, 2]
+        s02, s12 = k0 * f0 + k1 * f1 + k2 * f2, k0 * g0 + k1 * g1 + k2 * g2
+        s22 = k0 * (c00 * k0 + c01 * k1 + c02 * k2) + k1 * (c01 * k0 + c11 * k1 + c12 * k2) + k2 * (c02 * k0 + c12 * k1 + c22 * k2)
+        s22 += (terms.sigma_m[i] / (depth * depth)) ** 2
+        m00, m01, m02 = s11 * s22 - s12 * s12, s02 * s12 - s01 * s22, s01 * s12 - s02 * s11
+        det = s00 * m00 + s01 * m01 + s02 * m02
+        W[i, 0, 0], W[i, 1, 1], W[i, 2, 2] = m00 / det, (s00 * s22 - s02 * s02) / det, (s00 * s11 - s01 * s01) / det
+        W[i, 0, 1], W[i, 0, 2], W[i, 1, 2] = m01 / det, m02 / det, (s02 * s01 - s00 * s12) / det
+        W[i, 1, 0], W[i, 2, 0], W[i, 2, 1] = W[i, 0, 1], W[i, 0, 2], W[i, 1, 2]
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
+def _pair_noise(s0: float, s1: float, at_start: float, at_end: float, map0: float, map1: float, S: F64) -> None:
+    """Covariance of the distances at parameters s0, s1 along a segment whose ends have the given variances, plus those of the map's points."""
+    S[0, 0] = (1.0 - s0) ** 2 * at_start + s0 * s0 * at_end + map0
+    S[1, 1] = (1.0 - s1) ** 2 * at_start + s1 * s1 * at_end + map1
+    S[0, 1] = S[1, 0] = (1.0 - s0) * (1.0 - s1) * at_start + s0 * s1 * at_end
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _weigh_lines(R: F64, t: F64, camera: F64, terms: LineTerms, W: F64, V: F64) -> None:
+    """Noise of the segment's ends, extrapolated to where the map's end points fall, plus that of the map's end points."""
+    p, D, m, S = np.empty((2, 3)), np.empty((2, 3)), np.empty(3), np.empty((2, 2))
+    for i in range(len(terms.endpoints_m)):
+        for a in range(2):
+            for b in range(2):
+                W[i, a, b] = V[i, a, b] = 0.0
+        to_camera(R, t, terms.endpoints_m[i, 0], p[0])
+        to_camera(R, t, terms.endpoints_m[i, 1], p[1])
+        if not (p[0, 2] > NEAR_M and p[1, 2] > NEAR_M):
+            continue
+        s0 = line_row(p[0], terms.endpoints_px[i], camera, D[0])[1]
+        s1 = line_row(p[1], terms.endpoints_px[i], camera, D[1])[1]
+        C, noise = terms.covariance_m2[i], terms.sigma_px[i] ** 2
+        _pair_noise(s0, s1, noise, noise, _offset_variance(D[0], R, C[0]), _offset_variance(D[1], R, C[1]), S)
+        invert_small(S, len(S), W[i])
+        if depth_direction(terms.observed_m[i], m):
+            s0 = line_depth_row(p[0], terms.observed_m[i], m)[1]
+            s1 = line_depth_row(p[1], terms.observed_m[i], m)[1]
+            Q = terms.observed_covariance_m2[i]
+            _pair_noise(s0, s1, _quadratic(m, Q[0]), _quadratic(m, Q[1]), _offset_variance(m, R, C[0]), _offset_variance(m, R, C[1]), S)
+            invert_small(S, len(S), V[i])
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
+def rows_of(kind: int) -> int:
+    """Number of residuals of a kind of plane term."""
+    return 3 if kind == SAME else (1 if kind == PERPENDICULAR else 2)
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _weigh_planes(R: F64, t: F64, terms: PlaneTerms, W: F64) -> None:
+    """Noise of the observed planes plus that of the map's."""
+    Bw, B, F, G, S = np.empty((3, 2)), np.empty((3, 2)), np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
+    for i in range(len(terms.kinds)):
+        basis(terms.coefficients[i], Bw)
+        basis(terms.observed[i], B)
+        plane_slopes(terms.kinds[i], R, t, terms.coefficients[i], terms.observed[i], Bw, B, F, G)
+        rows, numbers = rows_of(terms.kinds[i]), 3 if terms.kinds[i] == SAME else 2  # of how far away walls are, relations say nothing
+        for a in range(rows):
+            for b in range(rows):
+                total = 0.0
+                for j in range(numbers):
+                    for k in range(numbers):
+                        total += F[a, j] * terms.covariance[i, j, k] * F[b, k] + G[a, j] * terms.observed_covariance[i, j, k] * G[b, k]
+                S[a, b] = total
+        invert_small(S, rows, W[i])
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def weigh(R: F64, t: F64, camera: F64, points: PointTerms, lines: LineTerms, planes: PlaneTerms, weights: Weights) -> None:
+    """Fill `weights` for the pose R, t."""
+    _weigh_points(R, t, camera, points, weights.points)
+    _weigh_lines(R, t, camera, lines, weights.lines, weights.line_depths)
+    _weigh_planes(R, t, planes, weights.planes)
+
+
+# The numba loops of the pose solver: normal equations of point, line and plane terms.
+
+CHI2_1, CHI2_2, CHI2_3 = 3.841, 5.991, 7.815  # 95 % of χ² with 1, 2, 3 degrees of freedom
+BEHIND = 10.0 * CHI2_3  # cost of a term that cannot be projected: as bad as a gross outlier, so that no step profits from it
+OUTLIER, INLIER, NO_DEPTH = 0, 1, 2  # flags of a term; NO_DEPTH is a line whose image part alone fits
+
+
+class Flags(NamedTuple):
+    """OUTLIER, INLIER or NO_DEPTH of each term."""
+
+    points: U8
+    lines: U8
+    planes: U8
+
+
+class Chi2(NamedTuple):
+    """Squared whitened residual of each term; inf when it cannot be projected (a line without depth has inf in `line_depths`)."""
+
+    points: F64
+    lines: F64
+    line_depths: F64
+    planes: F64
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
+def _chi2(r: F64, W: F64, rows: int, e: F64) -> float:
+    """rᵀ W r, with `e = W r` left for `_add`."""
+    chi2 = 0.0
+    for i in range(rows):
+        e[i] = 0.0
+        for j in range(rows):
+            e[i] += W[i, j] * r[j]
+        chi2 += e[i] * r[i]
+    return chi2
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
+def _huber(chi2: float, limit: float, robust: bool) -> tuple[float, float]:
+    """Weight and cost of a term whose χ² may lie beyond the limit."""
+    if robust and chi2 > limit:
+        return np.sqrt(limit / chi2), 2.0 * np.sqrt(limit * chi2) - limit
+    return 1.0, chi2
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
+def _add(chi2: float, e: F64, J: F64, rows: int, W: F64, limit: float, robust: bool, first: int, H: F64, g: F64) -> float:
+    """Add one term, which does not know of the unknowns before the `first`, to the normal equations `H dx = -g` (Huber beyond `limit` when
+    robust); returns its cost."""
+    w, cost = _huber(chi2, limit, robust)
+    for i in range(rows):
+        for b in range(first, 6):
+            WJ = 0.0
+            for j in range(rows):
+                WJ += w * W[i, j] * J[j, b]
+            g[b] += w * e[i] * J[i, b]
+            for a in range(b, 6):
+                H[a, b] += J[i, a] * WJ
+    return cost
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _add_points(
+    R: F64, t: F64, camera: F64, terms: PointTerms, W: F64, flags: U8, robust: bool, free: int, H: F64, g: F64, chi2: F64
+) -> float:
+    """All points; `point_rows` written out in scalars, since points are most of the work.
+
+    With D = dr/dp, A = DᵀWD, b = DᵀWr and P = [p]×, J = (-D, DP) gives the blocks A, PA, -PAP and -b, -p × b."""
+    cost = 0.0
+    for i in range(len(terms.positions_m)):
+        x, y, z = terms.positions_m[i, 0] - t[0], terms.positions_m[i, 1] - t[1], terms.positions_m[i, 2] - t[2]
+        p0, p1, p2 = R[0, 0] * x + R[1, 0] * y + R[2, 0] * z, R[0, 1] * x + R[1, 1] * y + R[2, 1] * z, R[0, 2] * x + R[1, 2] * y + R[2, 2] * z
+        chi2[i] = np.inf
+        if not p2 > NEAR_M:
+            cost += BEHIND if flags[i] else 0.0
+            continue
+        iz = 1.0 / p2
+        d00, d11, d22, r2 = camera[0] * iz, camera[1] * iz, 0.0, 0.0
+        d02, d12 = -d00 * p0 * iz, -d11 * p1 * iz
+        r0, r1 = d00 * p0 + camera[2] - terms.pixels[i, 0], d11 * p1 + camera[3] - terms.pixels[i, 1]
+        if np.isfinite(terms.depth_m[i]):
+            r2, d22 = iz - 1.0 / terms.depth_m[i], -iz * iz
+        w00, w01, w02, w11, w12, w22 = W[i, 0, 0], W[i, 0, 1], W[i, 0, 2], W[i, 1, 1], W[i, 1, 2], W[i, 2, 2]
+        e0, e1, e2 = w00 * r0 + w01 * r1 + w02 * r2, w01 * r0 + w11 * r1 + w12 * r2, w02 * r0 + w12 * r1 + w22 * r2
+        value = e0 * r0 + e1 * r1 + e2 * r2
+        if not value < np.inf:  # NaN, or a noise that has no inverse
+            cost += BEHIND if flags[i] else 0.0
+            continue
+        chi2[i] = value
+        if not flags[i]:
+            continue
+        w, share = _huber(value, CHI2_3 if w22 > 0.0 else CHI2_2, robust)
+        cost += share
+        a00, a11, a01 = w * d00 * d00 * w00, w * d11 * d11 * w11, w * d00 * d11 * w01
+        a02 = w * d00 * (w00 * d02 + w01 * d12 + w02 * d22)
+        a12 = w * d11 * (w01 * d02 + w11 * d12 + w12 * d22)
+        a22 = w * (d02 * d02 * w00 + d12 * d12 * w11 + d22 * d22 * w22 + 2.0 * (d02 * d12 * w01 + d02 * d22 * w02 + d12 * d22 * w12))
+        b0, b1, b2 = w * d00 * e0, w * d11 * e1, w * (d02 * e0 + d12 * e1 + d22 * e2)
+        H[0, 0] += a00
+        H[1, 0] += a01
+        H[1, 1] += a11
+        H[2, 0] += a02
+        H[2, 1] += a12
+        H[2, 2] += a22
+        g[0] -= b0
+        g[1] -= b1
+        g[2] -= b2
+        if free == 3:
+            continue
+        m00, m01, m02 = p1 * a02 - p2 * a01, p1 * a12 - p2 * a11, p1 * a22 - p2 * a12
+        m10, m11, m12 = p2 * a00 - p0 * a02, p2 * a01 - p0 * a12, p2 * a02 - p0 * a22
+        m20, m21, m22 = p0 * a01 - p1 * a00, p0 * a11 - p1 * a01, p0 * a12 - p1 * a02
+        H[3, 0] += m00
+        H[3, 1] += m01
+        H[3, 2] += m02
+        H[4, 0] += m10
+        H[4, 1] += m11
+        H[4, 2] += m12
+        H[5, 0] += m20
+        H[5, 1] += m21
+        H[5, 2] += m22
+        H[3, 3] += p1 * m02 - p2 * m01
+        H[4, 3] += p1 * m12 - p2 * m11
+        H[4, 4] += p2 * m10 - p0 * m12
+        H[5, 3] += p1 * m22 - p2 * m21
+        H[5, 4] += p2 * m20 - p0 * m22
+        H[5, 5] += p0 * m21 - p1 * m20
+        g[3] -= p1 * b2 - p2 * b1
+        g[4] -= p2 * b0 - p0 * b2
+        g[5] -= p0 * b1 - p1 * b0
+    return cost
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
+def _add_pair(r0: float, r1: float, W: F64, i: int, J: F64, counts: bool, robust: bool, H: F64, g: F64) -> tuple[float, float]:
+    """χ² and cost of term i with residuals r, derivatives J (2, 6) and weights W (·, 2, 2), added to the normal equations if it `counts`; χ² is inf,
+    and nothing is added, where it is none."""
+    w00, w01, w11 = W[i, 0, 0], W[i, 0, 1], W[i, 1, 1]
+    e0, e1 = w00 * r0 + w01 * r1, w01 * r0 + w11 * r1
+    chi2 = e0 * r0 + e1 * r1
+    if not chi2 < np.inf:  # NaN, or a noise that has no inverse
+        return np.inf, 0.0
+    if not counts:
+        return chi2, 0.0
+    w, cost = _huber(chi2, CHI2_2, robust)
+    for a in range(6):
+        x, y = w * (w00 * J[0, a] + w01 * J[1, a]), w * (w01 * J[0, a] + w11 * J[1, a])
+        g[a] += w * (e0 * J[0, a] + e1 * J[1, a])
+        for b in range(a + 1):
+            H[a, b] += x * J[0, b] + y * J[1, b]
+    return chi2, cost
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _add_lines(
+    R: F64, t: F64, camera: F64, terms: LineTerms, W: F64, V: F64, flags: U8, robust: bool, H: F64, g: F64, chi2: F64, depth_chi2: F64
+) -> float:
+    """All lines: the distances of both ends from the segment in the image (`line_row`) and from the 3D one in depth (`line_depth_row`)."""
+    cost = 0.0
+    p, r, J, m = np.empty((2, 3)), np.empty(2), np.empty((2, 6)), np.empty(3)
+    for i in range(len(terms.endpoints_m)):
+        for k in range(2):
+            x, y, z = terms.endpoints_m[i, k, 0] - t[0], terms.endpoints_m[i, k, 1] - t[1], terms.endpoints_m[i, k, 2] - t[2]
+            for a in range(3):
+                p[k, a] = R[0, a] * x + R[1, a] * y + R[2, a] * z
+        chi2[i], depth_chi2[i] = np.inf, np.inf
+        if not (p[0, 2] > NEAR_M and p[1, 2] > NEAR_M):
+            cost += BEHIND if flags[i] else 0.0
+            continue
+        u, v = terms.endpoints_px[i, 0, 0], terms.endpoints_px[i, 0, 1]
+        du, dv = terms.endpoints_px[i, 1, 0] - u, terms.endpoints_px[i, 1, 1] - v
+        length = max(np.sqrt(du * du + dv * dv), 1e-9)
+        nu, nv = -dv / length, du / length
+        for k in range(2):
+            iz = 1.0 / p[k, 2]
+            r[k] = nu * (camera[0] * p[k, 0] * iz + camera[2] - u) + nv * (camera[1] * p[k, 1] * iz + camera[3] - v)
+            d0, d1 = nu * camera[0] * iz, nv * camera[1] * iz
+            _chain(d0, d1, -(d0 * p[k, 0] + d1 * p[k, 1]) * iz, p, k, J)
+        chi2[i], share = _add_pair(r[0], r[1], W, i, J, flags[i] != OUTLIER, robust, H, g)
+        cost += share
+        if chi2[i] == np.inf:
+            cost += BEHIND if flags[i] else 0.0
+        elif depth_direction(terms.observed_m[i], m):
+            for k in range(2):
+                r[k] = 0.0
+                for a in range(3):
+                    r[k] += m[a] * (p[k, a] - terms.observed_m[i, 0, a])
+                _chain(m[0], m[1], m[2], p, k, J)
+            depth_chi2[i], share = _add_pair(r[0], r[1], V, i, J, flags[i] == INLIER, robust, H, g)
+            cost += share
+    return cost
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
+def _chain(a: float, b: float, c: float, p: F64, k: int, J: F64) -> None:
+    """Row k of J (·, 6) from the derivative (a, b, c) with respect to the camera-frame point in row k of p, as `chain_point`."""
+    J[k, 0], J[k, 1], J[k, 2] = -a, -b, -c
+    J[k, 3], J[k, 4], J[k, 5] = b * p[k, 2] - c * p[k, 1], c * p[k, 0] - a * p[k, 2], a * p[k, 1] - b * p[k, 0]
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
+def gate(rows: int) -> float:
+    """95 % of χ² with 1, 2 or 3 degrees of freedom."""
+    return CHI2_3 if rows == 3 else (CHI2_2 if rows == 2 else CHI2_1)
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _add_planes(R: F64, t: F64, terms: PlaneTerms, W: F64, flags: U8, H: F64, g: F64, chi2: F64) -> float:
+    cost = 0.0
+    r, e, J, B = np.empty(3), np.empty(3), np.empty((3, 6)), np.empty((3, 2))
+    for i in range(len(terms.kinds)):
+        basis(terms.observed[i], B)
+        rows = plane_rows(terms.kinds[i], R, t, terms.coefficients[i], terms.observed[i], B, r, J)
+        chi2[i] = _chi2(r, W[i], rows, e)
+        if not chi2[i] < np.inf:
+            chi2[i] = np.inf
+            cost += BEHIND if flags[i] else 0.0
+        elif flags[i]:
+            cost += _add(chi2[i], e, J, rows, W[i], gate(rows), True, 0 if rows == 3 else 3, H, g)
+    return cost
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def linearise(
+    R: F64,
+    t: F64,
+    camera: F64,
+    points: PointTerms,
+    lines: LineTerms,
+    planes: PlaneTerms,
+    weights: Weights,
+    flags: Flags,
+    robust: bool,
+    free: int,
+    H: F64,
+    g: F64,
+    chi2: Chi2,
+) -> float:
+    """Normal equations (H lower triangle of (6, 6), g (6,)) of all terms but the outliers, and the χ² of every term; returns the cost. With 3
+    `free` unknowns only what concerns the position is whole."""
+    for a in range(6):
+        g[a] = 0.0
+        for b in range(6):
+            H[a, b] = 0.0
+    cost = _add_points(R, t, camera, points, weights.points, flags.points, robust, free, H, g, chi2.points)
+    cost += _add_lines(R, t, camera, lines, weights.lines, weights.line_depths, flags.lines, robust, H, g, chi2.lines, chi2.line_depths)
+    return cost + _add_planes(R, t, planes, weights.planes, flags.planes, H, g, chi2.planes)
+
+
+# Steps of the pose solver: motions on SE(3), the Gaussian prior and the damped normal equations, for numba loops.
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _rotation(x: float, y: float, z: float) -> F64:
+    """Exp(phi) of phi = (x, y, z), Rodrigues."""
+    angle2 = x * x + y * y + z * z
+    if angle2 < 1e-12:
+        a, b = 1.0 - angle2 / 6.0, 0.5 - angle2 / 24.0
+    else:
+        angle = np.sqrt(angle2)
+        a, b = np.sin(angle) / angle, (1.0 - np.cos(angle)) / angle2
+    E = np.empty((3, 3))
+    E[0, 0], E[1, 1], E[2, 2] = 1.0 - b * (y * y + z * z), 1.0 - b * (x * x + z * z), 1.0 - b * (x * x + y * y)
+    E[0, 1], E[0, 2], E[1, 2] = b * x * y - a * z, b * x * z + a * y, b * y * z - a * x
+    E[1, 0], E[2, 0], E[2, 1] = b * x * y + a * z, b * x * z - a * y, b * y * z + a * x
+    return E
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _rotation_vector(R: F64) -> tuple[float, float, float]:
+    """Log(R) for angles below π (a prior is never that far)."""
+    x, y, z = 0.5 * (R[2, 1] - R[1, 2]), 0.5 * (R[0, 2] - R[2, 0]), 0.5 * (R[1, 0] - R[0, 1])
+    s, c = math.sqrt(x * x + y * y + z * z), 0.5 * (R[0, 0] + R[1, 1] + R[2, 2] - 1.0)
+    scale = math.atan2(s, c) / s if s > 1e-9 else 1.0
+    return x * scale, y * scale, z * scale
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def move(R: F64, t: F64, dx: F64, turned: F64, shifted: F64) -> None:
+    """The pose after the step (rho, phi) into the last two: R Exp(phi), t + R rho; agrees with Exp(xi) to first order, which is what covariances
+    mean."""
+    E = _rotation(dx[3], dx[4], dx[5])
+    for i in range(3):
+        shifted[i] = t[i] + R[i, 0] * dx[0] + R[i, 1] * dx[1] + R[i, 2] * dx[2]
+        for j in range(3):
+            turned[i, j] = R[i, 0] * E[0, j] + R[i, 1] * E[1, j] + R[i, 2] * E[2, j]
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def add_prior(R: F64, t: F64, R_prior: F64, t_prior: F64, prior: F64, H: F64, g: F64) -> float:
+    """Add the prior's term to H (lower triangle) and g; returns its cost."""
+    delta, r, J, e = np.zeros((3, 3)), np.zeros(6), np.zeros((6, 6)), np.zeros(6)
+    for i in range(3):
+        for k in range(3):
+            r[i] += R_prior[k, i] * (t[k] - t_prior[k])
+            for j in range(3):
+                delta[i, j] += R_prior[k, i] * R[k, j]
+    r[3], r[4], r[5] = _rotation_vector(delta)
+    for i in range(3):
+        J[3 + i, 3 + i] = 1.0  # with the terms below the inverse right Jacobian, first order
+        for j in range(3):
+            J[i, j] = delta[i, j]
+    J[3, 4], J[3, 5], J[4, 5] = -0.5 * r[5], 0.5 * r[4], -0.5 * r[3]
+    J[4, 3], J[5, 3], J[5, 4] = 0.5 * r[5], -0.5 * r[4], 0.5 * r[3]
+    cost = 0.0
+    for a in range(6):
+        for b in range(6):
+            e[a] += prior[a, b] * r[b]
+        cost += e[a] * r[a]
+    for a in range(6):
+        for k in range(a // 3 * 3, a // 3 * 3 + 3):  # J is two blocks
+            g[a] += J[k, a] * e[k]
+            for b in range(a + 1):
+                for j in range(b // 3 * 3, b // 3 * 3 + 3):
+                    H[a, b] += J[k, a] * prior[k, j] * J[j, b]
+    return cost
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def step(H: F64, g: F64, damping: float, free: int, dx: F64) -> None:
+    """dx (6,): solution of (H + damping · diag H) dx = -g over the first `free` unknowns, by Cholesky; zero if H is not positive definite."""
+    L = np.zeros((6, 6))
+    for i in range(6):
+        dx[i] = 0.0
+    for i in range(free):
+        for j in range(i + 1):
+            total = H[i, j] * (1.0 + damping if i == j else 1.0)
+            for k in range(j):
+                total -= L[i, k] * L[j, k]
+            if i == j:
+                if not total > 0.0:
+                    return
+                L[i, i] = np.sqrt(total)
+            else:
+                L[i, j] = total / L[j, j]
+    for i in range(free):
+        dx[i] = -g[i]
+        for k in range(i):
+            dx[i] -= L[i, k] * dx[k]
+        dx[i] /= L[i, i]
+    for i in range(free - 1, -1, -1):
+        for k in range(i + 1, free):
+            dx[i] -= L[k, i] * dx[k]
+        dx[i] /= L[i, i]
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def size(H: F64, dx: F64) -> float:
+    """Squared length of the step in standard deviations (H lower triangle)."""
+    total = 0.0
+    for a in range(6):
+        for b in range(a + 1):
+            total += H[a, b] * dx[a] * dx[b] * (1.0 if a == b else 2.0)
+    return total
+
+
+# Camera pose from points, lines and planes whose place in the world is known (eqs. 2–8): robust Levenberg–Marquardt with a Gaussian prior.
+#
+# Every term is weighed by covariances: of the measurement *and* of the landmark. The prior (the Manhattan rotation, a weak one on the position)
+# keeps what the data cannot see at its prediction, so that any set of terms, even one plane, can be solved.
+
+ROUNDS, ITERATIONS, ROBUST_ROUNDS = 4, 10, 2  # as ORB-SLAM2 optimises a pose; Huber only in the first rounds
+CONVERGED = 1e-3  # squared length of a step in standard deviations below which a round has converged
+MAX_DAMPING = 1e10
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def solve(
+    poses: F64,
+    prior: F64,
+    camera: F64,
+    points: PointTerms,
+    lines: LineTerms,
+    planes: PlaneTerms,
+    flags: Flags,
+    free: int,
+    rounds: int,
+    slack: float,
+) -> tuple[F64, F64, F64, F64, float, bool]:
+    """The rounds from the first of the poses (2, 4, 4), the other one being the prior's; changes `flags`. Returns the pose, its covariance, the
+    data's information, the step (6,) that would be next, the cost, and whether the data say more than the prior in all directions.
+
+    Every evaluation is the one call of `linearise`, and a step too short to matter is taken without another. The last turn takes no step and is only
+    the information of the final inliers. In no rounds all terms are judged at the first pose."""
+    n, m, p = len(points.positions_m), len(lines.endpoints_m), len(planes.kinds)
+    weights = Weights(np.empty((n, 3, 3)), np.empty((m, 2, 2)), np.empty((m, 2, 2)), np.empty((p, 3, 3)))
+    chi2 = Chi2(np.empty(n), np.empty(m), np.empty(m), np.empty(p))
+    (R, t), (R_new, t_new) = rotation_and_translation(poses[0]), rotation_and_translation(poses[0])
+    R_prior, t_prior = rotation_and_translation(poses[1])
+    H, g, dx = np.zeros((6, 6)), np.zeros(6), np.zeros(6)
+    data, data_g, trial_H, trial_g = np.zeros((6, 6)), np.zeros(6), np.zeros((6, 6)), np.zeros(6)
+    cost = 0.0
+    for turn in range(rounds + 1):
+        cost, damping = np.inf, 1e-6
+        _copy(R, t, R_new, t_new)
+        weigh(R, t, camera, points, lines, planes, weights)
+        for trial in range(ITERATIONS + 1):
+            new = linearise(R_new, t_new, camera, points, lines, planes, weights, flags, turn < ROBUST_ROUNDS, free, trial_H, trial_g, chi2)
+            _copy(trial_H, trial_g, data, data_g)
+            new += add_prior(R_new, t_new, R_prior, t_prior, prior, trial_H, trial_g)
+            accepted = trial == 0 or new <= cost
+            if accepted:
+                cost = new
+                _copy(R_new, t_new, R, t)
+                _copy(trial_H, trial_g, H, g)
+                damping = max(0.1 * damping, 1e-9)
+            else:
+                damping = max(10.0 * damping, 1e-3)
+            if turn == rounds or damping > MAX_DAMPING:
+                break
+            step(H, g, damping, free, dx)
+            move(R, t, dx, R_new, t_new)
+            length = size(H, dx)
+            if not length > CONVERGED:
+                if accepted and length >= 0.0:
+                    _copy(R_new, t_new, R, t)
+                break
+        if turn < rounds or rounds == 0:
+            _classify(points, planes, chi2, flags, slack)
+    step(H, g, 0.0, free, dx)
+    share = gate_efficiency(_rows(points, planes, flags), free) if rounds else 1.0
+    covariance, information, complete = _spread(data, share, prior, free)
+    T = np.zeros((4, 4))
+    for i in range(3):
+        T[i, 3] = t[i]
+        for j in range(3):
+            T[i, j] = R[i, j]
+    T[3, 3] = 1.0
+    return T, covariance, information, dx, cost, complete
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _copy(A: F64, a: F64, B: F64, b: F64) -> None:
+    """A matrix (n, n) and a vector (n,), of a pose or of normal equations, into others."""
+    for i in range(len(a)):
+        b[i] = a[i]
+        for j in range(len(a)):
+            B[i, j] = A[i, j]
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _spread(data: F64, share: float, prior: F64, free: int) -> tuple[F64, F64, bool]:
+    """Covariance of the `free` unknowns by a share of the data's information (lower triangle) and the prior's; that share of the data's; and
+    whether it is the larger one in all directions."""
+    information, total, more = np.empty((free, free)), np.empty((free, free)), np.empty((free, free))
+    for i in range(free):
+        for j in range(i + 1):
+            information[i, j] = information[j, i] = share * data[i, j]
+            total[i, j], more[i, j] = information[i, j] + prior[i, j], information[i, j] - prior[i, j]
+    covariance = inverse_positive(total)
+    for i in range(free):
+        for j in range(i):
+            covariance[i, j] = covariance[j, i] = 0.5 * (covariance[i, j] + covariance[j, i])
+    return covariance, information, solve_positive(more, np.zeros(free), np.empty(free))
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _rows(points: PointTerms, planes: PlaneTerms, flags: Flags) -> int:
+    """Number of residuals of the inliers."""
+    rows = 0
+    for i in range(len(flags.points)):
+        if flags.points[i]:
+            rows += 3 if np.isfinite(points.depth_m[i]) else 2
+    for i in range(len(flags.lines)):
+        if flags.lines[i]:
+            rows += 4 if flags.lines[i] == INLIER else 2
+    for i in range(len(flags.planes)):
+        if flags.planes[i]:
+            rows += rows_of(planes.kinds[i])
+    return rows
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def gate_efficiency(rows: int, unknowns: int) -> float:
+    """Share of the information that is left when terms are chosen by a hard 95 % gate on their own residuals.
+
+    A mean of samples cut at the gate c varies by 1 / F_{k+2}(c), F_k being the distribution of χ², where counting the F_k(c) kept samples promises
+    1 / F_k(c); with few redundant rows the residuals are smaller than the noise and the gate bites less. The tests check the normalised error."""
+    if rows <= unknowns:
+        return 1.0
+    half = 0.5 * CHI2_3 / (1.0 - unknowns / rows)
+    tail = math.sqrt(half / math.pi) * math.exp(-half)
+    kept = math.erf(math.sqrt(half)) - 2.0 * tail  # F_3, the incomplete gamma function of 3/2; that of 5/2 follows by its recurrence
+    return (kept - 4.0 / 3.0 * half * tail) / kept
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _classify(points: PointTerms, planes: PlaneTerms, chi2: Chi2, flags: Flags, slack: float) -> None:
+    """Choose the outliers anew: 95 % gates of χ², those of planes multiplied by `slack`."""
+    for i in range(len(chi2.points)):
+        limit = CHI2_3 if np.isfinite(points.depth_m[i]) else CHI2_2
+        flags.points[i] = INLIER if chi2.points[i] <= limit else OUTLIER
+    for i in range(len(chi2.lines)):
+        flags.lines[i] = OUTLIER
+        if chi2.lines[i] <= CHI2_2:
+            flags.lines[i] = INLIER if chi2.line_depths[i] <= CHI2_2 else NO_DEPTH
+    for i in range(len(chi2.planes)):
+        flags.planes[i] = INLIER if chi2.planes[i] <= slack * gate(rows_of(planes.kinds[i])) else OUTLIER

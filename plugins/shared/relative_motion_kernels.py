@@ -1,0 +1,359 @@
+"""Numba kernels of `relative_motion.py`."""
+# mypy: disable-error-code="arg-type, assignment, index, return-value"
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numba
+import numpy as np
+
+from trihedron.pipeline.core.types import F32, F64, I32
+from trihedron.plugins.shared.linalg_kernels import inverse_positive, median, solve_positive, turn_left
+from trihedron.plugins.shared.pose_optimizer_kernels import basis
+
+SHORTEST_M = 1e-3  # line
+
+
+class PointPairs(NamedTuple):
+    """n points of the previous frame, and which of the current ones they are."""
+
+    rows: I32  # (n, 2) previous, current
+    before: F32  # (n, 3)
+    before_sigma: F32  # (n,) of their depth
+    points: F32  # (k, 3) current
+    sigma_px: F32  # (k,) across the ray
+    sigma_m: F32  # (k,) along it
+
+
+class LinePairs(NamedTuple):
+    """n lines of the previous frame, and which of the current ones they are."""
+
+    rows: I32  # (n, 2) previous, current
+    before: F32  # (n, 2, 3)
+    endpoints: F32  # (k, 2, 3) current
+    covariance: F32  # (k, 2, 3, 3)
+
+
+class PlanePairs(NamedTuple):
+    """n planes of the previous frame, and which of the current ones they are."""
+
+    rows: I32  # (n, 2) previous, current
+    before: F64  # (n, 4)
+    before_covariance: F64  # (n, 3, 3) of (a, b, d)
+    planes: F64  # (k, 4) current
+    covariance: F64  # (k, 3, 3)
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def point_pairs(pairs: PointPairs, rad_per_px: float, step: int, p: F64, q: F64, information: F64) -> int:
+    """Write previous and current places (m, 3) and information (m, 3, 3), 1/m², of one in `step` of those of n pairs that both have depth; returns
+    their number m."""
+    rows, before, before_sigma, points, sigma_px, sigma_m = pairs
+    m, seen = 0, 0
+    for i in range(len(rows)):
+        row = rows[i, 1]
+        z = float(points[row, 2])
+        if not (np.isfinite(before[i, 2]) and np.isfinite(z)):
+            continue
+        seen += 1
+        if (seen - 1) % step:
+            continue
+        across = sigma_px[row] * rad_per_px * np.sqrt(float(before[i, 2]) ** 2 + z * z)
+        along2 = float(before_sigma[i]) ** 2 + float(sigma_m[row]) ** 2
+        for k in range(3):
+            p[m, k], q[m, k] = before[i, k], points[row, k]
+        x, y = q[m, 0] / z, q[m, 1] / z
+        shrink = along2 / (across * across + along2 * (x * x + y * y + 1.0))  # Sherman–Morrison
+        total = 0.0
+        for a in range(3):
+            for b in range(3):
+                ray = (x if a == 0 else y if a == 1 else 1.0) * (x if b == 0 else y if b == 1 else 1.0)
+                information[m, a, b] = ((1.0 if a == b else 0.0) - shrink * ray) / (across * across)
+                total += information[m, a, b]
+        m += np.isfinite(total)
+    return m
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def line_pairs(pairs: LinePairs, rad_per_px: float, step: int, m: int, p: F64, q: F64, information: F64) -> int:
+    """Write both ends of one in `step` of n previous lines, each against the start of the current line, whose noise serves for both: places and
+    information from row m on, which is zero along the line. Returns the next row."""
+    rows, before, endpoints, covariance = pairs
+    seen, direction, B, S = 0, np.empty(3), np.empty((3, 2)), np.empty((2, 2))
+    for i in range(len(rows)):
+        row = rows[i, 1]
+        length2, known = 0.0, 0.0
+        for k in range(3):
+            direction[k] = float(endpoints[row, 1, k]) - float(endpoints[row, 0, k])
+            length2 += direction[k] * direction[k]
+            known += before[i, 0, k] + before[i, 1, k]
+        if not (length2 > SHORTEST_M * SHORTEST_M and np.isfinite(length2) and np.isfinite(known)):
+            continue
+        seen += 1
+        if (seen - 1) % step:
+            continue
+        for k in range(3):
+            direction[k] /= np.sqrt(length2)
+        basis(direction, B)
+        floor = max(rad_per_px * float(endpoints[row, 0, 2]), 1e-6) ** 2
+        for a in range(2):
+            for b in range(2):
+                S[a, b] = floor if a == b else 0.0
+                for j in range(3):
+                    for k in range(3):
+                        S[a, b] += B[j, a] * (float(covariance[row, 0, j, k]) + float(covariance[row, 1, j, k])) * B[k, b]
+        det = S[0, 0] * S[1, 1] - S[0, 1] * S[1, 0]
+        if not (det > 0.0 and np.isfinite(det)):
+            continue
+        for end in range(2):
+            for a in range(3):
+                p[m + end, a], q[m + end, a] = before[i, end, a], endpoints[row, 0, a]
+                for b in range(3):
+                    first, second = S[1, 1] * B[b, 0] - S[0, 1] * B[b, 1], S[0, 0] * B[b, 1] - S[1, 0] * B[b, 0]
+                    information[m + end, a, b] = 0.5 * (B[a, 0] * first + B[a, 1] * second) / det
+        m += 2
+    return m
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def plane_pairs(pairs: PlanePairs, floor: float) -> tuple[F64, F64, F64]:
+    """Previous planes (m, 4), current ones, and the information (m, 4, 4) of their difference in (n, d), of those of n pairs that are known;
+    `floor` (rad) is the least error of a normal."""
+    rows, before, before_covariance, planes, covariance = pairs
+    m, p, q, information = 0, np.empty((len(rows), 4)), np.empty((len(rows), 4)), np.zeros((len(rows), 4, 4))
+    B, C = np.empty((3, 2)), np.empty((3, 3))
+    for i in range(len(rows)):
+        row, total = rows[i, 1], 0.0
+        for a in range(3):
+            for b in range(3):
+                C[a, b] = before_covariance[i, a, b] + covariance[row, a, b]
+                total += C[a, b]
+            C[a, a] += floor * floor if a < 2 else 0.0
+        for k in range(4):
+            p[m, k], q[m, k] = before[i, k], planes[row, k]
+            total += p[m, k] + q[m, k]
+        if not np.isfinite(total):
+            continue
+        A = inverse_positive(C)
+        if A[0, 0] == 0.0:
+            continue
+        basis(q[m, :3], B)
+        for a in range(3):
+            for b in range(3):
+                information[m, a, b] = 0.0
+                for u in range(2):
+                    for v in range(2):
+                        information[m, a, b] += B[a, u] * A[u, v] * B[b, v]
+            information[m, a, 3] = B[a, 0] * A[0, 2] + B[a, 1] * A[1, 2]
+            information[m, 3, a] = information[m, a, 3]
+        information[m, 3, 3] = A[2, 2]
+        m += 1
+    return p[:m], q[:m], information[:m]
+
+
+# Motion between two frames from 3D features seen in both: robust Gauss–Newton, no intrinsics needed.
+#
+# The motion is `T_current_previous`: `p_current = R p_previous + t`. Its unknowns are (phi, rho) in `R <- Exp(phi) R, t <- t + rho`. Points and the
+# ends of lines are pairs of places with a 3 × 3 information, which is zero along a line; planes are pairs (n, d) with a 4 × 4 one.
+
+MOST = 400  # pairs of places used, about; more only cost time
+GATE2 = 9.0  # squared standard deviations at which a term counts a quarter, once the scale has come down
+
+
+class Terms(NamedTuple):
+    """Pairs of places and of planes, previous and current."""
+
+    before_m: F64  # (n, 3)
+    after_m: F64  # (n, 3)
+    information: F64  # (n, 3, 3), 1/m²
+    planes_before: F64  # (p, 4)
+    planes_after: F64  # (p, 4)
+    plane_information: F64  # (p, 4, 4)
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def motion(
+    points: PointPairs, lines: LinePairs, walls: PlanePairs, start: F64, noise: tuple[float, float, float, float]
+) -> tuple[F64, F64, F64, float]:
+    """The fields of `Motion`."""
+    rad_per_px, floor, sigma, sigma_m = noise
+    terms = _terms(points, lines, walls, rad_per_px, floor)
+    R, t, prior, A = np.empty((3, 3)), np.zeros(3), np.empty(6), np.empty((6, 6))
+    for i in range(3):
+        prior[i], prior[3 + i] = 1.0 / sigma**2, 1.0 / sigma_m**2
+        for j in range(3):
+            R[i, j] = start[i, j]
+    residuals = _residuals(terms, R, t)
+    scale2 = max(2.0 * median(residuals), GATE2) if len(residuals) else GATE2
+    H, chi2, support = _solve(terms, R, t, prior, scale2)
+    scale = max(chi2 / max(3.0 * support - 6.0, 1.0), 1.0)
+    for i in range(6):
+        for j in range(6):
+            A[i, j] = H[i, j] / scale + (prior[i] if i == j else 0.0)
+    return R, t, inverse_positive(A), support
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _terms(points: PointPairs, lines: LinePairs, walls: PlanePairs, rad_per_px: float, floor: float) -> Terms:
+    """What the pairs say about the motion, of places about MOST at most."""
+    n, m = len(points.rows), len(lines.rows)
+    step = max((n + 2 * m + MOST - 1) // MOST, 1)
+    before, after, information = np.empty((n + 2 * m, 3)), np.empty((n + 2 * m, 3)), np.empty((n + 2 * m, 3, 3))
+    count = point_pairs(points, rad_per_px, step, before, after, information)
+    count = line_pairs(lines, rad_per_px, step, count, before, after, information)
+    planes_before, planes_after, plane_information = plane_pairs(walls, floor)
+    return Terms(before[:count], after[:count], information[:count], planes_before, planes_after, plane_information)
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _residuals(terms: Terms, R: F64, t: F64) -> F64:
+    """(n + p,) squared Mahalanobis distances of places and planes."""
+    n, p = len(terms.before_m), len(terms.planes_before)
+    out, e = np.empty(n + p), np.empty(4)
+    for i in range(n):
+        x, y, z = terms.before_m[i, 0], terms.before_m[i, 1], terms.before_m[i, 2]
+        a = R[0, 0] * x + R[0, 1] * y + R[0, 2] * z + t[0] - terms.after_m[i, 0]
+        b = R[1, 0] * x + R[1, 1] * y + R[1, 2] * z + t[1] - terms.after_m[i, 1]
+        c = R[2, 0] * x + R[2, 1] * y + R[2, 2] * z + t[2] - terms.after_m[i, 2]
+        L = terms.information
+        out[i] = a * (L[i, 0, 0] * a + 2.0 * (L[i, 0, 1] * b + L[i, 0, 2] * c)) + b * (L[i, 1, 1] * b + 2.0 * L[i, 1, 2] * c) + c * c * L[i, 2, 2]
+    for i in range(p):
+        _plane_residual(terms.planes_before[i], terms.planes_after[i], R, t, e)
+        out[n + i] = _plane_distance(e, terms.plane_information[i])
+    return out
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _plane_distance(e: F64, L: F64) -> float:
+    """eᵀ L e of four numbers."""
+    total = 0.0
+    for j in range(4):
+        for k in range(4):
+            total += e[j] * L[j, k] * e[k]
+    return total
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _plane_residual(before: F64, after: F64, R: F64, t: F64, e: F64) -> None:
+    """The previous plane moved into the current frame less the current one, (4,)."""
+    e[3] = before[3] - after[3]
+    for k in range(3):
+        n = R[k, 0] * before[0] + R[k, 1] * before[1] + R[k, 2] * before[2]
+        e[k] = n - after[k]
+        e[3] -= n * t[k]
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _add_places(terms: Terms, R: F64, t: F64, scale2: float, H: F64, g: F64) -> tuple[float, float]:
+    """Add w JᵀLJ of all places to the lower triangle of H and w JᵀLe to g, with p = R p_previous and J = (-[p]×, I); in scalars, for places are most
+    of the work. Returns the weighted χ² and number of components."""
+    chi2, components, L = 0.0, 0.0, terms.information
+    for i in range(len(terms.before_m)):
+        x, y, z = terms.before_m[i, 0], terms.before_m[i, 1], terms.before_m[i, 2]
+        p0, p1, p2 = R[0, 0] * x + R[0, 1] * y + R[0, 2] * z, R[1, 0] * x + R[1, 1] * y + R[1, 2] * z, R[2, 0] * x + R[2, 1] * y + R[2, 2] * z
+        a, b, c = p0 + t[0] - terms.after_m[i, 0], p1 + t[1] - terms.after_m[i, 1], p2 + t[2] - terms.after_m[i, 2]
+        l00, l01, l02, l11, l12, l22 = L[i, 0, 0], L[i, 0, 1], L[i, 0, 2], L[i, 1, 1], L[i, 1, 2], L[i, 2, 2]
+        e0, e1, e2 = l00 * a + l01 * b + l02 * c, l01 * a + l11 * b + l12 * c, l02 * a + l12 * b + l22 * c
+        distance = a * e0 + b * e1 + c * e2
+        w = (scale2 / (scale2 + distance)) ** 2
+        chi2 += w * distance
+        components += 3.0 * w
+        l00, l01, l02, l11, l12, l22, e0, e1, e2 = w * l00, w * l01, w * l02, w * l11, w * l12, w * l22, w * e0, w * e1, w * e2
+        m00, m01, m02 = p1 * l02 - p2 * l01, p1 * l12 - p2 * l11, p1 * l22 - p2 * l12  # [p]× w L
+        m10, m11, m12 = p2 * l00 - p0 * l02, p2 * l01 - p0 * l12, p2 * l02 - p0 * l22
+        m20, m21, m22 = p0 * l01 - p1 * l00, p0 * l11 - p1 * l01, p0 * l12 - p1 * l02
+        H[0, 0] += p1 * m02 - p2 * m01
+        H[1, 0] += p1 * m12 - p2 * m11
+        H[1, 1] += p2 * m10 - p0 * m12
+        H[2, 0] += p1 * m22 - p2 * m21
+        H[2, 1] += p2 * m20 - p0 * m22
+        H[2, 2] += p0 * m21 - p1 * m20
+        H[3, 0] += m00
+        H[3, 1] += m10
+        H[3, 2] += m20
+        H[4, 0] += m01
+        H[4, 1] += m11
+        H[4, 2] += m21
+        H[5, 0] += m02
+        H[5, 1] += m12
+        H[5, 2] += m22
+        H[3, 3] += l00
+        H[4, 3] += l01
+        H[4, 4] += l11
+        H[5, 3] += l02
+        H[5, 4] += l12
+        H[5, 5] += l22
+        g[0] += p1 * e2 - p2 * e1
+        g[1] += p2 * e0 - p0 * e2
+        g[2] += p0 * e1 - p1 * e0
+        g[3] += e0
+        g[4] += e1
+        g[5] += e2
+    return chi2, components
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _add_plane(e: F64, J: F64, L: F64, w: float, H: F64, g: F64) -> None:
+    """Add w JᵀLJ to the lower triangle of H and w JᵀLe to g for J (4, 6)."""
+    for i in range(4):
+        for b in range(6):
+            LJ = 0.0
+            for j in range(4):
+                LJ += w * L[i, j] * J[j, b]
+            g[b] += LJ * e[i]
+            for a in range(b, 6):
+                H[a, b] += J[i, a] * LJ
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _normal_equations(terms: Terms, R: F64, t: F64, scale2: float, H: F64, g: F64) -> tuple[float, float]:
+    """Fill H (6, 6) and g (6,) with Geman–McClure weights at the squared scale; returns the weighted χ² and the weighted number of components."""
+    for i in range(6):
+        g[i] = 0.0
+        for j in range(6):
+            H[i, j] = 0.0
+    e4, J4 = np.empty(4), np.zeros((4, 6))
+    chi2, components = _add_places(terms, R, t, scale2, H, g)
+    for i in range(len(terms.planes_before)):
+        _plane_residual(terms.planes_before[i], terms.planes_after[i], R, t, e4)
+        distance = _plane_distance(e4, terms.plane_information[i])
+        w = (scale2 / (scale2 + distance)) ** 2
+        chi2 += w * distance
+        components += 3.0 * w
+        x, y, z = e4[0] + terms.planes_after[i, 0], e4[1] + terms.planes_after[i, 1], e4[2] + terms.planes_after[i, 2]
+        J4[0, 1], J4[0, 2], J4[1, 0], J4[1, 2], J4[2, 0], J4[2, 1] = z, -y, -z, x, y, -x
+        J4[3, 0], J4[3, 1], J4[3, 2] = t[1] * z - t[2] * y, t[2] * x - t[0] * z, t[0] * y - t[1] * x  # -(phi × n)·t = -phi·(n × t)
+        J4[3, 3], J4[3, 4], J4[3, 5] = -x, -y, -z
+        _add_plane(e4, J4, terms.plane_information[i], w, H, g)
+    for i in range(6):
+        for j in range(i):
+            H[j, i] = H[i, j]
+    return chi2, components
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _solve(terms: Terms, R: F64, t: F64, prior: F64, scale2: float) -> tuple[F64, float, float]:
+    """Moves R and t, with a prior (6,) information on the way moved; returns H (6, 6), the weighted χ² and the summed weights."""
+    H, A, g = np.zeros((6, 6)), np.zeros((6, 6)), np.zeros(6)
+    phi, step = np.zeros(3), np.zeros(6)  # phi: since the start
+    chi2, components = 0.0, 0.0
+    settled = False
+    for _ in range(40):
+        chi2, components = _normal_equations(terms, R, t, scale2, H, g)
+        if settled:
+            break
+        size = 0.0
+        for i in range(6):
+            g[i] = -g[i] - prior[i] * (phi[i] if i < 3 else t[i - 3])
+            for j in range(6):
+                A[i, j] = H[i, j] + (prior[i] if i == j else 0.0)
+        solve_positive(A, g, step)
+        turn_left(step, R)
+        for i in range(3):
+            phi[i] += step[i]
+            t[i] += step[3 + i]
+            size += step[i] * step[i] + step[3 + i] * step[3 + i]
+        settled = scale2 <= GATE2 and size < 1e-12
+        scale2 = max(0.5 * scale2, GATE2)
+    return H, chi2, components / 3.0

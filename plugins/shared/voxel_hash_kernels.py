@@ -1,0 +1,57 @@
+"""Numba kernels of `voxel_hash.py`."""
+# mypy: disable-error-code="arg-type, assignment, index, return-value"
+
+from __future__ import annotations
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+from trihedron.pipeline.core.types import I32
+
+I64 = NDArray[np.int64]
+BITS, HALF = 21, 1 << 20  # of a coordinate, that may be -HALF … HALF - 1
+FREE = -1
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy", inline="always")
+def key_of(x: int, y: int, z: int) -> int:
+    """The cell as one number, at least 0."""
+    return ((x + HALF) << (2 * BITS)) | ((y + HALF) << BITS) | (z + HALF)
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy", inline="always")
+def slot_of(keys: I64, key: int) -> int:
+    """The slot that holds the key, or the free one where it belongs. There must be a free one."""
+    mask = len(keys) - 1
+    mixed = (key ^ (key >> 31)) * 0x9E3779B97F4A7C1
+    slot = ((mixed ^ (mixed >> 29)) & 0x7FFFFFFFFFFFFFFF) & mask
+    while keys[slot] != FREE and keys[slot] != key:
+        slot = (slot + 1) & mask
+    return slot
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def number_of(keys: I64, numbers: I32, x: int, y: int, z: int) -> int:
+    """The cell's number, -1 when it is not in the table."""
+    slot = slot_of(keys, key_of(x, y, z))
+    return numbers[slot] if keys[slot] != FREE else -1
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def absent(keys: I64, cells: I32) -> I32:
+    """The rows of the cells (n, 3) that are not in the table."""
+    rows, count = np.empty(len(cells), np.int32), 0
+    for i in range(len(cells)):
+        if keys[slot_of(keys, key_of(cells[i, 0], cells[i, 1], cells[i, 2]))] == FREE:
+            rows[count] = i
+            count += 1
+    return rows[:count].copy()
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def copy_kernel(keys: I64, numbers: I32, to_keys: I64, to_numbers: I32) -> None:
+    for i in range(len(keys)):
+        if keys[i] != FREE:
+            slot = slot_of(to_keys, keys[i])
+            to_keys[slot], to_numbers[slot] = keys[i], numbers[i]

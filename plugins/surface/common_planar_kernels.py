@@ -1,0 +1,324 @@
+"""Numba kernels of `common_planar.py`."""
+# mypy: disable-error-code="arg-type, assignment, index, return-value"
+
+from __future__ import annotations
+
+import numba
+import numpy as np
+
+from trihedron.pipeline.core.types import F64, I32
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def on_planes(vertices: F64, triangles: I32, turned: F64, planes: F64, distance: float, cosine: float) -> I32:
+    """The plane that is nearest to all corners of a triangle and looks the same way."""
+    labels = np.full(len(triangles), -1, np.int32)
+    for t in range(len(triangles)):
+        best = distance
+        for p in range(len(planes)):
+            if turned[t, 0] * planes[p, 0] + turned[t, 1] * planes[p, 1] + turned[t, 2] * planes[p, 2] < cosine:
+                continue
+            off = _farthest(vertices, triangles[t], planes[p])
+            if off < best:
+                best, labels[t] = off, p
+    return labels
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy", inline="always")
+def _farthest(vertices: F64, corners: I32, plane: F64) -> float:
+    off = 0.0
+    for k in range(3):
+        v = vertices[corners[k]]
+        off = max(off, abs(v[0] * plane[0] + v[1] * plane[1] + v[2] * plane[2] + plane[3]))
+    return off
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def steadiness(turned: F64, opposite: I32) -> F64:
+    """(t,) least cosine between a triangle's normal and its neighbours'; 0 at a border."""
+    out = np.ones(len(turned))
+    for t in range(len(turned)):
+        for k in range(3):
+            other = opposite[3 * t + k] // 3 if opposite[3 * t + k] >= 0 else -1
+            same = np.dot(turned[t], turned[other]) if other >= 0 else 0.0
+            out[t] = max(0.0, min(out[t], same))
+    return out
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def grown_kernel(
+    seeds: I32, labels: I32, first: int, middle: F64, turned: F64, area: F64, opposite: I32, distance: float, cosine: float, least: float
+) -> tuple[I32, F64]:  # fmt: skip
+    """Regions grown from seeds (t,) among the triangles without a label, about planes fitted each time they have doubled. Returns labels, those of
+    the new regions from `first` on, and the new planes."""
+    labels = labels.copy()
+    found, count = np.empty((len(labels), 4)), 0
+    tried = np.zeros(len(labels), np.bool_)
+    queue = np.empty(len(labels), np.int32)
+    seen = np.full(len(labels), -1, np.int32)
+    for turn in range(len(seeds)):
+        seed = seeds[turn]
+        if labels[seed] >= 0 or tried[seed]:
+            continue
+        n, d = turned[seed].copy(), -np.dot(turned[seed], middle[seed])
+        queue[0], size, at, fitted, total = seed, 1, 0, 16, area[seed]
+        seen[seed] = seed
+        while at < size:
+            t = queue[at]
+            at += 1
+            for k in range(3):
+                other = opposite[3 * t + k] // 3 if opposite[3 * t + k] >= 0 else -1
+                if other < 0 or labels[other] >= 0 or seen[other] == seed:
+                    continue
+                if np.dot(turned[other], n) < cosine or abs(np.dot(middle[other], n) + d) > distance:
+                    continue
+                seen[other] = seed
+                queue[size] = other
+                size += 1
+                total += area[other]
+            if size >= 2 * fitted:
+                fitted = size
+                n, d = plane_through(middle, area, queue[:size], n)
+        for i in range(size):
+            tried[queue[i]] = True
+        if total >= least:
+            n, d = plane_through(middle, area, queue[:size], n)
+            found[count, :3], found[count, 3] = n, d
+            for i in range(size):
+                if abs(np.dot(middle[queue[i]], n) + d) <= distance:
+                    labels[queue[i]] = first + count
+            count += 1
+    return labels, found[:count].copy()
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def plane_through(middle: F64, area: F64, rows: I32, like: F64) -> tuple[F64, float]:
+    """Least squares plane through the middles of triangles, weighed by area, facing as `like` does."""
+    centre, total = np.zeros(3), 0.0
+    for t in rows:
+        centre += area[t] * middle[t]
+        total += area[t]
+    centre /= total
+    scatter = np.zeros((3, 3))
+    for t in rows:
+        p = middle[t] - centre
+        for i in range(3):
+            for j in range(3):
+                scatter[i, j] += area[t] * p[i] * p[j]
+    n = np.ascontiguousarray(np.linalg.eigh(scatter)[1][:, 0])
+    if np.dot(n, like) < 0.0:
+        n = -n
+    return n, -np.dot(n, centre)
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def with_rim(labels: I32, vertices: F64, triangles: I32, turned: F64, opposite: I32, planes: F64, reach: float) -> I32:
+    """One ring more: a triangle beside labelled ones gets the label of the plane nearest to it, if that is near and it does not face away."""
+    out = labels.copy()
+    for t in range(len(labels)):
+        if labels[t] >= 0:
+            continue
+        best = reach
+        for k in range(3):
+            other = opposite[3 * t + k]
+            p = labels[other // 3] if other >= 0 else -1
+            if p < 0 or np.dot(turned[t], planes[p, :3]) <= 0.2:
+                continue
+            off = _farthest(vertices, triangles[t], planes[p])
+            if off < best:
+                best, out[t] = off, p
+    return out
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def without_steps(labels: I32, triangles: I32, count: int, planes: F64, area: F64) -> I32:
+    """No vertex between two planes that are nearly parallel: triangles about it lose the label of the smaller one, and become the step between
+    them."""
+    largest = np.full(count, -1, np.int32)
+    for t in range(len(labels)):
+        for k in range(3):
+            v = triangles[t, k]
+            if labels[t] >= 0 and (largest[v] < 0 or area[labels[t]] > area[largest[v]]):
+                largest[v] = labels[t]
+    out = labels.copy()
+    for t in range(len(labels)):
+        for k in range(3):
+            p = largest[triangles[t, k]]
+            if labels[t] >= 0 and p != labels[t] and abs(np.dot(planes[p, :3], planes[labels[t], :3])) > 0.9:
+                out[t] = -1
+    return out
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def enclosing(parts: I32, count: int, labels: I32, opposite: I32) -> I32:
+    """(count,) the one label about each part without label; -1 when there are several, or none, or the part reaches the mesh's border."""
+    around = np.full(count, -2, np.int32)
+    for t in range(len(parts)):
+        if labels[t] >= 0:
+            around[parts[t]] = -1
+            continue
+        for k in range(3):
+            other = opposite[3 * t + k]
+            if other < 0:
+                around[parts[t]] = -1
+            elif labels[other // 3] >= 0:
+                if around[parts[t]] == -2:
+                    around[parts[t]] = labels[other // 3]
+                elif around[parts[t]] != labels[other // 3]:
+                    around[parts[t]] = -1
+    return np.maximum(around, -1)
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def bends_kernel(parts: I32, count: int, labels: I32, middle: F64, area: F64, frames: F64) -> F64:
+    centre, total = np.zeros((count, 3)), np.zeros(count)
+    for t in range(len(parts)):
+        if labels[t] >= 0:
+            c = parts[t]
+            total[c] += area[t]
+            for k in range(3):
+                centre[c, k] += area[t] * middle[t, k]
+    normal, right, bend, row = np.zeros((count, 6, 6)), np.zeros((count, 6)), np.zeros(count), np.empty(6)
+    for t in range(len(parts)):
+        if labels[t] < 0:
+            continue
+        c, F = parts[t], frames[labels[t]]
+        px, py, pz = middle[t, 0] - centre[c, 0] / total[c], middle[t, 1] - centre[c, 1] / total[c], middle[t, 2] - centre[c, 2] / total[c]
+        x = F[0, 0] * px + F[1, 0] * py + F[2, 0] * pz
+        y = F[0, 1] * px + F[1, 1] * py + F[2, 1] * pz
+        z = F[0, 2] * px + F[1, 2] * py + F[2, 2] * pz
+        row[0], row[1], row[2], row[3], row[4], row[5] = 1.0, x, y, 0.5 * x * x, x * y, 0.5 * y * y
+        for i in range(6):
+            weighed = area[t] * row[i]
+            right[c, i] += weighed * z
+            for j in range(i + 1):
+                normal[c, i, j] += weighed * row[j]
+    for c in range(count):
+        if total[c] > 0.0:
+            for i in range(6):
+                normal[c, :i, i] = normal[c, i, :i]
+            for i in range(3, 6):
+                normal[c, i, i] += 1e-9 * total[c]  # a strip says nothing of its curvature across
+            q = np.linalg.solve(normal[c] + 1e-12 * np.eye(6), right[c])
+            bend[c] = abs(0.5 * (q[3] + q[5])) + np.sqrt(0.25 * (q[3] - q[5]) ** 2 + q[4] ** 2)
+    return bend
+
+
+# Vertices of planar parts moved onto their planes: one plane, the line where two meet, the point where three do.
+
+LEAST = 0.1  # share of the strongest direction below which planes do not say where a vertex is: two that differ by less than 26°
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def planes_about(count: int, triangles: I32, labels: I32) -> tuple[I32, I32]:
+    """The planes of the triangles about each vertex v, in ascending order and each once: rows[starts[v] : starts[v + 1]]."""
+    ends = np.zeros(count + 1, np.int32)
+    for t in range(len(triangles)):
+        if labels[t] >= 0:
+            for k in range(3):
+                ends[triangles[t, k] + 1] += 1
+    ends = np.cumsum(ends).astype(np.int32)
+    rows, filled = np.empty(ends[count], np.int32), ends[:-1].copy()
+    for t in range(len(triangles)):
+        if labels[t] >= 0:
+            for k in range(3):
+                v = triangles[t, k]
+                at = filled[v]
+                while at > ends[v] and rows[at - 1] > labels[t]:
+                    at -= 1
+                if at > ends[v] and rows[at - 1] == labels[t]:
+                    continue
+                rows[at + 1 : filled[v] + 1] = rows[at : filled[v]].copy()
+                rows[at] = labels[t]
+                filled[v] += 1
+    starts, size = np.zeros(count + 1, np.int32), 0
+    for v in range(count):
+        for k in range(ends[v], filled[v]):
+            rows[size] = rows[k]
+            size += 1
+        starts[v + 1] = size
+    return rows[:size].copy(), starts
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def snapped_kernel(vertices: F64, rows: I32, starts: I32, planes: F64, farthest: float) -> F64:
+    out = vertices.copy()
+    for v in range(len(vertices)):
+        a, b = starts[v], starts[v + 1]
+        if a == b:
+            continue
+        step, length = _step(vertices[v], planes, rows[a:b])
+        if length > farthest:
+            nearest = a
+            for k in range(a + 1, b):
+                if abs(_height(vertices[v], planes[rows[k]])) < abs(_height(vertices[v], planes[rows[nearest]])):
+                    nearest = k
+            step, _ = _step(vertices[v], planes, rows[nearest : nearest + 1])
+        out[v] += step
+    return out
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def unfold(points: F64, triangles: I32, normals: F64, rows: I32, starts: I32) -> int:
+    """Move the vertices of triangles (t, 3) that lie the wrong way round to the middle of those neighbours that are on all their planes, so that each
+    stays on its plane or line; returns how many."""
+    folded = np.zeros(len(points), np.bool_)
+    for t in range(len(triangles)):
+        a, b, c = triangles[t, 0], triangles[t, 1], triangles[t, 2]
+        x1, y1, z1 = points[b, 0] - points[a, 0], points[b, 1] - points[a, 1], points[b, 2] - points[a, 2]
+        x2, y2, z2 = points[c, 0] - points[a, 0], points[c, 1] - points[a, 1], points[c, 2] - points[a, 2]
+        if (y1 * z2 - z1 * y2) * normals[t, 0] + (z1 * x2 - x1 * z2) * normals[t, 1] + (x1 * y2 - y1 * x2) * normals[t, 2] < 0.0:
+            folded[a] = folded[b] = folded[c] = True
+    total = np.zeros((len(points), 4))
+    for t in range(len(triangles)):
+        for k in range(3):
+            v = triangles[t, k]
+            if folded[v]:
+                for other in (triangles[t, (k + 1) % 3], triangles[t, (k + 2) % 3]):
+                    if _includes(rows[starts[other] : starts[other + 1]], rows[starts[v] : starts[v + 1]]):
+                        total[v, :3] += points[other]
+                        total[v, 3] += 1.0
+    count = 0
+    for v in range(len(points)):
+        if total[v, 3] > 0.0:
+            points[v] = total[v, :3] / total[v, 3]
+            count += 1
+    return count
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy", inline="always")
+def _includes(larger: I32, smaller: I32) -> bool:
+    """Whether an ascending list holds another."""
+    at = 0
+    for wanted in smaller:
+        while at < len(larger) and larger[at] < wanted:
+            at += 1
+        if at == len(larger) or larger[at] != wanted:
+            return False
+    return True
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy", inline="always")
+def _height(p: F64, plane: F64) -> float:
+    return p[0] * plane[0] + p[1] * plane[1] + p[2] * plane[2] + plane[3]
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _step(p: F64, planes: F64, rows: I32) -> tuple[F64, float]:
+    """The shortest step onto the planes, by least squares within the directions that they determine, and its length."""
+    if len(rows) == 1:
+        height = _height(p, planes[rows[0]])
+        return -height * planes[rows[0], :3], abs(height)
+    A, r = np.zeros((3, 3)), np.zeros(3)
+    for k in rows:
+        height = _height(p, planes[k])
+        for i in range(3):
+            r[i] += planes[k, i] * height
+            for j in range(3):
+                A[i, j] += planes[k, i] * planes[k, j]
+    values, vectors = np.linalg.eigh(A)
+    step = np.zeros(3)
+    for i in range(3):
+        if values[i] > LEAST * values[2]:
+            step -= vectors[:, i] * (np.dot(vectors[:, i], r) / values[i])
+    return step, np.sqrt(np.dot(step, step))

@@ -1,0 +1,78 @@
+"""Pairs of features of two frames as the topic `tracks`."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from trihedron.pipeline.core.geometry import pose_matrix, transform_planes
+from trihedron.pipeline.core.types import F32, F64, I32, Camera, Keypoints, Planes, Segments, Tracks
+from trihedron.plugins.shared.descriptors import match_lines
+from trihedron.plugins.shared.linalg import constant
+from trihedron.plugins.shared.plane_association import associate_planes
+from trihedron.plugins.tracks.common_kernels import predicted_kernel, rows_of_pairs
+
+NO_PAIRS = np.zeros((0, 2), np.int32)
+
+
+@dataclass(frozen=True)
+class Features:
+    """What one frame shows."""
+
+    keypoints: Keypoints
+    segments: Segments
+    planes: Planes
+
+
+@dataclass(frozen=True)
+class StructureGates:
+    """How far lines and planes may be from where a known motion puts them."""
+
+    line_deg: float = 8.0
+    line_px: float = 8.0
+    line_overlap: float = 0.4  # of the shorter segment
+    line_bits: int = 80  # of 256
+    ratio: float = 0.9
+    plane_deg: float = 8.0
+    plane_m: float = 0.05
+
+    def pairs(self, now: Features, before: Features, camera: Camera, R: F64, t: F64) -> tuple[I32, I32]:
+        """(m, 2) lines and (p, 2) planes, rows (previous, current), found around the motion `p_current = R p_previous + t`."""
+        predicted = predict_pixels(before.segments.endpoints_px, before.segments.endpoints_m, camera, R, t).astype(np.float32)
+        known, found = before.segments.descriptors, now.segments
+        lines = match_lines(
+            predicted, known, found.endpoints_px, found.descriptors, self.line_deg, self.line_px, self.line_overlap, self.line_bits, self.ratio
+        )
+        moved = transform_planes(pose_matrix(R, t), before.planes.coefficients)
+        samples = (before.planes.samples_m @ R.T + t).astype(np.float32)
+        planes = associate_planes(now.planes.coefficients, now.planes.samples_m, moved, samples, self.plane_deg, self.plane_m, many_to_one=True)
+        return rows_of_pairs(lines), np.ascontiguousarray(planes[:, ::-1])
+
+
+def tracks_value(now: Features, before: Features, pairs: tuple[I32, I32, I32], R_current_previous: F64) -> Tracks:
+    """The pairs of points, lines and planes, rows (previous, current), with the previous geometry."""
+    points, lines, planes = pairs
+    return Tracks(
+        index=now.keypoints.index,
+        stamp_ns=now.keypoints.stamp_ns,
+        previous_index=before.keypoints.index,
+        keypoints=points,
+        points_m=before.keypoints.points_m[points[:, 0]],
+        sigma_m=before.keypoints.sigma_m[points[:, 0]],
+        segments=lines,
+        endpoints_m=before.segments.endpoints_m[lines[:, 0]],
+        planes=planes,
+        coefficients=before.planes.coefficients[planes[:, 0]],
+        plane_covariance=before.planes.covariance[planes[:, 0]],
+        R_current_previous=R_current_previous,
+    )
+
+
+# Where features of one image appear in another after a motion.
+
+def predict_pixels(pixels: F32, points_m: F32, camera: Camera, R: F64, t: F64) -> F64:
+    """Pixels (..., 2) of the previous image moved by (R, t), NaN behind the camera; those without a 3D point (..., 3) as if infinitely far."""
+    intrinsics = (float(camera.fx), float(camera.fy), float(camera.cx), float(camera.cy))
+    flat = constant(pixels.reshape(-1, 2), np.float32), constant(points_m.reshape(-1, 3), np.float32)
+    return np.asarray(predicted_kernel(*flat, intrinsics, constant(R, np.float64), constant(t, np.float64)).reshape(pixels.shape))

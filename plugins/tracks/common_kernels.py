@@ -1,0 +1,59 @@
+"""Numba kernels of `common.py`."""
+# mypy: disable-error-code="arg-type, assignment, index, return-value"
+
+from __future__ import annotations
+
+import numba
+import numpy as np
+
+from trihedron.pipeline.core.types import F32, F64, I32
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def rows_of_pairs(found: I32) -> I32:
+    """(n,) row of the current frame for each previous one, or -1 -> (k, 2)."""
+    out, k = np.empty((len(found), 2), np.int32), 0
+    for i in range(len(found)):
+        if found[i] >= 0:
+            out[k, 0], out[k, 1] = i, found[i]
+            k += 1
+    return out[:k]
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def predicted_kernel(pixels: F32, points_m: F32, intrinsics: tuple[float, float, float, float], R: F64, t: F64) -> F64:
+    """`predict_pixels` of n."""
+    out = np.empty((len(pixels), 2))
+    for i in range(len(pixels)):
+        out[i, 0], out[i, 1] = moved_pixel(pixels[i, 0], pixels[i, 1], points_m[i, 0], points_m[i, 1], points_m[i, 2], intrinsics, R, t)
+    return out
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def moved_pixel(u: float, v: float, x: float, y: float, z: float, camera: tuple[float, float, float, float], R: F64, t: F64) -> tuple[float, float]:
+    """`predict_pixels` of the pixel (u, v) with the point (x, y, z)."""
+    fx, fy, cx, cy = camera
+    near = 1.0
+    x, y, z = float(x), float(y), float(z)
+    if not np.isfinite(x + y + z):
+        x, y, z, near = (u - cx) / fx, (v - cy) / fy, 1.0, 0.0
+    depth = R[2, 0] * x + R[2, 1] * y + R[2, 2] * z + near * t[2]
+    if not depth > 1e-6:
+        return np.nan, np.nan
+    column = fx * (R[0, 0] * x + R[0, 1] * y + R[0, 2] * z + near * t[0]) / depth + cx
+    row = fy * (R[1, 0] * x + R[1, 1] * y + R[1, 2] * z + near * t[1]) / depth + cy
+    return column, row
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def nearest_pixels(pixels: F32, among: F32) -> tuple[I32, F64]:
+    """(n,) rows of the nearest of `among` (m, 2), m > 0, to each of the pixels (n, 2), the first of equals, and their distances (n,), px."""
+    rows, distances = np.zeros(len(pixels), np.int32), np.empty(len(pixels))
+    for i in range(len(pixels)):
+        best = np.inf
+        for j in range(len(among)):
+            x, y = pixels[i, 0] - among[j, 0], pixels[i, 1] - among[j, 1]
+            if x * x + y * y < best:
+                best, rows[i] = x * x + y * y, j
+        distances[i] = np.sqrt(best)
+    return rows, distances

@@ -1,0 +1,121 @@
+"""Translation from tracked points with the rotation known: the de-rotated reprojection error, which is linear in it.
+
+With the previous point turned into this frame's axes, q = R_current_previous p, and the unknown step s with `p_current = q + s`, a point seen at
+(x, y) on the image plane gives `(1, 0, -x)·s = x q_z - q_x` and `(0, 1, -y)·s = y q_z - q_y`; one without depth, of which only the rays b and b' are
+known, gives `(b × b')·s = 0` (Zhang, Kaess, Singh, IROS 2014; Kim, Coltin, Kim, ICRA 2018). That one is taken of the direction of s: noise would
+make s itself shorter.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from trihedron.pipeline.core.types import F64, LOST, Camera, Frame, Keypoints, Pose, Tracks, Translation
+
+ITERATIONS = 15
+CAUCHY = 2.385  # 95 % efficiency where the noise is Gaussian
+GATE = 3.0  # standard deviations, beyond which a point does not agree
+FLOOR_M = 0.01  # of the step, below which points without depth say no more: their rows' noise is a share of it
+SIGMAS = 0.849  # standard deviation in each of two directions, where the median length is 1
+ALONE = 4  # iterations of the points with depth alone: at a step of zero, those without depth agree with everything
+
+
+class Rows(NamedTuple):
+    """Linear equations `A s = b` of n points, two rows each (the second of a point without depth is zero)."""
+
+    A: F64  # (n, 2, 3); b × b' in the first row of a point without depth
+    b: F64  # (n, 2)
+    z: F64  # (n,) depth of q, NaN without
+    sigma: F64  # (n,) on the image plane at depth 1
+
+
+@dataclass(frozen=True)
+class Step:
+    """`s` (3,) in this frame's axes with covariance (3, 3), how many points agree, and unit vectors (u, 3) along which nothing was measured."""
+
+    s: F64
+    covariance: F64
+    inliers: int
+    unobservable: F64
+
+
+def point_rows(tracks: Tracks, now: Keypoints, before: Keypoints, camera: Camera, R_current_previous: F64, turn: F64, depthless: bool) -> Rows:
+    """The equations of the tracked points, those without depth where `depthless`. The rotation's error, of covariance `turn` (3, 3), is the same for
+    all of the latter: together they are no surer of the direction than it."""
+    i, j = tracks.keypoints.T
+    x = camera.back_project(now.pixels[j].astype(np.float64), np.ones(len(j)))
+    far = camera.back_project(before.pixels[i].astype(np.float64), np.ones(len(i))) @ R_current_previous.T
+    q = tracks.points_m.astype(np.float64) @ R_current_previous.T
+    known = np.isfinite(q).all(axis=1)
+    A, b = np.zeros((len(j), 2, 3)), np.zeros((len(j), 2))
+    A[:, 0, 0] = A[:, 1, 1] = 1.0
+    A[:, :, 2] = -x[:, :2]
+    b[:] = x[:, :2] * q[:, 2:] - q[:, :2]
+    A[~known], b[~known] = 0.0, 0.0
+    A[~known, 0] = np.cross(far[~known], x[~known])
+    sigma = np.hypot(now.sigma_px[j], before.sigma_px[i]).astype(np.float64) / camera.fx
+    sigma[~known] = np.sqrt(sigma[~known] ** 2 + np.count_nonzero(~known) * np.trace(turn) / 3.0)
+    used = (known & (q[:, 2] > 0.1)) | (~known & depthless)
+    return Rows(A[used], b[used], np.where(known, q[:, 2], np.nan)[used], sigma[used])
+
+
+def solve_step(rows: Rows, start: F64, prior_m: float) -> Step:
+    """Iteratively reweighted least squares with Cauchy's weights and the scale of the median residual, from `start`; `prior_m` is the standard
+    deviation of a step about it, and a direction known no better than half of that is called unobservable."""
+    s, prior = start.copy(), np.eye(3) / prior_m**2
+    H, normalised = np.zeros((3, 3)), np.empty((0, 2))
+    with_depth = np.isfinite(rows.z)
+    for iteration in range(ITERATIONS if len(rows.z) else 0):
+        A, b = _linearised(rows, s)
+        reach = np.where(with_depth, np.maximum(rows.z + s[2], 0.1), np.linalg.norm(s) + FLOOR_M)
+        noise = reach * rows.sigma
+        normalised = (np.einsum("nij,j->ni", A, s) - b) / noise[:, None]
+        size = np.linalg.norm(normalised, axis=1)
+        scale = max(SIGMAS * float(np.median(size[with_depth])) if with_depth.any() else 1.0, 0.3)
+        w = 1.0 / (1.0 + (size / (CAUCHY * scale)) ** 2) / (noise * scale) ** 2
+        if iteration < ALONE and with_depth.any():
+            w = np.where(with_depth, w, 0.0)
+        H = np.einsum("n,nij,nik->jk", w, A, A)
+        g = np.einsum("n,nij,ni->j", w, A, b)
+        step = np.linalg.solve(H + prior, g + prior @ start) - s
+        s = s + step
+        normalised = normalised / scale
+        if step @ step < 1e-14 and iteration >= ALONE:
+            break
+    values, vectors = np.linalg.eigh(H)
+    inliers = int(np.count_nonzero(np.linalg.norm(normalised, axis=1) < GATE))
+    return Step(s, np.linalg.inv(H + prior), inliers, vectors[:, values < (2.0 / prior_m) ** 2].T)
+
+
+def _linearised(rows: Rows, s: F64) -> tuple[F64, F64]:
+    """The equations with those of points without depth as `(b × b')·s / |s| = 0` about s, times |s|."""
+    size = max(float(np.linalg.norm(s)), 1e-9)
+    along = s / size
+    A, b = rows.A.copy(), rows.b.copy()
+    far = np.isnan(rows.z)
+    off = rows.A[far, 0] @ along
+    A[far, 0] -= off[:, None] * along
+    b[far, 0] = -size * off
+    return A, b
+
+
+# What every estimator of the position with the rotation fixed says alike: the first frame's, and one that was not measured.
+
+def origin(frame: Frame) -> Translation:
+    """The first frame's position, the origin of the world, which is certain."""
+    return Translation(frame.index, frame.stamp_ns, np.zeros(3), np.zeros((3, 3)), np.empty((0, 3)), np.zeros(3, np.int32), True)
+
+
+def unmeasured(frame: Frame, t_world_camera: F64, covariance: F64) -> Translation:
+    """A position (3,) that is only predicted, with its covariance (3, 3)."""
+    return Translation(frame.index, frame.stamp_ns, t_world_camera, covariance, np.eye(3), np.zeros(3, np.int32), False)
+
+
+def handed_on(previous: Pose, held_too: bool = False) -> F64:
+    """(3, 3) covariance (world) that a pose which was lost, or with `held_too` held in some direction, hands on to what is put on top of it; others
+    hand on none: the world is where they say."""
+    R, known = previous.T_world_camera[:3, :3], previous.status != LOST and not (held_too and previous.unobservable)
+    return np.zeros((3, 3)) if known else np.asarray(R @ previous.covariance[:3, :3] @ R.T)
