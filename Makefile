@@ -24,7 +24,7 @@ demo: install  ## track the built-in synthetic room
 
 test: install  ## style, types, and the tests that are quick
 	$(BIN)/ruff check .
-	$(BIN)/mypy -p trihedron.pipeline -p trihedron.datasets -p trihedron.plugins -p trihedron.tools
+	$(BIN)/mypy -p trihedron
 	$(BIN)/pytest -n 2
 
 test-slow: install  ## the tests that take longer

@@ -1,4 +1,4 @@
-"""What is installed: all of it, under one name, working away from the source folder."""
+"""The installed package: all of it, under one name, working away from the source folder."""
 
 import json
 import os
@@ -6,6 +6,7 @@ import shutil
 import subprocess
 import sys
 import sysconfig
+import tarfile
 import venv
 import zipfile
 from pathlib import Path
@@ -20,17 +21,11 @@ FOLDERS = ("pipeline", "plugins", "datasets", "tools", "conf")
 PROJECT = load_file(ROOT / "pyproject.toml")
 
 
-def test_every_folder_with_modules_is_packaged():
-    folders = {path.parent for folder in FOLDERS for path in (ROOT / folder).rglob("*.py")}
-    packages = {f"trihedron.{folder.relative_to(ROOT).as_posix().replace('/', '.')}" for folder in folders}
-    assert set(PROJECT["tool"]["setuptools"]["packages"]) == packages
-
-
-def test_folders_of_configuration_and_types_are_packages():
-    """Data files are only packaged from folders that are packages, and a type checker looks for the marker in each."""
-    for path in (ROOT / "conf").rglob("*.yaml"):
-        assert (path.parent / "__init__.py").is_file(), path
-    assert all((ROOT / folder / "py.typed").is_file() for folder in FOLDERS if folder != "conf")
+def test_the_package_links_to_the_folders():
+    """Relative links, so that a checkout may lie anywhere; a new folder with modules is a package."""
+    for folder in FOLDERS:
+        assert os.readlink(ROOT / "src" / "trihedron" / folder) == f"../../{folder}"
+        assert all((path.parent / "__init__.py").is_file() for path in (ROOT / folder).rglob("*") if path.suffix in (".py", ".yaml"))
 
 
 def test_commands_are_registered():
@@ -42,16 +37,20 @@ def test_commands_are_registered():
 
 @pytest.fixture(scope="module")
 def wheel(tmp_path_factory):
-    """The wheel, built from a copy so that nothing left over in build/ gets in."""
+    """The wheel that is built from the sdist, which is built from a copy so that nothing left over gets in."""
     folder = tmp_path_factory.mktemp("wheel")
     source = folder / "source"
-    source.mkdir()
-    for name in (*FOLDERS, "pyproject.toml", "README.md", "LICENSE"):
-        if (ROOT / name).is_dir():
-            shutil.copytree(ROOT / name, source / name, ignore=shutil.ignore_patterns("__pycache__"))
-        elif (ROOT / name).exists():
-            shutil.copy(ROOT / name, source / name)
-    command = [sys.executable, "-m", "pip", "wheel", "--quiet", "--no-deps", "--no-build-isolation", "--wheel-dir", str(folder), str(source)]
+    shutil.copytree(ROOT / "src", source / "src", symlinks=True, ignore=shutil.ignore_patterns("*.egg-info"))
+    for name in FOLDERS:
+        shutil.copytree(ROOT / name, source / name, ignore=shutil.ignore_patterns("__pycache__"))
+    for name in ("pyproject.toml", "README.md", "LICENSE"):
+        shutil.copy(ROOT / name, source / name)
+    program = "import sys; from setuptools.build_meta import build_sdist; build_sdist(sys.argv[1])"
+    subprocess.run([sys.executable, "-c", program, folder], cwd=source, check=True, capture_output=True)
+    (sdist,) = folder.glob("*.tar.gz")
+    with tarfile.open(sdist) as archive:
+        assert not [member.name for member in archive if member.issym() or member.islnk()]
+    command = [sys.executable, "-m", "pip", "wheel", "--quiet", "--no-deps", "--no-build-isolation", "--wheel-dir", str(folder), str(sdist)]
     subprocess.run(command, check=True, capture_output=True)
     (built,) = folder.glob("*.whl")
     return built
@@ -61,8 +60,7 @@ def test_content_of_the_wheel(wheel):
     names = zipfile.ZipFile(wheel).namelist()
     assert {name.split("/")[0] for name in names} == {"trihedron", wheel.name.removesuffix("-py3-none-any.whl") + ".dist-info"}
     ours = [path for folder in FOLDERS for path in (ROOT / folder).rglob("*") if path.suffix in (".py", ".yaml", ".json")]
-    expected = {f"trihedron/{path.relative_to(ROOT)}" for path in ours}
-    expected |= {f"trihedron/{folder}/py.typed" for folder in FOLDERS if folder != "conf"}
+    expected = {f"trihedron/{path.relative_to(ROOT)}" for path in ours} | {"trihedron/__init__.py", "trihedron/py.typed"}
     assert {name for name in names if name.startswith("trihedron/")} == expected
 
 
