@@ -92,7 +92,8 @@ def test_size_documentation_and_annotations(path):
 @pytest.mark.parametrize("path", FILES, ids=lambda path: str(path.relative_to(ROOT)))
 def test_no_private_member_of_a_library(path):
     tree = parsed(path)
-    libraries = {alias.asname or alias.name.split(".")[0]: alias.name for node in ast.walk(tree) if isinstance(node, ast.Import) for alias in node.names}
+    imports = [alias for node in ast.walk(tree) if isinstance(node, ast.Import) for alias in node.names]
+    libraries = {alias.asname or alias.name.split(".")[0]: alias.name for alias in imports}
     found = []
     for node in ast.walk(tree):
         if isinstance(node, ast.ImportFrom) and node.module:
