@@ -205,8 +205,8 @@ def test_an_interrupt_leaves_a_recording_and_a_trajectory(tmp_path):
 
 
 def readme_block(language, first_line):
-    """The fenced block of the README that begins with a comment naming its file."""
-    text = (Path(__file__).parents[2] / "README.md").read_text()
+    """The fenced block of the tutorial that begins with a comment naming its file."""
+    text = (Path(__file__).parents[2] / "docs" / "tutorial" / "write-a-plugin.md").read_text()
     return text.split(f"```{language}\n# {first_line}\n")[1].split("```")[0]
 
 
