@@ -77,7 +77,7 @@ def convert(dataset: str, options: dict[str, str | None], destination: Path) -> 
 
     load_plugins()
     plugin = _plugin(plugin_class("dataset", dataset), dataset, options)
-    runner = Runner(build_graph({"dataset": {}}, {"dataset": plugin}, ["dataset"]), frames=options["frames"] or "")
+    runner = Runner(build_graph({"dataset": plugin}, ["dataset"]), frames=options["frames"] or "")
     truth = plugin.truth()
     unfinished = destination.with_suffix(".part")
     try:

@@ -21,7 +21,7 @@ from omegaconf.errors import ValidationError
 from trihedron.pipeline.core.errors import ConfigError, TrihedronError, UsageError, did_you_mean
 from trihedron.pipeline.core.graph import Graph, build_graph
 from trihedron.pipeline.core.registry import load_plugins, options_of, plugin_class, plugins_of
-from trihedron.pipeline.core.slots import SLOTS
+from trihedron.pipeline.core.slots import SLOTS, default_wires
 
 PLUGIN_KEY = "plugin"  # which plugin a slot's configuration belongs to
 SWEEPER, SEARCH, DASK = (f"hydra_plugins.trihedron.{name}" for name in ("Sweeper", "Search", "Dask"))  # `_target_` of Hydra's groups
@@ -59,7 +59,7 @@ class RunOptions:
             {"override hydra/sweeper": "trihedron"},
         ]
     )
-    graph: dict[str, Any] = dataclasses.field(default_factory=dict)  # graph=NAME chooses a file; graph.STAGE.INPUT=TOPIC changes a wire
+    graph: dict[str, Any] = dataclasses.field(default_factory=lambda: {slot: _default_wiring(slot) for slot in SLOTS})  # all wires, by stage
     out: str = "runs/${now:%Y-%m-%d}/${now:%H-%M-%S}"  # the run folder
     threads: int = 2
     seed: int = 0
@@ -117,11 +117,15 @@ def _option(name: str, plugin: type[Any]) -> type[Any]:
     return dataclasses.make_dataclass(plugin.__name__, fields)
 
 
+def _default_wiring(slot: str) -> dict[str, str]:
+    return {parameter: str(wire) for parameter, wire in default_wires(slot).items()}
+
+
 def graph_of(config: DictConfig) -> Graph:
-    """The checked graph of a composed configuration, its plugins made. Raises ConfigError or GraphError, one line each."""
+    """Build the checked graph of a composed configuration, and its plugins. Raises ConfigError or GraphError, one line each."""
     for slot in SLOTS:
-        if isinstance(config.get(slot), str):
-            raise ConfigError(slot, "this graph has no such stage", "choose another graph or wire the stage in a graph file")
+        if isinstance(chosen := config.get(slot), str):
+            raise ConfigError(slot, "this graph has no such stage", f"add it with +{slot}={chosen}, or choose another graph")
     wiring: Any = OmegaConf.to_container(config.graph, resolve=True)
     if (stage := next((stage for stage, inputs in wiring.items() if not isinstance(inputs, dict)), None)) is not None:
         raise ConfigError(f"graph.{stage}", f"'{wiring[stage]}' is not the wires of a stage", f"choose a plugin with {stage}=NAME")
@@ -130,7 +134,13 @@ def graph_of(config: DictConfig) -> Graph:
         plugins["map"] = plugin_class("map", "none")()
         if hasattr(plugins.get("pose"), "submap_after"):  # a camera that is only localised begins no map of its own: it stays lost
             plugins["pose"] = dataclasses.replace(plugins["pose"], submap_after=0)
-    return build_graph(wiring, plugins, list(config.outputs))
+    return build_graph(plugins, list(config.outputs), {stage: wires for stage in wiring if (wires := _changed_wires(stage, wiring[stage]))})
+
+
+def _changed_wires(stage: str, wires: dict[str, str | None]) -> dict[str, str | None]:
+    """Return the wires of a stage that differ from its slot's defaults; one that was deleted (`~graph.STAGE.INPUT`) is None: not wired."""
+    default = _default_wiring(stage) if stage in SLOTS else {}
+    return {parameter: wires.get(parameter) for parameter in {**default, **wires} if wires.get(parameter) != default.get(parameter)}
 
 
 def make_plugin(slot: str, options: DictConfig) -> Any:

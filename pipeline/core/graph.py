@@ -2,34 +2,22 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
 from trihedron.pipeline.core.errors import GraphError, did_you_mean
 from trihedron.pipeline.core.registry import parameters_of_method
-from trihedron.pipeline.core.slots import FOLDS, SLOTS, accepts_none, inputs_of, output_of, strip_none
+from trihedron.pipeline.core.slots import FOLDS, SLOTS, accepts_none, default_wires, inputs_of, output_of, strip_none
+from trihedron.pipeline.core.wires import Wire, parse_wire
 
 TRAJECTORY = "trajectory"  # the output made of the topics `pose` and `map`
-PREVIOUS = -1  # delay of `topic@prev`
-
-
-@dataclass(frozen=True)
-class Wire:
-    """Where an input comes from: a topic of the same frame (delay 0), of exactly `delay` frames ago, or its latest earlier value (PREVIOUS)."""
-
-    topic: str
-    delay: int = 0
-
-    def __str__(self) -> str:
-        return self.topic + ("" if self.delay == 0 else "@prev" if self.delay == PREVIOUS else f"@{self.delay}")
 
 
 @dataclass(frozen=True)
 class Stage:
     """One plugin in the graph. `inputs` are the wires of the parameters it takes; `required` those whose None skips the stage; `absent` the optional
-    ones that are wired to null: always None."""
+    ones without a wire: always None."""
 
     name: str  # slot, configuration group and topic
     plugin: Any
@@ -40,7 +28,7 @@ class Stage:
 
     @property
     def fold(self) -> bool:
-        """Whether the stage gathers frames into a result written at the end."""
+        """True if the stage gathers frames into a result written at the end."""
         return self.name in FOLDS
 
 
@@ -52,7 +40,7 @@ class Graph:
     outputs: tuple[str, ...]
 
     def needed(self, targets: Iterable[str]) -> set[str]:
-        """The stages that `targets` depend on, delayed wires included, and the targets."""
+        """Return the stages that `targets` depend on, delayed wires included, and the targets."""
         found: set[str] = set()
         pending = list(targets)
         while pending:
@@ -63,21 +51,15 @@ class Graph:
         return found
 
 
-def parse_wire(text: str, place: str) -> Wire:
-    """`topic`, `topic@prev` or `topic@5`. Raises GraphError for anything else."""
-    match = re.fullmatch(r"(\w+)(?:@(prev|[1-9]\d*))?", str(text))
-    if not match:
-        raise GraphError(place, f"'{text}' is not a wire", "write topic, topic@prev or topic@5")
-    delay = match[2]
-    return Wire(match[1], 0 if delay is None else PREVIOUS if delay == "prev" else int(delay))
-
-
-def build_graph(wiring: Mapping[str, Mapping[str, str | None]], plugins: Mapping[str, Any], outputs: Iterable[str]) -> Graph:
-    """Join plugins (slot -> instance) by `wiring` (stage -> input -> wire, None = never) and keep what `outputs` need.
+def build_graph(plugins: Mapping[str, Any], outputs: Iterable[str], wiring: Mapping[str, Mapping[str, str | None]] | None = None) -> Graph:
+    """Join plugins (slot -> instance) by their slots' default wires, except where `wiring` (stage -> input -> wire) states another, None = not wired,
+    and retain the stages that `outputs` need. An optional input whose default topic no stage writes is None.
 
     Raises GraphError, one line each: a stage without plugin, an unknown input or topic, a missing wire, a type that does not fit, a delayed wire
     into an input that cannot be None, a cycle within one frame, an unknown output."""
-    stages = {name: _stage(name, wiring[name] or {}, plugins) for name in wiring}
+    wiring = wiring or {}
+    names = [*plugins, *(name for name in wiring if name not in plugins)]
+    stages = {name: _stage(name, wiring.get(name) or {}, plugins) for name in names}
     for stage in stages.values():
         for parameter, wire in stage.inputs.items():
             _check_wire(stage, parameter, wire, stages)
@@ -93,29 +75,34 @@ def _stage(name: str, wires: Mapping[str, str | None], plugins: Mapping[str, Any
     plugin = plugins.get(name)
     if plugin is None:
         raise GraphError(place, "no plugin is chosen for this stage", f"give {name}=PLUGIN (see trihedron plugins)")
-    given = inputs_of(name)
+    given, defaults = inputs_of(name), default_wires(name)
     for parameter in wires:
         if parameter not in given:
             raise GraphError(f"{place}.{parameter}", f"the slot '{name}' has no input '{parameter}'", did_you_mean(parameter, given))
     taken = parameters_of_method(name, type(plugin))
-    absent = frozenset(p for p in taken if p in wires and wires[p] is None and accepts_none(given[p]))
-    inputs = {}
+    inputs, absent = {}, set()
     for parameter in taken:
-        if parameter == "rng" or parameter in absent:
+        if parameter == "rng":
             continue
-        wire = wires.get(parameter)
-        if wire is None:
+        optional, text = accepts_none(given[parameter]), wires.get(parameter)
+        if parameter not in wires and (defaults[parameter].topic in plugins or not optional):
+            inputs[parameter] = defaults[parameter]
+        elif text is not None:
+            inputs[parameter] = parse_wire(text, f"{place}.{parameter}")
+        elif optional:
+            absent.add(parameter)
+        else:
             cause = f"the input is not wired, and {type(plugin).__name__} takes it"
             raise GraphError(f"{place}.{parameter}", cause, f"give graph.{name}.{parameter}=TOPIC")
-        inputs[parameter] = parse_wire(wire, f"{place}.{parameter}")
     required = frozenset(p for p in inputs if not accepts_none(given[p]))
-    return Stage(name, plugin, inputs, required, absent, "rng" in taken)
+    return Stage(name, plugin, inputs, required, frozenset(absent), "rng" in taken)
 
 
 def _check_wire(stage: Stage, parameter: str, wire: Wire, stages: Mapping[str, Stage]) -> None:
     place = f"graph.{stage.name}.{parameter}"
     if wire.topic not in stages:
-        raise GraphError(place, f"no stage writes topic '{wire.topic}'", did_you_mean(wire.topic, stages))
+        cure = f"choose a plugin with +{wire.topic}=PLUGIN" if wire.topic in SLOTS else did_you_mean(wire.topic, stages)
+        raise GraphError(place, f"no stage writes topic '{wire.topic}'", cure)
     expected, written = strip_none(inputs_of(stage.name)[parameter]), output_of(wire.topic)
     if expected is not written:
         fitting = [name for name in stages if output_of(name) is expected]
@@ -127,7 +114,7 @@ def _check_wire(stage: Stage, parameter: str, wire: Wire, stages: Mapping[str, S
 
 
 def _sorted(stages: Mapping[str, Stage]) -> list[str]:
-    """Topological order by the wires within a frame, ties in the order of the slots. Raises GraphError naming a cycle."""
+    """Sort topologically by the wires within a frame, ties in the order of the slots. Raises GraphError naming a cycle."""
     order: list[str] = []
     waiting = [name for name in SLOTS if name in stages]
     while waiting:
@@ -150,7 +137,7 @@ def _cycle(start: str, stages: Mapping[str, Stage], among: set[str]) -> list[str
 
 
 def _targets(graph: Graph) -> list[str]:
-    """The stages behind the outputs."""
+    """Return the stages behind the outputs."""
     targets = []
     for output in graph.outputs:
         if output == TRAJECTORY:

@@ -1,9 +1,12 @@
-"""The slots: what a stage is given and what it must return.
+"""The slots: the inputs a stage may take, the topics they are wired to by default, and the type it returns.
 
 A slot is a `Protocol`; its name in snake case is the configuration group, the node of the graph and the topic. A plugin takes any subset of the
-parameters (same names, same types), may also ask for `rng: numpy.random.Generator`, and returns the slot's type or None ("nothing this frame").
+parameters (same names, same types), may also take `rng: numpy.random.Generator`, and returns the slot's type or None ("nothing this frame").
 Frames, units and signs are those of `types`. Parameters `X | None` may come from a delayed wire (`topic@prev`, `topic@k`) and are None at the start.
-Feature stages never return None for a readable frame: nothing found is a value with no rows, so that later stages run on what there is.
+Feature stages never return None for a readable frame: nothing found is a value with no rows, so that later stages run on the rest.
+
+Default wires: a parameter reads the topic of its own name, `frame` reads `dataset`, `previous` the stage's own last output and `previous_X` the topic
+X@prev. `Annotated[..., Wire(...)]` declares any other. A graph changes single wires by `graph.STAGE.INPUT=TOPIC`, `null` for none.
 """
 
 from __future__ import annotations
@@ -11,7 +14,7 @@ from __future__ import annotations
 import inspect
 import re
 from functools import cache
-from typing import Any, Generic, Protocol, TypeVar, get_type_hints
+from typing import Annotated, Any, Generic, Protocol, TypeVar, get_type_hints
 
 from trihedron.pipeline.core.types import (
     Correction,
@@ -32,14 +35,16 @@ from trihedron.pipeline.core.types import (
     Trajectory,
     Translation,
 )
+from trihedron.pipeline.core.wires import PREVIOUS, Wire
 
 State = TypeVar("State")
+PreviousMap = Annotated[Map | None, Wire("map", PREVIOUS)]  # the map before this frame
 
 
 class Dataset(Protocol):
-    """A sequence of frames, read when asked for, in any order and from any thread.
+    """A sequence of frames, read on demand, in any order and from any thread.
 
-    `__call__(index)` returns frame `index` (0 <= index < len), or None where it cannot be read, after saying so on the logger `trihedron`.
+    `__call__(index)` returns frame `index` (0 <= index < len), or None where it cannot be read, after a warning on the logger `trihedron`.
     Stamps increase strictly with the index. Constructing it is cheap; `len` opens the folder and raises DataError when it cannot be used.
     A frame's own `index` is its number in the whole data set: position plus the start of the field `frames` ("A:B", see `frame_range`).
     `truth` is the ground truth `T_world_camera` as the data set gives it (any rate, any subset of the frames), or None."""
@@ -110,7 +115,7 @@ class TracksSlot(Protocol):
 class RotationSlot(Protocol):
     """The camera's rotation in the world, drift-free where the scene is Manhattan (eq. 1), with the world–Manhattan rotation it maintains.
     `previous` is this stage's last output, `previous_pose` the refined pose before this frame, `map` the map before this frame: a correction may
-    have moved the pose's reference keyframe since it was said, and both move with it. The world is the first frame's camera frame."""
+    have moved the pose's reference keyframe since that pose was estimated, and both move with it. The world is the first frame's camera frame."""
 
     def __call__(
         self,
@@ -121,7 +126,7 @@ class RotationSlot(Protocol):
         planes: Planes,
         previous: Rotation | None,
         previous_pose: Pose | None,
-        map: Map | None,
+        map: PreviousMap,
     ) -> Rotation | None: ...
 
 
@@ -138,9 +143,9 @@ class TranslationSlot(Protocol):
         planes: Planes,
         previous_keypoints: Keypoints | None,
         previous_pose: Pose | None,
-        earlier_pose: Pose | None,
+        earlier_pose: Annotated[Pose | None, Wire("pose", 2)],
         previous: Translation | None,
-        map: Map | None,
+        map: PreviousMap,
     ) -> Translation | None: ...
 
 
@@ -149,12 +154,12 @@ class MatchesSlot(Protocol):
 
     def __call__(
         self, frame: Frame, rotation: Rotation, translation: Translation, keypoints: Keypoints, segments: Segments, planes: Planes,
-        map: Map | None, relocalise: Pose | None,
+        map: PreviousMap, relocalise: Pose | None,
     ) -> Matches | None: ...  # fmt: skip
 
 
 class PoseSlot(Protocol):
-    """The pose of this frame with its status (section IV-C, eq. 8): a pose is always said, and `ok` or `degraded` only when it was estimated
+    """The pose of this frame with its status (section IV-C, eq. 8): every frame gets a pose, `ok` or `degraded` only when it was estimated
     from this frame's measurements. `map` is the map before this frame, `previous` this stage's last output; on a lost one nothing is tracked."""
 
     def __call__(
@@ -169,14 +174,14 @@ class PoseSlot(Protocol):
         segments: Segments,
         planes: Planes,
         previous: Pose | None,
-        model: PredictedView | None,
-        map: Map | None,
+        model: Annotated[PredictedView | None, Wire("model", PREVIOUS)],
+        map: PreviousMap,
         relocalise: Pose | None,
     ) -> Pose | None: ...
 
 
 class MapSlot(Protocol):
-    """The only writer of the map: inserts keyframes, culls and fuses landmarks, applies corrections, ties sub-maps. None when nothing changed."""
+    """The only writer of the map: inserts keyframes, culls and fuses landmarks, applies corrections, merges sub-maps. None when nothing changed."""
 
     def __call__(
         self,
@@ -186,9 +191,9 @@ class MapSlot(Protocol):
         segments: Segments,
         planes: Planes,
         matches: Matches | None,
-        map: Map | None,
-        bundle: Correction | None,
-        loop: Correction | None,
+        map: PreviousMap,
+        bundle: Annotated[Correction | None, Wire("bundle", 5)],
+        loop: Annotated[Correction | None, Wire("loop", 10)],
         relocalise: Pose | None,
     ) -> Map | None: ...
 
@@ -200,7 +205,7 @@ class BundleSlot(Protocol):
 
 
 class LoopSlot(Protocol):
-    """Recognises a place seen before and corrects the map."""
+    """Recognise a place seen before and correct the map."""
 
     def __call__(self, map: Map, frame: Frame) -> Correction | None: ...
 
@@ -210,7 +215,7 @@ class RelocaliseSlot(Protocol):
     recognised; `degraded` for one tracked in a sub-map that was recognised in an older one. None otherwise."""
 
     def __call__(
-        self, frame: Frame, rotation: Rotation, keypoints: Keypoints, segments: Segments, planes: Planes, map: Map | None, previous_pose: Pose | None
+        self, frame: Frame, rotation: Rotation, keypoints: Keypoints, segments: Segments, planes: Planes, map: PreviousMap, previous_pose: Pose | None
     ) -> Pose | None: ...
 
 
@@ -222,7 +227,7 @@ class ModelSlot(Protocol):
 
 class SurfaceSlot(Protocol, Generic[State]):
     """A mesh of the scene; empty rather than None. A fold: `start` makes a state, `add` takes it one frame further (`map` where it changed then),
-    `finish` hangs what was gathered on the final keyframes, as `trajectory.txt` does. Nothing reads it while the camera is tracked."""
+    `finish` transforms it to the final keyframes, as `trajectory.txt` does. Nothing reads it while the camera is tracked."""
 
     def start(self) -> State: ...
 
@@ -255,7 +260,7 @@ FOLDS = frozenset({"surface"})
 
 
 def frame_range(text: str) -> tuple[int, int | None]:
-    """The field `frames` of a data set, half open: "A:B", "A:", ":B" or "" for all -> (start, stop or None). Raises ValueError."""
+    """Parse the field `frames` of a data set, half open: "A:B", "A:", ":B" or "" for all -> (start, stop or None). Raises ValueError."""
     match = re.fullmatch(r"\s*(\d*)\s*:\s*(\d*)\s*", text or ":")
     if not match or (match[1] and match[2] and int(match[1]) >= int(match[2])):
         raise ValueError(f"frames: '{text}' is not a range of frames A:B with A < B")
@@ -263,34 +268,49 @@ def frame_range(text: str) -> tuple[int, int | None]:
 
 
 def method_of(slot: str) -> str:
-    """The method whose signature is the slot's contract: `add` of a fold, else `__call__`."""
+    """Return the method whose signature is the slot's contract: `add` of a fold, else `__call__`."""
     return "add" if slot in FOLDS else "__call__"
 
 
 def inputs_of(slot: str) -> dict[str, Any]:
-    """Parameter name -> type of a slot's inputs (without self, a fold's state or a data set's index)."""
+    """Return parameter name -> type of a slot's inputs (without self, a fold's state or a data set's index)."""
     hints = get_type_hints(getattr(SLOTS[slot], method_of(slot)))
     return {name: hint for name, hint in hints.items() if name not in ("state", "index", "return")}
 
 
 @cache
+def default_wires(slot: str) -> dict[str, Wire]:
+    """Return parameter name -> the wire it has unless the graph states another."""
+    hints = get_type_hints(getattr(SLOTS[slot], method_of(slot)), include_extras=True)
+    return {name: _default_wire(slot, name, hints[name]) for name in inputs_of(slot)}
+
+
+def _default_wire(slot: str, parameter: str, hint: Any) -> Wire:
+    declared = next((extra for extra in getattr(hint, "__metadata__", ()) if isinstance(extra, Wire)), None)
+    if declared is not None:
+        return declared
+    topic = slot if parameter == "previous" else parameter.removeprefix("previous_")
+    return Wire("dataset" if topic == "frame" else topic, PREVIOUS if parameter.startswith("previous") else 0)
+
+
+@cache
 def output_of(slot: str) -> Any:
-    """The type a slot writes (without None)."""
+    """Return the type a slot writes (without None)."""
     return strip_none(get_type_hints(SLOTS[slot].finish if slot in FOLDS else SLOTS[slot].__call__)["return"])
 
 
 def strip_none(hint: Any) -> Any:
-    """`X | None` -> X; anything else unchanged."""
+    """Strip None from a type: `X | None` -> X; anything else unchanged."""
     arms = [arm for arm in getattr(hint, "__args__", ()) if arm is not type(None)]
     return arms[0] if accepts_none(hint) and len(arms) == 1 else hint
 
 
 def accepts_none(hint: Any) -> bool:
-    """Whether a parameter of this type receives None instead of its stage being skipped."""
+    """Return True if a parameter of this type receives None instead of its stage being skipped."""
     return type(None) in getattr(hint, "__args__", ())
 
 
 def summary(slot: str) -> str:
-    """The first sentence of a slot's docstring."""
+    """Return the first sentence of a slot's docstring."""
     text = " ".join((inspect.getdoc(SLOTS[slot]) or "").split())
     return re.split(r"(?<=\.) (?=[A-Z`])", text, maxsplit=1)[0]

@@ -24,7 +24,7 @@ from typing import Any
 import cv2
 from threadpoolctl import threadpool_limits
 
-from trihedron.pipeline.core.graph import PREVIOUS, Wire
+from trihedron.pipeline.core.wires import PREVIOUS, Wire
 
 LATEST = 0.1  # share of the latest call in what a node is thought to take
 SWITCH_S = 0.0005  # of Python's usual 5 ms

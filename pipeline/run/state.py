@@ -17,8 +17,9 @@ from typing import Any
 import numpy as np
 
 from trihedron.pipeline.core.errors import RecordingError
-from trihedron.pipeline.core.graph import PREVIOUS, Stage
+from trihedron.pipeline.core.graph import Stage
 from trihedron.pipeline.core.types import LOST, Map, Pose, Rotation, Table, Value
+from trihedron.pipeline.core.wires import PREVIOUS
 from trihedron.pipeline.record.recording import FRAMES_TOPIC, Recording, RecordingWriter, TopicReader
 
 MAP_VERSION = "1"

@@ -6,7 +6,8 @@ import pytest
 
 from trihedron.pipeline.core.errors import GraphError
 from trihedron.pipeline.core.graph import build_graph
-from trihedron.pipeline.core.types import Frame, Keypoints, ManhattanFrame, Normals, Planes, Pose, Rotation, Segments, Tracks
+from trihedron.pipeline.core.slots import SLOTS, accepts_none, default_wires, inputs_of, output_of, strip_none
+from trihedron.pipeline.core.types import Frame, ManhattanFrame, Normals, Planes, Pose, Rotation
 
 
 @dataclass(frozen=True)
@@ -35,36 +36,68 @@ class ManhattanStub:
 
 
 PLUGINS = {"dataset": DatasetStub(), "normals": NormalsStub(), "planes": PlanesStub(), "manhattan": ManhattanStub()}
-WIRING = {
-    "dataset": {},
-    "normals": {"frame": "dataset"},
-    "planes": {"frame": "dataset", "normals": "normals"},
-    "manhattan": {"normals": "normals", "planes": "planes", "previous": "manhattan@prev"},
-}
 
 
-def message(outputs=("manhattan",), plugins=PLUGINS, **changes):
-    wiring = {stage: dict(wires) for stage, wires in WIRING.items()}
-    for stage, wires in changes.items():
-        wiring.setdefault(stage, {}).update(wires)
+def message(outputs=("manhattan",), plugins=PLUGINS, **wiring):
     with pytest.raises(GraphError) as error:
-        build_graph(wiring, plugins, outputs)
+        build_graph(plugins, outputs, wiring)
     return str(error.value)
 
 
+def wires(graph, stage):
+    return {parameter: str(wire) for parameter, wire in graph.stages[stage].inputs.items()}
+
+
+def test_an_input_reads_the_topic_of_its_name_unless_the_slot_declares_another():
+    assert {parameter: str(wire) for parameter, wire in default_wires("translation").items()} == {
+        "frame": "dataset", "rotation": "rotation", "tracks": "tracks", "keypoints": "keypoints", "segments": "segments", "planes": "planes",
+        "previous_keypoints": "keypoints@prev", "previous_pose": "pose@prev", "earlier_pose": "pose@2", "previous": "translation@prev",
+        "map": "map@prev",
+    }  # fmt: skip
+    declared = {parameter: str(wire) for parameter, wire in default_wires("map").items()}
+    assert (declared["map"], declared["bundle"], declared["loop"], declared["relocalise"]) == ("map@prev", "bundle@5", "loop@10", "relocalise")
+    assert str(default_wires("surface")["map"]) == "map"
+
+
+def test_every_default_wire_fits_its_input():
+    for slot in SLOTS:
+        for parameter, wire in default_wires(slot).items():
+            hint = inputs_of(slot)[parameter]
+            assert output_of(wire.topic) is strip_none(hint), f"{slot}.{parameter}"
+            assert not wire.delay or accepts_none(hint), f"{slot}.{parameter}"
+
+
+def test_a_graph_states_only_the_wires_that_differ():
+    assert wires(build_graph(PLUGINS, ["manhattan"]), "manhattan") == {"normals": "normals", "previous": "manhattan@prev"}
+    changed = build_graph(PLUGINS, ["manhattan"], {"manhattan": {"previous": "manhattan@3"}})
+    assert wires(changed, "manhattan") == {"normals": "normals", "previous": "manhattan@3"}
+
+
 def test_an_optional_input_wired_to_null_is_none():
-    stage = build_graph({**WIRING, "manhattan": {"normals": "normals", "previous": None}}, PLUGINS, ["manhattan"]).stages["manhattan"]
+    stage = build_graph(PLUGINS, ["manhattan"], {"manhattan": {"previous": None}}).stages["manhattan"]
     assert stage.absent == {"previous"} and set(stage.inputs) == {"normals"}
     assert message(manhattan={"normals": None}) == (
         "graph.manhattan.normals: the input is not wired, and ManhattanStub takes it; give graph.manhattan.normals=TOPIC"
     )
 
 
+def test_an_optional_input_whose_default_topic_no_stage_writes_is_none_and_a_required_one_is_refused():
+    plugins = {**PLUGINS, "rotation": RotationStub()}
+    stage = build_graph(plugins, ["rotation"]).stages["rotation"]
+    assert stage.absent == {"previous_pose"} and wires(build_graph(plugins, ["rotation"]), "rotation") == {
+        "planes": "planes", "previous": "rotation@prev",
+    }  # fmt: skip
+    without = {name: plugin for name, plugin in plugins.items() if name != "planes"}
+    assert message(["rotation"], without) == "graph.rotation.planes: no stage writes topic 'planes'; choose a plugin with +planes=PLUGIN"
+    expected = "graph.rotation.previous_pose: no stage writes topic 'pose'; choose a plugin with +pose=PLUGIN"
+    assert message(["rotation"], plugins, rotation={"previous_pose": "pose@2"}) == expected  # wired on purpose
+
+
 def test_a_good_graph_keeps_only_what_its_outputs_need():
-    graph = build_graph(WIRING, PLUGINS, ["manhattan"])
+    graph = build_graph(PLUGINS, ["manhattan"])
     assert list(graph.stages) == ["dataset", "normals", "manhattan"]  # the plugin does not take planes, so nobody needs them
     assert graph.stages["manhattan"].required == {"normals"}
-    assert list(build_graph(WIRING, PLUGINS, ["planes"]).stages) == ["dataset", "normals", "planes"]
+    assert list(build_graph(PLUGINS, ["planes"]).stages) == ["dataset", "normals", "planes"]
 
 
 def test_unknown_topic():
@@ -109,15 +142,9 @@ def test_malformed_wire(wire):
 
 
 def test_cycle_within_a_frame():
-    @dataclass(frozen=True)
-    class TracksStub:
-        def __call__(self, manhattan: ManhattanFrame | None, keypoints: Keypoints, segments: Segments) -> Tracks | None: ...
-
-    plugins = {"dataset": DatasetStub(), "normals": NormalsStub(), "manhattan": ManhattanStub()}
-    wiring = {"dataset": {}, "normals": {"frame": "dataset"}, "manhattan": {"normals": "normals", "previous": "manhattan"}}
-    with pytest.raises(GraphError) as error:
-        build_graph(wiring, plugins, ["manhattan"])
-    assert str(error.value) == "graph: manhattan -> manhattan need each other within one frame; put @prev on one of these wires"
+    assert message(manhattan={"previous": "manhattan"}) == (
+        "graph: manhattan -> manhattan need each other within one frame; put @prev on one of these wires"
+    )
 
 
 def test_unknown_output():

@@ -6,7 +6,7 @@ import time
 
 import pytest
 
-from trihedron.pipeline.core.graph import PREVIOUS, Wire
+from trihedron.pipeline.core.wires import PREVIOUS, Wire
 from trihedron.pipeline.run.scheduler import Node, NodeFailure, Scheduler
 
 

@@ -116,15 +116,6 @@ class ToySurface:
         return replace(empty, vertices_m=vertices.astype(np.float32), colors=np.zeros((n, 3), np.uint8))
 
 
-WIRING = {
-    "dataset": {},
-    "normals": {"frame": "dataset"},
-    "keypoints": {"frame": "dataset"},
-    "rotation": {"keypoints": "keypoints", "previous": "rotation@prev", "previous_pose": "pose@prev"},
-    "pose": {"frame": "dataset", "rotation": "rotation", "previous": "pose@prev", "map": "map@prev"},
-    "map": {"frame": "dataset", "pose": "pose", "map": "map@prev"},
-    "surface": {"pose": "pose"},
-}
 TOPICS = frozenset({"keypoints", "rotation", "pose", "map", "surface"})
 
 
@@ -134,7 +125,7 @@ def toy_graph(outputs=("trajectory", "normals", "surface"), **plugins):
         "dataset": ToyDataset(), "normals": ToyNormals(), "keypoints": ToyKeypoints(), "rotation": ToyRotation(), "pose": ToyPose(),
         "map": ToyMap(), "surface": ToySurface(), **plugins,
     }  # fmt: skip
-    return build_graph(WIRING, chosen, outputs)
+    return build_graph(chosen, outputs)
 
 
 def contents(path):
