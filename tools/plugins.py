@@ -1,4 +1,4 @@
-"""List the slots with their plugins, parameters, defaults and documentation.
+"""List the slots with their plugins, parameters, defaults, ranges and documentation.
 
 The parameters of a plugin are set as SLOT.NAME=VALUE, the plugin itself is chosen as SLOT=PLUGIN. A star marks what graph=structural uses.
 
@@ -38,9 +38,9 @@ def main(argv: list[str]) -> int:
 
 
 def describe_slot(slot: str) -> dict[str, Any]:
-    """A slot as plain data: its contract and its plugins, ready for JSON."""
+    """Describe a slot as plain data: its contract, default wires and plugins, ready for JSON."""
     from trihedron.pipeline.core.registry import plugins_of
-    from trihedron.pipeline.core.slots import FOLDS, SLOTS, inputs_of, output_of, summary
+    from trihedron.pipeline.core.slots import FOLDS, SLOTS, default_wires, inputs_of, output_of, summary
 
     default = default_plugins().get(slot)
     return {
@@ -48,6 +48,7 @@ def describe_slot(slot: str) -> dict[str, Any]:
         "summary": summary(slot),
         "doc": inspect.getdoc(SLOTS[slot]) or "",
         "inputs": {name: type_name(hint) for name, hint in inputs_of(slot).items()},
+        "wires": {name: str(wire) for name, wire in default_wires(slot).items()},
         "output": type_name(output_of(slot)),
         "fold": slot in FOLDS,
         "plugins": [describe_plugin(slot, name, plugin) | {"default": name == default} for name, plugin in plugins_of(slot).items()],
@@ -55,17 +56,24 @@ def describe_slot(slot: str) -> dict[str, Any]:
 
 
 def describe_plugin(slot: str, name: str, plugin: type[Any]) -> dict[str, Any]:
-    """A plugin as plain data: what it takes, its parameters with type, default and comment, ready for JSON."""
+    """Describe a plugin as plain data: its inputs, its parameters with type, default, range and comment, ready for JSON."""
     from typing import get_type_hints
 
+    from trihedron.pipeline.core.options import constraints_of
     from trihedron.pipeline.core.registry import options_of, parameters_of_method
 
-    hints, comments = get_type_hints(plugin), field_comments(plugin)
+    hints, comments, ranges = get_type_hints(plugin), field_comments(plugin), constraints_of(plugin)
     options = []
     for option in options_of(plugin):
         default = option.default_factory() if callable(option.default_factory) else option.default
         options.append(
-            {"name": option.name, "type": type_name(hints[option.name]), "default": _plain(default), "doc": comments.get(option.name, "")}
+            {
+                "name": option.name,
+                "type": type_name(hints[option.name]),
+                "default": _plain(default),
+                "range": " and ".join(map(str, ranges.get(option.name, ()))),
+                "doc": comments.get(option.name, ""),
+            }
         )
     return {
         "name": name,
@@ -77,7 +85,7 @@ def describe_plugin(slot: str, name: str, plugin: type[Any]) -> dict[str, Any]:
 
 
 def field_comments(plugin: type[Any]) -> dict[str, str]:
-    """Field name -> the comment behind it in the source, its bases' included; nothing where the source is not there."""
+    """Return field name -> the comment behind it in the source, its bases' included; nothing where there is no source."""
     found: dict[str, str] = {}
     for base in reversed(plugin.__mro__[:-1]):
         with contextlib.suppress(OSError, TypeError):
@@ -86,7 +94,7 @@ def field_comments(plugin: type[Any]) -> dict[str, str]:
 
 
 def _comments(source: str) -> dict[str, str]:
-    """Field name -> comment of one class's source."""
+    """Return field name -> comment of one class's source."""
     found, name = {}, ""
     for token in tokenize.generate_tokens(io.StringIO(source).readline):
         if token.type == tokenize.NAME and token.line[: token.start[1]].isspace() and token.line[token.end[1] :].lstrip().startswith(":"):
@@ -100,7 +108,7 @@ def _comments(source: str) -> dict[str, str]:
 
 
 def default_plugins() -> dict[str, str]:
-    """Slot -> plugin of `graph=structural` and of the root configuration."""
+    """Return slot -> plugin of `graph=structural` and of the root configuration."""
     from importlib.resources import files
 
     from omegaconf import OmegaConf
@@ -113,7 +121,7 @@ def default_plugins() -> dict[str, str]:
 
 
 def type_name(hint: Any) -> str:
-    """A type as it is written in the code, without modules."""
+    """Format a type as it is written in the code, without modules."""
     if isinstance(hint, type) and not hasattr(hint, "__args__"):
         return hint.__name__
     text = str(hint)
@@ -123,25 +131,25 @@ def type_name(hint: Any) -> str:
 
 
 def _plain(value: Any) -> Any:
-    """A default as JSON has it: the name of an Enum member, tuples as lists."""
+    """Convert a default to JSON: the name of an Enum member, tuples as lists."""
     if isinstance(value, Enum):
         return value.name
     return [_plain(item) for item in value] if isinstance(value, (tuple, list)) else value
 
 
 def report(slot: dict[str, Any]) -> str:
-    """A slot as text for people."""
+    """Format a slot for people."""
     inputs = ", ".join(f"{name}: {kind}" for name, kind in slot["inputs"].items())
     lines = [f"{slot['name']}({inputs}) -> {slot['output']}", f"  {slot['summary']}"]
     for plugin in slot["plugins"]:
         lines.append(f"  {'*' if plugin['default'] else ' '} {plugin['name']}: {first_sentence(plugin['doc'])}")
         if plugin["parameters"]:
-            rows = [(f"{p['name']}: {p['type']}", f"= {json.dumps(p['default'])}", p["doc"]) for p in plugin["parameters"]]
+            rows = [(f"{p['name']}: {p['type']}", f"= {json.dumps(p['default'])}", p["range"], p["doc"]) for p in plugin["parameters"]]
             lines += [f"        {line}" for line in table(rows).splitlines()]
     return "\n".join(lines)
 
 
 def first_sentence(text: str) -> str:
-    """The first paragraph of a docstring up to its first full stop (not that of "et al."), on one line."""
+    """Return the first paragraph of a docstring up to its first full stop (not that of "et al."), on one line."""
     paragraph = " ".join(text.split("\n\n")[0].split())
     return re.split(r"(?<!\bal)\.\s+(?=[A-Z`])", paragraph, maxsplit=1)[0].rstrip(".")

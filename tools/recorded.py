@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from trihedron.pipeline.core.errors import DataError
-from trihedron.pipeline.core.slots import frame_range
+from trihedron.pipeline.core.options import frame_range
 from trihedron.pipeline.core.types import Frame, FrameReference, Map, Pose, Trajectory
 from trihedron.pipeline.record.recording import FRAMES_TOPIC, Recording
 from trihedron.pipeline.run.replay import Poses, Result

@@ -14,8 +14,8 @@ from trihedron.datasets.faults import images as spoil
 from trihedron.datasets.faults.timing import Delivery, inside
 from trihedron.datasets.readers.sequence import clip_range
 from trihedron.pipeline.core.errors import DataError, did_you_mean
+from trihedron.pipeline.core.options import Frames, NonNegativeFloat, NonNegativeInt, PositiveFloat, PositiveInt, Share
 from trihedron.pipeline.core.registry import plugin_class, register
-from trihedron.pipeline.core.slots import frame_range
 from trihedron.pipeline.core.types import F32, U8, Camera, Frame, Trajectory
 
 
@@ -35,10 +35,6 @@ class Cover(Enum):
     hand = "hand"
 
 
-RANGES = ("cover", "drop", "freeze", "reverse", "during")
-SHARES = ("drop_share", "depth_holes", "not_finite", "moving", "reflecting")
-POSITIVE = ("every", "depth_times", "focal_times", "resize", "depth_resize", "gamma")
-LENGTHS = ("jump", "depth_noise", "depth_limit_m", "exposure_ms", "readout_ms", "seed")
 EACH, ALL = 5, 6  # streams of random numbers: one a frame, one for all frames
 
 
@@ -48,48 +44,36 @@ class Faults:
     """The data set `of` as a bad day would deliver it. Frames are numbered as they arrive; ranges are of the numbers in the data set underneath.
     What is random depends on the seed and the frame alone."""
 
-    frames: str = ""  # part to read, half open: A:B, A:, :B; empty = all
+    frames: Frames = ""  # part to read, half open: A:B, A:, :B; empty = all
     of: str = "synthetic"  # the data set underneath
     options: dict[str, Any] = field(default_factory=dict)  # its options: +dataset.options.path=FOLDER
-    cover: str = ""  # frames A:B for which the camera is covered; empty = never
+    cover: Frames = ""  # frames A:B for which the camera is covered; empty = never
     covered: Covered = Covered.both  # both | color | depth
     cover_with: Cover = Cover.black  # black | white | hand: what colour shows then
-    drop: str = ""  # frames A:B that are not delivered
-    drop_share: float = 0.0  # of the others, here and there
-    every: int = 1  # only one in so many is delivered: 6 makes 5 Hz of 30
-    freeze: str = ""  # frames A:B that show what A does
-    reverse: str = ""  # frames A:B that are delivered last first
-    jump: int = 0  # frame from which on the clock is wrong by jump_s
+    drop: Frames = ""  # frames A:B that are not delivered
+    drop_share: Share = 0.0  # of the others, here and there
+    every: PositiveInt = 1  # only one in so many is delivered: 6 makes 5 Hz of 30
+    freeze: Frames = ""  # frames A:B that show what A does
+    reverse: Frames = ""  # frames A:B that are delivered last first
+    jump: NonNegativeInt = 0  # frame from which on the clock is wrong by jump_s
     jump_s: float = 0.0
-    during: str = ""  # frames A:B with the faults below; empty = all
-    depth_noise: float = 0.0  # added, times the sensor's standard deviation
-    depth_holes: float = 0.0  # share of the depth image that is missing, in blobs
-    depth_limit_m: float = 0.0  # readings beyond say this; 0 = none
-    not_finite: float = 0.0  # share of the readings that are NaN or infinite
-    depth_times: float = 1.0  # depth is wrong by this factor
-    depth_resize: float = 1.0  # size of the depth image, times that of colour
-    focal_times: float = 1.0  # the focal lengths told are wrong by this factor
-    resize: float = 1.0  # resolution, times what it was; the camera told is right
-    gamma: float = 1.0  # of colour
-    exposure_ms: float = 0.0  # motion blur of colour
-    readout_ms: float = 0.0  # from the first row to the last: rolling shutter
-    moving: float = 0.0  # share of the image covered by what moves
-    reflecting: float = 0.0  # share of the image with mirrors and glass
-    seed: int = 0
+    during: Frames = ""  # frames A:B with the faults below; empty = all
+    depth_noise: NonNegativeFloat = 0.0  # added, times the sensor's standard deviation
+    depth_holes: Share = 0.0  # share of the depth image that is missing, in blobs
+    depth_limit_m: NonNegativeFloat = 0.0  # readings beyond say this; 0 = none
+    not_finite: Share = 0.0  # share of the readings that are NaN or infinite
+    depth_times: PositiveFloat = 1.0  # depth is wrong by this factor
+    depth_resize: PositiveFloat = 1.0  # size of the depth image, times that of colour
+    focal_times: PositiveFloat = 1.0  # the focal lengths told are wrong by this factor
+    resize: PositiveFloat = 1.0  # resolution, times what it was; the camera told is right
+    gamma: PositiveFloat = 1.0  # of colour
+    exposure_ms: NonNegativeFloat = 0.0  # motion blur of colour
+    readout_ms: NonNegativeFloat = 0.0  # from the first row to the last: rolling shutter
+    moving: Share = 0.0  # share of the image covered by what moves
+    reflecting: Share = 0.0  # share of the image with mirrors and glass
+    seed: NonNegativeInt = 0
 
     def __post_init__(self) -> None:
-        frame_range(self.frames)
-        for name in RANGES:
-            _check_range(name, getattr(self, name))
-        for name in SHARES:
-            if not 0.0 <= getattr(self, name) <= 1.0:
-                raise ValueError(f"{name}: {getattr(self, name)} is not within 0 … 1")
-        for name in POSITIVE:
-            if not getattr(self, name) > 0:
-                raise ValueError(f"{name}: {getattr(self, name)} is not positive")
-        for name in LENGTHS:
-            if not getattr(self, name) >= 0:
-                raise ValueError(f"{name}: {getattr(self, name)} is negative")
         if self.of == "faults" or "frames" in self.options:
             raise ValueError("of, options: another data set, its frames chosen by dataset.frames")
         _ = self._inner  # whose options are refused now when they are out of range
@@ -188,13 +172,6 @@ class Faults:
             raise ValueError(f"options: {self.of} has no option '{unknown}'; {did_you_mean(unknown, known)}")
         return kind(**{name: _as(hints.get(name), value) for name, value in self.options.items()})
 
-
-def _check_range(name: str, text: str) -> None:
-    """Raise ValueError naming the field unless `text` is empty or a range."""
-    try:
-        frame_range(text)
-    except ValueError as error:
-        raise ValueError(str(error).replace("frames:", f"{name}:", 1)) from error
 
 
 def _refuse_sizes(number: int, depth: F32, times: float) -> None:

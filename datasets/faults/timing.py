@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from trihedron.pipeline.core.slots import frame_range
+from trihedron.pipeline.core.options import frame_range
 
 Numbers = NDArray[np.int64]
 STREAM = 4  # of the random numbers that say which frames are dropped

@@ -13,8 +13,8 @@ from trihedron.datasets.readers.association import Stamps, associate
 from trihedron.datasets.readers.cameras import choose_calibration, with_noise
 from trihedron.datasets.readers.sequence import ImageSequence, SequenceReader, open_folder, select_frames
 from trihedron.pipeline.core.errors import DataError
+from trihedron.pipeline.core.options import Frames, PositiveFloat
 from trihedron.pipeline.core.registry import register
-from trihedron.pipeline.core.slots import frame_range
 from trihedron.pipeline.record.trajectories import TRUTH, parse_stamp_ns, read_trajectory
 
 COLOR_FOLDERS = ("rgb", "color", "colour", "image")  # beginnings of names, the first that fits
@@ -34,15 +34,10 @@ class Folder(SequenceReader):
     the position counts. Pairs have the same name; names in seconds that differ are paired by time, other names by their order."""
 
     path: str = ""  # folder of the sequence
-    frames: str = ""  # part to read, half open: A:B, A:, :B; empty = all
+    frames: Frames = ""  # part to read, half open: A:B, A:, :B; empty = all
     camera: str = ""  # preset or camera.yaml; empty = the folder's file, else its name
-    max_difference_ms: float = 20.0  # of the stamps of a pair whose names differ
+    max_difference_ms: PositiveFloat = 20.0  # of the stamps of a pair whose names differ
     exact_depth: bool = False  # rendered without sensor noise; false = a Kinect's
-
-    def __post_init__(self) -> None:
-        frame_range(self.frames)
-        if self.max_difference_ms <= 0.0:
-            raise ValueError(f"max_difference_ms: {self.max_difference_ms} is not positive")
 
     @cached_property
     def _sequence(self) -> ImageSequence:

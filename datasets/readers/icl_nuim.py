@@ -19,8 +19,8 @@ from trihedron.datasets.readers.cameras import Calibration, choose_calibration, 
 from trihedron.datasets.readers.images import read_depth
 from trihedron.datasets.readers.sequence import DepthReader, ImageSequence, SequenceReader, open_folder, select_frames
 from trihedron.pipeline.core.errors import DataError
+from trihedron.pipeline.core.options import Frames
 from trihedron.pipeline.core.registry import register
-from trihedron.pipeline.core.slots import frame_range
 from trihedron.pipeline.core.types import F32, F64, Trajectory
 from trihedron.pipeline.record.trajectories import TRUTH, parse_stamp_ns, read_trajectory, table_lines
 
@@ -36,12 +36,9 @@ class IclNuim(SequenceReader):
     (scene_00_0000.png, .depth, .txt) (Handa et al. 2014). Images without a pose, such as image 0, are frames without truth."""
 
     path: str = ""  # folder of the sequence
-    frames: str = ""  # part to read, half open: A:B, A:, :B; empty = all
+    frames: Frames = ""  # part to read, half open: A:B, A:, :B; empty = all
     camera: str = ""  # preset or camera.yaml; empty = the folder's file, else the benchmark's camera
     exact_depth: bool = False  # for the sequences published without noise; false = a Kinect's
-
-    def __post_init__(self) -> None:
-        frame_range(self.frames)
 
     @cached_property
     def _sequence(self) -> ImageSequence:

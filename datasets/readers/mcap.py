@@ -9,8 +9,8 @@ from functools import cached_property
 from trihedron.datasets.readers.robot_recording import RobotRecording, Topics
 from trihedron.datasets.readers.sequence import clip_range
 from trihedron.pipeline.core.errors import DataError
+from trihedron.pipeline.core.options import Frames, PositiveFloat
 from trihedron.pipeline.core.registry import register
-from trihedron.pipeline.core.slots import frame_range
 from trihedron.pipeline.core.types import Frame, Trajectory
 from trihedron.pipeline.record.mcap_file import McapFile
 from trihedron.pipeline.record.recording import METADATA, FrameReader, Recording
@@ -30,21 +30,15 @@ class McapDataset:
     whole. Raises DataError when the file holds no frames, RecordingError when it is missing, damaged or not MCAP."""
 
     path: str = ""  # FILE.mcap
-    frames: str = ""  # half-open range of frame numbers "A:B"
+    frames: Frames = ""  # half-open range of frame numbers "A:B"
     color_topic: str = ""  # of a robot's recording; empty = the only one with colour images
     depth_topic: str = ""  # empty = the only one with depth images
     color_info_topic: str = ""  # intrinsics; empty = those beside the images, else of the same coordinate frame
     depth_info_topic: str = ""  # likewise of depth
     truth_from: str = ""  # a topic of poses (/mocap/pose), or the frame the transforms of the camera begin from (map); empty = no truth
-    max_difference_ms: float = 20.0  # of the stamps of a pair of colour and depth
+    max_difference_ms: PositiveFloat = 20.0  # of the stamps of a pair of colour and depth
     depth_delay_ms: float = 0.0  # depth is taken this much later than its stamps say; trihedron calibrate estimates it
-    depth_scale: float = 1000.0  # of 16-bit depth: values per metre
-
-    def __post_init__(self) -> None:
-        frame_range(self.frames)
-        for name in ("max_difference_ms", "depth_scale"):
-            if getattr(self, name) <= 0.0:
-                raise ValueError(f"{name}: {getattr(self, name)} is not positive")
+    depth_scale: PositiveFloat = 1000.0  # of 16-bit depth: values per metre
 
     @cached_property
     def _frames(self) -> _Recorded | RobotRecording:

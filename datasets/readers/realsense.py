@@ -13,8 +13,8 @@ import cv2
 import numpy as np
 
 from trihedron.pipeline.core.errors import DataError
+from trihedron.pipeline.core.options import Frames, PositiveInt, frame_range
 from trihedron.pipeline.core.registry import register
-from trihedron.pipeline.core.slots import frame_range
 from trihedron.pipeline.core.types import Camera, Frame, Trajectory
 
 log = logging.getLogger("trihedron")
@@ -36,17 +36,15 @@ class RealSense:
     """A camera by itself (`pip install pyrealsense2`): frames come when they come, those for which a run is too late are dropped, and those taken
     are embedded in the recording. Depth is registered to colour by the maker's library. Ends after `frames`, or with Ctrl-C."""
 
-    frames: str = ""  # 0:B, to end after frame B - 1; empty = until interrupted
+    frames: Frames = ""  # 0:B, to end after frame B - 1; empty = until interrupted
     serial: str = ""  # of the camera, where there are several
-    width: int = 640
-    height: int = 480
-    fps: int = 30
+    width: PositiveInt = 640
+    height: PositiveInt = 480
+    fps: PositiveInt = 30
 
     def __post_init__(self) -> None:
         if frame_range(self.frames)[0] != 0:
             raise ValueError("frames: a camera begins with frame 0")
-        if min(self.width, self.height, self.fps) < 1:
-            raise ValueError("width, height, fps: give positive numbers")
 
     def __len__(self) -> int:
         stop = frame_range(self.frames)[1]

@@ -14,8 +14,8 @@ from trihedron.datasets.readers.cameras import Calibration, choose_calibration, 
 from trihedron.datasets.readers.matrices import frame_stamps, matrix, numbered, trajectory_of
 from trihedron.datasets.readers.sequence import ImageSequence, SequenceReader, open_folder, select_frames
 from trihedron.pipeline.core.errors import DataError
+from trihedron.pipeline.core.options import Frames
 from trihedron.pipeline.core.registry import register
-from trihedron.pipeline.core.slots import frame_range
 from trihedron.pipeline.core.types import Camera, Trajectory
 from trihedron.pipeline.record.trajectories import table_lines
 
@@ -31,12 +31,9 @@ class Replica(SequenceReader):
     iMAP and NICE-SLAM; x right, y down, z forward). cam_params.json lies in it or beside it. Frames are 1/30 s apart, depth is exact."""
 
     path: str = ""  # folder of the scene, for example Replica/room0
-    frames: str = ""  # part to read, half open: A:B, A:, :B; empty = all
+    frames: Frames = ""  # part to read, half open: A:B, A:, :B; empty = all
     camera: str = ""  # preset or camera.yaml; empty = the folder's file, else cam_params.json
     exact_depth: bool = True  # rendered without sensor noise; false = a Kinect's
-
-    def __post_init__(self) -> None:
-        frame_range(self.frames)
 
     @cached_property
     def _sequence(self) -> ImageSequence:

@@ -15,8 +15,8 @@ from trihedron.datasets.readers.matrices import frame_stamps, numbered, read_mat
 from trihedron.datasets.readers.picture_headers import UnreadableImage
 from trihedron.datasets.readers.sequence import ImageSequence, SequenceReader, open_folder, select_frames
 from trihedron.pipeline.core.errors import DataError
+from trihedron.pipeline.core.options import Frames
 from trihedron.pipeline.core.registry import register
-from trihedron.pipeline.core.slots import frame_range
 from trihedron.pipeline.core.types import F64, U8, Camera
 
 DEPTH_SCALE = 1000.0
@@ -33,10 +33,7 @@ class ScanNet(SequenceReader):
     Depth is registered to colour, which is larger: colour is reduced to the depth camera, whose intrinsics a frame has."""
 
     path: str = ""  # folder of the exported scan
-    frames: str = ""  # part to read, half open: A:B, A:, :B; empty = all
-
-    def __post_init__(self) -> None:
-        frame_range(self.frames)
+    frames: Frames = ""  # part to read, half open: A:B, A:, :B; empty = all
 
     @cached_property
     def _sequence(self) -> ImageSequence:

@@ -18,7 +18,7 @@ from trihedron.datasets.readers.cameras import Calibration
 from trihedron.datasets.readers.images import check_size, read_color, read_depth
 from trihedron.datasets.readers.picture_headers import UnreadableImage
 from trihedron.pipeline.core.errors import DataError
-from trihedron.pipeline.core.slots import frame_range
+from trihedron.pipeline.core.options import frame_range
 from trihedron.pipeline.core.types import F32, U8, Frame, Trajectory
 
 log = logging.getLogger("trihedron")

@@ -11,8 +11,8 @@ from trihedron.datasets.readers.images import read_depth
 from trihedron.datasets.readers.matrices import frame_stamps, numbered, read_matrix, trajectory_of
 from trihedron.datasets.readers.sequence import DepthReader, ImageSequence, SequenceReader, open_folder, select_frames
 from trihedron.pipeline.core.errors import DataError
+from trihedron.pipeline.core.options import Frames
 from trihedron.pipeline.core.registry import register
-from trihedron.pipeline.core.slots import frame_range
 from trihedron.pipeline.core.types import F32
 
 INVALID_M = 65.0  # 65535 mm says that there is no reading
@@ -29,11 +29,8 @@ class SevenScenes(SequenceReader):
     things colour and depth then disagree by some pixels. Poses are those of the depth camera."""
 
     path: str = ""  # folder of the sequence, for example chess/seq-01
-    frames: str = ""  # part to read, half open: A:B, A:, :B; empty = all
+    frames: Frames = ""  # part to read, half open: A:B, A:, :B; empty = all
     camera: str = ""  # preset or camera.yaml; empty = the folder's file, else the data set's camera
-
-    def __post_init__(self) -> None:
-        frame_range(self.frames)
 
     @cached_property
     def _sequence(self) -> ImageSequence:

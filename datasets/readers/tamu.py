@@ -8,8 +8,8 @@ from functools import cached_property
 from trihedron.datasets.readers.association import listed_pairs
 from trihedron.datasets.readers.cameras import choose_calibration
 from trihedron.datasets.readers.sequence import ImageSequence, SequenceReader, open_folder, select_frames
+from trihedron.pipeline.core.options import Frames, PositiveFloat
 from trihedron.pipeline.core.registry import register
-from trihedron.pipeline.core.slots import frame_range
 
 
 @register("dataset", "tamu")
@@ -19,15 +19,10 @@ class Tamu(SequenceReader):
     hall and a staircase, without true poses: a walk ends where it began, so that `start_to_end_m` of metrics.json is its drift."""
 
     path: str = ""  # folder of the sequence
-    frames: str = ""  # part to read, half open: A:B, A:, :B; empty = all
+    frames: Frames = ""  # part to read, half open: A:B, A:, :B; empty = all
     camera: str = ""  # preset or camera.yaml; empty = the folder's file
-    max_difference_ms: float = 20.0  # of a pair's stamps
+    max_difference_ms: PositiveFloat = 20.0  # of a pair's stamps
     depth_delay_ms: float = 0.0  # depth is taken this much later than its stamps say; trihedron calibrate estimates it
-
-    def __post_init__(self) -> None:
-        frame_range(self.frames)
-        if self.max_difference_ms <= 0.0:
-            raise ValueError(f"max_difference_ms: {self.max_difference_ms} is not positive")
 
     @cached_property
     def _sequence(self) -> ImageSequence:

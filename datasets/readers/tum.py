@@ -8,8 +8,8 @@ from functools import cached_property
 from trihedron.datasets.readers.association import listed_pairs
 from trihedron.datasets.readers.cameras import choose_calibration, with_noise
 from trihedron.datasets.readers.sequence import ImageSequence, SequenceReader, open_folder, select_frames
+from trihedron.pipeline.core.options import Frames, PositiveFloat
 from trihedron.pipeline.core.registry import register
-from trihedron.pipeline.core.slots import frame_range
 from trihedron.pipeline.record.trajectories import TRUTH, read_trajectory
 
 
@@ -20,16 +20,11 @@ class Tum(SequenceReader):
     paired by time; a frame carries the stamp of its colour image. fr1 and fr2 are undistorted at reading."""
 
     path: str = ""  # folder of the sequence
-    frames: str = ""  # part to read, half open: A:B, A:, :B; empty = all
+    frames: Frames = ""  # part to read, half open: A:B, A:, :B; empty = all
     camera: str = ""  # preset or camera.yaml; empty = the folder's file, else its name
-    max_difference_ms: float = 20.0  # of a pair's stamps; the benchmark's tools use the same
+    max_difference_ms: PositiveFloat = 20.0  # of a pair's stamps; the benchmark's tools use the same
     depth_delay_ms: float = 0.0  # depth is taken this much later than its stamps say; trihedron calibrate estimates it
     exact_depth: bool = False  # rendered without sensor noise; false = a Kinect's
-
-    def __post_init__(self) -> None:
-        frame_range(self.frames)
-        if self.max_difference_ms <= 0.0:
-            raise ValueError(f"max_difference_ms: {self.max_difference_ms} is not positive")
 
     @cached_property
     def _sequence(self) -> ImageSequence:

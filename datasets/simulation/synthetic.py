@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from enum import Enum
 from functools import cached_property
+from typing import Annotated
 
 import numpy as np
 
@@ -19,8 +20,8 @@ from trihedron.datasets.simulation.room import BOX, Room, all_faces, furnished_r
 from trihedron.datasets.simulation.shading import Atlas, render
 from trihedron.datasets.simulation.textures import bake
 from trihedron.datasets.simulation.true_surface import TrueSurface, surface_of
+from trihedron.pipeline.core.options import Frames, NonNegativeInt, PositiveFloat, Range
 from trihedron.pipeline.core.registry import register
-from trihedron.pipeline.core.slots import frame_range
 from trihedron.pipeline.core.types import EXACT_DEPTH, F64, Bool, Camera, DepthNoise, Frame, Trajectory
 
 
@@ -43,30 +44,20 @@ FOCAL_PER_WIDTH = 525.0 / 640.0  # a Kinect's nominal colour camera
 class Synthetic:
     """A furnished room of 5 × 4 × 2.7 m, or a building, ray traced when a frame is asked for. Frame i depends on the fields and i alone."""
 
-    frames: str = ""  # part to make, half open: A:B, A:, :B; empty = all
+    frames: Frames = ""  # part to make, half open: A:B, A:, :B; empty = all
     scene: Scene = Scene.room  # room | corridor | offices | rooms
-    length: int = 0  # frames; 0 = the scene's own: 150 of the room, once round a building (a longer walk goes on)
-    fps: float = 30.0
-    seed: int = 0  # of textures, path and noise
+    length: NonNegativeInt = 0  # frames; 0 = the scene's own: 150 of the room, once round a building (a longer walk goes on)
+    fps: PositiveFloat = 30.0
+    seed: NonNegativeInt = 0  # of textures, path and noise
     texture: bool = True  # false = plain surfaces: edges, but hardly a corner
     noise: bool = True  # a Kinect's depth and image noise; false = exact
-    width: int = 640
-    height: int = 480
+    width: Annotated[int, Range(16, 8192)] = 640
+    height: Annotated[int, Range(16, 8192)] = 480
     motion: Motion = Motion.walk  # walk | fast | still | pan; in a building only walk
     slanted: bool = False  # turns two of the room's walls by about 10°
     curved: bool = False  # adds a column, a ball and a plant to the room
 
     def __post_init__(self) -> None:
-        frame_range(self.frames)
-        if self.length < 0:
-            raise ValueError(f"length: {self.length} is negative")
-        if self.fps <= 0:
-            raise ValueError(f"fps: {self.fps} is not positive")
-        for name in ("width", "height"):
-            if not 16 <= getattr(self, name) <= 8192:
-                raise ValueError(f"{name}: {getattr(self, name)} is not within 16 … 8192")
-        if self.seed < 0:
-            raise ValueError(f"seed: {self.seed} is negative")
         if self.scene is not Scene.room and self.motion is not Motion.walk:
             raise ValueError(f"motion: {self.motion.name} is for the room, a building is walked through")
         if self.scene is not Scene.room and self.slanted:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import importlib
 import inspect
 import pkgutil
@@ -13,6 +14,7 @@ from typing import Any, TypeVar, get_type_hints
 import numpy as np
 
 from trihedron.pipeline.core.errors import PluginError, did_you_mean
+from trihedron.pipeline.core.options import check_options
 from trihedron.pipeline.core.slots import FOLDS, SLOTS, inputs_of, method_of, output_of, strip_none
 
 Plugin = TypeVar("Plugin", bound=type)
@@ -39,10 +41,23 @@ def register(slot: str, name: str) -> Callable[[Plugin], Plugin]:
         if params is None or not params.frozen:
             raise PluginError(place, "is not a frozen dataclass", "put @dataclass(frozen=True) under @register")
         _check_contract(slot, plugin, place)
+        _check_when_constructed(plugin)
         _PLUGINS[slot][name] = plugin
         return plugin
 
     return decorate
+
+
+def _check_when_constructed(plugin: type) -> None:
+    """Make each construction of a plugin raise ValueError for an option out of its range, whoever constructs it."""
+    initialise = plugin.__init__  # type: ignore[misc]
+
+    @functools.wraps(initialise)
+    def initialise_and_check(self: Any, *args: Any, **options: Any) -> None:
+        initialise(self, *args, **options)
+        check_options(self)
+
+    plugin.__init__ = initialise_and_check  # type: ignore[misc]
 
 
 def _source_of(plugin: type) -> str:

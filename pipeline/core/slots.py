@@ -259,14 +259,6 @@ SLOTS: dict[str, type[Any]] = {
 FOLDS = frozenset({"surface"})
 
 
-def frame_range(text: str) -> tuple[int, int | None]:
-    """Parse the field `frames` of a data set, half open: "A:B", "A:", ":B" or "" for all -> (start, stop or None). Raises ValueError."""
-    match = re.fullmatch(r"\s*(\d*)\s*:\s*(\d*)\s*", text or ":")
-    if not match or (match[1] and match[2] and int(match[1]) >= int(match[2])):
-        raise ValueError(f"frames: '{text}' is not a range of frames A:B with A < B")
-    return int(match[1] or 0), int(match[2]) if match[2] else None
-
-
 def method_of(slot: str) -> str:
     """Return the method whose signature is the slot's contract: `add` of a fold, else `__call__`."""
     return "add" if slot in FOLDS else "__call__"

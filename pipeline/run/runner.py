@@ -17,8 +17,8 @@ import numpy as np
 
 from trihedron.pipeline.core.errors import DataError, RecordingError, StageError, TrihedronError
 from trihedron.pipeline.core.graph import Graph, Stage
+from trihedron.pipeline.core.options import frame_range
 from trihedron.pipeline.core.registry import check_value
-from trihedron.pipeline.core.slots import frame_range
 from trihedron.pipeline.core.types import Frame, FrameReference, Map, Pose, Trajectory, Value
 from trihedron.pipeline.core.wires import Wire
 from trihedron.pipeline.record.foxglove import View

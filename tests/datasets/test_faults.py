@@ -29,7 +29,7 @@ def test_covered_frames_are_blind_and_the_others_untouched(covered):
         ({"of": "faults"}, "another data set"),
         ({"options": {"frames": "0:3"}}, "dataset.frames"),
         ({"options": {"motion": "fly"}}, "'fly' is not one of walk, fast, still, pan"),
-        ({"options": {"length": -1}}, "length: -1 is negative"),
+        ({"options": {"length": -1}}, "length: -1 is not at least 0"),
     ],
 )
 def test_what_cannot_be_read_is_refused(options, cause):

@@ -146,10 +146,10 @@ def test_the_selection_and_its_truth() -> None:
 @pytest.mark.parametrize(
     ("values", "message"),
     [
-        ({"length": -1}, "length: -1 is negative"),
+        ({"length": -1}, "length: -1 is not at least 0"),
         ({"fps": -1.0}, "fps: -1.0 is not positive"),
         ({"width": 8}, "width: 8 is not within 16 … 8192"),
-        ({"seed": -1}, "seed: -1 is negative"),
+        ({"seed": -1}, "seed: -1 is not at least 0"),
         ({"scene": Scene.rooms, "motion": Motion.pan}, "motion: pan is for the room, a building is walked through"),
         ({"scene": Scene.offices, "slanted": True}, "slanted: only the room has slanted walls"),
         ({"frames": "5"}, "frames: '5' is not a range of frames A:B with A < B"),

@@ -4,10 +4,12 @@ import json
 import sys
 from dataclasses import dataclass, make_dataclass
 from enum import Enum
+from typing import Annotated
 
 import pytest
 
 from trihedron.pipeline.app.cli import main
+from trihedron.pipeline.core.options import Range
 from trihedron.pipeline.core.slots import SLOTS
 from trihedron.pipeline.core.types import Frame, Normals
 from trihedron.tools.plugins import describe_plugin, field_comments, first_sentence
@@ -24,7 +26,7 @@ class Example:
 
     And a paragraph."""
 
-    radius_px: int = 3  # of the patch
+    radius_px: Annotated[int, Range(1, 9)] = 3  # of the patch
     kind: Kind = Kind.coarse
     weights: tuple[float, ...] = (1.0, 2.0)  # centre, border
 
@@ -54,7 +56,7 @@ def test_every_plugin_has_documentation_and_defaults(capsys):
         for plugin in slot["plugins"]:
             assert plugin["doc"] and plugin["class"].startswith("trihedron."), plugin
             assert set(plugin["inputs"]) <= {*slot["inputs"], "rng"}
-            assert all(set(option) == {"name", "type", "default", "doc"} for option in plugin["parameters"])
+            assert all(set(option) == {"name", "type", "default", "range", "doc"} for option in plugin["parameters"])
 
 
 def test_one_slot_as_text(capsys):
@@ -62,7 +64,7 @@ def test_one_slot_as_text(capsys):
     lines = capsys.readouterr().out.splitlines()
     assert lines[0] == "keypoints(frame: Frame) -> Keypoints"
     assert any(line.startswith("  * orb: ") for line in lines)
-    assert any(line.split() == ["features:", "int", "=", "1000", "most", "key", "points", "kept"] for line in lines)
+    assert any(line.split() == ["features:", "int", "=", "1000", "at", "least", "1", "most", "key", "points", "kept"] for line in lines)
 
 
 def test_a_plugin_as_data():
@@ -71,9 +73,9 @@ def test_a_plugin_as_data():
     assert found["doc"].startswith("Normals of an example. More of it.")
     assert found["inputs"] == ["frame"]
     assert found["parameters"] == [
-        {"name": "radius_px", "type": "int", "default": 3, "doc": "of the patch"},
-        {"name": "kind", "type": "Kind", "default": "coarse", "doc": ""},
-        {"name": "weights", "type": "tuple[float, ...]", "default": [1.0, 2.0], "doc": "centre, border"},
+        {"name": "radius_px", "type": "int", "default": 3, "range": "within 1 … 9", "doc": "of the patch"},
+        {"name": "kind", "type": "Kind", "default": "coarse", "range": "", "doc": ""},
+        {"name": "weights", "type": "tuple[float, ...]", "default": [1.0, 2.0], "range": "", "doc": "centre, border"},
     ]
 
 
