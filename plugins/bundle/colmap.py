@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from trihedron.pipeline.core.geometry import invert, pose_matrix
+from trihedron.pipeline.core.options import NonNegativeInt, PositiveFloat, PositiveInt
 from trihedron.pipeline.core.registry import register
 from trihedron.pipeline.core.types import Correction, Map
 from trihedron.plugins.bundle.common import bundle_problem, bundle_window, carried_correction
@@ -23,14 +24,10 @@ class Colmap:
     For comparison. Depth has no part in it, so two keyframes are held to keep the scale. Lines, planes and points seen once go with the newest
     keyframe that saw them. COLMAP says nothing of what is left uncertain: each landmark stays known as well as the map knew it."""
 
-    keyframes: int = 8  # at most, that may move: the newest and those that share most landmarks with it
-    fixed: int = 8  # at most, that are held
-    iterations: int = 20
-    loss_px: float = 2.0  # beyond which Huber's cost is linear
-
-    def __post_init__(self) -> None:
-        if self.keyframes < 1 or self.fixed < 0 or self.iterations < 1 or self.loss_px <= 0.0:
-            raise ValueError("keyframes, fixed, iterations, loss_px: must be at least 1, 0 and 1, and positive")
+    keyframes: PositiveInt = 8  # at most, that may move: the newest and those that share most landmarks with it
+    fixed: NonNegativeInt = 8  # at most, that are held
+    iterations: PositiveInt = 20
+    loss_px: PositiveFloat = 2.0  # beyond which Huber's cost is linear
 
     def __call__(self, map: Map) -> Correction | None:
         """The correction, or None when this version of the map has no new keyframe, or fewer than two to hold and one to move."""

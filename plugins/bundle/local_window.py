@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Annotated
 
+from trihedron.pipeline.core.options import NonNegativeInt, PositiveFloat, PositiveInt, Range
 from trihedron.pipeline.core.registry import register
 from trihedron.pipeline.core.types import Correction, Map
 from trihedron.plugins.bundle.common import bundle_correction, bundle_problem, bundle_window, solve_bundle
@@ -18,18 +20,12 @@ class LocalWindow:
     Levenberg–Marquardt with the Schur complement on what the keyframes measured, each weighed by its covariance, with Huber's cost. Keyframes outside
     the window that see its landmarks are held, and so is the first of all, which is the world."""
 
-    keyframes: int = 8  # at most, that may move: the newest and those that share most landmarks with it
-    fixed: int = 8  # at most, that are held
-    iterations: int = 10
-    line_sigma_px: float = 1.0  # of a segment's end point across it, as in the map
-    relation_sigma_deg: float = 0.5  # walls are parallel or perpendicular to within this
-    parallel_deg: float = 5.0  # planes nearer to parallel, or to a right angle, are meant to be
-
-    def __post_init__(self) -> None:
-        if self.keyframes < 1 or self.fixed < 0 or self.iterations < 1:
-            raise ValueError("keyframes, fixed, iterations: must be at least 1, 0 and 1")
-        if self.line_sigma_px <= 0.0 or self.relation_sigma_deg <= 0.0 or not 0.0 < self.parallel_deg < 45.0:
-            raise ValueError("line_sigma_px, relation_sigma_deg, parallel_deg: must be positive, parallel_deg below 45")
+    keyframes: PositiveInt = 8  # at most, that may move: the newest and those that share most landmarks with it
+    fixed: NonNegativeInt = 8  # at most, that are held
+    iterations: PositiveInt = 10
+    line_sigma_px: PositiveFloat = 1.0  # of a segment's end point across it, as in the map
+    relation_sigma_deg: PositiveFloat = 0.5  # walls are parallel or perpendicular to within this
+    parallel_deg: Annotated[float, Range(above=0, below=45)] = 5.0  # planes nearer to parallel, or to a right angle, are meant to be
 
     def __call__(self, map: Map) -> Correction | None:
         """The correction, or None when this version of the map has no new keyframe, or nothing that could move."""
