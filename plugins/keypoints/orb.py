@@ -5,10 +5,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import pairwise
+from typing import Annotated
 
 import cv2
 import numpy as np
 
+from trihedron.pipeline.core.options import NonNegativeFloat, PositiveFloat, PositiveInt, PositiveShare, Range, check_increasing
 from trihedron.pipeline.core.registry import register
 from trihedron.pipeline.core.types import F32, U8, Frame, Keypoints
 from trihedron.plugins.keypoints.orb_kernels import BITS, REACH_PX, Pyramid, full_pixels, oriented_corners, steered_brief
@@ -23,32 +25,21 @@ MARGIN_PX = 19  # of a level, within which its descriptors would reach over the 
 class Orb:
     """Oriented FAST and rotated BRIEF (Rublee et al., ICCV 2011), chosen per grid cell so that a textured corner does not take them all."""
 
-    features: int = 1000  # most key points kept
-    scale: float = 1.2  # between pyramid levels
-    levels: int = 8
-    fast_threshold: int = 20  # grey levels
-    fast_threshold_low: int = 7  # where a grid cell has few
-    cell_px: int = 64  # side of the grid cells
-    fineness: float = 2.0  # strengths are compared after division by the level's scale to this power: fine levels place points better
-    sigma_px: float = 0.6  # of a position at level 0; grows with the level's scale
-    depth_radius_px: int = 2  # of the neighbourhood the depth is taken from
-    depth_share: float = 0.5  # of the neighbourhood that must have depth
-    depth_gate: float = 3.0  # σ_z a neighbourhood may spread about a linear surface
-    depth_edge: float = 0.01  # more than that, as a share of z, is a depth edge: no depth
+    features: PositiveInt = 1000  # most key points kept
+    scale: Annotated[float, Range(above=1, high=2)] = 1.2  # between pyramid levels
+    levels: Annotated[int, Range(1, 16)] = 8
+    fast_threshold: Annotated[int, Range(1, 255)] = 20  # grey levels
+    fast_threshold_low: Annotated[int, Range(1, 255)] = 7  # where a grid cell has few
+    cell_px: Annotated[int, Range(4)] = 64  # side of the grid cells
+    fineness: NonNegativeFloat = 2.0  # strengths are compared after division by the level's scale to this power: fine levels place points better
+    sigma_px: PositiveFloat = 0.6  # of a position at level 0; grows with the level's scale
+    depth_radius_px: Annotated[int, Range(1, 10)] = 2  # of the neighbourhood the depth is taken from
+    depth_share: PositiveShare = 0.5  # of the neighbourhood that must have depth
+    depth_gate: PositiveFloat = 3.0  # σ_z a neighbourhood may spread about a linear surface
+    depth_edge: NonNegativeFloat = 0.01  # more than that, as a share of z, is a depth edge: no depth
 
     def __post_init__(self) -> None:
-        if self.features < 1:
-            raise ValueError("features: must be at least 1")
-        if not 1.0 < self.scale <= 2.0:
-            raise ValueError("scale: must be in (1, 2]")
-        if not 1 <= self.levels <= 16:
-            raise ValueError("levels: must be 1 to 16")
-        if not 1 <= self.fast_threshold_low <= self.fast_threshold <= 255:
-            raise ValueError("fast_threshold, fast_threshold_low: must be 1 to 255, the low one not above the other")
-        if self.cell_px < 4 or self.sigma_px <= 0.0 or self.fineness < 0.0:
-            raise ValueError("cell_px, sigma_px, fineness: must be at least 4, above 0 and not negative")
-        if not 1 <= self.depth_radius_px <= 10 or not 0.0 < self.depth_share <= 1.0 or self.depth_gate <= 0.0 or self.depth_edge < 0.0:
-            raise ValueError("depth_radius_px, depth_share, depth_gate, depth_edge: out of range")
+        check_increasing(self, "fast_threshold_low", "fast_threshold")
 
     def __call__(self, frame: Frame) -> Keypoints:
         """At most `features` key points ordered by level, row and column; (n, 32) binary descriptors."""
