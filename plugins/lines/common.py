@@ -6,10 +6,12 @@ import math
 import threading
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Annotated
 
 import cv2
 import numpy as np
 
+from trihedron.pipeline.core.options import NonNegativeFloat, PositiveInt, Range
 from trihedron.pipeline.core.types import F32, F64, U8, Frame, LineSegments
 from trihedron.plugins.lines.common_kernels import Placing, line_band_descriptors, placed_segments
 
@@ -22,27 +24,15 @@ class StraightEdges:
 
     Segments are directed with the bright side on their right: start and end keep their meaning over time."""
 
-    scale: float = 0.5  # of the image the detector looks at
-    segments: int = 150  # most segments kept, the longest
-    min_length_px: float = 20.0  # shortest segment kept
-    merge_deg: float = 2.0  # fragments of one edge: difference of direction,
-    merge_offset_px: float = 1.5  # distance across,
-    merge_gap_px: float = 12.0  # and along
-    border_px: float = 4.0  # a segment nearer than this to the image's border all along is the border
-    reach_px: int = 3  # searched across the segment for the edge on the full image
-    band_px: int = 7  # rows of an LBD band, on the reduced image
-
-    def __post_init__(self) -> None:
-        if not 0.1 <= self.scale <= 1.0:
-            raise ValueError("scale: must be 0.1 to 1")
-        if self.segments < 1 or self.min_length_px < 4.0:
-            raise ValueError("segments, min_length_px: must be at least 1 and 4 px")
-        if not 0.0 <= self.merge_deg < 45.0 or self.merge_offset_px < 0.0 or self.merge_gap_px < 0.0:
-            raise ValueError("merge_deg, merge_offset_px, merge_gap_px: must not be negative; merge_deg below 45")
-        if self.border_px < 0.0:
-            raise ValueError("border_px: must not be negative")
-        if not 1 <= self.reach_px <= 10 or not 1 <= self.band_px <= 31:
-            raise ValueError("reach_px, band_px: must be 1 to 10 and 1 to 31")
+    scale: Annotated[float, Range(0.1, 1)] = 0.5  # of the image the detector looks at
+    segments: PositiveInt = 150  # most segments kept, the longest
+    min_length_px: Annotated[float, Range(4)] = 20.0  # shortest segment kept
+    merge_deg: Annotated[float, Range(0, below=45)] = 2.0  # fragments of one edge: difference of direction,
+    merge_offset_px: NonNegativeFloat = 1.5  # distance across,
+    merge_gap_px: NonNegativeFloat = 12.0  # and along
+    border_px: NonNegativeFloat = 4.0  # a segment nearer than this to the image's border all along is the border
+    reach_px: Annotated[int, Range(1, 10)] = 3  # searched across the segment for the edge on the full image
+    band_px: Annotated[int, Range(1, 31)] = 7  # rows of an LBD band, on the reduced image
 
     def _reduced(self, gray: U8) -> U8:
         """The image at `scale`."""

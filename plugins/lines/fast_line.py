@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Annotated, Any
 
 import cv2
 
+from trihedron.pipeline.core.options import NonNegativeFloat, PositiveFloat, Range, check_increasing
 from trihedron.pipeline.core.registry import register
 from trihedron.pipeline.core.types import Frame, LineSegments
 from trihedron.plugins.lines.common import SMALLEST, StraightEdges
@@ -18,19 +19,15 @@ class FastLine(StraightEdges):
     """Fast line detector (Lee et al., ICRA 2014; OpenCV's): chains of Canny edge pixels cut into straight runs, then joined, placed to sub-pixel and
     described like those of `lsd`."""
 
-    scale: float = 0.7  # of the image the detector looks at; at half size close parallel edges become one
-    band_px: int = 10  # rows of an LBD band, on the reduced image
-    merge_gap_px: float = 18.0  # between fragments of one edge; Canny's chains turn at corners
-    weak: float = 20.0  # Canny's thresholds, grey levels per px times 4 (Sobel): a chain of edge pixels goes on above this
-    strong: float = 50.0  # and needs one above this (OpenCV's default)
-    straight_px: float = 1.41  # an edge pixel farther than this from the line of its run ends the run (Lee et al.)
+    scale: Annotated[float, Range(0.1, 1)] = 0.7  # of the image the detector looks at; at half size close parallel edges become one
+    band_px: Annotated[int, Range(1, 31)] = 10  # rows of an LBD band, on the reduced image
+    merge_gap_px: NonNegativeFloat = 18.0  # between fragments of one edge; Canny's chains turn at corners
+    weak: PositiveFloat = 20.0  # Canny's thresholds, grey levels per px times 4 (Sobel): a chain of edge pixels goes on above this
+    strong: PositiveFloat = 50.0  # and needs one above this (OpenCV's default)
+    straight_px: Annotated[float, Range(0.5, 5)] = 1.41  # an edge pixel farther than this from the line of its run ends the run (Lee et al.)
 
     def __post_init__(self) -> None:
-        super().__post_init__()
-        if not 0.0 < self.weak <= self.strong:
-            raise ValueError("weak, strong: must be above 0, weak not above strong")
-        if not 0.5 <= self.straight_px <= 5.0:
-            raise ValueError("straight_px: must be 0.5 to 5")
+        check_increasing(self, "weak", "strong")
 
     def __call__(self, frame: Frame) -> LineSegments:
         """The longest segments, longest first; (n, 32) binary descriptors."""

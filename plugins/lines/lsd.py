@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
 
+from trihedron.pipeline.core.options import PositiveFloat, PositiveShare, Range
 from trihedron.pipeline.core.registry import register
 from trihedron.pipeline.core.types import Frame, LineSegments
 from trihedron.plugins.lines.common import StraightEdges
@@ -18,14 +20,9 @@ class Lsd(StraightEdges):
     """Line segment detector (von Gioi et al., PAMI 2010) on a reduced image, fragments merged, placed to sub-pixel on the full image,
     described by LBD (Zhang & Koch, 2013). Segments are directed with the bright side on their right: start and end keep their meaning over time."""
 
-    tolerance_deg: float = 22.5  # between a pixel's level line and its segment's; this and the next two are von Gioi et al.'s
-    quantisation: float = 2.0  # grey levels a gradient may be wrong by
-    density: float = 0.7  # share of a segment's rectangle that its pixels fill
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if not 5.0 <= self.tolerance_deg <= 45.0 or self.quantisation <= 0.0 or not 0.0 < self.density <= 1.0:
-            raise ValueError("tolerance_deg, quantisation, density: must be 5 to 45, above 0, and above 0 and at most 1")
+    tolerance_deg: Annotated[float, Range(5, 45)] = 22.5  # between the level lines of a pixel and its segment; as the next two by von Gioi et al.
+    quantisation: PositiveFloat = 2.0  # grey levels a gradient may be wrong by
+    density: PositiveShare = 0.7  # share of a segment's rectangle that its pixels fill
 
     def __call__(self, frame: Frame) -> LineSegments:
         """The longest segments, longest first; (n, 32) binary descriptors."""

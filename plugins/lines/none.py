@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
 
+from trihedron.pipeline.core.options import Range
 from trihedron.pipeline.core.registry import register
 from trihedron.pipeline.core.types import Frame, LineSegments
 
@@ -15,11 +17,7 @@ from trihedron.pipeline.core.types import Frame, LineSegments
 class NoLines:
     """A value without rows: what the rest of the system does without lines."""
 
-    descriptor_bytes: int = 32  # length of the (absent) descriptors, that of binary LBD
-
-    def __post_init__(self) -> None:
-        if not 1 <= self.descriptor_bytes <= 4096:
-            raise ValueError("descriptor_bytes: must be 1 to 4096")
+    descriptor_bytes: Annotated[int, Range(1, 4096)] = 32  # length of the (absent) descriptors, that of binary LBD
 
     def __call__(self, frame: Frame) -> LineSegments:
         """Zero segments."""
