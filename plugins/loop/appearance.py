@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from trihedron.pipeline.core.options import PositiveInt, Share
 from trihedron.pipeline.core.registry import register
 from trihedron.pipeline.core.types import F64, I32, U8, Map
 from trihedron.plugins.loop.appearance_kernels import U64, nearest_words
@@ -23,20 +24,12 @@ class AppearanceLoop(LoopClosing):
     A keyframe is a candidate when it is as alike as a share of what the newest keyframe and its predecessor have in common (DBoW2). Every candidate
     is verified with points, lines and planes and by free space; the correction is that of a pose graph. A scene without points has no words."""
 
-    words: int = 256
-    rounds: int = 2  # of the training
-    training: int = 4000  # most descriptors it uses
-    context: int = 30  # other keyframes, spread over the run, that say which words are common
-    looked_at: int = 20  # keyframes within reach that are compared, the nearest first
-    min_likeness: float = 0.3  # share of the predecessor's likeness
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        for name in ("words", "rounds", "training", "context", "looked_at"):
-            if getattr(self, name) < 1:
-                raise ValueError(f"{name}: must be at least 1")
-        if not 0.0 <= self.min_likeness <= 1.0:
-            raise ValueError("min_likeness: must be in [0, 1]")
+    words: PositiveInt = 256
+    rounds: PositiveInt = 2  # of the training
+    training: PositiveInt = 4000  # most descriptors it uses
+    context: PositiveInt = 30  # other keyframes, spread over the run, that say which words are common
+    looked_at: PositiveInt = 20  # keyframes within reach that are compared, the nearest first
+    min_likeness: Share = 0.3  # share of the predecessor's likeness
 
     def ranked(self, map: Map) -> Iterator[tuple[int, float]]:
         """Keyframes within reach, the most alike first, with the way walked since."""

@@ -5,10 +5,12 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Iterable
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
 
 from trihedron.pipeline.core.geometry import invert, log_se3, pose_matrix, transform, umeyama
+from trihedron.pipeline.core.options import NonNegativeInt, PositiveFloat, PositiveInt, Range, Share
 from trihedron.pipeline.core.types import F64, I32, Bool, Camera, Correction, Frame, Keypoints, Map, Matches
 from trihedron.plugins.loop.common_pose_graph import Closure, Drift, Trueness, close, compass_of, straighten
 from trihedron.plugins.mapping.covisibility_graph import LocalWindow, current_submap, keyframes_of, observed_by
@@ -30,33 +32,21 @@ SEARCH = MapSearch(octave_step=3, relations=0)
 class LoopClosing(ABC):
     """Options of a loop closer, and the parts it is made of."""
 
-    every: int = 2  # keyframes between two looks
-    away_m: float = 6.0  # walked since a place was left, before it can be come back to
-    view_m: float = 2.0  # between keyframes that show the same, besides the drift
-    view_deg: float = 45.0
-    drift_share: float = 0.01  # of the way walked: standard deviation of the position, and per root metre of the pose graph
-    floor_m: float = 0.02  # added to it
-    rotation_sigma_deg: float = 0.3  # of a keyframe; the Manhattan frame keeps it from growing
-    rotation_drift_deg: float = 0.05  # per root metre of the pose graph
-    straighten: int = 16  # keyframes between two looks at the directions of the whole map, twice as many with each doubling of it; 0 = never
-    straighten_deg: float = 0.05  # least turn of the newest keyframe that is worth it
-    candidates: int = 5  # places looked at in one call, at most
-    shared: int = 30  # points and lines already shared with a place, from which on no loop is open there
-    min_score: int = 60  # points + 2 lines + 5 planes that must agree
-    min_share: float = 0.5  # of the matches that must agree
-    max_through: float = 0.15  # of the place's surfaces in view that the camera may see through
-
-    def __post_init__(self) -> None:
-        for name in ("every", "candidates", "shared", "min_score"):
-            if getattr(self, name) < 1:
-                raise ValueError(f"{name}: must be at least 1")
-        for name in ("away_m", "view_m", "drift_share", "floor_m", "rotation_sigma_deg", "rotation_drift_deg", "straighten_deg"):
-            if getattr(self, name) <= 0.0:
-                raise ValueError(f"{name}: must be positive")
-        if self.straighten < 0:
-            raise ValueError("straighten: must not be negative")
-        if not 0.0 < self.view_deg <= 90.0 or not 0.0 <= self.min_share <= 1.0 or not 0.0 <= self.max_through <= 1.0:
-            raise ValueError("view_deg, min_share, max_through: must be in (0, 90], [0, 1] and [0, 1]")
+    every: PositiveInt = 2  # keyframes between two looks
+    away_m: PositiveFloat = 6.0  # walked since a place was left, before it can be come back to
+    view_m: PositiveFloat = 2.0  # between keyframes that show the same, besides the drift
+    view_deg: Annotated[float, Range(above=0, high=90)] = 45.0
+    drift_share: PositiveFloat = 0.01  # of the way walked: standard deviation of the position, and per root metre of the pose graph
+    floor_m: PositiveFloat = 0.02  # added to it
+    rotation_sigma_deg: PositiveFloat = 0.3  # of a keyframe; the Manhattan frame keeps it from growing
+    rotation_drift_deg: PositiveFloat = 0.05  # per root metre of the pose graph
+    straighten: NonNegativeInt = 16  # keyframes between two alignments of the whole map's directions, doubled when the map doubles; 0 = never
+    straighten_deg: PositiveFloat = 0.05  # least turn of the newest keyframe that is worth it
+    candidates: PositiveInt = 5  # places looked at in one call, at most
+    shared: PositiveInt = 30  # points and lines already shared with a place, from which on no loop is open there
+    min_score: PositiveInt = 60  # points + 2 lines + 5 planes that must agree
+    min_share: Share = 0.5  # of the matches that must agree
+    max_through: Share = 0.15  # of the place's surfaces in view that the camera may see through
 
     @property
     def reach(self) -> Reach:

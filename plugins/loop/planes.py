@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from trihedron.pipeline.core.options import NonNegativeFloat, PositiveInt
 from trihedron.pipeline.core.registry import register
 from trihedron.pipeline.core.types import Map
 from trihedron.plugins.loop.common import LoopClosing, shift_of_planes, within_reach
@@ -20,13 +21,8 @@ class PlanesLoop(LoopClosing):
 
     Every candidate is verified with points, lines and planes and by free space; the correction is that of a pose graph."""
 
-    looked_at: int = 20  # keyframes within reach whose layout is compared, the nearest first
-    min_layout: float = 0.3  # planes whose extents agree, at least
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if self.looked_at < 1 or self.min_layout < 0.0:
-            raise ValueError("looked_at, min_layout: must be at least 1 and 0")
+    looked_at: PositiveInt = 20  # keyframes within reach whose layout is compared, the nearest first
+    min_layout: NonNegativeFloat = 0.3  # planes whose extents agree, at least
 
     def ranked(self, map: Map) -> Iterator[tuple[int, float]]:
         """Keyframes within reach, best layout first, with the way walked since."""

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
 
 from trihedron.pipeline.core.geometry import invert, pose_matrix
+from trihedron.pipeline.core.options import NonNegativeFloat, PositiveFloat, PositiveInt, Range
 from trihedron.pipeline.core.registry import register
 from trihedron.pipeline.core.types import F64, I32, Correction, Frame, Map
 from trihedron.plugins.loop.common_pose_graph import Edges, moved_keyframes, solve_pose_graph
@@ -23,14 +25,10 @@ class PoseGraph:
 
     Which points are the same `matches` says, neighbours and loops alike. Landmarks are not adjusted: that is what bundle adjustment does."""
 
-    every: int = 3  # keyframes between two optimisations
-    min_points: int = 20  # that two keyframes must share
-    gate: float = 3.0  # standard deviations within which a point agrees with an edge
-    least_m: float = 1e-4  # motion of a keyframe below which nothing is said
-
-    def __post_init__(self) -> None:
-        if self.every < 1 or self.min_points < 3 or self.gate <= 0.0 or self.least_m < 0.0:
-            raise ValueError("every, min_points, gate, least_m: at least 1, at least 3, positive, and not negative")
+    every: PositiveInt = 3  # keyframes between two optimisations
+    min_points: Annotated[int, Range(3)] = 20  # that two keyframes must share
+    gate: PositiveFloat = 3.0  # standard deviations within which a point agrees with an edge
+    least_m: NonNegativeFloat = 1e-4  # motion of a keyframe below which nothing is said
 
     def __call__(self, map: Map, frame: Frame) -> Correction | None:
         """The correction of all keyframes; None unless the newest one is due and closes a cycle."""
