@@ -5,11 +5,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import combinations
-from typing import NamedTuple
+from typing import Annotated, NamedTuple
 
 import numpy as np
 
 from trihedron.pipeline.core.geometry import exp_so3
+from trihedron.pipeline.core.options import NonNegativeFloat, PositiveFloat, PositiveInt, Range, Share, check_increasing
 from trihedron.pipeline.core.registry import register
 from trihedron.pipeline.core.types import F64, I32, Bool, ManhattanFrame, Normals, Planes, Segments
 from trihedron.plugins.manhattan.atlanta_kernels import QUARTER, azimuth_modes, fit_shared_vertical, shared_vertical
@@ -47,43 +48,34 @@ class Atlanta:
     Each azimuth makes a rotation whose third column is the vertical, the same in all; vertical and azimuths are fitted together, so every wall
     helps to hold the vertical upright. A pair keeps its id while it is seen, and out of sight as long as another tells where it must be."""
 
-    cone_deg: float = 12.0  # half-angle of the cone gathered around each axis
-    bandwidth_deg: float = 3.0  # of the Gaussian kernel
-    samples: int = 1500  # most normals used
-    search_samples: int = 500  # and in a search
-    line_weight_per_px: float = 0.1  # a line weighs like this many normals per pixel of its length
-    max_azimuths: int = 5  # pairs of horizontal directions, seen or remembered
-    apart_deg: int = 6  # azimuths nearer than this are one
-    min_azimuth: float = 0.04  # of all directions that an azimuth must gather
-    again_deg: float = 4.0  # an azimuth found this near to where the others tell it must be is that one
-    furthest_deg: float = 20.0  # turn about the vertical since a recent frame
-    upright: float = 0.1  # without a previous frame a vertical along the image's counts so much more than one across it
-    loyalty: float = 1.2  # another azimuth comes first, or another axis is the vertical, when it has so many times more
-    max_age: int = 5  # frames; with an older result the search is from everywhere
-    min_share: float = 0.05  # of all normals that an axis must gather
-    min_lines: int = 4  # or this many lines,
-    min_line_share: float = 0.15  # with this share of the lines' length
-    max_width: float = 0.44  # cones, standard deviation of a mode; directions without order have 0.5 and more
-    min_explained: float = 0.3  # share of all directions on the axes
-    max_skew_deg: float = 3.0  # a mode further from a right angle to the vertical is not horizontal
-    fit_deg: float = 6.0  # planes and lines this near to an axis refine it
-    plane_floor_deg: float = 0.3  # a wall's deviation from the axis
-    line_floor_deg: float = 0.5  # an edge's
-    normals_floor_deg: float = 0.5  # error of an axis however many normals it has
-    floor_deg: float = 0.05  # of every rotation
-    gate: float = 2.0  # σ at which a plane or line counts half
+    cone_deg: Annotated[float, Range(1, 30)] = 12.0  # half-angle of the cone gathered around each axis
+    bandwidth_deg: Annotated[float, Range(0.1, 30)] = 3.0  # of the Gaussian kernel
+    samples: Annotated[int, Range(10)] = 1500  # most normals used
+    search_samples: Annotated[int, Range(10)] = 500  # and in a search
+    line_weight_per_px: NonNegativeFloat = 0.1  # a line weighs like this many normals per pixel of its length
+    max_azimuths: PositiveInt = 5  # pairs of horizontal directions, seen or remembered
+    apart_deg: Annotated[int, Range(4, 30)] = 6  # azimuths nearer than this are one
+    min_azimuth: Share = 0.04  # of all directions that an azimuth must gather
+    again_deg: PositiveFloat = 4.0  # an azimuth found this near to where the others tell it must be is that one
+    furthest_deg: PositiveFloat = 20.0  # turn about the vertical since a recent frame
+    upright: NonNegativeFloat = 0.1  # without a previous frame a vertical along the image's counts so much more than one across it
+    loyalty: Annotated[float, Range(1)] = 1.2  # another azimuth comes first, or another axis is the vertical, when it has so many times more
+    max_age: PositiveInt = 5  # frames; with an older result the search is from everywhere
+    min_share: Share = 0.05  # of all normals that an axis must gather
+    min_lines: PositiveInt = 4  # or this many lines,
+    min_line_share: Share = 0.15  # with this share of the lines' length
+    max_width: Share = 0.44  # cones, standard deviation of a mode; directions without order have 0.5 and more
+    min_explained: Share = 0.3  # share of all directions on the axes
+    max_skew_deg: PositiveFloat = 3.0  # a mode further from a right angle to the vertical is not horizontal
+    fit_deg: PositiveFloat = 6.0  # planes and lines this near to an axis refine it
+    plane_floor_deg: PositiveFloat = 0.3  # a wall's deviation from the axis
+    line_floor_deg: PositiveFloat = 0.5  # an edge's
+    normals_floor_deg: PositiveFloat = 0.5  # error of an axis however many normals it has
+    floor_deg: PositiveFloat = 0.05  # of every rotation
+    gate: PositiveFloat = 2.0  # σ at which a plane or line counts half
 
     def __post_init__(self) -> None:
-        if not 1.0 <= self.cone_deg <= 30.0 or not 0.1 <= self.bandwidth_deg <= self.cone_deg:
-            raise ValueError("cone_deg, bandwidth_deg: cone_deg must be 1 to 30 and bandwidth_deg 0.1 to cone_deg")
-        if min(self.samples, self.search_samples) < 10 or min(self.max_azimuths, self.max_age, self.min_lines) < 1 or not 4 <= self.apart_deg <= 30:
-            raise ValueError("samples, search_samples, max_azimuths, max_age, min_lines, apart_deg: at least 10, 10, 1, 1, 1, and 4 to 30")
-        shares = (self.min_azimuth, self.min_share, self.min_line_share, self.max_width, self.min_explained)
-        if not all(0.0 <= share <= 1.0 for share in shares) or self.line_weight_per_px < 0.0:
-            raise ValueError("min_azimuth, min_share, min_line_share, max_width, min_explained: must be 0 to 1, line_weight_per_px at least 0")
-        if min(self.again_deg, self.furthest_deg, self.fit_deg, self.max_skew_deg) <= 0.0 or self.loyalty < 1.0 or self.upright < 0.0:
-            raise ValueError("again_deg, furthest_deg, fit_deg, max_skew_deg, loyalty, upright: must be positive, loyalty at least 1")
-        _ = self._fit  # checks its own fields
+        check_increasing(self, "bandwidth_deg", "cone_deg")
 
     def __call__(self, normals: Normals, segments: Segments, planes: Planes, previous: ManhattanFrame | None) -> ManhattanFrame:
         """Rotations with one vertical as their third column, the best supported first, then those known but out of sight: without inliers, with a

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import NamedTuple
+from typing import Annotated, NamedTuple
 
 import numpy as np
 
+from trihedron.pipeline.core.options import NonNegativeFloat, PositiveInt, Range
 from trihedron.pipeline.core.registry import register
 from trihedron.pipeline.core.types import F64, ManhattanFrame, Normals, Planes, Segments
 from trihedron.plugins.manhattan.branch_and_bound_kernels import (
@@ -40,19 +41,17 @@ class BranchAndBound(ModeOptions):
     Manhattan frame need 1000 to 4000. The optimum then says where the modes are: from there on rotation, covariance and the judgement whether this is
     a Manhattan frame are those of `mean_shift`."""
 
-    inlier_deg: float = 12.0  # furthest from an axis that a direction counts; at least three times the normals' noise
-    certificate_deg: float = 1.0  # rotations nearer to the optimum than this need not be told from it
-    max_gap: float = 0.001  # by which share a rotation further off must be better to be looked for
-    max_cubes: int = 10000  # of rotations looked at
-    search_samples: int = 1500  # most normals searched with
-    plane_weight: float = 0.5  # of a plane, in normals on its region
+    inlier_deg: Annotated[float, Range(2, 20)] = 12.0  # furthest from an axis that a direction counts; at least three times the normals' noise
+    certificate_deg: Annotated[float, Range(0.1)] = 1.0  # rotations nearer to the optimum than this need not be told from it
+    max_gap: NonNegativeFloat = 0.001  # by which share a rotation further off must be better to be looked for
+    max_cubes: PositiveInt = 10000  # of rotations looked at
+    search_samples: Annotated[int, Range(10)] = 1500  # most normals searched with
+    plane_weight: NonNegativeFloat = 0.5  # of a plane, in normals on its region
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if not 2.0 <= self.inlier_deg <= 20.0 or not 0.1 <= self.certificate_deg < self.inlier_deg:
-            raise ValueError("inlier_deg, certificate_deg: inlier_deg must be 2 to 20 and certificate_deg 0.1 to less than inlier_deg")
-        if self.max_gap < 0.0 or self.max_cubes < 1 or self.search_samples < 10 or self.plane_weight < 0.0:
-            raise ValueError("max_gap, max_cubes, search_samples, plane_weight: at least 0, 1, 10 and 0")
+        if not self.certificate_deg < self.inlier_deg:
+            raise ValueError(f"certificate_deg: {self.certificate_deg} is not below inlier_deg, {self.inlier_deg}")
 
     def __call__(self, normals: Normals, segments: Segments, planes: Planes, previous: ManhattanFrame | None) -> ManhattanFrame:
         """One rotation with id 0 and its `gap`; `supported` False, with a large covariance and no gap (NaN), where the scene shows no two axes at

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import NamedTuple
+from typing import Annotated, NamedTuple
 
 import numpy as np
 
+from trihedron.pipeline.core.options import NonNegativeFloat, NonNegativeInt, PositiveFloat, PositiveInt, PositiveShare, Range, Share
 from trihedron.pipeline.core.registry import register
 from trihedron.pipeline.core.types import F64, Bool, ManhattanFrame, Normals, Planes, Segments
 from trihedron.plugins.manhattan.common import AxisFit, gather_directions
@@ -24,31 +25,20 @@ class LinePlaneRansac:
     the line's bearing and not its noisy depth; the third is `n × v`. Hypotheses are scored over all planes, lines and normals, and the best is
     fitted to its inliers by their covariances."""
 
-    hypotheses: int = 100  # drawn; half of them right leaves no chance to miss
-    reach_deg: float = 5.0  # a plane or line this near to an axis belongs to it
-    normals_reach_deg: float = 12.0  # and a normal
-    samples: int = 300  # most normals scored
-    min_share: float = 0.05  # of the image that a plane must cover
-    min_line_px: float = 20.0  # of lines that an axis must show beside a plane
-    min_lines: int = 6  # on the axes when there is no plane
-    max_line_share: float = 0.6  # of the lines' length on the axes is always enough; with many lines, what chance does not give
-    min_plane_share: float = 0.4  # of the planes' area
-    loyalty: float = 1.2  # a frame with other axes than the previous must score so many times more
-    plane_floor_deg: float = 0.3  # a wall's deviation from the axis
-    line_floor_deg: float = 0.5  # an edge's
-    floor_deg: float = 0.05  # of the whole rotation
-    gate: float = 2.0  # σ at which a plane or line counts half
-
-    def __post_init__(self) -> None:
-        if self.hypotheses < 1 or self.samples < 0 or self.min_lines < 2:
-            raise ValueError("hypotheses, samples, min_lines: must be at least 1, 0 and 2")
-        if not 0.5 <= self.reach_deg <= 20.0 or not 0.5 <= self.normals_reach_deg <= 30.0:
-            raise ValueError("reach_deg, normals_reach_deg: must be 0.5 to 20 and 0.5 to 30")
-        if not 0.0 < self.min_share <= 1.0 or not 0.0 <= self.max_line_share <= 1.0 or not 0.0 <= self.min_plane_share <= 1.0:
-            raise ValueError("min_share, max_line_share, min_plane_share: must be above 0 to 1, and 0 to 1")
-        if self.min_line_px < 0.0 or self.loyalty < 1.0:
-            raise ValueError("min_line_px, loyalty: must be at least 0 and 1")
-        _ = self._fit  # checks its own fields
+    hypotheses: PositiveInt = 100  # drawn; half of them right leaves no chance to miss
+    reach_deg: Annotated[float, Range(0.5, 20)] = 5.0  # a plane or line this near to an axis belongs to it
+    normals_reach_deg: Annotated[float, Range(0.5, 30)] = 12.0  # and a normal
+    samples: NonNegativeInt = 300  # most normals scored
+    min_share: PositiveShare = 0.05  # of the image that a plane must cover
+    min_line_px: NonNegativeFloat = 20.0  # of lines that an axis must show beside a plane
+    min_lines: Annotated[int, Range(2)] = 6  # on the axes when there is no plane
+    max_line_share: Share = 0.6  # of the lines' length on the axes is always enough; with many lines, what chance does not give
+    min_plane_share: Share = 0.4  # of the planes' area
+    loyalty: Annotated[float, Range(1)] = 1.2  # a frame with other axes than the previous must score so many times more
+    plane_floor_deg: PositiveFloat = 0.3  # a wall's deviation from the axis
+    line_floor_deg: PositiveFloat = 0.5  # an edge's
+    floor_deg: PositiveFloat = 0.05  # of the whole rotation
+    gate: PositiveFloat = 2.0  # σ at which a plane or line counts half
 
     def __call__(
         self, normals: Normals, segments: Segments, planes: Planes, previous: ManhattanFrame | None, rng: np.random.Generator

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
 
+from trihedron.pipeline.core.options import PositiveInt, Range
 from trihedron.pipeline.core.registry import register
 from trihedron.pipeline.core.types import F64, ManhattanFrame, Normals, Planes, Segments
 from trihedron.plugins.manhattan.common import HALF_SPHERE, Directions, ModeOptions, Modes
@@ -21,15 +23,10 @@ class MeanShift(ModeOptions):
     The modes say which directions belong to which axis and whether there is a Manhattan frame at all; the rotation is then fitted to the planes and
     lines on the axes by their covariances, the mean of the normals on an axis counting like one more plane."""
 
-    max_age: int = 10  # frames after which the previous axes are old
-    search_samples: int = 400  # most normals a search looks at
-    primaries: int = 6  # directions a search starts from
-    turns: int = 2  # and turns about each
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if min(self.primaries, self.turns, self.max_age) < 1 or self.search_samples < 10:
-            raise ValueError("primaries, turns, max_age, search_samples: at least 1; search_samples at least 10")
+    max_age: PositiveInt = 10  # frames after which the previous axes are old
+    search_samples: Annotated[int, Range(10)] = 400  # most normals a search looks at
+    primaries: PositiveInt = 6  # directions a search starts from
+    turns: PositiveInt = 2  # and turns about each
 
     def __call__(self, normals: Normals, segments: Segments, planes: Planes, previous: ManhattanFrame | None) -> ManhattanFrame:
         """One rotation with id 0; `supported` False, with a large covariance, where the scene shows no two axes at right angles."""

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import NamedTuple
+from typing import Annotated, NamedTuple
 
 import numpy as np
 
 from trihedron.pipeline.core.geometry import rotation_angle_deg
+from trihedron.pipeline.core.options import NonNegativeFloat, PositiveFloat, PositiveInt, Range, Share, check_increasing
 from trihedron.pipeline.core.registry import register
 from trihedron.pipeline.core.types import F64, Bool, ManhattanFrame, Normals, Planes, Segments
 from trihedron.plugins.manhattan.common import (
@@ -42,41 +43,32 @@ class Mixture:
     Frames may share an axis (two blocks of walls on one floor), but each needs one of its own. A frame keeps its id while it is seen, while another
     is seen that tells where it must be, and through a jump of the camera that leaves several in view."""
 
-    cone_deg: float = 12.0  # half-angle of the cone gathered around each axis
-    bandwidth_deg: float = 4.0  # of the Gaussian kernel
-    samples: int = 1500  # most normals used
-    search_samples: int = 500  # and in a search
-    line_weight_per_px: float = 0.1  # a line weighs like this many normals per pixel of its length
-    max_frames: int = 4
-    min_own: float = 0.06  # of all directions that a frame must have on axes which are not a better frame's
-    shared_deg: float = 4.0  # axes nearer than this are the same one
-    merge_deg: float = 6.0  # frames nearer than this are the same one
-    again_deg: float = 10.0  # a frame found this near to where others tell it must be is that one; twice that without others
-    loyalty: float = 1.2  # another frame comes first when it has so many times more than the one that did
-    max_age: int = 5  # frames; with an older result the search is from everywhere
-    min_share: float = 0.05  # of its normals that an axis must gather
-    min_lines: int = 4  # or this many lines,
-    min_line_share: float = 0.15  # with this share of the lines' length
-    max_width: float = 0.44  # cones, standard deviation of a mode; directions without order have 0.5 and more
-    min_explained: float = 0.3  # share of its directions on its axes
-    max_skew_deg: float = 3.0  # two modes further from a right angle do not belong to one frame
-    fit_deg: float = 6.0  # planes and lines this near to an axis refine it
-    plane_floor_deg: float = 0.3  # a wall's deviation from the axis
-    line_floor_deg: float = 0.5  # an edge's
-    normals_floor_deg: float = 0.5  # error of an axis however many normals it has
-    floor_deg: float = 0.05  # of the whole rotation
+    cone_deg: Annotated[float, Range(1, 30)] = 12.0  # half-angle of the cone gathered around each axis
+    bandwidth_deg: Annotated[float, Range(0.1, 30)] = 4.0  # of the Gaussian kernel
+    samples: Annotated[int, Range(10)] = 1500  # most normals used
+    search_samples: Annotated[int, Range(10)] = 500  # and in a search
+    line_weight_per_px: NonNegativeFloat = 0.1  # a line weighs like this many normals per pixel of its length
+    max_frames: PositiveInt = 4
+    min_own: Share = 0.06  # of all directions that a frame must have on axes which are not a better frame's
+    shared_deg: PositiveFloat = 4.0  # axes nearer than this are the same one
+    merge_deg: PositiveFloat = 6.0  # frames nearer than this are the same one
+    again_deg: PositiveFloat = 10.0  # a frame found this near to where others tell it must be is that one; twice that without others
+    loyalty: Annotated[float, Range(1)] = 1.2  # another frame comes first when it has so many times more than the one that did
+    max_age: PositiveInt = 5  # frames; with an older result the search is from everywhere
+    min_share: Share = 0.05  # of its normals that an axis must gather
+    min_lines: PositiveInt = 4  # or this many lines,
+    min_line_share: Share = 0.15  # with this share of the lines' length
+    max_width: Share = 0.44  # cones, standard deviation of a mode; directions without order have 0.5 and more
+    min_explained: Share = 0.3  # share of its directions on its axes
+    max_skew_deg: PositiveFloat = 3.0  # two modes further from a right angle do not belong to one frame
+    fit_deg: PositiveFloat = 6.0  # planes and lines this near to an axis refine it
+    plane_floor_deg: PositiveFloat = 0.3  # a wall's deviation from the axis
+    line_floor_deg: PositiveFloat = 0.5  # an edge's
+    normals_floor_deg: PositiveFloat = 0.5  # error of an axis however many normals it has
+    floor_deg: PositiveFloat = 0.05  # of the whole rotation
 
     def __post_init__(self) -> None:
-        if not 1.0 <= self.cone_deg <= 30.0 or not 0.1 <= self.bandwidth_deg <= self.cone_deg:
-            raise ValueError("cone_deg, bandwidth_deg: cone_deg must be 1 to 30 and bandwidth_deg 0.1 to cone_deg")
-        if min(self.samples, self.search_samples) < 10 or min(self.max_frames, self.max_age, self.min_lines) < 1:
-            raise ValueError("samples, search_samples, max_frames, max_age, min_lines: at least 10, 10, 1, 1 and 1")
-        shares = (self.min_own, self.min_share, self.min_line_share, self.max_width, self.min_explained)
-        if not all(0.0 <= share <= 1.0 for share in shares) or self.line_weight_per_px < 0.0:
-            raise ValueError("min_own, min_share, min_line_share, max_width, min_explained: must be 0 to 1, line_weight_per_px at least 0")
-        if min(self.shared_deg, self.merge_deg, self.again_deg, self.fit_deg, self.max_skew_deg) <= 0.0 or self.loyalty < 1.0:
-            raise ValueError("shared_deg, merge_deg, again_deg, fit_deg, max_skew_deg, loyalty: must be positive, loyalty at least 1")
-        _ = self._fit  # checks its own fields
+        check_increasing(self, "bandwidth_deg", "cone_deg")
 
     def __call__(self, normals: Normals, segments: Segments, planes: Planes, previous: ManhattanFrame | None) -> ManhattanFrame:
         """Frames seen, the best supported first, then those known but out of sight: expected from the others, no inliers, a covariance that says

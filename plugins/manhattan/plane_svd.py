@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
 
+from trihedron.pipeline.core.options import PositiveFloat, PositiveShare, Range, Share
 from trihedron.pipeline.core.registry import register
 from trihedron.pipeline.core.types import F64, I32, ManhattanFrame, Planes
 from trihedron.plugins.manhattan.common_kernels import NOTHING_KNOWN, variance_scale
@@ -35,22 +37,14 @@ class PlaneSvd:
     `R = U diag(1, 1, det U Vᵀ) Vᵀ` of `U S Vᵀ = Σ w ±n eᵀ` minimises `Σ w |±n − R e|²` over planes with normal n on axis e, w the inverse variance of
     the normal; an axis without a plane becomes the cross product of the others. Neither the grid of normals nor lines are looked at."""
 
-    max_cos: float = 0.05  # of two planes taken as perpendicular, 0.01–0.09 in publications; twice their uncertainty is added
-    reach_deg: float = 5.0  # a plane this near to an axis belongs to it
-    min_share: float = 0.05  # of the image that the planes of an axis must cover
-    min_explained: float = 0.5  # share of the planes' area on the axes
-    loyalty: float = 1.2  # a pair with other axes than the previous must explain so many times more
-    gate: float = 3.0  # σ at which a plane counts half
-    plane_floor_deg: float = 0.3  # a wall's deviation from the axis
-    floor_deg: float = 0.05  # of the whole rotation
-
-    def __post_init__(self) -> None:
-        if not 0.0 <= self.max_cos <= LARGEST_COS or not 0.5 <= self.reach_deg <= 20.0:
-            raise ValueError("max_cos, reach_deg: must be 0 to 0.2 and 0.5 to 20")
-        if not 0.0 < self.min_share <= 1.0 or not 0.0 <= self.min_explained <= 1.0 or self.loyalty < 1.0:
-            raise ValueError("min_share, min_explained, loyalty: must be above 0 to 1, 0 to 1, and at least 1")
-        if min(self.gate, self.plane_floor_deg, self.floor_deg) <= 0.0:
-            raise ValueError("gate, plane_floor_deg, floor_deg: must be positive")
+    max_cos: Annotated[float, Range(0, LARGEST_COS)] = 0.05  # of perpendicular planes, 0.01–0.09 in publications; twice their uncertainty is added
+    reach_deg: Annotated[float, Range(0.5, 20)] = 5.0  # a plane this near to an axis belongs to it
+    min_share: PositiveShare = 0.05  # of the image that the planes of an axis must cover
+    min_explained: Share = 0.5  # share of the planes' area on the axes
+    loyalty: Annotated[float, Range(1)] = 1.2  # a pair with other axes than the previous must explain so many times more
+    gate: PositiveFloat = 3.0  # σ at which a plane counts half
+    plane_floor_deg: PositiveFloat = 0.3  # a wall's deviation from the axis
+    floor_deg: PositiveFloat = 0.05  # of the whole rotation
 
     def __call__(self, planes: Planes, previous: ManhattanFrame | None) -> ManhattanFrame:
         """One rotation with id 0; `inliers` counts planes, `spread` is their angle to the axis. `supported` is False where no two axes have planes: a

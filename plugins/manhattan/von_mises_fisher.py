@@ -4,9 +4,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Annotated
 
 import numpy as np
 
+from trihedron.pipeline.core.options import NonNegativeFloat, PositiveFloat, PositiveInt, Range, Share
 from trihedron.pipeline.core.registry import register
 from trihedron.pipeline.core.types import F64, ManhattanFrame, Normals, Segments
 from trihedron.plugins.manhattan.common import HALF_SPHERE, Directions, ModeFinder, Modes, gather_directions
@@ -25,40 +27,26 @@ class VonMisesFisher:
     Normals and lines have concentrations of their own on every axis, which are estimated with the rotation over a uniform background: the spread is
     what the data say, not what a cone cuts out, and the covariance follows from it. Detected planes are not looked at."""
 
-    samples: int = 1500  # most normals used
-    alike: float = 6.0  # neighbouring normals share pixels and the sensor's errors: of those used so many err as one
-    max_iterations: int = 25
-    tolerance_deg: float = 0.01  # of a step
-    start_spread_deg: float = 10.0  # standard deviation about the axes assumed at first: how far EM can see
-    prior: float = 10.0  # directions that say beforehand that an axis
-    prior_spread_deg: float = 4.0  # has this standard deviation
-    max_spread_deg: float = 12.0  # a wider axis is none
-    line_weight_per_px: float = 0.1  # a line weighs like this many normals per pixel of its length
-    min_share: float = 0.05  # of all normals that an axis must gather
-    min_lines: int = 4  # or this many lines,
-    min_line_share: float = 0.15  # with this share of the lines' length
-    min_explained: float = 0.3  # share of all directions on the axes
-    max_skew_deg: float = 3.0  # means further from a right angle do not belong to one Manhattan frame
-    peak_spread_deg: float = 2.0  # kernel with which peaks are looked for
-    max_shift_deg: float = 0.5  # from the mean of a wall's normals to their peak, beyond the uncertainty of the mean; two walls have more
-    axis_floor_deg: float = 0.1  # error of an axis however many directions it has
-    floor_deg: float = 0.05  # of the whole rotation
-    search_samples: int = 800  # most normals a search looks at
-    max_age: int = 5  # frames; with an older result the search is from everywhere
-
-    def __post_init__(self) -> None:
-        if self.max_iterations < 1 or min(self.samples, self.search_samples) < 10 or self.min_lines < 1 or self.max_age < 1:
-            raise ValueError("max_iterations, samples, search_samples, min_lines, max_age: at least 1, 10, 10, 1 and 1")
-        if not 0.5 <= self.peak_spread_deg <= 10.0 or self.max_shift_deg <= 0.0:
-            raise ValueError("peak_spread_deg, max_shift_deg: must be 0.5 to 10 and positive")
-        if min(self.tolerance_deg, self.prior, self.max_skew_deg, self.axis_floor_deg, self.floor_deg) <= 0.0:
-            raise ValueError("tolerance_deg, prior, max_skew_deg, axis_floor_deg, floor_deg: must be positive")
-        if self.line_weight_per_px < 0.0 or self.alike < 1.0:
-            raise ValueError("line_weight_per_px, alike: at least 0 and 1")
-        if not all(0.5 <= spread <= 20.0 for spread in (self.start_spread_deg, self.prior_spread_deg, self.max_spread_deg)):
-            raise ValueError("start_spread_deg, prior_spread_deg, max_spread_deg: must be 0.5 to 20")
-        if not all(0.0 <= share <= 1.0 for share in (self.min_share, self.min_line_share, self.min_explained)):
-            raise ValueError("min_share, min_line_share, min_explained: must be 0 to 1")
+    samples: Annotated[int, Range(10)] = 1500  # most normals used
+    alike: Annotated[float, Range(1)] = 6.0  # neighbouring normals share pixels and the sensor's errors: of those used so many err as one
+    max_iterations: PositiveInt = 25
+    tolerance_deg: PositiveFloat = 0.01  # of a step
+    start_spread_deg: Annotated[float, Range(0.5, 20)] = 10.0  # standard deviation about the axes assumed at first: how far EM can see
+    prior: PositiveFloat = 10.0  # directions that say beforehand that an axis
+    prior_spread_deg: Annotated[float, Range(0.5, 20)] = 4.0  # has this standard deviation
+    max_spread_deg: Annotated[float, Range(0.5, 20)] = 12.0  # a wider axis is none
+    line_weight_per_px: NonNegativeFloat = 0.1  # a line weighs like this many normals per pixel of its length
+    min_share: Share = 0.05  # of all normals that an axis must gather
+    min_lines: PositiveInt = 4  # or this many lines,
+    min_line_share: Share = 0.15  # with this share of the lines' length
+    min_explained: Share = 0.3  # share of all directions on the axes
+    max_skew_deg: PositiveFloat = 3.0  # means further from a right angle do not belong to one Manhattan frame
+    peak_spread_deg: Annotated[float, Range(0.5, 10)] = 2.0  # kernel with which peaks are looked for
+    max_shift_deg: PositiveFloat = 0.5  # from the mean of a wall's normals to their peak, beyond the uncertainty of the mean; two walls have more
+    axis_floor_deg: PositiveFloat = 0.1  # error of an axis however many directions it has
+    floor_deg: PositiveFloat = 0.05  # of the whole rotation
+    search_samples: Annotated[int, Range(10)] = 800  # most normals a search looks at
+    max_age: PositiveInt = 5  # frames; with an older result the search is from everywhere
 
     def __call__(self, normals: Normals, segments: Segments, previous: ManhattanFrame | None) -> ManhattanFrame:
         """One rotation with id 0; `inliers` counts the directions that belong to an axis, `spread` is √(2/κ). `supported` False, with a large
