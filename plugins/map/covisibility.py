@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from typing import Annotated
 
 import numpy as np
 
 from trihedron.pipeline.core.geometry import invert
+from trihedron.pipeline.core.options import PositiveFloat, PositiveInt, PositiveShare, Range, Share, check_increasing
 from trihedron.pipeline.core.registry import register
 from trihedron.pipeline.core.types import DEGRADED, F32, I32, LOST, Correction, Frame, Keypoints, Map, Matches, Planes, Pose, Segments
 from trihedron.plugins.mapping import insertion
@@ -32,35 +34,26 @@ class Covisibility:
 
     Without bundle adjustment a landmark is the running estimate of all its measurements, each weighed by its covariance."""
 
-    min_frames: int = 3  # between keyframes
-    max_frames: int = 30  # after which a quarter of the view change below is enough
-    min_shift: float = 0.06  # of the camera, as a share of the median depth, that makes a keyframe
-    min_turn_deg: float = 6.0
-    min_share: float = 0.5  # of the newest keyframe's landmarks tracked, below which a keyframe is made
+    min_frames: PositiveInt = 3  # between keyframes
+    max_frames: PositiveInt = 30  # after which a quarter of the view change below is enough
+    min_shift: PositiveFloat = 0.06  # of the camera, as a share of the median depth, that makes a keyframe
+    min_turn_deg: PositiveFloat = 6.0
+    min_share: Share = 0.5  # of the newest keyframe's landmarks tracked, below which a keyframe is made
     new_plane_px: int = 4000  # a plane this large that is not in the map makes a keyframe
-    memory: float = 30.0  # measurements a point or line remembers
-    plane_memory: float = 30.0  # keyframes a plane remembers
+    memory: Annotated[float, Range(above=1)] = 30.0  # measurements a point or line remembers
+    plane_memory: Annotated[float, Range(above=1)] = 30.0  # keyframes a plane remembers
     judge: bool = True  # matches by the final pose; false where they were verified among themselves and a loop may be longer than the pose is sure
-    line_sigma_px: float = 1.0  # of a segment's end point across it
+    line_sigma_px: PositiveFloat = 1.0  # of a segment's end point across it
     min_line_px: float = 30.0  # shortest segment that becomes a landmark
-    trial: int = 3  # keyframes after which a landmark seen by fewer of those that should have seen it is removed
-    min_found: float = 0.25  # found ratio below which a landmark is removed (ORB-SLAM)
-    redundant: int = 8  # keyframes that must see what another one sees, as well, for that to be redundant
-    redundant_share: float = 0.9  # of its landmarks (ORB-SLAM)
+    trial: PositiveInt = 3  # keyframes after which a landmark seen by fewer of those that should have seen it is removed
+    min_found: Share = 0.25  # found ratio below which a landmark is removed (ORB-SLAM)
+    redundant: PositiveInt = 8  # keyframes that must see what another one sees, as well, for that to be redundant
+    redundant_share: PositiveShare = 0.9  # of its landmarks (ORB-SLAM)
     merge_deg: float = 4.0  # planes that differ by less, and by less than merge_m on average, become one
     merge_m: float = 0.03
 
     def __post_init__(self) -> None:
-        if not 1 <= self.min_frames <= self.max_frames:
-            raise ValueError("min_frames: must be at least 1 and at most max_frames")
-        if self.memory <= 1.0 or self.plane_memory <= 1.0:
-            raise ValueError("memory, plane_memory: must be above 1")
-        if self.min_shift <= 0.0 or self.min_turn_deg <= 0.0 or self.line_sigma_px <= 0.0:
-            raise ValueError("min_shift, min_turn_deg, line_sigma_px: must be positive")
-        if not 0.0 <= self.min_share <= 1.0 or not 0.0 <= self.min_found <= 1.0 or self.trial < 1:
-            raise ValueError("min_share, min_found, trial: shares in [0, 1], trial at least 1")
-        if self.redundant < 1 or not 0.0 < self.redundant_share <= 1.0:
-            raise ValueError("redundant, redundant_share: must be at least 1, and a share in (0, 1]")
+        check_increasing(self, "min_frames", "max_frames")
 
     def __call__(
         self,
