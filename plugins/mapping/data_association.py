@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
 
 from trihedron.pipeline.core.geometry import invert
+from trihedron.pipeline.core.options import NonNegativeInt, PositiveFloat, Range, check_increasing
 from trihedron.pipeline.core.types import F64, I32, U8, Camera, Frame, Keypoints, Map, Matches, Planes, Segments
 from trihedron.plugins.mapping.covisibility_graph import LocalWindow
 from trihedron.plugins.mapping.data_association_kernels import pairs_kernel, related
@@ -32,36 +34,28 @@ class Guess:
 class MapSearch:
     """How far from its projection a landmark is sought, and what makes a match."""
 
-    radius_px: float = 4.0  # least search radius, at level 0 of the pyramid
-    max_radius_px: float = 20.0
+    radius_px: PositiveFloat = 4.0  # least search radius, at level 0 of the pyramid
+    max_radius_px: PositiveFloat = 20.0
     enough: int = 20  # points; when fewer are found, or the position is only a guess, they are sought once more within wide_radius_px
-    wide_radius_px: float = 60.0
-    view_deg: float = 60.0  # a point is not sought when seen from a direction that differs by more (ORB-SLAM2)
-    octave_scale: float = 1.2  # of the key points' pyramid
-    octave_step: int = 1  # levels about the predicted one
+    wide_radius_px: PositiveFloat = 60.0
+    view_deg: Annotated[float, Range(above=0, high=90)] = 60.0  # a point is not sought when seen from a direction that differs by more (ORB-SLAM2)
+    octave_scale: Annotated[float, Range(above=1, high=2)] = 1.2  # of the key points' pyramid
+    octave_step: NonNegativeInt = 1  # levels about the predicted one
     max_distance: int = 80  # bits between descriptors of a point (ORB-SLAM2: 50 strict, 100 loose)
     max_distance_l2: int = 250  # for descriptors compared by Euclidean distance
     ratio: float = 0.85  # best to second best
-    line_angle_deg: float = 8.0
+    line_angle_deg: Annotated[float, Range(above=0, high=90)] = 8.0
     line_offset_px: float = 10.0
     line_overlap: float = 0.3  # of the shorter of the two
     line_distance: int = 60  # bits
     line_ratio: float = 0.9
-    plane_angle_deg: float = 10.0  # paper, section III-A
+    plane_angle_deg: Annotated[float, Range(above=0, high=90)] = 10.0  # paper, section III-A
     plane_distance_m: float = 0.1  # paper, section III-A
-    parallel_deg: float = 5.0  # planes nearer to parallel are taken as parallel, and perpendicular ones likewise
-    relations: int = 3  # most parallel or perpendicular partners of an observed plane
+    parallel_deg: Annotated[float, Range(above=0, high=90)] = 5.0  # planes nearer to parallel are taken as parallel, and perpendicular ones likewise
+    relations: NonNegativeInt = 3  # most parallel or perpendicular partners of an observed plane
 
     def __post_init__(self) -> None:
-        if self.relations < 0:
-            raise ValueError("relations: must be at least 0")
-        if not 0.0 < self.radius_px <= self.max_radius_px <= self.wide_radius_px:
-            raise ValueError("radius_px: must be positive, at most max_radius_px, and that at most wide_radius_px")
-        if not 1.0 < self.octave_scale <= 2.0 or self.octave_step < 0:
-            raise ValueError("octave_scale, octave_step: must be in (1, 2] and at least 0")
-        for name in ("view_deg", "line_angle_deg", "plane_angle_deg", "parallel_deg"):
-            if not 0.0 < getattr(self, name) <= 90.0:
-                raise ValueError(f"{name}: must be in (0, 90]")
+        check_increasing(self, "radius_px", "max_radius_px", "wide_radius_px")
 
     def search(self, frame: Frame, guess: Guess, keypoints: Keypoints, segments: Segments, planes: Planes, map: Map, window: LocalWindow) -> Matches:
         """Landmarks of the window found around the guess."""
