@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
 
 from trihedron.pipeline.core.geometry import invert, transform
+from trihedron.pipeline.core.options import NonNegativeInt, PositiveFloat, PositiveInt, PositiveShare, Range, Share
 from trihedron.pipeline.core.registry import register
 from trihedron.pipeline.core.types import I32, Frame, Keypoints, Map, Matches, Rotation
 from trihedron.plugins.mapping.covisibility_graph import current_submap, keyframes_of, observed_by
@@ -23,19 +25,13 @@ class Keyframes:
     the rigid motion that most pairs agree on (RGB-D SLAM: Endres et al., T-RO 2014). The pose is not asked, so that a loop of any length can close;
     of two keyframes that have a point in common the one with more agreeing pairs has it."""
 
-    newest: int = 3
-    drawn: int = 3  # of the earlier ones, anew in every frame
-    ratio: float = 0.9  # best to second best descriptor
-    rounds: int = 150  # samples of three
-    gate: float = 3.0  # standard deviations within which a pair agrees
-    min_points: int = 25  # that must agree
-    min_share: float = 0.4  # of the pairs
-
-    def __post_init__(self) -> None:
-        if self.newest < 1 or self.drawn < 0 or self.rounds < 1 or self.min_points < 3 or self.gate <= 0.0:
-            raise ValueError("newest, drawn, rounds, min_points, gate: at least 1, 0, 1 and 3, and positive")
-        if not 0.0 < self.ratio <= 1.0 or not 0.0 <= self.min_share <= 1.0:
-            raise ValueError("ratio, min_share: must be shares")
+    newest: PositiveInt = 3
+    drawn: NonNegativeInt = 3  # of the earlier ones, anew in every frame
+    ratio: PositiveShare = 0.9  # best to second best descriptor
+    rounds: PositiveInt = 150  # samples of three
+    gate: PositiveFloat = 3.0  # standard deviations within which a pair agrees
+    min_points: Annotated[int, Range(3)] = 25  # that must agree
+    min_share: Share = 0.4  # of the pairs
 
     def __call__(self, frame: Frame, rotation: Rotation, keypoints: Keypoints, map: Map | None, rng: np.random.Generator) -> Matches:
         """Pairs of key points and the points of verified keyframes; what was offered and what was found count as visible."""

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from trihedron.pipeline.core.geometry import pose_matrix
+from trihedron.pipeline.core.options import NonNegativeInt, PositiveInt
 from trihedron.pipeline.core.registry import register
 from trihedron.pipeline.core.types import F64, OK, Frame, Keypoints, Map, Matches, Planes, Pose, Rotation, Segments, Translation
 from trihedron.plugins.mapping.covisibility_graph import living_keyframes, local_window
@@ -20,15 +21,10 @@ class LocalMap(MapSearch):
     """Project the landmarks of a bounded window of keyframes at the decoupled pose, or where a lost camera was recognised, and match what lies near
     (sections III-A, IV-C)."""
 
-    newest: int = 2  # keyframes always in the window
-    covisible: int = 10  # keyframes that share most landmarks with those
-    near: int = 3  # further keyframes taken from about here
-    recognised: int = 8  # keyframes taken from about the place where a lost camera was recognised
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if self.newest < 1 or self.covisible < 0 or self.near < 0 or self.recognised < 1:
-            raise ValueError("newest, covisible, near, recognised: must be at least 1, 0, 0 and 1")
+    newest: PositiveInt = 2  # keyframes always in the window
+    covisible: NonNegativeInt = 10  # keyframes that share most landmarks with those
+    near: NonNegativeInt = 3  # further keyframes taken from about here
+    recognised: PositiveInt = 8  # keyframes taken from about the place where a lost camera was recognised
 
     def __call__(
         self,
