@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
 
+from trihedron.pipeline.core.options import AcuteDeg, PositiveFloat, PositiveInt, Range, check_increasing
 from trihedron.pipeline.core.registry import register
 from trihedron.pipeline.core.types import I32, LOST, Bool, Column, Frame, Pose, PredictedView, Table
 from trihedron.plugins.model.common import sight_of
@@ -23,18 +25,15 @@ class SurfelModel:
     Without the publication's deformation graph and its loops: nothing moves once it is fused. The surfels are the rows of the value's table, so that
     the wire `model@prev` is the only memory."""
 
-    width: int = 213  # px, about, of the depth that is fused and of the view
-    apart: float = 3.0  # standard deviations of a depth, between a pixel and its surfel
-    most_deg: float = 40.0  # between their normals
-    most: float = 100.0  # views a surfel remembers
-    stable: float = 5.0  # views that make a surfel stable,
-    trial: int = 20  # frames after which one that is not is removed
+    width: Annotated[int, Range(32, 4096)] = 213  # px, about, of the depth that is fused and of the view
+    apart: PositiveFloat = 3.0  # standard deviations of a depth, between a pixel and its surfel
+    most_deg: AcuteDeg = 40.0  # between their normals
+    most: Annotated[float, Range(1)] = 100.0  # views a surfel remembers
+    stable: Annotated[float, Range(1)] = 5.0  # views that make a surfel stable,
+    trial: PositiveInt = 20  # frames after which one that is not is removed
 
     def __post_init__(self) -> None:
-        if not 32 <= self.width <= 4096 or self.apart <= 0.0 or not 0.0 < self.most_deg < 90.0:
-            raise ValueError("width, apart, most_deg: 32 to 4096 px, positive, an angle within 0 … 90")
-        if not 1.0 <= self.stable <= self.most or self.trial < 1:
-            raise ValueError("stable, most, trial: 1 <= stable <= most, at least 1")
+        check_increasing(self, "stable", "most")
 
     def __call__(self, frame: Frame, pose: Pose, previous: PredictedView | None) -> PredictedView | None:
         """The view from this frame's pose; None, so that the last one stays, while the camera is lost."""

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
 
+from trihedron.pipeline.core.options import PositiveFloat, Range
 from trihedron.pipeline.core.registry import register
 from trihedron.pipeline.core.types import F32, LOST, Frame, Pose, PredictedView, Table
 from trihedron.plugins.model.common import BLOCKS, fused, sight_of
@@ -23,14 +25,14 @@ class TsdfModel:
 
     The blocks are the rows of the value's table, so that the wire `model@prev` is the only memory."""
 
-    width: int = 320  # px, about, of the depth that is fused and of the view
-    voxel_m: float = 0.02
-    truncation_m: float = 0.08
-    most: int = 100  # views a voxel remembers
+    width: Annotated[int, Range(32, 4096)] = 320  # px, about, of the depth that is fused and of the view
+    voxel_m: PositiveFloat = 0.02
+    truncation_m: PositiveFloat = 0.08
+    most: Annotated[int, Range(1, 255)] = 100  # views a voxel remembers
 
     def __post_init__(self) -> None:
-        if not 32 <= self.width <= 4096 or self.voxel_m <= 0.0 or self.truncation_m < 2.0 * self.voxel_m or not 1 <= self.most <= 255:
-            raise ValueError("width, voxel_m, truncation_m, most: 32 to 4096 px, positive, at least two voxels, 1 to 255")
+        if self.truncation_m < 2.0 * self.voxel_m:
+            raise ValueError(f"truncation_m: {self.truncation_m} is less than two voxels of {self.voxel_m} m")
 
     def __call__(self, frame: Frame, pose: Pose, previous: PredictedView | None) -> PredictedView | None:
         """The view from this frame's pose; None, so that the last one stays, while the camera is lost."""
