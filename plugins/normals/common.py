@@ -5,11 +5,12 @@ from __future__ import annotations
 import threading
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
-from typing import Any
+from typing import Annotated, Any
 
 import cv2
 import numpy as np
 
+from trihedron.pipeline.core.options import NonNegativeFloat, PositiveFloat, Range
 from trihedron.pipeline.core.types import F32, F64, I32, U8, Camera, Frame, Normals
 from trihedron.plugins.normals.common_kernels import smooth_cells, smoothed_points, trusted_normals
 from trihedron.plugins.shared.depth_image import noise_coefficients
@@ -23,19 +24,11 @@ class CloudNormals:
     OpenCV's methods look at 7 × 7 points at most, take a missing point for one at the camera and see no depth edge: on a Kinect's raw points at
     2 m their normals scatter by tens of degrees. So points are averaged first, over what range asks for, and normals near an edge are dropped."""
 
-    stride: int = 2  # px between cells of the output grid
-    max_patch_px: int = 30  # side of the largest square points are averaged over, the method's own window included
-    noise_deg: float = 1.0  # the square grows with range until the normal's predicted standard deviation is below this
-    jump: float = 0.04  # a depth edge is a step above jump · z + jump_m
-    jump_m: float = 0.02
-
-    def __post_init__(self) -> None:
-        if not 1 <= self.stride <= 8:
-            raise ValueError("stride: must be 1 to 8 px")
-        if not 1 <= self.max_patch_px <= 100 or self.noise_deg <= 0.0:
-            raise ValueError("max_patch_px, noise_deg: must be 1 to 100 px and positive")
-        if self.jump < 0.0 or self.jump_m <= 0.0:
-            raise ValueError("jump, jump_m: must be positive")
+    stride: Annotated[int, Range(1, 8)] = 2  # px between cells of the output grid
+    max_patch_px: Annotated[int, Range(1, 100)] = 30  # side of the largest square points are averaged over, the method's own window included
+    noise_deg: PositiveFloat = 1.0  # the square grows with range until the normal's predicted standard deviation is below this
+    jump: NonNegativeFloat = 0.04  # a depth edge is a step above jump · z + jump_m
+    jump_m: PositiveFloat = 0.02
 
     def _normals(self, frame: Frame, method: int, window: int, reach: int, border: int) -> Normals:
         """Normals on a grid of ceil(h / stride) × ceil(w / stride) cells by a method with a window of `window` cells, which needs smooth cells up to

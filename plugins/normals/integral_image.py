@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Annotated
 
+from trihedron.pipeline.core.options import NonNegativeFloat, PositiveFloat, PositiveShare, Range, check_increasing
 from trihedron.pipeline.core.registry import register
 from trihedron.pipeline.core.types import Frame, Normals
 from trihedron.plugins.normals.common import patch_radii
@@ -19,23 +21,18 @@ class IntegralImage:
     without a patch is NaN.
     """
 
-    patch_px: int = 10  # side of the averaged patch, paper section III-A
-    max_patch_px: int = 26  # side it may grow to where depth is noisy
-    noise_deg: float = 1.0  # the patch grows with range until the normal's predicted standard deviation is below this
-    stride: int = 2  # px between cells of the output grid
-    jump: float = 0.04  # a depth edge is a step above jump · z + jump_m
-    jump_m: float = 0.02
-    share: float = 0.5  # of a half patch's pixels that must have depth
+    patch_px: Annotated[int, Range(3, 100)] = 10  # side of the averaged patch, paper section III-A
+    max_patch_px: Annotated[int, Range(3, 100)] = 26  # side it may grow to where depth is noisy
+    noise_deg: PositiveFloat = 1.0  # the patch grows with range until the normal's predicted standard deviation is below this
+    stride: Annotated[int, Range(1, 8)] = 2  # px between cells of the output grid
+    jump: NonNegativeFloat = 0.04  # a depth edge is a step above jump · z + jump_m
+    jump_m: PositiveFloat = 0.02
+    share: PositiveShare = 0.5  # of a half patch's pixels that must have depth
 
     def __post_init__(self) -> None:
-        if not 1 <= self.stride <= 8:
-            raise ValueError("stride: must be 1 to 8 px")
-        if not 3 * self.stride <= self.patch_px <= self.max_patch_px <= 100:
-            raise ValueError("patch_px: must be at least 3 strides and at most max_patch_px <= 100")
-        if self.noise_deg <= 0.0 or self.jump < 0.0 or self.jump_m <= 0.0:
-            raise ValueError("noise_deg, jump, jump_m: must be positive")
-        if not 0.0 < self.share <= 1.0:
-            raise ValueError("share: must be in (0, 1]")
+        check_increasing(self, "patch_px", "max_patch_px")
+        if self.patch_px < 3 * self.stride:
+            raise ValueError(f"patch_px: {self.patch_px} is less than three strides of {self.stride} px")
 
     def __call__(self, frame: Frame) -> Normals:
         """Normals on a grid of ceil(h / stride) × ceil(w / stride) cells."""

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
 
+from trihedron.pipeline.core.options import Range
 from trihedron.pipeline.core.registry import register
 from trihedron.pipeline.core.types import Frame, Normals
 
@@ -15,11 +17,7 @@ from trihedron.pipeline.core.types import Frame, Normals
 class NoNormals:
     """A grid of NaN: what the rest of the system does without normals (and so without planes found from them)."""
 
-    stride: int = 2  # px between cells of the grid
-
-    def __post_init__(self) -> None:
-        if not 1 <= self.stride <= 8:
-            raise ValueError("stride: must be 1 to 8 px")
+    stride: Annotated[int, Range(1, 8)] = 2  # px between cells of the grid
 
     def __call__(self, frame: Frame) -> Normals:
         """Not one normal."""

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Annotated
 
 import cv2
 
+from trihedron.pipeline.core.options import OneOf
 from trihedron.pipeline.core.registry import register
 from trihedron.pipeline.core.types import Frame, Normals
 from trihedron.plugins.normals.common import CloudNormals
@@ -18,12 +20,7 @@ class Sri(CloudNormals):
 
     The image is resampled to equal angles and the normals back, so a strip along the image's border, where that reaches outside, has none."""
 
-    window: int = 5  # cells of the derivative, 3, 5 or 7
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if self.window not in (3, 5, 7):
-            raise ValueError("window: must be 3, 5 or 7 cells")
+    window: Annotated[int, OneOf(3, 5, 7)] = 5  # cells of the derivative, 3, 5 or 7
 
     def __call__(self, frame: Frame) -> Normals:
         """Normals on a grid of ceil(h / stride) × ceil(w / stride) cells; NaN near missing depth, a depth edge or the image's border."""
