@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
 
+from trihedron.pipeline.core.options import PositiveFloat, PositiveShare, Range
 from trihedron.pipeline.core.registry import register
 from trihedron.pipeline.core.types import Frame, Normals, Planes
 from trihedron.plugins.planes.ahc_kernels import cluster_blocks
@@ -22,18 +24,11 @@ class Ahc(PlanarRegions):
     The paper's thresholds (mm², mm) are a noise model of one sensor; here errors are in σ of the frame's own. Its refinement (erode the blocks at the
     border, grow by pixels, cluster once more) is the trimmed fit, growth and merging that all detectors share."""
 
-    block_px: int = 10  # side of a node, Feng et al.
-    share: float = 0.75  # of a node's cells that must have depth; all of them in the paper, where sensors leave no speckles
-    block_sigma: float = 2.0  # rms distance, in σ_z, of a node's depths from its plane
-    sigma: float = 1.5  # the same, of a cluster
-    shift_sigma: float = 0.8  # rms, in σ_z, by which joining two clusters may move the plane away from the depths of either
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if not 4 <= self.block_px <= 100 or not 0.0 < self.share <= 1.0:
-            raise ValueError("block_px, share: must be 4 to 100 px and above 0, at most 1")
-        if self.block_sigma <= 0.0 or self.sigma <= 0.0 or self.shift_sigma <= 0.0:
-            raise ValueError("block_sigma, sigma, shift_sigma: must be positive")
+    block_px: Annotated[int, Range(4, 100)] = 10  # side of a node, Feng et al.
+    share: PositiveShare = 0.75  # of a node's cells that must have depth; all of them in the paper, where sensors leave no speckles
+    block_sigma: PositiveFloat = 2.0  # rms distance, in σ_z, of a node's depths from its plane
+    sigma: PositiveFloat = 1.5  # the same, of a cluster
+    shift_sigma: PositiveFloat = 0.8  # rms, in σ_z, by which joining two clusters may move the plane away from the depths of either
 
     def __call__(self, frame: Frame, normals: Normals) -> Planes:
         """Planes, largest first; `labels` on the grid of the normals, which only help to refine and to tell curved surfaces."""

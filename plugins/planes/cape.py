@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
 
+from trihedron.pipeline.core.options import AcuteDeg, PositiveFloat, PositiveInt, PositiveShare, Range
 from trihedron.pipeline.core.registry import register
 from trihedron.pipeline.core.types import Frame, Normals, Planes
 from trihedron.plugins.planes.cape_kernels import grow_blocks
@@ -22,21 +24,12 @@ class Cape(PlanarRegions):
     Planarity is the mean squared error of a cell's least-squares plane in σ of the frame's noise model; the paper takes the least eigenvalue of its
     points' covariance, and a constant. Its refinement by pixels is the trimmed fit and growth that all detectors share; no cylinders."""
 
-    block_px: int = 20  # side of a cell, Proença & Gao
-    share: float = 0.5  # of its pixels that must have depth, Proença & Gao
-    sigma: float = 1.5  # rms distance, in σ_z, of a planar cell's depths from its plane, and from its region's
-    step_sigma: float = 4.0  # the same, from the plane of the neighbour it is reached from
-    angle_deg: float = 15.0  # between the normals of neighbours in a region, Proença & Gao
-    least: int = 3  # cells of a region; 5 in the paper, which wants no small planes
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if not 4 <= self.block_px <= 100 or not 0.0 < self.share <= 1.0:
-            raise ValueError("block_px, share: must be 4 to 100 px and above 0, at most 1")
-        if self.sigma <= 0.0 or self.step_sigma <= 0.0:
-            raise ValueError("sigma, step_sigma: must be positive")
-        if not 0.0 < self.angle_deg < 90.0 or self.least < 1:
-            raise ValueError("angle_deg, least: must be above 0 and below 90, and at least 1")
+    block_px: Annotated[int, Range(4, 100)] = 20  # side of a cell, Proença & Gao
+    share: PositiveShare = 0.5  # of its pixels that must have depth, Proença & Gao
+    sigma: PositiveFloat = 1.5  # rms distance, in σ_z, of a planar cell's depths from its plane, and from its region's
+    step_sigma: PositiveFloat = 4.0  # the same, from the plane of the neighbour it is reached from
+    angle_deg: AcuteDeg = 15.0  # between the normals of neighbours in a region, Proença & Gao
+    least: PositiveInt = 3  # cells of a region; 5 in the paper, which wants no small planes
 
     def __call__(self, frame: Frame, normals: Normals) -> Planes:
         """Planes, largest first; `labels` on the grid of the normals, which only help to refine and to tell curved surfaces."""

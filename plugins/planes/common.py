@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
 
+from trihedron.pipeline.core.options import NonNegativeFloat, NonNegativeInt, PositiveFloat, PositiveInt, Range
 from trihedron.pipeline.core.types import F64, I32, U8, Frame, Normals, Planes
 from trihedron.plugins.planes.common_kernels import (
     MOST,
@@ -30,28 +32,18 @@ Sums = tuple[F64, F64, F64, I32]  # of each region's core, as from `accumulate`
 class PlanarRegions:
     """Base of the plugins of `planes`: a plugin finds the core of each region, `_complete` makes Planes of them."""
 
-    cone_deg: float = 15.0  # normals of one plane lie within this of it
-    gate: float = 3.0  # σ_z of a member's depth
-    turn: float = 0.5  # a region whose normals turn by more than this share of the cone's half angle is curved
-    border_px: int = 16  # grown into whatever the normals say
-    merge: float = 0.3  # rms distance, in σ_z, of a region from the common plane of the two, noise apart
-    gap_px: int = 8  # between regions that may be one
-    min_pixels: int = 1000  # smallest region
-    planes: int = 24  # most, the largest
-    samples: int = 48  # points spread over a region
-    correlation_px: float = 8.0  # side of the square that counts as one independent depth, where the residuals cannot tell
-    tiles: int = 16  # squares a region is cut into to see how its residuals are correlated
-    bias: float = 0.1  # σ_z common to all depths of a region: a real sensor's depth is bent (fr3 of TUM: 0.1 to 0.3 track best)
-
-    def __post_init__(self) -> None:
-        if not 0.0 < self.cone_deg <= 45.0:
-            raise ValueError("cone_deg: must be above 0 and at most 45")
-        if self.gate <= 0.0 or self.turn <= 0.0 or self.merge < 0.0:
-            raise ValueError("gate, turn, merge: must be positive")
-        if self.border_px < 0 or self.gap_px < 0 or self.min_pixels < 16 or not 1 <= self.planes <= MOST:
-            raise ValueError(f"border_px, gap_px, min_pixels, planes: at least 0, 0, 16, and 1 to {MOST}")
-        if self.samples < 1 or self.correlation_px < 1.0 or self.tiles < 4 or self.bias < 0.0:
-            raise ValueError("samples, correlation_px, tiles, bias: must be at least 1, 1 px, 4 and 0")
+    cone_deg: Annotated[float, Range(above=0, high=45)] = 15.0  # normals of one plane lie within this of it
+    gate: PositiveFloat = 3.0  # σ_z of a member's depth
+    turn: PositiveFloat = 0.5  # a region whose normals turn by more than this share of the cone's half angle is curved
+    border_px: NonNegativeInt = 16  # grown into whatever the normals say
+    merge: NonNegativeFloat = 0.3  # rms distance, in σ_z, of a region from the common plane of the two, noise apart
+    gap_px: NonNegativeInt = 8  # between regions that may be one
+    min_pixels: Annotated[int, Range(16)] = 1000  # smallest region
+    planes: Annotated[int, Range(1, MOST)] = 24  # most, the largest
+    samples: PositiveInt = 48  # points spread over a region
+    correlation_px: Annotated[float, Range(1)] = 8.0  # side of the square that counts as one independent depth, where the residuals cannot tell
+    tiles: Annotated[int, Range(4)] = 16  # squares a region is cut into to see how its residuals are correlated
+    bias: NonNegativeFloat = 0.1  # σ_z common to all depths of a region: a real sensor's depth is bent (fr3 of TUM: 0.1 to 0.3 track best)
 
     def _grid(self, frame: Frame, normals: Normals) -> Grid:
         """The frame's depths on the grid of the normals."""

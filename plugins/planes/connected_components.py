@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Annotated
 
+from trihedron.pipeline.core.options import AcuteDeg, Range
 from trihedron.pipeline.core.registry import register
 from trihedron.pipeline.core.types import Frame, Normals, Planes
 from trihedron.plugins.planes.common import EDGE, EDGE_M, PlanarRegions
@@ -18,13 +20,8 @@ class ConnectedComponents(PlanarRegions):
     """Connected components (Trevor et al., SPME 2013; paper, section III-A), each checked to be one plane, grown to its border, merged and fitted by
     weighted least squares in inverse depth."""
 
-    angle_deg: float = 3.0  # normals of neighbouring cells of one component differ by less (Trevor et al.)
-    rounds: int = 3  # components are sought among what is left, this often, with half the cone in each further round
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if not 0.0 < self.angle_deg < 90.0 or not 1 <= self.rounds <= 6:
-            raise ValueError("angle_deg, rounds: must be above 0 and below 90, and 1 to 6")
+    angle_deg: AcuteDeg = 3.0  # normals of neighbouring cells of one component differ by less (Trevor et al.)
+    rounds: Annotated[int, Range(1, 6)] = 3  # components are sought among what is left, this often, with half the cone in each further round
 
     def __call__(self, frame: Frame, normals: Normals) -> Planes:
         """Planes, largest first; `labels` on the grid of the normals."""

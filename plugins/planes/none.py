@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from trihedron.pipeline.core.options import PositiveInt
 from trihedron.pipeline.core.registry import register
 from trihedron.pipeline.core.types import Normals, Planes
 
@@ -15,11 +16,7 @@ from trihedron.pipeline.core.types import Normals, Planes
 class NoPlanes:
     """A value without rows and all labels 0: what the rest of the system does without planes."""
 
-    samples: int = 48  # points of the (absent) regions
-
-    def __post_init__(self) -> None:
-        if self.samples < 1:
-            raise ValueError("samples: must be at least 1")
+    samples: PositiveInt = 48  # points of the (absent) regions
 
     def __call__(self, normals: Normals) -> Planes:
         """Zero planes."""

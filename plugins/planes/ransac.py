@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
 
+from trihedron.pipeline.core.options import PositiveFloat, PositiveInt, Range
 from trihedron.pipeline.core.registry import register
 from trihedron.pipeline.core.types import Frame, Normals, Planes
 from trihedron.plugins.planes.common import EDGE, EDGE_M, PlanarRegions
@@ -20,17 +22,10 @@ class Ransac(PlanarRegions):
     """Sequential RANSAC (Fischler & Bolles 1981, scored as MSAC, Torr & Zisserman 2000): the plane with the best consensus, its largest connected
     region, then the next among what is left; on cells of twice the size. It needs no smooth neighbourhoods, and its random numbers are `rng`'s."""
 
-    hypotheses: int = 120  # planes drawn for each one found
-    rounds: int = 40  # at most
-    misses: int = 5  # rounds in a row without a region, before the search ends
-    sigma: float = 2.0  # σ_z of an inlier's depth
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if not 1 <= self.hypotheses <= 10000 or not 1 <= self.rounds <= MOST or self.misses < 1:
-            raise ValueError(f"hypotheses, rounds, misses: must be 1 to 10000, 1 to {MOST}, and at least 1")
-        if self.sigma <= 0.0:
-            raise ValueError("sigma: must be positive")
+    hypotheses: Annotated[int, Range(1, 10000)] = 120  # planes drawn for each one found
+    rounds: Annotated[int, Range(1, MOST)] = 40  # at most
+    misses: PositiveInt = 5  # rounds in a row without a region, before the search ends
+    sigma: PositiveFloat = 2.0  # σ_z of an inlier's depth
 
     def __call__(self, frame: Frame, normals: Normals, rng: np.random.Generator) -> Planes:
         """Planes, largest first; `labels` on the grid of the normals, which are asked where there are any."""
