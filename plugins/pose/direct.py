@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
 
 from trihedron.pipeline.core.geometry import pose_matrix
+from trihedron.pipeline.core.options import PositiveFloat, PositiveInt, Range, Share
 from trihedron.pipeline.core.registry import register
 from trihedron.pipeline.core.types import F64, Frame, Pose
 from trihedron.plugins.pose.common import Gates, align, dense_pose, first_pose, source_of, student_weights, target_of
@@ -25,21 +27,15 @@ class Direct:
 
     Its odometry alone: the publication's keyframes and pose graph are not part of it. What neither brightness nor depth measures is held."""
 
-    width: int = 320  # px, about, of the finest level
-    levels: int = 3
-    most: int = 10000  # pixels of the finest level that are used, about
-    iterations: int = 10  # of a level, at most
-    least_gradient: float = 5.0  # of brightness, 0 … 255, a pixel; less is noise
-    farthest_m: float = 0.3  # from the surface, that a pixel may be
-    motion_sigma_m: float = 0.1  # of no motion, per frame: a weak prior
-    motion_sigma_deg: float = 5.0
-    min_share: float = 0.3  # of the pixels that must be seen again and agree
-
-    def __post_init__(self) -> None:
-        if self.width < 32 or self.levels < 1 or self.most < 100 or self.iterations < 1:
-            raise ValueError("width, levels, most, iterations: must be at least 32, 1, 100 and 1")
-        if min(self.least_gradient, self.farthest_m, self.motion_sigma_m, self.motion_sigma_deg) <= 0.0 or not 0.0 <= self.min_share <= 1.0:
-            raise ValueError("least_gradient, farthest_m, motion_sigma_m, motion_sigma_deg, min_share: must be positive, min_share at most 1")
+    width: Annotated[int, Range(32)] = 320  # px, about, of the finest level
+    levels: PositiveInt = 3
+    most: Annotated[int, Range(100)] = 10000  # pixels of the finest level that are used, about
+    iterations: PositiveInt = 10  # of a level, at most
+    least_gradient: PositiveFloat = 5.0  # of brightness, 0 … 255, a pixel; less is noise
+    farthest_m: PositiveFloat = 0.3  # from the surface, that a pixel may be
+    motion_sigma_m: PositiveFloat = 0.1  # of no motion, per frame: a weak prior
+    motion_sigma_deg: PositiveFloat = 5.0
+    min_share: Share = 0.3  # of the pixels that must be seen again and agree
 
     def __call__(self, frame: Frame, previous_frame: Frame | None, previous: Pose | None) -> Pose:
         """The pose with status and reason; the identity for the first frame."""

@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from trihedron.pipeline.core.geometry import invert, log_se3
+from trihedron.pipeline.core.options import PositiveFloat, PositiveShare, Share
 from trihedron.pipeline.core.types import DEGRADED, F64, OK, U8, Bool, Keypoints, Map, Matches, Planes, Segments
 from trihedron.plugins.pose.dynamic_objects_kernels import chi2, on_planes_kernel
 from trihedron.plugins.pose.map_alignment import Agreement, MapAlignment, Verdict
@@ -22,17 +23,11 @@ ALL = "all"  # nothing that is at rest says more than all matches do
 class MovingObjects:
     """When what is at rest (`at_rest`) is taken alone, and when what is left is too little to be sure which of the two moves."""
 
-    moving_share: float = 0.15  # by which the shares of new and of proven points that disagree may differ; beyond, something may move
-    moving_gate: float = 2.2  # squared standard deviations (the lowest tenth of χ²) from the pose by what is proven alone, beyond which that is taken
-    moving_sure: float = 13.9  # the same of the position (0.997 of χ²), beyond which it is taken although the new and the proven disagree alike
-    moving_unproven: float = 9.0  # the same from the position by planes alone, beyond which those are taken while nothing can be proven
-    moving_most: float = 0.4  # of all matches that must agree, half if no more of the planes do, else the pose is degraded, known as planes say
-
-    def __post_init__(self) -> None:
-        if not 0.0 < self.moving_share <= 1.0 or not 0.0 <= self.moving_most <= 1.0:
-            raise ValueError("moving_share, moving_most: must be positive and at most 1")
-        if min(self.moving_gate, self.moving_sure, self.moving_unproven) <= 0.0:
-            raise ValueError("moving_gate, moving_sure, moving_unproven: must be positive")
+    moving_share: PositiveShare = 0.15  # by which the shares of new and of proven points that disagree may differ; beyond, something may move
+    moving_gate: PositiveFloat = 2.2  # Mahalanobis distance² (lowest tenth of χ²) from the pose by verified landmarks, beyond which that is taken
+    moving_sure: PositiveFloat = 13.9  # the same of the position (0.997 of χ²), beyond which it is taken although new and verified disagree alike
+    moving_unproven: PositiveFloat = 9.0  # the same from the position by planes alone, beyond which those are taken while nothing can be proven
+    moving_most: Share = 0.4  # of all matches that must agree, half if no more of the planes do, else the pose is degraded, known as planes say
 
     def solved_at_rest(self, problem: MapAlignment) -> tuple[PoseSolution, str]:
         """The solution by all matches and ''; or, where something moves and pulls the pose away, that of what is at rest, with all matches judged by

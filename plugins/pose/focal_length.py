@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from trihedron.pipeline.core.geometry import invert, rotation_angle_deg
+from trihedron.pipeline.core.options import PositiveFloat
 from trihedron.pipeline.core.types import DEGRADED, F32, F64, I32, U8, Frame, Keypoints, Map, Matches
 from trihedron.plugins.mapping.covisibility_graph import current_submap, keyframes_of, newest_keyframes
 from trihedron.plugins.mapping.keyframe_features import measured_points
@@ -30,13 +31,9 @@ from trihedron.plugins.shared.pose_optimizer import PoseSolution
 class FocalLengths:
     """How wrong focal lengths may be, by what keyframes say (`focal_check`) and, while these are few, the frame's motion (`focal_motion`)."""
 
-    focal_off: float = 0.1  # share by which the focal lengths are off, beyond which a pose is called degraded, if the map's newest keyframes
-    focal_worse: float = 0.2  # fit by this share worse for it
-    focal_sure: float = 2.0  # or, while these are few, standard deviations by which the points that move tell so
-
-    def __post_init__(self) -> None:
-        if min(self.focal_off, self.focal_worse, self.focal_sure) <= 0.0:
-            raise ValueError("focal_off, focal_worse, focal_sure: must be positive")
+    focal_off: PositiveFloat = 0.1  # share by which the focal lengths are off, beyond which a pose is called degraded, if the map's newest keyframes
+    focal_worse: PositiveFloat = 0.2  # fit by this share worse for it
+    focal_sure: PositiveFloat = 2.0  # or, while these are few, standard deviations by which the points that move tell so
 
     def judged_by_focal_lengths(self, found: PoseSolution, problem: MapAlignment, said: Verdict) -> Verdict:
         """What is said of a pose; degraded where the focal lengths are wrong, and less well known while the data do not say yet that they are

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
 
 from trihedron.pipeline.core.geometry import invert, pose_matrix
+from trihedron.pipeline.core.options import AcuteDeg, NonNegativeFloat, PositiveFloat, PositiveInt, Range, Share
 from trihedron.pipeline.core.registry import register
 from trihedron.pipeline.core.types import F64, Frame, Pose, PredictedView
 from trihedron.plugins.pose.common import Gates, align, dense_pose, first_pose, huber_weights, source_of, target_of
@@ -23,25 +25,17 @@ class Icp:
 
     It starts where the camera was. The model is its map, so a lost camera that comes back to where it was lost is found again, by a stricter test."""
 
-    photometric: float = 0.0  # weight of brightness besides its noise; 0 = depth alone, colour is not looked at
-    levels: int = 3
-    most: int = 10000  # pixels of the finest level that are used, about
-    iterations: int = 8  # of a level, at most
-    farthest_m: float = 0.1  # from the surface, that a pixel may be (KinectFusion)
-    most_deg: float = 30.0  # between the normals of a pixel and of the surface
-    floor_m: float = 0.003  # error of the model's surface
-    least_gradient: float = 5.0  # of brightness, 0 … 255, a pixel; less is noise
-    motion_sigma_m: float = 0.1  # of no motion, per frame: a weak prior
-    motion_sigma_deg: float = 5.0
-    min_share: float = 0.3  # of the pixels that must fall on the model and agree
-
-    def __post_init__(self) -> None:
-        if self.photometric < 0.0 or self.levels < 1 or self.most < 100 or self.iterations < 1 or not 0.0 < self.most_deg < 90.0:
-            raise ValueError("photometric, levels, most, iterations, most_deg: not negative, at least 1, 100, 1, an angle within 0 … 90")
-        if min(self.farthest_m, self.floor_m, self.least_gradient, self.motion_sigma_m, self.motion_sigma_deg) <= 0.0:
-            raise ValueError("farthest_m, floor_m, least_gradient, motion_sigma_m, motion_sigma_deg: must be positive")
-        if not 0.0 <= self.min_share <= 1.0:
-            raise ValueError("min_share: must be a share, 0 to 1")
+    photometric: NonNegativeFloat = 0.0  # weight of brightness besides its noise; 0 = depth alone, colour is not looked at
+    levels: PositiveInt = 3
+    most: Annotated[int, Range(100)] = 10000  # pixels of the finest level that are used, about
+    iterations: PositiveInt = 8  # of a level, at most
+    farthest_m: PositiveFloat = 0.1  # from the surface, that a pixel may be (KinectFusion)
+    most_deg: AcuteDeg = 30.0  # between the normals of a pixel and of the surface
+    floor_m: PositiveFloat = 0.003  # error of the model's surface
+    least_gradient: PositiveFloat = 5.0  # of brightness, 0 … 255, a pixel; less is noise
+    motion_sigma_m: PositiveFloat = 0.1  # of no motion, per frame: a weak prior
+    motion_sigma_deg: PositiveFloat = 5.0
+    min_share: Share = 0.3  # of the pixels that must fall on the model and agree
 
     def __call__(self, frame: Frame, previous: Pose | None, model: PredictedView | None) -> Pose:
         """The pose with status and reason; the identity for the first frame."""

@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from trihedron.pipeline.core.geometry import adjoint, invert
+from trihedron.pipeline.core.options import NonNegativeInt, PositiveFloat, Share, check_increasing
 from trihedron.pipeline.core.registry import register
 from trihedron.pipeline.core.types import (
     DEGRADED,
@@ -38,16 +39,14 @@ from trihedron.plugins.shared.pose_optimizer import PoseSolution
 class TrackingQuality:
     """How much of what is sought must agree with a pose; and with the first one after a loss, which has nothing else to go by."""
 
-    min_inliers: int = 10  # points + 2 lines + 5 planes below which the pose is called degraded
-    min_share: float = 0.25  # of the matches that must agree, else it is called degraded
-    found_inliers: int = 30  # points + 2 lines + 5 planes that find a lost pose again
-    found_share: float = 0.5  # of the matches that must agree for that
+    min_inliers: NonNegativeInt = 10  # points + 2 lines + 5 planes below which the pose is called degraded
+    min_share: Share = 0.25  # of the matches that must agree, else it is called degraded
+    found_inliers: NonNegativeInt = 30  # points + 2 lines + 5 planes that find a lost pose again
+    found_share: Share = 0.5  # of the matches that must agree for that
 
     def __post_init__(self) -> None:
-        if self.min_inliers < 0 or not 0.0 <= self.min_share <= 1.0:
-            raise ValueError("min_inliers, min_share: must not be negative, min_share at most 1")
-        if self.found_inliers < self.min_inliers or not self.min_share <= self.found_share <= 1.0:
-            raise ValueError("found_inliers, found_share: must be at least min_inliers and min_share, found_share at most 1")
+        check_increasing(self, "min_inliers", "found_inliers")
+        check_increasing(self, "min_share", "found_share")
 
     def enough(self, seen: Agreement) -> bool:
         """Whether this much is believed of a camera that was tracked."""
@@ -121,11 +120,7 @@ def _sigmas_m(map: Map, keyframes: list[int]) -> dict[int, float]:
 class Foundations:
     """How much worse than a pose the keyframes behind it may be known: after a loss, or where planes alone said where they are, they are poor."""
 
-    weak_foundation: float = 3.0  # times its own standard deviation that the map's keyframes about here may have before a pose is called degraded
-
-    def __post_init__(self) -> None:
-        if self.weak_foundation <= 0.0:
-            raise ValueError("weak_foundation: must be positive")
+    weak_foundation: PositiveFloat = 3.0  # times its own standard deviation that the nearby keyframes may have before a pose is degraded
 
     def judged_by_foundation(self, found: PoseSolution, problem: MapAlignment, said: Verdict) -> Verdict:
         """What is said of a pose, which is not better known than the keyframes behind what it was found from."""
@@ -152,20 +147,11 @@ class Refine(TrackingQuality, MovingObjects, Foundations, FocalLengths):
     of a pose is a base of its own, with its options: whether enough of the map agrees, what moves, how well the map there is known, and whether the
     focal lengths are right."""
 
-    position_sigma_m: float = 0.05  # of the decoupled position, a weak prior
-    rotation_sigma_deg: float = 0.2  # added to the rotation's own: no scene is exactly Manhattan
-    line_sigma_px: float = 1.0  # of a segment's end point across it
-    relation_sigma_deg: float = 0.5  # walls are parallel or perpendicular to within this
-    submap_after: int = 15  # frames that show a place that is not known, after which a lost camera begins a new sub-map; 0 = never
-
-    def __post_init__(self) -> None:
-        for name in ("position_sigma_m", "rotation_sigma_deg", "line_sigma_px", "relation_sigma_deg"):
-            if getattr(self, name) <= 0.0:
-                raise ValueError(f"{name}: must be positive")
-        if self.submap_after < 0:
-            raise ValueError("submap_after: must not be negative")
-        for judgement in Refine.__bases__:
-            judgement.__post_init__(self)  # type: ignore[attr-defined]
+    position_sigma_m: PositiveFloat = 0.05  # of the decoupled position, a weak prior
+    rotation_sigma_deg: PositiveFloat = 0.2  # added to the rotation's own: no scene is exactly Manhattan
+    line_sigma_px: PositiveFloat = 1.0  # of a segment's end point across it
+    relation_sigma_deg: PositiveFloat = 0.5  # walls are parallel or perpendicular to within this
+    submap_after: NonNegativeInt = 15  # frames that show a place that is not known, after which a lost camera begins a new sub-map; 0 = never
 
     def __call__(
         self,
