@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from trihedron.pipeline.core.options import NonNegativeInt, PositiveFloat, PositiveInt, PositiveShare, Share
 from trihedron.pipeline.core.registry import register
 from trihedron.pipeline.core.types import DEGRADED, F64, I32, LOST, OK, Frame, Keypoints, Map, Planes, Pose, Rotation, Segments
 from trihedron.plugins.mapping.covisibility_graph import keyframes_of, living_keyframes, observed_by
@@ -27,33 +28,23 @@ class Features:
     space, and no other place explains the frame nearly as well: a room that looks the same from two sides is refused, not guessed. A large map is
     looked through block by block, one a frame. Points need binary descriptors."""
 
-    block: int = 80  # keyframes looked at in one frame
-    every: int = 5  # frames between looks at older sub-maps, while the camera is tracked in one that is not tied to them
-    candidates: int = 20  # of them, whose landmarks make hypotheses
-    max_bits: int = 64  # of 256 between descriptors; the mean of strangers is 128
-    ratio: float = 0.85  # best to second best descriptor
-    draws: int = 1000  # triples of points tried
-    by_points: int = 4  # hypotheses verified
-    by_layout: int = 8
-    near: int = 8  # keyframes taken from about a hypothesis, whose landmarks verify it
-    min_score: int = 30  # points + 2 lines + 5 planes that recognise a place
-    min_details: int = 25  # points + 3 lines among them
-    min_share: float = 0.5  # of the matches that must agree
-    min_found: float = 0.08  # of the details expected in view (rooms built alike: at most 0.05; the same place: at least 0.12)
-    max_through: float = 0.15  # of the surfaces in view that the camera may see through, as for a loop
-    rival: float = 0.75  # of the best place's score, that makes another place as likely
-    angle_px: float = 0.002  # rad, of a pixel
-    floor_m: float = 0.01  # least error of a point's place
-
-    def __post_init__(self) -> None:
-        if min(self.block, self.every, self.candidates, self.draws, self.by_points, self.by_layout, self.near, self.min_score, self.min_details) < 1:
-            raise ValueError("block, every, candidates, draws, by_points, by_layout, near, min_score, min_details: must be at least 1")
-        if not 0.0 < self.ratio <= 1.0 or not 0.0 < self.rival <= 1.0:
-            raise ValueError("ratio, rival: must be in (0, 1]")
-        if not all(0.0 <= share <= 1.0 for share in (self.min_share, self.min_found, self.max_through)):
-            raise ValueError("min_share, min_found, max_through: must be in [0, 1]")
-        if min(self.angle_px, self.floor_m) <= 0.0 or self.max_bits < 0:
-            raise ValueError("angle_px, floor_m, max_bits: must be positive")
+    block: PositiveInt = 80  # keyframes looked at in one frame
+    every: PositiveInt = 5  # frames between looks at older sub-maps, while the camera is tracked in one that is not tied to them
+    candidates: PositiveInt = 20  # of them, whose landmarks make hypotheses
+    max_bits: NonNegativeInt = 64  # of 256 between descriptors; the mean of strangers is 128
+    ratio: PositiveShare = 0.85  # best to second best descriptor
+    draws: PositiveInt = 1000  # triples of points tried
+    by_points: PositiveInt = 4  # hypotheses verified
+    by_layout: PositiveInt = 8
+    near: PositiveInt = 8  # keyframes taken from about a hypothesis, whose landmarks verify it
+    min_score: PositiveInt = 30  # points + 2 lines + 5 planes that recognise a place
+    min_details: PositiveInt = 25  # points + 3 lines among them
+    min_share: Share = 0.5  # of the matches that must agree
+    min_found: Share = 0.08  # of the details expected in view (rooms built alike: at most 0.05; the same place: at least 0.12)
+    max_through: Share = 0.15  # of the surfaces in view that the camera may see through, as for a loop
+    rival: PositiveShare = 0.75  # of the best place's score, that makes another place as likely
+    angle_px: PositiveFloat = 0.002  # rad, of a pixel
+    floor_m: PositiveFloat = 0.01  # least error of a point's place
 
     def __call__(
         self,
