@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from trihedron.pipeline.core.options import PositiveFloat
 from trihedron.pipeline.core.registry import register
 from trihedron.pipeline.core.types import Keypoints, Map, Pose, Rotation, Tracks
 from trihedron.plugins.mapping.reference_keyframe import anchored_before
@@ -20,13 +21,9 @@ class ConstantVelocity:
     """The previous rotation turned on by the tracks' `R_current_previous` as it stands: where nothing was tracked, that is the last turn once more.
     A baseline, and what a lost camera has left; it is never more than a prediction."""
 
-    pose_floor_deg: float = 0.1  # least error of the previous pose
-    prior_deg: float = 2.0  # error of the last turn once more, per frame
-    tracked_deg: float = 0.1  # and of a turn that was corrected by what the tracks found
-
-    def __post_init__(self) -> None:
-        if min(self.pose_floor_deg, self.prior_deg, self.tracked_deg) <= 0.0:
-            raise ValueError("pose_floor_deg, prior_deg, tracked_deg: must be positive")
+    pose_floor_deg: PositiveFloat = 0.1  # least error of the previous pose
+    prior_deg: PositiveFloat = 2.0  # error of the last turn once more, per frame
+    tracked_deg: PositiveFloat = 0.1  # and of a turn that was corrected by what the tracks found
 
     def __call__(
         self, tracks: Tracks | None, keypoints: Keypoints, previous: Rotation | None, previous_pose: Pose | None, map: Map | None

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
 
 from trihedron.pipeline.core.geometry import exp_so3, log_so3
+from trihedron.pipeline.core.options import NonNegativeInt, PositiveFloat, PositiveInt, Range
 from trihedron.pipeline.core.registry import register
 from trihedron.pipeline.core.types import F64, Keypoints, ManhattanFrame, Map, Planes, Pose, Rotation, Segments, Tracks
 from trihedron.plugins.mapping.reference_keyframe import anchored_before
@@ -25,32 +27,22 @@ class DriftFree:
     the one seen disagrees with the tracks, the tracks go on alone and their covariance grows, so that a Manhattan frame that comes back takes over
     by degrees. One that disagrees is remembered under a number of its own. The world–Manhattan rotations are re-estimated from refined poses."""
 
-    unit_deg: float = 0.3  # an observation of R_world_manhattan with this standard deviation counts as one
-    max_weight: float = 300.0  # observations; more do not make it stiffer
-    correlation: float = 10.0  # successive frames err alike: so many observations count as one in its covariance
-    axis_floor_deg: float = 0.1  # least error of R_world_manhattan
-    pose_floor_deg: float = 0.1  # least error of the previous pose: the map drifts, which its covariance does not know
-    gate: float = 4.0  # standard deviations between tracks and Manhattan frame
-    gate_floor_deg: float = 0.7  # least standard deviation of that difference
-    step_deg: float = 0.5  # most that a Manhattan frame corrects rotations from tracks in one frame: no jump
+    unit_deg: PositiveFloat = 0.3  # an observation of R_world_manhattan with this standard deviation counts as one
+    max_weight: Annotated[float, Range(1)] = 300.0  # observations; more do not make it stiffer
+    correlation: Annotated[float, Range(1)] = 10.0  # successive frames err alike: so many observations count as one in its covariance
+    axis_floor_deg: PositiveFloat = 0.1  # least error of R_world_manhattan
+    pose_floor_deg: PositiveFloat = 0.1  # least error of the previous pose: the map drifts, which its covariance does not know
+    gate: PositiveFloat = 4.0  # standard deviations between tracks and Manhattan frame
+    gate_floor_deg: PositiveFloat = 0.7  # least standard deviation of that difference
+    step_deg: PositiveFloat = 0.5  # most that a Manhattan frame corrects rotations from tracks in one frame: no jump
     min_observations: float = 3.0  # frames seen less often are forgotten when out of sight
-    max_frames: int = 6  # Manhattan frames remembered
-    prior_deg: float = 2.0  # of the predicted rotation, per frame
-    prior_m: float = 0.1  # of the motion, per frame
-    measured_deg: float = 1.0  # tracks that leave the rotation less certain than this have not measured it
-    angle_px: float = 0.002  # rad, of a pixel
-    plane_floor_deg: float = 0.3  # error of a tracked plane's normal
-    predict_frames: int = 15  # half a second without features: beyond, a velocity says nothing of a hand
-
-    def __post_init__(self) -> None:
-        if min(self.unit_deg, self.axis_floor_deg, self.pose_floor_deg, self.gate, self.gate_floor_deg, self.prior_deg, self.prior_m) <= 0.0:
-            raise ValueError("unit_deg, axis_floor_deg, pose_floor_deg, gate, gate_floor_deg, prior_deg, prior_m: must be positive")
-        if self.max_weight < 1.0 or self.correlation < 1.0 or self.max_frames < 1:
-            raise ValueError("max_weight, correlation, max_frames: must be at least 1")
-        if self.predict_frames < 0:
-            raise ValueError("predict_frames: must not be negative")
-        if min(self.measured_deg, self.angle_px, self.plane_floor_deg, self.step_deg) <= 0.0:
-            raise ValueError("step_deg, measured_deg, angle_px, plane_floor_deg: must be positive")
+    max_frames: PositiveInt = 6  # Manhattan frames remembered
+    prior_deg: PositiveFloat = 2.0  # of the predicted rotation, per frame
+    prior_m: PositiveFloat = 0.1  # of the motion, per frame
+    measured_deg: PositiveFloat = 1.0  # tracks that leave the rotation less certain than this have not measured it
+    angle_px: PositiveFloat = 0.002  # rad, of a pixel
+    plane_floor_deg: PositiveFloat = 0.3  # error of a tracked plane's normal
+    predict_frames: NonNegativeInt = 15  # half a second without features: beyond, a velocity says nothing of a hand
 
     def __call__(
         self,

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from trihedron.pipeline.core.options import PositiveFloat
 from trihedron.pipeline.core.registry import register
 from trihedron.pipeline.core.types import F64, Keypoints, ManhattanFrame, Rotation
 from trihedron.plugins.rotation.common import Estimate, KnownFrames, rotation_value
@@ -22,11 +23,7 @@ class ManhattanRotation:
 
     Nothing else measures the rotation. Where no Manhattan frame is supported it is held, ever less certain, and says so (`source` prediction)."""
 
-    held_deg: float = 2.0  # error of a rotation that is held, per frame
-
-    def __post_init__(self) -> None:
-        if self.held_deg <= 0.0:
-            raise ValueError("held_deg: must be positive")
+    held_deg: PositiveFloat = 2.0  # error of a rotation that is held, per frame
 
     def __call__(self, manhattan: ManhattanFrame | None, keypoints: Keypoints, previous: Rotation | None) -> Rotation:
         """The rotation of this frame; the identity for the first."""

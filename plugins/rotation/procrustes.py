@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from trihedron.pipeline.core.options import NonNegativeInt, PositiveFloat
 from trihedron.pipeline.core.registry import register
 from trihedron.pipeline.core.types import Keypoints, Map, Planes, Pose, Rotation, Segments, Tracks
 from trihedron.plugins.mapping.reference_keyframe import anchored_before
@@ -18,19 +19,13 @@ class Procrustes:
     """The rotation that aligns the tracked points, lines and planes of the previous frame with this one's, on top of the previous pose: what
     `drift_free` falls back on, for comparison. No Manhattan frame takes part, so it drifts."""
 
-    pose_floor_deg: float = 0.1  # least error of the previous pose
-    prior_deg: float = 2.0  # of the predicted rotation, per frame
-    prior_m: float = 0.1  # of the motion, per frame
-    measured_deg: float = 1.0  # tracks that leave the rotation less certain than this have not measured it
-    angle_px: float = 0.002  # rad, of a pixel
-    plane_floor_deg: float = 0.3  # error of a tracked plane's normal
-    predict_frames: int = 15  # half a second without features: beyond, a velocity says nothing of a hand
-
-    def __post_init__(self) -> None:
-        if self.predict_frames < 0:
-            raise ValueError("predict_frames: must not be negative")
-        if min(self.pose_floor_deg, self.prior_deg, self.prior_m, self.measured_deg, self.angle_px, self.plane_floor_deg) <= 0.0:
-            raise ValueError("pose_floor_deg, prior_deg, prior_m, measured_deg, angle_px, plane_floor_deg: must be positive")
+    pose_floor_deg: PositiveFloat = 0.1  # least error of the previous pose
+    prior_deg: PositiveFloat = 2.0  # of the predicted rotation, per frame
+    prior_m: PositiveFloat = 0.1  # of the motion, per frame
+    measured_deg: PositiveFloat = 1.0  # tracks that leave the rotation less certain than this have not measured it
+    angle_px: PositiveFloat = 0.002  # rad, of a pixel
+    plane_floor_deg: PositiveFloat = 0.3  # error of a tracked plane's normal
+    predict_frames: NonNegativeInt = 15  # half a second without features: beyond, a velocity says nothing of a hand
 
     def __call__(
         self,

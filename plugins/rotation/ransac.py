@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
 
+from trihedron.pipeline.core.options import PositiveFloat, PositiveInt, Range
 from trihedron.pipeline.core.registry import register
 from trihedron.pipeline.core.types import Keypoints, Map, Pose, Rotation, Tracks
 from trihedron.plugins.mapping.reference_keyframe import anchored_before
@@ -19,15 +21,11 @@ class Ransac:
     """The rotation of the rigid motion that most tracked points with depth in both frames agree on, on top of the previous pose (RGB-D SLAM: Endres
     et al., T-RO 2014). Where too few agree it is held, and says so."""
 
-    rounds: int = 200  # samples of three
-    gate: float = 3.0  # standard deviations within which a point agrees
-    min_points: int = 12
-    held_deg: float = 2.0  # error of a rotation that is held, per frame
-    pose_floor_deg: float = 0.02  # least error of the previous pose
-
-    def __post_init__(self) -> None:
-        if self.rounds < 1 or self.min_points < 3 or min(self.gate, self.held_deg, self.pose_floor_deg) <= 0.0:
-            raise ValueError("rounds, min_points, gate, held_deg, pose_floor_deg: at least 1, at least 3, and positive")
+    rounds: PositiveInt = 200  # samples of three
+    gate: PositiveFloat = 3.0  # standard deviations within which a point agrees
+    min_points: Annotated[int, Range(3)] = 12
+    held_deg: PositiveFloat = 2.0  # error of a rotation that is held, per frame
+    pose_floor_deg: PositiveFloat = 0.02  # least error of the previous pose
 
     def __call__(
         self, tracks: Tracks | None, keypoints: Keypoints, previous: Rotation | None, previous_pose: Pose | None, map: Map | None,
