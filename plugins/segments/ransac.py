@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Annotated
 
+from trihedron.pipeline.core.options import NonNegativeFloat, PositiveFloat, PositiveShare, Range
 from trihedron.pipeline.core.registry import register
 from trihedron.pipeline.core.types import Frame, LineSegments, Segments
 from trihedron.plugins.segments.ransac_kernels import lift_segments
@@ -18,25 +20,15 @@ class Ransac:
     Every sample has a depth noise of its own, the acceptance is a share of the samples that were taken, and hypotheses are enumerated, not drawn.
     A segment on a depth edge takes the nearer surface, whose border it is. Rows without a 3D line are NaN; their image segment stays usable."""
 
-    samples: int = 64  # most depth samples along a segment
-    side_px: int = 3  # searched across the segment for the nearer surface
-    edge: float = 0.02  # a step above gate · σ_z + edge · z parts two surfaces
-    gate: float = 3.0  # σ_z within which a sample is an inlier
-    share: float = 0.5  # of the samples with depth that must be inliers
-    min_inliers: int = 10
-    sigma_px: float = 0.5  # of the end points across and along the segment
-    correlation_px: float = 4.0  # samples nearer than this do not count as independent
-    bias: float = 0.3  # σ_z common to all samples of a line
-
-    def __post_init__(self) -> None:
-        if self.samples < 2 or self.min_inliers < 2:
-            raise ValueError("samples, min_inliers: must be at least 2")
-        if not 0 <= self.side_px <= 20:
-            raise ValueError("side_px: must be 0 to 20")
-        if self.edge < 0.0 or self.gate <= 0.0 or not 0.0 < self.share <= 1.0:
-            raise ValueError("edge, gate, share: edge at least 0, gate above 0, share in (0, 1]")
-        if self.sigma_px <= 0.0 or self.correlation_px < 0.0 or self.bias < 0.0:
-            raise ValueError("sigma_px, correlation_px, bias: must not be negative, sigma_px above 0")
+    samples: Annotated[int, Range(2)] = 64  # most depth samples along a segment
+    side_px: Annotated[int, Range(0, 20)] = 3  # searched across the segment for the nearer surface
+    edge: NonNegativeFloat = 0.02  # a step above gate · σ_z + edge · z parts two surfaces
+    gate: PositiveFloat = 3.0  # σ_z within which a sample is an inlier
+    share: PositiveShare = 0.5  # of the samples with depth that must be inliers
+    min_inliers: Annotated[int, Range(2)] = 10
+    sigma_px: PositiveFloat = 0.5  # of the end points across and along the segment
+    correlation_px: NonNegativeFloat = 4.0  # samples nearer than this do not count as independent
+    bias: NonNegativeFloat = 0.3  # σ_z common to all samples of a line
 
     def __call__(self, frame: Frame, lines: LineSegments) -> Segments:
         """One row per row of `lines`."""
