@@ -4,10 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from typing import Annotated
 
 import cv2
 import numpy as np
 
+from trihedron.pipeline.core.options import NonNegativeFloat, PositiveFloat, PositiveShare, Range
 from trihedron.pipeline.core.types import F32, F64, I32, LOST, PLANE_KINDS, U8, Bool, DepthNoise, Frame, Map, Planes, Pose, Rotation, Surface
 from trihedron.plugins.shared.keyframe_views import KeyframeView, Known, readings, view_of
 from trihedron.plugins.shared.tsdf_volume import CELLS, Volume
@@ -50,16 +52,10 @@ class Gathered:
 class ViewFold:
     """Keeps the views that tell something new, at their final poses in the end."""
 
-    view_width: int = 320  # px, about, to which images are reduced
-    max_sigma_m: float = 0.05  # depth less certain than this is not used: a Kinect's beyond 4.2 m; a frame's planes say how certain it is
-    views: float = 6.0  # of its quality, after which a view has nothing new to tell of a place
-    news: float = 0.15  # share of new readings for which a view is kept
-
-    def __post_init__(self) -> None:
-        if not 16 <= self.view_width <= 4096:
-            raise ValueError("view_width: must be 16 to 4096 px")
-        if self.max_sigma_m <= 0.0 or self.views < 1.0 or not 0.0 < self.news <= 1.0:
-            raise ValueError("max_sigma_m, views, news: must be positive, at least 1, and a share in (0, 1]")
+    view_width: Annotated[int, Range(16, 4096)] = 320  # px, about, to which images are reduced
+    max_sigma_m: PositiveFloat = 0.05  # depth less certain than this is not used: a Kinect's beyond 4.2 m; a frame's planes say how certain it is
+    views: Annotated[float, Range(1)] = 6.0  # of its quality, after which a view has nothing new to tell of a place
+    news: PositiveShare = 0.15  # share of new readings for which a view is kept
 
     def start(self) -> Gathered:
         """Nothing seen."""
@@ -90,18 +86,15 @@ class ViewFold:
 class VolumeFold(ViewFold):
     """Fuses the views it keeps as they come, and all of them again in the end if the map has moved one since."""
 
-    voxel_m: float = 0.02
-    truncation_m: float = 0.06
-    max_error_m: float = 0.025  # standard deviation of a voxel's distance above which it is not known
-    rebuild_m: float = 0.01  # motion of a view for which the volume is built again
-    crumb_m2: float = 0.005  # a loose piece of the mesh that is smaller is left out
+    voxel_m: PositiveFloat = 0.02
+    truncation_m: PositiveFloat = 0.06
+    max_error_m: PositiveFloat = 0.025  # standard deviation of a voxel's distance above which it is not known
+    rebuild_m: PositiveFloat = 0.01  # motion of a view for which the volume is built again
+    crumb_m2: NonNegativeFloat = 0.005  # a loose piece of the mesh that is smaller is left out
 
     def __post_init__(self) -> None:
-        super().__post_init__()
-        if self.voxel_m <= 0.0 or self.truncation_m < 2.0 * self.voxel_m:
-            raise ValueError("voxel_m, truncation_m: must be positive, and at least two voxels")
-        if self.max_error_m <= 0.0 or self.rebuild_m <= 0.0 or self.crumb_m2 < 0.0:
-            raise ValueError("max_error_m, rebuild_m, crumb_m2: must be positive, and not negative")
+        if self.truncation_m < 2.0 * self.voxel_m:
+            raise ValueError(f"truncation_m: {self.truncation_m} is less than two voxels of {self.voxel_m} m")
 
     def _kept(self, state: Gathered, view: KeyframeView) -> None:
         """Fuse it, unless it stands in another world as yet."""

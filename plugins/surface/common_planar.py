@@ -4,9 +4,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from itertools import pairwise
+from typing import Annotated
 
 import numpy as np
 
+from trihedron.pipeline.core.options import AcuteDeg, NonNegativeFloat, NonNegativeInt, PositiveFloat, Range, check_increasing
 from trihedron.pipeline.core.types import F64, I32, Map, Surface
 from trihedron.plugins.surface.common import Gathered, VolumeFold, pictured
 from trihedron.plugins.surface.common_meshes import (
@@ -43,22 +45,20 @@ from trihedron.plugins.surface.common_planar_kernels import (
 class PlanarFold(VolumeFold):
     """Fuses all views, finds the planes of the map and others in the mesh, and makes polygons of them."""
 
-    distance_m: float = 0.012  # of a vertex from its plane
-    angle_deg: float = 25.0  # between the mesh's normal there and the plane's
-    rim_m: float = 0.03  # of a vertex from its plane in the rounded rim about it
-    rim: int = 4  # triangles wide
-    area_m2: float = 0.02  # of the smallest planar part
-    bend_per_m: float = 0.8  # curvature above which a part is not flat
-    snap_m: float = 0.05  # how far a vertex may be moved onto the line or the point where planes meet
-    outline_m: float = 0.02  # error allowed to an outline
-    hole_m2: float = 0.01  # a hole in a plane's mesh, with nothing in it, that is smaller is closed
-    texel_m: float = 0.015  # of the picture of the planes
+    distance_m: PositiveFloat = 0.012  # of a vertex from its plane
+    angle_deg: AcuteDeg = 25.0  # between the mesh's normal there and the plane's
+    rim_m: PositiveFloat = 0.03  # of a vertex from its plane in the rounded rim about it
+    rim: NonNegativeInt = 4  # triangles wide
+    area_m2: PositiveFloat = 0.02  # of the smallest planar part
+    bend_per_m: PositiveFloat = 0.8  # curvature above which a part is not flat
+    snap_m: PositiveFloat = 0.05  # how far a vertex may be moved onto the line or the point where planes meet
+    outline_m: NonNegativeFloat = 0.02  # error allowed to an outline
+    hole_m2: NonNegativeFloat = 0.01  # a hole in a plane's mesh, with nothing in it, that is smaller is closed
+    texel_m: Annotated[float, Range(0.001)] = 0.015  # of the picture of the planes
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        _ = self._flatness
-        if self.snap_m <= 0.0 or self.outline_m < 0.0 or self.hole_m2 < 0.0 or self.texel_m < 0.001:
-            raise ValueError("snap_m, outline_m, hole_m2, texel_m: must be positive, not negative twice, and at least a millimetre")
+        check_increasing(self, "distance_m", "rim_m")
 
     @property
     def _flatness(self) -> Flatness:
@@ -92,12 +92,6 @@ class Flatness:
     rim: int  # triangles wide
     area_m2: float  # of the smallest planar part
     bend_per_m: float  # curvature above which a part is not flat
-
-    def __post_init__(self) -> None:
-        if not 0.0 < self.distance_m <= self.rim_m or not 0.0 < self.angle_deg < 90.0:
-            raise ValueError("distance_m, rim_m, angle_deg: 0 < distance_m <= rim_m, and an angle within 0 … 90")
-        if self.rim < 0 or self.area_m2 <= 0.0 or self.bend_per_m <= 0.0:
-            raise ValueError("rim, area_m2, bend_per_m: at least 0, and positive")
 
 
 def map_planes(map: Map | None) -> tuple[I32, F64]:

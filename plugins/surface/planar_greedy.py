@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
 
+from trihedron.pipeline.core.options import AcuteDeg, PositiveFloat, PositiveInt, Range
 from trihedron.pipeline.core.registry import register
 from trihedron.pipeline.core.types import F64, I32, Map, Surface
 from trihedron.plugins.surface.common import Gathered, ViewFold, pictured
@@ -20,20 +22,13 @@ from trihedron.plugins.surface.planar_greedy_kernels import MOST, accepted
 class PlanarGreedy(ViewFold):
     """Points of each plane of the map, found by a kd-tree and joined by greedy triangulation (paper, section V-B); in the plane's own axes."""
 
-    angle_deg: float = 10.0  # between a region and the plane it belongs to (paper)
-    distance_m: float = 0.05  # of its points from it, on average
-    spacing_m: float = 0.07  # between the points of a plane
-    radius_m: float = 5.0  # of the search for neighbours (paper)
-    multiplier: float = 5.0  # of a point's distance to its nearest neighbour, farther than which it is joined to none (paper)
-    pixel_step: int = 4  # px between the readings that are gathered
-    texel_m: float = 0.015  # of the picture of the planes
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if not 0.0 < self.angle_deg < 90.0 or self.distance_m <= 0.0 or self.pixel_step < 1:
-            raise ValueError("angle_deg, distance_m, pixel_step: an angle within 0 … 90, positive, and at least 1")
-        if self.spacing_m < 0.01 or self.radius_m <= 0.0 or self.multiplier <= 1.0 or self.texel_m < 0.001:
-            raise ValueError("spacing_m, radius_m, multiplier, texel_m: at least 0.01, positive, above 1, and at least 0.001")
+    angle_deg: AcuteDeg = 10.0  # between a region and the plane it belongs to (paper)
+    distance_m: PositiveFloat = 0.05  # of its points from it, on average
+    spacing_m: Annotated[float, Range(0.01)] = 0.07  # between the points of a plane
+    radius_m: PositiveFloat = 5.0  # of the search for neighbours (paper)
+    multiplier: Annotated[float, Range(above=1)] = 5.0  # times the distance to a point's nearest neighbour, beyond which it is joined to none (paper)
+    pixel_step: PositiveInt = 4  # px between the readings that are gathered
+    texel_m: Annotated[float, Range(0.001)] = 0.015  # of the picture of the planes
 
     def finish(self, state: Gathered, map: Map | None) -> Surface:
         """One mesh for each plane that was seen."""

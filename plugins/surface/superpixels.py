@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Annotated
 
 import numpy as np
 
+from trihedron.pipeline.core.options import AcuteDeg, PositiveInt, Range
 from trihedron.pipeline.core.registry import register
 from trihedron.pipeline.core.types import Map, Surface
 from trihedron.plugins.shared.keyframe_views import KeyframeView
@@ -19,14 +21,9 @@ class Superpixels(ViewFold):
     """Superpixels of the views fused to discs that hang on the keyframes (Wang, Gao, Shen, ICRA 2019; the paper's "SPFu"). No plane takes part, which
     is the difference from `surfels`."""
 
-    side_px: int = 8  # of a superpixel, in the reduced view
-    angle_deg: float = 30.0  # between the normals of superpixels of one surfel
-    least: int = 3  # views that must agree on a surfel
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if self.side_px < 2 or not 0.0 < self.angle_deg < 90.0 or self.least < 1:
-            raise ValueError("side_px, angle_deg, least: at least 2, an angle within 0 … 90, at least 1")
+    side_px: Annotated[int, Range(2)] = 8  # of a superpixel, in the reduced view
+    angle_deg: AcuteDeg = 30.0  # between the normals of superpixels of one surfel
+    least: PositiveInt = 3  # views that must agree on a surfel
 
     def _kept(self, state: Gathered, view: KeyframeView) -> None:
         """Cut it, as if it had no planes."""

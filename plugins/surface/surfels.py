@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
 
+from trihedron.pipeline.core.options import AcuteDeg, PositiveFloat, PositiveInt, Range, check_increasing
 from trihedron.pipeline.core.registry import register
 from trihedron.pipeline.core.types import Map, Surface
 from trihedron.plugins.shared.keyframe_views import KeyframeView
@@ -19,20 +21,16 @@ from trihedron.plugins.surface.common_superpixels import discs, fused, moved, ob
 class Surfels(ViewFold):
     """Superpixels of the views fused to discs (Wang, Gao, Shen, ICRA 2019), but coarse where the view is planar: a wall needs few."""
 
-    side_px: int = 6  # of a superpixel, in the reduced view
-    coarse_px: int = 20  # in planar regions
-    angle_deg: float = 30.0  # between the normals of superpixels of one surfel
-    least: int = 3  # views that must agree on a surfel
-    region_deg: float = 10.0  # between a region and the plane it belongs to
-    region_m: float = 0.05  # of its points from it, on average
-    texel_m: float = 0.015  # of the picture of the planes
+    side_px: Annotated[int, Range(2)] = 6  # of a superpixel, in the reduced view
+    coarse_px: Annotated[int, Range(2)] = 20  # in planar regions
+    angle_deg: AcuteDeg = 30.0  # between the normals of superpixels of one surfel
+    least: PositiveInt = 3  # views that must agree on a surfel
+    region_deg: AcuteDeg = 10.0  # between a region and the plane it belongs to
+    region_m: PositiveFloat = 0.05  # of its points from it, on average
+    texel_m: Annotated[float, Range(0.001)] = 0.015  # of the picture of the planes
 
     def __post_init__(self) -> None:
-        super().__post_init__()
-        if not 2 <= self.side_px <= self.coarse_px or not 0.0 < self.angle_deg < 90.0 or self.least < 1:
-            raise ValueError("side_px, coarse_px, angle_deg, least: 2 <= side_px <= coarse_px, an angle within 0 … 90, at least 1")
-        if not 0.0 < self.region_deg < 90.0 or self.region_m <= 0.0 or self.texel_m < 0.001:
-            raise ValueError("region_deg, region_m, texel_m: an angle within 0 … 90, positive, and at least 0.001")
+        check_increasing(self, "side_px", "coarse_px")
 
     def _kept(self, state: Gathered, view: KeyframeView) -> None:
         """Cut it."""
