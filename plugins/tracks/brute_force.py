@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from trihedron.pipeline.core.options import PositiveFloat, PositiveInt, PositiveShare
 from trihedron.pipeline.core.registry import register
 from trihedron.pipeline.core.types import Frame, Keypoints, Planes, Segments, Tracks
 from trihedron.plugins.shared.descriptors import mutual_matches
@@ -19,18 +20,12 @@ class BruteForce:
     """Key points whose descriptors are each other's nearest among all (as RGB-D SLAM matches them: Endres et al., T-RO 2014): no motion is
     predicted, and wrong pairs are left to who uses them. Lines and planes are then paired by the points' motion."""
 
-    ratio: float = 0.9  # best to second best descriptor
-    max_age: int = 10  # frames; older features are not looked for
-    prior_deg: float = 10.0  # of no rotation, per frame
-    prior_m: float = 0.1  # of no translation, per frame
-    angle_px: float = 0.002  # rad, of a pixel
-    plane_floor_deg: float = 0.3
-
-    def __post_init__(self) -> None:
-        if not 0.0 < self.ratio <= 1.0 or self.max_age < 1:
-            raise ValueError("ratio, max_age: must be in (0, 1], and at least 1")
-        if min(self.prior_deg, self.prior_m, self.angle_px, self.plane_floor_deg) <= 0.0:
-            raise ValueError("prior_deg, prior_m, angle_px, plane_floor_deg: must be positive")
+    ratio: PositiveShare = 0.9  # best to second best descriptor
+    max_age: PositiveInt = 10  # frames; older features are not looked for
+    prior_deg: PositiveFloat = 10.0  # of no rotation, per frame
+    prior_m: PositiveFloat = 0.1  # of no translation, per frame
+    angle_px: PositiveFloat = 0.002  # rad, of a pixel
+    plane_floor_deg: PositiveFloat = 0.3
 
     def __call__(
         self,

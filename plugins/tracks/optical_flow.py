@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Annotated
 
 import cv2
 import numpy as np
 
 from trihedron.pipeline.core.geometry import exp_so3, log_so3
+from trihedron.pipeline.core.options import NonNegativeInt, PositiveFloat, PositiveInt, Range
 from trihedron.pipeline.core.registry import register
 from trihedron.pipeline.core.types import F32, I32, Bool, Frame, Keypoints, Planes, Segments, Tracks
 from trihedron.plugins.shared.relative_motion import solve_motion
@@ -22,21 +24,15 @@ class OpticalFlow:
     this frame's key point where one ends: no descriptor is looked at, and points without depth stay. Lines and planes are then paired by the
     points' motion."""
 
-    window_px: int = 15
-    levels: int = 3  # of the pyramid above the image
-    back_px: float = 1.0  # a point must come back to within this
-    snap_px: float = 1.5  # σ of the key point's own, between where the flow ends and the key point taken
-    max_age: int = 10  # frames; older features are not looked for
-    prior_deg: float = 2.0  # of the last rotation once more
-    prior_m: float = 0.1  # of no translation, per frame
-    angle_px: float = 0.002  # rad, of a pixel
-    plane_floor_deg: float = 0.3
-
-    def __post_init__(self) -> None:
-        if self.window_px < 3 or self.levels < 0 or self.max_age < 1:
-            raise ValueError("window_px, levels, max_age: must be at least 3, 0 and 1")
-        if min(self.back_px, self.snap_px, self.prior_deg, self.prior_m, self.angle_px, self.plane_floor_deg) <= 0.0:
-            raise ValueError("back_px, snap_px, prior_deg, prior_m, angle_px, plane_floor_deg: must be positive")
+    window_px: Annotated[int, Range(3)] = 15
+    levels: NonNegativeInt = 3  # of the pyramid above the image
+    back_px: PositiveFloat = 1.0  # a point must come back to within this
+    snap_px: PositiveFloat = 1.5  # σ of the key point's own, between where the flow ends and the key point taken
+    max_age: PositiveInt = 10  # frames; older features are not looked for
+    prior_deg: PositiveFloat = 2.0  # of the last rotation once more
+    prior_m: PositiveFloat = 0.1  # of no translation, per frame
+    angle_px: PositiveFloat = 0.002  # rad, of a pixel
+    plane_floor_deg: PositiveFloat = 0.3
 
     def __call__(
         self,

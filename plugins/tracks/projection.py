@@ -9,6 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from trihedron.pipeline.core.geometry import exp_so3, log_so3, rotation_angle_deg
+from trihedron.pipeline.core.options import AcuteDeg, NonNegativeInt, PositiveFloat, PositiveInt, PositiveShare, Share, check_increasing
 from trihedron.pipeline.core.registry import register
 from trihedron.pipeline.core.types import F64, U8, Camera, Frame, Keypoints, ManhattanFrame, Planes, Segments, Tracks
 from trihedron.plugins.shared.descriptors import compared_by, words_of
@@ -32,35 +33,29 @@ class Projection:
     The rotation comes from the Manhattan frames of the two images, else from the last motion, else there is none; where the two differ the one that
     finds more features is right. `R_current_previous` is the prediction corrected by what was found."""
 
-    radius_px: float = 25.0  # searched at first: the translation is unknown
-    near_px: float = 8.0  # searched once the motion is known
-    enough: int = 30  # key points; with fewer the first search is repeated with twice the radius
+    radius_px: PositiveFloat = 25.0  # searched at first: the translation is unknown
+    near_px: PositiveFloat = 8.0  # searched once the motion is known
+    enough: NonNegativeInt = 30  # key points; with fewer the first search is repeated with twice the radius
     max_bits: int = 64  # of 256, descriptor distance of key points
     max_l2: int = 250  # the same for descriptors compared by Euclidean distance
-    ratio: float = 0.9  # best to second best descriptor
-    octave_step: int = 1
-    line_deg: float = 8.0  # direction of a segment
-    line_overlap: float = 0.4  # of the shorter segment
+    ratio: PositiveShare = 0.9  # best to second best descriptor
+    octave_step: NonNegativeInt = 1
+    line_deg: AcuteDeg = 8.0  # direction of a segment
+    line_overlap: Share = 0.4  # of the shorter segment
     line_bits: int = 80  # of 256
-    plane_deg: float = 8.0
-    plane_m: float = 0.15  # distance at first
-    plane_near_m: float = 0.05  # and once the motion is known
-    max_age: int = 10  # frames; older features are not looked for
-    error_px: float = 4.0  # sigma_px a key point may miss its place by
-    prior_deg: float = 2.0  # of the predicted rotation
-    prior_m: float = 0.1  # of no translation, per frame
-    angle_px: float = 0.002  # rad, of a pixel
-    plane_floor_deg: float = 0.3
+    plane_deg: AcuteDeg = 8.0
+    plane_m: PositiveFloat = 0.15  # distance at first
+    plane_near_m: PositiveFloat = 0.05  # and once the motion is known
+    max_age: PositiveInt = 10  # frames; older features are not looked for
+    error_px: PositiveFloat = 4.0  # sigma_px a key point may miss its place by
+    prior_deg: PositiveFloat = 2.0  # of the predicted rotation
+    prior_m: PositiveFloat = 0.1  # of no translation, per frame
+    angle_px: PositiveFloat = 0.002  # rad, of a pixel
+    plane_floor_deg: PositiveFloat = 0.3
 
     def __post_init__(self) -> None:
-        if not 0.0 < self.near_px <= self.radius_px:
-            raise ValueError("near_px: must be positive and at most radius_px")
-        if not 0.0 < self.ratio <= 1.0 or self.octave_step < 0 or self.enough < 0 or not 0.0 <= self.line_overlap <= 1.0:
-            raise ValueError("ratio, octave_step, enough, line_overlap: in (0, 1], at least 0, at least 0, in [0, 1]")
-        if not 0.0 < self.line_deg < 90.0 or not 0.0 < self.plane_deg < 90.0 or not 0.0 < self.plane_near_m <= self.plane_m:
-            raise ValueError("line_deg, plane_deg, plane_near_m, plane_m: angles in (0, 90), plane_near_m positive and at most plane_m")
-        if self.max_age < 1 or min(self.error_px, self.prior_deg, self.prior_m, self.angle_px, self.plane_floor_deg) <= 0.0:
-            raise ValueError("max_age, error_px, prior_deg, prior_m, angle_px, plane_floor_deg: must be positive")
+        check_increasing(self, "near_px", "radius_px")
+        check_increasing(self, "plane_near_m", "plane_m")
 
     def __call__(
         self,
