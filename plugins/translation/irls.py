@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
 
+from trihedron.pipeline.core.options import PositiveFloat, Range
 from trihedron.pipeline.core.registry import register
 from trihedron.pipeline.core.types import Frame, Keypoints, Map, Pose, Rotation, Tracks, Translation
 from trihedron.plugins.mapping.reference_keyframe import anchored
@@ -21,12 +23,8 @@ class Irls:
     What fewer than `min_points` agree on is no measurement: the camera is taken to stand still, and `estimated` is False."""
 
     depthless: bool = True  # points without depth say in which plane the step lies
-    motion_sigma_m: float = 0.1  # of a step, per frame: a weak prior that holds what no point sees
-    min_points: int = 6
-
-    def __post_init__(self) -> None:
-        if self.motion_sigma_m <= 0.0 or self.min_points < 3:
-            raise ValueError("motion_sigma_m, min_points: must be positive, and at least 3")
+    motion_sigma_m: PositiveFloat = 0.1  # of a step, per frame: a weak prior that holds what no point sees
+    min_points: Annotated[int, Range(3)] = 6
 
     def __call__(
         self,

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
 
+from trihedron.pipeline.core.options import PositiveFloat, PositiveInt, Range
 from trihedron.pipeline.core.registry import register
 from trihedron.pipeline.core.types import F64, Frame, Keypoints, Planes, Pose, Rotation, Tracks, Translation
 from trihedron.plugins.translation.common import point_rows, solve_step
@@ -20,20 +22,14 @@ class Kalman:
 
     The state is `filtered_planes` and `filtered_covariance` of the value, so that the wire `translation@prev` is the filter's only memory."""
 
-    axis_deg: float = 8.0  # a plane nearer to an axis stands on it
-    distance_sigma_m: float = 0.01  # of a plane's distance, besides its noise: walls are not quite flat, and normals not quite on the axis
-    point_sigma_m: float = 0.002  # of a step measured by points, besides its noise
-    gate: float = 3.0  # standard deviations, and
-    gate_m: float = 0.1  # most, between a plane's distance and the predicted one
-    min_pixels: int = 3000  # of a plane in the state
-    motion_sigma_m: float = 0.1  # of a step that no point measured, per frame
-    min_points: int = 6
-
-    def __post_init__(self) -> None:
-        if not 0.0 < self.axis_deg < 45.0 or self.min_points < 3 or self.min_pixels < 1:
-            raise ValueError("axis_deg, min_points, min_pixels: an angle within 0 … 45, at least 3, at least 1")
-        if min(self.distance_sigma_m, self.point_sigma_m, self.gate, self.gate_m, self.motion_sigma_m) <= 0.0:
-            raise ValueError("distance_sigma_m, point_sigma_m, gate, gate_m, motion_sigma_m: must be positive")
+    axis_deg: Annotated[float, Range(above=0, below=45)] = 8.0  # a plane nearer to an axis stands on it
+    distance_sigma_m: PositiveFloat = 0.01  # of a plane's distance, besides its noise: walls are not quite flat, and normals not quite on the axis
+    point_sigma_m: PositiveFloat = 0.002  # of a step measured by points, besides its noise
+    gate: PositiveFloat = 3.0  # standard deviations, and
+    gate_m: PositiveFloat = 0.1  # most, between a plane's distance and the predicted one
+    min_pixels: PositiveInt = 3000  # of a plane in the state
+    motion_sigma_m: PositiveFloat = 0.1  # of a step that no point measured, per frame
+    min_points: Annotated[int, Range(3)] = 6
 
     def __call__(
         self,

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from trihedron.pipeline.core.geometry import pose_matrix
+from trihedron.pipeline.core.options import NonNegativeFloat, NonNegativeInt, PositiveFloat
 from trihedron.pipeline.core.registry import register
 from trihedron.pipeline.core.types import F64, Frame, Keypoints, Map, Planes, Pose, Rotation, Segments, Tracks, Translation
 from trihedron.plugins.mapping.reference_keyframe import anchored
@@ -28,16 +29,10 @@ class LevenbergMarquardt:
     position, `motion_sigma_m`) fills the directions that no feature sees. Without any measurement the camera is taken to keep its velocity for
     `predict_frames`, then to stand still, ever less certain; that is a prediction and says so (`estimated` False)."""
 
-    motion_sigma_m: float = 0.1  # per frame, of the position about the previous one: 3 m/s at 30 frames/s
-    line_sigma_px: float = 1.0  # of a segment's end point across it
-    rotation_sigma_deg: float = 0.05  # least uncertainty granted to the fixed rotation
-    predict_frames: int = 15  # half a second: beyond, a velocity says nothing of a hand
-
-    def __post_init__(self) -> None:
-        if self.motion_sigma_m <= 0.0 or self.line_sigma_px <= 0.0 or self.rotation_sigma_deg < 0.0:
-            raise ValueError("motion_sigma_m, line_sigma_px, rotation_sigma_deg: must be positive")
-        if self.predict_frames < 0:
-            raise ValueError("predict_frames: must not be negative")
+    motion_sigma_m: PositiveFloat = 0.1  # per frame, of the position about the previous one: 3 m/s at 30 frames/s
+    line_sigma_px: PositiveFloat = 1.0  # of a segment's end point across it
+    rotation_sigma_deg: NonNegativeFloat = 0.05  # least uncertainty granted to the fixed rotation
+    predict_frames: NonNegativeInt = 15  # half a second: beyond, a velocity says nothing of a hand
 
     def __call__(
         self,

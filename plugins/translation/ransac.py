@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from trihedron.pipeline.core.options import PositiveFloat, PositiveInt
 from trihedron.pipeline.core.registry import register
 from trihedron.pipeline.core.types import F64, Bool, Frame, Keypoints, Map, Pose, Rotation, Tracks, Translation
 from trihedron.plugins.mapping.reference_keyframe import anchored
@@ -19,14 +20,10 @@ class Ransac:
     """With the rotation known every tracked point with depth in both frames says the whole step: the one most points agree with, then their weighted
     mean (after RGB-D SLAM: Endres et al., T-RO 2014, whose samples of three give both). Fewer than `min_points` are no measurement."""
 
-    rounds: int = 100  # points tried
-    gate: float = 3.0  # standard deviations within which a point agrees
-    min_points: int = 12
-    motion_sigma_m: float = 0.1  # of a step that is not measured, per frame
-
-    def __post_init__(self) -> None:
-        if self.rounds < 1 or self.min_points < 1 or min(self.gate, self.motion_sigma_m) <= 0.0:
-            raise ValueError("rounds, min_points, gate, motion_sigma_m: at least 1, and positive")
+    rounds: PositiveInt = 100  # points tried
+    gate: PositiveFloat = 3.0  # standard deviations within which a point agrees
+    min_points: PositiveInt = 12
+    motion_sigma_m: PositiveFloat = 0.1  # of a step that is not measured, per frame
 
     def __call__(
         self, frame: Frame, rotation: Rotation, tracks: Tracks | None, keypoints: Keypoints, previous_pose: Pose | None, map: Map | None,
