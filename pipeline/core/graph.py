@@ -8,7 +8,8 @@ from typing import Any
 
 from trihedron.pipeline.core.errors import GraphError, did_you_mean
 from trihedron.pipeline.core.registry import parameters_of_method
-from trihedron.pipeline.core.slots import FOLDS, SLOTS, accepts_none, default_wires, inputs_of, output_of, strip_none
+from trihedron.pipeline.core.slots import CAMERA, FOLDS, RNG, SLOTS, accepts_none, default_wires, inputs_of, output_of, strip_none
+from trihedron.pipeline.core.types import Frame
 from trihedron.pipeline.core.wires import Wire, parse_wire
 
 TRAJECTORY = "trajectory"  # the output made of the topics `pose` and `map`
@@ -16,8 +17,8 @@ TRAJECTORY = "trajectory"  # the output made of the topics `pose` and `map`
 
 @dataclass(frozen=True)
 class Stage:
-    """One plugin in the graph. `inputs` are the wires of the parameters it takes; `required` those whose None skips the stage; `absent` the optional
-    ones without a wire: always None."""
+    """One plugin in the graph. `inputs` are the wires of the parameters it takes (`camera` reads the frame's); `required` those whose None skips the
+    stage; `absent` the optional ones without a wire: always None."""
 
     name: str  # slot, configuration group and topic
     plugin: Any
@@ -82,7 +83,9 @@ def _stage(name: str, wires: Mapping[str, str | None], plugins: Mapping[str, Any
     taken = parameters_of_method(name, type(plugin))
     inputs, absent = {}, set()
     for parameter in taken:
-        if parameter == "rng":
+        if parameter == CAMERA:
+            inputs[parameter] = Wire("dataset")
+        if parameter in (CAMERA, RNG):
             continue
         optional, text = accepts_none(given[parameter]), wires.get(parameter)
         if parameter not in wires and (defaults[parameter].topic in plugins or not optional):
@@ -94,8 +97,8 @@ def _stage(name: str, wires: Mapping[str, str | None], plugins: Mapping[str, Any
         else:
             cause = f"the input is not wired, and {type(plugin).__name__} takes it"
             raise GraphError(f"{place}.{parameter}", cause, f"give graph.{name}.{parameter}=TOPIC")
-    required = frozenset(p for p in inputs if not accepts_none(given[p]))
-    return Stage(name, plugin, inputs, required, frozenset(absent), "rng" in taken)
+    required = frozenset(p for p in inputs if p == CAMERA or not accepts_none(given[p]))
+    return Stage(name, plugin, inputs, required, frozenset(absent), RNG in taken)
 
 
 def _check_wire(stage: Stage, parameter: str, wire: Wire, stages: Mapping[str, Stage]) -> None:
@@ -103,7 +106,7 @@ def _check_wire(stage: Stage, parameter: str, wire: Wire, stages: Mapping[str, S
     if wire.topic not in stages:
         cure = f"choose a plugin with +{wire.topic}=PLUGIN" if wire.topic in SLOTS else did_you_mean(wire.topic, stages)
         raise GraphError(place, f"no stage writes topic '{wire.topic}'", cure)
-    expected, written = strip_none(inputs_of(stage.name)[parameter]), output_of(wire.topic)
+    expected, written = strip_none({CAMERA: Frame, **inputs_of(stage.name)}[parameter]), output_of(wire.topic)
     if expected is not written:
         fitting = [name for name in stages if output_of(name) is expected]
         cure = f"wire it to {' or '.join(fitting)}" if fitting else f"no stage of this graph writes {expected.__name__}"

@@ -11,11 +11,9 @@ from collections.abc import Callable
 from importlib.metadata import entry_points
 from typing import Any, TypeVar, get_type_hints
 
-import numpy as np
-
 from trihedron.pipeline.core.errors import PluginError, did_you_mean
 from trihedron.pipeline.core.options import check_options
-from trihedron.pipeline.core.slots import FOLDS, SLOTS, inputs_of, method_of, output_of, strip_none
+from trihedron.pipeline.core.slots import FOLDS, RESERVED, SLOTS, inputs_of, method_of, output_of, strip_none
 
 Plugin = TypeVar("Plugin", bound=type)
 _PLUGINS: dict[str, dict[str, type[Any]]] = {slot: {} for slot in SLOTS}
@@ -68,7 +66,7 @@ def _source_of(plugin: type) -> str:
 
 
 def _check_contract(slot: str, plugin: type, place: str) -> None:
-    """Compare the plugin's method with the slot's: a subset of its parameters (and rng), equal types, the slot's return type."""
+    """Compare the plugin's method with the slot's: a subset of its parameters and the reserved ones, equal types, the slot's return type."""
     for method in ("start", "add", "finish") if slot in FOLDS else ("__call__",):
         if not any(method in vars(base) for base in plugin.__mro__):
             raise PluginError(place, f"has no method {method}", f"the slot '{slot}' needs it")
@@ -77,7 +75,7 @@ def _check_contract(slot: str, plugin: type, place: str) -> None:
         hints = get_type_hints(getattr(plugin, method))
     except NameError as error:
         raise PluginError(place, f"type hint of {method} not found: {error}", "import it outside TYPE_CHECKING") from error
-    allowed = {**inputs_of(slot), "rng": np.random.Generator}
+    allowed = {**inputs_of(slot), **(RESERVED if slot != "dataset" else {})}
     for name in parameters_of_method(slot, plugin):
         if name not in allowed:
             raise PluginError(place, f"{method} takes '{name}', which the slot '{slot}' does not give", did_you_mean(name, allowed))
@@ -95,7 +93,7 @@ def _show(hint: Any) -> str:
 
 
 def parameters_of_method(slot: str, plugin: type) -> list[str]:
-    """The inputs a plugin asks for, `rng` included, in its own order."""
+    """Return the parameters a plugin takes, reserved ones included, in its own order."""
     names = inspect.signature(getattr(plugin, method_of(slot))).parameters
     return [name for name in names if name not in ("self", "state") and not (slot == "dataset" and name == "index")]
 

@@ -1,7 +1,8 @@
 """The slots: the inputs a stage may take, the topics they are wired to by default, and the type it returns.
 
 A slot is a `Protocol`; its name in snake case is the configuration group, the node of the graph and the topic. A plugin takes any subset of the
-parameters (same names, same types), may also take `rng: numpy.random.Generator`, and returns the slot's type or None ("nothing this frame").
+parameters (same names, same types), and the reserved ones `rng: numpy.random.Generator` and `camera: Camera`, the camera of this frame, and returns
+the slot's type or None ("nothing this frame"). Taking `camera` in the place of `frame` lets a replay run the stage without the images.
 Frames, units and signs are those of `types`. Parameters `X | None` may come from a delayed wire (`topic@prev`, `topic@k`) and are None at the start.
 Feature stages never return None for a readable frame: nothing found is a value with no rows, so that later stages run on the rest.
 
@@ -16,7 +17,10 @@ import re
 from functools import cache
 from typing import Annotated, Any, Generic, Protocol, TypeVar, get_type_hints
 
+import numpy as np
+
 from trihedron.pipeline.core.types import (
+    Camera,
     Correction,
     Frame,
     Keypoints,
@@ -39,6 +43,10 @@ from trihedron.pipeline.core.wires import PREVIOUS, Wire
 
 State = TypeVar("State")
 PreviousMap = Annotated[Map | None, Wire("map", PREVIOUS)]  # the map before this frame
+
+
+RNG, CAMERA = "rng", "camera"
+RESERVED: dict[str, Any] = {RNG: np.random.Generator, CAMERA: Camera}  # parameters that any plugin may take
 
 
 class Dataset(Protocol):

@@ -19,6 +19,7 @@ from trihedron.pipeline.core.errors import DataError, RecordingError, StageError
 from trihedron.pipeline.core.graph import Graph, Stage
 from trihedron.pipeline.core.options import frame_range
 from trihedron.pipeline.core.registry import check_value
+from trihedron.pipeline.core.slots import CAMERA
 from trihedron.pipeline.core.types import Frame, FrameReference, Map, Pose, Trajectory, Value
 from trihedron.pipeline.core.wires import Wire
 from trihedron.pipeline.record.foxglove import View
@@ -83,7 +84,7 @@ class Runner:
             name = pending.pop()
             if name not in found:
                 found.add(name)
-                pending += [w.topic for w in self.graph.stages[name].inputs.values() if w.topic not in recorded]
+                pending += [w.topic for p, w in self.graph.stages[name].inputs.items() if w.topic not in recorded and p != CAMERA]
         return tuple(name for name in self.graph.stages if name in found)
 
     def _frames(self, frames: str) -> tuple[Sequence[int], dict[int, int]]:
@@ -163,9 +164,10 @@ class Runner:
         inputs = {}
         for parameter, wire in stage.inputs.items():
             from_file = wire.topic not in self.computed or (wire.delay and self._recorded_feedback(wire.topic))
-            inputs[parameter] = Wire(RECORDED + wire.topic, wire.delay) if from_file else wire
-            if from_file and RECORDED + wire.topic not in readers:
-                readers[RECORDED + wire.topic] = self._reader_node(wire.topic)
+            topic = FRAMES_TOPIC if parameter == CAMERA else wire.topic
+            inputs[parameter] = Wire(RECORDED + topic, wire.delay) if from_file else wire
+            if from_file and RECORDED + topic not in readers:
+                readers[RECORDED + topic] = self._reader_node(topic)
         if self.feed is not None and stage.name != "dataset":
             inputs[FRAME_TAKEN] = Wire("dataset")
         if stage.name == "dataset":
@@ -191,6 +193,8 @@ class Runner:
                 return None
         arguments = {**dict.fromkeys(stage.absent), **values}
         arguments.pop(FRAME_TAKEN, None)
+        if CAMERA in arguments:
+            arguments[CAMERA] = arguments[CAMERA].camera  # of a frame, or of the recording's reference to it
         if stage.wants_rng:
             arguments["rng"] = np.random.default_rng([self.seed, self.indices[position], zlib.crc32(stage.name.encode())])
         if reads_frames:

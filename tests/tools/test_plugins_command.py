@@ -55,7 +55,7 @@ def test_every_plugin_has_documentation_and_defaults(capsys):
     for slot in described(capsys):
         for plugin in slot["plugins"]:
             assert plugin["doc"] and plugin["class"].startswith("trihedron."), plugin
-            assert set(plugin["inputs"]) <= {*slot["inputs"], "rng"}
+            assert set(plugin["inputs"]) <= {*slot["inputs"], "rng", "camera"}
             assert all(set(option) == {"name", "type", "default", "range", "doc"} for option in plugin["parameters"])
 
 
