@@ -105,7 +105,7 @@ class LoopClosing(ABC):
         T = self._start(map, frame, place, here, T_before)
         found, matches = None, None
         for sigma_m in (0.03, 0.01):
-            matches = SEARCH.search(frame, Guess(T, sigma_m, 0.3 * sigma_m, True), *features, map, place.seen)
+            matches = SEARCH.search(frame.camera, Guess(T, sigma_m, 0.3 * sigma_m, True), *features, map, place.seen)
             found = solve_pose(
                 T, frame.camera, T_before, np.linalg.inv(expected),
                 point_terms(map, features[0], matches.keypoints),
@@ -159,6 +159,7 @@ def _seen_alone(map: Map, keyframe: int, place: LocalWindow) -> LocalWindow:
 
 
 # Places the camera may have come back to: keyframes of long ago within reach of what it may have drifted since.
+
 
 @dataclass(frozen=True)
 class Reach:

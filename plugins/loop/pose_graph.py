@@ -10,7 +10,7 @@ import numpy as np
 from trihedron.pipeline.core.geometry import invert, pose_matrix
 from trihedron.pipeline.core.options import NonNegativeFloat, PositiveFloat, PositiveInt, Range
 from trihedron.pipeline.core.registry import register
-from trihedron.pipeline.core.types import F64, I32, Correction, Frame, Map
+from trihedron.pipeline.core.types import F64, I32, Correction, Map
 from trihedron.plugins.loop.common_pose_graph import Edges, moved_keyframes, solve_pose_graph
 from trihedron.plugins.mapping.covisibility_graph import current_submap, keyframes_of
 from trihedron.plugins.mapping.keyframe_features import measured_points
@@ -30,10 +30,10 @@ class PoseGraph:
     gate: PositiveFloat = 3.0  # standard deviations within which a point agrees with an edge
     least_m: NonNegativeFloat = 1e-4  # motion of a keyframe below which nothing is said
 
-    def __call__(self, map: Map, frame: Frame) -> Correction | None:
+    def __call__(self, map: Map) -> Correction | None:
         """The correction of all keyframes; None unless the newest one is due and closes a cycle."""
         newest = len(map.keyframes) - 1
-        if newest < 2 or newest % self.every or map.keyframes.row("index", newest) != frame.index:
+        if newest < 2 or newest % self.every or map.keyframes.row("index", newest) != map.index:
             return None
         rows = keyframes_of(map, current_submap(map))
         before = map.keyframes.rows("T_world_camera", rows)

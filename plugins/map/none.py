@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from trihedron.pipeline.core.registry import register
-from trihedron.pipeline.core.types import Frame, Map, Pose
+from trihedron.pipeline.core.types import Map, Pose
 
 
 @register("map", "none")
@@ -13,6 +13,6 @@ from trihedron.pipeline.core.types import Frame, Map, Pose
 class NoMap:
     """Nothing is kept: every pose stands on the previous frame alone."""
 
-    def __call__(self, frame: Frame, pose: Pose) -> Map | None:
+    def __call__(self, pose: Pose) -> Map | None:
         """None, whatever is given."""
         return None

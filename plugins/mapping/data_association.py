@@ -10,7 +10,7 @@ import numpy as np
 
 from trihedron.pipeline.core.geometry import invert
 from trihedron.pipeline.core.options import NonNegativeInt, PositiveFloat, Range, check_increasing
-from trihedron.pipeline.core.types import F64, I32, U8, Camera, Frame, Keypoints, Map, Matches, Planes, Segments
+from trihedron.pipeline.core.types import F64, I32, U8, Camera, Keypoints, Map, Matches, Planes, Segments
 from trihedron.plugins.mapping.covisibility_graph import LocalWindow
 from trihedron.plugins.mapping.data_association_kernels import pairs_kernel, related
 from trihedron.plugins.mapping.visibility import POINT_COLUMNS, VisiblePoints, clip_segments, visible_points
@@ -57,13 +57,15 @@ class MapSearch:
     def __post_init__(self) -> None:
         check_increasing(self, "radius_px", "max_radius_px", "wide_radius_px")
 
-    def search(self, frame: Frame, guess: Guess, keypoints: Keypoints, segments: Segments, planes: Planes, map: Map, window: LocalWindow) -> Matches:
+    def search(
+        self, camera: Camera, guess: Guess, keypoints: Keypoints, segments: Segments, planes: Planes, map: Map, window: LocalWindow
+    ) -> Matches:
         """Landmarks of the window found around the guess."""
         T_camera_world = invert(guess.T_world_camera)
-        pairs, visible = self._points(frame.camera, guess, keypoints, map, window)
-        line_pairs, visible_lines = self._lines(frame.camera, T_camera_world, segments, map, window)
+        pairs, visible = self._points(camera, guess, keypoints, map, window)
+        line_pairs, visible_lines = self._lines(camera, T_camera_world, segments, map, window)
         same, parallel, perpendicular = self._planes(T_camera_world, planes, map, window)
-        return Matches(frame.index, frame.stamp_ns, map.revision, pairs, line_pairs, same, parallel, perpendicular, visible, visible_lines)
+        return Matches(keypoints.index, keypoints.stamp_ns, map.revision, pairs, line_pairs, same, parallel, perpendicular, visible, visible_lines)
 
     def _points(self, camera: Camera, guess: Guess, keypoints: Keypoints, map: Map, window: LocalWindow) -> tuple[I32, I32]:
         """Pairs (row, id) and the ids expected in view."""
@@ -117,8 +119,6 @@ class MapSearch:
         same = associate_planes(planes.coefficients, planes.samples_m, known, samples, self.plane_angle_deg, self.plane_distance_m, True)
         order = (covariance[:, 0, 0] + covariance[:, 1, 1]).argsort(kind="stable")  # those whose normals are known best first
         limit = math.radians(self.parallel_deg)
-        parallel, perpendicular = related(
-            planes.coefficients, known, same, order, window.planes, math.cos(limit), math.sin(limit), self.relations
-        )
+        parallel, perpendicular = related(planes.coefficients, known, same, order, window.planes, math.cos(limit), math.sin(limit), self.relations)
         same[:, 1] = window.planes[same[:, 1]]
         return same, parallel, perpendicular

@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from trihedron.pipeline.core.geometry import invert, pose_matrix
-from trihedron.pipeline.core.types import DEGRADED, F64, I32, LOST, OK, Frame, Map, Pose, Rotation, Translation
+from trihedron.pipeline.core.types import DEGRADED, F64, I32, LOST, OK, Map, Pose, Rotation, Translation, Value
 from trihedron.plugins.mapping.covisibility_graph import keyframes_of
 
 UNMOVED = 1e-12  # rad and m: rounding; a keyframe that moved by less leaves the pose exactly as it was said
@@ -56,7 +56,7 @@ class Decoupled:
     status: str
     reason: str
 
-    def said(self, frame: Frame, map: Map | None, reason: str = "", submap: int = 0) -> Pose:
+    def said(self, frame: Value, map: Map | None, reason: str = "", submap: int = 0) -> Pose:
         """As the frame's pose in a sub-map; `reason` says why no refinement followed (degraded, unless it was lost already)."""
         status = DEGRADED if reason and self.status == OK else self.status
         reference, T_reference_camera = reference_of(map, self.T_world_camera, submap)

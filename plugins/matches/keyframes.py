@@ -10,7 +10,7 @@ import numpy as np
 from trihedron.pipeline.core.geometry import invert, transform
 from trihedron.pipeline.core.options import NonNegativeInt, PositiveFloat, PositiveInt, PositiveShare, Range, Share
 from trihedron.pipeline.core.registry import register
-from trihedron.pipeline.core.types import I32, Frame, Keypoints, Map, Matches, Rotation
+from trihedron.pipeline.core.types import I32, Camera, Keypoints, Map, Matches, Rotation
 from trihedron.plugins.mapping.covisibility_graph import current_submap, keyframes_of, observed_by
 from trihedron.plugins.shared.descriptors import mutual_matches
 from trihedron.plugins.shared.rigid_alignment import consensus, place_sigma, rows_with_depth
@@ -33,9 +33,9 @@ class Keyframes:
     min_points: Annotated[int, Range(3)] = 25  # that must agree
     min_share: Share = 0.4  # of the pairs
 
-    def __call__(self, frame: Frame, rotation: Rotation, keypoints: Keypoints, map: Map | None, rng: np.random.Generator) -> Matches:
+    def __call__(self, camera: Camera, rotation: Rotation, keypoints: Keypoints, map: Map | None, rng: np.random.Generator) -> Matches:
         """Pairs of key points and the points of verified keyframes; what was offered and what was found count as visible."""
-        pairs = [self._verified(frame, keypoints, map, row, rng) for row in self._candidates(map, rng)] if map is not None else []
+        pairs = [self._verified(camera, keypoints, map, row, rng) for row in self._candidates(map, rng)] if map is not None else []
         pairs = sorted(pairs, key=len, reverse=True)
         found = np.concatenate([NO_PAIRS, *pairs])
         for column in (0, 1):
@@ -45,7 +45,7 @@ class Keyframes:
         ids = np.unique(found[:, 1]).astype(np.int32)
         revision = -1 if map is None else map.revision
         return Matches(
-            frame.index, frame.stamp_ns, revision, np.ascontiguousarray(found), NO_PAIRS, NO_PAIRS, NO_PAIRS, NO_PAIRS, ids, none
+            keypoints.index, keypoints.stamp_ns, revision, np.ascontiguousarray(found), NO_PAIRS, NO_PAIRS, NO_PAIRS, NO_PAIRS, ids, none
         )  # fmt: skip
 
     def _candidates(self, map: Map, rng: np.random.Generator) -> list[int]:
@@ -55,7 +55,7 @@ class Keyframes:
         drawn = rng.choice(earlier, min(self.drawn, len(earlier)), replace=False) if len(earlier) else earlier
         return [int(row) for row in (*newest, *np.sort(drawn))]
 
-    def _verified(self, frame: Frame, keypoints: Keypoints, map: Map, keyframe: int, rng: np.random.Generator) -> I32:
+    def _verified(self, camera: Camera, keypoints: Keypoints, map: Map, keyframe: int, rng: np.random.Generator) -> I32:
         """(n, 2) rows of key points and ids of the keyframe's points that agree on one motion; none where too few do."""
         ids, mine = observed_by(map, np.array([keyframe], np.int32), "point"), rows_with_depth(keypoints)
         descriptors, positions = map.points.gathered(ids, "descriptor", "position_m")
@@ -65,7 +65,7 @@ class Keyframes:
         T_camera_world = invert(map.keyframes.rows("T_world_camera", np.array([keyframe]))[0])
         there, rows = transform(T_camera_world, positions[found[:, 0]]), mine[found[:, 1]]
         here = keypoints.points_m[rows].astype(np.float64)
-        known = frame.camera.depth_noise.sigma_m(there[:, 2])
+        known = camera.depth_noise.sigma_m(there[:, 2])
         sigma = place_sigma(there, here, known, keypoints.sigma_m[rows], keypoints.sigma_px[rows])
         agree = consensus(there, here, sigma, self.gate, self.rounds, rng).agree
         if agree.sum() < self.min_points or agree.sum() < self.min_share * len(found):

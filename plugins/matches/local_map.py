@@ -9,7 +9,7 @@ import numpy as np
 from trihedron.pipeline.core.geometry import pose_matrix
 from trihedron.pipeline.core.options import NonNegativeInt, PositiveInt
 from trihedron.pipeline.core.registry import register
-from trihedron.pipeline.core.types import F64, OK, Frame, Keypoints, Map, Matches, Planes, Pose, Rotation, Segments, Translation
+from trihedron.pipeline.core.types import F64, OK, Camera, Keypoints, Map, Matches, Planes, Pose, Rotation, Segments, Translation
 from trihedron.plugins.mapping.covisibility_graph import living_keyframes, local_window
 from trihedron.plugins.mapping.data_association import Guess, MapSearch
 from trihedron.plugins.places.verification import ABOUT_DEG, ABOUT_M
@@ -28,7 +28,7 @@ class LocalMap(MapSearch):
 
     def __call__(
         self,
-        frame: Frame,
+        camera: Camera,
         rotation: Rotation,
         translation: Translation,
         keypoints: Keypoints,
@@ -45,7 +45,7 @@ class LocalMap(MapSearch):
             window = local_window(map, guess.T_world_camera, 0, 0, self.recognised, ABOUT_M, ABOUT_DEG, relocalise.submap)
         else:
             window = local_window(map, guess.T_world_camera, self.newest, self.covisible, self.near)
-        return self.search(frame, guess, keypoints, segments, planes, map, window)
+        return self.search(camera, guess, keypoints, segments, planes, map, window)
 
     def _guess(self, rotation: Rotation, translation: Translation, relocalise: Pose | None) -> Guess:
         if relocalise is not None and relocalise.status == OK:

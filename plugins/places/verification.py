@@ -89,7 +89,7 @@ def check_place(T_world_camera: F64, view: FrameFeatures, map: Map, among: I32, 
     for (sigma_m, sigma_deg), search in ((WIDE, MapSearch(enough=0)), (CLOSE, MapSearch(enough=0, **STRICT))):
         guess = Guess(T, sigma_m, float(np.radians(sigma_deg)), True)
         window = _window(map, T, among, near)
-        matches = search.search(view.frame, guess, view.keypoints, view.segments, view.planes, map, window)
+        matches = search.search(view.frame.camera, guess, view.keypoints, view.segments, view.planes, map, window)
         found = _solved(T, view, matches, map)
         if found.unobservable.shape[1]:
             return None

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from trihedron.pipeline.core.geometry import invert, rotation_angle_deg
 from trihedron.pipeline.core.options import PositiveFloat
-from trihedron.pipeline.core.types import DEGRADED, F32, F64, I32, U8, Frame, Keypoints, Map, Matches
+from trihedron.pipeline.core.types import DEGRADED, F32, F64, I32, U8, Camera, Keypoints, Map, Matches
 from trihedron.plugins.mapping.covisibility_graph import current_submap, keyframes_of, newest_keyframes
 from trihedron.plugins.mapping.keyframe_features import measured_points
 from trihedron.plugins.pose.focal_length_kernels import (
@@ -43,7 +43,7 @@ class FocalLengths:
             first = map.keyframes.rows("T_world_camera", keyframes_of(map, current_submap(map))[:1])[0]
             depths_m = keypoints.points_m[matches.keypoints[:, 0], 2]
             return Verdict(DEGRADED, doubt, said.covariance + check.covariance(invert(first) @ found.T_world_camera, depths_m))
-        motion = focal_motion(map, problem.frame, keypoints, matches, found.points, found.T_world_camera)
+        motion = focal_motion(map, problem.camera, keypoints, matches, found.points, found.T_world_camera)
         if motion is None or motion.verified(self.focal_off, self.focal_sure):
             return said
         doubt = motion.doubt(self.focal_off, self.focal_sure)
@@ -62,7 +62,6 @@ class FocalCheck:
 
     factor: float
     worse: float
-
 
     def doubt(self, off: float, worse: float) -> str:
         """Why to doubt, where the keyframes fit by a share `worse` worse under the focal lengths told than under others, a share `off` away;
@@ -149,7 +148,7 @@ class FocalMotion:
         return np.asarray((variance + mean**2) * np.outer(self.effect, self.effect))
 
 
-def focal_motion(map: Map, frame: Frame, keypoints: Keypoints, matches: Matches, agreed: U8, T_world_camera: F64) -> FocalMotion | None:
+def focal_motion(map: Map, camera: Camera, keypoints: Keypoints, matches: Matches, agreed: U8, T_world_camera: F64) -> FocalMotion | None:
     """What the points (flags `agreed`) say that the first keyframe measured as well. None where they are too few, and once there are enough keyframes
     to tell by themselves (`focal_check`)."""
     keyframes = newest_keyframes(map, KEYFRAMES)
@@ -165,7 +164,6 @@ def focal_motion(map: Map, frame: Frame, keypoints: Keypoints, matches: Matches,
     now, at = pairs[same, 0], at[same]
     if len(now) < LEAST_POINTS:
         return None
-    camera = frame.camera
     seen = np.column_stack([keypoints.pixels[now], keypoints.points_m[now, 2]]).astype(np.float64)
     zoom = camera.fx / map.keyframes.rows("intrinsics", np.array([row]))[0, 0]  # 1 unless the resolution has changed
     noise_px = (zoom * sigma_px[at]) ** 2 + keypoints.sigma_px[now].astype(np.float64) ** 2

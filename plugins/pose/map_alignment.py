@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from trihedron.pipeline.core.types import F64, I32, Frame, Keypoints, Map, Matches, Planes, Segments
+from trihedron.pipeline.core.types import F64, I32, Camera, Keypoints, Map, Matches, Planes, Segments
 from trihedron.plugins.mapping.reprojection import line_terms, plane_terms, point_terms
 from trihedron.plugins.shared.pose_optimizer import PoseSolution, Terms, classify_terms, first_step, solve_pose
 from trihedron.plugins.shared.pose_optimizer_kernels import Flags
@@ -48,7 +48,7 @@ class MapAlignment:
 
     T_start: F64
     information: F64
-    frame: Frame
+    camera: Camera
     matches: Matches
     keypoints: Keypoints
     segments: Segments
@@ -62,22 +62,22 @@ class MapAlignment:
         map, matches = self.map, self.matches
         return (
             point_terms(map, self.keypoints, matches.keypoints),
-            line_terms(map, self.segments, matches.segments, T_world_camera, self.frame.camera, self.line_sigma_px),
+            line_terms(map, self.segments, matches.segments, T_world_camera, self.camera, self.line_sigma_px),
             plane_terms(map, self.planes, matches.planes, matches.parallel, matches.perpendicular, self.relation_sigma_deg),
         )
 
     def solved(self, terms: Terms) -> PoseSolution:
         """The pose by these terms and the prior."""
-        return solve_pose(self.T_start, self.frame.camera, self.T_start, self.information, *terms)
+        return solve_pose(self.T_start, self.camera, self.T_start, self.information, *terms)
 
     def first_step(self, T_world_camera: F64, terms: Terms, flags: Flags) -> tuple[F64, F64]:
         """Where these terms, without outliers, and the prior would move a pose at first, xi (6,), with its covariance (6, 6)."""
-        return first_step(T_world_camera, self.frame.camera, self.T_start, self.information, terms, flags)
+        return first_step(T_world_camera, self.camera, self.T_start, self.information, terms, flags)
 
     def judged(self, found: PoseSolution) -> PoseSolution:
         """The solution with the flags of all matches, whatever it was found from."""
         T = found.T_world_camera
-        flags = classify_terms(T, self.frame.camera, *self.terms(T))
+        flags = classify_terms(T, self.camera, *self.terms(T))
         return PoseSolution(T, found.covariance, found.unobservable, *flags, found.cost)
 
     def agreement(self, found: PoseSolution) -> Agreement:

@@ -16,7 +16,7 @@ from trihedron.pipeline.core.types import (
     I32,
     LOST,
     OK,
-    Frame,
+    Camera,
     Keypoints,
     Map,
     Matches,
@@ -73,6 +73,7 @@ class TrackingQuality:
 
 
 # How well the part of a map that a pose was found in is known itself.
+
 
 @dataclass(frozen=True)
 class Foundation:
@@ -155,7 +156,7 @@ class Refine(TrackingQuality, MovingObjects, Foundations, FocalLengths):
 
     def __call__(
         self,
-        frame: Frame,
+        camera: Camera,
         rotation: Rotation,
         translation: Translation,
         tracks: Tracks | None,
@@ -171,19 +172,19 @@ class Refine(TrackingQuality, MovingObjects, Foundations, FocalLengths):
         previous, relocalise = (anchored(said, map) if said is not None else None for said in (previous, relocalise))
         start = decoupled_pose(rotation, translation, previous, relocalise)
         if map is None or matches is None or previous is None:
-            return start.said(frame, map)
+            return start.said(rotation, map)
         submap = relocalise.submap if relocalise is not None and relocalise.status == OK else submap_of(previous, map)
         prior, sigmas = (start.T_world_camera, self._information(start)), (self.line_sigma_px, self.relation_sigma_deg)
-        problem = MapAlignment(*prior, frame, matches, keypoints, segments, planes, map, *sigmas)
+        problem = MapAlignment(*prior, camera, matches, keypoints, segments, planes, map, *sigmas)
         found, by = self.solved_at_rest(problem) if start.status != LOST else (problem.solved(problem.terms(problem.T_start)), "")
         seen = problem.agreement(found)
         if start.status == LOST and not self.found_again(found, seen):
-            return self._unknown_place(start, frame, previous, relocalise is not None and translation.estimated, map, submap)
+            return self._unknown_place(start, rotation, previous, relocalise is not None and translation.estimated, map, submap)
         if rotation.source == "prediction" and not self.enough(seen):
             reason = f"the rotation was not measured, and only {seen.agreed} of {seen.matches} matches with the map agree"
-            return replace(start, status=LOST, reason=reason).said(frame, map, submap=submap)
+            return replace(start, status=LOST, reason=reason).said(rotation, map, submap=submap)
         if not seen.agreed:
-            return start.said(frame, map, "nothing of the map was found, pose from the previous frame", submap)
+            return start.said(rotation, map, "nothing of the map was found, pose from the previous frame", submap)
         said = self.judged(found, seen, rotation)
         if by:
             said = self.judged_at_rest(found, problem, by, said)
@@ -194,7 +195,7 @@ class Refine(TrackingQuality, MovingObjects, Foundations, FocalLengths):
         T, held, inliers = found.T_world_camera, found.unobservable.shape[1], np.array(seen.inliers, np.int32)
         reference, T_reference_camera = reference_of(map, T, submap)
         return Pose(
-            frame.index, frame.stamp_ns, T, said.covariance, T_reference_camera, reference, inliers, held, said.status, said.reason, submap
+            rotation.index, rotation.stamp_ns, T, said.covariance, T_reference_camera, reference, inliers, held, said.status, said.reason, submap
         )
 
     def _information(self, start: Decoupled) -> F64:
@@ -206,12 +207,12 @@ class Refine(TrackingQuality, MovingObjects, Foundations, FocalLengths):
         information[:3, :3], information[3:, 3:] = np.linalg.inv(both)
         return information
 
-    def _unknown_place(self, start: Decoupled, frame: Frame, previous: Pose, sought: bool, map: Map, submap: int) -> Pose:
+    def _unknown_place(self, start: Decoupled, rotation: Rotation, previous: Pose, sought: bool, map: Map, submap: int) -> Pose:
         """Lost; or, once what is seen was `sought` in vain for long enough, the first pose of a new sub-map, exact by definition."""
         unrecognised = previous.unrecognised + int(sought)
         if not self.submap_after or unrecognised < self.submap_after:
-            return replace(start.said(frame, map, submap=submap), unrecognised=unrecognised)
+            return replace(start.said(rotation, map, submap=submap), unrecognised=unrecognised)
         number = int(map.keyframes.column("submap").max(initial=0)) + 1
         reason = f"first frame of sub-map {number}: nothing was recognised for {unrecognised} frames"
         new = replace(start, covariance=FIRST_SIGMA**2 * np.eye(6), status=DEGRADED, reason=reason)
-        return new.said(frame, map, submap=number)
+        return new.said(rotation, map, submap=number)

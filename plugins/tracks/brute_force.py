@@ -8,7 +8,7 @@ import numpy as np
 
 from trihedron.pipeline.core.options import PositiveFloat, PositiveInt, PositiveShare
 from trihedron.pipeline.core.registry import register
-from trihedron.pipeline.core.types import Frame, Keypoints, Planes, Segments, Tracks
+from trihedron.pipeline.core.types import Camera, Keypoints, Planes, Segments, Tracks
 from trihedron.plugins.shared.descriptors import mutual_matches
 from trihedron.plugins.shared.relative_motion import solve_motion
 from trihedron.plugins.tracks.common import NO_PAIRS, Features, StructureGates, tracks_value
@@ -29,7 +29,7 @@ class BruteForce:
 
     def __call__(
         self,
-        frame: Frame,
+        camera: Camera,
         keypoints: Keypoints,
         segments: Segments,
         planes: Planes,
@@ -41,10 +41,10 @@ class BruteForce:
         if previous_keypoints is None or previous_segments is None or previous_planes is None:
             return None
         now, before = Features(keypoints, segments, planes), Features(previous_keypoints, previous_segments, previous_planes)
-        gap = frame.index - before.keypoints.index
+        gap = keypoints.index - before.keypoints.index
         if gap > self.max_age:
             return tracks_value(now, before, (NO_PAIRS, NO_PAIRS, NO_PAIRS), np.eye(3))
         points = mutual_matches(before.keypoints.descriptors, keypoints.descriptors, keypoints.metric, self.ratio)
         tracks = tracks_value(now, before, (points, NO_PAIRS, NO_PAIRS), np.eye(3))
         motion = solve_motion(tracks, keypoints, segments, planes, self.angle_px, self.plane_floor_deg, self.prior_deg * gap, self.prior_m * gap)
-        return tracks_value(now, before, (points, *StructureGates().pairs(now, before, frame.camera, motion.R, motion.t)), motion.R)
+        return tracks_value(now, before, (points, *StructureGates().pairs(now, before, camera, motion.R, motion.t)), motion.R)

@@ -11,7 +11,7 @@ import numpy as np
 from trihedron.pipeline.core.geometry import exp_so3, log_so3, rotation_angle_deg
 from trihedron.pipeline.core.options import AcuteDeg, NonNegativeInt, PositiveFloat, PositiveInt, PositiveShare, Share, check_increasing
 from trihedron.pipeline.core.registry import register
-from trihedron.pipeline.core.types import F64, U8, Camera, Frame, Keypoints, ManhattanFrame, Planes, Segments, Tracks
+from trihedron.pipeline.core.types import F64, U8, Camera, Keypoints, ManhattanFrame, Planes, Segments, Tracks
 from trihedron.plugins.shared.descriptors import compared_by, words_of
 from trihedron.plugins.shared.descriptors_kernels import U64, line_matches, near_matches
 from trihedron.plugins.shared.linalg import constant
@@ -59,7 +59,7 @@ class Projection:
 
     def __call__(
         self,
-        frame: Frame,
+        camera: Camera,
         keypoints: Keypoints,
         segments: Segments,
         planes: Planes,
@@ -74,11 +74,11 @@ class Projection:
         if previous_keypoints is None or previous_segments is None or previous_planes is None:
             return None
         now, before = Features(keypoints, segments, planes), Features(previous_keypoints, previous_segments, previous_planes)
-        gap = frame.index - previous_keypoints.index
+        gap = keypoints.index - previous_keypoints.index
         rotations = self._predictions(gap, before.keypoints.index, manhattan, previous_manhattan, previous)
         if gap > self.max_age:
             return tracks_value(now, before, (NO_PAIRS, NO_PAIRS, NO_PAIRS), rotations[0])
-        search = Search(before, now, frame.camera, self._gates(now, before))
+        search = Search(before, now, camera, self._gates(now, before))
         radius = self.radius_px * min(gap, 3)
         first = max((search(R, NOT_MOVED, radius, self.plane_m) for R in rotations), key=_count)
         if len(first.keypoints) < min(self.enough, len(keypoints.pixels)):

@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from trihedron.pipeline.core.types import F64, LOST, Camera, Frame, Keypoints, Pose, Tracks, Translation
+from trihedron.pipeline.core.types import F64, LOST, Camera, Keypoints, Pose, Rotation, Tracks, Translation
 
 ITERATIONS = 15
 CAUCHY = 2.385  # 95 % efficiency where the noise is Gaussian
@@ -104,14 +104,15 @@ def _linearised(rows: Rows, s: F64) -> tuple[F64, F64]:
 
 # What every estimator of the position with the rotation fixed says alike: the first frame's, and one that was not measured.
 
-def origin(frame: Frame) -> Translation:
+
+def origin(rotation: Rotation) -> Translation:
     """The first frame's position, the origin of the world, which is certain."""
-    return Translation(frame.index, frame.stamp_ns, np.zeros(3), np.zeros((3, 3)), np.empty((0, 3)), np.zeros(3, np.int32), True)
+    return Translation(rotation.index, rotation.stamp_ns, np.zeros(3), np.zeros((3, 3)), np.empty((0, 3)), np.zeros(3, np.int32), True)
 
 
-def unmeasured(frame: Frame, t_world_camera: F64, covariance: F64) -> Translation:
+def unmeasured(rotation: Rotation, t_world_camera: F64, covariance: F64) -> Translation:
     """A position (3,) that is only predicted, with its covariance (3, 3)."""
-    return Translation(frame.index, frame.stamp_ns, t_world_camera, covariance, np.eye(3), np.zeros(3, np.int32), False)
+    return Translation(rotation.index, rotation.stamp_ns, t_world_camera, covariance, np.eye(3), np.zeros(3, np.int32), False)
 
 
 def handed_on(previous: Pose, held_too: bool = False) -> F64:

@@ -9,7 +9,7 @@ import numpy as np
 
 from trihedron.pipeline.core.options import PositiveFloat, Range
 from trihedron.pipeline.core.registry import register
-from trihedron.pipeline.core.types import Frame, Keypoints, Map, Pose, Rotation, Tracks, Translation
+from trihedron.pipeline.core.types import Camera, Keypoints, Map, Pose, Rotation, Tracks, Translation
 from trihedron.plugins.mapping.reference_keyframe import anchored
 from trihedron.plugins.translation.common import handed_on, origin, point_rows, solve_step, unmeasured
 
@@ -28,7 +28,7 @@ class Irls:
 
     def __call__(
         self,
-        frame: Frame,
+        camera: Camera,
         rotation: Rotation,
         tracks: Tracks | None,
         keypoints: Keypoints,
@@ -38,17 +38,17 @@ class Irls:
     ) -> Translation:
         """The position; the first frame's is the origin of the world."""
         if previous_pose is None:
-            return origin(frame)
+            return origin(rotation)
         pose = anchored(previous_pose, map)
         before, unknown = pose.T_world_camera, handed_on(pose)
-        prior_m = self.motion_sigma_m * max(frame.index - previous_pose.index, 1)
+        prior_m = self.motion_sigma_m * max(rotation.index - previous_pose.index, 1)
         R = rotation.R_world_camera
         if tracks is not None and previous_keypoints is not None and tracks.previous_index == previous_pose.index == previous_keypoints.index:
-            rows = point_rows(tracks, keypoints, previous_keypoints, frame.camera, R.T @ before[:3, :3], rotation.covariance, self.depthless)
+            rows = point_rows(tracks, keypoints, previous_keypoints, camera, R.T @ before[:3, :3], rotation.covariance, self.depthless)
             step = solve_step(rows, np.zeros(3), prior_m)
             if step.inliers >= self.min_points:
                 inliers = np.array([step.inliers, 0, 0], np.int32)
                 covariance = R @ step.covariance @ R.T + unknown
                 held = np.ascontiguousarray(step.unobservable @ R.T)
-                return Translation(frame.index, frame.stamp_ns, before[:3, 3] - R @ step.s, covariance, held, inliers, True)
-        return unmeasured(frame, before[:3, 3].copy(), unknown + prior_m**2 * np.eye(3))
+                return Translation(rotation.index, rotation.stamp_ns, before[:3, 3] - R @ step.s, covariance, held, inliers, True)
+        return unmeasured(rotation, before[:3, 3].copy(), unknown + prior_m**2 * np.eye(3))

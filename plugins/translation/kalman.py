@@ -9,7 +9,7 @@ import numpy as np
 
 from trihedron.pipeline.core.options import PositiveFloat, PositiveInt, Range
 from trihedron.pipeline.core.registry import register
-from trihedron.pipeline.core.types import F64, Frame, Keypoints, Planes, Pose, Rotation, Tracks, Translation
+from trihedron.pipeline.core.types import F64, Camera, Keypoints, Planes, Pose, Rotation, Tracks, Translation
 from trihedron.plugins.translation.common import point_rows, solve_step
 
 
@@ -33,7 +33,7 @@ class Kalman:
 
     def __call__(
         self,
-        frame: Frame,
+        camera: Camera,
         rotation: Rotation,
         tracks: Tracks | None,
         keypoints: Keypoints,
@@ -46,30 +46,30 @@ class Kalman:
         sights = axis_sights(planes, rotation, self.axis_deg, self.distance_sigma_m, self.min_pixels)
         if previous is None or previous_pose is None:
             state, matched = first_filter().updated(sights, self.gate, self.gate_m)
-            return self._said(frame, state, np.empty((0, 3)), (0, 0, matched), True)
+            return self._said(rotation, state, np.empty((0, 3)), (0, 0, matched), True)
         before = OffsetFilter(previous.t_world_camera, previous.filtered_planes, previous.filtered_covariance)
-        step, noise, points = self._step(frame, rotation, tracks, keypoints, previous_keypoints, previous_pose)
+        step, noise, points = self._step(camera, rotation, tracks, keypoints, previous_keypoints, previous_pose)
         state, matched = before.moved(step, noise).updated(sights, self.gate, self.gate_m)
         unobservable = _unmeasured(noise, sights[:matched], 0.5 * self.motion_sigma_m)
-        return self._said(frame, state, unobservable, (points, 0, matched), points + matched > 0)
+        return self._said(rotation, state, unobservable, (points, 0, matched), points + matched > 0)
 
     def _step(
-        self, frame: Frame, rotation: Rotation, tracks: Tracks | None, keypoints: Keypoints, before: Keypoints | None, pose: Pose
+        self, camera: Camera, rotation: Rotation, tracks: Tracks | None, keypoints: Keypoints, before: Keypoints | None, pose: Pose
     ) -> tuple[F64, F64, int]:
         """The step of the position by the points (3,), its covariance (3, 3), both in the world, and how many points agree."""
-        R, gap = rotation.R_world_camera, max(frame.index - pose.index, 1)
+        R, gap = rotation.R_world_camera, max(rotation.index - pose.index, 1)
         if tracks is not None and before is not None and tracks.previous_index == pose.index == before.index:
-            rows = point_rows(tracks, keypoints, before, frame.camera, R.T @ pose.T_world_camera[:3, :3], rotation.covariance, True)
+            rows = point_rows(tracks, keypoints, before, camera, R.T @ pose.T_world_camera[:3, :3], rotation.covariance, True)
             found = solve_step(rows, np.zeros(3), self.motion_sigma_m * gap)
             if found.inliers >= self.min_points:
                 return -R @ found.s, R @ found.covariance @ R.T + self.point_sigma_m**2 * np.eye(3), found.inliers
         return np.zeros(3), (self.motion_sigma_m * gap) ** 2 * np.eye(3), 0
 
-    def _said(self, frame: Frame, state: OffsetFilter, unobservable: F64, inliers: tuple[int, int, int], estimated: bool) -> Translation:
+    def _said(self, rotation: Rotation, state: OffsetFilter, unobservable: F64, inliers: tuple[int, int, int], estimated: bool) -> Translation:
         covariance = np.ascontiguousarray(state.covariance[:3, :3])
         counts = np.array(inliers, np.int32)
         return Translation(
-            frame.index, frame.stamp_ns, state.position_m, covariance, unobservable, counts, estimated, state.planes, state.covariance
+            rotation.index, rotation.stamp_ns, state.position_m, covariance, unobservable, counts, estimated, state.planes, state.covariance
         )  # fmt: skip
 
 

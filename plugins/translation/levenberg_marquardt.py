@@ -9,7 +9,7 @@ import numpy as np
 from trihedron.pipeline.core.geometry import pose_matrix
 from trihedron.pipeline.core.options import NonNegativeFloat, NonNegativeInt, PositiveFloat
 from trihedron.pipeline.core.registry import register
-from trihedron.pipeline.core.types import F64, Frame, Keypoints, Map, Planes, Pose, Rotation, Segments, Tracks, Translation
+from trihedron.pipeline.core.types import F64, Camera, Keypoints, Map, Planes, Pose, Rotation, Segments, Tracks, Translation
 from trihedron.plugins.mapping.reference_keyframe import anchored
 from trihedron.plugins.shared.depth_image import noise_coefficients
 from trihedron.plugins.shared.linalg import constant
@@ -36,7 +36,7 @@ class LevenbergMarquardt:
 
     def __call__(
         self,
-        frame: Frame,
+        camera: Camera,
         rotation: Rotation,
         tracks: Tracks | None,
         keypoints: Keypoints,
@@ -48,36 +48,36 @@ class LevenbergMarquardt:
     ) -> Translation:
         """The position; the first frame's is the origin of the world."""
         if previous_pose is None:
-            return origin(frame)
+            return origin(rotation)
         previous_pose = anchored(previous_pose, map)
-        frames = max(frame.index - previous_pose.index, 1)
+        frames = max(rotation.index - previous_pose.index, 1)
         if tracks is None or tracks.previous_index != previous_pose.index:
-            return self._predicted(frame, previous_pose, earlier_pose, map, frames)
+            return self._predicted(rotation, previous_pose, earlier_pose, map, frames)
         T, R = previous_pose.T_world_camera, rotation.R_world_camera
         start = pose_matrix(R, T[:3, 3])
         prior = np.diag(np.repeat([(self.motion_sigma_m * frames) ** -2, 1.0], 3))
         uncertain = rotation.covariance + np.radians(self.rotation_sigma_deg) ** 2 * np.eye(3)
-        terms = self._terms(tracks, keypoints, segments, planes, frame, T, uncertain)
-        found = solve_pose(start, frame.camera, start, prior, *terms, fixed_rotation=True)
+        terms = self._terms(tracks, keypoints, segments, planes, camera, T, uncertain)
+        found = solve_pose(start, camera, start, prior, *terms, fixed_rotation=True)
         if not (found.points.any() or found.lines.any() or found.planes.any()):
-            return self._predicted(frame, previous_pose, earlier_pose, map, frames)
+            return self._predicted(rotation, previous_pose, earlier_pose, map, frames)
         inliers = np.array([np.count_nonzero(kind) for kind in (found.points, found.lines, found.planes)], np.int32)
         unobservable = np.ascontiguousarray((R @ found.unobservable).T)
         covariance = R @ found.covariance @ R.T + handed_on(previous_pose, held_too=True)
-        return Translation(frame.index, frame.stamp_ns, found.T_world_camera[:3, 3].copy(), covariance, unobservable, inliers, True)
+        return Translation(rotation.index, rotation.stamp_ns, found.T_world_camera[:3, 3].copy(), covariance, unobservable, inliers, True)
 
-    def _predicted(self, frame: Frame, previous: Pose, earlier: Pose | None, map: Map | None, frames: int) -> Translation:
+    def _predicted(self, rotation: Rotation, previous: Pose, earlier: Pose | None, map: Map | None, frames: int) -> Translation:
         """Where the camera is if it goes on as before, for as long as that may be said, else where it was."""
         t, before = previous.T_world_camera[:3, 3].copy(), handed_on(previous, held_too=True)
         lately = np.trace(before) / 3.0 < self.predict_frames * self.motion_sigma_m**2
         if earlier is not None and lately:
             t += (t - anchored(earlier, map).T_world_camera[:3, 3]) * frames / (previous.index - earlier.index)
-        return unmeasured(frame, t, before + (self.motion_sigma_m * frames) ** 2 * np.eye(3))
+        return unmeasured(rotation, t, before + (self.motion_sigma_m * frames) ** 2 * np.eye(3))
 
-    def _terms(self, tracks: Tracks, keypoints: Keypoints, segments: Segments, planes: Planes, frame: Frame, T: F64, uncertain: F64) -> Terms:
+    def _terms(self, tracks: Tracks, keypoints: Keypoints, segments: Segments, planes: Planes, camera: Camera, T: F64, uncertain: F64) -> Terms:
         """The tracks, placed in the world by the previous pose T (4, 4) and a rotation of covariance `uncertain` (3, 3)."""
         points, lines, walls = pairs_of(tracks, keypoints, segments, planes)
-        camera, T, uncertain = frame.camera, constant(T, np.float64), constant(uncertain, np.float64)
+        T, uncertain = constant(T, np.float64), constant(uncertain, np.float64)
         fx, fy, noise = float(camera.fx), float(camera.fy), noise_coefficients(camera.depth_noise)
         return (
             tracked_points(points, keypoints.pixels, fx, fy, T, uncertain),

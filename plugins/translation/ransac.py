@@ -8,7 +8,7 @@ import numpy as np
 
 from trihedron.pipeline.core.options import PositiveFloat, PositiveInt
 from trihedron.pipeline.core.registry import register
-from trihedron.pipeline.core.types import F64, Bool, Frame, Keypoints, Map, Pose, Rotation, Tracks, Translation
+from trihedron.pipeline.core.types import F64, Bool, Keypoints, Map, Pose, Rotation, Tracks, Translation
 from trihedron.plugins.mapping.reference_keyframe import anchored
 from trihedron.plugins.shared.rigid_alignment import tracked_places
 from trihedron.plugins.translation.common import handed_on, origin, unmeasured
@@ -26,12 +26,12 @@ class Ransac:
     motion_sigma_m: PositiveFloat = 0.1  # of a step that is not measured, per frame
 
     def __call__(
-        self, frame: Frame, rotation: Rotation, tracks: Tracks | None, keypoints: Keypoints, previous_pose: Pose | None, map: Map | None,
+        self, rotation: Rotation, tracks: Tracks | None, keypoints: Keypoints, previous_pose: Pose | None, map: Map | None,
         rng: np.random.Generator,
     ) -> Translation:  # fmt: skip
         """The position; the first frame's is the origin of the world."""
         if previous_pose is None:
-            return origin(frame)
+            return origin(rotation)
         pose, R = anchored(previous_pose, map), rotation.R_world_camera
         T, unknown = pose.T_world_camera, handed_on(pose)
         if tracks is not None and tracks.previous_index == previous_pose.index:
@@ -42,9 +42,10 @@ class Ransac:
                 w = 1.0 / sigma[agree] ** 2
                 covariance = np.eye(3) / w.sum() + unknown
                 inliers = np.array([agree.sum(), 0, 0], np.int32)
-                return Translation(frame.index, frame.stamp_ns, T[:3, 3] + w @ steps[agree] / w.sum(), covariance, np.empty((0, 3)), inliers, True)
-        prior_m = self.motion_sigma_m * max(frame.index - previous_pose.index, 1)
-        return unmeasured(frame, T[:3, 3].copy(), unknown + prior_m**2 * np.eye(3))
+                t = T[:3, 3] + w @ steps[agree] / w.sum()
+                return Translation(rotation.index, rotation.stamp_ns, t, covariance, np.empty((0, 3)), inliers, True)
+        prior_m = self.motion_sigma_m * max(rotation.index - previous_pose.index, 1)
+        return unmeasured(rotation, T[:3, 3].copy(), unknown + prior_m**2 * np.eye(3))
 
     def _agreeing(self, steps: F64, sigma: F64, rng: np.random.Generator) -> Bool:
         """(n,) whether each of the steps (n, 3) agrees with the one that most agree with, and then with their mean."""

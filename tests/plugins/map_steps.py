@@ -21,7 +21,7 @@ def step(stage, world, map, index, at=None, features=None, bundle=None, loop=Non
     """The map after frame `index`, whose camera stands at step `at` of the path and is known exactly; None when the stage says None."""
     T = camera_at(index if at is None else at)
     features, frame = features or world.features(T, index), frame or world.frame(index)
-    matches = LocalMap()(frame, rotation_of(T, index), translation_of(T, index), *features, map, None)
+    matches = LocalMap()(frame.camera, rotation_of(T, index), translation_of(T, index), *features, map, None)
     return stage(frame, pose_of(T, index, **pose), *features, matches, map, bundle, loop, recognised)
 
 

@@ -44,7 +44,7 @@ def matched(world, map):
     """The features of a frame, and its matches from a decoupled pose 3 cm and half a degree off."""
     guess, features = camera_at(STEP) @ exp_se3(OFF), world.features(camera_at(STEP), STEP)
     start = rotation_of(guess, STEP, 0.5), translation_of(guess, STEP, sigma_m=0.03)
-    return start, features, LocalMap()(world.frame(STEP), *start, *features, map, None)
+    return start, features, LocalMap()(world.frame(STEP).camera, *start, *features, map, None)
 
 
 def with_movers(map, matches, share, shift_m):
@@ -58,7 +58,7 @@ def with_movers(map, matches, share, shift_m):
 def refined(world, map, share, shift_m=SWAY, **options):
     start, features, matches = matched(world, map)
     moved = with_movers(map, matches, share, shift_m)
-    return Refine(**options)(world.frame(STEP), *start, None, matches, *features, pose_of(camera_at(STEP - 1), STEP - 1), moved, None)
+    return Refine(**options)(world.frame(STEP).camera, *start, None, matches, *features, pose_of(camera_at(STEP - 1), STEP - 1), moved, None)
 
 
 def test_a_landmark_that_two_keyframes_measured_is_proven(world, map):
@@ -101,7 +101,7 @@ def test_a_plane_met_once_is_not_known_to_be_at_rest_unless_there_is_but_one_key
 def denied(world, map, points, planes):
     """Whether a pose by what lies on planes is, with which so many of the points and planes agree."""
     (rotation, _), features, matches = matched(world, map)
-    problem = MapAlignment(rotation.R_world_camera, np.eye(6), world.frame(STEP), matches, *features, map, 1.0, 0.5)
+    problem = MapAlignment(rotation.R_world_camera, np.eye(6), world.frame(STEP).camera, matches, *features, map, 1.0, 0.5)
     counts = (len(matches.keypoints), int(points * len(matches.keypoints))), (len(matches.segments), 0), (len(matches.planes), planes)
     flags = [(np.arange(count) < agree).astype(np.uint8) for count, agree in counts]
     found = PoseSolution(camera_at(STEP), 1e-6 * np.eye(6), np.empty((6, 0)), *flags, 0.0)

@@ -28,11 +28,11 @@ def told(world, map, wrong, turned_deg, keep=10**9):
     axis = np.array([0.8, 0.6, 0.0]) * np.radians(turned_deg)
     T = camera_at(0) @ exp_se3(np.concatenate([[0.04, 0.0, 0.0], axis]))
     features, frame = world.features(T, FRAME), world.frame(FRAME)
-    matches = LocalMap()(frame, rotation_of(T, FRAME), translation_of(T, FRAME), *features, map, None)
+    matches = LocalMap()(frame.camera, rotation_of(T, FRAME), translation_of(T, FRAME), *features, map, None)
     matches = dataclasses.replace(matches, keypoints=matches.keypoints[:keep])
     camera = dataclasses.replace(CAMERA, fx=wrong * CAMERA.fx, fy=wrong * CAMERA.fy)
     agreed = np.ones(len(matches.keypoints), np.uint8)
-    return focal_motion(misled, dataclasses.replace(frame, camera=camera), features[0], matches, agreed, T)
+    return focal_motion(misled, camera, features[0], matches, agreed, T)
 
 
 @pytest.fixture(scope="module")

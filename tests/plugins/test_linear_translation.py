@@ -18,7 +18,7 @@ from landmark_world import INTO_CORNER, World, camera_at, pose_of, rotation_of, 
 
 def irls(world, tracks, a, b, now, before, **options):
     rotation = rotation_of(camera_at(now), now, sigma_deg=0.05)
-    return Irls(**options)(world.frame(now), rotation, tracks, b, a, pose_of(camera_at(before), before), None)
+    return Irls(**options)(world.frame(now).camera, rotation, tracks, b, a, pose_of(camera_at(before), before), None)
 
 
 def test_exact_points_give_the_exact_position():
@@ -82,7 +82,7 @@ def filtered(world, steps, points=True):
         )  # fmt: skip
         tracks = tracks_of(world, step - 1, step)[0] if step and points else None
         keypoints = world.keypoints(T, step)[0]
-        previous = stage(world.frame(step), rotation, tracks, keypoints, world.plane_regions(T, step)[0], before, pose, previous)
+        previous = stage(world.frame(step).camera, rotation, tracks, keypoints, world.plane_regions(T, step)[0], before, pose, previous)
         pose, before = pose_of(np.block([[rotation.R_world_camera, previous.t_world_camera[:, None]], [np.zeros(3), 1.0]]), step), keypoints
         out.append(previous)
     return out

@@ -52,7 +52,7 @@ def walked():
     for index in range(STEPS):
         truth, T = true_pose(index), drifted_pose(index)
         features = world.features(truth, index)
-        matches = LocalMap(near=0)(world.frame(index), rotation_of(T, index), translation_of(T, index), *features, map, None)
+        matches = LocalMap(near=0)(world.frame(index).camera, rotation_of(T, index), translation_of(T, index), *features, map, None)
         pose = Pose(index, index * 33_000_000, T, np.eye(6) * 1e-6, T, -1, np.zeros(3, np.int32), 0, "ok", "")
         map = stage(world.frame(index), pose, *features, matches, map, None, None, None) or map
     return world, map

@@ -31,7 +31,7 @@ def matched(world, map, step, off=(0.0,) * 6, stage=None, features=None):
     T = camera_at(step)
     guess = T @ exp_se3(np.asarray(off, float))
     rotation, translation = rotation_of(guess, step), translation_of(guess, step)
-    return (stage or LocalMap())(world.frame(step), rotation, translation, *(features or world.features(T, step)), map, None)
+    return (stage or LocalMap())(world.frame(step).camera, rotation, translation, *(features or world.features(T, step)), map, None)
 
 
 def right(pairs, feature_rows, landmark_rows):
@@ -70,7 +70,7 @@ def test_walls_at_right_angles_and_opposite_walls_are_related():
     assert {tuple(pair) for pair in found.perpendicular} == {(a, b) for a in range(3) for b in range(3)} - {tuple(pair) for pair in found.planes}
     back = camera_at(0) @ exp_se3(np.array([0, 0, 0, 0, np.pi, 0]))
     features = world.features(back, 3)
-    found = LocalMap()(world.frame(3), rotation_of(back, 3), translation_of(back, 3), *features, first_map(world), None)
+    found = LocalMap()(world.frame(3).camera, rotation_of(back, 3), translation_of(back, 3), *features, first_map(world), None)
     assert len(found.planes) == 0 and len(found.parallel) >= 2
 
 
@@ -143,7 +143,7 @@ def test_the_window_is_bounded_and_reaches_what_was_seen_from_here():
     for index, step in enumerate(steps):
         T = camera_at(step)
         features = world.features(T, index)
-        matches = LocalMap()(world.frame(index), rotation_of(T, index), translation_of(T, index), *features, map, None)
+        matches = LocalMap()(world.frame(index).camera, rotation_of(T, index), translation_of(T, index), *features, map, None)
         map = stage(world.frame(index), pose_of(T, index), *features, matches, map, None, None, None) or map
     assert len(map.keyframes) == len(steps)
     window = local_window(map, camera_at(0), newest=2, covisible=6, near=3)

@@ -34,14 +34,14 @@ def refined(world, map, step=5, off=OFF, keep=tuple(KINDS), **changes):
     guess = camera_at(step) @ exp_se3(np.asarray(off, float))
     rotation, translation = rotation_of(guess, step, 0.5), translation_of(guess, step, sigma_m=0.03)
     features = world.features(camera_at(step), step)
-    matches = LocalMap()(world.frame(step), rotation, translation, *features, map, None)
+    matches = LocalMap()(world.frame(step).camera, rotation, translation, *features, map, None)
     if matches is not None:
         dropped = {name: getattr(matches, name)[:0] for kind, name in KINDS.items() if kind not in keep}
         if "planes" not in keep:
             dropped.update(parallel=dropped["planes"], perpendicular=dropped["planes"])
         matches = dataclasses.replace(matches, **dropped)
     given = {"previous": pose_of(camera_at(step - 1), step - 1), "relocalise": None, "matches": matches, **changes}
-    return Refine()(world.frame(step), rotation, translation, None, given["matches"], *features, given["previous"], map, given["relocalise"])
+    return Refine()(world.frame(step).camera, rotation, translation, None, given["matches"], *features, given["previous"], map, given["relocalise"])
 
 
 def error(pose, step=5):
@@ -98,8 +98,8 @@ def test_the_first_frame_is_the_identity_and_ok():
     world = World()
     rotation, translation = rotation_of(np.eye(4), 0), translation_of(np.eye(4), 0)
     for pose in (
-        Refine()(world.frame(0), rotation, translation, None, None, *world.features(np.eye(4), 0), None, None, None),
-        NoRefinement()(world.frame(0), rotation, translation, None, None, None),
+        Refine()(world.frame(0).camera, rotation, translation, None, None, *world.features(np.eye(4), 0), None, None, None),
+        NoRefinement()(rotation, translation, None, None, None),
     ):
         assert pose.status == "ok" and pose.reference == -1
         assert np.array_equal(pose.T_world_camera, np.eye(4)) and np.linalg.eigvalsh(pose.covariance).min() > 0.0
@@ -127,8 +127,8 @@ def test_the_status_of_a_decoupled_pose(source, estimated, held, status, reason)
     translation = dataclasses.replace(translation_of(T, 3, estimated=estimated), unobservable=np.eye(3)[:held].copy())
     rotation = rotation_of(T, 3, source=source)
     for pose in (
-        NoRefinement()(world.frame(3), rotation, translation, pose_of(T, 2), None, None),
-        Refine()(world.frame(3), rotation, translation, None, None, *world.features(T, 3), pose_of(T, 2), None, None),
+        NoRefinement()(rotation, translation, pose_of(T, 2), None, None),
+        Refine()(world.frame(3).camera, rotation, translation, None, None, *world.features(T, 3), pose_of(T, 2), None, None),
     ):
         assert (pose.status, pose.reason, pose.unobservable) == (status, reason, held)
         assert np.array_equal(pose.T_world_camera, T)
@@ -145,7 +145,7 @@ def test_matches_that_contradict_each_other_are_not_called_ok():
     world = World(noise=0.0)
     map = first_map(world)
     guess = camera_at(5) @ exp_se3(OFF)
-    matches = LocalMap()(world.frame(5), rotation_of(guess, 5), translation_of(guess, 5), *world.features(camera_at(5), 5), map, None)
+    matches = LocalMap()(world.frame(5).camera, rotation_of(guess, 5), translation_of(guess, 5), *world.features(camera_at(5), 5), map, None)
     pairs = matches.keypoints.copy()
     pairs[:, 1] = np.random.default_rng(0).permutation(pairs[:, 1])
     none = matches.planes[:0]
@@ -159,14 +159,14 @@ def test_a_rotation_that_was_not_measured_needs_the_map():
     world = World(noise=0.0)
     map, features = first_map(world), world.features(camera_at(5), 5)
     guess = camera_at(5) @ exp_se3(OFF)
-    matches = LocalMap()(world.frame(5), rotation_of(guess, 5), translation_of(guess, 5), *features, map, None)
+    matches = LocalMap()(world.frame(5).camera, rotation_of(guess, 5), translation_of(guess, 5), *features, map, None)
     pairs, none = matches.keypoints.copy(), matches.planes[:0]
     pairs[:, 1] = np.random.default_rng(0).permutation(pairs[:, 1])
     wrong = dataclasses.replace(matches, keypoints=pairs, segments=none, planes=none, parallel=none, perpendicular=none)
     previous = pose_of(camera_at(4), 4)
     for found, status in ((wrong, "lost"), (matches, "degraded")):
         rotation = rotation_of(guess, 5, 0.5, source="prediction")
-        pose = Refine()(world.frame(5), rotation, translation_of(guess, 5, sigma_m=0.03), None, found, *features, previous, map, None)
+        pose = Refine()(world.frame(5).camera, rotation, translation_of(guess, 5, sigma_m=0.03), None, found, *features, previous, map, None)
         assert pose.status == status and ("not measured" in pose.reason)
 
 
@@ -175,7 +175,7 @@ def test_a_corridor_keeps_the_prediction_along_it():
     world = World(noise=0.0)
     map = first_map(world)
     guess = camera_at(5) @ exp_se3(OFF)
-    matches = LocalMap()(world.frame(5), rotation_of(guess, 5), translation_of(guess, 5), *world.features(camera_at(5), 5), map, None)
+    matches = LocalMap()(world.frame(5).camera, rotation_of(guess, 5), translation_of(guess, 5), *world.features(camera_at(5), 5), map, None)
     none = matches.keypoints[:0]
     one = dataclasses.replace(matches, keypoints=none, segments=none, planes=matches.planes[:1], parallel=none, perpendicular=none)
     pose = refined(world, map, matches=one)
@@ -189,7 +189,7 @@ def test_a_lost_pose_stays_lost_however_well_the_frames_fit_each_other():
     """The previous pose was lost and wrong by a metre; the tracks are good."""
     held = camera_at(2) @ exp_se3(np.array([1.0, 0, 0, 0, 0.3, 0]))
     guess = held @ invert(camera_at(2)) @ camera_at(3)
-    found = NoRefinement()(World().frame(3), rotation_of(guess, 3), translation_of(guess, 3), pose_of(held, 2, "lost"), None, None)
+    found = NoRefinement()(rotation_of(guess, 3), translation_of(guess, 3), pose_of(held, 2, "lost"), None, None)
     assert found.status == "lost" and found.reason == "the place was not recognised since the pose was lost"
     assert np.allclose(found.T_world_camera, guess)
 
@@ -197,12 +197,12 @@ def test_a_lost_pose_stays_lost_however_well_the_frames_fit_each_other():
 def test_a_place_recognised_replaces_a_lost_pose():
     world, held = World(), camera_at(2) @ exp_se3(np.array([1.0, 0, 0, 0, 0.3, 0]))
     lost, recognised = pose_of(held, 2, "lost"), pose_of(camera_at(5), 5)
-    found = NoRefinement()(world.frame(5), rotation_of(held, 5), translation_of(held, 5), lost, None, recognised)
+    found = NoRefinement()(rotation_of(held, 5), translation_of(held, 5), lost, None, recognised)
     assert np.allclose(found.T_world_camera, camera_at(5)) and found.status == "ok"
     map, features = first_map(world), world.features(camera_at(5), 5)
     rotation, translation = rotation_of(held, 5), translation_of(held, 5)
-    matches = LocalMap()(world.frame(5), rotation, translation, *features, map, recognised)
-    pose = Refine()(world.frame(5), rotation, translation, None, matches, *features, lost, map, recognised)
+    matches = LocalMap()(world.frame(5).camera, rotation, translation, *features, map, recognised)
+    pose = Refine()(world.frame(5).camera, rotation, translation, None, matches, *features, lost, map, recognised)
     assert pose.status == "ok" and error(pose)[0] < 0.01
 
 

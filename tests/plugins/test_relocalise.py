@@ -29,7 +29,7 @@ def mapped(world, poses=None):
     map = None
     for i, T in enumerate(poses or [camera_at(step) for step in STEPS]):
         features = world.features(T, i)
-        matches = LocalMap()(world.frame(i), rotation_of(T, i), translation_of(T, i), *features, map, None) if map else None
+        matches = LocalMap()(world.frame(i).camera, rotation_of(T, i), translation_of(T, i), *features, map, None) if map else None
         map = EVERY(world.frame(i), pose_of(T, i), *features, matches, map, None, None, None) or map
     return map
 

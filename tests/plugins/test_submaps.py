@@ -30,7 +30,7 @@ def pose_of(T, index, status="ok", **more):
 def seen(world, map, index, step, T, **more):
     """The map after the frame seen at `step`, whose pose is said as T."""
     features = world.features(camera_at(step), index)
-    matches = LocalMap()(world.frame(index), rotation_of(T, index), translation_of(T, index), *features, map, None) if map else None
+    matches = LocalMap()(world.frame(index).camera, rotation_of(T, index), translation_of(T, index), *features, map, None) if map else None
     relocalise, reference = more.pop("recognised", None), more.get("reference", -1)
     if reference >= 0:
         more["T_reference_camera"] = invert(map.keyframes.column("T_world_camera")[reference]) @ T
@@ -96,9 +96,9 @@ def test_a_new_sub_map_begins_after_as_many_frames_as_were_sought_in_vain():
     for index in range(1, 20):
         T, features = camera_at(index), world.features(camera_at(index), index)
         translation = translation_of(T, index, estimated=index != 4)
-        matches = LocalMap()(world.frame(index), rotation_of(T, index), translation, *features, map, None)
+        matches = LocalMap()(world.frame(index).camera, rotation_of(T, index), translation, *features, map, None)
         sought = dataclasses.replace(pose, index=index) if index != 5 else None
-        pose = stage(world.frame(index), rotation_of(T, index), translation, None, matches, *features, pose, map, sought)
+        pose = stage(world.frame(index).camera, rotation_of(T, index), translation, None, matches, *features, pose, map, sought)
         statuses.append((pose.status, pose.submap))
         if pose.submap:
             break

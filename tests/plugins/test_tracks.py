@@ -23,7 +23,7 @@ def frame(room, index):
 
 
 def track(room, now, before, manhattan=(None, None), previous=None, **fields):
-    return Projection(**fields)(frame(room, now[0].index), *now, *before, *manhattan, previous)
+    return Projection(**fields)(frame(room, now[0].index).camera, *now, *before, *manhattan, previous)
 
 
 def right(now, before, tracks):

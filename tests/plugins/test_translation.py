@@ -45,7 +45,7 @@ def run(world, now, previous=0, rotation=None, **kinds):
     tracks, keypoints, segments, planes = tracked(world, previous, now, **kinds)
     stage = LevenbergMarquardt()
     rotation = rotation or rotation_of(camera_at(now), now, sigma_deg=0.05)
-    return stage(world.frame(now), rotation, tracks, keypoints, segments, planes, pose_of(camera_at(previous), previous), None, None)
+    return stage(world.frame(now).camera, rotation, tracks, keypoints, segments, planes, pose_of(camera_at(previous), previous), None, None)
 
 
 @pytest.mark.parametrize("kinds, limit_m", [({}, 0.002), ({"points": False}, 0.003), ({"points": False, "lines": False}, 0.004)], ids=str)
@@ -80,7 +80,7 @@ def test_a_poor_rotation_gives_the_planes_more_say():
 
 def test_the_first_frame_is_the_origin():
     world = World()
-    found = LevenbergMarquardt()(world.frame(0), rotation_of(np.eye(4), 0), None, *world.features(np.eye(4), 0), None, None, None)
+    found = LevenbergMarquardt()(world.frame(0).camera, rotation_of(np.eye(4), 0), None, *world.features(np.eye(4), 0), None, None, None)
     assert found.estimated and not found.t_world_camera.any()
 
 
@@ -88,12 +88,12 @@ def test_without_tracks_the_prediction_is_kept_and_not_called_an_estimate():
     world = World()
     T = camera_at(5)
     for tracks in (None, tracked(world, 3, 6)[0]):  # none, or of another frame than the pose
-        found = LevenbergMarquardt()(world.frame(6), rotation_of(T, 6), tracks, *world.features(T, 6), pose_of(T, 5), None, None)
+        found = LevenbergMarquardt()(world.frame(6).camera, rotation_of(T, 6), tracks, *world.features(T, 6), pose_of(T, 5), None, None)
         assert not found.estimated and not found.inliers.any()
         assert np.array_equal(found.t_world_camera, T[:3, 3])
         assert np.allclose(found.unobservable, np.eye(3))
     nothing = tracked(world, 5, 6, points=False, lines=False, planes=False)
-    assert not LevenbergMarquardt()(world.frame(6), rotation_of(T, 6), *nothing, pose_of(T, 5), None, None).estimated
+    assert not LevenbergMarquardt()(world.frame(6).camera, rotation_of(T, 6), *nothing, pose_of(T, 5), None, None).estimated
 
 
 def test_a_bare_corridor_keeps_the_prediction_along_it():
@@ -112,7 +112,7 @@ def test_a_bare_corridor_keeps_the_prediction_along_it():
     tracks = Tracks(
         1, 33_000_000, 0, none.keypoints, none.points_m, none.sigma_m, none.segments, none.endpoints_m, rows, before, small, np.eye(3)
     )  # fmt: skip
-    found = LevenbergMarquardt()(world.frame(1), rotation_of(T, 1), tracks, keypoints, segments, planes, pose_of(T, 0), None, None)
+    found = LevenbergMarquardt()(world.frame(1).camera, rotation_of(T, 1), tracks, keypoints, segments, planes, pose_of(T, 0), None, None)
     along = INTO_CORNER[:3, 2]
     assert np.allclose(found.t_world_camera, moved[:3, 3] - along * (along @ moved[:3, 3]), atol=1e-3)
     assert found.unobservable.shape == (1, 3) and abs(found.unobservable[0] @ along) > 0.999
@@ -131,7 +131,7 @@ def test_without_features_the_camera_goes_on_for_half_a_second_then_stands_ever_
     poses, found = [pose_of(camera_at(8), 8), pose_of(camera_at(9), 9)], []
     for index in range(10, 60):
         T = camera_at(9)
-        found.append(stage(world.frame(index), rotation_of(T, index), *nothing, poses[-1], poses[-2], None))
+        found.append(stage(world.frame(index).camera, rotation_of(T, index), *nothing, poses[-1], poses[-2], None))
         T = pose_matrix(T[:3, :3], found[-1].t_world_camera)
         covariance = np.zeros((6, 6))
         covariance[:3, :3] = T[:3, :3].T @ found[-1].covariance @ T[:3, :3]
