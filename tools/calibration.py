@@ -56,7 +56,7 @@ def _turn_of_planes(tracks: Tracks, planes: Planes) -> tuple[F64, F64] | None:
         if len(rows) < 2 or np.linalg.eigvalsh(information)[0] < WEAKEST:
             return None
         R = exp_so3(np.linalg.solve(information, (np.cross(turned, after) / variance[:, None]).sum(axis=0))) @ R
-    return log_so3(R), np.linalg.inv(information)
+    return log_so3(R), np.asarray(np.linalg.inv(information), np.float64)
 
 
 def _turn_of_points(tracks: Tracks, keypoints: Keypoints, camera: Camera) -> F64 | None:

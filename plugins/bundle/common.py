@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from trihedron.pipeline.core.geometry import invert, tangent_basis, transform_planes
 from trihedron.pipeline.core.types import F64, I32, Correction, Map, Table
@@ -201,7 +202,7 @@ def carried_correction(map: Map, window: BundleWindow, seen: BundleMeasurements,
     )
 
 
-def _newest_free(rows: I32, keyframes: I32, count: int, free: int) -> I32:
+def _newest_free(rows: NDArray[np.signedinteger], keyframes: I32, count: int, free: int) -> I32:
     """(count,) the newest free keyframe among those, `keyframes`, that saw each landmark, `rows`; every one was seen by some."""
     newest = np.zeros(count, np.int32)
     known = keyframes < free

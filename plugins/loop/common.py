@@ -107,7 +107,7 @@ class LoopClosing(ABC):
         for sigma_m in (0.03, 0.01):
             matches = SEARCH.search(frame.camera, Guess(T, sigma_m, 0.3 * sigma_m, True), *features, map, place.seen)
             found = solve_pose(
-                T, frame.camera, T_before, np.linalg.inv(expected),
+                T, frame.camera, T_before, np.asarray(np.linalg.inv(expected), np.float64),
                 point_terms(map, features[0], matches.keypoints),
                 line_terms(map, features[1], matches.segments, T, frame.camera, 1.0),
                 plane_terms(map, features[2], matches.planes, NOTHING, NOTHING, 1.0),
@@ -291,7 +291,7 @@ def _shift(n: F64, offset: F64, sigma_m: float) -> tuple[F64, Bool]:
     shift, kept = np.zeros(3), np.ones(len(n), np.bool_)
     for _ in range(len(n)):
         A = n[kept].T @ n[kept] / LAYOUT_M**2 + np.eye(3) / max(sigma_m, 1e-3) ** 2
-        shift = np.linalg.solve(A, n[kept].T @ offset[kept] / LAYOUT_M**2)
+        shift = np.asarray(np.linalg.solve(A, n[kept].T @ offset[kept] / LAYOUT_M**2), np.float64)
         error = np.where(kept, np.abs(n @ shift - offset), 0.0)
         if error.max() < LAYOUT_M:
             break

@@ -51,7 +51,7 @@ def close(map: Map, closure: Closure, drift: Drift, compass: Compass | None) -> 
     before = map.keyframes.rows("T_world_camera", rows)
     place, keyframe = np.searchsorted(rows, [closure.place, closure.keyframe])
     measured = invert(before[place]) @ closure.T_world_camera
-    closing = Edges(np.array([[place, keyframe]], np.int32), measured[None], np.linalg.inv(closure.covariance)[None])
+    closing = Edges(np.array([[place, keyframe]], np.int32), measured[None], np.asarray(np.linalg.inv(closure.covariance), np.float64)[None])
     return moved_keyframes(map, rows, before, _solved(before, joined(_odometry(map, rows, before, drift), closing), compass))
 
 

@@ -72,7 +72,7 @@ def cull_repeated(map: Map, shift_m: float, turn_deg: float, share: float) -> Ma
     for kind, weight in WEIGHTS.items():
         own = observed_by(map, keyframe, kind)
         seen += weight * len(own)
-        known += weight * np.count_nonzero(among(own, observed_by(map, near, kind)))
+        known += weight * int(np.count_nonzero(among(own, observed_by(map, near, kind))))
     planes = observed_by(map, keyframe, "plane")
     if not len(near) or known < share * seen or not among(planes, observed_by(map, older, "plane")).all():
         return map
@@ -128,7 +128,7 @@ def retired(map: Map, keyframe: int) -> Map:
 
 def released(map: Map) -> Map:
     """The same map with the chunks given back in which no landmark lives, or no living keyframe has a measurement; rows keep their numbers."""
-    changes: dict[str, Table] = {}
+    changes: dict[str, Any] = {}
     held = living_keyframes(map)
     for kind in KINDS:
         landmarks, measured = getattr(map, f"{kind}s"), getattr(map, f"{kind}_observations")

@@ -6,10 +6,11 @@ from dataclasses import dataclass
 from typing import Annotated
 
 import numpy as np
+from numpy.typing import NDArray
 
 from trihedron.pipeline.core.options import AcuteDeg, PositiveFloat, PositiveInt, Range, check_increasing
 from trihedron.pipeline.core.registry import register
-from trihedron.pipeline.core.types import I32, LOST, Bool, Column, Frame, Pose, PredictedView, Table
+from trihedron.pipeline.core.types import LOST, Bool, Column, Frame, Pose, PredictedView, Table
 from trihedron.plugins.model.common import sight_of
 from trihedron.plugins.model.common_kernels import Lens
 from trihedron.plugins.model.surfels_kernels import Images, fuse, index_map, shown
@@ -78,7 +79,7 @@ def fused(table: Table, images: Images, camera: Lens, index: int, apart: float, 
     return table.appended(surfel=left, seen=np.full(len(left), index, np.int32))[0]
 
 
-def _at(rows: I32, count: int) -> Bool:
+def _at(rows: NDArray[np.signedinteger], count: int) -> Bool:
     out = np.zeros(count, bool)
     out[rows] = True
     return out

@@ -83,7 +83,7 @@ class PlanarRegions:
         """The largest regions as a value, largest first; `owner` says which one a label belongs to, 0 = none."""
         numbered, number, ranked, area = largest_regions(labels, owner, grid.count, self.min_pixels, self.planes)
         A, b, moments, n = (total[ranked] for total in sums)
-        q = np.linalg.solve(A, b[..., None])[..., 0]
+        q = np.asarray(np.linalg.solve(A, b[..., None])[..., 0], np.float64)
         coefficients, J, excess, samples = plane_report(
             numbered, core, number, q, grid, self.tiles, self.correlation_px**2, 2.0, self.samples, 400
         )
@@ -93,7 +93,7 @@ class PlanarRegions:
             stamp_ns=frame.stamp_ns,
             coefficients=coefficients,
             covariance=J @ (np.linalg.inv(A) * variance[:, None, None]) @ np.swapaxes(J, -1, -2),
-            moments=moments,
+            moments=np.asarray(moments, np.float64),
             pixels=area,
             samples_m=samples,
             labels=numbered,

@@ -369,7 +369,7 @@ def areas(labels: U8, count: U8, regions: int) -> I32:
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def largest_regions(labels: U8, owner: I32, count: U8, least: int, most: int) -> tuple[U8, U8, I32, I32]:
+def largest_regions(labels: U8, owner: I32, count: U8 | I32, least: int, most: int) -> tuple[U8, U8, I32, I32]:
     """The regions of at least `least` depths, `most` at most, as 1 … k from the largest: `labels` (h, w) by these numbers, 0 = none, the number of
     each label, which of the regions each is, and its number of depths. `owner` (k + 1,) says which region a label belongs to, 0 = none."""
     area, single = np.zeros(len(owner)), areas(labels, count, len(owner) - 1)

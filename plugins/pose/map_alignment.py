@@ -83,7 +83,7 @@ class MapAlignment:
     def agreement(self, found: PoseSolution) -> Agreement:
         """Of a solution with the flags of all matches."""
         same = len(self.matches.planes)
-        inliers = np.count_nonzero(found.points), np.count_nonzero(found.lines), np.count_nonzero(found.planes[:same])
+        inliers = int(np.count_nonzero(found.points)), int(np.count_nonzero(found.lines)), int(np.count_nonzero(found.planes[:same]))
         return Agreement(inliers, (len(self.matches.keypoints), len(self.matches.segments), same))
 
     def landmarks(self, found: PoseSolution) -> tuple[I32, I32, I32]:

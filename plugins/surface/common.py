@@ -8,6 +8,7 @@ from typing import Annotated
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from trihedron.pipeline.core.options import NonNegativeFloat, PositiveFloat, PositiveShare, Range
 from trihedron.pipeline.core.types import F32, F64, I32, LOST, PLANE_KINDS, U8, Bool, DepthNoise, Frame, Map, Planes, Pose, Rotation, Surface
@@ -209,7 +210,7 @@ def _heights(corners: F64, rows: I32, count: int) -> F64:
     return out
 
 
-def _kinds(planes: F64, areas: F32, corners: F64, rows: I32, up: F64) -> U8:
+def _kinds(planes: F64, areas: F32, corners: F64, rows: NDArray[np.signedinteger], up: F64) -> U8:
     """(p,) rows of PLANE_KINDS; the most general one for all when nobody knows which way is up."""
     kinds = np.full(len(planes), PLANE_KINDS.index("plane"), np.uint8)
     if not np.isfinite(up).all():
@@ -237,14 +238,14 @@ MOST = 48  # views; what one sees its neighbours see too
 def painted(points: F64, normals: F64, views: Sequence[tuple[KeyframeView, F64]]) -> tuple[U8, Bool]:
     """(n, 3) RGB of points with unit normals (n, 3), the mean over the views that see them, those that see them large by far the most; and whether
     any does: UNSEEN grey if none. Of more than MOST views as many are asked, evenly."""
-    points, normals = np.ascontiguousarray(points, np.float32), np.ascontiguousarray(normals, np.float32)
+    points32, normals32 = np.ascontiguousarray(points, np.float32), np.ascontiguousarray(normals, np.float32)
     total = np.zeros((len(points), 4), np.float32)
     for row in np.unique(np.linspace(0, max(len(views) - 1, 0), min(MOST, len(views))).round().astype(int)):
         view, T = views[row]
         c = view.camera
         lens = c.intrinsics.astype(np.float32)
         near = (NEAR_M + VISIBLE_SIGMAS * c.depth_noise.sigma_m(np.arange(0.0, 16.0, 0.1))).astype(np.float32)
-        paint(points, normals, view.depth_m, view.color, T[:3, :3].T.astype(np.float32), T[:3, 3].astype(np.float32), lens, near, total)
+        paint(points32, normals32, view.depth_m, view.color, T[:3, :3].T.astype(np.float32), T[:3, 3].astype(np.float32), lens, near, total)
     seen = total[:, 3] > 0.0
     colors = np.rint(total[:, :3] / np.maximum(total[:, 3:], 1e-20))
     return np.where(seen[:, None], colors, UNSEEN).astype(np.uint8), seen
@@ -276,7 +277,9 @@ class Atlas:
     colors: U8
 
 
-def atlas_of(vertices: F64, triangles: I32, labels: I32, planes: F64, views: Sequence[tuple[KeyframeView, F64]], texel_m: float) -> Atlas:
+def atlas_of(
+    vertices: F64, triangles: I32, labels: NDArray[np.signedinteger], planes: F64, views: Sequence[tuple[KeyframeView, F64]], texel_m: float
+) -> Atlas:  # fmt: skip
     """Paint planes (p, 4) at `texel_m` a texel where their triangles are."""
     texels = np.full((len(triangles), 3, 2), np.nan, np.float32)
     axes = [plane_axes(plane) for plane in planes]

@@ -116,7 +116,7 @@ STEP = 0x9E3779B1  # visits vertices in an order without order, so that no verte
 NEAR = 1024  # but so many that follow each other before the next: they are near each other, in memory too
 
 
-def decimated(vertices: F64, triangles: I32, labels: I32, planes: F64, border: I32, free: Bool, beside: I32) -> I32:
+def decimated(vertices: F64, triangles: I32, labels: I32, planes: F64, border: Bool, free: Bool, beside: I32) -> I32:
     """The rows (t,) that stay, in triangles (t, 3) that are changed in place. Vertices of one plane's triangles alone go; those on a border (v,) go
     when they are `free` (v,), along it: `beside` (v, 2) are the neighbours there."""
     number = np.arange(len(vertices), dtype=np.uint64)

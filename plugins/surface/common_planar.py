@@ -125,7 +125,7 @@ def planar_labels(vertices: F64, normals: F64, triangles: I32, opposite: I32, pl
     planes = _fitted(labels, middle, area, planes)
     for _ in range(flat.rim):
         labels = with_rim(labels, vertices, triangles, turned, opposite, planes, flat.rim_m)
-    labels = without_steps(labels, triangles, len(vertices), planes, np.bincount(labels + 1, area, len(planes) + 1)[1:])
+    labels = without_steps(labels, triangles, len(vertices), planes, np.asarray(np.bincount(labels + 1, area, len(planes) + 1), np.float64)[1:])
     return _large(_filled(labels, vertices, triangles, opposite, planes, flat), middle, opposite, area, planes, flat), planes
 
 

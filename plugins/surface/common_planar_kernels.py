@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import numba
 import numpy as np
+from numpy.typing import NDArray
 
 from trihedron.pipeline.core.types import F64, I32
 
@@ -47,7 +48,8 @@ def steadiness(turned: F64, opposite: I32) -> F64:
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def grown_kernel(
-    seeds: I32, labels: I32, first: int, middle: F64, turned: F64, area: F64, opposite: I32, distance: float, cosine: float, least: float
+    seeds: NDArray[np.signedinteger], labels: I32, first: int, middle: F64, turned: F64, area: F64, opposite: I32,
+    distance: float, cosine: float, least: float,
 ) -> tuple[I32, F64]:  # fmt: skip
     """Regions grown from seeds (t,) among the triangles without a label, about planes fitted each time they have doubled. Returns labels, those of
     the new regions from `first` on, and the new planes."""

@@ -87,7 +87,7 @@ def solve_step(rows: Rows, start: F64, prior_m: float) -> Step:
             break
     values, vectors = np.linalg.eigh(H)
     inliers = int(np.count_nonzero(np.linalg.norm(normalised, axis=1) < GATE))
-    return Step(s, np.linalg.inv(H + prior), inliers, vectors[:, values < (2.0 / prior_m) ** 2].T)
+    return Step(s, np.asarray(np.linalg.inv(H + prior), np.float64), inliers, vectors[:, values < (2.0 / prior_m) ** 2].T)
 
 
 def _linearised(rows: Rows, s: F64) -> tuple[F64, F64]:
