@@ -63,7 +63,7 @@ Example: trihedron run replay=runs/latest/run.mcap only=[manhattan,rotation] man
 
 def main(argv: list[str] | None = None) -> int:
     """Entry point of the command; returns the exit code."""
-    memory.settle()
+    memory.configure_malloc()
     words = list(sys.argv[1:] if argv is None else argv)
     debug = "--debug" in words
     words = [word for word in words if word != "--debug"]
@@ -129,7 +129,7 @@ def _run(words: list[str]) -> int:
         if word.startswith("=") or word == "out=":
             raise UsageError(word, "lacks a " + ("key" if word.startswith("=") else "folder"), "write key=value, for example out=runs/mine")
     os.environ["HYDRA_FULL_ERROR"] = "1"  # exceptions come to us instead of being printed
-    with memory.growing():
+    with memory.gc_paused():
         import hydra
 
         from trihedron.pipeline.core.config import check_added, register_configs, rewritten

@@ -27,9 +27,10 @@ from trihedron.pipeline.record.trajectories import TRUTH, attached_truth, format
 from trihedron.pipeline.run import results
 from trihedron.pipeline.run.interrupts import Interrupts
 from trihedron.pipeline.run.live import Pace, is_camera
-from trihedron.pipeline.run.replay import Replay, Step
-from trihedron.pipeline.run.runner import Runner
-from trihedron.pipeline.run.state import Memory, load_map, reaches
+from trihedron.pipeline.run.map_file import load_map, save_map
+from trihedron.pipeline.run.replay import TOPICS, Replay
+from trihedron.pipeline.run.runner import Runner, Step
+from trihedron.pipeline.run.state import DelayLines, max_delays
 from trihedron.pipeline.run.timing import forget_peak
 from trihedron.pipeline.run.warm_up import prepared
 
@@ -57,7 +58,7 @@ def execute(config: DictConfig, out: Path, overrides: list[str], began: float) -
     trial = partial(Runner, graph, config.seed, config.threads, replay, frames, remembered)
     with _Warnings() as warnings, prepared(runner, trial) as waited:
         warnings.muted = False
-        writer = RecordingWriter(out / RECORDING, _metadata(config, overrides))
+        writer = RecordingWriter(out / RECORDING, {**_metadata(config, overrides), TOPICS: json.dumps(sorted(topics))})
         attachments = _attachments(graph, replay)
         for name, text in attachments.items():
             writer.attach(name, text)
@@ -67,7 +68,7 @@ def execute(config: DictConfig, out: Path, overrides: list[str], began: float) -
             for _ in _progress(runner.steps(writer, topics, embed_frames="dataset" in topics, truth=truth)):
                 pass
             if config.save_map:
-                runner.keeper.save(Path(config.save_map).expanduser(), _metadata(config, overrides), source)
+                save_map(Path(config.save_map).expanduser(), runner.state, _metadata(config, overrides), source)
         finally:
             with Interrupts() as interrupts, interrupts.held():
                 failure = _closed(writer)
@@ -88,7 +89,7 @@ def _closed(writer: RecordingWriter) -> RecordingError | None:
     return None
 
 
-def _remembered(config: DictConfig, graph: Graph) -> Callable[[int], Memory] | None:
+def _remembered(config: DictConfig, graph: Graph) -> Callable[[int], DelayLines] | None:
     """What a run begins with: nothing, or the map file it goes on from."""
     if config.save_map and config.replay:
         raise ConfigError("save_map", "a replay makes no map to go on from", "save the map of the run itself")
@@ -98,10 +99,10 @@ def _remembered(config: DictConfig, graph: Graph) -> Callable[[int], Memory] | N
         if config.localise_only:
             raise ConfigError("localise_only", "needs a map to find the camera in", "give load_map=FILE.mcap too")
         return None
-    if "map" not in reaches(graph.stages.values()):
+    if "map" not in max_delays(graph.stages.values()):
         raise ConfigError("load_map", "no stage of this graph reads a map", "choose another graph")
-    saved, source = load_map(config.load_map), _source(config)
-    return lambda first: saved.memory(first, source)
+    saved, source = load_map(config.load_map, [stage.plugin for stage in graph.stages.values()]), _source(config)
+    return lambda first: saved.delay_lines(first, source)
 
 
 def _pace(config: DictConfig) -> Pace:

@@ -21,7 +21,7 @@ from omegaconf.errors import ValidationError
 from trihedron.pipeline.core.errors import ConfigError, TrihedronError, UsageError, did_you_mean
 from trihedron.pipeline.core.graph import Graph, build_graph
 from trihedron.pipeline.core.registry import load_plugins, options_of, plugin_class, plugins_of
-from trihedron.pipeline.core.slots import SLOTS, default_wires
+from trihedron.pipeline.core.slots import SLOTS, Localising, default_wires
 
 PLUGIN_KEY = "plugin"  # which plugin a slot's configuration belongs to
 SWEEPER, SEARCH, DASK = (f"hydra_plugins.trihedron.{name}" for name in ("Sweeper", "Search", "Dask"))  # `_target_` of Hydra's groups
@@ -130,10 +130,10 @@ def graph_of(config: DictConfig) -> Graph:
     if (stage := next((stage for stage, inputs in wiring.items() if not isinstance(inputs, dict)), None)) is not None:
         raise ConfigError(f"graph.{stage}", f"'{wiring[stage]}' is not the wires of a stage", f"choose a plugin with {stage}=NAME")
     plugins = {slot: make_plugin(slot, config[slot]) for slot in wiring if slot in SLOTS and config.get(slot) is not None}
-    if config.localise_only and "map" in plugins:
-        plugins["map"] = plugin_class("map", "none")()
-        if hasattr(plugins.get("pose"), "submap_after"):  # a camera that is only localised begins no map of its own: it stays lost
-            plugins["pose"] = dataclasses.replace(plugins["pose"], submap_after=0)
+    if config.localise_only:
+        if "map" in plugins and not isinstance(plugins["map"], Localising):
+            raise ConfigError("localise_only", f"map={config.map.plugin} cannot leave a loaded map as it is", "choose another plugin, or map=none")
+        plugins = {slot: plugin.localising() if isinstance(plugin, Localising) else plugin for slot, plugin in plugins.items()}
     return build_graph(plugins, list(config.outputs), {stage: wires for stage in wiring if (wires := _changed_wires(stage, wiring[stage]))})
 
 

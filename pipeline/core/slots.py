@@ -15,7 +15,7 @@ from __future__ import annotations
 import inspect
 import re
 from functools import cache
-from typing import Annotated, Any, Generic, Protocol, TypeVar, get_type_hints
+from typing import Annotated, Any, Generic, Protocol, TypeVar, get_type_hints, runtime_checkable
 
 import numpy as np
 
@@ -242,6 +242,21 @@ class SurfaceSlot(Protocol, Generic[State]):
     def add(self, state: State, frame: Frame, planes: Planes, rotation: Rotation | None, pose: Pose, map: Map | None) -> State: ...
 
     def finish(self, state: State, map: Map | None) -> Surface: ...
+
+
+@runtime_checkable
+class Localising(Protocol):
+    """Optional interface of any plugin: `localising` returns the plugin that takes its place when the camera is only localised in a loaded map, which
+    stays as it is (`localise_only=true`)."""
+
+    def localising(self) -> Any: ...
+
+
+@runtime_checkable
+class ChecksLoadedMap(Protocol):
+    """Optional interface of any plugin: `check_loaded_map` raises ValueError or KeyError where a map from a file refers to rows that it lacks."""
+
+    def check_loaded_map(self, map: Map) -> None: ...
 
 
 SLOTS: dict[str, type[Any]] = {

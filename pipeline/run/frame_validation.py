@@ -1,4 +1,4 @@
-"""What the runner takes from a data set: frames whose images, camera and time stages can rely on. What cannot be used is said and left out."""
+"""Frame validation: images, camera and time of each frame are checked before a stage reads them; faults are reported and skipped."""
 
 from __future__ import annotations
 
@@ -14,7 +14,10 @@ from trihedron.pipeline.core.types import F32, Frame
 
 log = logging.getLogger("trihedron")
 LATE_NS = 1_000_000_000  # a frame that comes this late or later was not late: the clock was set back
-SATURATED, CROWDED = 0.02, 3.0  # a limit: share of the image that says it, and times the readings of any other depth
+CONSTANT = 0.95  # share of the readings with one value, from which an image of depth counts as constant
+CONSTANT_READINGS = 0.01  # of the image, without which nothing is constant
+CHANGED_LEVELS, CHANGED_SHARE = 16, 0.02  # grey levels, beyond image noise, and share of the pixels by which colour has changed
+SATURATED, CROWDED = 0.02, 3.0  # a limit: share of the image that has this value, and times the readings of any other depth
 AWAY_S = 0.5  # to a frame that shows surfaces at other distances
 JUDGED = 10  # readable frames after which the scale of depth is judged
 SAMPLED_PX = 8  # apart are the readings by which scale and limit are judged
@@ -22,7 +25,7 @@ NEAR_M, FAR_M = 0.7, 8.0  # half of the readings nearer, or farther: no room of 
 
 
 def usable(frame: Frame) -> Frame | None:
-    """The frame with readings that are no distance (NaN, infinite, negative) as missing; None where camera and images differ in size."""
+    """Return the frame with readings that are no distance (NaN, infinite, negative) as missing; None where camera and images differ in size."""
     camera, depth, (h, w) = frame.camera, frame.depth_m, frame.depth_m.shape
     if (camera.width, camera.height) != (w, h):
         log.warning("frame %d: its images are %d×%d while the camera is %d×%d; it is skipped", frame.index, w, h, camera.width, camera.height)
@@ -35,7 +38,7 @@ def usable(frame: Frame) -> Frame | None:
 
 
 def without_limit(frame: Frame | None, look: Callable[[float], Any]) -> Frame | None:
-    """The frame without the readings that only say the sensor's largest value: much of the image says it, here and in the frame that `look` finds,
+    """Remove the readings that only have the sensor's largest value: a large part of the image has it, here and in the frame that `look` returns,
     from where a surface would be at another distance."""
     if frame is None or (limit_m := _crowded_maximum(frame.depth_m)) == 0.0:
         return frame
@@ -44,12 +47,12 @@ def without_limit(frame: Frame | None, look: Callable[[float], Any]) -> Frame | 
         return frame
     saturated = frame.depth_m == limit_m
     count = np.count_nonzero(saturated)
-    log.warning("frame %d: %d depth readings say %.3f m and none more, which is a limit; they count as missing", frame.index, count, limit_m)
+    log.warning("frame %d: %d depth readings are %.3f m and none is more, which is a limit; they count as missing", frame.index, count, limit_m)
     return replace(frame, depth_m=np.where(saturated, np.float32(0.0), frame.depth_m))
 
 
 def _crowded_maximum(depth_m: F32) -> float:
-    """The largest depth where many readings, and many more than of any other depth, say exactly that; 0 elsewhere."""
+    """Return the largest depth where many readings, and many more than of any other depth, have exactly that value; 0 elsewhere."""
     farthest, sampled = float(depth_m.max(initial=0.0)), depth_m[::SAMPLED_PX, ::SAMPLED_PX]
     if not 0.0 < farthest < np.inf or np.count_nonzero(sampled == farthest) < SATURATED * sampled.size:
         return 0.0
@@ -57,20 +60,58 @@ def _crowded_maximum(depth_m: F32) -> float:
     return farthest if counts[-1] > CROWDED * counts[:-1].max(initial=0) else 0.0
 
 
-class Intake:
-    """Takes frames in their order. Stamps of frames in `known` are what they were when these were recorded; `count` frames can be read at any time
-    (0: a camera's, which comes once). `late` are the positions of frames that were left out because others had come before them."""
+def constant_share(depth_m: F32) -> float:
+    """Return the share of the readings (sampled) that have the commonest value; 0 for an image nearly without readings."""
+    sampled = depth_m[::SAMPLED_PX, ::SAMPLED_PX]
+    readings = sampled[sampled > 0.0]
+    if readings.size < max(CONSTANT_READINGS * sampled.size, 2):
+        return 0.0
+    return float(np.unique(readings, return_counts=True)[1].max() / readings.size)
+
+
+class FrozenDepth:
+    """Detects a depth stream that stands still, bit-identical frame after frame, while colour goes on.
+
+    Colour is compared with that of the first frame with this depth: the change adds up while the camera moves. A camera at rest that sees exact depth
+    shows no change of colour beyond its noise."""
+
+    def __init__(self) -> None:
+        self._first: Frame | None = None
+
+    def since(self, frame: Frame) -> int | None:
+        """Return the number of the first frame with the depth of this one, if colour has changed since; else None."""
+        first = self._first
+        if first is None or not _bit_identical(first.depth_m, frame.depth_m):
+            self._first = frame
+            return None
+        changed = np.abs(_sampled_gray(frame) - _sampled_gray(first)) > CHANGED_LEVELS
+        return first.index if frame.depth_m.any() and changed.mean() >= CHANGED_SHARE else None
+
+
+def _bit_identical(a: F32, b: F32) -> bool:
+    """Compare a sample first: two images that differ nearly always differ there."""
+    return np.array_equal(a[::SAMPLED_PX, ::SAMPLED_PX], b[::SAMPLED_PX, ::SAMPLED_PX]) and np.array_equal(a, b)
+
+
+def _sampled_gray(frame: Frame) -> F32:
+    return np.asarray(frame.color[::SAMPLED_PX, ::SAMPLED_PX].mean(axis=2, dtype=np.float32))
+
+
+class FrameValidation:
+    """Reads frames in their order. Frames in `known` have the stamps they were recorded with; `count` frames can be read at any time (0: those of a
+    camera, which come once). `late` are the positions of frames that were skipped because later ones had come before them."""
 
     def __init__(self, known: Mapping[int, int], count: int) -> None:
         self._known, self._count = known, count
         self._last_ns: int | None = None
         self._set_back_ns = 0
         self._medians_m: list[float] = []
+        self._frozen = FrozenDepth()
         self.late: set[int] = set()
 
     def __call__(self, position: int, read: Callable[[int], Any], index: Callable[[], int]) -> Any:
-        """The frame that `read` finds at a position, as stages can rely on it, or None; `index` is its number. What is wrong with the first frame is
-        wrong with the configuration or the data set, and raised."""
+        """Return the frame that `read` finds at a position, validated, or None; `index` is its number. An error of the first frame is one of the
+        configuration or the data set, and raised."""
         try:
             frame = read(position)
         except (DataError, ValueError) as error:
@@ -81,10 +122,24 @@ class Intake:
         if not isinstance(frame, Frame):
             return frame
         timed = self._in_time(position, frame)
-        return without_limit(usable(timed), lambda fps: self._elsewhere(position, read, fps)) if timed is not None else None
+        valid = self._without_faulty_depth(usable(timed)) if timed is not None else None
+        return without_limit(valid, lambda fps: self._elsewhere(position, read, fps))
+
+    def _without_faulty_depth(self, frame: Frame | None) -> Frame | None:
+        """Return the frame without its depth where that is constant (saturated, for one) or frozen: whatever is tracked by it is wrong."""
+        if frame is None:
+            return None
+        since, constant = self._frozen.since(frame), constant_share(frame.depth_m)
+        if since is not None:
+            log.warning("frame %d: its depth is that of frame %d, bit for bit, while colour has changed; it counts as missing", frame.index, since)
+        elif constant >= CONSTANT:
+            log.warning("frame %d: %.0f %% of its depth readings are equal; they count as missing", frame.index, 100 * constant)
+        else:
+            return frame
+        return replace(frame, depth_m=np.zeros_like(frame.depth_m))
 
     def _elsewhere(self, position: int, read: Callable[[int], Any], fps: float) -> Any:
-        """A frame half a second away, if it can be read."""
+        """Return a frame half a second away, if it can be read."""
         away = round(AWAY_S * fps)
         try:
             return read(position + away if position + away < self._count else max(position - away, 0)) if self._count else None
@@ -92,7 +147,7 @@ class Intake:
             return None
 
     def _in_time(self, position: int, frame: Frame) -> Frame | None:
-        """The frame, its time after that of the frame before; None for one that comes late."""
+        """Return the frame with a time after that of the frame before; None for one that comes late."""
         stamp_ns = self._known.get(frame.index, frame.stamp_ns + self._set_back_ns)
         if self._last_ns is not None and stamp_ns <= self._last_ns:
             late_ns = self._last_ns - stamp_ns

@@ -1,4 +1,4 @@
-"""What the C library keeps of memory that is free (of GNU's, that is; with any other nothing is done), and when garbage is looked for."""
+"""Settings of the C library's allocator (GNU's; with any other nothing is done) and of the garbage collector."""
 
 from __future__ import annotations
 
@@ -7,30 +7,32 @@ import gc
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 
-_MOST_HEAPS, _TRIM_THRESHOLD, _MMAP_THRESHOLD = -8, -1, -3  # M_ARENA_MAX and so on of malloc.h
-KEPT_BYTES = 64 << 20  # free at the heap's end before it is given back: what a frame frees the next one asks for
-MAPPED_BYTES = 8 << 20  # an array as large has memory of its own, which is given back with it
+_ARENA_MAX, _TRIM_THRESHOLD, _MMAP_THRESHOLD = -8, -1, -3  # M_ARENA_MAX and so on of malloc.h
+RETAINED_BYTES = 64 << 20  # free at the heap's end before it is returned: the next frame needs what this one frees
+MAPPED_BYTES = 8 << 20  # an array as large has a mapping of its own, which is returned with it
 
 
-def settle() -> None:
-    """Let all threads that are begun from now on share one heap, and keep what a frame needs. With one each, every heap keeps room for the most that
-    its thread ever held at once, between what the map keeps: 30 MB of a run at 320×240. They seldom ask at the same time, since most of what asks
-    holds the interpreter's lock. Left to itself, the library gives the images' memory back as often as they are freed, for the system to clear."""
+def configure_malloc() -> None:
+    """Let all threads that start from now on share one heap (arena), and retain the memory that a frame needs.
+
+    With an arena each, every arena retains the most that its thread ever held at once, fragmented by the map: 30 MB of a run at 320×240. Threads
+    seldom allocate at the same time, since most allocations hold the interpreter's lock. By default the library returns the images' memory to the
+    system each time they are freed, and the system clears it again."""
     with suppress(OSError, AttributeError):
         library = ctypes.CDLL(None)
-        for setting, value in ((_MOST_HEAPS, 1), (_TRIM_THRESHOLD, KEPT_BYTES), (_MMAP_THRESHOLD, MAPPED_BYTES)):
+        for setting, value in ((_ARENA_MAX, 1), (_TRIM_THRESHOLD, RETAINED_BYTES), (_MMAP_THRESHOLD, MAPPED_BYTES)):
             library.mallopt(setting, value)
 
 
-def give_back() -> None:
-    """Give the system the memory that is free but lies between what is not."""
+def malloc_trim() -> None:
+    """Return free memory between allocations to the system (`malloc_trim`)."""
     with suppress(OSError, AttributeError):
         ctypes.CDLL(None).malloc_trim(0)
 
 
 @contextmanager
-def growing() -> Iterator[None]:
-    """Within this no garbage is looked for, where nearly all that is made stays: imports, what loads kernels. It is a tenth of their time."""
+def gc_paused() -> Iterator[None]:
+    """Pause the garbage collector where nearly all that is allocated stays: imports, loading kernels. Collecting is a tenth of their time."""
     before = gc.isenabled()
     gc.disable()
     try:

@@ -1,16 +1,30 @@
-"""What goes into a run besides its graph, and what comes out of it."""
+"""The plan of a run: which stages compute, which topics are read from a recording, and the frames.
+
+Without a recording every stage computes. In a replay the stages of `only` compute; a wire from any other stage is read from the file, and where the
+file lacks its topic the stage computes after all, back to the frames if need be. A stage that takes `camera` reads that of the topic `frames`, unless
+the data set is computed.
+"""
 
 from __future__ import annotations
 
-from array import array
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
-from typing import overload
+import json
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
 
-import numpy as np
+from trihedron.pipeline.core.errors import DataError, RecordingError
+from trihedron.pipeline.core.graph import Graph
+from trihedron.pipeline.core.options import frame_range
+from trihedron.pipeline.core.slots import CAMERA, SLOTS
+from trihedron.pipeline.core.types import FrameReference, Value
+from trihedron.pipeline.core.wires import Wire
+from trihedron.pipeline.record.recording import FRAMES_TOPIC, Recording, TopicReader
+from trihedron.pipeline.run.live import is_camera
 
-from trihedron.pipeline.core.types import DEGRADED, LOST, OK, Map, Pose, Value
-from trihedron.pipeline.record.recording import Recording
+RECORDED = "recorded:"  # prefix of the node that reads a topic from the file
+TOPICS = "topics"  # metadata of a recording: the stages whose values it holds, as JSON
 
 
 @dataclass(frozen=True)
@@ -21,71 +35,78 @@ class Replay:
     only: tuple[str, ...]
     recorded_feedback: bool = False
 
+    @cached_property
+    def topics(self) -> frozenset[str]:
+        """The topics that were recorded, those without a single value included: that such a stage returned nothing is recorded too."""
+        stated: Any = []
+        with suppress(ValueError):
+            stated = json.loads(self.recording.metadata.get(TOPICS, "[]"))
+        silent = {topic for topic in stated if topic in SLOTS} if isinstance(stated, list) and all(isinstance(t, str) for t in stated) else set()
+        return frozenset(self.recording.topics | silent)
 
-class Poses(Sequence[Pose]):
-    """Poses in frame order, kept as numbers, without those that a rigid motion and a symmetric covariance imply: of a long run there are many."""
+    def computed(self, graph: Graph) -> tuple[str, ...]:
+        """Return the stages that compute, in order: those chosen, and those whose topics these read and the recording lacks."""
+        pending, found = list(self.only), set()
+        while pending:
+            name = pending.pop()
+            if name not in found:
+                found.add(name)
+                pending += [wire.topic for p, wire in graph.stages[name].inputs.items() if wire.topic not in self.topics and p != CAMERA]
+        return tuple(name for name in graph.stages if name in found)
 
-    _REALS, _WHOLE = 12 + 12 + 21, 11  # numbers a pose
-    _STATUSES = (OK, DEGRADED, LOST)
-    _UPPER = np.triu_indices(6)
-    _LAST_ROW = np.array([0.0, 0.0, 0.0, 1.0])
+    def reader(self, topic: str) -> Callable[[int], Value | None]:
+        """Return a function from frame number to recorded value, to be called with increasing numbers."""
+        return TopicReader(self.recording, topic).at if topic in self.recording.topics | {FRAMES_TOPIC} else lambda index: None
 
-    def __init__(self, poses: Iterable[Pose] = ()) -> None:
-        self._reals, self._whole, self._reasons = array("d"), array("q"), bytearray()
-        for pose in poses:
-            self.append(pose)
-
-    def append(self, pose: Pose) -> None:
-        """One more."""
-        for numbers in (pose.T_world_camera[:3], pose.T_reference_camera[:3], pose.covariance[self._UPPER]):
-            self._reals.frombytes(numbers.tobytes())
-        self._reasons += pose.reason.encode()
-        counts = pose.inliers.tolist()
-        self._whole.extend((pose.index, pose.stamp_ns, pose.reference, *counts, pose.unobservable, pose.submap, pose.unrecognised))
-        self._whole.extend((self._STATUSES.index(pose.status), len(self._reasons)))
-
-    def __len__(self) -> int:
-        return len(self._whole) // self._WHOLE
-
-    @overload
-    def __getitem__(self, at: int) -> Pose: ...
-
-    @overload
-    def __getitem__(self, at: slice) -> list[Pose]: ...
-
-    def __getitem__(self, at: int | slice) -> Pose | list[Pose]:
-        """The pose, or poses, at a place."""
-        if isinstance(at, slice):
-            return [self[k] for k in range(*at.indices(len(self)))]
-        k = range(len(self))[at]
-        reals = np.array(self._reals[k * self._REALS : (k + 1) * self._REALS])
-        T, T_reference = (np.vstack([rows.reshape(3, 4), self._LAST_ROW]) for rows in (reals[:12], reals[12:24]))
-        covariance = np.empty((6, 6))
-        covariance[self._UPPER] = covariance.T[self._UPPER] = reals[24:]
-        index, stamp_ns, reference, *inliers, unobservable, submap, unrecognised, state, end = self._whole[k * self._WHOLE : (k + 1) * self._WHOLE]
-        counts, reason = np.array(inliers, np.int32), self._reasons[self._whole[k * self._WHOLE - 1] if k else 0 : end].decode()
-        status = self._STATUSES[state]
-        return Pose(index, stamp_ns, T, covariance, T_reference, reference, counts, unobservable, status, reason, submap, unrecognised)
-
-
-@dataclass
-class Result:
-    """What a run leaves in memory: poses in frame order, the last map, results of folds, counts."""
-
-    poses: Poses = field(default_factory=Poses)
-    map: Map | None = None
-    loaded_keyframes: int = 0  # of another run, whose numbers say nothing here
-    folds: dict[str, Value] = field(default_factory=dict)
-    stamps_ns: array[int] = field(default_factory=lambda: array("q"))  # of every readable frame
-    unreadable: int = 0
-    fps: float = 30.0  # nominal, of the camera
+    def references(self, first: int, stop: int | None) -> dict[int, FrameReference]:
+        """Return frame number -> reference for the recorded frames in a range. Raises RecordingError when there is none."""
+        values = (value for value in self.recording.values(FRAMES_TOPIC) if isinstance(value, FrameReference))
+        found = {value.index: value for value in values if value.index >= first and (stop is None or value.index < stop)}
+        if not found:
+            wanted = f"{first or ''}:{'' if stop is None else stop}"
+            raise RecordingError(str(self.recording.path), f"has none of the frames '{wanted}'", "give another dataset.frames")
+        return found
 
 
 @dataclass(frozen=True)
-class Step:
-    """One finished frame, as handed to whoever watches the run (progress, tests)."""
+class Plan:
+    """The stages of a graph that compute, in order, and the numbers of the frames, with the stamps and the rate that are known before reading them.
+    `first` is the number of the first frame that was asked for."""
 
-    position: int
-    count: int
-    index: int
-    values: Mapping[str, Value | None]
+    graph: Graph
+    replay: Replay | None
+    computed: tuple[str, ...]
+    first: int
+    indices: Sequence[int]
+    stamps_ns: Mapping[int, int]
+    fps: float | None = None
+
+    def source(self, parameter: str, wire: Wire) -> Wire:
+        """Return the wire of a computed stage's input as nodes have it: from another computed stage, or from the file."""
+        topic = FRAMES_TOPIC if parameter == CAMERA else wire.topic
+        feedback = self.replay is not None and self.replay.recorded_feedback and wire.delay and wire.topic in self.replay.topics
+        return Wire(RECORDED + topic, wire.delay) if wire.topic not in self.computed or feedback else wire
+
+
+def plan_run(graph: Graph, replay: Replay | None, frames: str) -> Plan:
+    """Plan a run over a range of frames ("A:B", see `frame_range`). Raises RecordingError where the recording cannot give what the stages need."""
+    first, stop = frame_range(frames)
+    if replay is None:
+        return Plan(graph, None, tuple(graph.stages), first, range(first, first + len(graph.stages["dataset"].plugin)), {})
+    computed = replay.computed(graph)
+    if "dataset" in computed and "dataset" not in replay.only:
+        _check_images(graph, replay)
+    references = replay.references(first, stop)
+    stamps = {index: reference.stamp_ns for index, reference in references.items()}
+    return Plan(graph, replay, computed, first, list(references), stamps, next(iter(references.values())).camera.fps)
+
+
+def _check_images(graph: Graph, replay: Replay) -> None:
+    """Raise RecordingError when a replay needs the images, the recording does not embed them, and the data set cannot be opened."""
+    try:
+        if is_camera(graph.stages["dataset"].plugin):
+            raise DataError("dataset", "a camera shows no frame twice")
+        len(graph.stages["dataset"].plugin)
+    except DataError as error:
+        cause = f"does not embed the frames that {' and '.join(replay.only)} must see, and the data set is gone ({error.place}: {error.cause})"
+        raise RecordingError(str(replay.recording.path), cause, "give its new place as dataset.path=FOLDER") from error

@@ -14,11 +14,11 @@ import numpy as np
 from trihedron.pipeline.core.errors import DataError
 from trihedron.pipeline.core.types import DEGRADED, LOST, OK, Map, Pose, Surface, Trajectory
 from trihedron.pipeline.record.trajectories import write_trajectory
+from trihedron.pipeline.run.accounting import Result
 from trihedron.pipeline.run.consistency import pose_consistency
 from trihedron.pipeline.run.metrics import associate, evaluate_trajectory
 from trihedron.pipeline.run.plot import trajectory_figure
 from trihedron.pipeline.run.ply import triangle_planes, write_ply
-from trihedron.pipeline.run.replay import Result
 
 TRAJECTORY, CAUSAL, TIMING, METRICS, PLOT = "trajectory.txt", "trajectory_causal.txt", "timing.json", "metrics.json", "trajectory.png"
 SURFACE = "surface.ply"

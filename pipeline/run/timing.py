@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from trihedron.pipeline.run.memory import give_back
+from trihedron.pipeline.run.memory import malloc_trim
 
 _PAGE_MB = os.sysconf("SC_PAGE_SIZE") / 1e6
 
@@ -86,7 +86,7 @@ def peak_mb() -> float | None:
 def forget_peak() -> None:
     """Begin to measure the peak anew, without what earlier runs of this process left. Where that is not allowed the peak is the process's."""
     gc.collect()
-    give_back()
+    malloc_trim()
     with suppress(OSError):
         Path("/proc/self/clear_refs").write_text("5")
 

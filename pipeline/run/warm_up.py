@@ -11,7 +11,7 @@ from tqdm import tqdm
 
 from trihedron.pipeline.core.errors import TrihedronError
 from trihedron.pipeline.run.kernels import FEW, Awaited, Compilation, missing, used_by
-from trihedron.pipeline.run.memory import give_back, growing
+from trihedron.pipeline.run.memory import gc_paused, malloc_trim
 from trihedron.pipeline.run.runner import Runner
 
 WARM_UP_FRAMES = 3  # enough for every stage to have been called
@@ -25,7 +25,7 @@ def prepared(runner: Runner, trial: Callable[[], Runner]) -> Iterator[Callable[[
     Where a cache has them, the first frames of `trial`, a runner as this one, are run and thrown away: no frame waits for what is loaded or allocated
     once. Else other processes compile beside the run, and a call waits for what is not there yet, which is once an installation. What is
     fed in real time does not begin before all is there."""
-    with growing():
+    with gc_paused():
         rows = missing(used_by(runner.graph.stages[name].plugin for name in runner.computed))
     if len(rows) <= FEW:
         _warm_up(trial())
@@ -71,4 +71,4 @@ def _warm_up(runner: Runner) -> None:
         pass
     finally:
         said.cancel()
-    give_back()  # what the data set and the kernels needed to begin with: else the frames grow into it, unseen in what the run says it holds
+    malloc_trim()  # what the data set and the kernels needed to begin with: else the frames grow into it, unseen in what the run says it holds

@@ -198,6 +198,10 @@ class Refine(TrackingQuality, MovingObjects, Foundations, FocalLengths):
             rotation.index, rotation.stamp_ns, T, said.covariance, T_reference_camera, reference, inliers, held, said.status, said.reason, submap
         )
 
+    def localising(self) -> Refine:
+        """Return the refinement of a camera that begins no sub-map: where the loaded map does not reach it stays lost."""
+        return replace(self, submap_after=0)
+
     def _information(self, start: Decoupled) -> F64:
         """(6, 6) of the decoupled pose as a prior."""
         information = np.zeros((6, 6))

@@ -25,7 +25,8 @@ from trihedron.pipeline.record.codec import Decoder
 from trihedron.pipeline.record.mcap_file import McapFile
 from trihedron.pipeline.record.recording import METADATA, Recording
 from trihedron.pipeline.record.trajectories import read_trajectory
-from trihedron.pipeline.run.state import load_map
+from trihedron.pipeline.run.map_file import load_map
+from trihedron.plugins.map.covisibility import Covisibility
 from trihedron.tools.mesh_files import read_mesh
 from trihedron.tools.recover import recover
 
@@ -85,7 +86,7 @@ def recording(path: Path) -> int:
 
 def saved_map(path: Path) -> int:
     """A map to go on in."""
-    return len(load_map(str(path)).values)
+    return len(load_map(str(path), [Covisibility()]).values)
 
 
 def meshes(path: Path) -> int:

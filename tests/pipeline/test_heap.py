@@ -12,7 +12,7 @@ from trihedron.pipeline import heap
 libc = ctypes.CDLL(None)
 libc.fopen.restype = libc.malloc.restype = ctypes.c_void_p
 if sys.argv[1] == "shared":
-    heap.settle()
+    heap.configure_malloc()
 for _ in range(4):
     thread = threading.Thread(target=lambda: [bytearray(10_000) for _ in range(100)])
     thread.start()

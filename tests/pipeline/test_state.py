@@ -15,8 +15,10 @@ from trihedron.pipeline.core.errors import RecordingError
 from trihedron.pipeline.record import chunk_writer
 from trihedron.pipeline.record.codec import Encoder
 from trihedron.pipeline.record.recording import Recording, RecordingWriter
+from trihedron.pipeline.run.map_file import load_map, save_map
 from trihedron.pipeline.run.runner import Runner
-from trihedron.pipeline.run.state import Keeper, Memory, load_map, reaches
+from trihedron.pipeline.run.state import DelayLines, StateBuffer, max_delays
+from trihedron.plugins.map.covisibility import Covisibility
 from trihedron.plugins.mapping.landmarks import empty_map
 
 sys.path.insert(0, str(Path(__file__).parent))
@@ -76,9 +78,9 @@ def test_in_another_sequence_the_camera_is_lost_until_the_map_is_recognised(runs
 
 def test_localising_leaves_the_map_alone(runs):
     assert "map" not in Recording(runs / "only" / "run.mcap").topics
-    before, after = load_map(str(runs / "map.mcap")), load_map(str(runs / "only.mcap"))
+    before, after = load_map(str(runs / "map.mcap"), [Covisibility()]), load_map(str(runs / "only.mcap"), [Covisibility()])
     assert Encoder().encode(before.map) == Encoder().encode(after.map)
-    assert load_map(str(runs / "again.mcap")).frame == 11
+    assert load_map(str(runs / "again.mcap"), [Covisibility()]).frame == 11
 
 
 def test_a_camera_that_is_only_localised_stays_lost_where_the_map_does_not_reach(runs):
@@ -95,38 +97,38 @@ def test_a_replay_loads_the_map_again_and_saves_none(runs):
     assert (runs / "again.mcap").stat().st_mtime < (runs / "only.mcap").stat().st_mtime
 
 
-def test_wires_of_any_delay_are_remembered():
+def test_a_run_continues_with_the_values_of_wires_of_any_delay():
     """Seven frames and five more: what `@prev` and `@k` see is what they see in twelve frames at once."""
 
-    def run(count, start, remembered=None):
-        runner = Runner(toy_graph(outputs=("trajectory",), dataset=ToyDataset(length=count, start=start)), frames=f"{start}:", remembered=remembered)
-        runner.keeper = Keeper({"rotation": 3, "pose": 1}, runner._memory, start)
+    def run(count, start, initial=None):
+        runner = Runner(toy_graph(outputs=("trajectory",), dataset=ToyDataset(length=count, start=start)), frames=f"{start}:", initial=initial)
+        runner.state = StateBuffer({"rotation": 3, "pose": 1}, runner.initial, start)
         for _ in runner.steps(None, frozenset()):
             pass
         return runner
 
     whole, first = run(12, 0), run(7, 0)
-    kept = first.keeper._values
+    kept = first.state.values
     assert list(kept["rotation"]) == [5, 6] and list(kept["pose"]) == [6]  # rotation says nothing at frame 4
-    memory = Memory({topic: list(values.values())[-1] for topic, values in kept.items()} | {"map": first.result.map}, kept)
-    rest = run(5, 7, lambda _: memory)
+    lines = DelayLines({topic: list(values.values())[-1] for topic, values in kept.items()} | {"map": first.result.map}, kept)
+    rest = run(5, 7, lambda _: lines)
     assert [p.T_world_camera[0, 3] for p in rest.result.poses] == [p.T_world_camera[0, 3] for p in whole.result.poses if p.index >= 7]
 
 
-def test_the_reach_of_a_topic_is_its_longest_delay():
+def test_the_maximum_delay_of_a_topic():
     stages = toy_graph().stages
-    assert reaches(stages.values()) == {"rotation": 1, "pose": 1, "map": 1}
+    assert max_delays(stages.values()) == {"rotation": 1, "pose": 1, "map": 1}
 
 
 def test_a_map_that_cannot_be_written_is_one_line_and_leaves_nothing(runs, tmp_path, monkeypatch):
-    keeper = Keeper({"map": 1}, Memory(), 0)
-    keeper.see(3, {"map": load_map(str(runs / "map.mcap")).map})
+    state = StateBuffer({"map": 1}, DelayLines(), 0)
+    state.append(3, {"map": load_map(str(runs / "map.mcap"), [Covisibility()]).map})
     with pytest.raises(RecordingError) as error:
-        keeper.save(tmp_path / "no" / "a.mcap", {}, "{}")
+        save_map(tmp_path / "no" / "a.mcap", state, {}, "{}")
     assert str(error.value) == f"{tmp_path}/no/a.mcap: cannot be written: No such file or directory; give another save_map=FILE.mcap"
     monkeypatch.setattr(chunk_writer._Descriptor, "write", full_disk)
     with pytest.raises(RecordingError) as error:
-        keeper.save(tmp_path / "a.mcap", {}, "{}")
+        save_map(tmp_path / "a.mcap", state, {}, "{}")
     assert str(error.value) == f"{tmp_path}/a.mcap: cannot be written: No space left on device; give another save_map=FILE.mcap"
     assert list(tmp_path.iterdir()) == []
 
@@ -150,15 +152,15 @@ def test_a_file_that_is_no_map_of_this_version_is_refused(tmp_path):
         ({"frame": "many"}, "holds a map that does not fit together: "),
     ):
         with pytest.raises(RecordingError) as error:
-            load_map(written(tmp_path / "a.mcap", metadata))
+            load_map(written(tmp_path / "a.mcap", metadata), [Covisibility()])
         assert str(error.value).startswith(f"{path}: {cause}")
-    assert load_map(written(tmp_path / "a.mcap", {})).map.revision == 0
+    assert load_map(written(tmp_path / "a.mcap", {}), [Covisibility()]).map.revision == 0
     with pytest.raises(RecordingError, match="there is no such map; save one with"):
-        load_map(str(tmp_path / "missing.mcap"))
+        load_map(str(tmp_path / "missing.mcap"), [Covisibility()])
 
 
 def test_a_map_whose_rows_name_others_that_are_not_there_is_refused(runs, tmp_path):
-    map = load_map(str(runs / "map.mcap")).map
+    map = load_map(str(runs / "map.mcap"), [Covisibility()]).map
     row = np.zeros(1, np.int32)
     broken = {
         "observers": replace(map, points=map.points.updated(row, observers=np.full((1, 16), 1 << 20, np.int32))),
@@ -169,7 +171,7 @@ def test_a_map_whose_rows_name_others_that_are_not_there_is_refused(runs, tmp_pa
     }
     for what, damaged in broken.items():
         with pytest.raises(RecordingError, match=f"does not fit together.*{what}"):
-            load_map(written(tmp_path / "b.mcap", {}, damaged))
+            load_map(written(tmp_path / "b.mcap", {}, damaged), [Covisibility()])
 
 
 @pytest.mark.parametrize("at", [0.2, 0.5, 0.9])
@@ -181,5 +183,5 @@ def test_a_damaged_file_is_one_line(runs, tmp_path, at):
         path = tmp_path / f"{name}.mcap"
         path.write_bytes(damaged)
         with pytest.raises(RecordingError) as error:
-            load_map(str(path))
+            load_map(str(path), [Covisibility()])
         assert str(error.value).startswith(str(path)) and "\n" not in str(error.value)

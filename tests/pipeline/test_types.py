@@ -5,7 +5,7 @@ import pytest
 
 from trihedron.pipeline.core.geometry import exp_se3
 from trihedron.pipeline.core.types import DEGRADED, LOST, OK, Camera, DepthNoise, Keypoints, LineSegments, Pose
-from trihedron.pipeline.run.replay import Poses
+from trihedron.pipeline.run.poses import Poses
 
 
 def test_wrong_arrays_are_named():

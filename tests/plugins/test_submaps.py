@@ -9,7 +9,8 @@ import pytest
 
 from trihedron.pipeline.core.geometry import exp_se3, invert, transform
 from trihedron.pipeline.core.types import Pose
-from trihedron.pipeline.run.replay import Poses, Result
+from trihedron.pipeline.run.accounting import Result
+from trihedron.pipeline.run.poses import Poses
 from trihedron.pipeline.run.results import final_trajectory, is_tied
 from trihedron.plugins.map.covisibility import Covisibility
 from trihedron.plugins.mapping.covisibility_graph import current_submap, local_window, newest_keyframes
