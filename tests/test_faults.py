@@ -54,7 +54,7 @@ CASES = {
     "white images": Case({"cover": "20:40", "covered": "color", "cover_with": "white"}, most_mm=60.0),
     "no depth": Case({"cover": "20:40", "covered": "depth"}),
     "nine tenths of the depth missing": Case({"depth_holes": 0.9}, most_mm=100.0),
-    "depth that ends at 3 m": Case({"depth_limit_m": 3.0}, most_mm=60.0, said="depth readings say 3.000 m and none more, which is a limit"),
+    "depth that ends at 3 m": Case({"depth_limit_m": 3.0}, most_mm=60.0, said="depth readings are 3.000 m and none is more, which is a limit"),
     "depth that is not finite": Case({"not_finite": 0.1}, said="depth readings are negative or not finite; they count as missing"),
     "a hand for two seconds": Case({"cover": "10:70", "cover_with": "hand"}, {"length": 90}, lost=tuple(range(10, 70))),
     "depth of another size": Case({"depth_resize": 0.5, "during": "20:24"}, said="frame 20: depth is 160×120 while colour is 320×240"),

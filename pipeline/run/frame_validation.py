@@ -16,6 +16,7 @@ log = logging.getLogger("trihedron")
 LATE_NS = 1_000_000_000  # a frame that comes this late or later was not late: the clock was set back
 CONSTANT = 0.95  # share of the readings with one value, from which an image of depth counts as constant
 CONSTANT_READINGS = 0.01  # of the image, without which nothing is constant
+STALE_NS = 50_000_000  # age from which repeated depth is wrong: a Kinect repeats single images at 30 a second
 CHANGED_LEVELS, CHANGED_SHARE = 16, 0.02  # grey levels, beyond image noise, and share of the pixels by which colour has changed
 SATURATED, CROWDED = 0.02, 3.0  # a limit: share of the image that has this value, and times the readings of any other depth
 AWAY_S = 0.5  # to a frame that shows surfaces at other distances
@@ -73,19 +74,21 @@ class FrozenDepth:
     """Detects a depth stream that stands still, bit-identical frame after frame, while colour goes on.
 
     Colour is compared with that of the first frame with this depth: the change adds up while the camera moves. A camera at rest that sees exact depth
-    shows no change of colour beyond its noise."""
+    shows no change of colour beyond its noise. Depth that is repeated for less than `STALE_NS` is a late image, not a fault."""
 
     def __init__(self) -> None:
         self._first: Frame | None = None
 
     def since(self, frame: Frame) -> int | None:
-        """Return the number of the first frame with the depth of this one, if colour has changed since; else None."""
+        """Return the number of the first frame with the depth of this one, if that is stale and colour has changed since; else None."""
         first = self._first
         if first is None or not _bit_identical(first.depth_m, frame.depth_m):
             self._first = frame
             return None
+        if frame.stamp_ns - first.stamp_ns < STALE_NS or not frame.depth_m.any():
+            return None
         changed = np.abs(_sampled_gray(frame) - _sampled_gray(first)) > CHANGED_LEVELS
-        return first.index if frame.depth_m.any() and changed.mean() >= CHANGED_SHARE else None
+        return first.index if changed.mean() >= CHANGED_SHARE else None
 
 
 def _bit_identical(a: F32, b: F32) -> bool:
