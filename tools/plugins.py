@@ -125,7 +125,7 @@ def type_name(hint: Any) -> str:
     if isinstance(hint, type) and not hasattr(hint, "__args__"):
         return hint.__name__
     text = str(hint)
-    for module in ("trihedron.pipeline.core.types.", "numpy.random._generator.", "typing."):
+    for module in ("trihedron.pipeline.core.types.", "typing."):
         text = text.replace(module, "")
     return text
 

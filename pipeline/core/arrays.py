@@ -1,4 +1,4 @@
-"""Array fields that say their element type and shape, checked in O(1), and the base of the values that have them."""
+"""Array fields with a declared element type and shape, checked in O(1), and the base of the values that have them."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ class Shape:
 
 @dataclass(frozen=True)
 class ArraySpec:
-    """What a field's annotation promises of its array."""
+    """The element type and shape that a field's annotation declares."""
 
     name: str
     dtype: np.dtype[Any]
@@ -37,7 +37,7 @@ class ArraySpec:
 
 @cache
 def array_specs(kind: Any) -> tuple[ArraySpec, ...]:
-    """The array fields of a value type, in order."""
+    """Return the array fields of a value type, in order."""
     found = []
     for name, hint in get_type_hints(kind, include_extras=True).items():
         if get_origin(hint) is Annotated:
@@ -47,7 +47,7 @@ def array_specs(kind: Any) -> tuple[ArraySpec, ...]:
 
 
 def _element_type(array: Any) -> np.dtype[Any]:
-    """float64 of NDArray[float64], which is a `type` alias from NumPy 2.5 on and `ndarray[shape, dtype[float64]]` before."""
+    """Return float64 for NDArray[float64], which is a `type` alias from NumPy 2.5 on and `ndarray[shape, dtype[float64]]` before."""
     last = get_args(array)[-1]
     element: np.dtype[Any] = np.dtype((get_args(last) or (last,))[0])
     return element

@@ -18,11 +18,11 @@ class TrihedronError(Exception):
     def __init__(self, place: str, cause: str, cure: str = "") -> None:
         self.place, self.cause, self.cure = place, cause, cure
         text = f"{place}: {cause}" + (f"; {cure}" if cure else "")
-        super().__init__("".join(c if c.isprintable() else "?" for c in text))  # one line, whatever a file is called or says
+        super().__init__("".join(c if c.isprintable() else "?" for c in text))  # one line, whatever a file is called or holds
 
 
 class UsageError(TrihedronError):
-    """The words of the command line are wrong (exit code 2)."""
+    """A word of the command line is wrong (exit code 2)."""
 
     exit_code = 2
 
@@ -44,7 +44,7 @@ class DataError(TrihedronError):
 
 
 class RecordingError(TrihedronError):
-    """A recording lacks what was asked of it, is damaged or of another version."""
+    """A recording lacks a requested topic or frame, is damaged or of another version."""
 
 
 class StageError(TrihedronError):
@@ -52,7 +52,7 @@ class StageError(TrihedronError):
 
 
 def did_you_mean(name: str, known: Iterable[str]) -> str:
-    """The cure for an unknown name: the closest known one, or the list of them all."""
+    """Return the cure for an unknown name: the closest known one, or the list of them all."""
     known = sorted(known)
     close = difflib.get_close_matches(name, known, n=1, cutoff=0.6)
     if close:

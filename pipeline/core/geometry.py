@@ -11,12 +11,12 @@ from trihedron.pipeline.core.types import F64
 
 
 def skew(v: F64) -> F64:
-    """(3,) -> (3, 3) with `skew(v) @ x = v × x`."""
+    """Return the (3, 3) matrix of the cross product: `skew(v) @ x = v × x`."""
     return np.array([[0.0, -v[2], v[1]], [v[2], 0.0, -v[0]], [-v[1], v[0], 0.0]])
 
 
 def exp_so3(phi: F64) -> F64:
-    """(3,) rotation vector (rad) -> (3, 3) rotation (Rodrigues)."""
+    """Map a (3,) rotation vector (rad) to its (3, 3) rotation (Rodrigues)."""
     x, y, z = phi.tolist()  # plain numbers: NumPy takes five times as long for so few
     angle2 = x * x + y * y + z * z
     if angle2 < 1e-12:
@@ -30,7 +30,7 @@ def exp_so3(phi: F64) -> F64:
 
 
 def log_so3(R: F64) -> F64:
-    """(3, 3) rotation -> (3,) rotation vector with angle in [0, π]; inverse of `exp_so3`."""
+    """Map a (3, 3) rotation to its (3,) rotation vector, angle in [0, π]; inverse of `exp_so3`."""
     x, y, z, w = _quaternion(R)
     s = math.sqrt(x * x + y * y + z * z)
     factor = 2.0 / w if s < 1e-9 else 2.0 * math.atan2(s, w) / s
@@ -38,7 +38,7 @@ def log_so3(R: F64) -> F64:
 
 
 def left_jacobian_so3(phi: F64) -> F64:
-    """(3, 3) V with `exp_se3(rho, phi).t = V rho`."""
+    """Return the left Jacobian V (3, 3) of SO(3): `exp_se3(rho, phi).t = V rho`."""
     angle2 = float(phi @ phi)
     angle = np.sqrt(angle2)
     K = skew(phi)
@@ -49,18 +49,18 @@ def left_jacobian_so3(phi: F64) -> F64:
 
 
 def exp_se3(xi: F64) -> F64:
-    """(6,) twist (rho, phi) -> (4, 4) rigid motion."""
+    """Map a (6,) twist (rho, phi) to its (4, 4) rigid motion."""
     return pose_matrix(exp_so3(xi[3:]), left_jacobian_so3(xi[3:]) @ xi[:3])
 
 
 def log_se3(T: F64) -> F64:
-    """(4, 4) rigid motion -> (6,) twist (rho, phi); inverse of `exp_se3`."""
+    """Map a (4, 4) rigid motion to its (6,) twist (rho, phi); inverse of `exp_se3`."""
     phi = log_so3(T[:3, :3])
     return np.concatenate([np.linalg.solve(left_jacobian_so3(phi), T[:3, 3]), phi])
 
 
 def adjoint(T: F64) -> F64:
-    """(..., 4, 4) rigid motions -> (..., 6, 6) with `T Exp(xi) T⁻¹ = Exp(Ad xi)`, translation first."""
+    """Return the adjoints (..., 6, 6) of (..., 4, 4) rigid motions: `T Exp(xi) T⁻¹ = Exp(Ad xi)`, translation first."""
     R, t = T[..., :3, :3], T[..., :3, 3]
     out = np.zeros((*T.shape[:-2], 6, 6))
     out[..., :3, :3] = out[..., 3:, 3:] = R
@@ -69,14 +69,14 @@ def adjoint(T: F64) -> F64:
 
 
 def pose_matrix(R: F64, t: F64) -> F64:
-    """Rotation (3, 3) and translation (3,) -> (4, 4)."""
+    """Compose a rotation (3, 3) and a translation (3,) into a (4, 4) matrix."""
     T = np.eye(4)
     T[:3, :3], T[:3, 3] = R, t
     return T
 
 
 def invert(T: F64) -> F64:
-    """(..., 4, 4) rigid motions -> their inverses."""
+    """Invert (..., 4, 4) rigid motions."""
     R = T[..., :3, :3].swapaxes(-1, -2)
     out = np.zeros(T.shape)
     out[..., :3, :3] = R
@@ -86,18 +86,18 @@ def invert(T: F64) -> F64:
 
 
 def transform(T_a_b: F64, points_b: F64) -> F64:
-    """(4, 4) and (..., 3) points of frame b -> (..., 3) points of frame a."""
+    """Transform (..., 3) points of frame b into frame a."""
     return points_b @ T_a_b[:3, :3].T + T_a_b[:3, 3]
 
 
 def transform_planes(T_a_b: F64, planes_b: F64) -> F64:
-    """(4, 4) and (..., 4) planes (n, d) of frame b -> the same planes in frame a (signs kept: d may turn negative)."""
+    """Transform (..., 4) planes (n, d) of frame b into frame a, signs as they are: d may become negative."""
     n = planes_b[..., :3] @ T_a_b[:3, :3].T
     return np.concatenate([n, planes_b[..., 3:] - (n @ T_a_b[:3, 3])[..., None]], axis=-1)
 
 
 def tangent_basis(n: F64) -> F64:
-    """(..., 3) unit vectors -> (..., 3, 2): two orthonormal columns spanning the plane normal to n.
+    """Return, for (..., 3) unit vectors, (..., 3, 2): two orthonormal columns spanning the plane normal to n.
 
     A function of n alone, but it jumps where n_z changes sign: compare two normals in the basis of one of them, never each in its own."""
     x, y, z = n[..., 0], n[..., 1], n[..., 2]
@@ -111,19 +111,19 @@ def tangent_basis(n: F64) -> F64:
 
 
 def nearest_rotation(M: F64) -> F64:
-    """(3, 3) -> the rotation nearest in the Frobenius norm (SVD with determinant +1)."""
+    """Return the rotation nearest to a (3, 3) matrix in the Frobenius norm (SVD with determinant +1)."""
     U, _, Vt = np.linalg.svd(M)
     U[:, 2] *= np.linalg.det(U @ Vt)
     return np.asarray(U @ Vt, np.float64)
 
 
 def rotation_angle_deg(R: F64) -> float:
-    """Angle of a rotation in degrees, accurate near 0."""
+    """Return the angle of a rotation in degrees, accurate near 0."""
     return math.degrees(math.hypot(*log_so3(R).tolist()))
 
 
 def quaternion_from_rotation(R: F64) -> F64:
-    """(3, 3) rotation -> unit quaternion (x, y, z, w) with w >= 0, by the largest diagonal term (no cancellation)."""
+    """Convert a (3, 3) rotation to the unit quaternion (x, y, z, w) with w >= 0, by the largest diagonal term (no cancellation)."""
     return np.array(_quaternion(R))
 
 
@@ -144,7 +144,7 @@ def _quaternion(R: F64) -> tuple[float, float, float, float]:
 
 
 def rotation_from_quaternion(q: F64) -> F64:
-    """(4,) quaternion (x, y, z, w), normalised here -> (3, 3) rotation. Raises ValueError for a zero or non-finite quaternion."""
+    """Convert a (4,) quaternion (x, y, z, w), normalised here, to a (3, 3) rotation. Raises ValueError for a zero or non-finite one."""
     norm = float(np.linalg.norm(q))
     if not np.isfinite(norm) or norm < 1e-9:
         raise ValueError("not a rotation: the quaternion is zero or not finite")
@@ -159,7 +159,7 @@ def rotation_from_quaternion(q: F64) -> F64:
 
 
 def umeyama(estimate: F64, truth: F64) -> F64:
-    """SE(3) alignment of (n, 3) points: the T (4, 4) that minimises `Σ |truth - T estimate|²` (Umeyama 1991, scale fixed to 1)."""
+    """Align (n, 3) points by SE(3): the T (4, 4) that minimises `Σ |truth - T estimate|²` (Umeyama 1991, scale fixed to 1)."""
     mean_e, mean_t = estimate.mean(axis=0), truth.mean(axis=0)
     U, _, Vt = np.linalg.svd((truth - mean_t).T @ (estimate - mean_e))
     R = U @ np.diag([1.0, 1.0, np.sign(np.linalg.det(U) * np.linalg.det(Vt))]) @ Vt
@@ -167,8 +167,8 @@ def umeyama(estimate: F64, truth: F64) -> F64:
 
 
 def nearest_pairs(first: NDArray[np.int64], second: NDArray[np.int64], limit: int) -> NDArray[np.int64]:
-    """Two increasing lists of integers -> (n, 2) rows of pairs at most `limit` apart, the closest pair first, each entry at most once, ties to
-    the earlier row. Sorted by the first list."""
+    """Pair two increasing lists of integers: (n, 2) rows at most `limit` apart, the closest pair first, each entry at most once, ties to the
+    earlier row. Sorted by the first list."""
     low = np.searchsorted(second, first - limit, side="left")
     counts = np.maximum(np.searchsorted(second, first + limit, side="right") - low, 0)
     rows = np.repeat(np.arange(len(first)), counts)

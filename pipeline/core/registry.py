@@ -22,7 +22,7 @@ ENTRY_POINT_GROUP = "trihedron.plugins"
 
 
 def register(slot: str, name: str) -> Callable[[Plugin], Plugin]:
-    """Class decorator: make a frozen dataclass the plugin `name` of `slot`.
+    """Register a frozen dataclass as the plugin `name` of `slot` (class decorator). Each construction then checks the ranges of its options.
 
     Raises PluginError, naming the plugin and its file, when the slot is unknown, the name is taken, the class is not a frozen dataclass,
     or its method's parameters or return type are not the slot's.
@@ -107,7 +107,7 @@ def check_value(slot: str, value: Any, index: int) -> None:
 
 
 def plugin_class(slot: str, name: str) -> type[Any]:
-    """The class registered under slot and name. Raises PluginError with the closest names otherwise."""
+    """Return the class registered under slot and name. Raises PluginError with the closest names otherwise."""
     if slot not in SLOTS:
         raise PluginError(slot, f"there is no slot '{slot}'", did_you_mean(slot, SLOTS))
     if name not in _PLUGINS[slot]:
@@ -116,12 +116,12 @@ def plugin_class(slot: str, name: str) -> type[Any]:
 
 
 def plugins_of(slot: str) -> dict[str, type[Any]]:
-    """Name -> class of a slot's registered plugins, sorted by name."""
+    """Return name -> class of a slot's registered plugins, sorted by name."""
     return dict(sorted(_PLUGINS[slot].items()))
 
 
 def options_of(plugin: type[Any]) -> list[dataclasses.Field[Any]]:
-    """The configuration fields of a plugin."""
+    """Return the configuration fields of a plugin."""
     return list(dataclasses.fields(plugin))
 
 

@@ -1,6 +1,6 @@
 """The values that travel between stages.
 
-Conventions, said once. Camera frame: x right, y down, z forward, metres. Pixel centres at integers. Depth in metres, 0 = none.
+Conventions. Camera frame: x right, y down, z forward, metres. Pixel centres at integers. Depth in metres, 0 = none.
 `T_a_b` maps points of frame b into frame a: `p_a = T_a_b @ p_b`; `R_a_b`, `t_a_b` likewise. A plane is `n·x + d = 0` with `|n| = 1`;
 in the camera frame `d >= 0`, so n points towards the camera. Angles are radians unless the name says `_deg`.
 A pose covariance is that of `xi = (rho, phi)` in `T_world_camera = T_estimate · Exp(xi)` (camera frame, translation first),
@@ -8,7 +8,7 @@ in the map about it: relative to the keyframe that the pose names; how far that 
 
 Every value is a frozen dataclass with `index` (frame number in the data set) and `stamp_ns`. Array fields declare element type and shape
 with `Shape`; a letter stands for a length that is the same wherever the letter appears in one value. They are checked, in O(1), when the
-value is made, and the arrays become read-only.
+value is constructed, and the arrays become read-only.
 """
 
 from __future__ import annotations
@@ -73,7 +73,7 @@ class Frame(Value):
 
     @cached_property
     def gray(self) -> U8:
-        """(h, w) luminance."""
+        """Return the (h, w) luminance."""
         import cv2
 
         return np.asarray(cv2.cvtColor(self.color, cv2.COLOR_RGB2GRAY), dtype=np.uint8)
@@ -81,7 +81,7 @@ class Frame(Value):
 
 @dataclass(frozen=True)
 class FrameReference(Value):
-    """Stands for a frame in a recording that does not embed it (topic `frames`)."""
+    """A stand-in for a frame in a recording that does not embed it (topic `frames`)."""
 
     camera: Camera
 
@@ -148,9 +148,9 @@ class Planes(Value):
 class ManhattanFrame(Value):
     """Orthogonal directions of the scene: k rotations `R_camera_manhattan` whose columns are the axes seen from the camera.
 
-    `supported` says whether the scene shows a Manhattan frame at all; `ids` name the frames across time. `covariance` is that of the small
+    `supported` is False where the scene shows no Manhattan frame; `ids` name the frames across time. `covariance` is that of the small
     rotation phi in `R = Exp(phi) R_estimate` (camera frame, rad²); `inliers` and `spread` (rad, NaN = axis not seen) are per axis;
-    `gap` is the relative distance to a proven optimum (NaN when none is proven)."""
+    `gap` is the relative distance to a certified optimum (NaN without certificate)."""
 
     rotations: Annotated[F64, Shape("k", 3, 3)]
     ids: Annotated[I32, Shape("k")]
@@ -166,7 +166,7 @@ class Tracks(Value):
     """Features of this frame found in the previous one. Pairs are rows (previous, current).
 
     The previous geometry is copied, in the previous camera frame, so that motion can be solved from Tracks and the current features alone.
-    `R_current_previous` is the rotation that said where to look, corrected by what was found."""
+    `R_current_previous` is the rotation that predicted the search, corrected by the pairs found."""
 
     previous_index: int
     keypoints: Annotated[I32, Shape("n", 2)]
@@ -182,7 +182,7 @@ class Tracks(Value):
 
 @dataclass(frozen=True)
 class Rotation(Value):
-    """The camera's rotation and the world–Manhattan rotations it is tied to. `source` is manhattan | tracks | prediction.
+    """The camera's rotation and the world–Manhattan rotations that it is estimated from. `source` is manhattan | tracks | prediction.
 
     `covariance` is that of phi in `R_world_camera = R_estimate · Exp(phi)` (camera frame, rad²); `R_world_manhattan[i]` belongs to Manhattan frame
     `ids[i]`, with `weights[i]` observations behind it, and `R_camera_manhattan[i]` is this frame's observation of it (NaN = not seen)."""
@@ -198,9 +198,9 @@ class Rotation(Value):
 
 @dataclass(frozen=True)
 class Translation(Value):
-    """The camera's position for the given rotation. `unobservable` holds unit vectors (world) along which the prediction was kept;
+    """The camera's position for the given rotation. `unobservable` holds unit vectors (world) along which the prediction was retained;
     `inliers` counts points, lines and planes; `estimated` is False when no measurement of this frame took part. Covariance in the world frame, m².
-    A filter also says its state: planes (n, d) of the world that it keeps, and the covariance of (t_world_camera, d of each) together."""
+    A filter's state: planes (n, d) of the world, and the joint covariance of (t_world_camera, d of each)."""
 
     version: ClassVar[int] = 2
 
@@ -233,11 +233,11 @@ OK, DEGRADED, LOST = "ok", "degraded", "lost"
 
 @dataclass(frozen=True)
 class Pose(Value):
-    """Where the camera is. A frame counts as tracked only with status ok or degraded, which need measurements of that very frame.
+    """The camera's pose. A frame counts as tracked only with status ok or degraded, which need measurements of that very frame.
 
     `reference` is the keyframe the pose is expressed against (-1: none yet) and `T_reference_camera` the pose relative to it. `inliers` counts
-    points, lines and planes; `unobservable` the directions held at the prediction. `submap` is the part of the map the pose is said in (0: the first;
-    others have a world of their own until they are tied to it), `unrecognised` how many frames of a lost camera showed a place that is not known."""
+    points, lines and planes; `unobservable` the directions held at the prediction. `submap` is the part of the map whose world the pose is in (0: the
+    first; others have a world of their own until they are merged), `unrecognised` the number of frames of a lost camera without relocalisation."""
 
     version: ClassVar[int] = 2
 
@@ -255,8 +255,8 @@ class Pose(Value):
 
 @dataclass(frozen=True)
 class PredictedView(Value):
-    """What a dense model would show from a pose: depth (0 = none), normals (camera frame, NaN = none) and colour (black where the model has none),
-    of the frame's camera at a whole fraction of its size. `model` is the model itself, whose rows its plugin knows: the next view is made of it."""
+    """The predicted view of a dense model from a pose: depth (0 = none), normals (camera frame, NaN = none) and colour (black where there is none),
+    of the frame's camera at a whole fraction of its size. `model` is the model itself, from which its plugin renders the next view."""
 
     version: ClassVar[int] = 2
     dense: ClassVar[bool] = True
@@ -300,7 +300,7 @@ EXACT_DEPTH = DepthNoise(a_m=0.0, b=0.0, c_per_m=0.0, floor_m=0.001)
 
 @dataclass(frozen=True)
 class Camera:
-    """An undistorted pinhole camera; readers undistort before they hand a frame over. `fps` is nominal."""
+    """An undistorted pinhole camera; readers undistort frames. `fps` is nominal."""
 
     width: int
     height: int
@@ -313,33 +313,33 @@ class Camera:
 
     @property
     def K(self) -> F64:
-        """(3, 3) calibration matrix."""
+        """Return the (3, 3) calibration matrix."""
         return np.array([[self.fx, 0.0, self.cx], [0.0, self.fy, self.cy], [0.0, 0.0, 1.0]])
 
     @property
     def intrinsics(self) -> F64:
-        """(4,) fx, fy, cx, cy in pixels, as compiled loops and the map take them."""
+        """Return (4,) fx, fy, cx, cy in pixels, for kernels and the map."""
         return np.array([self.fx, self.fy, self.cx, self.cy])
 
     def project(self, points_m: F64) -> F64:
-        """(n, 3) points in the camera frame -> (n, 2) pixels; points behind the camera give NaN."""
+        """Project (n, 3) points in the camera frame to (n, 2) pixels; points behind the camera give NaN."""
         z = np.where(points_m[..., 2] > 1e-6, points_m[..., 2], np.nan)
         return np.stack([self.fx * points_m[..., 0] / z + self.cx, self.fy * points_m[..., 1] / z + self.cy], axis=-1)
 
     def back_project(self, pixels: NDArray[Any], depth_m: NDArray[Any]) -> NDArray[Any]:
-        """(n, 2) pixels with (n,) depths -> (n, 3) points in the camera frame."""
+        """Back-project (n, 2) pixels with (n,) depths to (n, 3) points in the camera frame."""
         x = (pixels[..., 0] - self.cx) / self.fx * depth_m
         y = (pixels[..., 1] - self.cy) / self.fy * depth_m
         return np.stack([x, y, depth_m], axis=-1)
 
 
-# The types of the topics `map`, `bundle` and `loop`: the map and what corrects it.
+# The types of the topics `map`, `bundle` and `loop`: the map and its corrections.
 
 @dataclass(frozen=True)
 class Map(Value):
-    """Keyframes and landmarks; a row number is an id for good, dead rows have `alive` False. Columns are listed in `plugins.numerics.maps.landmarks`.
+    """Keyframes and landmarks; a row number is an id for good, dead rows have `alive` False. Columns are listed in `plugins.mapping.landmarks`.
 
-    `revision` counts versions; `point_observations` and its siblings say which keyframe (row) saw which landmark, and what it measured."""
+    `revision` counts versions; a row of `point_observations` and its siblings is a keyframe (row), a landmark, and its measurement."""
 
     version: ClassVar[int] = 4
     revision: int
@@ -353,14 +353,14 @@ class Map(Value):
 
     @cached_property
     def memo(self) -> dict[Hashable, Any]:
-        """What was worked out of this version and is asked for frame after frame; gone with it, and no part of the value."""
+        """Return a cache for results derived from this version and needed frame after frame; it ends with it and is no part of the value."""
         return {}
 
 
 @dataclass(frozen=True)
 class Correction(Value):
-    """Moves keyframes and landmarks of the map, by id, as bundle adjustment or loop closing found them from revision `based_on`. `*_information`
-    (world, 1/m²; of each end of a line) and `plane_covariance`, of (a, b, d), replace what the map had gathered: no measurement is counted twice."""
+    """New poses of keyframes and positions of landmarks, by id, from bundle adjustment or loop closing of revision `based_on`. `*_information`
+    (world, 1/m²; of each end of a line) and `plane_covariance`, of (a, b, d), replace those of the map: no measurement is counted twice."""
 
     version: ClassVar[int] = 2
 
@@ -390,8 +390,8 @@ class Surface(Value):
     `instances` is the row of the plane a triangle lies in, -1 for none. Of plane i: `plane_ids` is its id in the map (beyond the map's if it is not
     there), `coefficients` n·x + d = 0 with n towards the camera, `kinds` a row of PLANE_KINDS, `areas_m2` that of its triangles, `plane_colors` its
     mean. Row k of `loops` is (plane, begin, end): `loop_vertices[begin:end]` go round it, anticlockwise about n; round a hole the other way.
-    `atlas` (RGB) pictures the planes: `texels` are the (x, y) of a triangle's corners in it, pixel centres at integers; NaN without a picture. `up`
-    points up in the world, along an axis of the Manhattan frame; NaN when nothing says so."""
+    `atlas` (RGB) is the planes' texture: `texels` are the (x, y) of a triangle's corners in it, pixel centres at integers; NaN without one. `up`
+    points up in the world, along an axis of the Manhattan frame; NaN where it is not known."""
 
     version: ClassVar[int] = 2
 
@@ -412,7 +412,7 @@ class Surface(Value):
 
     @staticmethod
     def empty(index: int, stamp_ns: int) -> Surface:
-        """A mesh without triangles and planes."""
+        """Make a mesh without triangles and planes."""
         none, no_number, no_color = np.empty((0, 3), np.float32), np.empty(0, np.int32), np.empty((0, 3), np.uint8)
         atlas, texels = np.empty((0, 0, 3), np.uint8), np.empty((0, 3, 2), np.float32)
         return Surface(

@@ -1,7 +1,7 @@
-"""Whether the poses are as uncertain as they say: normalised errors (NEES) against the truth (Bar-Shalom et al., 2001, section 5.4).
+"""Consistency of poses with their covariances: normalised errors (NEES) against the truth (Bar-Shalom et al., 2001, section 5.4).
 
-The first camera is the world by definition, but the map averages many frames, and its place relative to the first one is never seen again. So the
-truth is laid over the trajectory by the one rigid motion that the covariances make most likely, and what is judged is the pose in the map.
+The first camera is the world by definition, but the map averages many frames, and its pose relative to the first one is never measured again. So
+the truth is aligned to the trajectory by the one rigid motion that the covariances make most likely, and the pose in the map is evaluated.
 """
 
 from __future__ import annotations
@@ -20,8 +20,8 @@ ITERATIONS = 5
 
 @dataclass(frozen=True)
 class Consistency:
-    """`nees_mean` is 6 for honest covariances, more when they are too small; `share_within_95` is 0.95. `normalised_rms` (6,) tells the directions
-    apart: each error over its standard deviation, translation x y z then rotation x y z in the camera frame; 1 is honest."""
+    """`nees_mean` is 6 for honest covariances, more when they are too small; `share_within_95` is 0.95. `normalised_rms` (6,) is by
+    direction: each error over its standard deviation, translation x y z then rotation x y z in the camera frame; 1 is honest."""
 
     poses: int
     nees_mean: float
@@ -30,7 +30,7 @@ class Consistency:
     normalised_rms: tuple[float, ...]
 
     def to_dict(self) -> dict[str, Any]:
-        """Field name -> value, ready for JSON."""
+        """Return field name -> value, ready for JSON."""
         return asdict(self)
 
 
@@ -50,13 +50,13 @@ def pose_consistency(poses: F64, covariances: F64, true_poses: F64) -> Consisten
 
 
 def _errors(poses: F64, true_poses: F64, T_truth_world: F64) -> F64:
-    """(n, 6) xi with `T_true = T_truth_world · T · Exp(xi)`."""
+    """Return (n, 6) xi with `T_true = T_truth_world · T · Exp(xi)`."""
     motions = invert(T_truth_world @ poses) @ true_poses
     return np.array([log_se3(motion) for motion in motions])
 
 
 def _gauge(poses: F64, information: F64, true_poses: F64) -> F64:
-    """(4, 4) rigid motion of the world into the truth's that makes the weighted errors least (Gauss–Newton)."""
+    """Return the (4, 4) rigid motion of the world into the truth's that minimises the weighted errors (Gauss–Newton)."""
     T = true_poses[0] @ invert(poses[0])
     J = adjoint(invert(poses))
     H = np.einsum("nji,njk,nkl->il", J, information, J)

@@ -1,8 +1,7 @@
-"""Frames that come in real time: which of them a run takes, and which it misses.
+"""Live sources: frames that come in real time, and frame dropping.
 
-A camera delivers frames when it wants to. A run asks it for the newest frame it has not seen; those that came and went meanwhile are dropped,
-never queued, so that a pose is as late as one frame takes and no later. Which frames were taken stands in the recording (topic `frames`), so that
-a replay goes through the same ones.
+A live source delivers frames at its own rate. A run takes the newest frame that it has not seen; earlier ones are dropped, never queued, so that the
+latency of a pose is that of one frame. The recording holds the frames that were taken (topic `frames`), so that a replay goes through the same ones.
 """
 
 from __future__ import annotations
@@ -16,7 +15,7 @@ from trihedron.pipeline.core.errors import DataError
 
 
 class Pace(Enum):
-    """When frames may be asked for: at once, at the camera's rate, or at its rate with those dropped for which the run comes too late."""
+    """The pace of a run: frames at once, at the camera's rate, or at its rate with frame dropping."""
 
     none = "none"
     real_time = "real_time"
@@ -25,14 +24,14 @@ class Pace(Enum):
 
 @dataclass(frozen=True)
 class Arrival:
-    """A frame that is there: its number, and when it came (time.perf_counter)."""
+    """A frame that has arrived: its number and time (time.perf_counter)."""
 
     number: int
     at_s: float
 
 
 class Camera(Protocol):
-    """What delivers frames in real time; a data set that has these methods too is a camera by itself.
+    """A live source of frames; a data set that has these methods too is one.
 
     `start` begins anew with frame 0. `wait(after)` waits for a frame later than `after` and returns the newest, or None when no more will come; the
     data set's `__call__` then gives that frame. `stop` ends it."""
@@ -45,19 +44,19 @@ class Camera(Protocol):
 
 
 class Playback:
-    """Any data set as a camera: frame k of `count` comes k / fps after the first was asked for. With `drop` False every frame is given in turn,
-    none before its time."""
+    """Any data set as a live source: frame k of `count` comes k / fps after the first was requested. With `drop` False every frame is delivered in
+    turn, none before its time."""
 
     def __init__(self, count: int, fps: float, drop: bool = True) -> None:
         self._count, self._period_s, self._drop = count, 1.0 / fps, drop
         self._began: float | None = None
 
     def start(self) -> None:
-        """The next frame asked for is the first."""
+        """Restart: the next frame requested is the first."""
         self._began = None
 
     def wait(self, after: int) -> Arrival | None:
-        """The newest frame that has come, at least the one after `after`."""
+        """Return the newest frame that has come, at least the one after `after`."""
         now = time.perf_counter()
         if self._began is None:
             self._began = now
@@ -70,11 +69,11 @@ class Playback:
         return Arrival(number, at_s)
 
     def stop(self) -> None:
-        """Nothing runs."""
+        """Do nothing: no thread runs."""
 
 
 class Feed:
-    """What a run takes of a camera, in order: `numbers` of the frames taken so far (from 0), and when each came."""
+    """The frames that a run takes from a live source, in order: `numbers` of those taken so far (from 0), and the time each came."""
 
     def __init__(self, camera: Camera) -> None:
         self._camera = camera
@@ -97,23 +96,23 @@ class Feed:
         return arrival.number
 
     def stop(self) -> None:
-        """No more frames are wanted."""
+        """Stop the source."""
         self._camera.stop()
 
     def summary(self, latency_ms: dict[str, float]) -> dict[str, Any]:
-        """How many frames came while the run went on, how many were taken and dropped, and how late their poses were."""
+        """Return the numbers of frames that came during the run, were taken and were dropped, and the latency of their poses."""
         came = self.numbers[-1] + 1 if self.numbers else 0
         return {"came": came, "taken": len(self.numbers), "dropped": came - len(self.numbers), "latency_ms": latency_ms}
 
 
 def is_camera(dataset: Any) -> bool:
-    """Whether a data set delivers frames by itself, when it wants to."""
+    """Return True for a data set that is a live source."""
     return hasattr(dataset, "wait")
 
 
 def feed_of(dataset: Any, pace: Pace) -> Feed | None:
-    """What a run takes frames from: a camera, a data set played as one, or None where frames are there at any time. Raises DataError where no frame
-    says how many there are a second."""
+    """Return the feed of a live source, or of a data set played as one; None where frames can be read at any time. Raises DataError where no frame
+    can be read, which has the rate."""
     if is_camera(dataset):
         return Feed(dataset)
     if pace is Pace.none:

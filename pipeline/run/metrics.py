@@ -1,4 +1,4 @@
-"""How far a trajectory is from the truth: ATE, RPE and the share of frames tracked, as the benchmarks define them (Sturm et al., IROS 2012)."""
+"""Errors of a trajectory against the truth: ATE, RPE and the share of frames tracked, as the benchmarks define them (Sturm et al., IROS 2012)."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from trihedron.pipeline.core.types import F64, Trajectory
 I64 = NDArray[np.int64]
 MAX_DIFFERENCE_NS = 20_000_000  # between a pose and its truth; half a frame at 25 Hz, and the benchmark's usual value
 GAP_STEPS = 2.5  # a longer step between poses is a gap of the trajectory, a shorter one may be a frame the sensor dropped (TUM: up to 2.2)
-FEWEST_POSES = 3  # an alignment of fewer says nothing
+FEWEST_POSES = 3  # an alignment of fewer means nothing
 
 
 @dataclass(frozen=True)
@@ -23,7 +23,7 @@ class Metrics:
     """Errors of a trajectory after SE(3) alignment. Lengths in metres, angles in degrees; None where no pair of poses is that far apart.
 
     `rpe_frame_*` compares poses 1 frame apart, `rpe_second_*` poses `rpe_second_frames` = round(fps) frames apart, over all such pairs.
-    `tracked_share` is `poses_with_truth / frames_with_truth`. `share_basis` says where the frames come from: "frames" when the data set's stamps
+    `tracked_share` is `poses_with_truth / frames_with_truth`. `share_basis` is the source of the frames: "frames" when the data set's stamps
     were given, else "ground truth": the frames the whole ground truth has at the trajectory's rate, so what was lost at either end counts
     too, and so does ground truth beyond the sequence. `tracked_share_in_span` looks only between the first and the last pose."""
 
@@ -50,12 +50,12 @@ class Metrics:
     share_basis: str
 
     def to_dict(self) -> dict[str, Any]:
-        """Field name -> value, ready for JSON."""
+        """Return field name -> value, ready for JSON."""
         return asdict(self)
 
 
 def associate(estimate_stamps_ns: I64, truth_stamps_ns: I64, max_difference_ns: int = MAX_DIFFERENCE_NS) -> I64:
-    """(n, 2) rows (estimate, truth) of stamps at most `max_difference_ns` apart: the nearest pair first, each stamp at most once
+    """Associate stamps: (n, 2) rows (estimate, truth) at most `max_difference_ns` apart: the nearest pair first, each stamp at most once
     (the rule of the TUM benchmark).
 
     Both inputs increase. Of two equally near truths the earlier one is taken. Rows are in the order of the estimate."""
@@ -70,10 +70,10 @@ def evaluate_trajectory(
     max_difference_ns: int = MAX_DIFFERENCE_NS,
     names: tuple[str, str] = ("trajectory", "ground truth"),
 ) -> Metrics:
-    """Compare a trajectory with the truth. `fps` (default: by the stamps) says how many frames one second is.
+    """Compare a trajectory with the truth. `fps` (default: by the stamps) is the number of frames in one second.
 
-    `frame_stamps_ns` are the stamps of all frames of the data set, those of the estimate among them: they number the poses and are what the
-    share of tracked frames refers to. Without them poses are numbered by their stamps (see `GAP_STEPS`) and the share is over the ground truth.
+    `frame_stamps_ns` are the stamps of all frames of the data set, those of the estimate among them: they number the poses, and the share of
+    tracked frames refers to them. Without them poses are numbered by their stamps (see `GAP_STEPS`) and the share is over the ground truth.
     Raises DataError, naming `names`, for poses that are not finite, stamps that do not increase, and fewer than 3 poses with truth."""
     for name, trajectory in zip(names, (estimate, truth)):
         _check(trajectory, name)
@@ -103,13 +103,13 @@ def evaluate_trajectory(
 
 
 def aligned_errors(poses: F64, true_poses: F64) -> F64:
-    """(n, 4, 4) and (n, 4, 4) -> (n,) distances of the positions in metres, after the best SE(3) alignment."""
+    """Return (n,) distances of the positions of two sets of (n, 4, 4) poses in metres, after the best SE(3) alignment."""
     positions, true_positions = poses[:, :3, 3], true_poses[:, :3, 3]
     return np.asarray(np.linalg.norm(true_positions - transform(umeyama(positions, true_positions), positions), axis=1))
 
 
 def relative_errors(poses: F64, true_poses: F64, first: I64, second: I64) -> tuple[F64, F64]:
-    """Errors of the motion between poses `first` and `second` (rows): (n,) metres and (n,) degrees of `(Qi⁻¹ Qj)⁻¹ (Pi⁻¹ Pj)`."""
+    """Return errors of the motion between poses `first` and `second` (rows): (n,) metres and (n,) degrees of `(Qi⁻¹ Qj)⁻¹ (Pi⁻¹ Pj)`."""
     motion = invert(poses[first]) @ poses[second]
     true_motion = invert(true_poses[first]) @ true_poses[second]
     error = invert(true_motion) @ motion
@@ -117,14 +117,14 @@ def relative_errors(poses: F64, true_poses: F64, first: I64, second: I64) -> tup
 
 
 def rotation_angles_deg(R: F64) -> F64:
-    """(n, 3, 3) rotations -> (n,) their angles, by sine and cosine so that small ones are exact."""
+    """Return the (n,) angles of (n, 3, 3) rotations, by sine and cosine so that small ones are exact."""
     sine = 0.5 * np.linalg.norm(np.stack([R[:, 2, 1] - R[:, 1, 2], R[:, 0, 2] - R[:, 2, 0], R[:, 1, 0] - R[:, 0, 1]]), axis=0)
     cosine = 0.5 * (np.trace(R, axis1=1, axis2=2) - 1.0)
     return np.asarray(np.degrees(np.arctan2(sine, cosine)))
 
 
 def _relative(prefix: str, poses: F64, true_poses: F64, numbers: I64, apart: int) -> dict[str, Any]:
-    """The RPE fields of Metrics over all pairs of poses whose frame numbers are `apart`."""
+    """Return the RPE fields of Metrics over all pairs of poses whose frame numbers are `apart`."""
     second = np.searchsorted(numbers, numbers + apart)
     first = np.flatnonzero(second < len(numbers))
     first = first[numbers[second[first]] == numbers[first] + apart]
@@ -140,7 +140,7 @@ def _relative(prefix: str, poses: F64, true_poses: F64, numbers: I64, apart: int
 
 
 def _pairs_by_frame(estimate: Trajectory, truth: Trajectory, frame_stamps_ns: I64 | None, max_difference_ns: int) -> tuple[I64, I64]:
-    """(n, 2) rows (estimate, truth), and the (n,) frame numbers of these poses."""
+    """Return (n, 2) rows (estimate, truth), and the (n,) frame numbers of these poses."""
     if frame_stamps_ns is None:
         pairs = associate(estimate.stamps_ns, truth.stamps_ns, max_difference_ns)
         return pairs, _numbers_by_stamp(estimate.stamps_ns)[pairs[:, 0]]
@@ -151,7 +151,7 @@ def _pairs_by_frame(estimate: Trajectory, truth: Trajectory, frame_stamps_ns: I6
 
 
 def _numbers_by_stamp(stamps_ns: I64) -> I64:
-    """Frame numbers when only the poses' stamps are known: 1 a pose, more over a gap."""
+    """Number frames by the poses' stamps alone: 1 a pose, more over a gap."""
     if len(stamps_ns) < 2:
         return np.zeros(len(stamps_ns), np.int64)
     steps = np.diff(stamps_ns) / _period_ns(stamps_ns)
@@ -159,7 +159,7 @@ def _numbers_by_stamp(stamps_ns: I64) -> I64:
 
 
 def _frames_with_truth(span: I64 | None, estimate: Trajectory, truth: Trajectory, frame_stamps_ns: I64 | None, max_difference_ns: int) -> int:
-    """How many frames have truth, all or those in a span of stamps; without the frames' stamps, how many the truth has at the estimate's rate."""
+    """Count the frames with truth, all or those in a span of stamps; without the frames' stamps, those the truth has at the estimate's rate."""
     stamps = truth.stamps_ns if frame_stamps_ns is None else frame_stamps_ns
     if span is not None:
         stamps = stamps[(stamps >= span[0]) & (stamps <= span[1])]
@@ -176,7 +176,7 @@ def _period_ns(stamps_ns: I64) -> float:
 
 
 def _fps(stamps_ns: I64) -> float:
-    """Frames a second by the mean step, gaps apart: a real camera's steps scatter to one side, and their median is off by 3 % (TUM)."""
+    """Estimate the frames a second by the mean step, gaps apart: a real camera's steps scatter to one side, and their median is off by 3 % (TUM)."""
     steps = np.diff(stamps_ns)
     usual = steps[steps < 1.5 * _period_ns(stamps_ns)]
     return 1e9 / float(usual.mean()) if len(usual) else 30.0
@@ -190,14 +190,14 @@ def _check(trajectory: Trajectory, name: str) -> None:
     bad = np.flatnonzero(~np.isfinite(trajectory.poses.reshape(-1, 16)).all(axis=1))
     if len(bad):
         cause = f"{len(bad)} of {len(trajectory)} poses are not finite, the first at {trajectory.stamps_ns[bad[0]] / 1e9:.6f} s"
-        raise DataError(name, cause, "leave out the frames that have no pose")
+        raise DataError(name, cause, "remove the frames that have no pose")
     backwards = np.flatnonzero(np.diff(trajectory.stamps_ns) <= 0)
     if len(backwards):
         raise DataError(name, f"the stamps do not increase at {trajectory.stamps_ns[backwards[0] + 1] / 1e9:.6f} s", "sort the poses, one a stamp")
 
 
 def _too_few(estimate: Trajectory, truth: Trajectory, count: int, max_difference_ns: int, names: tuple[str, str]) -> DataError:
-    """The error for a comparison of fewer than 3 poses: nothing in common, or too little."""
+    """Return the error for a comparison of fewer than 3 poses: no overlap, or too little."""
     for name, trajectory in zip(names, (estimate, truth)):
         if len(trajectory) < FEWEST_POSES:
             return DataError(name, f"has {len(trajectory)} poses", f"an evaluation needs at least {FEWEST_POSES}")

@@ -1,4 +1,4 @@
-"""The picture of a run: the trajectory from above, and its errors over time."""
+"""The plot of a run: the trajectory from above, and its errors over time."""
 
 from __future__ import annotations
 
@@ -21,10 +21,10 @@ GAP_STEPS = 5.0  # a curve is broken where its stamps are that many median steps
 
 
 def trajectory_figure(estimate: Trajectory, truth: Trajectory | None, path: Path, status: Sequence[tuple[int, str]] = ()) -> None:
-    """Write a PNG: the path over its two widest axes, the position per axis or, with truth, the errors per axis and of the rotation.
+    """Write a PNG: the trajectory over its two widest axes, the position per axis or, with truth, the errors per axis and of the rotation.
 
     The estimate is aligned to the truth (SE(3)). `status` are (stamp_ns, ok | degraded | lost) of all frames; those that are not ok are marked.
-    Truth that has fewer than 3 stamps in common is left out. Raises DataError when the file cannot be written."""
+    Truth that has fewer than 3 stamps in common is skipped. Raises DataError when the file cannot be written."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
@@ -42,7 +42,7 @@ def trajectory_figure(estimate: Trajectory, truth: Trajectory | None, path: Path
 
 
 def _with_truth(figure: Any, estimate: Trajectory, truth: Trajectory, pairs: NDArray[np.int64], status: Sequence[tuple[int, str]]) -> None:
-    """Both paths from above, and the errors of the aligned poses."""
+    """Draw both trajectories from above, and the errors of the aligned poses."""
     poses, true_poses = estimate.poses[pairs[:, 0]], truth.poses[pairs[:, 1]]
     alignment = umeyama(poses[:, :3, 3], true_poses[:, :3, 3])
     errors = transform(alignment, poses[:, :3, 3]) - true_poses[:, :3, 3]
@@ -60,14 +60,14 @@ def _with_truth(figure: Any, estimate: Trajectory, truth: Trajectory, pairs: NDA
 
 
 def _rotation_errors(poses: F64, true_poses: F64) -> F64:
-    """(n,) degrees between the poses and their truth after the turn that best fits all rotations: an alignment by positions that lie nearly on
-    a line leaves the turn about that line open."""
+    """Return (n,) degrees between the poses and their truth after the rotation that best fits all rotations: an alignment by positions that lie
+    nearly on a line leaves the rotation about that line open."""
     turn = nearest_rotation(np.einsum("nij,nkj->ik", true_poses[:, :3, :3], poses[:, :3, :3]))
     return rotation_angles_deg(np.swapaxes(true_poses[:, :3, :3], 1, 2) @ turn @ poses[:, :3, :3])
 
 
 def _without_truth(figure: Any, estimate: Trajectory, status: Sequence[tuple[int, str]]) -> None:
-    """The path from above, and the position over time."""
+    """Draw the trajectory from above, and the position over time."""
     grid = figure.add_gridspec(3, 2)
     _draw_top(figure.add_subplot(grid[:, 0]), estimate, None)
     _draw_curves(figure, grid, estimate.stamps_ns, [(f"{name} (m)", estimate.poses[:, i, 3]) for i, name in enumerate(AXES)], status)
@@ -75,7 +75,7 @@ def _without_truth(figure: Any, estimate: Trajectory, status: Sequence[tuple[int
 
 
 def _draw_top(axes: Any, estimate: Trajectory, truth: Trajectory | None) -> None:
-    """Paths over the two axes along which they reach farthest, in the world frame of the truth if there is one."""
+    """Draw trajectories over the two axes of their largest extent, in the world frame of the truth if there is one."""
     points = np.concatenate([t.poses[:, :3, 3] for t in (estimate, truth) if t is not None])
     across, up = sorted(np.argsort(-np.ptp(points, axis=0), kind="stable")[:2])
     for trajectory, color, label in ((truth, TRUTH_COLOR, "ground truth"), (estimate, ESTIMATE_COLOR, "estimate")):
@@ -91,7 +91,7 @@ def _draw_top(axes: Any, estimate: Trajectory, truth: Trajectory | None) -> None
 
 
 def _draw_curves(figure: Any, grid: Any, stamps_ns: NDArray[np.int64], curves: list[tuple[str, F64]], status: Sequence[tuple[int, str]]) -> None:
-    """Quantities one above the other over seconds since the first stamp, with a mark at the lower edge for each frame that is not ok."""
+    """Draw quantities one above the other over seconds since the first stamp, with a mark at the lower edge for each frame that is not ok."""
     axes = None
     for row, (label, values) in enumerate(curves):
         axes = figure.add_subplot(grid[row, 1], sharex=axes)
@@ -108,7 +108,7 @@ def _draw_curves(figure: Any, grid: Any, stamps_ns: NDArray[np.int64], curves: l
 
 
 def _broken(stamps_ns: NDArray[np.int64], rows: F64) -> F64:
-    """Rows over time with a NaN row wherever a gap is, so that the line breaks."""
+    """Insert a NaN row into rows over time at each gap, so that the line breaks."""
     steps = np.diff(stamps_ns)
     gaps = np.flatnonzero(steps > GAP_STEPS * np.median(steps)) + 1 if len(steps) else np.empty(0, np.int64)
     return np.insert(rows, gaps, np.nan, axis=0)

@@ -28,6 +28,6 @@ def write_ply(path: Path, vertices_m: F32, colors: U8, triangles: I32, planes: I
 
 
 def triangle_planes(surface: Surface) -> I32:
-    """(t,) id of the plane each triangle lies in, -1 for none."""
+    """Return (t,) id of the plane each triangle lies in, -1 for none."""
     ids = np.append(surface.plane_ids, np.int32(-1))
     return np.asarray(ids[surface.instances], np.int32)

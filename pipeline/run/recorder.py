@@ -1,4 +1,4 @@
-"""What a run writes to its recording, frame by frame."""
+"""The recorder of a run: writes values, views and times, frame by frame."""
 
 from __future__ import annotations
 

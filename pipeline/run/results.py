@@ -1,4 +1,4 @@
-"""The files a run leaves behind, besides the recording: trajectories, timing, metrics, the plot."""
+"""The files of a run folder besides the recording: trajectories, timing, metrics, the plot."""
 
 from __future__ import annotations
 
@@ -26,25 +26,25 @@ WORLD = "metres; the world of trajectory.txt: the first camera's frame, x right,
 
 
 def causal_trajectory(result: Result) -> Trajectory:
-    """The tracked poses as they were said at the time, but for those in a sub-map, which were said in another world."""
+    """Return the tracked poses as they were estimated at the time, without those in a sub-map, which are in another world."""
     poses = [pose for pose in result.poses if pose.status != LOST and pose.submap == 0]
     return _trajectory([pose.stamp_ns for pose in poses], [pose.T_world_camera for pose in poses])
 
 
 def final_trajectory(result: Result) -> Trajectory:
-    """The tracked poses hung on the final keyframes: keyframe pose × relative pose, so corrections of the map reach every frame. A frame that became
-    a keyframe is where that is. Frames of sub-maps are among them once these are tied to the first."""
-    poses = [pose for pose in result.poses if is_tied(pose, result.map)]
+    """Return the tracked poses relative to the final keyframes: keyframe pose × relative pose, so that corrections of the map apply to every frame. A
+    frame that became a keyframe has its pose. Frames of sub-maps are included once these are merged with the first."""
+    poses = [pose for pose in result.poses if is_merged(pose, result.map)]
     if result.map is None:
         return causal_trajectory(result)
     keyframes = result.map.keyframes.column("T_world_camera")
     own = dict(list(zip(result.map.keyframes.column("index").tolist(), keyframes))[result.loaded_keyframes :])
-    hung = [pose.T_world_camera if pose.reference < 0 else keyframes[pose.reference] @ pose.T_reference_camera for pose in poses]
-    return _trajectory([pose.stamp_ns for pose in poses], [own.get(pose.index, T) for pose, T in zip(poses, hung)])
+    moved = [pose.T_world_camera if pose.reference < 0 else keyframes[pose.reference] @ pose.T_reference_camera for pose in poses]
+    return _trajectory([pose.stamp_ns for pose in poses], [own.get(pose.index, T) for pose, T in zip(poses, moved)])
 
 
-def is_tied(pose: Pose, map: Map | None) -> bool:
-    """Whether the pose was tracked and stands, in the end, in the world of the first frame."""
+def is_merged(pose: Pose, map: Map | None) -> bool:
+    """Return True if the pose was tracked and is, in the end, in the world of the first frame."""
     if pose.status == LOST or map is None or pose.reference < 0:
         return pose.status != LOST and pose.submap == 0
     return bool(map.keyframes.rows("submap", np.array([pose.reference]))[0] == 0)
@@ -62,9 +62,9 @@ def write_results(out: Path, result: Result, truth: Trajectory | None) -> dict[s
     metrics: dict[str, Any] = {
         "frames": len(result.stamps_ns),
         "unreadable": result.unreadable,
-        "untied": sum(pose.status != LOST and not is_tied(pose, result.map) for pose in result.poses),
+        "untied": sum(pose.status != LOST and not is_merged(pose, result.map) for pose in result.poses),
         "status": {status: sum(pose.status == status for pose in result.poses) for status in (OK, DEGRADED, LOST)},
-        "reasons": {status: said for status in (DEGRADED, LOST) if (said := _commonest_reason(result.poses, status))},
+        "reasons": {status: reason for status in (DEGRADED, LOST) if (reason := _commonest_reason(result.poses, status))},
     }
     if len(final):  # of a walk that ends where it began, the drift
         metrics["start_to_end_m"] = float(np.linalg.norm(final.poses[-1, :3, 3] - final.poses[0, :3, 3]))
@@ -83,7 +83,7 @@ def write_results(out: Path, result: Result, truth: Trajectory | None) -> dict[s
 
 
 def _commonest_reason(poses: Iterable[Pose], status: str) -> str:
-    """Why most frames of a status have it, in the words of the last of them; reasons that differ in numbers alone are one. '' without such frames."""
+    """Return the reason that most frames of a status have, as the last of them has it; reasons that differ in numbers alone are one. '' for none."""
     reasons = [pose.reason for pose in poses if pose.status == status]
     alike = [re.sub(r"\d+(\.\d+)?", "0", reason) for reason in reasons]
     commonest = Counter(alike).most_common(1)
@@ -91,7 +91,7 @@ def _commonest_reason(poses: Iterable[Pose], status: str) -> str:
 
 
 def write_surface(out: Path, surface: Surface) -> str:
-    """Write surface.ply, in the world of trajectory.txt, and say in one line what is in it."""
+    """Write surface.ply, in the world of trajectory.txt, and return a line that describes it."""
     write_ply(out / SURFACE, surface.vertices_m, surface.colors, surface.triangles, triangle_planes(surface), WORLD)
     if len(surface.triangles) == 0:
         return "the surface is empty: no tracked frame showed enough of one"
@@ -100,7 +100,7 @@ def write_surface(out: Path, surface: Surface) -> str:
 
 
 def _consistency(result: Result, truth: Trajectory) -> dict[str, Any]:
-    """Of the tracked poses but the first, which is exact by definition."""
+    """Return the consistency of the tracked poses without the first, which is exact by definition."""
     poses = [pose for pose in result.poses if pose.status != LOST][1:]
     pairs = associate(np.array([pose.stamp_ns for pose in poses], np.int64), truth.stamps_ns)
     known = [poses[row] for row, _ in pairs]
@@ -114,7 +114,7 @@ def write_json(path: Path, content: dict[str, Any]) -> None:
 
 
 def dotted(values: dict[str, Any], prefix: str = "") -> dict[str, Any]:
-    """The values of nested dictionaries by dotted name, as `final.ate_rmse_m`."""
+    """Flatten nested dictionaries: values by dotted name, as `final.ate_rmse_m`."""
     flat: dict[str, Any] = {}
     for name, value in values.items():
         flat |= dotted(value, f"{prefix}{name}.") if isinstance(value, dict) else {prefix + name: value}

@@ -1,10 +1,10 @@
 """Runs a graph over frames on several threads, with the same values whatever their number.
 
-A task is one node at one frame. It is ready when what its wires name is there: a value of the same frame, of exactly k frames ago, or, for
-`@prev`, all earlier frames of that topic. Ready tasks run oldest frame first, so tracking goes before features of later frames; of one frame, that
-first after which most remains to be done, by what calls took so far. How many frames may be in flight is bounded. What only later frames ask for has
-a thread of its own at a lower priority, so that no pose waits for it, and so has what waits for frames that have not come. Nodes see only their
-inputs, so the order in which tasks happen to run cannot change a value.
+A task is one node at one frame. It is ready when the values of its wires are there: of the same frame, of exactly k frames ago, or, for `@prev`, of
+all earlier frames of that topic. Ready tasks run oldest frame first, so tracking precedes features of later frames; within a frame by the longest
+remaining path, from measured times of calls. The number of pipelined frames is bounded. Nodes that only later frames read have a thread of their own
+at a lower priority, so that no pose waits for them, and so have nodes that wait for a live source. Nodes see only their inputs, so the order in which
+tasks happen to run cannot change a value.
 """
 
 from __future__ import annotations
@@ -26,15 +26,15 @@ from threadpoolctl import threadpool_limits
 
 from trihedron.pipeline.core.wires import PREVIOUS, Wire
 
-LATEST = 0.1  # share of the latest call in what a node is thought to take
+LATEST = 0.1  # weight of the latest call in the moving average of a node's time
 SWITCH_S = 0.0005  # of Python's usual 5 ms
-NICE = 10  # of the thread for what may lag; where the system has no such thing for threads, it is a thread like the others
+NICE = 10  # of the thread for lagging nodes, where the system has priorities of threads
 
 
 @dataclass(frozen=True)
 class Node:
     """`call(position, inputs)` computes a value or None; `ordered` nodes (folds, topics of a file) never run two frames out of order; one that
-    `waits` for something outside, as for a camera, keeps no worker meanwhile."""
+    `waits` for a live source occupies no worker meanwhile."""
 
     name: str
     call: Callable[[int, Mapping[str, Any]], Any]
@@ -44,7 +44,7 @@ class Node:
 
 
 class Lane(IntEnum):
-    """Which threads a task is for: the workers, the one for what may lag, or the one that waits."""
+    """The threads a task is for: the workers, the one for lagging nodes, or the one that waits for a live source."""
 
     prompt = 0
     lagging = 1
@@ -60,15 +60,15 @@ class NodeFailure(Exception):
 
 
 class NoMoreFrames(Exception):
-    """A node says that there is no frame at this position, nor at any later one."""
+    """Raised by a node: there is no frame at this position, nor at any later one."""
 
 
 class Scheduler:
-    """Nodes in topological order, `threads` workers, at most `lookahead` frames in flight.
+    """Nodes in topological order, `threads` workers, at most `lookahead` pipelined frames.
 
     A node read only through `@k` wires may lag k frames behind; it does not hold back the others, and with more than one worker another, of lower
-    priority, takes it. `initial` holds what `@prev` sees before the first
-    frame, `recent` what `@k` does: node -> position (-1: one frame before the first) -> value."""
+    priority, takes it. `initial` holds the values of `@prev` before the first
+    frame, `recent` those of `@k`: node -> position (-1: one frame before the first) -> value."""
 
     def __init__(
         self,
@@ -84,7 +84,7 @@ class Scheduler:
         self._urgency = dict.fromkeys(self._nodes, 0.0)  # seconds from a node's beginning to the end of its frame, at best
         self._threads, self._initial, self._recent = threads, initial, recent or {}
         delays = [wire.delay for node in nodes for wire in node.inputs.values()]
-        self._reach = max([1, *delays])
+        self._max_delay = max([1, *delays])
         self._lookahead = lookahead
         self._count = self._admitted = self._consumed = 0
         self._consumers: dict[str, list[tuple[str, int]]] = defaultdict(list)
@@ -93,7 +93,7 @@ class Scheduler:
                 self._consumers[wire.topic].append((node.name, wire.delay))
             if node.ordered:
                 self._consumers[node.name].append((node.name, PREVIOUS))
-        self._kept = {name: max([0, *(delay for _, delay in self._consumers[name])]) for name in self._nodes}  # how many frames a value is asked for
+        self._retained = {name: max([0, *(delay for _, delay in self._consumers[name])]) for name in self._nodes}  # frames for which a value is read
         lagging = {name for name in self._nodes if self._consumers[name] and all(delay > 0 for _, delay in self._consumers[name])}
         self._prompt = set(self._nodes) - lagging
         self._lanes = dict.fromkeys(self._nodes, Lane.prompt)
@@ -104,9 +104,9 @@ class Scheduler:
         self._work_there = {lane: threading.Condition(self._lock) for lane in Lane}
         self._ready: dict[Lane, list[tuple[int, float, int, str]]] = {lane: [] for lane in Lane}
         self._unmet: dict[tuple[str, int], int] = {}
-        self._undone: dict[int, int] = {}  # how many nodes a frame still waits for
-        self._prompt_undone: dict[int, int] = {}  # how many of these may not lag
-        self._in_flight = 0  # the first frame that still waits for one which may not lag
+        self._undone: dict[int, int] = {}  # unfinished nodes of a frame
+        self._prompt_undone: dict[int, int] = {}  # those of these that may not lag
+        self._oldest = 0  # the first frame with an unfinished node that may not lag
         self._values: dict[str, dict[int, Any]] = {name: {} for name in self._nodes}
         self._held: dict[str, dict[int, Any]] = {name: {} for name in self._nodes}
         self._frontier = dict.fromkeys(self._nodes, 0)  # frames done without a gap
@@ -116,7 +116,7 @@ class Scheduler:
 
     def run(self, count: int) -> Iterator[tuple[int, dict[str, Any]]]:
         """Yield (position, values by node) for 0..count-1 in order, fewer where a node raises NoMoreFrames. After a failure the frames before it
-        come, then what was done of that frame, then NodeFailure is raised."""
+        come, then the finished values of that frame, then NodeFailure is raised."""
         lanes = [Lane.prompt] * self._threads + [lane for lane in (Lane.lagging, Lane.waiting) if lane in self._lanes.values()]
         workers = [threading.Thread(target=self._work, args=(lane,), name=f"stage-{i}", daemon=True) for i, lane in enumerate(lanes)]
         for worker in workers:
@@ -145,7 +145,7 @@ class Scheduler:
                 worker.join()
 
     def _settled(self, position: int) -> bool:
-        """Whether the frame is complete, or nothing more will become of it."""
+        """Return True if the frame is complete, or none of its nodes will run any more."""
         if self._undone.get(position) == 0:
             return True
         if position >= self._count:
@@ -158,8 +158,8 @@ class Scheduler:
         return bool(ready) and ready[0][0] < self._count and (self._failure is None or ready[0][0] <= self._failure.position)
 
     def _admit(self, mine: Lane | None = None) -> None:
-        """Let frames in while few enough are in flight and the consumer keeps up, and wake who can work, for one task less in the caller's lane."""
-        limit = min(self._count, self._in_flight + self._lookahead, self._consumed + self._lookahead + self._reach)
+        """Admit frames while few enough are pipelined and the consumer keeps up, and wake idle threads, for one task less in the caller's lane."""
+        limit = min(self._count, self._oldest + self._lookahead, self._consumed + self._lookahead + self._max_delay)
         while self._admitted < limit:
             self._judge_urgency()
             self._undone[self._admitted], self._prompt_undone[self._admitted] = len(self._nodes), len(self._prompt)
@@ -174,7 +174,7 @@ class Scheduler:
                 self._work_there[lane].notify(len(ready) - (lane is mine))
 
     def _judge_urgency(self) -> None:
-        """The upward rank of list scheduling (Topcuoglu, Hariri, Wu: HEFT, 2002)."""
+        """Update the upward ranks of list scheduling (Topcuoglu, Hariri, Wu: HEFT, 2002)."""
         for name in reversed(self._nodes):
             after = max((self._urgency[consumer] for consumer, delay in self._consumers[name] if delay == 0), default=0.0)
             self._urgency[name] = self._seconds[name] + after
@@ -234,9 +234,9 @@ class Scheduler:
         self._undone[position] -= 1
         if name in self._prompt:
             self._prompt_undone[position] -= 1
-        while self._prompt_undone.get(self._in_flight) == 0:
-            del self._prompt_undone[self._in_flight]
-            self._in_flight += 1
+        while self._prompt_undone.get(self._oldest) == 0:
+            del self._prompt_undone[self._oldest]
+            self._oldest += 1
         for consumer, delay in self._consumers[name]:
             if delay != PREVIOUS:
                 self._meet(consumer, position + delay)
@@ -257,11 +257,11 @@ class Scheduler:
             self._offer(name, position)
 
     def _forget(self, position: int) -> None:
-        """Drop what no later frame can ask for once `position` is complete."""
+        """Drop the values that no later frame can read once `position` is complete."""
         self._undone.pop(position, None)
         for name in self._nodes:
             self._unmet.pop((name, position), None)
-            self._values[name].pop(position - self._kept[name], None)
+            self._values[name].pop(position - self._retained[name], None)
             self._held[name].pop(position - 1, None)
 
 

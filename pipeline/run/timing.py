@@ -1,4 +1,4 @@
-"""What the runner measures: how long each call took, and each frame from hand-over to pose; the memory that is held."""
+"""Times and memory of a run: milliseconds of each call, latency of each frame, resident memory."""
 
 from __future__ import annotations
 
@@ -28,19 +28,19 @@ class Timing:
         self._finish_ms: dict[str, float] = {}
 
     def add_call(self, stage: str, ms: float) -> None:
-        """One call of a stage."""
+        """Add one call of a stage."""
         self._calls[stage].append(ms)
 
     def add_finish(self, stage: str, ms: float) -> None:
-        """The end of a fold."""
+        """Add the end of a fold."""
         self._finish_ms[stage] = ms
 
     def add_frame(self, ms: float) -> None:
-        """One frame, from the moment it was handed over to its pose."""
+        """Add the latency of one frame, from reading it to its pose."""
         self._frames_ms.append(ms)
 
     def summary(self, threads: int, wall_s: float, startup_s: float) -> dict[str, Any]:
-        """Frames, wall time and percentiles; `fps` is the whole run's, with reading and recording; `startup_s` is imports and composition."""
+        """Return frames, wall time and percentiles; `fps` is the whole run's, with reading and recording; `startup_s` is imports and composition."""
         frames = len(self._frames_ms)
         p50, p95, largest = _percentiles(self._frames_ms)
         stages: dict[str, dict[str, float]] = {}
@@ -62,14 +62,14 @@ class Timing:
 
 
 def resident_mb() -> float:
-    """Memory (10⁶ bytes) this process holds now; 0 where the system does not say (Linux does). Asked for each frame, so the file stays open."""
+    """Return the resident memory of this process (10⁶ bytes), on Linux; 0 elsewhere. Read for each frame, so the file stays open."""
     file = _statistics(os.getpid())
     return int(os.pread(file, 100, 0).split()[1]) * _PAGE_MB if file is not None else 0.0
 
 
 @cache
 def _statistics(process: int) -> int | None:
-    """The file, opened by this process: one that was forked would read of the other."""
+    """Open the file once a process: a forked one would read that of the other."""
     try:
         return os.open("/proc/self/statm", os.O_RDONLY | os.O_CLOEXEC)
     except OSError:
@@ -77,14 +77,14 @@ def _statistics(process: int) -> int | None:
 
 
 def peak_mb() -> float | None:
-    """The most memory (10⁶ bytes) this process held since `forget_peak`; None where the system does not say (Linux does)."""
+    """Return the peak memory (10⁶ bytes) of this process since `forget_peak`, on Linux; None elsewhere."""
     status = Path("/proc/self/status")
     lines = status.read_text().splitlines() if status.exists() else []
     return next((round(int(line.split()[1]) * 1.024e-3, 1) for line in lines if line.startswith("VmHWM:")), None)
 
 
 def forget_peak() -> None:
-    """Begin to measure the peak anew, without what earlier runs of this process left. Where that is not allowed the peak is the process's."""
+    """Restart the measurement of the peak, without the memory of earlier runs. Where that is not permitted the peak is the process's."""
     gc.collect()
     malloc_trim()
     with suppress(OSError):

@@ -197,7 +197,7 @@ def test_poses_that_are_not_finite():
     poses[4, 0, 3], poses[7, 1, 1] = np.nan, np.inf
     with pytest.raises(DataError) as error:
         evaluate_trajectory(Trajectory(walk(10).stamps_ns, poses), walk(10), names=("a.txt", "b.txt"))
-    assert str(error.value) == "a.txt: 2 of 10 poses are not finite, the first at 0.133333 s; leave out the frames that have no pose"
+    assert str(error.value) == "a.txt: 2 of 10 poses are not finite, the first at 0.133333 s; remove the frames that have no pose"
 
 
 def test_stamps_that_go_backwards():

@@ -11,7 +11,7 @@ from trihedron.pipeline.core.geometry import exp_se3, invert, transform
 from trihedron.pipeline.core.types import Pose
 from trihedron.pipeline.run.accounting import Result
 from trihedron.pipeline.run.poses import Poses
-from trihedron.pipeline.run.results import final_trajectory, is_tied
+from trihedron.pipeline.run.results import final_trajectory, is_merged
 from trihedron.plugins.map.covisibility import Covisibility
 from trihedron.plugins.mapping.covisibility_graph import current_submap, local_window, newest_keyframes
 from trihedron.plugins.matches.local_map import LocalMap
@@ -59,7 +59,7 @@ def test_a_sub_map_shares_nothing_with_the_rest(both):
     assert map.planes.column("alive").sum() == 6  # three walls, each twice
 
 
-def test_a_sub_map_is_tied_where_the_camera_is_recognised(both):
+def test_a_sub_map_is_merged_where_the_camera_is_recognised(both):
     """Everything moves by AWAY's inverse, walls are one again, and the next frame finds landmarks of both."""
     world, map = both
     step = 33
@@ -80,12 +80,12 @@ def test_a_sub_map_is_tied_where_the_camera_is_recognised(both):
     assert len(set(local_window(after, camera_at(20), 2, 10, 5).keyframes) & set(range(6))) >= 3
 
 
-def test_frames_of_a_sub_map_count_once_it_is_tied(both):
+def test_frames_of_a_sub_map_count_once_it_is_merged(both):
     _, map = both
     poses = [pose_of(camera_at(0), 0, reference=0), pose_of(AWAY, 20, "degraded", submap=1, reference=8), pose_of(AWAY, 21, "lost", reference=8)]
-    assert [is_tied(pose, map) for pose in poses] == [True, False, False] and len(final_trajectory(Result(Poses(poses), map))) == 1
+    assert [is_merged(pose, map) for pose in poses] == [True, False, False] and len(final_trajectory(Result(Poses(poses), map))) == 1
     tied = dataclasses.replace(map, keyframes=map.keyframes.updated(np.arange(6, 12), submap=np.zeros(6, np.int32)))
-    assert [is_tied(pose, tied) for pose in poses] == [True, True, False] and len(final_trajectory(Result(Poses(poses), tied))) == 2
+    assert [is_merged(pose, tied) for pose in poses] == [True, True, False] and len(final_trajectory(Result(Poses(poses), tied))) == 2
 
 
 def test_a_new_sub_map_begins_after_as_many_frames_as_were_sought_in_vain():
