@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from trihedron.pipeline.core.geometry import nearest_pairs, rotation_angle_deg
-from trihedron.pipeline.record.recording import Recording
+from trihedron.pipeline.record.reader import Recording
 from trihedron.pipeline.record.trajectories import attached_truth
 
 DATA = Path(__file__).resolve().parents[2] / "shared" / "data"

@@ -17,7 +17,7 @@ from trihedron.datasets.simulation.synthetic import Synthetic
 from trihedron.pipeline.app.cli import main
 from trihedron.pipeline.core.geometry import invert, log_se3
 from trihedron.pipeline.core.types import DEGRADED, LOST, OK
-from trihedron.pipeline.record.recording import Recording
+from trihedron.pipeline.record.reader import Recording
 from trihedron.pipeline.run.consistency import pose_consistency
 
 SMALL = {"width": 320, "height": 240}

@@ -11,7 +11,7 @@ import pytest
 from trihedron.datasets.simulation.synthetic import Scene, Synthetic
 from trihedron.pipeline.core.geometry import invert
 from trihedron.pipeline.core.registry import load_plugins
-from trihedron.pipeline.record.recording import Recording
+from trihedron.pipeline.record.reader import Recording
 from trihedron.pipeline.record.trajectories import read_trajectory
 from trihedron.plugins.loop.appearance import AppearanceLoop
 from trihedron.plugins.loop.planes import PlanesLoop

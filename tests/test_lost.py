@@ -14,7 +14,7 @@ from trihedron.datasets.simulation.synthetic import Scene, Synthetic
 from trihedron.pipeline.core.geometry import invert, rotation_angle_deg
 from trihedron.pipeline.core.registry import load_plugins, plugin_class
 from trihedron.pipeline.core.types import Pose
-from trihedron.pipeline.record.recording import Recording
+from trihedron.pipeline.record.reader import Recording
 
 DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
 RUN = "import sys; from trihedron.pipeline.app.cli import main; sys.exit(main(['run', *sys.argv[1:]]))"

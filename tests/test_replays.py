@@ -12,7 +12,7 @@ from trihedron.pipeline.app.cli import main
 from trihedron.pipeline.core.config import graph_of, register_configs
 from trihedron.pipeline.core.registry import load_plugins, plugin_class
 from trihedron.pipeline.core.slots import output_of
-from trihedron.pipeline.record.recording import Recording
+from trihedron.pipeline.record.reader import Recording
 
 sys.path.insert(0, str(Path(__file__).parent / "pipeline"))
 from toys import contents

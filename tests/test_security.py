@@ -14,7 +14,7 @@ from trihedron.datasets.readers.tum import Tum
 from trihedron.pipeline.app.cli import main
 from trihedron.pipeline.core.errors import DataError
 from trihedron.pipeline.core.types import FrameReference
-from trihedron.pipeline.record.recording import FORMAT, METADATA
+from trihedron.pipeline.record.codec import FORMAT, METADATA
 
 ROOT = Path(__file__).resolve().parents[1]
 FOLDERS = ("pipeline", "plugins", "datasets", "tools", "conf")

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from trihedron.pipeline.record.recording import Recording
+from trihedron.pipeline.record.reader import Recording
 from trihedron.tools.benchmark import PROGRAM
 
 sys.path.insert(0, str(Path(__file__).parent / "plugins"))

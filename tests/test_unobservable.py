@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from trihedron.pipeline.app.cli import main
-from trihedron.pipeline.record.recording import Recording
+from trihedron.pipeline.record.reader import Recording
 
 GRAPHS = Path(__file__).parent.parent / "conf" / "graph"
 FRAMES, WIDTH, HEIGHT, FOCAL = 16, 320, 240, 260.0

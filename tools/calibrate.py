@@ -17,7 +17,7 @@ import numpy as np
 
 from trihedron.pipeline.core.errors import DataError
 from trihedron.pipeline.core.types import FrameReference, Keypoints, Matches, Planes, Tracks
-from trihedron.pipeline.record.recording import Recording
+from trihedron.pipeline.record.reader import Recording
 from trihedron.tools.arguments import Parser, table
 from trihedron.tools.calibration import DepthDelay, DepthOffset, RightAngle, Turn, estimate_depth_delay, estimate_depth_offset, right_angles, turn_of
 

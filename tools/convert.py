@@ -18,7 +18,7 @@ from trihedron.pipeline.core.errors import ConfigError, DataError, UsageError
 from trihedron.tools.arguments import Parser
 
 if TYPE_CHECKING:
-    from trihedron.pipeline.record.recording import RecordingWriter
+    from trihedron.pipeline.record.writer import RecordingWriter
 
 SUFFIX = ".mcap"
 
@@ -71,8 +71,8 @@ def convert(dataset: str, options: dict[str, str | None], destination: Path) -> 
     Raises DataError when the data set cannot be read, ConfigError for options it does not have."""
     from trihedron.pipeline.core.graph import build_graph
     from trihedron.pipeline.core.registry import load_plugins, plugin_class
-    from trihedron.pipeline.record.recording import RecordingWriter
     from trihedron.pipeline.record.trajectories import TRUTH, format_trajectory
+    from trihedron.pipeline.record.writer import RecordingWriter
     from trihedron.pipeline.run.runner import Runner
 
     load_plugins()

@@ -16,7 +16,8 @@ import numpy as np
 
 from trihedron.pipeline.core.errors import DataError, did_you_mean
 from trihedron.pipeline.core.types import Table, Value
-from trihedron.pipeline.record.recording import FRAMES_TOPIC, Recording, TopicReader
+from trihedron.pipeline.record.codec import FRAMES_TOPIC
+from trihedron.pipeline.record.reader import Recording, TopicReader
 from trihedron.tools.arguments import Parser, table
 
 

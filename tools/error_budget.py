@@ -22,8 +22,9 @@ import numpy as np
 from trihedron.pipeline.core.errors import DataError, StageError
 from trihedron.pipeline.core.geometry import nearest_pairs, nearest_rotation
 from trihedron.pipeline.core.types import F64, OK, Pose, Rotation, Translation, Value
-from trihedron.pipeline.record.recording import Recording, RecordingWriter
+from trihedron.pipeline.record.reader import Recording
 from trihedron.pipeline.record.trajectories import attached_truth
+from trihedron.pipeline.record.writer import RecordingWriter
 from trihedron.pipeline.run.metrics import MAX_DIFFERENCE_NS
 from trihedron.tools.arguments import Parser, table
 

@@ -74,7 +74,7 @@ def evaluate_files(
 
 
 def _read_truth(path: Path) -> Trajectory:
-    from trihedron.pipeline.record.recording import Recording
+    from trihedron.pipeline.record.reader import Recording
     from trihedron.pipeline.record.trajectories import attached_truth, read_trajectory
 
     if path.suffix != ".mcap":
@@ -100,7 +100,7 @@ def read_frames(path: Path, estimate: Trajectory) -> tuple[I64, float | None]:
     import numpy as np
 
     from trihedron.pipeline.core.types import FrameReference
-    from trihedron.pipeline.record.recording import Recording
+    from trihedron.pipeline.record.reader import Recording
     from trihedron.pipeline.record.trajectories import parse_stamp_ns, table_lines
     from trihedron.pipeline.run.metrics import associate
 

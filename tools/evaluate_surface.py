@@ -60,7 +60,7 @@ def evaluate_files(mesh: Path, recording: Path) -> dict[str, Any]:
 def prepared(trajectory: Path, recording: Path) -> tuple[F64, Truth]:
     """(4, 4) `T_truth_world` that aligns the trajectory with the recording's ground truth, and the true surface of its data set. Raises DataError."""
     from trihedron.pipeline.core.geometry import umeyama
-    from trihedron.pipeline.record.recording import Recording
+    from trihedron.pipeline.record.reader import Recording
     from trihedron.pipeline.record.trajectories import attached_truth, read_trajectory
     from trihedron.pipeline.run.metrics import associate
     from trihedron.tools.surface_truth import truth_of

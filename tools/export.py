@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from trihedron.pipeline.core.errors import DataError, UsageError, did_you_mean
-from trihedron.pipeline.record.recording import Recording
+from trihedron.pipeline.record.reader import Recording
 from trihedron.tools.arguments import Parser
 
 RECORDING = "run.mcap"

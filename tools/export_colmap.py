@@ -14,7 +14,7 @@ import numpy as np
 from trihedron.pipeline.core.errors import DataError
 from trihedron.pipeline.core.geometry import invert
 from trihedron.pipeline.core.types import I32, U8, FrameReference, Map
-from trihedron.pipeline.record.recording import Recording
+from trihedron.pipeline.record.reader import Recording
 from trihedron.tools.export import Format
 from trihedron.tools.recorded import colors_at, frames_of, last_map, references_of
 

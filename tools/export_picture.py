@@ -11,7 +11,7 @@ import numba
 import numpy as np
 
 from trihedron.pipeline.core.types import F64, I32, U8, Surface
-from trihedron.pipeline.record.recording import Recording
+from trihedron.pipeline.record.reader import Recording
 from trihedron.tools.export import Format
 from trihedron.tools.export_surface import surface_of, upright
 

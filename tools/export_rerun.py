@@ -15,7 +15,7 @@ from trihedron.pipeline.core.errors import DataError, UsageError
 from trihedron.pipeline.core.types import Camera, Keypoints, ManhattanFrame, Map, Planes, Pose, Segments, Surface
 from trihedron.pipeline.record.foxglove import View
 from trihedron.pipeline.record.foxglove_messages import AXES, COLORS
-from trihedron.pipeline.record.recording import Recording
+from trihedron.pipeline.record.reader import Recording
 from trihedron.pipeline.record.trajectories import attached_truth
 from trihedron.tools.export import Format
 from trihedron.tools.recorded import references_of

@@ -11,7 +11,8 @@ import numpy as np
 
 from trihedron.pipeline.core.geometry import quaternion_from_rotation
 from trihedron.pipeline.core.types import Pose
-from trihedron.pipeline.record.recording import TIMING_TOPIC, Recording
+from trihedron.pipeline.record.codec import TIMING_TOPIC
+from trihedron.pipeline.record.reader import Recording
 from trihedron.pipeline.record.trajectories import format_stamp, write_trajectory
 from trihedron.tools.export import Format
 from trihedron.tools.recorded import poses_of, trajectory_of

@@ -12,7 +12,7 @@ from trihedron.tools.arguments import Parser
 
 if TYPE_CHECKING:
     from trihedron.pipeline.core.types import Camera, Map, Planes
-    from trihedron.pipeline.record.recording import Recording
+    from trihedron.pipeline.record.reader import Recording
 
 AXIS_COLORS = ((220, 50, 50), (50, 170, 50), (60, 90, 230))
 AXIS_LENGTH_PX = 60
@@ -38,7 +38,7 @@ def draw(path: str, frame: int, out: Path) -> None:
     from matplotlib import pyplot
 
     from trihedron.pipeline.core.errors import RecordingError
-    from trihedron.pipeline.record.recording import Recording
+    from trihedron.pipeline.record.reader import Recording
 
     recording = Recording(path)
     poses = list(recording.values("pose"))
@@ -91,9 +91,8 @@ def _image(recording: Recording, stamp_ns: int, camera: Camera) -> Any:
     from trihedron.datasets.readers.pixels import color_of
     from trihedron.datasets.readers.robot_values import Picture
     from trihedron.pipeline.core.errors import RecordingError
-    from trihedron.pipeline.record.recording import FrameReader
 
-    whole: Any = FrameReader(recording, "dataset").at(stamp_ns) if "dataset" in recording.topics else None
+    whole: Any = recording.value("dataset", stamp_ns) if "dataset" in recording.topics else None
     if whole is not None:
         return np.array(whole.color)
     messages = list(recording.messages("/view/image"))

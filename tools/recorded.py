@@ -10,7 +10,8 @@ import numpy as np
 from trihedron.pipeline.core.errors import DataError
 from trihedron.pipeline.core.options import frame_range
 from trihedron.pipeline.core.types import Frame, FrameReference, Map, Pose, Trajectory
-from trihedron.pipeline.record.recording import FRAMES_TOPIC, Recording
+from trihedron.pipeline.record.codec import FRAMES_TOPIC
+from trihedron.pipeline.record.reader import Recording
 from trihedron.pipeline.run.accounting import Result
 from trihedron.pipeline.run.poses import Poses
 from trihedron.pipeline.run.results import final_trajectory

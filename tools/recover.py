@@ -1,6 +1,6 @@
-"""Give a recording that was cut off, or damaged, its index again: every message that is whole is kept, with metadata and attachments.
+"""Give a recording that was cut off, or damaged, its index again: every message that is whole is copied, with metadata and attachments.
 
-Works on any MCAP file. Without --out the file itself is replaced, once the new one is complete.
+Works on any MCAP file. What never reached the disk cannot be known. Without --out the file itself is replaced, once the new one is complete.
 
 Example: trihedron recover runs/latest/run.mcap
 """
@@ -13,31 +13,37 @@ from pathlib import Path
 from typing import IO, Any
 
 from mcap.records import Attachment, Channel, Chunk, Message, Metadata, Schema
-from mcap.stream_reader import StreamReader, breakup_chunk
+from mcap.stream_reader import StreamReader
 from mcap.writer import MCAP0_MAGIC, CompressionType, Writer
 
 from trihedron.pipeline.core.errors import DataError, RecordingError
-from trihedron.pipeline.record.chunk_writer import CHUNK_BYTES, is_being_written
-from trihedron.pipeline.record.mcap_errors import DAMAGE, damaged
+from trihedron.pipeline.record.mcap_file import chunk_records, damaged, is_being_written, max_plain_bytes
 from trihedron.tools.arguments import Parser
+
+CHUNK_BYTES = 4 << 20
 
 
 @dataclass
 class Rescued:
-    """What was kept of a file, with log times in ns, and what was not: chunks that are damaged inside, bytes beyond the last record."""
+    """What was copied of a file, with log times in ns; chunks that are damaged inside; how far the file is whole, and its size in bytes."""
 
     messages: int = 0
     topics: set[str] = field(default_factory=set)
     first_ns: int = 0
     last_ns: int = 0
     damaged_chunks: int = 0
-    lost_bytes: int = 0
+    whole_bytes: int = 0
+    size: int = 0
+    ended: bool = False  # with an end mark
 
     def __str__(self) -> str:
         times = f", {self.first_ns / 1e9:.3f} to {self.last_ns / 1e9:.3f} s" if self.messages else ""
-        lost = [f"{self.damaged_chunks} damaged chunks"] if self.damaged_chunks else []
-        lost += [f"the last {self.lost_bytes} bytes"] if self.lost_bytes else []
-        return f"{self.messages} messages on {len(self.topics)} topics{times}" + (f"; lost: {', '.join(lost)}" if lost else "; nothing was lost")
+        damage = f"; skipped {self.damaged_chunks} damaged chunks" if self.damaged_chunks else ""
+        if self.ended:
+            end = "the file has its end mark"
+        else:
+            end = f"the file ends without its end mark, after {self.whole_bytes} whole bytes of {self.size}"
+        return f"copied {self.messages} messages on {len(self.topics)} topics{times}{damage}; {end}"
 
 
 def main(argv: list[str]) -> int:
@@ -77,14 +83,16 @@ def _copy(source: IO[bytes], size: int, file: IO[bytes]) -> Rescued:
     """Record after record, until one is not whole."""
     writer: Any = Writer(file, chunk_size=CHUNK_BYTES, compression=CompressionType.ZSTD)
     writer.start(library="trihedron")
-    copy, end = _Copy(writer), 0
+    copy = _Copy(writer, size)
     try:
         for record in StreamReader(source, emit_chunks=True, record_size_limit=size).records:
-            end = source.tell()
+            copy.found.whole_bytes = min(source.tell(), size)
             copy.add(record)
-        end = size
-    except DAMAGE:
-        copy.found.lost_bytes = size - end
+        copy.found.ended = True
+    except OSError:
+        raise
+    except Exception:  # whatever the package raises for damaged bytes: the file is whole up to here
+        pass
     writer.finish()
     return copy.found
 
@@ -92,21 +100,27 @@ def _copy(source: IO[bytes], size: int, file: IO[bytes]) -> Rescued:
 class _Copy:
     """Writes records again, channels and schemas under the numbers of the new file."""
 
-    def __init__(self, writer: Any) -> None:
+    def __init__(self, writer: Any, size: int) -> None:
         self._writer = writer
         self._schemas: dict[int, Schema] = {}
         self._channels: dict[int, Channel] = {}
         self._schema_ids: dict[int, int] = {0: 0}
         self._channel_ids: dict[int, int] = {}
-        self.found = Rescued()
+        self._plain_bytes = 0
+        self.found = Rescued(size=size)
 
     def add(self, record: Any) -> None:
         """Take one record; indexes, statistics and the like are made anew."""
         if isinstance(record, Chunk):
+            self._plain_bytes += record.uncompressed_size
             try:
-                for inner in breakup_chunk(record, validate_crc=True):
+                if self._plain_bytes > max_plain_bytes(self.found.size):
+                    raise ValueError("its chunks claim to hold more than they can")
+                for _, inner in chunk_records(record):
                     self.add(inner)
-            except DAMAGE:
+            except OSError:
+                raise
+            except Exception:
                 self.found.damaged_chunks += 1
         elif isinstance(record, Metadata):
             self._writer.add_metadata(record.name, record.metadata)

@@ -20,7 +20,7 @@ import numpy as np
 from trihedron.pipeline.core.errors import DataError, TrihedronError
 from trihedron.pipeline.core.geometry import transform, umeyama
 from trihedron.pipeline.core.types import F64, Trajectory
-from trihedron.pipeline.record.recording import Recording
+from trihedron.pipeline.record.reader import Recording
 from trihedron.pipeline.record.trajectories import attached_truth, read_trajectory
 from trihedron.pipeline.run.metrics import aligned_errors, associate
 from trihedron.pipeline.run.results import dotted

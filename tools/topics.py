@@ -7,13 +7,10 @@ Example: trihedron topics runs/latest/run.mcap
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
-from trihedron.pipeline.core.errors import RecordingError
+from trihedron.pipeline.core.errors import printable
 from trihedron.tools.arguments import Parser, table
 
 VALUE_SCHEMA = "trihedron.Value"
@@ -46,38 +43,31 @@ def main(argv: list[str]) -> int:
 
 def topics_of(path: Path) -> list[Topic]:
     """The topics that have messages, by name; our own values show the type they hold. Raises RecordingError."""
+    from trihedron.pipeline.record.mcap_file import McapFile, damaged
+
+    file = McapFile(path)
+    if not file.complete:
+        raise damaged(path)
     found: dict[int, Topic] = {}
-    with _opened(path) as reader:
-        for schema, channel, message in reader.iter_messages(log_time_order=False):
-            topic = found.get(channel.id)
-            if topic is None:
-                name = schema.name if schema is not None else channel.message_encoding
-                name = _value_type(message.data) if name == VALUE_SCHEMA else name
-                topic = found[channel.id] = Topic(channel.topic, name, first_ns=message.log_time, last_ns=message.log_time)
-            topic.messages += 1
-            topic.bytes += len(message.data)
-            topic.first_ns, topic.last_ns = min(topic.first_ns, message.log_time), max(topic.last_ns, message.log_time)
+    for channel, log_time, data in file.messages():
+        topic = found.get(channel)
+        if topic is None:
+            name = file.schema_name(channel) or file.channels[channel].message_encoding
+            name = _value_type(data) if name == VALUE_SCHEMA else name
+            topic = found[channel] = Topic(printable(file.channels[channel].topic, 120), printable(name, 120), first_ns=log_time, last_ns=log_time)
+        topic.messages += 1
+        topic.bytes += len(data)
+        topic.first_ns, topic.last_ns = min(topic.first_ns, log_time), max(topic.last_ns, log_time)
     return sorted(found.values(), key=lambda topic: topic.name)
-
-
-@contextmanager
-def _opened(path: Path) -> Iterator[Any]:
-    """A reader of the file; what goes wrong with the file inside the block becomes a RecordingError."""
-    from mcap.reader import SeekingReader
-
-    from trihedron.pipeline.record.mcap_errors import DAMAGE, damaged
-
-    try:
-        with open(path, "rb") as file:
-            yield SeekingReader(file, validate_crcs=True, record_size_limit=path.stat().st_size)
-    except FileNotFoundError as error:
-        raise RecordingError(str(path), f"cannot be read: {error.strerror}", "give the path of an MCAP file") from error
-    except (OSError, *DAMAGE) as error:
-        raise damaged(path) from error
 
 
 def _value_type(data: bytes) -> str:
     """The type of value in a message of ours, for example Pose."""
+    from google.protobuf.message import DecodeError
+
     from trihedron.pipeline.record.codec import ValueMessage
 
-    return f"trihedron.{ValueMessage.FromString(data).type}"
+    try:
+        return f"trihedron.{ValueMessage.FromString(data).type}"
+    except DecodeError:
+        return VALUE_SCHEMA

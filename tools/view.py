@@ -10,7 +10,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from trihedron.pipeline.core.errors import UsageError
-from trihedron.pipeline.record.recording import Recording
+from trihedron.pipeline.record.reader import Recording
 from trihedron.tools.arguments import Parser
 from trihedron.tools.export import RECORDING
 

@@ -12,8 +12,9 @@ from trihedron.pipeline.core.errors import DataError
 from trihedron.pipeline.core.options import Frames, PositiveFloat
 from trihedron.pipeline.core.registry import register
 from trihedron.pipeline.core.types import Frame, Trajectory
+from trihedron.pipeline.record.codec import METADATA
 from trihedron.pipeline.record.mcap_file import McapFile
-from trihedron.pipeline.record.recording import METADATA, FrameReader, Recording
+from trihedron.pipeline.record.reader import Recording
 from trihedron.pipeline.record.trajectories import attached_truth
 
 log = logging.getLogger("trihedron")
@@ -76,7 +77,7 @@ class _Recorded:
     def __init__(self, recording: Recording) -> None:
         if "dataset" not in recording.topics:
             raise DataError(str(recording.path), "holds no frames", "record them with record.frames=true, or use trihedron convert")
-        self._recording, self._reader = recording, FrameReader(recording, "dataset")
+        self._recording = recording
         self._stamps = [value.stamp_ns for value in recording.values("frames")]
 
     def __len__(self) -> int:
@@ -84,7 +85,7 @@ class _Recorded:
 
     def frame(self, position: int) -> Frame | None:
         """The frame at a place, as it was."""
-        value = self._reader.at(self._stamps[position])
+        value = self._recording.value("dataset", self._stamps[position])
         return replace(value, index=position) if isinstance(value, Frame) else None
 
     def truth(self) -> Trajectory | None:

@@ -206,7 +206,7 @@ def _with_recorded(words: list[str]) -> list[str]:
     source = next((word.partition("=")[2] for word in words if word.startswith("replay=")), "")
     if not source:
         return words
-    from trihedron.pipeline.record.recording import Recording
+    from trihedron.pipeline.record.reader import Recording
 
     words_then = [word for word in Recording(source).overrides() if not word.startswith(OWN)]
     for word in words_then:

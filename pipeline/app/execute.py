@@ -22,8 +22,9 @@ from trihedron.pipeline.core.errors import ConfigError, DataError, RecordingErro
 from trihedron.pipeline.core.graph import Graph
 from trihedron.pipeline.core.slots import output_of
 from trihedron.pipeline.core.types import Surface, Trajectory
-from trihedron.pipeline.record.recording import Recording, RecordingWriter
+from trihedron.pipeline.record.reader import Recording
 from trihedron.pipeline.record.trajectories import TRUTH, attached_truth, format_trajectory
+from trihedron.pipeline.record.writer import RecordingWriter
 from trihedron.pipeline.run import results
 from trihedron.pipeline.run.interrupts import Interrupts
 from trihedron.pipeline.run.live import Pace, is_camera

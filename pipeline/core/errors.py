@@ -17,8 +17,7 @@ class TrihedronError(Exception):
 
     def __init__(self, place: str, cause: str, cure: str = "") -> None:
         self.place, self.cause, self.cure = place, cause, cure
-        text = f"{place}: {cause}" + (f"; {cure}" if cure else "")
-        super().__init__("".join(c if c.isprintable() else "?" for c in text))  # one line, whatever a file is called or holds
+        super().__init__(printable(f"{place}: {cause}" + (f"; {cure}" if cure else "")))  # one line, whatever a file is called or holds
 
 
 class UsageError(TrihedronError):
@@ -49,6 +48,12 @@ class RecordingError(TrihedronError):
 
 class StageError(TrihedronError):
     """A stage failed while the pipeline ran."""
+
+
+def printable(text: str, limit: int = 4000) -> str:
+    """A text from a file as one line that may go to a terminal: what cannot be printed becomes `?`, and beyond `limit` characters it ends in `…`."""
+    shown = text if len(text) <= limit else text[: max(limit - 1, 0)] + "…"
+    return "".join(c if c.isprintable() else "?" for c in shown)
 
 
 def did_you_mean(name: str, known: Iterable[str]) -> str:

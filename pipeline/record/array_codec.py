@@ -1,13 +1,15 @@
-"""One array, text or number as `trihedron.Array {name, dtype, shape, encoding, data}` and back, bit for bit.
+"""One array, text or number as the protobuf message `trihedron.Array {name, dtype, shape, encoding, data}` and back, bit for bit.
 
 `encoding` is one of
 - raw: the elements, row by row;
 - columns: the bytes of the rows as a matrix (row, byte), transposed. The high bytes of neighbours are alike, and equal columns (of a symmetric
-  matrix, say) become equal runs, which the compression of the file's chunks finds. Not of `COPIED` fields: what is found in keypoints and segments
-  goes on into tracks and the map row by row, and stays in rows, so that it is found again;
+  matrix, say) become equal runs, which the compression of the file's chunks finds. Not for `COPIED` fields: keypoints and segments go into tracks
+  and the map row by row, and compress best as the same bytes;
 - zstd: the elements under zstd (images);
-- rows: an image of three channels under zstd, its first row and then what each adds to the one above, modulo 256. A PNG that is as large takes five
-  times as long.
+- rows: an image of three channels under zstd, its first row and then the difference of each row to the one above, modulo 256. A PNG of the same
+  size takes five times as long.
+
+Fields are written as bytes directly: filling objects of the protobuf library and serialising them copies every array twice.
 """
 
 from __future__ import annotations
@@ -25,27 +27,68 @@ import numpy as np
 import zstandard
 from numpy.typing import NDArray
 
-from trihedron.pipeline.core.errors import RecordingError
-from trihedron.pipeline.record.mcap_chunks import MAX_RATIO
-from trihedron.pipeline.record.wire_format import bytes_field, head, varint
+from trihedron.pipeline.core.errors import RecordingError, printable
+from trihedron.pipeline.record.mcap_file import max_plain_bytes
 
 ENCODINGS = ("raw", "columns", "zstd", "rows")
 MAX_BYTES = 1 << 30  # of one decoded array
+MAX_AXES = 8
 DAMAGED = "the file is damaged; record it again"
-TRANSPOSED_BYTES = 1536  # smaller arrays are left as they are: of a frame's recording they would spare half a percent
-COPIED = {"points_m", "sigma_m", "endpoints_m"}  # in float32; what is worked out of them is not
+TRANSPOSED_BYTES = 1536  # smaller arrays are left as they are: transposing them would spare half a percent of a recording
+COPIED = {"points_m", "sigma_m", "endpoints_m"}  # in float32
 SCALARS: dict[str, type[Any]] = {"bool": bool, "int": int, "float": float}
+
+# Fields of protobuf messages, as the library would write them.
+
+_VARINT, _LENGTH = 0, 2  # types of a field on the wire
+_SHORT = [bytes((number,)) for number in range(0x80)]
+_TAGS = [bytes((field << 3 | _LENGTH,)) for field in range(16)]  # of what a length stands before
+
+
+def varint(number: int) -> bytes:
+    """Seven bits a byte, the lowest first; a negative number as the one of 64 bits that has its bits."""
+    if 0 <= number < 0x80:
+        return _SHORT[number]
+    if 0 < number < 0x4000:
+        return bytes((number & 0x7F | 0x80, number >> 7))
+    number &= (1 << 64) - 1
+    digits = bytearray()
+    while number > 0x7F:
+        digits.append(number & 0x7F | 0x80)
+        number >>= 7
+    digits.append(number)
+    return bytes(digits)
+
+
+def number_field(field: int, number: int) -> bytes:
+    """An int32, int64 or enum; nothing for 0."""
+    return varint(field << 3 | _VARINT) + varint(number) if number else b""
+
+
+def head(field: int, size: int) -> bytes:
+    """What stands before the `size` bytes of a text, of bytes, of a message or of packed numbers, in one of the fields 1..15."""
+    return _TAGS[field] + varint(size)
+
+
+def bytes_field(field: int, content: bytes) -> bytes:
+    """A text or bytes; nothing for empty ones."""
+    return head(field, len(content)) + content if content else b""
+
+
+# Arrays, texts and numbers.
 
 
 def array_parts(name: str, item: Any) -> tuple[bytes, Any]:
-    """An array as a field of `trihedron.Value`: what stands before its data, and these."""
+    """Encode an array as a field of `trihedron.Value`: the bytes before its data, and the data."""
     array = np.ascontiguousarray(item)
-    head, turned = plain_head(name, array.dtype, array.shape)
-    return head, _turned(array) if turned else array
+    before, transposed = _plain_head(name, array.dtype, array.shape)
+    if transposed:
+        return before, cv2.transpose(array.view(np.uint8).reshape(len(array), -1)).data
+    return before, array
 
 
 def image_parts(name: str, item: Any) -> tuple[bytes, Any]:
-    """The same of an image, whose first axes are height and width."""
+    """Encode an image, whose first axes are height and width, likewise."""
     array = np.ascontiguousarray(item)
     if not array.size:
         return array_parts(name, array)
@@ -56,13 +99,13 @@ def image_parts(name: str, item: Any) -> tuple[bytes, Any]:
 
 @lru_cache(256)
 def text_field(name: str, text: str) -> bytes:
-    """A text as a field; most are said again and again."""
+    """Encode a text as a field; most repeat."""
     data = text.encode()
     return _head(name, "str", (), "", len(data)) + data
 
 
 class Numbers:
-    """Truth values and numbers, each a field: what stands before it never changes, so that all of them are packed at once."""
+    """Truth values and numbers, each a field: the bytes before each never change, so that all of them are packed at once."""
 
     def __init__(self, kinds: Mapping[str, type[Any]]) -> None:
         """`kinds` is of SCALARS, by name."""
@@ -72,35 +115,19 @@ class Numbers:
         self._struct = struct.Struct("<" + "".join(f"{len(head)}s{code}" for head, code in zip(heads, codes)))
 
     def fields(self, numbers: Sequence[Any]) -> bytes:
-        """Of as many numbers."""
+        """Encode as many numbers."""
         filled = self._blank.copy()
         filled[1::2] = numbers
         return self._struct.pack(*filled)
 
 
 @lru_cache(4096)
-def plain_head(name: str, dtype: np.dtype[Any], shape: tuple[int, ...]) -> tuple[bytes, bool]:
-    """What stands before the data of an array that is no image, and whether the bytes of its rows are transposed; most arrays of a run are as large
-    as one before."""
+def _plain_head(name: str, dtype: np.dtype[Any], shape: tuple[int, ...]) -> tuple[bytes, bool]:
+    """The bytes before the data of an array that is no image, and whether the bytes of its rows are transposed."""
     size = dtype.itemsize * math.prod(shape)
     copied = dtype.itemsize == 4 and name.rpartition("#")[2] in COPIED
-    turned = size >= TRANSPOSED_BYTES and dtype.itemsize > 1 and not copied
-    return _head(name, _type_name(dtype), shape, "columns" if turned else "raw", size), turned
-
-
-def _turned(array: NDArray[Any]) -> Any:
-    """The bytes of rows that lie one after another, transposed."""
-    out = np.empty(array.nbytes, np.uint8)
-    row_kernels().turn(array.__array_interface__["data"][0], len(array), array.nbytes // len(array), out)
-    return out.data
-
-
-@cache
-def row_kernels() -> Any:
-    """What goes through rows; not before it is needed: a command's help need not wait for numba."""
-    from trihedron.pipeline.record import row_kernels
-
-    return row_kernels
+    transposed = size >= TRANSPOSED_BYTES and dtype.itemsize > 1 and not copied
+    return _head(name, _type_name(dtype), shape, "columns" if transposed else "raw", size), transposed
 
 
 def _head(name: str, dtype: str, shape: tuple[int, ...], encoding: str, size: int) -> bytes:
@@ -122,37 +149,37 @@ def _type_name(dtype: np.dtype[Any]) -> str:
 
 
 _CODES: dict[type[Any], str] = {bool: "?", int: "q", float: "d"}  # of `struct`
-_kept = threading.local()
+_of_thread = threading.local()
 
 
 def _compressor() -> Any:
-    """One of this thread, which keeps its tables."""
-    if not hasattr(_kept, "compressor"):
-        _kept.compressor = zstandard.ZstdCompressor(level=1)
-    return _kept.compressor
+    """The compressor of this thread."""
+    if not hasattr(_of_thread, "compressor"):
+        _of_thread.compressor = zstandard.ZstdCompressor(level=1)
+    return _of_thread.compressor
 
 
 def get_array(array: Any, place: str) -> Any:
-    """The content of one protobuf Array. Raises RecordingError, beginning with `place`, unless its bytes match its declared shape."""
+    """Decode one protobuf Array. Raises RecordingError, beginning with `place`, unless its bytes match its declared shape."""
     if array.dtype == "str":
         return array.data.decode("utf-8", "replace")
     dtype = element_type({"bool": "?", "int": "i8", "float": "f8"}.get(array.dtype, array.dtype))
     shape = tuple(array.shape)
     size = int(np.prod([float(n) for n in shape])) * dtype.itemsize if shape else dtype.itemsize
-    if dtype.hasobject or any(n < 0 for n in shape) or size > MAX_BYTES or (shape and array.dtype in SCALARS):
-        raise RecordingError(place, f"array '{array.name}' claims type {array.dtype!r} and shape {shape}", DAMAGED)
+    if dtype.hasobject or len(shape) > MAX_AXES or any(n < 0 for n in shape) or size > MAX_BYTES or (shape and array.dtype in SCALARS):
+        raise RecordingError(place, f"array '{printable(array.name, 60)}' claims type '{printable(array.dtype, 20)}' and shape {shape[:4]}", DAMAGED)
     if array.encoding not in ENCODINGS:
-        cause = f"array '{array.name}' has the encoding '{array.encoding[:40]}', this program reads {', '.join(ENCODINGS)}"
+        cause = f"array '{printable(array.name, 60)}' has the encoding '{printable(array.encoding, 40)}', this program reads {', '.join(ENCODINGS)}"
         raise RecordingError(place, cause, "read it with the version that wrote it")
     data = _plain(array, shape, size)
     if data is None or len(data) != size:
-        raise RecordingError(place, f"array '{array.name}' does not have the {size} bytes of its shape {shape}", DAMAGED)
+        raise RecordingError(place, f"array '{printable(array.name, 60)}' does not have the {size} bytes of its shape {shape}", DAMAGED)
     content = np.frombuffer(data, dtype).reshape(shape)
     return SCALARS[array.dtype](content[()]) if array.dtype in SCALARS else content
 
 
 def element_type(name: str) -> np.dtype[Any]:
-    """The type of that name, `object` for any but numbers and truth values: NumPy would read more into a text."""
+    """The type of that name, `object` for any but numbers and truth values."""
     return np.dtype(name if re.fullmatch(r"\?|b1|[iu][1248]|f[248]", name) else object)
 
 
@@ -178,9 +205,9 @@ def _row_steps(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
 
 
 def _unpacked(data: bytes, size: int) -> bytes | None:
-    """The bytes under zstd, None unless they are as many; nothing is allocated for a claim that is not so."""
+    """The bytes under zstd, None unless they are as many."""
     try:
-        possible = zstandard.frame_content_size(data) == size <= MAX_RATIO["zstd"] * len(data)
+        possible = zstandard.frame_content_size(data) == size <= max_plain_bytes(len(data))
         return bytes(zstandard.ZstdDecompressor().decompress(data)) if possible else None
     except zstandard.ZstdError:
         return None

@@ -20,12 +20,27 @@ from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
 
 from trihedron.pipeline.core import types
 from trihedron.pipeline.core.arrays import array_specs
-from trihedron.pipeline.core.errors import RecordingError
+from trihedron.pipeline.core.errors import RecordingError, printable
 from trihedron.pipeline.core.table import Table
 from trihedron.pipeline.core.types import Value
-from trihedron.pipeline.record.array_codec import DAMAGED, SCALARS, Numbers, array_parts, get_array, image_parts, text_field
+from trihedron.pipeline.record.array_codec import (
+    DAMAGED,
+    SCALARS,
+    Numbers,
+    array_parts,
+    bytes_field,
+    get_array,
+    image_parts,
+    number_field,
+    text_field,
+)
 from trihedron.pipeline.record.table_codec import TableReader, TableWriter, change_of, joined, messages_back
-from trihedron.pipeline.record.wire_format import bytes_field, number_field
+
+FORMAT = "4"
+READABLE = ("3", FORMAT)  # 3: a table was always a change of the message before
+METADATA = "trihedron"  # the name of the metadata record
+FRAMES_TOPIC = "frames"  # one FrameReference a frame: what a replay iterates over
+TIMING_TOPIC = "/timing"
 
 _TYPES: dict[str, type[Value]] = {
     name: kind for name, kind in vars(types).items() if isinstance(kind, type) and issubclass(kind, Value) and kind is not Value
@@ -158,7 +173,7 @@ class Decoder:
             raise RecordingError(self.place, "holds a message that is not a trihedron.Value", DAMAGED) from error
         kind = _TYPES.get(message.type)
         if kind is None:
-            raise RecordingError(self.place, f"holds the unknown type '{message.type}'", "read it with the version that wrote it")
+            raise RecordingError(self.place, f"holds the unknown type '{printable(message.type, 60)}'", "read it with the version that wrote it")
         if kind.version != message.version:
             cause = f"holds {message.type} version {message.version}, this program reads version {kind.version}{_other_fields(message, kind)}"
             raise RecordingError(self.place, cause, "record again, or read it with the version that wrote it")
@@ -179,8 +194,9 @@ class Decoder:
         try:
             made = {name: table(name, tables) for name in _layout(kind).tables}
             value = _make(kind, {**arrays, **made, "index": message.index, "stamp_ns": message.stamp_ns}, "")
-        except (KeyError, ValueError, TypeError, IndexError) as error:
-            raise RecordingError(self.place, f"frame {message.index}: {message.type} does not fit: {error}", DAMAGED) from error
+        except Exception as error:  # a stranger's file: its schema is JSON of any kind
+            cause = printable(f"frame {message.index}: {message.type} does not fit: {error}", 200)
+            raise RecordingError(self.place, cause, DAMAGED) from error
         assert isinstance(value, Value)
         return value
 

@@ -1,158 +1,174 @@
-"""The records of an MCAP file, in the order they stand in it: chunks are put together and packed at once, since a run closes one of some hundred
-messages twice a second."""
+"""Write an MCAP file that a kill costs less than a second of.
+
+Messages are handed over as functions; a thread of the writer calls them, and foxglove-sdk packs what they return. It ends a chunk at `CHUNK_BYTES`,
+and whatever there is every `FLUSH_SECONDS`, so that encoding, compression and the disk wait beside the run. `trihedron recover` gives a file that
+was cut off its index.
+"""
 
 from __future__ import annotations
 
-import struct
-from collections import Counter
-from collections.abc import Sequence
-from typing import Any
+import logging
+import os
+import threading
+from collections import deque
+from collections.abc import Callable, Iterable
+from pathlib import Path
 
-import zstandard
-from mcap.data_stream import RecordBuilder
-from mcap.opcode import Opcode
-from mcap.records import (
-    Attachment,
-    AttachmentIndex,
-    Channel,
-    ChunkIndex,
-    DataEnd,
-    Footer,
-    Header,
-    McapRecord,
-    Metadata,
-    MetadataIndex,
-    Schema,
-    Statistics,
-    SummaryOffset,
-)
-from mcap.writer import MCAP0_MAGIC
-from zlib_ng import zlib_ng
+import foxglove
+from foxglove.mcap import MCAPWriteOptions
 
-WINDOW_LOG = 22  # a whole chunk is searched for repeats
-QUICK = {"level": -3, "hash_log": 15}  # of zstd: numbers that repeat nothing stay as they are; the table leaves the cache of a processor to the run
-THOROUGH = {"level": 2, "hash_log": 17, "min_match": 5, "target_length": 1}  # twice the time for a tenth less bytes
-LARGE_BYTES = 200_000  # a frame: where as much comes, as on a walk where all is new, it is packed thoroughly
-ZSTD = b"zstd"
-_MESSAGE = struct.Struct("<BQHIQQ")  # opcode, length, channel, sequence, log time, publish time
-_CHUNK = struct.Struct(f"<BQQQQII{len(ZSTD)}sQ")  # opcode, length, first and last time, plain size, CRC, length of the name, name, packed size
-_INDEX = struct.Struct("<BQHI")  # opcode, length, channel, bytes of its entries
-_RECORD_HEAD = 9  # bytes of opcode and length
+from trihedron.pipeline.core.errors import RecordingError
+from trihedron.pipeline.record.mcap_file import is_being_written
 
-
-def _compressor(level: int, **options: int) -> Any:
-    return zstandard.ZstdCompressor(compression_params=zstandard.ZstdCompressionParameters.from_level(level, window_log=WINDOW_LOG, **options))
+log = logging.getLogger("trihedron")
+Messages = Iterable[tuple[int, int, bytes]]  # channel, log time in ns, content
+CHUNK_BYTES = 4 << 20  # an entry of the index is worth more messages
+FLUSH_SECONDS = 0.4
+LEVEL = 2  # of zstd
+MESSAGE_OVERHEAD = 64  # bytes of a message beside its data, generously
+MAX_QUEUE_BYTES = 64 << 20  # a run that is faster than the disk waits from there on
 
 
 class McapWriter:
-    """Writes to `file`, which has `write` and `tell`. Raises what these raise."""
+    """One file. Once the disk refuses it, a warning reports that, what follows is dropped, so that the run can go on, and `close` raises
+    RecordingError."""
 
-    def __init__(self, file: Any) -> None:
-        self._file = file
-        self._schemas: list[Schema] = []
-        self._channels: list[Channel] = []
-        self._undeclared: list[McapRecord] = []  # schemas and channels that the next chunk begins with
-        self._chunks = bytearray()  # their records in the summary: as objects those of a long run would be ten times as large
-        self._chunk_count = 0
-        self._times: tuple[int, ...] = ()  # of the first message and of the last
-        self._metadata: list[MetadataIndex] = []
-        self._attachments: list[AttachmentIndex] = []
-        self._counts: Counter[int] = Counter()
-        self._quick, self._thorough = _compressor(**QUICK), _compressor(**THOROUGH)
+    def __init__(self, path: Path) -> None:
+        """Raises RecordingError when the file cannot be written or another process is writing it."""
+        self.path = path
+        self._file = _File(path)
+        self._context = foxglove.Context()
+        options = MCAPWriteOptions(chunk_size=CHUNK_BYTES, compression_level=LEVEL, compression_threads=0, disable_seeking=True)
+        self._writer = foxglove.open_mcap(self._file, context=self._context, writer_options=options)
+        self._channels: list[foxglove.Channel] = []
+        self._queue: deque[tuple[int, Callable[[], Messages]]] = deque()
+        self._queued_bytes, self._taken_bytes = 0, 0  # each is written by one thread alone, so that queueing a message takes no lock
+        self._closing = False
+        self._mistake: BaseException | None = None  # of a queued function
+        self._enough, self._room, self._writing = threading.Event(), threading.Event(), threading.Lock()
+        self._thread = threading.Thread(target=self._work, name=f"writer of {path.name}", daemon=True)
+        self._thread.start()
 
-    def start(self, library: str) -> None:
-        """The beginning of the file."""
-        self._file.write(MCAP0_MAGIC + _bytes_of(Header("", library)))
+    @property
+    def failure(self) -> OSError | None:
+        """Why the disk refused the file, or None."""
+        return self._file.failure
 
     def metadata(self, name: str, content: dict[str, str]) -> None:
-        """A metadata record."""
-        at, data = self._file.tell(), _bytes_of(Metadata(name, content))
-        self._file.write(data)
-        self._metadata.append(MetadataIndex(at, len(data), name))
+        """Add a metadata record."""
+        with self._writing:
+            self._writer.write_metadata(name, content)
 
-    def attachment(self, name: str, media_type: str, content: bytes) -> None:
-        """An attachment without times."""
-        at, data = self._file.tell(), _bytes_of(Attachment(0, 0, name, media_type, content))
-        self._file.write(data)
-        self._attachments.append(AttachmentIndex(at, len(data), 0, 0, len(content), name, media_type))
+    def attach(self, name: str, text: str) -> None:
+        """Add a text file."""
+        with self._writing:
+            self._writer.attach(log_time=0, create_time=0, name=name, media_type="text/plain", data=text.encode())
 
     def channel(self, topic: str, schema: str, encoding: str, definition: bytes, message_encoding: str) -> int:
-        """Declare a channel with a schema of its own, in the next chunk; returns its number."""
-        number = len(self._channels) + 1
-        self._schemas.append(Schema(number, definition, encoding, schema))
-        self._channels.append(Channel(number, topic, message_encoding, {}, number))
-        self._undeclared += [self._schemas[-1], self._channels[-1]]
-        return number
+        """Declare a channel; returns its number. For the queued functions to call: no other thread writes then."""
+        described = foxglove.Schema(name=schema, encoding=encoding, data=definition)
+        self._channels.append(foxglove.Channel(topic, schema=described, message_encoding=message_encoding, context=self._context))
+        return len(self._channels) - 1
 
-    def chunk(self, messages: Sequence[tuple[int, int, bytes]]) -> None:
-        """A chunk of these messages (channel, log time in ns, content), at least one, and its index."""
-        parts, at = [_bytes_of(*self._undeclared)], 0
-        at += len(parts[0])
-        entries: dict[int, list[int]] = {}
-        for channel, stamp_ns, data in messages:
-            entries.setdefault(channel, []).extend((stamp_ns, at))
-            head = _MESSAGE.pack(Opcode.MESSAGE, _MESSAGE.size - _RECORD_HEAD + len(data), channel, 0, stamp_ns, stamp_ns)
-            parts += (head, data)
-            at += _MESSAGE.size + len(data)
-        plain = b"".join(parts)
-        stamps = {stamp_ns for _, stamp_ns, _ in messages}
-        packed = (self._thorough if len(plain) > LARGE_BYTES * len(stamps) else self._quick).compress(plain)
-        times = min(stamps), max(stamps)
-        length = _CHUNK.size - _RECORD_HEAD + len(packed)
-        head = _CHUNK.pack(Opcode.CHUNK, length, *times, len(plain), zlib_ng.crc32(plain), len(ZSTD), ZSTD, len(packed))
-        begin, size = self._file.tell(), _RECORD_HEAD + length
-        indexes, offsets = [], {}
-        end = begin + size
-        for channel, pairs in entries.items():
-            offsets[channel] = end
-            indexes.append(_INDEX.pack(Opcode.MESSAGE_INDEX, 6 + 8 * len(pairs), channel, 8 * len(pairs)) + struct.pack(f"<{len(pairs)}Q", *pairs))
-            end += len(indexes[-1])
-            self._counts[channel] += len(pairs) // 2
-        self._file.write(b"".join([head, packed, *indexes]))
-        self._undeclared = []
-        self._chunks += _bytes_of(ChunkIndex(size, begin, ZSTD.decode(), len(packed), times[1], end - begin - size, offsets, times[0], len(plain)))
-        self._chunk_count += 1
-        self._times = min(*self._times, *times), max(*self._times, *times)
+    def add(self, size: int, make: Callable[[], Messages]) -> None:
+        """Queue a function that makes messages, and the approximate bytes of memory that it holds. The writer's thread calls it, in the order of the
+        calls; what it raises is raised by the next call, or by `close`, and ends the file there."""
+        if self._mistake is not None:
+            raise self._mistake
+        self._queued_bytes += size + MESSAGE_OVERHEAD
+        self._queue.append((size + MESSAGE_OVERHEAD, make))
+        if self._queued_bytes - self._taken_bytes > CHUNK_BYTES:
+            self._enough.set()
+            self._room.clear()
+            while self._queued_bytes - self._taken_bytes > MAX_QUEUE_BYTES:
+                self._room.wait(FLUSH_SECONDS)
+                self._room.clear()
 
-    def finish(self) -> None:
-        """The summary and the end mark."""
-        self._file.write(_bytes_of(DataEnd(0)))
-        begin, at = self._file.tell(), 0
-        groups: list[tuple[int, bytes | bytearray]] = [
-            (Opcode.SCHEMA, _bytes_of(*self._schemas)),
-            (Opcode.CHANNEL, _bytes_of(*self._channels)),
-            (Opcode.STATISTICS, _bytes_of(self._statistics())),
-            (Opcode.CHUNK_INDEX, self._chunks),
-            (Opcode.ATTACHMENT_INDEX, _bytes_of(*self._attachments)),
-            (Opcode.METADATA_INDEX, _bytes_of(*self._metadata)),
-        ]
-        offsets = []
-        for opcode, records in groups:
-            if records:
-                offsets.append(SummaryOffset(opcode, begin + at, len(records)))
-                at += len(records)
-        summary = b"".join(records for _, records in groups) + _bytes_of(*offsets)
-        footer = _bytes_of(Footer(begin, begin + at, 0))
-        crc = zlib_ng.crc32(footer[:-4], zlib_ng.crc32(summary))
-        self._file.write(summary + footer[:-4] + struct.pack("<I", crc) + MCAP0_MAGIC)
+    def close(self) -> None:
+        """Write what is queued, and the index; the file is complete only then. Raises RecordingError when that, or anything before, failed."""
+        if self._closing:
+            return
+        self._closing = True
+        self._enough.set()
+        self._thread.join()
+        self._writer.close()
+        for channel in self._channels:
+            channel.close()
+        self._file.close()
+        if self._mistake is not None:
+            raise self._mistake
+        if self.failure is not None:
+            cure = f"what was written before is kept; index it with: trihedron recover {self.path}"
+            raise RecordingError(str(self.path), f"cannot be written: {self.failure.strerror}", cure) from self.failure
 
-    def _statistics(self) -> Statistics:
-        return Statistics(
-            attachment_count=len(self._attachments),
-            channel_count=len(self._channels),
-            channel_message_counts=dict(self._counts),
-            chunk_count=self._chunk_count,
-            message_count=self._counts.total(),
-            message_end_time=max(self._times, default=0),
-            message_start_time=min(self._times, default=0),
-            metadata_count=len(self._metadata),
-            schema_count=len(self._schemas),
-        )
+    def _work(self) -> None:
+        closing = False
+        while not closing:
+            self._enough.wait(FLUSH_SECONDS)
+            self._enough.clear()
+            closing = self._closing
+            if self._queue:
+                with self._writing:
+                    for _ in range(len(self._queue)):
+                        self._take()
+                    self._writer.flush()
+                self._file.sync()
+            self._room.set()
+
+    def _take(self) -> None:
+        """Write the messages of the oldest queued function."""
+        size, make = self._queue.popleft()
+        if self._mistake is None and self.failure is None:
+            try:
+                for channel, log_time, data in list(make()):
+                    self._channels[channel].log(data, log_time=log_time)
+            except Exception as error:
+                self._mistake = error
+        self._taken_bytes += size
+        if not self._room.is_set():
+            self._room.set()
 
 
-def _bytes_of(*records: McapRecord) -> bytes:
-    builder = RecordBuilder()
-    for record in records:
-        record.write(builder)
-    end: Any = builder.end
-    return bytes(end())
+class _File:
+    """The file for foxglove-sdk, which only appends: without a buffer, so that a killed process cannot lose what `write` returned from. The first
+    error of the disk is kept in `failure`, and everything later dropped."""
+
+    def __init__(self, path: Path) -> None:
+        """Empty the file and lock it for this process. Raises RecordingError."""
+        self.path, self._position = path, 0
+        self.failure: OSError | None = None
+        try:
+            self._descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o666)
+        except OSError as error:
+            raise RecordingError(str(path), f"cannot be written: {error.strerror}", "give another out=FOLDER") from error
+        if is_being_written(self._descriptor):
+            os.close(self._descriptor)
+            raise RecordingError(str(path), "is being written by another process", "wait until that has ended, or give another out=FOLDER")
+        if os.fstat(self._descriptor).st_size:  # a device has no size, and refuses
+            os.ftruncate(self._descriptor, 0)
+
+    def write(self, data: bytes | bytearray) -> int:
+        rest = memoryview(data)
+        try:
+            while rest and self.failure is None:
+                rest = rest[os.write(self._descriptor, rest) :]
+        except OSError as error:
+            self.failure = error
+            log.warning("%s: cannot be written: %s; the rest is done without it", self.path, error.strerror)
+        self._position += len(data)
+        return len(data)
+
+    def seek(self, offset: int, whence: int = os.SEEK_SET) -> int:
+        """Return the position, the only one there is."""
+        return self._position
+
+    def flush(self) -> None:
+        """Do nothing: there is no buffer."""
+
+    def sync(self) -> None:
+        """Wait until the disk has what was written."""
+        if self.failure is None and os.fstat(self._descriptor).st_size:
+            os.fdatasync(self._descriptor)
+
+    def close(self) -> None:
+        os.close(self._descriptor)

@@ -38,7 +38,6 @@ LISTED = Path(__file__).with_name("kernels.json")
 FEW = 3  # kernels, which the run compiles itself as it comes to them
 MOST = 8  # processes; one alone comes to 1.1 GB, several divide what is to be compiled
 ROW = 2  # bytes of a row's number
-RECORDING = "trihedron.pipeline.record.row_kernels:"
 LOOK_S = 0.2  # between two looks of a call that waits, whether a Ctrl-C came
 ARRAY = re.compile(r"(readonly )?(\w+)(?:\[(\d+)([CFA])\])?")
 
@@ -136,7 +135,7 @@ def kernel_of(kernel: str, arguments: list[Any]) -> tuple[Any, tuple[Kind, ...]]
 
 def used_by(objects: Iterable[Any]) -> set[str]:
     """The project's modules that these objects' modules take something from, and so on."""
-    found = {"trihedron.pipeline.core.gathering", "trihedron.pipeline.record.row_kernels"}
+    found: set[str] = set()
     pending = {type(item).__module__ for item in objects}
     while pending:
         found |= pending
@@ -243,7 +242,7 @@ def listed(called: Called) -> list[list[Any]]:
     """Kernels as `kernels.json` holds them: [module:name, [argument, ...]]; those of the project whose arguments have a word: what the
     recording begins with, then the longest first."""
     found = []
-    for (kernel, arguments), _ in sorted(called.kernels.items(), key=lambda one: (not one[0][0].startswith(RECORDING), -one[1])):
+    for (kernel, arguments), _ in sorted(called.kernels.items(), key=lambda one: -one[1]):
         if kernel.startswith("trihedron."):
             try:
                 found.append([kernel, [word_of(argument) for argument in arguments]])

@@ -19,7 +19,8 @@ import numpy as np
 from trihedron.pipeline.core.errors import RecordingError
 from trihedron.pipeline.core.slots import ChecksLoadedMap
 from trihedron.pipeline.core.types import LOST, Map, Pose, Rotation, Value
-from trihedron.pipeline.record.recording import Recording, RecordingWriter
+from trihedron.pipeline.record.reader import Recording
+from trihedron.pipeline.record.writer import RecordingWriter
 from trihedron.pipeline.run.state import DelayLines, StateBuffer
 
 MAP_VERSION = "1"

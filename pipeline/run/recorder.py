@@ -7,8 +7,9 @@ from typing import Any
 
 from trihedron.pipeline.core.graph import Graph
 from trihedron.pipeline.core.types import Frame, FrameReference, Trajectory, Value
+from trihedron.pipeline.record.codec import FRAMES_TOPIC
 from trihedron.pipeline.record.foxglove import View
-from trihedron.pipeline.record.recording import FRAMES_TOPIC, RecordingWriter
+from trihedron.pipeline.record.writer import RecordingWriter
 from trihedron.pipeline.run.accounting import FrameTimes
 from trihedron.pipeline.run.replay import Plan
 from trihedron.pipeline.run.timing import resident_mb

@@ -20,7 +20,8 @@ from trihedron.pipeline.core.options import frame_range
 from trihedron.pipeline.core.slots import CAMERA, SLOTS
 from trihedron.pipeline.core.types import FrameReference, Value
 from trihedron.pipeline.core.wires import Wire
-from trihedron.pipeline.record.recording import FRAMES_TOPIC, Recording, TopicReader
+from trihedron.pipeline.record.codec import FRAMES_TOPIC
+from trihedron.pipeline.record.reader import Recording, TopicReader
 from trihedron.pipeline.run.live import is_camera
 
 RECORDED = "recorded:"  # prefix of the node that reads a topic from the file

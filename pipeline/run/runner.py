@@ -21,7 +21,8 @@ from trihedron.pipeline.core.registry import check_value
 from trihedron.pipeline.core.slots import CAMERA, RNG
 from trihedron.pipeline.core.types import Map, Trajectory, Value
 from trihedron.pipeline.core.wires import Wire
-from trihedron.pipeline.record.recording import RecordingWriter, TopicReader
+from trihedron.pipeline.record.reader import TopicReader
+from trihedron.pipeline.record.writer import RecordingWriter
 from trihedron.pipeline.run.accounting import Accounting
 from trihedron.pipeline.run.frame_validation import FrameValidation
 from trihedron.pipeline.run.interrupts import Interrupts

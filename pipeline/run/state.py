@@ -9,7 +9,8 @@ from typing import Any
 from trihedron.pipeline.core.graph import Stage
 from trihedron.pipeline.core.types import Value
 from trihedron.pipeline.core.wires import PREVIOUS
-from trihedron.pipeline.record.recording import FRAMES_TOPIC, Recording, TopicReader
+from trihedron.pipeline.record.codec import FRAMES_TOPIC
+from trihedron.pipeline.record.reader import Recording, TopicReader
 
 
 @dataclass(frozen=True)

@@ -26,8 +26,8 @@ from mcap.writer import CompressionType
 from trihedron.datasets.readers import foxglove_messages
 from trihedron.datasets.readers.robot_streams import ROS
 from trihedron.pipeline.core.geometry import exp_se3, quaternion_from_rotation
-from trihedron.pipeline.record.recording import RecordingWriter
 from trihedron.pipeline.record.trajectories import TRUTH
+from trihedron.pipeline.record.writer import RecordingWriter
 from trihedron.pipeline.run.ply import write_ply
 from trihedron.pipeline.run.runner import Runner
 from trihedron.plugins.mapping.landmarks import empty_map

@@ -21,9 +21,9 @@ from trihedron.datasets.readers.replica import read_parameters
 from trihedron.datasets.readers.robot_streams import ROS
 from trihedron.datasets.readers.robot_values import Picture, UnreadableMessage
 from trihedron.pipeline.core.errors import TrihedronError
-from trihedron.pipeline.record.codec import Decoder
+from trihedron.pipeline.record.codec import METADATA, Decoder
 from trihedron.pipeline.record.mcap_file import McapFile
-from trihedron.pipeline.record.recording import METADATA, Recording
+from trihedron.pipeline.record.reader import Recording
 from trihedron.pipeline.record.trajectories import read_trajectory
 from trihedron.pipeline.run.map_file import load_map
 from trihedron.plugins.map.covisibility import Covisibility

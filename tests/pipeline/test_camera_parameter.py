@@ -11,7 +11,8 @@ from trihedron.pipeline.app.cli import main
 from trihedron.pipeline.core.config import composed, graph_of
 from trihedron.pipeline.core.errors import DataError
 from trihedron.pipeline.core.types import Camera, Keypoints, Pose, Rotation
-from trihedron.pipeline.record.recording import Recording, RecordingWriter
+from trihedron.pipeline.record.reader import Recording
+from trihedron.pipeline.record.writer import RecordingWriter
 from trihedron.pipeline.run.replay import TOPICS, Replay
 from trihedron.pipeline.run.runner import Runner
 

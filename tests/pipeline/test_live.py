@@ -10,7 +10,8 @@ import pytest
 
 from trihedron.pipeline.app.cli import main
 from trihedron.pipeline.core.types import Frame, Keypoints, Map, Pose, Rotation
-from trihedron.pipeline.record.recording import Recording, RecordingWriter
+from trihedron.pipeline.record.reader import Recording
+from trihedron.pipeline.record.writer import RecordingWriter
 from trihedron.pipeline.run.live import Arrival, Pace, Playback
 from trihedron.pipeline.run.replay import Replay
 from trihedron.pipeline.run.runner import Runner

@@ -20,10 +20,11 @@ from trihedron.pipeline.core.errors import RecordingError
 from trihedron.pipeline.core.geometry import exp_se3, exp_so3, rotation_from_quaternion
 from trihedron.pipeline.core.table import Column, Table
 from trihedron.pipeline.core.types import FrameReference, ManhattanFrame, Map, Planes, Pose, Segments, Surface, Trajectory
-from trihedron.pipeline.record import chunk_writer as module
+from trihedron.pipeline.record import mcap_writer as module
 from trihedron.pipeline.record.foxglove import View
 from trihedron.pipeline.record.foxglove_messages import MOST_VERTICES
-from trihedron.pipeline.record.recording import FrameReader, Recording, RecordingWriter, TopicReader
+from trihedron.pipeline.record.reader import Recording, TopicReader
+from trihedron.pipeline.record.writer import RecordingWriter
 
 sys.path.insert(0, str(Path(__file__).parent))
 from toys import CAMERA, ToyDataset, ToyKeypoints
@@ -59,9 +60,9 @@ def test_chunks_close_by_size_and_by_time(tmp_path, monkeypatch):
     assert len(chunks(write(tmp_path / "few.mcap", range(4)))) == 1
     monkeypatch.setattr(module, "CHUNK_BYTES", 5_000)
     many = chunks(write(tmp_path / "size.mcap", [i for _ in range(4) for i in range(38) if i % 5 != 4]))
-    assert len(many) > 5 and max(c.uncompressed_size for c in many[1:]) < 5_000  # the first has the schemas, too
+    assert len(many) > 5 and max(c.uncompressed_size for c in many[1:]) < 10_000  # closed by the message that exceeds it; the first has the schemas
     monkeypatch.setattr(module, "CHUNK_BYTES", 1 << 20)
-    monkeypatch.setattr(module, "CHUNK_SECONDS", 0.01)
+    monkeypatch.setattr(module, "FLUSH_SECONDS", 0.01)
     writer = RecordingWriter(tmp_path / "time.mcap", {})
     for i in (0, 1, 2):
         writer.write("keypoints", keypoints(i))
@@ -84,7 +85,7 @@ def test_what_cannot_be_encoded_or_shown_is_said_and_what_came_before_is_kept(tm
     writer.write("keypoints", keypoints(0))
     writer.show(Broken(), keypoints(1), 1000)
     writer.write("keypoints", keypoints(2))
-    time.sleep(2.5 * module.CHUNK_SECONDS)
+    time.sleep(2.5 * module.FLUSH_SECONDS)
     with pytest.raises(ZeroDivisionError, match="frame 1"):
         writer.write("keypoints", keypoints(3))
     with pytest.raises(ZeroDivisionError, match="frame 1"):
@@ -93,13 +94,13 @@ def test_what_cannot_be_encoded_or_shown_is_said_and_what_came_before_is_kept(tm
 
 
 def test_a_writer_that_is_faster_than_the_disk_waits(tmp_path, monkeypatch):
-    """At most MOST_WAITING bytes wait in memory, and all of them arrive."""
+    """At most MAX_QUEUE_BYTES bytes wait in memory, and all of them arrive."""
     monkeypatch.setattr(module, "CHUNK_BYTES", 10_000)
-    monkeypatch.setattr(module, "MOST_WAITING", 50_000)
+    monkeypatch.setattr(module, "MAX_QUEUE_BYTES", 50_000)
     writer, most = RecordingWriter(tmp_path / "a.mcap", {"overrides": "[]"}), 0
     for i in range(400):
         writer.write("keypoints", replace(keypoints(0), index=i, stamp_ns=1000 * i))
-        most = max(most, writer._file._handed_bytes - writer._file._taken_bytes)
+        most = max(most, writer._file._queued_bytes - writer._file._taken_bytes)
     writer.close()
     assert most <= 50_000 and [value.index for value in Recording(tmp_path / "a.mcap").values("keypoints")] == list(range(400))
 
@@ -146,8 +147,8 @@ def test_topics_and_values(tmp_path):
     assert reader.at(1).index == 1 and reader.latest.index == 0
     assert reader.at(4) is None and reader.latest.index == 3
     assert reader.at(5).index == 5 and reader.at(9) is None
-    frames = FrameReader(recording, "keypoints")
-    assert [frames.at(1000 * i).index for i in (5, 0, 2)] == [5, 0, 2] and frames.at(4000) is None
+
+    assert [recording.value("keypoints", 1000 * i).index for i in (5, 0, 2)] == [5, 0, 2] and recording.value("keypoints", 4000) is None
     timing = [json.loads(data) for _, data in recording.messages("/timing")]
     assert timing[1] == {"index": 1, "frame_ms": 1.5, "stage_ms": {"keypoints": 1.25}, "memory_mb": 250.0}
 
@@ -178,7 +179,7 @@ def test_wrong_files_say_so_in_one_line(tmp_path):
     write(tmp_path / "new.mcap", [0], format="9", version="0.0.9", commit="0123456789")
     assert refusal(tmp_path / "new.mcap") == (
         "DIR/new.mcap: has format 9 of trihedron 0.0.9 0123456, this program reads formats 3 and 4: its arrays and tables are packed otherwise; "
-        "read it with the version that wrote it, or record again"
+        "upgrade what can be read of it with: trihedron convert SRC DST.mcap"
     )
     with pytest.raises(RecordingError) as error:
         RecordingWriter(tmp_path / "no" / "a.mcap", {})
@@ -206,7 +207,7 @@ def test_a_recording_of_an_older_program_names_version_and_field(form, commit, d
     path = Path(__file__).parent / "recordings" / f"format_{form}.mcap"
     line = (
         f"trihedron: {path}: has format {form} of trihedron 0.0.1 {commit}, this program reads formats 3 and 4: {differs} of its topics are others; "
-        "read it with the version that wrote it, or record again\n"
+        "upgrade what can be read of it with: trihedron convert SRC DST.mcap\n"
     )
     for words in (["run", f"replay={path}", "only=[pose]"], ["diff", str(path), str(path)], ["export", str(path), "--to", "tum"]):
         assert main(words) == 1

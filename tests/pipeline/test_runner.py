@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from trihedron.pipeline.core.errors import DataError, RecordingError, StageError
-from trihedron.pipeline.record.recording import Recording, RecordingWriter
+from trihedron.pipeline.record.reader import Recording
+from trihedron.pipeline.record.writer import RecordingWriter
 from trihedron.pipeline.run.replay import Replay
 from trihedron.pipeline.run.runner import Runner
 

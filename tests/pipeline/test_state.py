@@ -12,9 +12,10 @@ import numpy as np
 import pytest
 
 from trihedron.pipeline.core.errors import RecordingError
-from trihedron.pipeline.record import chunk_writer
+from trihedron.pipeline.record import mcap_writer
 from trihedron.pipeline.record.codec import Encoder
-from trihedron.pipeline.record.recording import Recording, RecordingWriter
+from trihedron.pipeline.record.reader import Recording
+from trihedron.pipeline.record.writer import RecordingWriter
 from trihedron.pipeline.run.map_file import load_map, save_map
 from trihedron.pipeline.run.runner import Runner
 from trihedron.pipeline.run.state import DelayLines, StateBuffer, max_delays
@@ -126,7 +127,7 @@ def test_a_map_that_cannot_be_written_is_one_line_and_leaves_nothing(runs, tmp_p
     with pytest.raises(RecordingError) as error:
         save_map(tmp_path / "no" / "a.mcap", state, {}, "{}")
     assert str(error.value) == f"{tmp_path}/no/a.mcap: cannot be written: No such file or directory; give another save_map=FILE.mcap"
-    monkeypatch.setattr(chunk_writer._Descriptor, "write", full_disk)
+    monkeypatch.setattr(mcap_writer.os, "write", full_disk)
     with pytest.raises(RecordingError) as error:
         save_map(tmp_path / "a.mcap", state, {}, "{}")
     assert str(error.value) == f"{tmp_path}/a.mcap: cannot be written: No space left on device; give another save_map=FILE.mcap"

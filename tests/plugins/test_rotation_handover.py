@@ -10,7 +10,7 @@ from trihedron.pipeline.app.cli import main
 from trihedron.pipeline.core import registry
 from trihedron.pipeline.core.geometry import log_so3
 from trihedron.pipeline.core.types import ManhattanFrame, Normals, Planes, Segments
-from trihedron.pipeline.record.recording import Recording
+from trihedron.pipeline.record.reader import Recording
 from trihedron.pipeline.record.trajectories import attached_truth
 from trihedron.plugins.manhattan.mean_shift import MeanShift
 

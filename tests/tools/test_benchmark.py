@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 from trihedron.pipeline.app.cli import main
-from trihedron.pipeline.record.recording import TIMING_TOPIC, Recording
+from trihedron.pipeline.record.codec import TIMING_TOPIC
+from trihedron.pipeline.record.reader import Recording
 from trihedron.tools.benchmark import measure
 from trihedron.tools.benchmarks.paired import compared
 

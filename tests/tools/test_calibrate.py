@@ -10,7 +10,7 @@ import yaml
 from trihedron.datasets.readers.images import read_depth
 from trihedron.datasets.simulation.synthetic import Synthetic
 from trihedron.pipeline.app.cli import main
-from trihedron.pipeline.record.recording import Recording
+from trihedron.pipeline.record.reader import Recording
 from trihedron.pipeline.record.trajectories import write_trajectory
 from trihedron.tools.calibrate import depth_delay_of, depth_offset_of, planes_of
 from trihedron.tools.calibration import RightAngle, Turn, estimate_depth_delay, estimate_depth_offset

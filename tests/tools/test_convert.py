@@ -6,7 +6,7 @@ import pytest
 
 from trihedron.pipeline.app.cli import main
 from trihedron.pipeline.core.registry import load_plugins, plugin_class
-from trihedron.pipeline.record.recording import Recording
+from trihedron.pipeline.record.reader import Recording
 from trihedron.pipeline.record.trajectories import read_trajectory
 
 CAMERA = "width: 64\nheight: 48\nfx: 50.0\nfy: 50.0\ncx: 31.5\ncy: 23.5\ndepth_scale: 5000\nfps: 30\n"

@@ -10,7 +10,7 @@ import pytest
 from trihedron.pipeline.app.cli import main
 from trihedron.pipeline.core.table import Column, Table
 from trihedron.pipeline.core.types import FrameReference, Map, Pose
-from trihedron.pipeline.record.recording import RecordingWriter
+from trihedron.pipeline.record.writer import RecordingWriter
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "pipeline"))
 from toys import CAMERA

@@ -8,8 +8,8 @@ import pytest
 from trihedron.pipeline.app.cli import main
 from trihedron.pipeline.core.geometry import exp_se3
 from trihedron.pipeline.core.types import Camera, FrameReference, Trajectory
-from trihedron.pipeline.record.recording import RecordingWriter
 from trihedron.pipeline.record.trajectories import TRUTH, format_trajectory, write_trajectory
+from trihedron.pipeline.record.writer import RecordingWriter
 from trihedron.pipeline.run.metrics import evaluate_trajectory
 
 PERIOD_NS = 33_333_333

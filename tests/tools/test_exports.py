@@ -11,7 +11,7 @@ import pytest
 
 from trihedron.pipeline.app.cli import main
 from trihedron.pipeline.core.geometry import invert
-from trihedron.pipeline.record.recording import Recording
+from trihedron.pipeline.record.reader import Recording
 from trihedron.pipeline.record.trajectories import read_trajectory
 from trihedron.tools import export_rerun
 from trihedron.tools.recorded import last_map

@@ -13,7 +13,7 @@ import pytest
 
 from trihedron.pipeline.core.types import Frame, FrameReference, ManhattanFrame, Planes, Pose, Segments, Trajectory
 from trihedron.pipeline.record.foxglove import View
-from trihedron.pipeline.record.recording import RecordingWriter
+from trihedron.pipeline.record.writer import RecordingWriter
 from trihedron.tools.recover import recover
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "pipeline"))

@@ -10,7 +10,7 @@ import trimesh
 from trihedron.datasets.simulation.synthetic import Synthetic
 from trihedron.pipeline.core.errors import DataError, UsageError
 from trihedron.pipeline.core.types import Surface
-from trihedron.pipeline.record.recording import RecordingWriter
+from trihedron.pipeline.record.writer import RecordingWriter
 from trihedron.pipeline.run.ply import write_ply
 from trihedron.tools import evaluate_surface, export
 from trihedron.tools.evaluate_surface import judged

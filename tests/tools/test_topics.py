@@ -5,7 +5,7 @@ from mcap.writer import Writer
 
 from trihedron.pipeline.app.cli import main
 from trihedron.pipeline.core.types import Camera, FrameReference
-from trihedron.pipeline.record.recording import RecordingWriter
+from trihedron.pipeline.record.writer import RecordingWriter
 
 CAMERA = Camera(640, 480, 525.0, 525.0, 320.0, 240.0)
 CUT = "is not a complete MCAP file: what wrote it was cut off; rescue what is whole with: trihedron recover"
@@ -58,7 +58,20 @@ def test_damage_in_the_middle(recording, capsys):
     data[len(data) // 3 : len(data) // 3 + 200] = bytes(200)
     recording.write_bytes(data)
     assert main(["topics", str(recording)]) == 1
-    assert capsys.readouterr().err == f"trihedron: {recording}: is damaged; rescue what is whole with: trihedron recover {recording}\n"
+    line = capsys.readouterr().err
+    assert line.startswith(f"trihedron: {recording}: channel /") and line.endswith(f"; rescue what is whole with: trihedron recover {recording}\n")
+
+
+def test_escape_codes_in_names_do_not_reach_the_terminal(tmp_path, capsys):
+    with open(tmp_path / "hostile.mcap", "wb") as file:
+        writer = Writer(file)
+        writer.start()
+        channel = writer.register_channel("/\x1b]0;title\x07" + 500 * "x", "json", writer.register_schema("\x1b[2J", "jsonschema", b"{}"))
+        writer.add_message(channel, 1, b"{}", 1)
+        writer.finish()
+    assert main(["topics", str(tmp_path / "hostile.mcap")]) == 0
+    name, schema, *_ = capsys.readouterr().out.splitlines()[1].split()
+    assert name == "/?]0;title?" + 108 * "x" + "…" and schema == "?[2J"
 
 
 def test_other_files(tmp_path, capsys):

@@ -24,7 +24,9 @@ from trihedron.pipeline.core.errors import UsageError
 from trihedron.pipeline.core.graph import Graph
 from trihedron.pipeline.core.slots import output_of
 from trihedron.pipeline.core.types import F64, OK, Frame, Map, Pose, Trajectory
-from trihedron.pipeline.record.recording import TIMING_TOPIC, Recording, RecordingWriter
+from trihedron.pipeline.record.codec import TIMING_TOPIC
+from trihedron.pipeline.record.reader import Recording
+from trihedron.pipeline.record.writer import RecordingWriter
 from trihedron.pipeline.run.runner import Runner
 from trihedron.tools.arguments import Parser, table
 from trihedron.tools.benchmarks.map_benchmark import FEATURES, bytes_of, promises

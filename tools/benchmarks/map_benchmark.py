@@ -26,7 +26,8 @@ from numpy.typing import NDArray
 
 from trihedron.pipeline.core.errors import UsageError
 from trihedron.pipeline.core.types import F64, LOST, Map, Pose, Table, Trajectory
-from trihedron.pipeline.record.recording import TIMING_TOPIC, Recording
+from trihedron.pipeline.record.codec import TIMING_TOPIC
+from trihedron.pipeline.record.reader import Recording
 from trihedron.pipeline.record.trajectories import attached_truth, read_trajectory
 from trihedron.pipeline.run.metrics import associate, relative_errors
 from trihedron.tools.arguments import Parser, table
@@ -236,10 +237,8 @@ def line(frames: NDArray[np.int64], values: F64) -> list[float]:
 
 
 def bytes_of(map: Map) -> int:
-    """What the tables of a map hold, chunks that stand in several places once."""
-    tables = [table for table in vars(map).values() if isinstance(table, Table)]
-    held = {id(chunk): chunk.nbytes for one in tables for chunks in one.chunks.values() for chunk in chunks}
-    return sum(held.values())
+    """Bytes of the rows of a map's tables, without freed ones."""
+    return sum(table.nbytes for table in vars(map).values() if isinstance(table, Table))
 
 
 def floor_m2(map: Map, R_room_world: F64) -> float:

@@ -23,7 +23,9 @@ import numpy as np
 from trihedron.pipeline.core.graph import Graph
 from trihedron.pipeline.core.slots import output_of
 from trihedron.pipeline.core.types import Frame, Value
-from trihedron.pipeline.record.recording import FRAMES_TOPIC, Recording, RecordingWriter
+from trihedron.pipeline.record.codec import FRAMES_TOPIC
+from trihedron.pipeline.record.reader import Recording
+from trihedron.pipeline.record.writer import RecordingWriter
 from trihedron.pipeline.run.runner import Runner
 from trihedron.tools.arguments import Parser, table
 from trihedron.tools.topics import topics_of

@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from trihedron.pipeline.core.errors import DataError
 from trihedron.pipeline.core.geometry import log_so3, nearest_pairs, nearest_rotation
 from trihedron.pipeline.core.types import F64, ManhattanFrame
-from trihedron.pipeline.record.recording import Recording
+from trihedron.pipeline.record.reader import Recording
 from trihedron.pipeline.record.trajectories import attached_truth
 from trihedron.plugins.shared.manhattan_frames_kernels import CUBE, nearest_equivalent
 from trihedron.tools.arguments import Parser, table

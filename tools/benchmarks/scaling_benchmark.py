@@ -24,7 +24,8 @@ import numpy as np
 
 from trihedron.pipeline.core.errors import DataError, UsageError
 from trihedron.pipeline.core.types import Map
-from trihedron.pipeline.record.recording import TIMING_TOPIC, Recording
+from trihedron.pipeline.record.codec import TIMING_TOPIC
+from trihedron.pipeline.record.reader import Recording
 from trihedron.tools.arguments import Parser, table
 from trihedron.tools.benchmark import machine, measure, reference_ms, sample_images
 from trihedron.tools.benchmarks.map_benchmark import FEATURES

@@ -21,7 +21,7 @@ import numpy as np
 from trihedron.pipeline.core.errors import UsageError, did_you_mean
 from trihedron.pipeline.core.registry import load_plugins, plugin_class, plugins_of
 from trihedron.pipeline.core.types import Map, Surface
-from trihedron.pipeline.record.recording import Recording
+from trihedron.pipeline.record.reader import Recording
 from trihedron.tools.arguments import Parser, table
 
 SCENE = ("dataset=synthetic", "dataset.curved=true")

@@ -1,0 +1,147 @@
+"""Read a recording: topics in frame order, or one frame alone."""
+
+from __future__ import annotations
+
+import json
+from collections import deque
+from collections.abc import Iterator
+from pathlib import Path
+
+from mcap.records import Channel, ChunkIndex
+
+from trihedron.pipeline.core.errors import RecordingError
+from trihedron.pipeline.core.types import Value
+from trihedron.pipeline.record.codec import FRAMES_TOPIC, METADATA, READABLE, Decoder, ValueMessage, builds_on
+from trihedron.pipeline.record.mcap_file import McapFile, damaged
+
+
+class Recording:
+    """A recording opened for reading. Raises RecordingError when it is missing, damaged or not ours."""
+
+    def __init__(self, path: Path | str) -> None:
+        self.path = Path(path)
+        self._file = McapFile(self.path)
+        if not self._file.complete or not self._file.indexed:
+            raise damaged(self.path)
+        if METADATA not in self._file.metadata:
+            raise RecordingError(str(path), "is an MCAP file, but not a recording of trihedron", "convert it with: trihedron convert SRC DST.mcap")
+        self.metadata = self._file.metadata[METADATA]
+        self.attachments = {name: data.decode("utf-8", "replace") for name, data in self._file.attachments.items()}
+        self.channels: dict[str, Channel] = {c.topic: c for c in self._file.channels.values()}
+        self.counts = {c.topic: self._file.counts.get(c.id, 0) for c in self.channels.values()}
+        self.topics = {t[1:] for t, c in self.channels.items() if self._file.schema_name(c.id) == ValueMessage.DESCRIPTOR.full_name}
+        self._chunks: dict[str, list[ChunkIndex]] = {}
+        if self.metadata.get("format") not in READABLE:
+            written = " ".join(["trihedron", self.metadata.get("version", ""), self.metadata.get("commit", "")[:7]]).strip()
+            form = self.metadata.get("format")
+            cause = f"has format {form} of {written}, this program reads formats {' and '.join(READABLE)}: {self._difference()}"
+            raise RecordingError(str(path), cause, "upgrade what can be read of it with: trihedron convert SRC DST.mcap")
+
+    def _difference(self) -> str:
+        """Of a recording of another format: what its first messages hold that this program does not read, types with other fields first."""
+        causes: list[str] = []
+        for topic in sorted(self.topics):
+            try:
+                next(self.values(topic), None)
+            except RecordingError as error:
+                causes.append(f"topic /{topic} {error.cause}")
+        causes.sort(key=lambda cause: "the field" not in cause)
+        more = f", and {len(causes) - 1} more of its topics are others" if len(causes) > 1 else ""
+        return causes[0] + more if causes else "its arrays and tables are packed otherwise"
+
+    def overrides(self) -> list[str]:
+        """The overrides of the command that made the recording. Raises RecordingError where they are no list of texts."""
+        try:
+            found = json.loads(self.metadata.get("overrides", "[]"))
+        except (ValueError, RecursionError):
+            found = None
+        if not isinstance(found, list) or not all(isinstance(text, str) for text in found):
+            raise RecordingError(str(self.path), "does not say which command made it", "the file is damaged; record it again")
+        return found
+
+    def messages(self, channel: str) -> Iterator[tuple[int, bytes]]:
+        """(log_time, data) of the messages of one channel (with slash), in the order they were written."""
+        for chunk in self._holding(channel):
+            yield from self._file.in_chunk(chunk, self.channels[channel].id)
+
+    def values(self, topic: str) -> Iterator[Value]:
+        """The values of a topic in frame order."""
+        decoder = self._decoder(topic)
+        for _, data in self.messages(f"/{topic}"):
+            yield decoder.decode(data)
+
+    def frame(self, index: int) -> dict[str, Value]:
+        """What every topic holds of one frame; empty when there is none of this number. Reads only the chunks it needs."""
+        reference = self._reference(index)
+        if reference is None:
+            return {}
+        found = {topic: self.value(topic, reference.stamp_ns) for topic in sorted(self.topics)}
+        return {topic: value for topic, value in found.items() if value is not None and value.index == index}
+
+    def value(self, topic: str, stamp_ns: int) -> Value | None:
+        """The value of a topic with this stamp, or None."""
+        chain: list[bytes] = []
+        channel, skipped = f"/{topic}", 0
+        for chunk in reversed(self._holding(channel)):
+            if not chain and not chunk.message_start_time <= stamp_ns <= chunk.message_end_time:
+                continue
+            if skipped and skipped >= (count := self._file.count_in_chunk(chunk, self.channels[channel].id)):
+                skipped -= count
+                continue
+            for log_time, data in reversed(self._file.in_chunk(chunk, self.channels[channel].id)):
+                if skipped:
+                    skipped -= 1
+                elif chain or log_time == stamp_ns:
+                    chain.append(data)
+                    back = builds_on(data)
+                    if back == 0:
+                        return self._decoder(topic).decode_last(chain[::-1])
+                    skipped = back - 1
+        return None
+
+    def _holding(self, channel: str) -> list[ChunkIndex]:
+        """The chunks with messages of a channel (with slash), in file order."""
+        if channel not in self._chunks:
+            self._chunks[channel] = self._file.chunks(self.channels[channel].id) if channel in self.channels else []
+        return self._chunks[channel]
+
+    def _decoder(self, topic: str) -> Decoder:
+        return Decoder(f"{self.path}: topic /{topic}")
+
+    def _reference(self, index: int) -> Value | None:
+        """The FrameReference of a frame, by bisection: frame numbers grow."""
+        channel, decoder = f"/{FRAMES_TOPIC}", self._decoder(FRAMES_TOPIC)
+        chunks = self._holding(channel)
+        low, high = 0, len(chunks)
+        while low < high:
+            middle = (low + high) // 2
+            found = [decoder.decode(data) for _, data in self._file.in_chunk(chunks[middle], self.channels[channel].id)]
+            for value in found:
+                if value.index == index:
+                    return value
+            low, high = (middle + 1, high) if not found or found[-1].index < index else (low, middle)
+        return None
+
+
+class TopicReader:
+    """A topic of a recording, asked for frame by frame in increasing order."""
+
+    def __init__(self, recording: Recording, topic: str) -> None:
+        self._values = recording.values(topic)
+        self._next: deque[Value] = deque()
+        self.latest: Value | None = None  # the last value before the frame asked for
+
+    def at(self, index: int) -> Value | None:
+        """The value written at frame `index`, or None."""
+        while True:
+            if not self._next:
+                value = next(self._values, None)
+                if value is None:
+                    return None
+                self._next.append(value)
+            if self._next[0].index > index:
+                return None
+            value = self._next.popleft()
+            if value.index == index:
+                return value
+            self.latest = value
