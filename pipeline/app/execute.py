@@ -17,6 +17,7 @@ from typing import Any
 from omegaconf import DictConfig, OmegaConf
 from tqdm import tqdm
 
+from trihedron.pipeline.app.compilation import compile_once
 from trihedron.pipeline.core.config import Feedback, graph_of
 from trihedron.pipeline.core.errors import ConfigError, DataError, RecordingError, did_you_mean
 from trihedron.pipeline.core.graph import Graph
@@ -33,7 +34,7 @@ from trihedron.pipeline.run.replay import TOPICS, Replay
 from trihedron.pipeline.run.runner import Runner, Step
 from trihedron.pipeline.run.state import DelayLines, max_delays
 from trihedron.pipeline.run.timing import forget_peak
-from trihedron.pipeline.run.warm_up import prepared
+from trihedron.pipeline.run.warm_up import compilation_reported, warm_up
 
 RECORDING = "run.mcap"
 PATH_KEYS = ("dataset.path", "dataset.camera", "load_map")
@@ -57,14 +58,16 @@ def execute(config: DictConfig, out: Path, overrides: list[str], began: float) -
     topics = _recorded_topics(config, graph, replay)
     _announce(runner)
     trial = partial(Runner, graph, config.seed, config.threads, replay, frames, remembered)
-    with _Warnings() as warnings, prepared(runner, trial) as waited:
+    compile_once(runner.computed, runner.feed is not None)
+    with _Warnings() as warnings, compilation_reported():
+        warm_up(trial())
         warnings.muted = False
         writer = RecordingWriter(out / RECORDING, {**_metadata(config, overrides), TOPICS: json.dumps(sorted(topics))})
         attachments = _attachments(graph, replay)
         for name, text in attachments.items():
             writer.attach(name, text)
         truth = attached_truth(attachments, str(writer.path))
-        started = time.perf_counter() - waited()  # so far, for what the recording computes with
+        started = time.perf_counter()
         try:
             for _ in _progress(runner.steps(writer, topics, embed_frames="dataset" in topics, truth=truth)):
                 pass
@@ -73,7 +76,7 @@ def execute(config: DictConfig, out: Path, overrides: list[str], began: float) -
         finally:
             with Interrupts() as interrupts, interrupts.held():
                 failure = _closed(writer)
-                metrics, timing = _write(runner, truth, out, started + waited(), began)
+                metrics, timing = _write(runner, truth, out, started, began)
                 warnings.summarise()
     _report(out, metrics, timing, [results.write_surface(out, value) for value in runner.result.folds.values() if isinstance(value, Surface)])
     if failure is not None:

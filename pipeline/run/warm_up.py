@@ -1,74 +1,99 @@
-"""What a run computes with is compiled and loaded before it is asked for."""
+"""Warm-up: the first frames are run once before the clock starts, so that no frame waits for what is compiled, loaded or allocated once."""
 
 from __future__ import annotations
 
 import sys
-import threading
+import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
+from types import TracebackType
+from typing import Any
 
+from numba.core import event
 from tqdm import tqdm
 
 from trihedron.pipeline.core.errors import TrihedronError
-from trihedron.pipeline.run.kernels import FEW, Awaited, Compilation, missing, used_by
-from trihedron.pipeline.run.memory import gc_paused, malloc_trim
+from trihedron.pipeline.run.memory import malloc_trim
 from trihedron.pipeline.run.runner import Runner
 
+EVENTS: Any = event  # documented in numba's Event API, without types
 WARM_UP_FRAMES = 3  # enough for every stage to have been called
-SILENT_SECONDS = 5.0  # before it is said why no frame is seen yet; with compiled kernels the first frames take less
+COMPILING = "compiling functions for this machine, once"
+PLAIN_SECONDS = 10.0  # between two lines where standard error is no terminal
+
+
+class Progress:
+    """Progress of compilation on standard error: a bar on a terminal, else a line every few seconds. Nothing is printed before the first function."""
+
+    def __init__(self, total: int | None = None) -> None:
+        self.count, self._total = 0, total
+        self._bar: tqdm[None] | None = None
+        self._began = self._printed = 0.0
+
+    def update(self) -> None:
+        """Count one compiled function."""
+        self.count += 1
+        now = time.perf_counter()
+        if self.count == 1:
+            print(f"{COMPILING} ...", file=sys.stderr, flush=True)
+            self._began = self._printed = now
+            self._bar = tqdm(total=self._total, unit="function", leave=False) if sys.stderr.isatty() else None
+        if self._bar is not None:
+            self._bar.total = None if self._total is None else max(self._total, self.count)
+            self._bar.update()
+        elif now - self._printed > PLAIN_SECONDS:
+            self._printed = now
+            of = "" if self._total is None else f" of about {max(self._total, self.count)}"
+            print(f"{COMPILING}: {self.count}{of} after {now - self._began:.0f} s", file=sys.stderr, flush=True)
+
+    def close(self) -> None:
+        """Remove the bar."""
+        if self._bar is not None:
+            self._bar.close()
+
+
+class _Compiled(event.Listener):
+    """Calls a function as each compilation ends; numba broadcasts none for what a cache has."""
+
+    def __init__(self, update: Callable[[], None]) -> None:
+        self._update = update
+
+    def on_start(self, event: event.Event) -> None:
+        """Nothing: a function is counted when it is done."""
+
+    def on_end(self, event: event.Event) -> None:
+        """Count it."""
+        self._update()
+
+
+class compilations:
+    """Context within which `update` is called once for each function that numba compiles in this process."""
+
+    def __init__(self, update: Callable[[], None]) -> None:
+        self._listener = _Compiled(update)
+
+    def __enter__(self) -> None:
+        EVENTS.register("numba:compile", self._listener)
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None) -> None:
+        EVENTS.unregister("numba:compile", self._listener)
 
 
 @contextmanager
-def prepared(runner: Runner, trial: Callable[[], Runner]) -> Iterator[Callable[[], float]]:
-    """Within this a run finds its kernels; gives what tells for how many seconds calls have waited for them.
-
-    Where a cache has them, the first frames of `trial`, a runner as this one, are run and thrown away: no frame waits for what is loaded or allocated
-    once. Else other processes compile beside the run, and a call waits for what is not there yet, which is once an installation. What is
-    fed in real time does not begin before all is there."""
-    with gc_paused():
-        rows = missing(used_by(runner.graph.stages[name].plugin for name in runner.computed))
-    if len(rows) <= FEW:
-        _warm_up(trial())
-        yield lambda: 0.0
-        return
-    print(f"compiling {len(rows)} functions for this machine, once ...", file=sys.stderr, flush=True)
-    with Compilation(rows) as compilation, Awaited(rows) as awaited, _bar(len(rows)) as bar:
-        follower = threading.Thread(target=_follow, args=(compilation, awaited, bar), daemon=True)
-        follower.start()
-        try:
-            if runner.feed is not None:
-                follower.join()
-                _warm_up(trial())
-            yield lambda: awaited.seconds
-        finally:
-            compilation.give_up()
-            follower.join()
-
-
-def _bar(total: int) -> tqdm[None]:
-    return tqdm(total=total, disable=not sys.stderr.isatty(), leave=False, unit="function")
-
-
-def _follow(compilation: Compilation, awaited: Awaited, bar: tqdm[None]) -> None:
-    """Let calls go on as rows are done, and when no more will be."""
-    for row in compilation:
-        awaited.done(row)
-        bar.update()
-    awaited.end()
-
-
-def _warm_up(runner: Runner) -> None:
-    """Call every stage on the first frames; what goes wrong here is reported by the run itself."""
-    runner.count = min(runner.count, WARM_UP_FRAMES)
-    why = "preparing: what else computes is compiled for this machine, once, then loaded"
-    said = threading.Timer(SILENT_SECONDS, print, [why], {"file": sys.stderr, "flush": True})
-    said.daemon = True
-    said.start()
+def compilation_reported() -> Iterator[None]:
+    """Within this a message appears on standard error when the first function is compiled, and the count while more are."""
+    progress = Progress()
     try:
+        with compilations(progress.update):
+            yield
+    finally:
+        progress.close()
+
+
+def warm_up(runner: Runner) -> None:
+    """Call every stage on the first frames and discard the results; an error here is left to the run itself, which reports it."""
+    runner.count = min(runner.count, WARM_UP_FRAMES)
+    with suppress(TrihedronError):
         for _ in runner.steps(None, frozenset()):
             pass
-    except TrihedronError:
-        pass
-    finally:
-        said.cancel()
-    malloc_trim()  # what the data set and the kernels needed to begin with: else the frames grow into it, unseen in what the run says it holds
+    malloc_trim()  # the data set's and the compiler's memory: frames would grow into it, unseen in the memory that the run reports

@@ -132,14 +132,6 @@ def test_a_run_folder_is_complete(capsys, tmp_path):
     assert recording.channels["/view/pose"].message_encoding == "protobuf"
 
 
-def test_a_long_preparation_is_explained(capsys, tmp_path, monkeypatch):
-    words = ["run", *SMALL, "dataset.frames=0:4", "outputs=[keypoints]"]
-    monkeypatch.setattr("trihedron.pipeline.run.warm_up.SILENT_SECONDS", 60.0)
-    assert main([*words, f"out={tmp_path / 'quick'}"]) == 0 and "preparing" not in capsys.readouterr().err
-    monkeypatch.setattr("trihedron.pipeline.run.warm_up.SILENT_SECONDS", 0.0)
-    assert main([*words, f"out={tmp_path / 'long'}"]) == 0 and "compiled for this machine, once" in capsys.readouterr().err
-
-
 def test_a_replay_finds_the_data_from_another_folder(tmp_path, monkeypatch):
     assert main(["run", *SMALL, "record.frames=true", "out=embedded"]) == 0
     assert main(["run", "dataset=mcap", "dataset.path=embedded/run.mcap", "out=again"]) == 0

@@ -1,0 +1,119 @@
+"""Compile the kernels of the default graph in two processes, before the first run or when `trihedron compile` is called.
+
+numba compiles one function at a time in a process, and knows the types of the arguments only from a call. So two processes run the graph on small
+images of the built-in room, one as far as the Manhattan frame, the other with points alone but to the end. What both need is compiled by the one that
+comes to it first, and loaded from the cache by the other. The runs that follow need all stages and compile what is left.
+"""
+
+from __future__ import annotations
+
+import gc
+import os
+import queue
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from collections.abc import Sequence
+from contextlib import ExitStack, redirect_stderr, redirect_stdout, suppress
+from importlib.metadata import version
+from pathlib import Path
+
+from llvmlite import binding
+
+from trihedron.pipeline.core.errors import TrihedronError
+from trihedron.pipeline.core.kernel import cache_folder
+from trihedron.pipeline.run.warm_up import Progress, compilations
+
+SMALL = ("width=160", "height=120")
+ROOM = (*(f"dataset.{word}" for word in SMALL), "dataset.length=40")
+LOST = ("dataset=faults", *(f"+dataset.options.{word}" for word in SMALL), "dataset.cover=10:20")
+DIRECTIONS = (*ROOM, "dataset.frames=0:5", "outputs=[manhattan]")
+POINTS = (*ROOM, "normals=none", "planes=none", "lines=none")
+SURFACE = (*ROOM, "outputs=[trajectory,surface]")
+FOUND, UNKNOWN = (*LOST, "dataset.frames=0:100"), (*LOST, "dataset.frames=0:60", "+dataset.options.texture=false")
+TRACKING = ((DIRECTIONS,), (POINTS,))  # runs of each process before a run, which compiles what is left as it comes to it
+ALL = ((DIRECTIONS, SURFACE), (POINTS, FOUND, UNKNOWN))  # and before a live run: also what a surface, a loss and the way back need
+PARTS = {"tracking": TRACKING, "all": ALL}
+FUNCTIONS = {"tracking": 550, "all": 750}  # compiled by both processes, about
+STAGES = {"keypoints", "lines", "planes", "manhattan"}  # of the graphs that these runs compile most of
+SWITCH = "TRIHEDRON_COMPILE"  # environment variable: with 0 a run compiles what it calls and nothing beforehand
+GARBAGE = 100_000  # new objects between two collections: nearly all that the compiler makes is short-lived
+
+
+def compile_kernels(what: str = "all") -> float:
+    """Compile the default graph's kernels, `tracking` or `all` of them, with progress on standard error; returns seconds.
+
+    Raises TrihedronError where a process fails."""
+    began, progress = time.perf_counter(), Progress(FUNCTIONS[what])
+    command = [sys.executable, "-m", __name__]
+    environment = os.environ | {SWITCH: "0"}
+    workers = [subprocess.Popen([*command, what, str(part)], stdout=subprocess.PIPE, env=environment) for part in range(len(PARTS[what]))]
+    lines: queue.SimpleQueue[bytes] = queue.SimpleQueue()
+    threads = [threading.Thread(target=_forward, args=(worker, lines), daemon=True) for worker in workers]
+    for thread in threads:
+        thread.start()
+    try:
+        ended = 0
+        while ended < len(workers):
+            line = lines.get()
+            ended += not line
+            if line:
+                progress.update()
+    finally:
+        for worker in workers:
+            worker.terminate()
+            worker.wait()
+        progress.close()
+    if any(worker.returncode for worker in workers):
+        raise TrihedronError("compile", "not all functions were compiled", "see that 2 GB of memory are free, then repeat: trihedron compile --debug")
+    marker(what).parent.mkdir(parents=True, exist_ok=True)
+    marker(what).touch()
+    return time.perf_counter() - began
+
+
+def compile_once(stages: Sequence[str], live: bool) -> None:
+    """Fill the cache before a run of these stages, unless that was done for these versions and this processor; for a live run with all that it may
+    come to need. A graph of other stages compiles what it calls as it runs, and so does any run where the variable TRIHEDRON_COMPILE is 0."""
+    what = "all" if live else "tracking"
+    if os.environ.get(SWITCH) != "0" and set(stages) >= STAGES and not (marker(what).exists() or marker("all").exists()):
+        with suppress(TrihedronError, OSError):  # the run compiles by itself
+            compile_kernels(what)
+
+
+def marker(what: str) -> Path:
+    """File that is there once `compile_kernels` has filled the cache for these versions and this processor."""
+    python = f"py{sys.version_info.major}{sys.version_info.minor}"
+    return cache_folder() / f"{what}-{version('trihedron')}-{python}-{binding.get_host_cpu_name()}"
+
+
+def _forward(worker: subprocess.Popen[bytes], lines: queue.SimpleQueue[bytes]) -> None:
+    """Pass on a worker's lines, an empty one at its end."""
+    assert worker.stdout is not None
+    for line in worker.stdout:
+        lines.put(line)
+    worker.wait()
+    lines.put(b"")
+
+
+def _work(what: str, part: int) -> int:
+    """Make the runs of one part, writing a line to standard output for each function that is compiled; returns the exit code."""
+    from trihedron.pipeline.app.cli import main as command
+
+    gc.freeze()
+    gc.set_threshold(GARBAGE, 10, 10)
+    out, failures = sys.stdout, 0
+    with ExitStack() as stack:
+        folder = stack.enter_context(tempfile.TemporaryDirectory())
+        nowhere = stack.enter_context(open(os.devnull, "w"))
+        stack.enter_context(redirect_stdout(nowhere))
+        stack.enter_context(redirect_stderr(nowhere))
+        stack.enter_context(compilations(lambda: print(file=out, flush=True)))
+        for number, words in enumerate(PARTS[what][part]):
+            failures += command(["run", *words, "threads=1", f"out={folder}/{number}"]) != 0
+    return min(failures, 1)
+
+
+if __name__ == "__main__":
+    sys.exit(_work(sys.argv[1], int(sys.argv[2])))
