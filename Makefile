@@ -61,7 +61,7 @@ $(VENV)/installed: $(VENV)/created pyproject.toml
 $(VENV)/checked: $(VENV)/installed
 	@$(BIN)/python -m trihedron.tools.system_check && touch $@ || test $$? -eq 3
 
-# The kernels of the default graph; what is compiled stays beside the sources until they change.
+# The kernels of the default graph; what is compiled is cached in the user's cache folder (docs/decisions.md).
 $(VENV)/compiled: $(VENV)/installed
 	@echo "Compiling the kernels (a minute or two, once)"
 	@$(BIN)/trihedron compile >$(VENV)/compile.log 2>&1 || true
