@@ -7,9 +7,9 @@ from __future__ import annotations
 from pathlib import Path
 
 import cv2
-import numba
 import numpy as np
 
+from trihedron.pipeline.core.kernel import kernel
 from trihedron.pipeline.core.types import F64, I32, U8, Surface
 from trihedron.pipeline.record.reader import Recording
 from trihedron.tools.export import Format
@@ -57,7 +57,7 @@ def _seen(vertices: F64, triangles: I32) -> tuple[I32, F64, F64]:
     return triangle, weights, lit[triangle]
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel(error_model="python")
 def _rasterise(points: F64, triangles: I32, triangle: I32, weights: F64) -> None:
     """Fill the nearest front-facing triangle of each pixel; x right, y down, z away."""
     h, w = triangle.shape

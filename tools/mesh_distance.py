@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from trihedron.pipeline.core.kernel import kernel
 from trihedron.pipeline.core.types import F64, I32
 
 I64 = NDArray[np.int64]
@@ -31,7 +31,7 @@ def sampled(vertices: F64, triangles: I32, spacing_m: float) -> tuple[F64, I32, 
     return points, owner, (areas(vertices, triangles) / np.maximum(counts, 1))[owner]
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel(error_model="python")
 def _grid(corners: F64, parts: I64) -> tuple[F64, I32]:
     """The centres of the n² similar triangles that each triangle is cut into."""
     total = 0
@@ -70,7 +70,7 @@ class NearestTriangle:
         return _nearest(np.ascontiguousarray(points), self._corners, owner.astype(np.int32), FAR_M)
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel(error_model="python")
 def _nearest(points: F64, corners: F64, candidates: I32, far: float) -> tuple[F64, I32]:
     distance, nearest = np.full(len(points), far), np.full(len(points), -1, np.int32)
     for i in range(len(points)):
@@ -85,7 +85,7 @@ def _nearest(points: F64, corners: F64, candidates: I32, far: float) -> tuple[F6
     return distance, nearest
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel(error_model="python")
 def _distance(p: F64, a: F64, b: F64, c: F64) -> float:
     """From a point to a triangle (Ericson, Real-Time Collision Detection, 5.1.5)."""
     ab, ac, ap = b - a, c - a, p - a

@@ -9,12 +9,12 @@ from __future__ import annotations
 import struct
 from typing import Any
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 from zlib_ng import zlib_ng
 
 from trihedron.datasets.readers.png_chunks import PNG_MAGIC, chunks
+from trihedron.pipeline.core.kernel import kernel
 from trihedron.pipeline.core.types import U8
 
 CHANNELS = {0: 1, 2: 3}  # of the colour types that are read here
@@ -59,7 +59,7 @@ def _packed(data: bytes) -> bytes | None:
     return b"".join(parts)
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _unfiltered(lines: U8, pixel: int, out: U8) -> bool:
     """Writes the bytes (h, n) of lines (h, 1 + n) that each begin with their filter; `pixel` bytes are one. False for an unknown filter."""
     h, n = out.shape
@@ -92,7 +92,7 @@ def _unfiltered(lines: U8, pixel: int, out: U8) -> bool:
     return True
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy", inline="always")
+@kernel(inline="always")
 def _nearest(a: int, b: int, c: int) -> int:
     """Whichever of the bytes to the left, above, and above to the left is nearest to a + b - c."""
     # by cases, in fewer steps than three distances: each byte waits for the one before
@@ -101,7 +101,7 @@ def _nearest(a: int, b: int, c: int) -> int:
     return high if rest <= low else near
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _paeth(line: U8, above: U8, pixel: int, here: U8) -> None:
     for i in range(len(here)):
         a = int(here[i - pixel]) if i >= pixel else 0
@@ -109,7 +109,7 @@ def _paeth(line: U8, above: U8, pixel: int, here: U8) -> None:
         here[i] = line[i] + _nearest(a, int(above[i]), c)
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _paeth_2(line: U8, above: U8, here: U8) -> None:
     """Two bytes a pixel: two chains, which a processor follows at once."""
     a0, a1, c0, c1 = 0, 0, 0, 0
@@ -120,7 +120,7 @@ def _paeth_2(line: U8, above: U8, here: U8) -> None:
         here[i], here[i + 1], c0, c1 = a0, a1, b0, b1
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _paeth_3(line: U8, above: U8, here: U8) -> None:
     """Three bytes a pixel."""
     a0, a1, a2, c0, c1, c2 = 0, 0, 0, 0, 0, 0

@@ -7,10 +7,10 @@ from functools import cached_property
 from typing import Any
 
 import cv2
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from trihedron.pipeline.core.kernel import kernel
 from trihedron.pipeline.core.types import F32, F64, Camera
 
 WIDEST = 32  # pixels of colour that one pixel of depth may cover
@@ -51,7 +51,7 @@ class Registration:
         return _splat(depth_m, *self._rays, t, camera.fx, camera.fy, camera.cx, camera.cy, camera.height, camera.width)
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _splat(depth: F32, across: F32, down: F32, t: F32, fx: float, fy: float, cx: float, cy: float, height: int, width: int) -> F32:
     """The z-buffer of all readings, each a rectangle in the colour image between the middles of the sides of its pixel."""
     found = np.zeros((height, width), np.float32)

@@ -5,9 +5,9 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-import numba
 import numpy as np
 
+from trihedron.pipeline.core.kernel import kernel
 from trihedron.pipeline.core.types import F64, I32
 from trihedron.plugins.mapping.reprojection_kernels import EXTEND
 from trihedron.plugins.shared.linalg_kernels import invert_symmetric
@@ -71,7 +71,7 @@ class BundleMeasurements(NamedTuple):
 TRUST_M, TRUST_RAD, TRUST_LANDMARK = 1.0 / 0.1**2, 1.0 / np.radians(2.0) ** 2, 1.0 / 0.5**2
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _invert_block(V: F64, damping: float, point: bool, A: F64) -> None:
     """A (4, 4): inverse of the damped block V (lower triangle) with the trust added; that of a line, which is positive definite, by Gauss and Jordan
     without pivots."""
@@ -96,7 +96,7 @@ def _invert_block(V: F64, damping: float, point: bool, A: F64) -> None:
                     A[i, j] -= factor * A[k, j]
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def trusted(H: F64, free: int, damping: float, S: F64) -> None:
     """S (c, c), full: the damped H with the trust added."""
     for i in range(len(H)):
@@ -107,7 +107,7 @@ def trusted(H: F64, free: int, damping: float, S: F64) -> None:
         S[i, i] += damping * H[i, i] + (TRUST_RAD if of_angle else TRUST_M)
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _eliminate(A: F64, b: F64, W: F64, point: bool, keyframes: I32, begin: int, end: int, free: int, Y: F64, S: F64, y: F64) -> None:
     """Subtract one landmark, whose inverse block is A and whose observations are begin to end, from the lower triangle of the reduced system. Of a
     `point` the fourth unknown is left out. Y (6, 4): room."""
@@ -133,7 +133,7 @@ def _eliminate(A: F64, b: F64, W: F64, point: bool, keyframes: I32, begin: int, 
                     S[6 * k + i, 6 * q + j] -= share if point else share + y3 * W[other, j, 3]
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def reduce_bundle(normal: NormalEquations, seen: BundleMeasurements, damping: float, S: F64, y: F64, inverses: F64) -> None:
     """The reduced system `S dx = y` of poses and planes (S full) and the inverse blocks of points and lines (l, 4, 4). What a point that was measured
     once says of the pose, and takes back when it is eliminated, is in neither."""
@@ -155,7 +155,7 @@ def reduce_bundle(normal: NormalEquations, seen: BundleMeasurements, damping: fl
             S[j, i] = S[i, j]
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def landmark_steps(normal: NormalEquations, seen: BundleMeasurements, inverses: F64, dx: F64, steps: F64) -> None:
     """steps (l, 4) of points and lines that go with the step dx of poses and planes."""
     n, first = len(seen.point_starts) - 1, len(seen.point_keyframes)
@@ -177,7 +177,7 @@ def landmark_steps(normal: NormalEquations, seen: BundleMeasurements, inverses: 
                 steps[i, j] -= inverses[i, j, a] * rest[a]
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def moved_bundle(state: BundleState, free: int, dx: F64, steps: F64) -> BundleState:
     """The state after the steps of poses and planes, and of points and lines."""
     out = BundleState(state.rotations.copy(), state.positions.copy(), state.points.copy(), state.lines.copy(), state.planes.copy())
@@ -205,7 +205,7 @@ def moved_bundle(state: BundleState, free: int, dx: F64, steps: F64) -> BundleSt
     return out
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def marginals(normal: NormalEquations, seen: BundleMeasurements, inverses: F64, covariance: F64, out: F64) -> None:
     """out (l, 4, 4): covariance of each point and line with that of the poses, (c, c), in it: `A + A Wᵀ Σ W A`, A being its inverse block."""
     n, first = len(seen.point_starts) - 1, len(seen.point_keyframes)
@@ -228,7 +228,7 @@ def marginals(normal: NormalEquations, seen: BundleMeasurements, inverses: F64, 
                 out[i, a, j] = out[i, a, j] + b0 * Q[0, j] + b1 * Q[1, j] + b2 * Q[2, j] + b3 * Q[3, j]
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _between(W: F64, point: bool, keyframes: I32, begin: int, end: int, free: int, covariance: F64, M: F64) -> None:
     """Add `Wᵀ Σ W` of one landmark to M (4, 4), row by row of Σ W; of a `point` the fourth row and column are left out."""
     for o in range(begin, end):
@@ -274,7 +274,7 @@ class NormalEquations(NamedTuple):
     W: F64  # (o, 6, 4)
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _loss(chi2: float, limit: float, loss: int) -> tuple[float, float]:
     """Weight and cost of a term whose χ² may lie beyond the limit."""
     if loss == SQUARES or chi2 <= limit:
@@ -284,7 +284,7 @@ def _loss(chi2: float, limit: float, loss: int) -> tuple[float, float]:
     return 0.0, limit
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _clear(W: F64) -> None:
     """A block (6, 4) of W that nothing is known of."""
     for i in range(6):
@@ -292,7 +292,7 @@ def _clear(W: F64) -> None:
             W[i, j] = 0.0
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _add_points(state: BundleState, seen: BundleMeasurements, loss: int, out: NormalEquations, filled: bool) -> float:
     """All points: `point_rows` and its derivatives in scalars, since they are most of the work.
 
@@ -375,7 +375,7 @@ def _add_points(state: BundleState, seen: BundleMeasurements, loss: int, out: No
     return cost
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _add_lines(state: BundleState, seen: BundleMeasurements, loss: int, out: NormalEquations, filled: bool) -> float:
     """Both ends of each observed segment against the points of the line opposite to them, in the image (rows 0 and 1) and, where the segment has a
     3D line, in depth (rows 2 and 3)."""
@@ -414,7 +414,7 @@ def _add_lines(state: BundleState, seen: BundleMeasurements, loss: int, out: Nor
     return cost
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _add_rows(r: F64, w: F64, J: F64, pose: int, H: F64, g: F64, V: F64, b: F64, W: F64) -> None:
     """Add four residuals r of weights w with derivatives J (4, 10) of a line seen by the keyframe whose unknowns begin at `pose`, negative for a held
     one; W (6, 4) is theirs alone. Number by number, so that none is loaded and stored four times."""
@@ -435,7 +435,7 @@ def _add_rows(r: F64, w: F64, J: F64, pose: int, H: F64, g: F64, V: F64, b: F64,
             W[i, j] = a0 * J[0, 6 + j] + a1 * J[1, 6 + j] + a2 * J[2, 6 + j] + a3 * J[3, 6 + j]
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def line_basis(line: F64, N: F64) -> None:
     """N (3, 2): two directions across a line (2, 3)."""
     n = np.empty(3)
@@ -447,7 +447,7 @@ def line_basis(line: F64, N: F64) -> None:
     basis(n, N)
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _end_variance(s: float, m: F64, covariance: F64) -> float:
     """Variance along m at the place s of an observed 3D segment whose ends have the covariances (2, 3, 3)."""
     total = 0.0
@@ -457,7 +457,7 @@ def _end_variance(s: float, m: F64, covariance: F64) -> float:
     return total
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _add_dense(r: F64, rows: int, L: F64, A: F64, a: int, size: int, B: F64, b: int, weight: float, H: F64, g: F64) -> None:
     """Add `weight · rᵀ L r` with derivatives A (rows, size) by the unknowns from a on and B (rows, 3) by those from b on, a < b or negative."""
     for i in range(rows):
@@ -476,7 +476,7 @@ def _add_dense(r: F64, rows: int, L: F64, A: F64, a: int, size: int, B: F64, b: 
                         H[b + y, a + x] += w * A[i, x] * B[j, y]
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _add_planes(state: BundleState, seen: BundleMeasurements, loss: int, out: NormalEquations) -> float:
     cost, first = 0.0, 6 * seen.free
     r, B, Jc, Jp = np.empty(3), np.empty((3, 2)), np.empty((3, 6)), np.empty((3, 3))
@@ -504,7 +504,7 @@ def _add_planes(state: BundleState, seen: BundleMeasurements, loss: int, out: No
     return cost
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def linearise_bundle(state: BundleState, seen: BundleMeasurements, loss: int, out: NormalEquations, filled: bool = True) -> float:
     """Fill the normal equations at a state; returns the cost under a loss: SQUARES, HUBER beyond the 95 % gate of each term, or TRUNCATED there (for
     planes and their relations HUBER still: they are few, and 5 % would be too many to lose). Where they need not be `filled` they are spoilt."""
@@ -519,7 +519,7 @@ def linearise_bundle(state: BundleState, seen: BundleMeasurements, loss: int, ou
 # A line moves across itself only, by two tangent coordinates at each of its two points (four unknowns, as a line has); a plane moves by the tangent
 # coordinates of its normal and d.
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def share_opposite(R: F64, t: F64, line: F64, pixel: F64, camera: F64) -> float:
     """Where along a world line (2, 3; 0 = start, 1 = end) lies the point nearest to the ray through a pixel; at most EXTEND beyond its ends."""
     x, y = (pixel[0] - camera[2]) / camera[0], (pixel[1] - camera[3]) / camera[1]
@@ -533,7 +533,7 @@ def share_opposite(R: F64, t: F64, line: F64, pixel: F64, camera: F64) -> float:
     return min(max(share, -EXTEND), 1.0 + EXTEND)
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def line_term(R: F64, t: F64, line: F64, N: F64, share: float, segment_px: F64, camera: F64, J: F64, p: F64) -> tuple[float, float]:
     """Distance (px) of the line's point at `share` from the observed segment (2, 2), and where along that it falls; NaN behind the camera. J (10,):
     by the pose, and by the coordinates in N (3, 2) of the line's first and of its second point. p (3,) is left as the camera-frame point."""
@@ -547,14 +547,14 @@ def line_term(R: F64, t: F64, line: F64, N: F64, share: float, segment_px: F64, 
     return r, along
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def line_depth_term(R: F64, N: F64, share: float, observed_m: F64, m: F64, J: F64, p: F64) -> tuple[float, float]:
     """As `line_term` for the distance (m) of the camera-frame point p from the observed 3D segment (2, 3) along m (3,)."""
     _line_chain(R, N, share, m[0], m[1], m[2], p, J)
     return line_depth_row(p, observed_m, m)
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _line_chain(R: F64, N: F64, share: float, a: float, b: float, c: float, p: F64, J: F64) -> None:
     """J (10,) of `line_term` from the derivatives by the camera-frame point p."""
     J[0], J[1], J[2] = -a, -b, -c
@@ -565,7 +565,7 @@ def _line_chain(R: F64, N: F64, share: float, a: float, b: float, c: float, p: F
         J[8 + k] = share * d0 * N[0, k] + share * d1 * N[1, k] + share * d2 * N[2, k]
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def by_plane(R: F64, t: F64, world: F64, B: F64, J: F64) -> None:
     """J (3, 3): derivative of `plane_rows` of kind SAME by the (a, b, d) of the world plane; B is `basis` of the observed normal."""
     Bw = np.empty((3, 2))
@@ -579,7 +579,7 @@ def by_plane(R: F64, t: F64, world: F64, B: F64, J: F64) -> None:
     J[2, 2] = 1.0
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def relation_rows(kind: int, first: F64, second: F64, B: F64, r: F64, J_first: F64, J_second: F64) -> int:
     """Parallel or perpendicular world planes: r (2,), J_first and J_second (2, 3) by their (a, b, d); returns the number of rows.
 

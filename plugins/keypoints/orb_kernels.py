@@ -5,15 +5,15 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-import numba
 import numpy as np
 
+from trihedron.pipeline.core.kernel import kernel
 from trihedron.pipeline.core.types import F32, F64, I32, U8, Bool
 from trihedron.plugins.shared.linalg_kernels import descending
 
 # Corners of all levels of a pyramid, chosen and directed in one call that holds no lock.
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def oriented_corners(
     pyramid: Pyramid, threshold: int, threshold_low: int, margin: int, cell_px: int, wanted: int, weights: F64
 ) -> tuple[I32, I32, F32]:
@@ -31,7 +31,7 @@ def oriented_corners(
     return pixels, levels, _directions(pyramid, pixels, levels)
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _candidates(pyramid: Pyramid, threshold: int, margin: int) -> tuple[I32, I32, I32]:
     """FAST corners of every level: pixels (n, 2), levels (n,) and strengths (n,)."""
     most = len(pyramid.pixels) // 4
@@ -42,7 +42,7 @@ def _candidates(pyramid: Pyramid, threshold: int, margin: int) -> tuple[I32, I32
     return pixels[:n], levels[:n], strengths[:n]
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _grid_cells(pixels: I32, levels: I32, shapes: I32, cell_px: int) -> tuple[I32, int]:
     """Cells (n,) of the full image that corners lie in (see `full_pixels`), and how many cells there are."""
     height, width = shapes[0]
@@ -58,7 +58,7 @@ def _grid_cells(pixels: I32, levels: I32, shapes: I32, cell_px: int) -> tuple[I3
     return out, across * (cell[height - 1] + 1)
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _strong_or_rare(strong: Bool, cells: I32, number: int, wanted: int) -> Bool:
     """(n,) which corners are strong, or in cells with fewer strong ones than twice a cell's share of those wanted."""
     count, out = np.zeros(number, np.int32), np.empty(len(strong), np.bool_)
@@ -69,7 +69,7 @@ def _strong_or_rare(strong: Bool, cells: I32, number: int, wanted: int) -> Bool:
     return out
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _rows(kept: Bool, pixels: I32, levels: I32, cells: I32) -> tuple[I32, I32, I32]:
     """The kept ones of corners."""
     n = 0
@@ -83,7 +83,7 @@ def _rows(kept: Bool, pixels: I32, levels: I32, cells: I32) -> tuple[I32, I32, I
     return some, at, of
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _measured(pyramid: Pyramid, pixels: I32, levels: I32, weights: F64) -> F64:
     """(n,) Harris measure times the level's weight."""
     out = np.empty(len(pixels))
@@ -93,7 +93,7 @@ def _measured(pyramid: Pyramid, pixels: I32, levels: I32, weights: F64) -> F64:
     return out
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _directions(pyramid: Pyramid, pixels: I32, levels: I32) -> F32:
     """(n,) directions of corners, degrees."""
     out = np.empty(len(pixels), np.float32)
@@ -104,7 +104,7 @@ def _directions(pyramid: Pyramid, pixels: I32, levels: I32) -> F32:
     return out
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _place(pyramid: Pyramid, pixels: I32, levels: I32, i: int) -> tuple[int, int]:
     """Where a corner is in the pyramid's pixels, and how many of these are a row: unsigned, so that no index is taken to count from the end."""
     cols = np.uint64(pyramid.shapes[levels[i], 1])
@@ -125,14 +125,14 @@ class Pyramid(NamedTuple):
         return [self.pixels[start : start + h * w].reshape(h, w) for (h, w), start in zip(self.shapes.tolist(), self.starts.tolist())]
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def level_of(pyramid: Pyramid, level: int) -> U8:
     """(h, w) one level."""
     h, w = pyramid.shapes[level]
     return pyramid.pixels[pyramid.starts[level] : pyramid.starts[level + 1]].reshape((h, w))
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def full_pixels(cells: I32, levels: I32, shapes: I32) -> F64:
     """(n, 2) positions in the full image of pixels (n, 2) of their levels (n,), pixel centres at integers: x is centred at (x + ½) s − ½."""
     out = np.empty((len(cells), 2))
@@ -148,7 +148,7 @@ def full_pixels(cells: I32, levels: I32, shapes: I32) -> F64:
 RADIUS = 3  # px of the circle compared with
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def fast_corners(image: U8, threshold: int, margin: int) -> tuple[I32, I32]:
     """FAST-9 corners (Rosten & Drummond, ECCV 2006) of an image (h, w), in rows: pixels (n, 2) and strengths (n,).
 
@@ -159,7 +159,7 @@ def fast_corners(image: U8, threshold: int, margin: int) -> tuple[I32, I32]:
     return pixels[:n].copy(), strengths[:n].copy()
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def find_corners(image: U8, threshold: int, margin: int, pixels: I32, strengths: I32, n: int) -> int:
     """Writes the corners of `fast_corners` to `pixels` and `strengths` from row n on; returns the row after the last. A quarter of the image's pixels
     cannot be more of them."""
@@ -185,7 +185,7 @@ def find_corners(image: U8, threshold: int, margin: int, pixels: I32, strengths:
     return n
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _strengths(image: U8, y: int, first: int, out: U8) -> None:
     """Writes the strength of a row's pixels from column `first`: (width,). Straight bytes, so that the compiler takes 32 pixels at a time."""
     left, right = first - RADIUS, first + len(out) + RADIUS
@@ -207,7 +207,7 @@ def _strengths(image: U8, y: int, first: int, out: U8) -> None:
         out[i] = np.uint8(max(more, np.uint8(1)) - 1)
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _arc(
     p0: int, p1: int, p2: int, p3: int, p4: int, p5: int, p6: int, p7: int,
     p8: int, p9: int, p10: int, p11: int, p12: int, p13: int, p14: int, p15: int,
@@ -230,7 +230,7 @@ def _arc(
     return max(max(max(r0, r2), max(r4, r6)), max(max(r8, r10), max(r12, r14)))
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _peaks(above: U8, here: U8, below: U8, threshold: int, out: U8) -> None:
     """Writes into `out` (width,) the strengths of a row that reach the threshold and exceed their eight neighbours', else 0."""
     least = np.uint8(threshold)
@@ -253,7 +253,7 @@ PATCH = 15  # radius of the disc the orientation is taken from (Rublee et al., I
 ROW = 32  # px looked at in a row of the disc: a constant that the compiler can take several of at once; the last counts nothing
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def harris_score(pixels: U8, corner: int, cols: int) -> float:
     """Harris measure `det - k trace²` of the gradients (Sobel) in the 7 × 7 window around a pixel, given by its unsigned place in rows of `cols`, and
     at least 5 px from the border."""
@@ -276,7 +276,7 @@ def harris_score(pixels: U8, corner: int, cols: int) -> float:
     return p * q2 - t * t - HARRIS_K * (p + q2) * (p + q2)
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def half_disc() -> tuple[F32, F32]:
     """For `centroid_angle`: of the pixels in rows 0 … `PATCH` of the disc, each `ROW` from column -`PATCH`, how far they are to the right, and 1;
     0 for those outside. Row 0 counts half, for it is taken twice."""
@@ -289,7 +289,7 @@ def half_disc() -> tuple[F32, F32]:
     return across, inside
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy", fastmath={"reassoc"})  # the sums are of small integers: exact in any order
+@kernel(fastmath={"reassoc"})  # the sums are of small integers: exact in any order
 def centroid_angle(pixels: U8, corner: int, cols: int, across: F32, inside: F32) -> float:
     """Direction from a pixel to the intensity centroid of the disc around it, degrees in [0, 360), x right and y down.
 
@@ -313,7 +313,7 @@ def centroid_angle(pixels: U8, corner: int, cols: int, across: F32, inside: F32)
 
 # Choosing image features spread over the image.
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def spread_over_cells(cells: I32, number: int, order: I32, wanted: int) -> Bool:
     """Which of n features to keep, (n,): each of a `number` of cells of the image gives its best in turn until `wanted` are kept.
 
@@ -353,7 +353,7 @@ WINDOW_PX = 7  # side of the square each end of a test is the mean of
 AREA = WINDOW_PX * WINDOW_PX
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def steered_brief(pyramid: Pyramid, cells: I32, levels: I32, angles_deg: F32, tests: F32) -> U8:
     """(n, 32) descriptors of the pixels (n, 2) of their levels (n,), none nearer to a border than `REACH_PX` and half a window.
 
@@ -380,7 +380,7 @@ def steered_brief(pyramid: Pyramid, cells: I32, levels: I32, angles_deg: F32, te
     return out
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _window_means(pixels: U8, start: int, h: int, w: int, out: U8) -> None:
     """Writes the rounded mean of the window about each pixel of a level, but for those less than half a window from its border. Two bytes hold what
     is summed, and unsigned indices do not count from the end, so that the compiler takes 32 pixels at a time."""
@@ -404,7 +404,7 @@ def _window_means(pixels: U8, start: int, h: int, w: int, out: U8) -> None:
                 columns[c] = np.uint16(np.uint16(columns[c] + pixels[new + c]) - pixels[old + c])
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _places(x: F32, y: F32, c: float, s: float, width: int, out: I32) -> None:
     """Writes how many pixels after the centre the turned ends (n,) lie, in rows of `width`."""
     for k in range(len(out)):

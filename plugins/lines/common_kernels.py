@@ -5,9 +5,9 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-import numba
 import numpy as np
 
+from trihedron.pipeline.core.kernel import kernel
 from trihedron.pipeline.core.types import F32, F64, U8
 from trihedron.plugins.shared.linalg_kernels import descending, median
 
@@ -28,7 +28,7 @@ class Placing(NamedTuple):
     reach_px: int
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def placed_segments(image: U8, found: F64, scale: float, placing: Placing, most: int) -> F32:
     """(n, 2, 2) the longest of the segments (m, 4) `found` on the image at `scale`, joined and placed on the edge of the image; twice, because
     fragments of one edge become collinear when placed."""
@@ -44,7 +44,7 @@ def placed_segments(image: U8, found: F64, scale: float, placing: Placing, most:
     return out[:most].copy()
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _worthy(lines: F64, least_px: float, border_px: float, width: int, height: int) -> F64:
     """Those that are long enough, and not the border of the image (or of what the sensor's registration left of it)."""
     out, n = np.empty((len(lines), 4)), 0
@@ -58,7 +58,7 @@ def _worthy(lines: F64, least_px: float, border_px: float, width: int, height: i
     return out[:n]
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def merge_collinear(lines: F64, angle: float, offset_px: float, gap_px: float) -> F64:
     """Join directed segments (n, 4) of rows (x0, y0, x1, y1) that continue each other: directions within `angle` rad, ends within `offset_px` of the
     longer one's line, at most `gap_px` apart along it. Returns (m, 4), longest first; ties by position, so the order of the input does not matter."""
@@ -103,7 +103,7 @@ def merge_collinear(lines: F64, angle: float, offset_px: float, gap_px: float) -
     return out[descending(joined[:m])]
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def refine_on_edge(image: U8, lines: F64, reach_px: int, step_px: float) -> F32:
     """Move directed segments (n, 4) onto the grey-level edge and direct them with the bright side on the right, (n, 2, 2).
 
@@ -146,7 +146,7 @@ def refine_on_edge(image: U8, lines: F64, reach_px: int, step_px: float) -> F32:
     return out
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _levels_beside(image: U8, scratch: F64, right: float, down: float, out: F64) -> None:
     """Writes grey levels (n,), bilinear, so far from the positions in the first two rows of `scratch`; those outside the image are the border's."""
     rows, cols = image.shape
@@ -162,7 +162,7 @@ def _levels_beside(image: U8, scratch: F64, right: float, down: float, out: F64)
         out[k] = top * (1.0 - b) + (flat[q] * (1.0 - a) + flat[q + np.uint64(1)] * a) * b
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _steepest(levels: F64, sign: int, slopes: F64, top: F64, row: F64) -> None:
     """From the grey levels across samples, two rows more than there are of `slopes`: the slopes, counted along `sign`, the steepest rise (n,) of each
     sample and its row. All samples of a row at once."""
@@ -177,7 +177,7 @@ def _steepest(levels: F64, sign: int, slopes: F64, top: F64, row: F64) -> None:
             top[k], row[k] = slope[k] if more else top[k], float(j) if more else row[k]
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _robust_line(t: F64, o: F64, strength: F64) -> tuple[float, float]:
     """Offset a and slope b of o ≈ a + b t, by least squares reweighted with w = strength / (1 + (r / ½ px)²), starting from the median offset."""
     a, b = median(o.copy()), 0.0
@@ -205,7 +205,7 @@ BANDS = 9
 BYTES = 32
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def line_band_descriptors(image: U8, lines: F32, scale: float, band_px: int, step_px: float) -> U8:
     """(n, 32) binary descriptors of directed segments (n, 2, 2), from an image (h, w) that is `scale` times the size of the one they were found in.
 
@@ -234,7 +234,7 @@ def line_band_descriptors(image: U8, lines: F32, scale: float, band_px: int, ste
     return out
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _gradients(image: U8) -> F32:
     """(h · w + 1, 2) derivatives (Sobel) to the right and down, the image reflected at its borders, and zeros for what lies outside."""
     h, w = image.shape
@@ -249,7 +249,7 @@ def _gradients(image: U8) -> F32:
     return out
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _gradient(above: U8, here: U8, below: U8, left: int, c: int, right: int, out: F32) -> None:
     """Writes the derivatives at column c, with those on both sides of it."""
     falling, rising = np.int32(below[right]) - np.int32(above[left]), np.int32(above[right]) - np.int32(below[left])
@@ -257,7 +257,7 @@ def _gradient(above: U8, here: U8, below: U8, left: int, c: int, right: int, out
     out[c, 0], out[c, 1] = np.int32(falling + rising + 2 * across), np.int32(falling - rising + 2 * down)
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _row_sums(
     gradients: F32, h: int, w: int, x0: float, y0: float, x1: float, y1: float, step_px: float, weights: F64, scratch: F64, rows: F64
 ) -> None:
@@ -289,7 +289,7 @@ def _row_sums(
         rows[r, 0], rows[r, 1], rows[r, 2], rows[r, 3] = weight * a[r], weight * b[r], weight * c[r], weight * d[r]
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _bands(rows: F64, band_px: int, weights: F64) -> F64:
     """(9, 8): mean and standard deviation of the row sums of each band and its neighbours, weighted (3 · band_px,); both parts normalised over the
     line."""

@@ -5,9 +5,9 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-import numba
 import numpy as np
 
+from trihedron.pipeline.core.kernel import kernel
 from trihedron.pipeline.core.types import F32, F64, I32, U8
 
 # Straight line segments as regions of pixels whose level lines run alike (von Gioi et al., PAMI 2010; IPOL 2012).
@@ -24,7 +24,7 @@ class LevelLines(NamedTuple):
     magnitude: F32
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def line_support_segments(image: U8, tolerance: float, quantisation: float, density: float) -> F64:
     """(n, 4) end points (x, y, x, y) of the segments of an image (h, w), pixel centres at integers, strongest seed first.
 
@@ -55,7 +55,7 @@ def line_support_segments(image: U8, tolerance: float, quantisation: float, dens
     return out[:n].copy()
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _level_lines(image: U8, threshold: float) -> LevelLines:
     """Of the gradients over 2 × 2 pixels; the image's border is not free."""
     h, w = image.shape
@@ -71,7 +71,7 @@ def _level_lines(image: U8, threshold: float) -> LevelLines:
     return LevelLines(image, free, magnitude)
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _level_line(a: int, b: int, c: int, d: int) -> tuple[float, float, float]:
     """Unit vector and magnitude of the gradient over two rows of two grey levels each."""
     falling, rising = np.int32(d) - np.int32(a), np.int32(b) - np.int32(c)
@@ -81,7 +81,7 @@ def _level_line(a: int, b: int, c: int, d: int) -> tuple[float, float, float]:
     return -gy * inverse, gx * inverse, m
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _by_strength(magnitude: F32, threshold: float, strong: I32) -> I32:
     """Pixels whose gradient is above a threshold, from the largest to the smallest, in classes of about equal magnitude. `strong` is overwritten."""
     limit, scale = np.float32(threshold), (BINS - 1) / max(magnitude.max(), np.float32(1e-6))
@@ -101,7 +101,7 @@ def _by_strength(magnitude: F32, threshold: float, strong: I32) -> I32:
     return order
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _grow(region: I32, seed: int, w: int, cosine: float, free: F32) -> tuple[int, float, float]:
     """Takes the free pixels connected to a seed whose level lines are within an angle of the region's mean; (number, x, y along the mean)."""
     region[0, 0], region[0, 1], size, done = seed % w, seed // w, 1, 0
@@ -126,7 +126,7 @@ def _grow(region: I32, seed: int, w: int, cosine: float, free: F32) -> tuple[int
     return size, x, y
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _fit_rectangle(region: I32, w: int, x: float, y: float, magnitude: F32, out: F64) -> None:
     """Rectangle of a region about its weighted principal axis, directed like (x, y): end points (4), width, share of it that is filled."""
     total, cx, cy = 0.0, 0.0, 0.0
@@ -157,7 +157,7 @@ def _fit_rectangle(region: I32, w: int, x: float, y: float, magnitude: F32, out:
     out[5] = len(region) / (max(last - first, 1.0) * out[4])
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _refine(region: I32, size: int, w: int, x: float, y: float, density: float, lines: LevelLines, rectangle: F64) -> int:
     """Grows a sparse region anew with the tolerance that the level lines about its seed show, then cuts it shorter until it fills its rectangle."""
     sx, sy, turn, square, near = region[0, 0], region[0, 1], 0.0, 0.0, 0
@@ -191,7 +191,7 @@ def _refine(region: I32, size: int, w: int, x: float, y: float, density: float, 
     return size
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _release(lines: LevelLines, c: int, r: int) -> tuple[float, float]:
     """Makes a pixel free to be taken again; its level line."""
     image = lines.image

@@ -3,10 +3,10 @@
 
 from __future__ import annotations
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from trihedron.pipeline.core.kernel import kernel
 from trihedron.pipeline.core.types import I32
 from trihedron.plugins.shared.descriptors_kernels import hamming
 
@@ -18,7 +18,7 @@ from trihedron.plugins.shared.descriptors_kernels import hamming
 U64 = NDArray[np.uint64]
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def nearest_words(bits: U64, vocabulary: U64) -> I32:
     """(n,) row of the nearest word of each descriptor, the first of equally near ones."""
     out = np.zeros(len(bits), np.int32)

@@ -7,14 +7,14 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from trihedron.pipeline.core.kernel import kernel
 from trihedron.pipeline.core.types import F64, I32
 
 if TYPE_CHECKING:  # imported where it is needed: SciPy is slow to load, and most runs close no loop
     pass
-import numba
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def turns_kernel(vectors: F64, information: F64, places: I32, R_world_manhattan: F64, poses: F64, least_cos: float, gate: float) -> tuple[F64, F64]:
     """(k, 3) and (k, 3, 3), see `Compass`, from world directions (n, 3) with their information, seen at the keyframes `places` (n,).
 

@@ -3,9 +3,9 @@
 
 from __future__ import annotations
 
-import numba
 import numpy as np
 
+from trihedron.pipeline.core.kernel import kernel
 from trihedron.pipeline.core.types import F64, I32
 from trihedron.plugins.manhattan.common_kernels import (
     NORMALS_PER_SAMPLE,
@@ -21,7 +21,7 @@ CONTRAST, SIGMA = 2.5, 3.0  # a mode has so many times what directions without o
 QUARTER = 0.5 * np.pi
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def azimuth_modes(vectors: F64, weights: F64, first_line: int, vertical: F64, cone: float, apart: int, most: int, least: float) -> tuple[F64, F64]:
     """Rotations (k, 3, 3) with the vertical as third column and a horizontal mode as first, heaviest first, and their weights (k,).
 
@@ -50,7 +50,7 @@ def azimuth_modes(vectors: F64, weights: F64, first_line: int, vertical: F64, co
     return rotations[:found], masses[:found]
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _turned(base: F64, angle: float) -> F64:
     """`base` (3, 3) turned about its third column."""
     out, c, s = base.copy(), np.cos(angle), np.sin(angle)
@@ -59,7 +59,7 @@ def _turned(base: F64, angle: float) -> F64:
     return out
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _histograms(vectors: F64, weights: F64, first_line: int, base: F64, limit: float, alike: float) -> tuple[F64, F64]:
     """(BINS,) weight of the directions near the plane of the first two columns of `base`, by their turn, and the squares of what errs independently;
     `alike` normals of weight 1 err alike."""
@@ -74,7 +74,7 @@ def _histograms(vectors: F64, weights: F64, first_line: int, base: F64, limit: f
     return histogram, squares
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _peaks(histogram: F64, apart: int) -> I32:
     """Bins where the smoothed histogram is largest within `apart`, fullest first."""
     smooth, tops, found = np.zeros(BINS), np.empty(BINS, np.int32), 0
@@ -93,7 +93,7 @@ def _peaks(histogram: F64, apart: int) -> I32:
 
 # Rotations that share their third axis, fitted together to directions on any of their axes.
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def fit_shared_vertical(
     directions: F64, information: F64, columns: I32, counted: int, rotations: F64, prior: float, gate: float, iterations: int
 ) -> tuple[F64, F64, float, float]:
@@ -155,7 +155,7 @@ def fit_shared_vertical(
     return rotations, H, chi2, components
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def shared_vertical(first: F64, R: F64) -> F64:
     """R (3, 3) with the third column of `first` (3, 3), its first column staying as near as it can."""
     out = np.empty((3, 3))

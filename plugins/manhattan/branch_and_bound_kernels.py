@@ -5,9 +5,9 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-import numba
 import numpy as np
 
+from trihedron.pipeline.core.kernel import kernel
 from trihedron.pipeline.core.types import F64, I32
 from trihedron.plugins.shared.linalg_kernels import solve_positive, turn_left
 
@@ -28,7 +28,7 @@ class Maps(NamedTuple):
     near: tuple[F64, F64, F64]  # one a level: an axis within the radius of the level's cubes of the cell
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def image(vectors: F64, weights: F64, grid: SphereGrid, cones: Neighbours, inlier: float) -> F64:
     """(cells,) upper bound of the consensus of one axis anywhere in a cell: directions count by their angle to the cell, not to its centre."""
     out, face, steep = np.zeros(len(grid.radii)), int(np.sqrt(len(grid.radii) / 3.0) + 0.5), 1.0 / np.sin(inlier) ** 2
@@ -47,7 +47,7 @@ def image(vectors: F64, weights: F64, grid: SphereGrid, cones: Neighbours, inlie
     return out
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _look_up(values: F64, R: F64) -> float:
     """Sum of a map over the cells in which the axes of R lie."""
     face, total = int(np.sqrt(len(values) / 3.0) + 0.5), 0.0
@@ -56,7 +56,7 @@ def _look_up(values: F64, R: F64) -> float:
     return total
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def angle_to_equivalent(R: F64, Q: F64) -> float:
     """Angle between R and the nearest of the 24 equivalents of Q, exact when below 45° and else at least that."""
     trace = 0.0
@@ -68,7 +68,7 @@ def angle_to_equivalent(R: F64, Q: F64) -> float:
     return np.arccos(min(max(0.5 * (trace - 1.0), -1.0), 1.0))
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _split(cubes: F64, half: float) -> F64:
     """Centres (8 n, 3) of the eighths of cubes (n, 3), `half` being the half side of the eighths."""
     out = np.empty((8 * len(cubes), 3))
@@ -78,7 +78,7 @@ def _split(cubes: F64, half: float) -> F64:
     return out
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _first_cubes() -> F64:
     cubes, half = np.zeros((1, 3)), HALF_WIDTH
     while len(cubes) < FIRST**3:
@@ -87,7 +87,7 @@ def _first_cubes() -> F64:
     return cubes
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _centre(cube: F64, start: F64, R: F64) -> None:
     """Write the rotation in the middle of a cube, `R_start Exp(v)`, to R."""
     for k in range(9):
@@ -98,7 +98,7 @@ def _centre(cube: F64, start: F64, R: F64) -> None:
             R[i, j], R[j, i] = R[j, i], R[i, j]
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _bounds(groups: Groups, maps: Maps, cubes: F64, level: int, radius: float, start: F64, inlier: float, best: float) -> tuple[F64, F64]:
     """For each cube an upper bound of its consensus, and the consensus of its centre: -1 when the bound is not above `best`, on the map's levels a
     guess."""
@@ -116,7 +116,7 @@ def _bounds(groups: Groups, maps: Maps, cubes: F64, level: int, radius: float, s
     return uppers, values
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _climb_promising(groups: Groups, cubes: F64, values: F64, start: F64, inlier: float, top: F64, best: float, exact: bool) -> tuple[F64, float]:
     """The best summit: `top` or that of a slope on which one of the most promising centres is. `values` is used up."""
     R = np.empty((3, 3))
@@ -136,7 +136,7 @@ def _climb_promising(groups: Groups, cubes: F64, values: F64, start: F64, inlier
     return top, best
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def search(
     groups: Groups, maps: Maps, start: F64, inlier: float, certificate: float, slack: float, max_cubes: int
 ) -> tuple[F64, float, float, int, int]:
@@ -199,13 +199,13 @@ class Near(NamedTuple):
     value: float  # what the others do add at the centre
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def curvature(beta: float) -> float:
     """κ(β) = cos β (1 - cos β), the second derivative when ω is midway between d and r; for every other ω it is less."""
     return np.cos(beta) * (1.0 - np.cos(beta))
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def near_rotation(groups: Groups, R: F64, radius: float, inlier: float) -> Near:
     """What directions add within `radius` of R, `inlier` being τ; inlier + radius < 45°, so that no direction is near two axes.
 
@@ -240,7 +240,7 @@ def near_rotation(groups: Groups, R: F64, radius: float, inlier: float) -> Near:
     return Near(sure, torque, constant, value)
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _nearest_axis(x: float, y: float, z: float, R: F64) -> tuple[int, float]:
     axis, dot = 0, x * R[0, 0] + y * R[1, 0] + z * R[2, 0]
     for k in range(1, 3):
@@ -250,7 +250,7 @@ def _nearest_axis(x: float, y: float, z: float, R: F64) -> tuple[int, float]:
     return axis, dot
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _add_cross(out: F64, factor: float, R: F64, k: int, x: float, y: float, z: float) -> None:
     """out += factor · r_k × (x, y, z)."""
     out[0] += factor * (R[1, k] * z - R[2, k] * y)
@@ -258,7 +258,7 @@ def _add_cross(out: F64, factor: float, R: F64, k: int, x: float, y: float, z: f
     out[2] += factor * (R[0, k] * y - R[1, k] * x)
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _pulls(sure: F64, R: F64) -> F64:
     """(3, 3) columns M_k r_k: half the derivative of r_kᵀ M_k r_k by r_k."""
     out = np.empty((3, 3))
@@ -270,7 +270,7 @@ def _pulls(sure: F64, R: F64) -> F64:
     return out
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _first_order(near: Near, R: F64, pulls: F64, gradient: F64) -> tuple[float, float, float]:
     """At R: Σ r_kᵀ M_k r_k and the weight of the sure inliers. Writes the derivative by phi of that, and of the bound on the others, to `gradient`
     (3,), and returns its length last."""
@@ -284,7 +284,7 @@ def _first_order(near: Near, R: F64, pulls: F64, gradient: F64) -> tuple[float, 
     return total, weight, np.sqrt(gradient[0] ** 2 + gradient[1] ** 2 + gradient[2] ** 2)
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def consensus_bound(groups: Groups, R: F64, radius: float, inlier: float) -> tuple[float, float]:
     """C(R), and an upper bound of C for all rotations within `radius` of R."""
     near = near_rotation(groups, R, radius, inlier)
@@ -295,7 +295,7 @@ def consensus_bound(groups: Groups, R: F64, radius: float, inlier: float) -> tup
     return (total + near.value) / s2, (total + near.constant + rise) / s2 + ROUNDING * groups.total
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def climb(groups: Groups, R: F64, inlier: float, steps: int) -> tuple[F64, float]:
     """The rotation at the top of the slope on which R is, and its consensus, which no step lowers.
 
@@ -322,7 +322,7 @@ def climb(groups: Groups, R: F64, inlier: float, steps: int) -> tuple[F64, float
     return top, max(best, 0.0) / np.sin(inlier) ** 2
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def summit_radius(groups: Groups, R: F64, best: float, inner: float, inlier: float) -> float:
     """The largest angle found such that no rotation from `inner` to it off R has more consensus than `best`; `inner` when nothing is proven.
 
@@ -346,7 +346,7 @@ def summit_radius(groups: Groups, R: F64, best: float, inner: float, inlier: flo
     return reach
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _hessian(sure: F64, R: F64, pulls: F64, out: F64) -> None:
     """Second derivative of Σ r_kᵀ M_k r_k by phi: Σ 2 [r]×ᵀ M [r]× + r (M r)ᵀ + (M r) rᵀ - 2 rᵀ M r I."""
     for a in range(3):
@@ -364,7 +364,7 @@ def _hessian(sure: F64, R: F64, pulls: F64, out: F64) -> None:
                 out[a, b] += 2.0 * (u * p + v * q + w * r) + R[a, k] * pulls[b, k] + pulls[a, k] * R[b, k]
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _moved(R: F64, k: int, a: int) -> tuple[float, float, float]:
     """e_a × r_k: how the axis moves with phi_a."""
     if a == 0:
@@ -390,7 +390,7 @@ class Groups(NamedTuple):
     total: float  # of the weights
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def group_directions(vectors: F64, weights: F64) -> Groups:
     """Group unit directions (n, 3) with positive weights (n,) by cells of the sphere; d and -d are the same."""
     n = CELLS
@@ -422,7 +422,7 @@ def group_directions(vectors: F64, weights: F64) -> Groups:
     return Groups(in_order, in_order_weights, first, means, moments, total)
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _summarise(vectors: F64, weights: F64, begin: int, end: int, mean: F64, moments: F64) -> None:
     """Fill a row of `Groups.means` and of `Groups.moments`."""
     for i in range(begin, end):
@@ -438,7 +438,7 @@ def _summarise(vectors: F64, weights: F64, begin: int, end: int, mean: F64, mome
     mean[4] = np.sqrt(max(1.0 - mean[3] ** 2, 0.0))
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def add_moments(moments: F64, w: float, x: float, y: float, z: float) -> None:
     """Add a direction to a row of `Groups.moments`."""
     moments[0] += w * x * x
@@ -469,7 +469,7 @@ class Neighbours(NamedTuple):
     cells: I32
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def cell_of(x: float, y: float, z: float, n: int) -> int:
     """The cell of a direction, which may have any length but 0."""
     if abs(x) >= abs(y) and abs(x) >= abs(z):
@@ -482,7 +482,7 @@ def cell_of(x: float, y: float, z: float, n: int) -> int:
     return (face * n + i) * n + j
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def neighbours(grid: SphereGrid, reach: float) -> Neighbours:
     """For each cell those with a point within `reach` (rad) of one of its own."""
     centres, radii = grid
@@ -507,7 +507,7 @@ def neighbours(grid: SphereGrid, reach: float) -> Neighbours:
     return Neighbours(first, cells)
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def largest_near(values: F64, near: Neighbours) -> F64:
     """For each cell the largest of `values` (cells,) on its neighbours."""
     out = np.empty(len(values))
@@ -519,7 +519,7 @@ def largest_near(values: F64, near: Neighbours) -> F64:
     return out
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def coarser(values: F64, n: int) -> F64:
     """The largest of each 2 by 2 cells: values on the grid of n / 2, n being even."""
     half = n // 2

@@ -5,9 +5,9 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-import numba
 import numpy as np
 
+from trihedron.pipeline.core.kernel import kernel
 from trihedron.pipeline.core.types import F32, F64, I32, Bool
 from trihedron.plugins.shared.linalg_kernels import few_descending, inverse_positive, polar_rotation, solve_positive, turn_left
 from trihedron.plugins.shared.manhattan_frames_kernels import assign_axes, measured_directions
@@ -18,7 +18,7 @@ NOTHING_KNOWN = np.radians(30.0) ** 2  # rad², variance of a rotation that was 
 BEFOREHAND = 3.0
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def gathered(normals: F32, ends_m: F32, ends_px: F32, samples: int, per_px: float) -> tuple[F64, F64, int]:
     """The fields of `Directions`."""
     surface = subsample_normals(normals, samples)
@@ -41,7 +41,7 @@ def gathered(normals: F32, ends_m: F32, ends_px: F32, samples: int, per_px: floa
     return vectors[:n], weights[:n], count
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def variance_scale(chi2: float, freedom: float) -> float:
     """Of the variances assumed, by the residuals' χ² with so many degrees of freedom. The assumption counts like BEFOREHAND more: a scene that shows
     little keeps it, one with many planes and edges tells by itself how true its walls are."""
@@ -59,7 +59,7 @@ class FitOptions(NamedTuple):
     use_lines: bool
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def fitted(
     R: F64, axes: F64, normals: F64, taking_part: Bool, planes: F64, plane_covariance: F64, ends_m: F32, end_covariance: F32,
     rules: FitOptions, gate: float, floor: float,
@@ -80,7 +80,7 @@ def fitted(
     return R, covariance
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def measured_kernel(
     R: F64, axes: F64, normals: F64, planes: F64, plane_covariance: F64, ends_m: F32, end_covariance: F32, rules: FitOptions
 ) -> tuple[F64, F64, I32]:
@@ -116,7 +116,7 @@ class ModeLimits(NamedTuple):
     max_skew: float
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def surfaces_kernel(planes: F64, covariance: F64, pixels: I32, image: float, cone: float) -> F64:
     """`ModeFinder._surfaces` of those planes (p, 4) that are known; `image` has so many pixels."""
     out, n = np.empty((len(planes), 5)), 0
@@ -131,7 +131,7 @@ def surfaces_kernel(planes: F64, covariance: F64, pixels: I32, image: float, con
     return out[:n]
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def followed(
     vectors: F64, weights: F64, first: int, start: F64, shift: tuple[float, float, int, float], planes: F64, rules: ModeLimits
 ) -> tuple[F64, F64, F64, Bool, bool]:
@@ -148,7 +148,7 @@ def followed(
     return axes, normals, lines, seen, supported
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def judged(vectors: F64, weights: F64, first: int, axes: F64, normals: F64, lines: F64, planes: F64, rules: ModeLimits) -> tuple[Bool, bool]:
     """(3,) which modes are seen, and whether they make a Manhattan frame."""
     peaks = peaks_kernel(vectors, weights, first, axes, normals, lines, planes, rules)
@@ -158,7 +158,7 @@ def judged(vectors: F64, weights: F64, first: int, axes: F64, normals: F64, line
     return seen, seen.sum() >= 2 and explained >= rules.min_explained
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def peaks_kernel(vectors: F64, weights: F64, first: int, axes: F64, normals: F64, lines: F64, planes: F64, rules: ModeLimits) -> Bool:
     """(m,) which of the axes (3, m) are peaks."""
     cone, least, number, share, widest, _, _ = rules
@@ -175,7 +175,7 @@ BINS = 90  # one degree each, of a quarter turn
 ROWS_APART = 4  # of those in which valid normals are counted
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def subsample_normals(normals: F32, most: int) -> F64:
     """At most `most` of the finite normals of a grid (h, w, 3), on a regular sub-grid: (n, 3)."""
     h, w = normals.shape[:2]
@@ -195,7 +195,7 @@ def subsample_normals(normals: F32, most: int) -> F64:
     return out[:n]
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def shift_axes(directions: F64, weights: F64, axes: F64, cone: float, bandwidth: float, iterations: int, tolerance: float) -> F64:
     """Move each of m axes (3, m) to the Gaussian-weighted mean of the directions within `cone` (rad) of it, in its tangent plane, until none moves by
     more than `tolerance` (rad). A direction goes to its nearest axis only; an axis without directions stays. Returns the axes (Zhou et al. 2016)."""
@@ -235,7 +235,7 @@ def shift_axes(directions: F64, weights: F64, axes: F64, cone: float, bandwidth:
     return axes
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _across(x: float, y: float, z: float) -> tuple[float, float, float, float, float, float]:
     """Two unit vectors at right angles to the unit vector (x, y, z) and to each other."""
     if abs(x) < 0.7:
@@ -247,7 +247,7 @@ def _across(x: float, y: float, z: float) -> tuple[float, float, float, float, f
     return u[0], u[1], u[2], y * u[2] - z * u[1], z * u[0] - x * u[2], x * u[1] - y * u[0]
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def mode_statistics(directions: F64, weights: F64, axes: F64, cone: float) -> F64:
     """(m, 4) for each of m axes (3, m): number and weight of the directions within the cone which have none nearer, their mean squared angle (rad²),
     and the mean square of its component across the axis where that is largest. Without order the latter is cone² / 4, and cone² / 3 when all
@@ -279,7 +279,7 @@ def mode_statistics(directions: F64, weights: F64, axes: F64, cone: float) -> F6
     return out
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def density(directions: F64, weights: F64, axes: F64, bandwidth: float) -> float:
     """Sum of the weights, each times a Gaussian of the angle to its nearest axis."""
     total = 0.0
@@ -291,14 +291,14 @@ def density(directions: F64, weights: F64, axes: F64, bandwidth: float) -> float
     return total
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def orthonormal(axes: F64, weights: F64) -> F64:
     """The rotation nearest to three axes, each counting by its weight: the rotation in `Σ w_k a_k e_kᵀ`. An axis of weight 0
     becomes the cross product of the others; with fewer than two weights the remaining turn is arbitrary."""
     return polar_rotation(axes * weights)
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def right_handed(first: F64) -> F64:
     """(3, 3) rotation whose first column is the unit vector `first`."""
     across = _across(first[0], first[1], first[2])
@@ -308,7 +308,7 @@ def right_handed(first: F64) -> F64:
     return out
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _mass(directions: F64, weights: F64, starts: F64, cone: float) -> F64:
     """(m,) weight of the directions within the cone of each start, falling off towards its rim."""
     mass, floor = np.zeros(len(starts)), np.cos(cone)
@@ -320,7 +320,7 @@ def _mass(directions: F64, weights: F64, starts: F64, cone: float) -> F64:
     return mass
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def densest(directions: F64, weights: F64, starts: F64, cone: float, count: int) -> F64:
     """Of `starts` (m, 3) those with most weight within the cone, at least two cones apart; at most `count`, heaviest first."""
     mass, chosen, apart = _mass(directions, weights, starts, cone), np.empty((count, 3)), np.cos(2.0 * cone)
@@ -336,7 +336,7 @@ def densest(directions: F64, weights: F64, starts: F64, cone: float, count: int)
     return chosen
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _histogram(directions: F64, weights: F64, frame: F64, cone: float) -> F64:
     """(BINS,) weight of the directions normal to the first column of `frame` by their turn from its second to its third, modulo a quarter turn."""
     histogram, limit = np.zeros(BINS), np.sin(cone)
@@ -348,7 +348,7 @@ def _histogram(directions: F64, weights: F64, frame: F64, cone: float) -> F64:
     return histogram
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _quarter_turns(histogram: F64, count: int) -> F64:
     """(count,) the fullest turns (rad, modulo a quarter turn), 10° apart."""
     smooth, turns = np.zeros(BINS), np.empty(count)
@@ -363,7 +363,7 @@ def _quarter_turns(histogram: F64, count: int) -> F64:
     return turns
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def search_axes(directions: F64, weights: F64, starts: F64, cone: float, bandwidth: float, primaries: int, turns: int) -> F64:
     """The three orthogonal axes of greatest density, from nothing: each of the `primaries` densest directions with its `turns` fullest turns about it
     is refined and compared. `starts` (m, 3) are directions spread over the half sphere, less than a cone apart. (3, 3) rotation."""
@@ -386,7 +386,7 @@ def search_axes(directions: F64, weights: F64, starts: F64, cone: float, bandwid
     return found
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def fit_rotation(directions: F64, information: F64, axes: I32, counted: int, R: F64, gate: float, iterations: int) -> tuple[F64, F64, float, float]:
     """Rotation whose columns `axes[i]` best fit measured directions (n, 3), signs free; rows with axis -1 take no part. `information` is (n, 3, 3) in
     1/rad², zero along the direction. Gauss–Newton on `R <- Exp(phi) R` with Cauchy weights, one half at `gate` σ. Returns R, the information of
@@ -430,7 +430,7 @@ def fit_rotation(directions: F64, information: F64, axes: I32, counted: int, R: 
     return R, H, chi2, components
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _add_cross(a: F64, v: F64, w: float, out: F64) -> None:
     """out += w (a × v)."""
     out[0] += w * (a[1] * v[2] - a[2] * v[1])
@@ -443,7 +443,7 @@ def _add_cross(a: F64, v: F64, w: float, out: F64) -> None:
 NORMALS_PER_SAMPLE = 20.0  # neighbouring normals share pixels and the sensor's errors: so many count as one
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def surface_peaks(axes: F64, normals: F64, count: int, least: float, widest: float, planes: F64) -> Bool:
     """(m,) whether the share `least` of `count` normals stands on each axis (3, m), denser than directions without order would (mean square below
     `widest`) or beside planes with that share of the image. A plane is a row of (p, 5): its normal, the cosine of its reach, its share."""
@@ -456,7 +456,7 @@ def surface_peaks(axes: F64, normals: F64, count: int, least: float, widest: flo
     return peaks
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def line_peaks(directions: F64, length: F64, axes: F64, lines: F64, number: int, share: float, widest: float, cone: float) -> Bool:
     """(m,) whether `number` lines with `share` of the length of all stand on each axis (3, m), and on the axes together more than lines (n, 3), drawn
     any way on one wall would.
@@ -480,14 +480,14 @@ def line_peaks(directions: F64, length: F64, axes: F64, lines: F64, number: int,
     return peaks
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def by_chance(mean_square: float, cone: float, per_reach: float, length: F64) -> float:
     """The length that lines (n,) without order have within reach of an axis, give or take 3 sigma; reach is 3 standard deviations of those on it."""
     share = per_reach * min(max(3.0 * np.sqrt(mean_square), np.radians(2.0)), cone)
     return share * length.sum() + 3.0 * np.sqrt(share * (1.0 - share) * (length * length).sum())
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def perpendicular(axes: F64, normals: F64, lines: F64, skew: float) -> Bool:
     """(m, m) whether two modes (3, m) are within `skew` of a right angle, as far as their own uncertainty can tell."""
     count = len(normals)
@@ -503,7 +503,7 @@ def perpendicular(axes: F64, normals: F64, lines: F64, skew: float) -> Bool:
     return fits
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def largest_fitting(peaks: Bool, fits: Bool, weights: F64) -> Bool:
     """(3,) the most, and of those the heaviest, of three peaks that fit each other."""
     best, rank = np.zeros(3, np.bool_), 0.0

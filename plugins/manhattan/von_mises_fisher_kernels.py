@@ -5,9 +5,9 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-import numba
 import numpy as np
 
+from trihedron.pipeline.core.kernel import kernel
 from trihedron.pipeline.core.types import F64
 from trihedron.plugins.shared.linalg_kernels import polar_rotation
 
@@ -29,7 +29,7 @@ class AxisMixture(NamedTuple):
     weight: F64  # (2, 3)
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def improved(
     mixture: AxisMixture, directions: F64, weights: F64, first_line: int, prior: float, concentration: float, free: bool = False
 ) -> AxisMixture:
@@ -60,7 +60,7 @@ def improved(
     return AxisMixture(R, kappa, share, resultant, sums[:, :, 0].copy(), sums[:, :, 1].copy())
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def converged(
     mixture: AxisMixture,
     directions: F64,
@@ -82,7 +82,7 @@ def converged(
     return mixture
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _belonging(directions: F64, weights: F64, first_line: int, R: F64, concentration: F64, share: F64) -> F64:
     """(2, 3, 6) per population and axis: number, weight, `Σ w (1 − |x·a|)` and `Σ w ±x` of the directions, each as far as it belongs to the axis."""
     out = np.zeros((2, 3, 6))

@@ -3,16 +3,16 @@
 
 from __future__ import annotations
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from trihedron.pipeline.core.kernel import kernel
 from trihedron.pipeline.core.types import F64, I32, Bool
 
 FARTHER = 1.2  # a landmark seen from at most this many times as far is seen as well: a level of the key points' pyramid
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def seen_as_near(
     observed: I32, ends: NDArray[np.int64], keyframes: I32, observers: I32, centres: F64, rows: I32, poses: F64, alive: Bool, others: int
 ) -> NDArray[np.int64]:
@@ -39,7 +39,7 @@ def seen_as_near(
     return counts
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _away(T: F64, p: F64) -> float:
     """How far a point is from a camera."""
     x, y, z = T[0, 3] - p[0], T[1, 3] - p[1], T[2, 3] - p[2]

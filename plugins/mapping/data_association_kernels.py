@@ -3,14 +3,14 @@
 
 from __future__ import annotations
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from trihedron.pipeline.core.kernel import kernel
 from trihedron.pipeline.core.types import F64, I32
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def related(
     planes: F64, known: F64, same: I32, order: NDArray[np.int64], ids: I32, parallel_above: float, perpendicular_below: float, most: int
 ) -> tuple[I32, I32]:
@@ -35,7 +35,7 @@ def related(
     return parallel[:p], perpendicular[:q]
 
 
-@numba.njit(cache=True, error_model="numpy")
+@kernel(nogil=False)
 def pairs_kernel(found: I32, ids: I32, count: int) -> I32:
     """Of `count` rows the one found for each landmark (-1 = none), no row for two -> (n, 2) pairs (row, id) sorted by row."""
     owner, pairs, n = np.full(count, -1, np.int32), np.empty((len(found), 2), np.int32), 0

@@ -3,9 +3,9 @@
 
 from __future__ import annotations
 
-import numba
 import numpy as np
 
+from trihedron.pipeline.core.kernel import kernel
 from trihedron.pipeline.core.types import F64
 from trihedron.plugins.shared.pose_optimizer_kernels import (
     NEAR_M,
@@ -21,7 +21,7 @@ from trihedron.plugins.shared.pose_optimizer_kernels import (
 
 # Information filters that move point and line landmarks by what a keyframe measured of them.
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _noise(D: F64, p: F64, pose_covariance: F64, rows: int, J: F64, S: F64) -> None:
     """S: covariance that an uncertain pose gives to residuals with derivatives D (rows, 3) by the camera-frame point p."""
     chain_point(D, rows, p, J)
@@ -33,7 +33,7 @@ def _noise(D: F64, p: F64, pose_covariance: F64, rows: int, J: F64, S: F64) -> N
                     S[a, b] += J[a, i] * pose_covariance[i, j] * J[b, j]
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _update(position: F64, information: F64, R: F64, D: F64, r: F64, S: F64, rows: int) -> None:
     """One Gauss–Newton step of a landmark on r (rows,), whose derivative by the camera-frame point is D and covariance S; in place."""
     W, C, E, g = np.zeros((3, 3)), np.zeros((3, 3)), np.zeros((3, 3)), np.zeros(3)
@@ -52,7 +52,7 @@ def _update(position: F64, information: F64, R: F64, D: F64, r: F64, S: F64, row
         position[i] -= C[i, 0] * g[0] + C[i, 1] * g[1] + C[i, 2] * g[2]
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _fade_across(information: F64, ends: F64, share: float) -> None:
     """Information (3, 3) of a line's end times `share` across the line, in place. Along it, where no segment says anything, it stays: forgotten and
     never measured again it would vanish beside the other, and a rounded matrix is then no information any more, but has a negative eigenvalue."""
@@ -72,7 +72,7 @@ def _fade_across(information: F64, ends: F64, share: float) -> None:
             information[i, j] = share * information[i, j] + mixed
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def fuse_points(
     T_world_camera: F64,
     pose_covariance: F64,
@@ -106,7 +106,7 @@ def fuse_points(
         _update(positions[i], information[i], R, D, r, S, rows)
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def fuse_lines(
     T_world_camera: F64,
     pose_covariance: F64,

@@ -3,13 +3,13 @@
 
 from __future__ import annotations
 
-import numba
 import numpy as np
 
+from trihedron.pipeline.core.kernel import kernel
 from trihedron.pipeline.core.types import F32
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def spread(points: F32, count: int) -> F32:
     """(count, 3) of the finite rows of points (n, 3), each the one farthest from those before it; NaN-padded."""
     out = np.full((count, 3), np.nan, np.float32)

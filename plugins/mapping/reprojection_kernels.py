@@ -3,9 +3,9 @@
 
 from __future__ import annotations
 
-import numba
 import numpy as np
 
+from trihedron.pipeline.core.kernel import kernel
 from trihedron.pipeline.core.types import F32, F64, I32
 from trihedron.plugins.shared.linalg_kernels import invert_symmetric
 from trihedron.plugins.shared.pose_optimizer_kernels import PARALLEL, PERPENDICULAR, SAME, LineTerms, PointTerms
@@ -13,7 +13,7 @@ from trihedron.plugins.shared.pose_optimizer_kernels import PARALLEL, PERPENDICU
 EXTEND = 0.25  # a line's map end points may be moved outwards by this share of its length
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def point_terms_kernel(positions_m: F64, information: F32, rows: I32, pixels: F32, points_m: F32, sigmas_px: F32, sigmas_m: F32) -> PointTerms:
     n = len(rows)
     covariance, seen, depth_m, sigma_px, sigma_m = np.empty((n, 3, 3)), np.empty((n, 2)), np.empty(n), np.empty(n), np.empty(n)
@@ -25,7 +25,7 @@ def point_terms_kernel(positions_m: F64, information: F32, rows: I32, pixels: F3
     return PointTerms(positions_m, covariance, seen, depth_m, sigma_px, sigma_m)
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def line_terms_kernel(
     endpoints_m: F64, information: F32, rows: I32, ends_px: F32, ends_m: F32, covariances_m2: F32, T: F64, camera: F64, sigma_px: float
 ) -> LineTerms:
@@ -49,7 +49,7 @@ def line_terms_kernel(
     return LineTerms(points, covariance, seen_px, sigmas_px, seen_m, noise)
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
+@kernel(forceinline=True)
 def _share_opposite(line_m: F64, pixel: F64, T: F64, camera: F64) -> float:
     """Where along a world line (2, 3; 0 = start, 1 = end) lies the point nearest to the ray through a pixel, from the camera's pose T (4, 4). With d
     along the line and r the ray, `r × (d × r) = d (r·r) - r (r·d)` is normal to the ray in the plane it spans with the line."""
@@ -63,7 +63,7 @@ def _share_opposite(line_m: F64, pixel: F64, T: F64, camera: F64) -> float:
     return min(max(share, -EXTEND), 1.0 + EXTEND)
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def plane_terms_kernel(
     covariance: F64, pairs: I32, parallel: int, perpendicular: int, coefficients: F64, noise: F64, extra: float
 ) -> tuple[I32, F64, F64]:

@@ -3,16 +3,16 @@
 
 from __future__ import annotations
 
-import numba
 import numpy as np
 
+from trihedron.pipeline.core.kernel import kernel
 from trihedron.pipeline.core.types import F32, F64, I32, U8, Bool
 
 NEAR_M = 0.1
 MAX_SCALE_CHANGE = 2.0  # of the distance; beyond, a point does not look the same
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def seen(
     points: F64, directions: F32, distances: F32, octaves: U8, T_world_camera: F64, intrinsics: tuple[float, float, float, float, int, int],
     cosine: float, log_scale: float,
@@ -41,7 +41,7 @@ def seen(
     return rows[:n], pixels[:n], depth[:n], levels[:n]
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def clipped(world: F64, T: F64, intrinsics: tuple[float, float, float, float, int, int]) -> tuple[F64, Bool]:
     fx, fy, cx, cy, width, height = intrinsics
     pixels, left, local = np.empty((len(world), 2, 2)), np.zeros(len(world), np.bool_), np.empty((2, 3))

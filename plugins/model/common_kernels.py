@@ -5,10 +5,10 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from trihedron.pipeline.core.kernel import kernel
 from trihedron.pipeline.core.types import F32, F64, I32, U8, Bool
 from trihedron.plugins.shared.tsdf_volume_kernels import SIDE
 from trihedron.plugins.shared.voxel_hash_kernels import I64, key_of, number_of, slot_of
@@ -36,7 +36,7 @@ class Blocks(NamedTuple):
     weight: U8  # (n, CELLS)
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def insert(keys: I64, numbers: I32, places: I32) -> None:
     for i in range(len(places)):
         key = key_of(places[i, 0], places[i, 1], places[i, 2])
@@ -44,7 +44,7 @@ def insert(keys: I64, numbers: I32, places: I32) -> None:
         keys[slot], numbers[slot] = key, i
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def in_view(places: I32, camera: Lens, shape: tuple[int, int], block_m: float) -> Bool:
     """(n,) whether the sphere around a block may fall into the image."""
     fx, fy, cx, cy = camera.lens
@@ -62,7 +62,7 @@ def in_view(places: I32, camera: Lens, shape: tuple[int, int], block_m: float) -
     return out
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def integrate(blocks: Blocks, touched: I32, depth: F32, camera: Lens, voxel: float, truncation: float, most: int) -> Bool:
     """Update the voxels of the blocks `touched` (n, 3), which are among the blocks; (m,) which of these changed."""
     h, w = depth.shape

@@ -5,9 +5,9 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-import numba
 import numpy as np
 
+from trihedron.pipeline.core.kernel import kernel
 from trihedron.pipeline.core.types import F32, F64, I32, U8, Bool
 from trihedron.plugins.model.common_kernels import NEAREST_M, Lens
 
@@ -25,7 +25,7 @@ class Images(NamedTuple):
     noise: F64
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _in_camera(s: F32, camera: Lens) -> tuple[float, float, float]:
     """A surfel's place in the camera's axes."""
     R, t = camera.R_camera_world, camera.position_m
@@ -33,7 +33,7 @@ def _in_camera(s: F32, camera: Lens) -> tuple[float, float, float]:
     return R[0, 0] * a + R[0, 1] * b + R[0, 2] * c, R[1, 0] * a + R[1, 1] * b + R[1, 2] * c, R[2, 0] * a + R[2, 1] * b + R[2, 2] * c
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def index_map(surfels: F32, camera: Lens, shape: tuple[int, int]) -> I32:
     """(h, w) row of the nearest surfel whose centre falls on a pixel, -1 = none; those seen from behind do not count."""
     fx, fy, cx, cy = camera.lens
@@ -57,7 +57,7 @@ def index_map(surfels: F32, camera: Lens, shape: tuple[int, int]) -> I32:
     return out
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def fuse(
     surfels: F32, seen: I32, pixels: I32, images: Images, camera: Lens, index: int, apart: float, cosine: float, most: float
 ) -> tuple[Bool, F32]:  # fmt: skip
@@ -114,7 +114,7 @@ def fuse(
     return changed, fresh[:count].copy()
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def shown(surfels: F32, camera: Lens, shape: tuple[int, int], stable: float) -> tuple[F32, F32, F32]:
     """Depth (h, w), normals (h, w, 3) in the camera's axes and colour (h, w, 3) of the surfels drawn as discs, the nearest surface in front; those
     of a confidence below `stable` only where there is no other."""

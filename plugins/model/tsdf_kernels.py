@@ -3,9 +3,9 @@
 
 from __future__ import annotations
 
-import numba
 import numpy as np
 
+from trihedron.pipeline.core.kernel import kernel
 from trihedron.pipeline.core.types import F32, I32, U8
 from trihedron.plugins.model.common_kernels import FULL, I16, NEAREST_M, Blocks, Lens
 from trihedron.plugins.shared.tsdf_volume_kernels import SIDE
@@ -17,7 +17,7 @@ BEFORE = 1.5  # truncations before a reading, where the search begins
 TILE = 8  # pixels that share the range of depths in which there are blocks
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def ranges_kernel(blocks: Blocks, camera: Lens, shape: tuple[int, int], block_m: float) -> F32:
     """(rows, columns, 2) nearest and farthest depth of a block in each tile; (inf, 0) without one."""
     fx, fy, cx, cy = camera.lens
@@ -45,7 +45,7 @@ def ranges_kernel(blocks: Blocks, camera: Lens, shape: tuple[int, int], block_m:
     return out
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _between(keys: I64, numbers: I32, distance: I16, weight: U8, x: float, y: float, z: float) -> float:
     """The distance at a place (voxels) as a share of the truncation, trilinear; NaN where one of the eight voxels about it is not known."""
     i, j, k = int(np.floor(x)), int(np.floor(y)), int(np.floor(z))
@@ -64,7 +64,7 @@ def _between(keys: I64, numbers: I32, distance: I16, weight: U8, x: float, y: fl
     return total
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def cast_kernel(
     keys: I64, numbers: I32, distance: I16, weight: U8, camera: Lens, ranges: F32, depth: F32, voxel: float, truncation: float
 ) -> F32:  # fmt: skip

@@ -3,15 +3,15 @@
 
 from __future__ import annotations
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from trihedron.pipeline.core.kernel import kernel
 from trihedron.pipeline.core.types import F32, F64, I32, U8
 
 # An organised cloud of points for detectors that expect clean ones: smoothed over patches that never cross a depth edge.
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def smooth_cells(rho: F32, count: U8, full: int, jump: float, jump_m: float) -> U8:
     """(h, w) 1 where a cell's inverse depth rho is that of its centre, because all its `full` readings are there, and no neighbour in its row or
     column differs from it by more than `jump` z + `jump_m`."""
@@ -30,7 +30,7 @@ def smooth_cells(rho: F32, count: U8, full: int, jump: float, jump_m: float) -> 
     return out
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def smoothed_points(rho: F32, clear: F32, radii: I32, rays_x: F64, rays_y: F64) -> F64:
     """(h, w, 4) points of the cells, inverse depth averaged over a square around each; NaN where there is none, the last number is 0.
 
@@ -58,7 +58,7 @@ def smoothed_points(rho: F32, clear: F32, radii: I32, rays_x: F64, rays_y: F64) 
     return out
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def trusted_normals(normals: F64, rho: F32, clear: F32, radii: I32, reach: int, border: int, rays_x: F64, rays_y: F64) -> F32:
     """(h, w, 3) the first three of (h, w, 4) numbers, turned towards the camera; NaN where they are no direction, within `border` cells of the
     image's border or `reach` of a cell that is not smooth, or where either left less than half of the square of `smoothed_points`."""
@@ -88,7 +88,7 @@ VECTOR = np.dtype([("x", "f4"), ("y", "f4"), ("z", "f4")])
 Records = NDArray[np.void]  # of SUMS or VECTOR: their size is known when a kernel is compiled, so that it takes several at once
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def patch_normals(
     depth: F32, stride: int, edge: tuple[int, float, float], radii: I32, share: float, intrinsics: tuple[float, float, float, float]
 ) -> F32:
@@ -136,7 +136,7 @@ def patch_normals(
     return out.reshape(-1).view(np.float32).reshape(h, w, 3)
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _smooth_blocks(depth: F32, stride: int, edge: tuple[int, float, float]) -> U8:
     """(h, w) 0 where a block of stride × stride pixels holds a depth edge, else 1.
 
@@ -155,14 +155,14 @@ def _smooth_blocks(depth: F32, stride: int, edge: tuple[int, float, float]) -> U
     return smooth
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _known(depth: F32, z: F32) -> None:
     """Copies a row of depths, 0 = none."""
     for x in range(len(depth)):
         z[x] = depth[x] if depth[x] > 0.0 and depth[x] < np.inf else np.float32(0.0)
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _strip_of(depth: F32, first: int, strip: F32) -> None:
     """The depths of a row of blocks (stride, w · stride), 0 = none."""
     rows, cols = depth.shape
@@ -173,12 +173,12 @@ def _strip_of(depth: F32, first: int, strip: F32) -> None:
             strip[i] = 0.0
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _step(z: float, other: float, jump: float, jump_m: float) -> bool:
     return abs(z - other) > jump * min(z, other) + jump_m
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _marked(z: F32, above: F32, above_row: I32, y: int, reach: int, jump: float, jump_m: float, marks: U8) -> bool:
     """Marks in a row of depths, 0 = none: 1 = a step from the depth above, 2 = from the pixel on the left, 4 = nothing is measured there. Returns
     whether there are any."""
@@ -194,7 +194,7 @@ def _marked(z: F32, above: F32, above_row: I32, y: int, reach: int, jump: float,
     return some > 0
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _spoil(z: F32, above_row: I32, y: int, reach: int, jump: float, jump_m: float, marks: U8, stride: int, smooth: U8) -> None:
     """Writes 0 to the blocks on both sides of a row's edges."""
     r = y // stride
@@ -213,7 +213,7 @@ def _spoil(z: F32, above_row: I32, y: int, reach: int, jump: float, jump_m: floa
             smooth[r, x // stride] = smooth[r, left // stride] = 0
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _remember(z: F32, above: F32, above_row: I32, y: int) -> None:
     """The last depth measured in each column, and its row."""
     for x in range(len(z)):
@@ -221,7 +221,7 @@ def _remember(z: F32, above: F32, above_row: I32, y: int) -> None:
         above_row[x] = y if z[x] > 0.0 else above_row[x]
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _block_row(strip: F32, stride: int, r: int, out: F64) -> None:
     """Count, Σz, Σuz and Σvz (4, w) of the blocks of a strip (stride, w · stride)."""
     counts, totals, alongs, downs = out[0], out[1], out[2], out[3]
@@ -237,7 +237,7 @@ def _block_row(strip: F32, stride: int, r: int, out: F64) -> None:
         counts[c], totals[c], alongs[c], downs[c] = n, total, along, down
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _integrate(block: F64, above: Records, out: Records) -> None:
     """The next row (w + 1,) of the integral images."""
     n, total, along, down = 0.0, 0.0, 0.0, 0.0
@@ -248,7 +248,7 @@ def _integrate(block: F64, above: Records, out: Records) -> None:
         out[i]["n"], out[i]["z"], out[i]["uz"], out[i]["vz"] = above[i]["n"] + n, above[i]["z"] + total, above[i]["uz"] + along, above[i]["vz"] + down
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _clear_rings(smooth: U8, most: int) -> U8:
     """(h, w) how many rings of blocks about each, `most` at most, are free of depth edges, as it is itself; what is outside the image is free."""
     h, w = smooth.shape
@@ -268,7 +268,7 @@ def _clear_rings(smooth: U8, most: int) -> U8:
     return out
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _decimetres(above: Records, below: Records, out: I32) -> None:
     """Mean depth (w,) of the blocks between two rows (w + 1,) of the integral images, in whole decimetres; -1 without depth."""
     for c in range(len(out)):
@@ -277,7 +277,7 @@ def _decimetres(above: Records, below: Records, out: I32) -> None:
         out[c] = np.int32(min(10.0 * z, 1e6)) if n > 0.5 else -1
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _boxes(flat: F64, a: int, b: int, c: int, d: int, out: F64, first: int, n: int) -> None:
     """Sums over boxes side by side, given by the places of their corners in the flat rows of the integral images: a − b − c + d. Numbers that cannot
     be negative need no test for indices that count from the end, so the compiler takes several at once."""
@@ -286,7 +286,7 @@ def _boxes(flat: F64, a: int, b: int, c: int, d: int, out: F64, first: int, n: i
         out[o + t] = flat[i + t] - flat[j + t] - flat[k + t] + flat[m + t]
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _box(flat: F64, a: int, b: int, c: int, d: int, out: F64, first: int) -> None:
     """`_boxes` of one box."""
     i, j, k, m, o = np.uint64(a), np.uint64(b), np.uint64(c), np.uint64(d), np.uint64(first)
@@ -296,7 +296,7 @@ def _box(flat: F64, a: int, b: int, c: int, d: int, out: F64, first: int) -> Non
     out[o + three] = flat[i + three] - flat[j + three] - flat[k + three] + flat[m + three]
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _halves(flat: F64, kept: int, h: int, w: int, r: int, first: int, end: int, k: int, least: float, halves: F64, needed: F64) -> None:
     """The halves of the patches, k blocks to each side, of the blocks first … end of a row; only that of a single block may be cut by the image."""
     row, side, place, n = 4 * (w + 1), 4 * w, 4 * first, 4 * (end - first)
@@ -319,7 +319,7 @@ def _halves(flat: F64, kept: int, h: int, w: int, r: int, first: int, end: int, 
         needed[1, c] = max(least * (c1 - c0) * a, 1.0)
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _normals_of_row(
     east: Records, west: Records, south: Records, north: Records, needed: F64, intrinsics: tuple[float, float, float, float], out: Records
 ) -> None:

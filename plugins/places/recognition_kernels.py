@@ -3,15 +3,15 @@
 
 from __future__ import annotations
 
-import numba
 import numpy as np
 
+from trihedron.pipeline.core.kernel import kernel
 from trihedron.pipeline.core.types import F64, I32
 from trihedron.plugins.shared.descriptors_kernels import U64, hamming
 from trihedron.plugins.shared.linalg_kernels import polar_rotation
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def lookalikes_kernel(query: U64, train: U64, max_bits: int, ratio: float) -> I32:
     out = np.full(len(query), -1, np.int32)
     for i in range(len(query)):
@@ -27,7 +27,7 @@ def lookalikes_kernel(query: U64, train: U64, max_bits: int, ratio: float) -> I3
     return out
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _as_long(camera_m: F64, world_m: F64, limit: F64, i: int, j: int) -> bool:
     """Whether two pairs of places are as far apart here as there, and far enough to tell a direction."""
     here, there = 0.0, 0.0
@@ -37,7 +37,7 @@ def _as_long(camera_m: F64, world_m: F64, limit: F64, i: int, j: int) -> bool:
     return here > 0.1**2 and abs(np.sqrt(here) - np.sqrt(there)) <= limit[i] + limit[j]
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def consensus(camera_m: F64, world_m: F64, limit: F64, draws: I32) -> tuple[F64, I32]:
     """Pose and number of agreeing pairs of each draw; 0 for one whose triangles differ."""
     poses, support = np.zeros((len(draws), 4, 4)), np.zeros(len(draws), np.int32)

@@ -3,15 +3,15 @@
 
 from __future__ import annotations
 
-import numba
 import numpy as np
 
+from trihedron.pipeline.core.kernel import kernel
 from trihedron.pipeline.core.types import F64, I32
 from trihedron.plugins.planes.common_blocks_kernels import SUMS, block_mse, block_plane
 
 # Agglomerative hierarchical clustering of blocks into planes (Feng, Taguchi and Kamat, ICRA 2014).
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def cluster_blocks(sums: F64, block_limit: float, limit: float, excess: float, least: float) -> tuple[I32, F64]:
     """Labels (rows, cols) of the blocks, 0 = none, and q (k, 3) of their clusters.
 
@@ -70,7 +70,7 @@ def cluster_blocks(sums: F64, block_limit: float, limit: float, excess: float, l
     return _labelled(parent, finished, flat, rows, cols)
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _labelled(parent: I32, finished: np.ndarray, flat: F64, rows: int, cols: int) -> tuple[I32, F64]:
     """Labels of the blocks and q of the clusters that are finished, in the order of their first blocks."""
     n = rows * cols
@@ -89,7 +89,7 @@ def _labelled(parent: I32, finished: np.ndarray, flat: F64, rows: int, cols: int
     return labels.reshape(rows, cols), planes
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _root(parent: I32, i: int) -> int:
     while parent[i] != i:
         parent[i] = parent[parent[i]]
@@ -97,7 +97,7 @@ def _root(parent: I32, i: int) -> int:
     return i
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _links(closed: np.ndarray, rows: int, cols: int) -> tuple[I32, I32, I32, I32]:
     """Linked lists of each node's neighbours in its row and column: first and last edge of a node, the edge after an edge, and where it leads."""
     n = rows * cols
@@ -119,7 +119,7 @@ def _links(closed: np.ndarray, rows: int, cols: int) -> tuple[I32, I32, I32, I32
     return first, last, following, other
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _unlink(first: I32, last: I32, following: I32, i: int, before: int, edge: int) -> int:
     """Take an edge out of the list of node i; returns the edge before it."""
     if before < 0:
@@ -131,7 +131,7 @@ def _unlink(first: I32, last: I32, following: I32, i: int, before: int, edge: in
     return before
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _append(first: I32, last: I32, following: I32, i: int, j: int) -> None:
     """Hang the list of node j behind that of node i."""
     if first[j] < 0:
@@ -143,7 +143,7 @@ def _append(first: I32, last: I32, following: I32, i: int, j: int) -> None:
     last[i] = last[j]
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _push(heap: F64, size: int, mse: float, i: int, version: int) -> int:
     """Put an entry into the heap (least mse on top, then least number); returns the new size."""
     k = size
@@ -157,7 +157,7 @@ def _push(heap: F64, size: int, mse: float, i: int, version: int) -> int:
     return size + 1
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _pop(heap: F64, size: int) -> int:
     """Take the top off the heap; returns the new size."""
     size -= 1
@@ -174,12 +174,12 @@ def _pop(heap: F64, size: int) -> int:
     return size
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _before(heap: F64, k: int, m: int) -> bool:
     return heap[k, 0] < heap[m, 0] or (heap[k, 0] == heap[m, 0] and heap[k, 1] < heap[m, 1])
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _swap(heap: F64, k: int, m: int) -> None:
     for i in range(3):
         heap[k, i], heap[m, i] = heap[m, i], heap[k, i]

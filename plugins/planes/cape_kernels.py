@@ -3,9 +3,9 @@
 
 from __future__ import annotations
 
-import numba
 import numpy as np
 
+from trihedron.pipeline.core.kernel import kernel
 from trihedron.pipeline.core.types import F64, I32, Bool
 from trihedron.plugins.planes.common_blocks_kernels import SUMS, block_mse, block_plane
 
@@ -14,7 +14,7 @@ from trihedron.plugins.planes.common_blocks_kernels import SUMS, block_mse, bloc
 BINS = 20  # of the polar and of the azimuth angle in the histogram of directions, Proença & Gao
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def grow_blocks(sums: F64, q: F64, mse: F64, limit: float, cos_angle: float, gate: float, least: int) -> tuple[I32, F64]:
     """Labels (rows, cols) of the blocks, 0 = none, and q (k, 3) of their planes.
 
@@ -51,7 +51,7 @@ def grow_blocks(sums: F64, q: F64, mse: F64, limit: float, cos_angle: float, gat
     return labels.reshape(rows, cols), out[:found]
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _directions(planes: F64, free: Bool) -> tuple[F64, I32, I32]:
     """Unit normals (n, 3) of the planes q, the bin of each, and the histogram of the free ones."""
     normal, bins, histogram = np.zeros_like(planes), np.zeros(len(planes), np.int32), np.zeros(BINS * BINS, np.int32)
@@ -68,7 +68,7 @@ def _directions(planes: F64, free: Bool) -> tuple[F64, I32, I32]:
     return normal, bins, histogram
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _flattest(flatness: F64, bins: I32, free: Bool, wanted: int) -> int:
     """The free block of a bin with the least mse."""
     best = -1
@@ -78,7 +78,7 @@ def _flattest(flatness: F64, bins: I32, free: Bool, wanted: int) -> int:
     return best
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _region(seed: int, flat: F64, planes: F64, normal: F64, free: Bool, rows: int, cols: int, cos_angle: float, gate: float) -> I32:
     """The free blocks reached from the seed, each like the one it was reached from."""
     n = rows * cols
@@ -100,7 +100,7 @@ def _region(seed: int, flat: F64, planes: F64, normal: F64, free: Bool, rows: in
     return queue[:size]
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _common_plane(flat: F64, members: I32, limit: float) -> tuple[float, float, float, int]:
     """q of the plane through the blocks, without those that do not fit it (three rounds), and the number that do."""
     total, kept = np.zeros(SUMS), len(members)

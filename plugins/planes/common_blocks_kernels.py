@@ -8,16 +8,16 @@ of a fit is in units of σ_z² of the sensor's noise model: the same threshold s
 
 from __future__ import annotations
 
-import numba
 import numpy as np
 
+from trihedron.pipeline.core.kernel import kernel
 from trihedron.pipeline.core.types import F32, F64, I32
 from trihedron.plugins.shared.depth_image_kernels import Grid
 
 SUMS = 11
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def block_sums(grid: Grid, side: int, share: float) -> F64:
     """(rows, cols, 11) sums of blocks of side × side cells; zeros where fewer than `share` of a block's cells have depth."""
     rho, sigma, count, rays_x, rays_y, _ = grid
@@ -52,7 +52,7 @@ def block_sums(grid: Grid, side: int, share: float) -> F64:
     return sums
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def block_plane(s: F64) -> tuple[float, float, float, float]:
     """q (three numbers) of the plane through a row of sums, and the mse; infinite without a plane. Centred first, so that nothing cancels."""
     if s[5] <= 0.0:
@@ -67,7 +67,7 @@ def block_plane(s: F64) -> tuple[float, float, float, float]:
     return a, b, p - a * x - b * y, max(pp - a * xp - b * yp, 0.0) / s[10]
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def block_mse(s: F64, a: float, b: float, c: float) -> float:
     """Mean squared residual, in σ_z², of a row of sums about the plane q = (a, b, c)."""
     x, y = s[2] / s[5], s[4] / s[5]
@@ -78,7 +78,7 @@ def block_mse(s: F64, a: float, b: float, c: float) -> float:
     return max(spread + s[5] * mean * mean, 0.0) / s[10]
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def block_planes(sums: F64) -> tuple[F64, F64]:
     """q (rows, cols, 3) and mse (rows, cols) of each block; the mse is infinite where there is no plane."""
     rows, cols = sums.shape[:2]
@@ -89,7 +89,7 @@ def block_planes(sums: F64) -> tuple[F64, F64]:
     return q, mse
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def blocks_to_cells(blocks: I32, side: int, rho: F32) -> I32:
     """Labels (h, w) of the cells that have depth from those (rows, cols) of their blocks."""
     h, w = rho.shape

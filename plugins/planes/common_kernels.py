@@ -3,9 +3,9 @@
 
 from __future__ import annotations
 
-import numba
 import numpy as np
 
+from trihedron.pipeline.core.kernel import kernel
 from trihedron.pipeline.core.types import F32, F64, I32, U8, Bool
 from trihedron.plugins.shared.depth_image_kernels import Grid, cells_by_component
 from trihedron.plugins.shared.linalg_kernels import descending, fill_tangent_basis, inverse_positive, median, solve_positive
@@ -15,7 +15,7 @@ from trihedron.plugins.shared.linalg_kernels import descending, fill_tangent_bas
 MOST = 254  # regions the labels can name
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def solve_symmetric(A: F64, b: F64) -> tuple[bool, F64]:
     """Solution (3,) of a symmetric positive definite 3 × 3 system by cofactors; False, and zeros, when it is singular."""
     c00, c01, c02 = A[1, 1] * A[2, 2] - A[1, 2] * A[1, 2], A[0, 2] * A[1, 2] - A[0, 1] * A[2, 2], A[0, 1] * A[1, 2] - A[0, 2] * A[1, 1]
@@ -30,7 +30,7 @@ def solve_symmetric(A: F64, b: F64) -> tuple[bool, F64]:
     return True, x
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def fit_components(
     grid: Grid, cells: I32, starts: I32, cone: float, gate: float, curved: float, least: int, labels: U8, planes: F64, found: int
 ) -> int:
@@ -57,7 +57,7 @@ def fit_components(
     return found
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def fit_labelled(grid: Grid, labels: I32, planes: F64, cone: float, gate: float, least: int) -> tuple[U8, F64]:
     """Fit a plane to each labelled region (h, w), starting from its q in `planes` (k, 3), or two where it is two parallel surfaces. Returns the
     labels of the members, and the q, of those that have `least` members by the rules of `fit_cells`, largest first and MOST at most."""
@@ -83,13 +83,13 @@ def fit_labelled(grid: Grid, labels: I32, planes: F64, cone: float, gate: float,
     return out, fitted[:found]
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _fit_component(columns: F64, some: F64, cos_cone: float, gate: float, member: Bool) -> tuple[F64, int]:
     """q of the plane that most of a component belongs to and its number of members, which are marked; zeros when there is none."""
     return _trimmed(start_plane(dominant_normal(some, cos_cone), some, cos_cone), 0, columns, some, cos_cone, gate, member)
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _trimmed(q: F64, first: int, columns: F64, some: F64, cos_cone: float, gate: float, member: Bool) -> tuple[F64, int]:
     """Rounds of trimmed weighted least squares with a narrowing gate, the `first` of them left out, on some of the cells and last on all: (q, number
     of members), which are marked. A round that marks the same members has the plane of the one before."""
@@ -105,7 +105,7 @@ def _trimmed(q: F64, first: int, columns: F64, some: F64, cos_cone: float, gate:
     return q, members
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def dominant_normal(columns: F64, cos_cone: float) -> F64:
     """The commonest direction among the cells' normals: the fullest bin of a coarse grid over (n_x, n_y), then three mean shifts within the cone."""
     sums = np.zeros((21 * 21, 4))  # number and sum of the normals in each bin
@@ -136,7 +136,7 @@ def dominant_normal(columns: F64, cos_cone: float) -> F64:
     return np.array([x, y, z])
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def start_plane(normal: F64, columns: F64, cos_cone: float) -> F64:
     """q of the plane with this normal at the median distance of (at most 400 of) the cells that face its way."""
     xs, ys, rho, nx, ny, nz = columns[0], columns[1], columns[2], columns[5], columns[6], columns[7]
@@ -153,7 +153,7 @@ def start_plane(normal: F64, columns: F64, cos_cone: float) -> F64:
     return -normal / d if d > 1e-6 else np.zeros(3)
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def fit_cells(q: F64, columns: F64, cos_cone: float, gate: float, member: Bool) -> tuple[F64, int]:
     """One round of trimmed weighted least squares: (q, number of members). A cell is a member when its normal is within the cone of q's and its depth
     within `gate` σ of q's; `member` (per cell) is written. A degenerate fit returns zeros, and nothing is a member."""
@@ -161,7 +161,7 @@ def fit_cells(q: F64, columns: F64, cos_cone: float, gate: float, member: Bool) 
     return _fit_members(columns, member, found)
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _mark_members(q: F64, columns: F64, cos_cone: float, gate: float, member: Bool) -> tuple[int, bool]:
     """Write which cells are members as in `fit_cells`: how many are, and whether these are others than were marked."""
     xs, ys, rho, sigma, nx, ny, nz = columns[0], columns[1], columns[2], columns[3], columns[5], columns[6], columns[7]
@@ -179,7 +179,7 @@ def _mark_members(q: F64, columns: F64, cos_cone: float, gate: float, member: Bo
     return found, changed > 0
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _fit_members(columns: F64, member: Bool, found: int) -> tuple[F64, int]:
     """(q, number of members) by weighted least squares to the marked cells; (zeros, 0) when they are degenerate, and nothing stays marked."""
     solved, q = solve_symmetric(*normal_equations(columns, member))
@@ -189,7 +189,7 @@ def _fit_members(columns: F64, member: Bool, found: int) -> tuple[F64, int]:
     return q, found
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def turn(q: F64, columns: F64, member: Bool) -> float:
     """How far the normals turn across the members, rad: about 0 for a plane whatever its noise, all of the angle seen for a cylinder.
     Members without a normal do not count."""
@@ -216,7 +216,7 @@ def turn(q: F64, columns: F64, member: Bool) -> float:
 
 # Labelled planar regions on a grid: growth to their borders, sums over their cells, and which are the largest.
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def grow_regions(labels: U8, planes: F64, grid: Grid, gate: float, reach: int, cos_cone: float) -> U8:
     """Labels (h, w), grown ring by ring into unlabelled cells whose depth is within `gate` σ of the neighbouring region's q; returns a copy.
 
@@ -265,7 +265,7 @@ def grow_regions(labels: U8, planes: F64, grid: Grid, gate: float, reach: int, c
     return out
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _border(labels: U8) -> I32:
     """Flat numbers of the labelled cells beside unlabelled ones."""
     h, w = labels.shape
@@ -286,7 +286,7 @@ def _border(labels: U8) -> I32:
     return out[:n]
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def accumulate(labels: U8, regions: int, grid: Grid) -> tuple[F64, F64, F64, I32]:
     """Sums over each region's cells, all of which have depth, weighted by their number of depths: the normal equations of q (k, 3, 3) and (k, 3) with
     `σ = σ_z / z²`, the moments `Σ [x;1][x;1]ᵀ / σ_z²` (k, 4, 4), and the number of depths (k,)."""
@@ -317,7 +317,7 @@ def accumulate(labels: U8, regions: int, grid: Grid) -> tuple[F64, F64, F64, I32
     return A, b, M, n[1:].copy()
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _add_stretch(columns: F64, y: float, sums: F64) -> None:
     """Add cells beside each other, by x/z, inverse depth, depth and weights (5, n), to the sums (19,) of their region, which do not go through
     memory meanwhile."""
@@ -337,14 +337,14 @@ def _add_stretch(columns: F64, y: float, sums: F64) -> None:
     sums[9], sums[10], sums[11], sums[12], sums[13], sums[14], sums[15], sums[16], sums[17], sums[18] = XX, XY, XZ, X1, YY, YZ, Y1, ZZ, Z1, ONE
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def weigh_cells(sigma: F32, count: U8, out: F64) -> None:
     """Weights (w,) of a row's inverse depths, inf or NaN without any."""
     for c in range(len(out)):
         out[c] = np.int32(count[c]) / (float(sigma[c]) * sigma[c])
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _symmetric(upper: F64, out: F64) -> None:
     """Fill a square matrix from its upper triangle, row by row."""
     k = 0
@@ -354,7 +354,7 @@ def _symmetric(upper: F64, out: F64) -> None:
             k += 1
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def areas(labels: U8, count: U8, regions: int) -> I32:
     """(k,) number of depths in each region's cells."""
     out, flat, counts = np.zeros(regions + 1, np.int32), labels.ravel(), count.ravel()
@@ -368,7 +368,7 @@ def areas(labels: U8, count: U8, regions: int) -> I32:
     return out[1:]
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def largest_regions(labels: U8, owner: I32, count: U8 | I32, least: int, most: int) -> tuple[U8, U8, I32, I32]:
     """The regions of at least `least` depths, `most` at most, as 1 … k from the largest: `labels` (h, w) by these numbers, 0 = none, the number of
     each label, which of the regions each is, and its number of depths. `owner` (k + 1,) says which region a label belongs to, 0 = none."""
@@ -395,7 +395,7 @@ NOISE = 7.815  # χ² of a plane's three parameters, 95 %
 PARALLEL = 4.0  # times less than the common plane is turned from either must two surfaces be turned from each other to be a step, not a bend
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def grown_and_merged(
     core: U8, planes: F64, grid: Grid, gate: float, reach: int, cos_cone: float, gap: int, limit: float, alike: float
 ) -> tuple[U8, I32, tuple[F64, F64, F64, I32]]:
@@ -405,7 +405,7 @@ def grown_and_merged(
     return labels, merge_regions(*sums, neighbours(labels, len(planes), gap), limit, alike), sums
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def neighbours(labels: U8, count: int, gap: int) -> F64:
     """(count, count) number of places where regions lie within `gap` cells of each other in a row or column."""
     h, w = labels.shape
@@ -432,7 +432,7 @@ def neighbours(labels: U8, count: int, gap: int) -> F64:
     return touch
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def merge_regions(A: F64, b: F64, moments: F64, n: I32, touch: F64, limit: float, alike: float) -> I32:
     """Which region each of k becomes part of, (k + 1,) by label; the sums (as from `accumulate`, with the neighbours' counts) are added up in place.
 
@@ -461,7 +461,7 @@ def merge_regions(A: F64, b: F64, moments: F64, n: I32, touch: F64, limit: float
     return owner
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _one_plane(A: F64, b: F64, n: int, B: F64, c: F64, m: int, limit: float, noise: float) -> bool:
     """Whether the common plane of two regions lies within `limit` σ (rms) of each region's own; `noise` is added to the sums of squares. Not when it
     is turned from both while these are parallel: one surface is in front of the other."""
@@ -481,7 +481,7 @@ def _one_plane(A: F64, b: F64, n: int, B: F64, c: F64, m: int, limit: float, noi
 STEP_M = 2.0**-10  # samples of planes say where a plane is, to within centimetres: fewer digits, shorter recordings
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def plane_report(
     labels: U8, core: U8, number: U8, planes: F64, grid: Grid, tiles: int, expected: float, weight: float, wanted: int, most: int
 ) -> tuple[F64, F64, F64, F32]:
@@ -499,7 +499,7 @@ def plane_report(
     return coefficients, J, variance, spread_samples(labels, planes, grid.rays_x, grid.rays_y, wanted, most)
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def spread_samples(labels: U8, planes: F64, rays_x: F64, rays_y: F64, wanted: int, most: int) -> F32:
     """(k, wanted, 3) points of each plane, on its q to half a millimetre, and spread over its region by farthest-point choice among (about) `most`
     cells; NaN-padded."""
@@ -531,7 +531,7 @@ def spread_samples(labels: U8, planes: F64, rays_x: F64, rays_y: F64, wanted: in
     return out
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _farthest_points(xs: F64, ys: F64, zs: F64, out: F32) -> None:
     """Fill the rows of `out`, each the point farthest from those before it, beginning at the middle of the list."""
     n = len(xs)
@@ -552,7 +552,7 @@ def _farthest_points(xs: F64, ys: F64, zs: F64, out: F32) -> None:
             chosen += 1
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _sizes(labels: U8, number: U8, regions: int) -> I32:
     """(k,) number of cells of each region from the labels, whose regions are 1 … k by `number`, 0 = none."""
     out, flat = np.zeros(regions + 1, np.int32), labels.ravel()
@@ -565,7 +565,7 @@ def _sizes(labels: U8, number: U8, regions: int) -> I32:
     return out[1:]
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def excess_variance(labels: U8, number: U8, planes: F64, grid: Grid, tiles: int, expected: float, weight: float) -> F64:
     """(k,) variance of the mean of a patch of each region over what independent depths with the noise model's σ would give; all its
     cells have depth, and `number` says which region a label is of, 0 = none.
@@ -633,7 +633,7 @@ REACH = 2  # cells on each side that distances are averaged over
 ROUNDS = 10  # of two means
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def larger_surface(q: F64, grid: Grid, cells: I32, columns: F64, some: F64, member: Bool) -> tuple[F64, int, F64]:
     """Of the members of a region with plane q, when they are two parallel surfaces, the larger one: its q and number of members, which alone stay
     marked, and the q of the other. Otherwise all is left as it is, and there is no other (zeros). `some` of the columns show whether they may be."""
@@ -660,7 +660,7 @@ def larger_surface(q: F64, grid: Grid, cells: I32, columns: F64, some: F64, memb
     return first, max(one, other), second
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def angle_between(q: F64, normal: F64) -> float:
     """Acute angle (rad) between the normals of two planes, of any length; NaN for no plane or no normal."""
     sine, one, other = 0.0, 0.0, 0.0
@@ -672,7 +672,7 @@ def angle_between(q: F64, normal: F64) -> float:
     return float(np.arcsin(min(np.sqrt(sine / squares), 1.0))) if squares > 0.0 else np.nan
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _mean_normal(q: F64, columns: F64, member: Bool) -> F64:
     """Unit mean of the normals of the members, those across a step left out; NaN without any."""
     length = np.sqrt(q[0] * q[0] + q[1] * q[1] + q[2] * q[2])
@@ -687,7 +687,7 @@ def _mean_normal(q: F64, columns: F64, member: Bool) -> F64:
     return np.array([x, y, z])
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _distances(normal: F64, grid: Grid, cells: I32, member: Bool) -> F64:
     """(n,) how far along the normal the members about each member are from the camera, negative, on average over a square; 0 for the others."""
     w = grid.rho.shape[1]
@@ -714,7 +714,7 @@ def _distances(normal: F64, grid: Grid, cells: I32, member: Bool) -> F64:
     return out
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _box(cells: I32, w: int) -> tuple[int, int, int, int]:
     """Top, left, height and width of the rectangle about cells of a grid of w columns."""
     top, bottom, left, right = cells[0] // w, 0, w, 0
@@ -725,7 +725,7 @@ def _box(cells: I32, w: int) -> tuple[int, int, int, int]:
     return top, left, bottom - top + 1, right - left + 1
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _further(distances: F64, member: Bool) -> Bool:
     """(n,) which members have the further of two distances (two means)."""
     out = np.zeros(len(distances), np.bool_)
@@ -750,7 +750,7 @@ def _further(distances: F64, member: Bool) -> Bool:
     return out
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _fitted(columns: F64, chosen: Bool) -> F64:
     """q (3,) of the plane through the chosen cells, zeros when there is none."""
     q = np.zeros(3)
@@ -761,7 +761,7 @@ def _fitted(columns: F64, chosen: Bool) -> F64:
 
 # Whether regions found by their depths alone are planes: what the normals of their cells say.
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def linear_turn(C: F64, D: F64, sum_x: F64, sum_n: F64, count: float, normal: F64) -> float:
     """Width (rad) of the spread of a region's normals n that is linear in position x, from the sums of x xᵀ, n xᵀ, x and n over its cells: the part
     of their covariance that a linear map explains, as the width of a uniform spread. Directions the region does not extend in say nothing."""
@@ -780,7 +780,7 @@ def linear_turn(C: F64, D: F64, sum_x: F64, sum_n: F64, count: float, normal: F6
     return np.sqrt(12.0 * max(eigenvalues(explained)[0], 0.0))
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def covariance(products: F64, one: F64, other: F64, count: float) -> F64:
     """(3, 3) from the sums of a bᵀ, a and b over `count` pairs."""
     out = np.empty((3, 3))
@@ -790,7 +790,7 @@ def covariance(products: F64, one: F64, other: F64, count: float) -> F64:
     return out
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def eigenvalues(S: F64) -> tuple[float, float]:
     """The two largest of a symmetric S (3, 3), by the angle of its cubic (Smith, 1961)."""
     mean, p, K = (S[0, 0] + S[1, 1] + S[2, 2]) / 3.0, 0.0, S.copy()
@@ -806,7 +806,7 @@ def eigenvalues(S: F64) -> tuple[float, float]:
     return mean + width * np.cos(angle), mean + width * np.cos(angle - 2.0 * np.pi / 3.0)
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def normals_of_regions(labels: I32, planes: F64, grid: Grid, cos_cone: float, step: int) -> tuple[F64, F64, F64]:
     """What the normals of each region's cells say, (k,) each; those within the cone of the region's own count, in every `step`th row and column.
 
@@ -848,7 +848,7 @@ def normals_of_regions(labels: I32, planes: F64, grid: Grid, cos_cone: float, st
     return turns, biases, facing / np.maximum(cells, 1.0)
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def drop_engulfed(labels: I32, rho: F32, good: Bool, gap: int) -> Bool:
     """`good` (k,) less the regions at least half of whose border, where depth goes on, is within `gap` cells of regions that are not: a strip between
     strips of a curved surface is one of it, though too narrow to show."""
@@ -892,7 +892,7 @@ def drop_engulfed(labels: I32, rho: F32, good: Bool, gap: int) -> Bool:
 SOME = 2000  # cells that show where most of a region is
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def columns_of(grid: Grid, cells: I32) -> F64:
     """(8, n) of the cells, whose numbers ascend: x/z and y/z, inverse depth, its σ, its weight `count / σ²`, and the normal."""
     rho, sigma, count, normals = grid.rho.ravel(), grid.sigma.ravel(), grid.count.ravel(), grid.normals.reshape(-1, 3)
@@ -907,7 +907,7 @@ def columns_of(grid: Grid, cells: I32) -> F64:
     return out
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def thinned(columns: F64) -> F64:
     """One cell in as many as leave at least SOME."""
     step = max(columns.shape[1] // SOME, 1)
@@ -920,13 +920,13 @@ def thinned(columns: F64) -> F64:
     return out
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def thinned_marks(marks: Bool) -> Bool:
     """The marks (n,) of the cells that `thinned` leaves."""
     return marks[:: max(len(marks) // SOME, 1)].copy()
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def normal_equations(columns: F64, chosen: Bool) -> tuple[F64, F64]:
     """Of q, from the weighted depths of the chosen cells: A (3, 3), of which only the upper triangle is filled, and b (3,)."""
     xs, ys, rho, weights = columns[0], columns[1], columns[2], columns[4]
@@ -942,7 +942,7 @@ def normal_equations(columns: F64, chosen: Bool) -> tuple[F64, F64]:
     return A, b
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def mark_within(columns: F64, chosen: Bool, x: float, y: float, z: float, least: float, inside: Bool) -> bool:
     """Mark the chosen cells whose normal's cosine with (x, y, z) is above `least`; whether these are others than were marked."""
     nx, ny, nz = columns[5], columns[6], columns[7]
@@ -954,7 +954,7 @@ def mark_within(columns: F64, chosen: Bool, x: float, y: float, z: float, least:
     return changed > 0
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def sum_marked(columns: F64, inside: Bool) -> tuple[float, float, float]:
     """Sum of the normals of the marked cells."""
     nx, ny, nz = columns[5], columns[6], columns[7]

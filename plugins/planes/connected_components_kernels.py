@@ -3,16 +3,16 @@
 
 from __future__ import annotations
 
-import numba
 import numpy as np
 
+from trihedron.pipeline.core.kernel import kernel
 from trihedron.pipeline.core.types import F32, F64, U8
 from trihedron.plugins.planes.common_kernels import fit_components
 from trihedron.plugins.shared.depth_image_kernels import Grid, cells_by_component, coarser, connected_components, smooth_links
 
 # Planes among the connected components of a grid's normals (Trevor et al., SPME 2013; paper, section III-A).
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def planar_components(
     grid: Grid, edge: tuple[float, float], bend: float, gate: float, cone: float, turn: float, rounds: int, least: int, most: int
 ) -> tuple[U8, F64]:
@@ -38,7 +38,7 @@ def planar_components(
     return _finer(labels, grid.rho), planes[:found]
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _finer(labels: U8, rho: F32) -> U8:
     """Labels (h, w) of cells by those of cells of twice the size; 0 without depth."""
     h, w = rho.shape

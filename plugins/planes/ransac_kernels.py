@@ -3,9 +3,9 @@
 
 from __future__ import annotations
 
-import numba
 import numpy as np
 
+from trihedron.pipeline.core.kernel import kernel
 from trihedron.pipeline.core.types import F64, I32, U8, Bool
 from trihedron.plugins.planes.common_kernels import columns_of, fit_cells
 from trihedron.plugins.shared.depth_image_kernels import Grid, cells_by_component, connected_components
@@ -16,7 +16,7 @@ SCORED = 800  # cells a hypothesis is scored on, spread over those that are left
 POLISH = 3  # rounds of least squares on the inliers and of finding them again
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def consensus_planes(grid: Grid, draws: F64, gate: float, cos_cone: float, least: int, misses: int) -> tuple[I32, F64]:
     """Labels (h, w) of the cells, 0 = none, and q (k, 3) of their planes, in the order found.
 
@@ -51,7 +51,7 @@ def consensus_planes(grid: Grid, draws: F64, gate: float, cos_cone: float, least
     return labels, planes[:found]
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _all_links(h: int, w: int) -> U8:
     """The links of `connected_components` between all neighbours."""
     links = np.full((h, w), 3, np.uint8)
@@ -60,7 +60,7 @@ def _all_links(h: int, w: int) -> U8:
     return links
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _best_hypothesis(grid: Grid, draws: F64, cells: I32, free: Bool, gate: float, cos_cone: float) -> F64:
     """q of the best of the planes drawn; zeros when none could be."""
     best, most = np.zeros(3), 0.0
@@ -75,7 +75,7 @@ def _best_hypothesis(grid: Grid, draws: F64, cells: I32, free: Bool, gate: float
     return best
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _hypothesis(grid: Grid, draw: F64, cells: I32, free: Bool) -> F64:
     """q of the plane through a cell and two free ones within a square around it, whose size is drawn too; zeros when there is none."""
     h, w = free.shape
@@ -100,7 +100,7 @@ def _hypothesis(grid: Grid, draw: F64, cells: I32, free: Bool) -> F64:
     return q
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _score(grid: Grid, q: F64, cells: I32, gate: float, cos_cone: float) -> float:
     """Sum over the cells of 1 - (e / gate)², 0 for outliers; e in σ_z."""
     w = grid.rho.shape[1]
@@ -115,7 +115,7 @@ def _score(grid: Grid, q: F64, cells: I32, gate: float, cos_cone: float) -> floa
     return total
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _connected_inliers(grid: Grid, q: F64, cells: I32, links: U8, gate: float, cos_cone: float) -> I32:
     """The largest connected region of inliers among the cells."""
     member, inlier = np.zeros(len(cells), np.bool_), np.zeros(grid.rho.shape, np.bool_)

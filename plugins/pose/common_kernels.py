@@ -5,9 +5,9 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-import numba
 import numpy as np
 
+from trihedron.pipeline.core.kernel import kernel
 from trihedron.pipeline.core.types import F32, F64
 from trihedron.plugins.shared.image_reduction_kernels import EDGE
 
@@ -45,7 +45,7 @@ class Rows(NamedTuple):
     turned: F64  # (n, 3), NaN = none
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def fill_rows(source: Source, target: Target, R: F64, t: F64, least_gradient: float, farthest_m: float, least_cosine: float, rows: Rows) -> None:
     """Fill the rows at a motion. A brightness row needs a gradient of `least_gradient` a pixel, else it is zero: noise would make one. Points farther
     than `farthest_m` from the surface, or turned from it beyond `least_cosine`, are not seen."""
@@ -95,14 +95,14 @@ def fill_rows(source: Source, target: Target, R: F64, t: F64, least_gradient: fl
         _across(ax, ay, -(ax * x + ay * y) / z, x, y, z, rows.J[i, 0])
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy", inline="always")
+@kernel(inline="always")
 def _across(ax: float, ay: float, az: float, x: float, y: float, z: float, J: F64) -> None:
     """The derivative `(a, p' × a)` of a residual with gradient a at p'."""
     J[0], J[1], J[2] = ax, ay, az
     J[3], J[4], J[5] = y * az - z * ay, z * ax - x * az, x * ay - y * ax
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def normal_equations(rows: Rows, W: F64) -> tuple[F64, F64]:
     """H (6, 6) and g (6,) of half the squared error; W (n, 3) holds the weights of brightness², their product, and distance²."""
     H, g = np.zeros((6, 6)), np.zeros(6)
@@ -123,7 +123,7 @@ def normal_equations(rows: Rows, W: F64) -> tuple[F64, F64]:
     return H, g
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def what_is_seen(rows: Rows, W: F64) -> tuple[F64, F64, int]:
     """Mean of n mᵀ over the normals n of the target and m of the source at one place (3, 3), the brightness' information about the translation
     (3, 3), and how many points are seen. The noise of the two is not alike and drops out of the products, also of normals that do not face each
@@ -149,7 +149,7 @@ FREEDOM = 5.0  # degrees of freedom of the t-distribution (Kerl et al.)
 SCALE_ROUNDS = 4
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def student(r: F64, cosine: F64, sigma: F64) -> F64:
     n = len(r)
     a, b, c = 1.0 / 25.0, 0.0, 1.0  # the inverse of the scale: of brightness and depth in σ

@@ -3,16 +3,16 @@
 
 from __future__ import annotations
 
-import numba
 import numpy as np
 
+from trihedron.pipeline.core.kernel import kernel
 from trihedron.pipeline.core.types import F32, F64, I32, U8, Bool
 from trihedron.plugins.shared.linalg_kernels import solve_positive
 
 ALONG = np.array([0.1, 0.3, 0.5, 0.7, 0.9], np.float32)  # where it is asked on what a segment lies
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def on_planes_kernel(labels: U8, planes: I32, stride: int, pixels: F32, points: I32, ends: F32, lines: I32) -> tuple[Bool, Bool]:
     """Which of the matched points (n, 2) and lines (m, 2), some of those at pixels (·, 2) and ends (·, 2, 2), lie within matched planes (p, 2)."""
     known, flat, straight = np.zeros(256, np.bool_), np.zeros(len(points), np.bool_), np.ones(len(lines), np.bool_)
@@ -29,7 +29,7 @@ def on_planes_kernel(labels: U8, planes: I32, stride: int, pixels: F32, points: 
     return flat, straight
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _inside(labels: U8, known: Bool, stride: int, u: float, v: float) -> bool:
     """Whether all nine cells about a pixel have labels that are `known` (256,)."""
     h, w = labels.shape
@@ -41,7 +41,7 @@ def _inside(labels: U8, known: Bool, stride: int, u: float, v: float) -> bool:
     return True
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def chi2(xi: F64, covariance: F64, count: int) -> float:
     """Squared standard deviations of the first numbers of xi."""
     S, x, total = np.empty((count, count)), np.empty(count), 0.0

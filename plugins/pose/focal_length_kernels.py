@@ -5,10 +5,10 @@ from __future__ import annotations
 
 import math
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from trihedron.pipeline.core.kernel import kernel
 from trihedron.pipeline.core.types import F32, F64, I32
 from trihedron.plugins.shared.linalg_kernels import polar_rotation, solve_positive, turn_left
 
@@ -23,7 +23,7 @@ CUT = 3.0  # standard deviations at which a point counts half (Geman and McClure
 ROW_BITS, VIEW_BITS = 20, 51  # of a number that is sorted by view, id and row
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def places_kernel(views: NDArray[np.int64], pixels: F32, depths_m: F32, sigmas_m: F32, intrinsics: F64) -> F64:
     """(n, 5) measurements of `_measured`, of what the `views` (n,) with intrinsics (k, 4) saw at pixels (n, 2)."""
     out = np.empty((len(views), 5))
@@ -35,7 +35,7 @@ def places_kernel(views: NDArray[np.int64], pixels: F32, depths_m: F32, sigmas_m
     return out
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def totals_kernel(order: NDArray[np.int64], ids: I32, seen: F64, factors: F64) -> tuple[F64, int]:
     """What the best rigid motions between the views leave under focal lengths that are by these factors as long, and how many pairs of views saw
     enough of the same points."""
@@ -64,7 +64,7 @@ def totals_kernel(order: NDArray[np.int64], ids: I32, seen: F64, factors: F64) -
     return totals, pairs
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _distinct(order: NDArray[np.int64], seen: F64) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """The first row with depth of each point of each view, by views and ids, and where the views' rows begin and the last one's end."""
     views = (order[-1] >> VIEW_BITS) + 1 if len(order) else 0
@@ -80,7 +80,7 @@ def _distinct(order: NDArray[np.int64], seen: F64) -> tuple[NDArray[np.int64], N
     return rows, starts
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _cost(a: F64, b: F64, factor: float) -> float:
     """Robust cost, 0 to 1, of the best rigid motion (Procrustes, reweighted) between n points measured twice, (n, 5) as of `_measured`."""
     n = len(a)
@@ -132,7 +132,7 @@ CUT2 = 9.0  # squared standard deviations at which a point counts a quarter (Gem
 STEPS = 4  # of Gauss and Newton, from a pose that is nearly right
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def solve(before: F64, seen: F64, noise_px: F64, noise_m: F64, told: F64, R: F64, t: F64) -> tuple[float, float, F64, F64]:
     """The factor, the deviation of its logarithm, and how that turns and shifts (3,) the motion, from places (n, 3) seen again at pixels and depths
     (n, 3) after the motion R, t, or nearly, which is made exact."""

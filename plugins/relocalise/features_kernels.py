@@ -3,16 +3,16 @@
 
 from __future__ import annotations
 
-import numba
 import numpy as np
 
+from trihedron.pipeline.core.kernel import kernel
 from trihedron.pipeline.core.types import F64, I32
 
 BIN_M = 0.03  # of the votes
 NEAR_M = 1.5 * BIN_M  # what lies this near to a candidate belongs to it
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def explained(
     places: F64, sides: I32, offsets: F64, areas: F64, axes: I32, spans: F64, across: F64, lengths: F64,
     known_sides: I32, known_offsets: F64, known_axes: I32, known_spans: F64, known_across: F64,

@@ -3,9 +3,9 @@
 
 from __future__ import annotations
 
-import numba
 import numpy as np
 
+from trihedron.pipeline.core.kernel import kernel
 from trihedron.pipeline.core.types import F32, F64, Bool
 from trihedron.plugins.shared.depth_image_kernels import sigma_z
 
@@ -17,7 +17,7 @@ from trihedron.plugins.shared.depth_image_kernels import sigma_z
 STRATA = 8  # hypotheses come from every pair of 8 stretches of the segment: 28 of them, no randomness
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def lift_segments(
     depth: F32,
     endpoints_px: F32,
@@ -84,7 +84,7 @@ def lift_segments(
     return points, covariance
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _point_covariance(rx: float, ry: float, z: float, along: float, across: float, out: F32) -> None:
     """Covariance of the point z (rx, ry, 1): variance `along` of z on the ray, `across` in each direction normal to it."""
     ray = (rx, ry, 1.0)
@@ -94,7 +94,7 @@ def _point_covariance(rx: float, ry: float, z: float, along: float, across: floa
             out[j, k] = ray[j] * ray[k] * (along - across / norm2) + (across if j == k else 0.0)
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _sample(
     depth: F32, x: float, y: float, ux: float, uy: float, noise: tuple[float, float, float, float], gate: float, edge: float, profile: F64
 ) -> tuple[float, float, float]:
@@ -116,7 +116,7 @@ def _sample(
     return z, np.sqrt(s * s + ((0.5 + 0.5 * abs(offset)) * slope) ** 2), shift
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _interpolated(depth: F32, x: float, y: float) -> tuple[bool, float, float]:
     """Whether the four depths around (x, y) exist, their bilinear value, and their spread."""
     c, r = int(np.floor(x)), int(np.floor(y))
@@ -130,7 +130,7 @@ def _interpolated(depth: F32, x: float, y: float) -> tuple[bool, float, float]:
     return True, (a * (1.0 - u) + b * u) * (1.0 - v) + (d * (1.0 - u) + e * u) * v, high - low
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _depths_across(depth: F32, x: float, y: float, nx: float, ny: float, out: F64) -> None:
     """Depths (2 reach + 1,) of the pixels nearest to (x, y) + k (nx, ny), k = -reach … reach; 0 outside and where there is none."""
     reach = len(out) // 2
@@ -142,7 +142,7 @@ def _depths_across(depth: F32, x: float, y: float, nx: float, ny: float, out: F6
         out[k + reach] = z if 0.0 < z < np.inf else 0.0
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _nearer_surface(depths: F64, noise: tuple[float, float, float, float], gate: float, edge: float) -> tuple[float, int, float]:
     """Depth of the nearest surface that shows in a profile (2 reach + 1,) of depths across the line, 1 px apart; 0 when there is none.
 
@@ -176,7 +176,7 @@ def _nearer_surface(depths: F64, noise: tuple[float, float, float, float], gate:
     return best, best_offset, best_slope
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _best_line(t: F64, rho: F64, sigma: F64, gate: float) -> tuple[float, float, int]:
     """The line rho = a + b t with most samples within `gate` sigma, of those through the medians of two stretches of the segment."""
     n = len(t)
@@ -201,7 +201,7 @@ def _best_line(t: F64, rho: F64, sigma: F64, gate: float) -> tuple[float, float,
     return best_a, best_b, best
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _median_place(values: F64) -> int:
     """Index of the (upper) median of a handful of values, the first of equals."""
     n = len(values)
@@ -215,7 +215,7 @@ def _median_place(values: F64) -> int:
     return 0
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _refit(t: F64, rho: F64, sigma: F64, a: float, b: float, gate: float, inlier: Bool) -> tuple[float, float, int, tuple[float, float, float]]:
     """Weighted least squares on the inliers of (a, b), twice; marks the inliers and returns (a, b), their number and the covariance (aa, ab, bb)."""
     found = 0

@@ -5,21 +5,21 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-import numba
 import numpy as np
 
+from trihedron.pipeline.core.kernel import kernel
 from trihedron.pipeline.core.types import F32, F64, I32, U8, Bool
 from trihedron.plugins.shared.linalg_kernels import descending
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def sigma_z(z: float, noise: tuple[float, float, float, float]) -> float:
     """Standard deviation of a depth reading z, metres."""
     a, b, c, floor = noise
     return max(floor, a + b * z + c * z * z)
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def local_depth(
     depth: F32, pixels: F32, radius: int, share: float, noise: tuple[float, float, float, float], gate: float, edge: float
 ) -> tuple[F32, F32]:
@@ -48,7 +48,7 @@ def local_depth(
     return out, sigma
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _linear_fit(depth: F32, u: float, v: float, radius: int) -> tuple[int, float, float]:
     """Count, value at (u, v) and largest residual of the least-squares linear surface through the neighbourhood's depths."""
     rows, cols = depth.shape
@@ -87,7 +87,7 @@ def _linear_fit(depth: F32, u: float, v: float, radius: int) -> tuple[int, float
     return int(n), z0, worst
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _nearest_mean(depth: F32, u: float, v: float) -> tuple[float, float, float]:
     """Weight, bilinear mean and spread of the (up to four) depths around (u, v)."""
     rows, cols = depth.shape
@@ -123,7 +123,7 @@ class Grid(NamedTuple):
     normals: F32
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def cell_inverse_depths(
     depth: F32, stride: int, edge: float, edge_m: float, noise: tuple[float, float, float, float]
 ) -> tuple[F32, F32, U8]:
@@ -146,7 +146,7 @@ def cell_inverse_depths(
     return rho, sigma, count
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _cells_of_strip(
     strip: F32, stride: int, edge: float, edge_m: float, noise: tuple[float, float, float, float], rho: F32, sigma: F32, count: U8
 ) -> None:
@@ -166,7 +166,7 @@ def _cells_of_strip(
         count[c] = n if whole else 0
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def cell_rays(h: int, w: int, stride: int, intrinsics: tuple[float, float, float, float]) -> tuple[F64, F64]:
     """x/z of each column (w,) and y/z of each row (h,) at the centres of the cells' blocks."""
     fx, fy, cx, cy = intrinsics
@@ -174,7 +174,7 @@ def cell_rays(h: int, w: int, stride: int, intrinsics: tuple[float, float, float
     return (np.arange(w) * stride + centre - cx) / fx, (np.arange(h) * stride + centre - cy) / fy
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def coarser(grid: Grid, edge: float, edge_m: float) -> Grid:
     """The grid of 2 × 2 cells: mean inverse depth and mean normal of those that have one, none across a step of more than `edge` z + `edge_m`."""
     rho, sigma, count, rays_x, rays_y, normals = grid
@@ -207,7 +207,7 @@ def coarser(grid: Grid, edge: float, edge_m: float) -> Grid:
     return Grid(rho2, sigma2, count2, x2, y2, normals2)
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _mean_depths(rho: F32, sigma: F32, count: I32, edge: float, edge_m: float, rho2: F32, sigma2: F32, count2: I32) -> None:
     """A row (w,) of the depths of `coarser` from two rows (2, 2 w), 0 = none."""
     for c in range(len(rho2)):
@@ -223,7 +223,7 @@ def _mean_depths(rho: F32, sigma: F32, count: I32, edge: float, edge_m: float, r
         rho2[c], sigma2[c], count2[c] = total / n if whole else 0.0, error / n if whole else 0.0, n if whole else 0
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _mean_normals(x: F32, y: F32, z: F32, count: I32, x2: F32, y2: F32, z2: F32) -> None:
     """A row (w,) of the normals of `coarser` from two rows (2, 2 w), 0 = none."""
     for c in range(len(count)):
@@ -236,7 +236,7 @@ def _mean_normals(x: F32, y: F32, z: F32, count: I32, x2: F32, y2: F32, z2: F32)
         x2[c], y2[c], z2[c] = nx / length, ny / length, nz / length
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def smooth_links(grid: Grid, cos_angle: float, gate: float) -> U8:
     """(h, w) bits: 1 = the cell lies on one smooth surface with its left neighbour, 2 = with the upper one.
 
@@ -262,7 +262,7 @@ def smooth_links(grid: Grid, cos_angle: float, gate: float) -> U8:
     return links
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _tangent_planes(rho: F32, sigma: F32, rays_x: F64, ray_y: float, normal: F32, gate: float, out: F64) -> None:
     """Point, offset of the tangent plane and limit (5, w) of a row of cells, as in `smooth_links`."""
     xs, ys, zs, offsets, limits, a, b, d = out[0], out[1], out[2], out[3], out[4], normal[0], normal[1], normal[2]
@@ -275,7 +275,7 @@ def _tangent_planes(rho: F32, sigma: F32, rays_x: F64, ray_y: float, normal: F32
         limits[c] = gate * sigma[c] * zs[c] * zs[c] if (rho[c] > 0.0) & (a[c] == a[c]) else 0.0
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _joined(one: F64, normal: F32, other: F64, normal2: F32, cos_angle: float, out: U8) -> None:
     """1 where cells lie on one smooth surface with others, whose offsets may be as far off as the limit of the ones."""
     for c in range(out.size):
@@ -287,7 +287,7 @@ def _joined(one: F64, normal: F32, other: F64, normal2: F32, cos_angle: float, o
         out[c] = alike & (abs(there) < limit) & (abs(here) < limit)
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _root(parent: I32, i: int) -> int:
     while parent[i] != i:
         parent[i] = parent[parent[i]]
@@ -295,7 +295,7 @@ def _root(parent: I32, i: int) -> int:
     return i
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def connected_components(links: U8, free: Bool) -> I32:
     """Component number of each cell (h, w), the number of its first cell; -1 for cells that are not `free`. `links` as from `smooth_links`."""
     h, w = links.shape
@@ -324,7 +324,7 @@ def connected_components(links: U8, free: Bool) -> I32:
     return parent.reshape(h, w)
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def cells_by_component(component: I32, least: int) -> tuple[I32, I32]:
     """Flat cell numbers grouped by component, for components of `least` cells or more, largest first; and the (k + 1,) starts of the groups."""
     flat = component.ravel()

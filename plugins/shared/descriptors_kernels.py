@@ -3,17 +3,17 @@
 
 from __future__ import annotations
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from trihedron.pipeline.core.kernel import kernel
 from trihedron.pipeline.core.types import F32, F64, I32, U8
 
 U64 = NDArray[np.uint64]
 NONE, HAMMING, L2 = 0, 1, 2
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _ones(x: int) -> int:
     """Number of bits set in a word."""
     x = x - ((x >> np.uint64(1)) & np.uint64(0x5555555555555555))
@@ -22,7 +22,7 @@ def _ones(x: int) -> int:
     return (x * np.uint64(0x0101010101010101)) >> np.uint64(56)
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def hamming(a: U64, b: U64) -> int:
     """Number of differing bits of two rows of words."""
     total = np.uint64(0)
@@ -31,7 +31,7 @@ def hamming(a: U64, b: U64) -> int:
     return int(total)
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _bits_apart(a: U64, i: int, b: U64, j: int) -> int:
     """`hamming` of row i of a and row j of b: for inner loops, where to slice them takes longer."""
     total = np.uint64(0)
@@ -40,7 +40,7 @@ def _bits_apart(a: U64, i: int, b: U64, j: int) -> int:
     return int(total)
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _euclidean(a: U8, i: int, b: U8, j: int) -> float:
     """Distance of row i of a and row j of b."""
     total = 0
@@ -50,7 +50,7 @@ def _euclidean(a: U8, i: int, b: U8, j: int) -> float:
     return float(np.sqrt(total))
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _buckets(px: F32, cell: float, cols: int, rows: int, x0: float, y0: float) -> tuple[I32, I32]:
     """Counting sort of points into a grid: (cols·rows + 1,) starts and the row numbers in cell order; points with NaN are left out."""
     start = np.zeros(cols * rows + 1, np.int32)
@@ -70,7 +70,7 @@ def _buckets(px: F32, cell: float, cols: int, rows: int, x0: float, y0: float) -
     return start, order
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _bounds(px: F32) -> tuple[float, float, float, float]:
     """Smallest and largest finite x, y; (0, 0, -1, -1) when there is none."""
     x0, y0, x1, y1 = np.inf, np.inf, -np.inf, -np.inf
@@ -81,7 +81,7 @@ def _bounds(px: F32) -> tuple[float, float, float, float]:
     return (x0, y0, x1, y1) if x1 >= x0 else (0.0, 0.0, -1.0, -1.0)
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def near_matches(
     qpx: F32, qwords: U64, qbytes: U8, qoct: U8, tpx: F32, twords: U64, tbytes: U8, toct: U8,
     radius: F32, step: int, mode: int, limit: float, ratio: float,
@@ -136,7 +136,7 @@ def near_matches(
     return out
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _directions(segments: F32) -> F64:
     """(n, 5): middle x, y, direction x, y, length; NaN for a segment without length or with NaN."""
     out = np.full((len(segments), 5), np.nan)
@@ -149,7 +149,7 @@ def _directions(segments: F32) -> F64:
     return out
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _beside(q: F64, i: int, t: F64, j: int) -> tuple[float, float]:
     """Offset (px) beside row i of q in the middle of the overlap with row j of t, and overlap as a share of the shorter segment (negative: apart)."""
     mx, my, dx, dy, length = t[j, 0] - q[i, 0], t[j, 1] - q[i, 1], q[i, 2], q[i, 3], q[i, 4]
@@ -161,7 +161,7 @@ def _beside(q: F64, i: int, t: F64, j: int) -> tuple[float, float]:
     return abs(beside + (0.5 * (low + high) - along) * slope), (high - low) / min(length, t[j, 4])
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def line_matches(
     query: F32, qwords: U64, train: F32, twords: U64, sine_max: float, offset_px: float, overlap_min: float, mode: int, limit: float, ratio: float
 ) -> I32:
@@ -200,7 +200,7 @@ def line_matches(
     return out
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _ambiguous(t: F64, cost: F64, best: int, ratio: float) -> bool:
     """Whether another edge (not a collinear piece of the best one) is nearly as similar."""
     for j in range(len(t)):
@@ -212,7 +212,7 @@ def _ambiguous(t: F64, cost: F64, best: int, ratio: float) -> bool:
     return False
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def bits(a: U64, b: U64) -> F32:
     """(n, m) numbers of bits that differ."""
     out = np.empty((len(a), len(b)), np.float32)

@@ -3,15 +3,15 @@
 
 from __future__ import annotations
 
-import numba
 import numpy as np
 
+from trihedron.pipeline.core.kernel import kernel
 from trihedron.pipeline.core.types import F32, F64, U8
 
 EDGE = 0.03  # a reading farther than the nearest of its block by more than this share is behind an edge
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def halved(gray: F32, depth: F32) -> tuple[F32, F32]:
     h, w = gray.shape[0] // 2, gray.shape[1] // 2
     out, small = np.empty((h, w), np.float32), np.zeros((h, w), np.float32)
@@ -36,7 +36,7 @@ def halved(gray: F32, depth: F32) -> tuple[F32, F32]:
     return out, small
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def gradients(gray: F32) -> tuple[F32, F32]:
     """Central differences along x and y, (h, w) each, a pixel; 0 at the border and beside what is not known."""
     h, w = gray.shape
@@ -49,7 +49,7 @@ def gradients(gray: F32) -> tuple[F32, F32]:
     return x, y
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def smoothed(depth: F32, radius: int) -> F32:
     """(h, w) means of the readings within `radius` pixels that are not across an edge; 0 stays 0."""
     h, w = depth.shape
@@ -68,7 +68,7 @@ def smoothed(depth: F32, radius: int) -> F32:
     return out
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def depth_normals(depth: F32, lens: F64, reach: int) -> F32:
     """(h, w, 3) unit normals towards the camera from the points `reach` pixels to the left, right, above and below; NaN where one of them is missing
     or lies behind an edge."""
@@ -96,7 +96,7 @@ def depth_normals(depth: F32, lens: F64, reach: int) -> F32:
     return out
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def reduced(depth: F32, color: U8, step: int) -> tuple[F32, U8]:
     """Depth (h, w) and colour averaged over blocks of step × step pixels; of the depth only the readings that are not behind an edge."""
     h, w = depth.shape[0] // step, depth.shape[1] // step

@@ -3,14 +3,14 @@
 
 from __future__ import annotations
 
-import numba
 import numpy as np
 
+from trihedron.pipeline.core.kernel import kernel
 from trihedron.pipeline.core.types import F64, I32
 from trihedron.plugins.shared.voxel_hash_kernels import FREE, I64, key_of, slot_of
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def news(keys: I64, numbers: I32, information: F64, points: F64, weight: F64, side: float, views: float) -> int:
     fresh = 0
     for i in range(len(points)):
@@ -20,7 +20,7 @@ def news(keys: I64, numbers: I32, information: F64, points: F64, weight: F64, si
     return fresh
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def learn(keys: I64, numbers: I32, gained: F64, points: F64, weight: F64, side: float, count: int) -> int:
     for i in range(len(points)):
         key = key_of(int(np.floor(points[i, 0] / side)), int(np.floor(points[i, 1] / side)), int(np.floor(points[i, 2] / side)))

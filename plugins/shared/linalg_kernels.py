@@ -3,13 +3,13 @@
 
 from __future__ import annotations
 
-import numba
 import numpy as np
 
+from trihedron.pipeline.core.kernel import kernel
 from trihedron.pipeline.core.types import F64, I32
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def solve_positive(H: F64, g: F64, x: F64) -> bool:
     """x (n,) with `H x = g` for a symmetric positive definite H (n, n), by Cholesky; False, and x zero, when H is not positive definite."""
     n = len(g)
@@ -39,7 +39,7 @@ def solve_positive(H: F64, g: F64, x: F64) -> bool:
     return True
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def inverse_positive(H: F64) -> F64:
     """Inverse of a symmetric positive definite H (n, n); zeros where it is none."""
     n = len(H)
@@ -51,7 +51,7 @@ def inverse_positive(H: F64) -> F64:
     return out
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
+@kernel(forceinline=True)
 def invert_symmetric(S: F64, out: F64) -> float:
     """Inverse of a symmetric S (3, 3), in single precision too, into `out`, by cofactors; returns the determinant."""
     a, b, c = np.float64(S[0, 0]), np.float64(S[0, 1]), np.float64(S[0, 2])
@@ -64,7 +64,7 @@ def invert_symmetric(S: F64, out: F64) -> float:
     return determinant
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def turn_left(phi: F64, R: F64) -> None:
     """`R <- Exp(phi) R` in place, for the first three numbers of phi (Rodrigues)."""
     x, y, z = phi[0], phi[1], phi[2]
@@ -82,7 +82,7 @@ def turn_left(phi: F64, R: F64) -> None:
         R[2, c] = w + a * r + b * (x * q - y * p)
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def fill_tangent_basis(n: F64, out: F64) -> None:
     """Write the columns of `geometry.tangent_basis` of a unit vector to the rows of `out` (2, 3)."""
     x, y, z = n[0], n[1], n[2]
@@ -93,7 +93,7 @@ def fill_tangent_basis(n: F64, out: F64) -> None:
     out[1, 0], out[1, 1], out[1, 2] = b, sign + y * y * a, -y
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def polar_rotation(M: F64) -> F64:
     """The rotation nearest to M (3, 3), as `geometry.nearest_rotation`: one-sided Jacobi rotations make the columns of `A = M V` orthogonal
     (Hestenes, 1958), and R takes the two largest of them from V to their directions, the third by the cross product. Small columns keep their
@@ -120,7 +120,7 @@ def polar_rotation(M: F64) -> F64:
     return _from_columns(A, V)
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _from_columns(A: F64, V: F64) -> F64:
     """The rotation that takes columns of V (3, 3), a rotation, to the directions of the same columns of A (3, 3), orthogonal and of any length."""
     square = np.empty(3)
@@ -168,7 +168,7 @@ def _from_columns(A: F64, V: F64) -> F64:
 DIGIT = 11  # bits sorted by at a time: six digits of a double, whose counts stay in the nearest cache
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def descending(values: F64) -> I32:
     """Rows of (n,) numbers from the largest to the smallest, equal ones in their order. A radix sort: thousands in a fifth of a merge sort's time."""
     n, sign = len(values), np.uint64(1 << 63)
@@ -192,7 +192,7 @@ def descending(values: F64) -> I32:
     return order
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def few_descending(values: F64) -> I32:
     """As `descending`, by insertion: for a handful of numbers."""
     order = np.empty(len(values), np.int32)
@@ -205,7 +205,7 @@ def few_descending(values: F64) -> I32:
     return order
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def median(values: F64) -> float:
     """Of (n,) numbers, n > 0, which it puts into another order (Hoare's selection)."""
     middle, low, high = len(values) // 2, 0, len(values) - 1
@@ -228,7 +228,7 @@ def median(values: F64) -> float:
     return float(0.5 * (below + values[middle]))
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def invert_each(matrices: F64) -> bool:
     """Put the inverses of (n, 3, 3) symmetric matrices in their place; False when one is singular."""
     regular = True

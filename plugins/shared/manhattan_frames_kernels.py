@@ -6,9 +6,9 @@ from __future__ import annotations
 from itertools import permutations, product
 from typing import NamedTuple
 
-import numba
 import numpy as np
 
+from trihedron.pipeline.core.kernel import kernel
 from trihedron.pipeline.core.types import F32, F64, I32, Bool
 from trihedron.plugins.shared.linalg_kernels import fill_tangent_basis, inverse_positive, polar_rotation
 
@@ -29,7 +29,7 @@ def _cube_rotations() -> F64:
 CUBE = _cube_rotations()  # (24, 3, 3)
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def nearest_equivalent(R: F64, reference: F64) -> F64:
     """Of the 24 rotations `R @ S` with the same axes up to order and sign, the one nearest to `reference`; (3, 3) each."""
     best, highest, relative, out = 0, -4.0, np.zeros((3, 3)), np.zeros((3, 3))
@@ -53,7 +53,7 @@ def nearest_equivalent(R: F64, reference: F64) -> F64:
 
 # How well planes and lines tell a direction: information (n, 3, 3) in 1/rad², zero along the direction itself.
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def measured_directions(
     planes: F64, plane_covariance: F64, plane_floor: float, ends_m: F32, end_covariance: F32, line_floor: float, means: F64, mean_sigma: F64
 ) -> tuple[F64, F64]:
@@ -96,7 +96,7 @@ def measured_directions(
     return vectors, information
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _inverse_in_tangent_plane(C: F64, more: float, basis: F64, out: F64) -> None:
     """Write the information (3, 3) of a direction with covariance C (2, 2) plus `more` in its tangent plane, the rows of `basis`; nothing where that
     is no covariance."""
@@ -110,7 +110,7 @@ def _inverse_in_tangent_plane(C: F64, more: float, basis: F64, out: F64) -> None
             out[j, k] = (r * u * basis[0, k] - q * (u * basis[1, k] + v * basis[0, k]) + p * v * basis[1, k]) / det
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def assign_axes(directions: F64, R: F64, cone: float) -> I32:
     """(n,) column of R (3, m) nearest to each direction, antipodes being one; -1 further than `cone` (rad) from all, or NaN."""
     out = np.full(len(directions), -1, np.int32)
@@ -125,14 +125,14 @@ def assign_axes(directions: F64, R: F64, cone: float) -> I32:
 
 # The rotation nearest to measured directions in closed form (orthogonal Procrustes: Schönemann, Psychometrika 1966).
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def procrustes(directions: F64, weights: F64, axes: I32, R: F64, prior: float) -> F64:
     """`argmin Σ w |±n − R e|² + prior/2 Σ |R_before e − R e|²` over rotations (3, 3): directions n (n, 3) with weights (n,), each on the column
     `axes[i]` of R, signs as R has them; -1 takes no part. The small prior keeps what no direction tells."""
     return polar_rotation(0.5 * prior * R + _sums(directions, weights, axes, R))
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def procrustes_covariance(covariance: F64, weights: F64, axes: I32, R: F64, prior: float, scale: float) -> F64:
     """(3, 3) of phi in `R <- Exp(phi) R` for R from `procrustes`, when the directions have the 3D covariance C (n, 3, 3), which need not be that of
     the weights: `A⁻¹ (scale Σ w² [a]× C [a]×ᵀ + prior) A⁻¹` with `A = Σ w (1 − a aᵀ) + prior` and a the axis of each."""
@@ -146,7 +146,7 @@ def procrustes_covariance(covariance: F64, weights: F64, axes: I32, R: F64, prio
     return 0.5 * (out + out.T)
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def normal_covariance(planes: F64, covariance: F64, floor: float) -> F64:
     """(n, 3, 3) covariance in 3D, rad², of the normals of planes (n, 4) with `covariance` (n, 3, 3) of (a, b, d), see `types.Planes`; `floor` (rad)
     is added in square."""
@@ -161,7 +161,7 @@ def normal_covariance(planes: F64, covariance: F64, floor: float) -> F64:
     return out
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def square_angles(directions: F64, axes: I32, R: F64) -> F64:
     """(n,) squared sine of the angle between each direction and its column of R; 0 without one."""
     out = np.zeros(len(directions))
@@ -173,7 +173,7 @@ def square_angles(directions: F64, axes: I32, R: F64) -> F64:
     return out
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def inliers_and_spread(square: F64, axes: I32, weights: F64) -> tuple[I32, F64]:
     """(3,) number of the directions on each axis, and their root mean square angle, rad, by weight; NaN on an axis without. `square` from
     `square_angles`."""
@@ -186,7 +186,7 @@ def inliers_and_spread(square: F64, axes: I32, weights: F64) -> tuple[I32, F64]:
     return counts, np.where(sums[0] > 0.0, np.sqrt(sums[1] / np.maximum(sums[0], 1e-300)), np.nan)
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _sums(directions: F64, weights: F64, axes: I32, R: F64) -> F64:
     """(3, 3) `Σ w ±n eᵀ`."""
     M = np.zeros((3, 3))
@@ -200,7 +200,7 @@ def _sums(directions: F64, weights: F64, axes: I32, R: F64) -> F64:
     return M
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _normal_equations(covariance: F64, weights: F64, axes: I32, R: F64) -> tuple[F64, F64]:
     """(3, 3) `Σ w (1 − a aᵀ)` and (3, 3) `Σ w² [a]× C [a]×ᵀ`."""
     A, B, row = np.zeros((3, 3)), np.zeros((3, 3)), np.zeros((3, 3))
@@ -227,7 +227,7 @@ def _normal_equations(covariance: F64, weights: F64, axes: I32, R: F64) -> tuple
 NEAR = np.radians(15.0)  # a frame turned less than this from the previous axes is still the same
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def frames_through(first: F64, second: F64) -> F64:
     """(m, 3, 3) rotations whose first columns are the unit vectors `first` (m, 3), and whose second lie in the plane of these and `second` (m, 3),
     which must not be parallel to them."""
@@ -246,7 +246,7 @@ def frames_through(first: F64, second: F64) -> F64:
     return out
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def score_frames(frames: F64, directions: F64, weights: F64, reach: F64) -> F64:
     """(m,) weight of the directions (n, 3) near an axis of each frame (m, 3, 3), falling off with the squared angle to 0 at `reach` (n,) rad (MSAC:
     Torr and Zisserman 2000)."""
@@ -262,7 +262,7 @@ def score_frames(frames: F64, directions: F64, weights: F64, reach: F64) -> F64:
     return out
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def same_axes(frames: F64, R: F64) -> Bool:
     """(m,) whether each axis of R (3, 3) is within `NEAR` of one of the frame (m, 3, 3)."""
     out = np.ones(len(frames), np.bool_)
@@ -275,7 +275,7 @@ def same_axes(frames: F64, R: F64) -> Bool:
     return out
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def best_frame(frames: F64, directions: F64, weights: F64, reach: F64, before: F64, loyalty: float) -> F64:
     """The frame (3, 3) with the highest `score_frames`, named as is nearest to the previous axes `before` (3, 3); frames with the same axes as these
     count `loyalty` times."""
@@ -296,7 +296,7 @@ class Walls(NamedTuple):
     area: F64  # (n,) px
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def known_walls(planes: F64, covariance: F64, pixels: I32, floor: float) -> Walls:
     """Of planes (n, 4) with `covariance` (n, 3, 3) of (a, b, d) those whose normals are known; `floor` (rad) is added in square."""
     spatial = normal_covariance(planes, covariance, floor)
@@ -307,7 +307,7 @@ def known_walls(planes: F64, covariance: F64, pixels: I32, floor: float) -> Wall
     return Walls(np.ascontiguousarray(planes[good, :3]), spatial[good], variance[good], pixels[good].astype(np.float64))
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def perpendicular_pair(walls: Walls, max_cos: float, largest_cos: float, reach: float, before: F64, loyalty: float) -> tuple[bool, F64]:
     """Whether two walls stand at right angles (`max_cos` and twice their uncertainty, at most `largest_cos`), and the rotation through the pair that
     explains most area within `reach`, see `best_frame`."""
@@ -327,7 +327,7 @@ def perpendicular_pair(walls: Walls, max_cos: float, largest_cos: float, reach: 
     return True, best_frame(frames, walls.normals, walls.area, np.full(n, reach), before, loyalty)
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def area_on_axes(walls: Walls, R: F64, reach: float) -> F64:
     """(3,) of the walls within `reach` of each column of R."""
     out, axes = np.zeros(3), assign_axes(walls.normals, R, reach)
@@ -337,7 +337,7 @@ def area_on_axes(walls: Walls, R: F64, reach: float) -> F64:
     return out
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def settled(walls: Walls, R: F64, reach: float, gate: float, prior: float, rounds: int) -> tuple[F64, I32, F64]:
     """From R the rotation nearest to the walls within `reach` of its axes, again with new axes and with Cauchy weights, one half at `gate` σ: the
     rotation, the axis of each wall (n,), -1 for none, and its weight (n,), 1/rad²."""

@@ -3,13 +3,13 @@
 
 from __future__ import annotations
 
-import numba
 import numpy as np
 
+from trihedron.pipeline.core.kernel import kernel
 from trihedron.pipeline.core.types import F32, F64, I32
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def mean_distance(plane: F64, samples: F32) -> float:
     """Mean |n·x + d| over the finite rows of (s, 3) samples; inf without any."""
     nx, ny, nz, d = plane[0], plane[1], plane[2], plane[3]
@@ -22,7 +22,7 @@ def mean_distance(plane: F64, samples: F32) -> float:
     return total / count if count else np.inf
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _spacing(samples: F32) -> float:
     """Mean distance from a sample to its nearest neighbour, metres; 0 with fewer than two."""
     total, count = 0.0, 0
@@ -42,7 +42,7 @@ def _spacing(samples: F32) -> float:
     return total / count if count else 0.0
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def overlap(samples_a: F32, samples_b: F32, reach_m: float) -> float:
     """Share of the finite samples of a that have a sample of b within `reach_m`."""
     near, count = 0, 0
@@ -58,7 +58,7 @@ def overlap(samples_a: F32, samples_b: F32, reach_m: float) -> float:
     return near / count if count else 0.0
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def associated(a: F64, samples_a: F32, b: F64, samples_b: F32, cosine: float, limit: float, many_to_one: bool) -> I32:
     """`associate_planes` by the cosine of its angle and its distance (m): the pair that costs least, then the next among the rows that are left."""
     n, m = len(a), len(b)
@@ -94,7 +94,7 @@ def associated(a: F64, samples_a: F32, b: F64, samples_b: F32, cosine: float, li
     return out
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def moved_planes(planes: F64, samples_m: F32, R: F64, t: F64) -> tuple[F64, F32]:
     """Planes (p, 4) and points on them (p, s, 3) where the motion `p -> R p + t` puts them."""
     coefficients, samples = np.empty((len(planes), 4)), np.empty((len(planes), samples_m.shape[1], 3), np.float32)

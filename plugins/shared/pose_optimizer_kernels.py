@@ -6,9 +6,9 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
-import numba
 import numpy as np
 
+from trihedron.pipeline.core.kernel import kernel
 from trihedron.pipeline.core.types import F64, I32, U8
 from trihedron.plugins.shared.linalg_kernels import inverse_positive, solve_positive
 
@@ -48,7 +48,7 @@ class PlaneTerms(NamedTuple):
     observed_covariance: F64  # (p, 3, 3)
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def rotation_and_translation(T: F64) -> tuple[F64, F64]:
     """Rotation and translation of T (4, 4)."""
     R, t = np.empty((3, 3)), np.empty(3)
@@ -59,7 +59,7 @@ def rotation_and_translation(T: F64) -> tuple[F64, F64]:
     return R, t
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
+@kernel(forceinline=True)
 def to_camera(R: F64, t: F64, world: F64, out: F64) -> None:
     """`out = Rᵀ (world - t)`."""
     x, y, z = world[0] - t[0], world[1] - t[1], world[2] - t[2]
@@ -67,7 +67,7 @@ def to_camera(R: F64, t: F64, world: F64, out: F64) -> None:
         out[k] = R[0, k] * x + R[1, k] * y + R[2, k] * z
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def chain_point(D: F64, rows: int, p: F64, J: F64) -> None:
     """J (rows, 6) from the derivatives D (rows, 3) with respect to the camera-frame point p."""
     for k in range(rows):
@@ -78,7 +78,7 @@ def chain_point(D: F64, rows: int, p: F64, J: F64) -> None:
         J[k, 5] = a * p[1] - b * p[0]
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def point_rows(p: F64, pixel: F64, depth_m: float, camera: F64, r: F64, D: F64) -> bool:
     """Reprojection (px) and inverse depth (1/m) of camera-frame point p: residual r (3,) and D = dr/dp (3, 3); without depth the third row is 0.
 
@@ -98,7 +98,7 @@ def point_rows(p: F64, pixel: F64, depth_m: float, camera: F64, r: F64, D: F64) 
     return True
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
+@kernel(forceinline=True)
 def line_row(p: F64, segment_px: F64, camera: F64, D: F64) -> tuple[float, float]:
     """Signed distance (px) of the projection of camera-frame point p from the line through `segment_px` (2, 2), and where along the segment
     it falls (0 = start, 1 = end). D (3,) is the distance's derivative. The line is normalised by √(a² + b²). p must be in front."""
@@ -113,7 +113,7 @@ def line_row(p: F64, segment_px: F64, camera: F64, D: F64) -> tuple[float, float
     return a * x + b * y, (dx * x + dy * y) / (length * length)
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
+@kernel(forceinline=True)
 def depth_direction(observed_m: F64, m: F64) -> bool:
     """m (3,): the unit vector normal to an observed 3D segment (2, 3) within the plane through it and the camera centre, the direction the image
     cannot see. False when the segment has NaN or points at the camera."""
@@ -129,7 +129,7 @@ def depth_direction(observed_m: F64, m: F64) -> bool:
     return True
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
+@kernel(forceinline=True)
 def line_depth_row(p: F64, observed_m: F64, m: F64) -> tuple[float, float]:
     """Distance (m) of camera-frame point p from an observed 3D segment along m (its derivative), and where along the segment it falls."""
     x, y, z = p[0] - observed_m[0, 0], p[1] - observed_m[0, 1], p[2] - observed_m[0, 2]
@@ -137,7 +137,7 @@ def line_depth_row(p: F64, observed_m: F64, m: F64) -> tuple[float, float]:
     return m[0] * x + m[1] * y + m[2] * z, (dx * x + dy * y + dz * z) / max(dx * dx + dy * dy + dz * dz, 1e-12)
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
+@kernel(forceinline=True)
 def basis(n: F64, B: F64) -> None:
     """B (3, 2): `geometry.tangent_basis` of the unit vector n."""
     s = 1.0 if n[2] >= 0.0 else -1.0
@@ -147,7 +147,7 @@ def basis(n: F64, B: F64) -> None:
     B[0, 1], B[1, 1], B[2, 1] = b, s + n[1] * n[1] * a, -n[1]
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
+@kernel(forceinline=True)
 def plane_rows(kind: int, R: F64, t: F64, world: F64, observed: F64, B: F64, r: F64, J: F64) -> int:
     """Residual r (3,) and J (3, 6) of a plane pair; returns the number of rows. B is `basis` of the observed normal.
 
@@ -177,7 +177,7 @@ def plane_rows(kind: int, R: F64, t: F64, world: F64, observed: F64, B: F64, r: 
     return 3
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
+@kernel(forceinline=True)
 def plane_slopes(kind: int, R: F64, t: F64, world: F64, observed: F64, Bw: F64, B: F64, F: F64, G: F64) -> None:
     """Derivatives (3, 3) of `plane_rows` by the (a, b, d) of the map plane, F, and of the observed one, G, of bases Bw and B; signs apart."""
     for i in range(3):
@@ -212,7 +212,7 @@ class Weights(NamedTuple):
     planes: F64  # (p, 3, 3)
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
+@kernel(forceinline=True)
 def invert_small(S: F64, rows: int, W: F64) -> None:
     """Inverse of the leading block of 1, 2 or 3 rows of a symmetric matrix into W; the rest 0."""
     for i in range(len(W)):
@@ -238,7 +238,7 @@ def invert_small(S: F64, rows: int, W: F64) -> None:
             W[i, j] /= det
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
+@kernel(forceinline=True)
 def _offset_variance(d: F64, R: F64, S: F64) -> float:
     """Variance along the camera-frame direction d of a world covariance S."""
     x = R[0, 0] * d[0] + R[0, 1] * d[1] + R[0, 2] * d[2]
@@ -249,7 +249,7 @@ def _offset_variance(d: F64, R: F64, S: F64) -> float:
     return total + z * S[2, 0] * x + z * S[2, 1] * y + z * S[2, 2] * z
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
+@kernel(forceinline=True)
 def _quadratic(d: F64, S: F64) -> float:
     total = 0.0
     for i in range(3):
@@ -258,7 +258,7 @@ def _quadratic(d: F64, S: F64) -> float:
     return total
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _weigh_points(R: F64, t: F64, camera: F64, terms: PointTerms, W: F64) -> None:
     """Pixel and inverse-depth noise plus the landmark's own covariance, projected at this pose. In scalars, as `pose_kernel` has its points."""
     for i in range(len(terms.positions_m)):
@@ -297,7 +297,7 @@ def _weigh_points(R: F64, t: F64, camera: F64, terms: PointTerms, W: F64) -> Non
         W[i, 1, 0], W[i, 2, 0], W[i, 2, 1] = W[i, 0, 1], W[i, 0, 2], W[i, 1, 2]
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
+@kernel(forceinline=True)
 def _pair_noise(s0: float, s1: float, at_start: float, at_end: float, map0: float, map1: float, S: F64) -> None:
     """Covariance of the distances at parameters s0, s1 along a segment whose ends have the given variances, plus those of the map's points."""
     S[0, 0] = (1.0 - s0) ** 2 * at_start + s0 * s0 * at_end + map0
@@ -305,7 +305,7 @@ def _pair_noise(s0: float, s1: float, at_start: float, at_end: float, map0: floa
     S[0, 1] = S[1, 0] = (1.0 - s0) * (1.0 - s1) * at_start + s0 * s1 * at_end
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _weigh_lines(R: F64, t: F64, camera: F64, terms: LineTerms, W: F64, V: F64) -> None:
     """Noise of the segment's ends, extrapolated to where the map's end points fall, plus that of the map's end points."""
     p, D, m, S = np.empty((2, 3)), np.empty((2, 3)), np.empty(3), np.empty((2, 2))
@@ -330,13 +330,13 @@ def _weigh_lines(R: F64, t: F64, camera: F64, terms: LineTerms, W: F64, V: F64) 
             invert_small(S, len(S), V[i])
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
+@kernel(forceinline=True)
 def rows_of(kind: int) -> int:
     """Number of residuals of a kind of plane term."""
     return 3 if kind == SAME else (1 if kind == PERPENDICULAR else 2)
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _weigh_planes(R: F64, t: F64, terms: PlaneTerms, W: F64) -> None:
     """Noise of the observed planes plus that of the map's."""
     Bw, B, F, G, S = np.empty((3, 2)), np.empty((3, 2)), np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
@@ -355,7 +355,7 @@ def _weigh_planes(R: F64, t: F64, terms: PlaneTerms, W: F64) -> None:
         invert_small(S, rows, W[i])
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def weigh(R: F64, t: F64, camera: F64, points: PointTerms, lines: LineTerms, planes: PlaneTerms, weights: Weights) -> None:
     """Fill `weights` for the pose R, t."""
     _weigh_points(R, t, camera, points, weights.points)
@@ -387,7 +387,7 @@ class Chi2(NamedTuple):
     planes: F64
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
+@kernel(forceinline=True)
 def _chi2(r: F64, W: F64, rows: int, e: F64) -> float:
     """rᵀ W r, with `e = W r` left for `_add`."""
     chi2 = 0.0
@@ -399,7 +399,7 @@ def _chi2(r: F64, W: F64, rows: int, e: F64) -> float:
     return chi2
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
+@kernel(forceinline=True)
 def _huber(chi2: float, limit: float, robust: bool) -> tuple[float, float]:
     """Weight and cost of a term whose χ² may lie beyond the limit."""
     if robust and chi2 > limit:
@@ -407,7 +407,7 @@ def _huber(chi2: float, limit: float, robust: bool) -> tuple[float, float]:
     return 1.0, chi2
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
+@kernel(forceinline=True)
 def _add(chi2: float, e: F64, J: F64, rows: int, W: F64, limit: float, robust: bool, first: int, H: F64, g: F64) -> float:
     """Add one term, which does not know of the unknowns before the `first`, to the normal equations `H dx = -g` (Huber beyond `limit` when
     robust); returns its cost."""
@@ -423,7 +423,7 @@ def _add(chi2: float, e: F64, J: F64, rows: int, W: F64, limit: float, robust: b
     return cost
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _add_points(
     R: F64, t: F64, camera: F64, terms: PointTerms, W: F64, flags: U8, robust: bool, free: int, H: F64, g: F64, chi2: F64
 ) -> float:
@@ -495,7 +495,7 @@ def _add_points(
     return cost
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
+@kernel(forceinline=True)
 def _add_pair(r0: float, r1: float, W: F64, i: int, J: F64, counts: bool, robust: bool, H: F64, g: F64) -> tuple[float, float]:
     """χ² and cost of term i with residuals r, derivatives J (2, 6) and weights W (·, 2, 2), added to the normal equations if it `counts`; χ² is inf,
     and nothing is added, where it is none."""
@@ -515,7 +515,7 @@ def _add_pair(r0: float, r1: float, W: F64, i: int, J: F64, counts: bool, robust
     return chi2, cost
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _add_lines(
     R: F64, t: F64, camera: F64, terms: LineTerms, W: F64, V: F64, flags: U8, robust: bool, H: F64, g: F64, chi2: F64, depth_chi2: F64
 ) -> float:
@@ -555,20 +555,20 @@ def _add_lines(
     return cost
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
+@kernel(forceinline=True)
 def _chain(a: float, b: float, c: float, p: F64, k: int, J: F64) -> None:
     """Row k of J (·, 6) from the derivative (a, b, c) with respect to the camera-frame point in row k of p, as `chain_point`."""
     J[k, 0], J[k, 1], J[k, 2] = -a, -b, -c
     J[k, 3], J[k, 4], J[k, 5] = b * p[k, 2] - c * p[k, 1], c * p[k, 0] - a * p[k, 2], a * p[k, 1] - b * p[k, 0]
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
+@kernel(forceinline=True)
 def gate(rows: int) -> float:
     """95 % of χ² with 1, 2 or 3 degrees of freedom."""
     return CHI2_3 if rows == 3 else (CHI2_2 if rows == 2 else CHI2_1)
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _add_planes(R: F64, t: F64, terms: PlaneTerms, W: F64, flags: U8, H: F64, g: F64, chi2: F64) -> float:
     cost = 0.0
     r, e, J, B = np.empty(3), np.empty(3), np.empty((3, 6)), np.empty((3, 2))
@@ -584,7 +584,7 @@ def _add_planes(R: F64, t: F64, terms: PlaneTerms, W: F64, flags: U8, H: F64, g:
     return cost
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def linearise(
     R: F64,
     t: F64,
@@ -613,7 +613,7 @@ def linearise(
 
 # Steps of the pose solver: motions on SE(3), the Gaussian prior and the damped normal equations, for numba loops.
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _rotation(x: float, y: float, z: float) -> F64:
     """Exp(phi) of phi = (x, y, z), Rodrigues."""
     angle2 = x * x + y * y + z * z
@@ -629,7 +629,7 @@ def _rotation(x: float, y: float, z: float) -> F64:
     return E
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _rotation_vector(R: F64) -> tuple[float, float, float]:
     """Log(R) for angles below π (a prior is never that far)."""
     x, y, z = 0.5 * (R[2, 1] - R[1, 2]), 0.5 * (R[0, 2] - R[2, 0]), 0.5 * (R[1, 0] - R[0, 1])
@@ -638,7 +638,7 @@ def _rotation_vector(R: F64) -> tuple[float, float, float]:
     return x * scale, y * scale, z * scale
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def move(R: F64, t: F64, dx: F64, turned: F64, shifted: F64) -> None:
     """The pose after the step (rho, phi) into the last two: R Exp(phi), t + R rho; agrees with Exp(xi) to first order, which is what covariances
     mean."""
@@ -649,7 +649,7 @@ def move(R: F64, t: F64, dx: F64, turned: F64, shifted: F64) -> None:
             turned[i, j] = R[i, 0] * E[0, j] + R[i, 1] * E[1, j] + R[i, 2] * E[2, j]
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def add_prior(R: F64, t: F64, R_prior: F64, t_prior: F64, prior: F64, H: F64, g: F64) -> float:
     """Add the prior's term to H (lower triangle) and g; returns its cost."""
     delta, r, J, e = np.zeros((3, 3)), np.zeros(6), np.zeros((6, 6)), np.zeros(6)
@@ -679,7 +679,7 @@ def add_prior(R: F64, t: F64, R_prior: F64, t_prior: F64, prior: F64, H: F64, g:
     return cost
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def step(H: F64, g: F64, damping: float, free: int, dx: F64) -> None:
     """dx (6,): solution of (H + damping · diag H) dx = -g over the first `free` unknowns, by Cholesky; zero if H is not positive definite."""
     L = np.zeros((6, 6))
@@ -707,7 +707,7 @@ def step(H: F64, g: F64, damping: float, free: int, dx: F64) -> None:
         dx[i] /= L[i, i]
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def size(H: F64, dx: F64) -> float:
     """Squared length of the step in standard deviations (H lower triangle)."""
     total = 0.0
@@ -727,7 +727,7 @@ CONVERGED = 1e-3  # squared length of a step in standard deviations below which 
 MAX_DAMPING = 1e10
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def solve(
     poses: F64,
     prior: F64,
@@ -792,7 +792,7 @@ def solve(
     return T, covariance, information, dx, cost, complete
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _copy(A: F64, a: F64, B: F64, b: F64) -> None:
     """A matrix (n, n) and a vector (n,), of a pose or of normal equations, into others."""
     for i in range(len(a)):
@@ -801,7 +801,7 @@ def _copy(A: F64, a: F64, B: F64, b: F64) -> None:
             B[i, j] = A[i, j]
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _spread(data: F64, share: float, prior: F64, free: int) -> tuple[F64, F64, bool]:
     """Covariance of the `free` unknowns by a share of the data's information (lower triangle) and the prior's; that share of the data's; and
     whether it is the larger one in all directions."""
@@ -817,7 +817,7 @@ def _spread(data: F64, share: float, prior: F64, free: int) -> tuple[F64, F64, b
     return covariance, information, solve_positive(more, np.zeros(free), np.empty(free))
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _rows(points: PointTerms, planes: PlaneTerms, flags: Flags) -> int:
     """Number of residuals of the inliers."""
     rows = 0
@@ -833,7 +833,7 @@ def _rows(points: PointTerms, planes: PlaneTerms, flags: Flags) -> int:
     return rows
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def gate_efficiency(rows: int, unknowns: int) -> float:
     """Share of the information that is left when terms are chosen by a hard 95 % gate on their own residuals.
 
@@ -847,7 +847,7 @@ def gate_efficiency(rows: int, unknowns: int) -> float:
     return (kept - 4.0 / 3.0 * half * tail) / kept
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _classify(points: PointTerms, planes: PlaneTerms, chi2: Chi2, flags: Flags, slack: float) -> None:
     """Choose the outliers anew: 95 % gates of χ², those of planes multiplied by `slack`."""
     for i in range(len(chi2.points)):

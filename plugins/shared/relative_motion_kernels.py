@@ -5,9 +5,9 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-import numba
 import numpy as np
 
+from trihedron.pipeline.core.kernel import kernel
 from trihedron.pipeline.core.types import F32, F64, I32
 from trihedron.plugins.shared.linalg_kernels import inverse_positive, median, solve_positive, turn_left
 from trihedron.plugins.shared.pose_optimizer_kernels import basis
@@ -45,7 +45,7 @@ class PlanePairs(NamedTuple):
     covariance: F64  # (k, 3, 3)
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def point_pairs(pairs: PointPairs, rad_per_px: float, step: int, p: F64, q: F64, information: F64) -> int:
     """Write previous and current places (m, 3) and information (m, 3, 3), 1/m², of one in `step` of those of n pairs that both have depth; returns
     their number m."""
@@ -75,7 +75,7 @@ def point_pairs(pairs: PointPairs, rad_per_px: float, step: int, p: F64, q: F64,
     return m
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def line_pairs(pairs: LinePairs, rad_per_px: float, step: int, m: int, p: F64, q: F64, information: F64) -> int:
     """Write both ends of one in `step` of n previous lines, each against the start of the current line, whose noise serves for both: places and
     information from row m on, which is zero along the line. Returns the next row."""
@@ -116,7 +116,7 @@ def line_pairs(pairs: LinePairs, rad_per_px: float, step: int, m: int, p: F64, q
     return m
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def plane_pairs(pairs: PlanePairs, floor: float) -> tuple[F64, F64, F64]:
     """Previous planes (m, 4), current ones, and the information (m, 4, 4) of their difference in (n, d), of those of n pairs that are known;
     `floor` (rad) is the least error of a normal."""
@@ -172,7 +172,7 @@ class Terms(NamedTuple):
     plane_information: F64  # (p, 4, 4)
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def motion(
     points: PointPairs, lines: LinePairs, walls: PlanePairs, start: F64, noise: tuple[float, float, float, float]
 ) -> tuple[F64, F64, F64, float]:
@@ -194,7 +194,7 @@ def motion(
     return R, t, inverse_positive(A), support
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _terms(points: PointPairs, lines: LinePairs, walls: PlanePairs, rad_per_px: float, floor: float) -> Terms:
     """What the pairs say about the motion, of places about MOST at most."""
     n, m = len(points.rows), len(lines.rows)
@@ -206,7 +206,7 @@ def _terms(points: PointPairs, lines: LinePairs, walls: PlanePairs, rad_per_px: 
     return Terms(before[:count], after[:count], information[:count], planes_before, planes_after, plane_information)
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _residuals(terms: Terms, R: F64, t: F64) -> F64:
     """(n + p,) squared Mahalanobis distances of places and planes."""
     n, p = len(terms.before_m), len(terms.planes_before)
@@ -224,7 +224,7 @@ def _residuals(terms: Terms, R: F64, t: F64) -> F64:
     return out
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _plane_distance(e: F64, L: F64) -> float:
     """eᵀ L e of four numbers."""
     total = 0.0
@@ -234,7 +234,7 @@ def _plane_distance(e: F64, L: F64) -> float:
     return total
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _plane_residual(before: F64, after: F64, R: F64, t: F64, e: F64) -> None:
     """The previous plane moved into the current frame less the current one, (4,)."""
     e[3] = before[3] - after[3]
@@ -244,7 +244,7 @@ def _plane_residual(before: F64, after: F64, R: F64, t: F64, e: F64) -> None:
         e[3] -= n * t[k]
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _add_places(terms: Terms, R: F64, t: F64, scale2: float, H: F64, g: F64) -> tuple[float, float]:
     """Add w JᵀLJ of all places to the lower triangle of H and w JᵀLe to g, with p = R p_previous and J = (-[p]×, I); in scalars, for places are most
     of the work. Returns the weighted χ² and number of components."""
@@ -293,7 +293,7 @@ def _add_places(terms: Terms, R: F64, t: F64, scale2: float, H: F64, g: F64) -> 
     return chi2, components
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _add_plane(e: F64, J: F64, L: F64, w: float, H: F64, g: F64) -> None:
     """Add w JᵀLJ to the lower triangle of H and w JᵀLe to g for J (4, 6)."""
     for i in range(4):
@@ -306,7 +306,7 @@ def _add_plane(e: F64, J: F64, L: F64, w: float, H: F64, g: F64) -> None:
                 H[a, b] += J[i, a] * LJ
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _normal_equations(terms: Terms, R: F64, t: F64, scale2: float, H: F64, g: F64) -> tuple[float, float]:
     """Fill H (6, 6) and g (6,) with Geman–McClure weights at the squared scale; returns the weighted χ² and the weighted number of components."""
     for i in range(6):
@@ -332,7 +332,7 @@ def _normal_equations(terms: Terms, R: F64, t: F64, scale2: float, H: F64, g: F6
     return chi2, components
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _solve(terms: Terms, R: F64, t: F64, prior: F64, scale2: float) -> tuple[F64, float, float]:
     """Moves R and t, with a prior (6,) information on the way moved; returns H (6, 6), the weighted χ² and the summed weights."""
     H, A, g = np.zeros((6, 6)), np.zeros((6, 6)), np.zeros(6)

@@ -3,9 +3,9 @@
 
 from __future__ import annotations
 
-import numba
 import numpy as np
 
+from trihedron.pipeline.core.kernel import kernel
 from trihedron.pipeline.core.types import F64, I32
 
 # The rigid motion that most pairs of places agree on (Fischler and Bolles, CACM 1981), from three pairs at a time.
@@ -13,7 +13,7 @@ from trihedron.pipeline.core.types import F64, I32
 LEAST_M = 0.05  # between the three places of a sample
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _frame(a: F64, b: F64, c: F64, out: F64) -> bool:
     """Axes (columns) that three places span; False when they are too near to each other or to a line."""
     u, v = b - a, c - a
@@ -27,7 +27,7 @@ def _frame(a: F64, b: F64, c: F64, out: F64) -> bool:
     return True
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def best_kernel(before: F64, after: F64, reach: F64, samples: I32) -> tuple[F64, F64]:
     best, R_best, t_best = -1, np.eye(3), np.zeros(3)
     A, B, R, t = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3)), np.empty(3)

@@ -3,9 +3,9 @@
 
 from __future__ import annotations
 
-import numba
 import numpy as np
 
+from trihedron.pipeline.core.kernel import kernel
 from trihedron.pipeline.core.types import F32, F64, I32, U8
 from trihedron.plugins.shared.voxel_hash_kernels import FREE, I64, key_of, slot_of
 
@@ -14,14 +14,14 @@ RAY_STEP = 2  # px between the rays along which blocks are made; they are far la
 LEAST_COSINE = 0.3  # of the angle between ray and normal, 73°: behind a plane seen at less it is not known so far
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy", inline="always")
+@kernel(inline="always")
 def _cosine(x: float, y: float, z: float, length: float, slants: F64, label: int) -> float:
     """Of the angle between a ray (x, y, z) of that length and the plane's normal; 1 without a plane."""
     n = slants[label, 2] * x + slants[label, 3] * y + slants[label, 4] * z
     return 1.0 if n >= 0.0 else max(-n / length, LEAST_COSINE)
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def across_kernel(local: I64, depth: F32, labels: U8, slants: F64, lens: F64, T: F64, block_m: float, truncation: float) -> I32 | None:
     """Blocks (n, 3) within the truncation of the readings, along their rays or across their planes; None when the table `local` is too small."""
     h, w = depth.shape
@@ -57,7 +57,7 @@ def across_kernel(local: I64, depth: F32, labels: U8, slants: F64, lens: F64, T:
     return found[:count].copy()
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def insert(keys: I64, numbers: I32, fresh: I32, places: I32, count: int) -> int:
     for i in range(len(fresh)):
         key = key_of(fresh[i, 0], fresh[i, 1], fresh[i, 2])
@@ -68,7 +68,7 @@ def insert(keys: I64, numbers: I32, fresh: I32, places: I32, count: int) -> int:
     return count
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def integrate(
     keys: I64, numbers: I32, distance: F32, weight: F32, touched: I32, depth: F32, labels: U8, slants: F64, weights: F32, lens: F64,
     R_camera_world: F64, position: F64, voxel: float, truncation: float,

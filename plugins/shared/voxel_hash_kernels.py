@@ -3,10 +3,10 @@
 
 from __future__ import annotations
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from trihedron.pipeline.core.kernel import kernel
 from trihedron.pipeline.core.types import I32
 
 I64 = NDArray[np.int64]
@@ -14,13 +14,13 @@ BITS, HALF = 21, 1 << 20  # of a coordinate, that may be -HALF … HALF - 1
 FREE = -1
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy", inline="always")
+@kernel(inline="always")
 def key_of(x: int, y: int, z: int) -> int:
     """The cell as one number, at least 0."""
     return ((x + HALF) << (2 * BITS)) | ((y + HALF) << BITS) | (z + HALF)
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy", inline="always")
+@kernel(inline="always")
 def slot_of(keys: I64, key: int) -> int:
     """The slot that holds the key, or the free one where it belongs. There must be a free one."""
     mask = len(keys) - 1
@@ -31,14 +31,14 @@ def slot_of(keys: I64, key: int) -> int:
     return slot
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def number_of(keys: I64, numbers: I32, x: int, y: int, z: int) -> int:
     """The cell's number, -1 when it is not in the table."""
     slot = slot_of(keys, key_of(x, y, z))
     return numbers[slot] if keys[slot] != FREE else -1
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def absent(keys: I64, cells: I32) -> I32:
     """The rows of the cells (n, 3) that are not in the table."""
     rows, count = np.empty(len(cells), np.int32), 0
@@ -49,7 +49,7 @@ def absent(keys: I64, cells: I32) -> I32:
     return rows[:count].copy()
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def copy_kernel(keys: I64, numbers: I32, to_keys: I64, to_numbers: I32) -> None:
     for i in range(len(keys)):
         if keys[i] != FREE:

@@ -3,17 +3,17 @@
 
 from __future__ import annotations
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from trihedron.pipeline.core.kernel import kernel
 from trihedron.pipeline.core.types import F32, F64, I32, U8
 from trihedron.plugins.shared.tsdf_volume import CELLS
 from trihedron.plugins.shared.tsdf_volume_kernels import SIDE
 from trihedron.plugins.shared.voxel_hash_kernels import I64, number_of
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def off_planes(depth: F32, labels: U8, planes: F64, stride: int, step: int, lens: F64) -> tuple[F64, F64]:
     """How far readings (n,) are from their planes along their rays, and their depth."""
     h, w = labels.shape
@@ -31,7 +31,7 @@ def off_planes(depth: F32, labels: U8, planes: F64, stride: int, step: int, lens
     return off[:count], read[:count]
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def paint(points: F32, normals: F32, depth: F32, color: U8, R: F32, position: F32, lens: F32, near: F32, total: F32) -> None:
     """Add the colours one view gives, times their weight, and the weight, to `total` (n, 4). R is `R_camera_world`."""
     h, w = depth.shape
@@ -68,7 +68,7 @@ I8 = NDArray[np.int8]
 TOUCHING_M = 1e-4  # distance given to a voxel whose sign is turned
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def neighbours(keys: I64, numbers: I32, places: I32) -> I32:
     """(n, 27) the blocks around each, -1 = none; (dx + 1) · 9 + (dy + 1) · 3 + dz + 1."""
     out = np.empty((len(places), 27), np.int32)
@@ -78,7 +78,7 @@ def neighbours(keys: I64, numbers: I32, places: I32) -> I32:
     return out
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def signs_kernel(distance: F32, weight: F32, least: float, signs: I8) -> None:
     """1 before the surface, -1 behind it, 0 where that is not known."""
     for b in range(len(distance)):
@@ -87,7 +87,7 @@ def signs_kernel(distance: F32, weight: F32, least: float, signs: I8) -> None:
                 signs[b, i] = 1 if distance[b, i] >= 0.0 else -1
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def untangled(distance: F32, signs: I8, around: I32, near: float) -> int:
     """Wherever four in a square have signs like a chessboard's, put the one less far behind before the surface: noise, where that runs along a layer
     of voxels, and four triangles would meet in an edge. Always that way, so it comes to an end. Returns how many were turned."""
@@ -119,14 +119,14 @@ def untangled(distance: F32, signs: I8, around: I32, near: float) -> int:
     return turned
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy", inline="always")
+@kernel(inline="always")
 def _at(around: I32, b: int, x: int, y: int, z: int) -> tuple[int, int]:
     """Block and cell of the voxel (x, y, z) of block b, each in -1 … SIDE; block -1 where there is none."""
     block = around[b, ((x + SIDE) // SIDE) * 9 + ((y + SIDE) // SIDE) * 3 + (z + SIDE) // SIDE]
     return block, ((x + SIDE) % SIDE) * SIDE * SIDE + ((y + SIDE) % SIDE) * SIDE + (z + SIDE) % SIDE
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def vertices_kernel(places: I32, distance: F32, signs: I8, around: I32, cells: I32, voxel: float) -> F64:
     """(v, 3) vertices; `cells` gets their numbers."""
     out, count = np.empty((1024, 3)), 0
@@ -168,7 +168,7 @@ def vertices_kernel(places: I32, distance: F32, signs: I8, around: I32, cells: I
     return out[:count].copy()
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def triangles_kernel(signs: I8, around: I32, cells: I32, vertices: F64) -> I32:
     """(t, 3): two for each voxel edge with both signs whose four cells have vertices, cut along the shorter diagonal."""
     out, count = np.empty((4096, 3), np.int32), 0
@@ -210,7 +210,7 @@ def triangles_kernel(signs: I8, around: I32, cells: I32, vertices: F64) -> I32:
     return out[:count].copy()
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy", inline="always")
+@kernel(inline="always")
 def _squared(vertices: F64, i: int, j: int) -> float:
     x, y, z = vertices[i, 0] - vertices[j, 0], vertices[i, 1] - vertices[j, 1], vertices[i, 2] - vertices[j, 2]
     return x * x + y * y + z * z

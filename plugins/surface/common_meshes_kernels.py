@@ -3,16 +3,16 @@
 
 from __future__ import annotations
 
-import numba
 import numpy as np
 
+from trihedron.pipeline.core.kernel import kernel
 from trihedron.pipeline.core.types import F64, I32, Bool
 from trihedron.plugins.shared.voxel_hash_kernels import I64
 
 OPEN = -1  # beyond a half-edge: nothing, or more than one triangle
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def paired(triangles: I32, count: int) -> I32:
     """Half-edges sorted by the lower of their vertices, then compared with those of the same."""
     size = 3 * len(triangles)
@@ -40,7 +40,7 @@ def paired(triangles: I32, count: int) -> I32:
     return out
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def connected(opposite: I32, labels: I32) -> tuple[I32, int]:
     """(t,) numbers of the connected sets of triangles of equal label, from 0 in the order of their first triangle, and their count."""
     n = len(labels)
@@ -62,7 +62,7 @@ def connected(opposite: I32, labels: I32) -> tuple[I32, int]:
     return parts, count
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _join(root: I32, a: int, b: int) -> None:
     while root[a] != a:
         root[a] = root[root[a]]
@@ -73,7 +73,7 @@ def _join(root: I32, a: int, b: int) -> None:
     root[max(a, b)] = min(a, b)
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def fans_kernel(opposite: I32) -> I32:
     """(3 t,) the least corner of the fan that each corner belongs to: corners at the two ends of an edge are those of the triangle beyond it."""
     root = np.arange(len(opposite), dtype=np.int32)
@@ -88,7 +88,7 @@ def fans_kernel(opposite: I32) -> I32:
     return root
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def triangle_normals(vertices: F64, triangles: I32) -> F64:
     """(t, 3) normals, as long as twice the area."""
     out = np.empty((len(triangles), 3))
@@ -100,7 +100,7 @@ def triangle_normals(vertices: F64, triangles: I32) -> F64:
     return out
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def gather(normals: F64, triangles: I32, total: F64) -> None:
     for t in range(len(triangles)):
         for k in range(3):
@@ -108,7 +108,7 @@ def gather(normals: F64, triangles: I32, total: F64) -> None:
                 total[triangles[t, k], axis] += normals[t, axis]
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def kept(vertices: F64, begin: I32, end: I32, kinds: I32, fixed: Bool, tolerance: float) -> tuple[Bool, I32]:
     n = len(vertices)
     degree, kind, beside = np.zeros(n, np.int32), np.zeros(n, np.int64), np.full((n, 2), -1, np.int32)
@@ -137,7 +137,7 @@ def kept(vertices: F64, begin: I32, end: I32, kinds: I32, fixed: Bool, tolerance
     return keep, beside
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _walk(first: int, second: int, beside: I32, junction: Bool, done: Bool, chain: I32) -> int:
     """Follow a chain from `first` by `second` up to the next junction, or back to where it began; returns its length, both ends included."""
     chain[0], chain[1], length = first, second, 2
@@ -149,7 +149,7 @@ def _walk(first: int, second: int, beside: I32, junction: Bool, done: Bool, chai
     return length
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _simplify(vertices: F64, chain: I32, keep: Bool, tolerance: float) -> None:
     """Mark what the chain between its two ends needs."""
     stack, top = np.empty((len(chain), 2), np.int32), 1
@@ -169,7 +169,7 @@ def _simplify(vertices: F64, chain: I32, keep: Bool, tolerance: float) -> None:
             top += 2
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _simplify_ring(vertices: F64, chain: I32, keep: Bool, tolerance: float) -> None:
     """A closed chain, whose last vertex is the first: in halves between two that are far apart."""
     half, farthest = 0, 0.0
@@ -182,7 +182,7 @@ def _simplify_ring(vertices: F64, chain: I32, keep: Bool, tolerance: float) -> N
     _simplify(vertices, chain[half:], keep, tolerance)
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _off_segment(p: F64, a: F64, b: F64) -> float:
     d = b - a
     squared = np.dot(d, d)
@@ -191,7 +191,7 @@ def _off_segment(p: F64, a: F64, b: F64) -> float:
     return np.sqrt(np.dot(off, off))
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def loops(border: I32, parts: I32, opposite: I32) -> tuple[I32, I32]:
     """The border half-edges (n,) in the order in which they go round their parts, and where each loop begins (l + 1,)."""
     position = np.full(3 * len(parts), -1, np.int32)
@@ -225,7 +225,7 @@ ROUNDS = 30  # at most, over all vertices; most are gone after five
 FLAT_M2 = 1e-9  # a triangle with less area has none
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def collapse_all(
     vertices: F64, triangles: I32, labels: I32, normals: F64, border: Bool, free: Bool, beside: I32, order: I32, alive: Bool
 ) -> None:  # fmt: skip
@@ -265,7 +265,7 @@ def collapse_all(
             break
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _incident(v: int, alive: Bool, head: I32, tail: I32, after: I32, out: I32) -> int:
     """Write the living triangles about v and return their number, 0 when they are too many; its list forgets the dead ones."""
     count, c, last = 0, head[v], -1
@@ -284,7 +284,7 @@ def _incident(v: int, alive: Bool, head: I32, tail: I32, after: I32, out: I32) -
     return count if count <= MOST else 0
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _targets(u: int, mine: I32, vertices: F64, triangles: I32, border: Bool, beside: I32, found: I32, far: F64) -> int:
     """Write where u may go, the nearest first, and return their number: to its neighbours on the border, or to any."""
     count = 2 if border[u] else len(mine)
@@ -305,7 +305,7 @@ def _targets(u: int, mine: I32, vertices: F64, triangles: I32, border: Bool, bes
     return count
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _allowed(u: int, v: int, mine: I32, theirs: I32, vertices: F64, triangles: I32, labels: I32, normals: F64, mark: I64, stamp: int) -> bool:
     """Whether u may be drawn into v: the two have no common neighbours but those across from their edge (link condition), and no triangle turns
     over."""
@@ -337,7 +337,7 @@ def _allowed(u: int, v: int, mine: I32, theirs: I32, vertices: F64, triangles: I
     return True
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy", inline="always")
+@kernel(inline="always")
 def _signed(vertices: F64, a: int, b: int, c: int, x: float, y: float, z: float) -> float:
     """Area of a triangle seen against the normal (x, y, z), negative when it is seen from behind."""
     x1, y1, z1 = vertices[b, 0] - vertices[a, 0], vertices[b, 1] - vertices[a, 1], vertices[b, 2] - vertices[a, 2]
@@ -345,7 +345,7 @@ def _signed(vertices: F64, a: int, b: int, c: int, x: float, y: float, z: float)
     return 0.5 * ((y1 * z2 - z1 * y2) * x + (z1 * x2 - x1 * z2) * y + (x1 * y2 - y1 * x2) * z)
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _collapse(u: int, v: int, mine: I32, triangles: I32, alive: Bool, head: I32, tail: I32, after: I32) -> None:
     for t in mine:
         if triangles[t, 0] == v or triangles[t, 1] == v or triangles[t, 2] == v:
@@ -362,7 +362,7 @@ def _collapse(u: int, v: int, mine: I32, triangles: I32, alive: Bool, head: I32,
     head[u] = tail[u] = -1
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy", inline="always")
+@kernel(inline="always")
 def _relink(beside: I32, v: int, old: int, new: int) -> None:
     if beside[v, 0] == old:
         beside[v, 0] = new

@@ -3,14 +3,14 @@
 
 from __future__ import annotations
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from trihedron.pipeline.core.kernel import kernel
 from trihedron.pipeline.core.types import F64, I32
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def on_planes(vertices: F64, triangles: I32, turned: F64, planes: F64, distance: float, cosine: float) -> I32:
     """The plane that is nearest to all corners of a triangle and looks the same way."""
     labels = np.full(len(triangles), -1, np.int32)
@@ -25,7 +25,7 @@ def on_planes(vertices: F64, triangles: I32, turned: F64, planes: F64, distance:
     return labels
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy", inline="always")
+@kernel(inline="always")
 def _farthest(vertices: F64, corners: I32, plane: F64) -> float:
     off = 0.0
     for k in range(3):
@@ -34,7 +34,7 @@ def _farthest(vertices: F64, corners: I32, plane: F64) -> float:
     return off
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def steadiness(turned: F64, opposite: I32) -> F64:
     """(t,) least cosine between a triangle's normal and its neighbours'; 0 at a border."""
     out = np.ones(len(turned))
@@ -46,7 +46,7 @@ def steadiness(turned: F64, opposite: I32) -> F64:
     return out
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def grown_kernel(
     seeds: NDArray[np.signedinteger], labels: I32, first: int, middle: F64, turned: F64, area: F64, opposite: I32,
     distance: float, cosine: float, least: float,
@@ -93,7 +93,7 @@ def grown_kernel(
     return labels, found[:count].copy()
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def plane_through(middle: F64, area: F64, rows: I32, like: F64) -> tuple[F64, float]:
     """Least squares plane through the middles of triangles, weighed by area, facing as `like` does."""
     centre, total = np.zeros(3), 0.0
@@ -113,7 +113,7 @@ def plane_through(middle: F64, area: F64, rows: I32, like: F64) -> tuple[F64, fl
     return n, -np.dot(n, centre)
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def with_rim(labels: I32, vertices: F64, triangles: I32, turned: F64, opposite: I32, planes: F64, reach: float) -> I32:
     """One ring more: a triangle beside labelled ones gets the label of the plane nearest to it, if that is near and it does not face away."""
     out = labels.copy()
@@ -132,7 +132,7 @@ def with_rim(labels: I32, vertices: F64, triangles: I32, turned: F64, opposite: 
     return out
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def without_steps(labels: I32, triangles: I32, count: int, planes: F64, area: F64) -> I32:
     """No vertex between two planes that are nearly parallel: triangles about it lose the label of the smaller one, and become the step between
     them."""
@@ -151,7 +151,7 @@ def without_steps(labels: I32, triangles: I32, count: int, planes: F64, area: F6
     return out
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def enclosing(parts: I32, count: int, labels: I32, opposite: I32) -> I32:
     """(count,) the one label about each part without label; -1 when there are several, or none, or the part reaches the mesh's border."""
     around = np.full(count, -2, np.int32)
@@ -171,7 +171,7 @@ def enclosing(parts: I32, count: int, labels: I32, opposite: I32) -> I32:
     return np.maximum(around, -1)
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def bends_kernel(parts: I32, count: int, labels: I32, middle: F64, area: F64, frames: F64) -> F64:
     centre, total = np.zeros((count, 3)), np.zeros(count)
     for t in range(len(parts)):
@@ -211,7 +211,7 @@ def bends_kernel(parts: I32, count: int, labels: I32, middle: F64, area: F64, fr
 LEAST = 0.1  # share of the strongest direction below which planes do not say where a vertex is: two that differ by less than 26°
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def planes_about(count: int, triangles: I32, labels: I32) -> tuple[I32, I32]:
     """The planes of the triangles about each vertex v, in ascending order and each once: rows[starts[v] : starts[v + 1]]."""
     ends = np.zeros(count + 1, np.int32)
@@ -242,7 +242,7 @@ def planes_about(count: int, triangles: I32, labels: I32) -> tuple[I32, I32]:
     return rows[:size].copy(), starts
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def snapped_kernel(vertices: F64, rows: I32, starts: I32, planes: F64, farthest: float) -> F64:
     out = vertices.copy()
     for v in range(len(vertices)):
@@ -260,7 +260,7 @@ def snapped_kernel(vertices: F64, rows: I32, starts: I32, planes: F64, farthest:
     return out
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def unfold(points: F64, triangles: I32, normals: F64, rows: I32, starts: I32) -> int:
     """Move the vertices of triangles (t, 3) that lie the wrong way round to the middle of those neighbours that are on all their planes, so that each
     stays on its plane or line; returns how many."""
@@ -288,7 +288,7 @@ def unfold(points: F64, triangles: I32, normals: F64, rows: I32, starts: I32) ->
     return count
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy", inline="always")
+@kernel(inline="always")
 def _includes(larger: I32, smaller: I32) -> bool:
     """Whether an ascending list holds another."""
     at = 0
@@ -300,12 +300,12 @@ def _includes(larger: I32, smaller: I32) -> bool:
     return True
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy", inline="always")
+@kernel(inline="always")
 def _height(p: F64, plane: F64) -> float:
     return p[0] * plane[0] + p[1] * plane[1] + p[2] * plane[2] + plane[3]
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _step(p: F64, planes: F64, rows: I32) -> tuple[F64, float]:
     """The shortest step onto the planes, by least squares within the directions that they determine, and its length."""
     if len(rows) == 1:

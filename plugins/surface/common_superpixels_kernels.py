@@ -3,9 +3,9 @@
 
 from __future__ import annotations
 
-import numba
 import numpy as np
 
+from trihedron.pipeline.core.kernel import kernel
 from trihedron.pipeline.core.types import F32, F64, I32, U8
 from trihedron.plugins.shared.voxel_hash_kernels import I64, key_of, slot_of
 
@@ -16,7 +16,7 @@ COLOR, INVERSE_DEPTH = 0.03, 12.0  # weight of a grey level, and of 1/m, against
 COLUMNS = 13  # of a surfel: position, normal, colour, radius, weight, plane, number of views
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def assigned_kernel(depth: F32, gray: F32, labels: U8, mask: U8, side: int) -> I32:
     """(h, w) number of the superpixel a pixel belongs to, -1 = none: the nearest of the centres about it in place, inverse depth and brightness,
     and of the same region (SLIC, Achanta et al. 2012)."""
@@ -67,7 +67,7 @@ def assigned_kernel(depth: F32, gray: F32, labels: U8, mask: U8, side: int) -> I
     return out
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def surfels_kernel(depth: F32, color: U8, labels: U8, assigned: I32, lens: F64, side: int, count: int) -> F64:
     """(n, 13) one for each superpixel of at least a quarter of its square, camera frame: its mean point, and the plane of least squares through
     it."""
@@ -117,7 +117,7 @@ def surfels_kernel(depth: F32, color: U8, labels: U8, assigned: I32, lens: F64, 
 CELL_M = 0.15  # surfels farther apart than this are never one
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def fuse(surfels: F64, out: F64, keys: I64, heads: I32, after: I32, count: int, cosine: float) -> int:
     before = count
     for i in range(len(surfels)):

@@ -3,9 +3,9 @@
 
 from __future__ import annotations
 
-import numba
 import numpy as np
 
+from trihedron.pipeline.core.kernel import kernel
 from trihedron.pipeline.core.types import F64, I32
 
 # Greedy triangulation of points in a plane: the shortest edges first, each that crosses none before it (after Marton, Rusu, Beetz, ICRA 2009).
@@ -13,7 +13,7 @@ from trihedron.pipeline.core.types import F64, I32
 MOST = 96  # neighbours of a point that may be joined to it
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def accepted(points: F64, edges: I32, length: F64, distance: F64, nearest: I32) -> I32:
     """Rows of the edges, shortest first, that cross no edge accepted before. One that does is no longer, so one of its ends is as near to an end of
     the edge as that is long: among its neighbours (n, MOST), sorted by distance."""
@@ -39,7 +39,7 @@ def accepted(points: F64, edges: I32, length: F64, distance: F64, nearest: I32) 
     return out[:count].copy()
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _any_crosses(points: F64, a: int, b: int, c: int, partners: I32, degree: I32) -> bool:
     """Whether an accepted edge from c crosses ab."""
     for k in range(degree[c]):
@@ -49,12 +49,12 @@ def _any_crosses(points: F64, a: int, b: int, c: int, partners: I32, degree: I32
     return False
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy", inline="always")
+@kernel(inline="always")
 def _turn(a: F64, b: F64, c: F64) -> float:
     return (b[0] - a[0]) * (c[1] - a[1]) - (b[1] - a[1]) * (c[0] - a[0])
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy", inline="always")
+@kernel(inline="always")
 def _crosses(a: F64, b: F64, c: F64, d: F64) -> bool:
     """Whether segments ab and cd cross or touch."""
     return _turn(a, b, c) * _turn(a, b, d) <= 0.0 and _turn(c, d, a) * _turn(c, d, b) <= 0.0

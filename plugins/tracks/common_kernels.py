@@ -3,13 +3,13 @@
 
 from __future__ import annotations
 
-import numba
 import numpy as np
 
+from trihedron.pipeline.core.kernel import kernel
 from trihedron.pipeline.core.types import F32, F64, I32
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def rows_of_pairs(found: I32) -> I32:
     """(n,) row of the current frame for each previous one, or -1 -> (k, 2)."""
     out, k = np.empty((len(found), 2), np.int32), 0
@@ -20,7 +20,7 @@ def rows_of_pairs(found: I32) -> I32:
     return out[:k]
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def predicted_kernel(pixels: F32, points_m: F32, intrinsics: tuple[float, float, float, float], R: F64, t: F64) -> F64:
     """`predict_pixels` of n."""
     out = np.empty((len(pixels), 2))
@@ -29,7 +29,7 @@ def predicted_kernel(pixels: F32, points_m: F32, intrinsics: tuple[float, float,
     return out
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def moved_pixel(u: float, v: float, x: float, y: float, z: float, camera: tuple[float, float, float, float], R: F64, t: F64) -> tuple[float, float]:
     """`predict_pixels` of the pixel (u, v) with the point (x, y, z)."""
     fx, fy, cx, cy = camera
@@ -45,7 +45,7 @@ def moved_pixel(u: float, v: float, x: float, y: float, z: float, camera: tuple[
     return column, row
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def nearest_pixels(pixels: F32, among: F32) -> tuple[I32, F64]:
     """(n,) rows of the nearest of `among` (m, 2), m > 0, to each of the pixels (n, 2), the first of equals, and their distances (n,), px."""
     rows, distances = np.zeros(len(pixels), np.int32), np.empty(len(pixels))

@@ -5,9 +5,9 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-import numba
 import numpy as np
 
+from trihedron.pipeline.core.kernel import kernel
 from trihedron.pipeline.core.types import F32, F64, I32
 from trihedron.plugins.shared.plane_association_kernels import moved_planes
 from trihedron.plugins.tracks.common_kernels import moved_pixel
@@ -27,7 +27,7 @@ class Places(NamedTuple):
     endpoints_m: F32  # (m, 2, 3)
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def moved(before: Places, planes: F64, samples_m: F32, camera: Intrinsics, R: F64, t: F64) -> tuple[F32, F32, F64, F32]:
     """Pixels (n, 2) and ends of lines (m, 2, 2) of the previous frame, its planes (p, 4) and points on them (p, s, 3), where the motion puts them."""
     pixels, ends = np.empty((len(before.pixels), 2), np.float32), np.empty((len(before.endpoints_px), 2, 2), np.float32)
@@ -40,20 +40,20 @@ def moved(before: Places, planes: F64, samples_m: F32, camera: Intrinsics, R: F6
     return pixels, ends, coefficients, samples
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _there(pixels: F32, points_m: F32, i: int, camera: Intrinsics, R: F64, t: F64) -> tuple[float, float]:
     """Row i of key points where the motion puts it."""
     return moved_pixel(pixels[i, 0], pixels[i, 1], points_m[i, 0], points_m[i, 1], points_m[i, 2], camera, R, t)
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _end_there(shown: Places, i: int, end: int, camera: Intrinsics, R: F64, t: F64) -> tuple[float, float]:
     """An end of line i where the motion puts it."""
     px, m = shown.endpoints_px, shown.endpoints_m
     return moved_pixel(px[i, end, 0], px[i, end, 1], m[i, end, 0], m[i, end, 1], m[i, end, 2], camera, R, t)
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def agreeing_kernel(
     points: I32, lines: I32, before: Places, now: Places, camera: Intrinsics, R: F64, t: F64, unsure_px: float, error_px: float
 ) -> tuple[I32, I32]:

@@ -3,9 +3,9 @@
 
 from __future__ import annotations
 
-import numba
 import numpy as np
 
+from trihedron.pipeline.core.kernel import kernel
 from trihedron.pipeline.core.types import F32, F64
 from trihedron.plugins.shared.depth_image_kernels import sigma_z
 from trihedron.plugins.shared.pose_optimizer_kernels import SAME, LineTerms, PlaneTerms, PointTerms, basis
@@ -13,7 +13,7 @@ from trihedron.plugins.shared.relative_motion_kernels import LinePairs, PlanePai
 
 # Features of the previous frame placed in the world by its pose, with the noise of what they were measured from: terms for the pose solver.
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def tracked_points(pairs: PointPairs, pixels: F32, fx: float, fy: float, T: F64, turned: F64) -> PointTerms:
     """Those of the points whose previous depth is known, seen at some of `pixels` (k, 2); T (4, 4) and `turned` (3, 3) as in `placed_points`."""
     rows, before, before_sigma, points, sigma_px, sigma_m = pairs
@@ -34,7 +34,7 @@ def tracked_points(pairs: PointPairs, pixels: F32, fx: float, fy: float, T: F64,
     return PointTerms(world, covariance, seen, depth, seen_px, seen_m)
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def tracked_lines(
     pairs: LinePairs, pixels: F32, sigma_px: float, noise: tuple[float, float, float, float], fx: float, fy: float, T: F64, turned: F64
 ) -> LineTerms:
@@ -63,7 +63,7 @@ def tracked_lines(
     return LineTerms(world.reshape(n, 2, 3), of_world.reshape(n, 2, 3, 3), seen, np.full(n, sigma_px), measured, of_measured)
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def tracked_planes(pairs: PlanePairs, T: F64, turned: F64) -> PlaneTerms:
     """All of the planes."""
     rows, before, before_covariance, planes, covariance = pairs
@@ -80,7 +80,7 @@ def tracked_planes(pairs: PlanePairs, T: F64, turned: F64) -> PlaneTerms:
     return PlaneTerms(kinds, world, of_world, observed, of_observed)
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def placed_points(points: F32, sigma_px: F32, sigma_m: F32, fx: float, fy: float, T: F64, turned: F64) -> tuple[F64, F64]:
     """Camera-frame points (n, 3) in the world, T (4, 4) being `T_world_camera`, and their covariances (n, 3, 3) there: `sigma_px` (n,) across the
     ray, `sigma_m` (n,) of the depth, and what a rotation of the camera known to `turned` (3, 3, rad²) adds:
@@ -105,7 +105,7 @@ def placed_points(points: F32, sigma_px: F32, sigma_m: F32, fx: float, fy: float
     return world, covariance
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
+@kernel(forceinline=True)
 def _sandwich(A: F64, C: F64, M: F64, out: F64) -> None:
     """`out = A C Aᵀ`, all (3, 3); M is scratch."""
     for a in range(3):
@@ -116,7 +116,7 @@ def _sandwich(A: F64, C: F64, M: F64, out: F64) -> None:
             out[a, b] = M[a, 0] * A[b, 0] + M[a, 1] * A[b, 1] + M[a, 2] * A[b, 2]
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def placed_planes(planes: F64, covariance: F64, observed: F64, T: F64, turned: F64) -> tuple[F64, F64, F64]:
     """Camera-frame planes (n, 4) in the world, their covariances (n, 3, 3) of (a, b, d) there, and what a rotation of the camera known to `turned`
     (3, 3, rad²) adds to the covariances of the `observed` ones (n, 4): to the normal only."""
