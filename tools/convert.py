@@ -116,8 +116,13 @@ def _write(runner: Any, writer: RecordingWriter) -> None:
 
 
 def _metadata(destination: Path) -> dict[str, str]:
-    """What a replay starts from: the recording itself as the data set."""
+    """Describe the recording as the run a replay starts from: its data set is the recording itself."""
     from importlib.metadata import version
 
-    path = str(destination.resolve()).replace("\\", "\\\\").replace("'", "\\'")
-    return {"version": version("trihedron"), "commit": "", "overrides": json.dumps(["dataset=mcap", f"dataset.path='{path}'"]), "config": ""}
+    import yaml
+
+    from trihedron.pipeline.core.overrides import quoted
+
+    path = str(destination.resolve())
+    overrides, config = ["dataset=mcap", f"dataset.path={quoted(path)}"], {"dataset": {"plugin": "mcap", "path": path}}
+    return {"version": version("trihedron"), "commit": "", "overrides": json.dumps(overrides), "config": yaml.safe_dump(config)}

@@ -77,10 +77,11 @@ def prepared(trajectory: Path, recording: Path) -> tuple[F64, Truth]:
 
 
 def _dataset(recording: Any) -> Any:
-    """The data set of a run, from the overrides in its recording."""
-    from trihedron.pipeline.core.config import composed, make_plugin
+    """The data set of a run, from the configuration in its recording."""
+    from trihedron.pipeline.app.recorded_run import composed_run
+    from trihedron.pipeline.core.config import make_plugin
 
-    return make_plugin("dataset", composed(word for word in recording.overrides() if word.startswith("dataset")).dataset)
+    return make_plugin("dataset", composed_run(recording).dataset)
 
 
 def judged(vertices: F64, triangles: I32, truth: Truth) -> dict[str, Any]:

@@ -52,9 +52,10 @@ def frames_of(recording: Recording) -> Callable[[FrameReference], Frame | None]:
             return value if isinstance(value, Frame) else None
 
         return embedded
-    from trihedron.pipeline.core.config import composed, make_plugin
+    from trihedron.pipeline.app.recorded_run import composed_run
+    from trihedron.pipeline.core.config import make_plugin
 
-    options = composed(recording.overrides()).dataset
+    options = composed_run(recording).dataset
     dataset, first = make_plugin("dataset", options), frame_range(str(options.get("frames", "")))[0]
     try:
         len(dataset)

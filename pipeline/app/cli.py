@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import ast
 import os
-import re
 import shlex
 import sys
 import time
@@ -20,11 +19,13 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from trihedron.pipeline.core.errors import RecordingError, TrihedronError, UsageError, did_you_mean
+from trihedron.pipeline.core.errors import TrihedronError, UsageError, did_you_mean
 from trihedron.pipeline.run import memory
 
 if TYPE_CHECKING:
     from omegaconf import DictConfig
+
+    from trihedron.pipeline.core.config import RecordedConfig
 
     from trihedron.pipeline.sweep.sweep import Outcome
 
@@ -32,8 +33,6 @@ _FAILURES: list[Exception] = []  # of this process's runs
 _BEGAN = time.perf_counter()
 COMMAND_GROUP = "trihedron.commands"
 RUN_FLAGS = ("-m", "--multirun")
-OWN = ("out=", "replay=", "only=", "feedback=", "save_map=", "report=", "live=", "real_time=")  # of each run: no replay takes them from a recording
-RECORDED = ("graph", "experiment", "without", "threads", "seed", "outputs", "record", "load_map", "localise_only")  # what it may take, besides slots
 RUN_HELP = """Track a sequence: compose the configuration, run the graph, write the run folder.
 
 Usage: trihedron run [-m] [key=value ...]
@@ -133,12 +132,13 @@ def _run(words: list[str]) -> int:
         import hydra
 
         from trihedron.pipeline.core.config import check_added, register_configs, rewritten
+        from trihedron.pipeline.core.overrides import with_literal_paths
         from trihedron.pipeline.core.registry import load_plugins
 
         load_plugins()
-        register_configs()
+        register_configs(_recorded(words))
     check_added(words)
-    overrides = _with_recorded(words)
+    overrides = with_literal_paths(words, sweep=_is_sweep(words))
     outcomes = _swept(words)
     _FAILURES.clear()
     sys.argv = ["trihedron run", *sorted(overrides, key=lambda word: word not in RUN_FLAGS)]  # flags first
@@ -157,11 +157,15 @@ def _run(words: list[str]) -> int:
 
 def _swept(words: list[str]) -> list[Outcome]:
     """Where the outcomes of the sweeps that the words ask for will be; a single run does not wait for the engines of sweeps to be imported."""
-    if not any(word in RUN_FLAGS or word.lstrip("+").startswith("hydra.mode=") for word in words):
+    if not _is_sweep(words):
         return []
     from trihedron.pipeline.sweep.engines import register_engines
 
     return register_engines()
+
+
+def _is_sweep(words: list[str]) -> bool:
+    return any(word in RUN_FLAGS or word.lstrip("+").startswith("hydra.mode=") for word in words)
 
 
 def _task(config: DictConfig) -> float | None:
@@ -201,27 +205,14 @@ def _job(config: DictConfig, out: Path, work: Callable[[], dict[str, Any]]) -> d
     return metrics
 
 
-def _with_recorded(words: list[str]) -> list[str]:
-    """In a replay, the recording's own overrides come first and the command line on top; `out` is always new."""
-    source = next((word.partition("=")[2] for word in words if word.startswith("replay=")), "")
-    if not source:
-        return words
+def _recorded(words: list[str]) -> RecordedConfig | None:
+    """The configuration of the recording that the words replay, or None."""
+    from trihedron.pipeline.app.recorded_run import recorded_config_of
+    from trihedron.pipeline.core.overrides import path_of
     from trihedron.pipeline.record.reader import Recording
 
-    words_then = [word for word in Recording(source).overrides() if not word.startswith(OWN)]
-    for word in words_then:
-        _check_recorded(source, word)
-    return words_then + words
-
-
-def _check_recorded(source: str, word: str) -> None:
-    """A recording is data of others: it may choose stages, their options and wires, and nothing else of the program or of Hydra, which can be told
-    to write anywhere and to call anything. Raises RecordingError."""
-    from trihedron.pipeline.core.slots import SLOTS
-
-    key = re.match(r"\+{0,2}~?/?([\w]+)", word)
-    if key is None or key[1] not in (*SLOTS, *RECORDED) or "${" in word or "@" in word.partition("=")[0]:
-        raise RecordingError(source, f"was made with '{word}', which a recording has no say in", "give that on the command line if you trust it")
+    source = next((found[1] for word in reversed(words) if (found := path_of(word)) is not None and found[0] == "replay"), "")
+    return recorded_config_of(Recording(source)) if source else None
 
 
 def _point_latest(out: Path) -> None:

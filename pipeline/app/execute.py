@@ -21,6 +21,7 @@ from trihedron.pipeline.app.compilation import compile_once
 from trihedron.pipeline.core.config import Feedback, graph_of
 from trihedron.pipeline.core.errors import ConfigError, DataError, RecordingError, did_you_mean
 from trihedron.pipeline.core.graph import Graph
+from trihedron.pipeline.core.overrides import literal_text, path_of, quoted
 from trihedron.pipeline.core.slots import output_of
 from trihedron.pipeline.core.types import Surface, Trajectory
 from trihedron.pipeline.record.reader import Recording
@@ -37,7 +38,7 @@ from trihedron.pipeline.run.timing import forget_peak
 from trihedron.pipeline.run.warm_up import compilation_reported, warm_up
 
 RECORDING = "run.mcap"
-PATH_KEYS = ("dataset.path", "dataset.camera", "load_map")
+READ_PATHS = ("dataset.path", "dataset.camera", "dataset.options.path", "dataset.options.camera", "load_map")
 PLAIN_PROGRESS_SECONDS = 5.0
 
 
@@ -120,7 +121,7 @@ def _pace(config: DictConfig) -> Pace:
 def _source(config: DictConfig) -> str:
     """What is tracked, whichever part of it: the data set's options with absolute paths."""
     options: Any = OmegaConf.to_container(config.dataset, resolve=True, enum_to_str=True) if config.dataset is not None else {}
-    options = {name: _absolute(f"dataset.{name}={value}").partition("=")[2] for name, value in options.items() if name != "frames"}
+    options = {name: _absolute(value) if f"dataset.{name}" in READ_PATHS else str(value) for name, value in options.items() if name != "frames"}
     return json.dumps(options, sort_keys=True)
 
 
@@ -156,18 +157,27 @@ def _announce(runner: Runner) -> None:
 
 
 def _metadata(config: DictConfig, overrides: list[str]) -> dict[str, str]:
+    """Describe the run: version, commit, the words of its command, and its composed configuration, from which a replay is made."""
+    config = config.copy()
+    for key in READ_PATHS:
+        if isinstance(path := OmegaConf.select(config, key), str):
+            OmegaConf.update(config, key, literal_text(_absolute(path)))
     return {
         "version": importlib.metadata.version("trihedron"),
         "commit": _commit(),
-        "overrides": json.dumps([_absolute(word) for word in overrides]),
+        "overrides": json.dumps([_absolute_word(word) for word in overrides]),
         "config": OmegaConf.to_yaml(config, resolve=True),
     }
 
 
-def _absolute(override: str) -> str:
-    """A path of the data set as seen from anywhere, so that a replay finds it from another folder."""
-    key, _, value = override.partition("=")
-    return f"{key}={Path(value).expanduser().resolve()}" if key in PATH_KEYS and value and Path(value).expanduser().exists() else override
+def _absolute(path: str) -> str:
+    """The path as seen from anywhere, so that a replay finds it from another folder; text that names nothing stays as it is."""
+    return str(Path(path).expanduser().resolve()) if path and Path(path).expanduser().exists() else path
+
+
+def _absolute_word(word: str) -> str:
+    found = path_of(word)
+    return word if found is None or found[0].lstrip("+") not in READ_PATHS else f"{found[0]}={quoted(_absolute(found[1]))}"
 
 
 def _commit() -> str:

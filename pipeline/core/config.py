@@ -6,10 +6,12 @@ Hydra's many-line errors are rewritten as one line.
 
 from __future__ import annotations
 
+import copy
 import dataclasses
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from enum import Enum
+from functools import partial
 from typing import Any, get_type_hints
 
 from hydra import compose, initialize_config_module
@@ -20,10 +22,12 @@ from omegaconf.errors import ValidationError
 
 from trihedron.pipeline.core.errors import ConfigError, TrihedronError, UsageError, did_you_mean
 from trihedron.pipeline.core.graph import Graph, build_graph
+from trihedron.pipeline.core.overrides import with_literal_paths
 from trihedron.pipeline.core.registry import load_plugins, options_of, plugin_class, plugins_of
 from trihedron.pipeline.core.slots import SLOTS, Localising, default_wires
 
 PLUGIN_KEY = "plugin"  # which plugin a slot's configuration belongs to
+RECORDED_GRAPH = "recorded"  # in a replay: the option of `graph` with the wires of the recording
 SWEEPER, SEARCH, DASK = (f"hydra_plugins.trihedron.{name}" for name in ("Sweeper", "Search", "Dask"))  # `_target_` of Hydra's groups
 
 
@@ -93,20 +97,52 @@ class SearchOptions:
     params: Any = None  # overrides, as of any sweeper
 
 
-def register_configs() -> None:
-    """Put every loaded plugin and the root into Hydra's ConfigStore; call `registry.load_plugins` first."""
-    store = ConfigStore.instance()
+@dataclasses.dataclass(frozen=True)
+class RecordedConfig:
+    """Checked values of a recording: options by slot (`plugin` among them), wires by stage (None: not recorded), and root keys. Text is escaped, so
+    that OmegaConf interpolates nothing in it. `recorded_config.recorded_config` makes one."""
+
+    options: Mapping[str, Mapping[str, Any]] = dataclasses.field(default_factory=dict)
+    graph: Mapping[str, Mapping[str, str | None]] | None = None
+    root: Mapping[str, Any] = dataclasses.field(default_factory=dict)
+
+
+def register_configs(recorded: RecordedConfig | None = None) -> None:
+    """Put every loaded plugin and the root into Hydra's ConfigStore; call `registry.load_plugins` first.
+
+    The values of a recording take the place of the defaults: of its plugins' options, of the root keys, and of the graph, as `graph=recorded`."""
+    store, recorded = ConfigStore.instance(), recorded or RecordedConfig()
+    chosen = {slot: options[PLUGIN_KEY] for slot, options in recorded.options.items()}
     for slot in SLOTS:
         for name, plugin in plugins_of(slot).items():
-            store.store(group=slot, name=name, node=_option(name, plugin))
+            node = option_type(name, plugin)
+            store.store(group=slot, name=name, node=_with_defaults(node, recorded.options[slot]) if chosen.get(slot) == name else node)
+    store.repo.get("graph", {}).pop(f"{RECORDED_GRAPH}.yaml", None)
+    choices = {"dataset": chosen.get("dataset", "synthetic"), "graph": "structural"}
+    if recorded.graph is not None:
+        choices["graph"] = RECORDED_GRAPH
+        stages = [{f"/{slot}": name} for slot, name in chosen.items() if slot != "dataset"]
+        outputs = {"outputs": recorded.root["outputs"]} if "outputs" in recorded.root else {}
+        content = {"defaults": [*stages, "_self_"], "graph": dict(recorded.graph), **outputs}
+        store.store(group="graph", name=RECORDED_GRAPH, package="_global_", node=content)
     slots = [(slot, Any, dataclasses.field(default=None)) for slot in SLOTS]
+    defaults = [{key: choices.get(key, value) for key, value in entry.items()} if isinstance(entry, dict) else entry for entry in RunOptions().defaults]
     store.store(group="hydra/sweeper", name="trihedron", node={"_target_": SWEEPER, "max_batch_size": None, "params": None})
     store.store(group="hydra/sweeper", name="optuna", node=SearchOptions)
     store.store(group="hydra/launcher", name="dask", node={"_target_": DASK, "address": ""})
-    store.store(name="root", node=dataclasses.make_dataclass("Root", slots, bases=(RunOptions,)))
+    root = dataclasses.make_dataclass("Root", slots, bases=(RunOptions,))
+    values = {key: RecordOptions(**value) if key == "record" else value for key, value in recorded.root.items()}
+    store.store(name="root", node=_with_defaults(root, {**values, "defaults": defaults}))
 
 
-def _option(name: str, plugin: type[Any]) -> type[Any]:
+def _with_defaults(node: type[Any], values: Mapping[str, Any]) -> type[Any]:
+    """The dataclass with other defaults."""
+    hints = get_type_hints(node)
+    fields: list[Any] = [(name, hints[name], dataclasses.field(default_factory=partial(copy.deepcopy, value))) for name, value in values.items()]
+    return dataclasses.make_dataclass(node.__name__, fields, bases=(node,))
+
+
+def option_type(name: str, plugin: type[Any]) -> type[Any]:
     """The unfrozen twin of a plugin that Hydra wants (a frozen dataclass would be a read-only node), with the plugin's name."""
     hints = get_type_hints(plugin)
     fields: list[Any] = [(PLUGIN_KEY, str, dataclasses.field(default=name))]
@@ -164,13 +200,13 @@ def check_added(overrides: Iterable[str]) -> None:
             raise UsageError(added[1], "there is no such key to add to", cure if cure.startswith("did") else "see trihedron run --help")
 
 
-def composed(overrides: Iterable[str]) -> DictConfig:
-    """The configuration that `trihedron run` would make of these overrides. Raises TrihedronError, one line, as that does."""
+def composed(overrides: Iterable[str], recorded: RecordedConfig | None = None) -> DictConfig:
+    """Compose the configuration that `trihedron run` makes of these overrides, over the values of a recording. Raises TrihedronError, one line."""
     load_plugins()
-    register_configs()
+    register_configs(recorded)
     try:
         with initialize_config_module("trihedron.conf", version_base="1.3"):
-            return compose("root", overrides=list(overrides))
+            return compose("root", overrides=with_literal_paths(overrides))
     except Exception as error:
         raise rewritten(error) from error
 

@@ -7,6 +7,7 @@ to its end. A job that fails, be it because its configuration is refused, leaves
 from __future__ import annotations
 
 import itertools
+import re
 import sys
 import threading
 import time
@@ -23,7 +24,8 @@ from joblib.externals.loky import get_reusable_executor
 from omegaconf import DictConfig
 
 from trihedron.pipeline.core.config import rewritten
-from trihedron.pipeline.core.errors import TrihedronError
+from trihedron.pipeline.core.errors import TrihedronError, UsageError
+from trihedron.pipeline.core.overrides import with_literal_paths
 from trihedron.pipeline.sweep.cluster import all_awaited
 from trihedron.pipeline.sweep.jobs import DONE, FAILED, RUNNING, key_of, read_job, write_job
 
@@ -164,11 +166,19 @@ class Sweeper(BasicSweeper):
 
 
 def words_of_sequence(text: str) -> Overrides:
-    """`KIND`, `KIND:FOLDER`, and options after blanks, as overrides: "tum:/data/desk frames=0:100" is dataset=tum dataset.path=/data/desk
-    dataset.frames=0:100. Options of a data set underneath another (options.path=...) are added."""
-    kind, *options = text.split()
-    name, _, path = kind.partition(":")
-    return [f"dataset={name}", *([f"dataset.path={path}"] if path else []), *(f"{'+' * o.startswith('options.')}dataset.{o}" for o in options)]
+    """Turn `KIND`, `KIND:FOLDER`, and options after blanks, into overrides: "tum:/data/desk frames=0:100" is dataset=tum dataset.path=/data/desk
+    dataset.frames=0:100. Options of a data set underneath another (options.path=...) are added. A folder with blanks is the longest that exists."""
+    match = re.fullmatch(r"(?P<kind>\w*)(:(?P<path>.*?))?(?P<options>(\s+[\w.]+=\S*)*)\s*", text, re.DOTALL)
+    if match is None:
+        raise UsageError("sequences", f"'{text}' is not a data set", 'write KIND:FOLDER KEY=VALUE ..., for example "tum:/data/desk frames=0:300"')
+    kind, path, options = match["kind"], match["path"] or "", match["options"].split()
+    words = re.split(r"(\s+)", path + match["options"])
+    for count in range(len(words), 0, -2):  # blanks and `=` may be the folder's
+        if path and Path(folder := "".join(words[:count])).expanduser().exists():
+            path, options = folder, [word for word in words[count:] if word.strip()]
+            break
+    keys = [f"{'+' * option.startswith('options.')}dataset.{option}" for option in options]
+    return [f"dataset={kind}", *with_literal_paths(([f"dataset.path={path}"] if path else []) + keys)]
 
 
 def _numbers(folder: Path, jobs: Sequence[Overrides]) -> list[int]:
