@@ -10,7 +10,9 @@ MCAP = "is not an MCAP file; give a file that trihedron run or another MCAP writ
 MISTAKES = [  # words of the command, exit code, what is said after "trihedron: "
     ("run threads=abc", 1, f"threads: Value 'abc' of type 'str' could not be converted to Integer; {TYPE}"),
     ("run threads=", 1, f"threads: Value '' of type 'str' could not be converted to Integer; {TYPE}"),
-    ("run threads=-1", 1, "threads: -1 is not a number of threads; give 1 or more"),
+    ("run threads=-1", 1, "threads: -1 is not a number of threads; give 1 to 256"),
+    ("run dataset=tum dataset.path=~nobody_here/x", 1, "path: begins with ~ and the name of nobody; write ./~NAME for a file of that name"),
+    ("run threads=100000", 1, "threads: 100000 is not a number of threads; give 1 to 256"),
     ("run seed=-1", 1, "seed: -1 is negative; give 0 or more"),
     ("run seed=x", 1, f"seed: Value 'x' of type 'str' could not be converted to Integer; {TYPE}"),
     ("run keypoints=orb,sift", 2, "keypoints: 'orb,sift' is several values; add -m to run once with each, or write a list as [A,B]"),
@@ -55,7 +57,7 @@ MISTAKES = [  # words of the command, exit code, what is said after "trihedron: 
     ("run replay=small/run.mcap save_map=x.mcap", 1, "save_map: a replay makes no map to go on from; save the map of the run itself"),
     ("run experiment=leave_on_out", 1, "experiment: there is no experiment 'leave_on_out'; did you mean 'leave_one_out'?"),
     ("run without=legs", 1, "without: there is no without 'legs'; did you mean 'lines'?"),
-    ("run out=text.txt/x", 1, "out: the folder cannot be made: Not a directory: text.txt/x; give another out=FOLDER"),
+    ("run out=text.txt/x", 1, "out: the folder cannot be made: Not a directory: {here}/text.txt/x; give another out=FOLDER"),
     ("run out=", 2, "out=: lacks a folder; write key=value, for example out=runs/mine"),
     ("run =3", 2, "=3: lacks a key; write key=value, for example out=runs/mine"),
     ("run a b", 2, f"a: is not an override; {WRITE}"),
@@ -82,6 +84,9 @@ MISTAKES = [  # words of the command, exit code, what is said after "trihedron: 
 ]  # fmt: skip
 
 
+FILES = ["empty", "junk.mcap", "small", "text.txt"]
+
+
 @pytest.fixture(scope="module")
 def here(tmp_path_factory):
     """A folder with things that are not what a newcomer takes them for, and a small run."""
@@ -100,6 +105,7 @@ def test_a_mistake_is_one_line(here, monkeypatch, capsys, words, code, line):
     printed = capsys.readouterr()
     assert printed.err == f"trihedron: {line.format(here=here)}\n"
     assert not printed.out
+    assert sorted(path.name for path in here.iterdir()) == FILES  # a refused run leaves no folder behind
 
 
 def test_the_table_is_long_enough():

@@ -1,11 +1,14 @@
 """The command `trihedron`: `run` here, every other command from the entry-point group `trihedron.commands`.
 
-Exit codes: 0 done, 1 an error in configuration, data or a stage, 2 wrong usage, 130 interrupted. Errors are one line; `--debug` shows the traceback.
+Exit codes: 0 done, 1 an error in configuration, data or a stage, 2 wrong usage, 128 + the signal's number when one ended it (130 SIGINT, 143 SIGTERM,
+129 SIGHUP). Errors are one line; `--debug` shows the traceback.
 """
 
 from __future__ import annotations
 
 import ast
+import errno
+import io
 import os
 import shlex
 import sys
@@ -19,14 +22,15 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from trihedron.pipeline.core.errors import TrihedronError, UsageError, did_you_mean
+from trihedron.pipeline.core.errors import DataError, TrihedronError, UsageError, did_you_mean
+from trihedron.pipeline.core.overrides import literal_text, path_of, with_literal_paths
 from trihedron.pipeline.run import memory
+from trihedron.pipeline.run.interrupts import Interruption, ending_signals_interrupt
 
 if TYPE_CHECKING:
     from omegaconf import DictConfig
 
     from trihedron.pipeline.core.config import RecordedConfig
-
     from trihedron.pipeline.sweep.sweep import Outcome
 
 _FAILURES: list[Exception] = []  # of this process's runs
@@ -65,20 +69,48 @@ def main(argv: list[str] | None = None) -> int:
     memory.configure_malloc()
     words = list(sys.argv[1:] if argv is None else argv)
     debug = "--debug" in words
-    words = [word for word in words if word != "--debug"]
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="replace")  # where the terminal has no such letter
     try:
-        return _dispatch(words)
-    except TrihedronError as error:
-        if debug:
-            raise
-        print(f"trihedron: {error}", file=sys.stderr)
-        return error.exit_code
-    except KeyboardInterrupt:
+        with ending_signals_interrupt():
+            code = _dispatch([word for word in words if word != "--debug"])
+            sys.stdout.flush()
+            return code
+    except KeyboardInterrupt as error:
         print("trihedron: interrupted; what was done is kept", file=sys.stderr)
-        return 130
+        return error.exit_code if isinstance(error, Interruption) else 130
     except BrokenPipeError:
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        _discard_stdout()
         return 0
+    except Exception as error:
+        mistake = _of_the_machine(error)
+        if debug or mistake is None:
+            raise
+        print(f"trihedron: {mistake}", file=sys.stderr)
+        return mistake.exit_code
+
+
+def _of_the_machine(error: Exception) -> TrihedronError | None:
+    """The error as one line where the user or the machine caused it: no memory, no thread, no room, no permission; None for a defect."""
+    if isinstance(error, TrihedronError):
+        return error
+    if isinstance(error, OSError) and error.strerror:
+        if error.filename is None and error.errno in (errno.ENOSPC, errno.EIO, errno.EBADF):
+            _discard_stdout()
+        return DataError(str(error.filename or "standard output"), f"cannot be used: {error.strerror}", "make room, or give another place")
+    if isinstance(error, MemoryError) or "start new thread" in str(error) or "failed to map segment" in str(error):
+        cause = "ran out" if isinstance(error, MemoryError) else f"ran out ({error})"
+        return DataError("memory", cause, "give the process more (ulimit -v), fewer threads=N, or smaller images")
+    if isinstance(error, RuntimeError) and "home directory" in str(error):  # Path.expanduser
+        return DataError("path", "begins with ~ and the name of nobody", "write ./~NAME for a file of that name")
+    return None
+
+
+def _discard_stdout() -> None:
+    """Send what is still buffered nowhere, so that the interpreter's end does not complain of it."""
+    with suppress(OSError, ValueError):
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 def _dispatch(words: list[str]) -> int:
@@ -118,7 +150,7 @@ def _document(entry: EntryPoint) -> str:
 
 
 def _run(words: list[str]) -> int:
-    """Compose with Hydra and execute; Hydra writes `.hydra/` and carries sweeps."""
+    """Compose the configuration and execute it, once or as a sweep."""
     if "-h" in words or "--help" in words:
         print(RUN_HELP)
         return 0
@@ -127,18 +159,38 @@ def _run(words: list[str]) -> int:
             raise UsageError(word, "is not an option of run", f"known: {', '.join(RUN_FLAGS)}; everything else is key=value")
         if word.startswith("=") or word == "out=":
             raise UsageError(word, "lacks a " + ("key" if word.startswith("=") else "folder"), "write key=value, for example out=runs/mine")
-    os.environ["HYDRA_FULL_ERROR"] = "1"  # exceptions come to us instead of being printed
     with memory.gc_paused():
-        import hydra
+        from trihedron.pipeline.core.config import check_added, composed, rewritten
 
-        from trihedron.pipeline.core.config import check_added, register_configs, rewritten
-        from trihedron.pipeline.core.overrides import with_literal_paths
-        from trihedron.pipeline.core.registry import load_plugins
+        check_added(words)
+        recorded = _recorded(words)
+        if not _is_sweep(words):
+            config = composed(words, recorded)
+    if _is_sweep(words):
+        return _sweep(words, recorded)
+    from trihedron.pipeline.app.execute import execute
 
-        load_plugins()
-        register_configs(_recorded(words))
-    check_added(words)
-    overrides = with_literal_paths(words, sweep=_is_sweep(words))
+    try:
+        out = Path(config.out).expanduser().absolute()
+    except Exception as error:  # an interpolation of the user's that leads nowhere
+        raise rewritten(error) from error
+    config.out = literal_text(str(out))  # with the time of its beginning
+    execute(config, out, with_literal_paths(words), _BEGAN)
+    _point_latest(out)
+    return 0
+
+
+def _sweep(words: list[str], recorded: RecordedConfig | None) -> int:
+    """Let Hydra's multirun carry the jobs; then report."""
+    import hydra
+
+    from trihedron.pipeline.core.config import register_configs, rewritten
+    from trihedron.pipeline.core.registry import load_plugins
+
+    os.environ["HYDRA_FULL_ERROR"] = "1"  # exceptions come to us instead of being printed
+    load_plugins()
+    register_configs(recorded)
+    overrides = with_literal_paths(words, sweep=True)
     outcomes = _swept(words)
     _FAILURES.clear()
     sys.argv = ["trihedron run", *sorted(overrides, key=lambda word: word not in RUN_FLAGS)]  # flags first
@@ -208,7 +260,6 @@ def _job(config: DictConfig, out: Path, work: Callable[[], dict[str, Any]]) -> d
 def _recorded(words: list[str]) -> RecordedConfig | None:
     """The configuration of the recording that the words replay, or None."""
     from trihedron.pipeline.app.recorded_run import recorded_config_of
-    from trihedron.pipeline.core.overrides import path_of
     from trihedron.pipeline.record.reader import Recording
 
     source = next((found[1] for word in reversed(words) if (found := path_of(word)) is not None and found[0] == "replay"), "")

@@ -34,12 +34,14 @@ from trihedron.pipeline.run.map_file import load_map, save_map
 from trihedron.pipeline.run.replay import TOPICS, Replay
 from trihedron.pipeline.run.runner import Runner, Step
 from trihedron.pipeline.run.state import DelayLines, max_delays
+from trihedron.pipeline.run.run_folder import held, write_configuration
 from trihedron.pipeline.run.timing import forget_peak
 from trihedron.pipeline.run.warm_up import compilation_reported, warm_up
 
 RECORDING = "run.mcap"
 READ_PATHS = ("dataset.path", "dataset.camera", "dataset.options.path", "dataset.options.camera", "load_map")
 PLAIN_PROGRESS_SECONDS = 5.0
+MAX_THREADS = 256
 
 
 def execute(config: DictConfig, out: Path, overrides: list[str], began: float) -> dict[str, Any]:
@@ -47,8 +49,8 @@ def execute(config: DictConfig, out: Path, overrides: list[str], began: float) -
 
     Raises TrihedronError. Whatever happens after the first frame, the recording is closed and the trajectory so far is written."""
     forget_peak()
-    if config.threads < 1:
-        raise ConfigError("threads", f"{config.threads} is not a number of threads", "give 1 or more")
+    if not 1 <= config.threads <= MAX_THREADS:
+        raise ConfigError("threads", f"{config.threads} is not a number of threads", f"give 1 to {MAX_THREADS}")
     if config.seed < 0:
         raise ConfigError("seed", f"{config.seed} is negative", "give 0 or more")
     graph = graph_of(config)
@@ -60,26 +62,28 @@ def execute(config: DictConfig, out: Path, overrides: list[str], began: float) -
     _announce(runner)
     trial = partial(Runner, graph, config.seed, config.threads, replay, frames, remembered)
     compile_once(runner.computed, runner.feed is not None)
-    with _Warnings() as warnings, compilation_reported():
-        warm_up(trial())
-        warnings.muted = False
-        writer = RecordingWriter(out / RECORDING, {**_metadata(config, overrides), TOPICS: json.dumps(sorted(topics))})
-        attachments = _attachments(graph, replay)
-        for name, text in attachments.items():
-            writer.attach(name, text)
-        truth = attached_truth(attachments, str(writer.path))
-        started = time.perf_counter()
-        try:
-            for _ in _progress(runner.steps(writer, topics, embed_frames="dataset" in topics, truth=truth)):
-                pass
-            if config.save_map:
-                save_map(Path(config.save_map).expanduser(), runner.state, _metadata(config, overrides), source)
-        finally:
-            with Interrupts() as interrupts, interrupts.held():
-                failure = _closed(writer)
-                metrics, timing = _write(runner, truth, out, started, began)
-                warnings.summarise()
-    _report(out, metrics, timing, [results.write_surface(out, value) for value in runner.result.folds.values() if isinstance(value, Surface)])
+    with held(out):
+        write_configuration(out, config, overrides)
+        with _Warnings() as warnings, compilation_reported():
+            warm_up(trial())
+            warnings.muted = False
+            writer = RecordingWriter(out / RECORDING, {**_metadata(config, overrides), TOPICS: json.dumps(sorted(topics))})
+            attachments = _attachments(graph, replay)
+            for name, text in attachments.items():
+                writer.attach(name, text)
+            truth = attached_truth(attachments, str(writer.path))
+            started = time.perf_counter()
+            try:
+                for _ in _progress(runner.steps(writer, topics, embed_frames="dataset" in topics, truth=truth)):
+                    pass
+                if config.save_map:
+                    save_map(Path(config.save_map).expanduser(), runner.state, _metadata(config, overrides), source)
+            finally:
+                with Interrupts() as interrupts, interrupts.held():
+                    failure = _closed(writer)
+                    metrics, timing = _write(runner, truth, out, started, began)
+                    warnings.summarise()
+        _report(out, metrics, timing, [results.write_surface(out, value) for value in runner.result.folds.values() if isinstance(value, Surface)])
     if failure is not None:
         raise failure
     return metrics

@@ -126,7 +126,8 @@ def register_configs(recorded: RecordedConfig | None = None) -> None:
         content = {"defaults": [*stages, "_self_"], "graph": dict(recorded.graph), **outputs}
         store.store(group="graph", name=RECORDED_GRAPH, package="_global_", node=content)
     slots = [(slot, Any, dataclasses.field(default=None)) for slot in SLOTS]
-    defaults = [{key: choices.get(key, value) for key, value in entry.items()} if isinstance(entry, dict) else entry for entry in RunOptions().defaults]
+    plain = RunOptions().defaults
+    defaults = [{key: choices.get(key, value) for key, value in entry.items()} if isinstance(entry, dict) else entry for entry in plain]
     store.store(group="hydra/sweeper", name="trihedron", node={"_target_": SWEEPER, "max_batch_size": None, "params": None})
     store.store(group="hydra/sweeper", name="optuna", node=SearchOptions)
     store.store(group="hydra/launcher", name="dask", node={"_target_": DASK, "address": ""})

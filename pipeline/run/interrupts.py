@@ -1,4 +1,4 @@
-"""Ctrl-C where something must be done whole."""
+"""Signals that ask the program to end: SIGINT (Ctrl-C), SIGTERM and SIGHUP, and blocks that they do not cut in two."""
 
 from __future__ import annotations
 
@@ -8,31 +8,63 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
 
+ENDING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+
+
+class Interruption(KeyboardInterrupt):
+    """A signal asks the program to end. `exit_code` is 128 + its number: 143 for SIGTERM, 129 for SIGHUP."""
+
+    def __init__(self, number: int) -> None:
+        super().__init__(signal.Signals(number).name)
+        self.exit_code = 128 + number
+
+
+def interrupt(number: int, *_: Any) -> None:
+    """Handle SIGTERM or SIGHUP as Python handles SIGINT: raise in the main thread."""
+    raise KeyboardInterrupt if number == signal.SIGINT else Interruption(number)
+
+
+@contextmanager
+def ending_signals_interrupt() -> Iterator[None]:
+    """Within it SIGTERM and SIGHUP interrupt the program as SIGINT does. One that is ignored (nohup) or that others handle stays as it is."""
+    numbers = [number for number in ENDING[1:] if _on_main_thread() and signal.getsignal(number) is signal.SIG_DFL]
+    for number in numbers:
+        signal.signal(number, interrupt)
+    try:
+        yield
+    finally:
+        for number in numbers:
+            signal.signal(number, signal.SIG_DFL)
+
 
 class Interrupts:
-    """While this is entered, a Ctrl-C that comes in a `with self.held():` raises KeyboardInterrupt at the block's end, and any other at once, as
-    always. Entering asks the system, holding does not. Off the main thread, and where others handle Ctrl-C, nothing changes."""
+    """While this is entered, a signal that comes in a `with self.held():` raises KeyboardInterrupt at the block's end, and any other at once, as
+    always. Entering asks the system, holding does not. Off the main thread, and for signals that others handle, nothing changes."""
 
     count = 0  # of those that came to this process, for threads that wait for something
 
     def __init__(self) -> None:
-        self._holding = self._came = self._handling = False
+        self._holding, self._came = False, 0
+        self._handlers: dict[int, Any] = {}
 
     def __enter__(self) -> Interrupts:
-        self._handling = _on_main_thread() and signal.getsignal(signal.SIGINT) is signal.default_int_handler
-        if self._handling:
-            signal.signal(signal.SIGINT, self._handle)
+        if _on_main_thread():
+            handlers = {number: signal.getsignal(number) for number in ENDING}
+            self._handlers = {number: handler for number, handler in handlers.items() if handler in (signal.default_int_handler, interrupt)}
+            for number in self._handlers:
+                signal.signal(number, self._handle)
         return self
 
     def __exit__(self, *_: Any) -> None:
-        if self._handling and _on_main_thread():
-            signal.signal(signal.SIGINT, signal.default_int_handler)
+        if _on_main_thread():
+            for number, handler in self._handlers.items():
+                signal.signal(number, handler)
 
-    def _handle(self, *_: Any) -> None:
+    def _handle(self, number: int, *_: Any) -> None:
         Interrupts.count += 1
         if not self._holding:
-            raise KeyboardInterrupt
-        self._came = True
+            interrupt(number)
+        self._came = number
 
     @contextmanager
     def held(self) -> Iterator[None]:
@@ -43,8 +75,8 @@ class Interrupts:
         finally:
             self._holding = False
         if self._came:
-            self._came = False
-            raise KeyboardInterrupt
+            number, self._came = self._came, 0
+            interrupt(number)
 
 
 def _on_main_thread() -> bool:

@@ -12,6 +12,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+import yaml
 
 from trihedron.datasets.simulation.synthetic import Synthetic
 from trihedron.pipeline.app.cli import main
@@ -38,7 +39,7 @@ def refused(capsys, *words, code=1):
 SEE = "see trihedron plugins for the options of"
 MISTAKES = [
     (["threads=abc"], 1, "trihedron: threads: Value 'abc' of type 'str' could not be converted to Integer; give a value of that type"),
-    (["threads=0"], 1, "trihedron: threads: 0 is not a number of threads; give 1 or more"),
+    (["threads=0"], 1, "trihedron: threads: 0 is not a number of threads; give 1 to 256"),
     (["threds=1"], 1, "trihedron: threds: there is no such key; did you mean 'threads'?"),
     (["keypoints=orbs"], 1, "trihedron: keypoints: there is no plugin 'orbs' for the slot 'keypoints'; did you mean 'orb'?"),
     (["keypoints.featurs=3"], 1, "trihedron: keypoints.featurs: the chosen plugin has no option 'featurs'; did you mean 'features'?"),
@@ -177,23 +178,92 @@ def test_a_sweep_goes_on_after_a_job_that_fails(capsys, tmp_path):
     assert lengths == [3, 4]
 
 
-def test_an_interrupt_leaves_a_recording_and_a_trajectory(tmp_path):
-    words = ["run", "dataset=synthetic", "dataset.length=2000", "dataset.width=160", "dataset.height=120", "out=cut"]
-    listen = "import signal; signal.signal(signal.SIGINT, signal.default_int_handler)"  # a shell's background jobs are born deaf to it
-    code = f"{listen}; import sys; from trihedron.pipeline.app.cli import main; sys.exit(main({words!r}))"
-    process = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
-    recording = tmp_path / "cut" / "run.mcap"
-    for _ in range(600):
-        if recording.exists() and recording.stat().st_size > 2_000_000:
-            break
+def started(folder, *words, environment=None):
+    """A run in a process of its own that listens to Ctrl-C (a shell's background jobs are born deaf to it)."""
+    listen = "import signal; signal.signal(signal.SIGINT, signal.default_int_handler)"
+    code = f"{listen}; import sys; from trihedron.pipeline.app.cli import main; sys.exit(main({['run', *words]!r}))"
+    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
+    return subprocess.Popen([sys.executable, "-c", code], cwd=folder, env={**os.environ, **(environment or {})}, **pipes)
+
+
+def wait_for(recording, size=500_000):
+    for _ in range(1200):
+        if recording.exists() and recording.stat().st_size > size:
+            return
         time.sleep(0.1)
-    process.send_signal(signal.SIGINT)
+
+
+LONG = ["dataset=synthetic", "dataset.length=2000", "dataset.width=160", "dataset.height=120"]
+
+
+@pytest.mark.parametrize("number, code", [(signal.SIGINT, 130), (signal.SIGTERM, 143), (signal.SIGHUP, 129)])
+def test_a_signal_leaves_a_recording_and_a_trajectory(tmp_path, number, code):
+    process = started(tmp_path, *LONG, "out=cut")
+    recording = tmp_path / "cut" / "run.mcap"
+    wait_for(recording)
+    process.send_signal(number)
     _, errors = process.communicate(timeout=60)
-    assert process.returncode == 130 and errors.strip().splitlines()[-1] == "trihedron: interrupted; what was done is kept"
+    assert process.returncode == code and errors.strip().splitlines()[-1] == "trihedron: interrupted; what was done is kept"
     poses = list(Recording(recording).values("pose"))
     written = len(read_trajectory(tmp_path / "cut" / "trajectory.txt"))
     assert 5 < len(poses) < 2000 and written == len(poses)
     assert (tmp_path / "cut" / "timing.json").exists() and (tmp_path / "cut" / "metrics.json").exists()
+
+
+def test_a_folder_in_use_is_left_as_it_is(tmp_path, capsys):
+    process = started(tmp_path, *LONG, "out=used")
+    wait_for(tmp_path / "used" / "run.mcap")
+    before = (tmp_path / "used" / ".hydra" / "config.yaml").read_bytes()
+    line = refused(capsys, "out=used", "dataset.seed=9")
+    assert line == f"trihedron: {tmp_path}/used: is being written by another process; wait until that has ended, or give another out=FOLDER"
+    assert (tmp_path / "used" / ".hydra" / "config.yaml").read_bytes() == before
+    process.send_signal(signal.SIGTERM)
+    assert process.wait(60) == 143
+    assert main(["run", *SMALL, "dataset.frames=0:2", "outputs=[keypoints]", "out=used"]) == 0  # the lock ends with the process
+
+
+def test_a_full_device_and_an_ascii_terminal_are_no_tracebacks(tmp_path):
+    words = [*PROGRAM, "run", *SMALL, "dataset.frames=0:2", "outputs=[keypoints]", "out=full"]
+    with open("/dev/full", "w") as full:
+        done = subprocess.run(words, stdout=full, stderr=subprocess.PIPE, text=True)
+    line = "trihedron: standard output: cannot be used: No space left on device; make room, or give another place\n"
+    assert (done.returncode, done.stderr) == (1, line)
+    for words in (["plugins"], ["run", "--help"], ["run", "dataset.width=-5"]):
+        done = subprocess.run([*PROGRAM, *words], capture_output=True, text=True, env={**os.environ, "PYTHONIOENCODING": "ascii"})
+        assert "Traceback" not in done.stderr and done.returncode == (1 if words[-1].startswith("dataset") else 0)
+
+
+@pytest.mark.parametrize("megabytes", [300, 700, 1000, 1500])
+def test_memory_that_runs_out_is_one_line(tmp_path, megabytes):
+    code = (
+        f"import resource; resource.setrlimit(resource.RLIMIT_AS, ({megabytes} << 20,) * 2)\n"
+        f"import sys; from trihedron.pipeline.app.cli import main; sys.exit(main(['run', 'dataset.length=3', 'out=little']))"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env={**os.environ, "OPENBLAS_NUM_THREADS": "1"})
+    assert "Traceback" not in done.stderr, done.stderr[-1000:]
+    if done.returncode and "LLVM ERROR" not in done.stderr:  # the compiler ends the process itself
+        assert done.stderr.strip().splitlines()[-1].startswith("trihedron: "), done.stderr[-1000:]
+
+
+NAMES = ["with blanks", "it's", 'a "quoted" name', "[brackets] (and) {braces}", "a,b", "a=b", "#1", "größe", "日本", "${HOME}"]
+NAMES += ["back\\slash", "a: b", "null"]
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_any_path_works(tmp_path, name):
+    """Of a data set, a recording, a map and a run folder."""
+    folder = tmp_path / name
+    folder.mkdir()
+    small = ["dataset.width=64", "dataset.height=48", "dataset.length=4"]
+    assert main(["run", *small, "record.frames=true", f"out={name}/run", f"save_map={name}/map.mcap"]) == 0
+    assert main(["run", f"replay={name}/run/run.mcap", "only=[keypoints]", f"out={name}/again"]) == 0
+    again = ["dataset=mcap", f"dataset.path={name}/run/run.mcap", f"load_map={folder}/map.mcap", f"out={name}/on", "outputs=[pose]"]
+    assert main(["run", *again]) == 0
+    (tmp_path / "elsewhere").mkdir()
+    os.chdir(tmp_path / "elsewhere")
+    assert main(["run", f"replay={folder}/on/run.mcap", "only=[keypoints]", "out=x"]) == 0  # its own paths were relative
+    metadata = yaml.safe_load(Recording("x/run.mcap").metadata["config"])
+    assert (metadata["dataset"]["path"], metadata["load_map"]) == (str(folder / "run" / "run.mcap"), str(folder / "map.mcap"))
 
 
 def readme_block(language, first_line):

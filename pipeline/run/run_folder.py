@@ -1,0 +1,53 @@
+"""The folder of a run: made, and held for this process before anything is written into it."""
+
+from __future__ import annotations
+
+import fcntl
+import os
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+
+import yaml
+from omegaconf import DictConfig, OmegaConf
+
+from trihedron.pipeline.core.errors import ConfigError, DataError
+
+CONFIG = ".hydra"  # folder of the composed configuration and the words it was composed of
+CURE = "give another out=FOLDER"
+
+
+@contextmanager
+def held(folder: Path) -> Iterator[None]:
+    """Make the folder and lock it for the block (`flock`, which ends with the process); a file system without locks gives none.
+
+    Raises ConfigError or DataError, and has written nothing then."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
+    except OSError as error:
+        raise ConfigError("out", f"the folder cannot be made: {error.strerror}: {error.filename}", CURE) from error
+    try:
+        _lock(descriptor, folder)
+        yield
+    finally:
+        os.close(descriptor)
+
+
+def _lock(descriptor: int, folder: Path) -> None:
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError as error:
+        raise DataError(str(folder), "is being written by another process", f"wait until that has ended, or {CURE}") from error
+    except OSError:
+        return
+
+
+def write_configuration(folder: Path, config: DictConfig, words: Sequence[str]) -> None:
+    """Write the composed configuration and the words of the command. Raises ConfigError."""
+    try:
+        (folder / CONFIG).mkdir(exist_ok=True)
+        (folder / CONFIG / "config.yaml").write_text(OmegaConf.to_yaml(config), encoding="utf-8")
+        (folder / CONFIG / "overrides.yaml").write_text(yaml.safe_dump(list(words), allow_unicode=True), encoding="utf-8")
+    except OSError as error:
+        raise ConfigError("out", f"the folder cannot be written: {error.strerror}: {error.filename}", CURE) from error
