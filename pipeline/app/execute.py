@@ -32,9 +32,9 @@ from trihedron.pipeline.run.interrupts import Interrupts
 from trihedron.pipeline.run.live import Pace, is_camera
 from trihedron.pipeline.run.map_file import load_map, save_map
 from trihedron.pipeline.run.replay import TOPICS, Replay
+from trihedron.pipeline.run.run_folder import held, write_configuration
 from trihedron.pipeline.run.runner import Runner, Step
 from trihedron.pipeline.run.state import DelayLines, max_delays
-from trihedron.pipeline.run.run_folder import held, write_configuration
 from trihedron.pipeline.run.timing import forget_peak
 from trihedron.pipeline.run.warm_up import compilation_reported, warm_up
 
@@ -110,7 +110,7 @@ def _remembered(config: DictConfig, graph: Graph) -> Callable[[int], DelayLines]
         return None
     if "map" not in max_delays(graph.stages.values()):
         raise ConfigError("load_map", "no stage of this graph reads a map", "choose another graph")
-    saved, source = load_map(config.load_map, [stage.plugin for stage in graph.stages.values()]), _source(config)
+    saved, source = load_map(config.load_map), _source(config)
     return lambda first: saved.delay_lines(first, source)
 
 

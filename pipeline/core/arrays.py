@@ -40,9 +40,8 @@ def array_specs(kind: Any) -> tuple[ArraySpec, ...]:
     """Return the array fields of a value type, in order."""
     found = []
     for name, hint in get_type_hints(kind, include_extras=True).items():
-        if get_origin(hint) is Annotated:
-            array, shape = get_args(hint)
-            found.append(ArraySpec(name, _element_type(array), shape))
+        if get_origin(hint) is Annotated and (shape := next((item for item in get_args(hint)[1:] if isinstance(item, Shape)), None)) is not None:
+            found.append(ArraySpec(name, _element_type(get_args(hint)[0]), shape))
     return tuple(found)
 
 

@@ -252,13 +252,6 @@ class Localising(Protocol):
     def localising(self) -> Any: ...
 
 
-@runtime_checkable
-class ChecksLoadedMap(Protocol):
-    """Optional interface of any plugin: `check_loaded_map` raises ValueError or KeyError where a map from a file refers to rows that it lacks."""
-
-    def check_loaded_map(self, map: Map) -> None: ...
-
-
 SLOTS: dict[str, type[Any]] = {
     "dataset": Dataset,
     "normals": NormalsSlot,

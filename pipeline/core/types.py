@@ -22,6 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from trihedron.pipeline.core.arrays import F32, F64, I32, U8, Bool, Shape, Value
+from trihedron.pipeline.core.constraints import Columns, CoversImage, Finite, IndexInto, OneOf, Rotations, SameWidth, UnitNormals, Within
 from trihedron.pipeline.core.table import Column, Table
 
 __all__ = [
@@ -92,29 +93,29 @@ class Normals(Value):
 
     dense: ClassVar[bool] = True
 
-    normals: Annotated[F32, Shape("h", "w", 3)]
-    stride: int
+    normals: Annotated[F32, Shape("h", "w", 3), CoversImage()]
+    stride: Annotated[int, Within(1, 1024)]
 
 
 @dataclass(frozen=True)
 class Keypoints(Value):
     """Points of interest. `points_m` is the back-projection (camera frame), NaN without a trustworthy depth; `sigma_px` grows with the octave."""
 
-    pixels: Annotated[F32, Shape("n", 2)]
+    pixels: Annotated[F32, Shape("n", 2), Finite()]
     points_m: Annotated[F32, Shape("n", 3)]
     sigma_px: Annotated[F32, Shape("n")]
     sigma_m: Annotated[F32, Shape("n")]  # of the depth, NaN where points_m is
     octaves: Annotated[U8, Shape("n")]
     angles_deg: Annotated[F32, Shape("n")]
-    descriptors: Annotated[U8, Shape("n", "b")]
-    metric: str = "hamming"  # distance between descriptors: hamming | l2
+    descriptors: Annotated[U8, Shape("n", "b"), SameWidth(("previous_keypoints.descriptors", "map.points.descriptor"))]
+    metric: Annotated[str, OneOf(("hamming", "l2"))] = "hamming"  # distance between descriptors: hamming | l2
 
 
 @dataclass(frozen=True)
 class LineSegments(Value):
     """Straight edges of the image: end points (start, end) × (x, y), and binary descriptors."""
 
-    endpoints_px: Annotated[F32, Shape("n", 2, 2)]
+    endpoints_px: Annotated[F32, Shape("n", 2, 2), Finite()]
     descriptors: Annotated[U8, Shape("n", "b")]
 
 
@@ -123,10 +124,10 @@ class Segments(Value):
     """The image's line segments lifted to 3D. `endpoints_m` are the extreme inliers along the fitted line, in the order of `endpoints_px`
     (camera frame); NaN where depth supports no line. `covariance_m2` is that of each 3D end point."""
 
-    endpoints_px: Annotated[F32, Shape("n", 2, 2)]
+    endpoints_px: Annotated[F32, Shape("n", 2, 2), Finite()]
     endpoints_m: Annotated[F32, Shape("n", 2, 3)]
     covariance_m2: Annotated[F32, Shape("n", 2, 3, 3)]
-    descriptors: Annotated[U8, Shape("n", "b")]
+    descriptors: Annotated[U8, Shape("n", "b"), SameWidth(("previous_segments.descriptors", "map.lines.descriptor"))]
 
 
 @dataclass(frozen=True)
@@ -135,13 +136,13 @@ class Planes(Value):
     `moments` is `Σ w [x;1][x;1]ᵀ` over the region's points with `w = 1/σ_z²`. `samples_m` spreads points over the region (NaN-padded), for overlap.
     `labels` is on the grid of the normals: 0 = none, i + 1 = plane i."""
 
-    coefficients: Annotated[F64, Shape("n", 4)]  # (n, d), d >= 0
-    covariance: Annotated[F64, Shape("n", 3, 3)]
-    moments: Annotated[F64, Shape("n", 4, 4)]
-    pixels: Annotated[I32, Shape("n")]  # image pixels covered
+    coefficients: Annotated[F64, Shape("n", 4), UnitNormals()]  # (n, d), d >= 0
+    covariance: Annotated[F64, Shape("n", 3, 3), Finite()]
+    moments: Annotated[F64, Shape("n", 4, 4), Finite()]
+    pixels: Annotated[I32, Shape("n"), Within(0, 2**31)]  # image pixels covered
     samples_m: Annotated[F32, Shape("n", "s", 3)]
-    labels: Annotated[U8, Shape("h", "w")]
-    stride: int
+    labels: Annotated[U8, Shape("h", "w"), IndexInto(".coefficients+"), CoversImage()]
+    stride: Annotated[int, Within(1, 1024)]
 
 
 @dataclass(frozen=True)
@@ -152,9 +153,9 @@ class ManhattanFrame(Value):
     rotation phi in `R = Exp(phi) R_estimate` (camera frame, rad²); `inliers` and `spread` (rad, NaN = axis not seen) are per axis;
     `gap` is the relative distance to a certified optimum (NaN without certificate)."""
 
-    rotations: Annotated[F64, Shape("k", 3, 3)]
+    rotations: Annotated[F64, Shape("k", 3, 3), Rotations()]
     ids: Annotated[I32, Shape("k")]
-    covariance: Annotated[F64, Shape("k", 3, 3)]
+    covariance: Annotated[F64, Shape("k", 3, 3), Finite()]
     inliers: Annotated[I32, Shape("k", 3)]
     spread: Annotated[F64, Shape("k", 3)]
     supported: bool
@@ -169,15 +170,15 @@ class Tracks(Value):
     `R_current_previous` is the rotation that predicted the search, corrected by the pairs found."""
 
     previous_index: int
-    keypoints: Annotated[I32, Shape("n", 2)]
+    keypoints: Annotated[I32, Shape("n", 2), IndexInto("previous_keypoints", "keypoints")]
     points_m: Annotated[F32, Shape("n", 3)]  # previous; NaN without depth
     sigma_m: Annotated[F32, Shape("n")]  # of their depth
-    segments: Annotated[I32, Shape("m", 2)]
+    segments: Annotated[I32, Shape("m", 2), IndexInto("previous_segments", "segments")]
     endpoints_m: Annotated[F32, Shape("m", 2, 3)]  # previous; NaN without depth
-    planes: Annotated[I32, Shape("p", 2)]
-    coefficients: Annotated[F64, Shape("p", 4)]  # previous
+    planes: Annotated[I32, Shape("p", 2), IndexInto("previous_planes", "planes")]
+    coefficients: Annotated[F64, Shape("p", 4), UnitNormals()]  # previous
     plane_covariance: Annotated[F64, Shape("p", 3, 3)]
-    R_current_previous: Annotated[F64, Shape(3, 3)]
+    R_current_previous: Annotated[F64, Shape(3, 3), Rotations()]
 
 
 @dataclass(frozen=True)
@@ -187,13 +188,13 @@ class Rotation(Value):
     `covariance` is that of phi in `R_world_camera = R_estimate · Exp(phi)` (camera frame, rad²); `R_world_manhattan[i]` belongs to Manhattan frame
     `ids[i]`, with `weights[i]` observations behind it, and `R_camera_manhattan[i]` is this frame's observation of it (NaN = not seen)."""
 
-    R_world_camera: Annotated[F64, Shape(3, 3)]
-    covariance: Annotated[F64, Shape(3, 3)]
-    R_world_manhattan: Annotated[F64, Shape("k", 3, 3)]
-    R_camera_manhattan: Annotated[F64, Shape("k", 3, 3)]
+    R_world_camera: Annotated[F64, Shape(3, 3), Rotations()]
+    covariance: Annotated[F64, Shape(3, 3), Finite()]
+    R_world_manhattan: Annotated[F64, Shape("k", 3, 3), Rotations()]
+    R_camera_manhattan: Annotated[F64, Shape("k", 3, 3), Rotations(or_none=True)]
     ids: Annotated[I32, Shape("k")]
     weights: Annotated[F64, Shape("k")]
-    source: str
+    source: Annotated[str, OneOf(("manhattan", "tracks", "prediction"))]
 
 
 @dataclass(frozen=True)
@@ -204,8 +205,8 @@ class Translation(Value):
 
     version: ClassVar[int] = 2
 
-    t_world_camera: Annotated[F64, Shape(3)]
-    covariance: Annotated[F64, Shape(3, 3)]
+    t_world_camera: Annotated[F64, Shape(3), Finite()]
+    covariance: Annotated[F64, Shape(3, 3), Finite()]
     unobservable: Annotated[F64, Shape("u", 3)]
     inliers: Annotated[I32, Shape(3)]
     estimated: bool
@@ -219,13 +220,13 @@ class Matches(Value):
     with map planes that are not the same plane. `visible_*` are the landmarks that were expected in view, found or not."""
 
     map_revision: int
-    keypoints: Annotated[I32, Shape("n", 2)]
-    segments: Annotated[I32, Shape("m", 2)]
-    planes: Annotated[I32, Shape("p", 2)]
-    parallel: Annotated[I32, Shape("a", 2)]
-    perpendicular: Annotated[I32, Shape("b", 2)]
-    visible_points: Annotated[I32, Shape("v")]
-    visible_lines: Annotated[I32, Shape("w")]
+    keypoints: Annotated[I32, Shape("n", 2), IndexInto("keypoints", "map.points")]
+    segments: Annotated[I32, Shape("m", 2), IndexInto("segments", "map.lines")]
+    planes: Annotated[I32, Shape("p", 2), IndexInto("planes", "map.planes")]
+    parallel: Annotated[I32, Shape("a", 2), IndexInto("planes", "map.planes")]
+    perpendicular: Annotated[I32, Shape("b", 2), IndexInto("planes", "map.planes")]
+    visible_points: Annotated[I32, Shape("v"), IndexInto("map.points")]
+    visible_lines: Annotated[I32, Shape("w"), IndexInto("map.lines")]
 
 
 OK, DEGRADED, LOST = "ok", "degraded", "lost"
@@ -241,15 +242,15 @@ class Pose(Value):
 
     version: ClassVar[int] = 2
 
-    T_world_camera: Annotated[F64, Shape(4, 4)]
-    covariance: Annotated[F64, Shape(6, 6)]
-    T_reference_camera: Annotated[F64, Shape(4, 4)]
-    reference: int
-    inliers: Annotated[I32, Shape(3)]
+    T_world_camera: Annotated[F64, Shape(4, 4), Rotations()]
+    covariance: Annotated[F64, Shape(6, 6), Finite()]
+    T_reference_camera: Annotated[F64, Shape(4, 4), Rotations()]
+    reference: Annotated[int, IndexInto("map.keyframes", least=-1)]
+    inliers: Annotated[I32, Shape(3), Within(0, 2**31)]
     unobservable: int
-    status: str  # ok | degraded | lost
+    status: Annotated[str, OneOf((OK, DEGRADED, LOST))]  # ok | degraded | lost
     reason: str
-    submap: int = 0
+    submap: Annotated[int, Within(0, 2**31)] = 0
     unrecognised: int = 0
 
 
@@ -261,7 +262,7 @@ class PredictedView(Value):
     version: ClassVar[int] = 2
     dense: ClassVar[bool] = True
 
-    T_world_camera: Annotated[F64, Shape(4, 4)]
+    T_world_camera: Annotated[F64, Shape(4, 4), Rotations()]
     depth_m: Annotated[F32, Shape("h", "w")]
     normals: Annotated[F32, Shape("h", "w", 3)]
     color: Annotated[U8, Shape("h", "w", 3)]
@@ -302,13 +303,13 @@ EXACT_DEPTH = DepthNoise(a_m=0.0, b=0.0, c_per_m=0.0, floor_m=0.001)
 class Camera:
     """An undistorted pinhole camera; readers undistort frames. `fps` is nominal."""
 
-    width: int
-    height: int
-    fx: float
-    fy: float
-    cx: float
-    cy: float
-    fps: float = 30.0
+    width: Annotated[int, Within(1, 2**15)]
+    height: Annotated[int, Within(1, 2**15)]
+    fx: Annotated[float, Within(1e-3, 1e6)]
+    fy: Annotated[float, Within(1e-3, 1e6)]
+    cx: Annotated[float, Within(-1e6, 1e6)]
+    cy: Annotated[float, Within(-1e6, 1e6)]
+    fps: Annotated[float, Within(1e-6, 1e6)] = 30.0
     depth_noise: DepthNoise = field(default_factory=DepthNoise)
 
     @property
@@ -335,6 +336,67 @@ class Camera:
 
 # The types of the topics `map`, `bundle` and `loop`: the map and its corrections.
 
+# Columns that every map has: element type, shape of a row (None: any length), constraints. Indices refer to other tables of the map.
+_ROW, _KEYFRAME = ("i4", ()), ("i4", (), IndexInto(".keyframes"))
+_LIFE: dict[str, tuple[Any, ...]] = {
+    "first": _KEYFRAME,
+    "observers": ("i4", (None,), IndexInto(".keyframes", least=-1)),
+    "found": _ROW,
+    "visible": _ROW,
+    "alive": ("?", ()),
+}
+KEYFRAMES = Columns({
+    "index": _ROW,
+    "stamp_ns": ("i8", ()),
+    "T_world_camera": ("f8", (4, 4), Rotations()),
+    "covariance": ("f8", (6, 6), Finite()),
+    "intrinsics": ("f8", (4,), Finite()),
+    "points": ("i4", (2,), IndexInto(".point_observations+")),
+    "lines": ("i4", (2,), IndexInto(".line_observations+")),
+    "planes": ("i4", (2,), IndexInto(".plane_observations+")),
+    "submap": ("i4", (), Within(0, 2**31)),
+    "alive": ("?", ()),
+})
+POINTS = Columns({
+    "position_m": ("f8", (3,), Finite()),
+    "information": ("f4", (3, 3), Finite()),
+    "descriptor": ("u1", (None,)),
+    "direction": ("f4", (3,)),
+    "distance_m": ("f4", ()),
+    "octave": ("u1", ()),
+    **_LIFE,
+})
+LINES = Columns({"endpoints_m": ("f8", (2, 3), Finite()), "information": ("f4", (2, 3, 3), Finite()), "descriptor": ("u1", (None,)), **_LIFE})
+PLANES = Columns({
+    "coefficients": ("f8", (4,), UnitNormals()),
+    "covariance": ("f8", (3, 3), Finite()),
+    "moments": ("f8", (4, 4), Finite()),
+    "samples_m": ("f4", (None, 3)),
+    **_LIFE,
+})
+POINT_OBSERVATIONS = Columns({
+    "keyframe": _KEYFRAME,
+    "point": ("i4", (), IndexInto(".points")),
+    "pixel": ("f4", (2,), Finite()),
+    "depth_m": ("f4", ()),
+    "sigma_px": ("f4", ()),
+    "sigma_m": ("f4", ()),
+})
+LINE_OBSERVATIONS = Columns({
+    "keyframe": _KEYFRAME,
+    "line": ("i4", (), IndexInto(".lines")),
+    "endpoints_px": ("f4", (2, 2), Finite()),
+    "endpoints_m": ("f4", (2, 3)),
+    "covariance_m2": ("f4", (2, 3, 3)),
+})
+PLANE_OBSERVATIONS = Columns({
+    "keyframe": _KEYFRAME,
+    "plane": ("i4", (), IndexInto(".planes")),
+    "coefficients": ("f8", (4,), UnitNormals()),
+    "covariance": ("f8", (3, 3), Finite()),
+    "moments": ("f8", (4, 4), Finite()),
+})
+
 @dataclass(frozen=True)
 class Map(Value):
     """Keyframes and landmarks; a row number is an id for good, dead rows have `alive` False. Columns are listed in `plugins.mapping.landmarks`.
@@ -343,13 +405,13 @@ class Map(Value):
 
     version: ClassVar[int] = 4
     revision: int
-    keyframes: Table
-    points: Table
-    lines: Table
-    planes: Table
-    point_observations: Table
-    line_observations: Table
-    plane_observations: Table
+    keyframes: Annotated[Table, KEYFRAMES]
+    points: Annotated[Table, POINTS]
+    lines: Annotated[Table, LINES]
+    planes: Annotated[Table, PLANES]
+    point_observations: Annotated[Table, POINT_OBSERVATIONS]
+    line_observations: Annotated[Table, LINE_OBSERVATIONS]
+    plane_observations: Annotated[Table, PLANE_OBSERVATIONS]
 
     @cached_property
     def memo(self) -> dict[Hashable, Any]:
@@ -365,16 +427,16 @@ class Correction(Value):
     version: ClassVar[int] = 2
 
     based_on: int
-    keyframe_ids: Annotated[I32, Shape("k")]
-    T_world_keyframe: Annotated[F64, Shape("k", 4, 4)]
-    point_ids: Annotated[I32, Shape("n")]
-    points_m: Annotated[F64, Shape("n", 3)]
+    keyframe_ids: Annotated[I32, Shape("k"), IndexInto("map.keyframes")]
+    T_world_keyframe: Annotated[F64, Shape("k", 4, 4), Rotations()]
+    point_ids: Annotated[I32, Shape("n"), IndexInto("map.points")]
+    points_m: Annotated[F64, Shape("n", 3), Finite()]
     point_information: Annotated[F32, Shape("n", 3, 3)]
-    line_ids: Annotated[I32, Shape("m")]
-    endpoints_m: Annotated[F64, Shape("m", 2, 3)]
+    line_ids: Annotated[I32, Shape("m"), IndexInto("map.lines")]
+    endpoints_m: Annotated[F64, Shape("m", 2, 3), Finite()]
     line_information: Annotated[F32, Shape("m", 2, 3, 3)]
-    plane_ids: Annotated[I32, Shape("p")]
-    coefficients: Annotated[F64, Shape("p", 4)]
+    plane_ids: Annotated[I32, Shape("p"), IndexInto("map.planes")]
+    coefficients: Annotated[F64, Shape("p", 4), UnitNormals()]
     plane_covariance: Annotated[F64, Shape("p", 3, 3)]
 
 
@@ -395,17 +457,17 @@ class Surface(Value):
 
     version: ClassVar[int] = 2
 
-    vertices_m: Annotated[F32, Shape("v", 3)]
+    vertices_m: Annotated[F32, Shape("v", 3), Finite()]
     colors: Annotated[U8, Shape("v", 3)]
-    triangles: Annotated[I32, Shape("t", 3)]
-    instances: Annotated[I32, Shape("t")]
+    triangles: Annotated[I32, Shape("t", 3), IndexInto(".vertices_m")]
+    instances: Annotated[I32, Shape("t"), IndexInto(".coefficients", least=-1)]
     plane_ids: Annotated[I32, Shape("p")]
     coefficients: Annotated[F64, Shape("p", 4)]
-    kinds: Annotated[U8, Shape("p")]
+    kinds: Annotated[U8, Shape("p"), Within(0, len(PLANE_KINDS) - 1)]
     areas_m2: Annotated[F32, Shape("p")]
     plane_colors: Annotated[U8, Shape("p", 3)]
-    loops: Annotated[I32, Shape("l", 3)]
-    loop_vertices: Annotated[I32, Shape("k")]
+    loops: Annotated[I32, Shape("l", 3), IndexInto(".coefficients", ".loop_vertices+", ".loop_vertices+")]
+    loop_vertices: Annotated[I32, Shape("k"), IndexInto(".vertices_m")]
     atlas: Annotated[U8, Shape("h", "w", 3)]
     texels: Annotated[F32, Shape("t", 3, 2)]
     up: Annotated[F64, Shape(3)]

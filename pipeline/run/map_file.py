@@ -9,19 +9,18 @@ directions of its axes: its camera is lost until it is recognised.
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from trihedron.pipeline.core.errors import RecordingError
-from trihedron.pipeline.core.slots import ChecksLoadedMap
 from trihedron.pipeline.core.types import LOST, Map, Pose, Rotation, Value
 from trihedron.pipeline.record.reader import Recording
 from trihedron.pipeline.record.writer import RecordingWriter
 from trihedron.pipeline.run.state import DelayLines, StateBuffer
+from trihedron.pipeline.run.value_checks import checked
 
 MAP_VERSION = "1"
 SAVE_ONE = "save one with: trihedron run save_map=FILE.mcap"
@@ -80,10 +79,8 @@ def save_map(path: Path, state: StateBuffer, metadata: Mapping[str, str], source
     os.replace(partial, path)
 
 
-def load_map(path: str, plugins: Iterable[Any]) -> SavedMap:
-    """Read a map file, checked by the plugins that are to read it (`ChecksLoadedMap`).
-
-    Raises RecordingError when it is missing, damaged, of another version or not a map."""
+def load_map(path: str) -> SavedMap:
+    """Read a map file, checked. Raises RecordingError when it is missing, damaged, of another version or not a map."""
     if not Path(path).is_file():
         raise RecordingError(path, "there is no such map", SAVE_ONE)
     recording = Recording(path)
@@ -92,12 +89,10 @@ def load_map(path: str, plugins: Iterable[Any]) -> SavedMap:
     version = recording.metadata.get("map_version")
     if version != MAP_VERSION:
         raise RecordingError(path, f"is a map of version {version}, this program reads version {MAP_VERSION}", "make the map anew")
-    values = {topic: tuple(recording.values(topic)) for topic in sorted(recording.topics)}
+    values = {topic: tuple(value for value in recording.values(topic) if checked(topic, value, path)) for topic in sorted(recording.topics)}
     try:
         saved = SavedMap(int(recording.metadata["frame"]), recording.metadata["source"], values)
-        for plugin in plugins:
-            if isinstance(plugin, ChecksLoadedMap):
-                plugin.check_loaded_map(saved.map)
+        assert isinstance(saved.map, Map)
     except (KeyError, ValueError, IndexError, TypeError, AssertionError) as error:
         raise RecordingError(path, f"holds a map that does not fit together: {error}", "the file is damaged; make the map anew") from error
     return saved

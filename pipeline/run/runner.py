@@ -32,6 +32,7 @@ from trihedron.pipeline.run.recorder import Recorder
 from trihedron.pipeline.run.replay import RECORDED, Replay, plan_run
 from trihedron.pipeline.run.scheduler import Node, NodeFailure, NoMoreFrames, Scheduler, single_threaded_libraries
 from trihedron.pipeline.run.state import DelayLines, StateBuffer, max_delays, recorded_delay_lines
+from trihedron.pipeline.run.value_checks import check_together, checked
 
 TRIM_EVERY = 1000  # frames; it takes some 10 ms
 FRAME_TAKEN = "dataset:"  # input of every stage of a live run: which frame it is must be known first
@@ -74,6 +75,7 @@ class Runner:
         self._accounts = Accounting(self.plan.stamps_ns, self.plan.fps, loaded if isinstance(loaded, Map) else None)
         self.result, self.timing = self._accounts.result, self._accounts.timing
         self._validation = FrameValidation(self.plan.stamps_ns, self.count if self.feed is None else 0)
+        self._sources = str(replay.recording.path) if replay is not None else "load_map" if self.initial.held else ""  # files of inputs
         self._fold_states: dict[str, Any] = {}
 
     def steps(
@@ -141,8 +143,9 @@ class Runner:
 
     def _reader_node(self, name: str) -> Node:
         assert self.replay is not None
-        read = self.replay.reader(name.removeprefix(RECORDED))
-        return Node(name, lambda position, _: read(self.indices[position]), {}, ordered=True)
+        topic, place = name.removeprefix(RECORDED), str(self.replay.recording.path)
+        read = self.replay.reader(topic)
+        return Node(name, lambda position, _: checked(topic, read(self.indices[position]), place), {}, ordered=True)
 
     def _read_frame(self, stage: Stage, position: int) -> Any:
         """Return the frame at a position, validated, or None."""
@@ -166,6 +169,8 @@ class Runner:
             return None
         arguments = {**dict.fromkeys(stage.absent), **values}
         arguments.pop(FRAME_TAKEN, None)
+        if self._sources:
+            self._check_inputs(stage, arguments)
         if CAMERA in arguments:
             arguments[CAMERA] = arguments[CAMERA].camera  # of a frame, or of the recording's reference to it
         if stage.wants_rng:
@@ -181,6 +186,18 @@ class Runner:
         if value is not None:
             check_value(stage.name, value, self.indices[position])
         return value
+
+    def _check_inputs(self, stage: Stage, arguments: Mapping[str, Any]) -> None:
+        """Check inputs of a call that come from a file: of a replay those that are read, of a loaded map those from before the first frame."""
+        topics = {parameter: wire.topic for parameter, wire in stage.inputs.items()}
+        computed = set(self.computed)
+        for parameter, wire in stage.inputs.items():
+            value = arguments.get(parameter)
+            early = bool(wire.delay) and isinstance(value, Value) and value.index < self.indices[0]
+            if early or self.plan.source(parameter, wire).topic.startswith(RECORDED):
+                computed.discard(wire.topic)
+        if not computed.issuperset(topics.values()):
+            check_together(arguments, self._sources, topics, computed)
 
     def _finish_fold(self, name: str, recorder: Recorder | None) -> None:
         plugin = self.graph.stages[name].plugin

@@ -18,7 +18,7 @@ from trihedron.plugins.mapping.correction import apply_correction
 from trihedron.plugins.mapping.covisibility_graph import WEIGHTS, keyframes_of, local_window, newest_keyframes
 from trihedron.plugins.mapping.culling import cull, cull_keyframe, cull_repeated, released
 from trihedron.plugins.mapping.insertion import Associated, associate, existing
-from trihedron.plugins.mapping.landmarks import check_map, empty_map, union
+from trihedron.plugins.mapping.landmarks import empty_map, union
 from trihedron.plugins.mapping.merging import merge_lines, merge_planes, merge_points
 from trihedron.plugins.mapping.reference_keyframe import anchored
 from trihedron.plugins.mapping.submaps import submap_of, tied
@@ -92,10 +92,6 @@ class Covisibility:
     def localising(self) -> NoMap:
         """Return the plugin that leaves a loaded map as it is."""
         return NoMap()
-
-    def check_loaded_map(self, map: Map) -> None:
-        """Raise ValueError or KeyError where a loaded map does not fit together."""
-        check_map(map)
 
     def _version(self, map: Map, frame: Frame) -> Map:
         return replace(map, index=frame.index, stamp_ns=frame.stamp_ns, revision=map.revision + 1)

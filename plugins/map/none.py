@@ -6,7 +6,6 @@ from dataclasses import dataclass
 
 from trihedron.pipeline.core.registry import register
 from trihedron.pipeline.core.types import Map, Pose
-from trihedron.plugins.mapping.landmarks import check_map
 
 
 @register("map", "none")
@@ -21,7 +20,3 @@ class NoMap:
     def localising(self) -> NoMap:
         """Return itself."""
         return self
-
-    def check_loaded_map(self, map: Map) -> None:
-        """Raise ValueError or KeyError where a loaded map does not fit together: tracking reads it as it is."""
-        check_map(map)

@@ -151,24 +151,3 @@ def places(ids: I32, others: I32) -> I32:
 
 def _end(*parts: I32) -> int:
     return max((int(part.max()) + 1 for part in parts if len(part)), default=0)
-
-
-def check_map(map: Map) -> None:
-    """Raise ValueError or KeyError where a row refers to another that is not there, or a pose is not finite: a file is not to be trusted."""
-    sizes = {"keyframe": len(map.keyframes), "point": len(map.points), "line": len(map.lines), "plane": len(map.planes)}
-    for kind in ("point", "line", "plane"):
-        observations, landmarks = getattr(map, f"{kind}_observations"), getattr(map, f"{kind}s")
-        _check_rows(observations, "keyframe", 0, sizes["keyframe"])
-        _check_rows(observations, kind, 0, sizes[kind])
-        _check_rows(landmarks, "observers", -1, sizes["keyframe"])
-        _check_rows(landmarks, "first", 0, sizes["keyframe"])
-        _check_rows(map.keyframes, f"{kind}s", 0, len(observations) + 1)
-        landmarks.column("alive")
-    if not np.isfinite(map.keyframes.column("T_world_camera")).all():
-        raise ValueError("a keyframe's pose is not finite")
-
-
-def _check_rows(table: Table, column: str, low: int, stop: int) -> None:
-    values = table.column(column)
-    if values.size and (values.min() < low or values.max() >= stop):
-        raise ValueError(f"column '{column}' names rows that are not there")

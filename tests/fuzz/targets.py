@@ -26,7 +26,6 @@ from trihedron.pipeline.record.mcap_file import McapFile
 from trihedron.pipeline.record.reader import Recording
 from trihedron.pipeline.record.trajectories import read_trajectory
 from trihedron.pipeline.run.map_file import load_map
-from trihedron.plugins.map.covisibility import Covisibility
 from trihedron.tools.mesh_files import read_mesh
 from trihedron.tools.recover import recover
 
@@ -86,7 +85,7 @@ def recording(path: Path) -> int:
 
 def saved_map(path: Path) -> int:
     """A map to go on in."""
-    return len(load_map(str(path), [Covisibility()]).values)
+    return len(load_map(str(path)).values)
 
 
 def meshes(path: Path) -> int:

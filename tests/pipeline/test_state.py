@@ -19,7 +19,6 @@ from trihedron.pipeline.record.writer import RecordingWriter
 from trihedron.pipeline.run.map_file import load_map, save_map
 from trihedron.pipeline.run.runner import Runner
 from trihedron.pipeline.run.state import DelayLines, StateBuffer, max_delays
-from trihedron.plugins.map.covisibility import Covisibility
 from trihedron.plugins.mapping.landmarks import empty_map
 
 sys.path.insert(0, str(Path(__file__).parent))
@@ -79,9 +78,9 @@ def test_in_another_sequence_the_camera_is_lost_until_the_map_is_recognised(runs
 
 def test_localising_leaves_the_map_alone(runs):
     assert "map" not in Recording(runs / "only" / "run.mcap").topics
-    before, after = load_map(str(runs / "map.mcap"), [Covisibility()]), load_map(str(runs / "only.mcap"), [Covisibility()])
+    before, after = load_map(str(runs / "map.mcap")), load_map(str(runs / "only.mcap"))
     assert Encoder().encode(before.map) == Encoder().encode(after.map)
-    assert load_map(str(runs / "again.mcap"), [Covisibility()]).frame == 11
+    assert load_map(str(runs / "again.mcap")).frame == 11
 
 
 def test_a_camera_that_is_only_localised_stays_lost_where_the_map_does_not_reach(runs):
@@ -123,7 +122,7 @@ def test_the_maximum_delay_of_a_topic():
 
 def test_a_map_that_cannot_be_written_is_one_line_and_leaves_nothing(runs, tmp_path, monkeypatch):
     state = StateBuffer({"map": 1}, DelayLines(), 0)
-    state.append(3, {"map": load_map(str(runs / "map.mcap"), [Covisibility()]).map})
+    state.append(3, {"map": load_map(str(runs / "map.mcap")).map})
     with pytest.raises(RecordingError) as error:
         save_map(tmp_path / "no" / "a.mcap", state, {}, "{}")
     assert str(error.value) == f"{tmp_path}/no/a.mcap: cannot be written: No such file or directory; give another save_map=FILE.mcap"
@@ -153,26 +152,33 @@ def test_a_file_that_is_no_map_of_this_version_is_refused(tmp_path):
         ({"frame": "many"}, "holds a map that does not fit together: "),
     ):
         with pytest.raises(RecordingError) as error:
-            load_map(written(tmp_path / "a.mcap", metadata), [Covisibility()])
+            load_map(written(tmp_path / "a.mcap", metadata))
         assert str(error.value).startswith(f"{path}: {cause}")
-    assert load_map(written(tmp_path / "a.mcap", {}), [Covisibility()]).map.revision == 0
+    assert load_map(written(tmp_path / "a.mcap", {})).map.revision == 0
     with pytest.raises(RecordingError, match="there is no such map; save one with"):
-        load_map(str(tmp_path / "missing.mcap"), [Covisibility()])
+        load_map(str(tmp_path / "missing.mcap"))
 
 
 def test_a_map_whose_rows_name_others_that_are_not_there_is_refused(runs, tmp_path):
-    map = load_map(str(runs / "map.mcap"), [Covisibility()]).map
+    map = load_map(str(runs / "map.mcap")).map
     row = np.zeros(1, np.int32)
-    broken = {
-        "observers": replace(map, points=map.points.updated(row, observers=np.full((1, 16), 1 << 20, np.int32))),
-        "point": replace(map, point_observations=map.point_observations.updated(row, point=row - 1)),
-        "lines": replace(map, keyframes=map.keyframes.updated(row, lines=np.array([[0, 1 << 20]], np.int32))),
-        "finite": replace(map, keyframes=map.keyframes.updated(row, T_world_camera=np.full((1, 4, 4), np.nan))),
-        "keyframe": replace(map, line_observations=map.points),
-    }
-    for what, damaged in broken.items():
-        with pytest.raises(RecordingError, match=f"does not fit together.*{what}"):
-            load_map(written(tmp_path / "b.mcap", {}, damaged), [Covisibility()])
+    points, keyframes = len(map.points), len(map.keyframes)
+    broken = [
+        (replace(map, points=map.points.updated(row, observers=np.full((1, 16), 1 << 20, np.int32))), "points",
+         f"a column 'observers' that names row {1 << 20} of keyframes, which has {keyframes} rows"),
+        (replace(map, point_observations=map.point_observations.updated(row, point=row - 1)), "point_observations",
+         f"a column 'point' that names row -1 of points, which has {points} rows"),
+        (replace(map, keyframes=map.keyframes.updated(row, lines=np.array([[0, 1 << 20]], np.int32))), "keyframes",
+         f"a column 'lines' that names row {1 << 20} of line_observations, which has {len(map.line_observations) + 1} rows"),
+        (replace(map, keyframes=map.keyframes.updated(row, T_world_camera=np.full((1, 4, 4), np.nan))), "keyframes",
+         "a column 'T_world_camera' that is not a rotation with a translation"),
+        (replace(map, line_observations=map.points), "line_observations", "no column 'keyframe' of int32[]"),
+    ]  # fmt: skip
+    for damaged, field, cause in broken:
+        with pytest.raises(RecordingError) as error:
+            load_map(written(tmp_path / "b.mcap", {}, damaged))
+        place = f"{tmp_path}/b.mcap: topic /map, frame {map.index}"
+        assert str(error.value) == f"{place}: the field '{field}' has {cause}; the file is damaged; record it again"
 
 
 @pytest.mark.parametrize("at", [0.2, 0.5, 0.9])
@@ -184,5 +190,5 @@ def test_a_damaged_file_is_one_line(runs, tmp_path, at):
         path = tmp_path / f"{name}.mcap"
         path.write_bytes(damaged)
         with pytest.raises(RecordingError) as error:
-            load_map(str(path), [Covisibility()])
+            load_map(str(path))
         assert str(error.value).startswith(str(path)) and "\n" not in str(error.value)

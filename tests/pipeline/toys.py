@@ -6,12 +6,26 @@ from dataclasses import dataclass, replace
 import numpy as np
 from mcap.reader import make_reader
 
+from trihedron.pipeline.core import types
 from trihedron.pipeline.core.graph import build_graph
 from trihedron.pipeline.core.table import Column, Table
 from trihedron.pipeline.core.types import Camera, Frame, Keypoints, Map, Normals, Pose, Rotation, Surface
 
 CAMERA = Camera(8, 6, 4.0, 4.0, 3.5, 2.5)
-EMPTY = Table.empty({"position_m": Column("f8", (3,)), "alive": Column("?")})
+
+
+def empty(columns):
+    """A table of the columns that every map has."""
+    lengths = {name: tuple(size or 2 for size in shape) for name, (_, shape, *_) in columns.columns.items()}
+    return Table.empty({name: Column(dtype, lengths[name]) for name, (dtype, *_) in columns.columns.items()})
+
+
+EMPTY = empty(types.POINTS)
+OTHERS = [empty(columns) for columns in (types.LINES, types.PLANES, types.POINT_OBSERVATIONS, types.LINE_OBSERVATIONS, types.PLANE_OBSERVATIONS)]
+KEYFRAMES, _ = empty(types.KEYFRAMES).appended(**{
+    name: np.broadcast_to(np.eye(*shape) if len(shape) == 2 else np.ones(shape), (1, *shape)) * (name not in ("points", "lines", "planes"))
+    for name, (_, shape, *_) in types.KEYFRAMES.columns.items()
+})
 
 
 @dataclass(frozen=True)
@@ -94,9 +108,10 @@ class ToyMap:
         points = map.points if map is not None else EMPTY
         if len(points):
             points = points.updated(np.arange(2), position_m=np.full((2, 3), pose.T_world_camera[0, 3]))
-        points, _ = points.appended(position_m=np.full((100, 3), frame.index), alive=np.ones(100, bool))
+        new = {name: np.zeros((100, *column.shape)) for name, column in EMPTY.schema.items()}
+        points, _ = points.appended(**{**new, "position_m": np.full((100, 3), frame.index), "alive": np.ones(100, bool)})
         revision = map.revision + 1 if map is not None else 0
-        return Map(frame.index, frame.stamp_ns, revision, EMPTY, points, EMPTY, EMPTY, EMPTY, EMPTY, EMPTY)
+        return Map(frame.index, frame.stamp_ns, revision, KEYFRAMES, points, *OTHERS)
 
 
 @dataclass(frozen=True)
