@@ -1,25 +1,26 @@
-"""What a recording says of a run as a whole: the frames themselves, the last map, the final trajectory."""
+"""Read from a recording what belongs to the run as a whole: the frames themselves, the last map, the final trajectory."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import numpy as np
 
 from trihedron.pipeline.core.errors import DataError
 from trihedron.pipeline.core.options import frame_range
-from trihedron.pipeline.core.types import Frame, FrameReference, Map, Pose, Trajectory
+from trihedron.pipeline.core.types import Frame, FrameReference, Map, Pose, Trajectory, Value
 from trihedron.pipeline.record.codec import FRAMES_TOPIC
 from trihedron.pipeline.record.reader import Recording
 from trihedron.pipeline.run.accounting import Result
 from trihedron.pipeline.run.poses import Poses
 from trihedron.pipeline.run.results import final_trajectory
+from trihedron.pipeline.run.value_checks import checked
 
 
 def poses_of(recording: Recording) -> list[Pose]:
-    """The poses as they were said at the time. Raises DataError when there are none."""
-    poses = [value for value in recording.values("pose") if isinstance(value, Pose)] if "pose" in recording.topics else []
+    """The poses as they were estimated at the time. Raises DataError when there are none."""
+    poses = [value for value in _values(recording, "pose") if isinstance(value, Pose)]
     if not poses:
         raise DataError(str(recording.path), "holds no poses", "record a run with outputs=[trajectory]")
     return poses
@@ -30,6 +31,7 @@ def last_map(recording: Recording) -> Map | None:
     found = None
     for value in recording.values("map") if "map" in recording.topics else ():
         found = value if isinstance(value, Map) else found
+    checked("map", found, str(recording.path))
     return found
 
 
@@ -40,7 +42,14 @@ def trajectory_of(recording: Recording) -> Trajectory:
 
 def references_of(recording: Recording) -> dict[int, FrameReference]:
     """Frame number -> camera and stamp."""
-    return {value.index: value for value in recording.values(FRAMES_TOPIC) if isinstance(value, FrameReference)}
+    return {value.index: value for value in _values(recording, FRAMES_TOPIC) if isinstance(value, FrameReference)}
+
+
+def _values(recording: Recording, topic: str) -> Iterator[Value]:
+    """The values of a topic, each checked; none of a topic that is not recorded. Raises RecordingError."""
+    for value in recording.values(topic) if topic in recording.topics else ():
+        checked(topic, value, str(recording.path))
+        yield value
 
 
 def frames_of(recording: Recording) -> Callable[[FrameReference], Frame | None]:
