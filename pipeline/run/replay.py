@@ -63,7 +63,7 @@ class Replay:
     def references(self, first: int, stop: int | None) -> dict[int, FrameReference]:
         """Return frame number -> reference for the recorded frames in a range. Raises RecordingError when there is none."""
         place, recorded = str(self.recording.path), self.recording.values(FRAMES_TOPIC)
-        values = (value for value in recorded if isinstance(checked(FRAMES_TOPIC, value, place), FrameReference))
+        values = (value for value in recorded if isinstance(value, FrameReference) and checked(FRAMES_TOPIC, value, place))
         found = {value.index: value for value in values if value.index >= first and (stop is None or value.index < stop)}
         if not found:
             wanted = f"{first or ''}:{'' if stop is None else stop}"

@@ -71,4 +71,5 @@ def sight_of(frame: Frame, pose: Pose, width: int) -> Sight:
     """The frame as the model sees it."""
     step = step_to(frame, width)
     lens = lens_of(frame, step)
-    return Sight(*reduced(frame.depth_m, frame.color, step), lens, lens_at(lens, pose.T_world_camera))
+    depth_m, color = reduced(frame.depth_m, frame.color, step)
+    return Sight(depth_m, color, lens, lens_at(lens, pose.T_world_camera))
