@@ -24,7 +24,7 @@ log = logging.getLogger("trihedron")
 Messages = Iterable[tuple[int, int, bytes]]  # channel, log time in ns, content
 CHUNK_BYTES = 4 << 20  # an entry of the index is worth more messages
 FLUSH_SECONDS = 0.4
-LEVEL = 2  # of zstd
+LEVEL = 1  # of zstd: 2 takes a quarter more time for 7 % fewer bytes
 MESSAGE_OVERHEAD = 64  # bytes of a message beside its data, generously
 MAX_QUEUE_BYTES = 64 << 20  # a run that is faster than the disk waits from there on
 

@@ -90,17 +90,15 @@ def _changed_rows(before: Table, table: Table, column: str, freed: NDArray[np.in
         ids = added
     else:
         old, new = _words(before.shared(column)), _words(table.shared(column)[: before.size])
-        differ = old != new if old.ndim == 1 else (old != new).any(axis=1)
-        ids = np.concatenate([np.flatnonzero(differ).astype(np.int32), added])
+        places = np.flatnonzero(old != new) // max(len(old) // max(before.size, 1), 1)
+        ids = np.concatenate([np.unique(places).astype(np.int32), added])
     return ids[~np.isin(ids // CHUNK, freed)] if len(freed) else ids
 
 
 def _words(rows: Any) -> Any:
-    """The bytes of rows as unsigned numbers, the largest that they divide into: (n,) or (n, words)."""
+    """The bytes of rows, one after another, as (n,) unsigned numbers, the largest that divide a row."""
     size = rows.nbytes // max(len(rows), 1)
-    word = next(bytes_ for bytes_ in (8, 4, 2, 1) if size % bytes_ == 0)
-    words = rows.reshape(len(rows), -1).view(f"u{word}") if size else np.empty((len(rows), 0), np.uint8)
-    return words[:, 0] if words.shape[1] == 1 else words
+    return rows.reshape(-1).view(next(f"u{word}" for word in (8, 4, 2, 1) if size % word == 0))
 
 
 @lru_cache(256)
