@@ -1,7 +1,8 @@
 """Convert a data set to a recording: one MCAP file with the frames, lossless, and the ground truth if there is one.
 
 SRC is a folder in one of the layouts of `trihedron plugins dataset`, recognised by its files, or a recording with embedded frames. The result is
-run with dataset=mcap dataset.path=DST.mcap, and opens in Foxglove.
+run with dataset=mcap dataset.path=DST.mcap, and opens in Foxglove. A recording or map of an older format is upgraded instead: topics that cannot be
+read are listed and skipped; a replay computes them anew.
 
 Example: trihedron convert rgbd_dataset_freiburg3_structure_notexture_far far.mcap
 """
@@ -14,7 +15,7 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from trihedron.pipeline.core.errors import ConfigError, DataError, UsageError
+from trihedron.pipeline.core.errors import ConfigError, DataError, UsageError, printable
 from trihedron.tools.arguments import Parser
 
 if TYPE_CHECKING:
@@ -38,11 +39,26 @@ def main(argv: list[str]) -> int:
         raise UsageError("convert", f"'{destination}' does not end in {SUFFIX}", f"give for example {destination.name or 'far'}{SUFFIX}")
     if destination.exists() and not arguments.overwrite:
         raise UsageError(str(destination), "exists", "give another name or --overwrite")
+    if arguments.source.suffix == SUFFIX and arguments.source.is_file() and not arguments.dataset and _upgraded(arguments.source, destination):
+        return 0
     options = {"path": str(arguments.source), "frames": arguments.frames, "camera": arguments.camera}
     frames, unreadable = convert(arguments.dataset or layout_of(arguments.source), options, destination)
     skipped = f", {unreadable} could not be read" if unreadable else ""
     print(f"{destination}: {frames} frames, {destination.stat().st_size / 1e6:.1f} MB{skipped}")
     return 0
+
+
+def _upgraded(source: Path, destination: Path) -> bool:
+    """Upgrade a recording or map of an older format; returns False for any other file."""
+    from trihedron.pipeline.record.upgrade import is_outdated, upgrade
+
+    if not is_outdated(source):
+        return False
+    result = upgrade(source, destination)
+    print(f"{destination}: upgraded {result.messages} messages, {destination.stat().st_size / 1e6:.1f} MB")
+    for topic, why in sorted(result.skipped.items()):
+        print(f"  skipped {printable(topic, 80)}: {why}")
+    return True
 
 
 def layout_of(source: Path) -> str:

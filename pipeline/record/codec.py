@@ -41,6 +41,7 @@ READABLE = ("3", FORMAT)  # 3: a table was always a change of the message before
 METADATA = "trihedron"  # the name of the metadata record
 FRAMES_TOPIC = "frames"  # one FrameReference a frame: what a replay iterates over
 TIMING_TOPIC = "/timing"
+UPGRADE = "upgrade what can be read of it with: trihedron convert SRC DST.mcap"
 
 _TYPES: dict[str, type[Value]] = {
     name: kind for name, kind in vars(types).items() if isinstance(kind, type) and issubclass(kind, Value) and kind is not Value
@@ -176,7 +177,7 @@ class Decoder:
             raise RecordingError(self.place, f"holds the unknown type '{printable(message.type, 60)}'", "read it with the version that wrote it")
         if kind.version != message.version:
             cause = f"holds {message.type} version {message.version}, this program reads version {kind.version}{_other_fields(message, kind)}"
-            raise RecordingError(self.place, cause, "record again, or read it with the version that wrote it")
+            raise RecordingError(self.place, cause, UPGRADE if message.version < kind.version else "read it with the version that wrote it")
         return message
 
     def _arrays(self, message: Any) -> tuple[dict[str, Any], dict[str, Any]]:

@@ -11,7 +11,7 @@ from mcap.records import Channel, ChunkIndex
 
 from trihedron.pipeline.core.errors import RecordingError
 from trihedron.pipeline.core.types import Value
-from trihedron.pipeline.record.codec import FRAMES_TOPIC, METADATA, READABLE, Decoder, ValueMessage, builds_on
+from trihedron.pipeline.record.codec import FRAMES_TOPIC, METADATA, READABLE, UPGRADE, Decoder, ValueMessage, builds_on
 from trihedron.pipeline.record.mcap_file import McapFile, damaged
 
 
@@ -35,7 +35,7 @@ class Recording:
             written = " ".join(["trihedron", self.metadata.get("version", ""), self.metadata.get("commit", "")[:7]]).strip()
             form = self.metadata.get("format")
             cause = f"has format {form} of {written}, this program reads formats {' and '.join(READABLE)}: {self._difference()}"
-            raise RecordingError(str(path), cause, "upgrade what can be read of it with: trihedron convert SRC DST.mcap")
+            raise RecordingError(str(path), cause, UPGRADE)
 
     def _difference(self) -> str:
         """Of a recording of another format: what its first messages hold that this program does not read, types with other fields first."""

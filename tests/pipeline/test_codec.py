@@ -276,7 +276,7 @@ def test_damaged_and_foreign_values_are_refused():
     message = message_of(keypoints())
     message.version = 9
     assert refusal(message) == (
-        "a.mcap: topic /keypoints: holds Keypoints version 9, this program reads version 1; record again, or read it with the version that wrote it"
+        "a.mcap: topic /keypoints: holds Keypoints version 9, this program reads version 1; read it with the version that wrote it"
     )
     message = message_of(keypoints())
     del message.arrays[2]
@@ -327,7 +327,7 @@ def test_a_value_of_an_older_version_names_the_version_and_the_fields():
     message.arrays.extend([*kept, type(kept[0])(name="quality", dtype="float", encoding="raw", data=bytes(8))])
     assert refusal(message) == (
         "a.mcap: topic /keypoints: holds Pose version 1, this program reads version 2, with the field 'submap', 'unrecognised' that it lacks, "
-        "without its field 'quality'; record again, or read it with the version that wrote it"
+        "without its field 'quality'; upgrade what can be read of it with: trihedron convert SRC DST.mcap"
     )
 
 

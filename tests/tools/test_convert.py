@@ -1,11 +1,14 @@
 """`trihedron convert`: frames and truth survive bit for bit, and every mistake is one line."""
 
+from pathlib import Path
+
 import cv2
 import numpy as np
 import pytest
 
 from trihedron.pipeline.app.cli import main
 from trihedron.pipeline.core.registry import load_plugins, plugin_class
+from trihedron.pipeline.record import upgrade
 from trihedron.pipeline.record.reader import Recording
 from trihedron.pipeline.record.trajectories import read_trajectory
 
@@ -112,3 +115,45 @@ def test_errors(folder, capsys, words, code, line):
     assert main(["convert", *words]) == code
     assert capsys.readouterr().err == f"trihedron: {line}\n"
     assert not (folder.parent / "x.mcap").exists()
+
+
+@pytest.mark.parametrize("form, messages, skipped", [(1, 21, ["map", "pose"]), (2, 3, ["bundle", "dataset", "map"])])
+def test_a_recording_of_an_older_format_is_upgraded(form, messages, skipped, tmp_path, capsys):
+    """Refused with the line that names `convert`; after it, what this program can read is there, and the rest is listed."""
+    old, new = Path(__file__).parents[1] / "pipeline" / "recordings" / f"format_{form}.mcap", tmp_path / "new.mcap"
+    assert main(["diff", str(old), str(old)]) == 1
+    assert capsys.readouterr().err.endswith("upgrade what can be read of it with: trihedron convert SRC DST.mcap\n")
+    assert main(["convert", str(old), str(new)]) == 0
+    first, *rest = capsys.readouterr().out.splitlines()
+    assert first.startswith(f"{new}: upgraded {messages} messages, ")
+    assert [line.split(":")[0] for line in rest] == [f"  skipped /{topic}" for topic in skipped]
+    recording = Recording(new)
+    assert recording.metadata["format"] == "4" and not recording.topics & set(skipped)
+    assert [value.index for value in recording.values("frames")] == [0, 1, 2]
+    assert sum(recording.counts.values()) == messages and [path.name for path in tmp_path.iterdir()] == ["new.mcap"]
+
+
+def test_renamed_types_and_fields_are_upgraded(tmp_path, monkeypatch, capsys):
+    """A recording from before a renaming: the tables of `upgrade` carry it over, bit for bit."""
+    old, new = Path(__file__).parents[1] / "pipeline" / "recordings" / "format_3.mcap", tmp_path / "new.mcap"
+    before = tmp_path / "before.mcap"
+    monkeypatch.setattr(upgrade, "RENAMED_TYPES", {"Map": "LandmarkMap"})
+    monkeypatch.setattr(upgrade, "RENAMED_FIELDS", {"LandmarkMap": {"points": "corners", "revision": "number"}})
+    monkeypatch.setattr(upgrade, "_decoder", lambda file, channel: Raw())
+    monkeypatch.setattr(upgrade, "Encoder", Raw)
+    upgrade.upgrade(old, before)
+    monkeypatch.undo()
+    monkeypatch.setattr(upgrade, "RENAMED_TYPES", {"LandmarkMap": "Map"})
+    monkeypatch.setattr(upgrade, "RENAMED_FIELDS", {"Map": {"corners": "points", "number": "revision"}})
+    assert main(["convert", str(before), str(new)]) == 0
+    assert "upgraded 120 messages" in capsys.readouterr().out
+    assert main(["diff", str(old), str(new)]) == 0
+
+
+class Raw:
+    """Passes messages on as they are."""
+
+    def decode(self, data):
+        return data
+
+    encode = decode

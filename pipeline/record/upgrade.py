@@ -1,0 +1,108 @@
+"""Upgrade a recording or map of an older format: every topic that this program can read, after renaming, is written again."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from trihedron.pipeline.core.errors import RecordingError, printable
+from trihedron.pipeline.record.codec import FORMAT, FRAMES_TOPIC, METADATA, READABLE, Decoder, Encoder, ValueMessage
+from trihedron.pipeline.record.mcap_file import McapFile, damaged
+from trihedron.pipeline.record.mcap_writer import McapWriter
+
+RENAMED_TYPES: dict[str, str] = {}  # name in an older recording -> name today, where only the name changed
+RENAMED_FIELDS: dict[str, dict[str, str]] = {}  # type today -> older name of a field or table -> name today
+
+
+@dataclass
+class Upgraded:
+    """Messages copied, and the topics that were skipped with the reason: their values lack what this program needs."""
+
+    messages: int = 0
+    skipped: dict[str, str] = field(default_factory=dict)
+
+
+def is_outdated(path: Path) -> bool:
+    """Return whether a file is a recording or map of this program, complete, of a format or with values that it cannot read as they are."""
+    file = McapFile(path)
+    if METADATA not in file.metadata or not file.complete or not file.indexed:
+        return False
+    return file.metadata[METADATA].get("format") not in READABLE or bool(_unreadable(file, rename=False))
+
+
+def upgrade(source: Path, destination: Path) -> Upgraded:
+    """Write an upgraded copy; an existing file is replaced only when all is done. Raises RecordingError where the source is damaged, its frames
+    cannot be read, or the destination cannot be written."""
+    file = McapFile(source)
+    if not file.complete or not file.indexed:
+        raise damaged(source)
+    unreadable = _unreadable(file, rename=True)
+    result = Upgraded(skipped={file.channels[channel].topic: why for channel, why in unreadable.items()})
+    if f"/{FRAMES_TOPIC}" in result.skipped:
+        raise RecordingError(str(source), f"cannot be upgraded: {result.skipped[f'/{FRAMES_TOPIC}']}", "record it again")
+    partial = destination.with_name(destination.name + ".part")
+    try:
+        writer = McapWriter(partial)
+        try:
+            _copy(file, writer, unreadable, result)
+        finally:
+            writer.close()
+        partial.replace(destination)
+    finally:
+        partial.unlink(missing_ok=True)
+    return result
+
+
+def _copy(file: McapFile, writer: McapWriter, unreadable: dict[int, str], result: Upgraded) -> None:
+    writer.metadata(METADATA, {**file.metadata[METADATA], "format": FORMAT})
+    for name, data in file.attachments.items():
+        writer.attach(name, data.decode("utf-8", "replace"))
+    numbers: dict[int, int] = {}
+    codecs: dict[int, tuple[Decoder, Encoder]] = {}
+    for channel, log_time, data in file.messages():
+        if channel in unreadable:
+            continue
+        if _is_value(file, channel):
+            decoder, encoder = codecs.setdefault(channel, (_decoder(file, channel), Encoder()))
+            data = encoder.encode(decoder.decode(_renamed(data)))
+        if channel not in numbers:
+            declared, schema = file.channels[channel], file.schemas.get(file.channels[channel].schema_id)
+            described = (schema.name, schema.encoding, schema.data) if schema is not None else ("", "", b"")
+            numbers[channel] = writer.channel(declared.topic, *described, declared.message_encoding)
+        message = (numbers[channel], log_time, data)
+        writer.add(len(data), lambda message=message: [message])  # type: ignore[misc]
+        result.messages += 1
+
+
+def _unreadable(file: McapFile, rename: bool) -> dict[int, str]:
+    """The channels of values whose first message cannot be decoded, and why."""
+    causes: dict[int, str] = {}
+    for channel in file.channels:
+        chunks = file.chunks(channel) if _is_value(file, channel) else []
+        for _, data in file.in_chunk(chunks[0], channel)[:1] if chunks else ():
+            try:
+                _decoder(file, channel).decode(_renamed(data) if rename else data)
+            except RecordingError as error:
+                causes[channel] = error.cause
+    return causes
+
+
+def _is_value(file: McapFile, channel: int) -> bool:
+    return file.schema_name(channel) == ValueMessage.DESCRIPTOR.full_name
+
+
+def _decoder(file: McapFile, channel: int) -> Decoder:
+    return Decoder(f"{file.path}: topic {printable(file.channels[channel].topic, 80)}")
+
+
+def _renamed(data: bytes) -> bytes:
+    """A message with the names of today."""
+    if not RENAMED_TYPES and not RENAMED_FIELDS:
+        return data
+    message = ValueMessage.FromString(data)
+    message.type = RENAMED_TYPES.get(message.type, message.type)
+    fields = RENAMED_FIELDS.get(message.type, {})
+    for array in message.arrays if fields else ():
+        name, mark, rest = array.name.partition("#")
+        array.name = fields.get(name, name) + mark + rest
+    return bytes(message.SerializeToString())
