@@ -88,7 +88,7 @@ def _unreadable(file: McapFile, rename: bool) -> dict[int, str]:
 
 
 def _is_value(file: McapFile, channel: int) -> bool:
-    return file.schema_name(channel) == ValueMessage.DESCRIPTOR.full_name
+    return bool(file.schema_name(channel) == ValueMessage.DESCRIPTOR.full_name)
 
 
 def _decoder(file: McapFile, channel: int) -> Decoder:
