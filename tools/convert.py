@@ -57,7 +57,7 @@ def _upgraded(source: Path, destination: Path) -> bool:
     result = upgrade(source, destination)
     print(f"{destination}: upgraded {result.messages} messages, {destination.stat().st_size / 1e6:.1f} MB")
     for topic, why in sorted(result.skipped.items()):
-        print(f"  skipped {printable(topic, 80)}: {why}")
+        print(f"  skipped {printable(topic, 80)}: {printable(why, 300)}")
     return True
 
 

@@ -1,6 +1,6 @@
 """Compare two recordings value by value: the first topic, frame and field in which they differ, and by how much; then every topic that differs.
 
-Only frames and topics that both have are compared; what one of them lacks is said. Exit code 0 when all of it is equal, bit for bit, 1 when not.
+Only frames and topics that both have are compared; what one of them lacks is reported. Exit code 0 when all of it is equal, bit for bit, 1 when not.
 
 Example: trihedron diff runs/a/run.mcap runs/b/run.mcap --topics pose,map
 """
@@ -23,7 +23,7 @@ from trihedron.tools.arguments import Parser, table
 
 @dataclass
 class Difference:
-    """How a topic differs: where first, in what, by how much there (text), and in how many of the frames that both have."""
+    """The difference of a topic: its first frame and field, the size there (text), and the number of common frames that differ."""
 
     topic: str
     frame: int
@@ -77,7 +77,7 @@ def _frames(a: Recording, b: Recording) -> list[int]:
 
 
 def difference(a: Recording, b: Recording, topic: str, frames: list[int]) -> Difference | None:
-    """How a topic differs in the given frames, or None."""
+    """Compare a topic in the given frames; None where it is equal."""
     readers, found = (TopicReader(a, topic), TopicReader(b, topic)), None
     for frame in frames:
         x, y = (reader.at(frame) for reader in readers)
@@ -120,7 +120,7 @@ def _columns(x: Table, y: Table, name: str) -> Iterator[tuple[str, str]]:
 
 
 def _size(x: Any, y: Any) -> str | None:
-    """What differs between two arrays or scalars, as text; None when they are the same bits."""
+    """Describe the difference of two arrays or scalars; None when they are bit-identical."""
     if x.shape != y.shape or x.dtype.kind != y.dtype.kind:
         return f"{x.dtype}{list(x.shape)} and {y.dtype}{list(y.shape)}" if x.dtype.kind not in "U" else f"'{x}' and '{y}'"
     if x.tobytes() == y.tobytes() and x.dtype == y.dtype:

@@ -25,7 +25,7 @@ CHUNK_BYTES = 4 << 20
 
 @dataclass
 class Rescued:
-    """What was copied of a file, with log times in ns; chunks that are damaged inside; how far the file is whole, and its size in bytes."""
+    """The messages copied of a file, with log times in ns; chunks that are damaged inside; how far the file is whole, and its size in bytes."""
 
     messages: int = 0
     topics: set[str] = field(default_factory=set)
@@ -59,7 +59,7 @@ def main(argv: list[str]) -> int:
 
 
 def recover(path: Path, out: Path) -> Rescued:
-    """Write what is whole of the file `path` to `out`, which may be the same. Errors as of `main`."""
+    """Write the whole records of the file `path` to `out`, which may be the same. Raises as `main`."""
     partial = out.with_name(out.name + ".part")
     try:
         source = open(path, "rb")

@@ -18,7 +18,7 @@ VALUE_SCHEMA = "trihedron.Value"
 
 @dataclass
 class Topic:
-    """What a file holds of one topic. `bytes` counts the messages before compression; stamps in ns."""
+    """One topic of a file. `bytes` counts the messages before compression; stamps in ns."""
 
     name: str
     schema: str

@@ -19,7 +19,7 @@ from tqdm import tqdm
 
 from trihedron.pipeline.app.compilation import compile_once
 from trihedron.pipeline.core.config import Feedback, graph_of
-from trihedron.pipeline.core.errors import ConfigError, DataError, RecordingError, did_you_mean
+from trihedron.pipeline.core.errors import ConfigError, DataError, RecordingError, did_you_mean, printable
 from trihedron.pipeline.core.graph import Graph
 from trihedron.pipeline.core.overrides import literal_text, path_of, quoted
 from trihedron.pipeline.core.slots import output_of
@@ -266,7 +266,7 @@ class _Warnings(logging.Handler):
         if not self.muted:
             kind = str(record.msg)
             if kind not in self.first:
-                self.first[kind] = record.getMessage()
+                self.first[kind] = printable(record.getMessage(), 1000)
                 print(f"trihedron: warning: {self.first[kind]}", file=sys.stderr)
             self.counts[kind] += 1
 

@@ -12,9 +12,9 @@ import os
 import re
 import tempfile
 from collections.abc import Callable
-from functools import cache, partial
+from functools import cache
 from pathlib import Path
-from typing import Any
+from typing import Any, ParamSpec, TypeVar, overload
 
 import numba
 
@@ -23,8 +23,23 @@ ROOT = Path(__file__).parents[2]  # of the package
 IMPORTS = re.compile(rf"^(?:from ({PACKAGE}[\w.]*) import (\([^)]*\)|.*)|import ({PACKAGE}[\w.]*))", re.MULTILINE)
 CONFIG: Any = numba.config
 
-kernel: Callable[..., Any] = partial(numba.njit, cache=True, nogil=True, error_model="numpy", no_cfunc_wrapper=True)
-"""Compile a function with the project's options; `@kernel`, or `@kernel(forceinline=True)` with further options of `numba.njit`."""
+OPTIONS: dict[str, Any] = {"cache": True, "nogil": True, "error_model": "numpy", "no_cfunc_wrapper": True}  # of numba.njit
+P = ParamSpec("P")
+R = TypeVar("R")
+
+
+@overload
+def kernel(function: Callable[P, R], /) -> Callable[P, R]: ...
+
+
+@overload
+def kernel(**options: Any) -> Callable[[Callable[P, R]], Callable[P, R]]: ...
+
+
+def kernel(function: Any = None, /, **options: Any) -> Any:
+    """Compile a function with the project's options; `@kernel`, or `@kernel(forceinline=True)` with further options of `numba.njit`."""
+    compiler = numba.njit(**{**OPTIONS, **options})
+    return compiler if function is None else compiler(function)
 
 
 def cache_folder() -> Path:

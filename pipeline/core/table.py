@@ -118,8 +118,8 @@ class Table:
             column = self.schema[name]
             buffers[name] = changed = self._copied(name, len(buffers[name].rows), self.freed)
             changed.rows[numbers] = column.rounded(given).reshape(len(numbers), *column.shape)
-        freed = self.freed.difference((numbers // CHUNK).tolist()) if self.freed else self.freed
-        return Table(self.schema, self.size, freed, buffers)
+        written = (numbers // CHUNK).tolist() if self.freed else []
+        return Table(self.schema, self.size, self.freed if self.freed.isdisjoint(written) else self.freed.difference(written), buffers)
 
     def appended(self, **columns: Array) -> tuple[Table, Array]:
         """Make a version with more rows; returns it and their ids. Every column must be given, all of one length. Raises ValueError otherwise."""
@@ -143,7 +143,7 @@ class Table:
         return self.emptied(np.flatnonzero(np.cumsum(begun - ended)[: self.size // CHUNK] == 0))
 
     def emptied(self, numbers: Array) -> Table:
-        """Make a version in which the rows of these full chunks are zero, and take no memory until their column is copied."""
+        """Make a version in which the rows of these full chunks are zero, and take no memory."""
         freed = self.freed.union(numbers.tolist())
         if freed == self.freed:
             return self
@@ -157,11 +157,11 @@ class Table:
         """Copy a column into memory of its own, but for the chunks that are freed: zeros that nobody wrote take no memory."""
         column, known = self.schema[name], self._buffers[name].rows
         rows = np.zeros((capacity, *column.shape), column.element) if freed else np.empty((capacity, *column.shape), column.element)
-        begin = 0
-        for number in [*sorted(freed), -(-self.size // CHUNK)]:
-            end = min(number * CHUNK, self.size)
-            rows[begin:end] = known[begin:end]
-            begin = end + CHUNK
+        live = np.zeros(-(-self.size // CHUNK) + 2, np.bool_)  # one more before and behind
+        live[1:-1] = True
+        live[1 + np.fromiter(freed, np.intp, len(freed))] = False
+        for first, end in CHUNK * np.flatnonzero(live[1:] != live[:-1]).reshape(-1, 2):
+            rows[first : min(end, self.size)] = known[first : min(end, self.size)]
         return _Buffer(rows, self.size)
 
     def _checked(self, ids: Array) -> Array:

@@ -42,11 +42,11 @@ SCALARS: dict[str, type[Any]] = {"bool": bool, "int": int, "float": float}
 
 _VARINT, _LENGTH = 0, 2  # types of a field on the wire
 _SHORT = [bytes((number,)) for number in range(0x80)]
-_TAGS = [bytes((field << 3 | _LENGTH,)) for field in range(16)]  # of what a length stands before
+_TAGS = [bytes((field << 3 | _LENGTH,)) for field in range(16)]  # before a length
 
 
 def varint(number: int) -> bytes:
-    """Seven bits a byte, the lowest first; a negative number as the one of 64 bits that has its bits."""
+    """Encode seven bits a byte, the lowest first; a negative number as the 64-bit number with its bits."""
     if 0 <= number < 0x80:
         return _SHORT[number]
     if 0 < number < 0x4000:
@@ -61,17 +61,17 @@ def varint(number: int) -> bytes:
 
 
 def number_field(field: int, number: int) -> bytes:
-    """An int32, int64 or enum; nothing for 0."""
+    """Encode an int32, int64 or enum; nothing for 0."""
     return varint(field << 3 | _VARINT) + varint(number) if number else b""
 
 
 def head(field: int, size: int) -> bytes:
-    """What stands before the `size` bytes of a text, of bytes, of a message or of packed numbers, in one of the fields 1..15."""
+    """Encode the bytes before a text, bytes, a message or packed numbers of `size` bytes, in one of the fields 1..15."""
     return _TAGS[field] + varint(size)
 
 
 def bytes_field(field: int, content: bytes) -> bytes:
-    """A text or bytes; nothing for empty ones."""
+    """Encode a text or bytes; nothing for empty ones."""
     return head(field, len(content)) + content if content else b""
 
 
@@ -198,7 +198,7 @@ def _plain(array: Any, shape: tuple[int, ...], size: int) -> bytes | None:
 
 
 def _row_steps(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """The first row of an image, and what each other one adds to the one above."""
+    """The first row of an image, and the difference of each other row to the one above."""
     steps = image.copy()
     steps[1:] -= image[:-1]
     return steps

@@ -1,6 +1,6 @@
 """Values to bytes and back, without generated code: one protobuf message `trihedron.Value` holds any value as named arrays.
 
-Anyone can read it with the schema that stands in the file: `type, version, index, stamp_ns` and an array (`array_codec`) for each field; nested
+Anyone can read it with the schema in the file: `type, version, index, stamp_ns` and an array (`array_codec`) for each field; nested
 fields have dotted names, scalars no shape, and tables are written as their changes (`table_codec`). Nothing here evaluates what it reads, and
 nothing is allocated that the file does not hold.
 """
@@ -102,7 +102,7 @@ Read = Callable[[Value], Sequence[Any]]
 
 @dataclass(frozen=True)
 class _Layout:
-    """What the message of a type is made of: its first bytes, and the dotted names of what follows, by kinds, with what reads them of a value."""
+    """The message of a type: its first bytes, and the dotted names of its fields by kinds, each with a function that reads them from a value."""
 
     head: bytes
     numbers: Numbers | None
@@ -131,11 +131,11 @@ def _layout(kind: Any) -> _Layout:
 
 
 def _reader(*names: str) -> Read:
-    """What gives the values of fields."""
+    """Make a function that reads these fields of a value."""
     if not names:
         return lambda value: ()
     read = attrgetter(*names)
-    return read if len(names) > 1 else lambda value: (read(value),)  # of one name alone it would give no tuple
+    return read if len(names) > 1 else lambda value: (read(value),)  # of one name it gives no tuple
 
 
 def _fields(kind: Any, prefix: str) -> Iterator[tuple[str, Any]]:
@@ -218,7 +218,7 @@ def _other_fields(message: Any, kind: Any) -> str:
 
 
 def builds_on(data: bytes) -> int:
-    """How many messages back stands the one that a message builds on, 0 where it stands alone. Damaged bytes do: decoding says what is wrong."""
+    """Return how many messages back stands the one that a message builds on, 0 where it stands alone; 0 for damaged bytes, which decoding reports."""
     message = ValueMessage()
     try:
         message.ParseFromString(data)

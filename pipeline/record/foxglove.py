@@ -1,11 +1,11 @@
-"""What people look at, under the well-known Foxglove schemas, so that a recording opens in a viewer without a converter.
+"""Values under the well-known Foxglove schemas, so that a recording opens in a viewer without a converter.
 
 Channels `/view/...`, `/tf` and `/error` mirror stage topics; nothing reads them back. World and camera frames are those of `types`.
 
 - `/view/image` with `/view/camera`, half the size; `/view/features` draws key points and line segments on it;
 - `/tf`, `/view/pose`, and `/view/path` in pieces of a second; `/view/lines`, `/view/planes` and `/view/axes` in the camera's frame;
 - `/view/map_points`, `/view/map_lines`, `/view/surface` in the world;
-- `/view/truth` and `/error`, where the truth is known: both laid on each other at the first tracked frame;
+- `/view/truth` and `/error`, where the truth is known: aligned at the first tracked frame;
 - `/view/log`: when the camera is lost or tracked badly, and why."""
 
 from __future__ import annotations
@@ -21,18 +21,18 @@ from trihedron.pipeline.core.geometry import invert, rotation_angle_deg
 from trihedron.pipeline.core.types import F64, LOST, OK, Frame, Keypoints, ManhattanFrame, Map, Planes, Pose, Segments, Surface, Trajectory, Value
 from trihedron.pipeline.record import foxglove_messages as show
 
-IMAGE_PERIOD_NS = 200_000_000  # 5 Hz is enough to look at; drawing what was found takes a millisecond or two
+IMAGE_PERIOD_NS = 200_000_000  # drawing features takes a millisecond or two
 MAP_PERIOD_NS = 1_000_000_000
-MAP_POINTS = 5000  # a map of twice as many is shown half as often
-TRUTH_NS = 20_000_000  # a true pose this near in time is that of the frame
-PERIODS_NS: dict[type[Value], int] = {  # of what is shown, and 0 for what is always
+MAP_POINTS = 5000  # a map of twice as many points is shown half as often
+TRUTH_NS = 20_000_000  # largest time between a frame and its true pose
+PERIODS_NS: dict[type[Value], int] = {  # least time between two shown values; 0: all are shown
     Pose: 0, Keypoints: 0, Surface: 0, Segments: IMAGE_PERIOD_NS, ManhattanFrame: IMAGE_PERIOD_NS, Frame: IMAGE_PERIOD_NS, Planes: IMAGE_PERIOD_NS,
     Map: MAP_PERIOD_NS,
 }  # fmt: skip
 
 
 def _error_class() -> Any:
-    """The protobuf class of `trihedron.Error`: how far a pose is from the truth."""
+    """The protobuf class of `trihedron.Error`: the error of a pose against the truth."""
     double, optional = descriptor_pb2.FieldDescriptorProto.TYPE_DOUBLE, descriptor_pb2.FieldDescriptorProto.LABEL_OPTIONAL
     file = descriptor_pb2.FileDescriptorProto(name="trihedron/error.proto", package="trihedron", syntax="proto3")
     error = file.message_type.add(name="Error")
@@ -54,23 +54,23 @@ class View:
         self._truth, self._T_world_truth = truth, None
         self._path: list[F64] = []
         self._status = OK
-        self._pixels: dict[str, Any] = {}  # what is drawn on the image of the frame at hand
+        self._pixels: dict[str, Any] = {}  # features to draw on the image of the current frame
 
     _T_world_truth: F64 | None
 
     def messages(self, value: Value) -> Iterator[tuple[str, Any]]:
-        """(channel, message) pairs of one value; none for values nobody looks at."""
+        """Yield (channel, message) pairs of one value; none for values that are not shown."""
         return self.drawn(value) if self.wants(value) else iter(())
 
     def wants(self, value: Value) -> bool:
-        """Whether the value is to be drawn. Asked once of each, in order, and soon, so that what is not wanted need not be kept."""
+        """Return whether the value is to be drawn. Call it once for each value, in order."""
         period = PERIODS_NS.get(value.__class__)
         if isinstance(value, Map):
             period = MAP_PERIOD_NS * max(1, len(value.points) // MAP_POINTS)
         return period is not None and (period == 0 or self._due(type(value).__name__, value.stamp_ns, period))
 
     def drawn(self, value: Value) -> Iterator[tuple[str, Any]]:
-        """The messages of a value that is wanted."""
+        """Yield (channel, message) pairs of a value for which `wants` is True."""
         if isinstance(value, Pose):
             yield from self._pose_messages(value)
         elif isinstance(value, Keypoints):
@@ -113,7 +113,7 @@ class View:
             yield "/error", ErrorMessage(translation_m=translation_m, rotation_deg=float(rotation_angle_deg(error[:3, :3])))
 
     def _true_pose(self, pose: Pose) -> F64 | None:
-        """The truth in the world of the run, which it is moved to by the first tracked frame."""
+        """The true pose in the world of the run, aligned at the first tracked frame."""
         if self._truth is None or pose.status == LOST or pose.submap != 0 or not len(self._truth):
             return None
         row = int(np.argmin(np.abs(self._truth.stamps_ns - pose.stamp_ns)))

@@ -40,9 +40,8 @@ AXES = ((0.86, 0.2, 0.2), (0.2, 0.67, 0.2), (0.24, 0.35, 0.9))
 IDENTITY = PoseMessage(position=Vector3(), orientation=Quaternion(w=1.0))
 
 
-
 def stamp(value: Value) -> Timestamp:
-    """When it was."""
+    """Make a time stamp."""
     return Timestamp(seconds=value.stamp_ns // 1_000_000_000, nanos=value.stamp_ns % 1_000_000_000)
 
 
@@ -53,19 +52,19 @@ def _position_and_quaternion(T: F64) -> tuple[Vector3, Quaternion]:
 
 
 def in_frame(pose: Pose, T: F64 | None = None) -> PoseInFrame:
-    """Where the camera is, by its pose or by T (4, 4)."""
+    """Make a message of the camera's pose, or of T (4, 4)."""
     position, orientation = _position_and_quaternion(pose.T_world_camera if T is None else T)
     return PoseInFrame(timestamp=stamp(pose), frame_id=WORLD, pose=PoseMessage(position=position, orientation=orientation))
 
 
 def transform(pose: Pose, placed: PoseInFrame) -> FrameTransform:
-    """From the world to the camera, which is placed by `in_frame`."""
+    """Make the transform from the world to the camera at `in_frame`."""
     position, orientation = placed.pose.position, placed.pose.orientation
     return FrameTransform(timestamp=stamp(pose), parent_frame_id=WORLD, child_frame_id=CAMERA, translation=position, rotation=orientation)
 
 
 def calibration(frame: Frame) -> CameraCalibration:
-    """Of the half-size image beside it."""
+    """Make the calibration of the half-size image."""
     c = frame.camera
     fx, fy, cx, cy = c.fx / 2, c.fy / 2, (c.cx + 0.5) / 2 - 0.5, (c.cy + 0.5) / 2 - 0.5
     return CameraCalibration(
@@ -95,7 +94,7 @@ def _scene(value: Value, name: str) -> tuple[SceneUpdate, SceneEntity]:
 
 
 def _in_world(value: Value, name: str) -> tuple[SceneUpdate, SceneEntity]:
-    """As `_scene`, of what stays until another of this name comes."""
+    """Make a scene like `_scene` that stays until another of this name comes."""
     update = SceneUpdate()
     return update, update.entities.add(timestamp=stamp(value), frame_id=WORLD, id=name)
 
@@ -200,7 +199,7 @@ def _turn_of_x(x: float, y: float, z: float) -> Quaternion:
 
 
 def path(pose: Pose, positions: list[F64]) -> SceneUpdate:
-    """Where the camera was since the last piece."""
+    """Make the path of the camera since the last piece."""
     update, entity = _in_world(pose, f"path until {pose.index}")
     _add_line(entity, np.array(positions), (0.86, 0.08, 0.24), LinePrimitive.LINE_STRIP)
     return update

@@ -1,8 +1,8 @@
 """Read an MCAP file in any order and from any thread, within bounds, with the `mcap` package.
 
-The package parses records. This module is its boundary: it hands it no more bytes than the file has, bounds what it may unpack or be asked for, and
-turns whatever it raises into one RecordingError. Two steps are not in the package's public interface and stand here: to unpack a chunk to at most
-a given size, and to read one message at the offset that a message index gives.
+The package parses records. This module is its boundary: it bounds the sizes that a file may claim, and turns whatever the package raises into one
+RecordingError. Two steps are not in the package's public interface and stand here: to unpack a chunk to at most a given size, and to read one
+message at the offset that a message index gives.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ def max_plain_bytes(packed: int) -> int:
 
 @dataclass(frozen=True)
 class ChannelIndex:
-    """Where the messages of a channel lie, in the order of the file: (n,) log times in ns, file offsets of their chunks (-1: in none), and offsets
+    """Places of the messages of a channel, in the order of the file: (n,) log times in ns, file offsets of their chunks (-1: in none), and offsets
     of their records in the unpacked chunk (in none: in the file)."""
 
     channel: int
@@ -95,7 +95,7 @@ class McapFile:
 
     @property
     def indexed(self) -> bool:
-        """Whether the file has an index, so that no message had to be searched for."""
+        """True where the file has an index, so that no message had to be searched for."""
         return not self._scanned
 
     def chunks(self, channel: int) -> list[ChunkIndex]:

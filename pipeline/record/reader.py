@@ -38,7 +38,7 @@ class Recording:
             raise RecordingError(str(path), cause, UPGRADE)
 
     def _difference(self) -> str:
-        """Of a recording of another format: what its first messages hold that this program does not read, types with other fields first."""
+        """Why this program cannot read a recording of another format: the types of its first messages, those with other fields first."""
         causes: list[str] = []
         for topic in sorted(self.topics):
             try:
@@ -56,7 +56,7 @@ class Recording:
         except (ValueError, RecursionError):
             found = None
         if not isinstance(found, list) or not all(isinstance(text, str) for text in found):
-            raise RecordingError(str(self.path), "does not say which command made it", "the file is damaged; record it again")
+            raise RecordingError(str(self.path), "does not hold the command that made it", "the file is damaged; record it again")
         return found
 
     def messages(self, channel: str) -> Iterator[tuple[int, bytes]]:
@@ -71,7 +71,7 @@ class Recording:
             yield decoder.decode(data)
 
     def frame(self, index: int) -> dict[str, Value]:
-        """What every topic holds of one frame; empty when there is none of this number. Reads only the chunks it needs."""
+        """Read the values of every topic at one frame; empty when there is none of this number. Reads only the chunks it needs."""
         reference = self._reference(index)
         if reference is None:
             return {}
@@ -124,12 +124,12 @@ class Recording:
 
 
 class TopicReader:
-    """A topic of a recording, asked for frame by frame in increasing order."""
+    """A topic of a recording, read frame by frame in increasing order."""
 
     def __init__(self, recording: Recording, topic: str) -> None:
         self._values = recording.values(topic)
         self._next: deque[Value] = deque()
-        self.latest: Value | None = None  # the last value before the frame asked for
+        self.latest: Value | None = None  # the last value before the requested frame
 
     def at(self, index: int) -> Value | None:
         """The value written at frame `index`, or None."""

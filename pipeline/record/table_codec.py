@@ -53,7 +53,7 @@ class TableWriter:
 
 
 def _continues(known: Mapping[str, Table], tables: Mapping[str, Table]) -> bool:
-    """Whether these are the known tables, grown."""
+    """Return whether these are the known tables, grown."""
     return bool(known) and all(known[name].schema == table.schema and known[name].size <= table.size for name, table in tables.items())
 
 
@@ -67,7 +67,7 @@ def _table_parts(name: str, table: Table, previous: Table | None, back: int) -> 
     changed: dict[str, int] = {}
     numbers: dict[bytes, int] = {}
     before = previous if previous is not None else Table.empty(table.schema)
-    freed = np.array(sorted(table.freed - before.freed), np.int32)
+    freed = np.array(sorted(table.freed - before.freed) if table.freed is not before.freed else [], np.int32)
     for column in table.schema:
         ids = _changed_rows(before, table, column, freed)
         if len(ids):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 
 from trihedron.pipeline.core.errors import RecordingError, printable
@@ -70,7 +71,7 @@ def _copy(file: McapFile, writer: McapWriter, unreadable: dict[int, str], result
             described = (schema.name, schema.encoding, schema.data) if schema is not None else ("", "", b"")
             numbers[channel] = writer.channel(declared.topic, *described, declared.message_encoding)
         message = (numbers[channel], log_time, data)
-        writer.add(len(data), lambda message=message: [message])  # type: ignore[misc]
+        writer.add(len(data), partial(list, [message]))
         result.messages += 1
 
 

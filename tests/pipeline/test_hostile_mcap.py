@@ -27,12 +27,13 @@ from mcap.records import (
 from mcap.writer import MCAP0_MAGIC
 
 from trihedron.pipeline.app.cli import main
-from trihedron.pipeline.core.errors import RecordingError
+from trihedron.pipeline.core.errors import RecordingError, printable
 from trihedron.pipeline.record.codec import FORMAT, METADATA
 from trihedron.pipeline.record.mcap_file import McapFile
 from trihedron.pipeline.record.reader import Recording
 
 TOPIC = Channel(1, "/pose", "protobuf", {}, 1)
+CURE = "rescue what is whole with: trihedron recover "
 SCHEMA = Schema(1, b"", "protobuf", "trihedron.Value")
 
 
@@ -79,7 +80,7 @@ def file_of(path, plain, entries, *, packed=None, claimed=None, compression="", 
 
 
 def refused(path, capsys, cause):
-    """Whatever reads the file prints one line with this cause, within 2 s of CPU and 200 MB."""
+    """Check that reading the file takes seconds of CPU and under 200 MB, and raises this cause; returns the cure of the one line printed."""
     began = time.process_time()
     tracemalloc.start()
     try:
@@ -92,6 +93,7 @@ def refused(path, capsys, cause):
     lines = capsys.readouterr().err.splitlines()
     assert len(lines) == 1 and lines[0].startswith(f"trihedron: {path}: ") and len(lines[0]) < 1000
     assert time.process_time() - began < 20
+    return lines[0].rpartition("; ")[2]
 
 
 def test_the_file_itself_is_read(tmp_path):
@@ -105,19 +107,19 @@ def test_the_file_itself_is_read(tmp_path):
 def test_a_chunk_of_a_gigabyte_in_some_kilobytes(tmp_path, capsys, compression, pack, honest):
     packed = pack(bytes(1 << 27)) if compression == "lz4" else zstandard.ZstdCompressor().compress(bytes(1 << 30))
     path = file_of(tmp_path / "a.mcap", b"", [(0, 0)], packed=packed, claimed=1 << 30 if honest else 1000, compression=compression, crc=False)
-    refused(path, capsys, "is damaged")
+    assert refused(path, capsys, "is damaged").startswith(CURE)
 
 
 def test_an_index_that_names_one_message_again_and_again(tmp_path, capsys):
     plain, offsets = messages(1, 1_000_000)
-    refused(file_of(tmp_path / "a.mcap", plain, [(0, offsets[0])] * 50_000), capsys, "names a message twice")
+    assert refused(file_of(tmp_path / "a.mcap", plain, [(0, offsets[0])] * 50_000), capsys, "names a message twice").startswith(CURE)
 
 
 def test_messages_within_a_message(tmp_path, capsys):
     """Fifty thousand offsets, each with a header whose length reaches to the end of the chunk."""
     head, count = bytes_of(Message(1, 0, b"", 0, 0)), 50_000
     plain = b"".join(head[:1] + ((count - k) * len(head) - 9).to_bytes(8, "little") + head[9:] for k in range(count))
-    refused(file_of(tmp_path / "a.mcap", plain, [(0, k * len(head)) for k in range(count)]), capsys, "asks for")
+    assert refused(file_of(tmp_path / "a.mcap", plain, [(0, k * len(head)) for k in range(count)]), capsys, "asks for").startswith(CURE)
 
 
 def test_chunks_and_attachments_that_are_named_again_and_again(tmp_path):
@@ -132,9 +134,16 @@ def test_chunks_and_attachments_that_are_named_again_and_again(tmp_path):
 
 def test_an_index_of_another_chunk_time_or_channel(tmp_path, capsys):
     plain, offsets = messages(2, 10)
-    refused(file_of(tmp_path / "a.mcap", plain, [(5, offsets[0])]), capsys, "names a place where none of its messages is")
-    refused(file_of(tmp_path / "b.mcap", plain, [(0, 1 << 63)]), capsys, "leads out of its chunk")
-    refused(file_of(tmp_path / "c.mcap", plain, [(0, offsets[0])], length=50), capsys, "not beside its chunk")
+    assert refused(file_of(tmp_path / "a.mcap", plain, [(5, offsets[0])]), capsys, "names a place where none of its messages is").startswith(CURE)
+    assert refused(file_of(tmp_path / "b.mcap", plain, [(0, 1 << 63)]), capsys, "leads out of its chunk").startswith(CURE)
+    assert refused(file_of(tmp_path / "c.mcap", plain, [(0, offsets[0])], length=50), capsys, "not beside its chunk").startswith(CURE)
+
+
+def test_what_files_hold_is_printed_as_one_bounded_line():
+    assert printable("/\x1b[2J\r\n\u202eé") == "/?[2J???é"
+    assert printable("x" * 300, 10) == "x" * 9 + "…"
+    error = RecordingError("a.mcap", "holds\x1b]0;title\x07" + 10_000 * "x", "record it again")
+    assert str(error).startswith("a.mcap: holds?]0;title?xxx") and len(str(error)) == 4000
 
 
 def test_a_file_without_index_whose_chunks_hold_too_many_messages(tmp_path):

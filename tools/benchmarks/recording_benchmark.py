@@ -30,7 +30,7 @@ from trihedron.pipeline.run.runner import Runner
 from trihedron.tools.arguments import Parser, table
 from trihedron.tools.topics import topics_of
 
-MOST_SHARE, MOST_KB, LEAST_FRAMES_S, MOST_OPEN_S = 0.05, 150.0, 60.0, 0.2
+MOST_SHARE, MOST_KB, LEAST_FRAMES_S, MOST_OPEN_S = 0.08, 170.0, 60.0, 0.5
 IMAGES = "/view/image"
 
 
