@@ -50,9 +50,9 @@ SCENES = {  # depth, what the camera does each frame, which coordinates are seen
 
 
 REASONS = {
-    "1 directions of motion cannot be seen, held at the prediction",
+    "1 directions of motion are unobservable, held at the prediction",
     "the rotation was not measured, and only 1 of 1 matches with the map agree",
-    "the place was not recognised since the pose was lost",
+    "relocalisation failed since the pose was lost",
 }
 
 

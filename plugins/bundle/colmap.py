@@ -6,31 +6,33 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
-from trihedron.pipeline.core.geometry import invert, pose_matrix
+from trihedron.pipeline.core.geometry import invert, pose_matrix, transform_planes
 from trihedron.pipeline.core.options import NonNegativeInt, PositiveFloat, PositiveInt
 from trihedron.pipeline.core.registry import register
-from trihedron.pipeline.core.types import Correction, Map
-from trihedron.plugins.bundle.common import bundle_problem, bundle_window, carried_correction
-from trihedron.plugins.bundle.common_kernels import BundleMeasurements, BundleState
+from trihedron.pipeline.core.types import F64, I32, Correction, Map
+from trihedron.plugins.bundle.common import BundleMeasurements, BundleState, BundleWindow, bundle_problem, bundle_window, free_poses
 from trihedron.plugins.mapping.covisibility_graph import newest_keyframes
+from trihedron.plugins.mapping.landmarks import ENDS, PLACE
+from trihedron.plugins.shared.linalg import transform_plane_covariance
 
 
 @register("bundle", "colmap")
 @dataclass(frozen=True)
 class Colmap:
-    """The window of `local_window` with COLMAP's own solver (Schönberger and Frahm, CVPR 2016): reprojected points alone, a pixel each.
+    """The window of `local_window` with COLMAP's own solver (Schönberger and Frahm, CVPR 2016): reprojected points alone, σ = 1 px.
 
-    For comparison. Depth has no part in it, so two keyframes are held to keep the scale. Lines, planes and points seen once go with the newest
-    keyframe that saw them. COLMAP says nothing of what is left uncertain: each landmark stays known as well as the map knew it."""
+    For comparison. Depth is not used, so two keyframes are fixed to keep the scale. Lines, planes and points observed once move rigidly with the
+    newest keyframe that observed them. COLMAP returns no covariance here: each landmark retains that of the map."""
 
-    keyframes: PositiveInt = 8  # at most, that may move: the newest and those that share most landmarks with it
-    fixed: NonNegativeInt = 8  # at most, that are held
+    keyframes: PositiveInt = 8  # at most, that are adjusted: the newest and the most covisible
+    fixed: NonNegativeInt = 8  # at most, that are fixed
     iterations: PositiveInt = 20
     loss_px: PositiveFloat = 2.0  # beyond which Huber's cost is linear
 
     def __call__(self, map: Map) -> Correction | None:
-        """The correction, or None when this version of the map has no new keyframe, or fewer than two to hold and one to move."""
+        """Return the correction, or None when this version of the map has no new keyframe, or fewer than two to fix and one to adjust."""
         newest = newest_keyframes(map, 1)
         if not len(newest) or map.keyframes.rows("index", newest)[0] != map.index:
             return None
@@ -38,12 +40,11 @@ class Colmap:
         if not len(window.free):
             return None
         state, seen = bundle_problem(map, window)
-        return carried_correction(map, window, seen, solve_colmap(state, seen, self.iterations, self.loss_px))
+        return _correction(map, window, seen, solve_colmap(state, seen, self.iterations, self.loss_px))
 
 
 def solve_colmap(state: BundleState, seen: BundleMeasurements, iterations: int, loss_px: float) -> BundleState:
-    """The state with the free keyframes, and the points seen at least twice, where COLMAP's adjustment puts them; a `loss_px` of 0 is least
-    squares."""
+    """Adjust the free keyframes and the points observed at least twice with COLMAP; a `loss_px` of 0 is least squares."""
     import pycolmap
 
     reconstruction, points = _reconstruction(state, seen)
@@ -72,7 +73,7 @@ def solve_colmap(state: BundleState, seen: BundleMeasurements, iterations: int, 
 
 
 def _reconstruction(state: BundleState, seen: BundleMeasurements) -> tuple[Any, dict[int, int]]:
-    """The problem as COLMAP knows it, keyframe k as image k + 1 with a camera of its own, and COLMAP's number of each point that is seen twice."""
+    """Convert the problem to COLMAP's, keyframe k as image k + 1 with a camera of its own; also COLMAP's id of each point observed twice."""
     import pycolmap
 
     reconstruction, points = pycolmap.Reconstruction(), {}
@@ -93,3 +94,58 @@ def _reconstruction(state: BundleState, seen: BundleMeasurements) -> tuple[Any, 
                 track.add_element(int(seen.point_keyframes[o]) + 1, int(place[o]))
             points[i] = reconstruction.add_point3D(position, track)
     return reconstruction, points
+
+
+def _correction(map: Map, window: BundleWindow, seen: BundleMeasurements, state: BundleState) -> Correction:
+    """The state of the window's keyframes and points as a correction, with the map's covariances.
+
+    Lines, planes and points that the state left in place move rigidly with the newest free keyframe that observed them."""
+    free = len(window.free)
+    poses = free_poses(state, free)
+    motions = poses @ invert(map.keyframes.rows("T_world_camera", window.free))
+    by = [np.repeat(np.arange(len(starts) - 1), np.diff(starts)) for starts in (seen.point_starts, seen.line_starts)]
+    T_point, T_line, T_plane = (
+        motions[_newest_free(rows, who, count, free)]
+        for rows, who, count in (
+            (by[0], seen.point_keyframes, len(window.points)),
+            (by[1], seen.line_keyframes, len(window.lines)),
+            (seen.plane_landmarks, seen.plane_keyframes, len(window.planes)),
+        )
+    )
+    old = map.points.rows("position_m", window.points)
+    still = (state.points == old).all(axis=1)
+    points = np.where(still[:, None], _transform_each(T_point, old[:, None])[:, 0], state.points)
+    planes = map.planes.rows("coefficients", window.planes)
+    moved = [transform_planes(T, plane[None])[0] for T, plane in zip(T_plane, planes)]
+    covariance = map.planes.rows("covariance", window.planes)
+    plane_covariance = [transform_plane_covariance(T, a[None], b[None], C[None])[0] for T, a, b, C in zip(T_plane, planes, moved, covariance)]
+    R, Q = T_point[:, :3, :3], T_line[:, None, :3, :3]
+    return Correction(
+        index=map.index,
+        stamp_ns=map.stamp_ns,
+        based_on=map.revision,
+        keyframe_ids=window.free,
+        T_world_keyframe=poses,
+        point_ids=window.points,
+        points_m=PLACE.rounded(points),
+        point_information=(R @ map.points.rows("information", window.points) @ np.swapaxes(R, -1, -2)).astype(np.float32),
+        line_ids=window.lines,
+        endpoints_m=ENDS.rounded(_transform_each(T_line, map.lines.rows("endpoints_m", window.lines))),
+        line_information=(Q @ map.lines.rows("information", window.lines) @ np.swapaxes(Q, -1, -2)).astype(np.float32),
+        plane_ids=window.planes,
+        coefficients=np.array(moved, np.float64).reshape(-1, 4),
+        plane_covariance=np.array(plane_covariance, np.float64).reshape(-1, 3, 3),
+    )
+
+
+def _newest_free(rows: NDArray[np.signedinteger], keyframes: I32, count: int, free: int) -> I32:
+    """Newest free keyframe, (count,), that observed each landmark; `rows` and `keyframes` are the landmarks and observers of the observations."""
+    newest = np.zeros(count, np.int32)
+    known = keyframes < free
+    np.maximum.at(newest, rows[known], keyframes[known])
+    return newest
+
+
+def _transform_each(T: F64, points: F64) -> F64:
+    """Transform points (n, e, 3), each row by its own T (n, 4, 4)."""
+    return np.asarray(points @ np.swapaxes(T[:, :3, :3], -1, -2) + T[:, None, :3, 3], np.float64)

@@ -21,7 +21,7 @@ from trihedron.plugins.places.verification import seen_through
 from trihedron.plugins.shared.descriptors import match_near
 from trihedron.plugins.shared.plane_association import associate_planes
 from trihedron.plugins.shared.plane_association_kernels import overlap
-from trihedron.plugins.shared.pose_optimizer import PoseSolution, solve_pose
+from trihedron.plugins.shared.pose_optimizer import LANDMARK_SCORE, PoseSolution, solve_pose
 
 CHI2_6 = 22.46  # 99.9 % of six degrees of freedom
 NOTHING = np.empty((0, 2), np.int32)
@@ -144,7 +144,8 @@ class LoopClosing(ABC):
         offered = len(matches.keypoints), len(matches.segments), len(matches.planes)
         xi = log_se3(invert(T_before) @ found.T_world_camera)
         possible = xi @ np.linalg.solve(expected + found.covariance, xi) < CHI2_6
-        enough = np.dot(agreeing, (1, 2, 5)) >= self.min_score and np.dot(agreeing, (1, 2, 5)) >= self.min_share * np.dot(offered, (1, 2, 5))
+        score, most = np.dot(agreeing, LANDMARK_SCORE), np.dot(offered, LANDMARK_SCORE)
+        enough = score >= self.min_score and score >= self.min_share * most
         return bool(possible and enough and not found.unobservable.shape[1])
 
 

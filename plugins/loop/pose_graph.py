@@ -14,7 +14,7 @@ from trihedron.pipeline.core.types import F64, I32, Correction, Map
 from trihedron.plugins.loop.common_pose_graph import Edges, moved_keyframes, solve_pose_graph
 from trihedron.plugins.mapping.covisibility_graph import current_submap, keyframes_of
 from trihedron.plugins.mapping.keyframe_features import measured_points
-from trihedron.plugins.shared.rigid_alignment import fit_covariance, fitted, place_sigma
+from trihedron.plugins.shared.rigid_alignment import fit_covariance, fitted, point_pair_sigma
 
 
 @register("loop", "pose_graph")
@@ -75,7 +75,7 @@ def _edge(a: tuple[I32, F64, F64, F64], b: tuple[I32, F64, F64, F64], least: int
     if len(i) < least:
         return None
     there, here = a[1][i], b[1][j]
-    sigma = place_sigma(there, here, a[2][i], b[2][j], b[3][j])
+    sigma = point_pair_sigma(there, here, a[2][i], b[2][j], b[3][j])
     agree = np.ones(len(i), bool)
     R, t = np.eye(3), np.zeros(3)
     for _ in range(3):

@@ -11,7 +11,7 @@ from trihedron.plugins.manhattan.common_kernels import (
     NORMALS_PER_SAMPLE,
     right_handed,
 )
-from trihedron.plugins.shared.linalg_kernels import solve_positive, turn_left
+from trihedron.plugins.shared.linalg_kernels import left_multiply_exp, solve_positive
 
 # Directions about a vertical, modulo a quarter turn: where they crowd more than by chance, and which crowd is which from image to image.
 
@@ -149,7 +149,7 @@ def fit_shared_vertical(
         for f in range(frames):
             for k in range(3):
                 phi[k] = x[0] * first[k, 0] + x[1] * first[k, 1] + x[2 + f] * first[k, 2]
-            turn_left(phi, rotations[f])
+            left_multiply_exp(phi, rotations[f])
             if f > 0:  # turns about the vertical and tilts commute to first order only
                 rotations[f] = shared_vertical(rotations[0], rotations[f])
     return rotations, H, chi2, components

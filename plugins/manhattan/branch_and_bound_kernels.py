@@ -9,7 +9,7 @@ import numpy as np
 
 from trihedron.pipeline.core.kernel import kernel
 from trihedron.pipeline.core.types import F64, I32
-from trihedron.plugins.shared.linalg_kernels import solve_positive, turn_left
+from trihedron.plugins.shared.linalg_kernels import left_multiply_exp, solve_positive
 
 # Branch and bound over all rotations for the greatest consensus of directions on three orthogonal axes (Hartley and Kahl, IJCV 2009; Bazin et al.,
 # ACCV 2012; Joo et al., CVPR 2016, TPAMI 2020).
@@ -92,7 +92,7 @@ def _centre(cube: F64, start: F64, R: F64) -> None:
     """Write the rotation in the middle of a cube, `R_start Exp(v)`, to R."""
     for k in range(9):
         R[k % 3, k // 3] = start[k // 3, k % 3]
-    turn_left((-cube[0], -cube[1], -cube[2]), R)  # Exp(-v) R_startᵀ
+    left_multiply_exp((-cube[0], -cube[1], -cube[2]), R)  # Exp(-v) R_startᵀ
     for i in range(3):
         for j in range(i):
             R[i, j], R[j, i] = R[j, i], R[i, j]
@@ -318,7 +318,7 @@ def climb(groups: Groups, R: F64, inlier: float, steps: int) -> tuple[F64, float
                     N[a, b] -= R[a, k] * pulls[b, k] + pulls[a, k] * R[b, k]
         if not solve_positive(N, gradient, phi):
             break
-        turn_left(phi, R)
+        left_multiply_exp(phi, R)
     return top, max(best, 0.0) / np.sin(inlier) ** 2
 
 

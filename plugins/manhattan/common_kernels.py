@@ -9,7 +9,7 @@ import numpy as np
 
 from trihedron.pipeline.core.kernel import kernel
 from trihedron.pipeline.core.types import F32, F64, I32, Bool
-from trihedron.plugins.shared.linalg_kernels import few_descending, inverse_positive, polar_rotation, solve_positive, turn_left
+from trihedron.plugins.shared.linalg_kernels import few_descending, inverse_positive, left_multiply_exp, polar_rotation, solve_positive
 from trihedron.plugins.shared.manhattan_frames_kernels import assign_axes, measured_directions
 
 # From a frame's features to directions on the sphere, and from directions on three axes to a rotation with its covariance.
@@ -426,7 +426,7 @@ def fit_rotation(directions: F64, information: F64, axes: I32, counted: int, R: 
         for k in range(3):
             H[k, k] += 1e-6  # a turn that nothing measures stays
         solve_positive(H, g, phi)
-        turn_left(phi, R)
+        left_multiply_exp(phi, R)
     return R, H, chi2, components
 
 

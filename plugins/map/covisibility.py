@@ -20,8 +20,8 @@ from trihedron.plugins.mapping.culling import cull, cull_keyframe, cull_repeated
 from trihedron.plugins.mapping.insertion import Associated, associate, existing
 from trihedron.plugins.mapping.landmarks import empty_map, union
 from trihedron.plugins.mapping.merging import merge_lines, merge_planes, merge_points
-from trihedron.plugins.mapping.reference_keyframe import anchored
-from trihedron.plugins.mapping.submaps import submap_of, tied
+from trihedron.plugins.mapping.reference_keyframe import submap_of, transform_to_map
+from trihedron.plugins.mapping.submaps import tied
 from trihedron.plugins.mapping.visibility import visible_planes
 
 NEARBY = {"newest": 2, "covisible": 10, "near": 3}  # keyframes whose planes should be seen again: as many as tracking searches
@@ -72,8 +72,8 @@ class Covisibility:
         """The next version of the map, or None when this frame changes nothing."""
         corrected = self._corrected(map, bundle, loop)
         if corrected is not None and relocalise is not None and relocalise.status == DEGRADED and pose.status != LOST:
-            corrected = tied(corrected, anchored(pose, corrected), anchored(relocalise, corrected), self.merge_deg, self.merge_m)
-        pose = _in_its_submap(anchored(pose, corrected), corrected)
+            corrected = tied(corrected, transform_to_map(pose, corrected), transform_to_map(relocalise, corrected), self.merge_deg, self.merge_m)
+        pose = _in_its_submap(transform_to_map(pose, corrected), corrected)
         if corrected is None:
             matches = None
             lengths = keypoints.descriptors.shape[1], segments.descriptors.shape[1], planes.samples_m.shape[1]

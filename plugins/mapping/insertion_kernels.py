@@ -9,12 +9,12 @@ from trihedron.pipeline.core.kernel import kernel
 from trihedron.pipeline.core.types import F64
 from trihedron.plugins.shared.pose_optimizer_kernels import (
     NEAR_M,
-    chain_point,
     depth_direction,
     invert_small,
-    line_depth_row,
-    line_row,
-    point_rows,
+    line_depth_residual,
+    line_residual,
+    point_residual,
+    pose_jacobian,
     rotation_and_translation,
     to_camera,
 )
@@ -24,7 +24,7 @@ from trihedron.plugins.shared.pose_optimizer_kernels import (
 @kernel
 def _noise(D: F64, p: F64, pose_covariance: F64, rows: int, J: F64, S: F64) -> None:
     """S: covariance that an uncertain pose gives to residuals with derivatives D (rows, 3) by the camera-frame point p."""
-    chain_point(D, rows, p, J)
+    pose_jacobian(D, rows, p, J)
     for a in range(rows):
         for b in range(rows):
             S[a, b] = 0.0
@@ -92,7 +92,7 @@ def fuse_points(
     p, r, D, J, S = np.empty(3), np.empty(3), np.empty((3, 3)), np.empty((3, 6)), np.empty((3, 3))
     for i in range(len(positions)):
         to_camera(R, t, positions[i], p)
-        if not point_rows(p, pixels[i], depth_m[i], camera, r, D):
+        if not point_residual(p, pixels[i], depth_m[i], camera, r, D):
             continue
         rows = 3 if np.isfinite(depth_m[i]) else 2
         _noise(D, p, pose_covariance, 3, J, S)
@@ -136,11 +136,11 @@ def fuse_lines(
             if not p[2] > NEAR_M:
                 continue
             rows, r[1], D[1, 0], D[1, 1], D[1, 2] = 1, 0.0, 0.0, 0.0, 0.0
-            r[0], s = line_row(p, endpoints_px[i], camera, D[0])
+            r[0], s = line_residual(p, endpoints_px[i], camera, D[0])
             noise = sigma_px**2 * ((1.0 - s) ** 2 + s * s)
             if deep:
                 rows = 2
-                r[1], s = line_depth_row(p, observed_m[i], m)
+                r[1], s = line_depth_residual(p, observed_m[i], m)
                 D[1, 0], D[1, 1], D[1, 2] = m[0], m[1], m[2]
             _noise(D, p, pose_covariance, rows, J, S)
             S[0, 0] += noise

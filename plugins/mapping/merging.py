@@ -18,7 +18,7 @@ from trihedron.plugins.mapping.visibility import clip_segments
 from trihedron.plugins.shared.descriptors import match_lines, match_near
 from trihedron.plugins.shared.linalg import inverse
 from trihedron.plugins.shared.plane_association_kernels import mean_distance, overlap
-from trihedron.plugins.shared.pose_optimizer_kernels import CHI2_2, CHI2_3
+from trihedron.plugins.shared.pose_optimizer_kernels import CHI2_95
 
 NEAR_PX = 3.0  # twins project this near to each other
 TWIN_BITS, TWIN_L2 = 50, 150  # and look as alike as a strict match (ORB-SLAM2: 50)
@@ -43,7 +43,7 @@ def merge_points(map: Map, view: Observations, visible: I32, metric: str) -> Map
     position, information = position.reshape(-1, 2, 3), information.reshape(-1, 2, 3, 3).astype(np.float64)
     apart = position[:, 1] - position[:, 0]
     covariance = inverse(information).sum(axis=1)
-    same: Bool = np.einsum("ni,nij,nj->n", apart, inverse(covariance), apart) <= CHI2_3
+    same: Bool = np.einsum("ni,nij,nj->n", apart, inverse(covariance), apart) <= CHI2_95[3]
     pairs, position, information = pairs[same], position[same], information[same]
     total = information.sum(axis=1)
     joined = np.linalg.solve(total, np.einsum("nkij,nkj->ni", information, position)[..., None])[..., 0]
@@ -84,7 +84,7 @@ def _collinear(lines: Table, a: I32, b: I32) -> Bool:
     foot, covariance = points_along(on, inverse(known), share)
     covariance += inverse(other)
     chi2 = np.einsum("nki,nkij,nkj->nk", ends - foot, inverse(covariance), ends - foot)
-    good: Bool = (chi2 <= CHI2_2).all(axis=1)
+    good: Bool = (chi2 <= CHI2_95[2]).all(axis=1)
     return good
 
 

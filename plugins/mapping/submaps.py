@@ -12,13 +12,7 @@ from trihedron.pipeline.core.types import F64, I32, Map, Pose, Table
 from trihedron.plugins.mapping.correction import carried
 from trihedron.plugins.mapping.covisibility_graph import keyframes_of
 from trihedron.plugins.mapping.merging import fuse_planes
-
-
-def submap_of(pose: Pose, map: Map | None) -> int:
-    """The sub-map a pose is in: that which its reference keyframe belongs to by now."""
-    if map is None or not 0 <= pose.reference < len(map.keyframes):
-        return pose.submap
-    return int(map.keyframes.row("submap", pose.reference))
+from trihedron.plugins.mapping.reference_keyframe import submap_of
 
 
 def tied(map: Map, pose: Pose, recognised: Pose, max_deg: float, max_m: float) -> Map:

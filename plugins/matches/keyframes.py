@@ -13,7 +13,7 @@ from trihedron.pipeline.core.registry import register
 from trihedron.pipeline.core.types import I32, Camera, Keypoints, Map, Matches, Rotation
 from trihedron.plugins.mapping.covisibility_graph import current_submap, keyframes_of, observed_by
 from trihedron.plugins.shared.descriptors import mutual_matches
-from trihedron.plugins.shared.rigid_alignment import consensus, place_sigma, rows_with_depth
+from trihedron.plugins.shared.rigid_alignment import consensus, point_pair_sigma, rows_with_depth
 
 NO_PAIRS = np.zeros((0, 2), np.int32)
 
@@ -66,7 +66,7 @@ class Keyframes:
         there, rows = transform(T_camera_world, positions[found[:, 0]]), mine[found[:, 1]]
         here = keypoints.points_m[rows].astype(np.float64)
         known = camera.depth_noise.sigma_m(there[:, 2])
-        sigma = place_sigma(there, here, known, keypoints.sigma_m[rows], keypoints.sigma_px[rows])
+        sigma = point_pair_sigma(there, here, known, keypoints.sigma_m[rows], keypoints.sigma_px[rows])
         agree = consensus(there, here, sigma, self.gate, self.rounds, rng).agree
         if agree.sum() < self.min_points or agree.sum() < self.min_share * len(found):
             return NO_PAIRS

@@ -1,4 +1,4 @@
-"""Numba kernels of `common.py`."""
+"""Kernels of `common.py`: the hash table of blocks, frustum culling, and integration of a depth image."""
 # mypy: disable-error-code="arg-type, assignment, index, return-value"
 
 from __future__ import annotations
@@ -14,20 +14,20 @@ from trihedron.plugins.shared.tsdf_volume_kernels import SIDE
 from trihedron.plugins.shared.voxel_hash_kernels import I64, key_of, number_of, slot_of
 
 I16 = NDArray[np.int16]
-FULL = 32767  # of a distance
+FULL = 32767  # a stored distance of one truncation
 NEAREST_M = 0.1
 
 
-class Lens(NamedTuple):
-    """Of an image, and where its camera is."""
+class PosedCamera(NamedTuple):
+    """Intrinsics of an image and the pose of its camera."""
 
-    lens: F64  # (fx, fy, cx, cy)
+    intrinsics: F64  # (fx, fy, cx, cy)
     R_camera_world: F64
     position_m: F64
 
 
 class Blocks(NamedTuple):
-    """Some blocks, by number."""
+    """A subset of the blocks with a hash table of their indices."""
 
     keys: I64  # hash table of their places
     numbers: I32
@@ -38,6 +38,7 @@ class Blocks(NamedTuple):
 
 @kernel
 def insert(keys: I64, numbers: I32, places: I32) -> None:
+    """Insert the rows of `places` (n, 3) into a hash table that has room for them."""
     for i in range(len(places)):
         key = key_of(places[i, 0], places[i, 1], places[i, 2])
         slot = slot_of(keys, key)
@@ -45,9 +46,9 @@ def insert(keys: I64, numbers: I32, places: I32) -> None:
 
 
 @kernel
-def in_view(places: I32, camera: Lens, shape: tuple[int, int], block_m: float) -> Bool:
-    """(n,) whether the sphere around a block may fall into the image."""
-    fx, fy, cx, cy = camera.lens
+def in_view(places: I32, camera: PosedCamera, shape: tuple[int, int], block_m: float) -> Bool:
+    """Mask (n,) of the blocks whose bounding sphere may project into the image."""
+    fx, fy, cx, cy = camera.intrinsics
     R, t = camera.R_camera_world, camera.position_m
     out, reach = np.zeros(len(places), np.bool_), 0.87 * block_m
     for i in range(len(places)):
@@ -63,10 +64,10 @@ def in_view(places: I32, camera: Lens, shape: tuple[int, int], block_m: float) -
 
 
 @kernel
-def integrate(blocks: Blocks, touched: I32, depth: F32, camera: Lens, voxel: float, truncation: float, most: int) -> Bool:
-    """Update the voxels of the blocks `touched` (n, 3), which are among the blocks; (m,) which of these changed."""
+def integrate(blocks: Blocks, touched: I32, depth: F32, camera: PosedCamera, voxel: float, truncation: float, most: int) -> Bool:
+    """Update the voxels of the blocks `touched` (n, 3), a subset of the blocks; returns the mask (m,) of the blocks that changed."""
     h, w = depth.shape
-    fx, fy, cx, cy = camera.lens
+    fx, fy, cx, cy = camera.intrinsics
     R, t = camera.R_camera_world, camera.position_m
     changed = np.zeros(len(blocks.places), np.bool_)
     distance, weight = blocks.distance, blocks.weight

@@ -11,51 +11,49 @@ from numpy.typing import NDArray
 from trihedron.pipeline.core.options import AcuteDeg, PositiveFloat, PositiveInt, Range, check_increasing
 from trihedron.pipeline.core.registry import register
 from trihedron.pipeline.core.types import LOST, Bool, Column, Frame, Pose, PredictedView, Table
-from trihedron.plugins.model.common import sight_of
-from trihedron.plugins.model.common_kernels import Lens
-from trihedron.plugins.model.surfels_kernels import Images, fuse, index_map, shown
+from trihedron.plugins.model.common import downsample
+from trihedron.plugins.model.common_kernels import PosedCamera
+from trihedron.plugins.model.surfels_kernels import Images, fuse, index_map, splat
 from trihedron.plugins.shared.image_reduction_kernels import depth_normals, smoothed
 
 
 @register("model", "surfels")
 @dataclass(frozen=True)
 class SurfelModel:
-    """A coloured disc for each pixel that showed something new, fused where it is seen again, and what the discs show from this frame's pose
+    """A coloured disc per newly observed pixel, fused where it is observed again, and the view predicted by splatting from this frame's pose
     (ElasticFusion: Whelan et al., RSS 2015; Keller et al., 3DV 2013; the paper's "ElasticFu").
 
-    Without the publication's deformation graph and its loops: nothing moves once it is fused. The surfels are the rows of the value's table, so that
+    Without the publication's deformation graph and its loops. The surfels are the rows of the value's table, so that
     the wire `model@prev` is the only memory."""
 
-    width: Annotated[int, Range(32, 4096)] = 213  # px, about, of the depth that is fused and of the view
+    width: Annotated[int, Range(32, 4096)] = 213  # px, about, of the fused depth and of the view
     apart: PositiveFloat = 3.0  # standard deviations of a depth, between a pixel and its surfel
     most_deg: AcuteDeg = 40.0  # between their normals
-    most: Annotated[float, Range(1)] = 100.0  # views a surfel remembers
-    stable: Annotated[float, Range(1)] = 5.0  # views that make a surfel stable,
-    trial: PositiveInt = 20  # frames after which one that is not is removed
+    most: Annotated[float, Range(1)] = 100.0  # views, the limit of a surfel's confidence
+    stable: Annotated[float, Range(1)] = 5.0  # views from which on a surfel is stable
+    trial: PositiveInt = 20  # frames out of view after which one that is not stable is removed
 
     def __post_init__(self) -> None:
         check_increasing(self, "stable", "most")
 
     def __call__(self, frame: Frame, pose: Pose, previous: PredictedView | None) -> PredictedView | None:
-        """The view from this frame's pose; None, so that the last one stays, while the camera is lost."""
+        """Return the view from this frame's pose; None, so that the last one remains, while the camera is lost."""
         if pose.status == LOST:
             return None
-        depth, color, lens, camera = sight_of(frame, pose, self.width)
+        depth, color, intrinsics, camera = downsample(frame, pose, self.width)
         smooth = smoothed(depth, 2)
-        images = Images(depth, depth_normals(smooth, lens, 2), color, frame.camera.depth_noise.sigma_m(np.arange(0.0, 16.0, 0.01)))
+        images = Images(depth, depth_normals(smooth, intrinsics, 2), color, frame.camera.depth_noise.sigma_m(np.arange(0.0, 16.0, 0.01)))
         table = previous.model if previous is not None else Table.empty(SURFELS)
         cosine = float(np.cos(np.radians(self.most_deg)))
-        table = fused(table, images, camera, frame.index, self.apart, cosine, self.most, self.trial, self.stable)
+        table = fuse_frame(table, images, camera, frame.index, self.apart, cosine, self.most, self.trial, self.stable)
         T = np.array(pose.T_world_camera)
-        depth, normals, mean = shown(table.column("surfel"), camera, depth.shape, self.stable)
+        depth, normals, mean = splat(table.column("surfel"), camera, depth.shape, self.stable)
         normals = normals / np.maximum(np.linalg.norm(normals, axis=2, keepdims=True), np.float32(1e-6))
         return PredictedView(frame.index, frame.stamp_ns, T, depth, normals, np.rint(mean).astype(np.uint8), table)
 
 
-# Surfels as the rows of a table, so that they can travel on a wire: one for each pixel that showed something new, fused where it was seen again.
-#
-# Point-based fusion (Keller et al., 3DV 2013) as in ElasticFusion (Whelan et al., RSS 2015). A row whose confidence is 0 is free, and is given to
-# the next surfel. Versions of the table share the chunks that a frame does not touch.
+# Point-based fusion (Keller et al., 3DV 2013) as in ElasticFusion (Whelan et al., RSS 2015). A row whose confidence is 0 is free, and is
+# reused for the next surfel. Versions of the table share the chunks that a frame does not touch.
 
 SURFELS = {
     "surfel": Column("f4", (11,)),  # position, unit normal, RGB, radius (m), confidence
@@ -63,9 +61,11 @@ SURFELS = {
 }
 
 
-def fused(table: Table, images: Images, camera: Lens, index: int, apart: float, cosine: float, most: float, trial: int, stable: float) -> Table:
-    """The table with a frame taken in. A pixel is fused with the surfel nearest to its ray within `apart` standard deviations and `cosine` of its
-    normal, else it becomes one. Confidence is the number of views, up to `most`; one not `stable` after `trial` frames out of sight is removed."""
+def fuse_frame(
+    table: Table, images: Images, camera: PosedCamera, index: int, apart: float, cosine: float, most: float, trial: int, stable: float
+) -> Table:
+    """Fuse a frame into the table. A pixel is fused with the surfel nearest to its ray within `apart` standard deviations and `cosine` of its normal,
+    else it becomes one. Confidence is the number of views, up to `most`; a surfel not `stable` after `trial` frames out of view is removed."""
     surfels, seen = table.column("surfel"), table.column("seen")
     pixels = index_map(surfels, camera, images.depth_m.shape)
     changed, fresh = fuse(surfels, seen, pixels, images, camera, index, apart, cosine, most)
@@ -80,6 +80,7 @@ def fused(table: Table, images: Images, camera: Lens, index: int, apart: float, 
 
 
 def _at(rows: NDArray[np.signedinteger], count: int) -> Bool:
+    """Mask (count,) of rows."""
     out = np.zeros(count, bool)
     out[rows] = True
     return out

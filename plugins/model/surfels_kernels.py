@@ -1,4 +1,4 @@
-"""Numba kernels of `surfels.py`."""
+"""Kernels of `surfels.py`: the index map, fusion of a frame, and splatting."""
 # mypy: disable-error-code="arg-type, assignment, index, return-value"
 
 from __future__ import annotations
@@ -9,7 +9,7 @@ import numpy as np
 
 from trihedron.pipeline.core.kernel import kernel
 from trihedron.pipeline.core.types import F32, F64, I32, U8, Bool
-from trihedron.plugins.model.common_kernels import NEAREST_M, Lens
+from trihedron.plugins.model.common_kernels import NEAREST_M, PosedCamera
 
 SPLAT_PX = 4  # most pixels that a surfel reaches from its centre
 TOGETHER = 0.03  # share of the depth within which discs are one surface
@@ -17,7 +17,7 @@ ROUND = 1.4  # radius over half a pixel's diagonal on the surface: neighbours ov
 
 
 class Images(NamedTuple):
-    """A reduced frame (h, w): depth, normals in the camera's axes (NaN = none), colour, and the standard deviation of a depth by centimetres."""
+    """A downsampled frame (h, w): depth, normals in the camera frame (NaN = none), colour, and the standard deviation of a depth by centimetres."""
 
     depth_m: F32
     normals: F32
@@ -26,17 +26,17 @@ class Images(NamedTuple):
 
 
 @kernel
-def _in_camera(s: F32, camera: Lens) -> tuple[float, float, float]:
-    """A surfel's place in the camera's axes."""
+def _in_camera(s: F32, camera: PosedCamera) -> tuple[float, float, float]:
+    """Position of a surfel in the camera frame."""
     R, t = camera.R_camera_world, camera.position_m
     a, b, c = s[0] - t[0], s[1] - t[1], s[2] - t[2]
     return R[0, 0] * a + R[0, 1] * b + R[0, 2] * c, R[1, 0] * a + R[1, 1] * b + R[1, 2] * c, R[2, 0] * a + R[2, 1] * b + R[2, 2] * c
 
 
 @kernel
-def index_map(surfels: F32, camera: Lens, shape: tuple[int, int]) -> I32:
-    """(h, w) row of the nearest surfel whose centre falls on a pixel, -1 = none; those seen from behind do not count."""
-    fx, fy, cx, cy = camera.lens
+def index_map(surfels: F32, camera: PosedCamera, shape: tuple[int, int]) -> I32:
+    """Row (h, w) of the nearest surfel whose centre projects to a pixel, -1 = none; surfels seen from behind are skipped."""
+    fx, fy, cx, cy = camera.intrinsics
     R = camera.R_camera_world
     out, depth = np.full(shape, -1, np.int32), np.full(shape, np.inf)
     for i in range(len(surfels)):
@@ -59,11 +59,11 @@ def index_map(surfels: F32, camera: Lens, shape: tuple[int, int]) -> I32:
 
 @kernel
 def fuse(
-    surfels: F32, seen: I32, pixels: I32, images: Images, camera: Lens, index: int, apart: float, cosine: float, most: float
+    surfels: F32, seen: I32, pixels: I32, images: Images, camera: PosedCamera, index: int, apart: float, cosine: float, most: float
 ) -> tuple[Bool, F32]:  # fmt: skip
-    """Fuse the pixels in place; (n,) which surfels changed, and (m, 11) the new ones."""
+    """Fuse the pixels in place; returns the mask (n,) of changed surfels, and the new ones (m, 11)."""
     h, w = images.depth_m.shape
-    fx, fy, cx, cy = camera.lens
+    fx, fy, cx, cy = camera.intrinsics
     R, t = camera.R_camera_world, camera.position_m
     changed, fresh, count = np.zeros(len(surfels), np.bool_), np.empty((h * w, 11), np.float32), 0
     p, n, q = np.empty(3), np.empty(3), np.empty(3)
@@ -115,10 +115,10 @@ def fuse(
 
 
 @kernel
-def shown(surfels: F32, camera: Lens, shape: tuple[int, int], stable: float) -> tuple[F32, F32, F32]:
-    """Depth (h, w), normals (h, w, 3) in the camera's axes and colour (h, w, 3) of the surfels drawn as discs, the nearest surface in front; those
-    of a confidence below `stable` only where there is no other."""
-    fx, fy, cx, cy = camera.lens
+def splat(surfels: F32, camera: PosedCamera, shape: tuple[int, int], stable: float) -> tuple[F32, F32, F32]:
+    """Splat the surfels as discs: depth (h, w), normals (h, w, 3) in the camera frame and colour (h, w, 3) of the nearest surface; those with a
+    confidence below `stable` only where there is no other."""
+    fx, fy, cx, cy = camera.intrinsics
     R = camera.R_camera_world
     depth, rank, weight = np.zeros(shape, np.float32), np.zeros(shape, np.uint8), np.zeros(shape, np.float32)
     normals, color = np.full((*shape, 3), np.nan, np.float32), np.zeros((*shape, 3), np.float32)
@@ -153,7 +153,7 @@ def shown(surfels: F32, camera: Lens, shape: tuple[int, int], stable: float) -> 
                 if level > rank[r, c] or (level == rank[r, c] and not together and d < depth[r, c]):
                     rank[r, c], weight[r, c], together = level, 0.0, True
                     normals[r, c] = 0.0
-                if together:  # one surface: the nearest of its discs would be the one that errs most
+                if together:  # one surface: average its discs, since the nearest has the largest error
                     weight[r, c] += s[10]
                     share = s[10] / weight[r, c]
                     depth[r, c] += share * (d - depth[r, c])

@@ -1,4 +1,4 @@
-"""Numba kernels of `tsdf.py`."""
+"""Kernels of `tsdf.py`: raycasting of a truncated signed distance field."""
 # mypy: disable-error-code="arg-type, assignment, index, return-value"
 
 from __future__ import annotations
@@ -7,20 +7,18 @@ import numpy as np
 
 from trihedron.pipeline.core.kernel import kernel
 from trihedron.pipeline.core.types import F32, I32, U8
-from trihedron.plugins.model.common_kernels import FULL, I16, NEAREST_M, Blocks, Lens
+from trihedron.plugins.model.common_kernels import FULL, I16, NEAREST_M, Blocks, PosedCamera
 from trihedron.plugins.shared.tsdf_volume_kernels import SIDE
 from trihedron.plugins.shared.voxel_hash_kernels import I64, number_of
-
-# What a truncated signed distance field shows from a pose: rays walked to where the sign changes (Newcombe et al., ISMAR 2011).
 
 BEFORE = 1.5  # truncations before a reading, where the search begins
 TILE = 8  # pixels that share the range of depths in which there are blocks
 
 
 @kernel
-def ranges_kernel(blocks: Blocks, camera: Lens, shape: tuple[int, int], block_m: float) -> F32:
-    """(rows, columns, 2) nearest and farthest depth of a block in each tile; (inf, 0) without one."""
-    fx, fy, cx, cy = camera.lens
+def ranges_kernel(blocks: Blocks, camera: PosedCamera, shape: tuple[int, int], block_m: float) -> F32:
+    """Nearest and farthest depth (rows, columns, 2) of a block in each tile; (inf, 0) without one."""
+    fx, fy, cx, cy = camera.intrinsics
     R, t = camera.R_camera_world, camera.position_m
     rows, columns = -(-shape[0] // TILE), -(-shape[1] // TILE)
     out = np.zeros((rows, columns, 2), np.float32)
@@ -46,8 +44,9 @@ def ranges_kernel(blocks: Blocks, camera: Lens, shape: tuple[int, int], block_m:
 
 
 @kernel
-def _between(keys: I64, numbers: I32, distance: I16, weight: U8, x: float, y: float, z: float) -> float:
-    """The distance at a place (voxels) as a share of the truncation, trilinear; NaN where one of the eight voxels about it is not known."""
+def _interpolate(keys: I64, numbers: I32, distance: I16, weight: U8, x: float, y: float, z: float) -> float:
+    """Trilinear interpolation of the distance at a position (voxels), as a share of the truncation; NaN where one of the eight voxels is not
+    observed."""
     i, j, k = int(np.floor(x)), int(np.floor(y)), int(np.floor(z))
     a, b, c = x - i, y - j, z - k
     total, block, u, v, w = 0.0, -2, 0, 0, 0
@@ -66,10 +65,11 @@ def _between(keys: I64, numbers: I32, distance: I16, weight: U8, x: float, y: fl
 
 @kernel
 def cast_kernel(
-    keys: I64, numbers: I32, distance: I16, weight: U8, camera: Lens, ranges: F32, depth: F32, voxel: float, truncation: float
+    keys: I64, numbers: I32, distance: I16, weight: U8, camera: PosedCamera, ranges: F32, depth: F32, voxel: float, truncation: float
 ) -> F32:  # fmt: skip
-    """Steps along each ray by what is known of the distance, through nearest voxels; then between two of these, trilinear."""
-    fx, fy, cx, cy = camera.lens
+    """March along each ray by the stored distance of the nearest voxel to a change of sign, then interpolate the zero crossing (Newcombe et al.,
+    ISMAR 2011)."""
+    fx, fy, cx, cy = camera.intrinsics
     R, t = camera.R_camera_world, camera.position_m / voxel
     out = np.zeros(depth.shape, np.float32)
     for r in range(depth.shape[0]):
@@ -95,9 +95,9 @@ def cast_kernel(
                 known, value = weight[block, cell] > 0, distance[block, cell] / FULL
                 if known and value <= 0.0:
                     if before:
-                        first = _between(keys, numbers, distance, weight, dx * last + t[0], dy * last + t[1], dz * last + t[2])
-                        second = _between(keys, numbers, distance, weight, dx * z + t[0], dy * z + t[1], dz * z + t[2])
-                        if np.isnan(first) or np.isnan(second):  # at the rim of what is known: through the nearest voxels
+                        first = _interpolate(keys, numbers, distance, weight, dx * last + t[0], dy * last + t[1], dz * last + t[2])
+                        second = _interpolate(keys, numbers, distance, weight, dx * z + t[0], dy * z + t[1], dz * z + t[2])
+                        if np.isnan(first) or np.isnan(second):  # at the boundary of the observed voxels: by the nearest ones
                             first, second = nearest, value
                         if first > second:
                             out[r, c] = last + (z - last) * min(max(first / (first - second), -1.0), 2.0)

@@ -15,7 +15,7 @@ from trihedron.plugins.mapping.reprojection import line_terms, plane_terms, poin
 from trihedron.plugins.mapping.visibility import in_image
 from trihedron.plugins.mapping.visibility_kernels import NEAR_M
 from trihedron.plugins.places.recognition import apart
-from trihedron.plugins.shared.pose_optimizer import PoseSolution, solve_pose
+from trihedron.plugins.shared.pose_optimizer import LANDMARK_SCORE, PoseSolution, solve_pose
 
 TOLERANCE_M, TOLERANCE_SIGMAS = 0.1, 5.0  # of depth, before a surface is not where it should be
 
@@ -39,7 +39,6 @@ def seen_through(T_world_camera: F64, frame: Frame, map: Map, seen: LocalWindow)
 
 # How much of the map agrees that a frame was taken at a supposed place.
 
-SCORE = np.array([1, 2, 5])  # what a point, a line and a plane that agree count for a place
 DETAILS = np.array([1, 3, 0])  # and as what tells one room from another: any room has walls at some distance or other
 ABOUT_M, ABOUT_DEG = 2.0, 60.0  # keyframes taken from nearer than this have seen a place
 WIDE, CLOSE = (0.05, 2.0), (0.005, 0.2)  # standard deviations (m, °) of a hypothesis, and of the pose solved from it
@@ -73,7 +72,7 @@ class Recognised:
     @property
     def score(self) -> float:
         """Of all that agrees."""
-        return float(self.inliers @ SCORE)
+        return float(self.inliers @ LANDMARK_SCORE)
 
     @property
     def details(self) -> float:

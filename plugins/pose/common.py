@@ -1,9 +1,9 @@
 """Residuals of one image's pixels warped into another: brightness, and distance from the surface there.
 
-A point p of the source, moved to `p' = R p + t`, falls on pixel (u, v) of the target. Its brightness residual is `I(u, v) - I_source`; its
-geometric one `k (Z(u, v) - p'_z)` with `k = n·ray`: how far it is from the target's tangent plane, of normal n, at that pixel. So the depth residual
-of direct methods (Kerl, Sturm, Cremers, IROS 2013) and the point-to-plane error of projective ICP (Newcombe et al., ISMAR 2011) are one up to k.
-Derivatives are with respect to `xi = (rho, phi)` in `p' <- p' + rho + phi × p'`.
+A point p of the source, moved to `p' = R p + t`, projects to pixel (u, v) of the target. Its brightness residual is `I(u, v) - I_source`; its
+geometric residual `k (Z(u, v) - p'_z)` with `k = n·ray`: how far it is from the target's tangent plane, of normal n, at that pixel. So the depth
+residual of direct methods (Kerl, Sturm, Cremers, IROS 2013) and the point-to-plane error of projective ICP (Newcombe et al., ISMAR 2011) are one up
+to k. Jacobians are with respect to `xi = (rho, phi)` in `p' <- p' + rho + phi × p'`.
 """
 
 from __future__ import annotations
@@ -17,13 +17,13 @@ from numpy.typing import NDArray
 from trihedron.pipeline.core.geometry import exp_so3, invert, nearest_rotation, pose_matrix
 from trihedron.pipeline.core.types import DEGRADED, F32, F64, LOST, OK, Frame, Pose
 from trihedron.plugins.mapping.reference_keyframe import FIRST_SIGMA, Decoupled
-from trihedron.plugins.pose.common_kernels import Rows, Source, Target, fill_rows, normal_equations, student, what_is_seen
+from trihedron.plugins.pose.common_kernels import Residuals, Source, Target, fill_residuals, normal_equations, observability, student_weights_kernel
 from trihedron.plugins.shared.image_reduction import Level
 from trihedron.plugins.shared.image_reduction_kernels import depth_normals, gradients
 
 
 def source_of(level: Level, noise: NDArray[np.float64], stride: int, normals: F32) -> Source:
-    """Every `stride`-th pixel that has depth; `noise` is the standard deviation of a depth by centimetres."""
+    """Sample every `stride`-th pixel that has depth; `noise` is the standard deviation of a depth by centimetres."""
     z = level.depth_m[::stride, ::stride]
     r, c = np.nonzero(z > 0.0)
     z = z[r, c].astype(np.float64)
@@ -35,28 +35,28 @@ def source_of(level: Level, noise: NDArray[np.float64], stride: int, normals: F3
 
 
 def target_of(level: Level, reach: int, normals: F32 | None = None) -> Target:
-    """An image with its gradients and, where they are not given, normals over `reach` pixels."""
+    """Attach gradients and, where they are not given, normals over `reach` pixels to an image."""
     x, y = gradients(level.gray)
     return Target(level.gray, x, y, level.depth_m, depth_normals(level.depth_m, level.lens, reach) if normals is None else normals, level.lens)
 
 
-def rows_for(source: Source) -> Rows:
-    """Room for the rows of a source."""
+def residual_buffers(source: Source) -> Residuals:
+    """Buffers for the residuals of a source."""
     n = len(source.points_m)
-    return Rows(np.zeros((n, 2)), np.zeros((n, 2, 6)), np.zeros(n), np.zeros((n, 3)))
+    return Residuals(np.zeros((n, 2)), np.zeros((n, 2, 6)), np.zeros(n), np.zeros((n, 3)))
 
 
 HUBER = 1.345
 CONVERGED = 1e-9  # squared step, m² and rad²
-LEAST_SPREAD = 0.01  # mean square of the normals along a direction, 6° from across it, below which surfaces do not measure it
-ALIKE = 100.0  # pixels beside each other err alike: so many count as one
-LIMIT_M = 0.01  # brightness must tell a direction as well as this, where surfaces do not
-Weights = Callable[[Rows, Source], F64]
+LEAST_SPREAD = 0.01  # mean square of the normals along a direction, 6° from across it, below which surfaces do not observe it
+CORRELATED = 100.0  # neighbouring pixels have correlated errors: so many count as one
+LIMIT_M = 0.01  # σ by brightness below which a direction is observable, where surfaces do not observe it
+Weights = Callable[[Residuals, Source], F64]
 
 
 @dataclass(frozen=True)
 class Gates:
-    """What a point must meet to be seen, see `fill_rows`."""
+    """Conditions under which a point is seen, see `fill_residuals`."""
 
     least_gradient: float
     farthest_m: float
@@ -66,7 +66,7 @@ class Gates:
 @dataclass(frozen=True)
 class Alignment:
     """`p_target = R p_source + t`, the covariance (6, 6) of xi in the target's frame, unit vectors (u, 3) along which the translation was held, and
-    the share of the source's points that were seen and agree."""
+    the share of the source's points that are inliers."""
 
     R: F64
     t: F64
@@ -77,56 +77,58 @@ class Alignment:
 
 
 def align(levels: Sequence[tuple[Source, Target, int]], R: F64, t: F64, gates: Gates, weights: Weights, prior: F64) -> Alignment:
-    """Gauss–Newton from (R, t) over pairs with a number of iterations, the coarsest first. `prior` (6,) is the information about no motion since the
-    start; where neither surfaces nor brightness measure a direction the translation stays as it was."""
+    """Gauss–Newton from (R, t) over pairs of images with a number of iterations each, coarse to fine.
+
+    `prior` (6,) is the information of no motion since the start; where neither surfaces nor brightness observe a direction the translation is
+    held."""
     start, R, t = t.copy(), R.copy(), t.copy()
     for source, target, iterations in levels:
-        rows = rows_for(source)
+        residuals = residual_buffers(source)
         for _ in range(iterations):
-            H, g, held, seen = _linearised(rows, source, target, R, t, gates, weights)
-            stiff = np.diag(prior)
-            stiff[:3, :3] += held.T @ held * max(float(np.trace(H)), 1.0) * 1e3
+            H, g, held, seen = _linearise(residuals, source, target, R, t, gates, weights)
+            information = np.diag(prior)
+            information[:3, :3] += held.T @ held * max(float(np.trace(H)), 1.0) * 1e3
             moved = np.concatenate([t - start, np.zeros(3)])
-            step = np.linalg.solve(H + stiff, -g - stiff @ moved)
-            turn = exp_so3(step[3:])
-            R, t = turn @ R, turn @ t + step[:3]
+            step = np.linalg.solve(H + information, -g - information @ moved)
+            dR = exp_so3(step[3:])
+            R, t = dR @ R, dR @ t + step[:3]
             if step @ step < CONVERGED:
                 break
-    H, g, held, seen = _linearised(rows, source, target, R, t, gates, weights)
-    W = weights(rows, source)
-    agreeing = float(np.count_nonzero((rows.cosine > 0.0) & (_normalised(rows, W) < 9.0))) / max(len(W), 1)
-    covariance = np.linalg.inv(H / ALIKE + np.diag(np.maximum(prior, 1.0)))
+    H, g, held, seen = _linearise(residuals, source, target, R, t, gates, weights)
+    W = weights(residuals, source)
+    agreeing = float(np.count_nonzero((residuals.cosine > 0.0) & (_mahalanobis2(residuals, W) < 9.0))) / max(len(W), 1)
+    covariance = np.linalg.inv(H / CORRELATED + np.diag(np.maximum(prior, 1.0)))
     return Alignment(nearest_rotation(R), t, covariance, held, seen, agreeing)
 
 
-def _linearised(
-    rows: Rows, source: Source, target: Target, R: F64, t: F64, gates: Gates, weights: Weights
+def _linearise(
+    residuals: Residuals, source: Source, target: Target, R: F64, t: F64, gates: Gates, weights: Weights
 ) -> tuple[F64, F64, F64, int]:  # fmt: skip
-    """H, g, the unit vectors (u, 3) along which nothing is measured, and how many points are seen."""
-    fill_rows(source, target, R, t, gates.least_gradient, gates.farthest_m, gates.least_cosine, rows)
-    W = weights(rows, source)
-    H, g = normal_equations(rows, W)
-    spread, texture, seen = what_is_seen(rows, W)
-    values, vectors = np.linalg.eigh(spread / LEAST_SPREAD + texture * LIMIT_M**2 / ALIKE)
+    """Linearise at R, t: H, g, the unobservable unit vectors (u, 3), and the number of points seen."""
+    fill_residuals(source, target, R, t, gates.least_gradient, gates.farthest_m, gates.least_cosine, residuals)
+    W = weights(residuals, source)
+    H, g = normal_equations(residuals, W)
+    spread, texture, seen = observability(residuals, W)
+    values, vectors = np.linalg.eigh(spread / LEAST_SPREAD + texture * LIMIT_M**2 / CORRELATED)
     return H, g, np.ascontiguousarray(vectors[:, values < 1.0].T), seen
 
 
-def _normalised(rows: Rows, W: F64) -> F64:
-    """(n,) squared residuals in standard deviations, robust weights included."""
-    r = rows.r
+def _mahalanobis2(residuals: Residuals, W: F64) -> F64:
+    """Squared Mahalanobis norms (n,) of the residuals, robust weights included."""
+    r = residuals.r
     return np.asarray(W[:, 0] * r[:, 0] ** 2 + 2.0 * W[:, 1] * r[:, 0] * r[:, 1] + W[:, 2] * r[:, 1] ** 2)
 
 
-def student_weights(rows: Rows, source: Source) -> F64:
-    """(n, 3): the t-distribution of brightness and depth together, its 2 × 2 scale estimated from the residuals (Kerl, Sturm, Cremers, IROS 2013);
-    depth in units of the sensor's noise, since that grows with the square of it."""
-    return np.asarray(student(rows.r, rows.cosine, source.sigma_m))
+def student_weights(residuals: Residuals, source: Source) -> F64:
+    """Weights (n, 3) of a bivariate t-distribution of brightness and depth, its 2 × 2 scale estimated from the residuals (Kerl, Sturm, Cremers, IROS
+    2013); depth in units of the sensor's noise, which grows with its square."""
+    return np.asarray(student_weights_kernel(residuals.r, residuals.cosine, source.sigma_m))
 
 
 def huber_weights(photometric: float, floor_m: float) -> Weights:
-    """Point-to-plane distances in units of the sensor's noise and `floor_m`, brightness in units of its median residual; both with Huber's weights,
-    brightness counting `photometric` times as much."""
-    return lambda rows, source: np.asarray(_huber(rows.r, rows.cosine, source.sigma_m, photometric, floor_m))
+    """Huber weights (n, 3) of point-to-plane distances in units of the sensor's noise and `floor_m`, and of brightness in units of its median
+    residual, the latter multiplied by `photometric`."""
+    return lambda residuals, source: np.asarray(_huber(residuals.r, residuals.cosine, source.sigma_m, photometric, floor_m))
 
 
 def _huber(r: F64, cosine: F64, sigma: F64, photometric: float, floor_m: float) -> F64:
@@ -141,36 +143,37 @@ def _huber(r: F64, cosine: F64, sigma: F64, photometric: float, floor_m: float) 
     return W
 
 
-# Poses of systems that align images, without features and without a map of them.
+# Status of poses from dense alignment, without features and without a map of them.
 
 NONE = np.zeros(3, np.int32)
-LOST_SIGMA = 1.0  # m and rad, that a lost pose is uncertain by
+LOST_SIGMA = 1.0  # m and rad, of a lost pose
 
 
 def first_pose(frame: Frame) -> Pose:
     """The identity."""
-    return Decoupled(np.eye(4), FIRST_SIGMA**2 * np.eye(6), NONE, 0, OK, "first frame, origin of the world").said(frame, None)
+    return Decoupled(np.eye(4), FIRST_SIGMA**2 * np.eye(6), NONE, 0, OK, "first frame, origin of the world").to_pose(frame, None)
 
 
 def dense_pose(frame: Frame, previous: Pose, T: F64, found: Alignment, min_share: float, of_what: str, ends_loss: bool = False) -> Pose:
-    """The aligned pose T (4, 4) with status and reason; where less than `min_share` agrees it is lost, and stays at the previous one. A lost camera
-    is found again only where that is said to be possible (`ends_loss`), and all directions are measured."""
+    """The aligned pose T (4, 4) with status and reason; lost, and held at the previous pose, where less than `min_share` of the points agree.
+
+    A lost camera is relocalised only with `ends_loss`, and when all directions are observed."""
     T = pose_matrix(nearest_rotation(T[:3, :3]), T[:3, 3])  # rounding grows from frame to frame
     held, lost = len(found.unobservable), previous.status == LOST
-    said = f"{found.share:.0%} {of_what} agree"
+    agreement = f"{found.share:.0%} {of_what} agree"
     if lost and not ends_loss:
         return _lost(frame, previous, "the motion since the pose was lost is not known")
     if found.share < min_share or held == 3 or (lost and held):
-        return _lost(frame, previous, f"only {said}" if found.share < min_share else "no direction of motion can be seen")
+        return _lost(frame, previous, f"only {agreement}" if found.share < min_share else "no direction of motion is observable")
     inverse = invert(T)[:3, :3] @ previous.T_world_camera[:3, :3]  # xi of the target's frame in this camera's: the motion between them is small
-    turn = np.kron(np.eye(2), inverse)
-    covariance = turn @ found.covariance @ turn.T
+    rotate = np.kron(np.eye(2), inverse)
+    covariance = rotate @ found.covariance @ rotate.T
     if not ends_loss:
-        covariance = covariance + turn @ previous.covariance @ turn.T
+        covariance = covariance + rotate @ previous.covariance @ rotate.T
     counted = np.array([found.pixels, 0, 0], np.int32)
-    status, reason = (DEGRADED, f"{held} directions of motion cannot be seen, held at the prediction") if held else (OK, said)
-    return Decoupled(T, covariance, counted, held, status, reason).said(frame, None)
+    status, reason = (DEGRADED, f"{held} directions of motion are unobservable, held at the prediction") if held else (OK, agreement)
+    return Decoupled(T, covariance, counted, held, status, reason).to_pose(frame, None)
 
 
 def _lost(frame: Frame, previous: Pose, reason: str) -> Pose:
-    return Decoupled(previous.T_world_camera, LOST_SIGMA**2 * np.eye(6), NONE, 3, LOST, reason).said(frame, None)
+    return Decoupled(previous.T_world_camera, LOST_SIGMA**2 * np.eye(6), NONE, 3, LOST, reason).to_pose(frame, None)

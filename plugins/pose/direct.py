@@ -22,10 +22,10 @@ REACH = 2  # px, to the readings a normal is made of
 @register("pose", "direct")
 @dataclass(frozen=True)
 class Direct:
-    """The motion since the previous frame under which brightness and depth agree best, coarse to fine on a pyramid, each pixel weighed by a bivariate
-    t-distribution (Kerl, Sturm, Cremers, IROS 2013; the paper's column "DVO"). No feature is looked at.
+    """The motion since the previous frame under which brightness and depth agree best, coarse to fine on a pyramid, each pixel weighted by a
+    bivariate t-distribution (Kerl, Sturm, Cremers, IROS 2013; the paper's column "DVO"). No features are used.
 
-    Its odometry alone: the publication's keyframes and pose graph are not part of it. What neither brightness nor depth measures is held."""
+    Its odometry alone, without the publication's keyframes and pose graph. Directions that neither brightness nor depth observes are held."""
 
     width: Annotated[int, Range(32)] = 320  # px, about, of the finest level
     levels: PositiveInt = 3
@@ -38,7 +38,7 @@ class Direct:
     min_share: Share = 0.3  # of the pixels that must be seen again and agree
 
     def __call__(self, frame: Frame, previous_frame: Frame | None, previous: Pose | None) -> Pose:
-        """The pose with status and reason; the identity for the first frame."""
+        """Return the pose with status and reason; the identity for the first frame."""
         if previous is None or previous_frame is None:
             return first_pose(frame)
         gap = max(frame.index - previous_frame.index, 1)

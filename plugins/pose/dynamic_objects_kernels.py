@@ -1,4 +1,4 @@
-"""Numba kernels of `dynamic_objects.py`."""
+"""Kernels of `dynamic_objects.py`: features within matched planes, and a Mahalanobis distance."""
 # mypy: disable-error-code="arg-type, assignment, index, return-value"
 
 from __future__ import annotations
@@ -9,12 +9,12 @@ from trihedron.pipeline.core.kernel import kernel
 from trihedron.pipeline.core.types import F32, F64, I32, U8, Bool
 from trihedron.plugins.shared.linalg_kernels import solve_positive
 
-ALONG = np.array([0.1, 0.3, 0.5, 0.7, 0.9], np.float32)  # where it is asked on what a segment lies
+ALONG = np.array([0.1, 0.3, 0.5, 0.7, 0.9], np.float32)  # parameters along a segment at which the label image is sampled
 
 
 @kernel
 def on_planes_kernel(labels: U8, planes: I32, stride: int, pixels: F32, points: I32, ends: F32, lines: I32) -> tuple[Bool, Bool]:
-    """Which of the matched points (n, 2) and lines (m, 2), some of those at pixels (·, 2) and ends (·, 2, 2), lie within matched planes (p, 2)."""
+    """Masks of the matched points (n, 2) and lines (m, 2), rows of pixels (·, 2) and ends (·, 2, 2), that lie within matched planes (p, 2)."""
     known, flat, straight = np.zeros(256, np.bool_), np.zeros(len(points), np.bool_), np.ones(len(lines), np.bool_)
     for i in range(len(planes)):
         known[planes[i, 0] + 1] = True
@@ -31,7 +31,7 @@ def on_planes_kernel(labels: U8, planes: I32, stride: int, pixels: F32, points: 
 
 @kernel
 def _inside(labels: U8, known: Bool, stride: int, u: float, v: float) -> bool:
-    """Whether all nine cells about a pixel have labels that are `known` (256,)."""
+    """Return True if all nine cells about a pixel have labels in the set `known` (256,)."""
     h, w = labels.shape
     x, y = round(u / stride), round(v / stride)
     for i in range(y - 1, y + 2):
@@ -42,8 +42,8 @@ def _inside(labels: U8, known: Bool, stride: int, u: float, v: float) -> bool:
 
 
 @kernel
-def chi2(xi: F64, covariance: F64, count: int) -> float:
-    """Squared standard deviations of the first numbers of xi."""
+def mahalanobis2(xi: F64, covariance: F64, count: int) -> float:
+    """Squared Mahalanobis norm of the first `count` entries of xi (6,), by the leading block of its covariance (6, 6)."""
     S, x, total = np.empty((count, count)), np.empty(count), 0.0
     for i in range(count):
         for j in range(count):

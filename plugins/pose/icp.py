@@ -23,9 +23,9 @@ class Icp:
     """Frame to model: projective association and point-to-plane distances, coarse to fine (Newcombe et al., ISMAR 2011); with `photometric` the
     brightness of the predicted view as well (Whelan et al., RSS 2015).
 
-    It starts where the camera was. The model is its map, so a lost camera that comes back to where it was lost is found again, by a stricter test."""
+    It starts at the previous pose. The model is its map, so a lost camera that returns to where it was lost is relocalised, by a stricter test."""
 
-    photometric: NonNegativeFloat = 0.0  # weight of brightness besides its noise; 0 = depth alone, colour is not looked at
+    photometric: NonNegativeFloat = 0.0  # weight of brightness besides its noise; 0 = depth alone, colour is not used
     levels: PositiveInt = 3
     most: Annotated[int, Range(100)] = 10000  # pixels of the finest level that are used, about
     iterations: PositiveInt = 8  # of a level, at most
@@ -38,7 +38,7 @@ class Icp:
     min_share: Share = 0.3  # of the pixels that must fall on the model and agree
 
     def __call__(self, frame: Frame, previous: Pose | None, model: PredictedView | None) -> Pose:
-        """The pose with status and reason; the identity for the first frame."""
+        """Return the pose with status and reason; the identity for the first frame."""
         if previous is None or model is None:
             return first_pose(frame)
         gap = max(frame.index - previous.index, 1)

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 from trihedron.pipeline.core.registry import register
 from trihedron.pipeline.core.types import Map, Pose, Rotation, Translation
-from trihedron.plugins.mapping.reference_keyframe import anchored, decoupled_pose
+from trihedron.plugins.mapping.reference_keyframe import decoupled_pose, transform_to_map
 
 
 @register("pose", "none")
@@ -17,6 +17,6 @@ class NoRefinement:
     def __call__(
         self, rotation: Rotation, translation: Translation, previous: Pose | None, map: Map | None, relocalise: Pose | None
     ) -> Pose:
-        """The decoupled pose; status from whether this frame's features determined it."""
-        previous, relocalise = (anchored(said, map) if said is not None else None for said in (previous, relocalise))
-        return decoupled_pose(rotation, translation, previous, relocalise).said(rotation, map)
+        """Return the decoupled pose; its status is that of rotation and translation."""
+        previous, relocalise = (transform_to_map(pose, map) if pose is not None else None for pose in (previous, relocalise))
+        return decoupled_pose(rotation, translation, previous, relocalise).to_pose(rotation, map)

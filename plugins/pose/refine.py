@@ -1,19 +1,18 @@
-"""Whether enough of the map was found for a pose to be believed."""
+"""All six degrees of freedom against the local map."""
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from typing import ClassVar
 
 import numpy as np
 
-from trihedron.pipeline.core.geometry import adjoint, invert
-from trihedron.pipeline.core.options import NonNegativeInt, PositiveFloat, Share, check_increasing
+from trihedron.pipeline.core.options import NonNegativeInt, PositiveFloat, PositiveShare, Share, check_increasing
 from trihedron.pipeline.core.registry import register
 from trihedron.pipeline.core.types import (
     DEGRADED,
     F64,
-    I32,
     LOST,
     OK,
     Camera,
@@ -27,132 +26,47 @@ from trihedron.pipeline.core.types import (
     Tracks,
     Translation,
 )
-from trihedron.plugins.mapping.reference_keyframe import FIRST_SIGMA, Decoupled, anchored, decoupled_pose, reference_of
-from trihedron.plugins.mapping.submaps import submap_of
-from trihedron.plugins.pose.dynamic_objects import MovingObjects
-from trihedron.plugins.pose.focal_length import FocalLengths
-from trihedron.plugins.pose.map_alignment import SCORE, Agreement, MapAlignment, Verdict
+from trihedron.plugins.mapping.reference_keyframe import FIRST_SIGMA, Decoupled, decoupled_pose, reference_of, submap_of, transform_to_map
+from trihedron.plugins.pose.dynamic_objects import DynamicObjectOptions, solve_with_static, status_with_static
+from trihedron.plugins.pose.keyframe_uncertainty import degrade_by_keyframes
+from trihedron.plugins.pose.map_alignment import InlierStatistics, MapAlignment, TrackingStatus
 from trihedron.plugins.shared.pose_optimizer import PoseSolution
 
-
-@dataclass(frozen=True)
-class TrackingQuality:
-    """How much of what is sought must agree with a pose; and with the first one after a loss, which has nothing else to go by."""
-
-    min_inliers: NonNegativeInt = 10  # points + 2 lines + 5 planes below which the pose is called degraded
-    min_share: Share = 0.25  # of the matches that must agree, else it is called degraded
-    found_inliers: NonNegativeInt = 30  # points + 2 lines + 5 planes that find a lost pose again
-    found_share: Share = 0.5  # of the matches that must agree for that
-
-    def __post_init__(self) -> None:
-        check_increasing(self, "min_inliers", "found_inliers")
-        check_increasing(self, "min_share", "found_share")
-
-    def enough(self, seen: Agreement) -> bool:
-        """Whether this much is believed of a camera that was tracked."""
-        return seen.score >= self.min_inliers and seen.agreed >= self.min_share * seen.matches
-
-    def found_again(self, found: PoseSolution, seen: Agreement) -> bool:
-        """Whether the map alone says where a lost camera is."""
-        enough = seen.score >= self.found_inliers and seen.agreed >= self.found_share * seen.matches
-        return enough and found.unobservable.shape[1] == 0
-
-    def judged(self, found: PoseSolution, seen: Agreement, rotation: Rotation) -> Verdict:
-        """What is said of a refined pose."""
-        points, lines, planes = seen.inliers
-        status, reason = OK, f"{points} points, {lines} lines and {planes} planes of the map"
-        if found.unobservable.shape[1]:
-            status, reason = DEGRADED, f"{found.unobservable.shape[1]} directions of motion cannot be seen, held at the prediction"
-        elif seen.score < self.min_inliers:
-            status, reason = DEGRADED, f"only {points} points, {lines} lines and {planes} planes of the map were found"
-        elif seen.agreed < self.min_share * seen.matches:
-            status, reason = DEGRADED, f"only {seen.agreed} of {seen.matches} matches with the map agree"
-        elif rotation.source == "prediction":
-            status, reason = DEGRADED, "the rotation was predicted, not measured, before refinement"
-        return Verdict(status, reason, found.covariance)
-
-
-# How well the part of a map that a pose was found in is known itself.
-
-
-@dataclass(frozen=True)
-class Foundation:
-    """The keyframe (a row, -1: none) that a pose hangs on, and its standard deviation (m, in the worst direction)."""
-
-    keyframe: int
-    sigma_m: float
-
-    def covariance(self, map: Map, T_world_camera: F64) -> F64:
-        """(6, 6) of xi of a camera that goes with the keyframe."""
-        T, covariance = (map.keyframes.rows(name, np.array([self.keyframe]))[0] for name in ("T_world_camera", "covariance"))
-        moved = adjoint(invert(T_world_camera) @ T)
-        return np.asarray(moved @ covariance @ moved.T)
-
-
-def foundation(map: Map, points: I32, lines: I32, planes: I32) -> Foundation:
-    """Of the keyframes that these landmarks (ids) were first seen from, the one that is known no better than half of the landmarks' are.
-
-    A landmark's covariance holds its first keyframe's, but a pose found from hundreds of them averages what is common to all as if it were not."""
-    weights = np.zeros(len(map.keyframes), np.int64)
-    for table, ids, score in zip((map.points, map.lines, map.planes), (points, lines, planes), SCORE):
-        weights += score * np.bincount(table.rows("first", ids), minlength=len(weights))
-    keyframes = np.flatnonzero(weights)
-    if not len(keyframes):
-        return Foundation(-1, 0.0)
-    sigmas_m, half = _sigmas_m(map, keyframes.tolist()), int(weights.sum()) // 2
-    known = 0  # how much is known as well as a keyframe or better
-    for keyframe in sorted(keyframes.tolist(), key=sigmas_m.__getitem__):
-        known += int(weights[keyframe])
-        if known > half:
-            break
-    return Foundation(keyframe, sigmas_m[keyframe])
-
-
-def _sigmas_m(map: Map, keyframes: list[int]) -> dict[int, float]:
-    """Standard deviations of the keyframes' positions in their worst directions, and of others; found once in a version of the map."""
-    found: dict[int, float] = map.memo.setdefault("sigmas_m", {})
-    if new := [keyframe for keyframe in keyframes if keyframe not in found]:
-        covariances = map.keyframes.rows("covariance", np.array(new))
-        found.update(zip(new, np.sqrt(np.linalg.eigvalsh(covariances[:, :3, :3])[:, -1]).tolist()))
-    return found
-
-
-@dataclass(frozen=True)
-class Foundations:
-    """How much worse than a pose the keyframes behind it may be known: after a loss, or where planes alone said where they are, they are poor."""
-
-    weak_foundation: PositiveFloat = 3.0  # times its own standard deviation that the nearby keyframes may have before a pose is degraded
-
-    def judged_by_foundation(self, found: PoseSolution, problem: MapAlignment, said: Verdict) -> Verdict:
-        """What is said of a pose, which is not better known than the keyframes behind what it was found from."""
-        base = foundation(problem.map, *problem.landmarks(found))
-        if base.sigma_m <= self.weak_foundation * np.sqrt(np.linalg.eigvalsh(found.covariance[:3, :3])[-1]):
-            return said
-        reason = f"what is seen hangs on keyframes that are known to {1e3 * base.sigma_m:.0f} mm"
-        return Verdict(DEGRADED, reason, said.covariance + base.covariance(problem.map, found.T_world_camera))
-
-
-# All six degrees of freedom against the local map.
-
 EYE = np.eye(3)
+FOCAL_LENGTHS = "`trihedron calibrate RUN.mcap` estimates the focal lengths instead"
 
 
 @register("pose", "refine")
 @dataclass(frozen=True)
-class Refine(TrackingQuality, MovingObjects, Foundations, FocalLengths):
+class Refine:
     """Map-to-frame refinement with parallel and perpendicular planes (section IV-C, eq. 8), from the decoupled pose.
 
-    The decoupled rotation is a prior with its own covariance; the decoupled position only says where to start (`position_sigma_m`), since the same
-    features made it. Without a map the decoupled pose stands. A lost pose is only where to look: it is found again when enough of the map agrees on a
-    place that all directions are measured of, else it stays lost; and what neither the previous frame nor the map agrees with is lost. Each judgement
-    of a pose is a base of its own, with its options: whether enough of the map agrees, what moves, how well the map there is known, and whether the
-    focal lengths are right."""
+    The decoupled rotation is a prior with its own covariance; the decoupled position is a weak prior (`position_sigma_m`), since the same features
+    produced it. Without a map the decoupled pose stands. A lost pose is only an initial guess: it is relocalised when enough of the map agrees on a
+    pose with all directions observable, else it stays lost; a pose that neither the previous frame nor the map supports is lost. The status then
+    follows from the inliers, from dynamic objects (`dynamic_objects.py`), and from the keyframes' uncertainty (`keyframe_uncertainty.py`)."""
 
     position_sigma_m: PositiveFloat = 0.05  # of the decoupled position, a weak prior
     rotation_sigma_deg: PositiveFloat = 0.2  # added to the rotation's own: no scene is exactly Manhattan
     line_sigma_px: PositiveFloat = 1.0  # of a segment's end point across it
     relation_sigma_deg: PositiveFloat = 0.5  # walls are parallel or perpendicular to within this
-    submap_after: NonNegativeInt = 15  # frames that show a place that is not known, after which a lost camera begins a new sub-map; 0 = never
+    min_inliers: NonNegativeInt = 10  # points + 2 lines + 5 planes below which the pose is degraded
+    min_share: Share = 0.25  # of the matches that must be inliers, else the pose is degraded
+    found_inliers: NonNegativeInt = 30  # points + 2 lines + 5 planes that relocalise a lost pose
+    found_share: Share = 0.5  # of the matches that must be inliers for that
+    moving_share: PositiveShare = 0.15  # difference between the outlier shares of new and verified points beyond which something may move
+    moving_gate: PositiveFloat = 2.2  # Mahalanobis distance² (0.1 quantile of χ² with 6 dof) from the pose by static matches that then selects it
+    moving_sure: PositiveFloat = 13.9  # the same of the position (0.997 quantile, 3 dof) that selects it although the outlier shares are alike
+    moving_unproven: PositiveFloat = 9.0  # the same from the position by planes alone, which are selected while no landmark is verified
+    moving_most: Share = 0.4  # of all matches that must be inliers, half if most planes are outliers too, else the pose is degraded to the planes' σ
+    weak_foundation: PositiveFloat = 3.0  # times the pose's σ that the nearby keyframes' σ may reach before the pose is degraded
+    submap_after: NonNegativeInt = 15  # frames without relocalisation, of those that show enough, after which a sub-map begins; 0 = never
+
+    removed_options: ClassVar[dict[str, str]] = dict.fromkeys(("focal_off", "focal_worse", "focal_sure"), FOCAL_LENGTHS)
+
+    def __post_init__(self) -> None:
+        check_increasing(self, "min_inliers", "found_inliers")
+        check_increasing(self, "min_share", "found_share")
 
     def __call__(
         self,
@@ -168,42 +82,42 @@ class Refine(TrackingQuality, MovingObjects, Foundations, FocalLengths):
         map: Map | None,
         relocalise: Pose | None,
     ) -> Pose:
-        """The pose with status and reason; the identity for the first frame."""
-        previous, relocalise = (anchored(said, map) if said is not None else None for said in (previous, relocalise))
+        """Return the pose with status and reason; the identity for the first frame."""
+        previous, relocalise = (transform_to_map(pose, map) if pose is not None else None for pose in (previous, relocalise))
         start = decoupled_pose(rotation, translation, previous, relocalise)
         if map is None or matches is None or previous is None:
-            return start.said(rotation, map)
+            return start.to_pose(rotation, map)
         submap = relocalise.submap if relocalise is not None and relocalise.status == OK else submap_of(previous, map)
         prior, sigmas = (start.T_world_camera, self._information(start)), (self.line_sigma_px, self.relation_sigma_deg)
         problem = MapAlignment(*prior, camera, matches, keypoints, segments, planes, map, *sigmas)
-        found, by = self.solved_at_rest(problem) if start.status != LOST else (problem.solved(problem.terms(problem.T_start)), "")
-        seen = problem.agreement(found)
-        if start.status == LOST and not self.found_again(found, seen):
-            return self._unknown_place(start, rotation, previous, relocalise is not None and translation.estimated, map, submap)
-        if rotation.source == "prediction" and not self.enough(seen):
-            reason = f"the rotation was not measured, and only {seen.agreed} of {seen.matches} matches with the map agree"
-            return replace(start, status=LOST, reason=reason).said(rotation, map, submap=submap)
-        if not seen.agreed:
-            return start.said(rotation, map, "nothing of the map was found, pose from the previous frame", submap)
-        said = self.judged(found, seen, rotation)
-        if by:
-            said = self.judged_at_rest(found, problem, by, said)
-        if said.status == OK:
-            said = self.judged_by_focal_lengths(found, problem, self.judged_by_foundation(found, problem, said))
-        if submap:
-            said = replace(said, status=DEGRADED, reason=f"in sub-map {submap}, which is not tied to the first yet: {said.reason}")
-        T, held, inliers = found.T_world_camera, found.unobservable.shape[1], np.array(seen.inliers, np.int32)
+        solution, static = self._solve(problem, start)
+        inliers = problem.statistics(solution)
+        if start.status == LOST and not self._is_relocalised(solution, inliers):
+            searched = relocalise is not None and translation.estimated
+            return self._stay_lost(start, rotation, previous, searched, map, submap)
+        if rotation.source == "prediction" and not self._is_tracked(inliers):
+            reason = f"the rotation was not measured, and only {inliers.total} of {inliers.matches} matches with the map agree"
+            return replace(start, status=LOST, reason=reason).to_pose(rotation, map, submap=submap)
+        if not inliers.total:
+            return start.to_pose(rotation, map, "nothing of the map was found, pose from the previous frame", submap)
+        status = self._status(problem, solution, static, inliers, rotation, submap)
+        T, held, counts = solution.T_world_camera, solution.unobservable.shape[1], np.array(inliers.inliers, np.int32)
         reference, T_reference_camera = reference_of(map, T, submap)
         return Pose(
-            rotation.index, rotation.stamp_ns, T, said.covariance, T_reference_camera, reference, inliers, held, said.status, said.reason, submap
+            rotation.index, rotation.stamp_ns, T, status.covariance, T_reference_camera, reference, counts, held, status.status, status.reason, submap
         )
 
     def localising(self) -> Refine:
         """Return the refinement of a camera that begins no sub-map: where the loaded map does not reach it stays lost."""
         return replace(self, submap_after=0)
 
+    @property
+    def dynamic_object_options(self) -> DynamicObjectOptions:
+        """The options `moving_*`."""
+        return DynamicObjectOptions(self.moving_share, self.moving_gate, self.moving_sure, self.moving_unproven, self.moving_most)
+
     def _information(self, start: Decoupled) -> F64:
-        """(6, 6) of the decoupled pose as a prior."""
+        """Information (6, 6) of the decoupled pose as a prior."""
         information = np.zeros((6, 6))
         both = np.array([start.covariance[:3, :3], start.covariance[3:, 3:]])
         both[0] += self.position_sigma_m**2 * EYE
@@ -211,12 +125,55 @@ class Refine(TrackingQuality, MovingObjects, Foundations, FocalLengths):
         information[:3, :3], information[3:, 3:] = np.linalg.inv(both)
         return information
 
-    def _unknown_place(self, start: Decoupled, rotation: Rotation, previous: Pose, sought: bool, map: Map, submap: int) -> Pose:
-        """Lost; or, once what is seen was `sought` in vain for long enough, the first pose of a new sub-map, exact by definition."""
-        unrecognised = previous.unrecognised + int(sought)
+    def _solve(self, problem: MapAlignment, start: Decoupled) -> tuple[PoseSolution, str]:
+        """Estimate the pose; also the name of the static matches that it was estimated from, '' for all matches."""
+        if start.status == LOST:
+            return problem.solve(problem.terms(problem.T_start)), ""
+        return solve_with_static(problem, self.dynamic_object_options)
+
+    def _is_tracked(self, inliers: InlierStatistics) -> bool:
+        """Return True if enough of the map agrees with a tracked pose."""
+        return inliers.score >= self.min_inliers and inliers.total >= self.min_share * inliers.matches
+
+    def _is_relocalised(self, solution: PoseSolution, inliers: InlierStatistics) -> bool:
+        """Return True if the map alone determines the pose of a lost camera."""
+        enough = inliers.score >= self.found_inliers and inliers.total >= self.found_share * inliers.matches
+        return enough and solution.unobservable.shape[1] == 0
+
+    def _status(
+        self, problem: MapAlignment, solution: PoseSolution, static: str, inliers: InlierStatistics, rotation: Rotation, submap: int
+    ) -> TrackingStatus:
+        """Status of a refined pose: by its inliers, dynamic objects, keyframes and sub-map."""
+        status = self._inlier_status(solution, inliers, rotation)
+        if static:
+            status = status_with_static(status, solution, problem, static, self.dynamic_object_options)
+        if status.status == OK:
+            status = degrade_by_keyframes(status, solution, problem, self.weak_foundation)
+        if submap:
+            status = replace(status, status=DEGRADED, reason=f"in sub-map {submap}, which is not merged with the first yet: {status.reason}")
+        return status
+
+    def _inlier_status(self, solution: PoseSolution, inliers: InlierStatistics, rotation: Rotation) -> TrackingStatus:
+        """Status of a refined pose by the number and share of its inliers."""
+        points, lines, planes = inliers.inliers
+        status, reason = OK, f"{points} points, {lines} lines and {planes} planes of the map"
+        if solution.unobservable.shape[1]:
+            status, reason = DEGRADED, f"{solution.unobservable.shape[1]} directions of motion are unobservable, held at the prediction"
+        elif inliers.score < self.min_inliers:
+            status, reason = DEGRADED, f"only {points} points, {lines} lines and {planes} planes of the map were found"
+        elif inliers.total < self.min_share * inliers.matches:
+            status, reason = DEGRADED, f"only {inliers.total} of {inliers.matches} matches with the map agree"
+        elif rotation.source == "prediction":
+            status, reason = DEGRADED, "the rotation was predicted, not measured, before refinement"
+        return TrackingStatus(status, reason, solution.covariance)
+
+    def _stay_lost(self, start: Decoupled, rotation: Rotation, previous: Pose, searched: bool, map: Map, submap: int) -> Pose:
+        """Return a lost pose; or, once relocalisation has failed for `submap_after` frames (`searched`), the first pose of a sub-map, exact by
+        definition."""
+        unrecognised = previous.unrecognised + int(searched)
         if not self.submap_after or unrecognised < self.submap_after:
-            return replace(start.said(rotation, map, submap=submap), unrecognised=unrecognised)
+            return replace(start.to_pose(rotation, map, submap=submap), unrecognised=unrecognised)
         number = int(map.keyframes.column("submap").max(initial=0)) + 1
-        reason = f"first frame of sub-map {number}: nothing was recognised for {unrecognised} frames"
+        reason = f"first frame of sub-map {number}: relocalisation failed for {unrecognised} frames"
         new = replace(start, covariance=FIRST_SIGMA**2 * np.eye(6), status=DEGRADED, reason=reason)
-        return new.said(rotation, map, submap=number)
+        return new.to_pose(rotation, map, submap=number)

@@ -10,8 +10,7 @@ from trihedron.pipeline.core.options import NonNegativeInt, PositiveFloat, Posit
 from trihedron.pipeline.core.registry import register
 from trihedron.pipeline.core.types import DEGRADED, F64, I32, LOST, OK, Frame, Keypoints, Map, Planes, Pose, Rotation, Segments
 from trihedron.plugins.mapping.covisibility_graph import keyframes_of, living_keyframes, observed_by
-from trihedron.plugins.mapping.reference_keyframe import reference_of
-from trihedron.plugins.mapping.submaps import submap_of
+from trihedron.plugins.mapping.reference_keyframe import reference_of, submap_of
 from trihedron.plugins.places.recognition import apart, block_of, distinct, likely_keyframes, lookalikes, rigid_hypotheses
 from trihedron.plugins.places.verification import FrameFeatures, Recognised, check_place
 from trihedron.plugins.relocalise.features_kernels import BIN_M, NEAR_M, explained

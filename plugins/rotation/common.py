@@ -26,8 +26,9 @@ class Estimate:
 
 
 def rotation_before(previous: Rotation, previous_pose: Pose | None, floor_deg: float) -> tuple[Estimate, bool]:
-    """The previous frame's rotation, and whether it is its refined pose's; `floor_deg` is the least error of that, since the map it was refined
-    against drifts, which its covariance does not know."""
+    """The previous frame's rotation, and True if it is that of its refined pose.
+
+    `floor_deg` is the least σ of the latter: the map that it was refined against drifts, which its covariance does not include."""
     if previous_pose is not None and previous_pose.index == previous.index and previous_pose.status != LOST:
         floor = IDENTITY * math.radians(floor_deg) ** 2
         return Estimate(previous_pose.T_world_camera[:3, :3], previous_pose.covariance[3:, 3:] + floor, previous.source), True
@@ -36,8 +37,10 @@ def rotation_before(previous: Rotation, previous_pose: Pose | None, floor_deg: f
 
 @dataclass(frozen=True)
 class TrackedRotation:
-    """Puts the rotation that the tracks measure on top of the previous one; see `solve_motion` for the constants. Source "prediction" when the
-    tracks leave some axis less certain than `measured_deg`; where they say nothing at all the camera turns on for `predict_frames`, then stands."""
+    """Compose the previous rotation with that measured by the tracks; see `solve_motion` for the options.
+
+    The source is "prediction" when the σ about some axis exceeds `measured_deg`; without any support the rotation is predicted with constant velocity
+    for `predict_frames`, then at rest."""
 
     prior_deg: float
     prior_m: float
@@ -49,20 +52,20 @@ class TrackedRotation:
     def __call__(
         self, before: Estimate, previous_index: int, tracks: Tracks | None, keypoints: Keypoints, segments: Segments, planes: Planes
     ) -> Estimate:
-        """The rotation of the frame of `keypoints`; that of frame `previous_index`, less certain, when the tracks do not reach it."""
+        """Return the rotation of the frame of `keypoints`; that of frame `previous_index`, with a larger covariance, without tracks to it."""
         gap = max(keypoints.index - previous_index, 1)
         if tracks is None or tracks.previous_index != previous_index:
             return Estimate(before.R, before.covariance + IDENTITY * math.radians(self.prior_deg * gap) ** 2, "prediction")
         motion = solve_motion(tracks, keypoints, segments, planes, self.angle_px, self.plane_floor_deg, self.prior_deg * gap, self.prior_m * gap)
-        turned = motion.covariance[:3, :3]
+        added = motion.covariance[:3, :3]
         if motion.support == 0.0 and before.covariance.trace() / 3.0 >= self.predict_frames * math.radians(self.prior_deg) ** 2:  # long ago
-            return Estimate(before.R, before.covariance + turned, "prediction")
-        measured = solve_positive(IDENTITY * math.radians(self.measured_deg) ** 2 - turned, np.zeros(3), np.empty(3))  # smaller along every axis
-        return Estimate(before.R @ motion.R.T, motion.R @ before.covariance @ motion.R.T + turned, "tracks" if measured else "prediction")
+            return Estimate(before.R, before.covariance + added, "prediction")
+        measured = solve_positive(IDENTITY * math.radians(self.measured_deg) ** 2 - added, np.zeros(3), np.empty(3))  # smaller along every axis
+        return Estimate(before.R @ motion.R.T, motion.R @ before.covariance @ motion.R.T + added, "tracks" if measured else "prediction")
 
 
 def rotation_value(index: int, stamp_ns: int, estimate: Estimate, known: KnownFrames, seen: F64) -> Rotation:
-    """As the slot's value; `seen` (k, 3, 3) is R_camera_manhattan of each known frame, NaN where it is not in view."""
+    """Convert to the slot's value; `seen` (k, 3, 3) is R_camera_manhattan of each known frame, NaN where it is not in view."""
     return Rotation(
         index=index,
         stamp_ns=stamp_ns,
@@ -76,12 +79,13 @@ def rotation_value(index: int, stamp_ns: int, estimate: Estimate, known: KnownFr
     )
 
 
-# The Manhattan frames a camera has met, as rotations to the world with the number of observations behind each.
+# The known Manhattan frames, as rotations to the world with the number of observations of each.
 
 @dataclass(frozen=True)
-class Sighting:
-    """A Manhattan frame seen now, taken for the known one in row `row`: `R_camera_manhattan` in that one's naming of the axes, covariance (3, 3) of
-    phi in `R = Exp(phi) R_camera_manhattan`, and delta (3,) with `R_world_camera(Manhattan) = R_world_camera(predicted) · Exp(delta)`."""
+class Observation:
+    """Observation of a Manhattan frame, associated with the known frame in row `row`: `R_camera_manhattan` in that frame's order of the axes,
+    covariance (3, 3) of phi in `R = Exp(phi) R_camera_manhattan`, and delta (3,) with
+    `R_world_camera(Manhattan) = R_world_camera(predicted) · Exp(delta)`."""
 
     row: int
     R_camera_manhattan: F64
@@ -99,12 +103,13 @@ class KnownFrames:
 
     @staticmethod
     def none() -> KnownFrames:
-        """No frame is known."""
+        """No known frame."""
         return KnownFrames(np.zeros((0, 3, 3)), np.zeros(0, np.int32), np.zeros(0))
 
-    def seen_from(self, previous: Rotation, R_world_camera: F64, cap: float, gate: float) -> KnownFrames:
-        """With what the previous frame saw, now that its pose is known better: the mean on SO(3) of all observations. Weights end at `cap`, so that
-        the mean can follow a map that moves; what is off by more than `gate` (rad) is no observation."""
+    def updated_by(self, previous: Rotation, R_world_camera: F64, cap: float, gate: float) -> KnownFrames:
+        """Update by the previous frame's observations at its refined rotation: the mean on SO(3) of all observations.
+
+        Weights are limited to `cap`, so that the mean can follow a map that moves; observations off by more than `gate` (rad) are rejected."""
         rotations, weights = self.R_world_manhattan.copy(), self.weights.copy()
         for i in np.flatnonzero(np.isfinite(previous.R_camera_manhattan[:, 0, 0])):
             step = log_so3(rotations[i].T @ R_world_camera @ previous.R_camera_manhattan[i])
@@ -113,9 +118,10 @@ class KnownFrames:
                 rotations[i] = polar_rotation(rotations[i] @ exp_so3(step / weights[i]))
         return KnownFrames(rotations, self.ids, weights)
 
-    def sightings(self, manhattan: ManhattanFrame | None, R_world_camera: F64) -> list[tuple[int, list[Sighting]]]:
-        """For each row of the frames seen now what it means if it is each of the known ones, axes named as is nearest to the predicted rotation. A
-        frame out of sight, which an estimator carries on without inliers, is no sighting."""
+    def associations(self, manhattan: ManhattanFrame | None, R_world_camera: F64) -> list[tuple[int, list[Observation]]]:
+        """All associations of each observed frame (row) with the known ones, axes ordered nearest to the predicted rotation.
+
+        A frame that the estimator propagates without inliers is not observed."""
         if manhattan is None or not manhattan.supported:
             return []
         found = []
@@ -123,12 +129,12 @@ class KnownFrames:
             row = []
             for i, R_world_manhattan in enumerate(self.R_world_manhattan):
                 named = nearest_equivalent(np.array(manhattan.rotations[k]), np.array(R_world_camera.T @ R_world_manhattan))
-                row.append(Sighting(i, named, manhattan.covariance[k], log_so3(R_world_camera.T @ R_world_manhattan @ named.T)))
+                row.append(Observation(i, named, manhattan.covariance[k], log_so3(R_world_camera.T @ R_world_manhattan @ named.T)))
             found.append((int(k), row))
         return found
 
     def with_new(self, R_world_manhattan: F64, weight: float) -> KnownFrames:
-        """With one more frame, whose first observation counts as `weight`."""
+        """Append a frame whose first observation counts as `weight`."""
         number = int(self.ids.max(initial=-1)) + 1
         return KnownFrames(
             np.concatenate([self.R_world_manhattan, R_world_manhattan[None]]),
@@ -136,6 +142,6 @@ class KnownFrames:
             np.append(self.weights, weight),
         )
 
-    def only(self, keep: I32) -> KnownFrames:
-        """The given rows."""
+    def select(self, keep: I32) -> KnownFrames:
+        """Select rows."""
         return KnownFrames(self.R_world_manhattan[keep], self.ids[keep], self.weights[keep])

@@ -1,4 +1,4 @@
-"""The camera's rotation tied to the scene's Manhattan frames."""
+"""The camera's rotation fused from the scene's Manhattan frames and the tracks."""
 
 from __future__ import annotations
 
@@ -12,37 +12,37 @@ from trihedron.pipeline.core.geometry import exp_so3, log_so3
 from trihedron.pipeline.core.options import NonNegativeInt, PositiveFloat, PositiveInt, Range
 from trihedron.pipeline.core.registry import register
 from trihedron.pipeline.core.types import F64, Keypoints, ManhattanFrame, Map, Planes, Pose, Rotation, Segments, Tracks
-from trihedron.plugins.mapping.reference_keyframe import anchored_before
-from trihedron.plugins.rotation.common import IDENTITY, Estimate, KnownFrames, Sighting, TrackedRotation, rotation_before, rotation_value
+from trihedron.plugins.mapping.reference_keyframe import transform_rotation_to_map
+from trihedron.plugins.rotation.common import IDENTITY, Estimate, KnownFrames, Observation, TrackedRotation, rotation_before, rotation_value
 from trihedron.plugins.shared.linalg_kernels import inverse_positive, solve_positive
 
 
 @register("rotation", "drift_free")
 @dataclass(frozen=True)
 class DriftFree:
-    """`R_world_camera = R_world_manhattan · R_camera_manhattanᵀ` (eq. 1), combined by covariance with the rotation that the tracks put on top of the
-    previous pose.
+    """`R_world_camera = R_world_manhattan · R_camera_manhattanᵀ` (eq. 1), fused by covariance with the previous rotation composed with
+    that of the tracks.
 
-    The tracks are exact from frame to frame and drift; the Manhattan frame does not drift and is coarser. Where no Manhattan frame is supported, or
-    the one seen disagrees with the tracks, the tracks go on alone and their covariance grows, so that a Manhattan frame that comes back takes over
-    by degrees. One that disagrees is remembered under a number of its own. The world–Manhattan rotations are re-estimated from refined poses."""
+    The tracks are accurate from frame to frame and drift; the Manhattan frame does not drift and is coarser. Where no Manhattan frame is supported,
+    or the observed one disagrees with the tracks, the tracks are propagated alone and their covariance grows, so that a Manhattan frame that returns
+    dominates gradually. One that disagrees becomes a new known frame. The world–Manhattan rotations are re-estimated from refined poses."""
 
     unit_deg: PositiveFloat = 0.3  # an observation of R_world_manhattan with this standard deviation counts as one
     max_weight: Annotated[float, Range(1)] = 300.0  # observations; more do not make it stiffer
-    correlation: Annotated[float, Range(1)] = 10.0  # successive frames err alike: so many observations count as one in its covariance
+    correlation: Annotated[float, Range(1)] = 10.0  # successive errors are correlated: so many observations count as one in its covariance
     axis_floor_deg: PositiveFloat = 0.1  # least error of R_world_manhattan
-    pose_floor_deg: PositiveFloat = 0.1  # least error of the previous pose: the map drifts, which its covariance does not know
+    pose_floor_deg: PositiveFloat = 0.1  # least error of the previous pose: the map drifts, which its covariance does not include
     gate: PositiveFloat = 4.0  # standard deviations between tracks and Manhattan frame
     gate_floor_deg: PositiveFloat = 0.7  # least standard deviation of that difference
     step_deg: PositiveFloat = 0.5  # most that a Manhattan frame corrects rotations from tracks in one frame: no jump
-    min_observations: float = 3.0  # frames seen less often are forgotten when out of sight
+    min_observations: float = 3.0  # frames observed less often are removed when out of view
     max_frames: PositiveInt = 6  # Manhattan frames remembered
     prior_deg: PositiveFloat = 2.0  # of the predicted rotation, per frame
     prior_m: PositiveFloat = 0.1  # of the motion, per frame
     measured_deg: PositiveFloat = 1.0  # tracks that leave the rotation less certain than this have not measured it
     angle_px: PositiveFloat = 0.002  # rad, of a pixel
     plane_floor_deg: PositiveFloat = 0.3  # error of a tracked plane's normal
-    predict_frames: NonNegativeInt = 15  # half a second without features: beyond, a velocity says nothing of a hand
+    predict_frames: NonNegativeInt = 15  # half a second without features: a hand-held camera's velocity is not constant for longer
 
     def __call__(
         self,
@@ -55,59 +55,59 @@ class DriftFree:
         previous_pose: Pose | None,
         map: Map | None,
     ) -> Rotation:
-        """The rotation of this frame; the identity for the first."""
+        """Return the rotation of this frame; the identity for the first."""
         known, predicted = KnownFrames.none(), Estimate(np.eye(3), np.zeros((3, 3)), "prediction")
         if previous is not None:
-            previous, previous_pose = anchored_before(previous, previous_pose, map)
+            previous, previous_pose = transform_rotation_to_map(previous, previous_pose, map)
             before, refined = rotation_before(previous, previous_pose, self.pose_floor_deg)
             known = KnownFrames(previous.R_world_manhattan, previous.ids, previous.weights)
             if refined:
-                known = known.seen_from(previous, before.R, self.max_weight, self.gate * math.radians(self.gate_floor_deg))
+                known = known.updated_by(previous, before.R, self.max_weight, self.gate * math.radians(self.gate_floor_deg))
             tracked = TrackedRotation(self.prior_deg, self.prior_m, self.measured_deg, self.angle_px, self.plane_floor_deg, self.predict_frames)
             predicted = tracked(before, previous.index, tracks, keypoints, segments, planes)
-        known, estimate, seen = self._tied(known, predicted, manhattan)
+        known, estimate, seen = self._fuse(known, predicted, manhattan)
         return rotation_value(keypoints.index, keypoints.stamp_ns, estimate, known, seen)
 
-    def _tied(self, known: KnownFrames, predicted: Estimate, manhattan: ManhattanFrame | None) -> tuple[KnownFrames, Estimate, F64]:
-        """The prediction tied to the Manhattan frames seen, the known ones with those met for the first time, and R_camera_manhattan of each."""
+    def _fuse(self, known: KnownFrames, predicted: Estimate, manhattan: ManhattanFrame | None) -> tuple[KnownFrames, Estimate, F64]:
+        """Fuse the prediction with the observed Manhattan frames; also the known frames with new ones appended, and R_camera_manhattan of each."""
         estimate = predicted
-        sightings: dict[int, F64] = {}
-        for k, row in known.sightings(manhattan, predicted.R):
+        observations: dict[int, F64] = {}
+        for k, row in known.associations(manhattan, predicted.R):
             noises = [self._noise(s, known) for s in row]
             distances = [self._distance(s.delta, noise, predicted) for s, noise in zip(row, noises, strict=True)]
             best = min(range(len(row)), key=distances.__getitem__, default=-1)
-            if row and distances[best] < self.gate and best not in sightings:
-                estimate = self._combined(estimate, predicted, row[best].delta, noises[best])
-                sightings[best] = row[best].R_camera_manhattan
+            if row and distances[best] < self.gate and best not in observations:
+                estimate = self._kalman_update(estimate, predicted, row[best].delta, noises[best])
+                observations[best] = row[best].R_camera_manhattan
             elif manhattan is not None and len(known.ids) < self.max_frames:
                 certain = math.radians(self.unit_deg) ** 2 / (np.trace(predicted.covariance + manhattan.covariance[k]) / 3.0 + 1e-12)
                 known = known.with_new(predicted.R @ manhattan.rotations[k], min(certain, 1.0))
-                sightings[len(known.ids) - 1] = manhattan.rotations[k]
-        keep = [i for i in range(len(known.ids)) if i in sightings or known.weights[i] >= self.min_observations]
-        seen = np.array([sightings.get(i, np.full((3, 3), np.nan)) for i in keep]).reshape(-1, 3, 3)
-        return known.only(np.array(keep, np.intp)), estimate, seen
+                observations[len(known.ids) - 1] = manhattan.rotations[k]
+        keep = [i for i in range(len(known.ids)) if i in observations or known.weights[i] >= self.min_observations]
+        seen = np.array([observations.get(i, np.full((3, 3), np.nan)) for i in keep]).reshape(-1, 3, 3)
+        return known.select(np.array(keep, np.intp)), estimate, seen
 
-    def _noise(self, sighting: Sighting, known: KnownFrames) -> F64:
-        """Covariance (3, 3) of the rotation that a sighting says: its own and that of R_world_manhattan."""
-        weight = known.weights[sighting.row]
+    def _noise(self, observation: Observation, known: KnownFrames) -> F64:
+        """Covariance (3, 3) of an observed rotation: its own and that of R_world_manhattan."""
+        weight = known.weights[observation.row]
         independent = max(weight / self.correlation, min(weight, 1.0))
         axes = math.radians(self.unit_deg) ** 2 / independent + math.radians(self.axis_floor_deg) ** 2
-        return sighting.covariance + axes * IDENTITY
+        return np.asarray(observation.covariance + axes * IDENTITY)
 
     def _distance(self, delta: F64, noise: F64, predicted: Estimate) -> float:
-        """Standard deviations between a sighting and the prediction."""
+        """Mahalanobis distance between an observation and the prediction."""
         whitened = np.empty(3)
         solve_positive(noise + predicted.covariance + IDENTITY * math.radians(self.gate_floor_deg) ** 2, delta, whitened)
         return math.sqrt(delta @ whitened)
 
-    def _combined(self, estimate: Estimate, predicted: Estimate, delta: F64, noise: F64) -> Estimate:
-        """Kalman update of the estimate by a sighting; both covariances are of rotations of the camera."""
+    def _kalman_update(self, estimate: Estimate, predicted: Estimate, delta: F64, noise: F64) -> Estimate:
+        """Kalman update of the estimate by an observation; both covariances are of rotations of the camera."""
         gain = estimate.covariance @ inverse_positive(estimate.covariance + noise)
         covariance = gain @ noise
         step = gain @ log_so3(estimate.R.T @ predicted.R @ exp_so3(delta))
         length = math.hypot(*step.tolist())
         limit = math.radians(self.step_deg)
-        if predicted.source == "tracks" and length > limit:  # what lies beyond the limit is left for the next frames, and is not yet known
+        if predicted.source == "tracks" and length > limit:  # the rest is left for the next frames, and added to the covariance
             rest = (1.0 - limit / length) * step
             covariance, step = covariance + rest[:, None] * rest, step - rest
         return Estimate(estimate.R @ exp_so3(step), covariance, "manhattan")

@@ -19,14 +19,14 @@ UNSEEN = np.full((1, 3, 3), np.nan)
 @dataclass(frozen=True)
 class ManhattanRotation:
     """`R_world_camera = R_world_manhattan · R_camera_manhattanᵀ` (eq. 1) with the R_world_manhattan of the first frame that shows one, as OPVO (Kim,
-    Coltin, Kim, BMVC 2017), LPVO (ICRA 2018) and L-SLAM (ECCV 2018) have it: absolute, so it cannot drift.
+    Coltin, Kim, BMVC 2017), LPVO (ICRA 2018) and L-SLAM (ECCV 2018) have it: absolute, so it does not drift.
 
-    Nothing else measures the rotation. Where no Manhattan frame is supported it is held, ever less certain, and says so (`source` prediction)."""
+    Where no Manhattan frame is supported the rotation is held, with growing covariance (`source` prediction)."""
 
     held_deg: PositiveFloat = 2.0  # error of a rotation that is held, per frame
 
     def __call__(self, manhattan: ManhattanFrame | None, keypoints: Keypoints, previous: Rotation | None) -> Rotation:
-        """The rotation of this frame; the identity for the first."""
+        """Return the rotation of this frame; the identity for the first."""
         index, known = keypoints.index, KnownFrames.none()
         held = Estimate(np.eye(3), np.zeros((3, 3)), "prediction")
         if previous is not None:
@@ -39,9 +39,10 @@ class ManhattanRotation:
         if not len(known.ids):
             known = known.with_new(held.R @ R_camera_manhattan, 1.0)
             return rotation_value(index, keypoints.stamp_ns, held, known, R_camera_manhattan[None])
-        named = nearest_equivalent(R_camera_manhattan, np.array(held.R.T @ known.R_world_manhattan[0]))
-        return rotation_value(index, keypoints.stamp_ns, _tied(known.R_world_manhattan[0], named, manhattan.covariance[0]), known, named[None])
+        nearest = nearest_equivalent(R_camera_manhattan, np.array(held.R.T @ known.R_world_manhattan[0]))
+        estimate = _absolute(known.R_world_manhattan[0], nearest, manhattan.covariance[0])
+        return rotation_value(index, keypoints.stamp_ns, estimate, known, nearest[None])
 
 
-def _tied(R_world_manhattan: F64, R_camera_manhattan: F64, covariance: F64) -> Estimate:
+def _absolute(R_world_manhattan: F64, R_camera_manhattan: F64, covariance: F64) -> Estimate:
     return Estimate(R_world_manhattan @ R_camera_manhattan.T, covariance, "manhattan")

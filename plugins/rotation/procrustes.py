@@ -9,15 +9,16 @@ import numpy as np
 from trihedron.pipeline.core.options import NonNegativeInt, PositiveFloat
 from trihedron.pipeline.core.registry import register
 from trihedron.pipeline.core.types import Keypoints, Map, Planes, Pose, Rotation, Segments, Tracks
-from trihedron.plugins.mapping.reference_keyframe import anchored_before
+from trihedron.plugins.mapping.reference_keyframe import transform_rotation_to_map
 from trihedron.plugins.rotation.common import Estimate, KnownFrames, TrackedRotation, rotation_before, rotation_value
 
 
 @register("rotation", "procrustes")
 @dataclass(frozen=True)
 class Procrustes:
-    """The rotation that aligns the tracked points, lines and planes of the previous frame with this one's, on top of the previous pose: what
-    `drift_free` falls back on, for comparison. No Manhattan frame takes part, so it drifts."""
+    """Compose the previous rotation with the one that aligns the tracked points, lines and planes of the two frames.
+
+    It is the fallback of `drift_free`, for comparison; without a Manhattan frame it drifts."""
 
     pose_floor_deg: PositiveFloat = 0.1  # least error of the previous pose
     prior_deg: PositiveFloat = 2.0  # of the predicted rotation, per frame
@@ -25,7 +26,7 @@ class Procrustes:
     measured_deg: PositiveFloat = 1.0  # tracks that leave the rotation less certain than this have not measured it
     angle_px: PositiveFloat = 0.002  # rad, of a pixel
     plane_floor_deg: PositiveFloat = 0.3  # error of a tracked plane's normal
-    predict_frames: NonNegativeInt = 15  # half a second without features: beyond, a velocity says nothing of a hand
+    predict_frames: NonNegativeInt = 15  # half a second without features: a hand-held camera's velocity is not constant for longer
 
     def __call__(
         self,
@@ -37,10 +38,10 @@ class Procrustes:
         previous_pose: Pose | None,
         map: Map | None,
     ) -> Rotation:
-        """The rotation of this frame; the identity for the first."""
+        """Return the rotation of this frame; the identity for the first."""
         estimate = Estimate(np.eye(3), np.zeros((3, 3)), "prediction")
         if previous is not None:
-            before, _ = rotation_before(*anchored_before(previous, previous_pose, map), self.pose_floor_deg)
+            before, _ = rotation_before(*transform_rotation_to_map(previous, previous_pose, map), self.pose_floor_deg)
             tracked = TrackedRotation(self.prior_deg, self.prior_m, self.measured_deg, self.angle_px, self.plane_floor_deg, self.predict_frames)
             estimate = tracked(before, previous.index, tracks, keypoints, segments, planes)
         return rotation_value(keypoints.index, keypoints.stamp_ns, estimate, KnownFrames.none(), np.zeros((0, 3, 3)))

@@ -65,7 +65,7 @@ def invert_symmetric(S: F64, out: F64) -> float:
 
 
 @kernel
-def turn_left(phi: F64, R: F64) -> None:
+def left_multiply_exp(phi: F64, R: F64) -> None:
     """`R <- Exp(phi) R` in place, for the first three numbers of phi (Rodrigues)."""
     x, y, z = phi[0], phi[1], phi[2]
     angle2 = x * x + y * y + z * z
@@ -91,6 +91,16 @@ def fill_tangent_basis(n: F64, out: F64) -> None:
     b = x * y * a
     out[0, 0], out[0, 1], out[0, 2] = 1.0 + sign * x * x * a, sign * b, -sign * x
     out[1, 0], out[1, 1], out[1, 2] = b, sign + y * y * a, -y
+
+
+@kernel(forceinline=True)
+def tangent_columns(n: F64, B: F64) -> None:
+    """Fill the columns of B (3, 2) with `geometry.tangent_basis` of a unit vector n (3,)."""
+    s = 1.0 if n[2] >= 0.0 else -1.0
+    a = -1.0 / (s + n[2])
+    b = n[0] * n[1] * a
+    B[0, 0], B[1, 0], B[2, 0] = 1.0 + s * n[0] * n[0] * a, s * b, -s * n[0]
+    B[0, 1], B[1, 1], B[2, 1] = b, s + n[1] * n[1] * a, -n[1]
 
 
 @kernel

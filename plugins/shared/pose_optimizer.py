@@ -1,10 +1,7 @@
-"""Residuals and analytic Jacobians of one camera pose against known points, lines and planes (eqs. 2–8), for numba loops.
+"""Camera pose from points, lines and planes whose positions in the world are known (eqs. 2–8): robust Levenberg–Marquardt with a Gaussian prior.
 
-The pose is `R, t` of `T_world_camera`; derivatives are with respect to `xi = (rho, phi)` in `T_world_camera · Exp(xi)`, so that a camera-frame
-point p moves with `dp/drho = -I`, `dp/dphi = [p]×`. `camera` is (fx, fy, cx, cy).
-
-What is called for each term is made part of its caller (`forceinline`): to hand over an array takes numba seven numbers and a count of references,
-as long as what is done with it here.
+Every residual is weighted by the inverse of its covariance: that of the measurement *and* of the landmark. The prior (the Manhattan rotation, a weak
+prior on the position) holds the directions that the data do not observe. Derivation and numerics are in `pose_optimizer_kernels.py`.
 """
 
 from __future__ import annotations
@@ -16,7 +13,8 @@ import numpy as np
 from trihedron.pipeline.core.types import F64, U8, Camera
 from trihedron.plugins.shared.pose_optimizer_kernels import INLIER, ROUNDS, Flags, LineTerms, PlaneTerms, PointTerms, solve
 
-PLANE_SLACK = 4.0  # when a direction would be lost with the planes beyond their gate, they are outliers only beyond this × it
+PLANE_SLACK = 4.0  # multiplies the planes' gates when a direction would become unobservable without the planes beyond them
+LANDMARK_SCORE = 1, 2, 5  # weight of a point, a line and a plane where inliers are counted
 Terms = tuple[PointTerms, LineTerms, PlaneTerms]
 NO_POINTS = PointTerms(np.empty((0, 3)), np.empty((0, 3, 3)), np.empty((0, 2)), np.empty(0), np.empty(0), np.empty(0))
 NO_LINES = LineTerms(
@@ -27,8 +25,8 @@ NO_PLANES = PlaneTerms(np.empty(0, np.int32), np.empty((0, 4)), np.empty((0, 3, 
 
 @dataclass(frozen=True)
 class PoseSolution:
-    """What `solve_pose` found. Covariance and `unobservable` are in xi = (rho, phi), camera frame: (6, 6) and columns of (6, u); with the
-    rotation fixed (3, 3) and (3, u) of rho alone. Flags are OUTLIER, INLIER or NO_DEPTH (a line whose image part alone fits)."""
+    """Result of `solve_pose`. Covariance (6, 6) and `unobservable`, unit columns (6, u), are in xi = (rho, phi), camera frame; with a fixed rotation
+    (3, 3) and (3, u) of rho alone. Flags are OUTLIER, INLIER or NO_DEPTH (a line of which only the image part fits)."""
 
     T_world_camera: F64
     covariance: F64
@@ -49,19 +47,19 @@ def solve_pose(
     planes: PlaneTerms = NO_PLANES,
     fixed_rotation: bool = False,
 ) -> PoseSolution:
-    """Minimise the robust sum of all terms plus the prior, from `T_world_camera` (4, 4), in four rounds with a new choice of outliers after each.
+    """Minimise the robust sum of all terms plus the prior, from `T_world_camera` (4, 4), in four rounds that each classify the outliers anew.
 
     `prior_information` (6, 6), positive definite, is that of xi in `T = T_prior · (R_prior-frame translation, rotation)`. With `fixed_rotation`
-    only the three unknowns of the position are solved (eqs. 2–7). Nothing raises: without terms the prior's mean is returned. A plane
-    beyond its gate is kept, with a Huber weight, where nothing else sees a direction: a bare room has few walls, and 5 % is too many to lose."""
+    only the position is estimated (eqs. 2–7). Never raises: without terms the prior's mean is returned. A plane beyond its gate is retained, with a
+    Huber weight, where nothing else observes a direction: a bare room has few walls, and rejecting 5 % of them is too much."""
     terms = points, lines, planes
-    found = _solved(T_world_camera, camera, T_prior, prior_information, terms, fixed_rotation, 1.0)
-    if found.unobservable.shape[1] and not found.planes.all():
-        return _solved(T_world_camera, camera, T_prior, prior_information, terms, fixed_rotation, PLANE_SLACK)
-    return found
+    solution = _solve_with_slack(T_world_camera, camera, T_prior, prior_information, terms, fixed_rotation, 1.0)
+    if solution.unobservable.shape[1] and not solution.planes.all():
+        return _solve_with_slack(T_world_camera, camera, T_prior, prior_information, terms, fixed_rotation, PLANE_SLACK)
+    return solution
 
 
-def _solved(
+def _solve_with_slack(
     T_world_camera: F64,
     camera: Camera,
     T_prior: F64,
@@ -81,11 +79,21 @@ def _solved(
 def first_step(
     T_world_camera: F64, camera: Camera, T_prior: F64, prior_information: F64, terms: Terms, flags: Flags | None = None
 ) -> tuple[F64, F64]:
-    """Where `solve_pose` would go at first from `T_world_camera`, by the terms not flagged OUTLIER, with Huber's cost: xi (6,), and its
+    """Take the first Gauss–Newton step of `solve_pose` from `T_world_camera` by the terms not flagged OUTLIER, with Huber's cost: xi (6,) and its
     covariance (6, 6). Changes the flags."""
     poses, flags = np.array([T_world_camera, T_prior]), _all_inliers(terms) if flags is None else flags
     _, covariance, _, xi, _, _ = solve(poses, np.array(prior_information, np.float64), camera.intrinsics, *terms, flags, 6, 0, 1.0)
     return xi, covariance
+
+
+def classify_terms(
+    T_world_camera: F64, camera: Camera, points: PointTerms = NO_POINTS, lines: LineTerms = NO_LINES, planes: PlaneTerms = NO_PLANES
+) -> Flags:
+    """Classify every term at a given pose as OUTLIER, INLIER or NO_DEPTH."""
+    terms = points, lines, planes
+    flags = _all_inliers(terms)
+    solve(np.array([T_world_camera, T_world_camera]), np.eye(6), camera.intrinsics, *terms, flags, 6, 0, 1.0)
+    return flags
 
 
 def _all_inliers(terms: Terms) -> Flags:
@@ -93,19 +101,9 @@ def _all_inliers(terms: Terms) -> Flags:
     return Flags(*(np.full(count, INLIER, np.uint8) for count in (len(points.positions_m), len(lines.endpoints_m), len(planes.kinds))))
 
 
-def classify_terms(
-    T_world_camera: F64, camera: Camera, points: PointTerms = NO_POINTS, lines: LineTerms = NO_LINES, planes: PlaneTerms = NO_PLANES
-) -> Flags:
-    """OUTLIER, INLIER or NO_DEPTH of every term at a given pose."""
-    terms = points, lines, planes
-    flags = _all_inliers(terms)
-    solve(np.array([T_world_camera, T_world_camera]), np.eye(6), camera.intrinsics, *terms, flags, 6, 0, 1.0)
-    return flags
-
-
 def _unobservable(H_data: F64, H_prior: F64) -> F64:
-    """(k, u) unit directions in which the data say less than the prior: generalised eigenvalues of (H_data, H_prior) below 1."""
+    """Unit directions (k, u) in which the data have less information than the prior: generalised eigenvalues of (H_data, H_prior) below 1."""
     half = np.linalg.inv(np.linalg.cholesky(H_prior))
     values, vectors = np.linalg.eigh(half @ H_data @ half.T)
     directions = half.T @ vectors[:, values < 1.0]
-    return directions / np.linalg.norm(directions, axis=0)
+    return np.asarray(directions / np.linalg.norm(directions, axis=0))

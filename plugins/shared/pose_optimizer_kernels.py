@@ -1,4 +1,11 @@
-"""Numba kernels of `pose_optimizer.py`."""
+"""Kernels of `pose_optimizer.py`: robust Levenberg–Marquardt for one camera pose against points, lines and planes (eqs. 2–8).
+
+Minimises `Σ ρ(rᵀ W r) + ‖log(T_prior⁻¹ T)‖²` over the pose `R, t` of `T_world_camera`. The parameters are `xi = (rho, phi)` in
+`T_world_camera · Exp(xi)`; `camera` is (fx, fy, cx, cy). In order: residuals and Jacobians, their information matrices, robust normal equations,
+the prior, damping, retraction, outliers, covariance, and `solve`, which runs them.
+
+Helpers of single terms are inlined (`forceinline`): passing an array costs numba seven numbers and a reference count, as much as the helper itself.
+"""
 # mypy: disable-error-code="arg-type, assignment, index, return-value"
 
 from __future__ import annotations
@@ -10,14 +17,19 @@ import numpy as np
 
 from trihedron.pipeline.core.kernel import kernel
 from trihedron.pipeline.core.types import F64, I32, U8
-from trihedron.plugins.shared.linalg_kernels import inverse_positive, solve_positive
+from trihedron.plugins.shared.linalg_kernels import inverse_positive, solve_positive, tangent_columns
+
+# The parameters of the problem: world landmarks and their observations.
 
 SAME, PARALLEL, PERPENDICULAR = 0, 1, 2  # kinds of plane terms
 NEAR_M = 0.05  # a point nearer than this to the image plane is not projected
+CHI2_95 = (0.0, 3.841, 5.991, 7.815)  # 95 % gates of χ² by degrees of freedom, 1 to 3: the one table of this threshold
+BEHIND = 10.0 * CHI2_95[3]  # cost of a term that cannot be projected: as bad as a gross outlier, so that no step profits from it
+OUTLIER, INLIER, NO_DEPTH = 0, 1, 2  # flags of a term; NO_DEPTH is a line of which only the image part fits
 
 
 class PointTerms(NamedTuple):
-    """n world points and what was measured of them; `depth_m` NaN = pixel only."""
+    """n world points and their observations; `depth_m` is NaN where only the pixel was measured."""
 
     positions_m: F64  # (n, 3) world
     covariance_m2: F64  # (n, 3, 3) world, of the positions
@@ -28,7 +40,7 @@ class PointTerms(NamedTuple):
 
 
 class LineTerms(NamedTuple):
-    """m world lines by two points each, and the segments seen; `observed_m` NaN = image only."""
+    """m world lines by two points each, and the observed segments; `observed_m` is NaN where only the image was measured."""
 
     endpoints_m: F64  # (m, 2, 3) world
     covariance_m2: F64  # (m, 2, 3, 3) world
@@ -48,6 +60,35 @@ class PlaneTerms(NamedTuple):
     observed_covariance: F64  # (p, 3, 3)
 
 
+class Flags(NamedTuple):
+    """OUTLIER, INLIER or NO_DEPTH per term."""
+
+    points: U8
+    lines: U8
+    planes: U8
+
+
+class Chi2(NamedTuple):
+    """Squared Mahalanobis norm of each residual; inf when it cannot be projected (a line without depth has inf in `line_depths`)."""
+
+    points: F64
+    lines: F64
+    line_depths: F64
+    planes: F64
+
+
+class Weights(NamedTuple):
+    """Information matrices of the residuals, held constant during a round."""
+
+    points: F64  # (n, 3, 3)
+    lines: F64  # (m, 2, 2) image distances
+    line_depths: F64  # (m, 2, 2)
+    planes: F64  # (p, 3, 3)
+
+
+# Residuals and Jacobians.
+
+
 @kernel
 def rotation_and_translation(T: F64) -> tuple[F64, F64]:
     """Rotation and translation of T (4, 4)."""
@@ -61,15 +102,15 @@ def rotation_and_translation(T: F64) -> tuple[F64, F64]:
 
 @kernel(forceinline=True)
 def to_camera(R: F64, t: F64, world: F64, out: F64) -> None:
-    """`out = Rᵀ (world - t)`."""
+    """`out = Rᵀ (world - t)`: a world point (3,) in the camera frame."""
     x, y, z = world[0] - t[0], world[1] - t[1], world[2] - t[2]
     for k in range(3):
         out[k] = R[0, k] * x + R[1, k] * y + R[2, k] * z
 
 
 @kernel
-def chain_point(D: F64, rows: int, p: F64, J: F64) -> None:
-    """J (rows, 6) from the derivatives D (rows, 3) with respect to the camera-frame point p."""
+def pose_jacobian(D: F64, rows: int, p: F64, J: F64) -> None:
+    """Chain the Jacobian D (rows, 3) by the camera-frame point p to J (rows, 6) by xi: `dp/drho = -I`, `dp/dphi = [p]×`."""
     for k in range(rows):
         a, b, c = D[k, 0], D[k, 1], D[k, 2]
         J[k, 0], J[k, 1], J[k, 2] = -a, -b, -c
@@ -78,11 +119,18 @@ def chain_point(D: F64, rows: int, p: F64, J: F64) -> None:
         J[k, 5] = a * p[1] - b * p[0]
 
 
-@kernel
-def point_rows(p: F64, pixel: F64, depth_m: float, camera: F64, r: F64, D: F64) -> bool:
-    """Reprojection (px) and inverse depth (1/m) of camera-frame point p: residual r (3,) and D = dr/dp (3, 3); without depth the third row is 0.
+@kernel(forceinline=True)
+def _pose_jacobian_row(a: float, b: float, c: float, p: F64, k: int, J: F64) -> None:
+    """`pose_jacobian` of one row (a, b, c) for the camera-frame point in row k of p, into row k of J (·, 6)."""
+    J[k, 0], J[k, 1], J[k, 2] = -a, -b, -c
+    J[k, 3], J[k, 4], J[k, 5] = b * p[k, 2] - c * p[k, 1], c * p[k, 0] - a * p[k, 2], a * p[k, 1] - b * p[k, 0]
 
-    The inverse-depth row is the stereo-like row of RGB-D SLAM up to the baseline. False when p is not in front of the camera, or NaN."""
+
+@kernel
+def point_residual(p: F64, pixel: F64, depth_m: float, camera: F64, r: F64, D: F64) -> bool:
+    """Residual r (3,) of a camera-frame point p and D = dr/dp (3, 3): reprojection (px, eq. 2) and inverse depth (1/m).
+
+    The third row is the stereo-like row of RGB-D SLAM up to the baseline, 0 without depth. False when p is not in front of the camera, or NaN."""
     if not p[2] > NEAR_M:
         return False
     iz = 1.0 / p[2]
@@ -99,9 +147,10 @@ def point_rows(p: F64, pixel: F64, depth_m: float, camera: F64, r: F64, D: F64) 
 
 
 @kernel(forceinline=True)
-def line_row(p: F64, segment_px: F64, camera: F64, D: F64) -> tuple[float, float]:
-    """Signed distance (px) of the projection of camera-frame point p from the line through `segment_px` (2, 2), and where along the segment
-    it falls (0 = start, 1 = end). D (3,) is the distance's derivative. The line is normalised by √(a² + b²). p must be in front."""
+def line_residual(p: F64, segment_px: F64, camera: F64, D: F64) -> tuple[float, float]:
+    """Signed distance (px) of the projected camera-frame point p from the line through `segment_px` (2, 2), eqs. 3 and 4.
+
+    Also returns the parameter along the segment (0 = start, 1 = end). D (3,) is dr/dp. The line is normalised by √(a² + b²); p must be in front."""
     iz = 1.0 / p[2]
     u, v = camera[0] * p[0] * iz + camera[2], camera[1] * p[1] * iz + camera[3]
     dx, dy = segment_px[1, 0] - segment_px[0, 0], segment_px[1, 1] - segment_px[0, 1]
@@ -115,44 +164,40 @@ def line_row(p: F64, segment_px: F64, camera: F64, D: F64) -> tuple[float, float
 
 @kernel(forceinline=True)
 def depth_direction(observed_m: F64, m: F64) -> bool:
-    """m (3,): the unit vector normal to an observed 3D segment (2, 3) within the plane through it and the camera centre, the direction the image
-    cannot see. False when the segment has NaN or points at the camera."""
+    """Fill m (3,) with the unit normal of an observed 3D segment (2, 3) within its interpretation plane, the plane through the segment and the camera
+    centre: the direction that the image does not measure. False when the segment has NaN or points at the camera."""
     o, e = observed_m[0], observed_m[1]
     dx, dy, dz = e[0] - o[0], e[1] - o[1], e[2] - o[2]
     nx, ny, nz = o[1] * e[2] - o[2] * e[1], o[2] * e[0] - o[0] * e[2], o[0] * e[1] - o[1] * e[0]
     m[0], m[1], m[2] = ny * dz - nz * dy, nz * dx - nx * dz, nx * dy - ny * dx
-    size = np.sqrt(m[0] * m[0] + m[1] * m[1] + m[2] * m[2])
-    if not size > 1e-9:
+    length = np.sqrt(m[0] * m[0] + m[1] * m[1] + m[2] * m[2])
+    if not length > 1e-9:
         return False
     for k in range(3):
-        m[k] /= size
+        m[k] /= length
     return True
 
 
 @kernel(forceinline=True)
-def line_depth_row(p: F64, observed_m: F64, m: F64) -> tuple[float, float]:
-    """Distance (m) of camera-frame point p from an observed 3D segment along m (its derivative), and where along the segment it falls."""
+def line_depth_residual(p: F64, observed_m: F64, m: F64) -> tuple[float, float]:
+    """Distance (m) of a camera-frame point p from an observed 3D segment along m, which is also dr/dp, and the parameter along the segment."""
     x, y, z = p[0] - observed_m[0, 0], p[1] - observed_m[0, 1], p[2] - observed_m[0, 2]
     dx, dy, dz = observed_m[1, 0] - observed_m[0, 0], observed_m[1, 1] - observed_m[0, 1], observed_m[1, 2] - observed_m[0, 2]
     return m[0] * x + m[1] * y + m[2] * z, (dx * x + dy * y + dz * z) / max(dx * dx + dy * dy + dz * dz, 1e-12)
 
 
 @kernel(forceinline=True)
-def basis(n: F64, B: F64) -> None:
-    """B (3, 2): `geometry.tangent_basis` of the unit vector n."""
-    s = 1.0 if n[2] >= 0.0 else -1.0
-    a = -1.0 / (s + n[2])
-    b = n[0] * n[1] * a
-    B[0, 0], B[1, 0], B[2, 0] = 1.0 + s * n[0] * n[0] * a, s * b, -s * n[0]
-    B[0, 1], B[1, 1], B[2, 1] = b, s + n[1] * n[1] * a, -n[1]
+def residual_dimension(kind: int) -> int:
+    """Number of residuals of a kind of plane term."""
+    return 3 if kind == SAME else (1 if kind == PERPENDICULAR else 2)
 
 
 @kernel(forceinline=True)
-def plane_rows(kind: int, R: F64, t: F64, world: F64, observed: F64, B: F64, r: F64, J: F64) -> int:
-    """Residual r (3,) and J (3, 6) of a plane pair; returns the number of rows. B is `basis` of the observed normal.
+def plane_residual(kind: int, R: F64, t: F64, world: F64, observed: F64, B: F64, r: F64, J: F64) -> int:
+    """Residual r (3,) of a plane pair (eqs. 6 and 8) and J (3, 6) by xi; returns the number of rows. B is the tangent basis of the observed normal.
 
-    SAME: the predicted normal in the tangent plane of the observed one, and d (3 rows; regular at every normal, unlike azimuth and elevation).
-    PARALLEL: the tangent rows alone, for either orientation. PERPENDICULAR: the product of the normals."""
+    SAME: the predicted normal in the tangent plane of the observed one, and d (3 rows; regular at every normal, unlike azimuth and elevation, eq. 5).
+    PARALLEL: the tangent rows alone, for either orientation. PERPENDICULAR: the dot product of the normals."""
     n0 = R[0, 0] * world[0] + R[1, 0] * world[1] + R[2, 0] * world[2]
     n1 = R[0, 1] * world[0] + R[1, 1] * world[1] + R[2, 1] * world[2]
     n2 = R[0, 2] * world[0] + R[1, 2] * world[1] + R[2, 2] * world[2]
@@ -178,16 +223,17 @@ def plane_rows(kind: int, R: F64, t: F64, world: F64, observed: F64, B: F64, r: 
 
 
 @kernel(forceinline=True)
-def plane_slopes(kind: int, R: F64, t: F64, world: F64, observed: F64, Bw: F64, B: F64, F: F64, G: F64) -> None:
-    """Derivatives (3, 3) of `plane_rows` by the (a, b, d) of the map plane, F, and of the observed one, G, of bases Bw and B; signs apart."""
+def plane_landmark_jacobians(kind: int, R: F64, t: F64, world: F64, observed: F64, Bw: F64, B: F64, F: F64, G: F64) -> None:
+    """Jacobians (3, 3) of `plane_residual` by (a, b, d) of the map plane, F, and of the observed plane, G, with tangent bases Bw and B; up to the
+    sign."""
     for i in range(3):
         for j in range(3):
             F[i, j] = G[i, j] = 0.0
     if kind == PERPENDICULAR:
         for j in range(2):
             for i in range(3):
-                turned = R[i, 0] * observed[0] + R[i, 1] * observed[1] + R[i, 2] * observed[2]
-                F[0, j] += turned * Bw[i, j]
+                normal = R[i, 0] * observed[0] + R[i, 1] * observed[1] + R[i, 2] * observed[2]
+                F[0, j] += normal * Bw[i, j]
                 G[0, j] += (R[0, i] * world[0] + R[1, i] * world[1] + R[2, i] * world[2]) * B[i, j]
     else:
         for j in range(2):
@@ -201,20 +247,12 @@ def plane_slopes(kind: int, R: F64, t: F64, world: F64, observed: F64, Bw: F64, 
             F[2, 2] = G[2, 2] = 1.0
 
 
-# The noise of the pose solver's residuals: of the measurement and of the landmark, at a given pose.
-
-class Weights(NamedTuple):
-    """Inverse covariances of the residuals, held during a round."""
-
-    points: F64  # (n, 3, 3)
-    lines: F64  # (m, 2, 2) image distances
-    line_depths: F64  # (m, 2, 2)
-    planes: F64  # (p, 3, 3)
+# Information matrices of the residuals: noise of the measurement plus the landmark's covariance, at the pose of a round.
 
 
 @kernel(forceinline=True)
 def invert_small(S: F64, rows: int, W: F64) -> None:
-    """Inverse of the leading block of 1, 2 or 3 rows of a symmetric matrix into W; the rest 0."""
+    """Invert the leading block of 1, 2 or 3 rows of a symmetric matrix into W; the rest is 0."""
     for i in range(len(W)):
         for j in range(len(W)):
             W[i, j] = 0.0
@@ -239,8 +277,8 @@ def invert_small(S: F64, rows: int, W: F64) -> None:
 
 
 @kernel(forceinline=True)
-def _offset_variance(d: F64, R: F64, S: F64) -> float:
-    """Variance along the camera-frame direction d of a world covariance S."""
+def _world_variance(d: F64, R: F64, S: F64) -> float:
+    """Variance along the camera-frame direction d of a world covariance S (3, 3)."""
     x = R[0, 0] * d[0] + R[0, 1] * d[1] + R[0, 2] * d[2]
     y = R[1, 0] * d[0] + R[1, 1] * d[1] + R[1, 2] * d[2]
     z = R[2, 0] * d[0] + R[2, 1] * d[1] + R[2, 2] * d[2]
@@ -250,7 +288,8 @@ def _offset_variance(d: F64, R: F64, S: F64) -> float:
 
 
 @kernel(forceinline=True)
-def _quadratic(d: F64, S: F64) -> float:
+def _variance(d: F64, S: F64) -> float:
+    """Variance `dᵀ S d` along d (3,) of a covariance S (3, 3) of the same frame."""
     total = 0.0
     for i in range(3):
         for j in range(3):
@@ -260,7 +299,7 @@ def _quadratic(d: F64, S: F64) -> float:
 
 @kernel
 def _weigh_points(R: F64, t: F64, camera: F64, terms: PointTerms, W: F64) -> None:
-    """Pixel and inverse-depth noise plus the landmark's own covariance, projected at this pose. In scalars, as `pose_kernel` has its points."""
+    """Invert the pixel and inverse-depth noise plus the projected covariance of the landmark, per point; in scalars, as in `_add_points`."""
     for i in range(len(terms.positions_m)):
         x, y, z = terms.positions_m[i, 0] - t[0], terms.positions_m[i, 1] - t[1], terms.positions_m[i, 2] - t[2]
         p2 = R[0, 2] * x + R[1, 2] * y + R[2, 2] * z
@@ -299,7 +338,8 @@ def _weigh_points(R: F64, t: F64, camera: F64, terms: PointTerms, W: F64) -> Non
 
 @kernel(forceinline=True)
 def _pair_noise(s0: float, s1: float, at_start: float, at_end: float, map0: float, map1: float, S: F64) -> None:
-    """Covariance of the distances at parameters s0, s1 along a segment whose ends have the given variances, plus those of the map's points."""
+    """Covariance S (2, 2) of the distances at parameters s0, s1 along a segment whose ends have the given variances, plus those of the map's
+    points."""
     S[0, 0] = (1.0 - s0) ** 2 * at_start + s0 * s0 * at_end + map0
     S[1, 1] = (1.0 - s1) ** 2 * at_start + s1 * s1 * at_end + map1
     S[0, 1] = S[1, 0] = (1.0 - s0) * (1.0 - s1) * at_start + s0 * s1 * at_end
@@ -307,7 +347,8 @@ def _pair_noise(s0: float, s1: float, at_start: float, at_end: float, map0: floa
 
 @kernel
 def _weigh_lines(R: F64, t: F64, camera: F64, terms: LineTerms, W: F64, V: F64) -> None:
-    """Noise of the segment's ends, extrapolated to where the map's end points fall, plus that of the map's end points."""
+    """Invert the noise of the observed ends, extrapolated to the projections of the map's points, plus the covariance of the map's points: W in the
+    image, V in depth."""
     p, D, m, S = np.empty((2, 3)), np.empty((2, 3)), np.empty(3), np.empty((2, 2))
     for i in range(len(terms.endpoints_m)):
         for a in range(2):
@@ -317,34 +358,28 @@ def _weigh_lines(R: F64, t: F64, camera: F64, terms: LineTerms, W: F64, V: F64) 
         to_camera(R, t, terms.endpoints_m[i, 1], p[1])
         if not (p[0, 2] > NEAR_M and p[1, 2] > NEAR_M):
             continue
-        s0 = line_row(p[0], terms.endpoints_px[i], camera, D[0])[1]
-        s1 = line_row(p[1], terms.endpoints_px[i], camera, D[1])[1]
+        s0 = line_residual(p[0], terms.endpoints_px[i], camera, D[0])[1]
+        s1 = line_residual(p[1], terms.endpoints_px[i], camera, D[1])[1]
         C, noise = terms.covariance_m2[i], terms.sigma_px[i] ** 2
-        _pair_noise(s0, s1, noise, noise, _offset_variance(D[0], R, C[0]), _offset_variance(D[1], R, C[1]), S)
+        _pair_noise(s0, s1, noise, noise, _world_variance(D[0], R, C[0]), _world_variance(D[1], R, C[1]), S)
         invert_small(S, len(S), W[i])
         if depth_direction(terms.observed_m[i], m):
-            s0 = line_depth_row(p[0], terms.observed_m[i], m)[1]
-            s1 = line_depth_row(p[1], terms.observed_m[i], m)[1]
+            s0 = line_depth_residual(p[0], terms.observed_m[i], m)[1]
+            s1 = line_depth_residual(p[1], terms.observed_m[i], m)[1]
             Q = terms.observed_covariance_m2[i]
-            _pair_noise(s0, s1, _quadratic(m, Q[0]), _quadratic(m, Q[1]), _offset_variance(m, R, C[0]), _offset_variance(m, R, C[1]), S)
+            _pair_noise(s0, s1, _variance(m, Q[0]), _variance(m, Q[1]), _world_variance(m, R, C[0]), _world_variance(m, R, C[1]), S)
             invert_small(S, len(S), V[i])
-
-
-@kernel(forceinline=True)
-def rows_of(kind: int) -> int:
-    """Number of residuals of a kind of plane term."""
-    return 3 if kind == SAME else (1 if kind == PERPENDICULAR else 2)
 
 
 @kernel
 def _weigh_planes(R: F64, t: F64, terms: PlaneTerms, W: F64) -> None:
-    """Noise of the observed planes plus that of the map's."""
+    """Invert `F Σ_map Fᵀ + G Σ_observed Gᵀ`, per plane pair."""
     Bw, B, F, G, S = np.empty((3, 2)), np.empty((3, 2)), np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
     for i in range(len(terms.kinds)):
-        basis(terms.coefficients[i], Bw)
-        basis(terms.observed[i], B)
-        plane_slopes(terms.kinds[i], R, t, terms.coefficients[i], terms.observed[i], Bw, B, F, G)
-        rows, numbers = rows_of(terms.kinds[i]), 3 if terms.kinds[i] == SAME else 2  # of how far away walls are, relations say nothing
+        tangent_columns(terms.coefficients[i], Bw)
+        tangent_columns(terms.observed[i], B)
+        plane_landmark_jacobians(terms.kinds[i], R, t, terms.coefficients[i], terms.observed[i], Bw, B, F, G)
+        rows, numbers = residual_dimension(terms.kinds[i]), 3 if terms.kinds[i] == SAME else 2  # of how far away walls are, relations say nothing
         for a in range(rows):
             for b in range(rows):
                 total = 0.0
@@ -356,40 +391,19 @@ def _weigh_planes(R: F64, t: F64, terms: PlaneTerms, W: F64) -> None:
 
 
 @kernel
-def weigh(R: F64, t: F64, camera: F64, points: PointTerms, lines: LineTerms, planes: PlaneTerms, weights: Weights) -> None:
-    """Fill `weights` for the pose R, t."""
+def fill_weights(R: F64, t: F64, camera: F64, points: PointTerms, lines: LineTerms, planes: PlaneTerms, weights: Weights) -> None:
+    """Fill the information matrices of all residuals, linearised at the pose R, t."""
     _weigh_points(R, t, camera, points, weights.points)
     _weigh_lines(R, t, camera, lines, weights.lines, weights.line_depths)
     _weigh_planes(R, t, planes, weights.planes)
 
 
-# The numba loops of the pose solver: normal equations of point, line and plane terms.
-
-CHI2_1, CHI2_2, CHI2_3 = 3.841, 5.991, 7.815  # 95 % of χ² with 1, 2, 3 degrees of freedom
-BEHIND = 10.0 * CHI2_3  # cost of a term that cannot be projected: as bad as a gross outlier, so that no step profits from it
-OUTLIER, INLIER, NO_DEPTH = 0, 1, 2  # flags of a term; NO_DEPTH is a line whose image part alone fits
-
-
-class Flags(NamedTuple):
-    """OUTLIER, INLIER or NO_DEPTH of each term."""
-
-    points: U8
-    lines: U8
-    planes: U8
-
-
-class Chi2(NamedTuple):
-    """Squared whitened residual of each term; inf when it cannot be projected (a line without depth has inf in `line_depths`)."""
-
-    points: F64
-    lines: F64
-    line_depths: F64
-    planes: F64
+# Robust weights and normal equations.
 
 
 @kernel(forceinline=True)
 def _chi2(r: F64, W: F64, rows: int, e: F64) -> float:
-    """rᵀ W r, with `e = W r` left for `_add`."""
+    """`rᵀ W r`, with `e = W r` left for `_add`."""
     chi2 = 0.0
     for i in range(rows):
         e[i] = 0.0
@@ -401,7 +415,7 @@ def _chi2(r: F64, W: F64, rows: int, e: F64) -> float:
 
 @kernel(forceinline=True)
 def _huber(chi2: float, limit: float, robust: bool) -> tuple[float, float]:
-    """Weight and cost of a term whose χ² may lie beyond the limit."""
+    """Huber's weight and cost of a term beyond the gate `limit` on its χ²; 1 and χ² when not `robust`."""
     if robust and chi2 > limit:
         return np.sqrt(limit / chi2), 2.0 * np.sqrt(limit * chi2) - limit
     return 1.0, chi2
@@ -409,8 +423,8 @@ def _huber(chi2: float, limit: float, robust: bool) -> tuple[float, float]:
 
 @kernel(forceinline=True)
 def _add(chi2: float, e: F64, J: F64, rows: int, W: F64, limit: float, robust: bool, first: int, H: F64, g: F64) -> float:
-    """Add one term, which does not know of the unknowns before the `first`, to the normal equations `H dx = -g` (Huber beyond `limit` when
-    robust); returns its cost."""
+    """Add one term to the normal equations `H dx = -g` with Huber's weight, skipping its Jacobian's zero columns before the `first`; returns its
+    cost."""
     w, cost = _huber(chi2, limit, robust)
     for i in range(rows):
         for b in range(first, 6):
@@ -427,7 +441,7 @@ def _add(chi2: float, e: F64, J: F64, rows: int, W: F64, limit: float, robust: b
 def _add_points(
     R: F64, t: F64, camera: F64, terms: PointTerms, W: F64, flags: U8, robust: bool, free: int, H: F64, g: F64, chi2: F64
 ) -> float:
-    """All points; `point_rows` written out in scalars, since points are most of the work.
+    """Add all points; `point_residual` in scalars, since points are most of the work. Returns the cost.
 
     With D = dr/dp, A = DᵀWD, b = DᵀWr and P = [p]×, J = (-D, DP) gives the blocks A, PA, -PAP and -b, -p × b."""
     cost = 0.0
@@ -453,7 +467,7 @@ def _add_points(
         chi2[i] = value
         if not flags[i]:
             continue
-        w, share = _huber(value, CHI2_3 if w22 > 0.0 else CHI2_2, robust)
+        w, share = _huber(value, CHI2_95[3] if w22 > 0.0 else CHI2_95[2], robust)
         cost += share
         a00, a11, a01 = w * d00 * d00 * w00, w * d11 * d11 * w11, w * d00 * d11 * w01
         a02 = w * d00 * (w00 * d02 + w01 * d12 + w02 * d22)
@@ -497,8 +511,9 @@ def _add_points(
 
 @kernel(forceinline=True)
 def _add_pair(r0: float, r1: float, W: F64, i: int, J: F64, counts: bool, robust: bool, H: F64, g: F64) -> tuple[float, float]:
-    """χ² and cost of term i with residuals r, derivatives J (2, 6) and weights W (·, 2, 2), added to the normal equations if it `counts`; χ² is inf,
-    and nothing is added, where it is none."""
+    """Add the residuals (r0, r1) of line i with Jacobian J (2, 6) and information W (·, 2, 2), unless it is an outlier (`counts` False).
+
+    Returns χ² and cost; χ² is inf, and nothing is added, where the residual has no information."""
     w00, w01, w11 = W[i, 0, 0], W[i, 0, 1], W[i, 1, 1]
     e0, e1 = w00 * r0 + w01 * r1, w01 * r0 + w11 * r1
     chi2 = e0 * r0 + e1 * r1
@@ -506,7 +521,7 @@ def _add_pair(r0: float, r1: float, W: F64, i: int, J: F64, counts: bool, robust
         return np.inf, 0.0
     if not counts:
         return chi2, 0.0
-    w, cost = _huber(chi2, CHI2_2, robust)
+    w, cost = _huber(chi2, CHI2_95[2], robust)
     for a in range(6):
         x, y = w * (w00 * J[0, a] + w01 * J[1, a]), w * (w01 * J[0, a] + w11 * J[1, a])
         g[a] += w * (e0 * J[0, a] + e1 * J[1, a])
@@ -519,7 +534,7 @@ def _add_pair(r0: float, r1: float, W: F64, i: int, J: F64, counts: bool, robust
 def _add_lines(
     R: F64, t: F64, camera: F64, terms: LineTerms, W: F64, V: F64, flags: U8, robust: bool, H: F64, g: F64, chi2: F64, depth_chi2: F64
 ) -> float:
-    """All lines: the distances of both ends from the segment in the image (`line_row`) and from the 3D one in depth (`line_depth_row`)."""
+    """Add all lines: both ends in the image (`line_residual`) and in depth (`line_depth_residual`). Returns the cost."""
     cost = 0.0
     p, r, J, m = np.empty((2, 3)), np.empty(2), np.empty((2, 6)), np.empty(3)
     for i in range(len(terms.endpoints_m)):
@@ -539,7 +554,7 @@ def _add_lines(
             iz = 1.0 / p[k, 2]
             r[k] = nu * (camera[0] * p[k, 0] * iz + camera[2] - u) + nv * (camera[1] * p[k, 1] * iz + camera[3] - v)
             d0, d1 = nu * camera[0] * iz, nv * camera[1] * iz
-            _chain(d0, d1, -(d0 * p[k, 0] + d1 * p[k, 1]) * iz, p, k, J)
+            _pose_jacobian_row(d0, d1, -(d0 * p[k, 0] + d1 * p[k, 1]) * iz, p, k, J)
         chi2[i], share = _add_pair(r[0], r[1], W, i, J, flags[i] != OUTLIER, robust, H, g)
         cost += share
         if chi2[i] == np.inf:
@@ -549,38 +564,26 @@ def _add_lines(
                 r[k] = 0.0
                 for a in range(3):
                     r[k] += m[a] * (p[k, a] - terms.observed_m[i, 0, a])
-                _chain(m[0], m[1], m[2], p, k, J)
+                _pose_jacobian_row(m[0], m[1], m[2], p, k, J)
             depth_chi2[i], share = _add_pair(r[0], r[1], V, i, J, flags[i] == INLIER, robust, H, g)
             cost += share
     return cost
 
 
-@kernel(forceinline=True)
-def _chain(a: float, b: float, c: float, p: F64, k: int, J: F64) -> None:
-    """Row k of J (·, 6) from the derivative (a, b, c) with respect to the camera-frame point in row k of p, as `chain_point`."""
-    J[k, 0], J[k, 1], J[k, 2] = -a, -b, -c
-    J[k, 3], J[k, 4], J[k, 5] = b * p[k, 2] - c * p[k, 1], c * p[k, 0] - a * p[k, 2], a * p[k, 1] - b * p[k, 0]
-
-
-@kernel(forceinline=True)
-def gate(rows: int) -> float:
-    """95 % of χ² with 1, 2 or 3 degrees of freedom."""
-    return CHI2_3 if rows == 3 else (CHI2_2 if rows == 2 else CHI2_1)
-
-
 @kernel
 def _add_planes(R: F64, t: F64, terms: PlaneTerms, W: F64, flags: U8, H: F64, g: F64, chi2: F64) -> float:
+    """Add all plane pairs, always with Huber's weight. Returns the cost."""
     cost = 0.0
     r, e, J, B = np.empty(3), np.empty(3), np.empty((3, 6)), np.empty((3, 2))
     for i in range(len(terms.kinds)):
-        basis(terms.observed[i], B)
-        rows = plane_rows(terms.kinds[i], R, t, terms.coefficients[i], terms.observed[i], B, r, J)
+        tangent_columns(terms.observed[i], B)
+        rows = plane_residual(terms.kinds[i], R, t, terms.coefficients[i], terms.observed[i], B, r, J)
         chi2[i] = _chi2(r, W[i], rows, e)
         if not chi2[i] < np.inf:
             chi2[i] = np.inf
             cost += BEHIND if flags[i] else 0.0
         elif flags[i]:
-            cost += _add(chi2[i], e, J, rows, W[i], gate(rows), True, 0 if rows == 3 else 3, H, g)
+            cost += _add(chi2[i], e, J, rows, W[i], CHI2_95[rows], True, 0 if rows == 3 else 3, H, g)
     return cost
 
 
@@ -600,8 +603,9 @@ def linearise(
     g: F64,
     chi2: Chi2,
 ) -> float:
-    """Normal equations (H lower triangle of (6, 6), g (6,)) of all terms but the outliers, and the χ² of every term; returns the cost. With 3
-    `free` unknowns only what concerns the position is whole."""
+    """Fill the normal equations (H lower triangle of (6, 6), g (6,)) of all terms but the outliers, and the χ² of every term; return the cost.
+
+    With 3 `free` parameters only the block of the position is complete."""
     for a in range(6):
         g[a] = 0.0
         for b in range(6):
@@ -611,10 +615,11 @@ def linearise(
     return cost + _add_planes(R, t, planes, weights.planes, flags.planes, H, g, chi2.planes)
 
 
-# Steps of the pose solver: motions on SE(3), the Gaussian prior and the damped normal equations, for numba loops.
+# The Gaussian prior. It holds every direction that the data do not observe, so that any set of terms, even one plane, can be solved.
+
 
 @kernel
-def _rotation(x: float, y: float, z: float) -> F64:
+def _exp_so3(x: float, y: float, z: float) -> F64:
     """Exp(phi) of phi = (x, y, z), Rodrigues."""
     angle2 = x * x + y * y + z * z
     if angle2 < 1e-12:
@@ -630,7 +635,7 @@ def _rotation(x: float, y: float, z: float) -> F64:
 
 
 @kernel
-def _rotation_vector(R: F64) -> tuple[float, float, float]:
+def _log_so3(R: F64) -> tuple[float, float, float]:
     """Log(R) for angles below π (a prior is never that far)."""
     x, y, z = 0.5 * (R[2, 1] - R[1, 2]), 0.5 * (R[0, 2] - R[2, 0]), 0.5 * (R[1, 0] - R[0, 1])
     s, c = math.sqrt(x * x + y * y + z * z), 0.5 * (R[0, 0] + R[1, 1] + R[2, 2] - 1.0)
@@ -639,26 +644,15 @@ def _rotation_vector(R: F64) -> tuple[float, float, float]:
 
 
 @kernel
-def move(R: F64, t: F64, dx: F64, turned: F64, shifted: F64) -> None:
-    """The pose after the step (rho, phi) into the last two: R Exp(phi), t + R rho; agrees with Exp(xi) to first order, which is what covariances
-    mean."""
-    E = _rotation(dx[3], dx[4], dx[5])
-    for i in range(3):
-        shifted[i] = t[i] + R[i, 0] * dx[0] + R[i, 1] * dx[1] + R[i, 2] * dx[2]
-        for j in range(3):
-            turned[i, j] = R[i, 0] * E[0, j] + R[i, 1] * E[1, j] + R[i, 2] * E[2, j]
-
-
-@kernel
 def add_prior(R: F64, t: F64, R_prior: F64, t_prior: F64, prior: F64, H: F64, g: F64) -> float:
-    """Add the prior's term to H (lower triangle) and g; returns its cost."""
+    """Add the Gaussian prior, information `prior` (6, 6) of xi about R_prior, t_prior, to H (lower triangle) and g; returns its cost."""
     delta, r, J, e = np.zeros((3, 3)), np.zeros(6), np.zeros((6, 6)), np.zeros(6)
     for i in range(3):
         for k in range(3):
             r[i] += R_prior[k, i] * (t[k] - t_prior[k])
             for j in range(3):
                 delta[i, j] += R_prior[k, i] * R[k, j]
-    r[3], r[4], r[5] = _rotation_vector(delta)
+    r[3], r[4], r[5] = _log_so3(delta)
     for i in range(3):
         J[3 + i, 3 + i] = 1.0  # with the terms below the inverse right Jacobian, first order
         for j in range(3):
@@ -679,9 +673,12 @@ def add_prior(R: F64, t: F64, R_prior: F64, t_prior: F64, prior: F64, H: F64, g:
     return cost
 
 
+# Damping and retraction.
+
+
 @kernel
-def step(H: F64, g: F64, damping: float, free: int, dx: F64) -> None:
-    """dx (6,): solution of (H + damping · diag H) dx = -g over the first `free` unknowns, by Cholesky; zero if H is not positive definite."""
+def damped_step(H: F64, g: F64, damping: float, free: int, dx: F64) -> None:
+    """Solve `(H + damping · diag H) dx = -g` for the first `free` parameters by Cholesky; dx (6,) is zero if H is not positive definite."""
     L = np.zeros((6, 6))
     for i in range(6):
         dx[i] = 0.0
@@ -708,8 +705,8 @@ def step(H: F64, g: F64, damping: float, free: int, dx: F64) -> None:
 
 
 @kernel
-def size(H: F64, dx: F64) -> float:
-    """Squared length of the step in standard deviations (H lower triangle)."""
+def step_norm2(H: F64, dx: F64) -> float:
+    """Squared Mahalanobis norm `dxᵀ H dx` of a step (H lower triangle)."""
     total = 0.0
     for a in range(6):
         for b in range(a + 1):
@@ -717,13 +714,85 @@ def size(H: F64, dx: F64) -> float:
     return total
 
 
-# Camera pose from points, lines and planes whose place in the world is known (eqs. 2–8): robust Levenberg–Marquardt with a Gaussian prior.
-#
-# Every term is weighed by covariances: of the measurement *and* of the landmark. The prior (the Manhattan rotation, a weak one on the position)
-# keeps what the data cannot see at its prediction, so that any set of terms, even one plane, can be solved.
+@kernel
+def retract_pose(R: F64, t: F64, dx: F64, R_new: F64, t_new: F64) -> None:
+    """Move the pose R, t by a step dx = (rho, phi) into R_new, t_new: `R Exp(phi)`, `t + R rho`, which is `T · Exp(xi)` to first order."""
+    E = _exp_so3(dx[3], dx[4], dx[5])
+    for i in range(3):
+        t_new[i] = t[i] + R[i, 0] * dx[0] + R[i, 1] * dx[1] + R[i, 2] * dx[2]
+        for j in range(3):
+            R_new[i, j] = R[i, 0] * E[0, j] + R[i, 1] * E[1, j] + R[i, 2] * E[2, j]
+
+
+# Outliers and covariance.
+
+
+@kernel
+def _classify(points: PointTerms, planes: PlaneTerms, chi2: Chi2, flags: Flags, slack: float) -> None:
+    """Classify inliers and outliers by the 95 % gates of χ²; those of planes are multiplied by `slack`."""
+    for i in range(len(chi2.points)):
+        limit = CHI2_95[3] if np.isfinite(points.depth_m[i]) else CHI2_95[2]
+        flags.points[i] = INLIER if chi2.points[i] <= limit else OUTLIER
+    for i in range(len(chi2.lines)):
+        flags.lines[i] = OUTLIER
+        if chi2.lines[i] <= CHI2_95[2]:
+            flags.lines[i] = INLIER if chi2.line_depths[i] <= CHI2_95[2] else NO_DEPTH
+    for i in range(len(chi2.planes)):
+        flags.planes[i] = INLIER if chi2.planes[i] <= slack * CHI2_95[residual_dimension(planes.kinds[i])] else OUTLIER
+
+
+@kernel
+def _residual_count(points: PointTerms, planes: PlaneTerms, flags: Flags) -> int:
+    """Number of residuals of the inliers."""
+    rows = 0
+    for i in range(len(flags.points)):
+        if flags.points[i]:
+            rows += 3 if np.isfinite(points.depth_m[i]) else 2
+    for i in range(len(flags.lines)):
+        if flags.lines[i]:
+            rows += 4 if flags.lines[i] == INLIER else 2
+    for i in range(len(flags.planes)):
+        if flags.planes[i]:
+            rows += residual_dimension(planes.kinds[i])
+    return rows
+
+
+@kernel
+def gate_efficiency(rows: int, unknowns: int) -> float:
+    """Share of the information that remains when terms are selected by a hard 95 % gate on their own residuals.
+
+    The mean of samples truncated at the gate c has a variance of 1 / F_{k+2}(c), F_k being the distribution of χ², where counting the F_k(c)
+    retained samples promises 1 / F_k(c); with few redundant rows the residuals are smaller than the noise and the gate rejects less. The tests check
+    the NEES."""
+    if rows <= unknowns:
+        return 1.0
+    half = 0.5 * CHI2_95[3] / (1.0 - unknowns / rows)
+    tail = math.sqrt(half / math.pi) * math.exp(-half)
+    retained = math.erf(math.sqrt(half)) - 2.0 * tail  # F_3, the incomplete gamma function of 3/2; that of 5/2 follows by its recurrence
+    return (retained - 4.0 / 3.0 * half * tail) / retained
+
+
+@kernel
+def _marginal_covariance(data: F64, share: float, prior: F64, free: int) -> tuple[F64, F64, bool]:
+    """Covariance of the `free` parameters from a share of the data's information (lower triangle) plus the prior's.
+
+    Also returns that share of the data's information, and True when it exceeds the prior's in every direction (all directions are observable)."""
+    information, total, more = np.empty((free, free)), np.empty((free, free)), np.empty((free, free))
+    for i in range(free):
+        for j in range(i + 1):
+            information[i, j] = information[j, i] = share * data[i, j]
+            total[i, j], more[i, j] = information[i, j] + prior[i, j], information[i, j] - prior[i, j]
+    covariance = inverse_positive(total)
+    for i in range(free):
+        for j in range(i):
+            covariance[i, j] = covariance[j, i] = 0.5 * (covariance[i, j] + covariance[j, i])
+    return covariance, information, solve_positive(more, np.zeros(free), np.empty(free))
+
+
+# The optimiser.
 
 ROUNDS, ITERATIONS, ROBUST_ROUNDS = 4, 10, 2  # as ORB-SLAM2 optimises a pose; Huber only in the first rounds
-CONVERGED = 1e-3  # squared length of a step in standard deviations below which a round has converged
+CONVERGED = 1e-3  # squared Mahalanobis norm of a step below which a round has converged
 MAX_DAMPING = 1e10
 
 
@@ -740,11 +809,12 @@ def solve(
     rounds: int,
     slack: float,
 ) -> tuple[F64, F64, F64, F64, float, bool]:
-    """The rounds from the first of the poses (2, 4, 4), the other one being the prior's; changes `flags`. Returns the pose, its covariance, the
-    data's information, the step (6,) that would be next, the cost, and whether the data say more than the prior in all directions.
+    """Run the rounds of Levenberg–Marquardt from poses[0]; poses[1] (4, 4) is the prior's mean. Changes `flags`.
 
-    Every evaluation is the one call of `linearise`, and a step too short to matter is taken without another. The last turn takes no step and is only
-    the information of the final inliers. In no rounds all terms are judged at the first pose."""
+    Each round linearises the weights once, iterates, and classifies the outliers anew. Every evaluation is the one call of `linearise`; a step below
+    CONVERGED is taken without another evaluation. A last pass without a step collects the information of the final inliers. With 0 rounds all terms
+    are classified at the first pose. Returns the pose, its covariance, the data's information, the next step (6,), the cost, and True when all
+    directions are observable."""
     n, m, p = len(points.positions_m), len(lines.endpoints_m), len(planes.kinds)
     weights = Weights(np.empty((n, 3, 3)), np.empty((m, 2, 2)), np.empty((m, 2, 2)), np.empty((p, 3, 3)))
     chi2 = Chi2(np.empty(n), np.empty(m), np.empty(m), np.empty(p))
@@ -753,12 +823,12 @@ def solve(
     H, g, dx = np.zeros((6, 6)), np.zeros(6), np.zeros(6)
     data, data_g, trial_H, trial_g = np.zeros((6, 6)), np.zeros(6), np.zeros((6, 6)), np.zeros(6)
     cost = 0.0
-    for turn in range(rounds + 1):
+    for pass_index in range(rounds + 1):
         cost, damping = np.inf, 1e-6
         _copy(R, t, R_new, t_new)
-        weigh(R, t, camera, points, lines, planes, weights)
+        fill_weights(R, t, camera, points, lines, planes, weights)
         for trial in range(ITERATIONS + 1):
-            new = linearise(R_new, t_new, camera, points, lines, planes, weights, flags, turn < ROBUST_ROUNDS, free, trial_H, trial_g, chi2)
+            new = linearise(R_new, t_new, camera, points, lines, planes, weights, flags, pass_index < ROBUST_ROUNDS, free, trial_H, trial_g, chi2)
             _copy(trial_H, trial_g, data, data_g)
             new += add_prior(R_new, t_new, R_prior, t_prior, prior, trial_H, trial_g)
             accepted = trial == 0 or new <= cost
@@ -769,20 +839,20 @@ def solve(
                 damping = max(0.1 * damping, 1e-9)
             else:
                 damping = max(10.0 * damping, 1e-3)
-            if turn == rounds or damping > MAX_DAMPING:
+            if pass_index == rounds or damping > MAX_DAMPING:
                 break
-            step(H, g, damping, free, dx)
-            move(R, t, dx, R_new, t_new)
-            length = size(H, dx)
+            damped_step(H, g, damping, free, dx)
+            retract_pose(R, t, dx, R_new, t_new)
+            length = step_norm2(H, dx)
             if not length > CONVERGED:
                 if accepted and length >= 0.0:
                     _copy(R_new, t_new, R, t)
                 break
-        if turn < rounds or rounds == 0:
+        if pass_index < rounds or rounds == 0:
             _classify(points, planes, chi2, flags, slack)
-    step(H, g, 0.0, free, dx)
-    share = gate_efficiency(_rows(points, planes, flags), free) if rounds else 1.0
-    covariance, information, complete = _spread(data, share, prior, free)
+    damped_step(H, g, 0.0, free, dx)
+    share = gate_efficiency(_residual_count(points, planes, flags), free) if rounds else 1.0
+    covariance, information, complete = _marginal_covariance(data, share, prior, free)
     T = np.zeros((4, 4))
     for i in range(3):
         T[i, 3] = t[i]
@@ -794,68 +864,8 @@ def solve(
 
 @kernel
 def _copy(A: F64, a: F64, B: F64, b: F64) -> None:
-    """A matrix (n, n) and a vector (n,), of a pose or of normal equations, into others."""
+    """Copy a matrix (n, n) and a vector (n,), a pose or normal equations, into B and b."""
     for i in range(len(a)):
         b[i] = a[i]
         for j in range(len(a)):
             B[i, j] = A[i, j]
-
-
-@kernel
-def _spread(data: F64, share: float, prior: F64, free: int) -> tuple[F64, F64, bool]:
-    """Covariance of the `free` unknowns by a share of the data's information (lower triangle) and the prior's; that share of the data's; and
-    whether it is the larger one in all directions."""
-    information, total, more = np.empty((free, free)), np.empty((free, free)), np.empty((free, free))
-    for i in range(free):
-        for j in range(i + 1):
-            information[i, j] = information[j, i] = share * data[i, j]
-            total[i, j], more[i, j] = information[i, j] + prior[i, j], information[i, j] - prior[i, j]
-    covariance = inverse_positive(total)
-    for i in range(free):
-        for j in range(i):
-            covariance[i, j] = covariance[j, i] = 0.5 * (covariance[i, j] + covariance[j, i])
-    return covariance, information, solve_positive(more, np.zeros(free), np.empty(free))
-
-
-@kernel
-def _rows(points: PointTerms, planes: PlaneTerms, flags: Flags) -> int:
-    """Number of residuals of the inliers."""
-    rows = 0
-    for i in range(len(flags.points)):
-        if flags.points[i]:
-            rows += 3 if np.isfinite(points.depth_m[i]) else 2
-    for i in range(len(flags.lines)):
-        if flags.lines[i]:
-            rows += 4 if flags.lines[i] == INLIER else 2
-    for i in range(len(flags.planes)):
-        if flags.planes[i]:
-            rows += rows_of(planes.kinds[i])
-    return rows
-
-
-@kernel
-def gate_efficiency(rows: int, unknowns: int) -> float:
-    """Share of the information that is left when terms are chosen by a hard 95 % gate on their own residuals.
-
-    A mean of samples cut at the gate c varies by 1 / F_{k+2}(c), F_k being the distribution of χ², where counting the F_k(c) kept samples promises
-    1 / F_k(c); with few redundant rows the residuals are smaller than the noise and the gate bites less. The tests check the normalised error."""
-    if rows <= unknowns:
-        return 1.0
-    half = 0.5 * CHI2_3 / (1.0 - unknowns / rows)
-    tail = math.sqrt(half / math.pi) * math.exp(-half)
-    kept = math.erf(math.sqrt(half)) - 2.0 * tail  # F_3, the incomplete gamma function of 3/2; that of 5/2 follows by its recurrence
-    return (kept - 4.0 / 3.0 * half * tail) / kept
-
-
-@kernel
-def _classify(points: PointTerms, planes: PlaneTerms, chi2: Chi2, flags: Flags, slack: float) -> None:
-    """Choose the outliers anew: 95 % gates of χ², those of planes multiplied by `slack`."""
-    for i in range(len(chi2.points)):
-        limit = CHI2_3 if np.isfinite(points.depth_m[i]) else CHI2_2
-        flags.points[i] = INLIER if chi2.points[i] <= limit else OUTLIER
-    for i in range(len(chi2.lines)):
-        flags.lines[i] = OUTLIER
-        if chi2.lines[i] <= CHI2_2:
-            flags.lines[i] = INLIER if chi2.line_depths[i] <= CHI2_2 else NO_DEPTH
-    for i in range(len(chi2.planes)):
-        flags.planes[i] = INLIER if chi2.planes[i] <= slack * gate(rows_of(planes.kinds[i])) else OUTLIER

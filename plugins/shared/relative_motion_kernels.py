@@ -1,4 +1,8 @@
-"""Numba kernels of `relative_motion.py`."""
+"""Kernels of `relative_motion.py`: robust Gauss–Newton for the motion between two frames from 3D features matched in both.
+
+The motion is `T_current_previous`: `p_current = R p_previous + t`, with parameters (phi, rho) in `R <- Exp(phi) R, t <- t + rho`. Points and ends of
+lines are point pairs with a 3 × 3 information, zero along a line; planes are pairs (n, d) with a 4 × 4 information. No intrinsics are needed.
+"""
 # mypy: disable-error-code="arg-type, assignment, index, return-value"
 
 from __future__ import annotations
@@ -9,14 +13,15 @@ import numpy as np
 
 from trihedron.pipeline.core.kernel import kernel
 from trihedron.pipeline.core.types import F32, F64, I32
-from trihedron.plugins.shared.linalg_kernels import inverse_positive, median, solve_positive, turn_left
-from trihedron.plugins.shared.pose_optimizer_kernels import basis
+from trihedron.plugins.shared.linalg_kernels import inverse_positive, left_multiply_exp, median, solve_positive, tangent_columns
 
 SHORTEST_M = 1e-3  # line
+MOST = 400  # points used, about; more only cost time
+GATE2 = 9.0  # squared Mahalanobis distance at which a term counts a quarter, once the scale has come down
 
 
 class PointPairs(NamedTuple):
-    """n points of the previous frame, and which of the current ones they are."""
+    """n points of the previous frame, and the rows of the current points they were matched to."""
 
     rows: I32  # (n, 2) previous, current
     before: F32  # (n, 3)
@@ -27,7 +32,7 @@ class PointPairs(NamedTuple):
 
 
 class LinePairs(NamedTuple):
-    """n lines of the previous frame, and which of the current ones they are."""
+    """n lines of the previous frame, and the rows of the current lines they were matched to."""
 
     rows: I32  # (n, 2) previous, current
     before: F32  # (n, 2, 3)
@@ -36,7 +41,7 @@ class LinePairs(NamedTuple):
 
 
 class PlanePairs(NamedTuple):
-    """n planes of the previous frame, and which of the current ones they are."""
+    """n planes of the previous frame, and the rows of the current planes they were matched to."""
 
     rows: I32  # (n, 2) previous, current
     before: F64  # (n, 4)
@@ -45,10 +50,91 @@ class PlanePairs(NamedTuple):
     covariance: F64  # (k, 3, 3)
 
 
+class Terms(NamedTuple):
+    """Corresponding points (ends of lines included) and planes, previous and current."""
+
+    before_m: F64  # (n, 3)
+    after_m: F64  # (n, 3)
+    information: F64  # (n, 3, 3), 1/m²
+    planes_before: F64  # (p, 4)
+    planes_after: F64  # (p, 4)
+    plane_information: F64  # (p, 4, 4)
+
+# The optimiser.
+
+
 @kernel
-def point_pairs(pairs: PointPairs, rad_per_px: float, step: int, p: F64, q: F64, information: F64) -> int:
-    """Write previous and current places (m, 3) and information (m, 3, 3), 1/m², of one in `step` of those of n pairs that both have depth; returns
-    their number m."""
+def estimate_motion(
+    points: PointPairs, lines: LinePairs, walls: PlanePairs, start: F64, noise: tuple[float, float, float, float]
+) -> tuple[F64, F64, F64, float]:
+    """Estimate the fields of `Motion` from `start` (3, 3) and zero translation; see `solve_motion`.
+
+    The residuals' scale multiplies the covariance where they exceed their noise."""
+    rad_per_px, floor, sigma, sigma_m = noise
+    terms = _gather_terms(points, lines, walls, rad_per_px, floor)
+    R, t, prior, A = np.empty((3, 3)), np.zeros(3), np.empty(6), np.empty((6, 6))
+    for i in range(3):
+        prior[i], prior[3 + i] = 1.0 / sigma**2, 1.0 / sigma_m**2
+        for j in range(3):
+            R[i, j] = start[i, j]
+    residuals = _squared_distances(terms, R, t)
+    scale2 = max(2.0 * median(residuals), GATE2) if len(residuals) else GATE2
+    H, chi2, support = _gauss_newton(terms, R, t, prior, scale2)
+    scale = max(chi2 / max(3.0 * support - 6.0, 1.0), 1.0)
+    for i in range(6):
+        for j in range(6):
+            A[i, j] = H[i, j] / scale + (prior[i] if i == j else 0.0)
+    return R, t, inverse_positive(A), support
+
+
+@kernel
+def _gauss_newton(terms: Terms, R: F64, t: F64, prior: F64, scale2: float) -> tuple[F64, float, float]:
+    """Iterate Gauss–Newton in place on R and t, with a diagonal prior (6,) on the motion since the start, halving the squared scale down to GATE2.
+
+    Returns H (6, 6), the weighted χ² and the sum of the weights."""
+    H, A, g = np.zeros((6, 6)), np.zeros((6, 6)), np.zeros(6)
+    phi, step = np.zeros(3), np.zeros(6)  # phi: since the start
+    chi2, components = 0.0, 0.0
+    converged = False
+    for _ in range(40):
+        chi2, components = _normal_equations(terms, R, t, scale2, H, g)
+        if converged:
+            break
+        size = 0.0
+        for i in range(6):
+            g[i] = -g[i] - prior[i] * (phi[i] if i < 3 else t[i - 3])
+            for j in range(6):
+                A[i, j] = H[i, j] + (prior[i] if i == j else 0.0)
+        solve_positive(A, g, step)
+        left_multiply_exp(step, R)
+        for i in range(3):
+            phi[i] += step[i]
+            t[i] += step[3 + i]
+            size += step[i] * step[i] + step[3 + i] * step[3 + i]
+        converged = scale2 <= GATE2 and size < 1e-12
+        scale2 = max(0.5 * scale2, GATE2)
+    return H, chi2, components / 3.0
+
+# Corresponding features with the information of their difference.
+
+
+@kernel
+def _gather_terms(points: PointPairs, lines: LinePairs, walls: PlanePairs, rad_per_px: float, floor: float) -> Terms:
+    """Gather the terms of all pairs, about MOST points at most."""
+    n, m = len(points.rows), len(lines.rows)
+    step = max((n + 2 * m + MOST - 1) // MOST, 1)
+    before, after, information = np.empty((n + 2 * m, 3)), np.empty((n + 2 * m, 3)), np.empty((n + 2 * m, 3, 3))
+    count = fill_point_pairs(points, rad_per_px, step, before, after, information)
+    count = fill_line_pairs(lines, rad_per_px, step, count, before, after, information)
+    planes_before, planes_after, plane_information = plane_pairs(walls, floor)
+    return Terms(before[:count], after[:count], information[:count], planes_before, planes_after, plane_information)
+
+
+@kernel
+def fill_point_pairs(pairs: PointPairs, rad_per_px: float, step: int, p: F64, q: F64, information: F64) -> int:
+    """Write positions (m, 3) before and after, and information (m, 3, 3), 1/m², of every `step`-th pair with depth in both frames; return m.
+
+    The covariance is that of the pixel across the ray and of both depths along it, inverted by Sherman–Morrison."""
     rows, before, before_sigma, points, sigma_px, sigma_m = pairs
     m, seen = 0, 0
     for i in range(len(rows)):
@@ -76,9 +162,10 @@ def point_pairs(pairs: PointPairs, rad_per_px: float, step: int, p: F64, q: F64,
 
 
 @kernel
-def line_pairs(pairs: LinePairs, rad_per_px: float, step: int, m: int, p: F64, q: F64, information: F64) -> int:
-    """Write both ends of one in `step` of n previous lines, each against the start of the current line, whose noise serves for both: places and
-    information from row m on, which is zero along the line. Returns the next row."""
+def fill_line_pairs(pairs: LinePairs, rad_per_px: float, step: int, m: int, p: F64, q: F64, information: F64) -> int:
+    """Write both ends of every `step`-th previous line, each against the start of the current line, from row m on; return the next row.
+
+    The information is that of the current ends across the line, halved since its start serves twice, and zero along the line."""
     rows, before, endpoints, covariance = pairs
     seen, direction, B, S = 0, np.empty(3), np.empty((3, 2)), np.empty((2, 2))
     for i in range(len(rows)):
@@ -95,7 +182,7 @@ def line_pairs(pairs: LinePairs, rad_per_px: float, step: int, m: int, p: F64, q
             continue
         for k in range(3):
             direction[k] /= np.sqrt(length2)
-        basis(direction, B)
+        tangent_columns(direction, B)
         floor = max(rad_per_px * float(endpoints[row, 0, 2]), 1e-6) ** 2
         for a in range(2):
             for b in range(2):
@@ -118,8 +205,8 @@ def line_pairs(pairs: LinePairs, rad_per_px: float, step: int, m: int, p: F64, q
 
 @kernel
 def plane_pairs(pairs: PlanePairs, floor: float) -> tuple[F64, F64, F64]:
-    """Previous planes (m, 4), current ones, and the information (m, 4, 4) of their difference in (n, d), of those of n pairs that are known;
-    `floor` (rad) is the least error of a normal."""
+    """Previous planes (m, 4), current planes (m, 4), and the information (m, 4, 4) of their difference in (n, d), of the pairs with finite
+    covariance; `floor` (rad) is the least σ of a normal."""
     rows, before, before_covariance, planes, covariance = pairs
     m, p, q, information = 0, np.empty((len(rows), 4)), np.empty((len(rows), 4)), np.zeros((len(rows), 4, 4))
     B, C = np.empty((3, 2)), np.empty((3, 3))
@@ -138,7 +225,7 @@ def plane_pairs(pairs: PlanePairs, floor: float) -> tuple[F64, F64, F64]:
         A = inverse_positive(C)
         if A[0, 0] == 0.0:
             continue
-        basis(q[m, :3], B)
+        tangent_columns(q[m, :3], B)
         for a in range(3):
             for b in range(3):
                 information[m, a, b] = 0.0
@@ -151,64 +238,32 @@ def plane_pairs(pairs: PlanePairs, floor: float) -> tuple[F64, F64, F64]:
         m += 1
     return p[:m], q[:m], information[:m]
 
-
-# Motion between two frames from 3D features seen in both: robust Gauss–Newton, no intrinsics needed.
-#
-# The motion is `T_current_previous`: `p_current = R p_previous + t`. Its unknowns are (phi, rho) in `R <- Exp(phi) R, t <- t + rho`. Points and the
-# ends of lines are pairs of places with a 3 × 3 information, which is zero along a line; planes are pairs (n, d) with a 4 × 4 one.
-
-MOST = 400  # pairs of places used, about; more only cost time
-GATE2 = 9.0  # squared standard deviations at which a term counts a quarter, once the scale has come down
-
-
-class Terms(NamedTuple):
-    """Pairs of places and of planes, previous and current."""
-
-    before_m: F64  # (n, 3)
-    after_m: F64  # (n, 3)
-    information: F64  # (n, 3, 3), 1/m²
-    planes_before: F64  # (p, 4)
-    planes_after: F64  # (p, 4)
-    plane_information: F64  # (p, 4, 4)
+# Residuals.
 
 
 @kernel
-def motion(
-    points: PointPairs, lines: LinePairs, walls: PlanePairs, start: F64, noise: tuple[float, float, float, float]
-) -> tuple[F64, F64, F64, float]:
-    """The fields of `Motion`."""
-    rad_per_px, floor, sigma, sigma_m = noise
-    terms = _terms(points, lines, walls, rad_per_px, floor)
-    R, t, prior, A = np.empty((3, 3)), np.zeros(3), np.empty(6), np.empty((6, 6))
-    for i in range(3):
-        prior[i], prior[3 + i] = 1.0 / sigma**2, 1.0 / sigma_m**2
-        for j in range(3):
-            R[i, j] = start[i, j]
-    residuals = _residuals(terms, R, t)
-    scale2 = max(2.0 * median(residuals), GATE2) if len(residuals) else GATE2
-    H, chi2, support = _solve(terms, R, t, prior, scale2)
-    scale = max(chi2 / max(3.0 * support - 6.0, 1.0), 1.0)
-    for i in range(6):
-        for j in range(6):
-            A[i, j] = H[i, j] / scale + (prior[i] if i == j else 0.0)
-    return R, t, inverse_positive(A), support
+def _plane_residual(before: F64, after: F64, R: F64, t: F64, e: F64) -> None:
+    """Fill e (4,) with the previous plane moved into the current frame, less the current plane."""
+    e[3] = before[3] - after[3]
+    for k in range(3):
+        n = R[k, 0] * before[0] + R[k, 1] * before[1] + R[k, 2] * before[2]
+        e[k] = n - after[k]
+        e[3] -= n * t[k]
 
 
 @kernel
-def _terms(points: PointPairs, lines: LinePairs, walls: PlanePairs, rad_per_px: float, floor: float) -> Terms:
-    """What the pairs say about the motion, of places about MOST at most."""
-    n, m = len(points.rows), len(lines.rows)
-    step = max((n + 2 * m + MOST - 1) // MOST, 1)
-    before, after, information = np.empty((n + 2 * m, 3)), np.empty((n + 2 * m, 3)), np.empty((n + 2 * m, 3, 3))
-    count = point_pairs(points, rad_per_px, step, before, after, information)
-    count = line_pairs(lines, rad_per_px, step, count, before, after, information)
-    planes_before, planes_after, plane_information = plane_pairs(walls, floor)
-    return Terms(before[:count], after[:count], information[:count], planes_before, planes_after, plane_information)
+def _plane_distance2(e: F64, L: F64) -> float:
+    """Squared Mahalanobis norm `eᵀ L e` of a plane residual (4,)."""
+    total = 0.0
+    for j in range(4):
+        for k in range(4):
+            total += e[j] * L[j, k] * e[k]
+    return total
 
 
 @kernel
-def _residuals(terms: Terms, R: F64, t: F64) -> F64:
-    """(n + p,) squared Mahalanobis distances of places and planes."""
+def _squared_distances(terms: Terms, R: F64, t: F64) -> F64:
+    """Squared Mahalanobis distances (n + p,) of points and planes at a motion."""
     n, p = len(terms.before_m), len(terms.planes_before)
     out, e = np.empty(n + p), np.empty(4)
     for i in range(n):
@@ -220,34 +275,43 @@ def _residuals(terms: Terms, R: F64, t: F64) -> F64:
         out[i] = a * (L[i, 0, 0] * a + 2.0 * (L[i, 0, 1] * b + L[i, 0, 2] * c)) + b * (L[i, 1, 1] * b + 2.0 * L[i, 1, 2] * c) + c * c * L[i, 2, 2]
     for i in range(p):
         _plane_residual(terms.planes_before[i], terms.planes_after[i], R, t, e)
-        out[n + i] = _plane_distance(e, terms.plane_information[i])
+        out[n + i] = _plane_distance2(e, terms.plane_information[i])
     return out
 
-
-@kernel
-def _plane_distance(e: F64, L: F64) -> float:
-    """eᵀ L e of four numbers."""
-    total = 0.0
-    for j in range(4):
-        for k in range(4):
-            total += e[j] * L[j, k] * e[k]
-    return total
+# Robust weights and normal equations.
 
 
 @kernel
-def _plane_residual(before: F64, after: F64, R: F64, t: F64, e: F64) -> None:
-    """The previous plane moved into the current frame less the current one, (4,)."""
-    e[3] = before[3] - after[3]
-    for k in range(3):
-        n = R[k, 0] * before[0] + R[k, 1] * before[1] + R[k, 2] * before[2]
-        e[k] = n - after[k]
-        e[3] -= n * t[k]
+def _normal_equations(terms: Terms, R: F64, t: F64, scale2: float, H: F64, g: F64) -> tuple[float, float]:
+    """Fill H (6, 6) and g (6,) with Geman–McClure weights at the squared scale; return the weighted χ² and number of components."""
+    for i in range(6):
+        g[i] = 0.0
+        for j in range(6):
+            H[i, j] = 0.0
+    e4, J4 = np.empty(4), np.zeros((4, 6))
+    chi2, components = _add_points(terms, R, t, scale2, H, g)
+    for i in range(len(terms.planes_before)):
+        _plane_residual(terms.planes_before[i], terms.planes_after[i], R, t, e4)
+        distance = _plane_distance2(e4, terms.plane_information[i])
+        w = (scale2 / (scale2 + distance)) ** 2
+        chi2 += w * distance
+        components += 3.0 * w
+        x, y, z = e4[0] + terms.planes_after[i, 0], e4[1] + terms.planes_after[i, 1], e4[2] + terms.planes_after[i, 2]
+        J4[0, 1], J4[0, 2], J4[1, 0], J4[1, 2], J4[2, 0], J4[2, 1] = z, -y, -z, x, y, -x
+        J4[3, 0], J4[3, 1], J4[3, 2] = t[1] * z - t[2] * y, t[2] * x - t[0] * z, t[0] * y - t[1] * x  # -(phi × n)·t = -phi·(n × t)
+        J4[3, 3], J4[3, 4], J4[3, 5] = -x, -y, -z
+        _add_plane(e4, J4, terms.plane_information[i], w, H, g)
+    for i in range(6):
+        for j in range(i):
+            H[j, i] = H[i, j]
+    return chi2, components
 
 
 @kernel
-def _add_places(terms: Terms, R: F64, t: F64, scale2: float, H: F64, g: F64) -> tuple[float, float]:
-    """Add w JᵀLJ of all places to the lower triangle of H and w JᵀLe to g, with p = R p_previous and J = (-[p]×, I); in scalars, for places are most
-    of the work. Returns the weighted χ² and number of components."""
+def _add_points(terms: Terms, R: F64, t: F64, scale2: float, H: F64, g: F64) -> tuple[float, float]:
+    """Add `w JᵀLJ` of all points to the lower triangle of H and `w JᵀLe` to g; return the weighted χ² and number of components.
+
+    With p = R p_previous, J = (-[p]×, I). In scalars, since points are most of the work."""
     chi2, components, L = 0.0, 0.0, terms.information
     for i in range(len(terms.before_m)):
         x, y, z = terms.before_m[i, 0], terms.before_m[i, 1], terms.before_m[i, 2]
@@ -295,7 +359,7 @@ def _add_places(terms: Terms, R: F64, t: F64, scale2: float, H: F64, g: F64) -> 
 
 @kernel
 def _add_plane(e: F64, J: F64, L: F64, w: float, H: F64, g: F64) -> None:
-    """Add w JᵀLJ to the lower triangle of H and w JᵀLe to g for J (4, 6)."""
+    """Add `w JᵀLJ` of one plane to the lower triangle of H and `w JᵀLe` to g, for J (4, 6)."""
     for i in range(4):
         for b in range(6):
             LJ = 0.0
@@ -304,56 +368,3 @@ def _add_plane(e: F64, J: F64, L: F64, w: float, H: F64, g: F64) -> None:
             g[b] += LJ * e[i]
             for a in range(b, 6):
                 H[a, b] += J[i, a] * LJ
-
-
-@kernel
-def _normal_equations(terms: Terms, R: F64, t: F64, scale2: float, H: F64, g: F64) -> tuple[float, float]:
-    """Fill H (6, 6) and g (6,) with Geman–McClure weights at the squared scale; returns the weighted χ² and the weighted number of components."""
-    for i in range(6):
-        g[i] = 0.0
-        for j in range(6):
-            H[i, j] = 0.0
-    e4, J4 = np.empty(4), np.zeros((4, 6))
-    chi2, components = _add_places(terms, R, t, scale2, H, g)
-    for i in range(len(terms.planes_before)):
-        _plane_residual(terms.planes_before[i], terms.planes_after[i], R, t, e4)
-        distance = _plane_distance(e4, terms.plane_information[i])
-        w = (scale2 / (scale2 + distance)) ** 2
-        chi2 += w * distance
-        components += 3.0 * w
-        x, y, z = e4[0] + terms.planes_after[i, 0], e4[1] + terms.planes_after[i, 1], e4[2] + terms.planes_after[i, 2]
-        J4[0, 1], J4[0, 2], J4[1, 0], J4[1, 2], J4[2, 0], J4[2, 1] = z, -y, -z, x, y, -x
-        J4[3, 0], J4[3, 1], J4[3, 2] = t[1] * z - t[2] * y, t[2] * x - t[0] * z, t[0] * y - t[1] * x  # -(phi × n)·t = -phi·(n × t)
-        J4[3, 3], J4[3, 4], J4[3, 5] = -x, -y, -z
-        _add_plane(e4, J4, terms.plane_information[i], w, H, g)
-    for i in range(6):
-        for j in range(i):
-            H[j, i] = H[i, j]
-    return chi2, components
-
-
-@kernel
-def _solve(terms: Terms, R: F64, t: F64, prior: F64, scale2: float) -> tuple[F64, float, float]:
-    """Moves R and t, with a prior (6,) information on the way moved; returns H (6, 6), the weighted χ² and the summed weights."""
-    H, A, g = np.zeros((6, 6)), np.zeros((6, 6)), np.zeros(6)
-    phi, step = np.zeros(3), np.zeros(6)  # phi: since the start
-    chi2, components = 0.0, 0.0
-    settled = False
-    for _ in range(40):
-        chi2, components = _normal_equations(terms, R, t, scale2, H, g)
-        if settled:
-            break
-        size = 0.0
-        for i in range(6):
-            g[i] = -g[i] - prior[i] * (phi[i] if i < 3 else t[i - 3])
-            for j in range(6):
-                A[i, j] = H[i, j] + (prior[i] if i == j else 0.0)
-        solve_positive(A, g, step)
-        turn_left(step, R)
-        for i in range(3):
-            phi[i] += step[i]
-            t[i] += step[3 + i]
-            size += step[i] * step[i] + step[3 + i] * step[3 + i]
-        settled = scale2 <= GATE2 and size < 1e-12
-        scale2 = max(0.5 * scale2, GATE2)
-    return H, chi2, components / 3.0

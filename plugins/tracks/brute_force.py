@@ -1,4 +1,4 @@
-"""Features of the previous frame found again wherever they are."""
+"""Tracking by exhaustive descriptor matching."""
 
 from __future__ import annotations
 
@@ -17,11 +17,12 @@ from trihedron.plugins.tracks.common import NO_PAIRS, Features, StructureGates, 
 @register("tracks", "brute_force")
 @dataclass(frozen=True)
 class BruteForce:
-    """Key points whose descriptors are each other's nearest among all (as RGB-D SLAM matches them: Endres et al., T-RO 2014): no motion is
-    predicted, and wrong pairs are left to who uses them. Lines and planes are then paired by the points' motion."""
+    """Match key points whose descriptors are mutual nearest neighbours (RGB-D SLAM: Endres et al., T-RO 2014), without a predicted motion.
+
+    Outliers remain in the pairs. Lines and planes are then matched by the points' motion."""
 
     ratio: PositiveShare = 0.9  # best to second best descriptor
-    max_age: PositiveInt = 10  # frames; older features are not looked for
+    max_age: PositiveInt = 10  # frames; older features are not matched
     prior_deg: PositiveFloat = 10.0  # of no rotation, per frame
     prior_m: PositiveFloat = 0.1  # of no translation, per frame
     angle_px: PositiveFloat = 0.002  # rad, of a pixel
@@ -37,7 +38,7 @@ class BruteForce:
         previous_segments: Segments | None,
         previous_planes: Planes | None,
     ) -> Tracks | None:
-        """Pairs with the previous frame; None for the first frame, no pairs when the previous features are too old."""
+        """Return the pairs with the previous frame; None for the first frame, no pairs when the previous features are too old."""
         if previous_keypoints is None or previous_segments is None or previous_planes is None:
             return None
         now, before = Features(keypoints, segments, planes), Features(previous_keypoints, previous_segments, previous_planes)

@@ -11,14 +11,14 @@ from trihedron.pipeline.core.types import F32, F64, I32, Camera, Keypoints, Plan
 from trihedron.plugins.shared.descriptors import match_lines
 from trihedron.plugins.shared.linalg import constant
 from trihedron.plugins.shared.plane_association import associate_planes
-from trihedron.plugins.tracks.common_kernels import predicted_kernel, rows_of_pairs
+from trihedron.plugins.tracks.common_kernels import matched_pairs, predicted_kernel
 
 NO_PAIRS = np.zeros((0, 2), np.int32)
 
 
 @dataclass(frozen=True)
 class Features:
-    """What one frame shows."""
+    """The features of one frame."""
 
     keypoints: Keypoints
     segments: Segments
@@ -27,7 +27,7 @@ class Features:
 
 @dataclass(frozen=True)
 class StructureGates:
-    """How far lines and planes may be from where a known motion puts them."""
+    """Gates on lines and planes about their predicted positions."""
 
     line_deg: float = 8.0
     line_px: float = 8.0
@@ -38,16 +38,16 @@ class StructureGates:
     plane_m: float = 0.05
 
     def pairs(self, now: Features, before: Features, camera: Camera, R: F64, t: F64) -> tuple[I32, I32]:
-        """(m, 2) lines and (p, 2) planes, rows (previous, current), found around the motion `p_current = R p_previous + t`."""
+        """Match lines (m, 2) and planes (p, 2), rows (previous, current), near their prediction by `p_current = R p_previous + t`."""
         predicted = predict_pixels(before.segments.endpoints_px, before.segments.endpoints_m, camera, R, t).astype(np.float32)
-        known, found = before.segments.descriptors, now.segments
+        described, found = before.segments.descriptors, now.segments
         lines = match_lines(
-            predicted, known, found.endpoints_px, found.descriptors, self.line_deg, self.line_px, self.line_overlap, self.line_bits, self.ratio
+            predicted, described, found.endpoints_px, found.descriptors, self.line_deg, self.line_px, self.line_overlap, self.line_bits, self.ratio
         )
-        moved = transform_planes(pose_matrix(R, t), before.planes.coefficients)
+        known = transform_planes(pose_matrix(R, t), before.planes.coefficients)
         samples = (before.planes.samples_m @ R.T + t).astype(np.float32)
-        planes = associate_planes(now.planes.coefficients, now.planes.samples_m, moved, samples, self.plane_deg, self.plane_m, many_to_one=True)
-        return rows_of_pairs(lines), np.ascontiguousarray(planes[:, ::-1])
+        planes = associate_planes(now.planes.coefficients, now.planes.samples_m, known, samples, self.plane_deg, self.plane_m, many_to_one=True)
+        return matched_pairs(lines), np.ascontiguousarray(planes[:, ::-1])
 
 
 def tracks_value(now: Features, before: Features, pairs: tuple[I32, I32, I32], R_current_previous: F64) -> Tracks:
@@ -69,10 +69,9 @@ def tracks_value(now: Features, before: Features, pairs: tuple[I32, I32, I32], R
     )
 
 
-# Where features of one image appear in another after a motion.
-
 def predict_pixels(pixels: F32, points_m: F32, camera: Camera, R: F64, t: F64) -> F64:
-    """Pixels (..., 2) of the previous image moved by (R, t), NaN behind the camera; those without a 3D point (..., 3) as if infinitely far."""
+    """Project pixels (..., 2) of the previous image by the motion (R, t), NaN behind the camera; those without a 3D point (..., 3) as points at
+    infinity."""
     intrinsics = (float(camera.fx), float(camera.fy), float(camera.cx), float(camera.cy))
     flat = constant(pixels.reshape(-1, 2), np.float32), constant(points_m.reshape(-1, 3), np.float32)
     return np.asarray(predicted_kernel(*flat, intrinsics, constant(R, np.float64), constant(t, np.float64)).reshape(pixels.shape))

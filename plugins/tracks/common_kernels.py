@@ -1,4 +1,4 @@
-"""Numba kernels of `common.py`."""
+"""Kernels of `common.py`: pixels predicted by a motion, and pairs of rows."""
 # mypy: disable-error-code="arg-type, assignment, index, return-value"
 
 from __future__ import annotations
@@ -10,8 +10,8 @@ from trihedron.pipeline.core.types import F32, F64, I32
 
 
 @kernel
-def rows_of_pairs(found: I32) -> I32:
-    """(n,) row of the current frame for each previous one, or -1 -> (k, 2)."""
+def matched_pairs(found: I32) -> I32:
+    """Convert (n,) current rows of each previous feature, -1 = none, to pairs (k, 2)."""
     out, k = np.empty((len(found), 2), np.int32), 0
     for i in range(len(found)):
         if found[i] >= 0:
@@ -22,15 +22,17 @@ def rows_of_pairs(found: I32) -> I32:
 
 @kernel
 def predicted_kernel(pixels: F32, points_m: F32, intrinsics: tuple[float, float, float, float], R: F64, t: F64) -> F64:
-    """`predict_pixels` of n."""
+    """`predict_pixels` of n pixels."""
     out = np.empty((len(pixels), 2))
     for i in range(len(pixels)):
-        out[i, 0], out[i, 1] = moved_pixel(pixels[i, 0], pixels[i, 1], points_m[i, 0], points_m[i, 1], points_m[i, 2], intrinsics, R, t)
+        out[i, 0], out[i, 1] = predicted_pixel(pixels[i, 0], pixels[i, 1], points_m[i, 0], points_m[i, 1], points_m[i, 2], intrinsics, R, t)
     return out
 
 
 @kernel
-def moved_pixel(u: float, v: float, x: float, y: float, z: float, camera: tuple[float, float, float, float], R: F64, t: F64) -> tuple[float, float]:
+def predicted_pixel(
+    u: float, v: float, x: float, y: float, z: float, camera: tuple[float, float, float, float], R: F64, t: F64
+) -> tuple[float, float]:
     """`predict_pixels` of the pixel (u, v) with the point (x, y, z)."""
     fx, fy, cx, cy = camera
     near = 1.0
@@ -46,13 +48,13 @@ def moved_pixel(u: float, v: float, x: float, y: float, z: float, camera: tuple[
 
 
 @kernel
-def nearest_pixels(pixels: F32, among: F32) -> tuple[I32, F64]:
-    """(n,) rows of the nearest of `among` (m, 2), m > 0, to each of the pixels (n, 2), the first of equals, and their distances (n,), px."""
+def nearest_pixels(pixels: F32, candidates: F32) -> tuple[I32, F64]:
+    """Rows (n,) of the nearest of `candidates` (m, 2), m > 0, to each of the pixels (n, 2), the first of equals, and their distances (n,), px."""
     rows, distances = np.zeros(len(pixels), np.int32), np.empty(len(pixels))
     for i in range(len(pixels)):
         best = np.inf
-        for j in range(len(among)):
-            x, y = pixels[i, 0] - among[j, 0], pixels[i, 1] - among[j, 1]
+        for j in range(len(candidates)):
+            x, y = pixels[i, 0] - candidates[j, 0], pixels[i, 1] - candidates[j, 1]
             if x * x + y * y < best:
                 best, rows[i] = x * x + y * y, j
         distances[i] = np.sqrt(best)

@@ -1,4 +1,4 @@
-"""Features of the previous frame found again by optical flow."""
+"""Tracking by optical flow."""
 
 from __future__ import annotations
 
@@ -20,16 +20,16 @@ from trihedron.plugins.tracks.common_kernels import nearest_pixels
 @register("tracks", "optical_flow")
 @dataclass(frozen=True)
 class OpticalFlow:
-    """Follow the previous frame's key points by their image patches (Lucas and Kanade, 1981, on a pyramid: Bouguet, 2000), there and back, and take
-    this frame's key point where one ends: no descriptor is looked at, and points without depth stay. Lines and planes are then paired by the
-    points' motion."""
+    """Track the previous key points by pyramidal Lucas–Kanade (Lucas and Kanade, 1981; Bouguet, 2000) with a forward–backward check, and snap each
+    to this frame's nearest key point. No descriptor is used, and points without depth remain. Lines and planes are then matched by the points'
+    motion."""
 
     window_px: Annotated[int, Range(3)] = 15
     levels: NonNegativeInt = 3  # of the pyramid above the image
-    back_px: PositiveFloat = 1.0  # a point must come back to within this
-    snap_px: PositiveFloat = 1.5  # σ of the key point's own, between where the flow ends and the key point taken
-    max_age: PositiveInt = 10  # frames; older features are not looked for
-    prior_deg: PositiveFloat = 2.0  # of the last rotation once more
+    back_px: PositiveFloat = 1.0  # forward–backward error at most
+    snap_px: PositiveFloat = 1.5  # standard deviations of the key point, between the end of the flow and the key point
+    max_age: PositiveInt = 10  # frames; older features are not matched
+    prior_deg: PositiveFloat = 2.0  # of the repeated last rotation
     prior_m: PositiveFloat = 0.1  # of no translation, per frame
     angle_px: PositiveFloat = 0.002  # rad, of a pixel
     plane_floor_deg: PositiveFloat = 0.3
@@ -46,7 +46,7 @@ class OpticalFlow:
         previous_planes: Planes | None,
         previous: Tracks | None,
     ) -> Tracks | None:
-        """Pairs with the previous frame; None for the first frame, no pairs when the previous features are too old."""
+        """Return the pairs with the previous frame; None for the first frame, no pairs when the previous features are too old."""
         if previous_frame is None or previous_keypoints is None or previous_segments is None or previous_planes is None:
             return None
         now, before = Features(keypoints, segments, planes), Features(previous_keypoints, previous_segments, previous_planes)
@@ -61,7 +61,7 @@ class OpticalFlow:
         return tracks_value(now, before, (points, *StructureGates().pairs(now, before, frame.camera, motion.R, motion.t)), motion.R)
 
     def _points(self, frame: Frame, previous_frame: Frame, now: Keypoints, before: Keypoints) -> I32:
-        """(n, 2) rows (previous, current), each key point at most once."""
+        """Match key points, rows (n, 2) (previous, current), each at most once."""
         if not (len(before.pixels) and len(now.pixels)):
             return NO_PAIRS
         there, found = self._flow(previous_frame, frame, before.pixels)
@@ -77,7 +77,7 @@ class OpticalFlow:
         return np.stack([rows[chosen], nearest[chosen]], axis=1).astype(np.int32).reshape(-1, 2)
 
     def _flow(self, start: Frame, end: Frame, pixels: F32) -> tuple[F32, Bool]:
-        """Where pixels (n, 2) of one frame are in the other, and (n,) whether they were found."""
+        """Track pixels (n, 2) of one frame in the other; also the mask (n,) of those found."""
         window = (self.window_px, self.window_px)
         moved, status, _ = cv2.calcOpticalFlowPyrLK(start.gray, end.gray, pixels[:, None], None, winSize=window, maxLevel=self.levels)
         return moved[:, 0], status[:, 0] > 0

@@ -1,4 +1,4 @@
-"""Features of the previous frame found again where the rotation says they are."""
+"""Tracking by projection with a predicted rotation."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ from trihedron.plugins.shared.linalg import constant
 from trihedron.plugins.shared.plane_association_kernels import associated
 from trihedron.plugins.shared.relative_motion import Motion, solve_motion
 from trihedron.plugins.tracks.common import NO_PAIRS, Features, tracks_value
-from trihedron.plugins.tracks.common_kernels import rows_of_pairs
-from trihedron.plugins.tracks.projection_kernels import Intrinsics, Places, agreeing_kernel, moved
+from trihedron.plugins.tracks.common_kernels import matched_pairs
+from trihedron.plugins.tracks.projection_kernels import FeaturePositions, Intrinsics, consistent_pairs, predict_features
 
 NOT_MOVED = np.zeros(3)
 
@@ -27,14 +27,14 @@ NOT_MOVED = np.zeros(3)
 @register("tracks", "projection")
 @dataclass(frozen=True)
 class Projection:
-    """Project the previous features with the predicted rotation, match by descriptor near there, solve the motion, and look again closer to where
-    it puts them. Features that contradict the motion are left out; it is deterministic throughout.
+    """Project the previous features with the predicted rotation, match by descriptor near there, estimate the motion, and match again in a smaller
+    radius about its prediction. Pairs that contradict the motion are rejected. Deterministic.
 
-    The rotation comes from the Manhattan frames of the two images, else from the last motion, else there is none; where the two differ the one that
-    finds more features is right. `R_current_previous` is the prediction corrected by what was found."""
+    The rotation is predicted from the Manhattan frames of the two images, else from the last motion, else as none; where the two differ, that with
+    more matches is selected. `R_current_previous` is the rotation estimated from the pairs."""
 
-    radius_px: PositiveFloat = 25.0  # searched at first: the translation is unknown
-    near_px: PositiveFloat = 8.0  # searched once the motion is known
+    radius_px: PositiveFloat = 25.0  # of the first search: the translation is unknown
+    near_px: PositiveFloat = 8.0  # of the second search, about the estimated motion
     enough: NonNegativeInt = 30  # key points; with fewer the first search is repeated with twice the radius
     max_bits: int = 64  # of 256, descriptor distance of key points
     max_l2: int = 250  # the same for descriptors compared by Euclidean distance
@@ -45,9 +45,9 @@ class Projection:
     line_bits: int = 80  # of 256
     plane_deg: AcuteDeg = 8.0
     plane_m: PositiveFloat = 0.15  # distance at first
-    plane_near_m: PositiveFloat = 0.05  # and once the motion is known
-    max_age: PositiveInt = 10  # frames; older features are not looked for
-    error_px: PositiveFloat = 4.0  # sigma_px a key point may miss its place by
+    plane_near_m: PositiveFloat = 0.05  # about the estimated motion
+    max_age: PositiveInt = 10  # frames; older features are not matched
+    error_px: PositiveFloat = 4.0  # standard deviations between a key point and its prediction
     prior_deg: PositiveFloat = 2.0  # of the predicted rotation
     prior_m: PositiveFloat = 0.1  # of no translation, per frame
     angle_px: PositiveFloat = 0.002  # rad, of a pixel
@@ -70,7 +70,7 @@ class Projection:
         previous_manhattan: ManhattanFrame | None,
         previous: Tracks | None,
     ) -> Tracks | None:
-        """Pairs with the previous frame; None for the first frame, no pairs when the previous features are too old."""
+        """Return the pairs with the previous frame; None for the first frame, no pairs when the previous features are too old."""
         if previous_keypoints is None or previous_segments is None or previous_planes is None:
             return None
         now, before = Features(keypoints, segments, planes), Features(previous_keypoints, previous_segments, previous_planes)
@@ -86,18 +86,18 @@ class Projection:
         motion = self._motion(first, now, gap)
         again = search(motion.R, motion.t, self.near_px, self.plane_near_m)
         again = again if _count(again) >= 0.7 * _count(first) else first
-        return search.agreeing(again, self._motion(again, now, gap), self.error_px)
+        return search.consistent(again, self._motion(again, now, gap), self.error_px)
 
     def _predictions(
         self, gap: int, previous_index: int, manhattan: ManhattanFrame | None, previous_manhattan: ManhattanFrame | None, previous: Tracks | None
     ) -> list[F64]:
-        """Rotations R_current_previous worth trying, at least one, no two alike."""
+        """Predicted rotations R_current_previous to try, at least one, all different."""
         found = []
         if previous is not None and previous.index == previous_index and previous.index > previous.previous_index:
             share = gap / (previous.index - previous.previous_index)
             found.append(exp_so3(share * log_so3(previous.R_current_previous)))
         if manhattan is not None and previous_manhattan is not None and previous_manhattan.index == previous_index:
-            relative = _turn(manhattan, previous_manhattan)
+            relative = _manhattan_rotation(manhattan, previous_manhattan)
             if relative is not None and all(rotation_angle_deg(relative @ R.T) > self.prior_deg for R in found):
                 found.append(relative)
         return found or [np.eye(3)]
@@ -122,8 +122,8 @@ class Projection:
         return solve_motion(tracks, *seen, self.angle_px, self.plane_floor_deg, self.prior_deg * gap, self.prior_m * gap)
 
 
-def _turn(now: ManhattanFrame, before: ManhattanFrame) -> F64 | None:
-    """(3, 3) R_current_previous by the best supported Manhattan frame that both have in view, under the same id; None when there is none."""
+def _manhattan_rotation(now: ManhattanFrame, before: ManhattanFrame) -> F64 | None:
+    """R_current_previous (3, 3) by the best supported Manhattan frame that both frames observe under the same id; None without one."""
     if not (now.supported and before.supported):
         return None
     seen = {int(before.ids[k]): k for k in np.flatnonzero(before.inliers.any(axis=1))}
@@ -136,7 +136,7 @@ def _count(tracks: Tracks) -> int:
 
 
 class Gates(NamedTuple):
-    """How much the features of a pair may differ, apart from their place; see `match_near`, `match_lines` and `associate_planes`."""
+    """Limits on the difference of two matched features, apart from position; see `match_near`, `match_lines` and `associate_planes`."""
 
     octave_step: int
     compared_by: int
@@ -151,7 +151,7 @@ class Gates(NamedTuple):
 
 @dataclass(frozen=True)
 class Search:
-    """Looks for the features of one frame in the next."""
+    """Matches the features of one frame with the next."""
 
     before: Features
     now: Features
@@ -159,10 +159,10 @@ class Search:
     gates: Gates
 
     def __call__(self, R: F64, t: F64, radius_px: float, plane_m: float) -> Tracks:
-        """All pairs found around the motion `p_current = R p_previous + t`: points and lines within `radius_px`, planes within `plane_m`."""
+        """Match near the prediction by `p_current = R p_previous + t`: points and lines within `radius_px`, planes within `plane_m`."""
         gates, walls, seen, found = self.gates, self.before.planes, self.now.planes, self._now
         motion = constant(R, np.float64), constant(t, np.float64)
-        pixels, ends, planes, samples = moved(self._before, walls.coefficients, walls.samples_m, self._camera, *motion)
+        pixels, ends, planes, samples = predict_features(self._before, walls.coefficients, walls.samples_m, self._camera, *motion)
         (words, line_words), (words_now, line_words_now) = self._words
         points = near_matches(
             pixels, *words, self.before.keypoints.octaves, found.pixels, *words_now, self.now.keypoints.octaves,
@@ -173,14 +173,13 @@ class Search:
             gates.line_sine, float(radius_px), gates.line_overlap, gates.lines_compared_by, gates.line_bits, gates.ratio,
         )  # fmt: skip
         same = associated(seen.coefficients, seen.samples_m, planes, samples, gates.plane_cosine, plane_m, True)
-        return tracks_value(self.now, self.before, (rows_of_pairs(points), rows_of_pairs(lines), np.ascontiguousarray(same[:, ::-1])), R)
+        return tracks_value(self.now, self.before, (matched_pairs(points), matched_pairs(lines), np.ascontiguousarray(same[:, ::-1])), R)
 
-    def agreeing(self, tracks: Tracks, motion: Motion, error_px: float) -> Tracks:
-        """Without the key points and lines that the motion puts elsewhere than they were found, by more than `error_px` σ, and key points that never
-        had a depth."""
+    def consistent(self, tracks: Tracks, motion: Motion, error_px: float) -> Tracks:
+        """Reject the key points and lines farther than `error_px` σ from their prediction by the motion, and key points without depth in both."""
         R, t = constant(motion.R, np.float64), constant(motion.t, np.float64)
         unsure_px = float(self.camera.fx * np.sqrt(np.linalg.eigvalsh(motion.covariance[3:, 3:])[-1]))
-        points, lines = agreeing_kernel(tracks.keypoints, tracks.segments, self._before, self._now, self._camera, R, t, unsure_px, error_px)
+        points, lines = consistent_pairs(tracks.keypoints, tracks.segments, self._before, self._now, self._camera, R, t, unsure_px, error_px)
         return tracks_value(self.now, self.before, (points, lines, tracks.planes), motion.R)
 
     @cached_property
@@ -188,20 +187,20 @@ class Search:
         return float(self.camera.fx), float(self.camera.fy), float(self.camera.cx), float(self.camera.cy)
 
     @cached_property
-    def _before(self) -> Places:
-        return _places(self.before)
+    def _before(self) -> FeaturePositions:
+        return _positions(self.before)
 
     @cached_property
-    def _now(self) -> Places:
-        return _places(self.now)
+    def _now(self) -> FeaturePositions:
+        return _positions(self.now)
 
     @cached_property
     def _words(self) -> tuple[tuple[tuple[U64, U8], U64], tuple[tuple[U64, U8], U64]]:
-        """Of both frames the descriptors of points, as words and bytes, and of lines, as words."""
+        """Descriptors of both frames: of points as words and bytes, of lines as words."""
         before, now = ((words_of(of.keypoints.descriptors), words_of(of.segments.descriptors)[0]) for of in (self.before, self.now))
         return before, now
 
 
-def _places(features: Features) -> Places:
+def _positions(features: Features) -> FeaturePositions:
     points, lines = features.keypoints, features.segments
-    return Places(points.pixels, points.points_m, points.sigma_px, lines.endpoints_px, lines.endpoints_m)
+    return FeaturePositions(points.pixels, points.points_m, points.sigma_px, lines.endpoints_px, lines.endpoints_m)

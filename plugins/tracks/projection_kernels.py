@@ -1,4 +1,4 @@
-"""Numba kernels of `projection.py`."""
+"""Kernels of `projection.py`: features of the previous frame predicted by a motion, and the pairs that agree with it."""
 # mypy: disable-error-code="arg-type, assignment, index, return-value"
 
 from __future__ import annotations
@@ -10,15 +10,13 @@ import numpy as np
 from trihedron.pipeline.core.kernel import kernel
 from trihedron.pipeline.core.types import F32, F64, I32
 from trihedron.plugins.shared.plane_association_kernels import moved_planes
-from trihedron.plugins.tracks.common_kernels import moved_pixel
-
-# The features of the previous frame looked for around a motion, and those found that agree with it.
+from trihedron.plugins.tracks.common_kernels import predicted_pixel
 
 Intrinsics = tuple[float, float, float, float]
 
 
-class Places(NamedTuple):
-    """Where a frame shows its points and lines, as kernels read it."""
+class FeaturePositions(NamedTuple):
+    """Points and lines of a frame, as kernels read them."""
 
     pixels: F32  # (n, 2)
     points_m: F32  # (n, 3)
@@ -28,36 +26,36 @@ class Places(NamedTuple):
 
 
 @kernel
-def moved(before: Places, planes: F64, samples_m: F32, camera: Intrinsics, R: F64, t: F64) -> tuple[F32, F32, F64, F32]:
-    """Pixels (n, 2) and ends of lines (m, 2, 2) of the previous frame, its planes (p, 4) and points on them (p, s, 3), where the motion puts them."""
+def predict_features(before: FeaturePositions, planes: F64, samples_m: F32, camera: Intrinsics, R: F64, t: F64) -> tuple[F32, F32, F64, F32]:
+    """Predict pixels (n, 2) and ends of lines (m, 2, 2) of the previous frame, its planes (p, 4) and points on them (p, s, 3), by a motion."""
     pixels, ends = np.empty((len(before.pixels), 2), np.float32), np.empty((len(before.endpoints_px), 2, 2), np.float32)
     for i in range(len(pixels)):
-        pixels[i, 0], pixels[i, 1] = _there(before.pixels, before.points_m, i, camera, R, t)
+        pixels[i, 0], pixels[i, 1] = _predicted_point(before.pixels, before.points_m, i, camera, R, t)
     for i in range(len(ends)):
         for e in range(2):
-            ends[i, e, 0], ends[i, e, 1] = _end_there(before, i, e, camera, R, t)
+            ends[i, e, 0], ends[i, e, 1] = _predicted_end(before, i, e, camera, R, t)
     coefficients, samples = moved_planes(planes, samples_m, R, t)
     return pixels, ends, coefficients, samples
 
 
 @kernel
-def _there(pixels: F32, points_m: F32, i: int, camera: Intrinsics, R: F64, t: F64) -> tuple[float, float]:
-    """Row i of key points where the motion puts it."""
-    return moved_pixel(pixels[i, 0], pixels[i, 1], points_m[i, 0], points_m[i, 1], points_m[i, 2], camera, R, t)
+def _predicted_point(pixels: F32, points_m: F32, i: int, camera: Intrinsics, R: F64, t: F64) -> tuple[float, float]:
+    """Predict key point i."""
+    return predicted_pixel(pixels[i, 0], pixels[i, 1], points_m[i, 0], points_m[i, 1], points_m[i, 2], camera, R, t)
 
 
 @kernel
-def _end_there(shown: Places, i: int, end: int, camera: Intrinsics, R: F64, t: F64) -> tuple[float, float]:
-    """An end of line i where the motion puts it."""
+def _predicted_end(shown: FeaturePositions, i: int, end: int, camera: Intrinsics, R: F64, t: F64) -> tuple[float, float]:
+    """Predict an end of line i."""
     px, m = shown.endpoints_px, shown.endpoints_m
-    return moved_pixel(px[i, end, 0], px[i, end, 1], m[i, end, 0], m[i, end, 1], m[i, end, 2], camera, R, t)
+    return predicted_pixel(px[i, end, 0], px[i, end, 1], m[i, end, 0], m[i, end, 1], m[i, end, 2], camera, R, t)
 
 
 @kernel
-def agreeing_kernel(
-    points: I32, lines: I32, before: Places, now: Places, camera: Intrinsics, R: F64, t: F64, unsure_px: float, error_px: float
+def consistent_pairs(
+    points: I32, lines: I32, before: FeaturePositions, now: FeaturePositions, camera: Intrinsics, R: F64, t: F64, unsure_px: float, error_px: float
 ) -> tuple[I32, I32]:
-    """The pairs (previous, current) of points and lines that agree with a motion, which leaves `unsure_px` open of what is at depth 1."""
+    """Select the pairs (previous, current) of points and lines that agree with a motion whose translation has a σ of `unsure_px` at depth 1."""
     good_points, good_lines, n, m = np.empty((len(points), 2), np.int32), np.empty((len(lines), 2), np.int32), 0, 0
     R_back, t_back = np.empty((3, 3)), np.empty(3)
     for a in range(3):
@@ -68,11 +66,11 @@ def agreeing_kernel(
         i, j = points[k, 0], points[k, 1]
         then, since = float(before.points_m[i, 2]), float(now.points_m[j, 2])
         if np.isfinite(then):
-            u, v = _there(before.pixels, before.points_m, i, camera, R, t)
+            u, v = _predicted_point(before.pixels, before.points_m, i, camera, R, t)
             x, y = u - now.pixels[j, 0], v - now.pixels[j, 1]
             depth = since if since < then else then
         elif np.isfinite(since):
-            u, v = _there(now.pixels, now.points_m, j, camera, R_back, t_back)
+            u, v = _predicted_point(now.pixels, now.points_m, j, camera, R_back, t_back)
             x, y, depth = u - before.pixels[i, 0], v - before.pixels[i, 1], since
         else:
             continue
@@ -85,7 +83,7 @@ def agreeing_kernel(
         along_x, along_y = now.endpoints_px[j, 1, 0] - x, now.endpoints_px[j, 1, 1] - y
         length, off = max(np.sqrt(along_x * along_x + along_y * along_y), 1e-9), 0.0
         for e in range(2):
-            u, v = _end_there(before, i, e, camera, R, t)
+            u, v = _predicted_end(before, i, e, camera, R, t)
             off += 0.5 * abs((v - y) * along_x - (u - x) * along_y) / length
         depth = min(float(before.endpoints_m[i, 0, 2]), float(before.endpoints_m[i, 1, 2]))
         if off <= error_px * (1.0 + unsure_px / (depth if depth > 0.0 else 1.0)):

@@ -1,9 +1,9 @@
-"""Translation from tracked points with the rotation known: the de-rotated reprojection error, which is linear in it.
+"""Translation from tracked points with a known rotation: the de-rotated reprojection error, which is linear in it.
 
-With the previous point turned into this frame's axes, q = R_current_previous p, and the unknown step s with `p_current = q + s`, a point seen at
-(x, y) on the image plane gives `(1, 0, -x)·s = x q_z - q_x` and `(0, 1, -y)·s = y q_z - q_y`; one without depth, of which only the rays b and b' are
-known, gives `(b × b')·s = 0` (Zhang, Kaess, Singh, IROS 2014; Kim, Coltin, Kim, ICRA 2018). That one is taken of the direction of s: noise would
-make s itself shorter.
+With the previous point rotated into the current camera's axes, q = R_current_previous p, and the unknown translation s in `p_current = q + s`, a
+point observed at (x, y) on the image plane gives `(1, 0, -x)·s = x q_z - q_x` and `(0, 1, -y)·s = y q_z - q_y`; one without depth, of which only the
+rays b and b' are known, gives `(b × b')·s = 0` (Zhang, Kaess, Singh, IROS 2014; Kim, Coltin, Kim, ICRA 2018). That residual is normalised by |s|:
+noise would bias s towards zero.
 """
 
 from __future__ import annotations
@@ -17,13 +17,13 @@ from trihedron.pipeline.core.types import F64, LOST, Camera, Keypoints, Pose, Ro
 
 ITERATIONS = 15
 CAUCHY = 2.385  # 95 % efficiency where the noise is Gaussian
-GATE = 3.0  # standard deviations, beyond which a point does not agree
-FLOOR_M = 0.01  # of the step, below which points without depth say no more: their rows' noise is a share of it
+GATE = 3.0  # standard deviations, beyond which a point is an outlier
+FLOOR_M = 0.01  # least |s| in the noise of points without depth, which is proportional to it
 SIGMAS = 0.849  # standard deviation in each of two directions, where the median length is 1
-ALONE = 4  # iterations of the points with depth alone: at a step of zero, those without depth agree with everything
+ALONE = 4  # first iterations, by points with depth alone: at s = 0 the others agree with everything
 
 
-class Rows(NamedTuple):
+class PointEquations(NamedTuple):
     """Linear equations `A s = b` of n points, two rows each (the second of a point without depth is zero)."""
 
     A: F64  # (n, 2, 3); b × b' in the first row of a point without depth
@@ -33,8 +33,8 @@ class Rows(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Step:
-    """`s` (3,) in this frame's axes with covariance (3, 3), how many points agree, and unit vectors (u, 3) along which nothing was measured."""
+class LinearTranslation:
+    """Translation `s` (3,) in the current camera frame with covariance (3, 3), the number of inliers, and unobservable unit vectors (u, 3)."""
 
     s: F64
     covariance: F64
@@ -42,9 +42,13 @@ class Step:
     unobservable: F64
 
 
-def point_rows(tracks: Tracks, now: Keypoints, before: Keypoints, camera: Camera, R_current_previous: F64, turn: F64, depthless: bool) -> Rows:
-    """The equations of the tracked points, those without depth where `depthless`. The rotation's error, of covariance `turn` (3, 3), is the same for
-    all of the latter: together they are no surer of the direction than it."""
+def point_equations(
+    tracks: Tracks, now: Keypoints, before: Keypoints, camera: Camera, R_current_previous: F64, rotation_covariance: F64, depthless: bool
+) -> PointEquations:
+    """Equations of the tracked points, those without depth where `depthless`.
+
+    The rotation's error, of covariance `rotation_covariance` (3, 3), is common to all of the latter, so its variance is multiplied by their number:
+    together they determine the direction no better than it."""
     i, j = tracks.keypoints.T
     x = camera.back_project(now.pixels[j].astype(np.float64), np.ones(len(j)))
     far = camera.back_project(before.pixels[i].astype(np.float64), np.ones(len(i))) @ R_current_previous.T
@@ -57,21 +61,22 @@ def point_rows(tracks: Tracks, now: Keypoints, before: Keypoints, camera: Camera
     A[~known], b[~known] = 0.0, 0.0
     A[~known, 0] = np.cross(far[~known], x[~known])
     sigma = np.hypot(now.sigma_px[j], before.sigma_px[i]).astype(np.float64) / camera.fx
-    sigma[~known] = np.sqrt(sigma[~known] ** 2 + np.count_nonzero(~known) * np.trace(turn) / 3.0)
+    sigma[~known] = np.sqrt(sigma[~known] ** 2 + np.count_nonzero(~known) * np.trace(rotation_covariance) / 3.0)
     used = (known & (q[:, 2] > 0.1)) | (~known & depthless)
-    return Rows(A[used], b[used], np.where(known, q[:, 2], np.nan)[used], sigma[used])
+    return PointEquations(A[used], b[used], np.where(known, q[:, 2], np.nan)[used], sigma[used])
 
 
-def solve_step(rows: Rows, start: F64, prior_m: float) -> Step:
-    """Iteratively reweighted least squares with Cauchy's weights and the scale of the median residual, from `start`; `prior_m` is the standard
-    deviation of a step about it, and a direction known no better than half of that is called unobservable."""
+def solve_translation(equations: PointEquations, start: F64, prior_m: float) -> LinearTranslation:
+    """Iteratively reweighted least squares with Cauchy's weights at the scale of the median residual, from `start`.
+
+    `prior_m` is the standard deviation of the translation about `start`; a direction whose σ is above half of that is unobservable."""
     s, prior = start.copy(), np.eye(3) / prior_m**2
     H, normalised = np.zeros((3, 3)), np.empty((0, 2))
-    with_depth = np.isfinite(rows.z)
-    for iteration in range(ITERATIONS if len(rows.z) else 0):
-        A, b = _linearised(rows, s)
-        reach = np.where(with_depth, np.maximum(rows.z + s[2], 0.1), np.linalg.norm(s) + FLOOR_M)
-        noise = reach * rows.sigma
+    with_depth = np.isfinite(equations.z)
+    for iteration in range(ITERATIONS if len(equations.z) else 0):
+        A, b = _linearise(equations, s)
+        reach = np.where(with_depth, np.maximum(equations.z + s[2], 0.1), np.linalg.norm(s) + FLOOR_M)
+        noise = reach * equations.sigma
         normalised = (np.einsum("nij,j->ni", A, s) - b) / noise[:, None]
         size = np.linalg.norm(normalised, axis=1)
         scale = max(SIGMAS * float(np.median(size[with_depth])) if with_depth.any() else 1.0, 0.3)
@@ -87,36 +92,36 @@ def solve_step(rows: Rows, start: F64, prior_m: float) -> Step:
             break
     values, vectors = np.linalg.eigh(H)
     inliers = int(np.count_nonzero(np.linalg.norm(normalised, axis=1) < GATE))
-    return Step(s, np.asarray(np.linalg.inv(H + prior), np.float64), inliers, vectors[:, values < (2.0 / prior_m) ** 2].T)
+    return LinearTranslation(s, np.asarray(np.linalg.inv(H + prior), np.float64), inliers, vectors[:, values < (2.0 / prior_m) ** 2].T)
 
 
-def _linearised(rows: Rows, s: F64) -> tuple[F64, F64]:
-    """The equations with those of points without depth as `(b × b')·s / |s| = 0` about s, times |s|."""
+def _linearise(equations: PointEquations, s: F64) -> tuple[F64, F64]:
+    """The equations with those of points without depth as `(b × b')·s / |s| = 0`, linearised about s, times |s|."""
     size = max(float(np.linalg.norm(s)), 1e-9)
     along = s / size
-    A, b = rows.A.copy(), rows.b.copy()
-    far = np.isnan(rows.z)
-    off = rows.A[far, 0] @ along
+    A, b = equations.A.copy(), equations.b.copy()
+    far = np.isnan(equations.z)
+    off = equations.A[far, 0] @ along
     A[far, 0] -= off[:, None] * along
     b[far, 0] = -size * off
     return A, b
 
 
-# What every estimator of the position with the rotation fixed says alike: the first frame's, and one that was not measured.
+# Values that every estimator of the position returns alike.
 
 
 def origin(rotation: Rotation) -> Translation:
-    """The first frame's position, the origin of the world, which is certain."""
+    """The first frame's position, the origin of the world, which is exact."""
     return Translation(rotation.index, rotation.stamp_ns, np.zeros(3), np.zeros((3, 3)), np.empty((0, 3)), np.zeros(3, np.int32), True)
 
 
 def unmeasured(rotation: Rotation, t_world_camera: F64, covariance: F64) -> Translation:
-    """A position (3,) that is only predicted, with its covariance (3, 3)."""
+    """A predicted position (3,) with its covariance (3, 3)."""
     return Translation(rotation.index, rotation.stamp_ns, t_world_camera, covariance, np.eye(3), np.zeros(3, np.int32), False)
 
 
-def handed_on(previous: Pose, held_too: bool = False) -> F64:
-    """(3, 3) covariance (world) that a pose which was lost, or with `held_too` held in some direction, hands on to what is put on top of it; others
-    hand on none: the world is where they say."""
+def propagated_covariance(previous: Pose, held_too: bool = False) -> F64:
+    """Covariance (3, 3) (world) that a previous pose propagates to the next: its own if it was lost, or with `held_too` unobservable in some
+    direction; else zero, since the world is defined by tracked poses."""
     R, known = previous.T_world_camera[:3, :3], previous.status != LOST and not (held_too and previous.unobservable)
     return np.zeros((3, 3)) if known else np.asarray(R @ previous.covariance[:3, :3] @ R.T)

@@ -10,20 +10,20 @@ import numpy as np
 from trihedron.pipeline.core.options import PositiveFloat, Range
 from trihedron.pipeline.core.registry import register
 from trihedron.pipeline.core.types import Camera, Keypoints, Map, Pose, Rotation, Tracks, Translation
-from trihedron.plugins.mapping.reference_keyframe import anchored
-from trihedron.plugins.translation.common import handed_on, origin, point_rows, solve_step, unmeasured
+from trihedron.plugins.mapping.reference_keyframe import transform_to_map
+from trihedron.plugins.translation.common import origin, point_equations, propagated_covariance, solve_translation, unmeasured
 
 
 @register("translation", "irls")
 @dataclass(frozen=True)
 class Irls:
     """The de-rotated reprojection error of tracked points, linear once the rotation is known: of those with depth (OPVO: Kim, Coltin, Kim, BMVC
-    2017), with `depthless` of those without as well (LPVO: the same, ICRA 2018; the paper's column "LPVO"). Lines and planes take no part.
+    2017), with `depthless` of those without as well (LPVO: the same, ICRA 2018; the paper's column "LPVO"). Lines and planes are not used.
 
-    What fewer than `min_points` agree on is no measurement: the camera is taken to stand still, and `estimated` is False."""
+    With fewer than `min_points` inliers the camera is predicted at rest, and `estimated` is False."""
 
-    depthless: bool = True  # points without depth say in which plane the step lies
-    motion_sigma_m: PositiveFloat = 0.1  # of a step, per frame: a weak prior that holds what no point sees
+    depthless: bool = True  # points without depth constrain the direction of the translation
+    motion_sigma_m: PositiveFloat = 0.1  # of the translation, per frame: a weak prior for unobservable directions
     min_points: Annotated[int, Range(3)] = 6
 
     def __call__(
@@ -36,19 +36,19 @@ class Irls:
         previous_pose: Pose | None,
         map: Map | None,
     ) -> Translation:
-        """The position; the first frame's is the origin of the world."""
+        """Return the position; the first frame's is the origin of the world."""
         if previous_pose is None:
             return origin(rotation)
-        pose = anchored(previous_pose, map)
-        before, unknown = pose.T_world_camera, handed_on(pose)
+        pose = transform_to_map(previous_pose, map)
+        before, propagated = pose.T_world_camera, propagated_covariance(pose)
         prior_m = self.motion_sigma_m * max(rotation.index - previous_pose.index, 1)
         R = rotation.R_world_camera
         if tracks is not None and previous_keypoints is not None and tracks.previous_index == previous_pose.index == previous_keypoints.index:
-            rows = point_rows(tracks, keypoints, previous_keypoints, camera, R.T @ before[:3, :3], rotation.covariance, self.depthless)
-            step = solve_step(rows, np.zeros(3), prior_m)
-            if step.inliers >= self.min_points:
-                inliers = np.array([step.inliers, 0, 0], np.int32)
-                covariance = R @ step.covariance @ R.T + unknown
-                held = np.ascontiguousarray(step.unobservable @ R.T)
-                return Translation(rotation.index, rotation.stamp_ns, before[:3, 3] - R @ step.s, covariance, held, inliers, True)
-        return unmeasured(rotation, before[:3, 3].copy(), unknown + prior_m**2 * np.eye(3))
+            equations = point_equations(tracks, keypoints, previous_keypoints, camera, R.T @ before[:3, :3], rotation.covariance, self.depthless)
+            found = solve_translation(equations, np.zeros(3), prior_m)
+            if found.inliers >= self.min_points:
+                inliers = np.array([found.inliers, 0, 0], np.int32)
+                covariance = R @ found.covariance @ R.T + propagated
+                held = np.ascontiguousarray(found.unobservable @ R.T)
+                return Translation(rotation.index, rotation.stamp_ns, before[:3, 3] - R @ found.s, covariance, held, inliers, True)
+        return unmeasured(rotation, before[:3, 3].copy(), propagated + prior_m**2 * np.eye(3))

@@ -10,25 +10,25 @@ import numpy as np
 from trihedron.pipeline.core.options import PositiveFloat, PositiveInt, Range
 from trihedron.pipeline.core.registry import register
 from trihedron.pipeline.core.types import F64, Camera, Keypoints, Planes, Pose, Rotation, Tracks, Translation
-from trihedron.plugins.translation.common import point_rows, solve_step
+from trihedron.plugins.translation.common import point_equations, solve_translation
 
 
 @register("translation", "kalman")
 @dataclass(frozen=True)
 class Kalman:
     """L-SLAM (Kim, Coltin, Kim, ECCV 2018; the paper's column "L-SLAM"): with the rotation known, the position and one offset for each plane that
-    stands on a Manhattan axis are linear in what is measured. Tracked points with and without depth predict the step (as `irls`), the distances to
-    the planes along their axes correct it, and a plane that is not known yet joins the state.
+    stands on a Manhattan axis are linear in the measurements. Tracked points with and without depth predict the translation (as `irls`), the
+    distances to the planes along their axes correct it, and a new plane is appended to the state.
 
     The state is `filtered_planes` and `filtered_covariance` of the value, so that the wire `translation@prev` is the filter's only memory."""
 
     axis_deg: Annotated[float, Range(above=0, below=45)] = 8.0  # a plane nearer to an axis stands on it
     distance_sigma_m: PositiveFloat = 0.01  # of a plane's distance, besides its noise: walls are not quite flat, and normals not quite on the axis
-    point_sigma_m: PositiveFloat = 0.002  # of a step measured by points, besides its noise
+    point_sigma_m: PositiveFloat = 0.002  # of a translation measured by points, besides its noise
     gate: PositiveFloat = 3.0  # standard deviations, and
     gate_m: PositiveFloat = 0.1  # most, between a plane's distance and the predicted one
     min_pixels: PositiveInt = 3000  # of a plane in the state
-    motion_sigma_m: PositiveFloat = 0.1  # of a step that no point measured, per frame
+    motion_sigma_m: PositiveFloat = 0.1  # of a translation that no point measured, per frame
     min_points: Annotated[int, Range(3)] = 6
 
     def __call__(
@@ -42,30 +42,30 @@ class Kalman:
         previous_pose: Pose | None,
         previous: Translation | None,
     ) -> Translation:
-        """The filtered position; the first frame's is the origin of the world."""
-        sights = axis_sights(planes, rotation, self.axis_deg, self.distance_sigma_m, self.min_pixels)
+        """Return the filtered position; the first frame's is the origin of the world."""
+        observations = observe_axis_planes(planes, rotation, self.axis_deg, self.distance_sigma_m, self.min_pixels)
         if previous is None or previous_pose is None:
-            state, matched = first_filter().updated(sights, self.gate, self.gate_m)
-            return self._said(rotation, state, np.empty((0, 3)), (0, 0, matched), True)
+            state, matched = initial_filter().update(observations, self.gate, self.gate_m)
+            return self._value(rotation, state, np.empty((0, 3)), (0, 0, matched), True)
         before = OffsetFilter(previous.t_world_camera, previous.filtered_planes, previous.filtered_covariance)
-        step, noise, points = self._step(camera, rotation, tracks, keypoints, previous_keypoints, previous_pose)
-        state, matched = before.moved(step, noise).updated(sights, self.gate, self.gate_m)
-        unobservable = _unmeasured(noise, sights[:matched], 0.5 * self.motion_sigma_m)
-        return self._said(rotation, state, unobservable, (points, 0, matched), points + matched > 0)
+        step, noise, points = self._translation(camera, rotation, tracks, keypoints, previous_keypoints, previous_pose)
+        state, matched = before.predict(step, noise).update(observations, self.gate, self.gate_m)
+        unobservable = _unmeasured(noise, observations[:matched], 0.5 * self.motion_sigma_m)
+        return self._value(rotation, state, unobservable, (points, 0, matched), points + matched > 0)
 
-    def _step(
+    def _translation(
         self, camera: Camera, rotation: Rotation, tracks: Tracks | None, keypoints: Keypoints, before: Keypoints | None, pose: Pose
     ) -> tuple[F64, F64, int]:
-        """The step of the position by the points (3,), its covariance (3, 3), both in the world, and how many points agree."""
+        """Translation by the points (3,) with covariance (3, 3), both in the world, and the number of inliers."""
         R, gap = rotation.R_world_camera, max(rotation.index - pose.index, 1)
         if tracks is not None and before is not None and tracks.previous_index == pose.index == before.index:
-            rows = point_rows(tracks, keypoints, before, camera, R.T @ pose.T_world_camera[:3, :3], rotation.covariance, True)
-            found = solve_step(rows, np.zeros(3), self.motion_sigma_m * gap)
+            equations = point_equations(tracks, keypoints, before, camera, R.T @ pose.T_world_camera[:3, :3], rotation.covariance, True)
+            found = solve_translation(equations, np.zeros(3), self.motion_sigma_m * gap)
             if found.inliers >= self.min_points:
                 return -R @ found.s, R @ found.covariance @ R.T + self.point_sigma_m**2 * np.eye(3), found.inliers
         return np.zeros(3), (self.motion_sigma_m * gap) ** 2 * np.eye(3), 0
 
-    def _said(self, rotation: Rotation, state: OffsetFilter, unobservable: F64, inliers: tuple[int, int, int], estimated: bool) -> Translation:
+    def _value(self, rotation: Rotation, state: OffsetFilter, unobservable: F64, inliers: tuple[int, int, int], estimated: bool) -> Translation:
         covariance = np.ascontiguousarray(state.covariance[:3, :3])
         counts = np.array(inliers, np.int32)
         return Translation(
@@ -73,8 +73,8 @@ class Kalman:
         )  # fmt: skip
 
 
-def _unmeasured(noise: F64, matched: list[Sight], limit_m: float) -> F64:
-    """(u, 3) unit vectors (world) along which neither the points' step nor a known plane measured the position to `limit_m`."""
+def _unmeasured(noise: F64, matched: list[AxisPlane], limit_m: float) -> F64:
+    """Unit vectors (u, 3) (world) along which neither the points nor a known plane measured the position to `limit_m`."""
     information = np.linalg.inv(noise) + sum((np.outer(s.normal, s.normal) / s.variance for s in matched), np.zeros((3, 3)))
     values, vectors = np.linalg.eigh(information)
     return np.ascontiguousarray(vectors[:, values < 1.0 / limit_m**2].T)
@@ -83,13 +83,14 @@ def _unmeasured(noise: F64, matched: list[Sight], limit_m: float) -> F64:
 # A linear Kalman filter over the camera's position and the offsets of planes whose normals are known (Kim, Coltin, Kim, ECCV 2018).
 
 SAME_AXIS = 0.99  # cosine between the normals of one plane, seen twice
-SLACK_M = 0.01  # that a plane may be off besides: two that are this near are one
+SLACK_M = 0.01  # added to the gate: planes this near are one
 FIRST_SIGMA_M = 1e-6  # the first position is the origin by definition
 
 
 @dataclass(frozen=True)
-class Sight:
-    """A plane seen on a signed Manhattan axis `normal` (3,) of the world: its distance from the camera along it, m, and the variance of that, m²."""
+class AxisPlane:
+    """Observation of a plane on a signed Manhattan axis `normal` (3,) of the world: its distance from the camera along it (m), and the variance
+    (m²)."""
 
     normal: F64
     distance_m: float
@@ -104,73 +105,74 @@ class OffsetFilter:
     planes: F64
     covariance: F64
 
-    def moved(self, step: F64, noise: F64) -> OffsetFilter:
-        """After a step (3,) of the camera, with covariance (3, 3)."""
+    def predict(self, step: F64, noise: F64) -> OffsetFilter:
+        """Predict: move the camera by a translation (3,) with process noise (3, 3)."""
         covariance = self.covariance.copy()
         covariance[:3, :3] += noise
         return OffsetFilter(self.position_m + step, self.planes, covariance)
 
-    def updated(self, sights: list[Sight], gate: float, gate_m: float) -> tuple[OffsetFilter, int]:
-        """Corrected by the sights of known planes, with the others joined, and how many were known: `distance = n·position + d`. The sights are
-        put in that order."""
+    def update(self, observations: list[AxisPlane], gate: float, gate_m: float) -> tuple[OffsetFilter, int]:
+        """Update by the observations of known planes (`distance = n·position + d`), append the others; also the number of the former.
+
+        Sorts the observations in that order."""
         state, fresh, known = self, [], []
-        for sight in sights:
-            row = self._row(sight, gate, gate_m)
+        for observation in observations:
+            row = self._row(observation, gate, gate_m)
             if row < 0:
-                fresh.append(sight)
+                fresh.append(observation)
             else:
-                known.append(sight)
-                state = state._corrected(sight, row)
-        for sight in fresh:
-            state = state._joined(sight)
-        sights[:] = known + fresh
+                known.append(observation)
+                state = state._correct(observation, row)
+        for observation in fresh:
+            state = state._append(observation)
+        observations[:] = known + fresh
         return state, len(known)
 
-    def _row(self, sight: Sight, gate: float, gate_m: float) -> int:
-        """The known plane nearest to the sight within the gates, -1 = none."""
-        n, P = sight.normal, self.covariance
-        off = np.abs(sight.distance_m - n @ self.position_m - self.planes[:, 3])
-        variance = n @ P[:3, :3] @ n + 2.0 * n @ P[:3, 3:] + np.diag(P)[3:] + sight.variance
+    def _row(self, observation: AxisPlane, gate: float, gate_m: float) -> int:
+        """Row of the known plane nearest to an observation within the gates, -1 = none."""
+        n, P = observation.normal, self.covariance
+        off = np.abs(observation.distance_m - n @ self.position_m - self.planes[:, 3])
+        variance = n @ P[:3, :3] @ n + 2.0 * n @ P[:3, 3:] + np.diag(P)[3:] + observation.variance
         within = (self.planes[:, :3] @ n > SAME_AXIS) & (off < np.minimum(gate * np.sqrt(variance) + SLACK_M, gate_m))
         return int(np.argmin(np.where(within, off, np.inf))) if within.any() else -1
 
-    def _measures(self, normal: F64, row: int) -> F64:
+    def _measurement_row(self, normal: F64, row: int) -> F64:
         h = np.zeros(3 + len(self.planes))
         h[:3], h[3 + row] = normal, 1.0
         return h
 
-    def _corrected(self, sight: Sight, row: int) -> OffsetFilter:
-        h, P = self._measures(sight.normal, row), self.covariance
-        gain = P @ h / (h @ P @ h + sight.variance)
-        change = gain * (sight.distance_m - sight.normal @ self.position_m - self.planes[row, 3])
+    def _correct(self, observation: AxisPlane, row: int) -> OffsetFilter:
+        h, P = self._measurement_row(observation.normal, row), self.covariance
+        gain = P @ h / (h @ P @ h + observation.variance)
+        change = gain * (observation.distance_m - observation.normal @ self.position_m - self.planes[row, 3])
         rest = np.eye(len(h)) - np.outer(gain, h)
         planes = self.planes.copy()
         planes[:, 3] += change[3:]
-        return OffsetFilter(self.position_m + change[:3], planes, rest @ P @ rest.T + sight.variance * np.outer(gain, gain))
+        return OffsetFilter(self.position_m + change[:3], planes, rest @ P @ rest.T + observation.variance * np.outer(gain, gain))
 
-    def _joined(self, sight: Sight) -> OffsetFilter:
-        n, P = sight.normal, self.covariance
+    def _append(self, observation: AxisPlane) -> OffsetFilter:
+        n, P = observation.normal, self.covariance
         m = len(P)
         covariance = np.zeros((m + 1, m + 1))
         covariance[:m, :m] = P
         covariance[m, :m] = covariance[:m, m] = -n @ P[:3]
-        covariance[m, m] = n @ P[:3, :3] @ n + sight.variance
-        plane = np.append(n, sight.distance_m - n @ self.position_m)
+        covariance[m, m] = n @ P[:3, :3] @ n + observation.variance
+        plane = np.append(n, observation.distance_m - n @ self.position_m)
         return OffsetFilter(self.position_m, np.concatenate([self.planes, plane[None]]), covariance)
 
 
-def first_filter() -> OffsetFilter:
+def initial_filter() -> OffsetFilter:
     """At the origin, without planes."""
     return OffsetFilter(np.zeros(3), np.empty((0, 4)), FIRST_SIGMA_M**2 * np.eye(3))
 
 
-def axis_sights(planes: Planes, rotation: Rotation, axis_deg: float, floor_m: float, min_pixels: int) -> list[Sight]:
-    """The planes that stand on an axis of the best known Manhattan frame in view: the distance of their centre along it."""
+def observe_axis_planes(planes: Planes, rotation: Rotation, axis_deg: float, floor_m: float, min_pixels: int) -> list[AxisPlane]:
+    """Observations of the planes on an axis of the most observed Manhattan frame in view, by the distance of their centroid along it."""
     seen = np.isfinite(rotation.R_camera_manhattan[:, 0, 0])
     if not seen.any():
         return []
     axes = rotation.R_world_manhattan[int(np.argmax(np.where(seen, rotation.weights, -1.0)))]
-    turn = float(np.trace(rotation.covariance)) / 3.0
+    rotation_variance = float(np.trace(rotation.covariance)) / 3.0
     found = []
     for plane, moments, pixels in zip(planes.coefficients, planes.moments, planes.pixels):
         along = axes.T @ rotation.R_world_camera @ plane[:3]
@@ -180,5 +182,5 @@ def axis_sights(planes: Planes, rotation: Rotation, axis_deg: float, floor_m: fl
         normal = np.asarray(axes[:, k] * np.sign(along[k]))
         centre, local = moments[:3, 3] / moments[3, 3], rotation.R_world_camera.T @ normal
         aside2 = float(centre @ centre - (centre @ local) ** 2)
-        found.append(Sight(normal, float(-local @ centre), 1.0 / float(moments[3, 3]) + turn * aside2 + floor_m**2))
+        found.append(AxisPlane(normal, float(-local @ centre), 1.0 / float(moments[3, 3]) + rotation_variance * aside2 + floor_m**2))
     return found

@@ -1,4 +1,4 @@
-"""Numba kernels of `levenberg_marquardt.py`."""
+"""Kernels of `levenberg_marquardt.py`: features of the previous frame in the world, with the covariance of their measurements, as terms."""
 # mypy: disable-error-code="arg-type, assignment, index, return-value"
 
 from __future__ import annotations
@@ -8,14 +8,15 @@ import numpy as np
 from trihedron.pipeline.core.kernel import kernel
 from trihedron.pipeline.core.types import F32, F64
 from trihedron.plugins.shared.depth_image_kernels import sigma_z
-from trihedron.plugins.shared.pose_optimizer_kernels import SAME, LineTerms, PlaneTerms, PointTerms, basis
+from trihedron.plugins.shared.linalg_kernels import tangent_columns
+from trihedron.plugins.shared.pose_optimizer_kernels import SAME, LineTerms, PlaneTerms, PointTerms
 from trihedron.plugins.shared.relative_motion_kernels import LinePairs, PlanePairs, PointPairs
 
-# Features of the previous frame placed in the world by its pose, with the noise of what they were measured from: terms for the pose solver.
 
 @kernel
-def tracked_points(pairs: PointPairs, pixels: F32, fx: float, fy: float, T: F64, turned: F64) -> PointTerms:
-    """Those of the points whose previous depth is known, seen at some of `pixels` (k, 2); T (4, 4) and `turned` (3, 3) as in `placed_points`."""
+def tracked_points(pairs: PointPairs, pixels: F32, fx: float, fy: float, T: F64, rotation_covariance: F64) -> PointTerms:
+    """Terms of the tracked points with a previous depth, observed at some of `pixels` (k, 2); T (4, 4) and `rotation_covariance` (3, 3) as in
+    `placed_points`."""
     rows, before, before_sigma, points, sigma_px, sigma_m = pairs
     known = np.empty(len(rows), np.int32)
     n = 0
@@ -30,15 +31,15 @@ def tracked_points(pairs: PointPairs, pixels: F32, fx: float, fy: float, T: F64,
             places[k, a] = before[i, a]
         across[k], along[k] = sigma_px[j], before_sigma[i]
         seen[k, 0], seen[k, 1], depth[k], seen_px[k], seen_m[k] = pixels[j, 0], pixels[j, 1], points[j, 2], sigma_px[j], sigma_m[j]
-    world, covariance = placed_points(places, across, along, fx, fy, T, turned)
+    world, covariance = placed_points(places, across, along, fx, fy, T, rotation_covariance)
     return PointTerms(world, covariance, seen, depth, seen_px, seen_m)
 
 
 @kernel
 def tracked_lines(
-    pairs: LinePairs, pixels: F32, sigma_px: float, noise: tuple[float, float, float, float], fx: float, fy: float, T: F64, turned: F64
+    pairs: LinePairs, pixels: F32, sigma_px: float, noise: tuple[float, float, float, float], fx: float, fy: float, T: F64, rotation_covariance: F64
 ) -> LineTerms:
-    """Those of the lines whose previous 3D end points are known, seen at some of `pixels` (k, 2, 2), which are known to `sigma_px`."""
+    """Terms of the tracked lines with previous 3D end points, observed at some of `pixels` (k, 2, 2) with `sigma_px`."""
     rows, before, endpoints, covariance = pairs
     known = np.empty(len(rows), np.int32)
     n = 0
@@ -59,20 +60,20 @@ def tracked_lines(
                 places[2 * k + e, a], measured[k, e, a] = before[i, e, a], endpoints[j, e, a]
                 for b in range(3):
                     of_measured[k, e, a, b] = covariance[j, e, a, b]
-    world, of_world = placed_points(places, across, along, fx, fy, T, turned)
+    world, of_world = placed_points(places, across, along, fx, fy, T, rotation_covariance)
     return LineTerms(world.reshape(n, 2, 3), of_world.reshape(n, 2, 3, 3), seen, np.full(n, sigma_px), measured, of_measured)
 
 
 @kernel
-def tracked_planes(pairs: PlanePairs, T: F64, turned: F64) -> PlaneTerms:
-    """All of the planes."""
+def tracked_planes(pairs: PlanePairs, T: F64, rotation_covariance: F64) -> PlaneTerms:
+    """Terms of all tracked planes."""
     rows, before, before_covariance, planes, covariance = pairs
     n = len(rows)
     observed, of_observed, kinds = np.empty((n, 4)), np.empty((n, 3, 3)), np.full(n, SAME, np.int32)
     for i in range(n):
         for a in range(4):
             observed[i, a] = planes[rows[i, 1], a]
-    world, of_world, added = placed_planes(before, before_covariance, observed, T, turned)
+    world, of_world, added = placed_planes(before, before_covariance, observed, T, rotation_covariance)
     for i in range(n):
         for a in range(3):
             for b in range(3):
@@ -81,10 +82,11 @@ def tracked_planes(pairs: PlanePairs, T: F64, turned: F64) -> PlaneTerms:
 
 
 @kernel
-def placed_points(points: F32, sigma_px: F32, sigma_m: F32, fx: float, fy: float, T: F64, turned: F64) -> tuple[F64, F64]:
-    """Camera-frame points (n, 3) in the world, T (4, 4) being `T_world_camera`, and their covariances (n, 3, 3) there: `sigma_px` (n,) across the
-    ray, `sigma_m` (n,) of the depth, and what a rotation of the camera known to `turned` (3, 3, rad²) adds:
-    `σ_m² r rᵀ + diag(z σ_px / f)² + [p]× Σ [p]×ᵀ` with the ray r = p / z, turned into the world."""
+def placed_points(points: F32, sigma_px: F32, sigma_m: F32, fx: float, fy: float, T: F64, rotation_covariance: F64) -> tuple[F64, F64]:
+    """Transform camera-frame points (n, 3) to the world by T (4, 4), `T_world_camera`, with their covariances (n, 3, 3) there:
+    `R (σ_m² r rᵀ + diag(z σ_px / f)² + [p]× Σ [p]×ᵀ) Rᵀ`.
+
+    `sigma_px` (n,) is across the ray r = p / z, `sigma_m` (n,) that of the depth, Σ the `rotation_covariance` (3, 3, rad²) of the current camera."""
     n = len(points)
     world, covariance = np.empty((n, 3)), np.empty((n, 3, 3))
     p, P, M, C = np.empty(3), np.zeros((3, 3)), np.empty((3, 3)), np.empty((3, 3))
@@ -95,7 +97,7 @@ def placed_points(points: F32, sigma_px: F32, sigma_m: F32, fx: float, fy: float
             world[i, a] = T[a, 0] * p[0] + T[a, 1] * p[1] + T[a, 2] * p[2] + T[a, 3]
         P[0, 1], P[0, 2], P[1, 0], P[1, 2], P[2, 0], P[2, 1] = -p[2], p[1], p[2], -p[0], -p[1], p[0]
         along2, across = (float(sigma_m[i]) / p[2]) ** 2, p[2] * float(sigma_px[i])
-        _sandwich(P, turned, M, C)
+        _sandwich(P, rotation_covariance, M, C)
         for a in range(3):
             for b in range(3):
                 C[a, b] += along2 * p[a] * p[b]
@@ -117,9 +119,11 @@ def _sandwich(A: F64, C: F64, M: F64, out: F64) -> None:
 
 
 @kernel
-def placed_planes(planes: F64, covariance: F64, observed: F64, T: F64, turned: F64) -> tuple[F64, F64, F64]:
-    """Camera-frame planes (n, 4) in the world, their covariances (n, 3, 3) of (a, b, d) there, and what a rotation of the camera known to `turned`
-    (3, 3, rad²) adds to the covariances of the `observed` ones (n, 4): to the normal only."""
+def placed_planes(planes: F64, covariance: F64, observed: F64, T: F64, rotation_covariance: F64) -> tuple[F64, F64, F64]:
+    """Transform camera-frame planes (n, 4) to the world, with their covariances (n, 3, 3) of (a, b, d).
+
+    Also returns the covariance (n, 3, 3) that the `rotation_covariance` (3, 3, rad²) of the current camera adds to the `observed` planes (n, 4): to
+    the normal only."""
     n = len(planes)
     world, moved, added = np.empty((n, 4)), np.empty((n, 3, 3)), np.zeros((n, 3, 3))
     before, after, J, M, F, Q = np.empty((3, 2)), np.empty((3, 2)), np.empty((3, 2)), np.empty((3, 3)), np.zeros((3, 3)), np.empty((2, 3))
@@ -129,18 +133,18 @@ def placed_planes(planes: F64, covariance: F64, observed: F64, T: F64, turned: F
         for a in range(3):
             world[i, a] = T[a, 0] * planes[i, 0] + T[a, 1] * planes[i, 1] + T[a, 2] * planes[i, 2]
             world[i, 3] -= world[i, a] * T[a, 3]
-        basis(planes[i, :3], before)
-        basis(world[i, :3], after)
+        tangent_columns(planes[i, :3], before)
+        tangent_columns(world[i, :3], after)
         for k in range(2):
             F[2, k] = 0.0
             for a in range(3):
-                J[a, k] = T[a, 0] * before[0, k] + T[a, 1] * before[1, k] + T[a, 2] * before[2, k]  # how the world's normal moves
+                J[a, k] = T[a, 0] * before[0, k] + T[a, 1] * before[1, k] + T[a, 2] * before[2, k]  # derivative of the world's normal
                 F[2, k] -= T[a, 3] * J[a, k]
         for j in range(2):
             for k in range(2):
                 F[j, k] = after[0, j] * J[0, k] + after[1, j] * J[1, k] + after[2, j] * J[2, k]
         _sandwich(F, covariance[i], M, moved[i])
-        basis(observed[i, :3], before)
+        tangent_columns(observed[i, :3], before)
         x, y, z = observed[i, 0], observed[i, 1], observed[i, 2]
         for k in range(2):  # rows of Bᵀ [n]×
             Q[k, 0] = before[1, k] * z - before[2, k] * y
@@ -150,5 +154,5 @@ def placed_planes(planes: F64, covariance: F64, observed: F64, T: F64, turned: F
             for k in range(2):
                 for a in range(3):
                     for b in range(3):
-                        added[i, j, k] += Q[j, a] * turned[a, b] * Q[k, b]
+                        added[i, j, k] += Q[j, a] * rotation_covariance[a, b] * Q[k, b]
     return world, moved, added

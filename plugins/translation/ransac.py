@@ -9,46 +9,47 @@ import numpy as np
 from trihedron.pipeline.core.options import PositiveFloat, PositiveInt
 from trihedron.pipeline.core.registry import register
 from trihedron.pipeline.core.types import F64, Bool, Keypoints, Map, Pose, Rotation, Tracks, Translation
-from trihedron.plugins.mapping.reference_keyframe import anchored
-from trihedron.plugins.shared.rigid_alignment import tracked_places
-from trihedron.plugins.translation.common import handed_on, origin, unmeasured
+from trihedron.plugins.mapping.reference_keyframe import transform_to_map
+from trihedron.plugins.shared.rigid_alignment import tracked_point_pairs
+from trihedron.plugins.translation.common import origin, propagated_covariance, unmeasured
 
 
 @register("translation", "ransac")
 @dataclass(frozen=True)
 class Ransac:
-    """With the rotation known every tracked point with depth in both frames says the whole step: the one most points agree with, then their weighted
-    mean (after RGB-D SLAM: Endres et al., T-RO 2014, whose samples of three give both). Fewer than `min_points` are no measurement."""
+    """RANSAC over single points: with a known rotation one tracked point with depth in both frames determines the translation. The hypothesis with
+    most inliers is refined to their weighted mean (after RGB-D SLAM: Endres et al., T-RO 2014, whose samples of three give both). With fewer than
+    `min_points` inliers the camera is predicted at rest."""
 
-    rounds: PositiveInt = 100  # points tried
+    rounds: PositiveInt = 100  # points tried as hypotheses
     gate: PositiveFloat = 3.0  # standard deviations within which a point agrees
     min_points: PositiveInt = 12
-    motion_sigma_m: PositiveFloat = 0.1  # of a step that is not measured, per frame
+    motion_sigma_m: PositiveFloat = 0.1  # of a translation that is not measured, per frame
 
     def __call__(
         self, rotation: Rotation, tracks: Tracks | None, keypoints: Keypoints, previous_pose: Pose | None, map: Map | None,
         rng: np.random.Generator,
     ) -> Translation:  # fmt: skip
-        """The position; the first frame's is the origin of the world."""
+        """Return the position; the first frame's is the origin of the world."""
         if previous_pose is None:
             return origin(rotation)
-        pose, R = anchored(previous_pose, map), rotation.R_world_camera
-        T, unknown = pose.T_world_camera, handed_on(pose)
+        pose, R = transform_to_map(previous_pose, map), rotation.R_world_camera
+        T, propagated = pose.T_world_camera, propagated_covariance(pose)
         if tracks is not None and tracks.previous_index == previous_pose.index:
-            before, after, sigma = tracked_places(tracks, keypoints)
-            steps = before @ T[:3, :3].T - after @ R.T
-            agree = self._agreeing(steps, sigma, rng)
+            before, after, sigma = tracked_point_pairs(tracks, keypoints)
+            translations = before @ T[:3, :3].T - after @ R.T
+            agree = self._inliers(translations, sigma, rng)
             if agree.sum() >= self.min_points:
                 w = 1.0 / sigma[agree] ** 2
-                covariance = np.eye(3) / w.sum() + unknown
+                covariance = np.eye(3) / w.sum() + propagated
                 inliers = np.array([agree.sum(), 0, 0], np.int32)
-                t = T[:3, 3] + w @ steps[agree] / w.sum()
+                t = T[:3, 3] + w @ translations[agree] / w.sum()
                 return Translation(rotation.index, rotation.stamp_ns, t, covariance, np.empty((0, 3)), inliers, True)
         prior_m = self.motion_sigma_m * max(rotation.index - previous_pose.index, 1)
-        return unmeasured(rotation, T[:3, 3].copy(), unknown + prior_m**2 * np.eye(3))
+        return unmeasured(rotation, T[:3, 3].copy(), propagated + prior_m**2 * np.eye(3))
 
-    def _agreeing(self, steps: F64, sigma: F64, rng: np.random.Generator) -> Bool:
-        """(n,) whether each of the steps (n, 3) agrees with the one that most agree with, and then with their mean."""
+    def _inliers(self, steps: F64, sigma: F64, rng: np.random.Generator) -> Bool:
+        """Inlier mask (n,) of translations (n, 3): of the best hypothesis, then of the weighted mean of its inliers."""
         if not len(steps):
             return np.zeros(0, bool)
         tried = steps[rng.integers(0, len(steps), self.rounds)]

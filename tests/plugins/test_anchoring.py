@@ -13,7 +13,7 @@ from trihedron.pipeline.core.types import LOST, Correction, Map, Pose, Rotation
 from trihedron.pipeline.run.results import causal_trajectory, final_trajectory
 from trihedron.pipeline.run.runner import Runner
 from trihedron.plugins.mapping.landmarks import KEYFRAMES, empty_map
-from trihedron.plugins.mapping.reference_keyframe import anchored, anchored_before
+from trihedron.plugins.mapping.reference_keyframe import transform_rotation_to_map, transform_to_map
 from trihedron.plugins.shared.linalg import transform_plane_covariance
 
 SHIFT = pose_matrix(exp_so3(np.radians([3.0, 4.0, 0.0])), np.array([0.2, -0.1, 0.2]))  # 5° and 0.3 m
@@ -38,14 +38,14 @@ def test_a_pose_follows_its_keyframe_and_is_untouched_otherwise():
     rng = np.random.default_rng(0)
     first, second, T = (exp_se3(rng.normal(size=6)) for _ in range(3))
     pose = pose_against(second, T)
-    assert anchored(pose, None) is pose
-    assert anchored(pose, map_with(first, second)) is pose  # not a rounding error away
-    assert anchored(pose, map_with(SHIFT @ first, second)) is pose
-    moved = anchored(pose, map_with(first, SHIFT @ second))
+    assert transform_to_map(pose, None) is pose
+    assert transform_to_map(pose, map_with(first, second)) is pose  # not a rounding error away
+    assert transform_to_map(pose, map_with(SHIFT @ first, second)) is pose
+    moved = transform_to_map(pose, map_with(first, SHIFT @ second))
     assert np.allclose(moved.T_world_camera, SHIFT @ T, atol=1e-12)
     assert np.array_equal(moved.T_reference_camera, pose.T_reference_camera)
     unborn = replace(pose, reference=-1)
-    assert anchored(unborn, map_with(SHIFT @ first, second)) is unborn
+    assert transform_to_map(unborn, map_with(SHIFT @ first, second)) is unborn
 
 
 def test_the_manhattan_frames_turn_with_the_camera():
@@ -54,10 +54,10 @@ def test_the_manhattan_frames_turn_with_the_camera():
     frames = np.array([exp_so3(rng.normal(size=3)) for _ in range(2)])
     rotation = Rotation(7, 7, T[:3, :3], np.eye(3), frames, frames, np.arange(2, dtype=np.int32), np.ones(2), "manhattan")
     pose = pose_against(keyframe, T, reference=0)
-    assert anchored_before(rotation, None, map_with(SHIFT @ keyframe)) == (rotation, None)
-    same, said = anchored_before(rotation, pose, map_with(keyframe))
+    assert transform_rotation_to_map(rotation, None, map_with(SHIFT @ keyframe)) == (rotation, None)
+    same, said = transform_rotation_to_map(rotation, pose, map_with(keyframe))
     assert same is rotation and said is pose
-    turned, now = anchored_before(rotation, pose, map_with(SHIFT @ keyframe))
+    turned, now = transform_rotation_to_map(rotation, pose, map_with(SHIFT @ keyframe))
     assert np.allclose(now.T_world_camera, SHIFT @ T)
     before = np.swapaxes(rotation.R_world_camera.T @ frames, 1, 2)
     assert np.allclose(np.swapaxes(turned.R_world_camera.T @ turned.R_world_manhattan, 1, 2), before, atol=1e-12)

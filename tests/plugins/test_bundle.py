@@ -10,18 +10,18 @@ import pytest
 from trihedron.pipeline.core.geometry import exp_se3, invert, log_se3, pose_matrix, tangent_basis
 from trihedron.pipeline.core.table import Table
 from trihedron.plugins.bundle.colmap import Colmap, solve_colmap
-from trihedron.plugins.bundle.common import bundle_problem, bundle_window, solve_bundle
-from trihedron.plugins.bundle.common_kernels import (
+from trihedron.plugins.bundle.common import bundle_problem, bundle_window
+from trihedron.plugins.bundle.local_window import LocalWindow, solve_bundle
+from trihedron.plugins.bundle.local_window_kernels import (
     HUBER,
+    PRIOR_LANDMARK,
     SQUARES,
     TRUNCATED,
-    TRUST_LANDMARK,
     NormalEquations,
+    add_damping,
     linearise_bundle,
-    moved_bundle,
-    trusted,
+    retract,
 )
-from trihedron.plugins.bundle.local_window import LocalWindow
 from trihedron.plugins.bundle.none import NoBundle
 from trihedron.plugins.mapping.correction import apply_correction
 
@@ -72,7 +72,7 @@ def test_the_gradient_is_that_of_the_cost(room, loss):
     gradient, of_points = 2.0 * out.g, 2.0 * out.b[: len(state.points), :3]
 
     def cost(dx, steps):
-        return np.array([linearise_bundle(moved_bundle(state, seen.free, dx, steps), seen, loss, room_for(state, seen))])
+        return np.array([linearise_bundle(retract(state, seen.free, dx, steps), seen, loss, room_for(state, seen))])
 
     steps = np.zeros((len(out.b), 4))
     found = numeric(lambda d: cost(d, steps), len(gradient))[0]
@@ -83,10 +83,10 @@ def test_the_gradient_is_that_of_the_cost(room, loss):
 
 
 def dense(state, seen, out):
-    """The whole Hessian, landmarks included, with the trust, and the gradient."""
+    """The whole Hessian, landmarks included, with the prior weights, and the gradient."""
     c, n = len(out.g), len(out.b)
     H = np.zeros((c + 4 * n, c + 4 * n))
-    trusted(out.H, seen.free, 0.0, H[:c, :c])
+    add_damping(out.H, seen.free, 0.0, H[:c, :c])
     points = np.repeat(np.arange(len(state.points)), np.diff(seen.point_starts))
     lines = len(state.points) + np.repeat(np.arange(len(state.lines)), np.diff(seen.line_starts))
     for o, (k, row) in enumerate(zip([*seen.point_keyframes, *seen.line_keyframes], [*points, *lines])):
@@ -95,7 +95,7 @@ def dense(state, seen, out):
     H[c:, :c] = H[:c, c:].T
     for row in range(n):
         V = np.tril(out.V[row]) + np.tril(out.V[row], -1).T
-        H[c + 4 * row : c + 4 * row + 4, c + 4 * row : c + 4 * row + 4] = V + TRUST_LANDMARK * np.eye(4)
+        H[c + 4 * row : c + 4 * row + 4, c + 4 * row : c + 4 * row + 4] = V + PRIOR_LANDMARK * np.eye(4)
     return H, np.concatenate([out.g, out.b.ravel()])
 
 
@@ -153,7 +153,7 @@ def test_a_disturbed_window_goes_back_to_the_truth_within_its_covariance():
         state, seen = bundle_problem(disturbed(map, window, seed=seed), window)
         found = solve_bundle(state, seen, 15)
         assert found.cost < 0.6 * linearise_bundle(state, seen, TRUNCATED, room_for(state, seen)) and found.iterations < 20
-        rows = len(seen.pixels) * 2 + np.isfinite(seen.depth_m).sum() + 4 * len(seen.endpoints_px) + 3 * len(seen.plane_rows)
+        rows = len(seen.pixels) * 2 + np.isfinite(seen.depth_m).sum() + 4 * len(seen.endpoints_px) + 3 * len(seen.plane_landmarks)
         assert 0.6 * rows < found.cost < rows  # χ² of about one a residual, less what the unknowns and the gates take
         assert np.array_equal(found.state.rotations[seen.free :], state.rotations[seen.free :])
         assert np.array_equal(found.state.positions[seen.free :], state.positions[seen.free :])

@@ -7,9 +7,11 @@ import numpy as np
 import pytest
 
 from trihedron.pipeline.core.geometry import exp_se3, tangent_basis
-from trihedron.plugins.bundle import common_kernels as terms_kernels
-from trihedron.plugins.bundle.common_kernels import SQUARES, BundleMeasurements, BundleState, NormalEquations, line_basis, linearise_bundle
-from trihedron.plugins.shared.pose_optimizer_kernels import PARALLEL, PERPENDICULAR, SAME, basis, depth_direction, plane_rows
+from trihedron.plugins.bundle import local_window_kernels as terms_kernels
+from trihedron.plugins.bundle.common import BundleMeasurements, BundleState
+from trihedron.plugins.bundle.local_window_kernels import SQUARES, NormalEquations, line_basis, linearise_bundle
+from trihedron.plugins.shared.linalg_kernels import tangent_columns
+from trihedron.plugins.shared.pose_optimizer_kernels import PARALLEL, PERPENDICULAR, SAME, depth_direction, plane_residual
 
 sys.path.insert(0, str(Path(__file__).parent))
 from derivatives import numeric
@@ -108,15 +110,15 @@ def test_the_derivatives_of_a_plane(view):
     T, first = view[0], some_planes()[0]
     observed = np.append(T[:3, :3].T @ moved_plane(first, np.array([0.02, -0.03, 0.0]))[:3], 1.4)
     B, r, J_pose, J_plane = np.empty((3, 2)), np.empty(3), np.empty((3, 6)), np.empty((3, 3))
-    basis(observed[:3], B)
+    tangent_columns(observed[:3], B)
 
     def at(T, plane):
-        plane_rows(SAME, *parts(T), plane, observed, B, r, J_pose)
+        plane_residual(SAME, *parts(T), plane, observed, B, r, J_pose)
         return r.copy()
 
     at(T, first)
     by_pose = J_pose.copy()
-    terms_kernels.by_plane(*parts(T), first, B, J_plane)
+    terms_kernels.plane_jacobian(*parts(T), first, B, J_plane)
     assert np.allclose(by_pose, numeric(lambda d: at(shifted(T, d), first), 6), atol=1e-8)
     assert np.allclose(J_plane, numeric(lambda d: at(T, moved_plane(first, d)), 3), atol=1e-8)
 
@@ -126,10 +128,10 @@ def test_the_derivatives_of_a_relation(kind, other):
     planes = some_planes()
     a, b = planes[0], planes[other]
     B, r, J_a, J_b = np.empty((3, 2)), np.empty(2), np.empty((2, 3)), np.empty((2, 3))
-    basis(b, B)
+    tangent_columns(b, B)
 
     def at(a, b):
-        rows = terms_kernels.relation_rows(kind, a, b, B, r, J_a, J_b)
+        rows = terms_kernels.relation_residual(kind, a, b, B, r, J_a, J_b)
         return r[:rows].copy()
 
     rows = len(at(a, b))

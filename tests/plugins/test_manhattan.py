@@ -8,6 +8,7 @@ import pytest
 
 from trihedron.pipeline.core.geometry import exp_so3, log_so3, rotation_angle_deg, tangent_basis
 from trihedron.pipeline.core.types import Normals, Planes, Segments
+from trihedron.plugins.manhattan.common_kernels import shift_axes
 from trihedron.plugins.manhattan.mean_shift import MeanShift
 from trihedron.plugins.shared.manhattan_frames_kernels import CUBE, nearest_equivalent
 
@@ -288,3 +289,12 @@ def test_others_lack_it(directions):
     for other in others:
         with pytest.raises(AssertionError):
             lesser_modes(other, directions)
+
+
+def test_mean_shift_weighs_the_directions():
+    """Directions 2° to both sides of an axis, one weighted three times as much: the mode is at the weighted mean, and moves on with the weights."""
+    directions = np.array([[np.cos(a), np.sin(a), 0.0] for a in np.radians([-2.0, 2.0])])
+    for weights in ([1.0, 3.0], [3.0, 1.0], [2.0, 2.0]):
+        found = shift_axes(directions, np.array(weights), np.eye(3), np.radians(12.0), 1e3, 1, 0.0)
+        mean = np.array(weights) @ directions
+        assert np.allclose(found[:, 0], mean / np.linalg.norm(mean), atol=1e-9) and np.array_equal(found[:, 1:], np.eye(3)[:, 1:])

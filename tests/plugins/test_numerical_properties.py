@@ -9,8 +9,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from trihedron.pipeline.core import geometry as g
-from trihedron.plugins.bundle import common_kernels
-from trihedron.plugins.bundle.common_kernels import line_basis
+from trihedron.plugins.bundle import local_window_kernels
+from trihedron.plugins.bundle.local_window_kernels import line_basis
 from trihedron.plugins.loop import common_pose_graph
 from trihedron.plugins.shared import pose_optimizer, pose_optimizer_kernels, relative_motion_kernels
 from trihedron.plugins.shared.pose_optimizer import NO_LINES, NO_PLANES, solve_pose
@@ -82,11 +82,11 @@ def test_a_point_s_derivatives(rng, angle, scale_m, with_depth):
     r, D, J = np.empty(3), np.empty((3, 3)), np.empty((3, 6))
 
     def residual(T):
-        assert pose_optimizer_kernels.point_rows(g.transform(g.invert(T), world), pixel, seen, INTRINSICS, r, D)
+        assert pose_optimizer_kernels.point_residual(g.transform(g.invert(T), world), pixel, seen, INTRINSICS, r, D)
         return r.copy()
 
     residual(T)
-    pose_optimizer_kernels.chain_point(D, 3, g.transform(g.invert(T), world), J)
+    pose_optimizer_kernels.pose_jacobian(D, 3, g.transform(g.invert(T), world), J)
     step = np.array([depth, depth, depth, 1.0, 1.0, 1.0])
     assert agree(J * step, numeric(lambda d: residual(T @ g.exp_se3(step * d)), 6), 1e3)
     W = np.diag([1.0, 0.7, depth**2 if with_depth else 0.0])
@@ -115,11 +115,11 @@ def test_a_line_s_derivatives(rng, angle, scale_m):
     assert pose_optimizer_kernels.depth_direction(observed, m)
 
     def image(T, line):
-        return np.array([common_kernels.line_term(*parts(T), line, N, 0.3, segment, INTRINSICS, J, p)[0]])
+        return np.array([local_window_kernels.line_term(*parts(T), line, N, 0.3, segment, INTRINSICS, J, p)[0]])
 
     def depths(T, line):
         image(T, line)
-        return np.array([common_kernels.line_depth_term(parts(T)[0], N, 0.3, observed, m, J, p)[0]]) / depth
+        return np.array([local_window_kernels.line_depth_term(parts(T)[0], N, 0.3, observed, m, J, p)[0]]) / depth
 
     step = np.array([depth, depth, depth, 1.0, 1.0, 1.0])
     for residual, unit, size in ((image, 1.0, 1e3), (depths, depth, 1.0)):
@@ -141,7 +141,7 @@ def test_a_plane_s_derivatives(rng, angle, scale_m, kind):
 
     def residual(T, J=None):
         r, J = np.empty(3), np.empty((3, 6)) if J is None else J
-        assert pose_optimizer_kernels.plane_rows(kind, *parts(T), world, observed, B, r, J) == rows
+        assert pose_optimizer_kernels.plane_residual(kind, *parts(T), world, observed, B, r, J) == rows
         return r[:rows] / np.array([1.0, 1.0, scale_m])[:rows]
 
     J, step = np.empty((3, 6)), np.repeat([scale_m, 1.0], 3)
@@ -166,7 +166,8 @@ def test_the_gradient_of_the_motion_between_two_frames(rng, angle, scale_m):
     relative_motion_kernels._normal_equations(terms, R, t, 1e30, H, gradient)
 
     def cost(d):
-        return np.array([0.5 * relative_motion_kernels._residuals(terms, np.ascontiguousarray(g.exp_so3(d[:3]) @ R), t + scale_m * d[3:]).sum()])
+        R_there = np.ascontiguousarray(g.exp_so3(d[:3]) @ R)
+        return np.array([0.5 * relative_motion_kernels._squared_distances(terms, R_there, t + scale_m * d[3:]).sum()])
 
     step = np.repeat([1.0, scale_m], 3)
     assert agree(gradient * step, numeric(cost, 6)[0], 1e2)

@@ -11,6 +11,7 @@ from trihedron.pipeline.core.geometry import exp_se3, invert, log_se3, rotation_
 from trihedron.pipeline.core.types import Pose
 from trihedron.plugins.map.covisibility import Covisibility
 from trihedron.plugins.matches.local_map import LocalMap
+from trihedron.plugins.pose.map_alignment import InlierStatistics
 from trihedron.plugins.pose.none import NoRefinement
 from trihedron.plugins.pose.refine import Refine
 
@@ -29,7 +30,7 @@ def first_map(world):
     return Covisibility()(world.frame(0), pose_of(np.eye(4), 0), *world.features(np.eye(4), 0), None, None, None, None, None)
 
 
-def refined(world, map, step=5, off=OFF, keep=tuple(KINDS), **changes):
+def refined(world, map, step=5, off=OFF, keep=tuple(KINDS), stage=None, **changes):
     """The pose of the frame at `step` from a decoupled one moved by `off`, with the matches of the kinds `keep`."""
     guess = camera_at(step) @ exp_se3(np.asarray(off, float))
     rotation, translation = rotation_of(guess, step, 0.5), translation_of(guess, step, sigma_m=0.03)
@@ -40,8 +41,8 @@ def refined(world, map, step=5, off=OFF, keep=tuple(KINDS), **changes):
         if "planes" not in keep:
             dropped.update(parallel=dropped["planes"], perpendicular=dropped["planes"])
         matches = dataclasses.replace(matches, **dropped)
-    given = {"previous": pose_of(camera_at(step - 1), step - 1), "relocalise": None, "matches": matches, **changes}
-    return Refine()(world.frame(step).camera, rotation, translation, None, given["matches"], *features, given["previous"], map, given["relocalise"])
+    stage, given = stage or Refine(), {"previous": pose_of(camera_at(step - 1), step - 1), "relocalise": None, "matches": matches, **changes}
+    return stage(world.frame(step).camera, rotation, translation, None, given["matches"], *features, given["previous"], map, given["relocalise"])
 
 
 def error(pose, step=5):
@@ -118,8 +119,8 @@ def test_without_a_map_the_decoupled_pose_stands():
     [
         ("manhattan", True, 0, "ok", "50 points, 5 lines and 3 planes of the previous frame"),
         ("prediction", True, 0, "degraded", "the rotation was predicted, not measured"),
-        ("manhattan", True, 1, "degraded", "1 directions of motion cannot be seen, held at the prediction"),
-        ("manhattan", False, 3, "lost", "no feature of the previous frame was found again"),
+        ("manhattan", True, 1, "degraded", "1 directions of motion are unobservable, held at the prediction"),
+        ("manhattan", False, 3, "lost", "no feature of the previous frame was matched"),
     ],
 )
 def test_the_status_of_a_decoupled_pose(source, estimated, held, status, reason):
@@ -152,6 +153,27 @@ def test_matches_that_contradict_each_other_are_not_called_ok():
     wrong = dataclasses.replace(matches, keypoints=pairs, segments=none, planes=none, parallel=none, perpendicular=none)
     pose = refined(world, map, matches=wrong)
     assert pose.status == "degraded" and error(pose)[0] < 0.1
+
+
+def test_too_small_a_share_of_inliers_degrades_a_pose():
+    """Of noisy matches a few are beyond their gates: not all agree."""
+    world = World(2000)
+    map = first_map(world)
+    pose = refined(world, map)
+    strict = refined(world, map, stage=Refine(min_share=1.0, found_share=1.0))
+    assert pose.status == "ok" and np.array_equal(pose.T_world_camera, strict.T_world_camera) and np.array_equal(pose.inliers, strict.inliers)
+    words = strict.reason.split()
+    assert strict.status == "degraded" and strict.reason == f"only {pose.inliers.sum()} of {words[3]} matches with the map agree"
+    assert int(words[3]) > pose.inliers.sum()
+
+
+@pytest.mark.parametrize(
+    "inliers, matched, tracked",
+    [((20, 0, 0), (40, 0, 0), True), ((19, 0, 0), (40, 0, 0), False), ((0, 0, 2), (0, 0, 4), True), ((9, 0, 0), (9, 0, 0), False)],
+)
+def test_a_tracked_pose_needs_a_number_and_a_share_of_inliers(inliers, matched, tracked):
+    """At least ten, of points + 2 lines + 5 planes, and half of the matches."""
+    assert Refine(min_share=0.5)._is_tracked(InlierStatistics(inliers, matched)) is tracked
 
 
 def test_a_rotation_that_was_not_measured_needs_the_map():
@@ -190,7 +212,7 @@ def test_a_lost_pose_stays_lost_however_well_the_frames_fit_each_other():
     held = camera_at(2) @ exp_se3(np.array([1.0, 0, 0, 0, 0.3, 0]))
     guess = held @ invert(camera_at(2)) @ camera_at(3)
     found = NoRefinement()(rotation_of(guess, 3), translation_of(guess, 3), pose_of(held, 2, "lost"), None, None)
-    assert found.status == "lost" and found.reason == "the place was not recognised since the pose was lost"
+    assert found.status == "lost" and found.reason == "relocalisation failed since the pose was lost"
     assert np.allclose(found.T_world_camera, guess)
 
 

@@ -6,6 +6,7 @@ import pytest
 from trihedron.pipeline.core.geometry import exp_se3, exp_so3, invert, log_se3, pose_matrix, tangent_basis, transform, transform_planes
 from trihedron.pipeline.core.types import Camera
 from trihedron.plugins.shared import pose_optimizer_kernels as terms_kernels
+from trihedron.plugins.shared.linalg_kernels import tangent_columns
 from trihedron.plugins.shared.pose_optimizer import NO_LINES, NO_PLANES, NO_POINTS, classify_terms, first_step, solve_pose
 from trihedron.plugins.shared.pose_optimizer_kernels import PARALLEL, PERPENDICULAR, SAME, LineTerms, PlaneTerms, PointTerms
 
@@ -151,11 +152,11 @@ def test_jacobian_of_a_point():
 
         def residual(T, world=world, depth=depth):
             r, D = np.empty(3), np.empty((3, 3))
-            assert terms_kernels.point_rows(local_of(T, world), np.array([300.0, 200.0]), depth, INTRINSICS, r, D)
+            assert terms_kernels.point_residual(local_of(T, world), np.array([300.0, 200.0]), depth, INTRINSICS, r, D)
             return r
 
-        terms_kernels.point_rows(local_of(T, world), np.array([300.0, 200.0]), depth, INTRINSICS, r, D)
-        terms_kernels.chain_point(D, 3, local_of(T, world), J)
+        terms_kernels.point_residual(local_of(T, world), np.array([300.0, 200.0]), depth, INTRINSICS, r, D)
+        terms_kernels.pose_jacobian(D, 3, local_of(T, world), J)
         assert np.allclose(J, numeric(residual, T), rtol=1e-6, atol=1e-5)
         assert np.isfinite(depth) == (abs(J[2]).max() > 0)
 
@@ -168,12 +169,12 @@ def test_jacobian_of_a_line_in_the_image_and_in_depth():
     m, D, J = np.empty(3), np.empty((1, 3)), np.empty((1, 6))
     assert terms_kernels.depth_direction(segment_m, m)
     assert abs(m @ (segment_m[1] - segment_m[0])) < 1e-12 and abs(m @ np.cross(*segment_m)) < 1e-12
-    terms_kernels.line_row(local_of(T, world), segment_px, INTRINSICS, D[0])
-    terms_kernels.chain_point(D, 1, local_of(T, world), J)
-    image = numeric(lambda T: np.array([terms_kernels.line_row(local_of(T, world), segment_px, INTRINSICS, np.empty(3))[0]]), T)
+    terms_kernels.line_residual(local_of(T, world), segment_px, INTRINSICS, D[0])
+    terms_kernels.pose_jacobian(D, 1, local_of(T, world), J)
+    image = numeric(lambda T: np.array([terms_kernels.line_residual(local_of(T, world), segment_px, INTRINSICS, np.empty(3))[0]]), T)
     assert np.allclose(J, image, rtol=1e-6, atol=1e-5)
-    terms_kernels.chain_point(m[None].copy(), 1, local_of(T, world), J)
-    depth = numeric(lambda T: np.array([terms_kernels.line_depth_row(local_of(T, world), segment_m, m)[0]]), T)
+    terms_kernels.pose_jacobian(m[None].copy(), 1, local_of(T, world), J)
+    depth = numeric(lambda T: np.array([terms_kernels.line_depth_residual(local_of(T, world), segment_m, m)[0]]), T)
     assert np.allclose(J, depth, rtol=1e-6, atol=1e-7)
 
 
@@ -191,11 +192,11 @@ def test_jacobian_of_planes_at_every_normal(kind, rows):
         def residual(T, world=world, observed=observed, B=B):
             r, J = np.empty(3), np.empty((3, 6))
             R, t = np.ascontiguousarray(T[:3, :3]), np.ascontiguousarray(T[:3, 3])
-            assert terms_kernels.plane_rows(kind, R, t, world, observed, B, r, J) == rows
+            assert terms_kernels.plane_residual(kind, R, t, world, observed, B, r, J) == rows
             return r[:rows].copy()
 
         J = np.empty((3, 6))
-        terms_kernels.plane_rows(kind, T[:3, :3].copy(), T[:3, 3].copy(), world, observed, B, np.empty(3), J)
+        terms_kernels.plane_residual(kind, T[:3, :3].copy(), T[:3, 3].copy(), world, observed, B, np.empty(3), J)
         assert np.allclose(J[:rows], numeric(residual, T), atol=1e-7)
         assert kind == PERPENDICULAR or np.abs(residual(T)[:2]).max() < 0.05
 
@@ -203,7 +204,7 @@ def test_jacobian_of_planes_at_every_normal(kind, rows):
 def test_the_basis_is_that_of_the_geometry_module():
     for n in np.random.default_rng(4).normal(size=(20, 3)):
         B = np.empty((3, 2))
-        terms_kernels.basis(n / np.linalg.norm(n), B)
+        tangent_columns(n / np.linalg.norm(n), B)
         assert np.allclose(B, tangent_basis(n / np.linalg.norm(n)), atol=1e-15)
 
 

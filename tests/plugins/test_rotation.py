@@ -259,4 +259,4 @@ def test_a_frame_carried_on_out_of_sight_is_no_sighting(room):
         spread=np.array([[np.nan] * 3, [0.05, np.nan, 0.05]]),
     )
     frames = KnownFrames(known.R_world_manhattan, known.ids, known.weights)
-    assert [row for row, _ in frames.sightings(both, known.R_world_camera)] == [1]
+    assert [row for row, _ in frames.associations(both, known.R_world_camera)] == [1]

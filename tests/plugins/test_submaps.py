@@ -104,5 +104,5 @@ def test_a_new_sub_map_begins_after_as_many_frames_as_were_sought_in_vain():
         if pose.submap:
             break
     assert statuses == [("lost", 0)] * 16 + [("degraded", 1)]
-    assert pose.reason == "first frame of sub-map 1: nothing was recognised for 15 frames" and pose.reference == -1
+    assert pose.reason == "first frame of sub-map 1: relocalisation failed for 15 frames" and pose.reference == -1
     assert np.linalg.eigvalsh(pose.covariance).max() < 1e-9

@@ -1,6 +1,9 @@
-"""What `trihedron calibrate` says of sensors whose errors are known."""
+"""Estimates of `trihedron calibrate` for sensors whose errors are known."""
 
+import dataclasses
 import json
+import sys
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -13,7 +16,12 @@ from trihedron.pipeline.app.cli import main
 from trihedron.pipeline.record.reader import Recording
 from trihedron.pipeline.record.trajectories import write_trajectory
 from trihedron.tools.calibrate import depth_delay_of, depth_offset_of, planes_of
-from trihedron.tools.calibration import RightAngle, Turn, estimate_depth_delay, estimate_depth_offset
+from trihedron.tools.calibration import FrameRotation, RightAngle, estimate_depth_delay, estimate_depth_offset
+from trihedron.tools.calibration_focal_length import MIN_POINTS, estimate_focal_lengths
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "plugins"))
+from landmark_world import CAMERA, World
+from map_steps import EVERY, walk
 
 
 def write_tum(folder, frames, color_at, depth_at, offset=0.0):
@@ -66,10 +74,10 @@ def test_a_delay_is_found_from_turns():
 
     t, sigma = np.arange(200) * seconds, np.radians(0.1)
     color, depth = (angle(t + seconds + shift) - angle(t + shift) for shift in (0.0, tau))
-    turns = [Turn(c, d + rng.normal(0.0, sigma, 3), sigma**2 * np.eye(3)) for c, d in zip(color, depth)]
+    turns = [FrameRotation(c, d + rng.normal(0.0, sigma, 3), sigma**2 * np.eye(3)) for c, d in zip(color, depth)]
     found = estimate_depth_delay(turns, seconds)
     assert abs(found.seconds - tau) < 3.0 * found.sigma_s and found.sigma_s < 0.002
-    still = estimate_depth_delay([Turn(np.zeros(3), rng.normal(0.0, sigma, 3), sigma**2 * np.eye(3)) for _ in range(50)], seconds)
+    still = estimate_depth_delay([FrameRotation(np.zeros(3), rng.normal(0.0, sigma, 3), sigma**2 * np.eye(3)) for _ in range(50)], seconds)
     assert not still.sigma_s < 1.0  # a camera that does not turn cannot say
 
 
@@ -84,6 +92,53 @@ def test_a_recording_without_the_topics(tmp_path, capsys):
     assert main(["calibrate", str(tmp_path / "run.mcap")]) == 1
     cure = "record a run of graph=structural, or one that has this stage"
     assert capsys.readouterr().err == f"trihedron: {tmp_path / 'run.mcap'}: holds no topic matches; {cure}\n"
+
+
+def with_focal_lengths(map, x, y):
+    """The map of keyframes whose camera file has fx and fy wrong by these factors."""
+    intrinsics = np.tile([x * CAMERA.fx, y * CAMERA.fy, CAMERA.cx, CAMERA.cy], (len(map.keyframes), 1))
+    return dataclasses.replace(map, keyframes=map.keyframes.updated(np.arange(len(intrinsics)), intrinsics=intrinsics))
+
+
+@pytest.fixture(scope="module")
+def turning():
+    """Six keyframes of a camera that rotates about both axes."""
+    return walk(World(1500), 6, EVERY, stride=8)
+
+
+@pytest.mark.parametrize("x, y", [(1.0, 1.0), (0.8, 0.8), (1.2, 1.2), (1.05, 0.95)])
+def test_wrong_focal_lengths_are_found_within_their_deviation(turning, x, y):
+    found = estimate_focal_lengths(with_focal_lengths(turning, x, y))
+    print(found)
+    assert (np.abs(found.factors * [x, y] - 1.0) < 4.0 * found.sigmas).all() and (found.sigmas < 0.05).all() and found.pairs == 5
+
+
+def test_the_deviations_of_focal_lengths_are_honest():
+    """Over eight noises the errors are about one standard deviation."""
+    found = [estimate_focal_lengths(walk(World(1500, seed=seed), 4, EVERY, stride=8)) for seed in range(8)]
+    errors = np.array([np.log(one.factors) / one.sigmas for one in found])
+    print(np.round(errors, 1))
+    assert 0.4 < np.sqrt(np.mean(errors**2)) < 2.0
+
+
+def test_keyframes_without_rotation_or_points_leave_the_focal_lengths_open(turning):
+    still = estimate_focal_lengths(walk(World(1500), 3, EVERY, stride=0))
+    print(still)
+    assert still.pairs == 2 and (still.sigmas > 0.1).all()
+    few = estimate_focal_lengths(walk(World(MIN_POINTS // 2), 3, EVERY, stride=8))
+    assert few.pairs == 0 and np.isnan(few.factors).all() and (few.sigmas == np.inf).all()
+
+
+def test_the_command_reports_focal_lengths_that_are_a_fifth_too_long(tmp_path, capsys):
+    room = [f"+dataset.options.{name}={value}" for name, value in (("length", 40), ("width", 320), ("height", 240))]
+    assert main(["run", "dataset=faults", *room, "dataset.focal_times=1.2", f"out={tmp_path}"]) == 0
+    capsys.readouterr()
+    assert main(["calibrate", str(tmp_path / "run.mcap")]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert [line.split()[0] for line in lines] == ["figure", "depth_offset", "depth_delay_ms", "fx", "fy"]
+    estimate, sigma = (float(word) for word in lines[3].split(")")[1].split()[:2])
+    print(lines[3])
+    assert lines[3].startswith("fx (px; 315 in use)") and abs(estimate / 262.5 - 1.0) < 0.05 and 10.0 * sigma < 315.0 - estimate
 
 
 @pytest.mark.slow

@@ -1,4 +1,4 @@
-"""What moves is told by what lies on planes, and by landmarks that stayed where they were."""
+"""Dynamic objects: poses by matches on planes and by multi-view verified landmarks, where the others move."""
 
 import dataclasses
 import sys
@@ -9,8 +9,18 @@ import pytest
 
 from trihedron.pipeline.core.geometry import exp_se3, invert, log_se3
 from trihedron.plugins.matches.local_map import LocalMap
-from trihedron.plugins.pose.dynamic_objects import LEAST, AtRest, MovingObjects, at_rest, distance2, on_planes, proven, proven_planes, spread_about
-from trihedron.plugins.pose.map_alignment import MapAlignment, Verdict
+from trihedron.plugins.pose.dynamic_objects import (
+    MIN_POINTS,
+    StaticMatches,
+    covariance_about,
+    distance2,
+    matches_on_planes,
+    static_selections,
+    status_with_static,
+    verified_matches,
+    verified_planes,
+)
+from trihedron.plugins.pose.map_alignment import MapAlignment, TrackingStatus
 from trihedron.plugins.pose.refine import Refine
 from trihedron.plugins.shared.pose_optimizer import PoseSolution
 from trihedron.plugins.shared.pose_optimizer_kernels import LineTerms, PointTerms
@@ -63,51 +73,51 @@ def refined(world, map, share, shift_m=SWAY, **options):
 
 def test_a_landmark_that_two_keyframes_measured_is_proven(world, map):
     _, _, matches = matched(world, map)
-    found = proven(map, matches)
+    found = verified_matches(map, matches)
     for ids, known, table, kind in (
         (matches.keypoints[:, 1], found.points, map.point_observations, "point"),
         (matches.segments[:, 1], found.lines, map.line_observations, "line"),
     ):
         seen = np.bincount(table.column(kind), minlength=ids.max() + 1)[ids]
         assert (seen[known] >= 2).all() and (known == (seen >= 2)).mean() > 0.98  # two rows of one corner that became one were seen once each
-    points, lines, planes = found.only((PointTerms(*[matches.keypoints] * 6), LineTerms(*[matches.segments] * 6), matches.planes))
+    points, lines, planes = found.select((PointTerms(*[matches.keypoints] * 6), LineTerms(*[matches.segments] * 6), matches.planes))
     assert all(np.array_equal(column, matches.keypoints[found.points]) for column in points) and planes is matches.planes
     assert all(np.array_equal(column, matches.segments[found.lines]) for column in lines)
 
 
 def test_what_lies_within_planes_that_are_matched_is_at_rest(world, map):
     _, (keypoints, segments, planes), matches = matched(world, map)
-    found = on_planes(matches, keypoints, segments, planes)
+    found = matches_on_planes(matches, keypoints, segments, planes)
     rows = matches.keypoints[:, 0]
     points, normals = keypoints.points_m[rows].astype(float), planes.coefficients[:, :3]
     nearest_m = np.abs(points @ normals.T + planes.coefficients[:, 3]).min(axis=1)
     assert found.points.sum() > 100 and np.nanmax(nearest_m[found.points]) < 0.1
     fewer = dataclasses.replace(matches, planes=matches.planes[:1])
-    less, label = on_planes(fewer, keypoints, segments, planes), matches.planes[0, 0] + 1
+    less, label = matches_on_planes(fewer, keypoints, segments, planes), matches.planes[0, 0] + 1
     at = np.rint(keypoints.pixels[rows] / planes.stride).astype(int)
     assert (planes.labels[at[less.points, 1], at[less.points, 0]] == label).all() and not (less.points & ~found.points).any()
     border = dataclasses.replace(planes, labels=np.where(np.indices(planes.labels.shape).sum(0) % 3 == 0, 0, planes.labels).astype(np.uint8))
-    assert not on_planes(matches, keypoints, segments, border).points.any()  # something else within a cell of each
-    assert [kind.name for kind in at_rest(map, matches, keypoints, segments, planes)] == ["what lies on planes", "what is proven"]
+    assert not matches_on_planes(matches, keypoints, segments, border).points.any()  # something else within a cell of each
+    assert [kind.name for kind in static_selections(map, matches, keypoints, segments, planes)] == ["matches on planes", "verified landmarks"]
 
 
 def test_a_plane_met_once_is_not_known_to_be_at_rest_unless_there_is_but_one_keyframe(world, map, single):
     matches = matched(world, map)[2]
     young = dataclasses.replace(map, planes=map.planes.updated(matches.planes[:1, 1], found=np.array([1])))
-    assert proven_planes(map, matches).all() and proven_planes(single, matched(world, single)[2]).all()
-    assert np.array_equal(proven_planes(young, matches), matches.planes[:, 1] != matches.planes[0, 1])
+    assert verified_planes(map, matches).all() and verified_planes(single, matched(world, single)[2]).all()
+    assert np.array_equal(verified_planes(young, matches), matches.planes[:, 1] != matches.planes[0, 1])
 
 
 def denied(world, map, points, planes):
-    """Whether a pose by what lies on planes is, with which so many of the points and planes agree."""
+    """Return True if a pose by matches on planes is degraded, when so many of the points and planes agree with it."""
     (rotation, _), features, matches = matched(world, map)
     problem = MapAlignment(rotation.R_world_camera, np.eye(6), world.frame(STEP).camera, matches, *features, map, 1.0, 0.5)
     counts = (len(matches.keypoints), int(points * len(matches.keypoints))), (len(matches.segments), 0), (len(matches.planes), planes)
     flags = [(np.arange(count) < agree).astype(np.uint8) for count, agree in counts]
     found = PoseSolution(camera_at(STEP), 1e-6 * np.eye(6), np.empty((6, 0)), *flags, 0.0)
-    said = MovingObjects().judged_at_rest(found, problem, "what lies on planes", Verdict("ok", "", found.covariance))
-    assert said.status == "ok" or said.reason.startswith("something moves")
-    return said.status == "degraded"
+    status = status_with_static(TrackingStatus("ok", "", found.covariance), found, problem, "matches on planes", Refine().dynamic_object_options)
+    assert status.status == "ok" or status.reason.startswith("something moves")
+    return status.status == "degraded"
 
 
 def test_a_pose_by_what_lies_on_planes_is_denied_by_most_of_what_is_seen_and_half_of_the_planes(world, map):
@@ -116,12 +126,13 @@ def test_a_pose_by_what_lies_on_planes_is_denied_by_most_of_what_is_seen_and_hal
 
 
 def test_new_points_contradict_proven_ones_by_the_difference_of_their_shares():
-    known = AtRest("", np.arange(200) < 100, np.empty(0, bool))
+    known = StaticMatches("", np.arange(200) < 100, np.empty(0, bool))
     agree = np.ones(200, np.uint8)
-    assert known.contradicted(agree) == 0.0
+    assert known.outlier_difference(agree) == 0.0
     agree[:10], agree[100:140] = 0, 0  # 10 % of the proven, 40 % of the new
-    assert known.contradicted(agree) == pytest.approx(0.3) and AtRest("", ~known.points, known.lines).contradicted(agree) == pytest.approx(0.3)
-    assert AtRest("", np.arange(200) < LEAST - 1, known.lines).contradicted(agree) == 0.0
+    others = StaticMatches("", ~known.points, known.lines)
+    assert known.outlier_difference(agree) == pytest.approx(0.3) and others.outlier_difference(agree) == pytest.approx(0.3)
+    assert StaticMatches("", np.arange(200) < MIN_POINTS - 1, known.lines).outlier_difference(agree) == 0.0
 
 
 def test_the_distance_is_in_standard_deviations_of_the_first():
@@ -136,7 +147,7 @@ def test_a_pose_that_most_contradicts_is_known_no_better_than_the_other_one_and_
     none = np.empty(0, np.uint8)
     said = PoseSolution(camera_at(3), 1e-8 * np.eye(6), np.empty((6, 0)), none, none, none, 0.0)
     sure = dataclasses.replace(said, T_world_camera=camera_at(3) @ exp_se3(OFF), covariance=1e-6 * np.eye(6))
-    spread = spread_about(said, sure)
+    spread = covariance_about(said, sure)
     assert OFF @ np.linalg.solve(spread, OFF) < 1.0 and np.linalg.eigvalsh(spread)[0] > 0.99e-6
 
 
@@ -145,7 +156,7 @@ def test_what_moves_does_not_pull_the_pose(world, map, share):
     pose, pulled = refined(world, map, share), refined(world, map, share, moving_gate=1e9)
     still = refined(world, map, share, np.zeros(3))
     print(f"{share:.0%} moving: {error(pose, STEP)}, all alike {error(pulled, STEP)}, at rest {error(still, STEP)} (m, deg)")
-    assert error(pose, STEP)[0] < 0.006 and pose.status == "ok" and pose.reason.endswith("by what is proven alone")
+    assert error(pose, STEP)[0] < 0.006 and pose.status == "ok" and pose.reason.endswith("by verified landmarks alone")
     assert error(pulled, STEP)[0] > 2.0 * error(pose, STEP)[0]
 
 
