@@ -46,33 +46,6 @@ def test_a_small_camera_covered_for_ten_frames_is_lost_just_then(tmp_path):
     assert len((tmp_path / "run" / "trajectory.txt").read_text().splitlines()) == 1 + 22
 
 
-COMPILED = """
-import sys
-from numba.core.dispatcher import Dispatcher
-from trihedron.pipeline.app.cli import main
-def compiled():
-    modules = [module for name, module in sys.modules.items() if name.startswith("trihedron.")]
-    kernels = {kernel for module in modules for kernel in vars(module).values() if isinstance(kernel, Dispatcher)}
-    return {(kernel.py_func.__name__, signature) for kernel in kernels for signature in kernel.signatures}
-small = ["dataset.width=320", "dataset.height=240"]
-assert main(["run", *small, "dataset.frames=0:3", "out=three"]) == 0
-before = compiled()
-cover = ["dataset=faults", "dataset.of=synthetic", "dataset.frames=0:24", "dataset.cover=14:20"]
-assert main(["run", *cover, "+dataset.options.width=320", "+dataset.options.height=240", "out=covered"]) == 0
-print("later:", *sorted({name for name, _ in compiled() - before}))
-"""
-
-
-def test_the_first_loss_compiles_nothing(tmp_path):
-    """What a loss and the way back need is compiled, or loaded, in the first three frames, which are run before the clock starts. Only what joins
-    planes of the map comes later, with the first pair of them."""
-    done = subprocess.run([sys.executable, "-c", COMPILED], cwd=tmp_path, capture_output=True, text=True)
-    assert done.returncode == 0, done.stderr[-1000:]
-    assert any(pose.reason.startswith("recognised by") for pose in Recording(tmp_path / "covered" / "run.mcap").values("relocalise"))
-    (later,) = [line.split()[1:] for line in done.stdout.splitlines() if line.startswith("later:")]
-    assert set(later) <= {"spread", "overlap", "mean_distance"}
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("name", SEQUENCES)
 def test_a_camera_covered_for_a_second_is_lost_just_then(tmp_path, name):

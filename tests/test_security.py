@@ -31,7 +31,6 @@ FORBIDDEN = {  # names that run or load what data say; of attributes the object 
 }  # fmt: skip
 COMPUTED_IMPORTS = {  # files that import by a name that is not written in the call, and where the name comes from
     "pipeline/app/cli.py": "the installed entry points",
-    "pipeline/run/kernels.py": "a list beside the file",
     "pipeline/core/registry.py": "the packages' own folders and the installed entry points",
     "tools/benchmark.py": "a table in the file",
 }

@@ -1,8 +1,11 @@
 """Compare two recordings value by value: the first topic, frame and field in which they differ, and by how much; then every topic that differs.
 
-Only frames and topics that both have are compared; what one of them lacks is reported. Exit code 0 when all of it is equal, bit for bit, 1 when not.
+Only frames and topics that both have are compared; a message names what one of them lacks. Exit code 0 when all of it is equal, bit for bit, 1 when
+not. With --tolerance real numbers are equal that differ by no more: |a - b| <= T max(1, |a|, |b|); every field that differs is listed with its
+largest such difference. Libraries of linear algebra round differently on other processors.
 
 Example: trihedron diff runs/a/run.mcap runs/b/run.mcap --topics pose,map
+Example: trihedron diff runs/a/run.mcap runs/b/run.mcap --tolerance 1e-6
 """
 
 from __future__ import annotations
@@ -14,7 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from trihedron.pipeline.core.errors import DataError, did_you_mean
+from trihedron.pipeline.core.errors import DataError, UsageError, did_you_mean
 from trihedron.pipeline.core.types import Table, Value
 from trihedron.pipeline.record.codec import FRAMES_TOPIC
 from trihedron.pipeline.record.reader import Recording, TopicReader
@@ -38,13 +41,17 @@ def main(argv: list[str]) -> int:
     parser.add_argument("a", metavar="A.mcap", type=Path)
     parser.add_argument("b", metavar="B.mcap", type=Path)
     parser.add_argument("--topics", metavar="TOPIC,...", default="", help="(default: all that both have)")
+    parser.add_argument("--tolerance", metavar="T", type=float, help="list every field that differs, and call equal what differs by T at most")
     arguments = parser.parse_args(argv)
+    if arguments.tolerance is not None and not 0.0 <= arguments.tolerance < np.inf:
+        raise UsageError("--tolerance", f"{arguments.tolerance:g} is not a tolerance", "give a number from 0")
     a, b = Recording(arguments.a), Recording(arguments.b)
     topics, frames = _topics(a, b, arguments.topics), _frames(a, b)
+    if arguments.tolerance is not None:
+        _report_lacking(a, b)
+        return _within(a, b, topics, frames, arguments.tolerance)
     found = [found for topic in topics if (found := difference(a, b, topic, frames)) is not None]
-    for file, other in ((a, b), (b, a)):
-        if lacking := sorted(other.topics - file.topics):
-            print(f"{file.path} has no {', '.join(lacking)}")
+    _report_lacking(a, b)
     if not found:
         print(f"equal: {len(frames)} frames ({frames[0]}..{frames[-1]}) of {', '.join(topics)}")
         return 0
@@ -54,6 +61,54 @@ def main(argv: list[str]) -> int:
     rows += [[one.topic, str(one.frame), one.field, one.size, str(one.frames)] for one in found]
     print(table(rows, "lrllr"))
     return 1
+
+
+def _report_lacking(a: Recording, b: Recording) -> None:
+    for file, other in ((a, b), (b, a)):
+        if lacking := sorted(other.topics - file.topics):
+            print(f"{file.path} has no {', '.join(lacking)}")
+
+
+def _within(a: Recording, b: Recording, topics: list[str], frames: list[int], tolerance: float) -> int:
+    """Print every field that differs, with its largest difference; returns 0 when none differs by more than the tolerance."""
+    rows = [["topic", "field", "largest difference", "frame", ""]]
+    for topic in topics:
+        worst: dict[str, tuple[float, int]] = {}
+        readers = TopicReader(a, topic), TopicReader(b, topic)
+        for frame in frames:
+            for field, apart in _apart(*(reader.at(frame) for reader in readers)):
+                if apart > worst.get(field, (-1.0, 0))[0]:
+                    worst[field] = apart, frame
+        for field, (apart, frame) in worst.items():
+            verdict = f"equal within {tolerance:g}" if apart <= tolerance else "different"
+            rows.append([topic, field, f"{apart:.2g}" if np.isfinite(apart) else "not comparable", str(frame), verdict])
+    if len(rows) > 1:
+        print(table(rows, "llrll"))
+    different = sum(row[-1] == "different" for row in rows)
+    print(f"{'different' if different else 'equal'} within {tolerance:g}: {len(frames)} frames ({frames[0]}..{frames[-1]}) of {', '.join(topics)}")
+    return int(different > 0)
+
+
+def _apart(x: Value | None, y: Value | None) -> Iterator[tuple[str, float]]:
+    """(field, largest |a - b| / max(1, |a|, |b|)) of all fields that differ; infinite where they are of another kind or shape, or text."""
+    if x is None or y is None or type(x) is not type(y):
+        if x is not y:
+            yield "value", np.inf
+        return
+    for name, one, other in _arrays(x, y, ""):
+        if _size(one, other) is not None:
+            yield name, _relative(one, other)
+
+
+def _relative(x: Any, y: Any) -> float:
+    if x.shape != y.shape or x.dtype.kind != y.dtype.kind or x.dtype.kind == "U":
+        return float("inf")
+    whole = x.dtype.kind != "f"  # ids and counts are equal or not
+    with np.errstate(all="ignore"):
+        x, y = x.astype(np.float64), y.astype(np.float64)
+        apart = np.abs(x - y) / (1.0 if whole else np.maximum(1.0, np.maximum(np.abs(x), np.abs(y))))
+    same = (x == y) | (np.isnan(x) & np.isnan(y))
+    return float(np.max(np.where(same, 0.0, np.where(np.isnan(apart), np.inf, apart)), initial=0.0))
 
 
 def _topics(a: Recording, b: Recording, words: str) -> list[str]:
@@ -101,22 +156,23 @@ def _differing(x: Value | None, y: Value | None) -> Iterator[tuple[str, str]]:
 
 
 def _fields(x: Any, y: Any, prefix: str) -> Iterator[tuple[str, str]]:
-    for field in fields(x):
-        name, one, other = prefix + field.name, getattr(x, field.name), getattr(y, field.name)
-        if isinstance(one, Table):
-            yield from _columns(one, other, name)
-        elif is_dataclass(one):
-            yield from _fields(one, other, f"{name}.")
-        elif (size := _size(np.asarray(one), np.asarray(other))) is not None:
+    for name, one, other in _arrays(x, y, prefix):
+        if (size := _size(one, other)) is not None:
             yield name, size
 
 
-def _columns(x: Table, y: Table, name: str) -> Iterator[tuple[str, str]]:
-    for column in x.schema:
-        if column not in y.schema:
-            yield f"{name}.{column}", "only in the first"
-        elif (size := _size(x.column(column), y.column(column))) is not None:
-            yield f"{name}.{column}", size
+def _arrays(x: Any, y: Any, prefix: str) -> Iterator[tuple[str, Any, Any]]:
+    """(field, array of one, of the other) of two values of a type; a table gives its columns, one that only the first has an empty text instead."""
+    for field in fields(x):
+        name, one, other = prefix + field.name, getattr(x, field.name), getattr(y, field.name)
+        if isinstance(one, Table):
+            for column in one.schema:
+                missing = column not in other.schema
+                yield f"{name}.{column}", one.column(column), np.asarray("") if missing else other.column(column)
+        elif is_dataclass(one):
+            yield from _arrays(one, other, f"{name}.")
+        else:
+            yield name, np.asarray(one), np.asarray(other)
 
 
 def _size(x: Any, y: Any) -> str | None:

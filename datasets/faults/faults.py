@@ -173,7 +173,6 @@ class Faults:
         return kind(**{name: _as(hints.get(name), value) for name, value in self.options.items()})
 
 
-
 def _refuse_sizes(number: int, depth: F32, times: float) -> None:
     h, w = depth.shape
     cause = f"depth is {round(times * w)}×{round(times * h)} while colour is {w}×{h}"

@@ -105,7 +105,5 @@ def curved_pieces() -> list[Solid]:
     heights = np.linspace(-1.0, 1.0, len(turns))
     reach = 0.22 * np.sqrt(1.0 - heights**2) + 0.03
     radii = 0.05 + 0.02 * (np.arange(len(turns)) % 3)
-    crown = [
-        sphere(x + r * np.cos(t), y + r * np.sin(t), 1.02 + 0.26 * h, radius, "fabric") for t, h, r, radius in zip(turns, heights, reach, radii)
-    ]
+    crown = [sphere(x + r * np.cos(t), y + r * np.sin(t), 1.02 + 0.26 * h, radius, "fabric") for t, h, r, radius in zip(turns, heights, reach, radii)]
     return [column, ball, *pot, *crown]

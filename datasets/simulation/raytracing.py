@@ -243,9 +243,7 @@ def _hit_sphere(solid: F64, d0: float, d1: float, d2: float) -> tuple[float, int
 
 
 @njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
-def nearest(
-    room: F64, solids: F64, first_face: I32, chosen: NDArray[np.int64], count: int, dx: float, dy: float
-) -> tuple[float, int]:
+def nearest(room: F64, solids: F64, first_face: I32, chosen: NDArray[np.int64], count: int, dx: float, dy: float) -> tuple[float, int]:
     """Depth and face of the nearest hit among the room and the first `count` chosen solids (see View)."""
     inverse, face = nearest_wall(room, dx, dy)
     t = 1.0 / inverse

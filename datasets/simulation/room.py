@@ -119,9 +119,7 @@ class Wall:
     normal: F64
     length_m: float
 
-    def mounted(
-        self, at: float, z: tuple[float, float], width: float, thickness: float, material: str, front: str = "", off_m: float = 0.0
-    ) -> Solid:
+    def mounted(self, at: float, z: tuple[float, float], width: float, thickness: float, material: str, front: str = "", off_m: float = 0.0) -> Solid:
         """A box on the wall, or `off_m` from it, its middle `at` metres from its start; `front` is the material of the face towards the room."""
         centre = self.start + self.along * at + self.normal * (off_m + thickness / 2.0) + UP * ((z[0] + z[1]) / 2.0)
         half = np.array([width / 2.0, thickness / 2.0, (z[1] - z[0]) / 2.0])

@@ -145,9 +145,7 @@ def _smooth_borders(geometry: Geometry, atlas: Atlas, view: View, faces: I32, co
 
 
 @njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
-def _smooth_pixel(
-    geometry: Geometry, atlas: Atlas, view: View, solids: NDArray[np.int64], count: int, seen: F64, x: int, y: int, color: U8
-) -> None:
+def _smooth_pixel(geometry: Geometry, atlas: Atlas, view: View, solids: NDArray[np.int64], count: int, seen: F64, x: int, y: int, color: U8) -> None:
     """Find the faces in a pixel and colour each once, at the middle of its samples. `seen` is room for rows (face, samples, sums of dx, dy, t)."""
     found, samples = 0, SUBPIXELS * SUBPIXELS
     for i in range(samples):

@@ -282,6 +282,7 @@ class Trajectory:
 
 # The pinhole camera and its depth noise.
 
+
 @dataclass(frozen=True)
 class DepthNoise:
     """Standard deviation of a depth reading: `max(floor_m, a + b z + c z²)` metres at z metres. Belongs to the sensor, so to the data set."""
@@ -345,57 +346,70 @@ _LIFE: dict[str, tuple[Any, ...]] = {
     "visible": _ROW,
     "alive": ("?", ()),
 }
-KEYFRAMES = Columns({
-    "index": _ROW,
-    "stamp_ns": ("i8", ()),
-    "T_world_camera": ("f8", (4, 4), Rotations()),
-    "covariance": ("f8", (6, 6), Finite()),
-    "intrinsics": ("f8", (4,), Finite()),
-    "points": ("i4", (2,), IndexInto(".point_observations+")),
-    "lines": ("i4", (2,), IndexInto(".line_observations+")),
-    "planes": ("i4", (2,), IndexInto(".plane_observations+")),
-    "submap": ("i4", (), Within(0, 2**31)),
-    "alive": ("?", ()),
-})
-POINTS = Columns({
-    "position_m": ("f8", (3,), Finite()),
-    "information": ("f4", (3, 3), Finite()),
-    "descriptor": ("u1", (None,)),
-    "direction": ("f4", (3,)),
-    "distance_m": ("f4", ()),
-    "octave": ("u1", ()),
-    **_LIFE,
-})
+KEYFRAMES = Columns(
+    {
+        "index": _ROW,
+        "stamp_ns": ("i8", ()),
+        "T_world_camera": ("f8", (4, 4), Rotations()),
+        "covariance": ("f8", (6, 6), Finite()),
+        "intrinsics": ("f8", (4,), Finite()),
+        "points": ("i4", (2,), IndexInto(".point_observations+")),
+        "lines": ("i4", (2,), IndexInto(".line_observations+")),
+        "planes": ("i4", (2,), IndexInto(".plane_observations+")),
+        "submap": ("i4", (), Within(0, 2**31)),
+        "alive": ("?", ()),
+    }
+)
+POINTS = Columns(
+    {
+        "position_m": ("f8", (3,), Finite()),
+        "information": ("f4", (3, 3), Finite()),
+        "descriptor": ("u1", (None,)),
+        "direction": ("f4", (3,)),
+        "distance_m": ("f4", ()),
+        "octave": ("u1", ()),
+        **_LIFE,
+    }
+)
 LINES = Columns({"endpoints_m": ("f8", (2, 3), Finite()), "information": ("f4", (2, 3, 3), Finite()), "descriptor": ("u1", (None,)), **_LIFE})
-PLANES = Columns({
-    "coefficients": ("f8", (4,), UnitNormals()),
-    "covariance": ("f8", (3, 3), Finite()),
-    "moments": ("f8", (4, 4), Finite()),
-    "samples_m": ("f4", (None, 3)),
-    **_LIFE,
-})
-POINT_OBSERVATIONS = Columns({
-    "keyframe": _KEYFRAME,
-    "point": ("i4", (), IndexInto(".points")),
-    "pixel": ("f4", (2,), Finite()),
-    "depth_m": ("f4", ()),
-    "sigma_px": ("f4", ()),
-    "sigma_m": ("f4", ()),
-})
-LINE_OBSERVATIONS = Columns({
-    "keyframe": _KEYFRAME,
-    "line": ("i4", (), IndexInto(".lines")),
-    "endpoints_px": ("f4", (2, 2), Finite()),
-    "endpoints_m": ("f4", (2, 3)),
-    "covariance_m2": ("f4", (2, 3, 3)),
-})
-PLANE_OBSERVATIONS = Columns({
-    "keyframe": _KEYFRAME,
-    "plane": ("i4", (), IndexInto(".planes")),
-    "coefficients": ("f8", (4,), UnitNormals()),
-    "covariance": ("f8", (3, 3), Finite()),
-    "moments": ("f8", (4, 4), Finite()),
-})
+PLANES = Columns(
+    {
+        "coefficients": ("f8", (4,), UnitNormals()),
+        "covariance": ("f8", (3, 3), Finite()),
+        "moments": ("f8", (4, 4), Finite()),
+        "samples_m": ("f4", (None, 3)),
+        **_LIFE,
+    }
+)
+POINT_OBSERVATIONS = Columns(
+    {
+        "keyframe": _KEYFRAME,
+        "point": ("i4", (), IndexInto(".points")),
+        "pixel": ("f4", (2,), Finite()),
+        "depth_m": ("f4", ()),
+        "sigma_px": ("f4", ()),
+        "sigma_m": ("f4", ()),
+    }
+)
+LINE_OBSERVATIONS = Columns(
+    {
+        "keyframe": _KEYFRAME,
+        "line": ("i4", (), IndexInto(".lines")),
+        "endpoints_px": ("f4", (2, 2), Finite()),
+        "endpoints_m": ("f4", (2, 3)),
+        "covariance_m2": ("f4", (2, 3, 3)),
+    }
+)
+PLANE_OBSERVATIONS = Columns(
+    {
+        "keyframe": _KEYFRAME,
+        "plane": ("i4", (), IndexInto(".planes")),
+        "coefficients": ("f8", (4,), UnitNormals()),
+        "covariance": ("f8", (3, 3), Finite()),
+        "moments": ("f8", (4, 4), Finite()),
+    }
+)
+
 
 @dataclass(frozen=True)
 class Map(Value):

@@ -13,6 +13,7 @@ from trihedron.plugins.shared.linalg_kernels import descending
 
 # Corners of all levels of a pyramid, chosen and directed in one call that holds no lock.
 
+
 @kernel
 def oriented_corners(
     pyramid: Pyramid, threshold: int, threshold_low: int, margin: int, cell_px: int, wanted: int, weights: F64
@@ -112,6 +113,7 @@ def _place(pyramid: Pyramid, pixels: I32, levels: I32, i: int) -> tuple[int, int
 
 
 # Image pyramids and where their pixels lie in the full image.
+
 
 class Pyramid(NamedTuple):
     """Levels one after another: all pixels (n,), where each level starts in them (levels + 1,), and its height and width (levels, 2)."""
@@ -312,6 +314,7 @@ def centroid_angle(pixels: U8, corner: int, cols: int, across: F32, inside: F32)
 
 
 # Choosing image features spread over the image.
+
 
 @kernel
 def spread_over_cells(cells: I32, number: int, order: I32, wanted: int) -> Bool:

@@ -93,6 +93,7 @@ def _peaks(histogram: F64, apart: int) -> I32:
 
 # Rotations that share their third axis, fitted together to directions on any of their axes.
 
+
 @kernel
 def fit_shared_vertical(
     directions: F64, information: F64, columns: I32, counted: int, rotations: F64, prior: float, gate: float, iterations: int

@@ -455,6 +455,7 @@ def add_moments(moments: F64, w: float, x: float, y: float, z: float) -> None:
 # Cell `(face · n + i) · n + j` holds the directions d whose largest component is `d[face]` and whose next two, divided by it, fall into the i-th and
 # j-th of n parts of [-1, 1]. Finding the cell of a direction takes two divisions; a cell is 2/n rad wide in the middle of a face, half in a corner.
 
+
 class SphereGrid(NamedTuple):
     """Centres (3n², 3), unit, and radii (3n²,), rad: how far from its centre a cell reaches."""
 

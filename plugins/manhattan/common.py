@@ -175,6 +175,7 @@ HALF_SPHERE = _half_sphere(256)  # (256, 3) directions about 9° apart over half
 
 # What an estimator of several frames says: of those it sees, and of those it knows but does not see.
 
+
 def lost_frames(modes: Modes, fit: AxisFit, segments: Segments, planes: Planes, normals: Normals, known: F64, ids: I32) -> ManhattanFrame:
     """Not supported: a single axis of the first still turns all that are known (k, 3, 3), and tells two of its three angles."""
     R, covariance = known[0], np.eye(3) * NOTHING_KNOWN

@@ -119,9 +119,7 @@ class Covisibility:
         depth = frame.depth_m[::8, ::8].ravel()
         return self.min_shift * _median(depth[depth > 0.0], 1.0)
 
-    def _inserted(
-        self, map: Map, frame: Frame, pose: Pose, keypoints: Keypoints, segments: Segments, planes: Planes, matches: Matches | None
-    ) -> Map:
+    def _inserted(self, map: Map, frame: Frame, pose: Pose, keypoints: Keypoints, segments: Segments, planes: Planes, matches: Matches | None) -> Map:
         """The map with this frame as its newest keyframe."""
         matches = matches if len(keyframes_of(map, pose.submap)) else None  # a new sub-map knows nothing yet
         found = associate(map, frame.camera, pose.T_world_camera, keypoints, segments, planes, matches, self.line_sigma_px, self.judge)

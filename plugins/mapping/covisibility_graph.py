@@ -151,6 +151,7 @@ def local_window(
 
 def window_of(map: Map, keyframes: I32) -> LocalWindow:
     """The keyframes (sorted rows) and what they see."""
+
     def seen() -> LocalWindow:
         return LocalWindow(keyframes, *(observed_by(map, keyframes, kind) for kind in ("point", "line", "plane")))
 

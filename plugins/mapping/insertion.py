@@ -178,9 +178,7 @@ def insert_planes(map: Map, view: Observations, planes: Planes, pairs: I32, new:
     total = table.rows("moments", ids) * (1.0 - 1.0 / memory)
     np.add.at(total, where, moments[pairs[:, 0]])
     fitted, covariance = plane_fusion.fit_planes(total, table.rows("coefficients", ids))
-    spread = [
-        spread_samples(np.concatenate([old, *samples[pairs[where == k, 0]]]), len(old)) for k, old in enumerate(table.rows("samples_m", ids))
-    ]
+    spread = [spread_samples(np.concatenate([old, *samples[pairs[where == k, 0]]]), len(old)) for k, old in enumerate(table.rows("samples_m", ids))]
     table = table.updated(
         ids,
         coefficients=fitted,

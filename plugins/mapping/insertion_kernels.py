@@ -21,6 +21,7 @@ from trihedron.plugins.shared.pose_optimizer_kernels import (
 
 # Information filters that move point and line landmarks by what a keyframe measured of them.
 
+
 @kernel
 def _noise(D: F64, p: F64, pose_covariance: F64, rows: int, J: F64, S: F64) -> None:
     """S: covariance that an uncertain pose gives to residuals with derivatives D (rows, 3) by the camera-frame point p."""

@@ -113,6 +113,7 @@ def empty_map(index: int, stamp_ns: int, point_bytes: int, line_bytes: int, plan
 
 # Sets of ids, as sorted rows. Ids lie close together, so marking them beats sorting them.
 
+
 def distinct(ids: I32) -> I32:
     """(n,) the different ids, sorted."""
     if len(ids) == 0:

@@ -27,9 +27,7 @@ class VisiblePoints(NamedTuple):
     octaves: U8
 
 
-def visible_points(
-    points: Sequence[NDArray[Any]], T_world_camera: F64, camera: Camera, view_deg: float, octave_scale: float
-) -> VisiblePoints:
+def visible_points(points: Sequence[NDArray[Any]], T_world_camera: F64, camera: Camera, view_deg: float, octave_scale: float) -> VisiblePoints:
     """Those of the points, given by their columns `POINT_COLUMNS`, that lie in the image, are seen from within `view_deg` of the last direction and
     at a similar distance."""
     cosine, log_scale = math.cos(math.radians(view_deg)), math.log(octave_scale)

@@ -58,6 +58,7 @@ def _hash_table(places: I32) -> tuple[I64, I32]:
 
 # The downsampled frame that is integrated into a dense model.
 
+
 class DownsampledFrame(NamedTuple):
     """A frame downsampled to about a width, with its intrinsics (fx, fy, cx, cy) and its camera at its pose."""
 

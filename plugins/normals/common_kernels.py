@@ -11,6 +11,7 @@ from trihedron.pipeline.core.types import F32, F64, I32, U8
 
 # An organised cloud of points for detectors that expect clean ones: smoothed over patches that never cross a depth edge.
 
+
 @kernel
 def smooth_cells(rho: F32, count: U8, full: int, jump: float, jump_m: float) -> U8:
     """(h, w) 1 where a cell's inverse depth rho is that of its centre, because all its `full` readings are there, and no neighbour in its row or

@@ -11,6 +11,7 @@ from trihedron.plugins.planes.common_blocks_kernels import SUMS, block_mse, bloc
 
 # Agglomerative hierarchical clustering of blocks into planes (Feng, Taguchi and Kamat, ICRA 2014).
 
+
 @kernel
 def cluster_blocks(sums: F64, block_limit: float, limit: float, excess: float, least: float) -> tuple[I32, F64]:
     """Labels (rows, cols) of the blocks, 0 = none, and q (k, 3) of their clusters.

@@ -61,9 +61,7 @@ class PlanarRegions:
         """Planes of the regions whose core cells are labelled (h, w) and whose planes are q (k, 3): grown, merged, fitted to their cores. A detector
         that did not ask the normals says that the regions need not be `flat`: curved ones are dropped."""
         gap, cos_cone = max(self.gap_px // stride, 1), math.cos(2.0 * math.radians(self.cone_deg))
-        labels, owner, sums = grown_and_merged(
-            core, q, grid, self.gate, self.border_px // stride, cos_cone, gap, self.merge, self.correlation_px**2
-        )
+        labels, owner, sums = grown_and_merged(core, q, grid, self.gate, self.border_px // stride, cos_cone, gap, self.merge, self.correlation_px**2)
         if not flat:
             owner = self._flat(owner, labels, sums, grid, gap)
         return self._report(labels, core, owner, sums, grid, frame, stride)
@@ -84,9 +82,7 @@ class PlanarRegions:
         numbered, number, ranked, area = largest_regions(labels, owner, grid.count, self.min_pixels, self.planes)
         A, b, moments, n = (total[ranked] for total in sums)
         q = np.asarray(np.linalg.solve(A, b[..., None])[..., 0], np.float64)
-        coefficients, J, excess, samples = plane_report(
-            numbered, core, number, q, grid, self.tiles, self.correlation_px**2, 2.0, self.samples, 400
-        )
+        coefficients, J, excess, samples = plane_report(numbered, core, number, q, grid, self.tiles, self.correlation_px**2, 2.0, self.samples, 400)
         variance = excess + self.bias**2 * n  # over that of the least-squares fit to n independent depths, `A⁻¹`
         return Planes(
             index=frame.index,

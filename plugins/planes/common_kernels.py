@@ -216,6 +216,7 @@ def turn(q: F64, columns: F64, member: Bool) -> float:
 
 # Labelled planar regions on a grid: growth to their borders, sums over their cells, and which are the largest.
 
+
 @kernel
 def grow_regions(labels: U8, planes: F64, grid: Grid, gate: float, reach: int, cos_cone: float) -> U8:
     """Labels (h, w), grown ring by ring into unlabelled cells whose depth is within `gate` σ of the neighbouring region's q; returns a copy.
@@ -760,6 +761,7 @@ def _fitted(columns: F64, chosen: Bool) -> F64:
 
 
 # Whether regions found by their depths alone are planes: what the normals of their cells say.
+
 
 @kernel
 def linear_turn(C: F64, D: F64, sum_x: F64, sum_n: F64, count: float, normal: F64) -> float:

@@ -12,6 +12,7 @@ from trihedron.plugins.shared.depth_image_kernels import Grid, cells_by_componen
 
 # Planes among the connected components of a grid's normals (Trevor et al., SPME 2013; paper, section III-A).
 
+
 @kernel
 def planar_components(
     grid: Grid, edge: tuple[float, float], bend: float, gate: float, cone: float, turn: float, rounds: int, least: int, most: int

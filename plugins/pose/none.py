@@ -14,9 +14,7 @@ from trihedron.plugins.mapping.reference_keyframe import decoupled_pose, transfo
 class NoRefinement:
     """The decoupled pose as it is (Table I, "Ours/-wo")."""
 
-    def __call__(
-        self, rotation: Rotation, translation: Translation, previous: Pose | None, map: Map | None, relocalise: Pose | None
-    ) -> Pose:
+    def __call__(self, rotation: Rotation, translation: Translation, previous: Pose | None, map: Map | None, relocalise: Pose | None) -> Pose:
         """Return the decoupled pose; its status is that of rotation and translation."""
         previous, relocalise = (transform_to_map(pose, map) if pose is not None else None for pose in (previous, relocalise))
         return decoupled_pose(rotation, translation, previous, relocalise).to_pose(rotation, map)

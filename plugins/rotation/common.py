@@ -81,6 +81,7 @@ def rotation_value(index: int, stamp_ns: int, estimate: Estimate, known: KnownFr
 
 # The known Manhattan frames, as rotations to the world with the number of observations of each.
 
+
 @dataclass(frozen=True)
 class Observation:
     """Observation of a Manhattan frame, associated with the known frame in row `row`: `R_camera_manhattan` in that frame's order of the axes,

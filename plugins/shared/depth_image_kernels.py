@@ -111,6 +111,7 @@ def _nearest_mean(depth: F32, u: float, v: float) -> tuple[float, float, float]:
 # A plane `n·x + d = 0` is, along the ray r = (x/z, y/z, 1) of a cell, linear in inverse depth: `1 / z = q·r` with `q = -n / d`. The ray is exact and
 # only z is noisy, so least squares in q with `σ = σ_z / z²` is unbiased and has a closed form.
 
+
 class Grid(NamedTuple):
     """Cells of stride × stride pixels: inverse depth (0 = none), the σ of one reading of it and the number of readings, (h, w) each; x/z of the
     columns (w,) and y/z of the rows (h,); unit normals (h, w, 3), NaN = none."""
@@ -124,9 +125,7 @@ class Grid(NamedTuple):
 
 
 @kernel
-def cell_inverse_depths(
-    depth: F32, stride: int, edge: float, edge_m: float, noise: tuple[float, float, float, float]
-) -> tuple[F32, F32, U8]:
+def cell_inverse_depths(depth: F32, stride: int, edge: float, edge_m: float, noise: tuple[float, float, float, float]) -> tuple[F32, F32, U8]:
     """Inverse of the mean depth (h, w) of each block of stride × stride pixels, the σ of one reading of it, and the number of readings (255 at most).
 
     Where a block has no depth or a step of more than `edge` z + `edge_m` all three are 0."""

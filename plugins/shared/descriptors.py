@@ -91,6 +91,7 @@ def words_of(descriptors: U8) -> tuple[U64, U8]:
 
 # Descriptors that are each other's nearest, wherever they are in the image.
 
+
 def mutual_matches(before: U8, now: U8, metric: str, ratio: float) -> I32:
     """(k, 2) rows (before, now) of descriptors (n, b) and (m, b) that are nearest to each other, and whose second best is farther by 1/ratio. Of
     equals the first row is taken."""

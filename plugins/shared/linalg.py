@@ -12,6 +12,7 @@ from trihedron.plugins.shared.linalg_kernels import invert_each
 
 # Arrays as kernels read them.
 
+
 def constant(array: Any, dtype: type[np.generic]) -> Any:
     """The array, contiguous and of an element type, as a view that cannot be written. To numba that is a type of its own, and the arrays of values
     have it: without this a kernel would be compiled anew for each mixture of them with computed ones, seconds later in the middle of a run."""
@@ -21,6 +22,7 @@ def constant(array: Any, dtype: type[np.generic]) -> Any:
 
 
 # Covariances of what an RGB-D camera measures, and how they move between frames.
+
 
 def point_covariance(points_m: F64, sigma_px: F64, sigma_m: F64, camera: Camera) -> F64:
     """(..., 3, 3) covariance (camera frame) of back-projected points (..., 3): `sigma_px` across the ray, `sigma_m` of the depth, both (...)."""

@@ -53,6 +53,7 @@ def nearest_equivalent(R: F64, reference: F64) -> F64:
 
 # How well planes and lines tell a direction: information (n, 3, 3) in 1/rad², zero along the direction itself.
 
+
 @kernel
 def measured_directions(
     planes: F64, plane_covariance: F64, plane_floor: float, ends_m: F32, end_covariance: F32, line_floor: float, means: F64, mean_sigma: F64
@@ -124,6 +125,7 @@ def assign_axes(directions: F64, R: F64, cone: float) -> I32:
 
 
 # The rotation nearest to measured directions in closed form (orthogonal Procrustes: Schönemann, Psychometrika 1966).
+
 
 @kernel
 def procrustes(directions: F64, weights: F64, axes: I32, R: F64, prior: float) -> F64:
@@ -286,6 +288,7 @@ def best_frame(frames: F64, directions: F64, weights: F64, reach: F64, before: F
 
 
 # Planes on the axes of a Manhattan frame: which stand at right angles, and the rotation nearest to those on the axes.
+
 
 class Walls(NamedTuple):
     """n planes whose normals are known."""

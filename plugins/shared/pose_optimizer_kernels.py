@@ -438,9 +438,7 @@ def _add(chi2: float, e: F64, J: F64, rows: int, W: F64, limit: float, robust: b
 
 
 @kernel
-def _add_points(
-    R: F64, t: F64, camera: F64, terms: PointTerms, W: F64, flags: U8, robust: bool, free: int, H: F64, g: F64, chi2: F64
-) -> float:
+def _add_points(R: F64, t: F64, camera: F64, terms: PointTerms, W: F64, flags: U8, robust: bool, free: int, H: F64, g: F64, chi2: F64) -> float:
     """Add all points; `point_residual` in scalars, since points are most of the work. Returns the cost.
 
     With D = dr/dp, A = DᵀWD, b = DᵀWr and P = [p]×, J = (-D, DP) gives the blocks A, PA, -PAP and -b, -p × b."""

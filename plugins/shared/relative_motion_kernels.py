@@ -60,6 +60,7 @@ class Terms(NamedTuple):
     planes_after: F64  # (p, 4)
     plane_information: F64  # (p, 4, 4)
 
+
 # The optimiser.
 
 
@@ -114,6 +115,7 @@ def _gauss_newton(terms: Terms, R: F64, t: F64, prior: F64, scale2: float) -> tu
         converged = scale2 <= GATE2 and size < 1e-12
         scale2 = max(0.5 * scale2, GATE2)
     return H, chi2, components / 3.0
+
 
 # Corresponding features with the information of their difference.
 
@@ -238,6 +240,7 @@ def plane_pairs(pairs: PlanePairs, floor: float) -> tuple[F64, F64, F64]:
         m += 1
     return p[:m], q[:m], information[:m]
 
+
 # Residuals.
 
 
@@ -277,6 +280,7 @@ def _squared_distances(terms: Terms, R: F64, t: F64) -> F64:
         _plane_residual(terms.planes_before[i], terms.planes_after[i], R, t, e)
         out[n + i] = _plane_distance2(e, terms.plane_information[i])
     return out
+
 
 # Robust weights and normal equations.
 

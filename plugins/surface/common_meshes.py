@@ -128,6 +128,7 @@ def decimated(vertices: F64, triangles: I32, labels: I32, planes: F64, border: B
 
 # Coordinates within a plane.
 
+
 def plane_axes(plane: F64) -> F64:
     """(3, 2) orthonormal columns in the plane (4,): with its normal they make a right-handed frame, so what is anticlockwise in them is so about
     n."""

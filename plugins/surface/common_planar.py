@@ -82,6 +82,7 @@ class PlanarFold(VolumeFold):
 
 # Which triangles of a dense mesh lie in planes: those of the map first, then planes that only the mesh shows.
 
+
 @dataclass(frozen=True)
 class Flatness:
     """What counts as flat."""
@@ -190,6 +191,7 @@ def _filled(labels: I32, vertices: F64, triangles: I32, opposite: I32, planes: F
 
 # How curved the parts of a mesh are.
 
+
 def bends(parts: I32, count: int, labels: I32, middle: F64, area: F64, planes: F64) -> F64:
     """(count,) larger principal curvature (1/m) of the quadric of least squares over each part's plane; 0 for parts without one."""
     frames = np.array([np.column_stack([plane_axes(plane), plane[:3]]) for plane in planes]).reshape(-1, 3, 3)
@@ -197,6 +199,7 @@ def bends(parts: I32, count: int, labels: I32, middle: F64, area: F64, planes: F
 
 
 # The planar parts of a mesh as polygons: their loops simplified, cut into few triangles, and joined to what is beside them vertex by vertex.
+
 
 @dataclass(frozen=True)
 class Flattened:

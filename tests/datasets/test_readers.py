@@ -200,9 +200,7 @@ def test_published_icl_poses_are_reflected(shared_data: Path, warp_error_m: Call
     assert warp_error_m(a, b, *reflect(np.array([T_a, T_b]))) > 0.028
 
 
-@pytest.mark.parametrize(
-    ("name", "frames", "limit_m"), [("tum_fr3_structure_notexture_far", 250, 0.012), ("icl_office_rendered", 500, 0.003)]
-)
+@pytest.mark.parametrize(("name", "frames", "limit_m"), [("tum_fr3_structure_notexture_far", 250, 0.012), ("icl_office_rendered", 500, 0.003)])
 def test_published_depth_agrees_under_the_truth(
     shared_data: Path, warp_error_m: Callable[..., float], name: str, frames: int, limit_m: float
 ) -> None:

@@ -291,7 +291,10 @@ def test_the_plugin_package_of_the_readme_is_one_word_away(tmp_path):
     assert len(values) == 12 and 20 < max(len(v.pixels) for v in values) <= 200
     (site / "trihedron_corners.py").write_text("import not_there")
     done = trihedron("run", *SMALL)
-    assert (done.returncode, done.stderr.strip()) == (1, (
-        "trihedron: plugin package trihedron-corners (trihedron_corners): does not load: ModuleNotFoundError: "
-        "No module named 'not_there'; mend it or uninstall it"
-    ))
+    assert (done.returncode, done.stderr.strip()) == (
+        1,
+        (
+            "trihedron: plugin package trihedron-corners (trihedron_corners): does not load: ModuleNotFoundError: "
+            "No module named 'not_there'; mend it or uninstall it"
+        ),
+    )

@@ -30,7 +30,7 @@ CHANGES = {
     "translation": "translation.line_sigma_px=3",
     "matches": "matches.radius_px=3",
     "pose": "pose.line_sigma_px=3",
-    "map": "map.max_frames=5",
+    "map": "map.memory=20",
     "bundle": "bundle.keyframes=2",
 }
 RECORD = ["dataset=synthetic", f"dataset.frames=0:{FRAMES}", "dataset.width=320", "dataset.height=240"]

@@ -129,8 +129,7 @@ def test_no_plugin():
 
 def test_delayed_wire_into_an_input_that_cannot_be_none():
     expected = (
-        "graph.planes.normals: 'normals@prev' is None at first, and the input cannot be None; "
-        "wire it to 'normals', or take the input as optional"
+        "graph.planes.normals: 'normals@prev' is None at first, and the input cannot be None; wire it to 'normals', or take the input as optional"
     )
     assert message(planes={"normals": "normals@prev"}) == expected
 

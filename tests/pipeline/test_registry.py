@@ -132,6 +132,4 @@ def test_a_plugin_package_that_does_not_load_is_named(monkeypatch):
     monkeypatch.setattr(registry, "entry_points", lambda group: [Entry()])
     with pytest.raises(PluginError) as error:
         registry.load_plugins()
-    assert str(error.value) == (
-        "plugin package mine (mine.plugins): does not load: ImportError: No module named 'mine'; mend it or uninstall it"
-    )
+    assert str(error.value) == ("plugin package mine (mine.plugins): does not load: ImportError: No module named 'mine'; mend it or uninstall it")

@@ -6,10 +6,12 @@ import subprocess
 import sys
 
 import pytest
+import yaml
 from hydra import compose, initialize_config_module
 
 from trihedron.pipeline.app.cli import main
-from trihedron.pipeline.core.config import register_configs
+from trihedron.pipeline.core.config import composed, register_configs
+from trihedron.pipeline.core.overrides import list_elements
 from trihedron.pipeline.core.registry import load_plugins
 from trihedron.pipeline.sweep.jobs import key_of
 from trihedron.pipeline.sweep.sweep import words_of_sequence
@@ -50,10 +52,39 @@ def test_a_key_is_of_the_files_that_are_read(tmp_path):
         ("synthetic", ["dataset=synthetic"]),
         ("tum:/data/desk frames=0:9", ["dataset=tum", "dataset.path=/data/desk", "dataset.frames=0:9"]),
         ("faults of=tum options.path=/data", ["dataset=faults", "dataset.of=tum", "+dataset.options.path=/data"]),
+        ("tum:/my data/it's [1], a frames=0:9", ["dataset=tum", r"dataset.path='/my data/it\'s [1], a'", "dataset.frames=0:9"]),
     ],
 )
 def test_a_word_is_a_data_set(text, words):
     assert words_of_sequence(text) == words
+
+
+def test_a_folder_with_blanks_and_equal_signs_is_the_longest_that_exists(tmp_path):
+    folder = tmp_path / "a b=c d"
+    folder.mkdir()
+    assert words_of_sequence(f"tum:{folder} frames=0:9") == ["dataset=tum", f"dataset.path='{folder}'", "dataset.frames=0:9"]
+    assert words_of_sequence(f"tum:{folder} e=f")[1:] == [f"dataset.path='{folder}'", "dataset.e=f"]
+
+
+@pytest.mark.parametrize("text, elements", [
+    ('["tum:/data/desk frames=0:300",synthetic]', ["tum:/data/desk frames=0:300", "synthetic"]),
+    ("[tum:/a b, 'tum:/c,d' ,\"tum:/e'f\"]", ["tum:/a b", "tum:/c,d", "tum:/e'f"]),
+    (r"['it\'s',tum:/x[1](2)]", ["it's", "tum:/x[1](2)"]),
+    ("[]", []),
+])  # fmt: skip
+def test_a_list_of_data_sets_is_taken_literally(text, elements):
+    assert list_elements(text) == elements
+    assert list(composed([f"sequences={text}"]).sequences) == elements
+
+
+@pytest.mark.parametrize("name", ["with blanks", "it's", 'a "b"', "[1] (2) {3}", "a,b", "a=b", "#1", "größe"])
+def test_any_folder_can_be_swept(tmp_path, name):
+    folder = tmp_path / name
+    assert main(["run", *QUICK, "record.frames=true", f"out={folder}"]) == 0
+    element = f"mcap:{folder}/run.mcap".replace('"', r"\"")
+    words = ["run", "-m", "hydra/launcher=basic", "outputs=[keypoints]", f'sequences=["{element}"]', f"out={folder}/sweep"]
+    assert main(words) == 0
+    assert yaml.safe_load((folder / "sweep" / "0" / ".hydra" / "config.yaml").read_text())["dataset"]["path"] == f"{folder}/run.mcap"
 
 
 def test_a_sweep_goes_on_where_it_was_stopped(tmp_path, capfd):

@@ -22,10 +22,12 @@ def empty(columns):
 
 EMPTY = empty(types.POINTS)
 OTHERS = [empty(columns) for columns in (types.LINES, types.PLANES, types.POINT_OBSERVATIONS, types.LINE_OBSERVATIONS, types.PLANE_OBSERVATIONS)]
-KEYFRAMES, _ = empty(types.KEYFRAMES).appended(**{
-    name: np.broadcast_to(np.eye(*shape) if len(shape) == 2 else np.ones(shape), (1, *shape)) * (name not in ("points", "lines", "planes"))
-    for name, (_, shape, *_) in types.KEYFRAMES.columns.items()
-})
+KEYFRAMES, _ = empty(types.KEYFRAMES).appended(
+    **{
+        name: np.broadcast_to(np.eye(*shape) if len(shape) == 2 else np.ones(shape), (1, *shape)) * (name not in ("points", "lines", "planes"))
+        for name, (_, shape, *_) in types.KEYFRAMES.columns.items()
+    }
+)
 
 
 @dataclass(frozen=True)

@@ -1,6 +1,5 @@
 """Directions without surfaces: what the estimators of the Manhattan frame read."""
 
-
 import importlib
 import pkgutil
 from dataclasses import replace

@@ -38,7 +38,7 @@ def test_levels_agree_on_where_a_point_is(analytic):
     for _ in range(20):
         centre = rng.uniform((200, 200), (440, 280))
         v, u = np.mgrid[0:480, 0:640]
-        image = 40 + 180 * np.exp(-(np.hypot(u - centre[0], v - centre[1]) / 9.0) ** 4)
+        image = 40 + 180 * np.exp(-((np.hypot(u - centre[0], v - centre[1]) / 9.0) ** 4))
         found = Orb(fast_threshold_low=5)(analytic.frame(FLAT, gray=image.astype(np.uint8)))
         if (found.octaves >= 5).any():
             offsets.append((found.pixels - centre)[found.octaves >= 5].mean(0))

@@ -46,9 +46,7 @@ def test_nothing_is_returned_when_nothing_changes():
     assert NoMap()(pose_of(np.eye(4), 0)) is None
 
 
-@pytest.mark.parametrize(
-    "at, inliers, why", [(12, (60, 10, 3), "the view has changed"), (0.2, (5, 0, 1), "little of the last keyframe was found")]
-)
+@pytest.mark.parametrize("at, inliers, why", [(12, (60, 10, 3), "the view has changed"), (0.2, (5, 0, 1), "little of the last keyframe was found")])
 def test_a_keyframe_is_made_when(at, inliers, why):
     world = World()
     map = step(Covisibility(), world, None, 0)
@@ -208,9 +206,7 @@ def test_twins_are_joined_and_their_observations_go_to_the_older():
     seen_lines, _ = map.line_observations.appended(**{**observations, "line": line_copies})
     spans = {"points": np.array([[0, 2 * n]], np.int32), "lines": np.array([[0, 2 * m]], np.int32)}
     keyframes = map.keyframes.updated(np.array([0]), **spans)
-    map = dataclasses.replace(
-        map, points=points, lines=lines, point_observations=seen, line_observations=seen_lines, keyframes=keyframes
-    )
+    map = dataclasses.replace(map, points=points, lines=lines, point_observations=seen, line_observations=seen_lines, keyframes=keyframes)
     map = step(EVERY, world, map, 1)
     again = np.isin(np.arange(n), map.point_observations.column("point")[2 * n :])
     assert again.sum() > 20

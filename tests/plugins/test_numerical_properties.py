@@ -184,6 +184,7 @@ def test_the_gradient_of_a_graph_of_poses(rng, angle, scale_m):
     edges = common_pose_graph.Edges(pairs, measured, information)
     gradient = common_pose_graph._normal_equations(poses, edges)[2].reshape(3, 6)
     unit = np.repeat([scale_m, 1.0], 3)
+
     def half_cost(d):
         return np.array([0.5 * common_pose_graph._normal_equations(common_pose_graph._retract(poses, unit * d.reshape(3, 6)), edges)[0]])
 

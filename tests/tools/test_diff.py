@@ -96,3 +96,21 @@ def test_a_value_that_one_lacks_and_nothing_in_common(tmp_path, capsys):
             writer.write("pose", pose(i))
     writer.close()
     assert diff(capsys, a, str(tmp_path / "d.mcap"))[1][1] == "pose, frame 2, value: only in the first"
+
+
+def test_a_tolerance_lists_every_field_that_differs(tmp_path, capsys):
+    far = np.eye(4)
+    far[0, 3] = 1000.0
+    near = {2: pose(2, T_world_camera=far + 1e-4 * (far == 1000.0), covariance=np.eye(6) * (1 + 1e-9))}
+    a, b = record(tmp_path / "a.mcap", range(5), {2: pose(2, T_world_camera=far)}), record(tmp_path / "b.mcap", range(5), near)
+    assert diff(capsys, a, a, "--tolerance", "0") == (0, ["equal within 0: 5 frames (0..4) of pose, map"])
+    code, lines = diff(capsys, a, b, "--tolerance", "1e-6")
+    assert code == 0 and lines[-1] == "equal within 1e-06: 5 frames (0..4) of pose, map"
+    assert lines[-3].split() == ["pose", "T_world_camera", "1e-07", "2", "equal", "within", "1e-06"]
+    assert lines[-2].split() == ["pose", "covariance", "1e-09", "2", "equal", "within", "1e-06"]
+    code, lines = diff(capsys, a, b, "--tolerance", "1e-8")
+    assert code == 1 and lines[-1] == "different within 1e-08: 5 frames (0..4) of pose, map" and "different" in lines[-3]
+    c = record(tmp_path / "c.mcap", range(5), {2: pose(2, T_world_camera=far, reference=0, status="lost")})
+    code, lines = diff(capsys, a, c, "--tolerance", "0.9")  # ids are equal or not
+    assert code == 1 and [line.split()[1:3] for line in lines[-3:-1]] == [["reference", "1"], ["status", "not"]]
+    assert diff(capsys, a, b, "--tolerance", "-1") == (2, ["trihedron: --tolerance: -1 is not a tolerance; give a number from 0"])
