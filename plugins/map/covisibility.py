@@ -9,9 +9,9 @@ from typing import Annotated
 import numpy as np
 
 from trihedron.pipeline.core.geometry import invert
-from trihedron.pipeline.core.options import PositiveFloat, PositiveInt, PositiveShare, Range, Share, check_increasing
+from trihedron.pipeline.core.options import NonNegativeInt, PositiveFloat, PositiveInt, PositiveShare, Range, Share, check_increasing
 from trihedron.pipeline.core.registry import register
-from trihedron.pipeline.core.types import DEGRADED, F32, I32, LOST, Correction, Frame, Keypoints, Map, Matches, Planes, Pose, Segments
+from trihedron.pipeline.core.types import DEGRADED, F32, I32, LOST, OK, Correction, Frame, Keypoints, Map, Matches, Planes, Pose, Segments, Table
 from trihedron.plugins.map.none import NoMap
 from trihedron.plugins.mapping import insertion
 from trihedron.plugins.mapping.correction import apply_correction
@@ -40,6 +40,10 @@ class Covisibility:
     min_shift: PositiveFloat = 0.06  # of the camera, as a share of the median depth, that makes a keyframe
     min_turn_deg: PositiveFloat = 6.0
     min_share: Share = 0.5  # of the newest keyframe's landmarks tracked, below which a keyframe is made
+    doubt_sigmas: PositiveFloat = 3.0  # a degraded pose with this many times the standard deviation of its reference keyframe is in doubt
+    doubt_floor_m: PositiveFloat = 0.002  # least standard deviation of a keyframe in that comparison
+    doubt_frames: NonNegativeInt = 10  # since the newest keyframe, in which a pose in doubt makes none while enough landmarks are tracked
+    doubt_score: NonNegativeInt = 30  # points, lines and planes, weighed, that are enough
     new_plane_px: int = 4000  # a plane this large that is not in the map makes a keyframe
     memory: Annotated[float, Range(above=1)] = 30.0  # measurements a point or line remembers
     plane_memory: Annotated[float, Range(above=1)] = 30.0  # keyframes a plane remembers
@@ -112,7 +116,16 @@ class Covisibility:
         unknown = planes.pixels > self.new_plane_px
         if matches is not None:
             unknown[matches.planes[matches.planes[:, 1] < len(map.planes), 0]] = False
-        return moved > 1.0 or poor or bool(unknown.any()) or (frames >= self.max_frames and moved > STALE)
+        wanted = moved > 1.0 or poor or bool(unknown.any()) or (frames >= self.max_frames and moved > STALE)
+        return wanted and not (0 <= frames < self.doubt_frames and self._in_doubt(pose, keyframes))
+
+    def _in_doubt(self, pose: Pose, keyframes: Table) -> bool:
+        """Return True if a tracked pose is much less certain than the keyframe it refers to: its doubt would spread to all that is measured from it.
+        A later frame decides."""
+        if pose.status == OK or pose.reference < 0 or _weighed(pose.inliers.tolist()) < self.doubt_score:
+            return False
+        sigma, reference = (float(np.linalg.eigvalsh(c[:3, :3])[-1]) ** 0.5 for c in (pose.covariance, keyframes.row("covariance", pose.reference)))
+        return sigma > self.doubt_sigmas * max(reference, self.doubt_floor_m)
 
     def _shift_m(self, frame: Frame) -> float:
         """Way that makes a keyframe."""

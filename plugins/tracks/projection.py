@@ -12,11 +12,12 @@ from trihedron.pipeline.core.geometry import exp_so3, log_so3, rotation_angle_de
 from trihedron.pipeline.core.options import AcuteDeg, NonNegativeInt, PositiveFloat, PositiveInt, PositiveShare, Share, check_increasing
 from trihedron.pipeline.core.registry import register
 from trihedron.pipeline.core.types import F64, U8, Camera, Keypoints, ManhattanFrame, Planes, Segments, Tracks
-from trihedron.plugins.shared.descriptors import compared_by, words_of
+from trihedron.plugins.shared.descriptors import compared_by, mutual_matches, words_of
 from trihedron.plugins.shared.descriptors_kernels import U64, line_matches, near_matches
 from trihedron.plugins.shared.linalg import constant
 from trihedron.plugins.shared.plane_association_kernels import associated
 from trihedron.plugins.shared.relative_motion import Motion, solve_motion
+from trihedron.plugins.shared.rigid_alignment import consensus, tracked_point_pairs
 from trihedron.plugins.tracks.common import NO_PAIRS, Features, tracks_value
 from trihedron.plugins.tracks.common_kernels import matched_pairs
 from trihedron.plugins.tracks.projection_kernels import FeaturePositions, Intrinsics, consistent_pairs, predict_features
@@ -52,6 +53,10 @@ class Projection:
     prior_m: PositiveFloat = 0.1  # of no translation, per frame
     angle_px: PositiveFloat = 0.002  # rad, of a pixel
     plane_floor_deg: PositiveFloat = 0.3
+    wide_below: NonNegativeInt = 60  # key points; with fewer tracks the previous frame is matched without a prediction, for wide baselines
+    wide_inliers: PositiveInt = 12  # pairs that must agree on a rigid motion for that
+    wide_gate: PositiveFloat = 3.0  # standard deviations within which a pair agrees
+    wide_rounds: PositiveInt = 500  # samples of three pairs
 
     def __post_init__(self) -> None:
         check_increasing(self, "near_px", "radius_px")
@@ -69,6 +74,7 @@ class Projection:
         manhattan: ManhattanFrame | None,
         previous_manhattan: ManhattanFrame | None,
         previous: Tracks | None,
+        rng: np.random.Generator,
     ) -> Tracks | None:
         """Return the pairs with the previous frame; None for the first frame, no pairs when the previous features are too old."""
         if previous_keypoints is None or previous_segments is None or previous_planes is None:
@@ -86,6 +92,22 @@ class Projection:
         motion = self._motion(first, now, gap)
         again = search(motion.R, motion.t, self.near_px, self.plane_near_m)
         again = again if _count(again) >= 0.7 * _count(first) else first
+        found = search.consistent(again, self._motion(again, now, gap), self.error_px)
+        if len(found.keypoints) >= min(self.wide_below, len(keypoints.pixels)):
+            return found
+        wide = self._wide_baseline(search, now, before, gap, rng)
+        return wide if wide is not None and len(wide.keypoints) > len(found.keypoints) else found
+
+    def _wide_baseline(self, search: Search, now: Features, before: Features, gap: int, rng: np.random.Generator) -> Tracks | None:
+        """Track without a prediction: mutual nearest descriptors, the rigid motion that most of them agree on (RANSAC), then all features around it.
+        None when fewer than `wide_inliers` agree."""
+        pairs = mutual_matches(before.keypoints.descriptors, now.keypoints.descriptors, now.keypoints.metric, self.ratio)
+        unguided = tracks_value(now, before, (pairs, NO_PAIRS, NO_PAIRS), np.eye(3))
+        rigid = consensus(*tracked_point_pairs(unguided, now.keypoints), self.wide_gate, self.wide_rounds, rng)
+        if np.count_nonzero(rigid.agree) < self.wide_inliers:
+            return None
+        motion = self._motion(search(rigid.R, rigid.t, self.radius_px, self.plane_m), now, gap)
+        again = search(motion.R, motion.t, self.near_px, self.plane_near_m)
         return search.consistent(again, self._motion(again, now, gap), self.error_px)
 
     def _predictions(
