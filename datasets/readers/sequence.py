@@ -24,6 +24,15 @@ from trihedron.pipeline.core.types import F32, U8, Frame, Trajectory
 
 log = logging.getLogger("trihedron")
 CURE = "check the files of the data set"
+_FRAMES = "as rgb/00000.png and 16-bit depth/00000.png with a camera.yaml"
+_NO_DEPTH = f"a film has no metric depth; save the camera's frames {_FRAMES}"
+VIDEOS = {  # ending -> what gets the frames out
+    ".mkv": f"write its frames with Open3D's azure_kinect_mkv_reader {_FRAMES}",
+    ".svo": f"write its frames with the ZED SDK's export sample {_FRAMES}",
+    ".svo2": f"write its frames with the ZED SDK's export sample {_FRAMES}",
+    ".oni": f"write its frames with OpenNI {_FRAMES}",
+    **dict.fromkeys((".mp4", ".mov", ".avi", ".webm", ".m4v"), _NO_DEPTH),
+}
 DepthReader = Callable[[Path], F32]
 
 
@@ -121,6 +130,13 @@ class SequenceReader(ABC):
         return self._sequence.truth
 
 
+def refuse_video(path: Path) -> None:
+    """Raise DataError, with the cure, for a video file: its depth is lost, or in a stream of the camera's maker."""
+    cure = VIDEOS.get(path.suffix.lower())
+    if cure is not None:
+        raise DataError(str(path), "is a video file, which is not read", f"{cure}, then use dataset=folder")
+
+
 def open_folder(path: str) -> Path:
     """The data set's folder. Raises DataError when the path is not set, missing, a file or empty."""
     if not path:
@@ -128,6 +144,7 @@ def open_folder(path: str) -> Path:
     folder = Path(path).expanduser()
     if not folder.exists():
         raise DataError(str(folder), "does not exist", "give an existing folder as dataset.path")
+    refuse_video(folder)
     if not folder.is_dir():
         raise DataError(str(folder), "is not a folder", "give the folder that holds the images as dataset.path")
     with one_line_errors(str(folder), "check the folder's permissions"):
