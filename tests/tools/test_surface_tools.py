@@ -155,7 +155,7 @@ def test_meshes_of_other_programs_are_read(tmp_path, suffix):
         with pytest.raises(DataError, match="is not a mesh"):
             read_mesh(tmp_path / "bad.ply")
     os.mkfifo(tmp_path / f"pipe.{suffix}")
-    with pytest.raises(DataError, match="is not a mesh: .*it is not a regular file"):
+    with pytest.raises(DataError, match=r"is not a mesh: .*it is not a regular file"):
         read_mesh(tmp_path / f"pipe.{suffix}")
 
 
@@ -165,11 +165,11 @@ def test_polygons_and_indices_from_the_end_and_materials_elsewhere(tmp_path):
     vertices, triangles = read_mesh(tmp_path / "m.obj")
     assert len(vertices) == 5 and triangles.tolist() == [[0, 1, 2], [0, 2, 3], [0, 3, 4]]
     (tmp_path / "m.obj").write_text(f"{corners}f 1 2 9\n")
-    with pytest.raises(DataError, match="m.obj: "):
+    with pytest.raises(DataError, match=r"m\.obj: "):
         read_mesh(tmp_path / "m.obj")
     head = "ply\nformat binary_little_endian 1.0\nelement vertex 1000000000000\nproperty float x\nproperty float y\nproperty float z\nend_header\n"
     (tmp_path / "m.ply").write_text(head)
-    with pytest.raises(DataError, match="m.ply: is not a mesh: "):
+    with pytest.raises(DataError, match=r"m\.ply: is not a mesh: "):
         read_mesh(tmp_path / "m.ply")
 
 
