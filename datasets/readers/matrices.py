@@ -39,7 +39,7 @@ def trajectory_of(stamps_ns: Stamps, poses: Sequence[F64], places: Sequence[str]
     found = []
     for row in known:
         R, t = poses[row][:3, :3], poses[row][:3, 3]
-        if not np.abs(R.T @ R - np.eye(3)).max() < SKEWEST or np.linalg.det(R) < 0 or np.abs(t).max() > FARTHEST_M:
+        if np.abs(poses[row][:3]).max() > FARTHEST_M or not np.abs(R.T @ R - np.eye(3)).max() < SKEWEST or np.linalg.det(R) < 0:
             raise DataError(places[row], "is not the pose of a camera", "correct or remove it")
         found.append(pose_matrix(nearest_rotation(R), t))
     return Trajectory(stamps_ns[known], np.array(found)) if found else None

@@ -31,7 +31,7 @@ def read_file(path: Path, limit: int) -> bytes:
             raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR))
         if not stat.S_ISREG(found.st_mode):
             raise OSError(errno.EINVAL, "it is not a regular file")
-        data = file.read(limit + 1) if found.st_size <= limit else b""
+        data = file.read(found.st_size + 1) if found.st_size <= limit else b""
         if found.st_size > limit or len(data) > limit:
             raise OSError(errno.EFBIG, f"it has more than {limit} bytes")
         return data

@@ -196,7 +196,7 @@ def _plain(array: Any, shape: tuple[int, ...], size: int) -> bytes | None:
         steps = _unpacked(array.data, size) if len(shape) == 3 and size == int(np.prod(shape)) else None
         return bytes(np.add.accumulate(np.frombuffer(steps, np.uint8).reshape(shape), axis=0, dtype=np.uint8).tobytes()) if steps else None
     if array.encoding == "columns":
-        if len(array.data) != size or not size:
+        if len(array.data) != size or not size or not shape:
             return None
         return bytes(cv2.transpose(np.frombuffer(array.data, np.uint8).reshape(-1, shape[0])).tobytes())
     return bytes(array.data)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from decimal import Decimal, DecimalException
 from pathlib import Path
@@ -93,7 +94,7 @@ def _parse_pose(words: list[str]) -> tuple[int, F64]:
         raise ValueError("a column is not a number") from None
     if not np.isfinite(values).all():
         raise ValueError("the pose is not finite")
-    if np.linalg.norm(values[3:]) < 1e-3:
+    if math.hypot(*values[3:].tolist()) < 1e-3:
         raise ValueError("the quaternion is zero")
     return stamp_ns, pose_matrix(rotation_from_quaternion(values[3:]), values[:3])
 

@@ -1,7 +1,7 @@
 """Well-formed files whose values are extreme: what the fuzzer gives to a reader beside changed bytes.
 
-Each function makes one input out of a seed that was parsed: it goes through the first checks of its format (protobuf, JSON, YAML, PNG, CDR, the records
-and chunks of MCAP, the columns of a list), so that those behind are reached.
+Each function makes one input out of a parsed seed. It goes through the first checks of its format (protobuf, JSON, YAML, PNG, CDR, the records and
+chunks of MCAP, the columns of a list), so that those behind are reached.
 """
 
 from __future__ import annotations
@@ -144,7 +144,7 @@ def words(data: bytes, rng: Rng) -> bytes:
             parts = parts[:-2]
         elif kind < 0.9 and lines:
             lines.insert(int(rng.integers(0, len(lines))), lines[row])
-        elif lines:
+        elif sum(map(len, lines)) < 10_000:
             lines = lines[: row + 1] + lines[row:] * int(rng.integers(1, 200))
         if lines:
             lines[row] = "".join(parts)
@@ -169,7 +169,7 @@ def tree(value: Any, rng: Rng) -> Any:
         kind = rng.random()
         if kind < 0.2:
             return value[:at] + value[at + 1 :] if kind < 0.1 else value + value[at:] * int(rng.integers(1, 50))
-        return value[:at] + [tree(value[at], rng)] + value[at + 1 :]
+        return [*value[:at], tree(value[at], rng), *value[at + 1 :]]
     kind = rng.random()
     if kind < 0.35:
         return pick(INTEGERS, rng)

@@ -374,10 +374,10 @@ SHAPES = [[], [-1], [1] * 65, [0] * 65, [2**62] * 20, [0] + [2**62] * 20, [0, 2*
 @pytest.mark.parametrize("shape", SHAPES, ids=lambda shape: f"{len(shape)} axes {max(shape, default=None)}")
 def test_a_shape_that_no_array_has_is_one_line(shape, encoding):
     def change(message):
-        message.arrays[0].data, message.arrays[0].encoding = b"", encoding
+        message.arrays[0].data, message.arrays[0].encoding = bytes(0 if shape else 4), encoding
         message.arrays[0].shape[:] = shape
 
-    with pytest.raises(RecordingError, match=r"^x: array 'pixels' (claims type 'f4' and shape|does not have the 4 bytes of its shape)"):
+    with pytest.raises(RecordingError, match=r"^x: (array 'pixels' (claims|does not have the 4 bytes)|frame 0: Keypoints does not fit)"):
         Decoder("x").decode(message_with("keypoints", change))
 
 
