@@ -1,4 +1,4 @@
-"""Numba kernels of `data_association.py`."""
+"""Kernels of `data_association.py`: parallel and perpendicular planes, and one-to-one pairs."""
 # mypy: disable-error-code="arg-type, assignment, index, return-value"
 
 from __future__ import annotations
@@ -11,10 +11,10 @@ from trihedron.pipeline.core.types import F64, I32
 
 
 @kernel
-def related(
+def related_planes(
     planes: F64, known: F64, same: I32, order: NDArray[np.int64], ids: I32, parallel_above: float, perpendicular_below: float, most: int
 ) -> tuple[I32, I32]:
-    """Pairs (row, id) of each plane and the `most` known ones, first in order, that are parallel to it, and perpendicular, but for the same ones."""
+    """Pair (row, id) each plane with up to `most` known ones, first in order, that are parallel to it, and perpendicular, without the same plane."""
     n, one = len(planes), np.full(len(planes), -1, np.int32)
     parallel, perpendicular = np.empty((n * most, 2), np.int32), np.empty((n * most, 2), np.int32)
     p, q = 0, 0
@@ -36,8 +36,8 @@ def related(
 
 
 @kernel(nogil=False)
-def pairs_kernel(found: I32, ids: I32, count: int) -> I32:
-    """Of `count` rows the one found for each landmark (-1 = none), no row for two -> (n, 2) pairs (row, id) sorted by row."""
+def pairs_by_row(found: I32, ids: I32, count: int) -> I32:
+    """Sort the rows found for landmarks (-1 = none; of `count` rows, none for two) into pairs (row, id), (n, 2), by row."""
     owner, pairs, n = np.full(count, -1, np.int32), np.empty((len(found), 2), np.int32), 0
     for i in range(len(found)):
         if found[i] >= 0:

@@ -1,4 +1,4 @@
-"""Numba kernels of `linalg.py`."""
+"""Kernels of small linear algebra: Cholesky, inverses, tangent basis, nearest rotation (polar decomposition); and sorting and medians."""
 # mypy: disable-error-code="arg-type, assignment, index, return-value"
 
 from __future__ import annotations
@@ -62,35 +62,6 @@ def invert_symmetric(S: F64, out: F64) -> float:
     out[0, 1], out[0, 2], out[1, 2] = v / determinant, w / determinant, (b * c - a * e) / determinant
     out[1, 0], out[2, 0], out[2, 1] = out[0, 1], out[0, 2], out[1, 2]
     return determinant
-
-
-@kernel
-def left_multiply_exp(phi: F64, R: F64) -> None:
-    """`R <- Exp(phi) R` in place, for the first three numbers of phi (Rodrigues)."""
-    x, y, z = phi[0], phi[1], phi[2]
-    angle2 = x * x + y * y + z * z
-    if angle2 < 1e-12:
-        a, b = 1.0 - angle2 / 6.0, 0.5 - angle2 / 24.0
-    else:
-        angle = np.sqrt(angle2)
-        a, b = np.sin(angle) / angle, (1.0 - np.cos(angle)) / angle2
-    for c in range(3):
-        u, v, w = R[0, c], R[1, c], R[2, c]
-        p, q, r = y * w - z * v, z * u - x * w, x * v - y * u  # phi × column
-        R[0, c] = u + a * p + b * (y * r - z * q)
-        R[1, c] = v + a * q + b * (z * p - x * r)
-        R[2, c] = w + a * r + b * (x * q - y * p)
-
-
-@kernel
-def fill_tangent_basis(n: F64, out: F64) -> None:
-    """Write the columns of `geometry.tangent_basis` of a unit vector to the rows of `out` (2, 3)."""
-    x, y, z = n[0], n[1], n[2]
-    sign = 1.0 if z >= 0.0 else -1.0
-    a = -1.0 / (sign + z)
-    b = x * y * a
-    out[0, 0], out[0, 1], out[0, 2] = 1.0 + sign * x * x * a, sign * b, -sign * x
-    out[1, 0], out[1, 1], out[1, 2] = b, sign + y * y * a, -y
 
 
 @kernel(forceinline=True)

@@ -10,7 +10,7 @@ import numpy as np
 
 from trihedron.pipeline.core.kernel import kernel
 from trihedron.pipeline.core.types import F32, F64, I32, Bool
-from trihedron.plugins.shared.linalg_kernels import fill_tangent_basis, inverse_positive, polar_rotation
+from trihedron.plugins.shared.linalg_kernels import inverse_positive, polar_rotation, tangent_columns
 
 
 def _cube_rotations() -> F64:
@@ -68,7 +68,7 @@ def measured_directions(
         known = np.isfinite(planes[i, 0] + planes[i, 1] + planes[i, 2])
         for k in range(3):
             vectors[i, k] = planes[i, k] if known else np.nan
-        fill_tangent_basis(vectors[i], a)
+        tangent_columns(vectors[i], a.T)
         _inverse_in_tangent_plane(plane_covariance[i], plane_floor * plane_floor, a, information[i])
     for i in range(lines):
         d = vectors[p + i]
@@ -81,7 +81,7 @@ def measured_directions(
             d[k] = d[k] / np.sqrt(length2) if known else np.nan
         if not known:
             continue
-        fill_tangent_basis(d, a)
+        tangent_columns(d, a.T)
         for u in range(2):
             for v in range(2):
                 C[u, v] = 0.0
@@ -154,7 +154,7 @@ def normal_covariance(planes: F64, covariance: F64, floor: float) -> F64:
     is added in square."""
     out, basis = np.zeros((len(planes), 3, 3)), np.empty((2, 3))
     for i in range(len(planes)):
-        fill_tangent_basis(planes[i], basis)
+        tangent_columns(planes[i], basis.T)
         for j in range(3):
             for k in range(3):
                 for u in range(2):

@@ -17,6 +17,7 @@ import numpy as np
 
 from trihedron.pipeline.core.kernel import kernel
 from trihedron.pipeline.core.types import F64, I32, U8
+from trihedron.plugins.shared.lie_kernels import exp_so3, log_so3
 from trihedron.plugins.shared.linalg_kernels import inverse_positive, solve_positive, tangent_columns
 
 # The parameters of the problem: world landmarks and their observations.
@@ -617,31 +618,6 @@ def linearise(
 
 
 @kernel
-def _exp_so3(x: float, y: float, z: float) -> F64:
-    """Exp(phi) of phi = (x, y, z), Rodrigues."""
-    angle2 = x * x + y * y + z * z
-    if angle2 < 1e-12:
-        a, b = 1.0 - angle2 / 6.0, 0.5 - angle2 / 24.0
-    else:
-        angle = np.sqrt(angle2)
-        a, b = np.sin(angle) / angle, (1.0 - np.cos(angle)) / angle2
-    E = np.empty((3, 3))
-    E[0, 0], E[1, 1], E[2, 2] = 1.0 - b * (y * y + z * z), 1.0 - b * (x * x + z * z), 1.0 - b * (x * x + y * y)
-    E[0, 1], E[0, 2], E[1, 2] = b * x * y - a * z, b * x * z + a * y, b * y * z - a * x
-    E[1, 0], E[2, 0], E[2, 1] = b * x * y + a * z, b * x * z - a * y, b * y * z + a * x
-    return E
-
-
-@kernel
-def _log_so3(R: F64) -> tuple[float, float, float]:
-    """Log(R) for angles below π (a prior is never that far)."""
-    x, y, z = 0.5 * (R[2, 1] - R[1, 2]), 0.5 * (R[0, 2] - R[2, 0]), 0.5 * (R[1, 0] - R[0, 1])
-    s, c = math.sqrt(x * x + y * y + z * z), 0.5 * (R[0, 0] + R[1, 1] + R[2, 2] - 1.0)
-    scale = math.atan2(s, c) / s if s > 1e-9 else 1.0
-    return x * scale, y * scale, z * scale
-
-
-@kernel
 def add_prior(R: F64, t: F64, R_prior: F64, t_prior: F64, prior: F64, H: F64, g: F64) -> float:
     """Add the Gaussian prior, information `prior` (6, 6) of xi about R_prior, t_prior, to H (lower triangle) and g; returns its cost."""
     delta, r, J, e = np.zeros((3, 3)), np.zeros(6), np.zeros((6, 6)), np.zeros(6)
@@ -650,7 +626,7 @@ def add_prior(R: F64, t: F64, R_prior: F64, t_prior: F64, prior: F64, H: F64, g:
             r[i] += R_prior[k, i] * (t[k] - t_prior[k])
             for j in range(3):
                 delta[i, j] += R_prior[k, i] * R[k, j]
-    r[3], r[4], r[5] = _log_so3(delta)
+    r[3], r[4], r[5] = log_so3(delta)
     for i in range(3):
         J[3 + i, 3 + i] = 1.0  # with the terms below the inverse right Jacobian, first order
         for j in range(3):
@@ -677,29 +653,14 @@ def add_prior(R: F64, t: F64, R_prior: F64, t_prior: F64, prior: F64, H: F64, g:
 @kernel
 def damped_step(H: F64, g: F64, damping: float, free: int, dx: F64) -> None:
     """Solve `(H + damping · diag H) dx = -g` for the first `free` parameters by Cholesky; dx (6,) is zero if H is not positive definite."""
-    L = np.zeros((6, 6))
+    A, b = np.empty((free, free)), np.empty(free)
     for i in range(6):
         dx[i] = 0.0
     for i in range(free):
+        b[i] = -g[i]
         for j in range(i + 1):
-            total = H[i, j] * (1.0 + damping if i == j else 1.0)
-            for k in range(j):
-                total -= L[i, k] * L[j, k]
-            if i == j:
-                if not total > 0.0:
-                    return
-                L[i, i] = np.sqrt(total)
-            else:
-                L[i, j] = total / L[j, j]
-    for i in range(free):
-        dx[i] = -g[i]
-        for k in range(i):
-            dx[i] -= L[i, k] * dx[k]
-        dx[i] /= L[i, i]
-    for i in range(free - 1, -1, -1):
-        for k in range(i + 1, free):
-            dx[i] -= L[k, i] * dx[k]
-        dx[i] /= L[i, i]
+            A[i, j] = H[i, j] * (1.0 + damping if i == j else 1.0)
+    solve_positive(A, b, dx)
 
 
 @kernel
@@ -715,7 +676,7 @@ def step_norm2(H: F64, dx: F64) -> float:
 @kernel
 def retract_pose(R: F64, t: F64, dx: F64, R_new: F64, t_new: F64) -> None:
     """Move the pose R, t by a step dx = (rho, phi) into R_new, t_new: `R Exp(phi)`, `t + R rho`, which is `T · Exp(xi)` to first order."""
-    E = _exp_so3(dx[3], dx[4], dx[5])
+    E = exp_so3(dx[3], dx[4], dx[5])
     for i in range(3):
         t_new[i] = t[i] + R[i, 0] * dx[0] + R[i, 1] * dx[1] + R[i, 2] * dx[2]
         for j in range(3):

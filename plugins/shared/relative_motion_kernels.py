@@ -13,7 +13,8 @@ import numpy as np
 
 from trihedron.pipeline.core.kernel import kernel
 from trihedron.pipeline.core.types import F32, F64, I32
-from trihedron.plugins.shared.linalg_kernels import inverse_positive, left_multiply_exp, median, solve_positive, tangent_columns
+from trihedron.plugins.shared.lie_kernels import left_multiply_exp
+from trihedron.plugins.shared.linalg_kernels import inverse_positive, median, solve_positive, tangent_columns
 
 SHORTEST_M = 1e-3  # line
 MOST = 400  # points used, about; more only cost time

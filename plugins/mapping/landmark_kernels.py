@@ -1,12 +1,13 @@
-"""Numba kernels of `insertion.py`."""
+"""Kernels of the landmark map: information filters of points and lines (insertion), samples of planes (insertion, merging), redundancy (culling)."""
 # mypy: disable-error-code="arg-type, assignment, index, return-value"
 
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 
 from trihedron.pipeline.core.kernel import kernel
-from trihedron.pipeline.core.types import F64
+from trihedron.pipeline.core.types import F32, F64, I32, Bool
 from trihedron.plugins.shared.pose_optimizer_kernels import (
     NEAR_M,
     depth_direction,
@@ -19,12 +20,14 @@ from trihedron.plugins.shared.pose_optimizer_kernels import (
     to_camera,
 )
 
-# Information filters that move point and line landmarks by what a keyframe measured of them.
+FARTHER = 1.2  # a landmark observed from at most this many times as far is observed as well: a level of the key points' pyramid
+
+# Information filters: a keyframe's observations update point and line landmarks.
 
 
 @kernel
-def _noise(D: F64, p: F64, pose_covariance: F64, rows: int, J: F64, S: F64) -> None:
-    """S: covariance that an uncertain pose gives to residuals with derivatives D (rows, 3) by the camera-frame point p."""
+def _pose_noise(D: F64, p: F64, pose_covariance: F64, rows: int, J: F64, S: F64) -> None:
+    """Fill S with the covariance that the pose adds to residuals with Jacobian D (rows, 3) by the camera-frame point p."""
     pose_jacobian(D, rows, p, J)
     for a in range(rows):
         for b in range(rows):
@@ -36,7 +39,7 @@ def _noise(D: F64, p: F64, pose_covariance: F64, rows: int, J: F64, S: F64) -> N
 
 @kernel
 def _update(position: F64, information: F64, R: F64, D: F64, r: F64, S: F64, rows: int) -> None:
-    """One Gauss–Newton step of a landmark on r (rows,), whose derivative by the camera-frame point is D and covariance S; in place."""
+    """Update a landmark in place by one Gauss–Newton step on r (rows,), with Jacobian D by the camera-frame point and covariance S."""
     W, C, E, g = np.zeros((3, 3)), np.zeros((3, 3)), np.zeros((3, 3)), np.zeros(3)
     invert_small(S, rows, W)
     for k in range(rows):
@@ -55,8 +58,8 @@ def _update(position: F64, information: F64, R: F64, D: F64, r: F64, S: F64, row
 
 @kernel
 def _fade_across(information: F64, ends: F64, share: float) -> None:
-    """Information (3, 3) of a line's end times `share` across the line, in place. Along it, where no segment says anything, it stays: forgotten and
-    never measured again it would vanish beside the other, and a rounded matrix is then no information any more, but has a negative eigenvalue."""
+    """Multiply the information (3, 3) of a line's end by `share` across the line, in place. Along it, where segments measure nothing, it stays: it
+    would otherwise vanish beside the rest, and rounding would give the matrix a negative eigenvalue."""
     length, u, row, along, root = 0.0, np.empty(3), np.empty(3), 0.0, np.sqrt(share)
     for k in range(3):
         u[k] = ends[1, k] - ends[0, k]
@@ -86,7 +89,7 @@ def fuse_points(
     sigma_m: F64,
     memory: float,
 ) -> None:
-    """Update positions (n, 3) and information (n, 3, 3), in place, by pixels (n, 2) and depths (n,; NaN = none) seen from an uncertain pose.
+    """Update positions (n, 3) and information (n, 3, 3), in place, by pixels (n, 2) and depths (n,; NaN = none) measured from an uncertain pose.
 
     The old information is first multiplied by `1 - 1/memory`: it stays that of at most `memory` measurements, so that a landmark can still move."""
     R, t = rotation_and_translation(T_world_camera)
@@ -96,7 +99,7 @@ def fuse_points(
         if not point_residual(p, pixels[i], depth_m[i], camera, r, D):
             continue
         rows = 3 if np.isfinite(depth_m[i]) else 2
-        _noise(D, p, pose_covariance, 3, J, S)
+        _pose_noise(D, p, pose_covariance, 3, J, S)
         S[0, 0] += sigma_px[i] ** 2
         S[1, 1] += sigma_px[i] ** 2
         if rows == 3:
@@ -143,9 +146,73 @@ def fuse_lines(
                 rows = 2
                 r[1], s = line_depth_residual(p, observed_m[i], m)
                 D[1, 0], D[1, 1], D[1, 2] = m[0], m[1], m[2]
-            _noise(D, p, pose_covariance, rows, J, S)
+            _pose_noise(D, p, pose_covariance, rows, J, S)
             S[0, 0] += noise
             if deep:
                 S[1, 1] += (1.0 - s) ** 2 * ends[0] + s * s * ends[1]
             _fade_across(information[i, k], endpoints[i], 1.0 - 1.0 / memory)
             _update(endpoints[i, k], information[i, k], R, D, r, S, rows)
+
+
+# Samples of planes.
+
+
+@kernel
+def farthest_samples(points: F32, count: int) -> F32:
+    """Select up to `count` finite rows of points (n, 3), each the farthest from those before it; NaN-padded (count, 3)."""
+    out = np.full((count, 3), np.nan, np.float32)
+    n = 0
+    kept = np.empty((len(points), 3), np.float32)
+    for i in range(len(points)):
+        if np.isfinite(points[i, 0]):
+            kept[n] = points[i]
+            n += 1
+    distance = np.full(n, np.inf)
+    chosen = 0
+    for k in range(min(n, count)):
+        out[k] = kept[chosen]
+        x, y, z = kept[chosen, 0], kept[chosen, 1], kept[chosen, 2]
+        farthest = -1.0
+        for i in range(n):
+            distance[i] = min(distance[i], (kept[i, 0] - x) ** 2 + (kept[i, 1] - y) ** 2 + (kept[i, 2] - z) ** 2)
+            if distance[i] > farthest:
+                farthest, chosen = distance[i], i
+    return out
+
+
+# Redundancy of keyframes.
+
+
+@kernel
+def count_redundant(
+    observed: I32, ends: NDArray[np.int64], keyframes: I32, observers: I32, centres: F64, rows: I32, poses: F64, alive: Bool, others: int
+) -> NDArray[np.int64]:
+    """Count the landmarks of each keyframe, and those of them that at least `others` further living keyframes observed from as near: (2, n).
+
+    `observed` are the landmarks of each keyframe in turn up to its end, -1 = not counted; `observers` (m, OBSERVERS) and `centres` (m, 3) are those
+    of the landmarks; `poses` (k, 4, 4) and `alive` (k,) those of the keyframes `rows`, sorted, which include all observers."""
+    place, counts = np.empty(rows[-1] + 1, np.int32), np.zeros((2, len(keyframes)), np.int64)
+    for k in range(len(rows)):
+        place[rows[k]] = k
+    counted, begin = np.full(len(centres), -1), 0  # the last keyframe that a landmark was counted for
+    for k in range(len(keyframes)):
+        for o in range(begin, ends[k]):
+            i = observed[o]
+            if i < 0 or counted[i] == k:
+                continue
+            counted[i] = k
+            reach, count = FARTHER * _distance(poses[place[keyframes[k]]], centres[i]), 0
+            for row in observers[i]:
+                if row >= 0 and row != keyframes[k] and alive[place[row]]:
+                    count += _distance(poses[place[row]], centres[i]) <= reach
+            counts[0, k] += 1
+            counts[1, k] += count >= others
+        begin = ends[k]
+    return counts
+
+
+@kernel
+def _distance(T: F64, p: F64) -> float:
+    """Distance of a point from a camera."""
+    x, y, z = T[0, 3] - p[0], T[1, 3] - p[1], T[2, 3] - p[2]
+    return np.sqrt(x * x + y * y + z * z)
