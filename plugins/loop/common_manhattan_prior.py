@@ -22,22 +22,11 @@ UNKNOWN = 1e-6  # 1/m², information of the position of a direction: none
 PLAUSIBLE = 3.0  # standard deviations of the drift that the prior may correct; beyond, the directions are those of another wing
 WALLS = 60  # planes, those observed most often, from which the axes are estimated
 MAX_COS, LARGEST_COS = 0.05, 0.2  # of two walls at right angles, see `perpendicular_pair`
+WALL_SIGMA, EDGE_SIGMA = np.radians(0.3), np.radians(0.5)  # of walls and edges about the axes: no building is exactly Manhattan
+REACH = np.radians(2.0)  # within which a direction belongs to an axis
+GATE = 2.0  # σ at which a robust weight is one half
+EXPLAINED = 0.5  # share of the walls (by views) that must stand on the axes
 NO_MEANS = np.zeros((0, 3))
-
-
-@dataclass(frozen=True)
-class ManhattanNoise:
-    """Noise model of the Manhattan prior: deviation of walls and edges from the axes (standard deviations), the angle within which a direction
-    belongs to an axis, the σ at which its robust weight is one half, and the share of the walls (by views) that must stand on the axes."""
-
-    wall: float = np.radians(0.3)
-    edge: float = np.radians(0.5)
-    reach: float = np.radians(2.0)
-    gate: float = 2.0
-    explained: float = 0.5
-
-
-NOISE = ManhattanNoise()
 
 
 @dataclass(frozen=True)
@@ -51,22 +40,22 @@ class ManhattanPrior:
     information: F64
 
 
-def estimate_manhattan_prior(map: Map, noise: ManhattanNoise = NOISE) -> ManhattanPrior | None:
+def estimate_manhattan_prior(map: Map) -> ManhattanPrior | None:
     """Estimate the prior from the directions in the tracked sub-map; None where no two axes have walls, or most walls are on none."""
     rows = keyframes_of(map, current_submap(map))
     planes, at_plane = _middle_observers(map.planes, rows)
     lines, at_line = _middle_observers(map.lines, rows)
     coefficients, covariance = map.planes.rows("coefficients", planes), map.planes.rows("covariance", planes)
-    R = _axes(coefficients, covariance, map.planes.rows("found", planes), noise)
+    R = _axes(coefficients, covariance, map.planes.rows("found", planes))
     if R is None:
         return None
     ends, end_covariance = map.lines.rows("endpoints_m", lines), inverse(map.lines.rows("information", lines))
     vectors, information = measured_directions(
-        coefficients, covariance, noise.wall, ends.astype(np.float32), end_covariance.astype(np.float32), noise.edge, NO_MEANS, NO_MEANS[:, 0]
+        coefficients, covariance, WALL_SIGMA, ends.astype(np.float32), end_covariance.astype(np.float32), EDGE_SIGMA, NO_MEANS, NO_MEANS[:, 0]
     )
     poses = map.keyframes.rows("T_world_camera", rows)
     observers = np.concatenate([at_plane, at_line])
-    return ManhattanPrior(R, rows, *keyframe_rotations(vectors, information, observers, R, poses, np.cos(noise.reach), noise.gate))
+    return ManhattanPrior(R, rows, *keyframe_rotations(vectors, information, observers, R, poses, np.cos(REACH), GATE))
 
 
 def _middle_observers(landmarks: Table, keyframes: I32) -> tuple[I32, I32]:
@@ -80,17 +69,17 @@ def _middle_observers(landmarks: Table, keyframes: I32) -> tuple[I32, I32]:
     return ids[known], place[known].astype(np.int32)
 
 
-def _axes(planes: F64, covariance: F64, views: I32, noise: ManhattanNoise) -> F64 | None:
+def _axes(planes: F64, covariance: F64, views: I32) -> F64 | None:
     """R_world_manhattan on most views of the walls (n, 4), or None."""
     most = np.argsort(-views, kind="stable")[:WALLS]
-    walls: Walls = known_walls(planes[most], covariance[most], views[most], noise.wall)
-    found, R = perpendicular_pair(walls, MAX_COS, LARGEST_COS, noise.reach, np.eye(3), 1.0)
+    walls: Walls = known_walls(planes[most], covariance[most], views[most], WALL_SIGMA)
+    found, R = perpendicular_pair(walls, MAX_COS, LARGEST_COS, REACH, np.eye(3), 1.0)
     if not found:
         return None
-    on_axes = area_on_axes(walls, R, noise.reach)
-    if np.count_nonzero(on_axes) < 2 or on_axes.sum() < noise.explained * walls.area.sum():
+    on_axes = area_on_axes(walls, R, REACH)
+    if np.count_nonzero(on_axes) < 2 or on_axes.sum() < EXPLAINED * walls.area.sum():
         return None
-    on_walls: F64 = settled(walls, R, noise.reach, noise.gate, 0.0, 3)[0]
+    on_walls: F64 = settled(walls, R, REACH, GATE, 0.0, 3)[0]
     return on_walls
 
 

@@ -12,7 +12,7 @@ from trihedron.pipeline.core.geometry import invert
 from trihedron.pipeline.core.options import NonNegativeInt, PositiveFloat, Range, check_increasing
 from trihedron.pipeline.core.types import F64, I32, U8, Camera, Keypoints, Map, Matches, Planes, Segments
 from trihedron.plugins.mapping.covisibility_graph import LocalWindow
-from trihedron.plugins.mapping.data_association_kernels import pairs_by_row, related_planes
+from trihedron.plugins.mapping.landmark_kernels import pairs_by_row, related_planes
 from trihedron.plugins.mapping.projection import POINT_COLUMNS, VisiblePoints, clip_segments, visible_points
 from trihedron.plugins.shared.feature_matching import associate_planes, match_lines, match_near
 from trihedron.plugins.shared.feature_matching_kernels import transform_plane_samples

@@ -15,7 +15,7 @@ from trihedron.pipeline.core.types import F32, F64, I32, Bool, Camera, Keypoints
 from trihedron.plugins.mapping.landmark_kernels import farthest_samples, fuse_lines, fuse_points
 from trihedron.plugins.mapping.landmarks import OBSERVERS
 from trihedron.plugins.mapping.plane_fusion import equivalent_moments, fit_planes, move_moments, project_to_planes
-from trihedron.plugins.mapping.projection import line_terms, plane_terms, point_terms, points_along
+from trihedron.plugins.mapping.projection import line_terms, parameters_on, plane_terms, point_terms, points_along
 from trihedron.plugins.shared.linalg import inverse, point_covariance, propagate_pose_covariance
 from trihedron.plugins.shared.pose_optimizer import classify_terms
 
@@ -38,29 +38,18 @@ class Associated:
 
 
 def associate(
-    map: Map,
-    camera: Camera,
-    T_world_camera: F64,
-    keypoints: Keypoints,
-    segments: Segments,
-    planes: Planes,
-    matches: Matches | None,
-    line_sigma_px: float,
-    judge: bool = True,
-) -> Associated:
+    map: Map, camera: Camera, T_world_camera: F64, keypoints: Keypoints, segments: Segments, planes: Planes, matches: Matches | None,
+    line_sigma_px: float, judge: bool = True,
+) -> Associated:  # fmt: skip
     """Classify the matches at the final pose; with `judge` False all are inliers. A plane that is an outlier is neither updated nor new: a duplicate
     of a wall would do more harm than a lost measurement. New points and lines need a 3D position."""
     pairs = (matches.keypoints, matches.segments, matches.planes) if matches is not None else (NO_PAIRS, NO_PAIRS, NO_PAIRS)
     points, lines, same = (matched[_alive(table, matched[:, 1])] for matched, table in zip(pairs, (map.points, map.lines, map.planes)))
     inliers = same
     if judge and matches is not None:
-        flags = classify_terms(
-            T_world_camera,
-            camera,
-            point_terms(map, keypoints, points),
-            line_terms(map, segments, lines, T_world_camera, camera, line_sigma_px),
-            plane_terms(map, planes, same, NO_PAIRS, NO_PAIRS, 1.0),
-        )
+        on_lines = line_terms(map, segments, lines, T_world_camera, camera, line_sigma_px)
+        on_planes = plane_terms(map, planes, same, NO_PAIRS, NO_PAIRS, 1.0)
+        flags = classify_terms(T_world_camera, camera, point_terms(map, keypoints, points), on_lines, on_planes)
         points, lines, inliers = points[flags.points > 0], lines[flags.lines > 0], same[flags.planes > 0]
     new_points, new_lines = _others(_finite(keypoints.points_m), points), _others(_finite(segments.endpoints_m), lines)
     return Associated(points, new_points, lines, new_lines, inliers, _others(np.ones(len(planes.coefficients), np.bool_), same))
@@ -152,6 +141,11 @@ def _append_observations(map: Map, kind: str, keyframe: int, **columns: Any) -> 
     return replace(map, **changes)
 
 
+def _rows(features: Keypoints | Segments | Planes, rows: I32, *names: str) -> dict[str, Any]:
+    """These fields of some features."""
+    return {name: getattr(features, name)[rows] for name in names}
+
+
 def insert_points(map: Map, view: Observations, keypoints: Keypoints, pairs: I32, new: I32, memory: float) -> Map:
     """Update the points `pairs` (row, id) and make landmarks of the rows `new`, which have depth."""
     rows, ids = pairs[:, 0], pairs[:, 1]
@@ -175,16 +169,8 @@ def insert_points(map: Map, view: Observations, keypoints: Keypoints, pairs: I32
         **_new_landmark(len(new), view.keyframe),
     )
     all_rows = np.concatenate([rows, new])
-    return _append_observations(
-        replace(map, points=table),
-        "point",
-        view.keyframe,
-        point=np.concatenate([ids, created]),
-        pixel=keypoints.pixels[all_rows],
-        depth_m=keypoints.points_m[all_rows, 2],
-        sigma_px=keypoints.sigma_px[all_rows],
-        sigma_m=keypoints.sigma_m[all_rows],
-    )
+    measured = {"pixel": keypoints.pixels[all_rows], "depth_m": keypoints.points_m[all_rows, 2], **_rows(keypoints, all_rows, "sigma_px", "sigma_m")}
+    return _append_observations(replace(map, points=table), "point", view.keyframe, point=np.concatenate([ids, created]), **measured)
 
 
 def _appearance(view: Observations, keypoints: Keypoints, rows: I32, position: F64) -> dict[str, Any]:
@@ -221,23 +207,13 @@ def insert_lines(map: Map, view: Observations, segments: Segments, pairs: I32, n
         descriptor=segments.descriptors[new],
         **_new_landmark(len(new), view.keyframe),
     )
-    all_rows = np.concatenate([rows, new])
-    ids = np.concatenate([ids, created])
-    return _append_observations(
-        replace(map, lines=table),
-        "line",
-        view.keyframe,
-        line=ids,
-        endpoints_px=segments.endpoints_px[all_rows],
-        endpoints_m=segments.endpoints_m[all_rows],
-        covariance_m2=segments.covariance_m2[all_rows],
-    )
+    measured = _rows(segments, np.concatenate([rows, new]), "endpoints_px", "endpoints_m", "covariance_m2")
+    return _append_observations(replace(map, lines=table), "line", view.keyframe, line=np.concatenate([ids, created]), **measured)
 
 
 def extend_lines(endpoints: F64, information: F32 | F64, observed: F64) -> tuple[F64, F64]:
     """Extend lines (n, 2, 3) along their direction to the observed ends (n, 2, 3; NaN = unknown); also returns their information."""
-    direction = endpoints[:, 1] - endpoints[:, 0]
-    share = np.einsum("nkj,nj->nk", observed - endpoints[:, :1], direction) / np.maximum((direction**2).sum(-1), 1e-12)[:, None]
+    share = parameters_on(endpoints, observed)
     reach = np.stack([np.fmin(share.min(axis=1), 0.0), np.fmax(share.max(axis=1), 1.0)], axis=1)
     points, covariance = points_along(endpoints, inverse(information), reach)
     return points, inverse(covariance)
@@ -270,16 +246,8 @@ def insert_planes(map: Map, view: Observations, planes: Planes, pairs: I32, new:
         samples_m=project_to_planes(samples[new], fitted),
         **_new_landmark(len(new), view.keyframe),
     )
-    all_rows = np.concatenate([pairs[:, 0], new])
-    return _append_observations(
-        replace(map, planes=table),
-        "plane",
-        view.keyframe,
-        plane=np.concatenate([pairs[:, 1], created]),
-        coefficients=planes.coefficients[all_rows],
-        covariance=planes.covariance[all_rows],
-        moments=planes.moments[all_rows],
-    )
+    measured = _rows(planes, np.concatenate([pairs[:, 0], new]), "coefficients", "covariance", "moments")
+    return _append_observations(replace(map, planes=table), "plane", view.keyframe, plane=np.concatenate([pairs[:, 1], created]), **measured)
 
 
 def _plane_covariance(planes: Planes, view: Observations) -> F64:

@@ -14,7 +14,7 @@ from trihedron.plugins.mapping.insertion import Observations, extend_lines
 from trihedron.plugins.mapping.landmark_kernels import farthest_samples
 from trihedron.plugins.mapping.landmarks import OBSERVERS, isin, remove_rows
 from trihedron.plugins.mapping.plane_fusion import fit_planes, project_to_planes
-from trihedron.plugins.mapping.projection import clip_segments, points_along
+from trihedron.plugins.mapping.projection import clip_segments, parameters_on, points_along
 from trihedron.plugins.shared.feature_matching import match_lines, match_near
 from trihedron.plugins.shared.feature_matching_kernels import mean_distance, overlap
 from trihedron.plugins.shared.linalg import inverse
@@ -79,9 +79,7 @@ def merge_lines(map: Map, view: Observations, visible: I32) -> Map:
 def _collinear(lines: Table, a: I32, b: I32) -> Bool:
     """Return True (n,) where both ends of line b lie on line a within their uncertainty (χ² test)."""
     (on, known), (ends, other) = (lines.gathered(ids, "endpoints_m", "information") for ids in (a, b))
-    direction = on[:, 1] - on[:, 0]
-    share = np.einsum("nkj,nj->nk", ends - on[:, :1], direction) / np.maximum((direction**2).sum(-1), 1e-12)[:, None]
-    foot, covariance = points_along(on, inverse(known), share)
+    foot, covariance = points_along(on, inverse(known), parameters_on(on, ends))
     covariance += inverse(other)
     chi2 = np.einsum("nki,nkij,nkj->nk", ends - foot, inverse(covariance), ends - foot)
     good: Bool = (chi2 <= CHI2_95[2]).all(axis=1)
@@ -154,10 +152,7 @@ def _remove_merged(map: Map, kind: str, kept: I32, gone: I32) -> Map:
     both = -np.sort(-both, axis=1)
     both[:, 1:][both[:, 1:] == both[:, :-1]] = -1  # observed by the same keyframe
     table = table.updated(
-        kept,
-        observers=-np.sort(-both, axis=1)[:, :OBSERVERS],
-        found=np.maximum(mine[1], theirs[1]),
-        visible=np.maximum(mine[2], theirs[2]),
+        kept, observers=-np.sort(-both, axis=1)[:, :OBSERVERS], found=np.maximum(mine[1], theirs[1]), visible=np.maximum(mine[2], theirs[2])
     )
     observations = _replace_ids(map, kind, kept, gone)
     changes: dict[str, Any] = {f"{kind}s": remove_rows(table, gone), f"{kind}_observations": observations}

@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from trihedron.pipeline.core.geometry import invert, transform
 from trihedron.pipeline.core.types import F32, F64, I32, U8, Bool, Camera, Frame, Keypoints, Map, Planes, Segments, Table
-from trihedron.plugins.mapping.projection_kernels import (
-    NEAR_M,
+from trihedron.plugins.mapping.landmark_kernels import (
+    MIN_DEPTH_M,
     clip_segments_kernel,
     line_terms_kernel,
     plane_terms_kernel,
@@ -56,7 +56,7 @@ def visible_planes(planes: Table, ids: I32, T_world_camera: F64, frame: Frame) -
     coefficients, samples = planes.gathered(ids, "coefficients", "samples_m")
     local = transform(invert(T_world_camera), samples.astype(np.float64))
     pixels = frame.camera.project(local)
-    inside = (local[..., 2] > NEAR_M) & in_image(pixels, frame.camera)
+    inside = (local[..., 2] > MIN_DEPTH_M) & in_image(pixels, frame.camera)
     x, y = np.rint(np.where(inside[..., None], pixels, 0.0)).astype(int).transpose(2, 0, 1)
     depth = frame.depth_m[y, x].astype(np.float64)
     unoccluded = inside & (depth > 0.0) & (local[..., 2] < depth + HIDDEN_M + HIDDEN_SIGMAS * frame.camera.depth_noise.sigma_m(depth))
@@ -95,6 +95,12 @@ def line_terms(map: Map, segments: Segments, pairs: I32, T_world_camera: F64, ca
     ends_m, information = map.lines.gathered(pairs[:, 1], "endpoints_m", "information")
     seen_px, seen_m, noise = segments.endpoints_px, segments.endpoints_m, segments.covariance_m2
     return line_terms_kernel(ends_m, information, rows, seen_px, seen_m, noise, T_world_camera.copy(), camera.intrinsics, sigma_px)
+
+
+def parameters_on(lines: F64, points: F64) -> F64:
+    """Return the parameters (n, k), 0 = start and 1 = end, of the feet of points (n, k, 3) on lines (n, 2, 3)."""
+    direction = lines[:, 1] - lines[:, 0]
+    return np.einsum("nkj,nj->nk", points - lines[:, :1], direction) / np.maximum((direction**2).sum(-1), 1e-12)[:, None]
 
 
 def points_along(endpoints: F64, covariance: F64, share: F64) -> tuple[F64, F64]:

@@ -11,8 +11,8 @@ from trihedron.pipeline.core.geometry import invert, transform
 from trihedron.pipeline.core.types import F64, I32, Camera, Frame, Keypoints, Map, Matches, Planes, Segments
 from trihedron.plugins.mapping.covisibility_graph import LocalWindow, local_window, window_of
 from trihedron.plugins.mapping.data_association import PredictedPose, SearchOptions, search_map
+from trihedron.plugins.mapping.landmark_kernels import MIN_DEPTH_M
 from trihedron.plugins.mapping.projection import in_image, line_terms, plane_terms, point_terms
-from trihedron.plugins.mapping.projection_kernels import NEAR_M
 from trihedron.plugins.places.recognition import are_distinct
 from trihedron.plugins.shared.pose_optimizer import LANDMARK_SCORE, PoseSolution, solve_pose
 
@@ -31,7 +31,7 @@ def free_space_violation(T_world_camera: F64, frame: Frame, map: Map, window: Lo
     samples = map.planes.rows("samples_m", window.planes).reshape(-1, 3).astype(np.float64)
     world = np.concatenate([map.points.rows("position_m", window.points), samples[np.isfinite(samples[:, 0])]])
     local = transform(invert(T_world_camera), world)
-    local = local[local[:, 2] > NEAR_M]
+    local = local[local[:, 2] > MIN_DEPTH_M]
     pixels = frame.camera.project(local)
     inside = in_image(pixels, frame.camera)
     x, y = np.rint(pixels[inside]).astype(int).T

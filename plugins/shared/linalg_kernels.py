@@ -74,6 +74,25 @@ def tangent_columns(n: F64, B: F64) -> None:
     B[0, 1], B[1, 1], B[2, 1] = b, s + n[1] * n[1] * a, -n[1]
 
 
+@kernel(forceinline=True)
+def add_triple(row: F64, first: int, x: float, y: float, z: float) -> None:
+    """Add three numbers to a row, from column `first`."""
+    row[first] += x
+    row[first + 1] += y
+    row[first + 2] += z
+
+
+@kernel(forceinline=True)
+def add_triangle(H: F64, k: int, h00: float, h10: float, h11: float, h20: float, h21: float, h22: float) -> None:
+    """Add a symmetric block (3, 3), given by rows of its lower triangle, to H at (k, k)."""
+    H[k, k] += h00
+    H[k + 1, k] += h10
+    H[k + 1, k + 1] += h11
+    H[k + 2, k] += h20
+    H[k + 2, k + 1] += h21
+    H[k + 2, k + 2] += h22
+
+
 @kernel
 def polar_rotation(M: F64) -> F64:
     """The rotation nearest to M (3, 3), as `geometry.nearest_rotation`: one-sided Jacobi rotations make the columns of `A = M V` orthogonal
@@ -144,14 +163,15 @@ def _from_columns(A: F64, V: F64) -> F64:
     return out
 
 
-# Order of many values, in a call that holds no lock.
+# Sorting and medians, without the interpreter's lock.
 
 DIGIT = 11  # bits sorted by at a time: six digits of a double, whose counts stay in the nearest cache
 
 
 @kernel
 def descending(values: F64) -> I32:
-    """Rows of (n,) numbers from the largest to the smallest, equal ones in their order. A radix sort: thousands in a fifth of a merge sort's time."""
+    """Sort the rows of (n,) numbers from the largest to the smallest, equal ones in their order. A radix sort: thousands in a fifth of a merge sort's
+    time."""
     n, sign = len(values), np.uint64(1 << 63)
     keys = (0.0 - values).view(np.uint64)  # no -0
     for i in range(n):
@@ -175,7 +195,7 @@ def descending(values: F64) -> I32:
 
 @kernel
 def few_descending(values: F64) -> I32:
-    """As `descending`, by insertion: for a handful of numbers."""
+    """Sort like `descending`, by insertion: for a handful of numbers."""
     order = np.empty(len(values), np.int32)
     for k in range(len(values)):
         place = k
@@ -188,7 +208,7 @@ def few_descending(values: F64) -> I32:
 
 @kernel
 def median(values: F64) -> float:
-    """Of (n,) numbers, n > 0, which it puts into another order (Hoare's selection)."""
+    """Return the median of (n,) numbers, n > 0, and reorder them (Hoare's selection)."""
     middle, low, high = len(values) // 2, 0, len(values) - 1
     while low < high:
         pivot, i, j = values[(low + high) // 2], low, high
