@@ -90,6 +90,11 @@ def transform(T_a_b: F64, points_b: F64) -> F64:
     return points_b @ T_a_b[:3, :3].T + T_a_b[:3, 3]
 
 
+def transform_each(T_a_b: F64, points_b: F64) -> F64:
+    """Transform (n, k, 3) points of frame b into frame a, each row by its own motion (n, 4, 4)."""
+    return points_b @ T_a_b[:, :3, :3].swapaxes(-1, -2) + T_a_b[:, None, :3, 3]
+
+
 def transform_planes(T_a_b: F64, planes_b: F64) -> F64:
     """Transform (..., 4) planes (n, d) of frame b into frame a, signs as they are: d may become negative."""
     n = planes_b[..., :3] @ T_a_b[:3, :3].T

@@ -12,10 +12,10 @@ from numpy.typing import NDArray
 
 from trihedron.pipeline.core.options import NonNegativeFloat, PositiveFloat, PositiveShare, Range
 from trihedron.pipeline.core.types import F32, F64, I32, LOST, PLANE_KINDS, U8, Bool, DepthNoise, Frame, Map, Planes, Pose, Rotation, Surface
-from trihedron.plugins.shared.keyframe_views import KeyframeView, Known, readings, view_of
 from trihedron.plugins.shared.tsdf_volume import CELLS, Volume
 from trihedron.plugins.surface.common_kernels import neighbours, off_planes, paint, signs_kernel, triangles_kernel, untangled, vertices_kernel
 from trihedron.plugins.surface.common_meshes import compacted, plane_axes, triangle_areas, vertex_normals, with_single_fans, without_crumbs
+from trihedron.plugins.surface.common_views import KeyframeView, Known, readings, view_of
 
 NEWS_COLUMNS = 80  # of readings that are asked for news
 AHEAD_M = 2.0  # a pose has moved by as much as the camera and a point this far before it have
@@ -72,7 +72,7 @@ class ViewFold:
         frame = with_measured_noise(frame, planes)
         points, weight = readings(frame, pose.T_world_camera, max(1, frame.camera.width // NEWS_COLUMNS), self.max_sigma_m)
         known = state.known.setdefault(pose.submap, Known(CELL_M))
-        if len(points) and known.news(points, weight, self.views) >= self.news:
+        if len(points) and known.novelty(points, weight, self.views) >= self.news:
             known.learn(points, weight)
             view = view_of(frame, planes, pose, map, self.view_width, self.max_sigma_m)
             state.views.append(view)
@@ -102,7 +102,7 @@ class VolumeFold(ViewFold):
         if state.volume is None:
             state.volume = Volume(self.voxel_m, self.truncation_m)
         if view.submap == 0:
-            state.volume.integrate(view, view.T_world_camera)
+            state.volume.integrate(*view.fused, view.T_world_camera)
         state.fused.append(view.T_world_camera if view.submap == 0 else None)
 
     def _volume(self, state: Gathered, map: Map | None) -> Volume:
@@ -113,7 +113,7 @@ class VolumeFold(ViewFold):
         volume = Volume(self.voxel_m, self.truncation_m)
         for view, T in zip(state.views, finals):
             if T is not None:
-                volume.integrate(view, T)
+                volume.integrate(*view.fused, T)
         return volume
 
     def _mesh(self, state: Gathered, map: Map | None) -> tuple[F64, I32]:

@@ -1,4 +1,4 @@
-"""A corridor whose map has turned, put straight by the directions of its walls."""
+"""The Manhattan prior: a corridor whose map has drifted in rotation, aligned by the directions of its walls."""
 
 import dataclasses
 
@@ -8,7 +8,7 @@ import pytest
 from trihedron.pipeline.core.geometry import exp_so3, log_so3, pose_matrix, transform_planes
 from trihedron.pipeline.core.types import Camera, Frame, Pose
 from trihedron.plugins.loop.appearance import AppearanceLoop
-from trihedron.plugins.loop.common_pose_graph import Trueness, compass_of
+from trihedron.plugins.loop.common_manhattan_prior import estimate_manhattan_prior
 from trihedron.plugins.loop.planes import PlanesLoop
 from trihedron.plugins.mapping import plane_fusion
 from trihedron.plugins.mapping.correction import apply_correction
@@ -59,18 +59,18 @@ def errors_deg(rotations, truth):
     return np.degrees([np.linalg.norm(log_so3(R @ truth.T)) for R in rotations])
 
 
-def test_walls_say_how_far_each_keyframe_has_turned():
+def test_the_prior_rotations_are_the_drift():
     map, truth = corridor(DRIFT)
-    compass = compass_of(map, Trueness())
-    turned = np.array([log_so3(R @ exp_so3(phi) @ truth.T) for R, phi in zip(map.keyframes.column("T_world_camera")[:, :3, :3], compass.turns)])
+    prior = estimate_manhattan_prior(map)
+    turned = np.array([log_so3(R @ exp_so3(phi) @ truth.T) for R, phi in zip(map.keyframes.column("T_world_camera")[:, :3, :3], prior.rotations)])
     common = turned.mean(axis=0)  # the axes themselves are found in the middle of the drift
     assert np.degrees(np.linalg.norm(turned - common, axis=1).max()) < 0.5 and np.degrees(np.linalg.norm(common)) < 0.6
-    sigma = np.degrees(1.0 / np.sqrt(np.linalg.eigvalsh(compass.information)))
+    sigma = np.degrees(1.0 / np.sqrt(np.linalg.eigvalsh(prior.information)))
     assert sigma.min() > 0.15 and sigma.max() < 0.5  # three walls, true to 0.3° by assumption
 
 
 @pytest.mark.parametrize("loop", [PlanesLoop(), AppearanceLoop()])
-def test_a_map_that_has_turned_is_put_straight(loop):
+def test_a_drifted_map_is_aligned_with_its_manhattan_frame(loop):
     map, truth = corridor(DRIFT)
     correction = loop(map, frame())
     moved = apply_correction(map, correction)
@@ -83,15 +83,15 @@ def test_a_map_that_has_turned_is_put_straight(loop):
     np.testing.assert_array_equal(loop(map, frame()).T_world_keyframe, correction.T_world_keyframe)
 
 
-def test_nothing_is_turned_without_need():
+def test_no_alignment_without_need():
     assert PlanesLoop()(corridor(np.zeros(3))[0], frame()) is None  # it is straight
     map, _ = corridor(DRIFT)
     assert PlanesLoop(straighten=0)(map, frame()) is None
     assert PlanesLoop(straighten=48)(map, frame()) is None  # keyframe 64 is none of its
 
 
-def test_nothing_is_turned_to_what_is_no_manhattan_frame():
-    assert compass_of(corridor(DRIFT, axes=(0, 0, 0))[0], Trueness()) is None  # one direction alone
-    assert compass_of(corridor(DRIFT, wall_deg=20.0)[0], Trueness()) is None  # walls every way
+def test_no_alignment_without_a_manhattan_frame():
+    assert estimate_manhattan_prior(corridor(DRIFT, axes=(0, 0, 0))[0]) is None  # one direction alone
+    assert estimate_manhattan_prior(corridor(DRIFT, wall_deg=20.0)[0]) is None  # walls every way
     assert PlanesLoop()(corridor(np.zeros(3), turned=np.radians(10.0))[0], frame()) is None  # the second half is another wing
     assert PlanesLoop()(corridor(np.zeros(3), turned=np.radians(3.0))[0], frame()) is None

@@ -5,8 +5,7 @@ import time
 import numpy as np
 import pytest
 
-from trihedron.plugins.shared.descriptors import match_lines, match_near
-from trihedron.plugins.shared.plane_association import associate_planes
+from trihedron.plugins.shared.feature_matching import associate_planes, match_lines, match_near
 
 
 def scene(rng, n, noise_px=2.0, flipped_bits=10):

@@ -1,4 +1,4 @@
-"""Numba kernels of `descriptors.py`."""
+"""Kernels of `feature_matching.py`: descriptor distances, matching of points and lines near a prediction, association of planes."""
 # mypy: disable-error-code="arg-type, assignment, index, return-value"
 
 from __future__ import annotations
@@ -23,17 +23,8 @@ def _ones(x: int) -> int:
 
 
 @kernel
-def hamming(a: U64, b: U64) -> int:
-    """Number of differing bits of two rows of words."""
-    total = np.uint64(0)
-    for k in range(len(a)):
-        total += _ones(a[k] ^ b[k])
-    return int(total)
-
-
-@kernel
-def _bits_apart(a: U64, i: int, b: U64, j: int) -> int:
-    """`hamming` of row i of a and row j of b: for inner loops, where to slice them takes longer."""
+def hamming(a: U64, i: int, b: U64, j: int) -> int:
+    """Number of differing bits of row i of a and row j of b."""
     total = np.uint64(0)
     for k in range(a.shape[1]):
         total += _ones(a[i, k] ^ b[j, k])
@@ -52,7 +43,7 @@ def _euclidean(a: U8, i: int, b: U8, j: int) -> float:
 
 @kernel
 def _buckets(px: F32, cell: float, cols: int, rows: int, x0: float, y0: float) -> tuple[I32, I32]:
-    """Counting sort of points into a grid: (cols·rows + 1,) starts and the row numbers in cell order; points with NaN are left out."""
+    """Counting sort of points into a grid: (cols·rows + 1,) starts and the row numbers in cell order; points with NaN are skipped."""
     start = np.zeros(cols * rows + 1, np.int32)
     place = np.full(len(px), -1, np.int32)
     for i in range(len(px)):
@@ -114,7 +105,7 @@ def near_matches(
                     continue
                 t = order[k]
                 if mode == HAMMING:
-                    distance = float(_bits_apart(qwords, i, twords, t))
+                    distance = float(hamming(qwords, i, twords, t))
                 elif mode == L2:
                     distance = _euclidean(qbytes, i, tbytes, t)
                 else:
@@ -187,7 +178,7 @@ def line_matches(
             if mode == NONE:
                 cost[j] = offset / max(offset_px, 1e-9) + sine / max(sine_max, 1e-9) + 1.0 - overlap
             else:
-                cost[j] = float(_bits_apart(qwords, i, twords, j))
+                cost[j] = float(hamming(qwords, i, twords, j))
             if best < 0 or cost[j] < cost[best]:
                 best = j
         if best < 0 or (mode != NONE and cost[best] > limit) or cost[best] >= held[best]:
@@ -202,7 +193,7 @@ def line_matches(
 
 @kernel
 def _ambiguous(t: F64, cost: F64, best: int, ratio: float) -> bool:
-    """Whether another edge (not a collinear piece of the best one) is nearly as similar."""
+    """Return True if another edge (not a collinear piece of the best one) is nearly as similar."""
     for j in range(len(t)):
         if j != best and cost[best] >= ratio * cost[j]:
             sine = abs(t[best, 2] * t[j, 3] - t[best, 3] * t[j, 2])
@@ -213,10 +204,130 @@ def _ambiguous(t: F64, cost: F64, best: int, ratio: float) -> bool:
 
 
 @kernel
-def bits(a: U64, b: U64) -> F32:
-    """(n, m) numbers of bits that differ."""
+def nearest_descriptors(query: U64, train: U64, max_bits: int, ratio: float) -> I32:
+    """Match each of n descriptors (n, w) with the nearest (the first of equals) of m: its row (n,), or -1 where it is more than `max_bits` away, or
+    not nearer than `ratio` × the second best (1 or more: no such test)."""
+    out = np.full(len(query), -1, np.int32)
+    for i in range(len(query)):
+        best, second, row = 1 << 30, 1 << 30, -1
+        for j in range(len(train)):
+            distance = hamming(query, i, train, j)
+            if distance < best:
+                best, second, row = distance, best, j
+            elif distance < second:
+                second = distance
+        if best <= max_bits and (ratio >= 1.0 or best < ratio * second):
+            out[i] = row
+    return out
+
+
+@kernel
+def hamming_distances(a: U64, b: U64) -> F32:
+    """Hamming distances (n, m)."""
     out = np.empty((len(a), len(b)), np.float32)
     for i in range(len(a)):
         for j in range(len(b)):
-            out[i, j] = hamming(a[i], b[j])
+            out[i, j] = hamming(a, i, b, j)
     return out
+
+
+# Planes.
+
+
+@kernel
+def mean_distance(plane: F64, samples: F32) -> float:
+    """Mean |n·x + d| over the finite rows of (s, 3) samples; inf without any."""
+    nx, ny, nz, d = plane[0], plane[1], plane[2], plane[3]
+    total, count = 0.0, 0
+    for k in range(len(samples)):
+        x = nx * samples[k, 0] + ny * samples[k, 1] + nz * samples[k, 2] + d
+        if np.isfinite(x):
+            total += abs(x)
+            count += 1
+    return total / count if count else np.inf
+
+
+@kernel
+def _spacing(samples: F32) -> float:
+    """Mean distance from a sample to its nearest neighbour, metres; 0 with fewer than two."""
+    total, count = 0.0, 0
+    nearest = np.full(len(samples), np.inf, np.float32)
+    for i in range(len(samples)):
+        x, y, z = samples[i, 0], samples[i, 1], samples[i, 2]
+        for j in range(i):
+            squared = (x - samples[j, 0]) ** 2 + (y - samples[j, 1]) ** 2 + (z - samples[j, 2]) ** 2
+            if squared < nearest[i]:  # not with NaN
+                nearest[i] = squared
+            if squared < nearest[j]:
+                nearest[j] = squared
+    for i in range(len(samples)):
+        if nearest[i] < np.inf:
+            total += np.sqrt(float(nearest[i]))
+            count += 1
+    return total / count if count else 0.0
+
+
+@kernel
+def overlap(samples_a: F32, samples_b: F32, reach_m: float) -> float:
+    """Share of the finite samples of a that have a sample of b within `reach_m`."""
+    near, count = 0, 0
+    for i in range(len(samples_a)):
+        x, y, z = samples_a[i, 0], samples_a[i, 1], samples_a[i, 2]
+        if not np.isfinite(x):
+            continue
+        count += 1
+        for j in range(len(samples_b)):
+            if (x - samples_b[j, 0]) ** 2 + (y - samples_b[j, 1]) ** 2 + (z - samples_b[j, 2]) ** 2 <= reach_m * reach_m:  # not with NaN
+                near += 1
+                break
+    return near / count if count else 0.0
+
+
+@kernel
+def associate_planes_kernel(a: F64, samples_a: F32, b: F64, samples_b: F32, cosine: float, limit: float, many_to_one: bool) -> I32:
+    """Associate planes greedily by increasing cost; see `associate_planes`."""
+    n, m = len(a), len(b)
+    cost = np.full((n, m), np.inf)
+    reach = np.full(m, -1.0)
+    for i in range(n):
+        for j in range(m):
+            if not a[i, 0] * b[j, 0] + a[i, 1] * b[j, 1] + a[i, 2] * b[j, 2] >= cosine:
+                continue
+            distance = min(mean_distance(b[j], samples_a[i]), mean_distance(a[i], samples_b[j]))
+            if distance > limit:
+                continue
+            if reach[j] < 0.0:
+                reach[j] = max(1.5 * _spacing(samples_b[j]), limit)
+            cost[i, j] = distance / max(limit, 1e-9) + 1.0 - overlap(samples_a[i], samples_b[j], reach[j])
+    pairs = np.full(n, -1, np.int32)
+    while True:
+        best, row, column = np.inf, -1, -1
+        for i in range(n):
+            for j in range(m):
+                if cost[i, j] < best:
+                    best, row, column = cost[i, j], i, j
+        if row < 0:
+            break
+        pairs[row] = column
+        cost[row, :] = np.inf
+        if not many_to_one:
+            cost[:, column] = np.inf
+    rows = np.flatnonzero(pairs >= 0)
+    out = np.empty((len(rows), 2), np.int32)
+    for k in range(len(rows)):
+        out[k, 0], out[k, 1] = rows[k], pairs[rows[k]]
+    return out
+
+
+@kernel
+def transform_plane_samples(planes: F64, samples_m: F32, R: F64, t: F64) -> tuple[F64, F32]:
+    """Transform planes (p, 4) and points on them (p, s, 3) by the motion `p -> R p + t`."""
+    coefficients, samples = np.empty((len(planes), 4)), np.empty((len(planes), samples_m.shape[1], 3), np.float32)
+    for i in range(len(planes)):
+        coefficients[i, 3] = planes[i, 3]
+        for a in range(3):
+            coefficients[i, a] = R[a, 0] * planes[i, 0] + R[a, 1] * planes[i, 1] + R[a, 2] * planes[i, 2]
+            coefficients[i, 3] -= coefficients[i, a] * t[a]
+            for k in range(samples_m.shape[1]):
+                samples[i, k, a] = R[a, 0] * samples_m[i, k, 0] + R[a, 1] * samples_m[i, k, 1] + R[a, 2] * samples_m[i, k, 2] + t[a]
+    return coefficients, samples
