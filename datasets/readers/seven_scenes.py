@@ -24,7 +24,7 @@ class SevenScenes(SequenceReader):
 
     The published depth is *not* registered to colour: the two cameras are a few centimetres apart, and no calibration of the pair was
     published. It is read as if both were one camera, of focal length 585 and centre (320, 240), as the data set's authors say; along the edges of
-    things colour and depth then disagree by some pixels. Poses are those of the depth camera."""
+    things colour and depth then disagree by some pixels, which a run warns of. Poses are those of the depth camera."""
 
     camera: str = ""  # preset or camera.yaml; empty = the folder's file, else the data set's camera
 
