@@ -16,7 +16,8 @@ from trihedron.plugins.keypoints.common import OpenCvKeypoints
 @register("keypoints", "akaze")
 @dataclass(frozen=True)
 class Akaze(OpenCvKeypoints):
-    """`cv2.xfeatures2d.AKAZE` (Alcantarilla, Nuevo, Bartoli, BMVC 2013) with OpenCV's defaults: extrema of a nonlinear scale space, M-LDB descriptors.
+    """`cv2.xfeatures2d.AKAZE` (Alcantarilla, Nuevo, Bartoli, BMVC 2013) with OpenCV's defaults: extrema of a nonlinear scale space, M-LDB
+    descriptors.
 
     Library: OpenCV contrib (Apache-2.0). The bytes may differ on another CPU: the scale space is computed in single precision."""
 

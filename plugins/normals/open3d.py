@@ -20,8 +20,8 @@ LEAST = 3  # points, of which a normal is made
 class Open3dNormals:
     """`open3d.geometry.PointCloud.estimate_normals` (principal components of the 30 nearest neighbours, its default) of every `stride`-th pixel.
 
-    Neither noise nor depth edges are taken into account. Library: Open3D (MIT; Zhou, Park, Koltun, arXiv:1801.09847), held to one thread. The bytes may
-    differ on another CPU."""
+    Neither noise nor depth edges are taken into account. Library: Open3D (MIT; Zhou, Park, Koltun, arXiv:1801.09847), held to one thread. The bytes
+    may differ on another CPU."""
 
     stride: Annotated[int, Range(1, 8)] = 4  # px between cells of the output grid
 

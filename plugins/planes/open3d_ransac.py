@@ -24,8 +24,8 @@ from trihedron.plugins.shared.open3d_clouds import point_cloud
 class Open3dRansac(PlanarRegions):
     """`open3d.geometry.PointCloud.segment_plane`, again and again on the points that are left; each plane is cut into connected regions.
 
-    The regions are then grown and fitted as those of every detector, so that their covariance is comparable. Library: Open3D (MIT; Zhou, Park, Koltun,
-    arXiv:1801.09847), held to one thread, its generator seeded for each frame. The bytes may differ on another CPU."""
+    The regions are then grown and fitted as those of every detector, so that their covariance is comparable. Library: Open3D (MIT; Zhou, Park,
+    Koltun, arXiv:1801.09847), held to one thread, its generator seeded for each frame. The bytes may differ on another CPU."""
 
     distance_m: PositiveFloat = 0.02  # distance_threshold; Open3D's tutorial uses 0.01 m for a Kinect at 1.5 m
     points: Annotated[int, Range(3, 10)] = 3  # ransac_n
@@ -52,7 +52,8 @@ class Open3dRansac(PlanarRegions):
 
     def _planes(self, points: F64, rng: np.random.Generator) -> list[tuple[I32, F64]]:
         """Rows of the inliers and (n, d) of each plane."""
-        left, out, least = np.arange(len(points), dtype=np.int32), [], max(self.min_share * len(points), float(self.points), 3.0)
+        left, least = np.arange(len(points), dtype=np.int32), max(self.min_share * len(points), float(self.points), 3.0)
+        out: list[tuple[I32, F64]] = []
         seed = int(rng.integers(2**31))
         with RANDOM:
             open3d().utility.random.seed(seed)

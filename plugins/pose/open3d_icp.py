@@ -31,8 +31,8 @@ class IcpMethod(Enum):
 @register("pose", "open3d_icp")
 @dataclass(frozen=True)
 class Open3dIcp:
-    """`open3d.pipelines.registration.registration_icp` (point to plane: Chen and Medioni, 1992) or `registration_generalized_icp` (Segal, Haehnel, Thrun,
-    RSS 2009) of every `stride`-th pixel with the previous frame, from no motion, with Open3D's criteria.
+    """`open3d.pipelines.registration.registration_icp` (point to plane: Chen and Medioni, 1992) or `registration_generalized_icp` (Segal, Haehnel,
+    Thrun, RSS 2009) of every `stride`-th pixel with the previous frame, from no motion, with Open3D's criteria.
 
     Depth alone, without a map. Library: Open3D (MIT; Zhou, Park, Koltun, arXiv:1801.09847), held to one thread: its sums split over threads change
     from run to run. The bytes may differ on another CPU."""
