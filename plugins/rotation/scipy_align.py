@@ -65,7 +65,7 @@ def tracked_vectors(tracks: Tracks, keypoints: Keypoints, segments: Segments, pl
     if len(before):
         weight = sigma**-2.0 / (sigma**-2.0).sum()
         before, after = before - weight @ before, after - weight @ after
-    i, j = tracks.planes.T
+    j = tracks.planes[:, 1]
     tilt = tracks.plane_covariance[:, :2, :2] + planes.covariance[j][:, :2, :2]
     normals = tracks.coefficients[:, :3], planes.coefficients[j, :3], np.sqrt(0.5 * np.trace(tilt, axis1=1, axis2=2) + floor_rad**2)
     lines = _line_directions(tracks, segments)

@@ -66,7 +66,7 @@ class ScipyLeastSquares:
         J = found.jac[:-3] if count else np.zeros((0, 3))  # of the data, weighted by the loss
         information = J.T @ J
         values, vectors = np.linalg.eigh(information)
-        agreeing = [np.count_nonzero((np.abs(r.reshape(len(r), -1)) < GATE).all(axis=1)) for r in residuals(terms, camera, found.x)]
+        agreeing = [np.count_nonzero((np.abs(r) < GATE).all(axis=1)) for r in residuals(terms, camera, found.x)]
         covariance = np.linalg.inv(information + np.eye(3) / prior_m**2)
         return Solved(found.x, covariance, vectors[:, values < prior_m**-2.0].T, np.array(agreeing, np.int32))
 
@@ -119,12 +119,12 @@ def tracked_terms(tracks: Tracks, keypoints: Keypoints, segments: Segments, plan
 
 
 def residuals(terms: Terms, camera: Camera, s: F64) -> tuple[F64, F64, F64]:
-    """Residuals of points (n, 2), lines (m, 2) and planes (p,) in standard deviations, at the translation s (3,)."""
+    """Residuals of points (n, 2), lines (m, 2) and planes (p, 1) in standard deviations, at the translation s (3,)."""
     points = (_project(terms.points_m + s, camera) - terms.pixels) / terms.point_sigma_px[:, None]  # eq. 2
     ends = _project(terms.endpoints_m + s, camera)
     lines = (np.einsum("mec,mc->me", ends, terms.lines[:, :2]) + terms.lines[:, 2:]) / terms.line_sigma_px  # eq. 4
     planes = (terms.distances_m - terms.normals @ s - terms.observed_m) / terms.plane_sigma_m  # eq. 6: n·(p - s) + d = 0
-    return points, lines, planes
+    return points, lines, planes[:, None]
 
 
 def _project(points_m: F64, camera: Camera) -> F64:
