@@ -46,7 +46,11 @@ def read_depth(path: Path, depth_scale: float, depth_offset: float = 0.0) -> F32
     if image.dtype != np.uint16:
         cure = "give 16-bit depth images (value = metres × depth_scale); a preview picture does not hold metres"
         raise DataError(str(path), f"has {8 * image.itemsize} bits a pixel where depth has 16", cure)
-    depth = metres(image, depth_scale)
+    return corrected(metres(image, depth_scale), depth_offset)
+
+
+def corrected(depth: F32, depth_offset: float) -> F32:
+    """Depth z in metres as 1 / (1 / z + `depth_offset`), float32."""
     return depth / np.maximum(1.0 + np.float32(depth_offset) * depth, np.float32(0.1)) if depth_offset else depth
 
 

@@ -63,7 +63,7 @@ class ImageSequence:
             log.warning("%s; frame %d is skipped", error, self.first + position)
             return None
         self._check_sizes(position, color, depth)
-        color, depth = self._undistort(color, depth)
+        color, depth = undistorted(color, depth, self._maps)
         return Frame(self.first + position, int(self.stamps_ns[position]), color, depth, self.calibration.camera)
 
     def _read(self, path: Path, reader: Callable[[Path], Any]) -> Any:
@@ -84,20 +84,25 @@ class ImageSequence:
     @cached_property
     def _maps(self) -> tuple[F32, F32] | None:
         """Where each pixel of the undistorted image comes from: (h, w) x and y; None without distortion."""
-        if not self.calibration.distortion:
-            return None
-        camera = self.calibration.camera
-        lens = np.array(self.calibration.distortion)
-        x, y = cv2.initUndistortRectifyMap(camera.K, lens, np.eye(3), camera.K, (camera.width, camera.height), cv2.CV_32FC1)
-        return np.asarray(x), np.asarray(y)
+        return undistortion_maps(self.calibration)
 
-    def _undistort(self, color: U8, depth: F32) -> tuple[U8, F32]:
-        """Colour bilinear; depth nearest, since a mean across an edge is a point that does not exist. Outside the image colour repeats the
-        border, which makes no edge, and depth is 0."""
-        if self._maps is None:
-            return color, depth
-        color = np.asarray(cv2.remap(color, *self._maps, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE), dtype=np.uint8)
-        return color, np.asarray(cv2.remap(depth, *self._maps, cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT), dtype=np.float32)
+
+def undistortion_maps(calibration: Calibration) -> tuple[F32, F32] | None:
+    """Where each pixel of the undistorted image comes from: (h, w) x and y; None without distortion."""
+    if not calibration.distortion:
+        return None
+    camera, lens = calibration.camera, np.array(calibration.distortion)
+    x, y = cv2.initUndistortRectifyMap(camera.K, lens, np.eye(3), camera.K, (camera.width, camera.height), cv2.CV_32FC1)
+    return np.asarray(x), np.asarray(y)
+
+
+def undistorted(color: U8, depth: F32, maps: tuple[F32, F32] | None) -> tuple[U8, F32]:
+    """Colour bilinear; depth nearest, since a mean across an edge is a point that does not exist. Outside the image colour repeats the
+    border, which makes no edge, and depth is 0."""
+    if maps is None:
+        return color, depth
+    color = np.asarray(cv2.remap(color, *maps, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE), dtype=np.uint8)
+    return color, np.asarray(cv2.remap(depth, *maps, cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT), dtype=np.float32)
 
 
 @dataclass(frozen=True)

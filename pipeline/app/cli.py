@@ -172,15 +172,22 @@ def _run(words: list[str]) -> int:
             raise UsageError(word, "is not an option of run", f"known: {', '.join(RUN_FLAGS)}; everything else is key=value")
         if word.startswith("=") or word == "out=":
             raise UsageError(word, "lacks a " + ("key" if word.startswith("=") else "folder"), "write key=value, for example out=runs/mine")
+    if _is_sweep(words):
+        from trihedron.pipeline.core.config import check_added
+
+        check_added(words)
+        return _sweep(words, _recorded(words))
+    run_once(words, _BEGAN)
+    return 0
+
+
+def run_once(words: list[str], began: float) -> tuple[Path, dict[str, Any]]:
+    """Make one run of these words, which began at a time (perf_counter). Returns its folder and its metrics. Raises TrihedronError."""
     with memory.gc_paused():
         from trihedron.pipeline.core.config import check_added, composed, rewritten
 
         check_added(words)
-        recorded = _recorded(words)
-        if not _is_sweep(words):
-            config = composed(words, recorded)
-    if _is_sweep(words):
-        return _sweep(words, recorded)
+        config = composed(words, _recorded(words))
     from trihedron.pipeline.app.execute import execute
 
     try:
@@ -188,9 +195,10 @@ def _run(words: list[str]) -> int:
     except Exception as error:  # an interpolation of the user's that leads nowhere
         raise rewritten(error) from error
     config.out = literal_text(str(out))  # with the time of its beginning
-    execute(config, out, with_literal_paths(words), _BEGAN)
-    _point_latest(out)
-    return 0
+    metrics = execute(config, out, with_literal_paths(words), began)
+    if not config.replay:  # a part of a run, and no run to look at
+        _point_latest(out)
+    return out, metrics
 
 
 def _sweep(words: list[str], recorded: RecordedConfig | None) -> int:
