@@ -258,7 +258,7 @@ def combined(values: F64, information: F64, rows: I32) -> tuple[float, float]:
 
 
 CORRELATED = 4.0  # neighbouring keyframes that err alike
-SYSTEMATIC_M = 0.003  # what no averaging removes
+SYSTEMATIC_M = 0.005  # what no averaging removes
 
 
 def storeys_of(evidence: Evidence) -> list[Storey]:

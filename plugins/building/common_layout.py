@@ -15,7 +15,24 @@ import numpy as np
 from numpy.typing import NDArray
 
 from trihedron.pipeline.core.types import ELEMENTS, F64, I32, OPENING_KINDS, SUPPORTS, Bool, Building, Map
-from trihedron.plugins.building.common import CELL_M, LEVEL_M, LEVELS, Evidence, Face, FreeSpace, Gathered, Storey, combined, tall_m
+from trihedron.plugins.building.common import (
+    CELL_M,
+    LEVEL_M,
+    LEVELS,
+    Evidence,
+    Face,
+    FreeSpace,
+    Gathered,
+    LayoutFold,
+    Storey,
+    combined,
+    evidence_of,
+    faces_of,
+    free_space,
+    nothing,
+    storeys_of,
+    tall_m,
+)  # fmt: skip
 from trihedron.plugins.building.common_kernels import U32
 from trihedron.plugins.shared.voxel_hash_kernels import I64
 
@@ -234,7 +251,24 @@ def _fit(edge: Edge, evidence: Evidence, storey: Storey) -> None:
         offset, sigma = combined(evidence.points[mask, :2] @ edge.normal, evidence.information[mask], rows)
         edge.offset_m, edge.sigma_m, edge.views = offset, sigma, np.unique(rows)
         t = evidence.points[mask, :2] @ edge.along
+        if np.abs(edge.normal).max() < AXIS:
+            _turn(edge, evidence.points[mask, :2], evidence.information[mask])
         edge.angle_sigma = float(np.hypot(sigma / max(float(t.std()) * 2.0, 0.1), np.radians(0.03)))
+
+
+AXIS = 1.0 - 1e-9  # greatest component of a normal along an axis of the building
+
+
+def _turn(edge: Edge, points: F64, information: F64) -> None:
+    """Turn an edge that is along no axis of the building to its own points (n, 2)."""
+    t, off = points @ edge.along, points @ edge.normal - edge.offset_m
+    middle = float(np.average(t, weights=information))
+    spread = float(information @ (t - middle) ** 2)
+    slope = float(information @ ((t - middle) * off)) / spread if spread > 0.0 else 0.0
+    centre = middle * edge.along + edge.offset_m * edge.normal
+    normal = edge.normal - slope * edge.along
+    edge.normal = normal / np.linalg.norm(normal)
+    edge.offset_m = float(centre @ edge.normal)
 
 
 def _cornered(loop: list[Edge]) -> None:
@@ -629,6 +663,37 @@ def _furniture(map: Map | None, used: set[int], plans: list[StoreyPlan], evidenc
         if row not in used and not any(abs(height - level) < 0.1 for level in levels):
             found.append(int(row))
     return np.array(found, np.int32)
+
+
+@dataclass(frozen=True)
+class Layout(LayoutFold):
+    """Makes the plan of each storey: faces, free space, cells, and of those that are inside, rooms, walls and openings."""
+
+    def finish(self, state: Gathered, map: Map | None) -> Building:
+        """Make the plan at the final poses."""
+        evidence = evidence_of(state, map)
+        if evidence is None:
+            return nothing(state, "no plane was seen")
+        storeys, plans = storeys_of(evidence), []
+        for number, storey in enumerate(storeys):
+            here = in_storey(evidence, storeys, number)
+            faces, space = faces_of(here, storey, self._directions(here, storey), self.least_wall_m), free_space(here, storey)
+            cells = cells_of(faces, space)
+            rooms = rooms_of(cells, self._inside(cells), faces, here, space, storey, self.least_room_m2)
+            walls = walls_of(rooms, faces)
+            plans.append(StoreyPlan(storey, rooms, walls, openings_of(walls, rooms, faces, here, space, storey), faces))
+        return assembled(state, evidence, plans, map)
+
+    def _directions(self, evidence: Evidence, storey: Storey) -> F64:
+        """Return the unit normals (d, 2) that faces may have: the building's two axes."""
+        return AXES
+
+    def _inside(self, cells: Cells) -> Bool:
+        """Return the cells (n,) that are inside."""
+        return np.asarray(cells.free >= FREE_SHARE, np.bool_)
+
+
+AXES = np.array([[1.0, 0.0], [0.0, 1.0], [-1.0, 0.0], [0.0, -1.0]])
 
 
 def in_storey(evidence: Evidence, storeys: list[Storey], number: int) -> Evidence:
