@@ -23,11 +23,12 @@ from trihedron.pipeline.core.errors import ConfigError, DataError, RecordingErro
 from trihedron.pipeline.core.graph import Graph
 from trihedron.pipeline.core.overrides import literal_text, path_of, quoted
 from trihedron.pipeline.core.slots import output_of
-from trihedron.pipeline.core.types import Surface, Trajectory
+from trihedron.pipeline.core.types import Building, Surface, Trajectory
 from trihedron.pipeline.record.reader import Recording
 from trihedron.pipeline.record.trajectories import TRUTH, attached_truth, format_trajectory
 from trihedron.pipeline.record.writer import RecordingWriter
 from trihedron.pipeline.run import results
+from trihedron.pipeline.run.building_files import write_building
 from trihedron.pipeline.run.interrupts import Interrupts
 from trihedron.pipeline.run.live import Pace, shows_once
 from trihedron.pipeline.run.map_file import load_map, save_map
@@ -83,7 +84,7 @@ def execute(config: DictConfig, out: Path, overrides: list[str], began: float) -
                     failure = closed(writer)
                     metrics, timing = write_files(runner, truth, out, started, began)
                     warnings.summarise()
-        _report(out, metrics, timing, [results.write_surface(out, value) for value in runner.result.folds.values() if isinstance(value, Surface)])
+        _report(out, metrics, timing, _models(out, runner))
     if failure is not None:
         raise failure
     return metrics
@@ -232,6 +233,13 @@ def _attachments(graph: Graph, replay: Replay | None) -> dict[str, str]:
         return replay.recording.attachments
     truth: Trajectory | None = graph.stages["dataset"].plugin.truth()
     return {TRUTH: format_trajectory(truth)} if truth is not None else {}
+
+
+def _models(out: Path, runner: Runner) -> list[str]:
+    """Write the surface and the building of a run, and return lines that describe them."""
+    folds = list(runner.result.folds.values())
+    lines = [results.write_surface(out, value) for value in folds if isinstance(value, Surface)]
+    return lines + [line for value in folds if isinstance(value, Building) for line in write_building(out, value)]
 
 
 def _report(out: Path, metrics: dict[str, Any], timing: dict[str, Any], surfaces: list[str]) -> None:
