@@ -12,10 +12,10 @@ from numpy.typing import NDArray
 
 from trihedron.pipeline.core.options import NonNegativeFloat, PositiveFloat, PositiveShare, Range
 from trihedron.pipeline.core.types import F32, F64, I32, LOST, PLANE_KINDS, U8, Bool, DepthNoise, Frame, Map, Planes, Pose, Rotation, Surface
+from trihedron.plugins.shared.keyframe_views import KeyframeView, Known, readings, view_of
 from trihedron.plugins.shared.tsdf_volume import CELLS, Volume
 from trihedron.plugins.surface.common_kernels import neighbours, off_planes, paint, signs_kernel, triangles_kernel, untangled, vertices_kernel
 from trihedron.plugins.surface.common_meshes import compacted, plane_axes, triangle_areas, vertex_normals, with_single_fans, without_crumbs
-from trihedron.plugins.surface.common_views import KeyframeView, Known, readings, view_of
 
 NEWS_COLUMNS = 80  # of readings that are asked for news
 AHEAD_M = 2.0  # a pose has moved by as much as the camera and a point this far before it have

@@ -10,9 +10,9 @@ import numpy as np
 from trihedron.pipeline.core.options import AcuteDeg, PositiveInt, Range
 from trihedron.pipeline.core.registry import register
 from trihedron.pipeline.core.types import Map, Surface
+from trihedron.plugins.shared.keyframe_views import KeyframeView
 from trihedron.plugins.surface.common import Gathered, ViewFold, coloured
 from trihedron.plugins.surface.common_superpixels import discs, fused, moved, superpixels
-from trihedron.plugins.surface.common_views import KeyframeView
 
 
 @register("surface", "superpixels")

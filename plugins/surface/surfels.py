@@ -10,10 +10,10 @@ import numpy as np
 from trihedron.pipeline.core.options import AcuteDeg, PositiveFloat, PositiveInt, Range, check_increasing
 from trihedron.pipeline.core.registry import register
 from trihedron.pipeline.core.types import Map, Surface
+from trihedron.plugins.shared.keyframe_views import KeyframeView
 from trihedron.plugins.surface.common import Gathered, ViewFold, pictured
 from trihedron.plugins.surface.common_planar import map_planes, numbered
 from trihedron.plugins.surface.common_superpixels import discs, fused, moved, observed_planes, superpixels
-from trihedron.plugins.surface.common_views import KeyframeView
 
 
 @register("surface", "surfels")
