@@ -79,8 +79,8 @@ def in_world(pose: Pose, previous: Pose, solution: PoseSolution, problem: MapAli
         noise_scale += (min(scale, SCALE_OUTLIER * noise_scale) - noise_scale) / SCALE_FRAMES
     of_map = of_previous(pose, previous)
     if len(keyframes):
-        columns = (problem.map.keyframes.rows(name, keyframes) for name in ("T_world_camera", "world_covariance"))
-        of_map = covariance_of_keyframes(pose.T_world_camera, *columns, information)
+        poses, covariances = (problem.map.keyframes.rows(name, keyframes) for name in ("T_world_camera", "world_covariance"))
+        of_map = covariance_of_keyframes(pose.T_world_camera, poses, covariances, information)
     return replace(pose, covariance=noise_scale * pose.covariance + of_map, map_covariance=of_map, noise_scale=noise_scale)
 
 
