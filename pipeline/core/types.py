@@ -304,6 +304,11 @@ class DepthNoise:
     c_per_m: float = 0.00273
     floor_m: float = 0.001
 
+    @property
+    def coefficients(self) -> tuple[float, float, float, float]:
+        """Return (a, b, c, floor) as plain numbers, for kernels."""
+        return float(self.a_m), float(self.b), float(self.c_per_m), float(self.floor_m)
+
     def sigma_m(self, depth_m: Any) -> Any:
         """Standard deviation in metres for depth(s) in metres; same shape."""
         return np.maximum(self.floor_m, self.a_m + self.b * depth_m + self.c_per_m * depth_m * depth_m)

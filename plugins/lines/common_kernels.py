@@ -9,7 +9,7 @@ import numpy as np
 
 from trihedron.pipeline.core.kernel import kernel
 from trihedron.pipeline.core.types import F32, F64, U8
-from trihedron.plugins.shared.linalg_kernels import descending, median
+from trihedron.plugins.shared.linalg_kernels import descending
 
 # Image line segments: merging of collinear fragments and sub-pixel placement on the grey-level edge.
 
@@ -180,7 +180,7 @@ def _steepest(levels: F64, sign: int, slopes: F64, top: F64, row: F64) -> None:
 @kernel
 def _robust_line(t: F64, o: F64, strength: F64) -> tuple[float, float]:
     """Offset a and slope b of o ≈ a + b t, by least squares reweighted with w = strength / (1 + (r / ½ px)²), starting from the median offset."""
-    a, b = median(o.copy()), 0.0
+    a, b = np.median(o), 0.0
     for _ in range(5):
         s, st, so, stt, sto = 1e-12, 0.0, 0.0, 0.0, 0.0
         for k in range(len(t)):

@@ -10,7 +10,7 @@ import numpy as np
 from trihedron.pipeline.core.kernel import kernel
 from trihedron.pipeline.core.types import F32, F64, I32, Bool
 from trihedron.plugins.shared.lie_kernels import left_multiply_exp
-from trihedron.plugins.shared.linalg_kernels import few_descending, inverse_positive, polar_rotation, solve_positive
+from trihedron.plugins.shared.linalg_kernels import descending, inverse_positive, polar_rotation, solve_positive
 from trihedron.plugins.shared.manhattan_frames_kernels import assign_axes, measured_directions
 
 # From a frame's features to directions on the sphere, and from directions on three axes to a rotation with its covariance.
@@ -465,7 +465,7 @@ def line_peaks(directions: F64, length: F64, axes: F64, lines: F64, number: int,
     An axis is measured against the lines that no heavier axis has: a few long ones along a corridor must not outweigh what is across it."""
     peaks, left = np.zeros(len(lines), np.bool_), length.copy()
     any_peak, on_peaks, widest_peak = False, 0.0, 0.0
-    for k in few_descending(lines[:, 1]):
+    for k in descending(lines[:, 1]):
         if lines[k, 0] < number or not lines[k, 3] < widest:
             continue
         least = by_chance(lines[k, 3], cone, 2.0 / (np.pi - 2.0 * cone), left) if any_peak else 0.0

@@ -19,7 +19,6 @@ from trihedron.plugins.planes.common_kernels import (
     plane_report,
     solve_symmetric,
 )
-from trihedron.plugins.shared.depth_image import noise_coefficients
 from trihedron.plugins.shared.depth_image_kernels import Grid, cell_inverse_depths, cell_rays
 
 EDGE, EDGE_M = 0.04, 0.02  # a step above EDGE z + EDGE_M within a cell's pixels: no depth there
@@ -48,7 +47,7 @@ class PlanarRegions:
     def _grid(self, frame: Frame, normals: Normals) -> Grid:
         """The frame's depths on the grid of the normals."""
         camera = frame.camera
-        rho, sigma, count = cell_inverse_depths(frame.depth_m, normals.stride, EDGE, EDGE_M, noise_coefficients(camera.depth_noise))
+        rho, sigma, count = cell_inverse_depths(frame.depth_m, normals.stride, EDGE, EDGE_M, camera.depth_noise.coefficients)
         intrinsics = (float(camera.fx), float(camera.fy), float(camera.cx), float(camera.cy))
         rays_x, rays_y = cell_rays(rho.shape[0], rho.shape[1], normals.stride, intrinsics)
         return Grid(rho, sigma, count, rays_x, rays_y, normals.normals)

@@ -8,7 +8,7 @@ import numpy as np
 from trihedron.pipeline.core.kernel import kernel
 from trihedron.pipeline.core.types import F32, F64, I32, U8, Bool
 from trihedron.plugins.shared.depth_image_kernels import Grid, cells_by_component
-from trihedron.plugins.shared.linalg_kernels import descending, inverse_positive, median, solve_positive, tangent_columns
+from trihedron.plugins.shared.linalg_kernels import descending, inverse_positive, solve_positive, tangent_columns
 
 # Robust planes through the cells of a grid: dominant normal, trimmed weighted least squares in inverse depth, and a test for curvature.
 
@@ -149,7 +149,7 @@ def start_plane(normal: F64, columns: F64, cos_cone: float) -> F64:
             m += 1
     if m == 0:
         return np.zeros(3)
-    d = median(distance[:m])
+    d = np.median(distance[:m])
     return -normal / d if d > 1e-6 else np.zeros(3)
 
 

@@ -10,7 +10,7 @@ import numpy as np
 from trihedron.pipeline.core.geometry import transform_planes
 from trihedron.pipeline.core.types import F64, I32
 from trihedron.plugins.shared.keyframe_views import KeyframeView
-from trihedron.plugins.shared.voxel_hash import empty_table
+from trihedron.plugins.shared.voxel_hash_kernels import empty_table
 from trihedron.plugins.surface.common_superpixels_kernels import COLUMNS, assigned_kernel, fuse, surfels_kernel
 
 SAMPLE_STEP = 4  # px between the points that a region is compared by
