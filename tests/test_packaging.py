@@ -17,7 +17,7 @@ from setuptools.config.pyprojecttoml import load_file
 from trihedron.tools.benchmark import COMPARISONS
 
 ROOT = Path(__file__).resolve().parents[1]
-FOLDERS = ("pipeline", "plugins", "datasets", "tools", "conf")
+FOLDERS = ("api", "pipeline", "plugins", "datasets", "tools", "conf")
 PROJECT = load_file(ROOT / "pyproject.toml")
 
 

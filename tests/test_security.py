@@ -87,6 +87,9 @@ def test_associations_name_no_file_elsewhere(tmp_path, line):
 
 
 def test_a_dotted_name_within_the_folder_is_one(tmp_path):
+    for name in ("rgb/1.png", "depth/..1.png"):
+        (tmp_path / name).parent.mkdir()
+        (tmp_path / name).touch()
     (tmp_path / "rgb.txt").write_text("1.0 ./rgb/../rgb/1.png\n")
     (tmp_path / "depth.txt").write_text("1.0 depth/..1.png\n")
     (tmp_path / "camera.yaml").write_text("{width: 32, height: 24, fx: 30, fy: 30, cx: 15, cy: 11, depth_scale: 1000}")

@@ -37,6 +37,7 @@ from trihedron.tools.benchmarks.paired import compared, read_figures, times
 PROGRAM = (sys.executable, "-c", "import sys; from trihedron.pipeline.app.cli import main; sys.exit(main(sys.argv[1:]))")
 REFERENCE_FRAMES = 40  # at most
 COMPARISONS = {  # other words after `benchmark`, and whose `main` they stand for
+    "building": "trihedron.tools.benchmarks.building_benchmark",
     "long": "trihedron.tools.benchmarks.long_run",
     "manhattan": "trihedron.tools.benchmarks.manhattan_family",
     "map": "trihedron.tools.benchmarks.map_benchmark",

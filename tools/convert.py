@@ -62,17 +62,23 @@ def _upgraded(source: Path, destination: Path) -> bool:
 
 
 def layout_of(source: Path) -> str:
-    """The data set plugin whose layout a folder has, `mcap` for a file. Raises DataError for neither."""
+    """The data set plugin whose layout a folder has, `mcap` for a recording or bag. Raises DataError for neither."""
+    from trihedron.datasets.readers.bag_file import BAG, METADATA_FILE
+    from trihedron.datasets.readers.sequence import refuse_video
+
     if source.is_file() and source.suffix == SUFFIX:
         return "mcap"
-    if not source.is_dir():
+    refuse_video(source)
+    if not source.is_dir() and not (source.suffix == BAG and source.is_file()):
         cause = "is not a folder or a recording" if source.exists() else "does not exist"
         raise DataError(str(source), cause, f"give the folder of a data set or a {SUFFIX} file")
+    if source.suffix == BAG or (source / METADATA_FILE).is_file():
+        return "mcap"
     if (source / "rgb.txt").is_file() and (source / "depth.txt").is_file():
         return "tum"
     if (source / "associations.txt").is_file() or any(source.glob("*.freiburg")) or any(source.glob("scene_*.depth")):
         return "icl_nuim"
-    if any(source.glob("frame-*.color.png")):
+    if any(source.glob("frame-*.color.*")):
         return "seven_scenes"
     if (source / "traj.txt").is_file() and (source / "results").is_dir():
         return "replica"

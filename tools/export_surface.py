@@ -6,7 +6,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -15,8 +15,11 @@ from trihedron.pipeline.core.types import F64, PLANE_KINDS, Surface
 from trihedron.pipeline.record.reader import Recording
 from trihedron.pipeline.run.ply import triangle_planes, write_ply
 from trihedron.tools.export import Format
-from trihedron.tools.gltf import glb
 
+if TYPE_CHECKING:
+    import trimesh
+
+LOOK: dict[str, Any] = {"metallicFactor": 0.0, "roughnessFactor": 1.0, "doubleSided": True}
 CAMERA_UP, CAMERA_AHEAD = np.array([0.0, -1.0, 0.0]), np.array([0.0, 0.0, 1.0])  # of the first frame, which is the world
 
 
@@ -57,44 +60,66 @@ def write_mesh(recording: Recording, path: Path) -> str:
 
 
 def write_obj(recording: Recording, path: Path) -> str:
-    """OBJ: vertices with RGB (0..1), one group for each plane, one for the rest."""
+    """OBJ: vertices with RGB (0..1), one object for each plane, one for the rest."""
     surface = surface_of(recording)
-    lines = ["# metres; z up; x right and y ahead of the first camera"]
-    vertices = surface.vertices_m @ upright(surface.up).T
-    lines += [f"v {x:.5f} {y:.5f} {z:.5f} {r:.3f} {g:.3f} {b:.3f}" for (x, y, z), (r, g, b) in zip(vertices, surface.colors / 255.0)]
-    for plane in range(-1, len(surface.plane_ids)):
-        rows = surface.triangles[surface.instances == plane] + 1
-        if len(rows):
-            lines.append(f"g {_name(surface, plane)}")
-            lines += [f"f {a} {b} {c}" for a, b, c in rows]
-    path.write_text("\n".join(lines) + "\n")
+    scene = _scene(surface, upright(surface.up), textured=False)
+    header = "metres; z up; x right and y ahead of the first camera"
+    path.write_text(scene.export(file_type="obj", header=header, digits=5, include_normals=False) if scene.geometry else f"# {header}\n")
     return _summary(surface)
 
 
 def write_gltf(recording: Recording, path: Path) -> str:
     """Binary glTF 2.0: a node for each plane, with its facts as extras and its picture from one atlas, and one with RGB vertices for the rest."""
+    from trimesh.exchange.gltf import export_glb
+
     surface = surface_of(recording)
-    R = upright(surface.up, "y")
-    vertices = (surface.vertices_m @ R.T).astype(np.float32)
-    h, w = surface.atlas.shape[:2]
-    parts = []
+    scene = _scene(surface, upright(surface.up, "y"), textured=True)
+    path.write_bytes(export_glb(scene, tree_postprocessor=_finish_gltf))
+    return _summary(surface)
+
+
+def _scene(surface: Surface, R: F64, textured: bool) -> trimesh.Scene:
+    """A mesh for each plane and one for the rest, in the file's axes."""
+    import trimesh
+    from PIL import Image
+
+    vertices, scene, texture = surface.vertices_m @ R.T, trimesh.Scene(), {}
+    size = np.array(surface.atlas.shape[1::-1])
+    if textured and surface.atlas.size:
+        texture["baseColorTexture"] = Image.fromarray(surface.atlas)
+    material = trimesh.visual.material.PBRMaterial(name="planes", **LOOK, **texture)
     for plane in range(-1, len(surface.plane_ids)):
         mine = surface.instances == plane
-        used, corner = np.unique(surface.triangles[mine], return_inverse=True)
         if not mine.any():
             continue
-        part: dict[str, Any] = {"name": _name(surface, plane), "positions": vertices[used], "indices": corner.reshape(-1).astype(np.uint32)}
-        if plane >= 0:
-            texels = np.empty((len(used), 2), np.float32)
-            texels[corner.reshape(-1)] = surface.texels[mine].reshape(-1, 2)
-            part["texels"] = ((texels + 0.5) / np.array([w, h])).astype(np.float32)
-            part["normals"] = np.tile(R @ surface.coefficients[plane, :3], (len(used), 1)).astype(np.float32)
-            part["extras"] = _facts(surface, plane, R)
-        else:
-            part["colors"] = surface.colors[used]
-        parts.append(part)
-    path.write_bytes(glb(parts, surface.atlas))
-    return _summary(surface)
+        used, corners = np.unique(surface.triangles[mine], return_inverse=True)
+        options: dict[str, Any] = {"vertex_colors": surface.colors[used]}
+        if textured and plane >= 0:
+            texels = np.empty((len(used), 2))
+            texels[corners.reshape(-1)] = surface.texels[mine].reshape(-1, 2)
+            u, v = ((texels + 0.5) / size).T
+            visual = trimesh.visual.TextureVisuals(uv=np.stack([u, 1.0 - v], axis=1), material=material)  # trimesh counts rows from below
+            normals = np.tile(R @ surface.coefficients[plane, :3], (len(used), 1))
+            options = {"visual": visual, "vertex_normals": normals, "metadata": _facts(surface, plane, R)}
+        mesh = trimesh.Trimesh(vertices[used], corners.reshape(-1, 3), process=False, **options)
+        scene.add_geometry(mesh, node_name=_name(surface, plane), geom_name=_name(surface, plane))
+    return scene
+
+
+def _finish_gltf(tree: dict[str, Any]) -> None:
+    """Give nodes the facts of their planes, coloured vertices a material, and the texture no repetition."""
+    for node in tree["nodes"]:
+        facts = tree["meshes"][node["mesh"]].pop("extras", None) if "mesh" in node else None
+        if facts:
+            node["extras"] = facts
+    painted = {"name": "rest", "pbrMetallicRoughness": {key: value for key, value in LOOK.items() if key != "doubleSided"}, "doubleSided": True}
+    tree.setdefault("materials", []).append(painted)
+    for mesh in tree.get("meshes", []):
+        for primitive in mesh["primitives"]:
+            primitive.setdefault("material", len(tree["materials"]) - 1)
+    for texture in tree.get("textures", []):
+        texture["sampler"] = 0
+        tree["samplers"] = [{"magFilter": 9729, "minFilter": 9729, "wrapS": 33071, "wrapT": 33071}]  # linear, clamped
 
 
 def write_planes(recording: Recording, path: Path) -> str:

@@ -58,15 +58,16 @@ def main(argv: list[str]) -> int:
     return 0
 
 
-def recover(path: Path, out: Path) -> Rescued:
-    """Write the whole records of the file `path` to `out`, which may be the same. Raises as `main`."""
+def recover(path: Path, out: Path, being_written: bool = False) -> Rescued:
+    """Write the whole records of the file `path` to `out`, which may be the same; of a file that is being written those so far, if that is allowed.
+    Raises as `main`."""
     partial = out.with_name(out.name + ".part")
     try:
         source = open(path, "rb")
     except OSError as error:
         raise RecordingError(str(path), f"cannot be read: {error.strerror}", "give the path of an MCAP file") from error
     with source:
-        if source.read(len(MCAP0_MAGIC)) != MCAP0_MAGIC or is_being_written(source.fileno()):
+        if source.read(len(MCAP0_MAGIC)) != MCAP0_MAGIC or (not being_written and is_being_written(source.fileno())):
             raise damaged(path)
         source.seek(0)
         try:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import os
 from dataclasses import dataclass
 from pathlib import Path
@@ -9,10 +10,12 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from trihedron.pipeline.core.errors import DataError
+from trihedron.pipeline.core.errors import DataError, printable
+from trihedron.pipeline.core.files import SHOWN
 from trihedron.pipeline.core.geometry import nearest_pairs
 from trihedron.pipeline.record.trajectories import parse_stamp_ns, table_lines
 
+log = logging.getLogger("trihedron")
 Stamps = NDArray[np.int64]
 
 
@@ -37,7 +40,9 @@ def read_file_list(path: Path) -> FileList:
         except ValueError as error:
             raise DataError(place, str(error), "each line holds 'stamp file'; correct or remove this one") from error
         if stamps and stamp_ns <= stamps[-1]:
-            raise DataError(place, f"the time stamp {words[0]} does not come after the one before", "sort the list and remove duplicates")
+            raise DataError(
+                place, f"the time stamp {printable(words[0], SHOWN)} does not come after the one before", "sort the list and remove duplicates"
+            )
         stamps.append(stamp_ns)
         files.append(file_inside(path.parent, words[1], place))
     if not stamps:
@@ -45,11 +50,24 @@ def read_file_list(path: Path) -> FileList:
     return FileList(np.array(stamps, dtype=np.int64), tuple(files))
 
 
+def without_missing(listed: FileList, path: Path) -> FileList:
+    """The images of a list that are there; one warning counts those that are not. Raises DataError when none is."""
+    there = np.array([os.path.isfile(file) for file in listed.files])
+    if there.all():
+        return listed
+    if not there.any():
+        raise DataError(str(path), f"names {len(there)} images, of which none is there", "unpack the images beside the list")
+    missing = np.flatnonzero(~there)
+    first = printable(listed.files[missing[0]].name, SHOWN)
+    log.warning("%s: %d of the %d images it names are missing, the first is %s; they are skipped", path, len(missing), len(there), first)
+    return FileList(listed.stamps_ns[there], tuple(file for file, found in zip(listed.files, there) if found))
+
+
 def file_inside(folder: Path, name: str, place: str) -> Path:
     """The file of a list that lies with its images. Raises DataError, naming `place`, for one that is somewhere else: a list comes with data of
     others, and says nothing about the rest of the disk. (What a link in the folder points to is its owner's affair.)"""
     if os.path.isabs(name) or os.path.normpath(name).split(os.sep)[0] == os.pardir:
-        raise DataError(place, f"the file '{name}' is outside the folder of the list", "put the images below that folder")
+        raise DataError(place, f"the file '{printable(name, SHOWN)}' is outside the folder of the list", "put the images below that folder")
     return folder / name
 
 
@@ -67,7 +85,8 @@ def listed_pairs(folder: Path, max_difference_ms: float, depth_delay_ms: float) 
     for name, kind in (("rgb.txt", "colour"), ("depth.txt", "depth")):
         if not (folder / name).is_file():
             raise DataError(str(folder / name), "is missing", f"it lists the {kind} images; without lists use dataset=folder")
-    color, depth = read_file_list(folder / "rgb.txt"), read_file_list(folder / "depth.txt")
+    lists = [read_file_list(folder / name) for name in ("rgb.txt", "depth.txt")]
+    color, depth = (without_missing(listed, folder / name) for listed, name in zip(lists, ("rgb.txt", "depth.txt")))
     pairs = associate(color.stamps_ns, depth.stamps_ns + round(depth_delay_ms * 1e6), round(max_difference_ms * 1e6))
     if not len(pairs):
         cause = f"no colour and depth image are within {max_difference_ms:g} ms of each other"

@@ -8,14 +8,15 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-import yaml
-
-from trihedron.pipeline.core.errors import DataError, did_you_mean
+from trihedron.datasets.readers.images import MAX_PIXELS
+from trihedron.pipeline.core.errors import DataError, did_you_mean, printable
+from trihedron.pipeline.core.files import MAX_YAML_BYTES, SHOWN, YamlError, parse_yaml, read_text
 from trihedron.pipeline.core.types import EXACT_DEPTH, Camera, DepthNoise
 
 CAMERA_FILE = "camera.yaml"
 REQUIRED = ("width", "height", "fx", "fy", "cx", "cy", "depth_scale")
 OPTIONAL = ("distortion", "fps", "depth_noise", "depth_offset")
+BOUNDED, SMALLEST, LARGEST = ("fx", "fy", "depth_scale", "fps"), 1e-6, 1e9  # outside, single precision overflows
 COEFFICIENTS = ("k1", "k2", "p1", "p2", "k3")
 NOISES = {"kinect": DepthNoise(), "exact": EXACT_DEPTH}
 SHORT = "give dataset.camera=tum_fr1, tum_fr2, tum_fr3, icl_nuim or a camera.yaml"
@@ -78,18 +79,18 @@ def read_camera_file(path: Path) -> Calibration:
 
     Raises DataError naming file and key."""
     try:
-        content = yaml.safe_load(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise DataError(str(path), f"cannot be read ({error.strerror})", "check the path and its permissions") from error
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
-        mark = getattr(error, "problem_mark", None)
-        place = f"{path}:{mark.line + 1}" if mark else str(path)
-        raise DataError(place, "is not YAML", "write one 'key: value' a line") from error
+        content = parse_yaml(read_text(path, MAX_YAML_BYTES))
+    except YamlError as error:
+        raise DataError(
+            f"{path}:{error.line}" if error.line else str(path),
+            "is not YAML" if error.__cause__ else "holds aliases or deep nesting",
+            "write one 'key: value' a line",
+        ) from error
     if not isinstance(content, dict):
         raise DataError(str(path), "holds no keys", f"give {' '.join(REQUIRED)}, one 'key: value' a line")
     unknown = next((key for key in content if key not in REQUIRED + OPTIONAL), None)
     if unknown is not None:
-        raise DataError(str(path), f"unknown key '{unknown}'", did_you_mean(str(unknown), REQUIRED + OPTIONAL))
+        raise DataError(str(path), f"unknown key '{_shown(unknown)}'", did_you_mean(_shown(unknown), REQUIRED + OPTIONAL))
     missing = next((key for key in REQUIRED if key not in content), None)
     if missing is not None:
         raise DataError(str(path), f"the key '{missing}' is missing", f"give {' '.join(REQUIRED)}")
@@ -102,10 +103,12 @@ def _calibration(path: Path, content: dict[str, Any]) -> Calibration:
         raise DataError(str(path), "fy is negative (y up)", "give it positive; dataset=icl_nuim reflects the published poses itself")
     for key in ("width", "height", "fx", "fy", "depth_scale", "fps"):
         if values.get(key, 1.0) <= 0.0 or (key in ("width", "height") and values[key] % 1.0):
-            raise DataError(str(path), f"{key} is {content[key]}", f"give a positive {'whole ' if key in ('width', 'height') else ''}number")
+            raise DataError(str(path), f"{key} is {_shown(content[key])}", f"give a positive {'whole ' if key in ('width', 'height') else ''}number")
+    if values["width"] * values["height"] > MAX_PIXELS or not all(SMALLEST < values.get(key, 1.0) < LARGEST for key in BOUNDED):
+        raise DataError(str(path), "describes no camera", f"give an image of at most {MAX_PIXELS} pixels; {', '.join(BOUNDED)} above {SMALLEST:g}")
     noise = content.get("depth_noise", "kinect")
     if not isinstance(noise, str) or noise not in NOISES:
-        raise DataError(str(path), f"depth_noise is '{noise}'", did_you_mean(str(noise), NOISES))
+        raise DataError(str(path), f"depth_noise is '{_shown(noise)}'", did_you_mean(_shown(noise), NOISES))
     fx, fy, cx, cy = (values[key] for key in ("fx", "fy", "cx", "cy"))
     camera = Camera(int(values["width"]), int(values["height"]), fx, fy, cx, cy, values.get("fps", Camera.fps), NOISES[noise])
     return Calibration(camera, values["depth_scale"], _distortion(path, content.get("distortion")), values.get("depth_offset", 0.0))
@@ -118,7 +121,7 @@ def _distortion(path: Path, given: Any) -> tuple[float, ...]:
     if isinstance(given, dict):
         unknown = next((key for key in given if key not in COEFFICIENTS), None)
         if unknown is not None:
-            raise DataError(str(path), f"unknown key 'distortion.{unknown}'", did_you_mean(str(unknown), COEFFICIENTS))
+            raise DataError(str(path), f"unknown key 'distortion.{_shown(unknown)}'", did_you_mean(_shown(unknown), COEFFICIENTS))
         given = [given.get(key, 0.0) for key in COEFFICIENTS]
     if isinstance(given, str):
         given = given.replace(",", " ").split()
@@ -128,13 +131,21 @@ def _distortion(path: Path, given: Any) -> tuple[float, ...]:
     return values if any(values) else ()
 
 
+def _shown(value: Any) -> str:
+    """A value of the file in a message: one line, bounded."""
+    try:
+        return printable(str(value), SHOWN)
+    except ValueError:  # a whole number of thousands of digits
+        return "too large"
+
+
 def _number(path: Path, key: str, value: Any) -> float:
     try:
         number = math.nan if isinstance(value, bool) else float(value)  # text too: YAML takes 5e2 for text
     except (TypeError, ValueError, OverflowError):
         number = math.nan
     if not math.isfinite(number):
-        raise DataError(str(path), f"{key} is '{value}'", "give a finite number")
+        raise DataError(str(path), f"{key} is '{_shown(value)}'", "give a finite number")
     return number
 
 

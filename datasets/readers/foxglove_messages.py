@@ -21,15 +21,15 @@ from trihedron.datasets.readers.robot_values import Intrinsics, Link, Picture, U
 
 
 def _image(m: Any) -> Picture:
-    return Picture(_stamp(m), m.frame_id, m.encoding, _bytes(m.data), False, int(m.width), int(m.height), int(m.step))
+    return Picture(_stamp(m), _text(m.frame_id), _text(m.encoding), _bytes(m.data), False, int(m.width), int(m.height), int(m.step))
 
 
 def _compressed_image(m: Any) -> Picture:
-    return Picture(_stamp(m), m.frame_id, m.format, _bytes(m.data), True)
+    return Picture(_stamp(m), _text(m.frame_id), _text(m.format), _bytes(m.data), True)
 
 
 def _calibration(m: Any) -> Intrinsics:
-    return intrinsics(m.frame_id, int(m.width), int(m.height), m.distortion_model, m.D, m.K, m.P)
+    return intrinsics(_text(m.frame_id), int(m.width), int(m.height), _text(m.distortion_model), m.D, m.K, m.P)
 
 
 def _transform(m: Any) -> list[Link]:
@@ -45,7 +45,7 @@ def _pose(m: Any) -> list[Link]:
 
 
 def _link(m: Any, parent: str, child: str, t: Any, q: Any) -> Link:
-    return link(_stamp(m), parent, child, [t.x, t.y, t.z], [q.x, q.y, q.z, q.w])
+    return link(_stamp(m), _text(parent), _text(child), [t.x, t.y, t.z], [q.x, q.y, q.z, q.w])
 
 
 def _stamp(m: Any) -> int:
@@ -54,6 +54,13 @@ def _stamp(m: Any) -> int:
     if abs(stamp) >= 2**62:
         raise UnreadableMessage("has a stamp that is too large")
     return stamp
+
+
+def _text(value: Any) -> str:
+    """A text, which JSON of a stranger may lack."""
+    if not isinstance(value, str):
+        raise TypeError(f"{type(value).__name__} instead of a text")
+    return value
 
 
 def _bytes(data: Any) -> bytes:

@@ -8,7 +8,6 @@ trajectory files: one image is one second in them, though the nominal rate is 30
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property
 from pathlib import Path
 
 import numpy as np
@@ -17,9 +16,10 @@ from trihedron.datasets.readers import povray
 from trihedron.datasets.readers.association import Stamps, file_inside
 from trihedron.datasets.readers.cameras import Calibration, choose_calibration, with_noise
 from trihedron.datasets.readers.images import read_depth
-from trihedron.datasets.readers.sequence import DepthReader, ImageSequence, SequenceReader, open_folder, select_frames
-from trihedron.pipeline.core.errors import DataError
-from trihedron.pipeline.core.options import Frames
+from trihedron.datasets.readers.matrices import numbered
+from trihedron.datasets.readers.sequence import DepthReader, ImageSequence, SequenceReader
+from trihedron.pipeline.core.errors import DataError, printable
+from trihedron.pipeline.core.files import SHOWN
 from trihedron.pipeline.core.registry import register
 from trihedron.pipeline.core.types import F32, F64, Trajectory
 from trihedron.pipeline.record.trajectories import TRUTH, parse_stamp_ns, read_trajectory, table_lines
@@ -35,14 +35,10 @@ class IclNuim(SequenceReader):
     """Folder of the TUM-compatible layout (rgb/, depth/, associations.txt, groundtruth.txt or *.freiburg) or of POV-Ray's own
     (scene_00_0000.png, .depth, .txt) (Handa et al. 2014). Images without a pose, such as image 0, are frames without truth."""
 
-    path: str = ""  # folder of the sequence
-    frames: Frames = ""  # part to read, half open: A:B, A:, :B; empty = all
     camera: str = ""  # preset or camera.yaml; empty = the folder's file, else the benchmark's camera
     exact_depth: bool = False  # for the sequences published without noise; false = a Kinect's
 
-    @cached_property
-    def _sequence(self) -> ImageSequence:
-        folder = open_folder(self.path)
+    def _open(self, folder: Path) -> ImageSequence:
         calibration = with_noise(choose_calibration(folder, self.camera, default="icl_nuim"), self.exact_depth)
         reader: DepthReader
         if any(folder.glob(povray.DEPTH_FILES)):
@@ -52,8 +48,7 @@ class IclNuim(SequenceReader):
         else:
             numbers, colors, depths = _associations(folder) if (folder / "associations.txt").is_file() else _numbered_pairs(folder)
             truth, reader = _truth_file(folder), _png_reader(calibration)
-        whole = ImageSequence(numbers, colors, depths, calibration, _reflected(truth), depth_reader=reader)
-        return select_frames(whole, self.frames, str(folder))
+        return ImageSequence(numbers, colors, depths, calibration, _reflected(truth), depth_reader=reader)
 
 
 def _reflected(truth: Trajectory | None) -> Trajectory | None:
@@ -81,7 +76,7 @@ def _associations(folder: Path) -> tuple[Stamps, list[Path], list[Path]]:
         except ValueError as error:
             raise DataError(place, str(error), "each line begins with the image's number") from error
         if numbers and number <= numbers[-1]:
-            raise DataError(place, f"image {words[0]} does not come after the one before", "sort the list and remove duplicates")
+            raise DataError(place, f"image {printable(words[0], SHOWN)} does not come after the one before", "sort the list and remove duplicates")
         numbers.append(number)
         colors.append(file_inside(folder, words[3 if depth_first else 1], place))
         depths.append(file_inside(folder, words[1 if depth_first else 3], place))
@@ -92,12 +87,12 @@ def _associations(folder: Path) -> tuple[Stamps, list[Path], list[Path]]:
 
 def _numbered_pairs(folder: Path) -> tuple[Stamps, list[Path], list[Path]]:
     """The pairs rgb/N.png, depth/N.png, in order of N."""
-    numbers = sorted(int(file.stem) for file in folder.glob("rgb/*.png") if file.stem.isdigit() and (folder / "depth" / file.name).is_file())
+    colors, depths = numbered(folder / "rgb", r"(\d+)\.png"), numbered(folder / "depth", r"(\d+)\.png")
+    numbers = [number for number in colors if number in depths]
     if not numbers:
         cure = "give the folder that holds rgb/0.png and depth/0.png, or scene_00_0000.png and .depth"
         raise DataError(str(folder), "holds no image pairs of either ICL-NUIM layout", cure)
-    names = [f"{number}.png" for number in numbers]
-    return np.array(numbers, dtype=np.int64) * SECOND_NS, [folder / "rgb" / name for name in names], [folder / "depth" / name for name in names]
+    return np.array(numbers, dtype=np.int64) * SECOND_NS, [colors[n] for n in numbers], [depths[n] for n in numbers]
 
 
 def _truth_file(folder: Path) -> Trajectory | None:

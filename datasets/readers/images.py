@@ -7,18 +7,20 @@ from typing import Any
 
 import cv2
 import numpy as np
+from imagecodecs import png_decode
 from numpy.typing import NDArray
 
 from trihedron.datasets.readers.picture_headers import JPEG, PNG, UnreadableImage, picture_header
 from trihedron.datasets.readers.png_chunks import is_whole_png
-from trihedron.datasets.readers.png_decoder import decode_png
-from trihedron.pipeline.core.errors import DataError
+from trihedron.pipeline.core.errors import DataError, printable
+from trihedron.pipeline.core.files import SHOWN, read_file
 from trihedron.pipeline.core.types import F32, U8
 
 RGB = cv2.IMREAD_COLOR_RGB | cv2.IMREAD_IGNORE_ORIENTATION
 JPEG_END = b"\xff\xd9"  # of a complete file; a decoder would fill the rest of a truncated one with grey and say nothing
 PIXELS_PER_BYTE = 2048  # more than a picture can pack: deflate makes 1032 bytes of one, a grey JPEG 512 pixels of one
-MOST_PIXELS = 1 << 26  # more than any camera has that sees depth
+MAX_PIXELS = 1 << 26  # more than any depth camera has
+MAX_BYTES = 1 << 26  # of an image file
 TAIL = 64  # bytes searched for the end mark: writers may pad
 
 
@@ -44,7 +46,11 @@ def read_depth(path: Path, depth_scale: float, depth_offset: float = 0.0) -> F32
     if image.dtype != np.uint16:
         cure = "give 16-bit depth images (value = metres × depth_scale); a preview picture does not hold metres"
         raise DataError(str(path), f"has {8 * image.itemsize} bits a pixel where depth has 16", cure)
-    depth = metres(image, depth_scale)
+    return corrected(metres(image, depth_scale), depth_offset)
+
+
+def corrected(depth: F32, depth_offset: float) -> F32:
+    """Depth z in metres as 1 / (1 / z + `depth_offset`), float32."""
     return depth / np.maximum(1.0 + np.float32(depth_offset) * depth, np.float32(0.1)) if depth_offset else depth
 
 
@@ -57,7 +63,7 @@ def metres(values: NDArray[Any], depth_scale: float) -> F32:
 
 def _decode(path: Path) -> NDArray[Any]:
     try:
-        data = path.read_bytes()
+        data = read_file(path, MAX_BYTES)
     except OSError as error:
         raise UnreadableImage(f"cannot be opened ({error.strerror})") from error
     if not data:
@@ -66,28 +72,34 @@ def _decode(path: Path) -> NDArray[Any]:
 
 
 def decode_image(data: bytes) -> NDArray[Any]:
-    """The pixels of a picture: (h, w), (h, w, 3) RGB or (h, w, 4) RGBA. Raises UnreadableImage for another format (see `picture_headers`) and for
+    """Decode an image: (h, w), (h, w, 3) RGB or (h, w, 4) RGBA. Raises UnreadableImage for another format (see `picture_headers`) and for
     what is cut off, damaged or larger than its bytes can hold."""
     header = picture_header(data)
-    if header.cells > min(PIXELS_PER_BYTE * len(data), MOST_PIXELS):
+    if header.cells > min(PIXELS_PER_BYTE * len(data), MAX_PIXELS):
         raise UnreadableImage(f"claims {header.width}×{header.height} pixels in {len(data)} bytes")
     if (data.startswith(PNG) and not is_whole_png(data)) or (data.startswith(JPEG) and JPEG_END not in data[-TAIL:]):
         raise UnreadableImage("is truncated")
     try:
-        image = decode_png(data) if data.startswith(PNG) else None
-    except ValueError as error:
-        raise UnreadableImage(f"is damaged: {error}") from error
-    if image is not None:
-        return image
-    at_once = data.startswith(JPEG) and header.channels == 3
-    try:
-        image = cv2.imdecode(np.frombuffer(data, dtype=np.uint8), RGB if at_once else cv2.IMREAD_UNCHANGED)
-    except cv2.error:
-        image = None
+        image = _decode_png(data, header.channels) if data.startswith(PNG) else _decode_opencv(data, header.channels)
+    except Exception as error:  # the decoders' own, and UnicodeDecodeError where libpng quotes a damaged name
+        raise UnreadableImage(f"is damaged ({printable(str(error), SHOWN)})") from error
     if image is None:
         raise UnreadableImage("is damaged or of an unknown format")
-    if image.ndim == 2 or at_once:
-        return np.asarray(image)
+    return image
+
+
+def _decode_png(data: bytes, channels: int) -> NDArray[Any]:
+    image = np.asarray(png_decode(data))
+    if image.ndim == 3 and image.shape[2] == 2:  # grey with opacity, or with one value that counts as transparent
+        return image[..., [0, 0, 0, 1]] if channels == 2 else image[..., 0]
+    return image
+
+
+def _decode_opencv(data: bytes, channels: int) -> NDArray[Any] | None:
+    is_rgb = data.startswith(JPEG) and channels == 3
+    image = cv2.imdecode(np.frombuffer(data, dtype=np.uint8), RGB if is_rgb else cv2.IMREAD_UNCHANGED)
+    if image is None or image.ndim == 2 or is_rgb:
+        return image
     return np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2RGB if image.shape[2] == 3 else cv2.COLOR_BGRA2RGBA))
 
 

@@ -1,13 +1,16 @@
-"""Frames out of an MCAP file: a recording of this program, or one of a robot."""
+"""Frames out of an MCAP file or a bag of ROS: a recording of this program, or one of a robot."""
 
 from __future__ import annotations
 
 import logging
 from dataclasses import dataclass, replace
 from functools import cached_property
+from pathlib import Path
 
+from trihedron.datasets.readers.bag_file import BAG, METADATA_FILE, BagFile
 from trihedron.datasets.readers.robot_recording import RobotRecording, Topics
-from trihedron.datasets.readers.sequence import clip_range
+from trihedron.datasets.readers.robot_streams import ROS
+from trihedron.datasets.readers.sequence import clip_range, refuse_video
 from trihedron.pipeline.core.errors import DataError
 from trihedron.pipeline.core.options import Frames, PositiveFloat
 from trihedron.pipeline.core.registry import register
@@ -24,13 +27,13 @@ log = logging.getLogger("trihedron")
 @dataclass(frozen=True)
 class McapDataset:
     """A recording of this program (`record.frames=true`, or `trihedron convert`), whose frames come bit for bit with the ground truth attached
-    to it, or one of a robot: ROS 2 messages (sensor_msgs Image, CompressedImage, compressedDepth, CameraInfo; tf2_msgs) or Foxglove's schemas.
+    to it, or one of a robot: messages of ROS (sensor_msgs Image, CompressedImage, compressedDepth, CameraInfo; tf2_msgs) or Foxglove's schemas.
 
     Of a robot's recording the topics are chosen by their type; where several fit, one is named. Colour is undistorted, and paired with the depth
     nearest in time, which is registered to colour from both intrinsics and the transforms. Without index, or cut off, it is read as far as it is
     whole. Raises DataError when the file holds no frames, RecordingError when it is missing, damaged or not MCAP."""
 
-    path: str = ""  # FILE.mcap
+    path: str = ""  # FILE.mcap, FILE.bag of ROS 1, or the folder of a rosbag2
     frames: Frames = ""  # half-open range of frame numbers "A:B"
     color_topic: str = ""  # of a robot's recording; empty = the only one with colour images
     depth_topic: str = ""  # empty = the only one with depth images
@@ -44,12 +47,12 @@ class McapDataset:
     @cached_property
     def _frames(self) -> _Recorded | RobotRecording:
         if not self.path:
-            raise DataError("dataset.path", "is not set", "give dataset.path=FILE.mcap")
-        file = McapFile(self.path)
-        if METADATA in file.metadata:
-            return _Recorded(Recording(self.path))
+            raise DataError("dataset.path", "is not set", "give dataset.path=FILE.mcap, FILE.bag or the folder of a rosbag2")
+        file = open_messages(Path(self.path).expanduser())
+        if isinstance(file, McapFile) and METADATA in file.metadata:
+            return _Recorded(Recording(file.path))
         if not file.complete:
-            log.warning("%s is cut off; what is whole of it is read", self.path)
+            log.warning("%s is cut off; what is whole of it is read", file.path)
         topics = Topics(self.color_topic, self.depth_topic, self.color_info_topic, self.depth_info_topic, self.truth_from)
         return RobotRecording(file, topics, round(self.max_difference_ms * 1e6), round(self.depth_delay_ms * 1e6), self.depth_scale)
 
@@ -69,6 +72,15 @@ class McapDataset:
     def truth(self) -> Trajectory | None:
         """The attached ground truth, or that of `truth_from`."""
         return self._frames.truth()
+
+
+def open_messages(path: Path) -> McapFile | BagFile:
+    """Open a file of messages: an MCAP file, a bag of ROS 1, or a folder of rosbag2. Raises RecordingError where it is none."""
+    refuse_video(path)
+    if path.suffix == BAG or (path / METADATA_FILE).is_file():
+        return BagFile(path, ROS)
+    inside = sorted(path.glob("*.mcap")) if path.is_dir() else []
+    return McapFile(inside[0] if len(inside) == 1 else path)
 
 
 class _Recorded:

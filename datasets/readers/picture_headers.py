@@ -11,8 +11,8 @@ from dataclasses import dataclass
 
 PNG, JPEG, BMP = b"\x89PNG", b"\xff\xd8\xff", b"BM"
 TIFFS = {b"II*\0": "<", b"MM\0*": ">"}  # little and big endian
-PNM = re.compile(rb"P([1-6])(?:\s+|#[^\n]*\n)+(\d{1,9})(?:\s+|#[^\n]*\n)+(\d{1,9})(?:(?:\s+|#[^\n]*\n)+(\d{1,9}))?\s")
-PNM_HEAD = 4096  # bytes in which the header of a PNM, with its comments, ends
+COMMENT = re.compile(rb"#[^\n]*(?:\n|$)")  # of a PNM
+PNM_HEAD = 4096  # bytes that hold the header of a PNM with its comments
 FRAME_MARKS = {*range(0xC0, 0xD0)} - {0xC4, 0xC8, 0xCC}  # of a JPEG: where its size is said
 TIFF_WIDTH, TIFF_HEIGHT, TIFF_BITS, TIFF_SAMPLES, TIFF_TILE_WIDTH, TIFF_TILE_HEIGHT = 256, 257, 258, 277, 322, 323
 TIFF_FORMATS = {1: "B", 3: "H", 4: "I"}
@@ -74,13 +74,14 @@ def _bmp(data: bytes) -> PictureHeader:
 
 
 def _pnm(data: bytes) -> PictureHeader | None:
-    found = PNM.match(data[:PNM_HEAD])
-    if found is None:
+    """The header is words between blanks and comments: kind, width, height and, but for bitmaps, the largest value."""
+    words = COMMENT.sub(b" ", data[:PNM_HEAD]).split(maxsplit=4)
+    bitmap = words[:1] in ([b"P1"], [b"P4"])
+    numbers = words[1 : 3 if bitmap else 4]
+    if len(words) < (3 if bitmap else 4) or not re.fullmatch(rb"P[1-6]", words[0]) or not all(word.isdigit() and len(word) <= 9 for word in numbers):
         return None
-    kind, width, height, most = (int(word or 0) for word in found.groups())
-    if kind in (1, 4):
-        return PictureHeader(width, height, 1, 1)
-    return PictureHeader(width, height, 16 if most > 255 else 8, 3 if kind in (3, 6) else 1)
+    width, height, largest = (*map(int, numbers), 1)[:3]
+    return PictureHeader(width, height, 1 if bitmap else 16 if largest > 255 else 8, 3 if words[0] in (b"P3", b"P6") else 1)
 
 
 def _tiff(data: bytes) -> PictureHeader | None:

@@ -12,9 +12,12 @@ from pathlib import Path
 import numpy as np
 
 from trihedron.datasets.readers.association import Stamps
+from trihedron.datasets.readers.images import MAX_BYTES
+from trihedron.datasets.readers.matrices import MAX_DIGITS
 from trihedron.datasets.readers.picture_headers import UnreadableImage
 from trihedron.datasets.readers.sequence import DepthReader
 from trihedron.pipeline.core.errors import DataError
+from trihedron.pipeline.core.files import read_file, read_text
 from trihedron.pipeline.core.geometry import pose_matrix
 from trihedron.pipeline.core.types import F32, F64, Camera, Trajectory
 
@@ -22,6 +25,7 @@ DEPTH_FILES = "scene_*_*.depth"
 PER_METRE = 100.0
 NOTHING_HIT = 1e5  # centimetres: further than any room
 SECOND_NS = 1_000_000_000
+MAX_CAMERA_BYTES = 1 << 16
 
 
 @dataclass(frozen=True)
@@ -55,14 +59,14 @@ def _as_ns(numbers: list[int]) -> Stamps:
 def _number(file: Path) -> int:
     """scene_00_0042.depth -> 42."""
     digits = file.stem.rsplit("_", 1)[1]
-    if not digits.isdigit():
+    if not (digits.isdecimal() and len(digits) <= MAX_DIGITS):
         raise DataError(str(file), "has no image number in its name", "call it scene_00_0000.depth")
     return int(digits)
 
 
 def read_camera_pose(path: Path) -> F64:
     """`cam_pos`, `cam_dir`, `cam_up` of a camera file -> (4, 4) `T_world_camera`, y up, metres. Raises DataError."""
-    text = path.read_text(encoding="utf-8", errors="replace")
+    text = read_text(path, MAX_CAMERA_BYTES)
     position, forward, up = (_vector(path, text, key) for key in ("cam_pos", "cam_dir", "cam_up"))
     right = np.cross(up, forward)
     if np.linalg.norm(right) < 1e-9:
@@ -73,7 +77,7 @@ def read_camera_pose(path: Path) -> F64:
 
 
 def _vector(path: Path, text: str, key: str) -> F64:
-    match = re.search(rf"^\s*{key}\s*=\s*\[([^\]]*)\]", text, flags=re.MULTILINE)
+    match = re.search(rf"^[ \t]*{key}[ \t]*=[ \t]*\[([^\]]*)\]", text, flags=re.MULTILINE)
     try:
         vector = np.array([float(word) for word in match[1].replace(",", " ").split()]) if match else np.empty(0)
     except ValueError:
@@ -90,7 +94,7 @@ def depth_reader(camera: Camera) -> DepthReader:
 
     def read(path: Path) -> F32:
         try:
-            distances = np.array(path.read_text(encoding="ascii").split(), dtype=np.float64)
+            distances = np.array(read_file(path, MAX_BYTES).decode("ascii").split(), dtype=np.float64)
         except OSError as error:
             raise UnreadableImage(f"cannot be opened ({error.strerror})") from error
         except ValueError as error:

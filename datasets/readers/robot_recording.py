@@ -1,4 +1,4 @@
-"""Frames out of a robot's recording: ROS 2 messages or Foxglove's schemas in an MCAP file."""
+"""Frames out of a robot's recording: ROS 2 messages or Foxglove's schemas in an MCAP file or a bag."""
 
 from __future__ import annotations
 
@@ -15,12 +15,11 @@ from trihedron.datasets.readers.association import Stamps, associate
 from trihedron.datasets.readers.picture_headers import UnreadableImage
 from trihedron.datasets.readers.pixels import Kind, color_of, depth_of
 from trihedron.datasets.readers.registration import Registration
-from trihedron.datasets.readers.robot_streams import Role, Stream, Streams
+from trihedron.datasets.readers.robot_streams import MessageFile, Role, Stream, Streams
 from trihedron.datasets.readers.robot_values import Intrinsics, Link, Picture, UnreadableMessage
 from trihedron.datasets.readers.transform_tree import TransformTree
 from trihedron.pipeline.core.errors import DataError, RecordingError
 from trihedron.pipeline.core.types import F32, F64, U8, Camera, Frame, Trajectory
-from trihedron.pipeline.record.mcap_file import McapFile
 
 log = logging.getLogger("trihedron")
 RECTIFIED = re.compile(r"(^|[_/])rect")  # in the name of a topic, by the convention of image_proc
@@ -52,7 +51,7 @@ class _Sample:
 class RobotRecording:
     """The frames of a recording, in any order and from any thread: colour paired with the nearest depth, undistorted, depth registered to colour."""
 
-    file: McapFile
+    file: MessageFile
     topics: Topics
     max_difference_ns: int
     depth_delay_ns: int

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from enum import Enum
 from functools import cached_property, partial
-from typing import Any
+from pathlib import Path
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,7 +18,6 @@ from trihedron.datasets.readers.picture_headers import UnreadableImage
 from trihedron.datasets.readers.pixels import Kind, kind_of
 from trihedron.datasets.readers.robot_values import Intrinsics, Picture, UnreadableMessage
 from trihedron.pipeline.core.errors import DataError, did_you_mean
-from trihedron.pipeline.record.mcap_file import ChannelIndex, McapFile
 
 log = logging.getLogger("trihedron")
 
@@ -52,11 +52,30 @@ FOXGLOVE = {
 TRANSPORTS = ("/compressed", "/compressedDepth")  # what image_transport adds to the topic of the raw image
 
 
+class MessageFile(Protocol):
+    """A file of messages on topics: `McapFile` or `BagFile`."""
+
+    path: Path
+
+    @property
+    def channels(self) -> Mapping[int, Any]:
+        """By their numbers: `topic` and `message_encoding`."""
+
+    def schema_name(self, channel: int) -> str:
+        """Return the type of a channel's messages."""
+
+    def locate(self, channel: int) -> Any:
+        """Return an index of a channel's messages: its length and (n,) `log_times`."""
+
+    def read(self, index: Any, row: int, most: int | None = None) -> bytes:
+        """Read one message, or only its first `most` bytes."""
+
+
 @dataclass(frozen=True)
 class Stream:
     """A topic that says something of frames; `decode` raises UnreadableMessage."""
 
-    file: McapFile
+    file: MessageFile
     channel: int
     topic: str
     role: Role
@@ -64,7 +83,7 @@ class Stream:
     is_ros: bool
 
     @cached_property
-    def index(self) -> ChannelIndex:
+    def index(self) -> Any:
         """Where its messages lie."""
         return self.file.locate(self.channel)
 
@@ -98,7 +117,7 @@ class Stream:
 class Streams:
     """The topics of a recording by their roles, in order of their names."""
 
-    file: McapFile
+    file: MessageFile
 
     @cached_property
     def all(self) -> tuple[Stream, ...]:
@@ -168,7 +187,7 @@ def plain_topic(topic: str) -> str:
     return next((topic.removesuffix(end) for end in sorted(TRANSPORTS, key=len, reverse=True) if topic.endswith(end)), topic)
 
 
-def _stream(file: McapFile, channel: int) -> Stream | None:
+def _stream(file: MessageFile, channel: int) -> Stream | None:
     kind, sent = file.schema_name(channel), file.channels[channel]
     make = partial(Stream, file, channel, sent.topic)
     if sent.message_encoding == "cdr" and kind in ROS:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property, partial
+from functools import partial
 from pathlib import Path
 
 import cv2
@@ -11,11 +11,10 @@ import numpy as np
 
 from trihedron.datasets.readers.cameras import Calibration
 from trihedron.datasets.readers.images import read_color, read_depth
-from trihedron.datasets.readers.matrices import frame_stamps, numbered, read_matrix, trajectory_of
+from trihedron.datasets.readers.matrices import frame_stamps, numbered, pose_files, read_matrix
 from trihedron.datasets.readers.picture_headers import UnreadableImage
-from trihedron.datasets.readers.sequence import ImageSequence, SequenceReader, open_folder, select_frames
+from trihedron.datasets.readers.sequence import ImageSequence, SequenceReader
 from trihedron.pipeline.core.errors import DataError
-from trihedron.pipeline.core.options import Frames
 from trihedron.pipeline.core.registry import register
 from trihedron.pipeline.core.types import F64, U8, Camera
 
@@ -32,12 +31,7 @@ class ScanNet(SequenceReader):
 
     Depth is registered to colour, which is larger: colour is reduced to the depth camera, whose intrinsics a frame has."""
 
-    path: str = ""  # folder of the exported scan
-    frames: Frames = ""  # part to read, half open: A:B, A:, :B; empty = all
-
-    @cached_property
-    def _sequence(self) -> ImageSequence:
-        folder = open_folder(self.path)
+    def _open(self, folder: Path) -> ImageSequence:
         colors, depths = numbered(folder / "color", r"(\d+)\.(?:jpg|png)"), numbered(folder / "depth", r"(\d+)\.png")
         numbers = [number for number in colors if number in depths]
         if not numbers:
@@ -46,13 +40,10 @@ class ScanNet(SequenceReader):
         height, width = _first_size(list(depths.values()))
         camera = Camera(width, height, float(depth_K[0, 0]), float(depth_K[1, 1]), float(depth_K[0, 2]), float(depth_K[1, 2]))
         stamps = frame_stamps(numbers, camera.fps)
-        posed = [(row, file) for row, file in enumerate(folder / "pose" / f"{n}.txt" for n in numbers) if file.is_file()]
-        rows, files = [row for row, _ in posed], [file for _, file in posed]
-        truth = trajectory_of(stamps[rows], [read_matrix(file) for file in files], [str(file) for file in files])
+        truth = pose_files(stamps, [folder / "pose" / f"{n}.txt" for n in numbers])
         images = [colors[n] for n in numbers], [depths[n] for n in numbers]
         reader = partial(_read_reduced, K=color_K, camera=camera)
-        whole = ImageSequence(stamps, *images, Calibration(camera, DEPTH_SCALE), truth, color_reader=reader)
-        return select_frames(whole, self.frames, str(folder))
+        return ImageSequence(stamps, *images, Calibration(camera, DEPTH_SCALE), truth, color_reader=reader)
 
 
 def _intrinsics(path: Path) -> F64:

@@ -18,10 +18,21 @@ from trihedron.datasets.readers.cameras import Calibration
 from trihedron.datasets.readers.images import check_size, read_color, read_depth
 from trihedron.datasets.readers.picture_headers import UnreadableImage
 from trihedron.pipeline.core.errors import DataError
-from trihedron.pipeline.core.options import frame_range
+from trihedron.pipeline.core.files import one_line_errors
+from trihedron.pipeline.core.options import Frames, frame_range
 from trihedron.pipeline.core.types import F32, U8, Frame, Trajectory
 
 log = logging.getLogger("trihedron")
+CURE = "check the files of the data set"
+_FRAMES = "as rgb/00000.png and 16-bit depth/00000.png with a camera.yaml"
+_NO_DEPTH = f"a film has no metric depth; save the camera's frames {_FRAMES}"
+VIDEOS = {  # ending -> what gets the frames out
+    ".mkv": f"write its frames with Open3D's azure_kinect_mkv_reader {_FRAMES}",
+    ".svo": f"write its frames with the ZED SDK's export sample {_FRAMES}",
+    ".svo2": f"write its frames with the ZED SDK's export sample {_FRAMES}",
+    ".oni": f"write its frames with OpenNI {_FRAMES}",
+    **dict.fromkeys((".mp4", ".mov", ".avi", ".webm", ".m4v"), _NO_DEPTH),
+}
 DepthReader = Callable[[Path], F32]
 
 
@@ -52,7 +63,7 @@ class ImageSequence:
             log.warning("%s; frame %d is skipped", error, self.first + position)
             return None
         self._check_sizes(position, color, depth)
-        color, depth = self._undistort(color, depth)
+        color, depth = undistorted(color, depth, self._maps)
         return Frame(self.first + position, int(self.stamps_ns[position]), color, depth, self.calibration.camera)
 
     def _read(self, path: Path, reader: Callable[[Path], Any]) -> Any:
@@ -73,40 +84,62 @@ class ImageSequence:
     @cached_property
     def _maps(self) -> tuple[F32, F32] | None:
         """Where each pixel of the undistorted image comes from: (h, w) x and y; None without distortion."""
-        if not self.calibration.distortion:
-            return None
-        camera = self.calibration.camera
-        lens = np.array(self.calibration.distortion)
-        x, y = cv2.initUndistortRectifyMap(camera.K, lens, np.eye(3), camera.K, (camera.width, camera.height), cv2.CV_32FC1)
-        return np.asarray(x), np.asarray(y)
-
-    def _undistort(self, color: U8, depth: F32) -> tuple[U8, F32]:
-        """Colour bilinear; depth nearest, since a mean across an edge is a point that does not exist. Outside the image colour repeats the
-        border, which makes no edge, and depth is 0."""
-        if self._maps is None:
-            return color, depth
-        color = np.asarray(cv2.remap(color, *self._maps, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE), dtype=np.uint8)
-        return color, np.asarray(cv2.remap(depth, *self._maps, cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT), dtype=np.float32)
+        return undistortion_maps(self.calibration)
 
 
+def undistortion_maps(calibration: Calibration) -> tuple[F32, F32] | None:
+    """Where each pixel of the undistorted image comes from: (h, w) x and y; None without distortion."""
+    if not calibration.distortion:
+        return None
+    camera, lens = calibration.camera, np.array(calibration.distortion)
+    x, y = cv2.initUndistortRectifyMap(camera.K, lens, np.eye(3), camera.K, (camera.width, camera.height), cv2.CV_32FC1)
+    return np.asarray(x), np.asarray(y)
+
+
+def undistorted(color: U8, depth: F32, maps: tuple[F32, F32] | None) -> tuple[U8, F32]:
+    """Colour bilinear; depth nearest, since a mean across an edge is a point that does not exist. Outside the image colour repeats the
+    border, which makes no edge, and depth is 0."""
+    if maps is None:
+        return color, depth
+    color = np.asarray(cv2.remap(color, *maps, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE), dtype=np.uint8)
+    return color, np.asarray(cv2.remap(depth, *maps, cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT), dtype=np.float32)
+
+
+@dataclass(frozen=True)
 class SequenceReader(ABC):
-    """A data set that is an ImageSequence: what the readers of folders share. Frames are numbered as in the whole data set."""
+    """A folder that is an ImageSequence: what its readers share. Frames are numbered as in the whole data set."""
 
-    @property
+    path: str = ""  # folder of the sequence
+    frames: Frames = ""  # part to read, half open: A:B, A:, :B; empty = all
+
     @abstractmethod
+    def _open(self, folder: Path) -> ImageSequence:
+        """List the whole sequence. Raises DataError when the folder cannot be used."""
+
+    @cached_property
     def _sequence(self) -> ImageSequence:
-        """The chosen part of the folder, opened once. Raises DataError when the folder cannot be used."""
+        folder = open_folder(self.path)
+        with one_line_errors(str(folder), CURE):
+            return select_frames(self._open(folder), self.frames, str(folder))
 
     def __len__(self) -> int:
         return len(self._sequence)
 
     def __call__(self, index: int) -> Frame | None:
-        """Frame `index` of the selection, or None when one of its files cannot be read. Raises DataError for images of a wrong kind."""
-        return self._sequence.frame(index)
+        """Read frame `index` of the selection, or None when one of its files cannot be read. Raises DataError for images of a wrong kind."""
+        with one_line_errors(str(self._sequence.color_files[index]), CURE):
+            return self._sequence.frame(index)
 
     def truth(self) -> Trajectory | None:
-        """The ground truth that lies with the images, as published but with y down."""
+        """Return the ground truth that lies with the images, as published but with y down."""
         return self._sequence.truth
+
+
+def refuse_video(path: Path) -> None:
+    """Raise DataError, with the cure, for a video file: its depth is lost, or in a stream of the camera's maker."""
+    cure = VIDEOS.get(path.suffix.lower())
+    if cure is not None:
+        raise DataError(str(path), "is a video file, which is not read", f"{cure}, then use dataset=folder")
 
 
 def open_folder(path: str) -> Path:
@@ -116,9 +149,12 @@ def open_folder(path: str) -> Path:
     folder = Path(path).expanduser()
     if not folder.exists():
         raise DataError(str(folder), "does not exist", "give an existing folder as dataset.path")
+    refuse_video(folder)
     if not folder.is_dir():
         raise DataError(str(folder), "is not a folder", "give the folder that holds the images as dataset.path")
-    if not any(folder.iterdir()):
+    with one_line_errors(str(folder), "check the folder's permissions"):
+        empty = not any(folder.iterdir())
+    if empty:
         raise DataError(str(folder), "is empty", "give the folder that holds the images as dataset.path")
     return folder
 

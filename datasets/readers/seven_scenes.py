@@ -3,39 +3,33 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property
 from pathlib import Path
 
 from trihedron.datasets.readers.cameras import Calibration, choose_calibration
 from trihedron.datasets.readers.images import read_depth
-from trihedron.datasets.readers.matrices import frame_stamps, numbered, read_matrix, trajectory_of
-from trihedron.datasets.readers.sequence import DepthReader, ImageSequence, SequenceReader, open_folder, select_frames
+from trihedron.datasets.readers.matrices import frame_stamps, numbered, pose_files
+from trihedron.datasets.readers.sequence import DepthReader, ImageSequence, SequenceReader
 from trihedron.pipeline.core.errors import DataError
-from trihedron.pipeline.core.options import Frames
 from trihedron.pipeline.core.registry import register
 from trihedron.pipeline.core.types import F32
 
 INVALID_M = 65.0  # 65535 mm says that there is no reading
-LAYOUT = "give the folder that holds frame-000000.color.png, .depth.png and .pose.txt, for example chess/seq-01"
+LAYOUT = "give the folder that holds frame-000000.color.png or .jpg, .depth.png and .pose.txt, for example chess/seq-01"
 
 
 @register("dataset", "seven_scenes")
 @dataclass(frozen=True)
 class SevenScenes(SequenceReader):
-    """Folder with frame-000000.color.png, .depth.png (mm) and .pose.txt (camera to world) (Shotton et al. 2013). Frames are 1/30 s apart.
+    """Folder with frame-000000.color.png or .jpg, .depth.png (mm) and .pose.txt (camera to world) (Shotton et al. 2013). Frames are 1/30 s apart.
 
     The published depth is *not* registered to colour: the two cameras are a few centimetres apart, and no calibration of the pair was
     published. It is read as if both were one camera, of focal length 585 and centre (320, 240), as the data set's authors say; along the edges of
-    things colour and depth then disagree by some pixels. Poses are those of the depth camera."""
+    things colour and depth then disagree by some pixels, which a run warns of. Poses are those of the depth camera."""
 
-    path: str = ""  # folder of the sequence, for example chess/seq-01
-    frames: Frames = ""  # part to read, half open: A:B, A:, :B; empty = all
     camera: str = ""  # preset or camera.yaml; empty = the folder's file, else the data set's camera
 
-    @cached_property
-    def _sequence(self) -> ImageSequence:
-        folder = open_folder(self.path)
-        colors = numbered(folder, r"frame-(\d+)\.color\.png")
+    def _open(self, folder: Path) -> ImageSequence:
+        colors = numbered(folder, r"frame-(\d+)\.color\.(?:png|jpe?g)")
         depths = numbered(folder, r"frame-(\d+)\.depth\.png")
         numbers = [number for number in colors if number in depths]
         if not numbers:
@@ -43,12 +37,9 @@ class SevenScenes(SequenceReader):
             raise DataError(str(folder), "holds no frames of 7-Scenes", f"choose one of {', '.join(inside)}" if inside else LAYOUT)
         calibration = choose_calibration(folder, self.camera, default="seven_scenes")
         stamps = frame_stamps(numbers, calibration.camera.fps)
-        posed = [(row, file) for row, file in enumerate(folder / f"frame-{n:06}.pose.txt" for n in numbers) if file.is_file()]
-        rows, files = [row for row, _ in posed], [file for _, file in posed]
-        truth = trajectory_of(stamps[rows], [read_matrix(file) for file in files], [str(file) for file in files])
+        truth = pose_files(stamps, [folder / f"frame-{n:06}.pose.txt" for n in numbers])
         images = [colors[n] for n in numbers], [depths[n] for n in numbers]
-        whole = ImageSequence(stamps, *images, calibration, truth, depth_reader=_reader(calibration))
-        return select_frames(whole, self.frames, str(folder))
+        return ImageSequence(stamps, *images, calibration, truth, depth_reader=_reader(calibration))
 
 
 def _reader(calibration: Calibration) -> DepthReader:

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property
+from pathlib import Path
 
 from trihedron.datasets.readers.association import listed_pairs
 from trihedron.datasets.readers.cameras import choose_calibration
-from trihedron.datasets.readers.sequence import ImageSequence, SequenceReader, open_folder, select_frames
-from trihedron.pipeline.core.options import Frames, PositiveFloat
+from trihedron.datasets.readers.sequence import ImageSequence, SequenceReader
+from trihedron.pipeline.core.options import PositiveFloat
 from trihedron.pipeline.core.registry import register
 
 
@@ -18,15 +18,10 @@ class Tamu(SequenceReader):
     """Folder with rgb.txt and depth.txt, as in the TUM benchmark, and a camera.yaml (Lu and Song 2015). Long walks through corridors, an entry
     hall and a staircase, without true poses: a walk ends where it began, so that `start_to_end_m` of metrics.json is its drift."""
 
-    path: str = ""  # folder of the sequence
-    frames: Frames = ""  # part to read, half open: A:B, A:, :B; empty = all
     camera: str = ""  # preset or camera.yaml; empty = the folder's file
     max_difference_ms: PositiveFloat = 20.0  # of a pair's stamps
     depth_delay_ms: float = 0.0  # depth is taken this much later than its stamps say; trihedron calibrate estimates it
 
-    @cached_property
-    def _sequence(self) -> ImageSequence:
-        folder = open_folder(self.path)
+    def _open(self, folder: Path) -> ImageSequence:
         calibration = choose_calibration(folder, self.camera)
-        whole = ImageSequence(*listed_pairs(folder, self.max_difference_ms, self.depth_delay_ms), calibration)
-        return select_frames(whole, self.frames, str(folder))
+        return ImageSequence(*listed_pairs(folder, self.max_difference_ms, self.depth_delay_ms), calibration)

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property
+from pathlib import Path
 
 from trihedron.datasets.readers.association import listed_pairs
 from trihedron.datasets.readers.cameras import choose_calibration, with_noise
-from trihedron.datasets.readers.sequence import ImageSequence, SequenceReader, open_folder, select_frames
-from trihedron.pipeline.core.options import Frames, PositiveFloat
+from trihedron.datasets.readers.sequence import ImageSequence, SequenceReader
+from trihedron.pipeline.core.options import PositiveFloat
 from trihedron.pipeline.core.registry import register
 from trihedron.pipeline.record.trajectories import TRUTH, read_trajectory
 
@@ -19,20 +19,15 @@ class Tum(SequenceReader):
     """Folder with rgb.txt, depth.txt and, where there is truth, groundtruth.txt (Sturm et al. 2012). Colour and depth are separate streams,
     paired by time; a frame carries the stamp of its colour image. fr1 and fr2 are undistorted at reading."""
 
-    path: str = ""  # folder of the sequence
-    frames: Frames = ""  # part to read, half open: A:B, A:, :B; empty = all
     camera: str = ""  # preset or camera.yaml; empty = the folder's file, else its name
     max_difference_ms: PositiveFloat = 20.0  # of a pair's stamps; the benchmark's tools use the same
     depth_delay_ms: float = 0.0  # depth is taken this much later than its stamps say; trihedron calibrate estimates it
     exact_depth: bool = False  # rendered without sensor noise; false = a Kinect's
 
-    @cached_property
-    def _sequence(self) -> ImageSequence:
-        folder = open_folder(self.path)
+    def _open(self, folder: Path) -> ImageSequence:
         truth = folder / TRUTH
-        whole = ImageSequence(
+        return ImageSequence(
             *listed_pairs(folder, self.max_difference_ms, self.depth_delay_ms),
             with_noise(choose_calibration(folder, self.camera), self.exact_depth),
             read_trajectory(truth) if truth.is_file() else None,
         )
-        return select_frames(whole, self.frames, str(folder))

@@ -19,6 +19,7 @@ from trihedron.datasets.simulation.raytracing import Geometry, geometry_of
 from trihedron.datasets.simulation.room import BOX, Room, all_faces, furnished_room
 from trihedron.datasets.simulation.shading import Atlas, render
 from trihedron.datasets.simulation.textures import bake
+from trihedron.datasets.simulation.true_plan import TruePlan, plan_of
 from trihedron.datasets.simulation.true_surface import TrueSurface, surface_of
 from trihedron.pipeline.core.options import Frames, NonNegativeInt, PositiveFloat, Range
 from trihedron.pipeline.core.registry import register
@@ -89,6 +90,10 @@ class Synthetic:
     def surface(self) -> TrueSurface:
         """The exact surface of the scene, in the frame of `truth`."""
         return surface_of(self._room)
+
+    def plan(self) -> TruePlan:
+        """The exact plan of the scene, in the frame of `truth`."""
+        return plan_of(self._room)
 
     def true_view(self, index: int) -> tuple[F64, Bool]:
         """(h, w) exact depth in metres of frame `index` of the selection, and (h, w) whether what is seen there is curved."""

@@ -22,7 +22,7 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from trihedron.pipeline.core.errors import DataError, TrihedronError, UsageError, did_you_mean
+from trihedron.pipeline.core.errors import DataError, TrihedronError, UsageError, did_you_mean, printable
 from trihedron.pipeline.core.overrides import literal_text, path_of, with_literal_paths
 from trihedron.pipeline.run import memory
 from trihedron.pipeline.run.interrupts import Interruption, ending_signals_interrupt
@@ -37,6 +37,7 @@ _FAILURES: list[Exception] = []  # of this process's runs
 _BEGAN = time.perf_counter()
 COMMAND_GROUP = "trihedron.commands"
 RUN_FLAGS = ("-m", "--multirun")
+OUT_OF_MEMORY = ("start new thread", "failed to map segment", "load shared object file")  # in what libraries say of it
 RUN_HELP = """Track a sequence: compose the configuration, run the graph, write the run folder.
 
 Usage: trihedron run [-m] [key=value ...]
@@ -69,6 +70,7 @@ def main(argv: list[str] | None = None) -> int:
     memory.configure_malloc()
     words = list(sys.argv[1:] if argv is None else argv)
     debug = "--debug" in words
+    _open_closed_streams()
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="replace")  # where the terminal has no such letter
@@ -99,12 +101,23 @@ def _of_the_machine(error: Exception) -> TrihedronError | None:
         if error.filename is None and error.errno in (errno.ENOSPC, errno.EIO, errno.EBADF):
             _discard_stdout()
         return DataError(str(error.filename or "standard output"), f"cannot be used: {error.strerror}", "make room, or give another place")
-    if isinstance(error, MemoryError) or "start new thread" in str(error) or "failed to map segment" in str(error):
-        cause = "ran out" if isinstance(error, MemoryError) else f"ran out ({error})"
+    if isinstance(error, MemoryError) or any(words in str(error) for words in OUT_OF_MEMORY):
+        cause = "ran out" if isinstance(error, MemoryError) else f"ran out ({printable(str(error), 160)})"
         return DataError("memory", cause, "give the process more (ulimit -v), fewer threads=N, or smaller images")
     if isinstance(error, RuntimeError) and "home directory" in str(error):  # Path.expanduser
         return DataError("path", "begins with ~ and the name of nobody", "write ./~NAME for a file of that name")
     return None
+
+
+def _open_closed_streams() -> None:
+    """Open the null device as standard input, output and error where the caller closed them (`>&-`): the run's own files would take their numbers,
+    and what libraries print would go there."""
+    while (number := os.open(os.devnull, os.O_RDWR)) <= 2:
+        pass
+    os.close(number)
+    for name, mode in (("stdin", "r"), ("stdout", "w"), ("stderr", "w")):
+        if getattr(sys, name) is None:
+            setattr(sys, name, open(os.devnull, mode))
 
 
 def _discard_stdout() -> None:
@@ -159,15 +172,22 @@ def _run(words: list[str]) -> int:
             raise UsageError(word, "is not an option of run", f"known: {', '.join(RUN_FLAGS)}; everything else is key=value")
         if word.startswith("=") or word == "out=":
             raise UsageError(word, "lacks a " + ("key" if word.startswith("=") else "folder"), "write key=value, for example out=runs/mine")
+    if _is_sweep(words):
+        from trihedron.pipeline.core.config import check_added
+
+        check_added(words)
+        return _sweep(words, _recorded(words))
+    run_once(words, _BEGAN)
+    return 0
+
+
+def run_once(words: list[str], began: float) -> tuple[Path, dict[str, Any]]:
+    """Make one run of these words, which began at a time (perf_counter). Returns its folder and its metrics. Raises TrihedronError."""
     with memory.gc_paused():
         from trihedron.pipeline.core.config import check_added, composed, rewritten
 
         check_added(words)
-        recorded = _recorded(words)
-        if not _is_sweep(words):
-            config = composed(words, recorded)
-    if _is_sweep(words):
-        return _sweep(words, recorded)
+        config = composed(words, _recorded(words))
     from trihedron.pipeline.app.execute import execute
 
     try:
@@ -175,9 +195,10 @@ def _run(words: list[str]) -> int:
     except Exception as error:  # an interpolation of the user's that leads nowhere
         raise rewritten(error) from error
     config.out = literal_text(str(out))  # with the time of its beginning
-    execute(config, out, with_literal_paths(words), _BEGAN)
-    _point_latest(out)
-    return 0
+    metrics = execute(config, out, with_literal_paths(words), began)
+    if not config.replay:  # a part of a run, and no run to look at
+        _point_latest(out)
+    return out, metrics
 
 
 def _sweep(words: list[str], recorded: RecordedConfig | None) -> int:

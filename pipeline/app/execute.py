@@ -23,13 +23,14 @@ from trihedron.pipeline.core.errors import ConfigError, DataError, RecordingErro
 from trihedron.pipeline.core.graph import Graph
 from trihedron.pipeline.core.overrides import literal_text, path_of, quoted
 from trihedron.pipeline.core.slots import output_of
-from trihedron.pipeline.core.types import Surface, Trajectory
+from trihedron.pipeline.core.types import Building, Surface, Trajectory
 from trihedron.pipeline.record.reader import Recording
 from trihedron.pipeline.record.trajectories import TRUTH, attached_truth, format_trajectory
 from trihedron.pipeline.record.writer import RecordingWriter
 from trihedron.pipeline.run import results
+from trihedron.pipeline.run.building_files import write_building
 from trihedron.pipeline.run.interrupts import Interrupts
-from trihedron.pipeline.run.live import Pace, is_camera
+from trihedron.pipeline.run.live import Pace, shows_once
 from trihedron.pipeline.run.map_file import load_map, save_map
 from trihedron.pipeline.run.replay import TOPICS, Replay
 from trihedron.pipeline.run.run_folder import held, write_configuration
@@ -56,9 +57,9 @@ def execute(config: DictConfig, out: Path, overrides: list[str], began: float) -
     graph = graph_of(config)
     replay = _replay(config, graph)
     frames = str(config.dataset.get("frames", "")) if config.dataset is not None else ""
-    remembered, source = _remembered(config, graph), _source(config)
+    remembered, source = remembered_of(config, graph), source_of(config)
     runner = Runner(graph, config.seed, config.threads, replay, frames, remembered, _pace(config))
-    topics = _recorded_topics(config, graph, replay)
+    topics = recorded_topics(config, graph, replay)
     _announce(runner)
     trial = partial(Runner, graph, config.seed, config.threads, replay, frames, remembered)
     compile_once(runner.computed, runner.feed is not None)
@@ -67,7 +68,7 @@ def execute(config: DictConfig, out: Path, overrides: list[str], began: float) -
         with _Warnings() as warnings, compilation_reported():
             warm_up(trial())
             warnings.muted = False
-            writer = RecordingWriter(out / RECORDING, {**_metadata(config, overrides), TOPICS: json.dumps(sorted(topics))})
+            writer = RecordingWriter(out / RECORDING, {**metadata_of(config, overrides), TOPICS: json.dumps(sorted(topics))})
             attachments = _attachments(graph, replay)
             for name, text in attachments.items():
                 writer.attach(name, text)
@@ -77,19 +78,19 @@ def execute(config: DictConfig, out: Path, overrides: list[str], began: float) -
                 for _ in _progress(runner.steps(writer, topics, embed_frames="dataset" in topics, truth=truth)):
                     pass
                 if config.save_map:
-                    save_map(Path(config.save_map).expanduser(), runner.state, _metadata(config, overrides), source)
+                    save_map(Path(config.save_map).expanduser(), runner.state, metadata_of(config, overrides), source)
             finally:
                 with Interrupts() as interrupts, interrupts.held():
-                    failure = _closed(writer)
-                    metrics, timing = _write(runner, truth, out, started, began)
+                    failure = closed(writer)
+                    metrics, timing = write_files(runner, truth, out, started, began)
                     warnings.summarise()
-        _report(out, metrics, timing, [results.write_surface(out, value) for value in runner.result.folds.values() if isinstance(value, Surface)])
+        _report(out, metrics, timing, _models(out, runner))
     if failure is not None:
         raise failure
     return metrics
 
 
-def _closed(writer: RecordingWriter) -> RecordingError | None:
+def closed(writer: RecordingWriter) -> RecordingError | None:
     """Close the recording; what goes wrong must not cost the trajectory."""
     try:
         writer.close()
@@ -98,7 +99,7 @@ def _closed(writer: RecordingWriter) -> RecordingError | None:
     return None
 
 
-def _remembered(config: DictConfig, graph: Graph) -> Callable[[int], DelayLines] | None:
+def remembered_of(config: DictConfig, graph: Graph) -> Callable[[int], DelayLines] | None:
     """What a run begins with: nothing, or the map file it goes on from."""
     if config.save_map and config.replay:
         raise ConfigError("save_map", "a replay makes no map to go on from", "save the map of the run itself")
@@ -110,7 +111,7 @@ def _remembered(config: DictConfig, graph: Graph) -> Callable[[int], DelayLines]
         return None
     if "map" not in max_delays(graph.stages.values()):
         raise ConfigError("load_map", "no stage of this graph reads a map", "choose another graph")
-    saved, source = load_map(config.load_map), _source(config)
+    saved, source = load_map(config.load_map), source_of(config)
     return lambda first: saved.delay_lines(first, source)
 
 
@@ -122,7 +123,7 @@ def _pace(config: DictConfig) -> Pace:
     return Pace.live if config.live else Pace.real_time if config.real_time else Pace.none
 
 
-def _source(config: DictConfig) -> str:
+def source_of(config: DictConfig) -> str:
     """What is tracked, whichever part of it: the data set's options with absolute paths."""
     options: Any = OmegaConf.to_container(config.dataset, resolve=True, enum_to_str=True) if config.dataset is not None else {}
     options = {name: _absolute(value) if f"dataset.{name}" in READ_PATHS else str(value) for name, value in options.items() if name != "frames"}
@@ -141,14 +142,14 @@ def _replay(config: DictConfig, graph: Graph) -> Replay | None:
     return Replay(Recording(config.replay), only, config.feedback is Feedback.recorded)
 
 
-def _recorded_topics(config: DictConfig, graph: Graph, replay: Replay | None) -> frozenset[str]:
+def recorded_topics(config: DictConfig, graph: Graph, replay: Replay | None) -> frozenset[str]:
     """All computed topics that are not dense, and the dense ones that were named."""
     known = set(graph.stages) | (replay.recording.topics if replay is not None else set())  # a replay may leave out stages of the run
     for name in config.record.topics:
         if name not in known:
             raise ConfigError("record.topics", f"no stage writes '{name}'", did_you_mean(name, known))
     names = {name for name in graph.stages if not output_of(name).dense} | (set(config.record.topics) & set(graph.stages))
-    names |= {"dataset"} if config.record.frames or is_camera(graph.stages["dataset"].plugin) else set()  # a camera shows no frame twice
+    names |= {"dataset"} if config.record.frames or shows_once(graph.stages["dataset"].plugin) else set()
     return frozenset(names if replay is None else names & set(replay.only))
 
 
@@ -160,7 +161,7 @@ def _announce(runner: Runner) -> None:
             print(f"not in {runner.replay.recording.path}, computed again: {', '.join(extra)}")
 
 
-def _metadata(config: DictConfig, overrides: list[str]) -> dict[str, str]:
+def metadata_of(config: DictConfig, overrides: list[str]) -> dict[str, str]:
     """Describe the run: version, commit, the words of its command, and its composed configuration, from which a replay is made."""
     config = config.copy()
     for key in READ_PATHS:
@@ -211,7 +212,7 @@ def _progress(steps: Iterator[Step]) -> Iterator[Step]:
         bar.close()
 
 
-def _write(runner: Runner, truth: Trajectory | None, out: Path, started: float, began: float) -> tuple[dict[str, Any], dict[str, Any]]:
+def write_files(runner: Runner, truth: Trajectory | None, out: Path, started: float, began: float) -> tuple[dict[str, Any], dict[str, Any]]:
     """The files beside the recording; returns metrics and times. A trajectory is written only where poses were computed."""
     metrics: dict[str, Any] = {}
     timing = runner.timing.summary(runner.threads, time.perf_counter() - started, started - began)
@@ -232,6 +233,13 @@ def _attachments(graph: Graph, replay: Replay | None) -> dict[str, str]:
         return replay.recording.attachments
     truth: Trajectory | None = graph.stages["dataset"].plugin.truth()
     return {TRUTH: format_trajectory(truth)} if truth is not None else {}
+
+
+def _models(out: Path, runner: Runner) -> list[str]:
+    """Write the surface and the building of a run, and return lines that describe them."""
+    folds = list(runner.result.folds.values())
+    lines = [results.write_surface(out, value) for value in folds if isinstance(value, Surface)]
+    return lines + [line for value in folds if isinstance(value, Building) for line in write_building(out, value)]
 
 
 def _report(out: Path, metrics: dict[str, Any], timing: dict[str, Any], surfaces: list[str]) -> None:

@@ -90,6 +90,11 @@ def transform(T_a_b: F64, points_b: F64) -> F64:
     return points_b @ T_a_b[:3, :3].T + T_a_b[:3, 3]
 
 
+def transform_each(T_a_b: F64, points_b: F64) -> F64:
+    """Transform (n, k, 3) points of frame b into frame a, each row by its own motion (n, 4, 4)."""
+    return points_b @ T_a_b[:, :3, :3].swapaxes(-1, -2) + T_a_b[:, None, :3, 3]
+
+
 def transform_planes(T_a_b: F64, planes_b: F64) -> F64:
     """Transform (..., 4) planes (n, d) of frame b into frame a, signs as they are: d may become negative."""
     n = planes_b[..., :3] @ T_a_b[:3, :3].T
@@ -145,10 +150,11 @@ def _quaternion(R: F64) -> tuple[float, float, float, float]:
 
 def rotation_from_quaternion(q: F64) -> F64:
     """Convert a (4,) quaternion (x, y, z, w), normalised here, to a (3, 3) rotation. Raises ValueError for a zero or non-finite one."""
-    norm = float(np.linalg.norm(q))
-    if not np.isfinite(norm) or norm < 1e-9:
+    x, y, z, w = q.tolist()
+    norm = math.sqrt(x * x + y * y + z * z + w * w)
+    if not math.isfinite(norm) or norm < 1e-9:
         raise ValueError("not a rotation: the quaternion is zero or not finite")
-    x, y, z, w = q / norm
+    x, y, z, w = x / norm, y / norm, z / norm, w / norm
     return np.array(
         [
             [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],

@@ -11,12 +11,12 @@ import re
 from collections.abc import Mapping
 from typing import Any
 
-import yaml
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from trihedron.pipeline.core.config import PLUGIN_KEY, RecordedConfig, RunOptions, make_plugin, option_type
 from trihedron.pipeline.core.errors import RecordingError, TrihedronError
+from trihedron.pipeline.core.files import YamlError, parse_yaml
 from trihedron.pipeline.core.overrides import literal_text
 from trihedron.pipeline.core.registry import load_plugins, plugin_class
 from trihedron.pipeline.core.slots import SLOTS
@@ -45,18 +45,10 @@ def _parsed(text: str, place: str) -> Mapping[str, Any]:
     """The mapping in YAML of limited length and depth, without aliases."""
     if len(text) > MAX_CHARACTERS:
         raise RecordingError(place, f"has a configuration of {len(text)} characters, more than {MAX_CHARACTERS}", CURE)
-    depth = 0
     try:
-        for event in yaml.parse(text, yaml.CSafeLoader):
-            depth += isinstance(event, yaml.CollectionStartEvent) - isinstance(event, yaml.CollectionEndEvent)
-            if depth > MAX_DEPTH or isinstance(event, yaml.AliasEvent):
-                raise RecordingError(place, "has a configuration with aliases or deep nesting", CURE)
-        loader = yaml.CSafeLoader(text)
-        content = loader.get_single_data() or {}
-    except RecordingError:
-        raise
-    except Exception as error:  # PyYAML raises ValueError, TypeError, OverflowError and others for scalars such as 2024-13-45
-        raise RecordingError(place, f"has a configuration that is not YAML ({type(error).__name__})", CURE) from error
+        content = parse_yaml(text, MAX_DEPTH) or {}
+    except YamlError as error:
+        raise RecordingError(place, f"has a configuration {error}", CURE) from error
     if not isinstance(content, dict):
         raise RecordingError(place, "has a configuration that is not a mapping", CURE)
     return content

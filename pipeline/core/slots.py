@@ -20,6 +20,7 @@ from typing import Annotated, Any, Generic, Protocol, TypeVar, get_type_hints, r
 import numpy as np
 
 from trihedron.pipeline.core.types import (
+    Building,
     Camera,
     Correction,
     Frame,
@@ -244,6 +245,16 @@ class SurfaceSlot(Protocol, Generic[State]):
     def finish(self, state: State, map: Map | None) -> Surface: ...
 
 
+class BuildingSlot(Protocol, Generic[State]):
+    """The storeys, walls, rooms and openings of a building; a plan that says what is missing rather than None. A fold, as `surface` is."""
+
+    def start(self) -> State: ...
+
+    def add(self, state: State, frame: Frame, planes: Planes, rotation: Rotation | None, pose: Pose, map: Map | None) -> State: ...
+
+    def finish(self, state: State, map: Map | None) -> Building: ...
+
+
 @runtime_checkable
 class Localising(Protocol):
     """Optional interface of any plugin: `localising` returns the plugin that takes its place when the camera is only localised in a loaded map, which
@@ -271,8 +282,9 @@ SLOTS: dict[str, type[Any]] = {
     "relocalise": RelocaliseSlot,
     "model": ModelSlot,
     "surface": SurfaceSlot,
+    "building": BuildingSlot,
 }
-FOLDS = frozenset({"surface"})
+FOLDS = frozenset({"surface", "building"})
 
 
 def method_of(slot: str) -> str:

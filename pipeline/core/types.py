@@ -33,9 +33,11 @@ __all__ = [
     "I32",
     "LOST",
     "OK",
+    "OPENING_KINDS",
     "PLANE_KINDS",
     "U8",
     "Bool",
+    "Building",
     "Camera",
     "Column",
     "Correction",
@@ -494,4 +496,63 @@ class Surface(Value):
         return Surface(
             index, stamp_ns, none, no_color, np.empty((0, 3), np.int32), no_number, no_number.copy(), np.empty((0, 4)), np.empty(0, np.uint8),
             np.empty(0, np.float32), no_color.copy(), np.empty((0, 3), np.int32), no_number.copy(), atlas, texels, np.full(3, np.nan),
+        )  # fmt: skip
+
+
+# The type of the topic `building`: a plan with heights.
+
+OPENING_KINDS = ("door", "passage", "window")  # a passage reaches the ceiling or is wider than a door; a window begins above the floor
+ELEMENTS = ("storey", "wall", "room", "opening")
+SUPPORTS = ("plane", "keyframe", "frame")
+
+
+@dataclass(frozen=True)
+class Building(Value):
+    """Storeys, walls, rooms and openings, in the building's frame: z up, z = 0 at the lowest floor, y the horizontal axis nearest to the first
+    camera's view, x to its right, the first camera above the origin; metres.
+
+    Of storey i: `storeys` is its floor and ceiling height (NaN = not seen). Of wall i: `walls_m` are the ends of its face, with the side the face was
+    seen from on the left; the other face is parallel, `thickness_m` behind it (NaN = not seen); `wall_covariance` is that of (offset of the face,
+    thickness, direction in rad). Rows of `unseen` are (wall, begin, end): the stretches, in metres from the wall's start, that no reading shows.
+    Of room i: row k of `loops` is (room, begin, end), `corners_m[begin:end]` go round it anticlockwise, round a hole the other way; corner j and its
+    successor are the ends of an edge on wall `corner_walls[j]`, -1 where nothing bounds what was seen; `closed` says that every edge is on a wall.
+    Of opening i: its wall, its (left, right) in metres from the wall's start, its (bottom, top) above the floor, the covariance of these four, a row
+    of OPENING_KINDS, and the rooms it joins (-1 = none). `furniture` are ids of the planes of the map that are none of the building's own. Rows of
+    `support` are (row of ELEMENTS, the element, row of SUPPORTS, id or number). `note` says what is missing."""
+
+    T_world_building: Annotated[F64, Shape(4, 4), Rotations()]
+    note: str
+    storeys: Annotated[F64, Shape("s", 2)]
+    storey_covariance: Annotated[F64, Shape("s", 2, 2)]  # of (floor, ceiling), m²; NaN = not seen
+    walls_m: Annotated[F64, Shape("w", 2, 2), Finite()]
+    wall_storeys: Annotated[I32, Shape("w"), IndexInto(".storeys")]
+    thickness_m: Annotated[F64, Shape("w")]
+    wall_covariance: Annotated[F64, Shape("w", 3, 3)]
+    unseen: Annotated[F64, Shape("u", 3), Finite()]
+    room_storeys: Annotated[I32, Shape("r"), IndexInto(".storeys")]
+    loops: Annotated[I32, Shape("l", 3), IndexInto(".room_storeys", ".corners_m+", ".corners_m+")]
+    corners_m: Annotated[F64, Shape("c", 2), Finite()]
+    corner_walls: Annotated[I32, Shape("c"), IndexInto(".walls_m", least=-1)]
+    areas_m2: Annotated[F64, Shape("r"), Finite()]
+    area_variance: Annotated[F64, Shape("r")]  # m⁴
+    closed: Annotated[Bool, Shape("r")]
+    opening_walls: Annotated[I32, Shape("o"), IndexInto(".walls_m")]
+    opening_kinds: Annotated[U8, Shape("o"), Within(0, len(OPENING_KINDS) - 1)]
+    spans_m: Annotated[F64, Shape("o", 2), Finite()]
+    opening_heights_m: Annotated[F64, Shape("o", 2), Finite()]
+    opening_covariance: Annotated[F64, Shape("o", 4, 4)]
+    opening_rooms: Annotated[I32, Shape("o", 2), IndexInto(".room_storeys", least=-1)]
+    furniture: Annotated[I32, Shape("f")]
+    support: Annotated[I32, Shape("n", 4)]
+
+    @staticmethod
+    def empty(index: int, stamp_ns: int, note: str, T_world_building: F64 | None = None) -> Building:
+        """Make a plan without any element that says why."""
+        T = np.eye(4) if T_world_building is None else T_world_building
+        number, none, rows = np.empty(0, np.int32), np.empty(0), np.empty((0, 2))
+        return Building(
+            index, stamp_ns, T, note, rows, np.empty((0, 2, 2)), np.empty((0, 2, 2)), number, none, np.empty((0, 3, 3)), np.empty((0, 3)),
+            number.copy(), np.empty((0, 3), np.int32), rows.copy(), number.copy(), none.copy(), none.copy(), np.empty(0, np.bool_), number.copy(),
+            np.empty(0, np.uint8), rows.copy(), rows.copy(), np.empty((0, 4, 4)), np.empty((0, 2), np.int32), number.copy(),
+            np.empty((0, 4), np.int32),
         )  # fmt: skip

@@ -165,17 +165,22 @@ def get_array(array: Any, place: str) -> Any:
         return array.data.decode("utf-8", "replace")
     dtype = element_type({"bool": "?", "int": "i8", "float": "f8"}.get(array.dtype, array.dtype))
     shape = tuple(array.shape)
-    size = int(np.prod([float(n) for n in shape])) * dtype.itemsize if shape else dtype.itemsize
-    if dtype.hasobject or len(shape) > MAX_AXES or any(n < 0 for n in shape) or size > MAX_BYTES or (shape and array.dtype in SCALARS):
+    if dtype.hasobject or not _allowed(shape, dtype.itemsize) or (shape and array.dtype in SCALARS):
         raise RecordingError(place, f"array '{printable(array.name, 60)}' claims type '{printable(array.dtype, 20)}' and shape {shape[:4]}", DAMAGED)
     if array.encoding not in ENCODINGS:
         cause = f"array '{printable(array.name, 60)}' has the encoding '{printable(array.encoding, 40)}', this program reads {', '.join(ENCODINGS)}"
         raise RecordingError(place, cause, "read it with the version that wrote it")
+    size = math.prod(shape) * dtype.itemsize
     data = _plain(array, shape, size)
     if data is None or len(data) != size:
         raise RecordingError(place, f"array '{printable(array.name, 60)}' does not have the {size} bytes of its shape {shape}", DAMAGED)
     content = np.frombuffer(data, dtype).reshape(shape)
     return SCALARS[array.dtype](content[()]) if array.dtype in SCALARS else content
+
+
+def _allowed(shape: tuple[int, ...], itemsize: int) -> bool:
+    """Check that a shape has few axes and few bytes; beside an axis of length 0 NumPy counts the others, too."""
+    return len(shape) <= MAX_AXES and min(shape, default=0) >= 0 and math.prod(max(n, 1) for n in shape) * itemsize <= MAX_BYTES
 
 
 def element_type(name: str) -> np.dtype[Any]:
@@ -191,7 +196,7 @@ def _plain(array: Any, shape: tuple[int, ...], size: int) -> bytes | None:
         steps = _unpacked(array.data, size) if len(shape) == 3 and size == int(np.prod(shape)) else None
         return bytes(np.add.accumulate(np.frombuffer(steps, np.uint8).reshape(shape), axis=0, dtype=np.uint8).tobytes()) if steps else None
     if array.encoding == "columns":
-        if len(array.data) != size or not size:
+        if len(array.data) != size or not size or not shape:
             return None
         return bytes(cv2.transpose(np.frombuffer(array.data, np.uint8).reshape(-1, shape[0])).tobytes())
     return bytes(array.data)

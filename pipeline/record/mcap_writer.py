@@ -84,6 +84,12 @@ class McapWriter:
                 self._room.wait(FLUSH_SECONDS)
                 self._room.clear()
 
+    def flush(self) -> None:
+        """Write what is queued."""
+        with self._writing:
+            self._take_all()
+        self._file.sync()
+
     def close(self) -> None:
         """Write what is queued, and the index; the file is complete only then. Raises RecordingError when that, or anything before, failed."""
         if self._closing:
@@ -109,11 +115,14 @@ class McapWriter:
             closing = self._closing
             if self._queue:
                 with self._writing:
-                    for _ in range(len(self._queue)):
-                        self._take()
-                    self._writer.flush()
+                    self._take_all()
                 self._file.sync()
             self._room.set()
+
+    def _take_all(self) -> None:
+        for _ in range(len(self._queue)):
+            self._take()
+        self._writer.flush()
 
     def _take(self) -> None:
         """Write the messages of the oldest queued function."""

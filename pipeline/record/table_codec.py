@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 from trihedron.pipeline.core.table import CHUNK, Column, Table
 from trihedron.pipeline.record.array_codec import MAX_BYTES, array_parts, element_type, text_field
 
+ROW_NUMBER = 8  # bytes of a row's number, which a row without columns takes, too
 CHECKPOINT_EVERY = 64  # messages; on a walk through new rooms a checkpoint adds a third to the changes, however far apart they are
 MAX_CHECKPOINTS = 16  # that build on each other: reading one frame reads them all
 WORTH = 2 / 3  # of the bytes of a full snapshot, which a checkpoint must not exceed
@@ -122,8 +123,10 @@ class Change:
         freed = self.freed
         if freed.dtype != np.int32 or freed.ndim != 1 or (freed[:1] < 0).any() or (np.diff(freed) <= 0).any() or (freed >= self.size // CHUNK).any():
             raise ValueError(f"{name}: chunks that are not there")
-        if not 0 <= known <= self.size or self.size * max(sum(column.row_bytes for column in self.schema.values()), 1) > MAX_BYTES:
+        if not 0 <= known <= self.size or self.size * max(sum(column.row_bytes for column in self.schema.values()), ROW_NUMBER) > MAX_BYTES:
             raise ValueError(f"{name}: a table of {self.size} rows")
+        if self.size - known > len(freed) * CHUNK + min((len(ids) for ids, _ in self.columns.values()), default=0):
+            raise ValueError(f"{name}: rows are missing")
         added = np.arange(known, self.size)
         added = added[~np.isin(added // CHUNK, freed)]
         if len(added) and len(self.columns) < max(len(self.schema), 1):

@@ -2,18 +2,21 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from decimal import Decimal, DecimalException
 from pathlib import Path
 
 import numpy as np
 
-from trihedron.pipeline.core.errors import DataError
+from trihedron.pipeline.core.errors import DataError, printable
+from trihedron.pipeline.core.files import SHOWN, read_text
 from trihedron.pipeline.core.geometry import pose_matrix, quaternion_from_rotation, rotation_from_quaternion
 from trihedron.pipeline.core.types import F64, Trajectory
 
 TRUTH = "groundtruth.txt"  # in a folder, and attached to a recording, so that a replay is judged without the folder
 MAX_STAMP_S = 2**62 // 1_000_000_000  # what fits into 64 bits of nanoseconds
+MAX_BYTES, MAX_LINES, MAX_LINE = 1 << 26, 1_000_000, 4096  # of a list or trajectory: bytes, lines, characters of a line
 LAYOUT = "stamp tx ty tz qx qy qz qw"
 
 
@@ -24,8 +27,8 @@ def parse_stamp_ns(text: str) -> int:
         if abs(seconds) < MAX_STAMP_S:
             return int((seconds * 1_000_000_000).to_integral_value())
     except (DecimalException, ValueError) as error:  # its exponent may be anything
-        raise ValueError(f"the time stamp '{text}' is not a number of seconds") from error
-    raise ValueError(f"the time stamp '{text}' is too large for seconds")
+        raise ValueError(f"the time stamp '{printable(text, SHOWN)}' is not a number of seconds") from error
+    raise ValueError(f"the time stamp '{printable(text, SHOWN)}' is too large for seconds")
 
 
 def format_stamp(stamp_ns: int) -> str:
@@ -37,19 +40,19 @@ def format_stamp(stamp_ns: int) -> str:
 def table_lines(path: Path) -> list[tuple[int, list[str]]]:
     """The words of each line that is neither blank nor a comment, with its line number (from 1); commas and tabs separate like blanks.
 
-    Raises DataError when the file cannot be read as text."""
-    try:
-        text = path.read_text(encoding="utf-8-sig")
-    except UnicodeDecodeError as error:
-        raise DataError(str(path), "is not a text file", "give a text file with one entry a line") from error
-    except OSError as error:
-        raise DataError(str(path), f"cannot be read ({error.strerror})", "check the path and its permissions") from error
-    return split_lines(text)
+    Raises DataError when the file cannot be read as text, or is larger than any list of frames."""
+    return split_lines(read_text(path, MAX_BYTES), str(path))
 
 
-def split_lines(text: str) -> list[tuple[int, list[str]]]:
+def split_lines(text: str, place: str) -> list[tuple[int, list[str]]]:
     """`table_lines` of a text."""
-    rows = ((number, line.split("#")[0].replace(",", " ").split()) for number, line in enumerate(text.splitlines(), start=1))
+    lines = text.splitlines()
+    if len(lines) > MAX_LINES:
+        raise DataError(place, f"has more than {MAX_LINES} lines", "give a shorter list")
+    long = next((number for number, line in enumerate(lines, start=1) if len(line) > MAX_LINE), None)
+    if long is not None:
+        raise DataError(f"{place}:{long}", f"is longer than {MAX_LINE} characters", "give one entry a line")
+    rows = ((number, line.split("#")[0].replace(",", " ").split()) for number, line in enumerate(lines, start=1))
     return [(number, words) for number, words in rows if words]
 
 
@@ -71,7 +74,9 @@ def parse_trajectory(rows: list[tuple[int, list[str]]], source: str) -> Trajecto
         except ValueError as error:
             raise DataError(place, str(error), f"each line holds '{LAYOUT}'; correct or remove this one") from error
         if stamps and stamp_ns <= stamps[-1]:
-            raise DataError(place, f"the time stamp {words[0]} does not come after the one before", "sort the file and remove duplicates")
+            raise DataError(
+                place, f"the time stamp {printable(words[0], SHOWN)} does not come after the one before", "sort the file and remove duplicates"
+            )
         stamps.append(stamp_ns)
         poses.append(pose)
     if not stamps:
@@ -89,7 +94,7 @@ def _parse_pose(words: list[str]) -> tuple[int, F64]:
         raise ValueError("a column is not a number") from None
     if not np.isfinite(values).all():
         raise ValueError("the pose is not finite")
-    if np.linalg.norm(values[3:]) < 1e-3:
+    if math.hypot(*values[3:].tolist()) < 1e-3:
         raise ValueError("the quaternion is zero")
     return stamp_ns, pose_matrix(rotation_from_quaternion(values[3:]), values[:3])
 
@@ -97,7 +102,7 @@ def _parse_pose(words: list[str]) -> tuple[int, F64]:
 def attached_truth(attachments: Mapping[str, str], source: str) -> Trajectory | None:
     """The ground truth among a recording's attached texts, or None."""
     text = attachments.get(TRUTH)
-    return parse_trajectory(split_lines(text), f"{source}: {TRUTH}") if text is not None else None
+    return parse_trajectory(split_lines(text, place := f"{source}: {TRUTH}"), place) if text is not None else None
 
 
 def write_trajectory(path: str | Path, trajectory: Trajectory) -> None:

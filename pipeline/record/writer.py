@@ -101,6 +101,11 @@ class RecordingWriter:
             self._channels[TIMING_TOPIC] = self._file.channel(TIMING_TOPIC, "trihedron.Timing", "jsonschema", definition, "json")
         return self._channels[TIMING_TOPIC]
 
+    def flush(self) -> None:
+        """Write all values so far to the file, which lacks its index then."""
+        self._release(None)
+        self._file.flush()
+
     def close(self) -> None:
         """Write the index; the file is complete only then."""
         try:

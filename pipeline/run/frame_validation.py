@@ -11,6 +11,7 @@ import numpy as np
 
 from trihedron.pipeline.core.errors import DataError
 from trihedron.pipeline.core.types import F32, Frame
+from trihedron.pipeline.run.registration_check import RegistrationCheck
 
 log = logging.getLogger("trihedron")
 LATE_NS = 1_000_000_000  # a frame that comes this late or later was not late: the clock was set back
@@ -110,6 +111,7 @@ class FrameValidation:
         self._set_back_ns = 0
         self._medians_m: list[float] = []
         self._frozen = FrozenDepth()
+        self._registration = RegistrationCheck()
         self.late: set[int] = set()
 
     def __call__(self, position: int, read: Callable[[int], Any], index: Callable[[], int]) -> Any:
@@ -164,6 +166,9 @@ class FrameValidation:
             stamp_ns = self._last_ns + period_ns
         self._last_ns = stamp_ns
         self._judge_scale(frame.depth_m)
+        misregistered = self._registration(frame)
+        if misregistered:
+            log.warning("depth is not registered to colour: %s; register it, or calibrate the two cameras", misregistered)
         return frame if stamp_ns == frame.stamp_ns else replace(frame, stamp_ns=stamp_ns)
 
     def _judge_scale(self, depth_m: F32) -> None:

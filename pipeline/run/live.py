@@ -110,6 +110,12 @@ def is_camera(dataset: Any) -> bool:
     return hasattr(dataset, "wait")
 
 
+def shows_once(dataset: Any) -> bool:
+    """Return True for a live source whose frames are always embedded in a recording, as it shows none twice; `embedded = False` declares one whose
+    frames are not."""
+    return is_camera(dataset) and bool(getattr(dataset, "embedded", True))
+
+
 def feed_of(dataset: Any, pace: Pace) -> Feed | None:
     """Return the feed of a live source, or of a data set played as one; None where frames can be read at any time. Raises DataError where no frame
     can be read, which has the rate."""

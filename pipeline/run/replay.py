@@ -106,10 +106,11 @@ def plan_run(graph: Graph, replay: Replay | None, frames: str) -> Plan:
 
 def _check_images(graph: Graph, replay: Replay) -> None:
     """Raise RecordingError when a replay needs the images, the recording does not embed them, and the data set cannot be opened."""
+    needing = " and ".join(replay.only)
+    if is_camera(graph.stages["dataset"].plugin):
+        raise RecordingError(str(replay.recording.path), f"does not embed the images that {needing} must see", "record with record.frames=true")
     try:
-        if is_camera(graph.stages["dataset"].plugin):
-            raise DataError("dataset", "a camera shows no frame twice")
         len(graph.stages["dataset"].plugin)
     except DataError as error:
-        cause = f"does not embed the frames that {' and '.join(replay.only)} must see, and the data set is gone ({error.place}: {error.cause})"
+        cause = f"does not embed the frames that {needing} must see, and the data set is gone ({error.place}: {error.cause})"
         raise RecordingError(str(replay.recording.path), cause, "give its new place as dataset.path=FOLDER") from error

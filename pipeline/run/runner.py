@@ -35,6 +35,7 @@ from trihedron.pipeline.run.state import DelayLines, StateBuffer, max_delays, re
 from trihedron.pipeline.run.value_checks import check_together, checked
 
 TRIM_EVERY = 1000  # frames; it takes some 10 ms
+NodeCall = Callable[[int, Mapping[str, Any]], Any]
 FRAME_TAKEN = "dataset:"  # input of every stage of a live run: which frame it is must be known first
 
 
@@ -60,8 +61,11 @@ class Runner:
         frames: str = "",
         initial: Callable[[int], DelayLines] | None = None,
         pace: Pace = Pace.none,
+        on_value: Callable[[int, str, Value | None], None] | None = None,
     ) -> None:
-        """`initial` returns the values of delayed wires before the frame of a given number, `pace` is when frames may be read."""
+        """`initial` returns the values of delayed wires before the frame of a given number, `pace` is when frames may be read. `on_value` is called
+        with position, stage and value as soon as a stage is done with a frame, from any thread."""
+        self._on_value = on_value
         self.graph, self.seed, self.threads, self.replay = graph, seed, threads, replay
         self.feed = feed_of(graph.stages["dataset"].plugin, pace) if replay is None else None
         self.plan = plan_run(graph, replay, frames)
@@ -136,10 +140,23 @@ class Runner:
             if wire.topic.startswith(RECORDED) and wire.topic not in readers:
                 readers[wire.topic] = self._reader_node(wire.topic)
         if stage.name == "dataset":
-            return Node(stage.name, lambda position, _: self._read_frame(stage, position), inputs, ordered=True, waits=self.feed is not None)
+            read = self._reported(stage.name, lambda position, _: self._read_frame(stage, position))
+            return Node(stage.name, read, inputs, ordered=True, waits=self.feed is not None)
         if self.feed is not None:
             inputs[FRAME_TAKEN] = Wire("dataset")
-        return Node(stage.name, partial(self._call, stage), inputs, stage.fold)
+        return Node(stage.name, self._reported(stage.name, partial(self._call, stage)), inputs, stage.fold)
+
+    def _reported(self, stage: str, call: NodeCall) -> NodeCall:
+        """Wrap the call of a stage so that its value is handed to `on_value`."""
+        if (report := self._on_value) is None:
+            return call
+
+        def call_and_report(position: int, values: Mapping[str, Any]) -> Any:
+            value = call(position, values)
+            report(position, stage, value)
+            return value
+
+        return call_and_report
 
     def _reader_node(self, name: str) -> Node:
         assert self.replay is not None
@@ -208,6 +225,10 @@ class Runner:
         self.result.folds[name] = value
         if recorder is not None:
             recorder.fold(name, value)
+
+    def fold_state(self, name: str) -> Any:
+        """Return the state of a fold so far, that of no frame before its first; to be read while its stage is not called."""
+        return self._fold_states[name] if name in self._fold_states else self.graph.stages[name].plugin.start()
 
     def _recorded_map(self) -> Map | None:
         """Return the map after the last frame, where it was read rather than computed."""

@@ -22,6 +22,11 @@ COMPILING = "compiling functions for this machine, once"
 PLAIN_SECONDS = 10.0  # between two lines where standard error is no terminal
 
 
+def shows_bars() -> bool:
+    """Return True where standard error is a terminal or the output of a notebook's cell, which show progress bars."""
+    return sys.stderr.isatty() or "ipykernel.iostream" in sys.modules
+
+
 class Progress:
     """Progress of compilation on standard error: a bar on a terminal, else a line every few seconds. Nothing is printed before the first function."""
 
@@ -37,7 +42,7 @@ class Progress:
         if self.count == 1:
             print(f"{COMPILING} ...", file=sys.stderr, flush=True)
             self._began = self._printed = now
-            self._bar = tqdm(total=self._total, unit="function", leave=False) if sys.stderr.isatty() else None
+            self._bar = tqdm(total=self._total, unit="function", leave=False) if shows_bars() else None
         if self._bar is not None:
             self._bar.total = None if self._total is None else max(self._total, self.count)
             self._bar.update()

@@ -8,13 +8,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from trihedron.pipeline.core.geometry import invert, pose_matrix, transform_planes
+from trihedron.pipeline.core.geometry import invert, pose_matrix, transform_each, transform_planes
 from trihedron.pipeline.core.options import NonNegativeInt, PositiveFloat, PositiveInt
 from trihedron.pipeline.core.registry import register
-from trihedron.pipeline.core.types import F64, I32, Correction, Map
+from trihedron.pipeline.core.types import I32, Correction, Map
 from trihedron.plugins.bundle.common import BundleMeasurements, BundleState, BundleWindow, bundle_problem, bundle_window, free_poses
 from trihedron.plugins.mapping.covisibility_graph import newest_keyframes
-from trihedron.plugins.mapping.landmarks import ENDS, PLACE
+from trihedron.plugins.mapping.landmarks import ENDPOINTS, POSITION
 from trihedron.plugins.shared.linalg import transform_plane_covariance
 
 
@@ -114,7 +114,7 @@ def _correction(map: Map, window: BundleWindow, seen: BundleMeasurements, state:
     )
     old = map.points.rows("position_m", window.points)
     still = (state.points == old).all(axis=1)
-    points = np.where(still[:, None], _transform_each(T_point, old[:, None])[:, 0], state.points)
+    points = np.where(still[:, None], transform_each(T_point, old[:, None])[:, 0], state.points)
     planes = map.planes.rows("coefficients", window.planes)
     moved = [transform_planes(T, plane[None])[0] for T, plane in zip(T_plane, planes)]
     covariance = map.planes.rows("covariance", window.planes)
@@ -127,10 +127,10 @@ def _correction(map: Map, window: BundleWindow, seen: BundleMeasurements, state:
         keyframe_ids=window.free,
         T_world_keyframe=poses,
         point_ids=window.points,
-        points_m=PLACE.rounded(points),
+        points_m=POSITION.rounded(points),
         point_information=(R @ map.points.rows("information", window.points) @ np.swapaxes(R, -1, -2)).astype(np.float32),
         line_ids=window.lines,
-        endpoints_m=ENDS.rounded(_transform_each(T_line, map.lines.rows("endpoints_m", window.lines))),
+        endpoints_m=ENDPOINTS.rounded(transform_each(T_line, map.lines.rows("endpoints_m", window.lines))),
         line_information=(Q @ map.lines.rows("information", window.lines) @ np.swapaxes(Q, -1, -2)).astype(np.float32),
         plane_ids=window.planes,
         coefficients=np.array(moved, np.float64).reshape(-1, 4),
@@ -144,8 +144,3 @@ def _newest_free(rows: NDArray[np.signedinteger], keyframes: I32, count: int, fr
     known = keyframes < free
     np.maximum.at(newest, rows[known], keyframes[known])
     return newest
-
-
-def _transform_each(T: F64, points: F64) -> F64:
-    """Transform points (n, e, 3), each row by its own T (n, 4, 4)."""
-    return np.asarray(points @ np.swapaxes(T[:, :3, :3], -1, -2) + T[:, None, :3, 3], np.float64)

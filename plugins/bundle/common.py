@@ -9,7 +9,7 @@ import numpy as np
 
 from trihedron.pipeline.core.types import F64, I32, Map, Table
 from trihedron.plugins.mapping.covisibility_graph import covisible_keyframes, newest_keyframes, observed_by
-from trihedron.plugins.mapping.landmarks import places
+from trihedron.plugins.mapping.landmarks import index_of
 from trihedron.plugins.shared.linalg import inverse
 from trihedron.plugins.shared.pose_optimizer_kernels import PARALLEL, PERPENDICULAR
 
@@ -138,7 +138,7 @@ def _observations(map: Map, kind: str, keyframes: I32, ids: I32) -> tuple[I32, I
     spans = map.keyframes.rows(f"{kind}s", keyframes)
     rows = np.concatenate([np.empty(0, np.int32), *(np.arange(a, b, dtype=np.int32) for a, b in spans)])
     who = np.repeat(np.arange(len(keyframes), dtype=np.int32), spans[:, 1] - spans[:, 0])
-    place = places(table.rows(kind, rows), ids)
+    place = index_of(table.rows(kind, rows), ids)
     known = np.flatnonzero(place >= 0)
     place = place[known]
     short = place.astype(np.uint16) if len(ids) < 1 << 16 else place  # numbers of two bytes NumPy sorts in a third of the time

@@ -24,7 +24,7 @@ from trihedron.plugins.bundle.local_window_kernels import (
     retract,
 )
 from trihedron.plugins.mapping.covisibility_graph import newest_keyframes
-from trihedron.plugins.mapping.landmarks import ENDS, PLACE
+from trihedron.plugins.mapping.landmarks import ENDPOINTS, POSITION
 from trihedron.plugins.shared.linalg import inverse
 from trihedron.plugins.shared.linalg_kernels import solve_positive
 
@@ -141,10 +141,10 @@ def bundle_correction(map: Map, window: BundleWindow, found: BundleSolution) -> 
         keyframe_ids=window.free,
         T_world_keyframe=free_poses(state, free),
         point_ids=window.points,
-        points_m=PLACE.rounded(state.points),
+        points_m=POSITION.rounded(state.points),
         point_information=_symmetrise(inverse(points)).astype(np.float32),
         line_ids=window.lines,
-        endpoints_m=ENDS.rounded(state.lines),
+        endpoints_m=ENDPOINTS.rounded(state.lines),
         line_information=_symmetrise(inverse(ends)).astype(np.float32),
         plane_ids=window.planes,
         coefficients=state.planes,

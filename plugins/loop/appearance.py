@@ -1,4 +1,4 @@
-"""Loops found by what the points look like."""
+"""Loop closing by appearance: a bag of binary words."""
 
 from __future__ import annotations
 
@@ -9,20 +9,21 @@ import numpy as np
 
 from trihedron.pipeline.core.options import PositiveInt, Share
 from trihedron.pipeline.core.registry import register
-from trihedron.pipeline.core.types import F64, I32, U8, Map
-from trihedron.plugins.loop.appearance_kernels import U64, nearest_words
-from trihedron.plugins.loop.common import LoopClosing, walked, within_reach
+from trihedron.pipeline.core.types import F64, I32, U8, Correction, Frame, Map
+from trihedron.plugins.loop.common_loop_verification import LoopOptions, close_loop, path_lengths, within_reach
 from trihedron.plugins.mapping.covisibility_graph import observed_by
-from trihedron.plugins.shared.descriptors import words_of
+from trihedron.plugins.shared.feature_matching import words_of
+from trihedron.plugins.shared.feature_matching_kernels import U64, nearest_descriptors
 
 
 @register("loop", "appearance")
 @dataclass(frozen=True)
-class AppearanceLoop(LoopClosing):
+class AppearanceLoop(LoopOptions):
     """Recognise a place by a bag of binary words, trained on the keyframes that are compared: nothing is downloaded.
 
-    A keyframe is a candidate when it is as alike as a share of what the newest keyframe and its predecessor have in common (DBoW2). Every candidate
-    is verified with points, lines and planes and by free space; the correction is that of a pose graph. A scene without points has no words."""
+    A keyframe is a candidate when its similarity is a share of that of the newest keyframe and its predecessor (DBoW2: Gálvez-López and Tardós, T-RO
+    2012): the L1 distance of normalised tf-idf vectors. Every candidate is verified with points, lines and planes and by free space; the correction
+    is that of a pose graph. A scene without points has no words."""
 
     words: PositiveInt = 256
     rounds: PositiveInt = 2  # of the training
@@ -31,22 +32,25 @@ class AppearanceLoop(LoopClosing):
     looked_at: PositiveInt = 20  # keyframes within reach that are compared, the nearest first
     min_likeness: Share = 0.3  # share of the predecessor's likeness
 
-    def ranked(self, map: Map) -> Iterator[tuple[int, float]]:
-        """Keyframes within reach, the most alike first, with the way walked since."""
-        rows, way = within_reach(map, self.reach)
-        rows, way = rows[: self.looked_at], way[: self.looked_at]
-        living, _ = walked(map)
+    def __call__(self, map: Map, frame: Frame) -> Correction | None:
+        """Return the correction; None unless the newest keyframe closes a loop, or the map has rotated out of its Manhattan frame."""
+        return close_loop(self, self._rank, map, frame)
+
+    def _rank(self, map: Map) -> Iterator[tuple[int, float]]:
+        """Keyframes within reach, the most similar first, with the length of the path since."""
+        rows, path_m = within_reach(self, map, self.looked_at)
+        living, _ = path_lengths(map)
         if not len(rows) or len(living) < 2:
             return
         spread = living[np.linspace(0, len(living) - 1, min(self.context, len(living))).round().astype(int)]
         ids = [observed_by(map, np.array([row], np.int32), "point") for row in (*spread, living[-2], *rows, living[-1])]
-        alike = self._likeness(map, ids)[len(spread) :]
-        for k in np.argsort(-alike[1:], kind="stable"):
-            if alike[1 + k] >= self.min_likeness * alike[0] and alike[1 + k] > 0.0:
-                yield int(rows[k]), float(way[k])
+        similarity = self._similarities(map, ids)[len(spread) :]
+        for k in np.argsort(-similarity[1:], kind="stable"):
+            if similarity[1 + k] >= self.min_likeness * similarity[0] and similarity[1 + k] > 0.0:
+                yield int(rows[k]), float(path_m[k])
 
-    def _likeness(self, map: Map, ids: list[I32]) -> np.ndarray:
-        """How alike the last of some sets of points is to each of the others."""
+    def _similarities(self, map: Map, ids: list[I32]) -> F64:
+        """Similarity of the last of some sets of points to each of the others."""
         known = np.unique(np.concatenate(ids)).astype(np.int32)
         if not len(known):
             return np.zeros(len(ids) - 1)
@@ -57,18 +61,23 @@ class AppearanceLoop(LoopClosing):
         return similarities([words[np.searchsorted(known, one)] for one in ids], len(vocabulary))
 
 
-HISTOGRAM = 128  # bytes: a descriptor this long is a histogram (SIFT), and its bits are the bins above the median
+HISTOGRAM = 128  # bytes of a histogram descriptor (SIFT): its bits are the bins above the median
 
 
 def as_bits(descriptors: U8) -> U64:
-    """(n, b) descriptors -> (n, w) machine words of bits."""
+    """Convert descriptors (n, b) to machine words of bits (n, w)."""
     if descriptors.shape[1] == HISTOGRAM:
         descriptors = np.packbits(descriptors > np.median(descriptors, axis=1, keepdims=True), axis=1)
     return words_of(descriptors)[0]
 
 
+def nearest_words(bits: U64, vocabulary: U64) -> I32:
+    """Return the row (n,) of the nearest word of each descriptor, the first of equally near ones."""
+    return nearest_descriptors(bits, vocabulary, 64 * bits.shape[1], 1.0)
+
+
 def train(bits: U64, words: int, rounds: int) -> U64:
-    """(k, w) vocabulary of at most `words` from (n, w) descriptors: evenly chosen ones, then rounds of assignment and majority. Deterministic."""
+    """Train a vocabulary (k, w) of at most `words` on descriptors (n, w) by k-majority clustering (Grana et al. 2013), from evenly chosen ones."""
     chosen = np.unique(np.linspace(0, len(bits) - 1, min(words, len(bits))).round().astype(int))
     vocabulary = bits[chosen]
     single = np.unpackbits(bits.view(np.uint8), axis=1)
@@ -83,7 +92,7 @@ def train(bits: U64, words: int, rounds: int) -> U64:
 
 
 def similarities(bags: list[I32], words: int) -> F64:
-    """(m - 1,) how alike the last of m bags of words is to each other one: 1 for the same words, 0 for none in common."""
+    """Return the similarity (m - 1,) of the last of m bags of words to each other one: 1 for the same words, 0 for none in common."""
     counts = np.array([np.bincount(bag, minlength=words) for bag in bags], np.float64).reshape(len(bags), words)
     idf = np.log(len(bags) / np.maximum(np.count_nonzero(counts, axis=0), 1))
     weighed = counts * np.maximum(idf, 1e-6)

@@ -11,8 +11,8 @@ from trihedron.pipeline.core.types import Correction, Map
 @register("loop", "none")
 @dataclass(frozen=True)
 class NoLoop:
-    """Places seen before are not recognised."""
+    """Skip loop closing."""
 
     def __call__(self, map: Map) -> Correction | None:
-        """None, whatever is given."""
+        """Return None."""
         return None

@@ -1,4 +1,4 @@
-"""Loops found by the layout of planes."""
+"""Loop closing by the layout of planes."""
 
 from __future__ import annotations
 
@@ -9,29 +9,31 @@ import numpy as np
 
 from trihedron.pipeline.core.options import NonNegativeFloat, PositiveInt
 from trihedron.pipeline.core.registry import register
-from trihedron.pipeline.core.types import Map
-from trihedron.plugins.loop.common import LoopClosing, shift_of_planes, within_reach
+from trihedron.pipeline.core.types import Correction, Frame, Map
+from trihedron.plugins.loop.common_loop_verification import LoopOptions, close_loop, displacement_of_planes, within_reach
 from trihedron.plugins.mapping.covisibility_graph import observed_by
 
 
 @register("loop", "planes")
 @dataclass(frozen=True)
-class PlanesLoop(LoopClosing):
-    """Recognise a place by its planes: directions, offsets and extents that agree on one displacement within the drift to be expected.
+class PlanesLoop(LoopOptions):
+    """Recognise a place by its planes: normals, offsets and extents that agree on one displacement within the expected drift.
 
     Every candidate is verified with points, lines and planes and by free space; the correction is that of a pose graph."""
 
     looked_at: PositiveInt = 20  # keyframes within reach whose layout is compared, the nearest first
     min_layout: NonNegativeFloat = 0.3  # planes whose extents agree, at least
 
-    def ranked(self, map: Map) -> Iterator[tuple[int, float]]:
-        """Keyframes within reach, best layout first, with the way walked since."""
-        rows, way = within_reach(map, self.reach)
-        rows, way = rows[: self.looked_at], way[: self.looked_at]
+    def __call__(self, map: Map, frame: Frame) -> Correction | None:
+        """Return the correction; None unless the newest keyframe closes a loop, or the map has rotated out of its Manhattan frame."""
+        return close_loop(self, self._rank, map, frame)
+
+    def _rank(self, map: Map) -> Iterator[tuple[int, float]]:
+        """Keyframes within reach, best layout first, with the length of the path since."""
+        rows, path_m = within_reach(self, map, self.looked_at)
         here = observed_by(map, np.array([len(map.keyframes) - 1], np.int32), "plane")
-        scores = np.array(
-            [shift_of_planes(map, here, observed_by(map, rows[k : k + 1], "plane"), float(self.reach.sigma_m(way[k])))[1] for k in range(len(rows))]
-        )
+        places = [observed_by(map, rows[k : k + 1], "plane") for k in range(len(rows))]
+        scores = np.array([displacement_of_planes(map, here, there, float(self.sigma_m(path_m[k])))[1] for k, there in enumerate(places)])
         for k in np.argsort(-scores, kind="stable"):
             if scores[k] >= self.min_layout:
-                yield int(rows[k]), float(way[k])
+                yield int(rows[k]), float(path_m[k])

@@ -1,4 +1,4 @@
-"""Keyframes optimised by all that they saw in common."""
+"""Loop closing by a pose graph over all keyframes that share points."""
 
 from __future__ import annotations
 
@@ -11,27 +11,26 @@ from trihedron.pipeline.core.geometry import invert, pose_matrix
 from trihedron.pipeline.core.options import NonNegativeFloat, PositiveFloat, PositiveInt, Range
 from trihedron.pipeline.core.registry import register
 from trihedron.pipeline.core.types import F64, I32, Correction, Map
-from trihedron.plugins.loop.common_pose_graph import Edges, moved_keyframes, solve_pose_graph
+from trihedron.plugins.loop.common_pose_graph import Edges, correct_keyframes, solve_pose_graph
 from trihedron.plugins.mapping.covisibility_graph import current_submap, keyframes_of
-from trihedron.plugins.mapping.keyframe_features import measured_points
 from trihedron.plugins.shared.rigid_alignment import fit_covariance, fitted, point_pair_sigma
 
 
 @register("loop", "pose_graph")
 @dataclass(frozen=True)
 class PoseGraph:
-    """Every keyframe is tied to every other one that measured some of the same points, by the motion between these measurements, and all poses are
-    those that agree best with all edges (RGB-D SLAM: Endres et al., T-RO 2014; Grisetti et al., ITS Magazine 2010). Points follow their keyframes.
+    """Connect all keyframes that measured some of the same points by the motion between these measurements, and optimise all poses (RGB-D SLAM:
+    Endres et al., T-RO 2014; Grisetti et al., ITS Magazine 2010). Points move with their keyframes.
 
-    Which points are the same `matches` says, neighbours and loops alike. Landmarks are not adjusted: that is what bundle adjustment does."""
+    `matches` associates the points, of neighbours and loops alike. Landmarks are not adjusted: that is the task of bundle adjustment."""
 
     every: PositiveInt = 3  # keyframes between two optimisations
     min_points: Annotated[int, Range(3)] = 20  # that two keyframes must share
     gate: PositiveFloat = 3.0  # standard deviations within which a point agrees with an edge
-    least_m: NonNegativeFloat = 1e-4  # motion of a keyframe below which nothing is said
+    least_m: NonNegativeFloat = 1e-4  # motion of a keyframe below which nothing is corrected
 
     def __call__(self, map: Map) -> Correction | None:
-        """The correction of all keyframes; None unless the newest one is due and closes a cycle."""
+        """Return the correction of all keyframes; None unless the newest one is due and closes a cycle."""
         newest = len(map.keyframes) - 1
         if newest < 2 or newest % self.every or map.keyframes.row("index", newest) != map.index:
             return None
@@ -42,18 +41,16 @@ class PoseGraph:
             return None
         after = solve_pose_graph(before, edges)
         moved = float(np.linalg.norm(after[:, :3, 3] - before[:, :3, 3], axis=1).max())
-        return moved_keyframes(map, rows, before, after) if moved >= self.least_m else None
+        return correct_keyframes(map, rows, before, after) if moved >= self.least_m else None
 
-
-# The edges of a pose graph: how keyframes that saw the same points stand to each other, by their own measurements of these.
 
 FLOOR_M, FLOOR = 2e-3, 1e-3  # least standard deviations of an edge, m and rad
 LOOSE_M, LOOSE = 0.05, 0.02  # of keyframes that follow each other and share too little
 
 
 def shared_edges(map: Map, rows: I32, poses: F64, least: int, gate: float) -> tuple[Edges, int]:
-    """Edges between all of the keyframes `rows` (sorted), at `poses` (n, 4, 4), that saw at least `least` of the same points and agree on a motion;
-    and the longest of them, in keyframes. Neighbours in time that share less stay as they stand, loosely."""
+    """Return the edges between all of the keyframes `rows` (sorted), at `poses` (n, 4, 4), that measured at least `least` of the same points and
+    agree on a motion; and the longest of them, in keyframes. Neighbours in time that share less are tied loosely by their present motion."""
     seen = [measured_points(map, int(row)) for row in rows]
     pairs, measured, information = [], [], []
     for b in range(len(rows)):
@@ -85,3 +82,17 @@ def _edge(a: tuple[I32, F64, F64, F64], b: tuple[I32, F64, F64, F64], least: int
             return None
     covariance = fit_covariance(here[agree], sigma[agree]) + np.diag(np.repeat([FLOOR_M**2, FLOOR**2], 3))
     return pose_matrix(R, t), covariance
+
+
+def measured_points(map: Map, keyframe: int) -> tuple[I32, F64, F64, F64]:
+    """Return the ids (n,) of the points that a keyframe measured with depth, sorted, their positions (n, 3) in its frame by these measurements, and σ
+    of their depths (m) and pixels."""
+    first, end = map.keyframes.row("points", keyframe)
+    fx, fy, cx, cy = map.keyframes.row("intrinsics", keyframe)
+    names = ("point", "pixel", "depth_m", "sigma_m", "sigma_px")
+    ids, pixel, depth, sigma_m, sigma_px = map.point_observations.gathered(np.arange(first, end), *names)
+    pixel, depth = pixel.astype(np.float64), depth.astype(np.float64)
+    places = np.stack([(pixel[:, 0] - cx) / fx * depth, (pixel[:, 1] - cy) / fy * depth, depth], axis=1)
+    known = np.flatnonzero(np.isfinite(depth))
+    known = known[np.unique(ids[known], return_index=True)[1]]
+    return ids[known], places[known], sigma_m[known].astype(np.float64), sigma_px[known].astype(np.float64)

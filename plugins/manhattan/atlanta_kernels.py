@@ -11,7 +11,8 @@ from trihedron.plugins.manhattan.common_kernels import (
     NORMALS_PER_SAMPLE,
     right_handed,
 )
-from trihedron.plugins.shared.linalg_kernels import left_multiply_exp, solve_positive
+from trihedron.plugins.shared.lie_kernels import left_multiply_exp
+from trihedron.plugins.shared.linalg_kernels import solve_positive
 
 # Directions about a vertical, modulo a quarter turn: where they crowd more than by chance, and which crowd is which from image to image.
 

@@ -9,7 +9,8 @@ import numpy as np
 
 from trihedron.pipeline.core.kernel import kernel
 from trihedron.pipeline.core.types import F32, F64, I32, Bool
-from trihedron.plugins.shared.linalg_kernels import few_descending, inverse_positive, left_multiply_exp, polar_rotation, solve_positive
+from trihedron.plugins.shared.lie_kernels import left_multiply_exp
+from trihedron.plugins.shared.linalg_kernels import few_descending, inverse_positive, polar_rotation, solve_positive
 from trihedron.plugins.shared.manhattan_frames_kernels import assign_axes, measured_directions
 
 # From a frame's features to directions on the sphere, and from directions on three axes to a rotation with its covariance.

@@ -14,7 +14,6 @@ from trihedron.pipeline.core.types import F64, ManhattanFrame, Normals, Segments
 from trihedron.plugins.manhattan.common import HALF_SPHERE, Directions, ModeFinder, Modes, gather_directions
 from trihedron.plugins.manhattan.common_kernels import NORMALS_PER_SAMPLE, NOTHING_KNOWN, mode_statistics, orthonormal, search_axes, shift_axes
 from trihedron.plugins.manhattan.von_mises_fisher_kernels import AxisMixture, converged
-from trihedron.plugins.shared.manhattan_frames import isotropic_information
 from trihedron.plugins.shared.manhattan_frames_kernels import nearest_equivalent
 
 
@@ -127,3 +126,8 @@ def broad_mixture(R: F64, concentration: float) -> AxisMixture:
     """Where to start: nothing belongs anywhere yet."""
     none = np.zeros((2, 3))
     return AxisMixture(np.array(R), np.full((2, 3), concentration), np.full((2, 4), 0.25), np.zeros((2, 3, 3)), none, none)
+
+
+def isotropic_information(directions: F64, sigma: F64) -> F64:
+    """Return the information (n, 3, 3) of directions (n, 3) with an isotropic `sigma` (n,) rad."""
+    return (np.eye(3) - directions[:, :, None] * directions[:, None, :]) / (sigma * sigma)[:, None, None]

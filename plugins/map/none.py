@@ -11,10 +11,10 @@ from trihedron.pipeline.core.types import Map, Pose
 @register("map", "none")
 @dataclass(frozen=True)
 class NoMap:
-    """Nothing is kept: every pose stands on the previous frame alone."""
+    """Skip mapping: every pose is relative to the previous frame alone."""
 
     def __call__(self, pose: Pose) -> Map | None:
-        """None, whatever is given."""
+        """Return None."""
         return None
 
     def localising(self) -> NoMap:

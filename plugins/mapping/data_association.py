@@ -1,4 +1,4 @@
-"""Landmarks of a part of the map found among a frame's features, around where a pose projects them."""
+"""Data association: landmarks of a local window are projected at a predicted pose and matched with a frame's features nearby (section III-A)."""
 
 from __future__ import annotations
 
@@ -12,17 +12,16 @@ from trihedron.pipeline.core.geometry import invert
 from trihedron.pipeline.core.options import NonNegativeInt, PositiveFloat, Range, check_increasing
 from trihedron.pipeline.core.types import F64, I32, U8, Camera, Keypoints, Map, Matches, Planes, Segments
 from trihedron.plugins.mapping.covisibility_graph import LocalWindow
-from trihedron.plugins.mapping.data_association_kernels import pairs_kernel, related
-from trihedron.plugins.mapping.visibility import POINT_COLUMNS, VisiblePoints, clip_segments, visible_points
-from trihedron.plugins.shared.descriptors import match_lines, match_near
+from trihedron.plugins.mapping.landmark_kernels import pairs_by_row, related_planes
+from trihedron.plugins.mapping.projection import POINT_COLUMNS, VisiblePoints, clip_segments, visible_points
+from trihedron.plugins.shared.feature_matching import associate_planes, match_lines, match_near
+from trihedron.plugins.shared.feature_matching_kernels import transform_plane_samples
 from trihedron.plugins.shared.linalg import constant
-from trihedron.plugins.shared.plane_association import associate_planes
-from trihedron.plugins.shared.plane_association_kernels import moved_planes
 
 
 @dataclass(frozen=True)
-class Guess:
-    """A pose (4, 4) to search around, its standard deviations (m, rad), and whether it was measured at all."""
+class PredictedPose:
+    """A pose (4, 4) to search around, its standard deviations (m, rad), and False where it is a mere extrapolation."""
 
     T_world_camera: F64
     sigma_m: float
@@ -31,8 +30,8 @@ class Guess:
 
 
 @dataclass(frozen=True)
-class MapSearch:
-    """How far from its projection a landmark is sought, and what makes a match."""
+class SearchOptions:
+    """Search radii about a landmark's projection, and thresholds of a match."""
 
     radius_px: PositiveFloat = 4.0  # least search radius, at level 0 of the pyramid
     max_radius_px: PositiveFloat = 20.0
@@ -57,68 +56,63 @@ class MapSearch:
     def __post_init__(self) -> None:
         check_increasing(self, "radius_px", "max_radius_px", "wide_radius_px")
 
-    def search(
-        self, camera: Camera, guess: Guess, keypoints: Keypoints, segments: Segments, planes: Planes, map: Map, window: LocalWindow
-    ) -> Matches:
-        """Landmarks of the window found around the guess."""
-        T_camera_world = invert(guess.T_world_camera)
-        pairs, visible = self._points(camera, guess, keypoints, map, window)
-        line_pairs, visible_lines = self._lines(camera, T_camera_world, segments, map, window)
-        same, parallel, perpendicular = self._planes(T_camera_world, planes, map, window)
-        return Matches(keypoints.index, keypoints.stamp_ns, map.revision, pairs, line_pairs, same, parallel, perpendicular, visible, visible_lines)
 
-    def _points(self, camera: Camera, guess: Guess, keypoints: Keypoints, map: Map, window: LocalWindow) -> tuple[I32, I32]:
-        """Pairs (row, id) and the ids expected in view."""
-        known = window.columns(map, "points", *POINT_COLUMNS, "descriptor")
-        seen = visible_points(known[:-1], guess.T_world_camera, camera, self.view_deg, self.octave_scale)
-        ids, descriptors = window.points[seen.rows], known[-1][seen.rows]
-        moved = guess.sigma_m / np.maximum(seen.depth_m, 0.1)  # how far the guess may be off: three standard deviations of it are searched
-        radius = np.minimum(self.radius_px + 3.0 * camera.fx * np.hypot(moved, guess.sigma_rad), self.max_radius_px)
-        found = self._near(seen, descriptors, keypoints, radius)
-        if not guess.measured or np.count_nonzero(found >= 0) < min(self.enough, len(ids), len(keypoints.pixels)):
-            found = self._near(seen, descriptors, keypoints, self.wide_radius_px)
-        return pairs_kernel(found, ids, len(keypoints.pixels)), ids
+def search_map(
+    options: SearchOptions, camera: Camera, prediction: PredictedPose, keypoints: Keypoints, segments: Segments, planes: Planes, map: Map,
+    window: LocalWindow,
+) -> Matches:  # fmt: skip
+    """Match the landmarks of the window with the frame's features about the predicted pose."""
+    T_camera_world = invert(prediction.T_world_camera)
+    pairs, visible = _match_points(options, camera, prediction, keypoints, map, window)
+    line_pairs, visible_lines = _match_lines(options, camera, T_camera_world, segments, map, window)
+    same, parallel, perpendicular = _match_planes(options, T_camera_world, planes, map, window)
+    return Matches(keypoints.index, keypoints.stamp_ns, map.revision, pairs, line_pairs, same, parallel, perpendicular, visible, visible_lines)
 
-    def _near(self, seen: VisiblePoints, descriptors: U8, keypoints: Keypoints, radius_px: F64 | float) -> I32:
-        """The row found for each point expected in view, or -1; `radius_px` at level 0."""
-        return match_near(
-            seen.pixels,
-            descriptors,
-            seen.octaves,
-            keypoints.pixels,
-            keypoints.descriptors,
-            keypoints.octaves,
-            (radius_px * self.octave_scale ** seen.octaves.astype(np.float64)).astype(np.float32),
-            self.octave_step,
-            self.max_distance if keypoints.metric == "hamming" else self.max_distance_l2,
-            self.ratio,
-            keypoints.metric,
-        )
 
-    def _lines(self, camera: Camera, T_camera_world: F64, segments: Segments, map: Map, window: LocalWindow) -> tuple[I32, I32]:
-        endpoints, descriptors = window.columns(map, "lines", "endpoints_m", "descriptor")
-        pixels, inside = clip_segments(endpoints, T_camera_world, camera)
-        ids = window.lines[inside]
-        found = match_lines(
-            pixels[inside].astype(np.float32),
-            descriptors[inside],
-            segments.endpoints_px,
-            segments.descriptors,
-            self.line_angle_deg,
-            self.line_offset_px,
-            self.line_overlap,
-            self.line_distance,
-            self.line_ratio,
-        )
-        return pairs_kernel(found, ids, len(segments.endpoints_px)), ids
+def _match_points(
+    options: SearchOptions, camera: Camera, prediction: PredictedPose, keypoints: Keypoints, map: Map, window: LocalWindow
+) -> tuple[I32, I32]:
+    """Pairs (row, id) and the ids expected in view."""
+    *position, descriptors = window.columns(map, "points", *POINT_COLUMNS, "descriptor")
+    visible = visible_points(position, prediction.T_world_camera, camera, options.view_deg, options.octave_scale)
+    ids, descriptors = window.points[visible.rows], descriptors[visible.rows]
+    sigma = prediction.sigma_m / np.maximum(visible.depth_m, 0.1)  # of the projection, rad; three standard deviations are searched
+    radius = np.minimum(options.radius_px + 3.0 * camera.fx * np.hypot(sigma, prediction.sigma_rad), options.max_radius_px)
+    found = _match_visible(options, visible, descriptors, keypoints, radius)
+    if not prediction.measured or np.count_nonzero(found >= 0) < min(options.enough, len(ids), len(keypoints.pixels)):
+        found = _match_visible(options, visible, descriptors, keypoints, options.wide_radius_px)
+    return pairs_by_row(found, ids, len(keypoints.pixels)), ids
 
-    def _planes(self, T_camera_world: F64, planes: Planes, map: Map, window: LocalWindow) -> tuple[I32, I32, I32]:
-        """Pairs (row, id) of the same plane, of parallel and of perpendicular ones."""
-        world, samples, covariance = window.columns(map, "planes", "coefficients", "samples_m", "covariance")
-        known, samples = moved_planes(world, samples, constant(T_camera_world[:3, :3], np.float64), constant(T_camera_world[:3, 3], np.float64))
-        same = associate_planes(planes.coefficients, planes.samples_m, known, samples, self.plane_angle_deg, self.plane_distance_m, True)
-        order = (covariance[:, 0, 0] + covariance[:, 1, 1]).argsort(kind="stable")  # those whose normals are known best first
-        limit = math.radians(self.parallel_deg)
-        parallel, perpendicular = related(planes.coefficients, known, same, order, window.planes, math.cos(limit), math.sin(limit), self.relations)
-        same[:, 1] = window.planes[same[:, 1]]
-        return same, parallel, perpendicular
+
+def _match_visible(options: SearchOptions, visible: VisiblePoints, descriptors: U8, keypoints: Keypoints, radius_px: F64 | float) -> I32:
+    """Row of the key point matched with each visible point, or -1; `radius_px` at level 0."""
+    radius = (radius_px * options.octave_scale ** visible.octaves.astype(np.float64)).astype(np.float32)
+    limit = options.max_distance if keypoints.metric == "hamming" else options.max_distance_l2
+    return match_near(
+        visible.pixels, descriptors, visible.octaves, keypoints.pixels, keypoints.descriptors, keypoints.octaves,
+        radius, options.octave_step, limit, options.ratio, keypoints.metric,
+    )  # fmt: skip
+
+
+def _match_lines(options: SearchOptions, camera: Camera, T_camera_world: F64, segments: Segments, map: Map, window: LocalWindow) -> tuple[I32, I32]:
+    """Pairs (row, id) and the ids expected in view."""
+    endpoints, descriptors = window.columns(map, "lines", "endpoints_m", "descriptor")
+    pixels, inside = clip_segments(endpoints, T_camera_world, camera)
+    found = match_lines(
+        pixels[inside].astype(np.float32), descriptors[inside], segments.endpoints_px, segments.descriptors,
+        options.line_angle_deg, options.line_offset_px, options.line_overlap, options.line_distance, options.line_ratio,
+    )  # fmt: skip
+    return pairs_by_row(found, window.lines[inside], len(segments.endpoints_px)), window.lines[inside]
+
+
+def _match_planes(options: SearchOptions, T_camera_world: F64, planes: Planes, map: Map, window: LocalWindow) -> tuple[I32, I32, I32]:
+    """Pairs (row, id) of the same plane, of parallel and of perpendicular ones."""
+    world, samples, covariance = window.columns(map, "planes", "coefficients", "samples_m", "covariance")
+    R, t = constant(T_camera_world[:3, :3], np.float64), constant(T_camera_world[:3, 3], np.float64)
+    known, samples = transform_plane_samples(world, samples, R, t)
+    same = associate_planes(planes.coefficients, planes.samples_m, known, samples, options.plane_angle_deg, options.plane_distance_m, True)
+    order = (covariance[:, 0, 0] + covariance[:, 1, 1]).argsort(kind="stable")  # the most certain normals first
+    limit = math.radians(options.parallel_deg)
+    related = related_planes(planes.coefficients, known, same, order, window.planes, math.cos(limit), math.sin(limit), options.relations)
+    same[:, 1] = window.planes[same[:, 1]]
+    return same, *related

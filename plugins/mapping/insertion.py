@@ -1,6 +1,6 @@
-"""What a keyframe adds to the map: measurements of known points, lines and planes, new ones, and the rows that say who saw what.
+"""Landmark insertion: a keyframe updates the points, lines and planes it observed again, adds new ones, and appends the observations.
 
-Every function takes a map and returns a new version of it. `keyframe` is the row of the keyframe that is being inserted.
+Every function takes a map and returns a new version of it.
 """
 
 from __future__ import annotations
@@ -12,18 +12,80 @@ import numpy as np
 
 from trihedron.pipeline.core.geometry import tangent_basis, transform, transform_planes
 from trihedron.pipeline.core.types import F32, F64, I32, Bool, Camera, Keypoints, Map, Matches, Planes, Pose, Segments, Table
-from trihedron.plugins.mapping import plane_fusion
-from trihedron.plugins.mapping.insertion_kernels import fuse_lines, fuse_points
+from trihedron.plugins.mapping.landmark_kernels import farthest_samples, fuse_lines, fuse_points
 from trihedron.plugins.mapping.landmarks import OBSERVERS
-from trihedron.plugins.mapping.plane_fusion_kernels import spread as spread_samples
-from trihedron.plugins.mapping.reprojection import line_terms, plane_terms, point_terms, points_along
-from trihedron.plugins.shared.linalg import inverse, moved_covariance, point_covariance, rotate_covariance
+from trihedron.plugins.mapping.plane_fusion import equivalent_moments, fit_planes, move_moments, project_to_planes
+from trihedron.plugins.mapping.projection import line_terms, parameters_on, plane_terms, point_terms, points_along
+from trihedron.plugins.shared.linalg import inverse, point_covariance, propagate_pose_covariance
 from trihedron.plugins.shared.pose_optimizer import classify_terms
+
+NO_PAIRS = np.empty((0, 2), np.int32)
+
+
+# Data association at the final pose.
+
+
+@dataclass(frozen=True)
+class Associated:
+    """Inlier pairs (row of the feature, id of the landmark), each point and line once, and the rows of features that become new landmarks."""
+
+    points: I32
+    new_points: I32
+    lines: I32
+    new_lines: I32
+    planes: I32
+    new_planes: I32
+
+
+def associate(
+    map: Map, camera: Camera, T_world_camera: F64, keypoints: Keypoints, segments: Segments, planes: Planes, matches: Matches | None,
+    line_sigma_px: float, judge: bool = True,
+) -> Associated:  # fmt: skip
+    """Classify the matches at the final pose; with `judge` False all are inliers. A plane that is an outlier is neither updated nor new: a duplicate
+    of a wall would do more harm than a lost measurement. New points and lines need a 3D position."""
+    pairs = (matches.keypoints, matches.segments, matches.planes) if matches is not None else (NO_PAIRS, NO_PAIRS, NO_PAIRS)
+    points, lines, same = (matched[_alive(table, matched[:, 1])] for matched, table in zip(pairs, (map.points, map.lines, map.planes)))
+    inliers = same
+    if judge and matches is not None:
+        on_lines = line_terms(map, segments, lines, T_world_camera, camera, line_sigma_px)
+        on_planes = plane_terms(map, planes, same, NO_PAIRS, NO_PAIRS, 1.0)
+        flags = classify_terms(T_world_camera, camera, point_terms(map, keypoints, points), on_lines, on_planes)
+        points, lines, inliers = points[flags.points > 0], lines[flags.lines > 0], same[flags.planes > 0]
+    new_points, new_lines = _others(_finite(keypoints.points_m), points), _others(_finite(segments.endpoints_m), lines)
+    return Associated(points, new_points, lines, new_lines, inliers, _others(np.ones(len(planes.coefficients), np.bool_), same))
+
+
+def existing(matches: Matches, map: Map) -> Matches:
+    """Drop the matches with ids beyond the map's: a replay of the map alone is given matches made against the recorded map."""
+    sizes = len(map.points), len(map.lines), len(map.planes)
+    matched = (matches.keypoints, matches.segments, matches.planes)
+    keypoints, segments, planes = (pairs[pairs[:, 1] < size] for pairs, size in zip(matched, sizes))
+    points, lines = (ids[ids < size] for ids, size in zip((matches.visible_points, matches.visible_lines), sizes))
+    return replace(matches, keypoints=keypoints, segments=segments, planes=planes, visible_points=points, visible_lines=lines)
+
+
+def _alive(table: Table, ids: I32) -> Bool:
+    alive: Bool = table.rows("alive", ids)
+    return alive
+
+
+def _finite(positions: F32) -> Bool:
+    return np.asarray(np.isfinite(positions).all(axis=tuple(range(1, positions.ndim))), np.bool_)
+
+
+def _others(usable: Bool, pairs: I32) -> I32:
+    """Usable rows (True) that are in no pair (row, id)."""
+    usable = usable.copy()
+    usable[pairs[:, 0]] = False
+    return np.flatnonzero(usable).astype(np.int32)
+
+
+# Insertion.
 
 
 @dataclass(frozen=True)
 class Observations:
-    """The keyframe being inserted: its row, camera and pose."""
+    """The keyframe being inserted: its row, camera, pose and the covariance of that."""
 
     keyframe: int
     camera: Camera
@@ -32,7 +94,7 @@ class Observations:
 
 
 def add_keyframe(map: Map, pose: Pose, camera: Camera) -> tuple[Map, int]:
-    """A version with one more keyframe, whose observation rows are still to come, and its row."""
+    """Append a keyframe without observations; also returns its row."""
     empty = np.zeros((1, 2), np.int32)
     table, rows = map.keyframes.appended(
         index=np.array([pose.index]),
@@ -49,27 +111,29 @@ def add_keyframe(map: Map, pose: Pose, camera: Camera) -> tuple[Map, int]:
     return replace(map, keyframes=table), int(rows[0])
 
 
-def count_visible(table: Table, ids: I32) -> Table:
-    """One more keyframe in which these landmarks should have been seen."""
-    return table.updated(ids, visible=table.rows("visible", ids) + 1)
+def count_visible(map: Map, points: I32, lines: I32, planes: I32) -> Map:
+    """Count one more keyframe in which these landmarks are expected to be visible."""
+    visible = ((map.points, points), (map.lines, lines), (map.planes, planes))
+    tables = [table.updated(ids, visible=table.rows("visible", ids) + 1) for table, ids in visible]
+    return replace(map, points=tables[0], lines=tables[1], planes=tables[2])
 
 
-def _found(table: Table, ids: I32, keyframe: int) -> dict[str, Any]:
-    """Life columns of landmarks seen by one more keyframe."""
+def _update_observation(table: Table, ids: I32, keyframe: int) -> dict[str, Any]:
+    """Columns of landmarks observed by one more keyframe."""
     observers = np.concatenate([np.full((len(ids), 1), keyframe, np.int32), table.rows("observers", ids)[:, :-1]], axis=1)
     return {"observers": observers, "found": table.rows("found", ids) + 1}
 
 
-def _born(count: int, keyframe: int) -> dict[str, Any]:
-    """Life columns of new landmarks."""
+def _new_landmark(count: int, keyframe: int) -> dict[str, Any]:
+    """Columns of new landmarks."""
     observers = np.full((count, OBSERVERS), -1, np.int32)
     observers[:, 0] = keyframe
     one = np.ones(count, np.int32)
     return {"first": one * keyframe, "observers": observers, "found": one, "visible": one, "alive": np.ones(count, np.bool_)}
 
 
-def _tied(map: Map, kind: str, keyframe: int, **columns: Any) -> Map:
-    """Append rows to the observation table of `kind` and note their range with the keyframe."""
+def _append_observations(map: Map, kind: str, keyframe: int, **columns: Any) -> Map:
+    """Append the rows of a keyframe to the observation table of `kind`, and their range to the keyframe."""
     table, rows = getattr(map, f"{kind}_observations").appended(keyframe=np.full(len(columns[kind]), keyframe, np.int32), **columns)
     span = np.array([[table.size - len(rows), table.size]], np.int32)
     keyframes = map.keyframes.updated(np.array([keyframe]), **{f"{kind}s": span})
@@ -77,8 +141,13 @@ def _tied(map: Map, kind: str, keyframe: int, **columns: Any) -> Map:
     return replace(map, **changes)
 
 
+def _rows(features: Keypoints | Segments | Planes, rows: I32, *names: str) -> dict[str, Any]:
+    """These fields of some features."""
+    return {name: getattr(features, name)[rows] for name in names}
+
+
 def insert_points(map: Map, view: Observations, keypoints: Keypoints, pairs: I32, new: I32, memory: float) -> Map:
-    """Measure the points `pairs` (row, id) again and make landmarks of the rows `new`, which have depth."""
+    """Update the points `pairs` (row, id) and make landmarks of the rows `new`, which have depth."""
     rows, ids = pairs[:, 0], pairs[:, 1]
     table = map.points
     position, information = table.rows("position_m", ids), table.rows("information", ids).astype(np.float64)
@@ -88,32 +157,24 @@ def insert_points(map: Map, view: Observations, keypoints: Keypoints, pairs: I32
         view.T_world_camera, view.covariance, view.camera.intrinsics, position, information,
         pixels[rows], depth[rows], sigma_px[rows], sigma_m[rows], memory,
     )  # fmt: skip
-    looks = _look(view, keypoints, rows, position)
-    table = table.updated(ids, position_m=position, information=information, **looks, **_found(table, ids, view.keyframe))
+    appearance = _appearance(view, keypoints, rows, position)
+    table = table.updated(ids, position_m=position, information=information, **appearance, **_update_observation(table, ids, view.keyframe))
     local = keypoints.points_m[new].astype(np.float64)
-    covariance = point_covariance(local, sigma_px[new], sigma_m[new], view.camera) + moved_covariance(local, view.covariance)
-    position = transform(view.T_world_camera, local)
-    table, born = table.appended(
+    covariance = point_covariance(local, sigma_px[new], sigma_m[new], view.camera) + propagate_pose_covariance(local, view.covariance)
+    position, R = transform(view.T_world_camera, local), view.T_world_camera[:3, :3]
+    table, created = table.appended(
         position_m=position,
-        information=inverse(rotate_covariance(view.T_world_camera[:3, :3], covariance)),
-        **_look(view, keypoints, new, position),
-        **_born(len(new), view.keyframe),
+        information=inverse(R @ covariance @ R.T),
+        **_appearance(view, keypoints, new, position),
+        **_new_landmark(len(new), view.keyframe),
     )
-    seen = np.concatenate([rows, new])
-    return _tied(
-        replace(map, points=table),
-        "point",
-        view.keyframe,
-        point=np.concatenate([ids, born]),
-        pixel=keypoints.pixels[seen],
-        depth_m=keypoints.points_m[seen, 2],
-        sigma_px=keypoints.sigma_px[seen],
-        sigma_m=keypoints.sigma_m[seen],
-    )
+    all_rows = np.concatenate([rows, new])
+    measured = {"pixel": keypoints.pixels[all_rows], "depth_m": keypoints.points_m[all_rows, 2], **_rows(keypoints, all_rows, "sigma_px", "sigma_m")}
+    return _append_observations(replace(map, points=table), "point", view.keyframe, point=np.concatenate([ids, created]), **measured)
 
 
-def _look(view: Observations, keypoints: Keypoints, rows: I32, position: F64) -> dict[str, Any]:
-    """How points look from here: descriptor, direction, distance and octave."""
+def _appearance(view: Observations, keypoints: Keypoints, rows: I32, position: F64) -> dict[str, Any]:
+    """Columns of points as this keyframe observed them: descriptor, viewing direction, distance and octave."""
     away = view.T_world_camera[:3, 3] - position
     distance = np.linalg.norm(away, axis=1)
     return {
@@ -125,7 +186,7 @@ def _look(view: Observations, keypoints: Keypoints, rows: I32, position: F64) ->
 
 
 def insert_lines(map: Map, view: Observations, segments: Segments, pairs: I32, new: I32, sigma_px: float, memory: float) -> Map:
-    """Measure the lines `pairs` (row, id) again, lengthen them to what is seen, and make landmarks of the rows `new`, which have a 3D line."""
+    """Update the lines `pairs` (row, id), extend them to the observed ends, and make landmarks of the rows `new`, which have a 3D line."""
     rows, ids = pairs[:, 0], pairs[:, 1]
     table = map.lines
     endpoints, information = table.rows("endpoints_m", ids), table.rows("information", ids).astype(np.float64)
@@ -134,35 +195,25 @@ def insert_lines(map: Map, view: Observations, segments: Segments, pairs: I32, n
         view.T_world_camera, view.covariance, view.camera.intrinsics, endpoints, information,
         segments.endpoints_px[rows].astype(np.float64), observed[rows], covariance[rows], sigma_px, memory,
     )  # fmt: skip
-    endpoints, information = lengthened(endpoints, information, transform(view.T_world_camera, observed[rows]))
+    endpoints, information = extend_lines(endpoints, information, transform(view.T_world_camera, observed[rows]))
     table = table.updated(
-        ids, endpoints_m=endpoints, information=information, descriptor=segments.descriptors[rows], **_found(table, ids, view.keyframe)
+        ids, endpoints_m=endpoints, information=information, descriptor=segments.descriptors[rows], **_update_observation(table, ids, view.keyframe)
     )
     local = observed[new]
-    total = rotate_covariance(view.T_world_camera[:3, :3], covariance[new] + moved_covariance(local, view.covariance))
-    table, born = table.appended(
+    R, total = view.T_world_camera[:3, :3], covariance[new] + propagate_pose_covariance(local, view.covariance)
+    table, created = table.appended(
         endpoints_m=transform(view.T_world_camera, local),
-        information=inverse(total),
+        information=inverse(R @ total @ R.T),
         descriptor=segments.descriptors[new],
-        **_born(len(new), view.keyframe),
+        **_new_landmark(len(new), view.keyframe),
     )
-    seen = np.concatenate([rows, new])
-    ids = np.concatenate([ids, born])
-    return _tied(
-        replace(map, lines=table),
-        "line",
-        view.keyframe,
-        line=ids,
-        endpoints_px=segments.endpoints_px[seen],
-        endpoints_m=segments.endpoints_m[seen],
-        covariance_m2=segments.covariance_m2[seen],
-    )
+    measured = _rows(segments, np.concatenate([rows, new]), "endpoints_px", "endpoints_m", "covariance_m2")
+    return _append_observations(replace(map, lines=table), "line", view.keyframe, line=np.concatenate([ids, created]), **measured)
 
 
-def lengthened(endpoints: F64, information: F32 | F64, observed: F64) -> tuple[F64, F64]:
-    """Lines (n, 2, 3) made to reach as far as the observed ends (n, 2, 3; NaN = unknown), along their own direction."""
-    direction = endpoints[:, 1] - endpoints[:, 0]
-    share = np.einsum("nkj,nj->nk", observed - endpoints[:, :1], direction) / np.maximum((direction**2).sum(-1), 1e-12)[:, None]
+def extend_lines(endpoints: F64, information: F32 | F64, observed: F64) -> tuple[F64, F64]:
+    """Extend lines (n, 2, 3) along their direction to the observed ends (n, 2, 3; NaN = unknown); also returns their information."""
+    share = parameters_on(endpoints, observed)
     reach = np.stack([np.fmin(share.min(axis=1), 0.0), np.fmax(share.max(axis=1), 1.0)], axis=1)
     points, covariance = points_along(endpoints, inverse(information), reach)
     return points, inverse(covariance)
@@ -171,125 +222,39 @@ def lengthened(endpoints: F64, information: F32 | F64, observed: F64) -> tuple[F
 def insert_planes(map: Map, view: Observations, planes: Planes, pairs: I32, new: I32, memory: float) -> Map:
     """Re-estimate the planes `pairs` (row, id) from their summed moments and make landmarks of the rows `new`."""
     T = view.T_world_camera
-    moments = plane_fusion.move_moments(T, plane_fusion.equivalent_moments(planes.coefficients, _uncertain(planes, view)))
+    moments = move_moments(T, equivalent_moments(planes.coefficients, _plane_covariance(planes, view)))
     samples = transform(T, planes.samples_m.astype(np.float64)).astype(np.float32)
     table = map.planes
     ids, where = np.unique(pairs[:, 1], return_inverse=True)
     total = table.rows("moments", ids) * (1.0 - 1.0 / memory)
     np.add.at(total, where, moments[pairs[:, 0]])
-    fitted, covariance = plane_fusion.fit_planes(total, table.rows("coefficients", ids))
-    spread = [spread_samples(np.concatenate([old, *samples[pairs[where == k, 0]]]), len(old)) for k, old in enumerate(table.rows("samples_m", ids))]
+    fitted, covariance = fit_planes(total, table.rows("coefficients", ids))
+    spread = [farthest_samples(np.concatenate([old, *samples[pairs[where == k, 0]]]), len(old)) for k, old in enumerate(table.rows("samples_m", ids))]
     table = table.updated(
         ids,
         coefficients=fitted,
         covariance=covariance,
         moments=total,
-        samples_m=plane_fusion.onto(np.array(spread, np.float32).reshape(-1, *table.schema["samples_m"].shape), fitted),
-        **_found(table, ids, view.keyframe),
+        samples_m=project_to_planes(np.array(spread, np.float32).reshape(-1, *table.schema["samples_m"].shape), fitted),
+        **_update_observation(table, ids, view.keyframe),
     )
-    fitted, covariance = plane_fusion.fit_planes(moments[new], transform_planes(T, planes.coefficients[new]))
-    table, born = table.appended(
+    fitted, covariance = fit_planes(moments[new], transform_planes(T, planes.coefficients[new]))
+    table, created = table.appended(
         coefficients=fitted,
         covariance=covariance,
         moments=moments[new],
-        samples_m=plane_fusion.onto(samples[new], fitted),
-        **_born(len(new), view.keyframe),
+        samples_m=project_to_planes(samples[new], fitted),
+        **_new_landmark(len(new), view.keyframe),
     )
-    seen = np.concatenate([pairs[:, 0], new])
-    return _tied(
-        replace(map, planes=table),
-        "plane",
-        view.keyframe,
-        plane=np.concatenate([pairs[:, 1], born]),
-        coefficients=planes.coefficients[seen],
-        covariance=planes.covariance[seen],
-        moments=planes.moments[seen],
-    )
+    measured = _rows(planes, np.concatenate([pairs[:, 0], new]), "coefficients", "covariance", "moments")
+    return _append_observations(replace(map, planes=table), "plane", view.keyframe, plane=np.concatenate([pairs[:, 1], created]), **measured)
 
 
-def _uncertain(planes: Planes, view: Observations) -> F64:
-    """Covariance (n, 3, 3) of observed planes with that of the pose they were seen from."""
+def _plane_covariance(planes: Planes, view: Observations) -> F64:
+    """Covariance (n, 3, 3) of observed planes, that of the camera pose included."""
     B = tangent_basis(planes.coefficients[:, :3])
     J = np.zeros((len(B), 3, 6))
     n = planes.coefficients[:, :3]
     J[:, :2, 3:] = np.stack([np.cross(n, B[..., 0]), np.cross(n, B[..., 1])], axis=1)
     J[:, 2, :3] = n
     return planes.covariance + J @ view.covariance @ np.swapaxes(J, -1, -2)
-
-
-# Which matches of a frame agree with its final pose, and which features are new to the map.
-
-NOTHING = np.empty((0, 2), np.int32)
-
-
-@dataclass(frozen=True)
-class Associated:
-    """Pairs (row of the feature, id of the landmark) that agree with the pose, each landmark of points and lines once, and the rows that are new."""
-
-    points: I32
-    new_points: I32
-    lines: I32
-    new_lines: I32
-    planes: I32
-    new_planes: I32
-
-
-def associate(
-    map: Map,
-    camera: Camera,
-    T_world_camera: F64,
-    keypoints: Keypoints,
-    segments: Segments,
-    planes: Planes,
-    matches: Matches | None,
-    line_sigma_px: float,
-    judged: bool = True,
-) -> Associated:
-    """Judge the matches at the final pose, unless they are not to be `judged`. A plane that was matched but does not agree is neither measured again
-    nor new: a second copy of a wall would do more harm than a lost measurement. New points and lines need a 3D position."""
-    pairs = (matches.keypoints, matches.segments, matches.planes) if matches is not None else (NOTHING, NOTHING, NOTHING)
-    points, lines, same = (kept[_alive(map, kind, kept[:, 1])] for kept, kind in zip(pairs, ("points", "lines", "planes")))
-    agreeing = same
-    if judged and matches is not None:
-        flags = classify_terms(
-            T_world_camera,
-            camera,
-            point_terms(map, keypoints, points),
-            line_terms(map, segments, lines, T_world_camera, camera, line_sigma_px),
-            plane_terms(map, planes, same, NOTHING, NOTHING, 1.0),
-        )
-        points, lines, agreeing = points[flags.points > 0], lines[flags.lines > 0], same[flags.planes > 0]
-    return Associated(
-        points,
-        _others(_known(keypoints.points_m), points[:, 0]),
-        lines,
-        _others(_known(segments.endpoints_m), lines[:, 0]),
-        agreeing,
-        _others(np.ones(len(planes.coefficients), np.bool_), same[:, 0]),
-    )
-
-
-def existing(matches: Matches, map: Map) -> Matches:
-    """The matches without ids that the map does not have: a replay of the map alone is given matches made against the recorded one."""
-    sizes = len(map.points), len(map.lines), len(map.planes)
-    pairs = (matches.keypoints, matches.segments, matches.planes)
-    keypoints, segments, planes = (kept[kept[:, 1] < size] for kept, size in zip(pairs, sizes))
-    points, lines = (ids[ids < size] for ids, size in zip((matches.visible_points, matches.visible_lines), sizes))
-    return replace(matches, keypoints=keypoints, segments=segments, planes=planes, visible_points=points, visible_lines=lines)
-
-
-def _alive(map: Map, kind: str, ids: I32) -> Bool:
-    alive: Bool = getattr(map, kind).rows("alive", ids)
-    return alive
-
-
-def _known(positions: F32) -> Bool:
-    """Rows without NaN."""
-    return np.asarray(np.isfinite(positions).all(axis=tuple(range(1, positions.ndim))), np.bool_)
-
-
-def _others(usable: Bool, taken: I32) -> I32:
-    """Usable rows that are not taken."""
-    usable = usable.copy()
-    usable[taken] = False
-    return np.flatnonzero(usable).astype(np.int32)

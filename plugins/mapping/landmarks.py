@@ -1,4 +1,4 @@
-"""Columns of the map's tables."""
+"""Tables of the landmark map: keyframes, landmarks and their observations; and sets of their ids."""
 
 from __future__ import annotations
 
@@ -6,9 +6,9 @@ import numpy as np
 
 from trihedron.pipeline.core.types import I32, Bool, Column, Map, Table
 
-PLACE = Column("f8", (3,), 2.0**-20)  # in the world, to a micrometre: a thousandth of what is known of any
-ENDS = Column("f8", (2, 3), PLACE.step)
-SHOWN = 2.0**-10  # 1 mm, or 0.06°: what is only compared with limits of centimetres and degrees
+POSITION = Column("f8", (3,), 2.0**-20)  # in the world, to a micrometre: a thousandth of any standard deviation
+ENDPOINTS = Column("f8", (2, 3), POSITION.step)
+COARSE = 2.0**-10  # 1 mm, or 0.06°: for values only compared with thresholds of centimetres and degrees
 OBSERVERS = 16  # most recent keyframes remembered by a landmark, enough for co-visibility; -1 = empty
 
 KEYFRAMES = {
@@ -26,37 +26,33 @@ KEYFRAMES = {
 
 
 def point_columns(descriptor_bytes: int) -> dict[str, Column]:
-    """`information` is the inverse covariance of the position (world, 1/m²), good to a few digits and kept as such; `distance_m` and `octave` say at
-    which range and scale it was seen."""
+    """Columns of points: `information` is the inverse covariance of the position (world, 1/m²); `distance_m` and `octave` are the range and scale of
+    the last observation."""
     return {
-        "position_m": PLACE,
+        "position_m": POSITION,
         "information": Column("f4", (3, 3)),
         "descriptor": Column("u1", (descriptor_bytes,)),
-        "direction": Column("f4", (3,), SHOWN),  # unit, from the point to the camera that saw it last
-        "distance_m": Column("f4", step=SHOWN),
+        "direction": Column("f4", (3,), COARSE),  # unit, from the point to the camera that saw it last
+        "distance_m": Column("f4", step=COARSE),
         "octave": Column("u1"),
         **_life(),
     }
 
 
 def line_columns(descriptor_bytes: int) -> dict[str, Column]:
-    """End points in the world with the inverse covariance of each."""
-    return {
-        "endpoints_m": ENDS,
-        "information": Column("f4", (2, 3, 3)),
-        "descriptor": Column("u1", (descriptor_bytes,)),
-        **_life(),
-    }
+    """Columns of lines: end points in the world with the inverse covariance of each."""
+    descriptor = Column("u1", (descriptor_bytes,))
+    return {"endpoints_m": ENDPOINTS, "information": Column("f4", (2, 3, 3)), "descriptor": descriptor, **_life()}
 
 
 def plane_columns(samples: int) -> dict[str, Column]:
-    """World planes, re-estimated from `moments`, the sum of what each observation is equivalent to (`plane_fusion.equivalent_moments`); n points to
-    the side the plane was seen from, d has any sign."""
+    """Columns of world planes, re-estimated from `moments`, the sum over their observations (`plane_fusion.equivalent_moments`); n points to the
+    side the plane was observed from, d has any sign."""
     return {
         "coefficients": Column("f8", (4,)),
         "covariance": Column("f8", (3, 3)),  # of (a, b, d), see types.Planes
         "moments": Column("f8", (4, 4)),
-        "samples_m": Column("f4", (samples, 3), SHOWN),
+        "samples_m": Column("f4", (samples, 3), COARSE),
         **_life(),
     }
 
@@ -111,11 +107,16 @@ def empty_map(index: int, stamp_ns: int, point_bytes: int, line_bytes: int, plan
     )
 
 
+def remove_rows(table: Table, ids: I32) -> Table:
+    """Mark landmarks or keyframes as dead; their rows remain."""
+    return table.updated(ids, alive=np.zeros(len(ids), np.bool_))
+
+
 # Sets of ids, as sorted rows. Ids lie close together, so marking them beats sorting them.
 
 
 def distinct(ids: I32) -> I32:
-    """(n,) the different ids, sorted."""
+    """Return the different ids (n,), sorted."""
     if len(ids) == 0:
         return ids
     first = ids.min()
@@ -125,23 +126,20 @@ def distinct(ids: I32) -> I32:
 
 
 def union(a: I32, b: I32) -> I32:
-    """(n,) the ids of both, once each and sorted."""
-    marked = np.zeros(_end(a, b), np.bool_)
+    """Return the ids of both (n,), once each and sorted."""
+    marked = _marked(b, _end(a, b))
     marked[a] = True
-    marked[b] = True
     return np.flatnonzero(marked).astype(np.int32)
 
 
-def among(ids: I32, others: I32) -> Bool:
-    """(n,) which of the ids are among the others."""
-    marked = np.zeros(_end(ids, others), np.bool_)
-    marked[others] = True
-    found: Bool = marked[ids]
+def isin(ids: I32, others: I32) -> Bool:
+    """Return True (n,) for the ids that are among the others."""
+    found: Bool = _marked(others, _end(ids, others))[ids]
     return found
 
 
-def places(ids: I32, others: I32) -> I32:
-    """(n,) the row of each id among the others, which are sorted, -1 where it is none of them."""
+def index_of(ids: I32, others: I32) -> I32:
+    """Return the row (n,) of each id in the sorted others, -1 where it is none of them."""
     if not len(others):
         return np.full(len(ids), -1, np.int32)
     first = others[0] - 1
@@ -152,3 +150,9 @@ def places(ids: I32, others: I32) -> I32:
 
 def _end(*parts: I32) -> int:
     return max((int(part.max()) + 1 for part in parts if len(part)), default=0)
+
+
+def _marked(ids: I32, size: int) -> Bool:
+    marked = np.zeros(size, np.bool_)
+    marked[ids] = True
+    return marked

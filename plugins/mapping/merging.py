@@ -1,4 +1,4 @@
-"""Joining landmarks that turn out to be one and the same: points, lines and planes. The older id lives on."""
+"""Merging of duplicate landmarks: points, lines and planes that are one and the same. The older id remains."""
 
 from __future__ import annotations
 
@@ -9,34 +9,34 @@ import numpy as np
 
 from trihedron.pipeline.core.geometry import invert, transform
 from trihedron.pipeline.core.types import I32, Bool, Map, Table
-from trihedron.plugins.mapping import plane_fusion, plane_fusion_kernels
 from trihedron.plugins.mapping.covisibility_graph import newest_keyframes, observed_by
-from trihedron.plugins.mapping.insertion import Observations, lengthened
-from trihedron.plugins.mapping.landmarks import OBSERVERS, among
-from trihedron.plugins.mapping.reprojection import points_along
-from trihedron.plugins.mapping.visibility import clip_segments
-from trihedron.plugins.shared.descriptors import match_lines, match_near
+from trihedron.plugins.mapping.insertion import Observations, extend_lines
+from trihedron.plugins.mapping.landmark_kernels import farthest_samples
+from trihedron.plugins.mapping.landmarks import OBSERVERS, isin, remove_rows
+from trihedron.plugins.mapping.plane_fusion import fit_planes, project_to_planes
+from trihedron.plugins.mapping.projection import clip_segments, parameters_on, points_along
+from trihedron.plugins.shared.feature_matching import match_lines, match_near
+from trihedron.plugins.shared.feature_matching_kernels import mean_distance, overlap
 from trihedron.plugins.shared.linalg import inverse
-from trihedron.plugins.shared.plane_association_kernels import mean_distance, overlap
 from trihedron.plugins.shared.pose_optimizer_kernels import CHI2_95
 
-NEAR_PX = 3.0  # twins project this near to each other
-TWIN_BITS, TWIN_L2 = 50, 150  # and look as alike as a strict match (ORB-SLAM2: 50)
+NEAR_PX = 3.0  # between the projections of duplicates
+MAX_BITS, MAX_L2 = 50, 150  # between their descriptors, as for a strict match (ORB-SLAM2: 50)
 LINE_DEG, LINE_OVERLAP, LINE_BITS = 2.0, 0.3, 60
 
 
 def merge_points(map: Map, view: Observations, visible: I32, metric: str) -> Map:
-    """Join points that were expected by this keyframe and not found with those it did find or make, where pixel, descriptor and place agree."""
+    """Merge points expected by this keyframe but not matched with those it observed, where pixel, descriptor and position agree."""
     seen = observed_by(map, np.array([view.keyframe], np.int32), "point")
-    idle = visible[map.points.rows("alive", visible) & ~among(visible, seen)]
+    unmatched = visible[map.points.rows("alive", visible) & ~isin(visible, seen)]
     sides = []
-    for ids in (idle, seen):
+    for ids in (unmatched, seen):
         position, descriptors, octaves = map.points.gathered(ids, "position_m", "descriptor", "octave")
         pixels = view.camera.project(transform(invert(view.T_world_camera), position)).astype(np.float32)
         sides.append((pixels, descriptors, octaves))
-    limit = TWIN_BITS if metric == "hamming" else TWIN_L2
-    found = match_near(*sides[0], *sides[1], np.full(len(idle), NEAR_PX, np.float32), 1, limit, 1.0, metric)
-    pairs = np.stack([idle[found >= 0], seen[found[found >= 0]]], axis=-1)
+    limit = MAX_BITS if metric == "hamming" else MAX_L2
+    found = match_near(*sides[0], *sides[1], np.full(len(unmatched), NEAR_PX, np.float32), 1, limit, 1.0, metric)
+    pairs = np.stack([unmatched[found >= 0], seen[found[found >= 0]]], axis=-1)
     if not len(pairs):
         return map
     position, information = map.points.gathered(pairs.ravel(), "position_m", "information")
@@ -46,42 +46,40 @@ def merge_points(map: Map, view: Observations, visible: I32, metric: str) -> Map
     same: Bool = np.einsum("ni,nij,nj->n", apart, inverse(covariance), apart) <= CHI2_95[3]
     pairs, position, information = pairs[same], position[same], information[same]
     total = information.sum(axis=1)
-    joined = np.linalg.solve(total, np.einsum("nkij,nkj->ni", information, position)[..., None])[..., 0]
+    merged = np.linalg.solve(total, np.einsum("nkij,nkj->ni", information, position)[..., None])[..., 0]
     kept, gone = pairs.min(axis=1), pairs.max(axis=1)
     names = ("descriptor", "direction", "distance_m", "octave")
     newer: dict[str, Any] = dict(zip(names, map.points.gathered(pairs[:, 1], *names)))
-    points = map.points.updated(kept, position_m=joined, information=0.5 * total, **newer)  # half: both knew some of the same frames
-    return _buried(replace(map, points=points), "point", kept, gone)
+    points = map.points.updated(kept, position_m=merged, information=0.5 * total, **newer)  # half: both contain some of the same observations
+    return _remove_merged(replace(map, points=points), "point", kept, gone)
 
 
 def merge_lines(map: Map, view: Observations, visible: I32) -> Map:
-    """Join lines that were expected by this keyframe and not found with those it did find or make, where image, descriptor and place agree."""
+    """Merge lines expected by this keyframe but not matched with those it observed, where image, descriptor and position agree."""
     seen = observed_by(map, np.array([view.keyframe], np.int32), "line")
-    idle = visible[map.lines.rows("alive", visible) & ~among(visible, seen)]
+    unmatched = visible[map.lines.rows("alive", visible) & ~isin(visible, seen)]
     sides = []
-    for ids in (idle, seen):
+    for ids in (unmatched, seen):
         pixels, inside = clip_segments(map.lines.rows("endpoints_m", ids), invert(view.T_world_camera), view.camera)
         pixels[~inside] = np.nan
         sides.append((pixels.astype(np.float32), map.lines.rows("descriptor", ids)))
     found = match_lines(*sides[0], *sides[1], LINE_DEG, NEAR_PX, LINE_OVERLAP, LINE_BITS, 1.0)
-    pairs = np.sort(np.stack([idle[found >= 0], seen[found[found >= 0]]], axis=-1), axis=1)
+    pairs = np.sort(np.stack([unmatched[found >= 0], seen[found[found >= 0]]], axis=-1), axis=1)
     pairs = pairs[_collinear(map.lines, pairs[:, 0], pairs[:, 1])] if len(pairs) else pairs
     if not len(pairs):
         return map
     kept, gone = pairs[:, 0], pairs[:, 1]
     reach, descriptor = map.lines.gathered(gone, "endpoints_m", "descriptor")
     endpoints, information = map.lines.gathered(kept, "endpoints_m", "information")
-    endpoints, information = lengthened(endpoints, information, reach)
+    endpoints, information = extend_lines(endpoints, information, reach)
     lines = map.lines.updated(kept, endpoints_m=endpoints, information=information, descriptor=descriptor)
-    return _buried(replace(map, lines=lines), "line", kept, gone)
+    return _remove_merged(replace(map, lines=lines), "line", kept, gone)
 
 
 def _collinear(lines: Table, a: I32, b: I32) -> Bool:
-    """(n,) whether both ends of line b lie on line a, as far as is known of either."""
+    """Return True (n,) where both ends of line b lie on line a within their uncertainty (χ² test)."""
     (on, known), (ends, other) = (lines.gathered(ids, "endpoints_m", "information") for ids in (a, b))
-    direction = on[:, 1] - on[:, 0]
-    share = np.einsum("nkj,nj->nk", ends - on[:, :1], direction) / np.maximum((direction**2).sum(-1), 1e-12)[:, None]
-    foot, covariance = points_along(on, inverse(known), share)
+    foot, covariance = points_along(on, inverse(known), parameters_on(on, ends))
     covariance += inverse(other)
     chi2 = np.einsum("nki,nkij,nkj->nk", ends - foot, inverse(covariance), ends - foot)
     good: Bool = (chi2 <= CHI2_95[2]).all(axis=1)
@@ -89,43 +87,43 @@ def _collinear(lines: Table, a: I32, b: I32) -> Bool:
 
 
 def merge_planes(map: Map, keyframe: int, max_deg: float, max_m: float) -> Map:
-    """Join planes seen by this keyframe, or by those before it, that have become the same one. The older id lives on."""
+    """Merge planes observed by this keyframe with duplicates observed by the newest few."""
     fresh = observed_by(map, np.array([keyframe], np.int32), "plane")
     around = observed_by(map, newest_keyframes(map, 5), "plane")
-    is_fresh, alike = among(around, fresh), _alike(map.planes, around, max_deg)
+    is_fresh, parallel = isin(around, fresh), _parallel(map.planes, around, max_deg)
     for k in range(len(around) - 1, 0, -1):
-        older = alike[k, :k] if is_fresh[k] else alike[k, :k] & is_fresh[:k]
-        joined = _joined_with_first(map, around[:k][older], int(around[k]), max_m)
-        if joined is not map:
-            map, alike = joined, _alike(joined.planes, around, max_deg)
+        older = parallel[k, :k] if is_fresh[k] else parallel[k, :k] & is_fresh[:k]
+        merged = _merge_with_first(map, around[:k][older], int(around[k]), max_m)
+        if merged is not map:
+            map, parallel = merged, _parallel(merged.planes, around, max_deg)
     return map
 
 
 def fuse_planes(map: Map, older: I32, newer: I32, max_deg: float, max_m: float) -> Map:
-    """Join each of the planes `newer` with the first of the planes `older` that is the same one, both given by id."""
+    """Merge each of the planes `newer` with the first duplicate among the planes `older`, both given by id."""
     for b in newer.tolist():
-        alike = _alike(map.planes, np.append(older, b), max_deg)[-1, :-1]
-        map = _joined_with_first(map, older[alike], b, max_m)
+        parallel = _parallel(map.planes, np.append(older, b), max_deg)[-1, :-1]
+        map = _merge_with_first(map, older[parallel], b, max_m)
     return map
 
 
-def _alike(planes: Table, ids: I32, max_deg: float) -> Bool:
-    """(n, n) which of the planes look one way."""
+def _parallel(planes: Table, ids: I32, max_deg: float) -> Bool:
+    """(n, n) True for planes with the same normal."""
     normals = planes.rows("coefficients", ids)[:, :3]
-    alike: Bool = normals @ normals.T >= np.cos(np.radians(max_deg))
-    return alike
+    parallel: Bool = normals @ normals.T >= np.cos(np.radians(max_deg))
+    return parallel
 
 
-def _joined_with_first(map: Map, others: I32, plane: int, max_m: float) -> Map:
-    """Join a plane with the first of these, which look the same way, that is the same one, if any is."""
+def _merge_with_first(map: Map, others: I32, plane: int, max_m: float) -> Map:
+    """Merge a plane with its first duplicate among the others, which have the same normal."""
     for other in others.tolist():
-        if _are_one(map.planes, min(other, plane), max(other, plane), max_m):
-            return _join(map, min(other, plane), max(other, plane))
+        if _is_duplicate(map.planes, min(other, plane), max(other, plane), max_m):
+            return _merge_pair(map, min(other, plane), max(other, plane))
     return map
 
 
-def _are_one(planes: Table, a: int, b: int, max_m: float) -> bool:
-    """Whether two living planes that look one way lie within `max_m` of each other on average, both ways, and overlap."""
+def _is_duplicate(planes: Table, a: int, b: int, max_m: float) -> bool:
+    """Return True if two living planes with the same normal lie within `max_m` of each other on average, both ways, and overlap."""
     ids = np.array([a, b], np.int32)
     alive, coefficients, samples = planes.gathered(ids, "alive", "coefficients", "samples_m")
     if not alive.all():
@@ -134,38 +132,35 @@ def _are_one(planes: Table, a: int, b: int, max_m: float) -> bool:
     return apart < max_m and max(overlap(samples[0], samples[1], 0.3), overlap(samples[1], samples[0], 0.3)) > 0.3
 
 
-def _join(map: Map, a: int, b: int) -> Map:
-    """Plane a takes over the moments, samples and observations of b."""
+def _merge_pair(map: Map, a: int, b: int) -> Map:
+    """Merge the moments, samples and observations of plane b into plane a."""
     ids = np.array([a, b], np.int32)
     table = map.planes
     moments = table.rows("moments", ids).sum(axis=0)[None]
-    fitted, covariance = plane_fusion.fit_planes(moments, table.rows("coefficients", ids[:1]))
+    fitted, covariance = fit_planes(moments, table.rows("coefficients", ids[:1]))
     samples = table.rows("samples_m", ids)
-    spread = plane_fusion_kernels.spread(samples.reshape(-1, 3), samples.shape[1])
-    table = table.updated(ids[:1], coefficients=fitted, covariance=covariance, moments=moments, samples_m=plane_fusion.onto(spread[None], fitted))
-    return _buried(replace(map, planes=table), "plane", ids[:1], ids[1:])
+    spread = farthest_samples(samples.reshape(-1, 3), samples.shape[1])
+    table = table.updated(ids[:1], coefficients=fitted, covariance=covariance, moments=moments, samples_m=project_to_planes(spread[None], fitted))
+    return _remove_merged(replace(map, planes=table), "plane", ids[:1], ids[1:])
 
 
-def _buried(map: Map, kind: str, kept: I32, gone: I32) -> Map:
-    """Landmarks `gone` die; their observers, counts and observations pass to the distinct ids `kept`."""
+def _remove_merged(map: Map, kind: str, kept: I32, gone: I32) -> Map:
+    """Remove the landmarks `gone`; their observers, counts and observations pass to the distinct ids `kept`."""
     table: Table = getattr(map, f"{kind}s")
     mine, theirs = (table.gathered(ids, "observers", "found", "visible") for ids in (kept, gone))
     both = np.concatenate([mine[0], theirs[0]], axis=1)
     both = -np.sort(-both, axis=1)
-    both[:, 1:][both[:, 1:] == both[:, :-1]] = -1  # seen by the same keyframe
+    both[:, 1:][both[:, 1:] == both[:, :-1]] = -1  # observed by the same keyframe
     table = table.updated(
-        kept,
-        observers=-np.sort(-both, axis=1)[:, :OBSERVERS],
-        found=np.maximum(mine[1], theirs[1]),
-        visible=np.maximum(mine[2], theirs[2]),
+        kept, observers=-np.sort(-both, axis=1)[:, :OBSERVERS], found=np.maximum(mine[1], theirs[1]), visible=np.maximum(mine[2], theirs[2])
     )
-    observations = _renamed(map, kind, kept, gone)
-    changes: dict[str, Any] = {f"{kind}s": table.updated(gone, alive=np.zeros(len(gone), np.bool_)), f"{kind}_observations": observations}
+    observations = _replace_ids(map, kind, kept, gone)
+    changes: dict[str, Any] = {f"{kind}s": remove_rows(table, gone), f"{kind}_observations": observations}
     return replace(map, **changes)
 
 
-def _renamed(map: Map, kind: str, kept: I32, gone: I32) -> Table:
-    """The observation table with the rows of `gone` given to `kept`, in the keyframes that `gone` remember."""
+def _replace_ids(map: Map, kind: str, kept: I32, gone: I32) -> Table:
+    """Replace the ids `gone` by `kept` in the observations of their observers."""
     observations: Table = getattr(map, f"{kind}_observations")
     observers = np.unique(getattr(map, f"{kind}s").rows("observers", gone))
     spans = map.keyframes.rows(f"{kind}s", observers[observers >= 0])

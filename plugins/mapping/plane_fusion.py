@@ -1,4 +1,4 @@
-"""Map planes from the summed moments of all their observations."""
+"""Plane landmarks from the summed moments of all their observations."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from trihedron.plugins.shared.linalg import cross_matrices, inverse
 
 
 def information_of(moments: F64, coefficients: F64) -> F64:
-    """(n, 3, 3) information that moments (n, 4, 4) hold about (a, b, d) of planes (n, 4): `Jᵀ M J`, J the derivative of (n, d)."""
+    """Return the information (n, 3, 3) of moments (n, 4, 4) about (a, b, d) of planes (n, 4): `Jᵀ M J` with J the Jacobian of (n, d)."""
     J = np.zeros((len(moments), 4, 3))
     J[:, :3, :2] = tangent_basis(coefficients[:, :3])
     J[:, 3, 2] = 1.0
@@ -18,10 +18,10 @@ def information_of(moments: F64, coefficients: F64) -> F64:
 
 
 def equivalent_moments(coefficients: F64, covariance: F64) -> F64:
-    """(n, 4, 4) moments whose plane is `coefficients` (n, 4) and whose information about (a, b, d) is the inverse of `covariance` (n, 3, 3).
+    """Return moments (n, 4, 4) with the plane `coefficients` (n, 4) and with the inverse of `covariance` (n, 3, 3) as information about (a, b, d).
 
-    `M = Lᵀ C⁻¹ L`, where L takes (n', d') to its (a, b, d) about the plane, homogeneous in scale. The moments of a region's own points would not do:
-    its pixels are not independent, and least squares through points that err along their rays tilts a slanted plane however often it is seen."""
+    `M = Lᵀ C⁻¹ L`, where L takes (n', d') to its (a, b, d) about the plane, homogeneous in scale. The moments of a region's own points would be
+    biased: its pixels are not independent, and least squares through points with errors along their rays tilts a slanted plane."""
     n, d = coefficients[:, :3], coefficients[:, 3]
     L = np.zeros((len(n), 3, 4))
     L[:, :2, :3] = np.swapaxes(tangent_basis(n), -1, -2)
@@ -31,12 +31,12 @@ def equivalent_moments(coefficients: F64, covariance: F64) -> F64:
 
 
 def move_moments(T_a_b: F64, moments_b: F64) -> F64:
-    """(n, 4, 4) moments of the points moved into frame a."""
+    """Transform moments (n, 4, 4) of points into frame a."""
     return T_a_b @ moments_b @ T_a_b.T
 
 
 def fit_planes(moments: F64, like: F64) -> tuple[F64, F64]:
-    """Planes (n, 4) of least squares through moments (n, 4, 4) and their covariance (n, 3, 3); the side is that of `like` (n, 4)."""
+    """Fit planes (n, 4) to moments (n, 4, 4) by least squares, with covariance (n, 3, 3); their normals point to the side of `like` (n, 4)."""
     weight = moments[:, 3, 3]
     centre = moments[:, :3, 3] / weight[:, None]
     scatter = moments[:, :3, :3] - weight[:, None, None] * centre[:, :, None] * centre[:, None, :]
@@ -47,7 +47,8 @@ def fit_planes(moments: F64, like: F64) -> tuple[F64, F64]:
 
 
 def motions_between(old: F64, new: F64, centres: F64) -> F64:
-    """(n, 4, 4) smallest motions that take the planes `old` (n, 4) to `new` (n, 4), turning about the points `centres` (n, 3) of the old ones.
+    """Return the smallest motions (n, 4, 4) that take planes `old` (n, 4) to `new` (n, 4), rotating about the points `centres` (n, 3) of the old
+    ones.
 
     With v = a × b and c = a · b of the two normals the rotation is `1 + [v] + [v]² / (1 + c)`."""
     K = cross_matrices(np.cross(old[:, :3], new[:, :3]))
@@ -60,7 +61,7 @@ def motions_between(old: F64, new: F64, centres: F64) -> F64:
     return T
 
 
-def onto(samples: F32, planes: F64) -> F32:
-    """Samples (n, s, 3) dropped onto their planes (n, 4)."""
+def project_to_planes(samples: F32, planes: F64) -> F32:
+    """Project samples (n, s, 3) onto their planes (n, 4)."""
     distance = np.einsum("nsj,nj->ns", samples, planes[:, :3]) + planes[:, None, 3]
     return np.asarray(samples - distance[..., None] * planes[:, None, :3], np.float32)

@@ -1,4 +1,4 @@
-"""Points of several keyframes found in this frame, wherever they are."""
+"""Data association with single keyframes by descriptors alone."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from trihedron.pipeline.core.options import NonNegativeInt, PositiveFloat, Posit
 from trihedron.pipeline.core.registry import register
 from trihedron.pipeline.core.types import I32, Camera, Keypoints, Map, Matches, Rotation
 from trihedron.plugins.mapping.covisibility_graph import current_submap, keyframes_of, observed_by
-from trihedron.plugins.shared.descriptors import mutual_matches
+from trihedron.plugins.shared.feature_matching import mutual_matches
 from trihedron.plugins.shared.rigid_alignment import consensus, point_pair_sigma, rows_with_depth
 
 NO_PAIRS = np.zeros((0, 2), np.int32)
@@ -21,9 +21,9 @@ NO_PAIRS = np.zeros((0, 2), np.int32)
 @register("matches", "keyframes")
 @dataclass(frozen=True)
 class Keyframes:
-    """Edges of a pose graph: this frame against the newest keyframes and some drawn from all earlier ones, by descriptors alone, each verified by
-    the rigid motion that most pairs agree on (RGB-D SLAM: Endres et al., T-RO 2014). The pose is not asked, so that a loop of any length can close;
-    of two keyframes that have a point in common the one with more agreeing pairs has it."""
+    """Match this frame with the newest keyframes and some drawn from all earlier ones, by descriptors, each verified by the rigid motion with most
+    inliers (RGB-D SLAM: Endres et al., T-RO 2014): edges of a pose graph. No pose is predicted, so a loop of any length can close; a point that two
+    keyframes have in common is matched with the one with more inliers."""
 
     newest: PositiveInt = 3
     drawn: NonNegativeInt = 3  # of the earlier ones, anew in every frame
@@ -34,7 +34,7 @@ class Keyframes:
     min_share: Share = 0.4  # of the pairs
 
     def __call__(self, camera: Camera, rotation: Rotation, keypoints: Keypoints, map: Map | None, rng: np.random.Generator) -> Matches:
-        """Pairs of key points and the points of verified keyframes; what was offered and what was found count as visible."""
+        """Return the pairs of key points and points of verified keyframes; these points count as visible."""
         pairs = [self._verified(camera, keypoints, map, row, rng) for row in self._candidates(map, rng)] if map is not None else []
         pairs = sorted(pairs, key=len, reverse=True)
         found = np.concatenate([NO_PAIRS, *pairs])
@@ -44,19 +44,18 @@ class Keyframes:
         none = np.zeros(0, np.int32)
         ids = np.unique(found[:, 1]).astype(np.int32)
         revision = -1 if map is None else map.revision
-        return Matches(
-            keypoints.index, keypoints.stamp_ns, revision, np.ascontiguousarray(found), NO_PAIRS, NO_PAIRS, NO_PAIRS, NO_PAIRS, ids, none
-        )  # fmt: skip
+        lines_and_planes = (NO_PAIRS,) * 4
+        return Matches(keypoints.index, keypoints.stamp_ns, revision, np.ascontiguousarray(found), *lines_and_planes, ids, none)
 
     def _candidates(self, map: Map, rng: np.random.Generator) -> list[int]:
-        """Rows of the keyframes that are tried."""
+        """Keyframes that are tried."""
         rows = keyframes_of(map, current_submap(map))
         newest, earlier = rows[-self.newest :], rows[: -self.newest]
         drawn = rng.choice(earlier, min(self.drawn, len(earlier)), replace=False) if len(earlier) else earlier
         return [int(row) for row in (*newest, *np.sort(drawn))]
 
     def _verified(self, camera: Camera, keypoints: Keypoints, map: Map, keyframe: int, rng: np.random.Generator) -> I32:
-        """(n, 2) rows of key points and ids of the keyframe's points that agree on one motion; none where too few do."""
+        """Rows of key points and ids of the keyframe's points (n, 2) that agree on one motion; none where too few do."""
         ids, mine = observed_by(map, np.array([keyframe], np.int32), "point"), rows_with_depth(keypoints)
         descriptors, positions = map.points.gathered(ids, "descriptor", "position_m")
         found = mutual_matches(descriptors, keypoints.descriptors[mine], keypoints.metric, self.ratio)

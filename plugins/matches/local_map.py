@@ -1,4 +1,4 @@
-"""Landmarks of the local map found among the frame's features."""
+"""Data association with the local map."""
 
 from __future__ import annotations
 
@@ -11,15 +11,15 @@ from trihedron.pipeline.core.options import NonNegativeInt, PositiveInt
 from trihedron.pipeline.core.registry import register
 from trihedron.pipeline.core.types import F64, OK, Camera, Keypoints, Map, Matches, Planes, Pose, Rotation, Segments, Translation
 from trihedron.plugins.mapping.covisibility_graph import living_keyframes, local_window
-from trihedron.plugins.mapping.data_association import Guess, MapSearch
-from trihedron.plugins.places.verification import ABOUT_DEG, ABOUT_M
+from trihedron.plugins.mapping.data_association import PredictedPose, SearchOptions, search_map
+from trihedron.plugins.places.verification import VICINITY_DEG, VICINITY_M
 
 
 @register("matches", "local_map")
 @dataclass(frozen=True)
-class LocalMap(MapSearch):
-    """Project the landmarks of a bounded window of keyframes at the decoupled pose, or where a lost camera was recognised, and match what lies near
-    (sections III-A, IV-C)."""
+class LocalMap(SearchOptions):
+    """Match the frame's features with the landmarks of a bounded window of keyframes, projected at the decoupled pose, or at the relocalised one of a
+    lost camera (sections III-A, IV-C)."""
 
     newest: PositiveInt = 2  # keyframes always in the window
     covisible: NonNegativeInt = 10  # keyframes that share most landmarks with those
@@ -37,24 +37,24 @@ class LocalMap(MapSearch):
         map: Map | None,
         relocalise: Pose | None,
     ) -> Matches | None:
-        """None while there is no map."""
+        """Return the matches; None while there is no map."""
         if map is None or not len(living_keyframes(map)):
             return None
-        guess = self._guess(rotation, translation, relocalise)
+        prediction = self._predict(rotation, translation, relocalise)
         if relocalise is not None and relocalise.status == OK:  # the newest keyframes may be far from there
-            window = local_window(map, guess.T_world_camera, 0, 0, self.recognised, ABOUT_M, ABOUT_DEG, relocalise.submap)
+            window = local_window(map, prediction.T_world_camera, 0, 0, self.recognised, VICINITY_M, VICINITY_DEG, relocalise.submap)
         else:
-            window = local_window(map, guess.T_world_camera, self.newest, self.covisible, self.near)
-        return self.search(camera, guess, keypoints, segments, planes, map, window)
+            window = local_window(map, prediction.T_world_camera, self.newest, self.covisible, self.near)
+        return search_map(self, camera, prediction, keypoints, segments, planes, map, window)
 
-    def _guess(self, rotation: Rotation, translation: Translation, relocalise: Pose | None) -> Guess:
+    def _predict(self, rotation: Rotation, translation: Translation, relocalise: Pose | None) -> PredictedPose:
         if relocalise is not None and relocalise.status == OK:
-            return Guess(relocalise.T_world_camera, *_sigmas(relocalise.covariance[:3, :3], relocalise.covariance[3:, 3:]), True)
+            return PredictedPose(relocalise.T_world_camera, *_sigmas(relocalise.covariance[:3, :3], relocalise.covariance[3:, 3:]), True)
         T = pose_matrix(rotation.R_world_camera, translation.t_world_camera)
-        return Guess(T, *_sigmas(translation.covariance, rotation.covariance), translation.estimated)
+        return PredictedPose(T, *_sigmas(translation.covariance, rotation.covariance), translation.estimated)
 
 
 def _sigmas(position: F64, rotation: F64) -> tuple[float, float]:
-    """The largest standard deviation of each."""
+    """Largest standard deviation of each."""
     sigma_m, sigma_rad = np.sqrt(np.linalg.svd(np.array([position, rotation]), compute_uv=False)[:, 0]).tolist()
     return sigma_m, sigma_rad

@@ -12,7 +12,7 @@ import numpy as np
 
 from trihedron.pipeline.core.types import F32, F64, I32, U8, Column, Frame, Pose, Table
 from trihedron.plugins.model.common_kernels import Blocks, PosedCamera, in_view, insert, integrate
-from trihedron.plugins.shared.image_reduction import lens_of, step_to
+from trihedron.plugins.shared.image_reduction import reduced_intrinsics, step_to
 from trihedron.plugins.shared.image_reduction_kernels import reduced
 from trihedron.plugins.shared.tsdf_volume import CELLS, blocks_about
 from trihedron.plugins.shared.tsdf_volume_kernels import SIDE
@@ -71,6 +71,6 @@ class DownsampledFrame(NamedTuple):
 def downsample(frame: Frame, pose: Pose, width: int) -> DownsampledFrame:
     """Downsample a frame and attach its pose."""
     step = step_to(frame, width)
-    intrinsics = lens_of(frame, step)
+    intrinsics = reduced_intrinsics(frame, step)
     depth_m, color = reduced(frame.depth_m, frame.color, step)
     return DownsampledFrame(depth_m, color, intrinsics, posed_camera(intrinsics, pose.T_world_camera))

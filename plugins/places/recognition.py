@@ -1,39 +1,34 @@
-"""Where in the map a frame could be, by what its features look like: no pose is needed, and none is found here."""
+"""Place recognition: candidate keyframes by descriptor votes, and hypotheses of the camera pose from points of similar appearance."""
 
 from __future__ import annotations
 
 import numpy as np
 
-from trihedron.pipeline.core.types import F64, I32, U8, Keypoints, Map, Segments
+from trihedron.pipeline.core.types import F64, I32, Keypoints, Map, Segments
 from trihedron.plugins.mapping.covisibility_graph import WEIGHTS, observed_by
-from trihedron.plugins.places.recognition_kernels import consensus, lookalikes_kernel
-from trihedron.plugins.shared.descriptors import words_of
+from trihedron.plugins.places.recognition_kernels import rigid_hypotheses_kernel
+from trihedron.plugins.shared.feature_matching import nearest_matches
 
 
-def lookalikes(query: U8, train: U8, max_bits: int, ratio: float) -> I32:
-    """For each of n described things (n, bytes) the row of the m known ones (m, bytes) that looks most like it, or -1: at most `max_bits` away, and
-    less than `ratio` × the second best (1 or more: no such test)."""
-    return lookalikes_kernel(words_of(query)[0], words_of(train)[0], max_bits, ratio)
-
-
-def likely_keyframes(map: Map, keypoints: Keypoints, segments: Segments, among: I32, count: int, max_bits: int) -> I32:
-    """Of the keyframes `among`, sorted, the `count` that saw most of what looks like this frame's points and lines; all when they are no more."""
-    if len(among) <= count:
-        return among
+def candidate_keyframes(map: Map, keypoints: Keypoints, segments: Segments, keyframes: I32, count: int, max_bits: int) -> I32:
+    """Return the `count` of the keyframes, sorted, that observed most landmarks similar to this frame's points and lines; all when they are no
+    more."""
+    if len(keyframes) <= count:
+        return keyframes
     votes = np.zeros(len(map.keyframes), np.int64)
-    for kind, found, weight in (("point", keypoints, 1), ("line", segments, WEIGHTS["line"])):
-        ids = observed_by(map, among, kind)
+    for kind, features, weight in (("point", keypoints, 1), ("line", segments, WEIGHTS["line"])):
+        ids = observed_by(map, keyframes, kind)
         table = getattr(map, f"{kind}s")
-        rows = lookalikes(found.descriptors, table.rows("descriptor", ids), max_bits, 1.0)
+        rows = nearest_matches(features.descriptors, table.rows("descriptor", ids), max_bits, 1.0)
         observers = table.rows("observers", ids[np.unique(rows[rows >= 0])])
         votes += weight * np.bincount(observers[observers >= 0], minlength=len(votes))
-    order = among[np.argsort(-votes[among], kind="stable")]
+    order = keyframes[np.argsort(-votes[keyframes], kind="stable")]
     return np.sort(order[:count]).astype(np.int32)
 
 
 def block_of(keyframes: I32, size: int, number: int) -> I32:
-    """The `number`-th block of `size` keyframes, modulo their count, each half of it shared with the next: a large map is looked through block by
-    block, so that one frame's time is bounded."""
+    """Return the `number`-th block of `size` keyframes, modulo their count; blocks overlap by half. A large map is searched block by block, which
+    bounds the time of a frame."""
     if len(keyframes) <= size:
         return keyframes
     starts = np.arange(0, len(keyframes) - size // 2, size // 2)
@@ -41,26 +36,27 @@ def block_of(keyframes: I32, size: int, number: int) -> I32:
     return keyframes[start : start + size]
 
 
-def rigid_hypotheses(camera_m: F64, world_m: F64, sigma_m: F64, draws: I32, count: int) -> F64:
-    """(k, 4, 4), k <= count, poses `T_world_camera` by three points each (Procrustes), those that most of the n pairs of places (n, 3) agree with;
-    `sigma_m` (n,) is the error of each pair, `draws` (m, 3) the triples to try. No two are alike, the best is first."""
-    poses, support = consensus(camera_m, world_m, 3.0 * sigma_m, draws)
-    order = np.argsort(-support, kind="stable")
-    return distinct(poses[order[support[order] >= 6]], count)
+def rigid_hypotheses(camera_m: F64, world_m: F64, sigma_m: F64, samples: I32, count: int) -> F64:
+    """Return up to `count` distinct poses `T_world_camera` (k, 4, 4), each by three pairs of points (Procrustes), those with most inliers first.
+
+    The n pairs of points (n, 3) have errors `sigma_m` (n,); `samples` (m, 3) are the triples to try."""
+    poses, inliers = rigid_hypotheses_kernel(camera_m, world_m, 3.0 * sigma_m, samples)
+    order = np.argsort(-inliers, kind="stable")
+    return distinct_poses(poses[order[inliers[order] >= 6]], count)
 
 
-def distinct(poses: F64, count: int) -> F64:
-    """The first `count` of the poses (n, 4, 4) that differ from each before by 10 cm or 5°."""
-    kept: list[F64] = []
+def distinct_poses(poses: F64, count: int) -> F64:
+    """Return the first `count` of the poses (n, 4, 4) that differ from each before."""
+    chosen: list[F64] = []
     for T in poses:
-        if len(kept) == count:
+        if len(chosen) == count:
             break
-        if all(apart(T, other) for other in kept):
-            kept.append(T)
-    return np.array(kept).reshape(-1, 4, 4)
+        if all(are_distinct(T, other) for other in chosen):
+            chosen.append(T)
+    return np.array(chosen).reshape(-1, 4, 4)
 
 
-def apart(T: F64, other: F64) -> bool:
-    """Whether two poses are two places: 10 cm or 5° apart."""
+def are_distinct(T: F64, other: F64) -> bool:
+    """Return True if two poses differ by 10 cm or 5°."""
     cosine = 0.5 * (np.trace(T[:3, :3].T @ other[:3, :3]) - 1.0)
     return bool(np.linalg.norm(T[:3, 3] - other[:3, 3]) > 0.1 or cosine < np.cos(np.radians(5.0)))

@@ -1,4 +1,4 @@
-"""Numba kernels of `recognition.py`."""
+"""Kernel of `recognition.py`: rigid poses from triples of point pairs, and their inliers."""
 # mypy: disable-error-code="arg-type, assignment, index, return-value"
 
 from __future__ import annotations
@@ -7,29 +7,12 @@ import numpy as np
 
 from trihedron.pipeline.core.kernel import kernel
 from trihedron.pipeline.core.types import F64, I32
-from trihedron.plugins.shared.descriptors_kernels import U64, hamming
 from trihedron.plugins.shared.linalg_kernels import polar_rotation
 
 
 @kernel
-def lookalikes_kernel(query: U64, train: U64, max_bits: int, ratio: float) -> I32:
-    out = np.full(len(query), -1, np.int32)
-    for i in range(len(query)):
-        best, second, row = 1 << 30, 1 << 30, -1
-        for j in range(len(train)):
-            bits = hamming(query[i], train[j])
-            if bits < best:
-                best, second, row = bits, best, j
-            elif bits < second:
-                second = bits
-        if best <= max_bits and (ratio >= 1.0 or best < ratio * second):
-            out[i] = row
-    return out
-
-
-@kernel
-def _as_long(camera_m: F64, world_m: F64, limit: F64, i: int, j: int) -> bool:
-    """Whether two pairs of places are as far apart here as there, and far enough to tell a direction."""
+def _is_consistent(camera_m: F64, world_m: F64, limit: F64, i: int, j: int) -> bool:
+    """Return True if two points have the same distance in the camera and in the world, and one that is long enough."""
     here, there = 0.0, 0.0
     for r in range(3):
         here += (camera_m[i, r] - camera_m[j, r]) ** 2
@@ -38,15 +21,19 @@ def _as_long(camera_m: F64, world_m: F64, limit: F64, i: int, j: int) -> bool:
 
 
 @kernel
-def consensus(camera_m: F64, world_m: F64, limit: F64, draws: I32) -> tuple[F64, I32]:
-    """Pose and number of agreeing pairs of each draw; 0 for one whose triangles differ."""
-    poses, support = np.zeros((len(draws), 4, 4)), np.zeros(len(draws), np.int32)
+def rigid_hypotheses_kernel(camera_m: F64, world_m: F64, limit: F64, samples: I32) -> tuple[F64, I32]:
+    """Solve the pose of each sample and count its inliers; 0 for one whose triangles differ."""
+    poses, inliers = np.zeros((len(samples), 4, 4)), np.zeros(len(samples), np.int32)
     M, p, q, t = np.empty((3, 3)), np.empty(3), np.empty(3), np.empty(3)
-    for k in range(len(draws)):
-        a, b, c = draws[k, 0], draws[k, 1], draws[k, 2]
+    for k in range(len(samples)):
+        a, b, c = samples[k, 0], samples[k, 1], samples[k, 2]
         if a in (b, c) or b == c:
             continue
-        if not (_as_long(camera_m, world_m, limit, a, b) and _as_long(camera_m, world_m, limit, b, c) and _as_long(camera_m, world_m, limit, c, a)):
+        if not (
+            _is_consistent(camera_m, world_m, limit, a, b)
+            and _is_consistent(camera_m, world_m, limit, b, c)
+            and _is_consistent(camera_m, world_m, limit, c, a)
+        ):
             continue
         for r in range(3):
             p[r] = (camera_m[a, r] + camera_m[b, r] + camera_m[c, r]) / 3.0
@@ -64,10 +51,10 @@ def consensus(camera_m: F64, world_m: F64, limit: F64, draws: I32) -> tuple[F64,
             for r in range(3):
                 e = R[r, 0] * camera_m[i, 0] + R[r, 1] * camera_m[i, 1] + R[r, 2] * camera_m[i, 2] + t[r] - world_m[i, r]
                 square += e * e
-            support[k] += square <= limit[i] * limit[i]
+            inliers[k] += square <= limit[i] * limit[i]
         for r in range(3):
             poses[k, r, 3] = t[r]
             for s in range(3):
                 poses[k, r, s] = R[r, s]
         poses[k, 3, 3] = 1.0
-    return poses, support
+    return poses, inliers

@@ -1,4 +1,4 @@
-"""What the camera would see through, were it at a supposed place."""
+"""Geometric verification of a place: search the map from a hypothesis, solve the pose, and test for free-space violations."""
 
 from __future__ import annotations
 
@@ -8,47 +8,42 @@ from typing import NamedTuple
 import numpy as np
 
 from trihedron.pipeline.core.geometry import invert, transform
-from trihedron.pipeline.core.types import F64, I32, Frame, Keypoints, Map, Matches, Planes, Segments
+from trihedron.pipeline.core.types import F64, I32, Camera, Frame, Keypoints, Map, Matches, Planes, Segments
 from trihedron.plugins.mapping.covisibility_graph import LocalWindow, local_window, window_of
-from trihedron.plugins.mapping.data_association import Guess, MapSearch
-from trihedron.plugins.mapping.reprojection import line_terms, plane_terms, point_terms
-from trihedron.plugins.mapping.visibility import in_image
-from trihedron.plugins.mapping.visibility_kernels import NEAR_M
-from trihedron.plugins.places.recognition import apart
+from trihedron.plugins.mapping.data_association import PredictedPose, SearchOptions, search_map
+from trihedron.plugins.mapping.landmark_kernels import MIN_DEPTH_M
+from trihedron.plugins.mapping.projection import in_image, line_terms, plane_terms, point_terms
+from trihedron.plugins.places.recognition import are_distinct
 from trihedron.plugins.shared.pose_optimizer import LANDMARK_SCORE, PoseSolution, solve_pose
 
-TOLERANCE_M, TOLERANCE_SIGMAS = 0.1, 5.0  # of depth, before a surface is not where it should be
+TOLERANCE_M, TOLERANCE_SIGMAS = 0.1, 5.0  # of depth, before a surface is violated
+DETAILS = np.array([1, 3, 0])  # weights of points, lines and planes as details: any room has walls at some distance or other
+VICINITY_M, VICINITY_DEG = 2.0, 60.0  # of a place, within which keyframes observed it
+WIDE, CLOSE = (0.05, 2.0), (0.005, 0.2)  # standard deviations (m, °) of a hypothesis, and of the pose solved from it
+STRICT = SearchOptions(enough=0, max_distance=50, max_distance_l2=200, line_distance=40)  # ORB-SLAM2: 50; false matches often pass 80
+PRIOR_M, PRIOR_DEG = 0.5, 10.0  # weak: the data decide
+LINE_PX = 1.0  # of a segment's end point across it
 
 
-def seen_through(T_world_camera: F64, frame: Frame, map: Map, seen: LocalWindow) -> float:
-    """Share of the known points and samples of planes in view of a camera at (4, 4) that would hang in free space: the frame's depth lies beyond
-    them. What something hides says nothing, nor does a pixel without depth. 0 where nothing is in view."""
-    samples = map.planes.rows("samples_m", seen.planes).reshape(-1, 3).astype(np.float64)
-    world = np.concatenate([map.points.rows("position_m", seen.points), samples[np.isfinite(samples[:, 0])]])
+def free_space_violation(T_world_camera: F64, frame: Frame, map: Map, window: LocalWindow) -> float:
+    """Return the share of the points and plane samples in view of a camera at (4, 4) that would lie in free space: the frame's depth is beyond them.
+    Occluded ones and pixels without depth do not count. 0 where nothing is in view."""
+    samples = map.planes.rows("samples_m", window.planes).reshape(-1, 3).astype(np.float64)
+    world = np.concatenate([map.points.rows("position_m", window.points), samples[np.isfinite(samples[:, 0])]])
     local = transform(invert(T_world_camera), world)
-    local = local[local[:, 2] > NEAR_M]
+    local = local[local[:, 2] > MIN_DEPTH_M]
     pixels = frame.camera.project(local)
     inside = in_image(pixels, frame.camera)
     x, y = np.rint(pixels[inside]).astype(int).T
     depth, z = frame.depth_m[y, x].astype(np.float64), local[inside, 2]
     tolerance = TOLERANCE_M + TOLERANCE_SIGMAS * frame.camera.depth_noise.sigma_m(depth)
-    through = int(np.count_nonzero((depth > 0.0) & (z < depth - tolerance)))
-    met = int(np.count_nonzero((depth > 0.0) & (np.abs(z - depth) <= tolerance)))
-    return through / max(through + met, 1)
-
-
-# How much of the map agrees that a frame was taken at a supposed place.
-
-DETAILS = np.array([1, 3, 0])  # and as what tells one room from another: any room has walls at some distance or other
-ABOUT_M, ABOUT_DEG = 2.0, 60.0  # keyframes taken from nearer than this have seen a place
-WIDE, CLOSE = (0.05, 2.0), (0.005, 0.2)  # standard deviations (m, °) of a hypothesis, and of the pose solved from it
-PRIOR_M, PRIOR_DEG = 0.5, 10.0  # the data decide
-LINE_PX = 1.0  # of a segment's end point across it
-STRICT = {"max_distance": 50, "max_distance_l2": 200, "line_distance": 40}  # of descriptors (ORB-SLAM2: 50); strangers that lie right pass 80 often
+    violated = int(np.count_nonzero((depth > 0.0) & (z < depth - tolerance)))
+    confirmed = int(np.count_nonzero((depth > 0.0) & (np.abs(z - depth) <= tolerance)))
+    return violated / max(violated + confirmed, 1)
 
 
 class FrameFeatures(NamedTuple):
-    """A frame and what was found in it."""
+    """A frame and its features."""
 
     frame: Frame
     keypoints: Keypoints
@@ -57,64 +52,57 @@ class FrameFeatures(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Recognised:
-    """A place after the check: the pose (4, 4) solved from what agrees, its covariance (6, 6), the points, lines and planes that agree, the share of
-    all matches that these are, the share of the details expected in view that were found and agree, and of surfaces that the camera would see
-    through."""
+class VerifiedPlace:
+    """The pose (4, 4) at a place with covariance (6, 6), the inliers among points, lines and planes, their share of all matches, the share of the
+    details expected in view that are inliers, and the share of surfaces with a free-space violation."""
 
     T_world_camera: F64
     covariance: F64
     inliers: I32
-    agreeing: float
-    found: float
-    through: float
+    inlier_share: float
+    found_share: float
+    violation: float
 
     @property
     def score(self) -> float:
-        """Of all that agrees."""
+        """Return the weighted number of inliers."""
         return float(self.inliers @ LANDMARK_SCORE)
 
     @property
     def details(self) -> float:
-        """Of the details among it."""
+        """Return the weighted number of inliers among points and lines."""
         return float(self.inliers @ DETAILS)
 
 
-def check_place(T_world_camera: F64, view: FrameFeatures, map: Map, among: I32, near: int) -> Recognised | None:
-    """Search the map from a hypothesis (4, 4), widely, then closely and for what looks very much alike from the pose solved, with what the `near`
-    keyframes about it see; where there are none, with what the keyframes `among` see, since a twin of a place must be able to compete. All are of
-    the sub-map of these. None when the place does not hold."""
-    T = T_world_camera
-    for (sigma_m, sigma_deg), search in ((WIDE, MapSearch(enough=0)), (CLOSE, MapSearch(enough=0, **STRICT))):
-        guess = Guess(T, sigma_m, float(np.radians(sigma_deg)), True)
-        window = _window(map, T, among, near)
-        matches = search.search(view.frame.camera, guess, view.keypoints, view.segments, view.planes, map, window)
-        found = _solved(T, view, matches, map)
+def verify_place(T_world_camera: F64, view: FrameFeatures, map: Map, keyframes: I32, near: int) -> VerifiedPlace | None:
+    """Search the map from a hypothesis (4, 4), widely, then closely and strictly from the pose solved; None when that moves, or is unobservable.
+
+    The landmarks are those of the `near` keyframes in the vicinity; where there are none, those of the candidate `keyframes`, so that a similar
+    place can compete. All are of the sub-map of these."""
+    T, information = T_world_camera, np.diag(np.repeat([PRIOR_M**-2, np.radians(PRIOR_DEG) ** -2], 3))
+    submap = int(map.keyframes.row("submap", int(keyframes[0])))
+    for (sigma_m, sigma_deg), options in ((WIDE, SearchOptions(enough=0)), (CLOSE, STRICT)):
+        window = local_window(map, T, 0, 0, near, VICINITY_M, VICINITY_DEG, submap)
+        window = window if len(window.keyframes) else window_of(map, keyframes)
+        prediction = PredictedPose(T, sigma_m, float(np.radians(sigma_deg)), True)
+        matches = search_map(options, view.frame.camera, prediction, *view[1:], map, window)
+        found = solve_pose_in_map(T, T, information, map, matches, view.frame.camera, *view[1:])
         if found.unobservable.shape[1]:
             return None
         before, T = T, found.T_world_camera
-    if apart(before, T):
+    if are_distinct(before, T):
         return None
     inliers = np.array([np.count_nonzero(found.points), np.count_nonzero(found.lines), np.count_nonzero(found.planes)], np.int32)
-    sought = len(matches.keypoints) + len(matches.segments) + len(matches.planes)
+    matched = len(matches.keypoints) + len(matches.segments) + len(matches.planes)
     expected = np.array([len(matches.visible_points), len(matches.visible_lines), 0])
-    share = float(inliers @ DETAILS / max(expected @ DETAILS, 1))
-    return Recognised(T, found.covariance, inliers, float(inliers.sum() / max(sought, 1)), share, seen_through(T, view.frame, map, window))
+    inlier_share, found_share = float(inliers.sum() / max(matched, 1)), float(inliers @ DETAILS / max(expected @ DETAILS, 1))
+    return VerifiedPlace(T, found.covariance, inliers, inlier_share, found_share, free_space_violation(T, view.frame, map, window))
 
 
-def _window(map: Map, T: F64, among: I32, near: int) -> LocalWindow:
-    window = local_window(map, T, 0, 0, near, ABOUT_M, ABOUT_DEG, int(map.keyframes.row("submap", int(among[0]))))
-    return window if len(window.keyframes) else window_of(map, among)
-
-
-def _solved(T: F64, view: FrameFeatures, matches: Matches, map: Map) -> PoseSolution:
-    none = matches.parallel[:0]
-    return solve_pose(
-        T,
-        view.frame.camera,
-        T,
-        np.diag(np.repeat([PRIOR_M**-2, np.radians(PRIOR_DEG) ** -2], 3)),
-        point_terms(map, view.keypoints, matches.keypoints),
-        line_terms(map, view.segments, matches.segments, T, view.frame.camera, LINE_PX),
-        plane_terms(map, view.planes, matches.planes, none, none, 1.0),
-    )
+def solve_pose_in_map(
+    T: F64, T_prior: F64, information: F64, map: Map, matches: Matches, camera: Camera, keypoints: Keypoints, segments: Segments, planes: Planes
+) -> PoseSolution:
+    """Estimate the pose by matches with the map, without relations of planes, from T; `information` (6, 6) is that of the prior T_prior."""
+    points, none = point_terms(map, keypoints, matches.keypoints), matches.parallel[:0]
+    lines, walls = line_terms(map, segments, matches.segments, T, camera, LINE_PX), plane_terms(map, planes, matches.planes, none, none, 1.0)
+    return solve_pose(T, camera, T_prior, information, points, lines, walls)

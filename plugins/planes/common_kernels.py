@@ -8,7 +8,7 @@ import numpy as np
 from trihedron.pipeline.core.kernel import kernel
 from trihedron.pipeline.core.types import F32, F64, I32, U8, Bool
 from trihedron.plugins.shared.depth_image_kernels import Grid, cells_by_component
-from trihedron.plugins.shared.linalg_kernels import descending, fill_tangent_basis, inverse_positive, median, solve_positive
+from trihedron.plugins.shared.linalg_kernels import descending, inverse_positive, median, solve_positive, tangent_columns
 
 # Robust planes through the cells of a grid: dominant normal, trimmed weighted least squares in inverse depth, and a test for curvature.
 
@@ -493,7 +493,7 @@ def plane_report(
         x, y, z = planes[k, 0], planes[k, 1], planes[k, 2]
         d = 1.0 / max(np.sqrt(x * x + y * y + z * z), 1e-12)
         coefficients[k, 0], coefficients[k, 1], coefficients[k, 2], coefficients[k, 3] = -x * d, -y * d, -z * d, d
-        fill_tangent_basis(coefficients[k], J[k])
+        tangent_columns(coefficients[k], J[k].T)
         for i in range(3):
             J[k, 0, i], J[k, 1, i], J[k, 2, i] = -d * J[k, 0, i], -d * J[k, 1, i], d * d * coefficients[k, i]
     variance = excess_variance(core, number, planes, grid, tiles, expected, weight)

@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 
 from trihedron.pipeline.core.geometry import exp_so3, invert, nearest_rotation, pose_matrix
 from trihedron.pipeline.core.types import DEGRADED, F32, F64, LOST, OK, Frame, Pose
-from trihedron.plugins.mapping.reference_keyframe import FIRST_SIGMA, Decoupled
 from trihedron.plugins.pose.common_kernels import Residuals, Source, Target, fill_residuals, normal_equations, observability, student_weights_kernel
+from trihedron.plugins.pose.decoupled_pose import FIRST_SIGMA, Decoupled
 from trihedron.plugins.shared.image_reduction import Level
 from trihedron.plugins.shared.image_reduction_kernels import depth_normals, gradients
 
@@ -27,7 +27,7 @@ def source_of(level: Level, noise: NDArray[np.float64], stride: int, normals: F3
     z = level.depth_m[::stride, ::stride]
     r, c = np.nonzero(z > 0.0)
     z = z[r, c].astype(np.float64)
-    fx, fy, cx, cy = level.lens
+    fx, fy, cx, cy = level.intrinsics
     points = np.stack([(c * stride - cx) / fx * z, (r * stride - cy) / fy * z, z], axis=1)
     sigma = noise[np.minimum((100.0 * z).astype(int), len(noise) - 1)]
     at = r * stride, c * stride
@@ -37,7 +37,9 @@ def source_of(level: Level, noise: NDArray[np.float64], stride: int, normals: F3
 def target_of(level: Level, reach: int, normals: F32 | None = None) -> Target:
     """Attach gradients and, where they are not given, normals over `reach` pixels to an image."""
     x, y = gradients(level.gray)
-    return Target(level.gray, x, y, level.depth_m, depth_normals(level.depth_m, level.lens, reach) if normals is None else normals, level.lens)
+    return Target(
+        level.gray, x, y, level.depth_m, depth_normals(level.depth_m, level.intrinsics, reach) if normals is None else normals, level.intrinsics
+    )
 
 
 def residual_buffers(source: Source) -> Residuals:

@@ -56,6 +56,6 @@ class Direct:
         out = []
         for a, b in zip(pyramid(before, self.width, self.levels), pyramid(now, self.width, self.levels)):
             stride = max(1, round((a.gray.size / self.most) ** 0.5))
-            source = source_of(a, noise, stride, depth_normals(a.depth_m, a.lens, REACH))
+            source = source_of(a, noise, stride, depth_normals(a.depth_m, a.intrinsics, REACH))
             out.append((source, target_of(b, REACH), self.iterations))
         return out[::-1]

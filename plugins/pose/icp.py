@@ -13,7 +13,7 @@ from trihedron.pipeline.core.registry import register
 from trihedron.pipeline.core.types import F64, Frame, Pose, PredictedView
 from trihedron.plugins.pose.common import Gates, align, dense_pose, first_pose, huber_weights, source_of, target_of
 from trihedron.plugins.pose.common_kernels import Source, Target
-from trihedron.plugins.shared.image_reduction import Level, brightness, halvings, lens_of, pyramid
+from trihedron.plugins.shared.image_reduction import Level, brightness, halvings, pyramid, reduced_intrinsics
 from trihedron.plugins.shared.image_reduction_kernels import depth_normals, smoothed
 
 
@@ -55,10 +55,10 @@ class Icp:
         width = model.depth_m.shape[1]
         step = max(1, round(frame.camera.width / width))
         gray = np.where(model.depth_m > 0.0, brightness(model.color), np.float32(np.nan))
-        views = halvings(Level(gray, np.array(model.depth_m), lens_of(frame, step)), self.levels)
+        views = halvings(Level(gray, np.array(model.depth_m), reduced_intrinsics(frame, step)), self.levels)
         out = []
         for i, (now, view) in enumerate(zip(pyramid(frame, width, self.levels), views)):
             stride = max(1, round((now.gray.size / self.most) ** 0.5))
-            source = source_of(now, noise, stride, depth_normals(smoothed(now.depth_m, 3), now.lens, 4))
+            source = source_of(now, noise, stride, depth_normals(smoothed(now.depth_m, 3), now.intrinsics, 4))
             out.append((source, target_of(view, 3, np.array(model.normals) if i == 0 else None), self.iterations))
         return out[::-1]

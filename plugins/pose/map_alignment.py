@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from trihedron.pipeline.core.types import F64, I32, Camera, Keypoints, Map, Matches, Planes, Segments
-from trihedron.plugins.mapping.reprojection import line_terms, plane_terms, point_terms
+from trihedron.plugins.mapping.projection import line_terms, plane_terms, point_terms
 from trihedron.plugins.shared.pose_optimizer import LANDMARK_SCORE, PoseSolution, Terms, classify_terms, first_step, solve_pose
 from trihedron.plugins.shared.pose_optimizer_kernels import Flags
 

@@ -6,7 +6,8 @@ from dataclasses import dataclass
 
 from trihedron.pipeline.core.registry import register
 from trihedron.pipeline.core.types import Map, Pose, Rotation, Translation
-from trihedron.plugins.mapping.reference_keyframe import decoupled_pose, transform_to_map
+from trihedron.plugins.mapping.reference_keyframe import transform_to_map
+from trihedron.plugins.pose.decoupled_pose import decoupled_pose
 
 
 @register("pose", "none")

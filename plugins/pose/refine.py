@@ -26,7 +26,8 @@ from trihedron.pipeline.core.types import (
     Tracks,
     Translation,
 )
-from trihedron.plugins.mapping.reference_keyframe import FIRST_SIGMA, Decoupled, decoupled_pose, reference_of, submap_of, transform_to_map
+from trihedron.plugins.mapping.reference_keyframe import reference_of, submap_of, transform_to_map
+from trihedron.plugins.pose.decoupled_pose import FIRST_SIGMA, Decoupled, decoupled_pose
 from trihedron.plugins.pose.dynamic_objects import DynamicObjectOptions, solve_with_static, status_with_static
 from trihedron.plugins.pose.keyframe_uncertainty import degrade_by_keyframes
 from trihedron.plugins.pose.map_alignment import InlierStatistics, MapAlignment, TrackingStatus

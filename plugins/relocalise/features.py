@@ -1,4 +1,4 @@
-"""A lost camera's place, recognised by all kinds of features."""
+"""Relocalisation of a lost camera by points, lines and planes."""
 
 from __future__ import annotations
 
@@ -11,21 +11,23 @@ from trihedron.pipeline.core.registry import register
 from trihedron.pipeline.core.types import DEGRADED, F64, I32, LOST, OK, Frame, Keypoints, Map, Planes, Pose, Rotation, Segments
 from trihedron.plugins.mapping.covisibility_graph import keyframes_of, living_keyframes, observed_by
 from trihedron.plugins.mapping.reference_keyframe import reference_of, submap_of
-from trihedron.plugins.places.recognition import apart, block_of, distinct, likely_keyframes, lookalikes, rigid_hypotheses
-from trihedron.plugins.places.verification import FrameFeatures, Recognised, check_place
-from trihedron.plugins.relocalise.features_kernels import BIN_M, NEAR_M, explained
+from trihedron.plugins.places.recognition import are_distinct, block_of, candidate_keyframes, distinct_poses, rigid_hypotheses
+from trihedron.plugins.places.verification import FrameFeatures, VerifiedPlace, verify_place
+from trihedron.plugins.relocalise.features_kernels import BIN_M, NEAR_M, explained_share
+from trihedron.plugins.shared.feature_matching import nearest_matches
 from trihedron.plugins.shared.manhattan_frames_kernels import CUBE
 
 
 @register("relocalise", "features")
 @dataclass(frozen=True)
 class Features:
-    """Hypotheses from points that look alike (three by three, Procrustes) and, where these find nothing, from the layout of planes and lines (all 24
-    ways round of each Manhattan frame in view); each is verified by searching the map from there and solving the pose with points, lines and planes.
+    """Recognise a place by hypotheses and verification. Hypotheses are from points of similar appearance (three by three, Procrustes) and, where none
+    holds, from the layout of planes and lines (all 24 orientations of each Manhattan frame in view). Each is verified by searching the map from there
+    and solving the pose with points, lines and planes.
 
-    A place is recognised when enough of the map agrees, details among it, a fair part of those that should be in view, nothing would hang in free
-    space, and no other place explains the frame nearly as well: a room that looks the same from two sides is refused, not guessed. A large map is
-    looked through block by block, one a frame. Points need binary descriptors."""
+    A place is recognised when enough of the map agrees, details among it, a fair share of those expected in view, without free-space violations, and
+    no other place explains the frame nearly as well: a symmetric room is refused. A large map is searched block by block, one a frame. Points need
+    binary descriptors."""
 
     block: PositiveInt = 80  # keyframes looked at in one frame
     every: PositiveInt = 5  # frames between looks at older sub-maps, while the camera is tracked in one that is not tied to them
@@ -56,97 +58,90 @@ class Features:
         previous_pose: Pose | None,
         rng: np.random.Generator,
     ) -> Pose | None:
-        """The pose; for a lost camera that is not recognised the lost one, and else None."""
+        """Return the pose; for a lost camera that is not recognised the lost one, and else None."""
         if map is None or previous_pose is None:
             return None
         view = FrameFeatures(frame, keypoints, segments, planes)
-        lost, submap = previous_pose.status == LOST, submap_of(previous_pose, map)
-        submaps = self._sought(map, submap, lost, frame.index)
+        lost = previous_pose.status == LOST
+        submaps = self._submaps(map, submap_of(previous_pose, map), lost, frame.index)
         if not len(submaps):
             return None
-        among = self._candidates(view, map, submaps[frame.index % len(submaps)])
-        found = self._checked(self._by_points(view, map, among, rng), view, map, among)
-        if not any(self._good(one) for one in found):  # points alone say more than any layout
-            found += self._checked(self._by_layout(view, map, among, rotation), view, map, among)
-        best = self._only_one(found)
+        submap = int(submaps[frame.index % len(submaps)])
+        keyframes = block_of(keyframes_of(map, submap), self.block, frame.index)
+        keyframes = candidate_keyframes(map, keypoints, segments, keyframes, self.candidates, self.max_bits)
+        found = self._verify(self._by_points(keypoints, map, keyframes, rng), view, map, keyframes)
+        if not any(self._accept(place) for place in found):  # points are more distinctive than any layout
+            found += self._verify(self._by_layout(view, map, keyframes, rotation), view, map, keyframes)
+        best = self._unambiguous(found)
         if best is None:
             return replace(previous_pose, index=frame.index, stamp_ns=frame.stamp_ns, reason="nothing was recognised") if lost else None
-        return self._said(best, frame, map, int(map.keyframes.row("submap", int(among[0]))), lost)
+        T, status = best.T_world_camera, OK if lost else DEGRADED
+        reference, T_reference_camera = reference_of(map, T, submap)
+        reason = "recognised by {} points, {} lines and {} planes of the map".format(*best.inliers)
+        return Pose(frame.index, frame.stamp_ns, T, best.covariance, T_reference_camera, reference, best.inliers, 0, status, reason, submap)
 
-    def _sought(self, map: Map, submap: int, lost: bool, index: int) -> I32:
-        """Sub-maps to look in: all for a lost camera; now and then the older ones for one tracked in a sub-map that is not tied to the first."""
+    def _submaps(self, map: Map, submap: int, lost: bool, index: int) -> I32:
+        """Sub-maps to search: all for a lost camera; now and then the older ones for one tracked in a sub-map that is not merged with the first."""
         known = np.unique(map.keyframes.rows("submap", living_keyframes(map))).astype(np.int32)
         return known if lost else known[known < submap] if index % self.every == 0 else known[:0]
 
-    def _candidates(self, view: FrameFeatures, map: Map, submap: int) -> I32:
-        """Keyframes of a sub-map whose landmarks look like what is seen."""
-        among = block_of(keyframes_of(map, submap), self.block, view.frame.index)
-        return likely_keyframes(map, view.keypoints, view.segments, among, self.candidates, self.max_bits)
-
-    def _by_points(self, view: FrameFeatures, map: Map, among: I32, rng: np.random.Generator) -> F64:
-        """(n, 4, 4) poses by points that look like those of the map, best first."""
-        seen = view.keypoints
-        ids = observed_by(map, among, "point")
-        rows = np.flatnonzero(np.isfinite(seen.points_m[:, 2])).astype(np.int32)
-        if seen.metric != "hamming":
+    def _by_points(self, keypoints: Keypoints, map: Map, keyframes: I32, rng: np.random.Generator) -> F64:
+        """Poses (n, 4, 4) by points similar to those of the map, best first."""
+        if keypoints.metric != "hamming":
             return np.empty((0, 4, 4))
-        alike = lookalikes(seen.descriptors[rows], map.points.rows("descriptor", ids), self.max_bits, self.ratio)
-        rows, ids = rows[alike >= 0], ids[alike[alike >= 0]]
-        places = seen.points_m[rows].astype(np.float64)
-        across = seen.sigma_px[rows] * self.angle_px * places[:, 2]
-        sigma = np.sqrt(self.floor_m**2 + across**2 + seen.sigma_m[rows].astype(np.float64) ** 2)
-        draws = rng.integers(0, max(len(rows), 1), (self.draws, 3)).astype(np.int32)
-        return rigid_hypotheses(places, map.points.rows("position_m", ids), sigma, draws, self.by_points)
+        ids, rows = observed_by(map, keyframes, "point"), np.flatnonzero(np.isfinite(keypoints.points_m[:, 2])).astype(np.int32)
+        matched = nearest_matches(keypoints.descriptors[rows], map.points.rows("descriptor", ids), self.max_bits, self.ratio)
+        rows, ids = rows[matched >= 0], ids[matched[matched >= 0]]
+        points = keypoints.points_m[rows].astype(np.float64)
+        across = keypoints.sigma_px[rows] * self.angle_px * points[:, 2]
+        sigma = np.sqrt(self.floor_m**2 + across**2 + keypoints.sigma_m[rows].astype(np.float64) ** 2)
+        samples = rng.integers(0, max(len(rows), 1), (self.draws, 3)).astype(np.int32)
+        return rigid_hypotheses(points, map.points.rows("position_m", ids), sigma, samples, self.by_points)
 
-    def _by_layout(self, view: FrameFeatures, map: Map, among: I32, rotation: Rotation) -> F64:
-        """(n, 4, 4) poses by the layout of planes and lines about each known Manhattan frame in view, best first."""
+    def _by_layout(self, view: FrameFeatures, map: Map, keyframes: I32, rotation: Rotation) -> F64:
+        """Poses (n, 4, 4) by the layout of planes and lines about each known Manhattan frame in view, best first."""
         found, scores = np.empty((0, 4, 4)), np.empty(0)
-        plane_ids, line_ids = observed_by(map, among, "plane"), observed_by(map, among, "line")
+        plane_ids, line_ids = observed_by(map, keyframes, "plane"), observed_by(map, keyframes, "line")
         for R_world, R_camera in zip(rotation.R_world_manhattan, rotation.R_camera_manhattan):
             if np.isfinite(R_camera).all():
                 poses, values = layout_poses(map, plane_ids, line_ids, view.planes, view.segments, R_world, R_camera)
                 found, scores = np.concatenate([found, poses]), np.concatenate([scores, values])
-        return distinct(found[np.argsort(-scores, kind="stable")], self.by_layout)
+        return distinct_poses(found[np.argsort(-scores, kind="stable")], self.by_layout)
 
-    def _checked(self, poses: F64, view: FrameFeatures, map: Map, among: I32) -> list[Recognised]:
-        found = [check_place(T, view, map, among, self.near) for T in poses]
-        return [one for one in found if one is not None]
+    def _verify(self, poses: F64, view: FrameFeatures, map: Map, keyframes: I32) -> list[VerifiedPlace]:
+        found = [verify_place(T, view, map, keyframes, self.near) for T in poses]
+        return [place for place in found if place is not None]
 
-    def _only_one(self, found: list[Recognised]) -> Recognised | None:
-        """The best place if it is good enough and no other is nearly as good."""
-        best = max(found, key=lambda one: one.score, default=None)
-        if best is None or not self._good(best):
+    def _accept(self, place: VerifiedPlace) -> bool:
+        enough = place.score >= self.min_score and place.details >= self.min_details
+        fair = place.inlier_share >= self.min_share and place.found_share >= self.min_found
+        return enough and fair and place.violation <= self.max_through
+
+    def _unambiguous(self, found: list[VerifiedPlace]) -> VerifiedPlace | None:
+        """The best place if it is accepted and no other is nearly as good."""
+        best = max(found, key=lambda place: place.score, default=None)
+        if best is None or not self._accept(best):
             return None
-        rivals = [one for one in found if one.score > self.rival * best.score and apart(one.T_world_camera, best.T_world_camera)]
-        return None if rivals else best
-
-    def _good(self, one: Recognised) -> bool:
-        enough = one.score >= self.min_score and one.details >= self.min_details
-        return enough and one.agreeing >= self.min_share and one.found >= self.min_found and one.through <= self.max_through
-
-    def _said(self, one: Recognised, frame: Frame, map: Map, submap: int, lost: bool) -> Pose:
-        T, status = one.T_world_camera, OK if lost else DEGRADED
-        reference, T_reference_camera = reference_of(map, T, submap)
-        reason = "recognised by {} points, {} lines and {} planes of the map".format(*one.inliers)
-        return Pose(frame.index, frame.stamp_ns, T, one.covariance, T_reference_camera, reference, one.inliers, 0, status, reason, submap)
+        rivals = (place for place in found if place.score > self.rival * best.score)
+        return None if any(are_distinct(place.T_world_camera, best.T_world_camera) for place in rivals) else best
 
 
-# Poses at which the planes and lines of a frame lie on those of the map, for a scene whose axes are known: no descriptor and no prediction needed.
+# Hypotheses by layout: poses at which the planes and lines of a frame lie on those of the map, for known Manhattan axes, without descriptors.
 #
-# With the rotation fixed a plane says where the camera is along its normal (`n·t = d_camera - d_world`) and a line where it is across itself. So each
-# axis of the scene has a handful of likely coordinates, found by votes, and their combinations are counted out.
+# With the rotation fixed a plane determines the position along its normal (`n·t = d_camera - d_world`) and a line the position across itself. So each
+# axis has a handful of likely coordinates, found by votes, and all their combinations are scored.
 
 ON_AXIS = np.cos(np.radians(8.0))
-PEAKS = 8  # coordinates kept on each axis
+PEAKS = 8  # coordinates retained on each axis
 
 
 @dataclass(frozen=True)
 class Layout:
-    """Planes and lines along three axes, in the coordinates of these. Planes: side they face (0..5: +x +y +z -x -y -z), place along that axis, area.
-    Lines: axis, ends along it (low, high), the two other coordinates in cyclic order, length; sorted by axis, then by the first of these."""
+    """Planes and lines along three axes, in their coordinates. Planes: direction of the normal (0..5: +x +y +z -x -y -z), offset along that axis,
+    area. Lines: axis, ends along it (low, high), the two other coordinates in cyclic order, length; sorted by axis, then by the first of these."""
 
     sides: I32
-    places_m: F64
+    offsets_m: F64
     areas: F64
     axes: I32
     spans_m: F64
@@ -155,7 +150,7 @@ class Layout:
 
 
 def layout_of(coefficients: F64, areas: F64, endpoints_m: F64, lengths: F64, R: F64) -> Layout:
-    """What of planes (n, 4) and lines (m, 2, 3) lies along the columns of R (3, 3), which are in their frame."""
+    """Select the planes (n, 4) and lines (m, 2, 3) along the columns of R (3, 3), which are in their frame."""
     along = coefficients[:, :3] @ R
     axis = np.abs(along).argmax(axis=1)
     dot = along[np.arange(len(axis)), axis]
@@ -176,11 +171,9 @@ def layout_of(coefficients: F64, areas: F64, endpoints_m: F64, lengths: F64, R: 
     return Layout(sides, places, areas[good], line_axis[order].astype(np.int32), ends[order], across[order], lengths[straight][order])
 
 
-def layout_poses(
-    map: Map, plane_ids: I32, line_ids: I32, planes: Planes, segments: Segments, R_world: F64, R_camera: F64, ways: F64 = CUBE
-) -> tuple[F64, F64]:
-    """(n, 4, 4) poses `T_world_camera` and (n,) how much of the frame's planes and lines they explain (0..2), best first, for axes seen as the
-    columns of `R_camera` and known as those of `R_world`, whichever of the `ways` (n, 3, 3) round."""
+def layout_poses(map: Map, plane_ids: I32, line_ids: I32, planes: Planes, segments: Segments, R_world: F64, R_camera: F64) -> tuple[F64, F64]:
+    """Return poses `T_world_camera` (n, 4, 4) and the share of the frame's planes and lines that they explain (0..2), best first, for axes observed
+    as the columns of `R_camera` and known as those of `R_world`, in any of the 24 orientations."""
     known = layout_of(
         map.planes.rows("coefficients", plane_ids), np.ones(len(plane_ids)), map.lines.rows("endpoints_m", line_ids), np.ones(len(line_ids)), R_world
     )
@@ -188,10 +181,10 @@ def layout_poses(
     ends, pixels = segments.endpoints_m[solid].astype(np.float64), segments.endpoints_px[solid]
     lengths = np.linalg.norm(pixels[:, 1] - pixels[:, 0], axis=1).astype(np.float64)
     poses, scores = [], []
-    for S in ways:
+    for S in CUBE:
         named = R_camera @ S
         seen = layout_of(planes.coefficients, planes.pixels.astype(np.float64), ends, lengths, named)
-        t, score = _places(seen, known)
+        t, score = _positions(seen, known)
         R = R_world @ named.T
         for place, value in zip(t, score):
             T = np.eye(4)
@@ -202,24 +195,24 @@ def layout_poses(
     return np.array(poses).reshape(-1, 4, 4)[order], np.array(scores)[order]
 
 
-def _places(seen: Layout, known: Layout) -> tuple[F64, F64]:
-    """(n, 3) coordinates of the camera along the axes and (n,) the share of the frame explained there."""
+def _positions(seen: Layout, known: Layout) -> tuple[F64, F64]:
+    """Coordinates (n, 3) of the camera along the axes, and the share of the frame (n,) explained there."""
     candidates = [_peaks(*_votes(seen, known, axis)) for axis in range(3)]
     grid = np.stack(np.meshgrid(*candidates, indexing="ij"), axis=-1).reshape(-1, 3)
-    score = explained(
-        grid, seen.sides, seen.places_m, seen.areas / max(float(seen.areas.sum()), 1.0), seen.axes, seen.spans_m, seen.across_m,
-        seen.lengths / max(float(seen.lengths.sum()), 1.0), known.sides, known.places_m, known.axes, known.spans_m, known.across_m,
+    score = explained_share(
+        grid, seen.sides, seen.offsets_m, seen.areas / max(float(seen.areas.sum()), 1.0), seen.axes, seen.spans_m, seen.across_m,
+        seen.lengths / max(float(seen.lengths.sum()), 1.0), known.sides, known.offsets_m, known.axes, known.spans_m, known.across_m,
     )  # fmt: skip
     best = np.argsort(-score, kind="stable")[:3]
     return grid[best], score[best]
 
 
 def _votes(seen: Layout, known: Layout, axis: int) -> tuple[F64, F64]:
-    """Coordinates of the camera along an axis that pairs of planes or lines would mean, and what each counts."""
+    """Coordinates of the camera along an axis by each pair of planes or lines, and their weights."""
     values, weights = [], []
     for side in (axis, axis + 3):
         ours, theirs = np.flatnonzero(seen.sides == side), np.flatnonzero(known.sides == side)
-        values.append((known.places_m[theirs][None] - seen.places_m[ours][:, None]).ravel())
+        values.append((known.offsets_m[theirs][None] - seen.offsets_m[ours][:, None]).ravel())
         weights.append(np.repeat(2.0 * np.sqrt(seen.areas[ours] / max(float(seen.areas.max(initial=1.0)), 1.0)), len(theirs)))
     for k in range(2):
         line_axis = (axis - 1 - k) % 3  # whose coordinate k across is this axis
@@ -230,7 +223,7 @@ def _votes(seen: Layout, known: Layout, axis: int) -> tuple[F64, F64]:
 
 
 def _peaks(values: F64, weights: F64) -> F64:
-    """The coordinates with most votes, at most PEAKS."""
+    """Coordinates with most votes, at most PEAKS."""
     if not len(values):
         return np.empty(0)
     bins = np.floor(values / BIN_M).astype(np.int64)

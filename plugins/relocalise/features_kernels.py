@@ -1,4 +1,4 @@
-"""Numba kernels of `features.py`."""
+"""Kernel of `features.py`: share of a frame's planes and lines explained by the map at each hypothetical position."""
 # mypy: disable-error-code="arg-type, assignment, index, return-value"
 
 from __future__ import annotations
@@ -9,15 +9,15 @@ from trihedron.pipeline.core.kernel import kernel
 from trihedron.pipeline.core.types import F64, I32
 
 BIN_M = 0.03  # of the votes
-NEAR_M = 1.5 * BIN_M  # what lies this near to a candidate belongs to it
+NEAR_M = 1.5 * BIN_M  # within which a vote belongs to a candidate
 
 
 @kernel
-def explained(
+def explained_share(
     places: F64, sides: I32, offsets: F64, areas: F64, axes: I32, spans: F64, across: F64, lengths: F64,
     known_sides: I32, known_offsets: F64, known_axes: I32, known_spans: F64, known_across: F64,
 ) -> F64:  # fmt: skip
-    """(n,) share of the areas plus share of the lengths that lie on a known plane or line when the camera is at each of the places (n, 3)."""
+    """Return the share (n,) of the areas plus that of the lengths that lie on a known plane or line with the camera at each of the places (n, 3)."""
     out = np.zeros(len(places))
     start = np.searchsorted(known_axes, np.arange(4))
     for k in range(len(places)):

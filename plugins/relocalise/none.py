@@ -11,8 +11,8 @@ from trihedron.pipeline.core.types import Map, Pose
 @register("relocalise", "none")
 @dataclass(frozen=True)
 class NoRelocalisation:
-    """A camera that is lost finds back only near its last pose."""
+    """Skip relocalisation: a lost camera is tracked again only near its last pose."""
 
     def __call__(self, map: Map | None) -> Pose | None:
-        """None, whatever is given."""
+        """Return None."""
         return None

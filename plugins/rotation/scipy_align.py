@@ -61,7 +61,7 @@ def _squared_cross(vectors: F64) -> F64:
 
 def tracked_vectors(tracks: Tracks, keypoints: Keypoints, segments: Segments, planes: Planes, floor_rad: float) -> tuple[F64, F64, F64]:
     """Vectors (n, 3) of the previous and of the current frame that differ by the rotation alone, and the σ (n,) of their difference."""
-    before, after, sigma = tracked_point_pairs(tracks, keypoints)
+    before, after, sigma = _usable(*tracked_point_pairs(tracks, keypoints))
     if len(before):
         weight = sigma**-2.0 / (sigma**-2.0).sum()
         before, after = before - weight @ before, after - weight @ after
@@ -70,8 +70,13 @@ def tracked_vectors(tracks: Tracks, keypoints: Keypoints, segments: Segments, pl
     normals = tracks.coefficients[:, :3], planes.coefficients[j, :3], np.sqrt(0.5 * np.trace(tilt, axis1=1, axis2=2) + floor_rad**2)
     lines = _line_directions(tracks, segments)
     parts = [[before, normals[0], lines[0]], [after, normals[1], lines[1]], [sigma, normals[2], lines[2]]]
-    then, now, sigmas = (np.concatenate(part).astype(np.float64) for part in parts)
-    return then, now, sigmas
+    return _usable(*(np.concatenate(part).astype(np.float64) for part in parts))
+
+
+def _usable(then: F64, now: F64, sigma: F64) -> tuple[F64, F64, F64]:
+    """Rows whose numbers are all finite and whose σ is positive."""
+    rows = np.isfinite(then).all(axis=1) & np.isfinite(now).all(axis=1) & np.isfinite(sigma) & (sigma > 0.0)
+    return then[rows], now[rows], sigma[rows]
 
 
 def _line_directions(tracks: Tracks, segments: Segments) -> tuple[F64, F64, F64]:

@@ -1,4 +1,4 @@
-"""Numba kernels of `depth_image.py`."""
+"""Kernels of depth images: depth at sub-pixel positions; grids of cells with inverse depth and normals, and their smooth connected components."""
 # mypy: disable-error-code="arg-type, assignment, index, return-value"
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Colour and depth images made smaller, and what dense alignment needs of them: intensities, gradients, normals."""
+"""Image pyramids of intensity and depth for dense alignment."""
 
 from __future__ import annotations
 
@@ -18,37 +18,37 @@ class Level:
 
     gray: F32
     depth_m: F32
-    lens: F64
+    intrinsics: F64
 
 
 def step_to(frame: Frame, width: int) -> int:
-    """How many pixels of the frame are one of an image about `width` wide."""
+    """Return the reduction of a frame to an image about `width` wide, in pixels."""
     return max(1, round(frame.camera.width / width))
 
 
-def lens_of(frame: Frame, step: int) -> F64:
-    """(fx, fy, cx, cy) of the frame reduced by `step`."""
+def reduced_intrinsics(frame: Frame, step: int) -> F64:
+    """Return (fx, fy, cx, cy) of the frame reduced by `step`."""
     c, offset = frame.camera, (step - 1) / 2.0
     return np.array([c.fx / step, c.fy / step, (c.cx - offset) / step, (c.cy - offset) / step])
 
 
 def pyramid(frame: Frame, width: int, levels: int) -> list[Level]:
-    """The frame reduced to about `width` columns, and that halved again and again; the finest first."""
+    """Build the pyramid of a frame from about `width` columns, the finest level first."""
     step = step_to(frame, width)
     depth, color = reduced(frame.depth_m, frame.color, step)
-    return halvings(Level(brightness(color), depth, lens_of(frame, step)), levels)
+    return halvings(Level(brightness(color), depth, reduced_intrinsics(frame, step)), levels)
 
 
 def halvings(finest: Level, levels: int) -> list[Level]:
-    """An image, and halves of halves of it."""
+    """Halve an image again and again, the finest level first."""
     out = [finest]
     for _ in range(levels - 1):
-        fx, fy, cx, cy = out[-1].lens
+        fx, fy, cx, cy = out[-1].intrinsics
         gray, depth = halved(out[-1].gray, out[-1].depth_m)
         out.append(Level(gray, depth, np.array([fx / 2.0, fy / 2.0, (cx - 0.5) / 2.0, (cy - 0.5) / 2.0])))
     return out
 
 
 def brightness(color: U8) -> F32:
-    """(h, w, 3) RGB -> (h, w), 0 … 255."""
+    """Convert RGB (h, w, 3) to luminance (h, w), 0 … 255."""
     return np.asarray(color @ np.array(LUMINANCE, np.float32), np.float32)

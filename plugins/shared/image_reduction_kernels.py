@@ -1,4 +1,4 @@
-"""Numba kernels of `image_reduction.py`."""
+"""Kernels of dense images: halving, block means, gradients, edge-preserving smoothing and normals."""
 # mypy: disable-error-code="arg-type, assignment, index, return-value"
 
 from __future__ import annotations
@@ -13,6 +13,7 @@ EDGE = 0.03  # a reading farther than the nearest of its block by more than this
 
 @kernel
 def halved(gray: F32, depth: F32) -> tuple[F32, F32]:
+    """Halve intensity and depth (h, w), the depth without readings behind an edge."""
     h, w = gray.shape[0] // 2, gray.shape[1] // 2
     out, small = np.empty((h, w), np.float32), np.zeros((h, w), np.float32)
     for r in range(h):
@@ -51,7 +52,7 @@ def gradients(gray: F32) -> tuple[F32, F32]:
 
 @kernel
 def smoothed(depth: F32, radius: int) -> F32:
-    """(h, w) means of the readings within `radius` pixels that are not across an edge; 0 stays 0."""
+    """Smooth depth (h, w) by the mean of the readings within `radius` pixels that are not across an edge; 0 stays 0."""
     h, w = depth.shape
     out = np.zeros((h, w), np.float32)
     for r in range(h):
@@ -69,9 +70,9 @@ def smoothed(depth: F32, radius: int) -> F32:
 
 
 @kernel
-def depth_normals(depth: F32, lens: F64, reach: int) -> F32:
-    """(h, w, 3) unit normals towards the camera from the points `reach` pixels to the left, right, above and below; NaN where one of them is missing
-    or lies behind an edge."""
+def depth_normals(depth: F32, intrinsics: F64, reach: int) -> F32:
+    """Estimate unit normals (h, w, 3) towards the camera from the points `reach` pixels to the left, right, above and below; NaN where one of them is
+    missing or lies behind an edge."""
     h, w = depth.shape
     out = np.full((h, w, 3), np.nan, np.float32)
     for r in range(reach, h - reach):
@@ -83,11 +84,11 @@ def depth_normals(depth: F32, lens: F64, reach: int) -> F32:
                 continue
             if abs(left - z) > limit or abs(right - z) > limit or abs(up - z) > limit or abs(down - z) > limit:
                 continue
-            ax = ((c + reach - lens[2]) * right - (c - reach - lens[2]) * left) / lens[0]
-            ay = (r - lens[3]) * (right - left) / lens[1]
+            ax = ((c + reach - intrinsics[2]) * right - (c - reach - intrinsics[2]) * left) / intrinsics[0]
+            ay = (r - intrinsics[3]) * (right - left) / intrinsics[1]
             az = right - left
-            bx = (c - lens[2]) * (down - up) / lens[0]
-            by = ((r + reach - lens[3]) * down - (r - reach - lens[3]) * up) / lens[1]
+            bx = (c - intrinsics[2]) * (down - up) / intrinsics[0]
+            by = ((r + reach - intrinsics[3]) * down - (r - reach - intrinsics[3]) * up) / intrinsics[1]
             bz = down - up
             nx, ny, nz = by * az - bz * ay, bz * ax - bx * az, bx * ay - by * ax
             size = np.sqrt(nx * nx + ny * ny + nz * nz)
@@ -98,7 +99,7 @@ def depth_normals(depth: F32, lens: F64, reach: int) -> F32:
 
 @kernel
 def reduced(depth: F32, color: U8, step: int) -> tuple[F32, U8]:
-    """Depth (h, w) and colour averaged over blocks of step × step pixels; of the depth only the readings that are not behind an edge."""
+    """Average depth (h, w) and colour over blocks of step × step pixels; of the depth only the readings that are not behind an edge."""
     h, w = depth.shape[0] // step, depth.shape[1] // step
     small, paint = np.zeros((h, w), np.float32), np.empty((h, w, 3), np.uint8)
     for r in range(h):

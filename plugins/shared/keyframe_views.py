@@ -1,7 +1,6 @@
-"""Views: what a surface keeps of a frame, and which frames it keeps.
+"""Keyframe views: reduced frames from which a surface is fused, and the novelty by which they are selected.
 
-A view is kept while it tells enough that is not known yet, so their number is bounded by the surface of the scene and not by the length of the
-sequence.
+A view is retained while it observes enough that is new, so their number is bounded by the surface of the scene and not by the length of the sequence.
 """
 
 from __future__ import annotations
@@ -12,14 +11,14 @@ import numpy as np
 
 from trihedron.pipeline.core.types import F32, F64, I32, U8, Camera, Frame, Map, Planes, Pose
 from trihedron.plugins.shared.image_reduction_kernels import reduced
-from trihedron.plugins.shared.keyframe_views_kernels import learn, news
-from trihedron.plugins.shared.voxel_hash import empty_table, roomy
+from trihedron.plugins.shared.keyframe_views_kernels import add_readings, count_novel
+from trihedron.plugins.shared.voxel_hash import empty_table, reserve
 from trihedron.plugins.shared.voxel_hash_kernels import I64
 
 
 @dataclass(frozen=True)
 class KeyframeView:
-    """A frame reduced to about `width` columns, and where it hangs. `labels` and `coefficients` are those of its planar regions, camera frame."""
+    """A frame reduced to about `width` columns, with its pose. `labels` and `coefficients` are those of its planar regions, camera frame."""
 
     index: int
     camera: Camera  # of the reduced images
@@ -27,15 +26,20 @@ class KeyframeView:
     color: U8  # (h, w, 3)
     labels: U8  # (h, w), 0 = none, i + 1 = region i
     coefficients: F64  # (n, 4)
-    T_world_camera: F64  # as it was said
+    T_world_camera: F64  # as estimated at the time
     T_reference_camera: F64
     reference: int  # keyframe, -1 = none
     keyframe: int  # that this frame became, -1 = none
     submap: int
 
+    @property
+    def fused(self) -> tuple[Camera, F32, U8, F64]:
+        """Return what a TSDF fuses: camera, depth, labels and planes."""
+        return self.camera, self.depth_m, self.labels, self.coefficients
+
     def settled(self, map: Map | None) -> F64 | None:
-        """(4, 4) final pose: the keyframe's that the frame became, else hung on its reference keyframe; None when its sub-map is not tied to the
-        first."""
+        """Return the final pose (4, 4): the keyframe's that the frame became, else relative to its reference keyframe; None when its sub-map is not
+        merged with the first."""
         row = self.keyframe if self.keyframe >= 0 else self.reference
         if map is None or row < 0:
             return self.T_world_camera if self.submap == 0 else None
@@ -46,7 +50,7 @@ class KeyframeView:
 
 
 def view_of(frame: Frame, planes: Planes, pose: Pose, map: Map | None, width: int, max_sigma_m: float) -> KeyframeView:
-    """The frame as a view; depth whose standard deviation is above `max_sigma_m` is left out. `map` is that of this very frame, or None."""
+    """Reduce a frame to a view; depth whose standard deviation is above `max_sigma_m` is skipped. `map` is that of this very frame, or None."""
     step = max(1, round(frame.camera.width / width))
     depth, color = reduced(frame.depth_m, frame.color, step)
     camera, noise = frame.camera, frame.camera.depth_noise
@@ -69,30 +73,29 @@ def view_of(frame: Frame, planes: Planes, pose: Pose, map: Map | None, width: in
 
 @dataclass
 class Known:
-    """How well each cell of one world has been seen: cells of `side_m` and the information (1/m²) gathered about each."""
+    """Observed voxels of one world: cells of `side_m` and the information (1/m²) gathered about each."""
 
     side_m: float
     keys: I64 = field(default_factory=lambda: empty_table(1 << 12)[0])
     numbers: I32 = field(default_factory=lambda: empty_table(1 << 12)[1])
     information: F64 = field(default_factory=lambda: np.zeros(0))
 
-    def news(self, points: F64, weight: F64, views: float) -> float:
-        """The share of readings whose cell is not yet known as well as from `views` readings like it; of points (n, 3) with information (n,),
-        1/m²."""
-        return float(news(self.keys, self.numbers, self.information, points, weight, self.side_m, views)) / max(len(points), 1)
+    def novelty(self, points: F64, weight: F64, views: float) -> float:
+        """Return the share of readings, points (n, 3) with information (n,) in 1/m², whose cell has less information than `views` times theirs."""
+        return float(count_novel(self.keys, self.numbers, self.information, points, weight, self.side_m, views)) / max(len(points), 1)
 
     def learn(self, points: F64, weight: F64) -> None:
-        """Gather the readings of one view; a cell takes the information of one, however many fall into it."""
-        self.keys, self.numbers = roomy(self.keys, self.numbers, len(points))
+        """Add the readings of one view; a cell gains the largest information of those that fall into it."""
+        self.keys, self.numbers = reserve(self.keys, self.numbers, len(points))
         count = len(self.information)
         gained = np.zeros(count + len(points))
-        count = learn(self.keys, self.numbers, gained, points, weight, self.side_m, count)
+        count = add_readings(self.keys, self.numbers, gained, points, weight, self.side_m, count)
         gained[: len(self.information)] += self.information
         self.information = gained[:count]
 
 
 def readings(frame: Frame, T_world_camera: F64, step: int, max_sigma_m: float) -> tuple[F64, F64]:
-    """Every `step`-th reading of a frame that is as certain as that: points (n, 3) in the world, and information (n,) of their depth (1/m²)."""
+    """Sample every `step`-th reading of a frame within `max_sigma_m`: points (n, 3) in the world, and information (n,) of their depth (1/m²)."""
     depth = frame.depth_m[step // 2 :: step, step // 2 :: step].astype(np.float64)
     sigma = frame.camera.depth_noise.sigma_m(depth)
     r, c = np.nonzero((depth > 0.0) & (sigma <= max_sigma_m))

@@ -1,4 +1,4 @@
-"""Numba kernels of `linalg.py`."""
+"""Kernels of small linear algebra: Cholesky, inverses, tangent basis, nearest rotation (polar decomposition); and sorting and medians."""
 # mypy: disable-error-code="arg-type, assignment, index, return-value"
 
 from __future__ import annotations
@@ -64,35 +64,6 @@ def invert_symmetric(S: F64, out: F64) -> float:
     return determinant
 
 
-@kernel
-def left_multiply_exp(phi: F64, R: F64) -> None:
-    """`R <- Exp(phi) R` in place, for the first three numbers of phi (Rodrigues)."""
-    x, y, z = phi[0], phi[1], phi[2]
-    angle2 = x * x + y * y + z * z
-    if angle2 < 1e-12:
-        a, b = 1.0 - angle2 / 6.0, 0.5 - angle2 / 24.0
-    else:
-        angle = np.sqrt(angle2)
-        a, b = np.sin(angle) / angle, (1.0 - np.cos(angle)) / angle2
-    for c in range(3):
-        u, v, w = R[0, c], R[1, c], R[2, c]
-        p, q, r = y * w - z * v, z * u - x * w, x * v - y * u  # phi × column
-        R[0, c] = u + a * p + b * (y * r - z * q)
-        R[1, c] = v + a * q + b * (z * p - x * r)
-        R[2, c] = w + a * r + b * (x * q - y * p)
-
-
-@kernel
-def fill_tangent_basis(n: F64, out: F64) -> None:
-    """Write the columns of `geometry.tangent_basis` of a unit vector to the rows of `out` (2, 3)."""
-    x, y, z = n[0], n[1], n[2]
-    sign = 1.0 if z >= 0.0 else -1.0
-    a = -1.0 / (sign + z)
-    b = x * y * a
-    out[0, 0], out[0, 1], out[0, 2] = 1.0 + sign * x * x * a, sign * b, -sign * x
-    out[1, 0], out[1, 1], out[1, 2] = b, sign + y * y * a, -y
-
-
 @kernel(forceinline=True)
 def tangent_columns(n: F64, B: F64) -> None:
     """Fill the columns of B (3, 2) with `geometry.tangent_basis` of a unit vector n (3,)."""
@@ -101,6 +72,25 @@ def tangent_columns(n: F64, B: F64) -> None:
     b = n[0] * n[1] * a
     B[0, 0], B[1, 0], B[2, 0] = 1.0 + s * n[0] * n[0] * a, s * b, -s * n[0]
     B[0, 1], B[1, 1], B[2, 1] = b, s + n[1] * n[1] * a, -n[1]
+
+
+@kernel(forceinline=True)
+def add_triple(row: F64, first: int, x: float, y: float, z: float) -> None:
+    """Add three numbers to a row, from column `first`."""
+    row[first] += x
+    row[first + 1] += y
+    row[first + 2] += z
+
+
+@kernel(forceinline=True)
+def add_triangle(H: F64, k: int, h00: float, h10: float, h11: float, h20: float, h21: float, h22: float) -> None:
+    """Add a symmetric block (3, 3), given by rows of its lower triangle, to H at (k, k)."""
+    H[k, k] += h00
+    H[k + 1, k] += h10
+    H[k + 1, k + 1] += h11
+    H[k + 2, k] += h20
+    H[k + 2, k + 1] += h21
+    H[k + 2, k + 2] += h22
 
 
 @kernel
@@ -173,14 +163,15 @@ def _from_columns(A: F64, V: F64) -> F64:
     return out
 
 
-# Order of many values, in a call that holds no lock.
+# Sorting and medians, without the interpreter's lock.
 
 DIGIT = 11  # bits sorted by at a time: six digits of a double, whose counts stay in the nearest cache
 
 
 @kernel
 def descending(values: F64) -> I32:
-    """Rows of (n,) numbers from the largest to the smallest, equal ones in their order. A radix sort: thousands in a fifth of a merge sort's time."""
+    """Sort the rows of (n,) numbers from the largest to the smallest, equal ones in their order. A radix sort: thousands in a fifth of a merge sort's
+    time."""
     n, sign = len(values), np.uint64(1 << 63)
     keys = (0.0 - values).view(np.uint64)  # no -0
     for i in range(n):
@@ -204,7 +195,7 @@ def descending(values: F64) -> I32:
 
 @kernel
 def few_descending(values: F64) -> I32:
-    """As `descending`, by insertion: for a handful of numbers."""
+    """Sort like `descending`, by insertion: for a handful of numbers."""
     order = np.empty(len(values), np.int32)
     for k in range(len(values)):
         place = k
@@ -217,7 +208,7 @@ def few_descending(values: F64) -> I32:
 
 @kernel
 def median(values: F64) -> float:
-    """Of (n,) numbers, n > 0, which it puts into another order (Hoare's selection)."""
+    """Return the median of (n,) numbers, n > 0, and reorder them (Hoare's selection)."""
     middle, low, high = len(values) // 2, 0, len(values) - 1
     while low < high:
         pivot, i, j = values[(low + high) // 2], low, high

@@ -1,4 +1,4 @@
-"""Numba kernels of `manhattan_frames.py`."""
+"""Kernels of Manhattan frames: the 24 equivalent rotations, information of directions, Procrustes, frames of perpendicular planes, refinement."""
 # mypy: disable-error-code="arg-type, assignment, index, return-value"
 
 from __future__ import annotations
@@ -10,10 +10,11 @@ import numpy as np
 
 from trihedron.pipeline.core.kernel import kernel
 from trihedron.pipeline.core.types import F32, F64, I32, Bool
-from trihedron.plugins.shared.linalg_kernels import fill_tangent_basis, inverse_positive, polar_rotation
+from trihedron.plugins.shared.linalg_kernels import inverse_positive, polar_rotation, tangent_columns
 
 
 def _cube_rotations() -> F64:
+    """The 24 rotations (24, 3, 3) that map three orthogonal axes, signs apart, onto themselves."""
     found = []
     for order in permutations(range(3)):
         for signs in product((1.0, -1.0), repeat=3):
@@ -31,7 +32,7 @@ CUBE = _cube_rotations()  # (24, 3, 3)
 
 @kernel
 def nearest_equivalent(R: F64, reference: F64) -> F64:
-    """Of the 24 rotations `R @ S` with the same axes up to order and sign, the one nearest to `reference`; (3, 3) each."""
+    """Return the rotation (3, 3) nearest to `reference` of the 24 `R @ S` with the same axes up to order and sign."""
     best, highest, relative, out = 0, -4.0, np.zeros((3, 3)), np.zeros((3, 3))
     for i in range(3):
         for j in range(3):
@@ -51,16 +52,16 @@ def nearest_equivalent(R: F64, reference: F64) -> F64:
     return out
 
 
-# How well planes and lines tell a direction: information (n, 3, 3) in 1/rad², zero along the direction itself.
+# Directions of planes and lines with their information (n, 3, 3) in 1/rad², zero along the direction itself.
 
 
 @kernel
 def measured_directions(
     planes: F64, plane_covariance: F64, plane_floor: float, ends_m: F32, end_covariance: F32, line_floor: float, means: F64, mean_sigma: F64
 ) -> tuple[F64, F64]:
-    """Directions (n, 3) and their information: the normals of planes (p, 4) with covariances (p, 3, 3) of (a, b, d), see `types.Planes`; lines
-    through end points (l, 2, 3) with covariances (l, 2, 3, 3) each; and `means` (m, 3) known to `mean_sigma` (m,) every way. The floors (rad) are
-    added in square. A row that is not finite tells nothing: its information is zero."""
+    """Return directions (n, 3) and their information: the normals of planes (p, 4) with covariances (p, 3, 3) of (a, b, d), see `types.Planes`; lines
+    through end points (l, 2, 3) with covariances (l, 2, 3, 3) each; and `means` (m, 3) with isotropic `mean_sigma` (m,). The floors (rad) are
+    added in square. A row that is not finite has zero information."""
     p, lines = len(planes), len(ends_m)
     vectors, information = np.empty((p + lines + len(means), 3)), np.zeros((p + lines + len(means), 3, 3))
     C, a = np.empty((2, 2)), np.empty((2, 3))
@@ -68,7 +69,7 @@ def measured_directions(
         known = np.isfinite(planes[i, 0] + planes[i, 1] + planes[i, 2])
         for k in range(3):
             vectors[i, k] = planes[i, k] if known else np.nan
-        fill_tangent_basis(vectors[i], a)
+        tangent_columns(vectors[i], a.T)
         _inverse_in_tangent_plane(plane_covariance[i], plane_floor * plane_floor, a, information[i])
     for i in range(lines):
         d = vectors[p + i]
@@ -81,7 +82,7 @@ def measured_directions(
             d[k] = d[k] / np.sqrt(length2) if known else np.nan
         if not known:
             continue
-        fill_tangent_basis(d, a)
+        tangent_columns(d, a.T)
         for u in range(2):
             for v in range(2):
                 C[u, v] = 0.0
@@ -130,7 +131,7 @@ def assign_axes(directions: F64, R: F64, cone: float) -> I32:
 @kernel
 def procrustes(directions: F64, weights: F64, axes: I32, R: F64, prior: float) -> F64:
     """`argmin Σ w |±n − R e|² + prior/2 Σ |R_before e − R e|²` over rotations (3, 3): directions n (n, 3) with weights (n,), each on the column
-    `axes[i]` of R, signs as R has them; -1 takes no part. The small prior keeps what no direction tells."""
+    `axes[i]` of R, signs as in R; -1 takes no part. The small prior holds the unobserved directions."""
     return polar_rotation(0.5 * prior * R + _sums(directions, weights, axes, R))
 
 
@@ -154,7 +155,7 @@ def normal_covariance(planes: F64, covariance: F64, floor: float) -> F64:
     is added in square."""
     out, basis = np.zeros((len(planes), 3, 3)), np.empty((2, 3))
     for i in range(len(planes)):
-        fill_tangent_basis(planes[i], basis)
+        tangent_columns(planes[i], basis.T)
         for j in range(3):
             for k in range(3):
                 for u in range(2):
@@ -224,7 +225,7 @@ def _normal_equations(covariance: F64, weights: F64, axes: I32, R: F64) -> tuple
     return A, B
 
 
-# Rotations through two directions at right angles, and how much stands on their axes.
+# Frames through two perpendicular directions, and their scores.
 
 NEAR = np.radians(15.0)  # a frame turned less than this from the previous axes is still the same
 
@@ -266,7 +267,7 @@ def score_frames(frames: F64, directions: F64, weights: F64, reach: F64) -> F64:
 
 @kernel
 def same_axes(frames: F64, R: F64) -> Bool:
-    """(m,) whether each axis of R (3, 3) is within `NEAR` of one of the frame (m, 3, 3)."""
+    """Return True (m,) where each axis of R (3, 3) is within `NEAR` of one of the frame (m, 3, 3)."""
     out = np.ones(len(frames), np.bool_)
     for m in range(len(frames)):
         for j in range(3):
@@ -287,11 +288,11 @@ def best_frame(frames: F64, directions: F64, weights: F64, reach: F64, before: F
     return nearest_equivalent(frames[np.argmax(score)], before)
 
 
-# Planes on the axes of a Manhattan frame: which stand at right angles, and the rotation nearest to those on the axes.
+# Walls: planes with certain normals, perpendicular pairs, and the rotation nearest to those on the axes.
 
 
 class Walls(NamedTuple):
-    """n planes whose normals are known."""
+    """n planes with certain normals."""
 
     normals: F64  # (n, 3)
     spatial: F64  # (n, 3, 3) their covariances, rad²
@@ -301,7 +302,7 @@ class Walls(NamedTuple):
 
 @kernel
 def known_walls(planes: F64, covariance: F64, pixels: I32, floor: float) -> Walls:
-    """Of planes (n, 4) with `covariance` (n, 3, 3) of (a, b, d) those whose normals are known; `floor` (rad) is added in square."""
+    """Select the planes (n, 4) with a finite covariance (n, 3, 3) of (a, b, d); `floor` (rad) is added in square."""
     spatial = normal_covariance(planes, covariance, floor)
     variance = np.empty(len(planes))
     for i in range(len(planes)):
@@ -312,8 +313,8 @@ def known_walls(planes: F64, covariance: F64, pixels: I32, floor: float) -> Wall
 
 @kernel
 def perpendicular_pair(walls: Walls, max_cos: float, largest_cos: float, reach: float, before: F64, loyalty: float) -> tuple[bool, F64]:
-    """Whether two walls stand at right angles (`max_cos` and twice their uncertainty, at most `largest_cos`), and the rotation through the pair that
-    explains most area within `reach`, see `best_frame`."""
+    """Find perpendicular walls (`max_cos` and twice their uncertainty, at most `largest_cos`): True if there are, and the rotation through the pair
+    that explains most area within `reach`, see `best_frame`."""
     n, count = len(walls.normals), 0
     first, second = np.empty((n * n, 3)), np.empty((n * n, 3))
     for i in range(n):
@@ -332,7 +333,7 @@ def perpendicular_pair(walls: Walls, max_cos: float, largest_cos: float, reach: 
 
 @kernel
 def area_on_axes(walls: Walls, R: F64, reach: float) -> F64:
-    """(3,) of the walls within `reach` of each column of R."""
+    """Sum the area (3,) of the walls within `reach` of each column of R."""
     out, axes = np.zeros(3), assign_axes(walls.normals, R, reach)
     for i in range(len(axes)):
         if axes[i] >= 0:
@@ -342,8 +343,8 @@ def area_on_axes(walls: Walls, R: F64, reach: float) -> F64:
 
 @kernel
 def settled(walls: Walls, R: F64, reach: float, gate: float, prior: float, rounds: int) -> tuple[F64, I32, F64]:
-    """From R the rotation nearest to the walls within `reach` of its axes, again with new axes and with Cauchy weights, one half at `gate` σ: the
-    rotation, the axis of each wall (n,), -1 for none, and its weight (n,), 1/rad²."""
+    """Refine R to the rotation nearest to the walls within `reach` of its axes, again with new axes and with Cauchy weights, one half at `gate` σ:
+    the rotation, the axis of each wall (n,), -1 for none, and its weight (n,), 1/rad²."""
     axes, weights = assign_axes(walls.normals, R, reach), 1.0 / walls.variance
     for _ in range(rounds):
         R = procrustes(walls.normals, weights, axes, R, prior)

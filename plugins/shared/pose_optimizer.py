@@ -60,13 +60,7 @@ def solve_pose(
 
 
 def _solve_with_slack(
-    T_world_camera: F64,
-    camera: Camera,
-    T_prior: F64,
-    prior_information: F64,
-    terms: Terms,
-    fixed_rotation: bool,
-    slack: float,
+    T_world_camera: F64, camera: Camera, T_prior: F64, prior_information: F64, terms: Terms, fixed_rotation: bool, slack: float
 ) -> PoseSolution:
     """`solve_pose` with the planes' gates multiplied by `slack`."""
     free, flags = 3 if fixed_rotation else 6, _all_inliers(terms)

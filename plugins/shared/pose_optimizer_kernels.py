@@ -17,7 +17,8 @@ import numpy as np
 
 from trihedron.pipeline.core.kernel import kernel
 from trihedron.pipeline.core.types import F64, I32, U8
-from trihedron.plugins.shared.linalg_kernels import inverse_positive, solve_positive, tangent_columns
+from trihedron.plugins.shared.lie_kernels import exp_so3, log_so3
+from trihedron.plugins.shared.linalg_kernels import add_triangle, add_triple, inverse_positive, solve_positive, tangent_columns
 
 # The parameters of the problem: world landmarks and their observations.
 
@@ -87,17 +88,6 @@ class Weights(NamedTuple):
 
 
 # Residuals and Jacobians.
-
-
-@kernel
-def rotation_and_translation(T: F64) -> tuple[F64, F64]:
-    """Rotation and translation of T (4, 4)."""
-    R, t = np.empty((3, 3)), np.empty(3)
-    for i in range(3):
-        t[i] = T[i, 3]
-        for j in range(3):
-            R[i, j] = T[i, j]
-    return R, t
 
 
 @kernel(forceinline=True)
@@ -253,9 +243,7 @@ def plane_landmark_jacobians(kind: int, R: F64, t: F64, world: F64, observed: F6
 @kernel(forceinline=True)
 def invert_small(S: F64, rows: int, W: F64) -> None:
     """Invert the leading block of 1, 2 or 3 rows of a symmetric matrix into W; the rest is 0."""
-    for i in range(len(W)):
-        for j in range(len(W)):
-            W[i, j] = 0.0
+    W[:] = 0.0
     if rows == 1:
         W[0, 0] = 1.0 / S[0, 0]
         return
@@ -303,9 +291,7 @@ def _weigh_points(R: F64, t: F64, camera: F64, terms: PointTerms, W: F64) -> Non
     for i in range(len(terms.positions_m)):
         x, y, z = terms.positions_m[i, 0] - t[0], terms.positions_m[i, 1] - t[1], terms.positions_m[i, 2] - t[2]
         p2 = R[0, 2] * x + R[1, 2] * y + R[2, 2] * z
-        for a in range(3):
-            for b in range(3):
-                W[i, a, b] = 0.0
+        W[i] = 0.0
         if not p2 > NEAR_M:
             continue
         iz, depth = 1.0 / p2, terms.depth_m[i]
@@ -351,9 +337,7 @@ def _weigh_lines(R: F64, t: F64, camera: F64, terms: LineTerms, W: F64, V: F64) 
     image, V in depth."""
     p, D, m, S = np.empty((2, 3)), np.empty((2, 3)), np.empty(3), np.empty((2, 2))
     for i in range(len(terms.endpoints_m)):
-        for a in range(2):
-            for b in range(2):
-                W[i, a, b] = V[i, a, b] = 0.0
+        W[i], V[i] = 0.0, 0.0
         to_camera(R, t, terms.endpoints_m[i, 0], p[0])
         to_camera(R, t, terms.endpoints_m[i, 1], p[1])
         if not (p[0, 2] > NEAR_M and p[1, 2] > NEAR_M):
@@ -472,38 +456,20 @@ def _add_points(R: F64, t: F64, camera: F64, terms: PointTerms, W: F64, flags: U
         a12 = w * d11 * (w01 * d02 + w11 * d12 + w12 * d22)
         a22 = w * (d02 * d02 * w00 + d12 * d12 * w11 + d22 * d22 * w22 + 2.0 * (d02 * d12 * w01 + d02 * d22 * w02 + d12 * d22 * w12))
         b0, b1, b2 = w * d00 * e0, w * d11 * e1, w * (d02 * e0 + d12 * e1 + d22 * e2)
-        H[0, 0] += a00
-        H[1, 0] += a01
-        H[1, 1] += a11
-        H[2, 0] += a02
-        H[2, 1] += a12
-        H[2, 2] += a22
-        g[0] -= b0
-        g[1] -= b1
-        g[2] -= b2
+        add_triangle(H, 0, a00, a01, a11, a02, a12, a22)
+        add_triple(g, 0, -b0, -b1, -b2)
         if free == 3:
             continue
         m00, m01, m02 = p1 * a02 - p2 * a01, p1 * a12 - p2 * a11, p1 * a22 - p2 * a12
         m10, m11, m12 = p2 * a00 - p0 * a02, p2 * a01 - p0 * a12, p2 * a02 - p0 * a22
         m20, m21, m22 = p0 * a01 - p1 * a00, p0 * a11 - p1 * a01, p0 * a12 - p1 * a02
-        H[3, 0] += m00
-        H[3, 1] += m01
-        H[3, 2] += m02
-        H[4, 0] += m10
-        H[4, 1] += m11
-        H[4, 2] += m12
-        H[5, 0] += m20
-        H[5, 1] += m21
-        H[5, 2] += m22
-        H[3, 3] += p1 * m02 - p2 * m01
-        H[4, 3] += p1 * m12 - p2 * m11
-        H[4, 4] += p2 * m10 - p0 * m12
-        H[5, 3] += p1 * m22 - p2 * m21
-        H[5, 4] += p2 * m20 - p0 * m22
-        H[5, 5] += p0 * m21 - p1 * m20
-        g[3] -= p1 * b2 - p2 * b1
-        g[4] -= p2 * b0 - p0 * b2
-        g[5] -= p0 * b1 - p1 * b0
+        add_triple(H[3], 0, m00, m01, m02)
+        add_triple(H[4], 0, m10, m11, m12)
+        add_triple(H[5], 0, m20, m21, m22)
+        add_triangle(
+            H, 3, p1 * m02 - p2 * m01, p1 * m12 - p2 * m11, p2 * m10 - p0 * m12, p1 * m22 - p2 * m21, p2 * m20 - p0 * m22, p0 * m21 - p1 * m20
+        )
+        add_triple(g, 3, p2 * b1 - p1 * b2, p0 * b2 - p2 * b0, p1 * b0 - p0 * b1)
     return cost
 
 
@@ -604,41 +570,13 @@ def linearise(
     """Fill the normal equations (H lower triangle of (6, 6), g (6,)) of all terms but the outliers, and the χ² of every term; return the cost.
 
     With 3 `free` parameters only the block of the position is complete."""
-    for a in range(6):
-        g[a] = 0.0
-        for b in range(6):
-            H[a, b] = 0.0
+    H[:], g[:] = 0.0, 0.0
     cost = _add_points(R, t, camera, points, weights.points, flags.points, robust, free, H, g, chi2.points)
     cost += _add_lines(R, t, camera, lines, weights.lines, weights.line_depths, flags.lines, robust, H, g, chi2.lines, chi2.line_depths)
     return cost + _add_planes(R, t, planes, weights.planes, flags.planes, H, g, chi2.planes)
 
 
 # The Gaussian prior. It holds every direction that the data do not observe, so that any set of terms, even one plane, can be solved.
-
-
-@kernel
-def _exp_so3(x: float, y: float, z: float) -> F64:
-    """Exp(phi) of phi = (x, y, z), Rodrigues."""
-    angle2 = x * x + y * y + z * z
-    if angle2 < 1e-12:
-        a, b = 1.0 - angle2 / 6.0, 0.5 - angle2 / 24.0
-    else:
-        angle = np.sqrt(angle2)
-        a, b = np.sin(angle) / angle, (1.0 - np.cos(angle)) / angle2
-    E = np.empty((3, 3))
-    E[0, 0], E[1, 1], E[2, 2] = 1.0 - b * (y * y + z * z), 1.0 - b * (x * x + z * z), 1.0 - b * (x * x + y * y)
-    E[0, 1], E[0, 2], E[1, 2] = b * x * y - a * z, b * x * z + a * y, b * y * z - a * x
-    E[1, 0], E[2, 0], E[2, 1] = b * x * y + a * z, b * x * z - a * y, b * y * z + a * x
-    return E
-
-
-@kernel
-def _log_so3(R: F64) -> tuple[float, float, float]:
-    """Log(R) for angles below π (a prior is never that far)."""
-    x, y, z = 0.5 * (R[2, 1] - R[1, 2]), 0.5 * (R[0, 2] - R[2, 0]), 0.5 * (R[1, 0] - R[0, 1])
-    s, c = math.sqrt(x * x + y * y + z * z), 0.5 * (R[0, 0] + R[1, 1] + R[2, 2] - 1.0)
-    scale = math.atan2(s, c) / s if s > 1e-9 else 1.0
-    return x * scale, y * scale, z * scale
 
 
 @kernel
@@ -650,7 +588,7 @@ def add_prior(R: F64, t: F64, R_prior: F64, t_prior: F64, prior: F64, H: F64, g:
             r[i] += R_prior[k, i] * (t[k] - t_prior[k])
             for j in range(3):
                 delta[i, j] += R_prior[k, i] * R[k, j]
-    r[3], r[4], r[5] = _log_so3(delta)
+    r[3], r[4], r[5] = log_so3(delta)
     for i in range(3):
         J[3 + i, 3 + i] = 1.0  # with the terms below the inverse right Jacobian, first order
         for j in range(3):
@@ -677,29 +615,14 @@ def add_prior(R: F64, t: F64, R_prior: F64, t_prior: F64, prior: F64, H: F64, g:
 @kernel
 def damped_step(H: F64, g: F64, damping: float, free: int, dx: F64) -> None:
     """Solve `(H + damping · diag H) dx = -g` for the first `free` parameters by Cholesky; dx (6,) is zero if H is not positive definite."""
-    L = np.zeros((6, 6))
+    A, b = np.empty((free, free)), np.empty(free)
     for i in range(6):
         dx[i] = 0.0
     for i in range(free):
+        b[i] = -g[i]
         for j in range(i + 1):
-            total = H[i, j] * (1.0 + damping if i == j else 1.0)
-            for k in range(j):
-                total -= L[i, k] * L[j, k]
-            if i == j:
-                if not total > 0.0:
-                    return
-                L[i, i] = np.sqrt(total)
-            else:
-                L[i, j] = total / L[j, j]
-    for i in range(free):
-        dx[i] = -g[i]
-        for k in range(i):
-            dx[i] -= L[i, k] * dx[k]
-        dx[i] /= L[i, i]
-    for i in range(free - 1, -1, -1):
-        for k in range(i + 1, free):
-            dx[i] -= L[k, i] * dx[k]
-        dx[i] /= L[i, i]
+            A[i, j] = H[i, j] * (1.0 + damping if i == j else 1.0)
+    solve_positive(A, b, dx)
 
 
 @kernel
@@ -715,7 +638,7 @@ def step_norm2(H: F64, dx: F64) -> float:
 @kernel
 def retract_pose(R: F64, t: F64, dx: F64, R_new: F64, t_new: F64) -> None:
     """Move the pose R, t by a step dx = (rho, phi) into R_new, t_new: `R Exp(phi)`, `t + R rho`, which is `T · Exp(xi)` to first order."""
-    E = _exp_so3(dx[3], dx[4], dx[5])
+    E = exp_so3(dx[3], dx[4], dx[5])
     for i in range(3):
         t_new[i] = t[i] + R[i, 0] * dx[0] + R[i, 1] * dx[1] + R[i, 2] * dx[2]
         for j in range(3):
@@ -796,16 +719,7 @@ MAX_DAMPING = 1e10
 
 @kernel
 def solve(
-    poses: F64,
-    prior: F64,
-    camera: F64,
-    points: PointTerms,
-    lines: LineTerms,
-    planes: PlaneTerms,
-    flags: Flags,
-    free: int,
-    rounds: int,
-    slack: float,
+    poses: F64, prior: F64, camera: F64, points: PointTerms, lines: LineTerms, planes: PlaneTerms, flags: Flags, free: int, rounds: int, slack: float
 ) -> tuple[F64, F64, F64, F64, float, bool]:
     """Run the rounds of Levenberg–Marquardt from poses[0]; poses[1] (4, 4) is the prior's mean. Changes `flags`.
 
@@ -816,8 +730,9 @@ def solve(
     n, m, p = len(points.positions_m), len(lines.endpoints_m), len(planes.kinds)
     weights = Weights(np.empty((n, 3, 3)), np.empty((m, 2, 2)), np.empty((m, 2, 2)), np.empty((p, 3, 3)))
     chi2 = Chi2(np.empty(n), np.empty(m), np.empty(m), np.empty(p))
-    (R, t), (R_new, t_new) = rotation_and_translation(poses[0]), rotation_and_translation(poses[0])
-    R_prior, t_prior = rotation_and_translation(poses[1])
+    R, t = poses[0, :3, :3].copy(), poses[0, :3, 3].copy()
+    R_prior, t_prior = poses[1, :3, :3].copy(), poses[1, :3, 3].copy()
+    R_new, t_new = np.empty((3, 3)), np.empty(3)
     H, g, dx = np.zeros((6, 6)), np.zeros(6), np.zeros(6)
     data, data_g, trial_H, trial_g = np.zeros((6, 6)), np.zeros(6), np.zeros((6, 6)), np.zeros(6)
     cost = 0.0
@@ -851,19 +766,12 @@ def solve(
     damped_step(H, g, 0.0, free, dx)
     share = gate_efficiency(_residual_count(points, planes, flags), free) if rounds else 1.0
     covariance, information, complete = _marginal_covariance(data, share, prior, free)
-    T = np.zeros((4, 4))
-    for i in range(3):
-        T[i, 3] = t[i]
-        for j in range(3):
-            T[i, j] = R[i, j]
-    T[3, 3] = 1.0
+    T = np.eye(4)
+    T[:3, :3], T[:3, 3] = R, t
     return T, covariance, information, dx, cost, complete
 
 
 @kernel
 def _copy(A: F64, a: F64, B: F64, b: F64) -> None:
     """Copy a matrix (n, n) and a vector (n,), a pose or normal equations, into B and b."""
-    for i in range(len(a)):
-        b[i] = a[i]
-        for j in range(len(a)):
-            B[i, j] = A[i, j]
+    B[:], b[:] = A, a

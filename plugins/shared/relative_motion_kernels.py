@@ -13,7 +13,8 @@ import numpy as np
 
 from trihedron.pipeline.core.kernel import kernel
 from trihedron.pipeline.core.types import F32, F64, I32
-from trihedron.plugins.shared.linalg_kernels import inverse_positive, left_multiply_exp, median, solve_positive, tangent_columns
+from trihedron.plugins.shared.lie_kernels import left_multiply_exp
+from trihedron.plugins.shared.linalg_kernels import add_triangle, add_triple, inverse_positive, median, solve_positive, tangent_columns
 
 SHORTEST_M = 1e-3  # line
 MOST = 400  # points used, about; more only cost time
@@ -288,10 +289,7 @@ def _squared_distances(terms: Terms, R: F64, t: F64) -> F64:
 @kernel
 def _normal_equations(terms: Terms, R: F64, t: F64, scale2: float, H: F64, g: F64) -> tuple[float, float]:
     """Fill H (6, 6) and g (6,) with Geman–McClure weights at the squared scale; return the weighted χ² and number of components."""
-    for i in range(6):
-        g[i] = 0.0
-        for j in range(6):
-            H[i, j] = 0.0
+    H[:], g[:] = 0.0, 0.0
     e4, J4 = np.empty(4), np.zeros((4, 6))
     chi2, components = _add_points(terms, R, t, scale2, H, g)
     for i in range(len(terms.planes_before)):
@@ -331,33 +329,15 @@ def _add_points(terms: Terms, R: F64, t: F64, scale2: float, H: F64, g: F64) -> 
         m00, m01, m02 = p1 * l02 - p2 * l01, p1 * l12 - p2 * l11, p1 * l22 - p2 * l12  # [p]× w L
         m10, m11, m12 = p2 * l00 - p0 * l02, p2 * l01 - p0 * l12, p2 * l02 - p0 * l22
         m20, m21, m22 = p0 * l01 - p1 * l00, p0 * l11 - p1 * l01, p0 * l12 - p1 * l02
-        H[0, 0] += p1 * m02 - p2 * m01
-        H[1, 0] += p1 * m12 - p2 * m11
-        H[1, 1] += p2 * m10 - p0 * m12
-        H[2, 0] += p1 * m22 - p2 * m21
-        H[2, 1] += p2 * m20 - p0 * m22
-        H[2, 2] += p0 * m21 - p1 * m20
-        H[3, 0] += m00
-        H[3, 1] += m10
-        H[3, 2] += m20
-        H[4, 0] += m01
-        H[4, 1] += m11
-        H[4, 2] += m21
-        H[5, 0] += m02
-        H[5, 1] += m12
-        H[5, 2] += m22
-        H[3, 3] += l00
-        H[4, 3] += l01
-        H[4, 4] += l11
-        H[5, 3] += l02
-        H[5, 4] += l12
-        H[5, 5] += l22
-        g[0] += p1 * e2 - p2 * e1
-        g[1] += p2 * e0 - p0 * e2
-        g[2] += p0 * e1 - p1 * e0
-        g[3] += e0
-        g[4] += e1
-        g[5] += e2
+        add_triangle(
+            H, 0, p1 * m02 - p2 * m01, p1 * m12 - p2 * m11, p2 * m10 - p0 * m12, p1 * m22 - p2 * m21, p2 * m20 - p0 * m22, p0 * m21 - p1 * m20
+        )
+        add_triple(H[3], 0, m00, m10, m20)
+        add_triple(H[4], 0, m01, m11, m21)
+        add_triple(H[5], 0, m02, m12, m22)
+        add_triangle(H, 3, l00, l01, l11, l02, l12, l22)
+        add_triple(g, 0, p1 * e2 - p2 * e1, p2 * e0 - p0 * e2, p0 * e1 - p1 * e0)
+        add_triple(g, 3, e0, e1, e2)
     return chi2, components
 
 

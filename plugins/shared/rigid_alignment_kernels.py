@@ -1,4 +1,4 @@
-"""Numba kernels of `rigid_alignment.py`."""
+"""Kernel of `rigid_alignment.py`: the rigid motion with most inliers, from three pairs at a time (RANSAC: Fischler and Bolles, CACM 1981)."""
 # mypy: disable-error-code="arg-type, assignment, index, return-value"
 
 from __future__ import annotations
@@ -8,14 +8,12 @@ import numpy as np
 from trihedron.pipeline.core.kernel import kernel
 from trihedron.pipeline.core.types import F64, I32
 
-# The rigid motion that most pairs of places agree on (Fischler and Bolles, CACM 1981), from three pairs at a time.
-
-LEAST_M = 0.05  # between the three places of a sample
+LEAST_M = 0.05  # between the three points of a sample
 
 
 @kernel
 def _frame(a: F64, b: F64, c: F64, out: F64) -> bool:
-    """Axes (columns) that three places span; False when they are too near to each other or to a line."""
+    """Fill the axes (columns) spanned by three points; False when these are too near to each other or to a line."""
     u, v = b - a, c - a
     n = np.array([u[1] * v[2] - u[2] * v[1], u[2] * v[0] - u[0] * v[2], u[0] * v[1] - u[1] * v[0]])
     length, size = np.sqrt((u * u).sum()), np.sqrt((n * n).sum())
@@ -28,7 +26,8 @@ def _frame(a: F64, b: F64, c: F64, out: F64) -> bool:
 
 
 @kernel
-def best_kernel(before: F64, after: F64, reach: F64, samples: I32) -> tuple[F64, F64]:
+def best_motion(before: F64, after: F64, reach: F64, samples: I32) -> tuple[F64, F64]:
+    """Return R and t of the sample (m, 3) with most pairs of points (n, 3) within `reach` (n,)."""
     best, R_best, t_best = -1, np.eye(3), np.zeros(3)
     A, B, R, t = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3)), np.empty(3)
     for s in range(len(samples)):

@@ -1,4 +1,4 @@
-"""Numba kernels of `tsdf_volume.py`."""
+"""Kernels of `tsdf_volume.py`: blocks within the truncation, their insertion, and integration of a depth image."""
 # mypy: disable-error-code="arg-type, assignment, index, return-value"
 
 from __future__ import annotations
@@ -16,14 +16,14 @@ LEAST_COSINE = 0.3  # of the angle between ray and normal, 73°: behind a plane 
 
 @kernel(inline="always")
 def _cosine(x: float, y: float, z: float, length: float, slants: F64, label: int) -> float:
-    """Of the angle between a ray (x, y, z) of that length and the plane's normal; 1 without a plane."""
+    """Cosine of the angle between a ray (x, y, z) of that length and the plane's normal; 1 without a plane."""
     n = slants[label, 2] * x + slants[label, 3] * y + slants[label, 4] * z
     return 1.0 if n >= 0.0 else max(-n / length, LEAST_COSINE)
 
 
 @kernel
-def across_kernel(local: I64, depth: F32, labels: U8, slants: F64, lens: F64, T: F64, block_m: float, truncation: float) -> I32 | None:
-    """Blocks (n, 3) within the truncation of the readings, along their rays or across their planes; None when the table `local` is too small."""
+def find_blocks(local: I64, depth: F32, labels: U8, slants: F64, intrinsics: F64, T: F64, block_m: float, truncation: float) -> I32 | None:
+    """Find the blocks (n, 3) within the truncation of the readings, along rays or across planes; None when the table `local` is too small."""
     h, w = depth.shape
     found, count, last = np.empty((len(local) // 2, 3), np.int32), 0, -1
     for r in range(0, h, RAY_STEP):
@@ -31,7 +31,7 @@ def across_kernel(local: I64, depth: F32, labels: U8, slants: F64, lens: F64, T:
             z = depth[r, c]
             if z <= 0.0:
                 continue
-            x, y = (c - lens[2]) / lens[0], (r - lens[3]) / lens[1]
+            x, y = (c - intrinsics[2]) / intrinsics[0], (r - intrinsics[3]) / intrinsics[1]
             k = labels[r, c]
             if k > 0:
                 dx, dy, dz = -truncation * slants[k, 2], -truncation * slants[k, 3], -truncation * slants[k, 4]
@@ -58,7 +58,8 @@ def across_kernel(local: I64, depth: F32, labels: U8, slants: F64, lens: F64, T:
 
 
 @kernel
-def insert(keys: I64, numbers: I32, fresh: I32, places: I32, count: int) -> int:
+def insert_blocks(keys: I64, numbers: I32, fresh: I32, places: I32, count: int) -> int:
+    """Insert the blocks `fresh` (n, 3) into the table and their places into `places`; returns the number of blocks."""
     for i in range(len(fresh)):
         key = key_of(fresh[i, 0], fresh[i, 1], fresh[i, 2])
         slot = slot_of(keys, key)
@@ -70,12 +71,12 @@ def insert(keys: I64, numbers: I32, fresh: I32, places: I32, count: int) -> int:
 
 @kernel
 def integrate(
-    keys: I64, numbers: I32, distance: F32, weight: F32, touched: I32, depth: F32, labels: U8, slants: F64, weights: F32, lens: F64,
+    keys: I64, numbers: I32, distance: F32, weight: F32, touched: I32, depth: F32, labels: U8, slants: F64, weights: F32, intrinsics: F64,
     R_camera_world: F64, position: F64, voxel: float, truncation: float,
 ) -> None:  # fmt: skip
-    """Update the voxels of the blocks `touched` (n, 3), which are all in the table."""
+    """Integrate a depth image into the voxels of the blocks `touched` (n, 3), which are all in the table."""
     h, w = depth.shape
-    fx, fy, cx, cy = lens
+    fx, fy, cx, cy = intrinsics
     farthest = truncation / LEAST_COSINE  # along a ray; nothing farther is within the truncation across a plane
     sx, sy, sz = voxel * R_camera_world[0, 2], voxel * R_camera_world[1, 2], voxel * R_camera_world[2, 2]  # one voxel along z
     for b in range(len(touched)):

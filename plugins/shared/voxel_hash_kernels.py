@@ -1,4 +1,4 @@
-"""Numba kernels of `voxel_hash.py`."""
+"""Kernels of `voxel_hash.py`: keys, look-up and insertion of cells."""
 # mypy: disable-error-code="arg-type, assignment, index, return-value"
 
 from __future__ import annotations
@@ -16,13 +16,13 @@ FREE = -1
 
 @kernel(inline="always")
 def key_of(x: int, y: int, z: int) -> int:
-    """The cell as one number, at least 0."""
+    """Return the key of a cell, a number at least 0."""
     return ((x + HALF) << (2 * BITS)) | ((y + HALF) << BITS) | (z + HALF)
 
 
 @kernel(inline="always")
 def slot_of(keys: I64, key: int) -> int:
-    """The slot that holds the key, or the free one where it belongs. There must be a free one."""
+    """Find the slot that holds the key, or the free one where it belongs. There must be a free one."""
     mask = len(keys) - 1
     mixed = (key ^ (key >> 31)) * 0x9E3779B97F4A7C1
     slot = ((mixed ^ (mixed >> 29)) & 0x7FFFFFFFFFFFFFFF) & mask
@@ -33,14 +33,14 @@ def slot_of(keys: I64, key: int) -> int:
 
 @kernel
 def number_of(keys: I64, numbers: I32, x: int, y: int, z: int) -> int:
-    """The cell's number, -1 when it is not in the table."""
+    """Return the cell's number, -1 when it is not in the table."""
     slot = slot_of(keys, key_of(x, y, z))
     return numbers[slot] if keys[slot] != FREE else -1
 
 
 @kernel
 def absent(keys: I64, cells: I32) -> I32:
-    """The rows of the cells (n, 3) that are not in the table."""
+    """Return the rows of the cells (n, 3) that are not in the table."""
     rows, count = np.empty(len(cells), np.int32), 0
     for i in range(len(cells)):
         if keys[slot_of(keys, key_of(cells[i, 0], cells[i, 1], cells[i, 2]))] == FREE:
@@ -50,7 +50,8 @@ def absent(keys: I64, cells: I32) -> I32:
 
 
 @kernel
-def copy_kernel(keys: I64, numbers: I32, to_keys: I64, to_numbers: I32) -> None:
+def copy_cells(keys: I64, numbers: I32, to_keys: I64, to_numbers: I32) -> None:
+    """Insert the cells of a table into a larger one."""
     for i in range(len(keys)):
         if keys[i] != FREE:
             slot = slot_of(to_keys, keys[i])

@@ -72,7 +72,7 @@ class ViewFold:
         frame = with_measured_noise(frame, planes)
         points, weight = readings(frame, pose.T_world_camera, max(1, frame.camera.width // NEWS_COLUMNS), self.max_sigma_m)
         known = state.known.setdefault(pose.submap, Known(CELL_M))
-        if len(points) and known.news(points, weight, self.views) >= self.news:
+        if len(points) and known.novelty(points, weight, self.views) >= self.news:
             known.learn(points, weight)
             view = view_of(frame, planes, pose, map, self.view_width, self.max_sigma_m)
             state.views.append(view)
@@ -102,7 +102,7 @@ class VolumeFold(ViewFold):
         if state.volume is None:
             state.volume = Volume(self.voxel_m, self.truncation_m)
         if view.submap == 0:
-            state.volume.integrate(view, view.T_world_camera)
+            state.volume.integrate(*view.fused, view.T_world_camera)
         state.fused.append(view.T_world_camera if view.submap == 0 else None)
 
     def _volume(self, state: Gathered, map: Map | None) -> Volume:
@@ -113,7 +113,7 @@ class VolumeFold(ViewFold):
         volume = Volume(self.voxel_m, self.truncation_m)
         for view, T in zip(state.views, finals):
             if T is not None:
-                volume.integrate(view, T)
+                volume.integrate(*view.fused, T)
         return volume
 
     def _mesh(self, state: Gathered, map: Map | None) -> tuple[F64, I32]:

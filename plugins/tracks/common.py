@@ -8,9 +8,8 @@ import numpy as np
 
 from trihedron.pipeline.core.geometry import pose_matrix, transform_planes
 from trihedron.pipeline.core.types import F32, F64, I32, Camera, Keypoints, Planes, Segments, Tracks
-from trihedron.plugins.shared.descriptors import match_lines
+from trihedron.plugins.shared.feature_matching import associate_planes, match_lines
 from trihedron.plugins.shared.linalg import constant
-from trihedron.plugins.shared.plane_association import associate_planes
 from trihedron.plugins.tracks.common_kernels import matched_pairs, predicted_kernel
 
 NO_PAIRS = np.zeros((0, 2), np.int32)

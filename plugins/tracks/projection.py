@@ -12,10 +12,9 @@ from trihedron.pipeline.core.geometry import exp_so3, log_so3, rotation_angle_de
 from trihedron.pipeline.core.options import AcuteDeg, NonNegativeInt, PositiveFloat, PositiveInt, PositiveShare, Share, check_increasing
 from trihedron.pipeline.core.registry import register
 from trihedron.pipeline.core.types import F64, U8, Camera, Keypoints, ManhattanFrame, Planes, Segments, Tracks
-from trihedron.plugins.shared.descriptors import compared_by, mutual_matches, words_of
-from trihedron.plugins.shared.descriptors_kernels import U64, line_matches, near_matches
+from trihedron.plugins.shared.feature_matching import compared_by, mutual_matches, words_of
+from trihedron.plugins.shared.feature_matching_kernels import U64, associate_planes_kernel, line_matches, near_matches
 from trihedron.plugins.shared.linalg import constant
-from trihedron.plugins.shared.plane_association_kernels import associated
 from trihedron.plugins.shared.relative_motion import Motion, solve_motion
 from trihedron.plugins.shared.rigid_alignment import consensus, tracked_point_pairs
 from trihedron.plugins.tracks.common import NO_PAIRS, Features, tracks_value
@@ -194,7 +193,7 @@ class Search:
             ends, line_words, found.endpoints_px, line_words_now,
             gates.line_sine, float(radius_px), gates.line_overlap, gates.lines_compared_by, gates.line_bits, gates.ratio,
         )  # fmt: skip
-        same = associated(seen.coefficients, seen.samples_m, planes, samples, gates.plane_cosine, plane_m, True)
+        same = associate_planes_kernel(seen.coefficients, seen.samples_m, planes, samples, gates.plane_cosine, plane_m, True)
         return tracks_value(self.now, self.before, (matched_pairs(points), matched_pairs(lines), np.ascontiguousarray(same[:, ::-1])), R)
 
     def consistent(self, tracks: Tracks, motion: Motion, error_px: float) -> Tracks:

@@ -9,7 +9,7 @@ import numpy as np
 
 from trihedron.pipeline.core.kernel import kernel
 from trihedron.pipeline.core.types import F32, F64, I32
-from trihedron.plugins.shared.plane_association_kernels import moved_planes
+from trihedron.plugins.shared.feature_matching_kernels import transform_plane_samples
 from trihedron.plugins.tracks.common_kernels import predicted_pixel
 
 Intrinsics = tuple[float, float, float, float]
@@ -34,7 +34,7 @@ def predict_features(before: FeaturePositions, planes: F64, samples_m: F32, came
     for i in range(len(ends)):
         for e in range(2):
             ends[i, e, 0], ends[i, e, 1] = _predicted_end(before, i, e, camera, R, t)
-    coefficients, samples = moved_planes(planes, samples_m, R, t)
+    coefficients, samples = transform_plane_samples(planes, samples_m, R, t)
     return pixels, ends, coefficients, samples
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -10,10 +10,11 @@ from typing import Any
 import cv2
 import numpy as np
 from mcap.writer import CompressionType, Writer
+from rosbags.rosbag1 import Writer as Ros1Writer
 from rosbags.rosbag2 import StoragePlugin
 from rosbags.rosbag2 import Writer as BagWriter
 from rosbags.rosbag2.enums import CompressionFormat, CompressionMode
-from rosbags.typesys import Stores, get_typestore
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from trihedron.pipeline.core.geometry import quaternion_from_rotation
 
@@ -106,6 +107,37 @@ def write_bag(path: Path, messages: Iterable[Message], zstd: bool = False) -> Pa
             writer.write(connections[topic], log_time, data)
     (file,) = path.glob("*.mcap")
     return file
+
+
+def write_sqlite(path: Path, messages: Iterable[Message], compression: CompressionMode = CompressionMode.NONE) -> Path:
+    """A folder as `ros2 bag record` makes it by default; returns it."""
+    bag = BagWriter(path, version=9, storage_plugin=StoragePlugin.SQLITE3)
+    if compression is not CompressionMode.NONE:
+        bag.set_compression(compression, CompressionFormat.ZSTD)
+    _write(bag, messages, STORE, lambda data, _: data)
+    return path
+
+
+def write_ros1(path: Path, messages: Iterable[Message], lz4: bool = False) -> Path:
+    """A bag of ROS 1, in chunks; each topic alternates between two senders."""
+    bag = Ros1Writer(path)
+    if lz4:
+        bag.set_compression(Ros1Writer.CompressionFormat.LZ4)
+    store = get_typestore(Stores.ROS1_NOETIC)
+    store.register(get_types_from_msg("geometry_msgs/TransformStamped[] transforms", "tf2_msgs/msg/TFMessage"))
+    _write(bag, messages, store, lambda data, kind: bytes(STORE.cdr_to_ros1(data, kind)))
+    return path
+
+
+def _write(bag: Any, messages: Iterable[Message], store: Any, convert: Callable[[bytes, str], bytes]) -> None:
+    with bag as writer:
+        connections: dict[tuple[str, int], Any] = {}
+        for count, (topic, kind, log_time, data) in enumerate(messages):
+            sender = {"callerid": f"/node{count % 2}"} if isinstance(bag, Ros1Writer) else {}
+            key = (topic, count % 2 if sender else 0)
+            if key not in connections:
+                connections[key] = writer.add_connection(topic, kind, typestore=store, **sender)
+            writer.write(connections[key], log_time, convert(data, kind))
 
 
 def write_file(path: Path, messages: Iterable[Message], **options: Any) -> Path:

@@ -55,7 +55,7 @@ TUM: list[tuple[Change, str]] = [
     (replace("rgb.txt", "10.100000 rgb/10.100000.png", "10.100000"),
      "{}/rgb.txt:3: has 1 column instead of 2; each line holds 'stamp file'; correct or remove this one"),
     (lambda f: (f / "rgb.txt").write_text("# nothing\n"), "{}/rgb.txt: lists no images; give a list with a line 'stamp file' for each image"),
-    (replace("depth.txt", "10.", "20."), "{}: no colour and depth image are within 20 ms of each other; check the stamps in rgb.txt and depth.txt"
+    (replace("depth.txt", "\n10.", "\n20."), "{}: no colour and depth image are within 20 ms of each other; check the stamps in rgb.txt and depth.txt"
      " or raise dataset.max_difference_ms"),
     (replace("groundtruth.txt", "1 0 0 0", "nan 0 0 0"), "{}/groundtruth.txt:2: the pose is not finite; " + COLUMNS),
     (replace("groundtruth.txt", "2 0 0 0 0 0 1", "2 0 0 0 0 0 0"), "{}/groundtruth.txt:3: the quaternion is zero; " + COLUMNS),

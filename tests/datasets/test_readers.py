@@ -13,6 +13,7 @@ import pytest
 from trihedron.datasets.readers.folder import Folder
 from trihedron.datasets.readers.icl_nuim import IclNuim, reflect
 from trihedron.datasets.readers.tum import Tum
+from trihedron.pipeline.core.errors import DataError
 from trihedron.pipeline.core.geometry import exp_se3
 from trihedron.pipeline.core.types import EXACT_DEPTH, DepthNoise
 
@@ -51,25 +52,35 @@ def test_frames_is_a_half_open_range_of_the_whole_data_set(tum_folder: Path, cap
     assert caplog.messages == [f"dataset.frames: '2:9' ends beyond the 4 frames of {tum_folder}"]
 
 
-@pytest.mark.parametrize("damage", ["truncated", "garbled", "empty", "missing", "truncated jpeg"])
+@pytest.mark.parametrize("damage", ["truncated", "garbled", "empty", "truncated jpeg"])
 def test_an_unreadable_image_is_one_warning_and_no_frame(tum_folder: Path, caplog: pytest.LogCaptureFixture, damage: str) -> None:
     file = tum_folder / "rgb/10.100000.png"
     data = file.read_bytes()
     causes = {
         "truncated": (data[: len(data) // 2], "is truncated"),
-        "garbled": (data[:40] + bytes(30) + data[70:], "is damaged: it holds fewer pixels than it claims"),
+        "garbled": (data[:40] + bytes(30) + data[70:], "is damaged ("),
         "empty": (b"", "is empty"),
         "truncated jpeg": (cv2.imencode(".jpg", np.zeros((24, 32, 3), dtype=np.uint8))[1].tobytes()[:-40], "is truncated"),
-        "missing": (b"", "cannot be opened (No such file or directory)"),
     }
     file.write_bytes(causes[damage][0])
-    if damage == "missing":
-        file.unlink()
     dataset = Tum(path=str(tum_folder))
     with caplog.at_level(logging.WARNING, logger="trihedron"):
         assert dataset(1) is None
-    assert caplog.messages == [f"{file}: {causes[damage][1]}; frame 1 is skipped"]
+    (message,) = caplog.messages
+    assert message.startswith(f"{file}: {causes[damage][1]}") and message.endswith("; frame 1 is skipped")
     assert dataset(0) is not None
+
+
+def test_a_list_that_names_more_images_than_there_are_ends_with_one_warning(tum_folder: Path, caplog: pytest.LogCaptureFixture) -> None:
+    with (tum_folder / "rgb.txt").open("a") as file:
+        file.writelines(f"{10.4 + k / 10:.6f} rgb/{k}.png\n" for k in range(50))
+    dataset = Tum(path=str(tum_folder))
+    assert len(dataset) == 4 and dataset(3) is not None
+    assert caplog.messages == [f"{tum_folder}/rgb.txt: 50 of the 54 images it names are missing, the first is 0.png; they are skipped"]
+    for image in (tum_folder / "rgb").iterdir():
+        image.unlink()
+    with pytest.raises(DataError, match=r"rgb.txt: names 54 images, of which none is there; unpack the images beside the list$"):
+        len(Tum(path=str(tum_folder)))
 
 
 def test_a_known_distorted_point_lands_where_the_pinhole_camera_sees_it(tmp_path: Path) -> None:

@@ -3,20 +3,42 @@
 from __future__ import annotations
 
 import logging
+import os
 import sys
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 import pytest
 from mcap.writer import CompressionType, IndexType
+from rosbags.rosbag2.enums import CompressionMode
 
+from trihedron.datasets.readers.folder import Folder
 from trihedron.datasets.readers.mcap import McapDataset
 from trihedron.pipeline.core.errors import DataError, RecordingError
 from trihedron.pipeline.core.geometry import exp_se3, invert
+from trihedron.tools.convert import layout_of
 
 sys.path.insert(0, str(Path(__file__).parent))
-from robot_files import COLOR, camera_info, compressed, encoded, header, image, make, message, pose, transforms, write_bag, write_file
+from robot_files import (
+    COLOR,
+    Message,
+    camera_info,
+    compressed,
+    encoded,
+    header,
+    image,
+    make,
+    message,
+    pose,
+    transforms,
+    write_bag,
+    write_file,
+    write_ros1,
+    write_sqlite,
+)
 from robot_scene import BEGIN, STEP, WALL, check_registered, millimetres, registered
 
 PACKED = {
@@ -38,6 +60,90 @@ def test_registered_depth_however_the_file_is_packed(tmp_path: Path, packed: str
 @pytest.mark.parametrize("zstd", [False, True])
 def test_a_folder_that_ros2_bag_would_make(tmp_path: Path, zstd: bool) -> None:
     check_registered(McapDataset(str(write_bag(tmp_path / "bag", registered(), zstd))))
+
+
+def test_an_unfinished_folder_of_ros2_bag(tmp_path: Path) -> None:
+    """Without metadata.yaml, which is written at the end."""
+    folder = write_bag(tmp_path / "bag", registered()).parent
+    (folder / "metadata.yaml").unlink()
+    check_registered(McapDataset(str(folder)))
+
+
+BAGS: dict[str, Callable[[Path, list[Message]], Path]] = {
+    "sqlite3": write_sqlite,
+    "sqlite3, file compressed": partial(write_sqlite, compression=CompressionMode.FILE),
+    "sqlite3, messages compressed": partial(write_sqlite, compression=CompressionMode.MESSAGE),
+    "mcap": lambda path, messages: write_bag(path, messages, zstd=True).parent,
+    "ROS 1": lambda path, messages: write_ros1(path.with_suffix(".bag"), messages),
+    "ROS 1, lz4": lambda path, messages: write_ros1(path.with_suffix(".bag"), messages, lz4=True),
+}
+
+
+@pytest.mark.parametrize("kind", BAGS)
+def test_bags_of_ros(tmp_path: Path, kind: str) -> None:
+    """Frames, transforms and poses as in an MCAP file, in any order from any thread."""
+    links = [transforms("/tf", [(BEGIN + k * STEP, "map", COLOR, exp_se3(np.full(6, 0.1 * k)))]) for k in range(4)]
+    path = BAGS[kind](tmp_path / "bag", [*registered(), *links])
+    assert layout_of(path) == "mcap"
+    dataset = McapDataset(str(path), truth_from="map")
+    check_registered(dataset)
+    truth = dataset.truth()
+    assert truth is not None and np.allclose(truth.poses, [exp_se3(np.full(6, 0.1 * k)) for k in range(4)])
+    order = [3, 0, 2, 1] * 5
+    with ThreadPoolExecutor(4) as pool:
+        for k, frame in zip(order, pool.map(McapDataset(str(path)), order)):
+            assert frame is not None and frame.index == k and (frame.color == WALL.color() + np.uint8(k)).all()
+
+
+def test_bags_with_messages_of_one_time_and_topics_of_other_types(tmp_path: Path) -> None:
+    together = [(topic, kind, BEGIN, data) for topic, kind, _, data in registered()]
+    point = make("geometry_msgs/msg/Point", x=1.0, y=2.0, z=3.0)
+    path = write_sqlite(tmp_path / "bag", [*together, message("/point", "geometry_msgs/msg/Point", BEGIN, point)])
+    check_registered(McapDataset(str(path)))
+    with pytest.raises(DataError, match="the topic '/point' holds other things"):
+        len(McapDataset(str(path), color_topic="/point"))
+
+
+def test_a_damaged_bag_is_one_line(tmp_path: Path) -> None:
+    cause = r"cannot be read as a bag of ROS \(.+\); record it again, or convert it with ros2 bag convert$"
+    bag = write_ros1(tmp_path / "a.bag", registered())
+    data = bag.read_bytes()
+    for damaged in (b"", data[:4000], data[: len(data) // 2], b"#ROSBAG V1.2\n" + data[13:], data[:13] + bytes(4096) + data[4109:]):
+        bag.write_bytes(damaged)
+        with pytest.raises(RecordingError, match=rf"a.bag: {cause}"):
+            len(McapDataset(str(bag)))
+    folder = write_sqlite(tmp_path / "b", registered())
+    (database,) = folder.glob("*.db3")
+    metadata = (folder / "metadata.yaml").read_text()
+    for text in (
+        "",
+        "a: &a [*a]",
+        "[" * 1000,
+        "rosbag2_bagfile_information: {}",
+        metadata.replace("sqlite3", "sqlite9"),
+        metadata.replace(".db3", ".db4"),
+    ):
+        (folder / "metadata.yaml").write_text(text)
+        with pytest.raises(RecordingError, match=rf"b: {cause}"):
+            len(McapDataset(str(folder)))
+    (folder / "metadata.yaml").write_text(metadata)
+    content = database.read_bytes()
+    for damaged in (content[:5000], b"SQLite" + bytes(9000)):
+        database.write_bytes(damaged)
+        with pytest.raises(RecordingError, match=rf"b: {cause}"):
+            len(McapDataset(str(folder)))
+    database.unlink()
+    os.mkfifo(database)
+    with pytest.raises(RecordingError, match=r"is missing, or no regular file"):
+        len(McapDataset(str(folder)))
+
+
+@pytest.mark.parametrize("name, cure", [("walk.mp4", "has no metric depth"), ("k4a.MKV", "azure_kinect_mkv_reader"), ("zed.svo2", "the ZED SDK")])
+def test_a_video_is_refused_with_the_cure(tmp_path: Path, name: str, cure: str) -> None:
+    (tmp_path / name).write_bytes(b"video")
+    for dataset in (McapDataset(str(tmp_path / name)), Folder(str(tmp_path / name))):
+        with pytest.raises(DataError, match=rf"{name}: is a video file, which is not read; .*{cure}.*, then use dataset=folder$"):
+            len(dataset)
 
 
 @pytest.mark.parametrize("packed", ["lz4", "plain", "no chunks"])

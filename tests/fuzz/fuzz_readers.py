@@ -4,9 +4,10 @@
     python tests/fuzz/fuzz_readers.py --inputs 2000 --only ros,map --seed 7
     python tests/fuzz/fuzz_readers.py --seeds                # writes tests/fuzz/seeds anew
 
-An input is one of the seeds, changed at random: bits, bytes, lengths, spans cut out, doubled, moved in from another seed, the end cut off. Files of
-MCAP are also changed inside their messages, which then come through all checks of the container. An input that breaks a reader is written to
-tests/fuzz/found, and the exit code is 1.
+Half of the inputs are seeds changed at random: bits, bytes, lengths, spans cut out, doubled, moved in from another seed, the end cut off. Files of
+MCAP are also changed inside their messages, which then come through all checks of the container. The other half is well-formed and holds extreme
+values (structured.py). An input that breaks a reader is written to tests/fuzz/found, and the exit code is 1. So is one that takes more than 5 s, or 1
+GB beyond what the program had mapped when it began.
 """
 
 from __future__ import annotations
@@ -31,16 +32,17 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).parent))
 from changes import changed, changed_inside
+from structured import STRUCTURED
 from targets import BESIDE, DECLARED, IN_CONTAINER, TARGETS
 
 HERE = Path(__file__).parent
 SEEDS, FOUND = HERE / "seeds", HERE / "found"
-CPU_SECONDS = 10  # of one input
-MEMORY = 512 << 20  # beyond what the program itself has mapped
+CPU_SECONDS = 5  # of one input
+MEMORY = 1_000_000_000  # bytes, beyond what the program itself has mapped
 
 
-class Hang(Exception):
-    """An input took too long."""
+class Hang(BaseException):
+    """An input took too long; no Exception, which readers turn into their own."""
 
 
 @dataclass
@@ -61,6 +63,9 @@ def inputs(name: str, rng: np.random.Generator) -> Iterator[bytes]:
     yield from seeds
     while True:
         seed = seeds[int(rng.integers(0, len(seeds)))]
+        if rng.random() < 0.5:
+            yield STRUCTURED[name](seed, rng)
+            continue
         inside = name in IN_CONTAINER and rng.random() < 0.5
         yield changed_inside(seed, seeds, rng) if inside else changed(seed, seeds, rng)
 
@@ -68,9 +73,7 @@ def inputs(name: str, rng: np.random.Generator) -> Iterator[bytes]:
 def fuzz(name: str, count: int, seed: int) -> Tally:
     """Give a reader `count` inputs."""
     tally, reader = Tally(), TARGETS[name][1]
-    log = logging.getLogger("trihedron")
-    level = log.level
-    log.setLevel(logging.CRITICAL)
+    logging.disable(logging.CRITICAL)
     warnings.simplefilter("error", RuntimeWarning)  # of NumPy: a number that is none went unseen
     rng = np.random.default_rng([seed, *name.encode()])
     began = time.process_time()
@@ -88,17 +91,30 @@ def fuzz(name: str, count: int, seed: int) -> Tally:
                 tally.refused["nothing in it"] += not read
             except DECLARED as error:
                 tally.refused[type(error).__name__] += 1
-                if "\n" in str(error):
-                    tally.broke.append(f"more than one line: {error!r}")
-            except Exception:
-                FOUND.mkdir(exist_ok=True)
-                (FOUND / f"{name}_{tally.inputs}").write_bytes(data)
-                tally.broke.append(traceback.format_exc())
+                if "\n" in str(error) or len(str(error)) > 5000:
+                    tally.broke.append(f"more than one bounded line: {error!r:.1000}")
+                if out_of_memory(error):
+                    tally.broke.append(f"{kept(name, tally, data)}: more than {MEMORY} bytes: {error!r:.1000}")
+            except (Exception, Hang):
+                tally.broke.append(f"{kept(name, tally, data)}: {traceback.format_exc()}")
             outside = [entry for entry in Path(folder).iterdir() if entry.name not in {path.name, *BESIDE}]
             assert not outside, f"{name}: wrote {outside}"
-    log.setLevel(level)
+    logging.disable(logging.NOTSET)
     tally.seconds = time.process_time() - began
     return tally
+
+
+def kept(name: str, tally: Tally, data: bytes) -> Path:
+    """The file to which this input is written."""
+    FOUND.mkdir(exist_ok=True)
+    path = FOUND / f"{name}_{tally.inputs}"
+    path.write_bytes(data)
+    return path
+
+
+def out_of_memory(error: BaseException | None) -> bool:
+    """An error that a reader made of a MemoryError."""
+    return error is not None and (isinstance(error, MemoryError) or out_of_memory(error.__cause__ or error.__context__))
 
 
 class limited_time:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -21,11 +22,13 @@ from trihedron.datasets.readers.replica import read_parameters
 from trihedron.datasets.readers.robot_streams import ROS
 from trihedron.datasets.readers.robot_values import Picture, UnreadableMessage
 from trihedron.pipeline.core.errors import TrihedronError
+from trihedron.pipeline.core.recorded_config import recorded_config
 from trihedron.pipeline.record.codec import METADATA, Decoder
 from trihedron.pipeline.record.mcap_file import McapFile
 from trihedron.pipeline.record.reader import Recording
 from trihedron.pipeline.record.trajectories import read_trajectory
 from trihedron.pipeline.run.map_file import load_map
+from trihedron.pipeline.run.value_checks import checked
 from trihedron.tools.mesh_files import read_mesh
 from trihedron.tools.recover import recover
 
@@ -79,8 +82,18 @@ def recording(path: Path) -> int:
     """All topics of a recording, and one frame."""
     opened = Recording(path)
     opened.overrides()
-    read = sum(1 for topic in sorted(opened.topics) for _ in opened.values(topic))
+    read = 0
+    for topic in sorted(opened.topics):
+        for value in opened.values(topic):
+            _one_of(value, partial(checked, topic, place=""))
+            read += 1
     return min(read, len(opened.frame(2)))
+
+
+def configuration(path: Path) -> int:
+    """The recorded configuration of a run."""
+    recorded_config(path.read_text("utf-8", "replace"), str(path))
+    return 1
 
 
 def saved_map(path: Path) -> int:
@@ -149,5 +162,6 @@ TARGETS: dict[str, tuple[str, Reader, float]] = {  # name -> pattern of its seed
     "ros": ("ros*.mcap", frames, 0.06),
     "foxglove": ("foxglove*.mcap", frames, 0.03),
     "damaged": ("own*.mcap", damaged, 0.02),
+    "configurations": ("config*.yaml", configuration, 0.02),
 }
 IN_CONTAINER = {"recordings", "frames", "map", "ros", "foxglove"}  # their inputs are changed inside messages, too

@@ -198,7 +198,9 @@ LONG = ["dataset=synthetic", "dataset.length=2000", "dataset.width=160", "datase
 
 @pytest.mark.parametrize("number, code", [(signal.SIGINT, 130), (signal.SIGTERM, 143), (signal.SIGHUP, 129)])
 def test_a_signal_leaves_a_recording_and_a_trajectory(tmp_path, number, code):
+    before = signal.signal(number, signal.SIG_DFL)  # a child ignores what its parent ignores, as under nohup
     process = started(tmp_path, *LONG, "out=cut")
+    signal.signal(number, before)
     recording = tmp_path / "cut" / "run.mcap"
     wait_for(recording)
     process.send_signal(number)
@@ -231,6 +233,14 @@ def test_a_full_device_and_an_ascii_terminal_are_no_tracebacks(tmp_path):
     for words in (["plugins"], ["run", "--help"], ["run", "dataset.width=-5"]):
         done = subprocess.run([*PROGRAM, *words], capture_output=True, text=True, env={**os.environ, "PYTHONIOENCODING": "ascii"})
         assert "Traceback" not in done.stderr and done.returncode == (1 if words[-1].startswith("dataset") else 0)
+
+
+def test_closed_streams_are_no_traceback(tmp_path):
+    """As a service manager may start it; a file of the run that took the number of standard error would hold what libraries print."""
+    close = "import os, sys; [os.close(number) for number in (0, 1, 2)]; sys.stdin = sys.stdout = sys.stderr = None"
+    code = f"{close}; from trihedron.pipeline.app.cli import main; os._exit(main({['run', *SMALL, 'dataset.frames=0:2', 'out=closed']!r}))"
+    assert subprocess.run([sys.executable, "-c", code], cwd=tmp_path).returncode == 0
+    assert len(list(Recording(tmp_path / "closed" / "run.mcap").values("keypoints"))) == 2
 
 
 @pytest.mark.parametrize("megabytes", [300, 700, 1000, 1500])

@@ -2,7 +2,9 @@
 
 import contextlib
 import json
+import tracemalloc
 from dataclasses import replace
+from pathlib import Path
 
 import lz4.frame
 import numpy as np
@@ -355,3 +357,55 @@ def test_random_damage_never_raises_anything_else(cut):
             Decoder("x").decode(bytes(damaged[: rng.integers(1, len(data)) if cut else None]))
             read += 1
     assert read == 0 if cut else 0 < read < 2000
+
+
+def message_with(kind, change):
+    """A seed of the fuzzer, its message changed."""
+    message = ValueMessage()
+    message.ParseFromString((Path(__file__).parents[1] / "fuzz" / "seeds" / f"message_own_{kind}").read_bytes()[1:])
+    change(message)
+    return message.SerializeToString()
+
+
+SHAPES = [[], [-1], [1] * 65, [0] * 65, [2**62] * 20, [0] + [2**62] * 20, [0, 2**62], [2**63 - 1, 0], [10**6, 0, 10**6]]
+
+
+@pytest.mark.parametrize("encoding", ["raw", "columns", "zstd", "rows"])
+@pytest.mark.parametrize("shape", SHAPES, ids=lambda shape: f"{len(shape)} axes {max(shape, default=None)}")
+def test_a_shape_that_no_array_has_is_one_line(shape, encoding):
+    def change(message):
+        message.arrays[0].data, message.arrays[0].encoding = bytes(0 if shape else 4), encoding
+        message.arrays[0].shape[:] = shape
+
+    with pytest.raises(RecordingError, match=r"^x: (array 'pixels' (claims|does not have the 4 bytes)|frame 0: Keypoints does not fit)"):
+        Decoder("x").decode(message_with("keypoints", change))
+
+
+HEADERS = {  # text of a table's header, cause
+    "[" * 100_000: "recursion",
+    '{"a":' * 100_000: "recursion",
+    '{"size": [1], "back": 0, "schema": {}, "rows": {}}': "not 'list'",
+    '{"size": 1e999, "back": 0, "schema": {}, "rows": {}}': "cannot convert float infinity to integer",
+    f'{{"size": {"9" * 5000}, "back": 0, "schema": {{}}, "rows": {{}}}}': "4300 digits",
+    '{"size": 0, "back": 1e999, "schema": {}, "rows": {}}': "cannot convert float infinity to integer",
+    '{"size": 100000000, "back": 0, "schema": {}, "rows": {}}': "keyframes: rows are missing",
+    '{"size": 1000000000, "back": 0, "schema": {}, "rows": {}}': "keyframes: a table of 1000000000 rows",
+    '{"size": 0, "back": 0, "schema": {"a": ["f8", [4611686018427387904, 4611686018427387904], 0]}, "rows": {}}': "too big",
+    "null": "not subscriptable",
+}
+
+
+@pytest.mark.parametrize("header", HEADERS, ids=lambda text: text[:50])
+def test_a_table_whose_header_is_no_header_is_one_line(header):
+    """Nothing is allocated for rows that are not there."""
+
+    def change(message):
+        next(array for array in message.arrays if array.name == "keyframes#").data = header.encode()
+
+    tracemalloc.start()
+    try:
+        with pytest.raises(RecordingError, match=f"^x: frame 0: Map does not fit: .*{HEADERS[header]}") as caught:
+            Decoder("x").decode(message_with("map", change))
+        assert tracemalloc.get_traced_memory()[1] < 20e6 and len(str(caught.value)) < 400
+    finally:
+        tracemalloc.stop()

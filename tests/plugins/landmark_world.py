@@ -6,7 +6,7 @@ import numpy as np
 
 from trihedron.pipeline.core.geometry import exp_se3, invert, pose_matrix, tangent_basis, transform, transform_planes
 from trihedron.pipeline.core.types import Camera, Frame, Keypoints, Planes, Pose, Rotation, Segments, Tracks, Translation
-from trihedron.plugins.mapping.visibility import clip_segments
+from trihedron.plugins.mapping.projection import clip_segments
 from trihedron.plugins.shared.linalg import point_covariance
 
 CAMERA = Camera(640, 480, 525.0, 520.0, 319.5, 239.5)

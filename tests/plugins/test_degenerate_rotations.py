@@ -68,7 +68,7 @@ class Two:
 
     def tracks(self, before, now):
         blank = Frame(1, 33_000_000, np.zeros((2, 2, 3), np.uint8), np.zeros((2, 2), np.float32), self.world.camera)
-        return Projection()(blank.camera, *now, *before, None, None, None)
+        return Projection()(blank.camera, *now, *before, None, None, None, np.random.default_rng(0))
 
     def broken(self, value, share, what, *names):
         """Rows of the named arrays replaced."""

@@ -11,7 +11,7 @@ from trihedron.pipeline.core.geometry import exp_se3, invert, tangent_basis, tra
 from trihedron.plugins.map.covisibility import Covisibility
 from trihedron.plugins.map.none import NoMap
 from trihedron.plugins.mapping import plane_fusion
-from trihedron.plugins.mapping.insertion_kernels import fuse_lines
+from trihedron.plugins.mapping.landmark_kernels import fuse_lines
 
 sys.path.insert(0, str(Path(__file__).parent))
 from landmark_world import World, camera_at

@@ -11,7 +11,7 @@ from trihedron.pipeline.core.geometry import exp_se3
 from trihedron.pipeline.core.types import Keypoints, Pose
 from trihedron.plugins.map.covisibility import Covisibility
 from trihedron.plugins.mapping.covisibility_graph import local_window, observed_by
-from trihedron.plugins.mapping.visibility import clip_segments
+from trihedron.plugins.mapping.projection import clip_segments
 from trihedron.plugins.matches.local_map import LocalMap
 
 sys.path.insert(0, str(Path(__file__).parent))

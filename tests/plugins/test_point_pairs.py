@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from trihedron.pipeline.core.geometry import exp_se3, exp_so3, pose_matrix, rotation_angle_deg
-from trihedron.plugins.loop.common_pose_graph import moved_keyframes
+from trihedron.plugins.loop.common_pose_graph import correct_keyframes
 from trihedron.plugins.loop.pose_graph import PoseGraph
 from trihedron.plugins.mapping.correction import apply_correction
 from trihedron.plugins.matches.keyframes import Keyframes
@@ -201,7 +201,7 @@ def around():
         map = stage(world.frame(index), pose_of(T, index), *features, matches, map, None, None, None)
     truth = map.keyframes.column("T_world_camera")
     drifted = np.array([exp_se3(DRIFT * index / SQUARE) @ T for index, T in enumerate(truth)])
-    return world, apply_correction(map, moved_keyframes(map, np.arange(SQUARE + 1, dtype=np.int32), truth, drifted)), truth
+    return world, apply_correction(map, correct_keyframes(map, np.arange(SQUARE + 1, dtype=np.int32), truth, drifted)), truth
 
 
 def test_a_pose_graph_corrects_the_drift_around_a_square():

@@ -48,7 +48,8 @@ class Run:
         T, i = self.path(self.index), self.index
         now = self.world.see(T, i, self.rng, **self.kinds)
         frame = Frame(i, i * 33_000_000, np.zeros((2, 2, 3), np.uint8), np.zeros((2, 2), np.float32), self.world.camera)
-        self.tracks = Projection()(frame.camera, *now, *self.before, None, None, self.tracks) if tracked else None
+        rng = np.random.default_rng(self.index)
+        self.tracks = Projection()(frame.camera, *now, *self.before, None, None, self.tracks, rng) if tracked else None
         given = {"manhattan": self.world.manhattan(T[:3, :3], i, self.rng, **how) if manhattan else None, "tracks": self.tracks}
         given |= {"keypoints": now[0], "segments": now[1], "planes": now[2], "previous": self.previous, "previous_pose": self.pose, "map": None}
         wanted = type(self.plugin).__call__.__annotations__

@@ -23,7 +23,7 @@ def frame(room, index):
 
 
 def track(room, now, before, manhattan=(None, None), previous=None, **fields):
-    return Projection(**fields)(frame(room, now[0].index).camera, *now, *before, *manhattan, previous)
+    return Projection(**fields)(frame(room, now[0].index).camera, *now, *before, *manhattan, previous, np.random.default_rng(0))
 
 
 def right(now, before, tracks):
@@ -79,10 +79,24 @@ def test_turn_of_nine_degrees_needs_a_prediction_and_any_will_do(room):
     manhattan = world.manhattan(T[:3, :3], 6, rng), world.manhattan(START[:3, :3], 5, rng)
     still = replace(track(world, before, world.see(START, 4, rng)), R_current_previous=np.eye(3))
     turning = replace(still, R_current_previous=T[:3, :3].T)
-    blind = track(world, now, before)
+    blind = track(world, now, before, wide_below=0)
     guided = [track(world, now, before, manhattan), track(world, now, before, previous=turning), track(world, now, before, manhattan, still)]
     assert all(len(found.keypoints) > 1.2 * len(blind.keypoints) and right(now, before, found) == 1.0 for found in guided)
     assert all(rotation_angle_deg(found.R_current_previous @ T[:3, :3]) < 0.1 for found in guided)
+
+
+@pytest.mark.parametrize("turn_deg", [20.0, 35.0])
+def test_wide_baseline_is_matched_without_a_prediction(room, turn_deg):
+    """A turn that moves every key point far out of the search radius: pairs by descriptors alone that agree on one rigid motion, or none."""
+    world, rng = room(), np.random.default_rng(10)
+    T = pose([0.0, turn_deg, 2.0], [0.15, 0.0, 0.1])
+    before, now = world.see(START, 5, rng), world.see(T, 6, rng)
+    near, wide = track(world, now, before, wide_below=0), track(world, now, before)
+    assert len(wide.keypoints) > 50 > 3 * len(near.keypoints) and right(now, before, wide) == 1.0
+    assert rotation_angle_deg(wide.R_current_previous @ T[:3, :3] @ START[:3, :3].T) < 0.3
+    keypoints = now[0]
+    shuffled = replace(keypoints, descriptors=rng.permutation(keypoints.descriptors))
+    assert np.array_equal(track(world, (shuffled, *now[1:]), before).keypoints, track(world, (shuffled, *now[1:]), before, wide_below=0).keypoints)
 
 
 def test_of_several_manhattan_frames_those_with_one_id_are_compared(room):

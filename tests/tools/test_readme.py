@@ -6,6 +6,7 @@ from pathlib import Path
 
 import yaml
 
+from trihedron.datasets.simulation.synthetic import Synthetic
 from trihedron.pipeline.core.registry import load_plugins, plugins_of
 from trihedron.pipeline.core.slots import SLOTS, summary
 
@@ -52,10 +53,14 @@ def test_the_readme_is_one_page():
     assert len((ROOT / "README.md").read_text().split()) <= 1200
 
 
-def test_the_python_of_the_readme_runs(capsys):
+def test_the_python_of_the_readme_runs(capsys, tmp_path, monkeypatch):
     (program,) = re.findall(r"```python\n(.*?)```", (ROOT / "README.md").read_text(), re.DOTALL)
-    exec(compile(program, "README.md", "exec"), {})
-    assert capsys.readouterr().out.startswith("[[")
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "camera.yaml").write_text("width: 160\nheight: 120\nfx: 131.25\nfy: 131.25\ncx: 79.5\ncy: 59.5\ndepth_scale: 1000\n")
+    frames = map(Synthetic(length=5, width=160, height=120), range(5))
+    exec(compile(program, "README.md", "exec"), {"my_camera": ((frame.color, frame.depth_m, frame.stamp_ns / 1e9) for frame in frames)})
+    revision, planes, *topics = capsys.readouterr().out.split()
+    assert int(revision) > 0 and int(planes) > 0 and topics == ["('frames',", "'manhattan')"]
 
 
 if __name__ == "__main__":

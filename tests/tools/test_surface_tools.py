@@ -1,6 +1,7 @@
 """Surfaces as files that others read, and judged by a known truth."""
 
 import json
+import os
 from dataclasses import replace
 
 import numpy as np
@@ -153,6 +154,23 @@ def test_meshes_of_other_programs_are_read(tmp_path, suffix):
     if suffix == "ply":
         with pytest.raises(DataError, match="is not a mesh"):
             read_mesh(tmp_path / "bad.ply")
+    os.mkfifo(tmp_path / f"pipe.{suffix}")
+    with pytest.raises(DataError, match=r"is not a mesh: .*it is not a regular file"):
+        read_mesh(tmp_path / f"pipe.{suffix}")
+
+
+def test_polygons_and_indices_from_the_end_and_materials_elsewhere(tmp_path):
+    corners = "v 0 0 0\nv 1 0 0\nv 1 1 0\nv 0 1 0\nv -1 0.5 0\n"
+    (tmp_path / "m.obj").write_text(f"mtllib ../../etc/passwd\n{corners}f -5 -4 -3 -2 -1\n")
+    vertices, triangles = read_mesh(tmp_path / "m.obj")
+    assert len(vertices) == 5 and triangles.tolist() == [[0, 1, 2], [0, 2, 3], [0, 3, 4]]
+    (tmp_path / "m.obj").write_text(f"{corners}f 1 2 9\n")
+    with pytest.raises(DataError, match=r"m\.obj: "):
+        read_mesh(tmp_path / "m.obj")
+    head = "ply\nformat binary_little_endian 1.0\nelement vertex 1000000000000\nproperty float x\nproperty float y\nproperty float z\nend_header\n"
+    (tmp_path / "m.ply").write_text(head)
+    with pytest.raises(DataError, match=r"m\.ply: is not a mesh: "):
+        read_mesh(tmp_path / "m.ply")
 
 
 def test_truth_that_cannot_be_had_is_one_line(tmp_path):

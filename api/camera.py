@@ -1,0 +1,48 @@
+"""The camera of the Python API: intrinsics, the unit of depth images, and lens distortion."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+from pathlib import Path
+
+from trihedron.datasets.readers.cameras import Calibration, read_camera_file
+from trihedron.pipeline.core import types
+
+
+@dataclass(frozen=True)
+class Camera(types.Camera):
+    """A pinhole camera whose colour and depth images are registered, pixel by pixel.
+
+    Args:
+        depth_scale: value of a 16-bit depth image per metre, 1000 for millimetres; 0 where depth is given in metres.
+        distortion: k1 k2 p1 p2 k3 of Brown's model, in OpenCV's order, of both images; empty for undistorted ones.
+        depth_offset: added to inverse depths (1/m).
+    """
+
+    depth_scale: float = 0.0
+    distortion: tuple[float, ...] = ()
+    depth_offset: float = 0.0
+
+    @classmethod
+    def from_yaml(cls, path: str | Path) -> Camera:
+        """Read a camera file: `width height fx fy cx cy depth_scale [distortion] [fps] [depth_noise] [depth_offset]`.
+
+        Raises TrihedronError naming file and key."""
+        return cls.of(read_camera_file(Path(path).expanduser()))
+
+    @classmethod
+    def of(cls, camera: types.Camera | Calibration) -> Camera:
+        """Make a camera of a frame's, or of a data set's calibration."""
+        if isinstance(camera, cls):
+            return camera
+        pinhole = camera.camera if isinstance(camera, Calibration) else camera
+        values = {field.name: getattr(pinhole, field.name) for field in fields(types.Camera)}
+        if isinstance(camera, Calibration):
+            return cls(**values, depth_scale=camera.depth_scale, distortion=camera.distortion, depth_offset=camera.depth_offset)
+        return cls(**values)
+
+    @property
+    def calibration(self) -> Calibration:
+        """The camera as the readers of data sets have it."""
+        pinhole = types.Camera(**{field.name: getattr(self, field.name) for field in fields(types.Camera)})
+        return Calibration(pinhole, self.depth_scale, tuple(self.distortion), self.depth_offset)

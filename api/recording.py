@@ -1,0 +1,113 @@
+"""Recordings: read every topic, and run stages again."""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Iterator
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+from trihedron.api.trajectory import Trajectory
+from trihedron.api.words import words_of
+from trihedron.pipeline.core.errors import RecordingError, UsageError, did_you_mean
+from trihedron.pipeline.core.types import Frame, Map, Pose, Surface, Value
+from trihedron.pipeline.record import reader
+from trihedron.pipeline.record.codec import FRAMES_TOPIC
+from trihedron.tools.recorded import frames_of, last_map, poses_of, references_of, trajectory_of
+
+
+class Recording:
+    """A recording (run.mcap), or the folder of a run that has one. Raises TrihedronError where it cannot be read."""
+
+    def __init__(self, path: str | Path) -> None:
+        file = Path(path).expanduser()
+        self.path = file / "run.mcap" if file.is_dir() else file
+        self._file = reader.Recording(self.path)
+        self._temporary: tempfile.TemporaryDirectory[str] | None = None  # of a replay: it lives as long as this object
+
+    @property
+    def topics(self) -> tuple[str, ...]:
+        """The names of the topics."""
+        return tuple(sorted(self._file.topics))
+
+    @property
+    def metadata(self) -> dict[str, str]:
+        """Version, commit, overrides and configuration of the run."""
+        return dict(self._file.metadata)
+
+    def values(self, topic: str) -> Iterator[Any]:
+        """Read the values of a topic in frame order. Raises TrihedronError for a topic that is not recorded."""
+        if topic not in self._file.topics:
+            raise RecordingError(str(self.path), f"has no topic '{topic}'", did_you_mean(topic, self._file.topics))
+        return self._file.values(topic)
+
+    def frame(self, index: int) -> dict[str, Value]:
+        """Read the values of every topic at one frame; empty where there is none of this number."""
+        return self._file.frame(index)
+
+    def image(self, index: int) -> Frame:
+        """Read the images of a frame: those embedded, else those of the data set that was tracked. Raises TrihedronError."""
+        if index not in self._references:
+            numbers = list(self._references)
+            held = f"its frames are {numbers[0]} to {numbers[-1]}" if numbers else "it has none"
+            raise RecordingError(str(self.path), f"has no frame {index}", held)
+        frame = frames_of(self._file)(self._references[index])
+        if frame is None:
+            raise RecordingError(str(self.path), f"has no images of frame {index}", "record with record.frames=true")
+        return frame
+
+    @property
+    def frames(self) -> tuple[int, ...]:
+        """The numbers of the frames."""
+        return tuple(self._references)
+
+    @cached_property
+    def _references(self) -> dict[int, Any]:
+        return references_of(self._file) if FRAMES_TOPIC in self._file.topics else {}
+
+    @property
+    def poses(self) -> list[Pose]:
+        """The poses as they were estimated at the time."""
+        return poses_of(self._file)
+
+    @property
+    def trajectory(self) -> Trajectory:
+        """The poses of all tracked frames, relative to the keyframes of the last map."""
+        return Trajectory.of(trajectory_of(self._file))
+
+    @property
+    def map(self) -> Map | None:
+        """The last map, or None."""
+        return last_map(self._file)
+
+    def mesh(self) -> Surface:
+        """Read the surface. Raises TrihedronError where none was recorded."""
+        surface: Any = next(self.values("surface"), None)
+        if not isinstance(surface, Surface):
+            raise RecordingError(str(self.path), "holds no surface", "record a run with outputs=[surface]")
+        return surface
+
+    def replay(self, *overrides: str, only: list[str] | tuple[str, ...] = (), out: str | Path | None = None, **options: Any) -> Recording:
+        """Run stages again, and return the recording of what they gave.
+
+        Args:
+            overrides: words of the command line.
+            only: the stages; () = all. The rest is read from this recording.
+            out: the folder of the results; without it they last as long as the returned object.
+            options: as of `Slam`, for example `manhattan="branch_and_bound"`.
+
+        Raises TrihedronError, for example where a stage needs images that the recording does not embed."""
+        from trihedron.api.runs import run
+
+        if isinstance(only, str):
+            raise UsageError("only", f"is the text '{only}'", f'give a list, only=["{only}"]')
+        temporary = tempfile.TemporaryDirectory(prefix="trihedron-") if out is None else None
+        folder = Path(temporary.name) if temporary is not None else Path(str(out)).expanduser()
+        words = words_of(overrides, options)
+        made = run(f"replay={self.path}", *([f"only=[{','.join(only)}]"] if only else []), *words, out=folder, quiet=out is None)
+        made.recording._temporary = temporary
+        return made.recording
+
+    def __repr__(self) -> str:
+        return f"Recording({str(self.path)!r}, {len(self._references)} frames, topics {', '.join(self.topics)})"

@@ -1,0 +1,342 @@
+"""SLAM as an object: push frames, read the pose and every topic, save.
+
+The graph of the command line runs in a thread of its own on the frames that are pushed. The same frames with the same stamps give the same bytes on
+every topic as a run over a folder.
+"""
+
+from __future__ import annotations
+
+import atexit
+import copy
+import json
+import threading
+import time
+from collections import deque
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import ExitStack
+from dataclasses import replace
+from pathlib import Path
+from types import TracebackType
+from typing import Any
+
+from trihedron.api.camera import Camera
+from trihedron.api.images import Frames, camera_of, stamp_of
+from trihedron.api.trajectory import Trajectory
+from trihedron.api.words import words_of
+from trihedron.datasets.readers.cameras import Calibration
+from trihedron.datasets.simulation.synthetic import Synthetic
+from trihedron.pipeline.app.compilation import compile_once
+from trihedron.pipeline.app.execute import RECORDING, metadata_of, recorded_topics, remembered_of, source_of, write_files
+from trihedron.pipeline.core import types
+from trihedron.pipeline.core.config import check_added, composed, graph_of
+from trihedron.pipeline.core.errors import ConfigError, UsageError, did_you_mean
+from trihedron.pipeline.core.graph import Graph
+from trihedron.pipeline.core.types import FrameReference, Map, Surface, Value
+from trihedron.pipeline.record.codec import FRAMES_TOPIC
+from trihedron.pipeline.record.writer import RecordingWriter
+from trihedron.pipeline.run import results
+from trihedron.pipeline.run.map_file import save_map
+from trihedron.pipeline.run.replay import TOPICS
+from trihedron.pipeline.run.run_folder import held, write_configuration
+from trihedron.pipeline.run.runner import Runner, Step
+from trihedron.pipeline.run.warm_up import WARM_UP_FRAMES, compilation_reported, warm_up
+from trihedron.tools.recover import recover
+
+REFUSED = ("replay", "only", "live", "real_time", "save_map", "sequences")  # root keys of a run that make no sense for pushed frames
+WARM_UP_PX = 640  # the largest width of the images of the warm-up
+
+
+class Slam:
+    """Track a camera frame by frame.
+
+    ```python
+    slam = trihedron.Slam(trihedron.Camera.from_yaml("camera.yaml"), manhattan="mean_shift", outputs=["surface"])
+    for rgb, depth, t in my_camera:
+        pose = slam.track(rgb, depth, t)
+    slam.save("run.mcap")
+    ```
+
+    Args:
+        camera: intrinsics of both images, which are registered; a camera file's distortion and unit of depth are applied.
+        overrides: words of the command line, as "manhattan.cone_deg=8" or "graph=points".
+        out: a folder to which the recording is streamed, and in which `close` writes trajectory, times and surface, as `out=` of the command line.
+        history: number of frames whose images and values `save` writes where there is no `out`.
+        options: root keys and plugins by name, as `manhattan="mean_shift"`, `threads=2`, `outputs=["surface"]`.
+
+    Frames are pushed from one thread. Used as a context manager it is closed at the end of the block. Constructing compiles what is not compiled yet,
+    and says so. While it is open, OpenCV and BLAS use one thread in this process. Raises TrihedronError: one line with place, cause and cure.
+    """
+
+    def __init__(self, camera: types.Camera | Calibration, *overrides: str, out: str | Path | None = None, history: int = 10, **options: Any) -> None:
+        began = time.perf_counter()
+        self._frames = Frames(camera_of(camera))
+        words = words_of(overrides, options)
+        _check_words(words)
+        self._config = composed(["dataset=pushed", *words])
+        self._words = words
+        graph = graph_of(self._config)
+        self._queue = graph.stages["dataset"].plugin.queue
+        self._changed = threading.Condition()
+        self._values: dict[str, dict[int, Value | None]] = {name: {} for name in graph.stages}  # stage -> position -> value
+        self._last = -1  # position of the last frame pushed
+        self._settled = -1  # and of the last one with which all stages are done
+        self._last_ns: int | None = None
+        self._history: deque[tuple[int, Mapping[str, Any]]] = deque(maxlen=max(history, 1))
+        self._failure: BaseException | None = None
+        self._ended = self._closed = False
+        self._runner = Runner(graph, self._config.seed, self._config.threads, None, "", remembered_of(self._config, graph), on_value=self._note)
+        self._topics = recorded_topics(self._config, graph, None)
+        self._stack = ExitStack()
+        self._writer: RecordingWriter | None = None
+        self._out = Path(out).expanduser().absolute() if out is not None else None
+        try:
+            self._open(graph)
+        except BaseException:
+            self._stack.close()
+            raise
+        self._began, self._started = began, time.perf_counter()
+        self._thread = threading.Thread(target=self._work, name="trihedron", daemon=True)
+        self._thread.start()
+        atexit.register(self.close)
+
+    def _open(self, graph: Graph) -> None:
+        """Open the run folder and its recording, then compile and load what the first frames need."""
+        if self._out is not None:
+            self._stack.enter_context(held(self._out))
+            self._config.out = str(self._out)
+            write_configuration(self._out, self._config, self._words)
+        compile_once(self._runner.computed, True)
+        with compilation_reported():
+            warm_up(Runner(_on_synthetic_images(graph, self.camera), self._config.seed, self._config.threads))
+        if self._out is not None:
+            self._writer = RecordingWriter(self._out / RECORDING, self._metadata())
+            self._stack.callback(self._writer.close)
+
+    @property
+    def camera(self) -> Camera:
+        """The camera whose images are pushed."""
+        return self._frames.camera
+
+    def track(self, rgb: Any, depth: Any, t: float) -> Any:
+        """Track one frame and return its `Pose`; slow stages, such as bundle adjustment, may still work on it. A graph without the stage `pose`
+        gives the value of its last stage.
+
+        Args:
+            rgb: (h, w, 3) uint8, red first; copied.
+            depth: (h, w) float metres or uint16 divided by the camera's `depth_scale`, 0 where there is none; copied.
+            t: seconds, later than that of the frame before.
+
+        Raises TrihedronError for an argument that does not fit, naming it, and for a stage that failed."""
+        self._check_open()
+        stamp_ns = stamp_of(t, self._last_ns)
+        frame = self._frames(self._last + 1, stamp_ns, rgb, depth)
+        with self._changed:
+            for values in self._values.values():
+                values.clear()
+            self._last, self._last_ns = frame.index, stamp_ns
+        self._queue.push(frame)
+        return self._value("pose" if "pose" in self._values else list(self._values)[-1])
+
+    @property
+    def values(self) -> Values:
+        """The values of the last frame by topic, as `slam.values["planes"]`; None where a stage wrote nothing."""
+        return Values(self._values, self._value)
+
+    @property
+    def map(self) -> Map | None:
+        """The map after the last frame; None before there is one."""
+        self._settle()
+        return self._runner.result.map
+
+    @property
+    def trajectory(self) -> Trajectory:
+        """The poses of all tracked frames, relative to the keyframes of the map as it is now."""
+        self._settle()
+        return Trajectory.of(results.final_trajectory(self._runner.result))
+
+    @property
+    def causal_trajectory(self) -> Trajectory:
+        """The poses of all tracked frames as they were estimated at the time."""
+        self._settle()
+        return Trajectory.of(results.causal_trajectory(self._runner.result))
+
+    def mesh(self) -> Surface:
+        """Return the surface so far. Raises TrihedronError unless `surface` is among the outputs."""
+        if "surface" not in self._values:
+            raise ConfigError("outputs", "has no surface, so none is made", 'give outputs=["trajectory", "surface"]')
+        self._settle()
+        finished: Any = self._runner.result.folds.get("surface")
+        if finished is None:
+            plugin, state = self._runner.graph.stages["surface"].plugin, self._runner.fold_state("surface")
+            finished = plugin.preview(state) if hasattr(plugin, "preview") else plugin.finish(copy.deepcopy(state), self._runner.result.map)
+        surface: Surface = finished
+        return surface
+
+    def save(self, path: str | Path) -> None:
+        """Write a recording: all of it so far where frames are streamed to `out`; else all poses, the surface so far, and the images and values of
+        the last `history` frames. Raises TrihedronError where the file cannot be written."""
+        self._settle()
+        file = Path(path).expanduser()
+        if self._out is not None and self._writer is not None:
+            self._writer.flush()
+            recover(self._out / RECORDING, file, being_written=True)
+            return
+        writer = RecordingWriter(file, self._metadata("dataset"))
+        try:
+            self._write_history(writer)
+        finally:
+            writer.close()
+
+    def save_map(self, path: str | Path) -> None:
+        """Write the map, to localise or to go on in it with `load_map=`. Raises TrihedronError where there is none."""
+        self._settle()
+        save_map(Path(path).expanduser(), self._runner.state, metadata_of(self._config, self._words), source_of(self._config))
+
+    def close(self) -> None:
+        """End the run: finish the surface, and write the files of `out`. Raises TrihedronError for what failed. Closing twice does nothing."""
+        if self._closed:
+            return
+        self._closed = True
+        atexit.unregister(self.close)
+        self._queue.close()
+        self._thread.join()
+        with self._stack:
+            if self._out is not None and self._last >= 0:
+                write_files(self._runner, None, self._out, self._started, self._began)
+                for value in self._runner.result.folds.values():
+                    if isinstance(value, Surface):
+                        results.write_surface(self._out, value)
+        if self._failure is not None:
+            raise self._failure
+
+    def __enter__(self) -> Slam:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None) -> None:
+        try:
+            self.close()
+        except Exception:
+            if error is None:  # else it is the consequence
+                raise
+
+    def __repr__(self) -> str:
+        status = f"{self._last + 1} frames, {len(self._runner.result.poses)} poses"
+        return f"Slam({self.camera.width}×{self.camera.height}, {status}{', closed' if self._closed else ''})"
+
+    # the run's thread
+
+    def _work(self) -> None:
+        try:
+            with compilation_reported():
+                for step in self._runner.steps(self._writer, self._topics, embed_frames="dataset" in self._topics):
+                    self._take(step)
+        except BaseException as error:  # raised where the caller is
+            self._failure = error
+        finally:
+            with self._changed:
+                self._ended = True
+                self._changed.notify_all()
+
+    def _take(self, step: Step) -> None:
+        with self._changed:
+            self._settled = step.position
+            if self._writer is None:
+                self._history.append((step.index, {name: step.values[name] for name in ({"dataset"} | self._topics) & set(step.values)}))
+            self._changed.notify_all()
+
+    def _note(self, position: int, stage: str, value: Value | None) -> None:
+        with self._changed:
+            if position == self._last:
+                self._values[stage][position] = value
+                self._changed.notify_all()
+
+    # the caller's thread
+
+    def _value(self, stage: str) -> Value | None:
+        """Wait until a stage is done with the last frame, and return its value."""
+        if self._last < 0:
+            return None
+        with self._changed:
+            self._changed.wait_for(lambda: self._last in self._values[stage] or self._ended)
+            if self._last in self._values[stage]:
+                return self._values[stage][self._last]
+        self._check_failure()
+        return None
+
+    def _settle(self) -> None:
+        """Wait until all stages are done with the last frame."""
+        with self._changed:
+            self._changed.wait_for(lambda: self._settled >= self._last or self._ended)
+        if not self._closed:
+            self._check_failure()
+
+    def _check_open(self) -> None:
+        self._check_failure()
+        if self._closed:
+            raise UsageError("Slam", "is closed, and tracks no more frames", "make another")
+
+    def _check_failure(self) -> None:
+        if self._failure is not None:
+            raise self._failure
+
+    def _metadata(self, *more: str) -> dict[str, str]:
+        return {**metadata_of(self._config, self._words), TOPICS: json.dumps(sorted({*self._topics, *more}))}
+
+    def _write_history(self, writer: RecordingWriter) -> None:
+        """Write the poses that are no longer in the history, then its frames."""
+        first = self._history[0][0] if self._history else 0
+        for pose in self._runner.result.poses:
+            if pose.index < first:
+                writer.write("pose", pose)
+        for _, values in self._history:
+            frame = values.get("dataset")
+            if isinstance(frame, types.Frame):
+                writer.write(FRAMES_TOPIC, FrameReference(frame.index, frame.stamp_ns, frame.camera))
+            for name, value in values.items():
+                if isinstance(value, Value):
+                    writer.write(name, value)
+        if "surface" in self._values:
+            writer.write("surface", self.mesh())
+
+
+class Values(Mapping[str, Any]):
+    """The values of the last frame by topic; reading one waits until its stage is done."""
+
+    def __init__(self, stages: Mapping[str, Any], read: Callable[[str], Value | None]) -> None:
+        self._stages, self._read = stages, read
+
+    def __getitem__(self, topic: str) -> Any:
+        if topic not in self._stages:
+            raise UsageError(f"values[{topic!r}]", "no stage of this graph writes it", did_you_mean(topic, self._stages))
+        return self._read(topic)
+
+    def __contains__(self, topic: object) -> bool:
+        return topic in self._stages
+
+    def get(self, topic: str, default: Any = None) -> Any:
+        """Return the value of a topic, or the default for one that no stage writes."""
+        return self._read(topic) if topic in self._stages else default
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._stages)
+
+    def __len__(self) -> int:
+        return len(self._stages)
+
+
+def _check_words(words: list[str]) -> None:
+    check_added(words)
+    for word in words:
+        key = word.partition("=")[0].lstrip("+~")
+        if key.partition(".")[0] == "dataset":
+            raise UsageError(key, "frames are pushed, so there is no data set to choose", "leave it out, or use trihedron.run")
+        if key in REFUSED:
+            raise UsageError(key, "is for runs over a data set", "leave it out, or use trihedron.run")
+
+
+def _on_synthetic_images(graph: Graph, camera: types.Camera) -> Graph:
+    """Return the graph on images of the built-in room, of the camera's size as far as that is not large."""
+    width = min(camera.width, WARM_UP_PX)
+    height = max(round(camera.height * width / camera.width), 16)
+    room = Synthetic(length=WARM_UP_FRAMES, width=max(width, 16), height=height)
+    return Graph({**graph.stages, "dataset": replace(graph.stages["dataset"], plugin=room)}, graph.outputs)

@@ -1,0 +1,193 @@
+"""Any stage alone, as `trihedron.planes.connected_components(angle_deg=3)(depth, camera)`."""
+
+from __future__ import annotations
+
+import dataclasses
+import sys
+import zlib
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from trihedron.api.images import Frames, camera_of
+from trihedron.datasets.readers.cameras import Calibration
+from trihedron.pipeline.core import types
+from trihedron.pipeline.core.errors import ConfigError, UsageError, did_you_mean
+from trihedron.pipeline.core.registry import load_plugins, options_of, parameters_of_method, plugin_class, plugins_of
+from trihedron.pipeline.core.slots import CAMERA, FOLDS, RNG, accepts_none, default_wires, inputs_of, strip_none, summary
+from trihedron.pipeline.core.types import Frame, Value
+from trihedron.pipeline.run.scheduler import single_threaded_libraries
+from trihedron.pipeline.run.warm_up import compilation_reported
+from trihedron.tools.plugins import default_plugins
+
+COLOUR = {"keypoints", "lines"}  # slots whose plugins look at colour
+
+
+class Slot:
+    """The plugins of one slot as attributes: `trihedron.planes.ransac(angle_deg=3)` makes a stage."""
+
+    def __init__(self, name: str) -> None:
+        load_plugins()
+        self._name = name
+        self.__doc__ = f"{summary(name)}\n\nPlugins: {', '.join(plugins_of(name))}."
+
+    def __getattr__(self, plugin: str) -> Any:
+        if plugin.startswith("__"):
+            raise AttributeError(plugin)
+        return StageFactory(self._name, plugin, plugin_class(self._name, plugin))
+
+    def __dir__(self) -> list[str]:
+        return list(plugins_of(self._name))
+
+    def __repr__(self) -> str:
+        return f"<slot {self._name}: {', '.join(plugins_of(self._name))}>"
+
+
+class StageFactory:
+    """A plugin; calling it with options makes a stage (of the slot `dataset`: the data set)."""
+
+    def __init__(self, slot: str, name: str, kind: type[Any]) -> None:
+        self._slot, self._name, self._kind = slot, name, kind
+        self.__doc__ = kind.__doc__
+
+    def __call__(self, **options: Any) -> Any:
+        """Make the stage. Raises TrihedronError for an option that is unknown or out of range."""
+        place = f"{self._slot}.{self._name}"
+        known = {option.name for option in options_of(self._kind)}
+        for name in options:
+            if name not in known:
+                raise ConfigError(f"{place}({name}=...)", "the plugin has no such option", did_you_mean(name, known))
+        try:
+            plugin = self._kind(**options)
+        except (ValueError, TypeError) as error:
+            raise ConfigError(place, str(error), f"see trihedron plugins {self._slot} {self._name}") from error
+        return plugin if self._slot == "dataset" else Stage(self._slot, self._name, plugin)
+
+    def __repr__(self) -> str:
+        options = ", ".join(f"{option.name}={getattr(option, 'default', '')!r}" for option in options_of(self._kind))
+        return f"trihedron.{self._slot}.{self._name}({options})"
+
+
+class Stage:
+    """A plugin with its options that is called on arrays, frames and values.
+
+    `stage(depth, camera)`, `stage(rgb, depth, camera)` or `stage(frame)`, then any inputs of the slot: by their names, as `normals=normals`, or by
+    their types alone. What is missing and cannot be None is computed by the default plugin of its slot, which is printed once. Raises TrihedronError
+    naming the argument that does not fit."""
+
+    def __init__(self, slot: str, name: str, plugin: Any) -> None:
+        self.slot, self.name, self.plugin = slot, name, plugin
+        self._printed: set[str] = set()
+        self.__doc__ = type(plugin).__doc__
+
+    def __call__(self, *arguments: Any, **inputs: Any) -> Any:
+        """Compute the slot's value, or None."""
+        if self.slot in FOLDS:
+            cure = f'give Slam(..., {self.slot}="{self.name}", outputs=["{self.slot}"])'
+            raise UsageError(f"{self.slot}.{self.name}", "gathers many frames", cure)
+        given = _Inputs(self, arguments, inputs)
+        with single_threaded_libraries(), compilation_reported():
+            return given.compute(self.slot, self.plugin)
+
+    def say_default(self, slot: str, plugin: str) -> None:
+        """Print, once, that an input is computed by the default plugin."""
+        if slot not in self._printed:
+            self._printed.add(slot)
+            print(f"trihedron: {self.slot}.{self.name}: '{slot}' is not given; it is computed by {slot}.{plugin}, the default", file=sys.stderr)
+
+    def __repr__(self) -> str:
+        options = ", ".join(f"{field.name}={getattr(self.plugin, field.name)!r}" for field in dataclasses.fields(self.plugin))
+        return f"trihedron.{self.slot}.{self.name}({options})"
+
+
+class _Inputs:
+    """The arguments of one call, by input of the slot, and the values computed from them."""
+
+    def __init__(self, stage: Stage, arguments: tuple[Any, ...], named: Mapping[str, Any]) -> None:
+        self._stage, self._place = stage, f"{stage.slot}.{stage.name}"
+        self._types = {name: strip_none(hint) for name, hint in inputs_of(stage.slot).items()}
+        self._values: dict[str, Any] = {}
+        arrays: dict[str, Any] = {"rgb": None, "depth": None, CAMERA: None}
+        for argument in arguments:
+            self._place_argument(argument, arrays)
+        for name, value in named.items():
+            if name in arrays:
+                arrays[name] = value
+            else:
+                self._check(name, value)
+                self._values[name] = value
+        self._has_colour = arrays["rgb"] is not None or "frame" in self._values
+        self._camera = arrays[CAMERA]
+        if arrays["depth"] is not None:
+            if arrays[CAMERA] is None:
+                raise UsageError(f"{self._place}: camera", "is not given", "give trihedron.Camera(...) after the images")
+            self._values["frame"] = Frames(camera_of(arrays[CAMERA]))(self._index(), self._stamp(), arrays["rgb"], arrays["depth"])
+
+    def _place_argument(self, argument: Any, arrays: dict[str, Any]) -> None:
+        """Put an argument without a name where its type belongs."""
+        if isinstance(argument, (types.Camera, Calibration)):
+            arrays[CAMERA] = argument
+        elif isinstance(argument, Value):
+            fitting = [name for name, kind in self._types.items() if type(argument) is kind and name not in self._values]
+            name = "frame" if isinstance(argument, Frame) else fitting[0] if fitting else ""
+            if not name:
+                kinds = ", ".join(f"{name}: {kind.__name__}" for name, kind in self._types.items())
+                raise UsageError(self._place, f"takes no {type(argument).__name__}", f"its inputs are {kinds}")
+            self._values[name] = argument
+        else:
+            shape = np.shape(argument)
+            name = "rgb" if len(shape) == 3 else "depth" if len(shape) == 2 else ""
+            if not name:
+                cause = f"the argument of the shape {shape} is no image"
+                raise UsageError(self._place, cause, "give rgb (h, w, 3), depth (h, w), a camera, or inputs by name")
+            arrays[name] = argument
+
+    def _check(self, name: str, value: Any) -> None:
+        known = {**self._types, "frame": Frame}
+        if name not in known:
+            raise UsageError(f"{self._place}: {name}", "the slot has no such input", did_you_mean(name, [*known, "rgb", "depth", CAMERA]))
+        if value is not None and not isinstance(value, known[name]):
+            raise UsageError(f"{self._place}: {name}", f"is {type(value).__name__}", f"give {known[name].__name__}")
+
+    def compute(self, slot: str, plugin: Any) -> Any:
+        """Call a plugin on the inputs it takes."""
+        hints, taken = inputs_of(slot), parameters_of_method(slot, type(plugin))
+        arguments: dict[str, Any] = {}
+        if slot in COLOUR and "frame" in taken and not self._has_colour:
+            raise UsageError(f"{self._place}: rgb", f"is not given, and {slot} are found in it", "give rgb (h, w, 3) before depth")
+        for parameter in taken:
+            if parameter == RNG:
+                arguments[RNG] = np.random.default_rng([0, self._index(), zlib.crc32(slot.encode())])
+            elif parameter == CAMERA:
+                arguments[CAMERA] = self._camera_alone()
+            else:
+                arguments[parameter] = self._input(slot, parameter, hints[parameter])
+        return None if any(arguments[p] is None and not accepts_none(hints[p]) for p in taken if p in hints) else plugin(**arguments)
+
+    def _input(self, slot: str, parameter: str, hint: Any) -> Any:
+        """Return the input of a plugin of `slot`: given, None, or computed by the default plugin."""
+        if parameter in self._values and (slot == self._stage.slot or not parameter.startswith("previous")):
+            return self._values[parameter]
+        if accepts_none(hint):
+            return None
+        if parameter == "frame":
+            raise UsageError(f"{self._place}: depth", "is not given", "give depth (h, w) and a camera, or a frame")
+        source = default_wires(slot)[parameter].topic
+        name = default_plugins()[source]
+        self._stage.say_default(source, name)
+        self._values[parameter] = self.compute(source, plugin_class(source, name)())
+        return self._values[parameter]
+
+    def _camera_alone(self) -> types.Camera:
+        if isinstance(frame := self._values.get("frame"), Frame):
+            return frame.camera
+        if self._camera is None:
+            raise UsageError(f"{self._place}: camera", "is not given", "give trihedron.Camera(...)")
+        return camera_of(self._camera).calibration.camera
+
+    def _index(self) -> int:
+        return max((value.index for value in self._values.values() if isinstance(value, Value)), default=0)
+
+    def _stamp(self) -> int:
+        return max((value.stamp_ns for value in self._values.values() if isinstance(value, Value)), default=0)

@@ -1,0 +1,83 @@
+"""Files that come from anyone, read within bounds: regular files of limited size, YAML of limited depth, one line for whatever goes wrong."""
+
+from __future__ import annotations
+
+import errno
+import os
+import stat
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from trihedron.pipeline.core.errors import DataError, TrihedronError, printable
+
+MAX_YAML_BYTES = 1_000_000
+MAX_YAML_DEPTH = 20  # of nested lists and mappings
+SHOWN = 60  # characters of a stranger's text in a message
+
+
+def read_file(path: Path, limit: int) -> bytes:
+    """Return the bytes of a regular file. Raises OSError for more than `limit` bytes, and for a device, FIFO or socket, which may never end."""
+    try:
+        descriptor = os.open(path, os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0))  # a FIFO blocks without
+    except ValueError as error:  # a NUL in the name
+        raise OSError(errno.EINVAL, os.strerror(errno.EINVAL)) from error
+    with os.fdopen(descriptor, "rb") as file:
+        found = os.fstat(descriptor)
+        if stat.S_ISDIR(found.st_mode):
+            raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR))
+        if not stat.S_ISREG(found.st_mode):
+            raise OSError(errno.EINVAL, "it is not a regular file")
+        data = file.read(found.st_size + 1) if found.st_size <= limit else b""
+        if found.st_size > limit or len(data) > limit:
+            raise OSError(errno.EFBIG, f"it has more than {limit} bytes")
+        return data
+
+
+def read_text(path: Path, limit: int) -> str:
+    """Return the UTF-8 text of a regular file, without a byte order mark. Raises DataError."""
+    try:
+        return read_file(path, limit).decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        raise DataError(str(path), "is not a text file", "give a text file with one entry a line") from error
+    except OSError as error:
+        raise DataError(str(path), f"cannot be read ({error.strerror})", "check the path and its permissions") from error
+
+
+class YamlError(ValueError):
+    """A text is no YAML that is read here; `line` is where, from 1, or 0."""
+
+    def __init__(self, cause: str, line: int = 0) -> None:
+        self.line = line
+        super().__init__(cause)
+
+
+def parse_yaml(text: str, max_depth: int = MAX_YAML_DEPTH) -> Any:
+    """Return plain values of YAML without aliases. Raises YamlError, one line."""
+    depth = 0
+    try:
+        for event in yaml.parse(text, yaml.CSafeLoader):
+            depth += isinstance(event, yaml.CollectionStartEvent) - isinstance(event, yaml.CollectionEndEvent)
+            if depth > max_depth or isinstance(event, yaml.AliasEvent):
+                raise YamlError("with aliases or deep nesting", event.start_mark.line + 1)
+        return yaml.CSafeLoader(text).get_single_data()
+    except YamlError:
+        raise
+    except Exception as error:  # PyYAML raises ValueError, TypeError, OverflowError and others for scalars such as 2024-13-45
+        mark = getattr(error, "problem_mark", None)
+        raise YamlError(f"that is not YAML ({type(error).__name__})", mark.line + 1 if mark else 0) from error
+
+
+@contextmanager
+def one_line_errors(place: str, cure: str = "check the file, or record it again") -> Iterator[None]:
+    """Turn any exception of a reader into a DataError that names the place: the boundary between a file and the program."""
+    try:
+        yield
+    except (TrihedronError, GeneratorExit):
+        raise
+    except Exception as error:
+        cause = printable(f"{type(error).__name__}: {error}", 4 * SHOWN)
+        raise DataError(place, f"cannot be read ({cause})", cure) from error

@@ -1,0 +1,327 @@
+"""The files of a building: `building.json`, and floor plans as SVG and DXF, all in metres in the building's frame (see `types.Building`).
+
+A plan shows one storey beside the other, from the lowest. Walls whose other face was not seen are drawn with one line's width; dashed is what was not
+seen: stretches of walls without a reading, and edges of rooms that nothing bounds."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from dataclasses import dataclass
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+from xml.sax.saxutils import escape
+
+import numpy as np
+
+from trihedron.pipeline.core.types import ELEMENTS, F64, OPENING_KINDS, SUPPORTS, Building
+
+JSON, SVG, DXF = "building.json", "floorplan.svg", "floorplan.dxf"
+SCHEMA_VERSION = 1
+SHEET_M = 0.06  # thickness that a wall is drawn with where its other face was not seen
+
+
+def write_building(out: Path, building: Building) -> list[str]:
+    """Write the files of a run folder and return a line that describes them."""
+    (out / JSON).write_text(json.dumps(building_json(building), indent=1) + "\n", encoding="utf-8")
+    (out / SVG).write_text(floorplan_svg(building), encoding="utf-8")
+    write_dxf(out / DXF, building)
+    return [summary(building)]
+
+
+def summary(building: Building) -> str:
+    """Return a line that describes a building."""
+    counts = [
+        (len(building.storeys), "storey"),
+        (len(building.areas_m2), "room"),
+        (len(building.walls_m), "wall"),
+        (len(building.spans_m), "opening"),
+    ]
+    said = ", ".join(f"{count} {name}{'s' if count != 1 else ''}" for count, name in counts)
+    area = f" of {building.areas_m2.sum():.1f} ± {np.sqrt(building.area_variance.sum()):.1f} m²" if len(building.areas_m2) else ""
+    return f"building: {said}{area}" + (f"; {building.note}" if building.note else "")
+
+
+# JSON.
+
+
+def building_json(building: Building) -> dict[str, Any]:
+    """Return the building as the documented schema (docs/reference/building.md): `storeys`, `walls`, `rooms`, `openings`; null = not seen."""
+    return {
+        "schema": SCHEMA_VERSION,
+        "unit": "m",
+        "note": building.note,
+        "T_world_building": _numbers(building.T_world_building),
+        "storeys": [_storey(building, k) for k in range(len(building.storeys))],
+        "walls": [_wall(building, k) for k in range(len(building.walls_m))],
+        "rooms": [_room(building, k) for k in range(len(building.areas_m2))],
+        "openings": [_opening(building, k) for k in range(len(building.spans_m))],
+        "furniture_planes": building.furniture.tolist(),
+    }
+
+
+def _numbers(array: Any) -> Any:
+    """Return nested lists rounded to a hundredth of a millimetre, None for NaN."""
+    if isinstance(array, np.ndarray) and array.ndim:
+        return [_numbers(row) for row in array]
+    return round(float(array), 5) if np.isfinite(array) else None
+
+
+def _sigmas(covariance: F64) -> list[float | None]:
+    return [_numbers(value) for value in np.sqrt(np.diag(covariance))]
+
+
+def _support(building: Building, kind: str, number: int) -> dict[str, list[int]]:
+    rows = building.support[(building.support[:, 0] == ELEMENTS.index(kind)) & (building.support[:, 1] == number)]
+    return {f"{name}s": rows[rows[:, 2] == k, 3].tolist() for k, name in enumerate(SUPPORTS)}
+
+
+def _storey(building: Building, k: int) -> dict[str, Any]:
+    (floor, ceiling), (floor_sigma, ceiling_sigma) = building.storeys[k], np.sqrt(np.diag(building.storey_covariance[k]))
+    return {
+        "floor_m": _numbers(floor), "ceiling_m": _numbers(ceiling), "height_m": _numbers(ceiling - floor),
+        "floor_sigma_m": _numbers(floor_sigma), "ceiling_sigma_m": _numbers(ceiling_sigma), "support": _support(building, "storey", k),
+    }  # fmt: skip
+
+
+def _wall(building: Building, k: int) -> dict[str, Any]:
+    start, end = building.walls_m[k]
+    offset, thickness, angle = _sigmas(building.wall_covariance[k])
+    return {
+        "storey": int(building.wall_storeys[k]), "start": _numbers(start), "end": _numbers(end), "length_m": _numbers(np.linalg.norm(end - start)),
+        "thickness_m": _numbers(building.thickness_m[k]), "offset_sigma_m": offset, "thickness_sigma_m": thickness, "direction_sigma_rad": angle,
+        "unseen": [_numbers(row[1:]) for row in building.unseen if int(row[0]) == k], "support": _support(building, "wall", k),
+    }  # fmt: skip
+
+
+def _room(building: Building, k: int) -> dict[str, Any]:
+    rings = [(int(a), int(b)) for room, a, b in building.loops if room == k]
+    return {
+        "storey": int(building.room_storeys[k]), "polygon": _numbers(building.corners_m[slice(*rings[0])]),
+        "holes": [_numbers(building.corners_m[a:b]) for a, b in rings[1:]],
+        "walls": [building.corner_walls[a:b].tolist() for a, b in rings], "area_m2": _numbers(building.areas_m2[k]),
+        "area_sigma_m2": _numbers(np.sqrt(building.area_variance[k])), "closed": bool(building.closed[k]), "support": _support(building, "room", k),
+    }  # fmt: skip
+
+
+def _opening(building: Building, k: int) -> dict[str, Any]:
+    return {
+        "kind": OPENING_KINDS[building.opening_kinds[k]], "wall": int(building.opening_walls[k]), "rooms": building.opening_rooms[k].tolist(),
+        "span_m": _numbers(building.spans_m[k]), "width_m": _numbers(np.ptp(building.spans_m[k])),
+        "heights_m": _numbers(building.opening_heights_m[k]), "sigma_m": _sigmas(building.opening_covariance[k]),
+    }  # fmt: skip
+
+
+# What both plans draw.
+
+
+@dataclass(frozen=True)
+class Stretch:
+    """A piece of a wall between two places along it: its four corners (4, 2), the face first; `seen` False where no reading was."""
+
+    corners: F64
+    seen: bool
+
+
+def wall_pieces(building: Building, wall: Any) -> Iterator[Stretch]:
+    """Cut a wall at its openings that reach the floor and at stretches that were not seen."""
+    start, end = building.walls_m[wall]
+    length = float(np.linalg.norm(end - start))
+    gaps = [
+        span
+        for span, of, kind in zip(building.spans_m, building.opening_walls, building.opening_kinds)
+        if of == wall and OPENING_KINDS[kind] != "window"
+    ]
+    blind = [row[1:] for row in building.unseen if int(row[0]) == wall]
+    cuts = np.unique(np.clip([0.0, length, *np.ravel(gaps), *np.ravel(blind)], 0.0, length))
+    for a, b in pairwise(cuts):
+        middle = (a + b) / 2.0
+        if b - a > 1e-6 and not any(low < middle < high for low, high in gaps):
+            yield Stretch(quad(building, wall, a, b), not any(low < middle < high for low, high in blind))
+
+
+def quad(building: Building, wall: int, a: float, b: float) -> F64:
+    """Return the corners (4, 2) of a wall's stretch."""
+    start, end = building.walls_m[wall]
+    along = (end - start) / max(float(np.linalg.norm(end - start)), 1e-9)
+    back = np.array([along[1], -along[0]]) * (building.thickness_m[wall] if np.isfinite(building.thickness_m[wall]) else SHEET_M)
+    return np.array([start + a * along, start + b * along, start + b * along + back, start + a * along + back])
+
+
+def rooms_on(building: Building, storey: int) -> list[int]:
+    """Return the rooms of a storey."""
+    return [k for k in range(len(building.areas_m2)) if building.room_storeys[k] == storey]
+
+
+def open_edges(building: Building, room: int) -> Iterator[F64]:
+    """Yield the edges (2, 2) of a room that nothing bounds."""
+    for ring in building.loops[building.loops[:, 0] == room]:
+        corners, walls = building.corners_m[ring[1] : ring[2]], building.corner_walls[ring[1] : ring[2]]
+        for p, q, wall in zip(corners, np.roll(corners, -1, axis=0), walls):
+            if wall < 0:
+                yield np.array([p, q])
+
+
+def label_place(building: Building, room: int) -> F64:
+    """Return a place (2,) well inside a room, for its name."""
+    import shapely
+
+    rings = [building.corners_m[a:b] for of, a, b in building.loops if of == room]
+    polygon = shapely.make_valid(shapely.Polygon(rings[0], rings[1:]))
+    place = shapely.maximum_inscribed_circle(polygon, 0.05).coords[0] if not polygon.is_empty else rings[0].mean(axis=0)
+    return np.array(place)
+
+
+# SVG.
+
+PX = 60.0  # a metre
+STYLE = """
+text{font-family:Helvetica,Arial,sans-serif;fill:#222;text-anchor:middle}
+.room{fill:#eef3f8;stroke:none}.wall{fill:#333;stroke:#333;stroke-width:1}.unseen{fill:none;stroke:#c33;stroke-width:2;stroke-dasharray:7 5}
+.swing{fill:none;stroke:#777;stroke-width:1}.leaf{stroke:#555;stroke-width:2}.glass{fill:#fff;stroke:#38c;stroke-width:1.5}
+.name{font-size:15px;font-weight:bold}.area{font-size:13px}.length{font-size:10px;fill:#666}.note{font-size:12px;text-anchor:start}
+"""
+
+
+def floorplan_svg(building: Building) -> str:
+    """Return the plan as SVG: rooms with areas, lengths of their edges, walls, openings, a scale bar and north, the first camera's view."""
+    parts, x = [], 0.0
+    low, high = _extent(building)
+    size = high - low
+    for storey in range(max(len(building.storeys), 1)):
+        shift = np.array([x, 0.0])
+        parts += _svg_storey(
+            building, storey, lambda p, shift=shift: PX * np.stack([p[..., 0] - low[0] + shift[0] + 1.0, high[1] - p[..., 1] + 1.0], -1)
+        )
+        x += float(size[0]) + 1.5
+    width, height = PX * (max(x + 0.5, 4.0)), PX * (float(size[1]) + 3.0)
+    parts += _legend(building, height)
+    head = f'<svg xmlns="http://www.w3.org/2000/svg" width="{width:.0f}" height="{height:.0f}" viewBox="0 0 {width:.0f} {height:.0f}">'
+    return "\n".join([head, f"<style>{STYLE}</style>", '<rect width="100%" height="100%" fill="#fff"/>', *parts, "</svg>", ""])
+
+
+def _extent(building: Building) -> tuple[F64, F64]:
+    points = np.concatenate([building.corners_m, building.walls_m.reshape(-1, 2)])
+    return (points.min(axis=0), points.max(axis=0)) if len(points) else (np.zeros(2), np.array([3.0, 1.0]))
+
+
+def _svg_storey(building: Building, storey: int, at: Any) -> list[str]:
+    out = []
+    for room in rooms_on(building, storey):
+        rings = [at(building.corners_m[a:b]) for of, a, b in building.loops if of == room]
+        out.append(f'<path class="room" fill-rule="evenodd" d="{" ".join(_path(ring) for ring in rings)}"/>')
+    for wall in np.nonzero(building.wall_storeys == storey)[0]:
+        out += [f'<path class="{"wall" if piece.seen else "unseen"}" d="{_path(at(piece.corners))}"/>' for piece in wall_pieces(building, wall)]
+    for room in rooms_on(building, storey):
+        for edge in open_edges(building, room):
+            (x0, y0), (x1, y1) = at(edge)
+            out.append(f'<line class="unseen" x1="{x0:.1f}" y1="{y0:.1f}" x2="{x1:.1f}" y2="{y1:.1f}"/>')
+    for opening, wall in enumerate(building.opening_walls):
+        if building.wall_storeys[wall] == storey:
+            out += _svg_opening(building, opening, at)
+    for room in rooms_on(building, storey):
+        out += _svg_texts(building, room, at)
+    return out
+
+
+def _path(points: F64) -> str:
+    return "M" + " L".join(f"{x:.1f} {y:.1f}" for x, y in points) + " Z"
+
+
+def _svg_opening(building: Building, opening: int, at: Any) -> list[str]:
+    """Draw a window as glass, a door as a leaf with its swing, a passage as a gap. Which way a door turns is not known: a convention."""
+    kind, wall = OPENING_KINDS[building.opening_kinds[opening]], int(building.opening_walls[opening])
+    corners = at(quad(building, wall, *building.spans_m[opening]))
+    if kind == "window":
+        return [f'<path class="glass" d="{_path(corners)}"/>']
+    if kind == "passage":
+        return []
+    hinge, tip = corners[0], corners[1]
+    inward = corners[0] - corners[3]
+    inward = inward / max(float(np.linalg.norm(inward)), 1e-9)
+    width = float(np.linalg.norm(tip - hinge))
+    leaf = hinge + width * inward
+    cross = (tip - hinge)[0] * inward[1] - (tip - hinge)[1] * inward[0]
+    arc = f"M{leaf[0]:.1f} {leaf[1]:.1f} A{width:.1f} {width:.1f} 0 0 {1 if cross < 0 else 0} {tip[0]:.1f} {tip[1]:.1f}"
+    return [
+        f'<line class="leaf" x1="{hinge[0]:.1f}" y1="{hinge[1]:.1f}" x2="{leaf[0]:.1f}" y2="{leaf[1]:.1f}"/>',
+        f'<path class="swing" d="{arc}"/>',
+    ]  # fmt: skip
+
+
+def _svg_texts(building: Building, room: int, at: Any) -> list[str]:
+    x, y = at(label_place(building, room))
+    sigma = float(np.sqrt(building.area_variance[room]))
+    out = [
+        f'<text class="name" x="{x:.1f}" y="{y:.1f}">room {room}</text>',
+        f'<text class="area" x="{x:.1f}" y="{y + 17.0:.1f}">{building.areas_m2[room]:.2f} ± {sigma:.2f} m²</text>',
+    ]
+    for of, a, b in building.loops:
+        corners = building.corners_m[a:b]
+        for p, q in zip(corners, np.roll(corners, -1, axis=0)) if of == room else ():
+            length = float(np.linalg.norm(q - p))
+            if length < 0.8:
+                continue
+            along = (q - p) / length
+            place = at((p + q) / 2.0 + 0.16 * np.array([-along[1], along[0]]))
+            angle = (-float(np.degrees(np.arctan2(along[1], along[0]))) + 90.0) % 180.0 - 90.0
+            turn = f"rotate({angle:.1f} {place[0]:.1f} {place[1]:.1f})"
+            out.append(f'<text class="length" x="{place[0]:.1f}" y="{place[1] + 3.5:.1f}" transform="{turn}">{length:.2f}</text>')
+    return out
+
+
+def _legend(building: Building, height: float) -> list[str]:
+    """Draw scale bar, north, heights and the note."""
+    y = height - 0.7 * PX
+    out = [f'<path d="M{PX:.0f} {y:.0f} h{2 * PX:.0f} m0 -5 v10 M{PX:.0f} {y - 5:.0f} v10 M{2 * PX:.0f} {y - 4:.0f} v8" fill="none" stroke="#222"/>']
+    out += [f'<text class="length" x="{(1 + k) * PX:.0f}" y="{y + 18:.0f}">{k} m</text>' for k in range(3)]
+    x = 3.6 * PX
+    out.append(f'<path d="M{x:.0f} {y + 8:.0f} v-30 m-6 10 l6 -12 l6 12" fill="none" stroke="#222"/>')
+    out.append(f'<text class="length" x="{x:.0f}" y="{y + 22:.0f}">N: first view</text>')
+    said = [f"storey {k}: floor {_height(low)}, ceiling {_height(high)}" for k, (low, high) in enumerate(building.storeys)]
+    lines = [*said, *([building.note] if building.note else []), "dashed: not seen"]
+    out += [f'<text class="note" x="{4.3 * PX:.0f}" y="{y - 14 + 15 * k:.0f}">{escape(line)}</text>' for k, line in enumerate(lines)]
+    return out
+
+
+def _height(value: float) -> str:
+    return f"{value:.2f} m" if np.isfinite(value) else "not seen"
+
+
+# DXF.
+
+LAYERS = {"ROOMS": 8, "WALLS": 7, "UNSEEN": 1, "DOORS": 3, "WINDOWS": 5, "TEXT": 2}  # name -> AutoCAD colour
+
+
+def write_dxf(path: Path, building: Building) -> None:
+    """Write the plan as DXF R2010 in metres, with a layer for each of LAYERS."""
+    import ezdxf
+    from ezdxf import units
+
+    document = ezdxf.new("R2010", setup=["linetypes"])
+    document.units = units.M
+    for name, color in LAYERS.items():
+        document.layers.add(name, color=color, linetype="DASHED" if name == "UNSEEN" else "CONTINUOUS")
+    space, low_high = document.modelspace(), _extent(building)
+    pitch = float(low_high[1][0] - low_high[0][0]) + 1.5
+    for storey in range(len(building.storeys)):
+        shift = np.array([storey * pitch, 0.0])
+        for room in rooms_on(building, storey):
+            for of, a, b in building.loops:
+                if of == room:
+                    space.add_lwpolyline((building.corners_m[a:b] + shift).tolist(), close=True, dxfattribs={"layer": "ROOMS"})
+            for p, q in open_edges(building, room):
+                space.add_line((p + shift).tolist(), (q + shift).tolist(), dxfattribs={"layer": "UNSEEN"})
+            text = f"room {room}: {building.areas_m2[room]:.2f} m2"
+            space.add_text(text, height=0.15, dxfattribs={"layer": "TEXT"}).set_placement((label_place(building, room) + shift).tolist())
+        for wall in np.nonzero(building.wall_storeys == storey)[0]:
+            for piece in wall_pieces(building, wall):
+                layer = "WALLS" if piece.seen else "UNSEEN"
+                space.add_lwpolyline((piece.corners + shift).tolist(), close=True, dxfattribs={"layer": layer})
+        for opening, wall in enumerate(building.opening_walls):
+            if building.wall_storeys[wall] == storey:
+                layer = "WINDOWS" if OPENING_KINDS[building.opening_kinds[opening]] == "window" else "DOORS"
+                corners = quad(building, int(wall), *building.spans_m[opening]) + shift
+                space.add_lwpolyline(corners.tolist(), close=True, dxfattribs={"layer": layer})
+    document.saveas(path)

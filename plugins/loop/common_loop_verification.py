@@ -1,0 +1,257 @@
+"""Loop closing by verified candidates: keyframes within the expected drift, geometric verification, and the correction that follows.
+
+The plugins differ in how they rank candidates; `close_loop` does the rest, and aligns the map with its Manhattan frame from time to time.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from typing import Annotated
+
+import numpy as np
+
+from trihedron.pipeline.core.geometry import invert, log_se3, pose_matrix, transform, umeyama
+from trihedron.pipeline.core.options import NonNegativeInt, PositiveFloat, PositiveInt, Range, Share
+from trihedron.pipeline.core.types import F64, I32, Bool, Camera, Correction, Frame, Keypoints, Map, Matches
+from trihedron.plugins.loop.common_manhattan_prior import align_with_manhattan, correct_loop, estimate_manhattan_prior
+from trihedron.plugins.mapping.covisibility_graph import LocalWindow, current_submap, keyframes_of, observed_by
+from trihedron.plugins.mapping.data_association import PredictedPose, SearchOptions, search_map
+from trihedron.plugins.mapping.keyframe_features import features_of
+from trihedron.plugins.places.verification import free_space_violation, solve_pose_in_map
+from trihedron.plugins.shared.feature_matching import associate_planes, match_near
+from trihedron.plugins.shared.feature_matching_kernels import overlap
+from trihedron.plugins.shared.pose_optimizer import LANDMARK_SCORE, PoseSolution
+
+CHI2_6 = 22.46  # 99.9 % of six degrees of freedom
+SEARCH = SearchOptions(octave_step=3, relations=0)
+Candidates = Iterable[tuple[int, float]]  # keyframes, the likeliest first, and the length of the path since
+
+
+@dataclass(frozen=True)
+class LoopOptions:
+    """Options of loop closing, whatever ranks the candidates."""
+
+    every: PositiveInt = 2  # keyframes between two looks
+    away_m: PositiveFloat = 6.0  # walked since a place was left, before it can be come back to
+    view_m: PositiveFloat = 2.0  # between keyframes that show the same, besides the drift
+    view_deg: Annotated[float, Range(above=0, high=90)] = 45.0
+    drift_share: PositiveFloat = 0.01  # of the way walked: standard deviation of the position, and per root metre of the pose graph
+    floor_m: PositiveFloat = 0.02  # added to it
+    rotation_sigma_deg: PositiveFloat = 0.3  # of a keyframe; the Manhattan frame keeps it from growing
+    rotation_drift_deg: PositiveFloat = 0.05  # per root metre of the pose graph
+    straighten: NonNegativeInt = 16  # keyframes between two alignments of the map with its Manhattan frame, doubled when the map doubles; 0 = never
+    straighten_deg: PositiveFloat = 0.05  # least rotation of the newest keyframe that is worth it
+    candidates: PositiveInt = 5  # verified in one call, at most
+    shared: PositiveInt = 30  # points and lines already shared with a place, from which on no loop is open there
+    min_score: PositiveInt = 60  # points + 2 lines + 5 planes that must agree
+    min_share: Share = 0.5  # of the matches that must agree
+    max_through: Share = 0.15  # of the place's surfaces in view that the camera may see through
+
+    def sigma_m(self, path_m: float | F64) -> float | F64:
+        """Return the standard deviation of the position after a path of this length."""
+        return self.floor_m + self.drift_share * path_m
+
+
+def close_loop(options: LoopOptions, rank: Callable[[Map], Candidates], map: Map, frame: Frame) -> Correction | None:
+    """Correct the map if the newest keyframe closes a loop, or if the map has rotated out of its Manhattan frame; None otherwise."""
+    keyframes, newest = map.keyframes, len(map.keyframes) - 1
+    if newest < 0 or keyframes.row("index", newest) != frame.index or not keyframes.row("alive", newest):
+        return None
+    correction = _first_verified(options, map, frame, rank(map)) if newest % options.every == 0 else None
+    if correction is not None or not options.straighten:
+        return correction
+    count = len(map.keyframes)
+    if count % (options.straighten << (count // (16 * options.straighten)).bit_length()):
+        return None
+    return align_with_manhattan(map, options.drift_share, np.radians(options.rotation_drift_deg), np.radians(options.straighten_deg))
+
+
+def _first_verified(options: LoopOptions, map: Map, frame: Frame, candidates: Candidates) -> Correction | None:
+    """The correction by the first candidate that is verified."""
+    examined: set[int] = set()
+    tried = 0
+    for keyframe, path_m in candidates:
+        if keyframe in examined:
+            continue
+        if tried == options.candidates:
+            break
+        tried += 1
+        place = place_of(options, map, keyframe, path_m)
+        examined |= set(place.window.keyframes.tolist())
+        found = _verify(options, map, frame, place) if place.found < options.shared else None
+        if found is not None:
+            drift = options.drift_share, np.radians(options.rotation_drift_deg)
+            prior = estimate_manhattan_prior(map) if options.straighten else None
+            return correct_loop(map, keyframe, found.T_world_camera, found.covariance, *drift, prior)
+    return None
+
+
+def _verify(options: LoopOptions, map: Map, frame: Frame, place: Place) -> PoseSolution | None:
+    """Pose of the newest keyframe by the landmarks of a place, or None when the loop is not accepted."""
+    newest = len(map.keyframes) - 1
+    T = T_before = map.keyframes.row("T_world_camera", newest)
+    sigma_m, sigma_rad = options.sigma_m(place.path_m), 2.0 * np.radians(options.rotation_sigma_deg)
+    expected = np.diag(np.repeat([sigma_m**2, sigma_rad**2], 3))
+    window = _seen_alone(map, newest, place.window)
+    features = features_of(map, frame.camera, T_before, window)
+    T = _initial_pose(map, frame.camera, place, window, features[0], T, expected)
+    information = np.asarray(np.linalg.inv(expected), np.float64)
+    for radius_m in (0.03, 0.01):
+        matches = search_map(SEARCH, frame.camera, PredictedPose(T, radius_m, 0.3 * radius_m, True), *features, map, place.window)
+        found = solve_pose_in_map(T, T_before, information, map, matches, frame.camera, *features)
+        T = found.T_world_camera
+    if not accept_loop(options, found, matches, expected, T_before) or free_space_violation(T, frame, map, place.window) > options.max_through:
+        return None
+    return found
+
+
+def accept_loop(options: LoopOptions, found: PoseSolution, matches: Matches, expected: F64, T_before: F64) -> bool:
+    """Return True if enough agrees, all directions are observable, and the drift is plausible by its `expected` covariance (6, 6)."""
+    inliers = np.count_nonzero(found.points), np.count_nonzero(found.lines), np.count_nonzero(found.planes)
+    matched = len(matches.keypoints), len(matches.segments), len(matches.planes)
+    xi = log_se3(invert(T_before) @ found.T_world_camera)
+    plausible = xi @ np.linalg.solve(expected + found.covariance, xi) < CHI2_6
+    score, most = np.dot(inliers, LANDMARK_SCORE), np.dot(matched, LANDMARK_SCORE)
+    enough = score >= options.min_score and score >= options.min_share * most
+    return bool(plausible and enough and not found.unobservable.shape[1])
+
+
+# Candidates: earlier keyframes within reach of the drift since.
+
+
+@dataclass(frozen=True)
+class Place:
+    """A keyframe of long ago, the window of those with about its view and the landmarks that only they observed, the length of the path since, and
+    the number of points and lines of the place that the newest keyframe observed already."""
+
+    window: LocalWindow
+    path_m: float
+    found: int
+
+
+def path_lengths(map: Map) -> tuple[I32, F64]:
+    """Return the living keyframes of the tracked sub-map and the length of the path from each to the newest, metres."""
+    rows = keyframes_of(map, current_submap(map))
+    positions = map.keyframes.rows("T_world_camera", rows)[:, :3, 3]
+    steps = np.linalg.norm(np.diff(positions, axis=0), axis=1)
+    return rows, np.concatenate([np.cumsum(steps[::-1])[::-1], [0.0]])
+
+
+def within_reach(options: LoopOptions, map: Map, most: int) -> tuple[I32, F64]:
+    """Return up to `most` keyframes that the newest one may have come back to, nearest first, and the length of the path since."""
+    rows, path_m = path_lengths(map)
+    poses = map.keyframes.rows("T_world_camera", rows)
+    distance = np.linalg.norm(poses[:, :3, 3] - poses[-1, :3, 3], axis=1)
+    cosine = poses[:, :3, 2] @ poses[-1, :3, 2]
+    reach = options.view_m + 3.0 * options.sigma_m(path_m)
+    chosen = np.flatnonzero((path_m > options.away_m) & (distance < reach) & (cosine > np.cos(np.radians(options.view_deg))))
+    chosen = chosen[np.argsort(distance[chosen] / options.view_m + 1.0 - cosine[chosen], kind="stable")][:most]
+    return rows[chosen], path_m[chosen]
+
+
+def place_of(options: LoopOptions, map: Map, keyframe: int, path_m: float) -> Place:
+    """Return the place around a keyframe."""
+    rows, way = path_lengths(map)
+    poses = map.keyframes.rows("T_world_camera", rows)
+    own = poses[np.searchsorted(rows, keyframe)]
+    near = np.linalg.norm(poses[:, :3, 3] - own[:3, 3], axis=1) < options.view_m
+    near &= (poses[:, :3, 2] @ own[:3, 2] > np.cos(np.radians(options.view_deg))) & (way > 0.5 * options.away_m)
+    recent = rows[way <= 0.5 * options.away_m]
+    there = {kind: observed_by(map, rows[near], kind) for kind in ("point", "line", "plane")}
+    ids = [np.setdiff1d(there[kind], observed_by(map, recent, kind)).astype(np.int32) for kind in there]
+    found = sum(int(np.isin(observed_by(map, rows[-1:], kind), there[kind]).sum()) for kind in ("point", "line"))
+    return Place(LocalWindow(rows[near], *ids), path_m, found)
+
+
+def _seen_alone(map: Map, keyframe: int, place: LocalWindow) -> LocalWindow:
+    """Window of a keyframe with its landmarks that are not in the place's."""
+    row = np.array([keyframe], np.int32)
+    there = {"point": place.points, "line": place.lines, "plane": place.planes}
+    return LocalWindow(row, *(np.setdiff1d(observed_by(map, row, kind), ids).astype(np.int32) for kind, ids in there.items()))
+
+
+# Initial poses: the drift is mostly a displacement, on which similar points, or the layout of planes, agree. The rotation hardly drifts, so the
+# refinement that follows finds it.
+
+MAX_BITS, MAX_L2, RATIO = 60, 200, 0.85  # between descriptors of two views, and best to second best (ORB-SLAM2: 50 to 100 bits)
+LAYOUT_DEG, LAYOUT_M = 10.0, 0.05  # between the normals of planes that may be one; between their offsets, displaced
+SCALES_M = (0.1, 0.3, 0.9, 3.0)  # between their offsets before
+EXTENT_M = 0.5  # within which a sample of one plane has one of the other where both extend
+ROUNDS, MIN_POINTS = 3, 6  # of a refinement; points
+
+
+def _initial_pose(map: Map, camera: Camera, place: Place, window: LocalWindow, keypoints: Keypoints, T: F64, expected: F64) -> F64:
+    """Of the pose without drift, the one where the planes lie on those of the place, and the one where similar points agree, that with most agreeing
+    points."""
+    sigma_m, sigma_rad = np.sqrt(expected[0, 0]), np.sqrt(expected[3, 3])
+    pairs = _match_points(map, camera, T, keypoints, place.window.points, sigma_m, sigma_rad)
+    points, there = keypoints.points_m[pairs[:, 0]].astype(np.float64), map.points.rows("position_m", pairs[:, 1])
+    sigma = 0.01 + keypoints.sigma_m[pairs[:, 0]].astype(np.float64) + sigma_rad * points[:, 2]
+    by_planes = displacement_of_planes(map, window.planes, place.window.planes, sigma_m)[0]
+    starts = [T, pose_matrix(T[:3, :3], T[:3, 3] + by_planes), _motion_of_points(transform(T, points), there, sigma) @ T]
+    agreeing = [np.count_nonzero(np.linalg.norm(transform(start, points) - there, axis=1) < 3.0 * sigma) for start in starts]
+    return starts[int(np.argmax(agreeing))]
+
+
+def _match_points(map: Map, camera: Camera, T_world_camera: F64, keypoints: Keypoints, ids: I32, sigma_m: float, sigma_rad: float) -> I32:
+    """Pairs (row of the keyframe's points, id among `ids`), (n, 2), with similar descriptors within three standard deviations of the projection."""
+    local = transform(invert(T_world_camera), map.points.rows("position_m", ids))
+    ids, local = ids[local[:, 2] > 0.1], local[local[:, 2] > 0.1]
+    depth = np.maximum(keypoints.points_m[:, 2].astype(np.float64), 0.5)
+    radius = 3.0 * camera.fx * (sigma_m / depth + sigma_rad)
+    found = match_near(
+        keypoints.pixels, keypoints.descriptors, keypoints.octaves,
+        camera.project(local).astype(np.float32), map.points.rows("descriptor", ids), map.points.rows("octave", ids),
+        radius.astype(np.float32), 3, MAX_L2 if keypoints.metric == "l2" else MAX_BITS, RATIO, keypoints.metric,
+    )  # fmt: skip
+    rows = np.flatnonzero(found >= 0)
+    return np.stack([rows, ids[found[rows]]], axis=1).astype(np.int32)
+
+
+def _motion_of_points(here: F64, there: F64, sigma_m: F64) -> F64:
+    """Motion T (4, 4) with `there ≈ T here` for most of the pairs of points (n, 3) with errors `sigma_m` (n,): the displacement that most pairs
+    share, refined to a motion. The identity where fewer than MIN_POINTS agree."""
+    T = np.eye(4)
+    if len(here) < MIN_POINTS:
+        return T
+    shift = there - here
+    near = np.linalg.norm(shift[:, None] - shift[None], axis=2) < 3.0 * np.hypot(sigma_m[:, None], sigma_m[None])
+    chosen = near[np.argmax(near.sum(axis=1))]
+    for _ in range(ROUNDS):
+        if np.count_nonzero(chosen) < MIN_POINTS:
+            return np.eye(4)
+        T = umeyama(here[chosen], there[chosen])
+        chosen = np.linalg.norm(there - transform(T, here), axis=1) < 3.0 * sigma_m
+    return T
+
+
+def displacement_of_planes(map: Map, here: I32, there: I32, sigma_m: float) -> tuple[F64, float]:
+    """Return the displacement (3,) of the planes `here` onto those `there`, as far as they observe it, and the agreeing extent (in planes).
+
+    Planes with the same normal are paired when their offsets differ by little, then by more, up to three standard deviations; the displacement with
+    the largest agreeing extent is taken, the smaller one of two that are similar."""
+    planes = [map.planes.rows("coefficients", ids) for ids in (here, there)]
+    samples = [map.planes.rows("samples_m", ids) for ids in (here, there)]
+    best, agreed = np.zeros(3), 0.0
+    for reach_m in sorted({min(reach, 3.0 * sigma_m) for reach in SCALES_M}):
+        pairs = associate_planes(planes[0], samples[0], planes[1], samples[1], LAYOUT_DEG, reach_m, True)
+        n, offset = planes[0][pairs[:, 0], :3], planes[0][pairs[:, 0], 3] - planes[1][pairs[:, 1], 3]
+        shift, inliers = _solve_displacement(n, offset, sigma_m)
+        score = float(sum(overlap(samples[0][a] + shift.astype(np.float32), samples[1][b], EXTENT_M) for a, b in pairs[inliers]))
+        if score > 1.1 * agreed:
+            best, agreed = shift, score
+    return best, agreed
+
+
+def _solve_displacement(n: F64, offset: F64, sigma_m: float) -> tuple[F64, Bool]:
+    """Least squares of `n · shift = offset` (k, 3), (k,) with a prior, without outliers; the shift and the inliers."""
+    shift, inliers = np.zeros(3), np.ones(len(n), np.bool_)
+    for _ in range(len(n)):
+        A = n[inliers].T @ n[inliers] / LAYOUT_M**2 + np.eye(3) / max(sigma_m, 1e-3) ** 2
+        shift = np.asarray(np.linalg.solve(A, n[inliers].T @ offset[inliers] / LAYOUT_M**2), np.float64)
+        error = np.where(inliers, np.abs(n @ shift - offset), 0.0)
+        if error.max() < LAYOUT_M:
+            break
+        inliers[np.argmax(error)] = False
+    return shift, inliers

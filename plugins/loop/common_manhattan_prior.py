@@ -1,0 +1,128 @@
+"""The Manhattan prior of a whole map, and the corrections that use it: pose graphs of loops, and alignment of the map with its axes.
+
+Every keyframe is tied to those just before it, so a map drifts; directions repeat all through a building. Every plane and line of the map counts
+once, at the middle one of its observers, so that a wall off the axes errs once and not with each view.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from trihedron.pipeline.core.geometry import exp_so3, invert, pose_matrix
+from trihedron.pipeline.core.types import F64, I32, Correction, Map, Table
+from trihedron.plugins.loop.common_manhattan_prior_kernels import keyframe_rotations
+from trihedron.plugins.loop.common_pose_graph import Edges, correct_keyframes, joined, odometry_edges, solve_pose_graph
+from trihedron.plugins.mapping.covisibility_graph import current_submap, keyframes_of
+from trihedron.plugins.shared.linalg import inverse
+from trihedron.plugins.shared.manhattan_frames_kernels import Walls, area_on_axes, known_walls, measured_directions, perpendicular_pair, settled
+
+UNKNOWN = 1e-6  # 1/m², information of the position of a direction: none
+PLAUSIBLE = 3.0  # standard deviations of the drift that the prior may correct; beyond, the directions are those of another wing
+WALLS = 60  # planes, those observed most often, from which the axes are estimated
+MAX_COS, LARGEST_COS = 0.05, 0.2  # of two walls at right angles, see `perpendicular_pair`
+WALL_SIGMA, EDGE_SIGMA = np.radians(0.3), np.radians(0.5)  # of walls and edges about the axes: no building is exactly Manhattan
+REACH = np.radians(2.0)  # within which a direction belongs to an axis
+GATE = 2.0  # σ at which a robust weight is one half
+EXPLAINED = 0.5  # share of the walls (by views) that must stand on the axes
+NO_MEANS = np.zeros((0, 3))
+
+
+@dataclass(frozen=True)
+class ManhattanPrior:
+    """`R_world_manhattan` (3, 3), the keyframes' rows (k,) and, for each, phi of `R_world_camera · Exp(phi)` that agrees best with the axes (k, 3)
+    and its information (k, 3, 3), zero about directions that the keyframe's landmarks do not observe."""
+
+    R_world_manhattan: F64
+    keyframes: I32
+    rotations: F64
+    information: F64
+
+
+def estimate_manhattan_prior(map: Map) -> ManhattanPrior | None:
+    """Estimate the prior from the directions in the tracked sub-map; None where no two axes have walls, or most walls are on none."""
+    rows = keyframes_of(map, current_submap(map))
+    planes, at_plane = _middle_observers(map.planes, rows)
+    lines, at_line = _middle_observers(map.lines, rows)
+    coefficients, covariance = map.planes.rows("coefficients", planes), map.planes.rows("covariance", planes)
+    R = _axes(coefficients, covariance, map.planes.rows("found", planes))
+    if R is None:
+        return None
+    ends, end_covariance = map.lines.rows("endpoints_m", lines), inverse(map.lines.rows("information", lines))
+    vectors, information = measured_directions(
+        coefficients, covariance, WALL_SIGMA, ends.astype(np.float32), end_covariance.astype(np.float32), EDGE_SIGMA, NO_MEANS, NO_MEANS[:, 0]
+    )
+    poses = map.keyframes.rows("T_world_camera", rows)
+    observers = np.concatenate([at_plane, at_line])
+    return ManhattanPrior(R, rows, *keyframe_rotations(vectors, information, observers, R, poses, np.cos(REACH), GATE))
+
+
+def _middle_observers(landmarks: Table, keyframes: I32) -> tuple[I32, I32]:
+    """Living landmarks that the keyframes (sorted) observed, and the index of the middle observer of each."""
+    ids = np.flatnonzero(landmarks.column("alive")).astype(np.int32)
+    observers = np.sort(landmarks.rows("observers", ids), axis=1)
+    count = (observers >= 0).sum(axis=1)
+    middle = observers[np.arange(len(ids)), np.minimum(observers.shape[1] - count + count // 2, observers.shape[1] - 1)]
+    place = np.minimum(np.searchsorted(keyframes, middle), len(keyframes) - 1)
+    known = (count > 0) & (keyframes[place] == middle) if len(keyframes) else np.zeros(len(ids), np.bool_)
+    return ids[known], place[known].astype(np.int32)
+
+
+def _axes(planes: F64, covariance: F64, views: I32) -> F64 | None:
+    """R_world_manhattan on most views of the walls (n, 4), or None."""
+    most = np.argsort(-views, kind="stable")[:WALLS]
+    walls: Walls = known_walls(planes[most], covariance[most], views[most], WALL_SIGMA)
+    found, R = perpendicular_pair(walls, MAX_COS, LARGEST_COS, REACH, np.eye(3), 1.0)
+    if not found:
+        return None
+    on_axes = area_on_axes(walls, R, REACH)
+    if np.count_nonzero(on_axes) < 2 or on_axes.sum() < EXPLAINED * walls.area.sum():
+        return None
+    on_walls: F64 = settled(walls, R, REACH, GATE, 0.0, 3)[0]
+    return on_walls
+
+
+# Corrections.
+
+
+def correct_loop(
+    map: Map, keyframe: int, T_world_camera: F64, covariance: F64, drift: float, rotation_drift: float, prior: ManhattanPrior | None
+) -> Correction:
+    """Correct the tracked sub-map by a verified loop: the newest keyframe's pose (4, 4), and covariance (6, 6) of xi, relative to `keyframe`."""
+    rows = keyframes_of(map, current_submap(map))
+    before = map.keyframes.rows("T_world_camera", rows)
+    place, newest = np.searchsorted(rows, [keyframe, len(map.keyframes) - 1])
+    information = np.asarray(np.linalg.inv(covariance), np.float64)[None]
+    closing = Edges(np.array([[place, newest]], np.int32), (invert(before[place]) @ T_world_camera)[None], information)
+    edges = joined(odometry_edges(map, rows, before, drift, rotation_drift), closing)
+    return correct_keyframes(map, rows, before, _solve_with_prior(before, edges, prior))
+
+
+def align_with_manhattan(map: Map, drift: float, rotation_drift: float, least: float) -> Correction | None:
+    """Rotate every keyframe back to the Manhattan frame of the map; None without one, where the newest would rotate by less than `least` (rad), or
+    some keyframe by more than its plausible drift."""
+    prior = estimate_manhattan_prior(map)
+    if prior is None:
+        return None
+    before = map.keyframes.rows("T_world_camera", prior.keyframes)
+    after = _solve_with_prior(before, odometry_edges(map, prior.keyframes, before, drift, rotation_drift), prior)
+    cosine = 0.5 * (np.einsum("kij,kij->k", before[:, :3, :3], after[:, :3, :3]) - 1.0)
+    angle = np.arccos(np.clip(cosine, -1.0, 1.0))
+    path_m = np.linalg.norm(np.diff(before[:, :3, 3], axis=0), axis=1).sum()
+    if angle[-1] < least or angle.max() > PLAUSIBLE * rotation_drift * np.sqrt(path_m):
+        return None
+    return correct_keyframes(map, prior.keyframes, before, after)
+
+
+def _solve_with_prior(before: F64, edges: Edges, prior: ManhattanPrior | None) -> F64:
+    """Poses of the keyframes by a pose graph, in which the Manhattan frame is one more node, whose direction every keyframe measures."""
+    if prior is None:
+        return solve_pose_graph(before, edges)
+    count, axes = len(before), pose_matrix(prior.R_world_manhattan, np.zeros(3))
+    measured = invert(axes) @ before
+    measured[:, :3, :3] = measured[:, :3, :3] @ np.array([exp_so3(phi) for phi in prior.rotations])
+    information = np.zeros((count, 6, 6))
+    information[:, :3, :3], information[:, 3:, 3:] = UNKNOWN * np.eye(3), prior.information
+    pairs = np.stack([np.full(count, count), np.arange(count)], axis=1).astype(np.int32)
+    return solve_pose_graph(np.concatenate([before, axes[None]]), joined(edges, Edges(pairs, measured, information)))[:count]

@@ -1,0 +1,97 @@
+"""The Manhattan prior: a corridor whose map has drifted in rotation, aligned by the directions of its walls."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from trihedron.pipeline.core.geometry import exp_so3, log_so3, pose_matrix, transform_planes
+from trihedron.pipeline.core.types import Camera, Frame, Pose
+from trihedron.plugins.loop.appearance import AppearanceLoop
+from trihedron.plugins.loop.common_manhattan_prior import estimate_manhattan_prior
+from trihedron.plugins.loop.planes import PlanesLoop
+from trihedron.plugins.mapping import plane_fusion
+from trihedron.plugins.mapping.correction import apply_correction
+from trihedron.plugins.mapping.insertion import add_keyframe
+from trihedron.plugins.mapping.landmarks import OBSERVERS, empty_map
+
+CAMERA = Camera(640, 480, 525.0, 520.0, 319.5, 239.5)
+KEYFRAMES, STEP_M = 64, 0.5
+AXES = exp_so3(np.array([0.3, -0.4, 0.1]))  # R_world_manhattan
+DRIFT = np.radians([0.1, 0.7, -0.2])  # at the end of the walk
+
+
+def corridor(drift, axes=(0, 1, 2), turned=0.0, wall_deg=0.1):
+    """A map of keyframes along a corridor whose rotations drift, each with three new walls that are true to `wall_deg`; those of the second half
+    stand on axes `turned` (rad) from the others. Returns the map and the rotations as they should be."""
+    rng, map = np.random.default_rng(0), empty_map(0, 0, 32, 32, 4)
+    covariance = np.tile(np.diag([1e-7, 1e-7, 1e-6]), (3, 1, 1))
+    look, wing = exp_so3(np.array([0.0, 0.3, 0.0])), AXES @ exp_so3(np.array([turned, 0.0, 0.0]))
+    for i in range(KEYFRAMES):
+        T = pose_matrix(exp_so3(drift * i / (KEYFRAMES - 1)) @ look if i else look, np.array([0.0, 0.0, STEP_M * i]))
+        pose = Pose(i, i * 33_000_000, T, np.eye(6) * 1e-8, T, -1, np.zeros(3, np.int32), 0, "ok", "")
+        map, row = add_keyframe(map, pose, CAMERA)
+        normals = (AXES if i < KEYFRAMES / 2 else wing)[:, list(axes)].T
+        normals = np.array([exp_so3(np.radians(wall_deg) * rng.normal(size=3)) @ n for n in normals])
+        normals *= np.where(normals @ np.array([0.0, 0.0, 1.0]) > 0.0, -1.0, 1.0)[:, None]
+        local = np.concatenate([normals @ look, np.full((3, 1), 2.0)], axis=1)  # as the camera sees them where it truly is
+        table, _ = map.planes.appended(
+            coefficients=transform_planes(T, local),
+            covariance=covariance,
+            moments=plane_fusion.move_moments(T, plane_fusion.equivalent_moments(local, covariance)),
+            samples_m=np.zeros((3, 4, 3), np.float32),
+            first=np.full(3, row),
+            observers=np.tile(np.r_[row, np.full(OBSERVERS - 1, -1)], (3, 1)),
+            found=np.ones(3, np.int32),
+            visible=np.ones(3, np.int32),
+            alive=np.ones(3, np.bool_),
+        )
+        map = dataclasses.replace(map, planes=table, index=i, stamp_ns=i * 33_000_000)
+    return map, look
+
+
+def frame():
+    depth = np.zeros((CAMERA.height, CAMERA.width), np.float32)
+    return Frame(KEYFRAMES - 1, (KEYFRAMES - 1) * 33_000_000, np.zeros((*depth.shape, 3), np.uint8), depth, CAMERA)
+
+
+def errors_deg(rotations, truth):
+    return np.degrees([np.linalg.norm(log_so3(R @ truth.T)) for R in rotations])
+
+
+def test_the_prior_rotations_are_the_drift():
+    map, truth = corridor(DRIFT)
+    prior = estimate_manhattan_prior(map)
+    turned = np.array([log_so3(R @ exp_so3(phi) @ truth.T) for R, phi in zip(map.keyframes.column("T_world_camera")[:, :3, :3], prior.rotations)])
+    common = turned.mean(axis=0)  # the axes themselves are found in the middle of the drift
+    assert np.degrees(np.linalg.norm(turned - common, axis=1).max()) < 0.5 and np.degrees(np.linalg.norm(common)) < 0.6
+    sigma = np.degrees(1.0 / np.sqrt(np.linalg.eigvalsh(prior.information)))
+    assert sigma.min() > 0.15 and sigma.max() < 0.5  # three walls, true to 0.3° by assumption
+
+
+@pytest.mark.parametrize("loop", [PlanesLoop(), AppearanceLoop()])
+def test_a_drifted_map_is_aligned_with_its_manhattan_frame(loop):
+    map, truth = corridor(DRIFT)
+    correction = loop(map, frame())
+    moved = apply_correction(map, correction)
+    before, after = (errors_deg(m.keyframes.column("T_world_camera")[:, :3, :3], truth) for m in (map, moved))
+    print(f"rotation off by {before.max():.3f}° at most, {after.max():.3f}° when straight")
+    assert before.max() > 0.7 and after.max() < before.max() / 3.0
+    np.testing.assert_array_equal(moved.keyframes.column("T_world_camera")[0], map.keyframes.column("T_world_camera")[0])
+    normals = moved.planes.column("coefficients")[:, :3]
+    assert np.degrees(np.arccos(np.abs(normals @ AXES).max(axis=1))).max() < 0.6  # walls turned with their keyframes
+    np.testing.assert_array_equal(loop(map, frame()).T_world_keyframe, correction.T_world_keyframe)
+
+
+def test_no_alignment_without_need():
+    assert PlanesLoop()(corridor(np.zeros(3))[0], frame()) is None  # it is straight
+    map, _ = corridor(DRIFT)
+    assert PlanesLoop(straighten=0)(map, frame()) is None
+    assert PlanesLoop(straighten=48)(map, frame()) is None  # keyframe 64 is none of its
+
+
+def test_no_alignment_without_a_manhattan_frame():
+    assert estimate_manhattan_prior(corridor(DRIFT, axes=(0, 0, 0))[0]) is None  # one direction alone
+    assert estimate_manhattan_prior(corridor(DRIFT, wall_deg=20.0)[0]) is None  # walls every way
+    assert PlanesLoop()(corridor(np.zeros(3), turned=np.radians(10.0))[0], frame()) is None  # the second half is another wing
+    assert PlanesLoop()(corridor(np.zeros(3), turned=np.radians(3.0))[0], frame()) is None

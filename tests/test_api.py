@@ -1,0 +1,265 @@
+"""The Python API: the example of the README, pushed frames against a folder, arguments that do not fit, one stage alone."""
+
+import subprocess
+import sys
+
+import cv2
+import numpy as np
+import pytest
+
+import trihedron as th
+from trihedron.datasets.simulation.synthetic import Synthetic
+from trihedron.pipeline.record import reader
+
+LENGTH = 24
+SMALL = {"width": 160, "height": 120}
+CAMERA_FILE = "width: 160\nheight: 120\nfx: 131.25\nfy: 131.25\ncx: 79.5\ncy: 59.5\ndepth_scale: 5000\n"
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """The built-in room as a folder of images with a camera file, as `dataset=folder` reads it."""
+    path = tmp_path_factory.mktemp("room")
+    (path / "camera.yaml").write_text(CAMERA_FILE)
+    for name in ("rgb", "depth"):
+        (path / name).mkdir()
+    room = Synthetic(length=LENGTH, **SMALL)
+    for i in range(LENGTH):
+        frame = room(i)
+        name = f"{1305031102 + frame.stamp_ns / 1e9:.6f}.png"
+        cv2.imwrite(str(path / "rgb" / name), cv2.cvtColor(frame.color, cv2.COLOR_RGB2BGR))
+        cv2.imwrite(str(path / "depth" / name), np.rint(frame.depth_m * 5000).astype(np.uint16))
+    return path
+
+
+def images(path):
+    """What a camera loop has: RGB, 16-bit depth, seconds."""
+    for file in sorted((path / "rgb").iterdir()):
+        rgb = cv2.cvtColor(cv2.imread(str(file)), cv2.COLOR_BGR2RGB)
+        yield rgb, cv2.imread(str(path / "depth" / file.name), cv2.IMREAD_UNCHANGED), float(file.stem)
+
+
+@pytest.fixture(scope="module")
+def camera(folder):
+    return th.Camera.from_yaml(folder / "camera.yaml")
+
+
+@pytest.fixture(scope="module")
+def slam(camera):
+    with th.Slam(camera, "planes=connected_components", manhattan="mean_shift", outputs=["trajectory"]) as made:
+        yield made
+
+
+def test_importing_the_package_imports_nothing_else():
+    program = (
+        "import time; t = time.perf_counter(); import trihedron, sys; print(time.perf_counter() - t, 'numpy' in sys.modules, trihedron.__version__)"
+    )
+    seconds, numpy_imported, version = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True).stdout.split()
+    assert float(seconds) < 0.3 and numpy_imported == "False"
+    assert version == "0.1.0"
+
+
+def test_all_public_names_exist():
+    for name in th.__all__:
+        assert getattr(th, name) is not None
+    assert set(dir(th)) == set(th.__all__)
+    with pytest.raises(AttributeError, match="module 'trihedron' has no attribute 'Slamm'"):
+        _ = th.Slamm
+
+
+def test_the_example_of_the_readme(folder, tmp_path, monkeypatch):
+    """The seven lines, as they stand."""
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "camera.yaml").write_text(CAMERA_FILE)
+    my_camera = images(folder)
+
+    slam = th.Slam(th.Camera.from_yaml("camera.yaml"), manhattan="mean_shift", outputs=["trajectory", "surface"])
+    for rgb, depth, t in my_camera:
+        pose = slam.track(rgb, depth, t)
+        assert pose.T_world_camera.shape == (4, 4) and pose.covariance.shape == (6, 6)
+        assert pose.status == "ok"
+        assert len(slam.values["planes"].pixels) == len(slam.values["planes"].coefficients) > 0
+    assert len(slam.map.planes) > 0
+    assert len(slam.mesh().triangles) > 100
+    slam.save("run.mcap")
+    slam.save_map("office.mcap")
+    slam.trajectory.to_tum("t.txt")
+    slam.close()
+
+    assert len((tmp_path / "t.txt").read_text().splitlines()) == LENGTH + 1
+    camera = slam.camera
+    planes = th.planes.connected_components(angle_deg=3)(depth, camera)
+    assert len(planes.pixels) > 0
+    run = th.Recording("run.mcap")
+    assert run.frames == tuple(range(LENGTH - 10, LENGTH)) and len(run.poses) == LENGTH
+    assert [value.index for value in run.values("planes")] == list(run.frames)
+    again = run.replay(only=["manhattan"], manhattan="branch_and_bound")
+    found = list(again.values("manhattan"))
+    assert [value.index for value in found] == list(run.frames)
+    assert all(value.supported and value.gap >= 0 for value in found)  # the certificate that mean_shift does not give
+    first, second = th.run(f"replay={run.path}", "only=[planes]", out="a"), th.run(f"replay={run.path}", only=["planes"], planes="ahc", out="b")
+    assert {len(list(done.recording.values("planes"))) for done in (first, second)} == {10}
+
+
+def contents(path):
+    """Topic -> messages, of all topics that a replay reads."""
+    recording = reader.Recording(path)
+    return {topic: list(recording.messages(f"/{topic}")) for topic in sorted(recording.topics)}
+
+
+def test_pushed_frames_give_the_bytes_of_a_folder(folder, camera, tmp_path):
+    done = th.run("dataset=folder", dataset__path=folder, outputs=["trajectory", "surface"], out=tmp_path / "folder", quiet=True)
+    with th.Slam(camera, outputs=["trajectory", "surface"], out=tmp_path / "pushed", threads=3) as slam:
+        for number, (rgb, depth, t) in enumerate(images(folder)):
+            slam.track(rgb, depth, t)
+            if number == 11:
+                slam.save(tmp_path / "half.mcap")
+    expected, found = contents(done.folder / "run.mcap"), contents(tmp_path / "pushed" / "run.mcap")
+    assert expected.keys() == found.keys() and {"pose", "map", "surface", "frames"} < found.keys()
+    for topic, messages in expected.items():
+        assert found[topic] == messages, topic
+    for file in ("trajectory.txt", "trajectory_causal.txt", "surface.ply"):
+        assert (tmp_path / "pushed" / file).read_bytes() == (done.folder / file).read_bytes()
+    half = th.Recording(tmp_path / "half.mcap")
+    assert half.frames == tuple(range(12)) and len(half.poses) == 12
+    with pytest.raises(th.TrihedronError, match=r"does not embed the images that normals must see; record with record\.frames=true"):
+        th.Recording(tmp_path / "pushed").replay(only=["normals"])
+
+
+def test_images_are_embedded_on_request(folder, camera, tmp_path):
+    with th.Slam(camera, "record.frames=true", "outputs=[planes]", out=tmp_path) as slam:
+        for rgb, depth, t in list(images(folder))[:3]:
+            assert slam.track(rgb, depth, t) is slam.values["planes"]  # this graph has no pose
+    run = th.Recording(tmp_path)
+    np.testing.assert_array_equal(run.image(1).color, list(images(folder))[1][0])
+    assert len(list(run.replay(only=["planes"], planes="ransac").values("planes"))) == 3
+    with pytest.raises(th.TrihedronError, match=r"has no frame 7; its frames are 0 to 2"):
+        run.image(7)
+
+
+GOOD = np.zeros((120, 160, 3), np.uint8), np.ones((120, 160), np.float32)
+
+
+@pytest.mark.parametrize(
+    ("rgb", "depth", "t", "message"),
+    [
+        (GOOD[0][:, :, 0], GOOD[1], 1.0, "rgb: has no channels; give (h, w, 3), a gray image as np.stack([gray] * 3, axis=-1)"),
+        (GOOD[0][::2], GOOD[1], 1.0, "rgb: has the shape (60, 160, 3), the camera's images have (120, 160, 3); give images of the camera's size"),
+        (GOOD[0] / 255, GOOD[1], 1.0, "rgb: holds float64, not uint8; give values from 0 to 255 as np.uint8"),
+        (GOOD[0], GOOD[1].T, 1.0, "depth: has the shape (160, 120), the camera's images have (120, 160); give images of the camera's size"),
+        (
+            GOOD[0],
+            GOOD[1].astype(int),
+            1.0,
+            "depth: holds int64, neither metres nor uint16; give float metres, or np.uint16 and the camera's depth_scale",
+        ),
+        (
+            GOOD[0],
+            np.where(np.eye(120, 160) > 0, np.nan, GOOD[1]),
+            1.0,
+            "depth: holds 120 readings that are NaN, infinite or negative; give 0 where there is none: np.nan_to_num(depth)",
+        ),
+        (*GOOD, "now", "t: is str, not a number of seconds; give the time of the frame in seconds"),
+        (*GOOD, float("nan"), "t: is nan; give the time of the frame in seconds, 0 or later"),
+        (*GOOD, 1.7e18, "t: is 1.7e+18, too large for seconds; divide nanoseconds by 1e9, milliseconds by 1e3"),
+    ],
+)
+def test_an_argument_that_does_not_fit_is_named(slam, rgb, depth, t, message):
+    with pytest.raises(th.TrihedronError) as error:
+        slam.track(rgb, depth, t)
+    assert str(error.value) == message
+
+
+def test_time_that_goes_back_is_refused_and_any_strides_are_taken(folder, slam):
+    rgb, depth, _ = next(images(folder))
+    plain = slam.track(rgb, depth, 10.0)
+    with pytest.raises(th.TrihedronError) as error:
+        slam.track(rgb, depth, 10.0)
+    assert str(error.value) == "t: is 10.000000000 s, not after the frame before, 10.000000000 s; push frames in order of time"
+    before = slam.values["keypoints"]
+    strided = slam.track(rgb[::-1, ::-1].copy()[::-1, ::-1], np.asfortranarray(depth), 11.0)
+    assert (plain.index, strided.index) == (0, 1)
+    np.testing.assert_array_equal(slam.values["keypoints"].pixels, before.pixels)
+    rgb[:] = 0  # the caller's array stays the caller's
+    with pytest.raises(th.TrihedronError, match=r"values\['plane'\]: no stage of this graph writes it; did you mean 'planes'\?"):
+        slam.values["plane"]
+    with pytest.raises(th.TrihedronError, match=r"outputs: has no surface, so none is made"):
+        slam.mesh()
+
+
+@pytest.mark.parametrize(
+    ("words", "options", "message"),
+    [
+        ((), {"manhattan": "mean_shif"}, "manhattan: there is no plugin 'mean_shif' for the slot 'manhattan'; did you mean 'mean_shift'?"),
+        (("planes.angl=3",), {}, "planes.angl: the chosen plugin has no option 'angl'; did you mean 'angle_deg'?"),
+        ((), {"dataset": "tum"}, "dataset: frames are pushed, so there is no data set to choose; leave it out, or use trihedron.run"),
+        ((), {"replay": "run.mcap"}, "replay: is for runs over a data set; leave it out, or use trihedron.run"),
+        ((), {"planes": object()}, "planes: is object, which no option takes; give text, a number, True or False, or a list of these"),
+    ],
+)
+def test_an_option_that_does_not_fit_is_refused_at_once(camera, tmp_path, words, options, message):
+    out = tmp_path / "none"
+    with pytest.raises(th.TrihedronError) as error:
+        th.Slam(camera, *words, out=out, **options)
+    assert str(error.value) == message
+    assert not out.exists()
+
+
+def test_what_is_no_camera_is_named():
+    with pytest.raises(th.TrihedronError, match=r"camera: is dict, not a camera; give trihedron\.Camera\.from_yaml"):
+        th.Slam({"fx": 500})
+
+
+def test_a_closed_one_tracks_no_more(camera):
+    slam = th.Slam(camera, "outputs=[planes]")
+    slam.close()
+    slam.close()
+    with pytest.raises(th.TrihedronError, match="Slam: is closed, and tracks no more frames; make another"):
+        slam.track(*GOOD, 1.0)
+    assert len(slam.trajectory) == 0
+
+
+def test_a_stage_alone_says_what_it_computes_besides(folder, camera, capsys):
+    rgb, depth, _ = next(images(folder))
+    stage = th.planes.connected_components(angle_deg=3)
+    planes = stage(depth, camera)
+    assert (
+        "trihedron: planes.connected_components: 'normals' is not given; it is computed by normals.integral_image, the default"
+        in capsys.readouterr().err
+    )
+    normals = th.normals.integral_image()(depth, camera)
+    again = stage(depth, camera, normals=normals)
+    assert "normals" not in capsys.readouterr().err
+    np.testing.assert_array_equal(planes.coefficients, again.coefficients)
+    frame = th.manhattan.mean_shift()(rgb, depth, camera, planes)
+    assert frame.supported
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda d, c: th.planes.ransc, "planes: there is no plugin 'ransc' for the slot 'planes'; did you mean 'ransac'?"),
+        (
+            lambda d, c: th.planes.connected_components(angl=3),
+            "planes.connected_components(angl=...): the plugin has no such option; did you mean 'angle_deg'?",
+        ),
+        (lambda d, c: th.keypoints.orb()(d, c), "keypoints.orb: rgb: is not given, and keypoints are found in it; give rgb (h, w, 3) before depth"),
+        (lambda d, c: th.planes.ransac()(d), "planes.ransac: camera: is not given; give trihedron.Camera(...) after the images"),
+        (lambda d, c: th.planes.ransac()(c), "planes.ransac: depth: is not given; give depth (h, w) and a camera, or a frame"),
+        (lambda d, c: th.surface.tsdf()(d, c), 'surface.tsdf: gathers many frames; give Slam(..., surface="tsdf", outputs=["surface"])'),
+    ],
+)
+def test_mistakes_with_a_stage(folder, camera, call, message):
+    _, depth, _ = next(images(folder))
+    with pytest.raises(th.TrihedronError) as error:
+        call(depth, camera)
+    assert str(error.value) == message
+
+
+def test_runs_are_compared_as_a_table(tmp_path):
+    for threads in (1, 2):
+        th.run("outputs=[planes]", "planes=connected_components", dataset__length=3, threads=threads, out=tmp_path / str(threads), quiet=True)
+    table = th.compare([tmp_path / "1", tmp_path / "2"])
+    assert [row["change"] for row in (table if isinstance(table, list) else table.to_dict("records"))] == ["threads=1", "threads=2"]
+    with pytest.raises(th.TrihedronError, match="-m: is a sweep"):
+        th.run("-m", "threads=1,2")

@@ -1,0 +1,150 @@
+"""The examples run as they stand: each is loaded from its file."""
+
+import importlib.util
+import struct
+import sys
+from pathlib import Path
+from types import ModuleType, SimpleNamespace
+
+import numpy as np
+import pytest
+
+import trihedron as th
+from trihedron.datasets.simulation.synthetic import Synthetic
+from trihedron.pipeline.record.trajectories import read_trajectory
+
+EXAMPLES = Path(__file__).parents[1] / "examples"
+
+
+def example(name: str) -> ModuleType:
+    spec = importlib.util.spec_from_file_location(f"example_{name}", EXAMPLES / f"{name}.py")
+    module = sys.modules[spec.name] = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def test_every_example_is_tested():
+    tested = Path(__file__).read_text()
+    for file in EXAMPLES.iterdir():
+        assert file.stem in tested, file
+
+
+def test_camera_loop(tmp_path, capsys):
+    example("camera_loop").main(out=str(tmp_path), length=12, width=160, height=120)
+    assert len(read_trajectory(tmp_path / "trajectory.txt")) == 12
+    assert len(th.Recording(tmp_path / "run.mcap").poses) == 12
+    assert (tmp_path / "room_map.mcap").stat().st_size > 1000
+    printed = capsys.readouterr().out.splitlines()
+    assert len(printed) == 3 and "ok" in printed[1] and "triangles" in printed[2]
+
+
+def test_plugin_on_one_image(capsys):
+    example("plugin_on_one_image").main(length=12)
+    default, ours, tracked = capsys.readouterr().out.splitlines()
+    assert default.startswith("default: ") and ours.startswith("with the plugin: ")
+    assert int(ours.split()[3]) >= 3  # planes
+    assert tracked.startswith("ok after 12 frames, ATE ") and float(tracked.split()[-2]) < 30
+
+
+class Camera:
+    """A module in the place of pyrealsense2: the built-in room in units of 0.25 mm, until Ctrl-C after 6 frames."""
+
+    stream, format = SimpleNamespace(color=0, depth=1), SimpleNamespace(rgb8=0, z16=1)
+    room, stopped = Synthetic(width=160, height=120), False
+
+    def config(self) -> SimpleNamespace:
+        return SimpleNamespace(enable_stream=lambda *options: None)
+
+    def align(self, stream: int) -> SimpleNamespace:
+        return SimpleNamespace(process=lambda pair: pair)
+
+    def pipeline(self) -> "Camera":
+        self.count = 0
+        return self
+
+    def start(self, config: object) -> SimpleNamespace:
+        c = self.room(0).camera
+        lens = SimpleNamespace(width=c.width, height=c.height, fx=c.fx, fy=c.fy, ppx=c.cx, ppy=c.cy, coeffs=[0.0] * 5)
+        device = SimpleNamespace(first_depth_sensor=lambda: SimpleNamespace(get_depth_scale=lambda: 0.00025))
+        video = SimpleNamespace(as_video_stream_profile=lambda: SimpleNamespace(get_intrinsics=lambda: lens))
+        return SimpleNamespace(get_device=lambda: device, get_stream=lambda stream: video)
+
+    def wait_for_frames(self) -> SimpleNamespace:
+        frame, self.count = self.room(self.count), self.count + 1
+        if self.count > 6:
+            raise KeyboardInterrupt
+        depth = np.rint(frame.depth_m / 0.00025).astype(np.uint16)
+        images = [
+            SimpleNamespace(get_data=lambda data=data: data, get_timestamp=lambda: 1e12 + frame.stamp_ns / 1e6) for data in (frame.color, depth)
+        ]
+        return SimpleNamespace(get_color_frame=lambda: images[0], get_depth_frame=lambda: images[1])
+
+    def stop(self) -> None:
+        self.stopped = True
+
+
+def test_realsense_loop(tmp_path, monkeypatch, capsys):
+    camera = Camera()
+    monkeypatch.setitem(sys.modules, "pyrealsense2", camera)
+    example("realsense_loop").main(str(tmp_path), "outputs=[trajectory]")
+    assert camera.stopped
+    assert capsys.readouterr().out.endswith(f"the recording is in {tmp_path}\n")
+    assert [pose.status for pose in th.Recording(tmp_path).poses] == ["ok"] * 6
+
+
+def message(encoding, dtype, rows, big=False, pad=0):
+    """sensor_msgs/Image with padded rows."""
+    data = np.ascontiguousarray(rows, np.dtype(dtype).newbyteorder(">" if big else "<"))
+    width = data.shape[1]
+    packed = b"".join(row.tobytes() + b"\xff" * pad for row in data)
+    return SimpleNamespace(encoding=encoding, height=len(data), width=width, step=len(packed) // len(data), is_bigendian=big, data=packed)
+
+
+def test_messages_of_ros2_node():
+    node = example("ros2_node")
+    image = np.arange(2 * 3 * 3, dtype=np.uint8).reshape(2, 3, 3)
+    np.testing.assert_array_equal(node.color_of(message("rgb8", "u1", image, pad=5)), image)
+    np.testing.assert_array_equal(node.color_of(message("bgr8", "u1", image[:, :, ::-1])), image)
+    np.testing.assert_array_equal(node.color_of(message("mono8", "u1", image[:, :, 0])), np.repeat(image[:, :, :1], 3, axis=2))
+    depth = np.array([[0, 1000], [2500, 65535]])
+    for big in (False, True):
+        np.testing.assert_array_equal(node.depth_of(message("16UC1", "u2", depth, big, pad=2)), np.float32(depth) / 1000)
+        found = node.depth_of(message("32FC1", "f4", [[np.nan, 1.5], [np.inf, 0.25]], big))
+        np.testing.assert_array_equal(found, np.float32([[0, 1.5], [0, 0.25]]))
+        assert found.dtype == np.float32
+    info = SimpleNamespace(width=640, height=480, k=[525.0, 0, 319.5, 0, 526.0, 239.5, 0, 0, 1], d=[0.1, 0, 0, 0, 0])
+    camera = node.camera_of(info)
+    assert (camera.fx, camera.fy, camera.cx, camera.cy, camera.distortion) == (525.0, 526.0, 319.5, 239.5, (0.1, 0, 0, 0, 0))
+
+
+def test_frames_of_ros2_node():
+    """A camera that moves forward, along z of its optical frame, moves the robot along x of the map (REP 103)."""
+    node = example("ros2_node")
+    assert len((EXAMPLES / "ros2_node.py").read_text().splitlines()) <= 80
+    T_world_camera = np.eye(4)
+    T_world_camera[2, 3] = 2.0
+    T_map_base = node.FLU_OPTICAL @ T_world_camera @ np.linalg.inv(node.FLU_OPTICAL)
+    np.testing.assert_allclose(T_map_base[:3, 3], [2, 0, 0], atol=1e-12)
+    transform = SimpleNamespace(translation=SimpleNamespace(), rotation=SimpleNamespace())
+    node.fill(transform, T_map_base)
+    np.testing.assert_allclose(node.matrix_of(transform), T_map_base, atol=1e-12)
+    assert struct.pack("d", transform.translation.x) == struct.pack("d", 2.0)
+
+
+def test_main_of_ros2_node():
+    pytest.importorskip("rclpy")
+    import rclpy
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(rclpy, "spin", lambda node: rclpy.spin_once(node, timeout_sec=0.1))
+        example("ros2_node").main()
+
+
+@pytest.mark.slow
+def test_notebook_replay_a_stage(tmp_path):
+    nbformat, nbclient = pytest.importorskip("nbformat"), pytest.importorskip("nbclient")
+    notebook = nbformat.read(EXAMPLES / "replay_a_stage.ipynb", as_version=4)
+    done = nbclient.NotebookClient(notebook, timeout=500, resources={"metadata": {"path": str(tmp_path)}}).execute()
+    outputs = [cell.outputs for cell in done.cells if cell.cell_type == "code"]
+    assert outputs[-1][0]["data"]["text/plain"] == "True"
+    assert any("image/png" in output.get("data", {}) for output in outputs[-2])

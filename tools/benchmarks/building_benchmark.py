@@ -1,0 +1,215 @@
+"""Judge the plans of the synthetic buildings by the exact ones.
+
+Each scene is tracked with several seeds (of textures, path and noise), and its plan is moved by the SE(3) that aligns trajectory.txt with the truth,
+never by itself. A room is found where the intersection over union with a true one is above 0.5. Walls are the edges of found rooms that lie on a face
+that was seen, position the distance of their middle from the true edge. A doorway is found within 0.3 m of its middle. "honest" is the share of
+errors of areas, wall offsets and storey heights within 1.96 of their standard deviations. Figures are medians over the seeds.
+
+Example: trihedron benchmark building --scenes offices --seeds 2
+"""
+
+from __future__ import annotations
+
+import json
+import statistics
+import tempfile
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from trihedron.pipeline.core.errors import DataError, UsageError, did_you_mean
+from trihedron.tools.arguments import Parser, table
+
+if TYPE_CHECKING:
+    from trihedron.datasets.simulation.true_plan import TruePlan
+    from trihedron.pipeline.core.types import F64, Building
+
+SCENES = ("offices", "rooms", "corridor")
+FOUND_IOU, DOOR_M, EDGE_M, LEAST_EDGE_M = 0.5, 0.3, 0.15, 0.5
+HEADER = [
+    "scene", "runs", "wall cm", "angle °", "IoU", "recall", "precision", "doors", "precision", "area %", "height cm", "honest", "frame ms", "final s",
+]  # fmt: skip
+
+
+def main(argv: list[str]) -> int:
+    """Print the table; returns the exit code. Raises UsageError for an unknown scene or plugin, DataError for a run without a plan."""
+    parser = Parser("benchmark building", __name__)
+    parser.add_argument("--scenes", default=",".join(SCENES), metavar="A,B", help=f"some of them (default: {','.join(SCENES)})")
+    parser.add_argument("--seeds", type=int, default=5, metavar="N", help="runs of each scene (default: 5)")
+    parser.add_argument("--plugin", default="", metavar="NAME", help="of the slot building (default: the graph's own)")
+    parser.add_argument(
+        "--runs", type=Path, nargs="*", default=[], metavar="RUN", help="judge these run folders instead, by their building.json's run"
+    )
+    parser.add_argument("--json", type=Path, metavar="FILE", help="write the figures of each run too")
+    options = parser.parse_args(argv)
+    if not 1 <= options.seeds <= 100:
+        raise UsageError("benchmark building", f"--seeds {options.seeds} is out of range", "give 1 to 100")
+    _load()
+    scenes = [name for name in options.scenes.split(",") if name]
+    for name in scenes:
+        if name not in SCENES:
+            raise UsageError("benchmark building", f"there is no scene '{name}'", did_you_mean(name, list(SCENES)))
+    found: dict[str, list[dict[str, float]]] = {}
+    for run in options.runs:
+        found.setdefault(run.name, []).append(judged_run(run, options.plugin or None))
+    for name in () if options.runs else scenes:
+        found[name] = [_tracked(name, seed, options.plugin) for seed in range(options.seeds)]
+    print(report(found))
+    if options.json:
+        options.json.write_text(json.dumps(found, indent=2) + "\n")
+    return 0
+
+
+def _load() -> None:
+    from trihedron.pipeline.core.registry import load_plugins
+
+    load_plugins()
+
+
+def _tracked(scene: str, seed: int, plugin: str) -> dict[str, float]:
+    """Return the figures of one run, tracked in a process of its own."""
+    from trihedron.tools.benchmark import measure
+
+    with tempfile.TemporaryDirectory() as folder:
+        out = Path(folder) / "run"
+        words = ["dataset=synthetic", f"dataset.scene={scene}", f"dataset.seed={seed}", "dataset.width=320", "dataset.height=240", "dataset.fps=15"]
+        timing = measure([*words, "outputs=[trajectory,building]", *([f"building={plugin}"] if plugin else []), f"out={out}"], out)
+        stage = timing["stages"]["building"]
+        return {**judged_run(out), "frame_ms": stage["p50_ms"], "final_s": stage["finish_ms"] / 1e3}
+
+
+def judged_run(run: Path, plugin: str | None = None) -> dict[str, float]:
+    """Return the figures of a run folder of a synthetic scene; its plan as recorded, or made by a plugin. Raises DataError."""
+    from trihedron.pipeline.app.recorded_run import composed_run
+    from trihedron.pipeline.core.config import make_plugin
+    from trihedron.pipeline.core.geometry import umeyama
+    from trihedron.pipeline.record.reader import Recording
+    from trihedron.pipeline.record.trajectories import read_trajectory
+    from trihedron.pipeline.run.metrics import associate
+    from trihedron.tools.building import building_of
+
+    recording = Recording(run / "run.mcap")
+    dataset = make_plugin("dataset", composed_run(recording).dataset)
+    if not hasattr(dataset, "plan"):
+        raise DataError(str(run), "is of a data set without an exact plan", "judge a run of dataset=synthetic")
+    estimate, truth = read_trajectory(run / "trajectory.txt"), dataset.truth()
+    pairs = associate(estimate.stamps_ns, truth.stamps_ns)
+    T = umeyama(estimate.poses[pairs[:, 0], :3, 3], truth.poses[pairs[:, 1], :3, 3])
+    return judged(building_of(recording, plugin), T, dataset.plan())
+
+
+def judged(building: Building, T_truth_world: F64, plan: TruePlan) -> dict[str, float]:
+    """Return the figures of a plan: NaN where there is nothing to judge."""
+    import shapely
+
+    T = T_truth_world @ building.T_world_building
+    truth = [shapely.Polygon(rings[0], rings[1:]) for rings in plan.rooms]
+    mine = [_polygon(building, room, T) for room in range(len(building.areas_m2))]
+    overlap = np.array([[_iou(a, b) for b in truth] for a in mine]).reshape(len(mine), len(truth))
+    pairs = [(room, int(np.argmax(overlap[room]))) for room in range(len(mine)) if overlap[room].max(initial=0.0) > FOUND_IOU]
+    areas = np.array([mine[a].area - truth[b].area for a, b in pairs])
+    walls = [error for a, b in pairs for error in _edges(building, a, plan.rooms[b], T)]
+    height = np.array([high - low - plan.height_m for low, high in building.storeys])
+    doors, false = _doors(building, plan, T)
+    honest = [abs(error) < 1.96 * np.sqrt(building.area_variance[a]) for error, (a, _) in zip(areas, pairs)]
+    honest += [abs(off) < 1.96 * sigma for off, _, sigma in walls if np.isfinite(sigma)]
+    sigmas = np.sqrt([np.trace(covariance) for covariance in building.storey_covariance])
+    honest += [abs(error) < 1.96 * sigma for error, sigma in zip(height, sigmas) if np.isfinite(error)]
+    return {
+        "wall_m": _median([abs(off) for off, *_ in walls]),
+        "angle_deg": _median([abs(angle) for _, angle, _ in walls]),
+        "iou": _median([overlap[a, b] for a, b in pairs]),
+        "room_recall": len({b for _, b in pairs}) / len(truth),
+        "room_precision": len(pairs) / len(mine) if mine else float("nan"),
+        "door_recall": doors / len(plan.doorways) if plan.doorways else float("nan"),
+        "door_precision": doors / (doors + false) if doors + false else float("nan"),
+        "area_error": _median([abs(error) / truth[b].area for error, (_, b) in zip(areas, pairs)]),
+        "height_m": _median([abs(error) for error in height if np.isfinite(error)]),
+        "honest": float(np.mean(honest)) if honest else float("nan"),
+    }
+
+
+def _median(values: list[Any]) -> float:
+    return float(np.median(values)) if len(values) else float("nan")
+
+
+def _moved(points: F64, T: F64) -> F64:
+    """Return points (n, 2) of the building's plan on that of the truth."""
+    return np.asarray(points @ T[:2, :2].T + T[:2, 3])
+
+
+def _polygon(building: Building, room: int, T: F64) -> Any:
+    import shapely
+
+    rings = [_moved(building.corners_m[a:b], T) for of, a, b in building.loops if of == room]
+    return shapely.make_valid(shapely.Polygon(rings[0], rings[1:]))
+
+
+def _iou(a: Any, b: Any) -> float:
+    return float(a.intersection(b).area / a.union(b).area)
+
+
+def _edges(building: Building, room: int, rings: list[F64], T: F64) -> list[tuple[float, float, float]]:
+    """Return (offset in metres, angle in degrees, standard deviation of the offset; NaN where the face is another room's) of a room's edges."""
+    ends = [(p, q) for ring in rings for p, q in zip(ring, np.roll(ring, -1, axis=0))]
+    found = []
+    for of, a, b in building.loops:
+        corners = _moved(building.corners_m[a:b], T)
+        for p, q, wall in zip(corners, np.roll(corners, -1, axis=0), building.corner_walls[a:b]) if of == room else ():
+            if wall < 0 or np.linalg.norm(q - p) < LEAST_EDGE_M:
+                continue
+            along, middle = (q - p) / np.linalg.norm(q - p), (p + q) / 2.0
+            near = [(_off(middle, *end), _angle(along, *end)) for end in ends if _beside(middle, *end)]
+            near = [item for item in near if abs(item[0]) < EDGE_M and abs(item[1]) < 10.0]
+            if near:
+                face = _moved(building.walls_m[wall], T)
+                own = abs(_off(middle, face[0], face[1])) < 1e-6
+                sigma = float(np.sqrt(building.wall_covariance[wall, 0, 0])) if own else float("nan")
+                found.append((*min(near, key=lambda item: abs(item[0])), sigma))
+    return found
+
+
+def _off(point: F64, a: F64, b: F64) -> float:
+    along = (b - a) / np.linalg.norm(b - a)
+    return float((point - a) @ np.array([-along[1], along[0]]))
+
+
+def _beside(point: F64, a: F64, b: F64) -> bool:
+    length = float(np.linalg.norm(b - a))
+    return 0.0 <= float((point - a) @ (b - a)) / length <= length
+
+
+def _angle(along: F64, a: F64, b: F64) -> float:
+    """Return the angle between an edge and a true one in degrees, both taken as going the same way round the room."""
+    other = (b - a) / np.linalg.norm(b - a)
+    return float(np.degrees(np.arctan2(along[0] * other[1] - along[1] * other[0], along @ other)))
+
+
+def _doors(building: Building, plan: TruePlan, T: F64) -> tuple[int, int]:
+    """Return the number of true doorways that were found, and of doors and passages that are none."""
+    from trihedron.pipeline.core.types import OPENING_KINDS
+
+    middles = []
+    for wall, span, kind in zip(building.opening_walls, building.spans_m, building.opening_kinds):
+        start, end = _moved(building.walls_m[wall], T)
+        if OPENING_KINDS[kind] != "window":
+            middles.append(start + (end - start) / np.linalg.norm(end - start) * span.mean())
+    hits = {k for k, door in enumerate(plan.doorways) for middle in middles if np.linalg.norm(door.middle - middle) < DOOR_M}
+    false = sum(all(np.linalg.norm(door.middle - middle) >= DOOR_M for door in plan.doorways) for middle in middles)
+    return len(hits), false
+
+
+def report(found: dict[str, list[dict[str, float]]]) -> str:
+    """Return the table of medians over the runs of each scene."""
+    columns = [("wall_m", 1e2, ".2f"), ("angle_deg", 1.0, ".3f"), ("iou", 1.0, ".4f"), ("room_recall", 1.0, ".2f"), ("room_precision", 1.0, ".2f"),
+               ("door_recall", 1.0, ".2f"), ("door_precision", 1.0, ".2f"), ("area_error", 1e2, ".2f"), ("height_m", 1e2, ".2f"),
+               ("honest", 1.0, ".0%"), ("frame_ms", 1.0, ".3f"), ("final_s", 1.0, ".2f")]  # fmt: skip
+    rows = [HEADER]
+    for scene, runs in found.items():
+        cells = []
+        for name, factor, form in columns:
+            values = [run[name] for run in runs if np.isfinite(run.get(name, float("nan")))]
+            cells.append(format(factor * statistics.median(values), form) if values else "-")
+        rows.append([scene, str(len(runs)), *cells])
+    return table(rows, "lr" + "r" * len(columns))
