@@ -20,8 +20,8 @@ class BagOfWords(AppearanceLoop):
     The retrieval of pycolmap 4.2 cannot be used: its Python binding returns no scores. Library: SciPy (BSD). Sums of single precision: the bytes may
     differ on another CPU."""
 
-    def _likeness(self, map: Map, ids: list[I32]) -> F64:
-        """How alike the last of some sets of points is to each of the others."""
+    def _similarities(self, map: Map, ids: list[I32]) -> F64:
+        """Similarity of the last of some sets of points to each of the others."""
         from scipy.cluster.vq import kmeans2, vq
 
         known = np.unique(np.concatenate(ids)).astype(np.int32)

@@ -1,4 +1,4 @@
-"""A lost camera's place by COLMAP's LO-RANSAC."""
+"""Relocalisation by COLMAP's LO-RANSAC."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from trihedron.pipeline.core.types import F64, I32, Map, Rotation
 from trihedron.plugins.mapping.covisibility_graph import observed_by
 from trihedron.plugins.places.verification import FrameFeatures
 from trihedron.plugins.relocalise.features import Features
-from trihedron.plugins.shared.descriptors import mutual_matches
+from trihedron.plugins.shared.feature_matching import mutual_matches
 from trihedron.plugins.shared.pycolmap_pose import absolute_pose
 
 

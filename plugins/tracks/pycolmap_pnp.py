@@ -9,7 +9,7 @@ import numpy as np
 from trihedron.pipeline.core.options import PositiveFloat, PositiveInt, PositiveShare
 from trihedron.pipeline.core.registry import register
 from trihedron.pipeline.core.types import Camera, Keypoints, Planes, Segments, Tracks
-from trihedron.plugins.shared.descriptors import mutual_matches
+from trihedron.plugins.shared.feature_matching import mutual_matches
 from trihedron.plugins.shared.pycolmap_pose import absolute_pose
 from trihedron.plugins.tracks.common import NO_PAIRS, Features, StructureGates, tracks_value
 
