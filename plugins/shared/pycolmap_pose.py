@@ -30,11 +30,11 @@ def absolute_pose(
     if len(points_m) < LEAST:
         return None
     library = pycolmap()
-    model = library.Camera(model="PINHOLE", width=camera.width, height=camera.height, params=camera.intrinsics)
+    centre = camera.cx + 0.5, camera.cy + 0.5  # COLMAP's pixel centres are at halves
+    model = library.Camera(model="PINHOLE", width=camera.width, height=camera.height, params=[camera.fx, camera.fy, *centre])
     estimation = library.AbsolutePoseEstimationOptions()
     estimation.ransac.max_error, estimation.ransac.random_seed, estimation.ransac.num_threads = max_error_px, seed, 1
-    centres = np.asarray(pixels, np.float64) + 0.5  # COLMAP's pixel centres are at halves
-    model.params = camera.intrinsics + [0.0, 0.0, 0.5, 0.5]
+    centres = np.asarray(pixels, np.float64) + 0.5
     with RANDOM:
         found = library.estimate_and_refine_absolute_pose(centres, np.asarray(points_m, np.float64), model, estimation)
     if found is None:
