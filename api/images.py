@@ -11,7 +11,7 @@ import numpy as np
 from trihedron.api.camera import Camera
 from trihedron.datasets.readers.cameras import Calibration
 from trihedron.datasets.readers.images import corrected, metres
-from trihedron.datasets.readers.sequence import undistorted, undistortion_maps
+from trihedron.datasets.readers.registration import Undistortion
 from trihedron.pipeline.core import types
 from trihedron.pipeline.core.errors import DataError
 from trihedron.pipeline.core.types import F32, U8, Frame
@@ -34,12 +34,12 @@ class Frames:
     def __init__(self, camera: Camera) -> None:
         self.camera = camera
         self._calibration = camera.calibration
-        self._maps = undistortion_maps(self._calibration)
+        self._undistortion = Undistortion(self._calibration.camera, self._calibration.distortion)
 
     def __call__(self, index: int, stamp_ns: int, rgb: object | None, depth: object) -> Frame:
         """Make frame `index` of rgb (h, w, 3) uint8, None for a black image, and depth (h, w), in metres or uint16 / depth_scale."""
         color = self._color(rgb) if rgb is not None else np.zeros((self.camera.height, self.camera.width, 3), np.uint8)
-        color, depth_m = undistorted(color, self._depth(depth), self._maps)
+        color, depth_m = self._undistortion.color(color), self._undistortion.depth(self._depth(depth))
         return Frame(index, stamp_ns, color, depth_m, self._calibration.camera)
 
     def _color(self, given: object) -> U8:

@@ -11,7 +11,6 @@ import copy
 import json
 import threading
 import time
-from collections import deque
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack
 from dataclasses import replace
@@ -27,6 +26,7 @@ from trihedron.datasets.readers.cameras import Calibration
 from trihedron.datasets.simulation.synthetic import Synthetic
 from trihedron.pipeline.app.compilation import compile_once
 from trihedron.pipeline.app.execute import RECORDING, metadata_of, recorded_topics, remembered_of, source_of, write_files
+from trihedron.pipeline.app.viewers import Viewer, opened_viewer
 from trihedron.pipeline.core import types
 from trihedron.pipeline.core.config import check_added, composed, graph_of
 from trihedron.pipeline.core.errors import ConfigError, UsageError, did_you_mean
@@ -39,6 +39,7 @@ from trihedron.pipeline.run.map_file import save_map
 from trihedron.pipeline.run.replay import TOPICS
 from trihedron.pipeline.run.run_folder import held, write_configuration
 from trihedron.pipeline.run.runner import Runner, Step
+from trihedron.pipeline.run.sinks import MemorySink, Sink
 from trihedron.pipeline.run.warm_up import WARM_UP_FRAMES, compilation_reported, warm_up
 from trihedron.tools.recover import recover
 
@@ -81,16 +82,19 @@ class Slam:
         self._last = -1  # position of the last frame pushed
         self._settled = -1  # and of the last one with which all stages are done
         self._last_ns: int | None = None
-        self._history: deque[tuple[int, Mapping[str, Any]]] = deque(maxlen=max(history, 1))
         self._failure: BaseException | None = None
         self._ended = self._closed = False
-        self._runner = Runner(graph, self._config.seed, self._config.threads, None, "", remembered_of(self._config, graph), on_value=self._note)
         self._topics = recorded_topics(self._config, graph, None)
+        self._memory = MemorySink(max(history, 1) if out is None else 1, {"dataset"} | self._topics)
         self._stack = ExitStack()
         self._writer: RecordingWriter | None = None
         self._out = Path(out).expanduser().absolute() if out is not None else None
         try:
-            self._open(graph)
+            viewer = self._stack.enter_context(opened_viewer(self._config))
+            initial, period = remembered_of(self._config, graph), viewer.preview_period
+            self._runner = Runner(graph, self._config.seed, self._config.threads, None, "", initial, on_value=self._note, preview_period=period)
+            self._sinks: tuple[Sink, ...] = (self._memory, *viewer.sinks)
+            self._open(graph, viewer)
         except BaseException:
             self._stack.close()
             raise
@@ -99,7 +103,7 @@ class Slam:
         self._thread.start()
         atexit.register(self.close)
 
-    def _open(self, graph: Graph) -> None:
+    def _open(self, graph: Graph, viewer: Viewer) -> None:
         """Open the run folder and its recording, then compile and load what the first frames need."""
         if self._out is not None:
             self._stack.enter_context(held(self._out))
@@ -108,8 +112,9 @@ class Slam:
         compile_once(self._runner.computed, True)
         with compilation_reported():
             warm_up(Runner(_on_synthetic_images(graph, self.camera), self._config.seed, self._config.threads))
-        if self._out is not None:
-            self._writer = RecordingWriter(self._out / RECORDING, self._metadata())
+        if self._out is not None or viewer.server is not None:
+            file = self._out / RECORDING if self._out is not None else None
+            self._writer = RecordingWriter(file, self._metadata(), viewer.server)
             self._stack.callback(self._writer.close)
 
     @property
@@ -228,7 +233,7 @@ class Slam:
     def _work(self) -> None:
         try:
             with compilation_reported():
-                for step in self._runner.steps(self._writer, self._topics, embed_frames="dataset" in self._topics):
+                for step in self._runner.steps(self._writer, self._topics, "dataset" in self._topics, sinks=self._sinks):
                     self._take(step)
         except BaseException as error:  # raised where the caller is
             self._failure = error
@@ -240,8 +245,6 @@ class Slam:
     def _take(self, step: Step) -> None:
         with self._changed:
             self._settled = step.position
-            if self._writer is None:
-                self._history.append((step.index, {name: step.values[name] for name in ({"dataset"} | self._topics) & set(step.values)}))
             self._changed.notify_all()
 
     def _note(self, position: int, stage: str, value: Value | None) -> None:
@@ -284,17 +287,17 @@ class Slam:
 
     def _write_history(self, writer: RecordingWriter) -> None:
         """Write the poses that are no longer in the history, then its frames."""
-        first = self._history[0][0] if self._history else 0
+        frames = self._memory.frames
+        first = frames[0][0] if frames else 0
         for pose in self._runner.result.poses:
             if pose.index < first:
                 writer.write("pose", pose)
-        for _, values in self._history:
+        for _, values in frames:
             frame = values.get("dataset")
             if isinstance(frame, types.Frame):
                 writer.write(FRAMES_TOPIC, FrameReference(frame.index, frame.stamp_ns, frame.camera))
             for name, value in values.items():
-                if isinstance(value, Value):
-                    writer.write(name, value)
+                writer.write(name, value)
         if "surface" in self._values:
             writer.write("surface", self.mesh())
 

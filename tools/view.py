@@ -1,6 +1,6 @@
 """Open a run in rerun: frames, features, planes, axes, the map, the surface and the estimate against the truth.
 
-Needs the extra `view`: pip install trihedron[view]. `trihedron export RUN --to rerun` writes the same to a file.
+Needs rerun-sdk: pip install rerun-sdk. `trihedron export RUN --to rerun` writes the same to a file.
 
 Example: trihedron view runs/latest
 """

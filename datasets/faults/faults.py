@@ -1,4 +1,4 @@
-"""Another data set with what goes wrong in the field: for tests of what a system says and does then, and for experiments with noise."""
+"""Another data set with faults of sensors: for tests of a system under them, and for experiments with noise."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from trihedron.pipeline.core.types import F32, U8, Camera, Frame, Trajectory
 
 
 class Covered(Enum):
-    """Which of the two images a cover blinds; depth turns 0."""
+    """The image that a cover blinds; depth becomes 0."""
 
     both = "both"
     color = "color"
@@ -28,7 +28,7 @@ class Covered(Enum):
 
 
 class Cover(Enum):
-    """What colour shows of a cover: nothing, the light that blinds it, or a hand."""
+    """Appearance of a cover in colour: black, the light that blinds it, or a hand."""
 
     black = "black"
     white = "white"
@@ -60,12 +60,12 @@ class Faults:
     during: Frames = ""  # frames A:B with the faults below; empty = all
     depth_noise: NonNegativeFloat = 0.0  # added, times the sensor's standard deviation
     depth_holes: Share = 0.0  # share of the depth image that is missing, in blobs
-    depth_limit_m: NonNegativeFloat = 0.0  # readings beyond say this; 0 = none
+    depth_limit_m: NonNegativeFloat = 0.0  # readings beyond have this value; 0 = none
     not_finite: Share = 0.0  # share of the readings that are NaN or infinite
     depth_times: PositiveFloat = 1.0  # depth is wrong by this factor
     depth_resize: PositiveFloat = 1.0  # size of the depth image, times that of colour
-    focal_times: PositiveFloat = 1.0  # the focal lengths told are wrong by this factor
-    resize: PositiveFloat = 1.0  # resolution, times what it was; the camera told is right
+    focal_times: PositiveFloat = 1.0  # the stated focal lengths are wrong by this factor
+    resize: PositiveFloat = 1.0  # resolution, times what it was; the stated camera is right
     gamma: PositiveFloat = 1.0  # of colour
     exposure_ms: NonNegativeFloat = 0.0  # motion blur of colour
     readout_ms: NonNegativeFloat = 0.0  # from the first row to the last: rolling shutter
@@ -108,7 +108,7 @@ class Faults:
         return color, depth if self.covered is Covered.color else np.zeros_like(depth), camera
 
     def _spoilt(self, number: int, frame: Frame) -> tuple[U8, F32, Camera]:
-        """Colour, depth and camera of a frame with the faults of `during`: first the scene's, then the sensor's, then what is told of it."""
+        """Colour, depth and camera of a frame with the faults of `during`: first the scene's, then the sensor's, then the stated camera."""
         color, depth, camera = frame.color, frame.depth_m, frame.camera
         if self.during and not inside(self.during, np.array([number]))[0]:
             return color, depth, camera

@@ -1,4 +1,4 @@
-"""What goes wrong with images: each function takes colour (h, w, 3) RGB and depth (h, w) in metres, 0 = none, and returns them spoilt."""
+"""Faults of images: each function takes colour (h, w, 3) RGB and depth (h, w) in metres, 0 = none, and returns them spoilt."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from trihedron.pipeline.core.types import F32, U8, Camera
 
-SKIN = (150, 105, 85)  # RGB of a hand before the lens, out of focus
+SKIN = (150, 105, 85)  # RGB of a hand before the camera, out of focus
 HOLE_PX = 12.0  # size of the blobs in which depth is missing, at 640 pixels a line
 PATCHES = 6  # of glass and mirror, by turns
 OBJECTS = 8  # that move before the camera
@@ -30,7 +30,7 @@ def with_gamma(color: U8, gamma: float) -> U8:
 
 
 def noisy(depth_m: F32, times: float, camera: Camera, rng: np.random.Generator) -> F32:
-    """White noise of `times` the standard deviation that the camera says of its depth."""
+    """White noise of `times` the standard deviation that the camera states of its depth."""
     noise = np.float32(times) * camera.depth_noise.sigma_m(depth_m).astype(np.float32) * rng.standard_normal(depth_m.shape, dtype=np.float32)
     return np.where(depth_m > 0.0, np.maximum(depth_m + noise, np.float32(1e-3)), np.float32(0.0))
 
@@ -56,9 +56,9 @@ def resized(color: U8, depth_m: F32, camera: Camera, times: float) -> tuple[U8, 
     width, height = round(camera.width * times), round(camera.height * times)
     sx, sy = width / camera.width, height / camera.height
     centre = (camera.cx + 0.5) * sx - 0.5, (camera.cy + 0.5) * sy - 0.5
-    told = Camera(width, height, camera.fx * sx, camera.fy * sy, *centre, camera.fps, camera.depth_noise)
+    stated = Camera(width, height, camera.fx * sx, camera.fy * sy, *centre, camera.fps, camera.depth_noise)
     small = cv2.resize(color, (width, height), interpolation=cv2.INTER_AREA if times < 1.0 else cv2.INTER_LINEAR)
-    return np.asarray(small, np.uint8), np.asarray(cv2.resize(depth_m, (width, height), interpolation=cv2.INTER_NEAREST), np.float32), told
+    return np.asarray(small, np.uint8), np.asarray(cv2.resize(depth_m, (width, height), interpolation=cv2.INTER_NEAREST), np.float32), stated
 
 
 def with_moving_objects(color: U8, depth_m: F32, share: float, time_s: float, rng: np.random.Generator) -> tuple[U8, F32]:

@@ -1,4 +1,4 @@
-"""Which frames are delivered, in which order and with which time: dropped, repeated and reversed frames, and clocks that jump."""
+"""Delivery of frames, their order and times: dropped, repeated and reversed frames, and clocks that jump."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ from numpy.typing import NDArray
 from trihedron.pipeline.core.options import frame_range
 
 Numbers = NDArray[np.int64]
-STREAM = 4  # of the random numbers that say which frames are dropped
+STREAM = 4  # of the random numbers that choose the dropped frames
 
 
 @dataclass(frozen=True)
 class Delivery:
-    """What becomes of the frames of a sequence on their way. Ranges are of the sequence's own frame numbers."""
+    """Delivery of the frames of a sequence: dropped, reversed, late. Ranges are of the sequence's own frame numbers."""
 
     drop: str = ""
     drop_share: float = 0.0
@@ -39,7 +39,7 @@ class Delivery:
         return frame_range(self.freeze)[0] if bool(inside(self.freeze, np.array([number]))[0]) else number
 
     def stamp_ns(self, stamp_ns: int, number: int) -> int:
-        """What the camera's clock says when it should say `stamp_ns`."""
+        """Return the reading of the faulty clock at `stamp_ns`."""
         return stamp_ns + (round(self.jump_s * 1e9) if number >= self.jump else 0)
 
 

@@ -64,8 +64,8 @@ def without_missing(listed: FileList, path: Path) -> FileList:
 
 
 def file_inside(folder: Path, name: str, place: str) -> Path:
-    """The file of a list that lies with its images. Raises DataError, naming `place`, for one that is somewhere else: a list comes with data of
-    others, and says nothing about the rest of the disk. (What a link in the folder points to is its owner's affair.)"""
+    """The file of a list that lies with its images. Raises DataError, naming `place`, for one that is somewhere else: a list from
+    a stranger must not reach the rest of the disk. (What a link in the folder points to is its owner's affair.)"""
     if os.path.isabs(name) or os.path.normpath(name).split(os.sep)[0] == os.pardir:
         raise DataError(place, f"the file '{printable(name, SHOWN)}' is outside the folder of the list", "put the images below that folder")
     return folder / name

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from trihedron.pipeline.core.errors import RecordingError, TrihedronError, printable
-from trihedron.pipeline.core.files import MAX_YAML_BYTES, SHOWN, parse_yaml, read_text
+from trihedron.pipeline.core.files import MAX_YAML_BYTES, SHOWN, open_file, parse_yaml, read_text
 
 BAG = ".bag"  # of a ROS 1 bag
 METADATA_FILE = "metadata.yaml"  # of a rosbag2 folder
@@ -66,6 +66,7 @@ class BagFile:
                 _check_folder(self.path)
                 self._reader = rosbag2.Reader(self.path)
             else:
+                open_file(self.path).close()  # a FIFO would block
                 self._reader = rosbag1.Reader(self.path)
             self._reader.open()
             self._connections: dict[BagTopic, list[Any]] = defaultdict(list)  # ROS 1 has one a sender

@@ -24,7 +24,7 @@ SHORT = "give dataset.camera=tum_fr1, tum_fr2, tum_fr3, icl_nuim or a camera.yam
 
 @dataclass(frozen=True)
 class Calibration:
-    """The pinhole camera a reader hands out, and what turns the files into it: depth file value per metre, lens distortion of both images
+    """The pinhole camera of a reader's frames, and the conversion of its files: depth file value per metre, lens distortion of both images
     (k1 k2 p1 p2 k3 of Brown's model, as OpenCV orders them; empty = none), and what is added to inverse depths (1/m)."""
 
     camera: Camera

@@ -1,4 +1,4 @@
-"""Messages of Foxglove's schemas (protobuf or JSON) -> pictures, intrinsics, transforms."""
+"""Messages of Foxglove's schemas (protobuf or JSON) as images, intrinsics, transforms."""
 
 from __future__ import annotations
 
@@ -78,7 +78,7 @@ READERS: dict[str, tuple[Any, Callable[[Any], Any]]] = {
 
 
 def reader(kind: str, encoding: str) -> Callable[[bytes], Any]:
-    """What decodes messages of type `kind` (a key of READERS), encoded as `protobuf` or `json`; it raises UnreadableMessage."""
+    """Return a decoder of messages of type `kind` (a key of READERS) as `protobuf` or `json`; it raises UnreadableMessage."""
     message, convert = READERS[kind]
 
     def read(data: bytes) -> Any:

@@ -1,4 +1,4 @@
-"""Image files -> RGB and metres, checked."""
+"""Image files as RGB and metres, checked."""
 
 from __future__ import annotations
 
@@ -10,14 +10,13 @@ import numpy as np
 from imagecodecs import png_decode
 from numpy.typing import NDArray
 
-from trihedron.datasets.readers.picture_headers import JPEG, PNG, UnreadableImage, picture_header
-from trihedron.datasets.readers.png_chunks import is_whole_png
+from trihedron.datasets.readers.picture_headers import JPEG, PNG, UnreadableImage, is_whole_png, picture_header
 from trihedron.pipeline.core.errors import DataError, printable
 from trihedron.pipeline.core.files import SHOWN, read_file
 from trihedron.pipeline.core.types import F32, U8
 
 RGB = cv2.IMREAD_COLOR_RGB | cv2.IMREAD_IGNORE_ORIENTATION
-JPEG_END = b"\xff\xd9"  # of a complete file; a decoder would fill the rest of a truncated one with grey and say nothing
+JPEG_END = b"\xff\xd9"  # of a complete file; a decoder would fill the rest of a truncated one with grey, without an error
 PIXELS_PER_BYTE = 2048  # more than a picture can pack: deflate makes 1032 bytes of one, a grey JPEG 512 pixels of one
 MAX_PIXELS = 1 << 26  # more than any depth camera has
 MAX_BYTES = 1 << 26  # of an image file
@@ -55,7 +54,7 @@ def corrected(depth: F32, depth_offset: float) -> F32:
 
 
 def metres(values: NDArray[Any], depth_scale: float) -> F32:
-    """Whole numbers divided by `depth_scale`, (h, w) float32."""
+    """Divide whole numbers by `depth_scale`: (h, w) float32."""
     depth: F32 = values.astype(np.float32)
     depth /= np.float32(depth_scale)
     return depth
@@ -104,6 +103,6 @@ def _decode_opencv(data: bytes, channels: int) -> NDArray[Any] | None:
 
 
 def check_size(path: Path, image: NDArray[Any], width: int, height: int, reference: str, cure: str) -> None:
-    """Raise DataError unless the image is width × height, as `reference` (who says so) wants it."""
+    """Raise DataError unless the image is width × height, the size of `reference`."""
     if image.shape[:2] != (height, width):
         raise DataError(str(path), f"is {image.shape[1]}×{image.shape[0]} while {reference} is {width}×{height}", cure)

@@ -12,6 +12,7 @@ from trihedron.datasets.readers.robot_recording import RobotRecording, Topics
 from trihedron.datasets.readers.robot_streams import ROS
 from trihedron.datasets.readers.sequence import clip_range, refuse_video
 from trihedron.pipeline.core.errors import DataError
+from trihedron.pipeline.core.files import one_line_errors
 from trihedron.pipeline.core.options import Frames, PositiveFloat
 from trihedron.pipeline.core.registry import register
 from trihedron.pipeline.core.types import Frame, Trajectory
@@ -41,7 +42,7 @@ class McapDataset:
     depth_info_topic: str = ""  # likewise of depth
     truth_from: str = ""  # a topic of poses (/mocap/pose), or the frame the transforms of the camera begin from (map); empty = no truth
     max_difference_ms: PositiveFloat = 20.0  # of the stamps of a pair of colour and depth
-    depth_delay_ms: float = 0.0  # depth is taken this much later than its stamps say; trihedron calibrate estimates it
+    depth_delay_ms: float = 0.0  # depth is taken this much later than its stamps; trihedron calibrate estimates it
     depth_scale: PositiveFloat = 1000.0  # of 16-bit depth: values per metre
 
     @cached_property
@@ -61,17 +62,19 @@ class McapDataset:
         return clip_range(self.frames, len(self._frames), self.path)
 
     def __len__(self) -> int:
-        first, stop = self._range
+        with one_line_errors(self.path):
+            first, stop = self._range
         return stop - first
 
     def __call__(self, index: int) -> Frame | None:
-        """Frame `index` of the selection, or None, after a warning, where it cannot be read."""
-        number = self._range[0] + index
-        return self._frames.frame(number)
+        """Read frame `index` of the selection, or None, after a warning, where it cannot be read."""
+        with one_line_errors(self.path):
+            return self._frames.frame(self._range[0] + index)
 
     def truth(self) -> Trajectory | None:
-        """The attached ground truth, or that of `truth_from`."""
-        return self._frames.truth()
+        """Return the attached ground truth, or that of `truth_from`."""
+        with one_line_errors(self.path):
+            return self._frames.truth()
 
 
 def open_messages(path: Path) -> McapFile | BagFile:
@@ -96,10 +99,10 @@ class _Recorded:
         return len(self._stamps)
 
     def frame(self, position: int) -> Frame | None:
-        """The frame at a place, as it was."""
+        """Read the frame at a place, as it was."""
         value = self._recording.value("dataset", self._stamps[position])
         return replace(value, index=position) if isinstance(value, Frame) else None
 
     def truth(self) -> Trajectory | None:
-        """The attached ground truth."""
+        """Return the attached ground truth."""
         return attached_truth(self._recording.attachments, str(self._recording.path))

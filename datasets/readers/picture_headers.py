@@ -1,4 +1,4 @@
-"""What a picture says of itself before it is decoded: a decoder allocates what the header claims.
+"""Headers of images, read before a decoder allocates what they claim.
 
 PNG, JPEG, BMP, PNM (PBM, PGM, PPM) and TIFF; other formats are refused, so that no decoder sees a file whose size was not looked at."""
 
@@ -10,21 +10,22 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 PNG, JPEG, BMP = b"\x89PNG", b"\xff\xd8\xff", b"BM"
+PNG_START = b"\x89PNG\r\n\x1a\n" + struct.pack(">I4s", 13, b"IHDR")
 TIFFS = {b"II*\0": "<", b"MM\0*": ">"}  # little and big endian
 COMMENT = re.compile(rb"#[^\n]*(?:\n|$)")  # of a PNM
 PNM_HEAD = 4096  # bytes that hold the header of a PNM with its comments
-FRAME_MARKS = {*range(0xC0, 0xD0)} - {0xC4, 0xC8, 0xCC}  # of a JPEG: where its size is said
+FRAME_MARKS = {*range(0xC0, 0xD0)} - {0xC4, 0xC8, 0xCC}  # of a JPEG: segments that hold its size
 TIFF_WIDTH, TIFF_HEIGHT, TIFF_BITS, TIFF_SAMPLES, TIFF_TILE_WIDTH, TIFF_TILE_HEIGHT = 256, 257, 258, 277, 322, 323
 TIFF_FORMATS = {1: "B", 3: "H", 4: "I"}
 
 
 class UnreadableImage(Exception):
-    """A file that cannot be opened or decoded; the message says why."""
+    """A file that cannot be opened or decoded; the message is the cause."""
 
 
 @dataclass(frozen=True)
 class PictureHeader:
-    """What a picture claims to be; `bits` are of one channel. `cells` are the pixels of its largest part: of the picture, or of a tile of it."""
+    """Claimed size of an image; `bits` are of one channel. `cells` are the pixels of its largest part: of the image, or of a tile of it."""
 
     width: int
     height: int
@@ -39,7 +40,7 @@ class PictureHeader:
 
 
 def picture_header(data: bytes) -> PictureHeader:
-    """What the bytes of a picture say of themselves. Raises UnreadableImage for another format or none."""
+    """Read the header of an image. Raises UnreadableImage for another format or none."""
     reader = next((reader for magic, reader in READERS.items() if data.startswith(magic)), _pnm)
     try:
         header = reader(data)
@@ -48,6 +49,19 @@ def picture_header(data: bytes) -> PictureHeader:
     if header is None or header.width < 1 or header.height < 1:
         raise UnreadableImage("is damaged or of an unknown format")
     return header
+
+
+def is_whole_png(data: bytes) -> bool:
+    """Return True for a PNG whose chunks, the header first, lie within its bytes: a decoder allocates a chunk before it reads it."""
+    if not data.startswith(PNG_START):
+        return False
+    at = len(PNG_START) - 8
+    while at + 12 <= len(data):
+        length, name = struct.unpack_from(">I4s", data, at)
+        if name == b"IEND":
+            return bool(at + 12 + length <= len(data))
+        at += 12 + length  # with name and checksum
+    return False
 
 
 def _png(data: bytes) -> PictureHeader:

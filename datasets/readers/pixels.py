@@ -1,4 +1,4 @@
-"""The pixels of a picture -> RGB or metres, checked against the bytes there are."""
+"""Pixels of a message's image as RGB or metres, checked against the bytes there are."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from trihedron.pipeline.core.types import F32, U8
 
 
 class Kind(Enum):
-    """What the pixels of a picture are."""
+    """Content of an image."""
 
     color = "colour"
     grey = "grey"
@@ -40,7 +40,7 @@ COMPRESSED_DEPTH = "compressedDepth"
 
 
 def kind_of(picture: Picture) -> Kind | None:
-    """Whether a picture shows colour or depth; None for an encoding that is not known. Raises UnreadableImage for a damaged compressed one."""
+    """Classify an image; None for an encoding that is not known. Raises UnreadableImage for a damaged compressed one."""
     if not picture.compressed:
         if picture.encoding in DEPTHS:
             return Kind.depth

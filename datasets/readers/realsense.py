@@ -113,7 +113,7 @@ class _Stream:
     def _calibration(self, found: Any) -> tuple[Camera, Any]:
         coefficients = np.array(found.coeffs, float)
         if coefficients.any() and str(found.model) != LENS:
-            raise DataError("dataset=realsense", f"the lens model '{found.model}' is not known", "choose a size whose colour is undistorted")
+            raise DataError("dataset=realsense", f"the distortion model '{found.model}' is not known", "choose a size whose colour is undistorted")
         camera = Camera(found.width, found.height, found.fx, found.fy, found.ppx, found.ppy, float(self._options.fps))
         return camera, coefficients if coefficients.any() else None
 

@@ -1,4 +1,4 @@
-"""Depth seen by a camera of its own -> depth in the colour camera."""
+"""Undistortion of images, and registration of the depth of a separate camera to colour."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from trihedron.pipeline.core.kernel import kernel
-from trihedron.pipeline.core.types import F32, F64, Camera
+from trihedron.pipeline.core.types import F32, F64, U8, Camera
 
 WIDEST = 32  # pixels of colour that one pixel of depth may cover
 NEAREST_M = 1e-3
@@ -19,8 +19,38 @@ MARGIN_PX = 0.05  # between readings on a slanted surface, parallax opens gaps o
 
 
 @dataclass(frozen=True)
+class Undistortion:
+    """Removes the distortion (coefficients as OpenCV orders them, empty = none) from the images of `camera`.
+
+    Colour is bilinear; depth nearest, since a mean across an edge is a point that does not exist. Outside the image colour repeats the border, which
+    makes no edge, and depth is 0."""
+
+    camera: Camera
+    distortion: tuple[float, ...]
+
+    @cached_property
+    def _maps(self) -> tuple[F32, F32]:
+        """(h, w) x and y in the distorted image of each pixel of the undistorted one."""
+        size = self.camera.width, self.camera.height
+        x, y = cv2.initUndistortRectifyMap(self.camera.K, np.array(self.distortion), np.eye(3), self.camera.K, size, cv2.CV_32FC1)
+        return np.asarray(x), np.asarray(y)
+
+    def color(self, image: U8) -> U8:
+        """(h, w, 3) RGB, undistorted."""
+        if not self.distortion:
+            return image
+        return np.asarray(cv2.remap(image, *self._maps, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE), np.uint8)
+
+    def depth(self, depth_m: F32) -> F32:
+        """(h, w) metres, undistorted."""
+        if not self.distortion:
+            return depth_m
+        return np.asarray(cv2.remap(depth_m, *self._maps, cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT), np.float32)
+
+
+@dataclass(frozen=True)
 class Registration:
-    """Registers depth images of `width` × `height` (intrinsics `K`, lens `D` as OpenCV orders it) to the undistorted camera `color`.
+    """Registers depth images of `width` × `height` (intrinsics `K`, distortion `D` as OpenCV orders it) to the undistorted camera `color`.
 
     Each reading covers the pixels whose centres its own pixel covers, the nearest one on top: no holes where colour is the finer one."""
 
@@ -33,15 +63,15 @@ class Registration:
 
     @cached_property
     def _rays(self) -> tuple[F32, F32]:
-        """Directions (x, y, z), turned into the colour camera, of the middles of the left and right sides of the pixels (h, w + 1, 3) and of the
+        """Directions (x, y, z), rotated into the colour camera, of the middles of the left and right sides of the pixels (h, w + 1, 3) and of the
         upper and lower ones (h + 1, w, 3); pixel centres at integers."""
         columns, rows = np.arange(self.width + 1) - 0.5, np.arange(self.height + 1) - 0.5
-        return self._turned(columns, rows[:-1] + 0.5), self._turned(columns[:-1] + 0.5, rows)
+        return self._rotated_rays(columns, rows[:-1] + 0.5), self._rotated_rays(columns[:-1] + 0.5, rows)
 
-    def _turned(self, columns: NDArray[Any], rows: NDArray[Any]) -> F32:
+    def _rotated_rays(self, columns: NDArray[Any], rows: NDArray[Any]) -> F32:
         pixels = np.stack(np.meshgrid(columns, rows), axis=-1)
         rays = cv2.undistortPoints(pixels.reshape(-1, 1, 2), self.K, np.array(self.D) if self.D else None).reshape(pixels.shape)
-        with np.errstate(invalid="ignore", over="ignore"):  # where the lens model has no inverse, or the focal length is next to none
+        with np.errstate(invalid="ignore", over="ignore"):  # where the distortion has no inverse, or the focal length is next to none
             rays = np.concatenate([rays, np.ones((*rays.shape[:2], 1))], axis=2) @ self.T_color_depth[:3, :3].T
             return np.ascontiguousarray(rays, np.float32)
 

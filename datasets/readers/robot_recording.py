@@ -8,29 +8,28 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
-import cv2
 import numpy as np
 
 from trihedron.datasets.readers.association import Stamps, associate
 from trihedron.datasets.readers.picture_headers import UnreadableImage
 from trihedron.datasets.readers.pixels import Kind, color_of, depth_of
-from trihedron.datasets.readers.registration import Registration
+from trihedron.datasets.readers.registration import Registration, Undistortion
 from trihedron.datasets.readers.robot_streams import MessageFile, Role, Stream, Streams
 from trihedron.datasets.readers.robot_values import Intrinsics, Link, Picture, UnreadableMessage
 from trihedron.datasets.readers.transform_tree import TransformTree
 from trihedron.pipeline.core.errors import DataError, RecordingError
-from trihedron.pipeline.core.types import F32, F64, U8, Camera, Frame, Trajectory
+from trihedron.pipeline.core.types import F32, F64, Camera, Frame, Trajectory
 
 log = logging.getLogger("trihedron")
 RECTIFIED = re.compile(r"(^|[_/])rect")  # in the name of a topic, by the convention of image_proc
-LENSES = {"", "plumb_bob", "rational_polynomial", "thin_prism"}  # whose coefficients OpenCV takes in this order
+DISTORTION_MODELS = {"", "plumb_bob", "rational_polynomial", "thin_prism"}  # whose coefficients OpenCV takes in this order
 COEFFICIENTS = (0, 4, 5, 8, 12, 14)
 LARGEST = 1 << 14  # pixels of a side
 
 
 @dataclass(frozen=True)
 class Topics:
-    """What the user chose; an empty topic is chosen by its type."""
+    """Topics given by the user; an empty one is chosen by its type."""
 
     color: str = ""
     depth: str = ""
@@ -41,7 +40,7 @@ class Topics:
 
 @dataclass(frozen=True)
 class _Sample:
-    """What the first image of a topic says of all: whose it is, and its height and width."""
+    """Coordinate frame, height and width of the images of a topic, from the first."""
 
     frame_id: str
     shape: tuple[int, int]
@@ -61,7 +60,7 @@ class RobotRecording:
         return len(self._pairs)
 
     def stamp_ns(self, position: int) -> int:
-        """Of a frame: that of its colour image."""
+        """Return the stamp of a frame, that of its colour image."""
         return int(self._pairs[position, 0])
 
     def frame(self, position: int) -> Frame | None:
@@ -73,16 +72,16 @@ class RobotRecording:
         except (UnreadableImage, UnreadableMessage, RecordingError) as error:
             log.warning("%s; frame %d is skipped", error, position)
             return None
-        return Frame(position, stamp_ns, self._undistorted(color), self._registered(depth), self.camera)
+        return Frame(position, stamp_ns, self._undistortion.color(color), self._registered(depth), self.camera)
 
     def truth(self) -> Trajectory | None:
-        """`T_world_camera` from the poses or transforms that were chosen. Raises DataError where they say nothing."""
+        """`T_world_camera` from the poses or transforms that were chosen. Raises DataError where there is none."""
         if not self.topics.truth:
             return None
         links = self._pose_links() if self.topics.truth.startswith("/") else self._frame_links()
         poses = {link.stamp_ns: link.T_parent_child for link in links}
         if not poses:
-            raise DataError("dataset.truth_from", f"'{self.topics.truth}' says nothing of the camera at the times of the frames", "leave it out")
+            raise DataError("dataset.truth_from", f"'{self.topics.truth}' does not give the camera at the times of the frames", "leave it out")
         stamps = sorted(poses)
         return Trajectory(np.array(stamps, np.int64), np.array([poses[stamp] for stamp in stamps]))
 
@@ -131,7 +130,7 @@ class RobotRecording:
 
     @cached_property
     def _depth_intrinsics(self) -> Intrinsics | None:
-        """Those of a depth camera of its own, None where depth is in the colour camera already."""
+        """Intrinsics of a separate depth camera; None where depth is registered to colour already."""
         color, first = self._color_intrinsics, self._first_depth
         found = self._streams.calibration(self._depth, first.frame_id, "depth_info_topic", self.topics.depth_info)
         if found is None:
@@ -153,7 +152,7 @@ class RobotRecording:
         return self._first(self._depth)
 
     def _first(self, stream: Stream) -> _Sample:
-        """Of the first image that can be decoded. Raises DataError where there is none."""
+        """Describe the first image that can be decoded. Raises DataError where there is none."""
         why = "it is empty"
         for row in range(len(stream.index)):
             try:
@@ -177,12 +176,11 @@ class RobotRecording:
 
     @cached_property
     def _tree(self) -> TransformTree:
-        """All transforms of the recording; those of topics that are called static hold for good."""
+        """All transforms of the recording; those of topics that are called static are constant."""
         fixed: list[Link] = []
         moving: list[Link] = []
         for stream in self._streams.of(Role.links):
-            said = [link for value in stream.values() for link in value]
-            (fixed if "static" in stream.topic else moving).extend(said)
+            (fixed if "static" in stream.topic else moving).extend(link for value in stream.values() for link in value)
         return TransformTree(fixed, moving)
 
     @cached_property
@@ -200,41 +198,26 @@ class RobotRecording:
             cause = f"holds no transform from '{depth}' to '{color}', which registering depth to colour needs"
             raise DataError(str(self.file.path), cause, "record /tf_static too, or the topic of registered depth")
         K = _matrix(found, self._depth.topic)
-        return Registration(found.width, found.height, K, _lens(found, self._depth.topic), self._T_color_depth, self.camera)
+        return Registration(found.width, found.height, K, _distortion(found, self._depth.topic), self._T_color_depth, self.camera)
 
     def _registered(self, depth: F32) -> F32:
-        if self._registration is not None:
-            return self._registration(depth)
-        if self._maps is None:
-            return depth
-        return np.asarray(cv2.remap(depth, *self._maps, cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT), np.float32)
-
-    def _undistorted(self, color: U8) -> U8:
-        if self._maps is None:
-            return color
-        return np.asarray(cv2.remap(color, *self._maps, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE), np.uint8)
+        return self._registration(depth) if self._registration is not None else self._undistortion.depth(depth)
 
     @cached_property
-    def _maps(self) -> tuple[F32, F32] | None:
-        """Where each pixel of the undistorted colour image comes from; None without distortion."""
-        lens = _lens(self._color_intrinsics, self._color.topic)
-        if not lens:
-            return None
-        K = self.camera.K
-        x, y = cv2.initUndistortRectifyMap(K, np.array(lens), np.eye(3), K, (self.camera.width, self.camera.height), cv2.CV_32FC1)
-        return np.asarray(x), np.asarray(y)
+    def _undistortion(self) -> Undistortion:
+        return Undistortion(self.camera, _distortion(self._color_intrinsics, self._color.topic))
 
     # truth
 
     def _frame_links(self) -> list[Link]:
-        """The camera in the frame that was named, at each colour image where the transforms say it."""
+        """The camera in the frame that was named, at each colour image for which the transforms give it."""
         world, camera = self.topics.truth, self._first_color.frame_id
         stamps = self._pairs[:, 0].tolist()
         found = [(stamp, self._tree.lookup(world, camera, stamp)) for stamp in stamps]
         return [Link(stamp, world, camera, T) for stamp, T in found if T is not None]
 
     def _pose_links(self) -> list[Link]:
-        """The poses of a topic, carried on to the camera where the transforms say how it sits on what moves."""
+        """The poses of a topic, transformed to the camera where the transforms give its mounting."""
         camera, found = self._first_color.frame_id, []
         for value in self._streams.named(self.topics.truth, "truth_from", Role.pose).values():
             for link in value:
@@ -258,7 +241,7 @@ def _matrix(found: Intrinsics, topic: str) -> F64:
     return np.asarray(found.P[:, :3] if _is_rectified(found, topic) else found.K)
 
 
-def _lens(found: Intrinsics, topic: str) -> tuple[float, ...]:
+def _distortion(found: Intrinsics, topic: str) -> tuple[float, ...]:
     return found.D if any(found.D) and not _is_rectified(found, topic) else ()
 
 
@@ -267,7 +250,7 @@ def _check(found: Intrinsics, topic: str, shape: tuple[int, ...], place: str) ->
     if (found.height, found.width) != shape[:2] or max(shape[:2]) > LARGEST:
         cause = f"the images of {topic} are {shape[1]}×{shape[0]}, their intrinsics are of {found.width}×{found.height}"
         raise DataError(place, cause, "choose the intrinsics of these images")
-    lens = _lens(found, topic)
-    if lens and (found.model not in LENSES or len(lens) not in COEFFICIENTS):
-        cause = f"the lens model '{found.model[:40]}' of {topic} with {len(lens)} coefficients is not known"
-        raise DataError(place, cause, f"known: {', '.join(sorted(LENSES - {''}))}; rectify the images first")
+    distortion = _distortion(found, topic)
+    if distortion and (found.model not in DISTORTION_MODELS or len(distortion) not in COEFFICIENTS):
+        cause = f"the distortion model '{found.model[:40]}' of {topic} with {len(distortion)} coefficients is not known"
+        raise DataError(place, cause, f"known: {', '.join(sorted(DISTORTION_MODELS - {''}))}; rectify the images first")

@@ -1,4 +1,4 @@
-"""Which topics of a robot's recording are what, and which of them to read."""
+"""Topics of a robot's recording: their roles, and the choice of those to read."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ log = logging.getLogger("trihedron")
 
 
 class Role(Enum):
-    """What the messages of a topic are to a reader of frames."""
+    """Use of a topic to a reader of frames."""
 
     picture = "images"
     intrinsics = "camera intrinsics"
@@ -73,7 +73,7 @@ class MessageFile(Protocol):
 
 @dataclass(frozen=True)
 class Stream:
-    """A topic that says something of frames; `decode` raises UnreadableMessage."""
+    """A topic of use to frames; `decode` raises UnreadableMessage."""
 
     file: MessageFile
     channel: int
@@ -84,7 +84,7 @@ class Stream:
 
     @cached_property
     def index(self) -> Any:
-        """Where its messages lie."""
+        """The index of its messages."""
         return self.file.locate(self.channel)
 
     def at(self, row: int) -> Any:
@@ -131,7 +131,7 @@ class Streams:
 
     @cached_property
     def kinds(self) -> dict[str, Kind | None]:
-        """What the first readable image of each topic of images shows."""
+        """Content of the first readable image of each topic of images."""
         return {stream.topic: _first_kind(stream) for stream in self.of(Role.picture)}
 
     def named(self, topic: str, option: str, role: Role) -> Stream:

@@ -1,4 +1,4 @@
-"""What a robot's recording says, whichever message format said it: pictures, intrinsics, transforms."""
+"""Values of a robot's recording, whatever the format of its messages: images, intrinsics, transforms."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from trihedron.pipeline.core.types import F64
 
 
 class UnreadableMessage(ValueError):
-    """A message whose bytes are not what its type says; the message says why."""
+    """A message whose bytes do not fit its type; the text is the cause."""
 
 
 @dataclass(frozen=True)

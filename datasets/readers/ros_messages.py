@@ -1,6 +1,6 @@
-"""ROS 2 messages (CDR) -> pictures, intrinsics, transforms.
+"""ROS 2 messages (CDR) as images, intrinsics, transforms.
 
-Messages are decoded by the definitions below, never by those a recording brings: what it says of a type cannot steer the decoder.
+Messages are decoded by the definitions below, never by those a recording brings, which could steer the decoder.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""A sequence of colour and depth files: what the readers of folders have in common."""
+"""Sequences of colour and depth files, and the base of readers of folders."""
 
 from __future__ import annotations
 
@@ -10,13 +10,13 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from trihedron.datasets.readers.cameras import Calibration
 from trihedron.datasets.readers.images import check_size, read_color, read_depth
 from trihedron.datasets.readers.picture_headers import UnreadableImage
+from trihedron.datasets.readers.registration import Undistortion
 from trihedron.pipeline.core.errors import DataError
 from trihedron.pipeline.core.files import one_line_errors
 from trihedron.pipeline.core.options import Frames, frame_range
@@ -38,8 +38,8 @@ DepthReader = Callable[[Path], F32]
 
 @dataclass(frozen=True)
 class ImageSequence:
-    """Pairs of files with their stamps, and what turns a pair into a Frame. `first` is the number of the first pair in the whole data set;
-    `depth_reader` replaces the reading of 16-bit images, `color_reader` that of colour. Nothing is kept of a frame: memory does not grow with
+    """Pairs of files with their stamps, read as frames. `first` is the number of the first pair in the whole data set;
+    `depth_reader` replaces the reading of 16-bit images, `color_reader` that of colour. Frames are not cached: memory does not grow with
     the sequence."""
 
     stamps_ns: NDArray[np.int64]
@@ -63,7 +63,7 @@ class ImageSequence:
             log.warning("%s; frame %d is skipped", error, self.first + position)
             return None
         self._check_sizes(position, color, depth)
-        color, depth = undistorted(color, depth, self._maps)
+        color, depth = self._undistortion.color(color), self._undistortion.depth(depth)
         return Frame(self.first + position, int(self.stamps_ns[position]), color, depth, self.calibration.camera)
 
     def _read(self, path: Path, reader: Callable[[Path], Any]) -> Any:
@@ -82,27 +82,8 @@ class ImageSequence:
         check_size(path, color, camera.width, camera.height, "the camera", "give the dataset.camera of these images")
 
     @cached_property
-    def _maps(self) -> tuple[F32, F32] | None:
-        """Where each pixel of the undistorted image comes from: (h, w) x and y; None without distortion."""
-        return undistortion_maps(self.calibration)
-
-
-def undistortion_maps(calibration: Calibration) -> tuple[F32, F32] | None:
-    """Where each pixel of the undistorted image comes from: (h, w) x and y; None without distortion."""
-    if not calibration.distortion:
-        return None
-    camera, lens = calibration.camera, np.array(calibration.distortion)
-    x, y = cv2.initUndistortRectifyMap(camera.K, lens, np.eye(3), camera.K, (camera.width, camera.height), cv2.CV_32FC1)
-    return np.asarray(x), np.asarray(y)
-
-
-def undistorted(color: U8, depth: F32, maps: tuple[F32, F32] | None) -> tuple[U8, F32]:
-    """Colour bilinear; depth nearest, since a mean across an edge is a point that does not exist. Outside the image colour repeats the
-    border, which makes no edge, and depth is 0."""
-    if maps is None:
-        return color, depth
-    color = np.asarray(cv2.remap(color, *maps, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE), dtype=np.uint8)
-    return color, np.asarray(cv2.remap(depth, *maps, cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT), dtype=np.float32)
+    def _undistortion(self) -> Undistortion:
+        return Undistortion(self.calibration.camera, self.calibration.distortion)
 
 
 @dataclass(frozen=True)

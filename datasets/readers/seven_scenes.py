@@ -13,7 +13,7 @@ from trihedron.pipeline.core.errors import DataError
 from trihedron.pipeline.core.registry import register
 from trihedron.pipeline.core.types import F32
 
-INVALID_M = 65.0  # 65535 mm says that there is no reading
+INVALID_M = 65.0  # 65535 mm stands for no reading
 LAYOUT = "give the folder that holds frame-000000.color.png or .jpg, .depth.png and .pose.txt, for example chess/seq-01"
 
 
@@ -23,7 +23,7 @@ class SevenScenes(SequenceReader):
     """Folder with frame-000000.color.png or .jpg, .depth.png (mm) and .pose.txt (camera to world) (Shotton et al. 2013). Frames are 1/30 s apart.
 
     The published depth is *not* registered to colour: the two cameras are a few centimetres apart, and no calibration of the pair was
-    published. It is read as if both were one camera, of focal length 585 and centre (320, 240), as the data set's authors say; along the edges of
+    published. It is read as if both were one camera, of focal length 585 and centre (320, 240), as its authors do; along the edges of
     things colour and depth then disagree by some pixels, which a run warns of. Poses are those of the depth camera."""
 
     camera: str = ""  # preset or camera.yaml; empty = the folder's file, else the data set's camera

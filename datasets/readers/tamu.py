@@ -20,7 +20,7 @@ class Tamu(SequenceReader):
 
     camera: str = ""  # preset or camera.yaml; empty = the folder's file
     max_difference_ms: PositiveFloat = 20.0  # of a pair's stamps
-    depth_delay_ms: float = 0.0  # depth is taken this much later than its stamps say; trihedron calibrate estimates it
+    depth_delay_ms: float = 0.0  # depth is taken this much later than its stamps; trihedron calibrate estimates it
 
     def _open(self, folder: Path) -> ImageSequence:
         calibration = choose_calibration(folder, self.camera)

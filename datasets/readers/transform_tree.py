@@ -1,4 +1,4 @@
-"""The tree of coordinate frames that a robot's transforms span, and the way from one frame to another at a time."""
+"""The tree of coordinate frames that a robot's transforms span, and transforms between any two of them."""
 
 from __future__ import annotations
 
@@ -15,8 +15,8 @@ from trihedron.pipeline.core.types import F64
 
 
 class TransformTree:
-    """Each frame hangs on one parent, for good (`fixed`, and of those that are `moving` the ones said only once), or at many times, between which
-    it is interpolated, never beyond them."""
+    """Each frame has one parent. Its transform is constant (`fixed`, and `moving` ones given only once) or interpolated between the times at
+    which it is given, never beyond them."""
 
     def __init__(self, fixed: Iterable[Link], moving: Iterable[Link] = ()) -> None:
         self._parents: dict[str, str] = {}
@@ -30,27 +30,27 @@ class TransformTree:
             self._fixed[link.child] = link.T_parent_child
 
     def lookup(self, target: str, source: str, stamp_ns: int | None = None) -> F64 | None:
-        """`T_target_source` at a time; None where no way is known, or not at that time. Without a time: of frames that move, the first said."""
+        """Return `T_target_source` at a time; None where the frames are not connected then. Without a time: of moving frames the first transform."""
         up_target, up_source = self._ancestors(target.lstrip("/")), self._ancestors(source.lstrip("/"))
         common = next((frame for frame in up_source if frame in up_target), None)
         if common is None:
             return None
-        T_common_target, T_common_source = (self._climb(way[: way.index(common)], stamp_ns) for way in (up_target, up_source))
+        T_common_target, T_common_source = (self._chain(path[: path.index(common)], stamp_ns) for path in (up_target, up_source))
         if T_common_target is None or T_common_source is None:
             return None
         return np.asarray(invert(T_common_target) @ T_common_source)
 
     def _ancestors(self, frame: str) -> list[str]:
-        """The frame and those it hangs on, upwards; a circle ends it."""
-        way = [frame]
+        """The frame, its parent and so on; a cycle ends the list."""
+        path = [frame]
         seen = {frame}
-        while (parent := self._parents.get(way[-1])) is not None and parent not in seen:
-            way.append(parent)
+        while (parent := self._parents.get(path[-1])) is not None and parent not in seen:
+            path.append(parent)
             seen.add(parent)
-        return way
+        return path
 
-    def _climb(self, frames: list[str], stamp_ns: int | None) -> F64 | None:
-        """From the first of the frames to the parent of the last."""
+    def _chain(self, frames: list[str], stamp_ns: int | None) -> F64 | None:
+        """The transform from the first of the frames to the parent of the last."""
         T = np.eye(4)
         for frame in frames:
             step = self._fixed.get(frame)
@@ -71,7 +71,7 @@ class TransformTree:
         if after == 0 or after == len(stamps):
             return None
         before, span = after - 1, stamps[after] - stamps[after - 1]
-        return between(poses[before], poses[after], float(stamp_ns - stamps[before]) / float(span))
+        return interpolate(poses[before], poses[after], float(stamp_ns - stamps[before]) / float(span))
 
     @cached_property
     def _sorted(self) -> dict[str, tuple[NDArray[np.int64], F64]]:
@@ -83,7 +83,7 @@ class TransformTree:
         return found
 
 
-def between(T_a: F64, T_b: F64, share: float) -> F64:
-    """The pose a share of the way from one to the other: positions along the line, rotations along the shortest turn."""
+def interpolate(T_a: F64, T_b: F64, share: float) -> F64:
+    """Interpolate poses: positions linearly, rotations along the geodesic; `share` 0 gives `T_a`, 1 `T_b`."""
     R = T_a[:3, :3] @ exp_so3(share * log_so3(T_a[:3, :3].T @ T_b[:3, :3]))
     return np.asarray(pose_matrix(R, (1.0 - share) * T_a[:3, 3] + share * T_b[:3, 3]))

@@ -21,7 +21,7 @@ class Tum(SequenceReader):
 
     camera: str = ""  # preset or camera.yaml; empty = the folder's file, else its name
     max_difference_ms: PositiveFloat = 20.0  # of a pair's stamps; the benchmark's tools use the same
-    depth_delay_ms: float = 0.0  # depth is taken this much later than its stamps say; trihedron calibrate estimates it
+    depth_delay_ms: float = 0.0  # depth is taken this much later than its stamps; trihedron calibrate estimates it
     exact_depth: bool = False  # rendered without sensor noise; false = a Kinect's
 
     def _open(self, folder: Path) -> ImageSequence:

@@ -6,8 +6,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
+import numpy as np
+
 from trihedron.datasets.simulation.furniture import furnished
-from trihedron.datasets.simulation.room import HEIGHT_M, Room, Solid, Wall, box, shell, walls_of
+from trihedron.datasets.simulation.room import HEIGHT_M, UP, Room, Solid, Wall, box, shell, turned_box, walls_of
 from trihedron.datasets.simulation.walks import Walk
 
 DOORWAY_M = (0.9, 2.1)  # width and height
@@ -69,6 +71,58 @@ def _doorway(along_x: bool, across: tuple[float, float], span: tuple[float, floa
     left, right = (span[0], at - DOORWAY_M[0] / 2.0), (at + DOORWAY_M[0] / 2.0, span[1])
     pieces = [(left, (0.0, HEIGHT_M)), (right, (0.0, HEIGHT_M)), ((left[1], right[0]), (DOORWAY_M[1], HEIGHT_M))]
     return [box(part, across, z, "wall") if along_x else box(across, part, z, "wall") for part, z in pieces]
+
+
+def _pierced(start: tuple[float, float], end: tuple[float, float], gaps: list[tuple[float, float, float, float]]) -> list[Solid]:
+    """A wall along the middle line from `start` to `end` with gaps (middle along it, width, bottom, top)."""
+    a, b = np.array([*start, 0.0]), np.array([*end, 0.0])
+    length = float(np.linalg.norm(b - a))
+    along = (b - a) / length
+    yaw, pieces, at = float(np.arctan2(along[1], along[0])), list[tuple[float, float, float, float]](), 0.0
+    for middle, width, bottom, top in sorted(gaps):
+        left, right = middle - width / 2.0, middle + width / 2.0
+        pieces += [(at, left, 0.0, HEIGHT_M), (left, right, top, HEIGHT_M), *([(left, right, 0.0, bottom)] if bottom else [])]
+        at = right
+    half = [
+        (a + along * (s + t) / 2.0 + UP * (low + high) / 2.0, np.array([(t - s) / 2.0, WALL_M / 2.0, (high - low) / 2.0]))
+        for s, t, low, high in [*pieces, (at, length, 0.0, HEIGHT_M)]
+    ]
+    return [turned_box(centre, size, yaw, "wall") for centre, size in half]
+
+
+def flat() -> Building:
+    """An L-shaped flat: three rooms, the north one L-shaped about a shaft; a door ajar, a wardrobe 2.3 m high, a window between two rooms."""
+    x, y = 8.0, 6.0
+    door, window = (DOORWAY_M[0], 0.0, DOORWAY_M[1]), (1.0, 0.9, 2.0)
+    solids = [box((5.0, x), (3.5, y), (0.0, HEIGHT_M), "wall"), box((0.0, 1.2), (5.0, y), (0.0, HEIGHT_M), "wall")]
+    solids += _pierced((0.0, 3.55), (5.0, 3.55), [(1.4, *window), (3.6, *door)])
+    solids += _pierced((5.05, 0.0), (5.05, 3.5), [(1.75, *door)])
+    ajar, leaf = np.radians(75.0), np.array([0.42, 0.02, 1.02])
+    hinge = np.array([5.12, 2.2, 1.02])
+    solids.append(turned_box(hinge + leaf[0] * np.array([np.sin(ajar), np.cos(ajar), 0.0]), leaf, np.pi / 2.0 - float(ajar), "wood", "door", 3))
+    solids.append(box((7.4, x), (0.3, 1.9), (0.0, 2.3), "wood", "drawers", 0))
+    south, _, _, _ = walls_of(_rectangle((0.0, 5.0), (0.0, 3.5)))
+    _, east, north, _ = walls_of(_rectangle((1.2, 5.0), (3.6, y)))
+    solids += (
+        furnished(south, "picture 1.0, portrait 2.4, picture 4.0") + furnished(east, "picture 1.2") + furnished(north, "portrait 1.0, picture 2.4")
+    )
+    solids += furnished(walls_of(_rectangle((0.0, 5.0), (0.0, 3.5)))[3], "picture 1.2, portrait 2.5")
+    path = [(2.2, 0.9), (4.2, 1.75), (5.9, 1.75), (6.7, 1.3), (6.8, 2.4), (5.9, 2.0), (4.2, 1.75), (3.6, 2.6), (3.6, 4.2), (4.3, 4.9), (2.6, 5.1)]
+    path += [(1.0, 4.4), (1.8, 4.1), (3.6, 4.4), (3.6, 2.6), (1.4, 2.6), (0.9, 1.5)]
+    return _building(x, y, solids, [(2.5, 1.7), (6.5, 1.7), (2.8, 4.6)], Walk(tuple(path), 0.5, 0.5))
+
+
+def slanted_flat() -> Building:
+    """Two rooms whose outer walls in the west and north are along no axis, and the wall between them neither."""
+    footprint = ((0.0, 0.0), (8.0, 0.0), (8.0, 5.0), (1.5, 4.0))
+    planes, faces = shell(footprint)
+    south, east, north, west = walls_of(footprint)
+    solids = _pierced((3.6, -0.2), (4.8, 5.2), [(2.3, DOORWAY_M[0], 0.0, DOORWAY_M[1])])
+    solids += furnished(south, "picture 1.5, portrait 5.6, picture 7.0") + furnished(east, "picture 1.2, portrait 3.4")
+    solids += furnished(north, "portrait 1.6, picture 5.0") + furnished(west, "picture 1.2, portrait 2.8")
+    hanging, lights = _lamps([(2.5, 2.0), (6.2, 2.3)])
+    path = ((2.4, 1.0), (3.4, 1.9), (4.2, 2.05), (5.4, 1.6), (6.9, 1.1), (7.0, 3.6), (5.6, 3.4), (4.2, 2.05), (3.2, 2.6), (2.3, 3.1), (1.4, 1.6))
+    return Building(Room(planes, faces, (*solids, *hanging), lights, DETAIL), Walk(path, 0.5, 0.5))
 
 
 def _office(west: float) -> list[Solid]:

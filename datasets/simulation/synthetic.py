@@ -27,15 +27,19 @@ from trihedron.pipeline.core.types import EXACT_DEPTH, F64, Bool, Camera, DepthN
 
 
 class Scene(Enum):
-    """Where the camera is: one furnished room, a corridor that ends where it began, two identical offices on a corridor, ten rooms in a circuit."""
+    """Where the camera is: one furnished room, a corridor that ends where it began, two identical offices on a corridor, ten rooms in a circuit,
+    an L-shaped flat, two rooms with slanted walls."""
 
     room = "room"
     corridor = "corridor"
     offices = "offices"
     rooms = "rooms"
+    flat = "flat"
+    slanted_flat = "slanted_flat"
 
 
-BUILDINGS = {Scene.corridor: buildings.corridor, Scene.offices: buildings.offices, Scene.rooms: buildings.rooms}
+BUILDINGS = {Scene.corridor: buildings.corridor, Scene.offices: buildings.offices, Scene.rooms: buildings.rooms,
+             Scene.flat: buildings.flat, Scene.slanted_flat: buildings.slanted_flat}  # fmt: skip
 ROOM_FRAMES = 150  # of the room, whose walk never ends
 FOCAL_PER_WIDTH = 525.0 / 640.0  # a Kinect's nominal colour camera
 
@@ -46,7 +50,7 @@ class Synthetic:
     """A furnished room of 5 × 4 × 2.7 m, or a building, ray traced when a frame is asked for. Frame i depends on the fields and i alone."""
 
     frames: Frames = ""  # part to make, half open: A:B, A:, :B; empty = all
-    scene: Scene = Scene.room  # room | corridor | offices | rooms
+    scene: Scene = Scene.room  # room | corridor | offices | rooms | flat | slanted_flat
     length: NonNegativeInt = 0  # frames; 0 = the scene's own: 150 of the room, once round a building (a longer walk goes on)
     fps: PositiveFloat = 30.0
     seed: NonNegativeInt = 0  # of textures, path and noise

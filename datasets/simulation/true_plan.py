@@ -17,20 +17,22 @@ LEAST_M2 = 0.5  # of a room
 
 @dataclass(frozen=True)
 class Doorway:
-    """A gap in a wall: its middle on the floor (2,), the unit direction of the wall (2,), width and height in metres."""
+    """A gap in a wall: its middle on the floor (2,), the unit direction of the wall (2,), width, heights of bottom and top in metres."""
 
     middle: F64
     along: F64
     width_m: float
+    bottom_m: float
     height_m: float
 
 
 @dataclass(frozen=True)
 class TruePlan:
-    """Rooms as rings of corners, each ring (n, 2) anticlockwise, followed by the rings of holes; doorways; height of the ceiling above the floor."""
+    """Rooms as rings of corners, each ring (n, 2) anticlockwise, followed by the rings of holes; doorways; windows between rooms; height of the ceiling above the floor."""
 
     rooms: list[list[F64]]
     doorways: list[Doorway]
+    windows: list[Doorway]
     height_m: float
 
 
@@ -43,7 +45,8 @@ def plan_of(room: Room) -> TruePlan:
     parts = [part for part in getattr(inside, "geoms", [inside]) if part.area > LEAST_M2]
     oriented = [shapely.geometry.polygon.orient(part.simplify(1e-4)) for part in parts]
     rooms = [[np.array(ring.coords)[:-1] for ring in (part.exterior, *part.interiors)] for part in oriented]
-    return TruePlan(rooms, [_doorway(wall) for wall in walls if _bottom(wall) > 0.0], HEIGHT_M)
+    gaps = [_doorway(wall, room) for wall in walls if _bottom(wall) > 0.0]
+    return TruePlan(rooms, [gap for gap in gaps if gap.bottom_m == 0.0], [gap for gap in gaps if gap.bottom_m > 0.0], HEIGHT_M)
 
 
 def _is_wall(solid: Solid) -> bool:
@@ -60,9 +63,13 @@ def _outline(solid: Solid) -> F64:
     return np.asarray(corners @ solid.R_world_solid[:2, :2].T + solid.centre[:2])
 
 
-def _doorway(lintel: Solid) -> Doorway:
+def _doorway(lintel: Solid, room: Room) -> Doorway:
+    """Make the gap below a lintel, which begins on the parapet of the same outline, if there is one."""
     long = int(np.argmax(lintel.half[:2]))
-    return Doorway(lintel.centre[:2], lintel.R_world_solid[:2, long], 2.0 * float(lintel.half[long]), _bottom(lintel))
+    below = [solid for solid in room.solids if np.allclose(solid.centre[:2], lintel.centre[:2]) and np.allclose(solid.half[:2], lintel.half[:2])]
+    parapets = [float(solid.centre[2] + solid.half[2]) for solid in below if solid is not lintel]
+    along = lintel.R_world_solid[:2, long]
+    return Doorway(lintel.centre[:2], along, 2.0 * float(lintel.half[long]), max(parapets, default=0.0), _bottom(lintel))
 
 
 def _footprint(room: Room) -> object:

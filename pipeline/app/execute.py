@@ -18,6 +18,7 @@ from omegaconf import DictConfig, OmegaConf
 from tqdm import tqdm
 
 from trihedron.pipeline.app.compilation import compile_once
+from trihedron.pipeline.app.viewers import Viewer, opened_viewer
 from trihedron.pipeline.core.config import Feedback, graph_of
 from trihedron.pipeline.core.errors import ConfigError, DataError, RecordingError, did_you_mean, printable
 from trihedron.pipeline.core.files import sha256_of
@@ -51,6 +52,11 @@ def execute(config: DictConfig, out: Path, overrides: list[str], began: float) -
     """Run the configuration into folder `out`; `began` is when the program started (perf_counter). Returns the metrics.
 
     Raises TrihedronError. Whatever happens after the first frame, the recording is closed and the trajectory so far is written."""
+    with opened_viewer(config) as viewer:
+        return _execute(config, out, overrides, began, viewer)
+
+
+def _execute(config: DictConfig, out: Path, overrides: list[str], began: float, viewer: Viewer) -> dict[str, Any]:
     forget_peak()
     if not 1 <= config.threads <= MAX_THREADS:
         raise ConfigError("threads", f"{config.threads} is not a number of threads", f"give 1 to {MAX_THREADS}")
@@ -60,7 +66,7 @@ def execute(config: DictConfig, out: Path, overrides: list[str], began: float) -
     replay = _replay(config, graph)
     frames = str(config.dataset.get("frames", "")) if config.dataset is not None else ""
     remembered, source = remembered_of(config, graph), source_of(config)
-    runner = Runner(graph, config.seed, config.threads, replay, frames, remembered, _pace(config))
+    runner = Runner(graph, config.seed, config.threads, replay, frames, remembered, _pace(config), preview_period=viewer.preview_period)
     topics = recorded_topics(config, graph, replay)
     _announce(runner)
     trial = partial(Runner, graph, config.seed, config.threads, replay, frames, remembered)
@@ -70,14 +76,14 @@ def execute(config: DictConfig, out: Path, overrides: list[str], began: float) -
         with _Warnings() as warnings, compilation_reported():
             warm_up(trial())
             warnings.muted = False
-            writer = RecordingWriter(out / RECORDING, {**metadata_of(config, overrides), TOPICS: json.dumps(sorted(topics))})
+            writer = RecordingWriter(out / RECORDING, {**metadata_of(config, overrides), TOPICS: json.dumps(sorted(topics))}, viewer.server)
             attachments = _attachments(graph, replay)
             for name, text in attachments.items():
                 writer.attach(name, text)
             truth = attached_truth(attachments, str(writer.path))
             started = time.perf_counter()
             try:
-                for _ in _progress(runner.steps(writer, topics, embed_frames="dataset" in topics, truth=truth)):
+                for _ in _progress(runner.steps(writer, topics, "dataset" in topics, truth, viewer.sinks)):
                     pass
                 if config.save_map:
                     save_map(Path(config.save_map).expanduser(), runner.state, metadata_of(config, overrides), source)

@@ -47,6 +47,27 @@ class RecordOptions:
 
 
 @dataclasses.dataclass
+class FoxgloveView:
+    """`view=foxglove`: a WebSocket server on this machine."""
+
+    viewer: str = "foxglove"
+    port: int = 8765
+
+
+@dataclasses.dataclass
+class RerunView:
+    """`view=rerun`: opens the viewer, or with `web=true` serves it to a browser."""
+
+    viewer: str = "rerun"
+    port: int = 9876  # of the data
+    web: bool = False
+    web_port: int = 9090
+
+
+VIEWS = {"foxglove": FoxgloveView, "rerun": RerunView}
+
+
+@dataclasses.dataclass
 class RunOptions:
     """The root keys of a run, besides one group for each slot (`trihedron plugins` lists them)."""
 
@@ -57,6 +78,7 @@ class RunOptions:
             {"graph": "structural"},
             {"experiment": None},
             {"without": None},
+            {"view": None},
             {"override hydra/job_logging": "none"},
             {"override hydra/hydra_logging": "none"},
             {"override hydra/launcher": "joblib"},
@@ -78,6 +100,7 @@ class RunOptions:
     load_map: str = ""  # go on from such a file
     localise_only: bool = False  # the loaded map stays as it is
     live: bool = False  # frames come at the camera's rate, and those for which the run comes too late are dropped
+    view: Any = None  # show the run while it goes on: foxglove or rerun
     real_time: bool = False  # frames come at the camera's rate, none is dropped
     hydra: Any = dataclasses.field(
         default_factory=lambda: {"run": {"dir": "${out}"}, "sweep": {"dir": "${out}", "subdir": "${hydra.job.num}"}, "output_subdir": ".hydra"}
@@ -117,6 +140,8 @@ def register_configs(recorded: RecordedConfig | None = None) -> None:
         for name, plugin in plugins_of(slot).items():
             node = option_type(name, plugin)
             store.store(group=slot, name=name, node=_with_defaults(node, recorded.options[slot]) if chosen.get(slot) == name else node)
+    for name, options in VIEWS.items():
+        store.store(group="view", name=name, node=options)
     store.repo.get("graph", {}).pop(f"{RECORDED_GRAPH}.yaml", None)
     choices = {"dataset": chosen.get("dataset", "synthetic"), "graph": "structural"}
     if recorded.graph is not None:
@@ -253,5 +278,7 @@ def _unknown_key(key: str) -> TrihedronError:
         all_options = {known for options in owners.values() for known in options}
         cure = f"it belongs to {group}={' or '.join(having)}" if having else did_you_mean(option, all_options)
         return ConfigError(key, f"the chosen plugin has no option '{option}'", cure)
+    if group == "view":
+        return ConfigError(key, "no viewer with this option is chosen", f"give view={' or view='.join(VIEWS)} too")
     known = {f.name for f in dataclasses.fields(RunOptions) if f.name not in ("defaults", "hydra")} | set(SLOTS)
     return ConfigError(key, "there is no such key", did_you_mean(key, known) if not group else "see trihedron run --help")

@@ -9,7 +9,7 @@ import stat
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import yaml
 
@@ -21,22 +21,26 @@ MAX_YAML_DEPTH = 20  # of nested lists and mappings
 SHOWN = 60  # characters of a stranger's text in a message
 
 
-def read_file(path: Path, limit: int) -> bytes:
-    """Return the bytes of a regular file. Raises OSError for more than `limit` bytes, and for a device, FIFO or socket, which may never end."""
+def open_file(path: Path) -> BinaryIO:
+    """Open a regular file for reading. Raises OSError, for a device, FIFO or socket too, which may never end."""
     try:
         descriptor = os.open(path, os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0))  # a FIFO blocks without
     except ValueError as error:  # a NUL in the name
         raise OSError(errno.EINVAL, os.strerror(errno.EINVAL)) from error
-    with os.fdopen(descriptor, "rb") as file:
-        found = os.fstat(descriptor)
-        if stat.S_ISDIR(found.st_mode):
-            raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR))
-        if not stat.S_ISREG(found.st_mode):
-            raise OSError(errno.EINVAL, "it is not a regular file")
-        data = file.read(found.st_size + 1) if found.st_size <= limit else b""
-        if found.st_size > limit or len(data) > limit:
-            raise OSError(errno.EFBIG, f"it has more than {limit} bytes")
-        return data
+    kind = os.fstat(descriptor).st_mode
+    if not stat.S_ISREG(kind):
+        os.close(descriptor)
+        raise OSError(errno.EISDIR, os.strerror(errno.EISDIR)) if stat.S_ISDIR(kind) else OSError(errno.EINVAL, "it is not a regular file")
+    return open(descriptor, "rb")
+
+
+def read_file(path: Path, limit: int) -> bytes:
+    """Return the bytes of a regular file. Raises OSError for another kind of file, and for more than `limit` bytes."""
+    with open_file(path) as file:
+        data = file.read(limit + 1) if os.fstat(file.fileno()).st_size <= limit else None
+    if data is None or len(data) > limit:
+        raise OSError(errno.EFBIG, f"it has more than {limit} bytes")
+    return data
 
 
 def sha256_of(path: str) -> str:

@@ -240,9 +240,12 @@ class Pose(Value):
 
     `reference` is the keyframe the pose is expressed against (-1: none yet) and `T_reference_camera` the pose relative to it. `inliers` counts
     points, lines and planes; `unobservable` the directions held at the prediction. `submap` is the part of the map whose world the pose is in (0: the
-    first; others have a world of their own until they are merged), `unrecognised` the number of frames of a lost camera without relocalisation."""
+    first; others have a world of their own until they are merged), `unrecognised` the number of frames of a lost camera without relocalisation.
 
-    version: ClassVar[int] = 2
+    `covariance` is that of the pose in the world: `noise_scale` times the covariance relative to the landmarks near it, plus `map_covariance`, that
+    of these landmarks' common pose in the world. `noise_scale` is the variance of the residuals relative to the stated one."""
+
+    version: ClassVar[int] = 3
 
     T_world_camera: Annotated[F64, Shape(4, 4), Rotations()]
     covariance: Annotated[F64, Shape(6, 6), Finite()]
@@ -254,6 +257,13 @@ class Pose(Value):
     reason: str
     submap: Annotated[int, Within(0, 2**31)] = 0
     unrecognised: int = 0
+    map_covariance: Annotated[F64, Shape(6, 6), Finite()] = field(default_factory=lambda: np.zeros((6, 6)))
+    noise_scale: Annotated[float, Finite()] = 1.0
+
+    @property
+    def local_covariance(self) -> F64:
+        """Covariance (6, 6) relative to the landmarks near the pose, by the stated noise of the measurements."""
+        return (self.covariance - self.map_covariance) / self.noise_scale
 
 
 @dataclass(frozen=True)
@@ -354,6 +364,7 @@ KEYFRAMES = Columns(
         "stamp_ns": ("i8", ()),
         "T_world_camera": ("f8", (4, 4), Rotations()),
         "covariance": ("f8", (6, 6), Finite()),
+        "world_covariance": ("f8", (6, 6), Finite()),
         "intrinsics": ("f8", (4,), Finite()),
         "points": ("i4", (2,), IndexInto(".point_observations+")),
         "lines": ("i4", (2,), IndexInto(".line_observations+")),
@@ -419,7 +430,7 @@ class Map(Value):
 
     `revision` counts versions; a row of `point_observations` and its siblings is a keyframe (row), a landmark, and its measurement."""
 
-    version: ClassVar[int] = 4
+    version: ClassVar[int] = 5
     revision: int
     keyframes: Annotated[Table, KEYFRAMES]
     points: Annotated[Table, POINTS]

@@ -34,6 +34,7 @@ from mcap.writer import MCAP0_MAGIC
 from numpy.typing import NDArray
 
 from trihedron.pipeline.core.errors import RecordingError, printable
+from trihedron.pipeline.core.files import open_file
 
 FOOTER_BYTES = 9 + 20 + len(MCAP0_MAGIC)  # of the footer and the end mark
 MAX_INDEX_BYTES = 64 << 20  # of the summary at the end of the file
@@ -73,7 +74,7 @@ class McapFile:
     def __init__(self, path: Path | str) -> None:
         self.path = Path(path)
         try:
-            self._file = open(self.path, "rb")
+            self._file = open_file(self.path)
             self._size = os.fstat(self._file.fileno()).st_size
         except OSError as error:
             raise RecordingError(str(path), f"cannot be read: {error.strerror}", "give the path of an MCAP file") from error

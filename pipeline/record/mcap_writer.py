@@ -10,6 +10,7 @@ from __future__ import annotations
 import logging
 import os
 import threading
+import time
 from collections import deque
 from collections.abc import Callable, Iterable
 from pathlib import Path
@@ -18,51 +19,56 @@ import foxglove
 from foxglove.mcap import MCAPWriteOptions
 
 from trihedron.pipeline.core.errors import RecordingError
+from trihedron.pipeline.record.foxglove_server import FoxgloveServer
 from trihedron.pipeline.record.mcap_file import is_being_written
 
 log = logging.getLogger("trihedron")
 Messages = Iterable[tuple[int, int, bytes]]  # channel, log time in ns, content
 CHUNK_BYTES = 4 << 20  # an entry of the index is worth more messages
 FLUSH_SECONDS = 0.4
+LIVE_SECONDS = 0.03  # between two looks at the queue where a viewer waits
 LEVEL = 1  # of zstd: 2 takes a quarter more time for 7 % fewer bytes
 MESSAGE_OVERHEAD = 64  # bytes of a message beside its data, generously
 MAX_QUEUE_BYTES = 64 << 20  # a run that is faster than the disk waits from there on
 
 
 class McapWriter:
-    """One file. Once the disk refuses it, a warning reports that, what follows is dropped, so that the run can go on, and `close` raises
-    RecordingError."""
+    """One file, or none; `server` sends the same messages to viewers at once. Once the disk refuses the file, a warning reports that, what follows is
+    dropped, so that the run can go on, and `close` raises RecordingError."""
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path | None, server: FoxgloveServer | None = None) -> None:
         """Raises RecordingError when the file cannot be written or another process is writing it."""
         self.path = path
-        self._file = _File(path)
-        self._context = foxglove.Context()
+        self._context = server.context if server is not None else foxglove.Context()
+        self._period_s = LIVE_SECONDS if server is not None else FLUSH_SECONDS
+        self._file = _File(path) if path is not None else None
         options = MCAPWriteOptions(chunk_size=CHUNK_BYTES, compression_level=LEVEL, compression_threads=0, disable_seeking=True)
-        self._writer = foxglove.open_mcap(self._file, context=self._context, writer_options=options)
+        self._writer = foxglove.open_mcap(self._file, context=self._context, writer_options=options) if self._file is not None else None
         self._channels: list[foxglove.Channel] = []
         self._queue: deque[tuple[int, Callable[[], Messages]]] = deque()
         self._queued_bytes, self._taken_bytes = 0, 0  # each is written by one thread alone, so that queueing a message takes no lock
         self._closing = False
         self._mistake: BaseException | None = None  # of a queued function
         self._enough, self._room, self._writing = threading.Event(), threading.Event(), threading.Lock()
-        self._thread = threading.Thread(target=self._work, name=f"writer of {path.name}", daemon=True)
+        self._thread = threading.Thread(target=self._work, name=f"writer of {path}", daemon=True)
         self._thread.start()
 
     @property
     def failure(self) -> OSError | None:
         """Why the disk refused the file, or None."""
-        return self._file.failure
+        return self._file.failure if self._file is not None else None
 
     def metadata(self, name: str, content: dict[str, str]) -> None:
         """Add a metadata record."""
-        with self._writing:
-            self._writer.write_metadata(name, content)
+        if self._writer is not None:
+            with self._writing:
+                self._writer.write_metadata(name, content)
 
     def attach(self, name: str, text: str) -> None:
         """Add a text file."""
-        with self._writing:
-            self._writer.attach(log_time=0, create_time=0, name=name, media_type="text/plain", data=text.encode())
+        if self._writer is not None:
+            with self._writing:
+                self._writer.attach(log_time=0, create_time=0, name=name, media_type="text/plain", data=text.encode())
 
     def channel(self, topic: str, schema: str, encoding: str, definition: bytes, message_encoding: str) -> int:
         """Declare a channel; returns its number. For the queued functions to call: no other thread writes then."""
@@ -88,7 +94,7 @@ class McapWriter:
         """Write what is queued."""
         with self._writing:
             self._take_all()
-        self._file.sync()
+            self._end_chunk()
 
     def close(self) -> None:
         """Write what is queued, and the index; the file is complete only then. Raises RecordingError when that, or anything before, failed."""
@@ -97,10 +103,12 @@ class McapWriter:
         self._closing = True
         self._enough.set()
         self._thread.join()
-        self._writer.close()
+        if self._writer is not None:
+            self._writer.close()
         for channel in self._channels:
             channel.close()
-        self._file.close()
+        if self._file is not None:
+            self._file.close()
         if self._mistake is not None:
             raise self._mistake
         if self.failure is not None:
@@ -108,21 +116,31 @@ class McapWriter:
             raise RecordingError(str(self.path), f"cannot be written: {self.failure.strerror}", cure) from self.failure
 
     def _work(self) -> None:
-        closing = False
+        closing = pending = False
+        flushed_s = time.monotonic()
         while not closing:
-            self._enough.wait(FLUSH_SECONDS)
+            self._enough.wait(self._period_s)
             self._enough.clear()
             closing = self._closing
-            if self._queue:
-                with self._writing:
-                    self._take_all()
-                self._file.sync()
+            with self._writing:
+                pending = self._take_all() or pending
+                if pending and (closing or self._period_s == FLUSH_SECONDS or time.monotonic() - flushed_s >= FLUSH_SECONDS):
+                    self._end_chunk()
+                    pending, flushed_s = False, time.monotonic()
             self._room.set()
 
-    def _take_all(self) -> None:
-        for _ in range(len(self._queue)):
+    def _take_all(self) -> bool:
+        """Write the messages of all queued functions; return True if there were any."""
+        count = len(self._queue)
+        for _ in range(count):
             self._take()
-        self._writer.flush()
+        return count > 0
+
+    def _end_chunk(self) -> None:
+        """End the chunk, and wait until the disk has it."""
+        if self._writer is not None and self._file is not None:
+            self._writer.flush()
+            self._file.sync()
 
     def _take(self) -> None:
         """Write the messages of the oldest queued function."""

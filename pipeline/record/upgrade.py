@@ -2,17 +2,27 @@
 
 from __future__ import annotations
 
+import json
+from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
+from typing import Any
+
+import numpy as np
 
 from trihedron.pipeline.core.errors import RecordingError, printable
+from trihedron.pipeline.record.array_codec import Numbers, array_parts
 from trihedron.pipeline.record.codec import FORMAT, FRAMES_TOPIC, METADATA, READABLE, Decoder, Encoder, ValueMessage
 from trihedron.pipeline.record.mcap_file import McapFile, damaged
 from trihedron.pipeline.record.mcap_writer import McapWriter
 
 RENAMED_TYPES: dict[str, str] = {}  # name in an older recording -> name today, where only the name changed
 RENAMED_FIELDS: dict[str, dict[str, str]] = {}  # type today -> older name of a field or table -> name today
+ADDED_FIELDS = {  # type and older version -> fields that it lacks, encoded
+    ("Pose", 2): b"".join([*array_parts("map_covariance", np.zeros((6, 6))), Numbers({"noise_scale": float}).fields([1.0])])
+}
+ADDED_COLUMNS = {("Map", 4): ("keyframes", "world_covariance", "covariance")}  # likewise -> table, the column that it lacks, and that which it copies
 
 
 @dataclass
@@ -97,13 +107,32 @@ def _decoder(file: McapFile, channel: int) -> Decoder:
 
 
 def _renamed(data: bytes) -> bytes:
-    """A message with the names of today."""
-    if not RENAMED_TYPES and not RENAMED_FIELDS:
-        return data
+    """A message with the names, fields and columns of today."""
     message = ValueMessage.FromString(data)
     message.type = RENAMED_TYPES.get(message.type, message.type)
-    fields = RENAMED_FIELDS.get(message.type, {})
-    for array in message.arrays if fields else ():
+    fields, older = RENAMED_FIELDS.get(message.type, {}), (message.type, message.version)
+    if not fields and older not in ADDED_FIELDS and older not in ADDED_COLUMNS:
+        return data
+    for array in message.arrays:
         name, mark, rest = array.name.partition("#")
         array.name = fields.get(name, name) + mark + rest
-    return bytes(message.SerializeToString())
+    if older in ADDED_COLUMNS:
+        with suppress(Exception):  # a stranger's header, of which the decoder will say what is wrong
+            _copy_column(message, *ADDED_COLUMNS[older])
+    message.version += int(older in ADDED_FIELDS or older in ADDED_COLUMNS)
+    return bytes(message.SerializeToString() + ADDED_FIELDS.get(older, b""))
+
+
+def _copy_column(message: Any, table: str, column: str, source: str) -> None:
+    """Add a column to a table, or to a change of it, as a copy of another one."""
+    arrays = {array.name: array for array in message.arrays}
+    header = json.loads(arrays[f"{table}#"].data)
+    if source not in header["schema"]:
+        return
+    header["schema"][column] = header["schema"][source]
+    if source in header["rows"]:
+        header["rows"][column] = header["rows"][source]
+        copied = message.arrays.add()
+        copied.CopyFrom(arrays[f"{table}#{source}"])
+        copied.name = f"{table}#{column}"
+    arrays[f"{table}#"].data = json.dumps(header).encode()

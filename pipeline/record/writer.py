@@ -16,6 +16,7 @@ from trihedron.pipeline.core.slots import SLOTS
 from trihedron.pipeline.core.types import Value
 from trihedron.pipeline.record.codec import FORMAT, FRAMES_TOPIC, METADATA, TIMING_TOPIC, Encoder, ValueMessage
 from trihedron.pipeline.record.foxglove import View
+from trihedron.pipeline.record.foxglove_server import FoxgloveServer
 from trihedron.pipeline.record.mcap_writer import McapWriter
 
 SPARSE_BYTES = 1 << 15  # assumed size of a value of a topic that is not dense
@@ -35,9 +36,10 @@ class RecordingWriter:
 
     Metadata comes first. When the file cannot be written any more, a warning reports it, and `close` raises RecordingError."""
 
-    def __init__(self, path: Path, metadata: Mapping[str, str]) -> None:
+    def __init__(self, path: Path | None, metadata: Mapping[str, str], server: FoxgloveServer | None = None) -> None:
+        """Write to a file, or none; what viewers show goes to `server` too."""
         self.path = path
-        self._file = McapWriter(path)
+        self._file = McapWriter(path, server)
         self._file.metadata(METADATA, {"format": FORMAT, **metadata})
         self._channels: dict[str, int] = {}
         self._encoders: dict[str, Encoder] = {}
@@ -66,7 +68,8 @@ class RecordingWriter:
                 self._add(topic, values.popleft()[1])
 
     def _add(self, topic: str, value: Value) -> None:
-        self._file.add(_memory_bytes(value), lambda: self._encoded(topic, value))
+        if self.path is not None:
+            self._file.add(_memory_bytes(value), lambda: self._encoded(topic, value))
 
     def show(self, view: View, value: Value, stamp_ns: int) -> None:
         """Add the viewer messages of a value; they are drawn by the writer's thread."""

@@ -14,7 +14,7 @@ from trihedron.pipeline.core.types import DEGRADED, LOST, OK, Pose
 class Poses(Sequence[Pose]):
     """A sequence of poses in frame order, stored as numbers: the rows of rigid motions and the upper triangles of covariances."""
 
-    _REALS, _WHOLE = 12 + 12 + 21, 11  # numbers a pose
+    _REALS, _WHOLE = 12 + 12 + 21 + 21 + 1, 11  # numbers a pose
     _STATUSES = (OK, DEGRADED, LOST)
     _UPPER = np.triu_indices(6)
     _LAST_ROW = np.array([0.0, 0.0, 0.0, 1.0])
@@ -26,8 +26,9 @@ class Poses(Sequence[Pose]):
 
     def append(self, pose: Pose) -> None:
         """Append one pose."""
-        for numbers in (pose.T_world_camera[:3], pose.T_reference_camera[:3], pose.covariance[self._UPPER]):
+        for numbers in (pose.T_world_camera[:3], pose.T_reference_camera[:3], pose.covariance[self._UPPER], pose.map_covariance[self._UPPER]):
             self._reals.frombytes(numbers.tobytes())
+        self._reals.append(pose.noise_scale)
         self._reasons += pose.reason.encode()
         counts = pose.inliers.tolist()
         self._whole.extend((pose.index, pose.stamp_ns, pose.reference, *counts, pose.unobservable, pose.submap, pose.unrecognised))
@@ -49,9 +50,11 @@ class Poses(Sequence[Pose]):
         k = range(len(self))[at]
         reals = np.array(self._reals[k * self._REALS : (k + 1) * self._REALS])
         T, T_reference = (np.vstack([rows.reshape(3, 4), self._LAST_ROW]) for rows in (reals[:12], reals[12:24]))
-        covariance = np.empty((6, 6))
-        covariance[self._UPPER] = covariance.T[self._UPPER] = reals[24:]
+        covariances = np.empty((2, 6, 6))
+        for covariance, numbers in zip(covariances, (reals[24:45], reals[45:66])):
+            covariance[self._UPPER] = covariance.T[self._UPPER] = numbers
         index, stamp_ns, reference, *inliers, unobservable, submap, unrecognised, state, end = self._whole[k * self._WHOLE : (k + 1) * self._WHOLE]
         counts, reason = np.array(inliers, np.int32), self._reasons[self._whole[k * self._WHOLE - 1] if k else 0 : end].decode()
         status = self._STATUSES[state]
-        return Pose(index, stamp_ns, T, covariance, T_reference, reference, counts, unobservable, status, reason, submap, unrecognised)
+        first, second = (index, stamp_ns, T, covariances[0], T_reference, reference), (counts, unobservable, status, reason, submap, unrecognised)
+        return Pose(*first, *second, covariances[1], float(reals[66]))

@@ -16,7 +16,7 @@ from trihedron.pipeline.run.timing import resident_mb
 
 
 class Recorder:
-    """Writes the values of the chosen topics, what viewers show, the references to the frames and the times."""
+    """A sink that writes the values of the chosen topics, what viewers show, the references to the frames and the times."""
 
     def __init__(self, writer: RecordingWriter, plan: Plan, topics: frozenset[str], embed_frames: bool, truth: Trajectory | None) -> None:
         self._writer, self._topics = writer, topics if embed_frames else topics - {"dataset"}
@@ -39,6 +39,10 @@ class Recorder:
         if isinstance(frame, Frame):
             return FrameReference(frame.index, frame.stamp_ns, frame.camera)
         return self._reference(index) if self._reference is not None else None
+
+    def preview(self, name: str, value: Value) -> None:
+        """Show viewers what a fold has so far."""
+        self._writer.show(self._view, value, value.stamp_ns)
 
     def fold(self, name: str, value: Value) -> None:
         """Write the result of a fold."""

@@ -7,7 +7,8 @@ from __future__ import annotations
 
 import time
 import zlib
-from collections.abc import Callable, Iterator, Mapping
+from collections import deque
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
@@ -31,6 +32,7 @@ from trihedron.pipeline.run.memory import malloc_trim
 from trihedron.pipeline.run.recorder import Recorder
 from trihedron.pipeline.run.replay import RECORDED, Replay, plan_run
 from trihedron.pipeline.run.scheduler import Node, NodeFailure, NoMoreFrames, Scheduler, single_threaded_libraries
+from trihedron.pipeline.run.sinks import Sink
 from trihedron.pipeline.run.state import DelayLines, StateBuffer, max_delays, recorded_delay_lines
 from trihedron.pipeline.run.value_checks import check_together, checked
 
@@ -62,9 +64,11 @@ class Runner:
         initial: Callable[[int], DelayLines] | None = None,
         pace: Pace = Pace.none,
         on_value: Callable[[int, str, Value | None], None] | None = None,
+        preview_period: int = 0,
     ) -> None:
         """`initial` returns the values of delayed wires before the frame of a given number, `pace` is when frames may be read. `on_value` is called
-        with position, stage and value as soon as a stage is done with a frame, from any thread."""
+        with position, stage and value as soon as a stage is done with a frame, from any thread. Every
+        `preview_period` frames sinks get what a fold has so far, if its plugin has a method `preview(state)`; 0: never."""
         self._on_value = on_value
         self.graph, self.seed, self.threads, self.replay = graph, seed, threads, replay
         self.feed = feed_of(graph.stages["dataset"].plugin, pace) if replay is None else None
@@ -81,27 +85,35 @@ class Runner:
         self._validation = FrameValidation(self.plan.stamps_ns, self.count if self.feed is None else 0)
         self._sources = str(replay.recording.path) if replay is not None else "load_map" if self.initial.held else ""  # files of inputs
         self._fold_states: dict[str, Any] = {}
+        self._preview_period = preview_period
+        self._previews: deque[tuple[str, Value]] = deque()
+        self._sinks: tuple[Sink, ...] = ()
 
     def steps(
-        self, writer: RecordingWriter | None, topics: frozenset[str], embed_frames: bool = False, truth: Trajectory | None = None
+        self,
+        writer: RecordingWriter | None,
+        topics: frozenset[str],
+        embed_frames: bool = False,
+        truth: Trajectory | None = None,
+        sinks: Sequence[Sink] = (),
     ) -> Iterator[Step]:
-        """Run, yielding each finished frame; values of `topics` go to the writer, with what viewers show, errors by `truth` too.
-        Raises TrihedronError (StageError names stage and frame)."""
+        """Run, yielding each finished frame; values of `topics` go to the writer, with what viewers show, errors by `truth` too, and all values to
+        the sinks. Raises TrihedronError (StageError names stage and frame)."""
         first = self.indices[0]
         recent = {topic: {index - first: value for index, value in values.items()} for topic, values in self.initial.recent.items()}
         scheduler = Scheduler(self._nodes(), self.threads, self.threads, self.initial.held, recent)
-        recorder = Recorder(writer, self.plan, topics, embed_frames, truth) if writer is not None else None
+        self._sinks = (*([Recorder(writer, self.plan, topics, embed_frames, truth)] if writer is not None else []), *sinks)
         try:
             with single_threaded_libraries(), self._feeding(), Interrupts() as interrupts:
                 for position, values in scheduler.run(self.count):
                     with interrupts.held():
-                        self._take(position, values, recorder)
+                        self._take(position, values)
                     yield Step(position, self.count, self.indices[position], values)
                 if "map" not in self.computed:
                     self.result.map = self._recorded_map()
                 for name in self.computed:
                     if self.graph.stages[name].fold:
-                        self._finish_fold(name, recorder)
+                        self._finish_fold(name)
         except NodeFailure as failure:
             raise self._explain(failure, writer) from failure.__cause__
 
@@ -118,12 +130,17 @@ class Runner:
         finally:
             self.feed.stop()
 
-    def _take(self, position: int, values: Mapping[str, Any], recorder: Recorder | None) -> None:
+    def _take(self, position: int, values: Mapping[str, Any]) -> None:
         """Account for a finished frame and record it."""
         index, accounts = self.indices[position], self._accounts
         self.state.append(index, values)
-        if accounts.take(position, index, values, self.count, position in self._validation.late) and recorder is not None:
-            recorder.frame(index, accounts.stamps_ns[index], values, accounts.times[position])
+        if accounts.take(position, index, values, self.count, position in self._validation.late):
+            for sink in self._sinks:
+                sink.frame(index, accounts.stamps_ns[index], values, accounts.times[position])
+            while self._previews:
+                name, value = self._previews.popleft()
+                for sink in self._sinks:
+                    sink.preview(name, value)
         accounts.forget(position, index)
         if (position + 1) % TRIM_EVERY == 0:
             malloc_trim()
@@ -196,7 +213,9 @@ class Runner:
         value = None
         if stage.fold:
             state = self._fold_states[stage.name] if stage.name in self._fold_states else stage.plugin.start()
-            self._fold_states[stage.name] = stage.plugin.add(state, **arguments)
+            self._fold_states[stage.name] = state = stage.plugin.add(state, **arguments)
+            if self._preview_period and (position + 1) % self._preview_period == 0 and hasattr(stage.plugin, "preview"):
+                self._previews.append((stage.name, stage.plugin.preview(state)))
         else:
             value = stage.plugin(**arguments)
         self._accounts.stage_called(position, stage.name, began, time.perf_counter())
@@ -216,15 +235,15 @@ class Runner:
         if not computed.issuperset(topics.values()):
             check_together(arguments, self._sources, topics, computed)
 
-    def _finish_fold(self, name: str, recorder: Recorder | None) -> None:
+    def _finish_fold(self, name: str) -> None:
         plugin = self.graph.stages[name].plugin
         state = self._fold_states.pop(name) if name in self._fold_states else plugin.start()
         began = time.perf_counter()
         value = plugin.finish(state, self.result.map)
         self.timing.add_finish(name, 1e3 * (time.perf_counter() - began))
         self.result.folds[name] = value
-        if recorder is not None:
-            recorder.fold(name, value)
+        for sink in self._sinks:
+            sink.fold(name, value)
 
     def fold_state(self, name: str) -> Any:
         """Return the state of a fold so far, that of no frame before its first; to be read while its stage is not called."""
@@ -245,7 +264,7 @@ class Runner:
             return error
         index, stage = [*self.indices[failure.position : failure.position + 1], failure.position][0], failure.node
         cure = ""
-        if writer is not None:
+        if writer is not None and writer.path is not None:
             cure = f"repeat only that with: trihedron run replay={writer.path} only=[{stage}] dataset.frames={index}:{index + 1}"
         plugin = type(self.graph.stages[stage].plugin).__name__ if stage in self.graph.stages else "recording"
         return StageError(f"{stage} ({plugin}), frame {index}", f"{type(error).__name__}: {error}", cure)

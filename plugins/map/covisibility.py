@@ -97,7 +97,7 @@ class Covisibility(KeyframeOptions):
         found = associate(map, frame.camera, pose.T_world_camera, keypoints, segments, planes, matches, self.line_sigma_px, self.judge)
         expected = self._expected_planes(map, frame, pose, matches)
         map, row = add_keyframe(map, pose, frame.camera)
-        view = Observations(row, frame.camera, pose.T_world_camera, pose.covariance)
+        view = Observations(row, frame.camera, pose.T_world_camera, pose.local_covariance)
         if matches is not None:
             map = count_visible(map, matches.visible_points, matches.visible_lines, expected)
         map = insert_points(map, view, keypoints, found.points, found.new_points, self.memory)

@@ -59,7 +59,7 @@ def _in_doubt(options: KeyframeOptions, pose: Pose, keyframes: Table) -> bool:
     decides."""
     if pose.status == OK or pose.reference < 0 or _weighted(pose.inliers.tolist()) < options.doubt_score:
         return False
-    covariances: list[F64] = [pose.covariance, keyframes.row("covariance", pose.reference)]
+    covariances: list[F64] = [pose.local_covariance, keyframes.row("covariance", pose.reference)]
     sigma, reference = (float(np.linalg.eigvalsh(covariance[:3, :3])[-1]) ** 0.5 for covariance in covariances)
     return sigma > options.doubt_sigmas * max(reference, options.doubt_floor_m)
 

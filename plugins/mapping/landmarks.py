@@ -15,7 +15,8 @@ KEYFRAMES = {
     "index": Column("i4"),  # frame number
     "stamp_ns": Column("i8"),
     "T_world_camera": Column("f8", (4, 4)),
-    "covariance": Column("f8", (6, 6)),  # of its pose, see types
+    "covariance": Column("f8", (6, 6)),  # of its pose relative to the landmarks near it, see types
+    "world_covariance": Column("f8", (6, 6)),  # of its pose in the world
     "intrinsics": Column("f8", (4,)),  # fx, fy, cx, cy
     "points": Column("i4", (2,)),  # its rows of the observation tables, half open
     "lines": Column("i4", (2,)),

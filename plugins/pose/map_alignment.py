@@ -8,8 +8,8 @@ import numpy as np
 
 from trihedron.pipeline.core.types import F64, I32, Camera, Keypoints, Map, Matches, Planes, Segments
 from trihedron.plugins.mapping.projection import line_terms, plane_terms, point_terms
-from trihedron.plugins.shared.pose_optimizer import LANDMARK_SCORE, PoseSolution, Terms, classify_terms, first_step, solve_pose
-from trihedron.plugins.shared.pose_optimizer_kernels import Flags
+from trihedron.plugins.shared.pose_optimizer import LANDMARK_SCORE, PoseSolution, Terms, classify_terms, first_step, grouped_equations, solve_pose
+from trihedron.plugins.shared.pose_optimizer_kernels import Flags, Groups
 
 
 @dataclass(frozen=True)
@@ -93,6 +93,18 @@ class MapAlignment:
         flags = solution.points, solution.lines, solution.planes[:same]
         points, lines, planes = (int(np.count_nonzero(kind)) for kind in flags)
         return InlierStatistics((points, lines, planes), (len(self.matches.keypoints), len(self.matches.segments), same))
+
+    def equations_by_keyframe(self, solution: PoseSolution) -> tuple[I32, F64, F64]:
+        """The keyframes (k,) that created the landmarks which agree with a solution, and the normal equations of each one's landmarks: information
+        (k, 6, 6) and score (k, 6)."""
+        map, matches = self.map, self.matches
+        planes = np.concatenate([pairs[:, 1] for pairs in (matches.planes, matches.parallel, matches.perpendicular)])
+        tables = (map.points, matches.keypoints[:, 1]), (map.lines, matches.segments[:, 1]), (map.planes, planes)
+        first = [table.rows("first", ids) for table, ids in tables]
+        keyframes, numbers = np.unique(np.concatenate(first), return_inverse=True)
+        groups = Groups(*(part.astype(np.int32) for part in np.split(numbers, np.cumsum([len(part) for part in first[:2]]))))
+        T, flags = solution.T_world_camera, Flags(solution.points, solution.lines, solution.planes)
+        return keyframes, *grouped_equations(T, self.camera, self.terms(T), flags, groups, len(keyframes))
 
     def landmarks(self, solution: PoseSolution) -> tuple[I32, I32, I32]:
         """Ids of the points, lines and planes that agree with a solution."""

@@ -29,8 +29,8 @@ from trihedron.pipeline.core.types import (
 from trihedron.plugins.mapping.reference_keyframe import reference_of, submap_of, transform_to_map
 from trihedron.plugins.pose.decoupled_pose import FIRST_SIGMA, Decoupled, decoupled_pose
 from trihedron.plugins.pose.dynamic_objects import DynamicObjectOptions, solve_with_static, status_with_static
-from trihedron.plugins.pose.keyframe_uncertainty import degrade_by_keyframes
 from trihedron.plugins.pose.map_alignment import InlierStatistics, MapAlignment, TrackingStatus
+from trihedron.plugins.pose.world_uncertainty import carried, degrade_by_keyframes, in_world
 from trihedron.plugins.shared.pose_optimizer import PoseSolution
 
 EYE = np.eye(3)
@@ -45,7 +45,7 @@ class Refine:
     The decoupled rotation is a prior with its own covariance; the decoupled position is a weak prior (`position_sigma_m`), since the same features
     produced it. Without a map the decoupled pose stands. A lost pose is only an initial guess: it is relocalised when enough of the map agrees on a
     pose with all directions observable, else it stays lost; a pose that neither the previous frame nor the map supports is lost. The status then
-    follows from the inliers, from dynamic objects (`dynamic_objects.py`), and from the keyframes' uncertainty (`keyframe_uncertainty.py`)."""
+    follows from the inliers, from dynamic objects (`dynamic_objects.py`), and from the keyframes' uncertainty (`world_uncertainty.py`)."""
 
     position_sigma_m: PositiveFloat = 0.05  # of the decoupled position, a weak prior
     rotation_sigma_deg: PositiveFloat = 0.2  # added to the rotation's own: no scene is exactly Manhattan
@@ -98,15 +98,15 @@ class Refine:
             return self._stay_lost(start, rotation, previous, searched, map, submap)
         if rotation.source == "prediction" and not self._is_tracked(inliers):
             reason = f"the rotation was not measured, and only {inliers.total} of {inliers.matches} matches with the map agree"
-            return replace(start, status=LOST, reason=reason).to_pose(rotation, map, submap=submap)
+            return carried(replace(start, status=LOST, reason=reason).to_pose(rotation, map, submap=submap), previous)
         if not inliers.total:
-            return start.to_pose(rotation, map, "nothing of the map was found, pose from the previous frame", submap)
+            return carried(start.to_pose(rotation, map, "nothing of the map was found, pose from the previous frame", submap), previous)
         status = self._status(problem, solution, static, inliers, rotation, submap)
         T, held, counts = solution.T_world_camera, solution.unobservable.shape[1], np.array(inliers.inliers, np.int32)
         reference, T_reference_camera = reference_of(map, T, submap)
-        return Pose(
-            rotation.index, rotation.stamp_ns, T, status.covariance, T_reference_camera, reference, counts, held, status.status, status.reason, submap
-        )
+        stamps = rotation.index, rotation.stamp_ns
+        pose = Pose(*stamps, T, status.covariance, T_reference_camera, reference, counts, held, status.status, status.reason, submap)
+        return in_world(pose, previous, solution, problem)
 
     def localising(self) -> Refine:
         """Return the refinement of a camera that begins no sub-map: where the loaded map does not reach it stays lost."""
@@ -173,7 +173,7 @@ class Refine:
         definition."""
         unrecognised = previous.unrecognised + int(searched)
         if not self.submap_after or unrecognised < self.submap_after:
-            return replace(start.to_pose(rotation, map, submap=submap), unrecognised=unrecognised)
+            return carried(replace(start.to_pose(rotation, map, submap=submap), unrecognised=unrecognised), previous)
         number = int(map.keyframes.column("submap").max(initial=0)) + 1
         reason = f"first frame of sub-map {number}: relocalisation failed for {unrecognised} frames"
         new = replace(start, covariance=FIRST_SIGMA**2 * np.eye(6), status=DEGRADED, reason=reason)

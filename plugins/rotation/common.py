@@ -31,7 +31,7 @@ def rotation_before(previous: Rotation, previous_pose: Pose | None, floor_deg: f
     `floor_deg` is the least σ of the latter: the map that it was refined against drifts, which its covariance does not include."""
     if previous_pose is not None and previous_pose.index == previous.index and previous_pose.status != LOST:
         floor = IDENTITY * math.radians(floor_deg) ** 2
-        return Estimate(previous_pose.T_world_camera[:3, :3], previous_pose.covariance[3:, 3:] + floor, previous.source), True
+        return Estimate(previous_pose.T_world_camera[:3, :3], previous_pose.local_covariance[3:, 3:] + floor, previous.source), True
     return Estimate(previous.R_world_camera, previous.covariance, previous.source), False
 
 

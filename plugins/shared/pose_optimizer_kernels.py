@@ -69,6 +69,14 @@ class Flags(NamedTuple):
     planes: U8
 
 
+class Groups(NamedTuple):
+    """Number of the group that each term belongs to."""
+
+    points: I32
+    lines: I32
+    planes: I32
+
+
 class Chi2(NamedTuple):
     """Squared Mahalanobis norm of each residual; inf when it cannot be projected (a line without depth has inf in `line_depths`)."""
 
@@ -574,6 +582,35 @@ def linearise(
     cost = _add_points(R, t, camera, points, weights.points, flags.points, robust, free, H, g, chi2.points)
     cost += _add_lines(R, t, camera, lines, weights.lines, weights.line_depths, flags.lines, robust, H, g, chi2.lines, chi2.line_depths)
     return cost + _add_planes(R, t, planes, weights.planes, flags.planes, H, g, chi2.planes)
+
+
+@kernel
+def add_scores(
+    R: F64, t: F64, camera: F64, points: PointTerms, lines: LineTerms, planes: PlaneTerms, flags: Flags, groups: Groups, H: F64, g: F64
+) -> None:
+    """Add the normal equations of each term but the outliers to those of its group: H (k, 6, 6), lower triangles, and g (k, 6)."""
+    n, m, p = len(points.positions_m), len(lines.endpoints_m), len(planes.kinds)
+    weights = Weights(np.empty((n, 3, 3)), np.empty((m, 2, 2)), np.empty((m, 2, 2)), np.empty((p, 3, 3)))
+    chi2 = Chi2(np.empty(n), np.empty(m), np.empty(m), np.empty(p))
+    fill_weights(R, t, camera, points, lines, planes, weights)
+    for i in range(n):
+        a, b, k = i, i + 1, groups.points[i]
+        one = PointTerms(
+            points.positions_m[a:b], points.covariance_m2[a:b], points.pixels[a:b], points.depth_m[a:b], points.sigma_px[a:b], points.sigma_m[a:b]
+        )
+        _add_points(R, t, camera, one, weights.points[a:b], flags.points[a:b], False, 6, H[k], g[k], chi2.points[a:b])
+    for i in range(m):
+        a, b, k = i, i + 1, groups.lines[i]
+        line = LineTerms(
+            lines.endpoints_m[a:b], lines.covariance_m2[a:b], lines.endpoints_px[a:b], lines.sigma_px[a:b], lines.observed_m[a:b],
+            lines.observed_covariance_m2[a:b],
+        )  # fmt: skip
+        W, V = weights.lines[a:b], weights.line_depths[a:b]
+        _add_lines(R, t, camera, line, W, V, flags.lines[a:b], False, H[k], g[k], chi2.lines[a:b], chi2.line_depths[a:b])
+    for i in range(p):
+        a, b, k = i, i + 1, groups.planes[i]
+        plane = PlaneTerms(planes.kinds[a:b], planes.coefficients[a:b], planes.covariance[a:b], planes.observed[a:b], planes.observed_covariance[a:b])
+        _add_planes(R, t, plane, weights.planes[a:b], flags.planes[a:b], H[k], g[k], chi2.planes[a:b])
 
 
 # The Gaussian prior. It holds every direction that the data do not observe, so that any set of terms, even one plane, can be solved.

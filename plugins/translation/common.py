@@ -124,4 +124,4 @@ def propagated_covariance(previous: Pose, held_too: bool = False) -> F64:
     """Covariance (3, 3) (world) that a previous pose propagates to the next: its own if it was lost, or with `held_too` unobservable in some
     direction; else zero, since the world is defined by tracked poses."""
     R, known = previous.T_world_camera[:3, :3], previous.status != LOST and not (held_too and previous.unobservable)
-    return np.zeros((3, 3)) if known else np.asarray(R @ previous.covariance[:3, :3] @ R.T)
+    return np.zeros((3, 3)) if known else np.asarray(R @ previous.local_covariance[:3, :3] @ R.T)

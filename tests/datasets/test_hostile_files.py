@@ -18,12 +18,13 @@ from trihedron.datasets.readers.cameras import read_camera_file
 from trihedron.datasets.readers.folder import Folder
 from trihedron.datasets.readers.icl_nuim import IclNuim
 from trihedron.datasets.readers.images import decode_image, read_color, read_depth
+from trihedron.datasets.readers.mcap import McapDataset
 from trihedron.datasets.readers.picture_headers import UnreadableImage
 from trihedron.datasets.readers.replica import read_parameters
 from trihedron.datasets.readers.sequence import ImageSequence, SequenceReader
 from trihedron.datasets.readers.seven_scenes import SevenScenes
 from trihedron.datasets.readers.tum import Tum
-from trihedron.pipeline.core.errors import DataError
+from trihedron.pipeline.core.errors import DataError, RecordingError
 from trihedron.pipeline.record.trajectories import read_trajectory
 
 GOOD = "width: 32\nheight: 24\nfx: 30\nfy: 30\ncx: 15.5\ncy: 11.5\ndepth_scale: 1000\n"
@@ -62,6 +63,14 @@ def test_an_image_that_is_no_regular_file_is_refused(tmp_path: Path, make: Calla
     for read in (read_color, lambda path: read_depth(path, 1000.0)):
         with pytest.raises(UnreadableImage, match=r"^cannot be opened \(it is not a regular file\)$"):
             read(tmp_path / "1.png")
+
+
+@pytest.mark.parametrize("make", [fifo, zeros])
+@pytest.mark.parametrize("name", ["a.mcap", "a.bag"])
+def test_a_recording_that_is_no_regular_file_is_refused(tmp_path: Path, make: Callable[[Path], None], name: str) -> None:
+    make(tmp_path / name)
+    with pytest.raises(RecordingError, match="it is not a regular file"):
+        len(McapDataset(str(tmp_path / name)))
 
 
 def test_a_file_that_is_too_large_is_not_read(tmp_path: Path) -> None:
@@ -168,10 +177,12 @@ class Broken(SequenceReader):
 
 
 def test_any_exception_of_a_reader_is_one_line(tum_folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("trihedron.datasets.readers.mcap.open_messages", None)
+    assert refused(lambda: len(McapDataset("a.mcap"))).startswith("a.mcap: cannot be read (TypeError: ")
     expected = f"{tum_folder}: cannot be read (IndexError: list index out of range?second line); check the files of the data set"
     assert refused(lambda: len(Broken(path=str(tum_folder)))) == expected
     dataset = Tum(path=str(tum_folder))
     assert len(dataset) == 4
     monkeypatch.setattr(cv2, "cvtColor", None)
-    monkeypatch.setattr(ImageSequence, "_undistort", None)
+    monkeypatch.setattr(ImageSequence, "_check_sizes", None)
     assert re.search(r"10\.000000\.png: cannot be read \(TypeError: ", refused(lambda: dataset(0)))

@@ -118,7 +118,7 @@ def test_refusals(library: None, monkeypatch: pytest.MonkeyPatch) -> None:
     with pytest.raises(DataError, match="dataset=realsense: the camera does not start: No device connected; plug it in"):
         RealSense().start()
     Pipeline.ends, Pipeline.coeffs = 1000, [0.1, 0.0, 0.0, 0.0, 0.0]
-    with pytest.raises(DataError, match=r"the lens model 'distortion.inverse_brown_conrady' is not known"):
+    with pytest.raises(DataError, match=r"the distortion model 'distortion.inverse_brown_conrady' is not known"):
         RealSense().start()
     with pytest.raises(ValueError, match="frames: a camera begins with frame 0"):
         RealSense(frames="3:")

@@ -216,7 +216,7 @@ def test_what_is_missing_is_said_in_one_line(tmp_path: Path) -> None:
         len(McapDataset(str(tmp_path / "e.mcap")))
     fisheye = registered(1)
     fisheye[0] = camera_info("/camera/color/camera_info", BEGIN, COLOR, WALL.size, WALL.K, [0.1, 0.0, 0.0, 0.0], "equidistant")
-    with pytest.raises(DataError, match="the lens model 'equidistant' of /camera/color/image_raw with 4 coefficients is not known"):
+    with pytest.raises(DataError, match="the distortion model 'equidistant' of /camera/color/image_raw with 4 coefficients is not known"):
         McapDataset(str(write_file(tmp_path / "f.mcap", fisheye)))(0)
 
 
@@ -253,7 +253,7 @@ def test_truth_from_transforms(tmp_path: Path) -> None:
         expected = T_map_odom @ motion((stamp - BEGIN) / 1e9) @ mount
         assert np.abs(invert(expected) @ T - np.eye(4)).max() < 2e-5
     assert McapDataset(path).truth() is None
-    with pytest.raises(DataError, match="'world' says nothing of the camera"):
+    with pytest.raises(DataError, match="'world' does not give the camera"):
         McapDataset(path, truth_from="world").truth()
 
 

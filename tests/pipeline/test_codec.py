@@ -324,11 +324,12 @@ def test_a_value_of_an_older_version_names_the_version_and_the_fields():
     """As `Pose` was before sub-maps, with a field that there is no more."""
     message = message_of(Pose(3, 4, np.eye(4), np.eye(6), np.eye(4), -1, np.zeros(3, np.int32), 0, "ok", ""))
     message.version = 1
-    kept = [array for array in message.arrays if array.name not in ("submap", "unrecognised")]
+    kept = [array for array in message.arrays if array.name not in ("submap", "unrecognised", "map_covariance", "noise_scale")]
     del message.arrays[:]
     message.arrays.extend([*kept, type(kept[0])(name="quality", dtype="float", encoding="raw", data=bytes(8))])
     assert refusal(message) == (
-        "a.mcap: topic /keypoints: holds Pose version 1, this program reads version 2, with the field 'submap', 'unrecognised' that it lacks, "
+        "a.mcap: topic /keypoints: holds Pose version 1, this program reads version 3, with the field 'map_covariance', 'noise_scale', 'submap', "
+        "'unrecognised' that it lacks, "
         "without its field 'quality'; upgrade what can be read of it with: trihedron convert SRC DST.mcap"
     )
 

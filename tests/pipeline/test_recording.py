@@ -21,6 +21,7 @@ from trihedron.pipeline.core.geometry import exp_se3, exp_so3, rotation_from_qua
 from trihedron.pipeline.core.table import Column, Table
 from trihedron.pipeline.core.types import FrameReference, ManhattanFrame, Map, Planes, Pose, Segments, Surface, Trajectory
 from trihedron.pipeline.record import mcap_writer as module
+from trihedron.pipeline.record.codec import FORMAT
 from trihedron.pipeline.record.foxglove import View
 from trihedron.pipeline.record.foxglove_messages import MOST_VERTICES
 from trihedron.pipeline.record.reader import Recording, TopicReader
@@ -190,7 +191,8 @@ OLDER = [  # format, commit, what differs
     (
         1,
         "ad955b7",
-        "topic /pose holds Pose version 1, this program reads version 2, with the field 'submap', 'unrecognised' that it lacks, and 1 more",
+        "topic /pose holds Pose version 1, this program reads version 3, with the field 'map_covariance', 'noise_scale', 'submap', "
+        "'unrecognised' that it lacks, and 1 more",
     ),
     (
         2,
@@ -214,9 +216,10 @@ def test_a_recording_of_an_older_program_names_version_and_field(form, commit, d
         assert capsys.readouterr().err == line
 
 
-def test_a_recording_of_format_3_is_read(capsys):
+def test_a_recording_of_format_3_is_upgraded(tmp_path, capsys):
     """Sixty versions of a map, each changed from the one before, whole every fifty, as an earlier version of this program wrote them."""
-    path = Path(__file__).parent / "recordings" / "format_3.mcap"
+    path = tmp_path / "new.mcap"
+    assert main(["convert", str(Path(__file__).parent / "recordings" / "format_3.mcap"), str(path)]) == 0
     recording = Recording(path)
     for i, value in enumerate(recording.values("map")):
         expected = np.repeat(np.arange(i + 1.0), 10)
@@ -227,7 +230,7 @@ def test_a_recording_of_format_3_is_read(capsys):
         alone = recording.frame(i)["map"].points
         assert alone.column("x").tolist() == expected.tolist()
         assert len(alone) < 512 or alone.is_empty(1) == (i >= 55)
-    assert i == 59 and recording.metadata["format"] == "3"
+    assert i == 59 and recording.metadata["format"] == FORMAT
     assert main(["diff", str(path), str(path)]) == 0
     assert "equal: 60 frames" in capsys.readouterr().out
 

@@ -11,6 +11,7 @@ import pytest
 
 from trihedron.pipeline.app.cli import main
 from trihedron.pipeline.core.geometry import invert
+from trihedron.pipeline.record import rerun_view
 from trihedron.pipeline.record.reader import Recording
 from trihedron.pipeline.record.trajectories import read_trajectory
 from trihedron.tools import export_rerun
@@ -84,10 +85,10 @@ def test_colmap_models_read_back(run, capsys):
 def test_what_cannot_be_exported_is_one_line(run, tmp_path, monkeypatch, capsys):
     assert main(["export", str(run), "--to", "colmpa"]) == 2
     assert capsys.readouterr().err == "trihedron: export: there is no format 'colmpa'; did you mean 'colmap'?\n"
-    monkeypatch.setattr(export_rerun.importlib.util, "find_spec", lambda name: None)
+    monkeypatch.setattr(rerun_view.importlib.util, "find_spec", lambda name: None)
     for command in (["view", str(run)], ["export", str(run), "--to", "rerun", "--out", str(tmp_path / "a.rrd")]):
         assert main(command) == 2
-        assert capsys.readouterr().err == "trihedron: rerun: is not installed; install it with: pip install trihedron[view]\n"
+        assert capsys.readouterr().err == "trihedron: rerun: is not installed; install it with: pip install rerun-sdk\n"
 
 
 class Windowless:

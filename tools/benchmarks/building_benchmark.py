@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from trihedron.datasets.simulation.true_plan import TruePlan
     from trihedron.pipeline.core.types import F64, Building
 
-SCENES = ("offices", "rooms", "corridor")
+SCENES = ("offices", "rooms", "corridor", "flat", "slanted_flat")
 FOUND_IOU, DOOR_M, EDGE_M, LEAST_EDGE_M = 0.5, 0.3, 0.15, 0.5
 HEADER = [
     "scene", "runs", "wall cm", "angle °", "IoU", "recall", "precision", "doors", "precision", "area %", "height cm", "honest", "frame ms", "final s",

@@ -1,0 +1,109 @@
+"""Uncertainty of a refined pose in the world: the noise that its residuals show, and the uncertainty of the keyframes that its landmarks are from.
+
+A pose is estimated relative to hundreds of landmarks whose errors are treated as independent. Two parts are not: residuals of landmarks from one
+keyframe err alike, which their scatter shows (`noise_scale`); and the common error of the keyframes themselves, which no residual shows
+(`map_covariance`). The latter accumulates from keyframe to keyframe and is what odometry calls drift."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from trihedron.pipeline.core.geometry import adjoint, invert
+from trihedron.pipeline.core.types import DEGRADED, F64, I32, Map, Pose
+from trihedron.plugins.pose.map_alignment import MapAlignment, TrackingStatus
+from trihedron.plugins.shared.linalg_kernels import inverse_positive
+from trihedron.plugins.shared.pose_optimizer import LANDMARK_SCORE, PoseSolution, residual_scale
+
+SCALE_FRAMES = 10  # over which the scale of the residuals is averaged
+SCALE_OUTLIER = 4.0  # times the average that a frame's scale counts at most
+
+
+@dataclass(frozen=True)
+class KeyframeUncertainty:
+    """The keyframe (row, -1: none) that a pose is relative to, and the standard deviation of its position (m) in the worst direction."""
+
+    keyframe: int
+    sigma_m: float
+
+    def covariance(self, map: Map, T_world_camera: F64) -> F64:
+        """Covariance (6, 6) of the keyframe as that of xi of a camera that moves with it."""
+        T, covariance = (map.keyframes.rows(name, np.array([self.keyframe]))[0] for name in ("T_world_camera", "covariance"))
+        to_camera = adjoint(invert(T_world_camera) @ T)
+        return np.asarray(to_camera @ covariance @ to_camera.T)
+
+
+def keyframe_uncertainty(map: Map, points: I32, lines: I32, planes: I32) -> KeyframeUncertainty:
+    """Select the weighted median, by σ, of the keyframes that created these landmarks (ids).
+
+    A landmark's covariance includes its first keyframe's, but a pose estimated from hundreds of them averages out what is common to all."""
+    weights = np.zeros(len(map.keyframes), np.int64)
+    for table, ids, score in zip((map.points, map.lines, map.planes), (points, lines, planes), LANDMARK_SCORE):
+        weights += score * np.bincount(table.rows("first", ids), minlength=len(weights))
+    keyframes = np.flatnonzero(weights)
+    if not len(keyframes):
+        return KeyframeUncertainty(-1, 0.0)
+    sigmas_m, half = _sigmas_m(map, keyframes.tolist()), int(weights.sum()) // 2
+    below = 0
+    for keyframe in sorted(keyframes.tolist(), key=sigmas_m.__getitem__):
+        below += int(weights[keyframe])
+        if below > half:
+            break
+    return KeyframeUncertainty(keyframe, sigmas_m[keyframe])
+
+
+def _sigmas_m(map: Map, keyframes: list[int]) -> dict[int, float]:
+    """Standard deviations of (at least) these keyframes' positions in their worst directions; computed once per version of the map."""
+    sigmas_m: dict[int, float] = map.memo.setdefault("sigmas_m", {})
+    if new := [keyframe for keyframe in keyframes if keyframe not in sigmas_m]:
+        covariances = map.keyframes.rows("covariance", np.array(new))
+        sigmas_m.update(zip(new, np.sqrt(np.linalg.eigvalsh(covariances[:, :3, :3])[:, -1]).tolist()))
+    return sigmas_m
+
+
+def degrade_by_keyframes(status: TrackingStatus, solution: PoseSolution, problem: MapAlignment, factor: float) -> TrackingStatus:
+    """Degrade a pose whose keyframes are uncertain by more than `factor` times its own standard deviation, and add their covariance to it."""
+    base = keyframe_uncertainty(problem.map, *problem.landmarks(solution))
+    if base.sigma_m <= factor * np.sqrt(np.linalg.eigvalsh(solution.covariance[:3, :3])[-1]):
+        return status
+    reason = f"relative to keyframes with σ = {1e3 * base.sigma_m:.0f} mm"
+    return TrackingStatus(DEGRADED, reason, status.covariance + base.covariance(problem.map, solution.T_world_camera))
+
+
+def in_world(pose: Pose, previous: Pose, solution: PoseSolution, problem: MapAlignment) -> Pose:
+    """Give a refined pose its covariance in the world, scaled by the noise that the residuals show."""
+    keyframes, information, scores = problem.equations_by_keyframe(solution)
+    scale, noise_scale = residual_scale(information, scores), previous.noise_scale
+    if scale is not None:
+        noise_scale += (min(scale, SCALE_OUTLIER * noise_scale) - noise_scale) / SCALE_FRAMES
+    of_map = of_previous(pose, previous)
+    if len(keyframes):
+        poses, covariances = (problem.map.keyframes.rows(name, keyframes) for name in ("T_world_camera", "world_covariance"))
+        of_map = covariance_of_keyframes(pose.T_world_camera, poses, covariances, information)
+    return replace(pose, covariance=noise_scale * pose.covariance + of_map, map_covariance=of_map, noise_scale=noise_scale)
+
+
+def covariance_of_keyframes(T_world_camera: F64, T_world_keyframe: F64, covariance: F64, information: F64) -> F64:
+    """Covariance (6, 6) of the average error of keyframes in the order of time, their poses (k, 4, 4) and covariances (k, 6, 6), each weighted by the
+    information (k, 6, 6) of its landmarks, as that of xi of the camera.
+
+    The errors of keyframes are a random walk, in which the covariance of two is the variance of the earlier."""
+    to_camera = adjoint(invert(T_world_camera) @ T_world_keyframe)
+    weights = np.trace(information @ inverse_positive(information.sum(axis=0) + np.eye(6)), axis1=1, axis2=2)
+    weights = weights / weights.sum()
+    later = np.cumsum(weights[::-1])[::-1] - weights
+    common = (weights * (weights + 2.0 * later))[:, None, None] * to_camera @ covariance @ to_camera.transpose(0, 2, 1)
+    return np.asarray(common.sum(axis=0), np.float64)
+
+
+def of_previous(pose: Pose, previous: Pose) -> F64:
+    """The `map_covariance` of the previous pose as that of a camera that moves with it."""
+    to_camera = adjoint(invert(pose.T_world_camera) @ previous.T_world_camera)
+    return np.asarray(to_camera @ previous.map_covariance @ to_camera.T)
+
+
+def carried(pose: Pose, previous: Pose) -> Pose:
+    """Give a pose that was not refined, by its own covariance relative to the previous one, its covariance in the world."""
+    of_map = of_previous(pose, previous)
+    return replace(pose, covariance=previous.noise_scale * pose.covariance + of_map, map_covariance=of_map, noise_scale=previous.noise_scale)

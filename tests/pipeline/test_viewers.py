@@ -1,0 +1,205 @@
+"""Live views: a WebSocket client of Foxglove's protocol, rerun's viewer, previews of a fold, viewers that are slow or closed."""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+import socket
+import struct
+import subprocess
+import sys
+import threading
+from pathlib import Path
+from typing import Any
+
+import pytest
+from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
+from foxglove_schemas_protobuf.FrameTransform_pb2 import FrameTransform
+from websockets.sync.client import connect
+
+import trihedron as th
+from trihedron.datasets.simulation.synthetic import Synthetic
+from trihedron.pipeline.app.cli import main
+from trihedron.pipeline.core.types import Map, Surface
+from trihedron.pipeline.record.foxglove_server import FoxgloveServer
+from trihedron.pipeline.record.writer import RecordingWriter
+from trihedron.pipeline.run.rerun_sink import WAITING, RerunSink
+from trihedron.pipeline.run.runner import Runner
+from trihedron.pipeline.run.sinks import MemorySink
+
+sys.path.insert(0, str(Path(__file__).parent))
+from toys import ToySurface, toy_graph
+
+ROOM = Synthetic(width=160, height=120)
+LENGTH = 10
+
+
+def free_port() -> int:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return int(probe.getsockname()[1])
+
+
+class Client:
+    """Subscribes to channels of the server as they are advertised, and collects their messages."""
+
+    def __init__(self, port: int, topics: set[str]) -> None:
+        self.socket = connect(f"ws://localhost:{port}", subprotocols=["foxglove.sdk.v1"], max_size=None).__enter__()  # type: ignore[list-item]
+        self.channels: dict[int, dict[str, Any]] = {}
+        self.messages: list[tuple[str, int, bytes]] = []  # topic, log time, content
+        self._topics = topics
+        self._thread = threading.Thread(target=self._receive, daemon=True)
+        self._thread.start()
+
+    def _receive(self) -> None:
+        for message in self.socket:
+            if isinstance(message, bytes):
+                opcode, subscription, stamp_ns = struct.unpack_from("<BIQ", message)
+                assert opcode == 1
+                self.messages.append((self.channels[subscription]["topic"], stamp_ns, message[13:]))
+                continue
+            content = json.loads(message)
+            if content["op"] == "advertise":
+                self.channels |= {channel["id"]: channel for channel in content["channels"]}
+                chosen = [channel["id"] for channel in content["channels"] if channel["topic"] in self._topics]
+                self.socket.send(json.dumps({"op": "subscribe", "subscriptions": [{"id": id, "channelId": id} for id in chosen]}))
+
+    def closed(self) -> list[tuple[str, int, bytes]]:
+        """Wait until the server closes the connection; return the messages."""
+        self._thread.join(30)
+        assert not self._thread.is_alive()
+        return self.messages
+
+
+def test_a_websocket_client_sees_the_run(tmp_path: Path) -> None:
+    port = free_port()
+    with th.Slam(ROOM(0).camera, "view=foxglove", f"view.port={port}", out=tmp_path / "run") as slam:
+        client = Client(port, {"/tf", "/view/image", "/timing"})
+        leaver = connect(f"ws://localhost:{port}", subprotocols=["foxglove.sdk.v1"]).__enter__()  # type: ignore[list-item]
+        for i in range(LENGTH):
+            frame = ROOM(i)
+            pose = slam.track(frame.color, frame.depth_m, frame.stamp_ns / 1e9)
+            if i == 3:
+                leaver.close()
+    messages = client.closed()
+    transforms = [(stamp_ns, FrameTransform.FromString(content)) for topic, stamp_ns, content in messages if topic == "/tf"]
+    assert transforms[-1][0] == ROOM(LENGTH - 1).stamp_ns
+    place = transforms[-1][1].translation
+    assert [place.x, place.y, place.z] == pose.T_world_camera[:3, 3].tolist()
+    images = [CompressedImage.FromString(content) for topic, _, content in messages if topic == "/view/image"]
+    assert images and images[0].format == "jpeg"
+    names = {channel["topic"] for channel in client.channels.values()}
+    assert {"/view/features", "/view/path", "/view/planes", "/view/axes", "/view/map_points", "/view/pose", "/timing"} <= names
+    assert "/pose" not in names  # values are for the file
+    assert len(th.Recording(tmp_path / "run").poses) == LENGTH
+
+
+def test_viewers_change_no_byte(tmp_path: Path) -> None:
+    words = ["dataset.width=160", "dataset.height=120", f"dataset.length={LENGTH}"]
+    runs = [th.run(*words, out=tmp_path / "plain", quiet=True), th.run(*words, "view=foxglove", "view.port=0", out=tmp_path / "seen", quiet=True)]
+    plain, seen = (run.recording._file for run in runs)
+    for topic in plain.topics:
+        assert list(plain.messages(f"/{topic}")) == list(seen.messages(f"/{topic}")), topic
+
+
+def test_a_viewer_that_cannot_be_opened_is_one_line_and_leaves_no_folder(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        taken.listen()
+        port = taken.getsockname()[1]
+        assert main(["run", "view=foxglove", f"view.port={port}", f"out={tmp_path / 'none'}"]) == 1
+    printed = capsys.readouterr().err
+    assert printed.startswith(f"trihedron: view.port: {port} cannot be opened: ") and printed.endswith(
+        "; give another view.port, 0 for any that is free\n"
+    )
+    assert main(["run", "view.port=9", f"out={tmp_path / 'none'}"]) == 1
+    assert capsys.readouterr().err == "trihedron: view.port: no viewer with this option is chosen; give view=foxglove or view=rerun too\n"
+    assert main(["run", "view=foxgloves", f"out={tmp_path / 'none'}"]) == 1
+    assert capsys.readouterr().err == "trihedron: view: there is no view 'foxgloves'; did you mean 'foxglove'?\n"
+    assert not (tmp_path / "none").exists()
+
+
+class Preview(ToySurface):
+    """A fold that shows what it has so far: its stamps are those of the frames."""
+
+    def preview(self, state: Any) -> Surface:
+        return self.finish(state, None)
+
+
+def test_folds_are_previewed_to_sinks() -> None:
+    memory = MemorySink(3, {"pose"})
+    previews: list[tuple[str, int]] = []
+    memory.preview = lambda name, value: previews.append((name, len(value.vertices_m)))  # type: ignore[method-assign, assignment]
+    runner = Runner(toy_graph(surface=Preview()), threads=2, preview_period=4)
+    positions = [step.position for step in runner.steps(None, frozenset(), sinks=[memory])]
+    taken = memory.folds["surface"].vertices_m[:, 0]  # numbers of the frames that had a pose
+    assert previews == [("surface", sum(taken < count)) for count in range(4, len(positions) + 1, 4)]
+    assert [index for index, _ in memory.frames] == positions[-3:]
+    assert all(set(values) <= {"pose"} for _, values in memory.frames)
+    assert memory.folds["surface"] is runner.result.folds["surface"]
+
+
+class SlowStream:
+    """A rerun stream that blocks until it is released."""
+
+    def __init__(self) -> None:
+        self.go, self.logged = threading.Event(), 0
+
+    def log(self, *entity: Any, **options: Any) -> None:
+        if self.logged:
+            self.go.wait()
+        self.logged += 1
+
+    def set_time(self, *time: Any, **options: Any) -> None:
+        self.go.wait()
+
+    def flush(self) -> None:
+        """Nothing waits."""
+
+
+@pytest.mark.skipif(importlib.util.find_spec("rerun") is None, reason="rerun is not installed")
+def test_a_slow_viewer_does_not_slow_the_run() -> None:
+    stream = SlowStream()
+    sink = RerunSink(stream)
+    count = len(list(Runner(toy_graph(), threads=2).steps(None, frozenset(), sinks=[sink])))  # ends although nothing is shown
+    assert count > WAITING + 2
+    stream.go.set()
+    sink.close()
+    assert stream.logged > 0
+
+
+@pytest.mark.skipif(importlib.util.find_spec("rerun") is None, reason="rerun is not installed")
+def test_rerun_has_everything(tmp_path: Path) -> None:
+    import rerun
+
+    stream = rerun.RecordingStream("test")
+    stream.save(tmp_path / "a.rrd")
+    sink = RerunSink(stream)
+    program = "run", "dataset.width=160", "dataset.height=120", "dataset.length=6", "outputs=[trajectory,surface]"
+    import trihedron.pipeline.app.viewers as viewers
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(viewers, "_rerun_stream", lambda options: stream)
+        assert main([*program, "view=rerun", f"out={tmp_path / 'run'}"]) == 0
+    sink.close()
+    stream.disconnect()
+    done = subprocess.run([sys.executable, "-m", "rerun", "rrd", "print", str(tmp_path / "a.rrd")], capture_output=True, text=True)
+    printed = done.stdout + done.stderr
+    for path in (
+        "/world/camera/image",
+        "/world/camera/keypoints",
+        "/world/camera/axes",
+        "/world/map/points",
+        "/world/surface",
+        "/status",
+        "/times/pose",
+    ):
+        assert path in printed, path
+
+
+def test_a_recording_without_a_file_writes_nowhere() -> None:
+    server = FoxgloveServer(0)
+    writer = RecordingWriter(None, {}, server)
+    writer.write("map", Map.__new__(Map))  # is not encoded
+    writer.close()
+    server.close()

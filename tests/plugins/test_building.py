@@ -1,0 +1,147 @@
+"""Plans of buildings: from exact frames of the simulator at their true poses, and from next to nothing."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from xml.etree import ElementTree
+
+import numpy as np
+import pytest
+
+from trihedron.datasets.simulation.synthetic import Scene, Synthetic
+from trihedron.datasets.simulation.true_plan import plan_of
+from trihedron.pipeline.core.registry import load_plugins, plugin_class
+from trihedron.pipeline.core.types import OPENING_KINDS, Camera, Frame, Planes, Pose
+from trihedron.pipeline.run.building_files import building_json, floorplan_svg, summary, wall_pieces, write_building
+from trihedron.plugins.normals.integral_image import IntegralImage
+from trihedron.plugins.planes.connected_components import ConnectedComponents
+from trihedron.tools.benchmarks.building_benchmark import judged
+
+load_plugins()
+LAYOUTS = ("manhattan_layout", "atlanta_layout", "cells")
+
+
+def pose_at(index: int, T: np.ndarray) -> Pose:
+    """A tracked pose without a keyframe."""
+    return Pose(index, index, T, np.eye(6) * 1e-6, T, -1, np.zeros(3, np.int32), 0, "ok", "")
+
+
+def folded(name: str, inputs: list[tuple[Frame, Planes, Pose]]):
+    plugin = plugin_class("building", name)()
+    state = plugin.start()
+    for frame, planes, pose in inputs:
+        state = plugin.add(state, frame, planes, None, pose, None)
+    return plugin.finish(state, None)
+
+
+def planes_of(frame: Frame) -> Planes:
+    return ConnectedComponents()(frame, IntegralImage()(frame))
+
+
+@pytest.fixture(scope="module")
+def walk() -> tuple[Synthetic, list[tuple[Frame, Planes, Pose]]]:
+    """Two offices on a corridor, every half a second."""
+    dataset = Synthetic(scene=Scene.offices, fps=2.0, width=160, height=120, texture=False, noise=False)
+    truth = dataset.truth()
+    frames = [dataset(k) for k in range(len(dataset))]
+    return dataset, [(frame, planes_of(frame), pose_at(k, truth.poses[k])) for k, frame in enumerate(frames)]
+
+
+@pytest.fixture(scope="module")
+def offices(walk):
+    return {name: folded(name, walk[1]) for name in LAYOUTS}
+
+
+def test_the_true_plan_of_the_offices_is_that_of_its_walls():
+    plan = Synthetic(scene=Scene.offices).plan()
+    areas = sorted(0.5 * abs(np.sum(ring[:, 0] * np.roll(ring[:, 1], -1) - np.roll(ring[:, 0], -1) * ring[:, 1])) for (ring,) in plan.rooms)
+    assert areas == pytest.approx([16.0, 16.0, 28.0], abs=1e-3)
+    assert [size for door in plan.doorways for size in (door.width_m, door.height_m)] == pytest.approx([0.9, 2.1, 0.9, 2.1])
+    assert len(plan_of(Synthetic(scene=Scene.corridor)._room).rooms[0]) == 2  # round a block
+
+
+@pytest.mark.parametrize("name", LAYOUTS)
+def test_rooms_walls_and_doorways_of_the_offices_are_found(walk, offices, name):
+    figures = judged(offices[name], np.eye(4), walk[0].plan())
+    assert figures["room_recall"] == figures["room_precision"] == figures["door_recall"] == 1.0
+    assert figures["iou"] >= 0.97 and figures["wall_m"] <= 0.01 and figures["height_m"] <= 0.01 and figures["area_error"] <= 0.02
+    assert figures["door_precision"] == 1.0
+
+
+def test_doors_join_the_corridor_with_an_office_each(offices):
+    building = offices["manhattan_layout"]
+    corridor = int(np.argmax(building.areas_m2))
+    assert all(OPENING_KINDS[kind] == "door" for kind in building.opening_kinds)
+    assert [corridor in rooms for rooms in building.opening_rooms.tolist()] == [True, True]
+    assert len({room for rooms in building.opening_rooms.tolist() for room in rooms}) == 3
+    assert np.ptp(building.spans_m, axis=1) == pytest.approx([0.9, 0.9], abs=0.06)
+
+
+def test_the_plan_does_not_depend_on_the_world_it_is_tracked_in(walk, offices):
+    turn = np.eye(4)
+    turn[:3, :3] = [[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]
+    turn[:3, 3] = [3.0, -2.0, 5.0]
+    moved = [(frame, planes, pose_at(pose.index, turn @ pose.T_world_camera)) for frame, planes, pose in walk[1]]
+    again, before = folded("manhattan_layout", moved), offices["manhattan_layout"]
+    assert again.areas_m2 == pytest.approx(before.areas_m2, abs=0.02)
+    assert again.T_world_building == pytest.approx(turn @ before.T_world_building, abs=0.01)
+
+
+def test_what_was_not_seen_is_marked_and_not_closed(walk):
+    building = folded("manhattan_layout", walk[1][:12])
+    assert not building.closed.all() and "not seen all round" in building.note
+    assert (building.corner_walls == -1).any()
+    assert 'class="unseen"' in floorplan_svg(building)
+
+
+def test_the_files_hold_what_was_found_and_open_in_other_readers(offices, tmp_path):
+    import ezdxf
+
+    building = offices["manhattan_layout"]
+    (line,) = write_building(tmp_path, building)
+    assert line == summary(building) and line.startswith("building: 1 storey, 3 rooms, ")
+    read = json.loads((tmp_path / "building.json").read_text())
+    assert read == building_json(building)
+    assert [len(read[key]) for key in ("storeys", "walls", "rooms", "openings")] == [1, len(building.walls_m), 3, 2]
+    assert all(room["support"]["frames"] for room in read["rooms"])
+    ElementTree.fromstring((tmp_path / "floorplan.svg").read_text())
+    document = ezdxf.readfile(tmp_path / "floorplan.dxf")
+    assert not document.audit().errors
+    assert len(document.modelspace().query('LWPOLYLINE[layer=="ROOMS"]')) == 3 and len(document.modelspace().query('*[layer=="DOORS"]')) == 2
+
+
+def test_walls_are_cut_at_doors(offices):
+    building = offices["manhattan_layout"]
+    wall = int(building.opening_walls[0])
+    pieces = list(wall_pieces(building, wall))
+    cut = sum(float(np.linalg.norm(piece.corners[1] - piece.corners[0])) for piece in pieces)
+    assert len(pieces) >= 3
+    assert cut == pytest.approx(np.linalg.norm(np.diff(building.walls_m[wall], axis=0)) - np.ptp(building.spans_m, axis=1).sum(), abs=1e-6)
+
+
+def flat(depth: np.ndarray, index: int = 0) -> tuple[Frame, Planes, Pose]:
+    """A frame of a depth image (120, 160), level, at the origin."""
+    camera = Camera(160, 120, 130.0, 130.0, 79.5, 59.5)
+    frame = Frame(index, index, np.zeros((120, 160, 3), np.uint8), depth.astype(np.float32), camera)
+    return frame, planes_of(frame), pose_at(index, np.eye(4))
+
+
+@pytest.mark.parametrize("name", LAYOUTS)
+def test_a_plan_of_next_to_nothing_says_so(name):
+    assert folded(name, []).note == "no plane was seen"
+    assert folded(name, [flat(np.zeros((120, 160)))]).note == "no plane was seen"
+    wall = folded(name, [flat(np.full((120, 160), 2.0))])
+    assert wall.note == "no floor was seen; no ceiling was seen; 1 wall seen, which bounds no room"
+    assert len(wall.areas_m2) == 0 and "1 wall seen" in floorplan_svg(wall)
+
+
+def test_a_lost_camera_shows_nothing():
+    frame, planes, pose = flat(np.full((120, 160), 2.0))
+    assert folded("manhattan_layout", [(frame, planes, replace(pose, status="lost"))]).note == "no plane was seen"
+
+
+def test_none_has_no_element():
+    plugin = plugin_class("building", "none")()
+    building = plugin.finish(plugin.add(plugin.start(), pose_at(7, np.eye(4))), None)
+    assert (building.index, len(building.walls_m), building.note) == (7, 0, "no building was asked for")

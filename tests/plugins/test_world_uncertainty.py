@@ -1,0 +1,51 @@
+"""Covariance of a refined pose in the world, on errors that are known."""
+
+import numpy as np
+import pytest
+
+from trihedron.pipeline.core.types import Pose
+from trihedron.plugins.pose.world_uncertainty import carried, covariance_of_keyframes
+from trihedron.plugins.shared.pose_optimizer import residual_scale
+
+
+def equations(rng, groups, common):
+    """Information (k, 6, 6) of groups of 40 residuals of unit variance, and their scores where residuals of one group share `common` of it."""
+    J = rng.normal(0, 1, (groups, 40, 6))
+    shared = np.sqrt(common) * rng.normal(0, 1, (groups, 1, 6)) @ J.transpose(0, 2, 1)
+    residuals = rng.normal(0, 1, (groups, 40)) + shared[:, 0]
+    return J.transpose(0, 2, 1) @ J, np.einsum("kni,kn->ki", J, residuals)
+
+
+@pytest.mark.parametrize("common, expected", [(0.0, 1.0), (0.1, 5.2)])
+def test_scale_of_residuals_shows_what_those_of_one_keyframe_share(common, expected):
+    """A pose error of variance c, common to a group, adds H c H to the covariance H of its score: the factor is about 1 + 40 c."""
+    rng = np.random.default_rng(0)
+    scales = [residual_scale(*equations(rng, 8, common)) for _ in range(400)]
+    assert np.mean(scales) == pytest.approx(expected, rel=0.08)
+
+
+def test_scale_of_residuals_is_unknown_for_one_keyframe_and_without_any():
+    rng = np.random.default_rng(1)
+    assert residual_scale(*equations(rng, 1, 0.0)) is None
+    assert residual_scale(np.zeros((0, 6, 6)), np.zeros((0, 6))) is None
+
+
+def test_average_of_a_random_walk():
+    """Keyframes of a random walk: the stated covariance of their weighted average is that of simulated walks."""
+    rng, steps = np.random.default_rng(2), np.array([1.0, 2.0, 0.5, 4.0])
+    variance, shares = np.cumsum(steps), np.array([0.4, 0.1, 0.2, 0.3])
+    walks = np.cumsum(rng.normal(0, np.sqrt(steps), (200_000, 4)), axis=1)
+    poses, information = np.tile(np.eye(4), (4, 1, 1)), shares[:, None, None] * np.tile(1e9 * np.eye(6), (4, 1, 1))
+    stated = covariance_of_keyframes(np.eye(4), poses, variance[:, None, None] * np.eye(6), information)
+    assert stated == pytest.approx((walks @ shares).var() * np.eye(6), rel=0.02, abs=1e-9)
+
+
+def test_a_pose_that_was_not_refined_carries_the_uncertainty_of_the_map():
+    """A camera 2 m from the previous one: a common rotation of the map moves it sideways."""
+    previous = Pose(0, 0, np.eye(4), 5.0 * np.eye(6), np.eye(4), 0, np.zeros(3, np.int32), 0, "ok", "", 0, 0, np.diag([0, 0, 0, 1e-4, 0, 0]), 2.0)
+    T = np.eye(4)
+    T[2, 3] = 2.0
+    pose = carried(Pose(1, 1, T, np.eye(6), np.eye(4), 0, np.zeros(3, np.int32), 0, "degraded", ""), previous)
+    assert pose.map_covariance[[1, 3, 0], [1, 3, 0]] == pytest.approx([4e-4, 1e-4, 0.0])
+    assert pose.noise_scale == 2.0 and pose.local_covariance == pytest.approx(np.eye(6))
+    assert pose.covariance == pytest.approx(2.0 * np.eye(6) + pose.map_covariance)
