@@ -21,9 +21,10 @@ from trihedron.pipeline.app.compilation import compile_once
 from trihedron.pipeline.app.viewers import Viewer, opened_viewer
 from trihedron.pipeline.core.config import Feedback, graph_of
 from trihedron.pipeline.core.errors import ConfigError, DataError, RecordingError, did_you_mean, printable
+from trihedron.pipeline.core.files import sha256_of
 from trihedron.pipeline.core.graph import Graph
 from trihedron.pipeline.core.overrides import literal_text, path_of, quoted
-from trihedron.pipeline.core.slots import output_of
+from trihedron.pipeline.core.slots import SLOTS, output_of
 from trihedron.pipeline.core.types import Building, Surface, Trajectory
 from trihedron.pipeline.record.reader import Recording
 from trihedron.pipeline.record.trajectories import TRUTH, attached_truth, format_trajectory
@@ -41,7 +42,8 @@ from trihedron.pipeline.run.timing import forget_peak
 from trihedron.pipeline.run.warm_up import compilation_reported, warm_up
 
 RECORDING = "run.mcap"
-READ_PATHS = ("dataset.path", "dataset.camera", "dataset.options.path", "dataset.options.camera", "load_map")
+NETWORKS = tuple(f"{slot}.model" for slot in SLOTS)  # files of networks, of the plugins that run one
+READ_PATHS = ("dataset.path", "dataset.camera", "dataset.options.path", "dataset.options.camera", "load_map", *NETWORKS)
 PLAIN_PROGRESS_SECONDS = 5.0
 MAX_THREADS = 256
 
@@ -173,6 +175,10 @@ def metadata_of(config: DictConfig, overrides: list[str]) -> dict[str, str]:
     for key in READ_PATHS:
         if isinstance(path := OmegaConf.select(config, key), str):
             OmegaConf.update(config, key, literal_text(_absolute(path)))
+    for key in NETWORKS:
+        options = config.get(key.partition(".")[0])
+        if isinstance(options, DictConfig) and "sha256" in options and options.get("model"):
+            options.sha256 = sha256_of(options.model)  # a replay demands the same file
     return {
         "version": importlib.metadata.version("trihedron"),
         "commit": _commit(),

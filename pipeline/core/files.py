@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import errno
+import hashlib
 import os
 import stat
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -14,6 +15,7 @@ import yaml
 
 from trihedron.pipeline.core.errors import DataError, TrihedronError, printable
 
+MAX_NETWORK_BYTES = 2**31  # of an ONNX file, as its format has it
 MAX_YAML_BYTES = 1_000_000
 MAX_YAML_DEPTH = 20  # of nested lists and mappings
 SHOWN = 60  # characters of a stranger's text in a message
@@ -39,6 +41,13 @@ def read_file(path: Path, limit: int) -> bytes:
     if data is None or len(data) > limit:
         raise OSError(errno.EFBIG, f"it has more than {limit} bytes")
     return data
+
+
+def sha256_of(path: str) -> str:
+    """Return the SHA-256 of a file, in hexadecimal digits; nothing for one that cannot be read."""
+    with suppress(OSError, RuntimeError):
+        return hashlib.sha256(read_file(Path(path).expanduser(), MAX_NETWORK_BYTES)).hexdigest()
+    return ""
 
 
 def read_text(path: Path, limit: int) -> str:

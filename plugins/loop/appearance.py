@@ -61,12 +61,12 @@ class AppearanceLoop(LoopOptions):
         return similarities([words[np.searchsorted(known, one)] for one in ids], len(vocabulary))
 
 
-HISTOGRAM = 128  # bytes of a histogram descriptor (SIFT): its bits are the bins above the median
+HISTOGRAM = 128  # least bytes of a histogram (SIFT) or learned descriptor: its bits are those above the median
 
 
 def as_bits(descriptors: U8) -> U64:
     """Convert descriptors (n, b) to machine words of bits (n, w)."""
-    if descriptors.shape[1] == HISTOGRAM:
+    if descriptors.shape[1] >= HISTOGRAM:
         descriptors = np.packbits(descriptors > np.median(descriptors, axis=1, keepdims=True), axis=1)
     return words_of(descriptors)[0]
 

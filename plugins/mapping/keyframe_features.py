@@ -10,7 +10,7 @@ from trihedron.plugins.mapping.covisibility_graph import LocalWindow
 from trihedron.plugins.mapping.projection import clip_segments
 from trihedron.plugins.shared.linalg import inverse, transform_plane_covariance
 
-L2_BYTES = 128  # length of histogram descriptors (SIFT), compared by Euclidean distance; all others are binary
+L2_BYTES = 128  # least length of descriptors that are compared by Euclidean distance (SIFT, learned ones); binary ones are shorter
 PLANE_PX = 1000  # size of a region where it is unknown
 
 
@@ -30,7 +30,7 @@ def _points(map: Map, camera: Camera, T_camera_world: F64, ids: I32) -> Keypoint
     descriptors = map.points.rows("descriptor", ids)
     pixels, sigma_px = camera.project(local).astype(np.float32), np.maximum(camera.fx * across / local[:, 2], 0.3).astype(np.float32)
     sigma_m, response = np.sqrt(covariance[:, 2, 2]).astype(np.float32), np.zeros(len(ids), np.float32)
-    metric = "l2" if descriptors.shape[1] == L2_BYTES else "hamming"
+    metric = "l2" if descriptors.shape[1] >= L2_BYTES else "hamming"
     octaves = map.points.rows("octave", ids)
     return Keypoints(map.index, map.stamp_ns, pixels, local.astype(np.float32), sigma_px, sigma_m, octaves, response, descriptors, metric)
 

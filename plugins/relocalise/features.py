@@ -69,7 +69,7 @@ class Features:
         submap = int(submaps[frame.index % len(submaps)])
         keyframes = block_of(keyframes_of(map, submap), self.block, frame.index)
         keyframes = candidate_keyframes(map, keypoints, segments, keyframes, self.candidates, self.max_bits)
-        found = self._verify(self._by_points(keypoints, map, keyframes, rng), view, map, keyframes)
+        found = self._verify(self._by_points(view, map, keyframes, rng), view, map, keyframes)
         if not any(self._accept(place) for place in found):  # points are more distinctive than any layout
             found += self._verify(self._by_layout(view, map, keyframes, rotation), view, map, keyframes)
         best = self._unambiguous(found)
@@ -85,8 +85,9 @@ class Features:
         known = np.unique(map.keyframes.rows("submap", living_keyframes(map))).astype(np.int32)
         return known if lost else known[known < submap] if index % self.every == 0 else known[:0]
 
-    def _by_points(self, keypoints: Keypoints, map: Map, keyframes: I32, rng: np.random.Generator) -> F64:
+    def _by_points(self, view: FrameFeatures, map: Map, keyframes: I32, rng: np.random.Generator) -> F64:
         """Poses (n, 4, 4) by points similar to those of the map, best first."""
+        keypoints = view.keypoints
         if keypoints.metric != "hamming":
             return np.empty((0, 4, 4))
         ids, rows = observed_by(map, keyframes, "point"), np.flatnonzero(np.isfinite(keypoints.points_m[:, 2])).astype(np.int32)

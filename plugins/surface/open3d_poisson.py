@@ -1,0 +1,61 @@
+"""A surface by Open3D's Poisson reconstruction."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Annotated
+
+import numpy as np
+
+from trihedron.pipeline.core.options import NonNegativeFloat, PositiveFloat, Range, Share
+from trihedron.pipeline.core.registry import register
+from trihedron.pipeline.core.types import F64, I32, Map, Surface
+from trihedron.plugins.shared.keyframe_views import KeyframeView
+from trihedron.plugins.shared.libraries import open3d
+from trihedron.plugins.shared.open3d_clouds import cloud_with_normals
+from trihedron.plugins.surface.common import Gathered, ViewFold, coloured
+
+LEAST = 100  # points of a cloud
+
+
+@register("surface", "open3d_poisson")
+@dataclass(frozen=True)
+class Open3dPoisson(ViewFold):
+    """`open3d.geometry.TriangleMesh.create_from_point_cloud_poisson` (screened Poisson: Kazhdan and Hoppe, ToG 2013) of the readings of the retained
+    views, thinned to `voxel_m`, with Open3D's normals; vertices that few readings support are removed, for Poisson closes every hole. No planes.
+
+    Library: Open3D (MIT; Zhou, Park, Koltun, arXiv:1801.09847), one thread. The bytes may differ on another CPU."""
+
+    voxel_m: PositiveFloat = 0.02  # side of the cells in which readings are averaged
+    depth: Annotated[int, Range(1, 12)] = 8  # of the octree
+    scale: PositiveFloat = 1.1  # of the reconstruction cube
+    least_density: Share = 0.05  # quantile of the density below which vertices are removed
+    point_weight: NonNegativeFloat = 2.0  # of the screening
+
+    def finish(self, state: Gathered, map: Map | None) -> Surface:
+        """The reconstructed surface, coloured by the views."""
+        views = state.settled(map)
+        return coloured(state, map, *self._mesh(views)) if views else Surface.empty(state.index, state.stamp_ns)
+
+    def _mesh(self, views: list[tuple[KeyframeView, F64]]) -> tuple[F64, I32]:
+        """Vertices (v, 3) and triangles (t, 3)."""
+        geometry, cloud = open3d().geometry, open3d().geometry.PointCloud()
+        for view, T in views:
+            points = _points(view)
+            if len(points) >= LEAST:
+                cloud += cloud_with_normals(points).transform(T)
+        cloud = cloud.voxel_down_sample(self.voxel_m)
+        if len(cloud.points) < LEAST:
+            return np.empty((0, 3)), np.empty((0, 3), np.int32)
+        options = {"depth": self.depth, "scale": self.scale, "n_threads": 1, "point_weight": self.point_weight}
+        mesh, density = geometry.TriangleMesh.create_from_point_cloud_poisson(cloud, **options)
+        support = np.asarray(density)
+        mesh.remove_vertices_by_mask(support < np.quantile(support, self.least_density))
+        return np.asarray(mesh.vertices, np.float64), np.asarray(mesh.triangles, np.int32)
+
+
+def _points(view: KeyframeView) -> F64:
+    """(n, 3) readings of a view in its camera frame."""
+    rows, columns = np.nonzero(view.depth_m > 0.0)
+    pixels = np.stack([columns, rows], axis=1).astype(np.float64)
+    return np.asarray(view.camera.back_project(pixels, view.depth_m[rows, columns].astype(np.float64)), np.float64)

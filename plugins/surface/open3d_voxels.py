@@ -1,0 +1,63 @@
+"""A truncated signed distance field by Open3D."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from trihedron.pipeline.core.geometry import invert
+from trihedron.pipeline.core.options import PositiveFloat, PositiveInt
+from trihedron.pipeline.core.registry import register
+from trihedron.pipeline.core.types import F64, I32, Map, Surface
+from trihedron.plugins.shared.keyframe_views import KeyframeView
+from trihedron.plugins.shared.libraries import open3d
+from trihedron.plugins.surface.common import Gathered, ViewFold, coloured
+
+
+@register("surface", "open3d_voxels")
+@dataclass(frozen=True)
+class Open3dVoxels(ViewFold):
+    """`open3d.t.geometry.VoxelBlockGrid` (Dong, Lao, Kaess, Koltun, PAMI 2022) of the retained views at their final poses, without colour in the
+    volume; every reading counts alike. No planes.
+
+    Library: Open3D (MIT; Zhou, Park, Koltun, arXiv:1801.09847), held to one thread. The bytes may differ on another CPU."""
+
+    voxel_m: PositiveFloat = 0.02
+    truncation_voxels: PositiveFloat = 4.0  # trunc_voxel_multiplier
+    blocks: PositiveInt = 10000  # of 16³ voxels, reserved
+    least_weight: PositiveFloat = 1.0  # weight_threshold, in readings
+
+    def finish(self, state: Gathered, map: Map | None) -> Surface:
+        """The zero level of the distances, coloured by the views."""
+        views = state.settled(map)
+        if not views:
+            return Surface.empty(state.index, state.stamp_ns)
+        return coloured(state, map, *self._mesh(views))
+
+    def _mesh(self, views: list[tuple[KeyframeView, F64]]) -> tuple[F64, I32]:
+        """Vertices (v, 3) and triangles (t, 3)."""
+        library = open3d()
+        kinds = (library.core.float32, library.core.float32)
+        grid = library.t.geometry.VoxelBlockGrid(("tsdf", "weight"), kinds, ((1), (1)), self.voxel_m, 16, self.blocks)
+        used = False
+        for view, T in views:
+            used = self._integrate(library, grid, view, T) or used
+        if not used:
+            return np.empty((0, 3)), np.empty((0, 3), np.int32)
+        mesh = grid.extract_triangle_mesh(weight_threshold=self.least_weight)
+        if "indices" not in mesh.triangle or not len(mesh.triangle.indices):
+            return np.empty((0, 3)), np.empty((0, 3), np.int32)
+        return mesh.vertex.positions.numpy().astype(np.float64), mesh.triangle.indices.numpy().astype(np.int32)
+
+    def _integrate(self, library: Any, grid: Any, view: KeyframeView, T: F64) -> bool:
+        """Fuse a view; False when it has no depth."""
+        if not (view.depth_m > 0.0).any():
+            return False
+        depth = library.t.geometry.Image(np.ascontiguousarray(view.depth_m))
+        intrinsics, extrinsics = library.core.Tensor(view.camera.K), library.core.Tensor(invert(T))
+        far = float(view.depth_m.max()) + 1.0
+        blocks = grid.compute_unique_block_coordinates(depth, intrinsics, extrinsics, 1.0, far, self.truncation_voxels)
+        grid.integrate(blocks, depth, intrinsics, extrinsics, 1.0, far, self.truncation_voxels)
+        return True
