@@ -56,7 +56,7 @@ class Faults:
     freeze: Frames = ""  # frames A:B that show what A does
     reverse: Frames = ""  # frames A:B that are delivered last first
     jump: NonNegativeInt = 0  # frame from which on the clock is wrong by jump_s
-    jump_s: float = 0.0
+    jump_s: float = 0.0  # added to the stamps from then on
     during: Frames = ""  # frames A:B with the faults below; empty = all
     depth_noise: NonNegativeFloat = 0.0  # added, times the sensor's standard deviation
     depth_holes: Share = 0.0  # share of the depth image that is missing, in blobs

@@ -20,7 +20,7 @@ BINS = 180  # of 1°
 @register("building", "atlanta_layout")
 @dataclass(frozen=True)
 class AtlantaLayout(Layout):
-    """As `manhattan_layout`, with further directions of walls: the peaks of the upright regions' normals about the vertical (Schindler, Dellaert,
+    """Extend `manhattan_layout` by further directions of walls: the peaks of the upright regions' normals about the vertical (Schindler, Dellaert,
     CVPR 2004, "Atlanta world"). An edge along none of the axes is turned to its own points."""
 
     apart_deg: Annotated[float, Range(2, 45)] = 6.0  # between directions
@@ -36,7 +36,7 @@ class AtlantaLayout(Layout):
         found = [0.0, 90.0]
         for best in np.argsort(-smooth, kind="stable"):
             near = np.abs(_turned(angles, best + 0.5)) < 2.5
-            if smooth[best] < self.least_m2:
+            if smooth[best] < self.least_m2 or not weight[near].any():
                 break
             angle = best + 0.5 + float(np.average(_turned(angles[near], best + 0.5), weights=weight[near]))
             if all(abs(float(_turned(np.array(angle), other))) > max(self.apart_deg, SNAP_DEG) for other in found):

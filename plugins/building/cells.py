@@ -18,7 +18,7 @@ SCALE = 10_000  # capacities are whole numbers
 @register("building", "cells")
 @dataclass(frozen=True)
 class CellComplex(AtlantaLayout):
-    """As `atlanta_layout`, with the cells labelled together (Ochmann, Vock, Wessel, Klein, Computers & Graphics 2016, with two labels; the cut of
+    """Label the cells of `atlanta_layout` together (Ochmann, Vock, Wessel, Klein, Computers & Graphics 2016, with two labels; the cut of
     Boykov, Jolly, ICCV 2001): a cell costs the area that contradicts its label, a border between inside and outside its length without a wall."""
 
     open_border_m: PositiveFloat = 0.05  # area in m² that a metre of border without a wall costs

@@ -51,7 +51,7 @@ class Covisibility(KeyframeOptions):
     redundant: PositiveInt = 8  # keyframes that must see what another one sees, as well, for that to be redundant
     redundant_share: PositiveShare = 0.9  # of its landmarks (ORB-SLAM)
     merge_deg: float = 4.0  # planes that differ by less, and by less than merge_m on average, become one
-    merge_m: float = 0.03
+    merge_m: float = 0.03  # mean distance of planes that become one
 
     def __call__(
         self,

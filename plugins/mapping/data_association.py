@@ -44,10 +44,10 @@ class SearchOptions:
     max_distance_l2: int = 250  # for descriptors compared by Euclidean distance
     ratio: float = 0.85  # best to second best
     line_angle_deg: Annotated[float, Range(above=0, high=90)] = 8.0
-    line_offset_px: float = 10.0
+    line_offset_px: float = 10.0  # of a segment beside its prediction
     line_overlap: float = 0.3  # of the shorter of the two
     line_distance: int = 60  # bits
-    line_ratio: float = 0.9
+    line_ratio: float = 0.9  # best to second best descriptor of lines
     plane_angle_deg: Annotated[float, Range(above=0, high=90)] = 10.0  # paper, section III-A
     plane_distance_m: float = 0.1  # paper, section III-A
     parallel_deg: Annotated[float, Range(above=0, high=90)] = 5.0  # planes nearer to parallel are taken as parallel, and perpendicular ones likewise

@@ -41,14 +41,18 @@ class Open3dVoxels(ViewFold):
         library = open3d()
         kinds = (library.core.float32, library.core.float32)
         grid = library.t.geometry.VoxelBlockGrid(("tsdf", "weight"), kinds, ((1), (1)), self.voxel_m, 16, self.blocks)
+        nothing = np.empty((0, 3)), np.empty((0, 3), np.int32)
         used = False
         for view, T in views:
             used = self._integrate(library, grid, view, T) or used
         if not used:
-            return np.empty((0, 3)), np.empty((0, 3), np.int32)
-        mesh = grid.extract_triangle_mesh(weight_threshold=self.least_weight)
+            return nothing
+        try:
+            mesh = grid.extract_triangle_mesh(weight_threshold=self.least_weight)
+        except RuntimeError:  # Open3D's answer to a volume without a surface
+            return nothing
         if "indices" not in mesh.triangle or not len(mesh.triangle.indices):
-            return np.empty((0, 3)), np.empty((0, 3), np.int32)
+            return nothing
         return mesh.vertex.positions.numpy().astype(np.float64), mesh.triangle.indices.numpy().astype(np.int32)
 
     def _integrate(self, library: Any, grid: Any, view: KeyframeView, T: F64) -> bool:

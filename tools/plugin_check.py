@@ -1,0 +1,495 @@
+"""The contract test of plugins: what `trihedron check` runs, and the tests for every plugin of this package."""
+
+from __future__ import annotations
+
+import hashlib
+import inspect
+import io
+import logging
+import re
+import statistics
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+import zlib
+from collections.abc import Callable, Iterator, Mapping
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager, redirect_stderr, redirect_stdout
+from dataclasses import dataclass, field, replace
+from functools import cached_property, lru_cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from trihedron.pipeline.core.config import composed, graph_of
+from trihedron.pipeline.core.errors import PluginError, TrihedronError
+from trihedron.pipeline.core.graph import Graph, Stage
+from trihedron.pipeline.core.options import OneOf, Range, constraints_of
+from trihedron.pipeline.core.registry import check_value, options_of
+from trihedron.pipeline.core.slots import CAMERA, FOLDS, RNG, SLOTS, accepts_none, inputs_of, output_of
+from trihedron.pipeline.core.types import LOST, Frame, Pose, Trajectory, Value
+from trihedron.pipeline.core.wires import PREVIOUS, Wire
+from trihedron.pipeline.record.codec import Encoder
+from trihedron.pipeline.record.reader import Recording
+from trihedron.pipeline.run.live import is_camera
+from trihedron.pipeline.run.runner import Runner
+from trihedron.pipeline.run.scheduler import single_threaded_libraries
+from trihedron.pipeline.run.value_checks import check_together, checked
+from trihedron.tools.plugins import default_plugins, field_comments, first_sentence
+
+ROOM = ("dataset=synthetic", "dataset.width=320", "dataset.height=240", "dataset.length=8")
+BEFORE = 3  # ordinary frames of an adverse scene, from which there are a map and previous values
+AFTER = 3  # adverse ones
+SLOWEST_MS = 10_000.0  # a call, beyond which a plugin hangs
+SILENT = ("bundle", "loop", "relocalise", "model")  # slots whose plugins may return nothing in a short sequence
+LIBRARIES = {"OpenCV": "cv2", "Open3D": "open3d", "COLMAP": "pycolmap", "SciPy": "scipy", "ONNX Runtime": "onnxruntime"}  # in docstrings -> module
+CLAUSES = ("What ", "Whether ", "How ", "Of ", "Where ", "Which ", "As ", "Those ")  # no docstring begins with
+WORKERS = 4
+
+
+@dataclass(frozen=True)
+class Result:
+    """The outcome of one check."""
+
+    name: str
+    good: bool
+    detail: str
+
+
+@dataclass(frozen=True)
+class Scene:
+    """A short sequence: its values, topic -> one a frame."""
+
+    name: str
+    graph: Graph
+    values: tuple[Mapping[str, Any], ...]
+
+
+@dataclass(frozen=True)
+class Frames:
+    """A data set of frames that are there already."""
+
+    frames: tuple[Frame, ...]
+
+    def __len__(self) -> int:
+        return len(self.frames)
+
+    def __call__(self, index: int) -> Frame | None:
+        """Return a frame."""
+        return self.frames[index]
+
+    def truth(self) -> Trajectory | None:
+        """None."""
+        return None
+
+
+# Adverse frames: each makes another frame of an ordinary one.
+
+
+def _noise(frame: Frame) -> Frame:
+    rng = np.random.default_rng(frame.index)
+    color = rng.integers(0, 256, frame.color.shape).astype(np.uint8)
+    return replace(frame, color=color, depth_m=rng.uniform(0.3, 10.0, frame.depth_m.shape).astype(np.float32))
+
+
+def _one_row(frame: Frame) -> Frame:
+    depth = np.zeros_like(frame.depth_m)
+    depth[len(depth) // 2] = frame.depth_m[len(depth) // 2]
+    return replace(frame, depth_m=depth)
+
+
+ADVERSE: dict[str, Callable[[Frame], Frame]] = {
+    "no depth": lambda frame: replace(frame, depth_m=np.zeros_like(frame.depth_m)),
+    "depth that is not finite": lambda frame: replace(frame, depth_m=np.full_like(frame.depth_m, np.nan)),
+    "darkness": lambda frame: replace(frame, color=np.zeros_like(frame.color)),
+    "nothing at all": lambda frame: replace(frame, color=np.zeros_like(frame.color), depth_m=np.zeros_like(frame.depth_m)),
+    "noise": _noise,
+    "one row of depth": _one_row,
+    "depth of kilometres": lambda frame: replace(frame, depth_m=frame.depth_m * np.float32(1000.0)),
+}
+REPEATED = "a frame that repeats"
+FEW: dict[str, dict[str, str]] = {  # scenes in which other stages find little: slot -> word
+    "no features": {"keypoints": "keypoints=none", "lines": "lines=none", "planes": "planes=none", "normals": "normals=none"},
+    "one of each feature": {"keypoints": "keypoints.features=1", "lines": "lines.segments=1", "planes": "planes.planes=1"},
+}
+
+
+@dataclass(frozen=True)
+class PluginCheck:
+    """The checks of one plugin. `words` are overrides, as for `trihedron run`."""
+
+    slot: str
+    name: str
+    words: tuple[str, ...] = ()
+    _lock: Any = field(default_factory=threading.Lock, compare=False, repr=False)
+
+    @cached_property
+    def plugin(self) -> Any:
+        """The plugin with its options. Raises TrihedronError."""
+        config = composed([f"{self.slot}={self.name}", *self.words])
+        wanted = (
+            graph_of(composed([f"{self.slot}={self.name}", f"outputs=[{self.slot}]", *self.words])) if self.slot != "dataset" else graph_of(config)
+        )
+        return wanted.stages[self.slot].plugin
+
+    @property
+    def summary(self) -> str:
+        """The first sentence of its docstring."""
+        return first_sentence(inspect.getdoc(type(self.plugin)) or "without a docstring")
+
+    def results(self, quick: bool = False) -> list[Result]:
+        """Run the checks. Raises PluginError and ConfigError where the plugin cannot run here: a library or a file that it needs is missing."""
+        static = [self._documented(), self._options()]
+        if self.slot == "dataset":
+            return [*static, self._frames()]
+        if (failure := self._values()).good is False:
+            return [*static, failure]
+        checks = [failure, self._adverse(), self._inputs(), self._state(), self._threads()]
+        checks += [] if quick else [self._processes(), self._replay()]
+        return [*static, *checks, self._library(), self._differs(), self._time()]
+
+    def digest(self) -> str:
+        """SHA-256 of the plugin's values in the room."""
+        return hashlib.sha256(b"".join(self._called(room(self._upstream)))).hexdigest()
+
+    # The graph that feeds the plugin has the default plugin in its place.
+
+    @property
+    def _upstream(self) -> tuple[str, ...]:
+        """The words that do not configure this plugin, and those without which its inputs would be missing."""
+        needed = ("model=tsdf",) if self.slot == "pose" else ()
+        return (*needed, *(word for word in self.words if not word.startswith((f"{self.slot}.", f"{self.slot}="))))
+
+    def _called(self, scene: Scene) -> list[bytes]:
+        """Bytes of the plugin's values in a scene, frame by frame; its own earlier values are its own."""
+        return [encoded(value) for value in values_of(self.plugin, self.slot, scene)]
+
+    def _documented(self) -> Result:
+        kind = type(self.plugin)
+        text, comments, ranges = inspect.getdoc(kind) or "", field_comments(kind), constraints_of(kind)
+        own = "__doc__" in vars(kind) and text and not text.startswith(f"{kind.__name__}(")
+        silent = [
+            option.name for option in options_of(kind) if option.name not in comments and option.name not in ranges and _is_number(option.default)
+        ]
+        if not own or not re.match(r"[A-Z`'\"]", text) or text.startswith(CLAUSES):
+            return Result("documented", False, "the class has no docstring that opens with what it does")
+        if silent:
+            return Result("documented", False, f"neither a range nor a comment: {', '.join(silent)}")
+        return Result("documented", True, f"{len(options_of(kind))} options")
+
+    def _options(self) -> Result:
+        tried = 0
+        for option, value in _out_of_range(type(self.plugin)):
+            tried += 1
+            try:
+                replace(self.plugin, **{option: value})
+            except (ValueError, TypeError):
+                continue
+            return Result("options", False, f"{option}={value!r} is out of range and is taken")
+        return Result("options", True, f"{tried} values out of range are refused")
+
+    def _frames(self) -> Result:
+        """Frames of a data set: in order, by number, and again."""
+        try:
+            count = min(len(self.plugin), BEFORE) if not is_camera(self.plugin) else 0
+            frames = [self.plugin(index=k) for k in range(count)]
+            again = [self.plugin(index=k) for k in reversed(range(count))][::-1]
+        except TrihedronError as error:
+            return Result("frames", True, f"not read: {error}")
+        for frame, other in zip(frames, again):
+            if not isinstance(frame, Frame) or not isinstance(other, Frame) or encoded(frame) != encoded(other):
+                return Result("frames", False, "a frame that is read twice is not the same")
+        stamps = [frame.stamp_ns for frame in frames if frame is not None]
+        return Result("frames", stamps == sorted(set(stamps)), f"{count} frames, stamps increase")
+
+    def _values(self) -> Result:
+        scene, found = room(self._upstream), 0
+        try:
+            for arguments, value in calls_of(self.plugin, self.slot, scene):
+                if value is None:
+                    continue
+                found += 1
+                checked(self.slot, value, "value")
+                check_together({**arguments, self.slot: value}, "value", {})
+        except (PluginError, TrihedronError) as error:
+            if not str(error).startswith("value"):
+                raise
+            return Result("values", False, str(error))
+        except Exception as error:
+            return Result("values", False, f"{type(error).__name__}: {error}")
+        calls = 1 if self.slot in FOLDS else len(scene.values)
+        silent = found == 0 and self.slot not in SILENT and self.name != "none"
+        return Result("values", not silent, f"{found} of {calls} calls gave {output_of(self.slot).__name__}")
+
+    def _adverse(self) -> Result:
+        count = 0
+        for scene in adverse(self.slot, self._upstream):
+            count += 1
+            try:
+                for arguments, value in calls_of(self.plugin, self.slot, scene):
+                    if value is not None:
+                        checked(self.slot, value, "value")
+                        check_together({**arguments, self.slot: value}, "value", {})
+            except Exception as error:
+                return Result("adverse scenes", False, f"{scene.name}: {type(error).__name__}: {' '.join(str(error).split())}")
+        return Result("adverse scenes", True, f"{count} scenes")
+
+    def _inputs(self) -> Result:
+        for arguments, value in calls_of(self.plugin, self.slot, room(self._upstream), watch=True):
+            if value == "changed":
+                return Result("inputs", False, f"a call changes its inputs: {', '.join(arguments)}")
+        return Result("inputs", True, "unchanged")
+
+    def _state(self) -> Result:
+        scene = room(self._upstream)
+        if self.slot in FOLDS:
+            return Result("no hidden state", self._called(scene) == self._called(scene), "a second fold gives the same bytes")
+        calls = [(arguments, encoded(value)) for arguments, value in calls_of(self.plugin, self.slot, scene) if arguments is not None]
+        same = all(encoded(self.plugin(**_fresh(arguments))) == before for arguments, before in reversed(calls))
+        return Result("no hidden state", same, "calls in the opposite order give the same bytes" if same else "calls depend on earlier ones")
+
+    def _threads(self) -> Result:
+        scene = room(self._upstream)
+        expected = self._called(scene)
+        with ThreadPoolExecutor(WORKERS) as pool, single_threaded_libraries():
+            same = all(found == expected for found in pool.map(lambda _: self._called(scene), range(WORKERS)))
+        return Result("threads", same, f"{WORKERS} at once give {'the same' if same else 'other'} bytes")
+
+    def _processes(self) -> Result:
+        program = "import sys; from trihedron.pipeline.app.cli import main; sys.exit(main(sys.argv[1:]))"
+        words = [sys.executable, "-c", program, "check", self.slot, self.name, *self.words, "--digest"]
+        done = subprocess.run(words, capture_output=True, text=True)
+        if done.returncode:
+            return Result("processes", False, (done.stderr.strip().splitlines() or ["failed"])[-1])
+        same = done.stdout.split()[-1] == self.digest()
+        return Result("processes", same, f"another one gives {'the same' if same else 'other'} bytes")
+
+    def _replay(self) -> Result:
+        from trihedron.pipeline.app.cli import run_once
+
+        given = [f"{self.slot}={self.name}", f"outputs=[trajectory,{self.slot}]", f"record.topics=[{self.slot}]", *self._upstream, *self.words]
+        with tempfile.TemporaryDirectory() as folder, redirect_stdout(io.StringIO()), redirect_stderr(io.StringIO()):
+            try:
+                run_once([*ROOM, *given, f"out={folder}/run"], time.perf_counter())
+                only = [f"replay={folder}/run/run.mcap", f"only=[{self.slot}]", f"record.topics=[{self.slot}]", f"out={folder}/again"]
+                run_once(only, time.perf_counter())
+            except TrihedronError as error:
+                return Result("replay", False, str(error))
+            first, second = ([encoded(v) for v in _topic(Path(folder) / run / "run.mcap", self.slot)] for run in ("run", "again"))
+        return Result("replay", first == second, f"{len(first)} values are {'the same' if first == second else 'others'}")
+
+    @property
+    def _named(self) -> list[str]:
+        """Modules of the libraries that the docstring names."""
+        text = inspect.getdoc(type(self.plugin)) or ""
+        return [module for name, module in LIBRARIES.items() if re.search(rf"Librar(y|ies): [^.]*{name}", text)]
+
+    def _library(self) -> Result:
+        named = self._named
+        if not named:
+            return Result("library", True, "none is named")
+        scene, called = room(self._upstream), set[str]()
+        with modules_called(called):
+            values_of(self.plugin, self.slot, scene)
+        missing = [module for module in named if module not in called]
+        return Result("library", not missing, f"{', '.join(missing)} is named and not called" if missing else f"{', '.join(named)} called")
+
+    def _differs(self) -> Result:
+        default = default_plugins().get(self.slot)
+        if default == self.name:
+            return Result("differs", True, "it is the default")
+        scene = room(self._upstream)
+        plugin = graph_of(composed([f"outputs=[{self.slot}]", *self._upstream])).stages[self.slot].plugin
+        differing = sum(a != b for a, b in zip(self._called(scene), [encoded(v) for v in values_of(plugin, self.slot, scene)]))
+        good = differing > 0 or not self._named or self.slot in SILENT  # other methods may agree in a plain room
+        return Result("differs", good, f"from {default} in {differing} values")
+
+    def _time(self) -> Result:
+        scene, spent = room(self._upstream), []
+        for _ in calls_of(self.plugin, self.slot, scene, spent=spent):
+            pass
+        median, most = 1e3 * statistics.median(spent), 1e3 * max(spent)
+        return Result("time", most < SLOWEST_MS, f"{median:.1f} ms a call (median; {most:.1f} at most)")
+
+
+# Scenes, computed once in a process.
+
+
+@lru_cache(maxsize=64)
+def room(words: tuple[str, ...]) -> Scene:
+    """The room, seen by the default graph with these words."""
+    return _scene("room", words, None)
+
+
+def adverse(slot: str, words: tuple[str, ...]) -> Iterator[Scene]:
+    """The adverse scenes."""
+    yield from (_changed(name, words) for name in (*ADVERSE, REPEATED))
+    for name, few in FEW.items():
+        yield replace(room((*words, f"dataset.length={BEFORE}", *(word for of, word in few.items() if of != slot))), name=name)
+
+
+@lru_cache(maxsize=64)
+def _changed(name: str, words: tuple[str, ...]) -> Scene:
+    """The room whose last frames are changed."""
+    ordinary = tuple(value["dataset"] for value in room(words).values)
+    if name == REPEATED:
+        return _scene(name, words, tuple(replace(ordinary[0], index=f.index, stamp_ns=f.stamp_ns) for f in ordinary[:AFTER]))
+    return _scene(name, words, (*ordinary[:BEFORE], *(ADVERSE[name](frame) for frame in ordinary[BEFORE : BEFORE + AFTER])))
+
+
+def _scene(name: str, words: tuple[str, ...], frames: tuple[Frame, ...] | None) -> Scene:
+    """Run the default graph, without folds, on the room or on other frames."""
+    config = composed([*ROOM, *words])
+    config.outputs = [topic for topic in config.graph if topic not in FOLDS and config.get(topic) is not None and topic in SLOTS]
+    graph = graph_of(config)
+    if frames is not None:
+        graph = Graph({**graph.stages, "dataset": replace(graph.stages["dataset"], plugin=Frames(frames))}, graph.outputs)
+    with muted():
+        return Scene(name, graph, tuple(dict(step.values) for step in Runner(graph, threads=1).steps(None, frozenset())))
+
+
+# Calls of a plugin on the values of a scene.
+
+
+def values_of(plugin: Any, slot: str, scene: Scene) -> list[Any]:
+    """The plugin's values: one a frame, or the single one of a fold."""
+    return [value for _, value in calls_of(plugin, slot, scene)]
+
+
+def calls_of(plugin: Any, slot: str, scene: Scene, watch: bool = False, spent: list[float] | None = None) -> Iterator[tuple[Any, Any]]:
+    """Call the plugin in order: (arguments, value) of each call, None for both where an input that it requires is missing.
+
+    With `watch` the value is "changed" where a call changed its inputs; `spent` takes the seconds of each call."""
+    stage = _stage(plugin, slot, scene)
+    own: list[Any] = []
+    state = plugin.start() if slot in FOLDS else None
+    with single_threaded_libraries():
+        for position in range(len(scene.values)):
+            arguments = _arguments(stage, slot, scene, position, own)
+            value = None
+            if arguments is not None:
+                before = [encoded(item) for item in arguments.values()] if watch else []
+                began = time.perf_counter()
+                if slot in FOLDS:
+                    state = plugin.add(state, **_fresh(arguments))
+                else:
+                    value = plugin(**_fresh(arguments))
+                if spent is not None:
+                    spent.append(time.perf_counter() - began)
+                if value is not None:
+                    check_value(slot, value, _index(scene, position))
+                own.append(value)
+                if watch and before != [encoded(item) for item in arguments.values()]:
+                    yield arguments, "changed"
+                    continue
+            else:
+                own.append(None)
+            if slot not in FOLDS:
+                yield (arguments, value) if arguments is not None else (None, None)
+        if slot in FOLDS:
+            maps = [value["map"] for value in scene.values if value.get("map") is not None]
+            yield {}, plugin.finish(state, maps[-1] if maps else None)
+
+
+def _stage(plugin: Any, slot: str, scene: Scene) -> Stage:
+    """The plugin as a stage of the scene's graph."""
+    from trihedron.pipeline.core.graph import build_graph
+
+    plugins = {name: stage.plugin for name, stage in scene.graph.stages.items()}
+    return build_graph({**plugins, slot: plugin}, [slot]).stages[slot]
+
+
+def _arguments(stage: Stage, slot: str, scene: Scene, position: int, own: list[Any]) -> dict[str, Any] | None:
+    """The inputs of one call by the stage's wires; None where a required one is missing."""
+    index = _index(scene, position)
+    hints, arguments = inputs_of(slot), dict.fromkeys(stage.absent)
+    for parameter, wire in stage.inputs.items():
+        topic = own if wire.topic == slot else [value.get(wire.topic) for value in scene.values]
+        value = _delayed(topic, wire, position)
+        if value is None and (parameter == CAMERA or not accepts_none(hints[parameter])):
+            return None
+        if slot == "relocalise" and isinstance(value, Pose) and position >= BEFORE:
+            value = replace(value, status=LOST)  # for which the slot is there
+        arguments[parameter] = value.camera if parameter == CAMERA else value
+    if stage.wants_rng:
+        arguments[RNG] = [0, index, zlib.crc32(slot.encode())]
+    return arguments
+
+
+def _delayed(topic: list[Any], wire: Wire, position: int) -> Any:
+    if wire.delay == PREVIOUS:
+        return next((value for value in reversed(topic[:position]) if value is not None), None)
+    return topic[position - wire.delay] if position >= wire.delay else None
+
+
+def _fresh(arguments: Mapping[str, Any]) -> dict[str, Any]:
+    """Arguments with a generator of random numbers that nothing was drawn from."""
+    return {name: np.random.default_rng(value) if name == RNG else value for name, value in arguments.items()}
+
+
+def _index(scene: Scene, position: int) -> int:
+    frame = scene.values[position].get("dataset")
+    return frame.index if isinstance(frame, Frame) else position
+
+
+def encoded(value: Any) -> bytes:
+    """A value as the bytes of a recording; anything else by its text."""
+    return Encoder().encode(value) if isinstance(value, Value) else repr(value).encode()
+
+
+def _topic(path: Path, slot: str) -> list[Any]:
+    recording = Recording(str(path))
+    return list(recording.values(slot)) if slot in recording.topics else []
+
+
+def _is_number(default: Any) -> bool:
+    return isinstance(default, (int, float)) and not isinstance(default, bool)
+
+
+def _out_of_range(kind: type[Any]) -> Iterator[tuple[str, Any]]:
+    """(option, value) for each bound of an option."""
+    for option, constraints in constraints_of(kind).items():
+        for constraint in constraints:
+            if isinstance(constraint, Range):
+                bounds = ((constraint.low, -1), (constraint.high, 1), (constraint.above, 0), (constraint.below, 0))
+                yield from ((option, bound + step) for bound, step in bounds if bound is not None)
+            elif isinstance(constraint, OneOf):
+                yield option, "none of them"
+
+
+@contextmanager
+def muted() -> Iterator[None]:
+    """Within this the program's warnings, which adverse frames deserve, are not shown."""
+    logger = logging.getLogger("trihedron")
+    before = logger.disabled
+    logger.disabled = True
+    try:
+        yield
+    finally:
+        logger.disabled = before
+
+
+class modules_called:
+    """Context within which the top-level modules whose functions this thread calls are added to a set."""
+
+    def __init__(self, found: set[str]) -> None:
+        self._found = found
+
+    def __enter__(self) -> None:
+        sys.setprofile(self._profile)
+
+    def __exit__(self, *exception: object) -> None:
+        sys.setprofile(None)
+
+    def _profile(self, frame: Any, event: str, function: Any) -> None:
+        if event == "call":
+            name = frame.f_globals.get("__name__")
+        elif event == "c_call":
+            name = getattr(function, "__module__", None) or type(getattr(function, "__self__", None)).__module__
+        else:
+            return
+        if isinstance(name, str):
+            self._found.add(name.split(".")[0])
