@@ -136,7 +136,7 @@ def _cold(overrides: list[str], folder: Path) -> float:
 
 
 def machine() -> dict[str, Any]:
-    """What the figures were measured on, and with which versions."""
+    """Machine on which the figures were measured, and the versions."""
     cpuinfo = Path("/proc/cpuinfo").read_text() if Path("/proc/cpuinfo").exists() else ""
     models = [line.partition(":")[2].strip() for line in cpuinfo.splitlines() if line.startswith("model name")]
     packages = {name: version(name) for name in ("trihedron", "numpy", "numba", "opencv-contrib-python-headless")}

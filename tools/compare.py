@@ -42,7 +42,7 @@ class Run:
 
     @property
     def seeds(self) -> tuple[str, ...]:
-        """What makes it a repeat of another run, and pairs it with one of the baseline."""
+        """Seeds, which make it a repeat of another run, and pair it with one of the baseline."""
         return tuple(self.overrides.get(key, "") for key in SEEDS)
 
 
@@ -200,5 +200,5 @@ def _of_data(key: str) -> bool:
 
 
 def _said(run: Run, keys: Sequence[str]) -> str:
-    """What a run's overrides say of these keys; of a path its last part."""
+    """Overrides of a run for these keys; of a path its last part."""
     return " ".join(f"{key}={Path(run.overrides[key]).name}" for key in keys if run.overrides.get(key, "null") != "null")

@@ -141,7 +141,7 @@ def _name(surface: Surface, plane: int) -> str:
 
 
 def _facts(surface: Surface, plane: int, R: F64) -> dict[str, Any]:
-    """What is known of a plane; normal·x + d = 0 in the file's axes."""
+    """Facts about a plane; normal·x + d = 0 in the file's axes."""
     return {
         "id": int(surface.plane_ids[plane]),
         "kind": PLANE_KINDS[surface.kinds[plane]],

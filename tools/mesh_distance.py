@@ -87,7 +87,7 @@ def _nearest(points: F64, corners: F64, candidates: I32, far: float) -> tuple[F6
 
 @kernel(error_model="python")
 def _distance(p: F64, a: F64, b: F64, c: F64) -> float:
-    """From a point to a triangle (Ericson, Real-Time Collision Detection, 5.1.5)."""
+    """Distance from a point to a triangle (Ericson, Real-Time Collision Detection, 5.1.5)."""
     ab, ac, ap = b - a, c - a, p - a
     d1, d2 = np.dot(ab, ap), np.dot(ac, ap)
     if d1 <= 0.0 and d2 <= 0.0:

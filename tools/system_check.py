@@ -52,13 +52,13 @@ def main() -> int:
 
 
 def import_error(module: str) -> str:
-    """What the interpreter says when `module` is imported in a new process; empty when it loads."""
+    """Error of the interpreter when `module` is imported in a new process; empty when it loads."""
     done = subprocess.run([sys.executable, "-c", f"import {module}"], capture_output=True, text=True)
     return "" if done.returncode == 0 else done.stderr.strip() or f"the interpreter ended with code {done.returncode}"
 
 
 def check(module: str, run: Callable[[str], str] = import_error) -> str:
-    """What is wrong with a module and what to do about it, in one line; empty when it loads."""
+    """Check a module: what is wrong with it and what to do about it, in one line; empty when it loads."""
     said = run(module)
     if not said:
         return ""
@@ -74,7 +74,7 @@ def check(module: str, run: Callable[[str], str] = import_error) -> str:
 
 
 def loads(library: str) -> bool:
-    """Whether the system's loader finds a shared library."""
+    """Return True if the system's loader finds a shared library."""
     try:
         ctypes.CDLL(library)
     except OSError:

@@ -1,4 +1,4 @@
-"""What the surfaces of the synthetic room are made of: a painter for each material, drawing one texture from a seed."""
+"""Surfaces of the synthetic room: a painter for each material, drawing one texture from a seed."""
 
 from __future__ import annotations
 

@@ -27,8 +27,8 @@ from trihedron.pipeline.core.types import EXACT_DEPTH, F64, Bool, Camera, DepthN
 
 
 class Scene(Enum):
-    """Where the camera is: one furnished room, a corridor that ends where it began, two identical offices on a corridor, ten rooms in a circuit,
-    an L-shaped flat, two rooms with slanted walls."""
+    """Scene that the camera is in: one furnished room, a corridor that ends where it began, two identical offices on a corridor, ten rooms in a
+    circuit, an L-shaped flat, two rooms with slanted walls."""
 
     room = "room"
     corridor = "corridor"

@@ -1,4 +1,4 @@
-"""From a composed configuration to a finished run folder: what `trihedron run` does."""
+"""Execution of `trihedron run`: from a composed configuration to a finished run folder."""
 
 from __future__ import annotations
 
@@ -108,7 +108,7 @@ def closed(writer: RecordingWriter) -> RecordingError | None:
 
 
 def remembered_of(config: DictConfig, graph: Graph) -> Callable[[int], DelayLines] | None:
-    """What a run begins with: nothing, or the map file it goes on from."""
+    """Initial memory of a run: nothing, or the map file it continues."""
     if config.save_map and config.replay:
         raise ConfigError("save_map", "a replay makes no map to go on from", "save the map of the run itself")
     if config.save_map and not (folder := Path(config.save_map).expanduser().absolute().parent).is_dir():
@@ -132,7 +132,7 @@ def _pace(config: DictConfig) -> Pace:
 
 
 def source_of(config: DictConfig) -> str:
-    """What is tracked, whichever part of it: the data set's options with absolute paths."""
+    """Data set that is tracked, whichever part of it: its options with absolute paths."""
     options: Any = OmegaConf.to_container(config.dataset, resolve=True, enum_to_str=True) if config.dataset is not None else {}
     options = {name: _absolute(value) if f"dataset.{name}" in READ_PATHS else str(value) for name, value in options.items() if name != "frames"}
     return json.dumps(options, sort_keys=True)

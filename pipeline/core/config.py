@@ -32,7 +32,7 @@ SWEEPER, SEARCH, DASK = (f"hydra_plugins.trihedron.{name}" for name in ("Sweeper
 
 
 class Feedback(Enum):
-    """What a recomputed stage's delayed wires see in a replay: the new values, or those of the recording."""
+    """Values that a recomputed stage's delayed wires read in a replay: the new ones, or those of the recording."""
 
     new = "new"
     recorded = "recorded"
@@ -238,7 +238,7 @@ def composed(overrides: Iterable[str], recorded: RecordedConfig | None = None) -
 
 
 def rewritten(error: Exception) -> TrihedronError:
-    """What Hydra and OmegaConf raise while they compose, as one line with place, cause and cure."""
+    """Rewrite an error that Hydra or OmegaConf raises while composing as one line with place, cause and cure."""
     text = " ".join(str(error).split())
     cause: BaseException = error.__cause__ or error
     if match := re.search(r"Ambiguous value for argument '([^=']*)=([^']*)'", text):

@@ -73,7 +73,7 @@ class Sweeper(BasicSweeper):
 
     @property
     def loader(self) -> ConfigLoader:
-        """What composes configurations, from Hydra too."""
+        """Loader that composes configurations, from Hydra too."""
         assert self.hydra_context is not None
         return self.hydra_context.config_loader
 
@@ -159,7 +159,7 @@ class Sweeper(BasicSweeper):
 
     @property
     def _threads(self) -> int:
-        """Of a job: what the cluster is asked for, two where jobs come one by one, else one."""
+        """Threads of a job: the number that the cluster is asked for, two where jobs come one by one, else one."""
         launcher = self.options.hydra.launcher
         one_by_one = launcher.get("n_jobs") == 1 or self.options.hydra.runtime.choices["hydra/launcher"] == "basic"
         return int(launcher.get("cpus_per_task") or (2 if one_by_one else 1))
@@ -190,7 +190,7 @@ def _numbers(folder: Path, jobs: Sequence[Overrides]) -> list[int]:
 
 
 def _given_up(error: Exception) -> TrihedronError:
-    """What an engine of Hydra's failed with, as one line."""
+    """Error of an engine of Hydra's, as one line."""
     cause = next(iter(str(error).splitlines()), type(error).__name__)
     return TrihedronError("hydra.launcher", cause, "what is done is kept; the same command again runs the rest")
 
@@ -202,7 +202,7 @@ def failure_of(folder: Path) -> str:
 
 
 def _keep_overrides(folder: Path, job: Overrides) -> None:
-    """What tells a job from the others, where it came to no end before it could say so itself: it has no run then, but a reason."""
+    """Write the overrides that identify a job which ended before it could write them itself: it has no run then, but a reason."""
     file = folder / ".hydra" / "overrides.yaml"
     if not file.exists():
         file.parent.mkdir(parents=True, exist_ok=True)

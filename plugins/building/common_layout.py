@@ -1,4 +1,4 @@
-"""From faces and free space to rooms, walls and openings.
+"""Rooms, walls and openings from faces and free space.
 
 The lines of all faces divide the plan into cells; a solver says which cells are inside. Inside cells are one room where no tall face parts them
 (Mura, Mattausch, Jaspe Villanueva, Gobbetti, Pajarola, Computers & Graphics 2014, with free space in the place of scan positions). Every edge of a
@@ -498,7 +498,7 @@ def _room_at(rooms: list[RoomPlan], point: F64) -> int:
 
 @dataclass
 class StoreyPlan:
-    """What was found in one storey."""
+    """Elements found in one storey."""
 
     storey: Storey
     rooms: list[RoomPlan]

@@ -17,7 +17,7 @@ MOST = 2056  # samples of a segment; rows of a power of two would all lie in the
 
 
 class Placing(NamedTuple):
-    """How segments are joined and which are kept: the difference of direction (rad) of fragments of one edge, their distance across and along, the
+    """Rules for joining and selecting segments: the difference of direction (rad) of fragments of one edge, their distance across and along, the
     shortest segment, how near to the image's border all along a segment is the border, and how far across it its edge is searched, px."""
 
     angle: float
@@ -46,7 +46,7 @@ def placed_segments(image: U8, found: F64, scale: float, placing: Placing, most:
 
 @kernel
 def _worthy(lines: F64, least_px: float, border_px: float, width: int, height: int) -> F64:
-    """Those that are long enough, and not the border of the image (or of what the sensor's registration left of it)."""
+    """Select segments that are long enough, and not the border of the image (or of what the sensor's registration left of it)."""
     out, n = np.empty((len(lines), 4)), 0
     right, bottom = width - 1 - border_px, height - 1 - border_px
     for i in range(len(lines)):
@@ -164,8 +164,8 @@ def _levels_beside(image: U8, scratch: F64, right: float, down: float, out: F64)
 
 @kernel
 def _steepest(levels: F64, sign: int, slopes: F64, top: F64, row: F64) -> None:
-    """From the grey levels across samples, two rows more than there are of `slopes`: the slopes, counted along `sign`, the steepest rise (n,) of each
-    sample and its row. All samples of a row at once."""
+    """Compute, from the grey levels across samples (two rows more than `slopes` has): the slopes, counted along `sign`, the steepest rise (n,) of
+    each sample and its row. All samples of a row at once."""
     reach, n = len(slopes) // 2, len(top)
     for j in range(len(slopes)):
         here = reach + 1 + sign * (j - reach)

@@ -174,7 +174,7 @@ class AtlantaModes(NamedTuple):
 
     @property
     def supported(self) -> bool:
-        """Whether there is any."""
+        """Return True if there is any."""
         return len(self.rows) > 0
 
     @property

@@ -83,7 +83,7 @@ FACE = (12, 24, 48)  # cells a face of the maps for the first levels, whose cube
 
 
 class Optimum(NamedTuple):
-    """What a search found and proved."""
+    """Result of a search and its proven bound."""
 
     R: F64  # (3, 3)
     consensus: float

@@ -192,7 +192,7 @@ SUMMIT_STEP = 1.08  # factor by which a ball around a summit is widened
 
 
 class Near(NamedTuple):
-    """What directions add to the consensus within a ball of rotations, times sin²τ."""
+    """Contribution of directions to the consensus within a ball of rotations, times sin²τ."""
 
     sure: F64  # (3, 7) moments of the inliers that each axis has for all rotations of the ball
     torque: F64  # (3,) first derivative by phi in `Exp(phi) R` of the bound on the others
@@ -208,7 +208,7 @@ def curvature(beta: float) -> float:
 
 @kernel
 def near_rotation(groups: Groups, R: F64, radius: float, inlier: float) -> Near:
-    """What directions add within `radius` of R, `inlier` being τ; inlier + radius < 45°, so that no direction is near two axes.
+    """Contribution of directions within `radius` of R, `inlier` being τ; inlier + radius < 45°, so that no direction is near two axes.
 
     A direction that may enter or leave its cone adds at most max(0, p + s), p being its value and |s| <= L the change to first order. That is convex
     in s, so it is below the chord from -L to L, whose slopes are summed as a torque: directions on opposite edges of a cone cancel."""

@@ -1,4 +1,4 @@
-"""What estimators have in common that end with the modes of the sphere: their options, and the way from modes to a Manhattan frame."""
+"""Functions of all estimators that end with the modes of the sphere: their options, and the way from modes to a Manhattan frame."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ class ModeOptions:
             raise ValueError("use_normals, use_lines: at least one must be true")
 
     def directions(self, normals: Normals, segments: Segments) -> Directions:
-        """Of the normals and lines that the options let take part."""
+        """Directions of the normals and lines that the options include."""
         surface, lines = normals.normals if self.use_normals else None, segments if self.use_lines else None
         return gather_directions(surface, lines, self.samples, self.line_weight_per_px)
 
@@ -177,7 +177,8 @@ HALF_SPHERE = _half_sphere(256)  # (256, 3) directions about 9° apart over half
 
 
 def lost_frames(modes: Modes, fit: AxisFit, segments: Segments, planes: Planes, normals: Normals, known: F64, ids: I32) -> ManhattanFrame:
-    """Not supported: a single axis of the first still turns all that are known (k, 3, 3), and tells two of its three angles."""
+    """Manhattan frames that are not supported: a single axis of the first still rotates all that are known (k, 3, 3), and measures two of its three
+    angles."""
     R, covariance = known[0], np.eye(3) * NOTHING_KNOWN
     if modes.seen.sum() == 1:
         turned = orthonormal(modes.axes, np.where(modes.seen, 1.0, 1e-6))
@@ -236,7 +237,7 @@ class Directions(NamedTuple):
     first_line: int
 
     def thinned(self, most: int) -> Directions:
-        """With at most about `most` of the normals, which weigh the more, and all lines."""
+        """Keep about `most` of the normals at most, with larger weights, and all lines."""
         step = max(-(-self.first_line // most), 1)
         normals, lines = self.vectors[: self.first_line : step], self.vectors[self.first_line :]
         weights = np.concatenate([step * self.weights[: self.first_line : step], self.weights[self.first_line :]])
@@ -352,14 +353,14 @@ def turn_between(found: F64, before: F64, limit: float) -> F64:
 
 
 def missing(rows: I32, count: int) -> I32:
-    """Those of `count` rows that are not among `rows`."""
+    """Rows of `count` that are not among `rows`."""
     left = np.ones(count, np.bool_)
     left[rows[rows >= 0]] = False
     return np.flatnonzero(left).astype(np.int32)
 
 
 def remembered(unseen: I32, ids: I32, room: int) -> I32:
-    """Of the rows of frames out of sight those for which there is room: seen last, and the one with the highest id, so that no id is given twice."""
+    """Rows of frames out of sight for which there is room: seen last, and the one with the highest id, so that no id is given twice."""
     if len(unseen) <= max(room, 0):
         return unseen
     newest = unseen[ids[unseen] == ids.max()]

@@ -149,7 +149,7 @@ class Found(NamedTuple):
 
     @property
     def weight(self) -> float:
-        """Of the directions on its axes."""
+        """Weight of the directions on its axes."""
         return float(self.modes.weights[self.modes.seen].sum())
 
 
@@ -166,7 +166,7 @@ class FrameMixture:
     search_samples: int
 
     def followed(self, directions: Directions, planes: Planes, known: F64) -> list[Found]:
-        """Those of the known rotations (k, 3, 3) that the scene still supports nearby, heaviest first. The turn of the first one found says where to
+        """Known rotations (k, 3, 3) that the scene still supports nearby, heaviest first. The turn of the first one found says where to
         expect those after it."""
         found: list[Found] = []
         expected = known
@@ -185,7 +185,7 @@ class FrameMixture:
         return kept
 
     def searched(self, directions: Directions, planes: Planes, found: list[Found]) -> list[Found]:
-        """With those that the directions left over lead to."""
+        """Frames with those added to which the remaining directions lead."""
         few = directions.thinned(self.search_samples)
         while len(found) < self.max_frames:
             left = self._left(few, found)
@@ -210,7 +210,7 @@ class FrameMixture:
         return self.finder.follow(Directions(vectors[own], weights[own], int(own[:first].sum())), planes, rotations[row])
 
     def _is_another(self, one: Found, others: list[Found], directions: Directions) -> bool:
-        """Whether it is none of the others and has enough on axes which are not theirs."""
+        """Return True if it is none of the others and has enough on axes which are not theirs."""
         if not others:
             return True
         axes = np.concatenate([other.modes.axes[:, other.modes.seen] for other in others], axis=1)

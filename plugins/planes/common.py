@@ -1,4 +1,4 @@
-"""What every detector of planes ends in: regions grown to their borders, merged, fitted by weighted least squares, reported with covariance."""
+"""Final steps of every detector of planes: regions grown to their borders, merged, fitted by weighted least squares, reported with covariance."""
 
 from __future__ import annotations
 
@@ -66,7 +66,7 @@ class PlanarRegions:
         return self._report(labels, core, owner, sums, grid, frame, stride)
 
     def _flat(self, owner: I32, labels: U8, sums: Sums, grid: Grid, gap: int) -> I32:
-        """Which region each one became part of, (k + 1,) by label; 0 where the normals, if there are any, say that it is no plane."""
+        """New label (k + 1,) of each region; 0 where the normals, if there are any, show that it is no plane."""
         if np.isnan(grid.normals[..., 0]).all():
             return owner
         cone, merged = float(np.radians(self.cone_deg)), owner[labels]

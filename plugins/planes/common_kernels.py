@@ -191,7 +191,7 @@ def _fit_members(columns: F64, member: Bool, found: int) -> tuple[F64, int]:
 
 @kernel
 def turn(q: F64, columns: F64, member: Bool) -> float:
-    """How far the normals turn across the members, rad: about 0 for a plane whatever its noise, all of the angle seen for a cylinder.
+    """Angle by which the normals turn across the members, rad: about 0 for a plane whatever its noise, all of the angle seen for a cylinder.
     Members without a normal do not count."""
     m = 0
     cxx, cxy, cxz, cyy, cyz, czz = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0  # sums of x xᵀ, of n xᵀ, of x and of n
@@ -435,7 +435,7 @@ def neighbours(labels: U8, count: int, gap: int) -> F64:
 
 @kernel
 def merge_regions(A: F64, b: F64, moments: F64, n: I32, touch: F64, limit: float, alike: float) -> I32:
-    """Which region each of k becomes part of, (k + 1,) by label; the sums (as from `accumulate`, with the neighbours' counts) are added up in place.
+    """New label (k + 1,) of each of k regions; the sums (as from `accumulate`, with the neighbours' counts) are added up in place.
 
     From the largest down a region takes in those smaller neighbours for which the common plane is within `limit` σ (rms) of each one's own, and what
     noise moves these by when `alike` depths err as one."""
@@ -464,8 +464,8 @@ def merge_regions(A: F64, b: F64, moments: F64, n: I32, touch: F64, limit: float
 
 @kernel
 def _one_plane(A: F64, b: F64, n: int, B: F64, c: F64, m: int, limit: float, noise: float) -> bool:
-    """Whether the common plane of two regions lies within `limit` σ (rms) of each region's own; `noise` is added to the sums of squares. Not when it
-    is turned from both while these are parallel: one surface is in front of the other."""
+    """Return True if the common plane of two regions lies within `limit` σ (rms) of each region's own; `noise` is added to the sums of squares. Not
+    when it is turned from both while these are parallel: one surface is in front of the other."""
     solved, common = solve_symmetric(A + B, b + c)
     first, p = solve_symmetric(A, b)
     second, q = solve_symmetric(B, c)
@@ -486,7 +486,7 @@ STEP_M = 2.0**-10  # samples of planes say where a plane is, to within centimetr
 def plane_report(
     labels: U8, core: U8, number: U8, planes: F64, grid: Grid, tiles: int, expected: float, weight: float, wanted: int, most: int
 ) -> tuple[F64, F64, F64, F32]:
-    """Of planes q (k, 3) with their regions' labels (h, w) and cores, whose labels have these numbers: the coefficients (k, 4), the derivative
+    """Report planes q (k, 3) with their regions' labels (h, w) and cores, whose labels have these numbers: the coefficients (k, 4), the derivative
     (k, 3, 3) of (a, b, d) by q, the variance (k,) as by `excess_variance` and the samples (k, wanted, 3) as by `spread_samples`."""
     coefficients, J = np.empty((len(planes), 4)), np.empty((len(planes), 3, 3))
     for k in range(len(planes)):
@@ -636,8 +636,9 @@ ROUNDS = 10  # of two means
 
 @kernel
 def larger_surface(q: F64, grid: Grid, cells: I32, columns: F64, some: F64, member: Bool) -> tuple[F64, int, F64]:
-    """Of the members of a region with plane q, when they are two parallel surfaces, the larger one: its q and number of members, which alone stay
-    marked, and the q of the other. Otherwise all is left as it is, and there is no other (zeros). `some` of the columns show whether they may be."""
+    """Select, from the members of a region with plane q, when they are two parallel surfaces, the larger one: its q and number of members, which
+    alone stay marked, and the q of the other. Otherwise all is left as it is, and there is no other (zeros). `some` of the columns show whether they
+    may be."""
     members, none = 0, np.zeros(3)
     for k in range(len(cells)):
         members += member[k]
@@ -810,7 +811,7 @@ def eigenvalues(S: F64) -> tuple[float, float]:
 
 @kernel
 def normals_of_regions(labels: I32, planes: F64, grid: Grid, cos_cone: float, step: int) -> tuple[F64, F64, F64]:
-    """What the normals of each region's cells say, (k,) each; those within the cone of the region's own count, in every `step`th row and column.
+    """Statistics of the normals of each region's cells, (k,) each; those within the cone of the region's own count, in every `step`th row and column.
 
     How far they turn across the region, rad; σ_z over the lesser extent of the region, rad: how far a bias of one σ turns them; and their share."""
     rho, sigma, _, rays_x, rays_y, normals = grid
@@ -930,7 +931,7 @@ def thinned_marks(marks: Bool) -> Bool:
 
 @kernel
 def normal_equations(columns: F64, chosen: Bool) -> tuple[F64, F64]:
-    """Of q, from the weighted depths of the chosen cells: A (3, 3), of which only the upper triangle is filled, and b (3,)."""
+    """Normal equations of q, from the weighted depths of the chosen cells: A (3, 3), of which only the upper triangle is filled, and b (3,)."""
     xs, ys, rho, weights = columns[0], columns[1], columns[2], columns[4]
     xx, xy, x1, yy, y1, one, xp, yp, p1 = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
     for k in range(len(chosen)):

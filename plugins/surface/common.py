@@ -1,4 +1,4 @@
-"""What all surfaces have in common: the fold that gathers views, and the one that also fuses them as they come."""
+"""Shared parts of all surfaces: the fold that gathers views, and the one that also fuses them as they come."""
 
 from __future__ import annotations
 
@@ -80,7 +80,7 @@ class ViewFold:
         return state
 
     def _kept(self, state: Gathered, view: KeyframeView) -> None:
-        """What else is done with a view that was kept."""
+        """Process a view that was kept."""
 
 
 @dataclass(frozen=True)
@@ -123,7 +123,7 @@ class VolumeFold(ViewFold):
 
 
 def _moved_m(said: F64 | None, final: F64 | None) -> float:
-    """How far a view has moved; infinite when it was fused and should not be, or the other way round."""
+    """Distance that a view has moved; infinite when it was fused and should not be, or the other way round."""
     if said is None or final is None:
         return 0.0 if said is final else float("inf")
     ahead = np.array([[0.0, 0.0, 0.0, 1.0], [0.0, 0.0, AHEAD_M, 1.0]])

@@ -15,7 +15,7 @@ from trihedron.plugins.shared.voxel_hash_kernels import I64, number_of
 
 @kernel
 def off_planes(depth: F32, labels: U8, planes: F64, stride: int, step: int, lens: F64) -> tuple[F64, F64]:
-    """How far readings (n,) are from their planes along their rays, and their depth."""
+    """Distances of readings (n,) from their planes along their rays, and their depth."""
     h, w = labels.shape
     off, read, count = np.empty(h * w), np.empty(h * w), 0
     for r in range(0, h, step):

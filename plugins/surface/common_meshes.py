@@ -1,4 +1,4 @@
-"""What neighbours what in a triangle mesh. Half-edge 3 t + k runs from corner k of triangle t to the next one."""
+"""Adjacency in a triangle mesh. Half-edge 3 t + k runs from corner k of triangle t to the next one."""
 
 from __future__ import annotations
 

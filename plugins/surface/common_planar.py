@@ -1,4 +1,4 @@
-"""What the planar meshes have in common: a dense mesh, and which of it lies in planes."""
+"""Shared parts of the planar meshes: a dense mesh, and the part of it that lies in planes."""
 
 from __future__ import annotations
 
@@ -85,7 +85,7 @@ class PlanarFold(VolumeFold):
 
 @dataclass(frozen=True)
 class Flatness:
-    """What counts as flat."""
+    """Criteria of a flat region."""
 
     distance_m: float  # of a vertex from its plane
     angle_deg: float  # between the mesh's normal there and the plane's

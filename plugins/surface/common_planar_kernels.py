@@ -290,7 +290,7 @@ def unfold(points: F64, triangles: I32, normals: F64, rows: I32, starts: I32) ->
 
 @kernel(inline="always")
 def _includes(larger: I32, smaller: I32) -> bool:
-    """Whether an ascending list holds another."""
+    """Return True if an ascending list holds another."""
     at = 0
     for wanted in smaller:
         while at < len(larger) and larger[at] < wanted:

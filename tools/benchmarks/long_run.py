@@ -57,14 +57,14 @@ class BackAndForth:
         return None
 
     def shown(self, index: int) -> int:
-        """Which of the frames."""
+        """Frames that are shown."""
         there = index % max(2 * len(self.frames) - 2, 1)
         return min(there, 2 * len(self.frames) - 2 - there)
 
 
 @dataclass(frozen=True)
 class Row:
-    """What holds at the end of a span of frames, and over it."""
+    """State at the end of a span of frames, and over it."""
 
     frames: int
     memory_mb: float
@@ -132,7 +132,7 @@ def _off_mm(pose: Pose, places: F64, shown: BackAndForth) -> float:
 
 
 def _living(map: Map) -> tuple[int, int]:
-    """How many keyframes and landmarks live."""
+    """Count the living keyframes and landmarks."""
     landmarks = sum(np.count_nonzero(kind.column("alive")) for kind in (map.points, map.lines, map.planes))
     return int(np.count_nonzero(map.keyframes.column("alive"))), int(landmarks)
 

@@ -41,7 +41,7 @@ STAGES = {"normals": "integral_image", "lines": "lsd", "segments": "ransac", "pl
 
 @dataclass(frozen=True)
 class View:
-    """What the feature stages found in one rendered view, the true axes `R_camera_manhattan`, and the true axis of each cell of the normals (-1 =
+    """Output of the feature stages for one rendered view, the true axes `R_camera_manhattan`, and the true axis of each cell of the normals (-1 =
     none) with the share of the image that each axis covers."""
 
     normals: Normals
@@ -71,8 +71,8 @@ class View:
 
     @cached_property
     def lines_turned(self) -> bool:
-        """Whether lines at right angles to one axis, but along neither of the two others, are in all longer than those along these: a turned crate or
-        a slanted pattern that fills the view is a Manhattan frame too, and the better supported one."""
+        """Return True if lines at right angles to one axis, but along neither of the two others, are in all longer than those along these: a turned
+        crate or a slanted pattern that fills the view is a Manhattan frame too, and the better supported one."""
         across = (self._cosines_of_lines <= np.sin(np.radians(ON_AXIS_DEG))) & ~self._on_axes.any(axis=1, keepdims=True)
         along = self._length @ self._on_axes
         return bool((self._length @ across >= along.sum() - along).any())
@@ -107,7 +107,7 @@ class Scene:
         return np.asarray(np.bincount(faces.ravel(), minlength=len(self.normals)) / faces.size)
 
     def shows_right_angle(self, faces: I32) -> bool:
-        """Whether two directions in view, each on ABSENT_SHARE of the image, are at right angles; parallel faces count together."""
+        """Return True if two directions in view, each on ABSENT_SHARE of the image, are at right angles; parallel faces count together."""
         cosine = np.abs(self.normals @ self.normals.T)
         carried = (cosine > np.cos(np.radians(1.0))) @ self.truth_of(faces)
         seen = np.flatnonzero(carried >= ABSENT_SHARE)
@@ -126,7 +126,7 @@ class Scene:
 
     @cached_property
     def rendered(self) -> tuple[Geometry, Atlas]:
-        """As the ray tracer wants it."""
+        """Scene in the form that the ray tracer takes."""
         return geometry_of(self.room), bake(all_faces(self.room), True, 0)
 
 
@@ -191,7 +191,7 @@ def called(plugin: Any, slot: str, index: int, given: dict[str, Any]) -> Any:
 
 
 def inputs_of(plugin: Any, slot: str, index: int, given: dict[str, Any]) -> dict[str, Any]:
-    """Those of the inputs that a stage takes, and the randomness of its frame if it asks for it."""
+    """Inputs that a stage takes, and the randomness of its frame if it asks for it."""
     given = {**given, "rng": np.random.default_rng([0, index])}
     return {name: given[name] for name in parameters_of_method(slot, type(plugin))}
 

@@ -1,4 +1,4 @@
-"""What recording costs: time and bytes of a run beside the same run without, frames embedded a second, and how fast one frame of many is read.
+"""Cost of recording: time and bytes of a run beside the same run without, frames embedded a second, and how fast one frame of many is read.
 
     recording   runs alternate without and with; each with is compared with the two without about it, as the machine's speed changes, and the median
                 counts. The share is of CPU time, which waits do not count in, and bytes are those of the file

@@ -1,4 +1,4 @@
-"""How time and memory grow with threads, image size, number of features, size of the map and length of the walk, in the built-in rooms.
+"""Growth of time and memory with threads, image size, number of features, size of the map and length of the walk, in the built-in rooms.
 
 Each row is a run in a process of its own. A frame's time is that of its stages, one after another, without the rendering of the frame (median over
 the frames); the throughput contains it. Memory is the most that the run held at one of these frames, with the textures that are rendered. Further
@@ -122,7 +122,8 @@ def _living(map: Map | None) -> int:
 
 
 def measures(timing: Sequence[dict[str, Any]]) -> dict[str, Any]:
-    """Of some frames' messages: the most memory, and medians of all stages but the data set, of those after the features, and of each reader."""
+    """Measures of some frames' messages: the most memory, and medians of all stages but the data set, of those after the features, and of each
+    reader."""
     stages = [{name: ms for name, ms in row["stage_ms"].items() if name != "dataset"} for row in timing]
     every = [sum(row.values()) for row in stages]
     after = [sum(ms for name, ms in row.items() if name not in FEATURES) for row in stages]
