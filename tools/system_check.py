@@ -59,12 +59,12 @@ def import_error(module: str) -> str:
 
 def check(module: str, run: Callable[[str], str] = import_error) -> str:
     """Check a module: what is wrong with it and what to do about it, in one line; empty when it loads."""
-    said = run(module)
-    if not said:
+    error = run(module)
+    if not error:
         return ""
-    found = re.search(r"(\S+?\.so[.\d]*): cannot open shared object file", said)
+    found = re.search(r"(\S+?\.so[.\d]*): cannot open shared object file", error)
     if not found:
-        return f"{module} does not load: {said.splitlines()[-1]}; install it again with: pip install --force-reinstall {module}"
+        return f"{module} does not load: {error.splitlines()[-1]}; install it again with: pip install --force-reinstall {module}"
     others = [library for library in OPEN3D_NEEDS if module == "open3d" and library != found[1] and not loads(library)]
     libraries = [found[1], *others]
     packages = sorted({PACKAGES[library] for library in libraries if library in PACKAGES})

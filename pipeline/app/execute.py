@@ -211,14 +211,14 @@ def _commit() -> str:
 def _progress(steps: Iterator[Step]) -> Iterator[Step]:
     """A bar with the frame rate on a terminal, a plain line every few seconds elsewhere."""
     bar: Any = None
-    began = said = time.perf_counter()
+    began = printed = time.perf_counter()
     for step in steps:
         if sys.stderr.isatty():
             bar = bar or tqdm(total=step.count, unit="frame", dynamic_ncols=True)
             bar.update()
-        elif time.perf_counter() - said > PLAIN_PROGRESS_SECONDS:
-            said = time.perf_counter()
-            print(f"frame {step.position + 1}/{step.count}, {(step.position + 1) / (said - began):.1f} frames/s", flush=True)
+        elif time.perf_counter() - printed > PLAIN_PROGRESS_SECONDS:
+            printed = time.perf_counter()
+            print(f"frame {step.position + 1}/{step.count}, {(step.position + 1) / (printed - began):.1f} frames/s", flush=True)
         yield step
     if bar is not None:
         bar.close()
@@ -262,8 +262,8 @@ def _report(out: Path, metrics: dict[str, Any], timing: dict[str, Any], surfaces
         print(f"{name}, most of them: {reason}")
     if live := timing.get("live"):
         late = live["latency_ms"]
-        said = f"{live['came']} frames came, {live['taken']} were taken, {live['dropped']} dropped"
-        print(f"live: {said}; a pose is ready {late['p50']:.0f} ms after its frame came (median; at most {late['max']:.0f} ms)")
+        counts = f"{live['came']} frames came, {live['taken']} were taken, {live['dropped']} dropped"
+        print(f"live: {counts}; a pose is ready {late['p50']:.0f} ms after its frame came (median; at most {late['max']:.0f} ms)")
     if "final" in metrics:
         print(f"ATE {metrics['final']['ate_rmse_m']:.4f} m (as tracked {metrics['causal']['ate_rmse_m']:.4f} m)")
     for line in surfaces:

@@ -56,7 +56,7 @@ def _files(path: Path) -> list[tuple[str, int, int]]:
     if len(path.parts) < 2 or not path.exists():
         return []
     files = [path] if path.is_file() else sorted(file for file in path.rglob("*") if file.is_file())
-    return [(file.relative_to(path).as_posix(), (said := file.stat()).st_size, said.st_mtime_ns) for file in files]
+    return [(file.relative_to(path).as_posix(), (state := file.stat()).st_size, state.st_mtime_ns) for file in files]
 
 
 def write_job(folder: Path, key: str, state: str, error: str = "") -> None:

@@ -49,7 +49,7 @@ class Outcome:
         """Raise TrihedronError when a job failed."""
         if self.failures:
             cause = f"{len(self.failures)} of {self.jobs} jobs failed"
-            raise TrihedronError(str(self.folder), cause, "trihedron compare says why; the same command again runs those that are missing")
+            raise TrihedronError(str(self.folder), cause, "trihedron compare names the cause; the same command again runs those that are missing")
 
 
 OUTCOMES: list[Outcome] = []  # of the sweeps of this process; Hydra has no other way to hand one over
@@ -125,7 +125,7 @@ class Sweeper(BasicSweeper):
             self._launch_apart(missing, error)
         except TrihedronError:
             raise
-        except Exception as error:  # of the engine; a job that fails says so in its folder
+        except Exception as error:  # of the engine; a job that fails leaves the reason in its folder
             raise _given_up(error) from error
         for words, folder in missing:
             _keep_overrides(folder, words[:-1])

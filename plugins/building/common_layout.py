@@ -1,6 +1,6 @@
 """Rooms, walls and openings from faces and free space.
 
-The lines of all faces divide the plan into cells; a solver says which cells are inside. Inside cells are one room where no tall face parts them
+The lines of all faces divide the plan into cells; a solver decides which cells are inside. Inside cells are one room where no tall face parts them
 (Mura, Mattausch, Jaspe Villanueva, Gobbetti, Pajarola, Computers & Graphics 2014, with free space in the place of scan positions). Every edge of a
 room is then fitted again to the points of its own stretch, so that drift between rooms stays between them."""
 
@@ -568,18 +568,18 @@ def assembled(state: Gathered, evidence: Evidence, plans: list[StoreyPlan], map:
 
 def _note(plans: list[StoreyPlan]) -> str:
     """Say what the plan lacks."""
-    said = []
+    missing = []
     if not any(np.isfinite(plan.storey.floor_m) for plan in plans):
-        said.append("no floor was seen")
+        missing.append("no floor was seen")
     if not any(np.isfinite(plan.storey.ceiling_m) for plan in plans):
-        said.append("no ceiling was seen")
+        missing.append("no ceiling was seen")
     if not any(plan.rooms for plan in plans):
         count = sum(len(plan.faces) for plan in plans)
-        said.append(f"{count} wall{'s' if count != 1 else ''} seen, which bound{'s' if count == 1 else ''} no room")
+        missing.append(f"{count} wall{'s' if count != 1 else ''} seen, which bound{'s' if count == 1 else ''} no room")
     open_rooms = sum(any(edge.wall < 0 for loop in room.loops for edge in loop) for plan in plans for room in plan.rooms)
     if open_rooms:
-        said.append(f"{open_rooms} room{'s' if open_rooms != 1 else ''} not seen all round")
-    return "; ".join(said)
+        missing.append(f"{open_rooms} room{'s' if open_rooms != 1 else ''} not seen all round")
+    return "; ".join(missing)
 
 
 def _supports(kind: str, number: int, planes: list[int], rows: I32, evidence: Evidence) -> list[tuple[int, int, int, int]]:

@@ -320,7 +320,7 @@ def centroid_angle(pixels: U8, corner: int, cols: int, across: F32, inside: F32)
 def spread_over_cells(cells: I32, number: int, order: I32, wanted: int) -> Bool:
     """Select features (n,) spread over the image: each of a `number` of cells gives its best in turn until `wanted` are selected.
 
-    `cells` (n,) says where each feature lies; `order` lists the rows from best to worst. The quota per cell is the largest that keeps the total
+    `cells` (n,) is the cell of each feature; `order` lists the rows from best to worst. The quota per cell is the largest that keeps the total
     within `wanted`, and the best of the rest fill up, so a rich corner cannot take everything and an even image keeps its best."""
     n = len(cells)
     if n <= wanted:

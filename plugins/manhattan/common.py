@@ -173,7 +173,7 @@ def _half_sphere(count: int) -> F64:
 HALF_SPHERE = _half_sphere(256)  # (256, 3) directions about 9° apart over half the sphere (Fibonacci)
 
 
-# What an estimator of several frames says: of those it sees, and of those it knows but does not see.
+# Results of an estimator of several frames: of those it sees, and of those it knows but does not see.
 
 
 def lost_frames(modes: Modes, fit: AxisFit, segments: Segments, planes: Planes, normals: Normals, known: F64, ids: I32) -> ManhattanFrame:
@@ -203,7 +203,7 @@ def seen_frames(
     normals: Normals, rotations: F64, covariance: F64, inliers: F64, spread: F64, rows: I32, ids: I32, unseen: I32, expected: F64
 ) -> ManhattanFrame:
     """The frames seen, (k, 3, 3) with their covariances, inliers (k, 3) and spread (k, 3), then those out of sight, where they are `expected`
-    (u, 3, 3): without inliers, with a covariance that says nothing.
+    (u, 3, 3): without inliers, with an uninformative covariance.
 
     `rows` (k,) and `unseen` (u,) say which of the known frames, with `ids`, they are; -1 is a new one and gets a number of its own."""
     nothing = np.zeros((len(unseen), 3))

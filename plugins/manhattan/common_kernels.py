@@ -45,7 +45,7 @@ def gathered(normals: F32, ends_m: F32, ends_px: F32, samples: int, per_px: floa
 @kernel
 def variance_scale(chi2: float, freedom: float) -> float:
     """Scale of the assumed variances by the residuals' χ² with so many degrees of freedom. The assumption counts like BEFOREHAND more: a scene that
-    shows little keeps it, one with many planes and edges tells by itself how true its walls are."""
+    shows little keeps it, one with many planes and edges shows by itself how true its walls are."""
     return (chi2 + BEFOREHAND) / (max(freedom, 0.0) + BEFOREHAND)
 
 

@@ -84,7 +84,7 @@ def patch_sides(camera: Camera, noise_deg: float, least_px: float, most_px: floa
     """(100,) side in px of the patch whose normal has a predicted standard deviation of `noise_deg`, for depths of 0.1, 0.2 … 10 m, within bounds;
     read-only.
 
-    The tangents of n × n px with independent depth noise σ at z have slopes of σ f / z · √12 / n² (least squares, to 7 %)."""
+    The tangents of n × n px with independent depth noise σ at z have gradients of σ f / z · √12 / n² (least squares, to 7 %)."""
     z = np.arange(1, 101) * 0.1
     slope = camera.depth_noise.sigma_m(z) * camera.fx / z
     side = np.asarray(np.clip(np.sqrt(np.sqrt(12.0) * slope / np.radians(noise_deg)), least_px, most_px))

@@ -58,7 +58,7 @@ class PlanarRegions:
 
     def _complete(self, core: U8, q: F64, grid: Grid, frame: Frame, stride: int, flat: bool = True) -> Planes:
         """Planes of the regions whose core cells are labelled (h, w) and whose planes are q (k, 3): grown, merged, fitted to their cores. A detector
-        that did not ask the normals says that the regions need not be `flat`: curved ones are dropped."""
+        that did not use the normals passes `flat` False: curved regions are dropped."""
         gap, cos_cone = max(self.gap_px // stride, 1), math.cos(2.0 * math.radians(self.cone_deg))
         labels, owner, sums = grown_and_merged(core, q, grid, self.gate, self.border_px // stride, cos_cone, gap, self.merge, self.correlation_px**2)
         if not flat:
@@ -77,7 +77,7 @@ class PlanarRegions:
         return np.where(np.concatenate([[False], good])[owner], owner, 0).astype(np.int32)
 
     def _report(self, labels: U8, core: U8, owner: I32, sums: Sums, grid: Grid, frame: Frame, stride: int) -> Planes:
-        """The largest regions as a value, largest first; `owner` says which one a label belongs to, 0 = none."""
+        """The largest regions as a value, largest first; `owner` is the region of each label, 0 = none."""
         numbered, number, ranked, area = largest_regions(labels, owner, grid.count, self.min_pixels, self.planes)
         A, b, moments, n = (total[ranked] for total in sums)
         q = np.asarray(np.linalg.solve(A, b[..., None])[..., 0], np.float64)

@@ -372,7 +372,7 @@ def areas(labels: U8, count: U8, regions: int) -> I32:
 @kernel
 def largest_regions(labels: U8, owner: I32, count: U8 | I32, least: int, most: int) -> tuple[U8, U8, I32, I32]:
     """The regions of at least `least` depths, `most` at most, as 1 … k from the largest: `labels` (h, w) by these numbers, 0 = none, the number of
-    each label, which of the regions each is, and its number of depths. `owner` (k + 1,) says which region a label belongs to, 0 = none."""
+    each label, which of the regions each is, and its number of depths. `owner` (k + 1,) is the region of each label, 0 = none."""
     area, single = np.zeros(len(owner)), areas(labels, count, len(owner) - 1)
     for k in range(1, len(owner)):
         area[owner[k]] += single[k - 1]
@@ -569,7 +569,7 @@ def _sizes(labels: U8, number: U8, regions: int) -> I32:
 @kernel
 def excess_variance(labels: U8, number: U8, planes: F64, grid: Grid, tiles: int, expected: float, weight: float) -> F64:
     """(k,) variance of the mean of a patch of each region over what independent depths with the noise model's σ would give; all its
-    cells have depth, and `number` says which region a label is of, 0 = none.
+    cells have depth, and `number` is the region of each label, 0 = none.
 
     A region is cut into about `tiles` square tiles; with e the residuals and w the weights of a tile's cells the ratio is `Σ (Σ w e)² / Σ Σ w`, for
     the three parameters fitted corrected, and shrunk towards `expected` with the weight of that many tiles. It measures what makes plane fits worse
@@ -621,7 +621,7 @@ def excess_variance(labels: U8, number: U8, planes: F64, grid: Grid, tiles: int,
     return out
 
 
-# Parallel surfaces a few centimetres apart (a door, a board on a wall) that noise lets pass for one plane, told by the normals and taken apart.
+# Parallel surfaces a few centimetres apart (a door, a board on a wall) that noise lets pass for one plane, separated by their normals.
 #
 # The plane fitted to both leans from one to the other by degrees, while the mean of thousands of normals stays that of either: where the two disagree
 # the depths are tried as two planes.

@@ -65,7 +65,7 @@ class PlanarFold(VolumeFold):
         return Flatness(self.distance_m, self.angle_deg, self.rim_m, self.rim, self.area_m2, self.bend_per_m)
 
     def _surface(self, state: Gathered, map: Map | None, rest: bool) -> Surface:
-        """The planes as polygons; `rest` says whether the triangles that lie in none stay, joined to them."""
+        """The planes as polygons; with `rest` the triangles that lie in none stay, joined to them."""
         vertices, triangles = self._mesh(state, map)
         opposite = opposite_half_edges(triangles)
         ids, known = map_planes(map)

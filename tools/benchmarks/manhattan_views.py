@@ -1,6 +1,6 @@
 """Rendered views with known axes, and the parts of them that estimators of the Manhattan frame are tried on.
 
-What a view shows is told by the exact normals of the faces behind its pixels, never by what was detected. An axis is *visible* when surfaces
+What a view shows is decided by the exact normals of the faces behind its pixels, never by what was detected. An axis is *visible* when surfaces
 facing along it cover AXIS_SHARE of the image. There is *no Manhattan frame* in a view when no two directions that each carry ABSENT_SHARE of the
 image are within RIGHT_ANGLE_DEG of a right angle. Such views are tried without lines, since a line in a wall is at right angles to its normal in
 any room. The leaning room shows nothing else; the room with two slanted walls does where floor and ceiling are out of sight.
@@ -207,14 +207,14 @@ def case_of(view: View, case: str) -> View | None:
         number = 3 if case == "three planes" else 2
         upon = largest[:number]
         return _only(_without_lines(view), np.isin(view.axes, upon), np.isin(view.axes_of_planes, upon)) if visible.sum() >= number else None
-    told = view.lines_on_axes >= AXIS_LINES
+    measured = view.lines_on_axes >= AXIS_LINES
     if case == "one plane + lines":
         rows = np.flatnonzero(view.axes_of_planes == largest[0])[:1]
-        if len(rows) == 0 or not visible[largest[0]] or not told[largest[1:]].any():
+        if len(rows) == 0 or not visible[largest[0]] or not measured[largest[1:]].any():
             return None
         return _only(view, view.planes.labels == rows[0] + 1, np.arange(len(view.planes.pixels)) == rows[0])
     if case == "lines only":
-        if (told & (view.length_on_axes >= AXIS_SHARE)).sum() < 2 or view.lines_turned:
+        if (measured & (view.length_on_axes >= AXIS_SHARE)).sum() < 2 or view.lines_turned:
             return None
         return _only(view, np.zeros(view.axes.shape, np.bool_), np.zeros(len(view.planes.pixels), np.bool_))
     if case == CLUTTER:

@@ -92,7 +92,7 @@ def _run(out: Path, words: Sequence[str]) -> tuple[dict[str, Any], Trajectory, T
 
 
 def promises(*of: tuple[str, bool]) -> str:
-    """A line for each promise: what it says, and whether it was met."""
+    """A line for each promise: its text, and whether it was met."""
     return "\n" + "\n".join(f"{'met: ' if met else 'NOT MET: '}{what}" for what, met in of)
 
 

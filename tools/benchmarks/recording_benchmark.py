@@ -99,8 +99,8 @@ def _embedding(overrides: Sequence[str], folder: Path) -> list[tuple[str, bool]]
     writer.close()
     cpu_ms = 1e3 * (time.process_time() - cpu) / len(frames)
     rate, size = len(frames) / (time.perf_counter() - began), (folder / "frames.mcap").stat().st_size / len(frames) / 1e3
-    said = f"of {frames[0].camera.width} × {frames[0].camera.height}, {size:.0f} kB and {cpu_ms:.1f} ms CPU each"
-    text = f"{rate:.0f} embedded frames/s {said}, at least {LEAST_FRAMES_S:.0f}"
+    sizes = f"of {frames[0].camera.width} × {frames[0].camera.height}, {size:.0f} kB and {cpu_ms:.1f} ms CPU each"
+    text = f"{rate:.0f} embedded frames/s {sizes}, at least {LEAST_FRAMES_S:.0f}"
     return [(text, rate >= LEAST_FRAMES_S)]
 
 
