@@ -11,13 +11,12 @@ import statistics
 import subprocess
 import sys
 import tempfile
-import threading
 import time
 import zlib
 from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, redirect_stderr, redirect_stdout
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
 from pathlib import Path
 from typing import Any
@@ -25,9 +24,9 @@ from typing import Any
 import numpy as np
 
 from trihedron.pipeline.core.config import composed, graph_of
-from trihedron.pipeline.core.errors import PluginError, TrihedronError
+from trihedron.pipeline.core.errors import RecordingError, TrihedronError
 from trihedron.pipeline.core.graph import Graph, Stage
-from trihedron.pipeline.core.options import OneOf, Range, constraints_of
+from trihedron.pipeline.core.options import OneOf, Range, check_options, constraints_of
 from trihedron.pipeline.core.registry import check_value, options_of
 from trihedron.pipeline.core.slots import CAMERA, FOLDS, RNG, SLOTS, accepts_none, inputs_of, output_of
 from trihedron.pipeline.core.types import LOST, Frame, Pose, Trajectory, Value
@@ -124,16 +123,15 @@ class PluginCheck:
     slot: str
     name: str
     words: tuple[str, ...] = ()
-    _lock: Any = field(default_factory=threading.Lock, compare=False, repr=False)
+    given: Any = None  # the plugin itself, where it is not registered
 
     @cached_property
     def plugin(self) -> Any:
         """The plugin with its options. Raises TrihedronError."""
-        config = composed([f"{self.slot}={self.name}", *self.words])
-        wanted = (
-            graph_of(composed([f"{self.slot}={self.name}", f"outputs=[{self.slot}]", *self.words])) if self.slot != "dataset" else graph_of(config)
-        )
-        return wanted.stages[self.slot].plugin
+        if self.given is not None:
+            return self.given
+        outputs = [] if self.slot == "dataset" else [f"outputs=[{self.slot}]"]
+        return graph_of(composed([f"{self.slot}={self.name}", *outputs, *self.words])).stages[self.slot].plugin
 
     @property
     def summary(self) -> str:
@@ -142,7 +140,7 @@ class PluginCheck:
 
     def results(self, quick: bool = False) -> list[Result]:
         """Run the checks. Raises PluginError and ConfigError where the plugin cannot run here: a library or a file that it needs is missing."""
-        static = [self._documented(), self._options()]
+        static = self.static()
         if self.slot == "dataset":
             return [*static, self._frames()]
         if (failure := self._values()).good is False:
@@ -150,6 +148,10 @@ class PluginCheck:
         checks = [failure, self._adverse(), self._inputs(), self._state(), self._threads()]
         checks += [] if quick else [self._processes(), self._replay()]
         return [*static, *checks, self._library(), self._differs(), self._time()]
+
+    def static(self) -> list[Result]:
+        """Run the checks that need no call."""
+        return [self._documented(), self._options()]
 
     def digest(self) -> str:
         """SHA-256 of the plugin's values in the room."""
@@ -185,7 +187,7 @@ class PluginCheck:
         for option, value in _out_of_range(type(self.plugin)):
             tried += 1
             try:
-                replace(self.plugin, **{option: value})
+                check_options(replace(self.plugin, **{option: value}))
             except (ValueError, TypeError):
                 continue
             return Result("options", False, f"{option}={value!r} is out of range and is taken")
@@ -214,10 +216,10 @@ class PluginCheck:
                 found += 1
                 checked(self.slot, value, "value")
                 check_together({**arguments, self.slot: value}, "value", {})
-        except (PluginError, TrihedronError) as error:
-            if not str(error).startswith("value"):
-                raise
-            return Result("values", False, str(error))
+        except RecordingError as error:
+            return Result("values", False, error.cause)
+        except TrihedronError:
+            raise
         except Exception as error:
             return Result("values", False, f"{type(error).__name__}: {error}")
         calls = 1 if self.slot in FOLDS else len(scene.values)
@@ -233,6 +235,8 @@ class PluginCheck:
                     if value is not None:
                         checked(self.slot, value, "value")
                         check_together({**arguments, self.slot: value}, "value", {})
+            except RecordingError as error:
+                return Result("adverse scenes", False, f"{scene.name}: {error.cause}")
             except Exception as error:
                 return Result("adverse scenes", False, f"{scene.name}: {type(error).__name__}: {' '.join(str(error).split())}")
         return Result("adverse scenes", True, f"{count} scenes")

@@ -61,7 +61,7 @@ def _check_when_constructed(plugin: type) -> None:
 def _source_of(plugin: type) -> str:
     try:
         return inspect.getsourcefile(plugin) or plugin.__module__
-    except TypeError:
+    except (TypeError, OSError):  # defined where there is no file
         return plugin.__module__
 
 

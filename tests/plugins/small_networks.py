@@ -119,3 +119,24 @@ def answering(path: Path, channels: int, **answers: np.ndarray) -> Path:
     nodes += [node("Add", [f"{name}_answer", "nothing"], [name]) for name in answers]
     constants = {"zero": np.float32(0), **{f"{name}_answer": np.asarray(value, np.float32) for name, value in answers.items()}}
     return save(path, nodes, {"image": [1, channels, "h", "w"]}, {name: list(value.shape) for name, value in answers.items()}, constants)
+
+
+def network_words(slot: str, folder: Path) -> list[str]:
+    """Overrides with which `SLOT=onnx` (or the like) runs on small networks that are written to a folder."""
+    rng = np.random.default_rng(0)
+    if slot == "keypoints":
+        return [f"keypoints.model={corner_detector(folder / 'corners.onnx')}"]
+    if slot == "tracks":
+        keypoints = ["keypoints=onnx", *network_words("keypoints", folder)]
+        return [*keypoints, f"tracks.model={nearest_matcher(folder / 'matcher.onnx')}"]
+    if slot == "lines":
+        lines = np.array([[[20, 30, 200, 40], [50, 200, 60, 60], [10, 10, 300, 12]]], np.float32)
+        return [f"lines.model={answering(folder / 'lines.onnx', 1, lines=lines, scores=np.array([[0.9, 0.5, 0.8]]))}"]
+    if slot == "planes":
+        masks = np.zeros((1, 2, 60, 80), np.float32)
+        masks[0, 0, 35:, :], masks[0, 1, :25, 40:] = 1.0, 1.0
+        return [f"planes.model={answering(folder / 'masks.onnx', 3, masks=masks, scores=np.array([[0.9, 0.8]]))}"]
+    if slot == "normals":
+        normals = rng.normal(size=(1, 3, 30, 40)) + np.array([0.0, 0.0, -3.0])[None, :, None, None]
+        return [f"normals.model={answering(folder / 'normals.onnx', 3, normals=normals)}"]
+    raise ValueError(slot)
