@@ -299,7 +299,7 @@ def write_dxf(path: Path, building: Building) -> None:
     import ezdxf
     from ezdxf import units
 
-    document = ezdxf.new("R2010", setup=["linetypes"])
+    document = ezdxf.filemanagement.new("R2010", setup=["linetypes"])
     document.units = units.M
     for name, color in LAYERS.items():
         document.layers.add(name, color=color, linetype="DASHED" if name == "UNSEEN" else "CONTINUOUS")

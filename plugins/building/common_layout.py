@@ -18,7 +18,6 @@ from trihedron.pipeline.core.types import ELEMENTS, F64, I32, OPENING_KINDS, SUP
 from trihedron.plugins.building.common import (
     CELL_M,
     LEVEL_M,
-    LEVELS,
     Evidence,
     Face,
     FreeSpace,
@@ -32,8 +31,11 @@ from trihedron.plugins.building.common import (
     nothing,
     storeys_of,
     tall_m,
-)  # fmt: skip
-from trihedron.plugins.building.common_kernels import U32
+)
+from trihedron.plugins.building.common_kernels import (
+    LEVELS,  # fmt: skip
+    U32,
+)
 from trihedron.plugins.shared.voxel_hash_kernels import I64
 
 MARGIN_M = 0.3  # about what was seen

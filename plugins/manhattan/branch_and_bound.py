@@ -122,7 +122,7 @@ class RotationSearch:
         """C(R) of the same directions."""
         unit, weights = _usable(vectors, weights)
         square = np.max((unit @ R) ** 2, axis=1, initial=0.0)
-        return float(weights @ np.maximum(square - np.cos(self.inlier) ** 2, 0.0)) / np.sin(self.inlier) ** 2
+        return float(float(weights @ np.maximum(square - np.cos(self.inlier) ** 2, 0.0)) / np.sin(self.inlier) ** 2)
 
     @cached_property
     def _grid(self) -> SphereGrid:

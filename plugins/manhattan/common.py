@@ -146,13 +146,13 @@ class AxisFit:
         `axes` (3, 3) are the means of the normals on each axis, `normals` (3, 4) their statistics about these (`mode_statistics`); only the axes
         `taking_part` (3,) are fitted."""
         features = planes.coefficients, planes.covariance, segments.endpoints_m, segments.covariance_m2
-        return fitted(R, axes, normals, taking_part, *features, self._rules, self.gate, float(np.radians(self.floor_deg)))  # type: ignore[no-any-return]
+        return fitted(R, axes, normals, taking_part, *features, self._rules, self.gate, float(np.radians(self.floor_deg)))
 
     def measured(self, R: F64, axes: F64, normals: F64, segments: Segments, planes: Planes) -> tuple[F64, F64, I32]:
         """Directions (n, 3) of planes, lines and the means of the normals, their information (n, 3, 3) and the column of R (3, m) that each
         belongs to (-1: none). `axes` (3, m) and `normals` (m, 4) as above."""
         features = planes.coefficients, planes.covariance, segments.endpoints_m, segments.covariance_m2
-        return measured_kernel(R, axes, normals, *features, self._rules)  # type: ignore[no-any-return]
+        return measured_kernel(R, axes, normals, *features, self._rules)
 
     @cached_property
     def _rules(self) -> FitOptions:

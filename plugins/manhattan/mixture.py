@@ -101,7 +101,7 @@ class Mixture:
             turn = followed[0].R @ known[followed[0].row].T
             matched = (identified(rotations, turn @ known, limit) >= 0).sum()
             if matched >= min(len(found), len(known)):
-                return turn
+                return np.asarray(turn)
         other = turn_between(rotations, known, limit)
         return turn if followed and matched >= (identified(rotations, other @ known, limit) >= 0).sum() else other
 

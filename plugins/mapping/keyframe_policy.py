@@ -61,7 +61,7 @@ def _in_doubt(options: KeyframeOptions, pose: Pose, keyframes: Table) -> bool:
         return False
     covariances: list[F64] = [pose.local_covariance, keyframes.row("covariance", pose.reference)]
     sigma, reference = (float(np.linalg.eigvalsh(covariance[:3, :3])[-1]) ** 0.5 for covariance in covariances)
-    return sigma > options.doubt_sigmas * max(reference, options.doubt_floor_m)
+    return bool(sigma > options.doubt_sigmas * max(reference, options.doubt_floor_m))
 
 
 def keyframe_distance_m(options: KeyframeOptions, frame: Frame) -> float:

@@ -114,7 +114,7 @@ def distinct(ids: I32) -> I32:
     first = ids.min()
     marked = np.zeros(ids.max() - first + 1, np.bool_)
     marked[ids - first] = True
-    return (np.flatnonzero(marked) + first).astype(np.int32)
+    return np.asarray((np.flatnonzero(marked) + first).astype(np.int32))
 
 
 def union(a: I32, b: I32) -> I32:

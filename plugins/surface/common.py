@@ -324,7 +324,7 @@ def _spread(picture: U8, seen: Bool) -> U8:
     if seen.all() or not seen.any():
         return picture
     rows, columns = distance_transform_edt(~seen, return_distances=False, return_indices=True)
-    return picture[rows, columns]
+    return np.asarray(picture[rows, columns])
 
 
 def _packed(sizes: I32) -> tuple[I32, tuple[int, int]]:

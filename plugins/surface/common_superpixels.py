@@ -95,7 +95,7 @@ def superpixels(view: KeyframeView, side_px: int, coarse_px: int) -> F64:
     sigma = c.depth_noise.sigma_m(surfels[:, 2])
     flat = surfels[:, 10] <= (UNEVEN * sigma + UNEVEN_M) ** 2
     surfels[:, 10], surfels[:, 12] = 1.0 / sigma**2, 1.0
-    return surfels[flat]
+    return np.asarray(surfels[flat])
 
 
 def moved(surfels: F64, T_a_b: F64) -> F64:
