@@ -153,7 +153,7 @@ def register_configs(recorded: RecordedConfig | None = None) -> None:
     slots = [(slot, Any, dataclasses.field(default=None)) for slot in SLOTS]
     plain = RunOptions().defaults
     defaults = [{key: choices.get(key, value) for key, value in entry.items()} if isinstance(entry, dict) else entry for entry in plain]
-    store.store(group="hydra/sweeper", name="trihedron", node={"_target_": SWEEPER, "max_batch_size": None, "params": None})
+    store.store(group="hydra/sweeper", name="trihedron", node={"_target_": SWEEPER, "params": None})
     store.store(group="hydra/sweeper", name="optuna", node=SearchOptions)
     store.store(group="hydra/launcher", name="dask", node={"_target_": DASK, "address": ""})
     root = dataclasses.make_dataclass("Root", slots, bases=(RunOptions,))

@@ -11,15 +11,20 @@ import re
 import sys
 import threading
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import yaml
 from hydra.core.config_loader import ConfigLoader
 from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.core.override_parser.types import Override
 from hydra.core.plugins import Plugins
+from hydra.plugins.launcher import Launcher
+from hydra.plugins.sweeper import Sweeper as HydraSweeper
+from hydra.types import HydraContext, TaskFunction
 from joblib.externals.loky import get_reusable_executor
 from omegaconf import DictConfig
 
@@ -28,9 +33,6 @@ from trihedron.pipeline.core.errors import TrihedronError, UsageError
 from trihedron.pipeline.core.overrides import with_literal_paths
 from trihedron.pipeline.sweep.cluster import all_awaited
 from trihedron.pipeline.sweep.jobs import DONE, FAILED, RUNNING, key_of, read_job, write_job
-
-Plugins.instance()  # loads every plugin of Hydra anew, so that classes imported before are no longer theirs
-from hydra._internal.core_plugins.basic_sweeper import BasicSweeper  # noqa: E402
 
 LOOK_SECONDS = 1.0  # between two looks at the jobs' folders
 Overrides = list[str]
@@ -55,8 +57,18 @@ class Outcome:
 OUTCOMES: list[Outcome] = []  # of the sweeps of this process; Hydra has no other way to hand one over
 
 
-class Sweeper(BasicSweeper):
+class Sweeper(HydraSweeper):
     """Hydra's sweeper over comma-separated values, with sequences, that goes on where it was stopped."""
+
+    def __init__(self, params: Mapping[str, Any] | None = None) -> None:
+        """`params` are overrides of every sweep, key -> value or values, from the configuration."""
+        self.params = dict(params or {})
+        self.launcher: Launcher | None = None
+
+    def setup(self, *, hydra_context: HydraContext, task_function: TaskFunction, config: DictConfig) -> None:
+        """Take what Hydra prepared, before `sweep`."""
+        self.hydra_context, self.config = hydra_context, config
+        self.launcher = Plugins.instance().instantiate_launcher(hydra_context=hydra_context, task_function=task_function, config=config)
 
     def sweep(self, arguments: list[str]) -> None:
         """Run what is missing. Raises TrihedronError when no job can be composed."""
@@ -151,11 +163,15 @@ class Sweeper(BasicSweeper):
     def jobs(self, arguments: list[str]) -> list[Overrides]:
         """The overrides of every job: the cross product of sequences and of all values given."""
         parser = OverridesParser.create(config_loader=self.loader)
-        words = [word for word in [*self._parse_config(), *arguments] if not word.startswith("sequences=")]
+        words = [word for word in [*self.given, *arguments] if not word.startswith("sequences=")]
         words += [] if any(word.startswith("threads=") for word in words) else [f"threads={self._threads}"]
         sequences = [words_of_sequence(text) for text in self.options.sequences] or [[]]
-        products = [self.split_arguments(parser.parse_overrides([*sequence, *words]), None)[0] for sequence in sequences]
-        return [list(job) for product in products for job in product]
+        return [job for sequence in sequences for job in _product(parser.parse_overrides([*sequence, *words]))]
+
+    @property
+    def given(self) -> Overrides:
+        """The overrides `params`."""
+        return [f"{key}={value}" for key, value in self.params.items()]
 
     @property
     def _threads(self) -> int:
@@ -187,6 +203,18 @@ def _numbers(folder: Path, jobs: Sequence[Overrides]) -> list[int]:
     known = {tuple(yaml.safe_load(file.read_text()) or []): int(file.parent.parent.name) for file in files}
     free = itertools.count(max(known.values(), default=-1) + 1)
     return [known[tuple(job)] if tuple(job) in known else next(free) for job in jobs]
+
+
+def _product(overrides: list[Override]) -> list[Overrides]:
+    """The cross product of all values given; a later override replaces an earlier one of its key. Raises UsageError for a space to search in."""
+    values: dict[str, Overrides] = {}
+    for override in overrides:
+        key = override.get_key_element()
+        if override.is_sweep_override() and not override.is_discrete_sweep():
+            raise UsageError(key, f"'{override.input_line}' is a space to search in", "give values A,B or hydra/sweeper=optuna")
+        texts = override.sweep_string_iterator() if override.is_sweep_override() else [override.get_value_element_as_str()]
+        values[key] = [f"{key}={text}" for text in texts]
+    return [list(job) for job in itertools.product(*values.values())]
 
 
 def _given_up(error: Exception) -> TrihedronError:
