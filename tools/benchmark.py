@@ -6,9 +6,11 @@ frame's files to its pose, and the time it waits behind others does not count. -
 became slower since a --json file.
 
 Other comparisons, each with its --help: `trihedron benchmark scaling` (threads, image size, features, length), `trihedron benchmark manhattan`
-(estimators of the Manhattan frame on rendered rooms), `trihedron benchmark rotations` (the runs of a sweep over them), `trihedron benchmark surface`
-(all surfaces, by the true one), `trihedron benchmark map` (drift, recovery and growth of the map), `trihedron benchmark long` (what a long run leaves
-behind), `trihedron benchmark recording` (what recording costs). `trihedron compare` makes a table of the runs of any sweep.
+(estimators of the Manhattan frame on rendered rooms), `trihedron benchmark rotations` (the runs of a sweep over them), `trihedron benchmark
+detectors` (all detectors, by the truth of rendered scenes), `trihedron benchmark methods` (every plugin in the default graph), `trihedron benchmark
+surface` (all surfaces, by the true one), `trihedron benchmark map` (drift, recovery and growth of the map), `trihedron benchmark long` (what a long
+run leaves behind), `trihedron benchmark recording` (what recording costs), `trihedron benchmark building`. `trihedron compare` makes a table of the
+runs of any sweep.
 
 Example: trihedron benchmark dataset=tum dataset.path=FOLDER dataset.frames=0:150 --json benchmark.json
 """
@@ -38,9 +40,11 @@ PROGRAM = (sys.executable, "-c", "import sys; from trihedron.pipeline.app.cli im
 REFERENCE_FRAMES = 40  # at most
 COMPARISONS = {  # other words after `benchmark`, and whose `main` they stand for
     "building": "trihedron.tools.benchmarks.building_benchmark",
+    "detectors": "trihedron.tools.benchmarks.detector_truth",
     "long": "trihedron.tools.benchmarks.long_run",
     "manhattan": "trihedron.tools.benchmarks.manhattan_family",
     "map": "trihedron.tools.benchmarks.map_benchmark",
+    "methods": "trihedron.tools.benchmarks.method_tables",
     "recording": "trihedron.tools.benchmarks.recording_benchmark",
     "rotations": "trihedron.tools.benchmarks.rotation_comparison",
     "scaling": "trihedron.tools.benchmarks.scaling_benchmark",

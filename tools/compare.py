@@ -26,7 +26,7 @@ from trihedron.tools.arguments import Parser
 from trihedron.tools.comparison_table import FIGURES
 
 SEEDS = ("seed", "dataset.seed")
-NOT_SHOWN = ("out", "report", "experiment", "sequences", *SEEDS)
+NOT_SHOWN = ("out", "report", "experiment", "sequences", "alternatives", *SEEDS)
 CONFIDENCE = 0.95
 SURFACE, SURFACE_FIGURES = "surface.ply", "surface.json"
 

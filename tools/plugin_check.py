@@ -312,8 +312,7 @@ class PluginCheck:
         return Result("differs", good, f"from {default} in {differing} values")
 
     def _time(self) -> Result:
-        scene = room(self._upstream)
-        spent: list[float] = []
+        scene, spent = room(self._upstream), list[float]()
         for _ in calls_of(self.plugin, self.slot, scene, spent=spent):
             pass
         median, most = 1e3 * statistics.median(spent), 1e3 * max(spent)

@@ -14,6 +14,7 @@ import json
 import re
 import tokenize
 from enum import Enum
+from pathlib import Path
 from typing import Any
 
 from trihedron.pipeline.core.errors import UsageError, did_you_mean
@@ -25,6 +26,9 @@ def main(argv: list[str]) -> int:
     parser = Parser("plugins", __name__)
     parser.add_argument("slot", metavar="SLOT", nargs="?", help="only this slot")
     parser.add_argument("--json", action="store_true", help="print everything as JSON")
+    parser.add_argument("--pages", type=Path, metavar="FOLDER", help="write a page for each plugin of this package instead")
+    parser.add_argument("--results", type=Path, metavar="FILE", help="measured figures for the pages (trihedron benchmark methods --json FILE)")
+    parser.add_argument("--figures", action="store_true", help="draw what each finds, for the pages")
     arguments = parser.parse_args(argv)
     from trihedron.pipeline.core.registry import load_plugins
     from trihedron.pipeline.core.slots import SLOTS
@@ -32,6 +36,12 @@ def main(argv: list[str]) -> int:
     if arguments.slot is not None and arguments.slot not in SLOTS:
         raise UsageError("plugins", f"there is no slot '{arguments.slot}'", did_you_mean(arguments.slot, SLOTS))
     load_plugins()
+    if arguments.pages is not None:
+        from trihedron.tools.plugin_pages import read_results, write_pages
+
+        pages = write_pages(arguments.pages, read_results(arguments.results or Path()), arguments.figures)
+        print(f"{len(pages)} pages in {arguments.pages}")
+        return 0
     described = [describe_slot(slot) for slot in SLOTS if arguments.slot in (None, slot)]
     print(json.dumps({"slots": described}, indent=2) if arguments.json else "\n\n".join(map(report, described)))
     return 0

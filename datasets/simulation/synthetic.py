@@ -23,7 +23,7 @@ from trihedron.datasets.simulation.true_plan import TruePlan, plan_of
 from trihedron.datasets.simulation.true_surface import TrueSurface, surface_of
 from trihedron.pipeline.core.options import Frames, NonNegativeInt, PositiveFloat, Range
 from trihedron.pipeline.core.registry import register
-from trihedron.pipeline.core.types import EXACT_DEPTH, F64, Bool, Camera, DepthNoise, Frame, Trajectory
+from trihedron.pipeline.core.types import EXACT_DEPTH, F64, I32, Bool, Camera, DepthNoise, Frame, Trajectory
 
 
 class Scene(Enum):
@@ -104,6 +104,23 @@ class Synthetic:
         geometry, atlas = self._scene
         _, depth, faces, _ = render(geometry, atlas, self._camera, self._pose(self._range[0] + index))
         return depth, np.array([face.curved != BOX for face in all_faces(self._room)])[faces]
+
+    def true_planes(self, index: int) -> tuple[F64, I32, F64]:
+        """(h, w) exact depth in metres of frame `index` of the selection, (h, w) the plane that each pixel shows, -1 where it is curved, and (k, 4)
+        these planes in the camera frame, `d >= 0`. Faces that are coplanar are one plane."""
+        geometry, atlas = self._scene
+        T_world_camera = self._pose(self._range[0] + index)
+        _, depth, faces, _ = render(geometry, atlas, self._camera, T_world_camera)
+        known = all_faces(self._room)
+        world = np.array([[*face.normal, -face.normal @ face.origin] for face in known])
+        planes, number = np.unique(np.round(world, 6), axis=0, return_inverse=True)
+        number = np.where([face.curved == BOX for face in known], number.reshape(-1), -1).astype(np.int32)
+        local = planes @ T_world_camera  # n·(R p + t) + d
+        return depth, number[faces].astype(np.int32), np.asarray(np.where(local[:, 3:] < 0.0, -local, local), np.float64)
+
+    def true_pose(self, index: int) -> F64:
+        """(4, 4) exact `T_world_camera` of frame `index` of the selection, in the frame of `truth`."""
+        return self._pose(self._range[0] + index)
 
     def _pose(self, number: int) -> F64:
         """(4, 4) `T_world_camera` of a frame."""

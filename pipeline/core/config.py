@@ -95,6 +95,7 @@ class RunOptions:
     feedback: Feedback = Feedback.new
     report: str = ""  # a command that is given the folder of a sweep when all its jobs are done, for example: benchmark rotations
     sequences: list[str] = dataclasses.field(default_factory=list)  # of a sweep: KIND:FOLDER and options after blanks, see sweep.words_of_sequence
+    alternatives: list[str] = dataclasses.field(default_factory=list)  # of a sweep: words tried one at a time, see sweep.words_of_alternatives
     record: RecordOptions = dataclasses.field(default_factory=RecordOptions)
     save_map: str = ""  # write the map, and all that is needed to go on, to this file
     load_map: str = ""  # go on from such a file

@@ -11,8 +11,9 @@ from pathlib import Path
 
 PATH_KEYS = frozenset({
     "out", "replay", "load_map", "save_map", "dataset.path", "dataset.camera", "dataset.options.path", "dataset.options.camera",
+    "keypoints.model", "lines.model", "normals.model", "planes.model", "tracks.model", "loop.model",
 })  # fmt: skip
-SEQUENCES = "sequences"
+LISTS = ("sequences", "alternatives")
 PLAIN = re.compile(r"[\w./:+@%-]+", re.ASCII)  # a value that Hydra reads as it is written
 SWEPT = re.compile(r".*,|(choice|glob|sort|shuffle)\(")
 
@@ -41,13 +42,13 @@ def path_of(word: str) -> tuple[str, str] | None:
 
 
 def with_literal_paths(words: Iterable[str], sweep: bool = False) -> list[str]:
-    """Quote the values of paths, and of `sequences`, for Hydra. In a sweep `A,B` are several paths, unless one of that name exists."""
+    """Quote the values of paths, `sequences` and `alternatives` for Hydra. In a sweep `A,B` are several paths, unless one of that name exists."""
     return [_literal_word(word, sweep) for word in words]
 
 
 def _literal_word(word: str, sweep: bool) -> str:
-    if word.startswith(SEQUENCES + "=["):
-        return f"{SEQUENCES}=[{','.join(quoted(element) for element in list_elements(word.partition('=')[2]))}]"
+    if (found_list := word.partition("="))[0] in LISTS and found_list[2].startswith("["):
+        return f"{found_list[0]}=[{','.join(quoted(element) for element in list_elements(found_list[2]))}]"
     found = path_of(word)
     if found is None or not found[1]:
         return word

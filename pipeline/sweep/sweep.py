@@ -31,6 +31,8 @@ from omegaconf import DictConfig
 from trihedron.pipeline.core.config import rewritten
 from trihedron.pipeline.core.errors import TrihedronError, UsageError
 from trihedron.pipeline.core.overrides import with_literal_paths
+from trihedron.pipeline.core.registry import load_plugins, options_of, plugins_of
+from trihedron.pipeline.core.slots import SLOTS
 from trihedron.pipeline.sweep.cluster import all_awaited
 from trihedron.pipeline.sweep.jobs import DONE, FAILED, RUNNING, key_of, read_job, write_job
 
@@ -161,12 +163,14 @@ class Sweeper(HydraSweeper):
             self._launch(waiting)
 
     def jobs(self, arguments: list[str]) -> list[Overrides]:
-        """The overrides of every job: the cross product of sequences and of all values given."""
+        """The overrides of every job: the cross product of sequences, of all values given and of the alternatives."""
         parser = OverridesParser.create(config_loader=self.loader)
-        words = [word for word in [*self.given, *arguments] if not word.startswith("sequences=")]
+        words = [word for word in [*self.given, *arguments] if not word.startswith(("sequences=", "alternatives="))]
         words += [] if any(word.startswith("threads=") for word in words) else [f"threads={self._threads}"]
         sequences = [words_of_sequence(text) for text in self.options.sequences] or [[]]
-        return [job for sequence in sequences for job in _product(parser.parse_overrides([*sequence, *words]))]
+        alternatives = words_of_alternatives(list(self.options.alternatives)) or [[]]
+        given = [[*sequence, *words, *alternative] for sequence in sequences for alternative in alternatives]
+        return [job for one in given for job in _product(parser.parse_overrides(one))]
 
     @property
     def given(self) -> Overrides:
@@ -195,6 +199,23 @@ def words_of_sequence(text: str) -> Overrides:
             break
     keys = [f"{'+' * option.startswith('options.')}dataset.{option}" for option in options]
     return [f"dataset={kind}", *with_literal_paths(([f"dataset.path={path}"] if path else []) + keys)]
+
+
+def words_of_alternatives(texts: Sequence[str]) -> list[Overrides]:
+    """Turn texts into lists of overrides, each of which is tried with nothing else changed: words with blanks between them, or the name of a slot,
+    which stands for each of its other plugins, `none` and those that need a file apart. The first list is empty: the configuration as it is."""
+    found: list[Overrides] = [[]] if texts else []
+    for text in texts:
+        slot, *rest = text.split()
+        if "=" in slot or slot not in SLOTS:
+            found.append(with_literal_paths([slot, *rest]))
+            continue
+        load_plugins()
+        names = [
+            name for name, plugin in plugins_of(slot).items() if name != "none" and not any(option.name == "model" for option in options_of(plugin))
+        ]
+        found += [[f"{slot}={name}", *with_literal_paths(rest)] for name in names]
+    return found
 
 
 def _numbers(folder: Path, jobs: Sequence[Overrides]) -> list[int]:

@@ -24,7 +24,8 @@ def plugin_table():
     lines = ["| slot | plugins (**default**) | gives |", "|---|---|---|"]
     for slot in SLOTS:
         built_in = [name for name, plugin in plugins_of(slot).items() if plugin.__module__.startswith("trihedron.")]
-        names = [f"**`{default[slot]}`**", *(f"`{name}`" for name in built_in if name != default[slot])]
+        linked = {name: f"[`{name}`](plugins/{slot}/{name}.md)" for name in built_in}
+        names = [f"**{linked[default[slot]]}**", *(linked[name] for name in built_in if name != default[slot])]
         lines.append(f"| `{slot}` | {', '.join(names)} | {summary(slot).rstrip('.')} |")
     return "\n".join(lines) + "\n"
 

@@ -1,0 +1,177 @@
+"""Pages of the plugins, one each, from their docstrings, their options and a file of measured figures: `trihedron plugins --pages FOLDER`."""
+
+from __future__ import annotations
+
+import inspect
+import json
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from trihedron.pipeline.core.registry import plugins_of
+from trihedron.pipeline.core.slots import SLOTS
+from trihedron.tools.plugins import default_plugins, describe_plugin
+
+WITHOUT = {"pose": "refinement"}  # slot -> its name as in without=NAME, where that differs
+SIZE = {"width": 320, "height": 240, "length": 3}  # of the frame that figures show, its last
+QUALITY = 82  # of JPEG
+Results = dict[str, Any]
+
+
+def write_pages(folder: Path, results: Results, figures: bool) -> list[Path]:
+    """Write FOLDER/SLOT/NAME.md for each plugin of this package, and with `figures` FOLDER/SLOT/NAME.jpg; returns the pages."""
+    pages = []
+    for slot, name in built_in():
+        path = folder / slot / f"{name}.md"
+        path.parent.mkdir(parents=True, exist_ok=True)
+        if figures and slot in DRAWN:
+            draw(slot, name, path.with_suffix(".jpg"))
+        path.write_text(page(slot, name, results, path.with_suffix(".jpg").exists()), encoding="utf-8")
+        pages.append(path)
+    return pages
+
+
+def built_in() -> list[tuple[str, str]]:
+    """Slot and name of each plugin of this package."""
+    return [(slot, name) for slot in SLOTS for name, kind in plugins_of(slot).items() if kind.__module__.startswith("trihedron.")]
+
+
+def read_results(file: Path) -> Results:
+    """The figures of `trihedron benchmark methods --json`; none where there is no file."""
+    found: Results = json.loads(file.read_text()) if file.is_file() else {"runs": [], "detectors": {}}
+    return found
+
+
+def page(slot: str, name: str, results: Results, figure: bool) -> str:
+    """The page of a plugin."""
+    kind = plugins_of(slot)[name]
+    described = describe_plugin(slot, name, kind)
+    source = Path(*kind.__module__.split(".")[1:]).with_suffix(".py")
+    default = "The default. " if default_plugins().get(slot) == name else ""
+    parts = [
+        f"# `{slot}={name}`",
+        inspect.cleandoc(kind.__doc__ or ""),
+        f"{default}Inputs: {', '.join(f'`{one}`' for one in described['inputs']) or 'none'}. "
+        f"[Source](../../../../{source.as_posix()}) · [all plugins](../../plugins.md)",
+    ]
+    parts += [f"![{slot}={name} on a frame of the synthetic room]({name}.jpg)"] if figure else []
+    parts += ["## Options", _options(described["parameters"])] if described["parameters"] else []
+    measured = [part for part in (_runs(slot, name, results), _detected(slot, name, results), _without(slot, results)) if part]
+    return "\n\n".join([*parts, *(["## Measured", *measured] if measured else [])]) + "\n"
+
+
+def _options(parameters: list[dict[str, Any]]) -> str:
+    rows = [(f"`{p['name']}`", f"`{json.dumps(p['default'])}`", p["range"], p["doc"]) for p in parameters]
+    return markdown(["option", "default", "range", ""], rows)
+
+
+def _runs(slot: str, name: str, results: Results) -> str:
+    """Figures of the default graph with this plugin, beside those of the default one."""
+    runs = {(row["change"], row["sequence"]): row for row in results["runs"]}
+    default = default_plugins().get(slot)
+    rows = []
+    for sequence in dict.fromkeys(row["sequence"] for row in results["runs"]):
+        row, base = runs.get((f"{slot}={name}", sequence)), runs.get(("default", sequence))
+        row = base if row is None and name == default else row
+        if row is not None and base is not None:
+            rows.append((sequence, *_figures(row), _number(base["ate_mm"], 1)))
+    header = ["sequence", "ATE mm", "tracked %", "NEES", "ms", "frame ms", "MB", "ATE mm of the default"]
+    return "In the default graph (`trihedron run -m experiment=methods`):\n\n" + markdown(header, rows) if rows else ""
+
+
+def _figures(row: dict[str, Any]) -> tuple[str, ...]:
+    if row["note"]:
+        return (row["note"], *[""] * 5)
+    tracked = None if row["tracked"] is None else 100.0 * row["tracked"]
+    digits = ((row["ate_mm"], 1), (tracked, 0), (row["nees"], 2), (row["ms"], 1), (row["frame_ms"], 1), (row["mb"], 0))
+    return tuple(_number(value, places) for value, places in digits)
+
+
+def _detected(slot: str, name: str, results: Results) -> str:
+    """Figures by the truth of rendered scenes."""
+    scenes = results["detectors"].get(slot, {}).get(name, {})
+    if not scenes or "note" in scenes:
+        return str(scenes.get("note", ""))
+    header = ["scene", *next(iter(scenes.values()))]
+    rows = [(scene, *(f"{value:.3g}" for value in figures.values())) for scene, figures in scenes.items()]
+    return "By the truth of rendered scenes (`trihedron benchmark detectors`):\n\n" + markdown(header, rows)
+
+
+def _without(slot: str, results: Results) -> str:
+    """Cost of leaving the stage out."""
+    change = f"without={WITHOUT.get(slot, slot)}"
+    base = {row["sequence"]: row for row in results["runs"] if row["change"] == "default"}
+    runs = [row for row in results["runs"] if row["change"] == change]
+    rows = [(row["sequence"], *_figures(row)[:3], _number(base.get(row["sequence"], {}).get("ate_mm"), 1)) for row in runs]
+    header = ["sequence", "ATE mm", "tracked %", "NEES", "ATE mm with it"]
+    return f"Without the stage (`{change}`):\n\n" + markdown(header, rows) if rows else ""
+
+
+def _number(value: float | None, places: int) -> str:
+    return "-" if value is None else f"{value:.{places}f}"
+
+
+def markdown(header: list[str], rows: Sequence[tuple[Any, ...]]) -> str:
+    """A table; bars in cells are escaped."""
+    lines = [header, ["---"] * len(header), *([str(cell).replace("|", r"\|") for cell in row] for row in rows)]
+    return "\n".join("| " + " | ".join(line) + " |" for line in lines)
+
+
+# Figures: what a stage finds in one frame.
+
+
+def draw(slot: str, name: str, out: Path) -> None:
+    """Draw what a plugin finds; nothing where it needs a file or a library that is not there."""
+    import cv2
+
+    from trihedron.pipeline.core.errors import TrihedronError
+    from trihedron.tools.plugin_check import PluginCheck, room, values_of
+
+    scene = room(tuple(f"dataset.{key}={value}" for key, value in SIZE.items()))
+    try:
+        value = values_of(PluginCheck(slot, name).plugin, slot, scene)[-1]
+    except TrihedronError:
+        return
+    if value is None:
+        return
+    picture = DRAWN[slot](scene.values[-1]["dataset"].color.copy(), value)
+    cv2.imwrite(str(out), cv2.cvtColor(picture, cv2.COLOR_RGB2BGR), [cv2.IMWRITE_JPEG_QUALITY, QUALITY])
+
+
+def _colors(count: int) -> Any:
+    rng = np.random.default_rng(7)
+    return rng.integers(60, 256, (count + 1, 3)).astype(np.uint8)
+
+
+def _normals(picture: Any, value: Any) -> Any:
+    cells = np.where(np.isfinite(value.normals), 127.5 - 127.5 * value.normals, 0.0).astype(np.uint8)
+    height, width = picture.shape[:2]
+    return np.repeat(np.repeat(cells, value.stride, axis=0), value.stride, axis=1)[:height, :width]
+
+
+def _planes(picture: Any, value: Any) -> Any:
+    height, width = picture.shape[:2]
+    labels = np.repeat(np.repeat(value.labels, value.stride, axis=0), value.stride, axis=1)[:height, :width]
+    tinted = (0.4 * picture + 0.6 * _colors(len(value.coefficients))[labels]).astype(np.uint8)
+    return np.where(labels[..., None] > 0, tinted, picture)
+
+
+def _keypoints(picture: Any, value: Any) -> Any:
+    import cv2
+
+    for (x, y), sigma in zip(value.pixels, value.sigma_px):
+        cv2.circle(picture, (round(float(x)), round(float(y))), max(2, round(3.0 * float(sigma))), (60, 230, 60), 1, cv2.LINE_AA)
+    return picture
+
+
+def _lines(picture: Any, value: Any) -> Any:
+    import cv2
+
+    for (start, end), color in zip(np.rint(value.endpoints_px).astype(int), _colors(len(value.endpoints_px))):
+        cv2.line(picture, tuple(map(int, start)), tuple(map(int, end)), tuple(map(int, color)), 2, cv2.LINE_AA)
+    return picture
+
+
+DRAWN: dict[str, Callable[[Any, Any], Any]] = {"normals": _normals, "keypoints": _keypoints, "lines": _lines, "segments": _lines, "planes": _planes}
