@@ -66,7 +66,8 @@ class View:
         depth = self.depth_m[at[:, 1].clip(0, camera.height - 1), at[:, 0].clip(0, camera.width - 1)]
         points = transform(invert(other.T_world_camera) @ self.T_world_camera, camera.back_project(pixels, depth))
         places = camera.project(points)
-        inside: Bool = np.asarray(
+        within = np.isfinite(places) & (places >= 0.0) & (places <= [camera.width - 1, camera.height - 1])
+        inside: Bool = np.asarray(within.all(axis=1))
             np.isfinite(places).all(axis=1) & (places >= 0).all(axis=1) & (places <= [camera.width - 1, camera.height - 1]).all(axis=1)
         )
         at = np.rint(np.where(inside[:, None], places, 0)).astype(int)
