@@ -68,8 +68,6 @@ class View:
         places = camera.project(points)
         within = np.isfinite(places) & (places >= 0.0) & (places <= [camera.width - 1, camera.height - 1])
         inside: Bool = np.asarray(within.all(axis=1))
-            np.isfinite(places).all(axis=1) & (places >= 0).all(axis=1) & (places <= [camera.width - 1, camera.height - 1]).all(axis=1)
-        )
         at = np.rint(np.where(inside[:, None], places, 0)).astype(int)
         there = other.depth_m[at[:, 1], at[:, 0]]
         return places, inside & (np.abs(there - points[:, 2]) <= VISIBLE * points[:, 2])
