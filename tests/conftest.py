@@ -5,6 +5,8 @@ import re
 
 import pytest
 
+import trihedron  # noqa: F401  # before NumPy, so that OpenBLAS rounds alike in all processes
+
 os.environ["TRIHEDRON_COMPILE"] = "0"
 ON_OPEN3D = re.compile(r"open3d|\b(graph=)?libraries\b")
 
