@@ -214,9 +214,9 @@ class BundleSlot(Protocol):
 
 
 class LoopSlot(Protocol):
-    """Recognise a place seen before and correct the map."""
+    """Recognise a place seen before and correct the map. `previous` is this stage's last output."""
 
-    def __call__(self, map: Map, frame: Frame) -> Correction | None: ...
+    def __call__(self, map: Map, frame: Frame, previous: Correction | None) -> Correction | None: ...
 
 
 class RelocaliseSlot(Protocol):

@@ -50,6 +50,7 @@ __all__ = [
     "Map",
     "Matches",
     "Normals",
+    "PlaceCorrection",
     "Planes",
     "Pose",
     "PredictedView",
@@ -470,6 +471,16 @@ class Correction(Value):
     plane_ids: Annotated[I32, Shape("p"), IndexInto("map.planes")]
     coefficients: Annotated[F64, Shape("p", 4), UnitNormals()]
     plane_covariance: Annotated[F64, Shape("p", 3, 3)]
+
+
+PLACES = Columns({"keyframe": ("i4", (), IndexInto("map.keyframes")), "descriptor": ("f4", (None,), Finite())})
+
+
+@dataclass(frozen=True)
+class PlaceCorrection(Correction):
+    """A correction by a stage that remembers places: `places` has the descriptor of each keyframe that it saw. It may correct nothing."""
+
+    places: Annotated[Table, PLACES]
 
 
 # The type of the topic `surface`: a triangle mesh with plane instances.

@@ -69,7 +69,7 @@ class Covisibility(KeyframeOptions):
         """Return the next version of the map, or None when this frame changes nothing."""
         corrected = map
         for correction in (bundle, loop):
-            if corrected is not None and correction is not None:
+            if corrected is not None and correction is not None and len(correction.keyframe_ids):
                 corrected = apply_correction(corrected, correction)
         if corrected is not None and relocalise is not None and relocalise.status == DEGRADED and pose.status != LOST:
             here, recognised = transform_to_map(pose, corrected), transform_to_map(relocalise, corrected)

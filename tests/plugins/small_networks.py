@@ -139,4 +139,18 @@ def network_words(slot: str, folder: Path) -> list[str]:
     if slot == "normals":
         normals = rng.normal(size=(1, 3, 30, 40)) + np.array([0.0, 0.0, -3.0])[None, :, None, None]
         return [f"normals.model={answering(folder / 'normals.onnx', 3, normals=normals)}"]
+    if slot == "loop":
+        return [f"loop.model={small_image(folder / 'places.onnx')}"]
     raise ValueError(slot)
+
+
+def small_image(path: Path) -> Path:
+    """A descriptor of an image of 12 × 16 pixels: the pixels of its mean channel without their mean."""
+    node = helper.make_node
+    nodes = [
+        node("ReduceMean", ["image"], ["grey"], axes=[1], keepdims=0),
+        node("Reshape", ["grey", "flat"], ["pixels"]),
+        node("ReduceMean", ["pixels"], ["mean"], axes=[1], keepdims=1),
+        node("Sub", ["pixels", "mean"], ["descriptor"]),
+    ]
+    return save(path, nodes, {"image": [1, 3, 12, 16]}, {"descriptor": [1, 192]}, {"flat": np.array([1, -1])})

@@ -20,7 +20,7 @@ from trihedron.plugins.shared.networks import bytes_of, vectors_of
 
 pytest.importorskip("onnx", exc_type=ImportError)
 pytest.importorskip("onnxruntime", exc_type=ImportError)
-from small_networks import answering, corner_detector, nearest_matcher
+from small_networks import answering, corner_detector, nearest_matcher, network_words
 
 ROOM = ["dataset.width=320", "dataset.height=240", "dataset.length=20"]
 FRAME = Synthetic(length=2, width=320, height=240)(0)
@@ -152,6 +152,18 @@ def test_normals_face_the_camera(tmp_path):
     seen = np.isfinite(value.normals[..., 0])
     assert value.normals.shape == (60, 80, 3) and np.allclose(value.normals[seen], [0.0, 0.0, -1.0])
     assert not seen[(FRAME.depth_m[::4, ::4] == 0.0)].any() and seen.mean() > 0.8
+
+
+def test_places_are_remembered_in_the_value(tmp_path):
+    """A keyframe's descriptor is recorded with it, ranks keyframes, and corrects nothing by itself."""
+    words = ["loop=onnx_descriptor", *network_words("loop", tmp_path), "outputs=[trajectory,loop]", "map.min_turn_deg=0.5", "map.min_shift=0.01"]
+    assert main(["run", *ROOM, *words, f"out={tmp_path / 'run'}"]) == 0
+    values = list(Recording(tmp_path / "run" / "run.mcap").values("loop"))
+    keyframes = list(Recording(tmp_path / "run" / "run.mcap").values("map"))[-1].keyframes
+    assert len(values) >= 3 and [len(value.places) for value in values] == list(range(1, len(values) + 1))
+    assert values[-1].places.shared("keyframe").tolist() == list(range(len(values))) and len(values) <= len(keyframes)
+    assert np.allclose(np.linalg.norm(values[-1].places.shared("descriptor"), axis=1), 1.0, atol=1e-5)
+    assert not any(len(value.keyframe_ids) for value in values)
 
 
 def test_libraries_are_not_imported_before_they_are_asked_for():

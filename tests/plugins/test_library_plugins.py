@@ -1,0 +1,87 @@
+"""Plugins over COLMAP, Open3D and SciPy do what they say; their system tracks the room."""
+
+import json
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation
+
+from trihedron.datasets.simulation.synthetic import Synthetic
+from trihedron.pipeline.core.geometry import invert, rotation_angle_deg
+from trihedron.pipeline.core.types import Camera
+from trihedron.plugins.keypoints.opencv_orb import OpenCvOrb
+from trihedron.plugins.keypoints.sift import Sift
+from trihedron.plugins.loop.bag_of_words import as_vectors
+from trihedron.tools.plugin_check import PluginCheck, room, values_of
+
+CAMERA = Camera(640, 480, 525.0, 525.0, 319.5, 239.5)
+PROGRAM = "import sys; from trihedron.pipeline.app.cli import main; sys.exit(main(sys.argv[1:]))"
+
+
+def scene(outliers):
+    """200 points with their pixels under a known pose, of which the first `outliers` are wrong."""
+    rng = np.random.default_rng(1)
+    points = rng.uniform([-2.0, -1.5, 2.0], [2.0, 1.5, 5.0], (200, 3))
+    R, t = Rotation.from_rotvec([0.1, -0.2, 0.05]).as_matrix(), np.array([0.2, -0.1, 0.3])
+    pixels = CAMERA.project(points @ R.T + t) + rng.normal(0.0, 0.3, (200, 2))
+    pixels[:outliers] = rng.uniform([0, 0], [640, 480], (outliers, 2))
+    return points, pixels, R, t
+
+
+def test_colmap_recovers_a_pose_among_outliers_with_pixel_centres_at_integers():
+    pytest.importorskip("pycolmap", exc_type=ImportError)
+    from trihedron.plugins.shared.pycolmap_pose import absolute_pose
+
+    points, pixels, R, t = scene(outliers=60)
+    found = absolute_pose(points, pixels, CAMERA, 4.0, seed=3)
+    assert rotation_angle_deg(found.R @ R.T) < 0.05 and np.linalg.norm(found.t - t) < 0.005
+    assert found.inliers[60:].mean() > 0.98 and found.inliers[:60].mean() < 0.05
+    again = absolute_pose(points, pixels, CAMERA, 4.0, seed=3)
+    assert again.R.tobytes() == found.R.tobytes() and again.inliers.tobytes() == found.inliers.tobytes()
+    assert absolute_pose(points[:3], pixels[:3], CAMERA, 4.0, seed=3) is None
+
+
+@pytest.mark.parametrize("keypoints", ["opencv_orb", "sift"])
+def test_colmap_tracks_with_descriptors_of_either_metric(keypoints):
+    pytest.importorskip("pycolmap", exc_type=ImportError)
+    data = Synthetic(length=8, width=320, height=240)
+    tracks = values_of(PluginCheck("tracks", "pycolmap_pnp").plugin, "tracks", room((f"keypoints={keypoints}",)))
+    assert tracks[0] is None and all(len(found.keypoints) >= 30 for found in tracks[1:])
+    for k in range(1, 8):
+        truth = invert(data.true_pose(k)) @ data.true_pose(k - 1)
+        assert rotation_angle_deg(tracks[k].R_current_previous @ truth[:3, :3].T) < 1.0
+
+
+@pytest.mark.parametrize(("name", "words"), [("open3d_voxels", ()), ("open3d_poisson", ("surface.depth=7",))])
+def test_surfaces_of_open3d_lie_on_the_depth(name, words):
+    pytest.importorskip("open3d", exc_type=ImportError)
+    seen = room(())
+    (mesh,) = values_of(PluginCheck("surface", name, words).plugin, "surface", seen)
+    frame, pose = seen.values[0]["dataset"], seen.values[0]["pose"].T_world_camera
+    rows, columns = np.nonzero(frame.depth_m > 0.0)
+    points = frame.camera.back_project(np.stack([columns, rows], axis=1).astype(float), frame.depth_m[rows, columns].astype(float))
+    distance, _ = cKDTree(points @ pose[:3, :3].T + pose[:3, 3]).query(mesh.vertices_m)
+    assert len(mesh.triangles) > 5000 and np.median(distance) < 0.02
+    assert (mesh.instances == -1).all() and not (mesh.colors == 128).all()
+
+
+def test_words_are_made_of_binary_and_of_histogram_descriptors():
+    frame = Synthetic(length=1, width=320, height=240)(0)
+    binary, histogram = OpenCvOrb()(frame).descriptors, Sift()(frame).descriptors
+    assert as_vectors(binary).shape == (len(binary), 256) and set(np.unique(as_vectors(binary))) == {0.0, 1.0}
+    assert as_vectors(histogram).shape == histogram.shape and np.array_equal(as_vectors(histogram), histogram)
+
+
+@pytest.mark.slow
+def test_the_system_of_libraries_tracks_the_room(tmp_path):
+    for module in ("open3d", "pycolmap"):
+        pytest.importorskip(module, exc_type=ImportError)
+    words = ["graph=libraries", "dataset.length=40", "outputs=[trajectory,surface]", f"out={tmp_path}"]
+    done = subprocess.run([sys.executable, "-c", PROGRAM, "run", *words], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    metrics = json.loads((tmp_path / "metrics.json").read_text())
+    assert metrics["final"]["tracked_share"] == 1.0 and metrics["final"]["ate_rmse_m"] < 0.03
+    assert (tmp_path / "surface.ply").stat().st_size > 100_000
