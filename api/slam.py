@@ -65,7 +65,7 @@ class Slam:
         options: root keys and plugins by name, as `manhattan="mean_shift"`, `threads=2`, `outputs=["surface"]`.
 
     Frames are pushed from one thread. Used as a context manager it is closed at the end of the block. Constructing compiles what is not compiled yet,
-    and says so. While it is open, OpenCV and BLAS use one thread in this process. Raises TrihedronError: one line with place, cause and cure.
+    and a message names it. While it is open, OpenCV and BLAS use one thread in this process. Raises TrihedronError: one line, place, cause and cure.
     """
 
     def __init__(self, camera: types.Camera | Calibration, *overrides: str, out: str | Path | None = None, history: int = 10, **options: Any) -> None:

@@ -2,6 +2,7 @@
 
 import contextlib
 import os
+import platform
 import subprocess
 import sys
 from pathlib import Path
@@ -68,3 +69,22 @@ def test_ten_runs_in_processes_of_their_own_are_one(tmp_path):
         assert differing(first, found) == [], number
         for name in ("trajectory.txt", "trajectory_causal.txt", "metrics.json"):
             assert (folder / "run" / name).read_bytes() == (tmp_path / "0" / "run" / name).read_bytes()
+
+
+PROCESSORS = [
+    {"OPENBLAS_CORETYPE": "Haswell"},
+    {"OPENBLAS_CORETYPE": "SkylakeX"},
+    {"NPY_DISABLE_CPU_FEATURES": "X86_V3 X86_V4"},
+    pytest.param({"NUMBA_CPU_NAME": "generic"}, marks=pytest.mark.slow),  # compiles every kernel
+]
+
+
+@pytest.mark.skipif(platform.machine() not in ("x86_64", "AMD64"), reason="the kernels of x86-64 are selected")
+@pytest.mark.parametrize("environment", PROCESSORS, ids=lambda environment: " ".join(environment.values()))
+def test_other_processors_give_the_same_bytes(tmp_path, environment):
+    """Libraries select their code by the processor; these variables make them select that of another one."""
+    words = ["dataset=synthetic", "dataset.length=4", "dataset.width=320", "dataset.height=240", "outputs=[trajectory,surface]"]
+    for name, changes in (("here", {}), ("there", environment)):
+        program = [sys.executable, "-c", RUN, *words, f"out={tmp_path / name}"]
+        subprocess.run(program, check=True, capture_output=True, env={**os.environ, **changes})
+    assert main(["diff", str(tmp_path / "here" / "run.mcap"), str(tmp_path / "there" / "run.mcap")]) == 0

@@ -2,6 +2,7 @@
 
 import ast
 import json
+import re
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -11,6 +12,8 @@ import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
 LONGEST_FUNCTION = 80
+CLAUSE = re.compile(r"^(What|Whether|How|Of|Where|Which|As|Those|Not|Also|From|With)\b")
+PRIVATE = re.compile(r"^(hydra|numba|numpy|submitit|joblib|distributed|mcap|cv2|foxglove)\b[\w.]*\._[a-z]")
 FOLDERS = ("pipeline", "plugins", "datasets", "tools", "conf")
 FILES = sorted(path for folder in FOLDERS for path in (ROOT / folder).rglob("*.py"))
 
@@ -81,4 +84,23 @@ def test_size_documentation_and_annotations(path):
         public = isinstance(node, (ast.ClassDef, ast.FunctionDef)) and not node.name.startswith("_") and "_kernels" not in path.stem
         if public and not ast.get_docstring(node) and "overload" not in [ast.unparse(d) for d in node.decorator_list]:
             found.append(f"{node.name} has no docstring")
+    documented = (ast.Module, ast.ClassDef, ast.FunctionDef)
+    texts = [ast.get_docstring(node) for node in ast.walk(tree) if isinstance(node, documented)]
+    found += [f"the docstring '{text[:40]}' opens with a clause" for text in texts if text and CLAUSE.match(text)]
     assert not found, f"{path.relative_to(ROOT)}: {'; '.join(found)}"
+
+
+@pytest.mark.parametrize("path", FILES, ids=lambda path: str(path.relative_to(ROOT)))
+def test_no_private_member_of_a_library(path):
+    tree = parsed(path)
+    imports = [alias for node in ast.walk(tree) if isinstance(node, ast.Import) for alias in node.names]
+    libraries = {alias.asname or alias.name.split(".")[0]: alias.name for alias in imports}
+    found = []
+    for node in ast.walk(tree):
+        if isinstance(node, ast.ImportFrom) and node.module:
+            found += [f"{node.module}.{name.name}" for name in node.names if PRIVATE.match(f"{node.module}.{name.name}")]
+        elif isinstance(node, ast.Attribute) and isinstance(node.ctx, (ast.Load, ast.Store)):
+            head, _, rest = ast.unparse(node).partition(".")
+            if head in libraries and PRIVATE.match(f"{libraries[head]}.{rest}"):
+                found.append(f"{libraries[head]}.{rest}")
+    assert not found, f"{path.relative_to(ROOT)} uses {', '.join(found)}"

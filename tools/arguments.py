@@ -1,4 +1,4 @@
-"""What the commands share: an argument parser that speaks the program's one-line errors, and tables of text."""
+"""Shared parts of the commands: an argument parser that speaks the program's one-line errors, and tables of text."""
 
 from __future__ import annotations
 

@@ -2,7 +2,7 @@
 
 The machine's speed varies, so times are also given as multiples of the reference: OpenCV ORB (1000 features, 8 levels) and LSD on the same frames,
 one thread, measured before and after each run. --paced runs the frames a second time at the camera's own rate: latency is then from asking for a
-frame's files to its pose, and the time it waits behind others does not count. --cold runs one frame with an empty kernel cache. --compare says what
+frame's files to its pose, and the time it waits behind others does not count. --cold runs one frame with an empty kernel cache. --compare lists what
 became slower since a --json file.
 
 Other comparisons, each with its --help: `trihedron benchmark scaling` (threads, image size, features, length), `trihedron benchmark manhattan`
@@ -108,8 +108,8 @@ def measure(overrides: list[str], out: Path, environment: dict[str, str] | None 
     errors = process.stderr.read()
     _, status, usage = os.wait4(process.pid, 0)
     if os.waitstatus_to_exitcode(status):
-        said = errors.strip().splitlines()[-1].removeprefix("trihedron: ") if errors.strip() else "without a word"
-        raise StageError("benchmark", f"the run failed: {said}", "mend that first")
+        last = errors.strip().splitlines()[-1].removeprefix("trihedron: ") if errors.strip() else "without a word"
+        raise StageError("benchmark", f"the run failed: {last}", "mend that first")
     figures: dict[str, Any] = json.loads((out / "timing.json").read_text())
     figures["cpu_s"] = round(usage.ru_utime + usage.ru_stime, 2)
     figures["process_s"] = round(time.perf_counter() - began, 2)
@@ -140,7 +140,7 @@ def _cold(overrides: list[str], folder: Path) -> float:
 
 
 def machine() -> dict[str, Any]:
-    """What the figures were measured on, and with which versions."""
+    """Machine on which the figures were measured, and the versions."""
     cpuinfo = Path("/proc/cpuinfo").read_text() if Path("/proc/cpuinfo").exists() else ""
     models = [line.partition(":")[2].strip() for line in cpuinfo.splitlines() if line.startswith("model name")]
     packages = {name: version(name) for name in ("trihedron", "numpy", "numba", "opencv-contrib-python-headless")}

@@ -4,7 +4,7 @@ A row is what a run's overrides say that those of the others do not; runs that d
 from the smallest to the largest. Rows of one data set stand together; the best of each column is bold, errors only among rows that tracked almost
 as much as the best. `end to start` is where a run without ground truth ends, seen from where it began: the drift of a walk that returns.
 `--baseline` adds the mean paired difference (same data, same seeds) with its 95 % interval by Student's t, per row and over all data. A job that
-failed, or has no errors, has a row that says why.
+failed, or has no errors, has a row with the reason.
 
 Example: trihedron compare runs/table --baseline graph=points --markdown table.md
 """
@@ -33,7 +33,7 @@ SURFACE, SURFACE_FIGURES = "surface.ply", "surface.json"
 
 @dataclass(frozen=True)
 class Run:
-    """One run: its folder, its overrides (key -> value), its figures by column, NaN where there is none, and why, if it has to be said."""
+    """One run: its folder, its overrides (key -> value), its figures by column, NaN where there is none, and why, if there is a reason."""
 
     folder: Path
     overrides: dict[str, str]
@@ -42,7 +42,7 @@ class Run:
 
     @property
     def seeds(self) -> tuple[str, ...]:
-        """What makes it a repeat of another run, and pairs it with one of the baseline."""
+        """Seeds, which make it a repeat of another run, and pair it with one of the baseline."""
         return tuple(self.overrides.get(key, "") for key in SEEDS)
 
 
@@ -113,7 +113,7 @@ def _read(file: Path) -> dict[str, Any]:
 
 
 def _judge_surfaces(folders: Sequence[Path]) -> None:
-    """Write surface.json beside each surface.ply that has none; one that cannot be judged is said, and left out."""
+    """Write surface.json beside each surface.ply that has none; one that cannot be judged is named, and left out."""
     from trihedron.tools.evaluate_surface import evaluate_files
 
     for folder in (run for given in folders for run in run_folders(given)):
@@ -200,5 +200,5 @@ def _of_data(key: str) -> bool:
 
 
 def _said(run: Run, keys: Sequence[str]) -> str:
-    """What a run's overrides say of these keys; of a path its last part."""
+    """Overrides of a run for these keys; of a path its last part."""
     return " ".join(f"{key}={Path(run.overrides[key]).name}" for key in keys if run.overrides.get(key, "null") != "null")

@@ -64,7 +64,7 @@ def cells_of(rows: Sequence[Row]) -> tuple[list[str], list[list[Cell]]]:
 
 
 def _best(rows: Sequence[Row], name: str) -> str | None:
-    """What the best of a column prints; None when fewer than two rows compete."""
+    """Best value of a column; None when fewer than two rows compete."""
     figure = FIGURES[name]
     competing = [row for row in rows if name in row["figures"]]
     if figure.error:

@@ -126,10 +126,10 @@ def replayed(source: Path, stages: tuple[str, ...], out: Path, *overrides: str) 
     """Run the stages again over the recording, changed by `overrides`; the final metrics, empty when no pose is among them."""
     from trihedron.pipeline.app.cli import main as trihedron
 
-    said = io.StringIO()
-    with contextlib.redirect_stdout(said), contextlib.redirect_stderr(said):
+    printed = io.StringIO()
+    with contextlib.redirect_stdout(printed), contextlib.redirect_stderr(printed):
         code = trihedron(["run", f"replay={source}", f"only=[{','.join(stages)}]", f"out={out}", *overrides])
     if code:
-        raise StageError(f"replay of {', '.join(stages)}", (said.getvalue().strip().splitlines() or ["failed"])[-1], "run it alone to see more")
+        raise StageError(f"replay of {', '.join(stages)}", (printed.getvalue().strip().splitlines() or ["failed"])[-1], "run it alone to see more")
     metrics: dict[str, Any] = json.loads((out / "metrics.json").read_text())["final"] if "pose" in stages else {}
     return metrics

@@ -1,4 +1,4 @@
-"""Judge a mesh by the true surface: accuracy, completeness, triangles and bytes, planar and curved parts apart where the truth tells them.
+"""Judge a mesh by the true surface: accuracy, completeness, triangles and bytes, planar and curved parts apart where the truth distinguishes them.
 
 MESH is a run folder, whose surface.ply is judged, or a file (ply, obj) in the world of the trajectory beside it, or else beside TRUTH. TRUTH is the
 run's recording, or its folder: the truth is that of its data set, the exact surface of the synthetic scenes, rendered depth for ICL-NUIM. By

@@ -3,7 +3,7 @@
 RUN is a run folder or its recording. Lengths are metres. tum and kitti are the final trajectory, csv is a row for each frame, colmap a model with its
 images, rerun what `trihedron view` shows, all in the world of trajectory.txt. Meshes are
 turned so that up, an axis of the Manhattan frame, is +z (ply, obj,
-planes.json) or +y (gltf, as its standard says), and what the first camera saw is ahead: +y, or -z.
+planes.json) or +y (gltf, by its standard), and what the first camera saw is ahead: +y, or -z.
 
 Example: trihedron export runs/latest --to colmap
 """
@@ -23,7 +23,7 @@ RECORDING = "run.mcap"
 
 @dataclass(frozen=True)
 class Format:
-    """One format: `write` makes the file and says in one line what is in it."""
+    """One format: `write` makes the file and returns a line about its content."""
 
     name: str  # as given to --to
     file: str  # its default name, in the run folder
@@ -51,8 +51,8 @@ def main(argv: list[str]) -> int:
     recording: Path = arguments.run / RECORDING if arguments.run.is_dir() else arguments.run
     out: Path = arguments.out or recording.parent / chosen.file
     try:
-        said = chosen.write(Recording(recording), out)
+        content = chosen.write(Recording(recording), out)
     except OSError as error:
         raise DataError(str(out), f"cannot be written: {error.strerror}", "give another --out") from error
-    print(f"{out}: {said}")
+    print(f"{out}: {content}")
     return 0

@@ -47,7 +47,7 @@ def upright(up: F64, axis: str = "z") -> F64:
 def _summary(surface: Surface) -> str:
     if len(surface.triangles) == 0:
         return "empty: the run has no surface to speak of"
-    guessed = "" if np.isfinite(surface.up).all() else "; no Manhattan frame says what is up, so the first camera's up was taken"
+    guessed = "" if np.isfinite(surface.up).all() else "; no Manhattan frame determines the vertical, so the first camera's up was taken"
     return f"{len(surface.triangles)} triangles, {len(surface.plane_ids)} planes{guessed}"
 
 
@@ -141,7 +141,7 @@ def _name(surface: Surface, plane: int) -> str:
 
 
 def _facts(surface: Surface, plane: int, R: F64) -> dict[str, Any]:
-    """What is known of a plane; normal·x + d = 0 in the file's axes."""
+    """Facts about a plane; normal·x + d = 0 in the file's axes."""
     return {
         "id": int(surface.plane_ids[plane]),
         "kind": PLANE_KINDS[surface.kinds[plane]],

@@ -1,4 +1,4 @@
-"""The final trajectory in the formats of TUM and KITTI, and everything that is said of each frame as a table (CSV)."""
+"""The final trajectory in the formats of TUM and KITTI, and everything recorded of each frame as a table (CSV)."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def write_kitti(recording: Recording, path: Path) -> str:
 
 
 def write_csv(recording: Recording, path: Path) -> str:
-    """A row a frame: the pose as it was said at the time, its status and variances, what the stages found, and their milliseconds."""
+    """A row a frame: the pose as estimated at the time, its status and variances, what the stages found, and their milliseconds."""
     columns: dict[int, dict[str, Any]] = {pose.index: _pose_columns(pose) for pose in poses_of(recording)}
     for topic in ("keypoints", "segments", "planes", "manhattan", "rotation", "tracks", "matches"):
         for value in recording.values(topic) if topic in recording.topics else ():
@@ -58,11 +58,11 @@ def write_csv(recording: Recording, path: Path) -> str:
 def _pose_columns(pose: Pose) -> dict[str, Any]:
     x, y, z = (f"{v:.9f}" for v in pose.T_world_camera[:3, 3])
     qx, qy, qz, qw = (f"{v:.9f}" for v in quaternion_from_rotation(pose.T_world_camera[:3, :3]))
-    said = {"index": pose.index, "stamp": format_stamp(pose.stamp_ns), "status": pose.status, "reason": pose.reason}
-    said |= {"tx": x, "ty": y, "tz": z, "qx": qx, "qy": qy, "qz": qz, "qw": qw}
-    said |= {name: f"{variance:.6e}" for name, variance in zip(SIGMAS, np.diag(pose.covariance))}
-    said |= {f"inliers_{kind}": int(n) for kind, n in zip(("points", "lines", "planes"), pose.inliers)}
-    return said | {"unobservable": pose.unobservable, "reference": pose.reference, "submap": pose.submap}
+    row = {"index": pose.index, "stamp": format_stamp(pose.stamp_ns), "status": pose.status, "reason": pose.reason}
+    row |= {"tx": x, "ty": y, "tz": z, "qx": qx, "qy": qy, "qz": qz, "qw": qw}
+    row |= {name: f"{variance:.6e}" for name, variance in zip(SIGMAS, np.diag(pose.covariance))}
+    row |= {f"inliers_{kind}": int(n) for kind, n in zip(("points", "lines", "planes"), pose.inliers)}
+    return row | {"unobservable": pose.unobservable, "reference": pose.reference, "submap": pose.submap}
 
 
 def _stage_columns(topic: str, value: Any) -> dict[str, Any]:

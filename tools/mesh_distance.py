@@ -87,33 +87,33 @@ def _nearest(points: F64, corners: F64, candidates: I32, far: float) -> tuple[F6
 
 @kernel(error_model="python")
 def _distance(p: F64, a: F64, b: F64, c: F64) -> float:
-    """From a point to a triangle (Ericson, Real-Time Collision Detection, 5.1.5)."""
+    """Distance from a point to a triangle (Ericson, Real-Time Collision Detection, 5.1.5)."""
     ab, ac, ap = b - a, c - a, p - a
     d1, d2 = np.dot(ab, ap), np.dot(ac, ap)
     if d1 <= 0.0 and d2 <= 0.0:
-        return np.sqrt(np.dot(ap, ap))
+        return float(np.sqrt(np.dot(ap, ap)))
     bp = p - b
     d3, d4 = np.dot(ab, bp), np.dot(ac, bp)
     if d3 >= 0.0 and d4 <= d3:
-        return np.sqrt(np.dot(bp, bp))
+        return float(np.sqrt(np.dot(bp, bp)))
     vc = d1 * d4 - d3 * d2
     if vc <= 0.0 and d1 >= 0.0 and d3 <= 0.0:
         q = ap - ab * (d1 / max(d1 - d3, 1e-300))
-        return np.sqrt(np.dot(q, q))
+        return float(np.sqrt(np.dot(q, q)))
     cp = p - c
     d5, d6 = np.dot(ab, cp), np.dot(ac, cp)
     if d6 >= 0.0 and d5 <= d6:
-        return np.sqrt(np.dot(cp, cp))
+        return float(np.sqrt(np.dot(cp, cp)))
     vb = d5 * d2 - d1 * d6
     if vb <= 0.0 and d2 >= 0.0 and d6 <= 0.0:
         q = ap - ac * (d2 / max(d2 - d6, 1e-300))
-        return np.sqrt(np.dot(q, q))
+        return float(np.sqrt(np.dot(q, q)))
     va = d3 * d6 - d5 * d4
     if va <= 0.0 and d4 - d3 >= 0.0 and d5 - d6 >= 0.0:
         q = bp - (c - b) * ((d4 - d3) / max((d4 - d3) + (d5 - d6), 1e-300))
-        return np.sqrt(np.dot(q, q))
+        return float(np.sqrt(np.dot(q, q)))
     total = va + vb + vc
     if total <= 0.0:  # without area: nearest to a corner
-        return min(np.sqrt(np.dot(ap, ap)), np.sqrt(np.dot(bp, bp)), np.sqrt(np.dot(cp, cp)))
+        return float(min(np.sqrt(np.dot(ap, ap)), np.sqrt(np.dot(bp, bp)), np.sqrt(np.dot(cp, cp))))
     q = ap - ab * (vb / total) - ac * (vc / total)
-    return np.sqrt(np.dot(q, q))
+    return float(np.sqrt(np.dot(q, q)))

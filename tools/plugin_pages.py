@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import inspect
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -100,7 +100,7 @@ def _detected(slot: str, name: str, results: Results) -> str:
 
 
 def _without(slot: str, results: Results) -> str:
-    """What leaving the stage out costs."""
+    """Cost of leaving the stage out."""
     change = f"without={WITHOUT.get(slot, slot)}"
     base = {row["sequence"]: row for row in results["runs"] if row["change"] == "default"}
     runs = [row for row in results["runs"] if row["change"] == change]
@@ -113,7 +113,7 @@ def _number(value: float | None, places: int) -> str:
     return "-" if value is None else f"{value:.{places}f}"
 
 
-def markdown(header: list[str], rows: list[tuple[str, ...]]) -> str:
+def markdown(header: list[str], rows: Sequence[tuple[Any, ...]]) -> str:
     """A table; bars in cells are escaped."""
     lines = [header, ["---"] * len(header), *([str(cell).replace("|", r"\|") for cell in row] for row in rows)]
     return "\n".join("| " + " | ".join(line) + " |" for line in lines)

@@ -53,7 +53,7 @@ def _values(recording: Recording, topic: str) -> Iterator[Value]:
 
 
 def frames_of(recording: Recording) -> Callable[[FrameReference], Frame | None]:
-    """How to get at a frame's images: those embedded, else those of the data set that was tracked. DataError when that is gone."""
+    """Access to a frame's images: those embedded, else those of the data set that was tracked. DataError when that is gone."""
     if "dataset" in recording.topics:
 
         def embedded(reference: FrameReference) -> Frame | None:

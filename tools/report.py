@@ -159,7 +159,7 @@ def _stages(runs: dict[str, Run], colors: dict[str, str]) -> list[dict[str, Any]
 
 
 def _configurations(runs: dict[str, Run]) -> str:
-    """The values of the composed configurations that are not the same in all runs. Of a stage with different plugins only these are said: their
+    """The values of the composed configurations that are not the same in all runs. Of a stage with different plugins only these are named: their
     options have nothing to do with each other."""
     flat = {name: dotted(_config(run)) for name, run in runs.items()}
     keys = sorted({key for values in flat.values() for key in values})

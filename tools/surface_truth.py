@@ -93,7 +93,7 @@ def _of_depth(dataset: Any, trajectory: Trajectory, chosen: Any) -> Truth:
 
 
 def _pose(trajectory: Trajectory, stamp_ns: int) -> F64:
-    return trajectory.poses[int(np.argmin(np.abs(trajectory.stamps_ns - stamp_ns)))]
+    return np.asarray(trajectory.poses[int(np.argmin(np.abs(trajectory.stamps_ns - stamp_ns)))])
 
 
 def _world(depth: F64, camera: Camera, T: F64) -> tuple[F64, Any]:

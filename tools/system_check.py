@@ -52,19 +52,19 @@ def main() -> int:
 
 
 def import_error(module: str) -> str:
-    """What the interpreter says when `module` is imported in a new process; empty when it loads."""
+    """Error of the interpreter when `module` is imported in a new process; empty when it loads."""
     done = subprocess.run([sys.executable, "-c", f"import {module}"], capture_output=True, text=True)
     return "" if done.returncode == 0 else done.stderr.strip() or f"the interpreter ended with code {done.returncode}"
 
 
 def check(module: str, run: Callable[[str], str] = import_error) -> str:
-    """What is wrong with a module and what to do about it, in one line; empty when it loads."""
-    said = run(module)
-    if not said:
+    """Check a module: what is wrong with it and what to do about it, in one line; empty when it loads."""
+    error = run(module)
+    if not error:
         return ""
-    found = re.search(r"(\S+?\.so[.\d]*): cannot open shared object file", said)
+    found = re.search(r"(\S+?\.so[.\d]*): cannot open shared object file", error)
     if not found:
-        return f"{module} does not load: {said.splitlines()[-1]}; install it again with: pip install --force-reinstall {module}"
+        return f"{module} does not load: {error.splitlines()[-1]}; install it again with: pip install --force-reinstall {module}"
     others = [library for library in OPEN3D_NEEDS if module == "open3d" and library != found[1] and not loads(library)]
     libraries = [found[1], *others]
     packages = sorted({PACKAGES[library] for library in libraries if library in PACKAGES})
@@ -74,7 +74,7 @@ def check(module: str, run: Callable[[str], str] = import_error) -> str:
 
 
 def loads(library: str) -> bool:
-    """Whether the system's loader finds a shared library."""
+    """Return True if the system's loader finds a shared library."""
     try:
         ctypes.CDLL(library)
     except OSError:

@@ -18,7 +18,8 @@ from trihedron.tools.export import RECORDING
 def main(argv: list[str]) -> int:
     """Run the command; returns the exit code. Raises UsageError where rerun is not installed or its window does not open, RecordingError for a file
     that cannot be read."""
-    from trihedron.tools.export_rerun import require_rerun, show
+    from trihedron.pipeline.record.rerun_view import require_rerun
+    from trihedron.tools.export_rerun import show
 
     parser = Parser("view", __name__)
     parser.add_argument("run", metavar="RUN", type=Path, help="a run folder or its recording")

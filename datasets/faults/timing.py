@@ -32,7 +32,7 @@ class Delivery:
         kept = numbers[~lost | (numbers == 0)][:: self.every]
         turned = inside(self.reverse, kept)
         kept[turned] = kept[turned][::-1]
-        return kept
+        return np.asarray(kept)
 
     def shown(self, number: int) -> int:
         """The frame whose images arrive as those of frame `number`: another one while the camera is frozen."""

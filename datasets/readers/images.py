@@ -97,8 +97,10 @@ def _decode_png(data: bytes, channels: int) -> NDArray[Any]:
 def _decode_opencv(data: bytes, channels: int) -> NDArray[Any] | None:
     is_rgb = data.startswith(JPEG) and channels == 3
     image = cv2.imdecode(np.frombuffer(data, dtype=np.uint8), RGB if is_rgb else cv2.IMREAD_UNCHANGED)
-    if image is None or image.ndim == 2 or is_rgb:
-        return image
+    if image is None:
+        return None
+    if image.ndim == 2 or is_rgb:
+        return np.asarray(image)
     return np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2RGB if image.shape[2] == 3 else cv2.COLOR_BGRA2RGBA))
 
 

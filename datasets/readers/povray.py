@@ -102,6 +102,6 @@ def depth_reader(camera: Camera) -> DepthReader:
         if distances.size != stretch.size:
             raise UnreadableImage(f"holds {distances.size} distances instead of {stretch.size}")
         known = (distances > 0.0) & (distances < NOTHING_HIT)
-        return (np.where(known, distances, 0.0).reshape(stretch.shape) / (PER_METRE * stretch)).astype(np.float32)
+        return np.asarray((np.where(known, distances, 0.0).reshape(stretch.shape) / (PER_METRE * stretch)).astype(np.float32))
 
     return read

@@ -75,7 +75,7 @@ class TransformTree:
 
     @cached_property
     def _sorted(self) -> dict[str, tuple[NDArray[np.int64], F64]]:
-        """Of each moving frame: (n,) stamps, increasing, and (n, 4, 4) poses."""
+        """Stamps (n,), increasing, and poses (n, 4, 4) of each moving frame."""
         found = {}
         for frame, links in self._moving.items():
             stamps, first = np.unique(np.array([link.stamp_ns for link in links], np.int64), return_index=True)

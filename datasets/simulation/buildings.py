@@ -19,7 +19,7 @@ WALL_M = 0.1
 
 @dataclass(frozen=True)
 class Building:
-    """What stands where, and the walk through it."""
+    """Solids of a building, and the walk through it."""
 
     room: Room
     walk: Walk

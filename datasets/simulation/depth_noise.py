@@ -1,4 +1,4 @@
-"""What a Kinect-like sensor makes of exact images: axial noise, ragged edges, projector shadows, quantised disparity, holes, image noise."""
+"""Noise of a Kinect-like sensor, added to exact images: axial noise, ragged edges, projector shadows, quantised disparity, holes, image noise."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What the surfaces of the synthetic room are made of: a painter for each material, drawing one texture from a seed."""
+"""Surfaces of the synthetic room: a painter for each material, drawing one texture from a seed."""
 
 from __future__ import annotations
 
@@ -103,7 +103,7 @@ def _wood(h: int, w: int, per_metre: float, rng: np.random.Generator) -> F32:
     for _ in range(int(6 * h * w / per_metre**2) + 1):
         x, y = int(rng.uniform(0, w)), int(rng.uniform(0, h))
         cv2.ellipse(image, (x, y), (max(2, int(0.014 * per_metre)), max(2, int(0.009 * per_metre))), 0, 0, 360, (80.0, 50.0, 30.0), -1, cv2.LINE_AA)
-    return image
+    return np.asarray(image)
 
 
 def _floor(h: int, w: int, per_metre: float, rng: np.random.Generator) -> F32:
@@ -221,7 +221,7 @@ def _marble(h: int, w: int, per_metre: float, rng: np.random.Generator) -> F32:
     veins = np.exp(-((field / 0.06) ** 2))
     image = _ground(h, w, PLAIN["marble"]) - 95.0 * veins[:, :, None] + 8.0 * field[:, :, None]
     _scatter(image, int(40 * h * w / per_metre**2), (0.006 * per_metre, 0.015 * per_metre), rng, contrast=150.0)
-    return image
+    return np.asarray(image)
 
 
 def _globe(h: int, w: int, per_metre: float, rng: np.random.Generator) -> F32:

@@ -16,7 +16,7 @@ from trihedron.pipeline.core.types import F64
 
 
 class Motion(Enum):
-    """How the camera moves: a walk looking around, the same with a hasty hand, not at all, or turning on the spot."""
+    """Motion of the camera: a walk looking around, the same with a hasty hand, not at all, or turning on the spot."""
 
     walk = "walk"
     fast = "fast"

@@ -137,7 +137,7 @@ def walls_of(footprint: tuple[tuple[float, float], ...]) -> list[Wall]:
 
 
 def furnished_room(slanted: bool = False) -> Room:
-    """The room with all its furniture. `slanted` turns two walls, and what hangs on them, out of the Manhattan frame."""
+    """The room with all its furniture. `slanted` turns two walls, and what is mounted on them, out of the Manhattan frame."""
     footprint = SLANTED if slanted else RECTANGLE
     planes, faces = shell(footprint)
     return Room(planes, faces, (*_furniture(), *_on_the_walls(walls_of(footprint))))

@@ -1,6 +1,6 @@
 """Colour for the ray tracer: mip-mapped textures, a lamp, and smooth borders.
 
-Colour is sampled once a pixel, and SUBPIXELS² times where a neighbour shows another face, so that edges look as a lens shows them.
+Colour is sampled once a pixel, and SUBPIXELS² times where a neighbour shows another face, so that edges look as a camera shows them.
 """
 
 from __future__ import annotations

@@ -27,8 +27,8 @@ from trihedron.pipeline.core.types import EXACT_DEPTH, F64, I32, Bool, Camera, D
 
 
 class Scene(Enum):
-    """Where the camera is: one furnished room, a corridor that ends where it began, two identical offices on a corridor, ten rooms in a circuit,
-    an L-shaped flat, two rooms with slanted walls."""
+    """Scene that the camera is in: one furnished room, a corridor that ends where it began, two identical offices on a corridor, ten rooms in a
+    circuit, an L-shaped flat, two rooms with slanted walls."""
 
     room = "room"
     corridor = "corridor"
@@ -116,7 +116,7 @@ class Synthetic:
         planes, number = np.unique(np.round(world, 6), axis=0, return_inverse=True)
         number = np.where([face.curved == BOX for face in known], number.reshape(-1), -1).astype(np.int32)
         local = planes @ T_world_camera  # n·(R p + t) + d
-        return depth, number[faces], np.where(local[:, 3:] < 0.0, -local, local)
+        return depth, number[faces].astype(np.int32), np.asarray(np.where(local[:, 3:] < 0.0, -local, local), np.float64)
 
     def true_pose(self, index: int) -> F64:
         """(4, 4) exact `T_world_camera` of frame `index` of the selection, in the frame of `truth`."""

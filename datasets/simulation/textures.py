@@ -85,4 +85,4 @@ def paint(material: str, size_m: tuple[float, float], per_metre: float, rng: np.
     image = PAINTERS.get(material, speckled)(h, w, per_metre, rng) + np.zeros(3, dtype=np.float32)
     image = image + 3.0 * clouds(h, w, (0.01 * per_metre,), rng)[:, :, None]
     image = cv2.GaussianBlur(image, (0, 0), BLUR_TEXELS)
-    return np.clip(np.rint(image), 0, 255).astype(np.uint8)
+    return np.asarray(np.clip(np.rint(image), 0, 255).astype(np.uint8))

@@ -28,7 +28,8 @@ class Doorway:
 
 @dataclass(frozen=True)
 class TruePlan:
-    """Rooms as rings of corners, each ring (n, 2) anticlockwise, followed by the rings of holes; doorways; windows between rooms; height of the ceiling above the floor."""
+    """Rooms as rings of corners, each ring (n, 2) anticlockwise, followed by the rings of holes; doorways; windows between rooms; height of
+    the ceiling above the floor."""
 
     rooms: list[list[F64]]
     doorways: list[Doorway]

@@ -42,7 +42,7 @@ def surface_of(room: Room) -> TrueSurface:
 def _rectangle(face: Face) -> F64:
     """(4, 3) corners of a flat face, anticlockwise about its normal."""
     width, height = face.u * face.size_m[0], face.v * face.size_m[1]
-    return face.origin + np.array([0.0 * width, height, width + height, width])
+    return np.asarray(face.origin + np.array([0.0 * width, height, width + height, width]))
 
 
 def _fan(polygon: F64) -> tuple[F64, I32]:

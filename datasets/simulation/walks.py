@@ -32,7 +32,7 @@ class Walk:
 
     @property
     def length_m(self) -> float:
-        """Of the way-points' polygon."""
+        """Length of the way-points' polygon."""
         corners = np.array(self.points_m)
         return float(np.linalg.norm(np.roll(corners, -1, axis=0) - corners, axis=1).sum())
 

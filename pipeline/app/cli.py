@@ -229,7 +229,7 @@ def _sweep(words: list[str], recorded: RecordedConfig | None) -> int:
 
 
 def _swept(words: list[str]) -> list[Outcome]:
-    """Where the outcomes of the sweeps that the words ask for will be; a single run does not wait for the engines of sweeps to be imported."""
+    """Path of the outcomes of the sweeps that the words ask for; a single run does not wait for the engines of sweeps to be imported."""
     if not _is_sweep(words):
         return []
     from trihedron.pipeline.sweep.engines import register_engines

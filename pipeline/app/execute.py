@@ -1,4 +1,4 @@
-"""From a composed configuration to a finished run folder: what `trihedron run` does."""
+"""Execution of `trihedron run`: from a composed configuration to a finished run folder."""
 
 from __future__ import annotations
 
@@ -108,7 +108,7 @@ def closed(writer: RecordingWriter) -> RecordingError | None:
 
 
 def remembered_of(config: DictConfig, graph: Graph) -> Callable[[int], DelayLines] | None:
-    """What a run begins with: nothing, or the map file it goes on from."""
+    """Initial memory of a run: nothing, or the map file it continues."""
     if config.save_map and config.replay:
         raise ConfigError("save_map", "a replay makes no map to go on from", "save the map of the run itself")
     if config.save_map and not (folder := Path(config.save_map).expanduser().absolute().parent).is_dir():
@@ -132,7 +132,7 @@ def _pace(config: DictConfig) -> Pace:
 
 
 def source_of(config: DictConfig) -> str:
-    """What is tracked, whichever part of it: the data set's options with absolute paths."""
+    """Data set that is tracked, whichever part of it: its options with absolute paths."""
     options: Any = OmegaConf.to_container(config.dataset, resolve=True, enum_to_str=True) if config.dataset is not None else {}
     options = {name: _absolute(value) if f"dataset.{name}" in READ_PATHS else str(value) for name, value in options.items() if name != "frames"}
     return json.dumps(options, sort_keys=True)
@@ -211,14 +211,14 @@ def _commit() -> str:
 def _progress(steps: Iterator[Step]) -> Iterator[Step]:
     """A bar with the frame rate on a terminal, a plain line every few seconds elsewhere."""
     bar: Any = None
-    began = said = time.perf_counter()
+    began = printed = time.perf_counter()
     for step in steps:
         if sys.stderr.isatty():
             bar = bar or tqdm(total=step.count, unit="frame", dynamic_ncols=True)
             bar.update()
-        elif time.perf_counter() - said > PLAIN_PROGRESS_SECONDS:
-            said = time.perf_counter()
-            print(f"frame {step.position + 1}/{step.count}, {(step.position + 1) / (said - began):.1f} frames/s", flush=True)
+        elif time.perf_counter() - printed > PLAIN_PROGRESS_SECONDS:
+            printed = time.perf_counter()
+            print(f"frame {step.position + 1}/{step.count}, {(step.position + 1) / (printed - began):.1f} frames/s", flush=True)
         yield step
     if bar is not None:
         bar.close()
@@ -262,8 +262,8 @@ def _report(out: Path, metrics: dict[str, Any], timing: dict[str, Any], surfaces
         print(f"{name}, most of them: {reason}")
     if live := timing.get("live"):
         late = live["latency_ms"]
-        said = f"{live['came']} frames came, {live['taken']} were taken, {live['dropped']} dropped"
-        print(f"live: {said}; a pose is ready {late['p50']:.0f} ms after its frame came (median; at most {late['max']:.0f} ms)")
+        counts = f"{live['came']} frames came, {live['taken']} were taken, {live['dropped']} dropped"
+        print(f"live: {counts}; a pose is ready {late['p50']:.0f} ms after its frame came (median; at most {late['max']:.0f} ms)")
     if "final" in metrics:
         print(f"ATE {metrics['final']['ate_rmse_m']:.4f} m (as tracked {metrics['causal']['ate_rmse_m']:.4f} m)")
     for line in surfaces:

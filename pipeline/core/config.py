@@ -32,7 +32,7 @@ SWEEPER, SEARCH, DASK = (f"hydra_plugins.trihedron.{name}" for name in ("Sweeper
 
 
 class Feedback(Enum):
-    """What a recomputed stage's delayed wires see in a replay: the new values, or those of the recording."""
+    """Values that a recomputed stage's delayed wires read in a replay: the new ones, or those of the recording."""
 
     new = "new"
     recorded = "recorded"
@@ -154,7 +154,7 @@ def register_configs(recorded: RecordedConfig | None = None) -> None:
     slots = [(slot, Any, dataclasses.field(default=None)) for slot in SLOTS]
     plain = RunOptions().defaults
     defaults = [{key: choices.get(key, value) for key, value in entry.items()} if isinstance(entry, dict) else entry for entry in plain]
-    store.store(group="hydra/sweeper", name="trihedron", node={"_target_": SWEEPER, "max_batch_size": None, "params": None})
+    store.store(group="hydra/sweeper", name="trihedron", node={"_target_": SWEEPER, "params": None})
     store.store(group="hydra/sweeper", name="optuna", node=SearchOptions)
     store.store(group="hydra/launcher", name="dask", node={"_target_": DASK, "address": ""})
     root = dataclasses.make_dataclass("Root", slots, bases=(RunOptions,))
@@ -239,7 +239,7 @@ def composed(overrides: Iterable[str], recorded: RecordedConfig | None = None) -
 
 
 def rewritten(error: Exception) -> TrihedronError:
-    """What Hydra and OmegaConf raise while they compose, as one line with place, cause and cure."""
+    """Rewrite an error that Hydra or OmegaConf raises while composing as one line with place, cause and cure."""
     text = " ".join(str(error).split())
     cause: BaseException = error.__cause__ or error
     if match := re.search(r"Ambiguous value for argument '([^=']*)=([^']*)'", text):

@@ -81,7 +81,7 @@ class KernelCache:
         return self._key
 
     def get_disambiguator(self) -> str:
-        """Line of the function, which tells functions of one name apart."""
+        """Line of the function, which distinguishes functions of one name."""
         return str(self._line)
 
 

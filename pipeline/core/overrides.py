@@ -42,7 +42,7 @@ def path_of(word: str) -> tuple[str, str] | None:
 
 
 def with_literal_paths(words: Iterable[str], sweep: bool = False) -> list[str]:
-    """Quote the values of paths, of `sequences` and of `alternatives`, for Hydra. In a sweep `A,B` are several paths, unless one is called so."""
+    """Quote the values of paths, `sequences` and `alternatives` for Hydra. In a sweep `A,B` are several paths, unless one of that name exists."""
     return [_literal_word(word, sweep) for word in words]
 
 

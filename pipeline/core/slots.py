@@ -246,7 +246,7 @@ class SurfaceSlot(Protocol, Generic[State]):
 
 
 class BuildingSlot(Protocol, Generic[State]):
-    """The storeys, walls, rooms and openings of a building; a plan that says what is missing rather than None. A fold, as `surface` is."""
+    """The storeys, walls, rooms and openings of a building; a plan that names what is missing rather than None. A fold, as `surface` is."""
 
     def start(self) -> State: ...
 

@@ -2,7 +2,7 @@
 
 Conventions. Camera frame: x right, y down, z forward, metres. Pixel centres at integers. Depth in metres, 0 = none.
 `T_a_b` maps points of frame b into frame a: `p_a = T_a_b @ p_b`; `R_a_b`, `t_a_b` likewise. A plane is `n·x + d = 0` with `|n| = 1`;
-in the camera frame `d >= 0`, so n points towards the camera. Angles are radians unless the name says `_deg`.
+in the camera frame `d >= 0`, so n points towards the camera. Angles are radians unless the name ends in `_deg`.
 A pose covariance is that of `xi = (rho, phi)` in `T_world_camera = T_estimate · Exp(xi)` (camera frame, translation first),
 in the map about it: relative to the keyframe that the pose names; how far that has drifted from the first frame is not in it.
 
@@ -305,6 +305,11 @@ class DepthNoise:
     c_per_m: float = 0.00273
     floor_m: float = 0.001
 
+    @property
+    def coefficients(self) -> tuple[float, float, float, float]:
+        """Return (a, b, c, floor) as plain numbers, for kernels."""
+        return float(self.a_m), float(self.b), float(self.c_per_m), float(self.floor_m)
+
     def sigma_m(self, depth_m: Any) -> Any:
         """Standard deviation in metres for depth(s) in metres; same shape."""
         return np.maximum(self.floor_m, self.a_m + self.b * depth_m + self.c_per_m * depth_m * depth_m)
@@ -537,10 +542,10 @@ class Building(Value):
     seen from on the left; the other face is parallel, `thickness_m` behind it (NaN = not seen); `wall_covariance` is that of (offset of the face,
     thickness, direction in rad). Rows of `unseen` are (wall, begin, end): the stretches, in metres from the wall's start, that no reading shows.
     Of room i: row k of `loops` is (room, begin, end), `corners_m[begin:end]` go round it anticlockwise, round a hole the other way; corner j and its
-    successor are the ends of an edge on wall `corner_walls[j]`, -1 where nothing bounds what was seen; `closed` says that every edge is on a wall.
+    successor are the ends of an edge on wall `corner_walls[j]`, -1 where nothing bounds what was seen; `closed` is True if every edge is on a wall.
     Of opening i: its wall, its (left, right) in metres from the wall's start, its (bottom, top) above the floor, the covariance of these four, a row
     of OPENING_KINDS, and the rooms it joins (-1 = none). `furniture` are ids of the planes of the map that are none of the building's own. Rows of
-    `support` are (row of ELEMENTS, the element, row of SUPPORTS, id or number). `note` says what is missing."""
+    `support` are (row of ELEMENTS, the element, row of SUPPORTS, id or number). `note` names what is missing."""
 
     T_world_building: Annotated[F64, Shape(4, 4), Rotations()]
     note: str
@@ -569,7 +574,7 @@ class Building(Value):
 
     @staticmethod
     def empty(index: int, stamp_ns: int, note: str, T_world_building: F64 | None = None) -> Building:
-        """Make a plan without any element that says why."""
+        """Make a plan without any element, with the reason."""
         T = np.eye(4) if T_world_building is None else T_world_building
         number, none, rows = np.empty(0, np.int32), np.empty(0), np.empty((0, 2))
         return Building(

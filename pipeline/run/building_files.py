@@ -38,9 +38,9 @@ def summary(building: Building) -> str:
         (len(building.walls_m), "wall"),
         (len(building.spans_m), "opening"),
     ]
-    said = ", ".join(f"{count} {name}{'s' if count != 1 else ''}" for count, name in counts)
+    counted = ", ".join(f"{count} {name}{'s' if count != 1 else ''}" for count, name in counts)
     area = f" of {building.areas_m2.sum():.1f} ± {np.sqrt(building.area_variance.sum()):.1f} m²" if len(building.areas_m2) else ""
-    return f"building: {said}{area}" + (f"; {building.note}" if building.note else "")
+    return f"building: {counted}{area}" + (f"; {building.note}" if building.note else "")
 
 
 # JSON.
@@ -279,8 +279,8 @@ def _legend(building: Building, height: float) -> list[str]:
     x = 3.6 * PX
     out.append(f'<path d="M{x:.0f} {y + 8:.0f} v-30 m-6 10 l6 -12 l6 12" fill="none" stroke="#222"/>')
     out.append(f'<text class="length" x="{x:.0f}" y="{y + 22:.0f}">N: first view</text>')
-    said = [f"storey {k}: floor {_height(low)}, ceiling {_height(high)}" for k, (low, high) in enumerate(building.storeys)]
-    lines = [*said, *([building.note] if building.note else []), "dashed: not seen"]
+    heights = [f"storey {k}: floor {_height(low)}, ceiling {_height(high)}" for k, (low, high) in enumerate(building.storeys)]
+    lines = [*heights, *([building.note] if building.note else []), "dashed: not seen"]
     out += [f'<text class="note" x="{4.3 * PX:.0f}" y="{y - 14 + 15 * k:.0f}">{escape(line)}</text>' for k, line in enumerate(lines)]
     return out
 
@@ -299,7 +299,7 @@ def write_dxf(path: Path, building: Building) -> None:
     import ezdxf
     from ezdxf import units
 
-    document = ezdxf.new("R2010", setup=["linetypes"])
+    document = ezdxf.filemanagement.new("R2010", setup=["linetypes"])
     document.units = units.M
     for name, color in LAYERS.items():
         document.layers.add(name, color=color, linetype="DASHED" if name == "UNSEEN" else "CONTINUOUS")

@@ -15,7 +15,7 @@ from trihedron.pipeline.core.errors import DataError
 from trihedron.pipeline.core.types import DEGRADED, LOST, OK, Map, Pose, Surface, Trajectory
 from trihedron.pipeline.record.trajectories import write_trajectory
 from trihedron.pipeline.run.accounting import Result
-from trihedron.pipeline.run.consistency import pose_consistency
+from trihedron.pipeline.run.consistency import pose_consistency, truth_noise
 from trihedron.pipeline.run.metrics import associate, evaluate_trajectory
 from trihedron.pipeline.run.plot import trajectory_figure
 from trihedron.pipeline.run.ply import triangle_planes, write_ply
@@ -104,8 +104,12 @@ def _consistency(result: Result, truth: Trajectory) -> dict[str, Any]:
     poses = [pose for pose in result.poses if pose.status != LOST][1:]
     pairs = associate(np.array([pose.stamp_ns for pose in poses], np.int64), truth.stamps_ns)
     known = [poses[row] for row, _ in pairs]
-    covariances = np.array([pose.covariance for pose in known])
-    return pose_consistency(np.array([pose.T_world_camera for pose in known]), covariances, truth.poses[pairs[:, 1]]).to_dict()
+    if len(known) < 2:
+        return {}
+    estimated, true = np.array([pose.T_world_camera for pose in known]), truth.poses[pairs[:, 1]]
+    local = np.array([pose.noise_scale * pose.local_covariance for pose in known])
+    noise = truth_noise(estimated, local, true, np.array([pose.index for pose in known], np.int32))
+    return pose_consistency(estimated, np.array([pose.covariance for pose in known]), true, noise).to_dict()
 
 
 def write_json(path: Path, content: dict[str, Any]) -> None:

@@ -39,7 +39,7 @@ def _declared(kind: type) -> tuple[tuple[str, Any], ...]:
 
 
 def checked(topic: str, value: Value | None, place: str) -> Value | None:
-    """The value, once what it says by itself is checked. Raises RecordingError naming the file, topic, frame and field."""
+    """The value, after the checks that need no other value. Raises RecordingError naming the file, topic, frame and field."""
     if value is not None:
         if topic in SLOTS and not isinstance(value, output_of(topic)):
             raise RecordingError(f"{place}: topic /{topic}, frame {value.index}", f"is {type(value).__name__}, not {output_of(topic).__name__}", CURE)
@@ -72,7 +72,7 @@ def _of_its_time(parameter: str, value: Value, inputs: Mapping[str, Any]) -> Map
 
 
 def _faults(value: Any, prefix: str) -> Any:
-    """(field, cause) of all that a value says wrong by itself."""
+    """(field, cause) of every error that a value shows without others."""
     for name, constraint in constraints_of(type(value)):
         if cause := _CHECKS[type(constraint)](getattr(value, name), constraint, value):
             yield prefix + name, cause

@@ -74,7 +74,7 @@ def _connected(address: str) -> Any:
 
 
 def run_apart(job: bytes, folder: str, working_folder: str) -> None:
-    """Run a packed job in a process of its own, on the worker; one that crashes says so in its folder."""
+    """Run a packed job in a process of its own, on the worker; one that crashes leaves the reason in its folder."""
     done = subprocess.run([sys.executable, "-m", __name__], input=job, cwd=working_folder, capture_output=True)
     if done.returncode and read_job(Path(folder)).get("state") not in (DONE, FAILED):
         last = next(iter(reversed(done.stderr.decode(errors="replace").strip().splitlines())), "")

@@ -1,4 +1,4 @@
-"""What Hydra runs sweeps with, of ours: its plugins by the names under which the configuration has them."""
+"""Plugins by which Hydra runs sweeps, by the names under which the configuration has them."""
 
 from __future__ import annotations
 

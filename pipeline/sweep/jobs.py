@@ -1,4 +1,4 @@
-"""What a job of a sweep leaves in its folder besides the run's files: the key of what it computed, and whether it came to its end."""
+"""Files that a job of a sweep leaves in its folder besides the run's: the key of what it computed, and whether it came to its end."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ def _files(path: Path) -> list[tuple[str, int, int]]:
     if len(path.parts) < 2 or not path.exists():
         return []
     files = [path] if path.is_file() else sorted(file for file in path.rglob("*") if file.is_file())
-    return [(file.relative_to(path).as_posix(), (said := file.stat()).st_size, said.st_mtime_ns) for file in files]
+    return [(file.relative_to(path).as_posix(), (state := file.stat()).st_size, state.st_mtime_ns) for file in files]
 
 
 def write_job(folder: Path, key: str, state: str, error: str = "") -> None:
@@ -66,7 +66,7 @@ def write_job(folder: Path, key: str, state: str, error: str = "") -> None:
 
 
 def read_job(folder: Path) -> Job:
-    """What was said last; empty where no job ever was."""
+    """Read the last state of a job; empty where there never was one."""
     try:
         job: Job = json.loads((folder / JOB).read_text())
     except (FileNotFoundError, json.JSONDecodeError):  # absent, or being written

@@ -47,7 +47,7 @@ class Search(Sweeper):
 
     def __init__(self, trials: int, batch: int, objective: str, direction: str, seed: int, params: Any = None) -> None:
         """Raises UsageError for a number or direction that makes no sense."""
-        super().__init__(None, params)
+        super().__init__(params)
         if trials < 1 or batch < 1:
             raise UsageError("hydra.sweeper", f"{trials} trials in batches of {batch} are none", "give 1 or more of each")
         if direction not in ("minimize", "maximize"):
@@ -77,9 +77,9 @@ class Search(Sweeper):
         self._conclude(tried, words)
 
     def _split(self, arguments: list[str]) -> tuple[dict[str, Override], Overrides]:
-        """What is searched, by key, and all other words; a later word takes the place of an earlier one of its key."""
+        """Split words into search spaces, by key, and all others; a later word replaces an earlier one of its key."""
         parser = OverridesParser.create(config_loader=self.loader)
-        words, self.params = [*self._parse_config(), *arguments], {}
+        words, self.params = [*self.given, *arguments], {}
         parsed = {override.get_key_element(): (override, word) for word, override in zip(words, parser.parse_overrides(words))}
         searched = {key: override for key, (override, _) in parsed.items() if _is_searched(override)}
         if not searched:
@@ -163,7 +163,7 @@ def _optuna() -> Any:
 
 
 def _is_searched(override: Override) -> bool:
-    """Whether it is a space, and not plain values A,B."""
+    """Return True for a search space, False for plain values A,B."""
     value = override.value()
     return override.is_sweep_override() and not (isinstance(value, ChoiceSweep) and value.simple_form)
 

@@ -11,15 +11,20 @@ import re
 import sys
 import threading
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import yaml
 from hydra.core.config_loader import ConfigLoader
 from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.core.override_parser.types import Override
 from hydra.core.plugins import Plugins
+from hydra.plugins.launcher import Launcher
+from hydra.plugins.sweeper import Sweeper as HydraSweeper
+from hydra.types import HydraContext, TaskFunction
 from joblib.externals.loky import get_reusable_executor
 from omegaconf import DictConfig
 
@@ -30,9 +35,6 @@ from trihedron.pipeline.core.registry import load_plugins, options_of, plugins_o
 from trihedron.pipeline.core.slots import SLOTS
 from trihedron.pipeline.sweep.cluster import all_awaited
 from trihedron.pipeline.sweep.jobs import DONE, FAILED, RUNNING, key_of, read_job, write_job
-
-Plugins.instance()  # loads every plugin of Hydra anew, so that classes imported before are no longer theirs
-from hydra._internal.core_plugins.basic_sweeper import BasicSweeper  # noqa: E402
 
 LOOK_SECONDS = 1.0  # between two looks at the jobs' folders
 Overrides = list[str]
@@ -51,14 +53,24 @@ class Outcome:
         """Raise TrihedronError when a job failed."""
         if self.failures:
             cause = f"{len(self.failures)} of {self.jobs} jobs failed"
-            raise TrihedronError(str(self.folder), cause, "trihedron compare says why; the same command again runs those that are missing")
+            raise TrihedronError(str(self.folder), cause, "trihedron compare names the cause; the same command again runs those that are missing")
 
 
 OUTCOMES: list[Outcome] = []  # of the sweeps of this process; Hydra has no other way to hand one over
 
 
-class Sweeper(BasicSweeper):
+class Sweeper(HydraSweeper):
     """Hydra's sweeper over comma-separated values, with sequences, that goes on where it was stopped."""
+
+    def __init__(self, params: Mapping[str, Any] | None = None) -> None:
+        """`params` are overrides of every sweep, key -> value or values, from the configuration."""
+        self.params = dict(params or {})
+        self.launcher: Launcher | None = None
+
+    def setup(self, *, hydra_context: HydraContext, task_function: TaskFunction, config: DictConfig) -> None:
+        """Take what Hydra prepared, before `sweep`."""
+        self.hydra_context, self.config = hydra_context, config
+        self.launcher = Plugins.instance().instantiate_launcher(hydra_context=hydra_context, task_function=task_function, config=config)
 
     def sweep(self, arguments: list[str]) -> None:
         """Run what is missing. Raises TrihedronError when no job can be composed."""
@@ -75,7 +87,7 @@ class Sweeper(BasicSweeper):
 
     @property
     def loader(self) -> ConfigLoader:
-        """What composes configurations, from Hydra too."""
+        """Loader that composes configurations, from Hydra too."""
         assert self.hydra_context is not None
         return self.hydra_context.config_loader
 
@@ -127,7 +139,7 @@ class Sweeper(BasicSweeper):
             self._launch_apart(missing, error)
         except TrihedronError:
             raise
-        except Exception as error:  # of the engine; a job that fails says so in its folder
+        except Exception as error:  # of the engine; a job that fails leaves the reason in its folder
             raise _given_up(error) from error
         for words, folder in missing:
             _keep_overrides(folder, words[:-1])
@@ -153,17 +165,21 @@ class Sweeper(BasicSweeper):
     def jobs(self, arguments: list[str]) -> list[Overrides]:
         """The overrides of every job: the cross product of sequences, of all values given and of the alternatives."""
         parser = OverridesParser.create(config_loader=self.loader)
-        words = [word for word in [*self._parse_config(), *arguments] if not word.startswith(("sequences=", "alternatives="))]
+        words = [word for word in [*self.given, *arguments] if not word.startswith(("sequences=", "alternatives="))]
         words += [] if any(word.startswith("threads=") for word in words) else [f"threads={self._threads}"]
         sequences = [words_of_sequence(text) for text in self.options.sequences] or [[]]
         alternatives = words_of_alternatives(list(self.options.alternatives)) or [[]]
         given = [[*sequence, *words, *alternative] for sequence in sequences for alternative in alternatives]
-        products = [self.split_arguments(parser.parse_overrides(one), None)[0] for one in given]
-        return [list(job) for product in products for job in product]
+        return [job for one in given for job in _product(parser.parse_overrides(one))]
+
+    @property
+    def given(self) -> Overrides:
+        """The overrides `params`."""
+        return [f"{key}={value}" for key, value in self.params.items()]
 
     @property
     def _threads(self) -> int:
-        """Of a job: what the cluster is asked for, two where jobs come one by one, else one."""
+        """Threads of a job: the number that the cluster is asked for, two where jobs come one by one, else one."""
         launcher = self.options.hydra.launcher
         one_by_one = launcher.get("n_jobs") == 1 or self.options.hydra.runtime.choices["hydra/launcher"] == "basic"
         return int(launcher.get("cpus_per_task") or (2 if one_by_one else 1))
@@ -210,8 +226,20 @@ def _numbers(folder: Path, jobs: Sequence[Overrides]) -> list[int]:
     return [known[tuple(job)] if tuple(job) in known else next(free) for job in jobs]
 
 
+def _product(overrides: list[Override]) -> list[Overrides]:
+    """The cross product of all values given; a later override replaces an earlier one of its key. Raises UsageError for a space to search in."""
+    values: dict[str, Overrides] = {}
+    for override in overrides:
+        key = override.get_key_element()
+        if override.is_sweep_override() and not override.is_discrete_sweep():
+            raise UsageError(key, f"'{override.input_line}' is a space to search in", "give values A,B or hydra/sweeper=optuna")
+        texts = override.sweep_string_iterator() if override.is_sweep_override() else [override.get_value_element_as_str()]
+        values[key] = [f"{key}={text}" for text in texts]
+    return [list(job) for job in itertools.product(*values.values())]
+
+
 def _given_up(error: Exception) -> TrihedronError:
-    """What an engine of Hydra's failed with, as one line."""
+    """Error of an engine of Hydra's, as one line."""
     cause = next(iter(str(error).splitlines()), type(error).__name__)
     return TrihedronError("hydra.launcher", cause, "what is done is kept; the same command again runs the rest")
 
@@ -223,7 +251,7 @@ def failure_of(folder: Path) -> str:
 
 
 def _keep_overrides(folder: Path, job: Overrides) -> None:
-    """What tells a job from the others, where it came to no end before it could say so itself: it has no run then, but a reason."""
+    """Write the overrides that identify a job which ended before it could write them itself: it has no run then, but a reason."""
     file = folder / ".hydra" / "overrides.yaml"
     if not file.exists():
         file.parent.mkdir(parents=True, exist_ok=True)

@@ -413,5 +413,5 @@ def free_space(evidence: Evidence, storey: Storey, margin_m: float = 0.5) -> Fre
 
 
 def nothing(state: Gathered, note: str, T_world_building: F64 | None = None) -> Building:
-    """Return the plan without elements that says why."""
+    """Return the plan without elements, with the reason."""
     return Building.empty(state.index, state.stamp_ns, note, T_world_building)

@@ -10,12 +10,12 @@ from trihedron.pipeline.core.kernel import kernel
 from trihedron.pipeline.core.types import F32, F64
 
 U32 = NDArray[np.uint32]
-LEVELS = 32  # heights that a cell of the grid tells apart
+LEVELS = 32  # heights that a cell of the grid distinguishes
 
 
 @kernel
 def carve_kernel(
-    depth: F32, lens: F64, T: F64, origin: F64, side_m: float, floor_m: float, level_m: float, step: int, margin: F64, once: U32, twice: U32
+    depth: F32, camera: F64, T: F64, origin: F64, side_m: float, floor_m: float, level_m: float, step: int, margin: F64, once: U32, twice: U32
 ) -> None:
     """Mark in the cells (h, w) of a plan the levels that the rays of a depth image pass: `once` and, from the second ray on, `twice`.
 
@@ -26,7 +26,7 @@ def carve_kernel(
             z = float(depth[r, c])
             if not z > 0.0:
                 continue
-            x, y = (c - lens[2]) / lens[0], (r - lens[3]) / lens[1]
+            x, y = (c - camera[2]) / camera[0], (r - camera[3]) / camera[1]
             dx = T[0, 0] * x + T[0, 1] * y + T[0, 2]
             dy = T[1, 0] * x + T[1, 1] * y + T[1, 2]
             dz = T[2, 0] * x + T[2, 1] * y + T[2, 2]

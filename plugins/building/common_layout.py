@@ -1,6 +1,6 @@
-"""From faces and free space to rooms, walls and openings.
+"""Rooms, walls and openings from faces and free space.
 
-The lines of all faces divide the plan into cells; a solver says which cells are inside. Inside cells are one room where no tall face parts them
+The lines of all faces divide the plan into cells; a solver decides which cells are inside. Inside cells are one room where no tall face parts them
 (Mura, Mattausch, Jaspe Villanueva, Gobbetti, Pajarola, Computers & Graphics 2014, with free space in the place of scan positions). Every edge of a
 room is then fitted again to the points of its own stretch, so that drift between rooms stays between them."""
 
@@ -18,7 +18,6 @@ from trihedron.pipeline.core.types import ELEMENTS, F64, I32, OPENING_KINDS, SUP
 from trihedron.plugins.building.common import (
     CELL_M,
     LEVEL_M,
-    LEVELS,
     Evidence,
     Face,
     FreeSpace,
@@ -32,8 +31,11 @@ from trihedron.plugins.building.common import (
     nothing,
     storeys_of,
     tall_m,
-)  # fmt: skip
-from trihedron.plugins.building.common_kernels import U32
+)
+from trihedron.plugins.building.common_kernels import (
+    LEVELS,  # fmt: skip
+    U32,
+)
 from trihedron.plugins.shared.voxel_hash_kernels import I64
 
 MARGIN_M = 0.3  # about what was seen
@@ -498,7 +500,7 @@ def _room_at(rooms: list[RoomPlan], point: F64) -> int:
 
 @dataclass
 class StoreyPlan:
-    """What was found in one storey."""
+    """Elements found in one storey."""
 
     storey: Storey
     rooms: list[RoomPlan]
@@ -568,18 +570,18 @@ def assembled(state: Gathered, evidence: Evidence, plans: list[StoreyPlan], map:
 
 def _note(plans: list[StoreyPlan]) -> str:
     """Say what the plan lacks."""
-    said = []
+    missing = []
     if not any(np.isfinite(plan.storey.floor_m) for plan in plans):
-        said.append("no floor was seen")
+        missing.append("no floor was seen")
     if not any(np.isfinite(plan.storey.ceiling_m) for plan in plans):
-        said.append("no ceiling was seen")
+        missing.append("no ceiling was seen")
     if not any(plan.rooms for plan in plans):
         count = sum(len(plan.faces) for plan in plans)
-        said.append(f"{count} wall{'s' if count != 1 else ''} seen, which bound{'s' if count == 1 else ''} no room")
+        missing.append(f"{count} wall{'s' if count != 1 else ''} seen, which bound{'s' if count == 1 else ''} no room")
     open_rooms = sum(any(edge.wall < 0 for loop in room.loops for edge in loop) for plan in plans for room in plan.rooms)
     if open_rooms:
-        said.append(f"{open_rooms} room{'s' if open_rooms != 1 else ''} not seen all round")
-    return "; ".join(said)
+        missing.append(f"{open_rooms} room{'s' if open_rooms != 1 else ''} not seen all round")
+    return "; ".join(missing)
 
 
 def _supports(kind: str, number: int, planes: list[int], rows: I32, evidence: Evidence) -> list[tuple[int, int, int, int]]:

@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 
 from trihedron.pipeline.core.options import NonNegativeFloat, PositiveFloat, PositiveShare, Range
 from trihedron.pipeline.core.types import F32, F64, U8, Frame, Keypoints
-from trihedron.plugins.shared.depth_image import noise_coefficients
 from trihedron.plugins.shared.depth_image_kernels import local_depth
 
 LEVEL_SCALE = 1.2  # between levels, as the map expects (`octave_scale`)
@@ -31,7 +30,7 @@ class LiftedKeypoints:
 
     def _lifted(self, frame: Frame, pixels: F32, scales: F64, angles_deg: F32, descriptors: U8, metric: str) -> Keypoints:
         """Key points at pixels (n, 2) with scales (n,), 1 for the finest, directions (n,) and descriptors (n, b)."""
-        noise = noise_coefficients(frame.camera.depth_noise)
+        noise = frame.camera.depth_noise.coefficients
         depth, sigma = local_depth(frame.depth_m, pixels, self.depth_radius_px, self.depth_share, noise, self.depth_gate, self.depth_edge)
         scales = np.maximum(scales, 1.0)
         return Keypoints(

@@ -14,7 +14,6 @@ from trihedron.pipeline.core.options import NonNegativeFloat, PositiveFloat, Pos
 from trihedron.pipeline.core.registry import register
 from trihedron.pipeline.core.types import F32, U8, Frame, Keypoints
 from trihedron.plugins.keypoints.orb_kernels import BITS, REACH_PX, Pyramid, full_pixels, oriented_corners, steered_brief
-from trihedron.plugins.shared.depth_image import noise_coefficients
 from trihedron.plugins.shared.depth_image_kernels import local_depth
 
 MARGIN_PX = 19  # of a level, within which its descriptors would reach over the border
@@ -49,7 +48,7 @@ class Orb:
         cells, levels, angles = oriented_corners(pyramid, *thresholds, MARGIN_PX, self.cell_px, self.features, weights)
         descriptors = steered_brief(pyramid, cells, levels, angles, self._tests)
         pixels = full_pixels(cells, levels, pyramid.shapes).astype(np.float32)
-        noise = noise_coefficients(frame.camera.depth_noise)
+        noise = frame.camera.depth_noise.coefficients
         depth, sigma = local_depth(frame.depth_m, pixels, self.depth_radius_px, self.depth_share, noise, self.depth_gate, self.depth_edge)
         return Keypoints(
             index=frame.index,

@@ -107,7 +107,7 @@ def _directions(pyramid: Pyramid, pixels: I32, levels: I32) -> F32:
 
 @kernel
 def _place(pyramid: Pyramid, pixels: I32, levels: I32, i: int) -> tuple[int, int]:
-    """Where a corner is in the pyramid's pixels, and how many of these are a row: unsigned, so that no index is taken to count from the end."""
+    """Position of a corner in the pyramid's pixels, and their number per row: unsigned, so that no index is taken to count from the end."""
     cols = np.uint64(pyramid.shapes[levels[i], 1])
     return np.uint64(pyramid.starts[levels[i]]) + np.uint64(pixels[i, 1]) * cols + np.uint64(pixels[i, 0]), cols
 
@@ -318,9 +318,9 @@ def centroid_angle(pixels: U8, corner: int, cols: int, across: F32, inside: F32)
 
 @kernel
 def spread_over_cells(cells: I32, number: int, order: I32, wanted: int) -> Bool:
-    """Which of n features to keep, (n,): each of a `number` of cells of the image gives its best in turn until `wanted` are kept.
+    """Select features (n,) spread over the image: each of a `number` of cells gives its best in turn until `wanted` are selected.
 
-    `cells` (n,) says where each feature lies; `order` lists the rows from best to worst. The quota per cell is the largest that keeps the total
+    `cells` (n,) is the cell of each feature; `order` lists the rows from best to worst. The quota per cell is the largest that keeps the total
     within `wanted`, and the best of the rest fill up, so a rich corner cannot take everything and an even image keeps its best."""
     n = len(cells)
     if n <= wanted:

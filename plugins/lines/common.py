@@ -1,4 +1,4 @@
-"""What every detector of line segments ends in: fragments merged, placed on the edge to sub-pixel, directed, and described by LBD."""
+"""Final steps of every detector of line segments: fragments merged, placed on the edge to sub-pixel, directed, and described by LBD."""
 
 from __future__ import annotations
 

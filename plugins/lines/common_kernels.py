@@ -9,7 +9,7 @@ import numpy as np
 
 from trihedron.pipeline.core.kernel import kernel
 from trihedron.pipeline.core.types import F32, F64, U8
-from trihedron.plugins.shared.linalg_kernels import descending, median
+from trihedron.plugins.shared.linalg_kernels import descending
 
 # Image line segments: merging of collinear fragments and sub-pixel placement on the grey-level edge.
 
@@ -17,7 +17,7 @@ MOST = 2056  # samples of a segment; rows of a power of two would all lie in the
 
 
 class Placing(NamedTuple):
-    """How segments are joined and which are kept: the difference of direction (rad) of fragments of one edge, their distance across and along, the
+    """Rules for joining and selecting segments: the difference of direction (rad) of fragments of one edge, their distance across and along, the
     shortest segment, how near to the image's border all along a segment is the border, and how far across it its edge is searched, px."""
 
     angle: float
@@ -46,7 +46,7 @@ def placed_segments(image: U8, found: F64, scale: float, placing: Placing, most:
 
 @kernel
 def _worthy(lines: F64, least_px: float, border_px: float, width: int, height: int) -> F64:
-    """Those that are long enough, and not the border of the image (or of what the sensor's registration left of it)."""
+    """Select segments that are long enough, and not the border of the image (or of what the sensor's registration left of it)."""
     out, n = np.empty((len(lines), 4)), 0
     right, bottom = width - 1 - border_px, height - 1 - border_px
     for i in range(len(lines)):
@@ -111,7 +111,7 @@ def refine_on_edge(image: U8, lines: F64, reach_px: int, step_px: float) -> F32:
     line is fitted to these positions, weighted by slope, reweighted against outliers. A segment with fewer than 4 positions stays as it is."""
     out = np.empty((len(lines), 2, 2), np.float32)
     along, across, weight, levels = np.empty(MOST), np.empty(MOST), np.empty(MOST), np.empty((2 * reach_px + 3, MOST))
-    scratch, slopes = np.empty((4, MOST)), np.empty((2 * reach_px + 1, MOST))
+    scratch, gradients = np.empty((4, MOST)), np.empty((2 * reach_px + 1, MOST))
     for i in range(len(lines)):
         x0, y0, x1, y1 = lines[i, 0], lines[i, 1], lines[i, 2], lines[i, 3]
         length = max(np.hypot(x1 - x0, y1 - y0), 1e-6)
@@ -127,12 +127,12 @@ def refine_on_edge(image: U8, lines: F64, reach_px: int, step_px: float) -> F32:
         for k in range(count):
             contrast += levels[reach_px + 2, k] - levels[reach_px, k]
         sign = 1 if contrast >= 0.0 else -1
-        _steepest(levels, sign, slopes, scratch[0, :count], scratch[1, :count])
+        _steepest(levels, sign, gradients, scratch[0, :count], scratch[1, :count])
         m = 0
         for k in range(count):
             strength, row = scratch[0, k], int(scratch[1, k])
-            if 0 < row < len(slopes) - 1 and strength > 1.0:  # not at the end of the reach, and a rise
-                before, after = slopes[row - 1, k], slopes[row + 1, k]
+            if 0 < row < len(gradients) - 1 and strength > 1.0:  # not at the end of the reach, and a rise
+                before, after = gradients[row - 1, k], gradients[row + 1, k]
                 bend = before - 2.0 * strength + after
                 shift = 0.5 * (before - after) / bend if bend < -1e-9 else 0.0
                 along[m], across[m], weight[m] = length * (k + 0.5) / count, (row - reach_px + shift) * sign, strength
@@ -163,13 +163,13 @@ def _levels_beside(image: U8, scratch: F64, right: float, down: float, out: F64)
 
 
 @kernel
-def _steepest(levels: F64, sign: int, slopes: F64, top: F64, row: F64) -> None:
-    """From the grey levels across samples, two rows more than there are of `slopes`: the slopes, counted along `sign`, the steepest rise (n,) of each
-    sample and its row. All samples of a row at once."""
-    reach, n = len(slopes) // 2, len(top)
-    for j in range(len(slopes)):
+def _steepest(levels: F64, sign: int, gradients: F64, top: F64, row: F64) -> None:
+    """Compute, from the grey levels across samples (two rows more than `gradients` has): the gradients, counted along `sign`, the steepest rise (n,)
+    of each sample and its row. All samples of a row at once."""
+    reach, n = len(gradients) // 2, len(top)
+    for j in range(len(gradients)):
         here = reach + 1 + sign * (j - reach)
-        after, before, slope = levels[here + sign, :n], levels[here - sign, :n], slopes[j, :n]
+        after, before, slope = levels[here + sign, :n], levels[here - sign, :n], gradients[j, :n]
         for k in range(n):
             slope[k] = 0.5 * (after[k] - before[k])
         for k in range(n):
@@ -180,7 +180,7 @@ def _steepest(levels: F64, sign: int, slopes: F64, top: F64, row: F64) -> None:
 @kernel
 def _robust_line(t: F64, o: F64, strength: F64) -> tuple[float, float]:
     """Offset a and slope b of o ≈ a + b t, by least squares reweighted with w = strength / (1 + (r / ½ px)²), starting from the median offset."""
-    a, b = median(o.copy()), 0.0
+    a, b = np.median(o), 0.0
     for _ in range(5):
         s, st, so, stt, sto = 1e-12, 0.0, 0.0, 0.0, 0.0
         for k in range(len(t)):

@@ -16,7 +16,7 @@ BINS = 1024  # of gradient magnitude, by which pixels are taken in order
 
 
 class LevelLines(NamedTuple):
-    """Of an image (h, w): x and y (2 h · w,) of unit vectors along the level lines (dark on the right) of the pixels that are free to be taken, NaN
+    """Level lines of an image (h, w): x and y (2 h · w,) of unit vectors along them (dark on the right) of the pixels that are free to be taken, NaN
     of others, and gradient magnitudes (h · w,)."""
 
     image: U8
@@ -57,7 +57,7 @@ def line_support_segments(image: U8, tolerance: float, quantisation: float, dens
 
 @kernel
 def _level_lines(image: U8, threshold: float) -> LevelLines:
-    """Of the gradients over 2 × 2 pixels; the image's border is not free."""
+    """Level lines of the gradients over 2 × 2 pixels; the image's border is not free."""
     h, w = image.shape
     free, magnitude = np.full(2 * h * w, np.nan, np.float32), np.zeros(h * w, np.float32)
     limit, none = np.float32(threshold), np.float32(np.nan)

@@ -17,7 +17,7 @@ from trihedron.plugins.shared.networks import NetworkImage, NetworkOptions, netw
 
 
 class LineOutput(Enum):
-    """What a network of lines gives."""
+    """Output of a network of lines."""
 
     segments = "lines"  # (1, n, 4) x, y, x, y in pixels, and `scores` (1, n)
     distance_field = "df"  # (1, h, w) distance to the nearest line in pixels (DeepLSD)

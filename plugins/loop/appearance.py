@@ -88,7 +88,7 @@ def train(bits: U64, words: int, rounds: int) -> U64:
         np.add.at(votes, nearest, single)
         majority = np.packbits(2 * votes > members[:, None], axis=1).view(np.uint64)
         vocabulary = np.where(members[:, None] > 0, majority, vocabulary)
-    return vocabulary
+    return np.asarray(vocabulary)
 
 
 def similarities(bags: list[I32], words: int) -> F64:

@@ -182,8 +182,8 @@ ROUNDS, MIN_POINTS = 3, 6  # of a refinement; points
 
 
 def _initial_pose(map: Map, camera: Camera, place: Place, window: LocalWindow, keypoints: Keypoints, T: F64, expected: F64) -> F64:
-    """Of the pose without drift, the one where the planes lie on those of the place, and the one where similar points agree, that with most agreeing
-    points."""
+    """Select, from the pose without drift, the one where the planes lie on those of the place, and the one where similar points agree, that with most
+    agreeing points."""
     sigma_m, sigma_rad = np.sqrt(expected[0, 0]), np.sqrt(expected[3, 3])
     pairs = _match_points(map, camera, T, keypoints, place.window.points, sigma_m, sigma_rad)
     points, there = keypoints.points_m[pairs[:, 0]].astype(np.float64), map.points.rows("position_m", pairs[:, 1])

@@ -1,6 +1,6 @@
 """The Manhattan prior of a whole map, and the corrections that use it: pose graphs of loops, and alignment of the map with its axes.
 
-Every keyframe is tied to those just before it, so a map drifts; directions repeat all through a building. Every plane and line of the map counts
+Every keyframe is connected to those just before it, so a map drifts; directions repeat all through a building. Every plane and line of the map counts
 once, at the middle one of its observers, so that a wall off the axes errs once and not with each view.
 """
 

@@ -18,7 +18,7 @@ if TYPE_CHECKING:  # imported where it is needed: SciPy is slow to load, and mos
     from scipy.sparse import bsr_matrix
 
 LEAST_M, LEAST = 1e-3, 1e-4  # standard deviations between two keyframes at one place, m and rad
-LINKS = 3  # further keyframes each is tied to, so that a stretch that was observed often stays stiff
+LINKS = 3  # further keyframes each is connected to, so that a stretch that was observed often stays stiff
 ITERATIONS, CONVERGED = 20, 1e-9  # squared length of a step, metres and radians
 FIXED = 1e12 * np.eye(6)  # information of a fixed pose
 MAX_DAMPING = 1e8

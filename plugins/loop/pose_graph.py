@@ -50,7 +50,7 @@ LOOSE_M, LOOSE = 0.05, 0.02  # of keyframes that follow each other and share too
 
 def shared_edges(map: Map, rows: I32, poses: F64, least: int, gate: float) -> tuple[Edges, int]:
     """Return the edges between all of the keyframes `rows` (sorted), at `poses` (n, 4, 4), that measured at least `least` of the same points and
-    agree on a motion; and the longest of them, in keyframes. Neighbours in time that share less are tied loosely by their present motion."""
+    agree on a motion; and the longest of them, in keyframes. Neighbours in time that share less are connected loosely by their present motion."""
     seen = [measured_points(map, int(row)) for row in rows]
     pairs, measured, information = [], [], []
     for b in range(len(rows)):

@@ -46,7 +46,7 @@ class Atlanta:
     CVPR 2018) maximise by branch and bound.
 
     Each azimuth makes a rotation whose third column is the vertical, the same in all; vertical and azimuths are fitted together, so every wall
-    helps to hold the vertical upright. A pair keeps its id while it is seen, and out of sight as long as another tells where it must be."""
+    helps to hold the vertical upright. A pair keeps its id while it is seen, and out of sight as long as another determines its direction."""
 
     cone_deg: Annotated[float, Range(1, 30)] = 12.0  # half-angle of the cone gathered around each axis
     bandwidth_deg: Annotated[float, Range(0.1, 30)] = 3.0  # of the Gaussian kernel
@@ -79,7 +79,7 @@ class Atlanta:
 
     def __call__(self, normals: Normals, segments: Segments, planes: Planes, previous: ManhattanFrame | None) -> ManhattanFrame:
         """Rotations with one vertical as their third column, the best supported first, then those known but out of sight: without inliers, with a
-        covariance that says nothing. `supported` is False when no horizontal direction stands at right angles to the vertical or to another."""
+        uninformative covariance. `supported` is False when no horizontal direction stands at right angles to the vertical or to another."""
         directions = gather_directions(normals.normals, segments, self.samples, self.line_weight_per_px)
         recent = previous is not None and previous.supported and normals.index - previous.index <= self.max_age
         known, ids = self._known(directions, previous, recent)
@@ -174,7 +174,7 @@ class AtlantaModes(NamedTuple):
 
     @property
     def supported(self) -> bool:
-        """Whether there is any."""
+        """Return True if there is any."""
         return len(self.rows) > 0
 
     @property
@@ -218,7 +218,7 @@ class AtlantaFinder:
 
     def better_vertical(self, directions: Directions, known: F64, ids: I32) -> tuple[F64, I32]:
         """The known rotations (k, 3, 3) and their ids; only the first, with another of its axes as the vertical, when azimuths about that gather
-        clearly more: which axis is the vertical cannot be told while all that is seen is at right angles."""
+        clearly more: which axis is the vertical cannot be decided while all that is seen is at right angles."""
         few = directions.thinned(self.search_samples)
         scores = [self._score(few, v, False) for v in self._shifted(few, known[0]).T]
         best = int(np.argmax(scores))
@@ -239,7 +239,7 @@ class AtlantaFinder:
         return self._about(directions, planes, vertical, known, np.pi)
 
     def _score(self, directions: Directions, vertical: F64, alone: bool) -> float:
-        """Weight that the vertical and the azimuths about it gather; upright counts more where nothing else says which is the vertical."""
+        """Weight that the vertical and the azimuths about it gather; upright counts more where nothing else determines the vertical."""
         on_vertical = np.abs(directions.vectors @ vertical) > np.cos(self.finder.cone)
         masses = self._azimuths(directions, vertical)[1]
         explained = float(directions.weights[on_vertical].sum() + masses.sum())
@@ -367,7 +367,7 @@ def _tilted(rotations: F64, vertical: F64) -> F64:
 
 def shared_covariance(H: F64, rotations: F64, unknown: float) -> F64:
     """(k, 3, 3) covariance of phi in `R <- Exp(phi) R` of each rotation, from the information H (2 + k, 2 + k) of `fit_shared_vertical`; `unknown`
-    (rad²) is the variance of what nothing tells."""
+    (rad²) is the variance of what is not observed."""
     joint = np.linalg.inv(H + np.eye(len(H)) / unknown)
     out = np.empty((len(rotations), 3, 3))
     for f in range(len(rotations)):

@@ -103,7 +103,7 @@ def fit_shared_vertical(
 
     `columns` (n,) is 3 frame + axis, -1 takes no part; `information` (n, 3, 3) in 1/rad², zero along the direction. Gauss–Newton with Cauchy weights,
     one half at `gate` σ, over the tilt of the vertical about the first frame's two other axes and a turn of each frame about the vertical; `prior`
-    (1/rad²) holds what nothing tells. Returns the rotations, the information (2 + k, 2 + k) of these numbers, and of the first `counted` rows
+    (1/rad²) holds what is not observed. Returns the rotations, the information (2 + k, 2 + k) of these numbers, and of the first `counted` rows
     the weighted χ² and the weighted number of its components."""
     frames = len(rotations)
     rotations, size = rotations.copy(), 2 + frames

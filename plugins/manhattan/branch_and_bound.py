@@ -38,11 +38,11 @@ class BranchAndBound(ModeOptions):
     is how much more consensus, as a share, any rotation could have than the one returned; and unless the work limit was met, none further than
     `certificate_deg` from the optimum, by whichever of its 24 names, has more than 1 + `max_gap` times its consensus. Work is limited in cubes, not
     in time, because the result must not depend on the machine's speed or load; a core does 500 to 900 in a millisecond, and most scenes with a
-    Manhattan frame need 1000 to 4000. The optimum then says where the modes are: from there on rotation, covariance and the judgement whether this is
+    Manhattan frame need 1000 to 4000. The optimum then gives the modes: from there on rotation, covariance and the judgement whether this is
     a Manhattan frame are those of `mean_shift`."""
 
     inlier_deg: Annotated[float, Range(2, 20)] = 12.0  # furthest from an axis that a direction counts; at least three times the normals' noise
-    certificate_deg: Annotated[float, Range(0.1)] = 1.0  # rotations nearer to the optimum than this need not be told from it
+    certificate_deg: Annotated[float, Range(0.1)] = 1.0  # rotations nearer to the optimum than this need not be distinguished from it
     max_gap: NonNegativeFloat = 0.001  # by which share a rotation further off must be better to be looked for
     max_cubes: PositiveInt = 10000  # of rotations looked at
     search_samples: Annotated[int, Range(10)] = 1500  # most normals searched with
@@ -83,7 +83,7 @@ FACE = (12, 24, 48)  # cells a face of the maps for the first levels, whose cube
 
 
 class Optimum(NamedTuple):
-    """What a search found and proved."""
+    """Result of a search and its certified bound."""
 
     R: F64  # (3, 3)
     consensus: float
@@ -101,13 +101,13 @@ class RotationSearch:
     The first bounds are three look-ups in maps on the sphere, the later ones sums over all directions (`consensus_bound`)."""
 
     inlier: float  # τ of the consensus
-    certificate: float  # rotations this near to the best one need not be told from it
+    certificate: float  # rotations this near to the best one need not be distinguished from it
     slack: float  # share of the best consensus by which another must be better to count
     max_cubes: int  # work limit
 
     def __call__(self, vectors: F64, weights: F64, start: F64) -> Optimum:
         """The optimum for directions (n, 3) of any length but 0 and weights (n,); rows that are not finite or weigh nothing are left out. `start`
-        (3, 3) is the first guess and the middle of the search; the result is proven whatever it is."""
+        (3, 3) is the first guess and the middle of the search; the result is certified whatever it is."""
         unit, weights = _usable(vectors, weights)
         if len(unit) == 0:
             return Optimum(start, 0.0, 0.0, 0, 0)
@@ -122,7 +122,7 @@ class RotationSearch:
         """C(R) of the same directions."""
         unit, weights = _usable(vectors, weights)
         square = np.max((unit @ R) ** 2, axis=1, initial=0.0)
-        return float(weights @ np.maximum(square - np.cos(self.inlier) ** 2, 0.0)) / np.sin(self.inlier) ** 2
+        return float(float(weights @ np.maximum(square - np.cos(self.inlier) ** 2, 0.0)) / np.sin(self.inlier) ** 2)
 
     @cached_property
     def _grid(self) -> SphereGrid:

@@ -119,7 +119,7 @@ def _bounds(groups: Groups, maps: Maps, cubes: F64, level: int, radius: float, s
 
 @kernel
 def _climb_promising(groups: Groups, cubes: F64, values: F64, start: F64, inlier: float, top: F64, best: float, exact: bool) -> tuple[F64, float]:
-    """The best summit: `top` or that of a slope on which one of the most promising centres is. `values` is used up."""
+    """The best maximum: `top` or that of a slope on which one of the most promising centres is. `values` is used up."""
     R = np.empty((3, 3))
     for _ in range(CLIMBS):
         c = 0
@@ -131,9 +131,9 @@ def _climb_promising(groups: Groups, cubes: F64, values: F64, start: F64, inlier
         values[c] = -1.0
         _centre(cubes[c], start, R)
         if exact or angle_to_equivalent(R, top) > 0.5 * inlier:
-            summit, consensus = climb(groups, R, inlier, STEPS)
+            maximum, consensus = climb(groups, R, inlier, STEPS)
             if consensus > best * (1.0 + 1e-9):
-                top, best = summit, consensus
+                top, best = maximum, consensus
     return top, best
 
 
@@ -151,7 +151,7 @@ def search(
         uppers, values = _bounds(groups, maps, cubes, level, radius, start, inlier, best)
         before = best
         top, best = _climb_promising(groups, cubes, values, start, inlier, top, best, level + 1 >= len(maps.near))
-        if best > before and aside and used + FIRST**3 <= max_cubes:  # what was set aside was near another summit: once more, knowing this one
+        if best > before and aside and used + FIRST**3 <= max_cubes:  # what was set aside was near another maximum: once more, knowing this one
             cubes, half, level, aside, passed = _first_cubes(), HALF_WIDTH / FIRST, 0, False, 0.0
             continue
         reach = certificate if level + 1 < len(maps.near) else summit_radius(groups, top, best, certificate, inlier)
@@ -188,11 +188,11 @@ def search(
 # `curvature`; its third derivative is at most 4 anywhere; and its first at most |sin 2β|.
 
 ROUNDING = 1e-9  # of all weight, added to bounds
-SUMMIT_STEP = 1.08  # factor by which a ball around a summit is widened
+SUMMIT_STEP = 1.08  # factor by which a ball around a maximum is widened
 
 
 class Near(NamedTuple):
-    """What directions add to the consensus within a ball of rotations, times sin²τ."""
+    """Contribution of directions to the consensus within a ball of rotations, times sin²τ."""
 
     sure: F64  # (3, 7) moments of the inliers that each axis has for all rotations of the ball
     torque: F64  # (3,) first derivative by phi in `Exp(phi) R` of the bound on the others
@@ -208,10 +208,10 @@ def curvature(beta: float) -> float:
 
 @kernel
 def near_rotation(groups: Groups, R: F64, radius: float, inlier: float) -> Near:
-    """What directions add within `radius` of R, `inlier` being τ; inlier + radius < 45°, so that no direction is near two axes.
+    """Contribution of directions within `radius` of R, `inlier` being τ; inlier + radius < 45°, so that no direction is near two axes.
 
     A direction that may enter or leave its cone adds at most max(0, p + s), p being its value and |s| <= L the change to first order. That is convex
-    in s, so it is below the chord from -L to L, whose slopes are summed as a torque: directions on opposite edges of a cone cancel."""
+    in s, so it is below the chord from -L to L, whose gradients are summed as a torque: directions on opposite edges of a cone cancel."""
     sure, torque, constant, value = np.zeros((3, 7)), np.zeros(3), 0.0, 0.0
     inner, outer, apart = max(inlier - radius, 0.0), inlier + radius, inlier > radius
     inner_c, inner_s, outer_c, outer_s = np.cos(inner), np.sin(inner), np.cos(outer), np.sin(outer)
@@ -325,9 +325,9 @@ def climb(groups: Groups, R: F64, inlier: float, steps: int) -> tuple[F64, float
 
 @kernel
 def summit_radius(groups: Groups, R: F64, best: float, inner: float, inlier: float) -> float:
-    """The largest angle found such that no rotation from `inner` to it off R has more consensus than `best`; `inner` when nothing is proven.
+    """The largest angle found such that no rotation from `inner` to it off R has more consensus than `best`; `inner` when nothing is certified.
 
-    About a summit the sure inliers' part is concave. To second order, with the bound on the third, it falls faster than the others can add."""
+    About a maximum the sure inliers' part is concave. To second order, with the bound on the third, it falls faster than the others can add."""
     reach, s2, excess = inner, np.sin(inlier) ** 2, np.empty((3, 3))
     gradient, solution = np.empty(3), np.empty(3)
     while SUMMIT_STEP * reach < inlier:

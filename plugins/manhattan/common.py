@@ -1,4 +1,4 @@
-"""What estimators have in common that end with the modes of the sphere: their options, and the way from modes to a Manhattan frame."""
+"""Functions of all estimators that end with the modes of the sphere: their options, and the way from modes to a Manhattan frame."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ class ModeOptions:
             raise ValueError("use_normals, use_lines: at least one must be true")
 
     def directions(self, normals: Normals, segments: Segments) -> Directions:
-        """Of the normals and lines that the options let take part."""
+        """Directions of the normals and lines that the options include."""
         surface, lines = normals.normals if self.use_normals else None, segments if self.use_lines else None
         return gather_directions(surface, lines, self.samples, self.line_weight_per_px)
 
@@ -146,13 +146,13 @@ class AxisFit:
         `axes` (3, 3) are the means of the normals on each axis, `normals` (3, 4) their statistics about these (`mode_statistics`); only the axes
         `taking_part` (3,) are fitted."""
         features = planes.coefficients, planes.covariance, segments.endpoints_m, segments.covariance_m2
-        return fitted(R, axes, normals, taking_part, *features, self._rules, self.gate, float(np.radians(self.floor_deg)))  # type: ignore[no-any-return]
+        return fitted(R, axes, normals, taking_part, *features, self._rules, self.gate, float(np.radians(self.floor_deg)))
 
     def measured(self, R: F64, axes: F64, normals: F64, segments: Segments, planes: Planes) -> tuple[F64, F64, I32]:
         """Directions (n, 3) of planes, lines and the means of the normals, their information (n, 3, 3) and the column of R (3, m) that each
         belongs to (-1: none). `axes` (3, m) and `normals` (m, 4) as above."""
         features = planes.coefficients, planes.covariance, segments.endpoints_m, segments.covariance_m2
-        return measured_kernel(R, axes, normals, *features, self._rules)  # type: ignore[no-any-return]
+        return measured_kernel(R, axes, normals, *features, self._rules)
 
     @cached_property
     def _rules(self) -> FitOptions:
@@ -173,11 +173,12 @@ def _half_sphere(count: int) -> F64:
 HALF_SPHERE = _half_sphere(256)  # (256, 3) directions about 9° apart over half the sphere (Fibonacci)
 
 
-# What an estimator of several frames says: of those it sees, and of those it knows but does not see.
+# Results of an estimator of several frames: of those it sees, and of those it knows but does not see.
 
 
 def lost_frames(modes: Modes, fit: AxisFit, segments: Segments, planes: Planes, normals: Normals, known: F64, ids: I32) -> ManhattanFrame:
-    """Not supported: a single axis of the first still turns all that are known (k, 3, 3), and tells two of its three angles."""
+    """Manhattan frames that are not supported: a single axis of the first still rotates all that are known (k, 3, 3), and measures two of its three
+    angles."""
     R, covariance = known[0], np.eye(3) * NOTHING_KNOWN
     if modes.seen.sum() == 1:
         turned = orthonormal(modes.axes, np.where(modes.seen, 1.0, 1e-6))
@@ -202,7 +203,7 @@ def seen_frames(
     normals: Normals, rotations: F64, covariance: F64, inliers: F64, spread: F64, rows: I32, ids: I32, unseen: I32, expected: F64
 ) -> ManhattanFrame:
     """The frames seen, (k, 3, 3) with their covariances, inliers (k, 3) and spread (k, 3), then those out of sight, where they are `expected`
-    (u, 3, 3): without inliers, with a covariance that says nothing.
+    (u, 3, 3): without inliers, with an uninformative covariance.
 
     `rows` (k,) and `unseen` (u,) say which of the known frames, with `ids`, they are; -1 is a new one and gets a number of its own."""
     nothing = np.zeros((len(unseen), 3))
@@ -236,7 +237,7 @@ class Directions(NamedTuple):
     first_line: int
 
     def thinned(self, most: int) -> Directions:
-        """With at most about `most` of the normals, which weigh the more, and all lines."""
+        """Keep about `most` of the normals at most, with larger weights, and all lines."""
         step = max(-(-self.first_line // most), 1)
         normals, lines = self.vectors[: self.first_line : step], self.vectors[self.first_line :]
         weights = np.concatenate([step * self.weights[: self.first_line : step], self.weights[self.first_line :]])
@@ -352,14 +353,14 @@ def turn_between(found: F64, before: F64, limit: float) -> F64:
 
 
 def missing(rows: I32, count: int) -> I32:
-    """Those of `count` rows that are not among `rows`."""
+    """Rows of `count` that are not among `rows`."""
     left = np.ones(count, np.bool_)
     left[rows[rows >= 0]] = False
     return np.flatnonzero(left).astype(np.int32)
 
 
 def remembered(unseen: I32, ids: I32, room: int) -> I32:
-    """Of the rows of frames out of sight those for which there is room: seen last, and the one with the highest id, so that no id is given twice."""
+    """Rows of frames out of sight for which there is room: seen last, and the one with the highest id, so that no id is given twice."""
     if len(unseen) <= max(room, 0):
         return unseen
     newest = unseen[ids[unseen] == ids.max()]

@@ -10,7 +10,7 @@ import numpy as np
 from trihedron.pipeline.core.kernel import kernel
 from trihedron.pipeline.core.types import F32, F64, I32, Bool
 from trihedron.plugins.shared.lie_kernels import left_multiply_exp
-from trihedron.plugins.shared.linalg_kernels import few_descending, inverse_positive, polar_rotation, solve_positive
+from trihedron.plugins.shared.linalg_kernels import descending, inverse_positive, polar_rotation, solve_positive
 from trihedron.plugins.shared.manhattan_frames_kernels import assign_axes, measured_directions
 
 # From a frame's features to directions on the sphere, and from directions on three axes to a rotation with its covariance.
@@ -44,13 +44,13 @@ def gathered(normals: F32, ends_m: F32, ends_px: F32, samples: int, per_px: floa
 
 @kernel
 def variance_scale(chi2: float, freedom: float) -> float:
-    """Of the variances assumed, by the residuals' χ² with so many degrees of freedom. The assumption counts like BEFOREHAND more: a scene that shows
-    little keeps it, one with many planes and edges tells by itself how true its walls are."""
+    """Scale of the assumed variances by the residuals' χ² with so many degrees of freedom. The assumption counts like BEFOREHAND more: a scene that
+    shows little keeps it, one with many planes and edges shows by itself how true its walls are."""
     return (chi2 + BEFOREHAND) / (max(freedom, 0.0) + BEFOREHAND)
 
 
 class FitOptions(NamedTuple):
-    """Of `AxisFit`, for the kernels; angles in rad."""
+    """Options of `AxisFit`, for the kernels; angles in rad."""
 
     cone: float
     normals_floor: float
@@ -106,7 +106,7 @@ SIGMAS = 2.0  # that a plane may be off
 
 
 class ModeLimits(NamedTuple):
-    """Of `ModeFinder`, for the kernels; `widest` is the largest mean square of a mode."""
+    """Limits of `ModeFinder`, for the kernels; `widest` is the largest mean square of a mode."""
 
     cone: float
     min_share: float
@@ -323,7 +323,7 @@ def _mass(directions: F64, weights: F64, starts: F64, cone: float) -> F64:
 
 @kernel
 def densest(directions: F64, weights: F64, starts: F64, cone: float, count: int) -> F64:
-    """Of `starts` (m, 3) those with most weight within the cone, at least two cones apart; at most `count`, heaviest first."""
+    """Select from `starts` (m, 3) those with most weight within the cone, at least two cones apart; at most `count`, heaviest first."""
     mass, chosen, apart = _mass(directions, weights, starts, cone), np.empty((count, 3)), np.cos(2.0 * cone)
     for n in range(count):
         best = np.argmax(mass)
@@ -465,7 +465,7 @@ def line_peaks(directions: F64, length: F64, axes: F64, lines: F64, number: int,
     An axis is measured against the lines that no heavier axis has: a few long ones along a corridor must not outweigh what is across it."""
     peaks, left = np.zeros(len(lines), np.bool_), length.copy()
     any_peak, on_peaks, widest_peak = False, 0.0, 0.0
-    for k in few_descending(lines[:, 1]):
+    for k in descending(lines[:, 1]):
         if lines[k, 0] < number or not lines[k, 3] < widest:
             continue
         least = by_chance(lines[k, 3], cone, 2.0 / (np.pi - 2.0 * cone), left) if any_peak else 0.0

@@ -44,7 +44,7 @@ class LinePlaneRansac:
         self, normals: Normals, segments: Segments, planes: Planes, previous: ManhattanFrame | None, rng: np.random.Generator
     ) -> ManhattanFrame:
         """One rotation with id 0; `inliers` counts planes and lines. `supported` is False where no plane has a line along it and lines are few or
-        without order; a single plane still tells two of the three angles."""
+        without order; a single plane still determines two of the three angles."""
         start = np.eye(3) if previous is None else previous.rotations[0]
         features, reach = _features(planes, segments), np.radians(self.reach_deg)
         R, seen, supported = self._consensus(features, normals, start, previous is not None and previous.supported, rng)

@@ -41,7 +41,7 @@ class Mixture:
     frames, every frame is re-estimated from its own; instead of random splits and merges, what no frame explains is searched for another.
 
     Frames may share an axis (two blocks of walls on one floor), but each needs one of its own. A frame keeps its id while it is seen, while another
-    is seen that tells where it must be, and through a jump of the camera that leaves several in view."""
+    is seen that determines it, and through a jump of the camera that leaves several in view."""
 
     cone_deg: Annotated[float, Range(1, 30)] = 12.0  # half-angle of the cone gathered around each axis
     bandwidth_deg: Annotated[float, Range(0.1, 30)] = 4.0  # of the Gaussian kernel
@@ -71,8 +71,8 @@ class Mixture:
         check_increasing(self, "bandwidth_deg", "cone_deg")
 
     def __call__(self, normals: Normals, segments: Segments, planes: Planes, previous: ManhattanFrame | None) -> ManhattanFrame:
-        """Frames seen, the best supported first, then those known but out of sight: expected from the others, no inliers, a covariance that says
-        nothing. `supported` is False when none is seen."""
+        """Frames seen, the best supported first, then those known but out of sight: expected from the others, no inliers, an uninformative
+        covariance. `supported` is False when none is seen."""
         directions = gather_directions(normals.normals, segments, self.samples, self.line_weight_per_px)
         known = np.eye(3)[None] if previous is None else previous.rotations
         ids = np.zeros(1, np.int32) if previous is None else previous.ids
@@ -101,7 +101,7 @@ class Mixture:
             turn = followed[0].R @ known[followed[0].row].T
             matched = (identified(rotations, turn @ known, limit) >= 0).sum()
             if matched >= min(len(found), len(known)):
-                return turn
+                return np.asarray(turn)
         other = turn_between(rotations, known, limit)
         return turn if followed and matched >= (identified(rotations, other @ known, limit) >= 0).sum() else other
 
@@ -149,7 +149,7 @@ class Found(NamedTuple):
 
     @property
     def weight(self) -> float:
-        """Of the directions on its axes."""
+        """Weight of the directions on its axes."""
         return float(self.modes.weights[self.modes.seen].sum())
 
 
@@ -166,7 +166,7 @@ class FrameMixture:
     search_samples: int
 
     def followed(self, directions: Directions, planes: Planes, known: F64) -> list[Found]:
-        """Those of the known rotations (k, 3, 3) that the scene still supports nearby, heaviest first. The turn of the first one found says where to
+        """Known rotations (k, 3, 3) that the scene still supports nearby, heaviest first. The turn of the first one found shows where to
         expect those after it."""
         found: list[Found] = []
         expected = known
@@ -185,7 +185,7 @@ class FrameMixture:
         return kept
 
     def searched(self, directions: Directions, planes: Planes, found: list[Found]) -> list[Found]:
-        """With those that the directions left over lead to."""
+        """Frames with those added to which the remaining directions lead."""
         few = directions.thinned(self.search_samples)
         while len(found) < self.max_frames:
             left = self._left(few, found)
@@ -210,7 +210,7 @@ class FrameMixture:
         return self.finder.follow(Directions(vectors[own], weights[own], int(own[:first].sum())), planes, rotations[row])
 
     def _is_another(self, one: Found, others: list[Found], directions: Directions) -> bool:
-        """Whether it is none of the others and has enough on axes which are not theirs."""
+        """Return True if it is none of the others and has enough on axes which are not theirs."""
         if not others:
             return True
         axes = np.concatenate([other.modes.axes[:, other.modes.seen] for other in others], axis=1)

@@ -24,7 +24,7 @@ from trihedron.plugins.shared.manhattan_frames_kernels import (
     square_angles,
 )
 
-PRIOR = 1.0 / NOTHING_KNOWN  # 1/rad², weight of the previous rotation: holds the angles that no plane tells
+PRIOR = 1.0 / NOTHING_KNOWN  # 1/rad², weight of the previous rotation: holds the angles that no plane determines
 LARGEST_COS = 0.2  # of planes taken as perpendicular, however uncertain they are
 
 
@@ -48,7 +48,7 @@ class PlaneSvd:
 
     def __call__(self, planes: Planes, previous: ManhattanFrame | None) -> ManhattanFrame:
         """One rotation with id 0; `inliers` counts planes, `spread` is their angle to the axis. `supported` is False where no two axes have planes: a
-        single plane still tells two of the three angles."""
+        single plane still determines two of the three angles."""
         start = np.eye(3) if previous is None else previous.rotations[0]
         walls = known_walls(planes.coefficients, planes.covariance, planes.pixels, np.radians(self.plane_floor_deg))
         enough = self.min_share * planes.labels.size * planes.stride**2

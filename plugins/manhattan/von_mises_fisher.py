@@ -67,7 +67,7 @@ class VonMisesFisher:
         )
 
     def _settled(self, directions: Directions, previous: ManhattanFrame | None, index: int) -> tuple[F64, AxisMixture, Modes]:
-        """From the previous axes; from everywhere when there are none, they are old or nothing supports them. See `_judged`."""
+        """Fit from the previous axes; from everywhere when there are none, they are old or nothing supports them. See `_judged`."""
         start, near = np.eye(3) if previous is None else previous.rotations[0], None
         if previous is not None:
             near = self._judged(directions, start)
@@ -123,7 +123,7 @@ class VonMisesFisher:
 
 
 def broad_mixture(R: F64, concentration: float) -> AxisMixture:
-    """Where to start: nothing belongs anywhere yet."""
+    """Initial mixture: nothing belongs anywhere yet."""
     none = np.zeros((2, 3))
     return AxisMixture(np.array(R), np.full((2, 3), concentration), np.full((2, 4), 0.25), np.zeros((2, 3, 3)), none, none)
 

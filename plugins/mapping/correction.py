@@ -93,7 +93,7 @@ def _created_after(map: Map, kind: str, keyframe: int, later: I32, corrected: I3
     """Living landmarks created after the keyframe, by one of those later, without the corrected ones."""
     ids = observed_by(map, later, kind)
     ids = ids[getattr(map, f"{kind}s").rows("first", ids) > keyframe]
-    return ids[~isin(ids, corrected)]
+    return np.asarray(ids[~isin(ids, corrected)])
 
 
 def _moved_planes(table: Table, ids: I32, coefficients: F64, covariance: F64, T: F64 | None = None) -> Table:

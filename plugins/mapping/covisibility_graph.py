@@ -22,7 +22,7 @@ def once_per_version(function: Callable[Concatenate[Map, P], T]) -> Callable[Con
     """Cache the results of a function of a map and further positional arguments (values or arrays) with that version of the map."""
 
     @wraps(function)
-    def cached(map: Map, *args: P.args, **kwargs: P.kwargs) -> T:
+    def cached(map: Map, /, *args: P.args, **kwargs: P.kwargs) -> T:
         key = (function.__name__, *(arg.tobytes() if isinstance(arg, np.ndarray) else arg for arg in args), *kwargs.items())
         if key not in map.memo:
             map.memo[key] = function(map, *args, **kwargs)
@@ -76,7 +76,7 @@ def living_keyframes(map: Map) -> I32:
 def keyframes_of(map: Map, submap: int) -> I32:
     """Return the living keyframes of a sub-map."""
     living = living_keyframes(map)
-    return living[map.keyframes.rows("submap", living) == submap]
+    return np.asarray(living[map.keyframes.rows("submap", living) == submap])
 
 
 def current_submap(map: Map) -> int:

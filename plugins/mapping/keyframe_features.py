@@ -28,18 +28,11 @@ def _points(map: Map, camera: Camera, T_camera_world: F64, ids: I32) -> Keypoint
     covariance = R @ inverse(map.points.rows("information", ids)) @ R.T
     across = np.sqrt(0.5 * (covariance[:, 0, 0] + covariance[:, 1, 1]))
     descriptors = map.points.rows("descriptor", ids)
-    return Keypoints(
-        map.index,
-        map.stamp_ns,
-        camera.project(local).astype(np.float32),
-        local.astype(np.float32),
-        np.maximum(camera.fx * across / local[:, 2], 0.3).astype(np.float32),
-        np.sqrt(covariance[:, 2, 2]).astype(np.float32),
-        map.points.rows("octave", ids),
-        np.zeros(len(ids), np.float32),
-        descriptors,
-        "l2" if descriptors.shape[1] >= L2_BYTES else "hamming",
-    )
+    pixels, sigma_px = camera.project(local).astype(np.float32), np.maximum(camera.fx * across / local[:, 2], 0.3).astype(np.float32)
+    sigma_m, response = np.sqrt(covariance[:, 2, 2]).astype(np.float32), np.zeros(len(ids), np.float32)
+    metric = "l2" if descriptors.shape[1] >= L2_BYTES else "hamming"
+    octaves = map.points.rows("octave", ids)
+    return Keypoints(map.index, map.stamp_ns, pixels, local.astype(np.float32), sigma_px, sigma_m, octaves, response, descriptors, metric)
 
 
 def _lines(map: Map, camera: Camera, T_camera_world: F64, ids: I32) -> Segments:

@@ -9,7 +9,7 @@ import numpy as np
 
 from trihedron.pipeline.core.geometry import invert
 from trihedron.pipeline.core.options import NonNegativeInt, PositiveFloat, PositiveInt, Share, check_increasing
-from trihedron.pipeline.core.types import F64, OK, Frame, Map, Matches, Planes, Pose, Table
+from trihedron.pipeline.core.types import F64, Frame, Map, Matches, Planes, Pose, Table
 from trihedron.plugins.mapping.covisibility_graph import WEIGHTS, newest_keyframes
 
 UNCHANGED = 0.25  # of the view change of a keyframe, that suffices after max_frames: a camera at rest adds none
@@ -24,7 +24,7 @@ class KeyframeOptions:
     min_shift: PositiveFloat = 0.06  # of the camera, as a share of the median depth, that makes a keyframe
     min_turn_deg: PositiveFloat = 6.0
     min_share: Share = 0.5  # of the newest keyframe's landmarks tracked, below which a keyframe is made
-    doubt_sigmas: PositiveFloat = 3.0  # a degraded pose with this many times the standard deviation of its reference keyframe is in doubt
+    doubt_sigmas: PositiveFloat = 3.0  # a pose with this many times the standard deviation of its reference keyframe is in doubt
     doubt_floor_m: PositiveFloat = 0.002  # least standard deviation of a keyframe in that comparison
     doubt_frames: NonNegativeInt = 10  # since the newest keyframe, in which a pose in doubt makes none while enough landmarks are tracked
     doubt_score: NonNegativeInt = 30  # points, lines and planes, weighted, that are enough
@@ -57,11 +57,11 @@ def needs_keyframe(options: KeyframeOptions, frame: Frame, pose: Pose, planes: P
 def _in_doubt(options: KeyframeOptions, pose: Pose, keyframes: Table) -> bool:
     """Return True if a tracked pose is much less certain than its reference keyframe: its error would propagate to every new landmark. A later frame
     decides."""
-    if pose.status == OK or pose.reference < 0 or _weighted(pose.inliers.tolist()) < options.doubt_score:
+    if pose.reference < 0 or _weighted(pose.inliers.tolist()) < options.doubt_score:
         return False
     covariances: list[F64] = [pose.local_covariance, keyframes.row("covariance", pose.reference)]
     sigma, reference = (float(np.linalg.eigvalsh(covariance[:3, :3])[-1]) ** 0.5 for covariance in covariances)
-    return sigma > options.doubt_sigmas * max(reference, options.doubt_floor_m)
+    return bool(sigma > options.doubt_sigmas * max(reference, options.doubt_floor_m))
 
 
 def keyframe_distance_m(options: KeyframeOptions, frame: Frame) -> float:

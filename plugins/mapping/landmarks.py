@@ -94,18 +94,9 @@ PLANE_OBSERVATIONS = {  # as `types.Planes`, camera frame
 
 def empty_map(index: int, stamp_ns: int, point_bytes: int, line_bytes: int, plane_samples: int) -> Map:
     """A map without keyframes, for descriptors of the given lengths."""
-    return Map(
-        index=index,
-        stamp_ns=stamp_ns,
-        revision=0,
-        keyframes=Table.empty(KEYFRAMES),
-        points=Table.empty(point_columns(point_bytes)),
-        lines=Table.empty(line_columns(line_bytes)),
-        planes=Table.empty(plane_columns(plane_samples)),
-        point_observations=Table.empty(POINT_OBSERVATIONS),
-        line_observations=Table.empty(LINE_OBSERVATIONS),
-        plane_observations=Table.empty(PLANE_OBSERVATIONS),
-    )
+    landmarks = point_columns(point_bytes), line_columns(line_bytes), plane_columns(plane_samples)
+    schemas = (KEYFRAMES, *landmarks, POINT_OBSERVATIONS, LINE_OBSERVATIONS, PLANE_OBSERVATIONS)
+    return Map(index, stamp_ns, 0, *(Table.empty(schema) for schema in schemas))
 
 
 def remove_rows(table: Table, ids: I32) -> Table:
@@ -123,7 +114,7 @@ def distinct(ids: I32) -> I32:
     first = ids.min()
     marked = np.zeros(ids.max() - first + 1, np.bool_)
     marked[ids - first] = True
-    return (np.flatnonzero(marked) + first).astype(np.int32)
+    return np.asarray((np.flatnonzero(marked) + first).astype(np.int32))
 
 
 def union(a: I32, b: I32) -> I32:

@@ -100,7 +100,7 @@ def line_terms(map: Map, segments: Segments, pairs: I32, T_world_camera: F64, ca
 def parameters_on(lines: F64, points: F64) -> F64:
     """Return the parameters (n, k), 0 = start and 1 = end, of the feet of points (n, k, 3) on lines (n, 2, 3)."""
     direction = lines[:, 1] - lines[:, 0]
-    return np.einsum("nkj,nj->nk", points - lines[:, :1], direction) / np.maximum((direction**2).sum(-1), 1e-12)[:, None]
+    return np.asarray(np.einsum("nkj,nj->nk", points - lines[:, :1], direction) / np.maximum((direction**2).sum(-1), 1e-12)[:, None])
 
 
 def points_along(endpoints: F64, covariance: F64, share: F64) -> tuple[F64, F64]:

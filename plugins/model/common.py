@@ -16,8 +16,7 @@ from trihedron.plugins.shared.image_reduction import reduced_intrinsics, step_to
 from trihedron.plugins.shared.image_reduction_kernels import reduced
 from trihedron.plugins.shared.tsdf_volume import CELLS, blocks_about
 from trihedron.plugins.shared.tsdf_volume_kernels import SIDE
-from trihedron.plugins.shared.voxel_hash import empty_table
-from trihedron.plugins.shared.voxel_hash_kernels import I64, absent
+from trihedron.plugins.shared.voxel_hash_kernels import I64, absent, empty_table
 
 BLOCKS = {"place": Column("i4", (3,)), "distance": Column("i2", (CELLS,)), "weight": Column("u1", (CELLS,))}
 

@@ -13,7 +13,6 @@ import numpy as np
 from trihedron.pipeline.core.options import NonNegativeFloat, PositiveFloat, Range
 from trihedron.pipeline.core.types import F32, F64, I32, U8, Camera, Frame, Normals
 from trihedron.plugins.normals.common_kernels import smooth_cells, smoothed_points, trusted_normals
-from trihedron.plugins.shared.depth_image import noise_coefficients
 from trihedron.plugins.shared.depth_image_kernels import cell_inverse_depths, cell_rays
 
 
@@ -34,7 +33,7 @@ class CloudNormals:
         """Normals on a grid of ceil(h / stride) × ceil(w / stride) cells by a method with a window of `window` cells, which needs smooth cells up to
         `reach` cells away and fails within `border` cells of the image's border."""
         camera = frame.camera
-        rho, _, count = cell_inverse_depths(frame.depth_m, self.stride, self.jump, self.jump_m, noise_coefficients(camera.depth_noise))
+        rho, _, count = cell_inverse_depths(frame.depth_m, self.stride, self.jump, self.jump_m, camera.depth_noise.coefficients)
         intrinsics = (float(camera.fx), float(camera.fy), float(camera.cx), float(camera.cy))
         rays_x, rays_y = cell_rays(rho.shape[0], rho.shape[1], self.stride, intrinsics)
         clear = clearance(smooth_cells(rho, count, self.stride**2, self.jump, self.jump_m))
@@ -85,7 +84,7 @@ def patch_sides(camera: Camera, noise_deg: float, least_px: float, most_px: floa
     """(100,) side in px of the patch whose normal has a predicted standard deviation of `noise_deg`, for depths of 0.1, 0.2 … 10 m, within bounds;
     read-only.
 
-    The tangents of n × n px with independent depth noise σ at z have slopes of σ f / z · √12 / n² (least squares, to 7 %)."""
+    The tangents of n × n px with independent depth noise σ at z have gradients of σ f / z · √12 / n² (least squares, to 7 %)."""
     z = np.arange(1, 101) * 0.1
     slope = camera.depth_noise.sigma_m(z) * camera.fx / z
     side = np.asarray(np.clip(np.sqrt(np.sqrt(12.0) * slope / np.radians(noise_deg)), least_px, most_px))

@@ -20,6 +20,6 @@ class NoNormals:
     stride: Annotated[int, Range(1, 8)] = 2  # px between cells of the grid
 
     def __call__(self, frame: Frame) -> Normals:
-        """Not one normal."""
+        """Return no normals."""
         h, w = (-(-side // self.stride) for side in frame.depth_m.shape)
         return Normals(frame.index, frame.stamp_ns, np.full((h, w, 3), np.nan, np.float32), self.stride)

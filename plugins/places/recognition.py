@@ -6,8 +6,8 @@ import numpy as np
 
 from trihedron.pipeline.core.types import F64, I32, Keypoints, Map, Segments
 from trihedron.plugins.mapping.covisibility_graph import WEIGHTS, observed_by
-from trihedron.plugins.places.recognition_kernels import rigid_hypotheses_kernel
 from trihedron.plugins.shared.feature_matching import nearest_matches
+from trihedron.plugins.shared.rigid_alignment_kernels import rigid_hypotheses_kernel
 
 
 def candidate_keyframes(map: Map, keypoints: Keypoints, segments: Segments, keyframes: I32, count: int, max_bits: int) -> I32:

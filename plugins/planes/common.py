@@ -1,4 +1,4 @@
-"""What every detector of planes ends in: regions grown to their borders, merged, fitted by weighted least squares, reported with covariance."""
+"""Final steps of every detector of planes: regions grown to their borders, merged, fitted by weighted least squares, reported with covariance."""
 
 from __future__ import annotations
 
@@ -19,7 +19,6 @@ from trihedron.plugins.planes.common_kernels import (
     plane_report,
     solve_symmetric,
 )
-from trihedron.plugins.shared.depth_image import noise_coefficients
 from trihedron.plugins.shared.depth_image_kernels import Grid, cell_inverse_depths, cell_rays
 
 EDGE, EDGE_M = 0.04, 0.02  # a step above EDGE z + EDGE_M within a cell's pixels: no depth there
@@ -48,7 +47,7 @@ class PlanarRegions:
     def _grid(self, frame: Frame, normals: Normals) -> Grid:
         """The frame's depths on the grid of the normals."""
         camera = frame.camera
-        rho, sigma, count = cell_inverse_depths(frame.depth_m, normals.stride, EDGE, EDGE_M, noise_coefficients(camera.depth_noise))
+        rho, sigma, count = cell_inverse_depths(frame.depth_m, normals.stride, EDGE, EDGE_M, camera.depth_noise.coefficients)
         intrinsics = (float(camera.fx), float(camera.fy), float(camera.cx), float(camera.cy))
         rays_x, rays_y = cell_rays(rho.shape[0], rho.shape[1], normals.stride, intrinsics)
         return Grid(rho, sigma, count, rays_x, rays_y, normals.normals)
@@ -59,7 +58,7 @@ class PlanarRegions:
 
     def _complete(self, core: U8, q: F64, grid: Grid, frame: Frame, stride: int, flat: bool = True) -> Planes:
         """Planes of the regions whose core cells are labelled (h, w) and whose planes are q (k, 3): grown, merged, fitted to their cores. A detector
-        that did not ask the normals says that the regions need not be `flat`: curved ones are dropped."""
+        that did not use the normals passes `flat` False: curved regions are dropped."""
         gap, cos_cone = max(self.gap_px // stride, 1), math.cos(2.0 * math.radians(self.cone_deg))
         labels, owner, sums = grown_and_merged(core, q, grid, self.gate, self.border_px // stride, cos_cone, gap, self.merge, self.correlation_px**2)
         if not flat:
@@ -67,7 +66,7 @@ class PlanarRegions:
         return self._report(labels, core, owner, sums, grid, frame, stride)
 
     def _flat(self, owner: I32, labels: U8, sums: Sums, grid: Grid, gap: int) -> I32:
-        """Which region each one became part of, (k + 1,) by label; 0 where the normals, if there are any, say that it is no plane."""
+        """New label (k + 1,) of each region; 0 where the normals, if there are any, show that it is no plane."""
         if np.isnan(grid.normals[..., 0]).all():
             return owner
         cone, merged = float(np.radians(self.cone_deg)), owner[labels]
@@ -78,7 +77,7 @@ class PlanarRegions:
         return np.where(np.concatenate([[False], good])[owner], owner, 0).astype(np.int32)
 
     def _report(self, labels: U8, core: U8, owner: I32, sums: Sums, grid: Grid, frame: Frame, stride: int) -> Planes:
-        """The largest regions as a value, largest first; `owner` says which one a label belongs to, 0 = none."""
+        """The largest regions as a value, largest first; `owner` is the region of each label, 0 = none."""
         numbered, number, ranked, area = largest_regions(labels, owner, grid.count, self.min_pixels, self.planes)
         A, b, moments, n = (total[ranked] for total in sums)
         q = np.asarray(np.linalg.solve(A, b[..., None])[..., 0], np.float64)

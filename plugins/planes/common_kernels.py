@@ -8,7 +8,7 @@ import numpy as np
 from trihedron.pipeline.core.kernel import kernel
 from trihedron.pipeline.core.types import F32, F64, I32, U8, Bool
 from trihedron.plugins.shared.depth_image_kernels import Grid, cells_by_component
-from trihedron.plugins.shared.linalg_kernels import descending, inverse_positive, median, solve_positive, tangent_columns
+from trihedron.plugins.shared.linalg_kernels import descending, inverse_positive, solve_positive, tangent_columns
 
 # Robust planes through the cells of a grid: dominant normal, trimmed weighted least squares in inverse depth, and a test for curvature.
 
@@ -149,7 +149,7 @@ def start_plane(normal: F64, columns: F64, cos_cone: float) -> F64:
             m += 1
     if m == 0:
         return np.zeros(3)
-    d = median(distance[:m])
+    d = np.median(distance[:m])
     return -normal / d if d > 1e-6 else np.zeros(3)
 
 
@@ -191,7 +191,7 @@ def _fit_members(columns: F64, member: Bool, found: int) -> tuple[F64, int]:
 
 @kernel
 def turn(q: F64, columns: F64, member: Bool) -> float:
-    """How far the normals turn across the members, rad: about 0 for a plane whatever its noise, all of the angle seen for a cylinder.
+    """Angle by which the normals turn across the members, rad: about 0 for a plane whatever its noise, all of the angle seen for a cylinder.
     Members without a normal do not count."""
     m = 0
     cxx, cxy, cxz, cyy, cyz, czz = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0  # sums of x xᵀ, of n xᵀ, of x and of n
@@ -372,7 +372,7 @@ def areas(labels: U8, count: U8, regions: int) -> I32:
 @kernel
 def largest_regions(labels: U8, owner: I32, count: U8 | I32, least: int, most: int) -> tuple[U8, U8, I32, I32]:
     """The regions of at least `least` depths, `most` at most, as 1 … k from the largest: `labels` (h, w) by these numbers, 0 = none, the number of
-    each label, which of the regions each is, and its number of depths. `owner` (k + 1,) says which region a label belongs to, 0 = none."""
+    each label, which of the regions each is, and its number of depths. `owner` (k + 1,) is the region of each label, 0 = none."""
     area, single = np.zeros(len(owner)), areas(labels, count, len(owner) - 1)
     for k in range(1, len(owner)):
         area[owner[k]] += single[k - 1]
@@ -435,7 +435,7 @@ def neighbours(labels: U8, count: int, gap: int) -> F64:
 
 @kernel
 def merge_regions(A: F64, b: F64, moments: F64, n: I32, touch: F64, limit: float, alike: float) -> I32:
-    """Which region each of k becomes part of, (k + 1,) by label; the sums (as from `accumulate`, with the neighbours' counts) are added up in place.
+    """New label (k + 1,) of each of k regions; the sums (as from `accumulate`, with the neighbours' counts) are added up in place.
 
     From the largest down a region takes in those smaller neighbours for which the common plane is within `limit` σ (rms) of each one's own, and what
     noise moves these by when `alike` depths err as one."""
@@ -464,8 +464,8 @@ def merge_regions(A: F64, b: F64, moments: F64, n: I32, touch: F64, limit: float
 
 @kernel
 def _one_plane(A: F64, b: F64, n: int, B: F64, c: F64, m: int, limit: float, noise: float) -> bool:
-    """Whether the common plane of two regions lies within `limit` σ (rms) of each region's own; `noise` is added to the sums of squares. Not when it
-    is turned from both while these are parallel: one surface is in front of the other."""
+    """Return True if the common plane of two regions lies within `limit` σ (rms) of each region's own; `noise` is added to the sums of squares. Not
+    when it is turned from both while these are parallel: one surface is in front of the other."""
     solved, common = solve_symmetric(A + B, b + c)
     first, p = solve_symmetric(A, b)
     second, q = solve_symmetric(B, c)
@@ -486,7 +486,7 @@ STEP_M = 2.0**-10  # samples of planes say where a plane is, to within centimetr
 def plane_report(
     labels: U8, core: U8, number: U8, planes: F64, grid: Grid, tiles: int, expected: float, weight: float, wanted: int, most: int
 ) -> tuple[F64, F64, F64, F32]:
-    """Of planes q (k, 3) with their regions' labels (h, w) and cores, whose labels have these numbers: the coefficients (k, 4), the derivative
+    """Report planes q (k, 3) with their regions' labels (h, w) and cores, whose labels have these numbers: the coefficients (k, 4), the derivative
     (k, 3, 3) of (a, b, d) by q, the variance (k,) as by `excess_variance` and the samples (k, wanted, 3) as by `spread_samples`."""
     coefficients, J = np.empty((len(planes), 4)), np.empty((len(planes), 3, 3))
     for k in range(len(planes)):
@@ -569,7 +569,7 @@ def _sizes(labels: U8, number: U8, regions: int) -> I32:
 @kernel
 def excess_variance(labels: U8, number: U8, planes: F64, grid: Grid, tiles: int, expected: float, weight: float) -> F64:
     """(k,) variance of the mean of a patch of each region over what independent depths with the noise model's σ would give; all its
-    cells have depth, and `number` says which region a label is of, 0 = none.
+    cells have depth, and `number` is the region of each label, 0 = none.
 
     A region is cut into about `tiles` square tiles; with e the residuals and w the weights of a tile's cells the ratio is `Σ (Σ w e)² / Σ Σ w`, for
     the three parameters fitted corrected, and shrunk towards `expected` with the weight of that many tiles. It measures what makes plane fits worse
@@ -621,7 +621,7 @@ def excess_variance(labels: U8, number: U8, planes: F64, grid: Grid, tiles: int,
     return out
 
 
-# Parallel surfaces a few centimetres apart (a door, a board on a wall) that noise lets pass for one plane, told by the normals and taken apart.
+# Parallel surfaces a few centimetres apart (a door, a board on a wall) that noise lets pass for one plane, separated by their normals.
 #
 # The plane fitted to both leans from one to the other by degrees, while the mean of thousands of normals stays that of either: where the two disagree
 # the depths are tried as two planes.
@@ -636,8 +636,9 @@ ROUNDS = 10  # of two means
 
 @kernel
 def larger_surface(q: F64, grid: Grid, cells: I32, columns: F64, some: F64, member: Bool) -> tuple[F64, int, F64]:
-    """Of the members of a region with plane q, when they are two parallel surfaces, the larger one: its q and number of members, which alone stay
-    marked, and the q of the other. Otherwise all is left as it is, and there is no other (zeros). `some` of the columns show whether they may be."""
+    """Select, from the members of a region with plane q, when they are two parallel surfaces, the larger one: its q and number of members, which
+    alone stay marked, and the q of the other. Otherwise all is left as it is, and there is no other (zeros). `some` of the columns show whether they
+    may be."""
     members, none = 0, np.zeros(3)
     for k in range(len(cells)):
         members += member[k]
@@ -810,7 +811,7 @@ def eigenvalues(S: F64) -> tuple[float, float]:
 
 @kernel
 def normals_of_regions(labels: I32, planes: F64, grid: Grid, cos_cone: float, step: int) -> tuple[F64, F64, F64]:
-    """What the normals of each region's cells say, (k,) each; those within the cone of the region's own count, in every `step`th row and column.
+    """Statistics of the normals of each region's cells, (k,) each; those within the cone of the region's own count, in every `step`th row and column.
 
     How far they turn across the region, rad; σ_z over the lesser extent of the region, rad: how far a bias of one σ turns them; and their share."""
     rho, sigma, _, rays_x, rays_y, normals = grid
@@ -930,7 +931,7 @@ def thinned_marks(marks: Bool) -> Bool:
 
 @kernel
 def normal_equations(columns: F64, chosen: Bool) -> tuple[F64, F64]:
-    """Of q, from the weighted depths of the chosen cells: A (3, 3), of which only the upper triangle is filled, and b (3,)."""
+    """Normal equations of q, from the weighted depths of the chosen cells: A (3, 3), of which only the upper triangle is filled, and b (3,)."""
     xs, ys, rho, weights = columns[0], columns[1], columns[2], columns[4]
     xx, xy, x1, yy, y1, one, xp, yp, p1 = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
     for k in range(len(chosen)):

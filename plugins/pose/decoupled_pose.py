@@ -28,18 +28,10 @@ class Decoupled:
         """Convert to the frame's pose in a sub-map; `reason` is why no refinement followed (degraded, unless lost already)."""
         status = DEGRADED if reason and self.status == OK else self.status
         reference, T_reference_camera = reference_of(map, self.T_world_camera, submap)
+        reason = self.reason if status == LOST or not reason else reason
+        relative = T_reference_camera, reference
         return Pose(
-            frame.index,
-            frame.stamp_ns,
-            self.T_world_camera,
-            self.covariance,
-            T_reference_camera,
-            reference,
-            self.inliers,
-            self.unobservable,
-            status,
-            self.reason if status == LOST or not reason else reason,
-            submap,
+            frame.index, frame.stamp_ns, self.T_world_camera, self.covariance, *relative, self.inliers, self.unobservable, status, reason, submap
         )
 
 

@@ -35,6 +35,7 @@ class DynamicObjectOptions:
     sure: float
     unproven: float
     most: float
+    least: float
 
 
 def solve_with_static(problem: MapAlignment, options: DynamicObjectOptions) -> tuple[PoseSolution, str]:
@@ -83,6 +84,8 @@ def _solve_alone(
             return None
     alone = problem.solve(static.select(terms))
     if static.name == ON_PLANES and problem.statistics(alone).most_planes_disagree:  # planes that contradict each other are no evidence
+        return None
+    if static.name == PLANES and problem.statistics(problem.classify(alone)).total < options.least * inliers.matches:  # nothing else supports them
         return None
     pulled = distance2(alone, solution) >= options.gate if contradicted else distance2(alone, solution, 3) > far
     return alone if pulled and (static.name == PLANES or not alone.unobservable.shape[1]) else None

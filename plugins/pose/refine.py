@@ -30,7 +30,7 @@ from trihedron.plugins.mapping.reference_keyframe import reference_of, submap_of
 from trihedron.plugins.pose.decoupled_pose import FIRST_SIGMA, Decoupled, decoupled_pose
 from trihedron.plugins.pose.dynamic_objects import DynamicObjectOptions, solve_with_static, status_with_static
 from trihedron.plugins.pose.map_alignment import InlierStatistics, MapAlignment, TrackingStatus
-from trihedron.plugins.pose.world_uncertainty import carried, degrade_by_keyframes, in_world
+from trihedron.plugins.pose.world_uncertainty import carried, in_world, widened_by_keyframes
 from trihedron.plugins.shared.pose_optimizer import PoseSolution
 
 EYE = np.eye(3)
@@ -60,7 +60,7 @@ class Refine:
     moving_sure: PositiveFloat = 13.9  # the same of the position (0.997 quantile, 3 dof) that selects it although the outlier shares are alike
     moving_unproven: PositiveFloat = 9.0  # the same from the position by planes alone, which are selected while no landmark is verified
     moving_most: Share = 0.4  # of all matches that must be inliers, half if most planes are outliers too, else the pose is degraded to the planes' σ
-    weak_foundation: PositiveFloat = 3.0  # times the pose's σ that the nearby keyframes' σ may reach before the pose is degraded
+    weak_foundation: PositiveFloat = 3.0  # times the pose's σ beyond which the nearby keyframes' σ is added to it
     submap_after: NonNegativeInt = 15  # frames without relocalisation, of those that show enough, after which a sub-map begins; 0 = never
 
     removed_options: ClassVar[dict[str, str]] = dict.fromkeys(("focal_off", "focal_worse", "focal_sure"), FOCAL_LENGTHS)
@@ -115,7 +115,7 @@ class Refine:
     @property
     def dynamic_object_options(self) -> DynamicObjectOptions:
         """The options `moving_*`."""
-        return DynamicObjectOptions(self.moving_share, self.moving_gate, self.moving_sure, self.moving_unproven, self.moving_most)
+        return DynamicObjectOptions(self.moving_share, self.moving_gate, self.moving_sure, self.moving_unproven, self.moving_most, self.min_share)
 
     def _information(self, start: Decoupled) -> F64:
         """Information (6, 6) of the decoupled pose as a prior."""
@@ -149,7 +149,7 @@ class Refine:
         if static:
             status = status_with_static(status, solution, problem, static, self.dynamic_object_options)
         if status.status == OK:
-            status = degrade_by_keyframes(status, solution, problem, self.weak_foundation)
+            status = widened_by_keyframes(status, solution, problem, self.weak_foundation)
         if submap:
             status = replace(status, status=DEGRADED, reason=f"in sub-map {submap}, which is not merged with the first yet: {status.reason}")
         return status

@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from trihedron.pipeline.core.geometry import adjoint, invert
-from trihedron.pipeline.core.types import DEGRADED, F64, I32, Map, Pose
+from trihedron.pipeline.core.types import F64, I32, Map, Pose
 from trihedron.plugins.pose.map_alignment import MapAlignment, TrackingStatus
 from trihedron.plugins.shared.linalg_kernels import inverse_positive
 from trihedron.plugins.shared.pose_optimizer import LANDMARK_SCORE, PoseSolution, residual_scale
@@ -62,13 +62,13 @@ def _sigmas_m(map: Map, keyframes: list[int]) -> dict[int, float]:
     return sigmas_m
 
 
-def degrade_by_keyframes(status: TrackingStatus, solution: PoseSolution, problem: MapAlignment, factor: float) -> TrackingStatus:
-    """Degrade a pose whose keyframes are uncertain by more than `factor` times its own standard deviation, and add their covariance to it."""
+def widened_by_keyframes(status: TrackingStatus, solution: PoseSolution, problem: MapAlignment, factor: float) -> TrackingStatus:
+    """Add the covariance of the keyframes to that of a pose where they are uncertain by more than `factor` times its own standard deviation:
+    landmarks made from this pose would average it away."""
     base = keyframe_uncertainty(problem.map, *problem.landmarks(solution))
     if base.sigma_m <= factor * np.sqrt(np.linalg.eigvalsh(solution.covariance[:3, :3])[-1]):
         return status
-    reason = f"relative to keyframes with σ = {1e3 * base.sigma_m:.0f} mm"
-    return TrackingStatus(DEGRADED, reason, status.covariance + base.covariance(problem.map, solution.T_world_camera))
+    return replace(status, covariance=status.covariance + base.covariance(problem.map, solution.T_world_camera))
 
 
 def in_world(pose: Pose, previous: Pose, solution: PoseSolution, problem: MapAlignment) -> Pose:

@@ -30,7 +30,7 @@ class Features:
     binary descriptors."""
 
     block: PositiveInt = 80  # keyframes looked at in one frame
-    every: PositiveInt = 5  # frames between looks at older sub-maps, while the camera is tracked in one that is not tied to them
+    every: PositiveInt = 5  # frames between looks at older sub-maps, while the camera is tracked in one that is not connected to them
     candidates: PositiveInt = 20  # of them, whose landmarks make hypotheses
     max_bits: NonNegativeInt = 64  # of 256 between descriptors; the mean of strangers is 128
     ratio: PositiveShare = 0.85  # best to second best descriptor

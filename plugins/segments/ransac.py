@@ -9,7 +9,6 @@ from trihedron.pipeline.core.options import NonNegativeFloat, PositiveFloat, Pos
 from trihedron.pipeline.core.registry import register
 from trihedron.pipeline.core.types import Frame, LineSegments, Segments
 from trihedron.plugins.segments.ransac_kernels import lift_segments
-from trihedron.plugins.shared.depth_image import noise_coefficients
 
 
 @register("segments", "ransac")
@@ -37,7 +36,7 @@ class Ransac:
             frame.depth_m,
             lines.endpoints_px,
             (float(camera.fx), float(camera.fy), float(camera.cx), float(camera.cy)),
-            noise_coefficients(camera.depth_noise),
+            camera.depth_noise.coefficients,
             self.samples,
             self.side_px,
             self.edge,

@@ -118,7 +118,7 @@ def _sample(
 
 @kernel
 def _interpolated(depth: F32, x: float, y: float) -> tuple[bool, float, float]:
-    """Whether the four depths around (x, y) exist, their bilinear value, and their spread."""
+    """Return True if the four depths around (x, y) exist, their bilinear value, and their spread."""
     c, r = int(np.floor(x)), int(np.floor(y))
     if not ((c >= 0) & (c < depth.shape[1] - 1) & (r >= 0) & (r < depth.shape[0] - 1)):
         return False, 0.0, 0.0

@@ -12,8 +12,7 @@ import numpy as np
 from trihedron.pipeline.core.types import F32, F64, I32, U8, Camera, Frame, Map, Planes, Pose
 from trihedron.plugins.shared.image_reduction_kernels import reduced
 from trihedron.plugins.shared.keyframe_views_kernels import add_readings, count_novel
-from trihedron.plugins.shared.voxel_hash import empty_table, reserve
-from trihedron.plugins.shared.voxel_hash_kernels import I64
+from trihedron.plugins.shared.voxel_hash_kernels import I64, empty_table, reserve
 
 
 @dataclass(frozen=True)

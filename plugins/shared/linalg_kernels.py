@@ -1,4 +1,4 @@
-"""Kernels of small linear algebra: Cholesky, inverses, tangent basis, nearest rotation (polar decomposition); and sorting and medians."""
+"""Kernels of small linear algebra: Cholesky, inverses, tangent basis, nearest rotation (polar decomposition); and sorting."""
 # mypy: disable-error-code="arg-type, assignment, index, return-value"
 
 from __future__ import annotations
@@ -163,7 +163,7 @@ def _from_columns(A: F64, V: F64) -> F64:
     return out
 
 
-# Sorting and medians, without the interpreter's lock.
+# Sorting, without the interpreter's lock.
 
 DIGIT = 11  # bits sorted by at a time: six digits of a double, whose counts stay in the nearest cache
 
@@ -191,42 +191,6 @@ def descending(values: F64) -> I32:
             count[digit] += 1
         keys, sorted_keys, order, other = sorted_keys, keys, other, order
     return order
-
-
-@kernel
-def few_descending(values: F64) -> I32:
-    """Sort like `descending`, by insertion: for a handful of numbers."""
-    order = np.empty(len(values), np.int32)
-    for k in range(len(values)):
-        place = k
-        while place > 0 and values[order[place - 1]] < values[k]:
-            order[place] = order[place - 1]
-            place -= 1
-        order[place] = k
-    return order
-
-
-@kernel
-def median(values: F64) -> float:
-    """Return the median of (n,) numbers, n > 0, and reorder them (Hoare's selection)."""
-    middle, low, high = len(values) // 2, 0, len(values) - 1
-    while low < high:
-        pivot, i, j = values[(low + high) // 2], low, high
-        while i <= j:
-            while values[i] < pivot:
-                i += 1
-            while values[j] > pivot:
-                j -= 1
-            if i <= j:
-                values[i], values[j] = values[j], values[i]
-                i, j = i + 1, j - 1
-        low, high = i if j < middle else low, j if middle < i else high
-    if len(values) % 2:
-        return float(values[middle])
-    below = values[0]
-    for i in range(1, middle):
-        below = max(below, values[i])
-    return float(0.5 * (below + values[middle]))
 
 
 @kernel

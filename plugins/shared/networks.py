@@ -22,7 +22,7 @@ from trihedron.pipeline.core.files import MAX_NETWORK_BYTES, read_file
 from trihedron.pipeline.core.types import F32, F64, Frame
 from trihedron.plugins.shared.libraries import onnxruntime
 
-WHERE = "docs/reference/networks.md says where networks are published"
+WHERE = "docs/reference/networks.md lists where networks are published"
 MESSAGE = 256  # characters of a library's message that are shown
 CENTRE, DESCRIPTOR_GAIN = 128.0, 256.0  # of the bytes that stand for the numbers of a unit vector
 HISTOGRAM_BYTES = 128  # least length of descriptors that are compared by Euclidean distance

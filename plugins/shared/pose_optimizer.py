@@ -64,21 +64,14 @@ def solve_pose(
     `prior_information` (6, 6), positive definite, is that of xi in `T = T_prior · (R_prior-frame translation, rotation)`. With `fixed_rotation`
     only the position is estimated (eqs. 2–7). Never raises: without terms the prior's mean is returned. A plane beyond its gate is retained, with a
     Huber weight, where nothing else observes a direction: a bare room has few walls, and rejecting 5 % of them is too much."""
-    terms = points, lines, planes
-    solution = _solve_with_slack(T_world_camera, camera, T_prior, prior_information, terms, fixed_rotation, 1.0)
-    if solution.unobservable.shape[1] and not solution.planes.all():
-        return _solve_with_slack(T_world_camera, camera, T_prior, prior_information, terms, fixed_rotation, PLANE_SLACK)
-    return solution
-
-
-def _solve_with_slack(
-    T_world_camera: F64, camera: Camera, T_prior: F64, prior_information: F64, terms: Terms, fixed_rotation: bool, slack: float
-) -> PoseSolution:
-    """`solve_pose` with the planes' gates multiplied by `slack`."""
-    free, flags = 3 if fixed_rotation else 6, _all_inliers(terms)
-    prior = np.array(prior_information, np.float64)
-    T, covariance, data, _, cost, complete = solve(np.array([T_world_camera, T_prior]), prior, camera.intrinsics, *terms, flags, free, ROUNDS, slack)
-    unobservable = np.empty((free, 0)) if complete else _unobservable(data, prior[:free, :free])
+    terms, free = (points, lines, planes), 3 if fixed_rotation else 6
+    poses, prior = np.array([T_world_camera, T_prior]), np.array(prior_information, np.float64)
+    for slack in (1.0, PLANE_SLACK):
+        flags = _all_inliers(terms)
+        T, covariance, data, _, cost, complete = solve(poses, prior, camera.intrinsics, *terms, flags, free, ROUNDS, slack)
+        unobservable = np.empty((free, 0)) if complete else _unobservable(data, prior[:free, :free])
+        if not unobservable.shape[1] or flags.planes.all():
+            break
     return PoseSolution(T, covariance, unobservable, *flags, cost)
 
 

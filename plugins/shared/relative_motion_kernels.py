@@ -14,7 +14,7 @@ import numpy as np
 from trihedron.pipeline.core.kernel import kernel
 from trihedron.pipeline.core.types import F32, F64, I32
 from trihedron.plugins.shared.lie_kernels import left_multiply_exp
-from trihedron.plugins.shared.linalg_kernels import add_triangle, add_triple, inverse_positive, median, solve_positive, tangent_columns
+from trihedron.plugins.shared.linalg_kernels import add_triangle, add_triple, inverse_positive, solve_positive, tangent_columns
 
 SHORTEST_M = 1e-3  # line
 MOST = 400  # points used, about; more only cost time
@@ -80,7 +80,7 @@ def estimate_motion(
         for j in range(3):
             R[i, j] = start[i, j]
     residuals = _squared_distances(terms, R, t)
-    scale2 = max(2.0 * median(residuals), GATE2) if len(residuals) else GATE2
+    scale2 = max(2.0 * np.median(residuals), GATE2) if len(residuals) else GATE2
     H, chi2, support = _gauss_newton(terms, R, t, prior, scale2)
     scale = max(chi2 / max(3.0 * support - 6.0, 1.0), 1.0)
     for i in range(6):

@@ -1,4 +1,4 @@
-"""Kernel of `rigid_alignment.py`: the rigid motion with most inliers, from three pairs at a time (RANSAC: Fischler and Bolles, CACM 1981)."""
+"""Kernels of rigid motions from three pairs of points at a time (RANSAC: Fischler and Bolles, CACM 1981): the best one, or all with their inliers."""
 # mypy: disable-error-code="arg-type, assignment, index, return-value"
 
 from __future__ import annotations
@@ -7,6 +7,7 @@ import numpy as np
 
 from trihedron.pipeline.core.kernel import kernel
 from trihedron.pipeline.core.types import F64, I32
+from trihedron.plugins.shared.linalg_kernels import polar_rotation
 
 LEAST_M = 0.05  # between the three points of a sample
 
@@ -23,6 +24,16 @@ def _frame(a: F64, b: F64, c: F64, out: F64) -> bool:
     out[:, 0], out[:, 1] = u, n
     out[0, 2], out[1, 2], out[2, 2] = u[1] * n[2] - u[2] * n[1], u[2] * n[0] - u[0] * n[2], u[0] * n[1] - u[1] * n[0]
     return True
+
+
+@kernel(forceinline=True)
+def _squared_error(R: F64, t: F64, before: F64, after: F64, m: int) -> float:
+    """Squared distance `|R before + t - after|²` of pair m."""
+    total = 0.0
+    for r in range(3):
+        e = R[r, 0] * before[m, 0] + R[r, 1] * before[m, 1] + R[r, 2] * before[m, 2] + t[r] - after[m, r]
+        total += e * e
+    return total
 
 
 @kernel
@@ -43,11 +54,49 @@ def best_motion(before: F64, after: F64, reach: F64, samples: I32) -> tuple[F64,
                 t[r] += (after[m, r] - R[r, 0] * before[m, 0] - R[r, 1] * before[m, 1] - R[r, 2] * before[m, 2]) / 3.0
         count = 0
         for m in range(len(before)):
-            total = 0.0
-            for r in range(3):
-                e = R[r, 0] * before[m, 0] + R[r, 1] * before[m, 1] + R[r, 2] * before[m, 2] + t[r] - after[m, r]
-                total += e * e
-            count += total < reach[m] * reach[m]
+            count += _squared_error(R, t, before, after, m) < reach[m] * reach[m]
         if count > best:
             best, R_best, t_best = count, R.copy(), t.copy()
     return R_best, t_best
+
+
+@kernel
+def _is_consistent(camera_m: F64, world_m: F64, limit: F64, i: int, j: int) -> bool:
+    """Return True if two points have the same distance in the camera and in the world, and one that is long enough."""
+    here, there = 0.0, 0.0
+    for r in range(3):
+        here += (camera_m[i, r] - camera_m[j, r]) ** 2
+        there += (world_m[i, r] - world_m[j, r]) ** 2
+    return here > 0.1**2 and abs(np.sqrt(here) - np.sqrt(there)) <= limit[i] + limit[j]
+
+
+@kernel
+def rigid_hypotheses_kernel(camera_m: F64, world_m: F64, limit: F64, samples: I32) -> tuple[F64, I32]:
+    """Solve the pose of each sample and count its inliers; 0 for one whose triangles differ."""
+    poses, inliers = np.zeros((len(samples), 4, 4)), np.zeros(len(samples), np.int32)
+    M, p, q, t = np.empty((3, 3)), np.empty(3), np.empty(3), np.empty(3)
+    for k in range(len(samples)):
+        a, b, c = samples[k, 0], samples[k, 1], samples[k, 2]
+        if a in (b, c) or b == c:
+            continue
+        if not (
+            _is_consistent(camera_m, world_m, limit, a, b)
+            and _is_consistent(camera_m, world_m, limit, b, c)
+            and _is_consistent(camera_m, world_m, limit, c, a)
+        ):
+            continue
+        for r in range(3):
+            p[r] = (camera_m[a, r] + camera_m[b, r] + camera_m[c, r]) / 3.0
+            q[r] = (world_m[a, r] + world_m[b, r] + world_m[c, r]) / 3.0
+        for r in range(3):
+            for s in range(3):
+                M[r, s] = 0.0
+                for i in (a, b, c):
+                    M[r, s] += (world_m[i, r] - q[r]) * (camera_m[i, s] - p[s])
+        R = polar_rotation(M)
+        for r in range(3):
+            t[r] = q[r] - (R[r, 0] * p[0] + R[r, 1] * p[1] + R[r, 2] * p[2])
+        for i in range(len(camera_m)):
+            inliers[k] += _squared_error(R, t, camera_m, world_m, i) <= limit[i] * limit[i]
+        poses[k, :3, :3], poses[k, :3, 3], poses[k, 3, 3] = R, t, 1.0
+    return poses, inliers

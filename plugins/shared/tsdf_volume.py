@@ -12,8 +12,7 @@ import numpy as np
 
 from trihedron.pipeline.core.types import F32, F64, I32, U8, Camera
 from trihedron.plugins.shared.tsdf_volume_kernels import SIDE, find_blocks, insert_blocks, integrate
-from trihedron.plugins.shared.voxel_hash import empty_table, reserve
-from trihedron.plugins.shared.voxel_hash_kernels import I64, absent
+from trihedron.plugins.shared.voxel_hash_kernels import I64, absent, empty_table, reserve
 
 CELLS = SIDE**3
 LEAST_M = 0.01  # distance of a plane from the camera, below which it is seen from its edge

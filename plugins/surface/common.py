@@ -1,4 +1,4 @@
-"""What all surfaces have in common: the fold that gathers views, and the one that also fuses them as they come."""
+"""Shared parts of all surfaces: the fold that gathers views, and the one that also fuses them as they come."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from trihedron.plugins.shared.tsdf_volume import CELLS, Volume
 from trihedron.plugins.surface.common_kernels import neighbours, off_planes, paint, signs_kernel, triangles_kernel, untangled, vertices_kernel
 from trihedron.plugins.surface.common_meshes import compacted, plane_axes, triangle_areas, vertex_normals, with_single_fans, without_crumbs
 
-NEWS_COLUMNS = 80  # of readings that are asked for news
+NOVELTY_COLUMNS = 80  # of readings that are tested for novelty
 AHEAD_M = 2.0  # a pose has moved by as much as the camera and a point this far before it have
 CELL_M = 0.1  # of what is remembered to be known
 
@@ -63,14 +63,14 @@ class ViewFold:
         return Gathered()
 
     def add(self, state: Gathered, frame: Frame, planes: Planes, rotation: Rotation | None, pose: Pose, map: Map | None) -> Gathered:
-        """Keep the frame if it was tracked and tells something new."""
+        """Keep the frame if it was tracked and shows something new."""
         state.index, state.stamp_ns = frame.index, frame.stamp_ns
         if rotation is not None and len(rotation.weights):
             state.axes = rotation.R_world_manhattan[int(np.argmax(rotation.weights))]
         if pose.status == LOST:
             return state
         frame = with_measured_noise(frame, planes)
-        points, weight = readings(frame, pose.T_world_camera, max(1, frame.camera.width // NEWS_COLUMNS), self.max_sigma_m)
+        points, weight = readings(frame, pose.T_world_camera, max(1, frame.camera.width // NOVELTY_COLUMNS), self.max_sigma_m)
         known = state.known.setdefault(pose.submap, Known(CELL_M))
         if len(points) and known.novelty(points, weight, self.views) >= self.news:
             known.learn(points, weight)
@@ -80,7 +80,7 @@ class ViewFold:
         return state
 
     def _kept(self, state: Gathered, view: KeyframeView) -> None:
-        """What else is done with a view that was kept."""
+        """Process a view that was kept."""
 
 
 @dataclass(frozen=True)
@@ -108,7 +108,7 @@ class VolumeFold(ViewFold):
     def _volume(self, state: Gathered, map: Map | None) -> Volume:
         """The volume of all views at their final poses."""
         finals = [view.settled(map) for view in state.views]
-        if state.volume is not None and all(_moved_m(said, final) <= self.rebuild_m for said, final in zip(state.fused, finals)):
+        if state.volume is not None and all(_moved_m(fused_at, final) <= self.rebuild_m for fused_at, final in zip(state.fused, finals)):
             return state.volume
         volume = Volume(self.voxel_m, self.truncation_m)
         for view, T in zip(state.views, finals):
@@ -117,17 +117,17 @@ class VolumeFold(ViewFold):
         return volume
 
     def _mesh(self, state: Gathered, map: Map | None) -> tuple[F64, I32]:
-        """Vertices (v, 3) and triangles (t, 3) of the zero level at the final poses, without crumbs."""
+        """Vertices (v, 3) and triangles (t, 3) of the zero level at the final poses, without small fragments."""
         vertices, triangles = zero_level(self._volume(state, map), 1.0 / self.max_error_m**2)
         return with_single_fans(vertices, without_crumbs(vertices, triangles, self.crumb_m2))
 
 
-def _moved_m(said: F64 | None, final: F64 | None) -> float:
-    """How far a view has moved; infinite when it was fused and should not be, or the other way round."""
-    if said is None or final is None:
-        return 0.0 if said is final else float("inf")
+def _moved_m(fused_at: F64 | None, final: F64 | None) -> float:
+    """Distance that a view has moved; infinite when it was fused and should not be, or the other way round."""
+    if fused_at is None or final is None:
+        return 0.0 if fused_at is final else float("inf")
     ahead = np.array([[0.0, 0.0, 0.0, 1.0], [0.0, 0.0, AHEAD_M, 1.0]])
-    return float(np.linalg.norm((ahead @ (final - said).T)[:, :3], axis=1).max())
+    return float(np.linalg.norm((ahead @ (final - fused_at).T)[:, :3], axis=1).max())
 
 
 # How noisy a depth image is, by its own planes: a data set does not always say what made it.
@@ -141,9 +141,9 @@ def with_measured_noise(frame: Frame, planes: Planes) -> Frame:
     """The frame with its camera's depth noise scaled to what half of the readings on planes show of it; never above the camera's own, and never below
     its floor."""
     camera, noise = frame.camera, frame.camera.depth_noise
-    lens = camera.intrinsics
+    intrinsics = camera.intrinsics
     step = max(1, planes.labels.shape[1] // COLUMNS)
-    off, depth = off_planes(frame.depth_m, planes.labels, planes.coefficients, planes.stride, step, lens)
+    off, depth = off_planes(frame.depth_m, planes.labels, planes.coefficients, planes.stride, step, intrinsics)
     if len(off) < LEAST:
         return frame
     scale = float(min(1.0, MAD_TO_SIGMA * np.median(off / noise.sigma_m(depth))))
@@ -243,9 +243,9 @@ def painted(points: F64, normals: F64, views: Sequence[tuple[KeyframeView, F64]]
     for row in np.unique(np.linspace(0, max(len(views) - 1, 0), min(MOST, len(views))).round().astype(int)):
         view, T = views[row]
         c = view.camera
-        lens = c.intrinsics.astype(np.float32)
+        intrinsics = c.intrinsics.astype(np.float32)
         near = (NEAR_M + VISIBLE_SIGMAS * c.depth_noise.sigma_m(np.arange(0.0, 16.0, 0.1))).astype(np.float32)
-        paint(points32, normals32, view.depth_m, view.color, T[:3, :3].T.astype(np.float32), T[:3, 3].astype(np.float32), lens, near, total)
+        paint(points32, normals32, view.depth_m, view.color, T[:3, :3].T.astype(np.float32), T[:3, 3].astype(np.float32), intrinsics, near, total)
     seen = total[:, 3] > 0.0
     colors = np.rint(total[:, :3] / np.maximum(total[:, 3:], 1e-20))
     return np.where(seen[:, None], colors, UNSEEN).astype(np.uint8), seen
@@ -324,7 +324,7 @@ def _spread(picture: U8, seen: Bool) -> U8:
     if seen.all() or not seen.any():
         return picture
     rows, columns = distance_transform_edt(~seen, return_distances=False, return_indices=True)
-    return picture[rows, columns]
+    return np.asarray(picture[rows, columns])
 
 
 def _packed(sizes: I32) -> tuple[I32, tuple[int, int]]:

@@ -14,8 +14,8 @@ from trihedron.plugins.shared.voxel_hash_kernels import I64, number_of
 
 
 @kernel
-def off_planes(depth: F32, labels: U8, planes: F64, stride: int, step: int, lens: F64) -> tuple[F64, F64]:
-    """How far readings (n,) are from their planes along their rays, and their depth."""
+def off_planes(depth: F32, labels: U8, planes: F64, stride: int, step: int, intrinsics: F64) -> tuple[F64, F64]:
+    """Distances of readings (n,) from their planes along their rays, and their depth."""
     h, w = labels.shape
     off, read, count = np.empty(h * w), np.empty(h * w), 0
     for r in range(0, h, step):
@@ -24,7 +24,7 @@ def off_planes(depth: F32, labels: U8, planes: F64, stride: int, step: int, lens
             if labels[r, c] == 0 or v >= depth.shape[0] or u >= depth.shape[1] or not depth[v, u] > 0.0:
                 continue
             n = planes[labels[r, c] - 1]
-            slope = n[0] * (u - lens[2]) / lens[0] + n[1] * (v - lens[3]) / lens[1] + n[2]
+            slope = n[0] * (u - intrinsics[2]) / intrinsics[0] + n[1] * (v - intrinsics[3]) / intrinsics[1] + n[2]
             if slope < 0.0:  # towards the camera
                 off[count], read[count] = abs(depth[v, u] + n[3] / slope), depth[v, u]
                 count += 1
@@ -32,7 +32,7 @@ def off_planes(depth: F32, labels: U8, planes: F64, stride: int, step: int, lens
 
 
 @kernel
-def paint(points: F32, normals: F32, depth: F32, color: U8, R: F32, position: F32, lens: F32, near: F32, total: F32) -> None:
+def paint(points: F32, normals: F32, depth: F32, color: U8, R: F32, position: F32, intrinsics: F32, near: F32, total: F32) -> None:
     """Add the colours one view gives, times their weight, and the weight, to `total` (n, 4). R is `R_camera_world`."""
     h, w = depth.shape
     for i in range(len(points)):
@@ -40,8 +40,8 @@ def paint(points: F32, normals: F32, depth: F32, color: U8, R: F32, position: F3
         z = R[2, 0] * gx + R[2, 1] * gy + R[2, 2] * gz
         if z < 0.1:
             continue
-        u = lens[0] * (R[0, 0] * gx + R[0, 1] * gy + R[0, 2] * gz) / z + lens[2]
-        v = lens[1] * (R[1, 0] * gx + R[1, 1] * gy + R[1, 2] * gz) / z + lens[3]
+        u = intrinsics[0] * (R[0, 0] * gx + R[0, 1] * gy + R[0, 2] * gz) / z + intrinsics[2]
+        v = intrinsics[1] * (R[1, 0] * gx + R[1, 1] * gy + R[1, 2] * gz) / z + intrinsics[3]
         if u < 0.0 or v < 0.0 or u > w - 1.0 or v > h - 1.0:
             continue
         facing = -(normals[i, 0] * gx + normals[i, 1] * gy + normals[i, 2] * gz)

@@ -1,4 +1,4 @@
-"""What neighbours what in a triangle mesh. Half-edge 3 t + k runs from corner k of triangle t to the next one."""
+"""Adjacency in a triangle mesh. Half-edge 3 t + k runs from corner k of triangle t to the next one."""
 
 from __future__ import annotations
 
@@ -41,13 +41,13 @@ def vertex_normals(vertices: F64, triangles: I32) -> F64:
     """(v, 3) unit normals, the mean of those of the triangles (t, 3) about a vertex weighed by their areas; zero where there is none."""
     total = np.zeros_like(vertices)
     gather(triangle_normals(vertices, triangles), triangles, total)
-    return total / np.maximum(np.sqrt((total**2).sum(axis=1)), 1e-12)[:, None]
+    return np.asarray(total / np.maximum(np.sqrt((total**2).sum(axis=1)), 1e-12)[:, None])
 
 
 def without_crumbs(vertices: F64, triangles: I32, least_m2: float) -> I32:
     """The triangles (n, 3) of those connected sets that have at least that area."""
     parts, count = connected(opposite_half_edges(triangles), np.zeros(len(triangles), np.int32))
-    return triangles[np.bincount(parts, triangle_areas(vertices, triangles), count)[parts] >= least_m2]
+    return np.asarray(triangles[np.bincount(parts, triangle_areas(vertices, triangles), count)[parts] >= least_m2])
 
 
 def compacted(vertices: F64, triangles: I32) -> tuple[F64, I32, I32]:

@@ -307,8 +307,8 @@ def _targets(u: int, mine: I32, vertices: F64, triangles: I32, border: Bool, bes
 
 @kernel
 def _allowed(u: int, v: int, mine: I32, theirs: I32, vertices: F64, triangles: I32, labels: I32, normals: F64, mark: I64, stamp: int) -> bool:
-    """Whether u may be drawn into v: the two have no common neighbours but those across from their edge (link condition), and no triangle turns
-    over."""
+    """Return True if u may be drawn into v: the two have no common neighbours but those across from their edge (link condition), and no triangle
+    turns over."""
     removed = 0
     for t in mine:
         has = triangles[t, 0] == v or triangles[t, 1] == v or triangles[t, 2] == v

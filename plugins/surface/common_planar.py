@@ -1,4 +1,4 @@
-"""What the planar meshes have in common: a dense mesh, and which of it lies in planes."""
+"""Shared parts of the planar meshes: a dense mesh, and the part of it that lies in planes."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ class PlanarFold(VolumeFold):
         return Flatness(self.distance_m, self.angle_deg, self.rim_m, self.rim, self.area_m2, self.bend_per_m)
 
     def _surface(self, state: Gathered, map: Map | None, rest: bool) -> Surface:
-        """The planes as polygons; `rest` says whether the triangles that lie in none stay, joined to them."""
+        """The planes as polygons; with `rest` the triangles that lie in none stay, joined to them."""
         vertices, triangles = self._mesh(state, map)
         opposite = opposite_half_edges(triangles)
         ids, known = map_planes(map)
@@ -85,7 +85,7 @@ class PlanarFold(VolumeFold):
 
 @dataclass(frozen=True)
 class Flatness:
-    """What counts as flat."""
+    """Criteria of a flat region."""
 
     distance_m: float  # of a vertex from its plane
     angle_deg: float  # between the mesh's normal there and the plane's

@@ -200,7 +200,7 @@ def bends_kernel(parts: I32, count: int, labels: I32, middle: F64, area: F64, fr
             for i in range(6):
                 normal[c, :i, i] = normal[c, i, :i]
             for i in range(3, 6):
-                normal[c, i, i] += 1e-9 * total[c]  # a strip says nothing of its curvature across
+                normal[c, i, i] += 1e-9 * total[c]  # a strip does not determine its curvature across
             q = np.linalg.solve(normal[c] + 1e-12 * np.eye(6), right[c])
             bend[c] = abs(0.5 * (q[3] + q[5])) + np.sqrt(0.25 * (q[3] - q[5]) ** 2 + q[4] ** 2)
     return bend
@@ -290,7 +290,7 @@ def unfold(points: F64, triangles: I32, normals: F64, rows: I32, starts: I32) ->
 
 @kernel(inline="always")
 def _includes(larger: I32, smaller: I32) -> bool:
-    """Whether an ascending list holds another."""
+    """Return True if an ascending list holds another."""
     at = 0
     for wanted in smaller:
         while at < len(larger) and larger[at] < wanted:

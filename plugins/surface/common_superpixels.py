@@ -10,7 +10,7 @@ import numpy as np
 from trihedron.pipeline.core.geometry import transform_planes
 from trihedron.pipeline.core.types import F64, I32
 from trihedron.plugins.shared.keyframe_views import KeyframeView
-from trihedron.plugins.shared.voxel_hash import empty_table
+from trihedron.plugins.shared.voxel_hash_kernels import empty_table
 from trihedron.plugins.surface.common_superpixels_kernels import COLUMNS, assigned_kernel, fuse, surfels_kernel
 
 SAMPLE_STEP = 4  # px between the points that a region is compared by
@@ -85,17 +85,17 @@ def superpixels(view: KeyframeView, side_px: int, coarse_px: int) -> F64:
     views, 1. The side of a superpixel is `coarse_px` in planar regions and `side_px` elsewhere."""
     gray = view.color.astype(np.float32).mean(axis=2)
     c = view.camera
-    lens = c.intrinsics
+    intrinsics = c.intrinsics
     found = []
     for planar, side in ((True, coarse_px), (False, side_px)):
         mask = (view.depth_m > 0.0) & ((view.labels > 0) == planar)
         assigned = assigned_kernel(view.depth_m, gray, view.labels, mask, side)
-        found.append(surfels_kernel(view.depth_m, view.color, view.labels, assigned, lens, side, int(assigned.max()) + 1))
+        found.append(surfels_kernel(view.depth_m, view.color, view.labels, assigned, intrinsics, side, int(assigned.max()) + 1))
     surfels = np.concatenate(found)
     sigma = c.depth_noise.sigma_m(surfels[:, 2])
     flat = surfels[:, 10] <= (UNEVEN * sigma + UNEVEN_M) ** 2
     surfels[:, 10], surfels[:, 12] = 1.0 / sigma**2, 1.0
-    return surfels[flat]
+    return np.asarray(surfels[flat])
 
 
 def moved(surfels: F64, T_a_b: F64) -> F64:

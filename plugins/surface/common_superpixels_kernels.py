@@ -68,7 +68,7 @@ def assigned_kernel(depth: F32, gray: F32, labels: U8, mask: U8, side: int) -> I
 
 
 @kernel
-def surfels_kernel(depth: F32, color: U8, labels: U8, assigned: I32, lens: F64, side: int, count: int) -> F64:
+def surfels_kernel(depth: F32, color: U8, labels: U8, assigned: I32, intrinsics: F64, side: int, count: int) -> F64:
     """(n, 13) one for each superpixel of at least a quarter of its square, camera frame: its mean point, and the plane of least squares through
     it."""
     h, w = depth.shape
@@ -80,8 +80,8 @@ def surfels_kernel(depth: F32, color: U8, labels: U8, assigned: I32, lens: F64, 
             if k >= 0:
                 z = float(depth[y, x])
                 total[k, 0] += 1.0
-                total[k, 1] += (x - lens[2]) / lens[0] * z
-                total[k, 2] += (y - lens[3]) / lens[1] * z
+                total[k, 1] += (x - intrinsics[2]) / intrinsics[0] * z
+                total[k, 2] += (y - intrinsics[3]) / intrinsics[1] * z
                 total[k, 3] += z
                 for i in range(3):
                     total[k, 4 + i] += color[y, x, i]
@@ -91,7 +91,11 @@ def surfels_kernel(depth: F32, color: U8, labels: U8, assigned: I32, lens: F64, 
             k = assigned[y, x]
             if k >= 0:
                 n, z = total[k, 0], float(depth[y, x])
-                px, py, pz = (x - lens[2]) / lens[0] * z - total[k, 1] / n, (y - lens[3]) / lens[1] * z - total[k, 2] / n, z - total[k, 3] / n
+                px, py, pz = (
+                    (x - intrinsics[2]) / intrinsics[0] * z - total[k, 1] / n,
+                    (y - intrinsics[3]) / intrinsics[1] * z - total[k, 2] / n,
+                    z - total[k, 3] / n,
+                )
                 scatter[k, 0, 0] += px * px
                 scatter[k, 1, 0] += py * px
                 scatter[k, 1, 1] += py * py

@@ -83,4 +83,4 @@ def _faces(points: F64, edges: I32) -> I32:
     joined = keys[np.minimum(np.searchsorted(keys, wanted), len(keys) - 1)] == wanted
     u, v = points[b] - points[a], points[c] - points[a]
     good = joined & (u[:, 0] * v[:, 1] - u[:, 1] * v[:, 0] > 0.0) & (a < b) & (a < c)
-    return np.stack([a, b, c], axis=1)[good].astype(np.int32)
+    return np.asarray(np.stack([a, b, c], axis=1)[good].astype(np.int32))

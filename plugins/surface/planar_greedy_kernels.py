@@ -41,7 +41,7 @@ def accepted(points: F64, edges: I32, length: F64, distance: F64, nearest: I32) 
 
 @kernel
 def _any_crosses(points: F64, a: int, b: int, c: int, partners: I32, degree: I32) -> bool:
-    """Whether an accepted edge from c crosses ab."""
+    """Return True if an accepted edge from c crosses ab."""
     for k in range(degree[c]):
         d = partners[c, k]
         if c != a and c != b and d != a and d != b and _crosses(points[a], points[b], points[c], points[d]):
@@ -56,5 +56,5 @@ def _turn(a: F64, b: F64, c: F64) -> float:
 
 @kernel(inline="always")
 def _crosses(a: F64, b: F64, c: F64, d: F64) -> bool:
-    """Whether segments ab and cd cross or touch."""
+    """Return True if segments ab and cd cross or touch."""
     return _turn(a, b, c) * _turn(a, b, d) <= 0.0 and _turn(c, d, a) * _turn(c, d, b) <= 0.0

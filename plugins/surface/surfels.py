@@ -41,8 +41,8 @@ class Surfels(ViewFold):
         views = state.settled(map)
         ids, known = map_planes(map)
         found = observed_planes(views, known, self.region_deg, self.region_m)
-        tied = [surfels for view, surfels in zip(state.views, state.surfels) if view.settled(map) is not None]
-        placed = [moved(surfels, T) for surfels, (_, T) in zip(tied, views)]
+        settled = [surfels for view, surfels in zip(state.views, state.surfels) if view.settled(map) is not None]
+        placed = [moved(surfels, T) for surfels, (_, T) in zip(settled, views)]
         for surfels, planes in zip(placed, found.regions):
             surfels[:, 11] = np.append(planes, -1)[surfels[:, 11].astype(int)]
         agreed = fused(placed, float(np.cos(np.radians(self.angle_deg))))

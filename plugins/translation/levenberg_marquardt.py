@@ -11,7 +11,6 @@ from trihedron.pipeline.core.options import NonNegativeFloat, NonNegativeInt, Po
 from trihedron.pipeline.core.registry import register
 from trihedron.pipeline.core.types import F64, Camera, Keypoints, Map, Planes, Pose, Rotation, Segments, Tracks, Translation
 from trihedron.plugins.mapping.reference_keyframe import transform_to_map
-from trihedron.plugins.shared.depth_image import noise_coefficients
 from trihedron.plugins.shared.linalg import constant
 from trihedron.plugins.shared.pose_optimizer import Terms, solve_pose
 from trihedron.plugins.shared.relative_motion import pairs_of
@@ -78,7 +77,7 @@ class LevenbergMarquardt:
         """Convert the tracks to terms, the previous pose being T (4, 4) and the covariance of the fixed rotation `uncertain` (3, 3)."""
         points, lines, walls = pairs_of(tracks, keypoints, segments, planes)
         T, uncertain = constant(T, np.float64), constant(uncertain, np.float64)
-        fx, fy, noise = float(camera.fx), float(camera.fy), noise_coefficients(camera.depth_noise)
+        fx, fy, noise = float(camera.fx), float(camera.fy), camera.depth_noise.coefficients
         return (
             tracked_points(points, keypoints.pixels, fx, fy, T, uncertain),
             tracked_lines(lines, segments.endpoints_px, self.line_sigma_px, noise, fx, fy, T, uncertain),

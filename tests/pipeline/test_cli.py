@@ -85,7 +85,7 @@ def test_mistakes(capsys, words, code, line):
 @pytest.mark.parametrize("words, line", [
     (["dataset=tum"], "trihedron: dataset.path: is not set; give dataset.path=FOLDER"),
     (["dataset=tum", "dataset.path=no"], "trihedron: no: does not exist; give an existing folder as dataset.path"),
-    (["dataset=mcap"], "trihedron: dataset.path: is not set; give dataset.path=FILE.mcap"),
+    (["dataset=mcap"], "trihedron: dataset.path: is not set; give dataset.path=FILE.mcap, FILE.bag or the folder of a rosbag2"),
 ])  # fmt: skip
 def test_missing_data(capsys, words, line):
     assert main(["run", *words]) == 1

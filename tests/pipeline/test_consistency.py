@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from trihedron.pipeline.core.geometry import exp_se3
-from trihedron.pipeline.run.consistency import pose_consistency
+from trihedron.pipeline.run.consistency import pose_consistency, truth_noise
 
 SOMEWHERE = exp_se3(np.array([3.0, -1.0, 2.0, 0.4, -2.0, 1.0]))
 
@@ -48,3 +48,22 @@ def test_a_direction_that_is_worse_than_it_says_is_named():
     errors = rng.normal(size=(len(poses), 6)) * 1e-3 * np.array([1, 1, 5, 1, 1, 1])
     found = pose_consistency(poses, covariances, np.array([T @ exp_se3(e) for T, e in zip(poses, errors)]))
     assert np.argmax(found.normalised_rms) == 2 and found.normalised_rms[2] == pytest.approx(5.0, abs=0.3)
+
+
+@pytest.mark.parametrize("noisy", [False, True])
+def test_noise_of_the_truth_is_estimated_and_counted_in(noisy):
+    """A drift that no neighbours show, white errors of the estimate of 1 mm and 1 mrad, and of the truth of 4 mm and 3 mrad, or none."""
+    count, rng = 1500, np.random.default_rng(3)
+    sigma = np.repeat([4e-3, 3e-3], 3) * noisy
+    own, drift = 1e-3 * rng.normal(size=(count, 6)), np.cumsum(1e-5 * rng.normal(size=(count, 6)), axis=0)
+    true = np.array([exp_se3(np.array([0.01 * k, 0.0, 0.0, 0.0, 0.002 * k, 0.0])) for k in range(count)])
+    poses = np.array([T @ exp_se3(e + d) for T, e, d in zip(true, own, drift)])
+    measured = np.array([T @ exp_se3(sigma * e) for T, e in zip(true, rng.normal(size=(count, 6)))])
+    local = np.broadcast_to(1e-6 * np.eye(6), (count, 6, 6))
+    noise = truth_noise(poses, local, measured, np.arange(count, dtype=np.int32))
+    assert (noise.sigma_m, noise.sigma_rad) == pytest.approx((4e-3 * noisy, 3e-3 * noisy), rel=0.05, abs=4e-4)
+    stated = local + np.arange(1, count + 1)[:, None, None] * 1e-10 * np.eye(6)
+    found = pose_consistency(poses, stated, measured, noise)
+    assert found.nees_mean == pytest.approx(6.0, abs=0.8) and found.truth_sigma_m == noise.sigma_m
+    gaps = np.arange(0, 2 * count, 2, dtype=np.int32)
+    assert truth_noise(poses, local, measured, gaps).sigma_m == 0.0

@@ -14,7 +14,6 @@ from trihedron.plugins.planes.cape import Cape
 from trihedron.plugins.planes.common_blocks_kernels import block_mse, block_plane, block_planes, block_sums
 from trihedron.plugins.planes.common_kernels import drop_engulfed, normals_of_regions
 from trihedron.plugins.planes.ransac import Ransac
-from trihedron.plugins.shared.depth_image import noise_coefficients
 from trihedron.plugins.shared.depth_image_kernels import Grid, cell_inverse_depths, cell_rays
 
 CORNER = (((0.6, 0.0, -0.8), 2.2), ((-0.6, 0.0, -0.8), 2.2), ((0.0, -0.96, -0.28), 1.2))
@@ -34,7 +33,7 @@ def corner(analytic):
 
 def grid_of(frame, stride=2):
     camera = frame.camera
-    rho, sigma, count = cell_inverse_depths(frame.depth_m, stride, 0.04, 0.02, noise_coefficients(camera.depth_noise))
+    rho, sigma, count = cell_inverse_depths(frame.depth_m, stride, 0.04, 0.02, camera.depth_noise.coefficients)
     rays = cell_rays(*rho.shape, stride, (camera.fx, camera.fy, camera.cx, camera.cy))
     return Grid(rho, sigma, count, *rays, IntegralImage()(frame).normals)
 

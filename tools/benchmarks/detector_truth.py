@@ -66,7 +66,8 @@ class View:
         depth = self.depth_m[at[:, 1].clip(0, camera.height - 1), at[:, 0].clip(0, camera.width - 1)]
         points = transform(invert(other.T_world_camera) @ self.T_world_camera, camera.back_project(pixels, depth))
         places = camera.project(points)
-        inside = np.isfinite(places).all(axis=1) & (places >= 0).all(axis=1) & (places <= [camera.width - 1, camera.height - 1]).all(axis=1)
+        within = np.isfinite(places) & (places >= 0.0) & (places <= [camera.width - 1, camera.height - 1])
+        inside: Bool = np.asarray(within.all(axis=1))
         at = np.rint(np.where(inside[:, None], places, 0)).astype(int)
         there = other.depth_m[at[:, 1], at[:, 0]]
         return places, inside & (np.abs(there - points[:, 2]) <= VISIBLE * points[:, 2])
@@ -95,7 +96,7 @@ def main(argv: list[str]) -> int:
     return 0
 
 
-def views_of(pairs: int, **changes: bool) -> list[tuple[View, View]]:
+def views_of(pairs: int, **changes: Any) -> list[tuple[View, View]]:
     """Pairs of views, spread over the walk."""
     data = Synthetic(length=150, **changes)
     return [(_view(data, k), _view(data, k + APART)) for k in np.linspace(0, 149 - APART, pairs).astype(int)]
@@ -158,7 +159,8 @@ def judge_planes(first: View, second: View, a: Planes, b: Planes) -> Figures:
     angles, offsets = [0.0][:0], [0.0][:0]
     for view, value in ((first, a), (second, b)):
         truth, planes = true_regions(view, value.stride)
-        sizes, least = np.bincount(truth.ravel(), minlength=len(planes) + 1), LEAST_PX / value.stride**2
+        sizes = np.bincount(truth.ravel(), minlength=len(planes) + 1)
+        least = LEAST_PX / value.stride**2
         wanted += int(np.count_nonzero(sizes[1:] >= least))
         for k in range(len(value.coefficients)):
             mine = value.labels == k + 1
@@ -168,7 +170,7 @@ def judge_planes(first: View, second: View, a: Planes, b: Planes) -> Figures:
             if sizes[best] < least:
                 continue
             found += 1
-            if inside[best] >= OVERLAP * max(np.count_nonzero(mine & (truth > 0)), 1) and inside[best] >= OVERLAP * sizes[best]:
+            if inside[best] >= OVERLAP * max(int(np.count_nonzero(mine & (truth > 0))), 1) and inside[best] >= OVERLAP * sizes[best]:
                 correct += 1
                 true = planes[best - 1]
                 angles.append(float(np.degrees(np.arccos(min(value.coefficients[k, :3] @ true[:3], 1.0)))))

@@ -1,7 +1,7 @@
 """A long run in one process: memory, handles, threads and latency while the camera sees the same again and again.
 
 A walk of --loop frames is made once and shown forwards and backwards until there are --frames of them, so that the map is complete after the first
---warm-up and what grows from there on is a leak. It runs and is recorded as by `trihedron run`, 320×240 unless told otherwise. Each row is a thousand
+--warm-up and what grows from there on is a leak. It runs and is recorded as by `trihedron run`, 320×240 unless overridden. Each row is a thousand
 frames (--span): what the process holds (median), the map's living rows, times from hand-over to pose, the largest error of a position. Times are also
 given as multiples of those of the feature stages in the same frames, whatever else the machine does.
 
@@ -57,14 +57,14 @@ class BackAndForth:
         return None
 
     def shown(self, index: int) -> int:
-        """Which of the frames."""
+        """Frames that are shown."""
         there = index % max(2 * len(self.frames) - 2, 1)
         return min(there, 2 * len(self.frames) - 2 - there)
 
 
 @dataclass(frozen=True)
 class Row:
-    """What holds at the end of a span of frames, and over it."""
+    """State at the end of a span of frames, and over it."""
 
     frames: int
     memory_mb: float
@@ -93,8 +93,8 @@ def main(argv: list[str]) -> int:
         raise UsageError("benchmark long", "there are too few frames for two rows after the warm-up", "give more --frames, or a shorter --span")
     with tempfile.TemporaryDirectory() as folder:
         rows = measure(graph_of_words([*SMALL, *overrides]), Path(folder) / "run.mcap", arguments.frames, arguments.loop, arguments.span)
-    said, kept = report(rows, arguments.warm_up)
-    print(said)
+    text, kept = report(rows, arguments.warm_up)
+    print(text)
     if arguments.json:
         arguments.json.write_text(json.dumps({"machine": machine(), "rows": [asdict(row) for row in rows]}, indent=2) + "\n")
     return 0 if kept else 1
@@ -132,7 +132,7 @@ def _off_mm(pose: Pose, places: F64, shown: BackAndForth) -> float:
 
 
 def _living(map: Map) -> tuple[int, int]:
-    """How many keyframes and landmarks live."""
+    """Count the living keyframes and landmarks."""
     landmarks = sum(np.count_nonzero(kind.column("alive")) for kind in (map.points, map.lines, map.planes))
     return int(np.count_nonzero(map.keyframes.column("alive"))), int(landmarks)
 

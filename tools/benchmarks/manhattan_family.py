@@ -42,7 +42,7 @@ VARIANTS: dict[str, dict[str, bool]] = {  # of mean_shift
 
 
 class Answer(NamedTuple):
-    """What an estimator said of one view."""
+    """Result of an estimator on one view."""
 
     error_deg: float
     square: float  # the error's, in units of the covariance
@@ -90,9 +90,9 @@ def estimators(names: Sequence[str] = ()) -> dict[str, Any]:
 
 
 def measure(
-    chosen: dict[str, Any], count: int, cases: Sequence[str] = (*seen.CASES, *seen.WITHOUT_FRAME), told: Callable[[int], object] | None = None
+    chosen: dict[str, Any], count: int, cases: Sequence[str] = (*seen.CASES, *seen.WITHOUT_FRAME), done: Callable[[int], object] | None = None
 ) -> Answers:
-    """What each estimator says of `count` orientations, case by case; `told` hears of each orientation done."""
+    """Measure each estimator on `count` orientations, case by case; `done` is called after each orientation."""
     answers: Answers = defaultdict(list)
     scenes = seen.scenes()
     _warm_up(chosen, scenes[seen.WHOLE])
@@ -105,8 +105,8 @@ def measure(
                     part = view if without else seen.case_of(view, case)
                     if part is not None:
                         _ask(answers, chosen, depth, case, part)
-        if told is not None:
-            told(index)
+        if done is not None:
+            done(index)
     return answers
 
 
@@ -221,7 +221,7 @@ def _claims(pair: Sequence[dict[str, Any]]) -> str:
 
 
 def _times(cells: dict[Any, dict[str, Any]], name: str, reference_ms: float) -> list[str]:
-    """Of whole views with noisy depth: p50 and p95 from no start and from near, and the latter's p50 in reference workloads."""
+    """Times of whole views with noisy depth: p50 and p95 from no start and from near, and the latter's p50 in reference workloads."""
     pair = [cells.get((name, "noisy", seen.WHOLE, start)) for start in STARTS]
     if pair[0] is None or pair[1] is None:
         return ["-"] * 5

@@ -1,6 +1,6 @@
 """Rendered views with known axes, and the parts of them that estimators of the Manhattan frame are tried on.
 
-What a view shows is told by the exact normals of the faces behind its pixels, never by what was detected. An axis is *visible* when surfaces
+What a view shows is decided by the exact normals of the faces behind its pixels, never by what was detected. An axis is *visible* when surfaces
 facing along it cover AXIS_SHARE of the image. There is *no Manhattan frame* in a view when no two directions that each carry ABSENT_SHARE of the
 image are within RIGHT_ANGLE_DEG of a right angle. Such views are tried without lines, since a line in a wall is at right angles to its normal in
 any room. The leaning room shows nothing else; the room with two slanted walls does where floor and ceiling are out of sight.
@@ -41,7 +41,7 @@ STAGES = {"normals": "integral_image", "lines": "lsd", "segments": "ransac", "pl
 
 @dataclass(frozen=True)
 class View:
-    """What the feature stages found in one rendered view, the true axes `R_camera_manhattan`, and the true axis of each cell of the normals (-1 =
+    """Output of the feature stages for one rendered view, the true axes `R_camera_manhattan`, and the true axis of each cell of the normals (-1 =
     none) with the share of the image that each axis covers."""
 
     normals: Normals
@@ -71,8 +71,8 @@ class View:
 
     @cached_property
     def lines_turned(self) -> bool:
-        """Whether lines at right angles to one axis, but along neither of the two others, are in all longer than those along these: a turned crate or
-        a slanted pattern that fills the view is a Manhattan frame too, and the better supported one."""
+        """Return True if lines at right angles to one axis, but along neither of the two others, are in all longer than those along these: a turned
+        crate or a slanted pattern that fills the view is a Manhattan frame too, and the better supported one."""
         across = (self._cosines_of_lines <= np.sin(np.radians(ON_AXIS_DEG))) & ~self._on_axes.any(axis=1, keepdims=True)
         along = self._length @ self._on_axes
         return bool((self._length @ across >= along.sum() - along).any())
@@ -107,7 +107,7 @@ class Scene:
         return np.asarray(np.bincount(faces.ravel(), minlength=len(self.normals)) / faces.size)
 
     def shows_right_angle(self, faces: I32) -> bool:
-        """Whether two directions in view, each on ABSENT_SHARE of the image, are at right angles; parallel faces count together."""
+        """Return True if two directions in view, each on ABSENT_SHARE of the image, are at right angles; parallel faces count together."""
         cosine = np.abs(self.normals @ self.normals.T)
         carried = (cosine > np.cos(np.radians(1.0))) @ self.truth_of(faces)
         seen = np.flatnonzero(carried >= ABSENT_SHARE)
@@ -126,7 +126,7 @@ class Scene:
 
     @cached_property
     def rendered(self) -> tuple[Geometry, Atlas]:
-        """As the ray tracer wants it."""
+        """Scene in the form that the ray tracer takes."""
         return geometry_of(self.room), bake(all_faces(self.room), True, 0)
 
 
@@ -191,7 +191,7 @@ def called(plugin: Any, slot: str, index: int, given: dict[str, Any]) -> Any:
 
 
 def inputs_of(plugin: Any, slot: str, index: int, given: dict[str, Any]) -> dict[str, Any]:
-    """Those of the inputs that a stage takes, and the randomness of its frame if it asks for it."""
+    """Inputs that a stage takes, and the randomness of its frame if it asks for it."""
     given = {**given, "rng": np.random.default_rng([0, index])}
     return {name: given[name] for name in parameters_of_method(slot, type(plugin))}
 
@@ -207,14 +207,14 @@ def case_of(view: View, case: str) -> View | None:
         number = 3 if case == "three planes" else 2
         upon = largest[:number]
         return _only(_without_lines(view), np.isin(view.axes, upon), np.isin(view.axes_of_planes, upon)) if visible.sum() >= number else None
-    told = view.lines_on_axes >= AXIS_LINES
+    measured = view.lines_on_axes >= AXIS_LINES
     if case == "one plane + lines":
         rows = np.flatnonzero(view.axes_of_planes == largest[0])[:1]
-        if len(rows) == 0 or not visible[largest[0]] or not told[largest[1:]].any():
+        if len(rows) == 0 or not visible[largest[0]] or not measured[largest[1:]].any():
             return None
         return _only(view, view.planes.labels == rows[0] + 1, np.arange(len(view.planes.pixels)) == rows[0])
     if case == "lines only":
-        if (told & (view.length_on_axes >= AXIS_SHARE)).sum() < 2 or view.lines_turned:
+        if (measured & (view.length_on_axes >= AXIS_SHARE)).sum() < 2 or view.lines_turned:
             return None
         return _only(view, np.zeros(view.axes.shape, np.bool_), np.zeros(len(view.planes.pixels), np.bool_))
     if case == CLUTTER:

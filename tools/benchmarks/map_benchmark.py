@@ -71,7 +71,7 @@ def main(argv: list[str]) -> int:
 
 
 def _sequences(text: str) -> Sequences:
-    """Those of `KIND:FOLDER,...`, the built-in rooms first."""
+    """Sequences of `KIND:FOLDER,...`, the built-in rooms first."""
     found: Sequences = {name: ("synthetic", options) for name, options in ROOMS.items()}
     for word in filter(None, text.split(",")):
         kind, colon, path = word.partition(":")
@@ -92,7 +92,7 @@ def _run(out: Path, words: Sequence[str]) -> tuple[dict[str, Any], Trajectory, T
 
 
 def promises(*of: tuple[str, bool]) -> str:
-    """A line for each promise: what it says, and whether it was met."""
+    """A line for each promise: its text, and whether it was met."""
     return "\n" + "\n".join(f"{'met: ' if met else 'NOT MET: '}{what}" for what, met in of)
 
 
@@ -160,7 +160,7 @@ def _poses(out: Path) -> list[Pose]:
 
 
 def recovery(poses: Sequence[Pose], first: int, stop: int) -> dict[str, int]:
-    """How many of the frames first..stop, covered, are said to be lost, how many after them until one is tracked, and how many elsewhere."""
+    """Count the covered frames first..stop that are lost, the frames after them until one is tracked, and the lost frames elsewhere."""
     lost = {pose.index for pose in poses if pose.status == LOST}
     back = min((pose.index for pose in poses if pose.index >= stop and pose.index not in lost), default=poses[-1].index + 1)
     return {

@@ -1,4 +1,4 @@
-"""What became slower between two files of `trihedron benchmark --json`.
+"""Comparison of two files of `trihedron benchmark --json`: what became slower.
 
 Times are compared as multiples of each file's own reference workload, so that another machine, or the same one on a slower day, does not count.
 """

@@ -1,4 +1,4 @@
-"""What recording costs: time and bytes of a run beside the same run without, frames embedded a second, and how fast one frame of many is read.
+"""Cost of recording: time and bytes of a run beside the same run without, frames embedded a second, and how fast one frame of many is read.
 
     recording   runs alternate without and with; each with is compared with the two without about it, as the machine's speed changes, and the median
                 counts. The share is of CPU time, which waits do not count in, and bytes are those of the file
@@ -99,8 +99,8 @@ def _embedding(overrides: Sequence[str], folder: Path) -> list[tuple[str, bool]]
     writer.close()
     cpu_ms = 1e3 * (time.process_time() - cpu) / len(frames)
     rate, size = len(frames) / (time.perf_counter() - began), (folder / "frames.mcap").stat().st_size / len(frames) / 1e3
-    said = f"of {frames[0].camera.width} × {frames[0].camera.height}, {size:.0f} kB and {cpu_ms:.1f} ms CPU each"
-    text = f"{rate:.0f} embedded frames/s {said}, at least {LEAST_FRAMES_S:.0f}"
+    sizes = f"of {frames[0].camera.width} × {frames[0].camera.height}, {size:.0f} kB and {cpu_ms:.1f} ms CPU each"
+    text = f"{rate:.0f} embedded frames/s {sizes}, at least {LEAST_FRAMES_S:.0f}"
     return [(text, rate >= LEAST_FRAMES_S)]
 
 

@@ -47,7 +47,7 @@ class Run:
 
     @cached_property
     def claims(self) -> tuple[NDArray[np.int64], F64, F64]:
-        """(m,) rows of `found` that claim a frame, one for each frame in view, (m, 3, 3) R_world_manhattan as each says, and its covariance in the
+        """(m,) rows of `found` that claim a frame, one for each frame in view, (m, 3, 3) R_world_manhattan by each, and its covariance in the
         world."""
         rows = [(i, R, C) for i, value in enumerate(self.found) if value.supported for R, C in zip(*in_view(value))]
         number, (rotations, covariance) = np.array([i for i, _, _ in rows], np.int64), (np.array([row[k] for row in rows]) for k in (1, 2))

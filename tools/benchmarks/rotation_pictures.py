@@ -49,7 +49,7 @@ def errors_figure(runs: Sequence[comparison.Run], errors: dict[str, F64], path: 
 
 def sphere_figure(runs: Sequence[comparison.Run], world: F64, frame: int, path: Path) -> None:
     """A half sphere for each estimator, in Lambert's equal-area projection along the camera's axis, opposite directions folded together: normals,
-    planes and lines of the frame, the true axes and those it says. Writes a PNG."""
+    planes and lines of the frame, the true axes and those it estimates. Writes a PNG."""
     from matplotlib.lines import Line2D
 
     count = min(COLUMNS, len(runs))
@@ -70,7 +70,7 @@ def sphere_figure(runs: Sequence[comparison.Run], world: F64, frame: int, path: 
         ax.set_axis_off()
         ax.set_aspect("equal")
         ax.set(xlim=(-1.05, 1.05), ylim=(-1.05, 1.05))
-    handles = [*grid[0].get_legend_handles_labels()[0], Line2D([], [], **RING, color="tab:green", linestyle="", label="axes said")]
+    handles = [*grid[0].get_legend_handles_labels()[0], Line2D([], [], **RING, color="tab:green", linestyle="", label="axes estimated")]
     figure.legend(handles=handles, loc="outside lower center", ncols=len(handles), fontsize=9, frameon=False)
     figure.suptitle(f"directions of frame {frame}, opposite ones folded", fontsize=11)
     figure.savefig(path, dpi=100)

@@ -1,10 +1,10 @@
-"""How time and memory grow with threads, image size, number of features, size of the map and length of the walk, in the built-in rooms.
+"""Growth of time and memory with threads, image size, number of features, size of the map and length of the walk, in the built-in rooms.
 
 Each row is a run in a process of its own. A frame's time is that of its stages, one after another, without the rendering of the frame (median over
 the frames); the throughput contains it. Memory is the most that the run held at one of these frames, with the textures that are rendered. Further
 overrides hold for all runs. The reference workload is that of `trihedron benchmark`, on images of the row.
 
-threads, image and features are the built-in room; length is it in 320×240 unless told otherwise, as long walks take long. map is the walk through ten
+threads, image and features are the built-in room; length is it in 320×240 unless overridden, as long walks take long. map is the walk through ten
 rooms, always measured on the same 100 frames, in rooms not seen before: a row begins so many frames earlier, so that its map holds more. Besides all
 stages it shows those that read the map: medians, and of those that work at keyframes the 95th percentile.
 
@@ -40,7 +40,7 @@ PARTS: dict[str, dict[str, list[str]]] = {  # part -> what a row is called -> it
     "map": {str(n): [f"dataset.length={STOP}", f"dataset.frames={FIRST - n}:{STOP}"] for n in (50, 250, 900, 2200)},
     "length": {str(n): [f"dataset.length={n}"] for n in (100, 1000, 5000)},
 }
-OF_PART = {"map": ["dataset.scene=rooms"], "length": ["dataset.width=320", "dataset.height=240"]}  # of all its rows, unless told otherwise
+OF_PART = {"map": ["dataset.scene=rooms"], "length": ["dataset.width=320", "dataset.height=240"]}  # of all its rows, unless given otherwise
 LABELS = {"threads": "threads", "image": "image size", "features": "key points", "map": "walked before", "length": "frames"}
 AT_KEYFRAMES = ("map", "bundle", "loop")
 READERS = ("matches", "pose", *AT_KEYFRAMES)  # stages that read the map
@@ -122,7 +122,8 @@ def _living(map: Map | None) -> int:
 
 
 def measures(timing: Sequence[dict[str, Any]]) -> dict[str, Any]:
-    """Of some frames' messages: the most memory, and medians of all stages but the data set, of those after the features, and of each reader."""
+    """Measures of some frames' messages: the most memory, and medians of all stages but the data set, of those after the features, and of each
+    reader."""
     stages = [{name: ms for name, ms in row["stage_ms"].items() if name != "dataset"} for row in timing]
     every = [sum(row.values()) for row in stages]
     after = [sum(ms for name, ms in row.items() if name not in FEATURES) for row in stages]

@@ -23,7 +23,7 @@ def plot(parts: Mapping[str, Rows], path: Path) -> None:
 
 
 def figure_of(parts: Mapping[str, Rows]) -> Any:
-    """From above: ms of a frame's stages, these as multiples of the reference workload, memory. The rows of panels share their scale,
+    """Draw, from above: ms of a frame's stages, these as multiples of the reference workload, memory. The rows of panels share their scale,
     which begins at zero; what is varied is on a logarithmic one, marked where it was measured."""
     from matplotlib import rc_context
     from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -61,5 +61,5 @@ def _draw(panels: Any, part: str, rows: Rows) -> None:
 
 
 def place(part: str, row: Mapping[str, Any]) -> float:
-    """Where on its axis a row is: the map by what it holds, an image by its width, all else by the row's name."""
+    """Position of a row on its axis: the map by what it holds, an image by its width, all else by the row's name."""
     return float(row["points"]) if part == "map" else float(row["name"].partition("x")[0])
