@@ -332,7 +332,8 @@ def adverse(slot: str, words: tuple[str, ...]) -> Iterator[Scene]:
     """The adverse scenes."""
     yield from (_changed(name, words) for name in (*ADVERSE, REPEATED))
     for name, few in FEW.items():
-        yield replace(room((*words, f"dataset.length={BEFORE}", *(word for of, word in few.items() if of != slot))), name=name)
+        free = [word for of, word in few.items() if of != slot and not any(given.startswith((f"{of}=", f"{of}.")) for given in words)]
+        yield replace(room((*words, f"dataset.length={BEFORE}", *free)), name=name)
 
 
 @lru_cache(maxsize=64)

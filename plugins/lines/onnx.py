@@ -30,8 +30,7 @@ class OnnxLines(NetworkOptions, StraightEdges):
     distance field `df` of DeepLSD (Pautrat et al., CVPR 2023), whose valleys are thinned and cut into straight runs by OpenCV's fast line detector
     (DeepLSD's own tracing is not in its network).
 
-    Fragments are merged, placed and described like those of `lsd`. Libraries: ONNX Runtime (MIT), one thread, OpenCV (Apache-2.0). The bytes may
-    differ on another CPU."""
+    Fragments are merged, placed and described like those of `lsd`. Library: ONNX Runtime (MIT), one thread. The bytes may differ on another CPU."""
 
     slot: ClassVar[str] = "lines"
     scale: Annotated[float, Range(0.1, 1)] = 1.0  # of the image the segments are described on
