@@ -71,16 +71,13 @@ class PosedFrames:
 
 @dataclass(frozen=True)
 class Parts:
-    """Balls of points: (n, 3) ascending eigenvalues and (n, 3) normals, and the rows of the points in each."""
+    """Balls of points: (n, 3) ascending eigenvalues of their covariances, (n, 3) normals and (n,) whether they are flat as the frames that saw them
+    show each by itself, and the rows of the points in each."""
 
     eigenvalues: F64
     normals: F64
+    planar: NDArray[np.bool_]
     members: list[Rows]
-
-    @property
-    def planar(self) -> NDArray[np.bool_]:
-        """Return (n,) whether a part is flat."""
-        return np.asarray(self.eigenvalues[:, 0] < FLAT * self.eigenvalues[:, 1])
 
 
 def quality_of_run(run: Path) -> Quality:
@@ -109,7 +106,7 @@ def quality_of(frames: PosedFrames, count: int) -> Quality:
     medians = {apart: float(np.mean([m for m, _ in found])) if found else None for apart, found in warped.items()}
     shifts = [shift for _, shift in warped[APART[-1]] if np.isfinite(shift)]
     points, views = point_cloud(frames)
-    parts = parts_of(points)
+    parts = parts_of(points, views)
     flat = np.flatnonzero(parts.planar)
     entropy = 0.5 * np.log(np.maximum(np.prod(2.0 * np.pi * np.e * parts.eigenvalues, axis=1), 1e-300))
     orthogonal = flat[_orthogonal(parts.normals[flat])]
@@ -184,16 +181,26 @@ def _points_of(frame: Frame, stride: int, farthest_m: float) -> tuple[F64, Rows]
     return frame.camera.back_project(pixels.astype(np.float64), depth[seen]), pixels
 
 
-def parts_of(points: F64) -> Parts:
-    """Gather the points in balls about points spread over the cloud (n, 3)."""
+def parts_of(points: F64, views: Rows) -> Parts:
+    """Gather the points in balls about points spread over the cloud (n, 3); `views` (n,) are the frames that saw them."""
     if not len(points):
-        return Parts(np.zeros((0, 3)), np.zeros((0, 3)), [])
+        return Parts(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0, bool), [])
     tree = cKDTree(points)
     queries = points[np.unique(np.linspace(0, len(points) - 1, QUERIES).astype(int))]
     members = [np.asarray(rows) for rows in tree.query_ball_point(queries, BALL_M) if len(rows) >= LEAST_POINTS]
     covariances = np.array([np.cov(points[rows].T) for rows in members]).reshape(-1, 3, 3)
-    eigenvalues, vectors = np.linalg.eigh(covariances)
-    return Parts(np.maximum(eigenvalues, 1e-12), vectors[:, :, 0], members)
+    within, vectors = np.linalg.eigh(np.array([_covariance_within(points[rows], views[rows]) for rows in members]).reshape(-1, 3, 3))
+    planar = within[:, 0] < FLAT * within[:, 1]
+    return Parts(np.maximum(np.linalg.eigvalsh(covariances), 1e-12), vectors[:, :, 0], planar, members)
+
+
+def _covariance_within(points: F64, views: Rows) -> F64:
+    """Return the (3, 3) covariance of points about the mean of the frame that saw them."""
+    _, group, counts = np.unique(views, return_inverse=True, return_counts=True)
+    group = group.reshape(-1)
+    means = np.stack([np.bincount(group, points[:, k]) for k in range(3)], axis=1) / counts[:, None]
+    apart = points - means[group]
+    return np.asarray(apart.T @ apart / max(len(points) - len(counts), 1), np.float64)
 
 
 def _orthogonal(normals: F64) -> Rows:
