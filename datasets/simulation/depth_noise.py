@@ -79,7 +79,7 @@ def _read(z: float, normal: float, model: F64) -> float:
     step = z * z / model[4]
     noisy = z + normal * math.sqrt(max(0.0, sigma * sigma - step * step / 12.0))
     steps = round(model[4] / max(noisy, 0.1))
-    return model[4] / max(steps, 1.0)
+    return float(model[4] / max(steps, 1.0))
 
 
 def noisy_color(color: U8, rng: np.random.Generator) -> U8:

@@ -58,7 +58,8 @@ class Solid:
 class Room:
     """Walls, floor and ceiling as (k, 4) planes `n·x + d = 0` with n into the room, their faces in the same order, and the furniture.
 
-    A face is lit by the nearest lamp in front of it; `detail` multiplies the resolution of the textures; `storeys_m` are floor and ceiling heights."""
+    A face is lit by the nearest lamp in front of it; `detail` multiplies the resolution of the textures; `storeys_m` are heights of floor and
+    ceiling."""
 
     planes: F64
     faces: tuple[Face, ...]

@@ -17,7 +17,8 @@ LEAST_M2 = 0.5  # of a room
 
 @dataclass(frozen=True)
 class Doorway:
-    """A gap in a wall: its middle on the floor (2,), the unit direction of the wall (2,), width, heights of bottom and top above the floor, metres."""
+    """A gap in a wall: its middle on the floor (2,), the unit direction of the wall (2,), width, heights of bottom and top above
+    the floor, metres."""
 
     middle: F64
     along: F64

@@ -57,7 +57,8 @@ class Walk:
 
     @cached_property
     def _samples(self) -> tuple[F64, float]:
-        """(n + 1, 4) x, y, yaw (rad, continuous), height of the floor once round, the last row being the first again, and the yaw that a round adds."""
+        """(n + 1, 4) x, y, yaw (rad, continuous), height of the floor once round, the last row being the first again, and the yaw that a round
+        adds."""
         corners = np.array((*self.points_m, self.points_m[0]))
         lengths = np.linalg.norm(np.diff(corners, axis=0), axis=1)
         count = round(self.length_m / STEP_M)

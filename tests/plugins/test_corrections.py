@@ -10,6 +10,7 @@ import pytest
 from trihedron.pipeline.core.geometry import exp_se3, transform, transform_planes
 from trihedron.pipeline.core.table import CHUNK
 from trihedron.plugins.mapping import plane_fusion
+from trihedron.plugins.mapping.correction import apply_correction
 from trihedron.plugins.mapping.covisibility_graph import local_window, observed_by
 
 sys.path.insert(0, str(Path(__file__).parent))
@@ -117,3 +118,13 @@ def test_a_keyframe_is_not_redundant_when_the_others_are_far_behind_or_see_somet
     """Walking on, every keyframe sees something that too few others do."""
     map = walk(World(2000), 14, dataclasses.replace(EVERY, redundant=8), stride=8)
     assert map.keyframes.column("alive").all()
+
+
+def test_rounding_does_not_grow_from_keyframe_to_keyframe():
+    """Each correction puts keyframe 2 where keyframe 3 is, which moves on with it: without care, twice the error is handed on each time."""
+    map = walk(World(), 4)
+    for _ in range(60):
+        target = map.keyframes.row("T_world_camera", 3)
+        map = apply_correction(map, correction(map, keyframe_ids=np.array([2], np.int32), T_world_keyframe=target[None]))
+    R = map.keyframes.column("T_world_camera")[:, :3, :3]
+    assert np.abs(R @ R.transpose(0, 2, 1) - np.eye(3)).max() < 1e-9

@@ -1,9 +1,10 @@
 """Judge the plans of the synthetic buildings by the exact ones.
 
 Each scene is tracked with several seeds (of textures, path and noise) and the depth noise of two cameras, and its plan is moved by the SE(3) that
-aligns trajectory.txt with the truth, never by itself. A room is found where the intersection over union with a true one is above 0.5. Walls are the edges of found rooms that lie on a face
-that was seen, position the distance of their middle from the true edge. A doorway is found within 0.3 m of its middle. "honest" is the share of
-errors of areas, wall offsets and storey heights within 1.96 of their standard deviations. Figures are medians over the seeds, "honest" a mean.
+aligns trajectory.txt with the truth, never by itself. A room is found where the intersection over union with a true one is above 0.5. Walls are the
+edges of found rooms that lie on a face that was seen, position the distance of their middle from the true edge. A doorway is found within 0.3 m of
+its middle. "honest" is the share of errors of areas, wall offsets and storey heights within 1.96 of their standard deviations. Figures are medians
+over the seeds, "honest" a mean.
 
 Example: trihedron benchmark building --scenes offices --seeds 2
 """
@@ -29,7 +30,8 @@ SCENES = ("offices", "rooms", "corridor", "flat", "slanted_flat", "house")
 SENSORS = ("kinect", "stereo")
 FOUND_IOU, DOOR_M, EDGE_M, LEAST_EDGE_M = 0.5, 0.3, 0.15, 0.5
 HEADER = [
-    "scene", "sensor", "runs", "wall cm", "angle °", "IoU", "recall", "precision", "doors", "precision", "area %", "height cm", "honest", "frame ms", "final s",
+    "scene", "sensor", "runs", "wall cm", "angle °", "IoU", "recall", "precision", "doors", "precision", "area %", "height cm", "honest", "frame ms",
+    "final s",
 ]  # fmt: skip
 
 
