@@ -1,4 +1,5 @@
-"""The files of a building: `building.json`, and floor plans as SVG and DXF, all in metres in the building's frame (see `types.Building`).
+"""The files of a building: `building.json`, floor plans as SVG and DXF, and the model as glTF, all in metres in the building's frame (see
+`types.Building`).
 
 A plan shows one storey beside the other, from the lowest. Walls whose other face was not seen are drawn with one line's width; dashed is what was not
 seen: stretches of walls without a reading, and edges of rooms that nothing bounds."""
@@ -6,20 +7,17 @@ seen: stretches of walls without a reading, and edges of rooms that nothing boun
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator
-from dataclasses import dataclass
-from itertools import pairwise
 from pathlib import Path
 from typing import Any
 from xml.sax.saxutils import escape
 
 import numpy as np
 
+from trihedron.pipeline.core.building_geometry import CEILING, COLORS, label_place, open_edges, parts_of, quad, rings_of, rooms_on, wall_pieces
 from trihedron.pipeline.core.types import ELEMENTS, F64, OPENING_KINDS, SUPPORTS, Building
 
-JSON, SVG, DXF = "building.json", "floorplan.svg", "floorplan.dxf"
+JSON, SVG, DXF, GLB = "building.json", "floorplan.svg", "floorplan.dxf", "building.glb"
 SCHEMA_VERSION = 1
-SHEET_M = 0.06  # thickness that a wall is drawn with where its other face was not seen
 
 
 def write_building(out: Path, building: Building) -> list[str]:
@@ -27,6 +25,7 @@ def write_building(out: Path, building: Building) -> list[str]:
     (out / JSON).write_text(json.dumps(building_json(building), indent=1) + "\n", encoding="utf-8")
     (out / SVG).write_text(floorplan_svg(building), encoding="utf-8")
     write_dxf(out / DXF, building)
+    write_glb(out / GLB, building)
     return [summary(building)]
 
 
@@ -113,66 +112,6 @@ def _opening(building: Building, k: int) -> dict[str, Any]:
     }  # fmt: skip
 
 
-# What both plans draw.
-
-
-@dataclass(frozen=True)
-class Stretch:
-    """A piece of a wall between two places along it: its four corners (4, 2), the face first; `seen` False where no reading was."""
-
-    corners: F64
-    seen: bool
-
-
-def wall_pieces(building: Building, wall: Any) -> Iterator[Stretch]:
-    """Cut a wall at its openings that reach the floor and at stretches that were not seen."""
-    start, end = building.walls_m[wall]
-    length = float(np.linalg.norm(end - start))
-    gaps = [
-        span
-        for span, of, kind in zip(building.spans_m, building.opening_walls, building.opening_kinds)
-        if of == wall and OPENING_KINDS[kind] != "window"
-    ]
-    blind = [row[1:] for row in building.unseen if int(row[0]) == wall]
-    cuts = np.unique(np.clip([0.0, length, *np.ravel(gaps), *np.ravel(blind)], 0.0, length))
-    for a, b in pairwise(cuts):
-        middle = (a + b) / 2.0
-        if b - a > 1e-6 and not any(low < middle < high for low, high in gaps):
-            yield Stretch(quad(building, wall, a, b), not any(low < middle < high for low, high in blind))
-
-
-def quad(building: Building, wall: int, a: float, b: float) -> F64:
-    """Return the corners (4, 2) of a wall's stretch."""
-    start, end = building.walls_m[wall]
-    along = (end - start) / max(float(np.linalg.norm(end - start)), 1e-9)
-    back = np.array([along[1], -along[0]]) * (building.thickness_m[wall] if np.isfinite(building.thickness_m[wall]) else SHEET_M)
-    return np.array([start + a * along, start + b * along, start + b * along + back, start + a * along + back])
-
-
-def rooms_on(building: Building, storey: int) -> list[int]:
-    """Return the rooms of a storey."""
-    return [k for k in range(len(building.areas_m2)) if building.room_storeys[k] == storey]
-
-
-def open_edges(building: Building, room: int) -> Iterator[F64]:
-    """Yield the edges (2, 2) of a room that nothing bounds."""
-    for ring in building.loops[building.loops[:, 0] == room]:
-        corners, walls = building.corners_m[ring[1] : ring[2]], building.corner_walls[ring[1] : ring[2]]
-        for p, q, wall in zip(corners, np.roll(corners, -1, axis=0), walls):
-            if wall < 0:
-                yield np.array([p, q])
-
-
-def label_place(building: Building, room: int) -> F64:
-    """Return a place (2,) well inside a room, for its name."""
-    import shapely
-
-    rings = [building.corners_m[a:b] for of, a, b in building.loops if of == room]
-    polygon = shapely.make_valid(shapely.Polygon(rings[0], rings[1:]))
-    place = shapely.maximum_inscribed_circle(polygon, 0.05).coords[0] if not polygon.is_empty else rings[0].mean(axis=0)
-    return np.array(place)
-
-
 # SVG.
 
 PX = 60.0  # a metre
@@ -209,7 +148,7 @@ def _extent(building: Building) -> tuple[F64, F64]:
 def _svg_storey(building: Building, storey: int, at: Any) -> list[str]:
     out = []
     for room in rooms_on(building, storey):
-        rings = [at(building.corners_m[a:b]) for of, a, b in building.loops if of == room]
+        rings = [at(ring) for ring in rings_of(building, room)]
         out.append(f'<path class="room" fill-rule="evenodd" d="{" ".join(_path(ring) for ring in rings)}"/>')
     for wall in np.nonzero(building.wall_storeys == storey)[0]:
         out += [f'<path class="{"wall" if piece.seen else "unseen"}" d="{_path(at(piece.corners))}"/>' for piece in wall_pieces(building, wall)]
@@ -325,3 +264,25 @@ def write_dxf(path: Path, building: Building) -> None:
                 corners = quad(building, int(wall), *building.spans_m[opening]) + shift
                 space.add_lwpolyline(corners.tolist(), close=True, dxfattribs={"layer": layer})
     document.saveas(path)
+
+
+# glTF.
+
+
+def write_glb(path: Path, building: Building) -> None:
+    """Write the model as binary glTF 2.0: y up, -z north; a node for each kind of each storey."""
+    import trimesh
+
+    scene = trimesh.Scene()
+    for part in parts_of(building):
+        name, color = f"storey {part.storey} {part.kind}", COLORS[part.kind]
+        look: dict[str, Any] = {"metallicFactor": 0.0, "roughnessFactor": 1.0, "doubleSided": part.kind != CEILING}
+        if color[3] < 255:
+            look["alphaMode"] = "BLEND"
+        material = trimesh.visual.material.PBRMaterial(name=part.kind, baseColorFactor=color, **look)
+        flat = part.vertices_m[part.triangles].reshape(-1, 3)[:, [0, 2, 1]] * [1.0, 1.0, -1.0]
+        mesh = trimesh.Trimesh(flat, np.arange(len(flat)).reshape(-1, 3), process=False, visual=trimesh.visual.TextureVisuals(material=material))
+        scene.add_geometry(mesh, node_name=name, geom_name=name)
+    if not scene.geometry:
+        scene.add_geometry(trimesh.PointCloud(np.zeros((1, 3))), node_name=building.note or "empty")
+    path.write_bytes(trimesh.exchange.gltf.export_glb(scene, include_normals=True))

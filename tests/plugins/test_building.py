@@ -10,9 +10,10 @@ import numpy as np
 import pytest
 
 from trihedron.datasets.simulation.synthetic import Scene, Synthetic
+from trihedron.pipeline.core.building_geometry import wall_pieces
 from trihedron.pipeline.core.registry import load_plugins, plugin_class
 from trihedron.pipeline.core.types import OPENING_KINDS, Camera, Frame, Planes, Pose
-from trihedron.pipeline.run.building_files import building_json, floorplan_svg, summary, wall_pieces, write_building
+from trihedron.pipeline.run.building_files import building_json, floorplan_svg, summary, write_building
 from trihedron.plugins.normals.integral_image import IntegralImage
 from trihedron.plugins.planes.connected_components import ConnectedComponents
 from trihedron.tools.benchmarks.building_benchmark import judged
