@@ -322,30 +322,32 @@ def tall_m(storey: Storey) -> float:
 SAME_FACE = 10  # cm: of two faces of one direction that are nearer to each other, the lesser is furniture
 NEAR_FACE_M = 0.05
 LEAST_READINGS = 2  # for which a column reaches high
+HIGH_M = 1.5  # reached by a column that rays neither pass over nor get behind
+ASIDE_M = 0.1  # before and behind a face, where a ray that crosses it is sought
+CROSSED = 2  # levels of rays over a column, for which it ends below the ceiling
 
 
-def faces_of(evidence: Evidence, storey: Storey, directions: F64, least_m: float, cone_deg: float = 6.0) -> list[Face]:
-    """Find the faces with unit normals among `directions` (d, 2) that are tall over at least that length."""
+def faces_of(evidence: Evidence, storey: Storey, space: FreeSpace, directions: F64, least_m: float, cone_deg: float = 6.0) -> list[Face]:
+    """Find the faces with unit normals among `directions` (d, 2) that reach high over at least that length."""
     found: list[Face] = []
     height = evidence.points[:, 2] - storey.bottom_m
-    top = storey.ceiling_m - storey.bottom_m + 0.1 if np.isfinite(storey.ceiling_m) else LEVELS * LEVEL_M
+    top = storey.ceiling_m - storey.bottom_m - 0.05 if np.isfinite(storey.ceiling_m) else LEVELS * LEVEL_M
     upright = (np.abs(evidence.normals[:, 2]) < np.sin(np.radians(UPRIGHT_DEG))) & (height > 0.0) & (height < top)
-    tall = upright & (height > tall_m(storey))
     for normal in directions:
         facing = evidence.normals[:, :2] @ normal > np.cos(np.radians(cone_deg))
-        found += _faces_along(evidence, height, normal, upright & facing, tall & facing, least_m)
+        found += _faces_along(evidence, height, normal, np.nonzero(upright & facing)[0], storey, space, least_m)
     return found
 
 
-def _faces_along(evidence: Evidence, height: F64, normal: F64, upright: Bool, tall: Bool, least_m: float) -> list[Face]:
-    """Find the faces of one direction: the peaks of the offsets of its tall points."""
-    if not tall.any():
+def _faces_along(evidence: Evidence, height: F64, normal: F64, members: I64, storey: Storey, space: FreeSpace, least_m: float) -> list[Face]:
+    """Find the faces of one direction: the peaks of the offsets of its high points."""
+    high = height[members] > min(HIGH_M, tall_m(storey))
+    if not high.any():
         return []
-    members = np.nonzero(upright)[0]
     offsets = evidence.points[members, :2] @ normal
     along = evidence.points[members, :2] @ np.array([normal[1], -normal[0]])
-    high, levels = tall[upright], np.clip((height[upright] / LEVEL_M).astype(int), 0, LEVELS - 1)
-    weight = np.sqrt(evidence.information[upright]) * evidence.area_m2[upright]
+    levels = np.clip((height[members] / LEVEL_M).astype(int), 0, LEVELS - 1)
+    weight = np.sqrt(evidence.information[members]) * evidence.area_m2[members]
     low = float(offsets[high].min()) - 0.1
     bins = np.bincount(((offsets[high] - low) / 0.01).astype(int), weight[high])
     smooth = np.convolve(np.concatenate([bins, np.zeros(10)]), [0.25, 0.5, 0.75, 1.0, 0.75, 0.5, 0.25], "same")
@@ -361,10 +363,22 @@ def _faces_along(evidence: Evidence, height: F64, normal: F64, upright: Bool, ta
         columns = ((along[close] - start) / CELL_M).astype(int)
         count = np.zeros((int(columns.max()) + 1, LEVELS), np.int32)
         np.add.at(count, (columns, levels[close]), 1)
-        reach = np.bincount(columns[high[close]], minlength=len(count)) >= LEAST_READINGS
+        reach = _reaching(Face(normal, offset, start, count, np.zeros(len(count), np.bool_), members[close]), space, storey)
         if reach.sum() * CELL_M >= least_m:
             found.append(Face(normal, offset, start, count, _filled(reach), members[close]))
     return found
+
+
+def _reaching(face: Face, space: FreeSpace, storey: Storey) -> Bool:
+    """Return the columns (k,) of a face that reach high: above doors and furniture unless rays pass over them, or to HIGH_M if no ray gets behind."""
+    top = np.where(face.count.any(axis=1), LEVELS - 1 - np.argmax(face.count[:, ::-1] > 0, axis=1), -1)
+    levels = np.arange(LEVELS)
+    tall = face.count[:, levels * LEVEL_M > tall_m(storey)].sum(axis=1) >= LEAST_READINGS
+    line = (face.start_m + (np.arange(len(top)) + 0.5) * CELL_M)[:, None] * face.along + face.offset_m * face.normal
+    behind = space.at(line - ASIDE_M * face.normal)
+    crossed = behind & space.at(line) & space.at(line + ASIDE_M * face.normal)
+    over = ((crossed[:, None] >> levels.astype(np.uint32)) & np.uint32(1)).astype(bool) & (levels > top[:, None] + 1)
+    return np.asarray((tall & (over.sum(axis=1) < CROSSED)) | ((top * LEVEL_M >= HIGH_M) & (behind == 0)), np.bool_)
 
 
 def _filled(columns: Bool, gap: int = 2) -> Bool:

@@ -679,7 +679,8 @@ class Layout(LayoutFold):
         storeys, plans = storeys_of(evidence), []
         for number, storey in enumerate(storeys):
             here = in_storey(evidence, storeys, number)
-            faces, space = faces_of(here, storey, self._directions(here, storey), self.least_wall_m), free_space(here, storey)
+            space = free_space(here, storey)
+            faces = faces_of(here, storey, space, self._directions(here, storey), self.least_wall_m)
             cells = cells_of(faces, space)
             rooms = rooms_of(cells, self._inside(cells), faces, here, space, storey, self.least_room_m2)
             walls = walls_of(rooms, faces)
