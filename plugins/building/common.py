@@ -32,11 +32,12 @@ MOVED_M, TURNED_DEG = 0.25, 15.0  # after which a frame without a map is kept
 
 @dataclass
 class Gathered:
-    """The state of a building: the views kept, the Manhattan axes, the last frame."""
+    """The state of a building: the views kept, the Manhattan axes, the last frame and map."""
 
     views: list[KeyframeView] = field(default_factory=list)
     axes: F64 | None = None  # R_world_manhattan
     first: F64 | None = None  # T_world_camera
+    map: Map | None = None  # of the last frame
     keyframes: int = 0
     index: int = 0
     stamp_ns: int = 0
@@ -57,7 +58,7 @@ class LayoutFold:
 
     def add(self, state: Gathered, frame: Frame, planes: Planes, rotation: Rotation | None, pose: Pose, map: Map | None) -> Gathered:
         """Keep the frame if it became a keyframe; without a map, if the camera has moved since the last."""
-        state.index, state.stamp_ns = frame.index, frame.stamp_ns
+        state.index, state.stamp_ns, state.map = frame.index, frame.stamp_ns, map
         if rotation is not None and len(rotation.weights):
             state.axes = rotation.R_world_manhattan[int(np.argmax(rotation.weights))]
         if pose.status == LOST:
@@ -412,12 +413,18 @@ class FreeSpace:
         return out
 
 
+BESIDE_M = 1.0  # on stairs
+
+
 def free_space(evidence: Evidence, storey: Storey, margin_m: float = 0.5) -> FreeSpace:
-    """Carve the rays of all views that stand in a storey."""
+    """Carve the rays of all views from within a storey, or BESIDE_M below or above it."""
     low = evidence.points[:, :2].min(axis=0) - margin_m
     w, h = np.ceil((evidence.points[:, :2].max(axis=0) + margin_m - low) / CELL_M).astype(int)
     once, twice = np.zeros((h, w), np.uint32), np.zeros((h, w), np.uint32)
+    above = storey.ceiling_m if np.isfinite(storey.ceiling_m) else float("inf")
     for view, T in zip(evidence.views, evidence.poses):
+        if not storey.bottom_m - BESIDE_M < T[2, 3] < above + BESIDE_M:
+            continue
         carve_kernel(view.depth_m, view.camera.intrinsics, T, low, CELL_M, storey.bottom_m, LEVEL_M, 2, MARGIN, once, twice)
     floor = np.zeros((h, w), np.bool_)
     level = (evidence.normals[:, 2] > np.cos(np.radians(LEVEL_DEG))) & (np.abs(evidence.points[:, 2] - storey.bottom_m) < 0.1)

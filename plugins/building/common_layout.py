@@ -7,7 +7,7 @@ room is then fitted again to the points of its own stretch, so that drift betwee
 from __future__ import annotations
 
 from collections import defaultdict
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from typing import Any
 
@@ -44,6 +44,7 @@ TALL_SHARE = 0.5  # of an edge between cells, for which it parts them
 ON_WALL_SHARE = 0.3  # of a room's edge, for which it is a wall
 THICKEST_M, THINNEST_M = 0.5, 0.03
 FIT_M = 0.04  # about an edge, within which points take part in its fit
+PREVIEW_VIEWS = 60
 WINDOW_M = 0.35  # least height of a window's sill
 
 
@@ -686,6 +687,11 @@ class Layout(LayoutFold):
             walls = walls_of(rooms, faces)
             plans.append(StoreyPlan(storey, rooms, walls, openings_of(walls, rooms, faces, here, space, storey), faces))
         return assembled(state, evidence, plans, map)
+
+    def preview(self, state: Gathered) -> Building:
+        """Make the plan so far of PREVIEW_VIEWS views, at their poses as they are now."""
+        every = -(-len(state.views) // PREVIEW_VIEWS) if state.views else 1
+        return self.finish(replace(state, views=state.views[::every]), state.map)
 
     def _directions(self, evidence: Evidence, storey: Storey) -> F64:
         """Return the unit normals (d, 2) that faces may have: the building's two axes."""
