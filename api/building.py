@@ -228,15 +228,8 @@ class Building:
         return best[1]
 
     def _edge_sigma(self, corner: int) -> float:
-        """Return the standard deviation of the offset of the edge that begins at a corner."""
-        wall = int(self.plan.corner_walls[corner])
-        if wall < 0:
-            return OPEN_SIGMA_M
-        begin, stop = next((int(a), int(b)) for _, a, b in self.plan.loops if a <= corner < b)
-        edge = self.plan.corners_m[begin + (corner - begin + 1) % (stop - begin)] - self.plan.corners_m[corner]
-        offset, thickness, _ = np.sqrt(np.diag(self.plan.wall_covariance[wall]))
-        face = float(edge @ (self.plan.walls_m[wall, 1] - self.plan.walls_m[wall, 0])) > 0.0
-        sigma = float(offset if face else np.hypot(offset, thickness))
+        """Return the standard deviation of the offset, in its room, of the edge that begins at a corner."""
+        sigma = float(self.plan.edge_sigma_m[corner])
         return sigma if np.isfinite(sigma) else OPEN_SIGMA_M
 
     def _room(self, k: int) -> Room:

@@ -35,6 +35,7 @@ class Gathered:
     """The state of a building: the views kept, the Manhattan axes, the last frame and map."""
 
     views: list[KeyframeView] = field(default_factory=list)
+    covariances: list[F64] = field(default_factory=list)  # (6, 6), of their poses in the world
     axes: F64 | None = None  # R_world_manhattan
     first: F64 | None = None  # T_world_camera
     map: Map | None = None  # of the last frame
@@ -73,6 +74,7 @@ class LayoutFold:
         if wanted:
             view = view_of(frame, planes, pose, map, self.view_width, self.max_sigma_m)
             state.views.append(replace(view, color=view.color[:0, :0].copy()))
+            state.covariances.append(pose.covariance)
         return state
 
 
@@ -85,11 +87,13 @@ def _moved(before: F64, now: F64) -> bool:
 @dataclass(frozen=True)
 class Evidence:
     """Planar points (n, 3) in the building's frame with the unit normals (n, 3) of their regions, information (n,) of their depth (1/m²) along the
-    normal, area (n,) and the view (n,) that shows them; the views with `T_building_camera`."""
+    normal, area (n,) and the view (n,) that shows them; the views in the order of time with `T_building_camera` and the covariance (3, 3) of their
+    positions, m²."""
 
     T_world_building: F64
     views: list[KeyframeView]
     poses: list[F64]
+    drift_m2: F64
     points: F64
     normals: F64
     information: F64
@@ -106,10 +110,10 @@ class Evidence:
 
 def evidence_of(state: Gathered, map: Map | None) -> Evidence | None:
     """Gather the planar points of all views at their final poses; None when no view shows a plane."""
-    views = [(view, T) for view in state.views if (T := view.settled(map)) is not None]
-    if not views:
+    kept = [(view, T, C) for view, C in zip(state.views, state.covariances) if (T := view.settled(map)) is not None]
+    if not kept:
         return None
-    regions = [_regions(view) for view, _ in views]
+    views, regions = [(view, T) for view, T, _ in kept], [_regions(view) for view, *_ in kept]
     if not sum(len(points) for points, *_ in regions):
         return None
     R = _axes(state, [T for _, T in views], [(T[:3, :3] @ n.T).T for (_, T), (_, n, _, _) in zip(views, regions)], [area for *_, area in regions])
@@ -119,11 +123,12 @@ def evidence_of(state: Gathered, map: Map | None) -> Evidence | None:
     T_world_building[:3, 3] = R[:, :2] @ (R[:, :2].T @ start[:3, 3])
     inverse = np.linalg.inv(T_world_building)
     poses = [inverse @ T for _, T in views]
+    drift = np.array([T[:3, :3] @ C[:3, :3] @ T[:3, :3].T for T, (*_, C) in zip(poses, kept)])
     points = np.concatenate([p @ T[:3, :3].T + T[:3, 3] for T, (p, *_) in zip(poses, regions)])
     normals = np.concatenate([n @ T[:3, :3].T for T, (_, n, *_) in zip(poses, regions)])
     information, area = (np.concatenate([region[k] for region in regions]) for k in (2, 3))
     rows = np.repeat(np.arange(len(views), dtype=np.int32), [len(p) for p, *_ in regions])
-    found = Evidence(T_world_building, [view for view, _ in views], poses, points, normals, information, area, rows)
+    found = Evidence(T_world_building, [view for view, _ in views], poses, drift, points, normals, information, area, rows)
     level = _lowest_floor(found)
     T_world_building[:3, 3] += R[:, 2] * level
     found.points[:, 2] -= level
@@ -187,6 +192,16 @@ def dominant_turn(angles: F64, weight: F64) -> float:
         if near.any():
             turn += float((away * weight)[near].sum() / weight[near].sum())
     return float(np.mod(turn + quarter / 2.0, quarter) - quarter / 2.0)
+
+
+def drift_variance(evidence: Evidence, direction: F64, information: F64, rows: I32) -> float:
+    """Return the variance along a unit direction (3,) of the mean of readings by views `rows` (n,), m², that their poses in the world cause.
+
+    The errors of poses are a random walk, in which the covariance of two is the variance of the earlier."""
+    total = np.bincount(rows, information, len(evidence.poses))
+    weight = total / total.sum()
+    later = np.cumsum(weight[::-1])[::-1] - weight
+    return float((weight * (weight + 2.0 * later)) @ (evidence.drift_m2 @ direction @ direction))
 
 
 # Levels: floors and ceilings.
@@ -259,7 +274,8 @@ def combined(values: F64, information: F64, rows: I32) -> tuple[float, float]:
 
 
 CORRELATED = 4.0  # neighbouring keyframes that err alike
-SYSTEMATIC_M = 0.005  # what no averaging removes
+SYSTEMATIC_M = 0.002  # what no averaging removes
+SCALE = 0.0007  # standard deviation of the scale of the depth, and so of all lengths
 
 
 def storeys_of(evidence: Evidence) -> list[Storey]:
@@ -281,6 +297,7 @@ def storeys_of(evidence: Evidence) -> list[Storey]:
         ceiling = float(tops[over][np.argmax(areas[over])]) if over.any() else float("nan")
         low_mean, low_sigma = height_of(evidence, floor, 1.0) if np.isfinite(floor) else (float("nan"), float("nan"))
         high_mean, high_sigma = height_of(evidence, ceiling, -1.0) if np.isfinite(ceiling) else (float("nan"), float("nan"))
+        low_sigma, high_sigma = float(np.hypot(low_sigma, SCALE * low_mean)), float(np.hypot(high_sigma, SCALE * high_mean))
         heights = evidence.points[(evidence.points[:, 2] < high) & (np.abs(evidence.normals[:, 2]) < np.sin(np.radians(UPRIGHT_DEG))), 2]
         reach = float(np.percentile(heights, 98.0)) if len(heights) else float("inf")
         found.append(Storey(low_mean, high_mean, low_sigma, high_sigma, reach))
@@ -329,7 +346,7 @@ CROSSED = 2  # levels of rays over a column, for which it ends below the ceiling
 
 
 def faces_of(evidence: Evidence, storey: Storey, space: FreeSpace, directions: F64, least_m: float, cone_deg: float = 6.0) -> list[Face]:
-    """Find the faces with unit normals among `directions` (d, 2) that reach high over at least that length."""
+    """Find the faces with unit normals among `directions` (d, 2) that reach high over a stretch of at least that length."""
     found: list[Face] = []
     height = evidence.points[:, 2] - storey.bottom_m
     top = storey.ceiling_m - storey.bottom_m - 0.05 if np.isfinite(storey.ceiling_m) else LEVELS * LEVEL_M
@@ -364,9 +381,9 @@ def _faces_along(evidence: Evidence, height: F64, normal: F64, members: I64, sto
         columns = ((along[close] - start) / CELL_M).astype(int)
         count = np.zeros((int(columns.max()) + 1, LEVELS), np.int32)
         np.add.at(count, (columns, levels[close]), 1)
-        reach = _reaching(Face(normal, offset, start, count, np.zeros(len(count), np.bool_), members[close]), space, storey)
-        if reach.sum() * CELL_M >= least_m:
-            found.append(Face(normal, offset, start, count, _filled(reach), members[close]))
+        reach = _filled(_reaching(Face(normal, offset, start, count, np.zeros(len(count), np.bool_), members[close]), space, storey))
+        if _longest(reach) * CELL_M >= least_m:
+            found.append(Face(normal, offset, start, count, reach, members[close]))
     return found
 
 
@@ -380,6 +397,12 @@ def _reaching(face: Face, space: FreeSpace, storey: Storey) -> Bool:
     crossed = behind & space.at(line) & space.at(line + ASIDE_M * face.normal)
     over = ((crossed[:, None] >> levels.astype(np.uint32)) & np.uint32(1)).astype(bool) & (levels > top[:, None] + 1)
     return np.asarray((tall & (over.sum(axis=1) < CROSSED)) | ((top * LEVEL_M >= HIGH_M) & (behind == 0)), np.bool_)
+
+
+def _longest(columns: Bool) -> int:
+    """Return the length of the longest run of marked columns."""
+    ends = np.nonzero(np.diff(np.concatenate([[False], columns, [False]])))[0]
+    return int(np.diff(ends)[::2].max(initial=0))
 
 
 def _filled(columns: Bool, gap: int = 2) -> Bool:

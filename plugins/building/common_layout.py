@@ -18,6 +18,7 @@ from trihedron.pipeline.core.types import ELEMENTS, F64, I32, OPENING_KINDS, SUP
 from trihedron.plugins.building.common import (
     CELL_M,
     LEVEL_M,
+    SCALE,
     Evidence,
     Face,
     FreeSpace,
@@ -25,6 +26,7 @@ from trihedron.plugins.building.common import (
     LayoutFold,
     Storey,
     combined,
+    drift_variance,
     evidence_of,
     faces_of,
     free_space,
@@ -67,7 +69,8 @@ class Edge:
     face: Face | None
     begin: F64 = field(default_factory=lambda: np.zeros(2))
     end: F64 = field(default_factory=lambda: np.zeros(2))
-    sigma_m: float = float("nan")
+    sigma_m: float = float("nan")  # of the offset, relative to the other edges of the room
+    drift_m2: float = 0.0  # what the drift of the poses adds to its variance
     angle_sigma: float = float("nan")
     views: I32 = field(default_factory=lambda: np.empty(0, np.int32))
     wall: int = -1
@@ -182,8 +185,19 @@ def rooms_of(cells: Cells, inside: Bool, faces: list[Face], evidence: Evidence, 
                 for edge in loop:
                     _fit(edge, evidence, storey)
                 _cornered(loop)
+            _relative([edge for loop in loops for edge in loop])
             found.append(RoomPlan(loops, polygon))
     return found
+
+
+def _relative(edges: list[Edge]) -> None:
+    """Add to the edges of a room the drift that they do not have in common, and what the scale may move them from its middle."""
+    middle = np.mean([edge.begin for edge in edges], axis=0)
+    common = min((edge.drift_m2 for edge in edges if edge.face is not None), default=0.0)
+    for edge in edges:
+        size = SCALE * (edge.offset_m - middle @ edge.normal)
+        edge.sigma_m = float(np.sqrt(edge.sigma_m**2 + size**2 + max(edge.drift_m2 - common, 0.0)))
+        edge.drift_m2 = common
 
 
 SLIT_M = 0.03  # half of the width of what is no part of a room
@@ -253,6 +267,7 @@ def _fit(edge: Edge, evidence: Evidence, storey: Storey) -> None:
         rows = evidence.rows[mask]
         offset, sigma = combined(evidence.points[mask, :2] @ edge.normal, evidence.information[mask], rows)
         edge.offset_m, edge.sigma_m, edge.views = offset, sigma, np.unique(rows)
+        edge.drift_m2 = drift_variance(evidence, np.array([*edge.normal, 0.0]), evidence.information[mask], rows)
         t = evidence.points[mask, :2] @ edge.along
         if np.abs(edge.normal).max() < AXIS:
             _turn(edge, evidence.points[mask, :2], evidence.information[mask])
@@ -342,9 +357,9 @@ def _wall(members: list[tuple[int, Edge]], faces: list[Face], number: int) -> Wa
     span = min(a for a, _ in spans), max(b for _, b in spans)
     behind = [edge for _, edge in members if edge.normal @ main.normal < 0]
     if behind:
-        thickness = [(main.offset_m + edge.offset_m, float(np.hypot(main.sigma_m, edge.sigma_m)), edge.span[1] - edge.span[0]) for edge in behind]
-        depth, sigma, _ = max(thickness, key=lambda item: item[2])
-        return WallPlan(main, span, depth, sigma, members)
+        other = max(behind, key=lambda edge: edge.span[1] - edge.span[0])
+        sigma = float(np.sqrt(main.sigma_m**2 + other.sigma_m**2 + abs(main.drift_m2 - other.drift_m2)))
+        return WallPlan(main, span, main.offset_m + other.offset_m, sigma, members)
     for face in faces:  # seen through a door, but no room's
         depth = main.offset_m + face.offset_m
         if face.normal @ main.normal < -0.999 and THINNEST_M / 2.0 < depth < THICKEST_M and face.share(-span[1], -span[0], face.tall) > TALL_SHARE:
@@ -515,6 +530,7 @@ def assembled(state: Gathered, evidence: Evidence, plans: list[StoreyPlan], map:
     support: list[tuple[int, int, int, int]] = []
     walls: list[Any] = []
     corners: list[Any] = []
+    edge_sigmas: list[float] = []
     areas: list[float] = []
     thickness, wall_covariance, unseen, wall_storeys = [], [], [], []
     loops, corner_walls, variances, closed, room_storeys = [], [], [], [], []
@@ -529,7 +545,7 @@ def assembled(state: Gathered, evidence: Evidence, plans: list[StoreyPlan], map:
             wall_storeys.append(level)
             thickness.append(wall.thickness_m)
             angle = edge.angle_sigma
-            wall_covariance.append(np.diag([edge.sigma_m**2, wall.thickness_sigma_m**2, angle**2]))
+            wall_covariance.append(np.diag([edge.sigma_m**2 + edge.drift_m2 + (SCALE * edge.offset_m) ** 2, wall.thickness_sigma_m**2, angle**2]))
             unseen += [(first_wall + number, a - wall.span[0], b - wall.span[0]) for a, b in _unseen(wall, plan.openings, number)]
             planes = _planes_on(wall, evidence, map)
             used.update(planes)
@@ -541,6 +557,7 @@ def assembled(state: Gathered, evidence: Evidence, plans: list[StoreyPlan], map:
             for loop in room.loops:
                 loops.append((first_room + number, len(corners), len(corners) + len(loop)))
                 corners += [edge.begin for edge in loop]
+                edge_sigmas += [edge.sigma_m for edge in loop]
                 corner_walls += [first_wall + edge.wall if edge.wall >= 0 else -1 for edge in loop]
             area, variance = _area(room)
             areas.append(area)
@@ -562,6 +579,7 @@ def assembled(state: Gathered, evidence: Evidence, plans: list[StoreyPlan], map:
         np.array(walls).reshape(-1, 2, 2), np.array(wall_storeys, np.int32), np.array(thickness, np.float64),
         np.array(wall_covariance).reshape(-1, 3, 3), np.array(unseen, np.float64).reshape(-1, 3), np.array(room_storeys, np.int32),
         np.array(loops, np.int32).reshape(-1, 3), np.array(corners, np.float64).reshape(-1, 2), np.array(corner_walls, np.int32),
+        np.array(edge_sigmas, np.float64),
         np.array(areas, np.float64), np.array(variances, np.float64), np.array(closed, np.bool_), np.array(opening_walls, np.int32),
         np.array(kinds, np.uint8), np.array(spans, np.float64).reshape(-1, 2), np.array(heights, np.float64).reshape(-1, 2),
         np.array(opening_covariance).reshape(-1, 4, 4), np.array(opening_rooms, np.int32).reshape(-1, 2), _furniture(map, used, plans, evidence),
