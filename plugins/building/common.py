@@ -116,7 +116,8 @@ def evidence_of(state: Gathered, map: Map | None) -> Evidence | None:
     views, regions = [(view, T) for view, T, _ in kept], [_regions(view) for view, *_ in kept]
     if not sum(len(points) for points, *_ in regions):
         return None
-    R = _axes(state, [T for _, T in views], [(T[:3, :3] @ n.T).T for (_, T), (_, n, _, _) in zip(views, regions)], [area for *_, area in regions])
+    facing = [view.coefficients[:, :3] @ T[:3, :3].T for view, T in views]
+    R = _axes(state, [T for _, T in views], facing, [region[4] for region in regions])
     T_world_building = np.eye(4)
     T_world_building[:3, :3] = R
     start = state.first if state.first is not None else views[0][1]
@@ -137,17 +138,20 @@ def evidence_of(state: Gathered, map: Map | None) -> Evidence | None:
     return found
 
 
-def _regions(view: KeyframeView) -> tuple[F64, F64, F64, F64]:
-    """Return points (n, 3) on planes, the planes' normals (n, 3), information (n,) and area (n,), in the camera's frame."""
+def _regions(view: KeyframeView) -> tuple[F64, F64, F64, F64, F64]:
+    """Return points (n, 3) on planes, the planes' normals (n, 3), information (n,) and area (n,), in the camera's frame, and the area of each plane
+    (k,)."""
     half = STRIDE // 2
     r, c = np.nonzero((view.labels[half::STRIDE, half::STRIDE] > 0) & (view.depth_m[half::STRIDE, half::STRIDE] > 0.0))
     r, c = STRIDE * r + half, STRIDE * c + half
     camera, depth = view.camera, view.depth_m[r, c].astype(np.float64)
     points = camera.back_project(np.stack([c, r], axis=1), depth)
-    normals = view.coefficients[view.labels[r, c].astype(int) - 1, :3]
+    plane = view.labels[r, c].astype(int) - 1
+    normals = view.coefficients[plane, :3]
     cosine = np.clip(-(points * normals).sum(axis=1) / np.linalg.norm(points, axis=1), 0.1, 1.0)
     sigma = camera.depth_noise.sigma_m(depth) * np.clip(-(points * normals).sum(axis=1) / depth, 0.05, None)
-    return points, normals, 1.0 / np.maximum(sigma, 1e-3) ** 2, (STRIDE * depth) ** 2 / (camera.fx * camera.fy * cosine)
+    area = (STRIDE * depth) ** 2 / (camera.fx * camera.fy * cosine)
+    return points, normals, 1.0 / np.maximum(sigma, 1e-3) ** 2, area, np.asarray(np.bincount(plane, area, len(view.coefficients)), np.float64)
 
 
 def _axes(state: Gathered, poses: list[F64], normals: list[F64], areas: list[F64]) -> F64:
@@ -379,8 +383,8 @@ def _faces_along(evidence: Evidence, height: F64, normal: F64, members: I64, sto
         close = np.nonzero(np.abs(offsets - offset) < NEAR_FACE_M)[0]
         start = float(along[close].min())
         columns = ((along[close] - start) / CELL_M).astype(int)
-        count = np.zeros((int(columns.max()) + 1, LEVELS), np.int32)
-        np.add.at(count, (columns, levels[close]), 1)
+        width = int(columns.max()) + 1
+        count = np.bincount(columns * LEVELS + levels[close], minlength=width * LEVELS).reshape(width, LEVELS).astype(np.int32)
         reach = _filled(_reaching(Face(normal, offset, start, count, np.zeros(len(count), np.bool_), members[close]), space, storey))
         if _longest(reach) * CELL_M >= least_m:
             found.append(Face(normal, offset, start, count, reach, members[close]))

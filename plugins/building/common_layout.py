@@ -441,10 +441,11 @@ def _opening(
     if b - a < NARROWEST_M or len(open_levels) < LEAST_LEVELS:
         return None
     near = _wall_points(wall, faces, evidence, storey)
-    a, b, sigma_side = _jambs(a, b, *near)
-    bottom, top, sigma_top = _heights(a, b, open_levels, *near)
+    a, b, sigma_side, jambs = _jambs(a, b, *near)
+    bottom, top, sigma_top, lintel = _heights(a, b, open_levels, *near)
     ceiling = storey.ceiling_m - storey.bottom_m if np.isfinite(storey.ceiling_m) else float("inf")
-    kind = "window" if bottom > WINDOW_M else "passage" if b - a > WIDEST_DOOR_M or top > ceiling - 0.1 else "door"
+    door = (jambs or lintel) and b - a <= WIDEST_DOOR_M and top <= ceiling - 0.1
+    kind = "window" if bottom > WINDOW_M else "door" if door else "passage"
     sigmas = (sigma_side, sigma_side, 0.02 if bottom else 0.01, sigma_top)
     middle = (a + b) / 2.0 * wall.edge.along + wall.edge.offset_m * wall.edge.normal
     depth = wall.thickness_m if np.isfinite(wall.thickness_m) else 0.0
@@ -466,13 +467,13 @@ def _wall_points(wall: WallPlan, faces: list[Face], evidence: Evidence, storey: 
     return points[:, :2] @ edge.along, points[:, 2] - storey.bottom_m
 
 
-def _jambs(a: float, b: float, along: F64, height: F64) -> tuple[float, float, float]:
-    """Move the sides of an opening to where the wall's own points end."""
+def _jambs(a: float, b: float, along: F64, height: F64) -> tuple[float, float, float, bool]:
+    """Move the sides of an opening to where the wall's own points end; the standard deviation of the sides, and if both were seen."""
     middle, low = (a + b) / 2.0, along[(height > 0.2) & (height < 1.9)]
     left = _end_of(middle - low[(low < middle) & (low > a - 0.3)], middle - a)
     right = _end_of(low[(low > middle) & (low < b + 0.3)] - middle, b - middle)
     known = np.isfinite([left, right])
-    return middle - left if known[0] else a, middle + right if known[1] else b, 0.015 if known.all() else CELL_M / 2.0
+    return middle - left if known[0] else a, middle + right if known[1] else b, 0.015 if known.all() else CELL_M / 2.0, bool(known.all())
 
 
 END_STEP_M = 0.01
@@ -491,17 +492,17 @@ def _end_of(away: F64, guess_m: float) -> float:
     return float(dense[0]) * END_STEP_M if len(dense) else float("nan")
 
 
-def _heights(a: float, b: float, open_levels: NDArray[np.signedinteger], along: F64, height: F64) -> tuple[float, float, float]:
-    """Return bottom and top of an opening above the floor, and the top's standard deviation: by the lintel where one was seen. What is open only
-    higher up is a window if the wall was seen below it."""
+def _heights(a: float, b: float, open_levels: NDArray[np.signedinteger], along: F64, height: F64) -> tuple[float, float, float, bool]:
+    """Return bottom and top of an opening above the floor, the top's standard deviation, and if a lintel was seen, which the top is by. What is open
+    only higher up is a window if the wall was seen below it."""
     inside = (along > a + 0.1) & (along < b - 0.1)
     bottom, top = float(open_levels[0]) * LEVEL_M, float(open_levels[-1] + 1) * LEVEL_M
     if bottom < WINDOW_M or (height[inside] < bottom - LEVEL_M).sum() < 30:
         bottom = 0.0
     lintel = height[inside & (height > 1.5)]
     if len(lintel) >= 30:
-        return bottom, float(np.percentile(lintel, 1.0)), 0.02
-    return bottom, top, LEVEL_M / 2.0
+        return bottom, float(np.percentile(lintel, 1.0)), 0.02, True
+    return bottom, top, LEVEL_M / 2.0, False
 
 
 def _room_at(rooms: list[RoomPlan], point: F64) -> int:
@@ -611,6 +612,9 @@ def _supports(kind: str, number: int, planes: list[int], rows: I32, evidence: Ev
     return out + [(ELEMENTS.index(kind), number, SUPPORTS.index("frame"), view.index) for view in views]
 
 
+AT_END = 4  # cells of an end of a wall, of which those at the wall that meets it there are seen with that
+
+
 def _unseen(wall: WallPlan, openings: list[OpeningPlan], number: int) -> list[tuple[float, float]]:
     """Return the stretches along a wall without a reading on either face, in an edge of a room and not in an opening."""
     out: list[tuple[float, float]] = []
@@ -628,7 +632,10 @@ def _unseen(wall: WallPlan, openings: list[OpeningPlan], number: int) -> list[tu
                 seen |= (t > opening.span[0]) & (t < opening.span[1])
         marked = np.nonzero(~seen)[0]
         runs = np.split(marked, np.nonzero(np.diff(marked) > 1)[0] + 1) if len(marked) else []
-        out += [(a + CELL_M * run[0], a + CELL_M * (run[-1] + 1)) for run in runs if len(run) >= 3]
+        long = [run for run in runs if len(run) >= 3]
+        out += [
+            (a if run[0] < AT_END else a + CELL_M * run[0], b if run[-1] >= len(t) - AT_END else a + CELL_M * (run[-1] + 1)) for run in long
+        ]  # fmt: skip
     return out
 
 
