@@ -16,7 +16,7 @@ from trihedron.pipeline.core.types import F64, I32, OPENING_KINDS, Building
 
 SHEET_M = 0.06  # thickness that a wall is drawn with where its other face was not seen
 NOMINAL_M = 2.5  # of a storey whose floor or ceiling was not seen
-COLORS = {"floor": (205, 190, 165, 255), "ceiling": (240, 240, 240, 255), "wall": (225, 228, 232, 255), "unseen": (220, 80, 70, 110)}  # RGBA
+MODEL_COLORS = {"floor": (205, 190, 165, 255), "ceiling": (240, 240, 240, 255), "wall": (225, 228, 232, 255), "unseen": (220, 80, 70, 110)}  # RGBA
 CEILING = "ceiling"
 BOX = np.array([[0, 1, 5, 4], [1, 2, 6, 5], [2, 3, 7, 6], [3, 0, 4, 7], [3, 2, 1, 0], [4, 5, 6, 7]])  # faces of a box, outward
 
@@ -53,7 +53,7 @@ def quad(building: Building, wall: int, a: float, b: float) -> F64:
     """Return the corners (4, 2) of a wall's stretch."""
     start, end = building.walls_m[wall]
     along = (end - start) / max(float(np.linalg.norm(end - start)), 1e-9)
-    back = np.array([along[1], -along[0]]) * (building.thickness_m[wall] if np.isfinite(building.thickness_m[wall]) else SHEET_M)
+    back = np.array([along[1], -along[0]]) * _drawn_thickness(building, wall)
     return np.array([start + a * along, start + b * along, start + b * along + back, start + a * along + back])
 
 
@@ -76,6 +76,30 @@ def open_edges(building: Building, room: int) -> Iterator[F64]:
                 yield np.array([p, q])
 
 
+def wall_corners(building: Building, room: int) -> Iterator[F64]:
+    """Yield the pieces (4, 2) of walls outside the corners of a room where two walls meet."""
+    for ring in building.loops[building.loops[:, 0] == room]:
+        corners, walls = building.corners_m[ring[1] : ring[2]], building.corner_walls[ring[1] : ring[2]]
+        ahead = np.roll(corners, -1, axis=0) - corners
+        outward = np.stack([ahead[:, 1], -ahead[:, 0]], axis=1) / np.maximum(np.linalg.norm(ahead, axis=1), 1e-9)[:, None]
+        for k, corner in enumerate(corners):
+            if walls[k] < 0 or walls[k - 1] < 0 or _unseen_at(building, walls[k], corner) or _unseen_at(building, walls[k - 1], corner):
+                continue
+            first, second = (outward[j] * _drawn_thickness(building, walls[j]) for j in (k - 1, k))
+            yield np.array([corner, corner + first, corner + first + second, corner + second])
+
+
+def _drawn_thickness(building: Building, wall: Any) -> float:
+    return float(building.thickness_m[wall]) if np.isfinite(building.thickness_m[wall]) else SHEET_M
+
+
+def _unseen_at(building: Building, wall: Any, corner: F64) -> bool:
+    """Say if a wall was not seen where a corner (2,) is."""
+    start, end = building.walls_m[wall]
+    t = float((corner - start) @ (end - start)) / max(float(np.linalg.norm(end - start)), 1e-9)
+    return any(low - 0.05 <= t <= high + 0.05 for of, low, high in building.unseen if int(of) == wall)
+
+
 def label_place(building: Building, room: int) -> F64:
     """Return a place (2,) well inside a room, for its name."""
     import shapely
@@ -96,7 +120,8 @@ def opening_name(building: Building, opening: int) -> str:
 
 @dataclass(frozen=True)
 class Part:
-    """Triangles (t, 3) over vertices (v, 3) of one kind (a key of COLORS) of a storey; normals by the right-hand rule point away from the solid."""
+    """Triangles (t, 3) over vertices (v, 3) of one kind (a key of MODEL_COLORS) of a storey; their normals by the right-hand rule point away from
+    the solid."""
 
     storey: int
     kind: str
