@@ -32,6 +32,8 @@ def main(argv: list[str]) -> int:
         count = show(recording, stream)
         stream.flush()
     except RuntimeError as error:  # there is no display, for example
-        raise UsageError("rerun", f"its window does not open: {error}", f"write a file instead: trihedron export {run} --to rerun") from error
+        raise UsageError(
+            "rerun", f"its window does not open: {str(error).strip().splitlines()[0]}", f"write a file instead: trihedron export {run} --to rerun"
+        ) from error
     print(f"{count} frames of {recording.path}")
     return 0

@@ -44,15 +44,15 @@ def test_colmap_recovers_a_pose_among_outliers_with_pixel_centres_at_integers():
     assert absolute_pose(points[:3], pixels[:3], CAMERA, 4.0, seed=3) is None
 
 
-@pytest.mark.parametrize("keypoints", ["opencv_orb", "sift"])
-def test_colmap_tracks_with_descriptors_of_either_metric(keypoints):
+@pytest.mark.parametrize(("keypoints", "median_deg"), [("opencv_orb", 0.6), ("sift", 0.1)])
+def test_colmap_tracks_with_descriptors_of_either_metric(keypoints, median_deg):
+    """OpenCV's ORB places corners to whole pixels of a pyramid level, several of the image."""
     pytest.importorskip("pycolmap", exc_type=ImportError)
     data = Synthetic(length=8, width=320, height=240)
     tracks = values_of(PluginCheck("tracks", "pycolmap_pnp").plugin, "tracks", room((f"keypoints={keypoints}",)))
     assert tracks[0] is None and all(len(found.keypoints) >= 30 for found in tracks[1:])
-    for k in range(1, 8):
-        truth = invert(data.true_pose(k)) @ data.true_pose(k - 1)
-        assert rotation_angle_deg(tracks[k].R_current_previous @ truth[:3, :3].T) < 1.0
+    truths = [invert(data.true_pose(k)) @ data.true_pose(k - 1) for k in range(1, 8)]
+    assert np.median([rotation_angle_deg(found.R_current_previous @ T[:3, :3].T) for found, T in zip(tracks[1:], truths)]) < median_deg
 
 
 @pytest.mark.parametrize(("name", "words"), [("open3d_voxels", ()), ("open3d_poisson", ("surface.depth=7",))])

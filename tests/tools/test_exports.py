@@ -106,7 +106,7 @@ class Windowless:
 
 
 def test_a_viewer_that_does_not_open_is_one_line(run, monkeypatch, capsys):
-    monkeypatch.setattr(export_rerun, "require_rerun", lambda: Windowless)
+    monkeypatch.setattr(rerun_view, "require_rerun", lambda: Windowless)
     monkeypatch.setattr(export_rerun, "show", lambda recording, stream: 9)
     assert main(["view", str(run)]) == 2
     printed = capsys.readouterr()

