@@ -65,7 +65,7 @@ def main(argv: list[str]) -> int:
     options = parser.parse_args(argv)
     folders, files = [path for path in options.folders if not path.is_file()], [path for path in options.folders if path.is_file()]
     if options.surfaces:
-        _judge_surfaces(folders)
+        judge_surfaces(folders)
     runs = [run for folder in folders for run in read_runs(folder)]
     rows = rows_of(runs + read_trajectories(files, runs, options.label, options.y_up), options.baseline)
     print(render.as_text(rows))
@@ -140,7 +140,7 @@ def _read(file: Path) -> dict[str, Any]:
     return found
 
 
-def _judge_surfaces(folders: Sequence[Path]) -> None:
+def judge_surfaces(folders: Sequence[Path]) -> None:
     """Write surface.json beside each surface.ply that has none; one that cannot be judged is named, and left out."""
     from trihedron.tools.evaluate_surface import evaluate_files
 
@@ -154,9 +154,8 @@ def _judge_surfaces(folders: Sequence[Path]) -> None:
             (folder / SURFACE_FIGURES).write_text(json.dumps(figures, indent=2) + "\n")
 
 
-def rows_of(runs: Sequence[Run], baseline: str = "") -> list[dict[str, Any]]:
-    """One row for each data set and change: `data`, `change`, `runs`, `note`, of each figure's runs median, smallest and largest, and with a baseline
-    the paired `difference` of each figure. Then, if there are several data sets, the differences over all of them, `data` = "all"."""
+def groups_of(runs: Sequence[Run]) -> dict[tuple[str, str], list[Run]]:
+    """Return the runs of each row, by data and change: runs that differ in their seeds alone share one, data sets stand together."""
     keys = {key for run in runs for key in run.overrides if key not in NOT_SHOWN}
     own = [run for run in runs if not run.label]
     varying = sorted(key for key in keys if len({run.overrides.get(key) for run in own}) > 1)
@@ -165,9 +164,16 @@ def rows_of(runs: Sequence[Run], baseline: str = "") -> list[dict[str, Any]]:
         change = run.label or _said(run, [k for k in varying if not _of_data(k)])
         groups.setdefault((_said(run, [k for k in varying if _of_data(k)]), change), []).append(run)
     order = list(dict.fromkeys(data for data, _ in groups))
-    groups = dict(sorted(groups.items(), key=lambda group: order.index(group[0][0])))
+    return dict(sorted(groups.items(), key=lambda group: order.index(group[0][0])))
+
+
+def rows_of(runs: Sequence[Run], baseline: str = "") -> list[dict[str, Any]]:
+    """One row for each data set and change: `data`, `change`, `runs`, `note`, of each figure's runs median, smallest and largest, and with a baseline
+    the paired `difference` of each figure. Then, if there are several data sets, the differences over all of them, `data` = "all"."""
+    groups = groups_of(runs)
+    order = list(dict.fromkeys(data for data, _ in groups))
     _check_baseline(baseline, [change for _, change in groups])
-    rows = [_row(data, change, same, groups.get((data, baseline)) if change != baseline else None) for (data, change), same in groups.items()]
+    rows = [row_of(data, change, same, groups.get((data, baseline)) if change != baseline else None) for (data, change), same in groups.items()]
     if baseline and len(order) > 1:
         for other in dict.fromkeys(change for _, change in groups if change != baseline):
             pairs = [pair for data in order for pair in _pairs(groups.get((data, other), []), groups.get((data, baseline), []))]
@@ -175,7 +181,8 @@ def rows_of(runs: Sequence[Run], baseline: str = "") -> list[dict[str, Any]]:
     return rows
 
 
-def _row(data: str, change: str, same: Sequence[Run], base: Sequence[Run] | None) -> dict[str, Any]:
+def row_of(data: str, change: str, same: Sequence[Run], base: Sequence[Run] | None = None) -> dict[str, Any]:
+    """Return the row of runs that share one, and their paired differences from those of the baseline."""
     figures = {}
     for name in FIGURES:
         values = [run.figures[name] for run in same if np.isfinite(run.figures[name])]
