@@ -36,10 +36,13 @@ benchmark: install  ## time, memory and error on the synthetic room and the sequ
 		case $$folder in *icl_nuim*) kind=icl_nuim;; *) kind=tum;; esac; \
 		echo; echo "$$folder"; $(BIN)/trihedron benchmark dataset=$$kind dataset.path=$$folder; done
 
-table: install  ## every system on the synthetic room and on DATA="tum:FOLDER icl_nuim:FOLDER ..."; goes on where it was stopped
-	$(BIN)/trihedron run -m experiment=paper_table out=$(TABLE) 'sequences=[$(foreach d,$(DATA),"$(d)"$(COMMA))$(ROOMS)]' || test $$? -eq 1
+table: install  ## the paper's study and its pages: every system on rooms and DATA="tum:FOLDER icl_nuim:FOLDER ..."; goes on where it was stopped
+	$(BIN)/trihedron run -m experiment=paper out=$(TABLE) 'sequences=[$(foreach d,$(DATA),"$(d)"$(COMMA))$(ROOMS)]' || test $$? -eq 1
+	$(BIN)/trihedron run -m graph=structural,structural_paper,points dataset.scene=corridor out=$(TABLE)_corridor || test $$? -eq 1
 	$(BIN)/trihedron compare $(TABLE) --baseline graph=points --csv $(TABLE)/table.csv --markdown $(TABLE)/table.md \
 		--latex $(TABLE)/table.tex --json $(TABLE)/table.json
+	$(BIN)/trihedron paper $(TABLE) $(TABLE)_corridor --markdown $(TABLE)/paper.md
+	$(BIN)/trihedron site $(TABLE) $(TABLE)_corridor --out $(TABLE)/site
 
 install: $(VENV)/checked $(VENV)/compiled
 
