@@ -41,16 +41,24 @@ def printed(*words: str) -> str:
 def configuration() -> str:
     """Root keys with their defaults, and the files of each group."""
     parts = [
-        "# The configuration\n\nWords of the command line are `key=value`. A key is one of those on this page, a stage (`manhattan=branch_and_bound`), "
-        "an option of a stage (`manhattan.cone_deg=8`; see [Plugins](plugins.md)), a wire (`graph.tracks.manhattan=manhattan@prev`), or one of Hydra's own.\n",
+        "# The configuration\n\nWords of the command line are `key=value`. A key is one of those on this page, a stage "
+        "(`manhattan=branch_and_bound`), an option of a stage (`manhattan.cone_deg=8`; see [Plugins](plugins.md)), a wire "
+        "(`graph.tracks.manhattan=manhattan@prev`), or one of Hydra's own.\n",
         "## Root keys\n\n" + table(RunOptions, skipped=("defaults", "graph", "hydra", "record", "view")),
         "## record\n\n" + (inspect.getdoc(RecordOptions) or "") + "\n\n" + table(RecordOptions, "record."),
         "## view=foxglove\n\n" + table(FoxgloveView, "view."),
         "## view=rerun\n\n" + table(RerunView, "view."),
         "## hydra/sweeper=optuna\n\n" + table(SearchOptions, "hydra.sweeper.", skipped=("_target_",)),
     ]
-    for group, what in (("graph", "Systems"), ("experiment", "Sweeps with a table at their end"), ("without", "The default graph without one ingredient")):
-        rows = [(f"`{group}={path.stem}`", f"[{path.stem}.yaml](../../conf/{group}/{path.name})", about(path)) for path in sorted((ROOT / "conf" / group).glob("*.yaml"))]
+    for group, what in (
+        ("graph", "Systems"),
+        ("experiment", "Sweeps with a table at their end"),
+        ("without", "The default graph without one ingredient"),
+    ):
+        rows = [
+            (f"`{group}={path.stem}`", f"[{path.stem}.yaml](../../conf/{group}/{path.name})", about(path))
+            for path in sorted((ROOT / "conf" / group).glob("*.yaml"))
+        ]
         parts.append(f"## {group}\n\n{what}.\n\n" + markdown(["word", "file", "content"], rows))
     return "\n\n".join(parts) + "\n"
 
