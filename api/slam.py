@@ -173,7 +173,7 @@ class Slam:
         finished: Any = self._runner.result.folds.get("surface")
         if finished is None:
             plugin, state = self._runner.graph.stages["surface"].plugin, self._runner.fold_state("surface")
-            finished = plugin.preview(state) if hasattr(plugin, "preview") else plugin.finish(copy.deepcopy(state), self._runner.result.map)
+            finished = plugin.finish(copy.deepcopy(state), self._runner.result.map)
         surface: Surface = finished
         return surface
 

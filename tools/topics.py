@@ -13,7 +13,7 @@ from pathlib import Path
 from trihedron.pipeline.core.errors import printable
 from trihedron.tools.arguments import Parser, table
 
-VALUE_SCHEMA = "trihedron.Value"
+LEGACY_SCHEMA = "trihedron.Value"
 
 
 @dataclass
@@ -53,7 +53,7 @@ def topics_of(path: Path) -> list[Topic]:
         topic = found.get(channel)
         if topic is None:
             name = file.schema_name(channel) or file.channels[channel].message_encoding
-            name = _value_type(data) if name == VALUE_SCHEMA else name
+            name = _value_type(data) if name == LEGACY_SCHEMA else name
             topic = found[channel] = Topic(printable(file.channels[channel].topic, 120), printable(name, 120), first_ns=log_time, last_ns=log_time)
         topic.messages += 1
         topic.bytes += len(data)
@@ -62,12 +62,12 @@ def topics_of(path: Path) -> list[Topic]:
 
 
 def _value_type(data: bytes) -> str:
-    """The type of value in a message of ours, for example Pose."""
+    """The type of a value in a recording of format 4 or older, for example Pose."""
     from google.protobuf.message import DecodeError
 
-    from trihedron.pipeline.record.codec import ValueMessage
+    from trihedron.pipeline.record.codec import LegacyMessage
 
     try:
-        return f"trihedron.{ValueMessage.FromString(data).type}"
+        return f"trihedron.{LegacyMessage.FromString(data).type}"
     except DecodeError:
-        return VALUE_SCHEMA
+        return LEGACY_SCHEMA
