@@ -7,16 +7,14 @@ Example: trihedron plugins manhattan
 
 from __future__ import annotations
 
-import contextlib
 import inspect
-import io
 import json
 import re
-import tokenize
 from enum import Enum
 from pathlib import Path
 from typing import Any
 
+from trihedron.pipeline.core.comments import field_comments
 from trihedron.pipeline.core.errors import UsageError, did_you_mean
 from trihedron.tools.arguments import Parser, table
 
@@ -92,29 +90,6 @@ def describe_plugin(slot: str, name: str, plugin: type[Any]) -> dict[str, Any]:
         "inputs": parameters_of_method(slot, plugin),
         "parameters": options,
     }
-
-
-def field_comments(plugin: type[Any]) -> dict[str, str]:
-    """Return field name -> the comment behind it in the source, its bases' included; nothing where there is no source."""
-    found: dict[str, str] = {}
-    for base in reversed(plugin.__mro__[:-1]):
-        with contextlib.suppress(OSError, TypeError):
-            found |= _comments(inspect.getsource(base))
-    return found
-
-
-def _comments(source: str) -> dict[str, str]:
-    """Return field name -> comment of one class's source."""
-    found, name = {}, ""
-    for token in tokenize.generate_tokens(io.StringIO(source).readline):
-        if token.type == tokenize.NAME and token.line[: token.start[1]].isspace() and token.line[token.end[1] :].lstrip().startswith(":"):
-            name = token.string
-        elif token.type == tokenize.COMMENT and name:
-            found[name] = token.string.lstrip("# ")
-            name = ""
-        elif token.type == tokenize.NEWLINE:
-            name = ""
-    return found
 
 
 def default_plugins() -> dict[str, str]:

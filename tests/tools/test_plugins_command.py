@@ -9,10 +9,11 @@ from typing import Annotated
 import pytest
 
 from trihedron.pipeline.app.cli import main
+from trihedron.pipeline.core.comments import field_comments
 from trihedron.pipeline.core.options import Range
 from trihedron.pipeline.core.slots import SLOTS
 from trihedron.pipeline.core.types import Frame, Normals
-from trihedron.tools.plugins import describe_plugin, field_comments, first_sentence
+from trihedron.tools.plugins import describe_plugin, first_sentence
 
 
 class Kind(Enum):
