@@ -141,15 +141,18 @@ def _read(file: Path) -> dict[str, Any]:
 
 
 def judge_surfaces(folders: Sequence[Path]) -> None:
-    """Write surface.json beside each surface.ply that has none; one that cannot be judged is named, and left out."""
+    """Write surface.json beside each surface.ply that has none; one that cannot be judged is skipped, and each reason printed once."""
     from trihedron.tools.evaluate_surface import evaluate_files
 
+    reasons = set()
     for folder in (run for given in folders for run in run_folders(given)):
         if (folder / SURFACE).exists() and not (folder / SURFACE_FIGURES).exists():
             try:
                 figures = evaluate_files(folder / SURFACE, folder / "run.mcap")
             except DataError as error:
-                print(f"not judged: {error}")
+                if str(error) not in reasons:
+                    print(f"{folder / SURFACE} is not judged: {error}")
+                reasons.add(str(error))
                 continue
             (folder / SURFACE_FIGURES).write_text(json.dumps(figures, indent=2) + "\n")
 

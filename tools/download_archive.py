@@ -30,7 +30,7 @@ class DamagedArchive(DataError):
 
 @dataclass(frozen=True)
 class Layout:
-    """Where a sequence lies in its archive: in the folder that holds `marker` and, of several, is called `folder`; `nested` is an archive in the
+    """Place of a sequence in its archive: the folder that holds `marker` and, of several, is called `folder`; `nested` is an archive in the
     archive, `also` files from elsewhere in it."""
 
     marker: str

@@ -67,12 +67,17 @@ def main(argv: list[str]) -> int:
     options = parser.parse_args(argv)
     if not options.no_surfaces:
         judge_surfaces(options.folders)
-    runs = [run for folder in options.folders for run in read_runs(folder)]
-    tables = tables_of([(facts_of(same[0]), row_of(data, change, same)) for (data, change), same in groups_of(runs).items()])
+    tables = tables_of(known_of(options.folders))
     print("\n\n".join(found.as_text() for found in tables))
     if options.markdown:
         options.markdown.write_text("\n".join(found.as_markdown() for found in tables), encoding="utf-8")
     return 0
+
+
+def known_of(folders: Sequence[Path]) -> Known:
+    """Return the cells of the runs in some folders. Raises DataError when there are none."""
+    runs = [run for folder in folders for run in read_runs(folder)]
+    return [(facts_of(same[0]), row_of(data, change, same)) for (data, change), same in groups_of(runs).items()]
 
 
 def tables_of(known: Known) -> list[Table]:

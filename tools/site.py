@@ -37,7 +37,7 @@ BAND_COLUMNS = [TRACKED, COMPARED]
 
 @dataclass(frozen=True)
 class Badge:
-    """How a cell stands to the published figure. The sign and the text say it without colour."""
+    """Relation of a cell to the published figure. The sign and the text say it without colour."""
 
     kind: str
     sign: str
