@@ -6,10 +6,10 @@ Three kinds of figure, all in metres but the entropy:
   absolute difference to the depth measured there, mean over pairs. The sensor's noise is in it. `shifted_30_m` is without: the RMS over TILES × TILES
   parts of the image of the median difference, signed.
 - `map_entropy` and `plane_sigma_m`: mean map entropy (Droeschel and Behnke, 2018), `½ ln det(2π e Σ)` of the points in a ball, and the square
-  root of the mean smallest eigenvalue of Σ over points on mutually orthogonal planes (MOM; Kornilova and Ferrer, "Be your own benchmark: no-reference
-  trajectory metric on registered point clouds", ECMR 2021).
+  root of the median smallest eigenvalue of Σ over points on mutually orthogonal planes (MOM; Kornilova and Ferrer, "Be your own benchmark:
+  no-reference trajectory metric on registered point clouds", ECMR 2021, who take the mean: a ball that holds furniture, too, would decide it).
 - `wall_thickness_m`: on planar parts that several frames have seen, the standard deviation of the positions at which the frames saw them, along the
-  normal, RMS over the parts. A mean over the points of a frame has little noise: drift remains, and what is wrong with the sensor's depth.
+  normal, median over the parts. A mean over the points of a frame has little noise: drift remains, and what is wrong with the sensor's depth.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ PAIRS = 10  # for each distance
 WARP_STRIDE_PX, TILES, LEAST_PIXELS = 8, 4, 8  # sampled pixels; parts of the image a side; pixels of a part that is judged
 VIEWS, VIEW_STRIDE_PX, FARTHEST_M = 30, 8, 5.0  # frames of the point cloud, their sampled pixels and range
 QUERIES, BALL_M, LEAST_POINTS = 1500, 0.2, 30  # balls, their radius, and the points that one holds at least
-FLAT = 0.05  # of the second eigenvalue: the smallest of a planar part is less
+FLAT = 0.15  # of the second eigenvalue: the smallest of a planar part is less
 AXIS_DEG, LEAST_SHARE = 10.0, 0.03  # normals of one direction; share of the planar parts that a direction has at least
 LEAST_VIEWS, LEAST_OF_VIEW = 3, 5  # frames that saw a part, and their points in it
 CACHED = 16  # frames
@@ -119,7 +119,7 @@ def quality_of(frames: PosedFrames, count: int) -> Quality:
         warped_30_m=medians[30],
         shifted_30_m=float(np.mean(shifts)) if shifts else None,
         map_entropy=float(entropy.mean()) if len(entropy) else None,
-        plane_sigma_m=float(np.sqrt(parts.eigenvalues[orthogonal, 0].mean())) if len(orthogonal) else None,
+        plane_sigma_m=float(np.sqrt(np.median(parts.eigenvalues[orthogonal, 0]))) if len(orthogonal) else None,
         wall_thickness_m=thickness,
         parts=len(flat),
     )
@@ -223,11 +223,11 @@ def _orthogonal(normals: F64) -> Rows:
 
 
 def wall_thickness(points: F64, views: Rows, parts: Parts, flat: Sequence[int] | Rows) -> float | None:
-    """Return the RMS over planar parts of the standard deviation between the frames that saw a part, along its normal; None without any."""
+    """Return the median over planar parts of the standard deviation between the frames that saw a part, along its normal; None without any."""
     variances = []
     for part in flat:
         rows = parts.members[part]
         offsets, seen_by = points[rows] @ parts.normals[part], views[rows]
         means = [offsets[seen_by == view].mean() for view in np.unique(seen_by) if (seen_by == view).sum() >= LEAST_OF_VIEW]
         variances += [float(np.var(means, ddof=1))] if len(means) >= LEAST_VIEWS else []
-    return float(np.sqrt(np.mean(variances))) if variances else None
+    return float(np.sqrt(np.median(variances))) if variances else None

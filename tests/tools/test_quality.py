@@ -48,7 +48,7 @@ def test_true_poses_agree(found: list[Quality]) -> None:
     assert (true.frames, true.posed) == (COUNT, COUNT) and true.parts > 100
     for value in (true.warped_1_m, true.warped_10_m, true.warped_30_m):
         assert value is not None and value < 6e-3  # the nearest pixel's depth, on slanted walls
-    assert true.wall_thickness_m is not None and true.wall_thickness_m < 4e-3
+    assert true.wall_thickness_m is not None and true.wall_thickness_m < 2e-3
     assert true.plane_sigma_m is not None and true.plane_sigma_m < 8e-3
 
 
@@ -56,8 +56,8 @@ def test_every_figure_grows_with_the_error(found: list[Quality]) -> None:
     for name in ("warped_1_m", "warped_10_m", "warped_30_m", "shifted_30_m", "map_entropy", "plane_sigma_m", "wall_thickness_m"):
         values = [getattr(quality, name) for quality in found]
         assert values == sorted(values) and values[0] < values[2], name
-    thickness = found[1].wall_thickness_m
-    assert thickness is not None and thickness == pytest.approx(0.01, rel=0.3)
+    thickness = found[2].wall_thickness_m
+    assert thickness is not None and 0.015 < thickness < 0.05  # of few frames a part: the median of such variances is less than their mean
 
 
 def test_depth_is_warped_by_the_motion_between_both_frames() -> None:
