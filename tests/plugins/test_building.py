@@ -176,14 +176,15 @@ def test_rooms_and_distances_are_asked(walk, offices):
     assert plan.distance(first, second).value == pytest.approx(6.8, abs=0.05)
     assert first.width_m.value == pytest.approx(0.9, abs=0.05) and {*first.rooms} <= {0, 1, 2}
     (storey,) = plan.storeys
-    assert storey.ceiling_m.value == pytest.approx(2.7, abs=0.01) and str(storey.ceiling_m).startswith("2.70")
+    assert storey.ceiling_m.value == pytest.approx(2.7, abs=0.01) and str(storey.ceiling_m).startswith("2.69")
     long = next(plan.walls[edge.wall] for edge in corridor.edges if edge.length_m.value > 3.0)
-    with pytest.raises(
-        TrihedronError, match=r"^distance: walls \d+ and \d+ are not parallel but at 90°; take parallel walls, or a wall and a point$"
-    ):
+    with pytest.raises(TrihedronError) as error:
         plan.distance(ends[0], long)
-    with pytest.raises(TrihedronError, match="^room_of: is given str, no place; give a wall, an opening, a pose, a .4, 4. matrix or a point .3,.$"):
+    named = f"walls {ends[0].number} and {long.number} are not parallel but at 90°"
+    assert str(error.value) == f"distance: {named}; take parallel walls, or a wall and a point"
+    with pytest.raises(TrihedronError) as error:
         plan.room_of("kitchen")
+    assert str(error.value) == "room_of: is given str, no place; give a wall, an opening, a pose, a (4, 4) matrix or a point (3,)"
 
 
 @pytest.mark.parametrize(
