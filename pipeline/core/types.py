@@ -434,9 +434,10 @@ PLANE_OBSERVATIONS = Columns(
 class Map(Value):
     """Keyframes and landmarks; a row number is an id for good, dead rows have `alive` False. Columns are listed in `plugins.mapping.landmarks`.
 
-    `revision` counts versions; a row of `point_observations` and its siblings is a keyframe (row), a landmark, and its measurement."""
+    `revision` counts versions, `loop_closed` is that of the last one with a correction by `loop`; a row of `point_observations` and its siblings is a
+    keyframe (row), a landmark, and its measurement."""
 
-    version: ClassVar[int] = 5
+    version: ClassVar[int] = 6
     revision: int
     keyframes: Annotated[Table, KEYFRAMES]
     points: Annotated[Table, POINTS]
@@ -445,6 +446,7 @@ class Map(Value):
     point_observations: Annotated[Table, POINT_OBSERVATIONS]
     line_observations: Annotated[Table, LINE_OBSERVATIONS]
     plane_observations: Annotated[Table, PLANE_OBSERVATIONS]
+    loop_closed: int = 0
 
     @cached_property
     def memo(self) -> dict[Hashable, Any]:

@@ -128,3 +128,17 @@ def test_rounding_does_not_grow_from_keyframe_to_keyframe():
         map = apply_correction(map, correction(map, keyframe_ids=np.array([2], np.int32), T_world_keyframe=target[None]))
     R = map.keyframes.column("T_world_camera")[:, :3, :3]
     assert np.abs(R @ R.transpose(0, 2, 1) - np.eye(3)).max() < 1e-9
+
+
+def test_an_adjustment_that_began_before_a_loop_was_closed_does_not_undo_it():
+    """A loop moves the newest keyframe by 0.2 m; the bundle adjustment of the version before says otherwise, that of the version after counts."""
+    world = World()
+    map = walk(world, 4)
+    late, pose = correction(map, keyframe_ids=np.array([3], np.int32), T_world_keyframe=camera_at(3)[None]), camera_at(3).copy()
+    pose[0, 3] += 0.2
+    closed = step(EVERY, world, map, 4, status="lost", loop=correction(map, keyframe_ids=np.array([3], np.int32), T_world_keyframe=pose[None]))
+    assert closed.loop_closed == closed.revision and np.array_equal(closed.keyframes.row("T_world_camera", 3), pose)
+    assert step(EVERY, world, closed, 5, status="lost", bundle=late) is None
+    next_one = dataclasses.replace(late, based_on=closed.revision)
+    adjusted = step(EVERY, world, closed, 5, status="lost", bundle=next_one)
+    assert np.array_equal(adjusted.keyframes.row("T_world_camera", 3), camera_at(3)) and adjusted.loop_closed == closed.revision
