@@ -49,7 +49,9 @@ def problems(site: Path) -> list[str]:
                 if url in page.loaded and parts.scheme != "data":
                     found.append(f"{name}: loads {url}")
                 continue
-            target = (path if not parts.path else site / parts.path.lstrip("/") if parts.path.startswith("/") else path.parent / unquote(parts.path)).resolve()
+            target = (
+                path if not parts.path else site / parts.path.lstrip("/") if parts.path.startswith("/") else path.parent / unquote(parts.path)
+            ).resolve()
             if target.is_dir():
                 target /= "index.html"
             if not target.exists():
