@@ -17,7 +17,7 @@ import gallery
 import reference
 
 ROOT = Path(__file__).resolve().parents[2]
-RESULTS = ROOT / "build" / "gallery"
+RESULTS = Path(os.environ.get("TRIHEDRON_GALLERY", ROOT / "build" / "gallery"))
 LINK = re.compile(r"(\]\()([^)\s#]+)((?:#[^)\s]*)?\))")
 TOP = {"README.md": "index.md"}  # page of the repository's top -> page of the site; others keep their names, in lower case
 LANGUAGES = {".py": "python", ".yaml": "yaml", ".yml": "yaml", ".toml": "toml", ".json": "json", ".ipynb": "json", "": "text"}
