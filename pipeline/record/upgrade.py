@@ -20,7 +20,8 @@ from trihedron.pipeline.record.mcap_writer import McapWriter
 RENAMED_TYPES: dict[str, str] = {}  # name in an older recording -> name today, where only the name changed
 RENAMED_FIELDS: dict[str, dict[str, str]] = {}  # type today -> older name of a field or table -> name today
 ADDED_FIELDS = {  # type and older version -> fields that it lacks, encoded
-    ("Pose", 2): b"".join([*array_parts("map_covariance", np.zeros((6, 6))), Numbers({"noise_scale": float}).fields([1.0])])
+    ("Pose", 2): b"".join([*array_parts("map_covariance", np.zeros((6, 6))), Numbers({"noise_scale": float}).fields([1.0])]),
+    ("Map", 5): Numbers({"loop_closed": int}).fields([0]),
 }
 ADDED_COLUMNS = {("Map", 4): ("keyframes", "world_covariance", "covariance")}  # likewise -> table, the column that it lacks, and that which it copies
 
@@ -119,8 +120,10 @@ def _renamed(data: bytes) -> bytes:
     if older in ADDED_COLUMNS:
         with suppress(Exception):  # a stranger's header, of which the decoder will say what is wrong
             _copy_column(message, *ADDED_COLUMNS[older])
-    message.version += int(older in ADDED_FIELDS or older in ADDED_COLUMNS)
-    return bytes(message.SerializeToString() + ADDED_FIELDS.get(older, b""))
+    if older not in ADDED_FIELDS and older not in ADDED_COLUMNS:
+        return bytes(message.SerializeToString())
+    message.version += 1
+    return _renamed(bytes(message.SerializeToString() + ADDED_FIELDS.get(older, b"")))  # which may be an older version still
 
 
 def _copy_column(message: Any, table: str, column: str, source: str) -> None:

@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 
 from trihedron.datasets.simulation.synthetic import Scene, Synthetic
-from trihedron.datasets.simulation.true_plan import plan_of
+from trihedron.pipeline.core.building_geometry import wall_pieces
 from trihedron.pipeline.core.registry import load_plugins, plugin_class
 from trihedron.pipeline.core.types import OPENING_KINDS, Camera, Frame, Planes, Pose
-from trihedron.pipeline.run.building_files import building_json, floorplan_svg, summary, wall_pieces, write_building
+from trihedron.pipeline.run.building_files import building_json, floorplan_svg, summary, write_building
 from trihedron.plugins.normals.integral_image import IntegralImage
 from trihedron.plugins.planes.connected_components import ConnectedComponents
 from trihedron.tools.benchmarks.building_benchmark import judged
@@ -54,16 +54,16 @@ def offices(walk):
 
 
 def test_the_true_plan_of_the_offices_is_that_of_its_walls():
-    plan = Synthetic(scene=Scene.offices).plan()
+    (plan,) = Synthetic(scene=Scene.offices).plans()
     areas = sorted(0.5 * abs(np.sum(ring[:, 0] * np.roll(ring[:, 1], -1) - np.roll(ring[:, 0], -1) * ring[:, 1])) for (ring,) in plan.rooms)
     assert areas == pytest.approx([16.0, 16.0, 28.0], abs=1e-3)
     assert [size for door in plan.doorways for size in (door.width_m, door.height_m)] == pytest.approx([0.9, 2.1, 0.9, 2.1])
-    assert len(plan_of(Synthetic(scene=Scene.corridor)._room).rooms[0]) == 2  # round a block
+    assert len(Synthetic(scene=Scene.corridor).plans()[0].rooms[0]) == 2  # round a block
 
 
 @pytest.mark.parametrize("name", LAYOUTS)
 def test_rooms_walls_and_doorways_of_the_offices_are_found(walk, offices, name):
-    figures = judged(offices[name], np.eye(4), walk[0].plan())
+    figures = judged(offices[name], np.eye(4), walk[0].plans())
     assert figures["room_recall"] == figures["room_precision"] == figures["door_recall"] == 1.0
     assert figures["iou"] >= 0.97 and figures["wall_m"] <= 0.01 and figures["height_m"] <= 0.01 and figures["area_error"] <= 0.02
     assert figures["door_precision"] == 1.0
