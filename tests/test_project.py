@@ -120,3 +120,16 @@ def test_the_changelog_is_kept():
     assert all(re.fullmatch(r"\d+\.\d+\.\d+ – \d{4}-\d\d-\d\d", heading) for heading in headings[1:])
     kinds = set(re.findall(r"^### (.+)$", (ROOT / "CHANGELOG.md").read_text(), re.MULTILINE))
     assert kinds <= {"Added", "Changed", "Deprecated", "Removed", "Fixed", "Security"}
+
+
+def test_decisions_are_short_records_listed_in_order():
+    index = (ROOT / "docs" / "decisions.md").read_text()
+    records = sorted((ROOT / "docs" / "decisions").glob("*.md"))
+    assert [path.name for path in records] == sorted(re.findall(r"\]\(decisions/([^)]+)\)", index))
+    for number, path in enumerate(records, 1):
+        text = path.read_text()
+        assert path.name.startswith(f"{number:04}-") and text.startswith(f"# {number}. "), path
+        headings = re.findall(r"^## (.+)$", text, re.MULTILINE)
+        order = ["Context", "Decision", "Measurement", "Limits", "Rejected"]
+        assert "Decision" in headings and headings == [heading for heading in order if heading in headings], f"{path}: {headings}"
+        assert len(text.split()) < 600, f"{path}: {len(text.split())} words"
