@@ -8,13 +8,16 @@ from pathlib import Path
 from typing import Any
 
 from mkdocs.config.defaults import MkDocsConfig
+from mkdocs.exceptions import PluginError
 from mkdocs.structure.files import File, Files
 from mkdocs.structure.pages import Page
 
 sys.path.insert(0, str(Path(__file__).parent))
+import gallery
 import reference
 
 ROOT = Path(__file__).resolve().parents[2]
+RESULTS = Path(os.environ.get("TRIHEDRON_GALLERY", ROOT / "build" / "gallery"))
 LINK = re.compile(r"(\]\()([^)\s#]+)((?:#[^)\s]*)?\))")
 TOP = {"README.md": "index.md"}  # page of the repository's top -> page of the site; others keep their names, in lower case
 LANGUAGES = {".py": "python", ".yaml": "yaml", ".yml": "yaml", ".toml": "toml", ".json": "json", ".ipynb": "json", "": "text"}
@@ -67,7 +70,11 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
     for path in sorted(ROOT.glob("*.md")):
         text = LINK.sub(lambda match: match[1] + from_docs(match[2]) + match[3], path.read_text())
         files.append(File.generated(config, page_of(path), content=text))
-    for name, text in reference.pages().items():
+    if not any(RESULTS.glob("*.txt")):
+        raise PluginError(f"{RESULTS} holds no results of the gallery; write them with: python docs/site/gallery.py build/gallery")
+    for picture in sorted(RESULTS.glob("*.jpg")):
+        files.append(File.generated(config, f"gallery/{picture.name}", abs_src_path=str(picture)))
+    for name, text in (reference.pages() | gallery.pages(RESULTS)).items():
         files.append(File.generated(config, name, content=text))
     linked = set()
     for file in files.documentation_pages():

@@ -19,7 +19,42 @@ from trihedron.tools.plugin_pages import markdown
 from trihedron.tools.plugins import field_comments
 
 ROOT = Path(__file__).resolve().parents[2]
+GROUPS = {"graph": "Systems", "experiment": "Sweeps with a table at their end", "without": "The default graph without one ingredient"}
+HEAD = """# The configuration
+
+Words of the command line are `key=value`. A key is one of those on this page, a stage (`manhattan=branch_and_bound`), an option of a stage
+(`manhattan.cone_deg=8`; see [Plugins](plugins.md)), a wire (`graph.tracks.manhattan=manhattan@prev`), or one of Hydra's own.
+"""
 TITLE = re.compile(r"# @package _global_\n((?:#.*\n)+)")
+
+PYTHON = """# Python: classes and functions
+
+Docstrings of the names in `import trihedron as th`. [The Python API](python.md) introduces them.
+
+## Track, record, replay
+
+::: trihedron.api.slam.Slam
+    options: {members: [track, values, map, trajectory, causal_trajectory, mesh, save, save_map, close]}
+::: trihedron.api.recording.Recording
+    options: {members: [topics, metadata, values, frame, image, frames, poses, trajectory, map, mesh, replay]}
+::: trihedron.api.runs.run
+::: trihedron.api.runs.Run
+::: trihedron.api.runs.compare
+::: trihedron.api.camera.Camera
+::: trihedron.api.trajectory.Trajectory
+
+## Stages and plugins
+
+::: trihedron.api.stages.Slot
+::: trihedron.api.stages.Stage
+::: trihedron.pipeline.core.registry.register
+::: trihedron.pipeline.core.errors.TrihedronError
+
+## Values
+
+::: trihedron.pipeline.core.types
+    options: {show_root_heading: false, show_root_toc_entry: false, show_if_no_docstring: false, filters: ["!^_"]}
+"""
 
 
 def command_line() -> str:
@@ -41,9 +76,7 @@ def printed(*words: str) -> str:
 def configuration() -> str:
     """Root keys with their defaults, and the files of each group."""
     parts = [
-        "# The configuration\n\nWords of the command line are `key=value`. A key is one of those on this page, a stage "
-        "(`manhattan=branch_and_bound`), an option of a stage (`manhattan.cone_deg=8`; see [Plugins](plugins.md)), a wire "
-        "(`graph.tracks.manhattan=manhattan@prev`), or one of Hydra's own.\n",
+        HEAD,
         "## Root keys\n\n" + table(RunOptions, skipped=("defaults", "graph", "hydra", "record", "view")),
         "## record\n\n" + (inspect.getdoc(RecordOptions) or "") + "\n\n" + table(RecordOptions, "record."),
         "## view=foxglove\n\n" + table(FoxgloveView, "view."),
@@ -84,4 +117,4 @@ def about(path: Path) -> str:
 def pages() -> dict[str, str]:
     """Text of each generated page by its place below docs/."""
     load_plugins()
-    return {"reference/command-line.md": command_line(), "reference/configuration.md": configuration()}
+    return {"reference/python-objects.md": PYTHON, "reference/command-line.md": command_line(), "reference/configuration.md": configuration()}
