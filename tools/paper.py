@@ -97,13 +97,18 @@ def trajectory_table(known: Known) -> Table:
         of_it = {facts.graph: (facts, row) for facts, row in known if published.sequence_of(facts.folder_name) == sequence}
         ours = [figure_text(of_it[graph][1], COMPARED) if graph in of_it else NONE for graph in graphs]
         values = [NONE if value is None else f"{1e3 * value:g}" for value in published.paper()["ate_m"][sequence]]
-        note = f"not there: trihedron download {entry['download']}"
+        note = f"trihedron download {entry['download']}"
         if of_it:
             frames = max(facts.frames for facts, _ in of_it.values())
             note = "whole" if frames >= published.WHOLE * entry["frames"] else f"{frames} of about {entry['frames']} frames: not comparable"
         rows.append((sequence, *ours, *values, note))
-    header = ("sequence", *graphs, *(f"{name}¹" for name in systems), "frames")
-    return Table("Table I: trajectory error", "ATE RMSE in mm; - is not there, not published, or lost. ¹ as published.", header, tuple(rows))
+    header = ("sequence", *graphs, *(f"{name}¹" for name in systems), "frames, or how to get them")
+    return Table(
+        "Table I: trajectory error",
+        "ATE RMSE in mm; - is not there, not published, or lost. ¹ as published. Last column: how to get a sequence that is not there.",
+        header,
+        tuple(rows),
+    )
 
 
 def time_table(known: Known) -> Table | None:

@@ -136,7 +136,7 @@ def write_site(cells: Sequence[Cell], out: Path, title: str, outside: dict[tuple
     columns = [name for name in COLUMNS if any(name in cell.row["figures"] for cell in cells)]
     for cell in cells:
         for facts in cell.facts:
-            page = run_page(facts, f"{cell.change or facts.graph}, {_data_title(cell)}", facts.commit != commit, pictures)
+            page = run_page(facts, f"{_system(cell)}, {_data_title(cell)}", facts.commit != commit, pictures)
             (out / "runs" / f"{names[facts.run.folder]}.html").write_text(page, encoding="utf-8")
     groups = [_group(data, [cell for cell in cells if cell.data == data], columns, names, commit, outside or {}) for data in _data_of(cells)]
     page = render(
@@ -169,10 +169,14 @@ def _data_title(cell: Cell) -> str:
     return cell.facts[0].folder_name or " ".join([dataset, *[word for word in cell.data.split() if not word.startswith("dataset=")]])
 
 
+def _system(cell: Cell) -> str:
+    return cell.change.removeprefix("graph=") or cell.facts[0].graph
+
+
 def _page_names(cells: Sequence[Cell]) -> dict[Path, str]:
     """Return a file name for each run: a number, and what it is."""
     runs = [(cell, facts) for cell in cells for facts in cell.facts]
-    slugs = [re.sub(r"[^a-z0-9]+", "-", f"{cell.change or facts.graph} {_data_title(cell)}".lower()).strip("-")[:60] for cell, facts in runs]
+    slugs = [re.sub(r"[^a-z0-9]+", "-", f"{_system(cell)} {_data_title(cell)}".lower()).strip("-")[:60] for cell, _ in runs]
     return {facts.run.folder: f"{number:03}-{slug}" for number, ((_, facts), slug) in enumerate(zip(runs, slugs))}
 
 
@@ -188,8 +192,7 @@ def _group(
         ]
         texts = [figure_text(cell.row, name) for name in columns]
         band = outside.get((cell.data, cell.change), "")
-        system = cell.change or cell.facts[0].graph
-        shown.append({"system": system, "texts": texts, "badge": cell.badge, "band": band, "note": cell.row["note"], "links": links})
+        shown.append({"system": _system(cell), "texts": texts, "badge": cell.badge, "band": band, "note": cell.row["note"], "links": links})
     title = _data_title(cells[0])
     return {
         "id": re.sub(r"[^a-z0-9]+", "-", f"data-{title} {data}".lower()).strip("-"),

@@ -153,3 +153,12 @@ def test_runs_of_another_commit_are_marked(run: Path, tmp_path: Path, monkeypatc
     index = (tmp_path / "out" / "index.html").read_text()
     assert index.count("(other commit)") == 1 and "The runs are of 2 commits: aaaaaaaaaa, bbbbbbbbbb" in index
     assert "This run is of another commit" in next((tmp_path / "out" / "runs").glob("002*")).read_text()
+
+
+@pytest.mark.slow
+def test_small_rows_stay_in_their_band(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    words = ["dataset.width=320", "dataset.height=240", "dataset.length=30"]
+    assert trihedron(["run", "-m", "graph=structural,structural_paper,points", *words, f"out={tmp_path / 'runs'}"]) == 0
+    band = Path(__file__).with_name("small_rows_band.yaml")
+    code = site.main([str(tmp_path / "runs"), "--no-pictures", "--out", str(tmp_path / "out"), "--check", str(band)])
+    assert code == 0, capsys.readouterr().out
