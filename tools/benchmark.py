@@ -10,7 +10,8 @@ Other comparisons, each with its --help: `trihedron benchmark scaling` (threads,
 detectors` (all detectors, by the truth of rendered scenes), `trihedron benchmark methods` (every plugin in the default graph), `trihedron benchmark
 surface` (all surfaces, by the true one), `trihedron benchmark map` (drift, recovery and growth of the map), `trihedron benchmark long` (what a long
 run leaves behind), `trihedron benchmark recording` (what recording costs), `trihedron benchmark building`, `trihedron benchmark sensors` (honesty on
-simulated sensors of several kinds). `trihedron compare` makes a table of the runs of any sweep.
+simulated sensors of several kinds), `trihedron benchmark faults` (the same under degenerate input).
+`trihedron compare` makes a table of the runs of any sweep.
 
 Example: trihedron benchmark dataset=tum dataset.path=FOLDER dataset.frames=0:150 --json benchmark.json
 """
@@ -41,6 +42,7 @@ REFERENCE_FRAMES = 40  # at most
 COMPARISONS = {  # other words after `benchmark`, and whose `main` they stand for
     "building": "trihedron.tools.benchmarks.building_benchmark",
     "detectors": "trihedron.tools.benchmarks.detector_truth",
+    "faults": "trihedron.tools.benchmarks.fault_benchmark",
     "long": "trihedron.tools.benchmarks.long_run",
     "manhattan": "trihedron.tools.benchmarks.manhattan_family",
     "map": "trihedron.tools.benchmarks.map_benchmark",
