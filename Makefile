@@ -12,7 +12,7 @@ USABLE := 'import sys, venv, ensurepip; sys.exit(not (3, 10) <= sys.version_info
 PYTHON := $(shell for p in python3.14 python3.13 python3.12 python3.11 python3.10 python3 python; do \
 	$$p -c $(USABLE) >/dev/null 2>&1 && echo $$p && break; done)
 
-.PHONY: demo test test-slow benchmark table install clean
+.PHONY: demo test test-slow benchmark table docs release install clean
 .DELETE_ON_ERROR:
 
 demo: install  ## track the built-in synthetic room
@@ -44,6 +44,19 @@ table: install  ## the paper's study and its pages: every system on rooms and DA
 	$(BIN)/trihedron paper $(TABLE) $(TABLE)_corridor --markdown $(TABLE)/paper.md
 	$(BIN)/trihedron site $(TABLE) $(TABLE)_corridor --out $(TABLE)/site
 
+docs: install $(VENV)/docs  ## the documentation as a site in build/site; executes the gallery
+	$(BIN)/python docs/site/gallery.py build/gallery
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet
+	$(BIN)/python docs/site/check.py build/site
+
+release: install $(VENV)/docs  ## wheel and sdist, checked; the wheel installed in an empty environment tracks the demo
+	rm -rf dist build/release
+	$(BIN)/python -m build --outdir dist
+	$(BIN)/twine check --strict dist/*
+	$(PYTHON) -m venv build/release/env
+	build/release/env/bin/pip install --quiet --constraint constraints.txt dist/*.whl
+	cd build/release && env/bin/trihedron run dataset.length=60 out=demo && env/bin/trihedron --version
+
 install: $(VENV)/checked $(VENV)/compiled
 
 clean:  ## remove what make made; runs/ stays
@@ -58,6 +71,10 @@ $(VENV)/installed: $(VENV)/created pyproject.toml
 	@echo "Installing into $(VENV) (about 1.5 GB to download the first time)"
 	$(BIN)/python -m pip install --upgrade --quiet pip
 	$(BIN)/python -m pip install -e ".[dev]"
+	@touch $@
+
+$(VENV)/docs: $(VENV)/installed
+	$(BIN)/python -m pip install -e ".[docs]"
 	@touch $@
 
 # 3: a library that only some stages use is missing; said each time, until it is there.

@@ -341,6 +341,33 @@ def tall_m(storey: Storey) -> float:
     return float(min(TALL_M, top - storey.bottom_m - BELOW_CEILING_M))
 
 
+SNAP_DEG = 3.0  # a direction nearer to an axis of the building is that axis
+BINS = 180  # of 1°
+
+
+def slanted_directions(evidence: Evidence, storey: Storey, apart_deg: float, least_m2: float) -> F64:
+    """Return the directions (n,) of walls along neither axis, degrees: peaks with at least that area of tall points."""
+    tall = (np.abs(evidence.normals[:, 2]) < np.sin(np.radians(UPRIGHT_DEG))) & (evidence.points[:, 2] - storey.bottom_m > tall_m(storey))
+    angles = np.mod(np.degrees(np.arctan2(evidence.normals[tall, 1], evidence.normals[tall, 0])), 180.0)
+    weight = evidence.area_m2[tall]
+    histogram = np.bincount(angles.astype(int) % BINS, weight, BINS)
+    smooth = sum((np.roll(histogram, k) for k in (-2, -1, 1, 2)), histogram)
+    found = [0.0, 90.0]
+    for best in np.argsort(-smooth, kind="stable"):
+        near = np.abs(_turned(angles, best + 0.5)) < 2.5
+        if smooth[best] < least_m2 or not weight[near].any():
+            break
+        angle = best + 0.5 + float(np.average(_turned(angles[near], best + 0.5), weights=weight[near]))
+        if all(abs(float(_turned(np.array(angle), other))) > max(apart_deg, SNAP_DEG) for other in found):
+            found.append(angle)
+    return np.array(found[2:])
+
+
+def _turned(angles: F64, middle: float) -> F64:
+    """Return by how much directions modulo 180° are turned from another, in degrees."""
+    return np.asarray(np.mod(angles - middle + 90.0, 180.0) - 90.0)
+
+
 SAME_FACE = 10  # cm: of two faces of one direction that are nearer to each other, the lesser is furniture
 NEAR_FACE_M = 0.05
 LEAST_READINGS = 2  # for which a column reaches high

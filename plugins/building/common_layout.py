@@ -524,6 +524,7 @@ class StoreyPlan:
     walls: list[WallPlan]
     openings: list[OpeningPlan]
     faces: list[Face]
+    remark: str = ""
 
 
 def assembled(state: Gathered, evidence: Evidence, plans: list[StoreyPlan], map: Map | None) -> Building:
@@ -601,7 +602,7 @@ def _note(plans: list[StoreyPlan]) -> str:
     open_rooms = sum(any(edge.wall < 0 for loop in room.loops for edge in loop) for plan in plans for room in plan.rooms)
     if open_rooms:
         missing.append(f"{open_rooms} room{'s' if open_rooms != 1 else ''} not seen all round")
-    return "; ".join(missing)
+    return "; ".join([*missing, *dict.fromkeys(plan.remark for plan in plans if plan.remark)])
 
 
 def _supports(kind: str, number: int, planes: list[int], rows: I32, evidence: Evidence) -> list[tuple[int, int, int, int]]:
@@ -710,7 +711,8 @@ class Layout(LayoutFold):
             cells = cells_of(faces, space)
             rooms = rooms_of(cells, self._inside(cells), faces, here, space, storey, self.least_room_m2)
             walls = walls_of(rooms, faces)
-            plans.append(StoreyPlan(storey, rooms, walls, openings_of(walls, rooms, faces, here, space, storey), faces))
+            openings = openings_of(walls, rooms, faces, here, space, storey)
+            plans.append(StoreyPlan(storey, rooms, walls, openings, faces, self._remark(here, storey)))
         return assembled(state, evidence, plans, map)
 
     def preview(self, state: Gathered) -> Building:
@@ -721,6 +723,10 @@ class Layout(LayoutFold):
     def _directions(self, evidence: Evidence, storey: Storey) -> F64:
         """Return the unit normals (d, 2) that faces may have: the building's two axes."""
         return AXES
+
+    def _remark(self, evidence: Evidence, storey: Storey) -> str:
+        """Return what the layout cannot show of a storey; nothing by default."""
+        return ""
 
     def _inside(self, cells: Cells) -> Bool:
         """Return the cells (n,) that are inside."""
