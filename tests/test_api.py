@@ -2,6 +2,7 @@
 
 import subprocess
 import sys
+from importlib import metadata
 
 import cv2
 import numpy as np
@@ -56,7 +57,7 @@ def test_importing_the_package_imports_nothing_else():
     )
     seconds, numpy_imported, version = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True).stdout.split()
     assert float(seconds) < 0.3 and numpy_imported == "False"
-    assert version == "0.1.0"
+    assert version == metadata.version("trihedron")
 
 
 def test_all_public_names_exist():
@@ -73,14 +74,16 @@ def test_the_example_of_the_readme(folder, tmp_path, monkeypatch):
     (tmp_path / "camera.yaml").write_text(CAMERA_FILE)
     my_camera = images(folder)
 
-    slam = th.Slam(th.Camera.from_yaml("camera.yaml"), manhattan="mean_shift", outputs=["trajectory", "surface"])
+    slam = th.Slam(th.Camera.from_yaml("camera.yaml"), manhattan="mean_shift", outputs=["surface"])
     for rgb, depth, t in my_camera:
         pose = slam.track(rgb, depth, t)
         assert pose.T_world_camera.shape == (4, 4) and pose.covariance.shape == (6, 6)
         assert pose.status == "ok"
         assert len(slam.values["planes"].pixels) == len(slam.values["planes"].coefficients) > 0
     assert len(slam.map.planes) > 0
-    assert len(slam.mesh().triangles) > 100
+    mesh = slam.mesh()
+    assert len(mesh.triangles) > 100 and len(mesh.coefficients) > 2
+    check_conversions(mesh, slam.values["planes"], slam.values["keypoints"], slam.map)
     slam.save("run.mcap")
     slam.save_map("office.mcap")
     slam.trajectory.to_tum("t.txt")
@@ -99,6 +102,31 @@ def test_the_example_of_the_readme(folder, tmp_path, monkeypatch):
     assert all(value.supported and value.gap >= 0 for value in found)  # the certificate that mean_shift does not give
     first, second = th.run(f"replay={run.path}", "only=[planes]", out="a"), th.run(f"replay={run.path}", only=["planes"], planes="ahc", out="b")
     assert {len(list(done.recording.values("planes"))) for done in (first, second)} == {10}
+
+
+def check_conversions(mesh, planes, keypoints, map):
+    """The same numbers in Open3D's and trimesh's objects."""
+    arrays = mesh.to_numpy()
+    np.testing.assert_array_equal(mesh.to_trimesh().faces, arrays["triangles"])
+    np.testing.assert_array_equal(mesh.to_trimesh().visual.vertex_colors[:, :3], arrays["colors"])
+    found = planes.to_numpy()
+    off = np.einsum("ij,ij->i", found["points_m"], found["coefficients"][found["plane"], :3]) + found["coefficients"][found["plane"], 3]
+    assert len(off) > 20 and np.abs(off).max() < 0.1
+    assert len(planes.to_trimesh().vertices) == len(off)
+    assert len(keypoints.to_trimesh().vertices) == np.isfinite(keypoints.points_m[:, 0]).sum()
+    assert len(map.to_trimesh().vertices) == map.points.column("alive").sum() > 0
+    try:
+        import open3d  # noqa: F401
+    except ImportError:
+        with pytest.raises(th.TrihedronError, match=r"open3d: cannot be imported: .*; install it with: pip install open3d"):
+            mesh.to_open3d()
+        return
+    np.testing.assert_array_equal(np.asarray(mesh.to_open3d().triangles), arrays["triangles"])
+    np.testing.assert_array_equal(np.asarray(mesh.to_open3d().vertices), arrays["vertices_m"].astype(float))
+    assert len(planes.to_open3d().points) == len(off)
+    assert len(np.unique(np.asarray(planes.to_open3d().colors), axis=0)) == min(len(planes.coefficients), 10)
+    assert len(keypoints.to_open3d().points) == np.isfinite(keypoints.points_m[:, 0]).sum()
+    assert len(map.to_open3d().points) == map.points.column("alive").sum()
 
 
 def contents(path):

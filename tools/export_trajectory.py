@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import csv
-import json
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +10,7 @@ import numpy as np
 
 from trihedron.pipeline.core.geometry import quaternion_from_rotation
 from trihedron.pipeline.core.types import Pose
-from trihedron.pipeline.record.codec import TIMING_TOPIC
+from trihedron.pipeline.record.codec import TIMING_TOPIC, timing_of
 from trihedron.pipeline.record.reader import Recording
 from trihedron.pipeline.record.trajectories import format_stamp, write_trajectory
 from trihedron.tools.export import Format
@@ -44,7 +43,7 @@ def write_csv(recording: Recording, path: Path) -> str:
             if value.index in columns:
                 columns[value.index] |= _stage_columns(topic, value)
     for _, data in recording.messages(TIMING_TOPIC):
-        timing = json.loads(data)
+        timing = timing_of(data)
         if timing["index"] in columns:
             columns[timing["index"]] |= {"frame_ms": timing["frame_ms"], **{f"ms_{stage}": ms for stage, ms in timing["stage_ms"].items()}}
     names = list(dict.fromkeys(name for row in columns.values() for name in row))

@@ -1,22 +1,20 @@
-"""List the slots with their plugins, parameters, defaults, ranges and documentation.
+"""List the slots and the names of their plugins; of a slot its plugins; of a plugin its documentation and options.
 
-The parameters of a plugin are set as SLOT.NAME=VALUE, the plugin itself is chosen as SLOT=PLUGIN. A star marks what graph=structural uses.
+A plugin is chosen as SLOT=PLUGIN, its options are set as SLOT.NAME=VALUE. A star marks what graph=structural uses.
 
-Example: trihedron plugins manhattan
+Example: trihedron plugins manhattan mean_shift
 """
 
 from __future__ import annotations
 
-import contextlib
 import inspect
-import io
 import json
 import re
-import tokenize
 from enum import Enum
 from pathlib import Path
 from typing import Any
 
+from trihedron.pipeline.core.comments import field_comments
 from trihedron.pipeline.core.errors import UsageError, did_you_mean
 from trihedron.tools.arguments import Parser, table
 
@@ -25,6 +23,7 @@ def main(argv: list[str]) -> int:
     """Run the command; returns the exit code. Raises UsageError for an unknown slot, PluginError for a plugin that does not load."""
     parser = Parser("plugins", __name__)
     parser.add_argument("slot", metavar="SLOT", nargs="?", help="only this slot")
+    parser.add_argument("plugin", metavar="PLUGIN", nargs="?", help="only this plugin of it, with its options")
     parser.add_argument("--json", action="store_true", help="print everything as JSON")
     parser.add_argument("--pages", type=Path, metavar="FOLDER", help="write a page for each plugin of this package instead")
     parser.add_argument("--results", type=Path, metavar="FILE", help="measured figures for the pages (trihedron benchmark methods --json FILE)")
@@ -43,8 +42,24 @@ def main(argv: list[str]) -> int:
         print(f"{len(pages)} pages in {arguments.pages}")
         return 0
     described = [describe_slot(slot) for slot in SLOTS if arguments.slot in (None, slot)]
-    print(json.dumps({"slots": described}, indent=2) if arguments.json else "\n\n".join(map(report, described)))
+    if arguments.plugin is not None:
+        described[0]["plugins"] = [_chosen(described[0], arguments.plugin)]
+    if arguments.json:
+        print(json.dumps({"slots": described}, indent=2))
+    elif arguments.plugin is not None:
+        print(report_plugin(arguments.slot, described[0]["plugins"][0]))
+    else:
+        print(report_names(described) if arguments.slot is None else report(described[0]))
     return 0
+
+
+def _chosen(slot: dict[str, Any], name: str) -> dict[str, Any]:
+    """The plugin of that name. Raises UsageError where there is none."""
+    plugins = {plugin["name"]: plugin for plugin in slot["plugins"]}
+    if name not in plugins:
+        raise UsageError("plugins", f"the slot '{slot['name']}' has no plugin '{name}'", did_you_mean(name, plugins))
+    chosen: dict[str, Any] = plugins[name]
+    return chosen
 
 
 def describe_slot(slot: str) -> dict[str, Any]:
@@ -94,29 +109,6 @@ def describe_plugin(slot: str, name: str, plugin: type[Any]) -> dict[str, Any]:
     }
 
 
-def field_comments(plugin: type[Any]) -> dict[str, str]:
-    """Return field name -> the comment behind it in the source, its bases' included; nothing where there is no source."""
-    found: dict[str, str] = {}
-    for base in reversed(plugin.__mro__[:-1]):
-        with contextlib.suppress(OSError, TypeError):
-            found |= _comments(inspect.getsource(base))
-    return found
-
-
-def _comments(source: str) -> dict[str, str]:
-    """Return field name -> comment of one class's source."""
-    found, name = {}, ""
-    for token in tokenize.generate_tokens(io.StringIO(source).readline):
-        if token.type == tokenize.NAME and token.line[: token.start[1]].isspace() and token.line[token.end[1] :].lstrip().startswith(":"):
-            name = token.string
-        elif token.type == tokenize.COMMENT and name:
-            found[name] = token.string.lstrip("# ")
-            name = ""
-        elif token.type == tokenize.NEWLINE:
-            name = ""
-    return found
-
-
 def default_plugins() -> dict[str, str]:
     """Return slot -> plugin of `graph=structural` and of the root configuration."""
     from importlib.resources import files
@@ -147,16 +139,25 @@ def _plain(value: Any) -> Any:
     return [_plain(item) for item in value] if isinstance(value, (tuple, list)) else value
 
 
+def report_names(slots: list[dict[str, Any]]) -> str:
+    """Format the slots for people: a line of names each."""
+    names = [[slot["name"], ", ".join("*" * plugin["default"] + plugin["name"] for plugin in slot["plugins"])] for slot in slots]
+    return f"{table(names, 'll')}\n\ntrihedron plugins SLOT tells what each does, trihedron plugins SLOT PLUGIN its options"
+
+
 def report(slot: dict[str, Any]) -> str:
-    """Format a slot for people."""
+    """Format a slot for people: its contract, and a line for each plugin."""
     inputs = ", ".join(f"{name}: {kind}" for name, kind in slot["inputs"].items())
     lines = [f"{slot['name']}({inputs}) -> {slot['output']}", f"  {slot['summary']}"]
-    for plugin in slot["plugins"]:
-        lines.append(f"  {'*' if plugin['default'] else ' '} {plugin['name']}: {first_sentence(plugin['doc'])}")
-        if plugin["parameters"]:
-            rows = [(f"{p['name']}: {p['type']}", f"= {json.dumps(p['default'])}", p["range"], p["doc"]) for p in plugin["parameters"]]
-            lines += [f"        {line}" for line in table(rows).splitlines()]
-    return "\n".join(lines)
+    lines += [f"  {'*' if plugin['default'] else ' '} {plugin['name']}: {first_sentence(plugin['doc'])}" for plugin in slot["plugins"]]
+    return "\n".join([*lines, "", f"trihedron plugins {slot['name']} PLUGIN lists its options"])
+
+
+def report_plugin(slot: str, plugin: dict[str, Any]) -> str:
+    """Format a plugin for people: its documentation and options."""
+    rows = [(f"{slot}.{p['name']}: {p['type']}", f"= {json.dumps(p['default'])}", p["range"], p["doc"]) for p in plugin["parameters"]]
+    options = [f"  {line}" for line in table(rows).splitlines()] if rows else ["  no options"]
+    return "\n".join([f"{slot}={plugin['name']}({', '.join(plugin['inputs'])})", "", plugin["doc"], "", *options])
 
 
 def first_sentence(text: str) -> str:

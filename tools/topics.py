@@ -13,7 +13,7 @@ from pathlib import Path
 from trihedron.pipeline.core.errors import printable
 from trihedron.tools.arguments import Parser, table
 
-VALUE_SCHEMA = "trihedron.Value"
+LEGACY_SCHEMA = "trihedron.Value"
 
 
 @dataclass
@@ -31,8 +31,17 @@ class Topic:
 def main(argv: list[str]) -> int:
     """Run the command; returns the exit code. Raises RecordingError for a file that is missing, cut off or no MCAP."""
     parser = Parser("topics", __name__)
-    parser.add_argument("file", metavar="FILE.mcap", type=Path)
-    found = topics_of(parser.parse_args(argv).file)
+    parser.add_argument("file", metavar="FILE.mcap", type=Path, nargs="?")
+    parser.add_argument("--pages", type=Path, metavar="FOLDER", help="write a page for each topic of our recordings instead, with a decoder")
+    arguments = parser.parse_args(argv)
+    if arguments.pages is not None:
+        from trihedron.tools.topic_pages import write_pages
+
+        print(f"{len(write_pages(arguments.pages))} pages in {arguments.pages}")
+        return 0
+    if arguments.file is None:
+        parser.error("the following arguments are required: FILE.mcap")
+    found = topics_of(arguments.file)
     rows: list[list[str]] = [["topic", "schema", "messages", "first (s)", "last (s)", "bytes"]]
     for topic in found:
         first, last = (f"{stamp_ns / 1e9:.6f}" for stamp_ns in (topic.first_ns, topic.last_ns))
@@ -53,7 +62,7 @@ def topics_of(path: Path) -> list[Topic]:
         topic = found.get(channel)
         if topic is None:
             name = file.schema_name(channel) or file.channels[channel].message_encoding
-            name = _value_type(data) if name == VALUE_SCHEMA else name
+            name = _value_type(data) if name == LEGACY_SCHEMA else name
             topic = found[channel] = Topic(printable(file.channels[channel].topic, 120), printable(name, 120), first_ns=log_time, last_ns=log_time)
         topic.messages += 1
         topic.bytes += len(data)
@@ -62,12 +71,12 @@ def topics_of(path: Path) -> list[Topic]:
 
 
 def _value_type(data: bytes) -> str:
-    """The type of value in a message of ours, for example Pose."""
+    """The type of a value in a recording of format 4 or older, for example Pose."""
     from google.protobuf.message import DecodeError
 
-    from trihedron.pipeline.record.codec import ValueMessage
+    from trihedron.pipeline.record.codec import LegacyMessage
 
     try:
-        return f"trihedron.{ValueMessage.FromString(data).type}"
+        return f"trihedron.{LegacyMessage.FromString(data).type}"
     except DecodeError:
-        return VALUE_SCHEMA
+        return LEGACY_SCHEMA

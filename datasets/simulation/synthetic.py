@@ -23,7 +23,7 @@ from trihedron.datasets.simulation.true_plan import TruePlan, plans_of
 from trihedron.datasets.simulation.true_surface import TrueSurface, surface_of
 from trihedron.pipeline.core.options import Frames, NonNegativeInt, PositiveFloat, Range
 from trihedron.pipeline.core.registry import register
-from trihedron.pipeline.core.types import EXACT_DEPTH, F64, I32, Bool, Camera, Frame, Trajectory
+from trihedron.pipeline.core.types import EXACT_DEPTH, F32, F64, I32, U8, Bool, Camera, Frame, Trajectory
 
 
 class Scene(Enum):
@@ -132,11 +132,19 @@ class Synthetic:
         """(4, 4) exact `T_world_camera` of frame `index` of the selection, in the frame of `truth`."""
         return self._pose(self._range[0] + index)
 
+    def pose_at(self, time_s: float) -> F64:
+        """(4, 4) exact `T_world_camera` at a time in seconds; frame i is at i / fps."""
+        if self._building is not None:
+            return self._building.walk.pose(self.seed, time_s)
+        return camera_pose(self.motion, self.seed, time_s)
+
+    def seen_by(self, camera: Camera, T_world_camera: F64) -> tuple[U8, F64, I32, F32]:
+        """Render the scene without noise by any camera at any pose: what `shading.render` returns."""
+        return render(*self._scene, camera, T_world_camera)
+
     def _pose(self, number: int) -> F64:
         """(4, 4) `T_world_camera` of a frame."""
-        if self._building is not None:
-            return self._building.walk.pose(self.seed, number / self.fps)
-        return camera_pose(self.motion, self.seed, number / self.fps)
+        return self.pose_at(number / self.fps)
 
     def _stamp_ns(self, number: int) -> int:
         return round(number * 1e9 / self.fps)

@@ -263,7 +263,7 @@ def rewritten(error: Exception) -> TrihedronError:
 
 def _unknown_option(group: str, name: str, options: list[str]) -> TrihedronError:
     if name.startswith("submitit"):
-        return ConfigError(group, f"{name} is not installed", "pip install 'trihedron[cluster]'")
+        return ConfigError(group, f"{name} is not installed", "pip install hydra-submitit-launcher")
     what = f"there is no plugin '{name}' for the slot '{group}'" if group in SLOTS else f"there is no {group} '{name}'"
     return ConfigError(group, what, did_you_mean(name, options))
 

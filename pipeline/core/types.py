@@ -21,6 +21,7 @@ from typing import Annotated, Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
+from trihedron.pipeline.core import conversions
 from trihedron.pipeline.core.arrays import F32, F64, I32, U8, Bool, Shape, Value
 from trihedron.pipeline.core.constraints import Columns, CoversImage, Finite, IndexInto, OneOf, Rotations, SameWidth, UnitNormals, Within
 from trihedron.pipeline.core.table import Column, Table
@@ -113,6 +114,18 @@ class Keypoints(Value):
     descriptors: Annotated[U8, Shape("n", "b"), SameWidth(("previous_keypoints.descriptors", "map.points.descriptor"))]
     metric: Annotated[str, OneOf(("hamming", "l2"))] = "hamming"  # distance between descriptors: hamming | l2
 
+    def to_numpy(self) -> F32:
+        """Return the (k, 3) points that have depth, camera frame."""
+        return self.points_m[np.isfinite(self.points_m).all(axis=1)]
+
+    def to_open3d(self) -> Any:
+        """Return the points that have depth as an `open3d.geometry.PointCloud`."""
+        return conversions.points_to_open3d(self.to_numpy())
+
+    def to_trimesh(self) -> Any:
+        """Return the points that have depth as a `trimesh.PointCloud`."""
+        return conversions.points_to_trimesh(self.to_numpy())
+
 
 @dataclass(frozen=True)
 class LineSegments(Value):
@@ -146,6 +159,21 @@ class Planes(Value):
     samples_m: Annotated[F32, Shape("n", "s", 3)]
     labels: Annotated[U8, Shape("h", "w"), IndexInto(".coefficients+"), CoversImage()]
     stride: Annotated[int, Within(1, 1024)]
+
+    def to_numpy(self) -> dict[str, NDArray[Any]]:
+        """Return `coefficients` (n, 4), `points_m` (k, 3) spread over the planes, camera frame, and the `plane` (k,) of each."""
+        finite = np.isfinite(self.samples_m[:, :, 0])
+        return {"coefficients": self.coefficients, "points_m": self.samples_m[finite], "plane": np.nonzero(finite)[0].astype(np.int32)}
+
+    def to_open3d(self) -> Any:
+        """Return `points_m` of `to_numpy` as an `open3d.geometry.PointCloud`, a colour for each plane."""
+        arrays = self.to_numpy()
+        return conversions.points_to_open3d(arrays["points_m"], conversions.color_of_rows(arrays["plane"]))
+
+    def to_trimesh(self) -> Any:
+        """Return `points_m` of `to_numpy` as a `trimesh.PointCloud`, a colour for each plane."""
+        arrays = self.to_numpy()
+        return conversions.points_to_trimesh(arrays["points_m"], conversions.color_of_rows(arrays["plane"]))
 
 
 @dataclass(frozen=True)
@@ -453,6 +481,23 @@ class Map(Value):
         """Return a cache for results derived from this version and needed frame after frame; it ends with it and is no part of the value."""
         return {}
 
+    def to_numpy(self) -> dict[str, NDArray[Any]]:
+        """Return `points_m` (n, 3), `endpoints_m` of lines (m, 2, 3) and `coefficients` of planes (p, 4) in use, world frame."""
+        points, lines, planes = (table.column("alive") for table in (self.points, self.lines, self.planes))
+        return {
+            "points_m": self.points.column("position_m")[points],
+            "endpoints_m": self.lines.column("endpoints_m")[lines],
+            "coefficients": self.planes.column("coefficients")[planes],
+        }
+
+    def to_open3d(self) -> Any:
+        """Return the points in use as an `open3d.geometry.PointCloud`, world frame."""
+        return conversions.points_to_open3d(self.to_numpy()["points_m"])
+
+    def to_trimesh(self) -> Any:
+        """Return the points in use as a `trimesh.PointCloud`, world frame."""
+        return conversions.points_to_trimesh(self.to_numpy()["points_m"])
+
 
 @dataclass(frozen=True)
 class Correction(Value):
@@ -516,6 +561,18 @@ class Surface(Value):
     atlas: Annotated[U8, Shape("h", "w", 3)]
     texels: Annotated[F32, Shape("t", 3, 2)]
     up: Annotated[F64, Shape(3)]
+
+    def to_numpy(self) -> dict[str, NDArray[Any]]:
+        """Return `vertices_m` (v, 3), `colors` (v, 3) RGB, `triangles` (t, 3) and the `plane` (t,) of each, -1 for none."""
+        return {"vertices_m": self.vertices_m, "colors": self.colors, "triangles": self.triangles, "plane": self.instances}
+
+    def to_open3d(self) -> Any:
+        """Return the mesh as an `open3d.geometry.TriangleMesh` with coloured vertices."""
+        return conversions.mesh_to_open3d(self.vertices_m, self.triangles, self.colors)
+
+    def to_trimesh(self) -> Any:
+        """Return the mesh as a `trimesh.Trimesh` with coloured vertices."""
+        return conversions.mesh_to_trimesh(self.vertices_m, self.triangles, self.colors)
 
     @staticmethod
     def empty(index: int, stamp_ns: int) -> Surface:

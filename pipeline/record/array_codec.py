@@ -1,4 +1,4 @@
-"""One array, text or number as the protobuf message `trihedron.Array {name, dtype, shape, encoding, data}` and back, bit for bit.
+"""One array as the protobuf message `trihedron.Array {name, dtype, shape, encoding, data}` and back, bit for bit; and packed numbers.
 
 `encoding` is one of
 - raw: the elements, row by row;
@@ -18,7 +18,7 @@ import math
 import re
 import struct
 import threading
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from functools import cache, lru_cache
 from typing import Any
 
@@ -40,9 +40,8 @@ SCALARS: dict[str, type[Any]] = {"bool": bool, "int": int, "float": float}
 
 # Fields of protobuf messages, as the library would write them.
 
-_VARINT, _LENGTH = 0, 2  # types of a field on the wire
+_VARINT, _FIXED64, _LENGTH = 0, 1, 2  # types of a field on the wire
 _SHORT = [bytes((number,)) for number in range(0x80)]
-_TAGS = [bytes((field << 3 | _LENGTH,)) for field in range(16)]  # before a length
 
 
 def varint(number: int) -> bytes:
@@ -66,8 +65,8 @@ def number_field(field: int, number: int) -> bytes:
 
 
 def head(field: int, size: int) -> bytes:
-    """Encode the bytes before a text, bytes, a message or packed numbers of `size` bytes, in one of the fields 1..15."""
-    return _TAGS[field] + varint(size)
+    """Encode the bytes before a text, bytes, a message or packed numbers of `size` bytes."""
+    return varint(field << 3 | _LENGTH) + varint(size)
 
 
 def bytes_field(field: int, content: bytes) -> bytes:
@@ -78,41 +77,38 @@ def bytes_field(field: int, content: bytes) -> bytes:
 # Arrays, texts and numbers.
 
 
-def array_parts(name: str, item: Any) -> tuple[bytes, Any]:
-    """Encode an array as a field of `trihedron.Value`: the bytes before its data, and the data."""
+def array_parts(field: int, name: str, item: Any, named: bool = False) -> tuple[bytes, Any]:
+    """Encode an array as a field: the bytes before its data, and the data. `named`: with its name, of several in one field."""
     array = np.ascontiguousarray(item)
-    before, transposed = _plain_head(name, array.dtype, array.shape)
+    before, transposed = _plain_head(field, name, array.dtype, array.shape, named)
     if transposed:
         return before, cv2.transpose(array.view(np.uint8).reshape(len(array), -1)).data
     return before, array
 
 
-def image_parts(name: str, item: Any) -> tuple[bytes, Any]:
+def image_parts(field: int, name: str, item: Any) -> tuple[bytes, Any]:
     """Encode an image, whose first axes are height and width, likewise."""
     array = np.ascontiguousarray(item)
     if not array.size:
-        return array_parts(name, array)
+        return array_parts(field, name, array)
     steps = array.dtype == np.uint8 and array.ndim == 3
     data = _compressor().compress(_row_steps(array).data if steps else array.data)
-    return _head(name, _type_name(array.dtype), array.shape, "rows" if steps else "zstd", len(data)), data
+    return _head(field, "", _type_name(array.dtype), array.shape, "rows" if steps else "zstd", len(data)), data
 
 
 @lru_cache(256)
-def text_field(name: str, text: str) -> bytes:
+def text_field(field: int, text: str) -> bytes:
     """Encode a text as a field; most repeat."""
-    data = text.encode()
-    return _head(name, "str", (), "", len(data)) + data
+    return bytes_field(field, text.encode())
 
 
 class Numbers:
-    """Truth values and numbers, each a field: the bytes before each never change, so that all of them are packed at once."""
+    """Truth values and numbers, each a field of a fixed size: the bytes before each never change, so that all of them are packed at once."""
 
-    def __init__(self, kinds: Mapping[str, type[Any]]) -> None:
-        """`kinds` is of SCALARS, by name."""
-        codes = [_CODES[kind] for kind in kinds.values()]
-        heads = [_head(name, kind.__name__, (), "raw", struct.calcsize(code)) for (name, kind), code in zip(kinds.items(), codes)]
-        self._blank: list[Any] = [part for head in heads for part in (head, 0)]
-        self._struct = struct.Struct("<" + "".join(f"{len(head)}s{code}" for head, code in zip(heads, codes)))
+    def __init__(self, numbers: Sequence[tuple[bytes, type[Any]]]) -> None:
+        """Take what is before each number, and its type, of SCALARS."""
+        self._blank: list[Any] = [part for before, _ in numbers for part in (before, 0)]
+        self._struct = struct.Struct("<" + "".join(f"{len(before)}s{_CODES[kind]}" for before, kind in numbers))
 
     def fields(self, numbers: Sequence[Any]) -> bytes:
         """Encode as many numbers."""
@@ -121,20 +117,30 @@ class Numbers:
         return self._struct.pack(*filled)
 
 
+def number_head(field: int, kind: type[Any]) -> bytes:
+    """Encode the bytes before a number of a fixed size: bool, sfixed64, double."""
+    return varint(field << 3 | (_VARINT if kind is bool else _FIXED64))
+
+
+def number_bytes(kind: type[Any]) -> int:
+    """Return the bytes of a number of a fixed size."""
+    return struct.calcsize(_CODES[kind])
+
+
 @lru_cache(4096)
-def _plain_head(name: str, dtype: np.dtype[Any], shape: tuple[int, ...]) -> tuple[bytes, bool]:
+def _plain_head(field: int, name: str, dtype: np.dtype[Any], shape: tuple[int, ...], named: bool) -> tuple[bytes, bool]:
     """The bytes before the data of an array that is no image, and whether the bytes of its rows are transposed."""
     size = dtype.itemsize * math.prod(shape)
-    copied = dtype.itemsize == 4 and name.rpartition("#")[2] in COPIED
+    copied = dtype.itemsize == 4 and name in COPIED
     transposed = size >= TRANSPOSED_BYTES and dtype.itemsize > 1 and not copied
-    return _head(name, _type_name(dtype), shape, "columns" if transposed else "raw", size), transposed
+    return _head(field, name if named else "", _type_name(dtype), shape, "columns" if transposed else "raw", size), transposed
 
 
-def _head(name: str, dtype: str, shape: tuple[int, ...], encoding: str, size: int) -> bytes:
-    """A field `arrays` up to its data."""
+def _head(field: int, name: str, dtype: str, shape: tuple[int, ...], encoding: str, size: int) -> bytes:
+    """A field up to its data."""
     before, after = _texts(name, dtype, encoding)
     inner = before + bytes_field(3, b"".join(map(varint, shape))) + after + (head(5, size) if size else b"")
-    return head(5, len(inner) + size) + inner
+    return head(field, len(inner) + size) + inner
 
 
 @cache
@@ -159,21 +165,23 @@ def _compressor() -> Any:
     return _of_thread.compressor
 
 
-def get_array(array: Any, place: str) -> Any:
-    """Decode one protobuf Array. Raises RecordingError, beginning with `place`, unless its bytes match its declared shape."""
+def get_array(array: Any, place: str, name: str = "") -> Any:
+    """Decode one protobuf Array; until format 4 it could hold a text or a number. Raises RecordingError, beginning with `place`, unless its bytes
+    match its declared shape; `name` is that of its field, where it has none of its own."""
+    title = f"array '{printable(array.name or name, 60)}'"
     if array.dtype == "str":
         return array.data.decode("utf-8", "replace")
     dtype = element_type({"bool": "?", "int": "i8", "float": "f8"}.get(array.dtype, array.dtype))
     shape = tuple(array.shape)
     if dtype.hasobject or not _allowed(shape, dtype.itemsize) or (shape and array.dtype in SCALARS):
-        raise RecordingError(place, f"array '{printable(array.name, 60)}' claims type '{printable(array.dtype, 20)}' and shape {shape[:4]}", DAMAGED)
+        raise RecordingError(place, f"{title} claims type '{printable(array.dtype, 20)}' and shape {shape[:4]}", DAMAGED)
     if array.encoding not in ENCODINGS:
-        cause = f"array '{printable(array.name, 60)}' has the encoding '{printable(array.encoding, 40)}', this program reads {', '.join(ENCODINGS)}"
+        cause = f"{title} has the encoding '{printable(array.encoding, 40)}', this program reads {', '.join(ENCODINGS)}"
         raise RecordingError(place, cause, "read it with the version that wrote it")
     size = math.prod(shape) * dtype.itemsize
     data = _plain(array, shape, size)
     if data is None or len(data) != size:
-        raise RecordingError(place, f"array '{printable(array.name, 60)}' does not have the {size} bytes of its shape {shape}", DAMAGED)
+        raise RecordingError(place, f"{title} does not have the {size} bytes of its shape {shape}", DAMAGED)
     content = np.frombuffer(data, dtype).reshape(shape)
     return SCALARS[array.dtype](content[()]) if array.dtype in SCALARS else content
 

@@ -1,24 +1,19 @@
-"""Values to bytes and back, without generated code: one protobuf message `trihedron.Value` holds any value as named arrays.
+"""Values to bytes and back, without generated code: the protobuf message of the value's type (`schemas`), its arrays packed by `array_codec`, its
+tables written as their changes (`table_codec`).
 
-Anyone can read it with the schema in the file: `type, version, index, stamp_ns` and an array (`array_codec`) for each field; nested
-fields have dotted names, scalars no shape, and tables are written as their changes (`table_codec`). Nothing here evaluates what it reads, and
-nothing is allocated that the file does not hold.
+Nothing here evaluates what it reads, and nothing is allocated that the file does not hold.
 """
 
 from __future__ import annotations
 
-import dataclasses
 import json
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache, lru_cache
 from operator import attrgetter
-from typing import Any, get_type_hints
+from typing import Any
 
-from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
-
-from trihedron.pipeline.core import types
 from trihedron.pipeline.core.arrays import array_specs
 from trihedron.pipeline.core.errors import RecordingError, printable
 from trihedron.pipeline.core.table import Table
@@ -30,42 +25,30 @@ from trihedron.pipeline.record.array_codec import (
     array_parts,
     bytes_field,
     get_array,
+    head,
     image_parts,
+    number_bytes,
     number_field,
+    number_head,
     text_field,
 )
-from trihedron.pipeline.record.table_codec import TableReader, TableWriter, change_of, joined, messages_back
+from trihedron.pipeline.record.schemas import PACKAGE, TIMING, VALUE_TYPES, hints_of, is_nested, message_class, own_fields
+from trihedron.pipeline.record.table_codec import TableReader, TableWriter, bytes_of, change_of, joined, messages_back
 
-FORMAT = "4"
-READABLE = ("3", FORMAT)  # 3: a table was always a change of the message before
+FORMAT = "5"
+READABLE = ("3", "4", FORMAT)  # until 4 all values were of one schema; in 3 a table was always a change of the message before
 METADATA = "trihedron"  # the name of the metadata record
 FRAMES_TOPIC = "frames"  # one FrameReference a frame: what a replay iterates over
 TIMING_TOPIC = "/timing"
 UPGRADE = "upgrade what can be read of it with: trihedron convert SRC DST.mcap"
+NOT_VALUES = (TIMING, f"{PACKAGE}.Error")  # schemas of ours that are none
 
-_TYPES: dict[str, type[Value]] = {
-    name: kind for name, kind in vars(types).items() if isinstance(kind, type) and issubclass(kind, Value) and kind is not Value
-}
-
-
-def _message_class() -> Any:
-    """The protobuf class of `trihedron.Value`."""
-    field = descriptor_pb2.FieldDescriptorProto
-    text, number64, data = field.TYPE_STRING, field.TYPE_INT64, field.TYPE_BYTES
-    file = descriptor_pb2.FileDescriptorProto(name="trihedron/value.proto", package="trihedron", syntax="proto3")
-    array = file.message_type.add(name="Array")
-    for number, (name, kind) in enumerate([("name", text), ("dtype", text), ("shape", number64), ("encoding", text), ("data", data)], 1):
-        array.field.add(name=name, number=number, type=kind, label=field.LABEL_REPEATED if name == "shape" else field.LABEL_OPTIONAL)
-    value = file.message_type.add(name="Value")
-    for number, (name, kind) in enumerate([("type", text), ("version", field.TYPE_INT32), ("index", number64), ("stamp_ns", number64)], 1):
-        value.field.add(name=name, number=number, type=kind, label=field.LABEL_OPTIONAL)
-    value.field.add(name="arrays", number=5, type=field.TYPE_MESSAGE, type_name=".trihedron.Array", label=field.LABEL_REPEATED)
-    pool = descriptor_pool.Default()
-    pool.Add(file) if hasattr(pool, "Add") else pool.AddSerializedFile(file.SerializeToString())
-    return message_factory.GetMessageClass(pool.FindMessageTypeByName("trihedron.Value"))
+LegacyMessage = message_class("Value")  # of every value until format 4; its first fields are those of the others, too
 
 
-ValueMessage = _message_class()
+def is_value_schema(name: str) -> bool:
+    """Return whether a channel of this schema holds values."""
+    return name.startswith(f"{PACKAGE}.") and name not in NOT_VALUES
 
 
 class Encoder:
@@ -75,19 +58,21 @@ class Encoder:
         self._tables = TableWriter()
 
     def encode(self, value: Value) -> bytes:
-        """A value as the bytes of a `trihedron.Value`; tables relative to those of an earlier call."""
+        """A value as the bytes of the message of its type, arrays last, so that none is there of one that was cut off; tables relative to those of
+        an earlier call."""
         kind: Any = value.__class__
         layout = _layout(kind)
-        parts = [layout.head, _when(value.index, value.stamp_ns)]
-        for name, item in zip(layout.arrays, layout.array_values(value)):
-            parts += array_parts(name, item)
-        for name, item in zip(layout.images, layout.image_values(value)):
-            parts += image_parts(name, item)
+        parts: list[Any] = [layout.head, _when(value.index, value.stamp_ns)]
         if layout.numbers is not None:
             parts.append(layout.numbers.fields(layout.number_values(value)))
-        parts += map(text_field, layout.texts, layout.text_values(value))
+        parts += map(text_field, layout.texts.values(), layout.text_values(value))
+        for (name, field), item in zip(layout.arrays.items(), layout.array_values(value)):
+            parts += array_parts(field, name, item)
+        for (name, field), item in zip(layout.images.items(), layout.image_values(value)):
+            parts += image_parts(field, name, item)
         if layout.tables:
-            parts += self._tables.parts({name: getattr(value, name) for name in layout.tables})
+            for name, table in self._tables.parts({name: getattr(value, name) for name in layout.tables}).items():
+                parts += [head(layout.tables[name], bytes_of(table)), *table]
         return b"".join(parts)
 
 
@@ -102,32 +87,47 @@ Read = Callable[[Value], Sequence[Any]]
 
 @dataclass(frozen=True)
 class _Layout:
-    """The message of a type: its first bytes, and the dotted names of its fields by kinds, each with a function that reads them from a value."""
+    """The message of a type: its first bytes, and its fields by kinds, name -> number, each with a function that reads them from a value."""
 
     head: bytes
     numbers: Numbers | None
     number_values: Read
-    texts: tuple[str, ...]
+    texts: Mapping[str, int]
     text_values: Read
-    arrays: tuple[str, ...]
+    arrays: Mapping[str, int]
     array_values: Read
-    images: tuple[str, ...]
+    images: Mapping[str, int]
     image_values: Read
-    tables: tuple[str, ...]
+    tables: Mapping[str, int]
 
 
 @cache
 def _layout(kind: Any) -> _Layout:
-    fields = dict(_fields(kind, ""))
-    numbers = {name: hint for name, hint in fields.items() if hint in SCALARS.values()}
-    tables = tuple(name for name, hint in _hints(kind).items() if hint is Table)
-    texts = tuple(name for name, hint in fields.items() if hint is str)
+    fields, hints = own_fields(kind), hints_of(kind)
     seen = {spec.name for spec in array_specs(kind) if spec.shape.axes[:2] == ("h", "w")}  # images: their first axes are height and width
-    arrays = tuple(name for name in fields if name not in numbers and name not in texts and name not in seen)
-    images = tuple(name for name in fields if name in seen)
-    head = bytes_field(1, kind.__name__.encode()) + number_field(2, kind.version)
-    packed = Numbers(numbers) if numbers else None
-    return _Layout(head, packed, _reader(*numbers), texts, _reader(*texts), arrays, _reader(*arrays), images, _reader(*images), tables)
+    texts = {name: number for name, number in fields.items() if hints[name] is str}
+    tables = {name: number for name, number in fields.items() if hints[name] is Table}
+    images = {name: number for name, number in fields.items() if name in seen}
+    numbers = dict(_numbers(kind, ""))
+    others = {*texts, *tables, *images, *(name.partition(".")[0] for name in numbers)}
+    arrays = {name: number for name, number in fields.items() if name not in others}
+    first = bytes_field(1, kind.__name__.encode()) + number_field(2, kind.version)
+    packed = Numbers(list(numbers.values())) if numbers else None
+    return _Layout(first, packed, _reader(*numbers), texts, _reader(*texts), arrays, _reader(*arrays), images, _reader(*images), tables)
+
+
+def _numbers(kind: Any, prefix: str) -> Iterator[tuple[str, tuple[bytes, Any]]]:
+    """Dotted name, bytes before it, and type of each number; a nested value has nothing but numbers."""
+    for name, number in own_fields(kind).items():
+        hint = hints_of(kind)[name]
+        if hint in SCALARS.values():
+            yield prefix + name, (number_head(number, hint), hint)
+        elif is_nested(hint):
+            inner = list(_numbers(hint, f"{prefix}{name}."))
+            size = sum(len(before) + number_bytes(of) for _, (before, of) in inner)
+            (first, (before, of)), *others = inner
+            yield first, (head(number, size) + before, of)
+            yield from others
 
 
 def _reader(*names: str) -> Read:
@@ -136,17 +136,6 @@ def _reader(*names: str) -> Read:
         return lambda value: ()
     read = attrgetter(*names)
     return read if len(names) > 1 else lambda value: (read(value),)  # of one name it gives no tuple
-
-
-def _fields(kind: Any, prefix: str) -> Iterator[tuple[str, Any]]:
-    """(dotted name, type) of each field but index, stamp and tables."""
-    for name, hint in _hints(kind).items():
-        if hint is Table or (prefix == "" and name in ("index", "stamp_ns")):
-            continue
-        if _is_nested(hint):
-            yield from _fields(hint, f"{prefix}{name}.")
-        else:
-            yield prefix + name, hint
 
 
 class Decoder:
@@ -167,30 +156,51 @@ class Decoder:
         return self._made(parsed[-1], lambda name, arrays: joined(name, [change_of(name, tables) for tables in (*earlier, arrays)]))
 
     def _parsed(self, data: bytes) -> Any:
-        message = ValueMessage()
         try:
-            message.ParseFromString(data)
+            message = LegacyMessage.FromString(data)
         except Exception as error:
-            raise RecordingError(self.place, "holds a message that is not a trihedron.Value", DAMAGED) from error
-        kind = _TYPES.get(message.type)
+            raise RecordingError(self.place, "holds a message that is no value of trihedron", DAMAGED) from error
+        kind = VALUE_TYPES.get(message.type)
         if kind is None:
             raise RecordingError(self.place, f"holds the unknown type '{printable(message.type, 60)}'", "read it with the version that wrote it")
         if kind.version != message.version:
             cause = f"holds {message.type} version {message.version}, this program reads version {kind.version}{_other_fields(message, kind)}"
             raise RecordingError(self.place, cause, UPGRADE if message.version < kind.version else "read it with the version that wrote it")
-        return message
+        if message.arrays:
+            return message
+        try:
+            return message_class(message.type).FromString(data)
+        except Exception as error:
+            raise RecordingError(self.place, f"holds a message that is no trihedron.{message.type}", DAMAGED) from error
 
     def _arrays(self, message: Any) -> tuple[dict[str, Any], dict[str, Any]]:
-        """The arrays of fields, and those of tables."""
-        arrays: dict[str, Any] = {}
+        """The fields by dotted names, and the arrays of tables."""
+        fields: dict[str, Any] = {}
         tables: dict[str, Any] = {}
-        for array in message.arrays:
-            (tables if "#" in array.name else arrays)[array.name] = get_array(array, self.place)
-        return arrays, tables
+        if isinstance(message, LegacyMessage):
+            for array in message.arrays:
+                (tables if "#" in array.name else fields)[array.name] = get_array(array, self.place)
+        else:
+            self._read(message, VALUE_TYPES[message.type], "", fields, tables)
+        return fields, tables
+
+    def _read(self, message: Any, kind: Any, prefix: str, fields: dict[str, Any], tables: dict[str, Any]) -> None:
+        """Read the fields of a type's message; an array that is not there stays away."""
+        for name in own_fields(kind):
+            hint, found = hints_of(kind)[name], getattr(message, name)
+            if is_nested(hint):
+                self._read(found, hint, f"{prefix}{name}.", fields, tables)
+            elif hint is Table:
+                tables[f"{name}#"] = found.layout
+                tables |= {f"{name}#{array.name}": get_array(array, self.place) for array in found.arrays}
+            elif hint is str or hint in SCALARS.values():
+                fields[prefix + name] = found
+            elif message.HasField(name):
+                fields[prefix + name] = get_array(found, self.place, name)
 
     def _made(self, message: Any, table: Callable[[str, dict[str, Any]], Table]) -> Value:
         """The value of a message, whose tables are made of their arrays."""
-        kind: Any = _TYPES[message.type]
+        kind: Any = VALUE_TYPES[message.type]
         arrays, tables = self._arrays(message)
         try:
             made = {name: table(name, tables) for name in _layout(kind).tables}
@@ -204,42 +214,48 @@ class Decoder:
 
 def _other_fields(message: Any, kind: Any) -> str:
     """The fields by which a recorded value differs from the type of today, as a part of a sentence."""
+    if not message.arrays:
+        return ""
     types = {spec.name: spec.dtype.str.lstrip("<|=") for spec in array_specs(kind)}
     recorded = {array.name.partition("#")[0].partition(".")[0] for array in message.arrays}
-    expected = set(_hints(kind)) - {"index", "stamp_ns"}
+    expected = set(hints_of(kind)) - {"index", "stamp_ns"}
     lacks = ", ".join(f"'{name}'" for name in sorted(expected - recorded))
     more = ", ".join(f"'{name}'" for name in sorted(recorded - expected))
     others = ", ".join(f"'{array.name}' of type {array.dtype}" for array in message.arrays if array.dtype != types.get(array.name, array.dtype))
     if others:
         return f", with its field {others}"
-    if not lacks and not more and Table in _hints(kind).values():
+    if not lacks and not more and Table in hints_of(kind).values():
         return ", whose tables have other columns"
     return (f", with the field {lacks} that it lacks" if lacks else "") + (f", without its field {more}" if more else "")
 
 
 def builds_on(data: bytes) -> int:
     """Return how many messages back stands the one that a message builds on, 0 where it stands alone; 0 for damaged bytes, which decoding reports."""
-    message = ValueMessage()
     try:
-        message.ParseFromString(data)
-        return max((messages_back(json.loads(array.data)) for array in message.arrays if array.name.endswith("#")), default=0)
+        message = LegacyMessage.FromString(data)
+        layouts = [array.data for array in message.arrays if array.name.endswith("#")]
+        if not message.arrays:
+            kind: Any = VALUE_TYPES[message.type]
+            own = message_class(message.type).FromString(data)
+            layouts = [getattr(own, name).layout for name in _layout(kind).tables]
+        return max((messages_back(json.loads(layout)) for layout in layouts), default=0)
     except Exception:
         return 0
 
 
-@cache
-def _hints(kind: Any) -> Mapping[str, Any]:
-    hints = get_type_hints(kind)
-    return {f.name: hints[f.name] for f in dataclasses.fields(kind)}
-
-
-def _is_nested(hint: Any) -> bool:
-    return dataclasses.is_dataclass(hint) and hint is not Table and isinstance(hint, type)
+def timing_of(data: bytes) -> dict[str, Any]:
+    """Read a message of `/timing`: `index`, `frame_ms`, `stage_ms` by stage, `memory_mb`; until format 4 it was JSON."""
+    if data[:1] == b"{":
+        found: dict[str, Any] = json.loads(data)
+        return found
+    message = message_class("Timing").FromString(data)
+    stages = {field.name: ms for field, ms in message.stage_ms.ListFields()}
+    return {"index": message.index, "frame_ms": message.frame_ms, "stage_ms": stages, "memory_mb": message.memory_mb}
 
 
 def _make(kind: Any, fields: Mapping[str, Any], prefix: str) -> Any:
     """Rebuild a (nested) dataclass from dotted fields."""
     made = {}
-    for name, hint in _hints(kind).items():
-        made[name] = _make(hint, fields, f"{prefix}{name}.") if _is_nested(hint) else fields[prefix + name]
+    for name, hint in hints_of(kind).items():
+        made[name] = _make(hint, fields, f"{prefix}{name}.") if is_nested(hint) else fields[prefix + name]
     return kind(**made)

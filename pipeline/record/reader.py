@@ -11,7 +11,7 @@ from mcap.records import Channel, ChunkIndex
 
 from trihedron.pipeline.core.errors import RecordingError
 from trihedron.pipeline.core.types import Value
-from trihedron.pipeline.record.codec import FRAMES_TOPIC, METADATA, READABLE, UPGRADE, Decoder, ValueMessage, builds_on
+from trihedron.pipeline.record.codec import FRAMES_TOPIC, METADATA, READABLE, UPGRADE, Decoder, builds_on, is_value_schema
 from trihedron.pipeline.record.mcap_file import McapFile, damaged
 
 
@@ -29,12 +29,12 @@ class Recording:
         self.attachments = {name: data.decode("utf-8", "replace") for name, data in self._file.attachments.items()}
         self.channels: dict[str, Channel] = {c.topic: c for c in self._file.channels.values()}
         self.counts = {c.topic: self._file.counts.get(c.id, 0) for c in self.channels.values()}
-        self.topics = {t[1:] for t, c in self.channels.items() if self._file.schema_name(c.id) == ValueMessage.DESCRIPTOR.full_name}
+        self.topics = {t[1:] for t, c in self.channels.items() if is_value_schema(self._file.schema_name(c.id))}
         self._chunks: dict[str, list[ChunkIndex]] = {}
         if self.metadata.get("format") not in READABLE:
             written = " ".join(["trihedron", self.metadata.get("version", ""), self.metadata.get("commit", "")[:7]]).strip()
             form = self.metadata.get("format")
-            cause = f"has format {form} of {written}, this program reads formats {' and '.join(READABLE)}: {self._difference()}"
+            cause = f"has format {form} of {written}, this program reads formats {READABLE[0]} to {READABLE[-1]}: {self._difference()}"
             raise RecordingError(str(path), cause, UPGRADE)
 
     def _difference(self) -> str:

@@ -4,9 +4,9 @@ A message changes the one before it. Every `CHECKPOINT_EVERY` it changes the las
 that came before; where that spares little, or after `MAX_CHECKPOINTS`, it is a full snapshot. So what a frame takes does not grow with the map, and
 neither does what is read for it.
 
-A table `points` is `points#`, a JSON text with `size`, `back` (how many messages ago the table was that this changes; 0: a full snapshot), `schema`
-and, for each column that changed, the number k of its list of rows, `points#rows<k>`; `points#position_m` holds these rows, and `points#emptied` the
-numbers of the chunks that were freed.
+A table is a message `trihedron.Table`: `layout`, a JSON text with `size`, `back` (how many messages ago the table was that this changes; 0: a full
+snapshot), `schema` and, for each column that changed, the number k of its list of rows; and arrays: `rows<k>`, `position_m` with the values of these
+rows, and `emptied` with the numbers of the chunks that were freed. Here, and in files until format 4, they are `points#`, `points#rows<k>` and so on.
 """
 
 from __future__ import annotations
@@ -21,11 +21,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from trihedron.pipeline.core.table import CHUNK, Column, Table
-from trihedron.pipeline.record.array_codec import MAX_BYTES, array_parts, element_type, text_field
+from trihedron.pipeline.record.array_codec import MAX_BYTES, array_parts, bytes_field, element_type
 
 ROW_NUMBER = 8  # bytes of a row's number, which a row without columns takes, too
 CHECKPOINT_EVERY = 64  # messages; on a walk through new rooms a checkpoint adds a third to the changes, however far apart they are
 MAX_CHECKPOINTS = 16  # that build on each other: reading one frame reads them all
+_LAYOUT, _ARRAYS = 1, 2  # fields of `trihedron.Table`
 WORTH = 2 / 3  # of the bytes of a full snapshot, which a checkpoint must not exceed
 
 
@@ -38,16 +39,16 @@ class TableWriter:
         self._back = 0  # messages since the checkpoint
         self._checkpoints = 0  # that build on each other
 
-    def parts(self, tables: Mapping[str, Table]) -> list[Any]:
-        """Encode one value's tables as parts of its message."""
+    def parts(self, tables: Mapping[str, Table]) -> dict[str, list[Any]]:
+        """Encode one value's tables: the parts of each one's message."""
         self._back += 1
         known, latest, self._latest = self._checkpoint, self._latest, tables
         if self._back < CHECKPOINT_EVERY and _continues(latest, tables):
             return _parts(tables, latest, 1)
-        parts: list[Any] = []
+        parts: dict[str, list[Any]] = {}
         if self._checkpoints < MAX_CHECKPOINTS and _continues(known, tables):
             parts = _parts(tables, known, self._back)
-        if not parts or sum(memoryview(part).nbytes for part in parts) > WORTH * sum(table.nbytes for table in tables.values()):
+        if not parts or sum(map(bytes_of, parts.values())) > WORTH * sum(table.nbytes for table in tables.values()):
             parts, self._checkpoints = _parts(tables, {}, 0), 0
         self._checkpoint, self._back, self._checkpoints = tables, 0, self._checkpoints + 1
         return parts
@@ -58,11 +59,16 @@ def _continues(known: Mapping[str, Table], tables: Mapping[str, Table]) -> bool:
     return bool(known) and all(known[name].schema == table.schema and known[name].size <= table.size for name, table in tables.items())
 
 
-def _parts(tables: Mapping[str, Table], known: Mapping[str, Table], back: int) -> list[Any]:
-    return [part for name, table in tables.items() for part in _table_parts(name, table, known.get(name), back)]
+def bytes_of(parts: Sequence[Any]) -> int:
+    """Return the bytes of parts of a message."""
+    return sum(memoryview(part).nbytes for part in parts)
 
 
-def _table_parts(name: str, table: Table, previous: Table | None, back: int) -> list[Any]:
+def _parts(tables: Mapping[str, Table], known: Mapping[str, Table], back: int) -> dict[str, list[Any]]:
+    return {name: _table_parts(table, known.get(name), back) for name, table in tables.items()}
+
+
+def _table_parts(table: Table, previous: Table | None, back: int) -> list[Any]:
     """The rows of each column that `previous` does not have; columns whose rows are the same share the list of their numbers."""
     parts: list[Any] = []
     changed: dict[str, int] = {}
@@ -73,15 +79,14 @@ def _table_parts(name: str, table: Table, previous: Table | None, back: int) -> 
         ids = _changed_rows(before, table, column, freed)
         if len(ids):
             changed[column] = numbers.setdefault(ids.tobytes(), len(numbers))
-            parts += array_parts(f"{name}#{column}", table.shared(column).take(ids, axis=0))
+            parts += array_parts(_ARRAYS, column, table.shared(column).take(ids, axis=0), named=True)
     for ids_bytes, k in numbers.items():
-        parts += array_parts(f"{name}#rows{k}", np.frombuffer(ids_bytes, np.int32))
+        parts += array_parts(_ARRAYS, f"rows{k}", np.frombuffer(ids_bytes, np.int32), named=True)
     if len(freed):
-        parts += array_parts(f"{name}#emptied", freed)
+        parts += array_parts(_ARRAYS, "emptied", freed, named=True)
     schema = ", ".join(_column_text(column, kind) for column, kind in table.schema.items())
     header = f'{{"size": {table.size}, "back": {back}, "schema": {{{schema}}}, "rows": {json.dumps(changed)}}}'
-    parts.append(text_field(f"{name}#", header))
-    return parts
+    return [bytes_field(_LAYOUT, header.encode()), *parts]
 
 
 def _changed_rows(before: Table, table: Table, column: str, freed: NDArray[np.int32]) -> NDArray[np.int32]:

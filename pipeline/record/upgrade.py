@@ -12,16 +12,26 @@ from typing import Any
 import numpy as np
 
 from trihedron.pipeline.core.errors import RecordingError, printable
-from trihedron.pipeline.record.array_codec import Numbers, array_parts
-from trihedron.pipeline.record.codec import FORMAT, FRAMES_TOPIC, METADATA, READABLE, Decoder, Encoder, ValueMessage
+from trihedron.pipeline.record.codec import (
+    FORMAT,
+    FRAMES_TOPIC,
+    METADATA,
+    TIMING_TOPIC,
+    Decoder,
+    Encoder,
+    LegacyMessage,
+    is_value_schema,
+    timing_of,
+)
 from trihedron.pipeline.record.mcap_file import McapFile, damaged
 from trihedron.pipeline.record.mcap_writer import McapWriter
+from trihedron.pipeline.record.schemas import PACKAGE, definition, message_class
 
 RENAMED_TYPES: dict[str, str] = {}  # name in an older recording -> name today, where only the name changed
 RENAMED_FIELDS: dict[str, dict[str, str]] = {}  # type today -> older name of a field or table -> name today
-ADDED_FIELDS = {  # type and older version -> fields that it lacks, encoded
-    ("Pose", 2): b"".join([*array_parts("map_covariance", np.zeros((6, 6))), Numbers({"noise_scale": float}).fields([1.0])]),
-    ("Map", 5): Numbers({"loop_closed": int}).fields([0]),
+ADDED_FIELDS: dict[tuple[str, int], dict[str, Any]] = {  # type and older version -> fields that it lacks
+    ("Pose", 2): {"map_covariance": np.zeros((6, 6)), "noise_scale": 1.0},
+    ("Map", 5): {"loop_closed": 0},
 }
 ADDED_COLUMNS = {("Map", 4): ("keyframes", "world_covariance", "covariance")}  # likewise -> table, the column that it lacks, and that which it copies
 
@@ -35,11 +45,11 @@ class Upgraded:
 
 
 def is_outdated(path: Path) -> bool:
-    """Return whether a file is a recording or map of this program, complete, of a format or with values that it cannot read as they are."""
+    """Return whether a file is a recording or map of this program, complete, of an older format or with values that it cannot read as they are."""
     file = McapFile(path)
     if METADATA not in file.metadata or not file.complete or not file.indexed:
         return False
-    return file.metadata[METADATA].get("format") not in READABLE or bool(_unreadable(file, rename=False))
+    return file.metadata[METADATA].get("format") != FORMAT or bool(_unreadable(file, rename=False))
 
 
 def upgrade(source: Path, destination: Path) -> Upgraded:
@@ -74,16 +84,24 @@ def _copy(file: McapFile, writer: McapWriter, unreadable: dict[int, str], result
     for channel, log_time, data in file.messages():
         if channel in unreadable:
             continue
+        declared, schema = file.channels[channel], file.schemas.get(file.channels[channel].schema_id)
+        described = (schema.name, schema.encoding, schema.data, declared.message_encoding) if schema is not None else ("", "", b"", "")
         if _is_value(file, channel):
             decoder, encoder = codecs.setdefault(channel, (_decoder(file, channel), Encoder()))
-            data = encoder.encode(decoder.decode(_renamed(data)))
+            value = decoder.decode(_renamed(data))
+            data, described = encoder.encode(value), _described(type(value).__name__)
+        elif declared.topic == TIMING_TOPIC:
+            data, described = bytes(message_class("Timing")(**timing_of(data)).SerializeToString()), _described("Timing")
         if channel not in numbers:
-            declared, schema = file.channels[channel], file.schemas.get(file.channels[channel].schema_id)
-            described = (schema.name, schema.encoding, schema.data) if schema is not None else ("", "", b"")
-            numbers[channel] = writer.channel(declared.topic, *described, declared.message_encoding)
+            numbers[channel] = writer.channel(declared.topic, *described)
         message = (numbers[channel], log_time, data)
         writer.add(len(data), partial(list, [message]))
         result.messages += 1
+
+
+def _described(name: str) -> tuple[str, str, bytes, str]:
+    """Name, encoding and content of a schema of today, and the encoding of its messages."""
+    return f"{PACKAGE}.{name}", "protobuf", definition(name), "protobuf"
 
 
 def _unreadable(file: McapFile, rename: bool) -> dict[int, str]:
@@ -100,7 +118,7 @@ def _unreadable(file: McapFile, rename: bool) -> dict[int, str]:
 
 
 def _is_value(file: McapFile, channel: int) -> bool:
-    return bool(file.schema_name(channel) == ValueMessage.DESCRIPTOR.full_name)
+    return is_value_schema(file.schema_name(channel))
 
 
 def _decoder(file: McapFile, channel: int) -> Decoder:
@@ -109,7 +127,9 @@ def _decoder(file: McapFile, channel: int) -> Decoder:
 
 def _renamed(data: bytes) -> bytes:
     """A message with the names, fields and columns of today."""
-    message = ValueMessage.FromString(data)
+    message = LegacyMessage.FromString(data)
+    if not message.arrays:
+        return data
     message.type = RENAMED_TYPES.get(message.type, message.type)
     fields, older = RENAMED_FIELDS.get(message.type, {}), (message.type, message.version)
     if not fields and older not in ADDED_FIELDS and older not in ADDED_COLUMNS:
@@ -123,7 +143,11 @@ def _renamed(data: bytes) -> bytes:
     if older not in ADDED_FIELDS and older not in ADDED_COLUMNS:
         return bytes(message.SerializeToString())
     message.version += 1
-    return _renamed(bytes(message.SerializeToString() + ADDED_FIELDS.get(older, b"")))  # which may be an older version still
+    for name, value in ADDED_FIELDS.get(older, {}).items():
+        array = np.asarray(value)
+        kind = array.dtype.str.lstrip("<") if array.ndim else type(value).__name__
+        message.arrays.add(name=name, dtype=kind, shape=array.shape, encoding="raw", data=array.tobytes())
+    return _renamed(bytes(message.SerializeToString()))  # which may be an older version still
 
 
 def _copy_column(message: Any, table: str, column: str, source: str) -> None:

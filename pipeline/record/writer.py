@@ -2,33 +2,22 @@
 
 from __future__ import annotations
 
-import json
 from collections import deque
 from collections.abc import Mapping
-from functools import cache
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from mcap_protobuf.schema import build_file_descriptor_set
 
-from trihedron.pipeline.core.slots import SLOTS
 from trihedron.pipeline.core.types import Value
-from trihedron.pipeline.record.codec import FORMAT, FRAMES_TOPIC, METADATA, TIMING_TOPIC, Encoder, ValueMessage
+from trihedron.pipeline.record.codec import FORMAT, FRAMES_TOPIC, METADATA, TIMING_TOPIC, Encoder
 from trihedron.pipeline.record.foxglove import View
 from trihedron.pipeline.record.foxglove_server import FoxgloveServer
 from trihedron.pipeline.record.mcap_writer import McapWriter
+from trihedron.pipeline.record.schemas import PACKAGE, definition, message_class
 
 SPARSE_BYTES = 1 << 15  # assumed size of a value of a topic that is not dense
-TIMING_SCHEMA = {
-    "type": "object",
-    "properties": {
-        "index": {"type": "integer"},
-        "frame_ms": {"type": "number"},
-        "stage_ms": {"type": "object", "properties": {slot: {"type": "number"} for slot in SLOTS}},  # viewers read no object without properties
-        "memory_mb": {"type": "number", "description": "resident, of the whole process"},
-    },
-}
 
 
 class RecordingWriter:
@@ -81,13 +70,13 @@ class RecordingWriter:
         self._file.add(message.ByteSize(), lambda: [self._message(channel, message, stamp_ns)])
 
     def write_timing(self, index: int, stamp_ns: int, frame_ms: float, stage_ms: Mapping[str, float], memory_mb: float) -> None:
-        """Add a frame's times, and the memory the process holds after it (JSON, so that any viewer plots them)."""
-        self._file.add(0, lambda: [(self._timing_channel(), stamp_ns, _timing(index, frame_ms, stage_ms, memory_mb))])
+        """Add a frame's times, and the memory the process holds after it."""
+        self._file.add(0, lambda: [(self._own_channel(TIMING_TOPIC, "Timing"), stamp_ns, _timing(index, frame_ms, stage_ms, memory_mb))])
 
     def _encoded(self, topic: str, value: Value) -> list[tuple[int, int, bytes]]:
         if topic not in self._encoders:
             self._encoders[topic] = Encoder()
-        return [(self._channel(f"/{topic}", ValueMessage), value.stamp_ns, self._encoders[topic].encode(value))]
+        return [(self._own_channel(f"/{topic}", type(value).__name__), value.stamp_ns, self._encoders[topic].encode(value))]
 
     def _message(self, channel: str, message: Any, stamp_ns: int) -> tuple[int, int, bytes]:
         return self._channel(channel, type(message)), stamp_ns, message.SerializeToString()
@@ -98,11 +87,11 @@ class RecordingWriter:
             self._channels[channel] = self._file.channel(channel, kind.DESCRIPTOR.full_name, "protobuf", definition, "protobuf")
         return self._channels[channel]
 
-    def _timing_channel(self) -> int:
-        if TIMING_TOPIC not in self._channels:
-            definition = json.dumps(TIMING_SCHEMA).encode()
-            self._channels[TIMING_TOPIC] = self._file.channel(TIMING_TOPIC, "trihedron.Timing", "jsonschema", definition, "json")
-        return self._channels[TIMING_TOPIC]
+    def _own_channel(self, channel: str, name: str) -> int:
+        """The channel of messages `trihedron.<name>`."""
+        if channel not in self._channels:
+            self._channels[channel] = self._file.channel(channel, f"{PACKAGE}.{name}", "protobuf", definition(name), "protobuf")
+        return self._channels[channel]
 
     def flush(self) -> None:
         """Write all values so far to the file, which lacks its index then."""
@@ -123,9 +112,6 @@ def _memory_bytes(value: Value) -> int:
 
 
 def _timing(index: int, frame_ms: float, stage_ms: Mapping[str, float], memory_mb: float) -> bytes:
-    """A message of TIMING_SCHEMA."""
-    stages = ", ".join([f"{_quoted(name)}: {ms:.3f}" for name, ms in stage_ms.items()])
-    return f'{{"index": {index}, "frame_ms": {frame_ms:.3f}, "stage_ms": {{{stages}}}, "memory_mb": {memory_mb:.2f}}}'.encode()
-
-
-_quoted = cache(json.dumps)  # names of stages
+    """A message of `/timing`."""
+    message = message_class("Timing")(index=index, frame_ms=frame_ms, stage_ms=stage_ms, memory_mb=memory_mb)
+    return bytes(message.SerializeToString())

@@ -65,7 +65,7 @@ def _connected(address: str) -> Any:
     try:
         from distributed import Client
     except ImportError as error:
-        raise ConfigError("hydra.launcher", "Dask is not installed", "pip install 'trihedron[cluster]'") from error
+        raise ConfigError("hydra.launcher", "Dask is not installed", "pip install distributed") from error
     try:
         return Client(address, timeout=ANSWER_SECONDS, set_as_default=False)
     except (OSError, ValueError) as error:

@@ -154,7 +154,7 @@ def _optuna() -> Any:
     try:
         import optuna
     except ImportError as error:
-        raise ConfigError("hydra/sweeper", "Optuna is not installed", "pip install 'trihedron[search]'") from error
+        raise ConfigError("hydra/sweeper", "Optuna is not installed", "pip install optuna") from error
     import warnings
 
     warnings.filterwarnings("ignore", category=optuna.exceptions.ExperimentalWarning)

@@ -21,4 +21,4 @@ def odometry(map: Map, pairs: I32, drift: float, rotation_drift: float, times: f
     covariance = times * map.keyframes.rows("covariance", pairs[:, 1])
     covariance[:, :3, :3] += times * (drift**2 * length + LEAST_M**2) * np.eye(3)
     covariance[:, 3:, 3:] += times * (rotation_drift**2 * length + LEAST**2) * np.eye(3)
-    return np.ascontiguousarray(motions), np.linalg.inv(covariance)
+    return np.ascontiguousarray(motions), np.asarray(np.linalg.inv(covariance), np.float64)

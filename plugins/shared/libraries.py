@@ -27,7 +27,7 @@ def pycolmap() -> Any:
 
 def onnxruntime() -> Any:
     """Import ONNX Runtime (MIT). Raises PluginError."""
-    return _imported("onnxruntime", "trihedron[onnx]")
+    return _imported("onnxruntime", "onnxruntime")
 
 
 @cache

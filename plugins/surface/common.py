@@ -105,6 +105,13 @@ class VolumeFold(ViewFold):
             state.volume.integrate(*view.fused, view.T_world_camera)
         state.fused.append(view.T_world_camera if view.submap == 0 else None)
 
+    def preview(self, state: Gathered) -> Surface:
+        """The mesh of the views as they were fused, coloured by them, without planes: for viewers."""
+        if state.volume is None:
+            return Surface.empty(state.index, state.stamp_ns)
+        vertices, triangles = zero_level(state.volume, 1.0 / self.max_error_m**2)
+        return coloured(state, None, *with_single_fans(vertices, without_crumbs(vertices, triangles, self.crumb_m2)))
+
     def _volume(self, state: Gathered, map: Map | None) -> Volume:
         """The volume of all views at their final poses."""
         finals = [view.settled(map) for view in state.views]

@@ -28,6 +28,7 @@ from trihedron.datasets.readers import foxglove_messages
 from trihedron.datasets.readers.robot_streams import ROS
 from trihedron.pipeline.core.config import composed
 from trihedron.pipeline.core.geometry import exp_se3, quaternion_from_rotation
+from trihedron.pipeline.record.codec import is_value_schema
 from trihedron.pipeline.record.trajectories import TRUTH
 from trihedron.pipeline.record.writer import RecordingWriter
 from trihedron.pipeline.run.ply import write_ply
@@ -210,13 +211,19 @@ def _own(folder: Path) -> None:
 
 def _messages(folder: Path) -> None:
     """One message of each topic, behind a byte that says of which type."""
-    kinds = [*ROS, *(f"{kind} {encoding}" for kind in foxglove_messages.READERS for encoding in ("protobuf", "json")), "trihedron.Value"]
+    kinds = [*ROS, *(f"{kind} {encoding}" for kind in foxglove_messages.READERS for encoding in ("protobuf", "json")), "values"]
     for name in ("ros_raw", "ros_compressed", "foxglove_registered", "foxglove_own_depth", "foxglove_json", "own"):
         seen: set[str] = set()
         with open(folder / f"{name}.mcap", "rb") as file:
             for schema, channel, sent in make_reader(file).iter_messages():
                 assert schema is not None
-                kind = f"{schema.name} {channel.message_encoding}" if schema.name in foxglove_messages.READERS else schema.name
+                kind = (
+                    f"{schema.name} {channel.message_encoding}"
+                    if schema.name in foxglove_messages.READERS
+                    else "values"
+                    if is_value_schema(schema.name)
+                    else schema.name
+                )
                 if kind in kinds and channel.topic not in seen:
                     seen.add(channel.topic)
                     (folder / f"message_{name}{channel.topic.replace('/', '_')}").write_bytes(bytes([kinds.index(kind)]) + sent.data)

@@ -14,7 +14,8 @@ import zstandard
 from trihedron.pipeline.core.errors import RecordingError
 from trihedron.pipeline.core.table import CHUNK, Column, Table
 from trihedron.pipeline.core.types import Camera, DepthNoise, Frame, Keypoints, Map, Planes, Pose, Rotation
-from trihedron.pipeline.record.codec import Decoder, Encoder, ValueMessage, builds_on
+from trihedron.pipeline.record.codec import Decoder, Encoder, LegacyMessage, builds_on
+from trihedron.pipeline.record.schemas import message_class
 from trihedron.pipeline.record.table_codec import CHECKPOINT_EVERY, MAX_CHECKPOINTS
 
 RNG = np.random.default_rng(0)
@@ -63,7 +64,7 @@ def test_large_arrays_of_every_element_type_and_shape():
     for n in (1024, 2000):
         value = keypoints(n)
         message = message_of(value)
-        assert {a.name for a in message.arrays if a.encoding == "columns"} >= {"pixels"}
+        assert message.pixels.encoding == "columns"
         assert differing(value, there_and_back(value)) == []
     whole = next(iter(maps(1)))
     table, _ = Table.empty({"i": Column("i8"), "m": Column("f8", (3, 3))}).appended(i=np.arange(600) - 300, m=RNG.random((600, 3, 3)))
@@ -73,7 +74,7 @@ def test_large_arrays_of_every_element_type_and_shape():
 def test_symmetric_matrices_shrink():
     """Equal columns are runs of equal bytes after transposition: a third less, and the high bytes less still."""
     root = RNG.random((500, 3, 3))
-    data = next(a.data for a in message_of(planes(500, root @ np.swapaxes(root, 1, 2))).arrays if a.name == "covariance")
+    data = message_of(planes(500, root @ np.swapaxes(root, 1, 2))).covariance.data
     assert len(lz4.frame.compress(data)) < 0.7 * len(data) and len(data) == 500 * 72
 
 
@@ -100,7 +101,7 @@ def test_a_colour_image_is_stored_by_the_steps_between_its_rows():
         value = Frame(1, 2, color, depth, camera)
         assert differing(value, there_and_back(value)) == []
         message = message_of(value)
-        (array,) = (array for array in message.arrays if array.name == "color")
+        array = message.color
         sizes.append(len(array.data))
         for shape in ((48, 64, 4), (47, 64, 3), (48 * 64 * 3,), (48, 64)):
             array.shape[:] = shape
@@ -116,8 +117,7 @@ def test_a_column_s_step_is_told():
     assert differing(value, found) == [] and found.points.schema == table.schema
     for wrong in ("-1.0", "NaN", '"0.5"', "0.5, 2"):
         message = message_of(value)
-        (head,) = (array for array in message.arrays if array.name == "points#")
-        head.data = head.data.replace(b"9.5367431640625e-07", wrong.encode())
+        message.points.layout = message.points.layout.replace("9.5367431640625e-07", wrong)
         assert "Map does not fit: " in refusal(message)
 
 
@@ -190,8 +190,7 @@ def test_a_value_is_read_from_few_messages():
 def test_copied_fields_stay_in_rows():
     """A point of the key points is, in the tracks of the next frame, the same twelve bytes."""
     message = message_of(keypoints(300))
-    (points,) = (array for array in message.arrays if array.name == "points_m")
-    assert points.encoding == "raw" and len(points.data) == 3600
+    assert message.points_m.encoding == "raw" and len(message.points_m.data) == 3600
 
 
 def test_chunks_that_were_given_back_are_not_written_and_stay_given_back():
@@ -211,10 +210,10 @@ def test_chunks_that_were_given_back_are_not_written_and_stay_given_back():
     assert len(table) > 14_000 and max(sizes) < 35_000
     for wrong in ([0, 0], [-1], [len(table) // CHUNK]):
         message = message_of(value)
-        kept = [array for array in message.arrays if array.name != "points#emptied"]
-        del message.arrays[:]
-        message.arrays.extend(kept)
-        message.arrays.add(name="points#emptied", dtype="i4", shape=[len(wrong)], encoding="raw", data=np.array(wrong, np.int32).tobytes())
+        kept = [array for array in message.points.arrays if array.name != "emptied"]
+        del message.points.arrays[:]
+        message.points.arrays.extend(kept)
+        message.points.arrays.add(name="emptied", dtype="i4", shape=[len(wrong)], encoding="raw", data=np.array(wrong, np.int32).tobytes())
         with pytest.raises(RecordingError, match="does not fit"):
             Decoder("x").decode(message.SerializeToString())
 
@@ -227,14 +226,14 @@ def test_of_a_touched_chunk_only_the_rows_that_changed_are_written():
     moved = table.updated(ids[[3, 77, 200]], x=np.full((3, 8), -1.0))
     grown, _ = moved.appended(x=np.zeros((20, 8)))  # fills the chunk and begins the next
     for version, rows in ((moved, [3, 77, 200]), (grown, [*range(250, 270)])):
-        message = ValueMessage.FromString(encoder.encode(replace(whole, points=version)))
-        written = {array.name: array for array in message.arrays if array.name.startswith("points#")}
-        assert set(written) == {"points#", "points#x", "points#rows0"} and len(written["points#x"].data) == 64 * len(rows)
-        assert np.frombuffer(written["points#rows0"].data, np.int32).tolist() == rows
+        message = message_class("Map").FromString(encoder.encode(replace(whole, points=version)))
+        written = {array.name: array for array in message.points.arrays}
+        assert set(written) == {"x", "rows0"} and len(written["x"].data) == 64 * len(rows)
+        assert np.frombuffer(written["rows0"].data, np.int32).tolist() == rows
         assert differing(replace(whole, points=version), decoder.decode(message.SerializeToString())) == []
-    message = ValueMessage.FromString(encoder.encode(replace(whole, points=grown.updated(ids[:1], x=np.ones((1, 8))))))
-    for array in message.arrays:
-        if array.name.endswith("rows0"):
+    message = message_class("Map").FromString(encoder.encode(replace(whole, points=grown.updated(ids[:1], x=np.ones((1, 8))))))
+    for array in message.points.arrays:
+        if array.name == "rows0":
             array.data = b"\xff" * 4
     with pytest.raises(RecordingError, match="Map does not fit"):
         decoder.decode(message.SerializeToString())
@@ -248,18 +247,19 @@ def test_changes_depend_on_values_not_on_who_holds_them():
         assert one.encode(version) == two.encode(copy)
 
 
-def test_the_bytes_are_those_of_the_library():
-    """Written field by field, they are what the protobuf library makes of the same content; also of zeros, empty arrays and large numbers."""
+def test_the_messages_are_those_of_the_library():
+    """Written field by field, they are what the protobuf library reads, and what it writes is read; also zeros, empty arrays and large numbers."""
     frame = Frame(0, -(2**62), np.zeros((48, 64, 3), np.uint8), np.ones((48, 64), np.float32), Camera(64, 48, 50.0, 51.0, 31.5, 23.5))
     pose = Pose(2**40, 2**62, np.eye(4), np.eye(6), np.eye(4), -1, np.zeros(3, np.int32), 0, "lost", "where is — ‘it’?")
-    for value in (keypoints(0), keypoints(300), frame, pose, *maps(3)):
+    for value in (keypoints(0), keypoints(300), frame, pose, *maps(1)):
         message = message_of(value)
         assert (message.index, message.stamp_ns, message.version) == (value.index, value.stamp_ns, value.version)
-        assert message.SerializeToString() == Encoder().encode(value)
+        assert differing(value, Decoder("x").decode(message.SerializeToString())) == []
+    assert message_of(frame).camera.fx == 50.0 and message_of(pose).reason == pose.reason and message_of(pose).submap == 0
 
 
 def message_of(value):
-    return ValueMessage.FromString(Encoder().encode(value))
+    return message_class(type(value).__name__).FromString(Encoder().encode(value))
 
 
 def refusal(message):
@@ -270,7 +270,7 @@ def refusal(message):
 
 def test_damaged_and_foreign_values_are_refused():
     assert refusal(b"\xff\xff\xff") == (
-        "a.mcap: topic /keypoints: holds a message that is not a trihedron.Value; the file is damaged; record it again"
+        "a.mcap: topic /keypoints: holds a message that is no value of trihedron; the file is damaged; record it again"
     )
     message = message_of(keypoints())
     message.type = "Keypoint"
@@ -281,39 +281,34 @@ def test_damaged_and_foreign_values_are_refused():
         "a.mcap: topic /keypoints: holds Keypoints version 9, this program reads version 1; read it with the version that wrote it"
     )
     message = message_of(keypoints())
-    del message.arrays[2]
+    message.ClearField("sigma_px")
     assert refusal(message) == "a.mcap: topic /keypoints: frame 7: Keypoints does not fit: 'sigma_px'; the file is damaged; record it again"
     message = message_of(keypoints())
-    message.arrays[0].shape[0] = 1 << 50
+    message.pixels.shape[0] = 1 << 50
     assert refusal(message) == (
         "a.mcap: topic /keypoints: array 'pixels' claims type 'f4' and shape (1125899906842624, 2); the file is damaged; record it again"
     )
-    message = message_of(planes(2, np.zeros((2, 3, 3))))
-    (stride,) = (array for array in message.arrays if array.name == "stride")
-    stride.shape[:], stride.data = (2,), bytes(16)
-    assert "array 'stride' claims type 'int' and shape (2,)" in refusal(message)
     for text in (",1", "f4,f4", "i4, (2)f8", "O", "M8[ns]", "V16", "(2,)f4"):  # some of which NumPy evaluates
         message = message_of(keypoints())
-        message.arrays[0].dtype = text
+        message.pixels.dtype = text
         assert f"array 'pixels' claims type '{text}' and shape (20, 2)" in refusal(message)
         message = message_of(next(iter(maps(1))))
-        (head,) = (array for array in message.arrays if array.name == "points#")
-        head.data = head.data.replace(b'"?"', json.dumps(text).encode())
+        message.points.layout = message.points.layout.replace('"?"', json.dumps(text))
         assert f"a column of type {text!r}" in refusal(message)
     message = message_of(keypoints())
-    message.arrays[1].shape[0] = 19
+    message.points_m.shape[0] = 19
     assert refusal(message) == (
         "a.mcap: topic /keypoints: array 'points_m' does not have the 228 bytes of its shape (19, 3); the file is damaged; record it again"
     )
     message = message_of(keypoints())
-    message.arrays[0].encoding = "zstd_planes"
+    message.pixels.encoding = "zstd_planes"
     assert refusal(message) == (
         "a.mcap: topic /keypoints: array 'pixels' has the encoding 'zstd_planes', this program reads raw, columns, zstd, rows; "
         "read it with the version that wrote it"
     )
     message = message_of(keypoints())
-    message.arrays[0].dtype = "O"
-    assert "array 'pixels' claims type 'O'" in refusal(message)
+    message.pixels.dtype = "str"
+    assert "frame 7: Keypoints does not fit" in refusal(message)
     change = list(maps(2))
     encoder = Encoder()
     encoder.encode(change[0])
@@ -322,7 +317,7 @@ def test_damaged_and_foreign_values_are_refused():
 
 def test_a_value_of_an_older_version_names_the_version_and_the_fields():
     """As `Pose` was before sub-maps, with a field that there is no more."""
-    message = message_of(Pose(3, 4, np.eye(4), np.eye(6), np.eye(4), -1, np.zeros(3, np.int32), 0, "ok", ""))
+    message = legacy("pose")
     message.version = 1
     kept = [array for array in message.arrays if array.name not in ("submap", "unrecognised", "map_covariance", "noise_scale")]
     del message.arrays[:]
@@ -340,8 +335,7 @@ def test_an_image_that_claims_to_be_larger_than_its_shape_is_not_decoded():
     for name, size in (("color", 9216), ("depth_m", 12288)):
         for data in (zstandard.compress(bytes(1 << 24)), zstandard.compress(bytes(16)), b"no frame of zstd", b""):
             message = message_of(frame)
-            (image,) = (array for array in message.arrays if array.name == name)
-            image.data = data
+            getattr(message, name).data = data
             assert f"array '{name}' does not have the {size} bytes" in refusal(message)
 
 
@@ -360,12 +354,9 @@ def test_random_damage_never_raises_anything_else(cut):
     assert read == 0 if cut else 0 < read < 2000
 
 
-def message_with(kind, change):
-    """A seed of the fuzzer, its message changed."""
-    message = ValueMessage()
-    message.ParseFromString((Path(__file__).parents[1] / "fuzz" / "seeds" / f"message_own_{kind}").read_bytes()[1:])
-    change(message)
-    return message.SerializeToString()
+def legacy(kind):
+    """A message of format 4."""
+    return LegacyMessage.FromString((Path(__file__).parents[1] / "fuzz" / "seeds" / f"message_legacy_{kind}").read_bytes()[1:])
 
 
 SHAPES = [[], [-1], [1] * 65, [0] * 65, [2**62] * 20, [0] + [2**62] * 20, [0, 2**62], [2**63 - 1, 0], [10**6, 0, 10**6]]
@@ -374,12 +365,13 @@ SHAPES = [[], [-1], [1] * 65, [0] * 65, [2**62] * 20, [0] + [2**62] * 20, [0, 2*
 @pytest.mark.parametrize("encoding", ["raw", "columns", "zstd", "rows"])
 @pytest.mark.parametrize("shape", SHAPES, ids=lambda shape: f"{len(shape)} axes {max(shape, default=None)}")
 def test_a_shape_that_no_array_has_is_one_line(shape, encoding):
-    def change(message):
-        message.arrays[0].data, message.arrays[0].encoding = bytes(0 if shape else 4), encoding
-        message.arrays[0].shape[:] = shape
-
-    with pytest.raises(RecordingError, match=r"^x: (array 'pixels' (claims|does not have the 4 bytes)|frame 0: Keypoints does not fit)"):
-        Decoder("x").decode(message_with("keypoints", change))
+    old, new = legacy("keypoints"), message_of(keypoints())
+    for message, array in ((old, old.arrays[0]), (new, new.pixels)):
+        array.data, array.encoding = bytes(0 if shape else 4), encoding
+        array.shape[:] = shape
+        cause = r"^x: (array 'pixels' (claims|does not have the 4 bytes)|frame \d: Keypoints does not fit)"
+        with pytest.raises(RecordingError, match=cause):
+            Decoder("x").decode(message.SerializeToString())
 
 
 HEADERS = {  # text of a table's header, cause
@@ -400,13 +392,15 @@ HEADERS = {  # text of a table's header, cause
 def test_a_table_whose_header_is_no_header_is_one_line(header):
     """Nothing is allocated for rows that are not there."""
 
-    def change(message):
-        next(array for array in message.arrays if array.name == "keyframes#").data = header.encode()
-
-    tracemalloc.start()
-    try:
-        with pytest.raises(RecordingError, match=f"^x: frame 0: Map does not fit: .*{HEADERS[header]}") as caught:
-            Decoder("x").decode(message_with("map", change))
-        assert tracemalloc.get_traced_memory()[1] < 20e6 and len(str(caught.value)) < 400
-    finally:
-        tracemalloc.stop()
+    old, new = legacy("map"), message_of(next(iter(maps(1))))
+    next(array for array in old.arrays if array.name == "keyframes#").data = header.encode()
+    new.keyframes.layout = header
+    for message in (old, new):
+        data = message.SerializeToString()
+        tracemalloc.start()
+        try:
+            with pytest.raises(RecordingError, match=rf"^x: frame \d+: Map does not fit: .*{HEADERS[header]}") as caught:
+                Decoder("x").decode(data)
+            assert tracemalloc.get_traced_memory()[1] < 20e6 and len(str(caught.value)) < 400
+        finally:
+            tracemalloc.stop()

@@ -1,7 +1,6 @@
 """Recordings: what stands first, when chunks close, what a viewer sees, and what a wrong file says."""
 
 import io
-import json
 import sys
 import time
 from dataclasses import replace
@@ -21,7 +20,7 @@ from trihedron.pipeline.core.geometry import exp_se3, exp_so3, rotation_from_qua
 from trihedron.pipeline.core.table import Column, Table
 from trihedron.pipeline.core.types import FrameReference, ManhattanFrame, Map, Planes, Pose, Segments, Surface, Trajectory
 from trihedron.pipeline.record import mcap_writer as module
-from trihedron.pipeline.record.codec import FORMAT
+from trihedron.pipeline.record.codec import FORMAT, timing_of
 from trihedron.pipeline.record.foxglove import View
 from trihedron.pipeline.record.foxglove_messages import MOST_VERTICES
 from trihedron.pipeline.record.reader import Recording, TopicReader
@@ -150,7 +149,7 @@ def test_topics_and_values(tmp_path):
     assert reader.at(5).index == 5 and reader.at(9) is None
 
     assert [recording.value("keypoints", 1000 * i).index for i in (5, 0, 2)] == [5, 0, 2] and recording.value("keypoints", 4000) is None
-    timing = [json.loads(data) for _, data in recording.messages("/timing")]
+    timing = [timing_of(data) for _, data in recording.messages("/timing")]
     assert timing[1] == {"index": 1, "frame_ms": 1.5, "stage_ms": {"keypoints": 1.25}, "memory_mb": 250.0}
 
 
@@ -179,7 +178,7 @@ def test_wrong_files_say_so_in_one_line(tmp_path):
     )
     write(tmp_path / "new.mcap", [0], format="9", version="0.0.9", commit="0123456789")
     assert refusal(tmp_path / "new.mcap") == (
-        "DIR/new.mcap: has format 9 of trihedron 0.0.9 0123456, this program reads formats 3 and 4: its arrays and tables are packed otherwise; "
+        "DIR/new.mcap: has format 9 of trihedron 0.0.9 0123456, this program reads formats 3 to 5: its arrays and tables are packed otherwise; "
         "upgrade what can be read of it with: trihedron convert SRC DST.mcap"
     )
     with pytest.raises(RecordingError) as error:
@@ -206,7 +205,7 @@ def test_a_recording_of_an_older_program_names_version_and_field(form, commit, d
     """Three frames that an earlier version of this program wrote; whatever is asked of them."""
     path = Path(__file__).parent / "recordings" / f"format_{form}.mcap"
     line = (
-        f"trihedron: {path}: has format {form} of trihedron 0.0.1 {commit}, this program reads formats 3 and 4: {differs} of its topics are others; "
+        f"trihedron: {path}: has format {form} of trihedron 0.0.1 {commit}, this program reads formats 3 to 5: {differs} of its topics are others; "
         "upgrade what can be read of it with: trihedron convert SRC DST.mcap\n"
     )
     for words in (["run", f"replay={path}", "only=[pose]"], ["diff", str(path), str(path)], ["export", str(path), "--to", "tum"]):
@@ -231,6 +230,22 @@ def test_a_recording_of_format_3_is_upgraded(tmp_path, capsys):
     assert i == 59 and recording.metadata["format"] == FORMAT
     assert main(["diff", str(path), str(path)]) == 0
     assert "equal: 60 frames" in capsys.readouterr().out
+
+
+def test_a_recording_of_format_4_is_read_and_upgraded(tmp_path, capsys):
+    """What the previous version wrote, with one schema for all values, times as JSON, is the same after conversion; each type has its schema."""
+    old, new = Path(__file__).parent / "recordings" / "format_4.mcap", tmp_path / "new.mcap"
+    assert main(["convert", str(old), str(new)]) == 0
+    assert main(["diff", str(old), str(new)]) == 0
+    assert "equal: 3 frames" in capsys.readouterr().out
+    before, after = Recording(old), Recording(new)
+    assert after.metadata["format"] == FORMAT and after.topics == before.topics and after.counts == before.counts
+    assert [timing_of(data) for _, data in after.messages("/timing")] == [timing_of(data) for _, data in before.messages("/timing")]
+    assert main(["topics", str(old)]) == 0
+    listed = capsys.readouterr().out
+    assert main(["topics", str(new)]) == 0
+    schemas = [[line.split()[:3] for line in text.splitlines()] for text in (listed, capsys.readouterr().out)]
+    assert schemas[0] == schemas[1] and ["/planes", "trihedron.Planes", "3"] in schemas[1] and ["/timing", "trihedron.Timing", "3"] in schemas[1]
 
 
 def test_a_large_map_is_shown_more_seldom():

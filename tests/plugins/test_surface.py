@@ -193,3 +193,16 @@ def test_degenerate_input_gives_a_valid_file(name, case, tmp_path):
 def test_options_out_of_range_are_refused(name, options, said):
     with pytest.raises(ValueError, match=said):
         plugin_class("surface", name)(**options)
+
+
+def test_a_preview_is_the_mesh_so_far():
+    """Viewers are shown what is fused; the fold goes on, and ends with the same bytes."""
+    plugin, inputs = plugin_class("surface", "planar_tsdf")(view_width=160), [seen(k, T) for k, T in enumerate(walk())]
+    state = plugin.start()
+    assert len(plugin.preview(state).triangles) == 0
+    counts = []
+    for given in inputs:
+        state = plugin.add(state, *given, None)
+        counts.append(len(plugin.preview(state).triangles))
+    assert counts[0] > 1000 and counts[-1] > counts[0]
+    assert Encoder().encode(plugin.finish(state, None)) == Encoder().encode(corner("planar_tsdf"))

@@ -9,10 +9,11 @@ from typing import Annotated
 import pytest
 
 from trihedron.pipeline.app.cli import main
+from trihedron.pipeline.core.comments import field_comments
 from trihedron.pipeline.core.options import Range
 from trihedron.pipeline.core.slots import SLOTS
 from trihedron.pipeline.core.types import Frame, Normals
-from trihedron.tools.plugins import describe_plugin, field_comments, first_sentence
+from trihedron.tools.plugins import describe_plugin, first_sentence
 
 
 class Kind(Enum):
@@ -65,8 +66,25 @@ def test_one_slot_as_text(capsys):
     assert main(["plugins", "keypoints"]) == 0
     lines = capsys.readouterr().out.splitlines()
     assert lines[0] == "keypoints(frame: Frame) -> Keypoints"
-    assert any(line.startswith("  * orb: ") for line in lines)
-    assert any(line.split() == ["features:", "int", "=", "1000", "at", "least", "1", "most", "key", "points", "kept"] for line in lines)
+    assert any(line.startswith("  * orb: ") for line in lines) and len(lines) < 20
+    assert lines[-1] == "trihedron plugins keypoints PLUGIN lists its options"
+
+
+def test_names_alone(capsys):
+    assert main(["plugins"]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert [line.split()[0] for line in lines[: len(SLOTS)]] == list(SLOTS) and len(lines) == len(SLOTS) + 2
+    assert "*mean_shift" in lines[list(SLOTS).index("manhattan")] and max(map(len, lines)) < 200
+
+
+def test_one_plugin_as_text(capsys):
+    assert main(["plugins", "keypoints", "orb"]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[0].startswith("keypoints=orb(frame")
+    assert any(line.split() == ["keypoints.features:", "int", "=", "1000", "at", "least", "1", "most", "key", "points", "kept"] for line in lines)
+    assert len(described(capsys, "keypoints", "orb")[0]["plugins"]) == 1
+    assert main(["plugins", "keypoints", "orp"]) == 2
+    assert capsys.readouterr().err == "trihedron: plugins: the slot 'keypoints' has no plugin 'orp'; did you mean 'orb'?\n"
 
 
 def test_a_plugin_as_data():

@@ -24,7 +24,7 @@ from trihedron.pipeline.core.errors import UsageError
 from trihedron.pipeline.core.graph import Graph
 from trihedron.pipeline.core.slots import output_of
 from trihedron.pipeline.core.types import F64, OK, Frame, Map, Pose, Trajectory
-from trihedron.pipeline.record.codec import TIMING_TOPIC
+from trihedron.pipeline.record.codec import TIMING_TOPIC, timing_of
 from trihedron.pipeline.record.reader import Recording
 from trihedron.pipeline.record.writer import RecordingWriter
 from trihedron.pipeline.run.runner import Runner
@@ -121,7 +121,7 @@ def measure(graph: Graph, path: Path, count: int, loop: int, span: int) -> list[
         if (step.index + 1) % span == 0 and isinstance(map, Map):
             held.append((len(os.listdir("/proc/self/fd")), len(os.listdir("/proc/self/task")), *_living(map), bytes_of(map) / 1e6))
     writer.close()
-    timing = [json.loads(data) for _, data in Recording(path).messages(TIMING_TOPIC)]
+    timing = [timing_of(data) for _, data in Recording(path).messages(TIMING_TOPIC)]
     return [_row(k * span, timing[k * span : (k + 1) * span], here, errors_mm, not_ok) for k, here in enumerate(held)]
 
 

@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 
 from trihedron.pipeline.core.errors import UsageError
 from trihedron.pipeline.core.types import F64, LOST, Map, Pose, Table, Trajectory
-from trihedron.pipeline.record.codec import TIMING_TOPIC
+from trihedron.pipeline.record.codec import TIMING_TOPIC, timing_of
 from trihedron.pipeline.record.reader import Recording
 from trihedron.pipeline.record.trajectories import attached_truth, read_trajectory
 from trihedron.pipeline.run.metrics import associate, relative_errors
@@ -207,7 +207,7 @@ def measure_growth(folder: Path, _: Sequences, overrides: Sequence[str]) -> Rows
     """One row for each quantity, with its value at both ends of SPAN; the map's with the floor it covers."""
     out = folder / "growth"
     truth = _run(out, ["dataset=synthetic", "dataset.scene=rooms", f"dataset.frames={WALK}", *overrides])[2]
-    timing = [json.loads(data) for _, data in Recording(out / "run.mcap").messages(TIMING_TOPIC)]
+    timing = [timing_of(data) for _, data in Recording(out / "run.mcap").messages(TIMING_TOPIC)]
     frames = np.array([row["index"] for row in timing])
     features = np.array([sum(row["stage_ms"].get(name, 0.0) for name in FEATURES) for row in timing])
     others = np.array([sum(row["stage_ms"].values()) - row["stage_ms"]["dataset"] for row in timing]) - features

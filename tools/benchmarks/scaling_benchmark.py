@@ -24,7 +24,7 @@ import numpy as np
 
 from trihedron.pipeline.core.errors import DataError, UsageError
 from trihedron.pipeline.core.types import Map
-from trihedron.pipeline.record.codec import TIMING_TOPIC
+from trihedron.pipeline.record.codec import TIMING_TOPIC, timing_of
 from trihedron.pipeline.record.reader import Recording
 from trihedron.tools.arguments import Parser, table
 from trihedron.tools.benchmark import machine, measure, reference_ms, sample_images
@@ -107,7 +107,7 @@ def _measured(part: str, name: str, overrides: Sequence[str]) -> dict[str, Any]:
         out = Path(folder) / "run"
         run = measure([*overrides, f"out={out}"], out)
         recording = Recording(out / "run.mcap")
-        timing = [json.loads(data) for _, data in recording.messages(TIMING_TOPIC)]
+        timing = [timing_of(data) for _, data in recording.messages(TIMING_TOPIC)]
         map = last_map(recording)
     if part == "map":
         timing, overrides = timing[FIRST - STOP :], [*overrides, f"dataset.frames={FIRST}:{STOP}"]

@@ -1,0 +1,89 @@
+"""Print versions, processor, compiled functions and missing libraries: what to put into a bug report.
+
+Exit code 0 when all that a run needs is there, 1 when something is missing.
+
+Example: trihedron doctor
+"""
+
+from __future__ import annotations
+
+import importlib.metadata
+import os
+import platform
+import re
+import sys
+from importlib.util import find_spec
+from pathlib import Path
+
+from trihedron.tools.arguments import Parser, table
+from trihedron.tools.system_check import OPTIONAL, REQUIRED, check
+
+EXTRAS = {  # package -> what of us needs it
+    "onnxruntime": "the plugins onnx*",
+    "rerun-sdk": "view=rerun, export --to rerun",
+    "pyrealsense2": "dataset=realsense",
+    "optuna": "hydra/sweeper=optuna",
+    "distributed": "hydra/launcher=dask",
+}
+
+
+def main(argv: list[str]) -> int:
+    """Run the command; returns the exit code."""
+    Parser("doctor", __name__).parse_args(argv)
+    libraries = required()
+    missing = [name for name in libraries if version_of(name) is None]
+    broken = {module: problem for module in (*REQUIRED, *OPTIONAL) if find_spec(module) is not None and (problem := check(module))}
+    rows = [
+        ["trihedron", f"{version_of('trihedron')} in {Path(__file__).resolve().parents[1]}"],
+        ["python", f"{platform.python_version()} {sys.executable}"],
+    ]
+    rows += [["system", platform.platform()], ["processor", f"{processor()}, {os.cpu_count()} cores"], ["memory", memory_text()]]
+    rows += [["compiled functions", compiled_text()]]
+    rows += [[name, version_of(name) or "missing"] for name in libraries]
+    rows += [[name, version_of(name) or f"not installed; needed for {use}: pip install {name}"] for name, use in EXTRAS.items()]
+    print(table(rows, "ll"))
+    for module, problem in broken.items():
+        print(f"  {problem}" + ("" if module in REQUIRED else " (only the stages that use it need it)"))
+    if missing:
+        print(f"  missing: pip install {' '.join(missing)}")
+    return 1 if missing or set(REQUIRED) & set(broken) else 0
+
+
+def required() -> list[str]:
+    """Return the names of the packages that the installed package depends on, without extras."""
+    found = (re.match(r"[\w.-]+", text) for text in importlib.metadata.requires("trihedron") or () if "extra ==" not in text)
+    return sorted(match[0] for match in found if match)
+
+
+def version_of(package: str) -> str | None:
+    """Return the version of an installed package, or None."""
+    try:
+        return importlib.metadata.version(package)
+    except importlib.metadata.PackageNotFoundError:
+        return None
+
+
+def processor() -> str:
+    """Return the processor's name as the system has it."""
+    file = Path("/proc/cpuinfo")
+    lines = file.read_text().splitlines() if file.exists() else []
+    return next((line.partition(":")[2].strip() for line in lines if line.startswith("model name")), platform.processor() or platform.machine())
+
+
+def memory_text() -> str:
+    """Return the memory of the machine and what is free of it."""
+    file = Path("/proc/meminfo")
+    if not file.exists():
+        return "unknown"
+    kilobytes = {line.split(":")[0]: int(line.split()[1]) for line in file.read_text().splitlines()}
+    return f"{kilobytes['MemTotal'] / 1e6:.1f} GB, {kilobytes['MemAvailable'] / 1e6:.1f} GB free"
+
+
+def compiled_text() -> str:
+    """Describe the cache of compiled functions."""
+    from trihedron.pipeline.app.compilation import PARTS, marker
+    from trihedron.pipeline.core.kernel import cache_folder
+
+    done = [what for what in PARTS if marker(what).exists()]
+    state = "complete" if "all" in done else "for tracking" if done else "not yet: the first run compiles, or trihedron compile"
+    return f"{state}, in {cache_folder()}"
