@@ -419,15 +419,22 @@ def _faces_along(evidence: Evidence, height: F64, normal: F64, members: I64, sto
 
 
 def _reaching(face: Face, space: FreeSpace, storey: Storey) -> Bool:
-    """Return the columns (k,) of a face that reach high: above doors and furniture unless rays pass over them, or to HIGH_M if no ray gets behind."""
+    """Return the columns (k,) of a face that reach high and that rays do not pass over: above doors and furniture, or to HIGH_M where rays get behind
+    at less than half of the levels that were read, which noise does."""
     top = np.where(face.count.any(axis=1), LEVELS - 1 - np.argmax(face.count[:, ::-1] > 0, axis=1), -1)
     levels = np.arange(LEVELS)
     tall = face.count[:, levels * LEVEL_M > tall_m(storey)].sum(axis=1) >= LEAST_READINGS
     line = (face.start_m + (np.arange(len(top)) + 0.5) * CELL_M)[:, None] * face.along + face.offset_m * face.normal
     behind = space.at(line - ASIDE_M * face.normal)
     crossed = behind & space.at(line) & space.at(line + ASIDE_M * face.normal)
-    over = ((crossed[:, None] >> levels.astype(np.uint32)) & np.uint32(1)).astype(bool) & (levels > top[:, None] + 1)
-    return np.asarray((tall & (over.sum(axis=1) < CROSSED)) | ((top * LEVEL_M >= HIGH_M) & (behind == 0)), np.bool_)
+    passed, over = _bits(behind), _bits(crossed) & (levels > top[:, None] + 1)
+    solid = (top * LEVEL_M >= HIGH_M) & (2 * passed.sum(axis=1) < (face.count > 0).sum(axis=1))
+    return np.asarray((tall | solid) & (over.sum(axis=1) < CROSSED), np.bool_)
+
+
+def _bits(levels: U32) -> Bool:
+    """Return the bits (n, LEVELS) of levels (n,)."""
+    return np.asarray((levels[:, None] >> np.arange(LEVELS, dtype=np.uint32)) & np.uint32(1), np.bool_)
 
 
 def _longest(columns: Bool) -> int:
