@@ -9,6 +9,7 @@ import tarfile
 import threading
 import zipfile
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 
@@ -59,7 +60,8 @@ class Server:
         if self.length_stated:
             handler.send_header("Content-Length", str(len(data) - begin))
         handler.end_headers()
-        handler.wfile.write(data[begin : len(data) if self.cut is None else begin + self.cut])
+        with suppress(BrokenPipeError, ConnectionResetError):  # the client leaves what is too large
+            handler.wfile.write(data[begin : len(data) if self.cut is None else begin + self.cut])
 
     def address(self, path: str, data: bytes) -> str:
         self.files[path] = data

@@ -38,6 +38,7 @@ ROOMS = {  # name -> what the data set is given
 }
 USUAL_ROOMS = "room,bare,fast,offices"
 HEADER = ["sensor", "room", "runs", "ok %", "degr %", "lost %", "ATE mm", "wrong ok", "NEES", "in 95 %", "AUC", "log-lik", "steps %"]
+COUNTS = ("frames", "posed", "parts")  # of a run judged without truth: no measures of its quality
 Judged = tuple["StatusCheck", "FrameErrors"]
 
 
@@ -156,12 +157,13 @@ def correlations(found: Sequence[dict[str, Any]]) -> str:
     """Make the table of Spearman's rank correlation of each figure without truth with the ATE over the runs."""
     from scipy.stats import spearmanr
 
-    names = list(dict.fromkeys(name for row in found for name in row["quality"]))
+    names = list(dict.fromkeys(name for row in found for name in row["quality"] if name not in COUNTS))
     rows = [["figure without truth", "rank correlation with ATE", "runs"]]
     for name in names:
-        pairs = [(row["quality"][name], row["judged"][0].ate_m) for row in found]
+        pairs = [(row["quality"].get(name), row["judged"][0].ate_m) for row in found]
         known = np.array([pair for pair in pairs if None not in pair and np.isfinite(pair).all()]).reshape(-1, 2)
-        rho = f"{spearmanr(known[:, 0], known[:, 1])[0]:+.2f}" if len(known) > 2 else "-"
+        varies = len(known) > 2 and np.ptp(known, axis=0).min() > 0.0
+        rho = f"{spearmanr(known[:, 0], known[:, 1])[0]:+.2f}" if varies else "-"
         rows.append([name, rho, str(len(known))])
     return table(rows, "lrr")
 
