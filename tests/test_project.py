@@ -126,9 +126,11 @@ def test_decisions_are_short_records_listed_in_order():
     index = (ROOT / "docs" / "decisions.md").read_text()
     records = sorted((ROOT / "docs" / "decisions").glob("*.md"))
     assert [path.name for path in records] == sorted(re.findall(r"\]\(decisions/([^)]+)\)", index))
-    for number, path in enumerate(records, 1):
+    numbers = [int(path.name[:4]) for path in records]
+    assert len(set(numbers)) == len(numbers)  # a record that was replaced leaves a gap
+    for number, path in zip(numbers, records):
         text = path.read_text()
-        assert path.name.startswith(f"{number:04}-") and text.startswith(f"# {number}. "), path
+        assert text.startswith(f"# {number}. "), path
         headings = re.findall(r"^## (.+)$", text, re.MULTILINE)
         order = ["Context", "Decision", "Measurement", "Limits", "Rejected"]
         assert "Decision" in headings and headings == [heading for heading in order if heading in headings], f"{path}: {headings}"
