@@ -259,7 +259,7 @@ def _models(out: Path, runner: Runner) -> list[str]:
 def _replayed(replay: Replay, runner: Runner, timing: dict[str, Any]) -> str:
     """What a replay computed, as a line."""
     counts = [f"{name} ({stage['calls']} calls)" for name, stage in timing["stages"].items() if name in runner.computed]
-    return f"computed again: {', '.join(counts) or 'nothing'}; the rest is read from {replay.recording.path}"
+    return f"computed: {', '.join(counts) or 'nothing'}; the rest is read from {replay.recording.path}"
 
 
 def _report(out: Path, metrics: dict[str, Any], timing: dict[str, Any], surfaces: list[str]) -> None:

@@ -132,8 +132,9 @@ def test_a_replay_says_what_it_computed_and_is_not_the_latest_run(capsys, tmp_pa
     capsys.readouterr()
     assert main(["run", "replay=runs/first/run.mcap", "only=[manhattan]", "out=runs/second"]) == 0
     count = len(list(Recording(tmp_path / "runs" / "second" / "run.mcap").values("frames")))
-    line = capsys.readouterr().out.splitlines()[0]
-    assert line == f"computed again: manhattan ({count} calls); the rest is read from runs/first/run.mcap"
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[0] == "not in runs/first/run.mcap, computed again: dataset, normals"
+    assert lines[1].startswith("computed: dataset (") and lines[1].endswith(f"manhattan ({count} calls); the rest is read from runs/first/run.mcap")
     assert (tmp_path / "runs" / "latest").resolve() == tmp_path / "runs" / "first"
 
 
