@@ -12,7 +12,7 @@ USABLE := 'import sys, venv, ensurepip; sys.exit(not (3, 10) <= sys.version_info
 PYTHON := $(shell for p in python3.14 python3.13 python3.12 python3.11 python3.10 python3 python; do \
 	$$p -c $(USABLE) >/dev/null 2>&1 && echo $$p && break; done)
 
-.PHONY: demo test test-slow benchmark table install clean
+.PHONY: demo test test-slow benchmark table docs release install clean
 .DELETE_ON_ERROR:
 
 demo: install  ## track the built-in synthetic room
@@ -36,10 +36,26 @@ benchmark: install  ## time, memory and error on the synthetic room and the sequ
 		case $$folder in *icl_nuim*) kind=icl_nuim;; *) kind=tum;; esac; \
 		echo; echo "$$folder"; $(BIN)/trihedron benchmark dataset=$$kind dataset.path=$$folder; done
 
-table: install  ## every system on the synthetic room and on DATA="tum:FOLDER icl_nuim:FOLDER ..."; goes on where it was stopped
-	$(BIN)/trihedron run -m experiment=paper_table out=$(TABLE) 'sequences=[$(foreach d,$(DATA),"$(d)"$(COMMA))$(ROOMS)]' || test $$? -eq 1
+table: install  ## the paper's study and its pages: every system on rooms and DATA="tum:FOLDER icl_nuim:FOLDER ..."; goes on where it was stopped
+	$(BIN)/trihedron run -m experiment=paper out=$(TABLE) 'sequences=[$(foreach d,$(DATA),"$(d)"$(COMMA))$(ROOMS)]' || test $$? -eq 1
+	$(BIN)/trihedron run -m graph=structural,structural_paper,points dataset.scene=corridor out=$(TABLE)_corridor || test $$? -eq 1
 	$(BIN)/trihedron compare $(TABLE) --baseline graph=points --csv $(TABLE)/table.csv --markdown $(TABLE)/table.md \
 		--latex $(TABLE)/table.tex --json $(TABLE)/table.json
+	$(BIN)/trihedron paper $(TABLE) $(TABLE)_corridor --markdown $(TABLE)/paper.md
+	$(BIN)/trihedron site $(TABLE) $(TABLE)_corridor --out $(TABLE)/site
+
+docs: install $(VENV)/docs  ## the documentation as a site in build/site; executes the gallery
+	$(BIN)/python docs/site/gallery.py build/gallery
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet
+	$(BIN)/python docs/site/check.py build/site
+
+release: install $(VENV)/docs  ## wheel and sdist, checked; the wheel installed in an empty environment tracks the demo
+	rm -rf dist build/release
+	$(BIN)/python -m build --outdir dist
+	$(BIN)/twine check --strict dist/*
+	$(PYTHON) -m venv build/release/env
+	build/release/env/bin/pip install --quiet --constraint constraints.txt dist/*.whl
+	cd build/release && env/bin/trihedron run dataset.length=60 out=demo && env/bin/trihedron --version
 
 install: $(VENV)/checked $(VENV)/compiled
 
@@ -55,6 +71,10 @@ $(VENV)/installed: $(VENV)/created pyproject.toml
 	@echo "Installing into $(VENV) (about 1.5 GB to download the first time)"
 	$(BIN)/python -m pip install --upgrade --quiet pip
 	$(BIN)/python -m pip install -e ".[dev]"
+	@touch $@
+
+$(VENV)/docs: $(VENV)/installed
+	$(BIN)/python -m pip install -e ".[docs]"
 	@touch $@
 
 # 3: a library that only some stages use is missing; said each time, until it is there.

@@ -8,12 +8,14 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
+from trihedron.api.building import Building
 from trihedron.api.trajectory import Trajectory
 from trihedron.api.words import words_of
 from trihedron.pipeline.core.errors import RecordingError, UsageError, did_you_mean
 from trihedron.pipeline.core.types import Frame, Map, Pose, Surface, Value
 from trihedron.pipeline.record import reader
 from trihedron.pipeline.record.codec import FRAMES_TOPIC
+from trihedron.tools.building import building_of
 from trihedron.tools.recorded import frames_of, last_map, poses_of, references_of, trajectory_of
 
 
@@ -87,6 +89,12 @@ class Recording:
         if not isinstance(surface, Surface):
             raise RecordingError(str(self.path), "holds no surface", "record a run with outputs=[surface]")
         return surface
+
+    @cached_property
+    def building(self) -> Building:
+        """The plan of the building: as recorded (outputs=[building]), else made of the frames, planes and poses by `manhattan_layout`, which takes
+        time. Raises TrihedronError where these are not recorded."""
+        return Building(building_of(self._file))
 
     def replay(self, *overrides: str, only: list[str] | tuple[str, ...] = (), out: str | Path | None = None, **options: Any) -> Recording:
         """Run stages again, and return the recording of what they gave.

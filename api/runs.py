@@ -11,6 +11,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
+from trihedron.api.building import Building
 from trihedron.api.recording import Recording
 from trihedron.api.trajectory import Trajectory
 from trihedron.api.words import words_of
@@ -36,6 +37,11 @@ class Run:
     def trajectory(self) -> Trajectory:
         """The final trajectory."""
         return self.recording.trajectory
+
+    @property
+    def building(self) -> Building:
+        """The plan of the building."""
+        return self.recording.building
 
     def table(self) -> Any:
         """Return the metrics, one row a figure: a pandas DataFrame where pandas is installed, else a list of dicts."""

@@ -18,6 +18,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any
 
+from trihedron.api.building import Building
 from trihedron.api.camera import Camera
 from trihedron.api.images import Frames, camera_of, stamp_of
 from trihedron.api.trajectory import Trajectory
@@ -35,6 +36,7 @@ from trihedron.pipeline.core.types import FrameReference, Map, Surface, Value
 from trihedron.pipeline.record.codec import FRAMES_TOPIC
 from trihedron.pipeline.record.writer import RecordingWriter
 from trihedron.pipeline.run import results
+from trihedron.pipeline.run.building_files import write_building
 from trihedron.pipeline.run.map_file import save_map
 from trihedron.pipeline.run.replay import TOPICS
 from trihedron.pipeline.run.run_folder import held, write_configuration
@@ -167,15 +169,24 @@ class Slam:
 
     def mesh(self) -> Surface:
         """Return the surface so far. Raises TrihedronError unless `surface` is among the outputs."""
-        if "surface" not in self._values:
-            raise ConfigError("outputs", "has no surface, so none is made", 'give outputs=["trajectory", "surface"]')
-        self._settle()
-        finished: Any = self._runner.result.folds.get("surface")
-        if finished is None:
-            plugin, state = self._runner.graph.stages["surface"].plugin, self._runner.fold_state("surface")
-            finished = plugin.finish(copy.deepcopy(state), self._runner.result.map)
-        surface: Surface = finished
+        surface: Surface = self._fold("surface")
         return surface
+
+    def building(self) -> Building:
+        """Return the plan of the building so far: before `close`, of some of the keyframes only. Raises TrihedronError unless `building` is among the
+        outputs."""
+        return Building(self._fold("building"))
+
+    def _fold(self, name: str) -> Any:
+        """Return the result of a fold, or what it has so far."""
+        if name not in self._values:
+            raise ConfigError("outputs", f"has no {name}, so none is made", f'give outputs=["trajectory", "{name}"]')
+        self._settle()
+        finished = self._runner.result.folds.get(name)
+        if finished is None:
+            plugin, state = self._runner.graph.stages[name].plugin, self._runner.fold_state(name)
+            finished = plugin.preview(state) if hasattr(plugin, "preview") else plugin.finish(copy.deepcopy(state), self._runner.result.map)
+        return finished
 
     def save(self, path: str | Path) -> None:
         """Write a recording: all of it so far where frames are streamed to `out`; else all poses, the surface so far, and the images and values of
@@ -211,6 +222,8 @@ class Slam:
                 for value in self._runner.result.folds.values():
                     if isinstance(value, Surface):
                         results.write_surface(self._out, value)
+                    elif isinstance(value, types.Building):
+                        write_building(self._out, value)
         if self._failure is not None:
             raise self._failure
 
@@ -298,8 +311,8 @@ class Slam:
                 writer.write(FRAMES_TOPIC, FrameReference(frame.index, frame.stamp_ns, frame.camera))
             for name, value in values.items():
                 writer.write(name, value)
-        if "surface" in self._values:
-            writer.write("surface", self.mesh())
+        for name in {"surface", "building"} & set(self._values):
+            writer.write(name, self._fold(name))
 
 
 class Values(Mapping[str, Any]):

@@ -2,6 +2,7 @@
 
 import subprocess
 import sys
+from importlib import metadata
 
 import cv2
 import numpy as np
@@ -56,7 +57,7 @@ def test_importing_the_package_imports_nothing_else():
     )
     seconds, numpy_imported, version = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True).stdout.split()
     assert float(seconds) < 0.3 and numpy_imported == "False"
-    assert version == "0.1.0"
+    assert version == metadata.version("trihedron")
 
 
 def test_all_public_names_exist():

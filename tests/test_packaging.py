@@ -59,7 +59,7 @@ def wheel(tmp_path_factory):
 def test_content_of_the_wheel(wheel):
     names = zipfile.ZipFile(wheel).namelist()
     assert {name.split("/")[0] for name in names} == {"trihedron", wheel.name.removesuffix("-py3-none-any.whl") + ".dist-info"}
-    ours = [path for folder in FOLDERS for path in (ROOT / folder).rglob("*") if path.suffix in (".py", ".yaml", ".json")]
+    ours = [path for folder in FOLDERS for path in (ROOT / folder).rglob("*") if path.suffix in (".py", ".yaml", ".json", ".html", ".css", ".js")]
     expected = {f"trihedron/{path.relative_to(ROOT)}" for path in ours} | {"trihedron/__init__.py", "trihedron/py.typed"}
     assert {name for name in names if name.startswith("trihedron/")} == expected
 

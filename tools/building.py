@@ -1,8 +1,8 @@
-"""Make the plan of a building from a recording: building.json, floorplan.svg and floorplan.dxf.
+"""Make the plan of a building from a recording: building.json, floorplan.svg, floorplan.dxf, building.glb and model.ifc.
 
 RUN is a run folder or its recording. A building that is recorded (outputs=[trajectory,building]) is written as it is; else, or with --plugin, it is
 made from the frames, planes and poses of the recording. Metres; z up from the lowest floor, y (north on the plan) the direction of the building
-nearest to the first camera's view.
+nearest to the first camera's view. model.ifc needs ifcopenshell: pip install 'trihedron[ifc]'.
 
 Example: trihedron building runs/latest
 """
@@ -31,7 +31,8 @@ def main(argv: list[str]) -> int:
     options = parser.parse_args(argv)
     from trihedron.pipeline.core.registry import load_plugins, plugins_of
     from trihedron.pipeline.record.reader import Recording
-    from trihedron.pipeline.run.building_files import DXF, JSON, SVG, write_building
+    from trihedron.pipeline.run.building_files import DXF, GLB, JSON, SVG, write_building
+    from trihedron.pipeline.run.building_ifc import IFC, has_ifc, write_ifc
 
     load_plugins()
     if options.plugin is not None and options.plugin not in plugins_of("building"):
@@ -43,10 +44,14 @@ def main(argv: list[str]) -> int:
         out.mkdir(parents=True, exist_ok=True)
         for line in write_building(out, building):
             print(line)
+        if has_ifc():
+            write_ifc(out / IFC, building)
     except OSError as error:
         raise DataError(str(error.filename or out), f"cannot be written: {error.strerror}", "give another --out FOLDER") from error
-    for name in (JSON, SVG, DXF):
+    for name in (JSON, SVG, DXF, GLB, *((IFC,) if has_ifc() else ())):
         print(f"  {out / name}")
+    if not has_ifc():
+        print(f"no {IFC}: ifcopenshell is not installed; install it with: pip install 'trihedron[ifc]'")
     return 0
 
 

@@ -6,7 +6,11 @@ as much as the best. `end to start` is where a run without ground truth ends, se
 `--baseline` adds the mean paired difference (same data, same seeds) with its 95 % interval by Student's t, per row and over all data. A job that
 failed, or has no errors, has a row with the reason.
 
+Trajectory files of other programs (TUM format, or KITTI with a pose a frame) are rows of the same table, judged on the frames and the ground truth of
+the runs beside them, by the same association, alignment and share tracked. Files of one label are repeats of each other.
+
 Example: trihedron compare runs/table --baseline graph=points --markdown table.md
+Example: trihedron compare runs/desk orbslam2.txt --label ORB-SLAM2
 """
 
 from __future__ import annotations
@@ -22,6 +26,7 @@ import yaml
 
 from trihedron.pipeline.core.errors import DataError, UsageError, did_you_mean
 from trihedron.tools import comparison_table as render
+from trihedron.tools import other_programs
 from trihedron.tools.arguments import Parser
 from trihedron.tools.comparison_table import FIGURES
 
@@ -39,6 +44,7 @@ class Run:
     overrides: dict[str, str]
     figures: dict[str, float]
     note: str = ""
+    label: str = ""  # of another program's trajectory, in the place of its changes
 
     @property
     def seeds(self) -> tuple[str, ...]:
@@ -49,15 +55,19 @@ class Run:
 def main(argv: list[str]) -> int:
     """Print the table; returns the exit code. Raises DataError when there are no runs, UsageError for an unknown baseline."""
     parser = Parser("compare", __name__)
-    parser.add_argument("folders", nargs="+", type=Path, metavar="FOLDER", help="of sweeps, or of single runs")
+    parser.add_argument("folders", nargs="+", type=Path, metavar="FOLDER", help="of sweeps, of single runs; trajectories of other programs")
+    parser.add_argument("--label", action="append", default=[], metavar="NAME", help="of the trajectories: one for all, or one for each")
+    parser.add_argument("--y-up", action="store_true", help="the trajectories' y axis points up (as with fy = -480 on ICL-NUIM)")
     parser.add_argument("--baseline", default="", metavar="CHANGE", help="the row, for example graph=points, the others are compared with")
     parser.add_argument("--surfaces", action="store_true", help="judge each surface.ply that was not yet (as evaluate-surface does)")
     for name in render.WRITERS:
         parser.add_argument(f"--{name}", type=Path, metavar="FILE", help="write the table there too")
     options = parser.parse_args(argv)
+    folders, files = [path for path in options.folders if not path.is_file()], [path for path in options.folders if path.is_file()]
     if options.surfaces:
-        _judge_surfaces(options.folders)
-    rows = rows_of([run for folder in options.folders for run in read_runs(folder)], options.baseline)
+        judge_surfaces(folders)
+    runs = [run for folder in folders for run in read_runs(folder)]
+    rows = rows_of(runs + read_trajectories(files, runs, options.label, options.y_up), options.baseline)
     print(render.as_text(rows))
     for name, write in render.WRITERS.items():
         if getattr(options, name):
@@ -78,14 +88,32 @@ def read_runs(folder: Path) -> list[Run]:
     return [_run(found) for found in run_folders(folder)]
 
 
+def read_trajectories(files: Sequence[Path], runs: Sequence[Run], labels: Sequence[str] = (), y_up: bool = False) -> list[Run]:
+    """Return trajectories of other programs as runs of the data that `runs` have. Raises DataError for one of none or of several of them."""
+    candidates = other_programs.references([(run.folder, run.overrides) for run in runs]) if files else []
+    if labels and not files:
+        raise UsageError("--label", "there is no trajectory", "give files of other programs behind the folders")
+    found = []
+    for number, file in enumerate(files):
+        label = other_programs.label_of(file, labels, number, len(files))
+        reference, final = other_programs.judge(file, candidates, y_up)
+        found.append(Run(file, reference.overrides, _figures({"final": final}, {}, {}), label=label))
+    return found
+
+
 def _run(folder: Path) -> Run:
     overrides = dict(text.lstrip("+~").partition("=")[::2] for text in yaml.safe_load((folder / ".hydra" / "overrides.yaml").read_text()))
     metrics, timing, job = _read(folder / "metrics.json"), _read(folder / "timing.json"), _read(folder / "job.json")
     if job.get("state", "done") != "done":
         return Run(folder, overrides, dict.fromkeys(FIGURES, np.nan), str(job.get("error") or "was stopped before its end"))
-    known = _known(metrics, timing, _read(folder / SURFACE_FIGURES))
-    figures = {name: np.nan if known.get(name) is None else figure.factor * float(known[name]) for name, figure in FIGURES.items()}
+    figures = _figures(metrics, timing, _read(folder / SURFACE_FIGURES))
     return Run(folder, overrides, figures, str(metrics.get("note", "")) if metrics or timing else "holds no results")
+
+
+def _figures(metrics: dict[str, Any], timing: dict[str, Any], surface: dict[str, Any]) -> dict[str, float]:
+    """Return every column's value in the column's unit, NaN where there is none."""
+    known = _known(metrics, timing, surface)
+    return {name: np.nan if known.get(name) is None else figure.factor * float(known[name]) for name, figure in FIGURES.items()}
 
 
 def _known(metrics: dict[str, Any], timing: dict[str, Any], surface: dict[str, Any]) -> dict[str, Any]:
@@ -112,32 +140,43 @@ def _read(file: Path) -> dict[str, Any]:
     return found
 
 
-def _judge_surfaces(folders: Sequence[Path]) -> None:
-    """Write surface.json beside each surface.ply that has none; one that cannot be judged is named, and left out."""
+def judge_surfaces(folders: Sequence[Path]) -> None:
+    """Write surface.json beside each surface.ply that has none; one that cannot be judged is skipped, and each reason printed once."""
     from trihedron.tools.evaluate_surface import evaluate_files
 
+    reasons = set()
     for folder in (run for given in folders for run in run_folders(given)):
         if (folder / SURFACE).exists() and not (folder / SURFACE_FIGURES).exists():
             try:
                 figures = evaluate_files(folder / SURFACE, folder / "run.mcap")
             except DataError as error:
-                print(f"not judged: {error}")
+                if str(error) not in reasons:
+                    print(f"{folder / SURFACE} is not judged: {error}")
+                reasons.add(str(error))
                 continue
             (folder / SURFACE_FIGURES).write_text(json.dumps(figures, indent=2) + "\n")
+
+
+def groups_of(runs: Sequence[Run]) -> dict[tuple[str, str], list[Run]]:
+    """Return the runs of each row, by data and change: runs that differ in their seeds alone share one, data sets stand together."""
+    keys = {key for run in runs for key in run.overrides if key not in NOT_SHOWN}
+    own = [run for run in runs if not run.label]
+    varying = sorted(key for key in keys if len({run.overrides.get(key) for run in own}) > 1)
+    groups: dict[tuple[str, str], list[Run]] = {}
+    for run in runs:
+        change = run.label or _said(run, [k for k in varying if not _of_data(k)])
+        groups.setdefault((_said(run, [k for k in varying if _of_data(k)]), change), []).append(run)
+    order = list(dict.fromkeys(data for data, _ in groups))
+    return dict(sorted(groups.items(), key=lambda group: order.index(group[0][0])))
 
 
 def rows_of(runs: Sequence[Run], baseline: str = "") -> list[dict[str, Any]]:
     """One row for each data set and change: `data`, `change`, `runs`, `note`, of each figure's runs median, smallest and largest, and with a baseline
     the paired `difference` of each figure. Then, if there are several data sets, the differences over all of them, `data` = "all"."""
-    keys = {key for run in runs for key in run.overrides if key not in NOT_SHOWN}
-    varying = sorted(key for key in keys if len({run.overrides.get(key) for run in runs}) > 1)
-    groups: dict[tuple[str, str], list[Run]] = {}
-    for run in runs:
-        groups.setdefault((_said(run, [k for k in varying if _of_data(k)]), _said(run, [k for k in varying if not _of_data(k)])), []).append(run)
+    groups = groups_of(runs)
     order = list(dict.fromkeys(data for data, _ in groups))
-    groups = dict(sorted(groups.items(), key=lambda group: order.index(group[0][0])))
     _check_baseline(baseline, [change for _, change in groups])
-    rows = [_row(data, change, same, groups.get((data, baseline)) if change != baseline else None) for (data, change), same in groups.items()]
+    rows = [row_of(data, change, same, groups.get((data, baseline)) if change != baseline else None) for (data, change), same in groups.items()]
     if baseline and len(order) > 1:
         for other in dict.fromkeys(change for _, change in groups if change != baseline):
             pairs = [pair for data in order for pair in _pairs(groups.get((data, other), []), groups.get((data, baseline), []))]
@@ -145,7 +184,8 @@ def rows_of(runs: Sequence[Run], baseline: str = "") -> list[dict[str, Any]]:
     return rows
 
 
-def _row(data: str, change: str, same: Sequence[Run], base: Sequence[Run] | None) -> dict[str, Any]:
+def row_of(data: str, change: str, same: Sequence[Run], base: Sequence[Run] | None = None) -> dict[str, Any]:
+    """Return the row of runs that share one, and their paired differences from those of the baseline."""
     figures = {}
     for name in FIGURES:
         values = [run.figures[name] for run in same if np.isfinite(run.figures[name])]
@@ -164,8 +204,8 @@ def _row(data: str, change: str, same: Sequence[Run], base: Sequence[Run] | None
 
 def _pairs(runs: Sequence[Run], base: Sequence[Run]) -> list[tuple[Run, Run]]:
     """Runs with those of the baseline that have the same seeds."""
-    by_seeds = {run.seeds: run for run in base}
-    return [(run, by_seeds[run.seeds]) for run in runs if run.seeds in by_seeds]
+    by_seeds = {run.seeds: run for run in base if not run.label}
+    return [(run, by_seeds[run.seeds]) for run in runs if not run.label and run.seeds in by_seeds]
 
 
 def _differences(pairs: Sequence[tuple[Run, Run]]) -> dict[str, dict[str, Any]]:

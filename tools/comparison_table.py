@@ -83,12 +83,17 @@ def _tracked(row: Row) -> float:
 
 
 def _cell(row: Row, name: str, best: str | None) -> Cell:
+    text = figure_text(row, name)
+    return Cell(text, best is not None and text.partition(" ")[0] == best)
+
+
+def figure_text(row: Row, name: str) -> str:
+    """Return the median of a row's figure ± half the distance from the smallest to the largest; - where there is none."""
     if name not in row["figures"]:
-        return Cell("-")
-    found, figure = row["figures"][name], FIGURES[name]
-    text = f"{found['median']:.{figure.decimals}f}"
-    spread = f" ±{0.5 * (found['max'] - found['min']):.{figure.decimals}f}" if found["runs"] > 1 else ""
-    return Cell(text + spread, text == best)
+        return "-"
+    found, decimals = row["figures"][name], FIGURES[name].decimals
+    spread = f" ±{0.5 * (found['max'] - found['min']):.{decimals}f}" if found["runs"] > 1 else ""
+    return f"{found['median']:.{decimals}f}{spread}"
 
 
 def _difference(found: dict[str, Any] | None) -> str:

@@ -4,7 +4,11 @@ Trajectories are text files in the TUM format (stamp tx ty tz qx qy qz qw). TRUT
 run. The share of frames tracked needs to know the frames: they come from --frames, else from the recording run.mcap beside TRAJECTORY; without
 either they are taken to be those of the whole ground truth, thinned to the trajectory's rate. ICL-NUIM publishes poses with y up: --y-up.
 
+Without a ground truth, --no-reference judges a run by its own depth: images moved into later ones by the estimate, thickness of walls that several
+frames saw, entropy of the map, spread of mutually orthogonal planes (Kornilova and Ferrer, 2021). Smaller is better.
+
 Example: trihedron evaluate runs/latest/trajectory.txt groundtruth.txt
+Example: trihedron evaluate runs/latest --no-reference
 """
 
 from __future__ import annotations
@@ -30,14 +34,20 @@ ROUNDING_NS = 100_000  # stamps of other programs have 4 to 6 decimals
 def main(argv: list[str]) -> int:
     """Run the command; returns the exit code. Raises DataError for files that cannot be compared, UsageError for wrong arguments."""
     parser = Parser("evaluate", __name__)
-    parser.add_argument("trajectory", metavar="TRAJECTORY", type=Path, help="the estimate")
-    parser.add_argument("truth", metavar="TRUTH", type=Path, help="the ground truth, or a recording that holds it")
+    parser.add_argument("trajectory", metavar="TRAJECTORY", type=Path, help="the estimate; a run folder or its recording with --no-reference")
+    parser.add_argument("truth", metavar="TRUTH", nargs="?", type=Path, help="the ground truth, or a recording that holds it")
+    parser.add_argument("--no-reference", action="store_true", help="judge a run without ground truth")
     parser.add_argument("--json", action="store_true", help="print every figure as JSON")
     parser.add_argument("--fps", type=float, help="frames a second, for the RPE over one second (default: the recording's, else by the stamps)")
     parser.add_argument("--frames", type=Path, help="all frames of the data set: a file whose lines begin with a stamp (rgb.txt), or a recording")
     parser.add_argument("--y-up", action="store_true", help="mirror TRUTH, whose y axis points up")
     parser.add_argument("--max-difference-ms", type=float, default=20.0, help="largest time between a pose and its truth (default: 20)")
     arguments = parser.parse_args(argv)
+    if arguments.no_reference != (arguments.truth is None):
+        cause = "--no-reference takes no TRUTH" if arguments.no_reference else "the following arguments are required: TRUTH"
+        raise UsageError("evaluate", cause, "see trihedron evaluate --help")
+    if arguments.no_reference:
+        return _without_reference(arguments.trajectory, arguments.json)
     if arguments.fps is not None and not 0.0 < arguments.fps <= 10_000.0:
         raise UsageError("evaluate", f"--fps {arguments.fps:g} is not a frame rate", "give a number above 0, for example --fps 30")
     if not 0.0 < arguments.max_difference_ms <= LARGEST_DIFFERENCE_MS:
@@ -50,6 +60,22 @@ def main(argv: list[str]) -> int:
         cause = f"its turns fit better mirrored ({mirrored_deg:.3f}° instead of {figures['rpe_frame_rmse_deg']:.3f}° between frames)"
         print(f"trihedron: warning: {arguments.truth}: {cause}; is its y axis up? give --y-up", file=sys.stderr)
     print(json.dumps(figures, indent=2) if arguments.json else report(figures))
+    return 0
+
+
+def _without_reference(run: Path, as_json: bool) -> int:
+    from trihedron.tools.quality import quality_of_run
+
+    figures = quality_of_run(run).to_dict()
+    if as_json:
+        print(json.dumps(figures, indent=2))
+        return 0
+    rows = [["figure without truth", "value"]]
+    for name, value in figures.items():
+        length = name.endswith("_m")
+        text = "-" if value is None else f"{1e3 * value:.2f} mm" if length else f"{value:g}"
+        rows.append([name.removesuffix("_m") if length else name, text])
+    print(table(rows, "lr"))
     return 0
 
 

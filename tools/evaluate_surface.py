@@ -14,6 +14,7 @@ Example: trihedron evaluate-surface runs/latest runs/latest/run.mcap
 from __future__ import annotations
 
 import json
+from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -29,6 +30,7 @@ FIGURES = "surface.json"  # what is found of a run by its own truth is kept besi
 SAMPLE_M = 0.02  # between the points of the mesh that are judged
 WITHIN_M = (0.02, 0.05)
 PARTS = ("all", "planar", "curved")
+TRUTHS = 8  # kept for further runs of their data sets: rendering one takes ten times as long as judging a mesh by it
 
 
 def main(argv: list[str]) -> int:
@@ -63,7 +65,6 @@ def prepared(trajectory: Path, recording: Path) -> tuple[F64, Truth]:
     from trihedron.pipeline.record.reader import Recording
     from trihedron.pipeline.record.trajectories import attached_truth, read_trajectory
     from trihedron.pipeline.run.metrics import associate
-    from trihedron.tools.surface_truth import truth_of
 
     estimate, opened = read_trajectory(trajectory), Recording(recording)
     expected = attached_truth(opened.attachments, str(recording))
@@ -73,7 +74,18 @@ def prepared(trajectory: Path, recording: Path) -> tuple[F64, Truth]:
     if len(pairs) < 3:
         raise DataError(str(trajectory), f"{len(pairs)} of its poses have a truth", "give the recording of the same run")
     T = umeyama(estimate.poses[pairs[:, 0], :3, 3], expected.poses[pairs[:, 1], :3, 3])
-    return T, truth_of(_dataset(opened), expected)
+    return T, _truth(_dataset(opened), expected.stamps_ns.tobytes(), expected.poses.tobytes())
+
+
+@lru_cache(maxsize=TRUTHS)
+def _truth(dataset: Any, stamps_ns: bytes, poses: bytes) -> Truth:
+    """Return the truth of a data set; that of the last few is kept, for the runs of a sweep share it."""
+    import numpy as np
+
+    from trihedron.pipeline.core.types import Trajectory
+    from trihedron.tools.surface_truth import truth_of
+
+    return truth_of(dataset, Trajectory(np.frombuffer(stamps_ns, np.int64), np.frombuffer(poses, np.float64).reshape(-1, 4, 4)))
 
 
 def _dataset(recording: Any) -> Any:

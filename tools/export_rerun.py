@@ -17,7 +17,7 @@ from trihedron.pipeline.record.trajectories import attached_truth
 from trihedron.tools.export import Format
 from trihedron.tools.recorded import references_of
 
-TOPICS = ("keypoints", "segments", "planes", "manhattan", "pose", "map", "surface")  # what is shown
+TOPICS = ("keypoints", "segments", "planes", "manhattan", "pose", "map", "surface", "building")  # what is shown
 MAP_EVERY = 10  # versions of the map; each is logged whole
 
 

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from io import BytesIO
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from trihedron.pipeline.core.errors import DataError, printable
 from trihedron.pipeline.core.files import SHOWN, read_file
-from trihedron.pipeline.core.types import F64, I32
+from trihedron.pipeline.core.types import F64, I32, U8
 
 MAX_BYTES = 1 << 31
 CURE = "give a .ply or .obj file"
@@ -17,16 +18,13 @@ CURE = "give a .ply or .obj file"
 
 def read_mesh(path: Path) -> tuple[F64, I32]:
     """Vertices (v, 3) and triangles (t, 3) of a PLY or OBJ file; polygons become triangles. Raises DataError."""
-    import trimesh
-
     if not path.exists():
         raise DataError(str(path), "there is no such file", "run with outputs=[trajectory,surface] first")
     kind = path.suffix.lower().removeprefix(".")
     if kind not in ("ply", "obj"):
         raise DataError(str(path), f"'{path.suffix}' is not a mesh file this program reads", CURE)
     try:
-        data = BytesIO(read_file(path, MAX_BYTES))
-        found = trimesh.load_mesh(data, file_type=kind, process=False, maintain_order=True, skip_materials=True)
+        found = _loaded(path, kind)
         points = np.asarray(found.vertices, np.float64).reshape(-1, 3)
         triangles = np.asarray(getattr(found, "faces", np.empty((0, 3))), np.int64).reshape(-1, 3)
     except Exception as error:  # trimesh raises anything for a damaged file
@@ -36,3 +34,16 @@ def read_mesh(path: Path) -> tuple[F64, I32]:
     if len(triangles) and (triangles.min() < 0 or triangles.max() >= len(points)):
         raise DataError(str(path), "a face names a vertex that is not there", "the file is damaged; write it again")
     return points, triangles.astype(np.int32)
+
+
+def vertex_colors(path: Path, count: int, default: int = 180) -> U8:
+    """Return the (count, 3) RGB of the vertices of a PLY file that `read_mesh` read; grey where it has none."""
+    found = np.asarray(getattr(_loaded(path, "ply").visual, "vertex_colors", ()), np.uint8)
+    return found[:, :3].copy() if found.ndim == 2 and len(found) == count else np.full((count, 3), default, np.uint8)
+
+
+def _loaded(path: Path, kind: str) -> Any:
+    import trimesh
+
+    data = BytesIO(read_file(path, MAX_BYTES))
+    return trimesh.load_mesh(data, file_type=kind, process=False, maintain_order=True, skip_materials=True)

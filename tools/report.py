@@ -1,5 +1,5 @@
-"""Write one page of HTML about some runs: trajectories and surface in 3D, errors over time, times of the stages, what the configurations differ in,
-and a frame of each run with its features, planes and axes.
+"""Write one page of HTML about some runs: trajectories, surface and building in 3D, floor plans, errors over time, times of the stages, what the
+configurations differ in, and a frame of each run with its features, planes and axes.
 
 The page needs no network: everything, the drawing library too, is in the file. FOLDER is a run, or a sweep.
 
@@ -19,11 +19,13 @@ from typing import Any
 
 import numpy as np
 
+from trihedron.pipeline.core.building_geometry import MODEL_COLORS, parts_of
 from trihedron.pipeline.core.errors import DataError, TrihedronError
 from trihedron.pipeline.core.geometry import transform, umeyama
-from trihedron.pipeline.core.types import F64, Trajectory
+from trihedron.pipeline.core.types import F64, Building, Trajectory
 from trihedron.pipeline.record.reader import Recording
 from trihedron.pipeline.record.trajectories import attached_truth, read_trajectory
+from trihedron.pipeline.run.building_files import floorplan_svg, summary
 from trihedron.pipeline.run.metrics import aligned_errors, associate
 from trihedron.pipeline.run.results import dotted
 from trihedron.tools import comparison_table
@@ -68,7 +70,7 @@ def page(runs: Sequence[Run], title: str | None = None) -> str:
     paths, errors = _trajectories(drawn, colors)
     surface, up = _surface(drawn)
     figures = {
-        "Trajectories and surface": (paths + surface, {"scene": _scene(up), "height": 560}),
+        "Trajectories and surface": (paths + surface + _model(drawn), {"scene": _scene(up), "height": 560}),
         "Position error over time": (errors, {"xaxis": {"title": {"text": "s"}}, "yaxis": {"title": {"text": "mm"}}, "height": 320}),
         "Stages, median time": (_stages(drawn, colors), {"barmode": "group", "yaxis": {"title": {"text": "ms"}}, "height": 320}),
     }
@@ -80,6 +82,7 @@ def page(runs: Sequence[Run], title: str | None = None) -> str:
         "<h2>Results</h2>",
         _table(runs),
         *body,
+        *_plans(drawn),
         "<h2>Configurations</h2>",
         _configurations(drawn),
         "<h2>Frames</h2>",
@@ -186,6 +189,42 @@ def _surface(runs: dict[str, Run]) -> tuple[list[dict[str, Any]], F64]:
     mesh = {"type": "mesh3d", "name": "surface", "x": x, "y": y, "z": z, "i": i, "j": j, "k": k, "vertexcolor": colors, "opacity": 0.7}
     flat = {"lighting": {"ambient": 0.9, "diffuse": 0.2, "specular": 0.0}, "hoverinfo": "skip", "showlegend": False}
     return [mesh | flat], surface.up.astype(np.float64) if np.isfinite(surface.up).all() else up
+
+
+def _buildings(runs: dict[str, Run]) -> dict[str, Building]:
+    """The recorded building of each run that has one."""
+    found = {}
+    for name, run in runs.items():
+        recording = Recording(run.folder / "run.mcap")
+        for value in recording.values("building") if "building" in recording.topics else ():
+            if isinstance(value, Building):
+                found[name] = value
+    return found
+
+
+def _model(runs: dict[str, Run]) -> list[dict[str, Any]]:
+    """The model of the first run's building, without its ceilings: a layer that is hidden until its name in the legend is clicked."""
+    building = next(iter(_buildings(runs).values()), None)
+    if building is None:
+        return []
+    T, traces = building.T_world_building, []
+    for number, part in enumerate(parts_of(building, ceilings=False)):
+        (x, y, z), (i, j, k) = np.round(part.vertices_m @ T[:3, :3].T + T[:3, 3], 3).T.tolist(), part.triangles.T.tolist()
+        red, green, blue, opacity = MODEL_COLORS[part.kind]
+        look = {"color": f"rgb({red},{green},{blue})", "opacity": opacity / 255.0, "flatshading": True, "hoverinfo": "skip"}
+        group = {"name": "building", "legendgroup": "building", "showlegend": number == 0, "visible": "legendonly"}
+        traces.append({"type": "mesh3d", "x": x, "y": y, "z": z, "i": i, "j": j, "k": k, **look, **group})
+    return traces
+
+
+def _plans(runs: dict[str, Run]) -> list[str]:
+    """The floor plan of each run that has a building."""
+    parts = []
+    for name, building in list(_buildings(runs).items())[:MOST_PICTURES]:
+        data = base64.b64encode(floorplan_svg(building).encode()).decode()
+        image = f"<img src='data:image/svg+xml;base64,{data}' alt='floor plan' style='width:auto;max-width:100%'>"
+        parts.append(f"<figure><figcaption>{html.escape(name)}: {html.escape(summary(building))}</figcaption>{image}</figure>")
+    return ["<h2>Floor plans</h2>", *parts] if parts else []
 
 
 def _stages(runs: dict[str, Run], colors: dict[str, str]) -> list[dict[str, Any]]:

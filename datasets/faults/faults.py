@@ -11,6 +11,7 @@ from typing import Any, get_type_hints
 import numpy as np
 
 from trihedron.datasets.faults import images as spoil
+from trihedron.datasets.faults.joined import Joined
 from trihedron.datasets.faults.timing import Delivery, inside
 from trihedron.datasets.readers.sequence import clip_range
 from trihedron.pipeline.core.errors import DataError, did_you_mean
@@ -28,14 +29,15 @@ class Covered(Enum):
 
 
 class Cover(Enum):
-    """Appearance of a cover in colour: black, the light that blinds it, or a hand."""
+    """Appearance of a cover in colour: black, the light that blinds it, a hand, or random pixels."""
 
     black = "black"
     white = "white"
     hand = "hand"
+    random = "random"
 
 
-EACH, ALL = 5, 6  # streams of random numbers: one a frame, one for all frames
+EACH, ALL, SHUFFLED = 5, 6, 9  # streams of random numbers: one a frame, one for all frames, one of the order of colour
 
 
 @register("dataset", "faults")
@@ -49,7 +51,7 @@ class Faults:
     options: dict[str, Any] = field(default_factory=dict)  # its options: +dataset.options.path=FOLDER
     cover: Frames = ""  # frames A:B for which the camera is covered; empty = never
     covered: Covered = Covered.both  # both | color | depth
-    cover_with: Cover = Cover.black  # black | white | hand: what colour shows then
+    cover_with: Cover = Cover.black  # black | white | hand | random: what colour shows then
     drop: Frames = ""  # frames A:B that are not delivered
     drop_share: Share = 0.0  # of the others, here and there
     every: PositiveInt = 1  # only one in so many is delivered: 6 makes 5 Hz of 30
@@ -72,9 +74,14 @@ class Faults:
     moving: Share = 0.0  # share of the image covered by what moves
     reflecting: Share = 0.0  # share of the image with mirrors and glass
     seed: NonNegativeInt = 0
+    frozen: Covered = Covered.both  # both | color | depth: the images that freeze
+    shuffle: bool = False  # colour is that of any frame, at random
+    mirror: bool = False  # colour is mirrored left to right, depth is not
+    join: NonNegativeInt = 0  # frame from which on the images are of another recording; 0 = none
+    joined: dict[str, Any] = field(default_factory=dict)  # options of that where they differ: +dataset.joined.seed=1
 
     def __post_init__(self) -> None:
-        if self.of == "faults" or "frames" in self.options:
+        if self.of == "faults" or "frames" in {**self.options, **self.joined}:
             raise ValueError("of, options: another data set, its frames chosen by dataset.frames")
         _ = self._inner  # whose options are refused now when they are out of range
 
@@ -91,6 +98,9 @@ class Faults:
         timed: Frame | None = frame if shown == number else self._inner(number)
         if frame is None or timed is None:
             return None
+        if shown != number and self.frozen is not Covered.both:
+            frozen = {"color": frame.color} if self.frozen is Covered.color else {"depth_m": frame.depth_m}
+            shown, frame = number, replace(timed, **frozen)
         color, depth, camera = self._covered(number, *self._spoilt(shown, frame))
         return Frame(arrived, self._delivery.stamp_ns(timed.stamp_ns, number), color, depth, camera)
 
@@ -103,9 +113,15 @@ class Faults:
         if not inside(self.cover, np.array([number]))[0]:
             return color, depth, camera
         if self.covered is not Covered.depth:
-            hidden = spoil.hand(color.shape, self._rng(EACH, number)) if self.cover_with is Cover.hand else np.zeros_like(color)
-            color = np.full_like(color, 255) if self.cover_with is Cover.white else hidden
+            color = self._cover(color.shape, self._rng(EACH, number))
         return color, depth if self.covered is Covered.color else np.zeros_like(depth), camera
+
+    def _cover(self, shape: tuple[int, ...], rng: np.random.Generator) -> U8:
+        if self.cover_with is Cover.hand:
+            return spoil.hand(shape, rng)
+        if self.cover_with is Cover.random:
+            return rng.integers(0, 256, shape, np.uint8)
+        return np.full(shape, 255 if self.cover_with is Cover.white else 0, np.uint8)
 
     def _spoilt(self, number: int, frame: Frame) -> tuple[U8, F32, Camera]:
         """Colour, depth and camera of a frame with the faults of `during`: first the scene's, then the sensor's, then the stated camera."""
@@ -121,6 +137,9 @@ class Faults:
             period_ms = 1e3 / camera.fps
             color = spoil.blurred(color, flow, self.exposure_ms / period_ms) if self.exposure_ms else color
             color, depth = spoil.rolled(color, depth, flow, self.readout_ms / period_ms) if self.readout_ms else (color, depth)
+        if self.shuffle and (other := self._inner(int(self._rng(SHUFFLED, number).integers(len(self._inner))))) is not None:
+            color = other.color
+        color = np.ascontiguousarray(color[:, ::-1]) if self.mirror else color
         color = spoil.with_gamma(color, self.gamma) if self.gamma != 1.0 else color
         if self.resize != 1.0:
             color, depth, camera = spoil.resized(color, depth, camera, self.resize)
@@ -165,12 +184,16 @@ class Faults:
 
     @cached_property
     def _inner(self) -> Any:
+        first = self._underneath(self.options)
+        return Joined(first, self.join, self._underneath({**self.options, **self.joined})) if self.join else first
+
+    def _underneath(self, options: dict[str, Any]) -> Any:
         kind = plugin_class("dataset", self.of)
         hints = get_type_hints(kind)
         known = [option.name for option in fields(kind)]
-        if (unknown := next((name for name in self.options if name not in known), None)) is not None:
+        if (unknown := next((name for name in options if name not in known), None)) is not None:
             raise ValueError(f"options: {self.of} has no option '{unknown}'; {did_you_mean(unknown, known)}")
-        return kind(**{name: _as(hints.get(name), value) for name, value in self.options.items()})
+        return kind(**{name: _as(hints.get(name), value) for name, value in options.items()})
 
 
 def _refuse_sizes(number: int, depth: F32, times: float) -> None:

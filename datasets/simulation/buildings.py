@@ -34,10 +34,10 @@ def _skirting(wall: Wall) -> Solid:
     return wall.mounted(wall.length_m / 2.0, (0.0, 0.08), wall.length_m, 0.015, "plastic")
 
 
-def _lamps(places: list[tuple[float, float]]) -> tuple[list[Solid], tuple[tuple[float, float, float], ...]]:
+def _lamps(places: list[tuple[float, float]], ceiling_m: float = HEIGHT_M) -> tuple[list[Solid], tuple[tuple[float, float, float], ...]]:
     """Flat lamps on the ceiling, and where their light comes from."""
-    solids = [box((x - 0.3, x + 0.3), (y - 0.3, y + 0.3), (HEIGHT_M - 0.1, HEIGHT_M), "plastic") for x, y in places]
-    return solids, tuple((x, y, HEIGHT_M - 0.25) for x, y in places)
+    solids = [box((x - 0.3, x + 0.3), (y - 0.3, y + 0.3), (ceiling_m - 0.1, ceiling_m), "plastic") for x, y in places]
+    return solids, tuple((x, y, ceiling_m - 0.25) for x, y in places)
 
 
 def _building(x: float, y: float, solids: list[Solid], lamps: list[tuple[float, float]], walk: Walk) -> Building:
@@ -123,6 +123,47 @@ def slanted_flat() -> Building:
     hanging, lights = _lamps([(2.5, 2.0), (6.2, 2.3)])
     path = ((2.4, 1.0), (3.4, 1.9), (4.2, 2.05), (5.4, 1.6), (6.9, 1.1), (7.0, 3.6), (5.6, 3.4), (4.2, 2.05), (3.2, 2.6), (2.3, 3.1), (1.4, 1.6))
     return Building(Room(planes, faces, (*solids, *hanging), lights, DETAIL), Walk(path, 0.5, 0.5))
+
+
+UPPER_M = 3.0  # the upper floor of the house, above a slab of 0.3 m
+STEPS = 15
+
+
+def house() -> Building:
+    """Two storeys of two rooms each, joined by a straight flight of stairs along the west wall; the hole in the slab has a parapet of 0.9 m."""
+    x, y, top = 7.0, 6.0, UPPER_M + HEIGHT_M
+    footprint = _rectangle((0.0, x), (0.0, y))
+    planes, faces = shell(footprint, top)
+    divide = _doorway(False, (4.0, 4.1), (0.0, y), 2.0)
+    solids = [*divide, *(_lifted(solid) for solid in _doorway(False, (4.0, 4.1), (0.0, y), 4.2))]
+    hole = ((0.0, 1.1), (0.9, 4.5))
+    for part in (((1.1, x), (0.0, y)), ((0.0, 1.1), (0.0, 0.9)), ((0.0, 1.1), (4.5, y))):
+        solids += [box(*part, (HEIGHT_M, UPPER_M - 0.004), "ceiling"), box(*part, (UPPER_M - 0.004, UPPER_M), "floor")]
+    rise, going = UPPER_M / STEPS, (hole[1][1] - 0.6) / STEPS
+    for step in range(STEPS - 1):
+        begin = 0.6 + going * step
+        solids.append(box((0.0, 1.0), (begin, begin + going), (max(rise * (step - 1), 0.0), rise * (step + 1)), "wood"))
+    solids += [box((1.1, 1.14), (0.9, 4.5), (UPPER_M, UPPER_M + 0.9), "plastic"), box((0.0, 1.14), (0.86, 0.9), (UPPER_M, UPPER_M + 0.9), "plastic")]
+    south, east, north, west = walls_of(footprint)
+    solids += furnished(south, "cabinet 2.4, picture 2.4, sofa 5.6, picture 5.6") + furnished(east, "shelf 1.5, picture 3.2, desk 4.8")
+    solids += furnished(north, "locker 1.2, picture 2.4, portrait 4.4, picture 5.8") + furnished(west, "portrait 0.8")
+    solids += [_lifted(solid) for solid in furnished(south, "picture 2.2, portrait 3.2, desk 5.6, picture 5.6")]
+    solids += [_lifted(solid) for solid in furnished(east, "picture 1.2, shelf 3.0, portrait 4.8") + furnished(west, "portrait 0.6, picture 3.4")]
+    solids += [_lifted(solid) for solid in furnished(north, "cabinet 1.4, picture 1.4, picture 4.6, portrait 6.2")]
+    low, low_lights = _lamps([(2.5, 3.0), (5.5, 3.0)])
+    high, high_lights = _lamps([(2.5, 3.0), (5.5, 3.0)], top)
+    room = Room(planes, faces, (*solids, *low, *high), (*low_lights, *high_lights), DETAIL, ((0.0, HEIGHT_M), (UPPER_M, top)))
+    ground = [(2.0, 3.6), (2.6, 5.0), (3.2, 3.6), (3.4, 2.0), (4.7, 2.0), (5.8, 1.5), (6.1, 3.6), (5.2, 4.6), (4.7, 2.0), (3.4, 2.0), (2.4, 1.2)]
+    upper = [(1.6, 5.2), (3.2, 4.2), (4.9, 4.2), (6.0, 4.8), (6.0, 2.2), (5.2, 1.2), (4.9, 4.2), (3.2, 4.2), (3.0, 1.6), (1.9, 1.2), (1.8, 4.4)]
+    path = [*ground, (0.5, 0.35), (0.5, 0.6), (0.5, 4.5), (0.5, 5.1), *upper, (0.5, 5.1), (0.5, 4.5), (0.5, 0.6), (0.5, 0.35), (1.9, 0.6)]
+    floors = [0.0] * (len(ground) + 2) + [UPPER_M] * (len(upper) + 4) + [0.0] * 3
+    return Building(room, Walk(tuple(path), 0.55, 0.5, tuple(floors)))
+
+
+def _lifted(solid: Solid) -> Solid:
+    """Return a solid as it stands on the upper floor."""
+    shift = UPPER_M * UP
+    return replace(solid, centre=solid.centre + shift, faces=tuple(replace(face, origin=face.origin + shift) for face in solid.faces))
 
 
 def _office(west: float) -> list[Solid]:

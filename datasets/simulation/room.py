@@ -58,13 +58,15 @@ class Solid:
 class Room:
     """Walls, floor and ceiling as (k, 4) planes `n·x + d = 0` with n into the room, their faces in the same order, and the furniture.
 
-    A face is lit by the nearest lamp in front of it; `detail` multiplies the resolution of the textures."""
+    A face is lit by the nearest lamp in front of it; `detail` multiplies the resolution of the textures; `storeys_m` are heights of floor and
+    ceiling."""
 
     planes: F64
     faces: tuple[Face, ...]
     solids: tuple[Solid, ...] = field(default_factory=tuple)
     lamps_m: tuple[tuple[float, float, float], ...] = (LAMP_M,)
     detail: float = 1.0
+    storeys_m: tuple[tuple[float, float], ...] = ((0.0, HEIGHT_M),)
 
 
 def box(x: tuple[float, float], y: tuple[float, float], z: tuple[float, float], material: str, front: str = "", front_face: int = 0) -> Solid:
@@ -143,16 +145,16 @@ def furnished_room(slanted: bool = False) -> Room:
     return Room(planes, faces, (*_furniture(), *_on_the_walls(walls_of(footprint))))
 
 
-def shell(footprint: tuple[tuple[float, float], ...]) -> tuple[F64, tuple[Face, ...]]:
+def shell(footprint: tuple[tuple[float, float], ...], height_m: float = HEIGHT_M) -> tuple[F64, tuple[Face, ...]]:
     """(k, 4) planes and the faces of the walls, the floor and the ceiling around an anticlockwise convex footprint."""
     walls = walls_of(footprint)
     corners = np.array(footprint)
     (west, south), (east, north) = corners.min(axis=0), corners.max(axis=0)
     size = (float(east - west), float(north - south))
-    faces = [Face(w.start + w.along * w.length_m + UP * HEIGHT_M, -w.along, -UP, w.normal, (w.length_m, HEIGHT_M), "wall") for w in walls]
+    faces = [Face(w.start + w.along * w.length_m + UP * height_m, -w.along, -UP, w.normal, (w.length_m, height_m), "wall") for w in walls]
     x, y = np.array([1.0, 0.0, 0.0]), np.array([0.0, 1.0, 0.0])
     faces.append(Face(np.array([west, north, 0.0]), x, -y, UP, size, "floor"))
-    faces.append(Face(np.array([west, south, HEIGHT_M]), x, y, -UP, size, "ceiling"))
+    faces.append(Face(np.array([west, south, height_m]), x, y, -UP, size, "ceiling"))
     return np.array([[*face.normal, -float(face.normal @ face.origin)] for face in faces]), tuple(faces)
 
 

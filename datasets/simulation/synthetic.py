@@ -12,23 +12,23 @@ import numpy as np
 from trihedron.datasets.readers.sequence import clip_range
 from trihedron.datasets.simulation import buildings
 from trihedron.datasets.simulation.buildings import Building
-from trihedron.datasets.simulation.depth_noise import kinect_depth, noisy_color
+from trihedron.datasets.simulation.depth_noise import KINECT, STEREO, noisy_color, sensed_depth
 from trihedron.datasets.simulation.furniture import curved_pieces
 from trihedron.datasets.simulation.motion import Motion, camera_pose
 from trihedron.datasets.simulation.raytracing import Geometry, geometry_of
 from trihedron.datasets.simulation.room import BOX, Room, all_faces, furnished_room
 from trihedron.datasets.simulation.shading import Atlas, render
 from trihedron.datasets.simulation.textures import bake
-from trihedron.datasets.simulation.true_plan import TruePlan, plan_of
+from trihedron.datasets.simulation.true_plan import TruePlan, plans_of
 from trihedron.datasets.simulation.true_surface import TrueSurface, surface_of
 from trihedron.pipeline.core.options import Frames, NonNegativeInt, PositiveFloat, Range
 from trihedron.pipeline.core.registry import register
-from trihedron.pipeline.core.types import EXACT_DEPTH, F64, I32, Bool, Camera, DepthNoise, Frame, Trajectory
+from trihedron.pipeline.core.types import EXACT_DEPTH, F32, F64, I32, U8, Bool, Camera, Frame, Trajectory
 
 
 class Scene(Enum):
     """Scene that the camera is in: one furnished room, a corridor that ends where it began, two identical offices on a corridor, ten rooms in a
-    circuit, an L-shaped flat, two rooms with slanted walls."""
+    circuit, an L-shaped flat, two rooms with slanted walls, two storeys joined by stairs."""
 
     room = "room"
     corridor = "corridor"
@@ -36,10 +36,19 @@ class Scene(Enum):
     rooms = "rooms"
     flat = "flat"
     slanted_flat = "slanted_flat"
+    house = "house"
+
+
+class Sensor(Enum):
+    """Depth camera that is simulated: structured light, or stereo."""
+
+    kinect = "kinect"
+    stereo = "stereo"
 
 
 BUILDINGS = {Scene.corridor: buildings.corridor, Scene.offices: buildings.offices, Scene.rooms: buildings.rooms,
-             Scene.flat: buildings.flat, Scene.slanted_flat: buildings.slanted_flat}  # fmt: skip
+             Scene.flat: buildings.flat, Scene.slanted_flat: buildings.slanted_flat, Scene.house: buildings.house}  # fmt: skip
+SENSORS = {Sensor.kinect: KINECT, Sensor.stereo: STEREO}
 ROOM_FRAMES = 150  # of the room, whose walk never ends
 FOCAL_PER_WIDTH = 525.0 / 640.0  # a Kinect's nominal colour camera
 
@@ -50,12 +59,13 @@ class Synthetic:
     """A furnished room of 5 × 4 × 2.7 m, or a building, ray traced when a frame is asked for. Frame i depends on the fields and i alone."""
 
     frames: Frames = ""  # part to make, half open: A:B, A:, :B; empty = all
-    scene: Scene = Scene.room  # room | corridor | offices | rooms | flat | slanted_flat
+    scene: Scene = Scene.room  # room | corridor | offices | rooms | flat | slanted_flat | house
     length: NonNegativeInt = 0  # frames; 0 = the scene's own: 150 of the room, once round a building (a longer walk goes on)
     fps: PositiveFloat = 30.0
     seed: NonNegativeInt = 0  # of textures, path and noise
     texture: bool = True  # false = plain surfaces: edges, but hardly a corner
-    noise: bool = True  # a Kinect's depth and image noise; false = exact
+    noise: bool = True  # the sensor's depth and image noise; false = exact
+    sensor: Sensor = Sensor.kinect  # kinect | stereo
     width: Annotated[int, Range(16, 8192)] = 640
     height: Annotated[int, Range(16, 8192)] = 480
     motion: Motion = Motion.walk  # walk | fast | still | pan; in a building only walk
@@ -82,7 +92,7 @@ class Synthetic:
         depth = exact.astype(np.float32)
         if self.noise:
             rng = np.random.default_rng([self.seed, 3, number])
-            depth = kinect_depth(exact, cosine, self._camera.fx, self._camera.depth_noise, rng)
+            depth = sensed_depth(exact, cosine, self._camera.fx, SENSORS[self.sensor], rng)
             color = noisy_color(color, rng)
         return Frame(number, self._stamp_ns(number), color, depth, self._camera)
 
@@ -95,9 +105,9 @@ class Synthetic:
         """The exact surface of the scene, in the frame of `truth`."""
         return surface_of(self._room)
 
-    def plan(self) -> TruePlan:
-        """The exact plan of the scene, in the frame of `truth`."""
-        return plan_of(self._room)
+    def plans(self) -> list[TruePlan]:
+        """The exact plan of each storey of the scene, in the frame of `truth`."""
+        return plans_of(self._room)
 
     def true_view(self, index: int) -> tuple[F64, Bool]:
         """(h, w) exact depth in metres of frame `index` of the selection, and (h, w) whether what is seen there is curved."""
@@ -122,11 +132,19 @@ class Synthetic:
         """(4, 4) exact `T_world_camera` of frame `index` of the selection, in the frame of `truth`."""
         return self._pose(self._range[0] + index)
 
+    def pose_at(self, time_s: float) -> F64:
+        """(4, 4) exact `T_world_camera` at a time in seconds; frame i is at i / fps."""
+        if self._building is not None:
+            return self._building.walk.pose(self.seed, time_s)
+        return camera_pose(self.motion, self.seed, time_s)
+
+    def seen_by(self, camera: Camera, T_world_camera: F64) -> tuple[U8, F64, I32, F32]:
+        """Render the scene without noise by any camera at any pose: what `shading.render` returns."""
+        return render(*self._scene, camera, T_world_camera)
+
     def _pose(self, number: int) -> F64:
         """(4, 4) `T_world_camera` of a frame."""
-        if self._building is not None:
-            return self._building.walk.pose(self.seed, number / self.fps)
-        return camera_pose(self.motion, self.seed, number / self.fps)
+        return self.pose_at(number / self.fps)
 
     def _stamp_ns(self, number: int) -> int:
         return round(number * 1e9 / self.fps)
@@ -147,7 +165,7 @@ class Synthetic:
     @cached_property
     def _camera(self) -> Camera:
         focal = FOCAL_PER_WIDTH * self.width
-        noise = DepthNoise() if self.noise else EXACT_DEPTH
+        noise = SENSORS[self.sensor].noise if self.noise else EXACT_DEPTH
         return Camera(self.width, self.height, focal, focal, (self.width - 1) / 2.0, (self.height - 1) / 2.0, self.fps, noise)
 
     @cached_property

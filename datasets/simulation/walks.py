@@ -19,11 +19,13 @@ GAZE_DEG = Sway((14.0, 5.0, 2.0), (7.3, 5.7, 4.9))  # yaw, pitch, roll
 
 @dataclass(frozen=True)
 class Walk:
-    """Round and round along closed way-points (metres on the floor), looking where the path leads and a little about."""
+    """Round and round along closed way-points (metres on the floor), looking where the path leads and a little about. `floors_m` are the heights of
+    the floor at the way-points, none = 0."""
 
     points_m: tuple[tuple[float, float], ...]
     speed_m_s: float
     looking_ahead_m: float  # standard deviation of the Gaussian that smooths the heading along the path
+    floors_m: tuple[float, ...] = ()
 
     @property
     def duration_s(self) -> float:
@@ -39,23 +41,24 @@ class Walk:
     def pose(self, seed: int, time_s: float) -> F64:
         """(4, 4) `T_world_camera` at a time. The seed sets the phases of what is not the path."""
         phases = np.random.default_rng([seed, 1]).uniform(0.0, 2.0 * np.pi, size=(4, 3))
-        x, y, yaw = self._at(self.speed_m_s * time_s)
-        position = np.array([x, y, HEIGHT_M]) + STEPS_M.at(time_s, phases[0]) + TREMOR_M.at(time_s, phases[1])
+        x, y, yaw, floor = self._at(self.speed_m_s * time_s)
+        position = np.array([x, y, HEIGHT_M + floor]) + STEPS_M.at(time_s, phases[0]) + TREMOR_M.at(time_s, phases[1])
         angles = np.array([0.0, PITCH_DEG, 0.0]) + GAZE_DEG.at(time_s, phases[2]) + TREMOR_DEG.at(time_s, phases[3])
         return looking(position, np.radians(angles) + np.array([yaw, 0.0, 0.0]))
 
     def _at(self, along_m: float) -> F64:
-        """(x, y, yaw) at an arc length of the polygon, interpolated."""
+        """(x, y, yaw, floor) at an arc length of the polygon, interpolated."""
         samples, turns = self._samples
         rounds, place = divmod(along_m / self.length_m, 1.0)
         number = place * (len(samples) - 1)
         low = min(int(number), len(samples) - 2)
         found = samples[low] + (number - low) * (samples[low + 1] - samples[low])
-        return np.asarray(found + np.array([0.0, 0.0, rounds * turns]), np.float64)
+        return np.asarray(found + np.array([0.0, 0.0, rounds * turns, 0.0]), np.float64)
 
     @cached_property
     def _samples(self) -> tuple[F64, float]:
-        """(n + 1, 3) x, y, yaw (rad, continuous) once round, the last row being the first again, and the yaw that a round adds."""
+        """(n + 1, 4) x, y, yaw (rad, continuous), height of the floor once round, the last row being the first again, and the yaw that a round
+        adds."""
         corners = np.array((*self.points_m, self.points_m[0]))
         lengths = np.linalg.norm(np.diff(corners, axis=0), axis=1)
         count = round(self.length_m / STEP_M)
@@ -70,8 +73,10 @@ class Walk:
         yaw = first + np.concatenate([[0.0], np.cumsum(turning[:-1])])[side]
         ramp = turns * along / self.length_m  # what is left of the yaw without it is periodic
         step = self.length_m / count
-        smooth = np.column_stack([_blurred(xy, ROUNDING_M / step), _blurred((yaw - ramp)[:, None], self.looking_ahead_m / step) + ramp[:, None]])
-        return np.concatenate([smooth, smooth[:1] + np.array([0.0, 0.0, turns])]), turns
+        heading = _blurred((yaw - ramp)[:, None], self.looking_ahead_m / step) + ramp[:, None]
+        floor = np.interp(along, ends, [*self.floors_m, self.floors_m[0]])[:, None] if self.floors_m else np.zeros((count, 1))
+        smooth = np.column_stack([_blurred(xy, ROUNDING_M / step), heading, _blurred(floor, ROUNDING_M / step)])
+        return np.concatenate([smooth, smooth[:1] + np.array([0.0, 0.0, turns, 0.0])]), turns
 
 
 def _blurred(values: F64, sigma: float) -> F64:

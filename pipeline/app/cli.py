@@ -38,6 +38,7 @@ _FAILURES: list[Exception] = []  # of this process's runs
 _BEGAN = time.perf_counter()
 COMMAND_GROUP = "trihedron.commands"
 RUN_FLAGS = ("-m", "--multirun")
+RENAMED = {"experiment=paper_table": "experiment=paper"}  # words of the command that are accepted with a warning
 OUT_OF_MEMORY = ("start new thread", "failed to map segment", "load shared object file")  # in what libraries say of it
 RUN_HELP = """Track a sequence: compose the configuration, run the graph, write the run folder.
 
@@ -175,6 +176,9 @@ def _run(words: list[str]) -> int:
             raise UsageError(word, "is not an option of run", f"known: {', '.join(RUN_FLAGS)}; everything else is key=value")
         if word.startswith("=") or word == "out=":
             raise UsageError(word, "lacks a " + ("key" if word.startswith("=") else "folder"), "write key=value, for example out=runs/mine")
+        if word in RENAMED:
+            print(f"trihedron: warning: {word} is now {RENAMED[word]}", file=sys.stderr)
+    words = [RENAMED.get(word, word) for word in words]
     if _is_sweep(words):
         from trihedron.pipeline.core.config import check_added
 

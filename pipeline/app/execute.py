@@ -203,7 +203,7 @@ def _commit() -> str:
     """The git commit of the source tree, or nothing for an installed package."""
     folder = Path(__file__).resolve().parent
     try:
-        top = subprocess.run(["git", "-C", str(folder), "ls-files", "--error-unmatch", __file__], capture_output=True, timeout=5)
+        top = subprocess.run(["git", "-C", str(folder), "ls-files", "--error-unmatch", str(Path(__file__).resolve())], capture_output=True, timeout=5)
         head = subprocess.run(["git", "-C", str(folder), "rev-parse", "HEAD"], capture_output=True, text=True, timeout=5)
     except (OSError, subprocess.TimeoutExpired):
         return ""

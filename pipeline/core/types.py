@@ -462,9 +462,10 @@ PLANE_OBSERVATIONS = Columns(
 class Map(Value):
     """Keyframes and landmarks; a row number is an id for good, dead rows have `alive` False. Columns are listed in `plugins.mapping.landmarks`.
 
-    `revision` counts versions; a row of `point_observations` and its siblings is a keyframe (row), a landmark, and its measurement."""
+    `revision` counts versions, `loop_closed` is that of the last one with a correction by `loop`; a row of `point_observations` and its siblings is a
+    keyframe (row), a landmark, and its measurement."""
 
-    version: ClassVar[int] = 5
+    version: ClassVar[int] = 6
     revision: int
     keyframes: Annotated[Table, KEYFRAMES]
     points: Annotated[Table, POINTS]
@@ -473,6 +474,7 @@ class Map(Value):
     point_observations: Annotated[Table, POINT_OBSERVATIONS]
     line_observations: Annotated[Table, LINE_OBSERVATIONS]
     plane_observations: Annotated[Table, PLANE_OBSERVATIONS]
+    loop_closed: int = 0
 
     @cached_property
     def memo(self) -> dict[Hashable, Any]:
@@ -599,7 +601,8 @@ class Building(Value):
     seen from on the left; the other face is parallel, `thickness_m` behind it (NaN = not seen); `wall_covariance` is that of (offset of the face,
     thickness, direction in rad). Rows of `unseen` are (wall, begin, end): the stretches, in metres from the wall's start, that no reading shows.
     Of room i: row k of `loops` is (room, begin, end), `corners_m[begin:end]` go round it anticlockwise, round a hole the other way; corner j and its
-    successor are the ends of an edge on wall `corner_walls[j]`, -1 where nothing bounds what was seen; `closed` is True if every edge is on a wall.
+    successor are the ends of an edge on wall `corner_walls[j]`, -1 where nothing bounds what was seen, whose offset has the standard deviation
+    `edge_sigma_m[j]` relative to the room (NaN = not seen); `closed` is True if every edge is on a wall.
     Of opening i: its wall, its (left, right) in metres from the wall's start, its (bottom, top) above the floor, the covariance of these four, a row
     of OPENING_KINDS, and the rooms it joins (-1 = none). `furniture` are ids of the planes of the map that are none of the building's own. Rows of
     `support` are (row of ELEMENTS, the element, row of SUPPORTS, id or number). `note` names what is missing."""
@@ -617,6 +620,7 @@ class Building(Value):
     loops: Annotated[I32, Shape("l", 3), IndexInto(".room_storeys", ".corners_m+", ".corners_m+")]
     corners_m: Annotated[F64, Shape("c", 2), Finite()]
     corner_walls: Annotated[I32, Shape("c"), IndexInto(".walls_m", least=-1)]
+    edge_sigma_m: Annotated[F64, Shape("c")]
     areas_m2: Annotated[F64, Shape("r"), Finite()]
     area_variance: Annotated[F64, Shape("r")]  # m⁴
     closed: Annotated[Bool, Shape("r")]
@@ -636,7 +640,8 @@ class Building(Value):
         number, none, rows = np.empty(0, np.int32), np.empty(0), np.empty((0, 2))
         return Building(
             index, stamp_ns, T, note, rows, np.empty((0, 2, 2)), np.empty((0, 2, 2)), number, none, np.empty((0, 3, 3)), np.empty((0, 3)),
-            number.copy(), np.empty((0, 3), np.int32), rows.copy(), number.copy(), none.copy(), none.copy(), np.empty(0, np.bool_), number.copy(),
+            number.copy(), np.empty((0, 3), np.int32), rows.copy(), number.copy(), none.copy(), none.copy(), none.copy(), np.empty(0, np.bool_),
+            number.copy(),
             np.empty(0, np.uint8), rows.copy(), rows.copy(), np.empty((0, 4, 4)), np.empty((0, 2), np.int32), number.copy(),
             np.empty((0, 4), np.int32),
         )  # fmt: skip

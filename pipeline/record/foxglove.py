@@ -4,7 +4,7 @@ Channels `/view/...`, `/tf` and `/error` mirror stage topics; nothing reads them
 
 - `/view/image` with `/view/camera`, half the size; `/view/features` draws key points and line segments on it;
 - `/tf`, `/view/pose`, and `/view/path` in pieces of a second; `/view/lines`, `/view/planes` and `/view/axes` in the camera's frame;
-- `/view/map_points`, `/view/map_lines`, `/view/surface` in the world;
+- `/view/map_points`, `/view/map_lines`, `/view/surface`, `/view/building` in the world;
 - `/view/truth` and `/error`, where the truth is known: aligned at the first tracked frame;
 - `/view/log`: when the camera is lost or tracked badly, and why."""
 
@@ -18,7 +18,22 @@ from foxglove_schemas_protobuf.Log_pb2 import Log
 from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
 
 from trihedron.pipeline.core.geometry import invert, rotation_angle_deg
-from trihedron.pipeline.core.types import F64, LOST, OK, Frame, Keypoints, ManhattanFrame, Map, Planes, Pose, Segments, Surface, Trajectory, Value
+from trihedron.pipeline.core.types import (
+    F64,
+    LOST,
+    OK,
+    Building,
+    Frame,
+    Keypoints,
+    ManhattanFrame,
+    Map,
+    Planes,
+    Pose,
+    Segments,
+    Surface,
+    Trajectory,
+    Value,
+)
 from trihedron.pipeline.record import foxglove_messages as show
 
 IMAGE_PERIOD_NS = 200_000_000  # drawing features takes a millisecond or two
@@ -26,8 +41,8 @@ MAP_PERIOD_NS = 1_000_000_000
 MAP_POINTS = 5000  # a map of twice as many points is shown half as often
 TRUTH_NS = 20_000_000  # largest time between a frame and its true pose
 PERIODS_NS: dict[type[Value], int] = {  # least time between two shown values; 0: all are shown
-    Pose: 0, Keypoints: 0, Surface: 0, Segments: IMAGE_PERIOD_NS, ManhattanFrame: IMAGE_PERIOD_NS, Frame: IMAGE_PERIOD_NS, Planes: IMAGE_PERIOD_NS,
-    Map: MAP_PERIOD_NS,
+    Pose: 0, Keypoints: 0, Surface: 0, Building: 0, Segments: IMAGE_PERIOD_NS, ManhattanFrame: IMAGE_PERIOD_NS, Frame: IMAGE_PERIOD_NS,
+    Planes: IMAGE_PERIOD_NS, Map: MAP_PERIOD_NS,
 }  # fmt: skip
 
 
@@ -91,6 +106,8 @@ class View:
                 yield "/view/map_lines", show.map_lines(value)
         elif isinstance(value, Surface) and len(value.triangles):
             yield "/view/surface", show.surface(value)
+        elif isinstance(value, Building) and len(value.walls_m):
+            yield "/view/building", show.building(value)
 
     def _pose_messages(self, pose: Pose) -> Iterator[tuple[str, Any]]:
         placed = show.in_frame(pose)

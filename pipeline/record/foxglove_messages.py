@@ -27,8 +27,23 @@ from foxglove_schemas_protobuf.Vector3_pb2 import Vector3
 from google.protobuf.duration_pb2 import Duration
 from google.protobuf.timestamp_pb2 import Timestamp
 
+from trihedron.pipeline.core.building_geometry import MODEL_COLORS, parts_of
 from trihedron.pipeline.core.geometry import quaternion_from_rotation, tangent_basis
-from trihedron.pipeline.core.types import F32, F64, I32, Frame, Keypoints, ManhattanFrame, Map, Planes, Pose, Segments, Surface, Value  # fmt: skip
+from trihedron.pipeline.core.types import (  # fmt: skip
+    F32,
+    F64,
+    I32,
+    Building,
+    Frame,
+    Keypoints,
+    ManhattanFrame,
+    Map,
+    Planes,
+    Pose,
+    Segments,
+    Surface,
+    Value,
+)
 
 WORLD, CAMERA = "world", "camera"
 LIFETIME_NS = 400_000_000  # of what belongs to a frame
@@ -226,6 +241,19 @@ def surface(surface: Surface) -> SceneUpdate:
     mesh = entity.triangles.add(pose=IDENTITY, indices=triangles.ravel().tolist())
     _fill(mesh, "points", surface.vertices_m[first])
     _fill(mesh, "colors", np.column_stack([surface.colors[first] / 255.0, np.ones(len(first))]))
+    return update
+
+
+def building(building: Building) -> SceneUpdate:
+    """Make the model of a building without its ceilings, in the world; it stays."""
+    update, entity = _in_world(building, "building")
+    T = building.T_world_building
+    for part in parts_of(building, ceilings=False):
+        r, g, b, a = MODEL_COLORS[part.kind]
+        mesh = entity.triangles.add(
+            pose=IDENTITY, indices=part.triangles.ravel().tolist(), color=_color((r / 255.0, g / 255.0, b / 255.0), a / 255.0)
+        )
+        _fill(mesh, "points", part.vertices_m @ T[:3, :3].T + T[:3, 3])
     return update
 
 

@@ -29,7 +29,10 @@ from trihedron.pipeline.record.schemas import PACKAGE, definition, message_class
 
 RENAMED_TYPES: dict[str, str] = {}  # name in an older recording -> name today, where only the name changed
 RENAMED_FIELDS: dict[str, dict[str, str]] = {}  # type today -> older name of a field or table -> name today
-ADDED_FIELDS = {("Pose", 2): {"map_covariance": np.zeros((6, 6)), "noise_scale": np.array(1.0)}}  # type and older version -> fields that it lacks
+ADDED_FIELDS: dict[tuple[str, int], dict[str, Any]] = {  # type and older version -> fields that it lacks
+    ("Pose", 2): {"map_covariance": np.zeros((6, 6)), "noise_scale": 1.0},
+    ("Map", 5): {"loop_closed": 0},
+}
 ADDED_COLUMNS = {("Map", 4): ("keyframes", "world_covariance", "covariance")}  # likewise -> table, the column that it lacks, and that which it copies
 
 
@@ -137,11 +140,14 @@ def _renamed(data: bytes) -> bytes:
     if older in ADDED_COLUMNS:
         with suppress(Exception):  # a stranger's header, of which the decoder will say what is wrong
             _copy_column(message, *ADDED_COLUMNS[older])
-    message.version += int(older in ADDED_FIELDS or older in ADDED_COLUMNS)
-    for name, array in ADDED_FIELDS.get(older, {}).items():
-        kind = array.dtype.str.lstrip("<") if array.ndim else "float"
+    if older not in ADDED_FIELDS and older not in ADDED_COLUMNS:
+        return bytes(message.SerializeToString())
+    message.version += 1
+    for name, value in ADDED_FIELDS.get(older, {}).items():
+        array = np.asarray(value)
+        kind = array.dtype.str.lstrip("<") if array.ndim else type(value).__name__
         message.arrays.add(name=name, dtype=kind, shape=array.shape, encoding="raw", data=array.tobytes())
-    return bytes(message.SerializeToString())
+    return _renamed(bytes(message.SerializeToString()))  # which may be an older version still
 
 
 def _copy_column(message: Any, table: str, column: str, source: str) -> None:

@@ -1,4 +1,5 @@
-"""The files of a building: `building.json`, and floor plans as SVG and DXF, all in metres in the building's frame (see `types.Building`).
+"""The files of a building: `building.json`, floor plans as SVG and DXF, and the model as glTF, all in metres in the building's frame (see
+`types.Building`).
 
 A plan shows one storey beside the other, from the lowest. Walls whose other face was not seen are drawn with one line's width; dashed is what was not
 seen: stretches of walls without a reading, and edges of rooms that nothing bounds."""
@@ -6,20 +7,28 @@ seen: stretches of walls without a reading, and edges of rooms that nothing boun
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator
-from dataclasses import dataclass
-from itertools import pairwise
 from pathlib import Path
 from typing import Any
 from xml.sax.saxutils import escape
 
 import numpy as np
 
+from trihedron.pipeline.core.building_geometry import (
+    CEILING,
+    MODEL_COLORS,
+    label_place,
+    open_edges,
+    parts_of,
+    quad,
+    rings_of,
+    rooms_on,
+    wall_corners,
+    wall_pieces,
+)
 from trihedron.pipeline.core.types import ELEMENTS, F64, OPENING_KINDS, SUPPORTS, Building
 
-JSON, SVG, DXF = "building.json", "floorplan.svg", "floorplan.dxf"
+JSON, SVG, DXF, GLB = "building.json", "floorplan.svg", "floorplan.dxf", "building.glb"
 SCHEMA_VERSION = 1
-SHEET_M = 0.06  # thickness that a wall is drawn with where its other face was not seen
 
 
 def write_building(out: Path, building: Building) -> list[str]:
@@ -27,6 +36,7 @@ def write_building(out: Path, building: Building) -> list[str]:
     (out / JSON).write_text(json.dumps(building_json(building), indent=1) + "\n", encoding="utf-8")
     (out / SVG).write_text(floorplan_svg(building), encoding="utf-8")
     write_dxf(out / DXF, building)
+    write_glb(out / GLB, building)
     return [summary(building)]
 
 
@@ -113,74 +123,16 @@ def _opening(building: Building, k: int) -> dict[str, Any]:
     }  # fmt: skip
 
 
-# What both plans draw.
-
-
-@dataclass(frozen=True)
-class Stretch:
-    """A piece of a wall between two places along it: its four corners (4, 2), the face first; `seen` False where no reading was."""
-
-    corners: F64
-    seen: bool
-
-
-def wall_pieces(building: Building, wall: Any) -> Iterator[Stretch]:
-    """Cut a wall at its openings that reach the floor and at stretches that were not seen."""
-    start, end = building.walls_m[wall]
-    length = float(np.linalg.norm(end - start))
-    gaps = [
-        span
-        for span, of, kind in zip(building.spans_m, building.opening_walls, building.opening_kinds)
-        if of == wall and OPENING_KINDS[kind] != "window"
-    ]
-    blind = [row[1:] for row in building.unseen if int(row[0]) == wall]
-    cuts = np.unique(np.clip([0.0, length, *np.ravel(gaps), *np.ravel(blind)], 0.0, length))
-    for a, b in pairwise(cuts):
-        middle = (a + b) / 2.0
-        if b - a > 1e-6 and not any(low < middle < high for low, high in gaps):
-            yield Stretch(quad(building, wall, a, b), not any(low < middle < high for low, high in blind))
-
-
-def quad(building: Building, wall: int, a: float, b: float) -> F64:
-    """Return the corners (4, 2) of a wall's stretch."""
-    start, end = building.walls_m[wall]
-    along = (end - start) / max(float(np.linalg.norm(end - start)), 1e-9)
-    back = np.array([along[1], -along[0]]) * (building.thickness_m[wall] if np.isfinite(building.thickness_m[wall]) else SHEET_M)
-    return np.array([start + a * along, start + b * along, start + b * along + back, start + a * along + back])
-
-
-def rooms_on(building: Building, storey: int) -> list[int]:
-    """Return the rooms of a storey."""
-    return [k for k in range(len(building.areas_m2)) if building.room_storeys[k] == storey]
-
-
-def open_edges(building: Building, room: int) -> Iterator[F64]:
-    """Yield the edges (2, 2) of a room that nothing bounds."""
-    for ring in building.loops[building.loops[:, 0] == room]:
-        corners, walls = building.corners_m[ring[1] : ring[2]], building.corner_walls[ring[1] : ring[2]]
-        for p, q, wall in zip(corners, np.roll(corners, -1, axis=0), walls):
-            if wall < 0:
-                yield np.array([p, q])
-
-
-def label_place(building: Building, room: int) -> F64:
-    """Return a place (2,) well inside a room, for its name."""
-    import shapely
-
-    rings = [building.corners_m[a:b] for of, a, b in building.loops if of == room]
-    polygon = shapely.make_valid(shapely.Polygon(rings[0], rings[1:]))
-    place = shapely.maximum_inscribed_circle(polygon, 0.05).coords[0] if not polygon.is_empty else rings[0].mean(axis=0)
-    return np.array(place)
-
-
 # SVG.
 
 PX = 60.0  # a metre
+NARROW_M = 1.9  # room, of small letters
+LINE_PX, LETTER_PX = 15.0, 6.6  # of the legend: between lines, and a letter
 STYLE = """
 text{font-family:Helvetica,Arial,sans-serif;fill:#222;text-anchor:middle}
 .room{fill:#eef3f8;stroke:none}.wall{fill:#333;stroke:#333;stroke-width:1}.unseen{fill:none;stroke:#c33;stroke-width:2;stroke-dasharray:7 5}
 .swing{fill:none;stroke:#777;stroke-width:1}.leaf{stroke:#555;stroke-width:2}.glass{fill:#fff;stroke:#38c;stroke-width:1.5}
-.name{font-size:15px;font-weight:bold}.area{font-size:13px}.length{font-size:10px;fill:#666}.note{font-size:12px;text-anchor:start}
+.name{font-size:15px;font-weight:bold}.area{font-size:13px}.small{font-size:9px}.length{font-size:10px;fill:#666}.note{font-size:12px;text-anchor:start}
 """
 
 
@@ -195,8 +147,9 @@ def floorplan_svg(building: Building) -> str:
             building, storey, lambda p, shift=shift: PX * np.stack([p[..., 0] - low[0] + shift[0] + 1.0, high[1] - p[..., 1] + 1.0], -1)
         )
         x += float(size[0]) + 1.5
-    width, height = PX * (max(x + 0.5, 4.0)), PX * (float(size[1]) + 3.0)
-    parts += _legend(building, height)
+    legend, wide = _legend(building, PX * (float(size[1]) + 2.3))
+    parts += legend
+    width, height = max(PX * (x + 0.5), wide), PX * (float(size[1]) + 2.3) + LINE_PX * max(len(building.storeys) + 1.5, 3.0)
     head = f'<svg xmlns="http://www.w3.org/2000/svg" width="{width:.0f}" height="{height:.0f}" viewBox="0 0 {width:.0f} {height:.0f}">'
     return "\n".join([head, f"<style>{STYLE}</style>", '<rect width="100%" height="100%" fill="#fff"/>', *parts, "</svg>", ""])
 
@@ -209,10 +162,11 @@ def _extent(building: Building) -> tuple[F64, F64]:
 def _svg_storey(building: Building, storey: int, at: Any) -> list[str]:
     out = []
     for room in rooms_on(building, storey):
-        rings = [at(building.corners_m[a:b]) for of, a, b in building.loops if of == room]
+        rings = [at(ring) for ring in rings_of(building, room)]
         out.append(f'<path class="room" fill-rule="evenodd" d="{" ".join(_path(ring) for ring in rings)}"/>')
     for wall in np.nonzero(building.wall_storeys == storey)[0]:
         out += [f'<path class="{"wall" if piece.seen else "unseen"}" d="{_path(at(piece.corners))}"/>' for piece in wall_pieces(building, wall)]
+    out += [f'<path class="wall" d="{_path(at(corner))}"/>' for room in rooms_on(building, storey) for corner in wall_corners(building, room)]
     for room in rooms_on(building, storey):
         for edge in open_edges(building, room):
             (x0, y0), (x1, y1) = at(edge)
@@ -252,10 +206,10 @@ def _svg_opening(building: Building, opening: int, at: Any) -> list[str]:
 
 def _svg_texts(building: Building, room: int, at: Any) -> list[str]:
     x, y = at(label_place(building, room))
-    sigma = float(np.sqrt(building.area_variance[room]))
+    sigma, small = float(np.sqrt(building.area_variance[room])), " small" if np.ptp(rings_of(building, room)[0], axis=0).min() < NARROW_M else ""
     out = [
-        f'<text class="name" x="{x:.1f}" y="{y:.1f}">room {room}</text>',
-        f'<text class="area" x="{x:.1f}" y="{y + 17.0:.1f}">{building.areas_m2[room]:.2f} ± {sigma:.2f} m²</text>',
+        f'<text class="name{small}" x="{x:.1f}" y="{y:.1f}">room {room}</text>',
+        f'<text class="area{small}" x="{x:.1f}" y="{y + (11.0 if small else 17.0):.1f}">{building.areas_m2[room]:.2f} ± {sigma:.2f} m²</text>',
     ]
     for of, a, b in building.loops:
         corners = building.corners_m[a:b]
@@ -271,22 +225,21 @@ def _svg_texts(building: Building, room: int, at: Any) -> list[str]:
     return out
 
 
-def _legend(building: Building, height: float) -> list[str]:
-    """Draw scale bar, north, heights and the note."""
-    y = height - 0.7 * PX
+def _legend(building: Building, y: float) -> tuple[list[str], float]:
+    """Draw scale bar, north, heights and the note; returns the width that they take too."""
     out = [f'<path d="M{PX:.0f} {y:.0f} h{2 * PX:.0f} m0 -5 v10 M{PX:.0f} {y - 5:.0f} v10 M{2 * PX:.0f} {y - 4:.0f} v8" fill="none" stroke="#222"/>']
     out += [f'<text class="length" x="{(1 + k) * PX:.0f}" y="{y + 18:.0f}">{k} m</text>' for k in range(3)]
-    x = 3.6 * PX
+    x = 4.0 * PX
     out.append(f'<path d="M{x:.0f} {y + 8:.0f} v-30 m-6 10 l6 -12 l6 12" fill="none" stroke="#222"/>')
-    out.append(f'<text class="length" x="{x:.0f}" y="{y + 22:.0f}">N: first view</text>')
+    out.append(f'<text class="length" x="{x:.0f}" y="{y + 20:.0f}">N: first view</text>')
     heights = [f"storey {k}: floor {_height(low)}, ceiling {_height(high)}" for k, (low, high) in enumerate(building.storeys)]
     lines = [*heights, *([building.note] if building.note else []), "dashed: not seen"]
-    out += [f'<text class="note" x="{4.3 * PX:.0f}" y="{y - 14 + 15 * k:.0f}">{escape(line)}</text>' for k, line in enumerate(lines)]
-    return out
+    out += [f'<text class="note" x="{5.0 * PX:.0f}" y="{y - 14 + LINE_PX * k:.0f}">{escape(line)}</text>' for k, line in enumerate(lines)]
+    return out, 5.5 * PX + LETTER_PX * max(len(line) for line in lines)
 
 
 def _height(value: float) -> str:
-    return f"{value:.2f} m" if np.isfinite(value) else "not seen"
+    return f"{value + 0.0:.2f} m".replace("-0.00", "0.00") if np.isfinite(value) else "not seen"
 
 
 # DXF.
@@ -325,3 +278,25 @@ def write_dxf(path: Path, building: Building) -> None:
                 corners = quad(building, int(wall), *building.spans_m[opening]) + shift
                 space.add_lwpolyline(corners.tolist(), close=True, dxfattribs={"layer": layer})
     document.saveas(path)
+
+
+# glTF.
+
+
+def write_glb(path: Path, building: Building) -> None:
+    """Write the model as binary glTF 2.0: y up, -z north; a node for each kind of each storey."""
+    import trimesh
+
+    scene = trimesh.Scene()
+    for part in parts_of(building):
+        name, color = f"storey {part.storey} {part.kind}", MODEL_COLORS[part.kind]
+        look: dict[str, Any] = {"metallicFactor": 0.0, "roughnessFactor": 1.0, "doubleSided": part.kind != CEILING}
+        if color[3] < 255:
+            look["alphaMode"] = "BLEND"
+        material = trimesh.visual.material.PBRMaterial(name=part.kind, baseColorFactor=color, **look)
+        flat = part.vertices_m[part.triangles].reshape(-1, 3)[:, [0, 2, 1]] * [1.0, 1.0, -1.0]
+        mesh = trimesh.Trimesh(flat, np.arange(len(flat)).reshape(-1, 3), process=False, visual=trimesh.visual.TextureVisuals(material=material))
+        scene.add_geometry(mesh, node_name=name, geom_name=name)
+    if not scene.geometry:
+        scene.add_geometry(trimesh.PointCloud(np.zeros((1, 3))), node_name=building.note or "empty")
+    path.write_bytes(trimesh.exchange.gltf.export_glb(scene, include_normals=True))

@@ -75,9 +75,8 @@ def pose_consistency(poses: F64, covariances: F64, true_poses: F64, noise: Truth
     """Compare (n, 4, 4) poses `T_world_camera` of (n, 6, 6) covariance (of xi as in `types`) with the truth in any world; n at least 2."""
     noise = noise or TruthNoise()
     covariances = covariances + noise.covariance
-    information = np.asarray(np.linalg.inv(covariances), np.float64)
-    errors = _errors(poses, true_poses, _gauge(poses, information, true_poses))
-    nees = np.einsum("ni,nij,nj->n", errors, information, errors)
+    errors = gauge_free_errors(poses, covariances, true_poses)
+    nees = np.einsum("ni,nij,nj->n", errors, np.linalg.inv(covariances), errors)
     sigma = np.sqrt(np.diagonal(covariances, axis1=1, axis2=2))
     return Consistency(
         poses=len(poses),
@@ -88,6 +87,12 @@ def pose_consistency(poses: F64, covariances: F64, true_poses: F64, noise: Truth
         truth_sigma_m=noise.sigma_m,
         truth_sigma_deg=float(np.degrees(noise.sigma_rad)),
     )
+
+
+def gauge_free_errors(poses: F64, covariances: F64, true_poses: F64) -> F64:
+    """Return the errors (n, 6), as xi, after the rigid motion between both worlds that the covariances (n, 6, 6) make most likely."""
+    information = np.asarray(np.linalg.inv(covariances), np.float64)
+    return _errors(poses, true_poses, _gauge(poses, information, true_poses))
 
 
 def _errors(poses: F64, true_poses: F64, T_truth_world: F64) -> F64:

@@ -32,11 +32,13 @@ MOVED_M, TURNED_DEG = 0.25, 15.0  # after which a frame without a map is kept
 
 @dataclass
 class Gathered:
-    """The state of a building: the views kept, the Manhattan axes, the last frame."""
+    """The state of a building: the views kept, the Manhattan axes, the last frame and map."""
 
     views: list[KeyframeView] = field(default_factory=list)
+    covariances: list[F64] = field(default_factory=list)  # (6, 6), of their poses in the world
     axes: F64 | None = None  # R_world_manhattan
     first: F64 | None = None  # T_world_camera
+    map: Map | None = None  # of the last frame
     keyframes: int = 0
     index: int = 0
     stamp_ns: int = 0
@@ -57,7 +59,7 @@ class LayoutFold:
 
     def add(self, state: Gathered, frame: Frame, planes: Planes, rotation: Rotation | None, pose: Pose, map: Map | None) -> Gathered:
         """Keep the frame if it became a keyframe; without a map, if the camera has moved since the last."""
-        state.index, state.stamp_ns = frame.index, frame.stamp_ns
+        state.index, state.stamp_ns, state.map = frame.index, frame.stamp_ns, map
         if rotation is not None and len(rotation.weights):
             state.axes = rotation.R_world_manhattan[int(np.argmax(rotation.weights))]
         if pose.status == LOST:
@@ -72,6 +74,7 @@ class LayoutFold:
         if wanted:
             view = view_of(frame, planes, pose, map, self.view_width, self.max_sigma_m)
             state.views.append(replace(view, color=view.color[:0, :0].copy()))
+            state.covariances.append(pose.covariance)
         return state
 
 
@@ -84,11 +87,13 @@ def _moved(before: F64, now: F64) -> bool:
 @dataclass(frozen=True)
 class Evidence:
     """Planar points (n, 3) in the building's frame with the unit normals (n, 3) of their regions, information (n,) of their depth (1/m²) along the
-    normal, area (n,) and the view (n,) that shows them; the views with `T_building_camera`."""
+    normal, area (n,) and the view (n,) that shows them; the views in the order of time with `T_building_camera` and the covariance (3, 3) of their
+    positions, m²."""
 
     T_world_building: F64
     views: list[KeyframeView]
     poses: list[F64]
+    drift_m2: F64
     points: F64
     normals: F64
     information: F64
@@ -105,24 +110,26 @@ class Evidence:
 
 def evidence_of(state: Gathered, map: Map | None) -> Evidence | None:
     """Gather the planar points of all views at their final poses; None when no view shows a plane."""
-    views = [(view, T) for view in state.views if (T := view.settled(map)) is not None]
-    if not views:
+    kept = [(view, T, C) for view, C in zip(state.views, state.covariances) if (T := view.settled(map)) is not None]
+    if not kept:
         return None
-    regions = [_regions(view) for view, _ in views]
+    views, regions = [(view, T) for view, T, _ in kept], [_regions(view) for view, *_ in kept]
     if not sum(len(points) for points, *_ in regions):
         return None
-    R = _axes(state, [T for _, T in views], [(T[:3, :3] @ n.T).T for (_, T), (_, n, _, _) in zip(views, regions)], [area for *_, area in regions])
+    facing = [view.coefficients[:, :3] @ T[:3, :3].T for view, T in views]
+    R = _axes(state, [T for _, T in views], facing, [region[4] for region in regions])
     T_world_building = np.eye(4)
     T_world_building[:3, :3] = R
     start = state.first if state.first is not None else views[0][1]
     T_world_building[:3, 3] = R[:, :2] @ (R[:, :2].T @ start[:3, 3])
     inverse = np.linalg.inv(T_world_building)
     poses = [inverse @ T for _, T in views]
+    drift = np.array([T[:3, :3] @ C[:3, :3] @ T[:3, :3].T for T, (*_, C) in zip(poses, kept)])
     points = np.concatenate([p @ T[:3, :3].T + T[:3, 3] for T, (p, *_) in zip(poses, regions)])
     normals = np.concatenate([n @ T[:3, :3].T for T, (_, n, *_) in zip(poses, regions)])
     information, area = (np.concatenate([region[k] for region in regions]) for k in (2, 3))
     rows = np.repeat(np.arange(len(views), dtype=np.int32), [len(p) for p, *_ in regions])
-    found = Evidence(T_world_building, [view for view, _ in views], poses, points, normals, information, area, rows)
+    found = Evidence(T_world_building, [view for view, _ in views], poses, drift, points, normals, information, area, rows)
     level = _lowest_floor(found)
     T_world_building[:3, 3] += R[:, 2] * level
     found.points[:, 2] -= level
@@ -131,17 +138,20 @@ def evidence_of(state: Gathered, map: Map | None) -> Evidence | None:
     return found
 
 
-def _regions(view: KeyframeView) -> tuple[F64, F64, F64, F64]:
-    """Return points (n, 3) on planes, the planes' normals (n, 3), information (n,) and area (n,), in the camera's frame."""
+def _regions(view: KeyframeView) -> tuple[F64, F64, F64, F64, F64]:
+    """Return points (n, 3) on planes, the planes' normals (n, 3), information (n,) and area (n,), in the camera's frame, and the area of each plane
+    (k,)."""
     half = STRIDE // 2
     r, c = np.nonzero((view.labels[half::STRIDE, half::STRIDE] > 0) & (view.depth_m[half::STRIDE, half::STRIDE] > 0.0))
     r, c = STRIDE * r + half, STRIDE * c + half
     camera, depth = view.camera, view.depth_m[r, c].astype(np.float64)
     points = camera.back_project(np.stack([c, r], axis=1), depth)
-    normals = view.coefficients[view.labels[r, c].astype(int) - 1, :3]
+    plane = view.labels[r, c].astype(int) - 1
+    normals = view.coefficients[plane, :3]
     cosine = np.clip(-(points * normals).sum(axis=1) / np.linalg.norm(points, axis=1), 0.1, 1.0)
     sigma = camera.depth_noise.sigma_m(depth) * np.clip(-(points * normals).sum(axis=1) / depth, 0.05, None)
-    return points, normals, 1.0 / np.maximum(sigma, 1e-3) ** 2, (STRIDE * depth) ** 2 / (camera.fx * camera.fy * cosine)
+    area = (STRIDE * depth) ** 2 / (camera.fx * camera.fy * cosine)
+    return points, normals, 1.0 / np.maximum(sigma, 1e-3) ** 2, area, np.asarray(np.bincount(plane, area, len(view.coefficients)), np.float64)
 
 
 def _axes(state: Gathered, poses: list[F64], normals: list[F64], areas: list[F64]) -> F64:
@@ -186,6 +196,16 @@ def dominant_turn(angles: F64, weight: F64) -> float:
         if near.any():
             turn += float((away * weight)[near].sum() / weight[near].sum())
     return float(np.mod(turn + quarter / 2.0, quarter) - quarter / 2.0)
+
+
+def drift_variance(evidence: Evidence, direction: F64, information: F64, rows: I32) -> float:
+    """Return the variance along a unit direction (3,) of the mean of readings by views `rows` (n,), m², that their poses in the world cause.
+
+    The errors of poses are a random walk, in which the covariance of two is the variance of the earlier."""
+    total = np.bincount(rows, information, len(evidence.poses))
+    weight = total / total.sum()
+    later = np.cumsum(weight[::-1])[::-1] - weight
+    return float((weight * (weight + 2.0 * later)) @ (evidence.drift_m2 @ direction @ direction))
 
 
 # Levels: floors and ceilings.
@@ -258,7 +278,8 @@ def combined(values: F64, information: F64, rows: I32) -> tuple[float, float]:
 
 
 CORRELATED = 4.0  # neighbouring keyframes that err alike
-SYSTEMATIC_M = 0.005  # what no averaging removes
+SYSTEMATIC_M = 0.002  # what no averaging removes
+SCALE = 0.0007  # standard deviation of the scale of the depth, and so of all lengths
 
 
 def storeys_of(evidence: Evidence) -> list[Storey]:
@@ -280,6 +301,7 @@ def storeys_of(evidence: Evidence) -> list[Storey]:
         ceiling = float(tops[over][np.argmax(areas[over])]) if over.any() else float("nan")
         low_mean, low_sigma = height_of(evidence, floor, 1.0) if np.isfinite(floor) else (float("nan"), float("nan"))
         high_mean, high_sigma = height_of(evidence, ceiling, -1.0) if np.isfinite(ceiling) else (float("nan"), float("nan"))
+        low_sigma, high_sigma = float(np.hypot(low_sigma, SCALE * low_mean)), float(np.hypot(high_sigma, SCALE * high_mean))
         heights = evidence.points[(evidence.points[:, 2] < high) & (np.abs(evidence.normals[:, 2]) < np.sin(np.radians(UPRIGHT_DEG))), 2]
         reach = float(np.percentile(heights, 98.0)) if len(heights) else float("inf")
         found.append(Storey(low_mean, high_mean, low_sigma, high_sigma, reach))
@@ -319,33 +341,62 @@ def tall_m(storey: Storey) -> float:
     return float(min(TALL_M, top - storey.bottom_m - BELOW_CEILING_M))
 
 
+SNAP_DEG = 3.0  # a direction nearer to an axis of the building is that axis
+BINS = 180  # of 1°
+
+
+def slanted_directions(evidence: Evidence, storey: Storey, apart_deg: float, least_m2: float) -> F64:
+    """Return the directions (n,) of walls along neither axis, degrees: peaks with at least that area of tall points."""
+    tall = (np.abs(evidence.normals[:, 2]) < np.sin(np.radians(UPRIGHT_DEG))) & (evidence.points[:, 2] - storey.bottom_m > tall_m(storey))
+    angles = np.mod(np.degrees(np.arctan2(evidence.normals[tall, 1], evidence.normals[tall, 0])), 180.0)
+    weight = evidence.area_m2[tall]
+    histogram = np.bincount(angles.astype(int) % BINS, weight, BINS)
+    smooth = sum((np.roll(histogram, k) for k in (-2, -1, 1, 2)), histogram)
+    found = [0.0, 90.0]
+    for best in np.argsort(-smooth, kind="stable"):
+        near = np.abs(_turned(angles, best + 0.5)) < 2.5
+        if smooth[best] < least_m2 or not weight[near].any():
+            break
+        angle = best + 0.5 + float(np.average(_turned(angles[near], best + 0.5), weights=weight[near]))
+        if all(abs(float(_turned(np.array(angle), other))) > max(apart_deg, SNAP_DEG) for other in found):
+            found.append(angle)
+    return np.array(found[2:])
+
+
+def _turned(angles: F64, middle: float) -> F64:
+    """Return by how much directions modulo 180° are turned from another, in degrees."""
+    return np.asarray(np.mod(angles - middle + 90.0, 180.0) - 90.0)
+
+
 SAME_FACE = 10  # cm: of two faces of one direction that are nearer to each other, the lesser is furniture
 NEAR_FACE_M = 0.05
 LEAST_READINGS = 2  # for which a column reaches high
+HIGH_M = 1.5  # reached by a column that rays neither pass over nor get behind
+ASIDE_M = 0.1  # before and behind a face, where a ray that crosses it is sought
+CROSSED = 2  # levels of rays over a column, for which it ends below the ceiling
 
 
-def faces_of(evidence: Evidence, storey: Storey, directions: F64, least_m: float, cone_deg: float = 6.0) -> list[Face]:
-    """Find the faces with unit normals among `directions` (d, 2) that are tall over at least that length."""
+def faces_of(evidence: Evidence, storey: Storey, space: FreeSpace, directions: F64, least_m: float, cone_deg: float = 6.0) -> list[Face]:
+    """Find the faces with unit normals among `directions` (d, 2) that reach high over a stretch of at least that length."""
     found: list[Face] = []
     height = evidence.points[:, 2] - storey.bottom_m
-    top = storey.ceiling_m - storey.bottom_m + 0.1 if np.isfinite(storey.ceiling_m) else LEVELS * LEVEL_M
+    top = storey.ceiling_m - storey.bottom_m - 0.05 if np.isfinite(storey.ceiling_m) else LEVELS * LEVEL_M
     upright = (np.abs(evidence.normals[:, 2]) < np.sin(np.radians(UPRIGHT_DEG))) & (height > 0.0) & (height < top)
-    tall = upright & (height > tall_m(storey))
     for normal in directions:
         facing = evidence.normals[:, :2] @ normal > np.cos(np.radians(cone_deg))
-        found += _faces_along(evidence, height, normal, upright & facing, tall & facing, least_m)
+        found += _faces_along(evidence, height, normal, np.nonzero(upright & facing)[0], storey, space, least_m)
     return found
 
 
-def _faces_along(evidence: Evidence, height: F64, normal: F64, upright: Bool, tall: Bool, least_m: float) -> list[Face]:
-    """Find the faces of one direction: the peaks of the offsets of its tall points."""
-    if not tall.any():
+def _faces_along(evidence: Evidence, height: F64, normal: F64, members: I64, storey: Storey, space: FreeSpace, least_m: float) -> list[Face]:
+    """Find the faces of one direction: the peaks of the offsets of its high points."""
+    high = height[members] > min(HIGH_M, tall_m(storey))
+    if not high.any():
         return []
-    members = np.nonzero(upright)[0]
     offsets = evidence.points[members, :2] @ normal
     along = evidence.points[members, :2] @ np.array([normal[1], -normal[0]])
-    high, levels = tall[upright], np.clip((height[upright] / LEVEL_M).astype(int), 0, LEVELS - 1)
-    weight = np.sqrt(evidence.information[upright]) * evidence.area_m2[upright]
+    levels = np.clip((height[members] / LEVEL_M).astype(int), 0, LEVELS - 1)
+    weight = np.sqrt(evidence.information[members]) * evidence.area_m2[members]
     low = float(offsets[high].min()) - 0.1
     bins = np.bincount(((offsets[high] - low) / 0.01).astype(int), weight[high])
     smooth = np.convolve(np.concatenate([bins, np.zeros(10)]), [0.25, 0.5, 0.75, 1.0, 0.75, 0.5, 0.25], "same")
@@ -359,12 +410,37 @@ def _faces_along(evidence: Evidence, height: F64, normal: F64, upright: Bool, ta
         close = np.nonzero(np.abs(offsets - offset) < NEAR_FACE_M)[0]
         start = float(along[close].min())
         columns = ((along[close] - start) / CELL_M).astype(int)
-        count = np.zeros((int(columns.max()) + 1, LEVELS), np.int32)
-        np.add.at(count, (columns, levels[close]), 1)
-        reach = np.bincount(columns[high[close]], minlength=len(count)) >= LEAST_READINGS
-        if reach.sum() * CELL_M >= least_m:
-            found.append(Face(normal, offset, start, count, _filled(reach), members[close]))
+        width = int(columns.max()) + 1
+        count = np.bincount(columns * LEVELS + levels[close], minlength=width * LEVELS).reshape(width, LEVELS).astype(np.int32)
+        reach = _filled(_reaching(Face(normal, offset, start, count, np.zeros(len(count), np.bool_), members[close]), space, storey))
+        if _longest(reach) * CELL_M >= least_m:
+            found.append(Face(normal, offset, start, count, reach, members[close]))
     return found
+
+
+def _reaching(face: Face, space: FreeSpace, storey: Storey) -> Bool:
+    """Return the columns (k,) of a face that reach high and that rays do not pass over: above doors and furniture, or to HIGH_M where rays get behind
+    at less than half of the levels that were read, which noise does."""
+    top = np.where(face.count.any(axis=1), LEVELS - 1 - np.argmax(face.count[:, ::-1] > 0, axis=1), -1)
+    levels = np.arange(LEVELS)
+    tall = face.count[:, levels * LEVEL_M > tall_m(storey)].sum(axis=1) >= LEAST_READINGS
+    line = (face.start_m + (np.arange(len(top)) + 0.5) * CELL_M)[:, None] * face.along + face.offset_m * face.normal
+    behind = space.at(line - ASIDE_M * face.normal)
+    crossed = behind & space.at(line) & space.at(line + ASIDE_M * face.normal)
+    passed, over = _bits(behind), _bits(crossed) & (levels > top[:, None] + 1)
+    solid = (top * LEVEL_M >= HIGH_M) & (2 * passed.sum(axis=1) < (face.count > 0).sum(axis=1))
+    return np.asarray((tall | solid) & (over.sum(axis=1) < CROSSED), np.bool_)
+
+
+def _bits(levels: U32) -> Bool:
+    """Return the bits (n, LEVELS) of levels (n,)."""
+    return np.asarray((levels[:, None] >> np.arange(LEVELS, dtype=np.uint32)) & np.uint32(1), np.bool_)
+
+
+def _longest(columns: Bool) -> int:
+    """Return the length of the longest run of marked columns."""
+    ends = np.nonzero(np.diff(np.concatenate([[False], columns, [False]])))[0]
+    return int(np.diff(ends)[::2].max(initial=0))
 
 
 def _filled(columns: Bool, gap: int = 2) -> Bool:
@@ -398,12 +474,18 @@ class FreeSpace:
         return out
 
 
+BESIDE_M = 1.0  # on stairs
+
+
 def free_space(evidence: Evidence, storey: Storey, margin_m: float = 0.5) -> FreeSpace:
-    """Carve the rays of all views that stand in a storey."""
+    """Carve the rays of all views from within a storey, or BESIDE_M below or above it."""
     low = evidence.points[:, :2].min(axis=0) - margin_m
     w, h = np.ceil((evidence.points[:, :2].max(axis=0) + margin_m - low) / CELL_M).astype(int)
     once, twice = np.zeros((h, w), np.uint32), np.zeros((h, w), np.uint32)
+    above = storey.ceiling_m if np.isfinite(storey.ceiling_m) else float("inf")
     for view, T in zip(evidence.views, evidence.poses):
+        if not storey.bottom_m - BESIDE_M < T[2, 3] < above + BESIDE_M:
+            continue
         carve_kernel(view.depth_m, view.camera.intrinsics, T, low, CELL_M, storey.bottom_m, LEVEL_M, 2, MARGIN, once, twice)
     floor = np.zeros((h, w), np.bool_)
     level = (evidence.normals[:, 2] > np.cos(np.radians(LEVEL_DEG))) & (np.abs(evidence.points[:, 2] - storey.bottom_m) < 0.1)

@@ -7,7 +7,7 @@ room is then fitted again to the points of its own stretch, so that drift betwee
 from __future__ import annotations
 
 from collections import defaultdict
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from typing import Any
 
@@ -18,6 +18,7 @@ from trihedron.pipeline.core.types import ELEMENTS, F64, I32, OPENING_KINDS, SUP
 from trihedron.plugins.building.common import (
     CELL_M,
     LEVEL_M,
+    SCALE,
     Evidence,
     Face,
     FreeSpace,
@@ -25,6 +26,7 @@ from trihedron.plugins.building.common import (
     LayoutFold,
     Storey,
     combined,
+    drift_variance,
     evidence_of,
     faces_of,
     free_space,
@@ -44,6 +46,7 @@ TALL_SHARE = 0.5  # of an edge between cells, for which it parts them
 ON_WALL_SHARE = 0.3  # of a room's edge, for which it is a wall
 THICKEST_M, THINNEST_M = 0.5, 0.03
 FIT_M = 0.04  # about an edge, within which points take part in its fit
+PREVIEW_VIEWS = 60
 WINDOW_M = 0.35  # least height of a window's sill
 
 
@@ -66,7 +69,8 @@ class Edge:
     face: Face | None
     begin: F64 = field(default_factory=lambda: np.zeros(2))
     end: F64 = field(default_factory=lambda: np.zeros(2))
-    sigma_m: float = float("nan")
+    sigma_m: float = float("nan")  # of the offset, relative to the other edges of the room
+    drift_m2: float = 0.0  # what the drift of the poses adds to its variance
     angle_sigma: float = float("nan")
     views: I32 = field(default_factory=lambda: np.empty(0, np.int32))
     wall: int = -1
@@ -181,8 +185,19 @@ def rooms_of(cells: Cells, inside: Bool, faces: list[Face], evidence: Evidence, 
                 for edge in loop:
                     _fit(edge, evidence, storey)
                 _cornered(loop)
+            _relative([edge for loop in loops for edge in loop])
             found.append(RoomPlan(loops, polygon))
     return found
+
+
+def _relative(edges: list[Edge]) -> None:
+    """Add to the edges of a room the drift that they do not have in common, and what the scale may move them from its middle."""
+    middle = np.mean([edge.begin for edge in edges], axis=0)
+    common = min((edge.drift_m2 for edge in edges if edge.face is not None), default=0.0)
+    for edge in edges:
+        size = SCALE * (edge.offset_m - middle @ edge.normal)
+        edge.sigma_m = float(np.sqrt(edge.sigma_m**2 + size**2 + max(edge.drift_m2 - common, 0.0)))
+        edge.drift_m2 = common
 
 
 SLIT_M = 0.03  # half of the width of what is no part of a room
@@ -252,6 +267,7 @@ def _fit(edge: Edge, evidence: Evidence, storey: Storey) -> None:
         rows = evidence.rows[mask]
         offset, sigma = combined(evidence.points[mask, :2] @ edge.normal, evidence.information[mask], rows)
         edge.offset_m, edge.sigma_m, edge.views = offset, sigma, np.unique(rows)
+        edge.drift_m2 = drift_variance(evidence, np.array([*edge.normal, 0.0]), evidence.information[mask], rows)
         t = evidence.points[mask, :2] @ edge.along
         if np.abs(edge.normal).max() < AXIS:
             _turn(edge, evidence.points[mask, :2], evidence.information[mask])
@@ -341,9 +357,9 @@ def _wall(members: list[tuple[int, Edge]], faces: list[Face], number: int) -> Wa
     span = min(a for a, _ in spans), max(b for _, b in spans)
     behind = [edge for _, edge in members if edge.normal @ main.normal < 0]
     if behind:
-        thickness = [(main.offset_m + edge.offset_m, float(np.hypot(main.sigma_m, edge.sigma_m)), edge.span[1] - edge.span[0]) for edge in behind]
-        depth, sigma, _ = max(thickness, key=lambda item: item[2])
-        return WallPlan(main, span, depth, sigma, members)
+        other = max(behind, key=lambda edge: edge.span[1] - edge.span[0])
+        sigma = float(np.sqrt(main.sigma_m**2 + other.sigma_m**2 + abs(main.drift_m2 - other.drift_m2)))
+        return WallPlan(main, span, main.offset_m + other.offset_m, sigma, members)
     for face in faces:  # seen through a door, but no room's
         depth = main.offset_m + face.offset_m
         if face.normal @ main.normal < -0.999 and THINNEST_M / 2.0 < depth < THICKEST_M and face.share(-span[1], -span[0], face.tall) > TALL_SHARE:
@@ -425,10 +441,11 @@ def _opening(
     if b - a < NARROWEST_M or len(open_levels) < LEAST_LEVELS:
         return None
     near = _wall_points(wall, faces, evidence, storey)
-    a, b, sigma_side = _jambs(a, b, *near)
-    bottom, top, sigma_top = _heights(a, b, open_levels, *near)
+    a, b, sigma_side, jambs = _jambs(a, b, *near)
+    bottom, top, sigma_top, lintel = _heights(a, b, open_levels, *near)
     ceiling = storey.ceiling_m - storey.bottom_m if np.isfinite(storey.ceiling_m) else float("inf")
-    kind = "window" if bottom > WINDOW_M else "passage" if b - a > WIDEST_DOOR_M or top > ceiling - 0.1 else "door"
+    door = (jambs or lintel) and b - a <= WIDEST_DOOR_M and top <= ceiling - 0.1
+    kind = "window" if bottom > WINDOW_M else "door" if door else "passage"
     sigmas = (sigma_side, sigma_side, 0.02 if bottom else 0.01, sigma_top)
     middle = (a + b) / 2.0 * wall.edge.along + wall.edge.offset_m * wall.edge.normal
     depth = wall.thickness_m if np.isfinite(wall.thickness_m) else 0.0
@@ -450,13 +467,13 @@ def _wall_points(wall: WallPlan, faces: list[Face], evidence: Evidence, storey: 
     return points[:, :2] @ edge.along, points[:, 2] - storey.bottom_m
 
 
-def _jambs(a: float, b: float, along: F64, height: F64) -> tuple[float, float, float]:
-    """Move the sides of an opening to where the wall's own points end."""
+def _jambs(a: float, b: float, along: F64, height: F64) -> tuple[float, float, float, bool]:
+    """Move the sides of an opening to where the wall's own points end; the standard deviation of the sides, and if both were seen."""
     middle, low = (a + b) / 2.0, along[(height > 0.2) & (height < 1.9)]
     left = _end_of(middle - low[(low < middle) & (low > a - 0.3)], middle - a)
     right = _end_of(low[(low > middle) & (low < b + 0.3)] - middle, b - middle)
     known = np.isfinite([left, right])
-    return middle - left if known[0] else a, middle + right if known[1] else b, 0.015 if known.all() else CELL_M / 2.0
+    return middle - left if known[0] else a, middle + right if known[1] else b, 0.015 if known.all() else CELL_M / 2.0, bool(known.all())
 
 
 END_STEP_M = 0.01
@@ -475,17 +492,17 @@ def _end_of(away: F64, guess_m: float) -> float:
     return float(dense[0]) * END_STEP_M if len(dense) else float("nan")
 
 
-def _heights(a: float, b: float, open_levels: NDArray[np.signedinteger], along: F64, height: F64) -> tuple[float, float, float]:
-    """Return bottom and top of an opening above the floor, and the top's standard deviation: by the lintel where one was seen. What is open only
-    higher up is a window if the wall was seen below it."""
+def _heights(a: float, b: float, open_levels: NDArray[np.signedinteger], along: F64, height: F64) -> tuple[float, float, float, bool]:
+    """Return bottom and top of an opening above the floor, the top's standard deviation, and if a lintel was seen, which the top is by. What is open
+    only higher up is a window if the wall was seen below it."""
     inside = (along > a + 0.1) & (along < b - 0.1)
     bottom, top = float(open_levels[0]) * LEVEL_M, float(open_levels[-1] + 1) * LEVEL_M
     if bottom < WINDOW_M or (height[inside] < bottom - LEVEL_M).sum() < 30:
         bottom = 0.0
     lintel = height[inside & (height > 1.5)]
     if len(lintel) >= 30:
-        return bottom, float(np.percentile(lintel, 1.0)), 0.02
-    return bottom, top, LEVEL_M / 2.0
+        return bottom, float(np.percentile(lintel, 1.0)), 0.02, True
+    return bottom, top, LEVEL_M / 2.0, False
 
 
 def _room_at(rooms: list[RoomPlan], point: F64) -> int:
@@ -507,6 +524,7 @@ class StoreyPlan:
     walls: list[WallPlan]
     openings: list[OpeningPlan]
     faces: list[Face]
+    remark: str = ""
 
 
 def assembled(state: Gathered, evidence: Evidence, plans: list[StoreyPlan], map: Map | None) -> Building:
@@ -514,6 +532,7 @@ def assembled(state: Gathered, evidence: Evidence, plans: list[StoreyPlan], map:
     support: list[tuple[int, int, int, int]] = []
     walls: list[Any] = []
     corners: list[Any] = []
+    edge_sigmas: list[float] = []
     areas: list[float] = []
     thickness, wall_covariance, unseen, wall_storeys = [], [], [], []
     loops, corner_walls, variances, closed, room_storeys = [], [], [], [], []
@@ -528,7 +547,7 @@ def assembled(state: Gathered, evidence: Evidence, plans: list[StoreyPlan], map:
             wall_storeys.append(level)
             thickness.append(wall.thickness_m)
             angle = edge.angle_sigma
-            wall_covariance.append(np.diag([edge.sigma_m**2, wall.thickness_sigma_m**2, angle**2]))
+            wall_covariance.append(np.diag([edge.sigma_m**2 + edge.drift_m2 + (SCALE * edge.offset_m) ** 2, wall.thickness_sigma_m**2, angle**2]))
             unseen += [(first_wall + number, a - wall.span[0], b - wall.span[0]) for a, b in _unseen(wall, plan.openings, number)]
             planes = _planes_on(wall, evidence, map)
             used.update(planes)
@@ -540,6 +559,7 @@ def assembled(state: Gathered, evidence: Evidence, plans: list[StoreyPlan], map:
             for loop in room.loops:
                 loops.append((first_room + number, len(corners), len(corners) + len(loop)))
                 corners += [edge.begin for edge in loop]
+                edge_sigmas += [edge.sigma_m for edge in loop]
                 corner_walls += [first_wall + edge.wall if edge.wall >= 0 else -1 for edge in loop]
             area, variance = _area(room)
             areas.append(area)
@@ -561,6 +581,7 @@ def assembled(state: Gathered, evidence: Evidence, plans: list[StoreyPlan], map:
         np.array(walls).reshape(-1, 2, 2), np.array(wall_storeys, np.int32), np.array(thickness, np.float64),
         np.array(wall_covariance).reshape(-1, 3, 3), np.array(unseen, np.float64).reshape(-1, 3), np.array(room_storeys, np.int32),
         np.array(loops, np.int32).reshape(-1, 3), np.array(corners, np.float64).reshape(-1, 2), np.array(corner_walls, np.int32),
+        np.array(edge_sigmas, np.float64),
         np.array(areas, np.float64), np.array(variances, np.float64), np.array(closed, np.bool_), np.array(opening_walls, np.int32),
         np.array(kinds, np.uint8), np.array(spans, np.float64).reshape(-1, 2), np.array(heights, np.float64).reshape(-1, 2),
         np.array(opening_covariance).reshape(-1, 4, 4), np.array(opening_rooms, np.int32).reshape(-1, 2), _furniture(map, used, plans, evidence),
@@ -581,7 +602,7 @@ def _note(plans: list[StoreyPlan]) -> str:
     open_rooms = sum(any(edge.wall < 0 for loop in room.loops for edge in loop) for plan in plans for room in plan.rooms)
     if open_rooms:
         missing.append(f"{open_rooms} room{'s' if open_rooms != 1 else ''} not seen all round")
-    return "; ".join(missing)
+    return "; ".join([*missing, *dict.fromkeys(plan.remark for plan in plans if plan.remark)])
 
 
 def _supports(kind: str, number: int, planes: list[int], rows: I32, evidence: Evidence) -> list[tuple[int, int, int, int]]:
@@ -590,6 +611,9 @@ def _supports(kind: str, number: int, planes: list[int], rows: I32, evidence: Ev
     views = [evidence.views[row] for row in rows]
     out += [(ELEMENTS.index(kind), number, SUPPORTS.index("keyframe"), view.keyframe) for view in views if view.keyframe >= 0]
     return out + [(ELEMENTS.index(kind), number, SUPPORTS.index("frame"), view.index) for view in views]
+
+
+AT_END = 4  # cells of an end of a wall, of which those at the wall that meets it there are seen with that
 
 
 def _unseen(wall: WallPlan, openings: list[OpeningPlan], number: int) -> list[tuple[float, float]]:
@@ -609,7 +633,10 @@ def _unseen(wall: WallPlan, openings: list[OpeningPlan], number: int) -> list[tu
                 seen |= (t > opening.span[0]) & (t < opening.span[1])
         marked = np.nonzero(~seen)[0]
         runs = np.split(marked, np.nonzero(np.diff(marked) > 1)[0] + 1) if len(marked) else []
-        out += [(a + CELL_M * run[0], a + CELL_M * (run[-1] + 1)) for run in runs if len(run) >= 3]
+        long = [run for run in runs if len(run) >= 3]
+        out += [
+            (a if run[0] < AT_END else a + CELL_M * run[0], b if run[-1] >= len(t) - AT_END else a + CELL_M * (run[-1] + 1)) for run in long
+        ]  # fmt: skip
     return out
 
 
@@ -679,16 +706,27 @@ class Layout(LayoutFold):
         storeys, plans = storeys_of(evidence), []
         for number, storey in enumerate(storeys):
             here = in_storey(evidence, storeys, number)
-            faces, space = faces_of(here, storey, self._directions(here, storey), self.least_wall_m), free_space(here, storey)
+            space = free_space(here, storey)
+            faces = faces_of(here, storey, space, self._directions(here, storey), self.least_wall_m)
             cells = cells_of(faces, space)
             rooms = rooms_of(cells, self._inside(cells), faces, here, space, storey, self.least_room_m2)
             walls = walls_of(rooms, faces)
-            plans.append(StoreyPlan(storey, rooms, walls, openings_of(walls, rooms, faces, here, space, storey), faces))
+            openings = openings_of(walls, rooms, faces, here, space, storey)
+            plans.append(StoreyPlan(storey, rooms, walls, openings, faces, self._remark(here, storey)))
         return assembled(state, evidence, plans, map)
+
+    def preview(self, state: Gathered) -> Building:
+        """Make the plan so far of PREVIEW_VIEWS views, at their poses as they are now."""
+        every = -(-len(state.views) // PREVIEW_VIEWS) if state.views else 1
+        return self.finish(replace(state, views=state.views[::every]), state.map)
 
     def _directions(self, evidence: Evidence, storey: Storey) -> F64:
         """Return the unit normals (d, 2) that faces may have: the building's two axes."""
         return AXES
+
+    def _remark(self, evidence: Evidence, storey: Storey) -> str:
+        """Return what the layout cannot show of a storey; nothing by default."""
+        return ""
 
     def _inside(self, cells: Cells) -> Bool:
         """Return the cells (n,) that are inside."""

@@ -8,8 +8,9 @@ from typing import NamedTuple
 import numpy as np
 
 from trihedron.pipeline.core.types import F64, I32, Map, Table
-from trihedron.plugins.mapping.covisibility_graph import covisible_keyframes, newest_keyframes, observed_by
+from trihedron.plugins.mapping.covisibility_graph import covisible_keyframes, current_submap, keyframes_of, newest_keyframes, observed_by
 from trihedron.plugins.mapping.landmarks import index_of
+from trihedron.plugins.mapping.odometry import odometry
 from trihedron.plugins.shared.linalg import inverse
 from trihedron.plugins.shared.pose_optimizer_kernels import PARALLEL, PERPENDICULAR
 
@@ -48,6 +49,9 @@ class BundleMeasurements(NamedTuple):
     plane_information: F64  # (r, 3, 3) of (a, b, d)
     relations: I32  # (s, 3): PARALLEL or PERPENDICULAR, and two planes
     relation_variance: F64  # (s,) rad²
+    neighbours: I32  # (e, 2) keyframes a and b, neighbours in time
+    motions: F64  # (e, 4, 4) T_a_b by tracking
+    motion_information: F64  # (e, 6, 6) of xi in `T_a_b · Exp(xi)`
     robust: bool  # Huber's loss beyond the 95 % gates, then rejection of points and lines beyond them; False: least squares
 
 
@@ -84,11 +88,18 @@ def bundle_window(map: Map, free: int, fixed: int, least_fixed: int = 1) -> Bund
 
 
 def bundle_problem(
-    map: Map, window: BundleWindow, line_sigma_px: float = 1.0, relation_sigma_deg: float = 0.5, parallel_deg: float = 5.0
+    map: Map,
+    window: BundleWindow,
+    line_sigma_px: float = 1.0,
+    relation_sigma_deg: float = 0.5,
+    parallel_deg: float = 5.0,
+    drift_share: float = 0.01,
+    rotation_drift_deg: float = 0.05,
 ) -> tuple[BundleState, BundleMeasurements]:
     """Gather the initial state of the window from the map, and all observations of its landmarks by its keyframes.
 
-    Planes within `parallel_deg` of parallel or of a right angle are constrained to it with σ = `relation_sigma_deg`."""
+    Planes within `parallel_deg` of parallel or of a right angle are constrained to it with σ = `relation_sigma_deg`; `drift_share` and
+    `rotation_drift_deg` are those of odometry per root metre."""
     keyframes = np.concatenate([window.free, window.fixed])
     poses = map.keyframes.rows("T_world_camera", keyframes)
     state = BundleState(
@@ -102,6 +113,7 @@ def bundle_problem(
     line_rows, line_keyframes, line_starts = _observations(map, "line", keyframes, window.lines)
     plane_rows, plane_keyframes, plane_starts = _observations(map, "plane", keyframes, window.planes)
     relations, variance = _relations(state.planes, relation_sigma_deg, parallel_deg)
+    neighbours = _neighbours(map, keyframes, len(window.free))
     return state, BundleMeasurements(
         len(window.free),
         map.keyframes.rows("intrinsics", keyframes),
@@ -123,8 +135,19 @@ def bundle_problem(
         inverse(map.plane_observations.rows("covariance", plane_rows)),
         relations,
         variance,
+        neighbours,
+        *odometry(map, keyframes[neighbours], drift_share, np.radians(rotation_drift_deg)),
         True,
     )
+
+
+def _neighbours(map: Map, keyframes: I32, free: int) -> I32:
+    """(e, 2) the keyframes between which no other living one was made, the earlier first, at least one of them free; numbered as in the state."""
+    living = keyframes_of(map, current_submap(map))
+    place = np.full(len(map.keyframes), -1, np.int32)
+    place[keyframes] = np.arange(len(keyframes), dtype=np.int32)
+    pairs = np.stack([place[living[:-1]], place[living[1:]]], axis=1)
+    return np.ascontiguousarray(pairs[(pairs >= 0).all(axis=1) & (pairs < free).any(axis=1)])
 
 
 def _column(table: Table, name: str, rows: I32) -> F64:

@@ -39,7 +39,8 @@ class LocalWindow:
 
     Points and lines are eliminated by the Schur complement (Triggs et al., "Bundle Adjustment – A Modern Synthesis", 2000). Every residual is
     weighted by its covariance, with Huber's loss. Keyframes outside the window that observe its landmarks are fixed, and so is the first of all, the
-    world."""
+    world. The motion between keyframes that are neighbours in time is a measurement too, by odometry: a window that few landmarks, perhaps
+    wrong ones, connect with the map stays where tracking saw it."""
 
     keyframes: PositiveInt = 8  # at most, that are adjusted: the newest and the most covisible
     fixed: NonNegativeInt = 8  # at most, that are fixed
@@ -47,6 +48,8 @@ class LocalWindow:
     line_sigma_px: PositiveFloat = 1.0  # of a segment's end point across it, as in the map
     relation_sigma_deg: PositiveFloat = 0.5  # walls are parallel or perpendicular to within this
     parallel_deg: Annotated[float, Range(above=0, below=45)] = 5.0  # planes nearer to parallel, or to a right angle, are constrained to it
+    drift_share: PositiveFloat = 0.01  # of the motion between neighbours in time, per root metre
+    rotation_drift_deg: PositiveFloat = 0.05  # likewise
 
     def __call__(self, map: Map) -> Correction | None:
         """Return the correction, or None when this version of the map has no new keyframe, or none to adjust."""
@@ -56,7 +59,8 @@ class LocalWindow:
         window = bundle_window(map, self.keyframes, self.fixed)
         if not len(window.free):
             return None
-        problem = bundle_problem(map, window, self.line_sigma_px, self.relation_sigma_deg, self.parallel_deg)
+        drift = self.drift_share, self.rotation_drift_deg
+        problem = bundle_problem(map, window, self.line_sigma_px, self.relation_sigma_deg, self.parallel_deg, *drift)
         return bundle_correction(map, window, solve_bundle(*problem, self.iterations))
 
 

@@ -15,6 +15,7 @@ from trihedron.pipeline.core.kernel import kernel
 from trihedron.pipeline.core.types import F64, I32
 from trihedron.plugins.bundle.common import BundleMeasurements, BundleState
 from trihedron.plugins.mapping.landmark_kernels import EXTEND
+from trihedron.plugins.shared.lie_kernels import log_so3
 from trihedron.plugins.shared.linalg_kernels import invert_symmetric, tangent_columns
 from trihedron.plugins.shared.pose_optimizer_kernels import (
     BEHIND,
@@ -357,6 +358,42 @@ def _add_planes(state: BundleState, seen: BundleMeasurements, loss: int, out: No
 
 
 @kernel
+def _add_odometry(state: BundleState, seen: BundleMeasurements, out: NormalEquations) -> float:
+    """Add the motions between keyframes that are neighbours in time, with squared loss: they hold a window that few landmarks connect with the
+    others. Jacobians for small residuals. Returns the cost."""
+    cost = 0.0
+    r, A = np.empty(6), np.zeros((6, 6))
+    for e in range(len(seen.neighbours)):
+        a, b = seen.neighbours[e]
+        R_a, R_b, Z = state.rotations[a], state.rotations[b], seen.motions[e]
+        R, t = R_a.T @ R_b, R_a.T @ (state.positions[b] - state.positions[a])
+        Z_R = np.ascontiguousarray(Z[:3, :3])
+        r[:3] = Z_R.T @ (t - Z[:3, 3])
+        r[3], r[4], r[5] = log_so3(Z_R.T @ R)
+        A[:3, :3], A[3:, 3:] = -Z_R.T, -R.T
+        for j in range(3):  # Z_Rᵀ [t]×
+            A[j, 3] = Z_R[1, j] * t[2] - Z_R[2, j] * t[1]
+            A[j, 4] = Z_R[2, j] * t[0] - Z_R[0, j] * t[2]
+            A[j, 5] = Z_R[0, j] * t[1] - Z_R[1, j] * t[0]
+        B = np.eye(6)
+        B[:3, :3] = Z_R.T @ R
+        L = seen.motion_information[e]
+        cost += r @ L @ r
+        if a < seen.free:
+            out.H[6 * a : 6 * a + 6, 6 * a : 6 * a + 6] += A.T @ L @ A
+            out.g[6 * a : 6 * a + 6] += A.T @ (L @ r)
+        if b < seen.free:
+            out.H[6 * b : 6 * b + 6, 6 * b : 6 * b + 6] += B.T @ L @ B
+            out.g[6 * b : 6 * b + 6] += B.T @ (L @ r)
+        if a < seen.free and b < seen.free:
+            if a < b:
+                out.H[6 * b : 6 * b + 6, 6 * a : 6 * a + 6] += B.T @ L @ A
+            else:
+                out.H[6 * a : 6 * a + 6, 6 * b : 6 * b + 6] += A.T @ L @ B
+    return cost
+
+
+@kernel
 def _add_dense(r: F64, rows: int, L: F64, A: F64, a: int, size: int, B: F64, b: int, weight: float, H: F64, g: F64) -> None:
     """Add `weight · rᵀ L r` with Jacobian A (rows, size) by the parameters from a on and B (rows, 3) by those from b on, a < b or negative."""
     for i in range(rows):
@@ -384,6 +421,7 @@ def linearise_bundle(state: BundleState, seen: BundleMeasurements, loss: int, ou
     out.H[:], out.g[:], out.V[:], out.b[:] = 0.0, 0.0, 0.0, 0.0
     cost = _add_points(state, seen, loss, out, filled)
     cost += _add_lines(state, seen, loss, out, filled)
+    cost += _add_odometry(state, seen, out)
     return cost + _add_planes(state, seen, loss, out)
 
 

@@ -95,7 +95,7 @@ def correct_loop(
     place, newest = np.searchsorted(rows, [keyframe, len(map.keyframes) - 1])
     information = np.asarray(np.linalg.inv(covariance), np.float64)[None]
     closing = Edges(np.array([[place, newest]], np.int32), (invert(before[place]) @ T_world_camera)[None], information)
-    edges = joined(odometry_edges(map, rows, before, drift, rotation_drift), closing)
+    edges = joined(odometry_edges(map, rows, drift, rotation_drift), closing)
     return correct_keyframes(map, rows, before, _solve_with_prior(before, edges, prior))
 
 
@@ -106,7 +106,7 @@ def align_with_manhattan(map: Map, drift: float, rotation_drift: float, least: f
     if prior is None:
         return None
     before = map.keyframes.rows("T_world_camera", prior.keyframes)
-    after = _solve_with_prior(before, odometry_edges(map, prior.keyframes, before, drift, rotation_drift), prior)
+    after = _solve_with_prior(before, odometry_edges(map, prior.keyframes, drift, rotation_drift), prior)
     cosine = 0.5 * (np.einsum("kij,kij->k", before[:, :3, :3], after[:, :3, :3]) - 1.0)
     angle = np.arccos(np.clip(cosine, -1.0, 1.0))
     path_m = np.linalg.norm(np.diff(before[:, :3, 3], axis=0), axis=1).sum()

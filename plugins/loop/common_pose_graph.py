@@ -10,6 +10,7 @@ import numpy as np
 from trihedron.pipeline.core.geometry import exp_so3, invert, transform_each
 from trihedron.pipeline.core.types import F32, F64, I32, Correction, Map, Table
 from trihedron.plugins.mapping.landmarks import ENDPOINTS, POSITION
+from trihedron.plugins.mapping.odometry import odometry
 from trihedron.plugins.mapping.plane_fusion import information_of
 from trihedron.plugins.shared.lie_kernels import log_so3_each
 from trihedron.plugins.shared.linalg import cross_matrices, inverse
@@ -17,7 +18,6 @@ from trihedron.plugins.shared.linalg import cross_matrices, inverse
 if TYPE_CHECKING:  # imported where it is needed: SciPy is slow to load, and most runs close no loop
     from scipy.sparse import bsr_matrix
 
-LEAST_M, LEAST = 1e-3, 1e-4  # standard deviations between two keyframes at one place, m and rad
 LINKS = 3  # further keyframes each is connected to, so that a stretch that was observed often stays stiff
 ITERATIONS, CONVERGED = 20, 1e-9  # squared length of a step, metres and radians
 FIXED = 1e12 * np.eye(6)  # information of a fixed pose
@@ -106,16 +106,11 @@ def _assembled(blocks: F64, rows: I32, columns: I32, n: int) -> bsr_matrix:
 # Edges and corrections of a map.
 
 
-def odometry_edges(map: Map, rows: I32, poses: F64, drift: float, rotation_drift: float) -> Edges:
+def odometry_edges(map: Map, rows: I32, drift: float, rotation_drift: float) -> Edges:
     """Return edges between neighbours in time; their covariance is that of the later keyframe's pose plus the drift along the path: standard
     deviations per square root of a metre, m and rad."""
     pairs = np.concatenate([np.stack([np.arange(len(rows) - k), np.arange(k, len(rows))], axis=1) for k in range(1, LINKS + 1)])
-    measured = invert(poses[pairs[:, 0]]) @ poses[pairs[:, 1]]
-    length = np.linalg.norm(measured[:, :3, 3], axis=1)[:, None, None]
-    covariance = LINKS * map.keyframes.rows("covariance", rows[pairs[:, 1]])
-    covariance[:, :3, :3] += LINKS * (drift**2 * length + LEAST_M**2) * np.eye(3)
-    covariance[:, 3:, 3:] += LINKS * (rotation_drift**2 * length + LEAST**2) * np.eye(3)
-    return Edges(pairs.astype(np.int32), measured, np.linalg.inv(covariance))
+    return Edges(pairs.astype(np.int32), *odometry(map, rows[pairs], drift, rotation_drift, LINKS))
 
 
 def correct_keyframes(map: Map, rows: I32, before: F64, after: F64) -> Correction:

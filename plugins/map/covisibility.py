@@ -68,9 +68,10 @@ class Covisibility(KeyframeOptions):
     ) -> Map | None:
         """Return the next version of the map, or None when this frame changes nothing."""
         corrected = map
-        for correction in (bundle, loop):
-            if corrected is not None and correction is not None and len(correction.keyframe_ids):
-                corrected = apply_correction(corrected, correction)
+        if corrected is not None and bundle is not None and bundle.based_on >= corrected.loop_closed:  # else it would undo that correction
+            corrected = apply_correction(corrected, bundle)
+        if corrected is not None and loop is not None and len(loop.keyframe_ids):
+            corrected = replace(apply_correction(corrected, loop), loop_closed=corrected.revision + 1)
         if corrected is not None and relocalise is not None and relocalise.status == DEGRADED and pose.status != LOST:
             here, recognised = transform_to_map(pose, corrected), transform_to_map(relocalise, corrected)
             corrected = merge_submaps(corrected, here, recognised, self.merge_deg, self.merge_m)

@@ -96,7 +96,8 @@ def empty_map(index: int, stamp_ns: int, point_bytes: int, line_bytes: int, plan
     """A map without keyframes, for descriptors of the given lengths."""
     landmarks = point_columns(point_bytes), line_columns(line_bytes), plane_columns(plane_samples)
     schemas = (KEYFRAMES, *landmarks, POINT_OBSERVATIONS, LINE_OBSERVATIONS, PLANE_OBSERVATIONS)
-    return Map(index, stamp_ns, 0, *(Table.empty(schema) for schema in schemas))
+    keyframes, points, lines, planes, *observations = (Table.empty(schema) for schema in schemas)
+    return Map(index, stamp_ns, 0, keyframes, points, lines, planes, observations[0], observations[1], observations[2])
 
 
 def remove_rows(table: Table, ids: I32) -> Table:

@@ -29,6 +29,7 @@ if "numpy" not in sys.modules and platform.machine() in ("x86_64", "AMD64"):
     os.environ[BLAS_KERNELS[0]] = BLAS_KERNELS[1]
 
 if TYPE_CHECKING:
+    from trihedron.api.building import Building
     from trihedron.api.camera import Camera
     from trihedron.api.recording import Recording
     from trihedron.api.runs import Run, compare, run
@@ -71,15 +72,17 @@ if TYPE_CHECKING:
     relocalise: Slot
     model: Slot
     surface: Slot
+    building: Slot
 
 _TYPES = (
     "Frame", "Keypoints", "LineSegments", "ManhattanFrame", "Map", "Normals", "Planes", "Pose", "Rotation", "Segments", "Surface", "Translation",
 )  # fmt: skip
 _SLOTS = (
     "dataset", "normals", "keypoints", "lines", "segments", "planes", "manhattan", "tracks", "rotation", "translation", "matches", "pose", "map",
-    "bundle", "loop", "relocalise", "model", "surface",
+    "bundle", "loop", "relocalise", "model", "surface", "building",
 )  # fmt: skip
 _HOMES = {
+    "Building": "api.building",
     "Camera": "api.camera",
     "Recording": "api.recording",
     "Run": "api.runs",
@@ -93,10 +96,10 @@ _HOMES = {
 }
 
 __all__ = [
-    "Camera", "Frame", "Keypoints", "LineSegments", "ManhattanFrame", "Map", "Normals", "Planes", "Pose", "Recording", "Rotation", "Run", "Segments",
-    "Slam", "Surface", "Trajectory", "Translation", "TrihedronError", "__version__", "bundle", "compare", "dataset", "keypoints", "lines", "loop",
-    "manhattan", "map", "matches", "model", "normals", "planes", "pose", "register", "relocalise", "rotation", "run", "segments", "surface", "tracks",
-    "translation",
+    "Building", "Camera", "Frame", "Keypoints", "LineSegments", "ManhattanFrame", "Map", "Normals", "Planes", "Pose", "Recording", "Rotation", "Run",
+    "Segments", "Slam", "Surface", "Trajectory", "Translation", "TrihedronError", "__version__", "building", "bundle", "compare", "dataset",
+    "keypoints", "lines", "loop", "manhattan", "map", "matches", "model", "normals", "planes", "pose", "register", "relocalise", "rotation", "run",
+    "segments", "surface", "tracks", "translation",
 ]  # fmt: skip
 
 

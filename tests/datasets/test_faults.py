@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from trihedron.datasets.faults.faults import Covered, Faults
+from trihedron.datasets.faults.faults import Cover, Covered, Faults
 from trihedron.datasets.simulation.motion import Motion
 from trihedron.datasets.simulation.synthetic import Synthetic
 
@@ -35,3 +35,42 @@ def test_covered_frames_are_blind_and_the_others_untouched(covered):
 def test_what_cannot_be_read_is_refused(options, cause):
     with pytest.raises(ValueError, match=cause):
         Faults(**options)
+
+
+@pytest.mark.parametrize("frozen", list(Covered))
+def test_one_image_freezes_and_the_other_goes_on(frozen):
+    plain, faults = Synthetic(width=64, height=48, motion=Motion.pan, frames="0:6"), Faults("0:6", "synthetic", SMALL, freeze="2:5", frozen=frozen)
+    for position in range(6):
+        seen, still = faults(position), 2 if position in (3, 4) else position
+        assert seen.stamp_ns == plain(position).stamp_ns
+        assert np.array_equal(seen.color, plain(position if frozen is Covered.depth else still).color)
+        assert np.array_equal(seen.depth_m, plain(position if frozen is Covered.color else still).depth_m)
+
+
+def test_color_is_mirrored_shuffled_or_random_and_depth_is_not():
+    options = {**SMALL, "length": 12}
+    plain = [Synthetic(width=64, height=48, motion=Motion.pan, length=12)(i) for i in range(12)]
+    mirrored, shuffled = Faults("", "synthetic", options, mirror=True, during="3:5"), Faults("", "synthetic", options, shuffle=True)
+    noise = Faults("", "synthetic", options, "3:5", Covered.color, Cover.random)
+    assert np.array_equal(mirrored(3).color, plain[3].color[:, ::-1]) and np.array_equal(mirrored(5).color, plain[5].color)
+    shown = [next(k for k in range(12) if np.array_equal(shuffled(i).color, plain[k].color)) for i in range(12)]
+    assert shown != list(range(12)) and len(set(shown)) > 4
+    assert noise(3).color.std() > 60.0 and not np.array_equal(noise(3).color, noise(4).color)
+    for i in range(12):
+        assert all(np.array_equal(faults(i).depth_m, plain[i].depth_m) for faults in (mirrored, shuffled, noise))
+
+
+def test_two_recordings_are_joined_in_time_but_not_in_space():
+    joined = Faults("", "synthetic", {**SMALL, "length": 5}, join=3, joined={"seed": 1})
+    first, second = (Synthetic(width=64, height=48, motion=Motion.pan, length=5, seed=seed) for seed in (0, 1))
+    assert len(joined) == 8
+    frames = [joined(i) for i in range(8)]
+    assert [frame.index for frame in frames] == list(range(8))
+    steps = np.diff([frame.stamp_ns for frame in frames])
+    assert np.all(np.abs(steps - 1e9 / 30.0) < 2.0)
+    assert np.array_equal(frames[2].color, first(2).color) and np.array_equal(frames[3].color, second(0).color)
+    truth = joined.truth()
+    assert truth.stamps_ns.tolist() == [frame.stamp_ns for frame in frames]
+    assert truth.poses[3, 0, 3] - truth.poses[2, 0, 3] > 900.0
+    with pytest.raises(ValueError, match="join: the first data set has 5 frames only"):
+        Faults("", "synthetic", {**SMALL, "length": 5}, join=6)(0)

@@ -309,10 +309,10 @@ def test_any_path_works(tmp_path, name):
     assert (metadata["dataset"]["path"], metadata["load_map"]) == (str(folder / "run" / "run.mcap"), str(folder / "map.mcap"))
 
 
-def readme_block(language, first_line):
-    """The fenced block of the tutorial that begins with a comment naming its file."""
+def readme_block(language, file):
+    """The fenced block of the tutorial whose title names its file."""
     text = (Path(__file__).parents[2] / "docs" / "tutorial" / "write-a-plugin.md").read_text()
-    return text.split(f"```{language}\n# {first_line}\n")[1].split("```")[0]
+    return text.split(f'```{language} title="corners/{file}"\n')[1].split("```")[0]
 
 
 def test_the_plugin_package_of_the_readme_is_one_word_away(tmp_path):

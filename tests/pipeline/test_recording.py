@@ -190,14 +190,12 @@ OLDER = [  # format, commit, what differs
     (
         1,
         "ad955b7",
-        "topic /pose holds Pose version 1, this program reads version 3, with the field 'map_covariance', 'noise_scale', 'submap', "
-        "'unrecognised' that it lacks, and 1 more",
+        "topic /map holds Map version 1, this program reads version 6, with the field 'loop_closed' that it lacks, and 1 more",
     ),
     (
         2,
         "509b7cf",
-        "topic /bundle holds Correction version 1, this program reads version 2, with its field 'point_information' of type f8, 'line_information' "
-        "of type f8, and 2 more",
+        "topic /map holds Map version 3, this program reads version 6, with the field 'loop_closed' that it lacks, and 2 more",
     ),
 ]
 

@@ -9,11 +9,16 @@ from xml.etree import ElementTree
 import numpy as np
 import pytest
 
+import trihedron as th
 from trihedron.datasets.simulation.synthetic import Scene, Synthetic
-from trihedron.datasets.simulation.true_plan import plan_of
+from trihedron.pipeline.core.building_geometry import wall_pieces
+from trihedron.pipeline.core.errors import TrihedronError
 from trihedron.pipeline.core.registry import load_plugins, plugin_class
 from trihedron.pipeline.core.types import OPENING_KINDS, Camera, Frame, Planes, Pose
-from trihedron.pipeline.run.building_files import building_json, floorplan_svg, summary, wall_pieces, write_building
+from trihedron.pipeline.record.foxglove import View
+from trihedron.pipeline.run import building_ifc
+from trihedron.pipeline.run.building_files import building_json, floorplan_svg, summary, write_building
+from trihedron.pipeline.run.building_ifc import write_ifc
 from trihedron.plugins.normals.integral_image import IntegralImage
 from trihedron.plugins.planes.connected_components import ConnectedComponents
 from trihedron.tools.benchmarks.building_benchmark import judged
@@ -54,16 +59,16 @@ def offices(walk):
 
 
 def test_the_true_plan_of_the_offices_is_that_of_its_walls():
-    plan = Synthetic(scene=Scene.offices).plan()
+    (plan,) = Synthetic(scene=Scene.offices).plans()
     areas = sorted(0.5 * abs(np.sum(ring[:, 0] * np.roll(ring[:, 1], -1) - np.roll(ring[:, 0], -1) * ring[:, 1])) for (ring,) in plan.rooms)
     assert areas == pytest.approx([16.0, 16.0, 28.0], abs=1e-3)
     assert [size for door in plan.doorways for size in (door.width_m, door.height_m)] == pytest.approx([0.9, 2.1, 0.9, 2.1])
-    assert len(plan_of(Synthetic(scene=Scene.corridor)._room).rooms[0]) == 2  # round a block
+    assert len(Synthetic(scene=Scene.corridor).plans()[0].rooms[0]) == 2  # round a block
 
 
 @pytest.mark.parametrize("name", LAYOUTS)
 def test_rooms_walls_and_doorways_of_the_offices_are_found(walk, offices, name):
-    figures = judged(offices[name], np.eye(4), walk[0].plan())
+    figures = judged(offices[name], np.eye(4), walk[0].plans())
     assert figures["room_recall"] == figures["room_precision"] == figures["door_recall"] == 1.0
     assert figures["iou"] >= 0.97 and figures["wall_m"] <= 0.01 and figures["height_m"] <= 0.01 and figures["area_error"] <= 0.02
     assert figures["door_precision"] == 1.0
@@ -118,6 +123,121 @@ def test_walls_are_cut_at_doors(offices):
     cut = sum(float(np.linalg.norm(piece.corners[1] - piece.corners[0])) for piece in pieces)
     assert len(pieces) >= 3
     assert cut == pytest.approx(np.linalg.norm(np.diff(building.walls_m[wall], axis=0)) - np.ptp(building.spans_m, axis=1).sum(), abs=1e-6)
+
+
+def test_ifc_and_gltf_hold_the_model(offices, tmp_path):
+    import trimesh
+
+    building = offices["manhattan_layout"]
+    write_building(tmp_path, building)
+    scene = trimesh.load(tmp_path / "building.glb")
+    assert {"storey 0 wall", "storey 0 floor", "storey 0 ceiling"} <= set(scene.geometry)
+    assert scene.geometry["storey 0 floor"].area == pytest.approx(building.areas_m2.sum(), abs=0.01)
+    assert np.ptp(scene.bounds[:, 1]) == pytest.approx(np.ptp(building.storeys[0]), abs=1e-3)  # y is up
+    ifcopenshell = pytest.importorskip("ifcopenshell")
+    from ifcopenshell.validate import json_logger, validate
+
+    for name in ("a.ifc", "b.ifc"):
+        write_ifc(tmp_path / name, building)
+    model, logger = ifcopenshell.open(tmp_path / "a.ifc"), json_logger()
+    validate(model, logger, express_rules=True)
+    assert logger.statements == []
+    counts = {"IfcBuildingStorey": 1, "IfcWall": len(building.walls_m), "IfcSpace": 3, "IfcOpeningElement": 2, "IfcSlab": 6}
+    assert {kind: len(model.by_type(kind)) for kind in counts} == counts
+    names = [[root.GlobalId for root in ifcopenshell.open(tmp_path / name).by_type("IfcRoot")] for name in ("a.ifc", "b.ifc")]
+    assert names[0] == names[1] and len(set(names[0])) == len(names[0])
+
+
+def test_without_ifcopenshell_one_line_says_so(offices, tmp_path, monkeypatch):
+    monkeypatch.setattr(building_ifc, "has_ifc", lambda: False)
+    with pytest.raises(TrihedronError) as error:
+        write_ifc(tmp_path / "model.ifc", offices["cells"])
+    assert str(error.value) == "model.ifc: needs ifcopenshell, which is not installed; install it with: pip install 'trihedron[ifc]'"
+
+
+def test_a_browser_draws_the_plan(offices):
+    cairosvg = pytest.importorskip("cairosvg")
+    picture = cairosvg.svg2png(floorplan_svg(offices["manhattan_layout"]).encode())
+    assert picture.startswith(b"\x89PNG") and len(picture) > 5000
+
+
+def test_rooms_and_distances_are_asked(walk, offices):
+    plan = th.Building(offices["manhattan_layout"])
+    corridor = max(plan.rooms, key=lambda room: room.area_m2.value)
+    assert corridor.area_m2.value == pytest.approx(28.0, abs=0.3) and corridor.closed and len(corridor.openings) == 2
+    assert sorted(edge.length_m.value for edge in corridor.edges) == pytest.approx([2.0, 2.0, 14.0, 14.0], abs=0.03)
+    assert abs(corridor.perimeter_m.value - 32.0) < 1.96 * corridor.perimeter_m.sigma
+    assert plan.room_of(walk[1][0][2]) is corridor and plan.room_of(walk[1][0][2].T_world_camera) is corridor
+    assert plan.room_of(np.array([0.0, 0.0, 50.0])) is None
+    ends = [plan.walls[edge.wall] for edge in corridor.edges if edge.length_m.value < 3.0]
+    length = plan.distance(*ends)
+    assert abs(length.value - 14.0) < 1.96 * length.sigma and length.sigma < 0.03
+    first, second = plan.openings
+    assert plan.distance(first, second).value == pytest.approx(6.8, abs=0.05)
+    assert first.width_m.value == pytest.approx(0.9, abs=0.05) and {*first.rooms} <= {0, 1, 2}
+    (storey,) = plan.storeys
+    assert storey.ceiling_m.value == pytest.approx(2.7, abs=0.01) and str(storey.ceiling_m).startswith("2.69")
+    long = next(plan.walls[edge.wall] for edge in corridor.edges if edge.length_m.value > 3.0)
+    with pytest.raises(TrihedronError) as error:
+        plan.distance(ends[0], long)
+    named = f"walls {ends[0].number} and {long.number} are not parallel but at 90°"
+    assert str(error.value) == f"distance: {named}; take parallel walls, or a wall and a point"
+    with pytest.raises(TrihedronError) as error:
+        plan.room_of("kitchen")
+    assert str(error.value) == "room_of: is given str, no place; give a wall, an opening, a pose, a (4, 4) matrix or a point (3,)"
+
+
+@pytest.mark.parametrize(
+    ("scene", "name"),
+    [
+        ("flat", "manhattan_layout"),
+        pytest.param("slanted_flat", "atlanta_layout", marks=pytest.mark.slow),
+        pytest.param("slanted_flat", "cells", marks=pytest.mark.slow),
+        pytest.param("house", "manhattan_layout", marks=pytest.mark.slow),
+    ],
+)
+def test_wardrobes_slanted_walls_and_storeys(scene, name):
+    """The flat has an L-shaped room, a wardrobe that is no wall, a door ajar and a window; the house two storeys."""
+    dataset = Synthetic(scene=Scene[scene], fps=2.0, width=160, height=120, texture=False, noise=False)
+    truth = dataset.truth()
+    frames = [dataset(k) for k in range(len(dataset))]
+    building = folded(name, [(frame, planes_of(frame), pose_at(k, truth.poses[k])) for k, frame in enumerate(frames)])
+    figures = judged(building, np.eye(4), dataset.plans())
+    assert figures["room_recall"] == figures["room_precision"] == figures["door_recall"] == figures["door_precision"] == 1.0
+    assert figures["iou"] >= 0.98 and figures["wall_m"] <= 0.01 and figures["area_error"] <= 0.02 and len(building.storeys) == len(dataset.plans())
+    windows = [building.opening_heights_m[k] for k, kind in enumerate(building.opening_kinds) if OPENING_KINDS[kind] == "window"]
+    if scene == "flat":
+        assert len(windows) == 1 and windows[0] == pytest.approx([0.9, 2.0], abs=0.12)
+
+
+def test_a_preview_is_a_plan_of_some_views(walk, offices):
+    plugin = plugin_class("building", "manhattan_layout")()
+    state = plugin.start()
+    for frame, planes, pose in walk[1]:
+        state = plugin.add(state, frame, planes, None, pose, None)
+    views = len(state.views)
+    preview = plugin.preview(state)
+    assert len(state.views) == views > 60
+    assert len(preview.areas_m2) == 3 and preview.areas_m2.sum() == pytest.approx(offices["manhattan_layout"].areas_m2.sum(), rel=0.05)
+
+
+def test_slam_gives_the_plan_so_far():
+    room = Synthetic(length=4, width=160, height=120)
+    camera = room(0).camera
+    with th.Slam(camera, outputs=["trajectory", "building"]) as slam:
+        for k in range(4):
+            frame = room(k)
+            slam.track(frame.color, frame.depth_m, 0.1 * (k + 1))
+        assert slam.building().storeys
+    with th.Slam(camera, outputs=["trajectory"]) as slam, pytest.raises(TrihedronError) as error:
+        slam.building()
+    assert str(error.value) == 'outputs: has no building, so none is made; give outputs=["trajectory", "building"]'
+
+
+def test_viewers_get_a_layer(offices):
+    messages = dict(View().messages(offices["manhattan_layout"]))
+    (entity,) = messages["/view/building"].entities
+    assert entity.frame_id == "world" and len(entity.triangles) >= 2
 
 
 def flat(depth: np.ndarray, index: int = 0) -> tuple[Frame, Planes, Pose]:

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from trihedron.pipeline.core.geometry import exp_se3, tangent_basis
+from trihedron.pipeline.core.geometry import exp_se3, invert, log_so3, tangent_basis
 from trihedron.plugins.bundle import local_window_kernels as terms_kernels
 from trihedron.plugins.bundle.common import BundleMeasurements, BundleState
 from trihedron.plugins.bundle.local_window_kernels import SQUARES, NormalEquations, line_basis, linearise_bundle
@@ -49,7 +49,8 @@ def test_the_normal_equations_of_a_point(view, depth_m):
     seen = BundleMeasurements(
         1, np.stack([INTRINSICS] * 2), np.array([0, 2], np.int32), both, pixels, np.full(2, depth_m), np.full(2, 0.8), np.full(2, 0.02),
         both[:1], none, np.zeros((0, 2, 2)), np.zeros((0, 2, 3)), np.zeros((0, 2, 3, 3)), 1.0,
-        none, none, np.zeros((0, 4)), np.zeros((0, 3, 3)), np.zeros((0, 3), np.int32), np.zeros(0), True,
+        none, none, np.zeros((0, 4)), np.zeros((0, 3, 3)), np.zeros((0, 3), np.int32), np.zeros(0),
+        np.zeros((0, 2), np.int32), np.zeros((0, 4, 4)), np.zeros((0, 6, 6)), True,
     )  # fmt: skip
     out = NormalEquations(np.empty((6, 6)), np.empty(6), np.empty((1, 4, 4)), np.empty((1, 4)), np.empty((2, 6, 4)))
 
@@ -67,6 +68,32 @@ def test_the_normal_equations_of_a_point(view, depth_m):
         (np.append(out.g, 0.5 * out.b[0, :3]), g),
     ):
         assert np.allclose(found, wanted, rtol=1e-5, atol=1e-6 * np.abs(wanted).max())
+
+
+def test_the_normal_equations_of_odometry(view):
+    """JᵀLJ and JᵀLr by numeric derivatives, for neighbours in either order of the state, and beside a keyframe that is fixed."""
+    rng = np.random.default_rng(6)
+    T = [view[0], view[0] @ exp_se3(rng.normal(size=6) * 0.2)]
+    Z, L = invert(T[0]) @ T[1] @ exp_se3(rng.normal(size=6) * 1e-3), np.diag(rng.uniform(1.0, 5.0, 6))
+    none, lines = np.zeros(0, np.int32), (np.zeros((0, 2, 3)), np.zeros((0, 4)))
+    state = BundleState(np.stack([one[:3, :3] for one in T]), np.stack([one[:3, 3] for one in T]), np.zeros((0, 3)), *lines)
+
+    def residual(a, b):
+        d = invert(Z) @ invert(a) @ b
+        return np.concatenate([d[:3, 3], log_so3(d[:3, :3])])
+
+    for free, (a, b) in ((2, (0, 1)), (1, (0, 1))):
+        seen = BundleMeasurements(
+            free, np.stack([INTRINSICS] * 2), np.zeros(1, np.int32), none, np.zeros((0, 2)), np.zeros(0), np.zeros(0), np.zeros(0),
+            np.zeros(1, np.int32), none, np.zeros((0, 2, 2)), np.zeros((0, 2, 3)), np.zeros((0, 2, 3, 3)), 1.0,
+            none, none, np.zeros((0, 4)), np.zeros((0, 3, 3)), np.zeros((0, 3), np.int32), np.zeros(0),
+            np.array([[a, b]], np.int32), Z[None], L[None], True,
+        )  # fmt: skip
+        out = NormalEquations(np.empty((6 * free, 6 * free)), np.empty(6 * free), np.empty((0, 4, 4)), np.empty((0, 4)), np.empty((0, 6, 4)))
+        r = residual(T[a], T[b])
+        J = np.hstack([numeric(lambda d: residual(shifted(T[0], d), T[1]), 6), numeric(lambda d: residual(T[0], shifted(T[1], d)), 6)])[:, : 6 * free]
+        assert linearise_bundle(state, seen, SQUARES, out) == pytest.approx(r @ L @ r)
+        assert np.allclose(np.tril(out.H), np.tril(J.T @ L @ J), atol=2e-2) and np.allclose(out.g, J.T @ L @ r, atol=1e-4)
 
 
 @pytest.mark.parametrize("share", [0.2, 1.1])

@@ -10,6 +10,7 @@ import pytest
 from trihedron.pipeline.core.geometry import exp_se3, transform, transform_planes
 from trihedron.pipeline.core.table import CHUNK
 from trihedron.plugins.mapping import plane_fusion
+from trihedron.plugins.mapping.correction import apply_correction
 from trihedron.plugins.mapping.covisibility_graph import local_window, observed_by
 
 sys.path.insert(0, str(Path(__file__).parent))
@@ -117,3 +118,27 @@ def test_a_keyframe_is_not_redundant_when_the_others_are_far_behind_or_see_somet
     """Walking on, every keyframe sees something that too few others do."""
     map = walk(World(2000), 14, dataclasses.replace(EVERY, redundant=8), stride=8)
     assert map.keyframes.column("alive").all()
+
+
+def test_an_adjustment_that_began_before_a_loop_was_closed_does_not_undo_it():
+    """A loop moves the newest keyframe by 0.2 m; the bundle adjustment of the version before says otherwise, that of the version after counts."""
+    world = World()
+    map = walk(world, 4)
+    late, pose = correction(map, keyframe_ids=np.array([3], np.int32), T_world_keyframe=camera_at(3)[None]), camera_at(3).copy()
+    pose[0, 3] += 0.2
+    closed = step(EVERY, world, map, 4, status="lost", loop=correction(map, keyframe_ids=np.array([3], np.int32), T_world_keyframe=pose[None]))
+    assert closed.loop_closed == closed.revision and np.array_equal(closed.keyframes.row("T_world_camera", 3), pose)
+    assert step(EVERY, world, closed, 5, status="lost", bundle=late) is None
+    next_one = dataclasses.replace(late, based_on=closed.revision)
+    adjusted = step(EVERY, world, closed, 5, status="lost", bundle=next_one)
+    assert np.array_equal(adjusted.keyframes.row("T_world_camera", 3), camera_at(3)) and adjusted.loop_closed == closed.revision
+
+
+def test_rounding_does_not_grow_from_keyframe_to_keyframe():
+    """Each correction puts keyframe 2 where keyframe 3 is, which moves on with it: without care, twice the error is handed on each time."""
+    map = walk(World(), 4)
+    for _ in range(60):
+        target = map.keyframes.row("T_world_camera", 3)
+        map = apply_correction(map, correction(map, keyframe_ids=np.array([2], np.int32), T_world_keyframe=target[None]))
+    R = map.keyframes.column("T_world_camera")[:, :3, :3]
+    assert np.abs(R @ R.transpose(0, 2, 1) - np.eye(3)).max() < 1e-9

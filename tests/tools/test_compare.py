@@ -101,7 +101,7 @@ def test_a_sweep_ends_with_the_table(tmp_path, capsys):
 @pytest.mark.slow
 def test_every_system_computed_again_has_the_same_figures(tmp_path):
     """The table of all graphs twice from nothing, the second time with other threads: equal figures, and the same bytes of each surface."""
-    words = ["run", "-m", "experiment=paper_table", "outputs=[trajectory,surface]", 'sequences=["synthetic length=12 width=320 height=240"]']
+    words = ["run", "-m", "experiment=paper", 'sequences=["synthetic length=12 width=320 height=240"]']
     found = []
     for folder, threads in (("once", "threads=1"), ("again", "threads=2")):
         assert main([*words, threads, f"out={tmp_path / folder}"]) == 0

@@ -1,14 +1,20 @@
 """README and docs: the table of plugins is that of the registry, commands exist, links resolve."""
 
+import contextlib
+import io
 import re
+import shlex
 from importlib.metadata import entry_points
 from pathlib import Path
 
 import yaml
 
 from trihedron.datasets.simulation.synthetic import Synthetic
+from trihedron.pipeline.app.cli import main
+from trihedron.pipeline.core.config import composed, graph_of
 from trihedron.pipeline.core.registry import load_plugins, plugins_of
 from trihedron.pipeline.core.slots import SLOTS, summary
+from trihedron.tools.benchmark import COMPARISONS
 
 ROOT = Path(__file__).parents[2]
 PAGES = [*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md")]
@@ -40,6 +46,40 @@ def test_the_commands_exist():
         text = page.read_text()
         used = set(re.findall(r"^trihedron (\w[\w-]*)", text, re.MULTILINE)) | set(re.findall(r"`trihedron (\w[\w-]*)", text))
         assert used <= known, f"{page}: {used - known}"
+
+
+def shown_commands():
+    """Page and words of each command in a block `sh` or `console`, placeholders and other programs left out."""
+    for page in PAGES:
+        for block in re.findall(r"^```(?:sh|console)\n(.*?)^```", page.read_text(), re.MULTILINE | re.DOTALL):
+            for line in block.replace("\\\n", " ").splitlines():
+                for command in line.split(" && "):
+                    words = shlex.split(command.removeprefix("$ ").split("  #")[0], comments=True)
+                    if words[:1] == ["trihedron"] and "..." not in command and "=>" not in command:
+                        yield page, [word for word in words[1:] if word not in ("||", "true")]
+
+
+def test_the_commands_shown_have_these_options():
+    shown = list(shown_commands())
+    assert len(shown) > 60
+    for page, (name, *words) in shown:
+        if name != "run" and words and words[0] not in COMPARISONS:
+            stream = io.StringIO()
+            with contextlib.redirect_stdout(stream), contextlib.suppress(SystemExit):
+                main([name, "--help"])
+            for word in words:
+                if word.startswith("--"):
+                    assert word in stream.getvalue(), f"{page}: trihedron {name} {word}"
+
+
+def test_the_runs_shown_can_be_composed():
+    """Single runs: their keys, options and wires exist. No replays, no sweeps; tests/test_tutorials.py runs tutorials."""
+    counted = 0
+    for page, (name, *words) in shown_commands():
+        if name == "run" and "-m" not in words and page.parent.name != "tutorial" and not any(word.startswith("replay=") for word in words):
+            graph_of(composed([word for word in words if not word.startswith(("load_map=", "save_map="))]))
+            counted += 1
+    assert counted > 25
 
 
 def test_links_resolve_and_pictures_are_small():

@@ -1,9 +1,10 @@
 """Judge the plans of the synthetic buildings by the exact ones.
 
-Each scene is tracked with several seeds (of textures, path and noise), and its plan is moved by the SE(3) that aligns trajectory.txt with the truth,
-never by itself. A room is found where the intersection over union with a true one is above 0.5. Walls are the edges of found rooms that lie on a face
-that was seen, position the distance of their middle from the true edge. A doorway is found within 0.3 m of its middle. "honest" is the share of
-errors of areas, wall offsets and storey heights within 1.96 of their standard deviations. Figures are medians over the seeds.
+Each scene is tracked with several seeds (of textures, path and noise) and the depth noise of two cameras, and its plan is moved by the SE(3) that
+aligns trajectory.txt with the truth, never by itself. A room is found where the intersection over union with a true one is above 0.5. Walls are the
+edges of found rooms that lie on a face that was seen, position the distance of their middle from the true edge. A doorway is found within 0.3 m of
+its middle. "honest" is the share of errors of areas, wall offsets and storey heights within 1.96 of their standard deviations. Figures are medians
+over the seeds, "honest" a mean. slanted_flat is laid out by atlanta_layout.
 
 Example: trihedron benchmark building --scenes offices --seeds 2
 """
@@ -23,12 +24,15 @@ from trihedron.tools.arguments import Parser, table
 
 if TYPE_CHECKING:
     from trihedron.datasets.simulation.true_plan import TruePlan
-    from trihedron.pipeline.core.types import F64, Building
+    from trihedron.pipeline.core.types import F64, Bool, Building
 
-SCENES = ("offices", "rooms", "corridor", "flat", "slanted_flat")
+SCENES = ("offices", "rooms", "corridor", "flat", "slanted_flat", "house")
+LAYOUTS = {"slanted_flat": "atlanta_layout"}  # of the slot building; the other scenes have the graph's own
+SENSORS = ("kinect", "stereo")
 FOUND_IOU, DOOR_M, EDGE_M, LEAST_EDGE_M = 0.5, 0.3, 0.15, 0.5
 HEADER = [
-    "scene", "runs", "wall cm", "angle °", "IoU", "recall", "precision", "doors", "precision", "area %", "height cm", "honest", "frame ms", "final s",
+    "scene", "sensor", "runs", "wall cm", "angle °", "IoU", "recall", "precision", "doors", "precision", "area %", "height cm", "honest", "frame ms",
+    "final s",
 ]  # fmt: skip
 
 
@@ -37,46 +41,50 @@ def main(argv: list[str]) -> int:
     parser = Parser("benchmark building", __name__)
     parser.add_argument("--scenes", default=",".join(SCENES), metavar="A,B", help=f"some of them (default: {','.join(SCENES)})")
     parser.add_argument("--seeds", type=int, default=5, metavar="N", help="runs of each scene (default: 5)")
-    parser.add_argument("--plugin", default="", metavar="NAME", help="of the slot building (default: the graph's own)")
+    parser.add_argument("--sensors", default=",".join(SENSORS), metavar="A,B", help=f"of the depth noise (default: {','.join(SENSORS)})")
     parser.add_argument(
-        "--runs", type=Path, nargs="*", default=[], metavar="RUN", help="judge these run folders instead, by their building.json's run"
+        "--plugin", default="", metavar="NAME", help="of the slot building (default: atlanta_layout for slanted_flat, else the graph's own)"
     )
+    parser.add_argument("--out", type=Path, metavar="FOLDER", help="keep the runs here; one that is there already is judged as it is")
     parser.add_argument("--json", type=Path, metavar="FILE", help="write the figures of each run too")
     options = parser.parse_args(argv)
     if not 1 <= options.seeds <= 100:
         raise UsageError("benchmark building", f"--seeds {options.seeds} is out of range", "give 1 to 100")
-    _load()
-    scenes = [name for name in options.scenes.split(",") if name]
-    for name in scenes:
-        if name not in SCENES:
-            raise UsageError("benchmark building", f"there is no scene '{name}'", did_you_mean(name, list(SCENES)))
+    scenes, sensors = _listed("scene", options.scenes, SCENES), _listed("sensor", options.sensors, SENSORS)
     found: dict[str, list[dict[str, float]]] = {}
-    for run in options.runs:
-        found.setdefault(run.name, []).append(judged_run(run, options.plugin or None))
-    for name in () if options.runs else scenes:
-        found[name] = [_tracked(name, seed, options.plugin) for seed in range(options.seeds)]
+    with tempfile.TemporaryDirectory() as folder:
+        for scene in scenes:
+            for sensor in sensors:
+                runs = [(options.out or Path(folder)) / f"{scene}.{sensor}.{seed}" for seed in range(options.seeds)]
+                found[f"{scene} {sensor}"] = [_tracked(scene, sensor, seed, options.plugin, run) for seed, run in enumerate(runs)]
     print(report(found))
     if options.json:
         options.json.write_text(json.dumps(found, indent=2) + "\n")
     return 0
 
 
-def _load() -> None:
-    from trihedron.pipeline.core.registry import load_plugins
+def _listed(kind: str, names: str, known: tuple[str, ...]) -> list[str]:
+    """Return the names of a list with commas. Raises UsageError for an unknown one."""
+    listed = [name for name in names.split(",") if name]
+    for name in listed:
+        if name not in known:
+            raise UsageError("benchmark building", f"there is no {kind} '{name}'", did_you_mean(name, list(known)))
+    return listed
 
-    load_plugins()
 
-
-def _tracked(scene: str, seed: int, plugin: str) -> dict[str, float]:
-    """Return the figures of one run, tracked in a process of its own."""
+def _tracked(scene: str, sensor: str, seed: int, plugin: str, out: Path) -> dict[str, float]:
+    """Return the figures of one run, tracked in a process of its own unless its folder is there; its plan made anew if a plugin is given."""
     from trihedron.tools.benchmark import measure
 
-    with tempfile.TemporaryDirectory() as folder:
-        out = Path(folder) / "run"
-        words = ["dataset=synthetic", f"dataset.scene={scene}", f"dataset.seed={seed}", "dataset.width=320", "dataset.height=240", "dataset.fps=15"]
-        timing = measure([*words, "outputs=[trajectory,building]", *([f"building={plugin}"] if plugin else []), f"out={out}"], out)
-        stage = timing["stages"]["building"]
-        return {**judged_run(out), "frame_ms": stage["p50_ms"], "final_s": stage["finish_ms"] / 1e3}
+    if not (out / "timing.json").exists():
+        words = ["dataset=synthetic", f"dataset.scene={scene}", f"dataset.sensor={sensor}", f"dataset.seed={seed}", "dataset.width=320"]
+        words += [f"building={LAYOUTS[scene]}"] if scene in LAYOUTS else []
+        measure([*words, "dataset.height=240", "dataset.fps=15", "outputs=[trajectory,building]", f"out={out}"], out)
+    figures = judged_run(out, plugin or None)
+    if not plugin:
+        stage = json.loads((out / "timing.json").read_text())["stages"]["building"]
+        figures |= {"frame_ms": stage["p50_ms"], "final_s": stage["finish_ms"] / 1e3}
+    return figures
 
 
 def judged_run(run: Path, plugin: str | None = None) -> dict[str, float]:
@@ -84,50 +92,73 @@ def judged_run(run: Path, plugin: str | None = None) -> dict[str, float]:
     from trihedron.pipeline.app.recorded_run import composed_run
     from trihedron.pipeline.core.config import make_plugin
     from trihedron.pipeline.core.geometry import umeyama
+    from trihedron.pipeline.core.registry import load_plugins
     from trihedron.pipeline.record.reader import Recording
     from trihedron.pipeline.record.trajectories import read_trajectory
     from trihedron.pipeline.run.metrics import associate
     from trihedron.tools.building import building_of
 
+    load_plugins()
     recording = Recording(run / "run.mcap")
     dataset = make_plugin("dataset", composed_run(recording).dataset)
-    if not hasattr(dataset, "plan"):
+    if not hasattr(dataset, "plans"):
         raise DataError(str(run), "is of a data set without an exact plan", "judge a run of dataset=synthetic")
     estimate, truth = read_trajectory(run / "trajectory.txt"), dataset.truth()
     pairs = associate(estimate.stamps_ns, truth.stamps_ns)
     T = umeyama(estimate.poses[pairs[:, 0], :3, 3], truth.poses[pairs[:, 1], :3, 3])
-    return judged(building_of(recording, plugin), T, dataset.plan())
+    return judged(building_of(recording, plugin), T, dataset.plans())
 
 
-def judged(building: Building, T_truth_world: F64, plan: TruePlan) -> dict[str, float]:
-    """Return the figures of a plan: NaN where there is nothing to judge."""
+def judged(building: Building, T_truth_world: F64, plans: list[TruePlan]) -> dict[str, float]:
+    """Return the figures of a plan, each storey by the true one that is nearest in height: NaN where there is nothing to judge."""
     import shapely
 
     T = T_truth_world @ building.T_world_building
-    truth = [shapely.Polygon(rings[0], rings[1:]) for rings in plan.rooms]
-    mine = [_polygon(building, room, T) for room in range(len(building.areas_m2))]
-    overlap = np.array([[_iou(a, b) for b in truth] for a in mine]).reshape(len(mine), len(truth))
+    truth = [(storey, room, shapely.Polygon(room[0], room[1:])) for storey, plan in enumerate(plans) for room in plan.rooms]
+    mine, at = [_polygon(building, room, T) for room in range(len(building.areas_m2))], storeys_at(building, T, plans)
+    overlap = np.array([[_iou(a, b) * (at[building.room_storeys[k]] == storey) for storey, _, b in truth] for k, a in enumerate(mine)])
+    overlap = overlap.reshape(len(mine), len(truth))
     pairs = [(room, int(np.argmax(overlap[room]))) for room in range(len(mine)) if overlap[room].max(initial=0.0) > FOUND_IOU]
-    areas = np.array([mine[a].area - truth[b].area for a, b in pairs])
-    walls = [error for a, b in pairs for error in _edges(building, a, plan.rooms[b], T)]
-    height = np.array([high - low - plan.height_m for low, high in building.storeys])
-    doors, false = _doors(building, plan, T)
+    areas = np.array([mine[a].area - truth[b][2].area for a, b in pairs])
+    walls = [error for a, b in pairs for error in _edges(building, a, truth[b][1], T)]
+    heights = _heights(building, at, plans)
+    found = [_doors(building, plan, T, building.wall_storeys[building.opening_walls] == storey) for storey, plan in _matched(at, plans)]
+    doors, false, doorways = sum(hits for hits, _ in found), sum(wrong for _, wrong in found), sum(len(plan.doorways) for plan in plans)
     honest = [abs(error) < 1.96 * np.sqrt(building.area_variance[a]) for error, (a, _) in zip(areas, pairs)]
     honest += [abs(off) < 1.96 * sigma for off, _, sigma in walls if np.isfinite(sigma)]
-    sigmas = np.sqrt([np.trace(covariance) for covariance in building.storey_covariance])
-    honest += [abs(error) < 1.96 * sigma for error, sigma in zip(height, sigmas) if np.isfinite(error)]
+    honest += [abs(error) < 1.96 * sigma for error, sigma in heights]
     return {
         "wall_m": _median([abs(off) for off, *_ in walls]),
         "angle_deg": _median([abs(angle) for _, angle, _ in walls]),
         "iou": _median([overlap[a, b] for a, b in pairs]),
         "room_recall": len({b for _, b in pairs}) / len(truth),
         "room_precision": len(pairs) / len(mine) if mine else float("nan"),
-        "door_recall": doors / len(plan.doorways) if plan.doorways else float("nan"),
+        "door_recall": doors / doorways if doorways else float("nan"),
         "door_precision": doors / (doors + false) if doors + false else float("nan"),
-        "area_error": _median([abs(error) / truth[b].area for error, (_, b) in zip(areas, pairs)]),
-        "height_m": _median([abs(error) for error in height if np.isfinite(error)]),
+        "area_error": _median([abs(error) / truth[b][2].area for error, (_, b) in zip(areas, pairs)]),
+        "height_m": _median([abs(error) for error, _ in heights]),
         "honest": float(np.mean(honest)) if honest else float("nan"),
     }
+
+
+def storeys_at(building: Building, T: F64, plans: list[TruePlan]) -> list[int]:
+    """Return the true storey nearest to each of a building."""
+    floors = [low if np.isfinite(low) else high - 2.5 for low, high in building.storeys + T[2, 3]]
+    return [int(np.argmin([abs(floor - plan.floor_m) for plan in plans])) for floor in floors]
+
+
+def _matched(at: list[int], plans: list[TruePlan]) -> list[tuple[int, TruePlan]]:
+    return [(storey, plans[true]) for storey, true in enumerate(at)]
+
+
+def _heights(building: Building, at: list[int], plans: list[TruePlan]) -> list[tuple[float, float]]:
+    """Return (error, standard deviation) of the heights of storeys, and of floors above the lowest."""
+    pairs = list(zip(building.storeys, building.storey_covariance, (plans[k] for k in at)))
+    found = [(high - low - (true.ceiling_m - true.floor_m), float(np.sqrt(np.trace(covariance)))) for (low, high), covariance, true in pairs]
+    for (low, _), covariance, true in pairs[1:]:
+        (first, _), below, lowest = pairs[0]
+        found.append((low - first - (true.floor_m - lowest.floor_m), float(np.sqrt(covariance[0, 0] + below[0, 0]))))
+    return [(float(error), sigma) for error, sigma in found if np.isfinite(error) and np.isfinite(sigma)]
 
 
 def _median(values: list[Any]) -> float:
@@ -186,12 +217,12 @@ def _angle(along: F64, a: F64, b: F64) -> float:
     return float(np.degrees(np.arctan2(along[0] * other[1] - along[1] * other[0], along @ other)))
 
 
-def _doors(building: Building, plan: TruePlan, T: F64) -> tuple[int, int]:
-    """Return the number of true doorways that were found, and of doors and passages that are none."""
+def _doors(building: Building, plan: TruePlan, T: F64, chosen: Bool) -> tuple[int, int]:
+    """Return the number of true doorways that were found among the chosen openings, and of doors and passages that are none."""
     from trihedron.pipeline.core.types import OPENING_KINDS
 
     middles = []
-    for wall, span, kind in zip(building.opening_walls, building.spans_m, building.opening_kinds):
+    for wall, span, kind in zip(building.opening_walls[chosen], building.spans_m[chosen], building.opening_kinds[chosen]):
         start, end = _moved(building.walls_m[wall], T)
         if OPENING_KINDS[kind] != "window":
             middles.append(start + (end - start) / np.linalg.norm(end - start) * span.mean())
@@ -201,15 +232,16 @@ def _doors(building: Building, plan: TruePlan, T: F64) -> tuple[int, int]:
 
 
 def report(found: dict[str, list[dict[str, float]]]) -> str:
-    """Return the table of medians over the runs of each scene."""
+    """Return the table over the runs of each scene and sensor."""
     columns = [("wall_m", 1e2, ".2f"), ("angle_deg", 1.0, ".3f"), ("iou", 1.0, ".4f"), ("room_recall", 1.0, ".2f"), ("room_precision", 1.0, ".2f"),
                ("door_recall", 1.0, ".2f"), ("door_precision", 1.0, ".2f"), ("area_error", 1e2, ".2f"), ("height_m", 1e2, ".2f"),
                ("honest", 1.0, ".0%"), ("frame_ms", 1.0, ".3f"), ("final_s", 1.0, ".2f")]  # fmt: skip
-    rows = [HEADER]
-    for scene, runs in found.items():
+    rows, every = [HEADER], [run for runs in found.values() for run in runs]
+    for scene, runs in {**found, "all -": every}.items():
         cells = []
         for name, factor, form in columns:
             values = [run[name] for run in runs if np.isfinite(run.get(name, float("nan")))]
-            cells.append(format(factor * statistics.median(values), form) if values else "-")
-        rows.append([scene, str(len(runs)), *cells])
-    return table(rows, "lr" + "r" * len(columns))
+            middle = statistics.mean if name == "honest" else statistics.median
+            cells.append(format(factor * middle(values), form) if values else "-")
+        rows.append([*scene.split(), str(len(runs)), *cells])
+    return table(rows, "llr" + "r" * len(columns))

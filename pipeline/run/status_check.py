@@ -1,0 +1,174 @@
+"""Compare the status of poses with their errors: wrong `ok`, and how well the stated σ predicts the error.
+
+Poses count as they were estimated at the time. Each sub-map has a world of its own and is aligned with the truth by itself, robustly, over its posed
+frames; smaller ones than LEAST_POSES are left out. An `ok` frame is wrong where it is off by more than WRONG_M and SIGMAS standard deviations, or by
+more than WRONG_DEG and SIGMAS. Positions are in the camera frame.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+from scipy.stats import rankdata
+
+from trihedron.pipeline.core.geometry import invert, umeyama
+from trihedron.pipeline.core.types import DEGRADED, F64, LOST, OK, Bool, Pose, Trajectory
+from trihedron.pipeline.run.consistency import LIMIT_95, TruthNoise, gauge_free_errors, truth_noise
+from trihedron.pipeline.run.metrics import associate, relative_errors, rotation_angles_deg
+
+WRONG_M, WRONG_DEG, SIGMAS = 0.05, 2.0, 4.0
+LEAST_POSES = 10  # of a sub-map that is judged
+INLIER = 3.0  # times the median error
+ROUNDS = 5
+STEP_M = 0.05
+TINY = 1e-12  # variance, m² and rad²
+EXACT = 1e-10  # total variance below which a pose is exact by definition, as the first: it has no NEES
+
+
+@dataclass(frozen=True)
+class FrameErrors:
+    """Errors (n,) of the posed frames with truth: metres, degrees, the largest stated standard deviations, NEES (6 degrees of freedom), and the
+    logarithm of the likelihood of the error (nats). The latter two are NaN of a pose that is exact by definition. `ok` is the status; `judged` is
+    False in sub-maps that are too small, whose errors are NaN."""
+
+    indices: F64
+    judged: Bool
+    ok: Bool
+    error_m: F64
+    error_deg: F64
+    sigma_m: F64
+    sigma_deg: F64
+    nees: F64
+    log_likelihood: F64
+
+    @property
+    def wrong_ok(self) -> Bool:
+        """Return (n,) whether an `ok` frame is off by more than it states."""
+        far = (self.error_m > WRONG_M) & (self.error_m > SIGMAS * self.sigma_m)
+        turned = (self.error_deg > WRONG_DEG) & (self.error_deg > SIGMAS * self.sigma_deg)
+        return np.asarray(self.ok & self.judged & (far | turned))
+
+
+@dataclass(frozen=True)
+class StatusCheck:
+    """Figures of a run; None where too few frames are posed. Honest covariances have a median NEES of 5.3 and 0.95 for `share_within_95`. `sigma_auc`
+    is the probability that of two frames, one above the median error and one below, the former has the larger σ: 0.5 tells nothing."""
+
+    frames: int
+    ok: int
+    degraded: int
+    lost: int
+    ate_m: float | None
+    wrong_ok: int
+    nees_median: float | None
+    share_within_95: float | None
+    sigma_auc: float | None
+    log_likelihood: float | None
+    steps_within_50mm: float | None
+    steps: int
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return field name -> value, ready for JSON."""
+        return asdict(self)
+
+
+def check_status(poses: Sequence[Pose], truth: Trajectory, frames: int | None = None) -> tuple[StatusCheck, FrameErrors]:
+    """Compare the poses of a run with the truth; `frames` is the number of all frames (default: as many as there are poses)."""
+    errors, known, true = _frame_errors(poses, truth)
+    steps, close = _steps(known, true)
+    e = errors.error_m[errors.judged]
+    nees, likelihood = (values[np.isfinite(values)] for values in (errors.nees, errors.log_likelihood))
+    status = [pose.status for pose in poses]
+    found = len(e) > 0
+    figures = StatusCheck(
+        frames=frames if frames is not None else len(poses),
+        ok=status.count(OK),
+        degraded=status.count(DEGRADED),
+        lost=status.count(LOST),
+        ate_m=float(np.sqrt(np.mean(e**2))) if found else None,
+        wrong_ok=int(errors.wrong_ok.sum()),
+        nees_median=float(np.median(nees)) if len(nees) else None,
+        share_within_95=float((nees <= LIMIT_95).mean()) if len(nees) else None,
+        sigma_auc=sigma_auc(e, errors.sigma_m[errors.judged]),
+        log_likelihood=float(likelihood.mean()) if len(likelihood) else None,
+        steps_within_50mm=close / steps if steps else None,
+        steps=steps,
+    )
+    return figures, errors
+
+
+def sigma_auc(error_m: F64, sigma_m: F64) -> float | None:
+    """Return the area under the ROC curve of "the error is above its median" by σ, both (n,); None where all errors or no two are alike."""
+    above = error_m > np.median(error_m) if len(error_m) else np.zeros(0, bool)
+    positive, negative = int(above.sum()), int((~above).sum())
+    if not positive or not negative:
+        return None
+    return float((rankdata(sigma_m)[above].sum() - positive * (positive + 1) / 2.0) / (positive * negative))
+
+
+def _frame_errors(poses: Sequence[Pose], truth: Trajectory) -> tuple[FrameErrors, list[Pose], F64]:
+    """Return the errors of the posed frames that have truth, these poses, and their (n, 4, 4) truth."""
+    posed = [pose for pose in poses if pose.status != LOST]
+    pairs = associate(np.array([pose.stamp_ns for pose in posed], np.int64), truth.stamps_ns)
+    known, true = [posed[row] for row, _ in pairs], truth.poses[pairs[:, 1]].reshape(-1, 4, 4)
+    n = len(known)
+    error_m, error_deg, nees, likelihood = (np.full(n, np.nan) for _ in range(4))
+    judged = np.zeros(n, bool)
+    T = np.array([pose.T_world_camera for pose in known]).reshape(-1, 4, 4)
+    S = np.array([pose.covariance for pose in known]).reshape(-1, 6, 6) + TINY * np.eye(6)
+    submaps = np.array([pose.submap for pose in known], int)
+    for submap in np.unique(submaps):
+        rows = np.flatnonzero(submaps == submap)
+        if len(rows) < LEAST_POSES:
+            continue
+        judged[rows] = True
+        error_m[rows], error_deg[rows] = _robustly_aligned(T[rows], true[rows])
+        rows = rows[np.trace(S[rows], axis1=1, axis2=2) > EXACT]
+        if len(rows) < 2:
+            continue
+        covariances = S[rows] + _noise_of_truth([known[row] for row in rows], true[rows]).covariance
+        nees[rows], likelihood[rows] = _normalised(T[rows], covariances, true[rows])
+    sigma = np.sqrt(np.diagonal(S, axis1=1, axis2=2))
+    ok, indices = np.array([pose.status == OK for pose in known], bool), np.array([pose.index for pose in known], float)
+    sigma_m, sigma_deg = sigma[:, :3].max(axis=1, initial=0.0), np.degrees(sigma[:, 3:].max(axis=1, initial=0.0))
+    return FrameErrors(indices, judged, ok, error_m, error_deg, sigma_m, sigma_deg, nees, likelihood), known, true
+
+
+def _robustly_aligned(T: F64, true: F64) -> tuple[F64, F64]:
+    """Return (n,) metres and degrees by which poses (n, 4, 4) are off after alignment of their positions, without the worst ones."""
+    inlier, error = np.ones(len(T), bool), np.zeros(len(T))
+    motion = np.eye(4)
+    for _ in range(ROUNDS):
+        motion = umeyama(T[inlier, :3, 3], true[inlier, :3, 3])
+        error = np.linalg.norm((motion @ T)[:, :3, 3] - true[:, :3, 3], axis=1)
+        inlier = error <= max(INLIER * float(np.median(error)), 1e-4)
+    angle = rotation_angles_deg((invert(true) @ motion @ T)[:, :3, :3])
+    return error, np.asarray(angle - np.median(angle[inlier]))  # a path without turns leaves the rotation of the alignment uncertain
+
+
+def _noise_of_truth(poses: Sequence[Pose], true: F64) -> TruthNoise:
+    """Estimate errors of the truth that are independent from frame to frame."""
+    local = np.array([pose.noise_scale * pose.local_covariance for pose in poses])
+    T, indices = np.array([pose.T_world_camera for pose in poses]), np.array([pose.index for pose in poses], np.int32)
+    return truth_noise(T, local, true, indices)
+
+
+def _normalised(T: F64, covariances: F64, true: F64) -> tuple[F64, F64]:
+    """Return (n,) NEES and log-likelihood in nats of the errors of poses."""
+    errors = gauge_free_errors(T, covariances, true)
+    nees = np.einsum("ni,nij,nj->n", errors, np.linalg.inv(covariances), errors)
+    return nees, -0.5 * (nees + np.linalg.slogdet(2.0 * np.pi * covariances)[1])
+
+
+def _steps(known: Sequence[Pose], true: F64) -> tuple[int, int]:
+    """Return the number of steps between posed frames that follow each other in one sub-map, and of those within STEP_M of the true one."""
+    T = np.array([pose.T_world_camera for pose in known]).reshape(-1, 4, 4)
+    submaps = np.array([pose.submap for pose in known], int)
+    first = np.flatnonzero(submaps[:-1] == submaps[1:])
+    if not len(first):
+        return 0, 0
+    metres, _ = relative_errors(T, true, first, first + 1)
+    return len(first), int((metres < STEP_M).sum())

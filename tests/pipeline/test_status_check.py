@@ -1,0 +1,84 @@
+"""Wrong `ok`: frames whose errors exceed what they state, in each sub-map by itself."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from trihedron.pipeline.core.geometry import exp_se3
+from trihedron.pipeline.core.types import LOST, OK, Pose, Trajectory
+from trihedron.pipeline.run.status_check import check_status, sigma_auc
+
+SOMEWHERE = exp_se3(np.array([3.0, -1.0, 2.0, 0.4, -2.0, 1.0]))
+
+
+def run_of(count: int = 400, sigma: float = 0.004, submap_from: int = 10**9) -> tuple[list[Pose], Trajectory]:
+    """Poses along a curve with honest errors of σ along and about each axis, in another world than the truth; a sub-map has a world of its own."""
+    rng = np.random.default_rng(0)
+    truth = np.array([exp_se3(np.array([np.cos(t), np.sin(2 * t), 0.3 * t, 0.2 * np.sin(t), t, 0.1])) for t in np.linspace(0, 6, count)])
+    stamps = np.arange(count, dtype=np.int64) * 33_333_333
+    poses = []
+    for i in range(count):
+        world = np.eye(4) if i < submap_from else SOMEWHERE
+        T = world @ truth[i] @ exp_se3(-sigma * rng.standard_normal(6))
+        submap = int(i >= submap_from)
+        poses.append(Pose(i, int(stamps[i]), T, sigma**2 * np.eye(6), np.eye(4), -1, np.array([9, 0, 0], np.int32), 0, OK, "", submap))
+    return poses, Trajectory(stamps, SOMEWHERE @ truth)
+
+
+def test_honest_poses_are_honest_and_none_is_wrong() -> None:
+    poses, truth = run_of()
+    check, errors = check_status(poses, truth)
+    assert (check.frames, check.ok, check.degraded, check.lost, check.wrong_ok) == (400, 400, 0, 0, 0)
+    assert check.ate_m == pytest.approx(0.004 * np.sqrt(3), rel=0.05)
+    assert check.nees_median is not None and 3.0 < check.nees_median < 6.0  # errors independent from frame to frame count as the truth's, too
+    assert check.share_within_95 is not None and check.share_within_95 > 0.94
+    assert check.steps == 399 and check.steps_within_50mm == 1.0
+    assert errors.judged.all()
+
+
+@pytest.mark.parametrize(
+    "moved, sigma, wrong",
+    [
+        (np.array([0.08, 0, 0, 0, 0, 0]), 0.004, 5),  # 8 cm at 4 mm
+        (np.array([0.08, 0, 0, 0, 0, 0]), 0.03, 0),  # 8 cm at 3 cm is within 4 σ
+        (np.array([0.03, 0, 0, 0, 0, 0]), 0.004, 0),  # 3 cm is less than the 5 cm
+        (np.array([0, 0, 0, 0, np.radians(3.0), 0]), 0.004, 5),  # 3° at 0.23°
+    ],
+)
+def test_ok_frames_that_are_off_by_more_than_they_state_are_wrong(moved: np.ndarray, sigma: float, wrong: int) -> None:
+    poses, truth = run_of()
+    for i in range(100, 105):
+        poses[i] = replace(poses[i], T_world_camera=poses[i].T_world_camera @ exp_se3(moved), covariance=sigma**2 * np.eye(6))
+    assert check_status(poses, truth)[0].wrong_ok == wrong
+    for i in range(100, 105):
+        poses[i] = replace(poses[i], status="degraded", reason="doubt")
+    assert check_status(poses, truth)[0].wrong_ok == 0
+
+
+def test_each_sub_map_is_aligned_by_itself_and_lost_frames_do_not_count() -> None:
+    poses, truth = run_of(submap_from=200)
+    poses[300] = replace(poses[300], status=LOST, reason="covered", T_world_camera=np.eye(4))
+    check, errors = check_status(poses, truth)
+    assert (check.ok, check.lost, check.wrong_ok) == (399, 1, 0)
+    assert check.ate_m == pytest.approx(0.004 * np.sqrt(3), rel=0.05)
+    joined, _ = check_status([replace(pose, submap=0) for pose in poses], truth)
+    assert joined.wrong_ok > 150
+    assert len(errors.error_m) == 399
+
+
+def test_sigma_tells_large_errors_from_small_ones() -> None:
+    error = np.arange(100.0)
+    assert sigma_auc(error, error) == 1.0
+    assert sigma_auc(error, -error) == 0.0
+    assert sigma_auc(error, np.ones(100)) == 0.5
+    assert sigma_auc(np.ones(9), np.ones(9)) is None
+    assert sigma_auc(np.zeros(0), np.zeros(0)) is None
+
+
+def test_a_run_without_poses_has_no_figures() -> None:
+    poses, truth = run_of(20)
+    check, _ = check_status([replace(pose, status=LOST, reason="covered") for pose in poses], truth)
+    assert (check.lost, check.ate_m, check.nees_median, check.sigma_auc, check.steps_within_50mm) == (20, None, None, None, None)

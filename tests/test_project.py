@@ -1,0 +1,135 @@
+"""The project's habits: the site, the hosted tests, the container, versions, the changelog."""
+
+import os
+import re
+import subprocess
+import sys
+from importlib.metadata import version
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import yaml
+from packaging.requirements import Requirement
+from setuptools.config.pyprojecttoml import load_file
+
+from trihedron.tools.system_check import OPEN3D_NEEDS, PACKAGES
+
+ROOT = Path(__file__).resolve().parents[1]
+PROJECT = load_file(ROOT / "pyproject.toml")["project"]
+WORKFLOW = ROOT / ".github" / "workflows" / "test.yml"
+sys.path.insert(0, str(ROOT / "docs" / "site"))
+import check  # noqa: E402
+import gallery  # noqa: E402
+
+
+def test_a_site_that_loads_from_elsewhere_or_links_nowhere_is_refused(tmp_path):
+    page = (
+        '<link rel="stylesheet" href="https://fonts.example/a.css"><a href="b.html#here">b</a><a href="c.html">c</a><a href="https://elsewhere">e</a>'
+    )
+    (tmp_path / "a.html").write_text(page)
+    (tmp_path / "b.html").write_text('<p id="there">b</p><script src="//cdn.example/x.js"></script><a href="a.html">a</a>')
+    (tmp_path / "s.css").write_text("@font-face {src: url(https://fonts.example/f.woff2)}")
+    found = [
+        "s.css: loads https://fonts.example/f.woff2",
+        "a.html: loads https://fonts.example/a.css",
+        "a.html: no place b.html#here",
+        "a.html: no file c.html",
+        "b.html: loads //cdn.example/x.js",
+    ]
+    assert check.problems(tmp_path) == found
+
+
+@pytest.mark.slow
+def test_the_site_is_built_strictly_and_needs_no_network(tmp_path):
+    """With blank pictures in the gallery, which has tests of its own."""
+    pytest.importorskip("material")
+    results, site = tmp_path / "gallery", tmp_path / "site"
+    results.mkdir()
+    for example in gallery.EXAMPLES.glob("*.py"):
+        cv2.imwrite(str(results / f"{example.stem}.jpg"), np.zeros((8, 8), np.uint8))
+        (results / f"{example.stem}.txt").write_text("printed\n")
+    environment = os.environ | {"TRIHEDRON_GALLERY": str(results), "NO_MKDOCS_2_WARNING": "1"}
+    command = [sys.executable, "-m", "mkdocs", "build", "--strict", "--quiet", "--site-dir", str(site)]
+    done = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True)
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert check.problems(site) == []
+    assert len([path for path in site.rglob("*.html") if "source" not in path.parts]) >= 20
+    for part in (
+        "tutorial/first-run",
+        "how-to/replay",
+        "explanation/dataflow",
+        "reference/command-line",
+        "gallery/index",
+        "reference/python-objects",
+    ):
+        assert (site / f"{part}.html").is_file(), part
+    assert "trihedron compare" in (site / "reference" / "command-line.html").read_text()
+    assert "R_world_camera" in (site / "reference" / "python-objects.html").read_text()
+
+
+def test_hosted_tests_are_valid_and_run_what_developers_run():
+    command = [Path(sys.executable).parent / "check-jsonschema", "--builtin-schema", "vendor.github-workflows", WORKFLOW]
+    done = subprocess.run(command, capture_output=True, text=True)
+    assert done.returncode == 0, done.stdout + done.stderr
+    jobs = yaml.safe_load(WORKFLOW.read_text())["jobs"]
+    pythons = [line.rpartition(" ")[2] for line in PROJECT["classifiers"] if re.search(r"Python :: 3\.\d+$", line)]
+    assert jobs["test"]["strategy"]["matrix"]["python"] == pythons == ["3.10", "3.11", "3.12", "3.13", "3.14"]
+    commands = [step["run"].split()[:2] for job in jobs.values() for step in job["steps"] if "run" in step]
+    assert commands == [["make", "test"], ["make", "release"], ["make", "docs"]]
+    targets = set(re.findall(r"^(\w[\w-]*):", (ROOT / "Makefile").read_text(), re.MULTILINE))
+    assert {target for _, target in commands} <= targets
+
+
+def test_citation_and_templates_are_valid():
+    checks = {"vendor.citation-file-format": ROOT / "CITATION.cff"}
+    for schema, file in checks.items():
+        done = subprocess.run([Path(sys.executable).parent / "check-jsonschema", "--builtin-schema", schema, file], capture_output=True, text=True)
+        assert done.returncode == 0, done.stdout + done.stderr
+    for template in (ROOT / ".github" / "ISSUE_TEMPLATE").glob("*.md"):
+        assert {"name", "about"} <= set(yaml.safe_load(template.read_text().split("---")[1]))
+    hooks = [hook for repo in yaml.safe_load((ROOT / ".pre-commit-config.yaml").read_text())["repos"] for hook in repo["hooks"]]
+    assert {"ruff-check", "ruff-format", "workflows"} <= {hook["id"] for hook in hooks}
+
+
+def test_the_container_installs_as_the_readme_does():
+    text = (ROOT / "Containerfile").read_text()
+    readme = (ROOT / "README.md").read_text()
+    assert "pip install --constraint constraints.txt ." in readme and "--constraint constraints.txt ." in text and "trihedron compile" in text
+    assert {PACKAGES[library] for library in OPEN3D_NEEDS} <= set(text.split())
+
+
+def test_tested_versions_satisfy_the_requirements():
+    lines = (ROOT / "constraints.txt").read_text().splitlines()
+    pinned = dict(line.split("==") for line in lines if not line.startswith("#"))
+    for line in PROJECT["dependencies"]:
+        requirement = Requirement(line)
+        assert requirement.specifier.contains(pinned[requirement.name.lower()]), line
+
+
+def test_the_version_is_in_one_place():
+    assert version("trihedron") == PROJECT["version"]
+    assert re.fullmatch(r"\d+\.\d+\.\d+", PROJECT["version"])
+    assert "version:" not in (ROOT / "CITATION.cff").read_text().replace("cff-version:", "")
+
+
+def test_the_changelog_is_kept():
+    headings = re.findall(r"^## (.+)$", (ROOT / "CHANGELOG.md").read_text(), re.MULTILINE)
+    assert headings[0] == "Unreleased"
+    assert all(re.fullmatch(r"\d+\.\d+\.\d+ – \d{4}-\d\d-\d\d", heading) for heading in headings[1:])
+    kinds = set(re.findall(r"^### (.+)$", (ROOT / "CHANGELOG.md").read_text(), re.MULTILINE))
+    assert kinds <= {"Added", "Changed", "Deprecated", "Removed", "Fixed", "Security"}
+
+
+def test_decisions_are_short_records_listed_in_order():
+    index = (ROOT / "docs" / "decisions.md").read_text()
+    records = sorted((ROOT / "docs" / "decisions").glob("*.md"))
+    assert [path.name for path in records] == sorted(re.findall(r"\]\(decisions/([^)]+)\)", index))
+    for number, path in enumerate(records, 1):
+        text = path.read_text()
+        assert path.name.startswith(f"{number:04}-") and text.startswith(f"# {number}. "), path
+        headings = re.findall(r"^## (.+)$", text, re.MULTILINE)
+        order = ["Context", "Decision", "Measurement", "Limits", "Rejected"]
+        assert "Decision" in headings and headings == [heading for heading in order if heading in headings], f"{path}: {headings}"
+        assert len(text.split()) < 600, f"{path}: {len(text.split())} words"

@@ -1,0 +1,71 @@
+"""Each tutorial is executed as printed: its files are written, its shell blocks run in order, in a new folder and an environment of their own.
+
+A block of code with a title is a file; a block `sh` is run; `console` and `text` are for reading (installation, and what is printed)."""
+
+import os
+import re
+import subprocess
+import sysconfig
+import venv
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[1]
+TUTORIALS = sorted((ROOT / "docs" / "tutorial").glob("*.md"))
+BLOCK = re.compile(r'^```(\w*)(?: title="([^"]+)")?\n(.*?)^```$', re.MULTILINE | re.DOTALL)
+QUICK = {"first-run"}
+REPORTED = {  # lines that a tutorial's commands must print
+    "first-run": ("frames: 60 ok", "Keypoints", "manhattan"),
+    "own-recording": ("frames: 40 ok",),
+    "swap-and-compare": ("* mean_shift", "branch_and_bound", "did you mean 'normals'"),
+    "write-a-plugin": ("all is well", "ok"),
+    "from-python": ("triangles", "planes in the last frame", "40 frames compared"),
+    "watch-it-live": ("ws://localhost:8765", "/manhattan"),
+}
+
+
+def blocks(tutorial: Path) -> list[tuple[str, str, str]]:
+    """Language, title and text of each block of code."""
+    return BLOCK.findall(tutorial.read_text())
+
+
+@pytest.fixture(scope="session")
+def programs(tmp_path_factory):
+    """The bin folder of an environment that borrows the packages of this one, so that a tutorial may install its own."""
+    folder = tmp_path_factory.mktemp("tutorials") / "env"
+    venv.create(folder, with_pip=False, symlinks=True)
+    python = folder / "bin" / "python"
+    (site,) = folder.glob("lib/python*/site-packages")
+    (site / "borrowed.pth").write_text(f"{ROOT / 'src'}\n{sysconfig.get_path('purelib')}\n")
+    for name, call in {"pip": "from pip._internal.cli.main import main", "trihedron": "from trihedron.pipeline.app.cli import main"}.items():
+        script = folder / "bin" / name
+        script.write_text(f"#!{python}\nimport sys\n{call}\nsys.exit(main())\n")
+        script.chmod(0o755)
+    return folder / "bin"
+
+
+def test_every_tutorial_has_blocks_and_promises():
+    assert {path.stem for path in TUTORIALS} == set(REPORTED)
+    for tutorial in TUTORIALS:
+        assert any(language == "sh" for language, _, _ in blocks(tutorial)), tutorial
+        assert {language for language, _, _ in blocks(tutorial)} <= {"sh", "console", "text", "python", "yaml", "toml"}, tutorial
+        assert not [title for language, title, _ in blocks(tutorial) if language in ("python", "yaml", "toml") and not title], tutorial
+
+
+@pytest.mark.parametrize("tutorial", [pytest.param(p, id=p.stem, marks=() if p.stem in QUICK else pytest.mark.slow) for p in TUTORIALS])
+def test_tutorial(tutorial, programs, tmp_path):
+    environment = {name: value for name, value in os.environ.items() if name not in ("PYTHONPATH", "VIRTUAL_ENV")}
+    environment |= {"PATH": f"{programs}:{environment['PATH']}", "PIP_NO_BUILD_ISOLATION": "0", "PIP_NO_DEPS": "1", "PIP_NO_INDEX": "1"}
+    printed = ""
+    for language, title, text in blocks(tutorial):
+        if title:
+            path = tmp_path / title
+            path.parent.mkdir(parents=True, exist_ok=True)
+            path.write_text(text)
+        elif language == "sh":
+            done = subprocess.run(["bash", "-euo", "pipefail", "-c", text], cwd=tmp_path, env=environment, capture_output=True, text=True)
+            assert done.returncode == 0, f"{text}\n{done.stdout[-2000:]}\n{done.stderr[-2000:]}"
+            printed += done.stdout + done.stderr
+    for line in REPORTED[tutorial.stem]:
+        assert line in printed, f"{line} is not in:\n{printed[-4000:]}"

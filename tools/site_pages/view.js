@@ -1,0 +1,66 @@
+(() => {
+  "use strict";
+  const canvas = document.getElementById("view"), scene = JSON.parse(document.getElementById("scene").textContent);
+  const gl = canvas.getContext("webgl", { antialias: true });
+  if (!gl) { canvas.replaceWith("This browser has no WebGL; the path from above is drawn below."); return; }
+  const bytes = (text) => Uint8Array.from(atob(text), (c) => c.charCodeAt(0)).buffer;
+  const shader = (kind, source) => { const s = gl.createShader(kind); gl.shaderSource(s, source); gl.compileShader(s); return s; };
+  const program = gl.createProgram();
+  gl.attachShader(program, shader(gl.VERTEX_SHADER, "attribute vec3 p; attribute vec3 c; uniform mat4 m; varying vec3 v; void main() { v = c; gl_Position = m * vec4(p, 1.0); gl_PointSize = 4.0; }"));
+  gl.attachShader(program, shader(gl.FRAGMENT_SHADER, "precision mediump float; varying vec3 v; void main() { gl_FragColor = vec4(v, 1.0); }"));
+  gl.linkProgram(program); gl.useProgram(program); gl.enable(gl.DEPTH_TEST);
+  const at = { p: gl.getAttribLocation(program, "p"), c: gl.getAttribLocation(program, "c"), m: gl.getUniformLocation(program, "m") };
+  const buffer = (target, data) => { const b = gl.createBuffer(); gl.bindBuffer(target, b); gl.bufferData(target, data, gl.STATIC_DRAW); return b; };
+  const drawn = [];
+  if (scene.mesh) {
+    const triangles = new Uint16Array(bytes(scene.mesh.triangles));
+    drawn.push({ mode: gl.TRIANGLES, count: triangles.length, index: buffer(gl.ELEMENT_ARRAY_BUFFER, triangles),
+      p: buffer(gl.ARRAY_BUFFER, new Int16Array(bytes(scene.mesh.vertices))), c: buffer(gl.ARRAY_BUFFER, new Uint8Array(bytes(scene.mesh.colors))) });
+  }
+  for (const path of scene.paths) {
+    const points = new Int16Array(bytes(path.points)), colors = new Uint8Array(points.length);
+    for (let i = 0; i < colors.length; i++) colors[i] = path.color[i % 3];
+    const one = { count: points.length / 3, p: buffer(gl.ARRAY_BUFFER, points), c: buffer(gl.ARRAY_BUFFER, colors) };
+    drawn.push({ ...one, mode: path.dashed ? gl.LINES : gl.LINE_STRIP });
+    if (!path.dashed) drawn.push({ ...one, mode: gl.POINTS });
+  }
+  const start = { yaw: 0.5, pitch: 0.5, distance: 1.7 };
+  let eye = { ...start };
+  const multiply = (a, b) => { const o = new Float32Array(16); for (let c = 0; c < 4; c++) for (let r = 0; r < 4; r++) for (let k = 0; k < 4; k++) o[4 * c + r] += a[4 * k + r] * b[4 * c + k]; return o; };
+  function matrix() {
+    const f = 1.7, near = 0.02, far = 20, aspect = canvas.clientWidth / canvas.clientHeight;
+    const projection = new Float32Array([f / aspect, 0, 0, 0, 0, f, 0, 0, 0, 0, (far + near) / (near - far), -1, 0, 0, 2 * far * near / (near - far), 0]);
+    const cy = Math.cos(eye.yaw), sy = Math.sin(eye.yaw), cp = Math.cos(eye.pitch), sp = Math.sin(eye.pitch);
+    // The scene has z up; the camera looks at its middle.
+    const view = new Float32Array([cy, sy * sp, -sy * cp, 0, -sy, cy * sp, -cy * cp, 0, 0, cp, sp, 0, 0, 0, -eye.distance, 1]);
+    const s = 1 / 32767;
+    return multiply(projection, multiply(view, new Float32Array([s, 0, 0, 0, 0, s, 0, 0, 0, 0, s, 0, 0, 0, 0, 1])));
+  }
+  function draw() {
+    const ratio = Math.min(window.devicePixelRatio || 1, 2);
+    canvas.width = canvas.clientWidth * ratio; canvas.height = canvas.clientHeight * ratio;
+    gl.viewport(0, 0, canvas.width, canvas.height); gl.clearColor(0.93, 0.94, 0.95, 1); gl.clear(gl.COLOR_BUFFER_BIT | gl.DEPTH_BUFFER_BIT);
+    gl.uniformMatrix4fv(at.m, false, matrix());
+    for (const one of drawn) {
+      if (one.index) gl.enable(gl.DEPTH_TEST); else gl.disable(gl.DEPTH_TEST);
+      gl.bindBuffer(gl.ARRAY_BUFFER, one.p); gl.enableVertexAttribArray(at.p); gl.vertexAttribPointer(at.p, 3, gl.SHORT, false, 0, 0);
+      gl.bindBuffer(gl.ARRAY_BUFFER, one.c); gl.enableVertexAttribArray(at.c); gl.vertexAttribPointer(at.c, 3, gl.UNSIGNED_BYTE, true, 0, 0);
+      if (one.index) { gl.bindBuffer(gl.ELEMENT_ARRAY_BUFFER, one.index); gl.drawElements(one.mode, one.count, gl.UNSIGNED_SHORT, 0); } else gl.drawArrays(one.mode, 0, one.count);
+    }
+  }
+  const change = (yaw, pitch, zoom) => {
+    eye.yaw += yaw; eye.pitch = Math.min(1.55, Math.max(-1.55, eye.pitch + pitch)); eye.distance = Math.min(8, Math.max(0.3, eye.distance * zoom)); requestAnimationFrame(draw);
+  };
+  const keys = { ArrowLeft: [-0.1, 0, 1], ArrowRight: [0.1, 0, 1], ArrowUp: [0, 0.1, 1], ArrowDown: [0, -0.1, 1], "+": [0, 0, 0.9], "=": [0, 0, 0.9], "-": [0, 0, 1.1] };
+  canvas.addEventListener("keydown", (event) => {
+    if (event.key === "0") { eye = { ...start }; change(0, 0, 1); event.preventDefault(); }
+    if (keys[event.key]) { change(...keys[event.key]); event.preventDefault(); }
+  });
+  let last = null;
+  canvas.addEventListener("pointerdown", (event) => { last = event; canvas.setPointerCapture(event.pointerId); });
+  canvas.addEventListener("pointerup", () => { last = null; });
+  canvas.addEventListener("pointermove", (event) => { if (last) { change(0.008 * (event.clientX - last.clientX), 0.008 * (event.clientY - last.clientY), 1); last = event; } });
+  canvas.addEventListener("wheel", (event) => { if (document.activeElement === canvas) { change(0, 0, event.deltaY > 0 ? 1.1 : 0.9); event.preventDefault(); } }, { passive: false });
+  window.addEventListener("resize", draw);
+  draw();
+})();
