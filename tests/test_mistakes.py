@@ -4,7 +4,7 @@ import pytest
 
 from trihedron.pipeline.app.cli import main
 
-TYPE, SEE = "give a value of that type", "see trihedron plugins for the options of"
+TYPE, SEE = "give a value of that type", "see trihedron plugins"
 WRITE = "write key=value, for example threads=1 (quote lists: 'only=[pose]')"
 MCAP = "is not an MCAP file; give a file that trihedron run or another MCAP writer wrote"
 MISTAKES = [  # words of the command, exit code, what is said after "trihedron: "
@@ -17,16 +17,16 @@ MISTAKES = [  # words of the command, exit code, what is said after "trihedron: 
     ("run seed=x", 1, f"seed: Value 'x' of type 'str' could not be converted to Integer; {TYPE}"),
     ("run keypoints=orb,sift", 2, "keypoints: 'orb,sift' is several values; add -m to run once with each, or write a list as [A,B]"),
     ("run map=covisability", 1, "map: there is no plugin 'covisability' for the slot 'map'; did you mean 'covisibility'?"),
-    ("run map.min_frames=-1", 1, f"map.min_frames: -1 is not at least 1; {SEE} map"),
-    ("run pose.min_share=2", 1, f"pose.min_share: 2.0 is not within 0 … 1; {SEE} pose"),
+    ("run map.min_frames=-1", 1, f"map.min_frames: -1 is not at least 1; {SEE} map covisibility"),
+    ("run pose.min_share=2", 1, f"pose.min_share: 2.0 is not within 0 … 1; {SEE} pose refine"),
     ("run pose.focal_off=0.2", 1, "pose.focal_off: this option was removed; `trihedron calibrate RUN.mcap` estimates the focal lengths instead"),
     ("run pose.min_share=high", 1, f"pose.min_share: Value 'high' of type 'str' could not be converted to Float; {TYPE}"),
-    ("run dataset.width=-5", 1, f"dataset.width: -5 is not within 16 … 8192; {SEE} dataset"),
+    ("run dataset.width=-5", 1, f"dataset.width: -5 is not within 16 … 8192; {SEE} dataset synthetic"),
     ("run dataset.width=wide", 1, f"dataset.width: Value 'wide' of type 'str' could not be converted to Integer; {TYPE}"),
     ("run dataset.width=3.5", 1, f"dataset.width: Value '3.5' of type 'float' could not be converted to Integer; {TYPE}"),
     ("run dataset.motion=fly", 1, f"dataset.motion: Invalid value 'fly', expected one of [walk, fast, still, pan]; {TYPE}"),
-    ("run dataset.frames=5", 1, f"dataset.frames: '5' is not a range of frames A:B with A < B; {SEE} dataset"),
-    ("run dataset.frames=3:3", 1, f"dataset.frames: '3:3' is not a range of frames A:B with A < B; {SEE} dataset"),
+    ("run dataset.frames=5", 1, f"dataset.frames: '5' is not a range of frames A:B with A < B; {SEE} dataset synthetic"),
+    ("run dataset.frames=3:3", 1, f"dataset.frames: '3:3' is not a range of frames A:B with A < B; {SEE} dataset synthetic"),
     ("run dataset.frames=500:", 1,
      "dataset.frames: '500:' begins beyond the 150 frames of the synthetic room (dataset.length); give a range within 0:150"),
     ("run dataset=tum dataset.path=empty", 1, "empty: is empty; give the folder that holds the images as dataset.path"),
@@ -35,10 +35,10 @@ MISTAKES = [  # words of the command, exit code, what is said after "trihedron: 
     ("run dataset=mcap dataset.path=junk.mcap", 1, f"junk.mcap: {MCAP}"),
     ("run dataset=mcap dataset.path=nowhere.mcap", 1, "nowhere.mcap: cannot be read: No such file or directory; give the path of an MCAP file"),
     ("run dataset=faults dataset.of=tums", 1, "dataset: there is no plugin 'tums' for the slot 'dataset'; did you mean 'tum'?"),
-    ("run dataset=faults dataset.cover=9:3", 1, f"dataset.cover: '9:3' is not a range of frames A:B with A < B; {SEE} dataset"),
-    ("run dataset=faults dataset.moving=3", 1, f"dataset.moving: 3.0 is not within 0 … 1; {SEE} dataset"),
+    ("run dataset=faults dataset.cover=9:3", 1, f"dataset.cover: '9:3' is not a range of frames A:B with A < B; {SEE} dataset faults"),
+    ("run dataset=faults dataset.moving=3", 1, f"dataset.moving: 3.0 is not within 0 … 1; {SEE} dataset faults"),
     ("run dataset=faults +dataset.options.widht=3", 1,
-     f"dataset.options: synthetic has no option 'widht'; did you mean 'width'?; {SEE} dataset"),
+     f"dataset.options: synthetic has no option 'widht'; did you mean 'width'?; {SEE} dataset faults"),
     ("run graph=structual", 1, "graph: there is no graph 'structual'; did you mean 'structural'?"),
     ("run graph.pose=none", 1, "graph.pose: 'none' is not the wires of a stage; choose a plugin with pose=NAME"),
     ("run graph.pose.foo=pose", 1, "graph.pose.foo: there is no such key; see trihedron run --help"),

@@ -64,14 +64,18 @@ def cells_of(rows: Sequence[Row]) -> tuple[list[str], list[list[Cell]]]:
 
 
 def _best(rows: Sequence[Row], name: str) -> str | None:
-    """Best value of a column; None when fewer than two rows compete."""
+    """Best value of a column; None when fewer than two rows compete, or the runs of another row reach into those of the best: that is noise."""
     figure = FIGURES[name]
     competing = [row for row in rows if name in row["figures"]]
     if figure.error:
         most = max((row["figures"].get(TRACKED, {"median": 0.0})["median"] for row in competing), default=0.0)
         competing = [row for row in competing if _tracked(row) >= most - TRACKED_SLACK]
-    medians = [row["figures"][name]["median"] for row in competing]
-    return f"{max(medians) if figure.more else min(medians):.{figure.decimals}f}" if len(medians) > 1 else None
+    found = sorted((row["figures"][name] for row in competing), key=lambda one: -one["median"] if figure.more else one["median"])
+    if len(found) < 2:
+        return None
+    text = f"{found[0]['median']:.{figure.decimals}f}"
+    others = [one for one in found[1:] if f"{one['median']:.{figure.decimals}f}" != text]
+    return None if any(one["min"] <= found[0]["max"] and found[0]["min"] <= one["max"] for one in others) else text
 
 
 def _tracked(row: Row) -> float:

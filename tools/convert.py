@@ -15,7 +15,7 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from trihedron.pipeline.core.errors import ConfigError, DataError, UsageError, printable
+from trihedron.pipeline.core.errors import ConfigError, UsageError, printable
 from trihedron.tools.arguments import Parser
 
 if TYPE_CHECKING:
@@ -62,29 +62,13 @@ def _upgraded(source: Path, destination: Path) -> bool:
 
 
 def layout_of(source: Path) -> str:
-    """The data set plugin whose layout a folder has, `mcap` for a recording or bag. Raises DataError for neither."""
-    from trihedron.datasets.readers.bag_file import BAG, METADATA_FILE
+    """The data set plugin whose layout a folder has, `mcap` for a recording or bag. Raises DataError for neither, and for a video."""
     from trihedron.datasets.readers.sequence import refuse_video
+    from trihedron.pipeline.core import layouts
 
-    if source.is_file() and source.suffix == SUFFIX:
-        return "mcap"
-    refuse_video(source)
-    if not source.is_dir() and not (source.suffix == BAG and source.is_file()):
-        cause = "is not a folder or a recording" if source.exists() else "does not exist"
-        raise DataError(str(source), cause, f"give the folder of a data set or a {SUFFIX} file")
-    if source.suffix == BAG or (source / METADATA_FILE).is_file():
-        return "mcap"
-    if (source / "rgb.txt").is_file() and (source / "depth.txt").is_file():
-        return "tum"
-    if (source / "associations.txt").is_file() or any(source.glob("*.freiburg")) or any(source.glob("scene_*.depth")):
-        return "icl_nuim"
-    if any(source.glob("frame-*.color.*")):
-        return "seven_scenes"
-    if (source / "traj.txt").is_file() and (source / "results").is_dir():
-        return "replica"
-    if (source / "intrinsic" / "intrinsic_depth.txt").is_file():
-        return "scannet"
-    return "folder"
+    if source.suffix != SUFFIX:
+        refuse_video(source)
+    return layouts.layout_of(source)
 
 
 def convert(dataset: str, options: dict[str, str | None], destination: Path) -> tuple[int, int]:

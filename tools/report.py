@@ -11,7 +11,9 @@ from __future__ import annotations
 import base64
 import html
 import json
+import shlex
 from collections.abc import Sequence
+from datetime import datetime
 from pathlib import Path
 from typing import Any
 
@@ -32,11 +34,12 @@ from trihedron.tools.compare import Run, read_runs, rows_of
 from trihedron.tools.export_surface import surface_of
 
 MOST_PICTURES = 12  # a page of a large sweep would be too big to open
+TITLE_NAMES = 6
 MOST_TRIANGLES = 60_000
 STYLE = (
     "body{font:15px sans-serif;margin:2em auto;max-width:1100px;color:#222}h2{margin:1.6em 0 .4em;font-size:1.15em}table{border-collapse:collapse}"
     "td,th{padding:3px 10px;text-align:right;border-bottom:1px solid #ddd}td:first-child,th:first-child{text-align:left}"
-    "figure{margin:1em 0}img{width:100%}"
+    "figure{margin:1em 0}img{width:100%}.origins td{text-align:left}"
 )
 COLORS = ("#1f77b4", "#d62728", "#2ca02c", "#9467bd", "#ff7f0e", "#17becf", "#8c564b", "#e377c2")  # of the runs, in all figures
 LEGEND = {"orientation": "h", "x": 0.0, "y": 1.0, "yanchor": "bottom"}
@@ -48,15 +51,16 @@ def main(argv: list[str]) -> int:
     parser = Parser("report", __name__)
     parser.add_argument("folders", nargs="+", type=Path, metavar="FOLDER", help="of runs, or of a sweep")
     parser.add_argument("--out", type=Path, default=Path("report.html"), metavar="FILE", help="default report.html")
+    parser.add_argument("--title", metavar="TEXT", help="default: the data set and the names of the runs")
     options = parser.parse_args(argv)
     runs = [run for folder in options.folders for run in read_runs(folder)]
-    options.out.write_text(page(runs), encoding="utf-8")
+    options.out.write_text(page(runs, options.title), encoding="utf-8")
     print(options.out)
     return 0
 
 
-def page(runs: Sequence[Run]) -> str:
-    """The whole page. Raises DataError when no run has a trajectory."""
+def page(runs: Sequence[Run], title: str | None = None) -> str:
+    """The whole page, under a title. Raises DataError when no run has a trajectory."""
     from plotly.offline import get_plotlyjs
 
     drawn = {name: run for name, run in zip(_names(runs), runs) if (run.folder / "run.mcap").exists() and (run.folder / "trajectory.txt").exists()}
@@ -70,9 +74,12 @@ def page(runs: Sequence[Run]) -> str:
         "Position error over time": (errors, {"xaxis": {"title": {"text": "s"}}, "yaxis": {"title": {"text": "mm"}}, "height": 320}),
         "Stages, median time": (_stages(drawn, colors), {"barmode": "group", "yaxis": {"title": {"text": "ms"}}, "height": 320}),
     }
-    body = [f"<h2>{title}</h2>{_figure(number, *figure)}" for number, (title, figure) in enumerate(figures.items()) if figure[0]]
+    body = [f"<h2>{about}</h2>{_figure(number, *figure)}" for number, (about, figure) in enumerate(figures.items()) if figure[0]]
+    title = html.escape(title or title_of(drawn))
     parts = [
-        "<h1>Trihedron</h1>",
+        f"<h1>{title}</h1>",
+        _origins(drawn),
+        "<h2>Results</h2>",
         _table(runs),
         *body,
         *_plans(drawn),
@@ -81,8 +88,32 @@ def page(runs: Sequence[Run]) -> str:
         "<h2>Frames</h2>",
         *_pictures(drawn),
     ]
-    head = f"<meta charset='utf-8'><title>Trihedron</title><link rel='icon' href='data:,'><style>{STYLE}</style><script>{get_plotlyjs()}</script>"
+    head = f"<meta charset='utf-8'><title>{title}</title><link rel='icon' href='data:,'><style>{STYLE}</style><script>{get_plotlyjs()}</script>"
     return f"<!doctype html><html><head>{head}</head><body>{''.join(parts)}</body></html>\n"
+
+
+def title_of(runs: dict[str, Run]) -> str:
+    """The data sets of the runs and their names."""
+    names = list(runs)
+    data = ", ".join(dict.fromkeys(_data_set(run) for run in runs.values()))
+    return f"{data}: {', '.join(names[:TITLE_NAMES])}" + (f" and {len(names) - TITLE_NAMES} more" if len(names) > TITLE_NAMES else "")
+
+
+def _data_set(run: Run) -> str:
+    options = _config(run).get("dataset") or {}
+    name = Path(str(options.get("path") or "")).name
+    return f"{options.get('plugin', '-')} {name}".strip()
+
+
+def _origins(runs: dict[str, Run]) -> str:
+    """Name, data set, date and command of each run."""
+    lines = ["".join(f"<th>{name}</th>" for name in ("run", "data set", "date", "command"))]
+    for name, run in runs.items():
+        metadata, written = Recording(run.folder / "run.mcap").metadata, (run.folder / ".hydra" / "config.yaml").stat().st_mtime
+        date = datetime.fromtimestamp(written).astimezone().strftime("%Y-%m-%d %H:%M %Z")
+        command = shlex.join(["trihedron", "run", *json.loads(metadata.get("overrides", "[]"))])
+        lines.append("".join(f"<td>{html.escape(text)}</td>" for text in (name, _data_set(run), date, command)))
+    return "<table class='origins'>" + "".join(f"<tr>{line}</tr>" for line in lines) + "</table>"
 
 
 def _names(runs: Sequence[Run]) -> list[str]:
@@ -206,13 +237,10 @@ def _stages(runs: dict[str, Run], colors: dict[str, str]) -> list[dict[str, Any]
 
 
 def _configurations(runs: dict[str, Run]) -> str:
-    """The values of the composed configurations that are not the same in all runs. Of a stage with different plugins only these are named: their
-    options have nothing to do with each other."""
+    """Every value of the composed configurations that is not the same in all runs; an option that a run's plugin does not have is a dash."""
     flat = {name: dotted(_config(run)) for name, run in runs.items()}
     keys = sorted({key for values in flat.values() for key in values})
     differing = [key for key in keys if len({repr(values.get(key)) for values in flat.values()}) > 1 and key != "out"]
-    others = {key.removesuffix("plugin") for key in differing if key.endswith(".plugin")}
-    differing = [key for key in differing if key.endswith(".plugin") or not key.startswith(tuple(others))]
     if not differing:
         return "<p>All the same.</p>"
     lines = ["<th></th>" + "".join(f"<th>{html.escape(name)}</th>" for name in flat)]

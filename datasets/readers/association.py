@@ -79,6 +79,12 @@ def associate(first_ns: Stamps, second_ns: Stamps, max_difference_ns: int) -> ND
     return nearest_pairs(first_ns, second_ns, max_difference_ns - 1)
 
 
+def count_unpaired(folder: Path, colors: int, pairs: int, where: str = "") -> None:
+    """Warn of colour images that have no depth image, which are skipped."""
+    if pairs < colors:
+        log.warning("%s: %d of the %d colour images have no depth image%s; they are skipped", folder, colors - pairs, colors, where)
+
+
 def listed_pairs(folder: Path, max_difference_ms: float, depth_delay_ms: float) -> tuple[Stamps, list[Path], list[Path]]:
     """The pairs of rgb.txt and depth.txt, by time: stamps of colour, colour files, depth files. Depth is taken `depth_delay_ms` later than its
     stamps say. Raises DataError where a list is missing or nothing pairs."""
@@ -91,4 +97,5 @@ def listed_pairs(folder: Path, max_difference_ms: float, depth_delay_ms: float) 
     if not len(pairs):
         cause = f"no colour and depth image are within {max_difference_ms:g} ms of each other"
         raise DataError(str(folder), cause, "check the stamps in rgb.txt and depth.txt or raise dataset.max_difference_ms")
+    count_unpaired(folder, len(color.files), len(pairs), f" within {max_difference_ms:g} ms")
     return color.stamps_ns[pairs[:, 0]], [color.files[i] for i in pairs[:, 0]], [depth.files[i] for i in pairs[:, 1]]

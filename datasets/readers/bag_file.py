@@ -17,9 +17,8 @@ from numpy.typing import NDArray
 
 from trihedron.pipeline.core.errors import RecordingError, TrihedronError, printable
 from trihedron.pipeline.core.files import MAX_YAML_BYTES, SHOWN, open_file, parse_yaml, read_text
+from trihedron.pipeline.core.layouts import METADATA_FILE
 
-BAG = ".bag"  # of a ROS 1 bag
-METADATA_FILE = "metadata.yaml"  # of a rosbag2 folder
 HEAD_BYTES = 12  # of each message, kept for its stamp
 OLD_TYPES = {"tf/msg/tfMessage": "tf2_msgs/msg/TFMessage"}  # ROS 1 -> the same message of ROS 2
 CURE = "record it again, or convert it with ros2 bag convert"

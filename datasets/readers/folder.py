@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from trihedron.datasets.readers.association import Stamps, associate
+from trihedron.datasets.readers.association import Stamps, associate, count_unpaired
 from trihedron.datasets.readers.cameras import choose_calibration, with_noise
 from trihedron.datasets.readers.matrices import MAX_DIGITS
 from trihedron.datasets.readers.sequence import ImageSequence, SequenceReader
@@ -42,7 +42,9 @@ class Folder(SequenceReader):
 
     def _open(self, folder: Path) -> ImageSequence:
         colors, depths = _images(folder, COLOR_FOLDERS, "colour"), _images(folder, DEPTH_FOLDERS, "depth")
+        found = len(colors)
         names, colors, depths = _pair(folder, colors, depths, round(self.max_difference_ms * 1e6))
+        count_unpaired(folder, found, len(colors))
         calibration = with_noise(choose_calibration(folder, self.camera), self.exact_depth)
         truth = read_trajectory(folder / TRUTH) if (folder / TRUTH).is_file() else None
         return ImageSequence(_stamps(names, calibration.camera.fps), colors, depths, calibration, truth)

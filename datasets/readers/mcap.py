@@ -7,12 +7,13 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 
-from trihedron.datasets.readers.bag_file import BAG, METADATA_FILE, BagFile
+from trihedron.datasets.readers.bag_file import BagFile
 from trihedron.datasets.readers.robot_recording import RobotRecording, Topics
 from trihedron.datasets.readers.robot_streams import ROS
 from trihedron.datasets.readers.sequence import clip_range, refuse_video
 from trihedron.pipeline.core.errors import DataError
 from trihedron.pipeline.core.files import one_line_errors
+from trihedron.pipeline.core.layouts import BAG, METADATA_FILE
 from trihedron.pipeline.core.options import Frames, PositiveFloat
 from trihedron.pipeline.core.registry import register
 from trihedron.pipeline.core.types import Frame, Trajectory

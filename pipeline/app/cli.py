@@ -12,8 +12,9 @@ import io
 import os
 import shlex
 import sys
+import textwrap
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from contextlib import redirect_stderr, redirect_stdout, suppress
 from functools import partial
 from importlib.abc import InspectLoader
@@ -43,9 +44,10 @@ RUN_HELP = """Track a sequence: compose the configuration, run the graph, write 
 
 Usage: trihedron run [-m] [key=value ...]
 
-  dataset=NAME dataset.path=FOLDER   what to track: tum, icl_nuim, folder, mcap, synthetic (default)
+  FOLDER | FILE.mcap | FILE.bag      what to track; the data set is known by its files, else: dataset=NAME dataset.path=FOLDER
+  dataset=NAME                       {datasets}
   dataset.frames=A:B                 half-open range of frames       dataset.camera=PRESET|FILE  the camera
-  graph=NAME                         structural (default), structural_paper, structural_no_refine
+  graph=NAME                         {graphs}
   STAGE=PLUGIN STAGE.OPTION=VALUE    swap a method, set its options (trihedron plugins lists them all)
   graph.STAGE.INPUT=TOPIC            change a wire: topic, topic@prev or topic@5
   outputs=[trajectory]               what must be computed           threads=2  seed=0
@@ -62,7 +64,7 @@ Usage: trihedron run [-m] [key=value ...]
   hydra/launcher=dask                of a sweep: on a cluster; hydra/sweeper=optuna: a search (README)
   report=COMMAND                     what to do with the folder of a sweep at its end, for example: report="benchmark rotations"
 
-Example: trihedron run dataset=tum dataset.path=rgbd_dataset_freiburg3_structure_notexture_far
+Example: trihedron run rgbd_dataset_freiburg3_structure_notexture_far
 Example: trihedron run replay=runs/latest/run.mcap only=[manhattan,rotation] manhattan.cone_deg=8"""
 
 
@@ -166,8 +168,9 @@ def _document(entry: EntryPoint) -> str:
 def _run(words: list[str]) -> int:
     """Compose the configuration and execute it, once or as a sweep."""
     if "-h" in words or "--help" in words:
-        print(RUN_HELP)
+        print(run_help())
         return 0
+    words = [given for word in words for given in _data_set(word)]
     for word in words:
         if word.startswith("-") and word not in RUN_FLAGS:
             raise UsageError(word, "is not an option of run", f"known: {', '.join(RUN_FLAGS)}; everything else is key=value")
@@ -183,6 +186,34 @@ def _run(words: list[str]) -> int:
         return _sweep(words, _recorded(words))
     run_once(words, _BEGAN)
     return 0
+
+
+def run_help() -> str:
+    """Return the help of `run`, with the names of all data sets and graphs."""
+    from importlib.resources import files
+
+    from trihedron.pipeline.core.registry import load_plugins, plugins_of
+
+    load_plugins()
+    graphs = sorted(entry.name.removesuffix(".yaml") for entry in (files("trihedron.conf") / "graph").iterdir() if entry.name.endswith(".yaml"))
+    return RUN_HELP.format(datasets=_listed(plugins_of("dataset"), "synthetic"), graphs=_listed(graphs, "structural"))
+
+
+def _listed(names: Iterable[str], default: str) -> str:
+    """The names, the default first, as lines of the help's second column."""
+    others = [f"{default} (default)", *(name for name in sorted(names) if name not in (default, "pushed"))]
+    return textwrap.fill(", ".join(others), 110).replace("\n", "\n" + " " * 37)
+
+
+def _data_set(word: str) -> list[str]:
+    """A word of run that is a path instead of key=value, as overrides that choose the data set by its files."""
+    if "=" in word or word.startswith(("-", "~", "+")) or not (path := Path(word)).exists():
+        return [word]
+    from trihedron.pipeline.core.layouts import layout_of
+
+    name = layout_of(path)
+    print(f"dataset={name} dataset.path={word}", file=sys.stderr)
+    return [f"dataset={name}", f"dataset.path={word}"]
 
 
 def run_once(words: list[str], began: float) -> tuple[Path, dict[str, Any]]:
@@ -224,8 +255,9 @@ def _sweep(words: list[str], recorded: RecordedConfig | None) -> int:
     except Exception as error:
         raise error if isinstance(error, TrihedronError) else rewritten(error) from error
     for outcome in outcomes:
-        if outcome.report and len(outcome.failures) < outcome.jobs:
-            _dispatch([*shlex.split(outcome.report), str(outcome.folder)])
+        if len(outcome.failures) < outcome.jobs:
+            _dispatch([*(shlex.split(outcome.report) or ["compare"]), str(outcome.folder)])
+            print(f"next: trihedron report {shlex.quote(str(outcome.folder))} draws the runs of this table")
         outcome.raise_failures()
     if _FAILURES and not outcomes:
         raise _FAILURES[0]
@@ -260,7 +292,8 @@ def _task(config: DictConfig) -> float | None:
     except Exception as error:  # one job of a sweep must not stop the others, and Hydra would print its overrides
         _FAILURES.append(error)
         return None
-    _point_latest(out)
+    if not config.replay:
+        _point_latest(out)
     return metrics["final"]["ate_rmse_m"] if "final" in metrics else None
 
 

@@ -92,6 +92,8 @@ def _execute(config: DictConfig, out: Path, overrides: list[str], began: float, 
                     failure = closed(writer)
                     metrics, timing = write_files(runner, truth, out, started, began)
                     warnings.summarise()
+        if replay is not None:
+            print(_replayed(replay, runner, timing))
         _report(out, metrics, timing, _models(out, runner))
     if failure is not None:
         raise failure
@@ -252,6 +254,12 @@ def _models(out: Path, runner: Runner) -> list[str]:
     folds = list(runner.result.folds.values())
     lines = [results.write_surface(out, value) for value in folds if isinstance(value, Surface)]
     return lines + [line for value in folds if isinstance(value, Building) for line in write_building(out, value)]
+
+
+def _replayed(replay: Replay, runner: Runner, timing: dict[str, Any]) -> str:
+    """What a replay computed, as a line."""
+    counts = [f"{name} ({stage['calls']} calls)" for name, stage in timing["stages"].items() if name in runner.computed]
+    return f"computed: {', '.join(counts) or 'nothing'}; the rest is read from {replay.recording.path}"
 
 
 def _report(out: Path, metrics: dict[str, Any], timing: dict[str, Any], surfaces: list[str]) -> None:

@@ -209,13 +209,14 @@ def _changed_wires(stage: str, wires: dict[str, str | None]) -> dict[str, str | 
 def make_plugin(slot: str, options: DictConfig) -> Any:
     """The plugin a slot's options describe; lists become tuples. Raises ConfigError naming the option that is out of range."""
     values: Any = OmegaConf.to_container(options, resolve=True)
-    kind = plugin_class(slot, values.pop(PLUGIN_KEY))
+    name = values.pop(PLUGIN_KEY)
+    kind = plugin_class(slot, name)
     try:
-        return kind(**{name: tuple(value) if isinstance(value, list) else value for name, value in values.items()})
+        return kind(**{option: tuple(value) if isinstance(value, list) else value for option, value in values.items()})
     except (ValueError, TypeError) as error:
         field, _, cause = str(error).partition(": ")
         place, cause = (f"{slot}.{field}", cause) if cause and field.isidentifier() else (slot, str(error))
-        raise ConfigError(place, cause, f"see trihedron plugins for the options of {slot}") from error
+        raise ConfigError(place, cause, f"see trihedron plugins {slot} {name}") from error
 
 
 def check_added(overrides: Iterable[str]) -> None:

@@ -71,6 +71,13 @@ def test_an_unreadable_image_is_one_warning_and_no_frame(tum_folder: Path, caplo
     assert dataset(0) is not None
 
 
+def test_colour_images_without_depth_are_counted(tum_folder: Path, caplog: pytest.LogCaptureFixture) -> None:
+    lines = (tum_folder / "depth.txt").read_text().splitlines(keepends=True)
+    (tum_folder / "depth.txt").write_text("".join(lines[:-1]))
+    assert len(Tum(path=str(tum_folder))) == 3
+    assert caplog.messages == [f"{tum_folder}: 1 of the 4 colour images have no depth image within 20 ms; they are skipped"]
+
+
 def test_a_list_that_names_more_images_than_there_are_ends_with_one_warning(tum_folder: Path, caplog: pytest.LogCaptureFixture) -> None:
     with (tum_folder / "rgb.txt").open("a") as file:
         file.writelines(f"{10.4 + k / 10:.6f} rgb/{k}.png\n" for k in range(50))

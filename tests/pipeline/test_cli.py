@@ -36,7 +36,7 @@ def refused(capsys, *words, code=1):
     return lines[0]
 
 
-SEE = "see trihedron plugins for the options of"
+SEE = "see trihedron plugins"
 MISTAKES = [
     (["threads=abc"], 1, "trihedron: threads: Value 'abc' of type 'str' could not be converted to Integer; give a value of that type"),
     (["threads=0"], 1, "trihedron: threads: 0 is not a number of threads; give 1 to 256"),
@@ -65,7 +65,7 @@ MISTAKES = [
     (["+graph.planes.foo=dataset"], 1, "trihedron: graph.planes.foo: the slot 'planes' has no input 'foo'; known: frame, normals"),
     (["outputs=[trajektory]"], 1, "trihedron: outputs: no stage writes 'trajektory'; did you mean 'trajectory'?"),
     (["outputs=[]"], 1, "trihedron: outputs: is empty, so nothing would run; give outputs=[trajectory]"),
-    (["dataset.frames=9:3"], 1, f"trihedron: dataset.frames: '9:3' is not a range of frames A:B with A < B; {SEE} dataset"),
+    (["dataset.frames=9:3"], 1, f"trihedron: dataset.frames: '9:3' is not a range of frames A:B with A < B; {SEE} dataset synthetic"),
     (["dataset=tums"], 1, "trihedron: dataset: there is no plugin 'tums' for the slot 'dataset'; did you mean 'tum'?"),
     (["only=[pose]"], 1, "trihedron: only: chooses stages of a replay, and there is none; give replay=FILE.mcap too"),
     (["replay=no.mcap"], 1, "trihedron: no.mcap: cannot be read: No such file or directory; give the path of an MCAP file"),
@@ -100,7 +100,11 @@ def test_unknown_command_and_help(capsys):
     for command in ("run", "evaluate", "plugins", "topics", "convert", "benchmark"):
         assert f"\n  {command} " in text
     assert text.count("Example: trihedron ") >= 6
-    assert main(["run", "--help"]) == 0 and "replay=FILE.mcap" in capsys.readouterr().out
+    assert main(["run", "--help"]) == 0
+    text = " ".join(capsys.readouterr().out.split())
+    graphs = {file.stem for file in (Path(__file__).parents[2] / "conf" / "graph").glob("*.yaml")}
+    listed = text.partition("graph=NAME ")[2].partition(" STAGE=")[0].replace(" (default)", "").split(", ")
+    assert set(listed) == graphs and "synthetic (default), " in text and ", tum " in text and "replay=FILE.mcap" in text
     assert main(["--version"]) == 0 and capsys.readouterr().out.strip() == f"trihedron {version('trihedron')}"
 
 
@@ -109,6 +113,35 @@ def test_a_command_that_cannot_be_loaded_does_not_take_the_help_with_it(capsys, 
     monkeypatch.setattr("trihedron.pipeline.app.cli.entry_points", lambda group: [broken])
     assert main(["--help"]) == 0
     assert "  weave        cannot be loaded: No module named 'no_such_package'" in capsys.readouterr().out
+
+
+def test_a_folder_alone_is_a_data_set(capsys, tmp_path):
+    """Known by its files; what is neither a path nor key=value stays a mistake."""
+    (tmp_path / "desk").mkdir()
+    for name in ("rgb.txt", "depth.txt"):
+        (tmp_path / "desk" / name).write_text("# none\n")
+    assert main(["run", str(tmp_path / "desk")]) == 1
+    said = capsys.readouterr().err.splitlines()
+    assert said[0] == f"dataset=tum dataset.path={tmp_path}/desk" and said[1].startswith(f"trihedron: {tmp_path}/desk")
+    assert not (tmp_path / "runs").exists()
+
+
+def test_a_replay_says_what_it_computed_and_is_not_the_latest_run(capsys, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert main(["run", *SMALL, "out=runs/first"]) == 0
+    capsys.readouterr()
+    assert main(["run", "replay=runs/first/run.mcap", "only=[manhattan]", "out=runs/second"]) == 0
+    count = len(list(Recording(tmp_path / "runs" / "second" / "run.mcap").values("frames")))
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[0] == "not in runs/first/run.mcap, computed again: dataset, normals"
+    assert lines[1].startswith("computed: dataset (") and lines[1].endswith(f"manhattan ({count} calls); the rest is read from runs/first/run.mcap")
+    assert (tmp_path / "runs" / "latest").resolve() == tmp_path / "runs" / "first"
+
+
+@pytest.mark.parametrize("word", ["manhattan.cone_deg=99", "threads=0", "record.topics=[normal]", "dataset=tum"])
+def test_a_refused_option_leaves_no_folder(capsys, tmp_path, word):
+    assert main(["run", *SMALL, word, f"out={tmp_path}/new/run"]) == 1
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_debug_shows_the_traceback():

@@ -31,6 +31,15 @@ def test_a_page_needs_no_network(page):
     assert "<td>dataset.seed</td><td>0</td><td>1</td>" in text
 
 
+def test_a_page_names_data_set_runs_date_and_commands(page, tmp_path):
+    text = page.read_text()
+    assert "<title>synthetic: 0, 1</title>" in text and "<h1>synthetic: 0, 1</h1>" in text
+    command = f"trihedron run {' '.join(ROOM)} dataset.seed=1 out={page.parent}/1"
+    assert re.search(rf"<td>1</td><td>synthetic</td><td>20\d\d-\d\d-\d\d \d\d:\d\d \w+</td><td>{re.escape(command)}</td>", text)
+    assert main(["report", str(page.parent / "0"), "--title", "Room & more", "--out", str(tmp_path / "other.html")]) == 0
+    assert "<h1>Room &amp; more</h1>" in (tmp_path / "other.html").read_text()
+
+
 PLACES = """<script>addEventListener("load", () => setTimeout(() => {
     const box = (plot) => Object.values(plot.getBoundingClientRect().toJSON()).slice(0, 4).join();
     document.body.dataset.places = [...document.querySelectorAll(".js-plotly-plot")].map(box).join(";");

@@ -1,0 +1,34 @@
+"""Data sets by the files of their folders."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from trihedron.pipeline.core.errors import DataError
+
+RECORDING = ".mcap"
+BAG = ".bag"  # of a ROS 1 bag
+METADATA_FILE = "metadata.yaml"  # of a rosbag2 folder
+LAYOUTS = {  # data set plugin -> patterns: of each group one must be there
+    "mcap": ((METADATA_FILE,),),
+    "tum": (("rgb.txt",), ("depth.txt",)),
+    "icl_nuim": (("associations.txt", "*.freiburg", "scene_*.depth"),),
+    "seven_scenes": (("frame-*.color.*",),),
+    "replica": (("traj.txt",), ("results/",)),
+    "scannet": (("intrinsic/intrinsic_depth.txt",),),
+}
+
+
+def layout_of(source: Path) -> str:
+    """Return the data set plugin whose layout a folder has, `mcap` for a recording or bag, `folder` for any other folder. Raises DataError."""
+    if source.is_file() and source.suffix in (RECORDING, BAG):
+        return "mcap"
+    if not source.is_dir():
+        cause = "is not a folder or a recording" if source.exists() else "does not exist"
+        raise DataError(str(source), cause, f"give the folder of a data set or a {RECORDING} file")
+    return next((name for name, groups in LAYOUTS.items() if all(any(_holds(source, pattern) for pattern in group) for group in groups)), "folder")
+
+
+def _holds(folder: Path, pattern: str) -> bool:
+    """Return whether a folder has a file of a pattern; with a slash at its end, a folder."""
+    return any(path.is_dir() if pattern.endswith("/") else path.is_file() for path in folder.glob(pattern.rstrip("/")))
