@@ -294,6 +294,7 @@ def zip_link() -> bytes:
         link(tarfile.FIFOTYPE),
         zip_link(),
     ],
+    ids=[f"archive {k}" for k in range(10)],
 )
 def test_no_member_leaves_the_folder(data: bytes, tmp_path: Path) -> None:
     archive = tmp_path / "archive"
