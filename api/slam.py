@@ -175,17 +175,19 @@ class Slam:
     def building(self) -> Building:
         """Return the plan of the building so far: before `close`, of some of the keyframes only. Raises TrihedronError unless `building` is among the
         outputs."""
-        return Building(self._fold("building"))
+        return Building(self._fold("building", preview=True))
 
-    def _fold(self, name: str) -> Any:
-        """Return the result of a fold, or what it has so far."""
+    def _fold(self, name: str, preview: bool = False) -> Any:
+        """Return the result of a fold, or what it has so far: as a viewer sees it if `preview`, which is quicker."""
         if name not in self._values:
             raise ConfigError("outputs", f"has no {name}, so none is made", f'give outputs=["trajectory", "{name}"]')
         self._settle()
         finished = self._runner.result.folds.get(name)
         if finished is None:
             plugin, state = self._runner.graph.stages[name].plugin, self._runner.fold_state(name)
-            finished = plugin.preview(state) if hasattr(plugin, "preview") else plugin.finish(copy.deepcopy(state), self._runner.result.map)
+            finished = (
+                plugin.preview(state) if preview and hasattr(plugin, "preview") else plugin.finish(copy.deepcopy(state), self._runner.result.map)
+            )
         return finished
 
     def save(self, path: str | Path) -> None:

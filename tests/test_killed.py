@@ -1,6 +1,7 @@
 """A plug that is pulled, a disk that is full: what was recorded until then is there, and one command gives it its index."""
 
 import errno
+import io
 import json
 import os
 import resource
@@ -12,6 +13,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from mcap.reader import make_reader
 
 from trihedron.pipeline.app.cli import main
 from trihedron.pipeline.core.errors import RecordingError
@@ -143,7 +145,10 @@ def test_of_a_damaged_file_the_other_chunks_are_kept(tmp_path, monkeypatch, caps
     monkeypatch.setattr(mcap_writer, "CHUNK_BYTES", 3_000)
     recording(tmp_path / "a.mcap", 60).close()
     data = bytearray((tmp_path / "a.mcap").read_bytes())
-    data[len(data) // 2] ^= 0xFF
+    summary = make_reader(io.BytesIO(data)).get_summary()
+    assert summary is not None
+    chunk = summary.chunk_indexes[-1]
+    data[chunk.chunk_start_offset + chunk.chunk_length // 2] ^= 0xFF
     (tmp_path / "a.mcap").write_bytes(data)
     with pytest.raises(RecordingError, match=r"channel /frames is damaged.*rescue what is whole with: trihedron recover"):
         list(Recording(tmp_path / "a.mcap").values("frames"))

@@ -30,7 +30,7 @@ class Sensor(Enum):
 
 @dataclass(frozen=True)
 class SensorModel:
-    """What is common to the sensors of a kind: nominal focal length in widths of the image, frame rate, and ranges of the hidden parameters."""
+    """Common properties of the sensors of a kind: nominal focal length in widths of the image, frame rate, and ranges of the hidden parameters."""
 
     focal_per_width: float
     fps: float

@@ -257,7 +257,7 @@ def _models(out: Path, runner: Runner) -> list[str]:
 
 
 def _replayed(replay: Replay, runner: Runner, timing: dict[str, Any]) -> str:
-    """What a replay computed, as a line."""
+    """Describe in one line what a replay computed."""
     counts = [f"{name} ({stage['calls']} calls)" for name, stage in timing["stages"].items() if name in runner.computed]
     return f"computed: {', '.join(counts) or 'nothing'}; the rest is read from {replay.recording.path}"
 

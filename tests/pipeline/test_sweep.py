@@ -92,7 +92,7 @@ def test_a_sweep_goes_on_where_it_was_stopped(tmp_path, capfd):
     assert main(words) == 0
     said = capfd.readouterr()
     assert "sweep: 2 of 2 jobs done" in said.err
-    assert "tracked %" in said.out and said.out.splitlines()[-1] == f"next: trihedron report {tmp_path} draws the runs of this table"
+    assert "p50 ms" in said.out and said.out.splitlines()[-1] == f"next: trihedron report {tmp_path} draws the runs of this table"
     before = [(tmp_path / job / "run.mcap").stat().st_mtime_ns for job in ("0", "1")]
     assert json.loads((tmp_path / "1" / "job.json").read_text())["state"] == "done"
     assert "texture=False" in (tmp_path / "1" / ".hydra" / "overrides.yaml").read_text()

@@ -93,7 +93,7 @@ def test_a_wrong_network_is_one_line(change, message, tmp_path):
 def test_without_onnx_runtime_it_is_one_line(tmp_path, monkeypatch):
     corners = corner_detector(tmp_path / "corners.onnx")
     monkeypatch.setitem(sys.modules, "onnxruntime", None)
-    with pytest.raises(Exception, match=r"^onnxruntime: is not installed; install it with: pip install 'trihedron\[onnx\]'$"):
+    with pytest.raises(Exception, match=r"^onnxruntime: is not installed; install it with: pip install 'onnxruntime'$"):
         OnnxKeypoints(model=str(corners))(FRAME)
 
 

@@ -92,7 +92,7 @@ def test_a_recording_is_read_by_others(reader, tmp_path):
     found = reader(recorded(tmp_path / "a.mcap"))
     check(found)
     schemas = {name: topic["schema"] for name, topic in found["topics"].items()}
-    assert schemas["/pose"] == "trihedron.Value" and schemas["/tf"] == "foxglove.FrameTransform" and schemas["/error"] == "trihedron.Error"
+    assert schemas["/pose"] == "trihedron.Pose" and schemas["/tf"] == "foxglove.FrameTransform" and schemas["/error"] == "trihedron.Error"
     assert schemas["/view/features"] == "foxglove.ImageAnnotations" and schemas["/view/axes"] == "foxglove.SceneUpdate"
     assert found["topics"]["/pose"]["messages"] == 12 and found["topics"]["/error"]["messages"] == 11  # one frame is lost
     assert found["topics"]["/view/image"]["formats"] == ["jpeg"] * 3  # 5 Hz of 20
@@ -100,7 +100,7 @@ def test_a_recording_is_read_by_others(reader, tmp_path):
 
 def test_a_recording_that_was_cut_off_is_read_by_others_once_recovered(reader, tmp_path):
     data = recorded(tmp_path / "a.mcap").read_bytes()
-    (tmp_path / "a.mcap").write_bytes(data[: data.rindex(b"trihedron.Value") - 50])  # in the index
+    (tmp_path / "a.mcap").write_bytes(data[: data.rindex(b"trihedron.Pose") - 50])  # in the index
     recover(tmp_path / "a.mcap", tmp_path / "a.mcap")
     found = reader(tmp_path / "a.mcap")
     check(found)
