@@ -7,6 +7,7 @@ from functools import partial
 
 import numpy as np
 import pytest
+from small_networks import answering, corner_detector, nearest_matcher, network_words
 
 from trihedron.datasets.simulation.synthetic import Synthetic
 from trihedron.pipeline.app.cli import main
@@ -17,10 +18,6 @@ from trihedron.plugins.lines.onnx import LineOutput, OnnxLines
 from trihedron.plugins.normals.onnx import OnnxNormals
 from trihedron.plugins.planes.onnx import OnnxPlanes
 from trihedron.plugins.shared.networks import bytes_of, vectors_of
-
-pytest.importorskip("onnx", exc_type=ImportError)
-pytest.importorskip("onnxruntime", exc_type=ImportError)
-from small_networks import answering, corner_detector, nearest_matcher, network_words
 
 ROOM = ["dataset.width=320", "dataset.height=240", "dataset.length=20"]
 FRAME = Synthetic(length=2, width=320, height=240)(0)
