@@ -44,7 +44,6 @@ def test_a_site_that_loads_from_elsewhere_or_links_nowhere_is_refused(tmp_path):
 @pytest.mark.slow
 def test_the_site_is_built_strictly_and_needs_no_network(tmp_path):
     """With blank pictures in the gallery, which has tests of its own."""
-    pytest.importorskip("material")
     results, site = tmp_path / "gallery", tmp_path / "site"
     results.mkdir()
     for example in gallery.EXAMPLES.glob("*.py"):
