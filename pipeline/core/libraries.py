@@ -7,6 +7,7 @@ import re
 from collections import defaultdict
 from collections.abc import Iterator
 from contextlib import contextmanager
+from importlib.util import find_spec
 
 from trihedron.pipeline.core.errors import LibraryError
 
@@ -41,7 +42,7 @@ def imports_of(module: str) -> Iterator[None]:
 def library_error(module: str, error: ImportError | None = None) -> LibraryError:
     """Return the error of a library that is not installed, or that does not load for the reason that its import gave."""
     name, cure = distribution_of(module), f"install it with: {install_command(module)}"
-    if error is None or (isinstance(error, ModuleNotFoundError) and error.name == module):
+    if error is None or (isinstance(error, ModuleNotFoundError) and find_spec(module) is None):
         return LibraryError(name, "is not installed", cure)
     if "shared object file" in str(error):
         cure = "`python -m trihedron.tools.system_check` names the missing Debian packages"

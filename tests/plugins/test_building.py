@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import sys
 from dataclasses import replace
 from xml.etree import ElementTree
 
@@ -12,13 +13,12 @@ import pytest
 import trihedron as th
 from trihedron.datasets.simulation.synthetic import Scene, Synthetic
 from trihedron.pipeline.core.building_geometry import wall_pieces
-from trihedron.pipeline.core.errors import TrihedronError
+from trihedron.pipeline.core.errors import LibraryError, TrihedronError
 from trihedron.pipeline.core.registry import load_plugins, plugin_class
 from trihedron.pipeline.core.types import OPENING_KINDS, Camera, Frame, Planes, Pose
 from trihedron.pipeline.record.foxglove import View
-from trihedron.pipeline.run import building_ifc
 from trihedron.pipeline.run.building_files import building_json, floorplan_svg, summary, write_building
-from trihedron.pipeline.run.building_ifc import write_ifc
+from trihedron.pipeline.run.building_ifc import has_ifc, write_ifc
 from trihedron.plugins.normals.integral_image import IntegralImage
 from trihedron.plugins.planes.connected_components import ConnectedComponents
 from trihedron.tools.benchmarks.building_benchmark import judged
@@ -149,10 +149,11 @@ def test_ifc_and_gltf_hold_the_model(offices, tmp_path):
 
 
 def test_without_ifcopenshell_one_line_says_so(offices, tmp_path, monkeypatch):
-    monkeypatch.setattr(building_ifc, "has_ifc", lambda: False)
-    with pytest.raises(TrihedronError) as error:
+    monkeypatch.setitem(sys.modules, "ifcopenshell", None)
+    with pytest.raises(LibraryError) as error:
         write_ifc(tmp_path / "model.ifc", offices["cells"])
-    assert str(error.value) == "model.ifc: needs ifcopenshell, which is not installed; install it with: pip install 'trihedron[ifc]'"
+    assert str(error.value) == "ifcopenshell: is not installed; install it with: pip install 'trihedron[ifc]'"
+    assert not has_ifc() and list(tmp_path.iterdir()) == []
 
 
 def test_a_browser_draws_the_plan(offices):
