@@ -1,4 +1,4 @@
-"""Tests compile what they call; none fills the cache for the whole default graph first. A skip has a reason in ALLOWED, or the run fails."""
+"""Tests compile what they call; none fills the cache for the whole default graph first. A skip for a reason not in ALLOWED fails the run."""
 
 import os
 import re

@@ -125,6 +125,12 @@ def check_conversions(mesh, planes, keypoints, map):
     np.testing.assert_array_equal(np.asarray(map.to_open3d().points), map.to_numpy()["points_m"])
 
 
+def test_without_open3d_a_conversion_says_how_to_get_it(monkeypatch):
+    monkeypatch.setitem(sys.modules, "open3d", None)
+    with pytest.raises(th.TrihedronError, match=r"open3d: cannot be imported: .*; install it with: pip install open3d"):
+        th.Surface.empty(0, 0).to_open3d()
+
+
 def contents(path):
     """Topic -> messages, of all topics that a replay reads."""
     recording = reader.Recording(path)
