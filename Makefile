@@ -24,10 +24,12 @@ demo: install  ## track the built-in synthetic room
 	@echo "$(OUT)/trajectory.txt (TUM format) and $(OUT)/run.mcap (opens in Foxglove; rerun one stage of it with"
 	@echo "  $(BIN)/trihedron run replay=$(OUT)/run.mcap 'only=[manhattan,rotation]')"
 
+SHELL := bash
+TIMED := TIMEFORMAT='tests took %R s, %U s of CPU and %S s of the system'; time
 test: install  ## style, types, and the tests that are quick
 	$(BIN)/ruff check .
 	$(BIN)/mypy -p trihedron
-	$(BIN)/pytest -n 2
+	$(TIMED) $(BIN)/pytest -n 2 --durations=20
 
 test-slow: install  ## the tests that take longer
 	$(BIN)/pytest -n 2 -m slow
