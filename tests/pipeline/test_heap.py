@@ -9,11 +9,11 @@ import pytest
 HEAPS = """
 import ctypes, sys, threading
 from pathlib import Path
-from trihedron.pipeline import heap
+from trihedron.pipeline.run import memory
 libc = ctypes.CDLL(None)
 libc.fopen.restype = libc.malloc.restype = ctypes.c_void_p
 if sys.argv[1] == "shared":
-    heap.configure_malloc()
+    memory.configure_malloc()
 for _ in range(4):
     thread = threading.Thread(target=lambda: [bytearray(10_000) for _ in range(100)])
     thread.start()
