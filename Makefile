@@ -2,6 +2,8 @@
 
 VENV := .venv
 BIN := $(VENV)/bin
+LOCK := constraints.txt
+PIP := $(BIN)/python -m pip install --constraint $(LOCK)
 OUT := runs/demo
 TABLE := runs/table
 COMMA := ,
@@ -12,7 +14,7 @@ USABLE := 'import sys, venv, ensurepip; sys.exit(not (3, 10) <= sys.version_info
 PYTHON := $(shell for p in python3.14 python3.13 python3.12 python3.11 python3.10 python3 python; do \
 	$$p -c $(USABLE) >/dev/null 2>&1 && echo $$p && break; done)
 
-.PHONY: demo test test-slow benchmark table docs release install clean
+.PHONY: demo test test-slow test-newest benchmark table docs release lock install clean
 .DELETE_ON_ERROR:
 
 demo: install  ## track the built-in synthetic room
@@ -22,13 +24,20 @@ demo: install  ## track the built-in synthetic room
 	@echo "$(OUT)/trajectory.txt (TUM format) and $(OUT)/run.mcap (opens in Foxglove; rerun one stage of it with"
 	@echo "  $(BIN)/trihedron run replay=$(OUT)/run.mcap 'only=[manhattan,rotation]')"
 
+SHELL := bash
+TIMED := TIMEFORMAT='tests took %R s, %U s of CPU and %S s of the system'; time
 test: install  ## style, types, and the tests that are quick
 	$(BIN)/ruff check .
 	$(BIN)/mypy -p trihedron
-	$(BIN)/pytest -n 2
+	$(TIMED) $(BIN)/pytest -n 2 --durations=20
 
 test-slow: install  ## the tests that take longer
 	$(BIN)/pytest -n 2 -m slow
+
+test-newest:  ## the same with the newest version of everything, in an environment of its own; prints what differs from the lock
+	$(MAKE) install VENV=.venv-newest LOCK=/dev/null
+	.venv-newest/bin/python .ci/differences.py constraints.txt
+	$(MAKE) test VENV=.venv-newest LOCK=/dev/null
 
 benchmark: install  ## time, memory and error on the synthetic room and the sequences beside this folder
 	$(BIN)/trihedron benchmark
@@ -44,37 +53,38 @@ table: install  ## the paper's study and its pages: every system on rooms and DA
 	$(BIN)/trihedron paper $(TABLE) $(TABLE)_corridor --markdown $(TABLE)/paper.md
 	$(BIN)/trihedron site $(TABLE) $(TABLE)_corridor --out $(TABLE)/site
 
-docs: install $(VENV)/docs  ## the documentation as a site in build/site; executes the gallery
+docs: install  ## the documentation as a site in build/site; executes the gallery
 	$(BIN)/python docs/site/gallery.py build/gallery
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet
 	$(BIN)/python docs/site/check.py build/site
 
-release: install $(VENV)/docs  ## wheel and sdist, checked; the wheel installed in an empty environment tracks the demo
+release: install  ## wheel and sdist, checked; the wheel installed in an empty environment tracks the demo
 	rm -rf dist build/release
-	$(BIN)/python -m build --outdir dist
+	$(BIN)/python -m build --no-isolation --outdir dist
 	$(BIN)/twine check --strict dist/*
 	$(PYTHON) -m venv build/release/env
-	build/release/env/bin/pip install --quiet --constraint constraints.txt dist/*.whl
+	build/release/env/bin/pip install --quiet --constraint $(LOCK) dist/*.whl
 	cd build/release && env/bin/trihedron run dataset.length=60 out=demo && env/bin/trihedron --version
+
+lock: install  ## write constraints.txt: the newest versions of everything on all supported Pythons
+	$(BIN)/uv pip compile --quiet --universal --python-version 3.10 --all-extras --upgrade --no-annotate --no-emit-index-url --no-emit-find-links \
+		--custom-compile-command "make lock" --output-file constraints.txt pyproject.toml
 
 install: $(VENV)/checked $(VENV)/compiled
 
 clean:  ## remove what make made; runs/ stays
-	rm -rf $(VENV) build dist src/*.egg-info .mypy_cache .ruff_cache .pytest_cache
+	rm -rf .venv .venv-newest build dist src/*.egg-info .mypy_cache .ruff_cache .pytest_cache
 
 $(VENV)/created:
 	@test -n "$(PYTHON)" || { echo "trihedron: needs Python 3.10 to 3.14 with venv; install it with: apt-get install python3 python3-venv" >&2; exit 1; }
 	$(PYTHON) -m venv $(VENV)
 	@touch $@
 
-$(VENV)/installed: $(VENV)/created pyproject.toml
+# Build tools first: packages without wheels, and this one, are built with the locked ones.
+$(VENV)/installed: $(VENV)/created pyproject.toml $(LOCK)
 	@echo "Installing into $(VENV) (about 1.5 GB to download the first time)"
-	$(BIN)/python -m pip install --upgrade --quiet pip
-	$(BIN)/python -m pip install -e ".[dev]"
-	@touch $@
-
-$(VENV)/docs: $(VENV)/installed
-	$(BIN)/python -m pip install -e ".[docs]"
+	$(PIP) --quiet --upgrade pip setuptools
+	$(PIP) --upgrade --upgrade-strategy eager --no-build-isolation -e ".[dev]"
 	@touch $@
 
 # 3: a library that only some stages use is missing; said each time, until it is there.

@@ -1,6 +1,6 @@
 """Track an Intel RealSense camera and watch it in Foxglove (open ws://localhost:8765).
 
-pip install pyrealsense2
+pip install 'trihedron[realsense]'
 python examples/realsense_loop.py          # Ctrl-C ends it; the recording is in runs/realsense
 """
 

@@ -115,18 +115,20 @@ def check_conversions(mesh, planes, keypoints, map):
     assert len(planes.to_trimesh().vertices) == len(off)
     assert len(keypoints.to_trimesh().vertices) == np.isfinite(keypoints.points_m[:, 0]).sum()
     assert len(map.to_trimesh().vertices) == map.points.column("alive").sum() > 0
-    try:
-        import open3d  # noqa: F401
-    except ImportError:
-        with pytest.raises(th.TrihedronError, match=r"open3d: cannot be imported: .*; install it with: pip install open3d"):
-            mesh.to_open3d()
-        return
     np.testing.assert_array_equal(np.asarray(mesh.to_open3d().triangles), arrays["triangles"])
     np.testing.assert_array_equal(np.asarray(mesh.to_open3d().vertices), arrays["vertices_m"].astype(float))
+    np.testing.assert_array_equal(np.asarray(mesh.to_open3d().vertex_colors), arrays["colors"] / 255.0)
+    assert len(th.Surface.empty(0, 0).to_open3d().triangles) == 0
     assert len(planes.to_open3d().points) == len(off)
     assert len(np.unique(np.asarray(planes.to_open3d().colors), axis=0)) == min(len(planes.coefficients), 10)
     assert len(keypoints.to_open3d().points) == np.isfinite(keypoints.points_m[:, 0]).sum()
-    assert len(map.to_open3d().points) == map.points.column("alive").sum()
+    np.testing.assert_array_equal(np.asarray(map.to_open3d().points), map.to_numpy()["points_m"])
+
+
+def test_without_open3d_a_conversion_says_how_to_get_it(monkeypatch):
+    monkeypatch.setitem(sys.modules, "open3d", None)
+    with pytest.raises(th.TrihedronError, match=r"^open3d: is not installed; install it with: pip install open3d$"):
+        th.Surface.empty(0, 0).to_open3d()
 
 
 def contents(path):

@@ -142,7 +142,9 @@ def test_main_of_ros2_node():
 
 @pytest.mark.slow
 def test_notebook_replay_a_stage(tmp_path):
-    nbformat, nbclient = pytest.importorskip("nbformat"), pytest.importorskip("nbclient")
+    import nbclient
+    import nbformat
+
     notebook = nbformat.read(EXAMPLES / "replay_a_stage.ipynb", as_version=4)
     done = nbclient.NotebookClient(notebook, timeout=500, resources={"metadata": {"path": str(tmp_path)}}).execute()
     outputs = [cell.outputs for cell in done.cells if cell.cell_type == "code"]

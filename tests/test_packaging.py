@@ -68,7 +68,7 @@ def installed(wheel: Path, folder: Path, *, with_dependencies: bool) -> Path:
     """A new environment that holds the wheel; without dependencies of its own it borrows those of this one. Returns its bin folder."""
     venv.create(folder, with_pip=True, symlinks=True)
     python = folder / "bin" / "python"
-    options = [] if with_dependencies else ["--no-deps"]
+    options = ["--constraint", str(ROOT / "constraints.txt")] if with_dependencies else ["--no-deps"]
     subprocess.run([python, "-m", "pip", "install", "--quiet", *options, wheel], check=True)
     if not with_dependencies:
         site = subprocess.run([python, "-c", "import sysconfig; print(sysconfig.get_path('purelib'))"], capture_output=True, text=True, check=True)

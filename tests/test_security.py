@@ -32,7 +32,6 @@ FORBIDDEN = {  # names that run or load what data say; of attributes the object 
 COMPUTED_IMPORTS = {  # files that import by a name that is not written in the call, and where the name comes from
     "pipeline/app/cli.py": "the installed entry points",
     "pipeline/core/registry.py": "the packages' own folders and the installed entry points",
-    "plugins/shared/libraries.py": "names in the file",
     "tools/benchmark.py": "a table in the file",
 }
 PICKLING = {"pipeline/sweep/cluster.py": "jobs of a sweep, from its own process"}

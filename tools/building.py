@@ -29,6 +29,7 @@ def main(argv: list[str]) -> int:
     parser.add_argument("--plugin", metavar="NAME", help="make it anew by this plugin, for example atlanta_layout (default: as recorded)")
     parser.add_argument("--out", metavar="FOLDER", type=Path, help="where to write (default: beside the recording)")
     options = parser.parse_args(argv)
+    from trihedron.pipeline.core.libraries import library_error
     from trihedron.pipeline.core.registry import load_plugins, plugins_of
     from trihedron.pipeline.record.reader import Recording
     from trihedron.pipeline.run.building_files import DXF, GLB, JSON, SVG, write_building
@@ -51,7 +52,7 @@ def main(argv: list[str]) -> int:
     for name in (JSON, SVG, DXF, GLB, *((IFC,) if has_ifc() else ())):
         print(f"  {out / name}")
     if not has_ifc():
-        print(f"no {IFC}: ifcopenshell is not installed; install it with: pip install 'trihedron[ifc]'")
+        print(f"no {IFC}: {library_error('ifcopenshell')}")
     return 0
 
 

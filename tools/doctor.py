@@ -1,4 +1,4 @@
-"""Print versions, processor, compiled functions and missing libraries: what to put into a bug report.
+"""Print versions, processor, compiled functions and the libraries of each extra: what to put into a bug report.
 
 Exit code 0 when all that a run needs is there, 1 when something is missing.
 
@@ -10,28 +10,20 @@ from __future__ import annotations
 import importlib.metadata
 import os
 import platform
-import re
 import sys
 from importlib.util import find_spec
 from pathlib import Path
 
+from trihedron.pipeline.core.libraries import declared, install_command
 from trihedron.tools.arguments import Parser, table
 from trihedron.tools.system_check import OPTIONAL, REQUIRED, check
-
-EXTRAS = {  # package -> what of us needs it
-    "onnxruntime": "the plugins onnx*",
-    "rerun-sdk": "view=rerun, export --to rerun",
-    "pyrealsense2": "dataset=realsense",
-    "optuna": "hydra/sweeper=optuna",
-    "distributed": "hydra/launcher=dask",
-}
 
 
 def main(argv: list[str]) -> int:
     """Run the command; returns the exit code."""
     Parser("doctor", __name__).parse_args(argv)
-    libraries = required()
-    missing = [name for name in libraries if version_of(name) is None]
+    libraries = declared()
+    missing = [name for name in libraries.get("", ()) if version_of(name) is None]
     broken = {module: problem for module in (*REQUIRED, *OPTIONAL) if find_spec(module) is not None and (problem := check(module))}
     rows = [
         ["trihedron", f"{version_of('trihedron')} in {Path(__file__).resolve().parents[1]}"],
@@ -39,20 +31,15 @@ def main(argv: list[str]) -> int:
     ]
     rows += [["system", platform.platform()], ["processor", f"{processor()}, {os.cpu_count()} cores"], ["memory", memory_text()]]
     rows += [["compiled functions", compiled_text()]]
-    rows += [[name, version_of(name) or "missing"] for name in libraries]
-    rows += [[name, version_of(name) or f"not installed; needed for {use}: pip install {name}"] for name, use in EXTRAS.items()]
+    for extra, names in libraries.items():
+        suffix = f" [{extra}]" if extra else ""
+        rows += [[name + suffix, version_of(name) or f"missing; install with: {install_command(name)}"] for name in names]
     print(table(rows, "ll"))
     for module, problem in broken.items():
         print(f"  {problem}" + ("" if module in REQUIRED else " (only the stages that use it need it)"))
     if missing:
         print(f"  missing: pip install {' '.join(missing)}")
     return 1 if missing or set(REQUIRED) & set(broken) else 0
-
-
-def required() -> list[str]:
-    """Return the names of the packages that the installed package depends on, without extras."""
-    found = (re.match(r"[\w.-]+", text) for text in importlib.metadata.requires("trihedron") or () if "extra ==" not in text)
-    return sorted(match[0] for match in found if match)
 
 
 def version_of(package: str) -> str | None:

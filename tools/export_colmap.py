@@ -13,6 +13,7 @@ import numpy as np
 
 from trihedron.pipeline.core.errors import DataError
 from trihedron.pipeline.core.geometry import invert
+from trihedron.pipeline.core.libraries import imports_of
 from trihedron.pipeline.core.types import I32, U8, FrameReference, Map
 from trihedron.pipeline.record.reader import Recording
 from trihedron.tools.export import Format
@@ -23,8 +24,9 @@ LEAST_VIEWS = 2  # of a point: COLMAP's tracks are no shorter
 
 
 def write_colmap(recording: Recording, path: Path) -> str:
-    """Write the folder. Raises DataError for a run without keyframes, or whose images are gone."""
-    import pycolmap
+    """Write the folder. Raises DataError for a run without keyframes, or whose images are gone, LibraryError without pycolmap."""
+    with imports_of("pycolmap"):
+        import pycolmap
 
     map = last_map(recording)
     if map is None or not len(rows := _keyframes(map)):

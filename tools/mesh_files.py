@@ -8,8 +8,9 @@ from typing import Any
 
 import numpy as np
 
-from trihedron.pipeline.core.errors import DataError, printable
+from trihedron.pipeline.core.errors import DataError, LibraryError, printable
 from trihedron.pipeline.core.files import SHOWN, read_file
+from trihedron.pipeline.core.libraries import imports_of
 from trihedron.pipeline.core.types import F64, I32, U8
 
 MAX_BYTES = 1 << 31
@@ -17,7 +18,7 @@ CURE = "give a .ply or .obj file"
 
 
 def read_mesh(path: Path) -> tuple[F64, I32]:
-    """Vertices (v, 3) and triangles (t, 3) of a PLY or OBJ file; polygons become triangles. Raises DataError."""
+    """Vertices (v, 3) and triangles (t, 3) of a PLY or OBJ file; polygons become triangles. Raises DataError, LibraryError."""
     if not path.exists():
         raise DataError(str(path), "there is no such file", "run with outputs=[trajectory,surface] first")
     kind = path.suffix.lower().removeprefix(".")
@@ -27,6 +28,8 @@ def read_mesh(path: Path) -> tuple[F64, I32]:
         found = _loaded(path, kind)
         points = np.asarray(found.vertices, np.float64).reshape(-1, 3)
         triangles = np.asarray(getattr(found, "faces", np.empty((0, 3))), np.int64).reshape(-1, 3)
+    except LibraryError:
+        raise
     except Exception as error:  # trimesh raises anything for a damaged file
         raise DataError(str(path), f"is not a mesh: {printable(str(error), 2 * SHOWN)}", CURE) from error
     if not np.isfinite(points).all():
@@ -43,7 +46,8 @@ def vertex_colors(path: Path, count: int, default: int = 180) -> U8:
 
 
 def _loaded(path: Path, kind: str) -> Any:
-    import trimesh
+    with imports_of("trimesh"):
+        import trimesh
 
     data = BytesIO(read_file(path, MAX_BYTES))
     return trimesh.load_mesh(data, file_type=kind, process=False, maintain_order=True, skip_materials=True)

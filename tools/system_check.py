@@ -11,6 +11,8 @@ import subprocess
 import sys
 from collections.abc import Callable
 
+from trihedron.pipeline.core.libraries import distribution_of
+
 REQUIRED = ("cv2", "numba", "scipy")  # nothing runs without these
 OPTIONAL = ("open3d", "pycolmap")  # only the stages that use them do not run
 PACKAGES = {
@@ -64,7 +66,7 @@ def check(module: str, run: Callable[[str], str] = import_error) -> str:
         return ""
     found = re.search(r"(\S+?\.so[.\d]*): cannot open shared object file", error)
     if not found:
-        return f"{module} does not load: {error.splitlines()[-1]}; install it again with: pip install --force-reinstall {module}"
+        return f"{module} does not load: {error.splitlines()[-1]}; install it again with: pip install --force-reinstall {distribution_of(module)}"
     others = [library for library in OPEN3D_NEEDS if module == "open3d" and library != found[1] and not loads(library)]
     libraries = [found[1], *others]
     packages = sorted({PACKAGES[library] for library in libraries if library in PACKAGES})

@@ -1,6 +1,6 @@
 """Open a run in rerun: frames, features, planes, axes, the map, the surface and the estimate against the truth.
 
-Needs rerun-sdk: pip install rerun-sdk. `trihedron export RUN --to rerun` writes the same to a file.
+Needs rerun: pip install 'trihedron[view]'. `trihedron export RUN --to rerun` writes the same to a file.
 
 Example: trihedron view runs/latest
 """
@@ -16,8 +16,8 @@ from trihedron.tools.export import RECORDING
 
 
 def main(argv: list[str]) -> int:
-    """Run the command; returns the exit code. Raises UsageError where rerun is not installed or its window does not open, RecordingError for a file
-    that cannot be read."""
+    """Run the command; returns the exit code. Raises LibraryError without rerun, UsageError where its window does not open, RecordingError for a
+    file that cannot be read."""
     from trihedron.pipeline.record.rerun_view import require_rerun
     from trihedron.tools.export_rerun import show
 

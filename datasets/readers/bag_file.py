@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from trihedron.pipeline.core.errors import RecordingError, TrihedronError, printable
 from trihedron.pipeline.core.files import MAX_YAML_BYTES, SHOWN, open_file, parse_yaml, read_text
 from trihedron.pipeline.core.layouts import METADATA_FILE
+from trihedron.pipeline.core.libraries import imports_of
 
 HEAD_BYTES = 12  # of each message, kept for its stamp
 OLD_TYPES = {"tf/msg/tfMessage": "tf2_msgs/msg/TFMessage"}  # ROS 1 -> the same message of ROS 2
@@ -48,7 +49,7 @@ class BagIndex:
 class BagFile:
     """A bag opened for reading, with the interface of `McapFile`. Messages of `kinds` are listed in one pass over the bag, and read by their time.
 
-    Raises RecordingError, one line, for whatever is wrong with a bag."""
+    Raises RecordingError, one line, for whatever is wrong with a bag, LibraryError without rosbags."""
 
     complete = True
 
@@ -57,7 +58,8 @@ class BagFile:
         self._kinds = kinds
         self._lock = threading.Lock()  # rosbags' readers have one position
         self._reader: Any
-        from rosbags import rosbag1, rosbag2  # a tenth of a second, which other data sets need not wait
+        with imports_of("rosbags"):
+            from rosbags import rosbag1, rosbag2  # a tenth of a second, which other data sets need not wait
 
         self._is_ros1 = not self.path.is_dir()
         with self._one_line_errors():
@@ -114,8 +116,9 @@ class BagFile:
         """The message as ROS 2 would have written it; empty where a message of ROS 1 is not of its type."""
         if not self._is_ros1:
             return bytes(data)
+        types = _types()
         try:
-            return bytes(_types().ros1_to_cdr(data, topic.kind))
+            return bytes(types.ros1_to_cdr(data, topic.kind))
         except Exception:  # the generated code raises anything
             return b""
 
@@ -132,7 +135,8 @@ class BagFile:
 
 @cache
 def _types() -> Any:
-    from rosbags.typesys import Stores, get_typestore
+    with imports_of("rosbags"):
+        from rosbags.typesys import Stores, get_typestore
 
     return get_typestore(Stores.ROS2_HUMBLE)
 

@@ -13,6 +13,7 @@ import cv2
 import numpy as np
 
 from trihedron.pipeline.core.errors import DataError
+from trihedron.pipeline.core.libraries import imports_of
 from trihedron.pipeline.core.options import Frames, PositiveInt, frame_range
 from trihedron.pipeline.core.registry import register
 from trihedron.pipeline.core.types import Camera, Frame, Trajectory
@@ -33,8 +34,8 @@ class Arrival(NamedTuple):
 @register("dataset", "realsense")
 @dataclass(frozen=True)
 class RealSense:
-    """A camera by itself (`pip install pyrealsense2`): frames come when they come, those for which a run is too late are dropped, and those taken
-    are embedded in the recording. Depth is registered to colour by the maker's library. Ends after `frames`, or with Ctrl-C."""
+    """A camera by itself (`pip install 'trihedron[realsense]'`): frames come when they come, those for which a run is too late are dropped, and
+    those taken are embedded in the recording. Depth is registered to colour by the maker's library. Ends after `frames`, or with Ctrl-C."""
 
     frames: Frames = ""  # 0:B, to end after frame B - 1; empty = until interrupted
     serial: str = ""  # of the camera, where there are several
@@ -51,7 +52,7 @@ class RealSense:
         return ENDLESS if stop is None else stop
 
     def start(self) -> None:
-        """Begin with frame 0. Raises DataError where the library or the camera is missing."""
+        """Begin with frame 0. Raises LibraryError without the maker's library, DataError without the camera."""
         self._stream.begin()
 
     def wait(self, after: int) -> Arrival | None:
@@ -73,10 +74,8 @@ class RealSense:
 
     @cached_property
     def _stream(self) -> _Stream:
-        try:
+        with imports_of("pyrealsense2"):
             import pyrealsense2
-        except ImportError as error:
-            raise DataError("dataset=realsense", "needs the package pyrealsense2, which is not installed", "pip install pyrealsense2") from error
         return _Stream(pyrealsense2, self)
 
 

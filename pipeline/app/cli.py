@@ -24,6 +24,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from trihedron.pipeline.core.errors import DataError, TrihedronError, UsageError, did_you_mean, printable
+from trihedron.pipeline.core.libraries import library_error
 from trihedron.pipeline.core.overrides import literal_text, path_of, with_literal_paths
 from trihedron.pipeline.run import memory
 from trihedron.pipeline.run.interrupts import Interruption, ending_signals_interrupt
@@ -97,7 +98,7 @@ def main(argv: list[str] | None = None) -> int:
 
 
 def _of_the_machine(error: Exception) -> TrihedronError | None:
-    """The error as one line where the user or the machine caused it: no memory, no thread, no room, no permission; None for a defect."""
+    """The error as one line where the user or the machine caused it: no memory, no thread, no room, no permission, no library; None for a defect."""
     if isinstance(error, TrihedronError):
         return error
     if isinstance(error, OSError) and error.strerror:
@@ -109,6 +110,8 @@ def _of_the_machine(error: Exception) -> TrihedronError | None:
         return DataError("memory", cause, "give the process more (ulimit -v), fewer threads=N, or smaller images")
     if isinstance(error, RuntimeError) and "home directory" in str(error):  # Path.expanduser
         return DataError("path", "begins with ~ and the name of nobody", "write ./~NAME for a file of that name")
+    if isinstance(error, ModuleNotFoundError) and (library := str(error.name).partition(".")[0]) != "trihedron":
+        return library_error(library, error)
     return None
 
 

@@ -22,6 +22,7 @@ from omegaconf.errors import ValidationError
 
 from trihedron.pipeline.core.errors import ConfigError, TrihedronError, UsageError, did_you_mean
 from trihedron.pipeline.core.graph import Graph, build_graph
+from trihedron.pipeline.core.libraries import library_error
 from trihedron.pipeline.core.overrides import with_literal_paths
 from trihedron.pipeline.core.registry import load_plugins, options_of, plugin_class, plugins_of
 from trihedron.pipeline.core.slots import SLOTS, Localising, default_wires
@@ -264,7 +265,7 @@ def rewritten(error: Exception) -> TrihedronError:
 
 def _unknown_option(group: str, name: str, options: list[str]) -> TrihedronError:
     if name.startswith("submitit"):
-        return ConfigError(group, f"{name} is not installed", "pip install hydra-submitit-launcher")
+        return library_error("hydra_plugins.hydra_submitit_launcher")
     what = f"there is no plugin '{name}' for the slot '{group}'" if group in SLOTS else f"there is no {group} '{name}'"
     return ConfigError(group, what, did_you_mean(name, options))
 

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from trihedron.pipeline.core.errors import UsageError
+from trihedron.pipeline.core.libraries import imports_of
 
 # Ten colours that are told apart (Okabe and Ito 2008, without black, and three more); the instances after the tenth begin again.
 PALETTE = np.array(
@@ -17,9 +17,10 @@ PALETTE = np.array(
 
 
 def mesh_to_open3d(vertices_m: NDArray[Any], triangles: NDArray[Any], colors: NDArray[np.uint8]) -> Any:
-    """Make an `open3d.geometry.TriangleMesh` of (v, 3) vertices, (t, 3) triangles and (v, 3) colours. Raises UsageError without Open3D."""
+    """Make an `open3d.geometry.TriangleMesh` of (v, 3) vertices, (t, 3) triangles and (v, 3) colours. Raises LibraryError without Open3D."""
     o3d = _open3d()
-    mesh = o3d.geometry.TriangleMesh(o3d.utility.Vector3dVector(_doubles(vertices_m)), o3d.utility.Vector3iVector(np.asarray(triangles, np.int32)))
+    corners = o3d.utility.Vector3iVector(np.array(triangles, np.int32, order="C"))
+    mesh = o3d.geometry.TriangleMesh(o3d.utility.Vector3dVector(_doubles(vertices_m)), corners)
     mesh.vertex_colors = o3d.utility.Vector3dVector(colors / 255.0)
     return mesh
 
@@ -32,7 +33,7 @@ def mesh_to_trimesh(vertices_m: NDArray[Any], triangles: NDArray[Any], colors: N
 
 
 def points_to_open3d(points_m: NDArray[Any], colors: NDArray[np.uint8] | None = None) -> Any:
-    """Make an `open3d.geometry.PointCloud` of (n, 3) points and (n, 3) colours. Raises UsageError without Open3D."""
+    """Make an `open3d.geometry.PointCloud` of (n, 3) points and (n, 3) colours. Raises LibraryError without Open3D."""
     o3d = _open3d()
     cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(_doubles(points_m)))
     if colors is not None:
@@ -54,12 +55,11 @@ def color_of_rows(rows: NDArray[Any]) -> NDArray[np.uint8]:
 
 
 def _open3d() -> Any:
-    try:
+    with imports_of("open3d"):
         import open3d
-    except ImportError as error:
-        raise UsageError("open3d", f"cannot be imported: {error}", "install it with: pip install open3d") from error
     return open3d
 
 
 def _doubles(points: NDArray[Any]) -> NDArray[np.float64]:
-    return np.ascontiguousarray(points, np.float64)
+    """Copy an array: those of a value are read-only, which Open3D refuses."""
+    return np.array(points, np.float64, order="C")

@@ -46,6 +46,10 @@ class RecordingError(TrihedronError):
     """A recording lacks a requested topic or frame, is damaged or of another version."""
 
 
+class LibraryError(TrihedronError):
+    """A library that is imported when it is needed is not installed, or does not load."""
+
+
 class StageError(TrihedronError):
     """A stage failed while the pipeline ran."""
 

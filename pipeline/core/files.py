@@ -81,7 +81,10 @@ def parse_yaml(text: str, max_depth: int = MAX_YAML_DEPTH) -> Any:
         raise
     except Exception as error:  # PyYAML raises ValueError, TypeError, OverflowError and others for scalars such as 2024-13-45
         mark = getattr(error, "problem_mark", None)
-        raise YamlError(f"that is not YAML ({type(error).__name__})", mark.line + 1 if mark else 0) from error
+        line = mark.line + 1 if mark else 0
+        if "nesting" in str(getattr(error, "problem", "")):  # libyaml refuses by itself since PyYAML 6.0.4
+            raise YamlError("with aliases or deep nesting", line) from None
+        raise YamlError(f"that is not YAML ({type(error).__name__})", line) from error
 
 
 @contextmanager

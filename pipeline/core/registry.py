@@ -11,7 +11,7 @@ from collections.abc import Callable
 from importlib.metadata import entry_points
 from typing import Any, TypeVar, get_type_hints
 
-from trihedron.pipeline.core.errors import PluginError, did_you_mean
+from trihedron.pipeline.core.errors import LibraryError, PluginError, did_you_mean
 from trihedron.pipeline.core.options import check_options
 from trihedron.pipeline.core.slots import FOLDS, RESERVED, SLOTS, inputs_of, method_of, output_of, strip_none
 
@@ -134,7 +134,7 @@ def load_plugins() -> None:
     for entry in entry_points(group=ENTRY_POINT_GROUP):
         try:
             entry.load()
-        except PluginError:
+        except (PluginError, LibraryError):
             raise
         except Exception as error:
             place = f"plugin package {entry.dist.name if entry.dist else entry.name} ({entry.value})"

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import importlib.util
 from typing import Any
 
 import numpy as np
 
 from trihedron.pipeline.core.building_geometry import MODEL_COLORS, parts_of, rings_of
-from trihedron.pipeline.core.errors import UsageError
+from trihedron.pipeline.core.libraries import imports_of
 from trihedron.pipeline.core.types import OK, Building, Camera, Frame, Keypoints, ManhattanFrame, Map, Planes, Pose, Segments, Surface, Value
 from trihedron.pipeline.record.foxglove_messages import AXES, COLORS
 
@@ -17,11 +16,9 @@ TIMES = "times"
 
 
 def require_rerun() -> Any:
-    """Import rerun. Raises UsageError when it is not installed."""
-    if importlib.util.find_spec("rerun") is None:
-        raise UsageError("rerun", "is not installed", "install it with: pip install rerun-sdk")
-    import rerun
-
+    """Import rerun. Raises LibraryError when it is not installed."""
+    with imports_of("rerun"):
+        import rerun
     return rerun
 
 

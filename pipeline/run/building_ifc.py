@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from trihedron.pipeline.core.building_geometry import SHEET_M, opening_name, rings_of, rooms_on, storey_levels
-from trihedron.pipeline.core.errors import UsageError
+from trihedron.pipeline.core.libraries import imports_of
 from trihedron.pipeline.core.types import F64, Building
 
 IFC = "model.ifc"
@@ -29,9 +29,9 @@ def has_ifc() -> bool:
 
 
 def write_ifc(path: Path, building: Building) -> None:
-    """Write the file. Raises UsageError where ifcopenshell is not installed."""
-    if not has_ifc():
-        raise UsageError(IFC, "needs ifcopenshell, which is not installed", "install it with: pip install 'trihedron[ifc]'")
+    """Write the file. Raises LibraryError where ifcopenshell is not installed."""
+    with imports_of("ifcopenshell"):
+        import ifcopenshell  # noqa: F401
     _IfcWriter(building).write(path)
 
 

@@ -20,6 +20,7 @@ from hydra.types import HydraContext, TaskFunction
 from omegaconf import DictConfig
 
 from trihedron.pipeline.core.errors import ConfigError
+from trihedron.pipeline.core.libraries import imports_of
 from trihedron.pipeline.sweep.jobs import DONE, FAILED, read_job, write_job
 
 ANSWER_SECONDS = 5.0  # a scheduler that is there answers within one
@@ -48,7 +49,8 @@ class Dask(Launcher):
 
     def _packed(self, words: list[str], number: int) -> bytes:
         """All that a job needs, to be read by `main`."""
-        import cloudpickle
+        with imports_of("cloudpickle"):
+            import cloudpickle
 
         packed: bytes = cloudpickle.dumps((number, words, self.hydra_context, self.config, self.task_function, Singleton.get_state()))
         return packed
@@ -59,13 +61,11 @@ class Dask(Launcher):
 
 
 def _connected(address: str) -> Any:
-    """A client of the scheduler. Raises ConfigError."""
+    """A client of the scheduler. Raises ConfigError, LibraryError."""
     if not address:
         raise ConfigError(PLACE, "is not given", f"give {PLACE}=tcp://HOST:8786, where `dask scheduler` runs")
-    try:
+    with imports_of("distributed"):
         from distributed import Client
-    except ImportError as error:
-        raise ConfigError("hydra.launcher", "Dask is not installed", "pip install distributed") from error
     try:
         return Client(address, timeout=ANSWER_SECONDS, set_as_default=False)
     except (OSError, ValueError) as error:

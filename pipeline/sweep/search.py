@@ -24,6 +24,7 @@ from omegaconf import DictConfig, OmegaConf
 from trihedron.pipeline.core.config import PLUGIN_KEY, graph_of
 from trihedron.pipeline.core.errors import ConfigError, UsageError, did_you_mean
 from trihedron.pipeline.core.graph import Graph
+from trihedron.pipeline.core.libraries import imports_of
 from trihedron.pipeline.run.results import METRICS, dotted
 from trihedron.pipeline.sweep.sweep import OUTCOMES, Outcome, Overrides, Sweeper, failure_of
 
@@ -151,10 +152,8 @@ def followers(graph: Graph, stages: list[str]) -> list[str]:
 
 
 def _optuna() -> Any:
-    try:
+    with imports_of("optuna"):
         import optuna
-    except ImportError as error:
-        raise ConfigError("hydra/sweeper", "Optuna is not installed", "pip install optuna") from error
     import warnings
 
     warnings.filterwarnings("ignore", category=optuna.exceptions.ExperimentalWarning)

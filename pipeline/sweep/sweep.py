@@ -30,6 +30,7 @@ from omegaconf import DictConfig
 
 from trihedron.pipeline.core.config import rewritten
 from trihedron.pipeline.core.errors import TrihedronError, UsageError
+from trihedron.pipeline.core.libraries import library_error
 from trihedron.pipeline.core.overrides import with_literal_paths
 from trihedron.pipeline.core.registry import load_plugins, options_of, plugins_of
 from trihedron.pipeline.core.slots import SLOTS
@@ -139,6 +140,8 @@ class Sweeper(HydraSweeper):
             self._launch_apart(missing, error)
         except TrihedronError:
             raise
+        except ModuleNotFoundError as error:  # the launcher's
+            raise library_error((error.name or "").partition(".")[0], error) from error
         except Exception as error:  # of the engine; a job that fails leaves the reason in its folder
             raise _given_up(error) from error
         for words, folder in missing:

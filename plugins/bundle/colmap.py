@@ -15,6 +15,7 @@ from trihedron.pipeline.core.types import I32, Correction, Map
 from trihedron.plugins.bundle.common import BundleMeasurements, BundleState, BundleWindow, bundle_problem, bundle_window, free_poses
 from trihedron.plugins.mapping.covisibility_graph import newest_keyframes
 from trihedron.plugins.mapping.landmarks import ENDPOINTS, POSITION
+from trihedron.plugins.shared import libraries
 from trihedron.plugins.shared.linalg import transform_plane_covariance
 
 
@@ -45,8 +46,7 @@ class Colmap:
 
 def solve_colmap(state: BundleState, seen: BundleMeasurements, iterations: int, loss_px: float) -> BundleState:
     """Adjust the free keyframes and the points observed at least twice with COLMAP; a `loss_px` of 0 is least squares."""
-    import pycolmap
-
+    pycolmap = libraries.pycolmap()
     reconstruction, points = _reconstruction(state, seen)
     config = pycolmap.BundleAdjustmentConfig()
     for k in range(len(state.rotations)):
@@ -74,8 +74,7 @@ def solve_colmap(state: BundleState, seen: BundleMeasurements, iterations: int, 
 
 def _reconstruction(state: BundleState, seen: BundleMeasurements) -> tuple[Any, dict[int, int]]:
     """Convert the problem to COLMAP's, keyframe k as image k + 1 with a camera of its own; also COLMAP's id of each point observed twice."""
-    import pycolmap
-
+    pycolmap = libraries.pycolmap()
     reconstruction, points = pycolmap.Reconstruction(), {}
     place = np.zeros(len(seen.pixels), np.int64)  # of each observation within its image
     for k, (R, t) in enumerate(zip(state.rotations, state.positions)):

@@ -53,7 +53,7 @@ class Network:
 
     @staticmethod
     def opened(slot: str, path: str, sha256: str) -> Network:
-        """Open the file of the option `SLOT.model`. Raises ConfigError where it is not given, missing, another one, or no network, and PluginError
+        """Open the file of the option `SLOT.model`. Raises ConfigError where it is not given, missing, another one, or no network, and LibraryError
         without ONNX Runtime."""
         place = f"{slot}.model"
         if not path:

@@ -22,7 +22,7 @@ def depth_cells(frame: Frame, stride: int) -> tuple[I32, I32, F64]:
 def point_cloud(points_m: F64) -> Any:
     """An Open3D cloud of points (n, 3)."""
     library = open3d()
-    return library.geometry.PointCloud(library.utility.Vector3dVector(np.ascontiguousarray(points_m, np.float64)))
+    return library.geometry.PointCloud(library.utility.Vector3dVector(np.array(points_m, np.float64, order="C")))
 
 
 def cloud_with_normals(points_m: F64) -> Any:

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import numpy as np
 
-from trihedron.pipeline.core.options import NonNegativeFloat, PositiveFloat, Range, Share
+from trihedron.pipeline.core.options import NonNegativeFloat, PositiveFloat, Range
 from trihedron.pipeline.core.registry import register
 from trihedron.pipeline.core.types import F64, I32, Map, Surface
 from trihedron.plugins.shared.keyframe_views import KeyframeView
@@ -22,14 +22,14 @@ LEAST = 100  # points of a cloud
 @dataclass(frozen=True)
 class Open3dPoisson(ViewFold):
     """`open3d.geometry.TriangleMesh.create_from_point_cloud_poisson` (screened Poisson: Kazhdan and Hoppe, ToG 2013) of the readings of the retained
-    views, thinned to `voxel_m`, with Open3D's normals; vertices that few readings support are removed, for Poisson closes every hole. No planes.
+    views, thinned to `voxel_m`, with Open3D's normals; vertices far from every reading are removed, for Poisson closes every hole. No planes.
 
     Library: Open3D (MIT; Zhou, Park, Koltun, arXiv:1801.09847), one thread. The bytes may differ on another CPU."""
 
     voxel_m: PositiveFloat = 0.02  # side of the cells in which readings are averaged
     depth: Annotated[int, Range(1, 12)] = 8  # of the octree
     scale: PositiveFloat = 1.1  # of the reconstruction cube
-    least_density: Share = 0.05  # quantile of the density below which vertices are removed
+    max_distance_m: PositiveFloat = 0.04  # to the nearest reading, beyond which vertices are removed
     point_weight: NonNegativeFloat = 2.0  # of the screening
 
     def finish(self, state: Gathered, map: Map | None) -> Surface:
@@ -39,6 +39,8 @@ class Open3dPoisson(ViewFold):
 
     def _mesh(self, views: list[tuple[KeyframeView, F64]]) -> tuple[F64, I32]:
         """Vertices (v, 3) and triangles (t, 3)."""
+        from scipy.spatial import cKDTree
+
         geometry, cloud = open3d().geometry, open3d().geometry.PointCloud()
         for view, T in views:
             points = _points(view)
@@ -48,9 +50,9 @@ class Open3dPoisson(ViewFold):
         if len(cloud.points) < LEAST:
             return np.empty((0, 3)), np.empty((0, 3), np.int32)
         options = {"depth": self.depth, "scale": self.scale, "n_threads": 1, "point_weight": self.point_weight}
-        mesh, density = geometry.TriangleMesh.create_from_point_cloud_poisson(cloud, **options)
-        support = np.asarray(density)
-        mesh.remove_vertices_by_mask(support < np.quantile(support, self.least_density))
+        mesh, _ = geometry.TriangleMesh.create_from_point_cloud_poisson(cloud, **options)
+        distance_m, _ = cKDTree(np.asarray(cloud.points)).query(np.asarray(mesh.vertices))
+        mesh.remove_vertices_by_mask(distance_m > self.max_distance_m)
         return np.asarray(mesh.vertices, np.float64), np.asarray(mesh.triangles, np.int32)
 
 

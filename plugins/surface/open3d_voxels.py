@@ -27,7 +27,7 @@ class Open3dVoxels(ViewFold):
     voxel_m: PositiveFloat = 0.02
     truncation_voxels: PositiveFloat = 4.0  # trunc_voxel_multiplier
     blocks: PositiveInt = 10000  # of 16³ voxels, reserved
-    least_weight: PositiveFloat = 1.0  # weight_threshold, in readings
+    least_weight: PositiveFloat = 1.0  # readings of a voxel, of which fewer are none
 
     def finish(self, state: Gathered, map: Map | None) -> Surface:
         """The zero level of the distances, coloured by the views."""
@@ -47,8 +47,9 @@ class Open3dVoxels(ViewFold):
             used = self._integrate(library, grid, view, T) or used
         if not used:
             return nothing
+        below = float(np.nextafter(np.float32(self.least_weight), np.float32(0.0)))  # a voxel of the threshold itself is not used
         try:
-            mesh = grid.extract_triangle_mesh(weight_threshold=self.least_weight)
+            mesh = grid.extract_triangle_mesh(weight_threshold=below)
         except RuntimeError:  # Open3D's answer to a volume without a surface
             return nothing
         if "indices" not in mesh.triangle or not len(mesh.triangle.indices):

@@ -21,7 +21,7 @@ def shared_data() -> Path:
     """The folder of published sequences beside the repository."""
     path = Path(__file__).resolve().parents[2].parent / "shared" / "data"
     if not path.is_dir():
-        pytest.skip(f"no published sequences at {path}")
+        pytest.skip(f"{path} is not beside this checkout")
     return path
 
 

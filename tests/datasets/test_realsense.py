@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from trihedron.datasets.readers.realsense import RealSense
-from trihedron.pipeline.core.errors import DataError
+from trihedron.pipeline.core.errors import DataError, LibraryError
 from trihedron.pipeline.run.live import is_camera
 
 SPACE_S = 0.01
@@ -123,6 +123,6 @@ def test_refusals(library: None, monkeypatch: pytest.MonkeyPatch) -> None:
     with pytest.raises(ValueError, match="frames: a camera begins with frame 0"):
         RealSense(frames="3:")
     monkeypatch.setitem(sys.modules, "pyrealsense2", None)
-    with pytest.raises(DataError) as caught:
+    with pytest.raises(LibraryError) as caught:
         RealSense().start()
-    assert str(caught.value) == "dataset=realsense: needs the package pyrealsense2, which is not installed; pip install pyrealsense2"
+    assert str(caught.value) == "pyrealsense2: is not installed; install it with: pip install 'trihedron[realsense]'"

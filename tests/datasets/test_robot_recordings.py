@@ -17,6 +17,7 @@ from rosbags.rosbag2.enums import CompressionMode
 
 from trihedron.datasets.readers.folder import Folder
 from trihedron.datasets.readers.mcap import McapDataset
+from trihedron.pipeline.app.cli import main
 from trihedron.pipeline.core.errors import DataError, RecordingError
 from trihedron.pipeline.core.geometry import exp_se3, invert
 from trihedron.tools.convert import layout_of
@@ -102,6 +103,16 @@ def test_bags_with_messages_of_one_time_and_topics_of_other_types(tmp_path: Path
     check_registered(McapDataset(str(path)))
     with pytest.raises(DataError, match="the topic '/point' holds other things"):
         len(McapDataset(str(path), color_topic="/point"))
+
+
+@pytest.mark.parametrize("write", [lambda path: write_ros1(path / "a.bag", registered()), lambda path: write_sqlite(path / "a", registered())])
+def test_without_rosbags_a_bag_is_not_called_unreadable(tmp_path: Path, write, monkeypatch, capsys) -> None:
+    path = write(tmp_path)
+    monkeypatch.setitem(sys.modules, "rosbags", None)
+    assert main(["run", str(path), "outputs=[keypoints]", f"out={tmp_path / 'out'}"]) == 1
+    chosen, error = capsys.readouterr().err.splitlines()
+    assert chosen == f"dataset=mcap dataset.path={path}"
+    assert error == "trihedron: rosbags: is not installed; install it with: pip install rosbags"
 
 
 def test_a_damaged_bag_is_one_line(tmp_path: Path) -> None:

@@ -51,7 +51,6 @@ def threads_of(folder):
 @pytest.fixture(scope="module")
 def scheduler(tmp_path_factory):
     """The address of a Dask scheduler with one worker, on the loopback interface."""
-    pytest.importorskip("distributed", reason="needs trihedron[cluster]")
     folder = tmp_path_factory.mktemp("dask")
     dask = [sys.executable, "-m", "dask"]
     quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL, "cwd": folder}
@@ -84,7 +83,6 @@ def test_a_dask_scheduler_runs_what_is_missing_and_a_job_that_fails_stops_no_oth
 
 @pytest.mark.slow
 def test_submitit_runs_the_jobs_as_it_would_on_slurm(tmp_path, capfd):
-    pytest.importorskip("submitit", reason="needs trihedron[cluster]")
     words = ["run", "-m", *QUICK, "hydra/launcher=submitit_local", "hydra.launcher.cpus_per_task=2", f"out={tmp_path}"]
     assert main([*words, "seed=0,-1"]) == 1
     said = capfd.readouterr().err
@@ -108,7 +106,6 @@ def kill_one(program, folder):
 @pytest.mark.parametrize("engine", ["submitit", "dask"])
 def test_a_job_whose_process_dies_is_waited_for_by_no_other_and_stops_none(engine, request, tmp_path, capfd, monkeypatch):
     """It dies before it could say anything, and has its row."""
-    pytest.importorskip("submitit", reason="needs trihedron[cluster]")
     monkeypatch.chdir(tmp_path)
     if engine == "dask":
         program, cause = "trihedron.pipeline.sweep.cluster", "the job's process ended with -9"
@@ -135,7 +132,6 @@ def free_port():
 @pytest.fixture(scope="module")
 def slurm(tmp_path_factory):
     """The folder of a SLURM of this machine alone, on the loopback interface: its own key, controller and one node."""
-    pytest.importorskip("submitit", reason="needs trihedron[cluster]")
     programs = [shutil.which(name, path=os.environ["PATH"] + ":/usr/sbin") for name in ("munged", "slurmctld", "slurmd", "sbatch")]
     if not all(programs):
         pytest.skip("needs SLURM: apt-get install slurm-wlm munge")
@@ -195,7 +191,6 @@ def test_slurm_runs_what_is_missing_and_a_job_that_fails_stops_no_other(slurm, t
     ],
 )
 def test_a_wrong_address_is_one_line(address, said, tmp_path, capfd):
-    pytest.importorskip("distributed", reason="needs trihedron[cluster]")
     assert main(["run", "-m", *QUICK, "hydra/launcher=dask", f"hydra.launcher.address={address}", f"out={tmp_path}"]) == 1
     lines = capfd.readouterr().err.splitlines()
     assert len(lines) == 1 and lines[0].startswith(said)

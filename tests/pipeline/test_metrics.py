@@ -80,7 +80,7 @@ def test_equal_to_evo_where_truth_is_faster_and_shifted_in_time():
 @pytest.mark.parametrize(("name", "fps"), [("tum_fr3_structure_notexture_far", 30.0), ("icl_office_rendered", 30.0), ("icl_nuim_of_kt3", 30.0)])
 def test_equal_to_evo_on_real_ground_truth(name, fps):
     if not (SHARED / name).is_dir():
-        pytest.skip(f"{SHARED / name} is not there")
+        pytest.skip(f"{name} is not beside this checkout")
     truth = read_trajectory(SHARED / name / "groundtruth.txt")
     listed = SHARED / name / "depth.txt"
     if listed.is_file():  # at the images' stamps, two of three and with the frames the sensor dropped

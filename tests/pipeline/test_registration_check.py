@@ -47,7 +47,7 @@ def test_depth_of_another_camera_is_named_once():
 def test_the_kitchen_of_7_scenes(caplog):
     folder = Path(__file__).resolve().parents[2].parent / "shared" / "data" / "seven_scenes_kitchen"
     if not folder.is_dir():
-        pytest.skip("no published sequences")
+        pytest.skip(f"{folder.name} is not beside this checkout")
     dataset = SevenScenes(str(folder))
     first = dataset(0)
     assert len(dataset) == 160 and (first.index, first.stamp_ns) == (0, 13_333_333_333) and dataset.truth() is not None

@@ -13,7 +13,6 @@ from trihedron.pipeline.core.errors import UsageError
 from trihedron.pipeline.core.registry import load_plugins
 from trihedron.pipeline.sweep.search import Trial, _distribution, _is_searched, _judged, followers
 
-pytest.importorskip("optuna", reason="needs trihedron[search]")
 ROOM = ["dataset.width=160", "dataset.height=120", "dataset.length=8"]
 SEARCH = ["run", "-m", "hydra/sweeper=optuna", "hydra/launcher=basic", "hydra.sweeper.trials=3"]
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.util
 import json
 import socket
 import struct
@@ -157,7 +156,6 @@ class SlowStream:
         """Nothing waits."""
 
 
-@pytest.mark.skipif(importlib.util.find_spec("rerun") is None, reason="rerun is not installed")
 def test_a_slow_viewer_does_not_slow_the_run() -> None:
     stream = SlowStream()
     sink = RerunSink(stream)
@@ -168,7 +166,6 @@ def test_a_slow_viewer_does_not_slow_the_run() -> None:
     assert stream.logged > 0
 
 
-@pytest.mark.skipif(importlib.util.find_spec("rerun") is None, reason="rerun is not installed")
 def test_rerun_has_everything(tmp_path: Path) -> None:
     import rerun
 

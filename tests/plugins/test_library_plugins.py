@@ -32,7 +32,6 @@ def scene(outliers):
 
 
 def test_colmap_recovers_a_pose_among_outliers_with_pixel_centres_at_integers():
-    pytest.importorskip("pycolmap", exc_type=ImportError)
     from trihedron.plugins.shared.pycolmap_pose import absolute_pose
 
     points, pixels, R, t = scene(outliers=60)
@@ -47,7 +46,6 @@ def test_colmap_recovers_a_pose_among_outliers_with_pixel_centres_at_integers():
 @pytest.mark.parametrize(("keypoints", "median_deg"), [("opencv_orb", 0.6), ("sift", 0.1)])
 def test_colmap_tracks_with_descriptors_of_either_metric(keypoints, median_deg):
     """OpenCV's ORB places corners to whole pixels of a pyramid level, several of the image."""
-    pytest.importorskip("pycolmap", exc_type=ImportError)
     data = Synthetic(length=8, width=320, height=240)
     tracks = values_of(PluginCheck("tracks", "pycolmap_pnp").plugin, "tracks", room((f"keypoints={keypoints}",)))
     assert tracks[0] is None and all(len(found.keypoints) >= 30 for found in tracks[1:])
@@ -55,16 +53,20 @@ def test_colmap_tracks_with_descriptors_of_either_metric(keypoints, median_deg):
     assert np.median([rotation_angle_deg(found.R_current_previous @ T[:3, :3].T) for found, T in zip(tracks[1:], truths)]) < median_deg
 
 
-@pytest.mark.parametrize(("name", "words"), [("open3d_voxels", ()), ("open3d_poisson", ("surface.depth=7",))])
-def test_surfaces_of_open3d_lie_on_the_depth(name, words):
-    pytest.importorskip("open3d", exc_type=ImportError)
-    seen = room(())
-    (mesh,) = values_of(PluginCheck("surface", name, words).plugin, "surface", seen)
-    frame, pose = seen.values[0]["dataset"], seen.values[0]["pose"].T_world_camera
+def world_points(frame, T):
+    """(n, 3) all readings of a frame."""
     rows, columns = np.nonzero(frame.depth_m > 0.0)
     points = frame.camera.back_project(np.stack([columns, rows], axis=1).astype(float), frame.depth_m[rows, columns].astype(float))
-    distance, _ = cKDTree(points @ pose[:3, :3].T + pose[:3, 3]).query(mesh.vertices_m)
-    assert len(mesh.triangles) > 5000 and np.median(distance) < 0.02
+    return points @ T[:3, :3].T + T[:3, 3]
+
+
+@pytest.mark.parametrize(("name", "words", "furthest_m"), [("open3d_voxels", (), 0.1), ("open3d_poisson", ("surface.depth=7",), 0.045)])
+def test_surfaces_of_open3d_lie_on_the_depth_and_end_with_it(name, words, furthest_m):
+    seen = room(())
+    (mesh,) = values_of(PluginCheck("surface", name, words).plugin, "surface", seen)
+    tree = cKDTree(np.concatenate([world_points(values["dataset"], values["pose"].T_world_camera) for values in seen.values]))
+    distance, _ = tree.query(mesh.vertices_m)
+    assert len(mesh.triangles) > 5000 and np.median(distance) < 0.01 and distance.max() < furthest_m
     assert (mesh.instances == -1).all() and not (mesh.colors == 128).all()
 
 
@@ -77,8 +79,6 @@ def test_words_are_made_of_binary_and_of_histogram_descriptors():
 
 @pytest.mark.slow
 def test_the_system_of_libraries_tracks_the_room(tmp_path):
-    for module in ("open3d", "pycolmap"):
-        pytest.importorskip(module, exc_type=ImportError)
     words = ["graph=libraries", "dataset.length=40", "outputs=[trajectory,surface]", f"out={tmp_path}"]
     done = subprocess.run([sys.executable, "-c", PROGRAM, "run", *words], capture_output=True, text=True)
     assert done.returncode == 0, done.stderr

@@ -7,20 +7,17 @@ from functools import partial
 
 import numpy as np
 import pytest
+from small_networks import answering, corner_detector, nearest_matcher, network_words
 
 from trihedron.datasets.simulation.synthetic import Synthetic
 from trihedron.pipeline.app.cli import main
-from trihedron.pipeline.core.errors import ConfigError
+from trihedron.pipeline.core.errors import ConfigError, LibraryError
 from trihedron.pipeline.record.reader import Recording
 from trihedron.plugins.keypoints.onnx import OnnxKeypoints
 from trihedron.plugins.lines.onnx import LineOutput, OnnxLines
 from trihedron.plugins.normals.onnx import OnnxNormals
 from trihedron.plugins.planes.onnx import OnnxPlanes
 from trihedron.plugins.shared.networks import bytes_of, vectors_of
-
-pytest.importorskip("onnx", exc_type=ImportError)
-pytest.importorskip("onnxruntime", exc_type=ImportError)
-from small_networks import answering, corner_detector, nearest_matcher, network_words
 
 ROOM = ["dataset.width=320", "dataset.height=240", "dataset.length=20"]
 FRAME = Synthetic(length=2, width=320, height=240)(0)
@@ -93,8 +90,9 @@ def test_a_wrong_network_is_one_line(change, message, tmp_path):
 def test_without_onnx_runtime_it_is_one_line(tmp_path, monkeypatch):
     corners = corner_detector(tmp_path / "corners.onnx")
     monkeypatch.setitem(sys.modules, "onnxruntime", None)
-    with pytest.raises(Exception, match=r"^onnxruntime: is not installed; install it with: pip install 'onnxruntime'$"):
+    with pytest.raises(LibraryError) as error:
         OnnxKeypoints(model=str(corners))(FRAME)
+    assert str(error.value) == "onnxruntime: is not installed; install it with: pip install 'trihedron[onnx]'"
 
 
 def test_key_points_are_where_the_network_says(tmp_path):

@@ -28,18 +28,11 @@ WORDS = {  # so that little work is done, or any at all
     ("surface", "open3d_poisson"): ["surface.depth=5"],
     ("loop", "bag_of_words"): ["loop.away_m=0.01", "loop.every=1", "loop.shared=100000", *KEYFRAMES],
 }
-FOREIGN = {"bundle=colmap": "pycolmap", **dict.fromkeys(("tracks=pycolmap_pnp", "relocalise=pycolmap_pnp"), "pycolmap")}
 
 
 def words_for(slot, name, folder):
-    """Words with which a plugin is checked; skips where its library is not there."""
-    module = "open3d" if "open3d" in name else "onnxruntime" if name.startswith("onnx") else FOREIGN.get(f"{slot}={name}")
-    if module is not None:
-        pytest.importorskip(module, exc_type=ImportError)
-    if name.startswith("onnx"):
-        pytest.importorskip("onnx", exc_type=ImportError)
-        return network_words(slot, folder)
-    return WORDS.get((slot, name), [])
+    """Words with which a plugin is checked."""
+    return network_words(slot, folder) if name.startswith("onnx") else WORDS.get((slot, name), [])
 
 
 def wrong(results):

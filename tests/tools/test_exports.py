@@ -1,7 +1,6 @@
 """What other programs read of a run: trajectories, tables, COLMAP models, rerun."""
 
 import csv
-import importlib.util
 import subprocess
 import sys
 
@@ -85,10 +84,13 @@ def test_colmap_models_read_back(run, capsys):
 def test_what_cannot_be_exported_is_one_line(run, tmp_path, monkeypatch, capsys):
     assert main(["export", str(run), "--to", "colmpa"]) == 2
     assert capsys.readouterr().err == "trihedron: export: there is no format 'colmpa'; did you mean 'colmap'?\n"
-    monkeypatch.setattr(rerun_view.importlib.util, "find_spec", lambda name: None)
+    monkeypatch.setitem(sys.modules, "rerun", None)
+    monkeypatch.setitem(sys.modules, "pycolmap", None)
     for command in (["view", str(run)], ["export", str(run), "--to", "rerun", "--out", str(tmp_path / "a.rrd")]):
-        assert main(command) == 2
-        assert capsys.readouterr().err == "trihedron: rerun: is not installed; install it with: pip install rerun-sdk\n"
+        assert main(command) == 1
+        assert capsys.readouterr().err == "trihedron: rerun-sdk: is not installed; install it with: pip install 'trihedron[view]'\n"
+    assert main(["export", str(run), "--to", "colmap", "--out", str(tmp_path / "colmap")]) == 1
+    assert capsys.readouterr().err == "trihedron: pycolmap: is not installed; install it with: pip install pycolmap\n"
 
 
 class Windowless:
@@ -114,7 +116,6 @@ def test_a_viewer_that_does_not_open_is_one_line(run, monkeypatch, capsys):
     assert printed.err == f"trihedron: rerun: {line}\n" and printed.out == ""
 
 
-@pytest.mark.skipif(importlib.util.find_spec("rerun") is None, reason="rerun is not installed (the extra `view`)")
 def test_a_file_for_rerun_is_whole_and_holds_everything(run):
     assert main(["export", str(run), "--to", "rerun"]) == 0
     command = [sys.executable, "-m", "rerun", "rrd"]

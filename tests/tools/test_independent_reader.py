@@ -122,7 +122,7 @@ def test_the_layout_is_one(tmp_path):
 
 @pytest.mark.slow
 def test_a_run_is_read_by_others_and_holds_what_the_layout_shows(reader, tmp_path):
-    words = ["dataset=faults", "dataset.of=synthetic", "dataset.frames=0:60", "dataset.cover=30:40", "outputs=[trajectory,surface]"]
+    words = ["dataset=faults", "dataset.of=synthetic", "dataset.frames=0:60", "dataset.cover=30:40", "outputs=[trajectory,surface,building]"]
     words += [f"out={tmp_path}/run"]
     done = subprocess.run([sys.executable, "-c", RUN, *words], capture_output=True, text=True)
     assert done.returncode == 0, done.stderr

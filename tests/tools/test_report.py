@@ -51,7 +51,7 @@ def test_a_browser_draws_it(page):
     """Without a complaint, and all figures are to be seen: both runs' colours below the legends, and the surface as an area."""
     browser = shutil.which("chromium") or shutil.which("google-chrome")
     if browser is None:
-        pytest.skip("no chromium or google-chrome here")
+        pytest.skip("no chromium or google-chrome here; install it with: apt-get install chromium")
     told, picture = page.with_name("told.html"), page.with_name("picture.png")
     told.write_text(page.read_text().replace("</body>", PLACES + "</body>"))
     options = ["--headless", "--no-sandbox", "--enable-unsafe-swiftshader", "--enable-logging=stderr", "--virtual-time-budget=8000"]

@@ -26,7 +26,8 @@ def test_an_unknown_library_and_another_error():
     found = system_check.check("cv2", lambda _: LOADER.format("libfoo.so.3"))
     assert found == "cv2 needs libfoo.so.3; find the Debian package that holds it with: apt-file search libfoo.so.3"
     found = system_check.check("cv2", lambda _: "Traceback ...\nModuleNotFoundError: No module named 'cv2'")
-    assert found == "cv2 does not load: ModuleNotFoundError: No module named 'cv2'; install it again with: pip install --force-reinstall cv2"
+    cure = "install it again with: pip install --force-reinstall opencv-contrib-python-headless"
+    assert found == f"cv2 does not load: ModuleNotFoundError: No module named 'cv2'; {cure}"
 
 
 def test_a_module_that_loads():
@@ -40,4 +41,4 @@ def test_only_a_required_module_is_an_error(monkeypatch, capsys, required, code,
     monkeypatch.setattr(system_check, "OPTIONAL", () if required else ("no_such_module",))
     assert system_check.main() == code
     said = "trihedron: no_such_module does not load: ModuleNotFoundError: No module named 'no_such_module'; "
-    assert capsys.readouterr().err == said + "install it again with: pip install --force-reinstall no_such_module" + remark + "\n"
+    assert capsys.readouterr().err == said + "install it again with: pip install --force-reinstall no-such-module" + remark + "\n"
