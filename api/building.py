@@ -14,7 +14,7 @@ from trihedron.pipeline.core.building_geometry import rings_of
 from trihedron.pipeline.core.errors import DataError, UsageError
 from trihedron.pipeline.core.types import F64, OPENING_KINDS, Pose
 
-OPEN_SIGMA_M = 0.05  # of an edge that nothing bounds
+OPEN_SIGMA_M = 0.05  # of an edge that nothing bounds, and of where a wall was last seen
 PARALLEL_DEG = 5.0  # between walls that have a distance
 BELOW_M = 0.3  # below its floor that a storey begins
 
@@ -250,7 +250,8 @@ class Building:
             after, before = a + (j - a + 1) % (b - a), a + (j - a - 1) % (b - a)
             p, q = self.plan.corners_m[j], self.plan.corners_m[after]
             sines = np.abs(np.sin(_turns(self.plan.corners_m[a:b])))[[j - a, after - a]]
-            sigma = np.hypot(self._edge_sigma(before) / max(sines[0], 0.1), self._edge_sigma(after) / max(sines[1], 0.1))
+            ends = [OPEN_SIGMA_M if sine < 0.1 else self._edge_sigma(k) / sine for sine, k in zip(sines, (before, after))]
+            sigma = np.hypot(ends[0], ends[1])
             wall = int(self.plan.corner_walls[j])
             found.append(Edge(p, q, Measurement(float(np.linalg.norm(q - p)), float(sigma)), wall if wall >= 0 else None))
         return found

@@ -8,10 +8,14 @@ import pytest
 import trihedron  # noqa: F401  # before NumPy, so that OpenBLAS rounds alike in all processes
 
 os.environ["TRIHEDRON_COMPILE"] = "0"
+SLOW_S = 3600  # limit of a slow test that states none; the others have that of pyproject.toml
 ON_OPEN3D = re.compile(r"open3d|\b(graph=)?libraries\b")
 
 
 def pytest_collection_modifyitems(items):
+    for item in items:
+        if item.get_closest_marker("slow") and not item.get_closest_marker("timeout"):
+            item.add_marker(pytest.mark.timeout(SLOW_S))
     try:
         import open3d  # noqa: F401
     except ImportError as error:

@@ -4,13 +4,14 @@ import os
 import re
 import subprocess
 import sys
-from importlib.metadata import version
+from importlib.metadata import packages_distributions, version
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
 import yaml
+from packaging.requirements import Requirement
 from setuptools.config.pyprojecttoml import load_file
 
 from trihedron.tools.system_check import OPEN3D_NEEDS, PACKAGES
@@ -132,3 +133,24 @@ def test_decisions_are_short_records_listed_in_order():
         order = ["Context", "Decision", "Measurement", "Limits", "Rejected"]
         assert "Decision" in headings and headings == [heading for heading in order if heading in headings], f"{path}: {headings}"
         assert len(text.split()) < 600, f"{path}: {len(text.split())} words"
+
+
+CHOSEN_BY_NAME = {"hydra-joblib-launcher": "joblib", "hydra-submitit-launcher": "submitit"}  # plugins of Hydra -> the module that is named
+
+
+def unused(requirements):
+    """Those of which no module is imported, or named to be imported, in the program."""
+    text = "\n".join(path.read_text() for folder in ("pipeline", "plugins", "datasets", "tools", "api") for path in (ROOT / folder).rglob("*.py"))
+    used = set(re.findall(r"^\s*(?:import|from)\s+(\w+)", text, re.M)) | set(re.findall(r"""["'](\w+)(?:\.\w+)*["']""", text))
+    modules = {}
+    for module, distributions in packages_distributions().items():
+        for distribution in distributions:
+            modules.setdefault(distribution.lower().replace("_", "-"), set()).add(module)
+    names = [Requirement(line).name.lower().replace("_", "-") for line in requirements]
+    return [name for name in names if name in modules and not (modules[name] | {CHOSEN_BY_NAME.get(name, name)}) & used]
+
+
+def test_every_dependency_is_imported():
+    assert len(PROJECT["dependencies"]) > 20 and unused(PROJECT["dependencies"]) == []
+    assert [name for extra in ("onnx", "view", "ifc", "cluster", "search") for name in unused(PROJECT["optional-dependencies"][extra])] == []
+    assert "pytest" in unused(["pytest>=8", "numpy"]) and "numpy" not in unused(["numpy"])  # and it can fail

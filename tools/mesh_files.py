@@ -28,7 +28,7 @@ def read_mesh(path: Path) -> tuple[F64, I32]:
         points = np.asarray(found.vertices, np.float64).reshape(-1, 3)
         triangles = np.asarray(getattr(found, "faces", np.empty((0, 3))), np.int64).reshape(-1, 3)
     except Exception as error:  # trimesh raises anything for a damaged file
-        raise DataError(str(path), f"is not a mesh: {printable(str(error), 2 * SHOWN)}", CURE) from error
+        raise DataError(str(path), f"is not a mesh: {printable(str(error) or type(error).__name__, 2 * SHOWN)}", CURE) from error
     if not np.isfinite(points).all():
         raise DataError(str(path), "has a vertex that is not finite", "the file is damaged; write it again")
     if len(triangles) and (triangles.min() < 0 or triangles.max() >= len(points)):

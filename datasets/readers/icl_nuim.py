@@ -107,7 +107,7 @@ def _truth_file(folder: Path) -> Trajectory | None:
 
 def _png_reader(calibration: Calibration) -> DepthReader:
     def read(path: Path) -> F32:
-        depth = read_depth(path, calibration.depth_scale, calibration.depth_offset)
+        depth = read_depth(path, calibration.depth_scale)
         depth[depth < MIN_DEPTH_M] = 0.0
         return depth
 

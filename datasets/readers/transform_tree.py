@@ -10,7 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from trihedron.datasets.readers.robot_values import Link
-from trihedron.pipeline.core.geometry import exp_so3, invert, log_so3, pose_matrix
+from trihedron.pipeline.core.geometry import invert, pose_matrix
+from trihedron.pipeline.core.lie import exp_so3, log_so3
 from trihedron.pipeline.core.types import F64
 
 

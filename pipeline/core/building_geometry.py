@@ -100,14 +100,39 @@ def _unseen_at(building: Building, wall: Any, corner: F64) -> bool:
     return any(low - 0.05 <= t <= high + 0.05 for of, low, high in building.unseen if int(of) == wall)
 
 
+def door_swing(building: Building, opening: int) -> F64:
+    """Return the corners (4, 2) of the square in which a door's leaf is drawn: hinge, other jamb, and both a leaf's width before the wall's face."""
+    left, right = building.spans_m[opening]
+    hinge, jamb, _, back = quad(building, int(building.opening_walls[opening]), float(left), float(right))
+    out = (hinge - back) / max(float(np.linalg.norm(hinge - back)), 1e-9) * float(right - left)
+    return np.array([hinge, jamb, jamb + out, hinge + out])
+
+
+def doors_on(building: Building, storey: int) -> list[int]:
+    """Return the doors of a storey."""
+    return [k for k, wall in enumerate(building.opening_walls) if building.wall_storeys[wall] == storey and _is_door(building, k)]
+
+
+def _is_door(building: Building, opening: int) -> bool:
+    return OPENING_KINDS[building.opening_kinds[opening]] == "door"
+
+
+WIDE = 2.0  # times as wide as high is a label
+
+
 def label_place(building: Building, room: int) -> F64:
-    """Return a place (2,) well inside a room, for its name."""
+    """Return a place (2,) well inside a room and beside the swings of its doors, for its name."""
     import shapely
+    from shapely.affinity import scale
 
     rings = rings_of(building, room)
     polygon = shapely.make_valid(shapely.Polygon(rings[0], rings[1:]))
-    place = shapely.maximum_inscribed_circle(polygon, 0.05).coords[0] if not polygon.is_empty else rings[0].mean(axis=0)
-    return np.array(place)
+    swings = [shapely.Polygon(door_swing(building, door)) for door in doors_on(building, int(building.room_storeys[room]))]
+    for free in (shapely.difference(polygon, shapely.union_all(swings)), polygon):
+        if not free.is_empty and free.area > 0.0:
+            place = shapely.maximum_inscribed_circle(scale(free, 1.0 / WIDE, 1.0, origin=(0.0, 0.0)), 0.05).coords[0]
+            return np.array(place) * [WIDE, 1.0]
+    return np.asarray(rings[0].mean(axis=0), np.float64)
 
 
 def opening_name(building: Building, opening: int) -> str:

@@ -19,7 +19,7 @@ PALETTE = np.array(
 def mesh_to_open3d(vertices_m: NDArray[Any], triangles: NDArray[Any], colors: NDArray[np.uint8]) -> Any:
     """Make an `open3d.geometry.TriangleMesh` of (v, 3) vertices, (t, 3) triangles and (v, 3) colours. Raises UsageError without Open3D."""
     o3d = _open3d()
-    mesh = o3d.geometry.TriangleMesh(o3d.utility.Vector3dVector(_doubles(vertices_m)), o3d.utility.Vector3iVector(np.asarray(triangles, np.int32)))
+    mesh = o3d.geometry.TriangleMesh(o3d.utility.Vector3dVector(_doubles(vertices_m)), o3d.utility.Vector3iVector(np.array(triangles, np.int32)))
     mesh.vertex_colors = o3d.utility.Vector3dVector(colors / 255.0)
     return mesh
 
@@ -62,4 +62,5 @@ def _open3d() -> Any:
 
 
 def _doubles(points: NDArray[Any]) -> NDArray[np.float64]:
-    return np.ascontiguousarray(points, np.float64)
+    """A copy: Open3D refuses arrays that are read-only, as those of values are."""
+    return np.array(points, np.float64, order="C")

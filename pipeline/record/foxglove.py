@@ -17,7 +17,8 @@ import numpy as np
 from foxglove_schemas_protobuf.Log_pb2 import Log
 from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
 
-from trihedron.pipeline.core.geometry import invert, rotation_angle_deg
+from trihedron.pipeline.core.geometry import invert
+from trihedron.pipeline.core.lie import rotation_angle_deg
 from trihedron.pipeline.core.types import (
     F64,
     LOST,
@@ -61,7 +62,7 @@ def _error_class() -> Any:
 ErrorMessage = _error_class()
 
 
-class View:
+class TopicView:
     """Turns values into viewer messages, thinned by the frames' stamps (so the same run gives the same messages). Poses are compared with `truth`."""
 
     def __init__(self, truth: Trajectory | None = None) -> None:

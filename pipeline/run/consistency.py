@@ -14,7 +14,8 @@ from typing import Any
 
 import numpy as np
 
-from trihedron.pipeline.core.geometry import adjoint, exp_se3, invert, log_se3
+from trihedron.pipeline.core.geometry import invert
+from trihedron.pipeline.core.lie import adjoint, exp_se3, log_se3
 from trihedron.pipeline.core.types import F64, I32
 
 LIMIT_95 = 12.592  # χ² with 6 degrees of freedom

@@ -54,8 +54,8 @@ def _trajectory(stamps_ns: list[int], poses: list[Any]) -> Trajectory:
     return Trajectory(np.array(stamps_ns, np.int64), np.array(poses, np.float64).reshape(-1, 4, 4))
 
 
-def write_results(out: Path, result: Result, truth: Trajectory | None) -> dict[str, Any]:
-    """Write trajectories, plot and, with ground truth, metrics; return the metrics. Statuses are counted in any case."""
+def write_results(out: Path, result: Result, truth: Trajectory | None, plot: bool = True) -> dict[str, Any]:
+    """Write trajectories, `plot` and, with ground truth, metrics; return the metrics. Statuses are counted in any case."""
     final, causal = final_trajectory(result), causal_trajectory(result)
     write_trajectory(out / TRAJECTORY, final)
     write_trajectory(out / CAUSAL, causal)
@@ -77,7 +77,7 @@ def write_results(out: Path, result: Result, truth: Trajectory | None) -> dict[s
         except DataError as error:
             metrics["note"] = str(error)
     write_json(out / METRICS, metrics)
-    if len(final):
+    if plot and len(final):
         trajectory_figure(final, truth, out / PLOT, [(pose.stamp_ns, pose.status) for pose in result.poses])
     return metrics
 

@@ -45,37 +45,36 @@ class Gathered:
 
 
 @dataclass(frozen=True)
-class LayoutFold:
-    """Keeps the views of the keyframes; other frames cost next to nothing."""
+class LayoutOptions:
+    """Options of every plan."""
 
     view_width: Annotated[int, Range(16, 4096)] = 160  # px, about, to which images are reduced
     max_sigma_m: PositiveFloat = 0.05  # depth less certain than this is not used
     least_room_m2: PositiveFloat = 1.0
     least_wall_m: PositiveFloat = 0.4  # of tall face, for which there is a wall
 
-    def start(self) -> Gathered:
-        """Nothing seen."""
-        return Gathered()
 
-    def add(self, state: Gathered, frame: Frame, planes: Planes, rotation: Rotation | None, pose: Pose, map: Map | None) -> Gathered:
-        """Keep the frame if it became a keyframe; without a map, if the camera has moved since the last."""
-        state.index, state.stamp_ns, state.map = frame.index, frame.stamp_ns, map
-        if rotation is not None and len(rotation.weights):
-            state.axes = rotation.R_world_manhattan[int(np.argmax(rotation.weights))]
-        if pose.status == LOST:
-            return state
-        if state.first is None:
-            state.first = pose.T_world_camera
-        if map is not None:
-            newest, state.keyframes = len(map.keyframes), max(state.keyframes, len(map.keyframes))
-            wanted = newest > 0 and int(map.keyframes.rows("index", np.array([newest - 1]))[0]) == frame.index
-        else:
-            wanted = state.keyframes == 0 and (not state.views or _moved(state.views[-1].T_world_camera, pose.T_world_camera))
-        if wanted:
-            view = view_of(frame, planes, pose, map, self.view_width, self.max_sigma_m)
-            state.views.append(replace(view, color=view.color[:0, :0].copy()))
-            state.covariances.append(pose.covariance)
+def add_view(
+    options: LayoutOptions, state: Gathered, frame: Frame, planes: Planes, rotation: Rotation | None, pose: Pose, map: Map | None
+) -> Gathered:  # fmt: skip
+    """Retain the frame if it became a keyframe; without a map, if the camera has moved since the last. Other frames cost next to nothing."""
+    state.index, state.stamp_ns, state.map = frame.index, frame.stamp_ns, map
+    if rotation is not None and len(rotation.weights):
+        state.axes = rotation.R_world_manhattan[int(np.argmax(rotation.weights))]
+    if pose.status == LOST:
         return state
+    if state.first is None:
+        state.first = pose.T_world_camera
+    if map is not None:
+        newest, state.keyframes = len(map.keyframes), max(state.keyframes, len(map.keyframes))
+        wanted = newest > 0 and int(map.keyframes.rows("index", np.array([newest - 1]))[0]) == frame.index
+    else:
+        wanted = state.keyframes == 0 and (not state.views or _moved(state.views[-1].T_world_camera, pose.T_world_camera))
+    if wanted:
+        view = view_of(frame, planes, pose, map, options.view_width, options.max_sigma_m)
+        state.views.append(replace(view, color=view.color[:0, :0].copy()))
+        state.covariances.append(pose.covariance)
+    return state
 
 
 def _moved(before: F64, now: F64) -> bool:
@@ -251,9 +250,18 @@ def _lowest_floor(evidence: Evidence) -> float:
     return float(np.percentile(evidence.points[:, 2], 1.0))
 
 
-def height_of(evidence: Evidence, height: float, facing: float, tolerance: float = 0.05) -> tuple[float, float]:
+LEVEL_NEAR_M = 0.05  # readings of one level
+
+
+def at_level(evidence: Evidence, height: float, facing: float) -> Bool:
+    """Return the points (n,) of a level near `height` that faces up (1) or down (-1)."""
+    level = evidence.normals[:, 2] * facing > np.cos(np.radians(LEVEL_DEG))
+    return np.asarray(level & (np.abs(evidence.points[:, 2] - height) < LEVEL_NEAR_M), np.bool_)
+
+
+def height_of(evidence: Evidence, height: float, facing: float) -> tuple[float, float]:
     """Return the height of a level near `height` and its standard deviation."""
-    near = (evidence.normals[:, 2] * facing > np.cos(np.radians(LEVEL_DEG))) & (np.abs(evidence.points[:, 2] - height) < tolerance)
+    near = at_level(evidence, height, facing)
     return combined(evidence.points[near, 2], evidence.information[near], evidence.rows[near])
 
 

@@ -8,9 +8,8 @@ from typing import NamedTuple
 import numpy as np
 
 from trihedron.pipeline.core.types import F64, I32, Map, Table
-from trihedron.plugins.mapping.covisibility_graph import covisible_keyframes, current_submap, keyframes_of, newest_keyframes, observed_by
+from trihedron.plugins.mapping.covisibility_graph import covisible_keyframes, current_submap, keyframes_of, newest_keyframes, observed_by, odometry
 from trihedron.plugins.mapping.landmarks import index_of
-from trihedron.plugins.mapping.odometry import odometry
 from trihedron.plugins.shared.linalg import inverse
 from trihedron.plugins.shared.pose_optimizer_kernels import PARALLEL, PERPENDICULAR
 

@@ -11,7 +11,8 @@ from typing import Annotated
 
 import numpy as np
 
-from trihedron.pipeline.core.geometry import invert, log_se3, pose_matrix, transform, umeyama
+from trihedron.pipeline.core.geometry import invert, pose_matrix, transform, umeyama
+from trihedron.pipeline.core.lie import log_se3
 from trihedron.pipeline.core.options import NonNegativeInt, PositiveFloat, PositiveInt, Range, Share
 from trihedron.pipeline.core.types import F64, I32, Bool, Camera, Correction, Frame, Keypoints, Map, Matches
 from trihedron.plugins.loop.common_manhattan_prior import align_with_manhattan, correct_loop, estimate_manhattan_prior
@@ -48,9 +49,10 @@ class LoopOptions:
     min_share: Share = 0.5  # of the matches that must agree
     max_through: Share = 0.15  # of the place's surfaces in view that the camera may see through
 
-    def sigma_m(self, path_m: float | F64) -> float | F64:
-        """Return the standard deviation of the position after a path of this length."""
-        return self.floor_m + self.drift_share * path_m
+
+def drift_sigma_m(options: LoopOptions, path_m: float | F64) -> float | F64:
+    """Return the standard deviation of the position after a path of this length."""
+    return options.floor_m + options.drift_share * path_m
 
 
 def close_loop(options: LoopOptions, rank: Callable[[Map], Candidates], map: Map, frame: Frame) -> Correction | None:
@@ -91,7 +93,7 @@ def _verify(options: LoopOptions, map: Map, frame: Frame, place: Place) -> PoseS
     """Pose of the newest keyframe by the landmarks of a place, or None when the loop is not accepted."""
     newest = len(map.keyframes) - 1
     T = T_before = map.keyframes.row("T_world_camera", newest)
-    sigma_m, sigma_rad = options.sigma_m(place.path_m), 2.0 * np.radians(options.rotation_sigma_deg)
+    sigma_m, sigma_rad = drift_sigma_m(options, place.path_m), 2.0 * np.radians(options.rotation_sigma_deg)
     expected = np.diag(np.repeat([sigma_m**2, sigma_rad**2], 3))
     window = _seen_alone(map, newest, place.window)
     features = features_of(map, frame.camera, T_before, window)
@@ -144,7 +146,7 @@ def within_reach(options: LoopOptions, map: Map, most: int) -> tuple[I32, F64]:
     poses = map.keyframes.rows("T_world_camera", rows)
     distance = np.linalg.norm(poses[:, :3, 3] - poses[-1, :3, 3], axis=1)
     cosine = poses[:, :3, 2] @ poses[-1, :3, 2]
-    reach = options.view_m + 3.0 * options.sigma_m(path_m)
+    reach = options.view_m + 3.0 * drift_sigma_m(options, path_m)
     chosen = np.flatnonzero((path_m > options.away_m) & (distance < reach) & (cosine > np.cos(np.radians(options.view_deg))))
     chosen = chosen[np.argsort(distance[chosen] / options.view_m + 1.0 - cosine[chosen], kind="stable")][:most]
     return rows[chosen], path_m[chosen]

@@ -10,7 +10,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from trihedron.pipeline.core.geometry import exp_so3, invert, pose_matrix
+from trihedron.pipeline.core.geometry import invert, pose_matrix
+from trihedron.pipeline.core.lie import exp_so3
 from trihedron.pipeline.core.types import F64, I32, Correction, Map, Table
 from trihedron.plugins.loop.common_manhattan_prior_kernels import keyframe_rotations
 from trihedron.plugins.loop.common_pose_graph import Edges, correct_keyframes, joined, odometry_edges, solve_pose_graph

@@ -7,10 +7,11 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from trihedron.pipeline.core.geometry import exp_so3, invert, transform_each
+from trihedron.pipeline.core.geometry import invert, transform_each
+from trihedron.pipeline.core.lie import exp_so3
 from trihedron.pipeline.core.types import F32, F64, I32, Correction, Map, Table
+from trihedron.plugins.mapping.covisibility_graph import odometry
 from trihedron.plugins.mapping.landmarks import ENDPOINTS, POSITION
-from trihedron.plugins.mapping.odometry import odometry
 from trihedron.plugins.mapping.plane_fusion import information_of
 from trihedron.plugins.shared.lie_kernels import log_so3_each
 from trihedron.plugins.shared.linalg import cross_matrices, inverse

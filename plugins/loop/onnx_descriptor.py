@@ -49,7 +49,7 @@ class OnnxDescriptor(NetworkOptions, LoopOptions):
 
     def _described(self, frame: Frame) -> F32:
         """The unit vector (d,) of an image."""
-        network = self._network
+        network = self.network
         tensor = network_image(frame, network, "image", 3, self.multiple).tensor
         if self.imagenet:
             tensor = np.ascontiguousarray((tensor - MEAN[:, None, None]) / SPREAD[:, None, None], np.float32)

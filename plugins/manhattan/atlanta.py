@@ -9,7 +9,7 @@ from typing import Annotated, NamedTuple
 
 import numpy as np
 
-from trihedron.pipeline.core.geometry import exp_so3
+from trihedron.pipeline.core.lie import exp_so3
 from trihedron.pipeline.core.options import NonNegativeFloat, PositiveFloat, PositiveInt, Range, Share, check_increasing
 from trihedron.pipeline.core.registry import register
 from trihedron.pipeline.core.types import F64, I32, Bool, ManhattanFrame, Normals, Planes, Segments

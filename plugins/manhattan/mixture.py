@@ -8,7 +8,7 @@ from typing import Annotated, NamedTuple
 
 import numpy as np
 
-from trihedron.pipeline.core.geometry import rotation_angle_deg
+from trihedron.pipeline.core.lie import rotation_angle_deg
 from trihedron.pipeline.core.options import NonNegativeFloat, PositiveFloat, PositiveInt, Range, Share, check_increasing
 from trihedron.pipeline.core.registry import register
 from trihedron.pipeline.core.types import F64, Bool, ManhattanFrame, Normals, Planes, Segments

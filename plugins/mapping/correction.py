@@ -7,14 +7,12 @@ from typing import Any
 
 import numpy as np
 
-from trihedron.pipeline.core.geometry import invert, nearest_rotation, pose_matrix, transform, transform_each, transform_planes
+from trihedron.pipeline.core.geometry import invert, rigid, transform, transform_each, transform_planes
 from trihedron.pipeline.core.types import F64, I32, Bool, Correction, Map, Table
 from trihedron.plugins.mapping.covisibility_graph import observed_by
 from trihedron.plugins.mapping.landmarks import isin
 from trihedron.plugins.mapping.plane_fusion import equivalent_moments, motions_between
 from trihedron.plugins.shared.linalg import transform_plane_covariance
-
-ROUNDING = 1e-12  # of RRᵀ - I, above which a rotation is made one again
 
 
 def apply_correction(map: Map, correction: Correction) -> Map:
@@ -69,15 +67,9 @@ def _move_later(map: Map, correction: Correction, newest: int, T_corrected: F64)
     later = later[map.keyframes.rows("submap", later) == map.keyframes.rows("submap", np.array([newest]))]
     if not len(later):
         return map
-    T = _rigid(T_corrected @ invert(map.keyframes.row("T_world_camera", newest)))
+    T = rigid(T_corrected @ invert(map.keyframes.row("T_world_camera", newest)))
     corrected = {"point": correction.point_ids, "line": correction.line_ids, "plane": correction.plane_ids}
     return transform_landmarks(map, T, later, *(_created_after(map, kind, newest, later, ids) for kind, ids in corrected.items()))
-
-
-def _rigid(T: F64) -> F64:
-    """Return a motion (4, 4) whose rotation is one: `invert` doubles the rounding error of a keyframe, which the next keyframes would inherit."""
-    R = T[:3, :3]
-    return T if np.abs(R @ R.T - np.eye(3)).max() < ROUNDING else pose_matrix(nearest_rotation(R), T[:3, 3])
 
 
 def transform_landmarks(map: Map, T: F64, keyframes: I32, points: I32, lines: I32, planes: I32) -> Map:

@@ -16,6 +16,7 @@ from trihedron.plugins.mapping.landmark_kernels import farthest_samples, fuse_li
 from trihedron.plugins.mapping.landmarks import OBSERVERS
 from trihedron.plugins.mapping.plane_fusion import equivalent_moments, fit_planes, move_moments, project_to_planes
 from trihedron.plugins.mapping.projection import line_terms, parameters_on, plane_terms, point_terms, points_along
+from trihedron.plugins.shared.calibration_error import calibration_covariance
 from trihedron.plugins.shared.linalg import inverse, point_covariance, propagate_pose_covariance
 from trihedron.plugins.shared.pose_optimizer import classify_terms
 
@@ -94,14 +95,18 @@ class Observations:
 
 
 def add_keyframe(map: Map, pose: Pose, camera: Camera) -> tuple[Map, int]:
-    """Append a keyframe without observations; also returns its row."""
-    empty = np.zeros((1, 2), np.int32)
-    table, rows = map.keyframes.appended(
+    """Append a keyframe without observations; also returns its row. The velocity of the one before is known better by now."""
+    empty, table = np.zeros((1, 2), np.int32), map.keyframes
+    if 0 <= pose.reference < len(table):
+        table = table.updated(np.array([pose.reference]), twist=pose.reference_twist[None])
+    table, rows = table.appended(
         index=np.array([pose.index]),
         stamp_ns=np.array([pose.stamp_ns]),
         T_world_camera=pose.T_world_camera[None],
         covariance=pose.local_covariance[None],
-        world_covariance=pose.covariance[None],
+        world_covariance=(pose.covariance - calibration_covariance(pose))[None],
+        sensitivity=pose.sensitivity[None],
+        twist=pose.twist[None],
         intrinsics=camera.intrinsics[None],
         points=empty,
         lines=empty,

@@ -10,7 +10,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from trihedron.pipeline.core.geometry import invert
+from trihedron.pipeline.core.geometry import invert, rigid
 from trihedron.pipeline.core.types import F64, Map, Pose, Rotation
 from trihedron.plugins.mapping.covisibility_graph import keyframes_of
 
@@ -25,7 +25,7 @@ def transform_to_map(pose: Pose, map: Map | None) -> Pose:
     relative = invert(T_world_keyframe) @ pose.T_world_camera
     if np.abs(relative - pose.T_reference_camera).max() < UNMOVED:
         return pose
-    return replace(pose, T_world_camera=T_world_keyframe @ pose.T_reference_camera)
+    return replace(pose, T_world_camera=rigid(T_world_keyframe @ pose.T_reference_camera))
 
 
 def transform_rotation_to_map(previous: Rotation, pose: Pose | None, map: Map | None) -> tuple[Rotation, Pose | None]:

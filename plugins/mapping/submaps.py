@@ -7,7 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from trihedron.pipeline.core.geometry import adjoint, invert
+from trihedron.pipeline.core.geometry import invert
+from trihedron.pipeline.core.lie import adjoint
 from trihedron.pipeline.core.types import F64, I32, Map, Pose, Table
 from trihedron.plugins.mapping.correction import transform_landmarks
 from trihedron.plugins.mapping.covisibility_graph import keyframes_of
@@ -26,7 +27,8 @@ def merge_submaps(map: Map, pose: Pose, recognised: Pose, max_deg: float, max_m:
     map = transform_landmarks(map, T, rows, *(_created_by(table, rows) for table in (map.points, map.lines, map.planes)))
     newer, older = (_created_by(map.planes, keyframes_of(map, number)) for number in (submap, recognised.submap))
     submaps, covariance = np.full(len(rows), recognised.submap, np.int32), _world_covariance(map, rows, recognised)
-    changes: dict[str, Any] = {"keyframes": map.keyframes.updated(rows, submap=submaps, world_covariance=covariance)}
+    sensitivity = _sensitivity(map, rows, pose, recognised)
+    changes: dict[str, Any] = {"keyframes": map.keyframes.updated(rows, submap=submaps, world_covariance=covariance, sensitivity=sensitivity)}
     return fuse_planes(replace(map, **changes), older, newer, max_deg, max_m)
 
 
@@ -41,6 +43,17 @@ def _world_covariance(map: Map, rows: I32, recognised: Pose) -> F64:
         to_pose = adjoint(invert(recognised.T_world_camera) @ T)
         common = common + to_pose @ of_reference @ to_pose.T
     return np.asarray(covariance + to_rows @ common @ to_rows.transpose(0, 2, 1))
+
+
+def _sensitivity(map: Map, rows: I32, pose: Pose, recognised: Pose) -> F64:
+    """Sensitivities (k, 6, m) of keyframes in the world that their sub-map is merged into: their own, plus what the recognised pose has more than
+    this frame's in the sub-map's world."""
+    poses, own = (map.keyframes.rows(name, rows) for name in ("T_world_camera", "sensitivity"))
+    common = -pose.sensitivity
+    if recognised.reference >= 0:
+        T, of_reference = (map.keyframes.rows(name, np.array([recognised.reference]))[0] for name in ("T_world_camera", "sensitivity"))
+        common = common + adjoint(invert(recognised.T_world_camera) @ T) @ of_reference
+    return np.asarray(own + adjoint(invert(poses) @ recognised.T_world_camera) @ common)
 
 
 def _created_by(table: Table, keyframes: I32) -> I32:

@@ -10,9 +10,8 @@ from trihedron.pipeline.core.geometry import pose_matrix
 from trihedron.pipeline.core.options import NonNegativeInt, PositiveInt
 from trihedron.pipeline.core.registry import register
 from trihedron.pipeline.core.types import F64, OK, Camera, Keypoints, Map, Matches, Planes, Pose, Rotation, Segments, Translation
-from trihedron.plugins.mapping.covisibility_graph import living_keyframes, local_window
+from trihedron.plugins.mapping.covisibility_graph import VICINITY_DEG, VICINITY_M, living_keyframes, local_window
 from trihedron.plugins.mapping.data_association import PredictedPose, SearchOptions, search_map
-from trihedron.plugins.places.verification import VICINITY_DEG, VICINITY_M
 
 
 @register("matches", "local_map")

@@ -14,7 +14,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from trihedron.pipeline.core.geometry import exp_so3, invert, nearest_rotation, pose_matrix
+from trihedron.pipeline.core.geometry import invert, nearest_rotation, pose_matrix
+from trihedron.pipeline.core.lie import exp_so3
 from trihedron.pipeline.core.types import DEGRADED, F32, F64, LOST, OK, Frame, Pose
 from trihedron.plugins.pose.common_kernels import Residuals, Source, Target, fill_residuals, normal_equations, observability, student_weights_kernel
 from trihedron.plugins.pose.decoupled_pose import FIRST_SIGMA, Decoupled

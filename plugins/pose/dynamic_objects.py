@@ -12,7 +12,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from trihedron.pipeline.core.geometry import invert, log_se3
+from trihedron.pipeline.core.geometry import invert
+from trihedron.pipeline.core.lie import log_se3
 from trihedron.pipeline.core.types import DEGRADED, F64, OK, U8, Bool, Keypoints, Map, Matches, Planes, Segments
 from trihedron.plugins.pose.dynamic_objects_kernels import mahalanobis2, on_planes_kernel
 from trihedron.plugins.pose.map_alignment import InlierStatistics, MapAlignment, TrackingStatus

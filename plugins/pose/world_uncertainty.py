@@ -2,7 +2,8 @@
 
 A pose is estimated relative to hundreds of landmarks whose errors are treated as independent. Two parts are not: residuals of landmarks from one
 keyframe err alike, which their scatter shows (`noise_scale`); and the common error of the keyframes themselves, which no residual shows
-(`map_covariance`). The latter accumulates from keyframe to keyframe and is what odometry calls drift."""
+(`map_covariance`). The latter accumulates from keyframe to keyframe: at random, which odometry calls drift, and by an imperfect calibration, which
+is the same at all of them (`calibration_uncertainty.py`)."""
 
 from __future__ import annotations
 
@@ -10,9 +11,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from trihedron.pipeline.core.geometry import adjoint, invert
+from trihedron.pipeline.core.geometry import invert
+from trihedron.pipeline.core.lie import adjoint
 from trihedron.pipeline.core.types import F64, I32, Map, Pose
+from trihedron.plugins.pose.calibration_uncertainty import carried_calibration, with_calibration, with_velocity
 from trihedron.plugins.pose.map_alignment import MapAlignment, TrackingStatus
+from trihedron.plugins.shared.calibration_error import calibration_covariance
 from trihedron.plugins.shared.linalg_kernels import inverse_positive
 from trihedron.plugins.shared.pose_optimizer import LANDMARK_SCORE, PoseSolution, residual_scale
 
@@ -73,15 +77,23 @@ def widened_by_keyframes(status: TrackingStatus, solution: PoseSolution, problem
 
 def in_world(pose: Pose, previous: Pose, solution: PoseSolution, problem: MapAlignment) -> Pose:
     """Give a refined pose its covariance in the world, scaled by the noise that the residuals show."""
-    keyframes, information, scores = problem.equations_by_keyframe(solution)
+    keyframes, groups = problem.created_by()
+    information, scores = problem.equations_by_keyframe(solution, keyframes, groups)
     scale, noise_scale = residual_scale(information, scores), previous.noise_scale
     if scale is not None:
         noise_scale += (min(scale, SCALE_OUTLIER * noise_scale) - noise_scale) / SCALE_FRAMES
-    of_map = of_previous(pose, previous)
-    if len(keyframes):
+    by_drift = drift_of_previous(pose, previous)
+    if information.any():
         poses, covariances = (problem.map.keyframes.rows(name, keyframes) for name in ("T_world_camera", "world_covariance"))
-        of_map = covariance_of_keyframes(pose.T_world_camera, poses, covariances, information)
-    return replace(pose, covariance=noise_scale * pose.covariance + of_map, map_covariance=of_map, noise_scale=noise_scale)
+        by_drift = covariance_of_keyframes(pose.T_world_camera, poses, covariances, information)
+    moving = with_velocity(replace(pose, noise_scale=noise_scale), previous, problem.map)
+    return _composed(with_calibration(moving, previous, solution, problem, keyframes, groups), by_drift)
+
+
+def _composed(pose: Pose, by_drift: F64) -> Pose:
+    """Turn a pose whose `covariance` is the one relative to the landmarks near it into one whose `covariance` is that in the world."""
+    of_map = by_drift + calibration_covariance(pose)
+    return replace(pose, covariance=pose.noise_scale * pose.covariance + of_map, map_covariance=of_map)
 
 
 def covariance_of_keyframes(T_world_camera: F64, T_world_keyframe: F64, covariance: F64, information: F64) -> F64:
@@ -97,13 +109,12 @@ def covariance_of_keyframes(T_world_camera: F64, T_world_keyframe: F64, covarian
     return np.asarray(common.sum(axis=0), np.float64)
 
 
-def of_previous(pose: Pose, previous: Pose) -> F64:
-    """The `map_covariance` of the previous pose as that of a camera that moves with it."""
+def drift_of_previous(pose: Pose, previous: Pose) -> F64:
+    """The part of the previous pose's `map_covariance` that is not by the calibration, as that of a camera that moves with it."""
     to_camera = adjoint(invert(pose.T_world_camera) @ previous.T_world_camera)
-    return np.asarray(to_camera @ previous.map_covariance @ to_camera.T)
+    return np.asarray(to_camera @ (previous.map_covariance - calibration_covariance(previous)) @ to_camera.T)
 
 
 def carried(pose: Pose, previous: Pose) -> Pose:
     """Give a pose that was not refined, by its own covariance relative to the previous one, its covariance in the world."""
-    of_map = of_previous(pose, previous)
-    return replace(pose, covariance=previous.noise_scale * pose.covariance + of_map, map_covariance=of_map, noise_scale=previous.noise_scale)
+    return _composed(carried_calibration(replace(pose, noise_scale=previous.noise_scale), previous), drift_of_previous(pose, previous))

@@ -9,17 +9,16 @@ import numpy as np
 
 from trihedron.pipeline.core.options import AcuteDeg, PositiveFloat, PositiveInt, Range
 from trihedron.pipeline.core.registry import register
-from trihedron.pipeline.core.types import F64, I32, Map, Surface
-from trihedron.plugins.surface.common import Gathered, ViewFold, pictured
+from trihedron.pipeline.core.types import F64, I32, Frame, Map, Planes, Pose, Rotation, Surface
+from trihedron.plugins.surface.common import Gathered, ViewOptions, add_view, map_planes, numbered, pictured
 from trihedron.plugins.surface.common_meshes import plane_axes
-from trihedron.plugins.surface.common_planar import map_planes, numbered
 from trihedron.plugins.surface.common_superpixels import gathered_points, observed_planes
 from trihedron.plugins.surface.planar_greedy_kernels import MOST, accepted
 
 
 @register("surface", "planar_greedy")
 @dataclass(frozen=True)
-class PlanarGreedy(ViewFold):
+class PlanarGreedy(ViewOptions):
     """Points of each plane of the map, found by a kd-tree and joined by greedy triangulation (paper, section V-B); in the plane's own axes."""
 
     angle_deg: AcuteDeg = 10.0  # between a region and the plane it belongs to (paper)
@@ -29,6 +28,15 @@ class PlanarGreedy(ViewFold):
     multiplier: Annotated[float, Range(above=1)] = 5.0  # times the distance to a point's nearest neighbour, beyond which it is joined to none (paper)
     pixel_step: PositiveInt = 4  # px between the readings that are gathered
     texel_m: Annotated[float, Range(0.001)] = 0.015  # of the picture of the planes
+
+    def start(self) -> Gathered:
+        """Return an empty state."""
+        return Gathered()
+
+    def add(self, state: Gathered, frame: Frame, planes: Planes, rotation: Rotation | None, pose: Pose, map: Map | None) -> Gathered:
+        """Retain the frame if it was tracked and shows something new."""
+        add_view(self, state, frame, planes, rotation, pose, map)
+        return state
 
     def finish(self, state: Gathered, map: Map | None) -> Surface:
         """One mesh for each plane that was seen."""

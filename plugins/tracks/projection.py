@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from trihedron.pipeline.core.geometry import exp_so3, log_so3, rotation_angle_deg
+from trihedron.pipeline.core.lie import exp_so3, log_so3, rotation_angle_deg
 from trihedron.pipeline.core.options import AcuteDeg, NonNegativeInt, PositiveFloat, PositiveInt, PositiveShare, Share, check_increasing
 from trihedron.pipeline.core.registry import register
 from trihedron.pipeline.core.types import F64, U8, Camera, Keypoints, ManhattanFrame, Planes, Segments, Tracks

@@ -29,6 +29,7 @@ if "numpy" not in sys.modules and platform.machine() in ("x86_64", "AMD64"):
     os.environ[BLAS_KERNELS[0]] = BLAS_KERNELS[1]
 
 if TYPE_CHECKING:
+    from trihedron.api.ablations import ablate
     from trihedron.api.building import Building
     from trihedron.api.camera import Camera
     from trihedron.api.recording import Recording
@@ -82,6 +83,7 @@ _SLOTS = (
     "bundle", "loop", "relocalise", "model", "surface", "building",
 )  # fmt: skip
 _HOMES = {
+    "ablate": "api.ablations",
     "Building": "api.building",
     "Camera": "api.camera",
     "Recording": "api.recording",
@@ -97,9 +99,9 @@ _HOMES = {
 
 __all__ = [
     "Building", "Camera", "Frame", "Keypoints", "LineSegments", "ManhattanFrame", "Map", "Normals", "Planes", "Pose", "Recording", "Rotation", "Run",
-    "Segments", "Slam", "Surface", "Trajectory", "Translation", "TrihedronError", "__version__", "building", "bundle", "compare", "dataset",
-    "keypoints", "lines", "loop", "manhattan", "map", "matches", "model", "normals", "planes", "pose", "register", "relocalise", "rotation", "run",
-    "segments", "surface", "tracks", "translation",
+    "Segments", "Slam", "Surface", "Trajectory", "Translation", "TrihedronError", "__version__", "ablate", "building", "bundle", "compare",
+    "dataset", "keypoints", "lines", "loop", "manhattan", "map", "matches", "model", "normals", "planes", "pose", "register", "relocalise",
+    "rotation", "run", "segments", "surface", "tracks", "translation",
 ]  # fmt: skip
 
 

@@ -8,7 +8,8 @@ import numpy as np
 from hypothesis import strategies as st
 
 import trihedron.plugins.manhattan
-from trihedron.pipeline.core.geometry import exp_so3, log_so3, rotation_angle_deg, tangent_basis
+from trihedron.pipeline.core.geometry import tangent_basis
+from trihedron.pipeline.core.lie import exp_so3, log_so3, rotation_angle_deg
 from trihedron.pipeline.core.registry import parameters_of_method, plugins_of
 from trihedron.pipeline.core.types import ManhattanFrame, Normals, Planes, Segments
 from trihedron.plugins.shared.manhattan_frames_kernels import nearest_equivalent

@@ -6,7 +6,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from trihedron.pipeline.core.geometry import exp_so3, log_so3, rotation_angle_deg, tangent_basis
+from trihedron.pipeline.core.geometry import tangent_basis
+from trihedron.pipeline.core.lie import exp_so3, log_so3, rotation_angle_deg
 from trihedron.pipeline.core.types import Normals, Planes, Segments
 from trihedron.plugins.manhattan.common_kernels import shift_axes
 from trihedron.plugins.manhattan.mean_shift import MeanShift

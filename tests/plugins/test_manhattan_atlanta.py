@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from trihedron.pipeline.core.geometry import exp_so3, log_so3, rotation_angle_deg
+from trihedron.pipeline.core.lie import exp_so3, log_so3, rotation_angle_deg
 from trihedron.plugins.manhattan.atlanta import Atlanta, named_azimuths, shared_covariance
 from trihedron.plugins.manhattan.atlanta_kernels import fit_shared_vertical
 from trihedron.plugins.shared.manhattan_frames_kernels import nearest_equivalent

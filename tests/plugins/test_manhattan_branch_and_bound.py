@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from trihedron.pipeline.core.geometry import exp_so3, rotation_angle_deg
+from trihedron.pipeline.core.lie import exp_so3, rotation_angle_deg
 from trihedron.plugins.manhattan.branch_and_bound import BranchAndBound
 from trihedron.plugins.manhattan.mean_shift import MeanShift
 

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from trihedron.pipeline.core.geometry import exp_so3, rotation_angle_deg
+from trihedron.pipeline.core.lie import exp_so3, rotation_angle_deg
 from trihedron.plugins.manhattan.common import identified, symmetric_angles, turn_between
 from trihedron.plugins.manhattan.mixture import Mixture
 from trihedron.plugins.shared.manhattan_frames_kernels import CUBE, nearest_equivalent

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from trihedron.pipeline.core.geometry import exp_so3, rotation_angle_deg
+from trihedron.pipeline.core.lie import exp_so3, rotation_angle_deg
 from trihedron.plugins.manhattan.von_mises_fisher import VonMisesFisher, broad_mixture
 from trihedron.plugins.manhattan.von_mises_fisher_kernels import improved
 

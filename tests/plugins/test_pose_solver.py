@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from trihedron.pipeline.core.geometry import exp_se3, exp_so3, invert, log_se3, pose_matrix, tangent_basis, transform, transform_planes
+from trihedron.pipeline.core.geometry import invert, pose_matrix, tangent_basis, transform, transform_planes
+from trihedron.pipeline.core.lie import exp_se3, exp_so3, log_se3
 from trihedron.pipeline.core.types import Camera
 from trihedron.plugins.shared import pose_optimizer_kernels as terms_kernels
 from trihedron.plugins.shared.linalg_kernels import tangent_columns

@@ -6,7 +6,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from trihedron.pipeline.core.geometry import exp_so3, invert, pose_matrix, rotation_angle_deg
+from trihedron.pipeline.core.geometry import invert, pose_matrix
+from trihedron.pipeline.core.lie import exp_so3, rotation_angle_deg
 from trihedron.pipeline.core.types import Frame, Tracks
 from trihedron.plugins.shared.relative_motion import solve_motion
 from trihedron.plugins.tracks.projection import Projection

@@ -35,6 +35,7 @@ def test_what_became_slower_is_named_and_tiny_stages_are_not():
     assert "+20 %" in said and "new" in said
 
 
+@pytest.mark.slow
 def test_the_benchmark_writes_what_it_compares_with(tmp_path, capsys):
     file = tmp_path / "old.json"
     assert main(["benchmark", *TINY, "--json", str(file)]) == 0
@@ -45,6 +46,7 @@ def test_the_benchmark_writes_what_it_compares_with(tmp_path, capsys):
     assert min(before, after) <= figures["reference_ms"] <= max(before, after)
 
 
+@pytest.mark.slow
 def test_the_memory_of_a_run_is_not_that_of_who_measures_it(tmp_path):
     """It is about what importing takes, though 700 MB are held here."""
     held = np.ones(700 << 20, np.uint8)

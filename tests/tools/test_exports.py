@@ -114,6 +114,7 @@ def test_a_viewer_that_does_not_open_is_one_line(run, monkeypatch, capsys):
     assert printed.err == f"trihedron: rerun: {line}\n" and printed.out == ""
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(importlib.util.find_spec("rerun") is None, reason="rerun is not installed (the extra `view`)")
 def test_a_file_for_rerun_is_whole_and_holds_everything(run):
     assert main(["export", str(run), "--to", "rerun"]) == 0
