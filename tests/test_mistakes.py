@@ -19,7 +19,6 @@ MISTAKES = [  # words of the command, exit code, what is said after "trihedron: 
     ("run map=covisability", 1, "map: there is no plugin 'covisability' for the slot 'map'; did you mean 'covisibility'?"),
     ("run map.min_frames=-1", 1, f"map.min_frames: -1 is not at least 1; {SEE} map covisibility"),
     ("run pose.min_share=2", 1, f"pose.min_share: 2.0 is not within 0 … 1; {SEE} pose refine"),
-    ("run pose.focal_off=0.2", 1, "pose.focal_off: this option was removed; `trihedron calibrate RUN.mcap` estimates the focal lengths instead"),
     ("run pose.min_share=high", 1, f"pose.min_share: Value 'high' of type 'str' could not be converted to Float; {TYPE}"),
     ("run dataset.width=-5", 1, f"dataset.width: -5 is not within 16 … 8192; {SEE} dataset synthetic"),
     ("run dataset.width=wide", 1, f"dataset.width: Value 'wide' of type 'str' could not be converted to Integer; {TYPE}"),

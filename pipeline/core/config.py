@@ -278,9 +278,6 @@ def _unknown_option(group: str, name: str, options: list[str]) -> TrihedronError
 def _unknown_key(key: str) -> TrihedronError:
     group, _, option = key.rpartition(".")
     if group in SLOTS:
-        removed = {name: cure for plugin in plugins_of(group).values() for name, cure in getattr(plugin, "removed_options", {}).items()}
-        if option in removed:
-            return ConfigError(key, "this option was removed", removed[option])
         owners = {name: {f.name for f in options_of(plugin)} for name, plugin in plugins_of(group).items()}
         having = sorted(name for name, options in owners.items() if option in options)
         all_options = {known for options in owners.values() for known in options}

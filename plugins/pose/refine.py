@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from typing import ClassVar
 
 import numpy as np
 
@@ -35,7 +34,6 @@ from trihedron.plugins.shared.pose_optimizer import PoseSolution
 
 EYE = np.eye(3)
 DETAILED = 100  # key points with which a frame is expected to be recognised by them
-FOCAL_LENGTHS = "`trihedron calibrate RUN.mcap` estimates the focal lengths instead"
 
 
 @register("pose", "refine")
@@ -64,8 +62,6 @@ class Refine:
     min_continued: Share = 0.025  # of the key points with depth that the previous frame or the map must explain, else it is another place
     weak_foundation: PositiveFloat = 3.0  # times the pose's σ beyond which the nearby keyframes' σ is added to it
     submap_after: NonNegativeInt = 5  # frames without relocalisation, of those that show enough, after which a sub-map begins; 0 = never
-
-    removed_options: ClassVar[dict[str, str]] = dict.fromkeys(("focal_off", "focal_worse", "focal_sure"), FOCAL_LENGTHS)
 
     def __post_init__(self) -> None:
         check_increasing(self, "min_inliers", "found_inliers")
