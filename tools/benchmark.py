@@ -9,8 +9,9 @@ Other comparisons, each with its --help: `trihedron benchmark scaling` (threads,
 (estimators of the Manhattan frame on rendered rooms), `trihedron benchmark rotations` (the runs of a sweep over them), `trihedron benchmark
 detectors` (all detectors, by the truth of rendered scenes), `trihedron benchmark methods` (every plugin in the default graph), `trihedron benchmark
 surface` (all surfaces, by the true one), `trihedron benchmark map` (drift, recovery and growth of the map), `trihedron benchmark long` (what a long
-run leaves behind), `trihedron benchmark recording` (what recording costs), `trihedron benchmark building`, `trihedron benchmark sensors` (honesty on
-simulated sensors of several kinds), `trihedron benchmark faults` (the same under degenerate input).
+run leaves behind), `trihedron benchmark parts` (features and matching beside OpenCV's), `trihedron benchmark recording` (what recording costs),
+`trihedron benchmark building`, `trihedron benchmark sensors` (honesty on simulated sensors of several kinds), `trihedron benchmark faults` (the same
+under degenerate input).
 `trihedron compare` makes a table of the runs of any sweep.
 
 Example: trihedron benchmark dataset=tum dataset.path=FOLDER dataset.frames=0:150 --json benchmark.json
@@ -47,6 +48,7 @@ COMPARISONS = {  # other words after `benchmark`, and whose `main` they stand fo
     "manhattan": "trihedron.tools.benchmarks.manhattan_family",
     "map": "trihedron.tools.benchmarks.map_benchmark",
     "methods": "trihedron.tools.benchmarks.method_tables",
+    "parts": "trihedron.tools.benchmarks.part_times",
     "recording": "trihedron.tools.benchmarks.recording_benchmark",
     "rotations": "trihedron.tools.benchmarks.rotation_comparison",
     "scaling": "trihedron.tools.benchmarks.scaling_benchmark",
