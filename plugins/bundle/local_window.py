@@ -8,6 +8,7 @@ from typing import Annotated
 import numpy as np
 
 from trihedron.pipeline.core.geometry import tangent_basis
+from trihedron.pipeline.core.linalg_kernels import solve_positive
 from trihedron.pipeline.core.options import NonNegativeInt, PositiveFloat, PositiveInt, Range
 from trihedron.pipeline.core.registry import register
 from trihedron.pipeline.core.types import F64, Correction, Map
@@ -26,7 +27,6 @@ from trihedron.plugins.bundle.local_window_kernels import (
 from trihedron.plugins.mapping.covisibility_graph import newest_keyframes
 from trihedron.plugins.mapping.landmarks import ENDPOINTS, POSITION
 from trihedron.plugins.shared.linalg import inverse
-from trihedron.plugins.shared.linalg_kernels import solve_positive
 
 DAMPING, MIN_DAMPING = 1e-4, 1e-9
 CONVERGED = 1e-2  # squared Mahalanobis norm of the step of poses and planes, on average over these parameters

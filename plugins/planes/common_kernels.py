@@ -6,9 +6,10 @@ from __future__ import annotations
 import numpy as np
 
 from trihedron.pipeline.core.kernel import kernel
+from trihedron.pipeline.core.linalg_kernels import inverse_positive, solve_positive, tangent_columns
 from trihedron.pipeline.core.types import F32, F64, I32, U8, Bool
 from trihedron.plugins.shared.depth_image_kernels import Grid, cells_by_component
-from trihedron.plugins.shared.linalg_kernels import descending, inverse_positive, solve_positive, tangent_columns
+from trihedron.plugins.shared.sorting_kernels import descending
 
 # Robust planes through the cells of a grid: dominant normal, trimmed weighted least squares in inverse depth, and a test for curvature.
 

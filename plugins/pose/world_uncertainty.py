@@ -13,11 +13,11 @@ import numpy as np
 
 from trihedron.pipeline.core.geometry import invert
 from trihedron.pipeline.core.lie import adjoint
+from trihedron.pipeline.core.linalg_kernels import inverse_positive
 from trihedron.pipeline.core.types import F64, I32, Map, Pose
 from trihedron.plugins.pose.calibration_uncertainty import carried_calibration, with_calibration, with_velocity
 from trihedron.plugins.pose.map_alignment import MapAlignment, TrackingStatus
 from trihedron.plugins.shared.calibration_error import calibration_covariance
-from trihedron.plugins.shared.linalg_kernels import inverse_positive
 from trihedron.plugins.shared.pose_optimizer import LANDMARK_SCORE, PoseSolution, residual_scale
 
 SCALE_FRAMES = 10  # over which the scale of the residuals is averaged

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from trihedron.pipeline.core.lie import exp_so3, log_so3
+from trihedron.pipeline.core.linalg_kernels import polar_rotation, solve_positive
 from trihedron.pipeline.core.types import F64, I32, LOST, Keypoints, ManhattanFrame, Planes, Pose, Rotation, Segments, Tracks
-from trihedron.plugins.shared.linalg_kernels import polar_rotation, solve_positive
 from trihedron.plugins.shared.manhattan_frames_kernels import nearest_equivalent
 from trihedron.plugins.shared.relative_motion import solve_motion
 

@@ -9,12 +9,12 @@ from typing import Annotated
 import numpy as np
 
 from trihedron.pipeline.core.lie import exp_so3, log_so3
+from trihedron.pipeline.core.linalg_kernels import inverse_positive, solve_positive
 from trihedron.pipeline.core.options import NonNegativeInt, PositiveFloat, PositiveInt, Range
 from trihedron.pipeline.core.registry import register
 from trihedron.pipeline.core.types import F64, Keypoints, ManhattanFrame, Map, Planes, Pose, Rotation, Segments, Tracks
 from trihedron.plugins.mapping.reference_keyframe import transform_rotation_to_map
 from trihedron.plugins.rotation.common import IDENTITY, Estimate, KnownFrames, Observation, TrackedRotation, rotation_before, rotation_value
-from trihedron.plugins.shared.linalg_kernels import inverse_positive, solve_positive
 
 
 @register("rotation", "drift_free")

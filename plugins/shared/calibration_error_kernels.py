@@ -11,8 +11,8 @@ from typing import NamedTuple
 import numpy as np
 
 from trihedron.pipeline.core.kernel import kernel
+from trihedron.pipeline.core.linalg_kernels import inverse_positive, tangent_columns
 from trihedron.pipeline.core.types import CALIBRATION, F32, F64, I32, U8
-from trihedron.plugins.shared.linalg_kernels import inverse_positive, tangent_columns
 from trihedron.plugins.shared.pose_optimizer_kernels import (
     NEAR_M,
     SAME,

@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 
 from trihedron.pipeline.core.geometry import tangent_basis
+from trihedron.pipeline.core.linalg_kernels import invert_each
 from trihedron.pipeline.core.types import F32, F64, Camera
-from trihedron.plugins.shared.linalg_kernels import invert_each
 
 
 def constant(array: Any, dtype: type[np.generic]) -> Any:

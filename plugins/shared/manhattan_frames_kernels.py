@@ -9,8 +9,8 @@ from typing import NamedTuple
 import numpy as np
 
 from trihedron.pipeline.core.kernel import kernel
+from trihedron.pipeline.core.linalg_kernels import inverse_positive, polar_rotation, tangent_columns
 from trihedron.pipeline.core.types import F32, F64, I32, Bool
-from trihedron.plugins.shared.linalg_kernels import inverse_positive, polar_rotation, tangent_columns
 
 
 def _cube_rotations() -> F64:

@@ -10,8 +10,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from trihedron.pipeline.core.linalg_kernels import inverse_positive
 from trihedron.pipeline.core.types import F64, U8, Camera
-from trihedron.plugins.shared.linalg_kernels import inverse_positive
 from trihedron.plugins.shared.pose_optimizer_kernels import (
     INLIER,
     ROUNDS,
