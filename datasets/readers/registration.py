@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from trihedron.pipeline.core.geometry import pose_matrix
 from trihedron.pipeline.core.kernel import kernel
 from trihedron.pipeline.core.lie import exp_so3
+from trihedron.pipeline.core.linalg import matmul
 from trihedron.pipeline.core.types import F32, F64, U8, Camera
 
 WIDEST = 32  # pixels of colour that one pixel of depth may cover
@@ -140,7 +141,7 @@ class Registration:
         pixels = np.stack(np.meshgrid(columns, rows), axis=-1)
         rays = cv2.undistortPoints(pixels.reshape(-1, 1, 2), self.K, np.array(self.D) if self.D else None).reshape(pixels.shape)
         with np.errstate(invalid="ignore", over="ignore"):  # where the distortion has no inverse, or the focal length is next to none
-            rays = np.concatenate([rays, np.ones((*rays.shape[:2], 1))], axis=2) @ self.T_color_depth[:3, :3].T
+            rays = matmul(np.concatenate([rays, np.ones((*rays.shape[:2], 1))], axis=2), self.T_color_depth[:3, :3].T)
             return np.ascontiguousarray(rays, np.float32)
 
     def __call__(self, depth_m: F32) -> F32:

@@ -11,6 +11,7 @@ from trihedron.datasets.readers.matrices import frame_stamps, numbered, pose_fil
 from trihedron.datasets.readers.sequence import DepthReader, ImageSequence, SequenceReader
 from trihedron.pipeline.core.errors import DataError
 from trihedron.pipeline.core.geometry import invert
+from trihedron.pipeline.core.linalg import matmul
 from trihedron.pipeline.core.registry import register
 from trihedron.pipeline.core.types import F32, Trajectory
 
@@ -41,7 +42,7 @@ class SevenScenes(SequenceReader):
         stamps = frame_stamps(numbers, calibration.camera.fps)
         truth = pose_files(stamps, [folder / f"frame-{n:06}.pose.txt" for n in numbers])
         if truth is not None and calibration.depth_camera is not None:
-            truth = Trajectory(truth.stamps_ns, truth.poses @ invert(calibration.depth_camera.T_color_depth))
+            truth = Trajectory(truth.stamps_ns, matmul(truth.poses, invert(calibration.depth_camera.T_color_depth)))
         images = [colors[n] for n in numbers], [depths[n] for n in numbers]
         return ImageSequence(stamps, *images, calibration, truth, depth_reader=_reader(calibration))
 

@@ -15,6 +15,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from trihedron.datasets.simulation.room import BOX, CYLINDER, Face, Room, all_faces
+from trihedron.pipeline.core.linalg import matmul
 from trihedron.pipeline.core.types import F64, I32, Camera
 
 NEAR_M = 0.05  # nothing nearer is looked for
@@ -69,7 +70,7 @@ def _lamp(face: Face, room: Room) -> F64:
     """The nearest lamp in front of a face; of all lamps when none is in front of it."""
     lamps = np.array(room.lamps_m)
     centre = face.origin if face.curved else face.origin + face.u * (face.size_m[0] / 2.0) + face.v * (face.size_m[1] / 2.0)
-    behind = (lamps - centre) @ face.normal <= 0.0 if not face.curved else np.zeros(len(lamps))
+    behind = matmul(lamps - centre, face.normal) <= 0.0 if not face.curved else np.zeros(len(lamps))
     nearest_first = np.lexsort((np.linalg.norm(lamps - centre, axis=1), behind))
     return np.asarray(lamps[nearest_first[0]], np.float64)
 
@@ -78,12 +79,12 @@ def view_of(geometry: Geometry, camera: Camera, T_world_camera: F64) -> CameraVi
     """A camera at a pose, with what depends on the pose alone worked out."""
     R, position = np.ascontiguousarray(T_world_camera[:3, :3]), T_world_camera[:3, 3].copy()
     R_solid_world = np.swapaxes(geometry.rotations, 1, 2)
-    origins = (R_solid_world @ (position - geometry.centres)[:, :, None])[:, :, 0]
-    turned = (R_solid_world @ R).reshape(-1, 9)
+    origins = matmul(R_solid_world, (position - geometry.centres)[:, :, None])[:, :, 0]
+    turned = matmul(R_solid_world, R).reshape(-1, 9)
     normals = geometry.planes[:, :3]
-    distances = normals @ position + geometry.planes[:, 3]
+    distances = matmul(normals, position) + geometry.planes[:, 3]
     solids = np.column_stack([geometry.halves, origins, turned, geometry.kinds])
-    return CameraView(camera.fx, camera.fy, camera.cx, camera.cy, position, R, solids, -(normals @ R) / distances[:, None])
+    return CameraView(camera.fx, camera.fy, camera.cx, camera.cy, position, R, solids, -matmul(normals, R) / distances[:, None])
 
 
 @njit(cache=True, nogil=True, error_model="numpy")

@@ -1,4 +1,4 @@
-"""Rotations, rigid motions, planes, and numbers on a line: small, exact, NumPy and plain numbers only. Frames and signs as in `types`."""
+"""Rotations, rigid motions, planes, and numbers on a line: small and exact. Frames and signs as in `types`."""
 
 from __future__ import annotations
 
@@ -7,6 +7,8 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
+from trihedron.pipeline.core.linalg import matmul
+from trihedron.pipeline.core.linalg_kernels import polar_rotation
 from trihedron.pipeline.core.types import F64
 
 ROUNDING = 1e-12  # of RRᵀ - I, above which a rotation is made one again
@@ -24,25 +26,25 @@ def invert(T: F64) -> F64:
     R = T[..., :3, :3].swapaxes(-1, -2)
     out = np.zeros(T.shape)
     out[..., :3, :3] = R
-    out[..., :3, 3:] = -(R @ T[..., :3, 3:])
+    out[..., :3, 3:] = -matmul(R, T[..., :3, 3:])
     out[..., 3, 3] = 1.0
     return out
 
 
 def transform(T_a_b: F64, points_b: F64) -> F64:
     """Transform (..., 3) points of frame b into frame a."""
-    return points_b @ T_a_b[:3, :3].T + T_a_b[:3, 3]
+    return matmul(points_b, T_a_b[:3, :3].T) + T_a_b[:3, 3]
 
 
 def transform_each(T_a_b: F64, points_b: F64) -> F64:
     """Transform (n, k, 3) points of frame b into frame a, each row by its own motion (n, 4, 4)."""
-    return points_b @ T_a_b[:, :3, :3].swapaxes(-1, -2) + T_a_b[:, None, :3, 3]
+    return matmul(points_b, T_a_b[:, :3, :3].swapaxes(-1, -2)) + T_a_b[:, None, :3, 3]
 
 
 def transform_planes(T_a_b: F64, planes_b: F64) -> F64:
     """Transform (..., 4) planes (n, d) of frame b into frame a, signs as they are: d may become negative."""
-    n = planes_b[..., :3] @ T_a_b[:3, :3].T
-    return np.concatenate([n, planes_b[..., 3:] - (n @ T_a_b[:3, 3])[..., None]], axis=-1)
+    n = matmul(planes_b[..., :3], T_a_b[:3, :3].T)
+    return np.concatenate([n, planes_b[..., 3:] - matmul(n, T_a_b[:3, 3])[..., None]], axis=-1)
 
 
 def tangent_basis(n: F64) -> F64:
@@ -60,10 +62,8 @@ def tangent_basis(n: F64) -> F64:
 
 
 def nearest_rotation(M: F64) -> F64:
-    """Return the rotation nearest to a (3, 3) matrix in the Frobenius norm (SVD with determinant +1)."""
-    U, _, Vt = np.linalg.svd(M)
-    U[:, 2] *= np.linalg.det(U @ Vt)
-    return np.asarray(U @ Vt, np.float64)
+    """Return the rotation nearest to a (3, 3) matrix in the Frobenius norm (determinant +1), by its polar decomposition."""
+    return polar_rotation(np.array(M, np.float64, order="C"))
 
 
 def rigid(T: F64) -> F64:
@@ -72,7 +72,7 @@ def rigid(T: F64) -> F64:
     `invert` takes the transpose for the inverse, which doubles a rotation's rounding error: in a chain of poses, each relative to the one before, it
     would grow without bound."""
     R = T[:3, :3]
-    return T if np.abs(R @ R.T - np.eye(3)).max() < ROUNDING else pose_matrix(nearest_rotation(R), T[:3, 3])
+    return T if np.abs(matmul(R, R.T) - np.eye(3)).max() < ROUNDING else pose_matrix(nearest_rotation(R), T[:3, 3])
 
 
 def quaternion_from_rotation(R: F64) -> F64:
@@ -116,9 +116,8 @@ def rotation_from_quaternion(q: F64) -> F64:
 def umeyama(estimate: F64, truth: F64) -> F64:
     """Align (n, 3) points by SE(3): the T (4, 4) that minimises `Σ |truth - T estimate|²` (Umeyama 1991, scale fixed to 1)."""
     mean_e, mean_t = estimate.mean(axis=0), truth.mean(axis=0)
-    U, _, Vt = np.linalg.svd((truth - mean_t).T @ (estimate - mean_e))
-    R = U @ np.diag([1.0, 1.0, np.sign(np.linalg.det(U) * np.linalg.det(Vt))]) @ Vt
-    return pose_matrix(R, mean_t - R @ mean_e)
+    R = nearest_rotation(matmul((truth - mean_t).T, estimate - mean_e))
+    return pose_matrix(R, mean_t - matmul(R, mean_e))
 
 
 def nearest_pairs(first: NDArray[np.int64], second: NDArray[np.int64], limit: int) -> NDArray[np.int64]:

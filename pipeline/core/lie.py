@@ -9,6 +9,7 @@ import math
 import numpy as np
 
 from trihedron.pipeline.core.geometry import pose_matrix, quaternion_xyzw
+from trihedron.pipeline.core.linalg import matmul, solve
 from trihedron.pipeline.core.types import F64
 
 
@@ -41,24 +42,24 @@ def log_so3(R: F64) -> F64:
 
 def left_jacobian_so3(phi: F64) -> F64:
     """Return the left Jacobian V (3, 3) of SO(3): `exp_se3(rho, phi).t = V rho`."""
-    angle2 = float(phi @ phi)
+    angle2 = float(matmul(phi, phi))
     angle = np.sqrt(angle2)
     K = skew(phi)
     if angle2 < 1e-10:
-        return np.eye(3) + 0.5 * K + K @ K / 6.0
+        return np.eye(3) + 0.5 * K + matmul(K, K) / 6.0
     a, b = (1.0 - np.cos(angle)) / angle2, (angle - np.sin(angle)) / (angle2 * angle)
-    return np.asarray(np.eye(3) + a * K + b * (K @ K), np.float64)
+    return np.asarray(np.eye(3) + a * K + b * matmul(K, K), np.float64)
 
 
 def exp_se3(xi: F64) -> F64:
     """Map a (6,) twist (rho, phi) to its (4, 4) rigid motion."""
-    return pose_matrix(exp_so3(xi[3:]), left_jacobian_so3(xi[3:]) @ xi[:3])
+    return pose_matrix(exp_so3(xi[3:]), matmul(left_jacobian_so3(xi[3:]), xi[:3]))
 
 
 def log_se3(T: F64) -> F64:
     """Map a (4, 4) rigid motion to its (6,) twist (rho, phi); inverse of `exp_se3`."""
     phi = log_so3(T[:3, :3])
-    return np.concatenate([np.linalg.solve(left_jacobian_so3(phi), T[:3, 3]), phi])
+    return np.concatenate([solve(left_jacobian_so3(phi), T[:3, 3]), phi])
 
 
 def adjoint(T: F64) -> F64:

@@ -1,8 +1,8 @@
 """Linear algebra whose results depend on the values and shapes alone: on no BLAS or LAPACK, which round as the processor suits them.
 
-The functions are those of NumPy with the same names, for arrays (..., m, n) of float64, or of float32, whose precision the result has. Sums are in a
-fixed order, whatever the strides. Elementwise functions, sums, `np.einsum` without `optimize`, `np.cross`, `np.outer` and `np.linalg.norm` with an axis
-call no BLAS, and need no replacement. Kernels have theirs in `linalg_kernels`.
+The functions are those of NumPy with the same names, for arrays (..., m, n) of float64, or of float32, whose precision the result has. The order of
+operations is fixed, whatever the strides. Elementwise functions, sums, `np.einsum` without `optimize`, `np.cross`, `np.outer` and `np.linalg.norm`
+with an axis call no BLAS, and need no replacement. Kernels have theirs in `linalg_kernels`.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 from numpy.linalg import LinAlgError
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from trihedron.pipeline.core import linalg_kernels as kernels
 from trihedron.pipeline.core.types import F64
@@ -21,7 +21,7 @@ SUBSCRIPTS = {(1, 1): "i,i->", (1, 2): "j,...jk->...k", (2, 1): "...ij,j->...i",
 SMALL = 1000  # multiplications, below which the call of a kernel takes longer than they do
 
 
-def matmul(a: ArrayLike, b: ArrayLike, *more: ArrayLike) -> Any:
+def matmul(a: ArrayLike, b: ArrayLike, *more: ArrayLike) -> NDArray[Any]:
     """Multiply matrices (..., m, k) and (..., k, n) as `a @ b` does, vectors (k,) included, and the result by each of `more`."""
     x, y = np.ascontiguousarray(a), np.ascontiguousarray(b)
     if x.ndim > 1 and y.ndim > 1 and x.size * y.shape[-1] > SMALL and x.dtype.kind == y.dtype.kind == "f":
@@ -71,7 +71,7 @@ def norm(x: ArrayLike) -> float:
     return float(np.sqrt((values * values).sum()))
 
 
-def solve(A: ArrayLike, b: ArrayLike) -> Any:
+def solve(A: ArrayLike, b: ArrayLike) -> NDArray[Any]:
     """Solve `A x = b` for A (..., k, k) and b (k,) or (..., k, m), by elimination with row pivots. Raises LinAlgError where A is singular."""
     matrices, dtype, leading = _copies(A)
     right = np.asarray(b)
@@ -85,7 +85,7 @@ def solve(A: ArrayLike, b: ArrayLike) -> Any:
     return (out[..., 0] if right.ndim == 1 else out).astype(np.result_type(dtype, right), copy=False)
 
 
-def inv(A: ArrayLike) -> Any:
+def inv(A: ArrayLike) -> NDArray[Any]:
     """Invert matrices (..., k, k) by elimination with row pivots. Raises LinAlgError where one is singular."""
     matrices, dtype, _ = _copies(A)
     out = np.zeros(matrices.shape)
@@ -102,7 +102,7 @@ def det(A: ArrayLike) -> Any:
     return found.reshape(leading).astype(dtype, copy=False)[()]
 
 
-def cholesky(A: ArrayLike) -> Any:
+def cholesky(A: ArrayLike) -> NDArray[Any]:
     """Return the lower triangular L with `A = L Lᵀ` of symmetric matrices (..., k, k). Raises LinAlgError where one is not positive definite."""
     matrices, dtype, _ = _copies(A)
     if not kernels.factor_each(matrices):
@@ -110,14 +110,14 @@ def cholesky(A: ArrayLike) -> Any:
     return matrices.reshape(np.shape(A)).astype(dtype, copy=False)
 
 
-def eigh(A: ArrayLike) -> tuple[Any, Any]:
-    """Return the eigenvalues (..., k), increasing, and unit eigenvectors (..., k, k), in columns, of symmetric matrices (..., k, k), of which the lower
-    triangles are read; by Jacobi rotations."""
-    matrices, dtype, leading = _copies(A)
+def eigh(A: ArrayLike) -> tuple[NDArray[Any], NDArray[Any]]:
+    """Return the eigenvalues (..., k), increasing, and unit eigenvectors (..., k, k), in columns, of symmetric matrices (..., k, k), of which the
+    lower triangles are read; by Jacobi rotations."""
+    matrices, dtype, _ = _copies(A)
     values, vectors = kernels.eigh_each(matrices)
-    return values.reshape(*leading, -1).astype(dtype, copy=False), vectors.reshape(np.shape(A)).astype(dtype, copy=False)
+    return values.reshape(np.shape(A)[:-1]).astype(dtype, copy=False), vectors.reshape(np.shape(A)).astype(dtype, copy=False)
 
 
-def eigvalsh(A: ArrayLike) -> Any:
+def eigvalsh(A: ArrayLike) -> NDArray[Any]:
     """Return the eigenvalues (..., k), increasing, of symmetric matrices (..., k, k)."""
     return eigh(A)[0]

@@ -7,7 +7,7 @@ from __future__ import annotations
 import numpy as np
 
 from trihedron.pipeline.core.kernel import kernel
-from trihedron.pipeline.core.types import F64, I32
+from trihedron.pipeline.core.types import F64
 
 
 @kernel

@@ -14,6 +14,7 @@ import numpy as np
 
 from trihedron.pipeline.core.constraints import Columns, CoversImage, Finite, IndexInto, OneOf, Rotations, SameWidth, UnitNormals, Within
 from trihedron.pipeline.core.errors import RecordingError
+from trihedron.pipeline.core.linalg import det, matmul
 from trihedron.pipeline.core.slots import SLOTS, output_of
 from trihedron.pipeline.core.types import Camera, Frame, Value
 
@@ -163,7 +164,7 @@ def _fault_of_rotations(array: Any, rule: Rotations, owner: Any) -> str:
         array = array[~np.isnan(array).all(axis=(1, 2))]
     R = array[:, :3, :3]
     with np.errstate(all="ignore"):
-        fits = (np.abs(np.swapaxes(R, 1, 2) @ R - np.eye(3)) <= ORTHONORMAL).all() and (np.linalg.det(R) > 0).all()
+        fits = (np.abs(matmul(np.swapaxes(R, 1, 2), R) - np.eye(3)) <= ORTHONORMAL).all() and (det(R) > 0).all()
     if array.shape[-1] == 4:
         fits = fits and np.isfinite(array).all() and (array[:, 3] == [0, 0, 0, 1]).all()
     return "" if fits else "is not a rotation" + " with a translation" * (array.shape[-1] == 4)

@@ -27,6 +27,7 @@ from trihedron.pipeline.core.building_geometry import (
     wall_corners,
     wall_pieces,
 )
+from trihedron.pipeline.core.linalg import norm
 from trihedron.pipeline.core.types import ELEMENTS, F64, OPENING_KINDS, SUPPORTS, Building
 
 JSON, SVG, DXF, GLB = "building.json", "floorplan.svg", "floorplan.dxf", "building.glb"
@@ -101,7 +102,7 @@ def _wall(building: Building, k: int) -> dict[str, Any]:
     start, end = building.walls_m[k]
     offset, thickness, angle = _sigmas(building.wall_covariance[k])
     return {
-        "storey": int(building.wall_storeys[k]), "start": _numbers(start), "end": _numbers(end), "length_m": _numbers(np.linalg.norm(end - start)),
+        "storey": int(building.wall_storeys[k]), "start": _numbers(start), "end": _numbers(end), "length_m": _numbers(norm(end - start)),
         "thickness_m": _numbers(building.thickness_m[k]), "offset_sigma_m": offset, "thickness_sigma_m": thickness, "direction_sigma_rad": angle,
         "unseen": [_numbers(row[1:]) for row in building.unseen if int(row[0]) == k], "support": _support(building, "wall", k),
     }  # fmt: skip
@@ -195,7 +196,7 @@ def _svg_opening(building: Building, opening: int, at: Any) -> list[str]:
     if kind == "passage":
         return []
     hinge, tip, _, leaf = at(door_swing(building, opening))
-    width = float(np.linalg.norm(tip - hinge))
+    width = float(norm(tip - hinge))
     cross = (tip - hinge)[0] * (leaf - hinge)[1] - (tip - hinge)[1] * (leaf - hinge)[0]
     arc = f"M{leaf[0]:.1f} {leaf[1]:.1f} A{width:.1f} {width:.1f} 0 0 {1 if cross < 0 else 0} {tip[0]:.1f} {tip[1]:.1f}"
     return [
@@ -232,7 +233,7 @@ def _svg_texts(building: Building, room: int, at: Any) -> list[str]:
     for of, a, b in building.loops:
         corners, walls = building.corners_m[a:b], building.corner_walls[a:b]
         for p, q, wall in zip(corners, np.roll(corners, -1, axis=0), walls) if of == room else ():
-            if wall >= 0 and np.linalg.norm(q - p) >= LONGEST_UNLABELLED_M:
+            if wall >= 0 and norm(q - p) >= LONGEST_UNLABELLED_M:
                 text, box = _length_text(p, q, at, taken)
                 taken.append(box)
                 out.append(text)
@@ -244,7 +245,7 @@ def _length_text(p: F64, q: F64, at: Any, taken: list[Any]) -> tuple[str, Any]:
     import shapely
     from shapely.affinity import rotate
 
-    length = float(np.linalg.norm(q - p))
+    length = float(norm(q - p))
     along = (q - p) / length
     angle = (-float(np.degrees(np.arctan2(along[1], along[0]))) + 90.0) % 180.0 - 90.0
     half = len(f"{length:.2f}") * LETTERS_PX["length"] / 2.0

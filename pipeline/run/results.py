@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from trihedron.pipeline.core.errors import DataError
+from trihedron.pipeline.core.linalg import matmul, norm
 from trihedron.pipeline.core.types import DEGRADED, LOST, OK, Map, Pose, Surface, Trajectory
 from trihedron.pipeline.record.trajectories import write_trajectory
 from trihedron.pipeline.run.accounting import Result
@@ -39,7 +40,7 @@ def final_trajectory(result: Result) -> Trajectory:
         return causal_trajectory(result)
     keyframes = result.map.keyframes.column("T_world_camera")
     own = dict(list(zip(result.map.keyframes.column("index").tolist(), keyframes))[result.loaded_keyframes :])
-    moved = [pose.T_world_camera if pose.reference < 0 else keyframes[pose.reference] @ pose.T_reference_camera for pose in poses]
+    moved = [pose.T_world_camera if pose.reference < 0 else matmul(keyframes[pose.reference], pose.T_reference_camera) for pose in poses]
     return _trajectory([pose.stamp_ns for pose in poses], [own.get(pose.index, T) for pose, T in zip(poses, moved)])
 
 
@@ -67,7 +68,7 @@ def write_results(out: Path, result: Result, truth: Trajectory | None, plot: boo
         "reasons": {status: reason for status in (DEGRADED, LOST) if (reason := _commonest_reason(result.poses, status))},
     }
     if len(final):  # of a walk that ends where it began, the drift
-        metrics["start_to_end_m"] = float(np.linalg.norm(final.poses[-1, :3, 3] - final.poses[0, :3, 3]))
+        metrics["start_to_end_m"] = float(norm(final.poses[-1, :3, 3] - final.poses[0, :3, 3]))
     if truth is not None:
         stamps = np.array(result.stamps_ns, np.int64)
         try:

@@ -15,6 +15,7 @@ from typing import Annotated, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from trihedron.pipeline.core.linalg import det, matmul, norm, solve
 from trihedron.pipeline.core.options import PositiveFloat, Range
 from trihedron.pipeline.core.types import ELEMENTS, F64, I32, OPENING_KINDS, SUPPORTS, Bool, Building, Map
 from trihedron.plugins.building.common import (
@@ -37,6 +38,7 @@ from trihedron.plugins.building.common import (
     free_space,
     nothing,
     slanted_directions,
+    smoothed,
     storeys_of,
     tall_m,
 )
@@ -91,7 +93,7 @@ class Edge:
     @property
     def span(self) -> tuple[float, float]:
         """Return begin and end along `along`."""
-        a, b = float(self.begin @ self.along), float(self.end @ self.along)
+        a, b = float(matmul(self.begin, self.along)), float(matmul(self.end, self.along))
         return min(a, b), max(a, b)
 
 
@@ -111,11 +113,11 @@ def cells_of(faces: list[Face], space: FreeSpace) -> Cells:
     h, w = space.levels.shape
     low, high = space.origin, space.origin + CELL_M * np.array([w, h])
     box = shapely.box(*low, *high)
-    reach = float(np.linalg.norm(high - low))
+    reach = float(norm(high - low))
     middle = (low + high) / 2.0
     lines = [box.exterior]
     for face in faces:
-        foot = middle + (face.offset_m - middle @ face.normal) * face.normal
+        foot = middle + (face.offset_m - matmul(middle, face.normal)) * face.normal
         lines.append(shapely.LineString([foot - reach * face.along, foot + reach * face.along]).intersection(box))
     polygons = list(polygonize(unary_union(shapely.set_precision(lines, 1e-5))))
     free = np.array([_free_share(polygon, space) for polygon in polygons])
@@ -129,7 +131,7 @@ def cells_of(faces: list[Face], space: FreeSpace) -> Cells:
     for (p, q), pair in sides.items():
         if len(pair) == 2:
             a, b = np.array(p), np.array(q)
-            edges.append((pair[0], pair[1], _tall_share(faces, a, b), float(np.linalg.norm(b - a))))
+            edges.append((pair[0], pair[1], _tall_share(faces, a, b), float(norm(b - a))))
     return Cells(polygons, free, edges)
 
 
@@ -152,11 +154,11 @@ def _steps(low: float, high: float) -> F64:
 
 def _tall_share(faces: list[Face], a: F64, b: F64) -> float:
     """Return the greatest share of a stretch that one face covers with tall columns."""
-    direction = (b - a) / max(float(np.linalg.norm(b - a)), 1e-9)
+    direction = (b - a) / max(float(norm(b - a)), 1e-9)
     best = 0.0
     for face in faces:
-        if abs(float(direction @ face.normal)) < 0.02 and abs(float((a + b) @ face.normal) / 2.0 - face.offset_m) < 0.02:
-            t0, t1 = sorted((float(a @ face.along), float(b @ face.along)))
+        if abs(float(matmul(direction, face.normal))) < 0.02 and abs(float(matmul(a + b, face.normal)) / 2.0 - face.offset_m) < 0.02:
+            t0, t1 = sorted((float(matmul(a, face.along)), float(matmul(b, face.along))))
             best = max(best, face.share(t0, t1, face.tall))
     return best
 
@@ -204,7 +206,7 @@ def _relative(edges: list[Edge]) -> None:
     middle = np.mean([edge.begin for edge in edges], axis=0)
     common = min((edge.drift_m2 for edge in edges if edge.face is not None), default=0.0)
     for edge in edges:
-        size = SCALE * (edge.offset_m - middle @ edge.normal)
+        size = SCALE * (edge.offset_m - matmul(middle, edge.normal))
         edge.sigma_m = float(np.sqrt(edge.sigma_m**2 + size**2 + max(edge.drift_m2 - common, 0.0)))
         edge.drift_m2 = common
 
@@ -238,27 +240,27 @@ def _edges(ring: Any, faces: list[Face]) -> list[Edge]:
     points = np.array(ring.coords)[:-1]
     out = []
     for p, q in zip(points, np.roll(points, -1, axis=0)):
-        length = float(np.linalg.norm(q - p))
+        length = float(norm(q - p))
         along = (q - p) / length
         normal = np.array([-along[1], along[0]])
         best, share = None, 0.0
         for face in faces:
-            if float(face.normal @ normal) > 0.999 and abs(float((p + q) @ face.normal) / 2.0 - face.offset_m) < SAME_LINE_M:
-                covered = face.share(float(p @ face.along), float(q @ face.along), face.count.sum(axis=1) > 0)
+            if float(matmul(face.normal, normal)) > 0.999 and abs(float(matmul(p + q, face.normal)) / 2.0 - face.offset_m) < SAME_LINE_M:
+                covered = face.share(float(matmul(p, face.along)), float(matmul(q, face.along)), face.count.sum(axis=1) > 0)
                 if covered > share:
                     best, share = face, covered
-        glimpsed = share >= GLIMPSE_SHARE and _backed(normal, float(p @ normal), p, q, faces)
+        glimpsed = share >= GLIMPSE_SHARE and _backed(normal, float(matmul(p, normal)), p, q, faces)
         on = best if share >= ON_WALL_SHARE or glimpsed else None
-        out.append(Edge(on.normal if on is not None else normal, float(p @ normal) if on is None else on.offset_m, on, p, q))
+        out.append(Edge(on.normal if on is not None else normal, float(matmul(p, normal)) if on is None else on.offset_m, on, p, q))
     return out
 
 
 def _backed(normal: F64, offset_m: float, p: F64, q: F64, faces: list[Face]) -> bool:
     """Say if the other face of a wall, which was seen from behind, covers most of a stretch from p to q of a line."""
     return any(
-        float(other.normal @ normal) < -0.999
+        float(matmul(other.normal, normal)) < -0.999
         and -SAME_LINE_M < offset_m + other.offset_m < THICKEST_M
-        and other.share(float(q @ other.along), float(p @ other.along), other.tall) > TALL_SHARE
+        and other.share(float(matmul(q, other.along)), float(matmul(p, other.along)), other.tall) > TALL_SHARE
         for other in faces
     )
 
@@ -267,7 +269,7 @@ def _near(edge: Edge, face: Face, evidence: Evidence, within_m: float, end_m: fl
     """Return the numbers (n,) of the points of a face that lie on an edge."""
     a, b = edge.span
     points = evidence.points[face.members, :2]
-    t, off = points @ edge.along, points @ edge.normal - edge.offset_m
+    t, off = matmul(points, edge.along), matmul(points, edge.normal) - edge.offset_m
     return np.asarray(face.members[(np.abs(off) < within_m) & (t > a + end_m) & (t < b - end_m)])
 
 
@@ -285,10 +287,10 @@ def _fit(edge: Edge, evidence: Evidence, storey: Storey) -> None:
         if len(mask) == 0:
             return
         rows = evidence.rows[mask]
-        offset, sigma = combined(evidence.points[mask, :2] @ edge.normal, evidence.information[mask], rows)
+        offset, sigma = combined(matmul(evidence.points[mask, :2], edge.normal), evidence.information[mask], rows)
         edge.offset_m, edge.sigma_m, edge.views = offset, sigma, np.unique(rows)
         edge.drift_m2 = drift_variance(evidence, np.array([*edge.normal, 0.0]), evidence.information[mask], rows)
-        t = evidence.points[mask, :2] @ edge.along
+        t = matmul(evidence.points[mask, :2], edge.along)
         if np.abs(edge.normal).max() < AXIS:
             _turn(edge, evidence.points[mask, :2], evidence.information[mask])
         edge.angle_sigma = float(np.hypot(sigma / max(float(t.std()) * 2.0, 0.1), np.radians(0.03)))
@@ -299,14 +301,14 @@ AXIS = 1.0 - 1e-9  # greatest component of a normal along an axis of the buildin
 
 def _turn(edge: Edge, points: F64, information: F64) -> None:
     """Turn an edge that is along no axis of the building to its own points (n, 2)."""
-    t, off = points @ edge.along, points @ edge.normal - edge.offset_m
+    t, off = matmul(points, edge.along), matmul(points, edge.normal) - edge.offset_m
     middle = float(np.average(t, weights=information))
-    spread = float(information @ (t - middle) ** 2)
-    slope = float(information @ ((t - middle) * off)) / spread if spread > 0.0 else 0.0
+    spread = float(matmul(information, (t - middle) ** 2))
+    slope = float(matmul(information, (t - middle) * off)) / spread if spread > 0.0 else 0.0
     centre = middle * edge.along + edge.offset_m * edge.normal
     normal = edge.normal - slope * edge.along
-    edge.normal = normal / np.linalg.norm(normal)
-    edge.offset_m = float(centre @ edge.normal)
+    edge.normal = normal / norm(normal)
+    edge.offset_m = float(matmul(centre, edge.normal))
 
 
 LEAST_OPEN_M = 0.15  # of an edge beyond the last reading
@@ -317,7 +319,7 @@ def _ended(loop: list[Edge], faces: list[Face]) -> list[Edge]:
     out: list[Edge] = []
     for before, edge, after in zip([loop[-1], *loop[:-1]], loop, [*loop[1:], loop[0]]):
         pieces = [edge]
-        a, b = float(edge.begin @ edge.along), float(edge.end @ edge.along)
+        a, b = float(matmul(edge.begin, edge.along)), float(matmul(edge.end, edge.along))
         for open_end, neighbour in ((False, before), (True, after)):
             if edge.face is None or _bounded(neighbour, faces) or (seen := _readings_of(edge.face, a, b)) is None:
                 continue
@@ -350,10 +352,10 @@ def _cornered(loop: list[Edge]) -> None:
     """Put the corners of a ring where its edges' lines meet."""
     for before, edge in zip([loop[-1], *loop[:-1]], loop):
         A = np.stack([before.normal, edge.normal])
-        if abs(np.linalg.det(A)) > 0.05:
-            corner = np.asarray(np.linalg.solve(A, [before.offset_m, edge.offset_m]), np.float64)
+        if abs(det(A)) > 0.05:
+            corner = np.asarray(solve(A, [before.offset_m, edge.offset_m]), np.float64)
         else:
-            corner = edge.begin + (edge.offset_m - edge.begin @ edge.normal) * edge.normal
+            corner = edge.begin + (edge.offset_m - matmul(edge.begin, edge.normal)) * edge.normal
         before.end, edge.begin = corner, corner
 
 
@@ -417,7 +419,7 @@ def _stretches(face: Face, least_m: float) -> list[tuple[float, float]]:
 
 def _beside(edge: Edge, wall: WallPlan) -> bool:
     """Say if an edge is one of a wall's faces, or so near to one that the readings may be furniture before it or stray ones behind it."""
-    facing = float(edge.normal @ wall.edge.normal)
+    facing = float(matmul(edge.normal, wall.edge.normal))
     (a, b), (c, d) = edge.span, wall.span if facing > 0.0 else (-wall.span[1], -wall.span[0])
     away = edge.offset_m - np.sign(facing) * wall.edge.offset_m
     return abs(facing) > 0.99 and abs(away) < THICKEST_M and min(b, d) - max(a, c) > 0.0
@@ -425,7 +427,7 @@ def _beside(edge: Edge, wall: WallPlan) -> bool:
 
 def _one_wall(a: Edge, b: Edge) -> bool:
     """Say if two edges are the two sides of one wall, or stretches of one side with less than a wall's thickness between them."""
-    turned = float(a.normal @ b.normal)
+    turned = float(matmul(a.normal, b.normal))
     (a0, a1), (b0, b1) = a.span, b.span
     if turned < 0.0:
         b0, b1 = -b1, -b0
@@ -441,16 +443,20 @@ def _wall(members: list[tuple[int, Edge]], faces: list[Face], number: int) -> Wa
     for _, edge in members:
         edge.wall = number
     main = max((edge for _, edge in members), key=lambda edge: edge.span[1] - edge.span[0])
-    spans = [edge.span if edge.normal @ main.normal > 0 else (-edge.span[1], -edge.span[0]) for _, edge in members]
+    spans = [edge.span if matmul(edge.normal, main.normal) > 0 else (-edge.span[1], -edge.span[0]) for _, edge in members]
     span = min(a for a, _ in spans), max(b for _, b in spans)
-    behind = [edge for _, edge in members if edge.normal @ main.normal < 0]
+    behind = [edge for _, edge in members if matmul(edge.normal, main.normal) < 0]
     if behind:
         other = max(behind, key=lambda edge: edge.span[1] - edge.span[0])
         sigma = float(np.sqrt(main.sigma_m**2 + other.sigma_m**2 + abs(main.drift_m2 - other.drift_m2)))
         return WallPlan(main, span, main.offset_m + other.offset_m, sigma, members)
     for face in faces:  # seen through a door, but no room's
         depth = main.offset_m + face.offset_m
-        if face.normal @ main.normal < -0.999 and THINNEST_M / 2.0 < depth < THICKEST_M and face.share(-span[1], -span[0], face.tall) > TALL_SHARE:
+        if (
+            matmul(face.normal, main.normal) < -0.999
+            and THINNEST_M / 2.0 < depth < THICKEST_M
+            and face.share(-span[1], -span[0], face.tall) > TALL_SHARE
+        ):
             return WallPlan(main, span, depth, float(np.hypot(main.sigma_m, 0.005)), members)
     return WallPlan(main, span, float("nan"), float("nan"), members)
 
@@ -554,14 +560,14 @@ def _wall_points(wall: WallPlan, faces: list[Face], evidence: Evidence, storey: 
     edge, depth = wall.edge, wall.thickness_m if np.isfinite(wall.thickness_m) else 0.0
     members = [np.empty(0, np.int64)]
     for face in faces:
-        turned = float(face.normal @ edge.normal)
+        turned = float(matmul(face.normal, edge.normal))
         if (turned > 0.999 and abs(face.offset_m - edge.offset_m) < FIT_M) or (
             turned < -0.999 and abs(face.offset_m + edge.offset_m - depth) < FIT_M
         ):
             members.append(face.members)
     chosen = np.concatenate(members)
     points = evidence.points[chosen]
-    return points[:, :2] @ edge.along, points[:, 2] - storey.bottom_m, evidence.rows[chosen]
+    return matmul(points[:, :2], edge.along), points[:, 2] - storey.bottom_m, evidence.rows[chosen]
 
 
 def _between_levels(open_levels: NDArray[np.signedinteger], along: F64, height: F64) -> F64:
@@ -605,7 +611,7 @@ def _end_of(away: F64, guess_m: float) -> float:
     beyond = density[int((guess_m + CELL_M) / END_STEP_M) :]
     if len(beyond) == 0 or np.median(beyond) == 0.0:
         return float("nan")
-    smooth = np.convolve(density, np.ones(3) / 3.0, "same")
+    smooth = smoothed(density, np.ones(3) / 3.0)
     dense = np.nonzero(smooth >= 0.5 * np.median(beyond))[0]
     return float(dense[0]) * END_STEP_M if len(dense) else float("nan")
 
@@ -746,7 +752,7 @@ def _unseen(wall: WallPlan, openings: list[OpeningPlan], number: int) -> list[tu
     for _, edge in wall.edges:
         if edge.face is None:
             continue
-        along = t if edge.normal @ wall.edge.normal > 0.0 else -t
+        along = t if matmul(edge.normal, wall.edge.normal) > 0.0 else -t
         cell = ((along - edge.face.start_m) / CELL_M).astype(int)
         inside = (cell >= 0) & (cell < len(edge.face.count))
         seen[inside] |= edge.face.count[cell[inside]].any(axis=1)
@@ -766,7 +772,7 @@ def _area(room: RoomPlan) -> tuple[float, float]:
     for loop in room.loops:
         for edge in loop:
             area += 0.5 * float(edge.begin[0] * edge.end[1] - edge.begin[1] * edge.end[0])
-            length = float(np.linalg.norm(edge.end - edge.begin))
+            length = float(norm(edge.end - edge.begin))
             sigma = edge.sigma_m if np.isfinite(edge.sigma_m) else CELL_M
             variance += (length * sigma) ** 2
     return area, variance
@@ -782,7 +788,11 @@ def _planes_on(wall: WallPlan, evidence: Evidence, map: Map | None) -> list[int]
         seen = points[row][np.isfinite(points[row]).all(axis=1)]
         if len(seen) == 0:
             continue
-        facing, off, t = float(normals[row, :2] @ edge.normal), seen[:, :2] @ edge.normal - edge.offset_m, seen[:, :2] @ edge.along
+        facing, off, t = (
+            float(matmul(normals[row, :2], edge.normal)),
+            matmul(seen[:, :2], edge.normal) - edge.offset_m,
+            matmul(seen[:, :2], edge.along),
+        )
         between = ((t > wall.span[0] - 0.1) & (t < wall.span[1] + 0.1)).mean() > 0.5
         near = np.abs(off).mean() < FIT_M if facing > 0.995 else facing < -0.995 and np.isfinite(depth) and np.abs(off + depth).mean() < FIT_M
         if between and near:
@@ -811,7 +821,7 @@ def _map_planes(evidence: Evidence, map: Map) -> tuple[F64, F64, F64]:
     R, t = evidence.T_world_building[:3, :3], evidence.T_world_building[:3, 3]
     coefficients = map.planes.rows("coefficients", ids)
     samples = np.asarray(map.planes.rows("samples_m", ids), np.float64)
-    return coefficients[:, :3] @ R, coefficients[:, 3] + coefficients[:, :3] @ t, (samples - t) @ R
+    return matmul(coefficients[:, :3], R), coefficients[:, 3] + matmul(coefficients[:, :3], t), matmul(samples - t, R)
 
 
 def _furniture(map: Map | None, used: set[int], plans: list[StoreyPlan], evidence: Evidence) -> I32:

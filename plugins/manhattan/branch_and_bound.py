@@ -8,6 +8,7 @@ from typing import Annotated, NamedTuple
 
 import numpy as np
 
+from trihedron.pipeline.core.linalg import matmul
 from trihedron.pipeline.core.options import NonNegativeFloat, PositiveInt, Range
 from trihedron.pipeline.core.registry import register
 from trihedron.pipeline.core.types import F64, ManhattanFrame, Normals, Planes, Segments
@@ -121,8 +122,8 @@ class RotationSearch:
     def consensus(self, vectors: F64, weights: F64, R: F64) -> float:
         """C(R) of the same directions."""
         unit, weights = _usable(vectors, weights)
-        square = np.max((unit @ R) ** 2, axis=1, initial=0.0)
-        return float(float(weights @ np.maximum(square - np.cos(self.inlier) ** 2, 0.0)) / np.sin(self.inlier) ** 2)
+        square = np.max(matmul(unit, R) ** 2, axis=1, initial=0.0)
+        return float(float(matmul(weights, np.maximum(square - np.cos(self.inlier) ** 2, 0.0))) / np.sin(self.inlier) ** 2)
 
     @cached_property
     def _grid(self) -> SphereGrid:

@@ -8,6 +8,7 @@ from typing import Annotated, NamedTuple
 
 import numpy as np
 
+from trihedron.pipeline.core.linalg import matmul
 from trihedron.pipeline.core.options import NonNegativeFloat, PositiveFloat, PositiveInt, Range, Share, check_increasing
 from trihedron.pipeline.core.types import F32, F64, I32, Bool, ManhattanFrame, Normals, Planes, Segments
 from trihedron.plugins.manhattan.common_kernels import (
@@ -194,7 +195,7 @@ def lost_frames(modes: Modes, fit: AxisFit, segments: Segments, planes: Planes, 
     return ManhattanFrame(
         index=normals.index,
         stamp_ns=normals.stamp_ns,
-        rotations=R @ known[0].T @ known,
+        rotations=matmul(R, known[0].T, known),
         ids=ids,
         covariance=np.concatenate([covariance[None], np.tile(np.eye(3) * NOTHING_KNOWN, (count - 1, 1, 1))]),
         inliers=inliers,
@@ -346,11 +347,11 @@ def turn_between(found: F64, before: F64, limit: float) -> F64:
     for one in found:
         for known in before:
             for name in CUBE:
-                Q = one @ name @ known.T
+                Q = matmul(one, name, known.T)
                 cosine = 0.5 * (np.trace(Q) - 1.0)
                 if cosine < FURTHEST:  # some name is nearer
                     continue
-                rank = (int((identified(found, Q @ before, limit) >= 0).sum()), cosine)
+                rank = (int((identified(found, matmul(Q, before), limit) >= 0).sum()), cosine)
                 if rank > best:
                     best, turn = rank, Q
     return turn

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from trihedron.pipeline.core.geometry import invert
+from trihedron.pipeline.core.linalg import inv, matmul, norm
 from trihedron.pipeline.core.types import F64, I32, Bool, Map, Table
 from trihedron.plugins.mapping.landmarks import distinct, index_of, isin
 
@@ -143,7 +144,7 @@ def _near(map: Map, T_world_camera: F64, near_m: float, near_deg: float, submap:
     """Living keyframes of the sub-map with about this position and viewing direction, nearest first."""
     poses = _poses(map, submap)
     distance = np.linalg.norm(poses[:, :3, 3] - T_world_camera[:3, 3], axis=1)
-    cosine = poses[:, :3, 2] @ T_world_camera[:3, 2]
+    cosine = matmul(poses[:, :3, 2], T_world_camera[:3, 2])
     near = np.flatnonzero((distance < near_m) & (cosine > np.cos(np.radians(near_deg))))
     return keyframes_of(map, submap)[near[np.argsort(distance[near] / near_m + (1.0 - cosine[near]), kind="stable")]]
 
@@ -170,8 +171,8 @@ def window_of(map: Map, keyframes: I32) -> LocalWindow:
 
 def are_distinct(T: F64, other: F64) -> bool:
     """Return True if two poses differ by 10 cm or 5°."""
-    cosine = 0.5 * (np.trace(T[:3, :3].T @ other[:3, :3]) - 1.0)
-    return bool(np.linalg.norm(T[:3, 3] - other[:3, 3]) > 0.1 or cosine < np.cos(np.radians(5.0)))
+    cosine = 0.5 * (np.trace(matmul(T[:3, :3].T, other[:3, :3])) - 1.0)
+    return bool(norm(T[:3, 3] - other[:3, 3]) > 0.1 or cosine < np.cos(np.radians(5.0)))
 
 
 # Odometry: the edges between keyframes that follow each other.
@@ -185,9 +186,9 @@ def odometry(map: Map, pairs: I32, drift: float, rotation_drift: float, times: f
     The covariance is `times` that of the later keyframe's pose plus the drift along the path: standard deviations per square root of a metre, m and
     rad."""
     poses = map.keyframes.rows("T_world_camera", pairs.ravel()).reshape(-1, 2, 4, 4)
-    motions = invert(poses[:, 0]) @ poses[:, 1]
+    motions = matmul(invert(poses[:, 0]), poses[:, 1])
     length = np.linalg.norm(motions[:, :3, 3], axis=1)[:, None, None]
     covariance = times * map.keyframes.rows("covariance", pairs[:, 1])
     covariance[:, :3, :3] += times * (drift**2 * length + LEAST_SIGMA_M**2) * np.eye(3)
     covariance[:, 3:, 3:] += times * (rotation_drift**2 * length + LEAST_SIGMA**2) * np.eye(3)
-    return np.ascontiguousarray(motions), np.asarray(np.linalg.inv(covariance), np.float64)
+    return np.ascontiguousarray(motions), np.asarray(inv(covariance), np.float64)

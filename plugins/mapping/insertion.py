@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from trihedron.pipeline.core.geometry import tangent_basis, transform, transform_planes
+from trihedron.pipeline.core.linalg import matmul
 from trihedron.pipeline.core.types import F32, F64, I32, Bool, Camera, Keypoints, Map, Matches, Planes, Pose, Segments, Table
 from trihedron.plugins.mapping.landmark_kernels import farthest_samples, fuse_lines, fuse_points
 from trihedron.plugins.mapping.landmarks import OBSERVERS
@@ -170,7 +171,7 @@ def insert_points(map: Map, view: Observations, keypoints: Keypoints, pairs: I32
     position, R = transform(view.T_world_camera, local), view.T_world_camera[:3, :3]
     table, created = table.appended(
         position_m=position,
-        information=inverse(R @ covariance @ R.T),
+        information=inverse(matmul(R, covariance, R.T)),
         **_appearance(view, keypoints, new, position),
         **_new_landmark(len(new), view.keyframe),
     )
@@ -209,7 +210,7 @@ def insert_lines(map: Map, view: Observations, segments: Segments, pairs: I32, n
     R, total = view.T_world_camera[:3, :3], covariance[new] + propagate_pose_covariance(local, view.covariance)
     table, created = table.appended(
         endpoints_m=transform(view.T_world_camera, local),
-        information=inverse(R @ total @ R.T),
+        information=inverse(matmul(R, total, R.T)),
         descriptor=segments.descriptors[new],
         **_new_landmark(len(new), view.keyframe),
     )
@@ -263,4 +264,4 @@ def _plane_covariance(planes: Planes, view: Observations) -> F64:
     n = planes.coefficients[:, :3]
     J[:, :2, 3:] = np.stack([np.cross(n, B[..., 0]), np.cross(n, B[..., 1])], axis=1)
     J[:, 2, :3] = n
-    return planes.covariance + J @ view.covariance @ np.swapaxes(J, -1, -2)
+    return np.asarray(planes.covariance + matmul(J, view.covariance, np.swapaxes(J, -1, -2)))

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from trihedron.pipeline.core.geometry import invert
+from trihedron.pipeline.core.linalg import eigvalsh, matmul
 from trihedron.pipeline.core.options import NonNegativeInt, PositiveFloat, PositiveInt, Share, check_increasing
 from trihedron.pipeline.core.types import F64, Frame, Map, Matches, Planes, Pose, Table
 from trihedron.plugins.mapping.covisibility_graph import WEIGHTS, newest_keyframes
@@ -47,7 +48,7 @@ def needs_keyframe(options: KeyframeOptions, frame: Frame, pose: Pose, planes: P
     urgent = tracked_share < options.urgent_share
     if 0 <= frames < options.min_frames and not urgent:  # less than 0: a keyframe of another sequence
         return False
-    T = invert(keyframes.row("T_world_camera", newest[0])) @ pose.T_world_camera
+    T = matmul(invert(keyframes.row("T_world_camera", newest[0])), pose.T_world_camera)
     rotation_deg = math.degrees(math.acos(min(max(0.5 * (T.trace() - 2.0), -1.0), 1.0)))
     change = max(math.hypot(*T[:3, 3].tolist()) / keyframe_distance_m(options, frame), rotation_deg / options.min_turn_deg)
     unknown = planes.pixels > options.new_plane_px
@@ -63,7 +64,7 @@ def _in_doubt(options: KeyframeOptions, pose: Pose, keyframes: Table) -> bool:
     if pose.reference < 0 or _weighted(pose.inliers.tolist()) < options.doubt_score:
         return False
     covariances: list[F64] = [pose.local_covariance, keyframes.row("covariance", pose.reference)]
-    sigma, reference = (float(np.linalg.eigvalsh(covariance[:3, :3])[-1]) ** 0.5 for covariance in covariances)
+    sigma, reference = (float(eigvalsh(covariance[:3, :3])[-1]) ** 0.5 for covariance in covariances)
     return bool(sigma > options.doubt_sigmas * max(reference, options.doubt_floor_m))
 
 

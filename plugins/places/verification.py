@@ -8,6 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from trihedron.pipeline.core.geometry import invert, transform
+from trihedron.pipeline.core.linalg import matmul
 from trihedron.pipeline.core.types import F64, I32, Camera, Frame, Keypoints, Map, Matches, Planes, Segments
 from trihedron.plugins.mapping.covisibility_graph import VICINITY_DEG, VICINITY_M, LocalWindow, are_distinct, local_window, window_of
 from trihedron.plugins.mapping.data_association import PredictedPose, SearchOptions, search_map
@@ -67,12 +68,12 @@ class VerifiedPlace:
     @property
     def score(self) -> float:
         """Return the weighted number of inliers."""
-        return float(self.inliers @ LANDMARK_SCORE)
+        return float(matmul(self.inliers, LANDMARK_SCORE))
 
     @property
     def details(self) -> float:
         """Return the weighted number of inliers among points and lines."""
-        return float(self.inliers @ DETAILS)
+        return float(matmul(self.inliers, DETAILS))
 
 
 def verify_place(T_world_camera: F64, view: FrameFeatures, map: Map, keyframes: I32, near: int) -> VerifiedPlace | None:
@@ -96,7 +97,7 @@ def verify_place(T_world_camera: F64, view: FrameFeatures, map: Map, keyframes: 
     inliers = np.array([np.count_nonzero(found.points), np.count_nonzero(found.lines), np.count_nonzero(found.planes)], np.int32)
     matched = len(matches.keypoints) + len(matches.segments) + len(matches.planes)
     expected = np.array([len(matches.visible_points), len(matches.visible_lines), 0])
-    inlier_share, found_share = float(inliers.sum() / max(matched, 1)), float(inliers @ DETAILS / max(expected @ DETAILS, 1))
+    inlier_share, found_share = float(inliers.sum() / max(matched, 1)), float(matmul(inliers, DETAILS) / max(matmul(expected, DETAILS), 1))
     violation = free_space_violation(T, view.frame, map, window)
     return VerifiedPlace(T, found.covariance, inliers, inlier_share, found_share, least_share(inliers, matches, view.keypoints), violation)
 

@@ -8,6 +8,7 @@ from typing import Annotated
 
 import numpy as np
 
+from trihedron.pipeline.core.linalg import inv, matmul, solve
 from trihedron.pipeline.core.options import NonNegativeFloat, NonNegativeInt, PositiveFloat, PositiveInt, Range
 from trihedron.pipeline.core.types import F64, I32, U8, Frame, Normals, Planes
 from trihedron.plugins.planes.common_kernels import (
@@ -87,7 +88,7 @@ def _report(options: RegionOptions, labels: U8, core: U8, owner: I32, sums: Sums
     """The largest regions as a value, largest first; `owner` is the region of each label, 0 = none."""
     numbered, number, ranked, area = largest_regions(labels, owner, grid.count, options.min_pixels, options.planes)
     A, b, moments, n = (total[ranked] for total in sums)
-    q = np.asarray(np.linalg.solve(A, b[..., None])[..., 0], np.float64)
+    q = np.asarray(solve(A, b[..., None])[..., 0], np.float64)
     coefficients, J, excess, samples = plane_report(
         numbered, core, number, q, grid, options.tiles, options.correlation_px**2, 2.0, options.samples, 400
     )
@@ -96,7 +97,7 @@ def _report(options: RegionOptions, labels: U8, core: U8, owner: I32, sums: Sums
         index=frame.index,
         stamp_ns=frame.stamp_ns,
         coefficients=coefficients,
-        covariance=J @ (np.linalg.inv(A) * variance[:, None, None]) @ np.swapaxes(J, -1, -2),
+        covariance=matmul(J, inv(A) * variance[:, None, None], np.swapaxes(J, -1, -2)),
         moments=np.asarray(moments, np.float64),
         pixels=area,
         samples_m=samples,

@@ -8,6 +8,7 @@ from typing import ClassVar
 import cv2
 import numpy as np
 
+from trihedron.pipeline.core.linalg import eigvalsh, matmul, solve
 from trihedron.pipeline.core.options import PositiveInt, Share
 from trihedron.pipeline.core.registry import register
 from trihedron.pipeline.core.types import F32, F64, I32, Frame, Normals, Planes
@@ -18,6 +19,7 @@ from trihedron.plugins.shared.depth_image_kernels import Grid
 from trihedron.plugins.shared.networks import NetworkImage, NetworkOptions, network_image
 
 LEAST = 3  # cells, of which a plane is made
+COLLINEAR = 1e-12  # ratio of the least and the largest moment of points, below which they determine no plane
 
 
 @register("planes", "onnx")
@@ -69,8 +71,9 @@ def _started(labels: I32, grid: Grid) -> tuple[I32, F64]:
         mine = numbers == number
         if mine.sum() < LEAST:
             continue
-        q, _, rank, _ = np.linalg.lstsq(points[mine], np.ones(mine.sum()), rcond=None)
-        if rank == LEAST:
-            planes.append(q)
+        moments = matmul(points[mine].T, points[mine])
+        values = eigvalsh(moments)
+        if values[0] > COLLINEAR * values[-1]:
+            planes.append(solve(moments, points[mine].sum(axis=0)))
             out[rows[mine], columns[mine]] = len(planes)
     return out, np.array(planes, np.float64).reshape(-1, 3)

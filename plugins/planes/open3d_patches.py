@@ -7,6 +7,7 @@ from typing import Annotated
 
 import numpy as np
 
+from trihedron.pipeline.core.linalg import matmul
 from trihedron.pipeline.core.options import AcuteDeg, NonNegativeFloat, NonNegativeInt, Range
 from trihedron.pipeline.core.registry import register
 from trihedron.pipeline.core.types import F64, Frame, Normals, Planes
@@ -58,7 +59,7 @@ class Open3dPatches(RegionOptions):
         planes, members = [], []
         for box in cloud.detect_planar_patches(*options, search):
             normal = np.asarray(box.R)[:, 2]
-            offset = float(normal @ np.asarray(box.center))
+            offset = float(matmul(normal, np.asarray(box.center)))
             if abs(offset) > 1e-3:  # else the plane contains the camera
                 planes.append(normal / offset)
                 members.append(np.asarray(box.get_point_indices_within_bounding_box(cloud.points), np.int64))

@@ -15,6 +15,7 @@ import numpy as np
 
 from trihedron.pipeline.core.geometry import invert
 from trihedron.pipeline.core.lie import adjoint, log_se3
+from trihedron.pipeline.core.linalg import inv, matmul
 from trihedron.pipeline.core.types import F64, I32, LOST, Map, Pose
 from trihedron.plugins.pose.map_alignment import MapAlignment
 from trihedron.plugins.shared.calibration_error import calibration_scales
@@ -30,7 +31,7 @@ def with_velocity(pose: Pose, previous: Pose, map: Map) -> Pose:
     """Give a pose the velocity of the camera, and that of its reference keyframe: the mean of the motions to it and from it."""
     seconds = 1e-9 * (pose.stamp_ns - previous.stamp_ns)
     known = previous.status != LOST and 0.0 < seconds <= LONGEST_S
-    twist = log_se3(invert(previous.T_world_camera) @ pose.T_world_camera) / seconds if known else np.zeros(6)
+    twist = log_se3(matmul(invert(previous.T_world_camera), pose.T_world_camera)) / seconds if known else np.zeros(6)
     if not 0 <= pose.reference < len(map.keyframes):
         return replace(pose, twist=twist)
     if int(map.keyframes.row("index", pose.reference)) == previous.index:
@@ -43,15 +44,15 @@ def with_velocity(pose: Pose, previous: Pose, map: Map) -> Pose:
 def with_calibration(pose: Pose, previous: Pose, solution: PoseSolution, problem: MapAlignment, keyframes: I32, groups: Groups) -> Pose:
     """Give a refined pose, whose landmarks are from `keyframes` (k,), its sensitivity to the calibration, and what residuals have told of that."""
     equations = _equations(pose, solution, problem, keyframes, groups)
-    before = adjoint(invert(pose.T_world_camera) @ previous.T_world_camera) @ previous.sensitivity
-    to_pose = np.linalg.inv(equations.H + problem.information)
-    share = equations.C.T @ to_pose
+    before = matmul(adjoint(matmul(invert(pose.T_world_camera), previous.T_world_camera)), previous.sensitivity)
+    to_pose = inv(equations.H + problem.information)
+    share = matmul(equations.C.T, to_pose)
     scale = REPEATED_FRAMES * pose.noise_scale
     return replace(
         pose,
-        sensitivity=to_pose @ (problem.information @ before - equations.C),
-        calibration_information=previous.calibration_information + _symmetric(equations.G - share @ equations.C) / scale,
-        calibration_score=previous.calibration_score + (equations.s - share @ equations.b) / scale,
+        sensitivity=matmul(to_pose, matmul(problem.information, before) - equations.C),
+        calibration_information=previous.calibration_information + _symmetric(equations.G - matmul(share, equations.C)) / scale,
+        calibration_score=previous.calibration_score + (equations.s - matmul(share, equations.b)) / scale,
     )
 
 
@@ -59,7 +60,7 @@ def carried_calibration(pose: Pose, previous: Pose) -> Pose:
     """Give a pose that was not refined the previous one's error by the calibration, as a camera that moves with it."""
     return replace(
         pose,
-        sensitivity=adjoint(invert(pose.T_world_camera) @ previous.T_world_camera) @ previous.sensitivity,
+        sensitivity=matmul(adjoint(matmul(invert(pose.T_world_camera), previous.T_world_camera)), previous.sensitivity),
         calibration_information=previous.calibration_information,
         calibration_score=previous.calibration_score,
     )
@@ -73,7 +74,7 @@ def _equations(pose: Pose, solution: PoseSolution, problem: MapAlignment, rows: 
     map, T, camera = problem.map, pose.T_world_camera, problem.camera
     poses, sensitivities, twists = (map.keyframes.rows(name, rows) for name in ("T_world_camera", "sensitivity", "twist"))
     twists[rows == pose.reference] = pose.reference_twist
-    errors = adjoint(invert(T) @ poses) @ sensitivities
+    errors = matmul(adjoint(matmul(invert(T), poses)), sensitivities)
     keyframes = Keyframes(np.ascontiguousarray(poses[:, :3, :3]), np.ascontiguousarray(poses[:, :3, 3]), twists, errors)
     points, _, planes = problem.terms(T)
     samples = map.planes.rows("samples_m", problem.plane_ids())

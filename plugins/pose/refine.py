@@ -8,6 +8,7 @@ from typing import ClassVar
 
 import numpy as np
 
+from trihedron.pipeline.core.linalg import inv
 from trihedron.pipeline.core.options import NonNegativeInt, PositiveFloat, PositiveShare, Share, check_increasing
 from trihedron.pipeline.core.registry import register
 from trihedron.pipeline.core.types import (
@@ -133,7 +134,7 @@ class Refine:
         both = np.array([start.covariance[:3, :3], start.covariance[3:, 3:]])
         both[0] += self.position_sigma_m**2 * EYE
         both[1] += math.radians(self.rotation_sigma_deg) ** 2 * EYE
-        information[:3, :3], information[3:, 3:] = np.linalg.inv(both)
+        information[:3, :3], information[3:, 3:] = inv(both)
         return information
 
     def _solve(self, problem: MapAlignment, start: Decoupled) -> tuple[PoseSolution, str]:

@@ -13,6 +13,7 @@ import numpy as np
 
 from trihedron.pipeline.core.geometry import invert
 from trihedron.pipeline.core.lie import adjoint
+from trihedron.pipeline.core.linalg import eigvalsh, matmul
 from trihedron.pipeline.core.linalg_kernels import inverse_positive
 from trihedron.pipeline.core.types import F64, I32, Map, Pose
 from trihedron.plugins.pose.calibration_uncertainty import carried_calibration, with_calibration, with_velocity
@@ -34,8 +35,8 @@ class KeyframeUncertainty:
     def covariance(self, map: Map, T_world_camera: F64) -> F64:
         """Covariance (6, 6) of the keyframe as that of xi of a camera that moves with it."""
         T, covariance = (map.keyframes.rows(name, np.array([self.keyframe]))[0] for name in ("T_world_camera", "covariance"))
-        to_camera = adjoint(invert(T_world_camera) @ T)
-        return np.asarray(to_camera @ covariance @ to_camera.T)
+        to_camera = adjoint(matmul(invert(T_world_camera), T))
+        return np.asarray(matmul(to_camera, covariance, to_camera.T))
 
 
 def keyframe_uncertainty(map: Map, points: I32, lines: I32, planes: I32) -> KeyframeUncertainty:
@@ -62,7 +63,7 @@ def _sigmas_m(map: Map, keyframes: list[int]) -> dict[int, float]:
     sigmas_m: dict[int, float] = map.memo.setdefault("sigmas_m", {})
     if new := [keyframe for keyframe in keyframes if keyframe not in sigmas_m]:
         covariances = map.keyframes.rows("covariance", np.array(new))
-        sigmas_m.update(zip(new, np.sqrt(np.linalg.eigvalsh(covariances[:, :3, :3])[:, -1]).tolist()))
+        sigmas_m.update(zip(new, np.sqrt(eigvalsh(covariances[:, :3, :3])[:, -1]).tolist()))
     return sigmas_m
 
 
@@ -70,7 +71,7 @@ def widened_by_keyframes(status: TrackingStatus, solution: PoseSolution, problem
     """Add the covariance of the keyframes to that of a pose where they are uncertain by more than `factor` times its own standard deviation:
     landmarks made from this pose would average it away."""
     base = keyframe_uncertainty(problem.map, *problem.landmarks(solution))
-    if base.sigma_m <= factor * np.sqrt(np.linalg.eigvalsh(solution.covariance[:3, :3])[-1]):
+    if base.sigma_m <= factor * np.sqrt(eigvalsh(solution.covariance[:3, :3])[-1]):
         return status
     return replace(status, covariance=status.covariance + base.covariance(problem.map, solution.T_world_camera))
 
@@ -101,18 +102,18 @@ def covariance_of_keyframes(T_world_camera: F64, T_world_keyframe: F64, covarian
     information (k, 6, 6) of its landmarks, as that of xi of the camera.
 
     The errors of keyframes are a random walk, in which the covariance of two is the variance of the earlier."""
-    to_camera = adjoint(invert(T_world_camera) @ T_world_keyframe)
-    weights = np.trace(information @ inverse_positive(information.sum(axis=0) + np.eye(6)), axis1=1, axis2=2)
+    to_camera = adjoint(matmul(invert(T_world_camera), T_world_keyframe))
+    weights = np.trace(matmul(information, inverse_positive(information.sum(axis=0) + np.eye(6))), axis1=1, axis2=2)
     weights = weights / weights.sum()
     later = np.cumsum(weights[::-1])[::-1] - weights
-    common = (weights * (weights + 2.0 * later))[:, None, None] * to_camera @ covariance @ to_camera.transpose(0, 2, 1)
+    common = matmul((weights * (weights + 2.0 * later))[:, None, None] * to_camera, covariance, to_camera.transpose(0, 2, 1))
     return np.asarray(common.sum(axis=0), np.float64)
 
 
 def drift_of_previous(pose: Pose, previous: Pose) -> F64:
     """The part of the previous pose's `map_covariance` that is not by the calibration, as that of a camera that moves with it."""
-    to_camera = adjoint(invert(pose.T_world_camera) @ previous.T_world_camera)
-    return np.asarray(to_camera @ (previous.map_covariance - calibration_covariance(previous)) @ to_camera.T)
+    to_camera = adjoint(matmul(invert(pose.T_world_camera), previous.T_world_camera))
+    return np.asarray(matmul(to_camera, previous.map_covariance - calibration_covariance(previous), to_camera.T))
 
 
 def carried(pose: Pose, previous: Pose) -> Pose:

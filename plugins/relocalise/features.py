@@ -7,6 +7,7 @@ from functools import partial
 
 import numpy as np
 
+from trihedron.pipeline.core.linalg import matmul
 from trihedron.pipeline.core.options import PositiveFloat, PositiveInt
 from trihedron.pipeline.core.registry import register
 from trihedron.pipeline.core.types import F64, I32, Frame, Keypoints, Map, Planes, Pose, Rotation, Segments
@@ -101,13 +102,13 @@ class Layout:
 
 def layout_of(coefficients: F64, areas: F64, endpoints_m: F64, lengths: F64, R: F64) -> Layout:
     """Select the planes (n, 4) and lines (m, 2, 3) along the columns of R (3, 3), which are in their frame."""
-    along = coefficients[:, :3] @ R
+    along = matmul(coefficients[:, :3], R)
     axis = np.abs(along).argmax(axis=1)
     dot = along[np.arange(len(axis)), axis]
     good = np.abs(dot) > ON_AXIS
     sides = (axis + 3 * (dot < 0.0))[good].astype(np.int32)
     places = -(np.sign(dot) * coefficients[:, 3])[good]  # n·x + d = 0 with n = ±axis
-    local = endpoints_m @ R
+    local = matmul(endpoints_m, R)
     step = local[:, 1] - local[:, 0]
     size = np.linalg.norm(step, axis=1)
     line_axis = np.abs(step).argmax(axis=1)
@@ -132,13 +133,13 @@ def layout_poses(map: Map, plane_ids: I32, line_ids: I32, planes: Planes, segmen
     lengths = np.linalg.norm(pixels[:, 1] - pixels[:, 0], axis=1).astype(np.float64)
     poses, scores = [], []
     for S in CUBE:
-        named = R_camera @ S
+        named = matmul(R_camera, S)
         seen = layout_of(planes.coefficients, planes.pixels.astype(np.float64), ends, lengths, named)
         t, score = _positions(seen, known)
-        R = R_world @ named.T
+        R = matmul(R_world, named.T)
         for place, value in zip(t, score):
             T = np.eye(4)
-            T[:3, :3], T[:3, 3] = R, R_world @ place
+            T[:3, :3], T[:3, 3] = R, matmul(R_world, place)
             poses.append(T)
             scores.append(value)
     order = np.argsort(-np.array(scores), kind="stable")

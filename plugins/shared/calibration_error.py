@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from trihedron.pipeline.core.linalg import matmul
 from trihedron.pipeline.core.types import F64, Camera, Pose
 from trihedron.plugins.shared.calibration_error_kernels import calibration_moment
 
@@ -33,4 +34,4 @@ def calibration_scales(camera: Camera) -> F64:
 def calibration_covariance(pose: Pose) -> F64:
     """Covariance (6, 6) of a pose's error by the calibration, part of its `map_covariance`."""
     moment = calibration_moment(pose.calibration_information, pose.calibration_score)
-    return np.asarray(pose.sensitivity @ moment @ pose.sensitivity.T)
+    return np.asarray(matmul(pose.sensitivity, moment, pose.sensitivity.T))

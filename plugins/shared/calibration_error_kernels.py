@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 
 from trihedron.pipeline.core.kernel import kernel
-from trihedron.pipeline.core.linalg_kernels import inverse_positive, tangent_columns
+from trihedron.pipeline.core.linalg_kernels import inverse_positive, matmul, matvec, tangent_columns
 from trihedron.pipeline.core.types import CALIBRATION, F32, F64, I32, U8
 from trihedron.plugins.shared.pose_optimizer_kernels import (
     NEAR_M,
@@ -243,7 +243,7 @@ def _add_planes(
                 for c in range(CALIBRATION):
                     X[a, c] += row[a] * (F[c] - E[c])
         if seen >= LEAST_SAMPLES:
-            K[:] = inverse_positive(N) @ X
+            K[:] = matmul(inverse_positive(N), X)
             _scale_and_subtract(scales, J, keyframes.errors[k], K)
             _add(J, W[i], K, r, total)
 
@@ -279,6 +279,6 @@ def calibration_moment(information: F64, score: F64) -> F64:
     v = 1.0
     for _ in range(EXPECTATIONS + 1):
         covariance = inverse_positive(information + np.eye(CALIBRATION) / v)
-        mean = covariance @ score
+        mean = matvec(covariance, score)
         v = (PRIOR_COUNT + np.trace(covariance) + (mean * mean).sum()) / (PRIOR_COUNT + CALIBRATION)
     return covariance + np.outer(mean, mean)

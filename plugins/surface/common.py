@@ -10,6 +10,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from trihedron.pipeline.core.linalg import matmul
 from trihedron.pipeline.core.options import PositiveFloat, PositiveShare, Range
 from trihedron.pipeline.core.types import F32, F64, I32, LOST, PLANE_KINDS, U8, Bool, DepthNoise, Frame, Map, Planes, Pose, Rotation, Surface
 from trihedron.plugins.shared.keyframe_views import KeyframeView, Known, readings, view_of
@@ -40,7 +41,7 @@ class Gathered:
         if self.axes is None or not views:
             return np.full(3, np.nan)
         upright = -np.mean([T[:3, 1] for _, T in views], axis=0)
-        along = self.axes.T @ upright
+        along = matmul(self.axes.T, upright)
         best = int(np.argmax(np.abs(along)))
         return np.asarray(self.axes[:, best] * np.sign(along[best]), np.float64)
 
@@ -136,7 +137,7 @@ def pictured(
         instances=rows.astype(np.int32),
         plane_ids=ids[used],
         coefficients=planes,
-        kinds=_kinds(planes, areas, points[plain.triangles] @ plain.up, rows, plain.up),
+        kinds=_kinds(planes, areas, matmul(points[plain.triangles], plain.up), rows, plain.up),
         areas_m2=areas,
         plane_colors=atlas.colors,
         loops=np.array([(plane, a, b) for (plane, _), a, b in zip(rings, ends[:-1], ends[1:])], np.int32).reshape(-1, 3),
@@ -174,7 +175,7 @@ def _kinds(planes: F64, areas: F32, corners: F64, rows: NDArray[np.signedinteger
     kinds = np.full(len(planes), PLANE_KINDS.index("plane"), np.uint8)
     if not np.isfinite(up).all():
         return kinds
-    leaning, heights = planes[:, :3] @ up, _heights(corners, rows, len(planes))
+    leaning, heights = matmul(planes[:, :3], up), _heights(corners, rows, len(planes))
     level, upright = np.cos(np.radians(LEVEL_DEG)), np.sin(np.radians(LEVEL_DEG))
     kinds[np.abs(leaning) > level] = PLANE_KINDS.index("horizontal")
     kinds[np.abs(leaning) < upright] = PLANE_KINDS.index("vertical")
@@ -245,7 +246,7 @@ def atlas_of(
     corners, sizes = [], []
     for p, basis in enumerate(axes):
         mine = labels == p
-        flat = vertices[triangles[mine]] @ basis / texel_m
+        flat = matmul(vertices[triangles[mine]], basis) / texel_m
         low = np.floor(flat.reshape(-1, 2).min(axis=0)) - MARGIN if mine.any() else np.zeros(2)
         texels[mine] = flat - low
         corners.append(low)
@@ -258,7 +259,7 @@ def atlas_of(
             continue
         covered = _covered(texels[labels == p], w, h)
         grid = np.stack(np.nonzero(covered)[::-1], axis=1) + corners[p]
-        points = grid * texel_m @ basis.T - plane[3] * plane[:3]
+        points = matmul(grid * texel_m, basis.T) - plane[3] * plane[:3]
         found, seen = painted(points, np.broadcast_to(plane[:3], points.shape), views)
         picture, known = np.full((h, w, 3), UNSEEN, np.uint8), np.zeros((h, w), np.bool_)
         picture[covered], known[covered] = found, seen

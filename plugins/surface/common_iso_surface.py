@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from trihedron.pipeline.core.linalg import matmul
 from trihedron.pipeline.core.options import NonNegativeFloat, PositiveFloat
 from trihedron.pipeline.core.types import F64, I32, Map, Surface
 from trihedron.plugins.shared.keyframe_views import KeyframeView
@@ -86,7 +87,7 @@ def _moved_m(fused_at: F64 | None, final: F64 | None) -> float:
     if fused_at is None or final is None:
         return 0.0 if fused_at is final else float("inf")
     ahead = np.array([[0.0, 0.0, 0.0, 1.0], [0.0, 0.0, AHEAD_M, 1.0]])
-    return float(np.linalg.norm((ahead @ (final - fused_at).T)[:, :3], axis=1).max())
+    return float(np.linalg.norm(matmul(ahead, (final - fused_at).T)[:, :3], axis=1).max())
 
 
 PASSES = 20  # at most, over all voxels, to untangle signs

@@ -8,6 +8,7 @@ from typing import Annotated
 
 import numpy as np
 
+from trihedron.pipeline.core.linalg import matmul
 from trihedron.pipeline.core.options import AcuteDeg, NonNegativeFloat, NonNegativeInt, PositiveFloat, Range, check_increasing
 from trihedron.pipeline.core.types import F64, I32, Map, Surface
 from trihedron.plugins.surface.common import map_planes, numbered, pictured
@@ -116,8 +117,8 @@ def _joined(labels: I32, middle: F64, area: F64, opposite: I32, planes: F64, dis
         rows = np.flatnonzero(out == small)
         beside = beside[(total[beside] >= total[small]) & (beside != small)]
         for large in beside[np.argsort(-total[beside], kind="stable")]:
-            off = middle[rows] @ planes[large, :3] + planes[large, 3]
-            if planes[large, :3] @ planes[small, :3] > 0.9 and np.average(off**2, weights=area[rows]) <= distance**2:
+            off = matmul(middle[rows], planes[large, :3]) + planes[large, 3]
+            if matmul(planes[large, :3], planes[small, :3]) > 0.9 and np.average(off**2, weights=area[rows]) <= distance**2:
                 out[rows], stands_for[stands_for == small] = large, large
                 total[large] += total[small]
                 break
@@ -215,7 +216,7 @@ def _recut(points: F64, triangles: I32, labels: I32, parts: I32, planes: F64, ho
     holes: dict[int, list[I32]] = {}
     for a, b in pairwise(starts):
         ring = triangles.ravel()[order[a:b]]
-        closed = (opposite[order[a:b]] < 0).all() and 0.0 < -_area(points[ring] @ plane_axes(planes[labels[order[a] // 3]])) < hole_m2
+        closed = (opposite[order[a:b]] < 0).all() and 0.0 < -_area(matmul(points[ring], plane_axes(planes[labels[order[a] // 3]]))) < hole_m2
         (holes if closed else rings).setdefault(int(parts[order[a] // 3]), []).append(ring)
     first = {part: int(row) for part, row in zip(*np.unique(parts, return_index=True)) if part != REST}
     cuts = {part: found for part, row in first.items() if (found := _cut(points, rings[part], planes[labels[row]])) is not None}
@@ -240,7 +241,7 @@ def _cut(points: F64, rings: list[I32], plane: F64) -> I32 | None:
     """Triangles (t, 3) of the polygon with these loops, a constrained Delaunay triangulation; None when they cross or touch."""
     import shapely
 
-    flat = [points[ring] @ plane_axes(plane) for ring in rings]
+    flat = [matmul(points[ring], plane_axes(plane)) for ring in rings]
     turned = np.array([_area(ring) for ring in flat])
     outer = int(np.argmax(turned))
     if turned[outer] <= 0.0 or (turned > 0.0).sum() > 1 or min(map(len, rings)) < 3:

@@ -7,6 +7,7 @@ from typing import Annotated
 
 import numpy as np
 
+from trihedron.pipeline.core.linalg import matmul
 from trihedron.pipeline.core.options import AcuteDeg, PositiveFloat, PositiveInt, Range
 from trihedron.pipeline.core.registry import register
 from trihedron.pipeline.core.types import F64, I32, Frame, Map, Planes, Pose, Rotation, Surface
@@ -47,7 +48,7 @@ class PlanarGreedy(ViewOptions):
         points = gathered_points(views, found, axes, self.spacing_m, self.pixel_step)
         meshes = [greedy_triangles(flat, self.radius_m, self.multiplier) for flat in points]
         first = np.cumsum([0, *(len(flat) for flat in points)])
-        vertices = [flat @ basis.T - plane[3] * plane[:3] for flat, basis, plane in zip(points, axes, found.planes)]
+        vertices = [matmul(flat, basis.T) - plane[3] * plane[:3] for flat, basis, plane in zip(points, axes, found.planes)]
         triangles = [mesh + np.int32(start) for mesh, start in zip(meshes, first)]
         labels = [np.full(len(mesh), p, np.int32) for p, mesh in enumerate(meshes)]
         return pictured(

@@ -67,6 +67,7 @@ def test_eigenvalues(n):
             np.testing.assert_array_equal(one[0], values[k])
             np.testing.assert_array_equal(one[1], vectors[k])
     assert linalg.eigh(np.full((n, n), np.nan))[0].shape == (n,)
+    assert [one.shape for one in linalg.eigh(np.zeros((0, n, n)))] == [(0, n), (0, n, n)]
     small = linalg.eigh(1e-200 * A)[0]
     np.testing.assert_allclose(small, 1e-200 * values, atol=1e-214 * n)
 
@@ -87,6 +88,7 @@ def test_solutions_inverses_determinants_and_factors(n):
     np.testing.assert_allclose(linalg.cholesky(H), np.linalg.cholesky(H), rtol=1e-12, atol=1e-12)
     np.testing.assert_allclose(linalg.inv(1e-100 * np.eye(n)), 1e100 * np.eye(n))  # whose determinant is 0 in double precision
     assert linalg.inv(A.astype(np.float32)).dtype == linalg.det(A.astype(np.float32)).dtype == np.float32
+    assert linalg.inv(A[:0]).shape == linalg.cholesky(A[:0]).shape == linalg.solve(A[:0], A[:0]).shape == (0, n, n)
     singular = np.zeros((2, n, n)) + np.eye(n)
     singular[1, -1] = 0.0
     np.testing.assert_array_equal(linalg.det(singular), [1.0, 0.0])
