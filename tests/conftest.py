@@ -5,8 +5,6 @@ import re
 
 import pytest
 
-import trihedron  # noqa: F401  # before NumPy, so that OpenBLAS rounds alike in all processes
-
 os.environ["TRIHEDRON_COMPILE"] = "0"
 SLOW_S = 3600  # limit of a slow test that states none; the others have that of pyproject.toml
 ON_OPEN3D = re.compile(r"open3d|\b(graph=)?libraries\b")

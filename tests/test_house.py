@@ -132,3 +132,49 @@ def test_plugins_share_options_and_no_behaviour():
                     continue
                 assert not isinstance(value, (FunctionType, property, staticmethod, classmethod)), f"{base.__name__}.{name} is behaviour"
                 assert name not in own or name in base.__dataclass_fields__, f"{plugin.__name__} overrides {base.__name__}.{name}"
+
+
+# Recorded values depend on no BLAS or LAPACK (docs/decisions/0165), but for those of plugins on libraries.
+ON_BLAS = {
+    "plugins/loop/bag_of_words.py": "its words are the clusters of SciPy",
+    "plugins/rotation/scipy_align.py": "its solution is that of SciPy",
+    "plugins/translation/scipy_least_squares.py": "its optimiser is that of SciPy",
+}
+BLAS = re.compile(r"np\.(matmul|dot|vdot|inner|tensordot|convolve|correlate|cov|corrcoef|polyfit|linalg\.(?!LinAlgError)\w+)|.*\.dot", re.DOTALL)
+BLAS_IMPORT = re.compile(r"scipy\.(?:linalg|optimize|sparse\.linalg|spatial\.transform|cluster)\b|numpy\.linalg import (?!LinAlgError)")
+
+
+def blas_calls(path: Path) -> list[str]:
+    """What needs `pipeline.core.linalg` or `linalg_kernels` instead: `@`, products, `linalg` but for `norm` along an axis, `optimize` of einsum."""
+    found = []
+    for node in ast.walk(parsed(path)):
+        text = ast.unparse(node)
+        if isinstance(node, ast.Call) and ast.unparse(node.func) == "np.linalg.norm" and "axis" in [word.arg for word in node.keywords]:
+            node.func.attr = ""  # visited later
+        elif isinstance(node, (ast.Import, ast.ImportFrom)):
+            found += BLAS_IMPORT.findall(text)
+        elif isinstance(node, (ast.BinOp, ast.AugAssign)):
+            found += [text] * isinstance(node.op, ast.MatMult)
+        elif isinstance(node, ast.Attribute):
+            found += [text] * bool(BLAS.fullmatch(text))
+        elif isinstance(node, ast.keyword):
+            found += [text] * (node.arg == "optimize")
+    return found
+
+
+def test_what_is_recorded_depends_on_no_blas():
+    folders = [ROOT / name for name in ("plugins", "pipeline/core", "pipeline/run", "pipeline/record", "datasets", "api")]
+    found = {path.relative_to(ROOT).as_posix(): blas_calls(path) for folder in folders for path in folder.rglob("*.py")}
+    assert {path: calls for path, calls in found.items() if calls and path not in ON_BLAS} == {}
+    assert all(found[path] for path in ON_BLAS)
+
+
+def test_calls_of_blas_are_noticed(tmp_path):
+    file = tmp_path / "file.py"
+    calls = ["a @ b", "a @= b", "np.dot(a, b)", "a.T.dot(b)", "np.linalg.norm(a)", "np.linalg.inv(a)", "np.einsum('ij,jk', a, b, optimize=True)"]
+    for call in [*calls, "from scipy.sparse.linalg import splu"]:
+        file.write_text(call)
+        assert blas_calls(file), call
+    for call in ["np.linalg.norm(a, axis=1)", "np.linalg.LinAlgError", "np.einsum('ij,jk', a, b)", "matmul(a, b)", "from scipy.sparse import diags"]:
+        file.write_text(call)
+        assert not blas_calls(file), call
