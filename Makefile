@@ -41,9 +41,7 @@ test-newest:  ## the same with the newest version of everything, in an environme
 
 benchmark: install  ## time, memory and error on the synthetic room and the sequences beside this folder
 	$(BIN)/trihedron benchmark
-	@set -e; for folder in $(SEQUENCES); do \
-		case $$folder in *icl_nuim*) kind=icl_nuim;; *) kind=tum;; esac; \
-		echo; echo "$$folder"; $(BIN)/trihedron benchmark dataset=$$kind dataset.path=$$folder; done
+	@set -e; for folder in $(SEQUENCES); do echo; echo "$$folder"; $(BIN)/trihedron benchmark $$folder; done
 
 table: install  ## the paper's study and its pages: every system on rooms and DATA="tum:FOLDER icl_nuim:FOLDER ..."; goes on where it was stopped
 	$(BIN)/trihedron run -m experiment=paper out=$(TABLE) 'sequences=[$(foreach d,$(DATA),"$(d)"$(COMMA))$(ROOMS)]' || test $$? -eq 1

@@ -12,9 +12,10 @@ import numpy as np
 from trihedron.pipeline.core import types
 from trihedron.pipeline.core.building_geometry import rings_of
 from trihedron.pipeline.core.errors import DataError, UsageError
+from trihedron.pipeline.core.linalg import matmul, norm
 from trihedron.pipeline.core.types import F64, OPENING_KINDS, Pose
 
-OPEN_SIGMA_M = 0.05  # of an edge that nothing bounds
+OPEN_SIGMA_M = 0.05  # of an edge that nothing bounds, and of where a wall was last seen
 PARALLEL_DEG = 5.0  # between walls that have a distance
 BELOW_M = 0.3  # below its floor that a storey begins
 
@@ -59,7 +60,7 @@ class Wall:
     @property
     def along(self) -> F64:
         """The unit direction (2,) from start to end."""
-        return np.asarray((self.end - self.start) / max(float(np.linalg.norm(self.end - self.start)), 1e-9))
+        return np.asarray((self.end - self.start) / max(float(norm(self.end - self.start)), 1e-9))
 
     @property
     def normal(self) -> F64:
@@ -162,12 +163,12 @@ class Building:
         if isinstance(a, Wall):
             point, covariance = self._point(b, "distance")
             normal = np.array([*a.normal, 0.0])
-            sigma = np.sqrt(a.offset_sigma_m**2 + float(normal @ covariance @ normal))
-            return Measurement(abs(float((point[:2] - a.start) @ a.normal)), float(sigma))
+            sigma = np.sqrt(a.offset_sigma_m**2 + float(matmul(normal, covariance, normal)))
+            return Measurement(abs(float(matmul(point[:2] - a.start, a.normal))), float(sigma))
         (p, first), (q, second) = self._point(a, "distance"), self._point(b, "distance")
-        length = float(np.linalg.norm(q - p))
+        length = float(norm(q - p))
         along = (q - p) / max(length, 1e-9)
-        return Measurement(length, float(np.sqrt(max(float(along @ (first + second) @ along), 0.0))))
+        return Measurement(length, float(np.sqrt(max(float(matmul(along, first + second, along)), 0.0))))
 
     def save(self, folder: str | Path) -> None:
         """Write the files of `trihedron building`, model.ifc where ifcopenshell is installed. Raises TrihedronError."""
@@ -195,8 +196,8 @@ class Building:
             return thing.middle, np.outer(along, along) * (thing.width_m.sigma / 2.0) ** 2
         T, covariance = self.plan.T_world_building, np.zeros((3, 3))
         if isinstance(thing, Pose):
-            R = T[:3, :3].T @ thing.T_world_camera[:3, :3]
-            thing, covariance = thing.T_world_camera, R @ thing.covariance[:3, :3] @ R.T
+            R = matmul(T[:3, :3].T, thing.T_world_camera[:3, :3])
+            thing, covariance = thing.T_world_camera, matmul(R, thing.covariance[:3, :3], R.T)
         try:
             given = np.asarray(thing, np.float64)
         except (TypeError, ValueError):
@@ -204,7 +205,7 @@ class Building:
         if given.shape not in ((4, 4), (3,)):
             raise UsageError(place, f"is given {type(thing).__name__}, no place", "give a wall, an opening, a pose, a (4, 4) matrix or a point (3,)")
         position = given[:3, 3] if given.ndim == 2 else given
-        return np.asarray(T[:3, :3].T @ (position - T[:3, 3])), np.asarray(covariance)
+        return np.asarray(matmul(T[:3, :3].T, position - T[:3, 3])), np.asarray(covariance)
 
     def _wall(self, k: int) -> Wall:
         start, end = self.plan.walls_m[k]
@@ -212,7 +213,7 @@ class Building:
         sigma = float(np.hypot(self._end_sigma(k, start), self._end_sigma(k, end)))
         rows = self.plan.unseen[self.plan.unseen[:, 0].astype(int) == k]
         return Wall(
-            k, int(self.plan.wall_storeys[k]), start, end, Measurement(float(np.linalg.norm(end - start)), sigma),
+            k, int(self.plan.wall_storeys[k]), start, end, Measurement(float(norm(end - start)), sigma),
             Measurement(float(self.plan.thickness_m[k]), thickness), offset, rows[:, 1:],
         )  # fmt: skip
 
@@ -224,7 +225,7 @@ class Building:
                 before = a + (j - a - 1) % (b - a)
                 if wall in (self.plan.corner_walls[j], self.plan.corner_walls[before]):
                     other = before if self.plan.corner_walls[j] == wall else j
-                    best = min(best, (float(np.linalg.norm(self.plan.corners_m[j] - end)), self._edge_sigma(other)))
+                    best = min(best, (float(norm(self.plan.corners_m[j] - end)), self._edge_sigma(other)))
         return best[1]
 
     def _edge_sigma(self, corner: int) -> float:
@@ -250,9 +251,10 @@ class Building:
             after, before = a + (j - a + 1) % (b - a), a + (j - a - 1) % (b - a)
             p, q = self.plan.corners_m[j], self.plan.corners_m[after]
             sines = np.abs(np.sin(_turns(self.plan.corners_m[a:b])))[[j - a, after - a]]
-            sigma = np.hypot(self._edge_sigma(before) / max(sines[0], 0.1), self._edge_sigma(after) / max(sines[1], 0.1))
+            ends = [OPEN_SIGMA_M if sine < 0.1 else self._edge_sigma(k) / sine for sine, k in zip(sines, (before, after))]
+            sigma = np.hypot(ends[0], ends[1])
             wall = int(self.plan.corner_walls[j])
-            found.append(Edge(p, q, Measurement(float(np.linalg.norm(q - p)), float(sigma)), wall if wall >= 0 else None))
+            found.append(Edge(p, q, Measurement(float(norm(q - p)), float(sigma)), wall if wall >= 0 else None))
         return found
 
     def _perimeter(self, a: int, b: int) -> Measurement:
@@ -287,8 +289,8 @@ def _turns(ring: F64) -> F64:
 
 def _between(a: Wall, b: Wall) -> Measurement:
     """Return the smallest gap between faces of two walls that face each other; of the faces' offsets where none do, as on one line."""
-    if abs(float(a.along @ b.normal)) > np.sin(np.radians(PARALLEL_DEG)):
-        angle = float(np.degrees(np.arcsin(min(abs(float(a.along @ b.normal)), 1.0))))
+    if abs(float(matmul(a.along, b.normal))) > np.sin(np.radians(PARALLEL_DEG)):
+        angle = float(np.degrees(np.arcsin(min(abs(float(matmul(a.along, b.normal))), 1.0))))
         raise UsageError(
             "distance", f"walls {a.number} and {b.number} are not parallel but at {angle:.0f}°", "take parallel walls, or a wall and a point"
         )
@@ -296,11 +298,11 @@ def _between(a: Wall, b: Wall) -> Measurement:
     gaps = []
     for sign, depth, sigma in _faces(a):
         for other, deep, second in _faces(b):
-            facing = sign * other * float(a.normal @ b.normal) < 0.0
-            gap = sign * float((middle + deep * -b.normal) @ a.normal + depth)
+            facing = sign * other * float(matmul(a.normal, b.normal)) < 0.0
+            gap = sign * float(matmul(middle + deep * -b.normal, a.normal) + depth)
             if facing and gap > 0.0:
                 gaps.append((gap, float(np.hypot(sigma, second))))
-    return Measurement(*min(gaps)) if gaps else Measurement(abs(float(middle @ a.normal)), float(np.hypot(a.offset_sigma_m, b.offset_sigma_m)))
+    return Measurement(*min(gaps)) if gaps else Measurement(abs(float(matmul(middle, a.normal))), float(np.hypot(a.offset_sigma_m, b.offset_sigma_m)))
 
 
 def _faces(wall: Wall) -> list[tuple[float, float, float]]:

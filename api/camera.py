@@ -6,6 +6,7 @@ from dataclasses import dataclass, fields
 from pathlib import Path
 
 from trihedron.datasets.readers.cameras import Calibration, read_camera_file
+from trihedron.datasets.readers.registration import DepthCamera
 from trihedron.pipeline.core import types
 
 
@@ -17,15 +18,20 @@ class Camera(types.Camera):
         depth_scale: value of a 16-bit depth image per metre, 1000 for millimetres; 0 where depth is given in metres.
         distortion: k1 k2 p1 p2 k3 of Brown's model, in OpenCV's order, of both images; empty for undistorted ones.
         depth_offset: added to inverse depths (1/m).
+        depth_radial: relative error of depth in the corners of the image; it grows with the squared distance from the centre.
+        depth_camera: the separate camera of depth images that are not registered to colour.
     """
 
     depth_scale: float = 0.0
     distortion: tuple[float, ...] = ()
     depth_offset: float = 0.0
+    depth_radial: float = 0.0
+    depth_camera: DepthCamera | None = None
 
     @classmethod
     def from_yaml(cls, path: str | Path) -> Camera:
-        """Read a camera file: `width height fx fy cx cy depth_scale [distortion] [fps] [depth_noise] [depth_offset]`.
+        """Read a camera file: `width height fx fy cx cy depth_scale [distortion] [fps] [depth_noise] [depth_offset]
+        [depth_radial] [depth_camera]`.
 
         Raises TrihedronError naming file and key."""
         return cls.of(read_camera_file(Path(path).expanduser()))
@@ -38,11 +44,12 @@ class Camera(types.Camera):
         pinhole = camera.camera if isinstance(camera, Calibration) else camera
         values = {field.name: getattr(pinhole, field.name) for field in fields(types.Camera)}
         if isinstance(camera, Calibration):
-            return cls(**values, depth_scale=camera.depth_scale, distortion=camera.distortion, depth_offset=camera.depth_offset)
+            more = {field.name: getattr(camera, field.name) for field in fields(Calibration) if field.name != "camera"}
+            return cls(**values, **more)
         return cls(**values)
 
     @property
     def calibration(self) -> Calibration:
         """The camera as the readers of data sets have it."""
         pinhole = types.Camera(**{field.name: getattr(self, field.name) for field in fields(types.Camera)})
-        return Calibration(pinhole, self.depth_scale, tuple(self.distortion), self.depth_offset)
+        return Calibration(pinhole, self.depth_scale, tuple(self.distortion), self.depth_offset, self.depth_radial, self.depth_camera)

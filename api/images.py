@@ -10,8 +10,7 @@ import numpy as np
 
 from trihedron.api.camera import Camera
 from trihedron.datasets.readers.cameras import Calibration
-from trihedron.datasets.readers.images import corrected, metres
-from trihedron.datasets.readers.registration import Undistortion
+from trihedron.datasets.readers.images import metres
 from trihedron.pipeline.core import types
 from trihedron.pipeline.core.errors import DataError
 from trihedron.pipeline.core.types import F32, U8, Frame
@@ -34,12 +33,12 @@ class Frames:
     def __init__(self, camera: Camera) -> None:
         self.camera = camera
         self._calibration = camera.calibration
-        self._undistortion = Undistortion(self._calibration.camera, self._calibration.distortion)
+        self._rectification = self._calibration.rectification
 
     def __call__(self, index: int, stamp_ns: int, rgb: object | None, depth: object) -> Frame:
         """Make frame `index` of rgb (h, w, 3) uint8, None for a black image, and depth (h, w), in metres or uint16 / depth_scale."""
         color = self._color(rgb) if rgb is not None else np.zeros((self.camera.height, self.camera.width, 3), np.uint8)
-        color, depth_m = self._undistortion.color(color), self._undistortion.depth(self._depth(depth))
+        color, depth_m = self._rectification.color(color), self._rectification.depth(self._depth(depth))
         return Frame(index, stamp_ns, color, depth_m, self._calibration.camera)
 
     def _color(self, given: object) -> U8:
@@ -58,7 +57,7 @@ class Frames:
             scale = self.camera.depth_scale
             if scale <= 0.0:
                 raise DataError("depth", "holds uint16, and the camera has no depth_scale", "give Camera(..., depth_scale=1000) for millimetres")
-            return corrected(metres(image, scale), self.camera.depth_offset)
+            return metres(image, scale)
         if image.dtype.kind != "f":
             raise DataError(
                 "depth", f"holds {image.dtype}, neither metres nor uint16", "give float metres, or np.uint16 and the camera's depth_scale"

@@ -16,16 +16,18 @@ from trihedron.pipeline.core.types import Frame, Map, Pose, Surface, Value
 from trihedron.pipeline.record import reader
 from trihedron.pipeline.record.codec import FRAMES_TOPIC
 from trihedron.tools.building import building_of
-from trihedron.tools.recorded import frames_of, last_map, poses_of, references_of, trajectory_of
+from trihedron.tools.recorded import frames_of, last_map, opened, poses_of, references_of, trajectory_of
 
 
 class Recording:
-    """A recording (run.mcap), or the folder of a run that has one. Raises TrihedronError where it cannot be read."""
+    """A recording (run.mcap), or the folder of a run that has one; what it holds so far, where it is still being written.
+
+    Raises TrihedronError where it cannot be read."""
 
     def __init__(self, path: str | Path) -> None:
         file = Path(path).expanduser()
         self.path = file / "run.mcap" if file.is_dir() else file
-        self._file = reader.Recording(self.path)
+        self._file: reader.Recording = opened(self.path)
         self._temporary: tempfile.TemporaryDirectory[str] | None = None  # of a replay: it lives as long as this object
 
     @property

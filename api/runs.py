@@ -46,7 +46,7 @@ class Run:
     def table(self) -> Any:
         """Return the metrics, one row a figure: a pandas DataFrame where pandas is installed, else a list of dicts."""
         rows = [{"figure": name, "value": value} for name, value in dotted(self.metrics).items()]
-        return _table(rows)
+        return as_table(rows)
 
 
 def run(*overrides: str, out: str | Path | None = None, quiet: bool = False, **options: Any) -> Run:
@@ -76,7 +76,7 @@ def compare(folders: Iterable[str | Path | Run] | str | Path, baseline: str = ""
     given: Sequence[Any] = [folders] if isinstance(folders, (str, Path, Run)) else list(folders)
     paths = [item.folder if isinstance(item, Run) else Path(item).expanduser() for item in given]
     rows = comparison.rows_of([found for path in paths for found in comparison.read_runs(path)], baseline)
-    return _table([_flat(row) for row in rows])
+    return as_table([_flat(row) for row in rows])
 
 
 def _flat(row: dict[str, Any]) -> dict[str, Any]:
@@ -85,7 +85,8 @@ def _flat(row: dict[str, Any]) -> dict[str, Any]:
     return {"data": row["data"], "change": row["change"], "runs": row["runs"], **figures, **differences, "note": row["note"]}
 
 
-def _table(rows: list[dict[str, Any]]) -> Any:
+def as_table(rows: list[dict[str, Any]]) -> Any:
+    """Return rows as a pandas DataFrame where pandas is installed, else as they are."""
     try:
         import pandas
     except ImportError:

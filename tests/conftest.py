@@ -5,10 +5,10 @@ import re
 
 import pytest
 
-import trihedron  # noqa: F401  # before NumPy, so that OpenBLAS rounds alike in all processes
 from trihedron.tools import system_check
 
 os.environ["TRIHEDRON_COMPILE"] = "0"
+SLOW_S = 3600  # limit of a slow test that states none; the others have that of pyproject.toml
 ON_OPEN3D = re.compile(r"open3d|\b(graph=)?libraries\b")
 ALLOWED = {  # pattern of a skip's reason -> why the development environment does not mend it
     r"could not import 'rclpy'": "ROS 2 is on no package index",
@@ -22,7 +22,10 @@ ALLOWED = {  # pattern of a skip's reason -> why the development environment doe
 
 
 def pytest_collection_modifyitems(items):
-    """Skip the tests on Open3D where it does not load, with the Debian packages that it lacks as the reason."""
+    """Limit the time of slow tests. Skip those on Open3D where it does not load, with the Debian packages that it lacks as the reason."""
+    for item in items:
+        if item.get_closest_marker("slow") and not item.get_closest_marker("timeout"):
+            item.add_marker(pytest.mark.timeout(SLOW_S))
     on_open3d = [item for item in items if (call := getattr(item, "callspec", None)) and "path" not in call.params and ON_OPEN3D.search(call.id)]
     try:
         if on_open3d:

@@ -38,6 +38,7 @@ def test_camera_loop(tmp_path, capsys):
     assert len(printed) == 3 and "ok" in printed[1] and "triangles" in printed[2]
 
 
+@pytest.mark.slow
 def test_plugin_on_one_image(capsys):
     example("plugin_on_one_image").main(length=12)
     default, ours, tracked = capsys.readouterr().out.splitlines()
@@ -83,6 +84,7 @@ class Camera:
         self.stopped = True
 
 
+@pytest.mark.slow
 def test_realsense_loop(tmp_path, monkeypatch, capsys):
     camera = Camera()
     monkeypatch.setitem(sys.modules, "pyrealsense2", camera)

@@ -42,12 +42,12 @@ for i in range(3000):
 TRACKED = """
 import sys, time
 from trihedron.pipeline.app.cli import main
-from trihedron.pipeline.run.runner import Runner
-record = Runner._record
-def reported(self, writer, view, position, *rest):
-    record(self, writer, view, position, *rest)
-    print("recorded", self.indices[position], time.monotonic(), file=sys.stderr, flush=True)
-Runner._record = reported
+from trihedron.pipeline.run.recorder import Recorder
+frame = Recorder.frame
+def reported(self, index, *rest):
+    frame(self, index, *rest)
+    print("recorded", index, time.monotonic(), file=sys.stderr, flush=True)
+Recorder.frame = reported
 words = ["dataset=synthetic", "dataset.length=900", "dataset.width=320", "dataset.height=240", "record.frames=true"]
 sys.exit(main(["run", *words, f"out={sys.argv[1]}"]))
 """

@@ -11,7 +11,8 @@ import pytest
 
 from trihedron.datasets.simulation.motion import Motion, camera_pose
 from trihedron.datasets.simulation.synthetic import Scene, Synthetic
-from trihedron.pipeline.core.geometry import invert, rotation_angle_deg
+from trihedron.pipeline.core.geometry import invert
+from trihedron.pipeline.core.lie import rotation_angle_deg
 from trihedron.pipeline.core.registry import load_plugins, plugin_class
 from trihedron.pipeline.core.types import Pose
 from trihedron.pipeline.record.reader import Recording

@@ -102,6 +102,7 @@ def run_five_frames(programs: Path, folder: Path, *words: str) -> None:
     assert json.loads((folder / "five" / "timing.json").read_text())["frames"] == 5
 
 
+@pytest.mark.slow
 def test_wheel_in_an_empty_environment(wheel, tmp_path):
     """Two stages only: a new environment compiles its kernels anew, and all of them take more than a minute."""
     programs = installed(wheel, tmp_path / "env", with_dependencies=False)

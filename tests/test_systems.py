@@ -162,11 +162,13 @@ def seen(tmp_path_factory):
     return {name: Seen(folder / name) for name in SYSTEMS}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", SYSTEMS)
 def test_no_other_system_does_what_this_one_does(seen, name):
     assert [other for other in SYSTEMS if CHARACTER[name](seen[other])] == [name]
 
 
+@pytest.mark.slow
 def test_every_frame_is_tracked_and_no_two_trajectories_are_alike(seen):
     for name, system in seen.items():
         metrics = json.loads((system.folder / "metrics.json").read_text())
@@ -180,6 +182,7 @@ def apart(seen):
     return min(np.linalg.norm(a - b, axis=1).max() for i, a in enumerate(paths) for b in paths[:i])
 
 
+@pytest.mark.slow
 def test_the_new_stages_run_again_from_the_recording_give_its_bytes(seen):
     again = {name: stages for name, (_, stages, _) in SYSTEMS.items() if name != "manhattan_odometry"}  # whose stages are those of plane_odometry
     folder = next(iter(seen.values())).folder.parent

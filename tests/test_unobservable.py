@@ -75,7 +75,12 @@ def test_what_is_seen_is_measured_and_the_rest_is_held(tmp_path, name):
     assert (sigmas[1][unseen] > 1.5 * sigmas[0][unseen]).all() and sigmas[1][seen].max() < 0.02  # and it is known to be unknown
 
 
-@pytest.mark.parametrize("graph", sorted(path.stem for path in GRAPHS.glob("*.yaml")))
+QUICK = ("structural", "points", "direct", "plane_odometry")  # one of each kind: all features, points alone, images, no map
+
+
+@pytest.mark.parametrize(
+    "graph", [pytest.param(path.stem, marks=() if path.stem in QUICK else pytest.mark.slow) for path in sorted(GRAPHS.glob("*.yaml"))]
+)
 def test_no_system_is_sure_of_itself_in_front_of_one_bare_wall(tmp_path, graph):
     """Points on a textureless wall, and whatever else must fail there: it is said."""
     depth_of, step, *_ = SCENES["single wall"]

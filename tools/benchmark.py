@@ -9,11 +9,12 @@ Other comparisons, each with its --help: `trihedron benchmark scaling` (threads,
 (estimators of the Manhattan frame on rendered rooms), `trihedron benchmark rotations` (the runs of a sweep over them), `trihedron benchmark
 detectors` (all detectors, by the truth of rendered scenes), `trihedron benchmark methods` (every plugin in the default graph), `trihedron benchmark
 surface` (all surfaces, by the true one), `trihedron benchmark map` (drift, recovery and growth of the map), `trihedron benchmark long` (what a long
-run leaves behind), `trihedron benchmark recording` (what recording costs), `trihedron benchmark building`, `trihedron benchmark sensors` (honesty on
-simulated sensors of several kinds), `trihedron benchmark faults` (the same under degenerate input).
+run leaves behind), `trihedron benchmark parts` (features and matching beside OpenCV's), `trihedron benchmark recording` (what recording costs),
+`trihedron benchmark building`, `trihedron benchmark sensors` (honesty on simulated sensors of several kinds), `trihedron benchmark faults` (the same
+under degenerate input).
 `trihedron compare` makes a table of the runs of any sweep.
 
-Example: trihedron benchmark dataset=tum dataset.path=FOLDER dataset.frames=0:150 --json benchmark.json
+Example: trihedron benchmark FOLDER dataset.frames=0:150 --json benchmark.json
 """
 
 from __future__ import annotations
@@ -33,6 +34,7 @@ from pathlib import Path
 from typing import Any
 
 from trihedron.pipeline.core.errors import UsageError, did_you_mean
+from trihedron.pipeline.core.layouts import data_set_words
 from trihedron.pipeline.core.types import U8
 from trihedron.tools.arguments import Parser
 from trihedron.tools.benchmarks.paired import compared, read_figures, times
@@ -47,6 +49,7 @@ COMPARISONS = {  # other words after `benchmark`, and whose `main` they stand fo
     "manhattan": "trihedron.tools.benchmarks.manhattan_family",
     "map": "trihedron.tools.benchmarks.map_benchmark",
     "methods": "trihedron.tools.benchmarks.method_tables",
+    "parts": "trihedron.tools.benchmarks.part_times",
     "recording": "trihedron.tools.benchmarks.recording_benchmark",
     "rotations": "trihedron.tools.benchmarks.rotation_comparison",
     "scaling": "trihedron.tools.benchmarks.scaling_benchmark",
@@ -62,13 +65,13 @@ def main(argv: list[str]) -> int:
         comparison: Any = importlib.import_module(COMPARISONS[argv[0]])
         return int(comparison.main(argv[1:]))
     parser = Parser("benchmark", __name__)
-    parser.add_argument("overrides", nargs="*", help="as for trihedron run")
+    parser.add_argument("overrides", nargs="*", help="as for trihedron run, or the folder of a data set")
     parser.add_argument("--json", type=Path, metavar="FILE", help="write the figures too")
     parser.add_argument("--compare", type=Path, metavar="OLD.json", help="say what became slower since then")
     parser.add_argument("--paced", action="store_true", help="a second run at the camera's own rate")
     parser.add_argument("--cold", action="store_true", help="time the first frame with an empty kernel cache, too (half a minute)")
     options, rest = parser.parse_known_args(argv)
-    overrides = [*options.overrides, *rest]
+    overrides = [override for word in (*options.overrides, *rest) for override in data_set_words(word)]
     _checked(overrides)
     old = read_figures(options.compare) if options.compare else None
     with tempfile.TemporaryDirectory() as folder:
@@ -96,7 +99,7 @@ def _checked(overrides: list[str]) -> None:
     """Raise UsageError for a word that is no override: it may be a comparison misspelt."""
     for word in overrides:
         if "=" not in word:
-            raise UsageError("benchmark", f"'{word}' is neither key=value nor a comparison", did_you_mean(word, COMPARISONS))
+            raise UsageError("benchmark", f"'{word}' is neither key=value, a comparison nor an existing folder", did_you_mean(word, COMPARISONS))
 
 
 def measure(overrides: list[str], out: Path, environment: dict[str, str] | None = None) -> dict[str, Any]:
@@ -194,7 +197,8 @@ def report(figures: dict[str, Any]) -> str:
         f"throughput {figures['fps']:.1f} frames/s: {per_frame:.1f} ms a frame, {per_frame / reference:.2f} x reference",
         f"start-up {figures['startup_s']:.1f} s, --help {figures['cli_cpu_s']:.2f} s of CPU"
         + (f", the first frame without compiled kernels {figures['cold_first_frame_s']:.0f} s" if "cold_first_frame_s" in figures else ""),
-        f"CPU {figures['cpu_s']:.1f} s ({used:.2f} cores), peak memory {memory_text(figures)} MB",
+        f"CPU {figures['cpu_s']:.1f} s ({used:.2f} cores), start-up included: {1e3 * figures['cpu_s'] / max(figures['frames'], 1):.1f} ms a frame;"
+        f" peak memory {memory_text(figures)} MB",
     ]
     final = figures.get("metrics", {}).get("final")
     if final:

@@ -10,13 +10,13 @@ Example: trihedron building runs/latest
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from trihedron.pipeline.core.errors import DataError, UsageError, did_you_mean
 from trihedron.tools.arguments import Parser
 
 if TYPE_CHECKING:
-    from trihedron.pipeline.core.types import Building
+    from trihedron.pipeline.core.types import Building, Map
     from trihedron.pipeline.record.reader import Recording
 
 RECORDING = "run.mcap"
@@ -59,11 +59,9 @@ def main(argv: list[str]) -> int:
 def building_of(recording: Recording, plugin: str | None = None) -> Building:
     """Return the recorded building, or the one that a plugin (default: manhattan_layout) makes of the recording. Raises DataError."""
     from trihedron.pipeline.core.types import Building
-    from trihedron.pipeline.run.value_checks import checked
 
     if plugin is None and "building" in recording.topics:
         for value in recording.values("building"):
-            checked("building", value, str(recording.path))
             if isinstance(value, Building):
                 return value
     return folded(recording, plugin or "manhattan_layout")
@@ -71,8 +69,16 @@ def building_of(recording: Recording, plugin: str | None = None) -> Building:
 
 def folded(recording: Recording, name: str) -> Building:
     """Fold the recording's frames by a plugin with its default options. Raises DataError when planes are not recorded, or the frames are gone."""
+    fold, state, final = gathered(recording, name)
+    building: Building = fold.finish(state, final)
+    return building
+
+
+def gathered(recording: Recording, name: str) -> tuple[Any, Any, Map | None]:
+    """Return a plugin with its default options, its state after all frames of a recording, and the last map. Raises DataError as `folded` does."""
     from trihedron.pipeline.core.registry import plugin_class
     from trihedron.pipeline.core.types import Pose
+    from trihedron.pipeline.core.value_checks import check_together
     from trihedron.tools.recorded import frames_of, last_map, poses_of, references_of
 
     if "planes" not in recording.topics:
@@ -93,6 +99,6 @@ def folded(recording: Recording, name: str) -> Building:
         frame = frame_of(references[index])
         if frame is not None:
             values = dict(zip(given, (frame, planes, rotations.get(index), poses[index], maps.get(index))))
+            check_together(values, str(recording.path), {topic: topic for topic in given})
             state = fold.add(state, **values) if name != "none" else fold.add(state, pose=values["pose"])
-    value: Building = fold.finish(state, final)
-    return value
+    return fold, state, final

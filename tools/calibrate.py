@@ -1,101 +1,256 @@
-"""Estimate calibration from a run: the offset of inverse depth, the delay of the depth images, and focal lengths against depth.
+"""Estimate a camera's calibration from a run, and recommend what makes the half of the recording better that it was not estimated from.
 
-The offset (1/m, `depth_offset` of camera.yaml) is estimated from walls that should be at right angles, the delay (`dataset.depth_delay_ms` of
-dataset=tum) from the rotation of the camera in the colour and in the depth images, fx and fy from points that two keyframes measured. A scale of all
-depths is not observable. An estimate is significant when it differs from the value in use by several standard deviations; run again with it.
+Edges of depth are laid on gradients of colour: registration of the depth camera (focal length, centre, offset), and the delay of depth. Points that
+pairs of frames observed give fx and fy against depth, errors of depth that grow with range (`depth_offset`, 1/m, added to inverse depths) and towards
+the corners of the image (`depth_radial`), and the readout time of a rolling shutter. A scale of all depths is not observable. The gain of a change is
+the relative decrease of the cost on blocks of frames that were held out, with its standard error over the blocks; what does not gain significantly is
+not recommended. Where something is recommended, the lines for camera.yaml are printed, and --out writes the whole file: run again with it.
 
-Example: trihedron calibrate runs/a/run.mcap
+Example: trihedron calibrate runs/a/run.mcap --out camera.yaml
 """
 
 from __future__ import annotations
 
-from collections import deque
-from collections.abc import Mapping
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import yaml
 
+from trihedron.datasets.readers.cameras import Calibration, choose_calibration
+from trihedron.datasets.readers.registration import DepthCamera
 from trihedron.pipeline.core.errors import DataError
-from trihedron.pipeline.core.types import Camera, FrameReference, Keypoints, Matches, Planes, Tracks
+from trihedron.pipeline.core.types import F64, Camera
 from trihedron.pipeline.record.reader import Recording
+from trihedron.tools import calibration_edges, calibration_pairs
 from trihedron.tools.arguments import Parser, table
-from trihedron.tools.calibration import (
-    DepthDelay,
-    DepthOffset,
-    FrameRotation,
-    RightAngle,
-    estimate_depth_delay,
-    estimate_depth_offset,
-    right_angles,
-    rotation_of_frame,
-)
-from trihedron.tools.calibration_focal_length import FocalLengths, estimate_focal_lengths
+from trihedron.tools.calibration_edges import Edges, block_scores, edges_of, registered
+from trihedron.tools.calibration_judgement import Costs, Judgement, judge
+from trihedron.tools.calibration_pairs import Fit, Pairs, fit, scale_of
+from trihedron.tools.calibration_recording import Recorded, pairs_of, read_recording
 
-NEEDED = ("frames", "keypoints", "planes", "tracks", "matches", "map")
+DELAY = (5,)  # of the edges' parameters; always estimated with the others
+REGISTRATIONS = ((1, 2), (0, 1, 2), (0, 1, 2, 3, 4))  # sets of the edges' parameters, each a part of the next
+SHUTTER = (3, 4)  # readout and delay among the parameters of pairs; always estimated with the others
+CHANGES = {"focal lengths": (0,), "depth_offset": (1,), "depth_radial": (2,)}  # of pairs
+NONE = Judgement(0.0, float("inf"), 0, False)
+
+
+@dataclass(frozen=True)
+class Estimates:
+    """Parameters by edges and by pairs (in the order of their modules' NAMES) as recommended, 0 where not; all, estimated together, with their
+    standard deviations; and the judgement of each change by its name."""
+
+    edges: F64
+    pairs: F64
+    all_edges: tuple[F64, F64]
+    all_pairs: tuple[F64, F64]
+    judgements: dict[str, Judgement]
 
 
 def main(argv: list[str]) -> int:
-    """Print the estimates; returns the exit code. Raises RecordingError, or DataError for a recording without the topics."""
+    """Print the estimates; returns the exit code. Raises RecordingError, or DataError for a recording without topics, frames or a camera file."""
     parser = Parser("calibrate", __name__)
     parser.add_argument("recording", metavar="RUN.mcap", type=Path)
-    recording = Recording(parser.parse_args(argv).recording)
-    missing = next((topic for topic in NEEDED if topic not in recording.topics), None)
-    if missing:
-        raise DataError(str(recording.path), f"holds no topic {missing}", "record a run of graph=structural, or one that has this stage")
-    planes = planes_of(recording)
-    offset, delay, focal = depth_offset_of(recording, planes), depth_delay_of(recording, planes), focal_lengths_of(recording)
-    camera = camera_of(recording)
-    rows = [
-        ["figure", "estimate", "standard deviation", "from"],
-        ["depth_offset (1/m)", f"{offset.per_m:.5f}", f"{offset.sigma_per_m:.5f}", f"{offset.pairs} pairs of planes"],
-        ["depth_delay_ms", f"{1e3 * delay.seconds:.1f}", f"{1e3 * delay.sigma_s:.1f}", f"{delay.frames} frames"],
-        *(
-            [f"{name} (px; {used:g} in use)", f"{factor * used:.2f}", f"{sigma * used:.2f}", f"{focal.pairs} pairs of keyframes"]
-            for name, used, factor, sigma in zip(("fx", "fy"), (camera.fx, camera.fy), focal.factors, focal.sigmas)
-        ),
-    ]
-    print(table(rows, "lrr"))
+    parser.add_argument("--out", metavar="CAMERA.yaml", type=Path, help="write a camera file with what is recommended")
+    arguments = parser.parse_args(argv)
+    path: Path = arguments.recording
+    recording = Recording(path / "run.mcap" if path.is_dir() else path)
+    recorded = read_recording(recording)
+    used = calibration_in_use(recording, recorded.camera)
+    found = estimate(recorded)
+    print(report(found, recorded.camera))
+    changed = with_estimates(used, found)
+    if changed == used:
+        print("no change recommended")
+    else:
+        print("recommended, for camera.yaml:\n" + yaml.safe_dump(_changed_keys(used, changed), sort_keys=False, default_flow_style=None).rstrip())
+    if arguments.out is not None:
+        if not used.depth_scale:
+            raise DataError(str(recording.path), "is not of a data set with a camera file", "copy the lines that are printed")
+        arguments.out.write_text(yaml.safe_dump(keys_of(changed), sort_keys=False, default_flow_style=None))
     return 0
 
 
-def planes_of(recording: Recording) -> dict[int, Planes]:
-    """The planes of each frame."""
-    return {value.index: value for value in _all(recording, "planes", Planes)}
+def estimate(recorded: Recorded) -> Estimates:
+    """Estimate and judge everything."""
+    edges = edges_of(recorded.frames, recorded.motions, recorded.blocks)
+    judgements: dict[str, Judgement] = {}
+    by_edges, all_edges = (
+        _by_edges(edges, judgements)
+        if len(np.unique(edges.blocks)) > 1
+        else (np.zeros(len(calibration_edges.NAMES)), (np.zeros(6), np.full(6, np.inf)))
+    )
+    depth_camera = _depth_camera(None, recorded.camera, by_edges)
+    pairs = pairs_of(recorded, depth_camera)
+    nothing = np.zeros(len(calibration_pairs.NAMES))
+    by_pairs, all_pairs = (
+        _by_pairs(pairs, judgements, bool(by_edges[0])) if pairs is not None else (nothing, (nothing, np.full(len(nothing), np.inf)))
+    )
+    return Estimates(by_edges, by_pairs, all_edges, all_pairs, judgements)
 
 
-def camera_of(recording: Recording) -> Camera:
-    """The camera of the first frame."""
-    frames: list[FrameReference] = _all(recording, "frames", FrameReference)
-    return frames[0].camera
+def _by_edges(edges: Edges, judgements: dict[str, Judgement]) -> tuple[F64, tuple[F64, F64]]:
+    """Recommended parameters, and all of them with their standard deviations."""
+    halves = [edges.select(edges.blocks % 2 == half) for half in (0, 1)]
+
+    @lru_cache
+    def estimated(half: int, free: tuple[int, ...]) -> tuple[float, ...]:
+        return tuple(registered(halves[half], free).parameters) if len(halves[half].pixels) else (0.0,) * 6
+
+    def judged(before: tuple[int, ...], after: tuple[int, ...]) -> Judgement:
+        def costs(half: int) -> tuple[Costs, Costs]:
+            scores = (block_scores(halves[1 - half], np.array(estimated(half, free))) for free in (before, after))
+            low, high = ({block: -score for block, score in found.items()} for found in scores)
+            return low, high
+
+        return judge(costs)
+
+    accepted: tuple[int, ...] = ()
+    judgements["registration"] = NONE
+    for free in REGISTRATIONS:
+        found = judged(accepted + DELAY, free + DELAY)
+        if found.recommended:
+            judgements["registration"], accepted = found if not accepted else judged(DELAY, free + DELAY), free
+        elif not accepted and found.gain > judgements["registration"].gain:
+            judgements["registration"] = found
+    judgements["delay"] = judged(accepted, accepted + DELAY)
+    everything = registered(edges, REGISTRATIONS[-1] + DELAY)
+    chosen = accepted + (DELAY if judgements["delay"].recommended else ())
+    parameters = registered(edges, accepted + DELAY).parameters if accepted else np.zeros(6)
+    parameters[5] = parameters[5] if DELAY[0] in chosen else 0.0
+    if not accepted and chosen:
+        parameters = registered(edges, chosen).parameters
+    return parameters, (everything.parameters, np.sqrt(np.diag(everything.covariance)))
 
 
-def focal_lengths_of(recording: Recording) -> FocalLengths:
-    """Estimate the factors of fx and fy from the last map of the recording."""
-    maps: deque[Any] = deque(recording.values("map"), maxlen=1)
-    return estimate_focal_lengths(maps[0]) if maps else FocalLengths(np.full(2, np.nan), np.full(2, np.inf), 0)
+def _by_pairs(pairs: Pairs, judgements: dict[str, Judgement], has_ratio: bool) -> tuple[F64, tuple[F64, F64]]:
+    """Recommended parameters, and all of them with their standard deviations. Where the edges changed the ratio of colour's and depth's focal length
+    (`has_ratio`), focal lengths are estimated in any case: edges do not tell which of the two is wrong."""
+    scale = scale_of(pairs)
+    halves = [pairs.select(pairs.blocks % 2 == half) for half in (0, 1)]
+    if not all(len(half.blocks) for half in halves):
+        halves = []
+
+    @lru_cache
+    def held_out(half: int, free: tuple[int, ...]) -> dict[int, float]:
+        parameters = fit(halves[half], free, scale)[0].parameters
+        other = halves[1 - half]
+        found: Fit = fit(other, (), scale, held=parameters)[0]
+        return {int(block): float(found.costs[other.blocks == block].mean()) for block in np.unique(other.blocks)}
+
+    def judged(before: tuple[int, ...], after: tuple[int, ...]) -> Judgement:
+        return judge(lambda half: (held_out(half, before), held_out(half, after))) if halves else NONE
+
+    accepted: tuple[int, ...] = SHUTTER
+    remaining: dict[str, tuple[int, ...]] = dict(CHANGES)
+    if has_ratio:
+        free = remaining.pop("focal lengths")
+        judgements["focal lengths"] = replace(judged(accepted, accepted + free), recommended=True)
+        accepted += free
+    while remaining:
+        found = {name: judged(accepted, accepted + free) for name, free in remaining.items()}
+        judgements.update(found)
+        best = max(found, key=lambda name: found[name].gain if found[name].recommended else -np.inf)
+        if not found[best].recommended:
+            break
+        accepted += remaining.pop(best)
+    judgements["readout"] = judged(tuple(k for k in accepted if k != SHUTTER[0]), accepted)
+    everything = fit(pairs, range(len(calibration_pairs.NAMES)), scale)[0]
+    chosen = fit(pairs, accepted, scale)[0].parameters
+    recommended = np.where(np.isin(np.arange(len(chosen)), accepted), chosen, 0.0)
+    recommended[SHUTTER[1]] = 0.0
+    recommended[SHUTTER[0]] *= judgements["readout"].recommended
+    return recommended, (everything.parameters, np.sqrt(np.diag(everything.covariance)))
 
 
-def depth_offset_of(recording: Recording, planes: Mapping[int, Planes]) -> DepthOffset:
-    """Estimate the offset of the inverse depths of the recording's sensor; `planes` by frame."""
-    landmarks = {match.index: dict(match.planes.tolist()) for match in _all(recording, "matches", Matches)}
-    pairs: dict[tuple[int, int], list[RightAngle]] = {}
-    for index, found in planes.items():
-        for ids, seen in right_angles(found, landmarks.get(index, {})).items():
-            pairs.setdefault(ids, []).append(seen)
-    return estimate_depth_offset(pairs)
+def report(found: Estimates, camera: Camera) -> str:
+    """Make the table of estimates; pixels are those of the image."""
+    px = camera.width / 640.0
+    (edges, edge_sigmas), (pairs, pair_sigmas) = found.all_edges, found.all_pairs
+    rows = [["figure", "estimate", "standard deviation", "gain", "its error", "recommended"]]
+
+    def row(label: str, value: float, sigma: float, name: str, decimals: int) -> None:
+        verdict = found.judgements.get(name, NONE)
+        known = bool(np.isfinite(sigma))
+        cells = [f"{value:.{decimals}f}", f"{sigma:.{decimals}f}"] if known else ["-", "-"]
+        gain = [f"{100 * verdict.gain:.1f} %", f"{100 * verdict.sigma:.1f} %"] if np.isfinite(verdict.sigma) else ["-", "-"]
+        rows.append([label, *cells, *gain, "yes" if verdict.recommended else "no"])
+
+    row("colour focal length / depth focal length", float(np.exp(edges[0])), float(edge_sigmas[0]), "registration", 4)
+    for k, axis in ((1, "x"), (2, "y")):
+        row(f"shift of depth in {axis} (px)", edges[k] * px, edge_sigmas[k] * px, "registration", 2)
+    for k, axis in ((3, "x"), (4, "y")):
+        row(f"offset of depth in {axis} (mm)", 1e3 * edges[k], 1e3 * edge_sigmas[k], "registration", 1)
+    row("depth_delay_ms", 1e3 * edges[5], 1e3 * edge_sigmas[5], "delay", 1)
+    factor = float(np.exp(pairs[0]))
+    row(f"fx (px; {camera.fx:g} in use, fy alike)", camera.fx * factor, camera.fx * factor * float(pair_sigmas[0]), "focal lengths", 2)
+    row("depth_offset (1/m)", float(pairs[1]), float(pair_sigmas[1]), "depth_offset", 5)
+    row("depth_radial", float(pairs[2]), float(pair_sigmas[2]), "depth_radial", 4)
+    row("readout_ms", 1e3 * float(pairs[3]), 1e3 * float(pair_sigmas[3]), "readout", 1)
+    return table(rows, "lrrrrr")
 
 
-def depth_delay_of(recording: Recording, planes: Mapping[int, Planes]) -> DepthDelay:
-    """Estimate the time offset of the depth images relative to colour; `planes` by frame."""
-    camera = camera_of(recording)
-    keypoints = {value.index: value for value in _all(recording, "keypoints", Keypoints)}
-    tracks = [t for t in _all(recording, "tracks", Tracks) if t.previous_index >= 0 and t.index in keypoints and t.index in planes]
-    rotations: list[FrameRotation] = [r for t in tracks if (r := rotation_of_frame(t, keypoints[t.index], planes[t.index], camera)) is not None]
-    stamps = np.array([t.stamp_ns for t in tracks], np.int64)
-    return estimate_depth_delay(rotations, float(np.median(np.diff(stamps))) * 1e-9 if len(stamps) > 1 else np.nan)
+def calibration_in_use(recording: Recording, camera: Camera) -> Calibration:
+    """The calibration of the recording's data set; of one without a camera file the frames' camera, with the depth scale 0."""
+    from trihedron.pipeline.app.recorded_run import composed_run
+
+    options = composed_run(recording).dataset
+    folder, plugin = Path(str(options.get("path", ""))).expanduser(), str(options.get("plugin", ""))
+    try:
+        found = choose_calibration(folder, str(options.get("camera", "")), default="seven_scenes" if plugin == "seven_scenes" else "")
+    except (DataError, OSError):
+        return Calibration(camera, 0.0)
+    return found if (found.camera.width, found.camera.fx) == (camera.width, camera.fx) else Calibration(camera, 0.0)
 
 
-def _all(recording: Recording, topic: str, kind: type[Any]) -> list[Any]:
-    """A topic's values, in frame order."""
-    return [value for value in recording.values(topic) if isinstance(value, kind)]
+def with_estimates(used: Calibration, found: Estimates) -> Calibration:
+    """The calibration with what is recommended."""
+    camera = used.camera
+    depth_camera = _depth_camera(used.depth_camera, camera, found.edges)
+    factor = float(np.exp(found.pairs[0]))
+    if depth_camera is not None:  # the same pixels belong together under other focal lengths
+        x, y, z = depth_camera.translation_m
+        fx, fy = depth_camera.fx * factor, depth_camera.fy * factor
+        depth_camera = replace(depth_camera, fx=fx, fy=fy, translation_m=(x / factor, y / factor, z))
+    camera = replace(camera, fx=camera.fx * factor, fy=camera.fy * factor)
+    offset, radial = used.depth_offset + float(found.pairs[1]), used.depth_radial + float(found.pairs[2])
+    return replace(used, camera=camera, depth_camera=depth_camera, depth_offset=offset, depth_radial=radial)
+
+
+def _depth_camera(used: DepthCamera | None, camera: Camera, edges: F64) -> DepthCamera | None:
+    """The depth camera whose registered images lie where the edges' parameters move those of the camera in use."""
+    if not edges[:5].any():
+        return used
+    given = used if used is not None else DepthCamera(camera.fx, camera.fy, camera.cx, camera.cy)
+    scale, (shift_x, shift_y), (x, y, z) = float(np.exp(edges[0])), edges[1:3] * camera.width / 640.0, given.translation_m
+    fx, fy = given.fx / scale, given.fy / scale
+    translation = scale * x + float(edges[3]), scale * y + float(edges[4]), z
+    return replace(given, fx=fx, fy=fy, cx=given.cx - float(shift_x) * fx / camera.fx, cy=given.cy - float(shift_y) * fy / camera.fy,
+                   translation_m=translation)  # fmt: skip
+
+
+def keys_of(calibration: Calibration) -> dict[str, Any]:
+    """The keys of a camera file, rounded to what matters."""
+    camera, given = calibration.camera, calibration.depth_camera
+    keys: dict[str, Any] = {"width": camera.width, "height": camera.height}
+    keys |= {name: round(float(getattr(camera, name)), 3) for name in ("fx", "fy", "cx", "cy")}
+    keys |= {"depth_scale": calibration.depth_scale, "fps": camera.fps}
+    keys |= {"distortion": list(calibration.distortion)} if calibration.distortion else {}
+    keys |= {name: round(value, 6) for name in ("depth_offset", "depth_radial") if (value := getattr(calibration, name))}
+    if given is not None:
+        own: dict[str, Any] = {name: round(float(getattr(given, name)), 3) for name in ("fx", "fy", "cx", "cy")}
+        keys["depth_camera"] = own | {name: _rounded(getattr(given, name)) for name in ("translation_m", "rotation_deg") if any(getattr(given, name))}
+    return keys
+
+
+def _rounded(values: Sequence[float]) -> list[float]:
+    return [round(float(value), 5) for value in values]
+
+
+def _changed_keys(used: Calibration, changed: Calibration) -> dict[str, Any]:
+    before, after = keys_of(used), keys_of(changed)
+    return {name: value for name, value in after.items() if before.get(name) != value}

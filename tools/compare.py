@@ -22,9 +22,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import yaml
 
-from trihedron.pipeline.core.errors import DataError, UsageError, did_you_mean
+from trihedron.pipeline.core.errors import DataError, UsageError, did_you_mean, printable
+from trihedron.pipeline.core.files import MAX_YAML_BYTES, YamlError, parse_yaml, read_text
+from trihedron.pipeline.run.result_files import read_results
 from trihedron.tools import comparison_table as render
 from trihedron.tools import other_programs
 from trihedron.tools.arguments import Parser
@@ -102,12 +103,23 @@ def read_trajectories(files: Sequence[Path], runs: Sequence[Run], labels: Sequen
 
 
 def _run(folder: Path) -> Run:
-    overrides = dict(text.lstrip("+~").partition("=")[::2] for text in yaml.safe_load((folder / ".hydra" / "overrides.yaml").read_text()))
-    metrics, timing, job = _read(folder / "metrics.json"), _read(folder / "timing.json"), _read(folder / "job.json")
+    overrides = dict(text.lstrip("+~").partition("=")[::2] for text in _words(folder / ".hydra" / "overrides.yaml"))
+    metrics, timing, job = (read_results(folder / name) for name in ("metrics.json", "timing.json", "job.json"))
     if job.get("state", "done") != "done":
         return Run(folder, overrides, dict.fromkeys(FIGURES, np.nan), str(job.get("error") or "was stopped before its end"))
-    figures = _figures(metrics, timing, _read(folder / SURFACE_FIGURES))
+    figures = _figures(metrics, timing, read_results(folder / SURFACE_FIGURES))
     return Run(folder, overrides, figures, str(metrics.get("note", "")) if metrics or timing else "holds no results")
+
+
+def _words(file: Path) -> list[str]:
+    """The words that a run was composed of. Raises DataError."""
+    try:
+        words = parse_yaml(read_text(file, MAX_YAML_BYTES))
+    except YamlError as error:
+        raise DataError(str(file), f"is a text {error}", "run it again, or leave this folder out") from error
+    if not isinstance(words, list):
+        raise DataError(str(file), "is not a list of words", "run it again, or leave this folder out")
+    return [printable(str(word)) for word in words]
 
 
 def _figures(metrics: dict[str, Any], timing: dict[str, Any], surface: dict[str, Any]) -> dict[str, float]:
@@ -118,9 +130,9 @@ def _figures(metrics: dict[str, Any], timing: dict[str, Any], surface: dict[str,
 
 def _known(metrics: dict[str, Any], timing: dict[str, Any], surface: dict[str, Any]) -> dict[str, Any]:
     """Every figure a run's files have, by column, in SI units; too short a run has no RPE over a second, and few have a surface."""
-    final, frame, mesh = metrics.get("final") or {}, timing.get("frame_ms", {}), surface.get("parts", {}).get("all", {})
-    status = metrics.get("status", {})
-    tracked = sum(status.get(name, 0) for name in ("ok", "degraded")) / metrics["frames"] if status and metrics.get("frames") else None
+    final, frame, mesh = metrics.get("final") or {}, timing.get("frame_ms") or {}, (surface.get("parts") or {}).get("all") or {}
+    status = metrics.get("status") or {}
+    tracked = sum(status.get(name) or 0 for name in ("ok", "degraded")) / metrics["frames"] if status and metrics.get("frames") else None
     return {
         "tracked %": final.get("tracked_share", tracked),
         "ATE mm": final.get("ate_rmse_m"),
@@ -133,11 +145,6 @@ def _known(metrics: dict[str, Any], timing: dict[str, Any], surface: dict[str, A
         "p95 ms": frame.get("p95"),
         "memory MB": timing.get("peak_memory_mb"),
     }
-
-
-def _read(file: Path) -> dict[str, Any]:
-    found: dict[str, Any] = json.loads(file.read_text()) if file.exists() else {}
-    return found
 
 
 def judge_surfaces(folders: Sequence[Path]) -> None:

@@ -20,6 +20,7 @@ import numpy as np
 from trihedron.pipeline.core.errors import DataError, UsageError, did_you_mean
 from trihedron.pipeline.core.types import Table, Value
 from trihedron.pipeline.record.codec import FRAMES_TOPIC
+from trihedron.pipeline.record.embedded_images import topic_of
 from trihedron.pipeline.record.reader import Recording, TopicReader
 from trihedron.tools.arguments import Parser, table
 
@@ -74,7 +75,7 @@ def _within(a: Recording, b: Recording, topics: list[str], frames: list[int], to
     rows = [["topic", "field", "largest difference", "frame", ""]]
     for topic in topics:
         worst: dict[str, tuple[float, int]] = {}
-        readers = TopicReader(a, topic), TopicReader(b, topic)
+        readers = TopicReader(a, topic, check=False), TopicReader(b, topic, check=False)
         for frame in frames:
             for field, apart in _apart(*(reader.at(frame) for reader in readers)):
                 if apart > worst.get(field, (-1.0, 0))[0]:
@@ -113,7 +114,7 @@ def _relative(x: Any, y: Any) -> float:
 
 def _topics(a: Recording, b: Recording, words: str) -> list[str]:
     """The topics to compare, in the order in which they were first written."""
-    common = [channel[1:] for channel in a.channels if channel[1:] in a.topics & b.topics and channel[1:] != FRAMES_TOPIC]
+    common = [topic for topic in dict.fromkeys(map(topic_of, a.channels)) if topic in a.topics & b.topics and topic != FRAMES_TOPIC]
     for word in filter(None, words.split(",")):
         if word not in common:
             raise DataError(f"--topics {word}", "is not a topic of both recordings", did_you_mean(word, common))
@@ -133,10 +134,10 @@ def _frames(a: Recording, b: Recording) -> list[int]:
 
 def difference(a: Recording, b: Recording, topic: str, frames: list[int]) -> Difference | None:
     """Compare a topic in the given frames; None where it is equal."""
-    readers, found = (TopicReader(a, topic), TopicReader(b, topic)), None
+    readers, found = (TopicReader(a, topic, check=False), TopicReader(b, topic, check=False)), None
     for frame in frames:
         x, y = (reader.at(frame) for reader in readers)
-        first = next(_differing(x, y), None)
+        first = next(differing(x, y), None)
         if first is not None and found is None:
             found = Difference(topic, frame, *first)
         elif first is not None and found is not None:
@@ -144,7 +145,7 @@ def difference(a: Recording, b: Recording, topic: str, frames: list[int]) -> Dif
     return found
 
 
-def _differing(x: Value | None, y: Value | None) -> Iterator[tuple[str, str]]:
+def differing(x: Value | None, y: Value | None) -> Iterator[tuple[str, str]]:
     """(field, size of the difference) of all fields that differ."""
     if x is None or y is None:
         if x is not y:

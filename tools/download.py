@@ -180,18 +180,18 @@ def _write_camera(target: Path, camera: Any) -> None:
 
 
 def _read_calibration(target: Path) -> dict[str, Any]:
-    import cv2
+    from trihedron.datasets.readers.images import read_color
+    from trihedron.pipeline.core.files import MAX_YAML_BYTES, one_line_errors, read_text
 
-    from trihedron.pipeline.core.files import MAX_YAML_BYTES, read_text
-
-    path = target / CALIBRATION_FILE
-    words = read_text(path, MAX_YAML_BYTES).split()
-    image = next((target / "rgb").glob("*.png"), None)
-    pixels = None if image is None else cv2.imread(str(image))
-    if len(words) != 4 or pixels is None:
-        raise DataError(str(path), "does not hold fx fy cx cy beside images in rgb/", f"write a {CAMERA_FILE} there")
-    values = dict(zip(("fx", "fy", "cx", "cy"), map(float, words)))
-    return {"width": pixels.shape[1], "height": pixels.shape[0], **values, "depth_scale": 5000.0}
+    path, cure = target / CALIBRATION_FILE, f"write a {CAMERA_FILE} there"
+    with one_line_errors(str(path), cure):  # the archive is a stranger's
+        words = read_text(path, MAX_YAML_BYTES).split()
+        image = next((target / "rgb").glob("*.png"), None)
+        if len(words) != 4 or image is None:
+            raise DataError(str(path), "does not hold fx fy cx cy beside images in rgb/", cure)
+        values = dict(zip(("fx", "fy", "cx", "cy"), map(float, words)))
+        height, width = read_color(image).shape[:2]
+    return {"width": width, "height": height, **values, "depth_scale": 5000.0}
 
 
 def _frames(sequence: Sequence, folder: Path) -> int:

@@ -66,18 +66,21 @@ def main(argv: list[str]) -> int:
     """Print the table; returns the exit code. Raises DataError for a recording without poses or truth, StageError when a replay fails."""
     parser = Parser("error-budget", __name__)
     parser.add_argument("recording", metavar="RUN.mcap", type=Path, help="of a run whose data set has ground truth")
-    recording = Recording(parser.parse_args(argv).recording)
-    truth = true_poses(recording)
+    found = budget(Recording(parser.parse_args(argv).recording))
     rows: list[list[str]] = [["true", "ATE RMSE (m)", "× whole", "RPE over 1 s (m)", "(deg)"]]
-    whole = 0.0
-    with tempfile.TemporaryDirectory() as folder:
-        for stages in (row for row in ROWS if recording.topics.issuperset(row)):
-            metrics = rerun(recording, truth, stages, Path(folder))
-            ate, whole = metrics["ate_rmse_m"], whole or metrics["ate_rmse_m"]
-            errors = [f"{metrics[key]:.4f}" if metrics[key] is not None else "-" for key in ("rpe_second_rmse_m", "rpe_second_rmse_deg")]
-            rows.append([" + ".join(stages) or "nothing", f"{ate:.4f}", f"{ate / whole:.2f}", *errors])
+    whole = found[()]["ate_rmse_m"]
+    for stages, metrics in found.items():
+        errors = [f"{metrics[key]:.4f}" if metrics[key] is not None else "-" for key in ("rpe_second_rmse_m", "rpe_second_rmse_deg")]
+        rows.append([" + ".join(stages) or "nothing", f"{metrics['ate_rmse_m']:.4f}", f"{metrics['ate_rmse_m'] / whole:.2f}", *errors])
     print(table(rows, "lrrrr"))
     return 0
+
+
+def budget(recording: Recording) -> dict[tuple[str, ...], dict[str, Any]]:
+    """Return the final metrics with each row of stages replaced by the truth, beginning with none. Raises DataError, StageError."""
+    truth = true_poses(recording)
+    with tempfile.TemporaryDirectory() as folder:
+        return {stages: rerun(recording, truth, stages, Path(folder)) for stages in ROWS if recording.topics.issuperset(stages)}
 
 
 def true_poses(recording: Recording) -> Truth:

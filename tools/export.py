@@ -17,6 +17,7 @@ from pathlib import Path
 from trihedron.pipeline.core.errors import DataError, UsageError, did_you_mean
 from trihedron.pipeline.record.reader import Recording
 from trihedron.tools.arguments import Parser
+from trihedron.tools.recorded import opened
 
 RECORDING = "run.mcap"
 
@@ -51,7 +52,7 @@ def main(argv: list[str]) -> int:
     recording: Path = arguments.run / RECORDING if arguments.run.is_dir() else arguments.run
     out: Path = arguments.out or recording.parent / chosen.file
     try:
-        content = chosen.write(Recording(recording), out)
+        content = chosen.write(opened(recording), out)
     except OSError as error:
         raise DataError(str(out), f"cannot be written: {error.strerror}", "give another --out") from error
     print(f"{out}: {content}")

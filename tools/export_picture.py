@@ -1,6 +1,7 @@
 """A picture of a surface, seen from above, from the side that shows most: as coloured by the views, and each plane in a colour of its own.
 
-Triangles are seen from their front alone, so the walls and the ceiling that stand in the way do not."""
+The ceiling is cut away, islands of less than `ISLAND` of the area are dropped, and the frame holds 98 % of the vertices. Triangles are seen from
+their front alone, so that walls that stand in the way do not."""
 
 from __future__ import annotations
 
@@ -8,60 +9,131 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 
 from trihedron.pipeline.core.kernel import kernel
-from trihedron.pipeline.core.types import F64, I32, U8, Surface
+from trihedron.pipeline.core.types import F32, F64, I32, PLANE_KINDS, U8, Bool, Surface
 from trihedron.pipeline.record.reader import Recording
 from trihedron.tools.export import Format
 from trihedron.tools.export_surface import surface_of, upright
 
-SIZE = (560, 560)  # px, of each half
-ELEVATION_DEG, AZIMUTHS = 35.0, 24  # height of the viewer, and the directions that are tried
-PAPER, LIGHT, SHADE = 255, 0.72, 0.28
+SIZE = (1920, 1200)  # px, of the picture
+SUPERSAMPLING = 2  # pixels drawn for one of the picture, in each direction
+ELEVATION_DEG, AZIMUTHS = 40.0, 24  # height of the viewer, and the directions that are tried
+ISLAND = 0.05  # share of the area below which a connected component is dropped
+CEILING_M = 0.05  # below the ceiling, what is cut away with it
+FRAMED = (0.5, 99.5)  # percentiles between two edges of the frame, which holds 98 % of the vertices
+MARGIN = 0.04  # of the frame
+PAPER, LIGHT, SHADE = 255.0, 0.88, 0.14
+EDGE, EDGE_STEP = 0.4, 0.02  # darkness of an outline; a step in depth that is one, in parts of the picture's depth
+BRIGHT = 235.0  # what the brightest hundredth of the colours becomes
+REST = (205, 205, 200)  # what lies in no plane
+PALETTE = np.array(
+    [
+        (166, 206, 227), (178, 223, 138), (251, 154, 153), (253, 191, 111), (202, 178, 214), (255, 237, 140), (127, 201, 190), (244, 165, 213),
+        (141, 160, 203), (230, 171, 120), (166, 216, 84), (190, 174, 140),
+    ],
+    np.float64,
+)  # fmt: skip
 
 
 def write_picture(recording: Recording, path: Path) -> str:
-    """PNG: two views side by side."""
-    surface = surface_of(recording)
-    vertices = surface.vertices_m @ upright(surface.up).T
-    triangle, weights, shade = _seen(vertices, surface.triangles)
-    rng = np.random.default_rng(0)
-    tints = np.concatenate([rng.integers(70, 250, (len(surface.plane_ids), 3)), [[150, 150, 150]]]).astype(np.float64)
-    halves = []
-    for color in (_colors(surface, triangle, weights), tints[surface.instances[triangle]] if len(surface.triangles) else np.zeros((*SIZE[::-1], 3))):
-        halves.append(np.where((triangle >= 0)[..., None], color * shade[..., None], PAPER))
-    picture = np.clip(np.concatenate(halves, axis=1), 0, 255).astype(np.uint8)
+    """PNG: two views beside or above each other, whichever is larger."""
+    picture, count = drawn(surface_of(recording))
     path.write_bytes(bytes(cv2.imencode(".png", picture[..., ::-1], [cv2.IMWRITE_PNG_COMPRESSION, 9])[1]))
-    return f"{picture.shape[1]} × {picture.shape[0]} px, the surface as it was seen and by planes" if len(surface.triangles) else "empty: no surface"
+    size = f"{picture.shape[1]} × {picture.shape[0]} px"
+    return f"{size}, {count} triangles below the ceiling, as they were seen and by planes" if count else f"{size}, empty: no surface"
 
 
-def _seen(vertices: F64, triangles: I32) -> tuple[I32, F64, F64]:
-    """(h, w) triangle seen in a pixel, -1 = none, (h, w, 3) its weights of the corners, and (h, w) how light it is."""
-    w, h = SIZE
-    corners = vertices[triangles]
-    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    e, a = np.radians(ELEVATION_DEG), np.arange(AZIMUTHS) * 2.0 * np.pi / AZIMUTHS
-    directions = np.stack([np.sin(a) * np.cos(e), np.cos(a) * np.cos(e), np.full(AZIMUTHS, -np.sin(e))], axis=1)
-    ahead = directions[np.argmax(np.maximum(-normals @ directions.T, 0.0).sum(axis=0))]
-    right = np.array([ahead[1], -ahead[0], 0.0]) / np.hypot(ahead[0], ahead[1])
-    points = vertices @ np.stack([right, np.cross(ahead, right), ahead]).T
-    triangle, weights = np.full((h, w), -1, np.int32), np.zeros((h, w, 3))
+def drawn(surface: Surface, size: tuple[int, int] = SIZE) -> tuple[U8, int]:
+    """Draw a surface: (h, w, 3) RGB, and the number of triangles that are shown."""
+    shown = np.flatnonzero(_shown(surface)).astype(np.int32)
+    w, h = size
+    if len(shown) == 0:
+        return np.full((h, w, 3), int(PAPER), np.uint8), 0
+    points, lit = _seen(surface, shown)
+    low, high = _frame(points, surface.triangles[shown])
+    half = max(((w // 2, h), (w, h // 2)), key=lambda part: _scale(part, high - low))  # beside each other or above
+    triangle, weights, depth = _rasterised(points, surface.triangles[shown], half, low, high)
+    triangle = np.where(triangle >= 0, shown[triangle], -1).astype(np.int32)
+    light = lit[triangle] * (1.0 - EDGE * _outlines(surface.instances[triangle], depth))
+    halves = []
+    for color in (_brightened(_colors(surface, triangle, weights)), _tints(surface, triangle)):
+        full = np.where((triangle >= 0)[..., None], color * light[..., None], PAPER).astype(np.float32)
+        halves.append(cv2.resize(full, half, interpolation=cv2.INTER_AREA))
+    return np.clip(np.concatenate(halves, axis=1 if half[1] == h else 0), 0, 255).astype(np.uint8), len(shown)
+
+
+def _shown(surface: Surface) -> Bool:
+    """(t,) True for the triangles that are no ceiling, lie below it, and belong to no small island."""
+    triangles, vertices = surface.triangles, surface.vertices_m @ upright(surface.up).T
     if len(triangles) == 0:
-        return triangle, weights, np.zeros((h, w))
-    low, high = points[:, :2].min(axis=0), points[:, :2].max(axis=0)
-    scale = 0.96 * min(np.array([w, h]) / np.maximum(high - low, 1e-6))
-    points[:, :2] = (points[:, :2] - 0.5 * (low + high)) * scale + 0.5 * np.array([w, h])
-    _rasterise(points, triangles, triangle, weights)
+        return np.zeros(0, bool)
+    corners = vertices[triangles]
+    areas = 0.5 * np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
+    edges = np.concatenate([triangles[:, :2], triangles[:, 1:]])
+    _, labels = connected_components(coo_array((np.ones(len(edges), bool), edges.T), shape=2 * (len(vertices),)), directed=False)
+    component = labels[triangles[:, 0]]
+    large = np.asarray(np.bincount(component, areas)[component] >= ISLAND * areas.sum())
+    ceiling = np.append(surface.kinds == PLANE_KINDS.index("ceiling"), False)[surface.instances]
+    if not ceiling.any():
+        return large
+    lowest = corners[ceiling, :, 2].min() - CEILING_M
+    return np.asarray(large & ~ceiling & (corners[:, :, 2].min(axis=1) < lowest))
+
+
+def _seen(surface: Surface, shown: I32) -> tuple[F64, F64]:
+    """(v, 3) vertices as the viewer sees them, x right, y down, z away, from where most of the area shows its front; (t,) light on the triangles."""
+    vertices = surface.vertices_m @ upright(surface.up).T
+    corners = vertices[surface.triangles]
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    e, a = np.radians(ELEVATION_DEG), (np.arange(AZIMUTHS) + 0.5) * 2.0 * np.pi / AZIMUTHS  # not along the walls
+    directions = np.stack([np.sin(a) * np.cos(e), np.cos(a) * np.cos(e), np.full(AZIMUTHS, -np.sin(e))], axis=1)
+    ahead = directions[np.argmax(np.maximum(-normals[shown] @ directions.T, 0.0).sum(axis=0))]
+    right = np.array([ahead[1], -ahead[0], 0.0]) / np.hypot(ahead[0], ahead[1])
+    R_view_file = np.stack([right, np.cross(ahead, right), ahead])
     normals /= np.maximum(np.linalg.norm(normals, axis=1), 1e-12)[:, None]
-    lit = LIGHT + SHADE * normals @ np.array([0.3, -0.5, 0.8])
-    return triangle, weights, lit[triangle]
+    lamp = np.array([0.35, -0.80, -0.50]) @ R_view_file  # over the viewer's right shoulder
+    return vertices @ R_view_file.T, np.asarray(LIGHT + SHADE * np.clip(normals @ lamp, -1.0, 1.0))
+
+
+def _frame(points: F64, triangles: I32) -> tuple[F64, F64]:
+    """The (x, y) between which lie 98 % of the vertices, and as much of the area: a wall has few vertices."""
+    corners = points[triangles]
+    across = corners.reshape(-1, 3)
+    areas = np.repeat(np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1), 3)
+    low, high = np.percentile(points[np.unique(triangles), :2], FRAMED, axis=0)
+    for axis in (0, 1):
+        order = np.argsort(across[:, axis])
+        share = 100.0 * np.cumsum(areas[order]) / max(float(areas.sum()), 1e-12)
+        first, last = np.searchsorted(share, FRAMED)
+        low[axis] = min(low[axis], across[order[first], axis])
+        high[axis] = max(high[axis], across[order[min(last, len(order) - 1)], axis])
+    return low, high
+
+
+def _scale(size: tuple[int, int], extent: F64) -> float:
+    """Pixels per metre at which an extent (2,) fits, with a margin."""
+    return (1.0 - 2.0 * MARGIN) * float(np.min(size / np.maximum(extent, 1e-6)))
+
+
+def _rasterised(points: F64, triangles: I32, half: tuple[int, int], low: F64, high: F64) -> tuple[I32, F32, F32]:
+    """(h, w) row of the triangle seen in a pixel, -1 = none, (h, w, 3) its weights of the corners, and (h, w) the depth from 0 to 1; supersampled."""
+    w, h = (SUPERSAMPLING * side for side in half)
+    away = points[np.unique(triangles), 2]
+    placed = points - np.append(0.5 * (low + high), away.min())
+    placed[:, :2] = placed[:, :2] * _scale((w, h), high - low) + 0.5 * np.array([w, h])
+    placed[:, 2] /= max(float(np.ptp(away)), 1e-6)
+    triangle, weights, depth = np.full((h, w), -1, np.int32), np.zeros((h, w, 3), np.float32), np.full((h, w), np.inf, np.float32)
+    _rasterise(placed, triangles, triangle, weights, depth)
+    return triangle, weights, depth
 
 
 @kernel(error_model="python")
-def _rasterise(points: F64, triangles: I32, triangle: I32, weights: F64) -> None:
+def _rasterise(points: F64, triangles: I32, triangle: I32, weights: F32, nearest: F32) -> None:
     """Fill the nearest front-facing triangle of each pixel; x right, y down, z away."""
     h, w = triangle.shape
-    nearest = np.full((h, w), np.inf)
     for t in range(len(triangles)):
         a, b, c = points[triangles[t, 0]], points[triangles[t, 1]], points[triangles[t, 2]]
         area = (b[0] - a[0]) * (c[1] - a[1]) - (b[1] - a[1]) * (c[0] - a[0])
@@ -82,16 +154,48 @@ def _rasterise(points: F64, triangles: I32, triangle: I32, weights: F64) -> None
                     weights[y, x, 0], weights[y, x, 1], weights[y, x, 2] = u, v, s
 
 
-def _colors(surface: Surface, triangle: I32, weights: F64) -> F64:
+def _outlines(instance: I32, depth: F32) -> F64:
+    """(h, w) 1 where a plane, or what stands before something else, ends."""
+    behind = np.where(np.isfinite(depth), depth, 2.0)
+    edge = np.zeros(depth.shape)
+    for axis in (0, 1):
+        near, far = (np.take(behind, range(k, behind.shape[axis] - 1 + k), axis) for k in (0, 1))
+        one, other = (np.take(instance, range(k, behind.shape[axis] - 1 + k), axis) for k in (0, 1))
+        found = (np.abs(near - far) > EDGE_STEP) | ((one != other) & (one >= 0) & (other >= 0))
+        edge[: found.shape[0], : found.shape[1]][found] = 1.0
+    return edge
+
+
+def _tints(surface: Surface, triangle: I32) -> F64:
+    """(h, w, 3) RGB: planes in colours of the palette, of which planes that touch in the picture share none as long as there are enough."""
+    count = len(surface.plane_ids)
+    instance = np.where(triangle >= 0, surface.instances[triangle], -1)
+    near = np.zeros((count + 1, count + 1), bool)  # the last is no plane
+    for one, other in ((instance[:, :-1], instance[:, 1:]), (instance[:-1], instance[1:])):
+        near[one, other] = near[other, one] = True
+    chosen, used = np.full(count + 1, -1), np.zeros(len(PALETTE), int)
+    for plane in np.argsort(-surface.areas_m2, kind="stable"):
+        around = np.bincount(chosen[:count][near[plane, :count] & (chosen[:count] >= 0)], minlength=len(PALETTE))
+        chosen[plane] = int(np.lexsort((used, around))[0])  # of those least around, the least used
+        used[chosen[plane]] += 1
+    return np.concatenate([PALETTE[chosen[:count]], [REST]])[instance]
+
+
+def _brightened(color: F64) -> F64:
+    """Lift the colours of a dark room: the square root of their share of the brightest."""
+    bright = max(float(np.percentile(color[color.any(axis=-1)], 99)), 1.0) if color.any() else 1.0
+    return np.asarray(BRIGHT * np.clip(color / bright, 0.0, 1.1) ** 0.6)
+
+
+def _colors(surface: Surface, triangle: I32, weights: F32) -> F64:
     """(h, w, 3) RGB: of the atlas where there is a picture of the plane, else between the vertices."""
-    if len(surface.triangles) == 0:
-        return np.zeros((*triangle.shape, 3))
-    out = np.einsum("hwk,hwkc->hwc", weights, surface.colors[surface.triangles[triangle]].astype(np.float64))
-    place = np.einsum("hwk,hwkc->hwc", weights, surface.texels[triangle].astype(np.float64))
+    out = np.einsum("hwk,hwkc->hwc", weights, surface.colors[surface.triangles[triangle]].astype(np.float32))
+    place = np.einsum("hwk,hwkc->hwc", weights, surface.texels[triangle])
     pictured = (triangle >= 0) & np.isfinite(place[..., 0])
     x, y = np.rint(np.nan_to_num(place)).astype(int).transpose(2, 0, 1)
     atlas: U8 = surface.atlas
     out[pictured] = atlas[np.clip(y, 0, max(len(atlas) - 1, 0)), np.clip(x, 0, max(atlas.shape[1] - 1, 0))][pictured] if atlas.size else 0.0
+    out[triangle < 0] = 0.0
     return np.asarray(out, np.float64)
 
 

@@ -10,7 +10,7 @@ from typing import Any
 from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
 
 from trihedron.pipeline.core.errors import DataError
-from trihedron.pipeline.record.foxglove import View
+from trihedron.pipeline.record.foxglove import TopicView
 from trihedron.pipeline.record.reader import Recording
 from trihedron.pipeline.record.rerun_view import IMAGE, at, begin, blueprint, require_rerun, show_pinhole, show_value
 from trihedron.pipeline.record.trajectories import attached_truth
@@ -68,7 +68,7 @@ def _show_truth(recording: Recording, stream: Any) -> None:
     """The true path in the world of the run, and the error of each pose, as Foxglove's `/error`."""
     import rerun
 
-    view = View(attached_truth(recording.attachments, str(recording.path)))
+    view = TopicView(attached_truth(recording.attachments, str(recording.path)))
     true = []
     for value in recording.values("pose") if "pose" in recording.topics else ():
         found = dict(view.messages(value))

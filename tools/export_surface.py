@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     import trimesh
 
 LOOK: dict[str, Any] = {"metallicFactor": 0.0, "roughnessFactor": 1.0, "doubleSided": True}
+UNLIT = "KHR_materials_unlit"  # the colours have the light of the place in them
 CAMERA_UP, CAMERA_AHEAD = np.array([0.0, -1.0, 0.0]), np.array([0.0, 0.0, 1.0])  # of the first frame, which is the world
 
 
@@ -107,7 +108,7 @@ def _scene(surface: Surface, R: F64, textured: bool) -> trimesh.Scene:
 
 
 def _finish_gltf(tree: dict[str, Any]) -> None:
-    """Give nodes the facts of their planes, coloured vertices a material, and the texture no repetition."""
+    """Give nodes the facts of their planes, coloured vertices a material, all materials no further light, and the texture no repetition."""
     for node in tree["nodes"]:
         facts = tree["meshes"][node["mesh"]].pop("extras", None) if "mesh" in node else None
         if facts:
@@ -117,6 +118,9 @@ def _finish_gltf(tree: dict[str, Any]) -> None:
     for mesh in tree.get("meshes", []):
         for primitive in mesh["primitives"]:
             primitive.setdefault("material", len(tree["materials"]) - 1)
+    for material in tree["materials"]:
+        material["extensions"] = {UNLIT: {}}
+    tree["extensionsUsed"] = [UNLIT]
     for texture in tree.get("textures", []):
         texture["sampler"] = 0
         tree["samplers"] = [{"magFilter": 9729, "minFilter": 9729, "wrapS": 33071, "wrapT": 33071}]  # linear, clamped

@@ -31,7 +31,7 @@ def read_mesh(path: Path) -> tuple[F64, I32]:
     except LibraryError:
         raise
     except Exception as error:  # trimesh raises anything for a damaged file
-        raise DataError(str(path), f"is not a mesh: {printable(str(error), 2 * SHOWN)}", CURE) from error
+        raise DataError(str(path), f"is not a mesh: {printable(str(error) or type(error).__name__, 2 * SHOWN)}", CURE) from error
     if not np.isfinite(points).all():
         raise DataError(str(path), "has a vertex that is not finite", "the file is damaged; write it again")
     if len(triangles) and (triangles.min() < 0 or triangles.max() >= len(points)):

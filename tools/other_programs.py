@@ -14,7 +14,7 @@ import numpy as np
 from trihedron.pipeline.core.errors import DataError, RecordingError, UsageError
 from trihedron.pipeline.core.types import FrameReference, Trajectory
 from trihedron.pipeline.record.reader import Recording
-from trihedron.pipeline.record.trajectories import attached_truth, parse_trajectory, table_lines
+from trihedron.pipeline.record.trajectories import MAX_DISTANCE_M, attached_truth, parse_trajectory, table_lines
 from trihedron.pipeline.run.metrics import I64, associate, evaluate_trajectory
 
 RECORDING = "run.mcap"
@@ -125,4 +125,6 @@ def _kitti_poses(file: Path, rows: list[tuple[int, list[str]]]) -> Any:
             pose[:3] = np.array([float(word) for word in words]).reshape(3, 4)
         except ValueError:
             raise DataError(f"{file}:{number}", "a column is not a number", "each line holds the 12 numbers of a pose") from None
+        if np.isfinite(pose).all() and np.abs(pose).max() > MAX_DISTANCE_M:
+            raise DataError(f"{file}:{number}", f"a number is beyond {MAX_DISTANCE_M:g}", "each line holds the 12 numbers of a pose, metres")
     return poses

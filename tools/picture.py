@@ -5,6 +5,7 @@ Example: trihedron picture runs/latest/run.mcap --frame 60 --out picture.png
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -16,6 +17,10 @@ if TYPE_CHECKING:
 
 AXIS_COLORS = ((220, 50, 50), (50, 170, 50), (60, 90, 230))
 AXIS_LENGTH_PX = 60
+SIZE_INCHES, DPI = (16, 6.4), 120  # 1920 × 768 px
+FRAMED = (0.5, 99.5)  # percentiles of the landmarks between two edges of the map, which holds 98 % of them
+MARGIN_M = 0.2
+PAIR_COLORS = ("#0072b2", "#d55e00")  # of two runs; told apart by the colour-blind (Okabe and Ito)
 
 
 def main(argv: list[str]) -> int:
@@ -38,9 +43,9 @@ def draw(path: str, frame: int, out: Path) -> None:
     from matplotlib import pyplot
 
     from trihedron.pipeline.core.errors import RecordingError
-    from trihedron.pipeline.record.reader import Recording
+    from trihedron.tools.recorded import opened
 
-    recording = Recording(path)
+    recording = opened(Path(path))
     poses = list(recording.values("pose"))
     if not poses:
         raise RecordingError(path, "holds no poses", "record a run with outputs=[trajectory]")
@@ -48,25 +53,64 @@ def draw(path: str, frame: int, out: Path) -> None:
     frame = numbers[len(numbers) // 2] if frame < 0 else frame
     if frame not in numbers:
         raise RecordingError(path, f"has no frame {frame}", f"give one of {numbers[0]}..{numbers[-1]}")
-    figure, (left, right) = pyplot.subplots(1, 2, figsize=(12, 4.2), width_ratios=[4, 3], layout="constrained")
-    left.imshow(_annotated(recording, frame))
+    figure, (left, right) = pyplot.subplots(1, 2, figsize=SIZE_INCHES, width_ratios=[4, 3], layout="constrained")
+    left.imshow(_annotated([recording], frame))
     left.set_axis_off()
     left.set_title(f"frame {frame}: planes, 3D lines, key points, Manhattan axes", fontsize=10)
     _map_from_above(right, recording, poses)
-    figure.savefig(out, dpi=90)
+    figure.savefig(out, dpi=DPI)
     pyplot.close(figure)
 
 
-def _annotated(recording: Recording, frame: int) -> Any:
+def draw_pair(sides: Sequence[tuple[str, Sequence[Recording]]], frame: int, out: Path) -> None:
+    """Draw one frame of two runs beside each other, with both paths from above. A side is a title and the recordings in which its topics are looked
+    up, the first that has one; the last holds the images."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    from matplotlib import pyplot
+
+    figure, axes = pyplot.subplots(1, 3, figsize=(15, 4.2), layout="constrained")
+    for side, (title, recordings) in zip(axes, sides):
+        side.imshow(_annotated(recordings, frame))
+        side.set_axis_off()
+        side.set_title(f"frame {frame}: {title}", fontsize=10)
+    for (title, recordings), color, style in zip(sides, PAIR_COLORS, ("-", "--")):
+        _path_from_above(axes[2], _values(recordings, "pose"), frame, title, color, style)
+    axes[2].set_aspect("equal", adjustable="datalim")
+    axes[2].set_xlabel("x [m]")
+    axes[2].set_ylabel("z [m]")
+    axes[2].legend(loc="best", fontsize=8)
+    figure.savefig(out, dpi=80)
+    pyplot.close(figure)
+
+
+def _path_from_above(axes: Any, poses: Iterable[Any], frame: int, title: str, color: str, style: str) -> None:
+    """The path, with a mark at a frame."""
+    import numpy as np
+
+    tracked = [pose for pose in poses if pose.status != "lost"]
+    path = np.array([pose.T_world_camera[:3, 3] for pose in tracked]).reshape(-1, 3)
+    axes.plot(path[:, 0], path[:, 2], style, color=color, linewidth=1.5, label=title)
+    here = path[[pose.index == frame for pose in tracked]]
+    axes.plot(here[:, 0], here[:, 2], "o", color=color, markersize=7, markerfacecolor="none")
+
+
+def _values(recordings: Sequence[Recording], topic: str) -> Iterator[Any]:
+    """The values of a topic in the first recording that has it."""
+    return next((recording.values(topic) for recording in recordings if topic in recording.topics), iter(()))
+
+
+def _annotated(recordings: Sequence[Recording], frame: int) -> Any:
     """The frame's image (the nearest one that was kept to look at) with the features of that very frame."""
     import cv2
     import numpy as np
 
-    reference: Any = next(v for v in recording.values("frames") if v.index == frame)
+    reference: Any = next(v for v in recordings[-1].values("frames") if v.index == frame)
     camera = reference.camera
-    image = _image(recording, reference.stamp_ns, camera)
+    image = _image(recordings[-1], reference.stamp_ns, camera)
     topics = ("planes", "segments", "keypoints", "manhattan")
-    values: dict[str, Any] = {topic: next((v for v in recording.values(topic) if v.index == frame), None) for topic in topics}
+    values: dict[str, Any] = {topic: next((v for v in _values(recordings, topic) if v.index == frame), None) for topic in topics}
     if values["planes"] is not None:
         image = _tinted(image, values["planes"])
     if values["segments"] is not None:
@@ -134,9 +178,15 @@ def _map_from_above(axes: Any, recording: Recording, poses: list[Any]) -> None:
     import numpy as np
 
     versions: list[Any] = list(recording.values("map")) if "map" in recording.topics else []
+    path = np.array([pose.T_world_camera[:3, 3] for pose in poses])
+    shown = [path[:, [0, 2]]]
     if versions:
         _landmarks(axes, versions[-1])
-    path = np.array([pose.T_world_camera[:3, 3] for pose in poses])
+        points = versions[-1].points.column("position_m")[versions[-1].points.column("alive")]
+        if len(points):
+            shown.append(np.percentile(points[:, [0, 2]], FRAMED, axis=0))
+    low, high = np.concatenate(shown).min(axis=0) - MARGIN_M, np.concatenate(shown).max(axis=0) + MARGIN_M
+    axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]))
     axes.plot(path[:, 0], path[:, 2], color="crimson", linewidth=2, label="camera")
     axes.set_aspect("equal")
     axes.set_xlabel("x [m]")
@@ -153,6 +203,6 @@ def _landmarks(axes: Any, map: Map) -> None:
     for ends in map.lines.column("endpoints_m")[map.lines.column("alive")]:
         axes.plot(ends[:, 0], ends[:, 2], color="tab:blue", linewidth=0.8)
     alive = map.planes.column("alive")
-    for samples in map.planes.column("samples_m")[alive]:
+    for k, samples in enumerate(map.planes.column("samples_m")[alive]):
         samples = samples[np.isfinite(samples[:, 0])]
-        axes.scatter(samples[:, 0], samples[:, 2], s=6, marker="s")
+        axes.scatter(samples[:, 0], samples[:, 2], s=10, marker="s", color=f"C{k % 10}")

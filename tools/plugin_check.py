@@ -31,13 +31,13 @@ from trihedron.pipeline.core.options import OneOf, Range, check_options, constra
 from trihedron.pipeline.core.registry import check_value, options_of
 from trihedron.pipeline.core.slots import CAMERA, FOLDS, RNG, SLOTS, accepts_none, inputs_of, output_of
 from trihedron.pipeline.core.types import LOST, Frame, Pose, Trajectory, Value
+from trihedron.pipeline.core.value_checks import check_together, checked
 from trihedron.pipeline.core.wires import PREVIOUS, Wire
 from trihedron.pipeline.record.codec import Encoder
 from trihedron.pipeline.record.reader import Recording
 from trihedron.pipeline.run.live import is_camera
 from trihedron.pipeline.run.runner import Runner
 from trihedron.pipeline.run.scheduler import single_threaded_libraries
-from trihedron.pipeline.run.value_checks import check_together, checked
 from trihedron.tools.plugins import default_plugins, first_sentence
 
 ROOM = ("dataset=synthetic", "dataset.width=320", "dataset.height=240", "dataset.length=8")

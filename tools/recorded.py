@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable, Iterator
+from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
@@ -11,11 +14,25 @@ from trihedron.pipeline.core.errors import DataError
 from trihedron.pipeline.core.options import frame_range
 from trihedron.pipeline.core.types import Frame, FrameReference, Map, Pose, Trajectory, Value
 from trihedron.pipeline.record.codec import FRAMES_TOPIC
+from trihedron.pipeline.record.mcap_file import in_use
 from trihedron.pipeline.record.reader import Recording
 from trihedron.pipeline.run.accounting import Result
 from trihedron.pipeline.run.poses import Poses
 from trihedron.pipeline.run.results import final_trajectory
-from trihedron.pipeline.run.value_checks import checked
+from trihedron.tools.recover import recover
+
+
+def opened(path: Path) -> Recording:
+    """Open a recording; of one that is still being written, a copy of what the file holds so far. Raises RecordingError."""
+    if not in_use(path):
+        return Recording(path)
+    with TemporaryDirectory(prefix="trihedron-") as folder:
+        copy = Path(folder) / path.name
+        count = recover(path, copy, being_written=True).messages
+        found = Recording(copy)  # which stays open
+    found.path = path
+    print(f"trihedron: {path} is still being written; its first {count} messages are read", file=sys.stderr)
+    return found
 
 
 def poses_of(recording: Recording) -> list[Pose]:
@@ -31,7 +48,6 @@ def last_map(recording: Recording) -> Map | None:
     found = None
     for value in recording.values("map") if "map" in recording.topics else ():
         found = value if isinstance(value, Map) else found
-    checked("map", found, str(recording.path))
     return found
 
 
@@ -46,10 +62,8 @@ def references_of(recording: Recording) -> dict[int, FrameReference]:
 
 
 def _values(recording: Recording, topic: str) -> Iterator[Value]:
-    """The values of a topic, each checked; none of a topic that is not recorded. Raises RecordingError."""
-    for value in recording.values(topic) if topic in recording.topics else ():
-        checked(topic, value, str(recording.path))
-        yield value
+    """The values of a topic; none of a topic that is not recorded. Raises RecordingError."""
+    yield from recording.values(topic) if topic in recording.topics else ()
 
 
 def frames_of(recording: Recording) -> Callable[[FrameReference], Frame | None]:

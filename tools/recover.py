@@ -17,6 +17,7 @@ from mcap.stream_reader import StreamReader
 from mcap.writer import MCAP0_MAGIC, CompressionType, Writer
 
 from trihedron.pipeline.core.errors import DataError, RecordingError
+from trihedron.pipeline.core.files import open_file
 from trihedron.pipeline.record.mcap_file import chunk_records, damaged, is_being_written, max_plain_bytes
 from trihedron.tools.arguments import Parser
 
@@ -63,7 +64,7 @@ def recover(path: Path, out: Path, being_written: bool = False) -> Rescued:
     Raises as `main`."""
     partial = out.with_name(out.name + ".part")
     try:
-        source = open(path, "rb")
+        source = open_file(path)
     except OSError as error:
         raise RecordingError(str(path), f"cannot be read: {error.strerror}", "give the path of an MCAP file") from error
     with source:

@@ -21,12 +21,14 @@ import numpy as np
 
 from trihedron.pipeline.core.building_geometry import MODEL_COLORS, parts_of
 from trihedron.pipeline.core.errors import DataError, TrihedronError
+from trihedron.pipeline.core.files import MAX_YAML_BYTES, YamlError, parse_yaml, read_text
 from trihedron.pipeline.core.geometry import transform, umeyama
 from trihedron.pipeline.core.types import F64, Building, Trajectory
 from trihedron.pipeline.record.reader import Recording
 from trihedron.pipeline.record.trajectories import attached_truth, read_trajectory
 from trihedron.pipeline.run.building_files import floorplan_svg, summary
 from trihedron.pipeline.run.metrics import aligned_errors, associate
+from trihedron.pipeline.run.result_files import read_results
 from trihedron.pipeline.run.results import dotted
 from trihedron.tools import comparison_table
 from trihedron.tools.arguments import Parser
@@ -109,9 +111,9 @@ def _origins(runs: dict[str, Run]) -> str:
     """Name, data set, date and command of each run."""
     lines = ["".join(f"<th>{name}</th>" for name in ("run", "data set", "date", "command"))]
     for name, run in runs.items():
-        metadata, written = Recording(run.folder / "run.mcap").metadata, (run.folder / ".hydra" / "config.yaml").stat().st_mtime
+        recording, written = Recording(run.folder / "run.mcap"), (run.folder / ".hydra" / "config.yaml").stat().st_mtime
         date = datetime.fromtimestamp(written).astimezone().strftime("%Y-%m-%d %H:%M %Z")
-        command = shlex.join(["trihedron", "run", *json.loads(metadata.get("overrides", "[]"))])
+        command = shlex.join(["trihedron", "run", *recording.overrides()])
         lines.append("".join(f"<td>{html.escape(text)}</td>" for text in (name, _data_set(run), date, command)))
     return "<table class='origins'>" + "".join(f"<tr>{line}</tr>" for line in lines) + "</table>"
 
@@ -230,8 +232,8 @@ def _plans(runs: dict[str, Run]) -> list[str]:
 def _stages(runs: dict[str, Run], colors: dict[str, str]) -> list[dict[str, Any]]:
     traces = []
     for name, run in runs.items():
-        stages = json.loads((run.folder / "timing.json").read_text())["stages"]
-        shown = {stage: found["p50_ms"] for stage, found in stages.items() if "p50_ms" in found}
+        stages = read_results(run.folder / "timing.json").get("stages") or {}
+        shown = {stage: found["p50_ms"] for stage, found in stages.items() if found and "p50_ms" in found}
         traces.append({"type": "bar", "name": name, "x": list(shown), "y": list(shown.values()), "marker": {"color": colors[name]}})
     return traces
 
@@ -250,9 +252,13 @@ def _configurations(runs: dict[str, Run]) -> str:
 
 
 def _config(run: Run) -> Any:
-    import yaml
 
-    return yaml.safe_load((run.folder / ".hydra" / "config.yaml").read_text())
+    file = run.folder / ".hydra" / "config.yaml"
+    try:
+        found = parse_yaml(read_text(file, MAX_YAML_BYTES))
+    except YamlError as error:
+        raise DataError(str(file), f"is a text {error}", "run it again, or leave this folder out") from error
+    return found if isinstance(found, dict) else {}
 
 
 def _pictures(runs: dict[str, Run]) -> list[str]:

@@ -19,11 +19,12 @@ from typing import Any
 import yaml
 
 from trihedron.pipeline.core.errors import DataError
-from trihedron.pipeline.core.files import MAX_YAML_BYTES, read_text
+from trihedron.pipeline.core.files import MAX_YAML_BYTES, YamlError, parse_yaml, read_text
 from trihedron.tools import published
 from trihedron.tools.arguments import Parser
 from trihedron.tools.compare import Run, groups_of, read_runs, row_of
 from trihedron.tools.comparison_table import COMPARED, FIGURES, TRACKED, figure_text
+from trihedron.tools.site_ablations import ablations_of
 from trihedron.tools.site_pages import render
 from trihedron.tools.site_runs import RunFacts, facts_of, run_page
 
@@ -76,7 +77,7 @@ def main(argv: list[str]) -> int:
     options = parser.parse_args(argv)
     cells = cells_of([run for folder in options.folders for run in read_runs(folder)])
     outside = band_failures(read_band(options.check), cells) if options.check else {}
-    write_site(cells, options.out, options.title, outside, not options.no_pictures)
+    write_site(cells, options.out, options.title, outside, not options.no_pictures, ablations_of(options.folders))
     if options.write_band:
         options.write_band.write_text(yaml.safe_dump(band_of(cells), sort_keys=False, allow_unicode=True))
     print(options.out / "index.html")
@@ -125,7 +126,14 @@ def badge_of(facts: RunFacts, row: dict[str, Any]) -> Badge:
     return Badge("differs", "▼" if better else "▲", f"{BETTER if better else WORSE} than {expected:g} mm")
 
 
-def write_site(cells: Sequence[Cell], out: Path, title: str, outside: dict[tuple[str, str], str] | None = None, pictures: bool = True) -> None:
+def write_site(
+    cells: Sequence[Cell],
+    out: Path,
+    title: str,
+    outside: dict[tuple[str, str], str] | None = None,
+    pictures: bool = True,
+    ablations: Sequence[dict[str, Any]] = (),
+) -> None:
     """Write index.html and a page for each run into a folder."""
     from trihedron.tools.paper import tables_of
 
@@ -149,6 +157,7 @@ def write_site(cells: Sequence[Cell], out: Path, title: str, outside: dict[tuple
         commit=commit[:10],
         tables=tables_of([(cell.facts[0], cell.row) for cell in cells]),
         groups=groups,
+        ablations=ablations,
         columns=columns,
         sources=[f"{published.paper()['source']}; {published.paper()['machine']}", f"{published.peers()['source']}; {published.peers()['machine']}"],
     )
@@ -231,9 +240,9 @@ def band_of(cells: Sequence[Cell]) -> list[dict[str, Any]]:
 def read_band(path: Path) -> list[dict[str, Any]]:
     """Read a band. Raises DataError."""
     try:
-        found = yaml.safe_load(read_text(path, MAX_YAML_BYTES))
-    except yaml.YAMLError as error:
-        raise DataError(str(path), "is not YAML", "write it by --write-band") from error
+        found = parse_yaml(read_text(path, MAX_YAML_BYTES))
+    except YamlError as error:
+        raise DataError(str(path), f"is a text {error}", "write it by --write-band") from error
     keys = {"data", "change", "figure", "low", "high"}
     if not isinstance(found, list) or not all(isinstance(entry, dict) and keys == set(entry) and entry["figure"] in FIGURES for entry in found):
         raise DataError(str(path), f"is not a list of cells with {', '.join(sorted(keys))}", "write it by --write-band")

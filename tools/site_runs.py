@@ -14,9 +14,11 @@ from typing import Any
 import yaml
 
 from trihedron.pipeline.core.errors import DataError, RecordingError, TrihedronError
+from trihedron.pipeline.core.files import MAX_YAML_BYTES, YamlError, parse_yaml, read_text
 from trihedron.pipeline.core.types import Pose, Trajectory
 from trihedron.pipeline.record.reader import Recording
 from trihedron.pipeline.record.trajectories import attached_truth, read_trajectory
+from trihedron.pipeline.run.result_files import read_results
 from trihedron.tools import site_figures
 from trihedron.tools.compare import Run
 from trihedron.tools.comparison_table import FIGURES
@@ -60,7 +62,7 @@ class RunFacts:
 def facts_of(run: Run) -> RunFacts:
     """Read what a run's recording and configuration tell; without a recording, its overrides alone."""
     config = _yaml(run.folder / CONFIGURATION)
-    metrics = read_json(run.folder / "metrics.json")
+    metrics = read_results(run.folder / "metrics.json")
     words = [f"{key}={value}" for key, value in run.overrides.items()]
     commit = version = ""
     try:
@@ -69,7 +71,7 @@ def facts_of(run: Run) -> RunFacts:
         words = json.loads(metadata["overrides"])
     except (DataError, RecordingError, KeyError, ValueError):
         pass  # a run that failed has none, or a broken one
-    return RunFacts(run, commit, version, tuple(map(str, words)), config, int(metrics.get("frames", 0)))
+    return RunFacts(run, commit, version, tuple(map(str, words)), config, metrics.get("frames") or 0)
 
 
 def run_page(facts: RunFacts, title: str, other_commit: bool, pictures: bool) -> str:
@@ -164,15 +166,14 @@ def sha256(path: Path) -> str:
 def read_json(path: Path) -> dict[str, Any]:
     """Read a JSON object; empty where there is none."""
     try:
-        found: dict[str, Any] = json.loads(path.read_text())
-    except (OSError, ValueError):
+        return read_results(path)
+    except DataError:
         return {}
-    return found
 
 
 def _yaml(path: Path) -> dict[str, Any]:
     try:
-        found = yaml.safe_load(path.read_text())
-    except (OSError, yaml.YAMLError):
+        found = parse_yaml(read_text(path, MAX_YAML_BYTES))
+    except (DataError, YamlError):
         return {}
     return found if isinstance(found, dict) else {}

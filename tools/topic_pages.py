@@ -12,7 +12,7 @@ import numpy as np
 
 from trihedron.pipeline.core.slots import SLOTS
 from trihedron.pipeline.core.table import CHUNK, Column, Table
-from trihedron.pipeline.core.types import FrameReference, Map
+from trihedron.pipeline.core.types import Frame, FrameReference, Map
 from trihedron.pipeline.record.array_codec import SCALARS
 from trihedron.pipeline.record.codec import FRAMES_TOPIC, TIMING_TOPIC
 from trihedron.pipeline.record.schemas import field_text, hints_of, is_nested, own_fields
@@ -26,6 +26,12 @@ ABOUT = {
     "surface": "One message, after the last frame.",
     "building": "One message, after the last frame.",
 }
+IMAGE_FIELDS = """| channel | schema | |
+|---|---|---|
+| `/dataset/color` | `foxglove.CompressedImage` | PNG, 8 bits, RGB, (h, w, 3) |
+| `/dataset/depth` | `foxglove.RawImage` | `32FC1`: float32 (h, w), metres, 0 = none |
+
+`timestamp` and `log_time` are those of the message in [`/frames`](frames.md) that has the number and the camera."""
 IMPORTS = """import numpy as np
 import zstandard
 from mcap.reader import make_reader
@@ -55,6 +61,21 @@ def table(t, before):  # before: the columns of this table in each earlier messa
     before.append(columns)
     return columns
 """.replace("CHUNK", str(CHUNK))
+IMAGES = """from io import BytesIO
+
+import numpy as np
+from mcap.reader import make_reader
+from mcap_protobuf.decoder import DecoderFactory
+from PIL import Image
+
+with open("run.mcap", "rb") as file:
+    reader = make_reader(file, decoder_factories=[DecoderFactory()])
+    for _, channel, _, message in reader.iter_decoded_messages(["/dataset/color", "/dataset/depth"]):
+        if channel.topic == "/dataset/color":
+            color = np.asarray(Image.open(BytesIO(message.data)))
+        else:
+            depth_m = np.frombuffer(message.data, "<f4").reshape(message.height, message.width)
+"""
 LOOP = """with open("run.mcap", "rb") as file:
     reader = make_reader(file, decoder_factories=[DecoderFactory()])
     for _, _, _, message in reader.iter_decoded_messages("{topic}"):
@@ -86,8 +107,7 @@ def _returned(slot: type[Any]) -> type[Any]:
 
 def overview() -> str:
     """The list of the topics, and what their messages have in common."""
-    rows = [f"| [`/{topic}`]({topic}.md) | {'`trihedron.' + kind.__name__ + '`' if kind else '`trihedron.Timing`'} | {_first_line(topic, kind)} |"
-            for topic, kind in topic_types().items()]  # fmt: skip
+    rows = [f"| [`/{topic}`]({topic}.md) | {_schema(kind)} | {_first_line(topic, kind)} |" for topic, kind in topic_types().items()]
     return "\n\n".join([
         "# Topics of a recording",
         "`run.mcap` is an [MCAP](https://mcap.dev) file. Each topic is a channel of protobuf messages, whose schema, with these texts as comments, "
@@ -109,6 +129,11 @@ def overview() -> str:
     ]) + "\n"  # fmt: skip
 
 
+def _schema(kind: type[Any] | None) -> str:
+    """The schema of a topic's messages."""
+    return "images of Foxglove's schemas" if kind is Frame else f"`trihedron.{kind.__name__ if kind else 'Timing'}`"
+
+
 def _first_line(topic: str, kind: type[Any] | None) -> str:
     return first_sentence(inspect.cleandoc(kind.__doc__ or "")).replace("|", "\\|") + "." if kind else "Milliseconds of each stage."
 
@@ -117,6 +142,9 @@ def page(topic: str) -> str:
     """The page of one topic."""
     kind = topic_types()[topic]
     back = "[all topics](README.md)"
+    if kind is Frame:
+        return "\n\n".join([f"# `/{topic}/color`, `/{topic}/depth`: images", inspect.cleandoc(kind.__doc__ or ""), ABOUT[topic], back, "## Fields",
+                            IMAGE_FIELDS, "## Decoder", _fenced(IMAGES)]) + "\n"  # fmt: skip
     if kind is None:
         text = "Times of a frame in milliseconds, of each stage that was called, and the resident memory of the process. `index` is the frame's."
         fields = (
@@ -156,6 +184,8 @@ def _columns(table: str) -> str:
 def decoder(topic: str) -> str:
     """The program on a topic's page: reads every message of `run.mcap`."""
     kind: Any = topic_types()[topic]
+    if kind is Frame:
+        return IMAGES
     if kind is None:
         lines = ["times = {field.name: ms for field, ms in message.stage_ms.ListFields()}", "print(message.index, message.frame_ms, times)"]
         return _trimmed(IMPORTS, ("numpy", "zstandard")) + "\n" + _loop(topic, lines)

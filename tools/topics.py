@@ -51,11 +51,12 @@ def main(argv: list[str]) -> int:
 
 
 def topics_of(path: Path) -> list[Topic]:
-    """The topics that have messages, by name; our own values show the type they hold. Raises RecordingError."""
-    from trihedron.pipeline.record.mcap_file import McapFile, damaged
+    """The topics that have messages, by name, so far where the file is still being written; our own values show the type they hold. Raises
+    RecordingError."""
+    from trihedron.pipeline.record.mcap_file import McapFile, damaged, in_use
 
     file = McapFile(path)
-    if not file.complete:
+    if not file.complete and not in_use(path):
         raise damaged(path)
     found: dict[int, Topic] = {}
     for channel, log_time, data in file.messages():

@@ -10,9 +10,9 @@ from __future__ import annotations
 from pathlib import Path
 
 from trihedron.pipeline.core.errors import UsageError
-from trihedron.pipeline.record.reader import Recording
 from trihedron.tools.arguments import Parser
 from trihedron.tools.export import RECORDING
+from trihedron.tools.recorded import opened
 
 
 def main(argv: list[str]) -> int:
@@ -25,7 +25,7 @@ def main(argv: list[str]) -> int:
     parser.add_argument("run", metavar="RUN", type=Path, help="a run folder or its recording")
     run: Path = parser.parse_args(argv).run
     rerun = require_rerun()
-    recording = Recording(run / RECORDING if run.is_dir() else run)
+    recording = opened(run / RECORDING if run.is_dir() else run)
     stream = rerun.RecordingStream("trihedron")
     try:
         stream.spawn()

@@ -4,19 +4,22 @@ from __future__ import annotations
 
 import math
 import re
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 from trihedron.datasets.readers.images import MAX_PIXELS
+from trihedron.datasets.readers.registration import DepthCamera, Rectification
 from trihedron.pipeline.core.errors import DataError, did_you_mean, printable
 from trihedron.pipeline.core.files import MAX_YAML_BYTES, SHOWN, YamlError, parse_yaml, read_text
 from trihedron.pipeline.core.types import EXACT_DEPTH, Camera, DepthNoise
 
 CAMERA_FILE = "camera.yaml"
 REQUIRED = ("width", "height", "fx", "fy", "cx", "cy", "depth_scale")
-OPTIONAL = ("distortion", "fps", "depth_noise", "depth_offset")
+OPTIONAL = ("distortion", "fps", "depth_noise", "depth_offset", "depth_radial", "depth_camera")
 BOUNDED, SMALLEST, LARGEST = ("fx", "fy", "depth_scale", "fps"), 1e-6, 1e9  # outside, single precision overflows
+LARGEST_RADIAL = 0.5
 COEFFICIENTS = ("k1", "k2", "p1", "p2", "k3")
 NOISES = {"kinect": DepthNoise(), "exact": EXACT_DEPTH}
 SHORT = "give dataset.camera=tum_fr1, tum_fr2, tum_fr3, icl_nuim or a camera.yaml"
@@ -25,12 +28,20 @@ SHORT = "give dataset.camera=tum_fr1, tum_fr2, tum_fr3, icl_nuim or a camera.yam
 @dataclass(frozen=True)
 class Calibration:
     """The pinhole camera of a reader's frames, and the conversion of its files: depth file value per metre, lens distortion of both images
-    (k1 k2 p1 p2 k3 of Brown's model, as OpenCV orders them; empty = none), and what is added to inverse depths (1/m)."""
+    (k1 k2 p1 p2 k3 of Brown's model, as OpenCV orders them; empty = none), what is added to inverse depths (1/m), the relative error of depth in the
+    corners of the image, and the separate camera of depth images that are not registered to colour."""
 
     camera: Camera
     depth_scale: float
     distortion: tuple[float, ...] = ()
     depth_offset: float = 0.0
+    depth_radial: float = 0.0
+    depth_camera: DepthCamera | None = None
+
+    @cached_property
+    def rectification(self) -> Rectification:
+        """The conversion of the images."""
+        return Rectification(self.camera, self.distortion, self.depth_offset, self.depth_radial, self.depth_camera)
 
 
 def _vga(fx: float, fy: float, cx: float, cy: float, *distortion: float) -> Calibration:
@@ -75,7 +86,7 @@ def choose_calibration(folder: Path, choice: str, default: str = "") -> Calibrat
 
 def read_camera_file(path: Path) -> Calibration:
     """Read a camera.yaml: `width height fx fy cx cy depth_scale [distortion k1 k2 p1 p2 k3] [fps]
-    [depth_noise kinect|exact] [depth_offset]`.
+    [depth_noise kinect|exact] [depth_offset] [depth_radial] [depth_camera fx fy cx cy [translation_m] [rotation_deg]]`.
 
     Raises DataError naming file and key."""
     try:
@@ -98,7 +109,7 @@ def read_camera_file(path: Path) -> Calibration:
 
 
 def _calibration(path: Path, content: dict[str, Any]) -> Calibration:
-    values = {key: _number(path, key, content[key]) for key in (*REQUIRED, "fps", "depth_offset") if key in content}
+    values = {key: _number(path, key, content[key]) for key in (*REQUIRED, "fps", "depth_offset", "depth_radial") if key in content}
     if values["fy"] < 0.0:
         raise DataError(str(path), "fy is negative (y up)", "give it positive; dataset=icl_nuim reflects the published poses itself")
     for key in ("width", "height", "fx", "fy", "depth_scale", "fps"):
@@ -111,7 +122,40 @@ def _calibration(path: Path, content: dict[str, Any]) -> Calibration:
         raise DataError(str(path), f"depth_noise is '{_shown(noise)}'", did_you_mean(_shown(noise), NOISES))
     fx, fy, cx, cy = (values[key] for key in ("fx", "fy", "cx", "cy"))
     camera = Camera(int(values["width"]), int(values["height"]), fx, fy, cx, cy, values.get("fps", Camera.fps), NOISES[noise])
-    return Calibration(camera, values["depth_scale"], _distortion(path, content.get("distortion")), values.get("depth_offset", 0.0))
+    offset, radial = values.get("depth_offset", 0.0), values.get("depth_radial", 0.0)
+    if abs(radial) > LARGEST_RADIAL:
+        raise DataError(str(path), f"depth_radial is {_shown(content['depth_radial'])}", f"give a relative error within ±{LARGEST_RADIAL:g}")
+    distortion, depth_camera = _distortion(path, content.get("distortion")), _depth_camera(path, content.get("depth_camera"))
+    return Calibration(camera, values["depth_scale"], distortion, offset, radial, depth_camera)
+
+
+def _depth_camera(path: Path, given: Any) -> DepthCamera | None:
+    """A mapping fx fy cx cy [translation_m] [rotation_deg], the latter two of three numbers each."""
+    if given is None:
+        return None
+    known = tuple(field.name for field in fields(DepthCamera))
+    if not isinstance(given, dict):
+        raise DataError(str(path), "depth_camera holds no keys", f"give it {' '.join(known)}")
+    unknown = next((key for key in given if key not in known), None)
+    if unknown is not None:
+        raise DataError(str(path), f"unknown key 'depth_camera.{_shown(unknown)}'", did_you_mean(_shown(unknown), known))
+    missing = next((key for key in known[:4] if key not in given), None)
+    if missing is not None:
+        raise DataError(str(path), f"the key 'depth_camera.{missing}' is missing", f"give it {' '.join(known[:4])}")
+    fx, fy, cx, cy = (_number(path, f"depth_camera.{key}", given[key]) for key in known[:4])
+    if not all(SMALLEST < value < LARGEST for value in (fx, fy)):
+        raise DataError(str(path), "depth_camera describes no camera", f"give fx and fy above {SMALLEST:g}")
+    return DepthCamera(fx, fy, cx, cy, *(_three(path, f"depth_camera.{key}", given.get(key)) for key in known[4:]))
+
+
+def _three(path: Path, key: str, given: Any) -> tuple[float, float, float]:
+    """A list of three numbers; zeros where there is none."""
+    if given is None:
+        return 0.0, 0.0, 0.0
+    if not isinstance(given, list) or len(given) != 3:
+        raise DataError(str(path), f"{key} does not hold 3 numbers", "give a list [x, y, z]")
+    x, y, z = (_number(path, key, value) for value in given)
+    return x, y, z
 
 
 def _distortion(path: Path, given: Any) -> tuple[float, ...]:

@@ -64,6 +64,9 @@ def _text(value: Any) -> str:
 
 
 def _bytes(data: Any) -> bytes:
+    """Bytes of protobuf, or base64 of JSON; a list of numbers is accepted too. A number would ask for as many bytes."""
+    if not isinstance(data, (str, bytes, list)):
+        raise TypeError(f"{type(data).__name__} instead of bytes")
     return base64.b64decode(data, validate=True) if isinstance(data, str) else bytes(data)
 
 

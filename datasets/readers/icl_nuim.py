@@ -20,6 +20,7 @@ from trihedron.datasets.readers.matrices import numbered
 from trihedron.datasets.readers.sequence import DepthReader, ImageSequence, SequenceReader
 from trihedron.pipeline.core.errors import DataError, printable
 from trihedron.pipeline.core.files import SHOWN
+from trihedron.pipeline.core.linalg import matmul
 from trihedron.pipeline.core.registry import register
 from trihedron.pipeline.core.types import F32, F64, Trajectory
 from trihedron.pipeline.record.trajectories import TRUTH, parse_stamp_ns, read_trajectory, table_lines
@@ -57,7 +58,7 @@ def _reflected(truth: Trajectory | None) -> Trajectory | None:
 
 def reflect(poses: F64) -> F64:
     """(n, 4, 4) poses with y up -> with y down (the reflection is its own inverse)."""
-    return REFLECTION @ poses @ REFLECTION
+    return matmul(REFLECTION, poses, REFLECTION)
 
 
 def _associations(folder: Path) -> tuple[Stamps, list[Path], list[Path]]:
@@ -107,7 +108,7 @@ def _truth_file(folder: Path) -> Trajectory | None:
 
 def _png_reader(calibration: Calibration) -> DepthReader:
     def read(path: Path) -> F32:
-        depth = read_depth(path, calibration.depth_scale, calibration.depth_offset)
+        depth = read_depth(path, calibration.depth_scale)
         depth[depth < MIN_DEPTH_M] = 0.0
         return depth
 

@@ -35,8 +35,8 @@ def read_color(path: Path) -> U8:
     return np.asarray(image if image.shape[2] == 3 else cv2.cvtColor(image, cv2.COLOR_RGBA2RGB), dtype=np.uint8)
 
 
-def read_depth(path: Path, depth_scale: float, depth_offset: float = 0.0) -> F32:
-    """(h, w) metres, 0 = none, from a 16-bit image whose value divided by `depth_scale` is metres z, corrected to 1 / (1 / z + `depth_offset`).
+def read_depth(path: Path, depth_scale: float) -> F32:
+    """(h, w) metres, 0 = none, from a 16-bit image whose value divided by `depth_scale` is metres z.
 
     Raises UnreadableImage for a missing or damaged file, DataError for an image that is not 16-bit with one channel."""
     image = _decode(path)
@@ -45,12 +45,7 @@ def read_depth(path: Path, depth_scale: float, depth_offset: float = 0.0) -> F32
     if image.dtype != np.uint16:
         cure = "give 16-bit depth images (value = metres × depth_scale); a preview picture does not hold metres"
         raise DataError(str(path), f"has {8 * image.itemsize} bits a pixel where depth has 16", cure)
-    return corrected(metres(image, depth_scale), depth_offset)
-
-
-def corrected(depth: F32, depth_offset: float) -> F32:
-    """Depth z in metres as 1 / (1 / z + `depth_offset`), float32."""
-    return depth / np.maximum(1.0 + np.float32(depth_offset) * depth, np.float32(0.1)) if depth_offset else depth
+    return metres(image, depth_scale)
 
 
 def metres(values: NDArray[Any], depth_scale: float) -> F32:

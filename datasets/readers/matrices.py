@@ -11,6 +11,7 @@ import numpy as np
 from trihedron.datasets.readers.association import Stamps
 from trihedron.pipeline.core.errors import DataError
 from trihedron.pipeline.core.geometry import nearest_rotation, pose_matrix
+from trihedron.pipeline.core.linalg import det, matmul
 from trihedron.pipeline.core.types import F64, Trajectory
 from trihedron.pipeline.record.trajectories import MAX_STAMP_S, table_lines
 
@@ -39,7 +40,7 @@ def trajectory_of(stamps_ns: Stamps, poses: Sequence[F64], places: Sequence[str]
     found = []
     for row in known:
         R, t = poses[row][:3, :3], poses[row][:3, 3]
-        if np.abs(poses[row][:3]).max() > FARTHEST_M or not np.abs(R.T @ R - np.eye(3)).max() < SKEWEST or np.linalg.det(R) < 0:
+        if np.abs(poses[row][:3]).max() > FARTHEST_M or not np.abs(matmul(R.T, R) - np.eye(3)).max() < SKEWEST or det(R) < 0:
             raise DataError(places[row], "is not the pose of a camera", "correct or remove it")
         found.append(pose_matrix(nearest_rotation(R), t))
     return Trajectory(stamps_ns[known], np.array(found)) if found else None

@@ -19,6 +19,7 @@ from trihedron.datasets.readers.sequence import DepthReader
 from trihedron.pipeline.core.errors import DataError
 from trihedron.pipeline.core.files import read_file, read_text
 from trihedron.pipeline.core.geometry import pose_matrix
+from trihedron.pipeline.core.linalg import norm
 from trihedron.pipeline.core.types import F32, F64, Camera, Trajectory
 
 DEPTH_FILES = "scene_*_*.depth"
@@ -69,10 +70,10 @@ def read_camera_pose(path: Path) -> F64:
     text = read_text(path, MAX_CAMERA_BYTES)
     position, forward, up = (_vector(path, text, key) for key in ("cam_pos", "cam_dir", "cam_up"))
     right = np.cross(up, forward)
-    if np.linalg.norm(right) < 1e-9:
+    if norm(right) < 1e-9:
         raise DataError(str(path), "cam_dir and cam_up span no plane", "correct or remove the file")
-    right /= np.linalg.norm(right)
-    forward = forward / np.linalg.norm(forward)
+    right /= norm(right)
+    forward = forward / norm(forward)
     return pose_matrix(np.stack([right, np.cross(forward, right), forward], axis=-1), position / PER_METRE)
 
 

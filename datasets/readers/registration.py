@@ -10,7 +10,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from trihedron.pipeline.core.geometry import pose_matrix
 from trihedron.pipeline.core.kernel import kernel
+from trihedron.pipeline.core.lie import exp_so3
+from trihedron.pipeline.core.linalg import matmul
 from trihedron.pipeline.core.types import F32, F64, U8, Camera
 
 WIDEST = 32  # pixels of colour that one pixel of depth may cover
@@ -49,6 +52,72 @@ class Undistortion:
 
 
 @dataclass(frozen=True)
+class DepthCamera:
+    """The separate camera of depth images of the size of the colour images: focal lengths and centre (px), and the pose of its frame in that of the
+    colour camera, as the position (m) and the rotation vector (degrees) of `T_color_depth`. It has no lens distortion."""
+
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    translation_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    rotation_deg: tuple[float, float, float] = (0.0, 0.0, 0.0)
+
+    @property
+    def K(self) -> F64:
+        """Return the (3, 3) calibration matrix."""
+        return np.array([[self.fx, 0.0, self.cx], [0.0, self.fy, self.cy], [0.0, 0.0, 1.0]])
+
+    @property
+    def T_color_depth(self) -> F64:
+        """Return the (4, 4) pose of the depth camera in the frame of the colour camera."""
+        return pose_matrix(exp_so3(np.radians(self.rotation_deg)), np.array(self.translation_m))
+
+
+@dataclass(frozen=True)
+class Rectification:
+    """Makes the images of one undistorted camera of those of a colour camera with `distortion` and of its depth sensor.
+
+    A reading z becomes `1 / z' = (1 + depth_radial r²) / z + depth_offset`; r, about the depth camera's centre, is 1 in the corners of the image.
+    Depth of a separate `depth_camera` is then registered to colour, else undistorted as colour is."""
+
+    camera: Camera
+    distortion: tuple[float, ...] = ()
+    depth_offset: float = 0.0
+    depth_radial: float = 0.0
+    depth_camera: DepthCamera | None = None
+
+    @cached_property
+    def _undistortion(self) -> Undistortion:
+        return Undistortion(self.camera, self.distortion)
+
+    @cached_property
+    def _registration(self) -> Registration | None:
+        given, camera = self.depth_camera, self.camera
+        return None if given is None else Registration(camera.width, camera.height, given.K, (), given.T_color_depth, camera)
+
+    @cached_property
+    def _radial_factor(self) -> F32:
+        """(h, w) factor of inverse depth."""
+        camera, center = self.camera, self.depth_camera or self.camera
+        y, x = np.mgrid[: camera.height, : camera.width].astype(np.float32)
+        radius2 = ((x - center.cx) ** 2 + (y - center.cy) ** 2) / ((camera.width**2 + camera.height**2) / 4.0)
+        return np.asarray(1.0 + self.depth_radial * radius2, np.float32)
+
+    def color(self, image: U8) -> U8:
+        """(h, w, 3) RGB, undistorted."""
+        return self._undistortion.color(image)
+
+    def depth(self, depth_m: F32) -> F32:
+        """(h, w) metres, 0 = none, corrected and in the pixels of colour."""
+        if self.depth_radial:
+            depth_m = np.asarray(depth_m / np.maximum(self._radial_factor, np.float32(0.1)), np.float32)
+        if self.depth_offset:
+            depth_m = np.asarray(depth_m / np.maximum(1.0 + np.float32(self.depth_offset) * depth_m, np.float32(0.1)), np.float32)
+        return self._undistortion.depth(depth_m) if self._registration is None else self._registration(depth_m)
+
+
+@dataclass(frozen=True)
 class Registration:
     """Registers depth images of `width` × `height` (intrinsics `K`, distortion `D` as OpenCV orders it) to the undistorted camera `color`.
 
@@ -72,7 +141,7 @@ class Registration:
         pixels = np.stack(np.meshgrid(columns, rows), axis=-1)
         rays = cv2.undistortPoints(pixels.reshape(-1, 1, 2), self.K, np.array(self.D) if self.D else None).reshape(pixels.shape)
         with np.errstate(invalid="ignore", over="ignore"):  # where the distortion has no inverse, or the focal length is next to none
-            rays = np.concatenate([rays, np.ones((*rays.shape[:2], 1))], axis=2) @ self.T_color_depth[:3, :3].T
+            rays = matmul(np.concatenate([rays, np.ones((*rays.shape[:2], 1))], axis=2), self.T_color_depth[:3, :3].T)
             return np.ascontiguousarray(rays, np.float32)
 
     def __call__(self, depth_m: F32) -> F32:

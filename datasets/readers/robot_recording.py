@@ -18,6 +18,7 @@ from trihedron.datasets.readers.robot_streams import MessageFile, Role, Stream, 
 from trihedron.datasets.readers.robot_values import Intrinsics, Link, Picture, UnreadableMessage
 from trihedron.datasets.readers.transform_tree import TransformTree
 from trihedron.pipeline.core.errors import DataError, RecordingError
+from trihedron.pipeline.core.linalg import matmul
 from trihedron.pipeline.core.types import F32, F64, Camera, Frame, Trajectory
 
 log = logging.getLogger("trihedron")
@@ -222,7 +223,7 @@ class RobotRecording:
         for value in self._streams.named(self.topics.truth, "truth_from", Role.pose).values():
             for link in value:
                 mount = self._tree.lookup(link.child, camera) if link.child else None
-                found.append(link if mount is None else Link(link.stamp_ns, link.parent, camera, link.T_parent_child @ mount))
+                found.append(link if mount is None else Link(link.stamp_ns, link.parent, camera, matmul(link.T_parent_child, mount)))
         return found
 
 

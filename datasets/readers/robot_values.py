@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from trihedron.pipeline.core.geometry import pose_matrix, rotation_from_quaternion
+from trihedron.pipeline.core.linalg import norm
 from trihedron.pipeline.core.types import F64
 
 
@@ -64,6 +65,6 @@ def intrinsics(frame_id: str, width: int, height: int, model: str, D: list[float
 def link(stamp_ns: int, parent: str, child: str, t: list[float], q: list[float]) -> Link:
     """A transform from a translation and a quaternion x y z w, checked. Raises UnreadableMessage for numbers that are none."""
     values = np.array([float(x) for x in (*t, *q)])
-    if not np.isfinite(values).all() or np.abs(values).max() > 1e9 or not 1e-3 < np.linalg.norm(values[3:]) < 1e3:
+    if not np.isfinite(values).all() or np.abs(values).max() > 1e9 or not 1e-3 < norm(values[3:]) < 1e3:
         raise UnreadableMessage("holds no pose")
     return Link(stamp_ns, parent.lstrip("/"), child.lstrip("/"), pose_matrix(rotation_from_quaternion(values[3:]), values[:3]))

@@ -16,7 +16,6 @@ from numpy.typing import NDArray
 from trihedron.datasets.readers.cameras import Calibration
 from trihedron.datasets.readers.images import check_size, read_color, read_depth
 from trihedron.datasets.readers.picture_headers import UnreadableImage
-from trihedron.datasets.readers.registration import Undistortion
 from trihedron.pipeline.core.errors import DataError
 from trihedron.pipeline.core.files import one_line_errors
 from trihedron.pipeline.core.options import Frames, frame_range
@@ -63,7 +62,7 @@ class ImageSequence:
             log.warning("%s; frame %d is skipped", error, self.first + position)
             return None
         self._check_sizes(position, color, depth)
-        color, depth = self._undistortion.color(color), self._undistortion.depth(depth)
+        color, depth = self.calibration.rectification.color(color), self.calibration.rectification.depth(depth)
         return Frame(self.first + position, int(self.stamps_ns[position]), color, depth, self.calibration.camera)
 
     def _read(self, path: Path, reader: Callable[[Path], Any]) -> Any:
@@ -73,17 +72,13 @@ class ImageSequence:
             raise UnreadableImage(f"{path}: {error}") from error
 
     def _read_depth(self, path: Path) -> F32:
-        return read_depth(path, self.calibration.depth_scale, self.calibration.depth_offset)
+        return read_depth(path, self.calibration.depth_scale)
 
     def _check_sizes(self, position: int, color: U8, depth: F32) -> None:
         camera, path = self.calibration.camera, self.color_files[position]
         height, width = color.shape[:2]
         check_size(self.depth_files[position], depth, width, height, f"its colour image {path.name}", "register depth to colour first")
         check_size(path, color, camera.width, camera.height, "the camera", "give the dataset.camera of these images")
-
-    @cached_property
-    def _undistortion(self) -> Undistortion:
-        return Undistortion(self.calibration.camera, self.calibration.distortion)
 
 
 @dataclass(frozen=True)

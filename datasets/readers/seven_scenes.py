@@ -10,8 +10,10 @@ from trihedron.datasets.readers.images import read_depth
 from trihedron.datasets.readers.matrices import frame_stamps, numbered, pose_files
 from trihedron.datasets.readers.sequence import DepthReader, ImageSequence, SequenceReader
 from trihedron.pipeline.core.errors import DataError
+from trihedron.pipeline.core.geometry import invert
+from trihedron.pipeline.core.linalg import matmul
 from trihedron.pipeline.core.registry import register
-from trihedron.pipeline.core.types import F32
+from trihedron.pipeline.core.types import F32, Trajectory
 
 INVALID_M = 65.0  # 65535 mm stands for no reading
 LAYOUT = "give the folder that holds frame-000000.color.png or .jpg, .depth.png and .pose.txt, for example chess/seq-01"
@@ -24,7 +26,8 @@ class SevenScenes(SequenceReader):
 
     The published depth is *not* registered to colour: the two cameras are a few centimetres apart, and no calibration of the pair was
     published. It is read as if both were one camera, of focal length 585 and centre (320, 240), as its authors do; along the edges of
-    things colour and depth then disagree by some pixels, which a run warns of. Poses are those of the depth camera."""
+    things colour and depth then disagree by some pixels, which a run warns of and `trihedron calibrate` estimates. Poses are those of the depth
+    camera; with a `depth_camera` in camera.yaml they become those of the colour camera."""
 
     camera: str = ""  # preset or camera.yaml; empty = the folder's file, else the data set's camera
 
@@ -38,13 +41,15 @@ class SevenScenes(SequenceReader):
         calibration = choose_calibration(folder, self.camera, default="seven_scenes")
         stamps = frame_stamps(numbers, calibration.camera.fps)
         truth = pose_files(stamps, [folder / f"frame-{n:06}.pose.txt" for n in numbers])
+        if truth is not None and calibration.depth_camera is not None:
+            truth = Trajectory(truth.stamps_ns, matmul(truth.poses, invert(calibration.depth_camera.T_color_depth)))
         images = [colors[n] for n in numbers], [depths[n] for n in numbers]
         return ImageSequence(stamps, *images, calibration, truth, depth_reader=_reader(calibration))
 
 
 def _reader(calibration: Calibration) -> DepthReader:
     def read(path: Path) -> F32:
-        depth = read_depth(path, calibration.depth_scale, calibration.depth_offset)
+        depth = read_depth(path, calibration.depth_scale)
         depth[depth > INVALID_M] = 0.0
         return depth
 

@@ -10,7 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from trihedron.datasets.readers.robot_values import Link
-from trihedron.pipeline.core.geometry import exp_so3, invert, log_so3, pose_matrix
+from trihedron.pipeline.core.geometry import invert, pose_matrix
+from trihedron.pipeline.core.lie import exp_so3, log_so3
+from trihedron.pipeline.core.linalg import matmul
 from trihedron.pipeline.core.types import F64
 
 
@@ -38,7 +40,7 @@ class TransformTree:
         T_common_target, T_common_source = (self._chain(path[: path.index(common)], stamp_ns) for path in (up_target, up_source))
         if T_common_target is None or T_common_source is None:
             return None
-        return np.asarray(invert(T_common_target) @ T_common_source)
+        return np.asarray(matmul(invert(T_common_target), T_common_source))
 
     def _ancestors(self, frame: str) -> list[str]:
         """The frame, its parent and so on; a cycle ends the list."""
@@ -58,7 +60,7 @@ class TransformTree:
                 step = self._at(frame, stamp_ns)
             if step is None:
                 return None
-            T = step @ T
+            T = matmul(step, T)
         return T
 
     def _at(self, frame: str, stamp_ns: int | None) -> F64 | None:
@@ -85,5 +87,5 @@ class TransformTree:
 
 def interpolate(T_a: F64, T_b: F64, share: float) -> F64:
     """Interpolate poses: positions linearly, rotations along the geodesic; `share` 0 gives `T_a`, 1 `T_b`."""
-    R = T_a[:3, :3] @ exp_so3(share * log_so3(T_a[:3, :3].T @ T_b[:3, :3]))
+    R = matmul(T_a[:3, :3], exp_so3(share * log_so3(matmul(T_a[:3, :3].T, T_b[:3, :3]))))
     return np.asarray(pose_matrix(R, (1.0 - share) * T_a[:3, 3] + share * T_b[:3, 3]))

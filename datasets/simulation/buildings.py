@@ -11,6 +11,7 @@ import numpy as np
 from trihedron.datasets.simulation.furniture import furnished
 from trihedron.datasets.simulation.room import HEIGHT_M, UP, Room, Solid, Wall, box, shell, turned_box, walls_of
 from trihedron.datasets.simulation.walks import Walk
+from trihedron.pipeline.core.linalg import norm
 
 DOORWAY_M = (0.9, 2.1)  # width and height
 DETAIL = 0.7  # of the textures: those of a building take as much memory as those of a few rooms
@@ -76,7 +77,7 @@ def _doorway(along_x: bool, across: tuple[float, float], span: tuple[float, floa
 def _pierced(start: tuple[float, float], end: tuple[float, float], gaps: list[tuple[float, float, float, float]]) -> list[Solid]:
     """A wall along the middle line from `start` to `end` with gaps (middle along it, width, bottom, top)."""
     a, b = np.array([*start, 0.0]), np.array([*end, 0.0])
-    length = float(np.linalg.norm(b - a))
+    length = float(norm(b - a))
     along = (b - a) / length
     yaw, pieces, at = float(np.arctan2(along[1], along[0])), list[tuple[float, float, float, float]](), 0.0
     for middle, width, bottom, top in sorted(gaps):

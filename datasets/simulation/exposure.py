@@ -7,6 +7,7 @@ import numpy as np
 
 from trihedron.datasets.simulation.depth_noise import IMAGE_SIGMA
 from trihedron.pipeline.core.geometry import invert
+from trihedron.pipeline.core.linalg import matmul
 from trihedron.pipeline.core.types import F32, F64, U8, Camera
 
 SUB_FRAMES = 7  # of an exposure
@@ -17,7 +18,7 @@ VIGNETTE = 0.25  # of the light is missing in the corners
 def motion_px(depth_m: F64, camera: Camera, T_world_before: F64, T_world_after: F64) -> F32:
     """(h, w, 2) pixels by which what is seen moves from one pose to the other."""
     x, y = np.meshgrid(np.arange(camera.width, dtype=np.float32), np.arange(camera.height, dtype=np.float32))
-    T, z = (invert(T_world_after) @ T_world_before).astype(np.float32), depth_m.astype(np.float32)
+    T, z = matmul(invert(T_world_after), T_world_before).astype(np.float32), depth_m.astype(np.float32)
     X, Y = (x - np.float32(camera.cx)) / np.float32(camera.fx) * z, (y - np.float32(camera.cy)) / np.float32(camera.fy) * z
     moved = [T[k, 0] * X + T[k, 1] * Y + T[k, 2] * z + T[k, 3] for k in range(3)]
     ahead = np.maximum(moved[2], np.float32(1e-3))

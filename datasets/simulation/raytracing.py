@@ -15,6 +15,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from trihedron.datasets.simulation.room import BOX, CYLINDER, Face, Room, all_faces
+from trihedron.pipeline.core.linalg import matmul
 from trihedron.pipeline.core.types import F64, I32, Camera
 
 NEAR_M = 0.05  # nothing nearer is looked for
@@ -33,7 +34,7 @@ class Geometry(NamedTuple):
     faces: F64  # (f, 17): origin, u, v, normal, kind (BOX = flat), radius, its lamp
 
 
-class View(NamedTuple):
+class CameraView(NamedTuple):
     """A camera in the room, and the room as this camera sees it."""
 
     fx: float
@@ -69,25 +70,25 @@ def _lamp(face: Face, room: Room) -> F64:
     """The nearest lamp in front of a face; of all lamps when none is in front of it."""
     lamps = np.array(room.lamps_m)
     centre = face.origin if face.curved else face.origin + face.u * (face.size_m[0] / 2.0) + face.v * (face.size_m[1] / 2.0)
-    behind = (lamps - centre) @ face.normal <= 0.0 if not face.curved else np.zeros(len(lamps))
+    behind = matmul(lamps - centre, face.normal) <= 0.0 if not face.curved else np.zeros(len(lamps))
     nearest_first = np.lexsort((np.linalg.norm(lamps - centre, axis=1), behind))
     return np.asarray(lamps[nearest_first[0]], np.float64)
 
 
-def view_of(geometry: Geometry, camera: Camera, T_world_camera: F64) -> View:
+def view_of(geometry: Geometry, camera: Camera, T_world_camera: F64) -> CameraView:
     """A camera at a pose, with what depends on the pose alone worked out."""
     R, position = np.ascontiguousarray(T_world_camera[:3, :3]), T_world_camera[:3, 3].copy()
     R_solid_world = np.swapaxes(geometry.rotations, 1, 2)
-    origins = (R_solid_world @ (position - geometry.centres)[:, :, None])[:, :, 0]
-    turned = (R_solid_world @ R).reshape(-1, 9)
+    origins = matmul(R_solid_world, (position - geometry.centres)[:, :, None])[:, :, 0]
+    turned = matmul(R_solid_world, R).reshape(-1, 9)
     normals = geometry.planes[:, :3]
-    distances = normals @ position + geometry.planes[:, 3]
+    distances = matmul(normals, position) + geometry.planes[:, 3]
     solids = np.column_stack([geometry.halves, origins, turned, geometry.kinds])
-    return View(camera.fx, camera.fy, camera.cx, camera.cy, position, R, solids, -(normals @ R) / distances[:, None])
+    return CameraView(camera.fx, camera.fy, camera.cx, camera.cy, position, R, solids, -matmul(normals, R) / distances[:, None])
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def trace(geometry: Geometry, view: View, depth: F64, faces: I32) -> None:
+def trace(geometry: Geometry, view: CameraView, depth: F64, faces: I32) -> None:
     """Fill (h, w) depth in metres and face number of every pixel."""
     h, w = depth.shape
     _trace_room(view.room, view.fx, view.fy, view.cx, view.cy, depth, faces)
@@ -244,7 +245,7 @@ def _hit_sphere(solid: F64, d0: float, d1: float, d2: float) -> tuple[float, int
 
 @njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
 def nearest(room: F64, solids: F64, first_face: I32, chosen: NDArray[np.int64], count: int, dx: float, dy: float) -> tuple[float, int]:
-    """Depth and face of the nearest hit among the room and the first `count` chosen solids (see View)."""
+    """Depth and face of the nearest hit among the room and the first `count` chosen solids (see CameraView)."""
     inverse, face = nearest_wall(room, dx, dy)
     t = 1.0 / inverse
     for i in range(count):

@@ -10,6 +10,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from trihedron.pipeline.core.linalg import matmul, norm, solve
 from trihedron.pipeline.core.types import F64
 
 HEIGHT_M = 2.7
@@ -155,7 +156,7 @@ def shell(footprint: tuple[tuple[float, float], ...], height_m: float = HEIGHT_M
     x, y = np.array([1.0, 0.0, 0.0]), np.array([0.0, 1.0, 0.0])
     faces.append(Face(np.array([west, north, 0.0]), x, -y, UP, size, "floor"))
     faces.append(Face(np.array([west, south, height_m]), x, y, -UP, size, "ceiling"))
-    return np.array([[*face.normal, -float(face.normal @ face.origin)] for face in faces]), tuple(faces)
+    return np.array([[*face.normal, -float(matmul(face.normal, face.origin))] for face in faces]), tuple(faces)
 
 
 def leaning_room() -> Room:
@@ -163,20 +164,20 @@ def leaning_room() -> Room:
     upright = furnished_room()
     middle = np.array([*np.mean(RECTANGLE, axis=0), HEIGHT_M / 2.0])
     faces = [_leaned(face, middle) for face in upright.faces]
-    return Room(np.array([[*face.normal, -float(face.normal @ face.origin)] for face in faces]), tuple(faces))
+    return Room(np.array([[*face.normal, -float(matmul(face.normal, face.origin))] for face in faces]), tuple(faces))
 
 
 def _leaned(face: Face, middle: F64) -> Face:
     """A flat face under the shear; its texture covers the parallelogram that it becomes."""
     width, height = face.u * face.size_m[0], face.v * face.size_m[1]
     corners = face.origin + np.array([0.0 * width, width, height, width + height])
-    corners = middle + (corners - middle) @ LEAN.T
-    normal, u = np.linalg.solve(LEAN.T, face.normal), LEAN @ face.u
-    normal, u = normal / np.linalg.norm(normal), u / np.linalg.norm(u)
+    corners = middle + matmul(corners - middle, LEAN.T)
+    normal, u = solve(LEAN.T, face.normal), matmul(LEAN, face.u)
+    normal, u = normal / norm(normal), u / norm(u)
     frame = np.stack([u, np.cross(u, normal)])
-    extent = (corners - corners[0]) @ frame.T
+    extent = matmul(corners - corners[0], frame.T)
     size = np.ptp(extent, axis=0)
-    return Face(corners[0] + extent.min(axis=0) @ frame, frame[0], frame[1], normal, (float(size[0]), float(size[1])), face.material)
+    return Face(corners[0] + matmul(extent.min(axis=0), frame), frame[0], frame[1], normal, (float(size[0]), float(size[1])), face.material)
 
 
 def all_faces(room: Room) -> list[Face]:

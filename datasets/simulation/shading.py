@@ -12,7 +12,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from trihedron.datasets.simulation.raytracing import Geometry, View, nearest, trace, view_of
+from trihedron.datasets.simulation.raytracing import CameraView, Geometry, nearest, trace, view_of
 from trihedron.datasets.simulation.room import BOX, CYLINDER
 from trihedron.pipeline.core.types import F32, F64, I32, U8, Camera
 
@@ -45,7 +45,7 @@ def render(geometry: Geometry, atlas: Atlas, camera: Camera, T_world_camera: F64
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _shade(surfaces: F64, atlas: Atlas, view: View, depth: F64, faces: I32, color: U8, cosine: F32) -> None:
+def _shade(surfaces: F64, atlas: Atlas, view: CameraView, depth: F64, faces: I32, color: U8, cosine: F32) -> None:
     """Colour and cosine of incidence of every pixel."""
     texels, levels, per_metre, position, R = atlas.texels, atlas.levels, atlas.per_metre, view.position, view.R_world_camera
     per_px = 1.0 / view.fx
@@ -131,7 +131,7 @@ def _bilinear(t: U8, levels: NDArray[np.int64], face: int, level: int, x: float,
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _smooth_borders(geometry: Geometry, atlas: Atlas, view: View, faces: I32, color: U8) -> None:
+def _smooth_borders(geometry: Geometry, atlas: Atlas, view: CameraView, faces: I32, color: U8) -> None:
     """Average SUBPIXELS² samples where a pixel and one of its neighbours show different faces, among the solids these faces belong to."""
     h, w = faces.shape
     solids = np.empty(9, dtype=np.int64)
@@ -145,7 +145,9 @@ def _smooth_borders(geometry: Geometry, atlas: Atlas, view: View, faces: I32, co
 
 
 @njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
-def _smooth_pixel(geometry: Geometry, atlas: Atlas, view: View, solids: NDArray[np.int64], count: int, seen: F64, x: int, y: int, color: U8) -> None:
+def _smooth_pixel(
+    geometry: Geometry, atlas: Atlas, view: CameraView, solids: NDArray[np.int64], count: int, seen: F64, x: int, y: int, color: U8
+) -> None:
     """Find the faces in a pixel and colour each once, at the middle of its samples. `seen` is room for rows (face, samples, sums of dx, dy, t)."""
     found, samples = 0, SUBPIXELS * SUBPIXELS
     for i in range(samples):

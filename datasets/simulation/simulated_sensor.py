@@ -16,6 +16,7 @@ from trihedron.datasets.simulation.sensor_depth import coarse, lidar_depth, ster
 from trihedron.datasets.simulation.sensor_models import MODELS, Sensor, SensorParameters, drawn_parameters
 from trihedron.datasets.simulation.synthetic import Scene, Synthetic
 from trihedron.datasets.simulation.true_surface import TrueSurface
+from trihedron.pipeline.core.linalg import matmul
 from trihedron.pipeline.core.options import Frames, NonNegativeFloat, NonNegativeInt, Range
 from trihedron.pipeline.core.registry import register
 from trihedron.pipeline.core.types import F32, F64, U8, Camera, DepthNoise, Frame, Trajectory
@@ -109,7 +110,7 @@ class SimulatedSensor:
         """(h, w) readings in metres: of the sensor's kind, then its systematic errors."""
         hidden, camera = self.hidden, self.depth_camera
         color, exact, cosine = self._rolled(camera, time_s + hidden.delay_ms / 1e3, hidden.depth_readout_ms / 1e3)
-        gray = np.asarray(color @ np.array([0.299, 0.587, 0.114]), np.uint8)
+        gray = np.asarray(matmul(color, np.array([0.299, 0.587, 0.114])), np.uint8)
         if self.sensor is Sensor.kinect_v1:
             noise = camera.depth_noise
             a, b, c = (hidden.noise * k for k in (noise.a_m, noise.b, noise.c_per_m))

@@ -21,6 +21,7 @@ from trihedron.datasets.simulation.shading import Atlas, render
 from trihedron.datasets.simulation.textures import bake
 from trihedron.datasets.simulation.true_plan import TruePlan, plans_of
 from trihedron.datasets.simulation.true_surface import TrueSurface, surface_of
+from trihedron.pipeline.core.linalg import matmul
 from trihedron.pipeline.core.options import Frames, NonNegativeInt, PositiveFloat, Range
 from trihedron.pipeline.core.registry import register
 from trihedron.pipeline.core.types import EXACT_DEPTH, F32, F64, I32, U8, Bool, Camera, Frame, Trajectory
@@ -122,10 +123,10 @@ class Synthetic:
         T_world_camera = self._pose(self._range[0] + index)
         _, depth, faces, _ = render(geometry, atlas, self._camera, T_world_camera)
         known = all_faces(self._room)
-        world = np.array([[*face.normal, -face.normal @ face.origin] for face in known])
+        world = np.array([[*face.normal, matmul(-face.normal, face.origin)] for face in known])
         planes, number = np.unique(np.round(world, 6), axis=0, return_inverse=True)
         number = np.where([face.curved == BOX for face in known], number.reshape(-1), -1).astype(np.int32)
-        local = planes @ T_world_camera  # n·(R p + t) + d
+        local = matmul(planes, T_world_camera)  # n·(R p + t) + d
         return depth, number[faces].astype(np.int32), np.asarray(np.where(local[:, 3:] < 0.0, -local, local), np.float64)
 
     def true_pose(self, index: int) -> F64:

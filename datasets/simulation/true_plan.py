@@ -10,6 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from trihedron.datasets.simulation.room import Room, Solid
+from trihedron.pipeline.core.linalg import matmul
 from trihedron.pipeline.core.types import F64
 
 LEAST_M2 = 0.5  # of a room
@@ -67,7 +68,7 @@ def _bottom(solid: Solid) -> float:
 def _outline(solid: Solid) -> F64:
     """Return the corners (4, 2) of a box on the plan."""
     corners = np.array([[1, 1], [-1, 1], [-1, -1], [1, -1]]) * solid.half[:2]
-    return np.asarray(corners @ solid.R_world_solid[:2, :2].T + solid.centre[:2])
+    return np.asarray(matmul(corners, solid.R_world_solid[:2, :2].T) + solid.centre[:2])
 
 
 def _doorway(lintel: Solid, room: Room, floor_m: float) -> Doorway:

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from trihedron.datasets.simulation.room import BOX, CYLINDER, UP, Face, Room, Solid
+from trihedron.pipeline.core.linalg import matmul
 from trihedron.pipeline.core.types import F64, I32, Bool
 
 SAGITTA_M = 0.0002  # how far the facets of a circle are inside it
@@ -54,7 +55,7 @@ def _fan(polygon: F64) -> tuple[F64, I32]:
 def _clipped(polygon: F64, planes: F64) -> tuple[F64, I32]:
     """The part of a convex polygon (n, 3) on the positive side of all planes (k, 4) (Sutherland and Hodgman)."""
     for plane in planes:
-        height = polygon @ plane[:3] + plane[3]
+        height = matmul(polygon, plane[:3]) + plane[3]
         kept = []
         for k in range(len(polygon)):
             other = (k + 1) % len(polygon)

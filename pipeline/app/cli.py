@@ -23,7 +23,7 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from trihedron.pipeline.core.errors import DataError, TrihedronError, UsageError, did_you_mean, printable
+from trihedron.pipeline.core.errors import DataError, TrihedronError, UsageError, did_you_mean
 from trihedron.pipeline.core.libraries import library_error
 from trihedron.pipeline.core.overrides import literal_text, path_of, with_literal_paths
 from trihedron.pipeline.run import memory
@@ -39,8 +39,7 @@ _FAILURES: list[Exception] = []  # of this process's runs
 _BEGAN = time.perf_counter()
 COMMAND_GROUP = "trihedron.commands"
 RUN_FLAGS = ("-m", "--multirun")
-RENAMED = {"experiment=paper_table": "experiment=paper"}  # words of the command that are accepted with a warning
-OUT_OF_MEMORY = ("start new thread", "failed to map segment", "load shared object file")  # in what libraries say of it
+DRY_RUN = "--dry-run", "dry_run=true"  # a flag of sweeps, and the word that it stands for
 RUN_HELP = """Track a sequence: compose the configuration, run the graph, write the run folder.
 
 Usage: trihedron run [-m] [key=value ...]
@@ -57,10 +56,12 @@ Usage: trihedron run [-m] [key=value ...]
   replay=FILE.mcap only=[STAGE,...]  compute these stages again, read the rest from a recording
   save_map=FILE.mcap                 keep the map, to go on from    load_map=FILE.mcap  go on from it, or find the camera in it
   localise_only=true                 the loaded map stays as it is
+  view=foxglove | view=rerun         watch the run; view.port=8765; view.web=true serves rerun to a browser
   live=true                          play the data set in real time; frames that come while it is busy are dropped, latency is reported
   real_time=true                     the same without dropping any
   feedback=recorded                  delayed wires of recomputed stages see the recorded past
   -m                                 sweep over comma-separated values, on all cores; the same again does what is missing
+  -m ... --dry-run                   say which jobs a sweep has, which are done, and which stages they share; run nothing
   sequences=[KIND:FOLDER,...]        of a sweep: several data sets, for example ["tum:/data/desk frames=0:300",synthetic]
   hydra/launcher=dask                of a sweep: on a cluster; hydra/sweeper=optuna: a search (README)
   report=COMMAND                     what to do with the folder of a sweep at its end, for example: report="benchmark rotations"
@@ -80,11 +81,12 @@ def main(argv: list[str] | None = None) -> int:
             stream.reconfigure(errors="replace")  # where the terminal has no such letter
     try:
         with ending_signals_interrupt():
+            memory.check_address_space()
             code = _dispatch([word for word in words if word != "--debug"])
             sys.stdout.flush()
             return code
     except KeyboardInterrupt as error:
-        print("trihedron: interrupted; what was done is kept", file=sys.stderr)
+        print("; ".join(["trihedron: interrupted", *getattr(error, "__notes__", [])]), file=sys.stderr)
         return error.exit_code if isinstance(error, Interruption) else 130
     except BrokenPipeError:
         _discard_stdout()
@@ -105,9 +107,8 @@ def _of_the_machine(error: Exception) -> TrihedronError | None:
         if error.filename is None and error.errno in (errno.ENOSPC, errno.EIO, errno.EBADF):
             _discard_stdout()
         return DataError(str(error.filename or "standard output"), f"cannot be used: {error.strerror}", "make room, or give another place")
-    if isinstance(error, MemoryError) or any(words in str(error) for words in OUT_OF_MEMORY):
-        cause = "ran out" if isinstance(error, MemoryError) else f"ran out ({printable(str(error), 160)})"
-        return DataError("memory", cause, "give the process more (ulimit -v), fewer threads=N, or smaller images")
+    if (exhausted := memory.exhaustion(error)) is not None:
+        return exhausted
     if isinstance(error, RuntimeError) and "home directory" in str(error):  # Path.expanduser
         return DataError("path", "begins with ~ and the name of nobody", "write ./~NAME for a file of that name")
     if isinstance(error, ModuleNotFoundError) and (library := str(error.name).partition(".")[0]) != "trihedron":
@@ -173,15 +174,13 @@ def _run(words: list[str]) -> int:
     if "-h" in words or "--help" in words:
         print(run_help())
         return 0
-    words = [given for word in words for given in _data_set(word)]
+    words = [given for word in words for given in _data_set(DRY_RUN[1] if word == DRY_RUN[0] else word)]
     for word in words:
         if word.startswith("-") and word not in RUN_FLAGS:
-            raise UsageError(word, "is not an option of run", f"known: {', '.join(RUN_FLAGS)}; everything else is key=value")
+            raise UsageError(word, "is not an option of run", f"known: {', '.join((*RUN_FLAGS, DRY_RUN[0]))}; everything else is key=value")
         if word.startswith("=") or word == "out=":
             raise UsageError(word, "lacks a " + ("key" if word.startswith("=") else "folder"), "write key=value, for example out=runs/mine")
-        if word in RENAMED:
-            print(f"trihedron: warning: {word} is now {RENAMED[word]}", file=sys.stderr)
-    words = [RENAMED.get(word, word) for word in words]
+    words = _in_current_names(words)
     if _is_sweep(words):
         from trihedron.pipeline.core.config import check_added
 
@@ -189,6 +188,20 @@ def _run(words: list[str]) -> int:
         return _sweep(words, _recorded(words))
     run_once(words, _BEGAN)
     return 0
+
+
+def _in_current_names(words: list[str]) -> list[str]:
+    """The words with the names of earlier versions replaced, each with a warning."""
+    from trihedron.pipeline.core.registry import load_plugins, options_of, plugins_of
+    from trihedron.pipeline.core.renamed import current_words
+    from trihedron.pipeline.core.slots import SLOTS
+
+    load_plugins()
+    options = {slot: {name: {option.name for option in options_of(plugin)} for name, plugin in plugins_of(slot).items()} for slot in SLOTS}
+    words, warnings = current_words(words, options)
+    for warning in warnings:
+        print(f"trihedron: warning: {warning}", file=sys.stderr)
+    return words
 
 
 def run_help() -> str:
@@ -209,14 +222,13 @@ def _listed(names: Iterable[str], default: str) -> str:
 
 
 def _data_set(word: str) -> list[str]:
-    """A word of run that is a path instead of key=value, as overrides that choose the data set by its files."""
-    if "=" in word or word.startswith(("-", "~", "+")) or not (path := Path(word)).exists():
-        return [word]
-    from trihedron.pipeline.core.layouts import layout_of
+    """A word of run as overrides: a path chooses the data set, and prints which."""
+    from trihedron.pipeline.core.layouts import data_set_words
 
-    name = layout_of(path)
-    print(f"dataset={name} dataset.path={word}", file=sys.stderr)
-    return [f"dataset={name}", f"dataset.path={word}"]
+    words = data_set_words(word)
+    if words != [word]:
+        print(*words, file=sys.stderr)
+    return words
 
 
 def run_once(words: list[str], began: float) -> tuple[Path, dict[str, Any]]:
@@ -226,6 +238,8 @@ def run_once(words: list[str], began: float) -> tuple[Path, dict[str, Any]]:
 
         check_added(words)
         config = composed(words, _recorded(words))
+    if config.dry_run:
+        raise UsageError(DRY_RUN[0], "is of a sweep, and this is one run", "add -m to run once with each of several values")
     from trihedron.pipeline.app.execute import execute
 
     try:

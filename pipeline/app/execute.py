@@ -9,7 +9,7 @@ import subprocess
 import sys
 import time
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -26,12 +26,13 @@ from trihedron.pipeline.core.graph import Graph
 from trihedron.pipeline.core.overrides import literal_text, path_of, quoted
 from trihedron.pipeline.core.slots import SLOTS, output_of
 from trihedron.pipeline.core.types import Building, Surface, Trajectory
+from trihedron.pipeline.record.foxglove_server import FoxgloveServer
 from trihedron.pipeline.record.reader import Recording
 from trihedron.pipeline.record.trajectories import TRUTH, attached_truth, format_trajectory
 from trihedron.pipeline.record.writer import RecordingWriter
 from trihedron.pipeline.run import results
 from trihedron.pipeline.run.building_files import write_building
-from trihedron.pipeline.run.interrupts import Interrupts
+from trihedron.pipeline.run.interrupts import uninterrupted
 from trihedron.pipeline.run.live import Pace, shows_once
 from trihedron.pipeline.run.map_file import load_map, save_map
 from trihedron.pipeline.run.replay import TOPICS, Replay
@@ -73,31 +74,49 @@ def _execute(config: DictConfig, out: Path, overrides: list[str], began: float, 
     compile_once(runner.computed, runner.feed is not None)
     with held(out):
         write_configuration(out, config, overrides)
-        with _Warnings() as warnings, compilation_reported():
+        with Warnings() as warnings, compilation_reported():
             warm_up(trial())
             warnings.muted = False
-            writer = RecordingWriter(out / RECORDING, {**metadata_of(config, overrides), TOPICS: json.dumps(sorted(topics))}, viewer.server)
+            metadata = {**metadata_of(config, overrides), TOPICS: json.dumps(sorted(topics))}
             attachments = _attachments(graph, replay)
-            for name, text in attachments.items():
-                writer.attach(name, text)
-            truth = attached_truth(attachments, str(writer.path))
-            started = time.perf_counter()
+            truth = attached_truth(attachments, str(out / RECORDING))
+            started, writer, failure = time.perf_counter(), None, None
             try:
+                with uninterrupted():
+                    writer = opened(out / RECORDING, metadata, attachments, viewer.server)
                 for _ in _progress(runner.steps(writer, topics, "dataset" in topics, truth, viewer.sinks)):
                     pass
                 if config.save_map:
                     save_map(Path(config.save_map).expanduser(), runner.state, metadata_of(config, overrides), source)
+            except KeyboardInterrupt as error:
+                error.add_note(_kept(runner, out))
+                raise
             finally:
-                with Interrupts() as interrupts, interrupts.held():
-                    failure = closed(writer)
-                    metrics, timing = write_files(runner, truth, out, started, began)
+                with uninterrupted():
+                    if writer is not None:
+                        failure = closed(writer)
+                        metrics, timing = write_files(runner, truth, out, started, began)
                     warnings.summarise()
         if replay is not None:
             print(_replayed(replay, runner, timing))
-        _report(out, metrics, timing, _models(out, runner))
+        _report(out, metrics, timing, write_models(out, runner))
     if failure is not None:
         raise failure
     return metrics
+
+
+def opened(path: Path, metadata: Mapping[str, str], attachments: Mapping[str, str], server: FoxgloveServer | None = None) -> RecordingWriter:
+    """Open the recording and attach its texts."""
+    writer = RecordingWriter(path, metadata, server)
+    for name, text in attachments.items():
+        writer.attach(name, text)
+    return writer
+
+
+def _kept(runner: Runner, out: Path) -> str:
+    """Say what an interrupted run leaves behind."""
+    count = len(runner.result.stamps_ns)
+    return f"frames done: {count}, kept in {out}" if count else "no frame was done"
 
 
 def closed(writer: RecordingWriter) -> RecordingError | None:
@@ -226,15 +245,17 @@ def _progress(steps: Iterator[Step]) -> Iterator[Step]:
         bar.close()
 
 
-def write_files(runner: Runner, truth: Trajectory | None, out: Path, started: float, began: float) -> tuple[dict[str, Any], dict[str, Any]]:
-    """The files beside the recording; returns metrics and times. A trajectory is written only where poses were computed."""
+def write_files(
+    runner: Runner, truth: Trajectory | None, out: Path, started: float, began: float, plot: bool = True
+) -> tuple[dict[str, Any], dict[str, Any]]:
+    """The files beside the recording; returns metrics and times. A trajectory, and its `plot`, are written only where poses were computed."""
     metrics: dict[str, Any] = {}
     timing = runner.timing.summary(runner.threads, time.perf_counter() - started, started - began)
     if runner.feed is not None:
         timing["live"] = runner.feed.summary(timing["frame_ms"])
     try:
         if "pose" in runner.computed:
-            metrics = results.write_results(out, runner.result, truth)
+            metrics = results.write_results(out, runner.result, truth, plot)
         results.write_json(out / results.TIMING, timing)
     except OSError as error:
         raise DataError(str(error.filename or out), f"cannot be written: {error.strerror}", "make room, or give another out=FOLDER") from error
@@ -249,7 +270,7 @@ def _attachments(graph: Graph, replay: Replay | None) -> dict[str, str]:
     return {TRUTH: format_trajectory(truth)} if truth is not None else {}
 
 
-def _models(out: Path, runner: Runner) -> list[str]:
+def write_models(out: Path, runner: Runner) -> list[str]:
     """Write the surface and the building of a run, and return lines that describe them."""
     folds = list(runner.result.folds.values())
     lines = [results.write_surface(out, value) for value in folds if isinstance(value, Surface)]
@@ -281,7 +302,7 @@ def _report(out: Path, metrics: dict[str, Any], timing: dict[str, Any], surfaces
             print(f"  {path}")
 
 
-class _Warnings(logging.Handler):
+class Warnings(logging.Handler):
     """Collects the warnings of a run, once it is no longer `muted`: the first of each kind is shown when it comes, all are counted at the end."""
 
     def __init__(self) -> None:
@@ -304,7 +325,7 @@ class _Warnings(logging.Handler):
             if count > 1:
                 print(f"trihedron: {count} such warnings, the first: {self.first[kind]}", file=sys.stderr)
 
-    def __enter__(self) -> _Warnings:
+    def __enter__(self) -> Warnings:
         logger = logging.getLogger("trihedron")
         logger.addHandler(self)
         logger.propagate = False

@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from trihedron.pipeline.core.linalg import matmul, norm
 from trihedron.pipeline.core.types import F64, I32, OPENING_KINDS, Building
 
 SHEET_M = 0.06  # thickness that a wall is drawn with where its other face was not seen
@@ -35,7 +36,7 @@ class Stretch:
 def wall_pieces(building: Building, wall: Any) -> Iterator[Stretch]:
     """Cut a wall at its openings that reach the floor and at stretches that were not seen."""
     start, end = building.walls_m[wall]
-    length = float(np.linalg.norm(end - start))
+    length = float(norm(end - start))
     gaps = [
         span
         for span, of, kind in zip(building.spans_m, building.opening_walls, building.opening_kinds)
@@ -52,7 +53,7 @@ def wall_pieces(building: Building, wall: Any) -> Iterator[Stretch]:
 def quad(building: Building, wall: int, a: float, b: float) -> F64:
     """Return the corners (4, 2) of a wall's stretch."""
     start, end = building.walls_m[wall]
-    along = (end - start) / max(float(np.linalg.norm(end - start)), 1e-9)
+    along = (end - start) / max(float(norm(end - start)), 1e-9)
     back = np.array([along[1], -along[0]]) * _drawn_thickness(building, wall)
     return np.array([start + a * along, start + b * along, start + b * along + back, start + a * along + back])
 
@@ -96,18 +97,43 @@ def _drawn_thickness(building: Building, wall: Any) -> float:
 def _unseen_at(building: Building, wall: Any, corner: F64) -> bool:
     """Say if a wall was not seen where a corner (2,) is."""
     start, end = building.walls_m[wall]
-    t = float((corner - start) @ (end - start)) / max(float(np.linalg.norm(end - start)), 1e-9)
+    t = float(matmul(corner - start, end - start)) / max(float(norm(end - start)), 1e-9)
     return any(low - 0.05 <= t <= high + 0.05 for of, low, high in building.unseen if int(of) == wall)
 
 
+def door_swing(building: Building, opening: int) -> F64:
+    """Return the corners (4, 2) of the square in which a door's leaf is drawn: hinge, other jamb, and both a leaf's width before the wall's face."""
+    left, right = building.spans_m[opening]
+    hinge, jamb, _, back = quad(building, int(building.opening_walls[opening]), float(left), float(right))
+    out = (hinge - back) / max(float(norm(hinge - back)), 1e-9) * float(right - left)
+    return np.array([hinge, jamb, jamb + out, hinge + out])
+
+
+def doors_on(building: Building, storey: int) -> list[int]:
+    """Return the doors of a storey."""
+    return [k for k, wall in enumerate(building.opening_walls) if building.wall_storeys[wall] == storey and _is_door(building, k)]
+
+
+def _is_door(building: Building, opening: int) -> bool:
+    return OPENING_KINDS[building.opening_kinds[opening]] == "door"
+
+
+WIDE = 2.0  # times as wide as high is a label
+
+
 def label_place(building: Building, room: int) -> F64:
-    """Return a place (2,) well inside a room, for its name."""
+    """Return a place (2,) well inside a room and beside the swings of its doors, for its name."""
     import shapely
+    from shapely.affinity import scale
 
     rings = rings_of(building, room)
     polygon = shapely.make_valid(shapely.Polygon(rings[0], rings[1:]))
-    place = shapely.maximum_inscribed_circle(polygon, 0.05).coords[0] if not polygon.is_empty else rings[0].mean(axis=0)
-    return np.array(place)
+    swings = [shapely.Polygon(door_swing(building, door)) for door in doors_on(building, int(building.room_storeys[room]))]
+    for free in (shapely.difference(polygon, shapely.union_all(swings)), polygon):
+        if not free.is_empty and free.area > 0.0:
+            place = shapely.maximum_inscribed_circle(scale(free, 1.0 / WIDE, 1.0, origin=(0.0, 0.0)), 0.05).coords[0]
+            return np.array(place) * [WIDE, 1.0]
+    return np.asarray(rings[0].mean(axis=0), np.float64)
 
 
 def opening_name(building: Building, opening: int) -> str:
@@ -141,7 +167,7 @@ def wall_boxes(building: Building, wall: int) -> Iterator[tuple[float, float, fl
     """Yield the solid boxes of a wall: begin and end along it, bottom and top above its storey's floor, and if any of it was seen."""
     start, end = building.walls_m[wall]
     low, high = storey_levels(building, int(building.wall_storeys[wall]))
-    length = float(np.linalg.norm(end - start))
+    length = float(norm(end - start))
     mine = np.nonzero(building.opening_walls == wall)[0]
     blind = [row[1:] for row in building.unseen if int(row[0]) == wall]
     cuts = np.unique(np.clip([0.0, length, *building.spans_m[mine].ravel(), *np.ravel(blind)], 0.0, length))

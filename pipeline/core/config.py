@@ -95,6 +95,7 @@ class RunOptions:
     only: list[str] = dataclasses.field(default_factory=list)  # stages that a replay computes again; [] = all
     feedback: Feedback = Feedback.new
     report: str = ""  # a command that is given the folder of a sweep when all its jobs are done, for example: benchmark rotations
+    dry_run: bool = False  # of a sweep: say which jobs it has, and run none
     sequences: list[str] = dataclasses.field(default_factory=list)  # of a sweep: KIND:FOLDER and options after blanks, see sweep.words_of_sequence
     alternatives: list[str] = dataclasses.field(default_factory=list)  # of a sweep: words tried one at a time, see sweep.words_of_alternatives
     record: RecordOptions = dataclasses.field(default_factory=RecordOptions)
@@ -231,11 +232,16 @@ def check_added(overrides: Iterable[str]) -> None:
 
 def composed(overrides: Iterable[str], recorded: RecordedConfig | None = None) -> DictConfig:
     """Compose the configuration that `trihedron run` makes of these overrides, over the values of a recording. Raises TrihedronError, one line."""
+    return composed_each([overrides], recorded)[0]
+
+
+def composed_each(overrides: Iterable[Iterable[str]], recorded: RecordedConfig | None = None) -> list[DictConfig]:
+    """Compose one configuration for each list of overrides. Raises TrihedronError, one line."""
     load_plugins()
     register_configs(recorded)
     try:
         with initialize_config_module("trihedron.conf", version_base="1.3"):
-            return compose("root", overrides=with_literal_paths(overrides))
+            return [compose("root", overrides=with_literal_paths(words)) for words in overrides]
     except Exception as error:
         raise rewritten(error) from error
 
@@ -273,9 +279,6 @@ def _unknown_option(group: str, name: str, options: list[str]) -> TrihedronError
 def _unknown_key(key: str) -> TrihedronError:
     group, _, option = key.rpartition(".")
     if group in SLOTS:
-        removed = {name: cure for plugin in plugins_of(group).values() for name, cure in getattr(plugin, "removed_options", {}).items()}
-        if option in removed:
-            return ConfigError(key, "this option was removed", removed[option])
         owners = {name: {f.name for f in options_of(plugin)} for name, plugin in plugins_of(group).items()}
         having = sorted(name for name, options in owners.items() if option in options)
         all_options = {known for options in owners.values() for known in options}

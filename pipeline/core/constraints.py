@@ -1,7 +1,7 @@
 """Declarations beside a field's type: what its numbers may be, and what an index refers to.
 
 `keypoints: Annotated[I32, Shape("n", 2), IndexInto("previous_keypoints", "keypoints")]` pairs rows of two inputs of the same stage. A plugin's own
-values are not checked against them; values that come from a file are, in `pipeline.run.value_checks`, so that compiled kernels need no checks.
+values are not checked against them; values that come from a file are, in `pipeline.core.value_checks`, so that compiled kernels need no checks.
 """
 
 from __future__ import annotations

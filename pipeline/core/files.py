@@ -37,7 +37,10 @@ def open_file(path: Path) -> BinaryIO:
 def read_file(path: Path, limit: int) -> bytes:
     """Return the bytes of a regular file. Raises OSError for another kind of file, and for more than `limit` bytes."""
     with open_file(path) as file:
-        data = file.read(limit + 1) if os.fstat(file.fileno()).st_size <= limit else None
+        size = os.fstat(file.fileno()).st_size
+        data = file.read(size + 1) if size <= limit else None  # not `limit`: so much memory is allocated before the first byte is read
+        if data is not None and len(data) > size:  # it grows, or is of /proc
+            data += file.read(limit + 1 - len(data))
     if data is None or len(data) > limit:
         raise OSError(errno.EFBIG, f"it has more than {limit} bytes")
     return data

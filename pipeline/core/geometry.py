@@ -1,4 +1,4 @@
-"""Rotations, rigid motions, planes, and numbers on a line: small, exact, NumPy and plain numbers only. Frames and signs as in `types`."""
+"""Rotations, rigid motions, planes, and numbers on a line: small and exact. Frames and signs as in `types`."""
 
 from __future__ import annotations
 
@@ -7,65 +7,11 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
+from trihedron.pipeline.core.linalg import matmul
+from trihedron.pipeline.core.linalg_kernels import polar_rotation
 from trihedron.pipeline.core.types import F64
 
-
-def skew(v: F64) -> F64:
-    """Return the (3, 3) matrix of the cross product: `skew(v) @ x = v × x`."""
-    return np.array([[0.0, -v[2], v[1]], [v[2], 0.0, -v[0]], [-v[1], v[0], 0.0]])
-
-
-def exp_so3(phi: F64) -> F64:
-    """Map a (3,) rotation vector (rad) to its (3, 3) rotation (Rodrigues)."""
-    x, y, z = phi.tolist()  # plain numbers: NumPy takes five times as long for so few
-    angle2 = x * x + y * y + z * z
-    if angle2 < 1e-12:
-        a, b = 1.0 - angle2 / 6.0, 0.5 - angle2 / 24.0
-    else:
-        angle = math.sqrt(angle2)
-        a, b = math.sin(angle) / angle, (1.0 - math.cos(angle)) / angle2
-    xy, xz, yz = b * (x * y), b * (x * z), b * (y * z)
-    x2, y2, z2, x, y, z = x * x, y * y, z * z, a * x, a * y, a * z
-    return np.array([[1.0 - b * (y2 + z2), xy - z, xz + y], [xy + z, 1.0 - b * (x2 + z2), yz - x], [xz - y, yz + x, 1.0 - b * (x2 + y2)]])
-
-
-def log_so3(R: F64) -> F64:
-    """Map a (3, 3) rotation to its (3,) rotation vector, angle in [0, π]; inverse of `exp_so3`."""
-    x, y, z, w = _quaternion(R)
-    s = math.sqrt(x * x + y * y + z * z)
-    factor = 2.0 / w if s < 1e-9 else 2.0 * math.atan2(s, w) / s
-    return np.array([factor * x, factor * y, factor * z])
-
-
-def left_jacobian_so3(phi: F64) -> F64:
-    """Return the left Jacobian V (3, 3) of SO(3): `exp_se3(rho, phi).t = V rho`."""
-    angle2 = float(phi @ phi)
-    angle = np.sqrt(angle2)
-    K = skew(phi)
-    if angle2 < 1e-10:
-        return np.eye(3) + 0.5 * K + K @ K / 6.0
-    a, b = (1.0 - np.cos(angle)) / angle2, (angle - np.sin(angle)) / (angle2 * angle)
-    return np.asarray(np.eye(3) + a * K + b * (K @ K), np.float64)
-
-
-def exp_se3(xi: F64) -> F64:
-    """Map a (6,) twist (rho, phi) to its (4, 4) rigid motion."""
-    return pose_matrix(exp_so3(xi[3:]), left_jacobian_so3(xi[3:]) @ xi[:3])
-
-
-def log_se3(T: F64) -> F64:
-    """Map a (4, 4) rigid motion to its (6,) twist (rho, phi); inverse of `exp_se3`."""
-    phi = log_so3(T[:3, :3])
-    return np.concatenate([np.linalg.solve(left_jacobian_so3(phi), T[:3, 3]), phi])
-
-
-def adjoint(T: F64) -> F64:
-    """Return the adjoints (..., 6, 6) of (..., 4, 4) rigid motions: `T Exp(xi) T⁻¹ = Exp(Ad xi)`, translation first."""
-    R, t = T[..., :3, :3], T[..., :3, 3]
-    out = np.zeros((*T.shape[:-2], 6, 6))
-    out[..., :3, :3] = out[..., 3:, 3:] = R
-    out[..., :3, 3:] = -np.cross(R, t[..., None], axisa=-2, axisb=-2, axisc=-2)
-    return out
+ROUNDING = 1e-12  # of RRᵀ - I, above which a rotation is made one again
 
 
 def pose_matrix(R: F64, t: F64) -> F64:
@@ -80,25 +26,25 @@ def invert(T: F64) -> F64:
     R = T[..., :3, :3].swapaxes(-1, -2)
     out = np.zeros(T.shape)
     out[..., :3, :3] = R
-    out[..., :3, 3:] = -(R @ T[..., :3, 3:])
+    out[..., :3, 3:] = -matmul(R, T[..., :3, 3:])
     out[..., 3, 3] = 1.0
     return out
 
 
 def transform(T_a_b: F64, points_b: F64) -> F64:
     """Transform (..., 3) points of frame b into frame a."""
-    return points_b @ T_a_b[:3, :3].T + T_a_b[:3, 3]
+    return matmul(points_b, T_a_b[:3, :3].T) + T_a_b[:3, 3]
 
 
 def transform_each(T_a_b: F64, points_b: F64) -> F64:
     """Transform (n, k, 3) points of frame b into frame a, each row by its own motion (n, 4, 4)."""
-    return points_b @ T_a_b[:, :3, :3].swapaxes(-1, -2) + T_a_b[:, None, :3, 3]
+    return matmul(points_b, T_a_b[:, :3, :3].swapaxes(-1, -2)) + T_a_b[:, None, :3, 3]
 
 
 def transform_planes(T_a_b: F64, planes_b: F64) -> F64:
     """Transform (..., 4) planes (n, d) of frame b into frame a, signs as they are: d may become negative."""
-    n = planes_b[..., :3] @ T_a_b[:3, :3].T
-    return np.concatenate([n, planes_b[..., 3:] - (n @ T_a_b[:3, 3])[..., None]], axis=-1)
+    n = matmul(planes_b[..., :3], T_a_b[:3, :3].T)
+    return np.concatenate([n, planes_b[..., 3:] - matmul(n, T_a_b[:3, 3])[..., None]], axis=-1)
 
 
 def tangent_basis(n: F64) -> F64:
@@ -116,23 +62,26 @@ def tangent_basis(n: F64) -> F64:
 
 
 def nearest_rotation(M: F64) -> F64:
-    """Return the rotation nearest to a (3, 3) matrix in the Frobenius norm (SVD with determinant +1)."""
-    U, _, Vt = np.linalg.svd(M)
-    U[:, 2] *= np.linalg.det(U @ Vt)
-    return np.asarray(U @ Vt, np.float64)
+    """Return the rotation nearest to a (3, 3) matrix in the Frobenius norm (determinant +1), by its polar decomposition."""
+    return polar_rotation(np.array(M, np.float64, order="C"))
 
 
-def rotation_angle_deg(R: F64) -> float:
-    """Return the angle of a rotation in degrees, accurate near 0."""
-    return math.degrees(math.hypot(*log_so3(R).tolist()))
+def rigid(T: F64) -> F64:
+    """Return the motion (4, 4) with the rotation nearest to its own; the same array within rounding.
+
+    `invert` takes the transpose for the inverse, which doubles a rotation's rounding error: in a chain of poses, each relative to the one before, it
+    would grow without bound."""
+    R = T[:3, :3]
+    return T if np.abs(matmul(R, R.T) - np.eye(3)).max() < ROUNDING else pose_matrix(nearest_rotation(R), T[:3, 3])
 
 
 def quaternion_from_rotation(R: F64) -> F64:
     """Convert a (3, 3) rotation to the unit quaternion (x, y, z, w) with w >= 0, by the largest diagonal term (no cancellation)."""
-    return np.array(_quaternion(R))
+    return np.array(quaternion_xyzw(R))
 
 
-def _quaternion(R: F64) -> tuple[float, float, float, float]:
+def quaternion_xyzw(R: F64) -> tuple[float, float, float, float]:
+    """Return the quaternion (x, y, z, w), w ≥ 0, of a rotation (3, 3), as plain numbers."""
     (a, b, c), (d, e, f), (g, h, i) = R.tolist()
     trace = a + e + i
     largest = max(a, e, i, trace)
@@ -167,9 +116,8 @@ def rotation_from_quaternion(q: F64) -> F64:
 def umeyama(estimate: F64, truth: F64) -> F64:
     """Align (n, 3) points by SE(3): the T (4, 4) that minimises `Σ |truth - T estimate|²` (Umeyama 1991, scale fixed to 1)."""
     mean_e, mean_t = estimate.mean(axis=0), truth.mean(axis=0)
-    U, _, Vt = np.linalg.svd((truth - mean_t).T @ (estimate - mean_e))
-    R = U @ np.diag([1.0, 1.0, np.sign(np.linalg.det(U) * np.linalg.det(Vt))]) @ Vt
-    return pose_matrix(R, mean_t - R @ mean_e)
+    R = nearest_rotation(matmul((truth - mean_t).T, estimate - mean_e))
+    return pose_matrix(R, mean_t - matmul(R, mean_e))
 
 
 def nearest_pairs(first: NDArray[np.int64], second: NDArray[np.int64], limit: int) -> NDArray[np.int64]:

@@ -29,6 +29,13 @@ def layout_of(source: Path) -> str:
     return next((name for name, groups in LAYOUTS.items() if all(any(_holds(source, pattern) for pattern in group) for group in groups)), "folder")
 
 
+def data_set_words(word: str) -> list[str]:
+    """Return a word of the command line that is a path instead of key=value as overrides that choose the data set by its files; another as it is."""
+    if "=" in word or word.startswith(("-", "~", "+")) or not (path := Path(word)).exists():
+        return [word]
+    return [f"dataset={layout_of(path)}", f"dataset.path={word}"]
+
+
 def _holds(folder: Path, pattern: str) -> bool:
     """Return whether a folder has a file of a pattern; with a slash at its end, a folder."""
     return any(path.is_dir() if pattern.endswith("/") else path.is_file() for path in folder.glob(pattern.rstrip("/")))

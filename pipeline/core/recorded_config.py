@@ -19,6 +19,7 @@ from trihedron.pipeline.core.errors import RecordingError, TrihedronError
 from trihedron.pipeline.core.files import YamlError, parse_yaml
 from trihedron.pipeline.core.overrides import literal_text
 from trihedron.pipeline.core.registry import load_plugins, plugin_class
+from trihedron.pipeline.core.renamed import current_option, current_plugin
 from trihedron.pipeline.core.slots import SLOTS
 
 ROOT_KEYS = ("seed", "outputs", "record", "load_map", "localise_only")  # of a run, besides slots and wires, that a replay takes
@@ -58,14 +59,15 @@ def _options(given: Any, slot: str, place: str) -> Mapping[str, Any]:
     """The options of a slot's plugin."""
     if not isinstance(given, dict) or not isinstance(given.get(PLUGIN_KEY), str):
         raise RecordingError(place, f"was made with '{slot}: {_shown(given)}', which names no plugin", CURE)
-    name = given[PLUGIN_KEY]
+    name = current_plugin(slot, given[PLUGIN_KEY])
     try:
         node = OmegaConf.structured(option_type(name, plugin_class(slot, name)))
     except TrihedronError as error:
         cause = f"was made with {slot}={_shown(name)}, and there is no such plugin for the slot '{slot}'"
         raise RecordingError(place, cause, "install the package that has it") from error
     for key, value in given.items():
-        if key != PLUGIN_KEY:
+        key = current_option(slot, name, key) if isinstance(key, str) else key
+        if key not in (PLUGIN_KEY, None):
             _typed(node, key, value, f"{slot}.{_shown(key)}", place)
     try:
         make_plugin(slot, node)

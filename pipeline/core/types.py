@@ -263,6 +263,9 @@ class Matches(Value):
 OK, DEGRADED, LOST = "ok", "degraded", "lost"
 
 
+CALIBRATION = 12  # parameters of a camera's calibration whose errors a pose's covariance counts
+
+
 @dataclass(frozen=True)
 class Pose(Value):
     """The camera's pose. A frame counts as tracked only with status ok or degraded, which need measurements of that very frame.
@@ -272,9 +275,16 @@ class Pose(Value):
     first; others have a world of their own until they are merged), `unrecognised` the number of frames of a lost camera without relocalisation.
 
     `covariance` is that of the pose in the world: `noise_scale` times the covariance relative to the landmarks near it, plus `map_covariance`, that
-    of these landmarks' common pose in the world. `noise_scale` is the variance of the residuals relative to the stated one."""
+    of these landmarks' common pose in the world, by drift and by an imperfect calibration. `noise_scale` is the variance of the residuals relative to
+    the stated one.
 
-    version: ClassVar[int] = 3
+    `repeats` is the number of images in a row, up to this one, that repeat the one before bit for bit.
+
+    The last five fields are what the pose's error owes to an imperfect calibration (`plugins.shared.calibration_error`, which defines the parameters
+    and their units): `sensitivity` is the derivative of the error by them, `calibration_information` and `calibration_score` what the residuals have
+    told of them so far. `twist` is the camera's velocity (m/s, rad/s) in its own frame, `reference_twist` that of the reference keyframe."""
+
+    version: ClassVar[int] = 4
 
     T_world_camera: Annotated[F64, Shape(4, 4), Rotations()]
     covariance: Annotated[F64, Shape(6, 6), Finite()]
@@ -288,6 +298,14 @@ class Pose(Value):
     unrecognised: int = 0
     map_covariance: Annotated[F64, Shape(6, 6), Finite()] = field(default_factory=lambda: np.zeros((6, 6)))
     noise_scale: Annotated[float, Finite()] = 1.0
+    repeats: int = 0
+    sensitivity: Annotated[F64, Shape(6, CALIBRATION), Finite()] = field(default_factory=lambda: np.zeros((6, CALIBRATION)))
+    twist: Annotated[F64, Shape(6), Finite()] = field(default_factory=lambda: np.zeros(6))
+    reference_twist: Annotated[F64, Shape(6), Finite()] = field(default_factory=lambda: np.zeros(6))
+    calibration_information: Annotated[F64, Shape(CALIBRATION, CALIBRATION), Finite()] = field(
+        default_factory=lambda: np.zeros((CALIBRATION, CALIBRATION))
+    )
+    calibration_score: Annotated[F64, Shape(CALIBRATION), Finite()] = field(default_factory=lambda: np.zeros(CALIBRATION))
 
     @property
     def local_covariance(self) -> F64:
@@ -399,6 +417,8 @@ KEYFRAMES = Columns(
         "T_world_camera": ("f8", (4, 4), Rotations()),
         "covariance": ("f8", (6, 6), Finite()),
         "world_covariance": ("f8", (6, 6), Finite()),
+        "sensitivity": ("f8", (6, CALIBRATION), Finite()),
+        "twist": ("f8", (6,), Finite()),
         "intrinsics": ("f8", (4,), Finite()),
         "points": ("i4", (2,), IndexInto(".point_observations+")),
         "lines": ("i4", (2,), IndexInto(".line_observations+")),
@@ -462,10 +482,10 @@ PLANE_OBSERVATIONS = Columns(
 class Map(Value):
     """Keyframes and landmarks; a row number is an id for good, dead rows have `alive` False. Columns are listed in `plugins.mapping.landmarks`.
 
-    `revision` counts versions, `loop_closed` is that of the last one with a correction by `loop`; a row of `point_observations` and its siblings is a
-    keyframe (row), a landmark, and its measurement."""
+    `revision` counts versions, `loop_closed` is that of the last one with a correction by `loop` or a merged sub-map; a row of `point_observations`
+    and its siblings is a keyframe (row), a landmark, and its measurement."""
 
-    version: ClassVar[int] = 6
+    version: ClassVar[int] = 7
     revision: int
     keyframes: Annotated[Table, KEYFRAMES]
     points: Annotated[Table, POINTS]

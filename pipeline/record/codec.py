@@ -6,6 +6,7 @@ Nothing here evaluates what it reads, and nothing is allocated that the file doe
 
 from __future__ import annotations
 
+import dataclasses
 import json
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -35,8 +36,9 @@ from trihedron.pipeline.record.array_codec import (
 from trihedron.pipeline.record.schemas import PACKAGE, TIMING, VALUE_TYPES, hints_of, is_nested, message_class, own_fields
 from trihedron.pipeline.record.table_codec import TableReader, TableWriter, bytes_of, change_of, joined, messages_back
 
-FORMAT = "5"
-READABLE = ("3", "4", FORMAT)  # until 4 all values were of one schema; in 3 a table was always a change of the message before
+FORMAT = "6"
+# until 5 embedded images were values; until 4 all values were of one schema; in 3 a table was always a change of the message before
+READABLE = ("3", "4", "5", FORMAT)
 METADATA = "trihedron"  # the name of the metadata record
 FRAMES_TOPIC = "frames"  # one FrameReference a frame: what a replay iterates over
 TIMING_TOPIC = "/timing"
@@ -254,8 +256,11 @@ def timing_of(data: bytes) -> dict[str, Any]:
 
 
 def _make(kind: Any, fields: Mapping[str, Any], prefix: str) -> Any:
-    """Rebuild a (nested) dataclass from dotted fields."""
+    """Rebuild a (nested) dataclass from dotted fields; a number or text that a message does not hold, written before the field was added, is the
+    field's default."""
+    later = {one.name for one in dataclasses.fields(kind) if one.default is not dataclasses.MISSING}
     made = {}
     for name, hint in hints_of(kind).items():
-        made[name] = _make(hint, fields, f"{prefix}{name}.") if is_nested(hint) else fields[prefix + name]
+        if prefix + name in fields or is_nested(hint) or name not in later:
+            made[name] = _make(hint, fields, f"{prefix}{name}.") if is_nested(hint) else fields[prefix + name]
     return kind(**made)

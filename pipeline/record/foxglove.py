@@ -17,7 +17,9 @@ import numpy as np
 from foxglove_schemas_protobuf.Log_pb2 import Log
 from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
 
-from trihedron.pipeline.core.geometry import invert, rotation_angle_deg
+from trihedron.pipeline.core.geometry import invert
+from trihedron.pipeline.core.lie import rotation_angle_deg
+from trihedron.pipeline.core.linalg import matmul, norm
 from trihedron.pipeline.core.types import (
     F64,
     LOST,
@@ -61,7 +63,7 @@ def _error_class() -> Any:
 ErrorMessage = _error_class()
 
 
-class View:
+class TopicView:
     """Turns values into viewer messages, thinned by the frames' stamps (so the same run gives the same messages). Poses are compared with `truth`."""
 
     def __init__(self, truth: Trajectory | None = None) -> None:
@@ -125,8 +127,8 @@ class View:
         T = self._true_pose(pose)
         if T is not None:
             yield "/view/truth", show.in_frame(pose, T)
-            error = invert(T) @ pose.T_world_camera
-            translation_m = float(np.linalg.norm(error[:3, 3]))
+            error = matmul(invert(T), pose.T_world_camera)
+            translation_m = float(norm(error[:3, 3]))
             yield "/error", ErrorMessage(translation_m=translation_m, rotation_deg=float(rotation_angle_deg(error[:3, :3])))
 
     def _true_pose(self, pose: Pose) -> F64 | None:
@@ -137,8 +139,8 @@ class View:
         if abs(int(self._truth.stamps_ns[row]) - pose.stamp_ns) > TRUTH_NS:
             return None
         if self._T_world_truth is None:
-            self._T_world_truth = pose.T_world_camera @ invert(self._truth.poses[row])
-        return np.asarray(self._T_world_truth @ self._truth.poses[row])
+            self._T_world_truth = matmul(pose.T_world_camera, invert(self._truth.poses[row]))
+        return np.asarray(matmul(self._T_world_truth, self._truth.poses[row]))
 
     def _due(self, name: str, stamp_ns: int, period_ns: int) -> bool:
         last = self._last_ns.get(name)

@@ -29,6 +29,7 @@ from google.protobuf.timestamp_pb2 import Timestamp
 
 from trihedron.pipeline.core.building_geometry import MODEL_COLORS, parts_of
 from trihedron.pipeline.core.geometry import quaternion_from_rotation, tangent_basis
+from trihedron.pipeline.core.linalg import matmul
 from trihedron.pipeline.core.types import (  # fmt: skip
     F32,
     F64,
@@ -160,7 +161,7 @@ def planes(planes: Planes) -> SceneUpdate:
     """Each region as the convex hull of its samples, in the camera frame."""
     update, entity = _scene(planes, "planes")
     samples, points = planes.samples_m, _repeated(TriangleListPrimitive, "points", planes.samples_m).reshape(planes.samples_m.shape[:2])
-    flat = (samples @ tangent_basis(planes.coefficients[:, :3])).astype(np.float32)
+    flat = matmul(samples, tangent_basis(planes.coefficients[:, :3])).astype(np.float32)
     for i, finite in enumerate(np.isfinite(samples[:, :, 0])):
         seen = np.flatnonzero(finite)
         if len(seen) < 3:
@@ -253,7 +254,7 @@ def building(building: Building) -> SceneUpdate:
         mesh = entity.triangles.add(
             pose=IDENTITY, indices=part.triangles.ravel().tolist(), color=_color((r / 255.0, g / 255.0, b / 255.0), a / 255.0)
         )
-        _fill(mesh, "points", part.vertices_m @ T[:3, :3].T + T[:3, 3])
+        _fill(mesh, "points", matmul(part.vertices_m, T[:3, :3].T) + T[:3, 3])
     return update
 
 

@@ -375,6 +375,15 @@ def damaged(path: Path | str) -> RecordingError:
     return RecordingError(str(path), cause, f"rescue what is whole with: trihedron recover {path}")
 
 
+def in_use(path: Path | str) -> bool:
+    """Return whether a process is writing the file; False where it cannot be opened."""
+    try:
+        with open(path, "rb") as file:
+            return is_being_written(file.fileno(), fcntl.LOCK_SH)
+    except OSError:
+        return False
+
+
 def is_being_written(descriptor: int, lock: int = fcntl.LOCK_EX) -> bool:
     """Return whether another process holds the file's lock, and take it if not. False where the file system has no locks."""
     try:

@@ -1,4 +1,4 @@
-"""Read a recording: topics in frame order, or one frame alone."""
+"""Read a recording: topics in frame order, or one frame alone. Values are checked here, so that nothing behind needs to."""
 
 from __future__ import annotations
 
@@ -10,8 +10,10 @@ from pathlib import Path
 from mcap.records import Channel, ChunkIndex
 
 from trihedron.pipeline.core.errors import RecordingError
-from trihedron.pipeline.core.types import Value
+from trihedron.pipeline.core.types import FrameReference, Value
+from trihedron.pipeline.core.value_checks import checked
 from trihedron.pipeline.record.codec import FRAMES_TOPIC, METADATA, READABLE, UPGRADE, Decoder, builds_on, is_value_schema
+from trihedron.pipeline.record.embedded_images import COLOR, DAMAGED, DEPTH, PARTS, frame_of, topic_of
 from trihedron.pipeline.record.mcap_file import McapFile, damaged
 
 
@@ -30,12 +32,19 @@ class Recording:
         self.channels: dict[str, Channel] = {c.topic: c for c in self._file.channels.values()}
         self.counts = {c.topic: self._file.counts.get(c.id, 0) for c in self.channels.values()}
         self.topics = {t[1:] for t, c in self.channels.items() if is_value_schema(self._file.schema_name(c.id))}
+        self.embedded = {topic_of(channel) for channel in self.channels if channel.endswith(COLOR) and self._has_images(topic_of(channel))}
+        self.topics |= self.embedded
         self._chunks: dict[str, list[ChunkIndex]] = {}
         if self.metadata.get("format") not in READABLE:
             written = " ".join(["trihedron", self.metadata.get("version", ""), self.metadata.get("commit", "")[:7]]).strip()
             form = self.metadata.get("format")
             cause = f"has format {form} of {written}, this program reads formats {READABLE[0]} to {READABLE[-1]}: {self._difference()}"
             raise RecordingError(str(path), cause, UPGRADE)
+
+    def _has_images(self, topic: str) -> bool:
+        """Return True if the channels of a topic's images are there, with the types of images."""
+        channels = {f"/{topic}{part}": kind.DESCRIPTOR.full_name for part, kind in PARTS.items()}
+        return all(name in self.channels and self._file.schema_name(self.channels[name].id) == kind for name, kind in channels.items())
 
     def _difference(self) -> str:
         """Why this program cannot read a recording of another format: the types of its first messages, those with other fields first."""
@@ -64,22 +73,47 @@ class Recording:
         for chunk in self._holding(channel):
             yield from self._file.in_chunk(chunk, self.channels[channel].id)
 
-    def values(self, topic: str) -> Iterator[Value]:
-        """The values of a topic in frame order."""
-        decoder = self._decoder(topic)
+    def values(self, topic: str, check: bool = True) -> Iterator[Value]:
+        """The values of a topic in frame order, each checked by itself unless they are only compared. Raises RecordingError for a value that breaks
+        the declarations of its type."""
+        if topic in self.embedded:
+            for frame in self._frames(topic):
+                yield checked(topic, frame, str(self.path), _expected(topic)) if check else frame
+            return
+        decoder, place = self._decoder(topic), str(self.path)
         for _, data in self.messages(f"/{topic}"):
-            yield decoder.decode(data)
+            value = decoder.decode(data)
+            yield checked(topic, value, place, _expected(topic)) if check else value
 
-    def frame(self, index: int) -> dict[str, Value]:
-        """Read the values of every topic at one frame; empty when there is none of this number. Reads only the chunks it needs."""
+    def _frames(self, topic: str) -> Iterator[Value]:
+        """The frames of embedded images, whose numbers and cameras are in the topic `frames`."""
+        references, place = self.values(FRAMES_TOPIC), f"{self.path}: topic /{topic}"
+        for (stamp_ns, color), (depth_ns, depth) in zip(self.messages(f"/{topic}{COLOR}"), self.messages(f"/{topic}{DEPTH}")):
+            reference = next((value for value in references if value.stamp_ns == stamp_ns), None)
+            if not isinstance(reference, FrameReference) or depth_ns != stamp_ns:
+                raise RecordingError(place, f"has images of the time {stamp_ns / 1e9:.9f} s, at which it has no frame", DAMAGED)
+            yield frame_of(reference, color, depth, place)
+
+    def frame(self, index: int, check: bool = True) -> dict[str, Value]:
+        """Read the values of every topic at one frame, checked as in `values`; empty when there is none of this number. Reads only the chunks it
+        needs."""
         reference = self._reference(index)
         if reference is None:
             return {}
-        found = {topic: self.value(topic, reference.stamp_ns) for topic in sorted(self.topics)}
+        found = {topic: self.value(topic, reference.stamp_ns, check) for topic in sorted(self.topics)}
         return {topic: value for topic, value in found.items() if value is not None and value.index == index}
 
-    def value(self, topic: str, stamp_ns: int) -> Value | None:
-        """The value of a topic with this stamp, or None."""
+    def value(self, topic: str, stamp_ns: int, check: bool = True) -> Value | None:
+        """The value of a topic with this stamp, checked as in `values`, or None."""
+        if topic in self.embedded:
+            reference, color, depth = (
+                self.value(FRAMES_TOPIC, stamp_ns, check),
+                *(self._message(f"/{topic}{part}", stamp_ns) for part in (COLOR, DEPTH)),
+            )
+            if not isinstance(reference, FrameReference) or color is None or depth is None:
+                return None
+            frame = frame_of(reference, color, depth, f"{self.path}: topic /{topic}")
+            return checked(topic, frame, str(self.path), _expected(topic)) if check else frame
         chain: list[bytes] = []
         channel, skipped = f"/{topic}", 0
         for chunk in reversed(self._holding(channel)):
@@ -95,8 +129,18 @@ class Recording:
                     chain.append(data)
                     back = builds_on(data)
                     if back == 0:
-                        return self._decoder(topic).decode_last(chain[::-1])
+                        value = self._decoder(topic).decode_last(chain[::-1])
+                        return checked(topic, value, str(self.path), _expected(topic)) if check else value
                     skipped = back - 1
+        return None
+
+    def _message(self, channel: str, stamp_ns: int) -> bytes | None:
+        """The message of a channel with this stamp, or None."""
+        for chunk in self._holding(channel):
+            if chunk.message_start_time <= stamp_ns <= chunk.message_end_time:
+                for log_time, data in self._file.in_chunk(chunk, self.channels[channel].id):
+                    if log_time == stamp_ns:
+                        return data
         return None
 
     def _holding(self, channel: str) -> list[ChunkIndex]:
@@ -123,11 +167,16 @@ class Recording:
         return None
 
 
+def _expected(topic: str) -> type[Value]:
+    """The type of the values of a topic that is of no slot."""
+    return FrameReference if topic == FRAMES_TOPIC else Value
+
+
 class TopicReader:
     """A topic of a recording, read frame by frame in increasing order."""
 
-    def __init__(self, recording: Recording, topic: str) -> None:
-        self._values = recording.values(topic)
+    def __init__(self, recording: Recording, topic: str, check: bool = True) -> None:
+        self._values = recording.values(topic, check)
         self._next: deque[Value] = deque()
         self.latest: Value | None = None  # the last value before the requested frame
 

@@ -8,6 +8,7 @@ import numpy as np
 
 from trihedron.pipeline.core.building_geometry import MODEL_COLORS, parts_of, rings_of
 from trihedron.pipeline.core.libraries import imports_of
+from trihedron.pipeline.core.linalg import matmul
 from trihedron.pipeline.core.types import OK, Building, Camera, Frame, Keypoints, ManhattanFrame, Map, Planes, Pose, Segments, Surface, Value
 from trihedron.pipeline.record.foxglove_messages import AXES, COLORS
 
@@ -154,13 +155,13 @@ def _show_building(stream: Any, value: Building) -> None:
     stream.log("world/building", rerun.Clear(recursive=True))
     T = value.T_world_building
     for part in parts_of(value, ceilings=False):
-        vertices = part.vertices_m @ T[:3, :3].T + T[:3, 3]
+        vertices = matmul(part.vertices_m, T[:3, :3].T) + T[:3, 3]
         color = np.tile(np.array(MODEL_COLORS[part.kind], np.uint8), (len(vertices), 1))
         mesh = rerun.Mesh3D(vertex_positions=vertices, triangle_indices=part.triangles, vertex_colors=color)
         stream.log(f"world/building/{part.storey}/{part.kind}", mesh)
     for room, (area, storey) in enumerate(zip(value.areas_m2, value.room_storeys)):
         ring, height = rings_of(value, room)[0], float(np.nan_to_num(value.storeys[storey, 0]))
-        closed = np.column_stack([ring, np.full(len(ring), height)])[[*range(len(ring)), 0]] @ T[:3, :3].T + T[:3, 3]
+        closed = matmul(np.column_stack([ring, np.full(len(ring), height)])[[*range(len(ring)), 0]], T[:3, :3].T) + T[:3, 3]
         stream.log(f"world/building/room_{room}", rerun.LineStrips3D([closed], labels=[f"room {room}: {area:.1f} m²"], colors=(40, 40, 40)))
 
 

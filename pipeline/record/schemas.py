@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import dataclasses
 import inspect
+import threading
 from collections.abc import Iterator, Mapping
 from functools import cache
 from typing import Any, get_type_hints
@@ -153,11 +154,19 @@ def _timing_file() -> Any:
 
 _ARRAYS = _array_file()
 _POOL: Any = descriptor_pool.DescriptorPool()
+_FILES: dict[str, Any] = {}  # those in the pool
+_ADDING = threading.RLock()
 
 
-@cache
 def _added(name: str) -> Any:
-    """Add the file that declares a message to the pool, with those it needs; returns it."""
+    """Add the file that declares a message to the pool, with those it needs; returns it. Several recordings may be written at once."""
+    with _ADDING:
+        if name not in _FILES:
+            _FILES[name] = _add(name)
+        return _FILES[name]
+
+
+def _add(name: str) -> Any:
     makers = {"Array": lambda: _ARRAYS, "Value": _value_file, "Timing": _timing_file}
     file = makers[name]() if name in makers else _type_file(VALUE_TYPES[name])
     if file.dependency:

@@ -14,6 +14,7 @@ from trihedron.pipeline.core.files import SHOWN, read_text
 from trihedron.pipeline.core.geometry import pose_matrix, quaternion_from_rotation, rotation_from_quaternion
 from trihedron.pipeline.core.types import F64, Trajectory
 
+MAX_DISTANCE_M = 1e9  # from the origin; positions of GNSS are within 1e7 m
 TRUTH = "groundtruth.txt"  # in a folder, and attached to a recording, so that a replay is judged without the folder
 MAX_STAMP_S = 2**62 // 1_000_000_000  # what fits into 64 bits of nanoseconds
 MAX_BYTES, MAX_LINES, MAX_LINE = 1 << 26, 1_000_000, 4096  # of a list or trajectory: bytes, lines, characters of a line
@@ -94,6 +95,8 @@ def _parse_pose(words: list[str]) -> tuple[int, F64]:
         raise ValueError("a column is not a number") from None
     if not np.isfinite(values).all():
         raise ValueError("the pose is not finite")
+    if np.abs(values[:3]).max() > MAX_DISTANCE_M:
+        raise ValueError(f"the position is beyond {MAX_DISTANCE_M:.0e} m")
     if math.hypot(*values[3:].tolist()) < 1e-3:
         raise ValueError("the quaternion is zero")
     return stamp_ns, pose_matrix(rotation_from_quaternion(values[3:]), values[:3])

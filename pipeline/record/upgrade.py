@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import partial
@@ -10,8 +11,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from mcap_protobuf.schema import build_file_descriptor_set
 
 from trihedron.pipeline.core.errors import RecordingError, printable
+from trihedron.pipeline.core.types import CALIBRATION, Frame
 from trihedron.pipeline.record.codec import (
     FORMAT,
     FRAMES_TOPIC,
@@ -23,6 +26,7 @@ from trihedron.pipeline.record.codec import (
     is_value_schema,
     timing_of,
 )
+from trihedron.pipeline.record.embedded_images import messages_of
 from trihedron.pipeline.record.mcap_file import McapFile, damaged
 from trihedron.pipeline.record.mcap_writer import McapWriter
 from trihedron.pipeline.record.schemas import PACKAGE, definition, message_class
@@ -31,9 +35,22 @@ RENAMED_TYPES: dict[str, str] = {}  # name in an older recording -> name today, 
 RENAMED_FIELDS: dict[str, dict[str, str]] = {}  # type today -> older name of a field or table -> name today
 ADDED_FIELDS: dict[tuple[str, int], dict[str, Any]] = {  # type and older version -> fields that it lacks
     ("Pose", 2): {"map_covariance": np.zeros((6, 6)), "noise_scale": 1.0},
+    ("Pose", 3): {
+        "sensitivity": np.zeros((6, CALIBRATION)),
+        "twist": np.zeros(6),
+        "reference_twist": np.zeros(6),
+        "calibration_information": np.zeros((CALIBRATION, CALIBRATION)),
+        "calibration_score": np.zeros(CALIBRATION),
+    },
     ("Map", 5): {"loop_closed": 0},
 }
-ADDED_COLUMNS = {("Map", 4): ("keyframes", "world_covariance", "covariance")}  # likewise -> table, the column that it lacks, and that which it copies
+# likewise -> the columns of keyframes that it lacks, each a copy of the column `covariance`, or zeros of this shape wherever that changes
+ADDED_COLUMNS: dict[tuple[str, int], dict[str, tuple[int, ...] | None]] = {
+    ("Map", 4): {"world_covariance": None},
+    ("Map", 6): {"sensitivity": (6, CALIBRATION), "twist": (6,)},
+}
+
+_Schema = tuple[str, str, bytes, str]  # name, encoding, content, and the encoding of its messages
 
 
 @dataclass
@@ -79,28 +96,39 @@ def _copy(file: McapFile, writer: McapWriter, unreadable: dict[int, str], result
     writer.metadata(METADATA, {**file.metadata[METADATA], "format": FORMAT})
     for name, data in file.attachments.items():
         writer.attach(name, data.decode("utf-8", "replace"))
-    numbers: dict[int, int] = {}
+    numbers: dict[str, int] = {}
     codecs: dict[int, tuple[Decoder, Encoder]] = {}
     for channel, log_time, data in file.messages():
         if channel in unreadable:
             continue
-        declared, schema = file.channels[channel], file.schemas.get(file.channels[channel].schema_id)
-        described = (schema.name, schema.encoding, schema.data, declared.message_encoding) if schema is not None else ("", "", b"", "")
-        if _is_value(file, channel):
-            decoder, encoder = codecs.setdefault(channel, (_decoder(file, channel), Encoder()))
-            value = decoder.decode(_renamed(data))
-            data, described = encoder.encode(value), _described(type(value).__name__)
-        elif declared.topic == TIMING_TOPIC:
-            data, described = bytes(message_class("Timing")(**timing_of(data)).SerializeToString()), _described("Timing")
-        if channel not in numbers:
-            numbers[channel] = writer.channel(declared.topic, *described)
-        message = (numbers[channel], log_time, data)
-        writer.add(len(data), partial(list, [message]))
+        for topic, described, content in _of_today(file, channel, data, codecs):
+            if topic not in numbers:
+                numbers[topic] = writer.channel(topic, *described)
+            writer.add(len(content), partial(list, [(numbers[topic], log_time, content)]))
         result.messages += 1
 
 
-def _described(name: str) -> tuple[str, str, bytes, str]:
-    """Name, encoding and content of a schema of today, and the encoding of its messages."""
+def _of_today(file: McapFile, channel: int, data: bytes, codecs: dict[int, tuple[Decoder, Encoder]]) -> Iterator[tuple[str, _Schema, bytes]]:
+    """The messages that take the place of one: channel, schema, content."""
+    declared, schema = file.channels[channel], file.schemas.get(file.channels[channel].schema_id)
+    if _is_value(file, channel):
+        decoder, encoder = codecs.setdefault(channel, (_decoder(file, channel), Encoder()))
+        value = decoder.decode(_renamed(data))
+        if isinstance(value, Frame):
+            for part, message in messages_of(value):
+                definition = build_file_descriptor_set(type(message)).SerializeToString()
+                described = (message.DESCRIPTOR.full_name, "protobuf", definition, "protobuf")
+                yield declared.topic + part, described, message.SerializeToString()
+        else:
+            yield declared.topic, _described(type(value).__name__), encoder.encode(value)
+    elif declared.topic == TIMING_TOPIC:
+        yield declared.topic, _described("Timing"), bytes(message_class("Timing")(**timing_of(data)).SerializeToString())
+    else:
+        described = (schema.name, schema.encoding, schema.data, declared.message_encoding) if schema is not None else ("", "", b"", "")
+        yield declared.topic, described, data
+
+
+def _described(name: str) -> _Schema:
     return f"{PACKAGE}.{name}", "protobuf", definition(name), "protobuf"
 
 
@@ -139,7 +167,8 @@ def _renamed(data: bytes) -> bytes:
         array.name = fields.get(name, name) + mark + rest
     if older in ADDED_COLUMNS:
         with suppress(Exception):  # a stranger's header, of which the decoder will say what is wrong
-            _copy_column(message, *ADDED_COLUMNS[older])
+            for column, shape in ADDED_COLUMNS[older].items():
+                _add_keyframe_column(message, column, shape)
     if older not in ADDED_FIELDS and older not in ADDED_COLUMNS:
         return bytes(message.SerializeToString())
     message.version += 1
@@ -150,16 +179,22 @@ def _renamed(data: bytes) -> bytes:
     return _renamed(bytes(message.SerializeToString()))  # which may be an older version still
 
 
-def _copy_column(message: Any, table: str, column: str, source: str) -> None:
-    """Add a column to a table, or to a change of it, as a copy of another one."""
+def _add_keyframe_column(message: Any, column: str, shape: tuple[int, ...] | None) -> None:
+    """Add a column to the table of keyframes, or to a change of it: a copy of `covariance`, or zeros of a shape."""
     arrays = {array.name: array for array in message.arrays}
-    header = json.loads(arrays[f"{table}#"].data)
-    if source not in header["schema"]:
+    header = json.loads(arrays["keyframes#"].data)
+    if "covariance" not in header["schema"]:
         return
-    header["schema"][column] = header["schema"][source]
-    if source in header["rows"]:
-        header["rows"][column] = header["rows"][source]
-        copied = message.arrays.add()
-        copied.CopyFrom(arrays[f"{table}#{source}"])
-        copied.name = f"{table}#{column}"
-    arrays[f"{table}#"].data = json.dumps(header).encode()
+    kind, source_shape, step = header["schema"]["covariance"]
+    header["schema"][column] = [kind, source_shape if shape is None else shape, step]
+    if "covariance" in header["rows"]:
+        header["rows"][column] = header["rows"]["covariance"]
+        copied, source = message.arrays.add(), arrays["keyframes#covariance"]
+        copied.CopyFrom(source)
+        copied.name = f"keyframes#{column}"
+        if shape is not None:
+            zeros = np.zeros((source.shape[0], *shape))
+            del copied.shape[:]
+            copied.shape.extend(zeros.shape)
+            copied.encoding, copied.data = "raw", zeros.tobytes()
+    arrays["keyframes#"].data = json.dumps(header).encode()

@@ -10,9 +10,10 @@ from typing import Any
 import numpy as np
 from mcap_protobuf.schema import build_file_descriptor_set
 
-from trihedron.pipeline.core.types import Value
+from trihedron.pipeline.core.types import Frame, Value
 from trihedron.pipeline.record.codec import FORMAT, FRAMES_TOPIC, METADATA, TIMING_TOPIC, Encoder
-from trihedron.pipeline.record.foxglove import View
+from trihedron.pipeline.record.embedded_images import messages_of
+from trihedron.pipeline.record.foxglove import TopicView
 from trihedron.pipeline.record.foxglove_server import FoxgloveServer
 from trihedron.pipeline.record.mcap_writer import McapWriter
 from trihedron.pipeline.record.schemas import PACKAGE, definition, message_class
@@ -60,7 +61,7 @@ class RecordingWriter:
         if self.path is not None:
             self._file.add(_memory_bytes(value), lambda: self._encoded(topic, value))
 
-    def show(self, view: View, value: Value, stamp_ns: int) -> None:
+    def show(self, view: TopicView, value: Value, stamp_ns: int) -> None:
         """Add the viewer messages of a value; they are drawn by the writer's thread."""
         if view.wants(value):
             self._file.add(_memory_bytes(value), lambda: [self._message(channel, message, stamp_ns) for channel, message in view.drawn(value)])
@@ -74,6 +75,8 @@ class RecordingWriter:
         self._file.add(0, lambda: [(self._own_channel(TIMING_TOPIC, "Timing"), stamp_ns, _timing(index, frame_ms, stage_ms, memory_mb))])
 
     def _encoded(self, topic: str, value: Value) -> list[tuple[int, int, bytes]]:
+        if isinstance(value, Frame):
+            return [self._message(f"/{topic}{part}", message, value.stamp_ns) for part, message in messages_of(value)]
         if topic not in self._encoders:
             self._encoders[topic] = Encoder()
         return [(self._own_channel(f"/{topic}", type(value).__name__), value.stamp_ns, self._encoders[topic].encode(value))]

@@ -50,13 +50,13 @@ class Accounting:
 
     def frame_read(self, position: int, began_s: float, ended_s: float, handed_over_s: float) -> None:
         """Note the call of the data set, and when the frame was there for the stages: the latency counts from then."""
-        times = self._at(position)
+        times = self.times_at(position)
         times.calls_ms["dataset"] = 1e3 * (ended_s - began_s)
         times.handed_over_s = handed_over_s
 
     def stage_called(self, position: int, stage: str, began_s: float, ended_s: float) -> None:
         """Note the call of another stage."""
-        times = self._at(position)
+        times = self.times_at(position)
         times.calls_ms[stage] = 1e3 * (ended_s - began_s)
         if stage == "pose":
             times.latency_ms = 1e3 * (ended_s - (began_s if times.handed_over_s is None else times.handed_over_s))
@@ -65,7 +65,7 @@ class Accounting:
         """Add the values of a frame to the result; False where the frame cannot be read. `late` frames do not count as unreadable.
 
         Raises DataError when too many of `count` frames cannot be read."""
-        times = self._at(position)
+        times = self.times_at(position)
         for name, ms in times.calls_ms.items():
             self.timing.add_call(name, ms)
         if "dataset" in values and values["dataset"] is None:
@@ -94,5 +94,6 @@ class Accounting:
         self.times.pop(position, None)
         self.stamps_ns.pop(index, None)
 
-    def _at(self, position: int) -> FrameTimes:
+    def times_at(self, position: int) -> FrameTimes:
+        """Return the times of a frame, for its calls to be added."""
         return self.times.setdefault(position, FrameTimes())

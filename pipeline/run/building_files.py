@@ -16,6 +16,8 @@ import numpy as np
 from trihedron.pipeline.core.building_geometry import (
     CEILING,
     MODEL_COLORS,
+    door_swing,
+    doors_on,
     label_place,
     open_edges,
     parts_of,
@@ -25,6 +27,7 @@ from trihedron.pipeline.core.building_geometry import (
     wall_corners,
     wall_pieces,
 )
+from trihedron.pipeline.core.linalg import norm
 from trihedron.pipeline.core.types import ELEMENTS, F64, OPENING_KINDS, SUPPORTS, Building
 
 JSON, SVG, DXF, GLB = "building.json", "floorplan.svg", "floorplan.dxf", "building.glb"
@@ -49,7 +52,7 @@ def summary(building: Building) -> str:
         (len(building.spans_m), "opening"),
     ]
     counted = ", ".join(f"{count} {name}{'s' if count != 1 else ''}" for count, name in counts)
-    area = f" of {building.areas_m2.sum():.1f} ± {np.sqrt(building.area_variance.sum()):.1f} m²" if len(building.areas_m2) else ""
+    area = f" of {building.areas_m2.sum():.2f} ± {np.sqrt(building.area_variance.sum()):.2f} m²" if len(building.areas_m2) else ""
     return f"building: {counted}{area}" + (f"; {building.note}" if building.note else "")
 
 
@@ -99,7 +102,7 @@ def _wall(building: Building, k: int) -> dict[str, Any]:
     start, end = building.walls_m[k]
     offset, thickness, angle = _sigmas(building.wall_covariance[k])
     return {
-        "storey": int(building.wall_storeys[k]), "start": _numbers(start), "end": _numbers(end), "length_m": _numbers(np.linalg.norm(end - start)),
+        "storey": int(building.wall_storeys[k]), "start": _numbers(start), "end": _numbers(end), "length_m": _numbers(norm(end - start)),
         "thickness_m": _numbers(building.thickness_m[k]), "offset_sigma_m": offset, "thickness_sigma_m": thickness, "direction_sigma_rad": angle,
         "unseen": [_numbers(row[1:]) for row in building.unseen if int(row[0]) == k], "support": _support(building, "wall", k),
     }  # fmt: skip
@@ -120,6 +123,7 @@ def _opening(building: Building, k: int) -> dict[str, Any]:
         "kind": OPENING_KINDS[building.opening_kinds[k]], "wall": int(building.opening_walls[k]), "rooms": building.opening_rooms[k].tolist(),
         "span_m": _numbers(building.spans_m[k]), "width_m": _numbers(np.ptp(building.spans_m[k])),
         "heights_m": _numbers(building.opening_heights_m[k]), "sigma_m": _sigmas(building.opening_covariance[k]),
+        "support": _support(building, "opening", k),
     }  # fmt: skip
 
 
@@ -191,12 +195,9 @@ def _svg_opening(building: Building, opening: int, at: Any) -> list[str]:
         return [f'<path class="glass" d="{_path(corners)}"/>']
     if kind == "passage":
         return []
-    hinge, tip = corners[0], corners[1]
-    inward = corners[0] - corners[3]
-    inward = inward / max(float(np.linalg.norm(inward)), 1e-9)
-    width = float(np.linalg.norm(tip - hinge))
-    leaf = hinge + width * inward
-    cross = (tip - hinge)[0] * inward[1] - (tip - hinge)[1] * inward[0]
+    hinge, tip, _, leaf = at(door_swing(building, opening))
+    width = float(norm(tip - hinge))
+    cross = (tip - hinge)[0] * (leaf - hinge)[1] - (tip - hinge)[1] * (leaf - hinge)[0]
     arc = f"M{leaf[0]:.1f} {leaf[1]:.1f} A{width:.1f} {width:.1f} 0 0 {1 if cross < 0 else 0} {tip[0]:.1f} {tip[1]:.1f}"
     return [
         f'<line class="leaf" x1="{hinge[0]:.1f}" y1="{hinge[1]:.1f}" x2="{leaf[0]:.1f}" y2="{leaf[1]:.1f}"/>',
@@ -204,25 +205,57 @@ def _svg_opening(building: Building, opening: int, at: Any) -> list[str]:
     ]  # fmt: skip
 
 
+def area_text(building: Building, room: int) -> str:
+    """Return the area of a room, with its standard deviation where walls were seen all round."""
+    area, sigma = float(building.areas_m2[room]), float(np.sqrt(building.area_variance[room]))
+    return f"{area:.2f} ± {sigma:.2f} m²" if building.closed[room] else f"{area:.2f} m² seen"
+
+
+LONGEST_UNLABELLED_M = 0.8
+ALONG = (0.5, 0.35, 0.65, 0.2, 0.8)  # shares of an edge where its length is written, the first that is free
+LETTERS_PX = {"name": 8.5, "area": 7.4, "length": 6.0, "small": 5.2}  # about the width of a letter
+
+
 def _svg_texts(building: Building, room: int, at: Any) -> list[str]:
+    """Write name and area of a room, and the lengths of its edges that are walls, beside each other and the swings of doors."""
+    import shapely
+
     x, y = at(label_place(building, room))
-    sigma, small = float(np.sqrt(building.area_variance[room])), " small" if np.ptp(rings_of(building, room)[0], axis=0).min() < NARROW_M else ""
+    small = " small" if np.ptp(rings_of(building, room)[0], axis=0).min() < NARROW_M else ""
+    name, area, below = f"room {room}", area_text(building, room), 11.0 if small else 17.0
     out = [
-        f'<text class="name{small}" x="{x:.1f}" y="{y:.1f}">room {room}</text>',
-        f'<text class="area{small}" x="{x:.1f}" y="{y + (11.0 if small else 17.0):.1f}">{building.areas_m2[room]:.2f} ± {sigma:.2f} m²</text>',
+        f'<text class="name{small}" x="{x:.1f}" y="{y:.1f}">{name}</text>',
+        f'<text class="area{small}" x="{x:.1f}" y="{y + below:.1f}">{area}</text>',
     ]
+    half = max(len(name) * LETTERS_PX["small" if small else "name"], len(area) * LETTERS_PX["small" if small else "area"]) / 2.0
+    taken = [shapely.box(x - half, y - below, x + half, y + below + 3.0)]
+    taken += [shapely.Polygon(at(door_swing(building, door))) for door in doors_on(building, int(building.room_storeys[room]))]
     for of, a, b in building.loops:
-        corners = building.corners_m[a:b]
-        for p, q in zip(corners, np.roll(corners, -1, axis=0)) if of == room else ():
-            length = float(np.linalg.norm(q - p))
-            if length < 0.8:
-                continue
-            along = (q - p) / length
-            place = at((p + q) / 2.0 + 0.16 * np.array([-along[1], along[0]]))
-            angle = (-float(np.degrees(np.arctan2(along[1], along[0]))) + 90.0) % 180.0 - 90.0
-            turn = f"rotate({angle:.1f} {place[0]:.1f} {place[1]:.1f})"
-            out.append(f'<text class="length" x="{place[0]:.1f}" y="{place[1] + 3.5:.1f}" transform="{turn}">{length:.2f}</text>')
+        corners, walls = building.corners_m[a:b], building.corner_walls[a:b]
+        for p, q, wall in zip(corners, np.roll(corners, -1, axis=0), walls) if of == room else ():
+            if wall >= 0 and norm(q - p) >= LONGEST_UNLABELLED_M:
+                text, box = _length_text(p, q, at, taken)
+                taken.append(box)
+                out.append(text)
     return out
+
+
+def _length_text(p: F64, q: F64, at: Any, taken: list[Any]) -> tuple[str, Any]:
+    """Write the length of an edge on its left where nothing is yet, and return its box."""
+    import shapely
+    from shapely.affinity import rotate
+
+    length = float(norm(q - p))
+    along = (q - p) / length
+    angle = (-float(np.degrees(np.arctan2(along[1], along[0]))) + 90.0) % 180.0 - 90.0
+    half = len(f"{length:.2f}") * LETTERS_PX["length"] / 2.0
+    found = []
+    for share in ALONG:
+        x, y = at(p + share * (q - p) + 0.16 * np.array([-along[1], along[0]]))
+        box = rotate(shapely.box(x - half, y - 5.0, x + half, y + 5.0), angle, origin=(x, y))
+        found.append((sum(box.intersection(other).area for other in taken), x, y, box))
+    _, x, y, box = min(found, key=lambda item: item[0])
+    return f'<text class="length" x="{x:.1f}" y="{y + 3.5:.1f}" transform="rotate({angle:.1f} {x:.1f} {y:.1f})">{length:.2f}</text>', box
 
 
 def _legend(building: Building, y: float) -> tuple[list[str], float]:
@@ -251,6 +284,7 @@ def write_dxf(path: Path, building: Building) -> None:
     """Write the plan as DXF R2010 in metres, with a layer for each of LAYERS."""
     import ezdxf
     from ezdxf import units
+    from ezdxf.enums import TextEntityAlignment
 
     document = ezdxf.filemanagement.new("R2010", setup=["linetypes"])
     document.units = units.M
@@ -266,8 +300,9 @@ def write_dxf(path: Path, building: Building) -> None:
                     space.add_lwpolyline((building.corners_m[a:b] + shift).tolist(), close=True, dxfattribs={"layer": "ROOMS"})
             for p, q in open_edges(building, room):
                 space.add_line((p + shift).tolist(), (q + shift).tolist(), dxfattribs={"layer": "UNSEEN"})
-            text = f"room {room}: {building.areas_m2[room]:.2f} m2"
-            space.add_text(text, height=0.15, dxfattribs={"layer": "TEXT"}).set_placement((label_place(building, room) + shift).tolist())
+            text = f"room {room}: {area_text(building, room)}"
+            label = space.add_text(text, height=0.15, dxfattribs={"layer": "TEXT"})
+            label.set_placement((label_place(building, room) + shift).tolist(), align=TextEntityAlignment.MIDDLE_CENTER)
         for wall in np.nonzero(building.wall_storeys == storey)[0]:
             for piece in wall_pieces(building, wall):
                 layer = "WALLS" if piece.seen else "UNSEEN"

@@ -14,6 +14,7 @@ import numpy as np
 
 from trihedron.pipeline.core.building_geometry import SHEET_M, opening_name, rings_of, rooms_on, storey_levels
 from trihedron.pipeline.core.libraries import imports_of
+from trihedron.pipeline.core.linalg import norm
 from trihedron.pipeline.core.types import F64, Building
 
 IFC = "model.ifc"
@@ -146,7 +147,7 @@ class _IfcWriter:
     def _wall(self, k: int, storey: Any) -> Any:
         (start, end), thickness = self.building.walls_m[k], float(self.building.thickness_m[k])
         low, high = storey_levels(self.building, int(self.building.wall_storeys[k]))
-        measured, length = bool(np.isfinite(thickness)), float(np.linalg.norm(end - start))
+        measured, length = bool(np.isfinite(thickness)), float(norm(end - start))
         depth = thickness if measured else SHEET_M
         wall = self._entity("IfcWall", f"wall {k}")
         self.api.spatial.assign_container(self.file, products=[wall], relating_structure=storey)
@@ -161,7 +162,7 @@ class _IfcWriter:
         number = int(self.building.opening_walls[k])
         (start, end), thickness = self.building.walls_m[number], float(self.building.thickness_m[number])
         depth = (thickness if np.isfinite(thickness) else SHEET_M) + 2.0 * MARGIN_M
-        along = (end - start) / max(float(np.linalg.norm(end - start)), 1e-9)
+        along = (end - start) / max(float(norm(end - start)), 1e-9)
         low, _ = storey_levels(self.building, int(self.building.wall_storeys[number]))
         (left, right), (bottom, top) = self.building.spans_m[k], self.building.opening_heights_m[k]
         opening = self._entity("IfcOpeningElement", opening_name(self.building, k))

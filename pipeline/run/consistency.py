@@ -14,7 +14,9 @@ from typing import Any
 
 import numpy as np
 
-from trihedron.pipeline.core.geometry import adjoint, exp_se3, invert, log_se3
+from trihedron.pipeline.core.geometry import invert
+from trihedron.pipeline.core.lie import adjoint, exp_se3, log_se3
+from trihedron.pipeline.core.linalg import inv, matmul, solve
 from trihedron.pipeline.core.types import F64, I32
 
 LIMIT_95 = 12.592  # χ² with 6 degrees of freedom
@@ -60,8 +62,8 @@ def truth_noise(poses: F64, local_covariances: F64, true_poses: F64, indices: I3
     first = np.flatnonzero(np.diff(indices) == 1)
     if not len(first):
         return TruthNoise()
-    moved, truly = (invert(T[first]) @ T[first + 1] for T in (poses, true_poses))
-    errors = np.array([log_se3(motion) for motion in invert(moved) @ truly])
+    moved, truly = (matmul(invert(T[first]), T[first + 1]) for T in (poses, true_poses))
+    errors = np.array([log_se3(motion) for motion in matmul(invert(moved), truly)])
     variances = np.diagonal(local_covariances, axis1=1, axis2=2)
     sigmas = []
     for part in (slice(0, 3), slice(3, 6)):
@@ -76,7 +78,7 @@ def pose_consistency(poses: F64, covariances: F64, true_poses: F64, noise: Truth
     noise = noise or TruthNoise()
     covariances = covariances + noise.covariance
     errors = gauge_free_errors(poses, covariances, true_poses)
-    nees = np.einsum("ni,nij,nj->n", errors, np.linalg.inv(covariances), errors)
+    nees = np.einsum("ni,nij,nj->n", errors, inv(covariances), errors)
     sigma = np.sqrt(np.diagonal(covariances, axis1=1, axis2=2))
     return Consistency(
         poses=len(poses),
@@ -91,22 +93,22 @@ def pose_consistency(poses: F64, covariances: F64, true_poses: F64, noise: Truth
 
 def gauge_free_errors(poses: F64, covariances: F64, true_poses: F64) -> F64:
     """Return the errors (n, 6), as xi, after the rigid motion between both worlds that the covariances (n, 6, 6) make most likely."""
-    information = np.asarray(np.linalg.inv(covariances), np.float64)
+    information = np.asarray(inv(covariances), np.float64)
     return _errors(poses, true_poses, _gauge(poses, information, true_poses))
 
 
 def _errors(poses: F64, true_poses: F64, T_truth_world: F64) -> F64:
     """Return (n, 6) xi with `T_true = T_truth_world · T · Exp(xi)`."""
-    motions = invert(T_truth_world @ poses) @ true_poses
+    motions = matmul(invert(matmul(T_truth_world, poses)), true_poses)
     return np.array([log_se3(motion) for motion in motions])
 
 
 def _gauge(poses: F64, information: F64, true_poses: F64) -> F64:
     """Return the (4, 4) rigid motion of the world into the truth's that minimises the weighted errors (Gauss–Newton)."""
-    T = true_poses[0] @ invert(poses[0])
+    T = matmul(true_poses[0], invert(poses[0]))
     J = adjoint(invert(poses))
     H = np.einsum("nji,njk,nkl->il", J, information, J)
     for _ in range(ITERATIONS):
         gradient = np.einsum("nji,njk,nk->i", J, information, _errors(poses, true_poses, T))
-        T = T @ exp_se3(np.linalg.solve(H, gradient))
+        T = matmul(T, exp_se3(solve(H, gradient)))
     return np.asarray(T)

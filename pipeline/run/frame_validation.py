@@ -10,15 +10,16 @@ from typing import Any
 import numpy as np
 
 from trihedron.pipeline.core.errors import DataError
-from trihedron.pipeline.core.types import F32, Frame
+from trihedron.pipeline.core.types import F32, U8, Frame
 from trihedron.pipeline.run.registration_check import RegistrationCheck
 
 log = logging.getLogger("trihedron")
 LATE_NS = 1_000_000_000  # a frame that comes this late or later was not late: the clock was set back
 CONSTANT = 0.95  # share of the readings with one value, from which an image of depth counts as constant
 CONSTANT_READINGS = 0.01  # of the image, without which nothing is constant
-STALE_NS = 50_000_000  # age from which repeated depth is wrong: a Kinect repeats single images at 30 a second
-CHANGED_LEVELS, CHANGED_SHARE = 16, 0.02  # grey levels, beyond image noise, and share of the pixels by which colour has changed
+STALE_NS = 50_000_000  # age from which a repeated image is wrong: a Kinect repeats single images at 30 a second
+CHANGED_LEVELS, CHANGED_SIGMAS = 16, 7.0  # grey levels, and standard deviations of depth, beyond the noise of an image
+CHANGED_SHARE = 0.02  # of the pixels, by which an image has changed
 SATURATED, CROWDED = 0.02, 3.0  # a limit: share of the image that has this value, and times the readings of any other depth
 AWAY_S = 0.5  # to a frame that shows surfaces at other distances
 JUDGED = 10  # readable frames after which the scale of depth is judged
@@ -71,28 +72,40 @@ def constant_share(depth_m: F32) -> float:
     return float(np.unique(readings, return_counts=True)[1].max() / readings.size)
 
 
-class FrozenDepth:
-    """Detects a depth stream that stands still, bit-identical frame after frame, while colour goes on.
+class FrozenStream:
+    """Detects one stream, depth or colour, that stands still, bit-identical frame after frame, while the other goes on.
 
-    Colour is compared with that of the first frame with this depth: the change adds up while the camera moves. A camera at rest that sees exact depth
-    shows no change of colour beyond its noise. Depth that is repeated for less than `STALE_NS` is a late image, not a fault."""
+    The other is compared with that of the first frame with this image: the change adds up while the camera moves. A camera at rest shows no change
+    beyond its noise. An image that is repeated for less than `STALE_NS` is late, not a fault."""
 
-    def __init__(self) -> None:
+    def __init__(self, image: Callable[[Frame], F32 | U8], has_moved: Callable[[Frame, Frame], bool]) -> None:
+        self._image, self._has_moved = image, has_moved
         self._first: Frame | None = None
 
     def since(self, frame: Frame) -> int | None:
-        """Return the number of the first frame with the depth of this one, if that is stale and colour has changed since; else None."""
+        """Return the number of the first frame with the image of this one, if that is stale and the other image has changed since; else None."""
         first = self._first
-        if first is None or not _bit_identical(first.depth_m, frame.depth_m):
+        if first is None or not _bit_identical(self._image(first), self._image(frame)):
             self._first = frame
             return None
-        if frame.stamp_ns - first.stamp_ns < STALE_NS or not frame.depth_m.any():
-            return None
-        changed = np.abs(_sampled_gray(frame) - _sampled_gray(first)) > CHANGED_LEVELS
-        return first.index if changed.mean() >= CHANGED_SHARE else None
+        stale = frame.stamp_ns - first.stamp_ns >= STALE_NS and bool(self._image(frame).any())
+        return first.index if stale and self._has_moved(first, frame) else None
 
 
-def _bit_identical(a: F32, b: F32) -> bool:
+def color_has_changed(a: Frame, b: Frame) -> bool:
+    """Compare the colour of two frames beyond image noise."""
+    return bool((np.abs(_sampled_gray(b) - _sampled_gray(a)) > CHANGED_LEVELS).mean() >= CHANGED_SHARE)
+
+
+def depth_has_changed(a: Frame, b: Frame) -> bool:
+    """Compare the depth of two frames beyond the noise of the sensor, where both have readings."""
+    before, now = (frame.depth_m[::SAMPLED_PX, ::SAMPLED_PX] for frame in (a, b))
+    both = (before > 0.0) & (now > 0.0)
+    changed = np.abs(now - before)[both] > CHANGED_SIGMAS * b.camera.depth_noise.sigma_m(np.maximum(before, now)[both])
+    return bool(np.count_nonzero(changed) >= CHANGED_SHARE * both.size)
+
+
+def _bit_identical(a: F32 | U8, b: F32 | U8) -> bool:
     """Compare a sample first: two images that differ nearly always differ there."""
     return np.array_equal(a[::SAMPLED_PX, ::SAMPLED_PX], b[::SAMPLED_PX, ::SAMPLED_PX]) and np.array_equal(a, b)
 
@@ -110,7 +123,8 @@ class FrameValidation:
         self._last_ns: int | None = None
         self._set_back_ns = 0
         self._medians_m: list[float] = []
-        self._frozen = FrozenDepth()
+        self._frozen_depth = FrozenStream(lambda frame: frame.depth_m, color_has_changed)
+        self._frozen_color = FrozenStream(lambda frame: frame.color, depth_has_changed)
         self._registration = RegistrationCheck()
         self.late: set[int] = set()
 
@@ -127,14 +141,14 @@ class FrameValidation:
         if not isinstance(frame, Frame):
             return frame
         timed = self._in_time(position, frame)
-        valid = self._without_faulty_depth(usable(timed)) if timed is not None else None
+        valid = self._without_faulty_depth(self._without_frozen_color(usable(timed))) if timed is not None else None
         return without_limit(valid, lambda fps: self._elsewhere(position, read, fps))
 
     def _without_faulty_depth(self, frame: Frame | None) -> Frame | None:
         """Return the frame without its depth where that is constant (saturated, for one) or frozen: whatever is tracked by it is wrong."""
         if frame is None:
             return None
-        since, constant = self._frozen.since(frame), constant_share(frame.depth_m)
+        since, constant = self._frozen_depth.since(frame), constant_share(frame.depth_m)
         if since is not None:
             log.warning("frame %d: its depth is that of frame %d, bit for bit, while colour has changed; it counts as missing", frame.index, since)
         elif constant >= CONSTANT:
@@ -142,6 +156,14 @@ class FrameValidation:
         else:
             return frame
         return replace(frame, depth_m=np.zeros_like(frame.depth_m))
+
+    def _without_frozen_color(self, frame: Frame | None) -> Frame | None:
+        """Return the frame with black colour where that is frozen: the depth behind its key points is not theirs."""
+        since = None if frame is None else self._frozen_color.since(frame)
+        if frame is None or since is None:
+            return frame
+        log.warning("frame %d: its colour is that of frame %d, bit for bit, while depth has changed; it counts as missing", frame.index, since)
+        return replace(frame, color=np.zeros_like(frame.color))
 
     def _elsewhere(self, position: int, read: Callable[[int], Any], fps: float) -> Any:
         """Return a frame half a second away, if it can be read."""

@@ -79,5 +79,12 @@ class Interrupts:
             interrupt(number)
 
 
+@contextmanager
+def uninterrupted() -> Iterator[None]:
+    """Do the block whole: a signal that asks the program to end is handled at its end."""
+    with Interrupts() as interrupts, interrupts.held():
+        yield
+
+
 def _on_main_thread() -> bool:
     return threading.current_thread() is threading.main_thread()

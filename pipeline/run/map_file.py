@@ -20,7 +20,6 @@ from trihedron.pipeline.core.types import LOST, Map, Pose, Rotation, Value
 from trihedron.pipeline.record.reader import Recording
 from trihedron.pipeline.record.writer import RecordingWriter
 from trihedron.pipeline.run.state import DelayLines, StateBuffer
-from trihedron.pipeline.run.value_checks import checked
 
 MAP_VERSION = "1"
 SAVE_ONE = "save one with: trihedron run save_map=FILE.mcap"
@@ -89,7 +88,7 @@ def load_map(path: str) -> SavedMap:
     version = recording.metadata.get("map_version")
     if version != MAP_VERSION:
         raise RecordingError(path, f"is a map of version {version}, this program reads version {MAP_VERSION}", "make the map anew")
-    values = {topic: tuple(value for value in recording.values(topic) if checked(topic, value, path)) for topic in sorted(recording.topics)}
+    values = {topic: tuple(recording.values(topic)) for topic in sorted(recording.topics)}
     try:
         saved = SavedMap(int(recording.metadata["frame"]), recording.metadata["source"], values)
         assert isinstance(saved.map, Map)

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from trihedron.pipeline.core.errors import DataError
 from trihedron.pipeline.core.geometry import invert, nearest_pairs, transform, umeyama
+from trihedron.pipeline.core.linalg import matmul
 from trihedron.pipeline.core.types import F64, Trajectory
 
 I64 = NDArray[np.int64]
@@ -110,9 +111,9 @@ def aligned_errors(poses: F64, true_poses: F64) -> F64:
 
 def relative_errors(poses: F64, true_poses: F64, first: I64, second: I64) -> tuple[F64, F64]:
     """Return errors of the motion between poses `first` and `second` (rows): (n,) metres and (n,) degrees of `(Qi⁻¹ Qj)⁻¹ (Pi⁻¹ Pj)`."""
-    motion = invert(poses[first]) @ poses[second]
-    true_motion = invert(true_poses[first]) @ true_poses[second]
-    error = invert(true_motion) @ motion
+    motion = matmul(invert(poses[first]), poses[second])
+    true_motion = matmul(invert(true_poses[first]), true_poses[second])
+    error = matmul(invert(true_motion), motion)
     return np.linalg.norm(error[:, :3, 3], axis=1), rotation_angles_deg(error[:, :3, :3])
 
 

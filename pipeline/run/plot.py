@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from trihedron.pipeline.core.errors import DataError
 from trihedron.pipeline.core.geometry import nearest_rotation, transform, umeyama
+from trihedron.pipeline.core.linalg import matmul
 from trihedron.pipeline.core.types import DEGRADED, F64, LOST, Trajectory
 from trihedron.pipeline.run.metrics import FEWEST_POSES, associate, rotation_angles_deg
 
@@ -49,7 +50,7 @@ def _with_truth(figure: Any, estimate: Trajectory, truth: Trajectory, pairs: NDA
     grid = figure.add_gridspec(4, 2)
     span = slice(pairs[:, 1].min(), pairs[:, 1].max() + 1)
     true_path = Trajectory(truth.stamps_ns[span], truth.poses[span])
-    path = Trajectory(estimate.stamps_ns, alignment @ estimate.poses)
+    path = Trajectory(estimate.stamps_ns, matmul(alignment, estimate.poses))
     _draw_top(figure.add_subplot(grid[:, 0]), path, true_path)
     stamps = estimate.stamps_ns[pairs[:, 0]]
     curves = [(f"{name} error (mm)", 1e3 * errors[:, i]) for i, name in enumerate(AXES)]
@@ -63,7 +64,7 @@ def _rotation_errors(poses: F64, true_poses: F64) -> F64:
     """Return (n,) degrees between the poses and their truth after the rotation that best fits all rotations: an alignment by positions that lie
     nearly on a line leaves the rotation about that line open."""
     turn = nearest_rotation(np.einsum("nij,nkj->ik", true_poses[:, :3, :3], poses[:, :3, :3]))
-    return rotation_angles_deg(np.swapaxes(true_poses[:, :3, :3], 1, 2) @ turn @ poses[:, :3, :3])
+    return rotation_angles_deg(matmul(np.swapaxes(true_poses[:, :3, :3], 1, 2), turn, poses[:, :3, :3]))
 
 
 def _without_truth(figure: Any, estimate: Trajectory, status: Sequence[tuple[int, str]]) -> None:

@@ -14,7 +14,7 @@ from trihedron.pipeline.core.types import DEGRADED, LOST, OK, Pose
 class Poses(Sequence[Pose]):
     """A sequence of poses in frame order, stored as numbers: the rows of rigid motions and the upper triangles of covariances."""
 
-    _REALS, _WHOLE = 12 + 12 + 21 + 21 + 1, 11  # numbers a pose
+    _REALS, _WHOLE = 12 + 12 + 21 + 21 + 1, 12  # numbers a pose
     _STATUSES = (OK, DEGRADED, LOST)
     _UPPER = np.triu_indices(6)
     _LAST_ROW = np.array([0.0, 0.0, 0.0, 1.0])
@@ -31,7 +31,7 @@ class Poses(Sequence[Pose]):
         self._reals.append(pose.noise_scale)
         self._reasons += pose.reason.encode()
         counts = pose.inliers.tolist()
-        self._whole.extend((pose.index, pose.stamp_ns, pose.reference, *counts, pose.unobservable, pose.submap, pose.unrecognised))
+        self._whole.extend((pose.index, pose.stamp_ns, pose.reference, *counts, pose.unobservable, pose.submap, pose.unrecognised, pose.repeats))
         self._whole.extend((self._STATUSES.index(pose.status), len(self._reasons)))
 
     def __len__(self) -> int:
@@ -53,8 +53,9 @@ class Poses(Sequence[Pose]):
         covariances = np.empty((2, 6, 6))
         for covariance, numbers in zip(covariances, (reals[24:45], reals[45:66])):
             covariance[self._UPPER] = covariance.T[self._UPPER] = numbers
-        index, stamp_ns, reference, *inliers, unobservable, submap, unrecognised, state, end = self._whole[k * self._WHOLE : (k + 1) * self._WHOLE]
+        whole = self._whole[k * self._WHOLE : (k + 1) * self._WHOLE]
+        index, stamp_ns, reference, *inliers, unobservable, submap, unrecognised, repeats, state, end = whole
         counts, reason = np.array(inliers, np.int32), self._reasons[self._whole[k * self._WHOLE - 1] if k else 0 : end].decode()
         status = self._STATUSES[state]
         first, second = (index, stamp_ns, T, covariances[0], T_reference, reference), (counts, unobservable, status, reason, submap, unrecognised)
-        return Pose(*first, *second, covariances[1], float(reals[66]))
+        return Pose(*first, *second, covariances[1], float(reals[66]), repeats)

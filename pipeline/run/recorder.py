@@ -8,7 +8,7 @@ from typing import Any
 from trihedron.pipeline.core.graph import Graph
 from trihedron.pipeline.core.types import Frame, FrameReference, Trajectory, Value
 from trihedron.pipeline.record.codec import FRAMES_TOPIC
-from trihedron.pipeline.record.foxglove import View
+from trihedron.pipeline.record.foxglove import TopicView
 from trihedron.pipeline.record.writer import RecordingWriter
 from trihedron.pipeline.run.accounting import FrameTimes
 from trihedron.pipeline.run.replay import Plan
@@ -20,7 +20,7 @@ class Recorder:
 
     def __init__(self, writer: RecordingWriter, plan: Plan, topics: frozenset[str], embed_frames: bool, truth: Trajectory | None) -> None:
         self._writer, self._topics = writer, topics if embed_frames else topics - {"dataset"}
-        self._computed, self._view = plan.computed, View(truth)
+        self._computed, self._view = plan.computed, TopicView(truth)
         self._delays = {name: first_read_delay(plan.graph, name) for name in plan.computed}
         self._reference = plan.replay.reader(FRAMES_TOPIC) if plan.replay is not None else None
 

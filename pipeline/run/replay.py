@@ -23,7 +23,6 @@ from trihedron.pipeline.core.wires import Wire
 from trihedron.pipeline.record.codec import FRAMES_TOPIC
 from trihedron.pipeline.record.reader import Recording, TopicReader
 from trihedron.pipeline.run.live import is_camera
-from trihedron.pipeline.run.value_checks import checked
 
 RECORDED = "recorded:"  # prefix of the node that reads a topic from the file
 TOPICS = "topics"  # metadata of a recording: the stages whose values it holds, as JSON
@@ -41,7 +40,7 @@ class Replay:
     def topics(self) -> frozenset[str]:
         """The topics that were recorded, those without a single value included: that such a stage returned nothing is recorded too."""
         stated: Any = []
-        with suppress(ValueError):
+        with suppress(ValueError, RecursionError):
             stated = json.loads(self.recording.metadata.get(TOPICS, "[]"))
         silent = {topic for topic in stated if topic in SLOTS} if isinstance(stated, list) and all(isinstance(t, str) for t in stated) else set()
         return frozenset(self.recording.topics | silent)
@@ -62,8 +61,7 @@ class Replay:
 
     def references(self, first: int, stop: int | None) -> dict[int, FrameReference]:
         """Return frame number -> reference for the recorded frames in a range. Raises RecordingError when there is none."""
-        place, recorded = str(self.recording.path), self.recording.values(FRAMES_TOPIC)
-        values = (value for value in recorded if isinstance(value, FrameReference) and checked(FRAMES_TOPIC, value, place))
+        values = (value for value in self.recording.values(FRAMES_TOPIC) if isinstance(value, FrameReference))
         found = {value.index: value for value in values if value.index >= first and (stop is None or value.index < stop)}
         if not found:
             wanted = f"{first or ''}:{'' if stop is None else stop}"

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from trihedron.pipeline.core.errors import DataError
+from trihedron.pipeline.core.linalg import matmul, norm
 from trihedron.pipeline.core.types import DEGRADED, LOST, OK, Map, Pose, Surface, Trajectory
 from trihedron.pipeline.record.trajectories import write_trajectory
 from trihedron.pipeline.run.accounting import Result
@@ -39,7 +40,7 @@ def final_trajectory(result: Result) -> Trajectory:
         return causal_trajectory(result)
     keyframes = result.map.keyframes.column("T_world_camera")
     own = dict(list(zip(result.map.keyframes.column("index").tolist(), keyframes))[result.loaded_keyframes :])
-    moved = [pose.T_world_camera if pose.reference < 0 else keyframes[pose.reference] @ pose.T_reference_camera for pose in poses]
+    moved = [pose.T_world_camera if pose.reference < 0 else matmul(keyframes[pose.reference], pose.T_reference_camera) for pose in poses]
     return _trajectory([pose.stamp_ns for pose in poses], [own.get(pose.index, T) for pose, T in zip(poses, moved)])
 
 
@@ -54,8 +55,8 @@ def _trajectory(stamps_ns: list[int], poses: list[Any]) -> Trajectory:
     return Trajectory(np.array(stamps_ns, np.int64), np.array(poses, np.float64).reshape(-1, 4, 4))
 
 
-def write_results(out: Path, result: Result, truth: Trajectory | None) -> dict[str, Any]:
-    """Write trajectories, plot and, with ground truth, metrics; return the metrics. Statuses are counted in any case."""
+def write_results(out: Path, result: Result, truth: Trajectory | None, plot: bool = True) -> dict[str, Any]:
+    """Write trajectories, `plot` and, with ground truth, metrics; return the metrics. Statuses are counted in any case."""
     final, causal = final_trajectory(result), causal_trajectory(result)
     write_trajectory(out / TRAJECTORY, final)
     write_trajectory(out / CAUSAL, causal)
@@ -67,7 +68,7 @@ def write_results(out: Path, result: Result, truth: Trajectory | None) -> dict[s
         "reasons": {status: reason for status in (DEGRADED, LOST) if (reason := _commonest_reason(result.poses, status))},
     }
     if len(final):  # of a walk that ends where it began, the drift
-        metrics["start_to_end_m"] = float(np.linalg.norm(final.poses[-1, :3, 3] - final.poses[0, :3, 3]))
+        metrics["start_to_end_m"] = float(norm(final.poses[-1, :3, 3] - final.poses[0, :3, 3]))
     if truth is not None:
         stamps = np.array(result.stamps_ns, np.int64)
         try:
@@ -77,7 +78,7 @@ def write_results(out: Path, result: Result, truth: Trajectory | None) -> dict[s
         except DataError as error:
             metrics["note"] = str(error)
     write_json(out / METRICS, metrics)
-    if len(final):
+    if plot and len(final):
         trajectory_figure(final, truth, out / PLOT, [(pose.stamp_ns, pose.status) for pose in result.poses])
     return metrics
 

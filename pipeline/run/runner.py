@@ -21,6 +21,7 @@ from trihedron.pipeline.core.graph import Graph, Stage
 from trihedron.pipeline.core.registry import check_value
 from trihedron.pipeline.core.slots import CAMERA, RNG
 from trihedron.pipeline.core.types import Map, Trajectory, Value
+from trihedron.pipeline.core.value_checks import check_together
 from trihedron.pipeline.core.wires import Wire
 from trihedron.pipeline.record.reader import TopicReader
 from trihedron.pipeline.record.writer import RecordingWriter
@@ -28,13 +29,12 @@ from trihedron.pipeline.run.accounting import Accounting
 from trihedron.pipeline.run.frame_validation import FrameValidation
 from trihedron.pipeline.run.interrupts import Interrupts
 from trihedron.pipeline.run.live import Pace, feed_of
-from trihedron.pipeline.run.memory import malloc_trim
+from trihedron.pipeline.run.memory import exhaustion, malloc_trim
 from trihedron.pipeline.run.recorder import Recorder
 from trihedron.pipeline.run.replay import RECORDED, Replay, plan_run
 from trihedron.pipeline.run.scheduler import Node, NodeFailure, NoMoreFrames, Scheduler, single_threaded_libraries
 from trihedron.pipeline.run.sinks import Sink
 from trihedron.pipeline.run.state import DelayLines, StateBuffer, max_delays, recorded_delay_lines
-from trihedron.pipeline.run.value_checks import check_together, checked
 
 TRIM_EVERY = 1000  # frames; it takes some 10 ms
 NodeCall = Callable[[int, Mapping[str, Any]], Any]
@@ -80,14 +80,14 @@ class Runner:
             self.initial = self.initial.updated(recorded_delay_lines(replay.recording, delays, self.indices[0]), RECORDED)
         self.state = StateBuffer(delays, self.initial, self.indices[0])
         loaded = self.initial.held.get("map")
-        self._accounts = Accounting(self.plan.stamps_ns, self.plan.fps, loaded if isinstance(loaded, Map) else None)
-        self.result, self.timing = self._accounts.result, self._accounts.timing
-        self._validation = FrameValidation(self.plan.stamps_ns, self.count if self.feed is None else 0)
+        self.accounts = Accounting(self.plan.stamps_ns, self.plan.fps, loaded if isinstance(loaded, Map) else None)
+        self.result, self.timing = self.accounts.result, self.accounts.timing
+        self.validation = FrameValidation(self.plan.stamps_ns, self.count if self.feed is None else 0)
         self._sources = str(replay.recording.path) if replay is not None else "load_map" if self.initial.held else ""  # files of inputs
         self._fold_states: dict[str, Any] = {}
         self._preview_period = preview_period
         self._previews: deque[tuple[str, Value]] = deque()
-        self._sinks: tuple[Sink, ...] = ()
+        self.sinks: tuple[Sink, ...] = ()
 
     def steps(
         self,
@@ -99,23 +99,23 @@ class Runner:
     ) -> Iterator[Step]:
         """Run, yielding each finished frame; values of `topics` go to the writer, with what viewers show, errors by `truth` too, and all values to
         the sinks. Raises TrihedronError (StageError names stage and frame)."""
-        first = self.indices[0]
-        recent = {topic: {index - first: value for index, value in values.items()} for topic, values in self.initial.recent.items()}
-        scheduler = Scheduler(self._nodes(), self.threads, self.threads, self.initial.held, recent)
-        self._sinks = (*([Recorder(writer, self.plan, topics, embed_frames, truth)] if writer is not None else []), *sinks)
+        scheduler = Scheduler(self.nodes(), self.threads, self.threads, self.initial.held, self.recent())
+        self.sinks = (*([Recorder(writer, self.plan, topics, embed_frames, truth)] if writer is not None else []), *sinks)
+        self.timing.begin()
         try:
             with single_threaded_libraries(), self._feeding(), Interrupts() as interrupts:
                 for position, values in scheduler.run(self.count):
                     with interrupts.held():
-                        self._take(position, values)
+                        self.take(position, values)
                     yield Step(position, self.count, self.indices[position], values)
-                if "map" not in self.computed:
-                    self.result.map = self._recorded_map()
-                for name in self.computed:
-                    if self.graph.stages[name].fold:
-                        self._finish_fold(name)
+                self.finish()
         except NodeFailure as failure:
-            raise self._explain(failure, writer) from failure.__cause__
+            raise self.explain(failure, writer) from failure.__cause__
+
+    def recent(self) -> dict[str, dict[int, Value]]:
+        """Return the values before the first frame that `@k` wires read: topic -> position (-1: one frame before) -> value."""
+        first = self.indices[0]
+        return {topic: {index - first: value for index, value in values.items()} for topic, values in self.initial.recent.items()}
 
     @contextmanager
     def _feeding(self) -> Iterator[None]:
@@ -130,22 +130,23 @@ class Runner:
         finally:
             self.feed.stop()
 
-    def _take(self, position: int, values: Mapping[str, Any]) -> None:
+    def take(self, position: int, values: Mapping[str, Any]) -> None:
         """Account for a finished frame and record it."""
-        index, accounts = self.indices[position], self._accounts
+        index, accounts = self.indices[position], self.accounts
         self.state.append(index, values)
-        if accounts.take(position, index, values, self.count, position in self._validation.late):
-            for sink in self._sinks:
+        if accounts.take(position, index, values, self.count, position in self.validation.late):
+            for sink in self.sinks:
                 sink.frame(index, accounts.stamps_ns[index], values, accounts.times[position])
             while self._previews:
                 name, value = self._previews.popleft()
-                for sink in self._sinks:
+                for sink in self.sinks:
                     sink.preview(name, value)
         accounts.forget(position, index)
         if (position + 1) % TRIM_EVERY == 0:
             malloc_trim()
 
-    def _nodes(self) -> list[Node]:
+    def nodes(self) -> list[Node]:
+        """Return the nodes of the stages that compute, behind those of the topics that they read from a file, in topological order."""
         readers: dict[str, Node] = {}
         stages = [self._stage_node(self.graph.stages[name], readers) for name in self.computed]
         return [*readers.values(), *stages]
@@ -177,9 +178,8 @@ class Runner:
 
     def _reader_node(self, name: str) -> Node:
         assert self.replay is not None
-        topic, place = name.removeprefix(RECORDED), str(self.replay.recording.path)
-        read = self.replay.reader(topic)
-        return Node(name, lambda position, _: checked(topic, read(self.indices[position]), place), {}, ordered=True)
+        read = self.replay.reader(name.removeprefix(RECORDED))
+        return Node(name, lambda position, _: read(self.indices[position]), {}, ordered=True)
 
     def _read_frame(self, stage: Stage, position: int) -> Any:
         """Return the frame at a position, validated, or None."""
@@ -190,12 +190,12 @@ class Runner:
             began = time.perf_counter()
             frame = stage.plugin(index=self.indices[at] - self.plan.first)
             ended = time.perf_counter()
-            self._accounts.frame_read(at, began, ended, ended if self.feed is None else self.feed.came_s[at])
+            self.accounts.frame_read(at, began, ended, ended if self.feed is None else self.feed.came_s[at])
             if frame is not None:
                 check_value(stage.name, frame, self.indices[at])
             return frame
 
-        return self._validation(position, read, lambda: self.indices[position])
+        return self.validation(position, read, lambda: self.indices[position])
 
     def _call(self, stage: Stage, position: int, values: Mapping[str, Any]) -> Value | None:
         """Skip, seed, time and check one call."""
@@ -218,7 +218,7 @@ class Runner:
                 self._previews.append((stage.name, stage.plugin.preview(state)))
         else:
             value = stage.plugin(**arguments)
-        self._accounts.stage_called(position, stage.name, began, time.perf_counter())
+        self.accounts.stage_called(position, stage.name, began, time.perf_counter())
         if value is not None:
             check_value(stage.name, value, self.indices[position])
         return value
@@ -235,6 +235,14 @@ class Runner:
         if not computed.issuperset(topics.values()):
             check_together(arguments, self._sources, topics, computed)
 
+    def finish(self) -> None:
+        """Take the map of a recording where none was computed, and finish the folds; after the last frame."""
+        if "map" not in self.computed:
+            self.result.map = self._recorded_map()
+        for name in self.computed:
+            if self.graph.stages[name].fold:
+                self._finish_fold(name)
+
     def _finish_fold(self, name: str) -> None:
         plugin = self.graph.stages[name].plugin
         state = self._fold_states.pop(name) if name in self._fold_states else plugin.start()
@@ -242,7 +250,7 @@ class Runner:
         value = plugin.finish(state, self.result.map)
         self.timing.add_finish(name, 1e3 * (time.perf_counter() - began))
         self.result.folds[name] = value
-        for sink in self._sinks:
+        for sink in self.sinks:
             sink.fold(name, value)
 
     def fold_state(self, name: str) -> Any:
@@ -257,11 +265,13 @@ class Runner:
         found = reader.at(self.indices[-1]) or reader.latest
         return found if isinstance(found, Map) else None
 
-    def _explain(self, failure: NodeFailure, writer: RecordingWriter | None) -> TrihedronError:
+    def explain(self, failure: NodeFailure, writer: RecordingWriter | None) -> TrihedronError:
         """Return the failure as one line: a user's mistake as it is, anything else with stage, frame and the command that repeats only that."""
         error = failure.__cause__
         if isinstance(error, TrihedronError):
             return error
+        if error is not None and (exhausted := exhaustion(error)) is not None:
+            return exhausted
         index, stage = [*self.indices[failure.position : failure.position + 1], failure.position][0], failure.node
         cure = ""
         if writer is not None and writer.path is not None:

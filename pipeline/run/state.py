@@ -11,7 +11,6 @@ from trihedron.pipeline.core.types import Value
 from trihedron.pipeline.core.wires import PREVIOUS
 from trihedron.pipeline.record.codec import FRAMES_TOPIC
 from trihedron.pipeline.record.reader import Recording, TopicReader
-from trihedron.pipeline.run.value_checks import checked
 
 
 @dataclass(frozen=True)
@@ -71,9 +70,9 @@ def recorded_delay_lines(recording: Recording, max_delay: Mapping[str, int], fir
         reader = TopicReader(recording, topic)
         recent[topic] = {}
         for ago in range(min(max_delay[topic], len(frames)), 0, -1):
-            if (value := checked(topic, reader.at(frames[-ago]), str(recording.path))) is not None:
+            if (value := reader.at(frames[-ago])) is not None:
                 recent[topic][first - ago] = value
         reader.at(first)
-        if (latest := recent[topic][max(recent[topic])] if recent[topic] else checked(topic, reader.latest, str(recording.path))) is not None:
+        if (latest := recent[topic][max(recent[topic])] if recent[topic] else reader.latest) is not None:
             held[topic] = latest
     return DelayLines(held, recent)

@@ -15,6 +15,7 @@ import numpy as np
 from scipy.stats import rankdata
 
 from trihedron.pipeline.core.geometry import invert, umeyama
+from trihedron.pipeline.core.linalg import cholesky, inv, matmul
 from trihedron.pipeline.core.types import DEGRADED, F64, LOST, OK, Bool, Pose, Trajectory
 from trihedron.pipeline.run.consistency import LIMIT_95, TruthNoise, gauge_free_errors, truth_noise
 from trihedron.pipeline.run.metrics import associate, relative_errors, rotation_angles_deg
@@ -143,9 +144,9 @@ def _robustly_aligned(T: F64, true: F64) -> tuple[F64, F64]:
     motion = np.eye(4)
     for _ in range(ROUNDS):
         motion = umeyama(T[inlier, :3, 3], true[inlier, :3, 3])
-        error = np.linalg.norm((motion @ T)[:, :3, 3] - true[:, :3, 3], axis=1)
+        error = np.linalg.norm(matmul(motion, T)[:, :3, 3] - true[:, :3, 3], axis=1)
         inlier = error <= max(INLIER * float(np.median(error)), 1e-4)
-    angle = rotation_angles_deg((invert(true) @ motion @ T)[:, :3, :3])
+    angle = rotation_angles_deg(matmul(invert(true), motion, T)[:, :3, :3])
     return error, np.asarray(angle - np.median(angle[inlier]))  # a path without turns leaves the rotation of the alignment uncertain
 
 
@@ -159,8 +160,9 @@ def _noise_of_truth(poses: Sequence[Pose], true: F64) -> TruthNoise:
 def _normalised(T: F64, covariances: F64, true: F64) -> tuple[F64, F64]:
     """Return (n,) NEES and log-likelihood in nats of the errors of poses."""
     errors = gauge_free_errors(T, covariances, true)
-    nees = np.einsum("ni,nij,nj->n", errors, np.linalg.inv(covariances), errors)
-    return nees, -0.5 * (nees + np.linalg.slogdet(2.0 * np.pi * covariances)[1])
+    nees = np.einsum("ni,nij,nj->n", errors, inv(covariances), errors)
+    log_determinants = 2.0 * np.log(np.diagonal(cholesky(2.0 * np.pi * covariances), axis1=1, axis2=2)).sum(axis=1)
+    return nees, -0.5 * (nees + log_determinants)
 
 
 def _steps(known: Sequence[Pose], true: F64) -> tuple[int, int]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gc
 import os
+import time
 from array import array
 from collections import defaultdict
 from collections.abc import Sequence
@@ -26,6 +27,11 @@ class Timing:
         self._calls: dict[str, array[float]] = defaultdict(lambda: array("f"))
         self._frames_ms = array("d")
         self._finish_ms: dict[str, float] = {}
+        self._cpu_s = time.process_time()
+
+    def begin(self) -> None:
+        """Start the measurement of this process's CPU time, at the first frame."""
+        self._cpu_s = time.process_time()
 
     def add_call(self, stage: str, ms: float) -> None:
         """Add one call of a stage."""
@@ -40,7 +46,8 @@ class Timing:
         self._frames_ms.append(ms)
 
     def summary(self, threads: int, wall_s: float, startup_s: float) -> dict[str, Any]:
-        """Return frames, wall time and percentiles; `fps` is the whole run's, with reading and recording; `startup_s` is imports and composition."""
+        """Return frames, wall time and percentiles; `fps` is the whole run's, with reading and recording; `cpu_s` is the
+        process's CPU time since `begin`, of all threads, `startup_s` imports and composition."""
         frames = len(self._frames_ms)
         p50, p95, largest = _percentiles(self._frames_ms)
         stages: dict[str, dict[str, float]] = {}
@@ -53,6 +60,7 @@ class Timing:
             "frames": frames,
             "threads": threads,
             "wall_s": round(wall_s, 3),
+            "cpu_s": round(time.process_time() - self._cpu_s, 3),
             "startup_s": round(startup_s, 3),
             "fps": round(frames / wall_s, 2) if wall_s > 0 else 0.0,
             "frame_ms": {"p50": p50, "p95": p95, "max": largest},

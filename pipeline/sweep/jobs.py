@@ -16,7 +16,7 @@ from trihedron.pipeline.core.registry import ENTRY_POINT_GROUP
 
 JOB = "job.json"
 RUNNING, DONE, FAILED = "running", "done", "failed"
-NOT_PART = ("hydra", "out", "report", "sequences", "alternatives")  # of what a job computes
+NOT_PART = ("hydra", "out", "report", "sequences", "alternatives", "dry_run")  # of what a job computes
 SOURCES = ("pipeline", "plugins", "datasets")  # packages whose code decides on results
 Job = dict[str, Any]
 

@@ -58,6 +58,8 @@ class Search(Sweeper):
     def sweep(self, arguments: list[str]) -> None:
         """Run the default configuration and the trials, and write search.json. Raises TrihedronError when the default gives no value."""
         optuna = _optuna()
+        if self.options.dry_run:
+            raise UsageError("--dry-run", "a search chooses its jobs from the results of earlier ones", "leave it out, or give values A,B")
         searched, words = self._split(arguments)
         first = self.composed(self.jobs(words)[0])
         space = {key: _distribution(override, _chosen(first, key)) for key, override in searched.items()}

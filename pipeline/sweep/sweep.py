@@ -9,8 +9,6 @@ from __future__ import annotations
 import itertools
 import re
 import sys
-import threading
-import time
 from collections.abc import Mapping, Sequence
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass, field
@@ -28,7 +26,7 @@ from hydra.types import HydraContext, TaskFunction
 from joblib.externals.loky import get_reusable_executor
 from omegaconf import DictConfig
 
-from trihedron.pipeline.core.config import rewritten
+from trihedron.pipeline.core.config import graph_of, rewritten
 from trihedron.pipeline.core.errors import TrihedronError, UsageError
 from trihedron.pipeline.core.libraries import library_error
 from trihedron.pipeline.core.overrides import with_literal_paths
@@ -36,8 +34,9 @@ from trihedron.pipeline.core.registry import load_plugins, options_of, plugins_o
 from trihedron.pipeline.core.slots import SLOTS
 from trihedron.pipeline.sweep.cluster import all_awaited
 from trihedron.pipeline.sweep.jobs import DONE, FAILED, RUNNING, key_of, read_job, write_job
+from trihedron.pipeline.sweep.preview import Planned, preview, refused, state_of
+from trihedron.pipeline.sweep.progress import Progress
 
-LOOK_SECONDS = 1.0  # between two looks at the jobs' folders
 Overrides = list[str]
 
 
@@ -76,6 +75,9 @@ class Sweeper(HydraSweeper):
     def sweep(self, arguments: list[str]) -> None:
         """Run what is missing. Raises TrihedronError when no job can be composed."""
         jobs = self.jobs(arguments)
+        if self.options.dry_run:
+            print(preview([self._planned(job, self.folder / str(number)) for job, number in zip(jobs, _numbers(self.folder, jobs))]))
+            return
         folders = self.run(jobs, len(jobs))
         failures = [why for folder in folders if (why := failure_of(folder))]
         OUTCOMES.append(Outcome(self.folder, str(self.options.report), len(jobs), failures))
@@ -122,9 +124,18 @@ class Sweeper(HydraSweeper):
         if already := len(jobs) - len(errors) - len(missing):
             print(f"sweep: {already} of {len(jobs)} jobs are done already", file=sys.stderr)
         if missing:
-            with _Progress([place for _, place in missing], before + len(jobs) - len(missing), total):
+            changes = changes_of([given[:-1] for given, _ in missing])
+            with Progress([place for _, place in missing], changes, before + len(jobs) - len(missing), total):
                 self._launch(missing)
         return folders
+
+    def _planned(self, job: Overrides, folder: Path) -> Planned:
+        """The job as a dry run describes it."""
+        try:
+            config = self.composed([*job, f"hydra.sweep.subdir={folder.name}"])
+            return Planned(folder, job, state_of(folder, key_of(config)), graph=graph_of(config))
+        except Exception as error:
+            return refused(folder, job, error)
 
     def composed(self, words: Overrides) -> DictConfig:
         """The configuration of a job."""
@@ -229,6 +240,12 @@ def _numbers(folder: Path, jobs: Sequence[Overrides]) -> list[int]:
     return [known[tuple(job)] if tuple(job) in known else next(free) for job in jobs]
 
 
+def changes_of(jobs: Sequence[Overrides]) -> list[str]:
+    """Return the words of each job that not all of them have."""
+    common = set.intersection(*map(set, jobs)) if len(jobs) > 1 else set()
+    return [" ".join(word for word in job if word not in common) for job in jobs]
+
+
 def _product(overrides: list[Override]) -> list[Overrides]:
     """The cross product of all values given; a later override replaces an earlier one of its key. Raises UsageError for a space to search in."""
     values: dict[str, Overrides] = {}
@@ -264,40 +281,3 @@ def _keep_overrides(folder: Path, job: Overrides) -> None:
 def _died(folder: Path) -> None:
     """Say so of a job that cannot."""
     write_job(folder, "", FAILED, f"{folder}: its process died; it crashed, or memory ran out")
-
-
-class _Progress:
-    """Says on stderr how many jobs are done, which failed and why, and about how long the rest will take, as jobs end in other processes."""
-
-    def __init__(self, folders: list[Path], before: int, total: int) -> None:
-        """`before` jobs of `total` are done, those of `folders` will be."""
-        self.waiting, self.missing, self.before, self.total = folders, len(folders), before, total
-        self.began, self.stop = time.perf_counter(), threading.Event()
-        self.thread = threading.Thread(target=self._watch, daemon=True)
-
-    def __enter__(self) -> None:
-        self.thread.start()
-
-    def __exit__(self, *exception: object) -> None:
-        self.stop.set()
-        self.thread.join()
-        self._look()
-
-    def _watch(self) -> None:
-        while not self.stop.wait(LOOK_SECONDS):
-            self._look()
-
-    def _look(self) -> None:
-        ended = [(place, job) for place in self.waiting if (job := read_job(place)).get("state", RUNNING) != RUNNING]
-        self.waiting = [place for place in self.waiting if place not in {place for place, _ in ended}]
-        for _, job in ended:
-            if job["error"]:
-                print(f"trihedron: {job['error']}", file=sys.stderr)
-        if ended:
-            done, seconds = self.missing - len(self.waiting), time.perf_counter() - self.began
-            now, left = self.before + done, seconds / done * (self.total - self.before - done)
-            print(f"sweep: {now} of {self.total} jobs done, {_time(seconds)}, about {_time(left)} left", file=sys.stderr)
-
-
-def _time(seconds: float) -> str:
-    return f"{seconds:.0f} s" if seconds < 120 else f"{seconds / 60:.0f} min" if seconds < 7200 else f"{seconds / 3600:.1f} h"

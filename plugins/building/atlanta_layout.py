@@ -3,28 +3,32 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Annotated
+from functools import partial
 
-import numpy as np
-
-from trihedron.pipeline.core.options import PositiveFloat, Range
 from trihedron.pipeline.core.registry import register
-from trihedron.pipeline.core.types import F64
-from trihedron.plugins.building.common import Evidence, Storey, slanted_directions
-from trihedron.plugins.building.common_layout import AXES, Layout
+from trihedron.pipeline.core.types import Building, Frame, Map, Planes, Pose, Rotation
+from trihedron.plugins.building.common import Gathered, add_view
+from trihedron.plugins.building.common_layout import AtlantaOptions, atlanta_directions, plan_building, preview_state
 
 
 @register("building", "atlanta_layout")
 @dataclass(frozen=True)
-class AtlantaLayout(Layout):
+class AtlantaLayout(AtlantaOptions):
     """Extend `manhattan_layout` by further directions of walls: the peaks of the upright regions' normals about the vertical (Schindler, Dellaert,
     CVPR 2004, "Atlanta world"). An edge along none of the axes is turned to its own points."""
 
-    apart_deg: Annotated[float, Range(2, 45)] = 6.0  # between directions
-    least_m2: PositiveFloat = 1.0  # of tall points of a direction
+    def start(self) -> Gathered:
+        """Return an empty state."""
+        return Gathered()
 
-    def _directions(self, evidence: Evidence, storey: Storey) -> F64:
-        """Return the axes and the other peaks."""
-        more = np.radians(slanted_directions(evidence, storey, self.apart_deg, self.least_m2))
-        one = np.stack([np.cos(more), np.sin(more)], axis=1)
-        return np.concatenate([AXES, one, -one])
+    def add(self, state: Gathered, frame: Frame, planes: Planes, rotation: Rotation | None, pose: Pose, map: Map | None) -> Gathered:
+        """Retain the frame if it became a keyframe."""
+        return add_view(self, state, frame, planes, rotation, pose, map)
+
+    def preview(self, state: Gathered) -> Building:
+        """Return the plan so far of a few views, at their poses as they are now."""
+        return self.finish(preview_state(state), state.map)
+
+    def finish(self, state: Gathered, map: Map | None) -> Building:
+        """Return the plan at the final poses."""
+        return plan_building(self, state, map, partial(atlanta_directions, self))

@@ -3,25 +3,42 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 
 from trihedron.pipeline.core.options import PositiveFloat
 from trihedron.pipeline.core.registry import register
-from trihedron.pipeline.core.types import Bool
-from trihedron.plugins.building.atlanta_layout import AtlantaLayout
-from trihedron.plugins.building.common_layout import Cells
+from trihedron.pipeline.core.types import Bool, Building, Frame, Map, Planes, Pose, Rotation
+from trihedron.plugins.building.common import Gathered, add_view
+from trihedron.plugins.building.common_layout import AtlantaOptions, Cells, atlanta_directions, plan_building, preview_state
 
 SCALE = 10_000  # capacities are whole numbers
 
 
 @register("building", "cells")
 @dataclass(frozen=True)
-class CellComplex(AtlantaLayout):
+class CellComplex(AtlantaOptions):
     """Label the cells of `atlanta_layout` together (Ochmann, Vock, Wessel, Klein, Computers & Graphics 2016, with two labels; the cut of
     Boykov, Jolly, ICCV 2001): a cell costs the area that contradicts its label, a border between inside and outside its length without a wall."""
 
     open_border_m: PositiveFloat = 0.05  # area in m² that a metre of border without a wall costs
+
+    def start(self) -> Gathered:
+        """Return an empty state."""
+        return Gathered()
+
+    def add(self, state: Gathered, frame: Frame, planes: Planes, rotation: Rotation | None, pose: Pose, map: Map | None) -> Gathered:
+        """Retain the frame if it became a keyframe."""
+        return add_view(self, state, frame, planes, rotation, pose, map)
+
+    def preview(self, state: Gathered) -> Building:
+        """Return the plan so far of a few views, at their poses as they are now."""
+        return self.finish(preview_state(state), state.map)
+
+    def finish(self, state: Gathered, map: Map | None) -> Building:
+        """Return the plan at the final poses."""
+        return plan_building(self, state, map, partial(atlanta_directions, self), self._inside)
 
     def _inside(self, cells: Cells) -> Bool:
         """Return the cells on the source's side of the cut: source - cells - sink, capacities by free and not free area."""

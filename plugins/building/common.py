@@ -11,6 +11,7 @@ from typing import Annotated
 
 import numpy as np
 
+from trihedron.pipeline.core.linalg import inv, matmul, norm
 from trihedron.pipeline.core.options import PositiveFloat, Range
 from trihedron.pipeline.core.types import F64, I32, LOST, Bool, Building, Frame, Map, Planes, Pose, Rotation
 from trihedron.plugins.building.common_kernels import LEVELS, U32, carve_kernel
@@ -45,43 +46,42 @@ class Gathered:
 
 
 @dataclass(frozen=True)
-class LayoutFold:
-    """Keeps the views of the keyframes; other frames cost next to nothing."""
+class LayoutOptions:
+    """Options of every plan."""
 
     view_width: Annotated[int, Range(16, 4096)] = 160  # px, about, to which images are reduced
     max_sigma_m: PositiveFloat = 0.05  # depth less certain than this is not used
     least_room_m2: PositiveFloat = 1.0
     least_wall_m: PositiveFloat = 0.4  # of tall face, for which there is a wall
 
-    def start(self) -> Gathered:
-        """Nothing seen."""
-        return Gathered()
 
-    def add(self, state: Gathered, frame: Frame, planes: Planes, rotation: Rotation | None, pose: Pose, map: Map | None) -> Gathered:
-        """Keep the frame if it became a keyframe; without a map, if the camera has moved since the last."""
-        state.index, state.stamp_ns, state.map = frame.index, frame.stamp_ns, map
-        if rotation is not None and len(rotation.weights):
-            state.axes = rotation.R_world_manhattan[int(np.argmax(rotation.weights))]
-        if pose.status == LOST:
-            return state
-        if state.first is None:
-            state.first = pose.T_world_camera
-        if map is not None:
-            newest, state.keyframes = len(map.keyframes), max(state.keyframes, len(map.keyframes))
-            wanted = newest > 0 and int(map.keyframes.rows("index", np.array([newest - 1]))[0]) == frame.index
-        else:
-            wanted = state.keyframes == 0 and (not state.views or _moved(state.views[-1].T_world_camera, pose.T_world_camera))
-        if wanted:
-            view = view_of(frame, planes, pose, map, self.view_width, self.max_sigma_m)
-            state.views.append(replace(view, color=view.color[:0, :0].copy()))
-            state.covariances.append(pose.covariance)
+def add_view(
+    options: LayoutOptions, state: Gathered, frame: Frame, planes: Planes, rotation: Rotation | None, pose: Pose, map: Map | None
+) -> Gathered:  # fmt: skip
+    """Retain the frame if it became a keyframe; without a map, if the camera has moved since the last. Other frames cost next to nothing."""
+    state.index, state.stamp_ns, state.map = frame.index, frame.stamp_ns, map
+    if rotation is not None and len(rotation.weights):
+        state.axes = rotation.R_world_manhattan[int(np.argmax(rotation.weights))]
+    if pose.status == LOST:
         return state
+    if state.first is None:
+        state.first = pose.T_world_camera
+    if map is not None:
+        newest, state.keyframes = len(map.keyframes), max(state.keyframes, len(map.keyframes))
+        wanted = newest > 0 and int(map.keyframes.rows("index", np.array([newest - 1]))[0]) == frame.index
+    else:
+        wanted = state.keyframes == 0 and (not state.views or _moved(state.views[-1].T_world_camera, pose.T_world_camera))
+    if wanted:
+        view = view_of(frame, planes, pose, map, options.view_width, options.max_sigma_m)
+        state.views.append(replace(view, color=view.color[:0, :0].copy()))
+        state.covariances.append(pose.covariance)
+    return state
 
 
 def _moved(before: F64, now: F64) -> bool:
     """Say if a pose (4, 4) is far enough from another to be kept."""
-    turned = np.arccos(np.clip((np.trace(before[:3, :3].T @ now[:3, :3]) - 1.0) / 2.0, -1.0, 1.0))
-    return bool(np.linalg.norm(now[:3, 3] - before[:3, 3]) > MOVED_M or turned > np.radians(TURNED_DEG))
+    turned = np.arccos(np.clip((np.trace(matmul(before[:3, :3].T, now[:3, :3])) - 1.0) / 2.0, -1.0, 1.0))
+    return bool(norm(now[:3, 3] - before[:3, 3]) > MOVED_M or turned > np.radians(TURNED_DEG))
 
 
 @dataclass(frozen=True)
@@ -116,17 +116,17 @@ def evidence_of(state: Gathered, map: Map | None) -> Evidence | None:
     views, regions = [(view, T) for view, T, _ in kept], [_regions(view) for view, *_ in kept]
     if not sum(len(points) for points, *_ in regions):
         return None
-    facing = [view.coefficients[:, :3] @ T[:3, :3].T for view, T in views]
+    facing = [matmul(view.coefficients[:, :3], T[:3, :3].T) for view, T in views]
     R = _axes(state, [T for _, T in views], facing, [region[4] for region in regions])
     T_world_building = np.eye(4)
     T_world_building[:3, :3] = R
     start = state.first if state.first is not None else views[0][1]
-    T_world_building[:3, 3] = R[:, :2] @ (R[:, :2].T @ start[:3, 3])
-    inverse = np.linalg.inv(T_world_building)
-    poses = [inverse @ T for _, T in views]
-    drift = np.array([T[:3, :3] @ C[:3, :3] @ T[:3, :3].T for T, (*_, C) in zip(poses, kept)])
-    points = np.concatenate([p @ T[:3, :3].T + T[:3, 3] for T, (p, *_) in zip(poses, regions)])
-    normals = np.concatenate([n @ T[:3, :3].T for T, (_, n, *_) in zip(poses, regions)])
+    T_world_building[:3, 3] = matmul(R[:, :2], matmul(R[:, :2].T, start[:3, 3]))
+    inverse = inv(T_world_building)
+    poses = [matmul(inverse, T) for _, T in views]
+    drift = np.array([matmul(T[:3, :3], C[:3, :3], T[:3, :3].T) for T, (*_, C) in zip(poses, kept)])
+    points = np.concatenate([matmul(p, T[:3, :3].T) + T[:3, 3] for T, (p, *_) in zip(poses, regions)])
+    normals = np.concatenate([matmul(n, T[:3, :3].T) for T, (_, n, *_) in zip(poses, regions)])
     information, area = (np.concatenate([region[k] for region in regions]) for k in (2, 3))
     rows = np.repeat(np.arange(len(views), dtype=np.int32), [len(p) for p, *_ in regions])
     found = Evidence(T_world_building, [view for view, _ in views], poses, drift, points, normals, information, area, rows)
@@ -158,25 +158,25 @@ def _axes(state: Gathered, poses: list[F64], normals: list[F64], areas: list[F64
     """Return `R_world_building`: up by the level regions, the horizontal axes by the commonest upright direction, y nearest to the first view."""
     up = -np.mean([T[:3, 1] for T in poses], axis=0)
     if state.axes is not None:
-        along = state.axes.T @ up
+        along = matmul(state.axes.T, up)
         best = int(np.argmax(np.abs(along)))
         up = state.axes[:, best] * np.sign(along[best])
-    up /= np.linalg.norm(up)
+    up /= norm(up)
     all_normals, weight = np.concatenate(normals), np.concatenate(areas)
     for _ in range(2):
-        leaning = all_normals @ up
+        leaning = matmul(all_normals, up)
         level = np.abs(leaning) > np.cos(np.radians(LEVEL_DEG))
         if weight[level].sum() > LEAST_FLOOR_M2:
             up = (all_normals[level] * (np.sign(leaning[level]) * weight[level])[:, None]).sum(axis=0)
-            up /= np.linalg.norm(up)
+            up /= norm(up)
     T = state.first if state.first is not None else poses[0]
-    ahead = T[:3, 2] - (T[:3, 2] @ up) * up
-    if np.linalg.norm(ahead) < 0.1:
-        ahead = -T[:3, 1] + (T[:3, 1] @ up) * up
-    ahead /= np.linalg.norm(ahead)
+    ahead = T[:3, 2] - matmul(T[:3, 2], up) * up
+    if norm(ahead) < 0.1:
+        ahead = -T[:3, 1] + matmul(T[:3, 1], up) * up
+    ahead /= norm(ahead)
     right = np.cross(ahead, up)
-    upright = np.abs(all_normals @ up) < np.sin(np.radians(UPRIGHT_DEG))
-    turn = dominant_turn(np.arctan2(all_normals[upright] @ ahead, all_normals[upright] @ right), weight[upright])
+    upright = np.abs(matmul(all_normals, up)) < np.sin(np.radians(UPRIGHT_DEG))
+    turn = dominant_turn(np.arctan2(matmul(all_normals[upright], ahead), matmul(all_normals[upright], right)), weight[upright])
     x = np.cos(turn) * right + np.sin(turn) * ahead
     return np.stack([x, np.cross(up, x), up], axis=1)
 
@@ -205,7 +205,7 @@ def drift_variance(evidence: Evidence, direction: F64, information: F64, rows: I
     total = np.bincount(rows, information, len(evidence.poses))
     weight = total / total.sum()
     later = np.cumsum(weight[::-1])[::-1] - weight
-    return float((weight * (weight + 2.0 * later)) @ (evidence.drift_m2 @ direction @ direction))
+    return float(matmul(weight * (weight + 2.0 * later), matmul(evidence.drift_m2, direction, direction)))
 
 
 # Levels: floors and ceilings.
@@ -227,6 +227,12 @@ class Storey:
         return self.floor_m if np.isfinite(self.floor_m) else 0.0
 
 
+def smoothed(values: F64 | I64, weights: F64) -> F64:
+    """Weigh each of (n,) values with its neighbours, an odd number of them; there are zeros beyond the ends."""
+    padded = np.pad(values.astype(np.float64), len(weights) // 2)
+    return np.asarray(matmul(np.lib.stride_tricks.sliding_window_view(padded, len(weights)), weights))
+
+
 def _peaks(evidence: Evidence, facing: float) -> tuple[F64, F64]:
     """Return heights (n,) and areas (n,) of the levels that face up (1) or down (-1), from the lowest: counted in cells of 10 cm, not in readings."""
     level = evidence.normals[:, 2] * facing > np.cos(np.radians(LEVEL_DEG))
@@ -234,7 +240,7 @@ def _peaks(evidence: Evidence, facing: float) -> tuple[F64, F64]:
         return np.empty(0), np.empty(0)
     places = np.unique(np.floor(evidence.points[level] / [0.1, 0.1, 0.02]).astype(np.int64), axis=0)
     low = int(places[:, 2].min())
-    area = np.convolve(np.bincount(places[:, 2] - low), np.ones(3), "same") * 0.01 / 2.0
+    area = smoothed(np.bincount(places[:, 2] - low), np.ones(3)) * 0.01 / 2.0
     padded = np.concatenate([[-1.0] * 4, area, [-1.0] * 4])
     top = np.array([area[k] == padded[k : k + 9].max() and area[k] > 0.0 for k in range(len(area))], bool)
     heights = (np.nonzero(top)[0] + low + 0.5) * 0.02
@@ -251,9 +257,18 @@ def _lowest_floor(evidence: Evidence) -> float:
     return float(np.percentile(evidence.points[:, 2], 1.0))
 
 
-def height_of(evidence: Evidence, height: float, facing: float, tolerance: float = 0.05) -> tuple[float, float]:
+LEVEL_NEAR_M = 0.05  # readings of one level
+
+
+def at_level(evidence: Evidence, height: float, facing: float) -> Bool:
+    """Return the points (n,) of a level near `height` that faces up (1) or down (-1)."""
+    level = evidence.normals[:, 2] * facing > np.cos(np.radians(LEVEL_DEG))
+    return np.asarray(level & (np.abs(evidence.points[:, 2] - height) < LEVEL_NEAR_M), np.bool_)
+
+
+def height_of(evidence: Evidence, height: float, facing: float) -> tuple[float, float]:
     """Return the height of a level near `height` and its standard deviation."""
-    near = (evidence.normals[:, 2] * facing > np.cos(np.radians(LEVEL_DEG))) & (np.abs(evidence.points[:, 2] - height) < tolerance)
+    near = at_level(evidence, height, facing)
     return combined(evidence.points[near, 2], evidence.information[near], evidence.rows[near])
 
 
@@ -267,13 +282,13 @@ def combined(values: F64, information: F64, rows: I32) -> tuple[float, float]:
     means = np.bincount(rows, information * values, count)[seen] / weight[seen]
     share = np.minimum(weight[seen], 4.0 * np.median(weight[seen]))
     share = share / share.sum()
-    mean = float(share @ means)
+    mean = float(matmul(share, means))
     for _ in range(3):
         away = np.abs(means - mean)
         robust = share * np.minimum(1.0, 0.01 / np.maximum(away, 1e-9))
-        mean = float(robust @ means / robust.sum())
-    scatter = float(share @ (means - mean) ** 2)
-    views = 1.0 / float(share @ share)
+        mean = float(matmul(robust, means) / robust.sum())
+    scatter = float(matmul(share, (means - mean) ** 2))
+    views = 1.0 / float(matmul(share, share))
     return mean, float(np.sqrt(scatter / max(views / CORRELATED, 1.0) + SYSTEMATIC_M**2))
 
 
@@ -383,7 +398,7 @@ def faces_of(evidence: Evidence, storey: Storey, space: FreeSpace, directions: F
     top = storey.ceiling_m - storey.bottom_m - 0.05 if np.isfinite(storey.ceiling_m) else LEVELS * LEVEL_M
     upright = (np.abs(evidence.normals[:, 2]) < np.sin(np.radians(UPRIGHT_DEG))) & (height > 0.0) & (height < top)
     for normal in directions:
-        facing = evidence.normals[:, :2] @ normal > np.cos(np.radians(cone_deg))
+        facing = matmul(evidence.normals[:, :2], normal) > np.cos(np.radians(cone_deg))
         found += _faces_along(evidence, height, normal, np.nonzero(upright & facing)[0], storey, space, least_m)
     return found
 
@@ -393,13 +408,13 @@ def _faces_along(evidence: Evidence, height: F64, normal: F64, members: I64, sto
     high = height[members] > min(HIGH_M, tall_m(storey))
     if not high.any():
         return []
-    offsets = evidence.points[members, :2] @ normal
-    along = evidence.points[members, :2] @ np.array([normal[1], -normal[0]])
+    offsets = matmul(evidence.points[members, :2], normal)
+    along = matmul(evidence.points[members, :2], np.array([normal[1], -normal[0]]))
     levels = np.clip((height[members] / LEVEL_M).astype(int), 0, LEVELS - 1)
     weight = np.sqrt(evidence.information[members]) * evidence.area_m2[members]
     low = float(offsets[high].min()) - 0.1
     bins = np.bincount(((offsets[high] - low) / 0.01).astype(int), weight[high])
-    smooth = np.convolve(np.concatenate([bins, np.zeros(10)]), [0.25, 0.5, 0.75, 1.0, 0.75, 0.5, 0.25], "same")
+    smooth = smoothed(np.concatenate([bins, np.zeros(10)]), np.array([0.25, 0.5, 0.75, 1.0, 0.75, 0.5, 0.25]))
     around = np.concatenate([np.full(SAME_FACE, -1.0), smooth, np.full(SAME_FACE, -1.0)])
     found = []
     for best in np.nonzero(smooth > 0.0)[0]:

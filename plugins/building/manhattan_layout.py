@@ -5,19 +5,37 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from trihedron.pipeline.core.registry import register
-from trihedron.plugins.building.common import Evidence, Storey, slanted_directions
-from trihedron.plugins.building.common_layout import Layout
+from trihedron.pipeline.core.types import Building, Frame, Map, Planes, Pose, Rotation
+from trihedron.plugins.building.common import Evidence, Gathered, LayoutOptions, Storey, add_view, slanted_directions
+from trihedron.plugins.building.common_layout import AXES, plan_building, preview_state
 
 APART_DEG, LEAST_M2 = 6.0, 3.0  # from the axes, and area of tall points of all views, for which a slanted wall is mentioned
 
 
 @register("building", "manhattan_layout")
 @dataclass(frozen=True)
-class ManhattanLayout(Layout):
+class ManhattanLayout(LayoutOptions):
     """Cut the plan along the faces of walls in the two horizontal Manhattan axes; what rays passed is inside, what tall faces part are two rooms."""
 
-    def _remark(self, evidence: Evidence, storey: Storey) -> str:
-        """Name walls along neither axis."""
-        if not len(slanted_directions(evidence, storey, APART_DEG, LEAST_M2)):
-            return ""
-        return "walls at other than right angles were seen, which building=atlanta_layout lays out"
+    def start(self) -> Gathered:
+        """Return an empty state."""
+        return Gathered()
+
+    def add(self, state: Gathered, frame: Frame, planes: Planes, rotation: Rotation | None, pose: Pose, map: Map | None) -> Gathered:
+        """Retain the frame if it became a keyframe."""
+        return add_view(self, state, frame, planes, rotation, pose, map)
+
+    def preview(self, state: Gathered) -> Building:
+        """Return the plan so far of a few views, at their poses as they are now."""
+        return self.finish(preview_state(state), state.map)
+
+    def finish(self, state: Gathered, map: Map | None) -> Building:
+        """Return the plan at the final poses."""
+        return plan_building(self, state, map, lambda evidence, storey: AXES, remark=slanted_walls)
+
+
+def slanted_walls(evidence: Evidence, storey: Storey) -> str:
+    """Name walls along neither axis."""
+    if not len(slanted_directions(evidence, storey, APART_DEG, LEAST_M2)):
+        return ""
+    return "walls at other than right angles were seen, which building=atlanta_layout lays out"

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from trihedron.pipeline.core.geometry import invert, pose_matrix, transform_each, transform_planes
+from trihedron.pipeline.core.linalg import matmul
 from trihedron.pipeline.core.options import NonNegativeInt, PositiveFloat, PositiveInt
 from trihedron.pipeline.core.registry import register
 from trihedron.pipeline.core.types import I32, Correction, Map
@@ -101,7 +102,7 @@ def _correction(map: Map, window: BundleWindow, seen: BundleMeasurements, state:
     Lines, planes and points that the state left in place move rigidly with the newest free keyframe that observed them."""
     free = len(window.free)
     poses = free_poses(state, free)
-    motions = poses @ invert(map.keyframes.rows("T_world_camera", window.free))
+    motions = matmul(poses, invert(map.keyframes.rows("T_world_camera", window.free)))
     by = [np.repeat(np.arange(len(starts) - 1), np.diff(starts)) for starts in (seen.point_starts, seen.line_starts)]
     T_point, T_line, T_plane = (
         motions[_newest_free(rows, who, count, free)]
@@ -127,10 +128,10 @@ def _correction(map: Map, window: BundleWindow, seen: BundleMeasurements, state:
         T_world_keyframe=poses,
         point_ids=window.points,
         points_m=POSITION.rounded(points),
-        point_information=(R @ map.points.rows("information", window.points) @ np.swapaxes(R, -1, -2)).astype(np.float32),
+        point_information=matmul(R, map.points.rows("information", window.points), np.swapaxes(R, -1, -2)).astype(np.float32),
         line_ids=window.lines,
         endpoints_m=ENDPOINTS.rounded(transform_each(T_line, map.lines.rows("endpoints_m", window.lines))),
-        line_information=(Q @ map.lines.rows("information", window.lines) @ np.swapaxes(Q, -1, -2)).astype(np.float32),
+        line_information=matmul(Q, map.lines.rows("information", window.lines), np.swapaxes(Q, -1, -2)).astype(np.float32),
         plane_ids=window.planes,
         coefficients=np.array(moved, np.float64).reshape(-1, 4),
         plane_covariance=np.array(plane_covariance, np.float64).reshape(-1, 3, 3),

@@ -7,10 +7,10 @@ from typing import NamedTuple
 
 import numpy as np
 
+from trihedron.pipeline.core.linalg import matmul
 from trihedron.pipeline.core.types import F64, I32, Map, Table
-from trihedron.plugins.mapping.covisibility_graph import covisible_keyframes, current_submap, keyframes_of, newest_keyframes, observed_by
+from trihedron.plugins.mapping.covisibility_graph import covisible_keyframes, current_submap, keyframes_of, newest_keyframes, observed_by, odometry
 from trihedron.plugins.mapping.landmarks import index_of
-from trihedron.plugins.mapping.odometry import odometry
 from trihedron.plugins.shared.linalg import inverse
 from trihedron.plugins.shared.pose_optimizer_kernels import PARALLEL, PERPENDICULAR
 
@@ -174,7 +174,7 @@ def _relations(planes: F64, sigma_deg: float, parallel_deg: float) -> tuple[I32,
     """Pairs of planes that are parallel or perpendicular, (s, 3), and the variance of each angle (rad²).
 
     Walls deviate one by one, so the k relations of a plane count as one in total."""
-    cosine = np.abs(planes[:, :3] @ planes[:, :3].T)
+    cosine = np.abs(matmul(planes[:, :3], planes[:, :3].T))
     limit = np.radians(parallel_deg)
     related = np.triu((cosine > np.cos(limit)) | (cosine < np.sin(limit)), 1)
     a, b = np.nonzero(related)

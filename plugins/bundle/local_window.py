@@ -8,6 +8,8 @@ from typing import Annotated
 import numpy as np
 
 from trihedron.pipeline.core.geometry import tangent_basis
+from trihedron.pipeline.core.linalg import matmul
+from trihedron.pipeline.core.linalg_kernels import solve_positive
 from trihedron.pipeline.core.options import NonNegativeInt, PositiveFloat, PositiveInt, Range
 from trihedron.pipeline.core.registry import register
 from trihedron.pipeline.core.types import F64, Correction, Map
@@ -26,7 +28,6 @@ from trihedron.plugins.bundle.local_window_kernels import (
 from trihedron.plugins.mapping.covisibility_graph import newest_keyframes
 from trihedron.plugins.mapping.landmarks import ENDPOINTS, POSITION
 from trihedron.plugins.shared.linalg import inverse
-from trihedron.plugins.shared.linalg_kernels import solve_positive
 
 DAMPING, MIN_DAMPING = 1e-4, 1e-9
 CONVERGED = 1e-2  # squared Mahalanobis norm of the step of poses and planes, on average over these parameters
@@ -110,7 +111,7 @@ def _minimise(
             continue
         back_substitute(now, seen, inverses, dx, steps)
         trial_state = retract(state, seen.free, dx, steps)
-        length = float(dx @ S @ dx) / max(len(dx), 1)
+        length = float(matmul(dx, S, dx)) / max(len(dx), 1)
         new = linearise_bundle(trial_state, seen, loss, trial, last or not length < CONVERGED)
         if new < cost:
             state, cost, damping = trial_state, new, max(0.1 * damping, MIN_DAMPING)
@@ -166,7 +167,7 @@ def _ends(map: Map, window: BundleWindow, lines: F64, covariance: F64) -> F64:
     N = tangent_basis(direction)
     across = np.stack([covariance[:, :2, :2], covariance[:, 2:, 2:]], axis=1)
     outer: F64 = direction[:, :, None] * direction[:, None, :]
-    return np.asarray(N[:, None] @ across @ np.swapaxes(N, -1, -2)[:, None] + along[..., None, None] * outer[:, None])
+    return np.asarray(matmul(N[:, None], across, np.swapaxes(N, -1, -2)[:, None]) + along[..., None, None] * outer[:, None])
 
 
 def _symmetrise(matrices: F64) -> F64:

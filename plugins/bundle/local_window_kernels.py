@@ -12,11 +12,11 @@ from typing import NamedTuple
 import numpy as np
 
 from trihedron.pipeline.core.kernel import kernel
+from trihedron.pipeline.core.linalg_kernels import dot, invert_symmetric, matmul, matvec, tangent_columns
 from trihedron.pipeline.core.types import F64, I32
 from trihedron.plugins.bundle.common import BundleMeasurements, BundleState
 from trihedron.plugins.mapping.landmark_kernels import EXTEND
 from trihedron.plugins.shared.lie_kernels import log_so3
-from trihedron.plugins.shared.linalg_kernels import invert_symmetric, tangent_columns
 from trihedron.plugins.shared.pose_optimizer_kernels import (
     BEHIND,
     CHI2_95,
@@ -366,30 +366,31 @@ def _add_odometry(state: BundleState, seen: BundleMeasurements, out: NormalEquat
     for e in range(len(seen.neighbours)):
         a, b = seen.neighbours[e]
         R_a, R_b, Z = state.rotations[a], state.rotations[b], seen.motions[e]
-        R, t = R_a.T @ R_b, R_a.T @ (state.positions[b] - state.positions[a])
+        R, t = matmul(R_a.T, R_b), matvec(R_a.T, state.positions[b] - state.positions[a])
         Z_R = np.ascontiguousarray(Z[:3, :3])
-        r[:3] = Z_R.T @ (t - Z[:3, 3])
-        r[3], r[4], r[5] = log_so3(Z_R.T @ R)
+        r[:3] = matvec(Z_R.T, t - Z[:3, 3])
+        r[3], r[4], r[5] = log_so3(matmul(Z_R.T, R))
         A[:3, :3], A[3:, 3:] = -Z_R.T, -R.T
         for j in range(3):  # Z_Rᵀ [t]×
             A[j, 3] = Z_R[1, j] * t[2] - Z_R[2, j] * t[1]
             A[j, 4] = Z_R[2, j] * t[0] - Z_R[0, j] * t[2]
             A[j, 5] = Z_R[0, j] * t[1] - Z_R[1, j] * t[0]
         B = np.eye(6)
-        B[:3, :3] = Z_R.T @ R
+        B[:3, :3] = matmul(Z_R.T, R)
         L = seen.motion_information[e]
-        cost += r @ L @ r
+        cost += dot(r, matvec(L, r))
+        W_a, W_b = matmul(A.T, L), matmul(B.T, L)
         if a < seen.free:
-            out.H[6 * a : 6 * a + 6, 6 * a : 6 * a + 6] += A.T @ L @ A
-            out.g[6 * a : 6 * a + 6] += A.T @ (L @ r)
+            out.H[6 * a : 6 * a + 6, 6 * a : 6 * a + 6] += matmul(W_a, A)
+            out.g[6 * a : 6 * a + 6] += matvec(W_a, r)
         if b < seen.free:
-            out.H[6 * b : 6 * b + 6, 6 * b : 6 * b + 6] += B.T @ L @ B
-            out.g[6 * b : 6 * b + 6] += B.T @ (L @ r)
+            out.H[6 * b : 6 * b + 6, 6 * b : 6 * b + 6] += matmul(W_b, B)
+            out.g[6 * b : 6 * b + 6] += matvec(W_b, r)
         if a < seen.free and b < seen.free:
             if a < b:
-                out.H[6 * b : 6 * b + 6, 6 * a : 6 * a + 6] += B.T @ L @ A
+                out.H[6 * b : 6 * b + 6, 6 * a : 6 * a + 6] += matmul(W_b, A)
             else:
-                out.H[6 * a : 6 * a + 6, 6 * b : 6 * b + 6] += A.T @ L @ B
+                out.H[6 * a : 6 * a + 6, 6 * b : 6 * b + 6] += matmul(W_a, B)
     return cost
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import cv2
@@ -10,12 +11,13 @@ import cv2
 from trihedron.pipeline.core.options import PositiveFloat, PositiveInt
 from trihedron.pipeline.core.registry import register
 from trihedron.pipeline.core.types import Frame, Keypoints
-from trihedron.plugins.keypoints.common import OpenCvKeypoints
+from trihedron.plugins.keypoints.common import LiftOptions, detected
+from trihedron.plugins.shared.per_thread import PerThread
 
 
 @register("keypoints", "akaze")
 @dataclass(frozen=True)
-class Akaze(OpenCvKeypoints):
+class Akaze(LiftOptions):
     """`cv2.xfeatures2d.AKAZE` (Alcantarilla, Nuevo, Bartoli, BMVC 2013) with OpenCV's defaults: extrema of a nonlinear scale space, M-LDB
     descriptors.
 
@@ -27,7 +29,12 @@ class Akaze(OpenCvKeypoints):
 
     def __call__(self, frame: Frame) -> Keypoints:
         """Key points in OpenCV's order; (n, 61) binary descriptors."""
-        return self._found(frame, 4.8, 61, "hamming", 40)
+        return detected(self, self._detector(), frame, 4.8, 61, "hamming", 40)
+
+    @cached_property
+    def _detector(self) -> PerThread[Any]:
+        """OpenCV's detector of each thread."""
+        return PerThread(self._made)
 
     def _made(self) -> Any:
         return cv2.xfeatures2d.AKAZE_create(threshold=self.threshold, nOctaves=self.octaves, nOctaveLayers=self.octave_layers)

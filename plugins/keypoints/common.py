@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-import threading
-from abc import ABC, abstractmethod
 from dataclasses import dataclass
-from functools import cached_property
 from typing import Annotated, Any
 
 import numpy as np
@@ -19,8 +16,8 @@ LEVEL_SCALE = 1.2  # between levels, as the map expects (`octave_scale`)
 
 
 @dataclass(frozen=True)
-class LiftedKeypoints:
-    """Options by which key points receive their depth, those of `orb`; `_lifted` makes the value."""
+class LiftOptions:
+    """Options by which key points receive their depth, those of `orb`."""
 
     sigma_px: PositiveFloat = 0.6  # of a position at level 0; grows with the key point's size
     depth_radius_px: Annotated[int, Range(1, 10)] = 2  # of the neighbourhood the depth is taken from
@@ -28,48 +25,34 @@ class LiftedKeypoints:
     depth_gate: PositiveFloat = 3.0  # σ_z a neighbourhood may spread about a linear surface
     depth_edge: NonNegativeFloat = 0.01  # more than that, as a share of z, is a depth edge: no depth
 
-    def _lifted(self, frame: Frame, pixels: F32, scales: F64, angles_deg: F32, descriptors: U8, metric: str) -> Keypoints:
-        """Key points at pixels (n, 2) with scales (n,), 1 for the finest, directions (n,) and descriptors (n, b)."""
-        noise = frame.camera.depth_noise.coefficients
-        depth, sigma = local_depth(frame.depth_m, pixels, self.depth_radius_px, self.depth_share, noise, self.depth_gate, self.depth_edge)
-        scales = np.maximum(scales, 1.0)
-        return Keypoints(
-            index=frame.index,
-            stamp_ns=frame.stamp_ns,
-            pixels=pixels,
-            points_m=frame.camera.back_project(pixels, depth).astype(np.float32),
-            sigma_px=(self.sigma_px * scales).astype(np.float32),
-            sigma_m=sigma,
-            octaves=np.clip(np.rint(np.log(scales) / np.log(LEVEL_SCALE)), 0, 255).astype(np.uint8),
-            angles_deg=angles_deg,
-            descriptors=descriptors,
-            metric=metric,
-        )
+
+def lifted(options: LiftOptions, frame: Frame, pixels: F32, scales: F64, angles_deg: F32, descriptors: U8, metric: str) -> Keypoints:
+    """Key points at pixels (n, 2) with scales (n,), 1 for the finest, directions (n,) and descriptors (n, b)."""
+    noise = frame.camera.depth_noise.coefficients
+    depth, sigma = local_depth(frame.depth_m, pixels, options.depth_radius_px, options.depth_share, noise, options.depth_gate, options.depth_edge)
+    scales = np.maximum(scales, 1.0)
+    return Keypoints(
+        index=frame.index,
+        stamp_ns=frame.stamp_ns,
+        pixels=pixels,
+        points_m=frame.camera.back_project(pixels, depth).astype(np.float32),
+        sigma_px=(options.sigma_px * scales).astype(np.float32),
+        sigma_m=sigma,
+        octaves=np.clip(np.rint(np.log(scales) / np.log(LEVEL_SCALE)), 0, 255).astype(np.uint8),
+        angles_deg=angles_deg,
+        descriptors=descriptors,
+        metric=metric,
+    )
 
 
-@dataclass(frozen=True)
-class OpenCvKeypoints(LiftedKeypoints, ABC):
-    """Base of the detectors of OpenCV. Their objects hold buffers, so each thread has its own."""
-
-    @abstractmethod
-    def _made(self) -> Any:
-        """Make the detector."""
-
-    @cached_property
-    def _local(self) -> threading.local:
-        """Holds each thread's detector."""
-        return threading.local()
-
-    def _found(self, frame: Frame, smallest_px: float, width: int, metric: str, least_side: int) -> Keypoints:
-        """Detect and describe: key points with descriptors of `width` bytes; a size of `smallest_px` is level 0. None in an image smaller than
-        `least_side`."""
-        if not hasattr(self._local, "detector"):
-            self._local.detector = self._made()
-        small = min(frame.gray.shape) < least_side
-        found, described = ((), None) if small else self._local.detector.detectAndCompute(frame.gray, None)
-        rows = np.array([(*point.pt, point.size, point.angle) for point in found], np.float32).reshape(-1, 4)
-        descriptors = np.zeros((0, width), np.uint8) if described is None or not len(found) else _bytes(described)
-        return self._lifted(frame, rows[:, :2].copy(), rows[:, 2].astype(np.float64) / smallest_px, rows[:, 3].copy(), descriptors, metric)
+def detected(options: LiftOptions, detector: Any, frame: Frame, smallest_px: float, width: int, metric: str, least_side: int) -> Keypoints:
+    """Detect and describe by a detector of OpenCV: key points with descriptors of `width` bytes; a size of `smallest_px` is level 0. None in an image
+    smaller than `least_side`."""
+    small = min(frame.gray.shape) < least_side
+    found, described = ((), None) if small else detector.detectAndCompute(frame.gray, None)
+    rows = np.array([(*point.pt, point.size, point.angle) for point in found], np.float32).reshape(-1, 4)
+    descriptors = np.zeros((0, width), np.uint8) if described is None or not len(found) else _bytes(described)
+    return lifted(options, frame, rows[:, :2].copy(), rows[:, 2].astype(np.float64) / smallest_px, rows[:, 3].copy(), descriptors, metric)
 
 
 def _bytes(descriptors: NDArray[Any]) -> U8:

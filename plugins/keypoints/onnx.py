@@ -11,7 +11,7 @@ import numpy as np
 from trihedron.pipeline.core.options import NonNegativeFloat, NonNegativeInt
 from trihedron.pipeline.core.registry import register
 from trihedron.pipeline.core.types import Frame, Keypoints
-from trihedron.plugins.keypoints.common import LiftedKeypoints
+from trihedron.plugins.keypoints.common import LiftOptions, lifted
 from trihedron.plugins.shared.networks import NetworkOptions, bytes_of, network_image
 
 
@@ -47,7 +47,7 @@ PRESETS = {
 
 @register("keypoints", "onnx")
 @dataclass(frozen=True)
-class OnnxKeypoints(NetworkOptions, LiftedKeypoints):
+class OnnxKeypoints(NetworkOptions, LiftOptions):
     """Key points and descriptors of a network that the user gives: SuperPoint (DeTone et al., CVPRW 2018), ALIKED (Zhao et al., T-IM 2023), XFeat
     (Potje et al., CVPR 2024), DISK (Tyszkiewicz et al., NeurIPS 2020), or any other with the tensors of one of them.
 
@@ -61,7 +61,7 @@ class OnnxKeypoints(NetworkOptions, LiftedKeypoints):
 
     def __call__(self, frame: Frame) -> Keypoints:
         """Key points, best first; (n, d) descriptors, d at least 128, `metric` l2."""
-        preset, network = PRESETS[self.preset], self._network
+        preset, network = PRESETS[self.preset], self.network
         image = network_image(frame, network, preset.image, preset.channels, preset.multiple)
         outputs = network.run({preset.image: image.tensor}, (preset.keypoints, preset.scores, preset.descriptors))
         found = network.rows(preset.keypoints, outputs[0], None, 2).astype(np.float64)
@@ -74,4 +74,4 @@ class OnnxKeypoints(NetworkOptions, LiftedKeypoints):
         inside = ((pixels >= 0.0) & (pixels <= [width - 1, height - 1])).all(axis=1) & (scores >= self.min_score)
         order = np.flatnonzero(inside)[np.argsort(-scores[inside], kind="stable")][: self.features or None]
         alike = np.ones(len(order)), np.zeros(len(order), np.float32)  # one scale, no direction
-        return self._lifted(frame, np.ascontiguousarray(pixels[order], np.float32), *alike, bytes_of(descriptors[order]), "l2")
+        return lifted(self, frame, np.ascontiguousarray(pixels[order], np.float32), *alike, bytes_of(descriptors[order]), "l2")

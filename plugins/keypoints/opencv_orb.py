@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Annotated, Any
 
 import cv2
@@ -10,12 +11,13 @@ import cv2
 from trihedron.pipeline.core.options import PositiveInt, Range
 from trihedron.pipeline.core.registry import register
 from trihedron.pipeline.core.types import Frame, Keypoints
-from trihedron.plugins.keypoints.common import OpenCvKeypoints
+from trihedron.plugins.keypoints.common import LiftOptions, detected
+from trihedron.plugins.shared.per_thread import PerThread
 
 
 @register("keypoints", "opencv_orb")
 @dataclass(frozen=True)
-class OpenCvOrb(OpenCvKeypoints):
+class OpenCvOrb(LiftOptions):
     """`cv2.ORB` (Rublee, Rabaud, Konolige, Bradski, ICCV 2011) with OpenCV's defaults: the strongest corners of the whole image, wherever they are.
 
     Library: OpenCV (Apache-2.0). The bytes may differ on another CPU: its filters choose instructions by what the CPU has."""
@@ -28,7 +30,12 @@ class OpenCvOrb(OpenCvKeypoints):
 
     def __call__(self, frame: Frame) -> Keypoints:
         """At most `features` key points in OpenCV's order; (n, 32) binary descriptors."""
-        return self._found(frame, 31.0, 32, "hamming", 2 * self.edge_px + 1)
+        return detected(self, self._detector(), frame, 31.0, 32, "hamming", 2 * self.edge_px + 1)
+
+    @cached_property
+    def _detector(self) -> PerThread[Any]:
+        """OpenCV's detector of each thread."""
+        return PerThread(self._made)
 
     def _made(self) -> Any:
         options = {"nfeatures": self.features, "scaleFactor": self.scale, "nlevels": self.levels, "edgeThreshold": self.edge_px}

@@ -9,7 +9,7 @@ import numpy as np
 
 from trihedron.pipeline.core.kernel import kernel
 from trihedron.pipeline.core.types import F32, F64, I32, U8, Bool
-from trihedron.plugins.shared.linalg_kernels import descending
+from trihedron.plugins.shared.sorting_kernels import descending
 
 # Corners of all levels of a pyramid, chosen and directed in one call that holds no lock.
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import cv2
@@ -10,12 +11,13 @@ import cv2
 from trihedron.pipeline.core.options import NonNegativeFloat, NonNegativeInt, PositiveFloat, PositiveInt
 from trihedron.pipeline.core.registry import register
 from trihedron.pipeline.core.types import Frame, Keypoints
-from trihedron.plugins.keypoints.common import OpenCvKeypoints
+from trihedron.plugins.keypoints.common import LiftOptions, detected
+from trihedron.plugins.shared.per_thread import PerThread
 
 
 @register("keypoints", "sift")
 @dataclass(frozen=True)
-class Sift(OpenCvKeypoints):
+class Sift(LiftOptions):
     """`cv2.SIFT` (Lowe, IJCV 2004) with OpenCV's defaults: extrema of differences of Gaussians, histograms of gradients.
 
     Library: OpenCV (Apache-2.0; the patent expired in 2020). Descriptors are compared by Euclidean distance. The bytes may differ on another CPU."""
@@ -28,7 +30,12 @@ class Sift(OpenCvKeypoints):
 
     def __call__(self, frame: Frame) -> Keypoints:
         """Key points in OpenCV's order; (n, 128) descriptors, `metric` l2."""
-        return self._found(frame, 2.0 * self.blur_px, 128, "l2", 8)
+        return detected(self, self._detector(), frame, 2.0 * self.blur_px, 128, "l2", 8)
+
+    @cached_property
+    def _detector(self) -> PerThread[Any]:
+        """OpenCV's detector of each thread."""
+        return PerThread(self._made)
 
     def _made(self) -> Any:
         thresholds = {"contrastThreshold": self.contrast_threshold, "edgeThreshold": self.edge_threshold}

@@ -9,7 +9,7 @@ import numpy as np
 
 from trihedron.pipeline.core.kernel import kernel
 from trihedron.pipeline.core.types import F32, F64, U8
-from trihedron.plugins.shared.linalg_kernels import descending
+from trihedron.plugins.shared.sorting_kernels import descending
 
 # Image line segments: merging of collinear fragments and sub-pixel placement on the grey-level edge.
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Annotated, Any
 
 import cv2
@@ -10,12 +11,13 @@ import cv2
 from trihedron.pipeline.core.options import NonNegativeFloat, Range
 from trihedron.pipeline.core.registry import register
 from trihedron.pipeline.core.types import Frame, LineSegments
-from trihedron.plugins.lines.common import SMALLEST, StraightEdges
+from trihedron.plugins.lines.common import SMALLEST, LineOptions, line_segments, reduced
+from trihedron.plugins.shared.per_thread import PerThread
 
 
 @register("lines", "edge_drawing")
 @dataclass(frozen=True)
-class EdgeDrawing(StraightEdges):
+class EdgeDrawing(LineOptions):
     """EDLines (Akinlar & Topal, Pattern Recognition Letters 2011; OpenCV's): edges drawn from anchor to anchor along the gradient's ridges, cut into
     lines that pass a test against chance, then joined, placed to sub-pixel and described like those of `lsd`."""
 
@@ -29,21 +31,23 @@ class EdgeDrawing(StraightEdges):
 
     def __call__(self, frame: Frame) -> LineSegments:
         """The longest segments, longest first; (n, 32) binary descriptors."""
-        small, found = self._reduced(frame.gray), None
+        small, found = reduced(self, frame.gray), None
         if min(small.shape) >= SMALLEST:
-            detector = self._detector
+            detector = self._detector()
             detector.detectEdges(small)
             found = detector.detectLines()
-        return self._segments(frame, small, found)
+        return line_segments(self, frame, small, found)
 
-    @property
-    def _detector(self) -> Any:
-        """This thread's detector: it holds the edges between its two steps."""
-        if not hasattr(self._local, "edge_drawing"):
-            options = cv2.ximgproc.EdgeDrawing.Params()
-            options.EdgeDetectionOperator = cv2.ximgproc.EdgeDrawing_PREWITT
-            options.GradientThresholdValue, options.AnchorThresholdValue = self.gradient, self.anchor
-            options.LineFitErrorThreshold, options.NFAValidation = self.straight_px, self.validated
-            self._local.edge_drawing = cv2.ximgproc.createEdgeDrawing()
-            self._local.edge_drawing.setParams(options)
-        return self._local.edge_drawing
+    @cached_property
+    def _detector(self) -> PerThread[Any]:
+        """The detector of each thread: it holds the edges between its two steps."""
+        return PerThread(self._made)
+
+    def _made(self) -> Any:
+        options = cv2.ximgproc.EdgeDrawing.Params()
+        options.EdgeDetectionOperator = cv2.ximgproc.EdgeDrawing_PREWITT
+        options.GradientThresholdValue, options.AnchorThresholdValue = self.gradient, self.anchor
+        options.LineFitErrorThreshold, options.NFAValidation = self.straight_px, self.validated
+        detector = cv2.ximgproc.createEdgeDrawing()
+        detector.setParams(options)
+        return detector

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Annotated, Any
 
 import cv2
@@ -10,12 +11,13 @@ import cv2
 from trihedron.pipeline.core.options import NonNegativeFloat, PositiveFloat, Range, check_increasing
 from trihedron.pipeline.core.registry import register
 from trihedron.pipeline.core.types import Frame, LineSegments
-from trihedron.plugins.lines.common import SMALLEST, StraightEdges
+from trihedron.plugins.lines.common import SMALLEST, LineOptions, line_segments, reduced
+from trihedron.plugins.shared.per_thread import PerThread
 
 
 @register("lines", "fast_line")
 @dataclass(frozen=True)
-class FastLine(StraightEdges):
+class FastLine(LineOptions):
     """Fast line detector (Lee et al., ICRA 2014; OpenCV's): chains of Canny edge pixels cut into straight runs, then joined, placed to sub-pixel and
     described like those of `lsd`."""
 
@@ -31,14 +33,16 @@ class FastLine(StraightEdges):
 
     def __call__(self, frame: Frame) -> LineSegments:
         """The longest segments, longest first; (n, 32) binary descriptors."""
-        small = self._reduced(frame.gray)
-        found = self._detector.detect(small) if min(small.shape) >= SMALLEST else None
-        return self._segments(frame, small, found)
+        small = reduced(self, frame.gray)
+        found = self._detector().detect(small) if min(small.shape) >= SMALLEST else None
+        return line_segments(self, frame, small, found)
 
-    @property
-    def _detector(self) -> Any:
-        """This thread's detector. Runs half as long as the shortest segment wanted are kept: they may be fragments of one."""
-        if not hasattr(self._local, "fast_line"):
-            shortest = max(int(0.5 * self.min_length_px * self.scale), 3)
-            self._local.fast_line = cv2.ximgproc.createFastLineDetector(shortest, self.straight_px, self.weak, self.strong, 3, False)
-        return self._local.fast_line
+    @cached_property
+    def _detector(self) -> PerThread[Any]:
+        """The detector of each thread."""
+        return PerThread(self._made)
+
+    def _made(self) -> Any:
+        """Make a detector. Runs half as long as the shortest segment wanted are kept: they may be fragments of one."""
+        shortest = max(int(0.5 * self.min_length_px * self.scale), 3)
+        return cv2.ximgproc.createFastLineDetector(shortest, self.straight_px, self.weak, self.strong, 3, False)

@@ -10,13 +10,13 @@ import numpy as np
 from trihedron.pipeline.core.options import PositiveFloat, PositiveShare, Range
 from trihedron.pipeline.core.registry import register
 from trihedron.pipeline.core.types import Frame, LineSegments
-from trihedron.plugins.lines.common import StraightEdges
+from trihedron.plugins.lines.common import LineOptions, line_segments, reduced
 from trihedron.plugins.lines.lsd_kernels import line_support_segments
 
 
 @register("lines", "lsd")
 @dataclass(frozen=True)
-class Lsd(StraightEdges):
+class Lsd(LineOptions):
     """Line segment detector (von Gioi et al., PAMI 2010) on a reduced image, fragments merged, placed to sub-pixel on the full image,
     described by LBD (Zhang & Koch, 2013). Segments are directed with the bright side on their right: start and end keep their meaning over time."""
 
@@ -26,6 +26,6 @@ class Lsd(StraightEdges):
 
     def __call__(self, frame: Frame) -> LineSegments:
         """The longest segments, longest first; (n, 32) binary descriptors."""
-        small = self._reduced(frame.gray)
+        small = reduced(self, frame.gray)
         found = line_support_segments(small, float(np.radians(self.tolerance_deg)), self.quantisation, self.density)
-        return self._segments(frame, small, found)
+        return line_segments(self, frame, small, found)

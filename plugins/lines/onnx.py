@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from enum import Enum
+from functools import cached_property, partial
 from typing import Annotated, Any, ClassVar
 
 import cv2
@@ -12,8 +13,9 @@ import numpy as np
 from trihedron.pipeline.core.options import PositiveFloat, PositiveInt, Range, Share
 from trihedron.pipeline.core.registry import register
 from trihedron.pipeline.core.types import F32, F64, Frame, LineSegments
-from trihedron.plugins.lines.common import SMALLEST, StraightEdges
+from trihedron.plugins.lines.common import SMALLEST, LineOptions, line_segments, reduced
 from trihedron.plugins.shared.networks import NetworkImage, NetworkOptions, network_image
+from trihedron.plugins.shared.per_thread import PerThread
 
 
 class LineOutput(Enum):
@@ -25,7 +27,7 @@ class LineOutput(Enum):
 
 @register("lines", "onnx")
 @dataclass(frozen=True)
-class OnnxLines(NetworkOptions, StraightEdges):
+class OnnxLines(NetworkOptions, LineOptions):
     """Line segments of a network that the user gives: `image` (1, c, h, w) in 0 … 1 to `lines` and `scores` (M-LSD: Gu et al., AAAI 2022), or to the
     distance field `df` of DeepLSD (Pautrat et al., CVPR 2023), whose valleys are thinned and cut into straight runs by OpenCV's fast line detector
     (DeepLSD's own tracing is not in its network).
@@ -42,10 +44,10 @@ class OnnxLines(NetworkOptions, StraightEdges):
 
     def __call__(self, frame: Frame) -> LineSegments:
         """The longest segments, longest first; (n, 32) binary descriptors."""
-        network = self._network
-        small = self._reduced(frame.gray)
+        network = self.network
+        small = reduced(self, frame.gray)
         if min(frame.gray.shape) < SMALLEST:
-            return self._segments(frame, small, None)
+            return line_segments(self, frame, small, None)
         image = network_image(frame, network, "image", 3 if self.channels > 1 else 1, self.multiple)
         if self.output is LineOutput.distance_field:
             field = network.rows("df", network.run({"image": image.tensor}, ("df",))[0], *image.tensor.shape[2:])
@@ -54,7 +56,7 @@ class OnnxLines(NetworkOptions, StraightEdges):
             outputs = network.run({"image": image.tensor}, ("lines", "scores"))
             ends = network.rows("lines", outputs[0], None, 4)
             ends = ends[network.rows("scores", outputs[1], len(ends)) >= self.min_score]
-        return self._segments(frame, small, self._clipped(ends, image, frame) * self.scale)
+        return line_segments(self, frame, small, self._clipped(ends, image, frame) * self.scale)
 
     def _clipped(self, ends: F32, image: NetworkImage, frame: Frame) -> F64:
         """Segments (n, 4) in the frame's pixels, those that lie outside left out."""
@@ -68,13 +70,10 @@ class OnnxLines(NetworkOptions, StraightEdges):
         valley = np.where(field <= self.valley_px, 255, 0).astype(np.uint8)
         if not valley.any():
             return np.zeros((0, 4), np.float32)
-        found = self._detector.detect(cv2.ximgproc.thinning(valley))
+        found = self._detector().detect(cv2.ximgproc.thinning(valley))
         return np.zeros((0, 4), np.float32) if found is None else np.asarray(found, np.float32).reshape(-1, 4)
 
-    @property
-    def _detector(self) -> Any:
-        """This thread's detector; it takes an image of edges as it is."""
-        if not hasattr(self._local, "fast_line"):
-            shortest = max(int(0.5 * self.min_length_px), 3)
-            self._local.fast_line = cv2.ximgproc.createFastLineDetector(shortest, 1.41, 20.0, 50.0, 0, False)
-        return self._local.fast_line
+    @cached_property
+    def _detector(self) -> PerThread[Any]:
+        """The detector of each thread; it takes an image of edges as it is."""
+        return PerThread(partial(cv2.ximgproc.createFastLineDetector, max(int(0.5 * self.min_length_px), 3), 1.41, 20.0, 50.0, 0, False))

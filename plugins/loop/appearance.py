@@ -2,66 +2,40 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 
-from trihedron.pipeline.core.options import PositiveInt, Share
 from trihedron.pipeline.core.registry import register
-from trihedron.pipeline.core.types import F64, I32, U8, Correction, Frame, Map
-from trihedron.plugins.loop.common_loop_verification import LoopOptions, close_loop, path_lengths, within_reach
-from trihedron.plugins.mapping.covisibility_graph import observed_by
+from trihedron.pipeline.core.types import I32, U8, Correction, Frame, Map
+from trihedron.plugins.loop.common_bag_of_words import HISTOGRAM, WordOptions, rank_by_words
+from trihedron.plugins.loop.common_loop_verification import close_loop
 from trihedron.plugins.shared.feature_matching import words_of
 from trihedron.plugins.shared.feature_matching_kernels import U64, nearest_descriptors
 
 
 @register("loop", "appearance")
 @dataclass(frozen=True)
-class AppearanceLoop(LoopOptions):
+class AppearanceLoop(WordOptions):
     """Recognise a place by a bag of binary words, trained on the keyframes that are compared: nothing is downloaded.
 
     A keyframe is a candidate when its similarity is a share of that of the newest keyframe and its predecessor (DBoW2: Gálvez-López and Tardós, T-RO
     2012): the L1 distance of normalised tf-idf vectors. Every candidate is verified with points, lines and planes and by free space; the correction
     is that of a pose graph. A scene without points has no words."""
 
-    words: PositiveInt = 256
-    rounds: PositiveInt = 2  # of the training
-    training: PositiveInt = 4000  # most descriptors it uses
-    context: PositiveInt = 30  # other keyframes, spread over the run, that say which words are common
-    looked_at: PositiveInt = 20  # keyframes within reach that are compared, the nearest first
-    min_likeness: Share = 0.3  # share of the predecessor's likeness
-
     def __call__(self, map: Map, frame: Frame) -> Correction | None:
         """Return the correction; None unless the newest keyframe closes a loop, or the map has rotated out of its Manhattan frame."""
-        return close_loop(self, self._rank, map, frame)
+        return close_loop(self, partial(rank_by_words, self, self._words), map, frame)
 
-    def _rank(self, map: Map) -> Iterator[tuple[int, float]]:
-        """Keyframes within reach, the most similar first, with the length of the path since."""
-        rows, path_m = within_reach(self, map, self.looked_at)
-        living, _ = path_lengths(map)
-        if not len(rows) or len(living) < 2:
-            return
-        spread = living[np.linspace(0, len(living) - 1, min(self.context, len(living))).round().astype(int)]
-        ids = [observed_by(map, np.array([row], np.int32), "point") for row in (*spread, living[-2], *rows, living[-1])]
-        similarity = self._similarities(map, ids)[len(spread) :]
-        for k in np.argsort(-similarity[1:], kind="stable"):
-            if similarity[1 + k] >= self.min_likeness * similarity[0] and similarity[1 + k] > 0.0:
-                yield int(rows[k]), float(path_m[k])
-
-    def _similarities(self, map: Map, ids: list[I32]) -> F64:
-        """Similarity of the last of some sets of points to each of the others."""
-        known = np.unique(np.concatenate(ids)).astype(np.int32)
-        if not len(known):
-            return np.zeros(len(ids) - 1)
-        bits = as_bits(map.points.rows("descriptor", known))
+    def _words(self, map: Map, points: I32) -> tuple[I32, int]:
+        """The word (n,) of each point, and the length of the vocabulary."""
+        if not len(points):
+            return np.zeros(0, np.int32), 0
+        bits = as_bits(map.points.rows("descriptor", points))
         chosen = np.linspace(0, len(bits) - 1, min(self.training, len(bits))).round().astype(int)
         vocabulary = train(bits[chosen], self.words, self.rounds)
-        words = nearest_words(bits, vocabulary)
-        return similarities([words[np.searchsorted(known, one)] for one in ids], len(vocabulary))
-
-
-HISTOGRAM = 128  # least bytes of a histogram (SIFT) or learned descriptor: its bits are those above the median
+        return nearest_words(bits, vocabulary), len(vocabulary)
 
 
 def as_bits(descriptors: U8) -> U64:
@@ -89,12 +63,3 @@ def train(bits: U64, words: int, rounds: int) -> U64:
         majority = np.packbits(2 * votes > members[:, None], axis=1).view(np.uint64)
         vocabulary = np.where(members[:, None] > 0, majority, vocabulary)
     return np.asarray(vocabulary)
-
-
-def similarities(bags: list[I32], words: int) -> F64:
-    """Return the similarity (m - 1,) of the last of m bags of words to each other one: 1 for the same words, 0 for none in common."""
-    counts = np.array([np.bincount(bag, minlength=words) for bag in bags], np.float64).reshape(len(bags), words)
-    idf = np.log(len(bags) / np.maximum(np.count_nonzero(counts, axis=0), 1))
-    weighed = counts * np.maximum(idf, 1e-6)
-    weighed /= np.maximum(weighed.sum(axis=1, keepdims=True), 1e-12)
-    return np.asarray(1.0 - 0.5 * np.abs(weighed[:-1] - weighed[-1]).sum(axis=1))

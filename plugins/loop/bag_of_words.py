@@ -3,36 +3,41 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 
 from trihedron.pipeline.core.registry import register
-from trihedron.pipeline.core.types import F32, F64, I32, U8, Map
-from trihedron.plugins.loop.appearance import HISTOGRAM, AppearanceLoop, similarities
+from trihedron.pipeline.core.types import F32, I32, U8, Correction, Frame, Map
+from trihedron.plugins.loop.common_bag_of_words import HISTOGRAM, WordOptions, rank_by_words
+from trihedron.plugins.loop.common_loop_verification import close_loop
 
 
 @register("loop", "bag_of_words")
 @dataclass(frozen=True)
-class BagOfWords(AppearanceLoop):
+class BagOfWords(WordOptions):
     """Words are the clusters of `scipy.cluster.vq.kmeans2` (Sivic and Zisserman, ICCV 2003), trained on the keyframes that are compared and weighted
     by their inverse document frequency; places are then verified as those of `appearance`.
 
     The retrieval of pycolmap 4.2 cannot be used: its Python binding returns no scores. Library: SciPy (BSD). Sums of single precision: the bytes may
     differ on another CPU."""
 
-    def _similarities(self, map: Map, ids: list[I32]) -> F64:
-        """Similarity of the last of some sets of points to each of the others."""
+    def __call__(self, map: Map, frame: Frame) -> Correction | None:
+        """Return the correction; None unless the newest keyframe closes a loop, or the map has rotated out of its Manhattan frame."""
+        return close_loop(self, partial(rank_by_words, self, self._words), map, frame)
+
+    def _words(self, map: Map, points: I32) -> tuple[I32, int]:
+        """The word (n,) of each point, and the length of the vocabulary."""
         from scipy.cluster.vq import kmeans2, vq
 
-        known = np.unique(np.concatenate(ids)).astype(np.int32)
-        if len(known) < 2:
-            return np.zeros(len(ids) - 1)
-        vectors = as_vectors(map.points.rows("descriptor", known))
+        if len(points) < 2:
+            return np.zeros(len(points), np.int32), 0
+        vectors = as_vectors(map.points.rows("descriptor", points))
         chosen = vectors[np.linspace(0, len(vectors) - 1, min(self.training, len(vectors))).round().astype(int)]
         start = chosen[np.unique(np.linspace(0, len(chosen) - 1, min(self.words, len(chosen))).round().astype(int))]
         vocabulary, _ = kmeans2(chosen, start, iter=self.rounds, minit="matrix", missing="warn")
         words, _ = vq(vectors, vocabulary)
-        return similarities([words[np.searchsorted(known, one)].astype(np.int32) for one in ids], len(vocabulary))
+        return words.astype(np.int32), len(vocabulary)
 
 
 def as_vectors(descriptors: U8) -> F32:

@@ -11,7 +11,9 @@ from typing import Annotated
 
 import numpy as np
 
-from trihedron.pipeline.core.geometry import invert, log_se3, pose_matrix, transform, umeyama
+from trihedron.pipeline.core.geometry import invert, pose_matrix, transform, umeyama
+from trihedron.pipeline.core.lie import log_se3
+from trihedron.pipeline.core.linalg import inv, matmul, solve
 from trihedron.pipeline.core.options import NonNegativeInt, PositiveFloat, PositiveInt, Range, Share
 from trihedron.pipeline.core.types import F64, I32, Bool, Camera, Correction, Frame, Keypoints, Map, Matches
 from trihedron.plugins.loop.common_manhattan_prior import align_with_manhattan, correct_loop, estimate_manhattan_prior
@@ -48,9 +50,10 @@ class LoopOptions:
     min_share: Share = 0.5  # of the matches that must agree
     max_through: Share = 0.15  # of the place's surfaces in view that the camera may see through
 
-    def sigma_m(self, path_m: float | F64) -> float | F64:
-        """Return the standard deviation of the position after a path of this length."""
-        return self.floor_m + self.drift_share * path_m
+
+def drift_sigma_m(options: LoopOptions, path_m: float | F64) -> float | F64:
+    """Return the standard deviation of the position after a path of this length."""
+    return options.floor_m + options.drift_share * path_m
 
 
 def close_loop(options: LoopOptions, rank: Callable[[Map], Candidates], map: Map, frame: Frame) -> Correction | None:
@@ -91,12 +94,12 @@ def _verify(options: LoopOptions, map: Map, frame: Frame, place: Place) -> PoseS
     """Pose of the newest keyframe by the landmarks of a place, or None when the loop is not accepted."""
     newest = len(map.keyframes) - 1
     T = T_before = map.keyframes.row("T_world_camera", newest)
-    sigma_m, sigma_rad = options.sigma_m(place.path_m), 2.0 * np.radians(options.rotation_sigma_deg)
+    sigma_m, sigma_rad = drift_sigma_m(options, place.path_m), 2.0 * np.radians(options.rotation_sigma_deg)
     expected = np.diag(np.repeat([sigma_m**2, sigma_rad**2], 3))
     window = _seen_alone(map, newest, place.window)
     features = features_of(map, frame.camera, T_before, window)
     T = _initial_pose(map, frame.camera, place, window, features[0], T, expected)
-    information = np.asarray(np.linalg.inv(expected), np.float64)
+    information = np.asarray(inv(expected), np.float64)
     for radius_m in (0.03, 0.01):
         matches = search_map(SEARCH, frame.camera, PredictedPose(T, radius_m, 0.3 * radius_m, True), *features, map, place.window)
         found = solve_pose_in_map(T, T_before, information, map, matches, frame.camera, *features)
@@ -110,9 +113,9 @@ def accept_loop(options: LoopOptions, found: PoseSolution, matches: Matches, exp
     """Return True if enough agrees, all directions are observable, and the drift is plausible by its `expected` covariance (6, 6)."""
     inliers = np.count_nonzero(found.points), np.count_nonzero(found.lines), np.count_nonzero(found.planes)
     matched = len(matches.keypoints), len(matches.segments), len(matches.planes)
-    xi = log_se3(invert(T_before) @ found.T_world_camera)
-    plausible = xi @ np.linalg.solve(expected + found.covariance, xi) < CHI2_6
-    score, most = np.dot(inliers, LANDMARK_SCORE), np.dot(matched, LANDMARK_SCORE)
+    xi = log_se3(matmul(invert(T_before), found.T_world_camera))
+    plausible = matmul(xi, solve(expected + found.covariance, xi)) < CHI2_6
+    score, most = matmul(inliers, LANDMARK_SCORE), matmul(matched, LANDMARK_SCORE)
     enough = score >= options.min_score and score >= options.min_share * most
     return bool(plausible and enough and not found.unobservable.shape[1])
 
@@ -143,8 +146,8 @@ def within_reach(options: LoopOptions, map: Map, most: int) -> tuple[I32, F64]:
     rows, path_m = path_lengths(map)
     poses = map.keyframes.rows("T_world_camera", rows)
     distance = np.linalg.norm(poses[:, :3, 3] - poses[-1, :3, 3], axis=1)
-    cosine = poses[:, :3, 2] @ poses[-1, :3, 2]
-    reach = options.view_m + 3.0 * options.sigma_m(path_m)
+    cosine = matmul(poses[:, :3, 2], poses[-1, :3, 2])
+    reach = options.view_m + 3.0 * drift_sigma_m(options, path_m)
     chosen = np.flatnonzero((path_m > options.away_m) & (distance < reach) & (cosine > np.cos(np.radians(options.view_deg))))
     chosen = chosen[np.argsort(distance[chosen] / options.view_m + 1.0 - cosine[chosen], kind="stable")][:most]
     return rows[chosen], path_m[chosen]
@@ -156,7 +159,7 @@ def place_of(options: LoopOptions, map: Map, keyframe: int, path_m: float) -> Pl
     poses = map.keyframes.rows("T_world_camera", rows)
     own = poses[np.searchsorted(rows, keyframe)]
     near = np.linalg.norm(poses[:, :3, 3] - own[:3, 3], axis=1) < options.view_m
-    near &= (poses[:, :3, 2] @ own[:3, 2] > np.cos(np.radians(options.view_deg))) & (way > 0.5 * options.away_m)
+    near &= (matmul(poses[:, :3, 2], own[:3, 2]) > np.cos(np.radians(options.view_deg))) & (way > 0.5 * options.away_m)
     recent = rows[way <= 0.5 * options.away_m]
     there = {kind: observed_by(map, rows[near], kind) for kind in ("point", "line", "plane")}
     ids = [np.setdiff1d(there[kind], observed_by(map, recent, kind)).astype(np.int32) for kind in there]
@@ -189,7 +192,7 @@ def _initial_pose(map: Map, camera: Camera, place: Place, window: LocalWindow, k
     points, there = keypoints.points_m[pairs[:, 0]].astype(np.float64), map.points.rows("position_m", pairs[:, 1])
     sigma = 0.01 + keypoints.sigma_m[pairs[:, 0]].astype(np.float64) + sigma_rad * points[:, 2]
     by_planes = displacement_of_planes(map, window.planes, place.window.planes, sigma_m)[0]
-    starts = [T, pose_matrix(T[:3, :3], T[:3, 3] + by_planes), _motion_of_points(transform(T, points), there, sigma) @ T]
+    starts = [T, pose_matrix(T[:3, :3], T[:3, 3] + by_planes), matmul(_motion_of_points(transform(T, points), there, sigma), T)]
     agreeing = [np.count_nonzero(np.linalg.norm(transform(start, points) - there, axis=1) < 3.0 * sigma) for start in starts]
     return starts[int(np.argmax(agreeing))]
 
@@ -248,9 +251,9 @@ def _solve_displacement(n: F64, offset: F64, sigma_m: float) -> tuple[F64, Bool]
     """Least squares of `n · shift = offset` (k, 3), (k,) with a prior, without outliers; the shift and the inliers."""
     shift, inliers = np.zeros(3), np.ones(len(n), np.bool_)
     for _ in range(len(n)):
-        A = n[inliers].T @ n[inliers] / LAYOUT_M**2 + np.eye(3) / max(sigma_m, 1e-3) ** 2
-        shift = np.asarray(np.linalg.solve(A, n[inliers].T @ offset[inliers] / LAYOUT_M**2), np.float64)
-        error = np.where(inliers, np.abs(n @ shift - offset), 0.0)
+        A = matmul(n[inliers].T, n[inliers]) / LAYOUT_M**2 + np.eye(3) / max(sigma_m, 1e-3) ** 2
+        shift = np.asarray(solve(A, matmul(n[inliers].T, offset[inliers]) / LAYOUT_M**2), np.float64)
+        error = np.where(inliers, np.abs(matmul(n, shift) - offset), 0.0)
         if error.max() < LAYOUT_M:
             break
         inliers[np.argmax(error)] = False

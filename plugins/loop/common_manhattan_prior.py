@@ -10,7 +10,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from trihedron.pipeline.core.geometry import exp_so3, invert, pose_matrix
+from trihedron.pipeline.core.geometry import invert, pose_matrix
+from trihedron.pipeline.core.lie import exp_so3
+from trihedron.pipeline.core.linalg import inv, matmul
 from trihedron.pipeline.core.types import F64, I32, Correction, Map, Table
 from trihedron.plugins.loop.common_manhattan_prior_kernels import keyframe_rotations
 from trihedron.plugins.loop.common_pose_graph import Edges, correct_keyframes, joined, odometry_edges, solve_pose_graph
@@ -93,8 +95,8 @@ def correct_loop(
     rows = keyframes_of(map, current_submap(map))
     before = map.keyframes.rows("T_world_camera", rows)
     place, newest = np.searchsorted(rows, [keyframe, len(map.keyframes) - 1])
-    information = np.asarray(np.linalg.inv(covariance), np.float64)[None]
-    closing = Edges(np.array([[place, newest]], np.int32), (invert(before[place]) @ T_world_camera)[None], information)
+    information = np.asarray(inv(covariance), np.float64)[None]
+    closing = Edges(np.array([[place, newest]], np.int32), matmul(invert(before[place]), T_world_camera)[None], information)
     edges = joined(odometry_edges(map, rows, drift, rotation_drift), closing)
     return correct_keyframes(map, rows, before, _solve_with_prior(before, edges, prior))
 
@@ -120,8 +122,8 @@ def _solve_with_prior(before: F64, edges: Edges, prior: ManhattanPrior | None) -
     if prior is None:
         return solve_pose_graph(before, edges)
     count, axes = len(before), pose_matrix(prior.R_world_manhattan, np.zeros(3))
-    measured = invert(axes) @ before
-    measured[:, :3, :3] = measured[:, :3, :3] @ np.array([exp_so3(phi) for phi in prior.rotations])
+    measured = matmul(invert(axes), before)
+    measured[:, :3, :3] = matmul(measured[:, :3, :3], np.array([exp_so3(phi) for phi in prior.rotations]))
     information = np.zeros((count, 6, 6))
     information[:, :3, :3], information[:, 3:, 3:] = UNKNOWN * np.eye(3), prior.information
     pairs = np.stack([np.full(count, count), np.arange(count)], axis=1).astype(np.int32)

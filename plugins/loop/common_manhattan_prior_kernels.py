@@ -6,6 +6,7 @@ from __future__ import annotations
 import numpy as np
 
 from trihedron.pipeline.core.kernel import kernel
+from trihedron.pipeline.core.linalg_kernels import dot, matmul, matvec, solve
 from trihedron.pipeline.core.types import F64, I32
 
 
@@ -21,18 +22,18 @@ def keyframe_rotations(
     H, g, rotations = np.zeros((k, 3, 3)), np.zeros((k, 3)), np.zeros((k, 3))
     S, A, e, r = np.zeros((3, 3)), np.zeros((3, 3)), np.zeros(3), np.zeros(3)
     for i in range(len(vectors)):
-        along = R_world_manhattan.T @ vectors[i]
+        along = matvec(R_world_manhattan.T, vectors[i])
         axis = np.argmax(np.abs(along))
         if not abs(along[axis]) > least_cos:  # NaN too
             continue
         R = np.ascontiguousarray(poses[keyframes[i], :3, :3])
-        e[:] = R.T @ (R_world_manhattan[:, axis] * np.sign(along[axis]))
-        r[:] = R.T @ vectors[i] - e
+        e[:] = matvec(R.T, R_world_manhattan[:, axis] * np.sign(along[axis]))
+        r[:] = matvec(R.T, vectors[i]) - e
         S[0, 1], S[0, 2], S[1, 0], S[1, 2], S[2, 0], S[2, 1] = e[2], -e[1], -e[2], e[0], e[1], -e[0]  # phi × e = S phi
-        A[:] = R.T @ information[i] @ R
-        weight = 1.0 / (1.0 + r @ A @ r / gate**2)
-        H[keyframes[i]] += weight * (S.T @ A @ S)
-        g[keyframes[i]] -= weight * (S.T @ (A @ r))
+        A[:] = matmul(matmul(R.T, information[i]), R)
+        weight = 1.0 / (1.0 + dot(r, matvec(A, r)) / gate**2)
+        H[keyframes[i]] += weight * matmul(matmul(S.T, A), S)
+        g[keyframes[i]] -= weight * matvec(S.T, matvec(A, r))
     for j in range(k):
-        rotations[j] = np.linalg.solve(H[j] + 1e-2 * np.eye(3), g[j])
+        rotations[j] = solve(H[j] + 1e-2 * np.eye(3), g[j])
     return rotations, H

@@ -7,10 +7,13 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from trihedron.pipeline.core.geometry import exp_so3, invert, transform_each
+from trihedron.pipeline.core.geometry import invert, transform_each
+from trihedron.pipeline.core.lie import exp_so3
+from trihedron.pipeline.core.linalg import matmul
 from trihedron.pipeline.core.types import F32, F64, I32, Correction, Map, Table
+from trihedron.plugins.loop.common_pose_graph_kernels import solve_envelope
+from trihedron.plugins.mapping.covisibility_graph import odometry
 from trihedron.plugins.mapping.landmarks import ENDPOINTS, POSITION
-from trihedron.plugins.mapping.odometry import odometry
 from trihedron.plugins.mapping.plane_fusion import information_of
 from trihedron.plugins.shared.lie_kernels import log_so3_each
 from trihedron.plugins.shared.linalg import cross_matrices, inverse
@@ -42,13 +45,12 @@ def joined(*edges: Edges) -> Edges:
 def solve_pose_graph(poses: F64, edges: Edges) -> F64:
     """Minimise the squared error of the edges over `T_world_node` (n, 4, 4), from `poses`, by sparse Levenberg–Marquardt. Node 0 is fixed."""
     from scipy.sparse import diags
-    from scipy.sparse.linalg import splu
 
     damping, current = 1e-6, poses.copy()
     cost, H, g = _normal_equations(current, edges)
     for _ in range(ITERATIONS):
         scale = diags(H.diagonal())
-        step = splu((H + damping * scale).tocsc()).solve(-g).reshape(-1, 6)
+        step = _solve(H + damping * scale, -g).reshape(-1, 6)
         step[0] = 0.0  # fixed but for rounding
         tried = _retract(current, step)
         new_cost, new_H, new_g = _normal_equations(tried, edges)
@@ -63,11 +65,23 @@ def solve_pose_graph(poses: F64, edges: Edges) -> F64:
     return current
 
 
+def _solve(H: bsr_matrix, g: F64) -> F64:
+    """Solve `H x = g` for a symmetric positive definite H (6n, 6n), with nodes in the order of reverse Cuthill and McKee, which keeps the factor
+    narrow."""
+    from scipy.sparse.csgraph import reverse_cuthill_mckee
+
+    order = reverse_cuthill_mckee(H.tocsr(), symmetric_mode=True)
+    permuted = H.tocsr()[order][:, order]
+    x = np.empty(len(g))
+    x[order] = solve_envelope(permuted.indptr, permuted.indices, permuted.data, g[order])
+    return x
+
+
 def _retract(poses: F64, steps: F64) -> F64:
     """Move the frames of poses (n, 4, 4) by steps (rho, phi) (n, 6)."""
     out = poses.copy()
-    out[:, :3, 3] += (poses[:, :3, :3] @ steps[:, :3, None])[..., 0]
-    out[:, :3, :3] = poses[:, :3, :3] @ np.array([exp_so3(phi) for phi in steps[:, 3:]])
+    out[:, :3, 3] += matmul(poses[:, :3, :3], steps[:, :3, None])[..., 0]
+    out[:, :3, :3] = matmul(poses[:, :3, :3], np.array([exp_so3(phi) for phi in steps[:, 3:]]))
     return out
 
 
@@ -76,18 +90,18 @@ def _normal_equations(poses: F64, edges: Edges) -> tuple[float, bsr_matrix, F64]
     a, b = edges.pairs.T
     R_a, R_b, R_z = poses[a, :3, :3], poses[b, :3, :3], edges.measured[:, :3, :3]
     R_a_t, R_z_t = np.swapaxes(R_a, 1, 2), np.swapaxes(R_z, 1, 2)
-    t_a_b = (R_a_t @ (poses[b, :3, 3] - poses[a, :3, 3])[..., None])[..., 0]
-    error = np.concatenate([(R_z_t @ (t_a_b - edges.measured[:, :3, 3])[..., None])[..., 0], log_so3_each(R_z_t @ R_a_t @ R_b)], axis=1)
+    t_a_b = matmul(R_a_t, (poses[b, :3, 3] - poses[a, :3, 3])[..., None])[..., 0]
+    error = np.concatenate([matmul(R_z_t, (t_a_b - edges.measured[:, :3, 3])[..., None])[..., 0], log_so3_each(matmul(R_z_t, R_a_t, R_b))], axis=1)
     J_a, J_b = np.zeros((2, len(a), 6, 6))
-    J_a[:, :3, :3], J_a[:, :3, 3:], J_a[:, 3:, 3:] = -R_z_t, R_z_t @ cross_matrices(t_a_b), -np.swapaxes(R_b, 1, 2) @ R_a
-    J_b[:, :3, :3], J_b[:, 3:, 3:] = R_z_t @ R_a_t @ R_b, np.eye(3)
-    W_a, W_b = np.swapaxes(J_a, 1, 2) @ edges.information, np.swapaxes(J_b, 1, 2) @ edges.information
+    J_a[:, :3, :3], J_a[:, :3, 3:], J_a[:, 3:, 3:] = -R_z_t, matmul(R_z_t, cross_matrices(t_a_b)), matmul(-np.swapaxes(R_b, 1, 2), R_a)
+    J_b[:, :3, :3], J_b[:, 3:, 3:] = matmul(R_z_t, R_a_t, R_b), np.eye(3)
+    W_a, W_b = matmul(np.swapaxes(J_a, 1, 2), edges.information), matmul(np.swapaxes(J_b, 1, 2), edges.information)
     n = len(poses)
-    blocks = np.concatenate([W_a @ J_a, W_a @ J_b, W_b @ J_a, W_b @ J_b, FIXED[None]])
+    blocks = np.concatenate([matmul(W_a, J_a), matmul(W_a, J_b), matmul(W_b, J_a), matmul(W_b, J_b), FIXED[None]])
     rows, columns = np.concatenate([a, a, b, b, [0]]), np.concatenate([a, b, a, b, [0]])
     g = np.zeros((n, 6))
-    np.add.at(g, a, (W_a @ error[..., None])[..., 0])
-    np.add.at(g, b, (W_b @ error[..., None])[..., 0])
+    np.add.at(g, a, matmul(W_a, error[..., None])[..., 0])
+    np.add.at(g, b, matmul(W_b, error[..., None])[..., 0])
     cost = float(np.einsum("ei,eij,ej->", error, edges.information, error))
     return cost, _assembled(blocks, rows, columns, n), g.ravel()
 
@@ -116,10 +130,10 @@ def odometry_edges(map: Map, rows: I32, drift: float, rotation_drift: float) -> 
 def correct_keyframes(map: Map, rows: I32, before: F64, after: F64) -> Correction:
     """Return the correction that moves keyframes `rows` from poses (n, 4, 4) to others, and each landmark by the mean motion of its observers."""
     motions = np.broadcast_to(np.eye(4), (len(map.keyframes), 4, 4)).copy()
-    motions[rows] = after @ invert(before)
+    motions[rows] = matmul(after, invert(before))
     (points, T_points), (lines, T_lines), (planes, T_planes) = (_mean_motion(table, motions) for table in (map.points, map.lines, map.planes))
     coefficients = _transform_planes(T_planes, map.planes.rows("coefficients", planes))
-    moments = T_planes @ map.planes.rows("moments", planes) @ np.swapaxes(T_planes, 1, 2)
+    moments = matmul(T_planes, map.planes.rows("moments", planes), np.swapaxes(T_planes, 1, 2))
     return Correction(
         map.index, map.stamp_ns, map.revision, rows, after,
         points, POSITION.rounded(transform_each(T_points, map.points.rows("position_m", points)[:, None])[:, 0]),
@@ -144,11 +158,11 @@ def _mean_motion(table: Table, motions: F64) -> tuple[I32, F64]:
 
 def _rotate_information(T: F64, information: F32) -> F32:
     """Rotate information matrices (..., 3, 3) by motions (..., 4, 4)."""
-    return np.asarray(T[..., :3, :3] @ information @ np.swapaxes(T[..., :3, :3], -1, -2), np.float32)
+    return np.asarray(matmul(T[..., :3, :3], information, np.swapaxes(T[..., :3, :3], -1, -2)), np.float32)
 
 
 def _transform_planes(T: F64, planes: F64) -> F64:
     """Transform planes (n, 4), each by its own motion (n, 4, 4)."""
-    n = (T[:, :3, :3] @ planes[:, :3, None])[..., 0]
+    n = matmul(T[:, :3, :3], planes[:, :3, None])[..., 0]
     n /= np.linalg.norm(n, axis=1, keepdims=True)
     return np.concatenate([n, planes[:, 3:] - np.einsum("ni,ni->n", n, T[:, :3, 3])[:, None]], axis=1)

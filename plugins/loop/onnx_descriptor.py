@@ -9,6 +9,7 @@ from typing import ClassVar
 
 import numpy as np
 
+from trihedron.pipeline.core.linalg import matmul, norm
 from trihedron.pipeline.core.options import PositiveInt, Share
 from trihedron.pipeline.core.registry import register
 from trihedron.pipeline.core.types import F32, Column, Correction, Frame, Map, PlaceCorrection, Table
@@ -49,18 +50,18 @@ class OnnxDescriptor(NetworkOptions, LoopOptions):
 
     def _described(self, frame: Frame) -> F32:
         """The unit vector (d,) of an image."""
-        network = self._network
+        network = self.network
         tensor = network_image(frame, network, "image", 3, self.multiple).tensor
         if self.imagenet:
             tensor = np.ascontiguousarray((tensor - MEAN[:, None, None]) / SPREAD[:, None, None], np.float32)
         found = network.rows("descriptor", network.run({"image": tensor}, ("descriptor",))[0], None)
-        return np.asarray(found / max(float(np.linalg.norm(found)), 1e-12), np.float32)
+        return np.asarray(found / max(float(norm(found)), 1e-12), np.float32)
 
     def _rank(self, map: Map, places: Table, vector: F32) -> Iterator[tuple[int, float]]:
         """Keyframes within reach, the most similar first, with the length of the path since."""
         rows, path_m = within_reach(self, map, self.looked_at)
         keyframes = places.shared("keyframe")
-        similarity = {int(k): float(s) for k, s in zip(keyframes, places.shared("descriptor") @ vector)}
+        similarity = {int(k): float(s) for k, s in zip(keyframes, matmul(places.shared("descriptor"), vector))}
         order = sorted(range(len(rows)), key=lambda i: -similarity.get(int(rows[i]), -1.0))
         yield from ((int(rows[i]), float(path_m[i])) for i in order if similarity.get(int(rows[i]), -1.0) >= self.min_similarity)
 

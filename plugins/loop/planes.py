@@ -10,7 +10,7 @@ import numpy as np
 from trihedron.pipeline.core.options import NonNegativeFloat, PositiveInt
 from trihedron.pipeline.core.registry import register
 from trihedron.pipeline.core.types import Correction, Frame, Map
-from trihedron.plugins.loop.common_loop_verification import LoopOptions, close_loop, displacement_of_planes, within_reach
+from trihedron.plugins.loop.common_loop_verification import LoopOptions, close_loop, displacement_of_planes, drift_sigma_m, within_reach
 from trihedron.plugins.mapping.covisibility_graph import observed_by
 
 
@@ -33,7 +33,7 @@ class PlanesLoop(LoopOptions):
         rows, path_m = within_reach(self, map, self.looked_at)
         here = observed_by(map, np.array([len(map.keyframes) - 1], np.int32), "plane")
         places = [observed_by(map, rows[k : k + 1], "plane") for k in range(len(rows))]
-        scores = np.array([displacement_of_planes(map, here, there, float(self.sigma_m(path_m[k])))[1] for k, there in enumerate(places)])
+        scores = np.array([displacement_of_planes(map, here, there, float(drift_sigma_m(self, path_m[k])))[1] for k, there in enumerate(places)])
         for k in np.argsort(-scores, kind="stable"):
             if scores[k] >= self.min_layout:
                 yield int(rows[k]), float(path_m[k])

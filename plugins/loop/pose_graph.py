@@ -8,6 +8,7 @@ from typing import Annotated
 import numpy as np
 
 from trihedron.pipeline.core.geometry import invert, pose_matrix
+from trihedron.pipeline.core.linalg import inv, matmul
 from trihedron.pipeline.core.options import NonNegativeFloat, PositiveFloat, PositiveInt, Range
 from trihedron.pipeline.core.registry import register
 from trihedron.pipeline.core.types import F64, I32, Correction, Map
@@ -57,11 +58,11 @@ def shared_edges(map: Map, rows: I32, poses: F64, least: int, gate: float) -> tu
         for a in range(b):
             edge = _edge(seen[a], seen[b], least, gate)
             if edge is None and a == b - 1:
-                edge = invert(poses[a]) @ poses[b], np.diag(np.repeat([LOOSE_M**2, LOOSE**2], 3))
+                edge = matmul(invert(poses[a]), poses[b]), np.diag(np.repeat([LOOSE_M**2, LOOSE**2], 3))
             if edge is not None:
                 pairs.append((a, b))
                 measured.append(edge[0])
-                information.append(np.linalg.inv(edge[1]))
+                information.append(inv(edge[1]))
     longest = max((b - a for a, b in pairs), default=0)
     return Edges(np.array(pairs, np.int32).reshape(-1, 2), np.array(measured), np.array(information)), longest
 
@@ -77,7 +78,7 @@ def _edge(a: tuple[I32, F64, F64, F64], b: tuple[I32, F64, F64, F64], least: int
     R, t = np.eye(3), np.zeros(3)
     for _ in range(3):
         R, t = fitted(here[agree], there[agree], sigma[agree])
-        agree = np.linalg.norm(here @ R.T + t - there, axis=1) < gate * sigma
+        agree = np.linalg.norm(matmul(here, R.T) + t - there, axis=1) < gate * sigma
         if agree.sum() < least:
             return None
     covariance = fit_covariance(here[agree], sigma[agree]) + np.diag(np.repeat([FLOOR_M**2, FLOOR**2], 3))

@@ -9,7 +9,8 @@ from typing import Annotated, NamedTuple
 
 import numpy as np
 
-from trihedron.pipeline.core.geometry import exp_so3
+from trihedron.pipeline.core.lie import exp_so3
+from trihedron.pipeline.core.linalg import inv, matmul, norm
 from trihedron.pipeline.core.options import NonNegativeFloat, PositiveFloat, PositiveInt, Range, Share, check_increasing
 from trihedron.pipeline.core.registry import register
 from trihedron.pipeline.core.types import F64, I32, Bool, ManhattanFrame, Normals, Planes, Segments
@@ -145,15 +146,15 @@ def _sharing(previous: ManhattanFrame | None) -> tuple[F64, I32]:
     if previous is None:
         return np.eye(3)[None], np.zeros(1, np.int32)
     vertical = previous.rotations[:, :, 2]
-    same = vertical @ vertical[0] > 1.0 - 1e-9  # another estimator's frames need not have it
+    same = matmul(vertical, vertical[0]) > 1.0 - 1e-9  # another estimator's frames need not have it
     return previous.rotations[same], previous.ids[same]
 
 
 def _beside(rotations: F64, rows: I32, known: F64, unseen: I32) -> F64:
     """(u, 3, 3) where those of the `known` that are out of sight must be: turned like the first one seen again, with the vertical of all."""
     again = int(np.argmax(rows >= 0))
-    turn = rotations[again] @ known[max(rows[again], 0)].T
-    return np.array([shared_vertical(rotations[again], turn @ R) for R in known[unseen]]).reshape(-1, 3, 3)
+    turn = matmul(rotations[again], known[max(rows[again], 0)].T)
+    return np.array([shared_vertical(rotations[again], matmul(turn, R)) for R in known[unseen]]).reshape(-1, 3, 3)
 
 
 # When modes of the sphere are one vertical and horizontal directions about it.
@@ -234,16 +235,16 @@ class AtlantaFinder:
             return NONE
         modes = self._shifted(few, np.ascontiguousarray(starts.T))
         crossed = [np.cross(modes[:, i], modes[:, j]) for i, j in combinations(range(min(modes.shape[1], CROSSED)), 2)]
-        crossed = [c / np.linalg.norm(c) for c in crossed if np.linalg.norm(c) > 0.5]
+        crossed = [c / norm(c) for c in crossed if norm(c) > 0.5]
         vertical = max([*modes.T, *crossed], key=lambda v: self._score(few, v, known is None))
         return self._about(directions, planes, vertical, known, np.pi)
 
     def _score(self, directions: Directions, vertical: F64, alone: bool) -> float:
         """Weight that the vertical and the azimuths about it gather; upright counts more where nothing else determines the vertical."""
-        on_vertical = np.abs(directions.vectors @ vertical) > np.cos(self.finder.cone)
+        on_vertical = np.abs(matmul(directions.vectors, vertical)) > np.cos(self.finder.cone)
         masses = self._azimuths(directions, vertical)[1]
         explained = float(directions.weights[on_vertical].sum() + masses.sum())
-        return explained * (1.0 + self.upright * alone * abs(float(vertical @ UP)))
+        return explained * (1.0 + self.upright * alone * abs(float(matmul(vertical, UP))))
 
     def _azimuths(self, directions: Directions, vertical: F64) -> tuple[F64, F64]:
         least = self.min_azimuth * float(directions.weights.sum())
@@ -259,8 +260,8 @@ class AtlantaFinder:
         rotations, _ = self._azimuths(directions, vertical)
         if len(rotations) == 0:
             return NONE
-        up = np.sign(vertical @ UP) or 1.0
-        known = rotations[:1] @ np.diag([1.0, up, up]) if known is None else known
+        up = np.sign(matmul(vertical, UP)) or 1.0
+        known = matmul(rotations[:1], np.diag([1.0, up, up])) if known is None else known
         rotations, rows = named_azimuths(rotations, known, self.again, furthest)
         return self._judged(directions, planes, rotations, rows)
 
@@ -306,7 +307,7 @@ class AtlantaFinder:
         taken = np.zeros((3, 0))
         for k in sorted(range(1, len(peaks), 2), key=lambda k: -(weights[k] * seen[k] + weights[k + 1] * seen[k + 1])):
             own = seen[k : k + 2]
-            alone = (np.abs(axes[:, k : k + 2].T @ taken) < np.cos(np.radians(self.apart) * 0.7)).all(axis=1)
+            alone = (np.abs(matmul(axes[:, k : k + 2].T, taken)) < np.cos(np.radians(self.apart) * 0.7)).all(axis=1)
             if not alone[own].all() or weights[k : k + 2][own].sum() < self.min_azimuth * total:
                 own[:] = False
             taken = np.concatenate([taken, axes[:, k : k + 2][:, own]], axis=1)
@@ -315,10 +316,10 @@ class AtlantaFinder:
 
 def _rotation(vertical: F64, pair: F64, weights: F64) -> F64:
     """(3, 3) with third column `vertical` and the first two nearest to a pair of horizontal axes (3, 2), by weight (2,)."""
-    vertical = vertical / np.linalg.norm(vertical)
+    vertical = vertical / norm(vertical)
     first = weights[0] * pair[:, 0] + weights[1] * np.cross(pair[:, 1], vertical)
-    first -= (first @ vertical) * vertical
-    first /= np.linalg.norm(first)
+    first -= matmul(first, vertical) * vertical
+    first /= norm(first)
     return np.stack([first, np.cross(vertical, first), vertical], axis=1)
 
 
@@ -328,8 +329,8 @@ def named_azimuths(found: F64, known: F64, limit: float, furthest: float) -> tup
 
     The known ones keep their angles to each other: they are turned so that most of them are found within `limit` (rad), by no more than `furthest`
     when that finds any, and by the least of such turns."""
-    flip = np.diag([1.0, -1.0, -1.0]) if found[0, :, 2] @ known[0, :, 2] < 0.0 else np.eye(3)
-    found = found @ flip
+    flip = np.diag([1.0, -1.0, -1.0]) if matmul(found[0, :, 2], known[0, :, 2]) < 0.0 else np.eye(3)
+    found = matmul(found, flip)
     azimuth = _azimuths(found, found[0])
     expected = _azimuths(_tilted(known, found[0, :, 2]), found[0])
     apart = _wrapped(azimuth[:, None] - expected[None])
@@ -345,12 +346,12 @@ def named_azimuths(found: F64, known: F64, limit: float, furthest: float) -> tup
         rows[f] = k
         off[f], off[:, k] = np.inf, np.inf
     steps = np.round((expected[np.maximum(rows, 0)] + turn - azimuth) / QUARTER) * QUARTER
-    return np.array([exp_so3(step * R[:, 2]) @ R for step, R in zip(steps, found)]), rows
+    return np.array([matmul(exp_so3(step * R[:, 2]), R) for step, R in zip(steps, found)]), rows
 
 
 def _azimuths(rotations: F64, base: F64) -> F64:
     """(k,) turn of the first column of each about the third of `base` (rad)."""
-    return np.arctan2(rotations[:, :, 0] @ base[:, 1], rotations[:, :, 0] @ base[:, 0])
+    return np.asarray(np.arctan2(matmul(rotations[:, :, 0], base[:, 1]), matmul(rotations[:, :, 0], base[:, 0])))
 
 
 def _wrapped(angles: F64) -> F64:
@@ -361,16 +362,16 @@ def _wrapped(angles: F64) -> F64:
 def _tilted(rotations: F64, vertical: F64) -> F64:
     """(k, 3, 3) with their common third column turned onto `vertical` the shortest way."""
     axis = np.cross(rotations[0, :, 2], vertical)
-    sine, cosine = float(np.linalg.norm(axis)), float(rotations[0, :, 2] @ vertical)
-    return rotations if sine < 1e-12 else exp_so3(axis / sine * np.arctan2(sine, cosine)) @ rotations
+    sine, cosine = float(norm(axis)), float(matmul(rotations[0, :, 2], vertical))
+    return rotations if sine < 1e-12 else matmul(exp_so3(axis / sine * np.arctan2(sine, cosine)), rotations)
 
 
 def shared_covariance(H: F64, rotations: F64, unknown: float) -> F64:
     """(k, 3, 3) covariance of phi in `R <- Exp(phi) R` of each rotation, from the information H (2 + k, 2 + k) of `fit_shared_vertical`; `unknown`
     (rad²) is the variance of what is not observed."""
-    joint = np.linalg.inv(H + np.eye(len(H)) / unknown)
+    joint = inv(H + np.eye(len(H)) / unknown)
     out = np.empty((len(rotations), 3, 3))
     for f in range(len(rotations)):
         rows = [0, 1, 2 + f]
-        out[f] = rotations[0] @ joint[np.ix_(rows, rows)] @ rotations[0].T
+        out[f] = matmul(rotations[0], joint[np.ix_(rows, rows)], rotations[0].T)
     return np.asarray(0.5 * (out + np.swapaxes(out, 1, 2)))

@@ -8,6 +8,7 @@ from typing import Annotated, NamedTuple
 
 import numpy as np
 
+from trihedron.pipeline.core.linalg import matmul
 from trihedron.pipeline.core.options import NonNegativeFloat, PositiveInt, Range
 from trihedron.pipeline.core.registry import register
 from trihedron.pipeline.core.types import F64, ManhattanFrame, Normals, Planes, Segments
@@ -24,7 +25,7 @@ from trihedron.plugins.manhattan.branch_and_bound_kernels import (
     neighbours,
     search,
 )
-from trihedron.plugins.manhattan.common import Directions, ModeOptions
+from trihedron.plugins.manhattan.common import Directions, ModeOptions, directions_of, fit_modes, one_frame
 from trihedron.plugins.shared.manhattan_frames_kernels import nearest_equivalent
 
 
@@ -56,16 +57,16 @@ class BranchAndBound(ModeOptions):
     def __call__(self, normals: Normals, segments: Segments, planes: Planes, previous: ManhattanFrame | None) -> ManhattanFrame:
         """One rotation with id 0 and its `gap`; `supported` False, with a large covariance and no gap (NaN), where the scene shows no two axes at
         right angles. Only its naming, and the angles that the scene does not tell, are those of `previous`."""
-        directions = self.directions(normals, segments)
+        directions = directions_of(self, normals, segments)
         vectors, weights = self._with_planes(directions.thinned(self.search_samples), planes)
         start = np.eye(3) if previous is None else previous.rotations[0]
         optimum = self._search(vectors, weights, start)
         modes = self.finder.follow(directions, planes, nearest_equivalent(optimum.R, start))
         if not modes.supported and previous is not None:
             modes = self.finder.follow(directions, planes, start)
-        R, covariance = self.fitted(modes, segments, planes)
+        R, covariance = fit_modes(self, modes, segments, planes)
         reached = self._search.consensus(vectors, weights, R) if modes.supported else 0.0
-        return self.frame(modes, R, covariance, normals, float(optimum.upper / reached - 1.0) if reached > 0.0 else float("nan"))
+        return one_frame(modes, R, covariance, normals, float(optimum.upper / reached - 1.0) if reached > 0.0 else float("nan"))
 
     def _with_planes(self, directions: Directions, planes: Planes) -> tuple[F64, F64]:
         """The directions and the planes' normals (n, 3), and the weights (n,)."""
@@ -121,8 +122,8 @@ class RotationSearch:
     def consensus(self, vectors: F64, weights: F64, R: F64) -> float:
         """C(R) of the same directions."""
         unit, weights = _usable(vectors, weights)
-        square = np.max((unit @ R) ** 2, axis=1, initial=0.0)
-        return float(float(weights @ np.maximum(square - np.cos(self.inlier) ** 2, 0.0)) / np.sin(self.inlier) ** 2)
+        square = np.max(matmul(unit, R) ** 2, axis=1, initial=0.0)
+        return float(float(matmul(weights, np.maximum(square - np.cos(self.inlier) ** 2, 0.0))) / np.sin(self.inlier) ** 2)
 
     @cached_property
     def _grid(self) -> SphereGrid:

@@ -8,9 +8,9 @@ from typing import NamedTuple
 import numpy as np
 
 from trihedron.pipeline.core.kernel import kernel
+from trihedron.pipeline.core.linalg_kernels import solve_positive
 from trihedron.pipeline.core.types import F64, I32
 from trihedron.plugins.shared.lie_kernels import left_multiply_exp
-from trihedron.plugins.shared.linalg_kernels import solve_positive
 
 # Branch and bound over all rotations for the greatest consensus of directions on three orthogonal axes (Hartley and Kahl, IJCV 2009; Bazin et al.,
 # ACCV 2012; Joo et al., CVPR 2016, TPAMI 2020).

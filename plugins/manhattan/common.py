@@ -8,6 +8,7 @@ from typing import Annotated, NamedTuple
 
 import numpy as np
 
+from trihedron.pipeline.core.linalg import matmul
 from trihedron.pipeline.core.options import NonNegativeFloat, PositiveFloat, PositiveInt, Range, Share, check_increasing
 from trihedron.pipeline.core.types import F32, F64, I32, Bool, ManhattanFrame, Normals, Planes, Segments
 from trihedron.plugins.manhattan.common_kernels import (
@@ -29,7 +30,7 @@ from trihedron.plugins.shared.manhattan_frames_kernels import CUBE
 
 @dataclass(frozen=True)
 class ModeOptions:
-    """Base of the plugins that gather directions, find their modes and fit a rotation to what stands on these."""
+    """Options of the plugins that gather directions, find their modes and fit a rotation to what stands on these."""
 
     cone_deg: Annotated[float, Range(1, 30)] = 12.0  # half-angle of the cone gathered around each axis, 10–15 in MVO, OPVO and LPVO
     bandwidth_deg: Annotated[float, Range(0.1, 30)] = 4.0  # of the Gaussian kernel
@@ -57,11 +58,6 @@ class ModeOptions:
         if not (self.use_normals or self.use_lines):
             raise ValueError("use_normals, use_lines: at least one must be true")
 
-    def directions(self, normals: Normals, segments: Segments) -> Directions:
-        """Directions of the normals and lines that the options include."""
-        surface, lines = normals.normals if self.use_normals else None, segments if self.use_lines else None
-        return gather_directions(surface, lines, self.samples, self.line_weight_per_px)
-
     @cached_property
     def finder(self) -> ModeFinder:
         """Mean shift with these options."""
@@ -79,32 +75,9 @@ class ModeOptions:
             self.use_planes,
         )
 
-    def fitted(self, modes: Modes, segments: Segments, planes: Planes) -> tuple[F64, F64]:
-        """The rotation fitted to planes, lines and the modes of the normals near its axes, and the covariance of phi (3, 3)."""
-        weights = np.where(modes.seen, modes.weights, 1e-6)
-        R = orthonormal(modes.axes, weights / weights.max())
-        taking_part = modes.seen | modes.supported
-        R, covariance = self._fit(R, modes.axes, modes.normals, taking_part, segments, planes)
-        known = modes.supported or modes.seen.sum() < 2
-        return R, covariance if known else np.eye(3) * NOTHING_KNOWN
-
-    def frame(self, modes: Modes, R: F64, covariance: F64, normals: Normals, gap: float = float("nan")) -> ManhattanFrame:
-        """The one rotation R (3, 3) with id 0, and what its modes say of it."""
-        counts = (modes.normals[:, 0] + modes.lines[:, 0]).astype(np.int32)
-        return ManhattanFrame(
-            index=normals.index,
-            stamp_ns=normals.stamp_ns,
-            rotations=R[None],
-            ids=np.zeros(1, np.int32),
-            covariance=covariance[None],
-            inliers=counts[None],
-            spread=np.where(modes.seen, np.sqrt(modes.mean_squares), np.nan)[None],
-            supported=modes.supported,
-            gap=gap,
-        )
-
     @cached_property
-    def _fit(self) -> AxisFit:
+    def fit(self) -> AxisFit:
+        """The fit of a rotation with these options."""
         return AxisFit(
             self.cone_deg,
             self.normals_floor_deg,
@@ -115,6 +88,38 @@ class ModeOptions:
             self.use_planes,
             self.use_lines,
         )
+
+
+def directions_of(options: ModeOptions, normals: Normals, segments: Segments) -> Directions:
+    """Directions of the normals and lines that the options include."""
+    surface, lines = normals.normals if options.use_normals else None, segments if options.use_lines else None
+    return gather_directions(surface, lines, options.samples, options.line_weight_per_px)
+
+
+def fit_modes(options: ModeOptions, modes: Modes, segments: Segments, planes: Planes) -> tuple[F64, F64]:
+    """The rotation fitted to planes, lines and the modes of the normals near its axes, and the covariance of phi (3, 3)."""
+    weights = np.where(modes.seen, modes.weights, 1e-6)
+    R = orthonormal(modes.axes, weights / weights.max())
+    taking_part = modes.seen | modes.supported
+    R, covariance = options.fit(R, modes.axes, modes.normals, taking_part, segments, planes)
+    known = modes.supported or modes.seen.sum() < 2
+    return R, covariance if known else np.eye(3) * NOTHING_KNOWN
+
+
+def one_frame(modes: Modes, R: F64, covariance: F64, normals: Normals, gap: float = float("nan")) -> ManhattanFrame:
+    """The one rotation R (3, 3) with id 0, and what its modes say of it."""
+    counts = (modes.normals[:, 0] + modes.lines[:, 0]).astype(np.int32)
+    return ManhattanFrame(
+        index=normals.index,
+        stamp_ns=normals.stamp_ns,
+        rotations=R[None],
+        ids=np.zeros(1, np.int32),
+        covariance=covariance[None],
+        inliers=counts[None],
+        spread=np.where(modes.seen, np.sqrt(modes.mean_squares), np.nan)[None],
+        supported=modes.supported,
+        gap=gap,
+    )
 
 
 NO_NORMALS, NO_LINES_M, NO_LINES_PX = (np.zeros(shape, np.float32) for shape in ((0, 0, 3), (0, 2, 3), (0, 2, 2)))
@@ -190,7 +195,7 @@ def lost_frames(modes: Modes, fit: AxisFit, segments: Segments, planes: Planes, 
     return ManhattanFrame(
         index=normals.index,
         stamp_ns=normals.stamp_ns,
-        rotations=R @ known[0].T @ known,
+        rotations=matmul(R, known[0].T, known),
         ids=ids,
         covariance=np.concatenate([covariance[None], np.tile(np.eye(3) * NOTHING_KNOWN, (count - 1, 1, 1))]),
         inliers=inliers,
@@ -342,11 +347,11 @@ def turn_between(found: F64, before: F64, limit: float) -> F64:
     for one in found:
         for known in before:
             for name in CUBE:
-                Q = one @ name @ known.T
+                Q = matmul(one, name, known.T)
                 cosine = 0.5 * (np.trace(Q) - 1.0)
                 if cosine < FURTHEST:  # some name is nearer
                     continue
-                rank = (int((identified(found, Q @ before, limit) >= 0).sum()), cosine)
+                rank = (int((identified(found, matmul(Q, before), limit) >= 0).sum()), cosine)
                 if rank > best:
                     best, turn = rank, Q
     return turn

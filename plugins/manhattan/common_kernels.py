@@ -8,10 +8,11 @@ from typing import NamedTuple
 import numpy as np
 
 from trihedron.pipeline.core.kernel import kernel
+from trihedron.pipeline.core.linalg_kernels import inverse_positive, polar_rotation, solve_positive
 from trihedron.pipeline.core.types import F32, F64, I32, Bool
 from trihedron.plugins.shared.lie_kernels import left_multiply_exp
-from trihedron.plugins.shared.linalg_kernels import descending, inverse_positive, polar_rotation, solve_positive
 from trihedron.plugins.shared.manhattan_frames_kernels import assign_axes, measured_directions
+from trihedron.plugins.shared.sorting_kernels import descending
 
 # From a frame's features to directions on the sphere, and from directions on three axes to a rotation with its covariance.
 

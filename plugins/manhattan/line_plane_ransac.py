@@ -8,6 +8,7 @@ from typing import Annotated, NamedTuple
 
 import numpy as np
 
+from trihedron.pipeline.core.linalg import matmul
 from trihedron.pipeline.core.options import NonNegativeFloat, NonNegativeInt, PositiveFloat, PositiveInt, PositiveShare, Range, Share
 from trihedron.pipeline.core.registry import register
 from trihedron.pipeline.core.types import F64, Bool, ManhattanFrame, Normals, Planes, Segments
@@ -88,7 +89,7 @@ class LinePlaneRansac:
         """(m, 3, 3) rotations through drawn pairs of perpendicular features, each as likely as it is large, planes and lines half of the draws."""
         vectors, line = features.vectors, np.arange(len(features.vectors)) >= features.planes
         likely = features.share / np.where(line, max(features.share[line].sum(), 1e-12), max(features.share[~line].sum(), 1e-12))
-        partners = np.cumsum(likely * (np.abs(vectors @ vectors.T) < np.sin(np.radians(self.reach_deg))), axis=1)
+        partners = np.cumsum(likely * (np.abs(matmul(vectors, vectors.T)) < np.sin(np.radians(self.reach_deg))), axis=1)
         total = np.cumsum(likely * (partners[:, -1] > 0.0)) if len(vectors) else np.zeros(1)
         if total[-1] <= 0.0:
             return np.zeros((0, 3, 3))

@@ -10,7 +10,7 @@ import numpy as np
 from trihedron.pipeline.core.options import PositiveInt, Range
 from trihedron.pipeline.core.registry import register
 from trihedron.pipeline.core.types import F64, ManhattanFrame, Normals, Planes, Segments
-from trihedron.plugins.manhattan.common import HALF_SPHERE, Directions, ModeOptions, Modes
+from trihedron.plugins.manhattan.common import HALF_SPHERE, Directions, ModeOptions, Modes, directions_of, fit_modes, one_frame
 from trihedron.plugins.manhattan.common_kernels import search_axes
 from trihedron.plugins.shared.manhattan_frames_kernels import nearest_equivalent
 
@@ -30,8 +30,8 @@ class MeanShift(ModeOptions):
 
     def __call__(self, normals: Normals, segments: Segments, planes: Planes, previous: ManhattanFrame | None) -> ManhattanFrame:
         """One rotation with id 0; `supported` False, with a large covariance, where the scene shows no two axes at right angles."""
-        modes = self._modes(self.directions(normals, segments), planes, previous, normals.index)
-        return self.frame(modes, *self.fitted(modes, segments, planes), normals)
+        modes = self._modes(directions_of(self, normals, segments), planes, previous, normals.index)
+        return one_frame(modes, *fit_modes(self, modes, segments, planes), normals)
 
     def _modes(self, directions: Directions, planes: Planes, previous: ManhattanFrame | None, index: int) -> Modes:
         """Near the previous axes; from everywhere when there are none, they are old or nothing supports them."""

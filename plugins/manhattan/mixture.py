@@ -8,7 +8,8 @@ from typing import Annotated, NamedTuple
 
 import numpy as np
 
-from trihedron.pipeline.core.geometry import rotation_angle_deg
+from trihedron.pipeline.core.lie import rotation_angle_deg
+from trihedron.pipeline.core.linalg import matmul
 from trihedron.pipeline.core.options import NonNegativeFloat, PositiveFloat, PositiveInt, Range, Share, check_increasing
 from trihedron.pipeline.core.registry import register
 from trihedron.pipeline.core.types import F64, Bool, ManhattanFrame, Normals, Planes, Segments
@@ -80,7 +81,7 @@ class Mixture:
         followed = self._frames.followed(directions, planes, known) if recent else []
         found = self._frames.searched(directions, planes, followed)
         turn = self._turn(followed, found, known)
-        found = self._recognised(found, turn @ known)
+        found = self._recognised(found, matmul(turn, known))
         if not found:
             return lost_frames(self._frames.finder.follow(directions, planes, known[0]), self._fit, segments, planes, normals, known, ids)
         rows = np.array([one.row for one in found], np.int32)
@@ -89,21 +90,21 @@ class Mixture:
         rotations, covariance = (np.array(values) for values in zip(*fits))
         if rows.max() >= 0:  # with the fitted rotation, so that what is out of sight keeps its angles to it over many frames
             again = int(np.argmax(rows >= 0))
-            turn = rotations[again] @ known[rows[again]].T
+            turn = matmul(rotations[again], known[rows[again]].T)
         inliers = np.array([one.modes.normals[:, 0] + one.modes.lines[:, 0] for one in found])
         spread = np.array([mode_spread(one.modes) for one in found])
-        return seen_frames(normals, rotations, covariance, inliers, spread, rows, ids, unseen, (turn @ known)[unseen])
+        return seen_frames(normals, rotations, covariance, inliers, spread, rows, ids, unseen, matmul(turn, known)[unseen])
 
     def _turn(self, followed: list[Found], found: list[Found], known: F64) -> F64:
         """(3, 3) how the known frames (k, 3, 3) have turned: with the heaviest followed, unless another turn makes more of those found known ones."""
         rotations, limit = np.array([one.R for one in found]).reshape(-1, 3, 3), np.radians(self.again_deg)
         if followed:
-            turn = followed[0].R @ known[followed[0].row].T
-            matched = (identified(rotations, turn @ known, limit) >= 0).sum()
+            turn = matmul(followed[0].R, known[followed[0].row].T)
+            matched = (identified(rotations, matmul(turn, known), limit) >= 0).sum()
             if matched >= min(len(found), len(known)):
                 return np.asarray(turn)
         other = turn_between(rotations, known, limit)
-        return turn if followed and matched >= (identified(rotations, other @ known, limit) >= 0).sum() else other
+        return turn if followed and matched >= (identified(rotations, matmul(other, known), limit) >= 0).sum() else other
 
     def _recognised(self, found: list[Found], expected: F64) -> list[Found]:
         """Each with the row of the expected frame (k, 3, 3) that it is, named as this is, in order of support; the one that came first before stays
@@ -173,10 +174,10 @@ class FrameMixture:
         for row in range(len(known)):
             modes = self._near(directions, planes, expected, row)
             R = nearest_equivalent(_rotation(modes), expected[row])
-            off = np.radians(rotation_angle_deg(R.T @ expected[row]))
+            off = np.radians(rotation_angle_deg(matmul(R.T, expected[row])))
             if modes.supported and off < (self.again if found else 2.0 * self.again):  # mean shift can wander off to another frame
                 if not found:
-                    expected = R @ known[row].T @ known
+                    expected = matmul(R, known[row].T, known)
                 found.append(Found(R, modes, row))
         kept: list[Found] = []
         for one in sorted(found, key=lambda one: -one.weight):
@@ -214,7 +215,7 @@ class FrameMixture:
         if not others:
             return True
         axes = np.concatenate([other.modes.axes[:, other.modes.seen] for other in others], axis=1)
-        own = one.modes.seen & (np.abs(one.modes.axes.T @ axes).max(axis=1) < np.cos(self.shared))
+        own = one.modes.seen & (np.abs(matmul(one.modes.axes.T, axes)).max(axis=1) < np.cos(self.shared))
         if one.modes.weights[own].sum() < self.min_own * directions.weights.sum():
             return False
         return bool(symmetric_angles(one.R[None], np.array([other.R for other in others])).min() > self.merge)
@@ -222,20 +223,20 @@ class FrameMixture:
     def _left(self, directions: Directions, found: list[Found]) -> Bool:
         """(n,) directions on no axis that is seen."""
         axes = np.concatenate([np.zeros((3, 0)), *(one.modes.axes[:, one.modes.seen] for one in found)], axis=1)
-        return np.asarray((np.abs(directions.vectors @ axes) < np.cos(self.finder.cone)).all(axis=1))
+        return np.asarray((np.abs(matmul(directions.vectors, axes)) < np.cos(self.finder.cone)).all(axis=1))
 
     def _densest(self, directions: Directions, left: Bool) -> float:
         """Most weight of the directions left that any cone gathers."""
-        inside = np.abs(directions.vectors[left] @ HALF_SPHERE.T) > np.cos(self.finder.cone)
-        return float((directions.weights[left] @ inside).max())
+        inside = np.abs(matmul(directions.vectors[left], HALF_SPHERE.T)) > np.cos(self.finder.cone)
+        return float(matmul(directions.weights[left], inside).max())
 
 
 def members(vectors: F64, rotations: F64, row: int, shared: float) -> Bool:
     """(n,) whether a direction (n, 3) belongs to one of the frames (k, 3, 3): the nearest of all axes is the frame's, or one of the frame's axes is
     within `shared` (rad) of that axis, as two frames have the floor in common."""
     axes = np.moveaxis(rotations, 2, 1).reshape(-1, 3)
-    nearest = np.argmax(np.abs(vectors @ axes.T), axis=1)
-    return np.asarray((np.abs(rotations[row].T @ axes.T).max(axis=0) > np.cos(shared))[nearest])
+    nearest = np.argmax(np.abs(matmul(vectors, axes.T)), axis=1)
+    return np.asarray((np.abs(matmul(rotations[row].T, axes.T)).max(axis=0) > np.cos(shared))[nearest])
 
 
 def _rotation(modes: Modes) -> F64:

@@ -7,6 +7,7 @@ from typing import Annotated
 
 import numpy as np
 
+from trihedron.pipeline.core.linalg import matmul
 from trihedron.pipeline.core.options import PositiveFloat, PositiveShare, Range, Share
 from trihedron.pipeline.core.registry import register
 from trihedron.pipeline.core.types import F64, I32, ManhattanFrame, Planes
@@ -58,7 +59,7 @@ class PlaneSvd:
         else:
             R, axes, weights = _alone(walls, enough, start)
         square = square_angles(walls.normals, axes, R)
-        scale = variance_scale(float(weights @ square), 2.0 * np.count_nonzero(axes >= 0) - 3.0)
+        scale = variance_scale(float(matmul(weights, square)), 2.0 * np.count_nonzero(axes >= 0) - 3.0)
         covariance = procrustes_covariance(walls.spatial, weights, axes, R, PRIOR, scale) + np.eye(3) * np.radians(self.floor_deg) ** 2
         inliers, spread = inliers_and_spread(square, axes, walls.area)
         return ManhattanFrame(

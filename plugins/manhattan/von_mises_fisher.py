@@ -8,6 +8,7 @@ from typing import Annotated
 
 import numpy as np
 
+from trihedron.pipeline.core.linalg import inv
 from trihedron.pipeline.core.options import NonNegativeFloat, PositiveFloat, PositiveInt, Range, Share
 from trihedron.pipeline.core.registry import register
 from trihedron.pipeline.core.types import F64, ManhattanFrame, Normals, Segments
@@ -111,7 +112,7 @@ class VonMisesFisher:
             strength = np.where(modes.seen, 1.0 / sigma2, 0.0)
             R = orthonormal(np.where(modes.seen, modes.axes, R), (strength + 1e-6 * strength.max()) / strength.max())
             H = isotropic_information(R.T, np.sqrt(sigma2))[modes.seen].sum(axis=0)
-        covariance = np.linalg.inv(H + np.eye(3) / NOTHING_KNOWN) + np.eye(3) * np.radians(self.floor_deg) ** 2
+        covariance = inv(H + np.eye(3) / NOTHING_KNOWN) + np.eye(3) * np.radians(self.floor_deg) ** 2
         return R, covariance
 
     @cached_property

@@ -8,8 +8,8 @@ from typing import NamedTuple
 import numpy as np
 
 from trihedron.pipeline.core.kernel import kernel
+from trihedron.pipeline.core.linalg_kernels import polar_rotation
 from trihedron.pipeline.core.types import F64
-from trihedron.plugins.shared.linalg_kernels import polar_rotation
 
 # Mixture of von Mises–Fisher distributions about the six signed axes of a rotation, over a uniform background.
 

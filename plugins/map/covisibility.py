@@ -70,11 +70,11 @@ class Covisibility(KeyframeOptions):
         corrected = map
         if corrected is not None and bundle is not None and bundle.based_on >= corrected.loop_closed:  # else it would undo that correction
             corrected = apply_correction(corrected, bundle)
-        if corrected is not None and loop is not None and len(loop.keyframe_ids):
+        if corrected is not None and loop is not None and len(loop.keyframe_ids) and loop.based_on >= corrected.loop_closed:
             corrected = replace(apply_correction(corrected, loop), loop_closed=corrected.revision + 1)
         if corrected is not None and relocalise is not None and relocalise.status == DEGRADED and pose.status != LOST:
             here, recognised = transform_to_map(pose, corrected), transform_to_map(relocalise, corrected)
-            corrected = merge_submaps(corrected, here, recognised, self.merge_deg, self.merge_m)
+            corrected = replace(merge_submaps(corrected, here, recognised, self.merge_deg, self.merge_m), loop_closed=corrected.revision + 1)
         pose = replace(transform_to_map(pose, corrected), submap=submap_of(pose, corrected))
         if corrected is None:
             matches = None

@@ -7,14 +7,13 @@ from typing import Any
 
 import numpy as np
 
-from trihedron.pipeline.core.geometry import invert, nearest_rotation, pose_matrix, transform, transform_each, transform_planes
+from trihedron.pipeline.core.geometry import invert, rigid, transform, transform_each, transform_planes
+from trihedron.pipeline.core.linalg import matmul
 from trihedron.pipeline.core.types import F64, I32, Bool, Correction, Map, Table
 from trihedron.plugins.mapping.covisibility_graph import observed_by
 from trihedron.plugins.mapping.landmarks import isin
 from trihedron.plugins.mapping.plane_fusion import equivalent_moments, motions_between
 from trihedron.plugins.shared.linalg import transform_plane_covariance
-
-ROUNDING = 1e-12  # of RRᵀ - I, above which a rotation is made one again
 
 
 def apply_correction(map: Map, correction: Correction) -> Map:
@@ -54,13 +53,13 @@ def _move_culled(map: Map, ids: I32, poses: F64) -> Map:
     living = np.flatnonzero(alive)
     if not len(culled) or not len(living):
         return map
-    away = np.linalg.norm(T_world[culled, None, :3, 3] - T_world[living, :3, 3], axis=-1) - T_world[culled, :3, 2] @ T_world[living, :3, 2].T
+    away = np.linalg.norm(T_world[culled, None, :3, 3] - T_world[living, :3, 3], axis=-1) - matmul(T_world[culled, :3, 2], T_world[living, :3, 2].T)
     nearest = living[np.argmin(np.where(submap[culled, None] == submap[living], away, np.inf), axis=1)]
     moving = np.isin(nearest, ids) & (submap[nearest] == submap[culled])
     culled, nearest = culled[moving], nearest[moving]
     order = np.argsort(ids)
-    T = poses[order[np.searchsorted(ids[order], nearest)]] @ invert(T_world[nearest])
-    return replace(map, keyframes=map.keyframes.updated(culled, T_world_camera=T @ T_world[culled]))
+    T = matmul(poses[order[np.searchsorted(ids[order], nearest)]], invert(T_world[nearest]))
+    return replace(map, keyframes=map.keyframes.updated(culled, T_world_camera=matmul(T, T_world[culled])))
 
 
 def _move_later(map: Map, correction: Correction, newest: int, T_corrected: F64) -> Map:
@@ -69,26 +68,22 @@ def _move_later(map: Map, correction: Correction, newest: int, T_corrected: F64)
     later = later[map.keyframes.rows("submap", later) == map.keyframes.rows("submap", np.array([newest]))]
     if not len(later):
         return map
-    T = _rigid(T_corrected @ invert(map.keyframes.row("T_world_camera", newest)))
+    T = rigid(matmul(T_corrected, invert(map.keyframes.row("T_world_camera", newest))))
     corrected = {"point": correction.point_ids, "line": correction.line_ids, "plane": correction.plane_ids}
     return transform_landmarks(map, T, later, *(_created_after(map, kind, newest, later, ids) for kind, ids in corrected.items()))
-
-
-def _rigid(T: F64) -> F64:
-    """Return a motion (4, 4) whose rotation is one: `invert` doubles the rounding error of a keyframe, which the next keyframes would inherit."""
-    R = T[:3, :3]
-    return T if np.abs(R @ R.T - np.eye(3)).max() < ROUNDING else pose_matrix(nearest_rotation(R), T[:3, 3])
 
 
 def transform_landmarks(map: Map, T: F64, keyframes: I32, points: I32, lines: I32, planes: I32) -> Map:
     """Move these rows of the map rigidly by T (4, 4, from the left), and rotate their information."""
     R = T[:3, :3]
-    changes: dict[str, Any] = {"keyframes": map.keyframes.updated(keyframes, T_world_camera=T @ map.keyframes.rows("T_world_camera", keyframes))}
-    information = R @ map.points.rows("information", points) @ R.T
-    direction = (map.points.rows("direction", points) @ R.T).astype(np.float32)
+    changes: dict[str, Any] = {
+        "keyframes": map.keyframes.updated(keyframes, T_world_camera=matmul(T, map.keyframes.rows("T_world_camera", keyframes)))
+    }
+    information = matmul(R, map.points.rows("information", points), R.T)
+    direction = matmul(map.points.rows("direction", points), R.T).astype(np.float32)
     position = transform(T, map.points.rows("position_m", points))
     changes["points"] = map.points.updated(points, position_m=position, information=information, direction=direction)
-    information = R @ map.lines.rows("information", lines) @ R.T
+    information = matmul(R, map.lines.rows("information", lines), R.T)
     changes["lines"] = map.lines.updated(lines, endpoints_m=transform(T, map.lines.rows("endpoints_m", lines)), information=information)
     old = map.planes.rows("coefficients", planes)
     new = transform_planes(T, old)

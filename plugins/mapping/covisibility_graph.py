@@ -10,12 +10,15 @@ from typing import Any, Concatenate, ParamSpec, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from trihedron.pipeline.core.geometry import invert
+from trihedron.pipeline.core.linalg import inv, matmul, norm
 from trihedron.pipeline.core.types import F64, I32, Bool, Map, Table
 from trihedron.plugins.mapping.landmarks import distinct, index_of, isin
 
 P = ParamSpec("P")
 T = TypeVar("T")
 WEIGHTS = {"point": 1, "line": 5, "plane": 20}  # of a shared landmark, by kind: a bare room has few landmarks, all of them large
+VICINITY_M, VICINITY_DEG = 2.0, 60.0  # of a place, within which keyframes observed it
 
 
 def once_per_version(function: Callable[Concatenate[Map, P], T]) -> Callable[Concatenate[Map, P], T]:
@@ -141,7 +144,7 @@ def _near(map: Map, T_world_camera: F64, near_m: float, near_deg: float, submap:
     """Living keyframes of the sub-map with about this position and viewing direction, nearest first."""
     poses = _poses(map, submap)
     distance = np.linalg.norm(poses[:, :3, 3] - T_world_camera[:3, 3], axis=1)
-    cosine = poses[:, :3, 2] @ T_world_camera[:3, 2]
+    cosine = matmul(poses[:, :3, 2], T_world_camera[:3, 2])
     near = np.flatnonzero((distance < near_m) & (cosine > np.cos(np.radians(near_deg))))
     return keyframes_of(map, submap)[near[np.argsort(distance[near] / near_m + (1.0 - cosine[near]), kind="stable")]]
 
@@ -164,3 +167,28 @@ def local_window(
 def window_of(map: Map, keyframes: I32) -> LocalWindow:
     """Return the window of the keyframes (sorted rows)."""
     return LocalWindow(keyframes, *(observed_by(map, keyframes, kind) for kind in ("point", "line", "plane")))
+
+
+def are_distinct(T: F64, other: F64) -> bool:
+    """Return True if two poses differ by 10 cm or 5°."""
+    cosine = 0.5 * (np.trace(matmul(T[:3, :3].T, other[:3, :3])) - 1.0)
+    return bool(norm(T[:3, 3] - other[:3, 3]) > 0.1 or cosine < np.cos(np.radians(5.0)))
+
+
+# Odometry: the edges between keyframes that follow each other.
+
+LEAST_SIGMA_M, LEAST_SIGMA = 1e-3, 1e-4  # standard deviations between two keyframes at one place, m and rad
+
+
+def odometry(map: Map, pairs: I32, drift: float, rotation_drift: float, times: float = 1.0) -> tuple[F64, F64]:
+    """Return the motions `T_a_b` (e, 4, 4) between pairs (e, 2) of keyframes, the earlier first, and the information (e, 6, 6) of their xi.
+
+    The covariance is `times` that of the later keyframe's pose plus the drift along the path: standard deviations per square root of a metre, m and
+    rad."""
+    poses = map.keyframes.rows("T_world_camera", pairs.ravel()).reshape(-1, 2, 4, 4)
+    motions = matmul(invert(poses[:, 0]), poses[:, 1])
+    length = np.linalg.norm(motions[:, :3, 3], axis=1)[:, None, None]
+    covariance = times * map.keyframes.rows("covariance", pairs[:, 1])
+    covariance[:, :3, :3] += times * (drift**2 * length + LEAST_SIGMA_M**2) * np.eye(3)
+    covariance[:, 3:, 3:] += times * (rotation_drift**2 * length + LEAST_SIGMA**2) * np.eye(3)
+    return np.ascontiguousarray(motions), np.asarray(inv(covariance), np.float64)

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from trihedron.pipeline.core.geometry import invert
+from trihedron.pipeline.core.linalg import matmul
 from trihedron.pipeline.core.types import F64, I32, Map, Matches, Table
 from trihedron.plugins.mapping.covisibility_graph import (
     WEIGHTS,
@@ -61,7 +62,7 @@ def cull_repeated_keyframe(map: Map, shift_m: float, turn_deg: float, share: flo
     keyframe = newest[:1]
     older = keyframes_of(map, int(map.keyframes.rows("submap", keyframe)[0]))
     older = older[older < keyframe[0]]
-    T = invert(map.keyframes.rows("T_world_camera", keyframe)) @ map.keyframes.rows("T_world_camera", older)
+    T = matmul(invert(map.keyframes.rows("T_world_camera", keyframe)), map.keyframes.rows("T_world_camera", older))
     cosine = 0.5 * (np.trace(T[:, :3, :3], axis1=1, axis2=2) - 1.0)
     near = older[(np.linalg.norm(T[:, :3, 3], axis=1) <= shift_m) & (cosine >= np.cos(np.radians(turn_deg)))]
     seen, known = 0, 0

@@ -11,11 +11,13 @@ from typing import Any
 import numpy as np
 
 from trihedron.pipeline.core.geometry import tangent_basis, transform, transform_planes
+from trihedron.pipeline.core.linalg import matmul
 from trihedron.pipeline.core.types import F32, F64, I32, Bool, Camera, Keypoints, Map, Matches, Planes, Pose, Segments, Table
 from trihedron.plugins.mapping.landmark_kernels import farthest_samples, fuse_lines, fuse_points
 from trihedron.plugins.mapping.landmarks import OBSERVERS
 from trihedron.plugins.mapping.plane_fusion import equivalent_moments, fit_planes, move_moments, project_to_planes
 from trihedron.plugins.mapping.projection import line_terms, parameters_on, plane_terms, point_terms, points_along
+from trihedron.plugins.shared.calibration_error import calibration_covariance
 from trihedron.plugins.shared.linalg import inverse, point_covariance, propagate_pose_covariance
 from trihedron.plugins.shared.pose_optimizer import classify_terms
 
@@ -94,14 +96,18 @@ class Observations:
 
 
 def add_keyframe(map: Map, pose: Pose, camera: Camera) -> tuple[Map, int]:
-    """Append a keyframe without observations; also returns its row."""
-    empty = np.zeros((1, 2), np.int32)
-    table, rows = map.keyframes.appended(
+    """Append a keyframe without observations; also returns its row. The velocity of the one before is known better by now."""
+    empty, table = np.zeros((1, 2), np.int32), map.keyframes
+    if 0 <= pose.reference < len(table):
+        table = table.updated(np.array([pose.reference]), twist=pose.reference_twist[None])
+    table, rows = table.appended(
         index=np.array([pose.index]),
         stamp_ns=np.array([pose.stamp_ns]),
         T_world_camera=pose.T_world_camera[None],
         covariance=pose.local_covariance[None],
-        world_covariance=pose.covariance[None],
+        world_covariance=(pose.covariance - calibration_covariance(pose))[None],
+        sensitivity=pose.sensitivity[None],
+        twist=pose.twist[None],
         intrinsics=camera.intrinsics[None],
         points=empty,
         lines=empty,
@@ -165,7 +171,7 @@ def insert_points(map: Map, view: Observations, keypoints: Keypoints, pairs: I32
     position, R = transform(view.T_world_camera, local), view.T_world_camera[:3, :3]
     table, created = table.appended(
         position_m=position,
-        information=inverse(R @ covariance @ R.T),
+        information=inverse(matmul(R, covariance, R.T)),
         **_appearance(view, keypoints, new, position),
         **_new_landmark(len(new), view.keyframe),
     )
@@ -204,7 +210,7 @@ def insert_lines(map: Map, view: Observations, segments: Segments, pairs: I32, n
     R, total = view.T_world_camera[:3, :3], covariance[new] + propagate_pose_covariance(local, view.covariance)
     table, created = table.appended(
         endpoints_m=transform(view.T_world_camera, local),
-        information=inverse(R @ total @ R.T),
+        information=inverse(matmul(R, total, R.T)),
         descriptor=segments.descriptors[new],
         **_new_landmark(len(new), view.keyframe),
     )
@@ -258,4 +264,4 @@ def _plane_covariance(planes: Planes, view: Observations) -> F64:
     n = planes.coefficients[:, :3]
     J[:, :2, 3:] = np.stack([np.cross(n, B[..., 0]), np.cross(n, B[..., 1])], axis=1)
     J[:, 2, :3] = n
-    return planes.covariance + J @ view.covariance @ np.swapaxes(J, -1, -2)
+    return np.asarray(planes.covariance + matmul(J, view.covariance, np.swapaxes(J, -1, -2)))

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from trihedron.pipeline.core.geometry import invert, transform, transform_planes
+from trihedron.pipeline.core.linalg import matmul
 from trihedron.pipeline.core.types import F64, I32, Camera, Keypoints, Map, Planes, Segments
 from trihedron.plugins.mapping.covisibility_graph import LocalWindow
 from trihedron.plugins.mapping.projection import clip_segments
@@ -25,7 +26,7 @@ def _points(map: Map, camera: Camera, T_camera_world: F64, ids: I32) -> Keypoint
     front = local[:, 2] > 0.1
     ids, local = ids[front], local[front]
     R = T_camera_world[:3, :3]
-    covariance = R @ inverse(map.points.rows("information", ids)) @ R.T
+    covariance = matmul(R, inverse(map.points.rows("information", ids)), R.T)
     across = np.sqrt(0.5 * (covariance[:, 0, 0] + covariance[:, 1, 1]))
     descriptors = map.points.rows("descriptor", ids)
     pixels, sigma_px = camera.project(local).astype(np.float32), np.maximum(camera.fx * across / local[:, 2], 0.3).astype(np.float32)
@@ -40,7 +41,7 @@ def _lines(map: Map, camera: Camera, T_camera_world: F64, ids: I32) -> Segments:
     pixels, inside = clip_segments(world, T_camera_world, camera)
     ids, local, pixels = ids[inside], transform(T_camera_world, world[inside]), pixels[inside]
     R = T_camera_world[:3, :3]
-    covariance = R @ inverse(map.lines.rows("information", ids)) @ R.T
+    covariance = matmul(R, inverse(map.lines.rows("information", ids)), R.T)
     descriptors = map.lines.rows("descriptor", ids)
     return Segments(map.index, map.stamp_ns, pixels.astype(np.float32), local.astype(np.float32), covariance.astype(np.float32), descriptors)
 
@@ -51,7 +52,7 @@ def _planes(map: Map, T_camera_world: F64, ids: I32) -> Planes:
     facing = local[:, 3] >= 0.0  # else the camera is behind it
     ids, world, local = ids[facing], world[facing], local[facing]
     covariance = transform_plane_covariance(T_camera_world, world, local, map.planes.rows("covariance", ids))
-    moments = T_camera_world @ map.planes.rows("moments", ids) @ T_camera_world.T
+    moments = matmul(T_camera_world, map.planes.rows("moments", ids), T_camera_world.T)
     samples = transform(T_camera_world, map.planes.rows("samples_m", ids)).astype(np.float32)
     pixels = np.full(len(ids), PLANE_PX, np.int32)
     return Planes(map.index, map.stamp_ns, local, covariance, moments, pixels, samples, np.zeros((1, 1), np.uint8), 1)

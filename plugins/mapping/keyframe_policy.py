@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from trihedron.pipeline.core.geometry import invert
+from trihedron.pipeline.core.linalg import eigvalsh, matmul
 from trihedron.pipeline.core.options import NonNegativeInt, PositiveFloat, PositiveInt, Share, check_increasing
 from trihedron.pipeline.core.types import F64, Frame, Map, Matches, Planes, Pose, Table
 from trihedron.plugins.mapping.covisibility_graph import WEIGHTS, newest_keyframes
@@ -19,11 +20,12 @@ UNCHANGED = 0.25  # of the view change of a keyframe, that suffices after max_fr
 class KeyframeOptions:
     """Options of the keyframe policy."""
 
-    min_frames: PositiveInt = 3  # between keyframes
+    min_frames: PositiveInt = 3  # between keyframes, unless landmarks run out
     max_frames: PositiveInt = 30  # after which a quarter of the view change below is enough
     min_shift: PositiveFloat = 0.06  # of the camera, as a share of the median depth, that makes a keyframe
     min_turn_deg: PositiveFloat = 6.0
     min_share: Share = 0.5  # of the newest keyframe's landmarks tracked, below which a keyframe is made
+    urgent_share: Share = 0.25  # the same, below which one is made within `min_frames`: the next frame of a wide baseline would find no landmark
     doubt_sigmas: PositiveFloat = 3.0  # a pose with this many times the standard deviation of its reference keyframe is in doubt
     doubt_floor_m: PositiveFloat = 0.002  # least standard deviation of a keyframe in that comparison
     doubt_frames: NonNegativeInt = 10  # since the newest keyframe, in which a pose in doubt makes none while enough landmarks are tracked
@@ -32,6 +34,7 @@ class KeyframeOptions:
 
     def __post_init__(self) -> None:
         check_increasing(self, "min_frames", "max_frames")
+        check_increasing(self, "urgent_share", "min_share")
 
 
 def needs_keyframe(options: KeyframeOptions, frame: Frame, pose: Pose, planes: Planes, matches: Matches | None, map: Map) -> bool:
@@ -40,18 +43,19 @@ def needs_keyframe(options: KeyframeOptions, frame: Frame, pose: Pose, planes: P
     if not newest or keyframes.row("submap", newest[0]) != pose.submap:
         return True
     frames = frame.index - int(keyframes.row("index", newest[0]))
-    if 0 <= frames < options.min_frames:  # less than 0: a keyframe of another sequence
+    spans = [keyframes.row(kind, newest[0]).tolist() for kind in ("points", "lines", "planes")]
+    tracked_share = _weighted(pose.inliers.tolist()) / max(_weighted([end - begin for begin, end in spans]), 1)
+    urgent = tracked_share < options.urgent_share
+    if 0 <= frames < options.min_frames and not urgent:  # less than 0: a keyframe of another sequence
         return False
-    T = invert(keyframes.row("T_world_camera", newest[0])) @ pose.T_world_camera
+    T = matmul(invert(keyframes.row("T_world_camera", newest[0])), pose.T_world_camera)
     rotation_deg = math.degrees(math.acos(min(max(0.5 * (T.trace() - 2.0), -1.0), 1.0)))
     change = max(math.hypot(*T[:3, 3].tolist()) / keyframe_distance_m(options, frame), rotation_deg / options.min_turn_deg)
-    spans = [keyframes.row(kind, newest[0]).tolist() for kind in ("points", "lines", "planes")]
-    few_tracked = _weighted(pose.inliers.tolist()) < options.min_share * _weighted([end - begin for begin, end in spans])
     unknown = planes.pixels > options.new_plane_px
     if matches is not None:
         unknown[matches.planes[matches.planes[:, 1] < len(map.planes), 0]] = False
-    needed = change > 1.0 or few_tracked or bool(unknown.any()) or (frames >= options.max_frames and change > UNCHANGED)
-    return needed and not (0 <= frames < options.doubt_frames and _in_doubt(options, pose, keyframes))
+    needed = change > 1.0 or tracked_share < options.min_share or bool(unknown.any()) or (frames >= options.max_frames and change > UNCHANGED)
+    return needed and (urgent or not (0 <= frames < options.doubt_frames and _in_doubt(options, pose, keyframes)))
 
 
 def _in_doubt(options: KeyframeOptions, pose: Pose, keyframes: Table) -> bool:
@@ -60,7 +64,7 @@ def _in_doubt(options: KeyframeOptions, pose: Pose, keyframes: Table) -> bool:
     if pose.reference < 0 or _weighted(pose.inliers.tolist()) < options.doubt_score:
         return False
     covariances: list[F64] = [pose.local_covariance, keyframes.row("covariance", pose.reference)]
-    sigma, reference = (float(np.linalg.eigvalsh(covariance[:3, :3])[-1]) ** 0.5 for covariance in covariances)
+    sigma, reference = (float(eigvalsh(covariance[:3, :3])[-1]) ** 0.5 for covariance in covariances)
     return bool(sigma > options.doubt_sigmas * max(reference, options.doubt_floor_m))
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from trihedron.pipeline.core.types import I32, Bool, Column, Map, Table
+from trihedron.pipeline.core.types import CALIBRATION, I32, Bool, Column, Map, Table
 
 POSITION = Column("f8", (3,), 2.0**-20)  # in the world, to a micrometre: a thousandth of any standard deviation
 ENDPOINTS = Column("f8", (2, 3), POSITION.step)
@@ -16,7 +16,9 @@ KEYFRAMES = {
     "stamp_ns": Column("i8"),
     "T_world_camera": Column("f8", (4, 4)),
     "covariance": Column("f8", (6, 6)),  # of its pose relative to the landmarks near it, see types
-    "world_covariance": Column("f8", (6, 6)),  # of its pose in the world
+    "world_covariance": Column("f8", (6, 6)),  # of its pose in the world, by drift
+    "sensitivity": Column("f8", (6, CALIBRATION)),  # of its pose's error to the calibration, see `shared.calibration_error`
+    "twist": Column("f8", (6,)),  # velocity of the camera (m/s, rad/s), in its frame
     "intrinsics": Column("f8", (4,)),  # fx, fy, cx, cy
     "points": Column("i4", (2,)),  # its rows of the observation tables, half open
     "lines": Column("i4", (2,)),

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from trihedron.pipeline.core.geometry import invert, transform
+from trihedron.pipeline.core.linalg import matmul, solve
 from trihedron.pipeline.core.types import I32, Bool, Map, Table
 from trihedron.plugins.mapping.covisibility_graph import newest_keyframes, observed_by
 from trihedron.plugins.mapping.insertion import Observations, extend_lines
@@ -46,7 +47,7 @@ def merge_points(map: Map, view: Observations, visible: I32, metric: str) -> Map
     same: Bool = np.einsum("ni,nij,nj->n", apart, inverse(covariance), apart) <= CHI2_95[3]
     pairs, position, information = pairs[same], position[same], information[same]
     total = information.sum(axis=1)
-    merged = np.linalg.solve(total, np.einsum("nkij,nkj->ni", information, position)[..., None])[..., 0]
+    merged = solve(total, np.einsum("nkij,nkj->ni", information, position)[..., None])[..., 0]
     kept, gone = pairs.min(axis=1), pairs.max(axis=1)
     names = ("descriptor", "direction", "distance_m", "octave")
     newer: dict[str, Any] = dict(zip(names, map.points.gathered(pairs[:, 1], *names)))
@@ -110,7 +111,7 @@ def fuse_planes(map: Map, older: I32, newer: I32, max_deg: float, max_m: float) 
 def _parallel(planes: Table, ids: I32, max_deg: float) -> Bool:
     """(n, n) True for planes with the same normal."""
     normals = planes.rows("coefficients", ids)[:, :3]
-    parallel: Bool = normals @ normals.T >= np.cos(np.radians(max_deg))
+    parallel: Bool = matmul(normals, normals.T) >= np.cos(np.radians(max_deg))
     return parallel
 
 

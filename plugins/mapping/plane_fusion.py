@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from trihedron.pipeline.core.geometry import tangent_basis
+from trihedron.pipeline.core.linalg import eigh, matmul
 from trihedron.pipeline.core.types import F32, F64
 from trihedron.plugins.shared.linalg import cross_matrices, inverse
 
@@ -14,7 +15,7 @@ def information_of(moments: F64, coefficients: F64) -> F64:
     J = np.zeros((len(moments), 4, 3))
     J[:, :3, :2] = tangent_basis(coefficients[:, :3])
     J[:, 3, 2] = 1.0
-    return np.swapaxes(J, -1, -2) @ moments @ J
+    return matmul(np.swapaxes(J, -1, -2), moments, J)
 
 
 def equivalent_moments(coefficients: F64, covariance: F64) -> F64:
@@ -27,12 +28,12 @@ def equivalent_moments(coefficients: F64, covariance: F64) -> F64:
     L[:, :2, :3] = np.swapaxes(tangent_basis(n), -1, -2)
     L[:, 2, :3] = -d[:, None] * n
     L[:, 2, 3] = 1.0
-    return np.swapaxes(L, -1, -2) @ inverse(covariance) @ L
+    return matmul(np.swapaxes(L, -1, -2), inverse(covariance), L)
 
 
 def move_moments(T_a_b: F64, moments_b: F64) -> F64:
     """Transform moments (n, 4, 4) of points into frame a."""
-    return T_a_b @ moments_b @ T_a_b.T
+    return matmul(T_a_b, moments_b, T_a_b.T)
 
 
 def fit_planes(moments: F64, like: F64) -> tuple[F64, F64]:
@@ -40,7 +41,7 @@ def fit_planes(moments: F64, like: F64) -> tuple[F64, F64]:
     weight = moments[:, 3, 3]
     centre = moments[:, :3, 3] / weight[:, None]
     scatter = moments[:, :3, :3] - weight[:, None, None] * centre[:, :, None] * centre[:, None, :]
-    normal = np.asarray(np.linalg.eigh(scatter)[1][:, :, 0], np.float64)
+    normal = np.asarray(eigh(scatter)[1][:, :, 0], np.float64)
     normal = normal * np.where(np.einsum("ij,ij->i", normal, like[:, :3]) < 0.0, -1.0, 1.0)[:, None]
     planes = np.concatenate([normal, -np.einsum("ij,ij->i", normal, centre)[:, None]], axis=1)
     return planes, inverse(information_of(moments, planes))
@@ -54,7 +55,7 @@ def motions_between(old: F64, new: F64, centres: F64) -> F64:
     K = cross_matrices(np.cross(old[:, :3], new[:, :3]))
     cosine = np.einsum("ij,ij->i", old[:, :3], new[:, :3])
     T = np.zeros((len(old), 4, 4))
-    T[:, :3, :3] = R = np.eye(3) + K + K @ K / np.maximum(1.0 + cosine, 1e-12)[:, None, None]
+    T[:, :3, :3] = R = np.eye(3) + K + matmul(K, K) / np.maximum(1.0 + cosine, 1e-12)[:, None, None]
     away = np.einsum("ij,ij->i", new[:, :3], centres) + new[:, 3]
     T[:, :3, 3] = centres - np.einsum("nij,nj->ni", R, centres) - away[:, None] * new[:, :3]
     T[:, 3, 3] = 1.0

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from trihedron.pipeline.core.geometry import invert, transform
+from trihedron.pipeline.core.linalg import matmul
 from trihedron.pipeline.core.types import F32, F64, I32, U8, Bool, Camera, Frame, Keypoints, Map, Planes, Segments, Table
 from trihedron.plugins.mapping.landmark_kernels import (
     MIN_DEPTH_M,
@@ -60,7 +61,7 @@ def visible_planes(planes: Table, ids: I32, T_world_camera: F64, frame: Frame) -
     x, y = np.rint(np.where(inside[..., None], pixels, 0.0)).astype(int).transpose(2, 0, 1)
     depth = frame.depth_m[y, x].astype(np.float64)
     unoccluded = inside & (depth > 0.0) & (local[..., 2] < depth + HIDDEN_M + HIDDEN_SIGMAS * frame.camera.depth_noise.sigma_m(depth))
-    facing = coefficients[:, :3] @ T_world_camera[:3, 3] + coefficients[:, 3] > 0.0
+    facing = matmul(coefficients[:, :3], T_world_camera[:3, 3]) + coefficients[:, 3] > 0.0
     return np.asarray(ids[facing & (unoccluded.sum(axis=1) >= 0.5 * np.isfinite(samples[..., 0]).sum(axis=1))], np.int32)
 
 

@@ -10,7 +10,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from trihedron.pipeline.core.geometry import invert
+from trihedron.pipeline.core.geometry import invert, rigid
+from trihedron.pipeline.core.linalg import matmul
 from trihedron.pipeline.core.types import F64, Map, Pose, Rotation
 from trihedron.plugins.mapping.covisibility_graph import keyframes_of
 
@@ -22,10 +23,10 @@ def transform_to_map(pose: Pose, map: Map | None) -> Pose:
     if map is None or not 0 <= pose.reference < len(map.keyframes):
         return pose
     T_world_keyframe = map.keyframes.row("T_world_camera", pose.reference)
-    relative = invert(T_world_keyframe) @ pose.T_world_camera
+    relative = matmul(invert(T_world_keyframe), pose.T_world_camera)
     if np.abs(relative - pose.T_reference_camera).max() < UNMOVED:
         return pose
-    return replace(pose, T_world_camera=T_world_keyframe @ pose.T_reference_camera)
+    return replace(pose, T_world_camera=rigid(matmul(T_world_keyframe, pose.T_reference_camera)))
 
 
 def transform_rotation_to_map(previous: Rotation, pose: Pose | None, map: Map | None) -> tuple[Rotation, Pose | None]:
@@ -36,8 +37,10 @@ def transform_rotation_to_map(previous: Rotation, pose: Pose | None, map: Map | 
     now = transform_to_map(pose, map)
     if now is pose:
         return previous, pose
-    rotate = now.T_world_camera[:3, :3] @ pose.T_world_camera[:3, :3].T
-    return replace(previous, R_world_camera=rotate @ previous.R_world_camera, R_world_manhattan=rotate @ previous.R_world_manhattan), now
+    rotate = matmul(now.T_world_camera[:3, :3], pose.T_world_camera[:3, :3].T)
+    return replace(
+        previous, R_world_camera=matmul(rotate, previous.R_world_camera), R_world_manhattan=matmul(rotate, previous.R_world_manhattan)
+    ), now
 
 
 def submap_of(pose: Pose, map: Map | None) -> int:
@@ -52,4 +55,4 @@ def reference_of(map: Map | None, T_world_camera: F64, submap: int = 0) -> tuple
     newest = keyframes_of(map, submap)[-1:] if map is not None else np.empty(0, np.int32)
     if map is None or len(newest) == 0:
         return -1, T_world_camera
-    return int(newest[0]), invert(map.keyframes.row("T_world_camera", int(newest[0]))) @ T_world_camera
+    return int(newest[0]), matmul(invert(map.keyframes.row("T_world_camera", int(newest[0]))), T_world_camera)

@@ -7,7 +7,9 @@ from typing import Any
 
 import numpy as np
 
-from trihedron.pipeline.core.geometry import adjoint, invert
+from trihedron.pipeline.core.geometry import invert
+from trihedron.pipeline.core.lie import adjoint
+from trihedron.pipeline.core.linalg import matmul
 from trihedron.pipeline.core.types import F64, I32, Map, Pose, Table
 from trihedron.plugins.mapping.correction import transform_landmarks
 from trihedron.plugins.mapping.covisibility_graph import keyframes_of
@@ -22,11 +24,12 @@ def merge_submaps(map: Map, pose: Pose, recognised: Pose, max_deg: float, max_m:
     if submap == recognised.submap:
         return map
     rows = np.flatnonzero(map.keyframes.column("submap") == submap).astype(np.int32)
-    T: F64 = recognised.T_world_camera @ invert(pose.T_world_camera)
+    T: F64 = matmul(recognised.T_world_camera, invert(pose.T_world_camera))
     map = transform_landmarks(map, T, rows, *(_created_by(table, rows) for table in (map.points, map.lines, map.planes)))
     newer, older = (_created_by(map.planes, keyframes_of(map, number)) for number in (submap, recognised.submap))
     submaps, covariance = np.full(len(rows), recognised.submap, np.int32), _world_covariance(map, rows, recognised)
-    changes: dict[str, Any] = {"keyframes": map.keyframes.updated(rows, submap=submaps, world_covariance=covariance)}
+    sensitivity = _sensitivity(map, rows, pose, recognised)
+    changes: dict[str, Any] = {"keyframes": map.keyframes.updated(rows, submap=submaps, world_covariance=covariance, sensitivity=sensitivity)}
     return fuse_planes(replace(map, **changes), older, newer, max_deg, max_m)
 
 
@@ -34,13 +37,24 @@ def _world_covariance(map: Map, rows: I32, recognised: Pose) -> F64:
     """Covariances (k, 6, 6) of keyframes in the world that their sub-map is merged into: their own, plus that of the recognised pose, which they all
     move with, relative to a keyframe of that world, and of this keyframe."""
     poses, covariance = (map.keyframes.rows(name, rows) for name in ("T_world_camera", "world_covariance"))
-    to_rows = adjoint(invert(poses) @ recognised.T_world_camera)
+    to_rows = adjoint(matmul(invert(poses), recognised.T_world_camera))
     common = recognised.covariance
     if recognised.reference >= 0:
         T, of_reference = (map.keyframes.rows(name, np.array([recognised.reference]))[0] for name in ("T_world_camera", "world_covariance"))
-        to_pose = adjoint(invert(recognised.T_world_camera) @ T)
-        common = common + to_pose @ of_reference @ to_pose.T
-    return np.asarray(covariance + to_rows @ common @ to_rows.transpose(0, 2, 1))
+        to_pose = adjoint(matmul(invert(recognised.T_world_camera), T))
+        common = common + matmul(to_pose, of_reference, to_pose.T)
+    return np.asarray(covariance + matmul(to_rows, common, to_rows.transpose(0, 2, 1)))
+
+
+def _sensitivity(map: Map, rows: I32, pose: Pose, recognised: Pose) -> F64:
+    """Sensitivities (k, 6, m) of keyframes in the world that their sub-map is merged into: their own, plus what the recognised pose has more than
+    this frame's in the sub-map's world."""
+    poses, own = (map.keyframes.rows(name, rows) for name in ("T_world_camera", "sensitivity"))
+    common = -pose.sensitivity
+    if recognised.reference >= 0:
+        T, of_reference = (map.keyframes.rows(name, np.array([recognised.reference]))[0] for name in ("T_world_camera", "sensitivity"))
+        common = common + matmul(adjoint(matmul(invert(recognised.T_world_camera), T)), of_reference)
+    return np.asarray(own + matmul(adjoint(matmul(invert(poses), recognised.T_world_camera)), common))
 
 
 def _created_by(table: Table, keyframes: I32) -> I32:

@@ -7,12 +7,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from trihedron.pipeline.core.geometry import pose_matrix
+from trihedron.pipeline.core.linalg import eigvalsh
 from trihedron.pipeline.core.options import NonNegativeInt, PositiveInt
 from trihedron.pipeline.core.registry import register
 from trihedron.pipeline.core.types import F64, OK, Camera, Keypoints, Map, Matches, Planes, Pose, Rotation, Segments, Translation
-from trihedron.plugins.mapping.covisibility_graph import living_keyframes, local_window
+from trihedron.plugins.mapping.covisibility_graph import VICINITY_DEG, VICINITY_M, living_keyframes, local_window
 from trihedron.plugins.mapping.data_association import PredictedPose, SearchOptions, search_map
-from trihedron.plugins.places.verification import VICINITY_DEG, VICINITY_M
 
 
 @register("matches", "local_map")
@@ -56,5 +56,5 @@ class LocalMap(SearchOptions):
 
 def _sigmas(position: F64, rotation: F64) -> tuple[float, float]:
     """Largest standard deviation of each."""
-    sigma_m, sigma_rad = np.sqrt(np.linalg.svd(np.array([position, rotation]), compute_uv=False)[:, 0]).tolist()
+    sigma_m, sigma_rad = np.sqrt(eigvalsh(np.array([position, rotation]))[:, -1]).tolist()
     return sigma_m, sigma_rad

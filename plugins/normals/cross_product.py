@@ -3,20 +3,26 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import cv2
 
 from trihedron.pipeline.core.registry import register
 from trihedron.pipeline.core.types import Frame, Normals
-from trihedron.plugins.normals.common import CloudNormals
+from trihedron.plugins.normals.common import CloudMethod, CloudOptions, cloud_normals
+from trihedron.plugins.shared.per_thread import PerThread
 
 
 @register("normals", "cross_product")
 @dataclass(frozen=True)
-class CrossProduct(CloudNormals):
+class CrossProduct(CloudOptions):
     """Cross product of the steps to neighbouring points (OpenCV's RgbdNormals): cheapest, and exact on exact planes; all its resistance to noise is
     that of the averaged points."""
 
     def __call__(self, frame: Frame) -> Normals:
         """Normals on a grid of ceil(h / stride) × ceil(w / stride) cells; NaN beside missing depth, a depth edge or the image's border."""
-        return self._normals(frame, cv2.RgbdNormals_RGBD_NORMALS_METHOD_CROSS_PRODUCT, 1, reach=1, border=1)
+        return cloud_normals(self, self._method, frame, cv2.RgbdNormals_RGBD_NORMALS_METHOD_CROSS_PRODUCT, 1, reach=1, border=1)
+
+    @cached_property
+    def _method(self) -> PerThread[CloudMethod]:
+        return PerThread(CloudMethod)

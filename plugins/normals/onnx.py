@@ -33,7 +33,7 @@ class OnnxNormals(NetworkOptions):
 
     def __call__(self, frame: Frame) -> Normals:
         """Normals on a grid of ceil(h / stride) × ceil(w / stride) cells; NaN without depth."""
-        network, depth = self._network, frame.depth_m[:: self.stride, :: self.stride]
+        network, depth = self.network, frame.depth_m[:: self.stride, :: self.stride]
         image = network_image(frame, network, "image", 3, self.multiple)
         found = network.rows("normals", network.run({"image": image.tensor}, ("normals",))[0], 3, None, None)
         rows, columns = np.indices(depth.shape, np.float64) * self.stride

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from trihedron.pipeline.core.types import F64, I32, Keypoints, Map, Segments
-from trihedron.plugins.mapping.covisibility_graph import WEIGHTS, observed_by
+from trihedron.plugins.mapping.covisibility_graph import WEIGHTS, are_distinct, observed_by
 from trihedron.plugins.shared.feature_matching import nearest_matches
 from trihedron.plugins.shared.rigid_alignment_kernels import rigid_hypotheses_kernel
 
@@ -54,9 +54,3 @@ def distinct_poses(poses: F64, count: int) -> F64:
         if all(are_distinct(T, other) for other in chosen):
             chosen.append(T)
     return np.array(chosen).reshape(-1, 4, 4)
-
-
-def are_distinct(T: F64, other: F64) -> bool:
-    """Return True if two poses differ by 10 cm or 5°."""
-    cosine = 0.5 * (np.trace(T[:3, :3].T @ other[:3, :3]) - 1.0)
-    return bool(np.linalg.norm(T[:3, 3] - other[:3, 3]) > 0.1 or cosine < np.cos(np.radians(5.0)))

@@ -8,17 +8,17 @@ from typing import NamedTuple
 import numpy as np
 
 from trihedron.pipeline.core.geometry import invert, transform
+from trihedron.pipeline.core.linalg import matmul
 from trihedron.pipeline.core.types import F64, I32, Camera, Frame, Keypoints, Map, Matches, Planes, Segments
-from trihedron.plugins.mapping.covisibility_graph import LocalWindow, local_window, window_of
+from trihedron.plugins.mapping.covisibility_graph import VICINITY_DEG, VICINITY_M, LocalWindow, are_distinct, local_window, window_of
 from trihedron.plugins.mapping.data_association import PredictedPose, SearchOptions, search_map
 from trihedron.plugins.mapping.landmark_kernels import MIN_DEPTH_M
 from trihedron.plugins.mapping.projection import in_image, line_terms, plane_terms, point_terms
-from trihedron.plugins.places.recognition import are_distinct
 from trihedron.plugins.shared.pose_optimizer import LANDMARK_SCORE, PoseSolution, solve_pose
 
 TOLERANCE_M, TOLERANCE_SIGMAS = 0.1, 5.0  # of depth, before a surface is violated
+DETAILED = np.array([100, 30])  # points and lines expected in view, from which on a place is recognised by these
 DETAILS = np.array([1, 3, 0])  # weights of points, lines and planes as details: any room has walls at some distance or other
-VICINITY_M, VICINITY_DEG = 2.0, 60.0  # of a place, within which keyframes observed it
 WIDE, CLOSE = (0.05, 2.0), (0.005, 0.2)  # standard deviations (m, °) of a hypothesis, and of the pose solved from it
 STRICT = SearchOptions(enough=0, max_distance=50, max_distance_l2=200, line_distance=40)  # ORB-SLAM2: 50; false matches often pass 80
 PRIOR_M, PRIOR_DEG = 0.5, 10.0  # weak: the data decide
@@ -54,24 +54,26 @@ class FrameFeatures(NamedTuple):
 @dataclass(frozen=True)
 class VerifiedPlace:
     """The pose (4, 4) at a place with covariance (6, 6), the inliers among points, lines and planes, their share of all matches, the share of the
-    details expected in view that are inliers, and the share of surfaces with a free-space violation."""
+    details expected in view that are inliers, the smaller of the shares of points and of lines (`least_share`), and the share of surfaces with a
+    free-space violation."""
 
     T_world_camera: F64
     covariance: F64
     inliers: I32
     inlier_share: float
     found_share: float
+    least_share: float
     violation: float
 
     @property
     def score(self) -> float:
         """Return the weighted number of inliers."""
-        return float(self.inliers @ LANDMARK_SCORE)
+        return float(matmul(self.inliers, LANDMARK_SCORE))
 
     @property
     def details(self) -> float:
         """Return the weighted number of inliers among points and lines."""
-        return float(self.inliers @ DETAILS)
+        return float(matmul(self.inliers, DETAILS))
 
 
 def verify_place(T_world_camera: F64, view: FrameFeatures, map: Map, keyframes: I32, near: int) -> VerifiedPlace | None:
@@ -95,8 +97,19 @@ def verify_place(T_world_camera: F64, view: FrameFeatures, map: Map, keyframes: 
     inliers = np.array([np.count_nonzero(found.points), np.count_nonzero(found.lines), np.count_nonzero(found.planes)], np.int32)
     matched = len(matches.keypoints) + len(matches.segments) + len(matches.planes)
     expected = np.array([len(matches.visible_points), len(matches.visible_lines), 0])
-    inlier_share, found_share = float(inliers.sum() / max(matched, 1)), float(inliers @ DETAILS / max(expected @ DETAILS, 1))
-    return VerifiedPlace(T, found.covariance, inliers, inlier_share, found_share, free_space_violation(T, view.frame, map, window))
+    inlier_share, found_share = float(inliers.sum() / max(matched, 1)), float(matmul(inliers, DETAILS) / max(matmul(expected, DETAILS), 1))
+    violation = free_space_violation(T, view.frame, map, window)
+    return VerifiedPlace(T, found.covariance, inliers, inlier_share, found_share, least_share(inliers, matches, view.keypoints), violation)
+
+
+def least_share(inliers: I32, matches: Matches, keypoints: Keypoints) -> float:
+    """Return the smaller of the shares of points and of lines expected in view that are inliers (3,). Points are expected as many as have depth, or
+    as the map has there; a kind of which fewer than `DETAILED` are expected does not count.
+
+    Lines of rooms built alike agree with a map while points do not, and points of a pattern that repeats while lines do not."""
+    with_depth = int(np.count_nonzero(np.isfinite(keypoints.points_m[:, 2])))
+    expected = np.array([min(with_depth, len(matches.visible_points)), len(matches.visible_lines)])
+    return float((inliers[:2] / np.maximum(expected, 1))[expected >= DETAILED].min(initial=1.0))
 
 
 def solve_pose_in_map(

@@ -11,14 +11,14 @@ from trihedron.pipeline.core.options import PositiveFloat, PositiveShare, Range
 from trihedron.pipeline.core.registry import register
 from trihedron.pipeline.core.types import Frame, Normals, Planes
 from trihedron.plugins.planes.ahc_kernels import cluster_blocks
-from trihedron.plugins.planes.common import PlanarRegions
+from trihedron.plugins.planes.common import RegionOptions, complete_planes, grid_of, least_cells
 from trihedron.plugins.planes.common_blocks_kernels import block_sums, blocks_to_cells
 from trihedron.plugins.planes.common_kernels import fit_labelled
 
 
 @register("planes", "ahc")
 @dataclass(frozen=True)
-class Ahc(PlanarRegions):
+class Ahc(RegionOptions):
     """Agglomerative hierarchical clustering (Feng, Taguchi & Kamat, ICRA 2014) of small blocks by the mean squared error (mse) of their common plane.
 
     The paper's thresholds (mm², mm) are a noise model of one sensor; here errors are in σ of the frame's own. Its refinement (erode the blocks at the
@@ -32,11 +32,11 @@ class Ahc(PlanarRegions):
 
     def __call__(self, frame: Frame, normals: Normals) -> Planes:
         """Planes, largest first; `labels` on the grid of the normals, which only help to refine and to tell curved surfaces."""
-        grid, stride = self._grid(frame, normals), normals.stride
+        grid, stride = grid_of(frame, normals), normals.stride
         side = max(round(self.block_px / stride), 2)
         sums = block_sums(grid, side, self.share)
         blocks, q = cluster_blocks(sums, self.block_sigma**2, self.sigma**2, self.shift_sigma**2, 0.5 * self.min_pixels)
         labels = blocks_to_cells(blocks, side, grid.rho)
         cone = float(np.radians(self.cone_deg))
-        core, q = fit_labelled(grid, labels, q, cone, self.gate, self._least(stride))
-        return self._complete(core, q, grid, frame, stride, flat=False)
+        core, q = fit_labelled(grid, labels, q, cone, self.gate, least_cells(self, stride))
+        return complete_planes(self, core, q, grid, frame, stride, flat=False)

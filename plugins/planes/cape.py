@@ -11,14 +11,14 @@ from trihedron.pipeline.core.options import AcuteDeg, PositiveFloat, PositiveInt
 from trihedron.pipeline.core.registry import register
 from trihedron.pipeline.core.types import Frame, Normals, Planes
 from trihedron.plugins.planes.cape_kernels import grow_blocks
-from trihedron.plugins.planes.common import PlanarRegions
+from trihedron.plugins.planes.common import RegionOptions, complete_planes, grid_of, least_cells
 from trihedron.plugins.planes.common_blocks_kernels import block_planes, block_sums, blocks_to_cells
 from trihedron.plugins.planes.common_kernels import fit_labelled
 
 
 @register("planes", "cape")
 @dataclass(frozen=True)
-class Cape(PlanarRegions):
+class Cape(RegionOptions):
     """Cell-wise plane extraction (Proença & Gao, IROS 2018): the fastest, and blind to planes narrower than two cells.
 
     Planarity is the mean squared error of a cell's least-squares plane in σ of the frame's noise model; the paper takes the least eigenvalue of its
@@ -33,7 +33,7 @@ class Cape(PlanarRegions):
 
     def __call__(self, frame: Frame, normals: Normals) -> Planes:
         """Planes, largest first; `labels` on the grid of the normals, which only help to refine and to tell curved surfaces."""
-        grid, stride = self._grid(frame, normals), normals.stride
+        grid, stride = grid_of(frame, normals), normals.stride
         side = max(round(self.block_px / stride), 2)
         sums = block_sums(grid, side, self.share)
         flat = block_planes(sums)
@@ -41,5 +41,5 @@ class Cape(PlanarRegions):
         blocks, q = grow_blocks(sums, *flat, self.sigma**2, cos_angle, self.step_sigma**2, self.least)
         labels = blocks_to_cells(blocks, side, grid.rho)
         cone = float(np.radians(self.cone_deg))
-        core, q = fit_labelled(grid, labels, q, cone, self.gate, self._least(stride))
-        return self._complete(core, q, grid, frame, stride, flat=False)
+        core, q = fit_labelled(grid, labels, q, cone, self.gate, least_cells(self, stride))
+        return complete_planes(self, core, q, grid, frame, stride, flat=False)

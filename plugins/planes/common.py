@@ -8,6 +8,7 @@ from typing import Annotated
 
 import numpy as np
 
+from trihedron.pipeline.core.linalg import inv, matmul, solve
 from trihedron.pipeline.core.options import NonNegativeFloat, NonNegativeInt, PositiveFloat, PositiveInt, Range
 from trihedron.pipeline.core.types import F64, I32, U8, Frame, Normals, Planes
 from trihedron.plugins.planes.common_kernels import (
@@ -28,8 +29,8 @@ Sums = tuple[F64, F64, F64, I32]  # of each region's core, as from `accumulate`
 
 
 @dataclass(frozen=True)
-class PlanarRegions:
-    """Base of the plugins of `planes`: a plugin finds the core of each region, `_complete` makes Planes of them."""
+class RegionOptions:
+    """Options of every detector: a plugin finds the core of each region, `complete_planes` makes Planes of them."""
 
     cone_deg: Annotated[float, Range(above=0, high=45)] = 15.0  # normals of one plane lie within this of it
     gate: PositiveFloat = 3.0  # σ_z of a member's depth
@@ -44,53 +45,62 @@ class PlanarRegions:
     tiles: Annotated[int, Range(4)] = 16  # squares a region is cut into to see how its residuals are correlated
     bias: NonNegativeFloat = 0.1  # σ_z common to all depths of a region: a real sensor's depth is bent (fr3 of TUM: 0.1 to 0.3 track best)
 
-    def _grid(self, frame: Frame, normals: Normals) -> Grid:
-        """The frame's depths on the grid of the normals."""
-        camera = frame.camera
-        rho, sigma, count = cell_inverse_depths(frame.depth_m, normals.stride, EDGE, EDGE_M, camera.depth_noise.coefficients)
-        intrinsics = (float(camera.fx), float(camera.fy), float(camera.cx), float(camera.cy))
-        rays_x, rays_y = cell_rays(rho.shape[0], rho.shape[1], normals.stride, intrinsics)
-        return Grid(rho, sigma, count, rays_x, rays_y, normals.normals)
 
-    def _least(self, stride: int) -> int:
-        """Cells a region's core must have: half of what the smallest region covers."""
-        return self.min_pixels // (2 * stride * stride) + 1
+def grid_of(frame: Frame, normals: Normals) -> Grid:
+    """The frame's depths on the grid of the normals."""
+    camera = frame.camera
+    rho, sigma, count = cell_inverse_depths(frame.depth_m, normals.stride, EDGE, EDGE_M, camera.depth_noise.coefficients)
+    intrinsics = (float(camera.fx), float(camera.fy), float(camera.cx), float(camera.cy))
+    rays_x, rays_y = cell_rays(rho.shape[0], rho.shape[1], normals.stride, intrinsics)
+    return Grid(rho, sigma, count, rays_x, rays_y, normals.normals)
 
-    def _complete(self, core: U8, q: F64, grid: Grid, frame: Frame, stride: int, flat: bool = True) -> Planes:
-        """Planes of the regions whose core cells are labelled (h, w) and whose planes are q (k, 3): grown, merged, fitted to their cores. A detector
-        that did not use the normals passes `flat` False: curved regions are dropped."""
-        gap, cos_cone = max(self.gap_px // stride, 1), math.cos(2.0 * math.radians(self.cone_deg))
-        labels, owner, sums = grown_and_merged(core, q, grid, self.gate, self.border_px // stride, cos_cone, gap, self.merge, self.correlation_px**2)
-        if not flat:
-            owner = self._flat(owner, labels, sums, grid, gap)
-        return self._report(labels, core, owner, sums, grid, frame, stride)
 
-    def _flat(self, owner: I32, labels: U8, sums: Sums, grid: Grid, gap: int) -> I32:
-        """New label (k + 1,) of each region; 0 where the normals, if there are any, show that it is no plane."""
-        if np.isnan(grid.normals[..., 0]).all():
-            return owner
-        cone, merged = float(np.radians(self.cone_deg)), owner[labels]
-        q = np.array([solve_symmetric(A, b)[1] for A, b in zip(sums[0], sums[1])]).reshape(-1, 3)
-        turns, biases, share = normals_of_regions(merged, q, grid, float(np.cos(2.0 * cone)), 2)
-        good = (share >= FACING) & (turns <= np.maximum(self.turn * cone, BIASES * biases))
-        good = drop_engulfed(merged, grid.rho, good, gap)
-        return np.where(np.concatenate([[False], good])[owner], owner, 0).astype(np.int32)
+def least_cells(options: RegionOptions, stride: int) -> int:
+    """Cells a region's core must have: half of what the smallest region covers."""
+    return options.min_pixels // (2 * stride * stride) + 1
 
-    def _report(self, labels: U8, core: U8, owner: I32, sums: Sums, grid: Grid, frame: Frame, stride: int) -> Planes:
-        """The largest regions as a value, largest first; `owner` is the region of each label, 0 = none."""
-        numbered, number, ranked, area = largest_regions(labels, owner, grid.count, self.min_pixels, self.planes)
-        A, b, moments, n = (total[ranked] for total in sums)
-        q = np.asarray(np.linalg.solve(A, b[..., None])[..., 0], np.float64)
-        coefficients, J, excess, samples = plane_report(numbered, core, number, q, grid, self.tiles, self.correlation_px**2, 2.0, self.samples, 400)
-        variance = excess + self.bias**2 * n  # over that of the least-squares fit to n independent depths, `A⁻¹`
-        return Planes(
-            index=frame.index,
-            stamp_ns=frame.stamp_ns,
-            coefficients=coefficients,
-            covariance=J @ (np.linalg.inv(A) * variance[:, None, None]) @ np.swapaxes(J, -1, -2),
-            moments=np.asarray(moments, np.float64),
-            pixels=area,
-            samples_m=samples,
-            labels=numbered,
-            stride=stride,
-        )
+
+def complete_planes(options: RegionOptions, core: U8, q: F64, grid: Grid, frame: Frame, stride: int, flat: bool = True) -> Planes:
+    """Planes of the regions whose core cells are labelled (h, w) and whose planes are q (k, 3): grown, merged, fitted to their cores. A detector
+    that did not use the normals passes `flat` False: curved regions are dropped."""
+    gap, cos_cone = max(options.gap_px // stride, 1), math.cos(2.0 * math.radians(options.cone_deg))
+    labels, owner, sums = grown_and_merged(
+        core, q, grid, options.gate, options.border_px // stride, cos_cone, gap, options.merge, options.correlation_px**2
+    )
+    if not flat:
+        owner = _flat(options, owner, labels, sums, grid, gap)
+    return _report(options, labels, core, owner, sums, grid, frame, stride)
+
+
+def _flat(options: RegionOptions, owner: I32, labels: U8, sums: Sums, grid: Grid, gap: int) -> I32:
+    """New label (k + 1,) of each region; 0 where the normals, if there are any, show that it is no plane."""
+    if np.isnan(grid.normals[..., 0]).all():
+        return owner
+    cone, merged = float(np.radians(options.cone_deg)), owner[labels]
+    q = np.array([solve_symmetric(A, b)[1] for A, b in zip(sums[0], sums[1])]).reshape(-1, 3)
+    turns, biases, share = normals_of_regions(merged, q, grid, float(np.cos(2.0 * cone)), 2)
+    good = (share >= FACING) & (turns <= np.maximum(options.turn * cone, BIASES * biases))
+    good = drop_engulfed(merged, grid.rho, good, gap)
+    return np.where(np.concatenate([[False], good])[owner], owner, 0).astype(np.int32)
+
+
+def _report(options: RegionOptions, labels: U8, core: U8, owner: I32, sums: Sums, grid: Grid, frame: Frame, stride: int) -> Planes:
+    """The largest regions as a value, largest first; `owner` is the region of each label, 0 = none."""
+    numbered, number, ranked, area = largest_regions(labels, owner, grid.count, options.min_pixels, options.planes)
+    A, b, moments, n = (total[ranked] for total in sums)
+    q = np.asarray(solve(A, b[..., None])[..., 0], np.float64)
+    coefficients, J, excess, samples = plane_report(
+        numbered, core, number, q, grid, options.tiles, options.correlation_px**2, 2.0, options.samples, 400
+    )
+    variance = excess + options.bias**2 * n  # over that of the least-squares fit to n independent depths, `A⁻¹`
+    return Planes(
+        index=frame.index,
+        stamp_ns=frame.stamp_ns,
+        coefficients=coefficients,
+        covariance=matmul(J, inv(A) * variance[:, None, None], np.swapaxes(J, -1, -2)),
+        moments=np.asarray(moments, np.float64),
+        pixels=area,
+        samples_m=samples,
+        labels=numbered,
+        stride=stride,
+    )

@@ -6,9 +6,10 @@ from __future__ import annotations
 import numpy as np
 
 from trihedron.pipeline.core.kernel import kernel
+from trihedron.pipeline.core.linalg_kernels import dot, inverse_positive, matvec, solve_positive, tangent_columns
 from trihedron.pipeline.core.types import F32, F64, I32, U8, Bool
 from trihedron.plugins.shared.depth_image_kernels import Grid, cells_by_component
-from trihedron.plugins.shared.linalg_kernels import descending, inverse_positive, solve_positive, tangent_columns
+from trihedron.plugins.shared.sorting_kernels import descending
 
 # Robust planes through the cells of a grid: dominant normal, trimmed weighted least squares in inverse depth, and a test for curvature.
 
@@ -233,7 +234,7 @@ def grow_regions(labels: U8, planes: F64, grid: Grid, gate: float, reach: int, c
     nearby = np.empty(h * w, np.int32)
     unit = np.empty_like(planes)
     for k in range(len(planes)):
-        unit[k] = -planes[k] / max(np.sqrt(planes[k] @ planes[k]), 1e-12)
+        unit[k] = -planes[k] / max(np.sqrt(dot(planes[k], planes[k])), 1e-12)
     ring = 0
     while len(frontier) > 0:
         m = 0
@@ -474,7 +475,7 @@ def _one_plane(A: F64, b: F64, n: int, B: F64, c: F64, m: int, limit: float, noi
     e, f = common - p, common - q
     turned = min(angle_between(common, p), angle_between(common, q))
     step = turned > LEAST and turned > PARALLEL * angle_between(p, q)
-    return not step and e @ (A @ e) < limit * limit * n + noise and f @ (B @ f) < limit * limit * m + noise
+    return not step and dot(e, matvec(A, e)) < limit * limit * n + noise and dot(f, matvec(B, f)) < limit * limit * m + noise
 
 
 # What is reported of planes beside their labels: coefficients, how these depend on q, how much worse than their noise they are known, samples.
@@ -821,7 +822,7 @@ def normals_of_regions(labels: I32, planes: F64, grid: Grid, cos_cone: float, st
     unit, C, D = np.empty((regions, 3)), np.zeros((regions, 3, 3)), np.zeros((regions, 3, 3))
     sum_x, sum_n, x = np.zeros((regions, 3)), np.zeros((regions, 3)), np.empty(3)
     for k in range(regions):
-        unit[k] = -planes[k] / max(np.sqrt(planes[k] @ planes[k]), 1e-12)
+        unit[k] = -planes[k] / max(np.sqrt(dot(planes[k], planes[k])), 1e-12)
     for r in range(0, h, step):
         for c in range(0, w, step):
             k = labels[r, c] - 1

@@ -9,14 +9,14 @@ from typing import Annotated
 from trihedron.pipeline.core.options import AcuteDeg, Range
 from trihedron.pipeline.core.registry import register
 from trihedron.pipeline.core.types import Frame, Normals, Planes
-from trihedron.plugins.planes.common import EDGE, EDGE_M, PlanarRegions
+from trihedron.plugins.planes.common import EDGE, EDGE_M, RegionOptions, complete_planes, grid_of, least_cells
 from trihedron.plugins.planes.common_kernels import MOST
 from trihedron.plugins.planes.connected_components_kernels import planar_components
 
 
 @register("planes", "connected_components")
 @dataclass(frozen=True)
-class ConnectedComponents(PlanarRegions):
+class ConnectedComponents(RegionOptions):
     """Connected components (Trevor et al., SPME 2013; paper, section III-A), each checked to be one plane, grown to its border, merged and fitted by
     weighted least squares in inverse depth."""
 
@@ -25,7 +25,7 @@ class ConnectedComponents(PlanarRegions):
 
     def __call__(self, frame: Frame, normals: Normals) -> Planes:
         """Planes, largest first; `labels` on the grid of the normals."""
-        grid, cone, bend = self._grid(frame, normals), math.radians(self.cone_deg), 2.0 * math.radians(self.angle_deg)  # the same bend per metre
-        least = self._least(2 * normals.stride)
+        grid, cone, bend = grid_of(frame, normals), math.radians(self.cone_deg), 2.0 * math.radians(self.angle_deg)  # the same bend per metre
+        least = least_cells(self, 2 * normals.stride)
         core, q = planar_components(grid, (EDGE, EDGE_M), bend, self.gate, cone, self.turn, self.rounds, least, MOST)
-        return self._complete(core, q, grid, frame, normals.stride)
+        return complete_planes(self, core, q, grid, frame, normals.stride)

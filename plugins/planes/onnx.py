@@ -8,21 +8,23 @@ from typing import ClassVar
 import cv2
 import numpy as np
 
+from trihedron.pipeline.core.linalg import eigvalsh, matmul, solve
 from trihedron.pipeline.core.options import PositiveInt, Share
 from trihedron.pipeline.core.registry import register
 from trihedron.pipeline.core.types import F32, F64, I32, Frame, Normals, Planes
-from trihedron.plugins.planes.common import PlanarRegions
+from trihedron.plugins.planes.common import RegionOptions, complete_planes, grid_of, least_cells
 from trihedron.plugins.planes.common_kernels import fit_labelled
 from trihedron.plugins.planes.common_open3d import grid_points
 from trihedron.plugins.shared.depth_image_kernels import Grid
 from trihedron.plugins.shared.networks import NetworkImage, NetworkOptions, network_image
 
 LEAST = 3  # cells, of which a plane is made
+COLLINEAR = 1e-12  # ratio of the least and the largest moment of points, below which they determine no plane
 
 
 @register("planes", "onnx")
 @dataclass(frozen=True)
-class OnnxPlanes(NetworkOptions, PlanarRegions):
+class OnnxPlanes(NetworkOptions, RegionOptions):
     """Instance masks of a network that the user gives (PlaneRCNN: Liu et al., CVPR 2019; PlaneRecNet, BMVC 2021): RGB `image` (1, 3, h, w)
     in 0 … 1 to `masks` (1, n, h', w') in 0 … 1 and `scores` (1, n). A pixel belongs to the mask with the largest score × value.
 
@@ -36,15 +38,15 @@ class OnnxPlanes(NetworkOptions, PlanarRegions):
 
     def __call__(self, frame: Frame, normals: Normals) -> Planes:
         """Planes, largest first; `labels` on the grid of the normals."""
-        network, grid = self._network, self._grid(frame, normals)
+        network, grid = self.network, grid_of(frame, normals)
         image = network_image(frame, network, "image", 3, self.multiple)
         outputs = network.run({"image": image.tensor}, ("masks", "scores"))
         masks = network.rows("masks", outputs[0], None, None, None)
         scores = network.rows("scores", outputs[1], len(masks))
         labels = self._labels(masks, scores, image, grid, normals.stride)
         labels, q = _started(labels, grid)
-        core, fitted = fit_labelled(grid, labels, q, float(np.radians(self.cone_deg)), self.gate, self._least(normals.stride))
-        return self._complete(core, fitted, grid, frame, normals.stride, flat=False)
+        core, fitted = fit_labelled(grid, labels, q, float(np.radians(self.cone_deg)), self.gate, least_cells(self, normals.stride))
+        return complete_planes(self, core, fitted, grid, frame, normals.stride, flat=False)
 
     def _labels(self, masks: F32, scores: F32, image: NetworkImage, grid: Grid, stride: int) -> I32:
         """Label (h, w) of each cell with depth: 1 + its mask, 0 = none."""
@@ -69,8 +71,9 @@ def _started(labels: I32, grid: Grid) -> tuple[I32, F64]:
         mine = numbers == number
         if mine.sum() < LEAST:
             continue
-        q, _, rank, _ = np.linalg.lstsq(points[mine], np.ones(mine.sum()), rcond=None)
-        if rank == LEAST:
-            planes.append(q)
+        moments = matmul(points[mine].T, points[mine])
+        values = eigvalsh(moments)
+        if values[0] > COLLINEAR * values[-1]:
+            planes.append(solve(moments, points[mine].sum(axis=0)))
             out[rows[mine], columns[mine]] = len(planes)
     return out, np.array(planes, np.float64).reshape(-1, 3)

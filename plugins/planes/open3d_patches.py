@@ -7,10 +7,11 @@ from typing import Annotated
 
 import numpy as np
 
+from trihedron.pipeline.core.linalg import matmul
 from trihedron.pipeline.core.options import AcuteDeg, NonNegativeFloat, NonNegativeInt, Range
 from trihedron.pipeline.core.registry import register
 from trihedron.pipeline.core.types import F64, Frame, Normals, Planes
-from trihedron.plugins.planes.common import EDGE, EDGE_M, PlanarRegions
+from trihedron.plugins.planes.common import EDGE, EDGE_M, RegionOptions, complete_planes, grid_of, least_cells
 from trihedron.plugins.planes.common_kernels import fit_labelled
 from trihedron.plugins.planes.common_open3d import grid_points, on_finer_grid
 from trihedron.plugins.shared.depth_image_kernels import coarser
@@ -22,7 +23,7 @@ LEAST = 100  # points, of which patches are made: Open3D fails on a few
 
 @register("planes", "open3d_patches")
 @dataclass(frozen=True)
-class Open3dPatches(PlanarRegions):
+class Open3dPatches(RegionOptions):
     """`open3d.geometry.PointCloud.detect_planar_patches` (Araújo and Oliveira, Pattern Recognition 2020) with Open3D's defaults, on its own normals.
 
     The points within a patch's box are its region, which is then grown and fitted as that of every detector, so that the covariance is comparable.
@@ -36,7 +37,7 @@ class Open3dPatches(PlanarRegions):
 
     def __call__(self, frame: Frame, normals: Normals) -> Planes:
         """Planes, largest first; `labels` on the grid of the normals."""
-        grid, stride = self._grid(frame, normals), normals.stride
+        grid, stride = grid_of(frame, normals), normals.stride
         coarse = coarser(grid, EDGE, EDGE_M)
         rows, columns, points = grid_points(coarse)
         found = np.zeros(coarse.rho.shape, np.int32)
@@ -45,8 +46,8 @@ class Open3dPatches(PlanarRegions):
             free = member[found[rows[member], columns[member]] == 0]
             found[rows[free], columns[free]] = k + 1
         labels = on_finer_grid(found, grid)
-        core, fitted = fit_labelled(grid, labels, q, float(np.radians(self.cone_deg)), self.gate, self._least(stride))
-        return self._complete(core, fitted, grid, frame, stride, flat=False)
+        core, fitted = fit_labelled(grid, labels, q, float(np.radians(self.cone_deg)), self.gate, least_cells(self, stride))
+        return complete_planes(self, core, fitted, grid, frame, stride, flat=False)
 
     def _patches(self, points: F64) -> tuple[F64, list[np.ndarray]]:
         """q (k, 3) of the planes, with `q · (x, y, z) = 1`, and the rows of the points in each patch, the largest first."""
@@ -58,7 +59,7 @@ class Open3dPatches(PlanarRegions):
         planes, members = [], []
         for box in cloud.detect_planar_patches(*options, search):
             normal = np.asarray(box.R)[:, 2]
-            offset = float(normal @ np.asarray(box.center))
+            offset = float(matmul(normal, np.asarray(box.center)))
             if abs(offset) > 1e-3:  # else the plane contains the camera
                 planes.append(normal / offset)
                 members.append(np.asarray(box.get_point_indices_within_bounding_box(cloud.points), np.int64))

@@ -11,7 +11,7 @@ from scipy import ndimage
 from trihedron.pipeline.core.options import PositiveFloat, Range, Share
 from trihedron.pipeline.core.registry import register
 from trihedron.pipeline.core.types import F64, I32, Frame, Normals, Planes
-from trihedron.plugins.planes.common import EDGE, EDGE_M, PlanarRegions
+from trihedron.plugins.planes.common import EDGE, EDGE_M, RegionOptions, complete_planes, grid_of, least_cells
 from trihedron.plugins.planes.common_kernels import MOST, fit_labelled
 from trihedron.plugins.planes.common_open3d import grid_points, on_finer_grid
 from trihedron.plugins.shared.depth_image_kernels import coarser
@@ -21,7 +21,7 @@ from trihedron.plugins.shared.open3d_clouds import point_cloud
 
 @register("planes", "open3d_ransac")
 @dataclass(frozen=True)
-class Open3dRansac(PlanarRegions):
+class Open3dRansac(RegionOptions):
     """`open3d.geometry.PointCloud.segment_plane`, again and again on the points that are left; each plane is cut into connected regions.
 
     The regions are then grown and fitted as those of every detector, so that their covariance is comparable. Library: Open3D (MIT; Zhou, Park,
@@ -36,7 +36,7 @@ class Open3dRansac(PlanarRegions):
 
     def __call__(self, frame: Frame, normals: Normals, rng: np.random.Generator) -> Planes:
         """Planes, largest first; `labels` on the grid of the normals."""
-        grid, stride = self._grid(frame, normals), normals.stride
+        grid, stride = grid_of(frame, normals), normals.stride
         coarse = coarser(grid, EDGE, EDGE_M)
         rows, columns, points = grid_points(coarse)
         found, q = np.zeros(coarse.rho.shape, np.int32), [np.zeros((0, 3))]
@@ -47,8 +47,8 @@ class Open3dRansac(PlanarRegions):
             found = np.where(regions > 0, regions + sum(map(len, q)), found).astype(np.int32)
             q.append(np.repeat(-plane[None, :3] / plane[3], number, axis=0))
         labels = on_finer_grid(found, grid)
-        core, fitted = fit_labelled(grid, labels, np.concatenate(q), float(np.radians(self.cone_deg)), self.gate, self._least(stride))
-        return self._complete(core, fitted, grid, frame, stride, flat=False)
+        core, fitted = fit_labelled(grid, labels, np.concatenate(q), float(np.radians(self.cone_deg)), self.gate, least_cells(self, stride))
+        return complete_planes(self, core, fitted, grid, frame, stride, flat=False)
 
     def _planes(self, points: F64, rng: np.random.Generator) -> list[tuple[I32, F64]]:
         """Rows of the inliers and (n, d) of each plane."""

@@ -10,7 +10,7 @@ import numpy as np
 from trihedron.pipeline.core.options import PositiveFloat, PositiveInt, Range
 from trihedron.pipeline.core.registry import register
 from trihedron.pipeline.core.types import Frame, Normals, Planes
-from trihedron.plugins.planes.common import EDGE, EDGE_M, PlanarRegions
+from trihedron.plugins.planes.common import EDGE, EDGE_M, RegionOptions, complete_planes, grid_of, least_cells
 from trihedron.plugins.planes.common_kernels import MOST, fit_labelled
 from trihedron.plugins.planes.ransac_kernels import consensus_planes
 from trihedron.plugins.shared.depth_image_kernels import coarser
@@ -18,7 +18,7 @@ from trihedron.plugins.shared.depth_image_kernels import coarser
 
 @register("planes", "ransac")
 @dataclass(frozen=True)
-class Ransac(PlanarRegions):
+class Ransac(RegionOptions):
     """Sequential RANSAC (Fischler & Bolles 1981, scored as MSAC, Torr & Zisserman 2000): the plane with the best consensus, its largest connected
     region, then the next among what is left; on cells of twice the size. It needs no smooth neighbourhoods, and its random numbers are `rng`'s."""
 
@@ -29,11 +29,11 @@ class Ransac(PlanarRegions):
 
     def __call__(self, frame: Frame, normals: Normals, rng: np.random.Generator) -> Planes:
         """Planes, largest first; `labels` on the grid of the normals, which are asked where there are any."""
-        grid, stride = self._grid(frame, normals), normals.stride
+        grid, stride = grid_of(frame, normals), normals.stride
         cone = float(np.radians(self.cone_deg))
         draws = rng.random((self.rounds, self.hypotheses, 7))
         coarse = coarser(grid, EDGE, EDGE_M)
-        found, q = consensus_planes(coarse, draws, self.sigma, float(np.cos(cone)), self._least(2 * stride), self.misses)
+        found, q = consensus_planes(coarse, draws, self.sigma, float(np.cos(cone)), least_cells(self, 2 * stride), self.misses)
         labels = np.repeat(np.repeat(found, 2, axis=0), 2, axis=1)[: grid.rho.shape[0], : grid.rho.shape[1]] * (grid.rho > 0.0)
-        core, q = fit_labelled(grid, labels, q, cone, self.gate, self._least(stride))
-        return self._complete(core, q, grid, frame, stride, flat=False)
+        core, q = fit_labelled(grid, labels, q, cone, self.gate, least_cells(self, stride))
+        return complete_planes(self, core, q, grid, frame, stride, flat=False)

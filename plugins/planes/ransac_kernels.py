@@ -6,6 +6,7 @@ from __future__ import annotations
 import numpy as np
 
 from trihedron.pipeline.core.kernel import kernel
+from trihedron.pipeline.core.linalg_kernels import dot
 from trihedron.pipeline.core.types import F64, I32, U8, Bool
 from trihedron.plugins.planes.common_kernels import columns_of, fit_cells
 from trihedron.plugins.shared.depth_image_kernels import Grid, cells_by_component, connected_components
@@ -104,7 +105,7 @@ def _hypothesis(grid: Grid, draw: F64, cells: I32, free: Bool) -> F64:
 def _score(grid: Grid, q: F64, cells: I32, gate: float, cos_cone: float) -> float:
     """Sum over the cells of 1 - (e / gate)², 0 for outliers; e in σ_z."""
     w = grid.rho.shape[1]
-    length = np.sqrt(q @ q)
+    length = np.sqrt(dot(q, q))
     nx, ny, nz = -q[0] / length, -q[1] / length, -q[2] / length
     total = 0.0
     for i in cells:

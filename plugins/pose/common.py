@@ -14,7 +14,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from trihedron.pipeline.core.geometry import exp_so3, invert, nearest_rotation, pose_matrix
+from trihedron.pipeline.core.geometry import invert, nearest_rotation, pose_matrix
+from trihedron.pipeline.core.lie import exp_so3
+from trihedron.pipeline.core.linalg import eigh, inv, matmul, solve
 from trihedron.pipeline.core.types import DEGRADED, F32, F64, LOST, OK, Frame, Pose
 from trihedron.plugins.pose.common_kernels import Residuals, Source, Target, fill_residuals, normal_equations, observability, student_weights_kernel
 from trihedron.plugins.pose.decoupled_pose import FIRST_SIGMA, Decoupled
@@ -89,17 +91,17 @@ def align(levels: Sequence[tuple[Source, Target, int]], R: F64, t: F64, gates: G
         for _ in range(iterations):
             H, g, held, seen = _linearise(residuals, source, target, R, t, gates, weights)
             information = np.diag(prior)
-            information[:3, :3] += held.T @ held * max(float(np.trace(H)), 1.0) * 1e3
+            information[:3, :3] += matmul(held.T, held) * max(float(np.trace(H)), 1.0) * 1e3
             moved = np.concatenate([t - start, np.zeros(3)])
-            step = np.linalg.solve(H + information, -g - information @ moved)
+            step = solve(H + information, -g - matmul(information, moved))
             dR = exp_so3(step[3:])
-            R, t = dR @ R, dR @ t + step[:3]
-            if step @ step < CONVERGED:
+            R, t = matmul(dR, R), matmul(dR, t) + step[:3]
+            if matmul(step, step) < CONVERGED:
                 break
     H, g, held, seen = _linearise(residuals, source, target, R, t, gates, weights)
     W = weights(residuals, source)
     agreeing = float(np.count_nonzero((residuals.cosine > 0.0) & (_mahalanobis2(residuals, W) < 9.0))) / max(len(W), 1)
-    covariance = np.linalg.inv(H / CORRELATED + np.diag(np.maximum(prior, 1.0)))
+    covariance = inv(H / CORRELATED + np.diag(np.maximum(prior, 1.0)))
     return Alignment(nearest_rotation(R), t, covariance, held, seen, agreeing)
 
 
@@ -111,7 +113,7 @@ def _linearise(
     W = weights(residuals, source)
     H, g = normal_equations(residuals, W)
     spread, texture, seen = observability(residuals, W)
-    values, vectors = np.linalg.eigh(spread / LEAST_SPREAD + texture * LIMIT_M**2 / CORRELATED)
+    values, vectors = eigh(spread / LEAST_SPREAD + texture * LIMIT_M**2 / CORRELATED)
     return H, g, np.ascontiguousarray(vectors[:, values < 1.0].T), seen
 
 
@@ -167,11 +169,13 @@ def dense_pose(frame: Frame, previous: Pose, T: F64, found: Alignment, min_share
         return _lost(frame, previous, "the motion since the pose was lost is not known")
     if found.share < min_share or held == 3 or (lost and held):
         return _lost(frame, previous, f"only {agreement}" if found.share < min_share else "no direction of motion is observable")
-    inverse = invert(T)[:3, :3] @ previous.T_world_camera[:3, :3]  # xi of the target's frame in this camera's: the motion between them is small
+    inverse = matmul(
+        invert(T)[:3, :3], previous.T_world_camera[:3, :3]
+    )  # xi of the target's frame in this camera's: the motion between them is small
     rotate = np.kron(np.eye(2), inverse)
-    covariance = rotate @ found.covariance @ rotate.T
+    covariance = matmul(rotate, found.covariance, rotate.T)
     if not ends_loss:
-        covariance = covariance + rotate @ previous.covariance @ rotate.T
+        covariance = covariance + matmul(rotate, previous.covariance, rotate.T)
     counted = np.array([found.pixels, 0, 0], np.int32)
     status, reason = (DEGRADED, f"{held} directions of motion are unobservable, held at the prediction") if held else (OK, agreement)
     return Decoupled(T, covariance, counted, held, status, reason).to_pose(frame, None)

@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from trihedron.pipeline.core.linalg import inv, matmul
 from trihedron.pipeline.core.types import DEGRADED, F64, OK, Frame, Pose
 from trihedron.plugins.pose.common import CORRELATED, Alignment, dense_pose
 
@@ -20,8 +21,8 @@ def relative_pose(frame: Frame, previous: Pose, T_previous_frame: F64, informati
     nothing observes: the pose is `degraded` at best, for `ok` would promise its covariance."""
     order = np.array([3, 4, 5, 0, 1, 2])
     variance = CORRELATED * max(rmse, LEAST_SIGMA_M) ** 2
-    covariance = np.linalg.inv(information[np.ix_(order, order)] / variance + np.eye(6))
+    covariance = inv(information[np.ix_(order, order)] / variance + np.eye(6))
     pixels = int(information[3, 3])
     found = Alignment(T_previous_frame[:3, :3], T_previous_frame[:3, 3], covariance, np.empty((0, 3)), pixels, share)
-    pose = dense_pose(frame, previous, previous.T_world_camera @ T_previous_frame, found, least_share, "of the previous frame's points")
+    pose = dense_pose(frame, previous, matmul(previous.T_world_camera, T_previous_frame), found, least_share, "of the previous frame's points")
     return replace(pose, status=DEGRADED) if pose.status == OK else pose

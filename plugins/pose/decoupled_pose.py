@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from trihedron.pipeline.core.geometry import pose_matrix
+from trihedron.pipeline.core.linalg import matmul
 from trihedron.pipeline.core.types import DEGRADED, F64, I32, LOST, OK, Map, Pose, Rotation, Translation, Value
 from trihedron.plugins.mapping.reference_keyframe import reference_of
 
@@ -43,7 +44,7 @@ def decoupled_pose(rotation: Rotation, translation: Translation, previous: Pose 
     T = pose_matrix(rotation.R_world_camera, translation.t_world_camera)
     covariance = np.zeros((6, 6))
     R = rotation.R_world_camera
-    covariance[:3, :3] = R.T @ translation.covariance @ R + FIRST_SIGMA**2 * np.eye(3)
+    covariance[:3, :3] = matmul(R.T, translation.covariance, R) + FIRST_SIGMA**2 * np.eye(3)
     covariance[3:, 3:] = rotation.covariance + FIRST_SIGMA**2 * np.eye(3)
     unobservable = len(translation.unobservable)
     if previous is None:

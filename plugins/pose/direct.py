@@ -8,6 +8,7 @@ from typing import Annotated
 import numpy as np
 
 from trihedron.pipeline.core.geometry import pose_matrix
+from trihedron.pipeline.core.linalg import matmul
 from trihedron.pipeline.core.options import PositiveFloat, PositiveInt, Range, Share
 from trihedron.pipeline.core.registry import register
 from trihedron.pipeline.core.types import F64, Frame, Pose
@@ -46,7 +47,7 @@ class Direct:
         found = align(
             self._pairs(previous_frame, frame), np.eye(3), np.zeros(3), Gates(self.least_gradient, self.farthest_m, -1.0), student_weights, prior
         )
-        T = previous.T_world_camera @ pose_matrix(found.R.T, -found.R.T @ found.t)
+        T = matmul(previous.T_world_camera, pose_matrix(found.R.T, matmul(-found.R.T, found.t)))
         reaching = previous_frame.index == previous.index
         return dense_pose(frame, previous, T, found, self.min_share if reaching else 2.0, "of the previous frame's pixels")
 

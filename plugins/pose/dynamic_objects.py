@@ -12,7 +12,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from trihedron.pipeline.core.geometry import invert, log_se3
+from trihedron.pipeline.core.geometry import invert
+from trihedron.pipeline.core.lie import log_se3
+from trihedron.pipeline.core.linalg import matmul
 from trihedron.pipeline.core.types import DEGRADED, F64, OK, U8, Bool, Keypoints, Map, Matches, Planes, Segments
 from trihedron.plugins.pose.dynamic_objects_kernels import mahalanobis2, on_planes_kernel
 from trihedron.plugins.pose.map_alignment import InlierStatistics, MapAlignment, TrackingStatus
@@ -163,7 +165,7 @@ def matches_on_planes(matches: Matches, keypoints: Keypoints, segments: Segments
 
 def _difference(one: PoseSolution, other: PoseSolution) -> F64:
     """xi (6,) from the first pose to the other."""
-    return log_se3(invert(one.T_world_camera) @ other.T_world_camera)
+    return log_se3(matmul(invert(one.T_world_camera), other.T_world_camera))
 
 
 def distance2(one: PoseSolution, other: PoseSolution, dimension: int = 6) -> float:

@@ -6,8 +6,8 @@ from __future__ import annotations
 import numpy as np
 
 from trihedron.pipeline.core.kernel import kernel
+from trihedron.pipeline.core.linalg_kernels import solve_positive
 from trihedron.pipeline.core.types import F32, F64, I32, U8, Bool
-from trihedron.plugins.shared.linalg_kernels import solve_positive
 
 ALONG = np.array([0.1, 0.3, 0.5, 0.7, 0.9], np.float32)  # parameters along a segment at which the label image is sampled
 

@@ -8,6 +8,7 @@ from typing import Annotated
 import numpy as np
 
 from trihedron.pipeline.core.geometry import invert, pose_matrix
+from trihedron.pipeline.core.linalg import matmul
 from trihedron.pipeline.core.options import AcuteDeg, NonNegativeFloat, PositiveFloat, PositiveInt, Range, Share
 from trihedron.pipeline.core.registry import register
 from trihedron.pipeline.core.types import F64, Frame, Pose, PredictedView
@@ -43,10 +44,10 @@ class Icp:
             return first_pose(frame)
         gap = max(frame.index - previous.index, 1)
         prior = np.repeat([(self.motion_sigma_m * gap) ** -2, (np.radians(self.motion_sigma_deg) * gap) ** -2], 3)
-        start = invert(model.T_world_camera) @ previous.T_world_camera
+        start = matmul(invert(model.T_world_camera), previous.T_world_camera)
         gates = Gates(self.least_gradient, self.farthest_m, float(np.cos(np.radians(self.most_deg))))
         found = align(self._pairs(frame, model), start[:3, :3], start[:3, 3], gates, huber_weights(self.photometric, self.floor_m), prior)
-        T = model.T_world_camera @ pose_matrix(found.R, found.t)
+        T = matmul(model.T_world_camera, pose_matrix(found.R, found.t))
         return dense_pose(frame, previous, T, found, self.min_share, "of the pixels and the model", ends_loss=True)
 
     def _pairs(self, frame: Frame, model: PredictedView) -> list[tuple[Source, Target, int]]:

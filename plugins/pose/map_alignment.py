@@ -8,7 +8,15 @@ import numpy as np
 
 from trihedron.pipeline.core.types import F64, I32, Camera, Keypoints, Map, Matches, Planes, Segments
 from trihedron.plugins.mapping.projection import line_terms, plane_terms, point_terms
-from trihedron.plugins.shared.pose_optimizer import LANDMARK_SCORE, PoseSolution, Terms, classify_terms, first_step, grouped_equations, solve_pose
+from trihedron.plugins.shared.pose_optimizer import (
+    LANDMARK_SCORE,
+    PoseSolution,
+    Terms,
+    classify_terms,
+    first_step,
+    grouped_equations,
+    solve_pose,
+)
 from trihedron.plugins.shared.pose_optimizer_kernels import Flags, Groups
 
 
@@ -94,17 +102,30 @@ class MapAlignment:
         points, lines, planes = (int(np.count_nonzero(kind)) for kind in flags)
         return InlierStatistics((points, lines, planes), (len(self.matches.keypoints), len(self.matches.segments), same))
 
-    def equations_by_keyframe(self, solution: PoseSolution) -> tuple[I32, F64, F64]:
-        """The keyframes (k,) that created the landmarks which agree with a solution, and the normal equations of each one's landmarks: information
-        (k, 6, 6) and score (k, 6)."""
+    def plane_ids(self) -> I32:
+        """Ids of the map's planes in the terms of planes: the same, the parallel and the perpendicular ones."""
+        matches = self.matches
+        return np.concatenate([pairs[:, 1] for pairs in (matches.planes, matches.parallel, matches.perpendicular)])
+
+    def created_by(self) -> tuple[I32, Groups]:
+        """The keyframes (k,) that created the matched landmarks, and which of them created each."""
         map, matches = self.map, self.matches
-        planes = np.concatenate([pairs[:, 1] for pairs in (matches.planes, matches.parallel, matches.perpendicular)])
-        tables = (map.points, matches.keypoints[:, 1]), (map.lines, matches.segments[:, 1]), (map.planes, planes)
+        tables = (map.points, matches.keypoints[:, 1]), (map.lines, matches.segments[:, 1]), (map.planes, self.plane_ids())
         first = [table.rows("first", ids) for table, ids in tables]
         keyframes, numbers = np.unique(np.concatenate(first), return_inverse=True)
-        groups = Groups(*(part.astype(np.int32) for part in np.split(numbers, np.cumsum([len(part) for part in first[:2]]))))
+        return keyframes, Groups(*(part.astype(np.int32) for part in np.split(numbers, np.cumsum([len(part) for part in first[:2]]))))
+
+    def equations_by_keyframe(self, solution: PoseSolution, keyframes: I32, groups: Groups) -> tuple[F64, F64]:
+        """The normal equations of each keyframe's landmarks that agree with a solution: information (k, 6, 6) and score (k, 6)."""
         T, flags = solution.T_world_camera, Flags(solution.points, solution.lines, solution.planes)
-        return keyframes, *grouped_equations(T, self.camera, self.terms(T), flags, groups, len(keyframes))
+        return grouped_equations(T, self.camera, self.terms(T), flags, groups, len(keyframes))
+
+    def surfaces(self) -> F64:
+        """The observed planes (n, 4) that the matched key points lie on; NaN for none."""
+        labels, stride = self.planes.labels, self.planes.stride
+        x, y = np.rint(self.keypoints.pixels[self.matches.keypoints[:, 0]] / stride).astype(int).T
+        label = labels[np.clip(y, 0, labels.shape[0] - 1), np.clip(x, 0, labels.shape[1] - 1)]
+        return np.asarray(np.concatenate([np.full((1, 4), np.nan), self.planes.coefficients])[label], np.float64)
 
     def landmarks(self, solution: PoseSolution) -> tuple[I32, I32, I32]:
         """Ids of the points, lines and planes that agree with a solution."""

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from typing import ClassVar
 
 import numpy as np
 
+from trihedron.pipeline.core.linalg import inv
 from trihedron.pipeline.core.options import NonNegativeInt, PositiveFloat, PositiveShare, Share, check_increasing
 from trihedron.pipeline.core.registry import register
 from trihedron.pipeline.core.types import (
@@ -34,7 +34,7 @@ from trihedron.plugins.pose.world_uncertainty import carried, in_world, widened_
 from trihedron.plugins.shared.pose_optimizer import PoseSolution
 
 EYE = np.eye(3)
-FOCAL_LENGTHS = "`trihedron calibrate RUN.mcap` estimates the focal lengths instead"
+DETAILED = 100  # key points with which a frame is expected to be recognised by them
 
 
 @register("pose", "refine")
@@ -60,10 +60,9 @@ class Refine:
     moving_sure: PositiveFloat = 13.9  # the same of the position (0.997 quantile, 3 dof) that selects it although the outlier shares are alike
     moving_unproven: PositiveFloat = 9.0  # the same from the position by planes alone, which are selected while no landmark is verified
     moving_most: Share = 0.4  # of all matches that must be inliers, half if most planes are outliers too, else the pose is degraded to the planes' σ
+    min_continued: Share = 0.025  # of the key points with depth that the previous frame or the map must explain, else it is another place
     weak_foundation: PositiveFloat = 3.0  # times the pose's σ beyond which the nearby keyframes' σ is added to it
-    submap_after: NonNegativeInt = 15  # frames without relocalisation, of those that show enough, after which a sub-map begins; 0 = never
-
-    removed_options: ClassVar[dict[str, str]] = dict.fromkeys(("focal_off", "focal_worse", "focal_sure"), FOCAL_LENGTHS)
+    submap_after: NonNegativeInt = 5  # frames without relocalisation, of those that show enough, after which a sub-map begins; 0 = never
 
     def __post_init__(self) -> None:
         check_increasing(self, "min_inliers", "found_inliers")
@@ -93,19 +92,27 @@ class Refine:
         problem = MapAlignment(*prior, camera, matches, keypoints, segments, planes, map, *sigmas)
         solution, static = self._solve(problem, start)
         inliers = problem.statistics(solution)
-        if start.status == LOST and not self._is_relocalised(solution, inliers):
+        found_again = self._is_relocalised(solution, inliers) and not self._is_another_place(keypoints, matches, inliers.inliers[0])
+        if start.status == LOST and not found_again:
             searched = relocalise is not None and translation.estimated
             return self._stay_lost(start, rotation, previous, searched, map, submap)
         if rotation.source == "prediction" and not self._is_tracked(inliers):
             reason = f"the rotation was not measured, and only {inliers.total} of {inliers.matches} matches with the map agree"
             return carried(replace(start, status=LOST, reason=reason).to_pose(rotation, map, submap=submap), previous)
+        if start.status != LOST and self._is_another_place(keypoints, matches, max(int(translation.inliers[0]), inliers.inliers[0])):
+            continued = f"{translation.inliers[0]} key points continue the previous frame and {inliers.inliers[0]} are in the map"
+            reason = f"another place: of {len(keypoints.pixels)}, {continued}"
+            return carried(replace(start, status=LOST, reason=reason).to_pose(rotation, map, submap=submap), previous)
         if not inliers.total:
             return carried(start.to_pose(rotation, map, "nothing of the map was found, pose from the previous frame", submap), previous)
         status = self._status(problem, solution, static, inliers, rotation, submap)
+        repeats = previous.repeats + 1 if tracks is not None and _repeats(tracks, keypoints, planes) else 0
+        if status.status == OK and repeats > 1:  # a Kinect repeats single images
+            status = replace(status, status=DEGRADED, reason="the images repeat the previous frame bit for bit: at rest, or frozen")
         T, held, counts = solution.T_world_camera, solution.unobservable.shape[1], np.array(inliers.inliers, np.int32)
         reference, T_reference_camera = reference_of(map, T, submap)
         stamps = rotation.index, rotation.stamp_ns
-        pose = Pose(*stamps, T, status.covariance, T_reference_camera, reference, counts, held, status.status, status.reason, submap)
+        pose = Pose(*stamps, T, status.covariance, T_reference_camera, reference, counts, held, status.status, status.reason, submap, repeats=repeats)
         return in_world(pose, previous, solution, problem)
 
     def localising(self) -> Refine:
@@ -123,7 +130,7 @@ class Refine:
         both = np.array([start.covariance[:3, :3], start.covariance[3:, 3:]])
         both[0] += self.position_sigma_m**2 * EYE
         both[1] += math.radians(self.rotation_sigma_deg) ** 2 * EYE
-        information[:3, :3], information[3:, 3:] = np.linalg.inv(both)
+        information[:3, :3], information[3:, 3:] = inv(both)
         return information
 
     def _solve(self, problem: MapAlignment, start: Decoupled) -> tuple[PoseSolution, str]:
@@ -140,6 +147,13 @@ class Refine:
         """Return True if the map alone determines the pose of a lost camera."""
         enough = inliers.score >= self.found_inliers and inliers.total >= self.found_share * inliers.matches
         return enough and solution.unobservable.shape[1] == 0
+
+    def _is_another_place(self, keypoints: Keypoints, matches: Matches, continued: int) -> bool:
+        """Return True if the frame has details where details are expected, and hardly one of them is known from the previous frame or the map: what
+        its planes and lines agree with is then a place built alike."""
+        with_depth = int(np.count_nonzero(np.isfinite(keypoints.points_m[:, 2])))
+        expected = min(with_depth, len(matches.visible_points))
+        return expected >= DETAILED and continued < self.min_continued * with_depth
 
     def _status(
         self, problem: MapAlignment, solution: PoseSolution, static: str, inliers: InlierStatistics, rotation: Rotation, submap: int
@@ -177,4 +191,11 @@ class Refine:
         number = int(map.keyframes.column("submap").max(initial=0)) + 1
         reason = f"first frame of sub-map {number}: relocalisation failed for {unrecognised} frames"
         new = replace(start, covariance=FIRST_SIGMA**2 * np.eye(6), status=DEGRADED, reason=reason)
-        return new.to_pose(rotation, map, submap=number)
+        pose, information = new.to_pose(rotation, map, submap=number), previous.calibration_information
+        return replace(pose, calibration_information=information, calibration_score=previous.calibration_score)
+
+
+def _repeats(tracks: Tracks, keypoints: Keypoints, planes: Planes) -> bool:
+    """Return True if every tracked key point and plane is bit-identical to that of the previous frame, which no two images of a sensor are."""
+    points, walls = keypoints.points_m[tracks.keypoints[:, 1]], planes.coefficients[tracks.planes[:, 1]]
+    return bool(len(points) + len(walls)) and np.array_equal(tracks.points_m, points, True) and np.array_equal(tracks.coefficients, walls, True)

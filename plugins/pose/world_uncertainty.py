@@ -2,7 +2,8 @@
 
 A pose is estimated relative to hundreds of landmarks whose errors are treated as independent. Two parts are not: residuals of landmarks from one
 keyframe err alike, which their scatter shows (`noise_scale`); and the common error of the keyframes themselves, which no residual shows
-(`map_covariance`). The latter accumulates from keyframe to keyframe and is what odometry calls drift."""
+(`map_covariance`). The latter accumulates from keyframe to keyframe: at random, which odometry calls drift, and by an imperfect calibration, which
+is the same at all of them (`calibration_uncertainty.py`)."""
 
 from __future__ import annotations
 
@@ -10,10 +11,14 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from trihedron.pipeline.core.geometry import adjoint, invert
+from trihedron.pipeline.core.geometry import invert
+from trihedron.pipeline.core.lie import adjoint
+from trihedron.pipeline.core.linalg import eigvalsh, matmul
+from trihedron.pipeline.core.linalg_kernels import inverse_positive
 from trihedron.pipeline.core.types import F64, I32, Map, Pose
+from trihedron.plugins.pose.calibration_uncertainty import carried_calibration, with_calibration, with_velocity
 from trihedron.plugins.pose.map_alignment import MapAlignment, TrackingStatus
-from trihedron.plugins.shared.linalg_kernels import inverse_positive
+from trihedron.plugins.shared.calibration_error import calibration_covariance
 from trihedron.plugins.shared.pose_optimizer import LANDMARK_SCORE, PoseSolution, residual_scale
 
 SCALE_FRAMES = 10  # over which the scale of the residuals is averaged
@@ -30,8 +35,8 @@ class KeyframeUncertainty:
     def covariance(self, map: Map, T_world_camera: F64) -> F64:
         """Covariance (6, 6) of the keyframe as that of xi of a camera that moves with it."""
         T, covariance = (map.keyframes.rows(name, np.array([self.keyframe]))[0] for name in ("T_world_camera", "covariance"))
-        to_camera = adjoint(invert(T_world_camera) @ T)
-        return np.asarray(to_camera @ covariance @ to_camera.T)
+        to_camera = adjoint(matmul(invert(T_world_camera), T))
+        return np.asarray(matmul(to_camera, covariance, to_camera.T))
 
 
 def keyframe_uncertainty(map: Map, points: I32, lines: I32, planes: I32) -> KeyframeUncertainty:
@@ -58,7 +63,7 @@ def _sigmas_m(map: Map, keyframes: list[int]) -> dict[int, float]:
     sigmas_m: dict[int, float] = map.memo.setdefault("sigmas_m", {})
     if new := [keyframe for keyframe in keyframes if keyframe not in sigmas_m]:
         covariances = map.keyframes.rows("covariance", np.array(new))
-        sigmas_m.update(zip(new, np.sqrt(np.linalg.eigvalsh(covariances[:, :3, :3])[:, -1]).tolist()))
+        sigmas_m.update(zip(new, np.sqrt(eigvalsh(covariances[:, :3, :3])[:, -1]).tolist()))
     return sigmas_m
 
 
@@ -66,22 +71,30 @@ def widened_by_keyframes(status: TrackingStatus, solution: PoseSolution, problem
     """Add the covariance of the keyframes to that of a pose where they are uncertain by more than `factor` times its own standard deviation:
     landmarks made from this pose would average it away."""
     base = keyframe_uncertainty(problem.map, *problem.landmarks(solution))
-    if base.sigma_m <= factor * np.sqrt(np.linalg.eigvalsh(solution.covariance[:3, :3])[-1]):
+    if base.sigma_m <= factor * np.sqrt(eigvalsh(solution.covariance[:3, :3])[-1]):
         return status
     return replace(status, covariance=status.covariance + base.covariance(problem.map, solution.T_world_camera))
 
 
 def in_world(pose: Pose, previous: Pose, solution: PoseSolution, problem: MapAlignment) -> Pose:
     """Give a refined pose its covariance in the world, scaled by the noise that the residuals show."""
-    keyframes, information, scores = problem.equations_by_keyframe(solution)
+    keyframes, groups = problem.created_by()
+    information, scores = problem.equations_by_keyframe(solution, keyframes, groups)
     scale, noise_scale = residual_scale(information, scores), previous.noise_scale
     if scale is not None:
         noise_scale += (min(scale, SCALE_OUTLIER * noise_scale) - noise_scale) / SCALE_FRAMES
-    of_map = of_previous(pose, previous)
-    if len(keyframes):
+    by_drift = drift_of_previous(pose, previous)
+    if information.any():
         poses, covariances = (problem.map.keyframes.rows(name, keyframes) for name in ("T_world_camera", "world_covariance"))
-        of_map = covariance_of_keyframes(pose.T_world_camera, poses, covariances, information)
-    return replace(pose, covariance=noise_scale * pose.covariance + of_map, map_covariance=of_map, noise_scale=noise_scale)
+        by_drift = covariance_of_keyframes(pose.T_world_camera, poses, covariances, information)
+    moving = with_velocity(replace(pose, noise_scale=noise_scale), previous, problem.map)
+    return _composed(with_calibration(moving, previous, solution, problem, keyframes, groups), by_drift)
+
+
+def _composed(pose: Pose, by_drift: F64) -> Pose:
+    """Turn a pose whose `covariance` is the one relative to the landmarks near it into one whose `covariance` is that in the world."""
+    of_map = by_drift + calibration_covariance(pose)
+    return replace(pose, covariance=pose.noise_scale * pose.covariance + of_map, map_covariance=of_map)
 
 
 def covariance_of_keyframes(T_world_camera: F64, T_world_keyframe: F64, covariance: F64, information: F64) -> F64:
@@ -89,21 +102,20 @@ def covariance_of_keyframes(T_world_camera: F64, T_world_keyframe: F64, covarian
     information (k, 6, 6) of its landmarks, as that of xi of the camera.
 
     The errors of keyframes are a random walk, in which the covariance of two is the variance of the earlier."""
-    to_camera = adjoint(invert(T_world_camera) @ T_world_keyframe)
-    weights = np.trace(information @ inverse_positive(information.sum(axis=0) + np.eye(6)), axis1=1, axis2=2)
+    to_camera = adjoint(matmul(invert(T_world_camera), T_world_keyframe))
+    weights = np.trace(matmul(information, inverse_positive(information.sum(axis=0) + np.eye(6))), axis1=1, axis2=2)
     weights = weights / weights.sum()
     later = np.cumsum(weights[::-1])[::-1] - weights
-    common = (weights * (weights + 2.0 * later))[:, None, None] * to_camera @ covariance @ to_camera.transpose(0, 2, 1)
+    common = matmul((weights * (weights + 2.0 * later))[:, None, None] * to_camera, covariance, to_camera.transpose(0, 2, 1))
     return np.asarray(common.sum(axis=0), np.float64)
 
 
-def of_previous(pose: Pose, previous: Pose) -> F64:
-    """The `map_covariance` of the previous pose as that of a camera that moves with it."""
-    to_camera = adjoint(invert(pose.T_world_camera) @ previous.T_world_camera)
-    return np.asarray(to_camera @ previous.map_covariance @ to_camera.T)
+def drift_of_previous(pose: Pose, previous: Pose) -> F64:
+    """The part of the previous pose's `map_covariance` that is not by the calibration, as that of a camera that moves with it."""
+    to_camera = adjoint(matmul(invert(pose.T_world_camera), previous.T_world_camera))
+    return np.asarray(matmul(to_camera, previous.map_covariance - calibration_covariance(previous), to_camera.T))
 
 
 def carried(pose: Pose, previous: Pose) -> Pose:
     """Give a pose that was not refined, by its own covariance relative to the previous one, its covariance in the world."""
-    of_map = of_previous(pose, previous)
-    return replace(pose, covariance=previous.noise_scale * pose.covariance + of_map, map_covariance=of_map, noise_scale=previous.noise_scale)
+    return _composed(carried_calibration(replace(pose, noise_scale=previous.noise_scale), previous), drift_of_previous(pose, previous))

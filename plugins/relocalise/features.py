@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 
-from trihedron.pipeline.core.options import NonNegativeInt, PositiveFloat, PositiveInt, PositiveShare, Share
+from trihedron.pipeline.core.linalg import matmul
+from trihedron.pipeline.core.options import PositiveFloat, PositiveInt
 from trihedron.pipeline.core.registry import register
-from trihedron.pipeline.core.types import DEGRADED, F64, I32, LOST, OK, Frame, Keypoints, Map, Planes, Pose, Rotation, Segments
-from trihedron.plugins.mapping.covisibility_graph import keyframes_of, living_keyframes, observed_by
-from trihedron.plugins.mapping.reference_keyframe import reference_of, submap_of
-from trihedron.plugins.places.recognition import are_distinct, block_of, candidate_keyframes, distinct_poses, rigid_hypotheses
-from trihedron.plugins.places.verification import FrameFeatures, VerifiedPlace, verify_place
+from trihedron.pipeline.core.types import F64, I32, Frame, Keypoints, Map, Planes, Pose, Rotation, Segments
+from trihedron.plugins.mapping.covisibility_graph import observed_by
+from trihedron.plugins.places.recognition import distinct_poses, rigid_hypotheses
+from trihedron.plugins.places.verification import FrameFeatures
+from trihedron.plugins.relocalise.common import RelocaliseOptions, recognise
 from trihedron.plugins.relocalise.features_kernels import BIN_M, NEAR_M, explained_share
 from trihedron.plugins.shared.feature_matching import nearest_matches
 from trihedron.plugins.shared.manhattan_frames_kernels import CUBE
@@ -20,7 +22,7 @@ from trihedron.plugins.shared.manhattan_frames_kernels import CUBE
 
 @register("relocalise", "features")
 @dataclass(frozen=True)
-class Features:
+class Features(RelocaliseOptions):
     """Recognise a place by hypotheses and verification. Hypotheses are from points of similar appearance (three by three, Procrustes) and, where none
     holds, from the layout of planes and lines (all 24 orientations of each Manhattan frame in view). Each is verified by searching the map from there
     and solving the pose with points, lines and planes.
@@ -29,21 +31,9 @@ class Features:
     no other place explains the frame nearly as well: a symmetric room is refused. A large map is searched block by block, one a frame. Points need
     binary descriptors."""
 
-    block: PositiveInt = 80  # keyframes looked at in one frame
-    every: PositiveInt = 5  # frames between looks at older sub-maps, while the camera is tracked in one that is not connected to them
-    candidates: PositiveInt = 20  # of them, whose landmarks make hypotheses
-    max_bits: NonNegativeInt = 64  # of 256 between descriptors; the mean of strangers is 128
-    ratio: PositiveShare = 0.85  # best to second best descriptor
     draws: PositiveInt = 1000  # triples of points tried
     by_points: PositiveInt = 4  # hypotheses verified
     by_layout: PositiveInt = 8
-    near: PositiveInt = 8  # keyframes taken from about a hypothesis, whose landmarks verify it
-    min_score: PositiveInt = 30  # points + 2 lines + 5 planes that recognise a place
-    min_details: PositiveInt = 25  # points + 3 lines among them
-    min_share: Share = 0.5  # of the matches that must agree
-    min_found: Share = 0.08  # of the details expected in view (rooms built alike: at most 0.05; the same place: at least 0.12)
-    max_through: Share = 0.15  # of the surfaces in view that the camera may see through, as for a loop
-    rival: PositiveShare = 0.75  # of the best place's score, that makes another place as likely
     angle_px: PositiveFloat = 0.002  # rad, of a pixel
     floor_m: PositiveFloat = 0.01  # least error of a point's place
 
@@ -58,32 +48,9 @@ class Features:
         previous_pose: Pose | None,
         rng: np.random.Generator,
     ) -> Pose | None:
-        """Return the pose; for a lost camera that is not recognised the lost one, and else None."""
-        if map is None or previous_pose is None:
-            return None
-        view = FrameFeatures(frame, keypoints, segments, planes)
-        lost = previous_pose.status == LOST
-        submaps = self._submaps(map, submap_of(previous_pose, map), lost, frame.index)
-        if not len(submaps):
-            return None
-        submap = int(submaps[frame.index % len(submaps)])
-        keyframes = block_of(keyframes_of(map, submap), self.block, frame.index)
-        keyframes = candidate_keyframes(map, keypoints, segments, keyframes, self.candidates, self.max_bits)
-        found = self._verify(self._by_points(view, map, keyframes, rng), view, map, keyframes)
-        if not any(self._accept(place) for place in found):  # points are more distinctive than any layout
-            found += self._verify(self._by_layout(view, map, keyframes, rotation), view, map, keyframes)
-        best = self._unambiguous(found)
-        if best is None:
-            return replace(previous_pose, index=frame.index, stamp_ns=frame.stamp_ns, reason="nothing was recognised") if lost else None
-        T, status = best.T_world_camera, OK if lost else DEGRADED
-        reference, T_reference_camera = reference_of(map, T, submap)
-        reason = "recognised by {} points, {} lines and {} planes of the map".format(*best.inliers)
-        return Pose(frame.index, frame.stamp_ns, T, best.covariance, T_reference_camera, reference, best.inliers, 0, status, reason, submap)
-
-    def _submaps(self, map: Map, submap: int, lost: bool, index: int) -> I32:
-        """Sub-maps to search: all for a lost camera; now and then the older ones for one tracked in a sub-map that is not merged with the first."""
-        known = np.unique(map.keyframes.rows("submap", living_keyframes(map))).astype(np.int32)
-        return known if lost else known[known < submap] if index % self.every == 0 else known[:0]
+        """Return the pose; for a lost camera that is not recognised the lost one, and else None. Points are more distinctive than any layout."""
+        ways = partial(self._by_points, rng=rng), partial(self._by_layout, rotation=rotation)
+        return recognise(self, ways, FrameFeatures(frame, keypoints, segments, planes), map, previous_pose)
 
     def _by_points(self, view: FrameFeatures, map: Map, keyframes: I32, rng: np.random.Generator) -> F64:
         """Poses (n, 4, 4) by points similar to those of the map, best first."""
@@ -108,23 +75,6 @@ class Features:
                 poses, values = layout_poses(map, plane_ids, line_ids, view.planes, view.segments, R_world, R_camera)
                 found, scores = np.concatenate([found, poses]), np.concatenate([scores, values])
         return distinct_poses(found[np.argsort(-scores, kind="stable")], self.by_layout)
-
-    def _verify(self, poses: F64, view: FrameFeatures, map: Map, keyframes: I32) -> list[VerifiedPlace]:
-        found = [verify_place(T, view, map, keyframes, self.near) for T in poses]
-        return [place for place in found if place is not None]
-
-    def _accept(self, place: VerifiedPlace) -> bool:
-        enough = place.score >= self.min_score and place.details >= self.min_details
-        fair = place.inlier_share >= self.min_share and place.found_share >= self.min_found
-        return enough and fair and place.violation <= self.max_through
-
-    def _unambiguous(self, found: list[VerifiedPlace]) -> VerifiedPlace | None:
-        """The best place if it is accepted and no other is nearly as good."""
-        best = max(found, key=lambda place: place.score, default=None)
-        if best is None or not self._accept(best):
-            return None
-        rivals = (place for place in found if place.score > self.rival * best.score)
-        return None if any(are_distinct(place.T_world_camera, best.T_world_camera) for place in rivals) else best
 
 
 # Hypotheses by layout: poses at which the planes and lines of a frame lie on those of the map, for known Manhattan axes, without descriptors.
@@ -152,13 +102,13 @@ class Layout:
 
 def layout_of(coefficients: F64, areas: F64, endpoints_m: F64, lengths: F64, R: F64) -> Layout:
     """Select the planes (n, 4) and lines (m, 2, 3) along the columns of R (3, 3), which are in their frame."""
-    along = coefficients[:, :3] @ R
+    along = matmul(coefficients[:, :3], R)
     axis = np.abs(along).argmax(axis=1)
     dot = along[np.arange(len(axis)), axis]
     good = np.abs(dot) > ON_AXIS
     sides = (axis + 3 * (dot < 0.0))[good].astype(np.int32)
     places = -(np.sign(dot) * coefficients[:, 3])[good]  # n·x + d = 0 with n = ±axis
-    local = endpoints_m @ R
+    local = matmul(endpoints_m, R)
     step = local[:, 1] - local[:, 0]
     size = np.linalg.norm(step, axis=1)
     line_axis = np.abs(step).argmax(axis=1)
@@ -183,13 +133,13 @@ def layout_poses(map: Map, plane_ids: I32, line_ids: I32, planes: Planes, segmen
     lengths = np.linalg.norm(pixels[:, 1] - pixels[:, 0], axis=1).astype(np.float64)
     poses, scores = [], []
     for S in CUBE:
-        named = R_camera @ S
+        named = matmul(R_camera, S)
         seen = layout_of(planes.coefficients, planes.pixels.astype(np.float64), ends, lengths, named)
         t, score = _positions(seen, known)
-        R = R_world @ named.T
+        R = matmul(R_world, named.T)
         for place, value in zip(t, score):
             T = np.eye(4)
-            T[:3, :3], T[:3, 3] = R, R_world @ place
+            T[:3, :3], T[:3, 3] = R, matmul(R_world, place)
             poses.append(T)
             scores.append(value)
     order = np.argsort(-np.array(scores), kind="stable")

@@ -7,9 +7,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from trihedron.pipeline.core.geometry import exp_so3, log_so3
+from trihedron.pipeline.core.lie import exp_so3, log_so3
+from trihedron.pipeline.core.linalg import matmul
+from trihedron.pipeline.core.linalg_kernels import polar_rotation, solve_positive
 from trihedron.pipeline.core.types import F64, I32, LOST, Keypoints, ManhattanFrame, Planes, Pose, Rotation, Segments, Tracks
-from trihedron.plugins.shared.linalg_kernels import polar_rotation, solve_positive
 from trihedron.plugins.shared.manhattan_frames_kernels import nearest_equivalent
 from trihedron.plugins.shared.relative_motion import solve_motion
 
@@ -61,7 +62,7 @@ class TrackedRotation:
         if motion.support == 0.0 and before.covariance.trace() / 3.0 >= self.predict_frames * math.radians(self.prior_deg) ** 2:  # long ago
             return Estimate(before.R, before.covariance + added, "prediction")
         measured = solve_positive(IDENTITY * math.radians(self.measured_deg) ** 2 - added, np.zeros(3), np.empty(3))  # smaller along every axis
-        return Estimate(before.R @ motion.R.T, motion.R @ before.covariance @ motion.R.T + added, "tracks" if measured else "prediction")
+        return Estimate(matmul(before.R, motion.R.T), matmul(motion.R, before.covariance, motion.R.T) + added, "tracks" if measured else "prediction")
 
 
 def rotation_value(index: int, stamp_ns: int, estimate: Estimate, known: KnownFrames, seen: F64) -> Rotation:
@@ -113,10 +114,10 @@ class KnownFrames:
         Weights are limited to `cap`, so that the mean can follow a map that moves; observations off by more than `gate` (rad) are rejected."""
         rotations, weights = self.R_world_manhattan.copy(), self.weights.copy()
         for i in np.flatnonzero(np.isfinite(previous.R_camera_manhattan[:, 0, 0])):
-            step = log_so3(rotations[i].T @ R_world_camera @ previous.R_camera_manhattan[i])
+            step = log_so3(matmul(rotations[i].T, R_world_camera, previous.R_camera_manhattan[i]))
             if math.hypot(*step.tolist()) < gate:
                 weights[i] = min(weights[i] + 1.0, cap)
-                rotations[i] = polar_rotation(rotations[i] @ exp_so3(step / weights[i]))
+                rotations[i] = polar_rotation(matmul(rotations[i], exp_so3(step / weights[i])))
         return KnownFrames(rotations, self.ids, weights)
 
     def associations(self, manhattan: ManhattanFrame | None, R_world_camera: F64) -> list[tuple[int, list[Observation]]]:
@@ -129,8 +130,8 @@ class KnownFrames:
         for k in np.flatnonzero(manhattan.inliers.any(axis=1)):
             row = []
             for i, R_world_manhattan in enumerate(self.R_world_manhattan):
-                named = nearest_equivalent(np.array(manhattan.rotations[k]), np.array(R_world_camera.T @ R_world_manhattan))
-                row.append(Observation(i, named, manhattan.covariance[k], log_so3(R_world_camera.T @ R_world_manhattan @ named.T)))
+                named = nearest_equivalent(np.array(manhattan.rotations[k]), np.array(matmul(R_world_camera.T, R_world_manhattan)))
+                row.append(Observation(i, named, manhattan.covariance[k], log_so3(matmul(R_world_camera.T, R_world_manhattan, named.T))))
             found.append((int(k), row))
         return found
 

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from trihedron.pipeline.core.linalg import matmul
 from trihedron.pipeline.core.options import PositiveFloat
 from trihedron.pipeline.core.registry import register
 from trihedron.pipeline.core.types import Keypoints, Map, Pose, Rotation, Tracks
@@ -38,5 +39,7 @@ class ConstantVelocity:
             found = 0 if reaching is None else len(reaching.keypoints) + len(reaching.segments) + len(reaching.planes)
             error_deg = self.tracked_deg if found >= FEWEST else self.prior_deg * max(keypoints.index - previous.index, 1)
             grown = np.eye(3) * np.radians(error_deg) ** 2
-            estimate = Estimate(before.R @ R_current_previous.T, R_current_previous @ before.covariance @ R_current_previous.T + grown, "prediction")
+            estimate = Estimate(
+                matmul(before.R, R_current_previous.T), matmul(R_current_previous, before.covariance, R_current_previous.T) + grown, "prediction"
+            )
         return rotation_value(keypoints.index, keypoints.stamp_ns, estimate, KnownFrames.none(), np.zeros((0, 3, 3)))

@@ -8,13 +8,14 @@ from typing import Annotated
 
 import numpy as np
 
-from trihedron.pipeline.core.geometry import exp_so3, log_so3
+from trihedron.pipeline.core.lie import exp_so3, log_so3
+from trihedron.pipeline.core.linalg import matmul
+from trihedron.pipeline.core.linalg_kernels import inverse_positive, solve_positive
 from trihedron.pipeline.core.options import NonNegativeInt, PositiveFloat, PositiveInt, Range
 from trihedron.pipeline.core.registry import register
 from trihedron.pipeline.core.types import F64, Keypoints, ManhattanFrame, Map, Planes, Pose, Rotation, Segments, Tracks
 from trihedron.plugins.mapping.reference_keyframe import transform_rotation_to_map
 from trihedron.plugins.rotation.common import IDENTITY, Estimate, KnownFrames, Observation, TrackedRotation, rotation_before, rotation_value
-from trihedron.plugins.shared.linalg_kernels import inverse_positive, solve_positive
 
 
 @register("rotation", "drift_free")
@@ -81,7 +82,7 @@ class DriftFree:
                 observations[best] = row[best].R_camera_manhattan
             elif manhattan is not None and len(known.ids) < self.max_frames:
                 certain = math.radians(self.unit_deg) ** 2 / (np.trace(predicted.covariance + manhattan.covariance[k]) / 3.0 + 1e-12)
-                known = known.with_new(predicted.R @ manhattan.rotations[k], min(certain, 1.0))
+                known = known.with_new(matmul(predicted.R, manhattan.rotations[k]), min(certain, 1.0))
                 observations[len(known.ids) - 1] = manhattan.rotations[k]
         keep = [i for i in range(len(known.ids)) if i in observations or known.weights[i] >= self.min_observations]
         seen = np.array([observations.get(i, np.full((3, 3), np.nan)) for i in keep]).reshape(-1, 3, 3)
@@ -98,16 +99,16 @@ class DriftFree:
         """Mahalanobis distance between an observation and the prediction."""
         whitened = np.empty(3)
         solve_positive(noise + predicted.covariance + IDENTITY * math.radians(self.gate_floor_deg) ** 2, delta, whitened)
-        return math.sqrt(delta @ whitened)
+        return math.sqrt(matmul(delta, whitened))
 
     def _kalman_update(self, estimate: Estimate, predicted: Estimate, delta: F64, noise: F64) -> Estimate:
         """Kalman update of the estimate by an observation; both covariances are of rotations of the camera."""
-        gain = estimate.covariance @ inverse_positive(estimate.covariance + noise)
-        covariance = gain @ noise
-        step = gain @ log_so3(estimate.R.T @ predicted.R @ exp_so3(delta))
+        gain = matmul(estimate.covariance, inverse_positive(estimate.covariance + noise))
+        covariance = matmul(gain, noise)
+        step = matmul(gain, log_so3(matmul(estimate.R.T, predicted.R, exp_so3(delta))))
         length = math.hypot(*step.tolist())
         limit = math.radians(self.step_deg)
         if predicted.source == "tracks" and length > limit:  # the rest is left for the next frames, and added to the covariance
             rest = (1.0 - limit / length) * step
             covariance, step = covariance + rest[:, None] * rest, step - rest
-        return Estimate(estimate.R @ exp_so3(step), covariance, "manhattan")
+        return Estimate(matmul(estimate.R, exp_so3(step)), covariance, "manhattan")

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from trihedron.pipeline.core.linalg import matmul
 from trihedron.pipeline.core.options import PositiveFloat
 from trihedron.pipeline.core.registry import register
 from trihedron.pipeline.core.types import F64, Keypoints, ManhattanFrame, Rotation
@@ -37,12 +38,12 @@ class ManhattanRotation:
             return rotation_value(index, keypoints.stamp_ns, held, known, UNSEEN[: len(known.ids)].copy())
         R_camera_manhattan = np.array(manhattan.rotations[0])
         if not len(known.ids):
-            known = known.with_new(held.R @ R_camera_manhattan, 1.0)
+            known = known.with_new(matmul(held.R, R_camera_manhattan), 1.0)
             return rotation_value(index, keypoints.stamp_ns, held, known, R_camera_manhattan[None])
-        nearest = nearest_equivalent(R_camera_manhattan, np.array(held.R.T @ known.R_world_manhattan[0]))
+        nearest = nearest_equivalent(R_camera_manhattan, np.array(matmul(held.R.T, known.R_world_manhattan[0])))
         estimate = _absolute(known.R_world_manhattan[0], nearest, manhattan.covariance[0])
         return rotation_value(index, keypoints.stamp_ns, estimate, known, nearest[None])
 
 
 def _absolute(R_world_manhattan: F64, R_camera_manhattan: F64, covariance: F64) -> Estimate:
-    return Estimate(R_world_manhattan @ R_camera_manhattan.T, covariance, "manhattan")
+    return Estimate(matmul(R_world_manhattan, R_camera_manhattan.T), covariance, "manhattan")

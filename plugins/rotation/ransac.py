@@ -7,6 +7,7 @@ from typing import Annotated
 
 import numpy as np
 
+from trihedron.pipeline.core.linalg import matmul
 from trihedron.pipeline.core.options import PositiveFloat, PositiveInt, Range
 from trihedron.pipeline.core.registry import register
 from trihedron.pipeline.core.types import Keypoints, Map, Pose, Rotation, Tracks
@@ -42,5 +43,5 @@ class Ransac:
                 found = consensus(points, after, sigma, self.gate, self.rounds, rng)
                 if found.agree.sum() >= self.min_points:
                     added = fit_covariance(after[found.agree] - after[found.agree].mean(axis=0), sigma[found.agree])[3:, 3:]
-                    estimate = Estimate(before.R @ found.R.T, found.R @ before.covariance @ found.R.T + added, "tracks")
+                    estimate = Estimate(matmul(before.R, found.R.T), matmul(found.R, before.covariance, found.R.T) + added, "tracks")
         return rotation_value(keypoints.index, keypoints.stamp_ns, estimate, KnownFrames.none(), np.zeros((0, 3, 3)))

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from trihedron.pipeline.core.linalg import eigvalsh, inv, matmul
 from trihedron.pipeline.core.options import PositiveFloat
 from trihedron.pipeline.core.registry import register
 from trihedron.pipeline.core.types import F64, Keypoints, Map, Planes, Pose, Rotation, Segments, Tracks
@@ -48,10 +49,10 @@ class ScipyAlign:
         from scipy.spatial.transform import Rotation as Aligned
 
         information = np.einsum("n,nij->ij", sigma**-2.0, _squared_cross(now))
-        if np.linalg.eigvalsh(information)[0] <= np.radians(self.measured_deg) ** -2.0:
+        if eigvalsh(information)[0] <= np.radians(self.measured_deg) ** -2.0:
             return None
         R = Aligned.align_vectors(now, then, weights=sigma**-2.0)[0].as_matrix()
-        return Estimate(before.R @ R.T, R @ before.covariance @ R.T + np.linalg.inv(information), "tracks")
+        return Estimate(matmul(before.R, R.T), matmul(R, before.covariance, R.T) + inv(information), "tracks")
 
 
 def _squared_cross(vectors: F64) -> F64:
@@ -64,7 +65,7 @@ def tracked_vectors(tracks: Tracks, keypoints: Keypoints, segments: Segments, pl
     before, after, sigma = _usable(*tracked_point_pairs(tracks, keypoints))
     if len(before):
         weight = sigma**-2.0 / (sigma**-2.0).sum()
-        before, after = before - weight @ before, after - weight @ after
+        before, after = before - matmul(weight, before), after - matmul(weight, after)
     j = tracks.planes[:, 1]
     tilt = tracks.plane_covariance[:, :2, :2] + planes.covariance[j][:, :2, :2]
     normals = tracks.coefficients[:, :3], planes.coefficients[j, :3], np.sqrt(0.5 * np.trace(tilt, axis1=1, axis2=2) + floor_rad**2)
@@ -90,5 +91,5 @@ def _line_directions(tracks: Tracks, segments: Segments) -> tuple[F64, F64, F64]
     lengths = np.linalg.norm(then, axis=1), np.linalg.norm(now, axis=1)
     long = (lengths[0] > 1e-3) & (lengths[1] > 1e-3) & np.isfinite(spread)
     then, now = then[long] / lengths[0][long, None], now[long] / lengths[1][long, None]
-    sign = np.sign(((then @ tracks.R_current_previous.T) * now).sum(axis=1))
+    sign = np.sign((matmul(then, tracks.R_current_previous.T) * now).sum(axis=1))
     return then, now * np.where(sign < 0.0, -1.0, 1.0)[:, None], np.sqrt(2.0 * spread[long]) / lengths[1][long] + 1e-3

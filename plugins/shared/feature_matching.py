@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from trihedron.pipeline.core.linalg import matmul
 from trihedron.pipeline.core.types import F32, F64, I32, U8
 from trihedron.plugins.shared.feature_matching_kernels import (
     HAMMING,
@@ -104,7 +105,7 @@ def mutual_matches(before: U8, now: U8, metric: str, ratio: float) -> I32:
 def _euclidean_distances(a: U8, b: U8) -> F32:
     """Euclidean distances (n, m)."""
     x, y = a.astype(np.float32), b.astype(np.float32)
-    return np.asarray(np.sqrt(np.maximum((x * x).sum(axis=1)[:, None] + (y * y).sum(axis=1) - 2.0 * x @ y.T, 0.0)))
+    return np.asarray(np.sqrt(np.maximum((x * x).sum(axis=1)[:, None] + (y * y).sum(axis=1) - matmul(2.0 * x, y.T), 0.0)))
 
 
 # Planes.

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from trihedron.pipeline.core.linalg import matmul
 from trihedron.pipeline.core.types import F32, F64, U8, Frame
 from trihedron.plugins.shared.image_reduction_kernels import halved, reduced
 
@@ -51,4 +52,4 @@ def halvings(finest: Level, levels: int) -> list[Level]:
 
 def brightness(color: U8) -> F32:
     """Convert RGB (h, w, 3) to luminance (h, w), 0 … 255."""
-    return np.asarray(color @ np.array(LUMINANCE, np.float32), np.float32)
+    return np.asarray(matmul(color, np.array(LUMINANCE, np.float32)), np.float32)

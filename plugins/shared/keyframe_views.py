@@ -9,6 +9,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from trihedron.pipeline.core.linalg import matmul
 from trihedron.pipeline.core.types import F32, F64, I32, U8, Camera, Frame, Map, Planes, Pose
 from trihedron.plugins.shared.image_reduction_kernels import reduced
 from trihedron.plugins.shared.keyframe_views_kernels import add_readings, count_novel
@@ -45,7 +46,7 @@ class KeyframeView:
         if map.keyframes.rows("submap", np.array([row]))[0] != 0:
             return None
         T = np.asarray(map.keyframes.rows("T_world_camera", np.array([row]))[0], np.float64)
-        return T if self.keyframe >= 0 else T @ self.T_reference_camera
+        return T if self.keyframe >= 0 else matmul(T, self.T_reference_camera)
 
 
 def view_of(frame: Frame, planes: Planes, pose: Pose, map: Map | None, width: int, max_sigma_m: float) -> KeyframeView:
@@ -99,5 +100,5 @@ def readings(frame: Frame, T_world_camera: F64, step: int, max_sigma_m: float) -
     sigma = frame.camera.depth_noise.sigma_m(depth)
     r, c = np.nonzero((depth > 0.0) & (sigma <= max_sigma_m))
     pixels = np.stack([c, r], axis=1) * step + step // 2
-    points = frame.camera.back_project(pixels, depth[r, c]) @ T_world_camera[:3, :3].T + T_world_camera[:3, 3]
+    points = matmul(frame.camera.back_project(pixels, depth[r, c]), T_world_camera[:3, :3].T) + T_world_camera[:3, 3]
     return points, 1.0 / sigma[r, c] ** 2

@@ -7,8 +7,9 @@ from typing import Any
 import numpy as np
 
 from trihedron.pipeline.core.geometry import tangent_basis
+from trihedron.pipeline.core.linalg import inv, matmul
+from trihedron.pipeline.core.linalg_kernels import invert_each
 from trihedron.pipeline.core.types import F32, F64, Camera
-from trihedron.plugins.shared.linalg_kernels import invert_each
 
 
 def constant(array: Any, dtype: type[np.generic]) -> Any:
@@ -33,7 +34,7 @@ def point_covariance(points_m: F64, sigma_px: F64, sigma_m: F64, camera: Camera)
 def inverse(matrices: F32 | F64) -> F64:
     """Invert symmetric matrices (..., k, k): covariance to information or the other way round. Raises LinAlgError if one is singular."""
     if matrices.shape[-1] != 3:
-        return np.asarray(np.linalg.inv(matrices.astype(np.float64)), np.float64)
+        return np.asarray(inv(matrices.astype(np.float64)), np.float64)
     out = np.array(matrices, np.float64, order="C")
     if not invert_each(out.reshape(-1, 3, 3)):
         raise np.linalg.LinAlgError("Singular matrix")
@@ -55,14 +56,14 @@ def pose_jacobians(points: F64) -> F64:
 def propagate_pose_covariance(points: F64, pose_covariance: F64) -> F64:
     """Return the covariance (..., 3, 3) of camera-frame points (..., 3) due to that of the pose, (6, 6) of xi = (rho, phi)."""
     J = pose_jacobians(points)
-    return J @ pose_covariance @ np.swapaxes(J, -1, -2)
+    return matmul(J, pose_covariance, np.swapaxes(J, -1, -2))
 
 
 def transform_plane_covariance(T_a_b: F64, planes_b: F64, planes_a: F64, covariance_b: F64) -> F64:
     """Return the covariance (n, 3, 3) of (a, b, d) in frame a, for planes (n, 4) of frame b and the same in frame a (`geometry.transform_planes`)."""
-    rotated = T_a_b[:3, :3] @ tangent_basis(planes_b[:, :3])  # (n, 3, 2), basis of the normals in frame a
+    rotated = matmul(T_a_b[:3, :3], tangent_basis(planes_b[:, :3]))  # (n, 3, 2), basis of the normals in frame a
     F = np.zeros((len(planes_b), 3, 3))
-    F[:, :2, :2] = np.swapaxes(tangent_basis(planes_a[:, :3]), -1, -2) @ rotated
-    F[:, 2, :2] = -T_a_b[:3, 3] @ rotated
+    F[:, :2, :2] = matmul(np.swapaxes(tangent_basis(planes_a[:, :3]), -1, -2), rotated)
+    F[:, 2, :2] = matmul(-T_a_b[:3, 3], rotated)
     F[:, 2, 2] = 1.0
-    return F @ covariance_b @ np.swapaxes(F, -1, -2)
+    return matmul(F, covariance_b, np.swapaxes(F, -1, -2))

@@ -9,8 +9,8 @@ from typing import NamedTuple
 import numpy as np
 
 from trihedron.pipeline.core.kernel import kernel
+from trihedron.pipeline.core.linalg_kernels import inverse_positive, polar_rotation, tangent_columns
 from trihedron.pipeline.core.types import F32, F64, I32, Bool
-from trihedron.plugins.shared.linalg_kernels import inverse_positive, polar_rotation, tangent_columns
 
 
 def _cube_rotations() -> F64:
@@ -20,7 +20,7 @@ def _cube_rotations() -> F64:
         for signs in product((1.0, -1.0), repeat=3):
             matrix = np.zeros((3, 3))
             matrix[order, range(3)] = signs
-            if np.linalg.det(matrix) > 0.0:
+            if (np.cross(matrix[0], matrix[1]) == matrix[2]).all():
                 found.append(matrix)
     rotations = np.array(found)
     rotations.flags.writeable = False

@@ -38,7 +38,7 @@ class NetworkOptions:
     sha256: str = ""  # that the file must have; a recording states that of its run
 
     @cached_property
-    def _network(self) -> Network:
+    def network(self) -> Network:
         """The opened network. Raises ConfigError."""
         return Network.opened(self.slot, self.model, self.sha256)
 

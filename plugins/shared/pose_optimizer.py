@@ -10,8 +10,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from trihedron.pipeline.core.linalg import cholesky, eigh, inv, matmul
+from trihedron.pipeline.core.linalg_kernels import inverse_positive
 from trihedron.pipeline.core.types import F64, U8, Camera
-from trihedron.plugins.shared.linalg_kernels import inverse_positive
 from trihedron.plugins.shared.pose_optimizer_kernels import (
     INLIER,
     ROUNDS,
@@ -111,11 +112,11 @@ def residual_scale(information: F64, scores: F64) -> float | None:
     `H_k - H_k H⁻¹ H_k`. The cluster-robust ("sandwich") estimate of the pose's covariance (Liang and Zeger, Biometrika 1986) exceeds `H⁻¹` by this
     factor, averaged over directions."""
     inverse = inverse_positive(information.sum(axis=0))
-    share = information @ inverse
+    share = matmul(information, inverse)
     freedom = 6.0 - float(np.einsum("kij,kji->", share, share))
     if not inverse.any() or freedom < LEAST_FREEDOM:
         return None
-    scores = scores - share @ scores.sum(axis=0)
+    scores = scores - matmul(share, scores.sum(axis=0))
     return float(np.einsum("ki,ij,kj->", scores, inverse, scores)) / freedom
 
 
@@ -126,7 +127,7 @@ def _all_inliers(terms: Terms) -> Flags:
 
 def _unobservable(H_data: F64, H_prior: F64) -> F64:
     """Unit directions (k, u) in which the data have less information than the prior: generalised eigenvalues of (H_data, H_prior) below 1."""
-    half = np.linalg.inv(np.linalg.cholesky(H_prior))
-    values, vectors = np.linalg.eigh(half @ H_data @ half.T)
-    directions = half.T @ vectors[:, values < 1.0]
+    half = inv(cholesky(H_prior))
+    values, vectors = eigh(matmul(half, H_data, half.T))
+    directions = matmul(half.T, vectors[:, values < 1.0])
     return np.asarray(directions / np.linalg.norm(directions, axis=0))

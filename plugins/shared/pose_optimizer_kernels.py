@@ -16,9 +16,9 @@ from typing import NamedTuple
 import numpy as np
 
 from trihedron.pipeline.core.kernel import kernel
+from trihedron.pipeline.core.linalg_kernels import add_triangle, add_triple, inverse_positive, solve_positive, tangent_columns
 from trihedron.pipeline.core.types import F64, I32, U8
 from trihedron.plugins.shared.lie_kernels import exp_so3, log_so3
-from trihedron.plugins.shared.linalg_kernels import add_triangle, add_triple, inverse_positive, solve_positive, tangent_columns
 
 # The parameters of the problem: world landmarks and their observations.
 

@@ -12,9 +12,9 @@ from typing import NamedTuple
 import numpy as np
 
 from trihedron.pipeline.core.kernel import kernel
+from trihedron.pipeline.core.linalg_kernels import add_triangle, add_triple, inverse_positive, solve_positive, tangent_columns
 from trihedron.pipeline.core.types import F32, F64, I32
 from trihedron.plugins.shared.lie_kernels import left_multiply_exp
-from trihedron.plugins.shared.linalg_kernels import add_triangle, add_triple, inverse_positive, solve_positive, tangent_columns
 
 SHORTEST_M = 1e-3  # line
 MOST = 400  # points used, about; more only cost time

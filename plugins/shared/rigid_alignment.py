@@ -7,6 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from trihedron.pipeline.core.geometry import nearest_rotation
+from trihedron.pipeline.core.linalg import inv, matmul
 from trihedron.pipeline.core.types import F32, F64, I32, Bool, Keypoints, Tracks
 from trihedron.plugins.shared.linalg import pose_jacobians
 from trihedron.plugins.shared.rigid_alignment_kernels import best_motion
@@ -63,9 +64,9 @@ def consensus(before: F64, after: F64, sigma: F64, gate: float, rounds: int, rng
 def fitted(before: F64, after: F64, sigma: F64) -> tuple[F64, F64]:
     """Fit R (3, 3) and t (3,) by least squares, each pair weighted by 1/sigma² (Umeyama, PAMI 1991)."""
     w = 1.0 / sigma**2
-    a, b = w @ before / w.sum(), w @ after / w.sum()
-    R = nearest_rotation((after - b).T @ ((before - a) * w[:, None]))
-    return R, b - R @ a
+    a, b = matmul(w, before) / w.sum(), matmul(w, after) / w.sum()
+    R = nearest_rotation(matmul((after - b).T, (before - a) * w[:, None]))
+    return R, b - matmul(R, a)
 
 
 def fit_covariance(points: F64, sigma: F64) -> F64:
@@ -73,8 +74,8 @@ def fit_covariance(points: F64, sigma: F64) -> F64:
     w = 1.0 / sigma**2
     J = pose_jacobians(points)
     H = np.einsum("n,nij,nik->jk", w, J, J)
-    return np.linalg.inv(H + 1e-6 * np.eye(6))
+    return inv(H + 1e-6 * np.eye(6))
 
 
 def _distances(before: F64, after: F64, R: F64, t: F64) -> F64:
-    return np.asarray(np.linalg.norm(before @ R.T + t - after, axis=1))
+    return np.asarray(np.linalg.norm(matmul(before, R.T) + t - after, axis=1))

@@ -6,8 +6,8 @@ from __future__ import annotations
 import numpy as np
 
 from trihedron.pipeline.core.kernel import kernel
+from trihedron.pipeline.core.linalg_kernels import polar_rotation
 from trihedron.pipeline.core.types import F64, I32
-from trihedron.plugins.shared.linalg_kernels import polar_rotation
 
 LEAST_M = 0.05  # between the three points of a sample
 

@@ -1,4 +1,4 @@
-"""Shared parts of all surfaces: the fold that gathers views, and the one that also fuses them as they come."""
+"""Functions of all surfaces: views are retained, fused as they come, and coloured meshes made of them."""
 
 from __future__ import annotations
 
@@ -10,15 +10,14 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from trihedron.pipeline.core.options import NonNegativeFloat, PositiveFloat, PositiveShare, Range
+from trihedron.pipeline.core.linalg import matmul
+from trihedron.pipeline.core.options import PositiveFloat, PositiveShare, Range
 from trihedron.pipeline.core.types import F32, F64, I32, LOST, PLANE_KINDS, U8, Bool, DepthNoise, Frame, Map, Planes, Pose, Rotation, Surface
 from trihedron.plugins.shared.keyframe_views import KeyframeView, Known, readings, view_of
-from trihedron.plugins.shared.tsdf_volume import CELLS, Volume
-from trihedron.plugins.surface.common_kernels import neighbours, off_planes, paint, signs_kernel, triangles_kernel, untangled, vertices_kernel
-from trihedron.plugins.surface.common_meshes import compacted, plane_axes, triangle_areas, vertex_normals, with_single_fans, without_crumbs
+from trihedron.plugins.surface.common_kernels import off_planes, paint
+from trihedron.plugins.surface.common_meshes import compacted, plane_axes, triangle_areas, vertex_normals
 
 NOVELTY_COLUMNS = 80  # of readings that are tested for novelty
-AHEAD_M = 2.0  # a pose has moved by as much as the camera and a point this far before it have
 CELL_M = 0.1  # of what is remembered to be known
 
 
@@ -28,8 +27,6 @@ class Gathered:
 
     views: list[KeyframeView] = field(default_factory=list)
     known: dict[int, Known] = field(default_factory=dict)
-    fused: list[F64 | None] = field(default_factory=list)  # the pose each view has in the volume
-    volume: Volume | None = None
     surfels: list[F64] = field(default_factory=list)  # each view's own
     axes: F64 | None = None  # R_world_manhattan
     index: int = 0
@@ -44,97 +41,39 @@ class Gathered:
         if self.axes is None or not views:
             return np.full(3, np.nan)
         upright = -np.mean([T[:3, 1] for _, T in views], axis=0)
-        along = self.axes.T @ upright
+        along = matmul(self.axes.T, upright)
         best = int(np.argmax(np.abs(along)))
         return np.asarray(self.axes[:, best] * np.sign(along[best]), np.float64)
 
 
 @dataclass(frozen=True)
-class ViewFold:
-    """Keeps the views that tell something new, at their final poses in the end."""
+class ViewOptions:
+    """Options by which a surface retains views."""
 
     view_width: Annotated[int, Range(16, 4096)] = 320  # px, about, to which images are reduced
     max_sigma_m: PositiveFloat = 0.05  # depth less certain than this is not used: a Kinect's beyond 4.2 m; a frame's planes say how certain it is
     views: Annotated[float, Range(1)] = 6.0  # of its quality, after which a view has nothing new to tell of a place
     news: PositiveShare = 0.15  # share of new readings for which a view is kept
 
-    def start(self) -> Gathered:
-        """Nothing seen."""
-        return Gathered()
 
-    def add(self, state: Gathered, frame: Frame, planes: Planes, rotation: Rotation | None, pose: Pose, map: Map | None) -> Gathered:
-        """Keep the frame if it was tracked and shows something new."""
-        state.index, state.stamp_ns = frame.index, frame.stamp_ns
-        if rotation is not None and len(rotation.weights):
-            state.axes = rotation.R_world_manhattan[int(np.argmax(rotation.weights))]
-        if pose.status == LOST:
-            return state
-        frame = with_measured_noise(frame, planes)
-        points, weight = readings(frame, pose.T_world_camera, max(1, frame.camera.width // NOVELTY_COLUMNS), self.max_sigma_m)
-        known = state.known.setdefault(pose.submap, Known(CELL_M))
-        if len(points) and known.novelty(points, weight, self.views) >= self.news:
-            known.learn(points, weight)
-            view = view_of(frame, planes, pose, map, self.view_width, self.max_sigma_m)
-            state.views.append(view)
-            self._kept(state, view)
-        return state
-
-    def _kept(self, state: Gathered, view: KeyframeView) -> None:
-        """Process a view that was kept."""
-
-
-@dataclass(frozen=True)
-class VolumeFold(ViewFold):
-    """Fuses the views it keeps as they come, and all of them again in the end if the map has moved one since."""
-
-    voxel_m: PositiveFloat = 0.02
-    truncation_m: PositiveFloat = 0.06
-    max_error_m: PositiveFloat = 0.025  # standard deviation of a voxel's distance above which it is not known
-    rebuild_m: PositiveFloat = 0.01  # motion of a view for which the volume is built again
-    crumb_m2: NonNegativeFloat = 0.005  # a loose piece of the mesh that is smaller is left out
-
-    def __post_init__(self) -> None:
-        if self.truncation_m < 2.0 * self.voxel_m:
-            raise ValueError(f"truncation_m: {self.truncation_m} is less than two voxels of {self.voxel_m} m")
-
-    def _kept(self, state: Gathered, view: KeyframeView) -> None:
-        """Fuse it, unless it stands in another world as yet."""
-        if state.volume is None:
-            state.volume = Volume(self.voxel_m, self.truncation_m)
-        if view.submap == 0:
-            state.volume.integrate(*view.fused, view.T_world_camera)
-        state.fused.append(view.T_world_camera if view.submap == 0 else None)
-
-    def preview(self, state: Gathered) -> Surface:
-        """The mesh of the views as they were fused, coloured by them, without planes: for viewers."""
-        if state.volume is None:
-            return Surface.empty(state.index, state.stamp_ns)
-        vertices, triangles = zero_level(state.volume, 1.0 / self.max_error_m**2)
-        return coloured(state, None, *with_single_fans(vertices, without_crumbs(vertices, triangles, self.crumb_m2)))
-
-    def _volume(self, state: Gathered, map: Map | None) -> Volume:
-        """The volume of all views at their final poses."""
-        finals = [view.settled(map) for view in state.views]
-        if state.volume is not None and all(_moved_m(fused_at, final) <= self.rebuild_m for fused_at, final in zip(state.fused, finals)):
-            return state.volume
-        volume = Volume(self.voxel_m, self.truncation_m)
-        for view, T in zip(state.views, finals):
-            if T is not None:
-                volume.integrate(*view.fused, T)
-        return volume
-
-    def _mesh(self, state: Gathered, map: Map | None) -> tuple[F64, I32]:
-        """Vertices (v, 3) and triangles (t, 3) of the zero level at the final poses, without small fragments."""
-        vertices, triangles = zero_level(self._volume(state, map), 1.0 / self.max_error_m**2)
-        return with_single_fans(vertices, without_crumbs(vertices, triangles, self.crumb_m2))
-
-
-def _moved_m(fused_at: F64 | None, final: F64 | None) -> float:
-    """Distance that a view has moved; infinite when it was fused and should not be, or the other way round."""
-    if fused_at is None or final is None:
-        return 0.0 if fused_at is final else float("inf")
-    ahead = np.array([[0.0, 0.0, 0.0, 1.0], [0.0, 0.0, AHEAD_M, 1.0]])
-    return float(np.linalg.norm((ahead @ (final - fused_at).T)[:, :3], axis=1).max())
+def add_view(
+    options: ViewOptions, state: Gathered, frame: Frame, planes: Planes, rotation: Rotation | None, pose: Pose, map: Map | None
+) -> KeyframeView | None:  # fmt: skip
+    """Retain the frame in the state and return its view, if it was tracked and shows something new; else return None."""
+    state.index, state.stamp_ns = frame.index, frame.stamp_ns
+    if rotation is not None and len(rotation.weights):
+        state.axes = rotation.R_world_manhattan[int(np.argmax(rotation.weights))]
+    if pose.status == LOST:
+        return None
+    frame = with_measured_noise(frame, planes)
+    points, weight = readings(frame, pose.T_world_camera, max(1, frame.camera.width // NOVELTY_COLUMNS), options.max_sigma_m)
+    known = state.known.setdefault(pose.submap, Known(CELL_M))
+    if not len(points) or known.novelty(points, weight, options.views) < options.news:
+        return None
+    known.learn(points, weight)
+    view = view_of(frame, planes, pose, map, options.view_width, options.max_sigma_m)
+    state.views.append(view)
+    return view
 
 
 # How noisy a depth image is, by its own planes: a data set does not always say what made it.
@@ -198,7 +137,7 @@ def pictured(
         instances=rows.astype(np.int32),
         plane_ids=ids[used],
         coefficients=planes,
-        kinds=_kinds(planes, areas, points[plain.triangles] @ plain.up, rows, plain.up),
+        kinds=_kinds(planes, areas, matmul(points[plain.triangles], plain.up), rows, plain.up),
         areas_m2=areas,
         plane_colors=atlas.colors,
         loops=np.array([(plane, a, b) for (plane, _), a, b in zip(rings, ends[:-1], ends[1:])], np.int32).reshape(-1, 3),
@@ -206,6 +145,20 @@ def pictured(
         atlas=atlas.image,
         texels=atlas.texels,
     )
+
+
+def map_planes(map: Map | None) -> tuple[I32, F64]:
+    """Ids (n,) and coefficients (n, 4) of the living planes."""
+    if map is None:
+        return np.empty(0, np.int32), np.empty((0, 4))
+    ids = np.flatnonzero(map.planes.column("alive")).astype(np.int32)
+    return ids, map.planes.rows("coefficients", ids)
+
+
+def numbered(ids: I32, count: int, map: Map | None) -> I32:
+    """Ids for `count` planes: the map's, then numbers that it has not given for those that are not in it."""
+    first = len(map.planes) if map is not None else 0
+    return np.concatenate([ids, np.arange(first, first + count - len(ids))]).astype(np.int32)
 
 
 def _heights(corners: F64, rows: I32, count: int) -> F64:
@@ -222,7 +175,7 @@ def _kinds(planes: F64, areas: F32, corners: F64, rows: NDArray[np.signedinteger
     kinds = np.full(len(planes), PLANE_KINDS.index("plane"), np.uint8)
     if not np.isfinite(up).all():
         return kinds
-    leaning, heights = planes[:, :3] @ up, _heights(corners, rows, len(planes))
+    leaning, heights = matmul(planes[:, :3], up), _heights(corners, rows, len(planes))
     level, upright = np.cos(np.radians(LEVEL_DEG)), np.sin(np.radians(LEVEL_DEG))
     kinds[np.abs(leaning) > level] = PLANE_KINDS.index("horizontal")
     kinds[np.abs(leaning) < upright] = PLANE_KINDS.index("vertical")
@@ -293,7 +246,7 @@ def atlas_of(
     corners, sizes = [], []
     for p, basis in enumerate(axes):
         mine = labels == p
-        flat = vertices[triangles[mine]] @ basis / texel_m
+        flat = matmul(vertices[triangles[mine]], basis) / texel_m
         low = np.floor(flat.reshape(-1, 2).min(axis=0)) - MARGIN if mine.any() else np.zeros(2)
         texels[mine] = flat - low
         corners.append(low)
@@ -306,7 +259,7 @@ def atlas_of(
             continue
         covered = _covered(texels[labels == p], w, h)
         grid = np.stack(np.nonzero(covered)[::-1], axis=1) + corners[p]
-        points = grid * texel_m @ basis.T - plane[3] * plane[:3]
+        points = matmul(grid * texel_m, basis.T) - plane[3] * plane[:3]
         found, seen = painted(points, np.broadcast_to(plane[:3], points.shape), views)
         picture, known = np.full((h, w, 3), UNSEEN, np.uint8), np.zeros((h, w), np.bool_)
         picture[covered], known[covered] = found, seen
@@ -346,23 +299,3 @@ def _packed(sizes: I32) -> tuple[I32, tuple[int, int]]:
         places[k] = x, y
         x, row = x + int(sizes[k, 0]), max(row, int(sizes[k, 1]))
     return places, (width, y + row)
-
-
-PASSES = 20  # at most, over all voxels, to untangle signs
-NEAR = 2.0  # voxels from the surface, within which signs can tangle
-
-
-def zero_level(volume: Volume, least_weight: float) -> tuple[F64, I32]:
-    """Vertices (v, 3) in metres and triangles (t, 3), anticlockwise seen from outside, through voxels of at least that weight (1/m²)."""
-    n = volume.count
-    places, distance, weight = volume.places[:n], volume.distance[:n], volume.weight[:n]
-    around = neighbours(volume.keys, volume.numbers, places)
-    signs = np.zeros((n, CELLS), np.int8)
-    signs_kernel(distance, weight, least_weight, signs)
-    distance = distance.copy()
-    for _ in range(PASSES):
-        if not untangled(distance, signs, around, NEAR * volume.voxel_m):
-            break
-    cells = np.full((n, CELLS), -1, np.int32)
-    vertices = vertices_kernel(places, distance, signs, around, cells, volume.voxel_m)
-    return vertices, triangles_kernel(signs, around, cells, vertices)

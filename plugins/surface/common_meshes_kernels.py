@@ -6,6 +6,7 @@ from __future__ import annotations
 import numpy as np
 
 from trihedron.pipeline.core.kernel import kernel
+from trihedron.pipeline.core.linalg_kernels import dot
 from trihedron.pipeline.core.types import F64, I32, Bool
 from trihedron.plugins.shared.voxel_hash_kernels import I64
 
@@ -175,8 +176,8 @@ def _simplify_ring(vertices: F64, chain: I32, keep: Bool, tolerance: float) -> N
     half, farthest = 0, 0.0
     for k in range(len(chain)):
         d = vertices[chain[k]] - vertices[chain[0]]
-        if np.dot(d, d) > farthest:
-            farthest, half = np.dot(d, d), k
+        if dot(d, d) > farthest:
+            farthest, half = dot(d, d), k
     keep[chain[0]] = keep[chain[half]] = True
     _simplify(vertices, chain[: half + 1], keep, tolerance)
     _simplify(vertices, chain[half:], keep, tolerance)
@@ -185,10 +186,10 @@ def _simplify_ring(vertices: F64, chain: I32, keep: Bool, tolerance: float) -> N
 @kernel
 def _off_segment(p: F64, a: F64, b: F64) -> float:
     d = b - a
-    squared = np.dot(d, d)
-    share = min(max(np.dot(p - a, d) / squared, 0.0), 1.0) if squared > 0.0 else 0.0
+    squared = dot(d, d)
+    share = min(max(dot(p - a, d) / squared, 0.0), 1.0) if squared > 0.0 else 0.0
     off = p - a - share * d
-    return np.sqrt(np.dot(off, off))
+    return np.sqrt(dot(off, off))
 
 
 @kernel

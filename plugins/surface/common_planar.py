@@ -8,9 +8,11 @@ from typing import Annotated
 
 import numpy as np
 
+from trihedron.pipeline.core.linalg import matmul
 from trihedron.pipeline.core.options import AcuteDeg, NonNegativeFloat, NonNegativeInt, PositiveFloat, Range, check_increasing
 from trihedron.pipeline.core.types import F64, I32, Map, Surface
-from trihedron.plugins.surface.common import Gathered, VolumeFold, pictured
+from trihedron.plugins.surface.common import map_planes, numbered, pictured
+from trihedron.plugins.surface.common_iso_surface import Fused, VolumeOptions, final_mesh
 from trihedron.plugins.surface.common_meshes import (
     REST,
     border_half_edges,
@@ -42,8 +44,8 @@ from trihedron.plugins.surface.common_planar_kernels import (
 
 
 @dataclass(frozen=True)
-class PlanarFold(VolumeFold):
-    """Fuses all views, finds the planes of the map and others in the mesh, and makes polygons of them."""
+class PlanarOptions(VolumeOptions):
+    """Options of planes as polygons: those of the volume, and what is flat in its mesh."""
 
     distance_m: PositiveFloat = 0.012  # of a vertex from its plane
     angle_deg: AcuteDeg = 25.0  # between the mesh's normal there and the plane's
@@ -60,56 +62,27 @@ class PlanarFold(VolumeFold):
         super().__post_init__()
         check_increasing(self, "distance_m", "rim_m")
 
-    @property
-    def _flatness(self) -> Flatness:
-        return Flatness(self.distance_m, self.angle_deg, self.rim_m, self.rim, self.area_m2, self.bend_per_m)
 
-    def _surface(self, state: Gathered, map: Map | None, rest: bool) -> Surface:
-        """The planes as polygons; with `rest` the triangles that lie in none stay, joined to them."""
-        vertices, triangles = self._mesh(state, map)
+def planar_surface(options: PlanarOptions, state: Fused, map: Map | None, rest: bool) -> Surface:
+    """The planes of the map and others in the mesh of all views, as polygons; with `rest` the triangles that lie in none stay, joined to them."""
+    vertices, triangles = final_mesh(options, state, map)
+    opposite = opposite_half_edges(triangles)
+    ids, known = map_planes(map)
+    labels, planes = planar_labels(vertices, vertex_normals(vertices, triangles), triangles, opposite, known, options)
+    if not rest:
+        vertices, triangles = with_single_fans(vertices, triangles[labels >= 0])
+        labels = labels[labels >= 0]
         opposite = opposite_half_edges(triangles)
-        ids, known = map_planes(map)
-        labels, planes = planar_labels(vertices, vertex_normals(vertices, triangles), triangles, opposite, known, self._flatness)
-        if not rest:
-            vertices, triangles = with_single_fans(vertices, triangles[labels >= 0])
-            labels = labels[labels >= 0]
-            opposite = opposite_half_edges(triangles)
-        flat = flattened(vertices, triangles, opposite, labels, planes, self.snap_m, self.outline_m, self.hole_m2)
-        shown = flat.labels >= (REST if rest else 0)
-        triangles, labels = without_pinholes(flat.vertices, flat.triangles[shown], flat.labels[shown])
-        return pictured(state, map, flat.vertices, triangles, labels, planes, numbered(ids, len(planes), map), flat.loops, self.texel_m)
+    flat = flattened(vertices, triangles, opposite, labels, planes, options.snap_m, options.outline_m, options.hole_m2)
+    shown = flat.labels >= (REST if rest else 0)
+    triangles, labels = without_pinholes(flat.vertices, flat.triangles[shown], flat.labels[shown])
+    return pictured(state, map, flat.vertices, triangles, labels, planes, numbered(ids, len(planes), map), flat.loops, options.texel_m)
 
 
 # Which triangles of a dense mesh lie in planes: those of the map first, then planes that only the mesh shows.
 
 
-@dataclass(frozen=True)
-class Flatness:
-    """Criteria of a flat region."""
-
-    distance_m: float  # of a vertex from its plane
-    angle_deg: float  # between the mesh's normal there and the plane's
-    rim_m: float  # of a vertex from its plane in the rounded rim about it
-    rim: int  # triangles wide
-    area_m2: float  # of the smallest planar part
-    bend_per_m: float  # curvature above which a part is not flat
-
-
-def map_planes(map: Map | None) -> tuple[I32, F64]:
-    """Ids (n,) and coefficients (n, 4) of the living planes."""
-    if map is None:
-        return np.empty(0, np.int32), np.empty((0, 4))
-    ids = np.flatnonzero(map.planes.column("alive")).astype(np.int32)
-    return ids, map.planes.rows("coefficients", ids)
-
-
-def numbered(ids: I32, count: int, map: Map | None) -> I32:
-    """Ids for `count` planes: the map's, then numbers that it has not given for those that are not in it."""
-    first = len(map.planes) if map is not None else 0
-    return np.concatenate([ids, np.arange(first, first + count - len(ids))]).astype(np.int32)
-
-
-def planar_labels(vertices: F64, normals: F64, triangles: I32, opposite: I32, planes: F64, flat: Flatness) -> tuple[I32, F64]:
+def planar_labels(vertices: F64, normals: F64, triangles: I32, opposite: I32, planes: F64, flat: PlanarOptions) -> tuple[I32, F64]:
     """(t,) row of the plane each triangle lies in, -1 for none, and the planes (p, 4): the given (n, 4), then those found in the mesh, fitted to
     it."""
     cosine = float(np.cos(np.radians(flat.angle_deg)))
@@ -144,8 +117,8 @@ def _joined(labels: I32, middle: F64, area: F64, opposite: I32, planes: F64, dis
         rows = np.flatnonzero(out == small)
         beside = beside[(total[beside] >= total[small]) & (beside != small)]
         for large in beside[np.argsort(-total[beside], kind="stable")]:
-            off = middle[rows] @ planes[large, :3] + planes[large, 3]
-            if planes[large, :3] @ planes[small, :3] > 0.9 and np.average(off**2, weights=area[rows]) <= distance**2:
+            off = matmul(middle[rows], planes[large, :3]) + planes[large, 3]
+            if matmul(planes[large, :3], planes[small, :3]) > 0.9 and np.average(off**2, weights=area[rows]) <= distance**2:
                 out[rows], stands_for[stands_for == small] = large, large
                 total[large] += total[small]
                 break
@@ -164,7 +137,7 @@ def _fitted(labels: I32, middle: F64, area: F64, planes: F64) -> F64:
     return out
 
 
-def _large(labels: I32, middle: F64, opposite: I32, area: F64, planes: F64, flat: Flatness) -> I32:
+def _large(labels: I32, middle: F64, opposite: I32, area: F64, planes: F64, flat: PlanarOptions) -> I32:
     """The labels without the connected parts that are too small, or bent."""
     parts, count = connected(opposite, labels)
     total = np.bincount(parts, area, count)
@@ -172,7 +145,7 @@ def _large(labels: I32, middle: F64, opposite: I32, area: F64, planes: F64, flat
     return np.where((total[parts] >= flat.area_m2) & (bend[parts] <= flat.bend_per_m), labels, -1).astype(np.int32)
 
 
-def _filled(labels: I32, vertices: F64, triangles: I32, opposite: I32, planes: F64, flat: Flatness) -> I32:
+def _filled(labels: I32, vertices: F64, triangles: I32, opposite: I32, planes: F64, flat: PlanarOptions) -> I32:
     """Small holes in a planar part, all about it and near its plane, belong to it."""
     parts, count = connected(opposite, labels)
     around = enclosing(parts, count, labels, opposite)
@@ -243,7 +216,7 @@ def _recut(points: F64, triangles: I32, labels: I32, parts: I32, planes: F64, ho
     holes: dict[int, list[I32]] = {}
     for a, b in pairwise(starts):
         ring = triangles.ravel()[order[a:b]]
-        closed = (opposite[order[a:b]] < 0).all() and 0.0 < -_area(points[ring] @ plane_axes(planes[labels[order[a] // 3]])) < hole_m2
+        closed = (opposite[order[a:b]] < 0).all() and 0.0 < -_area(matmul(points[ring], plane_axes(planes[labels[order[a] // 3]]))) < hole_m2
         (holes if closed else rings).setdefault(int(parts[order[a] // 3]), []).append(ring)
     first = {part: int(row) for part, row in zip(*np.unique(parts, return_index=True)) if part != REST}
     cuts = {part: found for part, row in first.items() if (found := _cut(points, rings[part], planes[labels[row]])) is not None}
@@ -268,7 +241,7 @@ def _cut(points: F64, rings: list[I32], plane: F64) -> I32 | None:
     """Triangles (t, 3) of the polygon with these loops, a constrained Delaunay triangulation; None when they cross or touch."""
     import shapely
 
-    flat = [points[ring] @ plane_axes(plane) for ring in rings]
+    flat = [matmul(points[ring], plane_axes(plane)) for ring in rings]
     turned = np.array([_area(ring) for ring in flat])
     outer = int(np.argmax(turned))
     if turned[outer] <= 0.0 or (turned > 0.0).sum() > 1 or min(map(len, rings)) < 3:

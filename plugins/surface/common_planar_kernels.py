@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from trihedron.pipeline.core.kernel import kernel
+from trihedron.pipeline.core.linalg_kernels import dot, eigh, solve
 from trihedron.pipeline.core.types import F64, I32
 
 
@@ -41,7 +42,7 @@ def steadiness(turned: F64, opposite: I32) -> F64:
     for t in range(len(turned)):
         for k in range(3):
             other = opposite[3 * t + k] // 3 if opposite[3 * t + k] >= 0 else -1
-            same = np.dot(turned[t], turned[other]) if other >= 0 else 0.0
+            same = dot(turned[t], turned[other]) if other >= 0 else 0.0
             out[t] = max(0.0, min(out[t], same))
     return out
 
@@ -62,7 +63,7 @@ def grown_kernel(
         seed = seeds[turn]
         if labels[seed] >= 0 or tried[seed]:
             continue
-        n, d = turned[seed].copy(), -np.dot(turned[seed], middle[seed])
+        n, d = turned[seed].copy(), -dot(turned[seed], middle[seed])
         queue[0], size, at, fitted, total = seed, 1, 0, 16, area[seed]
         seen[seed] = seed
         while at < size:
@@ -72,7 +73,7 @@ def grown_kernel(
                 other = opposite[3 * t + k] // 3 if opposite[3 * t + k] >= 0 else -1
                 if other < 0 or labels[other] >= 0 or seen[other] == seed:
                     continue
-                if np.dot(turned[other], n) < cosine or abs(np.dot(middle[other], n) + d) > distance:
+                if dot(turned[other], n) < cosine or abs(dot(middle[other], n) + d) > distance:
                     continue
                 seen[other] = seed
                 queue[size] = other
@@ -87,7 +88,7 @@ def grown_kernel(
             n, d = plane_through(middle, area, queue[:size], n)
             found[count, :3], found[count, 3] = n, d
             for i in range(size):
-                if abs(np.dot(middle[queue[i]], n) + d) <= distance:
+                if abs(dot(middle[queue[i]], n) + d) <= distance:
                     labels[queue[i]] = first + count
             count += 1
     return labels, found[:count].copy()
@@ -107,10 +108,10 @@ def plane_through(middle: F64, area: F64, rows: I32, like: F64) -> tuple[F64, fl
         for i in range(3):
             for j in range(3):
                 scatter[i, j] += area[t] * p[i] * p[j]
-    n = np.ascontiguousarray(np.linalg.eigh(scatter)[1][:, 0])
-    if np.dot(n, like) < 0.0:
+    n = np.ascontiguousarray(eigh(scatter)[1][:, 0])
+    if dot(n, like) < 0.0:
         n = -n
-    return n, -np.dot(n, centre)
+    return n, -dot(n, centre)
 
 
 @kernel
@@ -124,7 +125,7 @@ def with_rim(labels: I32, vertices: F64, triangles: I32, turned: F64, opposite: 
         for k in range(3):
             other = opposite[3 * t + k]
             p = labels[other // 3] if other >= 0 else -1
-            if p < 0 or np.dot(turned[t], planes[p, :3]) <= 0.2:
+            if p < 0 or dot(turned[t], planes[p, :3]) <= 0.2:
                 continue
             off = _farthest(vertices, triangles[t], planes[p])
             if off < best:
@@ -146,7 +147,7 @@ def without_steps(labels: I32, triangles: I32, count: int, planes: F64, area: F6
     for t in range(len(labels)):
         for k in range(3):
             p = largest[triangles[t, k]]
-            if labels[t] >= 0 and p != labels[t] and abs(np.dot(planes[p, :3], planes[labels[t], :3])) > 0.9:
+            if labels[t] >= 0 and p != labels[t] and abs(dot(planes[p, :3], planes[labels[t], :3])) > 0.9:
                 out[t] = -1
     return out
 
@@ -201,7 +202,7 @@ def bends_kernel(parts: I32, count: int, labels: I32, middle: F64, area: F64, fr
                 normal[c, :i, i] = normal[c, i, :i]
             for i in range(3, 6):
                 normal[c, i, i] += 1e-9 * total[c]  # a strip does not determine its curvature across
-            q = np.linalg.solve(normal[c] + 1e-12 * np.eye(6), right[c])
+            q = solve(normal[c] + 1e-12 * np.eye(6), right[c])
             bend[c] = abs(0.5 * (q[3] + q[5])) + np.sqrt(0.25 * (q[3] - q[5]) ** 2 + q[4] ** 2)
     return bend
 
@@ -318,9 +319,9 @@ def _step(p: F64, planes: F64, rows: I32) -> tuple[F64, float]:
             r[i] += planes[k, i] * height
             for j in range(3):
                 A[i, j] += planes[k, i] * planes[k, j]
-    values, vectors = np.linalg.eigh(A)
+    values, vectors = eigh(A)
     step = np.zeros(3)
     for i in range(3):
         if values[i] > LEAST * values[2]:
-            step -= vectors[:, i] * (np.dot(vectors[:, i], r) / values[i])
-    return step, np.sqrt(np.dot(step, step))
+            step -= vectors[:, i] * (dot(vectors[:, i], r) / values[i])
+    return step, np.sqrt(dot(step, step))

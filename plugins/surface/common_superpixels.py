@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from trihedron.pipeline.core.geometry import transform_planes
+from trihedron.pipeline.core.linalg import matmul
 from trihedron.pipeline.core.types import F64, I32
 from trihedron.plugins.shared.keyframe_views import KeyframeView
 from trihedron.plugins.shared.voxel_hash_kernels import empty_table
@@ -38,8 +39,8 @@ def observed_planes(views: Sequence[tuple[KeyframeView, F64]], planes: F64, angl
             mine = points[labels == i]
             if len(mine) == 0:
                 continue
-            off = np.abs(mine @ known[:, :3].T + known[:, 3]).mean(axis=0)
-            off[known[:, :3] @ plane[:3] < cosine] = np.inf
+            off = np.abs(matmul(mine, known[:, :3].T) + known[:, 3]).mean(axis=0)
+            off[matmul(known[:, :3], plane[:3]) < cosine] = np.inf
             if len(off) and off.min() < distance_m:
                 rows[i] = int(np.argmin(off))
             elif len(mine) >= SMALLEST:
@@ -54,7 +55,7 @@ def labelled_points(view: KeyframeView, T_world_camera: F64, step: int) -> tuple
     depth, labels = view.depth_m[::step, ::step].astype(np.float64), view.labels[::step, ::step]
     r, c = np.nonzero((labels > 0) & (depth > 0.0))
     points = view.camera.back_project(np.stack([c, r], axis=1) * step, depth[r, c])
-    return points @ T_world_camera[:3, :3].T + T_world_camera[:3, 3], labels[r, c].astype(np.int32) - 1
+    return matmul(points, T_world_camera[:3, :3].T) + T_world_camera[:3, 3], labels[r, c].astype(np.int32) - 1
 
 
 def gathered_points(views: Sequence[tuple[KeyframeView, F64]], found: ViewPlanes, axes: Sequence[F64], spacing_m: float, step: int) -> list[F64]:
@@ -63,7 +64,7 @@ def gathered_points(views: Sequence[tuple[KeyframeView, F64]], found: ViewPlanes
     for (view, T), rows in zip(views, found.regions):
         points, labels = labelled_points(view, T, step)
         for p in np.unique(rows[rows >= 0]):
-            gathered[p].append(points[np.isin(labels, np.flatnonzero(rows == p))] @ axes[p])
+            gathered[p].append(matmul(points[np.isin(labels, np.flatnonzero(rows == p))], axes[p]))
     return [_meaned(np.concatenate([np.empty((0, 2)), *parts]), spacing_m) for parts in gathered]
 
 
@@ -101,8 +102,8 @@ def superpixels(view: KeyframeView, side_px: int, coarse_px: int) -> F64:
 def moved(surfels: F64, T_a_b: F64) -> F64:
     """Surfels (n, 13) of frame b in frame a."""
     out = surfels.copy()
-    out[:, :3] = surfels[:, :3] @ T_a_b[:3, :3].T + T_a_b[:3, 3]
-    out[:, 3:6] = surfels[:, 3:6] @ T_a_b[:3, :3].T
+    out[:, :3] = matmul(surfels[:, :3], T_a_b[:3, :3].T) + T_a_b[:3, 3]
+    out[:, 3:6] = matmul(surfels[:, 3:6], T_a_b[:3, :3].T)
     return out
 
 

@@ -6,6 +6,7 @@ from __future__ import annotations
 import numpy as np
 
 from trihedron.pipeline.core.kernel import kernel
+from trihedron.pipeline.core.linalg_kernels import dot, eigh
 from trihedron.pipeline.core.types import F32, F64, I32, U8
 from trihedron.plugins.shared.voxel_hash_kernels import I64, key_of, slot_of
 
@@ -106,9 +107,9 @@ def surfels_kernel(depth: F32, color: U8, labels: U8, assigned: I32, intrinsics:
     for k in range(count):
         if total[k, 0] < 0.25 * side * side:
             continue
-        values, vectors = np.linalg.eigh(scatter[k] / total[k, 0])  # reads the lower triangle
+        values, vectors = eigh(scatter[k] / total[k, 0])  # reads the lower triangle
         mean, normal = total[k, 1:4] / total[k, 0], vectors[:, 0].copy()
-        if np.dot(normal, mean) > 0.0:
+        if dot(normal, mean) > 0.0:
             normal = -normal
         out[found, :3], out[found, 3:6], out[found, 6:9] = mean, normal, total[k, 4:7] / total[k, 0]
         out[found, 9] = 2.0 * np.sqrt(max(values[1], 0.25 * values[2]))  # of a disc with this scatter across, if not much longer than wide
@@ -136,7 +137,7 @@ def fuse(surfels: F64, out: F64, keys: I64, heads: I32, after: I32, count: int, 
                 if m < before and s[3] * o[3] + s[4] * o[4] + s[5] * o[5] > cosine:
                     d = s[:3] - o[:3]
                     height = d[0] * o[3] + d[1] * o[4] + d[2] * o[5]
-                    along = np.sqrt(max(np.dot(d, d) - height * height, 0.0))
+                    along = np.sqrt(max(dot(d, d) - height * height, 0.0))
                     limit = 3.0 / np.sqrt(s[10]) + 0.01
                     far = max(along / (0.7 * min(s[9], o[9])), abs(height) / limit)
                     if far < best:

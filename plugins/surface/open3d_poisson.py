@@ -9,18 +9,18 @@ import numpy as np
 
 from trihedron.pipeline.core.options import NonNegativeFloat, PositiveFloat, Range
 from trihedron.pipeline.core.registry import register
-from trihedron.pipeline.core.types import F64, I32, Map, Surface
+from trihedron.pipeline.core.types import F64, I32, Frame, Map, Planes, Pose, Rotation, Surface
 from trihedron.plugins.shared.keyframe_views import KeyframeView
 from trihedron.plugins.shared.libraries import open3d
 from trihedron.plugins.shared.open3d_clouds import cloud_with_normals
-from trihedron.plugins.surface.common import Gathered, ViewFold, coloured
+from trihedron.plugins.surface.common import Gathered, ViewOptions, add_view, coloured
 
 LEAST = 100  # points of a cloud
 
 
 @register("surface", "open3d_poisson")
 @dataclass(frozen=True)
-class Open3dPoisson(ViewFold):
+class Open3dPoisson(ViewOptions):
     """`open3d.geometry.TriangleMesh.create_from_point_cloud_poisson` (screened Poisson: Kazhdan and Hoppe, ToG 2013) of the readings of the retained
     views, thinned to `voxel_m`, with Open3D's normals; vertices far from every reading are removed, for Poisson closes every hole. No planes.
 
@@ -31,6 +31,15 @@ class Open3dPoisson(ViewFold):
     scale: PositiveFloat = 1.1  # of the reconstruction cube
     max_distance_m: PositiveFloat = 0.04  # to the nearest reading, beyond which vertices are removed
     point_weight: NonNegativeFloat = 2.0  # of the screening
+
+    def start(self) -> Gathered:
+        """Return an empty state."""
+        return Gathered()
+
+    def add(self, state: Gathered, frame: Frame, planes: Planes, rotation: Rotation | None, pose: Pose, map: Map | None) -> Gathered:
+        """Retain the frame if it was tracked and shows something new."""
+        add_view(self, state, frame, planes, rotation, pose, map)
+        return state
 
     def finish(self, state: Gathered, map: Map | None) -> Surface:
         """The reconstructed surface, coloured by the views."""

@@ -10,15 +10,15 @@ import numpy as np
 from trihedron.pipeline.core.geometry import invert
 from trihedron.pipeline.core.options import PositiveFloat, PositiveInt
 from trihedron.pipeline.core.registry import register
-from trihedron.pipeline.core.types import F64, I32, Map, Surface
+from trihedron.pipeline.core.types import F64, I32, Frame, Map, Planes, Pose, Rotation, Surface
 from trihedron.plugins.shared.keyframe_views import KeyframeView
 from trihedron.plugins.shared.libraries import open3d
-from trihedron.plugins.surface.common import Gathered, ViewFold, coloured
+from trihedron.plugins.surface.common import Gathered, ViewOptions, add_view, coloured
 
 
 @register("surface", "open3d_voxels")
 @dataclass(frozen=True)
-class Open3dVoxels(ViewFold):
+class Open3dVoxels(ViewOptions):
     """`open3d.t.geometry.VoxelBlockGrid` (Dong, Lao, Kaess, Koltun, PAMI 2022) of the retained views at their final poses, without colour in the
     volume; every reading counts alike. No planes.
 
@@ -28,6 +28,15 @@ class Open3dVoxels(ViewFold):
     truncation_voxels: PositiveFloat = 4.0  # trunc_voxel_multiplier
     blocks: PositiveInt = 10000  # of 16³ voxels, reserved
     least_weight: PositiveFloat = 1.0  # readings of a voxel, of which fewer are none
+
+    def start(self) -> Gathered:
+        """Return an empty state."""
+        return Gathered()
+
+    def add(self, state: Gathered, frame: Frame, planes: Planes, rotation: Rotation | None, pose: Pose, map: Map | None) -> Gathered:
+        """Retain the frame if it was tracked and shows something new."""
+        add_view(self, state, frame, planes, rotation, pose, map)
+        return state
 
     def finish(self, state: Gathered, map: Map | None) -> Surface:
         """The zero level of the distances, coloured by the views."""

@@ -7,19 +7,19 @@ from typing import Annotated
 
 import numpy as np
 
+from trihedron.pipeline.core.linalg import matmul
 from trihedron.pipeline.core.options import AcuteDeg, PositiveFloat, PositiveInt, Range
 from trihedron.pipeline.core.registry import register
-from trihedron.pipeline.core.types import F64, I32, Map, Surface
-from trihedron.plugins.surface.common import Gathered, ViewFold, pictured
+from trihedron.pipeline.core.types import F64, I32, Frame, Map, Planes, Pose, Rotation, Surface
+from trihedron.plugins.surface.common import Gathered, ViewOptions, add_view, map_planes, numbered, pictured
 from trihedron.plugins.surface.common_meshes import plane_axes
-from trihedron.plugins.surface.common_planar import map_planes, numbered
 from trihedron.plugins.surface.common_superpixels import gathered_points, observed_planes
 from trihedron.plugins.surface.planar_greedy_kernels import MOST, accepted
 
 
 @register("surface", "planar_greedy")
 @dataclass(frozen=True)
-class PlanarGreedy(ViewFold):
+class PlanarGreedy(ViewOptions):
     """Points of each plane of the map, found by a kd-tree and joined by greedy triangulation (paper, section V-B); in the plane's own axes."""
 
     angle_deg: AcuteDeg = 10.0  # between a region and the plane it belongs to (paper)
@@ -30,6 +30,15 @@ class PlanarGreedy(ViewFold):
     pixel_step: PositiveInt = 4  # px between the readings that are gathered
     texel_m: Annotated[float, Range(0.001)] = 0.015  # of the picture of the planes
 
+    def start(self) -> Gathered:
+        """Return an empty state."""
+        return Gathered()
+
+    def add(self, state: Gathered, frame: Frame, planes: Planes, rotation: Rotation | None, pose: Pose, map: Map | None) -> Gathered:
+        """Retain the frame if it was tracked and shows something new."""
+        add_view(self, state, frame, planes, rotation, pose, map)
+        return state
+
     def finish(self, state: Gathered, map: Map | None) -> Surface:
         """One mesh for each plane that was seen."""
         views = state.settled(map)
@@ -39,7 +48,7 @@ class PlanarGreedy(ViewFold):
         points = gathered_points(views, found, axes, self.spacing_m, self.pixel_step)
         meshes = [greedy_triangles(flat, self.radius_m, self.multiplier) for flat in points]
         first = np.cumsum([0, *(len(flat) for flat in points)])
-        vertices = [flat @ basis.T - plane[3] * plane[:3] for flat, basis, plane in zip(points, axes, found.planes)]
+        vertices = [matmul(flat, basis.T) - plane[3] * plane[:3] for flat, basis, plane in zip(points, axes, found.planes)]
         triangles = [mesh + np.int32(start) for mesh, start in zip(meshes, first)]
         labels = [np.full(len(mesh), p, np.int32) for p, mesh in enumerate(meshes)]
         return pictured(

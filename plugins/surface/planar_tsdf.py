@@ -5,16 +5,29 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from trihedron.pipeline.core.registry import register
-from trihedron.pipeline.core.types import Map, Surface
-from trihedron.plugins.surface.common import Gathered
-from trihedron.plugins.surface.common_planar import PlanarFold
+from trihedron.pipeline.core.types import Frame, Map, Planes, Pose, Rotation, Surface
+from trihedron.plugins.surface.common import add_view
+from trihedron.plugins.surface.common_iso_surface import Fused, fuse_view, volume_preview
+from trihedron.plugins.surface.common_planar import PlanarOptions, planar_surface
 
 
 @register("surface", "planar_tsdf")
 @dataclass(frozen=True)
-class PlanarTsdf(PlanarFold):
+class PlanarTsdf(PlanarOptions):
     """Planes as polygons, and everything else as a distance field shows it, joined to them vertex by vertex."""
 
-    def finish(self, state: Gathered, map: Map | None) -> Surface:
+    def start(self) -> Fused:
+        """Return an empty state."""
+        return Fused()
+
+    def add(self, state: Fused, frame: Frame, planes: Planes, rotation: Rotation | None, pose: Pose, map: Map | None) -> Fused:
+        """Retain the frame if it was tracked and shows something new, and fuse it."""
+        return fuse_view(self, state, add_view(self, state, frame, planes, rotation, pose, map))
+
+    def preview(self, state: Fused) -> Surface:
+        """Return the mesh so far, without planes: for viewers."""
+        return volume_preview(self, state)
+
+    def finish(self, state: Fused, map: Map | None) -> Surface:
         """The mesh at the final poses, coloured and pictured by the views."""
-        return self._surface(state, map, rest=True)
+        return planar_surface(self, state, map, rest=True)

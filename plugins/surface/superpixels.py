@@ -9,15 +9,14 @@ import numpy as np
 
 from trihedron.pipeline.core.options import AcuteDeg, PositiveInt, Range
 from trihedron.pipeline.core.registry import register
-from trihedron.pipeline.core.types import Map, Surface
-from trihedron.plugins.shared.keyframe_views import KeyframeView
-from trihedron.plugins.surface.common import Gathered, ViewFold, coloured
+from trihedron.pipeline.core.types import Frame, Map, Planes, Pose, Rotation, Surface
+from trihedron.plugins.surface.common import Gathered, ViewOptions, add_view, coloured
 from trihedron.plugins.surface.common_superpixels import discs, fused, moved, superpixels
 
 
 @register("surface", "superpixels")
 @dataclass(frozen=True)
-class Superpixels(ViewFold):
+class Superpixels(ViewOptions):
     """Superpixels of the views fused to discs that hang on the keyframes (Wang, Gao, Shen, ICRA 2019; the paper's "SPFu"). No plane takes part, which
     is the difference from `surfels`."""
 
@@ -25,9 +24,16 @@ class Superpixels(ViewFold):
     angle_deg: AcuteDeg = 30.0  # between the normals of superpixels of one surfel
     least: PositiveInt = 3  # views that must agree on a surfel
 
-    def _kept(self, state: Gathered, view: KeyframeView) -> None:
-        """Cut it, as if it had no planes."""
-        state.surfels.append(superpixels(replace(view, labels=np.zeros_like(view.labels)), self.side_px, self.side_px))
+    def start(self) -> Gathered:
+        """Return an empty state."""
+        return Gathered()
+
+    def add(self, state: Gathered, frame: Frame, planes: Planes, rotation: Rotation | None, pose: Pose, map: Map | None) -> Gathered:
+        """Retain the frame if it was tracked and shows something new, and cut it, as if it had no planes."""
+        view = add_view(self, state, frame, planes, rotation, pose, map)
+        if view is not None:
+            state.surfels.append(superpixels(replace(view, labels=np.zeros_like(view.labels)), self.side_px, self.side_px))
+        return state
 
     def finish(self, state: Gathered, map: Map | None) -> Surface:
         """The surfels of all views at their final poses, as discs of six corners."""

@@ -9,16 +9,14 @@ import numpy as np
 
 from trihedron.pipeline.core.options import AcuteDeg, PositiveFloat, PositiveInt, Range, check_increasing
 from trihedron.pipeline.core.registry import register
-from trihedron.pipeline.core.types import Map, Surface
-from trihedron.plugins.shared.keyframe_views import KeyframeView
-from trihedron.plugins.surface.common import Gathered, ViewFold, pictured
-from trihedron.plugins.surface.common_planar import map_planes, numbered
+from trihedron.pipeline.core.types import Frame, Map, Planes, Pose, Rotation, Surface
+from trihedron.plugins.surface.common import Gathered, ViewOptions, add_view, map_planes, numbered, pictured
 from trihedron.plugins.surface.common_superpixels import discs, fused, moved, observed_planes, superpixels
 
 
 @register("surface", "surfels")
 @dataclass(frozen=True)
-class Surfels(ViewFold):
+class Surfels(ViewOptions):
     """Superpixels of the views fused to discs (Wang, Gao, Shen, ICRA 2019), but coarse where the view is planar: a wall needs few."""
 
     side_px: Annotated[int, Range(2)] = 6  # of a superpixel, in the reduced view
@@ -32,9 +30,16 @@ class Surfels(ViewFold):
     def __post_init__(self) -> None:
         check_increasing(self, "side_px", "coarse_px")
 
-    def _kept(self, state: Gathered, view: KeyframeView) -> None:
-        """Cut it."""
-        state.surfels.append(superpixels(view, self.side_px, self.coarse_px))
+    def start(self) -> Gathered:
+        """Return an empty state."""
+        return Gathered()
+
+    def add(self, state: Gathered, frame: Frame, planes: Planes, rotation: Rotation | None, pose: Pose, map: Map | None) -> Gathered:
+        """Retain the frame if it was tracked and shows something new, and cut it."""
+        view = add_view(self, state, frame, planes, rotation, pose, map)
+        if view is not None:
+            state.surfels.append(superpixels(view, self.side_px, self.coarse_px))
+        return state
 
     def finish(self, state: Gathered, map: Map | None) -> Surface:
         """The surfels of all views at their final poses, as discs of six corners."""

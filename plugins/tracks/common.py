@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from trihedron.pipeline.core.geometry import pose_matrix, transform_planes
+from trihedron.pipeline.core.linalg import matmul
 from trihedron.pipeline.core.types import F32, F64, I32, Camera, Keypoints, Planes, Segments, Tracks
 from trihedron.plugins.shared.feature_matching import associate_planes, match_lines
 from trihedron.plugins.shared.linalg import constant
@@ -44,7 +45,7 @@ class StructureGates:
             predicted, described, found.endpoints_px, found.descriptors, self.line_deg, self.line_px, self.line_overlap, self.line_bits, self.ratio
         )
         known = transform_planes(pose_matrix(R, t), before.planes.coefficients)
-        samples = (before.planes.samples_m @ R.T + t).astype(np.float32)
+        samples = (matmul(before.planes.samples_m, R.T) + t).astype(np.float32)
         planes = associate_planes(now.planes.coefficients, now.planes.samples_m, known, samples, self.plane_deg, self.plane_m, many_to_one=True)
         return matched_pairs(lines), np.ascontiguousarray(planes[:, ::-1])
 

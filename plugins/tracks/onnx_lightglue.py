@@ -57,7 +57,7 @@ class OnnxLightGlue(NetworkOptions):
 
     def _matched(self, before: Keypoints, now: Keypoints, camera: Camera) -> I32:
         """Pairs (n, 2) of rows, each row once, those with the best scores."""
-        network = self._network
+        network = self.network
         if not len(before.pixels) or not len(now.pixels) or before.metric != "l2" or now.metric != "l2":
             return NO_PAIRS
         width = network.inputs["desc0"][0][-1] if "desc0" in network.inputs else None

@@ -8,7 +8,7 @@ from typing import Annotated
 import cv2
 import numpy as np
 
-from trihedron.pipeline.core.geometry import exp_so3, log_so3
+from trihedron.pipeline.core.lie import exp_so3, log_so3
 from trihedron.pipeline.core.options import NonNegativeInt, PositiveFloat, PositiveInt, Range
 from trihedron.pipeline.core.registry import register
 from trihedron.pipeline.core.types import F32, I32, Bool, Frame, Keypoints, Planes, Segments, Tracks

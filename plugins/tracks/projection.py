@@ -8,7 +8,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from trihedron.pipeline.core.geometry import exp_so3, log_so3, rotation_angle_deg
+from trihedron.pipeline.core.lie import exp_so3, log_so3, rotation_angle_deg
+from trihedron.pipeline.core.linalg import eigvalsh, matmul
 from trihedron.pipeline.core.options import AcuteDeg, NonNegativeInt, PositiveFloat, PositiveInt, PositiveShare, Share, check_increasing
 from trihedron.pipeline.core.registry import register
 from trihedron.pipeline.core.types import F64, U8, Camera, Keypoints, ManhattanFrame, Planes, Segments, Tracks
@@ -119,7 +120,7 @@ class Projection:
             found.append(exp_so3(share * log_so3(previous.R_current_previous)))
         if manhattan is not None and previous_manhattan is not None and previous_manhattan.index == previous_index:
             relative = _manhattan_rotation(manhattan, previous_manhattan)
-            if relative is not None and all(rotation_angle_deg(relative @ R.T) > self.prior_deg for R in found):
+            if relative is not None and all(rotation_angle_deg(matmul(relative, R.T)) > self.prior_deg for R in found):
                 found.append(relative)
         return found or [np.eye(3)]
 
@@ -149,7 +150,7 @@ def _manhattan_rotation(now: ManhattanFrame, before: ManhattanFrame) -> F64 | No
         return None
     seen = {int(before.ids[k]): k for k in np.flatnonzero(before.inliers.any(axis=1))}
     both = [k for k in np.flatnonzero(now.inliers.any(axis=1)) if int(now.ids[k]) in seen]
-    return now.rotations[both[0]] @ before.rotations[seen[int(now.ids[both[0]])]].T if both else None
+    return matmul(now.rotations[both[0]], before.rotations[seen[int(now.ids[both[0]])]].T) if both else None
 
 
 def _count(tracks: Tracks) -> int:
@@ -199,7 +200,7 @@ class Search:
     def consistent(self, tracks: Tracks, motion: Motion, error_px: float) -> Tracks:
         """Reject the key points and lines farther than `error_px` σ from their prediction by the motion, and key points without depth in both."""
         R, t = constant(motion.R, np.float64), constant(motion.t, np.float64)
-        unsure_px = float(self.camera.fx * np.sqrt(np.linalg.eigvalsh(motion.covariance[3:, 3:])[-1]))
+        unsure_px = float(self.camera.fx * np.sqrt(eigvalsh(motion.covariance[3:, 3:])[-1]))
         points, lines = consistent_pairs(tracks.keypoints, tracks.segments, self._before, self._now, self._camera, R, t, unsure_px, error_px)
         return tracks_value(self.now, self.before, (points, lines, tracks.planes), motion.R)
 

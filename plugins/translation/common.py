@@ -13,6 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from trihedron.pipeline.core.linalg import eigh, inv, matmul, norm, solve
 from trihedron.pipeline.core.types import F64, LOST, Camera, Keypoints, Pose, Rotation, Tracks, Translation
 
 ITERATIONS = 15
@@ -51,8 +52,8 @@ def point_equations(
     together they determine the direction no better than it."""
     i, j = tracks.keypoints.T
     x = camera.back_project(now.pixels[j].astype(np.float64), np.ones(len(j)))
-    far = camera.back_project(before.pixels[i].astype(np.float64), np.ones(len(i))) @ R_current_previous.T
-    q = tracks.points_m.astype(np.float64) @ R_current_previous.T
+    far = matmul(camera.back_project(before.pixels[i].astype(np.float64), np.ones(len(i))), R_current_previous.T)
+    q = matmul(tracks.points_m.astype(np.float64), R_current_previous.T)
     known = np.isfinite(q).all(axis=1)
     A, b = np.zeros((len(j), 2, 3)), np.zeros((len(j), 2))
     A[:, 0, 0] = A[:, 1, 1] = 1.0
@@ -75,7 +76,7 @@ def solve_translation(equations: PointEquations, start: F64, prior_m: float) -> 
     with_depth = np.isfinite(equations.z)
     for iteration in range(ITERATIONS if len(equations.z) else 0):
         A, b = _linearise(equations, s)
-        reach = np.where(with_depth, np.maximum(equations.z + s[2], 0.1), np.linalg.norm(s) + FLOOR_M)
+        reach = np.where(with_depth, np.maximum(equations.z + s[2], 0.1), norm(s) + FLOOR_M)
         noise = reach * equations.sigma
         normalised = (np.einsum("nij,j->ni", A, s) - b) / noise[:, None]
         size = np.linalg.norm(normalised, axis=1)
@@ -85,23 +86,23 @@ def solve_translation(equations: PointEquations, start: F64, prior_m: float) -> 
             w = np.where(with_depth, w, 0.0)
         H = np.einsum("n,nij,nik->jk", w, A, A)
         g = np.einsum("n,nij,ni->j", w, A, b)
-        step = np.linalg.solve(H + prior, g + prior @ start) - s
+        step = solve(H + prior, g + matmul(prior, start)) - s
         s = s + step
         normalised = normalised / scale
-        if step @ step < 1e-14 and iteration >= ALONE:
+        if matmul(step, step) < 1e-14 and iteration >= ALONE:
             break
-    values, vectors = np.linalg.eigh(H)
+    values, vectors = eigh(H)
     inliers = int(np.count_nonzero(np.linalg.norm(normalised, axis=1) < GATE))
-    return LinearTranslation(s, np.asarray(np.linalg.inv(H + prior), np.float64), inliers, vectors[:, values < (2.0 / prior_m) ** 2].T)
+    return LinearTranslation(s, np.asarray(inv(H + prior), np.float64), inliers, vectors[:, values < (2.0 / prior_m) ** 2].T)
 
 
 def _linearise(equations: PointEquations, s: F64) -> tuple[F64, F64]:
     """The equations with those of points without depth as `(b × b')·s / |s| = 0`, linearised about s, times |s|."""
-    size = max(float(np.linalg.norm(s)), 1e-9)
+    size = max(float(norm(s)), 1e-9)
     along = s / size
     A, b = equations.A.copy(), equations.b.copy()
     far = np.isnan(equations.z)
-    off = equations.A[far, 0] @ along
+    off = matmul(equations.A[far, 0], along)
     A[far, 0] -= off[:, None] * along
     b[far, 0] = -size * off
     return A, b
@@ -124,4 +125,4 @@ def propagated_covariance(previous: Pose, held_too: bool = False) -> F64:
     """Covariance (3, 3) (world) that a previous pose propagates to the next: its own if it was lost, or with `held_too` unobservable in some
     direction; else zero, since the world is defined by tracked poses."""
     R, known = previous.T_world_camera[:3, :3], previous.status != LOST and not (held_too and previous.unobservable)
-    return np.zeros((3, 3)) if known else np.asarray(R @ previous.local_covariance[:3, :3] @ R.T)
+    return np.zeros((3, 3)) if known else np.asarray(matmul(R, previous.local_covariance[:3, :3], R.T))

@@ -7,6 +7,7 @@ from typing import Annotated
 
 import numpy as np
 
+from trihedron.pipeline.core.linalg import matmul
 from trihedron.pipeline.core.options import PositiveFloat, Range
 from trihedron.pipeline.core.registry import register
 from trihedron.pipeline.core.types import Camera, Keypoints, Map, Pose, Rotation, Tracks, Translation
@@ -44,11 +45,13 @@ class Irls:
         prior_m = self.motion_sigma_m * max(rotation.index - previous_pose.index, 1)
         R = rotation.R_world_camera
         if tracks is not None and previous_keypoints is not None and tracks.previous_index == previous_pose.index == previous_keypoints.index:
-            equations = point_equations(tracks, keypoints, previous_keypoints, camera, R.T @ before[:3, :3], rotation.covariance, self.depthless)
+            equations = point_equations(
+                tracks, keypoints, previous_keypoints, camera, matmul(R.T, before[:3, :3]), rotation.covariance, self.depthless
+            )
             found = solve_translation(equations, np.zeros(3), prior_m)
             if found.inliers >= self.min_points:
                 inliers = np.array([found.inliers, 0, 0], np.int32)
-                covariance = R @ found.covariance @ R.T + propagated
-                held = np.ascontiguousarray(found.unobservable @ R.T)
-                return Translation(rotation.index, rotation.stamp_ns, before[:3, 3] - R @ found.s, covariance, held, inliers, True)
+                covariance = matmul(R, found.covariance, R.T) + propagated
+                held = np.ascontiguousarray(matmul(found.unobservable, R.T))
+                return Translation(rotation.index, rotation.stamp_ns, before[:3, 3] - matmul(R, found.s), covariance, held, inliers, True)
         return unmeasured(rotation, before[:3, 3].copy(), propagated + prior_m**2 * np.eye(3))

@@ -7,6 +7,7 @@ from typing import Annotated
 
 import numpy as np
 
+from trihedron.pipeline.core.linalg import eigh, inv, matmul
 from trihedron.pipeline.core.options import PositiveFloat, PositiveInt, Range
 from trihedron.pipeline.core.registry import register
 from trihedron.pipeline.core.types import F64, Camera, Keypoints, Planes, Pose, Rotation, Tracks, Translation
@@ -59,10 +60,10 @@ class Kalman:
         """Translation by the points (3,) with covariance (3, 3), both in the world, and the number of inliers."""
         R, gap = rotation.R_world_camera, max(rotation.index - pose.index, 1)
         if tracks is not None and before is not None and tracks.previous_index == pose.index == before.index:
-            equations = point_equations(tracks, keypoints, before, camera, R.T @ pose.T_world_camera[:3, :3], rotation.covariance, True)
+            equations = point_equations(tracks, keypoints, before, camera, matmul(R.T, pose.T_world_camera[:3, :3]), rotation.covariance, True)
             found = solve_translation(equations, np.zeros(3), self.motion_sigma_m * gap)
             if found.inliers >= self.min_points:
-                return -R @ found.s, R @ found.covariance @ R.T + self.point_sigma_m**2 * np.eye(3), found.inliers
+                return matmul(-R, found.s), matmul(R, found.covariance, R.T) + self.point_sigma_m**2 * np.eye(3), found.inliers
         return np.zeros(3), (self.motion_sigma_m * gap) ** 2 * np.eye(3), 0
 
     def _value(self, rotation: Rotation, state: OffsetFilter, unobservable: F64, inliers: tuple[int, int, int], estimated: bool) -> Translation:
@@ -75,8 +76,8 @@ class Kalman:
 
 def _unmeasured(noise: F64, matched: list[AxisPlane], limit_m: float) -> F64:
     """Unit vectors (u, 3) (world) along which neither the points nor a known plane measured the position to `limit_m`."""
-    information = np.linalg.inv(noise) + sum((np.outer(s.normal, s.normal) / s.variance for s in matched), np.zeros((3, 3)))
-    values, vectors = np.linalg.eigh(information)
+    information = inv(noise) + sum((np.outer(s.normal, s.normal) / s.variance for s in matched), np.zeros((3, 3)))
+    values, vectors = eigh(information)
     return np.ascontiguousarray(vectors[:, values < 1.0 / limit_m**2].T)
 
 
@@ -131,9 +132,9 @@ class OffsetFilter:
     def _row(self, observation: AxisPlane, gate: float, gate_m: float) -> int:
         """Row of the known plane nearest to an observation within the gates, -1 = none."""
         n, P = observation.normal, self.covariance
-        off = np.abs(observation.distance_m - n @ self.position_m - self.planes[:, 3])
-        variance = n @ P[:3, :3] @ n + 2.0 * n @ P[:3, 3:] + np.diag(P)[3:] + observation.variance
-        within = (self.planes[:, :3] @ n > SAME_AXIS) & (off < np.minimum(gate * np.sqrt(variance) + SLACK_M, gate_m))
+        off = np.abs(observation.distance_m - matmul(n, self.position_m) - self.planes[:, 3])
+        variance = matmul(n, P[:3, :3], n) + matmul(2.0 * n, P[:3, 3:]) + np.diag(P)[3:] + observation.variance
+        within = (matmul(self.planes[:, :3], n) > SAME_AXIS) & (off < np.minimum(gate * np.sqrt(variance) + SLACK_M, gate_m))
         return int(np.argmin(np.where(within, off, np.inf))) if within.any() else -1
 
     def _measurement_row(self, normal: F64, row: int) -> F64:
@@ -143,21 +144,21 @@ class OffsetFilter:
 
     def _correct(self, observation: AxisPlane, row: int) -> OffsetFilter:
         h, P = self._measurement_row(observation.normal, row), self.covariance
-        gain = P @ h / (h @ P @ h + observation.variance)
-        change = gain * (observation.distance_m - observation.normal @ self.position_m - self.planes[row, 3])
+        gain = matmul(P, h) / (matmul(h, P, h) + observation.variance)
+        change = gain * (observation.distance_m - matmul(observation.normal, self.position_m) - self.planes[row, 3])
         rest = np.eye(len(h)) - np.outer(gain, h)
         planes = self.planes.copy()
         planes[:, 3] += change[3:]
-        return OffsetFilter(self.position_m + change[:3], planes, rest @ P @ rest.T + observation.variance * np.outer(gain, gain))
+        return OffsetFilter(self.position_m + change[:3], planes, matmul(rest, P, rest.T) + observation.variance * np.outer(gain, gain))
 
     def _append(self, observation: AxisPlane) -> OffsetFilter:
         n, P = observation.normal, self.covariance
         m = len(P)
         covariance = np.zeros((m + 1, m + 1))
         covariance[:m, :m] = P
-        covariance[m, :m] = covariance[:m, m] = -n @ P[:3]
-        covariance[m, m] = n @ P[:3, :3] @ n + observation.variance
-        plane = np.append(n, observation.distance_m - n @ self.position_m)
+        covariance[m, :m] = covariance[:m, m] = matmul(-n, P[:3])
+        covariance[m, m] = matmul(n, P[:3, :3], n) + observation.variance
+        plane = np.append(n, observation.distance_m - matmul(n, self.position_m))
         return OffsetFilter(self.position_m, np.concatenate([self.planes, plane[None]]), covariance)
 
 
@@ -175,12 +176,12 @@ def observe_axis_planes(planes: Planes, rotation: Rotation, axis_deg: float, flo
     rotation_variance = float(np.trace(rotation.covariance)) / 3.0
     found = []
     for plane, moments, pixels in zip(planes.coefficients, planes.moments, planes.pixels):
-        along = axes.T @ rotation.R_world_camera @ plane[:3]
+        along = matmul(axes.T, rotation.R_world_camera, plane[:3])
         k = int(np.argmax(np.abs(along)))
         if abs(along[k]) < np.cos(np.radians(axis_deg)) or pixels < min_pixels:
             continue
         normal = np.asarray(axes[:, k] * np.sign(along[k]))
-        centre, local = moments[:3, 3] / moments[3, 3], rotation.R_world_camera.T @ normal
-        aside2 = float(centre @ centre - (centre @ local) ** 2)
-        found.append(AxisPlane(normal, float(-local @ centre), 1.0 / float(moments[3, 3]) + rotation_variance * aside2 + floor_m**2))
+        centre, local = moments[:3, 3] / moments[3, 3], matmul(rotation.R_world_camera.T, normal)
+        aside2 = float(matmul(centre, centre) - matmul(centre, local) ** 2)
+        found.append(AxisPlane(normal, float(matmul(-local, centre)), 1.0 / float(moments[3, 3]) + rotation_variance * aside2 + floor_m**2))
     return found

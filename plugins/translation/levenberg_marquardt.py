@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from trihedron.pipeline.core.geometry import pose_matrix
+from trihedron.pipeline.core.linalg import matmul
 from trihedron.pipeline.core.options import NonNegativeFloat, NonNegativeInt, PositiveFloat
 from trihedron.pipeline.core.registry import register
 from trihedron.pipeline.core.types import F64, Camera, Keypoints, Map, Planes, Pose, Rotation, Segments, Tracks, Translation
@@ -61,8 +62,8 @@ class LevenbergMarquardt:
         if not (found.points.any() or found.lines.any() or found.planes.any()):
             return self._predicted(rotation, previous_pose, earlier_pose, map, frames)
         inliers = np.array([np.count_nonzero(kind) for kind in (found.points, found.lines, found.planes)], np.int32)
-        unobservable = np.ascontiguousarray((R @ found.unobservable).T)
-        covariance = R @ found.covariance @ R.T + propagated_covariance(previous_pose, held_too=True)
+        unobservable = np.ascontiguousarray(matmul(R, found.unobservable).T)
+        covariance = matmul(R, found.covariance, R.T) + propagated_covariance(previous_pose, held_too=True)
         return Translation(rotation.index, rotation.stamp_ns, found.T_world_camera[:3, 3].copy(), covariance, unobservable, inliers, True)
 
     def _predicted(self, rotation: Rotation, previous: Pose, earlier: Pose | None, map: Map | None, frames: int) -> Translation:

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from trihedron.pipeline.core.linalg import matmul
 from trihedron.pipeline.core.options import PositiveFloat, PositiveInt
 from trihedron.pipeline.core.registry import register
 from trihedron.pipeline.core.types import F64, Bool, Keypoints, Map, Pose, Rotation, Tracks, Translation
@@ -37,13 +38,13 @@ class Ransac:
         T, propagated = pose.T_world_camera, propagated_covariance(pose)
         if tracks is not None and tracks.previous_index == previous_pose.index:
             before, after, sigma = tracked_point_pairs(tracks, keypoints)
-            translations = before @ T[:3, :3].T - after @ R.T
+            translations = matmul(before, T[:3, :3].T) - matmul(after, R.T)
             agree = self._inliers(translations, sigma, rng)
             if agree.sum() >= self.min_points:
                 w = 1.0 / sigma[agree] ** 2
                 covariance = np.eye(3) / w.sum() + propagated
                 inliers = np.array([agree.sum(), 0, 0], np.int32)
-                t = T[:3, 3] + w @ translations[agree] / w.sum()
+                t = T[:3, 3] + matmul(w, translations[agree]) / w.sum()
                 return Translation(rotation.index, rotation.stamp_ns, t, covariance, np.empty((0, 3)), inliers, True)
         prior_m = self.motion_sigma_m * max(rotation.index - previous_pose.index, 1)
         return unmeasured(rotation, T[:3, 3].copy(), propagated + prior_m**2 * np.eye(3))

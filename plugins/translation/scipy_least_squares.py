@@ -7,6 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from trihedron.pipeline.core.linalg import eigh, inv, matmul
 from trihedron.pipeline.core.options import PositiveFloat, PositiveInt
 from trihedron.pipeline.core.registry import register
 from trihedron.pipeline.core.types import F64, Camera, Keypoints, Map, Planes, Pose, Rotation, Segments, Tracks, Translation
@@ -46,13 +47,13 @@ class ScipyLeastSquares:
         prior_m = self.motion_sigma_m * max(rotation.index - pose.index, 1)
         if tracks is None or tracks.previous_index != pose.index:
             return unmeasured(rotation, T[:3, 3].copy(), propagated + prior_m**2 * np.eye(3))
-        terms = tracked_terms(tracks, keypoints, segments, planes, R.T @ T[:3, :3], self.line_sigma_px, self.plane_floor_m)
+        terms = tracked_terms(tracks, keypoints, segments, planes, matmul(R.T, T[:3, :3]), self.line_sigma_px, self.plane_floor_m)
         found = self._solved(terms, camera, prior_m)
         if not found.inliers.any():
             return unmeasured(rotation, T[:3, 3].copy(), propagated + prior_m**2 * np.eye(3))
-        held = np.ascontiguousarray(found.unobservable @ R.T)
-        covariance = R @ found.covariance @ R.T + propagated
-        return Translation(rotation.index, rotation.stamp_ns, T[:3, 3] - R @ found.s, covariance, held, found.inliers, True)
+        held = np.ascontiguousarray(matmul(found.unobservable, R.T))
+        covariance = matmul(R, found.covariance, R.T) + propagated
+        return Translation(rotation.index, rotation.stamp_ns, T[:3, 3] - matmul(R, found.s), covariance, held, found.inliers, True)
 
     def _solved(self, terms: Terms, camera: Camera, prior_m: float) -> Solved:
         from scipy.optimize import least_squares
@@ -64,10 +65,10 @@ class ScipyLeastSquares:
 
         found = least_squares(cost, np.zeros(3), loss="huber", f_scale=self.huber, method="trf", max_nfev=self.evaluations)
         J = found.jac[:-3] if count else np.zeros((0, 3))  # of the data, weighted by the loss
-        information = J.T @ J
-        values, vectors = np.linalg.eigh(information)
+        information = matmul(J.T, J)
+        values, vectors = eigh(information)
         agreeing = [np.count_nonzero((np.abs(r) < GATE).all(axis=1)) for r in residuals(terms, camera, found.x)]
-        covariance = np.linalg.inv(information + np.eye(3) / prior_m**2)
+        covariance = inv(information + np.eye(3) / prior_m**2)
         return Solved(found.x, covariance, vectors[:, values < prior_m**-2.0].T, np.array(agreeing, np.int32))
 
 
@@ -105,13 +106,13 @@ def tracked_terms(tracks: Tracks, keypoints: Keypoints, segments: Segments, plan
     walls = tracks.planes[:, 1]
     variance = tracks.plane_covariance[:, 2, 2] + planes.covariance[walls, 2, 2]
     return Terms(
-        tracks.points_m[deep].astype(np.float64) @ R.T,
+        matmul(tracks.points_m[deep].astype(np.float64), R.T),
         keypoints.pixels[rows].astype(np.float64),
         keypoints.sigma_px[rows].astype(np.float64),
-        tracks.endpoints_m[whole].astype(np.float64) @ R.T,
+        matmul(tracks.endpoints_m[whole].astype(np.float64), R.T),
         lines / np.maximum(np.linalg.norm(lines[:, :2], axis=1), 1e-9)[:, None],
         line_sigma_px,
-        tracks.coefficients[:, :3] @ R.T,
+        matmul(tracks.coefficients[:, :3], R.T),
         tracks.coefficients[:, 3],
         planes.coefficients[walls, 3],
         np.sqrt(variance + floor_m**2),
@@ -123,7 +124,7 @@ def residuals(terms: Terms, camera: Camera, s: F64) -> tuple[F64, F64, F64]:
     points = (_project(terms.points_m + s, camera) - terms.pixels) / terms.point_sigma_px[:, None]  # eq. 2
     ends = _project(terms.endpoints_m + s, camera)
     lines = (np.einsum("mec,mc->me", ends, terms.lines[:, :2]) + terms.lines[:, 2:]) / terms.line_sigma_px  # eq. 4
-    planes = (terms.distances_m - terms.normals @ s - terms.observed_m) / terms.plane_sigma_m  # eq. 6: n·(p - s) + d = 0
+    planes = (terms.distances_m - matmul(terms.normals, s) - terms.observed_m) / terms.plane_sigma_m  # eq. 6: n·(p - s) + d = 0
     return points, lines, planes[:, None]
 
 

@@ -10,25 +10,17 @@ slam.save("run.mcap")
 ```
 
 `Slam` tracks frames that you push, `run` a data set. `Recording` reads every topic of a run and runs stages again. Each slot is a name, so that any
-stage runs alone: `th.planes.connected_components(angle_deg=3)(depth, camera)`. Names are imported when they are first used.
-
-OpenBLAS, which NumPy and SciPy bring, has kernels for each kind of processor, which round differently. So that recordings have the same bytes on
-every x86-64 machine, this package selects those that all of them can run. It can do so only before NumPy is imported.
+stage runs alone: `th.planes.connected_components(angle_deg=3)(depth, camera)`. Names are imported when they are first used. The import changes
+nothing of the process.
 """
 
 from __future__ import annotations
 
 import importlib
-import os
-import platform
-import sys
 from typing import TYPE_CHECKING, Any
 
-BLAS_KERNELS = "OPENBLAS_CORETYPE", "Prescott"  # an environment variable of OpenBLAS, and the oldest x86-64 processor that it knows
-if "numpy" not in sys.modules and platform.machine() in ("x86_64", "AMD64"):
-    os.environ[BLAS_KERNELS[0]] = BLAS_KERNELS[1]
-
 if TYPE_CHECKING:
+    from trihedron.api.ablations import ablate
     from trihedron.api.building import Building
     from trihedron.api.camera import Camera
     from trihedron.api.recording import Recording
@@ -82,6 +74,7 @@ _SLOTS = (
     "bundle", "loop", "relocalise", "model", "surface", "building",
 )  # fmt: skip
 _HOMES = {
+    "ablate": "api.ablations",
     "Building": "api.building",
     "Camera": "api.camera",
     "Recording": "api.recording",
@@ -97,9 +90,9 @@ _HOMES = {
 
 __all__ = [
     "Building", "Camera", "Frame", "Keypoints", "LineSegments", "ManhattanFrame", "Map", "Normals", "Planes", "Pose", "Recording", "Rotation", "Run",
-    "Segments", "Slam", "Surface", "Trajectory", "Translation", "TrihedronError", "__version__", "building", "bundle", "compare", "dataset",
-    "keypoints", "lines", "loop", "manhattan", "map", "matches", "model", "normals", "planes", "pose", "register", "relocalise", "rotation", "run",
-    "segments", "surface", "tracks", "translation",
+    "Segments", "Slam", "Surface", "Trajectory", "Translation", "TrihedronError", "__version__", "ablate", "building", "bundle", "compare",
+    "dataset", "keypoints", "lines", "loop", "manhattan", "map", "matches", "model", "normals", "planes", "pose", "register", "relocalise",
+    "rotation", "run", "segments", "surface", "tracks", "translation",
 ]  # fmt: skip
 
 

@@ -15,7 +15,7 @@ from trihedron.datasets.simulation.room import all_faces
 from trihedron.datasets.simulation.shading import render
 from trihedron.datasets.simulation.synthetic import BUILDINGS, Scene, Synthetic
 from trihedron.datasets.simulation.textures import bake
-from trihedron.pipeline.core.geometry import rotation_angle_deg
+from trihedron.pipeline.core.lie import rotation_angle_deg
 from trihedron.pipeline.core.types import Camera
 
 sys.path.insert(0, str(Path(__file__).parent))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from trihedron.datasets.readers.cameras import PRESETS, choose_calibration, read_camera_file
@@ -31,6 +32,24 @@ def test_distortion_may_be_a_list_or_a_line(tmp_path: Path, text: str) -> None:
     assert found.camera.depth_noise == DepthNoise()
 
 
+def test_depth_of_a_camera_file_is_corrected_and_registered(tmp_path: Path) -> None:
+    file = tmp_path / "camera.yaml"
+    small = "width: 40\nheight: 30\nfx: 50\nfy: 50\ncx: 19.5\ncy: 14.5\ndepth_scale: 1000\n"
+    wall = np.full((30, 40), 2.0, np.float32)
+    file.write_text(small)
+    assert read_camera_file(file).rectification.depth(wall) is wall  # bit-identical where nothing is stated
+    file.write_text(small + "depth_offset: 0.1\ndepth_radial: -0.2\n")
+    corrected = read_camera_file(file).rectification.depth(wall)
+    assert np.isclose(corrected[0, 0], 1.0 / ((1.0 - 0.2 * (19.5**2 + 14.5**2) / 625.0) / 2.0 + 0.1), rtol=1e-6)
+    assert np.isclose(corrected[14, 19], 1.0 / ((1.0 - 0.2 * 0.5 / 625.0) / 2.0 + 0.1), rtol=1e-6)
+    beside = small + "depth_camera: {fx: 50, fy: 50, cx: 19.5, cy: 14.5, translation_m: [0.08, 0, 0]}\n"
+    file.write_text(beside)
+    moved = wall.copy()
+    moved[:, 10] = 1.0  # at 1 m four pixels of parallax, at 2 m two
+    found = read_camera_file(file).rectification.depth(moved)
+    assert (found[:, 14] == 1.0).all() and (found[:, 16] == 2.0).all() and (found[:, 0] == 0.0).all() and np.count_nonzero(found[5] == 1.0) == 1
+
+
 BAD = [
     (GOOD.replace("fx: 500\n", ""), "{}: the key 'fx' is missing; " + KEYS),
     (GOOD + "dept_scale: 5000\n", "{}: unknown key 'dept_scale'; did you mean 'depth_scale'?"),
@@ -43,6 +62,14 @@ BAD = [
     (GOOD.replace("640", "640.5"), "{}: width is 640.5; give a positive whole number"),
     (GOOD.replace("1000", "0"), "{}: depth_scale is 0; give a positive number"),
     (GOOD + "depth_noise: kinnect\n", "{}: depth_noise is 'kinnect'; did you mean 'kinect'?"),
+    (GOOD + "depth_radial: 0.6\n", "{}: depth_radial is 0.6; give a relative error within ±0.5"),
+    (GOOD + "depth_camera: 580\n", "{}: depth_camera holds no keys; give it fx fy cx cy translation_m rotation_deg"),
+    (GOOD + "depth_camera: {fx: 580, fy: 580, cx: 320}\n", "{}: the key 'depth_camera.cy' is missing; give it fx fy cx cy"),
+    (GOOD + "depth_camera: {fx: 0, fy: 580, cx: 320, cy: 240}\n", "{}: depth_camera describes no camera; give fx and fy above 1e-06"),
+    (
+        GOOD + "depth_camera: {fx: 580, fy: 580, cx: 320, cy: 240, translation_m: 0.025}\n",
+        "{}: depth_camera.translation_m does not hold 3 numbers; give a list [x, y, z]",
+    ),
     ("", "{}: holds no keys; give width height fx fy cx cy depth_scale, one 'key: value' a line"),
     ("width: 640\nfx: [1\n", "{}:3: is not YAML; write one 'key: value' a line"),
 ]

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from trihedron.datasets.readers.association import associate
-from trihedron.pipeline.core.geometry import exp_se3
+from trihedron.pipeline.core.lie import exp_se3
 from trihedron.pipeline.core.types import Trajectory
 from trihedron.pipeline.record.trajectories import format_stamp, parse_stamp_ns, read_trajectory, write_trajectory
 

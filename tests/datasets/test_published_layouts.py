@@ -16,7 +16,7 @@ from trihedron.datasets.readers.tamu import Tamu
 from trihedron.datasets.simulation.synthetic import Synthetic
 from trihedron.pipeline.app.cli import main
 from trihedron.pipeline.core.errors import DataError
-from trihedron.pipeline.core.geometry import exp_se3
+from trihedron.pipeline.core.lie import exp_se3
 from trihedron.pipeline.core.types import EXACT_DEPTH, F64, DepthNoise
 from trihedron.tools.convert import layout_of
 

@@ -14,7 +14,7 @@ from trihedron.datasets.readers.folder import Folder
 from trihedron.datasets.readers.icl_nuim import IclNuim, reflect
 from trihedron.datasets.readers.tum import Tum
 from trihedron.pipeline.core.errors import DataError
-from trihedron.pipeline.core.geometry import exp_se3
+from trihedron.pipeline.core.lie import exp_se3
 from trihedron.pipeline.core.types import EXACT_DEPTH, DepthNoise
 
 

@@ -13,7 +13,7 @@ import pytest
 
 from trihedron.datasets.readers.mcap import McapDataset
 from trihedron.pipeline.core.errors import DataError
-from trihedron.pipeline.core.geometry import exp_se3
+from trihedron.pipeline.core.lie import exp_se3
 
 sys.path.insert(0, str(Path(__file__).parent))
 from robot_files import COLOR, DEPTH, Message, Wall, camera_info, compressed, encoded, image, transforms, write_file

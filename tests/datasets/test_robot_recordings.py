@@ -19,7 +19,8 @@ from trihedron.datasets.readers.folder import Folder
 from trihedron.datasets.readers.mcap import McapDataset
 from trihedron.pipeline.app.cli import main
 from trihedron.pipeline.core.errors import DataError, RecordingError
-from trihedron.pipeline.core.geometry import exp_se3, invert
+from trihedron.pipeline.core.geometry import invert
+from trihedron.pipeline.core.lie import exp_se3
 from trihedron.tools.convert import layout_of
 
 sys.path.insert(0, str(Path(__file__).parent))

@@ -18,7 +18,8 @@ from trihedron.datasets.simulation.shading import render
 from trihedron.datasets.simulation.synthetic import Scene, Synthetic
 from trihedron.datasets.simulation.textures import bake
 from trihedron.pipeline.core.errors import DataError
-from trihedron.pipeline.core.geometry import rotation_angle_deg, transform
+from trihedron.pipeline.core.geometry import transform
+from trihedron.pipeline.core.lie import rotation_angle_deg
 from trihedron.pipeline.core.types import EXACT_DEPTH, Camera, DepthNoise
 
 SMALL = Camera(320, 240, 262.5, 262.5, 159.5, 119.5)

@@ -27,7 +27,8 @@ from omegaconf import OmegaConf
 from trihedron.datasets.readers import foxglove_messages
 from trihedron.datasets.readers.robot_streams import ROS
 from trihedron.pipeline.core.config import composed
-from trihedron.pipeline.core.geometry import exp_se3, quaternion_from_rotation
+from trihedron.pipeline.core.geometry import quaternion_from_rotation
+from trihedron.pipeline.core.lie import exp_se3
 from trihedron.pipeline.record.codec import is_value_schema
 from trihedron.pipeline.record.trajectories import TRUTH
 from trihedron.pipeline.record.writer import RecordingWriter
@@ -69,6 +70,7 @@ def make_seeds(folder: Path) -> None:
     (folder / "associations.txt").write_text("".join(f"{k} depth/{k}.png {k} rgb/{k}.png\n" for k in range(1, 4)))
     (folder / "camera_short.yaml").write_text("width: 64\nheight: 48\nfx: 60.0\nfy: 60.0\ncx: 31.5\ncy: 23.5\ndepth_scale: 5000\n")
     more = "fps: 20\ndepth_noise: exact\ndepth_offset: 0.01\ndistortion: {k1: 0.1, k2: -0.2, p1: 0, p2: 1e-3, k3: 0}\n"
+    more += "depth_radial: -0.01\ndepth_camera: {fx: 61, fy: 61, cx: 32, cy: 24, translation_m: [0.025, 0, 0], rotation_deg: [0, 0.5, 0]}\n"
     (folder / "camera_long.yaml").write_text((folder / "camera_short.yaml").read_text() + more)
     camera = {"w": 1200, "h": 680, "fx": 600.0, "fy": 600.0, "cx": 599.5, "cy": 339.5, "scale": 6553.5}
     (folder / "cam_params.json").write_text(json.dumps({"camera": camera}))

@@ -388,7 +388,7 @@ def _content(content: bytes, rng: Rng) -> bytes:
     if content[:1] == b"{" and choice < 0.8:
         try:
             return json_text(content, rng)
-        except ValueError:
+        except (ValueError, RecursionError):  # it is extreme already
             return content
     if choice < 0.6 and wire(content):
         return protobuf(content, rng)

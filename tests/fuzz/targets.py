@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -28,7 +27,6 @@ from trihedron.pipeline.record.mcap_file import McapFile
 from trihedron.pipeline.record.reader import Recording
 from trihedron.pipeline.record.trajectories import read_trajectory
 from trihedron.pipeline.run.map_file import load_map
-from trihedron.pipeline.run.value_checks import checked
 from trihedron.tools.mesh_files import read_mesh
 from trihedron.tools.recover import recover
 
@@ -84,9 +82,10 @@ def recording(path: Path) -> int:
     opened.overrides()
     read = 0
     for topic in sorted(opened.topics):
-        for value in opened.values(topic):
-            _one_of(value, partial(checked, topic, place=""))
-            read += 1
+        try:
+            read += sum(1 for _ in opened.values(topic))
+        except TrihedronError:
+            continue
     return min(read, len(opened.frame(2)))
 
 

@@ -86,7 +86,7 @@ def recorded(tmp_path_factory):
     return folder / "run" / "run.mcap"
 
 
-@pytest.mark.parametrize("stage", ["tracks", "translation", "matches", "pose"])
+@pytest.mark.parametrize("stage", ["tracks", "pose", *(pytest.param(stage, marks=pytest.mark.slow) for stage in ("translation", "matches"))])
 def test_a_stage_of_the_default_graph_that_reads_intrinsics_alone_needs_no_images(recorded, tmp_path, stage):
     """The recording holds no images, and the stages that found nothing all along (loop, relocalise) are not asked again."""
     replay = Replay(Recording(recorded), (stage,))

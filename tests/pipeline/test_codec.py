@@ -315,16 +315,21 @@ def test_damaged_and_foreign_values_are_refused():
     assert "keyframes: a change without the version before it" in refusal(encoder.encode(change[1]))
 
 
+LEARNED = ("calibration_information", "calibration_score")
+
+
 def test_a_value_of_an_older_version_names_the_version_and_the_fields():
     """As `Pose` was before sub-maps, with a field that there is no more."""
     message = legacy("pose")
     message.version = 1
-    kept = [array for array in message.arrays if array.name not in ("submap", "unrecognised", "map_covariance", "noise_scale")]
+    later = {"submap", "unrecognised", "map_covariance", "noise_scale", "repeats", "sensitivity", "twist", "reference_twist", *LEARNED}
+    kept = [array for array in message.arrays if array.name not in later]
     del message.arrays[:]
     message.arrays.extend([*kept, type(kept[0])(name="quality", dtype="float", encoding="raw", data=bytes(8))])
     assert refusal(message) == (
-        "a.mcap: topic /keypoints: holds Pose version 1, this program reads version 3, with the field 'map_covariance', 'noise_scale', 'submap', "
-        "'unrecognised' that it lacks, "
+        "a.mcap: topic /keypoints: holds Pose version 1, this program reads version 4, with the field 'calibration_information', "
+        "'calibration_score', 'map_covariance', 'noise_scale', 'reference_twist', 'repeats', 'sensitivity', 'submap', 'twist', 'unrecognised' that "
+        "it lacks, "
         "without its field 'quality'; upgrade what can be read of it with: trihedron convert SRC DST.mcap"
     )
 
@@ -391,8 +396,9 @@ HEADERS = {  # text of a table's header, cause
 @pytest.mark.parametrize("header", HEADERS, ids=lambda text: text[:50])
 def test_a_table_whose_header_is_no_header_is_one_line(header):
     """Nothing is allocated for rows that are not there."""
-
-    old, new = legacy("map"), message_of(next(iter(maps(1))))
+    map = next(iter(maps(1)))
+    old, new = legacy("map"), message_of(map)
+    old.version = map.version
     next(array for array in old.arrays if array.name == "keyframes#").data = header.encode()
     new.keyframes.layout = header
     for message in (old, new):

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from trihedron.pipeline.core.geometry import exp_se3
+from trihedron.pipeline.core.lie import exp_se3
 from trihedron.pipeline.run.consistency import pose_consistency, truth_noise
 
 SOMEWHERE = exp_se3(np.array([3.0, -1.0, 2.0, 0.4, -2.0, 1.0]))

@@ -78,6 +78,7 @@ def recorded(tmp_path_factory):
     return folder
 
 
+@pytest.mark.slow
 def test_every_topic_has_the_same_bytes_for_one_thread_and_two(recorded):
     run([*RECORD, f"out={recorded}/one", "threads=1"], cwd=recorded)
     one, two = contents(recorded / "one" / "run.mcap"), contents(recorded / "two" / "run.mcap")
@@ -88,6 +89,7 @@ def test_every_topic_has_the_same_bytes_for_one_thread_and_two(recorded):
         assert (recorded / "one" / name).read_bytes() == (recorded / "two" / name).read_bytes()
 
 
+@pytest.mark.slow
 def test_every_stage_run_again_alone_gives_its_bytes_and_a_change_changes_them(recorded):
     source = contents(recorded / "two" / "run.mcap")
     jobs = []
@@ -105,6 +107,7 @@ def test_every_stage_run_again_alone_gives_its_bytes_and_a_change_changes_them(r
         assert {t for t in same if t[1:] in STAGES} == {topic}  # nothing is copied that was not computed
 
 
+@pytest.mark.slow
 def test_recorded_feedback_gives_the_same_bytes_too(recorded):
     whole = recorded / "two" / "run.mcap"
     stateful = ["manhattan", "tracks", "rotation", "pose", "map"]
@@ -114,6 +117,7 @@ def test_recorded_feedback_gives_the_same_bytes_too(recorded):
         assert contents(recorded / f"feedback_{stage}" / "run.mcap")[f"/{stage}"] == source[f"/{stage}"], stage
 
 
+@pytest.mark.slow
 def test_a_replay_with_new_poses_writes_their_trajectory(recorded):
     whole = recorded / "two" / "run.mcap"
     tracking = [f"replay={whole}", "only=[rotation,translation,matches,pose,map]", f"out={recorded}/tracking"]

@@ -35,6 +35,23 @@ def test_frozen_depth_counts_as_missing_once_it_is_stale_and_colour_has_changed(
     assert all(np.array_equal(f.color, given.color) for f, given in zip(found, frames))
 
 
+def test_frozen_colour_counts_as_missing_once_it_is_stale_and_depth_has_changed(caplog):
+    still = frame(2).color
+    frames = [frame(k) if k < 2 else frame(k, color=still.copy()) for k in range(6)] + [frame(6)]
+    found, warnings = validated(frames, caplog)
+    assert [bool(f.color.any()) for f in found] == [True] * 4 + [False] * 2 + [True]
+    assert warnings == [f"frame {k}: its colour is that of frame 2, bit for bit, while depth has changed; it counts as missing" for k in (4, 5)]
+    assert all(np.array_equal(f.depth_m, given.depth_m) for f, given in zip(found, frames))
+
+
+def test_noise_of_depth_over_colour_without_noise_is_no_fault(caplog):
+    """A rendered scene at rest: colour is exact, depth has the noise that the camera states."""
+    z = np.full((120, 160), 3.0, np.float32)
+    noisy = [z + CAMERA.depth_noise.sigma_m(z).astype(np.float32) * np.random.default_rng(k).standard_normal(z.shape, np.float32) for k in range(9)]
+    found, warnings = validated([frame(k, noisy[k], frame(0).color) for k in range(9)], caplog)
+    assert warnings == [] and all(f.color.any() for f in found)
+
+
 def test_at_a_low_rate_the_first_repetition_is_stale(caplog):
     found, warnings = validated([frame(0, period_ms=200), frame(1, frame(0).depth_m, period_ms=200)], caplog)
     assert not found[1].depth_m.any() and len(warnings) == 1

@@ -1,27 +1,33 @@
 """Recordings: what stands first, when chunks close, what a viewer sees, and what a wrong file says."""
 
 import io
+import struct
 import sys
 import time
 from dataclasses import replace
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
+from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
 from mcap.reader import make_reader
 from mcap.records import Chunk, Metadata
 from mcap.stream_reader import StreamReader
 from mcap.writer import Writer
 from mcap_protobuf.decoder import DecoderFactory
 
+from trihedron.datasets.simulation.synthetic import Synthetic
 from trihedron.pipeline.app.cli import main
 from trihedron.pipeline.core.errors import RecordingError
-from trihedron.pipeline.core.geometry import exp_se3, exp_so3, rotation_from_quaternion
+from trihedron.pipeline.core.geometry import rotation_from_quaternion
+from trihedron.pipeline.core.lie import exp_se3, exp_so3
 from trihedron.pipeline.core.table import Column, Table
 from trihedron.pipeline.core.types import FrameReference, ManhattanFrame, Map, Planes, Pose, Segments, Surface, Trajectory
 from trihedron.pipeline.record import mcap_writer as module
 from trihedron.pipeline.record.codec import FORMAT, timing_of
-from trihedron.pipeline.record.foxglove import View
+from trihedron.pipeline.record.embedded_images import frame_of, messages_of
+from trihedron.pipeline.record.foxglove import TopicView
 from trihedron.pipeline.record.foxglove_messages import MOST_VERTICES
 from trihedron.pipeline.record.reader import Recording, TopicReader
 from trihedron.pipeline.record.writer import RecordingWriter
@@ -74,7 +80,7 @@ def test_chunks_close_by_size_and_by_time(tmp_path, monkeypatch):
 def test_what_cannot_be_encoded_or_shown_is_said_and_what_came_before_is_kept(tmp_path):
     """In the writer's thread, after the call: the next one raises it, or closing."""
 
-    class Broken(View):
+    class Broken(TopicView):
         def wants(self, value):
             return True
 
@@ -119,7 +125,7 @@ def test_one_frame_is_read_alone(tmp_path, monkeypatch):
     writer.close()
     recording = Recording(tmp_path / "a.mcap")
     for i in (0, 1, 30, 49, 50, 59):
-        frame = recording.frame(i)
+        frame = recording.frame(i, check=False)  # its map lacks the columns of one
         assert set(frame) == {"frames", "map", *(["keypoints"] if i % 3 and i % 5 != 4 else [])} and all(v.index == i for v in frame.values())
         assert frame["map"].points.column("x").tolist() == np.repeat(np.arange(i + 1.0), 10).tolist()
     assert recording.frame(60) == {}
@@ -178,7 +184,7 @@ def test_wrong_files_say_so_in_one_line(tmp_path):
     )
     write(tmp_path / "new.mcap", [0], format="9", version="0.0.9", commit="0123456789")
     assert refusal(tmp_path / "new.mcap") == (
-        "DIR/new.mcap: has format 9 of trihedron 0.0.9 0123456, this program reads formats 3 to 5: its arrays and tables are packed otherwise; "
+        "DIR/new.mcap: has format 9 of trihedron 0.0.9 0123456, this program reads formats 3 to 6: its arrays and tables are packed otherwise; "
         "upgrade what can be read of it with: trihedron convert SRC DST.mcap"
     )
     with pytest.raises(RecordingError) as error:
@@ -190,12 +196,12 @@ OLDER = [  # format, commit, what differs
     (
         1,
         "ad955b7",
-        "topic /map holds Map version 1, this program reads version 6, with the field 'loop_closed' that it lacks, and 1 more",
+        "topic /map holds Map version 1, this program reads version 7, with the field 'loop_closed' that it lacks, and 1 more",
     ),
     (
         2,
         "509b7cf",
-        "topic /map holds Map version 3, this program reads version 6, with the field 'loop_closed' that it lacks, and 2 more",
+        "topic /map holds Map version 3, this program reads version 7, with the field 'loop_closed' that it lacks, and 2 more",
     ),
 ]
 
@@ -205,7 +211,7 @@ def test_a_recording_of_an_older_program_names_version_and_field(form, commit, d
     """Three frames that an earlier version of this program wrote; whatever is asked of them."""
     path = Path(__file__).parent / "recordings" / f"format_{form}.mcap"
     line = (
-        f"trihedron: {path}: has format {form} of trihedron 0.0.1 {commit}, this program reads formats 3 to 5: {differs} of its topics are others; "
+        f"trihedron: {path}: has format {form} of trihedron 0.0.1 {commit}, this program reads formats 3 to 6: {differs} of its topics are others; "
         "upgrade what can be read of it with: trihedron convert SRC DST.mcap\n"
     )
     for words in (["run", f"replay={path}", "only=[pose]"], ["diff", str(path), str(path)], ["export", str(path), "--to", "tum"]):
@@ -218,13 +224,13 @@ def test_a_recording_of_format_3_is_upgraded(tmp_path, capsys):
     path = tmp_path / "new.mcap"
     assert main(["convert", str(Path(__file__).parent / "recordings" / "format_3.mcap"), str(path)]) == 0
     recording = Recording(path)
-    for i, value in enumerate(recording.values("map")):
+    for i, value in enumerate(recording.values("map", check=False)):  # it lacks the columns of a map
         expected = np.repeat(np.arange(i + 1.0), 10)
         expected[: i + 1] = -1.0
         if i >= 55:
             expected[256:512] = 0.0
         assert value.points.column("x").tolist() == expected.tolist()
-        alone = recording.frame(i)["map"].points
+        alone = recording.frame(i, check=False)["map"].points
         assert alone.column("x").tolist() == expected.tolist()
         assert len(alone) < 512 or alone.is_empty(1) == (i >= 55)
     assert i == 59 and recording.metadata["format"] == FORMAT
@@ -233,19 +239,26 @@ def test_a_recording_of_format_3_is_upgraded(tmp_path, capsys):
 
 
 def test_a_recording_of_format_4_is_read_and_upgraded(tmp_path, capsys):
-    """What the previous version wrote, with one schema for all values, times as JSON, is the same after conversion; each type has its schema."""
+    """What the previous version wrote, with one schema for all values, times as JSON, is the same after conversion; each type has its schema. Poses
+    and keyframes have fields since, with what nothing is known of."""
     old, new = Path(__file__).parent / "recordings" / "format_4.mcap", tmp_path / "new.mcap"
     assert main(["convert", str(old), str(new)]) == 0
-    assert main(["diff", str(old), str(new)]) == 0
+    assert main(["diff", str(old), str(new), "--topics", ",".join(sorted(Recording(old).topics - {"frames", "map", "pose"}))]) == 0
     assert "equal: 3 frames" in capsys.readouterr().out
+    assert not any(pose.sensitivity.any() or pose.calibration_information.any() for pose in Recording(new).values("pose"))
+    assert not any(map.keyframes.column("sensitivity").any() for map in Recording(new).values("map"))
     before, after = Recording(old), Recording(new)
-    assert after.metadata["format"] == FORMAT and after.topics == before.topics and after.counts == before.counts
+    assert after.metadata["format"] == FORMAT and after.topics == before.topics
+    images = {"/dataset/color": 3, "/dataset/depth": 3}
+    assert {"/dataset": 3, **after.counts} == {**images, **before.counts}
     assert [timing_of(data) for _, data in after.messages("/timing")] == [timing_of(data) for _, data in before.messages("/timing")]
     assert main(["topics", str(old)]) == 0
     listed = capsys.readouterr().out
     assert main(["topics", str(new)]) == 0
     schemas = [[line.split()[:3] for line in text.splitlines()] for text in (listed, capsys.readouterr().out)]
-    assert schemas[0] == schemas[1] and ["/planes", "trihedron.Planes", "3"] in schemas[1] and ["/timing", "trihedron.Timing", "3"] in schemas[1]
+    images = [["/dataset", "trihedron.Frame", "3"], ["/dataset/color", "foxglove.CompressedImage", "3"], ["/dataset/depth", "foxglove.RawImage", "3"]]
+    before, after = ([line for line in lines if line not in images] for lines in schemas)
+    assert before == after and ["/planes", "trihedron.Planes", "3"] in schemas[1] and ["/timing", "trihedron.Timing", "3"] in schemas[1]
 
 
 def test_a_large_map_is_shown_more_seldom():
@@ -254,7 +267,7 @@ def test_a_large_map_is_shown_more_seldom():
     empty = Table.empty({"x": Column("f8")})
     for count, seconds in ((100, [0, 1, 2, 3, 4]), (12_000, [0, 2, 4])):
         points, _ = Table.empty(columns).appended(position_m=np.zeros((count, 3)), alive=np.ones(count, bool))
-        view = View()
+        view = TopicView()
         stamps = [k * 500_000_000 for k in range(10)]
         assert [s for s in stamps if view.wants(Map(0, s, 0, empty, points, empty, empty, empty, empty, empty))] == [s * 10**9 for s in seconds]
 
@@ -275,7 +288,7 @@ def test_a_large_surface_is_shown_coarsely():
     vertices = (0.005 * np.stack([x, y, 0 * x], axis=-1).reshape(-1, 3)).astype(np.float32)
     corner = (400 * y + x)[:-1, :-1].ravel()
     triangles = np.stack([corner, corner + 1, corner + 401], axis=1).astype(np.int32)
-    ((_, message),) = View().messages(loose_mesh(0, vertices, triangles))
+    ((_, message),) = TopicView().messages(loose_mesh(0, vertices, triangles))
     shown = message.entities[0].triangles[0]
     assert 5_000 < len(shown.points) <= MOST_VERTICES and message.ByteSize() < 5_000_000
     corners = np.array([(p.x, p.y) for p in shown.points])[np.array(shown.indices).reshape(-1, 3)]
@@ -289,7 +302,7 @@ def test_errors_the_path_and_the_log_of_poses():
     off = exp_se3(np.array([0, 0.1, 0, 0, 0, np.radians(2.0)]))
     said = [true[0], true[1] @ off, true[2]]
     stamps = 50_000_000 * np.arange(3)
-    view = View(Trajectory(stamps + 1_000_000, np.array([T_truth_world @ T for T in true])))
+    view = TopicView(Trajectory(stamps + 1_000_000, np.array([T_truth_world @ T for T in true])))
     found = []
     for i, (T, status) in enumerate(zip(said, ("ok", "degraded", "lost"))):
         pose = Pose(i, int(stamps[i]), T, np.eye(6), T, -1, np.zeros(3, np.int32), 0, status, "why" if i else "")
@@ -307,7 +320,7 @@ def test_errors_the_path_and_the_log_of_poses():
 @pytest.mark.parametrize("R", [exp_so3(np.array([0.3, -0.2, 0.5])), np.diag([-1.0, -1.0, 1.0])])
 def test_axes_are_arrows_along_them(R):
     axes = ManhattanFrame(0, 0, R[None], np.zeros(1, np.int32), np.zeros((1, 3, 3)), np.ones((1, 3), np.int32), np.zeros((1, 3)), True)
-    ((channel, message),) = View().messages(axes)
+    ((channel, message),) = TopicView().messages(axes)
     assert channel == "/view/axes"
     for axis, arrow in zip(R.T, message.entities[0].arrows):
         q = arrow.pose.orientation
@@ -315,7 +328,7 @@ def test_axes_are_arrows_along_them(R):
 
 
 def test_viewer_messages_are_decoded_by_their_own_schema(tmp_path):
-    view, frame = View(), ToyDataset()(3)
+    view, frame = TopicView(), ToyDataset()(3)
     pixels, points, covariance = (np.zeros((2, 2, *shape), np.float32) for shape in ((2,), (3,), (3, 3)))
     lines = Segments(3, 3000, pixels, points, covariance, np.zeros((2, 0), np.uint8))
     square = np.array([[[-1, -1, 2], [1, -1, 2], [1, 1, 2], [-1, 1, 2], [0, 0, 2]]], np.float32)
@@ -345,3 +358,44 @@ def test_viewer_messages_are_decoded_by_their_own_schema(tmp_path):
     assert len(found["/view/lines"][1].entities[0].lines[0].points) == 4
     assert len(found["/view/planes"][1].entities[0].triangles[0].points) == 6  # the square, without the point inside
     assert found["/view/image"][1].format == "jpeg" and found["/view/image"][1].data[:2] == b"\xff\xd8"
+
+
+def test_images_of_format_5_are_read_and_become_those_of_foxglove(tmp_path, capsys):
+    """Embedded images were values; they are the same after conversion, and as PNG and readings that other tools show."""
+    old, new = Path(__file__).parent / "recordings" / "format_5.mcap", tmp_path / "new.mcap"
+    assert main(["convert", str(old), str(new)]) == 0
+    assert main(["diff", str(old), str(new)]) == 0
+    assert "equal: 3 frames (0..2) of dataset, planes" in capsys.readouterr().out
+    before, after = Recording(old), Recording(new)
+    assert after.topics == before.topics and "/dataset" not in after.channels
+    frames = [list(recording.values("dataset")) for recording in (before, after)]
+    room = Synthetic(length=3, width=64, height=48)
+    for index, (ours, theirs) in enumerate(zip(*frames)):
+        assert (ours.index, ours.stamp_ns, ours.camera) == (theirs.index, theirs.stamp_ns, theirs.camera)
+        for frame in (ours, theirs, after.frame(index)["dataset"]):
+            np.testing.assert_array_equal(frame.color, room(index).color, strict=True)
+            np.testing.assert_array_equal(frame.depth_m, room(index).depth_m, strict=True)
+    (_, data), *_ = after.messages("/dataset/color")
+    read = cv2.imdecode(np.frombuffer(CompressedImage.FromString(data).data, np.uint8), cv2.IMREAD_COLOR)
+    np.testing.assert_array_equal(read[..., ::-1], room(0).color)
+
+
+@pytest.mark.parametrize(
+    ("part", "old", "new", "message"),
+    [
+        (0, b"IDAT", b"IDAX", "frame 0: an image cannot be read: "),
+        (0, struct.pack(">II", 32, 16), b"\x7f" * 8, "frame 0: an image cannot be read: it is no PNG of three channels and eight bits"),
+        (1, b"32FC1", b"16UC1", "frame 0: an image cannot be read: its encoding is '16UC1', not 32FC1"),
+        (1, b"\x1d\x10", b"\x1d\x11", "frame 0: an image cannot be read: "),
+    ],
+)
+def test_damaged_images_are_one_line(part, old, new, message):
+    frame = Synthetic(length=1, width=32, height=16)(0)
+    parts = [one.SerializeToString() for _, one in messages_of(frame)]
+    reference = FrameReference(0, 0, frame.camera)
+    assert (frame_of(reference, *parts, "FILE").color == frame.color).all()
+    assert old in parts[part]
+    parts[part] = parts[part].replace(old, new, 1)
+    with pytest.raises(RecordingError) as error:
+        frame_of(reference, *parts, "FILE")
+    assert str(error.value).startswith(f"FILE: {message}") and str(error.value).endswith("; the file is damaged; record it again")

@@ -143,6 +143,16 @@ def test_a_failing_stage_names_itself_and_keeps_the_rest(tmp_path):
         record(tmp_path / "b.mcap", toy_graph(rotation=ToyRotation(fails_at=6)), replay=Replay(recording, ("rotation",)), frames="6:7")
 
 
+def test_memory_that_runs_out_in_a_stage_has_a_cure_that_helps(tmp_path):
+    class Large(ToyRotation):
+        def __call__(self, keypoints, previous, previous_pose):
+            raise MemoryError("Unable to allocate 9 GiB")
+
+    with pytest.raises(DataError) as error:
+        record(tmp_path / "a.mcap", toy_graph(rotation=Large()))
+    assert str(error.value) == ("memory: ran out (Unable to allocate 9 GiB); give the process more (ulimit -v), fewer threads=N, or smaller images")
+
+
 def test_a_plugin_that_returns_the_wrong_thing_is_named(tmp_path):
     class Wrong(ToyRotation):
         def __call__(self, keypoints, previous, previous_pose):

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from trihedron.pipeline.core.geometry import exp_se3
+from trihedron.pipeline.core.lie import exp_se3
 from trihedron.pipeline.core.types import LOST, OK, Pose, Trajectory
 from trihedron.pipeline.run.status_check import check_status, sigma_auc
 

@@ -13,7 +13,8 @@ from trihedron.pipeline.app.cli import main
 from trihedron.pipeline.core.config import composed, register_configs
 from trihedron.pipeline.core.overrides import list_elements
 from trihedron.pipeline.core.registry import load_plugins
-from trihedron.pipeline.sweep.jobs import key_of
+from trihedron.pipeline.sweep.jobs import key_of, write_job
+from trihedron.pipeline.sweep.progress import Progress
 from trihedron.pipeline.sweep.sweep import words_of_sequence
 from trihedron.tools.benchmark import PROGRAM
 
@@ -77,7 +78,11 @@ def test_a_list_of_data_sets_is_taken_literally(text, elements):
     assert list(composed([f"sequences={text}"]).sequences) == elements
 
 
-@pytest.mark.parametrize("name", ["with blanks", "it's", 'a "b"', "[1] (2) {3}", "a,b", "a=b", "#1", "größe"])
+ALL_AT_ONCE = 'it\'s "b" [1] (2) {3},a=b #1 größe'
+NAMES = ["with blanks", "it's", 'a "b"', "[1] (2) {3}", "a,b", "a=b", "#1", "größe"]
+
+
+@pytest.mark.parametrize("name", [ALL_AT_ONCE, *(pytest.param(name, marks=pytest.mark.slow) for name in NAMES)])
 def test_any_folder_can_be_swept(tmp_path, name):
     folder = tmp_path / name
     assert main(["run", *QUICK, "record.frames=true", f"out={folder}"]) == 0
@@ -85,6 +90,39 @@ def test_any_folder_can_be_swept(tmp_path, name):
     words = ["run", "-m", "hydra/launcher=basic", "outputs=[keypoints]", f'sequences=["{element}"]', f"out={folder}/sweep"]
     assert main(words) == 0
     assert yaml.safe_load((folder / "sweep" / "0" / ".hydra" / "config.yaml").read_text())["dataset"]["path"] == f"{folder}/run.mcap"
+
+
+def test_a_dry_run_lists_jobs_and_what_they_share_and_runs_nothing(tmp_path, capfd):
+    folder, words = tmp_path / "sweep", ["run", "-m", *QUICK[:-1], "outputs=[manhattan]", "manhattan=mean_shift,plane_svd"]
+    assert main([*words, "normals.patch_px=8,10,999", "--dry-run", f"out={folder}"]) == 0
+    said = capfd.readouterr().out.splitlines()
+    assert not folder.exists()
+    assert said[0].split() == ["job", "state", "change", "stages", "shared", "with", "other", "jobs"]
+    rows = {line.split()[0]: line for line in said[1:7]}
+    assert "manhattan=mean_shift normals.patch_px=8 " in rows["0"] and rows["0"].endswith("dataset, normals, lines, segments, planes")
+    assert rows["3"].endswith("  dataset, normals, planes") and "refused" in rows["5"] and "normals.patch_px: 999 is not" in rows["5"]
+    assert said[7] == "6 jobs: 4 to run, 2 refused" and said[8].startswith("20 stages, 11 of them different")
+
+
+def test_a_live_table_shows_what_runs_what_ended_and_why_one_failed(tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(sys.stderr, "isatty", lambda: True)
+    folders = [tmp_path / name for name in "0123"]
+    progress = Progress(folders, ["seed=0", "seed=1", "seed=2", "seed=3"], 2, 6)
+    write_job(folders[0], "", "done")
+    (folders[0] / "metrics.json").write_text(json.dumps({"final": {"ate_rmse_m": 0.00123}}))
+    write_job(folders[1], "", "running")
+    with progress:
+        pass
+    first = capsys.readouterr().err
+    assert first.splitlines()[0].startswith("sweep: 3 of 6 jobs done, 0 s, about ") and first.splitlines()[0].endswith(" left")
+    assert [line.split() for line in first.splitlines()[1:]] == [
+        ["1", "running", "0", "s", "seed=1"],
+        ["0", "done", "0", "s", "ATE", "1.23", "mm", "seed=0"],
+    ]
+    write_job(folders[1], "", "failed", "planes: no plane")
+    progress.__exit__()
+    second = capsys.readouterr().err
+    assert second.startswith("\x1b[3F\x1b[Jtrihedron: planes: no plane\nsweep: 4 of 6 jobs done") and "1  failed" in second
 
 
 def test_a_sweep_goes_on_where_it_was_stopped(tmp_path, capfd):

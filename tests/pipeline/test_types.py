@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from trihedron.pipeline.core.geometry import exp_se3
+from trihedron.pipeline.core.lie import exp_se3
 from trihedron.pipeline.core.types import DEGRADED, LOST, OK, Camera, DepthNoise, Keypoints, LineSegments, Pose
 from trihedron.pipeline.run.poses import Poses
 

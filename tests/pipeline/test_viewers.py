@@ -166,6 +166,7 @@ def test_a_slow_viewer_does_not_slow_the_run() -> None:
     assert stream.logged > 0
 
 
+@pytest.mark.slow
 def test_rerun_has_everything(tmp_path: Path) -> None:
     import rerun
 

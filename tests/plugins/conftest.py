@@ -7,7 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from trihedron.pipeline.core.geometry import exp_so3, invert, tangent_basis, transform, transform_planes
+from trihedron.pipeline.core.geometry import invert, tangent_basis, transform, transform_planes
+from trihedron.pipeline.core.lie import exp_so3
 from trihedron.pipeline.core.types import EXACT_DEPTH, Camera, DepthNoise, Frame, Keypoints, ManhattanFrame, Planes, Segments
 from trihedron.plugins.shared.manhattan_frames_kernels import CUBE
 

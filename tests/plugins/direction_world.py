@@ -1,15 +1,13 @@
 """Directions without surfaces: what the estimators of the Manhattan frame read."""
 
-import importlib
-import pkgutil
 from dataclasses import replace
 
 import numpy as np
 from hypothesis import strategies as st
 
-import trihedron.plugins.manhattan
-from trihedron.pipeline.core.geometry import exp_so3, log_so3, rotation_angle_deg, tangent_basis
-from trihedron.pipeline.core.registry import parameters_of_method, plugins_of
+from trihedron.pipeline.core.geometry import tangent_basis
+from trihedron.pipeline.core.lie import exp_so3, log_so3, rotation_angle_deg
+from trihedron.pipeline.core.registry import parameters_of_method
 from trihedron.pipeline.core.types import ManhattanFrame, Normals, Planes, Segments
 from trihedron.plugins.shared.manhattan_frames_kernels import nearest_equivalent
 
@@ -172,13 +170,6 @@ class Directions:
         normals, segments, planes = value
         inputs = {"normals": normals, "segments": segments, "planes": planes, "previous": previous, "rng": np.random.default_rng(normals.index)}
         return estimator(**{name: inputs[name] for name in parameters_of_method("manhattan", type(estimator))})
-
-    @staticmethod
-    def others(name):
-        """Every other estimator, at its defaults."""
-        for module in pkgutil.iter_modules(trihedron.plugins.manhattan.__path__, "trihedron.plugins.manhattan."):
-            importlib.import_module(module.name)
-        return [plugin() for other, plugin in plugins_of("manhattan").items() if other not in (name, "none")]
 
     @classmethod
     def figures(cls, estimator, kind, count=200, seed=1):

@@ -4,7 +4,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from trihedron.pipeline.core.geometry import exp_se3, invert, pose_matrix, tangent_basis, transform, transform_planes
+from trihedron.pipeline.core.geometry import invert, pose_matrix, tangent_basis, transform, transform_planes
+from trihedron.pipeline.core.lie import exp_se3
 from trihedron.pipeline.core.types import Camera, Frame, Keypoints, Planes, Pose, Rotation, Segments, Tracks, Translation
 from trihedron.plugins.mapping.projection import clip_segments
 from trihedron.plugins.shared.linalg import point_covariance

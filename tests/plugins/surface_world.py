@@ -2,7 +2,8 @@
 
 import numpy as np
 
-from trihedron.pipeline.core.geometry import exp_so3, pose_matrix
+from trihedron.pipeline.core.geometry import pose_matrix
+from trihedron.pipeline.core.lie import exp_so3
 from trihedron.pipeline.core.types import EXACT_DEPTH, OK, Camera, Frame, Planes, Pose, Rotation
 from trihedron.plugins.surface.common_meshes import opposite_half_edges
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import sys
 from dataclasses import replace
 from xml.etree import ElementTree
@@ -12,15 +13,18 @@ import pytest
 
 import trihedron as th
 from trihedron.datasets.simulation.synthetic import Scene, Synthetic
-from trihedron.pipeline.core.building_geometry import wall_pieces
+from trihedron.pipeline.core.building_geometry import door_swing, doors_on, label_place, wall_pieces
 from trihedron.pipeline.core.errors import LibraryError, TrihedronError
 from trihedron.pipeline.core.registry import load_plugins, plugin_class
 from trihedron.pipeline.core.types import OPENING_KINDS, Camera, Frame, Planes, Pose
-from trihedron.pipeline.record.foxglove import View
+from trihedron.pipeline.record.foxglove import TopicView
 from trihedron.pipeline.run.building_files import building_json, floorplan_svg, summary, write_building
 from trihedron.pipeline.run.building_ifc import has_ifc, write_ifc
+from trihedron.plugins.building.common import LEVELS, Face
+from trihedron.plugins.building.common_layout import Edge, _cornered, _ended, _gap, _jambs
 from trihedron.plugins.normals.integral_image import IntegralImage
 from trihedron.plugins.planes.connected_components import ConnectedComponents
+from trihedron.tools.benchmarks import building_benchmark
 from trihedron.tools.benchmarks.building_benchmark import judged
 
 load_plugins()
@@ -109,7 +113,7 @@ def test_the_files_hold_what_was_found_and_open_in_other_readers(offices, tmp_pa
     read = json.loads((tmp_path / "building.json").read_text())
     assert read == building_json(building)
     assert [len(read[key]) for key in ("storeys", "walls", "rooms", "openings")] == [1, len(building.walls_m), 3, 2]
-    assert all(room["support"]["frames"] for room in read["rooms"])
+    assert all(element["support"]["frames"] for key in ("storeys", "walls", "rooms", "openings") for element in read[key])
     ElementTree.fromstring((tmp_path / "floorplan.svg").read_text())
     document = ezdxf.readfile(tmp_path / "floorplan.dxf")
     assert not document.audit().errors
@@ -212,6 +216,24 @@ def test_wardrobes_slanted_walls_and_storeys(scene, name):
         assert len(windows) == 1 and windows[0] == pytest.approx([0.9, 2.0], abs=0.12)
 
 
+def test_a_benchmark_that_was_stopped_goes_on(tmp_path, monkeypatch):
+    began = []
+
+    def measure(words: list[str], out) -> None:
+        began.append(out.name)
+        out.mkdir()
+        (out / "timing.json").write_text("{}")
+
+    monkeypatch.setattr("trihedron.tools.benchmark.measure", measure)
+    (tmp_path / "flat.kinect.1.unfinished").mkdir()
+    for _ in range(2):
+        assert [building_benchmark._tracked("flat", "kinect", seed, 15.0, tmp_path / f"flat.kinect.{seed}").name for seed in range(2)] == [
+            "flat.kinect.0", "flat.kinect.1"
+        ]  # fmt: skip
+    assert began == ["flat.kinect.0.unfinished", "flat.kinect.1.unfinished"]
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["flat.kinect.0", "flat.kinect.1"]
+
+
 def test_a_preview_is_a_plan_of_some_views(walk, offices):
     plugin = plugin_class("building", "manhattan_layout")()
     state = plugin.start()
@@ -223,6 +245,7 @@ def test_a_preview_is_a_plan_of_some_views(walk, offices):
     assert len(preview.areas_m2) == 3 and preview.areas_m2.sum() == pytest.approx(offices["manhattan_layout"].areas_m2.sum(), rel=0.05)
 
 
+@pytest.mark.slow
 def test_slam_gives_the_plan_so_far():
     room = Synthetic(length=4, width=160, height=120)
     camera = room(0).camera
@@ -237,7 +260,7 @@ def test_slam_gives_the_plan_so_far():
 
 
 def test_viewers_get_a_layer(offices):
-    messages = dict(View().messages(offices["manhattan_layout"]))
+    messages = dict(TopicView().messages(offices["manhattan_layout"]))
     (entity,) = messages["/view/building"].entities
     assert entity.frame_id == "world" and len(entity.triangles) >= 2
 
@@ -256,6 +279,51 @@ def test_a_plan_of_next_to_nothing_says_so(name):
     wall = folded(name, [flat(np.full((120, 160), 2.0))])
     assert wall.note == "no floor was seen; no ceiling was seen; 1 wall seen, which bounds no room"
     assert len(wall.areas_m2) == 0 and "1 wall seen" in floorplan_svg(wall)
+    assert len(wall.walls_m) == 1 and np.linalg.norm(np.diff(wall.walls_m[0], axis=0)) == pytest.approx(2.44, abs=0.06)  # all that is in view
+
+
+def test_a_crossed_stretch_is_no_opening_where_the_wall_was_read():
+    wall = np.arange(0.0, 4.0, 0.01)
+    assert _gap(1.0, 2.0, wall) is None  # rays go through by their noise
+    door = wall[(wall < 1.2) | (wall > 2.1)]
+    assert _gap(1.0, 2.6, door) == pytest.approx((1.2, 2.1), abs=0.06)
+    assert _gap(1.2, 2.1, np.empty(0)) == pytest.approx((1.2, 2.1))
+
+
+def test_a_jamb_that_was_hardly_read_does_not_close_an_opening():
+    beside = np.concatenate([np.arange(0.0, 1.2, 0.001), np.full(40, 2.15)])
+    assert _jambs(1.2, 1.95, beside)[:2] == pytest.approx((1.2, 1.95), abs=0.02)
+
+
+def test_a_wall_ends_with_its_readings_where_nothing_bounds_the_room():
+    count = np.zeros((20, LEVELS), np.int32)
+    count[:12, 5] = 3  # 0.6 m of 1 m
+    face = Face(np.array([0.0, 1.0]), 0.0, 0.0, count, count.any(axis=1), np.empty(0, np.int64))
+    corners = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]])
+    normals = np.array([[0.0, 1.0], [-1.0, 0.0], [0.0, -1.0], [1.0, 0.0]])
+    ring = [Edge(n, float(p @ n), face if k == 0 else None, p, q) for k, (n, p, q) in enumerate(zip(normals, corners, np.roll(corners, -1, axis=0)))]
+    loop = _ended(ring, [face])
+    _cornered(loop)
+    assert [edge.face is face for edge in loop] == [True, False, False, False, False]
+    assert np.array([edge.begin for edge in loop]) == pytest.approx(np.insert(corners, 1, [0.6, 0.0], axis=0))
+    behind = Face(np.array([1.0, 0.0]), 1.1, -1.5, np.ones((40, LEVELS), np.int32), np.ones(40, np.bool_), np.empty(0, np.int64))
+    ring[0] = Edge(normals[0], 0.0, face, corners[0], corners[1])
+    assert len(_ended(ring, [face, behind])) == 4  # the wall there was seen from behind
+
+
+def test_names_and_lengths_are_beside_the_swings_of_doors(offices):
+    import shapely
+
+    building = offices["manhattan_layout"]
+    swings = [shapely.Polygon(door_swing(building, door)) for door in doors_on(building, 0)]
+    assert len(swings) == 2 and all(swing.area == pytest.approx(0.81, abs=0.1) for swing in swings)
+    assert not any(shapely.contains_xy(swing, *label_place(building, room)) for swing in swings for room in range(3))
+    assert len(re.findall('class="length"[^>]*>[0-9]+[.]', floorplan_svg(building))) >= 12
+
+
+def test_a_room_seen_in_part_has_no_standard_deviation_on_its_plan(walk):
+    building = folded("manhattan_layout", walk[1][:12])
+    assert "m² seen" in floorplan_svg(building) and "±" not in floorplan_svg(building)
 
 
 def test_a_lost_camera_shows_nothing():

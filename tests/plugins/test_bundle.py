@@ -7,7 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from trihedron.pipeline.core.geometry import exp_se3, invert, log_se3, pose_matrix, tangent_basis
+from trihedron.pipeline.core.geometry import invert, pose_matrix, tangent_basis
+from trihedron.pipeline.core.lie import exp_se3, log_se3
 from trihedron.pipeline.core.table import Table
 from trihedron.plugins.bundle.colmap import Colmap, solve_colmap
 from trihedron.plugins.bundle.common import bundle_problem, bundle_window

@@ -7,7 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from trihedron.pipeline.core.geometry import exp_se3, transform, transform_planes
+from trihedron.pipeline.core.geometry import transform, transform_planes
+from trihedron.pipeline.core.lie import exp_se3
 from trihedron.pipeline.core.table import CHUNK
 from trihedron.plugins.mapping import plane_fusion
 from trihedron.plugins.mapping.correction import apply_correction

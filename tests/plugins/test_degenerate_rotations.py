@@ -7,7 +7,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from trihedron.pipeline.core.geometry import exp_so3, pose_matrix
+from trihedron.pipeline.core.geometry import pose_matrix
+from trihedron.pipeline.core.lie import exp_so3
 from trihedron.pipeline.core.registry import load_plugins, parameters_of_method, plugins_of
 from trihedron.pipeline.core.types import DEGRADED, LOST, OK, Frame, Pose
 from trihedron.plugins.tracks.projection import Projection

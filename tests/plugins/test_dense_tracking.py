@@ -8,7 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from trihedron.pipeline.core.geometry import exp_se3, invert, rotation_angle_deg, transform
+from trihedron.pipeline.core.geometry import invert, transform
+from trihedron.pipeline.core.lie import exp_se3, rotation_angle_deg
 from trihedron.pipeline.core.types import DepthNoise
 from trihedron.plugins.model.surfels import SurfelModel
 from trihedron.plugins.model.tsdf import TsdfModel

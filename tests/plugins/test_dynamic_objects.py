@@ -7,7 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from trihedron.pipeline.core.geometry import exp_se3, invert, log_se3
+from trihedron.pipeline.core.geometry import invert
+from trihedron.pipeline.core.lie import exp_se3, log_se3
 from trihedron.plugins.matches.local_map import LocalMap
 from trihedron.plugins.pose.dynamic_objects import (
     MIN_POINTS,

@@ -3,7 +3,6 @@
 import cv2
 import numpy as np
 import pytest
-from stopwatch import fastest_ms
 
 from trihedron.plugins.keypoints.orb_kernels import fast_corners
 
@@ -41,11 +40,3 @@ def test_corners_at_a_higher_threshold_are_those_of_that_strength():
 @pytest.mark.parametrize("shape", [(1, 1), (7, 200), (200, 9)])
 def test_an_image_too_small_has_none(shape):
     assert len(fast_corners(np.zeros(shape, np.uint8), 7, MARGIN)[0]) == 0
-
-
-def test_it_takes_less_time_than_opencv_s():
-    image = np.kron(images()["blurred"], np.ones((5, 5), np.uint8))
-    detector = cv2.FastFeatureDetector_create(7, True)
-    ours, theirs = fastest_ms(lambda: fast_corners(image, 7, MARGIN)), fastest_ms(lambda: detector.detect(image))
-    print(f"FAST at threshold 7 on {image.shape[1]} × {image.shape[0]}: {ours:.2f} ms, OpenCV's {theirs:.2f} ms")
-    assert ours < theirs

@@ -10,7 +10,8 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from trihedron.datasets.simulation.synthetic import Synthetic
-from trihedron.pipeline.core.geometry import invert, rotation_angle_deg
+from trihedron.pipeline.core.geometry import invert
+from trihedron.pipeline.core.lie import rotation_angle_deg
 from trihedron.pipeline.core.types import Camera
 from trihedron.plugins.keypoints.opencv_orb import OpenCvOrb
 from trihedron.plugins.keypoints.sift import Sift
@@ -43,6 +44,7 @@ def test_colmap_recovers_a_pose_among_outliers_with_pixel_centres_at_integers():
     assert absolute_pose(points[:3], pixels[:3], CAMERA, 4.0, seed=3) is None
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("keypoints", "median_deg"), [("opencv_orb", 0.6), ("sift", 0.1)])
 def test_colmap_tracks_with_descriptors_of_either_metric(keypoints, median_deg):
     """OpenCV's ORB places corners to whole pixels of a pyramid level, several of the image."""

@@ -3,7 +3,6 @@
 import cv2
 import numpy as np
 import pytest
-from stopwatch import fastest_ms
 
 from trihedron.datasets.simulation.synthetic import Synthetic
 from trihedron.plugins.lines.lsd_kernels import line_support_segments
@@ -57,11 +56,3 @@ def test_nothing_in_nothing(image):
 def test_noise_draws_almost_nothing():
     noise = np.random.default_rng(1).normal(120.0, 20.0, (240, 320)).clip(0, 255).astype(np.uint8)
     assert len(segments(noise)) <= 5  # OpenCV's finds as few
-
-
-def test_it_takes_less_time_than_opencv_s():
-    image = cv2.resize(Synthetic()(0).gray, (320, 240), interpolation=cv2.INTER_AREA)
-    detector = cv2.createLineSegmentDetector(cv2.LSD_REFINE_STD, 1.0)
-    ours, theirs = fastest_ms(lambda: segments(image)), fastest_ms(lambda: detector.detect(image))
-    print(f"LSD at half size: {ours:.2f} ms, OpenCV's {theirs:.2f} ms")
-    assert ours < 0.6 * theirs

@@ -7,7 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from trihedron.pipeline.core.geometry import exp_se3, invert, pose_matrix
+from trihedron.pipeline.core.geometry import invert, pose_matrix
+from trihedron.pipeline.core.lie import exp_se3
 from trihedron.pipeline.core.types import Frame, Pose
 from trihedron.plugins.loop.appearance import AppearanceLoop
 from trihedron.plugins.loop.common_pose_graph import Edges, solve_pose_graph

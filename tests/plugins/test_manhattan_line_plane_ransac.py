@@ -1,6 +1,5 @@
 """line_plane_ransac: one plane and one line suffice; more of either is agreed upon."""
 
-import time
 from dataclasses import replace
 
 import numpy as np
@@ -8,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from trihedron.pipeline.core.geometry import exp_so3, rotation_angle_deg
+from trihedron.pipeline.core.lie import exp_so3, rotation_angle_deg
 from trihedron.plugins.manhattan.line_plane_ransac import LinePlaneRansac
 
 KINDS = [
@@ -59,12 +58,6 @@ def test_its_characteristic(directions):
     one_plane_and_one_line(LinePlaneRansac(), directions)
 
 
-def test_others_lack_it(directions):
-    for other in directions.others("line_plane_ransac"):
-        with pytest.raises(AssertionError):
-            one_plane_and_one_line(other, directions)
-
-
 def test_the_line_gives_its_bearing_not_its_depth(directions):
     """The depth of the line's ends is off by 2 %, as a real sensor's: its direction is off by degrees, its interpretation plane does not notice."""
     rng = np.random.default_rng(4)
@@ -113,17 +106,6 @@ def test_same_draws_same_bytes_other_draws_same_frame(directions):
     found = [LinePlaneRansac()(*value, None, np.random.default_rng(seed)) for seed in (0, 0, 1, 2)]
     assert found[0].rotations.tobytes() == found[1].rotations.tobytes()
     assert all(directions.error_deg(one, found[0].rotations[0]) < 0.1 for one in found)
-
-
-def test_it_is_fast(directions):
-    rng = np.random.default_rng(7)
-    value = directions.room(rng, directions.rotation(rng), lines=(30, 30, 30), strays=20)
-    first, times = directions.estimate(LinePlaneRansac(), value), []
-    for _ in range(21):
-        start = time.perf_counter()
-        directions.estimate(LinePlaneRansac(), value, first)
-        times.append(time.perf_counter() - start)
-    assert min(times) < 3e-3
 
 
 @settings(max_examples=80, deadline=None, derandomize=True)

@@ -5,7 +5,8 @@ import dataclasses
 import numpy as np
 import pytest
 
-from trihedron.pipeline.core.geometry import exp_so3, log_so3, pose_matrix, transform_planes
+from trihedron.pipeline.core.geometry import pose_matrix, transform_planes
+from trihedron.pipeline.core.lie import exp_so3, log_so3
 from trihedron.pipeline.core.types import Camera, Frame, Pose
 from trihedron.plugins.loop.appearance import AppearanceLoop
 from trihedron.plugins.loop.common_manhattan_prior import estimate_manhattan_prior

@@ -7,14 +7,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from trihedron.pipeline.core.geometry import exp_se3, invert, tangent_basis, transform, transform_planes
+from trihedron.pipeline.core.geometry import invert, tangent_basis, transform, transform_planes
+from trihedron.pipeline.core.lie import exp_se3
 from trihedron.plugins.map.covisibility import Covisibility
 from trihedron.plugins.map.none import NoMap
 from trihedron.plugins.mapping import plane_fusion
 from trihedron.plugins.mapping.landmark_kernels import fuse_lines
+from trihedron.plugins.matches.local_map import LocalMap
 
 sys.path.insert(0, str(Path(__file__).parent))
-from landmark_world import World, camera_at
+from landmark_world import World, camera_at, rotation_of, translation_of
 from map_steps import EVERY, TABLES, pose_of, rows_of_world, step, walk
 
 
@@ -52,6 +54,18 @@ def test_a_keyframe_is_made_when(at, inliers, why):
     map = step(Covisibility(), world, None, 0)
     after = step(Covisibility(), world, map, 9, at=at, inliers=inliers)
     assert after is not None and len(after.keyframes) == 2 and after.revision == 2, why
+
+
+@pytest.mark.parametrize("inliers, sigma_m", [((5, 0, 0), 1e-5), ((12, 0, 1), 0.1)])
+def test_a_keyframe_is_made_at_once_where_landmarks_run_out(inliers, sigma_m):
+    """Frames far apart: three frames later nothing of the newest keyframe would be in view, also where the pose is in doubt."""
+    world = World()
+    map = step(Covisibility(), world, None, 0)
+    pose = dataclasses.replace(pose_of(camera_at(20), 1, inliers=inliers), covariance=sigma_m**2 * np.eye(6), reference=0)
+    features, frame = world.features(camera_at(20), 1), world.frame(1)
+    matches = LocalMap()(frame.camera, rotation_of(camera_at(20), 1), translation_of(camera_at(20), 1), *features, map, None)
+    after = Covisibility()(frame, pose, *features, matches, map, None, None, None)
+    assert after is not None and len(after.keyframes) == 2
 
 
 def test_a_wall_that_is_new_makes_a_keyframe():

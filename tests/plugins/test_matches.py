@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from trihedron.pipeline.core.geometry import exp_se3
+from trihedron.pipeline.core.lie import exp_se3
 from trihedron.pipeline.core.types import Keypoints, Pose
 from trihedron.plugins.map.covisibility import Covisibility
 from trihedron.plugins.mapping.covisibility_graph import local_window, observed_by

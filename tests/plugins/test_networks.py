@@ -23,6 +23,7 @@ ROOM = ["dataset.width=320", "dataset.height=240", "dataset.length=20"]
 FRAME = Synthetic(length=2, width=320, height=240)(0)
 
 
+@pytest.mark.slow
 def test_the_room_is_tracked_by_learned_features(tmp_path):
     """Corners by convolutions and nearest neighbours; the replay demands the same file."""
     corners, matcher = corner_detector(tmp_path / "corners.onnx"), nearest_matcher(tmp_path / "matcher.onnx")
@@ -36,6 +37,7 @@ def test_the_room_is_tracked_by_learned_features(tmp_path):
     assert len(first) == 20 and all(np.array_equal(a.descriptors, b.descriptors) for a, b in zip(first, second))
 
 
+@pytest.mark.slow
 def test_a_replay_demands_the_same_network(tmp_path, capsys):
     corners = corner_detector(tmp_path / "corners.onnx")
     first = hashlib.sha256(corners.read_bytes()).hexdigest()

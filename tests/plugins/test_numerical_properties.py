@@ -9,6 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from trihedron.pipeline.core import geometry as g
+from trihedron.pipeline.core import lie
 from trihedron.plugins.bundle import local_window_kernels
 from trihedron.plugins.bundle.local_window_kernels import line_basis
 from trihedron.plugins.loop import common_pose_graph
@@ -36,7 +37,7 @@ def direction(rng):
 
 
 def pose(rng, angle, scale_m):
-    return g.pose_matrix(g.exp_so3(angle * direction(rng)), scale_m * rng.normal(size=3))
+    return g.pose_matrix(lie.exp_so3(angle * direction(rng)), scale_m * rng.normal(size=3))
 
 
 def parts(T):
@@ -52,12 +53,12 @@ def agree(analytic, by_differences, size):
 @given(numbers, angles, scales_m)
 def test_exp_and_log_undo_each_other(rng, angle, scale_m):
     xi = np.concatenate([scale_m * rng.normal(size=3), angle * direction(rng)])
-    T = g.exp_se3(xi)
+    T = lie.exp_se3(xi)
     assert np.abs(T[:3, :3] @ T[:3, :3].T - np.eye(3)).max() < 1e-14 and np.linalg.det(T[:3, :3]) > 0.0
-    assert np.abs(g.exp_so3(g.log_so3(T[:3, :3])) - T[:3, :3]).max() < 1e-13  # near 180° the vector itself may be the other one
-    assert np.allclose(g.exp_se3(g.log_se3(T)), T, rtol=0.0, atol=1e-9 * max(1.0, scale_m))
+    assert np.abs(lie.exp_so3(lie.log_so3(T[:3, :3])) - T[:3, :3]).max() < 1e-13  # near 180° the vector itself may be the other one
+    assert np.allclose(lie.exp_se3(lie.log_se3(T)), T, rtol=0.0, atol=1e-9 * max(1.0, scale_m))
     if angle < 3.0:
-        assert np.allclose(g.log_se3(T), xi, rtol=1e-9, atol=1e-12)
+        assert np.allclose(lie.log_se3(T), xi, rtol=1e-9, atol=1e-12)
 
 
 @MANY
@@ -88,7 +89,7 @@ def test_a_point_s_derivatives(rng, angle, scale_m, with_depth):
     residual(T)
     pose_optimizer_kernels.pose_jacobian(D, 3, g.transform(g.invert(T), world), J)
     step = np.array([depth, depth, depth, 1.0, 1.0, 1.0])
-    assert agree(J * step, numeric(lambda d: residual(T @ g.exp_se3(step * d)), 6), 1e3)
+    assert agree(J * step, numeric(lambda d: residual(T @ lie.exp_se3(step * d)), 6), 1e3)
     W = np.diag([1.0, 0.7, depth**2 if with_depth else 0.0])
     W[0, 1] = W[1, 0] = 0.2
     one, none = np.ones(1), (np.empty((0, 2, 2)), np.empty((0, 2, 2)), np.empty((0, 3, 3)))
@@ -125,7 +126,7 @@ def test_a_line_s_derivatives(rng, angle, scale_m):
     for residual, unit, size in ((image, 1.0, 1e3), (depths, depth, 1.0)):
         residual(T, line)
         by_pose, by_line = J[:6] * step / unit, J[6:] * depth / unit
-        assert agree(by_pose, numeric(lambda d, f=residual: f(T @ g.exp_se3(step * d), line), 6)[0], size)
+        assert agree(by_pose, numeric(lambda d, f=residual: f(T @ lie.exp_se3(step * d), line), 6)[0], size)
         assert agree(by_line, numeric(lambda d, f=residual: f(T, line + depth * np.stack([N @ d[:2], N @ d[2:]])), 4)[0], size)
 
 
@@ -147,14 +148,14 @@ def test_a_plane_s_derivatives(rng, angle, scale_m, kind):
     J, step = np.empty((3, 6)), np.repeat([scale_m, 1.0], 3)
     residual(T, J)
     found = J[:rows] * step / np.array([1.0, 1.0, scale_m])[:rows, None]
-    assert agree(found, numeric(lambda d: residual(T @ g.exp_se3(step * d)), 6), 1.0)
+    assert agree(found, numeric(lambda d: residual(T @ lie.exp_se3(step * d)), 6), 1.0)
 
 
 @MANY
 @given(numbers, angles, scales_m)
 def test_the_gradient_of_the_motion_between_two_frames(rng, angle, scale_m):
     """Places and planes, as `solve_motion` weighs them; without robust weights (a very large scale)."""
-    R, t = g.exp_so3(angle * direction(rng)), scale_m * rng.normal(size=3)
+    R, t = lie.exp_so3(angle * direction(rng)), scale_m * rng.normal(size=3)
     before = scale_m * rng.normal(size=(4, 3))
     after = before @ R.T + t + 0.05 * scale_m * rng.normal(size=(4, 3))
     A = rng.normal(size=(4, 3, 3))
@@ -166,7 +167,7 @@ def test_the_gradient_of_the_motion_between_two_frames(rng, angle, scale_m):
     relative_motion_kernels._normal_equations(terms, R, t, 1e30, H, gradient)
 
     def cost(d):
-        R_there = np.ascontiguousarray(g.exp_so3(d[:3]) @ R)
+        R_there = np.ascontiguousarray(lie.exp_so3(d[:3]) @ R)
         return np.array([0.5 * relative_motion_kernels._squared_distances(terms, R_there, t + scale_m * d[3:]).sum()])
 
     step = np.repeat([1.0, scale_m], 3)
@@ -179,7 +180,7 @@ def test_the_gradient_of_a_graph_of_poses(rng, angle, scale_m):
     poses = np.array([pose(rng, angle, scale_m) for _ in range(3)])
     noise = np.repeat([1e-5 * scale_m, 1e-5], 3)  # the derivatives are those of small errors
     pairs = np.array([[0, 1], [1, 2], [0, 2]], np.int32)
-    measured = np.array([g.invert(poses[a]) @ poses[b] @ g.exp_se3(noise * rng.normal(size=6)) for a, b in pairs])
+    measured = np.array([g.invert(poses[a]) @ poses[b] @ lie.exp_se3(noise * rng.normal(size=6)) for a, b in pairs])
     information = np.tile(np.diag(noise**-2.0), (3, 1, 1))
     edges = common_pose_graph.Edges(pairs, measured, information)
     gradient = common_pose_graph._normal_equations(poses, edges)[2].reshape(3, 6)
@@ -209,7 +210,7 @@ PRIOR = np.diag(np.repeat([0.05**-2, 0.03**-2], 3))
 def test_where_the_world_begins_changes_neither_the_cost_nor_the_motion(rng, angle, scale_m):
     """Gauge invariance of tracking: the same camera and points seen from a world that is turned and moved, up to a kilometre."""
     T, G = pose(rng, 0.5, 1.0), pose(rng, angle, scale_m)
-    terms, start = measured(rng, T, 30), T @ g.exp_se3(0.01 * rng.normal(size=6))
+    terms, start = measured(rng, T, 30), T @ lie.exp_se3(0.01 * rng.normal(size=6))
     moved = terms._replace(positions_m=g.transform(G, terms.positions_m))  # their covariance is round
     one, other = solve_pose(start, CAMERA, start, PRIOR, terms), solve_pose(G @ start, CAMERA, G @ start, PRIOR, moved)
     assert np.allclose(other.T_world_camera, G @ one.T_world_camera, atol=1e-7 * max(1.0, scale_m))
@@ -227,7 +228,7 @@ def test_what_the_data_do_not_see_stays_at_the_prior(rng, angle, count):
     seen = local + 0.01 * np.array([0.0, 0.0, 0.0, 1.0])
     planes = PlaneTerms(np.full(count, SAME, np.int32), g.transform_planes(T, local), tight, seen, tight)
     found = solve_pose(T, CAMERA, T, PRIOR, planes=planes)
-    moved = g.log_se3(g.invert(T) @ found.T_world_camera)
+    moved = lie.log_se3(g.invert(T) @ found.T_world_camera)
     blind = np.linalg.svd(local[:, :3])[2][count:] if count else np.eye(3)
     assert np.abs(blind @ moved[:3]).max() < 1e-5  # the null space of the walls' normals
     assert np.allclose(np.einsum("ki,ij,kj->k", blind, found.covariance[:3, :3], blind), 0.05**2, rtol=1e-3)

@@ -3,10 +3,11 @@
 import numpy as np
 import pytest
 
-from trihedron.pipeline.core.geometry import exp_se3, exp_so3, invert, log_se3, pose_matrix, tangent_basis, transform, transform_planes
+from trihedron.pipeline.core.geometry import invert, pose_matrix, tangent_basis, transform, transform_planes
+from trihedron.pipeline.core.lie import exp_se3, exp_so3, log_se3
+from trihedron.pipeline.core.linalg_kernels import tangent_columns
 from trihedron.pipeline.core.types import Camera
 from trihedron.plugins.shared import pose_optimizer_kernels as terms_kernels
-from trihedron.plugins.shared.linalg_kernels import tangent_columns
 from trihedron.plugins.shared.pose_optimizer import NO_LINES, NO_PLANES, NO_POINTS, classify_terms, first_step, solve_pose
 from trihedron.plugins.shared.pose_optimizer_kernels import PARALLEL, PERPENDICULAR, SAME, LineTerms, PlaneTerms, PointTerms
 

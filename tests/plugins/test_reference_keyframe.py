@@ -7,9 +7,10 @@ import pytest
 from hydra import compose, initialize_config_module
 
 from trihedron.pipeline.core.config import graph_of, register_configs
-from trihedron.pipeline.core.geometry import exp_se3, exp_so3, invert, log_se3, pose_matrix, rotation_angle_deg, transform, transform_planes
+from trihedron.pipeline.core.geometry import invert, pose_matrix, transform, transform_planes
+from trihedron.pipeline.core.lie import exp_se3, exp_so3, log_se3, rotation_angle_deg
 from trihedron.pipeline.core.registry import load_plugins
-from trihedron.pipeline.core.types import LOST, Correction, Map, Pose, Rotation
+from trihedron.pipeline.core.types import CALIBRATION, LOST, Correction, Map, Pose, Rotation
 from trihedron.pipeline.run.results import causal_trajectory, final_trajectory
 from trihedron.pipeline.run.runner import Runner
 from trihedron.plugins.mapping.landmarks import KEYFRAMES, empty_map
@@ -24,7 +25,7 @@ def map_with(*poses):
     map = empty_map(0, 0, 32, 32, 8)
     keyframes, _ = map.keyframes.appended(
         index=np.arange(n), stamp_ns=np.arange(n), T_world_camera=np.array(poses), covariance=np.tile(np.eye(6), (n, 1, 1)),
-        world_covariance=np.tile(np.eye(6), (n, 1, 1)),
+        world_covariance=np.tile(np.eye(6), (n, 1, 1)), sensitivity=np.zeros((n, 6, CALIBRATION)), twist=np.zeros((n, 6)),
         intrinsics=np.ones((n, 4)), submap=np.zeros(n), points=empty, lines=empty, planes=empty, alive=np.ones(n, np.bool_),
     )  # fmt: skip
     assert set(KEYFRAMES) == set(keyframes.schema)
@@ -47,6 +48,17 @@ def test_a_pose_follows_its_keyframe_and_is_untouched_otherwise():
     assert np.array_equal(moved.T_reference_camera, pose.T_reference_camera)
     unborn = replace(pose, reference=-1)
     assert transform_to_map(unborn, map_with(SHIFT @ first, second)) is unborn
+
+
+def test_rounding_does_not_grow_from_keyframe_to_keyframe():
+    """A hundred keyframes, each the pose of a camera that follows the keyframe before, which a correction moves: the transpose as inverse doubles the
+    rounding of a rotation each time."""
+    rng, T = np.random.default_rng(0), exp_se3(np.ones(6))
+    T[:3, :3] *= 1.0 + 1e-13
+    for _ in range(100):
+        pose = pose_against(T, T @ exp_se3(rng.normal(size=6)), reference=0)
+        T = transform_to_map(pose, map_with(SHIFT @ T)).T_world_camera
+    assert np.abs(T[:3, :3] @ T[:3, :3].T - np.eye(3)).max() < 1e-11
 
 
 def test_the_manhattan_frames_turn_with_the_camera():

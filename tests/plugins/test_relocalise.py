@@ -7,10 +7,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from trihedron.pipeline.core.geometry import exp_se3, exp_so3, invert, pose_matrix, rotation_angle_deg
+from trihedron.pipeline.core.geometry import invert, pose_matrix
+from trihedron.pipeline.core.lie import exp_se3, exp_so3, rotation_angle_deg
 from trihedron.pipeline.core.types import LOST, Pose
 from trihedron.plugins.map.covisibility import Covisibility
 from trihedron.plugins.matches.local_map import LocalMap
+from trihedron.plugins.places.verification import least_share
 from trihedron.plugins.relocalise.features import Features
 
 sys.path.insert(0, str(Path(__file__).parent))
@@ -170,6 +172,26 @@ def test_a_place_where_most_of_what_should_be_seen_is_not_is_refused(world, map)
     assert recognise(other, map, camera_at(31), 800, stage=asked) is None
     found = recognise(other, map, camera_at(31), 800, stage=dataclasses.replace(asked, min_found=0.0))
     assert found is not None and error(found, camera_at(31))[0] < 0.05
+
+
+@pytest.mark.parametrize("strange", ["keypoints", "segments"])
+def test_a_place_where_one_kind_of_detail_is_unknown_is_refused(world, map, strange):
+    """Walls and lines as in the map with other points are another room; the same points with other lines are a pattern that repeats."""
+    T, other = camera_at(30), World(2000, 1, marks=400)
+    keypoints, segments, planes = world.features(T, 40)
+    inliers = np.array([300, 60, 5], np.int32)
+    inliers[0 if strange == "keypoints" else 1] = 1
+    matches = dataclasses.replace(
+        LocalMap()(world.frame(40).camera, rotation_of(T, 40), translation_of(T, 40), keypoints, segments, planes, map, None),
+        visible_points=np.arange(400, dtype=np.int32), visible_lines=np.arange(80, dtype=np.int32),
+    )  # fmt: skip
+    assert least_share(inliers, matches, keypoints) < Features().min_each < least_share(np.array([300, 60, 5]), matches, keypoints)
+    few = dataclasses.replace(matches, visible_points=np.arange(99, dtype=np.int32), visible_lines=np.arange(29, dtype=np.int32))
+    assert least_share(inliers, few, keypoints) == 1.0
+    if strange == "keypoints":
+        frame, previous = world.seen(T, 40), pose_of(np.eye(4), 39, LOST)
+        shown = other.features(T, 40)[0], segments, planes
+        assert Features()(frame, manhattan_of(T, 40), *shown, map, previous, np.random.default_rng(0)).status == LOST
 
 
 def test_it_runs_for_a_lost_camera_only(world, map):

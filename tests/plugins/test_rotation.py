@@ -5,7 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from trihedron.pipeline.core.geometry import exp_so3, log_so3, pose_matrix, rotation_angle_deg
+from trihedron.pipeline.core.geometry import pose_matrix
+from trihedron.pipeline.core.lie import exp_so3, log_so3, rotation_angle_deg
 from trihedron.pipeline.core.types import LOST, OK, Frame, Pose
 from trihedron.plugins.rotation.common import KnownFrames
 from trihedron.plugins.rotation.constant_velocity import ConstantVelocity

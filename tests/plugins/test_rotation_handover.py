@@ -8,7 +8,7 @@ from hydra.core.config_store import ConfigStore
 
 from trihedron.pipeline.app.cli import main
 from trihedron.pipeline.core import registry
-from trihedron.pipeline.core.geometry import log_so3
+from trihedron.pipeline.core.lie import log_so3
 from trihedron.pipeline.core.types import ManhattanFrame, Normals, Planes, Segments
 from trihedron.pipeline.record.reader import Recording
 from trihedron.pipeline.record.trajectories import attached_truth

@@ -2,10 +2,9 @@
 
 import cv2
 import numpy as np
-from stopwatch import fastest_ms
 
 from trihedron.plugins.keypoints.orb import LONGEST_PX, brief_tests, image_pyramid
-from trihedron.plugins.keypoints.orb_kernels import BITS, REACH_PX, WINDOW_PX, oriented_corners, steered_brief
+from trihedron.plugins.keypoints.orb_kernels import BITS, REACH_PX, WINDOW_PX, steered_brief
 
 TESTS = brief_tests()
 MARGIN = 19
@@ -62,14 +61,3 @@ def test_noise_changes_fewer_bits_than_another_place():
     cells, here = described(image)
     again, other = described(noisy, cells=cells)[1], described(image, cells=cells[::-1].copy())[1]
     assert differing(here, again).max() < 50 < np.percentile(differing(here, other), 5)
-
-
-def test_they_take_less_time_than_opencv_s():
-    image = cv2.resize(texture(size=320), (640, 480))
-    pyramid = image_pyramid(image, 1.2, 8, 2 * MARGIN + 1)
-    cells, levels, angles = oriented_corners(pyramid, 20, 7, MARGIN, 64, 1000, 1.2 ** (-2.0 * np.arange(8)))
-    points = [cv2.KeyPoint(x * 1.2**o, y * 1.2**o, 31 * 1.2**o, a, 1.0, o) for (x, y), o, a in zip(cells.tolist(), levels.tolist(), angles.tolist())]
-    orb = cv2.ORB_create(1000, 1.2, 8, edgeThreshold=MARGIN)
-    ours, theirs = fastest_ms(lambda: steered_brief(pyramid, cells, levels, angles, TESTS)), fastest_ms(lambda: orb.compute(image, points))
-    print(f"{len(cells)} descriptors on 8 levels: {ours:.2f} ms, OpenCV's with its pyramid {theirs:.2f} ms")
-    assert len(cells) > 500 and ours < theirs

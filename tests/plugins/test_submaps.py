@@ -7,7 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from trihedron.pipeline.core.geometry import exp_se3, invert, transform
+from trihedron.pipeline.core.geometry import invert, transform
+from trihedron.pipeline.core.lie import exp_se3
 from trihedron.pipeline.core.types import Pose
 from trihedron.pipeline.run.accounting import Result
 from trihedron.pipeline.run.poses import Poses
@@ -19,6 +20,7 @@ from trihedron.plugins.pose.refine import Refine
 
 sys.path.insert(0, str(Path(__file__).parent))
 from landmark_world import World, camera_at, rotation_of, translation_of
+from map_steps import correction
 
 EVERY = Covisibility(min_frames=1, max_frames=1, min_shift=1e-6, min_turn_deg=1e-6)
 AWAY = exp_se3(np.array([3.0, -1.0, 0.5, 0.1, 1.2, -0.3]))  # from the world to that of the sub-map
@@ -32,10 +34,10 @@ def seen(world, map, index, step, T, **more):
     """The map after the frame seen at `step`, whose pose is said as T."""
     features = world.features(camera_at(step), index)
     matches = LocalMap()(world.frame(index).camera, rotation_of(T, index), translation_of(T, index), *features, map, None) if map else None
-    relocalise, reference = more.pop("recognised", None), more.get("reference", -1)
+    relocalise, bundle, reference = more.pop("recognised", None), more.pop("bundle", None), more.get("reference", -1)
     if reference >= 0:
         more["T_reference_camera"] = invert(map.keyframes.column("T_world_camera")[reference]) @ T
-    return EVERY(world.frame(index), pose_of(T, index, **more), *features, matches, map, None, None, relocalise)
+    return EVERY(world.frame(index), pose_of(T, index, **more), *features, matches, map, bundle, None, relocalise)
 
 
 @pytest.fixture
@@ -78,6 +80,18 @@ def test_a_sub_map_is_merged_where_the_camera_is_recognised(both):
     expected = transform(invert(AWAY), map.points.rows("position_m", moved))
     assert np.allclose(after.points.rows("position_m", moved)[untouched], expected[untouched], atol=2.0**-20)  # the steps of places
     assert len(set(local_window(after, camera_at(20), 2, 10, 5).keyframes) & set(range(6))) >= 3
+
+
+def test_an_adjustment_that_began_before_sub_maps_were_merged_does_not_undo_it(both):
+    """The bundle adjustment of the version before still has the keyframes in the world of the sub-map."""
+    world, map = both
+    rows = np.arange(6, 12, dtype=np.int32)
+    late = correction(map, keyframe_ids=rows, T_world_keyframe=map.keyframes.rows("T_world_camera", rows))
+    recognised, merging = pose_of(camera_at(33), 12, "degraded", submap=0), {"status": "degraded", "submap": 1, "reference": 11}
+    merged = seen(world, map, 12, 33, AWAY @ camera_at(33), recognised=recognised, **merging)
+    assert merged.loop_closed == merged.revision
+    after = seen(world, merged, 13, 33, camera_at(33), bundle=late)
+    assert np.array_equal(after.keyframes.rows("T_world_camera", rows), merged.keyframes.rows("T_world_camera", rows))
 
 
 def test_frames_of_a_sub_map_count_once_it_is_merged(both):

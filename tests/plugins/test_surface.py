@@ -156,7 +156,7 @@ def test_polygons_take_far_fewer_triangles():
         assert len(ring) >= 3 and np.abs(ring @ n[:3] + n[3]).max() < 1e-4
 
 
-@pytest.mark.parametrize("name", SURFACES)
+@pytest.mark.parametrize("name", [pytest.param(name, marks=pytest.mark.slow if name.startswith("open3d") else ()) for name in SURFACES])
 def test_the_same_frames_give_the_same_bytes(name):
     again = fold(plugin_class("surface", name)(view_width=160), [seen(k, T) for k, T in enumerate(walk())])
     assert Encoder().encode(again) == Encoder().encode(corner(name))

@@ -14,8 +14,9 @@ from trihedron.plugins.mapping.insertion import add_keyframe
 from trihedron.plugins.mapping.landmarks import empty_map
 from trihedron.plugins.shared.keyframe_views import readings
 from trihedron.plugins.surface.common import with_measured_noise
+from trihedron.plugins.surface.common_iso_surface import final_volume
 from trihedron.plugins.surface.common_meshes import opposite_half_edges
-from trihedron.plugins.surface.common_planar import Flatness, planar_labels
+from trihedron.plugins.surface.common_planar import PlanarOptions, planar_labels
 
 sys.path.insert(0, str(Path(__file__).parent))
 from surface_world import CAMERA, FLOOR, fold, off_truth, seen, walk
@@ -76,7 +77,7 @@ def test_the_volume_is_built_again_only_when_the_map_moved_a_view():
                 map, _ = add_keyframe(map, replace(pose, T_world_camera=there), CAMERA)
             hung = replace(pose, reference=0, T_reference_camera=np.linalg.inv(walk(1)[0]) @ T)
             state = plugin.add(state, frame, planes, rotation, hung, None)
-        assert (plugin._volume(state, map) is state.volume) == same
+        assert (final_volume(plugin, state, map) is state.volume) == same
 
 
 def test_planes_found_in_the_mesh_are_numbered_after_those_of_the_map_that_nobody_saw():
@@ -87,7 +88,7 @@ def test_planes_found_in_the_mesh_are_numbered_after_those_of_the_map_that_nobod
     half = np.concatenate([np.stack([corner, corner + 1, corner + 21], axis=1), np.stack([corner, corner + 21, corner + 20], axis=1)])
     vertices, triangles = np.concatenate([square, square + np.array([0.0, 0.0, 1.0])]), np.concatenate([half, half + 400]).astype(np.int32)
     known = np.array([[0.0, 0.0, 1.0, 0.0], [1.0, 0.0, 0.0, 5.0]])
-    normals, flat = np.tile([0.0, 0.0, 1.0], (800, 1)), Flatness(0.012, 25.0, 0.03, 4, 0.02, 0.8)
+    normals, flat = np.tile([0.0, 0.0, 1.0], (800, 1)), PlanarOptions()
     labels, planes = planar_labels(vertices, normals, triangles, opposite_half_edges(triangles), known, flat)
     assert set(labels[: len(half)]) == {0} and set(labels[len(half) :]) == {2}
     assert np.allclose(planes[2], [0.0, 0.0, 1.0, -1.0]) and np.allclose(planes[1], known[1])
@@ -100,7 +101,7 @@ def test_a_floor_that_was_mapped_twice_is_one_plane():
     corner = (np.arange(19)[:, None] * 40 + np.arange(39)).ravel().astype(np.int32)
     triangles = np.concatenate([np.stack([corner, corner + 1, corner + 41], axis=1), np.stack([corner, corner + 41, corner + 40], axis=1)])
     tilted = np.array([[0.006, 0.0, 1.0, -0.009], [-0.006, 0.0, 1.0, 0.009]]) / np.sqrt(1.0 + 0.006**2)
-    normals, flat = np.tile([0.0, 0.0, 1.0], (len(vertices), 1)), Flatness(0.012, 25.0, 0.03, 4, 0.02, 0.8)
+    normals, flat = np.tile([0.0, 0.0, 1.0], (len(vertices), 1)), PlanarOptions()
     labels, planes = planar_labels(vertices, normals, triangles, opposite_half_edges(triangles), tilted, flat)
     assert len(set(labels)) == 1 and np.allclose(planes[labels[0]], [0.0, 0.0, 1.0, 0.0], atol=1e-9)
 

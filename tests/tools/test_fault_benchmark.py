@@ -11,7 +11,7 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 
 from trihedron.datasets.faults.faults import Faults
 from trihedron.pipeline.app.cli import main
-from trihedron.pipeline.core.geometry import exp_se3
+from trihedron.pipeline.core.lie import exp_se3
 from trihedron.pipeline.core.types import Pose, Trajectory
 from trihedron.pipeline.run.status_check import check_status
 from trihedron.tools.benchmarks.fault_benchmark import CASES, HEADER, row_of, words_of

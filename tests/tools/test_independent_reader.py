@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from trihedron.pipeline.core.types import Frame, FrameReference, ManhattanFrame, Planes, Pose, Segments, Trajectory
-from trihedron.pipeline.record.foxglove import View
+from trihedron.pipeline.record.foxglove import TopicView
 from trihedron.pipeline.record.writer import RecordingWriter
 from trihedron.tools.recover import recover
 
@@ -72,7 +72,7 @@ def values(index):
 
 def recorded(path, count=12):
     poses = np.tile(np.eye(4), (count, 1, 1))
-    writer, view = RecordingWriter(path, {"overrides": "[]"}), View(Trajectory(50_000_000 * np.arange(count), poses))
+    writer, view = RecordingWriter(path, {"overrides": "[]"}), TopicView(Trajectory(50_000_000 * np.arange(count), poses))
     writer.attach("groundtruth.txt", "# none")
     for i in range(count):
         for topic, value in values(i):

@@ -25,6 +25,7 @@ def test_each_promise_can_be_broken(worse, verdict):
     assert said.count("NOT MET") == verdict and kept is not bool(verdict)
 
 
+@pytest.mark.slow
 def test_a_short_run_holds_what_it_did(tmp_path, capsys):
     """Three times to and fro over 20 frames: no keyframes, handles and threads more; what time says is the slow test's."""
     words = ["benchmark", "long", "--frames", "120", "--loop", "20", "--warm-up", "30", "--span", "30", "--json", str(tmp_path / "long.json"), *SMALL]

@@ -6,10 +6,11 @@ import numpy as np
 import pytest
 
 from trihedron.pipeline.app.cli import main
-from trihedron.pipeline.core.geometry import exp_so3
+from trihedron.pipeline.core.lie import exp_so3
 from trihedron.pipeline.core.registry import load_plugins
 from trihedron.pipeline.core.types import ManhattanFrame
 from trihedron.plugins.manhattan.branch_and_bound import BranchAndBound
+from trihedron.plugins.manhattan.common import directions_of
 from trihedron.plugins.shared.manhattan_frames_kernels import CUBE
 from trihedron.tools.benchmarks import manhattan_views as seen
 from trihedron.tools.benchmarks.manhattan_family import error_of, estimators, figures, measure
@@ -85,6 +86,7 @@ def test_the_parts_of_a_view_hold_what_their_names_say(scenes):
     assert min(counts.values()) > 0
 
 
+@pytest.mark.slow
 def test_few_views_and_one_estimator(tmp_path, capsys):
     assert main(["benchmark", "manhattan", "--orientations", "3", "--estimators", "mean_shift", "--json", str(tmp_path / "f.json")]) == 0
     said = capsys.readouterr().out
@@ -112,7 +114,8 @@ def test_the_gap_is_not_refuted_by_a_grid_over_all_rotations(scenes):
     for index in range(3):
         _, view = list(seen.views(scenes[seen.WHOLE], index, False))[1]
         found = estimator(view.normals, view.segments, view.planes, None)
-        vectors, weights = estimator._with_planes(estimator.directions(view.normals, view.segments).thinned(estimator.search_samples), view.planes)
+        directions = directions_of(estimator, view.normals, view.segments)
+        vectors, weights = estimator._with_planes(directions.thinned(estimator.search_samples), view.planes)
         inlier = np.radians(estimator.inlier_deg)
         reached = consensus(vectors, weights, found.rotations, inlier)[0]
         values = np.concatenate([consensus(vectors, weights, part, inlier) for part in np.array_split(grid, 20)])

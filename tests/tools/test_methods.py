@@ -96,6 +96,7 @@ def test_alternatives_are_one_change_each():
     assert words_of_alternatives([]) == []
 
 
+@pytest.mark.slow
 def test_a_sweep_over_alternatives_and_its_table(tmp_path, capsys):
     small = ["dataset.width=160", "dataset.height=120", "dataset.length=6"]
     words = ["alternatives=[rotation=procrustes]", "report=benchmark methods", "hydra/launcher=basic"]

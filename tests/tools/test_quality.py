@@ -11,7 +11,7 @@ import pytest
 
 from trihedron.datasets.simulation.synthetic import Synthetic
 from trihedron.pipeline.app.cli import main
-from trihedron.pipeline.core.geometry import exp_se3
+from trihedron.pipeline.core.lie import exp_se3
 from trihedron.pipeline.core.types import F64, Frame
 from trihedron.tools.quality import Parts, PosedFrames, Quality, _orthogonal, quality_of, wall_thickness, warped_depth
 

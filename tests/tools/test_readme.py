@@ -7,6 +7,7 @@ import shlex
 from importlib.metadata import entry_points
 from pathlib import Path
 
+import pytest
 import yaml
 
 from trihedron.datasets.simulation.synthetic import Synthetic
@@ -72,6 +73,7 @@ def test_the_commands_shown_have_these_options():
                     assert word in stream.getvalue(), f"{page}: trihedron {name} {word}"
 
 
+@pytest.mark.slow
 def test_the_runs_shown_can_be_composed():
     """Single runs: their keys, options and wires exist. No replays, no sweeps; tests/test_tutorials.py runs tutorials."""
     counted = 0

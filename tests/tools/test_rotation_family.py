@@ -8,7 +8,7 @@ from hydra.core.config_store import ConfigStore
 
 from trihedron.pipeline.app.cli import main
 from trihedron.pipeline.core import registry
-from trihedron.pipeline.core.geometry import exp_so3
+from trihedron.pipeline.core.lie import exp_so3
 from trihedron.pipeline.core.types import ManhattanFrame, Normals
 from trihedron.plugins.shared.manhattan_frames_kernels import CUBE
 from trihedron.tools.benchmarks.rotation_comparison import common_world, read_runs, residuals_deg

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from trihedron.pipeline.app.cli import main
-from trihedron.pipeline.core.geometry import exp_se3
+from trihedron.pipeline.core.lie import exp_se3
 from trihedron.pipeline.core.types import Pose, Trajectory
 from trihedron.pipeline.run.status_check import check_status
 from trihedron.tools.benchmarks.sensor_benchmark import HEADER, Judged, chosen, correlations, report, words_of

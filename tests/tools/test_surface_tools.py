@@ -13,7 +13,7 @@ from trihedron.pipeline.core.errors import DataError, UsageError
 from trihedron.pipeline.core.types import Surface
 from trihedron.pipeline.record.writer import RecordingWriter
 from trihedron.pipeline.run.ply import write_ply
-from trihedron.tools import evaluate_surface, export
+from trihedron.tools import evaluate_surface, export, export_picture
 from trihedron.tools.evaluate_surface import judged
 from trihedron.tools.export_surface import upright
 from trihedron.tools.mesh_distance import FAR_M, NearestTriangle, sampled
@@ -66,8 +66,50 @@ def test_gltf_keeps_each_plane_with_its_facts_and_its_picture(tmp_path):
     assert (np.asarray(scene.geometry["rest"].visual.vertex_attributes["color"])[:, :3] == (10, 20, 30)).all()
     data = (tmp_path / "a.glb").read_bytes()
     document = json.loads(data[20 : 20 + int.from_bytes(data[12:16], "little")])
+    assert document["extensionsUsed"] == ["KHR_materials_unlit"]
+    assert all(material["extensions"] == {"KHR_materials_unlit": {}} for material in document["materials"]) and len(document["materials"]) == 2
     extras = next(node["extras"] for node in document["nodes"] if node["name"] == "floor_17")
     assert extras["id"] == 17 and extras["kind"] == "floor" and extras["area_m2"] == 2.0 and extras["normal"] == [0.0, 1.0, 0.0]
+
+
+def corner(island_m=0.1):
+    """Floor, two walls and ceiling of a corner 2 m wide and 1 m high, y down, each of two triangles, and a loose square 30 m away."""
+    quads = np.array([
+        [(0, 1, 0), (2, 1, 0), (2, 1, 2), (0, 1, 2)],
+        [(0, 0, 2), (0, 1, 2), (2, 1, 2), (2, 0, 2)],
+        [(0, 0, 0), (0, 1, 0), (0, 1, 2), (0, 0, 2)],
+        [(0, 0, 0), (0, 0, 2), (2, 0, 2), (2, 0, 0)],
+        [(30, 1, 0), (30 + island_m, 1, 0), (30 + island_m, 1, island_m), (30, 1, island_m)],
+    ], np.float32)  # fmt: skip
+    vertices, rows = np.unique(quads.reshape(-1, 3), axis=0, return_inverse=True)
+    triangles = rows.reshape(-1, 4)[:, [0, 2, 1, 0, 3, 2]].reshape(-1, 3)
+    inside = np.array([1.0, 0.5, 1.0])
+    a, b, c = (vertices[triangles[:, k]] for k in range(3))
+    away = np.einsum("ij,ij->i", np.cross(b - a, c - a), inside - a) < 0
+    triangles[away] = triangles[away][:, ::-1]
+    normals = np.array([[0, -1, 0, 1], [0, 0, -1, 2], [1, 0, 0, 0], [0, 1, 0, 0]], float)
+    instances = np.repeat([0, 1, 2, 3, -1], 2).astype(np.int32)
+    empty = Surface.empty(3, 99)
+    return replace(
+        empty, vertices_m=vertices, colors=np.full((len(vertices), 3), (10, 20, 30), np.uint8), triangles=triangles.astype(np.int32),
+        instances=instances, plane_ids=np.arange(4, dtype=np.int32), coefficients=normals, kinds=np.array([1, 3, 3, 2], np.uint8),
+        areas_m2=np.array([4, 2, 2, 4], np.float32), plane_colors=np.zeros((4, 3), np.uint8), up=np.array([0.0, -1.0, 0.0]),
+        texels=np.full((10, 3, 2), np.nan, np.float32),
+    )  # fmt: skip
+
+
+def test_the_picture_shows_the_room_without_its_ceiling_and_without_islands():
+    picture, count = export_picture.drawn(corner(), (320, 200))
+    assert picture.shape == (200, 320, 3) and count == 6  # floor and walls
+    half = picture[:, 160:] if (picture[100, 157:163] == 255).all() else picture[100:]
+    drawn = (half != 255).any(axis=2)
+    filled = [np.ptp(np.flatnonzero(drawn.any(axis=axis))) / drawn.shape[1 - axis] for axis in (0, 1)]
+    assert 0.85 < max(filled) < 0.95
+    colors, counts = np.unique(half.reshape(-1, 3), axis=0, return_counts=True)
+    flat = colors[np.argsort(-counts)[:4]].astype(int)  # paper and three planes
+    assert min(np.abs(a - b).max() for i, a in enumerate(flat) for b in flat[:i]) > 25
+    assert export_picture.drawn(corner(island_m=2.0), (32, 20))[1] == 8
+    assert (export_picture.drawn(Surface.empty(0, 0))[0] == np.full((1200, 1920, 3), 255)).all()
 
 
 def test_planes_json_holds_identity_boundary_and_equation(tmp_path):
@@ -88,7 +130,7 @@ def test_up_is_the_manhattan_axis_or_said_to_be_a_guess(tmp_path, capsys):
     assert "first camera's up" in capsys.readouterr().out
 
 
-@pytest.mark.parametrize("to", ["ply", "obj", "gltf", "planes.json"])
+@pytest.mark.parametrize("to", ["ply", "obj", "gltf", "planes.json", "png"])
 def test_an_empty_surface_is_a_valid_file_and_said_to_be_empty(tmp_path, to, capsys):
     export.main([recorded(tmp_path, Surface.empty(0, 0)), "--to", to, "--out", str(tmp_path / "file")])
     assert "empty" in capsys.readouterr().out and (tmp_path / "file").stat().st_size > 20

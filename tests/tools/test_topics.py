@@ -1,10 +1,12 @@
 """`trihedron topics`: what a file holds, and one clear line for one that is damaged."""
 
+import numpy as np
 import pytest
 from mcap.writer import Writer
 
+import trihedron as th
 from trihedron.pipeline.app.cli import main
-from trihedron.pipeline.core.types import Camera, FrameReference
+from trihedron.pipeline.core.types import Camera, Frame, FrameReference
 from trihedron.pipeline.record.writer import RecordingWriter
 
 CAMERA = Camera(640, 480, 525.0, 525.0, 320.0, 240.0)
@@ -84,3 +86,28 @@ def test_other_files(tmp_path, capsys):
     assert capsys.readouterr().err == f"trihedron: {missing}: cannot be read: No such file or directory; give the path of an MCAP file\n"
     assert main(["topics"]) == 2
     assert capsys.readouterr().err == "trihedron: topics: the following arguments are required: FILE.mcap; see trihedron topics --help\n"
+
+
+def test_a_file_that_is_still_being_written(tmp_path, capsys):
+    path, camera = tmp_path / "run.mcap", Camera(32, 32, 30.0, 30.0, 15.5, 15.5)
+    writer = RecordingWriter(path, {"overrides": "[]"})
+    for index in range(3):
+        writer.write("frames", FrameReference(index, 1000 * index, camera))
+        writer.write("dataset", Frame(index, 1000 * index, np.full((32, 32, 3), index, np.uint8), np.full((32, 32), 0.1, np.float32), camera))
+    writer.flush()
+    assert main(["topics", str(path)]) == 0
+    assert [line.split()[:3] for line in capsys.readouterr().out.splitlines()[1:]] == [
+        ["/dataset/color", "foxglove.CompressedImage", "3"],
+        ["/dataset/depth", "foxglove.RawImage", "3"],
+        ["/frames", "trihedron.FrameReference", "3"],
+    ]
+    run = th.Recording(path)
+    assert run.frames == (0, 1, 2) and [value.color[0, 0, 0] for value in run.values("dataset")] == [0, 1, 2]
+    capsys.readouterr()
+    assert main(["export", str(path), "--to", "csv"]) == 1
+    assert capsys.readouterr().err.splitlines() == [
+        f"trihedron: {path} is still being written; its first 9 messages are read",
+        f"trihedron: {path}: holds no poses; record a run with outputs=[trajectory]",
+    ]
+    writer.close()
+    assert th.Recording(path).frames == (0, 1, 2) and capsys.readouterr().err == ""

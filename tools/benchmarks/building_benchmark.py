@@ -4,7 +4,7 @@ Each scene is tracked with several seeds (of textures, path and noise) and the d
 aligns trajectory.txt with the truth, never by itself. A room is found where the intersection over union with a true one is above 0.5. Walls are the
 edges of found rooms that lie on a face that was seen, position the distance of their middle from the true edge. A doorway is found within 0.3 m of
 its middle. "honest" is the share of errors of areas, wall offsets and storey heights within 1.96 of their standard deviations. Figures are medians
-over the seeds, "honest" a mean. slanted_flat is laid out by atlanta_layout.
+over the seeds, "honest" a mean. slanted_flat is laid out by atlanta_layout. A benchmark with --out that was stopped goes on where it was.
 
 Example: trihedron benchmark building --scenes offices --seeds 2
 """
@@ -12,8 +12,10 @@ Example: trihedron benchmark building --scenes offices --seeds 2
 from __future__ import annotations
 
 import json
+import shutil
 import statistics
 import tempfile
+import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -45,18 +47,24 @@ def main(argv: list[str]) -> int:
     parser.add_argument(
         "--plugin", default="", metavar="NAME", help="of the slot building (default: atlanta_layout for slanted_flat, else the graph's own)"
     )
+    parser.add_argument("--fps", type=float, default=15.0, metavar="HZ", help="frames a second of the walks (default: 15)")
     parser.add_argument("--out", type=Path, metavar="FOLDER", help="keep the runs here; one that is there already is judged as it is")
+    parser.add_argument("--anew", action="store_true", help="make the plans of runs anew from what they recorded; final s is then CPU time")
     parser.add_argument("--json", type=Path, metavar="FILE", help="write the figures of each run too")
     options = parser.parse_args(argv)
     if not 1 <= options.seeds <= 100:
         raise UsageError("benchmark building", f"--seeds {options.seeds} is out of range", "give 1 to 100")
+    if not 1.0 <= options.fps <= 60.0:
+        raise UsageError("benchmark building", f"--fps {options.fps:g} is out of range", "give 1 to 60")
     scenes, sensors = _listed("scene", options.scenes, SCENES), _listed("sensor", options.sensors, SENSORS)
     found: dict[str, list[dict[str, float]]] = {}
     with tempfile.TemporaryDirectory() as folder:
         for scene in scenes:
             for sensor in sensors:
                 runs = [(options.out or Path(folder)) / f"{scene}.{sensor}.{seed}" for seed in range(options.seeds)]
-                found[f"{scene} {sensor}"] = [_tracked(scene, sensor, seed, options.plugin, run) for seed, run in enumerate(runs)]
+                found[f"{scene} {sensor}"] = [
+                    _figures(_tracked(scene, sensor, seed, options.fps, run), options.plugin, options.anew) for seed, run in enumerate(runs)
+                ]
     print(report(found))
     if options.json:
         options.json.write_text(json.dumps(found, indent=2) + "\n")
@@ -72,23 +80,30 @@ def _listed(kind: str, names: str, known: tuple[str, ...]) -> list[str]:
     return listed
 
 
-def _tracked(scene: str, sensor: str, seed: int, plugin: str, out: Path) -> dict[str, float]:
-    """Return the figures of one run, tracked in a process of its own unless its folder is there; its plan made anew if a plugin is given."""
+def _tracked(scene: str, sensor: str, seed: int, fps: float, out: Path) -> Path:
+    """Return the folder of one run, tracked in a process of its own unless it is there. A run that was stopped is begun again."""
     from trihedron.tools.benchmark import measure
 
     if not (out / "timing.json").exists():
+        unfinished = out.with_name(out.name + ".unfinished")
+        shutil.rmtree(unfinished, ignore_errors=True)
         words = ["dataset=synthetic", f"dataset.scene={scene}", f"dataset.sensor={sensor}", f"dataset.seed={seed}", "dataset.width=320"]
         words += [f"building={LAYOUTS[scene]}"] if scene in LAYOUTS else []
-        measure([*words, "dataset.height=240", "dataset.fps=15", "outputs=[trajectory,building]", f"out={out}"], out)
-    figures = judged_run(out, plugin or None)
-    if not plugin:
-        stage = json.loads((out / "timing.json").read_text())["stages"]["building"]
-        figures |= {"frame_ms": stage["p50_ms"], "final_s": stage["finish_ms"] / 1e3}
-    return figures
+        measure([*words, "dataset.height=240", f"dataset.fps={fps:g}", "outputs=[trajectory,building]", f"out={unfinished}"], unfinished)
+        unfinished.rename(out)
+    return out
+
+
+def _figures(run: Path, plugin: str, anew: bool) -> dict[str, float]:
+    """Return the figures of a run folder: of its plan as recorded, or made anew by a plugin or by its own."""
+    stage = json.loads((run / "timing.json").read_text())["stages"]["building"]
+    own = LAYOUTS.get(run.name.split(".")[0], "manhattan_layout")
+    figures = {"final_s": stage["finish_ms"] / 1e3} | judged_run(run, plugin or (own if anew else None))
+    return figures if plugin else figures | {"frame_ms": stage["p50_ms"]}
 
 
 def judged_run(run: Path, plugin: str | None = None) -> dict[str, float]:
-    """Return the figures of a run folder of a synthetic scene; its plan as recorded, or made by a plugin. Raises DataError."""
+    """Return the figures of a run folder of a synthetic scene; its plan as recorded, or made by a plugin, with the CPU time. Raises DataError."""
     from trihedron.pipeline.app.recorded_run import composed_run
     from trihedron.pipeline.core.config import make_plugin
     from trihedron.pipeline.core.geometry import umeyama
@@ -96,7 +111,7 @@ def judged_run(run: Path, plugin: str | None = None) -> dict[str, float]:
     from trihedron.pipeline.record.reader import Recording
     from trihedron.pipeline.record.trajectories import read_trajectory
     from trihedron.pipeline.run.metrics import associate
-    from trihedron.tools.building import building_of
+    from trihedron.tools.building import building_of, gathered
 
     load_plugins()
     recording = Recording(run / "run.mcap")
@@ -106,7 +121,13 @@ def judged_run(run: Path, plugin: str | None = None) -> dict[str, float]:
     estimate, truth = read_trajectory(run / "trajectory.txt"), dataset.truth()
     pairs = associate(estimate.stamps_ns, truth.stamps_ns)
     T = umeyama(estimate.poses[pairs[:, 0], :3, 3], truth.poses[pairs[:, 1], :3, 3])
-    return judged(building_of(recording, plugin), T, dataset.plans())
+    if plugin is None:
+        return judged(building_of(recording), T, dataset.plans())
+    fold, state, final = gathered(recording, plugin)
+    began = time.process_time()
+    building = fold.finish(state, final)
+    spent = time.process_time() - began
+    return judged(building, T, dataset.plans()) | {"final_s": spent}
 
 
 def judged(building: Building, T_truth_world: F64, plans: list[TruePlan]) -> dict[str, float]:

@@ -44,7 +44,7 @@ Figures = dict[str, float]
 
 
 @dataclass(frozen=True)
-class View:
+class TrueView:
     """A frame with its truth."""
 
     frame: Frame
@@ -59,7 +59,7 @@ class View:
         value: Normals = plugin_class("normals", default_plugins()["normals"])()(self.frame)
         return value
 
-    def seen_from(self, other: View, pixels: F64) -> tuple[F64, Bool]:
+    def seen_from(self, other: TrueView, pixels: F64) -> tuple[F64, Bool]:
         """The true places (n, 2) in another view of the points at pixels (n, 2) of this one, and whether they are visible there."""
         camera = self.frame.camera
         at = np.rint(pixels).astype(int)
@@ -96,19 +96,19 @@ def main(argv: list[str]) -> int:
     return 0
 
 
-def views_of(pairs: int, **changes: Any) -> list[tuple[View, View]]:
+def views_of(pairs: int, **changes: Any) -> list[tuple[TrueView, TrueView]]:
     """Pairs of views, spread over the walk."""
     data = Synthetic(length=150, **changes)
     return [(_view(data, k), _view(data, k + APART)) for k in np.linspace(0, 149 - APART, pairs).astype(int)]
 
 
-def _view(data: Synthetic, index: int) -> View:
+def _view(data: Synthetic, index: int) -> TrueView:
     frame = data(index)
     assert frame is not None
-    return View(frame, data.true_pose(index), *data.true_planes(index))
+    return TrueView(frame, data.true_pose(index), *data.true_planes(index))
 
 
-def judged(slot: str, scenes: dict[str, list[tuple[View, View]]]) -> dict[str, Any]:
+def judged(slot: str, scenes: dict[str, list[tuple[TrueView, TrueView]]]) -> dict[str, Any]:
     """Plugin -> scene -> figures; for one that cannot run here, why."""
     found: dict[str, Any] = {}
     for name, kind in plugins_of(slot).items():
@@ -122,7 +122,7 @@ def judged(slot: str, scenes: dict[str, list[tuple[View, View]]]) -> dict[str, A
     return found
 
 
-def _figures(slot: str, kind: type[Any], pairs: list[tuple[View, View]]) -> Figures:
+def _figures(slot: str, kind: type[Any], pairs: list[tuple[TrueView, TrueView]]) -> Figures:
     plugin = kind()
     _called(plugin, slot, pairs[0][0])  # compiles
     values, spent = [], []
@@ -134,12 +134,12 @@ def _figures(slot: str, kind: type[Any], pairs: list[tuple[View, View]]) -> Figu
     return {key: float(np.mean([row[key] for row in rows])) for key in rows[0]} | {"ms": statistics.median(spent)}
 
 
-def _called(plugin: Any, slot: str, view: View) -> Any:
+def _called(plugin: Any, slot: str, view: TrueView) -> Any:
     given = {"frame": view.frame, "normals": view.normals, "rng": np.random.default_rng(0)}
     return plugin(**{name: given[name] for name in parameters_of_method(slot, type(plugin))})
 
 
-def judge_normals(first: View, second: View, a: Normals, b: Normals) -> Figures:
+def judge_normals(first: TrueView, second: TrueView, a: Normals, b: Normals) -> Figures:
     """Angles to the truth, and the share of cells with depth that have a normal."""
     angles, shares = [], []
     for view, value in ((first, a), (second, b)):
@@ -153,7 +153,7 @@ def judge_normals(first: View, second: View, a: Normals, b: Normals) -> Figures:
     return {"median deg": float(np.median(every)), "90 % deg": float(np.quantile(every, 0.9)), "share": float(np.mean(shares))}
 
 
-def judge_planes(first: View, second: View, a: Planes, b: Planes) -> Figures:
+def judge_planes(first: TrueView, second: TrueView, a: Planes, b: Planes) -> Figures:
     """Precision and recall of regions, and the median error of the planes of the correct ones."""
     correct = found = wanted = 0
     angles, offsets = [0.0][:0], [0.0][:0]
@@ -179,7 +179,7 @@ def judge_planes(first: View, second: View, a: Planes, b: Planes) -> Figures:
     return {"precision": correct / max(found, 1), "recall": correct / max(wanted, 1), "deg": medians[0], "mm": medians[1]}
 
 
-def true_regions(view: View, stride: int) -> tuple[I32, F64]:
+def true_regions(view: TrueView, stride: int) -> tuple[I32, F64]:
     """Connected true regions on a grid, 1 … k, 0 where there is no depth, and the plane (k, 4) of each."""
     cells = slice(None, None, stride)
     labels, seen = view.labels[cells, cells], view.frame.depth_m[cells, cells] > 0.0
@@ -192,7 +192,7 @@ def true_regions(view: View, stride: int) -> tuple[I32, F64]:
     return np.where(seen, regions, 0).astype(np.int32), np.array(planes).reshape(-1, 4)
 
 
-def judge_keypoints(first: View, second: View, a: Keypoints, b: Keypoints) -> Figures:
+def judge_keypoints(first: TrueView, second: TrueView, a: Keypoints, b: Keypoints) -> Figures:
     """Repeatability and matching score."""
     ways = []
     for view, other, mine, theirs in ((first, second, a, b), (second, first, b, a)):
@@ -206,7 +206,7 @@ def judge_keypoints(first: View, second: View, a: Keypoints, b: Keypoints) -> Fi
     return {"repeatability": repeated / max(visible, 1), "matching score": good / max(visible, 1), "points": 0.5 * (len(a.pixels) + len(b.pixels))}
 
 
-def judge_lines(first: View, second: View, a: LineSegments, b: LineSegments) -> Figures:
+def judge_lines(first: TrueView, second: TrueView, a: LineSegments, b: LineSegments) -> Figures:
     """Repeatability of segments."""
     ways = []
     for view, other, mine, theirs in ((first, second, a, b), (second, first, b, a)):
@@ -218,7 +218,7 @@ def judge_lines(first: View, second: View, a: LineSegments, b: LineSegments) -> 
     return {"repeatability": repeated / max(visible_count, 1), "lines": 0.5 * (len(a.endpoints_px) + len(b.endpoints_px))}
 
 
-def _on_the_nearer_side(view: View, pixels: F64) -> F64:
+def _on_the_nearer_side(view: TrueView, pixels: F64) -> F64:
     """Pixels (n, 2) of the nearest surface within 2 px, on which an edge before a background is."""
     height, width = view.depth_m.shape
     around = np.array([(dx, dy) for dy in (-2, 0, 2) for dx in (-2, 0, 2)])

@@ -24,7 +24,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from trihedron.pipeline.core.errors import UsageError, did_you_mean
-from trihedron.pipeline.core.geometry import exp_so3, log_so3
+from trihedron.pipeline.core.lie import exp_so3, log_so3
 from trihedron.pipeline.core.registry import load_plugins, plugin_class, plugins_of
 from trihedron.pipeline.core.types import F64, ManhattanFrame
 from trihedron.plugins.shared.manhattan_frames_kernels import CUBE
@@ -116,7 +116,7 @@ def _warm_up(chosen: dict[str, Any], scene: seen.Scene) -> None:
         _ask(defaultdict(list), chosen, "", "", view)
 
 
-def _ask(answers: Answers, chosen: dict[str, Any], depth: str, case: str, view: seen.View) -> None:
+def _ask(answers: Answers, chosen: dict[str, Any], depth: str, case: str, view: seen.DirectionView) -> None:
     for name, estimator in chosen.items():
         for start in STARTS:
             given: dict[str, Any] = {"normals": view.normals, "segments": view.segments, "planes": view.planes}
@@ -128,7 +128,7 @@ def _ask(answers: Answers, chosen: dict[str, Any], depth: str, case: str, view: 
             answers[name, depth, case, start].append(Answer(*error_of(found, view.truth), found is not None and found.supported, ms))
 
 
-def _start(view: seen.View) -> ManhattanFrame:
+def _start(view: seen.DirectionView) -> ManhattanFrame:
     """A previous frame up to 10° from the truth, about any axis."""
     rng = np.random.default_rng([11, view.normals.index])
     axis = rng.standard_normal(3)

@@ -40,7 +40,7 @@ STAGES = {"normals": "integral_image", "lines": "lsd", "segments": "ransac", "pl
 
 
 @dataclass(frozen=True)
-class View:
+class DirectionView:
     """Output of the feature stages for one rendered view, the true axes `R_camera_manhattan`, and the true axis of each cell of the normals (-1 =
     none) with the share of the image that each axis covers."""
 
@@ -139,7 +139,7 @@ def scenes() -> dict[str, Scene]:
     }
 
 
-def views(scene: Scene, index: int, without_frame: bool) -> Iterator[tuple[str, View]]:
+def views(scene: Scene, index: int, without_frame: bool) -> Iterator[tuple[str, DirectionView]]:
     """(clean | noisy, view) of the scene at a position and a uniformly random orientation of number `index`; `without_frame` leaves out a view that
     shows a right angle, and the lines of the others."""
     rng = np.random.default_rng([7, index])
@@ -157,7 +157,7 @@ def views(scene: Scene, index: int, without_frame: bool) -> Iterator[tuple[str, 
         h, w, _ = normals.normals.shape
         axes = scene.axes[faces[:: normals.stride, :: normals.stride][:h, :w]]
         covered = np.array([scene.truth_of(faces)[scene.axes == k].sum() for k in range(3)])
-        view = View(normals, segments, planes, R.T.copy(), axes, covered)
+        view = DirectionView(normals, segments, planes, R.T.copy(), axes, covered)
         yield depth, _without_lines(view) if without_frame else view
 
 
@@ -196,7 +196,7 @@ def inputs_of(plugin: Any, slot: str, index: int, given: dict[str, Any]) -> dict
     return {name: given[name] for name in parameters_of_method(slot, type(plugin))}
 
 
-def case_of(view: View, case: str) -> View | None:
+def case_of(view: DirectionView, case: str) -> DirectionView | None:
     """The view as the case has it, or None where it does not show what the case asks for (two visible axes, unless it names another number).
 
     Planes: only the surfaces along the two or three axes that cover most, no lines. One plane + lines: the largest, and lines that tell one more
@@ -224,7 +224,7 @@ def case_of(view: View, case: str) -> View | None:
     return _cluttered(view, np.random.default_rng([9, view.normals.index])) if case == CLUTTER else view
 
 
-def _only(view: View, cells: Bool, rows: Bool) -> View:
+def _only(view: DirectionView, cells: Bool, rows: Bool) -> DirectionView:
     """The view with the normals of the chosen cells (h, w) and the chosen planes (n,)."""
     p = view.planes
     number = np.concatenate([[0], np.where(rows, np.cumsum(rows), 0)]).astype(np.uint8)
@@ -233,13 +233,13 @@ def _only(view: View, cells: Bool, rows: Bool) -> View:
     return replace(view, planes=replace(p, labels=number[p.labels], **kept), normals=replace(view.normals, normals=normals))
 
 
-def _without_lines(view: View) -> View:
+def _without_lines(view: DirectionView) -> DirectionView:
     s = view.segments
     none: dict[str, Any] = {name: getattr(s, name)[:0] for name in ("endpoints_px", "endpoints_m", "covariance_m2", "descriptors")}
     return replace(view, segments=replace(s, **none))
 
 
-def _cluttered(view: View, rng: np.random.Generator) -> View:
+def _cluttered(view: DirectionView, rng: np.random.Generator) -> DirectionView:
     """Half of all cells and lines turned any way; the lines about their middles."""
     normals, ends = view.normals.normals.copy(), view.segments.endpoints_m.copy()
     cells = (rng.random(normals.shape[:2]) < CLUTTERED) & np.isfinite(normals[..., 0])

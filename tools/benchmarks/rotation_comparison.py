@@ -21,7 +21,8 @@ import yaml
 from numpy.typing import NDArray
 
 from trihedron.pipeline.core.errors import DataError
-from trihedron.pipeline.core.geometry import log_so3, nearest_pairs, nearest_rotation
+from trihedron.pipeline.core.geometry import nearest_pairs, nearest_rotation
+from trihedron.pipeline.core.lie import log_so3
 from trihedron.pipeline.core.types import F64, ManhattanFrame
 from trihedron.pipeline.record.reader import Recording
 from trihedron.pipeline.record.trajectories import attached_truth

@@ -10,7 +10,7 @@ import numpy as np
 from omegaconf import OmegaConf
 
 from trihedron.pipeline.core.errors import TrihedronError
-from trihedron.pipeline.core.geometry import rotation_angle_deg
+from trihedron.pipeline.core.lie import rotation_angle_deg
 from trihedron.pipeline.core.types import F64, Normals
 from trihedron.pipeline.record.reader import Recording
 from trihedron.plugins.shared.manhattan_frames_kernels import nearest_equivalent

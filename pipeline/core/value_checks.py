@@ -1,7 +1,7 @@
 """Checks of values that come from a file, by the constraints that their types declare (`core.constraints`).
 
-A value is checked alone when it is read, and against the other inputs of a stage when it meets them there: ids that name no row would reach compiled
-kernels, which check nothing. What a plugin of this run computed is not checked.
+A value is checked alone when it is read (`record.reader`), and against the other inputs of a stage when it meets them there: ids that name no row
+would reach compiled kernels, which check nothing. What a plugin of this run computed is not checked.
 """
 
 from __future__ import annotations
@@ -14,6 +14,7 @@ import numpy as np
 
 from trihedron.pipeline.core.constraints import Columns, CoversImage, Finite, IndexInto, OneOf, Rotations, SameWidth, UnitNormals, Within
 from trihedron.pipeline.core.errors import RecordingError
+from trihedron.pipeline.core.linalg import det, matmul
 from trihedron.pipeline.core.slots import SLOTS, output_of
 from trihedron.pipeline.core.types import Camera, Frame, Value
 
@@ -38,13 +39,14 @@ def _declared(kind: type) -> tuple[tuple[str, Any], ...]:
     return tuple((name, item) for name, hint in hints if get_origin(hint) is Annotated for item in get_args(hint)[1:] if type(item) in _CHECKS)
 
 
-def checked(topic: str, value: Value | None, place: str) -> Value | None:
-    """The value, after the checks that need no other value. Raises RecordingError naming the file, topic, frame and field."""
-    if value is not None:
-        if topic in SLOTS and not isinstance(value, output_of(topic)):
-            raise RecordingError(f"{place}: topic /{topic}, frame {value.index}", f"is {type(value).__name__}, not {output_of(topic).__name__}", CURE)
-        for name, cause in _faults(value, ""):
-            raise RecordingError(f"{place}: topic /{topic}, frame {value.index}", f"the field '{name}' {cause}", CURE)
+def checked(topic: str, value: Value, place: str, expected: type[Value] = Value) -> Value:
+    """The value, after the checks that need no other value: of the type of its slot, or an `expected` one. Raises RecordingError naming the file,
+    topic, frame and field."""
+    expected = output_of(topic) if topic in SLOTS else expected
+    if not isinstance(value, expected):
+        raise RecordingError(f"{place}: topic /{topic}, frame {value.index}", f"is {type(value).__name__}, not {expected.__name__}", CURE)
+    for name, cause in _faults(value, ""):
+        raise RecordingError(f"{place}: topic /{topic}, frame {value.index}", f"the field '{name}' {cause}", CURE)
     return value
 
 
@@ -162,7 +164,7 @@ def _fault_of_rotations(array: Any, rule: Rotations, owner: Any) -> str:
         array = array[~np.isnan(array).all(axis=(1, 2))]
     R = array[:, :3, :3]
     with np.errstate(all="ignore"):
-        fits = (np.abs(np.swapaxes(R, 1, 2) @ R - np.eye(3)) <= ORTHONORMAL).all() and (np.linalg.det(R) > 0).all()
+        fits = (np.abs(matmul(np.swapaxes(R, 1, 2), R) - np.eye(3)) <= ORTHONORMAL).all() and (det(R) > 0).all()
     if array.shape[-1] == 4:
         fits = fits and np.isfinite(array).all() and (array[:, 3] == [0, 0, 0, 1]).all()
     return "" if fits else "is not a rotation" + " with a translation" * (array.shape[-1] == 4)

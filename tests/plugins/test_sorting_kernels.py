@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from trihedron.plugins.shared.linalg_kernels import descending
+from trihedron.plugins.shared.sorting_kernels import descending
 
 RNG = np.random.default_rng(0)
 VALUES = {

@@ -1,0 +1,60 @@
+"""Ablations of recordings, as the command line makes them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from trihedron.api.runs import Run, as_table
+from trihedron.api.words import words_of
+from trihedron.tools.ablate import ablate as computed
+from trihedron.tools.ablate import options_of
+from trihedron.tools.ablation_tables import as_json, as_text, sections_of
+
+
+@dataclass(frozen=True)
+class Ablation:
+    """A finished ablation. `tables` are those of `trihedron ablate` by title, `figures` the same as numbers, `folders` the run folders by change: of
+    several recordings one each."""
+
+    tables: dict[str, Any]
+    figures: dict[str, Any]
+    folders: dict[str, list[Path]]
+    text: str
+
+    def __str__(self) -> str:
+        return self.text
+
+
+def ablate(
+    recordings: Iterable[str | Path | Run] | str | Path | Run,
+    *swaps: str,
+    out: str | Path,
+    feedback: str = "new",
+    budget: bool = False,
+    **options: Any,
+) -> Ablation:
+    """Swap stages of recorded runs and compute again only what follows from them: `ablate("runs/a", "manhattan=mean_shift,plane_svd", out="runs/b")`.
+
+    Args:
+        recordings: run folders or recordings; several are paired repeats.
+        swaps: words `STAGE=PLUGIN,PLUGIN` or `STAGE.OPTION=VALUE,VALUE`.
+        out: the folder of the alternatives.
+        feedback: "new" computes all that follows, "recorded" the swapped stages alone.
+        budget: of a single recording, the error budget too.
+        options: swaps by name; two underscores stand for a dot, as `planes__angle_deg=3`.
+
+    Raises TrihedronError, one line."""
+    given = [recordings] if isinstance(recordings, (str, Path, Run)) else list(recordings)
+    paths = [str(item.folder if isinstance(item, Run) else item) for item in given]
+    words = [*paths, *words_of(swaps, options), f"out={out}", f"feedback={feedback}"]
+    cases = computed(options_of(words, budget))
+    sections = sections_of(cases)
+    found = as_json(cases, sections)
+    folders: dict[str, list[Path]] = {}
+    for case in cases:
+        for variant in case.variants:
+            folders.setdefault(variant.combination.label, []).append(Path(variant.folder))
+    return Ablation({title: as_table(rows) for title, rows in found["tables"].items()}, found, folders, as_text(sections))

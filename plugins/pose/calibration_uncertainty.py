@@ -1,0 +1,84 @@
+"""Uncertainty of a pose by an imperfect calibration: what no scatter of residuals shows, since every measurement shares it.
+
+The error of a pose by the calibration is linear in its parameters θ (`shared.calibration_error`): `B θ`, with B the pose's `sensitivity`. It is zero
+for the first pose. A frame like its keyframes repeats their errors, so B grows with what the view changed since, and keyframes hand theirs on: an
+error of calibration is the same in all of them, and grows with the way from the origin where a random walk grows with its root. The residuals tell
+of θ by the pattern that it leaves in them. The covariance `B E[θθᵀ] Bᵀ` is added to that of the pose (a Schmidt–Kalman filter); no pose is corrected.
+
+A landmark is taken to be where the keyframe that created it saw it. Lines, and relations of planes, tell nothing of θ here."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from trihedron.pipeline.core.geometry import invert
+from trihedron.pipeline.core.lie import adjoint, log_se3
+from trihedron.pipeline.core.linalg import inv, matmul
+from trihedron.pipeline.core.types import F64, I32, LOST, Map, Pose
+from trihedron.plugins.pose.map_alignment import MapAlignment
+from trihedron.plugins.shared.calibration_error import calibration_scales
+from trihedron.plugins.shared.calibration_error_kernels import Equations, Keyframes, calibration_equations
+from trihedron.plugins.shared.pose_optimizer import PoseSolution
+from trihedron.plugins.shared.pose_optimizer_kernels import Flags, Groups
+
+REPEATED_FRAMES = 20  # in which the errors of a landmark's residuals repeat: so many frames tell of the calibration as much as one
+LONGEST_S = 1.0  # between two frames that a velocity is taken from
+
+
+def with_velocity(pose: Pose, previous: Pose, map: Map) -> Pose:
+    """Give a pose the velocity of the camera, and that of its reference keyframe: the mean of the motions to it and from it."""
+    seconds = 1e-9 * (pose.stamp_ns - previous.stamp_ns)
+    known = previous.status != LOST and 0.0 < seconds <= LONGEST_S
+    twist = log_se3(matmul(invert(previous.T_world_camera), pose.T_world_camera)) / seconds if known else np.zeros(6)
+    if not 0 <= pose.reference < len(map.keyframes):
+        return replace(pose, twist=twist)
+    if int(map.keyframes.row("index", pose.reference)) == previous.index:
+        reference_twist = 0.5 * (previous.twist + twist) if known and previous.twist.any() else twist
+    else:
+        reference_twist = previous.reference_twist if previous.reference == pose.reference else map.keyframes.row("twist", pose.reference)
+    return replace(pose, twist=twist, reference_twist=reference_twist)
+
+
+def with_calibration(pose: Pose, previous: Pose, solution: PoseSolution, problem: MapAlignment, keyframes: I32, groups: Groups) -> Pose:
+    """Give a refined pose, whose landmarks are from `keyframes` (k,), its sensitivity to the calibration, and what residuals have told of that."""
+    equations = _equations(pose, solution, problem, keyframes, groups)
+    before = matmul(adjoint(matmul(invert(pose.T_world_camera), previous.T_world_camera)), previous.sensitivity)
+    to_pose = inv(equations.H + problem.information)
+    share = matmul(equations.C.T, to_pose)
+    scale = REPEATED_FRAMES * pose.noise_scale
+    return replace(
+        pose,
+        sensitivity=matmul(to_pose, matmul(problem.information, before) - equations.C),
+        calibration_information=previous.calibration_information + _symmetric(equations.G - matmul(share, equations.C)) / scale,
+        calibration_score=previous.calibration_score + (equations.s - matmul(share, equations.b)) / scale,
+    )
+
+
+def carried_calibration(pose: Pose, previous: Pose) -> Pose:
+    """Give a pose that was not refined the previous one's error by the calibration, as a camera that moves with it."""
+    return replace(
+        pose,
+        sensitivity=matmul(adjoint(matmul(invert(pose.T_world_camera), previous.T_world_camera)), previous.sensitivity),
+        calibration_information=previous.calibration_information,
+        calibration_score=previous.calibration_score,
+    )
+
+
+def _symmetric(matrix: F64) -> F64:
+    return np.asarray(0.5 * (matrix + matrix.T))
+
+
+def _equations(pose: Pose, solution: PoseSolution, problem: MapAlignment, rows: I32, groups: Groups) -> Equations:
+    map, T, camera = problem.map, pose.T_world_camera, problem.camera
+    poses, sensitivities, twists = (map.keyframes.rows(name, rows) for name in ("T_world_camera", "sensitivity", "twist"))
+    twists[rows == pose.reference] = pose.reference_twist
+    errors = matmul(adjoint(matmul(invert(T), poses)), sensitivities)
+    keyframes = Keyframes(np.ascontiguousarray(poses[:, :3, :3]), np.ascontiguousarray(poses[:, :3, 3]), twists, errors)
+    points, _, planes = problem.terms(T)
+    samples = map.planes.rows("samples_m", problem.plane_ids())
+    return calibration_equations(
+        T, camera.intrinsics, camera.width, camera.height, calibration_scales(camera), pose.twist, points, planes,
+        Flags(solution.points, solution.lines, solution.planes), problem.surfaces(), samples, groups, keyframes,
+    )  # fmt: skip

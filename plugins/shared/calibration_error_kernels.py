@@ -1,0 +1,284 @@
+"""Kernels of `calibration_error.py`: what residuals tell of the calibration, and its second moments.
+
+A measurement errs by `M θ`: `keypoint_errors` in the image and in inverse depth, `plane_point_error` along a plane's normal. A landmark was placed by
+the same camera from the keyframe that created it, and errs with that. What a residual shows is the difference, and the keyframe's own error."""
+# mypy: disable-error-code="arg-type, assignment, index, return-value"
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from trihedron.pipeline.core.kernel import kernel
+from trihedron.pipeline.core.linalg_kernels import inverse_positive, matmul, matvec, tangent_columns
+from trihedron.pipeline.core.types import CALIBRATION, F32, F64, I32, U8
+from trihedron.plugins.shared.pose_optimizer_kernels import (
+    NEAR_M,
+    SAME,
+    Flags,
+    Groups,
+    LineTerms,
+    PlaneTerms,
+    PointTerms,
+    Weights,
+    fill_weights,
+    plane_residual,
+    point_residual,
+    pose_jacobian,
+)
+
+EXPECTATIONS = 8  # iterations for the common scale
+PRIOR_COUNT = 4.0  # parameters that the prior of the common scale counts as
+LEAST_SAMPLES = 4  # of a plane in both views, from which on it tells of the calibration
+
+
+class Keyframes(NamedTuple):
+    """The m keyframes that created landmarks: rotations and positions of `T_world_keyframe`, velocities, and errors by the calibration as those of xi
+    of the camera."""
+
+    R: F64  # (m, 3, 3)
+    t: F64  # (m, 3)
+    twists: F64  # (m, 6)
+    errors: F64  # (m, 6, 12)
+
+
+class Equations(NamedTuple):
+    """Normal equations by the pose, H (6, 6) and b (6,), and by the calibration, G (12, 12) and s (12,), with C (6, 12) between them."""
+
+    H: F64
+    b: F64
+    C: F64
+    G: F64
+    s: F64
+
+
+@kernel
+def keypoint_errors(p: F64, plane: F64, twist: F64, camera: F64, width: int, height: int, E: F64) -> None:
+    """Fill E (3, 12): errors of a key point's u, v (px) and of the inverse depth at it, by each parameter in its own unit.
+
+    p (3,) is the point, `plane` (4,) the surface there (NaN: not known; its slope is then left out), both in the camera frame."""
+    fx, fy, iz = camera[0], camera[1], 1.0 / p[2]
+    x, y = fx * p[0] * iz, fy * p[1] * iz
+    row = (y + camera[3]) / height - 0.5
+    a = -twist[0] - twist[4] * p[2] + twist[5] * p[1]  # velocity of the point in the camera frame
+    b = -twist[1] - twist[5] * p[0] + twist[3] * p[2]
+    c = -twist[2] - twist[3] * p[1] + twist[4] * p[0]
+    du, dv = fx * iz * (a - p[0] * iz * c), fy * iz * (b - p[1] * iz * c)
+    E[:] = 0.0
+    E[0, 0], E[1, 1], E[0, 2], E[1, 3], E[0, 9], E[1, 9] = x, y, 1.0, 1.0, du * row, dv * row
+    E[2, 7], E[2, 8] = -1.0, -(x * x + y * y) / (0.25 * (width * width + height * height)) * iz
+    E[2, 10], E[2, 11] = -c * iz * iz, -c * iz * iz * row
+    if np.isfinite(plane[3]):
+        s, t = plane[0] / (fx * plane[3]), plane[1] / (fy * plane[3])
+        moved = s * du + t * dv
+        E[2, 4], E[2, 5], E[2, 6] = s * x + t * y, s, t
+        E[2, 9], E[2, 10], E[2, 11] = -moved * row, E[2, 10] + moved, E[2, 11] + moved * row
+
+
+@kernel
+def plane_point_error(p: F64, plane: F64, twist: F64, camera: F64, width: int, height: int, E: F64) -> None:
+    """Fill E (12,): error (m) along a plane's normal of a point p (3,) on it, as depth and its ray give it, by each parameter in its own unit."""
+    fx, fy, iz = camera[0], camera[1], 1.0 / p[2]
+    x, y = fx * p[0] * iz, fy * p[1] * iz
+    row = (y + camera[3]) / height - 0.5
+    a = -twist[0] - twist[4] * p[2] + twist[5] * p[1]
+    b = -twist[1] - twist[5] * p[0] + twist[3] * p[2]
+    c = -twist[2] - twist[3] * p[1] + twist[4] * p[0]
+    du, dv = fx * iz * (a - p[0] * iz * c), fy * iz * (b - p[1] * iz * c)
+    g, k = plane[0] * p[2] / fx, plane[1] * p[2] / fy
+    q = -p[2] * (plane[0] * p[0] + plane[1] * p[1] + plane[2] * p[2])
+    E[0], E[1], E[2], E[3], E[4], E[5], E[6] = g * x, k * y, g, k, g * x + k * y, g, k
+    E[7], E[8], E[9] = -q, -q * (x * x + y * y) / (0.25 * (width * width + height * height)) * iz, 0.0
+    E[10] = g * du + k * dv - q * c * iz * iz
+    E[11] = E[10] * row
+
+
+@kernel
+def _add(J: F64, W: F64, K: F64, r: F64, total: Equations) -> None:
+    """Add a residual r (3,) of information W (3, 3), with Jacobians J (3, 6) by the pose and K (3, 12) by the calibration."""
+    WK = np.empty(CALIBRATION)
+    for i in range(3):
+        e = W[i, 0] * r[0] + W[i, 1] * r[1] + W[i, 2] * r[2]
+        for k in range(CALIBRATION):
+            WK[k] = W[i, 0] * K[0, k] + W[i, 1] * K[1, k] + W[i, 2] * K[2, k]
+        for a in range(6):
+            total.b[a] += J[i, a] * e
+            for k in range(6):
+                total.H[a, k] += J[i, a] * (W[i, 0] * J[0, k] + W[i, 1] * J[1, k] + W[i, 2] * J[2, k])
+            for k in range(CALIBRATION):
+                total.C[a, k] += J[i, a] * WK[k]
+        for a in range(CALIBRATION):
+            total.s[a] += K[i, a] * e
+            for k in range(CALIBRATION):
+                total.G[a, k] += K[i, a] * WK[k]
+
+
+@kernel
+def _scale_and_subtract(scales: F64, J: F64, A: F64, K: F64) -> None:
+    """Express K (3, 12) in units of `scales`; and subtract J A, since a landmark moves with the keyframe that created it, whose error by the
+    calibration is A (6, 12) as that of the camera."""
+    for i in range(3):
+        for k in range(CALIBRATION):
+            K[i, k] *= scales[k]
+        for a in range(6):
+            for k in range(CALIBRATION):
+                K[i, k] -= J[i, a] * A[a, k]
+
+
+@kernel
+def _to_keyframe(R: F64, t: F64, plane: F64, out: F64) -> None:
+    """Move a plane (4,) of the world into the frame of a pose R, t."""
+    out[3] = plane[3]
+    for i in range(3):
+        out[i] = R[0, i] * plane[0] + R[1, i] * plane[1] + R[2, i] * plane[2]
+        out[3] += plane[i] * t[i]
+
+
+@kernel
+def _point_calibration_jacobian(
+    p: F64, q: F64, plane: F64, of_plane: F64, Q: F64, twist: F64, twist_then: F64, camera: F64, width: int, height: int, D: F64, K: F64
+) -> None:
+    """Fill K (3, 12): `D Q dq/dθ` of the landmark, q (3,) in its keyframe's frame, less the errors at p (3,) in the camera's, with Q from that frame
+    to this one and D = dr/dp. `plane` and `of_plane` (4,) are the surface in the camera's and in the keyframe's frame."""
+    E, L = np.empty((3, CALIBRATION)), np.empty((3, 3))
+    keypoint_errors(q, of_plane, twist_then, camera, width, height, E)
+    for i in range(3):  # L = D Q dq/d(u, v, 1/z)
+        x, y, z = 0.0, 0.0, 0.0
+        for j in range(3):
+            x, y, z = x + D[i, j] * Q[j, 0], y + D[i, j] * Q[j, 1], z + D[i, j] * Q[j, 2]
+        L[i, 0], L[i, 1], L[i, 2] = x * q[2] / camera[0], y * q[2] / camera[1], -q[2] * (x * q[0] + y * q[1] + z * q[2])
+    for i in range(3):
+        for k in range(CALIBRATION):
+            K[i, k] = L[i, 0] * E[0, k] + L[i, 1] * E[1, k] + L[i, 2] * E[2, k]
+    keypoint_errors(p, plane, twist, camera, width, height, E)
+    rows = 3 if D[2, 2] != 0.0 else 2
+    for i in range(rows):
+        for k in range(CALIBRATION):
+            K[i, k] -= E[i, k]
+
+
+@kernel
+def _local(R: F64, t: F64, world: F64, out: F64) -> None:
+    """`out = Rᵀ (world - t)`."""
+    x, y, z = world[0] - t[0], world[1] - t[1], world[2] - t[2]
+    for k in range(3):
+        out[k] = R[0, k] * x + R[1, k] * y + R[2, k] * z
+
+
+@kernel
+def _plane_then(surface: F64, Q: F64, p: F64, q: F64, out: F64) -> None:
+    """Move the plane of a point from the camera's frame, where the point is p, into its keyframe's, where it is q; NaN through the centre."""
+    out[3] = surface[3]
+    for a in range(3):
+        out[a] = Q[0, a] * surface[0] + Q[1, a] * surface[1] + Q[2, a] * surface[2]
+        out[3] += surface[a] * p[a]
+    out[3] -= out[0] * q[0] + out[1] * q[1] + out[2] * q[2]
+    if not abs(out[3]) > NEAR_M:
+        out[3] = np.nan
+
+
+@kernel
+def _add_points(
+    R: F64, t: F64, camera: F64, width: int, height: int, scales: F64, twist: F64, points: PointTerms, W: F64, flags: U8, surfaces: F64,
+    first: I32, keyframes: Keyframes, total: Equations,
+) -> None:  # fmt: skip
+    """Add the inliers among the points; `surfaces` (n, 4) are the planes that they lie on, in the camera frame (NaN: none)."""
+    p, q, r, then = np.empty(3), np.empty(3), np.empty(3), np.empty(4)
+    D, J, K, Q = np.zeros((3, 3)), np.empty((3, 6)), np.empty((3, CALIBRATION)), np.empty((3, 3))
+    for i in range(len(flags)):
+        if not flags[i]:
+            continue
+        k = first[i]
+        _local(R, t, points.positions_m[i], p)
+        _local(keyframes.R[k], keyframes.t[k], points.positions_m[i], q)
+        if not (q[2] > NEAR_M and point_residual(p, points.pixels[i], points.depth_m[i], camera, r, D)):
+            continue
+        Q[:] = 0.0
+        for a in range(3):
+            for b in range(3):
+                for c in range(3):
+                    Q[a, b] += R[c, a] * keyframes.R[k, c, b]
+        _plane_then(surfaces[i], Q, p, q, then)
+        _point_calibration_jacobian(p, q, surfaces[i], then, Q, twist, keyframes.twists[k], camera, width, height, D, K)
+        pose_jacobian(D, 3, p, J)
+        _scale_and_subtract(scales, J, keyframes.errors[k], K)
+        _add(J, W[i], K, r, total)
+
+
+@kernel
+def _add_planes(
+    R: F64, t: F64, camera: F64, width: int, height: int, scales: F64, twist: F64, planes: PlaneTerms, W: F64, flags: U8, samples: F32,
+    first: I32, keyframes: Keyframes, total: Equations,
+) -> None:  # fmt: skip
+    """Add the inliers among the identical planes; `samples` (p, n, 3) are points on them, world: what the calibration does to a plane is fitted to
+    what it does to those in view."""
+    p, q, r, B, J, K = np.empty(3), np.empty(3), np.empty(3), np.empty((3, 2)), np.empty((3, 6)), np.empty((3, CALIBRATION))
+    now, then, E, F, row = np.empty(4), np.empty(4), np.empty(CALIBRATION), np.empty(CALIBRATION), np.ones(3)
+    for i in range(len(flags)):
+        if not flags[i] or planes.kinds[i] != SAME:
+            continue
+        k = first[i]
+        tangent_columns(planes.observed[i], B)
+        plane_residual(SAME, R, t, planes.coefficients[i], planes.observed[i], B, r, J)
+        _to_keyframe(R, t, planes.coefficients[i], now)
+        _to_keyframe(keyframes.R[k], keyframes.t[k], planes.coefficients[i], then)
+        N, X, seen = np.zeros((3, 3)), np.zeros((3, CALIBRATION)), 0
+        for j in range(samples.shape[1]):
+            point = samples[i, j].astype(np.float64)
+            _local(R, t, point, p)
+            _local(keyframes.R[k], keyframes.t[k], point, q)
+            if not (p[2] > NEAR_M and q[2] > NEAR_M):
+                continue
+            u, v = camera[0] * p[0] / p[2] + camera[2], camera[1] * p[1] / p[2] + camera[3]
+            if not (0.0 <= u < width and 0.0 <= v < height):
+                continue
+            seen += 1
+            plane_point_error(q, then, keyframes.twists[k], camera, width, height, E)
+            plane_point_error(p, now, twist, camera, width, height, F)
+            row[0], row[1] = B[0, 0] * p[0] + B[1, 0] * p[1] + B[2, 0] * p[2], B[0, 1] * p[0] + B[1, 1] * p[1] + B[2, 1] * p[2]
+            for a in range(3):
+                for b in range(3):
+                    N[a, b] += row[a] * row[b]
+                for c in range(CALIBRATION):
+                    X[a, c] += row[a] * (F[c] - E[c])
+        if seen >= LEAST_SAMPLES:
+            K[:] = matmul(inverse_positive(N), X)
+            _scale_and_subtract(scales, J, keyframes.errors[k], K)
+            _add(J, W[i], K, r, total)
+
+
+@kernel
+def calibration_equations(
+    T: F64, camera: F64, width: int, height: int, scales: F64, twist: F64, points: PointTerms, planes: PlaneTerms, flags: Flags, surfaces: F64,
+    samples: F32, groups: Groups, keyframes: Keyframes,
+) -> Equations:  # fmt: skip
+    """Normal equations of the inliers among points and identical planes at the pose T (4, 4), for parameters in units of `scales` (12,)."""
+    R, t = np.ascontiguousarray(T[:3, :3]), np.ascontiguousarray(T[:3, 3])
+    total = Equations(
+        np.zeros((6, 6)), np.zeros(6), np.zeros((6, CALIBRATION)), np.zeros((CALIBRATION, CALIBRATION)), np.zeros(CALIBRATION)
+    )  # fmt: skip
+    no_lines = LineTerms(
+        np.empty((0, 2, 3)), np.empty((0, 2, 3, 3)), np.empty((0, 2, 2)), np.empty(0), np.empty((0, 2, 3)), np.empty((0, 2, 3, 3))
+    )  # fmt: skip
+    n, p = len(points.positions_m), len(planes.kinds)
+    weights = Weights(np.empty((n, 3, 3)), np.empty((0, 2, 2)), np.empty((0, 2, 2)), np.empty((p, 3, 3)))
+    fill_weights(R, t, camera, points, no_lines, planes, weights)
+    _add_points(R, t, camera, width, height, scales, twist, points, weights.points, flags.points, surfaces, groups.points, keyframes, total)
+    _add_planes(R, t, camera, width, height, scales, twist, planes, weights.planes, flags.planes, samples, groups.planes, keyframes, total)
+    return total
+
+
+@kernel
+def calibration_moment(information: F64, score: F64) -> F64:
+    """Second moment (12, 12) of the parameters given what residuals told of them, `information` (12, 12) and `score` (12,): the covariance, and the
+    square of the mean, which nothing is corrected by.
+
+    They are independent with a common variance v, which is learned by expectation maximisation (MacKay, Neural Computation 1992) from 1, its value
+    for a camera of a kind that nothing is known of. It falls with what residuals rule out: an exact camera is told from one that is not."""
+    v = 1.0
+    for _ in range(EXPECTATIONS + 1):
+        covariance = inverse_positive(information + np.eye(CALIBRATION) / v)
+        mean = matvec(covariance, score)
+        v = (PRIOR_COUNT + np.trace(covariance) + (mean * mean).sum()) / (PRIOR_COUNT + CALIBRATION)
+    return covariance + np.outer(mean, mean)

@@ -1,0 +1,158 @@
+"""Error of a pose by an imperfect calibration, against a simulated camera with known errors."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from trihedron.pipeline.core.geometry import invert
+from trihedron.pipeline.core.lie import adjoint, exp_se3, log_se3
+from trihedron.pipeline.core.types import CALIBRATION, Camera, Pose
+from trihedron.plugins.pose.calibration_uncertainty import carried_calibration
+from trihedron.plugins.shared.calibration_error import calibration_covariance, calibration_scales
+from trihedron.plugins.shared.calibration_error_kernels import (
+    Keyframes,
+    calibration_equations,
+    calibration_moment,
+    keypoint_errors,
+    plane_point_error,
+)
+from trihedron.plugins.shared.pose_optimizer import NO_PLANES, solve_pose
+from trihedron.plugins.shared.pose_optimizer_kernels import Flags, Groups, PointTerms
+
+CAMERA = Camera(640, 480, 520.0, 530.0, 315.0, 245.0)
+TWIST = np.array([0.3, -0.2, 0.1, 0.2, -0.4, 0.3])
+WALLS = np.array([[0.0, 0.0, -1.0, 3.0], [0.6, 0.0, -0.8, 2.5], [0.0, 0.6, -0.8, 2.2]])  # in the world; the camera looks along z
+
+
+def measured(points, plane, theta, twist):
+    """Pixels (n, 2), depth (n,) at them, and the points (n, 3) of a plane as depth alone sees them, by a camera that errs by theta (12,)."""
+    fx, fy, cx, cy = CAMERA.intrinsics
+    f, c = np.array([fx * (1 + theta[0]), fy * (1 + theta[1])]), np.array([cx + theta[2], cy + theta[3]])
+    rows = (fy * points[:, 1] / points[:, 2] + cy) / CAMERA.height - 0.5
+    pixels, depth, seen = np.empty((len(points), 2)), np.empty(len(points)), np.empty((len(points), 3))
+    for i, (point, row) in enumerate(zip(points, rows)):
+        rolled = (invert(exp_se3(twist * theta[9] * row)) @ [*point, 1.0])[:3]
+        pixels[i] = f * rolled[:2] / rolled[2] + c
+        later = exp_se3(twist * (theta[10] + theta[11] * row))
+        moved = np.append(later[:3, :3].T @ plane[:3], plane[3] + plane[:3] @ later[:3, 3])
+
+        def reading(ray, radius2, moved=moved):
+            z = -moved[3] / (moved[:3] @ ray)
+            return 1.0 / ((1.0 / z - theta[7]) / (1.0 + theta[8] * radius2))
+
+        of_depth = f * (1 + theta[4]), c + theta[5:7]
+        pixel = CAMERA.project(point[None])[0]
+        radius2 = ((pixel - [cx, cy]) ** 2).sum() / (0.25 * (CAMERA.width**2 + CAMERA.height**2))
+        depth[i] = reading(np.append((pixels[i] - of_depth[1]) / of_depth[0], 1.0), radius2)
+        on_plane = (invert(later) @ [*point, 1.0])[:3]
+        at = of_depth[0] * on_plane[:2] / on_plane[2] + of_depth[1]
+        z = reading(on_plane / on_plane[2], radius2)
+        seen[i] = z * np.append((at - [cx, cy]) / [fx, fy], 1.0)
+    return pixels, depth, seen
+
+
+def points_on(rng, plane, T_world_camera, count):
+    """Points (count, 3) of the world on a plane, in view of the camera, and the plane (4,) in the camera frame."""
+    local = np.append(T_world_camera[:3, :3].T @ plane[:3], plane[3] + plane[:3] @ T_world_camera[:3, 3])
+    rays = CAMERA.back_project(rng.uniform([40, 40], [600, 440], (count, 2)), np.ones(count))
+    points = rays * (-local[3] / (rays @ local[:3]))[:, None]
+    return points @ T_world_camera[:3, :3].T + T_world_camera[:3, 3], points, local
+
+
+@pytest.mark.parametrize("parameter", range(CALIBRATION))
+def test_errors_of_measurements_are_those_of_a_camera_with_that_error(parameter):
+    points, plane = points_on(np.random.default_rng(0), WALLS[1], np.eye(4), 12)[1:]
+    step = 1e-4 * calibration_scales(CAMERA)[parameter] * np.eye(CALIBRATION)[parameter]
+    (pixels, depth, seen), (pixels2, depth2, seen2) = (measured(points, plane, sign * step, TWIST) for sign in (1.0, -1.0))
+    errors, along = np.empty((3, CALIBRATION)), np.empty(CALIBRATION)
+    for i, point in enumerate(points):
+        keypoint_errors(point, plane, TWIST, CAMERA.intrinsics, CAMERA.width, CAMERA.height, errors)
+        plane_point_error(point, plane, TWIST, CAMERA.intrinsics, CAMERA.width, CAMERA.height, along)
+        expected = np.append(pixels[i] - pixels2[i], 1.0 / depth[i] - 1.0 / depth2[i]) / (2.0 * step[parameter])
+        assert errors[:, parameter] == pytest.approx(expected, rel=1e-4, abs=1e-6)
+        assert along[parameter] == pytest.approx(plane[:3] @ (seen[i] - seen2[i]) / (2.0 * step[parameter]), rel=1e-4, abs=1e-6)
+
+
+def two_views(theta):
+    """A keyframe at the origin and a camera 0.4 m and 9° from it, both with the calibration error theta: the terms of the points, the surfaces that
+    they lie on, and the true pose."""
+    rng, T = np.random.default_rng(1), exp_se3(np.array([0.3, 0.05, 0.25, 0.05, 0.14, -0.03]))
+    terms, surfaces = [], []
+    for wall in WALLS:
+        world, local, plane = points_on(rng, wall, T, 60)
+        pixels, depth, _ = measured(world, wall, theta, np.zeros(6))
+        landmarks = CAMERA.back_project(pixels, depth)
+        terms.append((landmarks, *measured(local, plane, theta, TWIST)[:2]))
+        surfaces.append(np.tile(plane, (60, 1)))
+    landmarks, pixels, depth = (np.concatenate(parts) for parts in zip(*terms))
+    n = len(landmarks)
+    points = PointTerms(landmarks, np.tile(1e-5 * np.eye(3), (n, 1, 1)), pixels, depth, np.full(n, 1.0), 0.003 * depth**2)
+    return points, np.concatenate(surfaces), T
+
+
+def equations_of(points, surfaces, T):
+    """The equations at pose T of landmarks that a keyframe at the origin created."""
+    keyframes = Keyframes(np.eye(3)[None], np.zeros((1, 3)), np.zeros((1, 6)), np.zeros((1, 6, CALIBRATION)))
+    flags = Flags(np.ones(len(surfaces), np.uint8), np.empty(0, np.uint8), np.empty(0, np.uint8))
+    groups = Groups(np.zeros(len(surfaces), np.int32), np.empty(0, np.int32), np.empty(0, np.int32))
+    samples, size = np.empty((0, 8, 3), np.float32), (CAMERA.width, CAMERA.height)
+    return calibration_equations(
+        T, CAMERA.intrinsics, *size, calibration_scales(CAMERA), TWIST, points, NO_PLANES, flags, surfaces, samples, groups, keyframes
+    )
+
+
+@pytest.mark.parametrize("parameter", range(CALIBRATION))
+def test_sensitivity_is_the_error_of_the_pose(parameter):
+    """The pose estimated from what a miscalibrated camera measures, in both views, is off by the sensitivity times the error."""
+    unit = 0.1 * np.eye(CALIBRATION)[parameter]
+    points, surfaces, T = two_views(unit * calibration_scales(CAMERA))
+    solution = solve_pose(T, CAMERA, T, 1e-6 * np.eye(6), points)
+    assert (solution.points > 0).all()
+    equations = equations_of(points, surfaces, solution.T_world_camera)
+    expected = -np.linalg.solve(equations.H, equations.C @ unit)
+    error = log_se3(invert(T) @ solution.T_world_camera)
+    assert error == pytest.approx(expected, rel=0.1, abs=0.03 * np.abs(expected).max() + 1e-6)
+
+
+def test_residuals_tell_of_the_calibration():
+    """Two views with random errors of every parameter: the estimate from their residuals agrees with the truth by its covariance, and is nearer to it
+    than nothing known."""
+    true = 0.2 * np.random.default_rng(2).normal(0.0, 1.0, CALIBRATION)
+    points, surfaces, T = two_views(true * calibration_scales(CAMERA))
+    solution = solve_pose(T, CAMERA, T, 1e-6 * np.eye(6), points)
+    assert (solution.points > 0).all()
+    H, b, C, G, s = equations_of(points, surfaces, solution.T_world_camera)
+    information, score = G - C.T @ np.linalg.solve(H, C), s - C.T @ np.linalg.solve(H, b)
+    covariance = np.linalg.inv(information + np.eye(CALIBRATION))
+    error = covariance @ score - true
+    assert error @ np.linalg.solve(covariance, error) < CALIBRATION
+    assert error @ error < 0.7 * (true @ true)
+    assert np.trace(covariance) < 0.7 * CALIBRATION
+
+
+def test_moments_of_the_calibration():
+    """Nothing known: the unit variance of a camera of its kind. Known to be exact: nearly none. Known to be off: that, squared."""
+    assert calibration_moment(np.zeros((CALIBRATION, CALIBRATION)), np.zeros(CALIBRATION)) == pytest.approx(np.eye(CALIBRATION))
+    known = 1e4 * np.eye(CALIBRATION)
+    assert np.abs(calibration_moment(known, np.zeros(CALIBRATION))).max() < 2e-4
+    off = np.linspace(-2.0, 2.0, CALIBRATION)
+    assert calibration_moment(known, known @ off) == pytest.approx(np.outer(off, off), abs=2e-3)
+
+
+def test_a_camera_that_is_mostly_right_is_trusted_in_the_rest():
+    """Parameters that no residual shows are taken to be as good as those that residuals do show."""
+    information = np.diag([1e4] * 6 + [0.0] * 6)
+    right, wrong = (calibration_moment(information, information @ np.full(CALIBRATION, off)) for off in (0.0, 1.5))
+    assert right[-1, -1] < 0.5 < 1.0 < wrong[-1, -1]
+
+
+def test_a_pose_that_was_not_refined_keeps_the_error_of_the_previous_one():
+    """A camera that moved 2 m: the position errs by the previous rotation's error besides."""
+    sensitivity, moved = np.zeros((6, CALIBRATION)), np.eye(4)
+    sensitivity[4, 3], moved[2, 3] = 0.01, 2.0
+    first = Pose(0, 0, np.eye(4), np.eye(6), np.eye(4), 0, np.zeros(3, np.int32), 0, "ok", "", sensitivity=sensitivity)
+    pose = carried_calibration(replace(first, T_world_camera=moved, index=1), first)
+    assert pose.sensitivity[[0, 4], 3] == pytest.approx([0.02, 0.01])
+    assert calibration_covariance(pose) == pytest.approx(pose.sensitivity @ pose.sensitivity.T)
+    assert pose.sensitivity == pytest.approx(adjoint(invert(moved)) @ sensitivity)

@@ -1,0 +1,196 @@
+"""Ablations of recordings: what is computed, what each swap changes, and mistakes in one line."""
+
+import json
+import os
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from trihedron.pipeline.app.cli import main
+from trihedron.pipeline.core import registry
+from trihedron.pipeline.core.errors import DataError
+from trihedron.pipeline.core.types import Camera, Keypoints, Map, Planes, Pose, Rotation, Segments, Tracks, Translation
+from trihedron.pipeline.record.reader import Recording
+from trihedron.plugins.translation.levenberg_marquardt import LevenbergMarquardt
+from trihedron.tools.ablation_differences import Parting, StageErrors, distance
+from trihedron.tools.ablation_swaps import combinations_of, folder_name, parsed
+from trihedron.tools.ablation_tables import Case, Variant, attribution, case_from_dict, case_to_dict, comparisons, sections_of, verdict
+from trihedron.tools.site_ablations import ablations_of
+
+SMALL = ["dataset.width=320", "dataset.height=240", "threads=1"]
+
+
+def case(number, figures, stages=("manhattan", "rotation")):
+    """Alternatives of one recording: all combinations of one change a stage, with these ATE."""
+    combinations = combinations_of(parsed([f"{stage}=other" for stage in stages]))
+    variants = [Variant(one, f"{number}/{one.label}", {"ATE mm": ate, "ms": 1.0}, 1.0, 1.1) for one, ate in zip(combinations, figures)]
+    return Case(f"{number}/run.mcap", 10, list(stages), [], np.nan, 4.4, variants)
+
+
+def test_swaps_are_combined_by_stage():
+    swaps = parsed(["planes.angle_deg=2,3", "planes.min_points=100", "manhattan=mean_shift,plane_svd", "graph.tracks.manhattan=manhattan@prev"])
+    assert [(swap.stage, len(swap.levels)) for swap in swaps] == [("planes", 6), ("manhattan", 3), ("tracks", 2)]
+    combinations = combinations_of(swaps)
+    assert len(combinations) == 36 and combinations[0].label == "as recorded" and combinations[0].stages == frozenset()
+    assert combinations[-1].words == ("planes.angle_deg=3", "planes.min_points=100", "manhattan=plane_svd", "graph.tracks.manhattan=manhattan@prev")
+    name = folder_name("desk", combinations[-1])
+    assert name == "desk,planes.angle_deg=3,planes.min_points=100,manhattan=plane_svd,graph.tracks.manhattan=manhattan_prev"
+
+
+def test_attribution_has_an_interval_over_recordings():
+    cases = [case(0, [1.0, 2.0, 3.0, 5.0]), case(1, [1.0, 1.5, 4.0, 5.0])]
+    found = {one["stage"]: one for one in attribution(cases) if one["figure"] == "ATE mm"}
+    assert found["rotation"]["mean"] == pytest.approx((1.5 + 0.75) / 2) and found["manhattan"]["mean"] == pytest.approx((2.5 + 3.25) / 2)
+    assert found[""]["mean"] == pytest.approx(4.0) and found[""]["half"] == pytest.approx(0.0)
+    assert found["rotation"]["half"] == pytest.approx(12.7062 * 0.375, rel=1e-4)
+    assert [section.title.split(",")[0] for section in sections_of(cases)][1:3] == [
+        "Differences from the recorded configuration",
+        "Attribution: Shapley value of each swap",
+    ]
+
+
+def test_a_difference_is_shown_or_not():
+    rng = np.random.default_rng(0)
+    cases = [case(k, [1.0, 1.0 + noise, 3.0 + noise, 3.0]) for k, noise in enumerate(rng.normal(0.0, 0.2, 6))]
+    found = {(label, one.figure): one for label, one in comparisons(cases)}
+    assert verdict(found["manhattan=other", "ATE mm"]) == "worse" and verdict(found["rotation=other", "ATE mm"]) == "no difference shown"
+    assert verdict(found["rotation=other", "ms"]) == "equal"
+    assert found["rotation=other", "ATE mm"].needed > 6 and found["manhattan=other", "ATE mm"].needed < 6
+    assert all(one.corrected >= one.p for one in found.values())
+
+
+def test_bars_of_the_pages_of_results(tmp_path):
+    cases = [case(number, [3.0, 1.0, 5.0, 3.0]) for number in (0, 1)]
+    (tmp_path / "ablation.json").write_text(json.dumps({str(k): case_to_dict(one) for k, one in enumerate(cases)}))
+    assert case_from_dict(json.loads(json.dumps(case_to_dict(cases[0])))).variants == cases[0].variants
+    (found,) = ablations_of([tmp_path, tmp_path / "nowhere"])
+    assert found["title"].endswith(": 2 recordings") and [figure["name"] for figure in found["figures"]] == ["ATE mm", "ms"]
+    bars = {bar["label"]: (bar["left"], bar["length"], bar["text"]) for bar in found["figures"][0]["bars"]}
+    assert bars["manhattan=other"] == (50.0, 50.0, "+2.00 ± 0.00") and bars["rotation=other"] == (0.0, 50.0, "-2.00 ± 0.00")
+    (tmp_path / "ablation.json").write_text('{"a": {"variants": 3}}')
+    with pytest.raises(DataError, match="is not an ablation"):
+        ablations_of([tmp_path])
+
+
+def translation(index, x):
+    return Translation(index, 1000 * index, np.array([x, 0.0, 0.0]), np.eye(3), np.empty((0, 3)), np.zeros(3, np.int32), True)
+
+
+def test_where_two_variants_part():
+    parting = Parting()
+    for index, apart in enumerate((0.0, 0.0, 0.002, 0.005, 0.001)):
+        parting.compare(index, ["translation"], {"translation": translation(index, 1.0)}, {"translation": translation(index, 1.0 + apart)})
+    assert (parting.frame, parting.topic, parting.field, parting.frames) == (2, "translation", "t_world_camera", 3)
+    assert (parting.worst, parting.unit) == (3, "mm") and parting.distance == pytest.approx(5.0)
+
+
+def test_errors_of_a_stage_alone():
+    errors = StageErrors({1000 * index: np.eye(4) for index in range(4)})
+    for index in range(4):
+        errors.take(["translation"], {"translation": translation(index, 0.003) if index else None})
+    assert errors.figures()["translation mm"] == pytest.approx(3.0) and errors.figures()["values %"] == 75.0
+    assert np.isnan(errors.figures()["axes deg"]) and distance(translation(0, 0.0), None) is None
+
+
+@pytest.mark.parametrize(
+    ("words", "code", "message"),
+    [
+        ("manhattan=plane_svd out=o", 2, "ablate: no recording is given; give RUN.mcap first"),
+        ("run.mcap out=o", 2, "ablate: nothing is swapped; give STAGE=PLUGIN,PLUGIN or STAGE.OPTION=VALUE,VALUE"),
+        ("run.mcap manhattan=plane_svd", 2, "out: is not given; give out=DIR for the alternatives"),
+        ("run.mcap manhattan=plane_svd out=o feedback=recorder", 2, "feedback: is 'recorder'; did you mean 'recorded'?"),
+        ("run.mcap manhattan=plane_svd out=o threads=0", 1, "threads: 0 is not a number of threads; give 1 to 256"),
+        ("a.mcap b.mcap bundle=none out=o --budget", 2, "--budget: is of one run, and 2 recordings are given; give one of them"),
+        ("own.mcap manhatan=plane_svd out=o", 2, "manhatan: is not a stage, nor an option or a wire of one; did you mean 'manhattan'?"),
+        ("own.mcap dataset.length=3 out=o", 2,
+         "dataset.length: an ablation has the frames of its recordings; make a recording of the other frames, and give it too"),
+        ("own.mcap planes.angle_deg=interval(1,2) out=o", 2,
+         "planes.angle_deg: 'planes.angle_deg=interval(1,2)' is a space to search in; give values A,B"),
+        ("nowhere.mcap bundle=none out=o", 1, "nowhere.mcap: cannot be read: No such file or directory; give the path of an MCAP file"),
+    ],
+)  # fmt: skip
+def test_mistakes_are_one_line(tmp_path, capsys, monkeypatch, words, code, message):
+    monkeypatch.chdir(tmp_path)
+    os.symlink(Path(__file__).parents[1] / "fuzz" / "seeds" / "own.mcap", "own.mcap")
+    assert main(["ablate", *words.split()]) == code
+    assert capsys.readouterr().err.splitlines()[-1] == f"trihedron: {message}"
+
+
+@dataclass(frozen=True)
+class WrongSign:
+    """The default translation with the camera's motion the wrong way round."""
+
+    def __call__(
+        self, camera: Camera, rotation: Rotation, tracks: Tracks | None, keypoints: Keypoints, segments: Segments, planes: Planes,
+        previous_pose: Pose | None, earlier_pose: Pose | None, map: Map | None,
+    ) -> Translation:  # fmt: skip
+        found = LevenbergMarquardt()(camera, rotation, tracks, keypoints, segments, planes, previous_pose, earlier_pose, map)
+        if previous_pose is None:
+            return found
+        return replace(found, t_world_camera=2.0 * previous_pose.T_world_camera[:3, 3] - found.t_world_camera)
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(900)
+def test_a_wrong_sign_in_translation_is_attributed_to_translation(tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(registry, "_PLUGINS", {slot: dict(plugins) for slot, plugins in registry._PLUGINS.items()})
+    registry.register("translation", "wrong_sign")(WrongSign)
+    assert main(["run", "graph=structural_no_refine", "dataset.length=14", *SMALL, f"out={tmp_path}/run"]) == 0
+    words = ["manhattan=mean_shift,plane_svd", "rotation=drift_free", "translation=levenberg_marquardt,wrong_sign"]
+    command = ["ablate", f"{tmp_path}/run/run.mcap", *words, f"out={tmp_path}/ablation", "threads=1", f"--json={tmp_path}/found.json"]
+    capsys.readouterr()
+    assert main(command) == 0
+    found = json.loads((tmp_path / "found.json").read_text())
+    shares = {one["stage"]: one["mean"] for one in found["attribution"] if one["figure"] == "RPE 1 frame mm"}  # ATE aligns a mirrored straight line
+    assert set(shares) == {"manhattan", "translation", ""} and shares["translation"] > 0.95 * shares[""] > 10.0
+    assert abs(shares["manhattan"]) < 0.05 * shares["translation"]
+    mutated = next(one for one in found["recordings"][0]["variants"] if one["change"] == "translation=wrong_sign")
+    assert (mutated["parting"]["topic"], mutated["parting"]["field"]) == ("translation", "t_world_camera")
+    assert Path(mutated["picture"]).stat().st_size > 10_000
+    before = {path: path.stat().st_mtime_ns for path in (tmp_path / "ablation").rglob("*") if path.name != "ablation.json"}
+    assert main(command) == 0
+    assert "done already" in capsys.readouterr().err
+    assert before == {path: path.stat().st_mtime_ns for path in (tmp_path / "ablation").rglob("*") if path.name != "ablation.json"}
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(900)
+def test_closed_loop_gives_the_bytes_of_a_full_run_and_open_loop_those_of_a_replay(tmp_path, capsys):
+    room = ["dataset.length=14", *SMALL]
+    swaps = ["manhattan=plane_svd", "bundle=none"]
+    assert main(["run", *room, "record.frames=true", "record.topics=[normals]", f"out={tmp_path}/run"]) == 0
+    assert main(["run", *room, *swaps, f"out={tmp_path}/full"]) == 0
+    source = f"{tmp_path}/run/run.mcap"
+    assert main(["ablate", source, *swaps, f"out={tmp_path}/closed", f"--json={tmp_path}/closed.json", "--budget"]) == 0
+    own, whole = Recording(tmp_path / "closed" / "manhattan=plane_svd,bundle=none" / "run.mcap"), Recording(tmp_path / "full" / "run.mcap")
+    assert {"manhattan", "rotation", "translation", "pose", "map"} <= own.topics and "keypoints" not in own.topics
+    for topic in own.topics - {"frames"}:
+        assert list(own.messages(f"/{topic}")) == list(whole.messages(f"/{topic}")), topic
+    one, other = (json.loads((folder / "metrics.json").read_text()) for folder in (own.path.parent, whole.path.parent))
+    assert one == other
+    found = json.loads((tmp_path / "closed.json").read_text())["recordings"][0]
+    assert found["changed"]["frame"] is None and found["shared"] == []
+    assert set(found["budget"]) >= {"", "rotation", "translation", "map"}
+    assert main(["compare", f"{tmp_path}/closed"]) == 0 and "manhattan=plane_svd bundle=none" in capsys.readouterr().out
+
+    open_loop = ["feedback=recorded", "manhattan=plane_svd"]
+    assert main(["ablate", source, *open_loop, f"out={tmp_path}/open", f"--json={tmp_path}/open.json"]) == 0
+    assert main(["run", f"replay={source}", "only=[manhattan]", *open_loop, f"out={tmp_path}/replay"]) == 0
+    own, replay = Recording(tmp_path / "open" / "manhattan=plane_svd" / "run.mcap"), Recording(tmp_path / "replay" / "run.mcap")
+    assert own.topics == {"manhattan", "frames"} and list(own.messages("/manhattan")) == list(replay.messages("/manhattan"))
+    alternatives = json.loads((tmp_path / "open.json").read_text())["recordings"][0]["variants"]
+    assert all(0.0 < variant["figures"]["axes deg"] < 1.0 and "ATE mm" in variant["figures"] for variant in alternatives)
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(900)
+def test_several_recordings_from_python(tmp_path):
+    import trihedron as th
+
+    runs = [th.run("dataset.length=8", *SMALL, f"dataset.seed={seed}", out=tmp_path / f"seed{seed}", quiet=True) for seed in (0, 1, 2)]
+    found = th.ablate(runs, "bundle=none", out=tmp_path / "ablation")
+    assert sorted(path.name for path in found.folders["bundle=none"]) == [f"seed{seed},bundle=none" for seed in (0, 1, 2)]
+    assert {one["change"] for one in found.figures["comparisons"]} == {"bundle=none"}
+    assert "Paired over 3 recordings" in str(found) and len(found.tables["Differences from the recorded configuration"]) == 4

@@ -1,0 +1,46 @@
+"""Statistics of ablations on known figures."""
+
+import numpy as np
+import pytest
+
+from trihedron.tools.ablation_statistics import holm, paired, repeats_needed, shapley
+
+
+def test_shapley_values_of_the_glove_game():
+    """Two left gloves a and b, one right glove c; a pair is worth 1: 1/6, 1/6 and 2/3."""
+    worth = {frozenset(some): float("c" in some and len(some) > 1) for some in ("", "a", "b", "c", "ab", "ac", "bc", "abc")}
+    assert shapley(worth, "abc") == pytest.approx({"a": 1 / 6, "b": 1 / 6, "c": 2 / 3})
+
+
+def test_shapley_values_sum_to_the_whole_and_divide_an_interaction_equally():
+    worth = {frozenset(): 5.0, frozenset("a"): 7.0, frozenset("b"): 4.0, frozenset("ab"): 10.0}
+    found = shapley(worth, "ab")
+    assert found == pytest.approx({"a": 4.0, "b": 1.0}) and sum(found.values()) == pytest.approx(5.0)
+
+
+def test_holm_on_four_known_p_values():
+    assert holm([0.01, 0.04, 0.03, 0.005]) == pytest.approx([0.03, 0.06, 0.06, 0.02])
+    assert holm([0.9, 0.8]) == [1.0, 1.0] and holm([]) == []
+
+
+@pytest.mark.parametrize(("effect", "pairs"), [(0.5, 34), (0.8, 15), (0.2, 199), (-0.5, 34)])
+def test_repeats_needed_are_those_of_the_tables(effect, pairs):
+    """Cohen, 1988, and G*Power: two-sided paired t test, 5 %, power 80 %."""
+    assert repeats_needed(effect) == pairs
+
+
+def test_repeats_needed_at_the_ends():
+    assert repeats_needed(50.0) == 2 and repeats_needed(1e-4) is None
+
+
+def test_paired_differences_by_student():
+    found = paired("ATE mm", [1.0, 2.0, 3.0, 4.0])
+    assert (found.pairs, found.mean) == (4, 2.5) and found.effect == pytest.approx(2.5 / np.std([1, 2, 3, 4], ddof=1))
+    assert found.half == pytest.approx(3.182446 * 1.290994 / 2.0, rel=1e-6) and found.p == pytest.approx(0.030466, rel=1e-4)
+
+
+def test_differences_that_do_not_vary_or_exist():
+    assert paired("ATE mm", [np.nan, np.nan]) is None
+    assert paired("ATE mm", [1.0, np.nan]).p is None
+    equal = paired("ATE mm", [0.0, 0.0, 0.0])
+    assert (equal.mean, equal.half, equal.p, equal.needed) == (0.0, 0.0, 1.0, None)

@@ -1,0 +1,229 @@
+"""Swap stages of recorded runs, compute again only what follows from them, and say what each swap changes and where.
+
+From each recording every combination of the given plugins, options or wires is computed, side by side: what they have in common is read or computed
+once. Each alternative is a run folder in out=DIR. By default all that follows from a swap is computed again, as a full run would, to the same bytes;
+with feedback=recorded the swapped stages alone, on the recorded past.
+
+The tables: every alternative's figures; paired differences over the recordings with intervals, Holm's correction, effect sizes and the number of
+repeats needed; the Shapley value of each swap, and with --budget what the truth in the place of a stage changes; where they part, with a picture of
+the worst frame; the cost.
+The same command again computes only what is missing.
+
+Example: trihedron ablate runs/a/run.mcap manhattan=mean_shift,plane_svd rotation=drift_free,procrustes out=runs/ablation
+Example: trihedron ablate runs/seeds/*/run.mcap planes.angle_deg=2,3 bundle=none out=runs/ablation --markdown table.md
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import sys
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from trihedron.pipeline.app.alternatives import Alternatives, Outcome, alternatives_of
+from trihedron.pipeline.app.execute import MAX_THREADS
+from trihedron.pipeline.core.config import Feedback
+from trihedron.pipeline.core.errors import ConfigError, DataError, TrihedronError, UsageError, did_you_mean
+from trihedron.pipeline.record.reader import Recording
+from trihedron.pipeline.run.result_files import read_results
+from trihedron.pipeline.sweep.jobs import key_of
+from trihedron.tools import ablation_tables as tables
+from trihedron.tools.ablation_differences import Parting, RecordedValues, StageErrors, truth_of
+from trihedron.tools.ablation_swaps import Combination, combinations_of, folder_name, parsed, without_repeats
+from trihedron.tools.ablation_tables import Case, Variant
+from trihedron.tools.arguments import Parser
+
+RESULT = "ablation.json"
+PICTURE = "differs.png"
+ERRORS = {  # column -> key of the final metrics, factor
+    "ATE mm": ("ate_rmse_m", 1e3),
+    "RPE 1 frame mm": ("rpe_frame_rmse_m", 1e3),
+    "RPE 1 s mm": ("rpe_second_rmse_m", 1e3),
+    "RPE 1 s deg": ("rpe_second_rmse_deg", 1.0),
+}
+SETTINGS = ("out", "feedback", "threads")
+
+
+@dataclass(frozen=True)
+class Options:
+    """The recordings, the swaps, and the settings of an ablation."""
+
+    recordings: tuple[Path, ...]
+    swaps: tuple[str, ...]
+    out: Path
+    feedback: Feedback = Feedback.new
+    threads: int = 2
+    budget: bool = False
+
+
+def main(argv: list[str]) -> int:
+    """Run the command; returns the exit code. Raises TrihedronError, one line."""
+    parser = Parser("ablate", __name__)
+    parser.add_argument("words", nargs="+", metavar="RUN.mcap|SWAP", help="recordings; STAGE=PLUGIN,... or STAGE.OPTION=VALUE,...; out=DIR")
+    parser.add_argument("--budget", action="store_true", help="of a single recording: the truth in the place of stages too, which takes six replays")
+    parser.add_argument("--json", type=Path, metavar="FILE", help="write figures and tables there too")
+    parser.add_argument("--markdown", type=Path, metavar="FILE", help="write the tables there too")
+    given = parser.parse_args(argv)
+    cases = ablate(options_of(given.words, given.budget))
+    sections = tables.sections_of(cases)
+    print(tables.as_text(sections))
+    if given.markdown:
+        given.markdown.write_text(tables.as_markdown(sections))
+    if given.json:
+        given.json.write_text(json.dumps(tables.as_json(cases, sections), indent=2) + "\n")
+    return 0
+
+
+def options_of(words: Sequence[str], budget: bool = False) -> Options:
+    """Sort words into recordings, swaps and settings. Raises UsageError."""
+    recordings = [word for word in words if "=" not in word or Path(word).is_file()]
+    rest = [word for word in words if word not in recordings]
+    settings = {key: value for key, _, value in (word.partition("=") for word in rest) if key in SETTINGS}
+    swaps = tuple(word for word in rest if word.partition("=")[0] not in SETTINGS)
+    if not recordings:
+        raise UsageError("ablate", "no recording is given", "give RUN.mcap first")
+    if budget and len(recordings) > 1:
+        raise UsageError("--budget", f"is of one run, and {len(recordings)} recordings are given", "give one of them")
+    if not swaps:
+        raise UsageError("ablate", "nothing is swapped", "give STAGE=PLUGIN,PLUGIN or STAGE.OPTION=VALUE,VALUE")
+    if not settings.get("out"):
+        raise UsageError("out", "is not given", "give out=DIR for the alternatives")
+    feedback = settings.get("feedback", Feedback.new.name)
+    if feedback not in Feedback.__members__:
+        raise UsageError("feedback", f"is '{feedback}'", did_you_mean(feedback, Feedback.__members__))
+    threads = settings.get("threads", "2")
+    if not threads.isdigit() or not 1 <= int(threads) <= MAX_THREADS:
+        raise ConfigError("threads", f"{threads} is not a number of threads", f"give 1 to {MAX_THREADS}")
+    paths = tuple(path / "run.mcap" if path.is_dir() else path for path in (Path(word).expanduser() for word in recordings))
+    return Options(paths, swaps, Path(settings["out"]).expanduser(), Feedback[feedback], int(threads), budget)
+
+
+def ablate(options: Options) -> list[Case]:
+    """Compute what is missing of an ablation; returns the figures of every recording. Raises TrihedronError."""
+    recordings = [Recording(path) for path in options.recordings]
+    swaps = without_repeats(parsed(options.swaps), recordings)
+    combinations, prefixes = combinations_of(swaps), _prefixes(options.recordings)
+    known, keys, cases = _known(options.out), [], []
+    for number, (recording, prefix) in enumerate(zip(recordings, prefixes), 1):
+        alternatives = alternatives_of(recording, [combination.words for combination in combinations])
+        computing = Alternatives(recording, alternatives, options.feedback, options.threads)
+        key = _key(recording, computing, options)
+        if key in known:
+            print(f"{recording.path}: done already", file=sys.stderr)
+            case = tables.case_from_dict(known[key])
+        else:
+            print(f"{recording.path} ({number} of {len(recordings)}): {len(combinations)} alternatives", file=sys.stderr)
+            folders = [options.out / folder_name(prefix, combination) for combination in combinations]
+            case = _computed(computing, combinations, folders)
+            if options.budget:
+                case.budget = _budget(recording)
+        cases.append(case)
+        keys.append(key)
+        _write(options.out, {**known, **dict(zip(keys, map(tables.case_to_dict, cases)))})
+    _draw_farthest(cases)
+    _write(options.out, {**known, **dict(zip(keys, map(tables.case_to_dict, cases)))})
+    return cases
+
+
+def _prefixes(paths: Sequence[Path]) -> list[str]:
+    """Tell the folders of several recordings apart: the names of their runs, or numbers."""
+    if len(paths) == 1:
+        return [""]
+    names = [path.resolve().parent.name for path in paths]
+    return names if len(set(names)) == len(names) else [str(number) for number in range(len(paths))]
+
+
+def _key(recording: Recording, computing: Alternatives, options: Options) -> str:
+    """Hash of all that the figures depend on."""
+    state = recording.path.stat()
+    parts = [str(recording.path.resolve()), state.st_size, state.st_mtime_ns, options.feedback.name, options.budget]
+    configs = [key_of(alternative.config) for alternative in computing.alternatives]
+    return hashlib.sha256(json.dumps([*parts, *configs, str(options.out.resolve())]).encode()).hexdigest()
+
+
+def _known(out: Path) -> Mapping[str, Any]:
+    known = read_results(out / RESULT)
+    return {key: case for key, case in known.items() if all(Path(one["folder"]).is_dir() for one in case["variants"])}
+
+
+def _write(out: Path, cases: Mapping[str, Any]) -> None:
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+        (out / RESULT).write_text(json.dumps(cases, indent=2) + "\n")
+    except OSError as error:
+        raise DataError(str(out), f"cannot be written: {error.strerror}", "give another out=DIR") from error
+
+
+def _computed(computing: Alternatives, combinations: Sequence[Combination], folders: Sequence[Path]) -> Case:
+    """Compute all alternatives of a recording."""
+    recording, graphs = computing.recording, [alternative.graph for alternative in computing.alternatives]
+    topics = [name for name in graphs[0].stages if name in computing.stages]
+    truth = truth_of(recording)
+    errors, partings = [StageErrors(truth) for _ in folders], [Parting() for _ in folders]
+    recorded = RecordedValues(recording, topics)
+
+    def on_frame(index: int, values: Sequence[Mapping[str, Any]]) -> None:
+        recorded.compare(index, values[0])
+        for one, parting, found in zip(values, partings, errors):
+            parting.compare(index, topics, values[0], one)
+            found.take(topics if computing.feedback is Feedback.recorded else (), one)
+
+    computing.run(folders, on_frame)
+    figures = [_figures(outcome, found, computing.feedback) for outcome, found in zip(computing.outcomes, errors)]
+    full_s = read_results(recording.path.parent / "timing.json").get("cpu_s")
+    variants = [
+        Variant(combination, str(folder), one, outcome.stages_s, outcome.total_s, parting)
+        for combination, folder, one, outcome, parting in zip(combinations, folders, figures, computing.outcomes, partings)
+    ]
+    case = Case(
+        str(recording.path), computing.runners[0].count, topics, list(computing.shared), full_s or np.nan, computing.cpu_s, variants, recorded.parting
+    )
+    if case.changed.frame is not None:
+        changed = f"{case.changed.topic}.{case.changed.field} from frame {case.changed.frame} on"
+        print(f"trihedron: warning: {recording.path} was recorded by other code: as recorded gives another {changed}", file=sys.stderr)
+    return case
+
+
+def _figures(outcome: Outcome, errors: StageErrors, feedback: Feedback) -> dict[str, float]:
+    """Figures of an alternative by column, NaN where there is none."""
+    final, status = outcome.metrics.get("final") or {}, outcome.metrics.get("status") or {}
+    figures = _errors(final)
+    if status:
+        figures["ok %"] = 100.0 * status["ok"] / max(1, outcome.metrics["frames"])
+    return {**figures, **(errors.figures() if feedback is Feedback.recorded else {}), "ms": outcome.stage_ms}
+
+
+def _errors(final: Mapping[str, Any]) -> dict[str, float]:
+    """Columns of the metrics of a trajectory, NaN where there are none."""
+    return {name: factor * final[key] if final.get(key) is not None else np.nan for name, (key, factor) in ERRORS.items()}
+
+
+def _budget(recording: Recording) -> dict[str, dict[str, float]]:
+    """Errors with the truth in the place of stages, by their names; empty where the recording cannot be judged."""
+    from trihedron.tools.error_budget import budget
+
+    try:
+        rows = budget(recording)
+    except TrihedronError as error:
+        print(f"no error budget: {error}", file=sys.stderr)
+        return {}
+    return {" + ".join(stages): _errors(row) for stages, row in rows.items()}
+
+
+def _draw_farthest(cases: Sequence[Case]) -> None:
+    """Draw the worst frame of each alternative, in the recording where it is farthest from the recorded configuration."""
+    from trihedron.tools.picture import draw_pair
+
+    for number in range(1, len(cases[0].variants)):
+        case, variant = tables.farthest([(case, case.variants[number]) for case in cases])
+        if variant.picture or variant.parting.worst is None:
+            continue
+        original, base = Recording(case.recording), Recording(Path(case.variants[0].folder) / "run.mcap")
+        out, own = Path(variant.folder) / PICTURE, Recording(Path(variant.folder) / "run.mcap")
+        draw_pair([("as recorded", [base, original]), (variant.combination.label, [own, original])], variant.parting.worst, out)
+        variant.picture = str(out)

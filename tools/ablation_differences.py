@@ -1,0 +1,160 @@
+"""Differences of alternatives: the frames at which their values part, and the errors of single stages against the ground truth."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import asdict, dataclass, field
+from itertools import permutations, product
+from typing import Any
+
+import numpy as np
+
+from trihedron.pipeline.core.errors import DataError
+from trihedron.pipeline.core.geometry import nearest_rotation
+from trihedron.pipeline.core.types import F64, ManhattanFrame, Pose, Rotation, Translation, Value
+from trihedron.pipeline.record.reader import Recording, TopicReader
+from trihedron.pipeline.run.metrics import rotation_angles_deg
+from trihedron.tools.diff import differing
+from trihedron.tools.error_budget import true_poses
+
+MEASURED = ("pose", "translation", "rotation", "manhattan")  # topics with a distance of two values; the first that is there finds the worst
+CUBE = [
+    sign * np.eye(3)[list(order)].T
+    for order in permutations(range(3))
+    for sign in (np.array(signs, np.float64) for signs in product((1, -1), repeat=3))
+    if np.linalg.det(sign * np.eye(3)[list(order)].T) > 0.0
+]  # the 24 rotations of a cube, which exchange the axes of a Manhattan frame
+
+
+@dataclass
+class Parting:
+    """First difference of an alternative from the recorded run: frame, topic and field, its size there (text), the number of frames that
+    differ, and the worst frame with the distance there."""
+
+    frame: int | None = None
+    topic: str = ""
+    field: str = ""
+    size: str = ""
+    frames: int = 0
+    worst: int | None = None
+    distance: float = 0.0
+    unit: str = ""
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return field name -> value, ready for JSON."""
+        return asdict(self)
+
+    def compare(self, index: int, topics: Iterable[str], base: Mapping[str, Any], other: Mapping[str, Any]) -> None:
+        """Take the values of a frame; `topics` in data order."""
+        parted = False
+        for topic in topics:
+            x, y = _value(base, topic, index), _value(other, topic, index)
+            if x is y or (first := next(differing(x, y), None)) is None:
+                continue
+            if self.frame is None:
+                self.frame, self.topic, self.field, self.size = index, topic, *first
+            parted = True
+            if self.frame != index:
+                break  # that the frame differs is enough
+        self.frames += parted
+        self._measure(index, base, other)
+
+    def _measure(self, index: int, base: Mapping[str, Any], other: Mapping[str, Any]) -> None:
+        topic = next((name for name in MEASURED if name in base and name in other), None)
+        if topic is None:
+            self.worst = self.frame
+            return
+        found = distance(_value(base, topic, index), _value(other, topic, index))
+        if found is not None and found[0] > self.distance:
+            self.worst, (self.distance, self.unit) = index, found
+
+
+def _value(values: Mapping[str, Any], topic: str, index: int) -> Value | None:
+    value = values.get(topic)
+    return value if isinstance(value, Value) and value.index == index else None
+
+
+def distance(x: Value | None, y: Value | None) -> tuple[float, str] | None:
+    """Return the distance of two poses or translations (mm), rotations or Manhattan frames (deg), with its unit; None for other values."""
+    if isinstance(x, Pose) and isinstance(y, Pose):
+        return 1e3 * float(np.linalg.norm(x.T_world_camera[:3, 3] - y.T_world_camera[:3, 3])), "mm"
+    if isinstance(x, Translation) and isinstance(y, Translation):
+        return 1e3 * float(np.linalg.norm(x.t_world_camera - y.t_world_camera)), "mm"
+    if isinstance(x, Rotation) and isinstance(y, Rotation):
+        return _angle_deg(x.R_world_camera.T @ y.R_world_camera), "deg"
+    if isinstance(x, ManhattanFrame) and isinstance(y, ManhattanFrame) and len(x.rotations) and len(y.rotations):
+        return min(_angle_deg(x.rotations[0].T @ y.rotations[0] @ turn) for turn in CUBE), "deg"
+    return None
+
+
+def _angle_deg(R: F64) -> float:
+    return float(rotation_angles_deg(R[None])[0])
+
+
+@dataclass
+class StageErrors:
+    """Errors of the values of single stages against the true poses, and the share of frames with a value, of one alternative."""
+
+    truth: Mapping[int, F64]  # true pose (4, 4) by frame stamp
+    rotations_deg: list[float] = field(default_factory=list)
+    translations_m: list[float] = field(default_factory=list)
+    axes: list[F64] = field(default_factory=list)  # R_world_manhattan by the true rotation: constant, were the axes right
+    seen: int = 0
+    present: int = 0
+
+    def take(self, topics: Iterable[str], values: Mapping[str, Any]) -> None:
+        """Add a frame."""
+        for topic in topics:
+            value = values.get(topic)
+            self.seen, self.present = self.seen + 1, self.present + isinstance(value, Value)
+            if not isinstance(value, Value) or (T := self.truth.get(value.stamp_ns)) is None:
+                continue
+            if isinstance(value, Rotation):
+                self.rotations_deg.append(_angle_deg(T[:3, :3].T @ value.R_world_camera))
+            elif isinstance(value, Translation) and value.estimated:
+                self.translations_m.append(float(np.linalg.norm(T[:3, 3] - value.t_world_camera)))
+            elif isinstance(value, ManhattanFrame) and value.supported and len(value.rotations):
+                self.axes.append(T[:3, :3] @ value.rotations[0])
+
+    def figures(self) -> dict[str, float]:
+        """Return the root mean square of each kind of error, NaN where there is none."""
+        return {
+            "axes deg": _rms(_deviations_deg(self.axes)),
+            "rotation deg": _rms(self.rotations_deg),
+            "translation mm": 1e3 * _rms(self.translations_m),
+            "values %": 100.0 * self.present / self.seen if self.seen else np.nan,
+        }
+
+
+def _rms(values: Sequence[float]) -> float:
+    return float(np.sqrt(np.mean(np.square(values)))) if len(values) else np.nan
+
+
+def _deviations_deg(axes: Sequence[F64]) -> list[float]:
+    """Angles of rotations from their mean, each after the exchange of axes that brings it nearest to the first."""
+    if not axes:
+        return []
+    alike = [min((R @ turn for turn in CUBE), key=lambda turned: _angle_deg(axes[0].T @ turned)) for R in axes]
+    mean = nearest_rotation(np.mean(alike, axis=0))
+    return [_angle_deg(mean.T @ R) for R in alike]
+
+
+def truth_of(recording: Recording) -> Mapping[int, F64]:
+    """Return the true poses in the world of the run, by stamp; none where the recording has no ground truth or no poses."""
+    try:
+        return true_poses(recording).poses
+    except DataError:
+        return {}
+
+
+class RecordedValues:
+    """The recorded values of the small topics that are computed again, to be compared with those that the same stages compute now."""
+
+    def __init__(self, recording: Recording, topics: Iterable[str]) -> None:
+        self._readers = {topic: TopicReader(recording, topic) for topic in topics if topic in MEASURED and topic in recording.topics}
+        self.parting = Parting()
+
+    def compare(self, index: int, values: Mapping[str, Any]) -> None:
+        """Take the values of a frame that the recorded configuration computes."""
+        recorded = {topic: reader.at(index) for topic, reader in self._readers.items()}
+        self.parting.compare(index, self._readers, recorded, {topic: values.get(topic) for topic in self._readers})

@@ -1,0 +1,299 @@
+"""The tables of an ablation: comparisons, attribution, differences and cost, from the figures of each recording; as text, markdown and JSON."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field, replace
+from typing import Any
+
+import numpy as np
+
+from trihedron.tools.ablation_differences import Parting
+from trihedron.tools.ablation_statistics import Paired, holm, paired, shapley
+from trihedron.tools.ablation_swaps import AS_RECORDED, Combination
+from trihedron.tools.arguments import table
+from trihedron.tools.compare import CONFIDENCE, half_interval
+
+HIGHER_IS_BETTER = ("ok %", "values %")
+DIGITS = {
+    "ATE mm": 2, "RPE 1 frame mm": 2, "RPE 1 s mm": 2, "RPE 1 s deg": 3, "ok %": 1,
+    "axes deg": 3, "rotation deg": 3, "translation mm": 2, "values %": 1, "ms": 2,
+}  # fmt: skip
+FIGURES = tuple(DIGITS)  # in the order of columns
+
+
+@dataclass
+class Variant:
+    """An alternative of one recording: its folder, figures by column (NaN: none), CPU seconds of its recomputed stages and with its share of all
+    else, and where it leaves the recorded configuration."""
+
+    combination: Combination
+    folder: str
+    figures: dict[str, float]
+    stages_s: float
+    total_s: float
+    parting: Parting = field(default_factory=Parting)
+    picture: str = ""
+
+
+@dataclass
+class Case:
+    """All alternatives of one recording; the first is as recorded. `stages` are computed again, `shared` computed once because they are not recorded,
+    `full_s` is the CPU time of the recorded run (NaN: not known), `budget` the errors with the truth in the place of stages, by their names."""
+
+    recording: str
+    frames: int
+    stages: list[str]
+    shared: list[str]
+    full_s: float
+    cpu_s: float
+    variants: list[Variant]
+    changed: Parting = field(default_factory=Parting)  # of what the recorded configuration computes now, from the recorded values
+    budget: dict[str, dict[str, float]] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Section:
+    """A table with a title and a note; `right` as of `table`."""
+
+    title: str
+    rows: list[list[str]]
+    right: str
+    note: str = ""
+
+
+def sections_of(cases: Sequence[Case]) -> list[Section]:
+    """Return all tables of an ablation."""
+    parts = [alternatives_table(cases), comparison_table(cases), attribution_table(cases), parting_table(cases), cost_table(cases)]
+    return [section for section in parts if len(section.rows) > 1]
+
+
+def as_text(sections: Sequence[Section]) -> str:
+    """Return the tables as aligned text."""
+    parts = [f"{section.title}\n{table(section.rows, section.right)}" + (f"\n{section.note}" if section.note else "") for section in sections]
+    return "\n\n".join(parts)
+
+
+def as_markdown(sections: Sequence[Section]) -> str:
+    """Return the tables as Markdown."""
+    lines: list[str] = []
+    for section in sections:
+        head, *rows = [[cell.replace("|", "\\|") for cell in row] for row in section.rows]
+        rule = ["--:" if section.right[i : i + 1] == "r" else "---" for i in range(len(head))]
+        lines += [f"## {section.title}", "", *(f"| {' | '.join(row)} |" for row in (head, rule, *rows)), ""]
+        lines += [section.note, ""] if section.note else []
+    return "\n".join(lines)
+
+
+def as_json(cases: Sequence[Case], sections: Sequence[Section]) -> dict[str, Any]:
+    """Return cases and tables, ready for JSON; a figure that does not exist is None."""
+    tables = {section.title: [dict(zip(section.rows[0], row)) for row in section.rows[1:]] for section in sections}
+    found: dict[str, Any] = _without_nan(
+        {
+            "recordings": [case_to_dict(case) for case in cases],
+            "comparisons": [{"change": label, **asdict(one)} for label, one in comparisons(cases)],
+            "attribution": attribution(cases),
+            "tables": tables,
+        }
+    )
+    return found
+
+
+def case_to_dict(case: Case) -> dict[str, Any]:
+    """Return the fields of a case, ready for JSON."""
+    values = asdict(case)
+    for one, variant in zip(values["variants"], case.variants):
+        one["change"], one["combination"] = variant.combination.label, [[stage, list(words)] for stage, words in variant.combination.levels]
+    found: dict[str, Any] = _without_nan(values)
+    return found
+
+
+def case_from_dict(values: Mapping[str, Any]) -> Case:
+    """Return the case of which `case_to_dict` made this."""
+    variants = []
+    for one in values["variants"]:
+        given = {key: value for key, value in one.items() if key != "change"}
+        given["combination"] = Combination(tuple((stage, tuple(words)) for stage, words in one["combination"]))
+        given["figures"] = {name: np.nan if value is None else value for name, value in one["figures"].items()}
+        variants.append(Variant(**{**given, "parting": Parting(**one["parting"])}))
+    full_s = np.nan if values["full_s"] is None else values["full_s"]
+    budget = {name: {key: np.nan if value is None else value for key, value in row.items()} for name, row in values["budget"].items()}
+    return Case(**{**values, "variants": variants, "full_s": full_s, "changed": Parting(**values["changed"]), "budget": budget})
+
+
+def _without_nan(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {key: _without_nan(item) for key, item in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_without_nan(item) for item in value]
+    return None if isinstance(value, float) and not np.isfinite(value) else value
+
+
+def columns_of(cases: Sequence[Case]) -> list[str]:
+    """Return the figures that at least one alternative has."""
+    return [name for name in FIGURES if any(np.isfinite(variant.figures.get(name, np.nan)) for case in cases for variant in case.variants)]
+
+
+def number(name: str, value: float | None, sign: bool = False) -> str:
+    """Return a figure as text, "-" where there is none."""
+    if value is None or not np.isfinite(value):
+        return "-"
+    text = f"{value:{'+' if sign else ''}.{DIGITS[name]}f}"
+    return text if float(text) else text.lstrip("+-")
+
+
+def _by_change(cases: Sequence[Case]) -> dict[str, list[tuple[Case, Variant]]]:
+    """The alternatives of all recordings by their words, as recorded first."""
+    found: dict[str, list[tuple[Case, Variant]]] = {}
+    for case in cases:
+        for variant in case.variants:
+            found.setdefault(variant.combination.label, []).append((case, variant))
+    return found
+
+
+def alternatives_table(cases: Sequence[Case]) -> Section:
+    """Means over the recordings of every figure of every alternative."""
+    columns = columns_of(cases)
+    rows = [["change", *columns]]
+    for label, found in _by_change(cases).items():
+        values = {name: [variant.figures.get(name, np.nan) for _, variant in found] for name in columns}
+        rows.append([label, *(number(name, _mean(some)) for name, some in values.items())])
+    count = f"mean of {len(cases)} recordings" if len(cases) > 1 else f"{cases[0].recording}, {cases[0].frames} frames"
+    note = f"computed again: {', '.join(cases[0].stages)}; ms are CPU milliseconds a frame of these"
+    return Section(f"Alternatives, {count}", rows, "l" + "r" * len(columns), note)
+
+
+def _mean(values: Sequence[float]) -> float:
+    finite = [value for value in values if np.isfinite(value)]
+    return float(np.mean(finite)) if finite else np.nan
+
+
+def comparisons(cases: Sequence[Case]) -> list[tuple[str, Paired]]:
+    """Return (change, statistics) of every alternative and figure against the recorded configuration, corrected for their number."""
+    found: list[tuple[str, Paired]] = []
+    for label, group in _by_change(cases).items():
+        if label != AS_RECORDED:
+            for name in columns_of(cases):
+                differences = [variant.figures.get(name, np.nan) - case.variants[0].figures.get(name, np.nan) for case, variant in group]
+                if (one := paired(name, differences)) is not None:
+                    found.append((label, one))
+    tested = [one.p for _, one in found if one.p is not None]
+    corrected = iter(holm(tested))
+    return [(label, one if one.p is None else replace(one, corrected=next(corrected))) for label, one in found]
+
+
+def comparison_table(cases: Sequence[Case]) -> Section:
+    """Paired differences from the recorded configuration, of several recordings."""
+    rows = [["change", "figure", "difference", "95 % interval", "p", "d", "result", "repeats needed"]]
+    for label, one in comparisons(cases) if len(cases) > 1 else []:
+        ends = "-" if one.half is None else f"{number(one.figure, one.mean - one.half, True)} to {number(one.figure, one.mean + one.half, True)}"
+        p, effect = ("-" if value is None else f"{value:.3g}" for value in (one.corrected, one.effect))
+        needed = "-" if one.needed is None else str(one.needed)
+        rows.append([label, one.figure, number(one.figure, one.mean, True), ends, p, effect, verdict(one), needed])
+    note = (
+        f"Paired over {len(cases)} recordings, Student's t; p by Holm over all rows; d: Cohen's, of pairs; "
+        "repeats needed: pairs with which a difference of this size is shown in 8 of 10 studies"
+    )
+    return Section("Differences from the recorded configuration", rows, "llrlrrlr", note)
+
+
+def verdict(one: Paired) -> str:
+    """Return the answer of a comparison."""
+    if one.p is None:
+        return "one pair: no test"
+    if one.mean == 0.0 and one.half == 0.0:
+        return "equal"
+    if not one.shown:
+        return "no difference shown"
+    return "better" if (one.mean > 0.0) == (one.figure in HIGHER_IS_BETTER) else "worse"
+
+
+def targets_of(case: Case) -> list[Combination]:
+    """Return the combinations in which most stages are swapped."""
+    most = max(len(variant.combination.stages) for variant in case.variants)
+    return [variant.combination for variant in case.variants if len(variant.combination.stages) == most]
+
+
+def attribution(cases: Sequence[Case]) -> list[dict[str, Any]]:
+    """Return for each combination of swaps, stage and figure the Shapley value: its mean over the recordings and half its confidence interval. The
+    stage "" is their sum, the whole difference."""
+    found = []
+    for target in targets_of(cases[0]):
+        for name in columns_of(cases):
+            shares: dict[str, list[float]] = {stage: [] for stage, _ in target.levels}
+            for case in cases:
+                figures = {variant.combination: variant.figures.get(name, np.nan) for variant in case.variants}
+                values = {part: figures[target.part(part)] for part in _subsets(target.stages)}
+                for stage, value in shapley(values, target.stages).items():
+                    shares[stage].append(value)
+            shares[""] = [sum(values) for values in zip(*shares.values())]
+            for stage, some in shares.items():
+                finite = np.array([value for value in some if np.isfinite(value)])
+                mean = float(finite.mean()) if len(finite) else np.nan
+                words = " ".join(dict(target.levels).get(stage, target.words))
+                found.append({"target": target.label, "stage": stage, "words": words, "figure": name, "mean": mean, "half": half_interval(finite)})
+    return found
+
+
+def _subsets(stages: frozenset[str]) -> list[frozenset[str]]:
+    names = sorted(stages)
+    return [frozenset(name for bit, name in enumerate(names) if mask >> bit & 1) for mask in range(2 ** len(names))]
+
+
+def attribution_table(cases: Sequence[Case]) -> Section:
+    """Shapley values of the swapped stages; of one recording the error budget too."""
+    columns, rows = columns_of(cases), []
+    by_row: dict[tuple[str, str], dict[str, str]] = {}
+    for one in attribution(cases):
+        half = "" if one["half"] is None else f" ± {number(one['figure'], one['half'])}"
+        text = one["words"].replace("+", "") if one["stage"] else "all of them"
+        by_row.setdefault((one["target"], text), {})[one["figure"]] = number(one["figure"], one["mean"], True) + half
+    targets = {target for target, _ in by_row}
+    for (target, text), cells in by_row.items():
+        if text == "all of them" and len(targets) > 1:
+            text = f"all of {target}"
+        rows.append([text, *(cells.get(name, "-") for name in columns)])
+    budget = cases[0].budget if len(cases) == 1 else {}
+    for stages, figures in budget.items():
+        whole = budget.get("", {})
+        if stages:
+            rows.append([f"truth in the place of {stages}", *(number(n, figures.get(n, np.nan) - whole.get(n, np.nan), True) for n in columns)])
+    interval = f"± half the {100 * CONFIDENCE:.0f} % interval over {len(cases)} recordings" if len(cases) > 1 else "one recording: no interval"
+    return Section("Attribution: Shapley value of each swap", [["swap", *columns], *rows], "l" + "r" * len(columns), f"Differences; {interval}")
+
+
+def parting_table(cases: Sequence[Case]) -> Section:
+    """List where each alternative leaves the recorded configuration; of several recordings the one in which they are farthest apart."""
+    rows = [["change", "recording", "first frame", "first difference", "frames", "worst frame", "apart there", "picture"]]
+    for label, group in _by_change(cases).items():
+        if label == AS_RECORDED:
+            continue
+        case, variant = farthest(group)
+        parting = variant.parting
+        if parting.frame is None:
+            rows.append([label, case.recording, "-", "none: equal in all frames", "0", "-", "-", ""])
+            continue
+        what = f"{parting.topic}.{parting.field}: {parting.size}"
+        apart = f"{parting.distance:.3g} {parting.unit}" if parting.unit else "-"
+        counts = [f"{parting.frames} of {case.frames}", str(parting.worst)]
+        rows.append([label, case.recording, str(parting.frame), what, *counts, apart, variant.picture])
+    return Section("Where they differ", rows, "llrlrrrl")
+
+
+def farthest(group: Sequence[tuple[Case, Variant]]) -> tuple[Case, Variant]:
+    """Return the recording in which an alternative is farthest from the recorded configuration."""
+    return max(group, key=lambda one: (one[1].parting.distance, one[1].parting.frames))
+
+
+def cost_table(cases: Sequence[Case]) -> Section:
+    """CPU time of each alternative, over all recordings."""
+    rows = [["change", "stages s", "with all else s", "× its stages", "full run s", "× less"]]
+    for label, group in _by_change(cases).items():
+        stages, total = (sum(getattr(variant, name) for _, variant in group) for name in ("stages_s", "total_s"))
+        full = sum(case.full_s for case, _ in group)
+        known = np.isfinite(full) and total > 0.0
+        ratio = f"{total / stages:.2f}" if stages > 0.0 else "-"
+        rows.append([label, f"{stages:.2f}", f"{total:.2f}", ratio, f"{full:.2f}" if known else "-", f"{full / total:.1f}" if known else "-"])
+    shared = sorted({name for case in cases for name in case.shared})
+    note = "CPU seconds; nodes that serve several alternatives, reading and recording are divided among them"
+    return Section("Cost", rows, "lrrrrr", note + (f"; not recorded, so computed once for all: {', '.join(shared)}" if shared else ""))
