@@ -262,21 +262,21 @@ def test_a_position_beyond_any_place_is_refused(tmp_path, capsys):
 
 
 def test_tools_check_the_rows_that_recorded_values_name(tmp_path, capsys):
-    """A recording whose tracks name a keypoint that is not there is one line for a tool as for a replay."""
+    """A recording whose matches name a keypoint that is not there is one line for a tool as for a replay."""
     path = tmp_path / "run.mcap"
     words = ["dataset.width=160", "dataset.height=120", "dataset.length=4", f"out={tmp_path}/run"]
     assert main(["run", *words]) == 0
     source, writer = Recording(tmp_path / "run" / "run.mcap"), RecordingWriter(path, {"overrides": "[]", "config": "seed: 0"})
-    for topic in ("frames", "keypoints", "planes", "tracks", "matches", "map"):
+    for topic in ("frames", "keypoints", "planes", "tracks", "matches", "pose", "map"):
         for value in source.values(topic):
-            if topic == "tracks" and len(value.keypoints):
+            if topic == "matches" and len(value.keypoints):
                 value = replace(value, keypoints=np.full_like(value.keypoints, 2**24))
             writer.write(topic, value)
     writer.close()
     capsys.readouterr()
     assert main(["calibrate", str(path)]) == 1
     line = capsys.readouterr().err
-    assert line.startswith(f"trihedron: {path}: topic /tracks, frame 1: the field 'keypoints' names row 16777216 of keypoints"), line
+    assert line.startswith(f"trihedron: {path}: topic /matches, frame 1: the field 'keypoints' names row 16777216 of keypoints"), line
 
 
 def test_a_small_file_takes_little_memory(tmp_path):

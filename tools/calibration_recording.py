@@ -12,7 +12,7 @@ from trihedron.pipeline.core.errors import DataError
 from trihedron.pipeline.core.geometry import invert
 from trihedron.pipeline.core.lie import log_so3
 from trihedron.pipeline.core.types import F32, F64, Camera, Frame, Keypoints, Matches, Trajectory
-from trihedron.pipeline.core.value_checks import checked
+from trihedron.pipeline.core.value_checks import check_together, checked
 from trihedron.pipeline.record.reader import Recording
 from trihedron.tools.calibration_judgement import blocks_of
 from trihedron.tools.calibration_pairs import Observations, Pairs
@@ -59,9 +59,10 @@ def read_recording(recording: Recording) -> Recorded:
     pixels, sigmas, landmarks = [], [], []
     for frame, _ in known:
         points, matched = keypoints.get(frame.index), matches.get(frame.index)
-        pairs = matched.keypoints if points is not None and matched is not None else np.zeros((0, 2), np.int32)
-        own = points is not None and len(pairs) > 0 and int(pairs[:, 0].max()) < len(points.pixels)
-        pairs = pairs if own else pairs[:0]
+        pairs = np.zeros((0, 2), np.int32)
+        if points is not None and matched is not None:
+            check_together({"keypoints": points, "matches": matched}, place, {topic: topic for topic in ("keypoints", "matches")})
+            pairs = matched.keypoints
         pixels.append(np.zeros((0, 2)) if points is None else points.pixels[pairs[:, 0]].astype(np.float64))
         sigmas.append(np.zeros(0) if points is None else points.sigma_px[pairs[:, 0]].astype(np.float64))
         landmarks.append(pairs[:, 1].astype(np.int64))

@@ -37,7 +37,9 @@ def main(argv: list[str]) -> int:
     if options.calls not in CALLS:
         raise UsageError("benchmark parts", f"--calls {options.calls} is out of range", f"give {CALLS[0]} to {CALLS[-1]}")
     cv2.setNumThreads(1)
-    rows = [row(name, pair, options.calls) for name, pair in parts(Synthetic()(0).gray).items()]
+    frame = Synthetic()(0)
+    assert frame is not None  # of a rendered room none is missing
+    rows = [row(name, pair, options.calls) for name, pair in parts(frame.gray).items()]
     print(table([["part", "p50 ms", "p95 ms", "OpenCV p50 ms", "× OpenCV"], *rows], "lrrrr"))
     return 0
 
@@ -47,7 +49,7 @@ def parts(image: U8) -> dict[str, Pair]:
     half = cv2.resize(image, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
     corners, segments = cv2.FastFeatureDetector_create(7, True), cv2.createLineSegmentDetector(cv2.LSD_REFINE_STD, 1.0)
     pyramid, tests = image_pyramid(image, SCALE, LEVELS, 2 * MARGIN + 1), brief_tests()
-    cells, levels, angles = oriented_corners(pyramid, 20, 7, MARGIN, 64, 1000, SCALE ** (-2.0 * np.arange(LEVELS)))
+    cells, levels, angles = oriented_corners(pyramid, 20, 7, MARGIN, 64, 1000, np.power(SCALE, -2.0 * np.arange(LEVELS, dtype=np.float64)))
     factors = SCALE**levels
     points = [
         cv2.KeyPoint(x * f, y * f, 31 * f, a, 1.0, o) for (x, y), f, a, o in zip(cells.tolist(), factors.tolist(), angles.tolist(), levels.tolist())
