@@ -10,7 +10,7 @@ import sys
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
-from functools import partial
+from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -218,8 +218,9 @@ def _absolute_word(word: str) -> str:
     return word if found is None or found[0].lstrip("+") not in READ_PATHS else f"{found[0]}={quoted(_absolute(found[1]))}"
 
 
+@cache
 def _commit() -> str:
-    """The git commit of the source tree, or nothing for an installed package."""
+    """The git commit of the source tree when this process first asked, or nothing for an installed package."""
     folder = Path(__file__).resolve().parent
     try:
         top = subprocess.run(["git", "-C", str(folder), "ls-files", "--error-unmatch", str(Path(__file__).resolve())], capture_output=True, timeout=5)

@@ -11,7 +11,7 @@ import dataclasses
 import re
 from collections.abc import Iterable, Mapping
 from enum import Enum
-from functools import partial
+from functools import cache, partial
 from typing import Any, get_type_hints
 
 from hydra import compose, initialize_config_module
@@ -142,7 +142,7 @@ def register_configs(recorded: RecordedConfig | None = None) -> None:
     for slot in SLOTS:
         for name, plugin in plugins_of(slot).items():
             node = option_type(name, plugin)
-            store.store(group=slot, name=name, node=_with_defaults(node, recorded.options[slot]) if chosen.get(slot) == name else node)
+            _store(store, slot, name, _with_defaults(node, recorded.options[slot]) if chosen.get(slot) == name else node)
     for name, options in VIEWS.items():
         store.store(group="view", name=name, node=options)
     store.repo.get("graph", {}).pop(f"{RECORDED_GRAPH}.yaml", None)
@@ -164,6 +164,13 @@ def register_configs(recorded: RecordedConfig | None = None) -> None:
     store.store(name="root", node=_with_defaults(root, {**values, "defaults": defaults}))
 
 
+def _store(store: ConfigStore, group: str, name: str, node: type[Any]) -> None:
+    """Store the dataclass, unless it is what the store holds: to convert those of all plugins takes as long as a short run."""
+    held = store.repo.get(group, {}).get(f"{name}.yaml")
+    if held is None or OmegaConf.get_type(held.node) is not node:
+        store.store(group=group, name=name, node=node)
+
+
 def _with_defaults(node: type[Any], values: Mapping[str, Any]) -> type[Any]:
     """The dataclass with other defaults."""
     hints = get_type_hints(node)
@@ -171,6 +178,7 @@ def _with_defaults(node: type[Any], values: Mapping[str, Any]) -> type[Any]:
     return dataclasses.make_dataclass(node.__name__, fields, bases=(node,))
 
 
+@cache
 def option_type(name: str, plugin: type[Any]) -> type[Any]:
     """The unfrozen twin of a plugin that Hydra wants (a frozen dataclass would be a read-only node), with the plugin's name."""
     hints = get_type_hints(plugin)

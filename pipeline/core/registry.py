@@ -125,12 +125,17 @@ def options_of(plugin: type[Any]) -> list[dataclasses.Field[Any]]:
     return list(dataclasses.fields(plugin))
 
 
-def load_plugins() -> None:
-    """Import every built-in plugin and each module of the entry-point group `trihedron.plugins`. Raises PluginError for one that does not load."""
+@functools.cache
+def _load_built_in() -> None:
     for package in _BUILT_IN:
         root = importlib.import_module(package)
         for module in pkgutil.walk_packages(root.__path__, package + "."):
             importlib.import_module(module.name)
+
+
+def load_plugins() -> None:
+    """Import every built-in plugin and each module of the entry-point group `trihedron.plugins`. Raises PluginError for one that does not load."""
+    _load_built_in()
     for entry in entry_points(group=ENTRY_POINT_GROUP):
         try:
             entry.load()

@@ -16,6 +16,7 @@ from trihedron.pipeline.core.types import DEGRADED, F64, LOST, Trajectory
 from trihedron.pipeline.run.metrics import FEWEST_POSES, associate, rotation_angles_deg
 
 AXES = "xyz"
+MARGINS = {"left": 0.07, "right": 0.98, "bottom": 0.07, "top": 0.93, "wspace": 0.22, "hspace": 0.25}  # to compute them is to draw everything twice
 ESTIMATE_COLOR, TRUTH_COLOR = "tab:blue", "tab:green"
 STATUS_COLORS = {DEGRADED: "tab:orange", LOST: "tab:red"}
 GAP_STEPS = 5.0  # a curve is broken where its stamps are that many median steps apart, instead of a straight line across
@@ -30,7 +31,7 @@ def trajectory_figure(estimate: Trajectory, truth: Trajectory | None, path: Path
     from matplotlib.figure import Figure
 
     pairs = associate(estimate.stamps_ns, truth.stamps_ns) if truth is not None else np.empty((0, 2), np.int64)
-    figure = Figure(figsize=(11, 8), layout="constrained")
+    figure = Figure(figsize=(11, 8))
     FigureCanvasAgg(figure)
     if truth is not None and len(pairs) >= FEWEST_POSES:
         _with_truth(figure, estimate, truth, pairs, status)
@@ -47,7 +48,7 @@ def _with_truth(figure: Any, estimate: Trajectory, truth: Trajectory, pairs: NDA
     poses, true_poses = estimate.poses[pairs[:, 0]], truth.poses[pairs[:, 1]]
     alignment = umeyama(poses[:, :3, 3], true_poses[:, :3, 3])
     errors = transform(alignment, poses[:, :3, 3]) - true_poses[:, :3, 3]
-    grid = figure.add_gridspec(4, 2)
+    grid = figure.add_gridspec(4, 2, **MARGINS)
     span = slice(pairs[:, 1].min(), pairs[:, 1].max() + 1)
     true_path = Trajectory(truth.stamps_ns[span], truth.poses[span])
     path = Trajectory(estimate.stamps_ns, matmul(alignment, estimate.poses))
@@ -69,7 +70,7 @@ def _rotation_errors(poses: F64, true_poses: F64) -> F64:
 
 def _without_truth(figure: Any, estimate: Trajectory, status: Sequence[tuple[int, str]]) -> None:
     """Draw the trajectory from above, and the position over time."""
-    grid = figure.add_gridspec(3, 2)
+    grid = figure.add_gridspec(3, 2, **MARGINS)
     _draw_top(figure.add_subplot(grid[:, 0]), estimate, None)
     _draw_curves(figure, grid, estimate.stamps_ns, [(f"{name} (m)", estimate.poses[:, i, 3]) for i, name in enumerate(AXES)], status)
     figure.suptitle(f"{len(estimate)} poses, no ground truth")

@@ -95,10 +95,19 @@ def compilation_reported() -> Iterator[None]:
         progress.close()
 
 
+_WARM: set[str] = set()  # stages with their options, and data sets, that this process has warmed up
+
+
 def warm_up(runner: Runner) -> None:
-    """Call every stage on the first frames and discard the results; an error here is left to the run itself, which reports it."""
+    """Call every stage on the first frames and discard the results, unless this process has done so for all of them; an error here is left to the
+    run itself, which reports it."""
+    plugins = {name: runner.graph.stages[name].plugin for name in runner.computed}
+    stages = {f"{name}={type(plugin) if name == 'dataset' else plugin!r}" for name, plugin in plugins.items()}
+    if stages <= _WARM:
+        return
     runner.count = min(runner.count, WARM_UP_FRAMES)
     with suppress(TrihedronError):
         for _ in runner.steps(None, frozenset()):
             pass
+        _WARM.update(stages)
     malloc_trim()  # the data set's and the compiler's memory: frames would grow into it, unseen in the memory that the run reports

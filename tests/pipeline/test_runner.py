@@ -10,6 +10,7 @@ import pytest
 from trihedron.pipeline.core.errors import DataError, RecordingError, StageError
 from trihedron.pipeline.record.reader import Recording
 from trihedron.pipeline.record.writer import RecordingWriter
+from trihedron.pipeline.run import warm_up
 from trihedron.pipeline.run.replay import Replay
 from trihedron.pipeline.run.runner import Runner
 
@@ -27,6 +28,21 @@ def record(path, graph=None, threads=2, replay=None, topics=TOPICS, frames="", *
     finally:
         writer.close()
     return runner
+
+
+def test_stages_are_warmed_up_once_a_process_and_with_other_options_again(monkeypatch):
+    monkeypatch.setattr(warm_up, "_WARM", set())
+    read, call, counts = [], ToyDataset.__call__, []
+
+    def counted(self, index):
+        read.append(index)
+        return call(self, index)
+
+    monkeypatch.setattr(ToyDataset, "__call__", counted)
+    for graph in (toy_graph(), toy_graph(dataset=ToyDataset(length=9)), toy_graph(rotation=ToyRotation(gain=3.0))):
+        warm_up.warm_up(Runner(graph))
+        counts.append(len(read))
+    assert counts == [3, 3, 6]
 
 
 def without(source, topic, path):
