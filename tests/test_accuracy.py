@@ -1,13 +1,12 @@
 """The default graph on whole sequences: every frame tracked, errors below their limits, and what each kind of feature is worth."""
 
 import json
-import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from trihedron.pipeline.app.cli import main
 from trihedron.pipeline.core.geometry import nearest_pairs
 from trihedron.pipeline.core.lie import rotation_angle_deg
 from trihedron.pipeline.record.reader import Recording
@@ -22,13 +21,11 @@ SEQUENCES = {
     "start of a bare room": (["dataset=synthetic", "dataset.texture=false", "dataset.length=40"], 0.006),
     "office": (["dataset=tum", f"dataset.path={DATA}/icl_office_rendered"], 0.004),
 }
-RUN = "import sys; from trihedron.pipeline.app.cli import main; sys.exit(main(['run', *sys.argv[1:]]))"
 
 
 def track(out, *overrides):
-    """`metrics.json` of a run in its own process."""
-    done = subprocess.run([sys.executable, "-c", RUN, *overrides, f"out={out}"], capture_output=True, text=True)
-    assert done.returncode == 0, done.stderr[-1000:]
+    """`metrics.json` of a run."""
+    assert main(["run", *overrides, f"out={out}"]) == 0
     return json.loads((out / "metrics.json").read_text())
 
 

@@ -1,14 +1,13 @@
 """Loops on whole walks: the drift around a corridor with and without them, and two identical offices that must stay two."""
 
 import json
-import subprocess
-import sys
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from trihedron.datasets.simulation.synthetic import Scene, Synthetic
+from trihedron.pipeline.app.cli import main
 from trihedron.pipeline.core.geometry import invert
 from trihedron.pipeline.core.registry import load_plugins
 from trihedron.pipeline.record.reader import Recording
@@ -16,14 +15,10 @@ from trihedron.pipeline.record.trajectories import read_trajectory
 from trihedron.plugins.loop.appearance import AppearanceLoop
 from trihedron.plugins.loop.planes import PlanesLoop
 
-RUN = "import sys; from trihedron.pipeline.app.cli import main; sys.exit(main(['run', *sys.argv[1:]]))"
-
 
 def track(out, scene, *overrides):
-    """`metrics.json` of a run over a scene in its own process."""
-    command = [sys.executable, "-c", RUN, "dataset=synthetic", f"dataset.scene={scene.name}", *overrides, f"out={out}"]
-    done = subprocess.run(command, capture_output=True, text=True)
-    assert done.returncode == 0, done.stderr[-1000:]
+    """`metrics.json` of a run over a scene."""
+    assert main(["run", "dataset=synthetic", f"dataset.scene={scene.name}", *overrides, f"out={out}"]) == 0
     return json.loads((out / "metrics.json").read_text())
 
 

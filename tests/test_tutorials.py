@@ -4,6 +4,7 @@ A block of code with a title is a file; a block `sh` is run; `console` and `text
 
 import os
 import re
+import shlex
 import subprocess
 import sysconfig
 import venv
@@ -11,10 +12,11 @@ from pathlib import Path
 
 import pytest
 
+from trihedron.pipeline.app.cli import main
+
 ROOT = Path(__file__).resolve().parents[1]
 TUTORIALS = sorted((ROOT / "docs" / "tutorial").glob("*.md"))
 BLOCK = re.compile(r'^```(\w*)(?: title="([^"]+)")?\n(.*?)^```$', re.MULTILINE | re.DOTALL)
-QUICK = {"first-run"}
 REPORTED = {  # lines that a tutorial's commands must print
     "first-run": ("frames: 60 ok", "Keypoints", "manhattan"),
     "own-recording": ("frames: 40 ok",),
@@ -53,7 +55,18 @@ def test_every_tutorial_has_blocks_and_promises():
         assert not [title for language, title, _ in blocks(tutorial) if language in ("python", "yaml", "toml") and not title], tutorial
 
 
-@pytest.mark.parametrize("tutorial", [pytest.param(p, id=p.stem, marks=() if p.stem in QUICK else pytest.mark.slow) for p in TUTORIALS])
+def test_the_commands_of_the_first_run(tmp_path, monkeypatch, capsys):
+    """In this process; `test_tutorial` has them executed by a shell, as printed."""
+    monkeypatch.chdir(tmp_path)
+    (tutorial,) = (path for path in TUTORIALS if path.stem == "first-run")
+    commands = [shlex.split(line) for language, _, text in blocks(tutorial) if language == "sh" for line in text.splitlines()]
+    assert [(words[0], main(words[1:])) for words in commands] == [("trihedron", 0)] * len(commands) and len(commands) > 4
+    printed = capsys.readouterr().out
+    assert not [line for line in REPORTED["first-run"] if line not in printed]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("tutorial", TUTORIALS, ids=lambda path: path.stem)
 def test_tutorial(tutorial, programs, tmp_path):
     environment = {name: value for name, value in os.environ.items() if name not in ("PYTHONPATH", "VIRTUAL_ENV")}
     environment |= {"PATH": f"{programs}:{environment['PATH']}", "PIP_NO_BUILD_ISOLATION": "0", "PIP_NO_DEPS": "1", "PIP_NO_INDEX": "1"}
