@@ -109,7 +109,7 @@ def halved(color: U8, depth_m: F32, jump_m: float) -> tuple[U8, F32]:
 
 def _halved_intrinsics(K: F64, level: int) -> F64:
     """K (3, 3) of an image halved `level` times, whose pixel (x, y) lies at (2x, 2y) of the larger one."""
-    return K * np.array([[0.5**level], [0.5**level], [1.0]])
+    return np.asarray(K * np.array([[0.5**level], [0.5**level], [1.0]]), np.float64)
 
 
 def _nothing() -> tuple[F64, float, float, F64]:
