@@ -3,6 +3,7 @@
 VENV := .venv
 BIN := $(VENV)/bin
 LOCK := constraints.txt
+LOCKER := build/lock
 PIP := $(BIN)/python -m pip install --constraint $(LOCK)
 OUT := runs/demo
 TABLE := runs/table
@@ -64,8 +65,8 @@ release: install  ## wheel and sdist, checked; the wheel installed in an empty e
 	build/release/env/bin/pip install --quiet --constraint $(LOCK) dist/*.whl
 	cd build/release && env/bin/trihedron run dataset.length=60 out=demo && env/bin/trihedron --version
 
-lock: install  ## write constraints.txt: the newest versions of everything on all supported Pythons
-	$(BIN)/uv pip compile --quiet --universal --python-version 3.10 --all-extras --upgrade --no-annotate --no-emit-index-url --no-emit-find-links \
+lock: $(LOCKER)/bin/uv  ## write constraints.txt: the newest versions of everything on all supported Pythons
+	$< pip compile --quiet --universal --python-version 3.10 --all-extras --upgrade --no-annotate --no-emit-index-url --no-emit-find-links \
 		--custom-compile-command "make lock" --output-file constraints.txt pyproject.toml
 
 install: $(VENV)/checked $(VENV)/compiled
@@ -73,9 +74,13 @@ install: $(VENV)/checked $(VENV)/compiled
 clean:  ## remove what make made; runs/ stays
 	rm -rf .venv .venv-newest build dist src/*.egg-info .mypy_cache .ruff_cache .pytest_cache
 
-$(VENV)/created:
+$(VENV)/created $(LOCKER)/created:
 	@test -n "$(PYTHON)" || { echo "trihedron: needs Python 3.10 to 3.14 with venv; install it with: apt-get install python3 python3-venv" >&2; exit 1; }
-	$(PYTHON) -m venv $(VENV)
+	$(PYTHON) -m venv $(@D)
+	@touch $@
+
+$(LOCKER)/bin/uv: $(LOCKER)/created $(LOCK)
+	$(LOCKER)/bin/python -m pip install --quiet --constraint $(LOCK) uv
 	@touch $@
 
 # Build tools first: packages without wheels, and this one, are built with the locked ones.

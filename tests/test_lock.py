@@ -2,6 +2,7 @@
 
 import importlib.metadata
 import re
+import subprocess
 import sys
 from pathlib import Path
 
@@ -65,8 +66,22 @@ def test_everything_installs_by_it():
     """The environment of make, hosted tests, the container and what the README tells to type."""
     makefile = (ROOT / "Makefile").read_text()
     others = re.findall(r"^(?!PIP :=).*pip install (.*)$", makefile, re.MULTILINE)
-    assert others == ["--quiet --constraint $(LOCK) dist/*.whl"]
+    assert others == ["--quiet --constraint $(LOCK) dist/*.whl", "--quiet --constraint $(LOCK) uv"]
     assert "\nPIP := $(BIN)/python -m pip install --constraint $(LOCK)\n" in makefile and "\nLOCK := constraints.txt\n" in makefile
     for name in ("README.md", "Containerfile", "docs/how-to/install.md"):
         installs = re.findall(r"pip install [^`\n]*(?<=[\s'])\.(?:\[\w+\]'?)?(?=[\s`]|$)", (ROOT / name).read_text())
         assert installs and all("--constraint constraints.txt" in line for line in installs), f"{name}: {installs}"
+
+
+def test_make_lock_installs_uv_alone():
+    done = subprocess.run(["make", "--dry-run", "--always-make", "lock"], cwd=ROOT, capture_output=True, text=True, check=True)
+    assert re.findall(r"pip install .* (\S+)$", done.stdout, re.MULTILINE) == ["uv"] and "uv pip compile" in done.stdout
+
+
+def test_what_make_makes_is_in_no_commit_and_no_container():
+    """Every environment of the Makefile lies in a folder that both files name."""
+    makefile = (ROOT / "Makefile").read_text()
+    environments = {*re.findall(r"^VENV := (\S+)$", makefile, re.MULTILINE), *re.findall(r"VENV=(\S+)", makefile)}
+    assert environments == {".venv", ".venv-newest"}
+    for name in (".gitignore", ".dockerignore"):
+        assert environments | {"build"} <= {line.rstrip("/") for line in (ROOT / name).read_text().splitlines()}, name

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from trihedron.pipeline.core.types import F64, I32, Frame
+from trihedron.pipeline.core.types import F32, F64, I32, U8, Frame
 from trihedron.plugins.shared.libraries import open3d
 
 
@@ -33,7 +33,7 @@ def cloud_with_normals(points_m: F64) -> Any:
     return cloud
 
 
-def rgbd_image(frame: Frame) -> Any:
-    """An Open3D image of colour and depth in metres."""
+def rgbd_image(color: U8, depth_m: F32) -> Any:
+    """An Open3D image of colour (h, w, 3) and depth in metres (h, w)."""
     geometry = open3d().t.geometry
-    return geometry.RGBDImage(geometry.Image(np.ascontiguousarray(frame.color)), geometry.Image(np.ascontiguousarray(frame.depth_m)))
+    return geometry.RGBDImage(geometry.Image(np.ascontiguousarray(color)), geometry.Image(np.ascontiguousarray(depth_m)))

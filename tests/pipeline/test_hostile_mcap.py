@@ -1,8 +1,8 @@
-"""Files that claim more than they hold: each is refused with one line, before memory or time is spent on the claim."""
+"""Files that claim more than they hold: each is refused with one line, before memory or work is spent on the claim."""
 
-import time
 import tracemalloc
 import zlib
+from contextlib import suppress
 
 import lz4.frame
 import pytest
@@ -80,19 +80,20 @@ def file_of(path, plain, entries, *, packed=None, claimed=None, compression="", 
 
 
 def refused(path, capsys, cause):
-    """Check that reading the file takes seconds of CPU and under 200 MB, and raises this cause; returns the cure of the one line printed."""
-    began = time.process_time()
+    """Check that reading the file takes under 200 MB, hands out no message, and raises this cause; returns the cure of the one line printed."""
+    handed_out = []
     tracemalloc.start()
     try:
         with pytest.raises(RecordingError, match=cause):
-            list(Recording(path).values("pose"))
-        assert main(["topics", str(path)]) == 1
+            handed_out.extend(Recording(path).values("pose"))
+        with suppress(RecordingError):
+            handed_out.extend(McapFile(path).messages())
+        assert handed_out == [] and main(["topics", str(path)]) == 1
         assert tracemalloc.get_traced_memory()[1] < 200e6
     finally:
         tracemalloc.stop()
     lines = capsys.readouterr().err.splitlines()
     assert len(lines) == 1 and lines[0].startswith(f"trihedron: {path}: ") and len(lines[0]) < 1000
-    assert time.process_time() - began < 20
     return lines[0].rpartition("; ")[2]
 
 

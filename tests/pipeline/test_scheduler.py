@@ -3,11 +3,15 @@
 import random
 import threading
 import time
+from types import SimpleNamespace
 
 import pytest
 
 from trihedron.pipeline.core.wires import PREVIOUS, Wire
+from trihedron.pipeline.run import scheduler
 from trihedron.pipeline.run.scheduler import Node, NodeFailure, Scheduler
+
+NET_S = 120.0  # after which what waits for another thread fails: no measure of speed
 
 
 def run(nodes, count, threads=2, lookahead=3, initial=None):
@@ -109,7 +113,7 @@ def test_later_frames_that_fail_too_do_not_hang():
 
     thread = threading.Thread(target=run, daemon=True)
     thread.start()
-    thread.join(5.0)
+    thread.join(NET_S)
     assert raised == [0]
 
 
@@ -124,7 +128,7 @@ def test_memory_is_bounded_by_the_reach_of_the_wires():
 
 def test_what_may_lag_takes_none_of_the_workers():
     """Two workers and the lagging node meet, which they can only on three threads."""
-    meeting = threading.Barrier(3, timeout=20.0)
+    meeting = threading.Barrier(3, timeout=NET_S)
 
     def meets(k, v):
         if k == 2:
@@ -139,12 +143,17 @@ def test_what_may_lag_takes_none_of_the_workers():
     assert [values["left"] for values in run(nodes, 5)] == [0, 1, 2, 3, 4]
 
 
-def test_of_a_frame_that_comes_first_after_which_most_remains():
+def test_of_a_frame_that_comes_first_after_which_most_remains(monkeypatch):
     """`alone`, named first, takes longer than `first`, but after `first` comes `long`: learned from the frames before."""
-    seconds, order = {"alone": 0.004, "first": 0.001, "long": 0.02}, []
+    seconds, order, now = {"alone": 0.004, "first": 0.001, "long": 0.02}, [], [0.0]
+    monkeypatch.setattr(scheduler, "time", SimpleNamespace(perf_counter=lambda: now[0]))
 
     def takes(name):
-        return lambda k, v: (order.append((k, name)), time.sleep(seconds[name]))[0]
+        def call(k, v):
+            order.append((k, name))
+            now[0] += seconds[name]
+
+        return call
 
     nodes = [Node("alone", takes("alone"), {}), Node("first", takes("first"), {}), Node("long", takes("long"), {"x": Wire("first")})]
     run(nodes, 4, threads=1, lookahead=1)
@@ -153,11 +162,11 @@ def test_of_a_frame_that_comes_first_after_which_most_remains():
 
 def test_what_waits_for_a_frame_takes_none_of_the_workers():
     """While frame 1 has not come, both workers meet at frame 0: it comes only after they did."""
-    meeting, met = threading.Barrier(2, timeout=5.0), threading.Event()
+    meeting, met = threading.Barrier(2, timeout=NET_S), threading.Event()
 
     def camera(k, v):
         if k:
-            assert met.wait(5.0)
+            assert met.wait(NET_S)
         return k
 
     def meet(k, v):

@@ -3,6 +3,7 @@
 import json
 import subprocess
 import sys
+from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
@@ -13,9 +14,11 @@ from trihedron.datasets.simulation.synthetic import Synthetic
 from trihedron.pipeline.core.geometry import invert
 from trihedron.pipeline.core.lie import rotation_angle_deg
 from trihedron.pipeline.core.types import Camera
+from trihedron.pipeline.run.scheduler import single_threaded_libraries
 from trihedron.plugins.keypoints.opencv_orb import OpenCvOrb
 from trihedron.plugins.keypoints.sift import Sift
 from trihedron.plugins.loop.bag_of_words import as_vectors
+from trihedron.plugins.pose.open3d_odometry import OdometryMethod, Open3dOdometry, halved
 from trihedron.tools.plugin_check import PluginCheck, room, values_of
 
 CAMERA = Camera(640, 480, 525.0, 525.0, 319.5, 239.5)
@@ -53,6 +56,42 @@ def test_colmap_tracks_with_descriptors_of_either_metric(keypoints, median_deg):
     assert tracks[0] is None and all(len(found.keypoints) >= 30 for found in tracks[1:])
     truths = [invert(data.true_pose(k)) @ data.true_pose(k - 1) for k in range(1, 8)]
     assert np.median([rotation_angle_deg(found.R_current_previous @ T[:3, :3].T) for found, T in zip(tracks[1:], truths)]) < median_deg
+
+
+@pytest.mark.parametrize("name", ["open3d_odometry"])
+def test_odometry_is_equal_for_any_number_of_calls_at_once(name):
+    """Twelve calls on four threads, whose images lie at other addresses."""
+    plugin, frames = Open3dOdometry(), [Synthetic(length=2, width=160, height=120)(k) for k in range(2)]
+    first = plugin(frames[0], None, None)
+    with ThreadPoolExecutor(4) as pool, single_threaded_libraries():
+        poses = list(pool.map(lambda _: plugin(frames[1], frames[0], first), range(12)))
+    assert len({(pose.T_world_camera.tobytes(), pose.covariance.tobytes()) for pose in poses}) == 1
+
+
+@pytest.mark.parametrize("name", ["open3d_odometry"])
+def test_odometry_by_levels_is_that_of_one_call(name):
+    """Without brightness, of which Open3D's images are rounded by address, it is one call of Open3D for all levels."""
+    from trihedron.plugins.shared.libraries import open3d
+    from trihedron.plugins.shared.open3d_clouds import rgbd_image
+
+    plugin, frames = Open3dOdometry(OdometryMethod.point_to_plane), [Synthetic(length=2, width=161, height=123)(k) for k in range(2)]
+    pose = plugin(frames[1], frames[0], plugin(frames[0], None, None))
+    odometry, tensor = open3d().t.pipelines.odometry, open3d().core.Tensor
+    source, target = (rgbd_image(frame.color, frame.depth_m) for frame in reversed(frames))
+    criteria = [odometry.OdometryConvergenceCriteria(count, 1e-6, 1e-6) for count in (10, 5, 3)]
+    losses = odometry.OdometryLossParams(depth_outlier_trunc=0.07)
+    given = source, target, tensor(frames[0].camera.K), tensor(np.eye(4)), 1.0, 6.0, criteria, odometry.Method.PointToPlane, losses
+    assert np.abs(pose.T_world_camera - odometry.rgbd_odometry_multi_scale(*given).transformation.numpy()).max() < 1e-9
+
+
+def test_depth_is_halved_without_a_mean_over_an_edge():
+    """A wall 2 m away, one 3 m away, and a column without depth; jumps beyond 0.1 m are edges."""
+    depth = np.full((9, 13), 2.0, np.float32)
+    depth[:, 6:], depth[:, 10] = 3.0, 0.0
+    color = np.full((9, 13, 3), 200, np.uint8)
+    smaller, halves = halved(color, depth, 0.1)
+    assert smaller.shape == (4, 6, 3) and (smaller == 200).all()
+    assert np.array_equal(halves, np.tile(np.float32([2, 2, 2, 3, 3, 0]), (4, 1)))
 
 
 def world_points(frame, T):
