@@ -47,7 +47,7 @@ def camera(folder):
 
 @pytest.fixture(scope="module")
 def slam(camera):
-    with th.Slam(camera, "planes=connected_components", manhattan="mean_shift", outputs=["trajectory"]) as made:
+    with th.Slam(camera, "planes=connected_components", "record.frames=true", manhattan="mean_shift", outputs=["trajectory"]) as made:
         yield made
 
 
@@ -215,6 +215,22 @@ def test_time_that_goes_back_is_refused_and_any_strides_are_taken(folder, slam):
         slam.values["plane"]
     with pytest.raises(th.TrihedronError, match=r"outputs: has no surface, so none is made"):
         slam.mesh()
+
+
+def test_arrays_that_the_caller_uses_again_change_nothing(folder, slam, tmp_path):
+    """As a camera's driver does, which writes every image into the same memory: what was pushed is saved later as it was."""
+    buffer, pushed = np.empty((120, 160, 3), np.uint8), {}
+    for dtype, scale in ((np.float32, 5000.0), (np.float64, 5000.0), (np.uint16, 1.0)):
+        depth = np.empty((120, 160), dtype)
+        for rgb, raw, _ in list(images(folder))[:2]:
+            buffer[:], depth[:] = rgb, raw / scale
+            pushed[slam.track(buffer, depth, 100.0 * (len(pushed) + 1)).index] = rgb, raw
+            buffer[:], depth[:] = 7, 7
+    slam.save(tmp_path / "run.mcap")
+    run = th.Recording(tmp_path / "run.mcap")
+    for index, (rgb, raw) in pushed.items():
+        np.testing.assert_array_equal(run.image(index).color, rgb)
+        np.testing.assert_allclose(run.image(index).depth_m, raw / 5000.0, rtol=1e-6)
 
 
 @pytest.mark.parametrize(

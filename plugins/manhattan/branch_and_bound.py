@@ -19,6 +19,7 @@ from trihedron.plugins.manhattan.branch_and_bound_kernels import (
     Neighbours,
     SphereGrid,
     coarser,
+    cube_radius,
     group_directions,
     image,
     largest_near,
@@ -137,7 +138,7 @@ class RotationSearch:
     @cached_property
     def _reaches(self) -> list[Neighbours]:
         """For each level the cells within the radius of its cubes of each."""
-        return [neighbours(sphere_grid(face), np.sqrt(3.0) * HALF_WIDTH / FIRST / 2**level) for level, face in enumerate(FACE)]
+        return [neighbours(sphere_grid(face), cube_radius(HALF_WIDTH / FIRST / 2**level)) for level, face in enumerate(FACE)]
 
 
 def _usable(vectors: F64, weights: F64) -> tuple[F64, F64]:

@@ -89,6 +89,13 @@ def _first_cubes() -> F64:
 
 
 @kernel
+def cube_radius(half: float) -> float:
+    """Largest angle (rad) between the rotation in the centre of a cube of rotation vectors of half side `half` (rad) and any other of the cube: at
+    most that of the vectors, whose furthest are the corners (Hartley and Kahl, IJCV 2009, lemma 4)."""
+    return np.sqrt(3.0) * half
+
+
+@kernel
 def _centre(cube: F64, start: F64, R: F64) -> None:
     """Write the rotation in the middle of a cube, `R_start Exp(v)`, to R."""
     for k in range(9):
@@ -147,7 +154,7 @@ def search(
     aside, passed, R = False, 0.0, np.empty((3, 3))
     while True:
         used += len(cubes)
-        radius = np.sqrt(3.0) * half
+        radius = cube_radius(half)
         uppers, values = _bounds(groups, maps, cubes, level, radius, start, inlier, best)
         before = best
         top, best = _climb_promising(groups, cubes, values, start, inlier, top, best, level + 1 >= len(maps.near))

@@ -12,6 +12,7 @@ import cv2
 import numpy as np
 import pytest
 
+from trihedron.datasets.readers import images
 from trihedron.datasets.readers.images import decode_image
 from trihedron.datasets.readers.picture_headers import UnreadableImage, picture_header
 
@@ -133,3 +134,25 @@ except Exception as error:
 """
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
     assert done.stdout.startswith("claims 20000×20000 pixels in ") and done.stdout.endswith(" bytes True\n"), done.stdout + done.stderr
+
+
+def black(width: int, height: int, size: int) -> bytes:
+    """A PNG of one bit a pixel, all black, of so many bytes: what it lacks is a comment."""
+
+    def chunk(name: bytes, data: bytes) -> bytes:
+        return struct.pack(">I", len(data)) + name + data + struct.pack(">I", zlib.crc32(name + data))
+
+    before = b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", struct.pack(">IIBBBBB", width, height, 1, 0, 0, 0, 0))
+    after = chunk(b"IDAT", zlib.compress(bytes((width // 8 + 1) * height), 9)) + chunk(b"IEND", b"")
+    comment = b"Comment\0".ljust(size - len(before) - len(after) - 12, b" ")
+    return before + chunk(b"tEXt", comment) + after
+
+
+def test_a_byte_holds_2048_pixels_at_most(monkeypatch: pytest.MonkeyPatch) -> None:
+    """As many in every byte of the file are read; one row more is refused before anything decodes it, and so is what no camera has."""
+    within = black(2048, 400, 400)
+    assert len(within) == 400 and decode_image(within).shape == (400, 2048)
+    monkeypatch.setattr(images, "png_decode", lambda *_: pytest.fail("decoded"))
+    for width, height, size in ((2048, 401, 400), (8192, 8193, 100_000)):
+        with pytest.raises(UnreadableImage, match=f"^claims {width}×{height} pixels in {size} bytes$"):
+            decode_image(black(width, height, size))

@@ -239,6 +239,21 @@ def test_of_a_touched_chunk_only_the_rows_that_changed_are_written():
         decoder.decode(message.SerializeToString())
 
 
+@pytest.mark.parametrize("rows", [[3, 3, 200], [77, 3, 200], [-1, 3, 200]])
+def test_rows_that_are_listed_twice_or_out_of_order_are_refused(rows):
+    """However the message is read: which of two values a row has would depend on the reader."""
+    table, ids = Table.empty({"x": Column("f8", (8,))}).appended(x=np.arange(2000.0).reshape(250, 8))
+    encoder, decoder, whole = Encoder(), Decoder("x"), next(iter(maps(1)))
+    first = encoder.encode(replace(whole, points=table))
+    decoder.decode(first)
+    message = message_class("Map").FromString(encoder.encode(replace(whole, points=table.updated(ids[[3, 77, 200]], x=np.zeros((3, 8))))))
+    next(array for array in message.points.arrays if array.name == "rows0").data = np.array(rows, np.int32).tobytes()
+    changed = message.SerializeToString()
+    for read in (lambda: decoder.decode(changed), lambda: Decoder("x").decode_last([first, changed])):
+        with pytest.raises(RecordingError, match=r"^x: frame \d+: Map does not fit: points\.x: rows of another size"):
+            read()
+
+
 def test_changes_depend_on_values_not_on_who_holds_them():
     versions = list(maps(3))
     copies = [Decoder("x").decode(Encoder().encode(v)) for v in versions]
@@ -365,6 +380,14 @@ def legacy(kind):
 
 
 SHAPES = [[], [-1], [1] * 65, [0] * 65, [2**62] * 20, [0] + [2**62] * 20, [0, 2**62], [2**63 - 1, 0], [10**6, 0, 10**6]]
+
+
+def test_an_array_is_of_one_gibibyte_at_most():
+    """A shape of so many bytes is looked for, the next larger one is refused at once."""
+    for rows, cause in ((1 << 27, "does not have the 1073741824 bytes of its shape"), ((1 << 27) + 1, "claims type 'f4' and shape")):
+        message = message_of(keypoints())
+        message.pixels.shape[0] = rows
+        assert f"array 'pixels' {cause} ({rows}, 2)" in refusal(message)
 
 
 @pytest.mark.parametrize("encoding", ["raw", "columns", "zstd", "rows"])

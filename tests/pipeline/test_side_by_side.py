@@ -83,6 +83,21 @@ def test_side_by_side_gives_the_bytes_of_each_alone(tmp_path, threads, feedback)
         assert all(contents(tmp_path / "2.mcap")[f"/{topic}"] == whole[f"/{topic}"] for topic in only)
 
 
+@pytest.mark.parametrize("wire", ["rotation@prev", "rotation@3"])
+def test_recorded_feedback_is_as_old_as_the_wire_says(tmp_path, wire):
+    """A frame of k key points adds k to the total that the wire brings, with gain 2 it adds 2 k: to the recorded total of an earlier frame, not of
+    this one or of its own. Every fifth frame has none."""
+    wiring = {"rotation": {"previous": wire}}
+    source, recorded, expected = record(tmp_path / "source.mcap", toy_graph(wiring=wiring)), {}, {}
+    for k in (k for k in range(12) if k % 5 != 4):
+        before = recorded.get(k - 3 if wire == "rotation@3" else max(recorded, default=None), 0.0)
+        recorded[k], expected[k] = k + before, 2 * k + before
+    double = toy_graph(rotation=ToyRotation(gain=2.0), wiring=wiring)
+    again = record(tmp_path / "again.mcap", double, Replay(Recording(source), ("rotation",), True), frozenset({"rotation"}))
+    for path, totals in ((source, recorded), (again, expected)):
+        assert {value.index: value.covariance[0, 0] for value in Recording(path).values("rotation")} == totals
+
+
 def test_what_is_not_recorded_is_computed_once(tmp_path):
     source = record(tmp_path / "source.mcap", toy_graph(keypoints=FromNormals()), topics=TOPICS - {"keypoints"})
     CountedNormals.calls.clear()

@@ -136,13 +136,13 @@ class ToySurface:
 TOPICS = frozenset({"keypoints", "rotation", "pose", "map", "surface"})
 
 
-def toy_graph(outputs=("trajectory", "normals", "surface"), **plugins):
-    """The toy graph; `rotation=ToyRotation(...)` and so on replace a stage."""
+def toy_graph(outputs=("trajectory", "normals", "surface"), wiring=None, **plugins):
+    """The toy graph; `rotation=ToyRotation(...)` and so on replace a stage, `wiring` (stage -> input -> wire) its default wires."""
     chosen = {
         "dataset": ToyDataset(), "normals": ToyNormals(), "keypoints": ToyKeypoints(), "rotation": ToyRotation(), "pose": ToyPose(),
         "map": ToyMap(), "surface": ToySurface(), **plugins,
     }  # fmt: skip
-    return build_graph(chosen, outputs)
+    return build_graph(chosen, outputs, wiring)
 
 
 def contents(path):

@@ -21,7 +21,7 @@ from trihedron.pipeline.record.foxglove import TopicView
 from trihedron.pipeline.run.building_files import building_json, floorplan_svg, summary, write_building
 from trihedron.pipeline.run.building_ifc import has_ifc, write_ifc
 from trihedron.plugins.building.common import LEVELS, Face
-from trihedron.plugins.building.common_layout import Edge, _cornered, _ended, _gap, _jambs
+from trihedron.plugins.building.common_layout import Edge, _cornered, _ended, _gap, _jambs, _relative, _turn
 from trihedron.plugins.normals.integral_image import IntegralImage
 from trihedron.plugins.planes.connected_components import ConnectedComponents
 from trihedron.tools.benchmarks import building_benchmark
@@ -309,6 +309,36 @@ def test_a_wall_ends_with_its_readings_where_nothing_bounds_the_room():
     behind = Face(np.array([1.0, 0.0]), 1.1, -1.5, np.ones((40, LEVELS), np.int32), np.ones(40, np.bool_), np.empty(0, np.int64))
     ring[0] = Edge(normals[0], 0.0, face, corners[0], corners[1])
     assert len(_ended(ring, [face, behind])) == 4  # the wall there was seen from behind
+
+
+@pytest.mark.parametrize("turn_deg", [-2.0, 1.0])
+def test_an_edge_turns_to_its_own_points(turn_deg):
+    """A slanted wall that was taken to be 1° or 2° from where it is."""
+    angle = np.radians(30.0)
+    normal, along = np.array([np.cos(angle), np.sin(angle)]), np.array([np.sin(angle), -np.cos(angle)])
+    points = 1.5 * normal + np.linspace(-1.0, 3.0, 50)[:, None] * along
+    guess = angle + np.radians(turn_deg)
+    edge = Edge(np.array([np.cos(guess), np.sin(guess)]), 0.0, None)
+    edge.offset_m = float(np.mean(points @ edge.normal))
+    for _ in range(2):
+        _turn(edge, points, np.linspace(1.0, 2.0, 50))
+        edge.offset_m = float(np.mean(points @ edge.normal))
+    assert edge.normal == pytest.approx(normal, abs=1e-4) and edge.offset_m == pytest.approx(1.5, abs=1e-4)
+
+
+@pytest.mark.parametrize("middle", [(0.0, 0.0), (80.0, -30.0)])
+def test_the_error_of_an_edge_is_relative_to_its_room(middle):
+    """A room of 4 by 6 m wherever it is: 0.07 % of the distance from its middle by the scale of depth, and of drift what the edges do not share."""
+    corners = np.array([[-2.0, -3.0], [2.0, -3.0], [2.0, 3.0], [-2.0, 3.0]]) + middle
+    normals = np.array([[0.0, 1.0], [-1.0, 0.0], [0.0, -1.0], [1.0, 0.0]])
+    seen = Face(normals[0], 0.0, 0.0, np.ones((20, LEVELS), np.int32), np.ones(20, np.bool_), np.empty(0, np.int64))
+    edges = [Edge(n, float(p @ n), seen, p, q, 0.002) for n, p, q in zip(normals, corners, np.roll(corners, -1, axis=0))]
+    for edge, drift_m2 in zip(edges, (5e-6, 1e-6, 1e-6, 9e-6)):
+        edge.drift_m2 = drift_m2
+    _relative(edges)
+    expected = 0.002**2 + (0.0007 * np.array([3.0, 2.0, 3.0, 2.0])) ** 2 + [4e-6, 0.0, 0.0, 8e-6]
+    assert np.square([edge.sigma_m for edge in edges]) == pytest.approx(expected, rel=1e-6)
+    assert [edge.drift_m2 for edge in edges] == [1e-6] * 4
 
 
 def test_names_and_lengths_are_beside_the_swings_of_doors(offices):

@@ -9,13 +9,17 @@ import pytest
 
 from trihedron.pipeline.core.geometry import invert, pose_matrix
 from trihedron.pipeline.core.lie import exp_se3
-from trihedron.pipeline.core.types import Frame, Pose
+from trihedron.pipeline.core.types import Frame, Matches, Pose
 from trihedron.plugins.loop.appearance import AppearanceLoop
+from trihedron.plugins.loop.common_loop_verification import accept_loop, path_lengths, place_of
 from trihedron.plugins.loop.common_pose_graph import Edges, solve_pose_graph
 from trihedron.plugins.loop.planes import PlanesLoop
 from trihedron.plugins.map.covisibility import Covisibility
 from trihedron.plugins.mapping.correction import apply_correction
+from trihedron.plugins.mapping.covisibility_graph import observed_by
 from trihedron.plugins.matches.local_map import LocalMap
+from trihedron.plugins.shared.pose_optimizer import solve_pose
+from trihedron.plugins.shared.pose_optimizer_kernels import PlaneTerms
 
 sys.path.insert(0, str(Path(__file__).parent))
 from landmark_world import CAMERA, World, rotation_of, translation_of
@@ -98,6 +102,32 @@ def test_nothing_to_do(walked, name):
     assert LOOPS[name](map, frame_at(world, STEPS)) is None  # this frame made no keyframe
     assert dataclasses.replace(LOOPS[name], away_m=50.0)(map, frame_at(world, STEPS - 1)) is None
     assert dataclasses.replace(LOOPS[name], every=2)(map, frame_at(world, STEPS - 1)) is None  # keyframe 39 is not looked at
+
+
+@pytest.mark.parametrize(("normals", "accepted"), [(np.eye(3), True), (np.eye(3)[:2], False), (np.eye(3)[:1], False)])
+def test_a_loop_that_leaves_a_direction_unobservable_is_refused(normals, accepted):
+    """Thirty planes that agree within their noise: in a corridor they say nothing of the position along it."""
+    planes = np.concatenate([np.tile(normals, (30 // len(normals), 1)), np.full((30, 1), 2.0)], axis=1)
+    tight, prior = np.tile(np.eye(3) * 1e-6, (30, 1, 1)), np.diag(np.repeat([0.3**2, 0.02**2], 3))
+    terms = PlaneTerms(np.zeros(30, np.int32), planes, tight, planes + np.array([0.0, 0.0, 0.0, 0.01]), tight)
+    found = solve_pose(np.eye(4), CAMERA, np.eye(4), np.linalg.inv(prior), planes=terms)
+    none, pairs = np.zeros((0, 2), np.int32), np.zeros((30, 2), np.int32)
+    matches = Matches(0, 0, 0, none, none, pairs, none, none, none[:, 0], none[:, 0])
+    assert found.planes.all() and accept_loop(PlanesLoop(), found, matches, prior, np.eye(4)) is accepted
+
+
+def test_landmarks_that_recent_keyframes_observed_are_no_evidence_of_a_loop(walked):
+    """Their positions have the drift that the loop would correct; the newest keyframe's own share with a place is counted."""
+    _, map = walked
+    rows, way = path_lengths(map)
+    place, recent = place_of(LOOPS["planes"], map, 12, float(way[12])), rows[way <= 0.5 * OPTIONS["away_m"]]
+    for kind in ("point", "line", "plane"):
+        there, since = observed_by(map, place.window.keyframes, kind), observed_by(map, recent, kind)
+        assert len(np.intersect1d(there, since)) > 0
+        assert set(getattr(place.window, f"{kind}s").tolist()) == set(there.tolist()) - set(since.tolist())
+    near = place_of(dataclasses.replace(LOOPS["planes"], away_m=0.02), map, STEPS - 6, float(way[STEPS - 6]))
+    here = [observed_by(map, rows[-1:], kind) for kind in ("point", "line")]
+    assert near.found == sum(np.isin(ids, observed_by(map, near.window.keyframes, kind)).sum() for ids, kind in zip(here, ("point", "line"))) > 0
 
 
 @pytest.mark.parametrize(("values", "field"), [({"every": 0}, "every"), ({"drift_share": 0.0}, "drift_share"), ({"view_deg": 120.0}, "view_deg")])

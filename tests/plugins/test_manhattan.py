@@ -285,3 +285,19 @@ def test_mean_shift_weighs_the_directions():
         found = shift_axes(directions, np.array(weights), np.eye(3), np.radians(12.0), 1e3, 1, 0.0)
         mean = np.array(weights) @ directions
         assert np.allclose(found[:, 0], mean / np.linalg.norm(mean), atol=1e-9) and np.array_equal(found[:, 1:], np.eye(3)[:, 1:])
+
+
+@pytest.mark.parametrize("tolerance_deg", [0.001, 0.02, 0.2])
+def test_mean_shift_ends_with_the_first_step_within_its_tolerance(tolerance_deg):
+    """Directions 4° about each axis, the start 6° off: the mode that is returned is a fixed point to within this angle."""
+    rng, R = np.random.default_rng(5), exp_so3(np.radians(6.0) * np.full(3, 1.0 / np.sqrt(3.0)))
+    directions, weights = tilted(rng, np.repeat(np.eye(3), 150, axis=0), 4.0), np.ones(450)
+    limits = np.radians(12.0), np.radians(4.0)
+    axes, moved_deg, steps = R, np.inf, 0
+    while moved_deg >= tolerance_deg:
+        before, axes = axes, shift_axes(directions, weights, axes, *limits, 1, 0.0)
+        moved_deg, steps = np.degrees(np.linalg.norm(axes - before, axis=0).max()), steps + 1
+    found = shift_axes(directions, weights, R, *limits, 100, np.radians(tolerance_deg))
+    assert np.array_equal(found, axes) and 2 < steps < 100
+    again = shift_axes(directions, weights, found, *limits, 1, 0.0)
+    assert np.degrees(np.linalg.norm(again - found, axis=0).max()) < tolerance_deg

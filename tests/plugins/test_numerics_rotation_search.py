@@ -15,6 +15,7 @@ from trihedron.plugins.manhattan.branch_and_bound_kernels import (
     climb,
     coarser,
     consensus_bound,
+    cube_radius,
     curvature,
     group_directions,
     largest_near,
@@ -145,6 +146,18 @@ def test_every_rotation_has_an_equivalent_in_the_first_cube(directions):
     v = np.array([0.3, -0.2, 0.5])
     branch_and_bound_kernels._centre(v, R_start, R)
     assert np.allclose(R, R_start @ exp_so3(v))
+
+
+@pytest.mark.parametrize("half_deg", [45.0 / 8, 1.0, 0.05])
+def test_every_rotation_of_a_cube_is_within_its_radius(half_deg):
+    """Corners and random places of cubes all over the search; a corner of the cube about the identity is at that radius."""
+    rng, half = np.random.default_rng(12), np.radians(half_deg)
+    corners = half * np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])
+    for centre in np.concatenate([np.zeros((1, 3)), rng.uniform(-1.0, 1.0, (20, 3)) * (np.pi / 4.0 - half)]):
+        vectors = centre + np.concatenate([corners, rng.uniform(-half, half, (30, 3))])
+        angles = [np.linalg.norm(log_so3(exp_so3(centre).T @ exp_so3(v))) for v in vectors]
+        assert max(angles) <= cube_radius(half) * (1.0 + 1e-7)
+        assert centre.any() or max(angles) == pytest.approx(cube_radius(half), rel=1e-6)
 
 
 def test_angle_to_the_nearest_equivalent(directions):

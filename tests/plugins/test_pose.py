@@ -89,6 +89,30 @@ def test_the_covariance_is_honest():
     assert abs(np.mean(errors) - 6.0) < 2.2
 
 
+def walked_map(world, steps):
+    """The map after frames of which every one is a keyframe."""
+    stage, map = Covisibility(min_frames=1, max_frames=1, min_shift=1e-3), None
+    for step in steps:
+        T, features = camera_at(step), world.features(camera_at(step), step)
+        matches = LocalMap()(world.frame(step).camera, rotation_of(T, step), translation_of(T, step), *features, map, None)
+        map = stage(world.frame(step), pose_of(T, step), *features, matches, map, None, None, None) or map
+    return map
+
+
+@pytest.mark.parametrize("steps, share", [((0,), 0.0), ((0, 15, 30, 45), 0.1)])
+def test_covariances_in_the_world_scale_with_the_noise_that_residuals_show(steps, share):
+    """The scale that the residuals show is averaged over ten frames; landmarks of one keyframe show none, and the previous scale stays."""
+    world = World()
+    map, poses, step = walked_map(world, steps), {}, steps[-1] + 2
+    for scale in (2.0, 3.0):
+        poses[scale] = refined(world, map, step, previous=dataclasses.replace(pose_of(camera_at(step - 1), step - 1), noise_scale=scale))
+    shown = [pose.noise_scale - (1.0 - share) * scale for scale, pose in poses.items()]  # `share` times the scale of this frame alone
+    assert shown[0] == pytest.approx(shown[1], abs=1e-12) and (shown[0] > 0.01 if share else abs(shown[0]) < 1e-12)
+    measured = [(pose.covariance - pose.map_covariance) / pose.noise_scale for pose in poses.values()]
+    np.testing.assert_allclose(measured[0], measured[1], rtol=1e-9, atol=1e-15)
+    assert poses[3.0].noise_scale > 1.2 * poses[2.0].noise_scale > 2.0
+
+
 def test_a_pose_says_its_keyframe_and_what_it_rests_on():
     world = World()
     map = first_map(world)

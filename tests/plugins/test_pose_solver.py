@@ -9,7 +9,20 @@ from trihedron.pipeline.core.linalg_kernels import tangent_columns
 from trihedron.pipeline.core.types import Camera
 from trihedron.plugins.shared import pose_optimizer_kernels as terms_kernels
 from trihedron.plugins.shared.pose_optimizer import NO_LINES, NO_PLANES, NO_POINTS, classify_terms, first_step, solve_pose
-from trihedron.plugins.shared.pose_optimizer_kernels import PARALLEL, PERPENDICULAR, SAME, LineTerms, PlaneTerms, PointTerms
+from trihedron.plugins.shared.pose_optimizer_kernels import (
+    INLIER,
+    NO_DEPTH,
+    OUTLIER,
+    PARALLEL,
+    PERPENDICULAR,
+    SAME,
+    Chi2,
+    Flags,
+    LineTerms,
+    PlaneTerms,
+    PointTerms,
+    Weights,
+)
 
 CAMERA = Camera(640, 480, 525.0, 520.0, 319.5, 239.5)
 INTRINSICS = np.array([525.0, 520.0, 319.5, 239.5])
@@ -291,3 +304,87 @@ def test_the_first_step_goes_where_the_solution_is():
     xi, covariance = first_step(found.T_world_camera @ exp_se3(off), CAMERA, scene.T, prior, (scene.points, scene.lines, scene.planes))
     assert np.linalg.norm(xi + off) < 0.2 * np.linalg.norm(off)
     assert np.allclose(np.diag(covariance) / np.diag(found.covariance), 1.0, atol=0.3)
+
+
+@pytest.mark.parametrize("with_depth", [False, True])
+def test_one_point_in_twenty_is_beyond_its_gate(with_depth):
+    """At the true pose: a pixel has two degrees of freedom, and three with a depth."""
+    scene = Scene(np.random.default_rng(14), 6000)
+    chosen = np.isfinite(scene.points.depth_m) == with_depth
+    flags = classify_terms(scene.T, CAMERA, PointTerms(*(column[chosen] for column in scene.points)))
+    assert 1.0 - flags.points.mean() == pytest.approx(0.05, abs=0.01)
+
+
+def test_residuals_are_counted():
+    """Those of inliers: pixel and depth of a point, two distances of a line in the image and two in depth, and three, two or one of planes."""
+    scene = Scene(np.random.default_rng(15), 4, 4, (SAME, PARALLEL, PERPENDICULAR, SAME))
+    points = scene.points._replace(depth_m=np.array([1.0, np.nan, 2.0, np.nan]))
+    lines, planes = np.array([INLIER, NO_DEPTH, OUTLIER, INLIER], np.uint8), np.array([INLIER, INLIER, INLIER, OUTLIER], np.uint8)
+    flags = Flags(np.array([INLIER, INLIER, OUTLIER, INLIER], np.uint8), lines, planes)
+    assert terms_kernels._residual_count(points, scene.planes, flags) == (3 + 2 + 2) + (4 + 2 + 4) + (3 + 2 + 1)
+
+
+def linearised(points, lines, robust):
+    """Cost and gradient by xi of terms at the identity, all of them inliers, with their information there."""
+    n, m = len(points.positions_m), len(lines.endpoints_m)
+    weights = Weights(np.empty((n, 3, 3)), np.empty((m, 2, 2)), np.empty((m, 2, 2)), np.empty((0, 3, 3)))
+    pose, H, g = (np.eye(3), np.zeros(3), INTRINSICS), np.empty((6, 6)), np.empty(6)
+    terms_kernels.fill_weights(*pose, points, lines, NO_PLANES, weights)
+    flags = Flags(np.full(n, INLIER, np.uint8), np.full(m, INLIER, np.uint8), np.empty(0, np.uint8))
+    chi2 = Chi2(np.empty(n), np.empty(m), np.empty(m), np.empty(0))
+    cost = terms_kernels.linearise(*pose, points, lines, NO_PLANES, weights, flags, robust, 6, H, g, chi2)
+    return cost, 2.0 * g, weights
+
+
+@pytest.mark.parametrize(("kind", "limit"), [("pixel", 5.991), ("pixel and depth", 7.815), ("line", 5.991)])
+def test_the_cost_is_hubers(kind, limit):
+    """χ² up to the gate and linear in the residual from there on, without a step; the gradient is the derivative."""
+
+    def cost_of(sigmas, robust=True):
+        points, lines = NO_POINTS, NO_LINES
+        if kind == "line":  # horizontal, and seen in the image alone
+            ends, pixels = np.array([[[-0.5, 0.0, 2.0], [0.5, 0.0, 2.0]]]), np.array([[[188.25, 239.5], [450.75, 239.5]]])
+            none = np.full((1, 2, 3), np.nan)
+            lines = LineTerms(ends, np.zeros((1, 2, 3, 3)), pixels + np.array([0.0, sigmas / np.sqrt(2.0)]), np.ones(1), none, np.zeros((1, 2, 3, 3)))
+        else:
+            depth = np.array([2.0 if kind == "pixel and depth" else np.nan])
+            pixel = np.array([[319.5, 239.5 + sigmas]])
+            points = PointTerms(np.array([[0.0, 0.0, 2.0]]), np.zeros((1, 3, 3)), pixel, depth, np.ones(1), np.full(1, 0.01))
+        return linearised(points, lines, robust)
+
+    per_m, gate = 520.0 / 2.0 * (np.sqrt(2.0) if kind == "line" else 1.0), np.sqrt(limit)
+    for sigmas in (0.5, 2.0, gate - 1e-6, gate + 1e-6, 3.0, 5.0, 20.0):
+        cost, gradient, _ = cost_of(sigmas)
+        assert cost == pytest.approx(sigmas**2 if sigmas < gate else 2.0 * gate * sigmas - limit, rel=1e-9)
+        assert gradient[1] == pytest.approx(2.0 * min(sigmas, gate) * per_m, rel=1e-6)  # of the camera's way down, by which the residual grows
+        assert cost_of(sigmas, robust=False)[0] == pytest.approx(sigmas**2)
+
+
+def test_the_ends_of_a_line_seen_in_part_err_together():
+    """A fifth of a line is seen: extrapolated to both ends of the map's line the noise of its ends is five times as large, and has opposite signs."""
+    rng, map_m = np.random.default_rng(16), np.array([[-1.0, 0.2, 3.0], [1.2, -0.3, 3.5]])
+    seen_m = map_m[0] + np.array([[0.4], [0.6]]) * (map_m[1] - map_m[0])
+    seen_px, none, noise = CAMERA.project(seen_m), np.zeros((1, 2, 3, 3)), np.tile(np.eye(3) * 0.003**2, (1, 2, 1, 1))
+    _, _, weights = linearised(NO_POINTS, LineTerms(map_m[None], none, seen_px[None], np.array([0.3]), seen_m[None], noise), False)
+    image, depth, D, m = [], [], np.empty(3), np.empty(3)
+    for _ in range(3000):
+        shaken_px, shaken_m = seen_px + 0.3 * rng.normal(size=(2, 2)), seen_m + 0.003 * rng.normal(size=(2, 3))
+        assert terms_kernels.depth_direction(shaken_m, m)
+        image.append([terms_kernels.line_residual(p, shaken_px, INTRINSICS, D)[0] for p in map_m])
+        depth.append([terms_kernels.line_depth_residual(p, shaken_m, m)[0] for p in map_m])
+    for residuals, information in ((image, weights.lines[0]), (depth, weights.line_depths[0])):
+        stated = np.linalg.inv(information)
+        assert np.allclose(np.cov(np.transpose(residuals)), stated, rtol=0.1) and stated[0, 1] < -0.8 * stated[0, 0]
+
+
+def test_relations_say_nothing_of_how_far_away_walls_are():
+    """Walls whose distances are known by nothing: a pose by their angles is the same, bit for bit."""
+    rng = np.random.default_rng(17)
+    scene = Scene(rng, 20, kinds=(PARALLEL,) * 4 + (PERPENDICULAR,) * 4)
+    known = scene.solve(np.random.default_rng(0))[2]
+    for covariance in (scene.planes.covariance, scene.planes.observed_covariance):
+        covariance[:, 2, :], covariance[:, :, 2] = 0.0, 0.0
+        covariance[:, 2, 2] = np.inf
+    unknown = scene.solve(np.random.default_rng(0))[2]
+    assert known.planes.all() and unknown.planes.all()
+    assert np.array_equal(known.T_world_camera, unknown.T_world_camera) and np.array_equal(known.covariance, unknown.covariance)

@@ -3,8 +3,9 @@
 import numpy as np
 import pytest
 
-from trihedron.pipeline.core.types import Pose
-from trihedron.plugins.pose.world_uncertainty import carried, covariance_of_keyframes
+from trihedron.pipeline.core.table import Column, Table
+from trihedron.pipeline.core.types import Map, Pose
+from trihedron.plugins.pose.world_uncertainty import carried, covariance_of_keyframes, keyframe_uncertainty
 from trihedron.plugins.shared.pose_optimizer import residual_scale
 
 
@@ -49,3 +50,25 @@ def test_a_pose_that_was_not_refined_carries_the_uncertainty_of_the_map():
     assert pose.map_covariance[[1, 3, 0], [1, 3, 0]] == pytest.approx([4e-4, 1e-4, 0.0])
     assert pose.noise_scale == 2.0 and pose.local_covariance == pytest.approx(np.eye(6))
     assert pose.covariance == pytest.approx(2.0 * np.eye(6) + pose.map_covariance)
+
+
+def map_of(sigmas_m, *first):
+    """A map of keyframes with these standard deviations of their positions, and of points, lines and planes that these keyframes created."""
+    none = Table.empty({"first": Column("i4")})
+    covariance = np.array([np.diag([0.25 * s * s, s * s, 0.5 * s * s, 1.0, 1.0, 1.0]) for s in sigmas_m])
+    keyframes, _ = Table.empty({"covariance": Column("f8", (6, 6))}).appended(covariance=covariance)
+    landmarks = [none.appended(first=np.asarray(rows, np.int32))[0] if len(rows) else none for rows in first]
+    return Map(0, 0, 0, keyframes, *landmarks, none, none, none)
+
+
+def test_a_pose_is_as_uncertain_as_the_median_of_its_landmarks_keyframes():
+    """A line counts like two points and a plane like five; landmarks of the first keyframe, which is exact, do not make a far one exact."""
+    rng = np.random.default_rng(3)
+    for _ in range(20):
+        sigmas_m = np.concatenate([[1e-4], rng.uniform(0.01, 0.1, 7)])
+        first = [rng.integers(0, 8, count) for count in (9, 4, 2)]
+        found = keyframe_uncertainty(map_of(sigmas_m, *first), *(np.arange(len(rows), dtype=np.int32) for rows in first))
+        each = np.sort(np.concatenate([np.repeat(sigmas_m[rows], score) for rows, score in zip(first, (1, 2, 5))]))
+        assert found.sigma_m == pytest.approx(each[len(each) // 2]) == pytest.approx(sigmas_m[found.keyframe])
+    nothing = np.zeros(0, np.int32)
+    assert keyframe_uncertainty(map_of([0.1], [], [], []), nothing, nothing, nothing).keyframe == -1
