@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from enum import Enum
-from functools import cached_property
+from functools import cached_property, lru_cache
 from typing import Annotated
 
 import numpy as np
@@ -171,11 +171,22 @@ class Synthetic:
 
     @cached_property
     def _scene(self) -> tuple[Geometry, Atlas]:
-        return geometry_of(self._room), bake(all_faces(self._room), self.texture, self.seed, self._room.detail)
+        return _painted(self.scene, self.slanted, self.curved, self.texture, self.seed)
 
     @cached_property
     def _room(self) -> Room:
-        if self._building is not None:
-            return self._building.room
-        room = furnished_room(self.slanted)
-        return replace(room, solids=(*room.solids, *curved_pieces())) if self.curved else room
+        return _room_of(self.scene, self.slanted, self.curved)
+
+
+def _room_of(scene: Scene, slanted: bool, curved: bool) -> Room:
+    if scene in BUILDINGS:
+        return BUILDINGS[scene]().room
+    room = furnished_room(slanted)
+    return replace(room, solids=(*room.solids, *curved_pieces())) if curved else room
+
+
+@lru_cache(maxsize=2)
+def _painted(scene: Scene, slanted: bool, curved: bool, texture: bool, seed: int) -> tuple[Geometry, Atlas]:
+    """Shapes and textures of a scene: to paint them takes as long as a hundred small frames, and runs of one process share them."""
+    room = _room_of(scene, slanted, curved)
+    return geometry_of(room), bake(all_faces(room), texture, seed, room.detail)

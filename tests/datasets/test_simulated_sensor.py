@@ -13,32 +13,20 @@ from trihedron.datasets.simulation.exposure import exposed, gain_for, motion_px
 from trihedron.datasets.simulation.motion import Motion
 from trihedron.datasets.simulation.sensor_models import MODELS, Sensor, SensorParameters, drawn_parameters
 from trihedron.datasets.simulation.simulated_sensor import SimulatedSensor
-from trihedron.datasets.simulation.synthetic import Synthetic
 from trihedron.pipeline.core.types import Camera
 
 PERFECT = SensorParameters(0.0, 0.0, 0.0, 0.0, 0, 0.0, 0.0, 1.0, 0.0, (1.0, 1.0), (0.0, 0.0), 1.0, (0.0, 0.0))
 SMALL: dict[str, Any] = {"width": 160, "height": 120, "motion": Motion.pan, "length": 30, "texture": False}
 
 
-SCENES: dict[float, Synthetic] = {}  # rendered once: by frame rate
-
-
-def sharing_its_scene(dataset: SimulatedSensor) -> SimulatedSensor:
-    world = dataset._world
-    dataset.__dict__["_world"] = SCENES.setdefault(world.fps, world)  # cached properties
-    return dataset
-
-
 def with_hidden(dataset: SimulatedSensor, **hidden: Any) -> SimulatedSensor:
     dataset.__dict__["hidden"] = replace(PERFECT, **hidden)
-    return sharing_its_scene(dataset)
+    return dataset
 
 
 @pytest.mark.parametrize("sensor", list(Sensor))
 def test_a_frame_depends_on_its_number_and_the_seeds_alone(sensor: Sensor) -> None:
-    first, again, other = (
-        sharing_its_scene(SimulatedSensor(sensor=sensor, sensor_seed=seed, frames=frames, **SMALL)) for seed, frames in ((1, ""), (1, "7:"), (2, ""))
-    )
+    first, again, other = (SimulatedSensor(sensor=sensor, sensor_seed=seed, frames=frames, **SMALL) for seed, frames in ((1, ""), (1, "7:"), (2, "")))
     a, b, c = first(7), again(0), other(7)
     assert a is not None and b is not None and c is not None
     assert a.index == b.index == 7 and a.stamp_ns == b.stamp_ns == round(7e9 / MODELS[sensor].fps)
