@@ -30,10 +30,10 @@ TIMED := TIMEFORMAT='tests took %R s, %U s of CPU and %S s of the system'; time
 test: install  ## style, types, and the tests that are quick
 	$(BIN)/ruff check .
 	$(BIN)/mypy -p trihedron
-	$(TIMED) $(BIN)/pytest -n 2 --durations=20
+	$(TIMED) $(BIN)/pytest -n 2 --dist loadfile --durations=20
 
 test-slow: install  ## the tests that take longer
-	$(BIN)/pytest -n 2 -m slow
+	$(BIN)/pytest -n 2 --dist loadfile -m slow
 
 test-newest:  ## the same with the newest version of everything, in an environment of its own; prints what differs from the lock
 	$(MAKE) install VENV=.venv-newest LOCK=/dev/null

@@ -4,6 +4,7 @@ import ast
 import json
 import sys
 from collections.abc import Iterable, Iterator
+from functools import cache
 from importlib.metadata import packages_distributions
 from pathlib import Path
 from typing import NamedTuple
@@ -17,8 +18,8 @@ from trihedron.pipeline.core.libraries import declared, distribution_of
 
 ROOT = Path(__file__).resolve().parents[1]
 PROJECT = load_file(ROOT / "pyproject.toml")["project"]
-PROGRAM = ["pipeline", "plugins", "datasets", "tools", "api", "src/trihedron/__init__.py"]
-BESIDE = ["tests", "docs/site", "examples", ".ci"]
+PROGRAM = ("pipeline", "plugins", "datasets", "tools", "api", "src/trihedron/__init__.py")
+BESIDE = ("tests", "docs/site", "examples", ".ci")
 OF_EXTRAS_FOR_DEVELOPERS = {"docs", "dev"}
 NAMESPACES = {"hydra_plugins"}  # which several distributions share: the module below tells them apart
 UNDECLARED = {  # module -> why no dependency or extra declares it
@@ -68,7 +69,7 @@ def imports_in(source: str, place: str) -> Iterator[Import]:
             names = [alias.name for alias in node.names]
         elif isinstance(node, ast.ImportFrom) and not node.level:
             names = [node.module or ""]
-        elif isinstance(node, ast.Call) and ast.unparse(node.func).rpartition(".")[2] in ("importorskip", "import_module"):
+        elif isinstance(node, ast.Call) and getattr(node.func, "attr", getattr(node.func, "id", "")) in ("importorskip", "import_module"):
             names = [node.args[0].value] if isinstance(node.args[0], ast.Constant) else []
         for name in names:
             parts = name.split(".")
@@ -79,7 +80,8 @@ def imports_in(source: str, place: str) -> Iterator[Import]:
     yield from walk(ast.parse(source), False)
 
 
-def third_party(places: Iterable[str]) -> list[Import]:
+@cache
+def third_party(places: tuple[str, ...]) -> list[Import]:
     """The imports of files, folders and notebooks that are neither of the standard library nor of this project."""
     files = [file for place in places for file in ([ROOT / place] if place.endswith(".py") else sorted((ROOT / place).rglob("*")))]
     found: list[Import] = []
@@ -137,7 +139,7 @@ def test_what_is_declared_is_imported(names, places):
 
 
 def test_the_exceptions_are_needed():
-    imports = third_party([*PROGRAM, *BESIDE])
+    imports = [*third_party(PROGRAM), *third_party(BESIDE)]
     used = {distribution_of(one.module) for one in imports}
     assert sorted(set(UNDECLARED) - {one.module for one in imports}) == []
     assert sorted(set(NOT_IMPORTED) - ALL) == [] and sorted(set(NOT_IMPORTED) & used) == []
@@ -146,7 +148,7 @@ def test_the_exceptions_are_needed():
 def test_modules_belong_to_the_distributions_that_install_them():
     """The names that errors print are those of the installed packages."""
     installed = {module: {str(canonicalize_name(name)) for name in names} for module, names in packages_distributions().items()}
-    modules = {one.module for one in third_party([*PROGRAM, *BESIDE])} | {"hydra_plugins.hydra_submitit_launcher"}
+    modules = {one.module for one in [*third_party(PROGRAM), *third_party(BESIDE)]} | {"hydra_plugins.hydra_submitit_launcher"}
     known = [module for module in modules if module.split(".")[0] in installed]
     assert len(known) > 50
     assert [module for module in known if distribution_of(module) not in installed[module.split(".")[0]]] == []

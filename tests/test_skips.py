@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-CONFTEST = Path(__file__).with_name("conftest.py")
+SKIPS = Path(__file__).with_name("skips.py")
 ALLOWED = """
 import pytest
 
@@ -40,15 +40,15 @@ SAID = [
     "FAILED test_others.py::test_browser: skipped: no chromium here; install it with: apt-get install chromium",
     "FAILED test_others.py::test_package: skipped: could not import 'no_such_package': No module named 'no_such_package'; "
     "install it with: pip install -e '.[dev]'",
-    "FAILED test_others.py::test_hurry: skipped: someone was in a hurry; make the test run, or add the reason to ALLOWED in tests/conftest.py",
+    "FAILED test_others.py::test_hurry: skipped: someone was in a hurry; make the test run, or add the reason to ALLOWED in tests/skips.py",
     "FAILED test_whole.py: skipped: could not import 'no_such_package': No module named 'no_such_package'; install it with: pip install -e '.[dev]'",
 ]
 
 
 @pytest.fixture
 def run(tmp_path):
-    """Run pytest on files in a folder of their own, with this folder's conftest: exit status and printed lines."""
-    shutil.copy(CONFTEST, tmp_path)
+    """Run pytest on files in a folder of their own, with the accounting of this one: exit status and printed lines."""
+    shutil.copy(SKIPS, tmp_path / "conftest.py")
 
     def of(files, *words):
         for name, text in files.items():

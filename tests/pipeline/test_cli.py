@@ -19,6 +19,8 @@ from trihedron.pipeline.app.cli import main
 from trihedron.pipeline.record.reader import Recording
 from trihedron.pipeline.record.trajectories import read_trajectory
 from trihedron.pipeline.record.writer import RecordingWriter
+from trihedron.pipeline.run import results
+from trihedron.pipeline.run.plot import trajectory_figure
 from trihedron.tools.benchmark import PROGRAM
 
 SMALL = ["dataset=synthetic", "dataset.width=160", "dataset.height=120", "dataset.length=12"]
@@ -150,12 +152,13 @@ def test_debug_shows_the_traceback():
         main(["run", *SMALL, "threds=1", "--debug"])
 
 
-def test_a_run_folder_is_complete(capsys, tmp_path):
+def test_a_run_folder_is_complete(capsys, tmp_path, monkeypatch):
+    monkeypatch.setattr(results, "trajectory_figure", trajectory_figure)
     assert main(["run", *SMALL]) == 0
     printed = capsys.readouterr().out
     out = (tmp_path / "runs" / "latest").resolve()
     expected = {"trajectory.txt", "trajectory_causal.txt", "run.mcap", "timing.json", "metrics.json", "trajectory.png", ".hydra"}
-    assert {p.name for p in out.iterdir()} == expected
+    assert {p.name for p in out.iterdir()} == expected and cv2.imread(str(out / "trajectory.png")).std() > 10.0
     assert all(str(out / name) in printed for name in expected - {".hydra"})
     timing, metrics = json.loads((out / "timing.json").read_text()), json.loads((out / "metrics.json").read_text())
     assert timing["frames"] == 12 == metrics["frames"] and timing["threads"] == 2
