@@ -91,7 +91,7 @@ def _first_cubes() -> F64:
 @kernel
 def cube_radius(half: float) -> float:
     """Largest angle (rad) between the rotation in the centre of a cube of rotation vectors of half side `half` (rad) and any other of the cube: at
-    most that of the vectors, whose furthest are the corners (Hartley and Kahl, IJCV 2009, lemma 4)."""
+    most that of the vectors, whose furthest are the corners (Hartley and Kahl, IJCV 2009)."""
     return np.sqrt(3.0) * half
 
 

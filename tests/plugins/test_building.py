@@ -129,6 +129,15 @@ def test_walls_are_cut_at_doors(offices):
     assert cut == pytest.approx(np.linalg.norm(np.diff(building.walls_m[wall], axis=0)) - np.ptp(building.spans_m, axis=1).sum(), abs=1e-6)
 
 
+def test_walls_are_less_certain_the_farther_they_are(offices):
+    """By the scale of depth, 0.07 % of the distance from the first camera, beside what no averaging removes."""
+    building = offices["manhattan_layout"]
+    (begin, end), sigma_m = building.walls_m.transpose(1, 0, 2), np.sqrt(building.wall_covariance[:, 0, 0])
+    offset_m = np.abs(np.linalg.det(np.stack([begin, end], axis=1))) / np.linalg.norm(end - begin, axis=1)
+    least = np.hypot(0.002, 0.0007 * offset_m)
+    assert offset_m.max() > 5.0 and (sigma_m > least).all() and (sigma_m < 3.0 * least).all()
+
+
 def test_ifc_and_gltf_hold_the_model(offices, tmp_path):
     import trimesh
 
