@@ -11,7 +11,7 @@ import dataclasses
 import re
 from collections.abc import Iterable, Mapping
 from enum import Enum
-from functools import cache, partial
+from functools import partial
 from typing import Any, get_type_hints
 
 from hydra import compose, initialize_config_module
@@ -178,16 +178,22 @@ def _with_defaults(node: type[Any], values: Mapping[str, Any]) -> type[Any]:
     return dataclasses.make_dataclass(node.__name__, fields, bases=(node,))
 
 
-@cache
+_OPTION_TYPES: dict[tuple[str, type[Any]], type[Any]] = {}
+
+
 def option_type(name: str, plugin: type[Any]) -> type[Any]:
     """The unfrozen twin of a plugin that Hydra wants (a frozen dataclass would be a read-only node), with the plugin's name."""
+    if (name, plugin) in _OPTION_TYPES:
+        return _OPTION_TYPES[name, plugin]
     hints = get_type_hints(plugin)
     fields: list[Any] = [(PLUGIN_KEY, str, dataclasses.field(default=name))]
     for option in options_of(plugin):
         made = option.default_factory is not dataclasses.MISSING
         default = dataclasses.field(default_factory=option.default_factory) if made else dataclasses.field(default=option.default)
         fields.append((option.name, hints[option.name], default))
-    return dataclasses.make_dataclass(plugin.__name__, fields)
+    made_type = dataclasses.make_dataclass(plugin.__name__, fields)
+    _OPTION_TYPES[name, plugin] = made_type
+    return made_type
 
 
 def _default_wiring(slot: str) -> dict[str, str]:

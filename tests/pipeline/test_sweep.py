@@ -126,7 +126,7 @@ def test_a_live_table_shows_what_runs_what_ended_and_why_one_failed(tmp_path, ca
 
 
 def test_a_sweep_goes_on_where_it_was_stopped(tmp_path, capfd):
-    words = ["run", "-m", *QUICK, 'sequences=["synthetic","synthetic texture=false"]', "hydra.launcher.n_jobs=1", f"out={tmp_path}", "seed=0"]
+    words = ["run", "-m", *QUICK, 'sequences=["synthetic","synthetic texture=false"]', f"out={tmp_path}", "seed=0"]
     assert main(words) == 0
     said = capfd.readouterr()
     assert "sweep: 2 of 2 jobs done" in said.err
