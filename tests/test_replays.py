@@ -13,7 +13,7 @@ from trihedron.pipeline.core.slots import output_of
 from trihedron.pipeline.record.reader import Recording
 
 sys.path.insert(0, str(Path(__file__).parent / "pipeline"))
-from toys import contents
+from toys import contents, run_in
 
 ROOT = Path(__file__).resolve().parents[1]
 GRAPHS = sorted(path.stem for path in (ROOT / "conf" / "graph").glob("*.yaml"))
@@ -28,14 +28,6 @@ MAY_BE_SILENT = {
     "map": ["none"],
     "relocalise": ["none"],
 }  # on so short a way no loop is to close
-
-
-def run(*jobs, cwd):
-    """Several `trihedron run` in a folder."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.chdir(cwd)
-        for job in jobs:
-            assert main(["run", *job]) == 0, job
 
 
 def stages_of(graph):
@@ -57,7 +49,7 @@ def test_every_stage_of_every_graph_gives_its_values_again(graph, tmp_path, caps
     words = ["dataset=faults", *(f"+dataset.options.{word}" for word in (f"length={frames}", "width=320", "height=240"))]
     words += [f"dataset.cover={COVERED}"] if "relocalise" in set(stages) - silent else []
     dense = [name for name in stages if name != "dataset" and output_of(name).dense]
-    run([f"graph={graph}", *words, SURFACE, "record.frames=true", f"record.topics=[{','.join(dense)}]", f"out={tmp_path}/run"], cwd=tmp_path)
+    run_in(tmp_path, [f"graph={graph}", *words, SURFACE, "record.frames=true", f"record.topics=[{','.join(dense)}]", f"out={tmp_path}/run"])
     recorded = contents(source)
     said = {name for name in stages if recorded.get(f"/{name}")}
     assert said | silent >= set(stages) and len(recorded["/pose"]) == frames, f"{graph}: {set(stages) - said} say nothing"
@@ -70,7 +62,7 @@ def test_every_stage_of_every_graph_gives_its_values_again(graph, tmp_path, caps
             kinds[stage]["range"] = [f"dataset.frames={FIRST}:{STOP}"]
         again = [f"replay={source}", f"only=[{stage}]", f"outputs=[{stage}]"]
         jobs += [[*again, *more, f"out={tmp_path}/{kind}_{stage}"] for kind, more in kinds[stage].items()]
-    run(*jobs, cwd=tmp_path)
+    run_in(tmp_path, *jobs)
     for stage in stages:
         for kind in kinds[stage].keys() - {"range"}:
             same = contents(tmp_path / f"{kind}_{stage}" / "run.mcap")

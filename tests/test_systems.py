@@ -7,12 +7,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from trihedron.pipeline.app.cli import main
 from trihedron.pipeline.record.reader import Recording
 from trihedron.pipeline.record.trajectories import read_trajectory
 
 sys.path.insert(0, str(Path(__file__).parent / "pipeline"))
-from toys import contents
+from toys import contents, run_in
 
 ROOM = ["dataset=synthetic", "dataset.length=9", "dataset.width=320", "dataset.height=240"]
 MODEL = ["record.topics=[model]"]
@@ -30,12 +29,6 @@ OTHERS = {  # graphs that are tested elsewhere too -> the same limit
     **{"structural": 0.003, "structural_paper": 0.003, "structural_no_refine": 0.008},
     **dict.fromkeys(("points", "points_lines", "points_planes"), 0.004),
 }
-
-
-def run(jobs):
-    """Several `trihedron run`."""
-    for job in jobs:
-        assert main(["run", *job]) == 0, job
 
 
 class Seen:
@@ -153,7 +146,7 @@ CHARACTER = {
 def seen(tmp_path_factory):
     """Each system on a short walk through the textured room, half size."""
     folder = tmp_path_factory.mktemp("systems")
-    run([[*ROOM, f"graph={name}", *record, f"out={folder}/{name}"] for name, (record, _, _) in SYSTEMS.items()])
+    run_in(folder, *([*ROOM, f"graph={name}", *record, f"out={folder}/{name}"] for name, (record, _, _) in SYSTEMS.items()))
     return {name: Seen(folder / name) for name in SYSTEMS}
 
 
@@ -182,7 +175,7 @@ def test_the_new_stages_run_again_from_the_recording_give_its_bytes(seen):
     again = {name: stages for name, (_, stages, _) in SYSTEMS.items() if name != "manhattan_odometry"}  # whose stages are those of plane_odometry
     folder = next(iter(seen.values())).folder.parent
     jobs = [[f"replay={folder}/{n}/run.mcap", f"only=[{','.join(stages)}]", "threads=1", *SYSTEMS[n][0]] for n, stages in again.items()]
-    run([[*job, f"out={folder}/again/{name}"] for name, job in zip(again, jobs)])
+    run_in(folder, *([*job, f"out={folder}/again/{name}"] for name, job in zip(again, jobs)))
     for name, stages in again.items():
         before, after = contents(folder / name / "run.mcap"), contents(folder / "again" / name / "run.mcap")
         for stage in stages:
@@ -192,7 +185,7 @@ def test_the_new_stages_run_again_from_the_recording_give_its_bytes(seen):
 
 @pytest.mark.slow
 def test_no_other_graph_does_what_a_system_does(seen, tmp_path):
-    run([[*ROOM, f"graph={name}", "outputs=[trajectory,surface]", f"out={tmp_path}/{name}"] for name in OTHERS])
+    run_in(tmp_path, *([*ROOM, f"graph={name}", "outputs=[trajectory,surface]", f"out={tmp_path}/{name}"] for name in OTHERS))
     others = {name: Seen(tmp_path / name) for name in OTHERS}
     assert [(name, other) for name in SYSTEMS for other in others if CHARACTER[name](others[other])] == []
 
@@ -202,7 +195,7 @@ def whole(tmp_path_factory):
     """Every graph in the whole textured room."""
     folder = tmp_path_factory.mktemp("whole")
     meshed = {"superpixel_surfel": ["outputs=[trajectory,surface]"]}
-    run([["dataset=synthetic", f"graph={name}", *meshed.get(name, []), f"out={folder}/{name}"] for name in (*SYSTEMS, *OTHERS)])
+    run_in(folder, *(["dataset=synthetic", f"graph={name}", *meshed.get(name, []), f"out={folder}/{name}"] for name in (*SYSTEMS, *OTHERS)))
     return {name: Seen(folder / name) for name in (*SYSTEMS, *OTHERS)}
 
 

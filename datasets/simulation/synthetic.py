@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from enum import Enum
-from functools import cached_property, lru_cache
+from functools import cache, cached_property, lru_cache
 from typing import Annotated
 
 import numpy as np
@@ -152,7 +152,7 @@ class Synthetic:
 
     @cached_property
     def _building(self) -> Building | None:
-        return BUILDINGS[self.scene]() if self.scene in BUILDINGS else None
+        return _building_of(self.scene)
 
     @cached_property
     def _length(self) -> int:
@@ -178,9 +178,15 @@ class Synthetic:
         return _room_of(self.scene, self.slanted, self.curved)
 
 
+@cache
+def _building_of(scene: Scene) -> Building | None:
+    return BUILDINGS[scene]() if scene in BUILDINGS else None
+
+
+@cache
 def _room_of(scene: Scene, slanted: bool, curved: bool) -> Room:
-    if scene in BUILDINGS:
-        return BUILDINGS[scene]().room
+    if (building := _building_of(scene)) is not None:
+        return building.room
     room = furnished_room(slanted)
     return replace(room, solids=(*room.solids, *curved_pieces())) if curved else room
 

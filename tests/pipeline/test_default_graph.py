@@ -1,7 +1,5 @@
 """The promises of the dataflow over the whole default graph: bytes do not depend on threads, and every stage runs again alone, bit for bit."""
 
-import contextlib
-import io
 import sys
 from pathlib import Path
 
@@ -9,10 +7,8 @@ import pytest
 from mcap.reader import make_reader
 from mcap.writer import CompressionType, Writer
 
-from trihedron.pipeline.app.cli import main
-
 sys.path.insert(0, str(Path(__file__).parent))
-from toys import contents
+from toys import contents, run_in
 
 FRAMES = 104
 STAGES = [
@@ -41,15 +37,6 @@ RECORD += ["loop.every=1", "loop.away_m=0.2", "loop.shared=1000", "loop.max_thro
 RECORD += ["loop.min_score=10", "loop.min_share=0.1"]  # closes some that are none
 
 
-def run(*jobs, cwd):
-    """Several `trihedron run` in a folder; returns what they print."""
-    with pytest.MonkeyPatch.context() as patch, contextlib.redirect_stdout(io.StringIO()) as said:
-        patch.chdir(cwd)
-        for job in jobs:
-            assert main(["run", *job]) == 0, job
-    return said.getvalue()
-
-
 def without(source, topic, path):
     """A copy of a recording, message by message, that lacks one topic."""
     with open(source, "rb") as file, open(path, "wb") as copy:
@@ -72,13 +59,13 @@ def without(source, topic, path):
 @pytest.fixture(scope="module")
 def recorded(tmp_path_factory):
     folder = tmp_path_factory.mktemp("runs")
-    run([*RECORD, f"out={folder}/two", "threads=2"], cwd=folder)
+    run_in(folder, [*RECORD, f"out={folder}/two", "threads=2"])
     return folder
 
 
 @pytest.mark.slow
 def test_every_topic_has_the_same_bytes_for_one_thread_and_two(recorded):
-    run([*RECORD, f"out={recorded}/one", "threads=1"], cwd=recorded)
+    run_in(recorded, [*RECORD, f"out={recorded}/one", "threads=1"])
     one, two = contents(recorded / "one" / "run.mcap"), contents(recorded / "two" / "run.mcap")
     assert set(one) == set(two) >= {f"/{stage}" for stage in (*STAGES, "loop")}
     assert min(log_time for log_time, _ in one["/loop"]) < (FRAMES - 10) / 30 * 1e9  # and the map has applied it
@@ -95,7 +82,7 @@ def test_every_stage_run_again_alone_gives_its_bytes_and_a_change_changes_them(r
         without(recorded / "two" / "run.mcap", stage, recorded / f"without_{stage}.mcap")
         again = [f"replay={recorded}/without_{stage}.mcap", f"only=[{stage}]"]
         jobs += [[*again, f"out={recorded}/same_{stage}"], [*again, f"out={recorded}/changed_{stage}", CHANGES[stage]]]
-    run(*jobs, cwd=recorded)
+    run_in(recorded, *jobs)
     for stage in STAGES:
         topic = f"/{stage}"
         same, changed = contents(recorded / f"same_{stage}" / "run.mcap"), contents(recorded / f"changed_{stage}" / "run.mcap")
@@ -109,7 +96,7 @@ def test_every_stage_run_again_alone_gives_its_bytes_and_a_change_changes_them(r
 def test_recorded_feedback_gives_the_same_bytes_too(recorded):
     whole = recorded / "two" / "run.mcap"
     stateful = ["manhattan", "tracks", "rotation", "pose", "map"]
-    run(*[[f"replay={whole}", f"only=[{s}]", "feedback=recorded", f"out={recorded}/feedback_{s}"] for s in stateful], cwd=recorded)
+    run_in(recorded, *([f"replay={whole}", f"only=[{s}]", "feedback=recorded", f"out={recorded}/feedback_{s}"] for s in stateful))
     source = contents(whole)
     for stage in stateful:
         assert contents(recorded / f"feedback_{stage}" / "run.mcap")[f"/{stage}"] == source[f"/{stage}"], stage
@@ -119,7 +106,7 @@ def test_recorded_feedback_gives_the_same_bytes_too(recorded):
 def test_a_replay_with_new_poses_writes_their_trajectory(recorded):
     whole = recorded / "two" / "run.mcap"
     tracking = [f"replay={whole}", "only=[rotation,translation,matches,pose,map]", f"out={recorded}/tracking"]
-    out = run(tracking, [f"replay={whole}", "only=[manhattan]", f"out={recorded}/axes"], cwd=recorded)
+    out = run_in(recorded, tracking, [f"replay={whole}", "only=[manhattan]", f"out={recorded}/axes"])
     assert "ATE" in out
     for name in ("trajectory.txt", "metrics.json"):
         assert (recorded / "tracking" / name).read_bytes() == (recorded / "two" / name).read_bytes()

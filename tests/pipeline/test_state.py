@@ -10,7 +10,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from trihedron.pipeline.app.cli import main
 from trihedron.pipeline.core.errors import RecordingError
 from trihedron.pipeline.record import mcap_writer
 from trihedron.pipeline.record.codec import Encoder
@@ -22,7 +21,7 @@ from trihedron.pipeline.run.state import DelayLines, StateBuffer, max_delays
 from trihedron.plugins.mapping.landmarks import empty_map
 
 sys.path.insert(0, str(Path(__file__).parent))
-from toys import ToyDataset, toy_graph
+from toys import ToyDataset, run_in, toy_graph
 
 SMALL = ["dataset.width=320", "dataset.height=240"]
 JOBS = {
@@ -40,9 +39,7 @@ def runs(tmp_path_factory):
     folder = tmp_path_factory.mktemp("maps")
     jobs = [[*SMALL, *words, f"out={name}"] for name, words in JOBS.items()]
     jobs.append(["replay=elsewhere/run.mcap", "only=[pose]", "out=replayed"])
-    with pytest.MonkeyPatch.context() as patch:
-        patch.chdir(folder)
-        assert [main(["run", *job]) for job in jobs] == [0] * len(jobs)
+    run_in(folder, *jobs)
     return folder
 
 

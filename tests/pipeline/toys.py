@@ -1,11 +1,15 @@
 """Small stages with known arithmetic, to test the machinery without any algorithm."""
 
+import contextlib
+import io
 import time
 from dataclasses import dataclass, replace
 
 import numpy as np
+import pytest
 from mcap.reader import make_reader
 
+from trihedron.pipeline.app.cli import main
 from trihedron.pipeline.core import types
 from trihedron.pipeline.core.graph import build_graph
 from trihedron.pipeline.core.table import Column, Table
@@ -145,6 +149,15 @@ def toy_graph(outputs=("trajectory", "normals", "surface"), wiring=None, **plugi
     return build_graph(chosen, outputs, wiring)
 
 
+def run_in(folder, *jobs):
+    """Several `trihedron run` in a folder, which all end well; returns what they print."""
+    with pytest.MonkeyPatch.context() as patch, contextlib.redirect_stdout(io.StringIO()) as printed:
+        patch.chdir(folder)
+        for job in jobs:
+            assert main(["run", *job]) == 0, job
+    return printed.getvalue()
+
+
 def contents(path):
     """Channel -> list of (log time, bytes), without /timing."""
     found = {}
@@ -155,4 +168,4 @@ def contents(path):
     return found
 
 
-__all__ = ["CAMERA", "TOPICS", "ToyDataset", "ToyKeypoints", "ToyNormals", "ToyRotation", "contents", "toy_graph"]
+__all__ = ["CAMERA", "TOPICS", "ToyDataset", "ToyKeypoints", "ToyNormals", "ToyRotation", "contents", "run_in", "toy_graph"]
