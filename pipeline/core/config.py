@@ -6,13 +6,11 @@ Hydra's many-line errors are rewritten as one line.
 
 from __future__ import annotations
 
-import copy
 import dataclasses
 import re
 from collections.abc import Iterable, Mapping
 from enum import Enum
-from functools import partial
-from typing import Any, get_type_hints
+from typing import Any
 
 from hydra import compose, initialize_config_module
 from hydra.core.config_store import ConfigStore
@@ -24,10 +22,10 @@ from trihedron.pipeline.core.errors import ConfigError, TrihedronError, UsageErr
 from trihedron.pipeline.core.graph import Graph, build_graph
 from trihedron.pipeline.core.libraries import library_error
 from trihedron.pipeline.core.overrides import with_literal_paths
+from trihedron.pipeline.core.plugin_configs import PLUGIN_KEY, offer_plugins, with_defaults
 from trihedron.pipeline.core.registry import load_plugins, options_of, plugin_class, plugins_of
 from trihedron.pipeline.core.slots import SLOTS, Localising, default_wires
 
-PLUGIN_KEY = "plugin"  # which plugin a slot's configuration belongs to
 RECORDED_GRAPH = "recorded"  # in a replay: the option of `graph` with the wires of the recording
 SWEEPER, SEARCH, DASK = (f"hydra_plugins.trihedron.{name}" for name in ("Sweeper", "Search", "Dask"))  # `_target_` of Hydra's groups
 
@@ -134,15 +132,12 @@ class RecordedConfig:
 
 
 def register_configs(recorded: RecordedConfig | None = None) -> None:
-    """Put every loaded plugin and the root into Hydra's ConfigStore; call `registry.load_plugins` first.
+    """Let Hydra know every loaded plugin, and put the rest into its ConfigStore; call `registry.load_plugins` first.
 
     The values of a recording take the place of the defaults: of its plugins' options, of the root keys, and of the graph, as `graph=recorded`."""
     store, recorded = ConfigStore.instance(), recorded or RecordedConfig()
+    offer_plugins(recorded.options)
     chosen = {slot: options[PLUGIN_KEY] for slot, options in recorded.options.items()}
-    for slot in SLOTS:
-        for name, plugin in plugins_of(slot).items():
-            node = option_type(name, plugin)
-            _store(store, slot, name, _with_defaults(node, recorded.options[slot]) if chosen.get(slot) == name else node)
     for name, options in VIEWS.items():
         store.store(group="view", name=name, node=options)
     store.repo.get("graph", {}).pop(f"{RECORDED_GRAPH}.yaml", None)
@@ -161,39 +156,7 @@ def register_configs(recorded: RecordedConfig | None = None) -> None:
     store.store(group="hydra/launcher", name="dask", node={"_target_": DASK, "address": ""})
     root = dataclasses.make_dataclass("Root", slots, bases=(RunOptions,))
     values = {key: RecordOptions(**value) if key == "record" else value for key, value in recorded.root.items()}
-    store.store(name="root", node=_with_defaults(root, {**values, "defaults": defaults}))
-
-
-def _store(store: ConfigStore, group: str, name: str, node: type[Any]) -> None:
-    """Store the dataclass, unless it is what the store holds: to convert those of all plugins takes as long as a short run."""
-    held = store.repo.get(group, {}).get(f"{name}.yaml")
-    if held is None or OmegaConf.get_type(held.node) is not node:
-        store.store(group=group, name=name, node=node)
-
-
-def _with_defaults(node: type[Any], values: Mapping[str, Any]) -> type[Any]:
-    """The dataclass with other defaults."""
-    hints = get_type_hints(node)
-    fields: list[Any] = [(name, hints[name], dataclasses.field(default_factory=partial(copy.deepcopy, value))) for name, value in values.items()]
-    return dataclasses.make_dataclass(node.__name__, fields, bases=(node,))
-
-
-_OPTION_TYPES: dict[tuple[str, type[Any]], type[Any]] = {}
-
-
-def option_type(name: str, plugin: type[Any]) -> type[Any]:
-    """The unfrozen twin of a plugin that Hydra wants (a frozen dataclass would be a read-only node), with the plugin's name."""
-    if (name, plugin) in _OPTION_TYPES:
-        return _OPTION_TYPES[name, plugin]
-    hints = get_type_hints(plugin)
-    fields: list[Any] = [(PLUGIN_KEY, str, dataclasses.field(default=name))]
-    for option in options_of(plugin):
-        made = option.default_factory is not dataclasses.MISSING
-        default = dataclasses.field(default_factory=option.default_factory) if made else dataclasses.field(default=option.default)
-        fields.append((option.name, hints[option.name], default))
-    made_type = dataclasses.make_dataclass(plugin.__name__, fields)
-    _OPTION_TYPES[name, plugin] = made_type
-    return made_type
+    store.store(name="root", node=with_defaults(root, {**values, "defaults": defaults}))
 
 
 def _default_wiring(slot: str) -> dict[str, str]:

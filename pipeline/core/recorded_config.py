@@ -14,7 +14,8 @@ from typing import Any
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from trihedron.pipeline.core.config import PLUGIN_KEY, RecordedConfig, RunOptions, make_plugin, option_type
+from trihedron.pipeline.core.config import RecordedConfig, RunOptions, make_plugin
+from trihedron.pipeline.core.plugin_configs import PLUGIN_KEY, option_type
 from trihedron.pipeline.core.errors import RecordingError, TrihedronError
 from trihedron.pipeline.core.files import YamlError, parse_yaml
 from trihedron.pipeline.core.overrides import literal_text

@@ -4,7 +4,6 @@ from dataclasses import dataclass
 
 import numpy as np
 import pytest
-from hydra.core.config_store import ConfigStore
 
 from trihedron.pipeline.app.cli import main
 from trihedron.pipeline.core import registry
@@ -31,7 +30,6 @@ def blinking():
 
     yield
     registry._PLUGINS["manhattan"].pop("blinking")
-    ConfigStore.instance().repo["manhattan"].pop("blinking.yaml")
 
 
 def errors_of(path):

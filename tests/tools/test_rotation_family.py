@@ -4,7 +4,6 @@ from dataclasses import dataclass
 
 import numpy as np
 import pytest
-from hydra.core.config_store import ConfigStore
 
 from trihedron.pipeline.app.cli import main
 from trihedron.pipeline.core import registry
@@ -36,7 +35,6 @@ def foreign():
 
     yield
     registry._PLUGINS["manhattan"].pop("stubborn")
-    ConfigStore.instance().repo["manhattan"].pop("stubborn.yaml")
 
 
 @pytest.fixture(scope="module")

@@ -1,0 +1,102 @@
+"""Hydra's options `slot=name`: the configuration of each registered plugin, made when it is asked for.
+
+Hydra copies its ConfigStore with every composition; to convert and copy the configurations of all plugins takes as long as a short run.
+"""
+
+from __future__ import annotations
+
+import copy
+import dataclasses
+from collections.abc import Mapping
+from functools import cache, partial
+from typing import Any, get_type_hints
+
+from hydra.core.config_search_path import ConfigSearchPath
+from hydra.core.object_type import ObjectType
+from hydra.core.plugins import Plugins
+from hydra.plugins.config_source import ConfigResult, ConfigSource
+from hydra.plugins.search_path_plugin import SearchPathPlugin
+from omegaconf import DictConfig, OmegaConf
+
+from trihedron.pipeline.core.registry import options_of, plugins_of
+from trihedron.pipeline.core.slots import SLOTS
+
+PLUGIN_KEY = "plugin"  # which plugin a slot's configuration belongs to
+SCHEME = "trihedron"
+
+
+class PluginConfigs(ConfigSource):
+    """Source of one group for each slot, with one configuration for each plugin that is registered."""
+
+    recorded: Mapping[str, Mapping[str, Any]] = {}  # by slot: options of the plugin `plugin` that take the place of its defaults
+
+    @staticmethod
+    def scheme() -> str:
+        return SCHEME
+
+    def available(self) -> bool:
+        return True
+
+    def is_group(self, config_path: str) -> bool:
+        return config_path.rstrip("/") in SLOTS
+
+    def is_config(self, config_path: str) -> bool:
+        slot, name = _parts(config_path)
+        return slot in SLOTS and name in plugins_of(slot)
+
+    def load_config(self, config_path: str) -> ConfigResult:
+        slot, name = _parts(config_path)
+        kind = option_type(name, plugins_of(slot)[name])
+        recorded = self.recorded.get(slot, {})
+        node = OmegaConf.structured(with_defaults(kind, recorded)) if recorded.get(PLUGIN_KEY) == name else copy.deepcopy(_structured(kind))
+        return ConfigResult(provider=self.provider, path=self.full_path(), config=node, header={"package": None})
+
+    def list(self, config_path: str, results_filter: ObjectType | None) -> list[str]:
+        slot = config_path.rstrip("/")
+        if not slot:
+            return [] if results_filter == ObjectType.CONFIG else sorted(SLOTS)
+        return [] if results_filter == ObjectType.GROUP or slot not in SLOTS else list(plugins_of(slot))
+
+
+class PluginSearchPath(SearchPathPlugin):
+    """Entry of Hydra's search path for the configurations of plugins."""
+
+    def manipulate_search_path(self, search_path: ConfigSearchPath) -> None:
+        search_path.prepend(provider=SCHEME, path=f"{SCHEME}://")
+
+
+def offer_plugins(recorded: Mapping[str, Mapping[str, Any]]) -> None:
+    """Let Hydra find the configurations of all registered plugins, with the options of a recording, by slot, instead of the defaults."""
+    for kind in (PluginConfigs, PluginSearchPath):
+        Plugins.instance().register(kind)
+    PluginConfigs.recorded = recorded
+
+
+def with_defaults(node: type[Any], values: Mapping[str, Any]) -> type[Any]:
+    """Return the dataclass with other defaults."""
+    hints = get_type_hints(node)
+    fields: list[Any] = [(name, hints[name], dataclasses.field(default_factory=partial(copy.deepcopy, value))) for name, value in values.items()]
+    return dataclasses.make_dataclass(node.__name__, fields, bases=(node,))
+
+
+@cache
+def option_type(name: str, plugin: type[Any]) -> type[Any]:
+    """Return the unfrozen twin of a plugin that Hydra wants (a frozen dataclass would be a read-only node), with the plugin's name."""
+    hints = get_type_hints(plugin)
+    fields: list[Any] = [(PLUGIN_KEY, str, dataclasses.field(default=name))]
+    for option in options_of(plugin):
+        made = option.default_factory is not dataclasses.MISSING
+        default = dataclasses.field(default_factory=option.default_factory) if made else dataclasses.field(default=option.default)
+        fields.append((option.name, hints[option.name], default))
+    return dataclasses.make_dataclass(plugin.__name__, fields)
+
+
+@cache
+def _structured(kind: type[Any]) -> DictConfig:
+    return OmegaConf.structured(kind)
+
+
+def _parts(config_path: str) -> tuple[str, str]:
+    """Slot and plugin's name of a path of Hydra's; the name is empty for a path of another form."""
+    slot, _, name = config_path.removesuffix(".yaml").partition("/")
+    return slot, name
