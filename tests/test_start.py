@@ -23,6 +23,14 @@ def test_the_help_imports_no_library():
     assert "trihedron" in imported and imported - {"trihedron"} <= sys.stdlib_module_names
 
 
+def test_the_plugins_import_no_library_that_few_of_them_use():
+    """What one plugin computes with is imported when it computes."""
+    program = "import sys; from trihedron.pipeline.core.registry import load_plugins; load_plugins(); print(*sys.modules)"
+    imported = set(subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True).stdout.split())
+    heavy = {"scipy.ndimage", "scipy.optimize", "scipy.spatial", "scipy.sparse", "scipy.stats", "matplotlib", "open3d", "onnxruntime", "pycolmap"}
+    assert not heavy & imported
+
+
 @pytest.mark.slow
 def test_kernels_survive_in_the_users_cache_when_the_package_is_read_only(tmp_path):
     """A file in the place of every __pycache__ folder: nothing can be kept beside the sources, whoever asks."""

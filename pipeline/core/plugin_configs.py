@@ -8,8 +8,8 @@ from __future__ import annotations
 import copy
 import dataclasses
 from collections.abc import Mapping
-from functools import cache, partial
-from typing import Any, get_type_hints
+from functools import partial
+from typing import Any, ClassVar, get_type_hints
 
 from hydra.core.config_search_path import ConfigSearchPath
 from hydra.core.object_type import ObjectType
@@ -18,7 +18,7 @@ from hydra.plugins.config_source import ConfigResult, ConfigSource
 from hydra.plugins.search_path_plugin import SearchPathPlugin
 from omegaconf import DictConfig, OmegaConf
 
-from trihedron.pipeline.core.registry import options_of, plugins_of
+from trihedron.pipeline.core.registry import load_plugins, options_of, plugins_of
 from trihedron.pipeline.core.slots import SLOTS
 
 PLUGIN_KEY = "plugin"  # which plugin a slot's configuration belongs to
@@ -26,9 +26,13 @@ SCHEME = "trihedron"
 
 
 class PluginConfigs(ConfigSource):
-    """Source of one group for each slot, with one configuration for each plugin that is registered."""
+    """Source of one group for each slot, with one configuration for each plugin that is registered. Processes of a sweep are sent a copy."""
 
-    recorded: Mapping[str, Mapping[str, Any]] = {}  # by slot: options of the plugin `plugin` that take the place of its defaults
+    offered: ClassVar[Mapping[str, Mapping[str, Any]]] = {}  # by slot: options of the plugin `plugin` that take the place of its defaults
+
+    def __init__(self, provider: str, path: str) -> None:
+        super().__init__(provider, path)
+        self.recorded = self.offered
 
     @staticmethod
     def scheme() -> str:
@@ -41,14 +45,17 @@ class PluginConfigs(ConfigSource):
         return config_path.rstrip("/") in SLOTS
 
     def is_config(self, config_path: str) -> bool:
+        load_plugins()
         slot, name = _parts(config_path)
         return slot in SLOTS and name in plugins_of(slot)
 
     def load_config(self, config_path: str) -> ConfigResult:
         slot, name = _parts(config_path)
-        kind = option_type(name, plugins_of(slot)[name])
-        recorded = self.recorded.get(slot, {})
-        node = OmegaConf.structured(with_defaults(kind, recorded)) if recorded.get(PLUGIN_KEY) == name else copy.deepcopy(_structured(kind))
+        plugin, recorded = plugins_of(slot)[name], self.recorded.get(slot, {})
+        if recorded.get(PLUGIN_KEY) == name:
+            node = OmegaConf.structured(with_defaults(_option_type(name, plugin), recorded))
+        else:
+            node = plugin_config(name, plugin)
         return ConfigResult(provider=self.provider, path=self.full_path(), config=node, header={"package": None})
 
     def list(self, config_path: str, results_filter: ObjectType | None) -> list[str]:
@@ -69,7 +76,7 @@ def offer_plugins(recorded: Mapping[str, Mapping[str, Any]]) -> None:
     """Let Hydra find the configurations of all registered plugins, with the options of a recording, by slot, instead of the defaults."""
     for kind in (PluginConfigs, PluginSearchPath):
         Plugins.instance().register(kind)
-    PluginConfigs.recorded = recorded
+    PluginConfigs.offered = recorded
 
 
 def with_defaults(node: type[Any], values: Mapping[str, Any]) -> type[Any]:
@@ -79,8 +86,7 @@ def with_defaults(node: type[Any], values: Mapping[str, Any]) -> type[Any]:
     return dataclasses.make_dataclass(node.__name__, fields, bases=(node,))
 
 
-@cache
-def option_type(name: str, plugin: type[Any]) -> type[Any]:
+def _option_type(name: str, plugin: type[Any]) -> type[Any]:
     """Return the unfrozen twin of a plugin that Hydra wants (a frozen dataclass would be a read-only node), with the plugin's name."""
     hints = get_type_hints(plugin)
     fields: list[Any] = [(PLUGIN_KEY, str, dataclasses.field(default=name))]
@@ -91,9 +97,14 @@ def option_type(name: str, plugin: type[Any]) -> type[Any]:
     return dataclasses.make_dataclass(plugin.__name__, fields)
 
 
-@cache
-def _structured(kind: type[Any]) -> DictConfig:
-    return OmegaConf.structured(kind)
+_NODES: dict[tuple[str, type[Any]], DictConfig] = {}
+
+
+def plugin_config(name: str, plugin: type[Any]) -> DictConfig:
+    """Return the configuration of a plugin with its defaults, typed; a copy, because Hydra changes what it is given."""
+    if (name, plugin) not in _NODES:
+        _NODES[name, plugin] = OmegaConf.structured(_option_type(name, plugin))
+    return copy.deepcopy(_NODES[name, plugin])
 
 
 def _parts(config_path: str) -> tuple[str, str]:

@@ -15,10 +15,10 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from trihedron.pipeline.core.config import RecordedConfig, RunOptions, make_plugin
-from trihedron.pipeline.core.plugin_configs import PLUGIN_KEY, option_type
 from trihedron.pipeline.core.errors import RecordingError, TrihedronError
 from trihedron.pipeline.core.files import YamlError, parse_yaml
 from trihedron.pipeline.core.overrides import literal_text
+from trihedron.pipeline.core.plugin_configs import PLUGIN_KEY, plugin_config
 from trihedron.pipeline.core.registry import load_plugins, plugin_class
 from trihedron.pipeline.core.renamed import current_option, current_plugin
 from trihedron.pipeline.core.slots import SLOTS
@@ -62,7 +62,7 @@ def _options(given: Any, slot: str, place: str) -> Mapping[str, Any]:
         raise RecordingError(place, f"was made with '{slot}: {_shown(given)}', which names no plugin", CURE)
     name = current_plugin(slot, given[PLUGIN_KEY])
     try:
-        node = OmegaConf.structured(option_type(name, plugin_class(slot, name)))
+        node = plugin_config(name, plugin_class(slot, name))
     except TrihedronError as error:
         cause = f"was made with {slot}={_shown(name)}, and there is no such plugin for the slot '{slot}'"
         raise RecordingError(place, cause, "install the package that has it") from error

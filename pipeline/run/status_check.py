@@ -12,7 +12,6 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
-from scipy.stats import rankdata
 
 from trihedron.pipeline.core.geometry import invert, umeyama
 from trihedron.pipeline.core.linalg import cholesky, inv, matmul
@@ -104,10 +103,11 @@ def check_status(poses: Sequence[Pose], truth: Trajectory, frames: int | None = 
 def sigma_auc(error_m: F64, sigma_m: F64) -> float | None:
     """Return the area under the ROC curve of "the error is above its median" by σ, both (n,); None where all errors or no two are alike."""
     above = error_m > np.median(error_m) if len(error_m) else np.zeros(0, bool)
-    positive, negative = int(above.sum()), int((~above).sum())
-    if not positive or not negative:
+    positive, negative = sigma_m[above], np.sort(sigma_m[~above])
+    if not len(positive) or not len(negative):
         return None
-    return float((rankdata(sigma_m)[above].sum() - positive * (positive + 1) / 2.0) / (positive * negative))
+    smaller = np.searchsorted(negative, positive, "left") + np.searchsorted(negative, positive, "right")  # twice; an equal one counts half
+    return float(0.5 * smaller.sum() / (len(positive) * len(negative)))
 
 
 def _frame_errors(poses: Sequence[Pose], truth: Trajectory) -> tuple[FrameErrors, list[Pose], F64]:

@@ -22,10 +22,10 @@ from hydra.core.override_parser.types import ChoiceSweep, Override
 from omegaconf import DictConfig, OmegaConf
 
 from trihedron.pipeline.core.config import graph_of
-from trihedron.pipeline.core.plugin_configs import PLUGIN_KEY
 from trihedron.pipeline.core.errors import ConfigError, UsageError, did_you_mean
 from trihedron.pipeline.core.graph import Graph
 from trihedron.pipeline.core.libraries import imports_of
+from trihedron.pipeline.core.plugin_configs import PLUGIN_KEY
 from trihedron.pipeline.run.results import METRICS, dotted
 from trihedron.pipeline.sweep.sweep import OUTCOMES, Outcome, Overrides, Sweeper, failure_of
 

@@ -6,7 +6,6 @@ from dataclasses import dataclass
 from typing import Annotated, Any
 
 import numpy as np
-from scipy import ndimage
 
 from trihedron.pipeline.core.options import PositiveFloat, Range, Share
 from trihedron.pipeline.core.registry import register
@@ -36,6 +35,8 @@ class Open3dRansac(RegionOptions):
 
     def __call__(self, frame: Frame, normals: Normals, rng: np.random.Generator) -> Planes:
         """Planes, largest first; `labels` on the grid of the normals."""
+        from scipy.ndimage import label
+
         grid, stride = grid_of(frame, normals), normals.stride
         coarse = coarser(grid, EDGE, EDGE_M)
         rows, columns, points = grid_points(coarse)
@@ -43,7 +44,7 @@ class Open3dRansac(RegionOptions):
         for member, plane in self._planes(points, rng):
             inliers = np.zeros(coarse.rho.shape, bool)
             inliers[rows[member], columns[member]] = True
-            regions, number = ndimage.label(inliers)
+            regions, number = label(inliers)
             found = np.where(regions > 0, regions + sum(map(len, q)), found).astype(np.int32)
             q.append(np.repeat(-plane[None, :3] / plane[3], number, axis=0))
         labels = on_finer_grid(found, grid)
