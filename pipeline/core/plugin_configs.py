@@ -45,8 +45,9 @@ class PluginConfigs(ConfigSource):
         return config_path.rstrip("/") in SLOTS
 
     def is_config(self, config_path: str) -> bool:
-        load_plugins()
         slot, name = _parts(config_path)
+        if slot in SLOTS and not plugins_of(slot):
+            load_plugins()  # in a process of a sweep, which begins with this copy
         return slot in SLOTS and name in plugins_of(slot)
 
     def load_config(self, config_path: str) -> ConfigResult:
