@@ -38,15 +38,18 @@ def _tint(rng: np.random.Generator, low: int = 20, high: int = 240) -> tuple[flo
 def _scatter(image: F32, count: int, radius: tuple[float, float], rng: np.random.Generator, contrast: float = 255.0) -> None:
     """Draw random filled polygons (3 to 6 corners) and rings; `contrast` limits how far a tint is from mid grey."""
     h, w = image.shape[:2]
+    darkest, brightest = 128 - contrast / 2, 128 + contrast / 2
+    smallest, largest = np.log(radius)
     for _ in range(count):
-        centre = rng.uniform((0, 0), (w, h))
-        r = np.exp(rng.uniform(np.log(radius[0]), np.log(radius[1])))
-        tint = tuple(float(np.clip(c, 128 - contrast / 2, 128 + contrast / 2)) for c in _tint(rng, 0, 255))
+        centre = rng.uniform(0, w), rng.uniform(0, h)
+        r = np.exp(rng.uniform(smallest, largest))
+        tint = tuple(min(max(c, darkest), brightest) for c in _tint(rng, 0, 255))
         if rng.random() < 0.2:
             cv2.circle(image, (int(centre[0]), int(centre[1])), max(2, int(r)), tint, max(1, int(0.35 * r)), cv2.LINE_AA)
             continue
         angles = np.sort(rng.uniform(0.0, 2.0 * np.pi, size=int(rng.integers(3, 7))))
-        corners = centre + r * np.stack([np.cos(angles), np.sin(angles)], axis=-1)
+        corners = np.empty((len(angles), 2))
+        corners[:, 0], corners[:, 1] = centre[0] + r * np.cos(angles), centre[1] + r * np.sin(angles)
         cv2.fillPoly(image, [np.rint(corners * 16).astype(np.int32)], tint, cv2.LINE_AA, 4)
 
 

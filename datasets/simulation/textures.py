@@ -82,7 +82,7 @@ def _padded(image: U8) -> U8:
 def paint(material: str, size_m: tuple[float, float], per_metre: float, rng: np.random.Generator) -> U8:
     """(h, w, 3) texture of a face of the given width and height in metres."""
     w, h = (max(4, round(length * per_metre)) for length in size_m)
-    image = PAINTERS.get(material, speckled)(h, w, per_metre, rng) + np.zeros(3, dtype=np.float32)
-    image = image + 3.0 * clouds(h, w, (0.01 * per_metre,), rng)[:, :, None]
-    image = cv2.GaussianBlur(image, (0, 0), BLUR_TEXELS)
-    return np.asarray(np.clip(np.rint(image), 0, 255).astype(np.uint8))
+    image = PAINTERS.get(material, speckled)(h, w, per_metre, rng)
+    image += 3.0 * clouds(h, w, (0.01 * per_metre,), rng)[:, :, None]
+    cv2.GaussianBlur(image, (0, 0), BLUR_TEXELS, dst=image)
+    return np.asarray(np.clip(np.rint(image, out=image), 0, 255, out=image).astype(np.uint8))

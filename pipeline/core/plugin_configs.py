@@ -18,7 +18,7 @@ from hydra.plugins.config_source import ConfigResult, ConfigSource
 from hydra.plugins.search_path_plugin import SearchPathPlugin
 from omegaconf import DictConfig, OmegaConf
 
-from trihedron.pipeline.core.registry import load_plugins, options_of, plugins_of
+from trihedron.pipeline.core.registry import load_plugins, options_of, plugin_class, plugins_of
 from trihedron.pipeline.core.slots import SLOTS
 
 PLUGIN_KEY = "plugin"  # which plugin a slot's configuration belongs to
@@ -28,7 +28,7 @@ SCHEME = "trihedron"
 class PluginConfigs(ConfigSource):
     """Source of one group for each slot, with one configuration for each plugin that is registered. Processes of a sweep are sent a copy."""
 
-    offered: ClassVar[Mapping[str, Mapping[str, Any]]] = {}  # by slot: options of the plugin `plugin` that take the place of its defaults
+    offered: ClassVar[Mapping[str, DictConfig]] = {}  # by slot: the configuration of its plugin in a recording
 
     def __init__(self, provider: str, path: str) -> None:
         super().__init__(provider, path)
@@ -52,11 +52,11 @@ class PluginConfigs(ConfigSource):
 
     def load_config(self, config_path: str) -> ConfigResult:
         slot, name = _parts(config_path)
-        plugin, recorded = plugins_of(slot)[name], self.recorded.get(slot, {})
-        if recorded.get(PLUGIN_KEY) == name:
-            node = OmegaConf.structured(with_defaults(_option_type(name, plugin), recorded))
+        recorded = self.recorded.get(slot)
+        if recorded is not None and recorded[PLUGIN_KEY] == name:
+            node = copy.deepcopy(recorded)
         else:
-            node = plugin_config(name, plugin)
+            node = plugin_config(name, plugins_of(slot)[name])
         return ConfigResult(provider=self.provider, path=self.full_path(), config=node, header={"package": None})
 
     def list(self, config_path: str, results_filter: ObjectType | None) -> list[str]:
@@ -77,7 +77,8 @@ def offer_plugins(recorded: Mapping[str, Mapping[str, Any]]) -> None:
     """Let Hydra find the configurations of all registered plugins, with the options of a recording, by slot, instead of the defaults."""
     for kind in (PluginConfigs, PluginSearchPath):
         Plugins.instance().register(kind)
-    PluginConfigs.offered = recorded
+    kinds = {slot: _option_type(options[PLUGIN_KEY], plugin_class(slot, options[PLUGIN_KEY])) for slot, options in recorded.items()}
+    PluginConfigs.offered = {slot: OmegaConf.structured(with_defaults(kind, recorded[slot])) for slot, kind in kinds.items()}
 
 
 def with_defaults(node: type[Any], values: Mapping[str, Any]) -> type[Any]:
