@@ -4,15 +4,12 @@ A block of code with a title is a file; a block `sh` is run; `console` and `text
 
 import os
 import re
-import shlex
 import subprocess
 import sysconfig
 import venv
 from pathlib import Path
 
 import pytest
-
-from trihedron.pipeline.app.cli import main
 
 ROOT = Path(__file__).resolve().parents[1]
 TUTORIALS = sorted((ROOT / "docs" / "tutorial").glob("*.md"))
@@ -53,16 +50,6 @@ def test_every_tutorial_has_blocks_and_promises():
         assert any(language == "sh" for language, _, _ in blocks(tutorial)), tutorial
         assert {language for language, _, _ in blocks(tutorial)} <= {"sh", "console", "text", "python", "yaml", "toml"}, tutorial
         assert not [title for language, title, _ in blocks(tutorial) if language in ("python", "yaml", "toml") and not title], tutorial
-
-
-def test_the_commands_of_the_first_run(tmp_path, monkeypatch, capsys):
-    """In this process; `test_tutorial` has them executed by a shell, as printed."""
-    monkeypatch.chdir(tmp_path)
-    (tutorial,) = (path for path in TUTORIALS if path.stem == "first-run")
-    commands = [shlex.split(line) for language, _, text in blocks(tutorial) if language == "sh" for line in text.splitlines()]
-    assert [(words[0], main(words[1:])) for words in commands] == [("trihedron", 0)] * len(commands) and len(commands) > 4
-    printed = capsys.readouterr().out
-    assert not [line for line in REPORTED["first-run"] if line not in printed]
 
 
 @pytest.mark.slow

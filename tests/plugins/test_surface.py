@@ -20,6 +20,7 @@ from surface_world import BACK, BALL, FLOOR, LEFT, RADIUS, faults, fold, off_tru
 
 load_plugins()
 SURFACES = tuple(name for name in plugins_of("surface") if name != "none")
+SLOW_POISSON = [pytest.param(name, marks=pytest.mark.slow if name == "open3d_poisson" else ()) for name in SURFACES]
 DENSE = ("tsdf", "open3d_voxels", "open3d_poisson")  # two triangles or more a cell of 2 cm, also where it is flat: 55 000 on 11 m²
 
 
@@ -37,7 +38,7 @@ def corner(name):
         ("planar_greedy", 0.001, 0.995),
         ("surfels", 0.02, 0.995),
         ("open3d_voxels", 0.01, 0.97),
-        ("open3d_poisson", 0.001, 0.99),
+        pytest.param("open3d_poisson", 0.001, 0.99, marks=pytest.mark.slow),
     ],
 )
 def test_a_corner_with_a_ball(name, mean_m, facing):
@@ -162,7 +163,7 @@ def test_the_same_frames_give_the_same_bytes(name):
     assert Encoder().encode(again) == Encoder().encode(corner(name))
 
 
-@pytest.mark.parametrize("name", SURFACES)
+@pytest.mark.parametrize("name", SLOW_POISSON)
 @pytest.mark.parametrize("case", ["nothing", "lost", "no depth", "NaN", "one plane", "edge-on", "a million points"])
 def test_degenerate_input_gives_a_valid_file(name, case, tmp_path):
     T, large = np.eye(4), Camera(1280, 960, 1000.0, 1000.0, 639.5, 479.5, depth_noise=EXACT_DEPTH)
@@ -189,7 +190,7 @@ def test_degenerate_input_gives_a_valid_file(name, case, tmp_path):
         assert case == "one plane" or name in DENSE or len(surface.triangles) < 20_000
 
 
-@pytest.mark.parametrize("name", DENSE)
+@pytest.mark.parametrize("name", [param for param in SLOW_POISSON if param.values[0] in DENSE])
 def test_one_view_gives_the_area_that_it_shows(name):
     surface = fold(plugin_class("surface", name)(), [seen(0, np.eye(4), (BACK,), ball=False)])
     corners = surface.vertices_m.astype(float)[surface.triangles]

@@ -25,7 +25,7 @@ load_plugins()
 SURFACES = tuple(name for name in plugins_of("surface") if name != "none")
 
 
-@pytest.mark.parametrize("name", SURFACES)
+@pytest.mark.parametrize("name", [pytest.param(name, marks=pytest.mark.slow if name == "open3d_poisson" else ()) for name in SURFACES])
 def test_what_was_gathered_follows_the_final_keyframes(name):
     """Poses said 5 cm off, hung on a keyframe that the map puts right in the end."""
     shift = np.array([0.05, 0.0, 0.0])

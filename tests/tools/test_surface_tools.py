@@ -225,7 +225,7 @@ def test_truth_that_cannot_be_had_is_one_line(tmp_path):
         evaluate_surface.main([str(tmp_path / "none.ply"), str(tmp_path)])
 
 
-@pytest.mark.parametrize("curved", [False, True])
+@pytest.mark.parametrize("curved", [pytest.param(False, marks=pytest.mark.slow), True])
 def test_the_true_surface_of_the_room_is_what_its_depth_shows(curved):
     dataset = Synthetic(width=80, height=60, noise=False, texture=False, curved=curved, length=300)
     surface, frame, T = dataset.surface(), dataset(250), dataset.truth().poses[250]
