@@ -11,14 +11,15 @@ from trihedron.api.runs import Run, as_table
 from trihedron.api.words import words_of
 from trihedron.tools.ablate import ablate as computed
 from trihedron.tools.ablate import options_of
-from trihedron.tools.ablation_tables import as_json, as_text, sections_of
+from trihedron.tools.ablation_tables import as_json, as_text, lines_of, sections_of, verdicts
 
 
 @dataclass(frozen=True)
 class Ablation:
-    """A finished ablation. `tables` are those of `trihedron ablate` by title, `figures` the same as numbers, `folders` the run folders by change: of
-    several recordings one each."""
+    """A finished ablation. `verdicts` are the lines of `trihedron ablate`, `tables` its tables by title, `figures` the same as numbers, `folders` the
+    run folders by change: of several recordings one each."""
 
+    verdicts: list[str]
     tables: dict[str, Any]
     figures: dict[str, Any]
     folders: dict[str, list[Path]]
@@ -51,10 +52,11 @@ def ablate(
     paths = [str(item.folder if isinstance(item, Run) else item) for item in given]
     words = [*paths, *words_of(swaps, options), f"out={out}", f"feedback={feedback}"]
     cases = computed(options_of(words, budget))
-    sections = sections_of(cases)
-    found = as_json(cases, sections)
+    judged, sections = verdicts(cases), sections_of(cases)
+    lines, found = lines_of(judged), as_json(cases, judged, sections)
     folders: dict[str, list[Path]] = {}
     for case in cases:
         for variant in case.variants:
             folders.setdefault(variant.combination.label, []).append(Path(variant.folder))
-    return Ablation({title: as_table(rows) for title, rows in found["tables"].items()}, found, folders, as_text(sections))
+    tables = {title: as_table(rows) for title, rows in found["tables"].items()}
+    return Ablation(lines, tables, found, folders, as_text(lines, sections))

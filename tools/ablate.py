@@ -4,9 +4,12 @@ From each recording every combination of the given plugins, options or wires is 
 once. Each alternative is a run folder in out=DIR. By default all that follows from a swap is computed again, as a full run would, to the same bytes;
 with feedback=recorded the swapped stages alone, on the recorded past.
 
-The tables: every alternative's figures; paired differences over the recordings with intervals, Holm's correction, effect sizes and the number of
-repeats needed; the Shapley value of each swap, and with --budget what the truth in the place of a stage changes; where they part, with a picture of
-the worst frame; the cost.
+First the verdicts, a line for each pair of alternatives and figure: both figures, their difference with its 95 % interval, the effect size, and
+"better", "worse" or "no difference shown" with how many seeds more would show one of 5 %. Of one recording the interval is from its frames (blocks of
+at least a second; fewer than 8 blocks are "too short to tell"), of several from their differences. Holm's correction is over the pairs of a figure.
+
+The tables: every alternative's figures; the Shapley value of each swap, and with --budget what the truth in the place of a stage changes; where they
+part, with a picture of the worst frame; the cost.
 The same command again computes only what is missing.
 
 Example: trihedron ablate runs/a/run.mcap manhattan=mean_shift,plane_svd rotation=drift_free,procrustes out=runs/ablation
@@ -30,10 +33,12 @@ from trihedron.pipeline.app.execute import MAX_THREADS
 from trihedron.pipeline.core.config import Feedback
 from trihedron.pipeline.core.errors import ConfigError, DataError, TrihedronError, UsageError, did_you_mean
 from trihedron.pipeline.record.reader import Recording
+from trihedron.pipeline.record.trajectories import attached_truth
 from trihedron.pipeline.run.result_files import read_results
 from trihedron.pipeline.sweep.jobs import key_of
 from trihedron.tools import ablation_tables as tables
 from trihedron.tools.ablation_differences import Parting, RecordedValues, StageErrors, truth_of
+from trihedron.tools.ablation_errors import of_trajectory, read_errors, write_errors
 from trihedron.tools.ablation_swaps import Combination, combinations_of, folder_name, parsed, without_repeats
 from trihedron.tools.ablation_tables import Case, Variant
 from trihedron.tools.arguments import Parser
@@ -70,12 +75,13 @@ def main(argv: list[str]) -> int:
     parser.add_argument("--markdown", type=Path, metavar="FILE", help="write the tables there too")
     given = parser.parse_args(argv)
     cases = ablate(options_of(given.words, given.budget))
-    sections = tables.sections_of(cases)
-    print(tables.as_text(sections))
+    found, sections = tables.verdicts(cases), tables.sections_of(cases)
+    lines = tables.lines_of(found)
+    print(tables.as_text(lines, sections))
     if given.markdown:
-        given.markdown.write_text(tables.as_markdown(sections))
+        given.markdown.write_text(tables.as_markdown(lines, sections))
     if given.json:
-        given.json.write_text(json.dumps(tables.as_json(cases, sections), indent=2) + "\n")
+        given.json.write_text(json.dumps(tables.as_json(cases, found, sections), indent=2) + "\n")
     return 0
 
 
@@ -113,15 +119,20 @@ def ablate(options: Options) -> list[Case]:
         alternatives = alternatives_of(recording, [combination.words for combination in combinations])
         computing = Alternatives(recording, alternatives, options.feedback, options.threads)
         key = _key(recording, computing, options)
-        if key in known:
+        file = options.out / f"errors-{key[:16]}.npz"
+        errors = read_errors(file, len(combinations))
+        if key in known and errors is not None:
             print(f"{recording.path}: done already", file=sys.stderr)
             case = tables.case_from_dict(known[key])
+            for variant, one in zip(case.variants, errors):
+                variant.errors = one
         else:
             print(f"{recording.path} ({number} of {len(recordings)}): {len(combinations)} alternatives", file=sys.stderr)
             folders = [options.out / folder_name(prefix, combination) for combination in combinations]
             case = _computed(computing, combinations, folders)
             if options.budget:
                 case.budget = _budget(recording)
+            write_errors(file, [variant.errors for variant in case.variants])
         cases.append(case)
         keys.append(key)
         _write(options.out, {**known, **dict(zip(keys, map(tables.case_to_dict, cases)))})
@@ -175,13 +186,26 @@ def _computed(computing: Alternatives, combinations: Sequence[Combination], fold
 
     computing.run(folders, on_frame)
     figures = [_figures(outcome, found, computing.feedback) for outcome, found in zip(computing.outcomes, errors)]
+    reference = attached_truth(recording.attachments, str(recording.path))
+    judged = [
+        {**(of_trajectory(runner.result, reference, ERRORS) if outcome.metrics.get("final") else {}), **found.of_frames()}
+        for runner, outcome, found in zip(computing.runners, computing.outcomes, errors)
+    ]
     full_s = read_results(recording.path.parent / "timing.json").get("cpu_s")
     variants = [
-        Variant(combination, str(folder), one, outcome.stages_s, outcome.total_s, parting)
-        for combination, folder, one, outcome, parting in zip(combinations, folders, figures, computing.outcomes, partings)
+        Variant(combination, str(folder), one, outcome.stages_s, outcome.total_s, parting, errors=of_frames)
+        for combination, folder, one, outcome, parting, of_frames in zip(combinations, folders, figures, computing.outcomes, partings, judged)
     ]
     case = Case(
-        str(recording.path), computing.runners[0].count, topics, list(computing.shared), full_s or np.nan, computing.cpu_s, variants, recorded.parting
+        str(recording.path),
+        computing.runners[0].count,
+        topics,
+        list(computing.shared),
+        full_s or np.nan,
+        computing.cpu_s,
+        variants,
+        recorded.parting,
+        fps=computing.runners[0].result.fps,
     )
     if case.changed.frame is not None:
         changed = f"{case.changed.topic}.{case.changed.field} from frame {case.changed.frame} on"

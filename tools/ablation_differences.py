@@ -18,6 +18,7 @@ from trihedron.tools.diff import differing
 from trihedron.tools.error_budget import true_poses
 
 MEASURED = ("pose", "translation", "rotation", "manhattan")  # topics with a distance of two values; the first that is there finds the worst
+OPEN_LOOP = ("axes deg", "rotation deg", "translation mm")  # columns of the errors of single stages
 CUBE = [
     sign * np.eye(3)[list(order)].T
     for order in permutations(range(3))
@@ -93,12 +94,13 @@ def _angle_deg(R: F64) -> float:
 
 @dataclass
 class StageErrors:
-    """Errors of the values of single stages against the true poses, and the share of frames with a value, of one alternative."""
+    """Errors of the values of single stages against the true poses, frame by frame, and the share of frames with a value, of one alternative."""
 
     truth: Mapping[int, F64]  # true pose (4, 4) by frame stamp
-    rotations_deg: list[float] = field(default_factory=list)
-    translations_m: list[float] = field(default_factory=list)
-    axes: list[F64] = field(default_factory=list)  # R_world_manhattan by the true rotation: constant, were the axes right
+    rotations_deg: dict[int, float] = field(default_factory=dict)  # by the number of the frame
+    translations_m: dict[int, float] = field(default_factory=dict)
+    axes: dict[int, F64] = field(default_factory=dict)  # R_world_manhattan by the true rotation: constant, were the axes right
+    frames: int = 0
     seen: int = 0
     present: int = 0
 
@@ -110,24 +112,25 @@ class StageErrors:
             if not isinstance(value, Value) or (T := self.truth.get(value.stamp_ns)) is None:
                 continue
             if isinstance(value, Rotation):
-                self.rotations_deg.append(_angle_deg(T[:3, :3].T @ value.R_world_camera))
+                self.rotations_deg[self.frames] = _angle_deg(T[:3, :3].T @ value.R_world_camera)
             elif isinstance(value, Translation) and value.estimated:
-                self.translations_m.append(float(np.linalg.norm(T[:3, 3] - value.t_world_camera)))
+                self.translations_m[self.frames] = float(np.linalg.norm(T[:3, 3] - value.t_world_camera))
             elif isinstance(value, ManhattanFrame) and value.supported and len(value.rotations):
-                self.axes.append(T[:3, :3] @ value.rotations[0])
+                self.axes[self.frames] = T[:3, :3] @ value.rotations[0]
+        self.frames += 1
+
+    def of_frames(self) -> dict[str, F64]:
+        """Return each kind of error there is as an array (frames,), NaN where a frame has none."""
+        deviations = dict(zip(self.axes, _deviations_deg(list(self.axes.values()))))
+        distances = {frame: 1e3 * metres for frame, metres in self.translations_m.items()}
+        errors = {"axes deg": deviations, "rotation deg": self.rotations_deg, "translation mm": distances}
+        return {name: np.array([values.get(frame, np.nan) for frame in range(self.frames)]) for name, values in errors.items() if values}
 
     def figures(self) -> dict[str, float]:
         """Return the root mean square of each kind of error, NaN where there is none."""
-        return {
-            "axes deg": _rms(_deviations_deg(self.axes)),
-            "rotation deg": _rms(self.rotations_deg),
-            "translation mm": 1e3 * _rms(self.translations_m),
-            "values %": 100.0 * self.present / self.seen if self.seen else np.nan,
-        }
-
-
-def _rms(values: Sequence[float]) -> float:
-    return float(np.sqrt(np.mean(np.square(values)))) if len(values) else np.nan
+        errors = self.of_frames()
+        found = {name: float(np.sqrt(np.nanmean(np.square(errors[name])))) if name in errors else np.nan for name in OPEN_LOOP}
+        return {**found, "values %": 100.0 * self.present / self.seen if self.seen else np.nan}
 
 
 def _deviations_deg(axes: Sequence[F64]) -> list[float]:

@@ -1,25 +1,35 @@
-"""The tables of an ablation: comparisons, attribution, differences and cost, from the figures of each recording; as text, markdown and JSON."""
+"""The verdicts and tables of an ablation: comparisons, attribution, differences and cost, from the figures of each recording; as text, markdown and
+JSON."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, field
+from itertools import combinations
 from typing import Any
 
 import numpy as np
 
+from trihedron.pipeline.core.types import F64
 from trihedron.tools.ablation_differences import Parting
-from trihedron.tools.ablation_statistics import Paired, holm, paired, shapley
+from trihedron.tools.ablation_statistics import shapley
 from trihedron.tools.ablation_swaps import AS_RECORDED, Combination
 from trihedron.tools.arguments import table
-from trihedron.tools.compare import CONFIDENCE, half_interval
+from trihedron.tools.paired_statistics import CONFIDENCE, half_interval
+from trihedron.tools.verdicts import NOTE, VERDICTS, Column, Sample, Verdict, line_of, verdicts_of
 
-HIGHER_IS_BETTER = ("ok %", "values %")
-DIGITS = {
-    "ATE mm": 2, "RPE 1 frame mm": 2, "RPE 1 s mm": 2, "RPE 1 s deg": 3, "ok %": 1,
-    "axes deg": 3, "rotation deg": 3, "translation mm": 2, "values %": 1, "ms": 2,
-}  # fmt: skip
-FIGURES = tuple(DIGITS)  # in the order of columns
+FIGURES = {  # in the order of columns
+    "ATE mm": Column(2),
+    "RPE 1 frame mm": Column(2),
+    "RPE 1 s mm": Column(2),
+    "RPE 1 s deg": Column(3),
+    "ok %": Column(1, more=True),
+    "axes deg": Column(3),
+    "rotation deg": Column(3),
+    "translation mm": Column(2),
+    "values %": Column(1, more=True),
+    "ms": Column(2),
+}
 
 
 @dataclass
@@ -34,6 +44,7 @@ class Variant:
     total_s: float
     parting: Parting = field(default_factory=Parting)
     picture: str = ""
+    errors: dict[str, F64] = field(default_factory=dict, compare=False, repr=False)  # of each frame (n,), by column, NaN where there is none
 
 
 @dataclass
@@ -50,6 +61,7 @@ class Case:
     variants: list[Variant]
     changed: Parting = field(default_factory=Parting)  # of what the recorded configuration computes now, from the recorded values
     budget: dict[str, dict[str, float]] = field(default_factory=dict)
+    fps: float = 30.0
 
 
 @dataclass(frozen=True)
@@ -62,47 +74,64 @@ class Section:
     note: str = ""
 
 
+def verdicts(cases: Sequence[Case]) -> list[Verdict]:
+    """Return the verdict of each pair of alternatives, the earlier one first, in each figure."""
+    samples = {label: [_sample(case, variant) for case, variant in found] for label, found in _by_change(cases).items()}
+    pairs = {(first, second): list(zip(samples[first], samples[second])) for first, second in combinations(samples, 2)}
+    return verdicts_of(pairs, FIGURES)
+
+
+def _sample(case: Case, variant: Variant) -> Sample:
+    return Sample(variant.figures, variant.errors, round(case.fps))
+
+
+def lines_of(found: Sequence[Verdict]) -> list[str]:
+    """Return verdicts as lines."""
+    return [line_of(one, FIGURES[one.figure]) for one in found]
+
+
 def sections_of(cases: Sequence[Case]) -> list[Section]:
     """Return all tables of an ablation."""
-    parts = [alternatives_table(cases), comparison_table(cases), attribution_table(cases), parting_table(cases), cost_table(cases)]
+    parts = [alternatives_table(cases), attribution_table(cases), parting_table(cases), cost_table(cases)]
     return [section for section in parts if len(section.rows) > 1]
 
 
-def as_text(sections: Sequence[Section]) -> str:
-    """Return the tables as aligned text."""
+def as_text(lines: Sequence[str], sections: Sequence[Section]) -> str:
+    """Return the lines of the verdicts, then the tables, as aligned text."""
     parts = [f"{section.title}\n{table(section.rows, section.right)}" + (f"\n{section.note}" if section.note else "") for section in sections]
-    return "\n\n".join(parts)
+    return "\n\n".join(["\n".join([VERDICTS, *lines, NOTE]), *parts])
 
 
-def as_markdown(sections: Sequence[Section]) -> str:
-    """Return the tables as Markdown."""
-    lines: list[str] = []
+def as_markdown(lines: Sequence[str], sections: Sequence[Section]) -> str:
+    """Return the verdicts, then the tables, as Markdown."""
+    text = [f"## {VERDICTS}", "", *(f"- {line}" for line in lines), "", NOTE, ""]
     for section in sections:
         head, *rows = [[cell.replace("|", "\\|") for cell in row] for row in section.rows]
         rule = ["--:" if section.right[i : i + 1] == "r" else "---" for i in range(len(head))]
-        lines += [f"## {section.title}", "", *(f"| {' | '.join(row)} |" for row in (head, rule, *rows)), ""]
-        lines += [section.note, ""] if section.note else []
-    return "\n".join(lines)
+        text += [f"## {section.title}", "", *(f"| {' | '.join(row)} |" for row in (head, rule, *rows)), ""]
+        text += [section.note, ""] if section.note else []
+    return "\n".join(text)
 
 
-def as_json(cases: Sequence[Case], sections: Sequence[Section]) -> dict[str, Any]:
-    """Return cases and tables, ready for JSON; a figure that does not exist is None."""
+def as_json(cases: Sequence[Case], found: Sequence[Verdict], sections: Sequence[Section]) -> dict[str, Any]:
+    """Return cases, verdicts and tables, ready for JSON; a figure that does not exist is None."""
     tables = {section.title: [dict(zip(section.rows[0], row)) for row in section.rows[1:]] for section in sections}
-    found: dict[str, Any] = _without_nan(
+    values: dict[str, Any] = _without_nan(
         {
+            "verdicts": [{"text": line, **asdict(one)} for line, one in zip(lines_of(found), found)],
             "recordings": [case_to_dict(case) for case in cases],
-            "comparisons": [{"change": label, **asdict(one)} for label, one in comparisons(cases)],
             "attribution": attribution(cases),
             "tables": tables,
         }
     )
-    return found
+    return values
 
 
 def case_to_dict(case: Case) -> dict[str, Any]:
     """Return the fields of a case, ready for JSON."""
     values = asdict(case)
     for one, variant in zip(values["variants"], case.variants):
+        del one["errors"]  # they are in a file beside
         one["change"], one["combination"] = variant.combination.label, [[stage, list(words)] for stage, words in variant.combination.levels]
     found: dict[str, Any] = _without_nan(values)
     return found
@@ -138,7 +167,7 @@ def number(name: str, value: float | None, sign: bool = False) -> str:
     """Return a figure as text, "-" where there is none."""
     if value is None or not np.isfinite(value):
         return "-"
-    text = f"{value:{'+' if sign else ''}.{DIGITS[name]}f}"
+    text = f"{value:{'+' if sign else ''}.{FIGURES[name].decimals}f}"
     return text if float(text) else text.lstrip("+-")
 
 
@@ -166,46 +195,6 @@ def alternatives_table(cases: Sequence[Case]) -> Section:
 def _mean(values: Sequence[float]) -> float:
     finite = [value for value in values if np.isfinite(value)]
     return float(np.mean(finite)) if finite else np.nan
-
-
-def comparisons(cases: Sequence[Case]) -> list[tuple[str, Paired]]:
-    """Return (change, statistics) of every alternative and figure against the recorded configuration, corrected for their number."""
-    found: list[tuple[str, Paired]] = []
-    for label, group in _by_change(cases).items():
-        if label != AS_RECORDED:
-            for name in columns_of(cases):
-                differences = [variant.figures.get(name, np.nan) - case.variants[0].figures.get(name, np.nan) for case, variant in group]
-                if (one := paired(name, differences)) is not None:
-                    found.append((label, one))
-    tested = [one.p for _, one in found if one.p is not None]
-    corrected = iter(holm(tested))
-    return [(label, one if one.p is None else replace(one, corrected=next(corrected))) for label, one in found]
-
-
-def comparison_table(cases: Sequence[Case]) -> Section:
-    """Paired differences from the recorded configuration, of several recordings."""
-    rows = [["change", "figure", "difference", "95 % interval", "p", "d", "result", "repeats needed"]]
-    for label, one in comparisons(cases) if len(cases) > 1 else []:
-        ends = "-" if one.half is None else f"{number(one.figure, one.mean - one.half, True)} to {number(one.figure, one.mean + one.half, True)}"
-        p, effect = ("-" if value is None else f"{value:.3g}" for value in (one.corrected, one.effect))
-        needed = "-" if one.needed is None else str(one.needed)
-        rows.append([label, one.figure, number(one.figure, one.mean, True), ends, p, effect, verdict(one), needed])
-    note = (
-        f"Paired over {len(cases)} recordings, Student's t; p by Holm over all rows; d: Cohen's, of pairs; "
-        "repeats needed: pairs with which a difference of this size is shown in 8 of 10 studies"
-    )
-    return Section("Differences from the recorded configuration", rows, "llrlrrlr", note)
-
-
-def verdict(one: Paired) -> str:
-    """Return the answer of a comparison."""
-    if one.p is None:
-        return "one pair: no test"
-    if one.mean == 0.0 and one.half == 0.0:
-        return "equal"
-    if not one.shown:
-        return "no difference shown"
-    return "better" if (one.mean > 0.0) == (one.figure in HIGHER_IS_BETTER) else "worse"
 
 
 def targets_of(case: Case) -> list[Combination]:

@@ -3,8 +3,9 @@
 A row is what a run's overrides say that those of the others do not; runs that differ in their seed alone share a row, as median ± half the distance
 from the smallest to the largest. Rows of one data set stand together; the best of each column is bold, errors only among rows that tracked almost
 as much as the best. `end to start` is where a run without ground truth ends, seen from where it began: the drift of a walk that returns.
-`--baseline` adds the mean paired difference (same data, same seeds) with its 95 % interval by Student's t, per row and over all data. A job that
-failed, or has no errors, has a row with the reason.
+`--baseline` adds the mean paired difference (same data, same seeds) with its 95 % interval by Student's t, per row and over all data, and prints
+verdicts first, as `trihedron ablate` does: of each change against the baseline, over all pairs of runs; of a single pair by the errors of its frames.
+A job that failed, or has no errors, has a row with the reason.
 
 Trajectory files of other programs (TUM format, or KITTI with a pose a frame) are rows of the same table, judged on the frames and the ground truth of
 the runs beside them, by the same association, alignment and share tracked. Files of one label are repeats of each other.
@@ -30,10 +31,12 @@ from trihedron.tools import comparison_table as render
 from trihedron.tools import other_programs
 from trihedron.tools.arguments import Parser
 from trihedron.tools.comparison_table import FIGURES
+from trihedron.tools.comparison_verdicts import COLUMNS, paired_samples
+from trihedron.tools.paired_statistics import half_interval
+from trihedron.tools.verdicts import NOTE, VERDICTS, Sample, line_of, verdicts_of
 
 SEEDS = ("seed", "dataset.seed")
 NOT_SHOWN = ("out", "report", "experiment", "sequences", "alternatives", *SEEDS)
-CONFIDENCE = 0.95
 SURFACE, SURFACE_FIGURES = "surface.ply", "surface.json"
 
 
@@ -69,6 +72,8 @@ def main(argv: list[str]) -> int:
         judge_surfaces(folders)
     runs = [run for folder in folders for run in read_runs(folder)]
     rows = rows_of(runs + read_trajectories(files, runs, options.label, options.y_up), options.baseline)
+    if lines := verdicts_against(runs, options.baseline):
+        print("\n".join([VERDICTS, *lines, NOTE, ""]))
     print(render.as_text(rows))
     for name, write in render.WRITERS.items():
         if getattr(options, name):
@@ -209,6 +214,17 @@ def row_of(data: str, change: str, same: Sequence[Run], base: Sequence[Run] | No
     }
 
 
+def verdicts_against(runs: Sequence[Run], baseline: str) -> list[str]:
+    """Return the verdict of each change against the baseline in each figure, over all data and seeds that both have, as lines; none without one."""
+    groups = groups_of(runs) if baseline else {}
+    pairs: dict[tuple[str, str], list[tuple[Sample, Sample]]] = {}
+    for (data, change), same in groups.items():
+        for run, base in _pairs(same, groups.get((data, baseline), [])) if change != baseline else []:
+            samples = paired_samples(base.folder, run.folder, (base.figures, run.figures))
+            pairs.setdefault((baseline, change), []).append(samples)
+    return [line_of(one, COLUMNS[one.figure]) for one in verdicts_of(pairs, COLUMNS)]
+
+
 def _pairs(runs: Sequence[Run], base: Sequence[Run]) -> list[tuple[Run, Run]]:
     """Runs with those of the baseline that have the same seeds."""
     by_seeds = {run.seeds: run for run in base if not run.label}
@@ -226,15 +242,6 @@ def _differences(pairs: Sequence[tuple[Run, Run]]) -> dict[str, dict[str, Any]]:
             low, high = (None, None) if half is None else (mean - half, mean + half)
             out[name] = {"mean": mean, "low": low, "high": high, "pairs": len(differences)}
     return out
-
-
-def half_interval(values: Any) -> float | None:
-    """Half the width of the confidence interval of the mean of values (n,), by Student's t; None for fewer than two."""
-    from scipy.stats import t
-
-    if len(values) < 2:
-        return None
-    return float(t.ppf(0.5 + 0.5 * CONFIDENCE, len(values) - 1) * np.std(values, ddof=1) / np.sqrt(len(values)))
 
 
 def _check_baseline(baseline: str, changes: Sequence[str]) -> None:

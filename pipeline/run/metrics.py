@@ -103,6 +103,25 @@ def evaluate_trajectory(
     )
 
 
+def frame_errors(estimate: Trajectory, truth: Trajectory, fps: float, frame_stamps_ns: I64) -> dict[str, F64]:
+    """Return the (n,) errors of the n frames behind the root mean squares of `evaluate_trajectory`, by the names they have in `Metrics`.
+
+    NaN where a frame has none. The error of a pair of poses (RPE) is that of its first frame. Empty for fewer than 3 poses with truth."""
+    pairs, numbers = _pairs_by_frame(estimate, truth, frame_stamps_ns, MAX_DIFFERENCE_NS)
+    if len(pairs) < FEWEST_POSES:
+        return {}
+    poses, true_poses = estimate.poses[pairs[:, 0]], truth.poses[pairs[:, 1]]
+    found = {"ate_rmse_m": (numbers, aligned_errors(poses, true_poses))}
+    for prefix, apart in (("rpe_frame", 1), ("rpe_second", max(1, round(fps)))):
+        first, second = _rows_apart(numbers, apart)
+        metres, degrees = relative_errors(poses, true_poses, first, second)
+        found |= {f"{prefix}_rmse_m": (numbers[first], metres), f"{prefix}_rmse_deg": (numbers[first], degrees)}
+    errors = {name: np.full(len(frame_stamps_ns), np.nan) for name in found}
+    for name, (frames, values) in found.items():
+        errors[name][frames] = values
+    return errors
+
+
 def aligned_errors(poses: F64, true_poses: F64) -> F64:
     """Return (n,) distances of the positions of two sets of (n, 4, 4) poses in metres, after the best SE(3) alignment."""
     positions, true_positions = poses[:, :3, 3], true_poses[:, :3, 3]
@@ -126,11 +145,9 @@ def rotation_angles_deg(R: F64) -> F64:
 
 def _relative(prefix: str, poses: F64, true_poses: F64, numbers: I64, apart: int) -> dict[str, Any]:
     """Return the RPE fields of Metrics over all pairs of poses whose frame numbers are `apart`."""
-    second = np.searchsorted(numbers, numbers + apart)
-    first = np.flatnonzero(second < len(numbers))
-    first = first[numbers[second[first]] == numbers[first] + apart]
+    first, second = _rows_apart(numbers, apart)
     found = len(first) > 0
-    metres, degrees = relative_errors(poses, true_poses, first, second[first])
+    metres, degrees = relative_errors(poses, true_poses, first, second)
     return {
         f"{prefix}_rmse_m": _rmse(metres) if found else None,
         f"{prefix}_median_m": float(np.median(metres)) if found else None,
@@ -138,6 +155,14 @@ def _relative(prefix: str, poses: F64, true_poses: F64, numbers: I64, apart: int
         f"{prefix}_median_deg": float(np.median(degrees)) if found else None,
         f"{prefix}_pairs": len(first),
     }
+
+
+def _rows_apart(numbers: I64, apart: int) -> tuple[I64, I64]:
+    """Return the rows of all pairs of frame numbers that are `apart`: those of the first and of the second."""
+    second = np.searchsorted(numbers, numbers + apart)
+    first = np.flatnonzero(second < len(numbers))
+    first = first[numbers[second[first]] == numbers[first] + apart]
+    return first, second[first]
 
 
 def _pairs_by_frame(estimate: Trajectory, truth: Trajectory, frame_stamps_ns: I64 | None, max_difference_ns: int) -> tuple[I64, I64]:

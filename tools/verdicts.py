@@ -1,0 +1,193 @@
+"""Verdicts in words: which of two alternatives is better in a figure, by how much, and how sure that is.
+
+Figures that are root mean squares over frames are compared on the frames that both alternatives have an error of. Of one recording their difference
+has an interval by the moving-block bootstrap. Of several recordings each is one difference, and the interval of their mean is Student's t: what
+varies between stretches of a recording varies between recordings too, and drawing blocks within them besides would count it twice.
+
+P-values are corrected by Holm over all pairs of alternatives that are compared in the same figure: in a figure in which nothing differs, the chance
+of any "better" or "worse" is 5 %. Figures are not corrected for one another.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from trihedron.pipeline.core.types import F64
+from trihedron.tools.block_bootstrap import resampled
+from trihedron.tools.paired_statistics import LEVEL, MOST_REPEATS, POWER, half_width, holm, p_value, power, repeats_needed
+
+SMALL_SHARE = 0.05  # of the first alternative's figure: the difference that further recordings would show
+ROUNDING = 1e-12  # of a figure: less is no difference, and no spread
+TOO_SHORT = "too short to tell"
+NO_INTERVAL = "one recording, no interval"
+EQUAL = "equal"
+VERDICTS = "Verdicts"  # the title of the lines, and the note below them
+NOTE = (
+    "of the second against the first; of one recording by its frames (moving-block bootstrap), of several by their differences (Student's t); "
+    "corrected by Holm over the pairs of a figure; d: difference by its standard deviation from segment to segment, or recording to recording"
+)
+
+
+@dataclass(frozen=True)
+class Column:
+    """A figure's decimals, and whether more of it is better."""
+
+    decimals: int
+    more: bool = False
+
+
+@dataclass(frozen=True)
+class Sample:
+    """What an alternative did on one recording: figures by column, and of those that are root mean squares over frames the error (n,) of each, NaN
+    where it has none, in the figure's unit. `second` is the number of frames in one second, which a block has at least."""
+
+    figures: Mapping[str, float]
+    errors: Mapping[str, F64] = field(default_factory=dict)
+    second: int = 30
+
+
+Pairs = Sequence[tuple[Sample, Sample]]  # of two alternatives, one a recording
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """The second alternative against the first in one figure.
+
+    `before`, `after`: the figure of the first and the second, means over the recordings. `pieces`: the number of segments of the one recording
+    (blocks), or of recordings. `error`: standard error of the difference, with `pieces - 1` degrees of freedom. `low`, `high`: ends of the 95 %
+    interval. `corrected`: p-value after Holm's correction. `effect`: the difference by its standard deviation from piece to piece. `needed`: how many
+    recordings of this length more would show a difference of 5 % of `before` in 8 of 10 studies. `answer`: the verdict in words. What cannot be told
+    is None."""
+
+    first: str
+    second: str
+    figure: str
+    before: float
+    after: float
+    difference: float
+    pieces: int
+    recordings: int
+    block_frames: int | None = None
+    error: float | None = None
+    low: float | None = None
+    high: float | None = None
+    p: float | None = None
+    corrected: float | None = None
+    effect: float | None = None
+    needed: int | None = None
+    answer: str = ""
+
+
+def verdicts_of(comparisons: Mapping[tuple[str, str], Pairs], columns: Mapping[str, Column]) -> list[Verdict]:
+    """Return the verdicts of each pair of alternatives (first, second) in each column that both have, in this order."""
+    found = [one for names, pairs in comparisons.items() for column in columns if (one := _difference(names, column, pairs)) is not None]
+    corrected: dict[int, tuple[float, int]] = {}
+    for column in columns:
+        tested = [(number, one.p) for number, one in enumerate(found) if one.figure == column and one.p is not None]
+        corrected |= {number: (p, len(tested)) for (number, _), p in zip(tested, holm([p for _, p in tested]))}
+    return [_answered(one, columns[one.figure], *corrected.get(number, (None, 1))) for number, one in enumerate(found)]
+
+
+def _difference(names: tuple[str, str], column: str, pairs: Pairs) -> Verdict | None:
+    """Return the difference of a pair of alternatives with its interval, before the correction; None where no recording has both figures."""
+    values = np.array([_figures(column, a, b) for a, b in pairs]).reshape(-1, 2)
+    known = np.flatnonzero(np.isfinite(values).all(axis=1))
+    if not len(known):
+        return None
+    before, after = values[known].mean(axis=0)
+    one = Verdict(*names, column, float(before), float(after), float(after - before), len(known), len(known))
+    a, b = pairs[known[0]]
+    if len(known) > 1:
+        error: float | None = float(np.std(np.diff(values[known], axis=1), ddof=1) / np.sqrt(len(known)))
+    elif column in a.errors and column in b.errors:
+        found = resampled(a.errors[column], b.errors[column], max(1, a.second))
+        one, error = replace(one, pieces=found.blocks, block_frames=found.length), found.error
+        if np.array_equal(a.errors[column], b.errors[column], equal_nan=True):
+            error = 0.0
+    else:
+        return one
+    return one if error is None else _with_interval(one, error)
+
+
+def _figures(column: str, a: Sample, b: Sample) -> tuple[float, float]:
+    """Return the figure of both, over the frames that both have an error of; as they are where it is not one of frames."""
+    if column not in a.errors or column not in b.errors:
+        return a.figures.get(column, np.nan), b.figures.get(column, np.nan)
+    both = np.isfinite(a.errors[column]) & np.isfinite(b.errors[column])
+    if not both.any():
+        return np.nan, np.nan
+    return tuple(float(np.sqrt(np.mean(np.square(one.errors[column][both])))) for one in (a, b))
+
+
+def _with_interval(one: Verdict, error: float) -> Verdict:
+    scale = ROUNDING * max(abs(one.before), abs(one.after))
+    difference, error = (0.0 if abs(value) <= scale else value for value in (one.difference, error))
+    half, deviation = half_width(error, one.pieces - 1) if error else 0.0, error * np.sqrt(one.pieces)
+    return replace(
+        one,
+        difference=difference,
+        error=error,
+        low=difference - half,
+        high=difference + half,
+        p=p_value(difference, error, one.pieces - 1),
+        effect=float(difference / deviation) if error else None,
+    )
+
+
+def _answered(one: Verdict, column: Column, corrected: float | None, tests: int) -> Verdict:
+    """Add the words; `tests` is the number of comparisons that the correction is for."""
+    if corrected is None or one.error is None:
+        return replace(one, answer=NO_INTERVAL if one.block_frames is None else TOO_SHORT)
+    if one.error == 0.0 and one.difference == 0.0:
+        return replace(one, corrected=corrected, answer=EQUAL)
+    if corrected < LEVEL:
+        return replace(one, corrected=corrected, answer="better" if (one.difference > 0.0) == column.more else "worse")
+    needed = recordings_needed(one, LEVEL / tests)
+    if needed is None:
+        wanting = f"more than {MOST_REPEATS} seeds would be needed to show 5 %"
+    else:
+        wanting = f"{needed} seed{'s' if needed > 1 else ''} more would show 5 %" if needed else "5 % would have been shown"
+    return replace(one, corrected=corrected, needed=needed, answer=f"no difference shown; {wanting}")
+
+
+def recordings_needed(one: Verdict, level: float) -> int | None:
+    """Return how many further recordings of the same length would show a difference of 5 % of `before` with a power of 80 % at this level, by a
+    paired t test over recordings; 0 where this comparison would have shown it, None above 10 000.
+
+    A difference of one recording alone is taken to vary from one to the next as it does within: scenes that are less alike need more."""
+    if not one.error:
+        return None
+    wanted = SMALL_SHARE * abs(one.before)
+    if power(wanted / one.error, one.pieces - 1, level) >= POWER:
+        return 0
+    total = repeats_needed(wanted / (one.error * np.sqrt(one.recordings)), level)
+    return None if total is None else max(1, total - one.recordings)
+
+
+def line_of(one: Verdict, column: Column) -> str:
+    """Return a verdict as one line: `A against B: ATE 12.31 -> 13.08 mm, +0.77 (95 %: +0.21 to +1.40), d 0.90: worse`."""
+    name, _, unit = one.figure.rpartition(" ")
+    figure = f"{name or 'time'} {one.before:.{column.decimals}f} -> {one.after:.{column.decimals}f} {unit}"
+    text = f"{named(one.first, one.second)}: {figure}, {_signed(one.difference, column)}"
+    if one.low is not None and one.high is not None:
+        text += f" (95 %: {_signed(one.low, column)} to {_signed(one.high, column)})"
+    elif one.block_frames is not None:
+        text += f" ({one.pieces} block{'' if one.pieces == 1 else 's'} of {one.block_frames} frames)"
+    if one.effect is not None:
+        text += f", d {one.effect:.1f}"
+    return f"{text}: {one.answer}"
+
+
+def named(first: str, second: str) -> str:
+    """Return "first against second"; a key that both single words have is said once."""
+    key, value = first.partition("=")[0], second.partition("=")[2]
+    short = " " not in first + second and value and second.startswith(f"{key}=")
+    return f"{first} against {value if short else second}"
+
+
+def _signed(value: float, column: Column) -> str:
+    text = f"{value:+.{column.decimals}f}"
+    return text if float(text) else text.lstrip("+-")
