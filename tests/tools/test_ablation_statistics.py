@@ -1,9 +1,9 @@
 """Statistics of ablations on known figures."""
 
-import numpy as np
 import pytest
 
-from trihedron.tools.ablation_statistics import holm, paired, repeats_needed, shapley
+from trihedron.tools.ablation_statistics import shapley
+from trihedron.tools.paired_statistics import half_interval, half_width, holm, p_value, power, repeats_needed
 
 
 def test_shapley_values_of_the_glove_game():
@@ -33,14 +33,14 @@ def test_repeats_needed_at_the_ends():
     assert repeats_needed(50.0) == 2 and repeats_needed(1e-4) is None
 
 
-def test_paired_differences_by_student():
-    found = paired("ATE mm", [1.0, 2.0, 3.0, 4.0])
-    assert (found.pairs, found.mean) == (4, 2.5) and found.effect == pytest.approx(2.5 / np.std([1, 2, 3, 4], ddof=1))
-    assert found.half == pytest.approx(3.182446 * 1.290994 / 2.0, rel=1e-6) and found.p == pytest.approx(0.030466, rel=1e-4)
+def test_intervals_and_p_values_by_student():
+    """Of 1, 2, 3, 4: mean 2.5, deviation 1.290994, three degrees of freedom."""
+    assert half_interval([1.0, 2.0, 3.0, 4.0]) == pytest.approx(3.182446 * 1.290994 / 2.0, rel=1e-6) and half_interval([1.0]) is None
+    assert half_width(2.0, 3) == pytest.approx(2.0 * 3.182446, rel=1e-6)
+    assert p_value(2.5, 1.290994 / 2.0, 3) == pytest.approx(0.030466, rel=1e-4) == p_value(-2.5, 1.290994 / 2.0, 3)
+    assert (p_value(0.0, 0.0, 3), p_value(0.1, 0.0, 3)) == (1.0, 0.0)
 
 
-def test_differences_that_do_not_vary_or_exist():
-    assert paired("ATE mm", [np.nan, np.nan]) is None
-    assert paired("ATE mm", [1.0, np.nan]).p is None
-    equal = paired("ATE mm", [0.0, 0.0, 0.0])
-    assert (equal.mean, equal.half, equal.p, equal.needed) == (0.0, 0.0, 1.0, None)
+def test_power_grows_with_the_difference_and_falls_with_the_level():
+    assert power(0.0, 9) == pytest.approx(0.025) and power(50.0, 9) == 1.0  # one side of the two
+    assert power(3.0, 9, 0.01) < power(3.0, 9) < power(4.0, 9)
