@@ -23,12 +23,12 @@ FIGURES = {  # in the order of columns
     "RPE 1 frame mm": Column(2),
     "RPE 1 s mm": Column(2),
     "RPE 1 s deg": Column(3),
-    "ok %": Column(1, more=True),
+    "ok %": Column(1, more=True, of_frames=False),
     "axes deg": Column(3),
     "rotation deg": Column(3),
     "translation mm": Column(2),
-    "values %": Column(1, more=True),
-    "ms": Column(2),
+    "values %": Column(1, more=True, of_frames=False),
+    "ms": Column(2, of_frames=False),
 }
 
 

@@ -16,8 +16,8 @@ from trihedron.tools import other_programs
 from trihedron.tools.comparison_table import FIGURES
 from trihedron.tools.verdicts import Column, Sample
 
-COLUMNS = {name: Column(figure.decimals, figure.more) for name, figure in FIGURES.items()}
 ERRORS = {"ATE mm": "ate_rmse_m", "RPE 1 s mm": "rpe_second_rmse_m", "RPE 1 s deg": "rpe_second_rmse_deg"}  # column -> name in the metrics
+COLUMNS = {name: Column(figure.decimals, figure.more, name in ERRORS) for name, figure in FIGURES.items()}
 
 
 def paired_samples(first: Path, second: Path, figures: tuple[Mapping[str, float], Mapping[str, float]]) -> tuple[Sample, Sample]:

@@ -26,17 +26,18 @@ NO_INTERVAL = "one recording, no interval"
 EQUAL = "equal"
 VERDICTS = "Verdicts"  # the title of the lines, and the note below them
 NOTE = (
-    "of the second against the first; of one recording by its frames (moving-block bootstrap), of several by their differences (Student's t); "
-    "corrected by Holm over the pairs of a figure; d: difference by its standard deviation from segment to segment, or recording to recording"
+    "the second against the first; 95 % interval from the frames of one recording (moving-block bootstrap), or over several (Student's t);\n"
+    "answers by Holm over all pairs of a figure; d: the difference by its standard deviation from segment to segment, or recording to recording"
 )
 
 
 @dataclass(frozen=True)
 class Column:
-    """A figure's decimals, and whether more of it is better."""
+    """A figure's decimals, whether more of it is better, and whether it is a root mean square over frames."""
 
     decimals: int
     more: bool = False
+    of_frames: bool = True
 
 
 @dataclass(frozen=True)
@@ -82,8 +83,10 @@ class Verdict:
 
 
 def verdicts_of(comparisons: Mapping[tuple[str, str], Pairs], columns: Mapping[str, Column]) -> list[Verdict]:
-    """Return the verdicts of each pair of alternatives (first, second) in each column that both have, in this order."""
-    found = [one for names, pairs in comparisons.items() for column in columns if (one := _difference(names, column, pairs)) is not None]
+    """Return the verdicts of each pair of alternatives (first, second) in each column that both have, in this order. Of one recording there are none
+    in a figure that is not of frames."""
+    differences = [_difference(names, column, pairs) for names, pairs in comparisons.items() for column in columns]
+    found = [one for one in differences if one is not None and (one.recordings > 1 or columns[one.figure].of_frames)]
     corrected: dict[int, tuple[float, int]] = {}
     for column in columns:
         tested = [(number, one.p) for number, one in enumerate(found) if one.figure == column and one.p is not None]
@@ -141,7 +144,7 @@ def _answered(one: Verdict, column: Column, corrected: float | None, tests: int)
     """Add the words; `tests` is the number of comparisons that the correction is for."""
     if corrected is None or one.error is None:
         return replace(one, answer=NO_INTERVAL if one.block_frames is None else TOO_SHORT)
-    if one.error == 0.0 and one.difference == 0.0:
+    if not any(float(_signed(value, column)) for value in (one.low, one.high) if value is not None):  # zero to the digits shown
         return replace(one, corrected=corrected, answer=EQUAL)
     if corrected < LEVEL:
         return replace(one, corrected=corrected, answer="better" if (one.difference > 0.0) == column.more else "worse")

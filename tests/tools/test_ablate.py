@@ -15,8 +15,21 @@ from trihedron.pipeline.core.types import Camera, Keypoints, Map, Planes, Pose, 
 from trihedron.pipeline.record.reader import Recording
 from trihedron.plugins.translation.levenberg_marquardt import LevenbergMarquardt
 from trihedron.tools.ablation_differences import Parting, StageErrors, distance
+from trihedron.tools.ablation_errors import read_errors, write_errors
 from trihedron.tools.ablation_swaps import combinations_of, folder_name, parsed
-from trihedron.tools.ablation_tables import Case, Variant, attribution, case_from_dict, case_to_dict, comparisons, sections_of, verdict
+from trihedron.tools.ablation_tables import (
+    Case,
+    Variant,
+    as_json,
+    as_markdown,
+    as_text,
+    attribution,
+    case_from_dict,
+    case_to_dict,
+    lines_of,
+    sections_of,
+    verdicts,
+)
 from trihedron.tools.site_ablations import ablations_of
 
 SMALL = ["dataset.width=320", "dataset.height=240", "threads=1"]
@@ -45,20 +58,49 @@ def test_attribution_has_an_interval_over_recordings():
     assert found["rotation"]["mean"] == pytest.approx((1.5 + 0.75) / 2) and found["manhattan"]["mean"] == pytest.approx((2.5 + 3.25) / 2)
     assert found[""]["mean"] == pytest.approx(4.0) and found[""]["half"] == pytest.approx(0.0)
     assert found["rotation"]["half"] == pytest.approx(12.7062 * 0.375, rel=1e-4)
-    assert [section.title.split(",")[0] for section in sections_of(cases)][1:3] == [
-        "Differences from the recorded configuration",
-        "Attribution: Shapley value of each swap",
-    ]
+    assert sections_of(cases)[1].title == "Attribution: Shapley value of each swap"
 
 
-def test_a_difference_is_shown_or_not():
+def test_every_pair_of_alternatives_has_a_verdict():
     rng = np.random.default_rng(0)
     cases = [case(k, [1.0, 1.0 + noise, 3.0 + noise, 3.0]) for k, noise in enumerate(rng.normal(0.0, 0.2, 6))]
-    found = {(label, one.figure): one for label, one in comparisons(cases)}
-    assert verdict(found["manhattan=other", "ATE mm"]) == "worse" and verdict(found["rotation=other", "ATE mm"]) == "no difference shown"
-    assert verdict(found["rotation=other", "ms"]) == "equal"
-    assert found["rotation=other", "ATE mm"].needed > 6 and found["manhattan=other", "ATE mm"].needed < 6
-    assert all(one.corrected >= one.p for one in found.values())
+    found = verdicts(cases)
+    both = "manhattan=other rotation=other"
+    assert [(one.first, one.second) for one in found if one.figure == "ms"] == [
+        ("as recorded", "rotation=other"),
+        ("as recorded", "manhattan=other"),
+        ("as recorded", both),
+        ("rotation=other", "manhattan=other"),
+        ("rotation=other", both),
+        ("manhattan=other", both),
+    ]
+    answers = {(one.first, one.second): one.answer for one in found if one.figure == "ATE mm"}
+    assert answers["as recorded", "manhattan=other"] == "worse" and answers["rotation=other", "manhattan=other"] == "worse"
+    assert answers["as recorded", "rotation=other"].startswith("no difference shown; ")
+    assert {one.answer for one in found if one.figure == "ms"} == {"equal"}
+
+
+def test_verdicts_are_first_in_text_and_markdown():
+    cases = [case(number, [3.0, 1.0, 5.0, 3.0]) for number in (0, 1)]
+    found, sections = verdicts(cases), sections_of(cases)
+    lines = lines_of(found)
+    assert lines[0] == "as recorded against rotation=other: ATE 3.00 -> 1.00 mm, -2.00 (95 %: -2.00 to -2.00): better"
+    assert as_text(lines, sections).startswith(f"Verdicts\n{lines[0]}\n{lines[1]}\n")
+    assert as_markdown(lines, sections).startswith(f"## Verdicts\n\n- {lines[0]}\n- {lines[1]}\n")
+    written = json.loads(json.dumps(as_json(cases, found, sections)))["verdicts"]
+    assert [one["text"] for one in written] == lines and written[0]["difference"] == -2.0 and written[0]["answer"] == "better"
+
+
+def test_errors_of_frames_are_kept_beside(tmp_path):
+    errors = [{"ATE mm": np.array([1.0, np.nan])}, {}, {"axes deg": np.array([0.5])}]
+    write_errors(tmp_path / "errors.npz", errors)
+    found = read_errors(tmp_path / "errors.npz", 3)
+    assert [list(one) for one in found] == [["ATE mm"], [], ["axes deg"]]
+    np.testing.assert_array_equal(found[0]["ATE mm"], errors[0]["ATE mm"])
+    (tmp_path / "errors.npz").write_bytes(b"PK\x03\x04 cut off")
+    assert read_errors(tmp_path / "errors.npz", 3) is None and read_errors(tmp_path / "nowhere.npz", 3) is None
+    with pytest.raises(DataError, match="cannot be written"):
+        write_errors(tmp_path / "nowhere" / "errors.npz", errors)
 
 
 def test_bars_of_the_pages_of_results(tmp_path):
@@ -91,6 +133,7 @@ def test_errors_of_a_stage_alone():
     for index in range(4):
         errors.take(["translation"], {"translation": translation(index, 0.003) if index else None})
     assert errors.figures()["translation mm"] == pytest.approx(3.0) and errors.figures()["values %"] == 75.0
+    assert np.isnan(errors.of_frames()["translation mm"][0]) and errors.of_frames()["translation mm"][1:] == pytest.approx([3.0] * 3)
     assert np.isnan(errors.figures()["axes deg"]) and distance(translation(0, 0.0), None) is None
 
 
@@ -150,8 +193,11 @@ def test_a_wrong_sign_in_translation_is_attributed_to_translation(tmp_path, caps
     assert (mutated["parting"]["topic"], mutated["parting"]["field"]) == ("translation", "t_world_camera")
     assert Path(mutated["picture"]).stat().st_size > 10_000
     before = {path: path.stat().st_mtime_ns for path in (tmp_path / "ablation").rglob("*") if path.name != "ablation.json"}
+    assert found["verdicts"][0]["text"].endswith(": too short to tell") and found["verdicts"][0]["figure"] == "ATE mm"
+    first = capsys.readouterr().out
     assert main(command) == 0
-    assert "done already" in capsys.readouterr().err
+    again = capsys.readouterr()
+    assert "done already" in again.err and again.out == first
     assert before == {path: path.stat().st_mtime_ns for path in (tmp_path / "ablation").rglob("*") if path.name != "ablation.json"}
 
 
@@ -192,5 +238,5 @@ def test_several_recordings_from_python(tmp_path):
     runs = [th.run("dataset.length=8", *SMALL, f"dataset.seed={seed}", out=tmp_path / f"seed{seed}", quiet=True) for seed in (0, 1, 2)]
     found = th.ablate(runs, "bundle=none", out=tmp_path / "ablation")
     assert sorted(path.name for path in found.folders["bundle=none"]) == [f"seed{seed},bundle=none" for seed in (0, 1, 2)]
-    assert {one["change"] for one in found.figures["comparisons"]} == {"bundle=none"}
-    assert "Paired over 3 recordings" in str(found) and len(found.tables["Differences from the recorded configuration"]) == 4
+    assert {(one["first"], one["second"]) for one in found.figures["verdicts"]} == {("as recorded", "bundle=none")}
+    assert found.verdicts[0].startswith("as recorded against bundle=none: ATE ") and str(found).startswith(f"Verdicts\n{found.verdicts[0]}\n")
