@@ -221,7 +221,7 @@ def verdicts_against(runs: Sequence[Run], baseline: str) -> list[str]:
     for (data, change), same in groups.items():
         for run, base in _pairs(same, groups.get((data, baseline), [])) if change != baseline else []:
             samples = paired_samples(base.folder, run.folder, (base.figures, run.figures))
-            pairs.setdefault((baseline, change), []).append(samples)
+            pairs.setdefault((baseline, change or "-"), []).append(samples)
     return [line_of(one, COLUMNS[one.figure]) for one in verdicts_of(pairs, COLUMNS)]
 
 

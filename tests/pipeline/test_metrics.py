@@ -10,7 +10,7 @@ from trihedron.pipeline.core.geometry import pose_matrix
 from trihedron.pipeline.core.lie import exp_se3, exp_so3
 from trihedron.pipeline.core.types import Trajectory
 from trihedron.pipeline.record.trajectories import read_trajectory
-from trihedron.pipeline.run.metrics import associate, evaluate_trajectory
+from trihedron.pipeline.run.metrics import associate, evaluate_trajectory, frame_errors
 
 SHARED = Path(__file__).resolve().parents[2].parent / "shared" / "data"
 MS = 1_000_000
@@ -228,3 +228,16 @@ def test_too_few_poses_with_truth():
     with pytest.raises(DataError) as error:
         evaluate_trajectory(part(truth, [0, 1]), truth)
     assert str(error.value) == "trajectory: has 2 poses; an evaluation needs at least 3"
+
+
+def test_the_errors_of_frames_have_the_root_mean_squares_of_the_metrics():
+    truth = walk(80)
+    estimate = part(noisy(truth), np.r_[0:20, 23:70])
+    metrics = evaluate_trajectory(estimate, truth, 30.0, truth.stamps_ns).to_dict()
+    errors = frame_errors(estimate, truth, 30.0, truth.stamps_ns)
+    assert sorted(errors) == ["ate_rmse_m", "rpe_frame_rmse_deg", "rpe_frame_rmse_m", "rpe_second_rmse_deg", "rpe_second_rmse_m"]
+    for name, values in errors.items():
+        assert values.shape == (80,) and np.sqrt(np.nanmean(values**2)) == pytest.approx(metrics[name], rel=1e-12), name
+    assert np.flatnonzero(np.isnan(errors["ate_rmse_m"])).tolist() == [20, 21, 22, *range(70, 80)]
+    assert np.flatnonzero(np.isnan(errors["rpe_frame_rmse_m"])).tolist() == [19, 20, 21, 22, *range(69, 80)]  # the first frame of a pair
+    assert frame_errors(part(estimate, np.r_[0:2]), truth, 30.0, truth.stamps_ns) == {}

@@ -12,8 +12,12 @@ import trihedron.conf
 from trihedron.pipeline.app.cli import main
 from trihedron.pipeline.core.config import graph_of, register_configs
 from trihedron.pipeline.core.errors import UsageError
+from trihedron.pipeline.core.geometry import pose_matrix
 from trihedron.pipeline.core.registry import load_plugins
-from trihedron.tools.compare import read_runs, rows_of
+from trihedron.pipeline.core.types import Trajectory
+from trihedron.pipeline.record.trajectories import write_trajectory
+from trihedron.tools import other_programs
+from trihedron.tools.compare import read_runs, rows_of, verdicts_against
 from trihedron.tools.comparison_table import WRITERS, as_latex, as_markdown, as_text
 
 GRAPHS = Path(trihedron.conf.__file__).parent / "graph"
@@ -70,6 +74,38 @@ def test_differences_are_paired_and_have_an_interval(tmp_path):
     assert rows[1]["difference"] == {} and rows[2]["difference"]["ATE mm"]["low"] is None
     with pytest.raises(UsageError, match="did you mean 'graph=points'"):
         rows_of(written(tmp_path / "again"), baseline="graph=point")
+
+
+def test_verdicts_of_runs_are_paired_and_first(tmp_path, capsys):
+    for i, (graph, seed, ate) in enumerate([("points", s, 4.0) for s in range(4)] + [("structural", s, 2.0 + 0.1 * s) for s in range(4)]):
+        write_run(tmp_path / str(i), [f"graph={graph}", f"seed={seed}"], 1e-3 * ate, p50=10.0 + seed)
+    assert main(["compare", str(tmp_path), "--baseline", "graph=points"]) == 0
+    said = capsys.readouterr().out
+    verdicts, _, table = said.partition("\n\n")
+    assert verdicts.splitlines()[:3] == [
+        "Verdicts",
+        "graph=points against structural: tracked 100.0 -> 100.0 %, 0.0 (95 %: 0.0 to 0.0): equal",
+        "graph=points against structural: ATE 4.00 -> 2.15 mm, -1.85 (95 %: -2.06 to -1.64), d -14.3: better",
+    ]
+    assert table.startswith("change ")
+    assert main(["compare", str(tmp_path)]) == 0
+    assert "Verdicts" not in capsys.readouterr().out
+
+
+def test_two_runs_are_compared_by_the_errors_of_their_frames(tmp_path, monkeypatch):
+    rng, stamps = np.random.default_rng(0), np.arange(300, dtype=np.int64) * 33_333_333
+    truth = Trajectory(stamps, np.array([pose_matrix(np.eye(3), position) for position in np.cumsum(rng.normal(size=(300, 3)), axis=0)]))
+    monkeypatch.setattr(other_programs, "references", lambda folders: [other_programs.Reference(folders[0][0], {}, stamps, truth, 30.0)])
+    for name, sigma_m in (("points", 0.002), ("structural", 0.004)):
+        write_run(tmp_path / name, [f"graph={name}"], 1.0)
+        poses = truth.poses.copy()
+        poses[:, :3, 3] += rng.normal(0.0, sigma_m, (300, 3))
+        write_trajectory(tmp_path / name / "trajectory.txt", Trajectory(stamps, poses))
+    lines = verdicts_against(read_runs(tmp_path), "graph=points")
+    assert [line.partition(": ")[2].split()[0] for line in lines] == ["ATE", "RPE", "RPE"]
+    assert lines[0].startswith("graph=points against structural: ATE 3.50 -> 6.88 mm, +3.39 (95 %: ") and lines[0].endswith(": worse")
+    (tmp_path / "points" / "trajectory.txt").unlink()
+    assert verdicts_against(read_runs(tmp_path), "graph=points")[0].endswith("ATE 1000.00 -> 1000.00 mm, 0.00: one recording, no interval")
 
 
 def test_the_best_is_bold_and_an_error_over_few_frames_is_not(tmp_path):
