@@ -2,7 +2,8 @@
 
 Figures that are root mean squares over frames are compared on the frames that both alternatives have an error of. Of one recording their difference
 has an interval by the moving-block bootstrap. Of several recordings each is one difference, and the interval of their mean is Student's t: what
-varies between stretches of a recording varies between recordings too, and drawing blocks within them besides would count it twice.
+varies between stretches of a recording varies between recordings too, and drawing blocks within them besides would count it twice (such intervals,
+of five simulated recordings, cover in 99 to 100 % instead of 95).
 
 P-values are corrected by Holm over all pairs of alternatives that are compared in the same figure: in a figure in which nothing differs, the chance
 of any "better" or "worse" is 5 %. Figures are not corrected for one another.
@@ -122,7 +123,8 @@ def _figures(column: str, a: Sample, b: Sample) -> tuple[float, float]:
     both = np.isfinite(a.errors[column]) & np.isfinite(b.errors[column])
     if not both.any():
         return np.nan, np.nan
-    return tuple(float(np.sqrt(np.mean(np.square(one.errors[column][both])))) for one in (a, b))
+    before, after = (float(np.sqrt(np.mean(np.square(one.errors[column][both])))) for one in (a, b))
+    return before, after
 
 
 def _with_interval(one: Verdict, error: float) -> Verdict:
