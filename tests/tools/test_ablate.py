@@ -178,6 +178,7 @@ class WrongSign:
 @pytest.mark.slow
 @pytest.mark.timeout(900)
 def test_a_wrong_sign_in_translation_is_attributed_to_translation(tmp_path, capsys, monkeypatch):
+    registry.load_plugins()  # before the copy, which is discarded with all that is registered in it
     monkeypatch.setattr(registry, "_PLUGINS", {slot: dict(plugins) for slot, plugins in registry._PLUGINS.items()})
     registry.register("translation", "wrong_sign")(WrongSign)
     assert main(["run", "graph=structural_no_refine", "dataset.length=14", *SMALL, f"out={tmp_path}/run"]) == 0
