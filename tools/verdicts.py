@@ -43,7 +43,7 @@ class Column:
 
 @dataclass(frozen=True)
 class Sample:
-    """What an alternative did on one recording: figures by column, and of those that are root mean squares over frames the error (n,) of each, NaN
+    """Outcome of an alternative on one recording: figures by column, and of those that are root mean squares over frames the error (n,) of each, NaN
     where it has none, in the figure's unit. `second` is the number of frames in one second, which a block has at least."""
 
     figures: Mapping[str, float]
