@@ -7,11 +7,12 @@ from dataclasses import dataclass
 from typing import Any
 
 from trihedron.pipeline.core.errors import GraphError, did_you_mean
-from trihedron.pipeline.core.registry import parameters_of_method
+from trihedron.pipeline.core.registry import name_of, parameters_of_method
 from trihedron.pipeline.core.slots import CAMERA, FOLDS, RNG, SLOTS, accepts_none, default_wires, inputs_of, output_of, strip_none
 from trihedron.pipeline.core.types import Frame
 from trihedron.pipeline.core.wires import Wire, parse_wire
 
+NOTHING = "none"  # name of the plugins that leave a slot's topic empty
 TRAJECTORY = "trajectory"  # the output made of the topics `pose` and `map`
 
 
@@ -57,7 +58,7 @@ def build_graph(plugins: Mapping[str, Any], outputs: Iterable[str], wiring: Mapp
     and retain the stages that `outputs` need. An optional input whose default topic no stage writes is None.
 
     Raises GraphError, one line each: a stage without plugin, an unknown input or topic, a missing wire, a type that does not fit, a delayed wire
-    into an input that cannot be None, a cycle within one frame, an unknown output."""
+    into an input that cannot be None, an input of the plugin's `needs` that nothing writes, a cycle within one frame, an unknown output."""
     wiring = wiring or {}
     names = [*plugins, *(name for name in wiring if name not in plugins)]
     stages = {name: _stage(name, wiring.get(name) or {}, plugins) for name in names}
@@ -97,6 +98,12 @@ def _stage(name: str, wires: Mapping[str, str | None], plugins: Mapping[str, Any
         else:
             cause = f"the input is not wired, and {type(plugin).__name__} takes it"
             raise GraphError(f"{place}.{parameter}", cause, f"give graph.{name}.{parameter}=TOPIC")
+    for parameter in getattr(plugin, "needs", ()):
+        topic = inputs.get(parameter, defaults[parameter]).topic
+        missing = "it is not wired" if parameter in absent else f"{topic}={NOTHING} writes nothing"
+        if parameter in absent or name_of(topic, plugins.get(topic)) == NOTHING:
+            cause = f"{name}={name_of(name, plugin)} needs it, and {missing}"
+            raise GraphError(f"{place}.{parameter}", cause, f"choose another plugin for {topic}, or for {name}")
     required = frozenset(p for p in inputs if p == CAMERA or not accepts_none(given[p]))
     return Stage(name, plugin, inputs, required, frozenset(absent), RNG in taken)
 

@@ -120,6 +120,11 @@ def plugins_of(slot: str) -> dict[str, type[Any]]:
     return dict(sorted(_PLUGINS[slot].items()))
 
 
+def name_of(slot: str, plugin: Any) -> str:
+    """Return the name under which the class of a plugin is registered; that of the class where it is not."""
+    return next((name for name, kind in _PLUGINS[slot].items() if kind is type(plugin)), type(plugin).__name__)
+
+
 def options_of(plugin: type[Any]) -> list[dataclasses.Field[Any]]:
     """Return the configuration fields of a plugin."""
     return list(dataclasses.fields(plugin))

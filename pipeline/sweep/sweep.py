@@ -217,7 +217,8 @@ def words_of_sequence(text: str) -> Overrides:
 
 def words_of_alternatives(texts: Sequence[str]) -> list[Overrides]:
     """Turn texts into lists of overrides, each of which is tried with nothing else changed: words with blanks between them, or the name of a slot,
-    which stands for each of its other plugins, `none` and those that need a file apart. The first list is empty: the configuration as it is."""
+    which stands for each of its other plugins, but for `none` and those that need a file or another stage. The first list is empty: the configuration
+    as it is."""
     found: list[Overrides] = [[]] if texts else []
     for text in texts:
         slot, *rest = text.split()
@@ -226,7 +227,9 @@ def words_of_alternatives(texts: Sequence[str]) -> list[Overrides]:
             continue
         load_plugins()
         names = [
-            name for name, plugin in plugins_of(slot).items() if name != "none" and not any(option.name == "model" for option in options_of(plugin))
+            name
+            for name, plugin in plugins_of(slot).items()
+            if name != "none" and not hasattr(plugin, "needs") and not any(option.name == "model" for option in options_of(plugin))
         ]
         found += [[f"{slot}={name}", *with_literal_paths(rest)] for name in names]
     return found

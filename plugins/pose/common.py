@@ -166,9 +166,9 @@ def dense_pose(frame: Frame, previous: Pose, T: F64, found: Alignment, min_share
     held, lost = len(found.unobservable), previous.status == LOST
     agreement = f"{found.share:.0%} {of_what} agree"
     if lost and not ends_loss:
-        return _lost(frame, previous, "the motion since the pose was lost is not known")
+        return lost_pose(frame, previous, "the motion since the pose was lost is not known")
     if found.share < min_share or held == 3 or (lost and held):
-        return _lost(frame, previous, f"only {agreement}" if found.share < min_share else "no direction of motion is observable")
+        return lost_pose(frame, previous, f"only {agreement}" if found.share < min_share else "no direction of motion is observable")
     inverse = matmul(
         invert(T)[:3, :3], previous.T_world_camera[:3, :3]
     )  # xi of the target's frame in this camera's: the motion between them is small
@@ -181,5 +181,6 @@ def dense_pose(frame: Frame, previous: Pose, T: F64, found: Alignment, min_share
     return Decoupled(T, covariance, counted, held, status, reason).to_pose(frame, None)
 
 
-def _lost(frame: Frame, previous: Pose, reason: str) -> Pose:
+def lost_pose(frame: Frame, previous: Pose, reason: str) -> Pose:
+    """The previous pose, lost."""
     return Decoupled(previous.T_world_camera, LOST_SIGMA**2 * np.eye(6), NONE, 3, LOST, reason).to_pose(frame, None)

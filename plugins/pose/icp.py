@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Annotated
+from typing import Annotated, ClassVar
 
 import numpy as np
 
@@ -12,7 +12,7 @@ from trihedron.pipeline.core.linalg import matmul
 from trihedron.pipeline.core.options import AcuteDeg, NonNegativeFloat, PositiveFloat, PositiveInt, Range, Share
 from trihedron.pipeline.core.registry import register
 from trihedron.pipeline.core.types import F64, Frame, Pose, PredictedView
-from trihedron.plugins.pose.common import Gates, align, dense_pose, first_pose, huber_weights, source_of, target_of
+from trihedron.plugins.pose.common import Gates, align, dense_pose, first_pose, huber_weights, lost_pose, source_of, target_of
 from trihedron.plugins.pose.common_kernels import Source, Target
 from trihedron.plugins.shared.image_reduction import Level, brightness, halvings, pyramid, reduced_intrinsics
 from trihedron.plugins.shared.image_reduction_kernels import depth_normals, smoothed
@@ -25,6 +25,8 @@ class Icp:
     brightness of the predicted view as well (Whelan et al., RSS 2015).
 
     It starts at the previous pose. The model is its map, so a lost camera that returns to where it was lost is relocalised, by a stricter test."""
+
+    needs: ClassVar[tuple[str, ...]] = ("model",)  # though there is none in the first frame
 
     photometric: NonNegativeFloat = 0.0  # weight of brightness besides its noise; 0 = depth alone, colour is not used
     levels: PositiveInt = 3
@@ -39,9 +41,11 @@ class Icp:
     min_share: Share = 0.3  # of the pixels that must fall on the model and agree
 
     def __call__(self, frame: Frame, previous: Pose | None, model: PredictedView | None) -> Pose:
-        """Return the pose with status and reason; the identity for the first frame."""
-        if previous is None or model is None:
+        """Return the pose with status and reason; the identity for the first frame; lost, and held at the previous pose, where there is no view."""
+        if previous is None:
             return first_pose(frame)
+        if model is None:
+            return lost_pose(frame, previous, "there is no view of a model")
         gap = max(frame.index - previous.index, 1)
         prior = np.repeat([(self.motion_sigma_m * gap) ** -2, (np.radians(self.motion_sigma_deg) * gap) ** -2], 3)
         start = matmul(invert(model.T_world_camera), previous.T_world_camera)

@@ -4,6 +4,8 @@ from dataclasses import dataclass
 
 import pytest
 
+from trihedron.pipeline.core import registry
+from trihedron.pipeline.core.config import composed, graph_of
 from trihedron.pipeline.core.errors import GraphError
 from trihedron.pipeline.core.graph import build_graph
 from trihedron.pipeline.core.slots import SLOTS, accepts_none, default_wires, inputs_of, output_of, strip_none
@@ -46,6 +48,33 @@ def message(outputs=("manhattan",), plugins=PLUGINS, **wiring):
 
 def wires(graph, stage):
     return {parameter: str(wire) for parameter, wire in graph.stages[stage].inputs.items()}
+
+
+@dataclass(frozen=True)
+class Needy:
+    needs = ("normals",)
+
+    def __call__(self, normals: Normals | None, previous: ManhattanFrame | None) -> ManhattanFrame | None: ...
+
+
+def test_an_input_that_a_plugin_needs_is_written(monkeypatch):
+    """Though it may be None in a frame."""
+    plugins = {**PLUGINS, "manhattan": Needy()}
+    assert "manhattan" in build_graph(plugins, ("manhattan",)).stages
+    monkeypatch.setitem(registry._PLUGINS, "normals", {"none": NormalsStub})
+    assert message(plugins=plugins) == (
+        "graph.manhattan.normals: manhattan=Needy needs it, and normals=none writes nothing; choose another plugin for normals, or for manhattan"
+    )
+
+
+def test_icp_without_a_model_is_refused():
+    """It would hold the first pose, and call it tracked."""
+    with pytest.raises(GraphError) as error:
+        graph_of(composed(["pose=icp"]))
+    assert str(error.value) == "graph.pose.model: pose=icp needs it, and model=none writes nothing; choose another plugin for model, or for pose"
+    with pytest.raises(GraphError, match="pose=icp needs it, and it is not wired; choose another plugin for model, or for pose"):
+        graph_of(composed(["pose=icp", "model=tsdf", "~graph.pose.model"]))
+    assert "model" in graph_of(composed(["pose=icp", "model=tsdf"])).stages
 
 
 def test_an_input_reads_the_topic_of_its_name_unless_the_slot_declares_another():

@@ -120,6 +120,8 @@ def test_icp_is_lost_where_nothing_can_be_aligned():
         found = Icp()(frame, view(2, T)[1], model)
         assert found.status == "lost" and "of the pixels and the model agree" in found.reason
         assert np.array_equal(found.T_world_camera, T)
+    unseen = Icp()(view(3, T)[0], view(2, T)[1], None)
+    assert (unseen.status, unseen.reason) == ("lost", "there is no view of a model") and np.array_equal(unseen.T_world_camera, T)
 
 
 @pytest.mark.parametrize("name", MODELS)
