@@ -136,7 +136,7 @@ def test_a_sweep_goes_on_where_it_was_stopped(tmp_path, capfd):
     assert "texture=False" in (tmp_path / "1" / ".hydra" / "overrides.yaml").read_text()
     assert "threads: 1" in (tmp_path / "1" / ".hydra" / "config.yaml").read_text()
     (tmp_path / "0" / "job.json").write_text(json.dumps({"key": "", "state": "running", "error": ""}))  # as one that was killed leaves it
-    more = [*words[:-1], "seed=0,9:0", "hydra/launcher=basic"]
+    more = [*words[:-1], "seed=0,9:0"]
     assert main(more) == 1
     said = capfd.readouterr().err
     assert "sweep: 1 of 4 jobs are done already" in said and "2 of 4 jobs failed" in said
