@@ -18,6 +18,7 @@ REPORTED = {  # lines that a tutorial's commands must print
     "first-run": ("frames: 60 ok", "Keypoints", "manhattan"),
     "own-recording": ("frames: 40 ok",),
     "swap-and-compare": ("* mean_shift", "branch_and_bound", "did you mean 'normals'"),
+    "which-estimator": ("as recorded against manhattan=plane_svd: axes", "false axes %", "differs.png", "mean of 3 recordings"),
     "write-a-plugin": ("all is well", "ok"),
     "from-python": ("triangles", "planes in the last frame", "40 frames compared"),
     "watch-it-live": ("ws://localhost:8765", "/manhattan"),

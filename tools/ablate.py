@@ -37,11 +37,12 @@ from trihedron.pipeline.record.trajectories import attached_truth
 from trihedron.pipeline.run.result_files import read_results
 from trihedron.pipeline.sweep.jobs import key_of
 from trihedron.tools import ablation_tables as tables
-from trihedron.tools.ablation_differences import Parting, RecordedValues, StageErrors, truth_of
+from trihedron.tools.ablation_differences import Parting, RecordedValues, StageErrors, reference_of
 from trihedron.tools.ablation_errors import of_trajectory, read_errors, write_errors
 from trihedron.tools.ablation_swaps import Combination, combinations_of, folder_name, parsed, without_repeats
-from trihedron.tools.ablation_tables import Case, Variant
+from trihedron.tools.ablation_tables import NEES, Case, Variant
 from trihedron.tools.arguments import Parser
+from trihedron.tools.benchmarks.method_tables import nees_of
 
 RESULT = "ablation.json"
 PICTURE = "differs.png"
@@ -174,8 +175,8 @@ def _computed(computing: Alternatives, combinations: Sequence[Combination], fold
     """Compute all alternatives of a recording."""
     recording, graphs = computing.recording, [alternative.graph for alternative in computing.alternatives]
     topics = [name for name in graphs[0].stages if name in computing.stages]
-    truth = truth_of(recording)
-    errors, partings = [StageErrors(truth) for _ in folders], [Parting() for _ in folders]
+    known, true = reference_of(recording)
+    errors, partings = [StageErrors(known) for _ in folders], [Parting() for _ in folders]
     recorded = RecordedValues(recording, topics)
 
     def on_frame(index: int, values: Sequence[Mapping[str, Any]]) -> None:
@@ -206,6 +207,7 @@ def _computed(computing: Alternatives, combinations: Sequence[Combination], fold
         variants,
         recorded.parting,
         fps=computing.runners[0].result.fps,
+        true=true,
     )
     if case.changed.frame is not None:
         changed = f"{case.changed.topic}.{case.changed.field} from frame {case.changed.frame} on"
@@ -219,6 +221,8 @@ def _figures(outcome: Outcome, errors: StageErrors, feedback: Feedback) -> dict[
     figures = _errors(final)
     if status:
         figures["ok %"] = 100.0 * status["ok"] / max(1, outcome.metrics["frames"])
+    if (nees := nees_of(outcome.metrics)) is not None:
+        figures[NEES] = nees
     return {**figures, **(errors.figures() if feedback is Feedback.recorded else {}), "ms": outcome.stage_ms}
 
 

@@ -11,14 +11,17 @@ import numpy as np
 
 from trihedron.pipeline.core.errors import DataError
 from trihedron.pipeline.core.geometry import nearest_rotation
-from trihedron.pipeline.core.types import F64, ManhattanFrame, Pose, Rotation, Translation, Value
+from trihedron.pipeline.core.types import F64, LOST, ManhattanFrame, Pose, Rotation, Translation, Value
 from trihedron.pipeline.record.reader import Recording, TopicReader
 from trihedron.pipeline.run.metrics import rotation_angles_deg
+from trihedron.pipeline.run.replay import RECORDED
 from trihedron.tools.diff import differing
 from trihedron.tools.error_budget import true_poses
+from trihedron.tools.stage_measures import COLUMNS, Seen, measured
 
 MEASURED = ("pose", "translation", "rotation", "manhattan")  # topics with a distance of two values; the first that is there finds the worst
-OPEN_LOOP = ("axes deg", "rotation deg", "translation mm")  # columns of the errors of single stages
+OPEN_LOOP = ("axes deg", "rotation deg", "translation mm", *COLUMNS)  # columns of the errors of single stages
+FALSE_DEG = 5.0  # of a Manhattan frame from the others: a false one
 CUBE = [
     sign * np.eye(3)[list(order)].T
     for order in permutations(range(3))
@@ -96,58 +99,81 @@ def _angle_deg(R: F64) -> float:
 class StageErrors:
     """Errors of the values of single stages against the true poses, frame by frame, and the share of frames with a value, of one alternative."""
 
-    truth: Mapping[int, F64]  # true pose (4, 4) by frame stamp
+    truth: Mapping[int, F64]  # true pose (4, 4) by frame stamp, or that of the recorded run
     rotations_deg: dict[int, float] = field(default_factory=dict)  # by the number of the frame
     translations_m: dict[int, float] = field(default_factory=dict)
     axes: dict[int, F64] = field(default_factory=dict)  # R_world_manhattan by the true rotation: constant, were the axes right
+    measures: dict[str, dict[int, float]] = field(default_factory=dict)  # of `stage_measures`: column -> error by the number of the frame
     frames: int = 0
     seen: int = 0
     present: int = 0
+    _before: Seen | None = None
+    _map: Any = None  # before this frame
 
     def take(self, topics: Iterable[str], values: Mapping[str, Any]) -> None:
         """Add a frame."""
+        now: Seen | None = None
         for topic in topics:
             value = values.get(topic)
             self.seen, self.present = self.seen + 1, self.present + isinstance(value, Value)
             if not isinstance(value, Value) or (T := self.truth.get(value.stamp_ns)) is None:
                 continue
+            now = Seen({**values, "map": self._map}, T)
+            for column, error in measured(topic, now, self._before).items():
+                self.measures.setdefault(column, {})[self.frames] = error
             if isinstance(value, Rotation):
                 self.rotations_deg[self.frames] = _angle_deg(T[:3, :3].T @ value.R_world_camera)
             elif isinstance(value, Translation) and value.estimated:
                 self.translations_m[self.frames] = float(np.linalg.norm(T[:3, 3] - value.t_world_camera))
             elif isinstance(value, ManhattanFrame) and value.supported and len(value.rotations):
                 self.axes[self.frames] = T[:3, :3] @ value.rotations[0]
-        self.frames += 1
+        self._before, self.frames = now, self.frames + 1
+        self._map = values.get(RECORDED + "map") or self._map
 
     def of_frames(self) -> dict[str, F64]:
         """Return each kind of error there is as an array (frames,), NaN where a frame has none."""
         deviations = dict(zip(self.axes, _deviations_deg(list(self.axes.values()))))
         distances = {frame: 1e3 * metres for frame, metres in self.translations_m.items()}
-        errors = {"axes deg": deviations, "rotation deg": self.rotations_deg, "translation mm": distances}
+        errors = {"axes deg": deviations, "rotation deg": self.rotations_deg, "translation mm": distances, **self.measures}
         return {name: np.array([values.get(frame, np.nan) for frame in range(self.frames)]) for name, values in errors.items() if values}
 
     def figures(self) -> dict[str, float]:
         """Return the root mean square of each kind of error, NaN where there is none."""
         errors = self.of_frames()
         found = {name: float(np.sqrt(np.nanmean(np.square(errors[name])))) if name in errors else np.nan for name in OPEN_LOOP}
-        return {**found, "values %": 100.0 * self.present / self.seen if self.seen else np.nan}
+        false = 100.0 * float(np.mean(_from_most_deg(list(self.axes.values())) > FALSE_DEG)) if self.axes else np.nan
+        return {**found, "false axes %": false, "values %": 100.0 * self.present / self.seen if self.seen else np.nan}
 
 
 def _deviations_deg(axes: Sequence[F64]) -> list[float]:
     """Angles of rotations from their mean, each after the exchange of axes that brings it nearest to the first."""
     if not axes:
         return []
-    alike = [min((R @ turn for turn in CUBE), key=lambda turned: _angle_deg(axes[0].T @ turned)) for R in axes]
+    alike = _alike(axes)
     mean = nearest_rotation(np.mean(alike, axis=0))
     return [_angle_deg(mean.T @ R) for R in alike]
 
 
-def truth_of(recording: Recording) -> Mapping[int, F64]:
-    """Return the true poses in the world of the run, by stamp; none where the recording has no ground truth or no poses."""
+def _from_most_deg(axes: Sequence[F64]) -> F64:
+    """Angles (n,) of rotations from the one that is nearest to the others, in the sum of angles, so that false ones do not count."""
+    alike = np.array(_alike(axes))
+    angles = np.array([rotation_angles_deg(np.swapaxes(alike, 1, 2) @ R) for R in alike])
+    found: F64 = angles[np.argmin(angles.sum(axis=1))]
+    return found
+
+
+def _alike(axes: Sequence[F64]) -> list[F64]:
+    """Rotations, each after the exchange of axes that brings it nearest to the first."""
+    return [min((R @ turn for turn in CUBE), key=lambda turned: _angle_deg(axes[0].T @ turned)) for R in axes]
+
+
+def reference_of(recording: Recording) -> tuple[Mapping[int, F64], bool]:
+    """Return poses (4, 4) in the world of the run, by stamp, and whether they are true: the ground truth, else the posed frames of the run itself."""
     try:
-        return true_poses(recording).poses
+        return true_poses(recording).poses, True
     except DataError:
-        return {}
+        poses = recording.values("pose") if "pose" in recording.topics else []
+        return {pose.stamp_ns: pose.T_world_camera for pose in poses if isinstance(pose, Pose) and pose.status != LOST}, False
 
 
 class RecordedValues:

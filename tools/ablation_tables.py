@@ -11,25 +11,33 @@ from typing import Any
 import numpy as np
 
 from trihedron.pipeline.core.types import F64
-from trihedron.tools.ablation_differences import Parting
+from trihedron.tools.ablation_differences import OPEN_LOOP, Parting
 from trihedron.tools.ablation_statistics import shapley
 from trihedron.tools.ablation_swaps import AS_RECORDED, Combination
 from trihedron.tools.arguments import table
 from trihedron.tools.paired_statistics import CONFIDENCE, half_interval
+from trihedron.tools.stage_measures import COLUMNS as MEASURED
 from trihedron.tools.verdicts import NOTE, VERDICTS, Column, Sample, Verdict, line_of, verdicts_of
 
+NEES = "NEES"
 FIGURES = {  # in the order of columns
     "ATE mm": Column(2),
     "RPE 1 frame mm": Column(2),
     "RPE 1 s mm": Column(2),
     "RPE 1 s deg": Column(3),
     "ok %": Column(1, more=True, of_frames=False),
+    NEES: Column(2, of_frames=False),
     "axes deg": Column(3),
     "rotation deg": Column(3),
     "translation mm": Column(2),
+    "false axes %": Column(1, of_frames=False),
+    **{name: Column(1 if name.endswith("%") else 2) for name in MEASURED},
     "values %": Column(1, more=True, of_frames=False),
     "ms": Column(2, of_frames=False),
 }
+
+
+UNKNOWN_TRUTH = "there is no ground truth: single stages are measured by the poses of the recorded run, which is agreement with it and no error"
 
 
 @dataclass
@@ -62,6 +70,7 @@ class Case:
     changed: Parting = field(default_factory=Parting)  # of what the recorded configuration computes now, from the recorded values
     budget: dict[str, dict[str, float]] = field(default_factory=dict)
     fps: float = 30.0
+    true: bool = True  # the poses by which single stages are measured are the ground truth, not those of the recorded run
 
 
 @dataclass(frozen=True)
@@ -78,7 +87,7 @@ def verdicts(cases: Sequence[Case]) -> list[Verdict]:
     """Return the verdict of each pair of alternatives, the earlier one first, in each figure."""
     samples = {label: [_sample(case, variant) for case, variant in found] for label, found in _by_change(cases).items()}
     pairs = {(first, second): list(zip(samples[first], samples[second])) for first, second in combinations(samples, 2)}
-    return verdicts_of(pairs, FIGURES)
+    return verdicts_of(pairs, {name: column for name, column in FIGURES.items() if name != NEES})  # of which neither more nor less is better
 
 
 def _sample(case: Case, variant: Variant) -> Sample:
@@ -189,6 +198,8 @@ def alternatives_table(cases: Sequence[Case]) -> Section:
         rows.append([label, *(number(name, _mean(some)) for name, some in values.items())])
     count = f"mean of {len(cases)} recordings" if len(cases) > 1 else f"{cases[0].recording}, {cases[0].frames} frames"
     note = f"computed again: {', '.join(cases[0].stages)}; ms are CPU milliseconds a frame of these"
+    if not all(case.true for case in cases) and any(name in columns for name in OPEN_LOOP):
+        note += f"\n{UNKNOWN_TRUTH}"
     return Section(f"Alternatives, {count}", rows, "l" + "r" * len(columns), note)
 
 

@@ -18,7 +18,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -33,9 +33,10 @@ from trihedron.tools.arguments import Parser
 from trihedron.tools.comparison_table import FIGURES
 from trihedron.tools.comparison_verdicts import COLUMNS, paired_samples
 from trihedron.tools.paired_statistics import half_interval
-from trihedron.tools.verdicts import NOTE, VERDICTS, Sample, line_of, verdicts_of
+from trihedron.tools.verdicts import NOTE, VERDICTS, Sample, Verdict, line_of, verdicts_of
 
 SEEDS = ("seed", "dataset.seed")
+ALL_DATA = "all"  # in the place of a data set: differences over all of them
 NOT_SHOWN = ("out", "report", "experiment", "sequences", "alternatives", *SEEDS)
 SURFACE, SURFACE_FIGURES = "surface.ply", "surface.json"
 
@@ -71,13 +72,15 @@ def main(argv: list[str]) -> int:
     if options.surfaces:
         judge_surfaces(folders)
     runs = [run for folder in folders for run in read_runs(folder)]
-    rows = rows_of(runs + read_trajectories(files, runs, options.label, options.y_up), options.baseline)
-    if lines := verdicts_against(runs, options.baseline):
+    found = verdicts_against(runs, options.baseline)
+    rows = with_verdicts(rows_of(runs + read_trajectories(files, runs, options.label, options.y_up), options.baseline), found)
+    lines = [line_of(one, COLUMNS[one.figure]) for one in found]
+    if lines:
         print("\n".join([VERDICTS, *lines, NOTE, ""]))
     print(render.as_text(rows))
     for name, write in render.WRITERS.items():
         if getattr(options, name):
-            getattr(options, name).write_text(write(rows))
+            getattr(options, name).write_text(write(rows, lines))
     return 0
 
 
@@ -184,7 +187,8 @@ def groups_of(runs: Sequence[Run]) -> dict[tuple[str, str], list[Run]]:
 
 def rows_of(runs: Sequence[Run], baseline: str = "") -> list[dict[str, Any]]:
     """One row for each data set and change: `data`, `change`, `runs`, `note`, of each figure's runs median, smallest and largest, and with a baseline
-    the paired `difference` of each figure. Then, if there are several data sets, the differences over all of them, `data` = "all"."""
+    the paired `difference` of each figure. Then, if there are several data sets, the differences over all of them, `data` = "all". `verdicts` are
+    empty: see `with_verdicts`."""
     groups = groups_of(runs)
     order = list(dict.fromkeys(data for data, _ in groups))
     _check_baseline(baseline, [change for _, change in groups])
@@ -192,7 +196,8 @@ def rows_of(runs: Sequence[Run], baseline: str = "") -> list[dict[str, Any]]:
     if baseline and len(order) > 1:
         for other in dict.fromkeys(change for _, change in groups if change != baseline):
             pairs = [pair for data in order for pair in _pairs(groups.get((data, other), []), groups.get((data, baseline), []))]
-            rows.append({"data": "all", "change": other, "runs": len(pairs), "figures": {}, "note": "", "difference": _differences(pairs)})
+            figures = {"figures": {}, "note": "", "difference": _differences(pairs), "verdicts": {}}
+            rows.append({"data": ALL_DATA, "change": other, "runs": len(pairs), **figures})
     return rows
 
 
@@ -211,18 +216,28 @@ def row_of(data: str, change: str, same: Sequence[Run], base: Sequence[Run] | No
         "figures": figures,
         "note": "; ".join(notes),
         "difference": _differences(_pairs(same, base or [])),
+        "verdicts": {},
     }
 
 
-def verdicts_against(runs: Sequence[Run], baseline: str) -> list[str]:
-    """Return the verdict of each change against the baseline in each figure, over all data and seeds that both have, as lines; none without one."""
+def verdicts_against(runs: Sequence[Run], baseline: str) -> list[Verdict]:
+    """Return the verdict of each change against the baseline in each figure, over all data and seeds that both have; none without a baseline."""
     groups = groups_of(runs) if baseline else {}
     pairs: dict[tuple[str, str], list[tuple[Sample, Sample]]] = {}
     for (data, change), same in groups.items():
         for run, base in _pairs(same, groups.get((data, baseline), [])) if change != baseline else []:
             samples = paired_samples(base.folder, run.folder, (base.figures, run.figures))
             pairs.setdefault((baseline, change or "-"), []).append(samples)
-    return [line_of(one, COLUMNS[one.figure]) for one in verdicts_of(pairs, COLUMNS)]
+    return verdicts_of(pairs, COLUMNS)
+
+
+def with_verdicts(rows: Sequence[dict[str, Any]], found: Sequence[Verdict]) -> list[dict[str, Any]]:
+    """Return the rows with `verdicts`, by figure, of the change of each over all data: in the row of all data where there is one."""
+    over_all = any(row["data"] == ALL_DATA for row in rows)
+    by_change: dict[str, dict[str, Any]] = {}
+    for one in found:
+        by_change.setdefault(one.second, {})[one.figure] = {"text": line_of(one, COLUMNS[one.figure]), **asdict(one)}
+    return [{**row, "verdicts": by_change.get(row["change"] or "-", {})} if not over_all or row["data"] == ALL_DATA else row for row in rows]
 
 
 def _pairs(runs: Sequence[Run], base: Sequence[Run]) -> list[tuple[Run, Run]]:

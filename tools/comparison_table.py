@@ -121,16 +121,17 @@ def _aligned(text: str, width: int, left: bool) -> str:
     return text.ljust(width) if left else text.rjust(width)
 
 
-def as_markdown(rows: Sequence[Row]) -> str:
-    """A table of Markdown, best in bold."""
+def as_markdown(rows: Sequence[Row], verdicts: Sequence[str] = ()) -> str:
+    """The verdicts as a list, if there are any, and a table of Markdown, best in bold."""
     header, cells = cells_of(rows)
     rule = [":--" if name in ("data", "change", "note") else "--:" for name in header]
     lines = [header, rule, *([f"**{cell.text}**" if cell.best else cell.text.replace("|", "\\|") for cell in row] for row in cells)]
-    return "".join("| " + " | ".join(line) + " |\n" for line in lines)
+    told = "".join(f"- {line.replace('|', chr(92) + '|')}\n" for line in verdicts)
+    return told + "\n" * bool(told) + "".join("| " + " | ".join(line) + " |\n" for line in lines)
 
 
-def as_latex(rows: Sequence[Row]) -> str:
-    """A tabular of LaTeX, best in bold."""
+def as_latex(rows: Sequence[Row], verdicts: Sequence[str] = ()) -> str:
+    """A tabular of LaTeX, best in bold; without the verdicts."""
     header, cells = cells_of(rows)
     columns = "".join("l" if name in ("data", "change", "note") else "r" for name in header)
     body = [[_escaped(name) for name in header], *([rf"\textbf{{{_escaped(c.text)}}}" if c.best else _escaped(c.text) for c in row] for row in cells)]
@@ -142,24 +143,27 @@ def _escaped(text: str) -> str:
     return "".join(LATEX.get(letter, letter) for letter in text)
 
 
-def as_csv(rows: Sequence[Row]) -> str:
-    """A line for each row: median, smallest and largest of each figure, and the differences with their intervals."""
+def as_csv(rows: Sequence[Row], verdicts: Sequence[str] = ()) -> str:
+    """A line for each row: median, smallest and largest of each figure, the differences with their intervals, and the verdict's answer on each."""
     out = io.StringIO()
     writer = csv.writer(out, lineterminator="\n")
     writer.writerow(
         ["data", "change", "runs", "note", *(f"{name} {part}" for name in FIGURES for part in ("median", "min", "max"))]
         + [f"{name} - baseline {part}" for name in FIGURES for part in ("mean", "low", "high")]
+        + [f"{name} verdict" for name in FIGURES]
     )
     for row in rows:
         figures = [row["figures"].get(name, {}).get(part, "") for name in FIGURES for part in ("median", "min", "max")]
         differences = [row["difference"].get(name, {}).get(part) for name in FIGURES for part in ("mean", "low", "high")]
-        writer.writerow([row["data"], row["change"], row["runs"], row["note"], *figures, *("" if value is None else value for value in differences)])
+        answers = [row["verdicts"].get(name, {}).get("answer", "") for name in FIGURES]
+        shown = ["" if value is None else value for value in differences]
+        writer.writerow([row["data"], row["change"], row["runs"], row["note"], *figures, *shown, *answers])
     return out.getvalue()
 
 
-def as_json(rows: Sequence[Row]) -> str:
-    """The rows as they are."""
+def as_json(rows: Sequence[Row], verdicts: Sequence[str] = ()) -> str:
+    """The rows as they are, which hold their verdicts."""
     return json.dumps(list(rows), indent=2) + "\n"
 
 
-WRITERS: dict[str, Callable[[Sequence[Row]], str]] = {"csv": as_csv, "markdown": as_markdown, "latex": as_latex, "json": as_json}
+WRITERS: dict[str, Callable[[Sequence[Row], Sequence[str]], str]] = {"csv": as_csv, "markdown": as_markdown, "latex": as_latex, "json": as_json}

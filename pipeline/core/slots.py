@@ -66,44 +66,48 @@ class Dataset(Protocol):
 
 
 class NormalsSlot(Protocol):
-    """Surface normals of the depth image, towards the camera."""
+    """Surface normals of the depth image, towards the camera. Measure: angle between the normals of one place in two frames."""
 
     def __call__(self, frame: Frame) -> Normals | None: ...
 
 
 class KeypointsSlot(Protocol):
-    """Points of interest with descriptors and their 3D positions where depth can be trusted (not across a depth edge)."""
+    """Points of interest with descriptors and their 3D positions where depth can be trusted (not across a depth edge).
+    Measure: share of the points in view that are not found again in the next frame."""
 
     def __call__(self, frame: Frame) -> Keypoints | None: ...
 
 
 class LinesSlot(Protocol):
-    """Straight line segments of the image with descriptors."""
+    """Straight line segments of the image with descriptors. Measure: share of the segments in view that are not found again in the next frame."""
 
     def __call__(self, frame: Frame) -> LineSegments | None: ...
 
 
 class SegmentsSlot(Protocol):
-    """3D lines along the image's segments, fitted robustly to depth; one row per row of `lines`."""
+    """3D lines along the image's segments, fitted robustly to depth; one row per row of `lines`.
+    Measure: distance between the lines of one segment in two frames."""
 
     def __call__(self, frame: Frame, lines: LineSegments) -> Segments | None: ...
 
 
 class PlanesSlot(Protocol):
-    """Planar regions of the depth image."""
+    """Planar regions of the depth image. Measure: distance and angle between one plane in two frames, and the share that is not found again."""
 
     def __call__(self, frame: Frame, normals: Normals) -> Planes | None: ...
 
 
 class ManhattanSlot(Protocol):
     """The scene's orthogonal axes seen from the camera (section IV-A). `previous` is this stage's last output: look near it first,
-    search the whole of SO(3) when it is None, old or no longer supported; among the 24 equivalent rotations keep the one nearest to it."""
+    search the whole of SO(3) when it is None, old or no longer supported; among the 24 equivalent rotations keep the one nearest to it.
+    Measure: angle of the axes from their mean, and the share of frames with false ones."""
 
     def __call__(self, normals: Normals, segments: Segments, planes: Planes, previous: ManhattanFrame | None) -> ManhattanFrame | None: ...
 
 
 class TracksSlot(Protocol):
-    """Features of this frame found in the previous one. `previous` is this stage's last output, `manhattan` may predict the rotation."""
+    """Features of this frame found in the previous one. `previous` is this stage's last output, `manhattan` may predict the rotation.
+    Measure: shares of wrong and of missed pairs of key points."""
 
     def __call__(
         self,
@@ -124,7 +128,8 @@ class TracksSlot(Protocol):
 class RotationSlot(Protocol):
     """The camera's rotation in the world, drift-free where the scene is Manhattan (eq. 1), with the world–Manhattan rotation it maintains.
     `previous` is this stage's last output, `previous_pose` the refined pose before this frame, `map` the map before this frame: a correction may
-    have moved the pose's reference keyframe since that pose was estimated, and both move with it. The world is the first frame's camera frame."""
+    have moved the pose's reference keyframe since that pose was estimated, and both move with it. The world is the first frame's camera frame.
+    Measure: angle from the true rotation."""
 
     def __call__(
         self,
@@ -140,7 +145,8 @@ class RotationSlot(Protocol):
 
 
 class TranslationSlot(Protocol):
-    """The camera's position with the rotation fixed (eqs. 2–7), from features tracked since the last frame; `earlier_pose` is of two frames ago."""
+    """The camera's position with the rotation fixed (eqs. 2–7), from features tracked since the last frame; `earlier_pose` is of two frames ago.
+    Measure: distance from the true position."""
 
     def __call__(
         self,
@@ -159,7 +165,8 @@ class TranslationSlot(Protocol):
 
 
 class MatchesSlot(Protocol):
-    """Map landmarks found among this frame's features, searched around their projection at the decoupled, or recognised, pose (section III-B)."""
+    """Map landmarks found among this frame's features, searched around their projection at the decoupled, or recognised, pose (section III-B).
+    Measure: shares of wrong and of missed matches of points."""
 
     def __call__(
         self, frame: Frame, rotation: Rotation, translation: Translation, keypoints: Keypoints, segments: Segments, planes: Planes,
@@ -169,7 +176,8 @@ class MatchesSlot(Protocol):
 
 class PoseSlot(Protocol):
     """The pose of this frame with its status (section IV-C, eq. 8): every frame gets a pose, `ok` or `degraded` only when it was estimated
-    from this frame's measurements. `map` is the map before this frame, `previous` this stage's last output; on a lost one nothing is tracked."""
+    from this frame's measurements. `map` is the map before this frame, `previous` this stage's last output; on a lost one nothing is tracked.
+    Measure: ATE, RPE, NEES and the share of frames that are ok."""
 
     def __call__(
         self,
@@ -190,7 +198,8 @@ class PoseSlot(Protocol):
 
 
 class MapSlot(Protocol):
-    """The only writer of the map: inserts keyframes, culls and fuses landmarks, applies corrections, merges sub-maps. None when nothing changed."""
+    """The only writer of the map: inserts keyframes, culls and fuses landmarks, applies corrections, merges sub-maps. None when nothing changed.
+    Measure: that of `pose`."""
 
     def __call__(
         self,
@@ -208,20 +217,20 @@ class MapSlot(Protocol):
 
 
 class BundleSlot(Protocol):
-    """Joint optimisation of a window of keyframes and landmarks; may take several frames behind a wire `bundle@k`."""
+    """Joint optimisation of a window of keyframes and landmarks; may take several frames behind a wire `bundle@k`. Measure: that of `pose`."""
 
     def __call__(self, map: Map) -> Correction | None: ...
 
 
 class LoopSlot(Protocol):
-    """Recognise a place seen before and correct the map. `previous` is this stage's last output."""
+    """Recognise a place seen before and correct the map. `previous` is this stage's last output. Measure: that of `pose`."""
 
     def __call__(self, map: Map, frame: Frame, previous: Correction | None) -> Correction | None: ...
 
 
 class RelocaliseSlot(Protocol):
     """The pose of this frame found against the map without a prediction: for a lost camera `ok`, or `lost` when nothing, or more than one place, was
-    recognised; `degraded` for one tracked in a sub-map that was recognised in an older one. None otherwise."""
+    recognised; `degraded` for one tracked in a sub-map that was recognised in an older one. None otherwise. Measure: that of `pose`."""
 
     def __call__(
         self, frame: Frame, rotation: Rotation, keypoints: Keypoints, segments: Segments, planes: Planes, map: PreviousMap, previous_pose: Pose | None
@@ -229,14 +238,16 @@ class RelocaliseSlot(Protocol):
 
 
 class ModelSlot(Protocol):
-    """The view of a dense model from the current pose, for frame-to-model tracking; `previous`, its last output, carries the model."""
+    """The view of a dense model from the current pose, for frame-to-model tracking; `previous`, its last output, carries the model.
+    Measure: that of `pose`."""
 
     def __call__(self, frame: Frame, pose: Pose, map: Map | None, previous: PredictedView | None) -> PredictedView | None: ...
 
 
 class SurfaceSlot(Protocol, Generic[State]):
     """A mesh of the scene; empty rather than None. A fold: `start` makes a state, `add` takes it one frame further (`map` where it changed then),
-    `finish` transforms it to the final keyframes, as `trajectory.txt` does. Nothing reads it while the camera is tracked."""
+    `finish` transforms it to the final keyframes, as `trajectory.txt` does. Nothing reads it while the camera is tracked.
+    Measure: distance from the true surface, and how much of it is covered (`trihedron evaluate-surface`)."""
 
     def start(self) -> State: ...
 
@@ -246,7 +257,8 @@ class SurfaceSlot(Protocol, Generic[State]):
 
 
 class BuildingSlot(Protocol, Generic[State]):
-    """The storeys, walls, rooms and openings of a building; a plan that names what is missing rather than None. A fold, as `surface` is."""
+    """The storeys, walls, rooms and openings of a building; a plan that names what is missing rather than None. A fold, as `surface` is.
+    Measure: rooms and walls against those of the simulated building."""
 
     def start(self) -> State: ...
 

@@ -20,6 +20,7 @@ from trihedron.tools.ablation_swaps import combinations_of, folder_name, parsed
 from trihedron.tools.ablation_tables import (
     Case,
     Variant,
+    alternatives_table,
     as_json,
     as_markdown,
     as_text,
@@ -126,6 +127,15 @@ def test_where_two_variants_part():
         parting.compare(index, ["translation"], {"translation": translation(index, 1.0)}, {"translation": translation(index, 1.0 + apart)})
     assert (parting.frame, parting.topic, parting.field, parting.frames) == (2, "translation", "t_world_camera", 3)
     assert (parting.worst, parting.unit) == (3, "mm") and parting.distance == pytest.approx(5.0)
+
+
+def test_without_ground_truth_a_line_says_what_single_stages_are_measured_by():
+    found = case(0, [1.0, 2.0, 3.0, 4.0])
+    for variant in found.variants:
+        variant.figures["planes mm"] = 3.0
+    line = "there is no ground truth: single stages are measured by the poses of the recorded run, which is agreement with it and no error"
+    assert line not in alternatives_table([found]).note
+    assert alternatives_table([replace(found, true=False)]).note.splitlines()[-1] == line
 
 
 def test_errors_of_a_stage_alone():

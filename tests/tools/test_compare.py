@@ -1,6 +1,7 @@
 """The runs of a sweep as one table, and the graphs and omissions it is made for."""
 
 import csv
+import io
 import json
 from pathlib import Path
 
@@ -19,6 +20,8 @@ from trihedron.pipeline.record.trajectories import write_trajectory
 from trihedron.tools import other_programs
 from trihedron.tools.compare import read_runs, rows_of, verdicts_against
 from trihedron.tools.comparison_table import WRITERS, as_latex, as_markdown, as_text
+from trihedron.tools.comparison_verdicts import COLUMNS
+from trihedron.tools.verdicts import line_of
 
 GRAPHS = Path(trihedron.conf.__file__).parent / "graph"
 SMALL = ["dataset.width=160", "dataset.height=120", "dataset.length=4"]
@@ -92,6 +95,29 @@ def test_verdicts_of_runs_are_paired_and_first(tmp_path, capsys):
     assert "Verdicts" not in capsys.readouterr().out
 
 
+def test_files_hold_the_verdicts(tmp_path):
+    """In the row of the change, or of all data where there are several data sets."""
+    for i, (graph, seed) in enumerate([("points", 0), ("points", 1), ("structural", 0), ("structural", 1)]):
+        write_run(tmp_path / "runs" / str(i), [f"graph={graph}", f"seed={seed}"], 1e-3 * (4.0 if graph == "points" else 2.0 + 0.01 * seed))
+    files = {name: tmp_path / f"table.{name}" for name in WRITERS}
+    words = ["compare", str(tmp_path / "runs"), "--baseline", "graph=points", *(word for n, file in files.items() for word in (f"--{n}", str(file)))]
+    assert main(words) == 0
+    line = "graph=points against structural: ATE 4.00 -> 2.00 mm, -2.00 (95 %: -2.06 to -1.93), d -282.1: better"
+    base, other = json.loads(files["json"].read_text())
+    assert base["verdicts"] == {} and other["verdicts"]["ATE mm"]["text"] == line and other["verdicts"]["ATE mm"]["answer"] == "better"
+    assert f"- {line}\n" in files["markdown"].read_text().partition("\n\n")[0] + "\n"
+    header, first, second = csv.reader(io.StringIO(files["csv"].read_text()))
+    assert [dict(zip(header, row))["ATE mm verdict"] for row in (first, second)] == ["", "better"]
+    for i, graph in enumerate(("points", "structural"), 4):
+        write_run(tmp_path / "runs" / str(i), [f"graph={graph}", "seed=0", "dataset.scene=corridor"], 0.004)
+    assert main(words) == 0
+    assert [row["data"] for row in json.loads(files["json"].read_text()) if row["verdicts"]] == ["all"]
+
+
+def lines_against(folder):
+    return [line_of(one, COLUMNS[one.figure]) for one in verdicts_against(read_runs(folder), "graph=points")]
+
+
 def test_two_runs_are_compared_by_the_errors_of_their_frames(tmp_path, monkeypatch):
     rng, stamps = np.random.default_rng(0), np.arange(300, dtype=np.int64) * 33_333_333
     truth = Trajectory(stamps, np.array([pose_matrix(np.eye(3), position) for position in np.cumsum(rng.normal(size=(300, 3)), axis=0)]))
@@ -101,11 +127,11 @@ def test_two_runs_are_compared_by_the_errors_of_their_frames(tmp_path, monkeypat
         poses = truth.poses.copy()
         poses[:, :3, 3] += rng.normal(0.0, sigma_m, (300, 3))
         write_trajectory(tmp_path / name / "trajectory.txt", Trajectory(stamps, poses))
-    lines = verdicts_against(read_runs(tmp_path), "graph=points")
+    lines = lines_against(tmp_path)
     assert [line.partition(": ")[2].split()[0] for line in lines] == ["ATE", "RPE", "RPE"]
     assert lines[0].startswith("graph=points against structural: ATE 3.50 -> 6.88 mm, +3.39 (95 %: ") and lines[0].endswith(": worse")
     (tmp_path / "points" / "trajectory.txt").unlink()
-    assert verdicts_against(read_runs(tmp_path), "graph=points")[0].endswith("ATE 1000.00 -> 1000.00 mm, 0.00: one recording, no interval")
+    assert lines_against(tmp_path)[0].endswith("ATE 1000.00 -> 1000.00 mm, 0.00: one recording, no interval")
 
 
 def test_the_best_is_bold_and_an_error_over_few_frames_is_not(tmp_path):
