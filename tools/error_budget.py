@@ -1,7 +1,13 @@
-"""Say where a run's error comes from: rerun it with the output of one stage replaced by the truth, and see what remains.
+"""Attribute a run's error to its stages: rerun it with the output of one stage replaced by the truth, and see what remains.
 
-Each row replays the recording from behind the replaced stage: `rotation` and `translation` are the decoupled pose, `map` is the map that the same
-frames build from true poses. What disappears with a row is that stage's share of the error; what remains with all of them is the refinement's own.
+Each row replays the recording: the stages it names are true, every stage that depends on them is computed again, everything else is as recorded.
+
+- `nothing`: the run again, as it was.
+- `rotation`, `translation`: the rotation, the position of the decoupled pose is the ground truth's; tracking and mapping start from it.
+- `map`: keyframes have their true poses, and landmarks move with the keyframes that observed them (`true_map`). The rows of the map, what it holds
+  when, and the noise of its measurements are as recorded. The poses are found in it anew.
+
+What disappears with a row is the error that enters through that stage; what remains with all of them is that of the refinement on single frames.
 
 Example: trihedron error-budget runs/a/run.mcap
 """
@@ -12,26 +18,29 @@ import contextlib
 import io
 import json
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from trihedron.pipeline.app.recorded_run import composed_run
+from trihedron.pipeline.core.config import graph_of
 from trihedron.pipeline.core.errors import DataError, StageError
 from trihedron.pipeline.core.geometry import nearest_pairs, nearest_rotation
-from trihedron.pipeline.core.types import F64, OK, Pose, Rotation, Translation, Value
+from trihedron.pipeline.core.graph import Graph
+from trihedron.pipeline.core.types import F64, Map, Pose, Rotation, Translation, Value
 from trihedron.pipeline.record.reader import Recording
 from trihedron.pipeline.record.trajectories import attached_truth
 from trihedron.pipeline.record.writer import RecordingWriter
 from trihedron.pipeline.run.metrics import MAX_DIFFERENCE_NS
+from trihedron.pipeline.sweep.search import followers
 from trihedron.tools.arguments import Parser, table
+from trihedron.tools.true_map import true_map
 
 EXACT = 1e-12  # variance of what is true, m² and rad²; positive, so that it can be inverted
 ROWS = ((), ("rotation",), ("translation",), ("rotation", "translation"), ("map",), ("rotation", "translation", "map"))
-LOOP = ("relocalise", "matches", "pose", "map", "bundle", "loop")  # corrections are of one map only: whoever changes it adjusts it again
-AFTER = {"rotation": ("translation", *LOOP), "translation": LOOP, "map": ("relocalise", "matches", "pose")}
 
 
 @dataclass(frozen=True)
@@ -54,12 +63,9 @@ class Truth:
             return value
         return replace(value, t_world_camera=T[:3, 3].copy(), covariance=EXACT * np.eye(3), unobservable=np.empty((0, 3)), estimated=True)
 
-    def pose(self, value: Value) -> Value:
-        """The frame's Pose as it should have been."""
-        T = self.poses.get(value.stamp_ns)
-        if not isinstance(value, Pose) or T is None:
-            return value
-        return replace(value, T_world_camera=T, covariance=EXACT * np.eye(6), T_reference_camera=T, reference=-1, status=OK)
+    def map(self, value: Value) -> Value:
+        """The Map as it should have been, with the same rows."""
+        return true_map(value, self.poses) if isinstance(value, Map) else value
 
 
 def main(argv: list[str]) -> int:
@@ -101,38 +107,50 @@ def true_poses(recording: Recording) -> Truth:
 
 def rerun(recording: Recording, truth: Truth, stages: tuple[str, ...], folder: Path) -> dict[str, Any]:
     """Final metrics of a replay in which the topics of `stages` are true."""
-    source, changed = folder / "source.mcap", {name: getattr(truth, name) for name in stages if name != "map"}
-    if "map" in stages:
-        rewrite(recording, source, {"pose": truth.pose})
-        correctors = [stage for stage in ("bundle", "loop") if stage in recording.topics]
-        replayed(source, ("map", *correctors), folder / "map", *(f"{stage}=none" for stage in correctors))
-        changed["map"] = dict(enumerate(Recording(folder / "map" / "run.mcap").values("map")))
-    rewrite(recording, source, changed)
-    first = min(stages, key=list(AFTER).index, default="rotation")
-    again = [stage for stage in AFTER[first] if stage not in stages and stage in recording.topics]
-    return replayed(source, tuple(again), folder / "run")
+    source = folder / "source.mcap"
+    rewrite(recording, source, {name: getattr(truth, name) for name in stages})
+    return replayed(source, recomputed(recording, stages), folder / "run")
 
 
-def rewrite(recording: Recording, path: Path, changed: dict[str, Any]) -> None:
-    """Copy the recording's topics, those in `changed` through the function given there, or replaced by the values given there."""
+def recomputed(recording: Recording, stages: tuple[str, ...]) -> tuple[str, ...]:
+    """Return the recorded stages that depend on one of these, over any number of wires, without these; of none, those of the first row."""
+    graph = graph_of(composed_run(recording))
+    first = [stage for stage in stages or ("rotation",) if stage in graph.stages]
+    found = needed_for_pose(graph, frozenset(stages))
+    return tuple(stage for stage in followers(graph, first) if stage not in stages and stage in found & recording.topics)
+
+
+def needed_for_pose(graph: Graph, given: frozenset[str]) -> frozenset[str]:
+    """Return the stages from which the pose is computed, over any number of wires, when those `given` are not computed."""
+    found: set[str] = set()
+    pending = ["pose", "map"]
+    while pending:
+        name = pending.pop()
+        if name in graph.stages and name not in found and name not in given:
+            found.add(name)
+            pending += [wire.topic for wire in graph.stages[name].inputs.values()]
+    return frozenset(found)
+
+
+def rewrite(recording: Recording, path: Path, changed: Mapping[str, Callable[[Value], Value]]) -> None:
+    """Copy the recording's topics, those in `changed` through the function given there."""
     writer = RecordingWriter(path, {name: text for name, text in recording.metadata.items() if name != "format"})
     for name, text in recording.attachments.items():
         writer.attach(name, text)
     for topic in sorted(recording.topics):
-        change: Callable[[Value], Value] | dict[int, Value] = changed.get(topic, lambda value: value)
-        for value in change.values() if isinstance(change, dict) else map(change, recording.values(topic)):
+        for value in map(changed.get(topic, lambda value: value), recording.values(topic)):
             writer.write(topic, value)
     writer.close()
 
 
-def replayed(source: Path, stages: tuple[str, ...], out: Path, *overrides: str) -> dict[str, Any]:
-    """Run the stages again over the recording, changed by `overrides`; the final metrics, empty when no pose is among them."""
+def replayed(source: Path, stages: tuple[str, ...], out: Path) -> dict[str, Any]:
+    """Run the stages again over the recording; the final metrics."""
     from trihedron.pipeline.app.cli import main as trihedron
 
     printed = io.StringIO()
     with contextlib.redirect_stdout(printed), contextlib.redirect_stderr(printed):
-        code = trihedron(["run", f"replay={source}", f"only=[{','.join(stages)}]", f"out={out}", *overrides])
+        code = trihedron(["run", f"replay={source}", f"only=[{','.join(stages)}]", f"out={out}"])
     if code:
         raise StageError(f"replay of {', '.join(stages)}", (printed.getvalue().strip().splitlines() or ["failed"])[-1], "run it alone to see more")
-    metrics: dict[str, Any] = json.loads((out / "metrics.json").read_text())["final"] if "pose" in stages else {}
+    metrics: dict[str, Any] = json.loads((out / "metrics.json").read_text())["final"]
     return metrics
