@@ -32,14 +32,16 @@ from trihedron.pipeline.core.geometry import nearest_pairs, nearest_rotation
 from trihedron.pipeline.core.graph import Graph
 from trihedron.pipeline.core.types import F64, Map, Pose, Rotation, Translation, Value
 from trihedron.pipeline.record.reader import Recording
-from trihedron.pipeline.record.trajectories import attached_truth
+from trihedron.pipeline.record.trajectories import attached_truth, read_trajectory
 from trihedron.pipeline.record.writer import RecordingWriter
-from trihedron.pipeline.run.metrics import MAX_DIFFERENCE_NS
+from trihedron.pipeline.run.metrics import MAX_DIFFERENCE_NS, frame_errors
 from trihedron.pipeline.sweep.search import followers
 from trihedron.tools.arguments import Parser, table
 from trihedron.tools.true_map import true_map
+from trihedron.tools.verdicts import TOO_SHORT, Column, Sample, verdicts_of
 
 EXACT = 1e-12  # variance of what is true, m² and rad²; positive, so that it can be inverted
+ATE = "ate_rmse_m"
 ROWS = ((), ("rotation",), ("translation",), ("rotation", "translation"), ("map",), ("rotation", "translation", "map"))
 
 
@@ -68,25 +70,71 @@ class Truth:
         return true_map(value, self.poses) if isinstance(value, Map) else value
 
 
+@dataclass(frozen=True)
+class Rerun:
+    """Final metrics of a replay, and the errors of its frames (n,) by their names in the metrics; both empty where fewer than 3 poses have truth."""
+
+    metrics: dict[str, Any]
+    errors: dict[str, F64]
+
+
 def main(argv: list[str]) -> int:
     """Print the table; returns the exit code. Raises DataError for a recording without poses or truth, StageError when a replay fails."""
     parser = Parser("error-budget", __name__)
     parser.add_argument("recording", metavar="RUN.mcap", type=Path, help="of a run whose data set has ground truth")
-    found = budget(Recording(parser.parse_args(argv).recording))
+    found = reruns(Recording(parser.parse_args(argv).recording))
     rows: list[list[str]] = [["true", "ATE RMSE (m)", "× whole", "RPE over 1 s (m)", "(deg)"]]
-    whole = found[()]["ate_rmse_m"]
-    for stages, metrics in found.items():
-        errors = [f"{metrics[key]:.4f}" if metrics[key] is not None else "-" for key in ("rpe_second_rmse_m", "rpe_second_rmse_deg")]
-        rows.append([" + ".join(stages) or "nothing", f"{metrics['ate_rmse_m']:.4f}", f"{metrics['ate_rmse_m'] / whole:.2f}", *errors])
+    whole = found[()].metrics.get(ATE) or np.nan
+    for stages, one in found.items():
+        ate, *relative = (_number(one.metrics.get(key)) for key in (ATE, "rpe_second_rmse_m", "rpe_second_rmse_deg"))
+        share = (one.metrics.get(ATE) or 0.0) / whole if ATE in one.metrics else np.nan
+        rows.append([named(stages), ate, f"{share:.2f}" if np.isfinite(share) else "-", *relative])
     print(table(rows, "lrrrr"))
+    for sentence in remarks(found):
+        print(sentence)
     return 0
+
+
+def _number(value: float | None) -> str:
+    return "-" if value is None else f"{value:.4f}"
+
+
+def named(stages: tuple[str, ...]) -> str:
+    """Return the name of a row."""
+    return " + ".join(stages) or "nothing"
 
 
 def budget(recording: Recording) -> dict[tuple[str, ...], dict[str, Any]]:
     """Return the final metrics with each row of stages replaced by the truth, beginning with none. Raises DataError, StageError."""
+    return {stages: one.metrics for stages, one in reruns(recording).items()}
+
+
+def reruns(recording: Recording) -> dict[tuple[str, ...], Rerun]:
+    """Return the replay with each row of stages replaced by the truth, beginning with none. Raises DataError, StageError."""
     truth = true_poses(recording)
     with tempfile.TemporaryDirectory() as folder:
         return {stages: rerun(recording, truth, stages, Path(folder)) for stages in ROWS if recording.topics.issuperset(stages)}
+
+
+def remarks(found: Mapping[tuple[str, ...], Rerun]) -> list[str]:
+    """Return sentences on the rows whose ATE is not comparable with that of the whole run, or differs from it by no more than chance."""
+    whole = found[()]
+    second = int(whole.metrics.get("rpe_second_frames") or 1)
+    samples = {stages: Sample({}, {"ATE m": one.errors[ATE]}, second) for stages, one in found.items() if ATE in one.errors}
+    pairs = {("", named(stages)): [(samples[()], sample)] for stages, sample in samples.items() if stages and () in samples}
+    verdicts = verdicts_of(pairs, {"ATE m": Column(4)})
+    frames = whole.metrics.get("poses_with_truth", 0)
+    fewer = [named(stages) for stages, one in found.items() if one.metrics.get("poses_with_truth", 0) < frames]
+    short = [one.second for one in verdicts if one.answer == TOO_SHORT]
+    equal = [one.second for one in verdicts if one.answer not in (TOO_SHORT, "better", "worse")]
+    sentences = []
+    if fewer:
+        sentences.append(f"Errors are over fewer than the run's {frames} poses, and no measure of the whole, in: {', '.join(fewer)}.")
+    if short:
+        sentences.append(f"{frames} poses are too few to tell the difference from the whole run from chance in: {', '.join(short)}.")
+    if equal:
+        sentences.append(f"The difference from the whole run is within its noise over {frames} poses in: {', '.join(equal)}.")
+    return sentences
 
 
 def true_poses(recording: Recording) -> Truth:
@@ -105,19 +153,25 @@ def true_poses(recording: Recording) -> Truth:
     return Truth({poses[row].stamp_ns: T @ pose for (row, _), pose in zip(pairs, true)})
 
 
-def rerun(recording: Recording, truth: Truth, stages: tuple[str, ...], folder: Path) -> dict[str, Any]:
-    """Final metrics of a replay in which the topics of `stages` are true."""
-    source = folder / "source.mcap"
+def rerun(recording: Recording, truth: Truth, stages: tuple[str, ...], folder: Path) -> Rerun:
+    """Replay with the topics of `stages` true."""
+    source, out = folder / "source.mcap", folder / "run"
     rewrite(recording, source, {name: getattr(truth, name) for name in stages})
-    return replayed(source, recomputed(recording, stages), folder / "run")
+    metrics = replayed(source, recomputed(recording, stages), out)
+    reference = attached_truth(recording.attachments, str(recording.path))
+    if reference is None or not metrics:
+        return Rerun({}, {})
+    stamps = np.array([pose.stamp_ns for pose in recording.values("pose")], np.int64)
+    estimate = read_trajectory(out / "trajectory.txt")
+    return Rerun(metrics, frame_errors(estimate, reference, float(metrics["rpe_second_frames"]), stamps))
 
 
 def recomputed(recording: Recording, stages: tuple[str, ...]) -> tuple[str, ...]:
-    """Return the recorded stages that depend on one of these, over any number of wires, without these; of none, those of the first row."""
+    """Return the stages that depend on one of these, over any number of wires, without these; of none, those of the first row."""
     graph = graph_of(composed_run(recording))
     first = [stage for stage in stages or ("rotation",) if stage in graph.stages]
     found = needed_for_pose(graph, frozenset(stages))
-    return tuple(stage for stage in followers(graph, first) if stage not in stages and stage in found & recording.topics)
+    return tuple(stage for stage in followers(graph, first) if stage not in stages and stage in found)
 
 
 def needed_for_pose(graph: Graph, given: frozenset[str]) -> frozenset[str]:
@@ -152,5 +206,5 @@ def replayed(source: Path, stages: tuple[str, ...], out: Path) -> dict[str, Any]
         code = trihedron(["run", f"replay={source}", f"only=[{','.join(stages)}]", f"out={out}"])
     if code:
         raise StageError(f"replay of {', '.join(stages)}", (printed.getvalue().strip().splitlines() or ["failed"])[-1], "run it alone to see more")
-    metrics: dict[str, Any] = json.loads((out / "metrics.json").read_text())["final"]
+    metrics: dict[str, Any] = json.loads((out / "metrics.json").read_text()).get("final") or {}
     return metrics
