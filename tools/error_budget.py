@@ -7,6 +7,9 @@ Each row replays the recording: the stages it names are true, every stage that d
 - `map`: keyframes have their true poses, and landmarks move with the keyframes that observed them (`true_map`). The rows of the map, what it holds
   when, and the noise of its measurements are as recorded. The poses are found in it anew.
 
+Covariances stay as the stage stated them, so that gates and weights do: a measured ground truth has errors too, and whoever takes it to be exact
+gains a worse pose.
+
 What disappears with a row is the error that enters through that stage; what remains with all of them is that of the refinement on single frames.
 
 Example: trihedron error-budget runs/a/run.mcap
@@ -40,7 +43,6 @@ from trihedron.tools.arguments import Parser, table
 from trihedron.tools.true_map import true_map
 from trihedron.tools.verdicts import TOO_SHORT, Column, Sample, verdicts_of
 
-EXACT = 1e-12  # variance of what is true, m² and rad²; positive, so that it can be inverted
 ATE = "ate_rmse_m"
 ROWS = ((), ("rotation",), ("translation",), ("rotation", "translation"), ("map",), ("rotation", "translation", "map"))
 
@@ -56,14 +58,14 @@ class Truth:
         T = self.poses.get(value.stamp_ns)
         if not isinstance(value, Rotation) or T is None:
             return value
-        return replace(value, R_world_camera=T[:3, :3].copy(), covariance=EXACT * np.eye(3))
+        return replace(value, R_world_camera=T[:3, :3].copy())
 
     def translation(self, value: Value) -> Value:
         """The frame's Translation as it should have been."""
         T = self.poses.get(value.stamp_ns)
         if not isinstance(value, Translation) or T is None:
             return value
-        return replace(value, t_world_camera=T[:3, 3].copy(), covariance=EXACT * np.eye(3), unobservable=np.empty((0, 3)), estimated=True)
+        return replace(value, t_world_camera=T[:3, 3].copy(), unobservable=np.empty((0, 3)), estimated=True)
 
     def map(self, value: Value) -> Value:
         """The Map as it should have been, with the same rows."""
@@ -127,13 +129,18 @@ def remarks(found: Mapping[tuple[str, ...], Rerun]) -> list[str]:
     fewer = [named(stages) for stages, one in found.items() if one.metrics.get("poses_with_truth", 0) < frames]
     short = [one.second for one in verdicts if one.answer == TOO_SHORT]
     equal = [one.second for one in verdicts if one.answer not in (TOO_SHORT, "better", "worse")]
+    rows = len(found) - 1
     sentences = []
     if fewer:
-        sentences.append(f"Errors are over fewer than the run's {frames} poses, and no measure of the whole, in: {', '.join(fewer)}.")
-    if short:
-        sentences.append(f"{frames} poses are too few to tell the difference from the whole run from chance in: {', '.join(short)}.")
-    if equal:
-        sentences.append(f"The difference from the whole run is within its noise over {frames} poses in: {', '.join(equal)}.")
+        sentences.append(f"These rows track fewer than the whole run's {frames} poses, so that their errors are not comparable: {', '.join(fewer)}.")
+    if len(short) == rows:
+        sentences.append(f"{frames} poses are too few to tell any row from the whole run.")
+    elif short:
+        sentences.append(f"{frames} poses are too few to tell these rows from the whole run: {', '.join(short)}.")
+    if len(equal) == rows:
+        sentences.append(f"No row differs from the whole run by more than its noise over {frames} poses.")
+    elif equal:
+        sentences.append(f"These rows differ from the whole run by no more than its noise over {frames} poses: {', '.join(equal)}.")
     return sentences
 
 
