@@ -136,9 +136,8 @@ def test_a_wrong_sign_in_translation_disappears_with_the_true_translation(tmp_pa
     words = ["graph=structural_no_refine", "translation=wrong_sign", *ROOM]
     assert main(["run", *words, f"out={tmp_path}/run"]) == 0
     found = budget(tmp_path / "run" / "run.mcap", capsys)
-    assert found["translation"] < 0.2 * found["nothing"] and found["rotation"] > 0.8 * found["nothing"]
-    gains = {stage: found["nothing"] - error for stage, error in found.items() if stage in ("rotation", "translation", "map")}
-    assert max(gains, key=gains.get) == "translation"
+    assert found["translation"] < 0.2 * found["nothing"] and found["rotation"] > 0.5 * found["nothing"]
+    assert min(("rotation", "translation"), key=found.get) == "translation"
 
 
 @pytest.mark.slow
