@@ -1,7 +1,16 @@
-"""Say where a run's error comes from: rerun it with the output of one stage replaced by the truth, and see what remains.
+"""Attribute a run's error to its stages: rerun it with the output of one stage replaced by the truth, and see what remains.
 
-Each row replays the recording from behind the replaced stage: `rotation` and `translation` are the decoupled pose, `map` is the map that the same
-frames build from true poses. What disappears with a row is that stage's share of the error; what remains with all of them is the refinement's own.
+Each row replays the recording: the stages it names are true, every stage that depends on them is computed again, everything else is as recorded.
+
+- `nothing`: the run again, as it was.
+- `rotation`, `translation`: the rotation, the position of the decoupled pose is the ground truth's; tracking and mapping start from it.
+- `map`: keyframes have their true poses, and landmarks move with the keyframes that observed them (`true_map`). The rows of the map, what it holds
+  when, and the noise of its measurements are as recorded. The poses are found in it anew.
+
+Covariances stay as the stage stated them, so that gates and weights do: a measured ground truth has errors too, and whoever takes it to be exact
+gains a worse pose.
+
+What disappears with a row is the error that enters through that stage; what remains with all of them is that of the refinement on single frames.
 
 Example: trihedron error-budget runs/a/run.mcap
 """
@@ -12,26 +21,30 @@ import contextlib
 import io
 import json
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from trihedron.pipeline.app.recorded_run import composed_run
+from trihedron.pipeline.core.config import graph_of
 from trihedron.pipeline.core.errors import DataError, StageError
 from trihedron.pipeline.core.geometry import nearest_pairs, nearest_rotation
-from trihedron.pipeline.core.types import F64, OK, Pose, Rotation, Translation, Value
+from trihedron.pipeline.core.graph import Graph
+from trihedron.pipeline.core.types import F64, Map, Pose, Rotation, Translation, Value
 from trihedron.pipeline.record.reader import Recording
-from trihedron.pipeline.record.trajectories import attached_truth
+from trihedron.pipeline.record.trajectories import attached_truth, read_trajectory
 from trihedron.pipeline.record.writer import RecordingWriter
-from trihedron.pipeline.run.metrics import MAX_DIFFERENCE_NS
+from trihedron.pipeline.run.metrics import MAX_DIFFERENCE_NS, frame_errors
+from trihedron.pipeline.sweep.search import followers
 from trihedron.tools.arguments import Parser, table
+from trihedron.tools.true_map import true_map
+from trihedron.tools.verdicts import TOO_SHORT, Column, Sample, verdicts_of
 
-EXACT = 1e-12  # variance of what is true, m² and rad²; positive, so that it can be inverted
+ATE = "ate_rmse_m"
 ROWS = ((), ("rotation",), ("translation",), ("rotation", "translation"), ("map",), ("rotation", "translation", "map"))
-LOOP = ("relocalise", "matches", "pose", "map", "bundle", "loop")  # corrections are of one map only: whoever changes it adjusts it again
-AFTER = {"rotation": ("translation", *LOOP), "translation": LOOP, "map": ("relocalise", "matches", "pose")}
 
 
 @dataclass(frozen=True)
@@ -45,42 +58,90 @@ class Truth:
         T = self.poses.get(value.stamp_ns)
         if not isinstance(value, Rotation) or T is None:
             return value
-        return replace(value, R_world_camera=T[:3, :3].copy(), covariance=EXACT * np.eye(3))
+        return replace(value, R_world_camera=T[:3, :3].copy())
 
     def translation(self, value: Value) -> Value:
         """The frame's Translation as it should have been."""
         T = self.poses.get(value.stamp_ns)
         if not isinstance(value, Translation) or T is None:
             return value
-        return replace(value, t_world_camera=T[:3, 3].copy(), covariance=EXACT * np.eye(3), unobservable=np.empty((0, 3)), estimated=True)
+        return replace(value, t_world_camera=T[:3, 3].copy(), unobservable=np.empty((0, 3)), estimated=True)
 
-    def pose(self, value: Value) -> Value:
-        """The frame's Pose as it should have been."""
-        T = self.poses.get(value.stamp_ns)
-        if not isinstance(value, Pose) or T is None:
-            return value
-        return replace(value, T_world_camera=T, covariance=EXACT * np.eye(6), T_reference_camera=T, reference=-1, status=OK)
+    def map(self, value: Value) -> Value:
+        """The Map as it should have been, with the same rows."""
+        return true_map(value, self.poses) if isinstance(value, Map) else value
+
+
+@dataclass(frozen=True)
+class Rerun:
+    """Final metrics of a replay, and the errors of its frames (n,) by their names in the metrics; both empty where fewer than 3 poses have truth."""
+
+    metrics: dict[str, Any]
+    errors: dict[str, F64]
 
 
 def main(argv: list[str]) -> int:
     """Print the table; returns the exit code. Raises DataError for a recording without poses or truth, StageError when a replay fails."""
     parser = Parser("error-budget", __name__)
     parser.add_argument("recording", metavar="RUN.mcap", type=Path, help="of a run whose data set has ground truth")
-    found = budget(Recording(parser.parse_args(argv).recording))
+    found = reruns(Recording(parser.parse_args(argv).recording))
     rows: list[list[str]] = [["true", "ATE RMSE (m)", "× whole", "RPE over 1 s (m)", "(deg)"]]
-    whole = found[()]["ate_rmse_m"]
-    for stages, metrics in found.items():
-        errors = [f"{metrics[key]:.4f}" if metrics[key] is not None else "-" for key in ("rpe_second_rmse_m", "rpe_second_rmse_deg")]
-        rows.append([" + ".join(stages) or "nothing", f"{metrics['ate_rmse_m']:.4f}", f"{metrics['ate_rmse_m'] / whole:.2f}", *errors])
+    whole = found[()].metrics.get(ATE) or np.nan
+    for stages, one in found.items():
+        ate, *relative = (_number(one.metrics.get(key)) for key in (ATE, "rpe_second_rmse_m", "rpe_second_rmse_deg"))
+        share = (one.metrics.get(ATE) or 0.0) / whole if ATE in one.metrics else np.nan
+        rows.append([named(stages), ate, f"{share:.2f}" if np.isfinite(share) else "-", *relative])
     print(table(rows, "lrrrr"))
+    for sentence in remarks(found):
+        print(sentence)
     return 0
+
+
+def _number(value: float | None) -> str:
+    return "-" if value is None else f"{value:.4f}"
+
+
+def named(stages: tuple[str, ...]) -> str:
+    """Return the name of a row."""
+    return " + ".join(stages) or "nothing"
 
 
 def budget(recording: Recording) -> dict[tuple[str, ...], dict[str, Any]]:
     """Return the final metrics with each row of stages replaced by the truth, beginning with none. Raises DataError, StageError."""
+    return {stages: one.metrics for stages, one in reruns(recording).items()}
+
+
+def reruns(recording: Recording) -> dict[tuple[str, ...], Rerun]:
+    """Return the replay with each row of stages replaced by the truth, beginning with none. Raises DataError, StageError."""
     truth = true_poses(recording)
     with tempfile.TemporaryDirectory() as folder:
         return {stages: rerun(recording, truth, stages, Path(folder)) for stages in ROWS if recording.topics.issuperset(stages)}
+
+
+def remarks(found: Mapping[tuple[str, ...], Rerun]) -> list[str]:
+    """Return sentences on the rows whose ATE is not comparable with that of the whole run, or differs from it by no more than chance."""
+    whole = found[()]
+    second = int(whole.metrics.get("rpe_second_frames") or 1)
+    samples = {stages: Sample({}, {"ATE m": one.errors[ATE]}, second) for stages, one in found.items() if ATE in one.errors}
+    pairs = {("", named(stages)): [(samples[()], sample)] for stages, sample in samples.items() if stages and () in samples}
+    verdicts = verdicts_of(pairs, {"ATE m": Column(4)})
+    frames = whole.metrics.get("poses_with_truth", 0)
+    fewer = [named(stages) for stages, one in found.items() if one.metrics.get("poses_with_truth", 0) < frames]
+    short = [one.second for one in verdicts if one.answer == TOO_SHORT]
+    equal = [one.second for one in verdicts if one.answer not in (TOO_SHORT, "better", "worse")]
+    rows = len(found) - 1
+    sentences = []
+    if fewer:
+        sentences.append(f"These rows track fewer than the whole run's {frames} poses, so that their errors are not comparable: {', '.join(fewer)}.")
+    if len(short) == rows:
+        sentences.append(f"{frames} poses are too few to tell any row from the whole run.")
+    elif short:
+        sentences.append(f"{frames} poses are too few to tell these rows from the whole run: {', '.join(short)}.")
+    if len(equal) == rows:
+        sentences.append(f"No row differs from the whole run by more than its noise over {frames} poses.")
+    elif equal:
+        sentences.append(f"These rows differ from the whole run by no more than its noise over {frames} poses: {', '.join(equal)}.")
+    return sentences
 
 
 def true_poses(recording: Recording) -> Truth:
@@ -99,40 +160,58 @@ def true_poses(recording: Recording) -> Truth:
     return Truth({poses[row].stamp_ns: T @ pose for (row, _), pose in zip(pairs, true)})
 
 
-def rerun(recording: Recording, truth: Truth, stages: tuple[str, ...], folder: Path) -> dict[str, Any]:
-    """Final metrics of a replay in which the topics of `stages` are true."""
-    source, changed = folder / "source.mcap", {name: getattr(truth, name) for name in stages if name != "map"}
-    if "map" in stages:
-        rewrite(recording, source, {"pose": truth.pose})
-        correctors = [stage for stage in ("bundle", "loop") if stage in recording.topics]
-        replayed(source, ("map", *correctors), folder / "map", *(f"{stage}=none" for stage in correctors))
-        changed["map"] = dict(enumerate(Recording(folder / "map" / "run.mcap").values("map")))
-    rewrite(recording, source, changed)
-    first = min(stages, key=list(AFTER).index, default="rotation")
-    again = [stage for stage in AFTER[first] if stage not in stages and stage in recording.topics]
-    return replayed(source, tuple(again), folder / "run")
+def rerun(recording: Recording, truth: Truth, stages: tuple[str, ...], folder: Path) -> Rerun:
+    """Replay with the topics of `stages` true."""
+    source, out = folder / "source.mcap", folder / "run"
+    rewrite(recording, source, {name: getattr(truth, name) for name in stages})
+    metrics = replayed(source, recomputed(recording, stages), out)
+    reference = attached_truth(recording.attachments, str(recording.path))
+    if reference is None or not metrics:
+        return Rerun({}, {})
+    stamps = np.array([pose.stamp_ns for pose in recording.values("pose")], np.int64)
+    estimate = read_trajectory(out / "trajectory.txt")
+    return Rerun(metrics, frame_errors(estimate, reference, float(metrics["rpe_second_frames"]), stamps))
 
 
-def rewrite(recording: Recording, path: Path, changed: dict[str, Any]) -> None:
-    """Copy the recording's topics, those in `changed` through the function given there, or replaced by the values given there."""
+def recomputed(recording: Recording, stages: tuple[str, ...]) -> tuple[str, ...]:
+    """Return the stages that depend on one of these, over any number of wires, without these; of none, those of the first row."""
+    graph = graph_of(composed_run(recording))
+    first = [stage for stage in stages or ("rotation",) if stage in graph.stages]
+    found = needed_for_pose(graph, frozenset(stages))
+    return tuple(stage for stage in followers(graph, first) if stage not in stages and stage in found)
+
+
+def needed_for_pose(graph: Graph, given: frozenset[str]) -> frozenset[str]:
+    """Return the stages from which the pose is computed, over any number of wires, when those `given` are not computed."""
+    found: set[str] = set()
+    pending = ["pose", "map"]
+    while pending:
+        name = pending.pop()
+        if name in graph.stages and name not in found and name not in given:
+            found.add(name)
+            pending += [wire.topic for wire in graph.stages[name].inputs.values()]
+    return frozenset(found)
+
+
+def rewrite(recording: Recording, path: Path, changed: Mapping[str, Callable[[Value], Value]]) -> None:
+    """Copy the recording's topics, those in `changed` through the function given there."""
     writer = RecordingWriter(path, {name: text for name, text in recording.metadata.items() if name != "format"})
     for name, text in recording.attachments.items():
         writer.attach(name, text)
     for topic in sorted(recording.topics):
-        change: Callable[[Value], Value] | dict[int, Value] = changed.get(topic, lambda value: value)
-        for value in change.values() if isinstance(change, dict) else map(change, recording.values(topic)):
+        for value in map(changed.get(topic, lambda value: value), recording.values(topic)):
             writer.write(topic, value)
     writer.close()
 
 
-def replayed(source: Path, stages: tuple[str, ...], out: Path, *overrides: str) -> dict[str, Any]:
-    """Run the stages again over the recording, changed by `overrides`; the final metrics, empty when no pose is among them."""
+def replayed(source: Path, stages: tuple[str, ...], out: Path) -> dict[str, Any]:
+    """Run the stages again over the recording; the final metrics."""
     from trihedron.pipeline.app.cli import main as trihedron
 
     printed = io.StringIO()
     with contextlib.redirect_stdout(printed), contextlib.redirect_stderr(printed):
-        code = trihedron(["run", f"replay={source}", f"only=[{','.join(stages)}]", f"out={out}", *overrides])
+        code = trihedron(["run", f"replay={source}", f"only=[{','.join(stages)}]", f"out={out}"])
     if code:
         raise StageError(f"replay of {', '.join(stages)}", (printed.getvalue().strip().splitlines() or ["failed"])[-1], "run it alone to see more")
-    metrics: dict[str, Any] = json.loads((out / "metrics.json").read_text())["final"] if "pose" in stages else {}
+    metrics: dict[str, Any] = json.loads((out / "metrics.json").read_text()).get("final") or {}
     return metrics

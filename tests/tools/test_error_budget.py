@@ -1,10 +1,18 @@
 """The error budget on runs whose budget is known."""
 
 import json
+from dataclasses import dataclass, replace
 
+import numpy as np
 import pytest
 
 from trihedron.pipeline.app.cli import main
+from trihedron.pipeline.core import registry
+from trihedron.pipeline.core.geometry import tangent_basis
+from trihedron.pipeline.core.types import Camera, Frame, Keypoints, Map, Normals, Planes, Pose, Rotation, Segments, Tracks, Translation
+from trihedron.plugins.planes.connected_components import ConnectedComponents
+from trihedron.plugins.translation.levenberg_marquardt import LevenbergMarquardt
+from trihedron.tools.error_budget import Rerun, remarks
 
 ROOM = ["dataset.length=14", "dataset.width=320", "dataset.height=240", "threads=1"]
 
@@ -13,7 +21,7 @@ def budget(path, capsys):
     """Row -> ATE."""
     capsys.readouterr()
     assert main(["error-budget", str(path)]) == 0
-    rows = [line.rsplit(maxsplit=4) for line in capsys.readouterr().out.strip().splitlines()[1:]]
+    rows = [line.rsplit(maxsplit=4) for line in capsys.readouterr().out.strip().splitlines()[1:] if not line.endswith(".")]
     return {row[0].strip(): float(row[1]) for row in rows}
 
 
@@ -49,3 +57,96 @@ def test_what_it_cannot_judge(tmp_path, capsys, overrides, message):
     capsys.readouterr()
     assert main(["error-budget", str(path)]) == 1
     assert capsys.readouterr().err == f"trihedron: {path}: {message}\n"
+
+
+def reruns(**errors):
+    """The whole run and rows, by the names of their stages, with these errors (n,) of frames, in metres."""
+    every = {(): errors.pop("whole"), **{tuple(name.split("_and_")): values for name, values in errors.items()}}
+    return {
+        stages: Rerun(
+            {"ate_rmse_m": float(np.sqrt(np.nanmean(values**2))), "rpe_second_frames": 30, "poses_with_truth": int(np.isfinite(values).sum())},
+            {"ate_rmse_m": values},
+        )
+        for stages, values in every.items()
+    }
+
+
+def test_rows_within_the_noise_are_named_below_the_table():
+    rng = np.random.default_rng(0)
+    whole, other = rng.uniform(0.5e-2, 1.5e-2, (2, 600))
+    assert remarks(reruns(whole=whole, map=0.5 * whole)) == []
+    assert remarks(reruns(whole=whole, rotation=other, map=0.5 * whole, rotation_and_map=whole)) == [
+        "These rows differ from the whole run by no more than its noise over 600 poses: rotation, rotation + map."
+    ]
+    assert remarks(reruns(whole=whole, rotation=other)) == ["No row differs from the whole run by more than its noise over 600 poses."]
+
+
+def test_too_few_poses_are_stated_below_the_table():
+    whole = np.random.default_rng(0).uniform(0.5e-2, 1.5e-2, 60)
+    assert remarks(reruns(whole=whole, rotation=0.5 * whole, map=0.9 * whole)) == ["60 poses are too few to tell any row from the whole run."]
+
+
+def test_rows_that_track_fewer_poses_are_named_below_the_table():
+    whole = np.random.default_rng(0).uniform(0.5e-2, 1.5e-2, 600)
+    lost = np.where(np.arange(600) < 400, 0.5 * whole, np.nan)
+    assert remarks(reruns(whole=whole, map=lost)) == [
+        "These rows track fewer than the whole run's 600 poses, so that their errors are not comparable: map."
+    ]
+
+
+@dataclass(frozen=True)
+class WrongSign:
+    """The default translation with the camera's motion the wrong way round."""
+
+    def __call__(
+        self, camera: Camera, rotation: Rotation, tracks: Tracks | None, keypoints: Keypoints, segments: Segments, planes: Planes,
+        previous_pose: Pose | None, earlier_pose: Pose | None, map: Map | None,
+    ) -> Translation:  # fmt: skip
+        found = LevenbergMarquardt()(camera, rotation, tracks, keypoints, segments, planes, previous_pose, earlier_pose, map)
+        if previous_pose is None:
+            return found
+        return replace(found, t_world_camera=2.0 * previous_pose.T_world_camera[:3, 3] - found.t_world_camera)
+
+
+@dataclass(frozen=True)
+class NoisyPlanes:
+    """The default planes with ten times the noise of their distance and normal."""
+
+    def __call__(self, frame: Frame, normals: Normals, rng: np.random.Generator) -> Planes:
+        found = ConnectedComponents()(frame, normals)
+        planes = found.coefficients.copy()
+        noise = np.array([rng.multivariate_normal(np.zeros(3), 100.0 * one) for one in found.covariance]).reshape(-1, 3)
+        planes[:, :3] += np.einsum("nij,nj->ni", tangent_basis(planes[:, :3]), noise[:, :2])
+        planes[:, :3] /= np.linalg.norm(planes[:, :3], axis=1)[:, None]
+        planes[:, 3] = np.maximum(planes[:, 3] + noise[:, 2], 0.0)
+        return replace(found, coefficients=planes)
+
+
+@pytest.fixture
+def faulty(monkeypatch):
+    """Plugins with a known fault, for the length of a test."""
+    registry.load_plugins()  # before the copy, which is discarded with all that is registered in it
+    monkeypatch.setattr(registry, "_PLUGINS", {slot: dict(plugins) for slot, plugins in registry._PLUGINS.items()})
+    registry.register("translation", "wrong_sign")(WrongSign)
+    registry.register("planes", "noisy")(NoisyPlanes)
+
+
+@pytest.mark.slow
+def test_a_wrong_sign_in_translation_disappears_with_the_true_translation(tmp_path, capsys, faulty):
+    words = ["graph=structural_no_refine", "translation=wrong_sign", *ROOM]
+    assert main(["run", *words, f"out={tmp_path}/run"]) == 0
+    found = budget(tmp_path / "run" / "run.mcap", capsys)
+    assert found["translation"] < 0.2 * found["nothing"] and found["rotation"] > 0.5 * found["nothing"]
+    assert min(("rotation", "translation"), key=found.get) == "translation"
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(900)
+def test_noise_of_planes_is_attributed_to_planes(tmp_path, faulty):
+    assert main(["run", "graph=structural_no_refine", "dataset.texture=false", *ROOM, f"out={tmp_path}/run"]) == 0
+    words = ["planes=noisy", "manhattan=plane_svd", "translation.motion_sigma_m=0.2"]
+    command = ["ablate", f"{tmp_path}/run/run.mcap", *words, f"out={tmp_path}/ablation", "threads=1", f"--json={tmp_path}/found.json"]
+    assert main(command) == 0
+    attribution = json.loads((tmp_path / "found.json").read_text())["attribution"]
+    shares = {one["stage"]: abs(one["mean"]) for one in attribution if one["figure"] == "RPE 1 frame mm" and one["stage"]}
+    assert set(shares) == {"planes", "manhattan", "translation"} and max(shares, key=shares.get) == "planes"
