@@ -1,5 +1,6 @@
 """Tests compile what they call; none fills the cache for the whole default graph first. Runs draw no picture, and skips are accounted for."""
 
+import gc
 import os
 import sys
 from pathlib import Path
@@ -22,6 +23,14 @@ def no_pictures():
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(results, "trajectory_figure", lambda estimate, truth, path, status=(): path.touch())
         yield
+
+
+@pytest.fixture(scope="module", autouse=True)
+def modules_are_left_out_of_collections():
+    """A run collects garbage when it starts, to measure its own peak of memory. What is there before the tests of a file, mostly
+    modules of libraries, lives as long as the process; to look through it each time takes longer than to start the run."""
+    gc.collect()
+    gc.freeze()
 
 
 def pytest_itemcollected(item):

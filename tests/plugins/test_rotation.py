@@ -41,7 +41,7 @@ class Run:
     def __init__(self, room, seed=0, plugin=None, path=wobble, **kinds):
         axes = exp_so3(np.random.default_rng(seed + 100).normal(0, 1, 3))
         self.world, self.rng, self.path, self.kinds = room(seed, axes=axes), np.random.default_rng(seed), path, kinds
-        self.plugin = DriftFree() if plugin is None else plugin
+        self.plugin, self.track = DriftFree() if plugin is None else plugin, Projection()
         self.index, self.before, self.tracks, self.previous, self.pose = -1, (None, None, None), None, None, None
 
     def step(self, manhattan=True, tracked=True, **how):
@@ -50,7 +50,7 @@ class Run:
         now = self.world.see(T, i, self.rng, **self.kinds)
         frame = Frame(i, i * 33_000_000, np.zeros((2, 2, 3), np.uint8), np.zeros((2, 2), np.float32), self.world.camera)
         rng = np.random.default_rng(self.index)
-        self.tracks = Projection()(frame.camera, *now, *self.before, None, None, self.tracks, rng) if tracked else None
+        self.tracks = self.track(frame.camera, *now, *self.before, None, None, self.tracks, rng) if tracked else None
         given = {"manhattan": self.world.manhattan(T[:3, :3], i, self.rng, **how) if manhattan else None, "tracks": self.tracks}
         given |= {"keypoints": now[0], "segments": now[1], "planes": now[2], "previous": self.previous, "previous_pose": self.pose, "map": None}
         wanted = type(self.plugin).__call__.__annotations__
