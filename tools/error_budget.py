@@ -7,8 +7,7 @@ Each row replays the recording: the stages it names are true, every stage that d
 - `map`: keyframes have their true poses, and landmarks move with the keyframes that observed them (`true_map`). The rows of the map, what it holds
   when, and the noise of its measurements are as recorded. The poses are found in it anew.
 
-Covariances stay as the stage stated them, so that gates and weights do: a measured ground truth has errors too, and whoever takes it to be exact
-gains a worse pose.
+Covariances stay as the stages stated them, so that gates and weights do too: a measured ground truth is not exact.
 
 What disappears with a row is the error that enters through that stage; what remains with all of them is that of the refinement on single frames.
 
