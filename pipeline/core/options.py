@@ -12,7 +12,6 @@ import re
 from abc import abstractmethod
 from contextlib import suppress
 from dataclasses import dataclass, fields
-from functools import cache
 from itertools import pairwise
 from typing import Annotated, Any, get_type_hints
 
@@ -103,12 +102,16 @@ PositiveShare = Annotated[float, Range(above=0, high=1)]
 AcuteDeg = Annotated[float, Range(above=0, below=90)]  # an angle between directions without sign
 
 
-@cache
+_CONSTRAINTS: dict[type[Any], dict[str, tuple[Constraint, ...]]] = {}
+
+
 def constraints_of(plugin: type[Any]) -> dict[str, tuple[Constraint, ...]]:
     """Return option -> its constraints, for the options of a dataclass that have any; read once, because each construction of a plugin asks."""
-    hints = get_type_hints(plugin, include_extras=True)
-    declared = {f.name: tuple(e for e in getattr(hints[f.name], "__metadata__", ()) if isinstance(e, Constraint)) for f in fields(plugin)}
-    return {name: constraints for name, constraints in declared.items() if constraints}
+    if plugin not in _CONSTRAINTS:
+        hints = get_type_hints(plugin, include_extras=True)
+        declared = {f.name: tuple(e for e in getattr(hints[f.name], "__metadata__", ()) if isinstance(e, Constraint)) for f in fields(plugin)}
+        _CONSTRAINTS[plugin] = {name: constraints for name, constraints in declared.items() if constraints}
+    return _CONSTRAINTS[plugin]
 
 
 def check_options(plugin: Any) -> None:

@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import inspect
 import re
+from collections.abc import Mapping
 from functools import cache
 from typing import Annotated, Any, Generic, Protocol, TypeVar, get_type_hints, runtime_checkable
 
@@ -304,7 +305,8 @@ def method_of(slot: str) -> str:
     return "add" if slot in FOLDS else "__call__"
 
 
-def inputs_of(slot: str) -> dict[str, Any]:
+@cache
+def inputs_of(slot: str) -> Mapping[str, Any]:
     """Return parameter name -> type of a slot's inputs (without self, a fold's state or a data set's index)."""
     hints = get_type_hints(getattr(SLOTS[slot], method_of(slot)))
     return {name: hint for name, hint in hints.items() if name not in ("state", "index", "return")}
