@@ -1,4 +1,4 @@
-"""What single stages do wrong, frame by frame, judged by known poses of the camera: each slot's own measure, for the open loop of `trihedron ablate`.
+"""Errors of single stages, frame by frame, by known poses of the camera: the measure of each slot, for the open loop of `trihedron ablate`.
 
 A measure compares what a stage says of a frame with what it, or its inputs, said of the frame before, moved by the motion between the two. So it
 needs no labelled scene, and later stages hide nothing. All measures are errors: less is better, 0 is perfect; over frames their root mean square

@@ -54,9 +54,9 @@ def mean_motions(table: Table, ids: I32, motions: F64) -> F64:
 
     Applied to a point this is the mean of where the motions take it. Its rotation is shortened by what the motions differ in, squared."""
     observers, first = table.gathered(ids, "observers", "first")
-    seen = np.asarray(observers >= 0)
+    seen = observers >= 0
     observers = np.where(seen, observers, first[:, None])
-    weights = np.where(seen.any(axis=1)[:, None], seen, 1.0)
+    weights = np.where(seen.any(axis=1, keepdims=True), seen, 1.0)
     return np.asarray(np.einsum("nk,nkij->nij", weights / weights.sum(axis=1)[:, None], motions[observers]))
 
 
