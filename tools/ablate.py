@@ -132,7 +132,7 @@ def ablate(options: Options) -> list[Case]:
             folders = [options.out / folder_name(prefix, combination) for combination in combinations]
             case = _computed(computing, combinations, folders)
             if options.budget:
-                case.budget = _budget(recording)
+                case.budget, case.remarks = _budget(recording)
             write_errors(file, [variant.errors for variant in case.variants])
         cases.append(case)
         keys.append(key)
@@ -231,16 +231,16 @@ def _errors(final: Mapping[str, Any]) -> dict[str, float]:
     return {name: factor * final[key] if final.get(key) is not None else np.nan for name, (key, factor) in ERRORS.items()}
 
 
-def _budget(recording: Recording) -> dict[str, dict[str, float]]:
-    """Errors with the truth in the place of stages, by their names; empty where the recording cannot be judged."""
-    from trihedron.tools.error_budget import budget
+def _budget(recording: Recording) -> tuple[dict[str, dict[str, float]], list[str]]:
+    """Errors with the truth in the place of stages, by their names, and sentences on those that mean nothing; empty where it cannot be judged."""
+    from trihedron.tools.error_budget import remarks, reruns
 
     try:
-        rows = budget(recording)
+        found = reruns(recording)
     except TrihedronError as error:
         print(f"no error budget: {error}", file=sys.stderr)
-        return {}
-    return {" + ".join(stages): _errors(row) for stages, row in rows.items()}
+        return {}, []
+    return {" + ".join(stages): _errors(one.metrics) for stages, one in found.items()}, remarks(found)
 
 
 def _draw_farthest(cases: Sequence[Case]) -> None:

@@ -69,6 +69,7 @@ class Case:
     variants: list[Variant]
     changed: Parting = field(default_factory=Parting)  # of what the recorded configuration computes now, from the recorded values
     budget: dict[str, dict[str, float]] = field(default_factory=dict)
+    remarks: list[str] = field(default_factory=list)  # sentences on rows of the budget that mean nothing
     fps: float = 30.0
     true: bool = True  # the poses by which single stages are measured are the ground truth, not those of the recorded run
 
@@ -259,7 +260,8 @@ def attribution_table(cases: Sequence[Case]) -> Section:
         if stages:
             rows.append([f"truth in the place of {stages}", *(number(n, figures.get(n, np.nan) - whole.get(n, np.nan), True) for n in columns)])
     interval = f"± half the {100 * CONFIDENCE:.0f} % interval over {len(cases)} recordings" if len(cases) > 1 else "one recording: no interval"
-    return Section("Attribution: Shapley value of each swap", [["swap", *columns], *rows], "l" + "r" * len(columns), f"Differences; {interval}")
+    note = "\n".join([f"Differences; {interval}", *(f"Truth: {sentence}" for case in cases if len(cases) == 1 for sentence in case.remarks)])
+    return Section("Attribution: Shapley value of each swap", [["swap", *columns], *rows], "l" + "r" * len(columns), note)
 
 
 def parting_table(cases: Sequence[Case]) -> Section:

@@ -105,11 +105,6 @@ def named(stages: tuple[str, ...]) -> str:
     return " + ".join(stages) or "nothing"
 
 
-def budget(recording: Recording) -> dict[tuple[str, ...], dict[str, Any]]:
-    """Return the final metrics with each row of stages replaced by the truth, beginning with none. Raises DataError, StageError."""
-    return {stages: one.metrics for stages, one in reruns(recording).items()}
-
-
 def reruns(recording: Recording) -> dict[tuple[str, ...], Rerun]:
     """Return the replay with each row of stages replaced by the truth, beginning with none. Raises DataError, StageError."""
     truth = true_poses(recording)

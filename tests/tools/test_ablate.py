@@ -25,6 +25,7 @@ from trihedron.tools.ablation_tables import (
     as_markdown,
     as_text,
     attribution,
+    attribution_table,
     case_from_dict,
     case_to_dict,
     lines_of,
@@ -136,6 +137,13 @@ def test_without_ground_truth_a_line_says_what_single_stages_are_measured_by():
     line = "there is no ground truth: single stages are measured by the poses of the recorded run, which is agreement with it and no error"
     assert line not in alternatives_table([found]).note
     assert alternatives_table([replace(found, true=False)]).note.splitlines()[-1] == line
+
+
+def test_remarks_on_the_truth_stand_below_the_attribution():
+    found = replace(case(0, [1.0, 2.0, 3.0, 4.0]), budget={"": {"ATE mm": 1.0}, "map": {"ATE mm": 0.9}}, remarks=["10 poses are too few."])
+    section = attribution_table([case_from_dict(case_to_dict(found))])
+    assert section.rows[-1][:2] == ["truth in the place of map", "-0.10"]
+    assert section.note == "Differences; one recording: no interval\nTruth: 10 poses are too few."
 
 
 def test_errors_of_a_stage_alone():
