@@ -13,6 +13,7 @@ part, with a picture of the worst frame; the cost.
 The same command again computes only what is missing.
 
 Example: trihedron ablate runs/a/run.mcap manhattan=mean_shift,plane_svd rotation=drift_free,procrustes out=runs/ablation
+Example: trihedron ablate runs/a/run.mcap 'manhattan=*' feedback=recorded out=runs/axes
 Example: trihedron ablate runs/seeds/*/run.mcap planes.angle_deg=2,3 bundle=none out=runs/ablation --markdown table.md
 """
 
@@ -70,7 +71,7 @@ class Options:
 def main(argv: list[str]) -> int:
     """Run the command; returns the exit code. Raises TrihedronError, one line."""
     parser = Parser("ablate", __name__)
-    parser.add_argument("words", nargs="+", metavar="RUN.mcap|SWAP", help="recordings; STAGE=PLUGIN,... or STAGE.OPTION=VALUE,...; out=DIR")
+    parser.add_argument("words", nargs="+", metavar="RUN.mcap|SWAP", help="recordings; STAGE=PLUGIN,..., STAGE=*, STAGE.OPTION=VALUE,...; out=DIR")
     parser.add_argument("--budget", action="store_true", help="of a single recording: the truth in the place of stages too, which takes six replays")
     parser.add_argument("--json", type=Path, metavar="FILE", help="write figures and tables there too")
     parser.add_argument("--markdown", type=Path, metavar="FILE", help="write the tables there too")

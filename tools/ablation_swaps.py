@@ -15,6 +15,7 @@ from trihedron.pipeline.core.config import rewritten
 from trihedron.pipeline.core.errors import DataError, UsageError, did_you_mean
 from trihedron.pipeline.core.slots import SLOTS
 from trihedron.pipeline.record.reader import Recording
+from trihedron.pipeline.sweep.sweep import plugins_alone
 
 MOST = 64  # alternatives of one recording, which are all in memory
 AS_RECORDED = "as recorded"
@@ -81,7 +82,9 @@ def _stage_of(word: str) -> str:
 
 
 def _values_of(word: str) -> tuple[str, list[str]]:
-    """Key and values of a word, as Hydra reads them."""
+    """Key and values of a word, as Hydra reads them; `SLOT=*` has all plugins of the slot that can be chosen with nothing else."""
+    if word.endswith("=*") and word[:-2] in SLOTS:
+        return word[:-2], plugins_alone(word[:-2])
     try:
         override = OverridesParser.create().parse_override(word)
     except OverrideParseException as error:

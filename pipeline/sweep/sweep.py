@@ -225,14 +225,15 @@ def words_of_alternatives(texts: Sequence[str]) -> list[Overrides]:
         if "=" in slot or slot not in SLOTS:
             found.append(with_literal_paths([slot, *rest]))
             continue
-        load_plugins()
-        names = [
-            name
-            for name, plugin in plugins_of(slot).items()
-            if name != "none" and not hasattr(plugin, "needs") and not any(option.name == "model" for option in options_of(plugin))
-        ]
-        found += [[f"{slot}={name}", *with_literal_paths(rest)] for name in names]
+        found += [[f"{slot}={name}", *with_literal_paths(rest)] for name in plugins_alone(slot)]
     return found
+
+
+def plugins_alone(slot: str) -> list[str]:
+    """Return the names of a slot's plugins that can be chosen with nothing else: all but `none` and those that need a file or another stage."""
+    load_plugins()
+    named = {name: plugin for name, plugin in plugins_of(slot).items() if name != "none" and not hasattr(plugin, "needs")}
+    return [name for name, plugin in named.items() if not any(option.name == "model" for option in options_of(plugin))]
 
 
 def _numbers(folder: Path, jobs: Sequence[Overrides]) -> list[int]:

@@ -122,6 +122,14 @@ def translation(index, x):
     return Translation(index, 1000 * index, np.array([x, 0.0, 0.0]), np.eye(3), np.empty((0, 3)), np.zeros(3, np.int32), True)
 
 
+def test_a_star_stands_for_all_plugins_that_can_be_chosen_alone():
+    (swap,) = parsed(["pose=*"])
+    names = {word.partition("=")[2] for (word,) in swap.levels[1:]}
+    assert {"refine", "direct", "open3d_icp"} <= names and not {"icp", "none"} & names  # icp needs a model
+    (swap,) = parsed(["lines=*"])
+    assert ("lines=onnx",) not in swap.levels  # which needs a file
+
+
 def test_where_two_variants_part():
     parting = Parting()
     for index, apart in enumerate((0.0, 0.0, 0.002, 0.005, 0.001)):

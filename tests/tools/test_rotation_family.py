@@ -74,6 +74,17 @@ def test_residuals_know_no_names_of_axes():
     assert np.allclose(residuals_deg(turned, R), [0.0, 2.0, 30.0], atol=1e-5)
 
 
+def test_alternatives_of_an_ablation_are_drawn_too(tmp_path, capsys):
+    """In a corridor, whose walk a configuration of plain words cannot name."""
+    words = ["dataset.scene=corridor", "dataset.texture=false", "dataset.length=4", "dataset.width=160", "dataset.height=120"]
+    assert main(["run", *words, f"out={tmp_path}/run"]) == 0
+    assert main(["ablate", f"{tmp_path}/run", "manhattan=plane_svd", "feedback=recorded", f"out={tmp_path}/axes"]) == 0
+    capsys.readouterr()
+    assert main(["benchmark", "rotations", f"{tmp_path}/axes"]) == 0
+    assert "\nmean_shift " in (said := capsys.readouterr().out) and "\nplane_svd " in said
+    assert (tmp_path / "axes" / "rotation_error.png").is_file() and list((tmp_path / "axes").glob("sphere_*.png"))
+
+
 @pytest.mark.slow
 def test_every_registered_estimator_takes_part(recording, tmp_path, capsys):
     assert main(["run", "-m", "experiment=rotation_family", f"replay={recording}", f"out={tmp_path}"]) == 0

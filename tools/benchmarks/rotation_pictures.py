@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from omegaconf import OmegaConf
 
 from trihedron.pipeline.core.errors import TrihedronError
 from trihedron.pipeline.core.lie import rotation_angle_deg
@@ -137,12 +136,11 @@ def _features(recording: Recording, frame: int) -> dict[str, Any]:
 
 def _normals_again(recording: Recording, frame: int) -> Normals | None:
     """By the recording's own normals plugin from its data set; None where that is not at hand."""
+    from trihedron.pipeline.app.recorded_run import composed_run
     from trihedron.pipeline.core.config import make_plugin
-    from trihedron.pipeline.core.registry import load_plugins
 
-    load_plugins()
-    config: Any = OmegaConf.create(comparison.config_of(recording))
     try:
+        config = composed_run(recording)
         dataset = make_plugin("dataset", config.dataset)
         first = dataset(0)
         image = dataset(frame - first.index) if first is not None else None
