@@ -176,7 +176,8 @@ def _computed(computing: Alternatives, combinations: Sequence[Combination], fold
     """Compute all alternatives of a recording."""
     recording, graphs = computing.recording, [alternative.graph for alternative in computing.alternatives]
     topics = [name for name in graphs[0].stages if name in computing.stages]
-    known, true = reference_of(recording)
+    alone = computing.feedback is Feedback.recorded
+    known, true = reference_of(recording) if alone else ({}, True)
     errors, partings = [StageErrors(known) for _ in folders], [Parting() for _ in folders]
     recorded = RecordedValues(recording, topics)
 
@@ -184,14 +185,16 @@ def _computed(computing: Alternatives, combinations: Sequence[Combination], fold
         recorded.compare(index, values[0])
         for one, parting, found in zip(values, partings, errors):
             parting.compare(index, topics, values[0], one)
-            found.take(topics if computing.feedback is Feedback.recorded else (), one)
+            found.take(topics if alone else (), one)
 
     computing.run(folders, on_frame)
-    figures = [_figures(outcome, found, computing.feedback) for outcome, found in zip(computing.outcomes, errors)]
+    of_stages = [found.of_frames() for found in errors]
+    own = [found.figures(of_frames) if alone else {} for found, of_frames in zip(errors, of_stages)]
+    figures = [{**_figures(outcome), **of_stage} for outcome, of_stage in zip(computing.outcomes, own)]
     reference = attached_truth(recording.attachments, str(recording.path))
     judged = [
-        {**(of_trajectory(runner.result, reference, ERRORS) if outcome.metrics.get("final") else {}), **found.of_frames()}
-        for runner, outcome, found in zip(computing.runners, computing.outcomes, errors)
+        {**(of_trajectory(runner.result, reference, ERRORS) if outcome.metrics.get("final") else {}), **of_frames}
+        for runner, outcome, of_frames in zip(computing.runners, computing.outcomes, of_stages)
     ]
     full_s = read_results(recording.path.parent / "timing.json").get("cpu_s")
     variants = [
@@ -216,7 +219,7 @@ def _computed(computing: Alternatives, combinations: Sequence[Combination], fold
     return case
 
 
-def _figures(outcome: Outcome, errors: StageErrors, feedback: Feedback) -> dict[str, float]:
+def _figures(outcome: Outcome) -> dict[str, float]:
     """Figures of an alternative by column, NaN where there is none."""
     final, status = outcome.metrics.get("final") or {}, outcome.metrics.get("status") or {}
     figures = _errors(final)
@@ -224,7 +227,7 @@ def _figures(outcome: Outcome, errors: StageErrors, feedback: Feedback) -> dict[
         figures["ok %"] = 100.0 * status["ok"] / max(1, outcome.metrics["frames"])
     if (nees := nees_of(outcome.metrics)) is not None:
         figures[NEES] = nees
-    return {**figures, **(errors.figures() if feedback is Feedback.recorded else {}), "ms": outcome.stage_ms}
+    return {**figures, "ms": outcome.stage_ms}
 
 
 def _errors(final: Mapping[str, Any]) -> dict[str, float]:

@@ -137,9 +137,8 @@ class StageErrors:
         errors = {"axes deg": deviations, "rotation deg": self.rotations_deg, "translation mm": distances, **self.measures}
         return {name: np.array([values.get(frame, np.nan) for frame in range(self.frames)]) for name, values in errors.items() if values}
 
-    def figures(self) -> dict[str, float]:
-        """Return the root mean square of each kind of error, NaN where there is none."""
-        errors = self.of_frames()
+    def figures(self, errors: Mapping[str, F64]) -> dict[str, float]:
+        """Return the root mean square of each kind of error of `of_frames`, NaN where there is none, and the shares of values and of false axes."""
         found = {name: float(np.sqrt(np.nanmean(np.square(errors[name])))) if name in errors else np.nan for name in OPEN_LOOP}
         false = 100.0 * float(np.mean(_from_most_deg(list(self.axes.values())) > FALSE_DEG)) if self.axes else np.nan
         return {**found, "false axes %": false, "values %": 100.0 * self.present / self.seen if self.seen else np.nan}
@@ -157,9 +156,7 @@ def _deviations_deg(axes: Sequence[F64]) -> list[float]:
 def _from_most_deg(axes: Sequence[F64]) -> F64:
     """Angles (n,) of rotations from the one that is nearest to the others, in the sum of angles, so that false ones do not count."""
     alike = np.array(_alike(axes))
-    angles = np.array([rotation_angles_deg(np.swapaxes(alike, 1, 2) @ R) for R in alike])
-    found: F64 = angles[np.argmin(angles.sum(axis=1))]
-    return found
+    return min((rotation_angles_deg(np.swapaxes(alike, 1, 2) @ R) for R in alike), key=np.sum)
 
 
 def _alike(axes: Sequence[F64]) -> list[F64]:

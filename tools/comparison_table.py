@@ -126,8 +126,8 @@ def as_markdown(rows: Sequence[Row], verdicts: Sequence[str] = ()) -> str:
     header, cells = cells_of(rows)
     rule = [":--" if name in ("data", "change", "note") else "--:" for name in header]
     lines = [header, rule, *([f"**{cell.text}**" if cell.best else cell.text.replace("|", "\\|") for cell in row] for row in cells)]
-    told = "".join(f"- {line.replace('|', chr(92) + '|')}\n" for line in verdicts)
-    return told + "\n" * bool(told) + "".join("| " + " | ".join(line) + " |\n" for line in lines)
+    listed = "".join(f"- {line.replace('|', chr(92) + '|')}\n" for line in verdicts)
+    return listed + "\n" * bool(listed) + "".join("| " + " | ".join(line) + " |\n" for line in lines)
 
 
 def as_latex(rows: Sequence[Row], verdicts: Sequence[str] = ()) -> str:

@@ -31,7 +31,6 @@ from trihedron.pipeline.app.recorded_run import composed_run
 from trihedron.pipeline.core.config import graph_of
 from trihedron.pipeline.core.errors import DataError, StageError
 from trihedron.pipeline.core.geometry import nearest_pairs, nearest_rotation
-from trihedron.pipeline.core.graph import Graph
 from trihedron.pipeline.core.types import F64, Map, Pose, Rotation, Translation, Value
 from trihedron.pipeline.record.reader import Recording
 from trihedron.pipeline.record.trajectories import attached_truth, read_trajectory
@@ -171,20 +170,8 @@ def recomputed(recording: Recording, stages: tuple[str, ...]) -> tuple[str, ...]
     """Return the stages that depend on one of these, over any number of wires, without these; of none, those of the first row."""
     graph = graph_of(composed_run(recording))
     first = [stage for stage in stages or ("rotation",) if stage in graph.stages]
-    found = needed_for_pose(graph, frozenset(stages))
+    found = graph.needed([name for name in ("pose", "map") if name in graph.stages], stages)
     return tuple(stage for stage in followers(graph, first) if stage not in stages and stage in found)
-
-
-def needed_for_pose(graph: Graph, given: frozenset[str]) -> frozenset[str]:
-    """Return the stages from which the pose is computed, over any number of wires, when those `given` are not computed."""
-    found: set[str] = set()
-    pending = ["pose", "map"]
-    while pending:
-        name = pending.pop()
-        if name in graph.stages and name not in found and name not in given:
-            found.add(name)
-            pending += [wire.topic for wire in graph.stages[name].inputs.values()]
-    return frozenset(found)
 
 
 def rewrite(recording: Recording, path: Path, changed: Mapping[str, Callable[[Value], Value]]) -> None:

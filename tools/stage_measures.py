@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from trihedron.pipeline.core.geometry import invert
+from trihedron.pipeline.core.geometry import invert, transform
 from trihedron.pipeline.core.types import F64, Bool, Camera, Frame, Keypoints, LineSegments, Map, Matches, Normals, Planes, Segments, Tracks, Value
 from trihedron.pipeline.run.replay import RECORDED
 
@@ -77,7 +77,7 @@ def of_normals(value: Normals, now: Seen, before: Seen, T: F64) -> Errors:
     if not isinstance(last, Normals) or camera is None or depth is None or last_depth is None:
         return {}
     v, u = np.mgrid[0 : last_depth.shape[0] : STEP_PX, 0 : last_depth.shape[1] : STEP_PX].reshape(2, -1)
-    points = moved(camera.back_project(np.stack([u, v], axis=1), last_depth[v, u].astype(np.float64)), T)
+    points = transform(T, camera.back_project(np.stack([u, v], axis=1), last_depth[v, u].astype(np.float64)))
     pixels = np.rint(camera.project(points))
     known = (last_depth[v, u] > 0.0) & within(pixels, camera)
     known[known] = np.abs(at(depth, pixels[known]) - points[known, 2]) < DEPTH_EDGE * points[known, 2]
@@ -92,7 +92,7 @@ def of_keypoints(value: Keypoints, now: Seen, before: Seen, T: F64) -> Errors:
     last = before.get("keypoints")
     if not isinstance(last, Keypoints) or now.camera is None:
         return {}
-    pixels, visible = in_view(moved(last.points_m, T), now)
+    pixels, visible = in_view(transform(T, last.points_m.astype(np.float64)), now)
     return {"points lost %": share(distances(pixels[visible], value.pixels) > NEAR_PX)}
 
 
@@ -104,9 +104,9 @@ def of_lines(value: LineSegments, now: Seen, before: Seen, T: F64) -> Errors:
     ends = last.endpoints_px.reshape(-1, 2).astype(np.float64)
     depth = at(nearest_depth(before.depth_m), np.clip(np.rint(ends), 0, [camera.width - 1, camera.height - 1])).astype(np.float64)
     points = camera.back_project(ends, np.where(depth < UNKNOWN_M, depth, np.nan))
-    pixels, visible = in_view(moved(points, T), now)
+    pixels, visible = in_view(transform(T, points), now)
     both = visible.reshape(-1, 2).all(axis=1)
-    return {"lines lost %": share(~found_again(pixels.reshape(-1, 2, 2)[both], value.endpoints_px.astype(np.float64)))}
+    return {"lines lost %": share(nearest_segment(pixels.reshape(-1, 2, 2)[both], value.endpoints_px.astype(np.float64)) < 0)}
 
 
 def of_segments(value: Segments, now: Seen, before: Seen, T: F64) -> Errors:
@@ -114,7 +114,7 @@ def of_segments(value: Segments, now: Seen, before: Seen, T: F64) -> Errors:
     last, camera = before.get("segments"), now.camera
     if not isinstance(last, Segments) or camera is None:
         return {}
-    points = moved(last.endpoints_m.reshape(-1, 3), T)
+    points = transform(T, last.endpoints_m.reshape(-1, 3).astype(np.float64))
     pixels, visible = in_view(points, now)
     both, known = visible.reshape(-1, 2).all(axis=1), np.isfinite(value.endpoints_m).all(axis=(1, 2))
     old, lines = points.reshape(-1, 2, 3)[both], value.endpoints_m[known].astype(np.float64)
@@ -136,7 +136,7 @@ def of_planes(value: Planes, now: Seen, before: Seen, T: F64) -> Errors:
         return {}
     offsets, angles, lost = [], [], []
     for plane, samples in zip(last.coefficients, last.samples_m):
-        points = moved(samples[np.isfinite(samples[:, 0])], T)
+        points = transform(T, samples[np.isfinite(samples[:, 0])].astype(np.float64))
         normal = T[:3, :3] @ plane[:3]
         labels = labels_at(points, value, camera)
         if not len(labels):
@@ -158,11 +158,11 @@ def of_tracks(value: Tracks, now: Seen, before: Seen, T: F64) -> Errors:
     points, last, camera = now.get("keypoints"), before.get("keypoints"), now.camera
     if not isinstance(points, Keypoints) or camera is None:
         return {}
-    pixels = camera.project(moved(value.points_m, T))
+    pixels = camera.project(transform(T, value.points_m.astype(np.float64)))
     off = np.linalg.norm(pixels - points.pixels[value.keypoints[:, 1]], axis=1)
     errors = {"wrong pairs %": share(off[np.isfinite(off)] > WRONG_PX)}
     if isinstance(last, Keypoints):
-        pixels, visible = in_view(moved(last.points_m, T), now)
+        pixels, visible = in_view(transform(T, last.points_m.astype(np.float64)), now)
         there = visible.copy()
         there[visible] = distances(pixels[visible], points.pixels) <= NEAR_PX
         paired = np.zeros(len(last.pixels), bool)
@@ -181,7 +181,7 @@ def of_matches(value: Matches, now: Seen, before: Seen, T: F64) -> Errors:
     ids = value.keypoints[:, 1]
     if len(ids) and ids.max() >= len(places):
         return {}
-    pixels = camera.project(moved(places, invert(now.T_world_camera)))
+    pixels = camera.project(transform(invert(now.T_world_camera), places))
     off = np.linalg.norm(pixels[ids] - points.pixels[value.keypoints[:, 0]], axis=1)
     visible = value.visible_points[value.visible_points < len(places)]
     there = visible[distances(pixels[visible], points.pixels) <= NEAR_PX]
@@ -197,12 +197,6 @@ MEASURES: dict[type[Any], Measure] = {
     Tracks: of_tracks,
     Matches: of_matches,
 }
-
-
-def moved(points: Any, T: F64) -> F64:
-    """Return points (n, 3) moved by T (4, 4)."""
-    result: F64 = np.asarray(points, np.float64) @ T[:3, :3].T + T[:3, 3]
-    return result
 
 
 def within(pixels: F64, camera: Camera, border: float = 0.0) -> Bool:
@@ -261,12 +255,6 @@ def nearest_segment(ends: F64, lines: F64) -> Any:
     fits = (across <= NEAR_PX) & (middle >= -NEAR_PX) & (middle <= length[None] + NEAR_PX) & (cosine >= np.cos(np.radians(LINE_DEG)))
     best = np.argmin(np.where(fits, across, np.inf), axis=1)
     return np.where(fits.any(axis=1), best, -1)
-
-
-def found_again(ends: F64, lines: F64) -> Bool:
-    """Return which segments (n, 2, 2) have one among the others, see `nearest_segment`."""
-    again: Bool = nearest_segment(ends, lines) >= 0
-    return again
 
 
 def labels_at(points: F64, planes: Planes, camera: Camera) -> Any:

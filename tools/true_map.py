@@ -13,7 +13,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from trihedron.pipeline.core.geometry import invert
+from trihedron.pipeline.core.geometry import invert, transform_each
 from trihedron.pipeline.core.linalg import matmul
 from trihedron.pipeline.core.types import F64, I32, Map, Table
 from trihedron.plugins.mapping.plane_fusion import motions_between
@@ -68,15 +68,15 @@ def _points(table: Table, motions: F64) -> Table:
     ids = _living(table)
     M = mean_motions(table, ids, motions)
     position, information, direction = table.gathered(ids, "position_m", "information", "direction")
-    moved = _moved(M, position[:, None])[:, 0]
-    return table.updated(ids, position_m=moved, information=_rotated(M, information), direction=_moved(M[:, :3, :3], direction[:, None])[:, 0])
+    moved = transform_each(M, position[:, None])[:, 0]
+    return table.updated(ids, position_m=moved, information=_rotated(M, information), direction=_turned(M, direction[:, None])[:, 0])
 
 
 def _lines(table: Table, motions: F64) -> Table:
     ids = _living(table)
     M = mean_motions(table, ids, motions)
     ends, information = table.gathered(ids, "endpoints_m", "information")
-    return table.updated(ids, endpoints_m=_moved(M, ends), information=_rotated(M[:, None], information))
+    return table.updated(ids, endpoints_m=transform_each(M, ends), information=_rotated(M[:, None], information))
 
 
 def _planes(table: Table, motions: F64) -> Table:
@@ -85,9 +85,9 @@ def _planes(table: Table, motions: F64) -> Table:
     M = mean_motions(table, ids, motions)
     old, covariance, moments, samples = table.gathered(ids, "coefficients", "covariance", "moments", "samples_m")
     centres = moments[:, :3, 3] / moments[:, 3, 3:]
-    moved = _moved(M, centres[:, None])[:, 0]
+    moved = transform_each(M, centres[:, None])[:, 0]
     new = np.empty_like(old)
-    normals = _moved(M[:, :3, :3], old[:, None, :3])[:, 0]
+    normals = _turned(M, old[:, None, :3])[:, 0]
     new[:, :3] = normals / np.linalg.norm(normals, axis=1)[:, None]
     new[:, 3] = old[:, 3] + np.einsum("ni,ni->n", old[:, :3], centres) - np.einsum("ni,ni->n", new[:, :3], moved)
     T = motions_between(old, new, centres)
@@ -95,13 +95,12 @@ def _planes(table: Table, motions: F64) -> Table:
         one = slice(row, row + 1)
         covariance[one] = transform_plane_covariance(T[row], old[one], new[one], covariance[one])
     moments = matmul(T, moments, np.swapaxes(T, 1, 2))
-    return table.updated(ids, coefficients=new, covariance=covariance, moments=moments, samples_m=_moved(T, samples))
+    return table.updated(ids, coefficients=new, covariance=covariance, moments=moments, samples_m=transform_each(T, samples))
 
 
-def _moved(M: F64, points: NDArray[np.floating]) -> F64:
-    """Points or directions (n, k, 3), each row by its own (n, 4, 4) or (n, 3, 3)."""
-    moved = np.einsum("nij,nkj->nki", M[:, :3, :3], points)
-    return np.asarray(moved + M[:, None, :3, 3] if M.shape[-1] == 4 else moved)
+def _turned(M: F64, directions: NDArray[np.floating]) -> F64:
+    """Directions (n, k, 3), each row by the rotation of its own (n, 4, 4)."""
+    return np.asarray(matmul(directions, np.swapaxes(M[:, :3, :3], 1, 2)))
 
 
 def _rotated(M: F64, information: NDArray[np.floating]) -> F64:

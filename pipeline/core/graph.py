@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Container, Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -41,13 +41,13 @@ class Graph:
     stages: Mapping[str, Stage]
     outputs: tuple[str, ...]
 
-    def needed(self, targets: Iterable[str]) -> set[str]:
-        """Return the stages that `targets` depend on, delayed wires included, and the targets."""
+    def needed(self, targets: Iterable[str], given: Container[str] = ()) -> set[str]:
+        """Return the stages that `targets` depend on, delayed wires included, and the targets; without those `given`, and what only they need."""
         found: set[str] = set()
         pending = list(targets)
         while pending:
             name = pending.pop()
-            if name not in found:
+            if name not in found and name not in given:
                 found.add(name)
                 pending += [wire.topic for wire in self.stages[name].inputs.values()]
         return found

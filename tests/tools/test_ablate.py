@@ -2,18 +2,17 @@
 
 import json
 import os
-from dataclasses import dataclass, replace
+import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from trihedron.pipeline.app.cli import main
-from trihedron.pipeline.core import registry
 from trihedron.pipeline.core.errors import DataError
-from trihedron.pipeline.core.types import Camera, Keypoints, Map, Planes, Pose, Rotation, Segments, Tracks, Translation
+from trihedron.pipeline.core.types import Translation
 from trihedron.pipeline.record.reader import Recording
-from trihedron.plugins.translation.levenberg_marquardt import LevenbergMarquardt
 from trihedron.tools.ablation_differences import Parting, StageErrors, distance
 from trihedron.tools.ablation_errors import read_errors, write_errors
 from trihedron.tools.ablation_swaps import combinations_of, folder_name, parsed
@@ -33,6 +32,11 @@ from trihedron.tools.ablation_tables import (
     verdicts,
 )
 from trihedron.tools.site_ablations import ablations_of
+
+sys.path.insert(0, str(Path(__file__).parent))
+from faulty_plugins import faulty
+
+__all__ = ["faulty"]  # a fixture
 
 SMALL = ["dataset.width=320", "dataset.height=240", "threads=1"]
 
@@ -158,9 +162,11 @@ def test_errors_of_a_stage_alone():
     errors = StageErrors({1000 * index: np.eye(4) for index in range(4)})
     for index in range(4):
         errors.take(["translation"], {"translation": translation(index, 0.003) if index else None})
-    assert errors.figures()["translation mm"] == pytest.approx(3.0) and errors.figures()["values %"] == 75.0
-    assert np.isnan(errors.of_frames()["translation mm"][0]) and errors.of_frames()["translation mm"][1:] == pytest.approx([3.0] * 3)
-    assert np.isnan(errors.figures()["axes deg"]) and distance(translation(0, 0.0), None) is None
+    of_frames = errors.of_frames()
+    figures = errors.figures(of_frames)
+    assert figures["translation mm"] == pytest.approx(3.0) and figures["values %"] == 75.0
+    assert np.isnan(of_frames["translation mm"][0]) and of_frames["translation mm"][1:] == pytest.approx([3.0] * 3)
+    assert np.isnan(figures["axes deg"]) and distance(translation(0, 0.0), None) is None
 
 
 @pytest.mark.parametrize(
@@ -187,26 +193,9 @@ def test_mistakes_are_one_line(tmp_path, capsys, monkeypatch, words, code, messa
     assert capsys.readouterr().err.splitlines()[-1] == f"trihedron: {message}"
 
 
-@dataclass(frozen=True)
-class WrongSign:
-    """The default translation with the camera's motion the wrong way round."""
-
-    def __call__(
-        self, camera: Camera, rotation: Rotation, tracks: Tracks | None, keypoints: Keypoints, segments: Segments, planes: Planes,
-        previous_pose: Pose | None, earlier_pose: Pose | None, map: Map | None,
-    ) -> Translation:  # fmt: skip
-        found = LevenbergMarquardt()(camera, rotation, tracks, keypoints, segments, planes, previous_pose, earlier_pose, map)
-        if previous_pose is None:
-            return found
-        return replace(found, t_world_camera=2.0 * previous_pose.T_world_camera[:3, 3] - found.t_world_camera)
-
-
 @pytest.mark.slow
 @pytest.mark.timeout(900)
-def test_a_wrong_sign_in_translation_is_attributed_to_translation(tmp_path, capsys, monkeypatch):
-    registry.load_plugins()  # before the copy, which is discarded with all that is registered in it
-    monkeypatch.setattr(registry, "_PLUGINS", {slot: dict(plugins) for slot, plugins in registry._PLUGINS.items()})
-    registry.register("translation", "wrong_sign")(WrongSign)
+def test_a_wrong_sign_in_translation_is_attributed_to_translation(tmp_path, capsys, faulty):
     assert main(["run", "graph=structural_no_refine", "dataset.length=14", *SMALL, f"out={tmp_path}/run"]) == 0
     words = ["manhattan=mean_shift,plane_svd", "rotation=drift_free", "translation=levenberg_marquardt,wrong_sign"]
     command = ["ablate", f"{tmp_path}/run/run.mcap", *words, f"out={tmp_path}/ablation", "threads=1", f"--json={tmp_path}/found.json"]

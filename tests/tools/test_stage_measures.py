@@ -131,7 +131,7 @@ def test_frames_follow_each_other_and_the_first_has_no_error():
         off = replace(planes, coefficients=planes.coefficients + np.array([0.0, 0.0, 0.0, 0.01 * (step == 2)]))
         found.take(["planes"], {"dataset": EXACT.seen(camera_at(step), step), "planes": off})
     assert found.of_frames()["planes mm"] == pytest.approx([np.nan, 0.0, 10.0, 0.0], abs=0.1, nan_ok=True)
-    assert found.figures()["planes mm"] == pytest.approx(10.0 / np.sqrt(3.0), abs=0.1)
+    assert found.figures(found.of_frames())["planes mm"] == pytest.approx(10.0 / np.sqrt(3.0), abs=0.1)
 
 
 def test_a_measure_without_what_it_needs_says_nothing():
