@@ -30,7 +30,7 @@ from typing import Any
 import numpy as np
 
 from trihedron.pipeline.app.alternatives import Alternatives, Outcome, alternatives_of
-from trihedron.pipeline.app.execute import MAX_THREADS
+from trihedron.pipeline.app.execute import MAX_THREADS, RECORDING
 from trihedron.pipeline.core.config import Feedback
 from trihedron.pipeline.core.errors import ConfigError, DataError, TrihedronError, UsageError, did_you_mean
 from trihedron.pipeline.record.reader import Recording
@@ -38,7 +38,7 @@ from trihedron.pipeline.record.trajectories import attached_truth
 from trihedron.pipeline.run.result_files import read_results
 from trihedron.pipeline.sweep.jobs import key_of
 from trihedron.tools import ablation_tables as tables
-from trihedron.tools.ablation_differences import Parting, RecordedValues, StageErrors, reference_of
+from trihedron.tools.ablation_differences import Parting, StageErrors, changed_by_code, reference_of
 from trihedron.tools.ablation_errors import of_trajectory, read_errors, write_errors
 from trihedron.tools.ablation_swaps import Combination, combinations_of, folder_name, parsed, without_repeats
 from trihedron.tools.ablation_tables import NEES, Case, Variant
@@ -179,10 +179,8 @@ def _computed(computing: Alternatives, combinations: Sequence[Combination], fold
     alone = computing.feedback is Feedback.recorded
     known, true = reference_of(recording) if alone else ({}, True)
     errors, partings = [StageErrors(known) for _ in folders], [Parting() for _ in folders]
-    recorded = RecordedValues(recording, topics)
 
     def on_frame(index: int, values: Sequence[Mapping[str, Any]]) -> None:
-        recorded.compare(index, values[0])
         for one, parting, found in zip(values, partings, errors):
             parting.compare(index, topics, values[0], one)
             found.take(topics if alone else (), one)
@@ -209,13 +207,12 @@ def _computed(computing: Alternatives, combinations: Sequence[Combination], fold
         full_s or np.nan,
         computing.cpu_s,
         variants,
-        recorded.parting,
+        changed_by_code(recording, Recording(folders[0] / RECORDING)),
         fps=computing.runners[0].result.fps,
         true=true,
     )
-    if case.changed.frame is not None:
-        changed = f"{case.changed.topic}.{case.changed.field} from frame {case.changed.frame} on"
-        print(f"trihedron: warning: {recording.path} was recorded by other code: as recorded gives another {changed}", file=sys.stderr)
+    if case.changed:
+        print(f"trihedron: warning: {recording.path} was recorded by other code: as recorded gives another {case.changed}", file=sys.stderr)
     return case
 
 
@@ -255,7 +252,7 @@ def _draw_farthest(cases: Sequence[Case]) -> None:
         case, variant = tables.farthest([(case, case.variants[number]) for case in cases])
         if variant.picture or variant.parting.worst is None:
             continue
-        original, base = Recording(case.recording), Recording(Path(case.variants[0].folder) / "run.mcap")
-        out, own = Path(variant.folder) / PICTURE, Recording(Path(variant.folder) / "run.mcap")
+        original, base = Recording(case.recording), Recording(Path(case.variants[0].folder) / RECORDING)
+        out, own = Path(variant.folder) / PICTURE, Recording(Path(variant.folder) / RECORDING)
         draw_pair([("as recorded", [base, original]), (variant.combination.label, [own, original])], variant.parting.worst, out)
         variant.picture = str(out)

@@ -12,10 +12,10 @@ import numpy as np
 from trihedron.pipeline.core.errors import DataError
 from trihedron.pipeline.core.geometry import nearest_rotation
 from trihedron.pipeline.core.types import F64, LOST, ManhattanFrame, Pose, Rotation, Translation, Value
-from trihedron.pipeline.record.reader import Recording, TopicReader
+from trihedron.pipeline.record.reader import Recording
 from trihedron.pipeline.run.metrics import rotation_angles_deg
 from trihedron.pipeline.run.replay import RECORDED
-from trihedron.tools.diff import differing
+from trihedron.tools.diff import common_frames, difference, differing
 from trihedron.tools.error_budget import true_poses
 from trihedron.tools.stage_measures import COLUMNS, Seen, measured
 
@@ -173,14 +173,10 @@ def reference_of(recording: Recording) -> tuple[Mapping[int, F64], bool]:
         return {pose.stamp_ns: pose.T_world_camera for pose in poses if isinstance(pose, Pose) and pose.status != LOST}, False
 
 
-class RecordedValues:
-    """The recorded values of the small topics that are computed again, to be compared with those that the same stages compute now."""
-
-    def __init__(self, recording: Recording, topics: Iterable[str]) -> None:
-        self._readers = {topic: TopicReader(recording, topic, check=False) for topic in topics if topic in MEASURED and topic in recording.topics}
-        self.parting = Parting()
-
-    def compare(self, index: int, values: Mapping[str, Any]) -> None:
-        """Take the values of a frame that the recorded configuration computes."""
-        recorded = {topic: reader.at(index) for topic, reader in self._readers.items()}
-        self.parting.compare(index, self._readers, recorded, {topic: values.get(topic) for topic in self._readers})
+def changed_by_code(recording: Recording, again: Recording) -> str:
+    """Compare the small topics of a recording with what the same stages compute now; returns the first difference, empty where all is equal."""
+    topics = [topic for topic in MEASURED if topic in recording.topics & again.topics]
+    frames = common_frames(recording, again)
+    found = [one for topic in topics if (one := difference(recording, again, topic, frames)) is not None]
+    first = min(found, key=lambda one: one.frame, default=None)
+    return f"{first.topic}.{first.field} from frame {first.frame} on" if first is not None else ""

@@ -67,7 +67,7 @@ class Case:
     full_s: float
     cpu_s: float
     variants: list[Variant]
-    changed: Parting = field(default_factory=Parting)  # of what the recorded configuration computes now, from the recorded values
+    changed: str = ""  # what the recorded configuration computes now and the recording does not hold
     budget: dict[str, dict[str, float]] = field(default_factory=dict)
     remarks: list[str] = field(default_factory=list)  # sentences on rows of the budget that mean nothing
     fps: float = 30.0
@@ -157,7 +157,7 @@ def case_from_dict(values: Mapping[str, Any]) -> Case:
         variants.append(Variant(**{**given, "parting": Parting(**one["parting"])}))
     full_s = np.nan if values["full_s"] is None else values["full_s"]
     budget = {name: {key: np.nan if value is None else value for key, value in row.items()} for name, row in values["budget"].items()}
-    return Case(**{**values, "variants": variants, "full_s": full_s, "changed": Parting(**values["changed"]), "budget": budget})
+    return Case(**{**values, "variants": variants, "full_s": full_s, "budget": budget})
 
 
 def _without_nan(value: Any) -> Any:

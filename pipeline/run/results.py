@@ -6,6 +6,7 @@ import json
 import re
 from collections import Counter
 from collections.abc import Iterable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -57,6 +58,7 @@ def _trajectory(stamps_ns: list[int], poses: list[Any]) -> Trajectory:
 
 def write_results(out: Path, result: Result, truth: Trajectory | None, plot: bool = True) -> dict[str, Any]:
     """Write trajectories, `plot` and, with ground truth, metrics; return the metrics. Statuses are counted in any case."""
+    result = replace(result, poses=list(result.poses))  # unpacked once
     final, causal = final_trajectory(result), causal_trajectory(result)
     write_trajectory(out / TRAJECTORY, final)
     write_trajectory(out / CAUSAL, causal)
