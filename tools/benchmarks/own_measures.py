@@ -1,7 +1,7 @@
 """Own measures of the plugins of a sweep: each slot's by `trihedron ablate` in the open loop, and those of surfaces and buildings by the true ones.
 
-The open loop takes the recording of the unchanged graph on each sequence, and computes the alternatives of one slot on what was recorded of the others.
-Its results are kept in FOLDER/open_loop, so that the same call again computes only what is missing. All measures are errors: less is better.
+The open loop takes the recording of the unchanged graph on each sequence, and computes the alternatives of one slot on what was recorded of the
+others. Its results are kept in FOLDER/open_loop, so that the same call again computes only what is missing. All measures are errors: less is better.
 """
 
 from __future__ import annotations
@@ -32,21 +32,24 @@ BUILDING = {  # column -> key of the figures, the value where it is perfect, fac
     "missed rooms %": ("room_recall", 1.0, 100.0),
     "false rooms %": ("room_precision", 1.0, 100.0),
 }
-DECIMALS = {"surface mm": 2, "missed surface %": 1, "walls mm": 1, "missed rooms %": 0, "false rooms %": 0} | {name: FIGURES[name].decimals for name in OPEN}
+DECIMALS = {name: FIGURES[name].decimals for name in OPEN}  # of every column
+DECIMALS |= {"surface mm": 2, "missed surface %": 1, "walls mm": 1, "missed rooms %": 0, "false rooms %": 0}
 Measures = dict[str, float]  # error by column
 
 
 def open_loop(run: Path, slot: str, plugins: Sequence[str], out: Path) -> dict[str, Measures]:
     """Return the measures of a slot's plugins on the recorded inputs of a run, by plugin; "" is the recorded one. Raises TrihedronError."""
     options = Options((run / RECORDING,), (f"{slot}={','.join(plugins)}",), out, Feedback.recorded, pictures=False)
-    variants = ablate(options)[0].variants
-    names = ["".join(variant.combination.words).partition("=")[2] for variant in variants]
-    return {name: {key: variant.figures[key] for key in OPEN if np.isfinite(variant.figures.get(key, np.nan))} for name, variant in zip(names, variants)}
+    found = {}
+    for variant in ablate(options)[0].variants:
+        name = "".join(variant.combination.words).partition("=")[2]
+        found[name] = {key: variant.figures[key] for key in OPEN if np.isfinite(variant.figures.get(key, np.nan))}
+    return found
 
 
 def of_surface(run: Path) -> Measures:
-    """`surface mm`: mean distance of the mesh from the true surface. `missed surface %`: share of the seen true surface farther than 5 cm from it. Empty
-    where the run has no figures of `judge_surfaces`."""
+    """`surface mm`: mean distance of the mesh from the true surface. `missed surface %`: share of the seen true surface farther than 5 cm from it.
+    Empty where the run has no figures of `judge_surfaces`."""
     if not (run / SURFACE_JSON).exists():
         return {}
     whole = json.loads((run / SURFACE_JSON).read_text())["parts"]["all"]
@@ -55,8 +58,8 @@ def of_surface(run: Path) -> Measures:
 
 
 def of_building(run: Path) -> Measures:
-    """`walls mm`: median offset of walls from the true ones. `missed rooms %`, `false rooms %`: of the true ones, of those that are found. Empty where
-    the data set has no true plan."""
+    """`walls mm`: median offset of walls from the true ones. `missed rooms %`, `false rooms %`: of the true ones, of those that are found.
+    Empty where the data set has no true plan."""
     try:
         figures = judged_run(run)
     except DataError:
