@@ -4,9 +4,9 @@ A cell is the ATE in mm, with the share of the frames that were tracked where it
 the sequences of the poses' normalised squared errors (1 where the covariance is right), ms those of the stage itself (of the whole frame for a
 system), MB the largest peak of memory.
 
-Columns behind MB are the slot's own measures, means over the sequences that have them. Of most slots they are those of `trihedron ablate` in the open
-loop, on the recording of the unchanged graph: refinement against the map hides nothing of them. Of surfaces and buildings they are the errors against the
-true ones. They are computed where they are missing, and kept in FOLDER/open_loop. With --json all figures are written for the pages of the plugins.
+Columns behind MB are the slot's own measures, means over the sequences that have them: those of `trihedron ablate` in the open loop, on the recording
+of the unchanged graph, of which refinement against the map hides nothing; of surfaces and buildings, errors against the true ones. They are computed
+where they are missing, and kept in FOLDER/open_loop. With --json all figures are written for the pages of the plugins.
 
 Example: trihedron benchmark methods runs/methods --detectors detectors.json --json docs/results/methods.json
 """
