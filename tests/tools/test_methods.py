@@ -16,6 +16,7 @@ from trihedron.pipeline.sweep.sweep import words_of_alternatives
 from trihedron.plugins.normals.integral_image import IntegralImage
 from trihedron.plugins.planes.connected_components import ConnectedComponents
 from trihedron.tools.benchmarks.detector_truth import _view, judge_keypoints, judge_lines, judge_normals, judge_planes, true_regions
+from trihedron.tools.benchmarks.method_tables import sequence_of
 
 sys.path.insert(0, str(Path(__file__).parent))
 from faulty_plugins import faulty
@@ -100,6 +101,13 @@ def test_alternatives_are_one_change_each():
     assert found[0] == [] and ["lines=opencv_lsd"] in found and ["lines=none"] not in found and ["lines=onnx"] not in found
     assert ["model=tsdf", "pose=icp"] in found and found[-1] == ["graph=points", "threads=1"]
     assert words_of_alternatives([]) == []
+
+
+def test_sequences_have_short_names():
+    assert sequence_of(["dataset=synthetic", "dataset.length=60", "without=loop"]) == "room without=loop"
+    assert sequence_of(["dataset=synthetic", "dataset.scene=flat", "dataset.fps=10"]) == "flat fps=10"
+    assert sequence_of(["dataset=faults", r"dataset.cover=20\:35", "+dataset.options.length=60"]) == "faults cover=20:35"
+    assert sequence_of(["dataset=tum", "dataset.path=/data/desk", "pose=icp"]) == "desk pose=icp"
 
 
 @pytest.mark.slow

@@ -93,7 +93,7 @@ def sequence_of(words: Sequence[str]) -> str:
         return " ".join([Path(path).name, *of_graph])
     kind, scene = values.get("dataset", "synthetic"), values.get("dataset.scene", "room")
     options = {key.removeprefix("dataset."): value for key, value in values.items() if key.startswith("dataset.")}
-    texts = [f"{key}={value}" for key, value in options.items() if key != "scene" and not key.endswith("length")]
+    texts = [f"{key}={value}".replace("\\:", ":") for key, value in options.items() if key != "scene" and not key.endswith("length")]
     return " ".join([scene if kind == "synthetic" else kind, *texts, *of_graph])
 
 
