@@ -40,10 +40,10 @@ from trihedron.pipeline.sweep.jobs import key_of
 from trihedron.tools import ablation_tables as tables
 from trihedron.tools.ablation_differences import Parting, StageErrors, changed_by_code, reference_of
 from trihedron.tools.ablation_errors import of_trajectory, read_errors, write_errors
+from trihedron.tools.ablation_statistics import nees_of
 from trihedron.tools.ablation_swaps import Combination, combinations_of, folder_name, parsed, without_repeats
 from trihedron.tools.ablation_tables import NEES, Case, Variant
 from trihedron.tools.arguments import Parser
-from trihedron.tools.benchmarks.method_tables import nees_of
 
 RESULT = "ablation.json"
 PICTURE = "differs.png"
@@ -66,6 +66,7 @@ class Options:
     feedback: Feedback = Feedback.new
     threads: int = 2
     budget: bool = False
+    pictures: bool = True  # of the worst frame of each alternative
 
 
 def main(argv: list[str]) -> int:
@@ -138,7 +139,8 @@ def ablate(options: Options) -> list[Case]:
         cases.append(case)
         keys.append(key)
         _write(options.out, {**known, **dict(zip(keys, map(tables.case_to_dict, cases)))})
-    _draw_farthest(cases)
+    if options.pictures:
+        _draw_farthest(cases)
     _write(options.out, {**known, **dict(zip(keys, map(tables.case_to_dict, cases)))})
     return cases
 

@@ -21,6 +21,7 @@ from trihedron.tools.stage_measures import COLUMNS, Seen, measured
 
 MEASURED = ("pose", "translation", "rotation", "manhattan")  # topics with a distance of two values; the first that is there finds the worst
 OPEN_LOOP = ("axes deg", "rotation deg", "translation mm", *COLUMNS)  # columns of the errors of single stages
+FALSE_AXES = "false axes %"
 FALSE_DEG = 5.0  # of a Manhattan frame from the others: a false one
 CUBE = [
     sign * np.eye(3)[list(order)].T
@@ -141,7 +142,7 @@ class StageErrors:
         """Return the root mean square of each kind of error of `of_frames`, NaN where there is none, and the shares of values and of false axes."""
         found = {name: float(np.sqrt(np.nanmean(np.square(errors[name])))) if name in errors else np.nan for name in OPEN_LOOP}
         false = 100.0 * float(np.mean(_from_most_deg(list(self.axes.values())) > FALSE_DEG)) if self.axes else np.nan
-        return {**found, "false axes %": false, "values %": 100.0 * self.present / self.seen if self.seen else np.nan}
+        return {**found, FALSE_AXES: false, "values %": 100.0 * self.present / self.seen if self.seen else np.nan}
 
 
 def _deviations_deg(axes: Sequence[F64]) -> list[float]:

@@ -1,10 +1,13 @@
-"""Statistics of an ablation: the Shapley value of each swap."""
+"""Statistics of an ablation: the Shapley value of each swap, and the NEES of a run."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from itertools import combinations
 from math import factorial
+from typing import Any
+
+CHI2_6_MEDIAN = 5.348
 
 
 def shapley(values: Mapping[frozenset[str], float], players: Iterable[str]) -> dict[str, float]:
@@ -20,3 +23,9 @@ def shapley(values: Mapping[frozenset[str], float], players: Iterable[str]) -> d
             for some in combinations(others, size)
         )
     return found
+
+
+def nees_of(metrics: Mapping[str, Any]) -> float | None:
+    """Return the median NEES of the poses over that of χ² with six degrees of freedom, None without ground truth."""
+    found = metrics.get("consistency", {}).get("nees_median")
+    return float(found) / CHI2_6_MEDIAN if found is not None else None

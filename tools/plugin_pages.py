@@ -71,13 +71,14 @@ def _runs(slot: str, name: str, results: Results) -> str:
     """Figures of the default graph with this plugin, beside those of the default one."""
     runs = {(row["change"], row["sequence"]): row for row in results["runs"]}
     default = default_plugins().get(slot)
+    own = {key: None for row in results["runs"] if row["change"].startswith(f"{slot}=") for key in row.get("measures", {})}  # columns, in order
     rows = []
     for sequence in dict.fromkeys(row["sequence"] for row in results["runs"]):
         row, base = runs.get((f"{slot}={name}", sequence)), runs.get(("default", sequence))
         row = base if row is None and name == default else row
         if row is not None and base is not None:
-            rows.append((sequence, *_figures(row), _number(base["ate_mm"], 1)))
-    header = ["sequence", "ATE mm", "tracked %", "NEES", "ms", "frame ms", "MB", "ATE mm of the default"]
+            rows.append((sequence, *_figures(row), _number(base["ate_mm"], 1), *(_number(row.get("measures", {}).get(key), 2) for key in own)))
+    header = ["sequence", "ATE mm", "tracked %", "NEES", "ms", "frame ms", "MB", "ATE mm of the default", *own]
     return "In the default graph (`trihedron run -m experiment=methods`):\n\n" + markdown(header, rows) if rows else ""
 
 

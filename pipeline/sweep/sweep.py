@@ -27,7 +27,7 @@ from joblib.externals.loky import get_reusable_executor
 from omegaconf import DictConfig
 
 from trihedron.pipeline.core.config import graph_of, rewritten
-from trihedron.pipeline.core.errors import TrihedronError, UsageError
+from trihedron.pipeline.core.errors import TrihedronError, UsageError, did_you_mean
 from trihedron.pipeline.core.libraries import library_error
 from trihedron.pipeline.core.overrides import with_literal_paths
 from trihedron.pipeline.core.registry import load_plugins, options_of, plugins_of
@@ -38,6 +38,8 @@ from trihedron.pipeline.sweep.preview import Planned, preview, refused, state_of
 from trihedron.pipeline.sweep.progress import Progress
 
 Overrides = list[str]
+GRAPH_KEYS = frozenset({*SLOTS, "graph", "without"} - {"dataset"})  # of words that choose or change a graph
+CHOICE = "alternatives="  # a word of a sequence: the alternatives that are tried on it
 
 
 @dataclass
@@ -181,9 +183,12 @@ class Sweeper(HydraSweeper):
         parser = OverridesParser.create(config_loader=self.loader)
         words = [word for word in [*self.given, *arguments] if not word.startswith(("sequences=", "alternatives="))]
         words += [] if any(word.startswith("threads=") for word in words) else [f"threads={self._threads}"]
-        sequences = [words_of_sequence(text) for text in self.options.sequences] or [[]]
+        sequences = list(self.options.sequences)
         alternatives = words_of_alternatives(list(self.options.alternatives)) or [[]]
-        given = [[*sequence, *words, *alternative] for sequence in sequences for alternative in alternatives]
+        of_each = [(words_of_sequence(text), alternatives_on(text, alternatives)) for text in sequences] or [([], alternatives)]
+        given = [[*sequence, *words, *alternative] for sequence, some in of_each for alternative in some]
+        if not given:
+            raise UsageError("alternatives", "no sequence names any of these", "give sequences=[...] too")
         return [job for one in given for job in _product(parser.parse_overrides(one))]
 
     @property
@@ -201,7 +206,37 @@ class Sweeper(HydraSweeper):
 
 def words_of_sequence(text: str) -> Overrides:
     """Turn `KIND`, `KIND:FOLDER`, and options after blanks, into overrides: "tum:/data/desk frames=0:100" is dataset=tum dataset.path=/data/desk
-    dataset.frames=0:100. Options of a data set underneath another (options.path=...) are added. A folder with blanks is the longest that exists."""
+    dataset.frames=0:100. Options of a data set underneath another (options.path=...) are added. Words of the graph, as without=loop or pose=icp, stay
+    as they are. A folder with blanks is the longest that exists."""
+    kind, path, options = _parts_of_sequence(text)
+    keys = [_word_of_sequence(option) for option in options if not option.startswith(CHOICE)]
+    return [f"dataset={kind}", *with_literal_paths(([f"dataset.path={path}"] if path else []) + keys)]
+
+
+def _word_of_sequence(option: str) -> str:
+    return option if is_graph_word(option) else f"{'+' * option.startswith('options.')}dataset.{option}"
+
+
+def is_graph_word(word: str) -> bool:
+    """Return True for a word that chooses a graph or a plugin other than the data set, or sets an option of one."""
+    key, equals, _ = word.partition("=")
+    return bool(equals) and key.partition(".")[0] in GRAPH_KEYS
+
+
+def alternatives_on(text: str, alternatives: Sequence[Overrides]) -> list[Overrides]:
+    """Return the alternatives that are tried on a sequence: all, or with `alternatives=A,B` among its words those that begin with a word of key A or
+    B and the empty one beside them; none where there are no such. Raises UsageError for what can be no key."""
+    chosen = {name for option in _parts_of_sequence(text)[2] if option.startswith(CHOICE) for name in option.removeprefix(CHOICE).split(",")}
+    keys = [words[0].partition("=")[0] if words else "" for words in alternatives]
+    for name in sorted(chosen - GRAPH_KEYS.union(keys)):
+        raise UsageError("sequences", f"no alternative of '{text}' begins with '{name}='", did_you_mean(name, GRAPH_KEYS))
+    if not chosen:
+        return list(alternatives)
+    return [words for words, key in zip(alternatives, keys) if key in chosen or not words] if chosen.intersection(keys) else []
+
+
+def _parts_of_sequence(text: str) -> tuple[str, str, list[str]]:
+    """Return kind, folder and options of a sequence. Raises UsageError."""
     match = re.fullmatch(r"(?P<kind>\w*)(:(?P<path>.*?))?(?P<options>(\s+[\w.]+=\S*)*)\s*", text, re.DOTALL)
     if match is None:
         raise UsageError("sequences", f"'{text}' is not a data set", 'write KIND:FOLDER KEY=VALUE ..., for example "tum:/data/desk frames=0:300"')
@@ -211,8 +246,7 @@ def words_of_sequence(text: str) -> Overrides:
         if path and Path(folder := "".join(words[:count])).expanduser().exists():
             path, options = folder, [word for word in words[count:] if word.strip()]
             break
-    keys = [f"{'+' * option.startswith('options.')}dataset.{option}" for option in options]
-    return [f"dataset={kind}", *with_literal_paths(([f"dataset.path={path}"] if path else []) + keys)]
+    return kind, path, options
 
 
 def words_of_alternatives(texts: Sequence[str]) -> list[Overrides]:

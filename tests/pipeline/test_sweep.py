@@ -11,11 +11,12 @@ from hydra import compose, initialize_config_module
 
 from trihedron.pipeline.app.cli import main
 from trihedron.pipeline.core.config import composed, register_configs
+from trihedron.pipeline.core.errors import UsageError
 from trihedron.pipeline.core.overrides import list_elements
 from trihedron.pipeline.core.registry import load_plugins
 from trihedron.pipeline.sweep.jobs import key_of, write_job
 from trihedron.pipeline.sweep.progress import Progress
-from trihedron.pipeline.sweep.sweep import words_of_sequence
+from trihedron.pipeline.sweep.sweep import alternatives_on, words_of_sequence
 from trihedron.tools.benchmark import PROGRAM
 
 QUICK = ["dataset.width=64", "dataset.height=48", "dataset.length=4", "outputs=[keypoints]"]
@@ -53,11 +54,21 @@ def test_a_key_is_of_the_files_that_are_read(tmp_path):
         ("synthetic", ["dataset=synthetic"]),
         ("tum:/data/desk frames=0:9", ["dataset=tum", "dataset.path=/data/desk", "dataset.frames=0:9"]),
         ("faults of=tum options.path=/data", ["dataset=faults", "dataset.of=tum", "+dataset.options.path=/data"]),
+        ("synthetic length=9 without=loop pose.x=1 alternatives=a,b", ["dataset=synthetic", "dataset.length=9", "without=loop", "pose.x=1"]),
         ("tum:/my data/it's [1], a frames=0:9", ["dataset=tum", r"dataset.path='/my data/it\'s [1], a'", "dataset.frames=0:9"]),
     ],
 )
 def test_a_word_is_a_data_set(text, words):
     assert words_of_sequence(text) == words
+
+
+def test_a_sequence_chooses_its_alternatives():
+    alternatives = [[], ["lines=lsd"], ["model=tsdf", "pose=icp"], ["graph=points"]]
+    assert alternatives_on("synthetic", alternatives) == alternatives
+    assert alternatives_on("synthetic alternatives=model,graph length=9", alternatives) == [[], ["model=tsdf", "pose=icp"], ["graph=points"]]
+    assert alternatives_on("synthetic alternatives=planes", alternatives) == []
+    with pytest.raises(UsageError, match="begins with 'plane='; did you mean 'planes'"):
+        alternatives_on("synthetic alternatives=plane", alternatives)
 
 
 def test_a_folder_with_blanks_and_equal_signs_is_the_longest_that_exists(tmp_path):

@@ -1,7 +1,9 @@
 """Tables of methods: every plugin in the default graph, and detectors by the truth of rendered scenes."""
 
 import json
+import sys
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -14,7 +16,12 @@ from trihedron.pipeline.sweep.sweep import words_of_alternatives
 from trihedron.plugins.normals.integral_image import IntegralImage
 from trihedron.plugins.planes.connected_components import ConnectedComponents
 from trihedron.tools.benchmarks.detector_truth import _view, judge_keypoints, judge_lines, judge_normals, judge_planes, true_regions
+from trihedron.tools.benchmarks.method_tables import sequence_of
 
+sys.path.insert(0, str(Path(__file__).parent))
+from faulty_plugins import faulty
+
+__all__ = ["faulty"]  # a fixture
 DATA = Synthetic(length=12, width=320, height=240, noise=False)
 FIRST, SECOND = _view(DATA, 2), _view(DATA, 7)
 
@@ -96,20 +103,52 @@ def test_alternatives_are_one_change_each():
     assert words_of_alternatives([]) == []
 
 
+def test_sequences_have_short_names():
+    assert sequence_of(["dataset=synthetic", "dataset.length=60", "without=loop"]) == "room without=loop"
+    assert sequence_of(["dataset=synthetic", "dataset.scene=flat", "dataset.fps=10"]) == "flat fps=10"
+    assert sequence_of(["dataset=faults", r"dataset.cover=20\:35", "+dataset.options.length=60"]) == "faults cover=20:35"
+    assert sequence_of(["dataset=tum", "dataset.path=/data/desk", "pose=icp"]) == "desk pose=icp"
+
+
 @pytest.mark.slow
-def test_a_sweep_over_alternatives_and_its_table(tmp_path, capsys):
-    small = ["dataset.width=160", "dataset.height=120", "dataset.length=6"]
-    words = ["alternatives=[rotation=procrustes]", "report=benchmark methods", "hydra/launcher=basic"]
-    assert main(["run", "-m", *small, *words, f"out={tmp_path}"]) == 0
-    overrides = [yaml.safe_load((tmp_path / job / ".hydra" / "overrides.yaml").read_text()) for job in ("0", "1")]
-    assert "rotation=procrustes" not in overrides[0] and "rotation=procrustes" in overrides[1]
-    capsys.readouterr()
+def test_a_sweep_over_alternatives_and_its_table(tmp_path, capsys, faulty):
+    """The open loop tells the translation of wrong sign from the default, the ATE does not: refinement against the map hides it."""
+    small = "length=12 fps=10 width=160 height=120"
+    places = f"sequences=[synthetic {small},synthetic {small} texture=false without=loop alternatives=rotation]"
+    changes = "alternatives=[translation=wrong_sign,translation=irls,rotation=procrustes,rotation=ransac]"
+    assert main(["run", "-m", places, changes, "report=benchmark methods", "hydra/launcher=basic", f"out={tmp_path}"]) == 0
+    overrides = [yaml.safe_load((tmp_path / job / ".hydra" / "overrides.yaml").read_text()) for job in ("0", "3", "6")]
+    assert ["rotation=procrustes" in words for words in overrides] == [False, True, True] and "without=loop" in overrides[2]
+    printed = capsys.readouterr().out.splitlines()
     assert main(["benchmark", "methods", str(tmp_path), "--json", str(tmp_path / "methods.json")]) == 0
-    lines = capsys.readouterr().out.splitlines()
-    assert [line.split()[0] for line in lines[:3]] == ["rotation", "default", "rotation=procrustes"] and lines[-1] == "2 runs, 0 failed"
-    rows = json.loads((tmp_path / "methods.json").read_text())["runs"]
-    assert [row["change"] for row in rows] == ["default", "rotation=procrustes"]
-    assert all(row["tracked"] == 1.0 and 0.0 < row["ate_mm"] < 50.0 and row["ms"] is not None for row in rows[1:])
+    again = capsys.readouterr()
+    lines = again.out.splitlines()
+    assert lines == printed[: len(lines)] and again.err.count("done already") == 3
+    assert lines[0].split() == ["translation", "ATE", "1", "NEES", "ms", "MB", "translation", "mm"]
+    assert lines[5].split() == ["rotation", "ATE", "1", "ATE", "2", "NEES", "ms", "MB", "rotation", "deg"]
+    assert [line.split()[0] for line in lines[6:9]] == ["default", "rotation=procrustes", "rotation=ransac"]
+    assert lines[-1] == "8 runs, 0 failed" and lines[-3].startswith("ATE 2: room ") and lines[-3].endswith("texture=False without=loop")
+    rows = {(row["change"], row["sequence"]): row for row in json.loads((tmp_path / "methods.json").read_text())["runs"]}
+    first, second = dict.fromkeys(sequence for _, sequence in rows)
+    assert [change for change, sequence in rows if sequence == second] == ["default", "rotation=procrustes", "rotation=ransac"]
+    assert all(row["tracked"] > 0.5 and 0.0 < row["ate_mm"] < 50.0 and row["measures"] for row in rows.values())
+    assert set(rows["default", first]["measures"]) == {"rotation deg", "translation mm"}
+    default, wrong = rows["default", first], rows["translation=wrong_sign", first]
+    assert abs(wrong["ate_mm"] - default["ate_mm"]) < 0.2 * default["ate_mm"]
+    assert wrong["measures"]["translation mm"] > 3.0 * default["measures"]["translation mm"]
+
+
+@pytest.mark.slow
+def test_surfaces_and_buildings_have_measures_by_the_true_ones(tmp_path, capsys):
+    small = ["dataset.width=160", "dataset.height=120", "dataset.length=24", "dataset.fps=3"]  # a path long enough to be aligned
+    changes = "alternatives=['surface=tsdf outputs=[trajectory,surface]','building=manhattan_layout outputs=[trajectory,building]']"
+    assert main(["run", "-m", *small, changes, "report=benchmark methods", "hydra/launcher=basic", f"out={tmp_path}"]) == 0
+    assert "missed surface %" in capsys.readouterr().out
+    assert main(["benchmark", "methods", str(tmp_path), "--json", str(tmp_path / "methods.json")]) == 0
+    default, surface, building = (row["measures"] for row in json.loads((tmp_path / "methods.json").read_text())["runs"])
+    assert default == {}
+    assert 0.0 < surface["surface mm"] < 30.0 and 0.0 <= surface["missed surface %"] < 10.0
+    assert 0.0 < building["walls mm"] < 100.0 and building["missed rooms %"] == building["false rooms %"] == 0.0
 
 
 def test_a_detector_that_is_no_slot(capsys):

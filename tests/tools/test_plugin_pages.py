@@ -54,6 +54,8 @@ def test_a_page(tmp_path):
     text = page("planes", "cape", results, False)
     assert text.startswith("# `planes=cape`\n\nCell-wise plane extraction")
     assert "| room | 1.2 | 50 | 1.00 | 9.0 | 20.0 | 400 | 1.0 |" in text
+    measured = {**run, "measures": {"planes mm": 3.456}}
+    assert "| 400 | 1.0 | 3.46 |" in page("planes", "cape", {**results, "runs": [*results["runs"], measured]}, False)
     assert "| room | 0.25 |" in text and "Without the stage (`without=planes`)" in text and "| room | 3.0 | 50 | 1.00 | 1.0 |" in text
     assert "| `cone_deg` | `15.0` | above 0 and at most 45 | normals of one plane lie within this of it |" in text
 
