@@ -12,11 +12,11 @@ import numpy as np
 
 from trihedron.pipeline.core.config import Feedback
 from trihedron.pipeline.core.types import F64
+from trihedron.pipeline.sweep.paired_statistics import CONFIDENCE, half_interval
 from trihedron.tools.ablation_differences import OPEN_LOOP, Parting
 from trihedron.tools.ablation_statistics import shapley
 from trihedron.tools.ablation_swaps import AS_RECORDED, Combination
 from trihedron.tools.arguments import table
-from trihedron.tools.paired_statistics import CONFIDENCE, half_interval
 from trihedron.tools.stage_measures import COLUMNS as MEASURED
 from trihedron.tools.verdicts import NOTE, VERDICTS, Column, Sample, Verdict, line_of, verdicts_of
 

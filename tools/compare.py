@@ -27,15 +27,15 @@ import numpy as np
 from trihedron.pipeline.core.errors import DataError, UsageError, did_you_mean, printable
 from trihedron.pipeline.core.files import MAX_YAML_BYTES, YamlError, parse_yaml, read_text
 from trihedron.pipeline.run.result_files import read_results
+from trihedron.pipeline.sweep.jobs import SEEDS
+from trihedron.pipeline.sweep.paired_statistics import half_interval
 from trihedron.tools import comparison_table as render
 from trihedron.tools import other_programs
 from trihedron.tools.arguments import Parser
 from trihedron.tools.comparison_table import FIGURES
 from trihedron.tools.comparison_verdicts import COLUMNS, paired_samples
-from trihedron.tools.paired_statistics import half_interval
 from trihedron.tools.verdicts import NOTE, VERDICTS, Sample, Verdict, line_of, verdicts_of
 
-SEEDS = ("seed", "dataset.seed")
 ALL_DATA = "all"  # in the place of a data set: differences over all of them
 NOT_SHOWN = ("out", "report", "experiment", "sequences", "alternatives", *SEEDS)
 SURFACE, SURFACE_FIGURES = "surface.ply", "surface.json"

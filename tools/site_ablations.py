@@ -15,11 +15,11 @@ import numpy as np
 from trihedron.pipeline.core.config import Feedback
 from trihedron.pipeline.core.errors import DataError
 from trihedron.pipeline.run.result_files import read_results
+from trihedron.pipeline.sweep.paired_statistics import half_interval
 from trihedron.tools import ablation_tables as tables
 from trihedron.tools.ablation_errors import errors_file, read_errors
 from trihedron.tools.ablation_swaps import AS_RECORDED
 from trihedron.tools.ablation_tables import RESULT, Case, Variant, by_change, number
-from trihedron.tools.paired_statistics import half_interval
 from trihedron.tools.site_figures import MOST_CURVES, Figure, curve_look, curves_figure
 from trihedron.tools.site_pages import render
 from trihedron.tools.site_pictures import embedded
