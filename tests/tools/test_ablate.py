@@ -32,6 +32,7 @@ from trihedron.tools.ablation_tables import (
     sections_of,
     verdicts,
 )
+from trihedron.tools.site import write_site
 from trihedron.tools.site_ablations import ablation_page, ablations_of, attribution_bars, charts_of
 
 sys.path.insert(0, str(Path(__file__).parent))
@@ -163,6 +164,12 @@ def test_the_page_of_an_ablation_has_verdicts_attribution_curves_and_its_command
     assert "rotation=other: frame 5 of 1/run.mcap, 3 mm apart; 7 of 10 frames differ" in page
     assert "manhattan=other: equal to the recorded configuration in all frames" in page
     assert "Attribution: Shapley value of each swap" in page and "<td>+2.12 ± 1.59</td>" in page
+
+
+def test_the_index_of_the_pages_leads_to_the_ablation(ablation, tmp_path):
+    write_site([], tmp_path / "site", "Results", pictures=False, ablations=[ablation])
+    assert f'<li><a href="ablations/{ablation.name}.html">{ablation.title}</a></li>' in (tmp_path / "site" / "index.html").read_text()
+    assert (tmp_path / "site" / "ablations" / f"{ablation.name}.html").read_text() == ablation_page(ablation, pictures=False)
 
 
 def test_the_command_of_an_open_loop_says_so(ablation):
