@@ -2,8 +2,8 @@
 
 A row is what a run's overrides say that those of the others do not; runs that differ in their seed alone share a row, as median ± half the distance
 from the smallest to the largest, and the mean of their ATE ± half its 95 % interval by Student's t. Rows of one data set stand together; the best of
-each column is bold, errors only among rows that tracked almost as much as the best. `end to start` is where a run without ground truth ends, seen from
-where it began: the drift of a walk that returns.
+each column is bold, errors only among rows that tracked almost as much as the best. `end to start` is where a run without ground truth ends, seen
+from where it began: the drift of a walk that returns.
 `--baseline` adds the mean paired difference (same data, same seeds) with its 95 % interval by Student's t, per row and over all data, and prints
 verdicts first, as `trihedron ablate` does: of each change against the baseline, over all pairs of runs; of a single pair by the errors of its frames.
 A job that failed, or has no errors, has a row with the reason.
