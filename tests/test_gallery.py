@@ -22,6 +22,7 @@ PRINTED = {  # a pattern that the printed lines must match
     "plane_detectors": r"connected_components: \d+ planes cover [789]\d % of the image\nahc: ",
     "replay_one_stage": r"mean_shift again: bit-equal in 45 frames",
     "time_of_each_stage": r"30 frames of 640 x 480; the slowest stage is \w+",
+    "which_manhattan_estimator": r"as recorded against manhattan=mixture: axes 0\.\d+ -> 0\.\d+ deg, .+ \(95 %: [-+]0\.\d+ to \+0\.\d+\)",
 }
 QUICK = {"features_of_one_frame", "manhattan_axes"}
 

@@ -39,13 +39,12 @@ from trihedron.pipeline.run.result_files import read_results
 from trihedron.pipeline.sweep.jobs import key_of
 from trihedron.tools import ablation_tables as tables
 from trihedron.tools.ablation_differences import Parting, StageErrors, changed_by_code, reference_of
-from trihedron.tools.ablation_errors import of_trajectory, read_errors, write_errors
+from trihedron.tools.ablation_errors import errors_file, of_trajectory, read_errors, write_errors
 from trihedron.tools.ablation_statistics import nees_of
 from trihedron.tools.ablation_swaps import Combination, combinations_of, folder_name, parsed, without_repeats
-from trihedron.tools.ablation_tables import NEES, Case, Variant
+from trihedron.tools.ablation_tables import NEES, RESULT, Case, Variant
 from trihedron.tools.arguments import Parser
 
-RESULT = "ablation.json"
 PICTURE = "differs.png"
 ERRORS = {  # column -> key of the final metrics, factor
     "ATE mm": ("ate_rmse_m", 1e3),
@@ -122,7 +121,7 @@ def ablate(options: Options) -> list[Case]:
         alternatives = alternatives_of(recording, [combination.words for combination in combinations])
         computing = Alternatives(recording, alternatives, options.feedback, options.threads)
         key = _key(recording, computing, options)
-        file = options.out / f"errors-{key[:16]}.npz"
+        file = errors_file(options.out, key)
         errors = read_errors(file, len(combinations))
         if key in known and errors is not None:
             print(f"{recording.path}: done already", file=sys.stderr)
@@ -136,6 +135,7 @@ def ablate(options: Options) -> list[Case]:
             if options.budget:
                 case.budget, case.remarks = _budget(recording)
             write_errors(file, [variant.errors for variant in case.variants])
+        case.swaps, case.feedback = list(options.swaps), options.feedback.name
         cases.append(case)
         keys.append(key)
         _write(options.out, {**known, **dict(zip(keys, map(tables.case_to_dict, cases)))})

@@ -176,7 +176,7 @@ def reference_of(recording: Recording) -> tuple[Mapping[int, F64], bool]:
 
 def changed_by_code(recording: Recording, again: Recording) -> str:
     """Compare the small topics of a recording with what the same stages compute now; returns the first difference, empty where all is equal."""
-    topics = [topic for topic in MEASURED if topic in recording.topics & again.topics]
+    topics = [topic for topic in reversed(MEASURED) if topic in recording.topics & again.topics]  # in data order
     frames = common_frames(recording, again)
     found = [one for topic in topics if (one := difference(recording, again, topic, frames)) is not None]
     first = min(found, key=lambda one: one.frame, default=None)

@@ -26,6 +26,11 @@ def of_trajectory(result: Result, truth: Trajectory | None, columns: Mapping[str
     return {column: factor * found[name] for column, (name, factor) in columns.items() if name in found}
 
 
+def errors_file(out: Path, key: str) -> Path:
+    """Return the file of the errors of a recording's alternatives, by the key of its case in an ablation's folder."""
+    return out / f"errors-{key[:16]}.npz"
+
+
 def write_errors(file: Path, errors: Sequence[Errors]) -> None:
     """Write the errors of all alternatives of a recording. Raises DataError."""
     arrays = {f"{number} {column}": values for number, one in enumerate(errors) for column, values in one.items()}

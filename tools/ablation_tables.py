@@ -3,22 +3,24 @@ JSON."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from itertools import combinations
 from typing import Any
 
 import numpy as np
 
+from trihedron.pipeline.core.config import Feedback
 from trihedron.pipeline.core.types import F64
+from trihedron.pipeline.sweep.paired_statistics import CONFIDENCE, half_interval
 from trihedron.tools.ablation_differences import OPEN_LOOP, Parting
 from trihedron.tools.ablation_statistics import shapley
 from trihedron.tools.ablation_swaps import AS_RECORDED, Combination
 from trihedron.tools.arguments import table
-from trihedron.tools.paired_statistics import CONFIDENCE, half_interval
 from trihedron.tools.stage_measures import COLUMNS as MEASURED
 from trihedron.tools.verdicts import NOTE, VERDICTS, Column, Sample, Verdict, line_of, verdicts_of
 
+RESULT = "ablation.json"
 NEES = "NEES"
 FIGURES = {  # in the order of columns
     "ATE mm": Column(2),
@@ -71,6 +73,8 @@ class Case:
     budget: dict[str, dict[str, float]] = field(default_factory=dict)
     remarks: list[str] = field(default_factory=list)  # sentences on rows of the budget that mean nothing
     fps: float = 30.0
+    swaps: list[str] = field(default_factory=list)  # the words that the alternatives were made of
+    feedback: str = Feedback.new.name
     true: bool = True  # the poses by which single stages are measured are the ground truth, not those of the recorded run
 
 
@@ -86,7 +90,7 @@ class Section:
 
 def verdicts(cases: Sequence[Case]) -> list[Verdict]:
     """Return the verdict of each pair of alternatives, the earlier one first, in each figure."""
-    samples = {label: [_sample(case, variant) for case, variant in found] for label, found in _by_change(cases).items()}
+    samples = {label: [_sample(case, variant) for case, variant in found] for label, found in by_change(cases).items()}
     pairs = {(first, second): list(zip(samples[first], samples[second])) for first, second in combinations(samples, 2)}
     return verdicts_of(pairs, {name: column for name, column in FIGURES.items() if name != NEES})  # of which neither more nor less is better
 
@@ -181,8 +185,8 @@ def number(name: str, value: float | None, sign: bool = False) -> str:
     return text if float(text) else text.lstrip("+-")
 
 
-def _by_change(cases: Sequence[Case]) -> dict[str, list[tuple[Case, Variant]]]:
-    """The alternatives of all recordings by their words, as recorded first."""
+def by_change(cases: Sequence[Case]) -> dict[str, list[tuple[Case, Variant]]]:
+    """Return the alternatives of all recordings by their words, as recorded first."""
     found: dict[str, list[tuple[Case, Variant]]] = {}
     for case in cases:
         for variant in case.variants:
@@ -194,9 +198,9 @@ def alternatives_table(cases: Sequence[Case]) -> Section:
     """Means over the recordings of every figure of every alternative."""
     columns = columns_of(cases)
     rows = [["change", *columns]]
-    for label, found in _by_change(cases).items():
+    for label, found in by_change(cases).items():
         values = {name: [variant.figures.get(name, np.nan) for _, variant in found] for name in columns}
-        rows.append([label, *(number(name, _mean(some)) for name, some in values.items())])
+        rows.append([label, *(number(name, mean_of(some)) for name, some in values.items())])
     count = f"mean of {len(cases)} recordings" if len(cases) > 1 else f"{cases[0].recording}, {cases[0].frames} frames"
     note = f"computed again: {', '.join(cases[0].stages)}; ms are CPU milliseconds a frame of these"
     if not all(case.true for case in cases) and any(name in columns for name in OPEN_LOOP):
@@ -204,7 +208,8 @@ def alternatives_table(cases: Sequence[Case]) -> Section:
     return Section(f"Alternatives, {count}", rows, "l" + "r" * len(columns), note)
 
 
-def _mean(values: Sequence[float]) -> float:
+def mean_of(values: Iterable[float]) -> float:
+    """Return the mean of the values that are finite, NaN where there is none."""
     finite = [value for value in values if np.isfinite(value)]
     return float(np.mean(finite)) if finite else np.nan
 
@@ -267,7 +272,7 @@ def attribution_table(cases: Sequence[Case]) -> Section:
 def parting_table(cases: Sequence[Case]) -> Section:
     """List where each alternative leaves the recorded configuration; of several recordings the one in which they are farthest apart."""
     rows = [["change", "recording", "first frame", "first difference", "frames", "worst frame", "apart there", "picture"]]
-    for label, group in _by_change(cases).items():
+    for label, group in by_change(cases).items():
         if label == AS_RECORDED:
             continue
         case, variant = farthest(group)
@@ -290,7 +295,7 @@ def farthest(group: Sequence[tuple[Case, Variant]]) -> tuple[Case, Variant]:
 def cost_table(cases: Sequence[Case]) -> Section:
     """CPU time of each alternative, over all recordings."""
     rows = [["change", "stages s", "with all else s", "× its stages", "full run s", "× less"]]
-    for label, group in _by_change(cases).items():
+    for label, group in by_change(cases).items():
         stages, total = (sum(getattr(variant, name) for _, variant in group) for name in ("stages_s", "total_s"))
         full = sum(case.full_s for case, _ in group)
         known = np.isfinite(full) and total > 0.0

@@ -1,8 +1,9 @@
 """The runs of sweeps, and single runs, as one table: what each one changed, what it tracked, its errors, its time and its memory.
 
 A row is what a run's overrides say that those of the others do not; runs that differ in their seed alone share a row, as median ± half the distance
-from the smallest to the largest. Rows of one data set stand together; the best of each column is bold, errors only among rows that tracked almost
-as much as the best. `end to start` is where a run without ground truth ends, seen from where it began: the drift of a walk that returns.
+from the smallest to the largest, and the mean of their ATE ± half its 95 % interval by Student's t. Rows of one data set stand together; the best of
+each column is bold, errors only among rows that tracked almost as much as the best. `end to start` is where a run without ground truth ends, seen
+from where it began: the drift of a walk that returns.
 `--baseline` adds the mean paired difference (same data, same seeds) with its 95 % interval by Student's t, per row and over all data, and prints
 verdicts first, as `trihedron ablate` does: of each change against the baseline, over all pairs of runs; of a single pair by the errors of its frames.
 A job that failed, or has no errors, has a row with the reason.
@@ -27,15 +28,15 @@ import numpy as np
 from trihedron.pipeline.core.errors import DataError, UsageError, did_you_mean, printable
 from trihedron.pipeline.core.files import MAX_YAML_BYTES, YamlError, parse_yaml, read_text
 from trihedron.pipeline.run.result_files import read_results
+from trihedron.pipeline.sweep.jobs import SEEDS
+from trihedron.pipeline.sweep.paired_statistics import half_interval
 from trihedron.tools import comparison_table as render
 from trihedron.tools import other_programs
 from trihedron.tools.arguments import Parser
 from trihedron.tools.comparison_table import FIGURES
 from trihedron.tools.comparison_verdicts import COLUMNS, paired_samples
-from trihedron.tools.paired_statistics import half_interval
 from trihedron.tools.verdicts import NOTE, VERDICTS, Sample, Verdict, line_of, verdicts_of
 
-SEEDS = ("seed", "dataset.seed")
 ALL_DATA = "all"  # in the place of a data set: differences over all of them
 NOT_SHOWN = ("out", "report", "experiment", "sequences", "alternatives", *SEEDS)
 SURFACE, SURFACE_FIGURES = "surface.ply", "surface.json"
@@ -202,12 +203,14 @@ def rows_of(runs: Sequence[Run], baseline: str = "") -> list[dict[str, Any]]:
 
 
 def row_of(data: str, change: str, same: Sequence[Run], base: Sequence[Run] | None = None) -> dict[str, Any]:
-    """Return the row of runs that share one, and their paired differences from those of the baseline."""
+    """Return the row of runs that share one, and their paired differences from those of the baseline. `half` of a figure is half the 95 % interval of
+    its mean, None for one run."""
     figures = {}
     for name in FIGURES:
         values = [run.figures[name] for run in same if np.isfinite(run.figures[name])]
         if values:
-            figures[name] = {"median": float(np.median(values)), "min": min(values), "max": max(values), "runs": len(values)}
+            spread = {"median": float(np.median(values)), "min": min(values), "max": max(values), "runs": len(values)}
+            figures[name] = {**spread, "mean": float(np.mean(values)), "half": half_interval(values)}
     notes = dict.fromkeys(run.note for run in same if run.note)
     return {
         "data": data,

@@ -12,6 +12,7 @@ from typing import Any
 
 Row = dict[str, Any]
 TRACKED, COMPARED = "tracked %", "ATE mm"
+MEAN = f"{COMPARED} mean, 95 %"
 TRACKED_SLACK = 5.0  # percent of the frames: an error over fewer of them is no better
 LATEX = {"%": r"\%", "&": r"\&", "_": r"\_", "#": r"\#", "±": r"$\pm$", "°": r"$^\circ$"}
 
@@ -52,12 +53,15 @@ def cells_of(rows: Sequence[Row]) -> tuple[list[str], list[list[Cell]]]:
     """Header and cells; columns in which no row has anything are left out."""
     shown = [name for name in FIGURES if any(name in row["figures"] for row in rows)]
     data, compared, notes = len({row["data"] for row in rows}) > 1, any(row["difference"] for row in rows), any(row["note"] for row in rows)
-    header = [*(["data"] if data else []), "change", "runs", *shown, *([f"{COMPARED} - baseline"] if compared else []), *(["note"] if notes else [])]
+    repeated = any(row["figures"].get(COMPARED, {}).get("half") is not None for row in rows)
+    added = [name for name, there in ((MEAN, repeated), (f"{COMPARED} - baseline", compared), ("note", notes)) if there]
+    header = [*(["data"] if data else []), "change", "runs", *shown, *added]
     best = {(row["data"], name): _best([other for other in rows if other["data"] == row["data"]], name) for row in rows for name in shown}
     cells = []
     for row in rows:
         line = [*([Cell(row["data"] or "-")] if data else []), Cell(row["change"] or "-"), Cell(str(row["runs"]))]
         line += [_cell(row, name, best[row["data"], name]) for name in shown]
+        line += [Cell(_mean(row["figures"].get(COMPARED)))] if repeated else []
         line += [Cell(_difference(row["difference"].get(COMPARED)))] if compared else []
         cells.append([*line, Cell(row["note"])] if notes else line)
     return header, cells
@@ -94,6 +98,13 @@ def figure_text(row: Row, name: str) -> str:
     found, decimals = row["figures"][name], FIGURES[name].decimals
     spread = f" ±{0.5 * (found['max'] - found['min']):.{decimals}f}" if found["runs"] > 1 else ""
     return f"{found['median']:.{decimals}f}{spread}"
+
+
+def _mean(found: dict[str, Any] | None) -> str:
+    if found is None or found["half"] is None:
+        return "-"
+    decimals = FIGURES[COMPARED].decimals
+    return f"{found['mean']:.{decimals}f} ±{found['half']:.{decimals}f}"
 
 
 def _difference(found: dict[str, Any] | None) -> str:

@@ -24,7 +24,7 @@ from trihedron.tools import published
 from trihedron.tools.arguments import Parser
 from trihedron.tools.compare import Run, groups_of, read_runs, row_of
 from trihedron.tools.comparison_table import COMPARED, FIGURES, TRACKED, figure_text
-from trihedron.tools.site_ablations import ablations_of
+from trihedron.tools.site_ablations import Ablation, ablation_page, ablations_of
 from trihedron.tools.site_pages import render
 from trihedron.tools.site_runs import RunFacts, facts_of, run_page
 
@@ -132,9 +132,9 @@ def write_site(
     title: str,
     outside: dict[tuple[str, str], str] | None = None,
     pictures: bool = True,
-    ablations: Sequence[dict[str, Any]] = (),
+    ablations: Sequence[Ablation] = (),
 ) -> None:
-    """Write index.html and a page for each run into a folder."""
+    """Write index.html and a page for each run and each ablation into a folder."""
     from trihedron.tools.paper import tables_of
 
     (out / "runs").mkdir(parents=True, exist_ok=True)
@@ -146,6 +146,9 @@ def write_site(
         for facts in cell.facts:
             page = run_page(facts, f"{_system(cell)}, {_data_title(cell)}", facts.commit != commit, pictures)
             (out / "runs" / f"{names[facts.run.folder]}.html").write_text(page, encoding="utf-8")
+    for ablation in ablations:
+        (out / "ablations").mkdir(exist_ok=True)
+        (out / "ablations" / f"{ablation.name}.html").write_text(ablation_page(ablation, pictures), encoding="utf-8")
     groups = [_group(data, [cell for cell in cells if cell.data == data], columns, names, commit, outside or {}) for data in _data_of(cells)]
     page = render(
         "index.html",

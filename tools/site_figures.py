@@ -22,6 +22,9 @@ from trihedron.tools.mesh_files import read_mesh, vertex_colors
 WIDTH, HEIGHT = 560, 240
 LEFT, RIGHT, TOP, BOTTOM = 52, 12, 12, 34
 OURS, TRUTH = "#d55e00", "#0072b2"  # Okabe and Ito's colours, which the colour-blind tell apart
+CURVE_COLORS = ("#0072b2", OURS, "#009e73", "#cc79a7", "#e69f00", "#000000", "#56b4e9")
+DASHES = ("", "5 4", "2 3", "9 3 2 3")
+MOST_CURVES = 12  # of a figure
 STATUS_LOOK = {OK: ("#009e73", "ok"), DEGRADED: ("#e69f00", "degraded"), LOST: ("#000000", "lost")}
 MOST_POINTS = 500  # of a curve or path
 MOST_TRIANGLES = 5000
@@ -53,7 +56,7 @@ def path_figure(estimate: Trajectory, truth: Trajectory | None) -> Figure:
 
     step = nice_step(size)
     bar = f'<path d="M{LEFT},{HEIGHT - 14}h{scale * step:.1f}" stroke="#333" stroke-width="3"/><text x="{LEFT}" y="{HEIGHT - 20}">{step:g} m</text>'
-    body = polyline(place(_thinned(true)), TRUTH, dashed=True) + polyline(place(_thinned(ours)), OURS) + bar
+    body = polyline(place(_thinned(true)), TRUTH, DASHES[1]) + polyline(place(_thinned(ours)), OURS) + bar
     return Figure(_svg(body, f"Path from above, {len(ours)} poses"), "Path from above: ours in orange, ground truth in blue, dashed.")
 
 
@@ -66,6 +69,27 @@ def error_figure(estimate: Trajectory, truth: Trajectory) -> Figure | None:
     seconds = (estimate.stamps_ns[pairs[:, 0]] - estimate.stamps_ns[0]) / 1e9
     body = _axes(seconds[-1], errors.max(), "s", "mm") + polyline(_thinned(_placed(seconds, errors, seconds[-1], errors.max())), OURS)
     text = f"Position error over time: median {np.median(errors):.2f} mm, largest {errors.max():.2f} mm"
+    return Figure(_svg(body, text), text + ".")
+
+
+def curve_look(number: int) -> tuple[str, str]:
+    """Return the colour and the dashes of one of several curves."""
+    return CURVE_COLORS[number % len(CURVE_COLORS)], DASHES[number % len(DASHES)]
+
+
+def curves_figure(name: str, curves: Sequence[F64], fps: float) -> Figure:
+    """Draw the errors (n,) of the same frames in several alternatives over seconds; `name` ends in the unit. A curve is open where there is none."""
+    title, _, unit = name.rpartition(" ")
+    seconds = np.arange(max(map(len, curves))) / fps
+    largest = max((float(np.nanmax(one)) for one in curves if np.isfinite(one).any()), default=1.0)
+    top = 1.15 * largest  # room for the unit
+    body = _axes(float(seconds[-1]), top, "s", unit)
+    for number, values in enumerate(curves):
+        known = np.flatnonzero(np.isfinite(values))
+        for piece in np.split(known, np.flatnonzero(np.diff(known) > 1) + 1):
+            places = _placed(seconds[piece], values[piece], float(seconds[-1]), top)
+            body += polyline(_thinned(places), *curve_look(number))
+    text = f"{title} over time, {unit}; the largest is {largest:.3g}"
     return Figure(_svg(body, text), text + ".")
 
 
@@ -183,11 +207,11 @@ def _placed(x: F64, y: F64, largest_x: float, largest_y: float) -> F64:
     return np.stack([LEFT + across * x, HEIGHT - BOTTOM - up * y], axis=1)
 
 
-def polyline(points: F64, color: str, dashed: bool = False) -> str:
+def polyline(points: F64, color: str, dashes: str = "") -> str:
     """Return an SVG line through (n, 2) places; nothing for fewer than two."""
     if len(points) < 2:
         return ""
-    dash = ' stroke-dasharray="5 4"' if dashed else ""
+    dash = f' stroke-dasharray="{dashes}"' if dashes else ""
     places = " ".join(f"{x:.1f},{y:.1f}" for x, y in points)
     return f'<polyline points="{places}" fill="none" stroke="{color}" stroke-width="1.8"{dash}/>'
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import base64
 import hashlib
 import json
 import shlex
@@ -23,10 +22,10 @@ from trihedron.tools import site_figures
 from trihedron.tools.compare import Run
 from trihedron.tools.comparison_table import FIGURES
 from trihedron.tools.site_pages import render
+from trihedron.tools.site_pictures import embedded
 
 RECORDING, TRAJECTORY, SURFACE = "run.mcap", "trajectory.txt", "surface.ply"
 CONFIGURATION = Path(".hydra") / "config.yaml"
-PICTURE_WIDTH, PICTURE_QUALITY = 900, 65
 NOT_REPEATED = ("out", "hydra.sweep.dir")  # of the words of a command
 
 
@@ -136,8 +135,6 @@ def _results(folder: Path) -> tuple[Trajectory | None, Trajectory | None, list[P
 
 def _pictures(folder: Path) -> list[dict[str, Any]]:
     """Return the middle frame with its features, and the map from above, as JPEG; none where the recording cannot be drawn."""
-    import cv2
-
     from trihedron.tools.picture import draw
 
     with TemporaryDirectory() as temporary:
@@ -146,12 +143,8 @@ def _pictures(folder: Path) -> list[dict[str, Any]]:
             draw(str(folder / RECORDING), -1, file)
         except TrihedronError:
             return []
-        image = cv2.imread(str(file))
-    height = round(image.shape[0] * PICTURE_WIDTH / image.shape[1])
-    small = cv2.resize(image, (PICTURE_WIDTH, height), interpolation=cv2.INTER_AREA)
-    data = cv2.imencode(".jpg", small, [cv2.IMWRITE_JPEG_QUALITY, PICTURE_QUALITY])[1].tobytes()
-    alt = "The middle frame with planes, 3D lines, key points and Manhattan axes; the map from above"
-    return [{"data": base64.b64encode(data).decode(), "alt": alt, "width": PICTURE_WIDTH, "height": height}]
+        picture = embedded(file, "The middle frame with planes, 3D lines, key points and Manhattan axes; the map from above")
+    return [picture] if picture else []
 
 
 def sha256(path: Path) -> str:

@@ -18,6 +18,7 @@ JOB = "job.json"
 RUNNING, DONE, FAILED = "running", "done", "failed"
 NOT_PART = ("hydra", "out", "report", "sequences", "alternatives", "dry_run")  # of what a job computes
 SOURCES = ("pipeline", "plugins", "datasets")  # packages whose code decides on results
+SEEDS = ("seed", "dataset.seed")  # options in which alone the repeats of a job differ
 Job = dict[str, Any]
 
 

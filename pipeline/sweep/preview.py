@@ -47,7 +47,7 @@ def preview(jobs: Sequence[Planned]) -> str:
     for own in classes:
         for number in own.values():
             users[number] = users.get(number, 0) + 1
-    common: set[str] = set.intersection(*(set(job.words) for job in jobs)) if len(jobs) > 1 else set()
+    common = common_words([job.words for job in jobs])
     rows, each = [("job", "state", "change", "stages", "shared with other jobs")], iter(classes)
     for job in jobs:
         change = " ".join(word for word in job.words if word not in common) or "-"
@@ -62,10 +62,15 @@ def preview(jobs: Sequence[Planned]) -> str:
 
 
 def _counts(jobs: Sequence[Planned], users: dict[int, int]) -> list[str]:
-    states = [job.state for job in jobs]
+    states, words = [job.state for job in jobs], common_words([job.words for job in jobs])
     counts = [f"{states.count(state)} {state}" for state in (DONE, TO_RUN, AGAIN, REFUSED) if state in states]
     stages = sum(users.values())
     found = [f"{len(jobs)} jobs: {', '.join(counts)}"]
     if stages > len(users):
         found.append(f"{stages} stages, {len(users)} of them different; trihedron ablate computes what alternatives of a recording share once")
-    return found
+    return [*found, printable(f"words of all jobs: {' '.join(words)}")] if words else found
+
+
+def common_words(jobs: Sequence[Sequence[str]]) -> list[str]:
+    """Return the words that all of several jobs have, in the order of the first; none of a single job."""
+    return [word for word in jobs[0] if all(word in job for job in jobs)] if len(jobs) > 1 else []

@@ -34,12 +34,13 @@ from trihedron.pipeline.core.registry import load_plugins, options_of, plugins_o
 from trihedron.pipeline.core.slots import SLOTS
 from trihedron.pipeline.sweep.cluster import all_awaited
 from trihedron.pipeline.sweep.jobs import DONE, FAILED, RUNNING, key_of, read_job, write_job
-from trihedron.pipeline.sweep.preview import Planned, preview, refused, state_of
-from trihedron.pipeline.sweep.progress import Progress
+from trihedron.pipeline.sweep.preview import Planned, common_words, preview, refused, state_of
+from trihedron.pipeline.sweep.progress import Progress, reason
 
 Overrides = list[str]
 GRAPH_KEYS = frozenset({*SLOTS, "graph", "without"} - {"dataset"})  # of words that choose or change a graph
 CHOICE = "alternatives="  # a word of a sequence: the alternatives that are tried on it
+OF_SWEEPS = ("sequences=", "alternatives=", "dry_run=")  # words that no job has
 
 
 @dataclass
@@ -108,6 +109,7 @@ class Sweeper(HydraSweeper):
         folders = [self.folder / str(number) for number in _numbers(self.folder, jobs)]
         missing: list[tuple[Overrides, Path]] = []
         errors: list[TrihedronError] = []
+        composed: list[tuple[Overrides, Path]] = []
         for job, folder in zip(jobs, folders):
             words = [*job, f"hydra.sweep.subdir={folder.name}"]  # the last is its own alone
             try:
@@ -116,8 +118,9 @@ class Sweeper(HydraSweeper):
                 errors.append(error if isinstance(error, TrihedronError) else rewritten(error))
                 _keep_overrides(folder, job)
                 write_job(folder, "", FAILED, str(errors[-1]))
-                print(f"trihedron: {errors[-1]}", file=sys.stderr)
+                print(reason(folder, errors[-1]), file=sys.stderr)
                 continue
+            composed.append((job, folder))
             if read_job(folder) != {"key": key, "state": DONE, "error": ""}:
                 (folder / "job.json").unlink(missing_ok=True)
                 missing.append((words, folder))
@@ -126,8 +129,7 @@ class Sweeper(HydraSweeper):
         if already := len(jobs) - len(errors) - len(missing):
             print(f"sweep: {already} of {len(jobs)} jobs are done already", file=sys.stderr)
         if missing:
-            changes = changes_of([given[:-1] for given, _ in missing])
-            with Progress([place for _, place in missing], changes, before + len(jobs) - len(missing), total):
+            with Progress([folder for _, folder in composed], changes_of([job for job, _ in composed]), before, total, len(errors)):
                 self._launch(missing)
         return folders
 
@@ -181,7 +183,7 @@ class Sweeper(HydraSweeper):
     def jobs(self, arguments: list[str]) -> list[Overrides]:
         """The overrides of every job: the cross product of sequences, of all values given and of the alternatives."""
         parser = OverridesParser.create(config_loader=self.loader)
-        words = [word for word in [*self.given, *arguments] if not word.startswith(("sequences=", "alternatives="))]
+        words = [word for word in [*self.given, *arguments] if not word.startswith(OF_SWEEPS)]
         words += [] if any(word.startswith("threads=") for word in words) else [f"threads={self._threads}"]
         sequences = list(self.options.sequences)
         alternatives = words_of_alternatives(list(self.options.alternatives)) or [[]]
@@ -280,7 +282,7 @@ def _numbers(folder: Path, jobs: Sequence[Overrides]) -> list[int]:
 
 def changes_of(jobs: Sequence[Overrides]) -> list[str]:
     """Return the words of each job that not all of them have."""
-    common = set.intersection(*map(set, jobs)) if len(jobs) > 1 else set()
+    common = common_words(jobs)
     return [" ".join(word for word in job if word not in common) for job in jobs]
 
 

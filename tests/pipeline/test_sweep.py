@@ -1,9 +1,11 @@
 """Sweeps: keys of jobs, data sets by a word, what is done already is not done again, and a job that fails stops no other."""
 
+import io
 import json
 import os
 import subprocess
 import sys
+from contextlib import redirect_stderr
 
 import pytest
 import yaml
@@ -113,6 +115,7 @@ def test_a_dry_run_lists_jobs_and_what_they_share_and_runs_nothing(tmp_path, cap
     assert "manhattan=mean_shift normals.patch_px=8 " in rows["0"] and rows["0"].endswith("dataset, normals, lines, segments, planes")
     assert rows["3"].endswith("  dataset, normals, planes") and "refused" in rows["5"] and "normals.patch_px: 999 is not" in rows["5"]
     assert said[7] == "6 jobs: 4 to run, 2 refused" and said[8].startswith("20 stages, 11 of them different")
+    assert said[9] == f"words of all jobs: {' '.join(QUICK[:-1])} outputs=[manhattan] out={folder} threads=1"
 
 
 def test_a_live_table_shows_what_runs_what_ended_and_why_one_failed(tmp_path, capsys, monkeypatch):
@@ -125,7 +128,7 @@ def test_a_live_table_shows_what_runs_what_ended_and_why_one_failed(tmp_path, ca
     with progress:
         pass
     first = capsys.readouterr().err
-    assert first.splitlines()[0].startswith("sweep: 3 of 6 jobs done, 0 s, about ") and first.splitlines()[0].endswith(" left")
+    assert first.splitlines()[0].startswith("sweep: 3 of 6 jobs done, 3 left, 0 s, about ") and first.splitlines()[0].endswith(" left")
     assert [line.split() for line in first.splitlines()[1:]] == [
         ["1", "running", "0", "s", "seed=1"],
         ["0", "done", "0", "s", "ATE", "1.23", "mm", "seed=0"],
@@ -133,7 +136,35 @@ def test_a_live_table_shows_what_runs_what_ended_and_why_one_failed(tmp_path, ca
     write_job(folders[1], "", "failed", "planes: no plane")
     progress.__exit__()
     second = capsys.readouterr().err
-    assert second.startswith("\x1b[3F\x1b[Jtrihedron: planes: no plane\nsweep: 4 of 6 jobs done") and "1  failed" in second
+    assert second.startswith("\x1b[3F\x1b[Jtrihedron: job 1: planes: no plane\nsweep: 3 of 6 jobs done, 1 failed, 2 left, ") and "1  failed" in second
+
+
+def test_progress_goes_to_the_terminal_while_a_job_redirects_its_errors(tmp_path, capsys):
+    progress = Progress([tmp_path], [""], 0, 1)
+    with redirect_stderr(io.StringIO()) as log:
+        progress.__enter__()
+        write_job(tmp_path, "", "failed", "planes: no plane")
+        progress.__exit__()
+    assert log.getvalue() == ""
+    assert capsys.readouterr().err.splitlines()[0] == f"trihedron: job {tmp_path.name}: planes: no plane"
+
+
+def test_a_live_table_has_median_and_interval_of_repeats(tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(sys.stderr, "isatty", lambda: True)
+    changes = [f"manhattan={name} dataset.seed={seed}" for name in ("mean_shift", "mixture") for seed in range(3)]
+    folders = [tmp_path / str(number) for number in range(6)]
+    for folder, ate_mm in zip(folders, (1.0, 2.0, 6.0, 4.0)):
+        write_job(folder, "", "done")
+        (folder / "metrics.json").write_text(json.dumps({"final": {"ate_rmse_m": 1e-3 * ate_mm}}))
+    write_job(folders[5], "", "running")
+    with Progress(folders, changes, 1, 9, failed=1):  # four of the six were done before
+        pass
+    said = capsys.readouterr().err.splitlines()
+    assert said == [
+        "sweep: 5 of 9 jobs done, 1 failed, 3 left, 0 s",
+        "  5  running  0 s    manhattan=mixture dataset.seed=2",
+        "  3 seeds: ATE median 2.00 mm, mean 3.00 ± 6.57 (95 %)  manhattan=mean_shift",  # 4.3027 standard errors of 1.5275
+    ]
 
 
 def test_a_sweep_goes_on_where_it_was_stopped(tmp_path, capfd):
@@ -143,6 +174,8 @@ def test_a_sweep_goes_on_where_it_was_stopped(tmp_path, capfd):
     assert "sweep: 2 of 2 jobs done" in said.err
     assert "p50 ms" in said.out and said.out.splitlines()[-1] == f"next: trihedron report {tmp_path} draws the runs of this table"
     before = [(tmp_path / job / "run.mcap").stat().st_mtime_ns for job in ("0", "1")]
+    assert main([*words, "--dry-run"]) == 0
+    assert "2 jobs: 2 done" in capfd.readouterr().out.splitlines()
     assert json.loads((tmp_path / "1" / "job.json").read_text())["state"] == "done"
     assert "texture=False" in (tmp_path / "1" / ".hydra" / "overrides.yaml").read_text()
     assert "threads: 1" in (tmp_path / "1" / ".hydra" / "config.yaml").read_text()
@@ -181,7 +214,7 @@ def test_a_job_whose_process_dies_fails_alone(tmp_path):
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(tmp_path), os.environ.get("PYTHONPATH", "")])}
     words = ["run", "-m", *QUICK, "keypoints=orb,killed,none", "seed=0,1", f"out={tmp_path / 'sweep'}"]
     done = subprocess.run([*PROGRAM, *words], env=environment, capture_output=True, text=True)
-    assert done.returncode == 1 and "2 of 6 jobs failed" in done.stderr and "sweep: 6 of 6 jobs done" in done.stderr, done.stderr
+    assert done.returncode == 1 and "2 of 6 jobs failed" in done.stderr and "sweep: 4 of 6 jobs done, 2 failed, " in done.stderr, done.stderr
     jobs = [json.loads((tmp_path / "sweep" / str(number) / "job.json").read_text()) for number in range(6)]
     assert [job["state"] for job in jobs] == ["done", "done", "failed", "failed", "done", "done"]
     assert jobs[2]["error"] == f"{tmp_path / 'sweep' / '2'}: its process died; it crashed, or memory ran out"

@@ -7,6 +7,7 @@ import sys
 from dataclasses import replace
 from pathlib import Path
 
+import html5lib
 import numpy as np
 import pytest
 
@@ -32,7 +33,8 @@ from trihedron.tools.ablation_tables import (
     sections_of,
     verdicts,
 )
-from trihedron.tools.site_ablations import ablations_of
+from trihedron.tools.site import write_site
+from trihedron.tools.site_ablations import ablation_page, ablations_of, attribution_bars, charts_of
 
 sys.path.insert(0, str(Path(__file__).parent))
 from faulty_plugins import faulty
@@ -110,17 +112,79 @@ def test_errors_of_frames_are_kept_beside(tmp_path):
         write_errors(tmp_path / "nowhere" / "errors.npz", errors)
 
 
-def test_bars_of_the_pages_of_results(tmp_path):
-    cases = [case(number, [3.0, 1.0, 5.0, 3.0]) for number in (0, 1)]
-    (tmp_path / "ablation.json").write_text(json.dumps({str(k): case_to_dict(one) for k, one in enumerate(cases)}))
-    assert case_from_dict(json.loads(json.dumps(case_to_dict(cases[0])))).variants == cases[0].variants
+@pytest.fixture
+def ablation(tmp_path):
+    """The ablation of two recordings as `ablate` writes it, with errors of frames."""
+    cases = {}
+    for number, shift in enumerate((0.0, 0.5)):
+        found = replace(case(number, [3.0, 1.0, 5.0 + shift, 3.0]), swaps=["manhattan=other", "rotation=other"])
+        found.variants[1].parting = Parting(0, "rotation", "R", "0.1", 7, 4 + number, 2.0 + number, "mm")
+        cases[str(number)] = case_to_dict(found)
+        errors = [{"ATE mm": np.full(10, variant.figures["ATE mm"])} for variant in found.variants]
+        errors[1]["ATE mm"][:3] = np.nan
+        write_errors(tmp_path / f"errors-{number}.npz", errors)
+    (tmp_path / "ablation.json").write_text(json.dumps(cases))
     (found,) = ablations_of([tmp_path, tmp_path / "nowhere"])
-    assert found["title"].endswith(": 2 recordings") and [figure["name"] for figure in found["figures"]] == ["ATE mm", "ms"]
-    bars = {bar["label"]: (bar["left"], bar["length"], bar["text"]) for bar in found["figures"][0]["bars"]}
-    assert bars["manhattan=other"] == (50.0, 50.0, "+2.00 ± 0.00") and bars["rotation=other"] == (0.0, 50.0, "-2.00 ± 0.00")
+    return found
+
+
+def test_a_case_is_read_as_it_was_written(tmp_path):
+    found = case(0, [3.0, 1.0, 5.0, 3.0])
+    assert case_from_dict(json.loads(json.dumps(case_to_dict(found)))).variants == found.variants
     (tmp_path / "ablation.json").write_text('{"a": {"variants": 3}}')
     with pytest.raises(DataError, match="is not an ablation"):
         ablations_of([tmp_path])
+
+
+def test_the_page_of_an_ablation_has_a_chart_with_intervals_of_each_figure(ablation):
+    assert ablation.title.endswith(": 2 recordings, closed loop")
+    against = [one for one in verdicts(ablation.cases) if one.first == "as recorded"]
+    charts = charts_of(ablation.cases, against)
+    assert [chart["name"] for chart in charts] == ["ATE mm", "ms"]
+    ate, ms = charts
+    assert [(row["label"], row["text"]) for row in ate["rows"]] == [
+        ("as recorded", "3.00"),
+        ("rotation=other", "1.00, -2.00 (95 %: -2.00 to -2.00)"),
+        ("manhattan=other", "5.25, +2.25 (95 %: -0.93 to +5.43)"),  # 12.7062 standard errors of 0.25
+        ("manhattan=other rotation=other", "3.00, 0.00 (95 %: 0.00 to 0.00)"),
+    ]
+    assert ate["scale"] == ("1.00", "8.43") and ate["reference"] == ate["rows"][0]["dot"] == pytest.approx(4 + 92 * 2 / 7.4266, abs=0.01)
+    assert ate["rows"][2]["dot"] == pytest.approx(4 + 92 * 4.25 / 7.4266, abs=0.01)
+    assert ate["rows"][2]["interval"] == (pytest.approx(4 + 92 * 1.0734 / 7.4266, abs=0.01), 96.0)
+    assert ms["scale"] == ("", "") and [row["dot"] for row in ms["rows"]] == [50.0] * 4  # equal
+
+
+def test_the_page_of_an_ablation_has_verdicts_attribution_curves_and_its_command(ablation):
+    page = ablation_page(ablation, pictures=True)
+    html5lib.HTMLParser(strict=True).parse(page)
+    assert "<code>trihedron ablate 0/run.mcap 1/run.mcap manhattan=other rotation=other out=again</code>" in page
+    assert "<li>as recorded against rotation=other: ATE 3.00 -&gt; 1.00 mm, -2.00 (95 %: -2.00 to -2.00): better</li>" in page
+    assert page.index("as recorded against") < page.index("<details>") < page.index("rotation=other against manhattan=other: ATE")
+    assert "<title>manhattan=other: 5.25, +2.25 (95 %: -0.93 to +5.43)</title>" in page
+    assert "ATE over time, mm; the largest is 5.5." in page and page.count("<polyline") == 4
+    assert "rotation=other: frame 5 of 1/run.mcap, 3 mm apart; 7 of 10 frames differ" in page
+    assert "manhattan=other: equal to the recorded configuration in all frames" in page
+    assert "Attribution: Shapley value of each swap" in page and "<td>+2.12 ± 1.59</td>" in page
+
+
+def test_the_index_of_the_pages_leads_to_the_ablation(ablation, tmp_path):
+    write_site([], tmp_path / "site", "Results", pictures=False, ablations=[ablation])
+    assert f'<li><a href="ablations/{ablation.name}.html">{ablation.title}</a></li>' in (tmp_path / "site" / "index.html").read_text()
+    assert (tmp_path / "site" / "ablations" / f"{ablation.name}.html").read_text() == ablation_page(ablation, pictures=False)
+
+
+def test_the_command_of_an_open_loop_says_so(ablation):
+    (first, _) = ablation.cases
+    opened = replace(ablation, cases=(replace(first, feedback="recorded", budget={"": {"ATE mm": 1.0}}),))
+    assert opened.command == "trihedron ablate 0/run.mcap manhattan=other rotation=other feedback=recorded --budget out=again"
+    assert replace(ablation, cases=(replace(first, swaps=[]),)).command == ""  # of an older version
+
+
+def test_bars_of_the_attribution():
+    figures = attribution_bars([case(number, [3.0, 1.0, 5.0, 3.0]) for number in (0, 1)])
+    assert [figure["name"] for figure in figures] == ["ATE mm", "ms"]
+    bars = {bar["label"]: (bar["left"], bar["length"], bar["text"]) for bar in figures[0]["bars"]}
+    assert bars["manhattan=other"] == (50.0, 50.0, "+2.00 ± 0.00") and bars["rotation=other"] == (0.0, 50.0, "-2.00 ± 0.00")
 
 
 def translation(index, x):

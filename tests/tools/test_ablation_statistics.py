@@ -2,8 +2,8 @@
 
 import pytest
 
+from trihedron.pipeline.sweep.paired_statistics import half_interval, half_width, holm, p_value, power, repeats_needed
 from trihedron.tools.ablation_statistics import shapley
-from trihedron.tools.paired_statistics import half_interval, half_width, holm, p_value, power, repeats_needed
 
 
 def test_shapley_values_of_the_glove_game():

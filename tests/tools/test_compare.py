@@ -40,9 +40,9 @@ def test_rows_say_what_differs_and_seeds_share_one(tmp_path):
     for i, (without, seed, ate) in enumerate([("nothing", 0, 0.002), ("nothing", 1, 0.004), ("lines", 0, 0.006), ("lines", 1, 0.006)]):
         write_run(tmp_path / str(i), [f"without={without}", f"dataset.seed={seed}", "threads=2", f"out={tmp_path}"], ate, p50=10.0 + i)
     assert as_text(rows_of(read_runs(tmp_path))).splitlines() == [
-        "change           runs   tracked %      ATE mm  RPE 1 s mm   RPE 1 s deg     p50 ms",
-        "without=nothing     2  100.0 ±0.0  3.00 ±1.00  2.00 ±0.00  0.050 ±0.000  10.5 ±0.5",
-        "without=lines       2  100.0 ±0.0  6.00 ±0.00  2.00 ±0.00  0.050 ±0.000  12.5 ±0.5",
+        "change           runs   tracked %      ATE mm  RPE 1 s mm   RPE 1 s deg     p50 ms  ATE mm mean, 95 %",
+        "without=nothing     2  100.0 ±0.0  3.00 ±1.00  2.00 ±0.00  0.050 ±0.000  10.5 ±0.5        3.00 ±12.71",
+        "without=lines       2  100.0 ±0.0  6.00 ±0.00  2.00 ±0.00  0.050 ±0.000  12.5 ±0.5         6.00 ±0.00",
     ]
 
 
@@ -148,7 +148,8 @@ def test_files_hold_the_figures(tmp_path):
     written(tmp_path / "runs")
     files = {name: tmp_path / f"table.{name}" for name in WRITERS}
     assert main(["compare", str(tmp_path / "runs"), *(word for name, file in files.items() for word in (f"--{name}", str(file)))]) == 0
-    assert json.loads(files["json"].read_text())[0]["figures"]["ATE mm"] == {"median": 3.0, "min": 2.0, "max": 4.0, "runs": 2}
+    figure = json.loads(files["json"].read_text())[0]["figures"]["ATE mm"]
+    assert figure == {"median": 3.0, "min": 2.0, "max": 4.0, "runs": 2, "mean": 3.0, "half": pytest.approx(12.7062, rel=1e-5)}
     table = list(csv.DictReader(files["csv"].open()))
     assert [(row["change"], row["ATE mm median"]) for row in table] == [("graph=structural", "3.0"), ("graph=points", "5.0"), ("graph=direct", "1.0")]
 
