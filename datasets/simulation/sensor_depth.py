@@ -26,8 +26,8 @@ def tof_depth(depth_m: F64, cosine: F32, gray: U8, noise: float, rng: np.random.
     """Time of flight: noise over the square root of the returned amplitude, wiggling error, flying pixels, nothing from what is dark and far."""
     amplitude = np.maximum(gray / 255.0, 0.02) * np.maximum(cosine, 0.05)
     sigma = noise * (TOF_FLOOR_M + TOF_PER_M2 * depth_m**2 / np.sqrt(amplitude / 0.3))
-    read = _with_flying_pixels(depth_m.astype(np.float32), rng)
-    read = read + WIGGLE_M * np.sin(2.0 * np.pi * read / WIGGLE_PERIOD_M) + sigma * rng.standard_normal(depth_m.shape, dtype=np.float32)
+    seen = _with_flying_pixels(depth_m.astype(np.float32), rng)
+    read = seen + WIGGLE_M * np.sin(2.0 * np.pi * seen / WIGGLE_PERIOD_M) + sigma * rng.standard_normal(depth_m.shape, dtype=np.float32)
     lost = (amplitude < DARK * (depth_m / 3.0) ** 2) | (depth_m < TOF_RANGE_M[0]) | (depth_m > TOF_RANGE_M[1]) | (read <= 0.0)
     return np.where(lost, np.float32(0.0), np.round(read, 3)).astype(np.float32)
 

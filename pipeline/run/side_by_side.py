@@ -55,8 +55,8 @@ def equivalence(graphs: Sequence[Mapping[str, Vertex]]) -> list[dict[str, int]]:
 
 
 def _signature(own: Mapping[str, int], name: str, vertex: Vertex) -> tuple[Any, ...]:
-    """The class so far, and those of all that is read."""
-    return own[name], *((parameter, wire.delay, own.get(wire.topic, wire.topic)) for parameter, wire in sorted(vertex.inputs.items()))
+    """The class so far, which tells wires and delays, and those of all that is read."""
+    return own[name], *(own.get(wire.topic, wire.topic) for _, wire in sorted(vertex.inputs.items()))
 
 
 def _numbered(known: list[tuple[str, Vertex]], name: str, vertex: Vertex) -> int:

@@ -49,6 +49,16 @@ def test_short_or_unrelated_trajectories_are_drawn_too(tmp_path, count):
     assert BLUE in colors_in(tmp_path / "t.png") or count == 1
 
 
+def test_the_picture_does_not_depend_on_the_world_frame(tmp_path):
+    truth, moved = circle(), exp_se3(np.full(6, 0.3))
+    bent = truth.poses @ np.array([exp_se3(np.full(6, 0.02 * np.sin(i / 5.0))) for i in range(len(truth))])
+    pictures = []
+    for name, poses in (("a.png", bent), ("b.png", moved @ bent)):
+        plot.trajectory_figure(Trajectory(truth.stamps_ns, poses), truth, tmp_path / name, [])
+        pictures.append(cv2.imread(str(tmp_path / name)).astype(int))
+    assert (np.abs(pictures[0] - pictures[1]).max(axis=2) > 64).mean() < 1e-3
+
+
 def test_rotation_errors_do_not_depend_on_the_world_frame():
     truth = circle()
     bent = truth.poses @ pose_matrix(exp_so3(np.array([0.0, 0.0, 0.02])), np.zeros(3))

@@ -57,13 +57,13 @@ def recording(tmp_path_factory):
 
 
 def test_a_search_on_a_recording(recording, tmp_path, capfd):
-    words = [*SEARCH, f"replay={recording}", "only=[planes]", "planes.angle_deg=interval(1,5)"]
+    words = [*SEARCH, "hydra.sweeper.trials=3", "hydra.sweeper.batch=2", f"replay={recording}", "only=[planes]", "planes.angle_deg=interval(1,5)"]
     assert main([*words, f"out={tmp_path / 'a'}"]) == 0
     said = capfd.readouterr()
-    assert f"reads dataset, normals, keypoints, lines, segments from {recording}" in said.err and "sweep: 3 of 3 jobs done" in said.err
+    assert f"reads dataset, normals, keypoints, lines, segments from {recording}" in said.err and "sweep: 4 of 4 jobs done" in said.err
     found = json.loads((tmp_path / "a" / "search.json").read_text())
     objectives = [trial["objective"] for trial in found["trials"]]
-    assert len(objectives) == 2 and all(1.0 <= trial["values"]["planes.angle_deg"] <= 5.0 for trial in found["trials"])
+    assert len(objectives) == 3 and all(1.0 <= trial["values"]["planes.angle_deg"] <= 5.0 for trial in found["trials"])
     assert found["best"]["objective"] == min([found["default"]["objective"], *objectives]) and len({*objectives}) > 1
 
     stopped = tmp_path / "a" / found["trials"][1]["jobs"][0]

@@ -90,8 +90,9 @@ def test_a_replay_loads_the_map_again_and_saves_none(runs):
     assert (runs / "again.mcap").stat().st_mtime < (runs / "only.mcap").stat().st_mtime
 
 
-def test_a_run_continues_with_the_values_of_wires_of_any_delay():
-    """Seven frames and five more: what `@prev` and `@k` see is what they see in twelve frames at once."""
+@pytest.mark.parametrize("cut, rotations", [(7, [5, 6]), (8, [5, 6, 7])])  # rotation says nothing at frame 4
+def test_a_run_continues_with_the_values_of_wires_of_any_delay(cut, rotations):
+    """Some of twelve frames, and the rest: what `@prev` and `@k` see is what they see in twelve frames at once."""
 
     def run(count, start, initial=None):
         runner = Runner(toy_graph(outputs=("trajectory",), dataset=ToyDataset(length=count, start=start)), frames=f"{start}:", initial=initial)
@@ -100,12 +101,12 @@ def test_a_run_continues_with_the_values_of_wires_of_any_delay():
             pass
         return runner
 
-    whole, first = run(12, 0), run(7, 0)
+    whole, first = run(12, 0), run(cut, 0)
     kept = first.state.values
-    assert list(kept["rotation"]) == [5, 6] and list(kept["pose"]) == [6]  # rotation says nothing at frame 4
+    assert list(kept["rotation"]) == rotations and list(kept["pose"]) == [cut - 1]
     lines = DelayLines({topic: list(values.values())[-1] for topic, values in kept.items()} | {"map": first.result.map}, kept)
-    rest = run(5, 7, lambda _: lines)
-    assert [p.T_world_camera[0, 3] for p in rest.result.poses] == [p.T_world_camera[0, 3] for p in whole.result.poses if p.index >= 7]
+    rest = run(12 - cut, cut, lambda _: lines)
+    assert [p.T_world_camera[0, 3] for p in rest.result.poses] == [p.T_world_camera[0, 3] for p in whole.result.poses if p.index >= cut]
 
 
 def test_the_maximum_delay_of_a_topic():

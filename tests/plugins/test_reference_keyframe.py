@@ -11,7 +11,8 @@ from trihedron.pipeline.core.geometry import invert, pose_matrix, transform, tra
 from trihedron.pipeline.core.lie import exp_se3, exp_so3, log_se3, rotation_angle_deg
 from trihedron.pipeline.core.registry import load_plugins
 from trihedron.pipeline.core.types import CALIBRATION, LOST, Correction, Map, Pose, Rotation
-from trihedron.pipeline.run.results import causal_trajectory, final_trajectory
+from trihedron.pipeline.record.trajectories import read_trajectory
+from trihedron.pipeline.run.results import causal_trajectory, final_trajectory, write_results
 from trihedron.pipeline.run.runner import Runner
 from trihedron.plugins.mapping.landmarks import KEYFRAMES, empty_map
 from trihedron.plugins.mapping.reference_keyframe import transform_rotation_to_map, transform_to_map
@@ -116,9 +117,14 @@ def still():
     return tracked(np.eye(4))
 
 
-def test_tracking_goes_on_in_the_moved_world(still):
+@pytest.fixture(scope="module")
+def shoved():
+    return tracked(SHIFT)
+
+
+def test_tracking_goes_on_in_the_moved_world(still, shoved):
     """The same camera in a map that was moved by 0.3 m and 5° half-way: every later pose is moved by as much, to a millimetre."""
-    (result, rotations), (plain, plain_rotations) = tracked(SHIFT), still
+    (result, rotations), (plain, plain_rotations) = shoved, still
     keyframes = result.map.keyframes
     applied = int(keyframes.column("index")[2]) + 5  # bundle@5: seen by the poses after this frame
     assert 10 < applied < 34 and all(pose.status != LOST for pose in result.poses)
@@ -133,7 +139,15 @@ def test_tracking_goes_on_in_the_moved_world(still):
         assert rotation_angle_deg(now.R_world_manhattan[0].T @ expected) < 0.02 and now.source == before.source
 
 
-def test_the_final_trajectory_has_no_step(still):
-    (result, _), (plain, _) = tracked(SHIFT), still
+def test_the_final_trajectory_has_no_step(still, shoved):
+    (result, _), (plain, _) = shoved, still
     for said, final in zip(causal_trajectory(plain).poses, final_trajectory(result).poses):
         assert np.abs(log_se3(invert(SHIFT @ said) @ final)).max() < 2e-3
+
+
+def test_both_trajectories_are_written(shoved, tmp_path):
+    result, _ = shoved
+    write_results(tmp_path, result, None, plot=False)
+    causal, final = (read_trajectory(tmp_path / name).poses for name in ("trajectory_causal.txt", "trajectory.txt"))
+    assert np.allclose(causal, causal_trajectory(result).poses, atol=1e-6) and np.allclose(final, final_trajectory(result).poses, atol=1e-6)
+    assert not np.allclose(causal, final, atol=0.1)

@@ -3,6 +3,7 @@
 import json
 import os
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -10,7 +11,8 @@ import trimesh
 
 from trihedron.datasets.simulation.synthetic import Synthetic
 from trihedron.pipeline.core.errors import DataError, UsageError
-from trihedron.pipeline.core.types import Surface
+from trihedron.pipeline.core.geometry import pose_matrix
+from trihedron.pipeline.core.types import Camera, Frame, Surface, Trajectory
 from trihedron.pipeline.record.writer import RecordingWriter
 from trihedron.pipeline.run.ply import write_ply
 from trihedron.tools import evaluate_surface, export, export_picture
@@ -18,7 +20,7 @@ from trihedron.tools.evaluate_surface import judged
 from trihedron.tools.export_surface import upright
 from trihedron.tools.mesh_distance import FAR_M, NearestTriangle, sampled
 from trihedron.tools.mesh_files import read_mesh
-from trihedron.tools.surface_truth import Truth
+from trihedron.tools.surface_truth import Truth, truth_of
 
 SQUARE = np.array([[0, 0, 0], [2, 0, 0], [2, 1, 0], [0, 1, 0]], float)
 TWO = np.array([[0, 1, 2], [0, 2, 3]], np.int32)
@@ -236,6 +238,40 @@ def test_the_true_surface_of_the_room_is_what_its_depth_shows(curved):
     assert off.max() < 0.005 and (surface.curved[triangle] == bent[v, u]).mean() > 0.99
     assert (bent.mean() > 0.2) == curved
     assert np.array_equal(depth.astype(np.float32), frame.depth_m)
+
+
+class SquareBefore:
+    """A camera 2 m before the middle of the square; its right half counts as curved."""
+
+    camera = Camera(80, 60, 150.0, 150.0, 39.5, 29.5)
+
+    def __len__(self):
+        return 1
+
+    def __call__(self, position):
+        return Frame(0, 0, np.zeros((60, 80, 3), np.uint8), np.full((60, 80), 2.0, np.float32), self.camera)
+
+
+class SquareWithSurface(SquareBefore):
+    def surface(self):
+        triangles = np.array([[0, 4, 5], [0, 5, 3], [4, 1, 2], [4, 2, 5]], np.int32)
+        vertices = np.concatenate([SQUARE, [[1, 0, 0], [1, 1, 0]]])
+        return SimpleNamespace(vertices_m=vertices, triangles=triangles, curved=np.array([False, False, True, True]))
+
+    def true_view(self, position):
+        return np.full((60, 80), 2.0), np.tile(np.arange(80) > 39, (60, 1))
+
+
+@pytest.mark.parametrize("kind", [SquareBefore, SquareWithSurface])
+def test_truth_is_the_distance_to_a_surface_also_where_only_depth_is_exact(kind):
+    T = pose_matrix(np.eye(3), np.array([1.0, 0.5, -2.0]))
+    truth = truth_of(kind(), Trajectory(np.zeros(1, np.int64), T[None]))
+    points = np.array([[0.8, 0.4, -0.01], [1.2, 0.6, -0.01], [1.0, 0.5, 0.02]]) + 0.004
+    off, curved = truth.distance(points)
+    assert np.allclose(off, [0.006, 0.006, 0.024], atol=1e-6) and np.allclose(truth.seen_m[:, 2], 0.0, atol=1e-6)
+    assert truth.labelled == (kind is SquareWithSurface)
+    assert curved[:2].tolist() == ([False, True] if truth.labelled else [False, False])
+    assert np.array_equal(truth.curved, truth.seen_m[:, 0] > 1.0) or not truth.labelled
 
 
 def test_the_curved_pieces_are_for_the_room():

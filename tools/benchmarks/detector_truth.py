@@ -148,7 +148,7 @@ def judge_normals(first: TrueView, second: TrueView, a: Normals, b: Normals) -> 
         known = np.isfinite(value.normals[..., 0]) & (labels >= 0)
         cosine = np.abs((value.normals[known] * view.planes[labels[known], :3]).sum(axis=1))
         angles.append(np.degrees(np.arccos(np.clip(cosine, 0.0, 1.0))))
-        shares.append(known.sum() / max(np.count_nonzero((depth > 0.0) & (labels >= 0)), 1))
+        shares.append(float(known.sum()) / max(float(np.count_nonzero((depth > 0.0) & (labels >= 0))), 1.0))
     every = np.concatenate(angles) if sum(map(len, angles)) else np.array([90.0])
     return {"median deg": float(np.median(every)), "90 % deg": float(np.quantile(every, 0.9)), "share": float(np.mean(shares))}
 
