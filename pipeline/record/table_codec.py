@@ -96,8 +96,8 @@ def _changed_rows(before: Table, table: Table, column: str, freed: NDArray[np.in
         ids = added
     else:
         old, new = _words(before.shared(column)), _words(table.shared(column)[: before.size])
-        places = np.flatnonzero(old != new) // max(len(old) // max(before.size, 1), 1)
-        ids = np.concatenate([np.unique(places).astype(np.int32), added])
+        differ = (old != new).reshape(max(before.size, 1), -1).any(axis=1)
+        ids = np.concatenate([np.flatnonzero(differ).astype(np.int32), added])
     return ids[~np.isin(ids // CHUNK, freed)] if len(freed) else ids
 
 
