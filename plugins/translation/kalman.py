@@ -48,7 +48,7 @@ class Kalman:
         if previous is None or previous_pose is None:
             state, matched = initial_filter().update(observations, self.gate, self.gate_m)
             return self._value(rotation, state, np.empty((0, 3)), (0, 0, matched), True)
-        before = OffsetFilter(previous.t_world_camera, previous.filtered_planes, previous.filtered_covariance)
+        before = OffsetFilter.of(previous)
         step, noise, points = self._translation(camera, rotation, tracks, keypoints, previous_keypoints, previous_pose)
         state, matched = before.predict(step, noise).update(observations, self.gate, self.gate_m)
         unobservable = _unmeasured(noise, observations[:matched], 0.5 * self.motion_sigma_m)
@@ -105,6 +105,13 @@ class OffsetFilter:
     position_m: F64
     planes: F64
     covariance: F64
+
+    @classmethod
+    def of(cls, translation: Translation) -> OffsetFilter:
+        """Return the filter that a translation holds; one of another plugin holds none, and a filter without planes begins there."""
+        if not len(translation.filtered_covariance):
+            return cls(translation.t_world_camera, np.empty((0, 4)), translation.covariance)
+        return cls(translation.t_world_camera, translation.filtered_planes, translation.filtered_covariance)
 
     def predict(self, step: F64, noise: F64) -> OffsetFilter:
         """Predict: move the camera by a translation (3,) with process noise (3, 3)."""

@@ -69,8 +69,8 @@ def test_too_few_points_are_no_measurement(depth):
     assert not found.estimated and np.array_equal(found.t_world_camera, np.zeros(3)) and len(found.unobservable) == 3
 
 
-def filtered(world, steps, points=True):
-    """The filter's values over a walk in which every plane stands on the axes of the room."""
+def filtered(world, steps, points=True, forgetful=False):
+    """The filter's values over a walk in which every plane stands on the axes of the room; a forgetful one finds others' before."""
     stage, previous, pose, out = Kalman(), None, None, []
     before = None
     for step in range(steps):
@@ -85,6 +85,8 @@ def filtered(world, steps, points=True):
         previous = stage(world.frame(step).camera, rotation, tracks, keypoints, world.plane_regions(T, step)[0], before, pose, previous)
         pose, before = pose_of(np.block([[rotation.R_world_camera, previous.t_world_camera[:, None]], [np.zeros(3), 1.0]]), step), keypoints
         out.append(previous)
+        if forgetful:
+            previous = replace(previous, filtered_planes=np.empty((0, 4)), filtered_covariance=np.empty((0, 0)))
     return out
 
 
@@ -96,6 +98,13 @@ def test_planes_on_the_axes_hold_the_position_without_a_point():
     for plane in found[-1].filtered_planes:
         assert np.abs(world.planes - plane).max(axis=1).min() < 0.02
     assert found[-1].inliers[2] >= 3 and found[-1].estimated and not len(found[-1].unobservable)
+
+
+def test_a_translation_of_another_plugin_is_where_the_filter_begins():
+    """As in a replay that computes this stage alone, on the recorded past of another."""
+    found = filtered(World(), 15, forgetful=True)
+    assert np.linalg.norm(found[-1].t_world_camera - camera_at(14)[:3, 3]) < 0.02 and found[-1].inliers[2] == 0
+    assert len(found[-1].filtered_planes) >= 3 and found[-1].covariance.trace() > found[1].covariance.trace() > 0.0
 
 
 def test_the_state_is_a_joint_gaussian_and_survives_recording():

@@ -13,6 +13,7 @@ import pytest
 
 from trihedron.pipeline.app.cli import main
 from trihedron.pipeline.core.errors import DataError
+from trihedron.pipeline.core.slots import SLOTS
 from trihedron.pipeline.core.types import Translation
 from trihedron.pipeline.record.reader import Recording
 from trihedron.tools.ablation_differences import Parting, StageErrors, changed_by_code, distance
@@ -197,6 +198,17 @@ def test_a_star_stands_for_all_plugins_that_can_be_chosen_alone():
     assert {"refine", "direct", "open3d_icp"} <= names and not {"icp", "none"} & names  # icp needs a model
     (swap,) = parsed(["lines=*"])
     assert ("lines=onnx",) not in swap.levels  # which needs a file
+
+
+@pytest.mark.slow
+def test_every_plugin_is_computed_alone_on_the_recorded_past_of_another(tmp_path, capsys):
+    room = ["dataset.width=320", "dataset.height=240", "dataset.length=8", "model=tsdf"]
+    assert main(["run", *room, f"out={tmp_path}/run"]) == 0
+    recorded = {topic for topic in Recording(tmp_path / "run" / "run.mcap").topics if topic in SLOTS}
+    slots = [slot for slot in SLOTS if slot in recorded and len(parsed([f"{slot}=*"])[0].levels) > 2]
+    assert {"planes", "manhattan", "tracks", "rotation", "translation", "matches", "pose"} <= set(slots)
+    for slot in slots:
+        assert main(["ablate", f"{tmp_path}/run", f"{slot}=*", "feedback=recorded", f"out={tmp_path}/{slot}"]) == 0, capsys.readouterr().err
 
 
 def test_where_two_variants_part():
