@@ -10,18 +10,18 @@ from typing import Any
 CHI2_6_MEDIAN = 5.348
 
 
-def shapley(values: Mapping[frozenset[str], float], players: Iterable[str]) -> dict[str, float]:
-    """Return the Shapley value of each player (Shapley, 1953): the mean of what it adds, over all orders of joining. `values` has every subset of the
-    players; the values of all players sum to values[all] - values[none]."""
+def shapley_weights(players: Iterable[str]) -> dict[str, dict[frozenset[str], float]]:
+    """Return for each player the weight of the value of each subset of the players in its Shapley value (Shapley, 1953): the mean of what it adds,
+    over all orders of joining. The values of all players sum to the value of all less that of none."""
     names = list(players)
-    found = {}
+    found: dict[str, dict[frozenset[str], float]] = {}
     for name in names:
         others = [other for other in names if other != name]
-        found[name] = sum(
-            factorial(size) * factorial(len(others) - size) / factorial(len(names)) * (values[frozenset((*some, name))] - values[frozenset(some)])
-            for size in range(len(names))
-            for some in combinations(others, size)
-        )
+        weights = found.setdefault(name, {})
+        for size in range(len(names)):
+            weight = factorial(size) * factorial(len(others) - size) / factorial(len(names))
+            for some in combinations(others, size):
+                weights[frozenset(some)], weights[frozenset((*some, name))] = -weight, weight
     return found
 
 

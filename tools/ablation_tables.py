@@ -12,11 +12,12 @@ import numpy as np
 
 from trihedron.pipeline.core.config import Feedback
 from trihedron.pipeline.core.types import F64
-from trihedron.pipeline.sweep.paired_statistics import CONFIDENCE, half_interval
+from trihedron.pipeline.sweep.paired_statistics import CONFIDENCE, half_interval, half_width
 from trihedron.tools.ablation_differences import OPEN_LOOP, Parting
-from trihedron.tools.ablation_statistics import shapley
+from trihedron.tools.ablation_statistics import shapley_weights
 from trihedron.tools.ablation_swaps import AS_RECORDED, Combination
 from trihedron.tools.arguments import table
+from trihedron.tools.block_bootstrap import resampled
 from trihedron.tools.stage_measures import COLUMNS as MEASURED
 from trihedron.tools.verdicts import NOTE, VERDICTS, Column, Sample, Verdict, line_of, verdicts_of
 
@@ -221,29 +222,31 @@ def targets_of(case: Case) -> list[Combination]:
 
 
 def attribution(cases: Sequence[Case]) -> list[dict[str, Any]]:
-    """Return for each combination of swaps, stage and figure the Shapley value: its mean over the recordings and half its confidence interval. The
-    stage "" is their sum, the whole difference."""
+    """Return for each combination of swaps, stage and figure the Shapley value: its mean over the recordings and half its confidence interval, of
+    one recording from its frames (None where there is none). The stage "" is their sum, the whole difference."""
     found = []
     for target in targets_of(cases[0]):
+        variants = [{variant.combination: variant for variant in case.variants} for case in cases]
+        weights = {**shapley_weights(target.stages), "": {frozenset(): -1.0, target.stages: 1.0}}
         for name in columns_of(cases):
-            shares: dict[str, list[float]] = {stage: [] for stage, _ in target.levels}
-            for case in cases:
-                figures = {variant.combination: variant.figures.get(name, np.nan) for variant in case.variants}
-                values = {part: figures[target.part(part)] for part in _subsets(target.stages)}
-                for stage, value in shapley(values, target.stages).items():
-                    shares[stage].append(value)
-            shares[""] = [sum(values) for values in zip(*shares.values())]
-            for stage, some in shares.items():
-                finite = np.array([value for value in some if np.isfinite(value)])
-                mean = float(finite.mean()) if len(finite) else np.nan
+            for stage, of_parts in weights.items():
+                parts = [[one[target.part(part)] for part in of_parts] for one in variants]
+                values = [sum(w * variant.figures.get(name, np.nan) for w, variant in zip(of_parts.values(), some)) for some in parts]
+                finite = np.array([value for value in values if np.isfinite(value)])
+                half = half_interval(finite) if len(cases) > 1 else _half_of_frames(cases[0], name, parts[0], list(of_parts.values()))
                 words = " ".join(dict(target.levels).get(stage, target.words))
-                found.append({"target": target.label, "stage": stage, "words": words, "figure": name, "mean": mean, "half": half_interval(finite)})
+                mean = float(finite.mean()) if len(finite) else np.nan
+                found.append({"target": target.label, "stage": stage, "words": words, "figure": name, "mean": mean, "half": half})
     return found
 
 
-def _subsets(stages: frozenset[str]) -> list[frozenset[str]]:
-    names = sorted(stages)
-    return [frozenset(name for bit, name in enumerate(names) if mask >> bit & 1) for mask in range(2 ** len(names))]
+def _half_of_frames(case: Case, name: str, variants: Sequence[Variant], weights: Sequence[float]) -> float | None:
+    """Half the confidence interval of a weighted sum of a figure, from the frames of one recording; None where there are none, or too few."""
+    errors = [variant.errors.get(name, np.full(case.frames, np.nan)) for variant in variants]
+    if not np.isfinite(errors).all(axis=0).any():
+        return None
+    found = resampled(errors, weights, max(1, round(case.fps)))
+    return None if found.error is None else half_width(found.error, found.blocks - 1)
 
 
 def attribution_table(cases: Sequence[Case]) -> Section:
@@ -264,7 +267,8 @@ def attribution_table(cases: Sequence[Case]) -> Section:
         whole = budget.get("", {})
         if stages:
             rows.append([f"truth in the place of {stages}", *(number(n, figures.get(n, np.nan) - whole.get(n, np.nan), True) for n in columns)])
-    interval = f"± half the {100 * CONFIDENCE:.0f} % interval over {len(cases)} recordings" if len(cases) > 1 else "one recording: no interval"
+    over = f"over {len(cases)} recordings" if len(cases) > 1 else "from the frames of one recording, where a figure is one of frames"
+    interval = f"± half the {100 * CONFIDENCE:.0f} % interval {over}"
     note = "\n".join([f"Differences; {interval}", *(f"Truth: {sentence}" for case in cases if len(cases) == 1 for sentence in case.remarks)])
     return Section("Attribution: Shapley value of each swap", [["swap", *columns], *rows], "l" + "r" * len(columns), note)
 

@@ -1,17 +1,18 @@
-"""The difference of two root mean squares over the frames of one recording, and its standard error by the moving-block bootstrap (Künsch, 1989).
+"""A weighted sum of root mean squares over the frames of one recording, and its standard error by the moving-block bootstrap (Künsch, 1989).
 
 The errors of neighbouring frames are alike, so that frames are no independent samples; blocks of consecutive frames nearly are, when they are longer
-than the errors remember. Blocks are drawn with replacement, the same for both series, until the recording has its length again; the difference is
-computed from the frames drawn; its spread over the resamples is its standard error.
+than the errors remember. Blocks are drawn with replacement, the same for all series, until the recording has its length again; the spread of the sum
+over such resamples is its standard error. The difference of two alternatives has the weights -1 and 1.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
-from trihedron.pipeline.core.types import F64
+from trihedron.pipeline.core.types import F64, Bool
 
 RESAMPLES = 2000
 SEED = 0  # of the blocks drawn: the same errors give the same interval
@@ -21,40 +22,39 @@ BIAS = 0.1  # largest share by which blocks make the variance too small, before 
 
 @dataclass(frozen=True)
 class Resampled:
-    """Difference of two root mean squares, its standard error (None: fewer than `FEWEST_BLOCKS`), the number of blocks and the frames of one."""
+    """Weighted sum of root mean squares, its standard error (None: fewer than `FEWEST_BLOCKS`), the number of blocks and the frames of one."""
 
-    difference: float
+    value: float
     error: float | None
     blocks: int
     length: int
 
 
-def resampled(first: F64, second: F64, shortest: int) -> Resampled:
-    """Compare two series of errors (n,) of the same frames: root mean square of the second minus that of the first.
+def resampled(errors: Sequence[F64], weights: Sequence[float], shortest: int) -> Resampled:
+    """Sum the root mean squares of k series of errors (n,) of the same frames, each with its weight.
 
-    Frames where either is not finite are left out; at least one must remain. A block has at least `shortest` frames. The standard error of b blocks
-    is the spread of the resamples times sqrt(b / (b - 1)), as that of a mean of b values, and corrected for the bias of `block_length`; b - 1 are its
+    Frames where one is not finite are left out; at least one must remain. A block has at least `shortest` frames. The standard error of b blocks is
+    the spread of the resamples times sqrt(b / (b - 1)), as that of a mean of b values, and corrected for the bias of `block_length`; b - 1 are its
     degrees of freedom."""
-    both = np.isfinite(first) & np.isfinite(second)
-    found = np.flatnonzero(both)
-    part = slice(found[0], found[-1] + 1)
-    both = both[part]
-    squares = np.where(both, np.square([first[part], second[part]]), 0.0)
-    roots = np.sqrt(squares.sum(axis=1) / both.sum())
-    difference = float(roots[1] - roots[0])
-    slopes = squares / np.where(roots > 0.0, 2.0 * roots, 1.0)[:, None]  # each frame's part in the root mean square, to first order
-    length, bias = block_length(np.where(both, slopes[1] - slopes[0], np.nan), shortest)
-    length = min(length, len(both))
-    blocks = len(both) // length
+    series, factors = np.array(errors), np.array(weights)[:, None]
+    found = np.flatnonzero(np.isfinite(series).all(axis=0))
+    series = series[:, found[0] : found[-1] + 1]
+    known: Bool = np.asarray(np.isfinite(series).all(axis=0))
+    squares = np.where(known, np.square(series), 0.0)
+    roots = np.sqrt(squares.sum(axis=1) / known.sum())[:, None]
+    parts = (factors * squares / np.where(roots > 0.0, 2.0 * roots, 1.0)).sum(axis=0)  # each frame's part in the sum, to first order
+    length, bias = block_length(np.where(known, parts, np.nan), shortest)
+    length = min(length, len(known))
+    value, blocks = float((factors * roots).sum()), len(known) // length
     if blocks < FEWEST_BLOCKS:
-        return Resampled(difference, None, blocks, length)
-    sums = np.concatenate([np.zeros((3, 1)), np.cumsum([*squares, both], axis=1)], axis=1)
+        return Resampled(value, None, blocks, length)
+    sums = np.concatenate([np.zeros((len(series) + 1, 1)), np.cumsum([*squares, known], axis=1)], axis=1)
     of_blocks = sums[:, length:] - sums[:, :-length]
     drawn = np.random.default_rng(SEED).integers(0, of_blocks.shape[1], (RESAMPLES, blocks))
-    squares_a, squares_b, counts = of_blocks[:, drawn].sum(axis=2)
-    known = counts > 0
-    differences = np.sqrt(np.maximum(squares_b[known], 0.0) / counts[known]) - np.sqrt(np.maximum(squares_a[known], 0.0) / counts[known])
-    return Resampled(difference, float(np.std(differences) * np.sqrt(blocks / (blocks - 1) / (1.0 - bias))), blocks, length)
+    *totals, counts = of_blocks[:, drawn].sum(axis=2)
+    drawn_roots = np.sqrt(np.maximum(totals, 0.0)[:, counts > 0] / counts[counts > 0])
+    spread = float(np.std((factors * drawn_roots).sum(axis=0)))
+    return Resampled(value, float(spread * np.sqrt(blocks / (blocks - 1) / (1.0 - bias))), blocks, length)
 
 
 def block_length(series: F64, shortest: int) -> tuple[int, float]:

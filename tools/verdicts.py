@@ -107,7 +107,7 @@ def _difference(names: tuple[str, str], column: str, pairs: Pairs) -> Verdict | 
     if len(known) > 1:
         error: float | None = float(np.std(np.diff(values[known], axis=1), ddof=1) / np.sqrt(len(known)))
     elif column in a.errors and column in b.errors:
-        found = resampled(a.errors[column], b.errors[column], max(1, a.second))
+        found = resampled([a.errors[column], b.errors[column]], [-1.0, 1.0], max(1, a.second))
         one, error = replace(one, pieces=found.blocks, block_frames=found.length), found.error
         if np.array_equal(a.errors[column], b.errors[column], equal_nan=True):
             error = 0.0

@@ -3,7 +3,11 @@
 import pytest
 
 from trihedron.pipeline.sweep.paired_statistics import half_interval, half_width, holm, p_value, power, repeats_needed
-from trihedron.tools.ablation_statistics import shapley
+from trihedron.tools.ablation_statistics import shapley_weights
+
+
+def shapley(worth, players):
+    return {player: sum(weight * worth[some] for some, weight in weights.items()) for player, weights in shapley_weights(players).items()}
 
 
 def test_shapley_values_of_the_glove_game():

@@ -10,6 +10,7 @@ from trihedron.tools.block_bootstrap import block_length, resampled
 from trihedron.tools.verdicts import Column, Sample, Verdict, line_of, named, recordings_needed, verdicts_of
 
 ATE = {"ATE mm": Column(2)}
+DIFFERENCE = [-1.0, 1.0]
 
 
 def autoregressive(rng, count, frames, memory):
@@ -36,9 +37,9 @@ def sample(values, **figures):
 def test_the_interval_covers_the_true_difference(memory, frames):
     rng, covered = np.random.default_rng(2), []
     for _ in range(200):
-        found = resampled(*errors(rng, frames, memory, 1.0, 1.2), 30)
+        found = resampled(errors(rng, frames, memory, 1.0, 1.2), DIFFERENCE, 30)
         if found.error is not None:
-            covered.append(abs(found.difference - 0.2) <= t.ppf(0.975, found.blocks - 1) * found.error)
+            covered.append(abs(found.value - 0.2) <= t.ppf(0.975, found.blocks - 1) * found.error)
     assert len(covered) > 190 and 0.90 <= np.mean(covered) <= 0.98
 
 
@@ -132,8 +133,8 @@ def test_the_number_of_seeds_shows_5_percent_in_8_of_10_simulated_studies(kind, 
 def test_seeds_are_seeds_of_the_recording_that_was_resampled():
     """The spread that one recording's blocks foretell is that of the differences of further recordings."""
     rng = np.random.default_rng(6)
-    foretold = np.median([resampled(*errors(rng, 600, 0.8, 10.0, 10.0), 30).error for _ in range(60)])
-    differences = [resampled(*errors(rng, 600, 0.8, 10.0, 10.0), 600).difference for _ in range(200)]
+    foretold = np.median([resampled(errors(rng, 600, 0.8, 10.0, 10.0), DIFFERENCE, 30).error for _ in range(60)])
+    differences = [resampled(errors(rng, 600, 0.8, 10.0, 10.0), DIFFERENCE, 600).value for _ in range(200)]
     assert foretold == pytest.approx(np.std(differences), rel=0.15)
 
 
