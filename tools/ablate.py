@@ -10,7 +10,7 @@ at least a second; fewer than 8 blocks are "too short to tell"), of several from
 
 The tables: every alternative's figures; the Shapley value of each swap, and with --budget what the truth in the place of a stage changes; where they
 part, with a picture of the worst frame; the cost.
-The same command again computes only what is missing.
+The same command again computes only what is missing; with --dry-run it says what that is, and what the alternatives share.
 
 Example: trihedron ablate runs/a/run.mcap manhattan=mean_shift,plane_svd rotation=drift_free,procrustes out=runs/ablation
 Example: trihedron ablate runs/a/run.mcap 'manhattan=*' feedback=recorded out=runs/axes
@@ -22,7 +22,7 @@ from __future__ import annotations
 import hashlib
 import json
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -39,7 +39,8 @@ from trihedron.pipeline.run.result_files import read_results
 from trihedron.pipeline.sweep.jobs import key_of
 from trihedron.tools import ablation_tables as tables
 from trihedron.tools.ablation_differences import Parting, StageErrors, changed_by_code, reference_of
-from trihedron.tools.ablation_errors import errors_file, of_trajectory, read_errors, write_errors
+from trihedron.tools.ablation_errors import Errors, errors_file, of_trajectory, read_errors, write_errors
+from trihedron.tools.ablation_preview import preview
 from trihedron.tools.ablation_statistics import nees_of
 from trihedron.tools.ablation_swaps import Combination, combinations_of, folder_name, parsed, without_repeats
 from trihedron.tools.ablation_tables import NEES, RESULT, Case, Variant
@@ -68,15 +69,32 @@ class Options:
     pictures: bool = True  # of the worst frame of each alternative
 
 
+@dataclass(frozen=True)
+class Work:
+    """The alternatives of one recording, their folders, the key of their figures, and the errors of their frames: None where these are to compute."""
+
+    computing: Alternatives
+    combinations: Sequence[Combination]
+    folders: Sequence[Path]
+    key: str
+    errors: list[Errors] | None
+
+
 def main(argv: list[str]) -> int:
     """Run the command; returns the exit code. Raises TrihedronError, one line."""
     parser = Parser("ablate", __name__)
     parser.add_argument("words", nargs="+", metavar="RUN.mcap|SWAP", help="recordings; STAGE=PLUGIN,..., STAGE=*, STAGE.OPTION=VALUE,...; out=DIR")
     parser.add_argument("--budget", action="store_true", help="of a single recording: the truth in the place of stages too, which takes six replays")
+    parser.add_argument("--dry-run", action="store_true", help="say what each alternative computes, reads and shares; compute nothing")
     parser.add_argument("--json", type=Path, metavar="FILE", help="write figures and tables there too")
     parser.add_argument("--markdown", type=Path, metavar="FILE", help="write the tables there too")
     given = parser.parse_args(argv)
-    cases = ablate(options_of(given.words, given.budget))
+    options = options_of(given.words, given.budget)
+    if given.dry_run:
+        works = _works(options, _known(options.out))
+        print("\n\n".join(preview(work.computing, work.combinations, work.folders, work.errors is not None) for work in works))
+        return 0
+    cases = ablate(options)
     found, sections = tables.verdicts(cases), tables.sections_of(cases)
     lines = tables.lines_of(found)
     print(tables.as_text(lines, sections))
@@ -113,36 +131,40 @@ def options_of(words: Sequence[str], budget: bool = False) -> Options:
 
 def ablate(options: Options) -> list[Case]:
     """Compute what is missing of an ablation; returns the figures of every recording. Raises TrihedronError."""
-    recordings = [Recording(path) for path in options.recordings]
-    swaps = without_repeats(parsed(options.swaps), recordings)
-    combinations, prefixes = combinations_of(swaps), _prefixes(options.recordings)
     known, keys, cases = _known(options.out), [], []
-    for number, (recording, prefix) in enumerate(zip(recordings, prefixes), 1):
-        alternatives = alternatives_of(recording, [combination.words for combination in combinations])
-        computing = Alternatives(recording, alternatives, options.feedback, options.threads)
-        key = _key(recording, computing, options)
-        file = errors_file(options.out, key)
-        errors = read_errors(file, len(combinations))
-        if key in known and errors is not None:
+    for number, work in enumerate(_works(options, known), 1):
+        recording = work.computing.recording
+        if work.errors is not None:
             print(f"{recording.path}: done already", file=sys.stderr)
-            case = tables.case_from_dict(known[key])
-            for variant, one in zip(case.variants, errors):
+            case = tables.case_from_dict(known[work.key])
+            for variant, one in zip(case.variants, work.errors):
                 variant.errors = one
         else:
-            print(f"{recording.path} ({number} of {len(recordings)}): {len(combinations)} alternatives", file=sys.stderr)
-            folders = [options.out / folder_name(prefix, combination) for combination in combinations]
-            case = _computed(computing, combinations, folders)
+            print(f"{recording.path} ({number} of {len(options.recordings)}): {len(work.combinations)} alternatives", file=sys.stderr)
+            case = _computed(work.computing, work.combinations, work.folders)
             if options.budget:
                 case.budget, case.remarks = _budget(recording)
-            write_errors(file, [variant.errors for variant in case.variants])
+            write_errors(errors_file(options.out, work.key), [variant.errors for variant in case.variants])
         case.swaps, case.feedback = list(options.swaps), options.feedback.name
         cases.append(case)
-        keys.append(key)
+        keys.append(work.key)
         _write(options.out, {**known, **dict(zip(keys, map(tables.case_to_dict, cases)))})
     if options.pictures:
         _draw_farthest(cases)
     _write(options.out, {**known, **dict(zip(keys, map(tables.case_to_dict, cases)))})
     return cases
+
+
+def _works(options: Options, known: Mapping[str, Any]) -> Iterator[Work]:
+    """Compose the alternatives of one recording after the other; `known` has the figures in out=DIR by key."""
+    recordings = [Recording(path) for path in options.recordings]
+    combinations = combinations_of(without_repeats(parsed(options.swaps), recordings))
+    for recording, prefix in zip(recordings, _prefixes(options.recordings)):
+        alternatives = alternatives_of(recording, [combination.words for combination in combinations])
+        computing = Alternatives(recording, alternatives, options.feedback, options.threads)
+        key = _key(recording, computing, options)
+        errors = read_errors(errors_file(options.out, key), len(combinations)) if key in known else None
+        yield Work(computing, combinations, [options.out / folder_name(prefix, combination) for combination in combinations], key, errors)
 
 
 def _prefixes(paths: Sequence[Path]) -> list[str]:

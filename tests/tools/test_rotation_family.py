@@ -78,7 +78,9 @@ def test_alternatives_of_an_ablation_are_drawn_too(tmp_path, capsys):
     """In a corridor, whose walk a configuration of plain words cannot name."""
     words = ["dataset.scene=corridor", "dataset.texture=false", "dataset.length=4", "dataset.width=160", "dataset.height=120"]
     assert main(["run", *words, f"out={tmp_path}/run"]) == 0
-    assert main(["ablate", f"{tmp_path}/run", "manhattan=plane_svd", "feedback=recorded", f"out={tmp_path}/axes"]) == 0
+    command = ["ablate", f"{tmp_path}/run", "manhattan=plane_svd", "feedback=recorded", f"out={tmp_path}/axes"]
+    assert main(command) == 0
+    assert main([*command, "--dry-run"]) == 0 and "\n2  manhattan=plane_svd: done\n" in capsys.readouterr().out
     capsys.readouterr()
     assert main(["benchmark", "rotations", f"{tmp_path}/axes"]) == 0
     assert "\nmean_shift " in (said := capsys.readouterr().out) and "\nplane_svd " in said
