@@ -349,6 +349,21 @@ def test_a_dry_run_says_what_is_computed_read_and_shared_and_writes_nothing(tmp_
     assert said[-2] == "   computed for 3 too: rotation"
 
 
+def test_a_recording_ablates_itself_from_python(tmp_path):
+    import trihedron as th
+
+    source = Path(__file__).parents[1] / "fuzz" / "seeds" / "own.mcap"
+    found = th.Recording(source).ablate("rotation=constant_velocity", out=tmp_path, feedback="recorded", keypoints__features=200)
+    assert list(found.folders) == [
+        "as recorded",
+        "keypoints.features=200",
+        "rotation=constant_velocity",
+        "rotation=constant_velocity keypoints.features=200",
+    ]
+    assert all((folder / "run.mcap").is_file() for (folder,) in found.folders.values())
+    assert str(found) == str(th.ablate(source, "rotation=constant_velocity", "keypoints.features=200", out=tmp_path, feedback="recorded"))
+
+
 def test_values_of_other_code_are_named(tmp_path):
     words = ["run", "dataset.width=160", "dataset.height=120", "dataset.length=4", "outputs=[rotation]"]
     for name, more in (("a", []), ("b", []), ("c", ["dataset.seed=1"])):
