@@ -71,10 +71,12 @@ class Options:
 
 @dataclass(frozen=True)
 class Work:
-    """The alternatives of one recording, their folders, the key of their figures, and the errors of their frames: None where these are to compute."""
+    """The alternatives of one recording, their folders with the prefix of the recording, the key of their figures, and the errors of their frames:
+    None where these are to compute."""
 
     computing: Alternatives
     combinations: Sequence[Combination]
+    prefix: str
     folders: Sequence[Path]
     key: str
     errors: list[Errors] | None
@@ -142,6 +144,8 @@ def ablate(options: Options) -> list[Case]:
         else:
             print(f"{recording.path} ({number} of {len(options.recordings)}): {len(work.combinations)} alternatives", file=sys.stderr)
             case = _computed(work.computing, work.combinations, work.folders)
+            if options.pictures and "manhattan" in case.stages and options.feedback is Feedback.recorded:
+                _draw_axes(options.out, work)
             if options.budget:
                 case.budget, case.remarks = _budget(recording)
             write_errors(errors_file(options.out, work.key), [variant.errors for variant in case.variants])
@@ -164,7 +168,7 @@ def _works(options: Options, known: Mapping[str, Any]) -> Iterator[Work]:
         computing = Alternatives(recording, alternatives, options.feedback, options.threads)
         key = _key(recording, computing, options)
         errors = read_errors(errors_file(options.out, key), len(combinations)) if key in known else None
-        yield Work(computing, combinations, [options.out / folder_name(prefix, combination) for combination in combinations], key, errors)
+        yield Work(computing, combinations, prefix, [options.out / folder_name(prefix, combination) for combination in combinations], key, errors)
 
 
 def _prefixes(paths: Sequence[Path]) -> list[str]:
@@ -266,6 +270,18 @@ def _budget(recording: Recording) -> tuple[dict[str, dict[str, float]], list[str
         print(f"no error budget: {error}", file=sys.stderr)
         return {}, []
     return {" + ".join(stages): _errors(one.metrics) for stages, one in found.items()}, remarks(found)
+
+
+def _draw_axes(out: Path, work: Work) -> None:
+    """Draw the errors of all estimators of the Manhattan frame, and their axes on the sphere, where there is ground truth."""
+    from trihedron.tools.benchmarks.rotation_comparison import common_world, draw, read_runs
+
+    try:
+        runs = read_runs(out, work.folders)
+        files = draw(runs, common_world(runs), out, work.prefix and f"{work.prefix},")
+        print(f"drawn: {', '.join(map(str, files))}", file=sys.stderr)
+    except DataError as error:
+        print(f"no pictures of the axes: {error}", file=sys.stderr)
 
 
 def _draw_farthest(cases: Sequence[Case]) -> None:
