@@ -33,8 +33,9 @@ from trihedron.pipeline.app.alternatives import Alternatives, Outcome, alternati
 from trihedron.pipeline.app.execute import MAX_THREADS, RECORDING
 from trihedron.pipeline.core.config import Feedback
 from trihedron.pipeline.core.errors import ConfigError, DataError, TrihedronError, UsageError, did_you_mean
-from trihedron.pipeline.record.reader import Recording
+from trihedron.pipeline.record.reader import Recording, TopicReader
 from trihedron.pipeline.record.trajectories import attached_truth
+from trihedron.pipeline.run.replay import RECORDED
 from trihedron.pipeline.run.result_files import read_results
 from trihedron.pipeline.sweep.jobs import key_of
 from trihedron.tools import ablation_tables as tables
@@ -208,10 +209,13 @@ def _computed(computing: Alternatives, combinations: Sequence[Combination], fold
     known, true = reference_of(recording) if alone else ({}, True)
     errors, partings = [StageErrors(known) for _ in folders], [Parting() for _ in folders]
 
+    images = TopicReader(recording, "dataset").at if alone and "dataset" in recording.topics else lambda index: None
+
     def on_frame(index: int, values: Sequence[Mapping[str, Any]]) -> None:
+        embedded = {RECORDED + "dataset": image} if (image := images(index)) is not None else {}
         for one, parting, found in zip(values, partings, errors):
             parting.compare(index, topics, values[0], one)
-            found.take(topics if alone else (), one)
+            found.take(topics if alone else (), {**embedded, **one})
 
     computing.run(folders, on_frame)
     of_stages = [found.of_frames() for found in errors]

@@ -15,7 +15,7 @@ import numpy as np
 from trihedron.pipeline.core.config import Feedback
 from trihedron.pipeline.core.errors import DataError
 from trihedron.pipeline.core.slots import FOLDS, SLOTS, output_of, strip_none
-from trihedron.pipeline.core.types import ManhattanFrame, Rotation, Translation
+from trihedron.pipeline.core.types import ManhattanFrame, Pose
 from trihedron.tools.ablate import Options, ablate
 from trihedron.tools.ablation_differences import FALSE_AXES, OPEN_LOOP
 from trihedron.tools.ablation_tables import FIGURES
@@ -25,7 +25,7 @@ from trihedron.tools.evaluate_surface import RECORDING
 from trihedron.tools.stage_measures import MEASURES
 
 FOLDER = "open_loop"
-MEASURED = [slot for slot in SLOTS if slot not in FOLDS and strip_none(output_of(slot)) in (*MEASURES, ManhattanFrame, Rotation, Translation)]
+MEASURED = [slot for slot in SLOTS if slot not in FOLDS and strip_none(output_of(slot)) in {*MEASURES, ManhattanFrame} - {Pose}]
 OPEN = [name for name in FIGURES if name in (*OPEN_LOOP, FALSE_AXES)]
 BUILDING = {  # column -> key of the figures, the value where it is perfect, factor
     "walls mm": ("wall_m", 0.0, 1e3),

@@ -1,9 +1,9 @@
 """Compare estimators of the Manhattan frame over one recording: a table, the errors against frame, and the sphere of one frame.
 
-FOLDER is of `trihedron ablate RUN.mcap 'manhattan=*' feedback=recorded`, which draws the same pictures. The truth is the one rotation from the scene's
-axes to the world that the claims of all runs agree on best, carried into each camera by the ground truth of the poses. An error is that of the nearest
-frame in view; a claim more than 3° off is false. `normalised` is the squared error of the others in units of their covariance, the median over that of
-χ²: 1 when that is right. Times are those of the replay.
+FOLDER is of `trihedron ablate RUN.mcap 'manhattan=*' feedback=recorded`, which draws the same pictures. The truth is the one rotation from the
+scene's axes to the world that the claims of all runs agree on best, carried into each camera by the ground truth of the poses. An error is that of
+the nearest frame in view; a claim more than 3° off is false. `normalised` is the squared error of the others in units of their covariance, the
+median over that of χ²: 1 when that is right. Times are those of the replay.
 
 Example: trihedron benchmark rotations runs/axes --frame 60
 """
