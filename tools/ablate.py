@@ -33,6 +33,7 @@ from trihedron.pipeline.app.alternatives import Alternatives, Outcome, alternati
 from trihedron.pipeline.app.execute import MAX_THREADS, RECORDING
 from trihedron.pipeline.core.config import Feedback
 from trihedron.pipeline.core.errors import ConfigError, DataError, TrihedronError, UsageError, did_you_mean
+from trihedron.pipeline.core.slots import FOLDS
 from trihedron.pipeline.record.reader import Recording, TopicReader
 from trihedron.pipeline.record.trajectories import attached_truth
 from trihedron.pipeline.run.replay import RECORDED
@@ -46,6 +47,7 @@ from trihedron.tools.ablation_statistics import nees_of
 from trihedron.tools.ablation_swaps import Combination, combinations_of, folder_name, parsed, without_repeats
 from trihedron.tools.ablation_tables import NEES, RESULT, Case, Variant
 from trihedron.tools.arguments import Parser
+from trihedron.tools.fold_measures import of_folds
 
 PICTURE = "differs.png"
 ERRORS = {  # column -> key of the final metrics, factor
@@ -215,12 +217,15 @@ def _computed(computing: Alternatives, combinations: Sequence[Combination], fold
         embedded = {RECORDED + "dataset": image} if (image := images(index)) is not None else {}
         for one, parting, found in zip(values, partings, errors):
             parting.compare(index, topics, values[0], one)
-            found.take(topics if alone else (), {**embedded, **one})
+            found.take([name for name in topics if name not in FOLDS] if alone else (), {**embedded, **one})
 
     computing.run(folders, on_frame)
     of_stages = [found.of_frames() for found in errors]
     own = [found.figures(of_frames) if alone else {} for found, of_frames in zip(errors, of_stages)]
-    figures = [{**_figures(outcome), **of_stage} for outcome, of_stage in zip(computing.outcomes, own)]
+    figures = [
+        {**_figures(outcome), **of_stage, **of_folds(topics, folder, recording.path)}
+        for outcome, of_stage, folder in zip(computing.outcomes, own, folders)
+    ]
     reference = attached_truth(recording.attachments, str(recording.path))
     judged = [
         {**(of_trajectory(runner.result, reference, ERRORS) if outcome.metrics.get("final") else {}), **of_frames}
