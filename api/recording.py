@@ -6,7 +6,7 @@ import tempfile
 from collections.abc import Iterator
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from trihedron.api.building import Building
 from trihedron.api.trajectory import Trajectory
@@ -17,6 +17,9 @@ from trihedron.pipeline.record import reader
 from trihedron.pipeline.record.codec import FRAMES_TOPIC
 from trihedron.tools.building import building_of
 from trihedron.tools.recorded import frames_of, last_map, opened, poses_of, references_of, trajectory_of
+
+if TYPE_CHECKING:
+    from trihedron.api.ablations import Ablation
 
 
 class Recording:
@@ -118,6 +121,12 @@ class Recording:
         made = run(f"replay={self.path}", *([f"only=[{','.join(only)}]"] if only else []), *words, out=folder, quiet=out is None)
         made.recording._temporary = temporary
         return made.recording
+
+    def ablate(self, *swaps: str, out: str | Path, feedback: str = "new", budget: bool = False, **options: Any) -> Ablation:
+        """Swap stages and compute again only what follows from them; arguments and result are those of `trihedron.ablate`."""
+        from trihedron.api.ablations import ablate
+
+        return ablate(self.path, *swaps, out=out, feedback=feedback, budget=budget, **options)
 
     def __repr__(self) -> str:
         return f"Recording({str(self.path)!r}, {len(self._references)} frames, topics {', '.join(self.topics)})"

@@ -10,7 +10,7 @@ at least a second; fewer than 8 blocks are "too short to tell"), of several from
 
 The tables: every alternative's figures; the Shapley value of each swap, and with --budget what the truth in the place of a stage changes; where they
 part, with a picture of the worst frame; the cost.
-The same command again computes only what is missing.
+The same command again computes only what is missing; with --dry-run it says what that is, and what the alternatives share.
 
 Example: trihedron ablate runs/a/run.mcap manhattan=mean_shift,plane_svd rotation=drift_free,procrustes out=runs/ablation
 Example: trihedron ablate runs/a/run.mcap 'manhattan=*' feedback=recorded out=runs/axes
@@ -22,7 +22,7 @@ from __future__ import annotations
 import hashlib
 import json
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -33,17 +33,21 @@ from trihedron.pipeline.app.alternatives import Alternatives, Outcome, alternati
 from trihedron.pipeline.app.execute import MAX_THREADS, RECORDING
 from trihedron.pipeline.core.config import Feedback
 from trihedron.pipeline.core.errors import ConfigError, DataError, TrihedronError, UsageError, did_you_mean
-from trihedron.pipeline.record.reader import Recording
+from trihedron.pipeline.core.slots import FOLDS
+from trihedron.pipeline.record.reader import Recording, TopicReader
 from trihedron.pipeline.record.trajectories import attached_truth
+from trihedron.pipeline.run.replay import RECORDED
 from trihedron.pipeline.run.result_files import read_results
 from trihedron.pipeline.sweep.jobs import key_of
 from trihedron.tools import ablation_tables as tables
 from trihedron.tools.ablation_differences import Parting, StageErrors, changed_by_code, reference_of
-from trihedron.tools.ablation_errors import errors_file, of_trajectory, read_errors, write_errors
+from trihedron.tools.ablation_errors import Errors, errors_file, of_trajectory, read_errors, write_errors
+from trihedron.tools.ablation_preview import preview
 from trihedron.tools.ablation_statistics import nees_of
 from trihedron.tools.ablation_swaps import Combination, combinations_of, folder_name, parsed, without_repeats
 from trihedron.tools.ablation_tables import NEES, RESULT, Case, Variant
 from trihedron.tools.arguments import Parser
+from trihedron.tools.fold_measures import of_folds
 
 PICTURE = "differs.png"
 ERRORS = {  # column -> key of the final metrics, factor
@@ -68,15 +72,34 @@ class Options:
     pictures: bool = True  # of the worst frame of each alternative
 
 
+@dataclass(frozen=True)
+class Work:
+    """The alternatives of one recording, their folders with the prefix of the recording, the key of their figures, and the errors of their frames:
+    None where these are to compute."""
+
+    computing: Alternatives
+    combinations: Sequence[Combination]
+    prefix: str
+    folders: Sequence[Path]
+    key: str
+    errors: list[Errors] | None
+
+
 def main(argv: list[str]) -> int:
     """Run the command; returns the exit code. Raises TrihedronError, one line."""
     parser = Parser("ablate", __name__)
     parser.add_argument("words", nargs="+", metavar="RUN.mcap|SWAP", help="recordings; STAGE=PLUGIN,..., STAGE=*, STAGE.OPTION=VALUE,...; out=DIR")
     parser.add_argument("--budget", action="store_true", help="of a single recording: the truth in the place of stages too, which takes six replays")
+    parser.add_argument("--dry-run", action="store_true", help="say what each alternative computes, reads and shares; compute nothing")
     parser.add_argument("--json", type=Path, metavar="FILE", help="write figures and tables there too")
     parser.add_argument("--markdown", type=Path, metavar="FILE", help="write the tables there too")
     given = parser.parse_args(argv)
-    cases = ablate(options_of(given.words, given.budget))
+    options = options_of(given.words, given.budget)
+    if given.dry_run:
+        works = _works(options, _known(options.out))
+        print("\n\n".join(preview(work.computing, work.combinations, work.folders, work.errors is not None) for work in works))
+        return 0
+    cases = ablate(options)
     found, sections = tables.verdicts(cases), tables.sections_of(cases)
     lines = tables.lines_of(found)
     print(tables.as_text(lines, sections))
@@ -113,36 +136,42 @@ def options_of(words: Sequence[str], budget: bool = False) -> Options:
 
 def ablate(options: Options) -> list[Case]:
     """Compute what is missing of an ablation; returns the figures of every recording. Raises TrihedronError."""
-    recordings = [Recording(path) for path in options.recordings]
-    swaps = without_repeats(parsed(options.swaps), recordings)
-    combinations, prefixes = combinations_of(swaps), _prefixes(options.recordings)
     known, keys, cases = _known(options.out), [], []
-    for number, (recording, prefix) in enumerate(zip(recordings, prefixes), 1):
-        alternatives = alternatives_of(recording, [combination.words for combination in combinations])
-        computing = Alternatives(recording, alternatives, options.feedback, options.threads)
-        key = _key(recording, computing, options)
-        file = errors_file(options.out, key)
-        errors = read_errors(file, len(combinations))
-        if key in known and errors is not None:
+    for number, work in enumerate(_works(options, known), 1):
+        recording = work.computing.recording
+        if work.errors is not None:
             print(f"{recording.path}: done already", file=sys.stderr)
-            case = tables.case_from_dict(known[key])
-            for variant, one in zip(case.variants, errors):
+            case = tables.case_from_dict(known[work.key])
+            for variant, one in zip(case.variants, work.errors):
                 variant.errors = one
         else:
-            print(f"{recording.path} ({number} of {len(recordings)}): {len(combinations)} alternatives", file=sys.stderr)
-            folders = [options.out / folder_name(prefix, combination) for combination in combinations]
-            case = _computed(computing, combinations, folders)
+            print(f"{recording.path} ({number} of {len(options.recordings)}): {len(work.combinations)} alternatives", file=sys.stderr)
+            case = _computed(work.computing, work.combinations, work.folders)
+            if options.pictures and "manhattan" in case.stages and options.feedback is Feedback.recorded:
+                _draw_axes(options.out, work)
             if options.budget:
                 case.budget, case.remarks = _budget(recording)
-            write_errors(file, [variant.errors for variant in case.variants])
+            write_errors(errors_file(options.out, work.key), [variant.errors for variant in case.variants])
         case.swaps, case.feedback = list(options.swaps), options.feedback.name
         cases.append(case)
-        keys.append(key)
+        keys.append(work.key)
         _write(options.out, {**known, **dict(zip(keys, map(tables.case_to_dict, cases)))})
     if options.pictures:
         _draw_farthest(cases)
     _write(options.out, {**known, **dict(zip(keys, map(tables.case_to_dict, cases)))})
     return cases
+
+
+def _works(options: Options, known: Mapping[str, Any]) -> Iterator[Work]:
+    """Compose the alternatives of one recording after the other; `known` has the figures in out=DIR by key."""
+    recordings = [Recording(path) for path in options.recordings]
+    combinations = combinations_of(without_repeats(parsed(options.swaps), recordings))
+    for recording, prefix in zip(recordings, _prefixes(options.recordings)):
+        alternatives = alternatives_of(recording, [combination.words for combination in combinations])
+        computing = Alternatives(recording, alternatives, options.feedback, options.threads)
+        key = _key(recording, computing, options)
+        errors = read_errors(errors_file(options.out, key), len(combinations)) if key in known else None
+        yield Work(computing, combinations, prefix, [options.out / folder_name(prefix, combination) for combination in combinations], key, errors)
 
 
 def _prefixes(paths: Sequence[Path]) -> list[str]:
@@ -182,15 +211,21 @@ def _computed(computing: Alternatives, combinations: Sequence[Combination], fold
     known, true = reference_of(recording) if alone else ({}, True)
     errors, partings = [StageErrors(known) for _ in folders], [Parting() for _ in folders]
 
+    images = TopicReader(recording, "dataset").at if alone and "dataset" in recording.topics else lambda index: None
+
     def on_frame(index: int, values: Sequence[Mapping[str, Any]]) -> None:
+        embedded = {RECORDED + "dataset": image} if (image := images(index)) is not None else {}
         for one, parting, found in zip(values, partings, errors):
             parting.compare(index, topics, values[0], one)
-            found.take(topics if alone else (), one)
+            found.take([name for name in topics if name not in FOLDS] if alone else (), {**embedded, **one})
 
     computing.run(folders, on_frame)
     of_stages = [found.of_frames() for found in errors]
     own = [found.figures(of_frames) if alone else {} for found, of_frames in zip(errors, of_stages)]
-    figures = [{**_figures(outcome), **of_stage} for outcome, of_stage in zip(computing.outcomes, own)]
+    figures = [
+        {**_figures(outcome), **of_stage, **of_folds(topics, folder, recording.path)}
+        for outcome, of_stage, folder in zip(computing.outcomes, own, folders)
+    ]
     reference = attached_truth(recording.attachments, str(recording.path))
     judged = [
         {**(of_trajectory(runner.result, reference, ERRORS) if outcome.metrics.get("final") else {}), **of_frames}
@@ -244,6 +279,18 @@ def _budget(recording: Recording) -> tuple[dict[str, dict[str, float]], list[str
         print(f"no error budget: {error}", file=sys.stderr)
         return {}, []
     return {" + ".join(stages): _errors(one.metrics) for stages, one in found.items()}, remarks(found)
+
+
+def _draw_axes(out: Path, work: Work) -> None:
+    """Draw the errors of all estimators of the Manhattan frame, and their axes on the sphere, where there is ground truth."""
+    from trihedron.tools.benchmarks.rotation_comparison import common_world, draw, read_runs
+
+    try:
+        runs = read_runs(out, work.folders)
+        files = draw(runs, common_world(runs), out, work.prefix and f"{work.prefix},")
+        print(f"drawn: {', '.join(map(str, files))}", file=sys.stderr)
+    except DataError as error:
+        print(f"no pictures of the axes: {error}", file=sys.stderr)
 
 
 def _draw_farthest(cases: Sequence[Case]) -> None:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
-from itertools import permutations, product
 from typing import Any
 
 import numpy as np
@@ -15,6 +14,7 @@ from trihedron.pipeline.core.types import F64, LOST, ManhattanFrame, Pose, Rotat
 from trihedron.pipeline.record.reader import Recording
 from trihedron.pipeline.run.metrics import rotation_angles_deg
 from trihedron.pipeline.run.replay import RECORDED
+from trihedron.plugins.shared.manhattan_frames_kernels import nearest_equivalent
 from trihedron.tools.diff import common_frames, difference, differing
 from trihedron.tools.error_budget import true_poses
 from trihedron.tools.stage_measures import COLUMNS, Seen, measured
@@ -23,12 +23,6 @@ MEASURED = ("pose", "translation", "rotation", "manhattan")  # topics with a dis
 OPEN_LOOP = ("axes deg", "rotation deg", "translation mm", *COLUMNS)  # columns of the errors of single stages
 FALSE_AXES = "false axes %"
 FALSE_DEG = 5.0  # of a Manhattan frame from the others: a false one
-CUBE = [
-    sign * np.eye(3)[list(order)].T
-    for order in permutations(range(3))
-    for sign in (np.array(signs, np.float64) for signs in product((1, -1), repeat=3))
-    if np.linalg.det(sign * np.eye(3)[list(order)].T) > 0.0
-]  # the 24 rotations of a cube, which exchange the axes of a Manhattan frame
 
 
 @dataclass
@@ -88,7 +82,7 @@ def distance(x: Value | None, y: Value | None) -> tuple[float, str] | None:
     if isinstance(x, Rotation) and isinstance(y, Rotation):
         return _angle_deg(x.R_world_camera.T @ y.R_world_camera), "deg"
     if isinstance(x, ManhattanFrame) and isinstance(y, ManhattanFrame) and len(x.rotations) and len(y.rotations):
-        return min(_angle_deg(x.rotations[0].T @ y.rotations[0] @ turn) for turn in CUBE), "deg"
+        return _angle_deg(x.rotations[0].T @ nearest_equivalent(y.rotations[0], x.rotations[0])), "deg"
     return None
 
 
@@ -162,7 +156,7 @@ def _from_most_deg(axes: Sequence[F64]) -> F64:
 
 def _alike(axes: Sequence[F64]) -> list[F64]:
     """Rotations, each after the exchange of axes that brings it nearest to the first."""
-    return [min((R @ turn for turn in CUBE), key=lambda turned: _angle_deg(axes[0].T @ turned)) for R in axes]
+    return [nearest_equivalent(R, axes[0]) for R in axes]
 
 
 def reference_of(recording: Recording) -> tuple[Mapping[int, F64], bool]:

@@ -18,6 +18,7 @@ from trihedron.tools.ablation_statistics import shapley_weights
 from trihedron.tools.ablation_swaps import AS_RECORDED, Combination
 from trihedron.tools.arguments import table
 from trihedron.tools.block_bootstrap import resampled
+from trihedron.tools.fold_measures import COLUMNS as OF_FOLDS
 from trihedron.tools.stage_measures import COLUMNS as MEASURED
 from trihedron.tools.verdicts import NOTE, VERDICTS, Column, Sample, Verdict, line_of, verdicts_of
 
@@ -35,6 +36,7 @@ FIGURES = {  # in the order of columns
     "translation mm": Column(2),
     "false axes %": Column(1, of_frames=False),
     **{name: Column(1 if name.endswith("%") else 2) for name in MEASURED},
+    **{name: Column(decimals, of_frames=False) for name, decimals in OF_FOLDS.items()},
     "values %": Column(1, more=True, of_frames=False),
     "ms": Column(2, of_frames=False),
 }

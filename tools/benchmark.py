@@ -6,7 +6,7 @@ frame's files to its pose, and the time it waits behind others does not count. -
 became slower since a --json file.
 
 Other comparisons, each with its --help: `trihedron benchmark scaling` (threads, image size, features, length), `trihedron benchmark manhattan`
-(estimators of the Manhattan frame on rendered rooms), `trihedron benchmark rotations` (the runs of a sweep over them), `trihedron benchmark
+(estimators of the Manhattan frame on rendered rooms), `trihedron benchmark rotations` (the same over one recording), `trihedron benchmark
 detectors` (all detectors, by the truth of rendered scenes), `trihedron benchmark methods` (every plugin in the default graph), `trihedron benchmark
 surface` (all surfaces, by the true one), `trihedron benchmark map` (drift, recovery and growth of the map), `trihedron benchmark long` (what a long
 run leaves behind), `trihedron benchmark parts` (features and matching beside OpenCV's), `trihedron benchmark recording` (what recording costs),

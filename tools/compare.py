@@ -17,7 +17,6 @@ Example: trihedron compare runs/desk orbslam2.txt --label ORB-SLAM2
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -158,19 +157,17 @@ def _known(metrics: dict[str, Any], timing: dict[str, Any], surface: dict[str, A
 
 def judge_surfaces(folders: Sequence[Path]) -> None:
     """Write surface.json beside each surface.ply that has none; one that cannot be judged is skipped, and each reason printed once."""
-    from trihedron.tools.evaluate_surface import evaluate_files
+    from trihedron.tools.fold_measures import judge_surface
 
     reasons = set()
     for folder in (run for given in folders for run in run_folders(given)):
         if (folder / SURFACE).exists() and not (folder / SURFACE_FIGURES).exists():
             try:
-                figures = evaluate_files(folder / SURFACE, folder / "run.mcap")
+                judge_surface(folder, folder / "run.mcap")
             except DataError as error:
                 if str(error) not in reasons:
                     print(f"{folder / SURFACE} is not judged: {error}")
                 reasons.add(str(error))
-                continue
-            (folder / SURFACE_FIGURES).write_text(json.dumps(figures, indent=2) + "\n")
 
 
 def groups_of(runs: Sequence[Run]) -> dict[tuple[str, str], list[Run]]:

@@ -22,7 +22,7 @@ from trihedron.pipeline.core.errors import DataError
 from trihedron.tools.arguments import Parser, table
 
 if TYPE_CHECKING:
-    from trihedron.pipeline.core.types import F64, I32
+    from trihedron.pipeline.core.types import F64, I32, Trajectory
     from trihedron.tools.surface_truth import Truth
 
 SURFACE, TRAJECTORY, RECORDING = "surface.ply", "trajectory.txt", "run.mcap"
@@ -54,27 +54,38 @@ def evaluate_files(mesh: Path, recording: Path) -> dict[str, Any]:
     from trihedron.tools.mesh_files import read_mesh
 
     vertices, triangles = read_mesh(mesh)
-    beside = next((folder for folder in (mesh.parent, recording.parent) if (folder / TRAJECTORY).is_file()), mesh.parent)
-    T, truth = prepared(beside / TRAJECTORY, recording)
+    T, truth = prepared(trajectory_in(mesh.parent, recording.parent), recording)
     return {**judged(vertices @ T[:3, :3].T + T[:3, 3], triangles, truth), "bytes": mesh.stat().st_size}
+
+
+def trajectory_in(*folders: Path) -> Path:
+    """Return the trajectory.txt of the first folder that has one; that of the first where none has."""
+    return next((folder / TRAJECTORY for folder in folders if (folder / TRAJECTORY).is_file()), folders[0] / TRAJECTORY)
 
 
 def prepared(trajectory: Path, recording: Path) -> tuple[F64, Truth]:
     """(4, 4) `T_truth_world` that aligns the trajectory with the recording's ground truth, and the true surface of its data set. Raises DataError."""
-    from trihedron.pipeline.core.geometry import umeyama
     from trihedron.pipeline.record.reader import Recording
-    from trihedron.pipeline.record.trajectories import attached_truth, read_trajectory
-    from trihedron.pipeline.run.metrics import associate
+    from trihedron.pipeline.record.trajectories import attached_truth
 
-    estimate, opened = read_trajectory(trajectory), Recording(recording)
+    opened = Recording(recording)
     expected = attached_truth(opened.attachments, str(recording))
     if expected is None:
         raise DataError(str(recording), "holds no ground truth, so the mesh cannot be aligned", "run on a data set with ground truth")
-    pairs = associate(estimate.stamps_ns, expected.stamps_ns)
+    return alignment(trajectory, expected), _truth(_dataset(opened), expected.stamps_ns.tobytes(), expected.poses.tobytes())
+
+
+def alignment(trajectory: Path, truth: Trajectory) -> F64:
+    """Return the (4, 4) `T_truth_world` that aligns a trajectory file with the truth. Raises DataError for fewer than three poses with a truth."""
+    from trihedron.pipeline.core.geometry import umeyama
+    from trihedron.pipeline.record.trajectories import read_trajectory
+    from trihedron.pipeline.run.metrics import associate
+
+    estimate = read_trajectory(trajectory)
+    pairs = associate(estimate.stamps_ns, truth.stamps_ns)
     if len(pairs) < 3:
         raise DataError(str(trajectory), f"{len(pairs)} of its poses have a truth", "give the recording of the same run")
-    T = umeyama(estimate.poses[pairs[:, 0], :3, 3], expected.poses[pairs[:, 1], :3, 3])
-    return T, _truth(_dataset(opened), expected.stamps_ns.tobytes(), expected.poses.tobytes())
+    return umeyama(estimate.poses[pairs[:, 0], :3, 3], truth.poses[pairs[:, 1], :3, 3])
 
 
 @lru_cache(maxsize=TRUTHS)

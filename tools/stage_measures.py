@@ -3,6 +3,7 @@
 A measure compares what a stage says of a frame with what it, or its inputs, said of the frame before, moved by the motion between the two. So it
 needs no labelled scene, and later stages hide nothing. All measures are errors: less is better, 0 is perfect; over frames their root mean square
 counts. The poses are the ground truth where there is any; else those of the recorded run, and what is measured then is agreement with it.
+`cycle px`, `depth mm` and `one-way pairs %` need no truth: they compare an estimate with the pairs, the depth and the descriptors of the two frames.
 """
 
 from __future__ import annotations
@@ -14,7 +15,25 @@ from typing import Any
 import numpy as np
 
 from trihedron.pipeline.core.geometry import invert, transform
-from trihedron.pipeline.core.types import F64, Bool, Camera, Frame, Keypoints, LineSegments, Map, Matches, Normals, Planes, Segments, Tracks, Value
+from trihedron.pipeline.core.types import (
+    F64,
+    LOST,
+    Bool,
+    Camera,
+    Frame,
+    Keypoints,
+    LineSegments,
+    Map,
+    Matches,
+    Normals,
+    Planes,
+    Pose,
+    Rotation,
+    Segments,
+    Tracks,
+    Translation,
+    Value,
+)
 from trihedron.pipeline.run.replay import RECORDED
 
 NEAR_PX = 2.0  # of where a feature must be, to be found again
@@ -22,13 +41,14 @@ WRONG_PX = 3.0  # from where a pair's landmark is: a wrong one
 OCCLUDED = 0.05  # of its depth that a point may lie behind what is seen there
 UNKNOWN_M = 1e6  # in the place of a depth that is not known, where the nearest is looked for
 BORDER_PX = 8.0  # of the image, where features are not looked for
-STEP_PX = 8  # between the pixels at which normals are compared
+STEP_PX = 8  # between the pixels at which normals and depth are compared
+SAMPLED_PAIRS = 200  # of a frame, that are matched backwards, too
 DEPTH_EDGE = 0.02  # of the depth: normals are compared where the depth agrees so well
 LINE_DEG = 5.0  # between the directions of a segment and the same one a frame later
 LEAST_SHARE = 0.5  # of a plane's points that must fall on one plane of the next frame
 COLUMNS = (
     "normals deg", "points lost %", "lines lost %", "segments mm", "planes mm", "planes deg", "planes lost %", "wrong pairs %", "missed pairs %",
-    "wrong matches %", "missed matches %",
+    "one-way pairs %", "wrong matches %", "missed matches %", "cycle px", "depth mm",
 )  # fmt: skip
 
 
@@ -76,10 +96,8 @@ def of_normals(value: Normals, now: Seen, before: Seen, T: F64) -> Errors:
     last, camera, depth, last_depth = before.get("normals"), now.camera, now.depth_m, before.depth_m
     if not isinstance(last, Normals) or camera is None or depth is None or last_depth is None:
         return {}
-    v, u = np.mgrid[0 : last_depth.shape[0] : STEP_PX, 0 : last_depth.shape[1] : STEP_PX].reshape(2, -1)
-    points = transform(T, camera.back_project(np.stack([u, v], axis=1), last_depth[v, u].astype(np.float64)))
-    pixels = np.rint(camera.project(points))
-    known = (last_depth[v, u] > 0.0) & within(pixels, camera)
+    (v, u), points, pixels, known = warped(last_depth, camera, T)
+    pixels = np.rint(pixels)
     known[known] = np.abs(at(depth, pixels[known]) - points[known, 2]) < DEPTH_EDGE * points[known, 2]
     old = last.normals[v[known] // last.stride, u[known] // last.stride] @ T[:3, :3].T
     new = at(value.normals, pixels[known] // value.stride)
@@ -158,9 +176,7 @@ def of_tracks(value: Tracks, now: Seen, before: Seen, T: F64) -> Errors:
     points, last, camera = now.get("keypoints"), before.get("keypoints"), now.camera
     if not isinstance(points, Keypoints) or camera is None:
         return {}
-    pixels = camera.project(transform(T, value.points_m.astype(np.float64)))
-    off = np.linalg.norm(pixels - points.pixels[value.keypoints[:, 1]], axis=1)
-    errors = {"wrong pairs %": share(off[np.isfinite(off)] > WRONG_PX)}
+    errors = {"wrong pairs %": share(offsets_px(value, points, camera, T) > WRONG_PX)}
     if isinstance(last, Keypoints):
         pixels, visible = in_view(transform(T, last.points_m.astype(np.float64)), now)
         there = visible.copy()
@@ -168,7 +184,55 @@ def of_tracks(value: Tracks, now: Seen, before: Seen, T: F64) -> Errors:
         paired = np.zeros(len(last.pixels), bool)
         paired[value.keypoints[:, 0]] = True
         errors["missed pairs %"] = share(~paired[there])
+        errors["one-way pairs %"] = one_way(value.keypoints, last, points)
     return errors
+
+
+def one_way(pairs: Any, last: Keypoints, points: Keypoints) -> float:
+    """Return the share, in percent, of pairs (n, 2) whose point now has its nearest descriptor in the frame before at another point than the paired
+    one, of `SAMPLED_PAIRS` spread over them; NaN where the points have no descriptors."""
+    import cv2
+
+    old, new = (np.ascontiguousarray(one.descriptors) for one in (last, points))
+    sampled = pairs[:: -(-len(pairs) // SAMPLED_PAIRS) or 1]
+    if not len(sampled) or not old.shape[1] or old.dtype != new.dtype:
+        return np.nan
+    matcher = cv2.BFMatcher(cv2.NORM_HAMMING if old.dtype == np.uint8 else cv2.NORM_L2)
+    found = matcher.match(new[sampled[:, 1]], old)
+    return share(np.array([match.trainIdx for match in found]) != sampled[:, 0])
+
+
+def of_motion(value: Rotation | Translation | Pose, now: Seen, before: Seen, T: F64) -> Errors:
+    """By the estimated motion since the last frame: `cycle px`, median distance of the pairs' points, there by the motion and back by the pairs, and
+    `depth mm`, median difference of the last frame's depth from that of this one, on pixels that both see. A rotation is judged with the known
+    translation."""
+    ends, camera, errors = [estimated(type(value), frame) for frame in (now, before)], now.camera, {}
+    if ends[0] is None or ends[1] is None or camera is None:
+        return {}
+    motion = invert(ends[0]) @ ends[1]
+    tracks, points, depth, last_depth = now.get("tracks"), now.get("keypoints"), now.depth_m, before.depth_m
+    if isinstance(tracks, Tracks) and isinstance(points, Keypoints):
+        errors["cycle px"] = median(offsets_px(tracks, points, camera, motion))
+    if depth is not None and last_depth is not None:
+        _, moved, pixels, known = warped(last_depth, camera, motion)
+        there = between(depth, pixels[known])
+        off = np.abs(there - moved[known, 2])
+        errors["depth mm"] = median(1e3 * off[off < OCCLUDED * there])  # where it is unknown, off is NaN
+    return errors
+
+
+def estimated(kind: type[Any], seen: Seen) -> F64 | None:
+    """Return the pose (4, 4) that a stage of a kind estimates, with what it does not estimate as known; None without an estimate."""
+    pose, rotation, translation = (seen.get(topic) for topic in ("pose", "rotation", "translation"))
+    if kind is Pose:
+        return pose.T_world_camera if isinstance(pose, Pose) and pose.status != LOST else None
+    if not isinstance(rotation, Rotation) or (kind is Translation and not (isinstance(translation, Translation) and translation.estimated)):
+        return None
+    T = seen.T_world_camera.copy()
+    T[:3, :3] = rotation.R_world_camera
+    if kind is Translation:
+        T[:3, 3] = translation.t_world_camera
+    return T
 
 
 def of_matches(value: Matches, now: Seen, before: Seen, T: F64) -> Errors:
@@ -196,7 +260,35 @@ MEASURES: dict[type[Any], Measure] = {
     Planes: of_planes,
     Tracks: of_tracks,
     Matches: of_matches,
+    Rotation: of_motion,
+    Translation: of_motion,
+    Pose: of_motion,
 }
+
+
+def warped(depth_m: Any, camera: Camera, T: F64) -> tuple[Any, F64, F64, Bool]:
+    """Return rows and columns (2, n) of the pixels of a grid, their points (n, 3) moved by T, the pixels (n, 2) where these are, and which have a
+    depth and are in the image."""
+    v, u = np.mgrid[0 : depth_m.shape[0] : STEP_PX, 0 : depth_m.shape[1] : STEP_PX].reshape(2, -1)
+    points = transform(T, camera.back_project(np.stack([u, v], axis=1), depth_m[v, u].astype(np.float64)))
+    pixels = camera.project(points)
+    return (v, u), points, pixels, (depth_m[v, u] > 0.0) & within(np.nan_to_num(np.rint(pixels), nan=-1.0), camera)
+
+
+def between(depth_m: Any, pixels: F64) -> F64:
+    """Return the depth (n,) at pixels (n, 2) with fractions, where the inverse depth is linear, as on a plane; NaN beside unknown depth."""
+    import cv2
+
+    inverse = np.where(depth_m > 0.0, 1.0 / np.maximum(depth_m, 1e-6), np.nan).astype(np.float32)
+    found = cv2.remap(inverse, pixels.astype(np.float32)[None], None, cv2.INTER_LINEAR, borderValue=(np.nan,))
+    return 1.0 / found[0].astype(np.float64)
+
+
+def offsets_px(tracks: Tracks, points: Keypoints, camera: Camera, T: F64) -> F64:
+    """Return the distances (n,) of the pairs' points, moved by T, from their pixels in this frame, of those with depth."""
+    pixels = camera.project(transform(T, tracks.points_m.astype(np.float64)))
+    off: F64 = np.linalg.norm(pixels - points.pixels[tracks.keypoints[:, 1]], axis=1)
+    return off[np.isfinite(off)]
 
 
 def within(pixels: F64, camera: Camera, border: float = 0.0) -> Bool:

@@ -64,7 +64,7 @@ Usage: trihedron run [-m] [key=value ...]
   -m ... --dry-run                   say which jobs a sweep has, which are done, and which stages they share; run nothing
   sequences=[KIND:FOLDER,...]        of a sweep: several data sets, for example ["tum:/data/desk frames=0:300",synthetic]
   hydra/launcher=dask                of a sweep: on a cluster; hydra/sweeper=optuna: a search (README)
-  report=COMMAND                     what to do with the folder of a sweep at its end, for example: report="benchmark rotations"
+  report=COMMAND                     what to do with the folder of a sweep at its end, for example: report="benchmark methods"
 
 Example: trihedron run rgbd_dataset_freiburg3_structure_notexture_far
 Example: trihedron run replay=runs/latest/run.mcap only=[manhattan,rotation] manhattan.cone_deg=8"""

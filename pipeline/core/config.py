@@ -92,7 +92,7 @@ class RunOptions:
     replay: str = ""  # a recording to read topics from
     only: list[str] = dataclasses.field(default_factory=list)  # stages that a replay computes again; [] = all
     feedback: Feedback = Feedback.new
-    report: str = ""  # a command that is given the folder of a sweep when all its jobs are done, for example: benchmark rotations
+    report: str = ""  # a command that is given the folder of a sweep when all its jobs are done, for example: benchmark methods
     dry_run: bool = False  # of a sweep: say which jobs it has, and run none
     sequences: list[str] = dataclasses.field(default_factory=list)  # of a sweep: KIND:FOLDER and options after blanks, see sweep.words_of_sequence
     alternatives: list[str] = dataclasses.field(default_factory=list)  # of a sweep: words tried one at a time, see sweep.words_of_alternatives

@@ -8,9 +8,9 @@ from __future__ import annotations
 
 import time
 from collections import defaultdict
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Hashable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
-from typing import Any
+from typing import Any, TypeVar
 
 from trihedron.pipeline.core.errors import StageError, TrihedronError
 from trihedron.pipeline.core.graph import Graph, Stage
@@ -20,6 +20,7 @@ from trihedron.pipeline.run.runner import Runner
 from trihedron.pipeline.run.scheduler import Node, NodeFailure, Scheduler, single_threaded_libraries
 
 MAP = "map"  # what the end of a fold reads besides its wires
+Class = TypeVar("Class", bound=Hashable)
 
 
 @dataclass(frozen=True)
@@ -87,6 +88,15 @@ def _unequal(graphs: Sequence[Graph], classes: Sequence[Mapping[str, int]]) -> f
     return frozenset(name for name in names if len({own.get(name) for own in classes}) > 1)
 
 
+def users_of(classes: Sequence[Mapping[str, Class]]) -> dict[Class, list[int]]:
+    """Return for each class of stages the numbers of the graphs that have it; `classes` as of `equivalence`."""
+    found: dict[Class, list[int]] = defaultdict(list)
+    for number, own in enumerate(classes):
+        for name in own.values():
+            found[name].append(number)
+    return dict(found)
+
+
 class SideBySide:
     """Replays of one recording that advance together, frame by frame. `cpu_s` has the CPU seconds of each node so far, `node_of` the node that
     serves a stage of a runner, `users` how many runners a node serves."""
@@ -119,11 +129,7 @@ class SideBySide:
     @property
     def users(self) -> dict[str, int]:
         """The number of runners that each node serves."""
-        found: dict[str, int] = defaultdict(int)
-        for nodes in self.node_of:
-            for node in nodes.values():
-                found[node] += 1
-        return dict(found)
+        return {node: len(numbers) for node, numbers in users_of(self.node_of).items()}
 
     @property
     def cpu_s(self) -> dict[str, float]:

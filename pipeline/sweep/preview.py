@@ -9,7 +9,7 @@ from pathlib import Path
 from trihedron.pipeline.core.config import rewritten
 from trihedron.pipeline.core.errors import TrihedronError, printable
 from trihedron.pipeline.core.graph import Graph
-from trihedron.pipeline.run.side_by_side import equivalence, vertices_of
+from trihedron.pipeline.run.side_by_side import equivalence, users_of, vertices_of
 from trihedron.pipeline.sweep.jobs import DONE, FAILED, read_job
 
 TO_RUN, AGAIN, REFUSED = "to run", "to run again", "refused"
@@ -43,10 +43,7 @@ def preview(jobs: Sequence[Planned]) -> str:
     """Describe the jobs, one a line, and count them; a stage is shared when another job computes the same on the same frames."""
     graphs = [job.graph for job in jobs if job.graph is not None]
     classes = equivalence([vertices_of(graph) for graph in graphs])
-    users: dict[int, int] = {}
-    for own in classes:
-        for number in own.values():
-            users[number] = users.get(number, 0) + 1
+    users = users_of(classes)
     common = common_words([job.words for job in jobs])
     rows, each = [("job", "state", "change", "stages", "shared with other jobs")], iter(classes)
     for job in jobs:
@@ -54,17 +51,17 @@ def preview(jobs: Sequence[Planned]) -> str:
         if job.graph is None:
             rows.append((job.folder.name, job.state, change, "-", job.reason))
             continue
-        shared = [name for name, number in next(each).items() if users[number] > 1]
+        shared = [name for name, number in next(each).items() if len(users[number]) > 1]
         rows.append((job.folder.name, job.state, change, str(len(job.graph.stages)), ", ".join(shared) or "-"))
     widths = [max(len(row[column]) for row in rows) for column in range(4)]
     lines = ["  ".join([*(cell.ljust(width) for cell, width in zip(row, widths)), row[4]]) for row in rows]
     return "\n".join([*map(printable, lines), *_counts(jobs, users)])
 
 
-def _counts(jobs: Sequence[Planned], users: dict[int, int]) -> list[str]:
+def _counts(jobs: Sequence[Planned], users: dict[int, list[int]]) -> list[str]:
     states, words = [job.state for job in jobs], common_words([job.words for job in jobs])
     counts = [f"{states.count(state)} {state}" for state in (DONE, TO_RUN, AGAIN, REFUSED) if state in states]
-    stages = sum(users.values())
+    stages = sum(map(len, users.values()))
     found = [f"{len(jobs)} jobs: {', '.join(counts)}"]
     if stages > len(users):
         found.append(f"{stages} stages, {len(users)} of them different; trihedron ablate computes what alternatives of a recording share once")

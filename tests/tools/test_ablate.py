@@ -354,6 +354,47 @@ def test_several_recordings_from_python(tmp_path):
     assert found.verdicts[0].startswith("as recorded against bundle=none: ATE ") and str(found).startswith(f"Verdicts\n{found.verdicts[0]}\n")
 
 
+def test_a_dry_run_says_what_is_computed_read_and_shared_and_writes_nothing(tmp_path, capsys):
+    source, before = Path(__file__).parents[1] / "fuzz" / "seeds" / "own.mcap", tmp_path / "rotation=procrustes" / "run.mcap"
+    before.parent.mkdir()
+    before.touch()  # of an ablation with other values
+    words = [str(source), "rotation=procrustes", "translation=irls", "feedback=recorded", f"out={tmp_path}"]
+    assert main(["ablate", *words, "--dry-run"]) == 0
+    said = capsys.readouterr().out.splitlines()
+    assert list(tmp_path.iterdir()) == [before.parent] and before.stat().st_size == 0
+    assert said[0] == f"{source}: 4 alternatives, 5 frames" and said[-1] == "32 stages, 12 of them different, which are computed"
+    assert said[1:8] == [
+        "1  as recorded: to run",
+        "   computes again: rotation, translation",
+        "   computes once, not recorded: normals, lines, segments, planes, manhattan, tracks",
+        "   reads: dataset, frames, keypoints, rotation, pose, map",
+        "   read for 2, 3, 4 too: dataset, frames, keypoints, rotation, pose, map",
+        "   computed for 2, 3, 4 too: normals, lines, segments, planes, manhattan, tracks",
+        "   computed for 2 too: rotation",
+    ]
+    assert [line for line in said if line[0].isdigit()][1:4] == [
+        "2  translation=irls: to run",
+        "3  rotation=procrustes: to run again",
+        "4  rotation=procrustes translation=irls: to run",
+    ]
+    assert said[-2] == "   computed for 3 too: rotation"
+
+
+def test_a_recording_ablates_itself_from_python(tmp_path):
+    import trihedron as th
+
+    source = Path(__file__).parents[1] / "fuzz" / "seeds" / "own.mcap"
+    found = th.Recording(source).ablate("rotation=constant_velocity", out=tmp_path, feedback="recorded", keypoints__features=200)
+    assert list(found.folders) == [
+        "as recorded",
+        "keypoints.features=200",
+        "rotation=constant_velocity",
+        "rotation=constant_velocity keypoints.features=200",
+    ]
+    assert all((folder / "run.mcap").is_file() for (folder,) in found.folders.values())
+    assert str(found) == str(th.ablate(source, "rotation=constant_velocity", "keypoints.features=200", out=tmp_path, feedback="recorded"))
+
+
 def test_values_of_other_code_are_named(tmp_path):
     words = ["run", "dataset.width=160", "dataset.height=120", "dataset.length=4", "outputs=[rotation]"]
     for name, more in (("a", []), ("b", []), ("c", ["dataset.seed=1"])):

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from trihedron.pipeline.core.geometry import pose_matrix
 from trihedron.pipeline.core.lie import exp_so3
 from trihedron.pipeline.core.types import LineSegments, Normals
 from trihedron.plugins.map.covisibility import Covisibility
@@ -96,13 +97,14 @@ def test_normals_that_are_askew():
 def test_pairs_that_are_wrong_and_missed():
     tracks, old, new = tracks_of(EXACT, BEFORE, NOW)
     before = seen(BEFORE, keypoints=old)
-    assert errors("tracks", before, tracks=tracks, keypoints=new) == {"wrong pairs %": 0.0, "missed pairs %": 0.0}
+    assert errors("tracks", before, tracks=tracks, keypoints=new) == {"wrong pairs %": 0.0, "missed pairs %": 0.0, "one-way pairs %": 0.0}
     deep = np.flatnonzero(np.isfinite(tracks.points_m).all(axis=1))
     pairs = tracks.keypoints.copy()
     wrong = deep[with_share(deep, 0.2)]
     pairs[wrong, 1] = np.roll(pairs[wrong, 1], 1)
     found = errors("tracks", before, tracks=replace(tracks, keypoints=pairs), keypoints=new)
     assert found["wrong pairs %"] == pytest.approx(100.0 * len(wrong) / len(deep)) and found["missed pairs %"] == 0.0
+    assert found["one-way pairs %"] == pytest.approx(100.0 * len(wrong) / len(pairs), abs=3.0)  # of some 200 pairs
     kept = np.setdiff1d(np.arange(len(pairs)), wrong)
     fewer = replace(tracks, keypoints=tracks.keypoints[kept], points_m=tracks.points_m[kept], sigma_m=tracks.sigma_m[kept])
     assert errors("tracks", before, tracks=fewer, keypoints=new)["missed pairs %"] == pytest.approx(20.0, abs=3.0)
@@ -121,6 +123,40 @@ def test_matches_that_are_wrong_and_missed():
     assert errors("matches", before, matches=replace(found, keypoints=pairs))["wrong matches %"] == pytest.approx(30.0, abs=1.0)
     fewer = replace(found, keypoints=found.keypoints[np.setdiff1d(np.arange(len(pairs)), wrong)])
     assert errors("matches", before, matches=fewer)["missed matches %"] == pytest.approx(30.0, abs=3.0)
+
+
+def moved(step, off=None):
+    """The values of a frame whose estimates are off by a motion in the camera."""
+    tracks, _, keypoints = tracks_of(EXACT, BEFORE, step)
+    return seen(step, tracks=tracks, keypoints=keypoints, **estimates(camera_at(step) @ (np.eye(4) if off is None else off)))
+
+
+def estimates(T):
+    """Rotation, translation and pose of a camera."""
+    return {"rotation": rotation_of(T, NOW), "translation": translation_of(T, NOW), "pose": pose_of(T, NOW)}
+
+
+@pytest.mark.parametrize("topic", ["rotation", "translation", "pose"])
+def test_a_right_motion_closes_the_cycle_and_warps_the_depth(topic):
+    found = measured(topic, moved(NOW), moved(BEFORE))
+    assert found["cycle px"] < 0.01 and found["depth mm"] < 0.5
+
+
+@pytest.mark.parametrize("topic", ["translation", "pose"])
+def test_a_motion_towards_a_wall_that_is_20_mm_off_is_20_mm_off_in_depth(topic):
+    wall, T, off = {"dataset": EXACT.frame(0)}, np.eye(4), pose_matrix(np.eye(3), np.array([0.0, 0.0, 0.02]))
+    before, now = (Seen({**moved(BEFORE).values, **wall, **estimates(one)}, T) for one in (T, off))
+    assert measured(topic, now, before)["depth mm"] == pytest.approx(20.0, abs=0.01)
+    assert measured("rotation", now, before)["depth mm"] == pytest.approx(0.0, abs=0.01)  # with the known translation
+
+
+def test_a_rotation_about_the_optical_axis_moves_points_by_their_radius():
+    off = moved(NOW, pose_matrix(exp_so3(np.radians([0.0, 0.0, 1.0])), np.zeros(3)))
+    tracks, keypoints = off.values["tracks"], off.values["keypoints"]
+    deep = tracks.keypoints[np.isfinite(tracks.points_m).all(axis=1), 1]
+    radii = np.linalg.norm(keypoints.pixels[deep] - [319.5, 239.5], axis=1)
+    for topic in ("rotation", "translation", "pose"):
+        assert measured(topic, off, moved(BEFORE))["cycle px"] == pytest.approx(2.0 * np.sin(np.radians(0.5)) * np.median(radii), rel=0.02)
 
 
 def test_frames_follow_each_other_and_the_first_has_no_error():

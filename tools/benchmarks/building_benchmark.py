@@ -102,25 +102,22 @@ def _figures(run: Path, plugin: str, anew: bool) -> dict[str, float]:
     return figures if plugin else figures | {"frame_ms": stage["p50_ms"]}
 
 
-def judged_run(run: Path, plugin: str | None = None) -> dict[str, float]:
-    """Return the figures of a run folder of a synthetic scene; its plan as recorded, or made by a plugin, with the CPU time. Raises DataError."""
+def judged_run(run: Path, plugin: str | None = None, beside: Path | None = None) -> dict[str, float]:
+    """Return the figures of a run folder of a synthetic scene; its plan as recorded, or made by a plugin, with the CPU time. The trajectory is that
+    of the folder `beside` where the run has none. Raises DataError."""
     from trihedron.pipeline.app.recorded_run import composed_run
     from trihedron.pipeline.core.config import make_plugin
-    from trihedron.pipeline.core.geometry import umeyama
     from trihedron.pipeline.core.registry import load_plugins
     from trihedron.pipeline.record.reader import Recording
-    from trihedron.pipeline.record.trajectories import read_trajectory
-    from trihedron.pipeline.run.metrics import associate
     from trihedron.tools.building import building_of, gathered
+    from trihedron.tools.evaluate_surface import alignment, trajectory_in
 
     load_plugins()
     recording = Recording(run / "run.mcap")
     dataset = make_plugin("dataset", composed_run(recording).dataset)
     if not hasattr(dataset, "plans"):
         raise DataError(str(run), "is of a data set without an exact plan", "judge a run of dataset=synthetic")
-    estimate, truth = read_trajectory(run / "trajectory.txt"), dataset.truth()
-    pairs = associate(estimate.stamps_ns, truth.stamps_ns)
-    T = umeyama(estimate.poses[pairs[:, 0], :3, 3], truth.poses[pairs[:, 1], :3, 3])
+    T = alignment(trajectory_in(run, beside or run), dataset.truth())
     if plugin is None:
         return judged(building_of(recording), T, dataset.plans())
     fold, state, final = gathered(recording, plugin)

@@ -6,7 +6,6 @@ others. Its results are kept in FOLDER/open_loop, so that the same call again co
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -15,26 +14,18 @@ import numpy as np
 from trihedron.pipeline.core.config import Feedback
 from trihedron.pipeline.core.errors import DataError
 from trihedron.pipeline.core.slots import FOLDS, SLOTS, output_of, strip_none
-from trihedron.pipeline.core.types import ManhattanFrame, Rotation, Translation
+from trihedron.pipeline.core.types import ManhattanFrame, Pose
 from trihedron.tools.ablate import Options, ablate
 from trihedron.tools.ablation_differences import FALSE_AXES, OPEN_LOOP
 from trihedron.tools.ablation_tables import FIGURES
-from trihedron.tools.benchmarks.building_benchmark import judged_run
-from trihedron.tools.evaluate_surface import FIGURES as SURFACE_JSON
 from trihedron.tools.evaluate_surface import RECORDING
+from trihedron.tools.fold_measures import COLUMNS, Measures, of_building, of_surface
 from trihedron.tools.stage_measures import MEASURES
 
 FOLDER = "open_loop"
-MEASURED = [slot for slot in SLOTS if slot not in FOLDS and strip_none(output_of(slot)) in (*MEASURES, ManhattanFrame, Rotation, Translation)]
+MEASURED = [slot for slot in SLOTS if slot not in FOLDS and strip_none(output_of(slot)) in {*MEASURES, ManhattanFrame} - {Pose}]
 OPEN = [name for name in FIGURES if name in (*OPEN_LOOP, FALSE_AXES)]
-BUILDING = {  # column -> key of the figures, the value where it is perfect, factor
-    "walls mm": ("wall_m", 0.0, 1e3),
-    "missed rooms %": ("room_recall", 1.0, 100.0),
-    "false rooms %": ("room_precision", 1.0, 100.0),
-}
-DECIMALS = {name: FIGURES[name].decimals for name in OPEN}  # of every column
-DECIMALS |= {"surface mm": 2, "missed surface %": 1, "walls mm": 1, "missed rooms %": 0, "false rooms %": 0}
-Measures = dict[str, float]  # error by column
+DECIMALS = {name: FIGURES[name].decimals for name in (*OPEN, *COLUMNS)}  # of every column
 
 
 def open_loop(run: Path, slot: str, plugins: Sequence[str], out: Path) -> dict[str, Measures]:
@@ -47,25 +38,12 @@ def open_loop(run: Path, slot: str, plugins: Sequence[str], out: Path) -> dict[s
     return found
 
 
-def of_surface(run: Path) -> Measures:
-    """`surface mm`: mean distance of the mesh from the true surface. `missed surface %`: share of the seen true surface farther than 5 cm from it.
-    Empty where the run has no figures of `judge_surfaces`."""
-    if not (run / SURFACE_JSON).exists():
-        return {}
-    whole = json.loads((run / SURFACE_JSON).read_text())["parts"]["all"]
-    found = {"surface mm": (0.0, 1e3, whole["mean_m"]), "missed surface %": (100.0, -100.0, whole["within_5_cm"])}
-    return {name: offset + factor * value for name, (offset, factor, value) in found.items() if value is not None}
-
-
-def of_building(run: Path) -> Measures:
-    """`walls mm`: median offset of walls from the true ones. `missed rooms %`, `false rooms %`: of the true ones, of those that are found.
-    Empty where the data set has no true plan."""
+def of_plan(run: Path) -> Measures:
+    """Return the measures of a run folder's building; empty where the data set has no true plan."""
     try:
-        figures = judged_run(run)
+        return of_building(run)
     except DataError:
         return {}
-    found = {name: factor * abs(figures[key] - perfect) for name, (key, perfect, factor) in BUILDING.items()}
-    return {name: value for name, value in found.items() if np.isfinite(value)}
 
 
-OF_FOLDS = {"surface": of_surface, "building": of_building}
+OF_FOLDS = {"surface": of_surface, "building": of_plan}

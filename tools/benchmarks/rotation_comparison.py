@@ -1,16 +1,17 @@
-"""Compare the runs of a sweep over estimators of the Manhattan frame: a table, the errors against frame, and the sphere of one frame.
+"""Compare estimators of the Manhattan frame over one recording: a table, the errors against frame, and the sphere of one frame.
 
-`trihedron run -m experiment=rotation_family` ends with this. The truth is the one rotation from the scene's axes to the world that the claims of all
-runs agree on best, carried into each camera by the ground truth of the poses. An error is that of the nearest frame in view; a claim more than 3°
-off is false. `normalised` is the squared error of the others in units of their covariance, the median over that of χ²: 1 when that is right. Times
-are those of the replay.
+FOLDER is of `trihedron ablate RUN.mcap 'manhattan=*' feedback=recorded`, which draws the same pictures. The truth is the one rotation from the
+scene's axes to the world that the claims of all runs agree on best, carried into each camera by the ground truth of the poses. An error is that of
+the nearest frame in view; a claim more than 3° off is false. `normalised` is the squared error of the others in units of their covariance, the
+median over that of χ²: 1 when that is right. Times are those of the replay.
 
-Example: trihedron benchmark rotations runs/family --frame 60
+Example: trihedron benchmark rotations runs/axes --frame 60
 """
 
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -74,7 +75,7 @@ class Run:
 def main(argv: list[str]) -> int:
     """Print the table and the names of the pictures; returns the exit code. Raises DataError when there is nothing to compare."""
     parser = Parser("benchmark rotations", __name__)
-    parser.add_argument("folder", type=Path, help="of the sweep")
+    parser.add_argument("folder", type=Path, help="of the alternatives")
     parser.add_argument("--frame", type=int, metavar="N", help="whose sphere is drawn (default: the middle one)")
     options = parser.parse_args(argv)
     print(compare(options.folder, options.frame))
@@ -83,22 +84,13 @@ def main(argv: list[str]) -> int:
 
 def compare(folder: Path, frame: int | None = None) -> str:
     """The table of all runs in `folder` and the paths of the pictures written there. Raises DataError when nothing can be compared."""
-    from trihedron.tools.benchmarks import rotation_pictures
-
-    runs = read_runs(folder)
+    runs = read_runs(folder, [folder, *sorted(path.parent for path in folder.glob(f"*/{RECORDING}"))])
     world = common_world(runs)
-    errors = {run.name: run.errors_deg(world) for run in runs}
-    numbers = [value.index for value in runs[0].found]
-    frame = numbers[len(numbers) // 2] if frame is None else frame
-    if frame not in numbers:
-        raise DataError(str(folder), f"there is no frame {frame}", f"give one of {numbers[0]}..{numbers[-1]}")
-    written = [folder / ERRORS_PNG, folder / f"sphere_{frame}.png"]
-    rotation_pictures.errors_figure(runs, errors, written[0])
-    rotation_pictures.sphere_figure(runs, world, frame, written[1])
+    written = draw(runs, world, folder, frame=frame)
     heads = ["estimator", "frames", "claimed", "within 1°", "false", "median (deg)", "p95 (deg)", "max (deg)", "normalised", "p50 ms"]
     rows: list[list[str]] = []
     for run in runs:
-        error = errors[run.name]
+        error = run.errors_deg(world)
         known = error[np.isfinite(error)]
         shares = [np.isfinite(error), error <= RIGHT_DEG, error > FALSE_DEG]
         largest = [np.median(known), np.percentile(known, 95), known.max()] if len(known) else []
@@ -108,16 +100,31 @@ def compare(folder: Path, frame: int | None = None) -> str:
     return "\n".join([table([heads, *rows], "lrrrrrrrrr"), *(str(path) for path in written)])
 
 
-def read_runs(folder: Path) -> list[Run]:
-    """The runs of `folder`, itself or the jobs of a sweep, by job number. Raises DataError without any, or without ground truth."""
+def draw(runs: Sequence[Run], world: F64, folder: Path, prefix: str = "", frame: int | None = None) -> list[Path]:
+    """Draw the errors against frame and the sphere of a frame, by default the middle one; returns the files. Raises DataError for an unknown one."""
+    from trihedron.tools.benchmarks import rotation_pictures
+
+    numbers = [value.index for value in runs[0].found]
+    frame = numbers[len(numbers) // 2] if frame is None else frame
+    if frame not in numbers:
+        raise DataError(str(folder), f"there is no frame {frame}", f"give one of {numbers[0]}..{numbers[-1]}")
+    written = [folder / f"{prefix}{name}" for name in (ERRORS_PNG, f"sphere_{frame}.png")]
+    rotation_pictures.errors_figure(runs, world, written[0])
+    rotation_pictures.sphere_figure(runs, world, frame, written[1])
+    return written
+
+
+def read_runs(place: Path, folders: Sequence[Path]) -> list[Run]:
+    """The runs of folders, those without a recording left out. Raises DataError, naming `place`, without any, or without ground truth."""
     runs: list[Run] = []
-    for path in [folder / RECORDING, *sorted(folder.glob(f"*/{RECORDING}"), key=lambda p: (len(p.parent.name), p.parent.name))]:
+    for path in (folder / RECORDING for folder in folders):
         recording = Recording(path) if path.exists() else None
         if recording is not None and "manhattan" in recording.topics:
             runs.append(_run(recording, [run.name for run in runs]))
-    if not any(run.found for run in runs):
-        cure = "make them with: trihedron run -m experiment=rotation_family replay=FILE"
-        raise DataError(str(folder), "holds no runs with a Manhattan frame and ground truth", cure)
+    runs = [run for run in runs if run.found]
+    if not runs:
+        cure = "make them with: trihedron ablate RUN.mcap 'manhattan=*' feedback=recorded out=FOLDER"
+        raise DataError(str(place), "holds no runs with a Manhattan frame and ground truth", cure)
     return runs
 
 
@@ -152,7 +159,7 @@ def residuals_deg(rotations: F64, reference: F64) -> F64:
     return np.asarray(np.degrees(np.arccos(np.clip((traces - 1.0) / 2.0, -1.0, 1.0))))
 
 
-def common_world(runs: list[Run]) -> F64:
+def common_world(runs: Sequence[Run]) -> F64:
     """(3, 3) R_world_manhattan: of claims spread over all runs the one with the least mean residual, larger ones cut off, each run alike; then the
     mean of the claims near it. Raises DataError when nothing was claimed."""
     claims = [run.claims[1] for run in runs if len(run.claims[1])]

@@ -8,12 +8,15 @@ from typing import Any
 
 import numpy as np
 
+from trihedron.pipeline.app.recorded_run import composed_run
+from trihedron.pipeline.core.config import make_plugin
 from trihedron.pipeline.core.errors import TrihedronError
 from trihedron.pipeline.core.lie import rotation_angle_deg
 from trihedron.pipeline.core.types import F64, Normals
 from trihedron.pipeline.record.reader import Recording
 from trihedron.plugins.shared.manhattan_frames_kernels import nearest_equivalent
 from trihedron.tools.benchmarks import rotation_comparison as comparison
+from trihedron.tools.recorded import frames_of, references_of
 
 AXIS_COLORS = ("tab:red", "tab:green", "tab:blue")
 NORMAL_STEP = 3  # every third normal is drawn, in both directions of the grid
@@ -23,13 +26,13 @@ RING: dict[str, Any] = {"marker": "o", "markersize": 13, "fillstyle": "none", "m
 MARKERS = "os^D"  # of several frames
 
 
-def errors_figure(runs: Sequence[comparison.Run], errors: dict[str, F64], path: Path) -> None:
+def errors_figure(runs: Sequence[comparison.Run], world: F64, path: Path) -> None:
     """A row for each estimator: its error (n,) by frame, false claims in red, frames without a claim marked below. Writes a PNG."""
     figure = _figure(10.0, 0.6 + 1.1 * len(runs))
     axes: Any = np.atleast_1d(figure.subplots(len(runs), 1, sharex=True, sharey=True))
     for run, ax in zip(runs, axes):
         numbers = np.array([value.index for value in run.found])
-        error = np.clip(errors[run.name], LEAST_DEG, MOST_DEG)
+        error = np.clip(run.errors_deg(world), LEAST_DEG, MOST_DEG)
         false, silent = error > comparison.FALSE_DEG, np.isnan(error)
         ax.plot(numbers, error, ".-", color="tab:blue", markersize=2, linewidth=0.7)
         ax.plot(numbers[false], error[false], "o", color="tab:red", markersize=3, label="more than 3° off")
@@ -130,23 +133,15 @@ def _features(recording: Recording, frame: int) -> dict[str, Any]:
         values = (value for file in sources if topic in file.topics for value in file.values(topic) if value.index == frame)
         found[topic] = next(values, None)
     if found["normals"] is None:
-        found["normals"] = _normals_again(recording, frame)
+        found["normals"] = _normals_again(sources[-1], frame)
     return found
 
 
 def _normals_again(recording: Recording, frame: int) -> Normals | None:
-    """By the recording's own normals plugin from its data set; None where that is not at hand."""
-    from trihedron.pipeline.app.recorded_run import composed_run
-    from trihedron.pipeline.core.config import make_plugin
-
+    """By the recording's own normals plugin from its images; None where these are not at hand."""
     try:
-        config = composed_run(recording)
-        dataset = make_plugin("dataset", config.dataset)
-        first = dataset(0)
-        image = dataset(frame - first.index) if first is not None else None
-        if image is None or image.index != frame:
-            return None
-        normals: Normals = make_plugin("normals", config.normals)(frame=image)
-        return normals
+        image = frames_of(recording)(references_of(recording)[frame])
+        normals: Normals | None = make_plugin("normals", composed_run(recording).normals)(frame=image) if image is not None else None
     except TrihedronError:
         return None
+    return normals

@@ -1,6 +1,8 @@
-"""`experiment=rotation_family`: one recording, every estimator replayed over it, a table and pictures."""
+"""Estimators of the Manhattan frame over one recording, as `trihedron ablate` computes them: a table and pictures."""
 
+import shutil
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -45,17 +47,17 @@ def recording(tmp_path_factory):
 
 
 def test_a_plugin_of_another_package_joins_by_a_word(recording, foreign, tmp_path, capsys):
-    words = ["run", "-m", "experiment=rotation_family", f"replay={recording}", f"out={tmp_path}", "hydra/launcher=basic"]  # which knows `foreign`
-    assert main([*words, "manhattan=mean_shift,plane_svd,stubborn"]) == 0
+    assert main(["ablate", str(recording), "manhattan=mean_shift,plane_svd,stubborn", "feedback=recorded", f"out={tmp_path}"]) == 0
+    assert {path.name for path in tmp_path.glob("*.png")} == {"rotation_error.png", "sphere_2.png"}
+    capsys.readouterr()
+    assert main(["benchmark", "rotations", str(tmp_path), "--frame", "4"]) == 0 and (tmp_path / "sphere_4.png").stat().st_size > 20_000
     said = capsys.readouterr().out
     rows = {line.split()[0]: line.split()[1:] for line in said.splitlines() if line.startswith(("mean_shift ", "plane_svd ", "stubborn "))}
     assert rows["mean_shift"][:4] == ["5", "1.000", "1.000", "0.000"] and float(rows["mean_shift"][4]) < 0.5
     assert rows["stubborn"][:4] == ["5", "0.600", "0.000", "0.600"] and float(rows["stubborn"][4]) > 10.0
-    assert {path.name for path in tmp_path.glob("*.png")} == {"rotation_error.png", "sphere_2.png"}
-    assert main(["benchmark", "rotations", str(tmp_path), "--frame", "4"]) == 0 and (tmp_path / "sphere_4.png").stat().st_size > 20_000
     assert main(["benchmark", "rotations", str(tmp_path), "--frame", "9"]) == 1
     assert "give one of 0..4" in capsys.readouterr().err
-    runs = {run.name: run for run in read_runs(tmp_path)}
+    runs = {run.name: run for run in read_runs(tmp_path, list(tmp_path.iterdir()))}
     world = common_world(list(runs.values()))
     assert residuals_deg(world[None], np.eye(3))[0] < 0.6  # the room's axes are the world's
     assert 0.01 < runs["mean_shift"].normalised(world) < 2.0 and np.isnan(runs["stubborn"].normalised(world))
@@ -65,7 +67,7 @@ def test_a_plugin_of_another_package_joins_by_a_word(recording, foreign, tmp_pat
 
 def test_a_folder_without_runs_is_an_error(tmp_path, capsys):
     assert main(["benchmark", "rotations", str(tmp_path)]) == 1
-    assert "experiment=rotation_family" in capsys.readouterr().err
+    assert "trihedron ablate RUN.mcap 'manhattan=*' feedback=recorded" in capsys.readouterr().err
 
 
 def test_residuals_know_no_names_of_axes():
@@ -74,20 +76,30 @@ def test_residuals_know_no_names_of_axes():
     assert np.allclose(residuals_deg(turned, R), [0.0, 2.0, 30.0], atol=1e-5)
 
 
-def test_alternatives_of_an_ablation_are_drawn_too(tmp_path, capsys):
+def test_each_of_several_recordings_has_its_pictures_once(tmp_path, capsys):
     """In a corridor, whose walk a configuration of plain words cannot name."""
     words = ["dataset.scene=corridor", "dataset.texture=false", "dataset.length=4", "dataset.width=160", "dataset.height=120"]
-    assert main(["run", *words, f"out={tmp_path}/run"]) == 0
-    assert main(["ablate", f"{tmp_path}/run", "manhattan=plane_svd", "feedback=recorded", f"out={tmp_path}/axes"]) == 0
+    assert main(["run", *words, "outputs=[manhattan]", f"out={tmp_path}/run"]) == 0
+    shutil.copytree(tmp_path / "run", tmp_path / "copy")
+    command = ["ablate", f"{tmp_path}/run", f"{tmp_path}/copy", "manhattan=plane_svd", "feedback=recorded", f"out={tmp_path}/axes"]
+    assert main(command) == 0
+    drawn = {path: path.stat().st_mtime_ns for path in (tmp_path / "axes").glob("*.png")}
+    assert {path.name for path in drawn} == {f"{name},{kind}.png" for name in ("run", "copy") for kind in ("rotation_error", "sphere_2")}
     capsys.readouterr()
-    assert main(["benchmark", "rotations", f"{tmp_path}/axes"]) == 0
-    assert "\nmean_shift " in (said := capsys.readouterr().out) and "\nplane_svd " in said
-    assert (tmp_path / "axes" / "rotation_error.png").is_file() and list((tmp_path / "axes").glob("sphere_*.png"))
+    assert main([*command, "--dry-run"]) == 0 and capsys.readouterr().out.count("\n2  manhattan=plane_svd: done\n") == 2
+    assert main(command) == 0 and {path: path.stat().st_mtime_ns for path in drawn} == drawn
+
+
+def test_without_ground_truth_a_line_says_that_nothing_is_drawn(tmp_path, capsys):
+    source = Path(__file__).parents[1] / "fuzz" / "seeds" / "own.mcap"
+    assert main(["ablate", str(source), "manhattan=plane_svd", "feedback=recorded", f"out={tmp_path}"]) == 0
+    assert "\nno pictures of the axes: " in capsys.readouterr().err and not list(tmp_path.glob("*.png"))
 
 
 @pytest.mark.slow
 def test_every_registered_estimator_takes_part(recording, tmp_path, capsys):
-    assert main(["run", "-m", "experiment=rotation_family", f"replay={recording}", f"out={tmp_path}"]) == 0
+    assert main(["ablate", str(recording), "manhattan=*", "feedback=recorded", f"out={tmp_path}"]) == 0
+    assert main(["benchmark", "rotations", str(tmp_path)]) == 0
     said = capsys.readouterr().out
     names = [name for name in registry.plugins_of("manhattan") if name != "none"]
     assert len(names) >= 6 and all(f"\n{name} " in said for name in names)

@@ -1,0 +1,66 @@
+"""Errors of the surface and the building of a run, by the true ones of its data set, for tables beside those of single stages: less is better."""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from trihedron.pipeline.core.errors import DataError
+from trihedron.tools.evaluate_surface import FIGURES, SURFACE, evaluate_files
+
+BUILDING = {  # column -> key of the figures, the value where it is perfect, factor
+    "walls mm": ("wall_m", 0.0, 1e3),
+    "missed rooms %": ("room_recall", 1.0, 100.0),
+    "false rooms %": ("room_precision", 1.0, 100.0),
+}
+COLUMNS = {"surface mm": 2, "missed surface %": 1, "walls mm": 1, "missed rooms %": 0, "false rooms %": 0}  # -> decimals
+Measures = dict[str, float]  # error by column
+
+
+def of_folds(stages: Iterable[str], run: Path, source: Path) -> Measures:
+    """Return the measures of those folds of a run folder that are among the stages; `source` is the recording that it was computed from. A fold
+    without a truth has none, and a line says why."""
+    found: Measures = {}
+    for stage in stages:
+        try:
+            if stage == "surface" and (run / SURFACE).exists():
+                found |= of_surface_figures(judge_surface(run, source))
+            elif stage == "building":
+                found |= of_building(run, source.parent)
+        except DataError as error:
+            print(f"{stage} of {run} is not judged: {error}", file=sys.stderr)
+    return found
+
+
+def judge_surface(run: Path, recording: Path) -> dict[str, Any]:
+    """Judge the surface of a run folder by the truth of a recording's data set, and write surface.json. Raises DataError."""
+    figures = evaluate_files(run / SURFACE, recording)
+    (run / FIGURES).write_text(json.dumps(figures, indent=2) + "\n")
+    return figures
+
+
+def of_surface(run: Path) -> Measures:
+    """Return the measures of a run folder's surface; empty where it was not judged."""
+    return of_surface_figures(json.loads((run / FIGURES).read_text())) if (run / FIGURES).exists() else {}
+
+
+def of_surface_figures(figures: Mapping[str, Any]) -> Measures:
+    """`surface mm`: mean distance of the mesh from the true surface. `missed surface %`: share of the seen true surface farther than 5 cm from it."""
+    whole = figures["parts"]["all"]
+    found = {"surface mm": (0.0, 1e3, whole["mean_m"]), "missed surface %": (100.0, -100.0, whole["within_5_cm"])}
+    return {name: offset + factor * value for name, (offset, factor, value) in found.items() if value is not None}
+
+
+def of_building(run: Path, beside: Path | None = None) -> Measures:
+    """`walls mm`: median offset of walls from the true ones. `missed rooms %`, `false rooms %`: of the true ones, of those that are found.
+    `beside` has the trajectory where the run folder has none. Raises DataError where the data set has no true plan."""
+    from trihedron.tools.benchmarks.building_benchmark import judged_run
+
+    figures = judged_run(run, beside=beside)
+    found = {name: factor * abs(figures[key] - perfect) for name, (key, perfect, factor) in BUILDING.items()}
+    return {name: value for name, value in found.items() if np.isfinite(value)}
