@@ -10,6 +10,7 @@ commit: the measured folders may hold no change that is not committed.
 from __future__ import annotations
 
 import json
+import statistics
 import subprocess
 import sys
 import time
@@ -23,7 +24,7 @@ from trihedron.pipeline.core.errors import DataError, TrihedronError
 from trihedron.pipeline.core.layouts import layout_of
 from trihedron.pipeline.run.results import TIMING
 from trihedron.pipeline.sweep.sweep import words_of_sequence
-from trihedron.tools.benchmark import PROGRAM, machine, measure
+from trihedron.tools.benchmark import PROGRAM, machine, measure, reference_ms, sample_images
 
 ROOT = Path(__file__).resolve().parents[2]
 RESULTS, WORK = ROOT / "docs" / "results", ROOT / "runs" / "results"
@@ -97,9 +98,11 @@ def sequence_text(word: str) -> str:
 
 def figures_of(words: Sequence[str], out: Path) -> Row:
     """Run the default graph in a process of its own, and return its figures: metres, degrees, milliseconds, MB (10⁶ bytes), seconds. Errors are None
-    without ground truth. Raises TrihedronError."""
-    began = time.perf_counter()
+    without ground truth. `reference_ms` is the reference workload of `trihedron benchmark`, before and after. Raises TrihedronError."""
+    began, images = time.perf_counter(), sample_images(list(words))
+    before = reference_ms(images)
     figures = measure([*words, f"out={out}"], out)
+    reference = statistics.mean((before, reference_ms(images)))
     metrics, timing = figures["metrics"], json.loads((out / TIMING).read_text())
     final, status, honest = metrics.get("final", {}), metrics["status"], metrics.get("consistency") or {}
     frames = metrics["frames"]
@@ -109,7 +112,7 @@ def figures_of(words: Sequence[str], out: Path) -> Row:
         **{name: final.get(name) for name in ("ate_rmse_m", "rpe_second_rmse_m", "rpe_second_rmse_deg")},
         **{name: honest.get(name) for name in ("nees_median", "nees_mean", "share_within_95", "truth_sigma_m", "truth_sigma_deg")},
         "p50_ms": timing["frame_ms"]["p50"], "p95_ms": timing["frame_ms"]["p95"], "fps": timing["fps"],
-        "cpu_ms": round(1e3 * timing["cpu_s"] / max(timing["frames"], 1), 1),
+        "reference_ms": round(reference, 1), "cpu_ms": round(1e3 * timing["cpu_s"] / max(timing["frames"], 1), 1),
         "peak_memory_mb": timing["peak_memory_mb"], "own_memory_mb": timing["own_memory_mb"],
         "seconds": round(time.perf_counter() - began, 1),
     }  # fmt: skip
