@@ -10,6 +10,7 @@ commit: the measured folders may hold no change that is not committed.
 from __future__ import annotations
 
 import json
+import os
 import statistics
 import subprocess
 import sys
@@ -28,7 +29,7 @@ from trihedron.tools.benchmark import PROGRAM, machine, measure, reference_ms, s
 
 ROOT = Path(__file__).resolve().parents[2]
 RESULTS, WORK = ROOT / "docs" / "results", ROOT / "runs" / "results"
-MEASURED = ("pipeline", "plugins", "datasets", "conf", "api", "tools")  # folders whose code decides on figures
+MEASURED = ("pipeline", "plugins", "datasets", "conf")  # folders whose code decides on figures
 ROOM = "synthetic length=150"
 Row = dict[str, Any]
 
@@ -52,11 +53,11 @@ def main(argv: Sequence[str]) -> int:
 
 
 def commit_of(root: Path) -> str:
-    """Return the commit of the code that is measured. Raises DataError where the code differs from it, or is in no repository."""
+    """Return the last commit of the measured folders. Raises DataError where they hold other changes, or are in no repository."""
     changed = _git(root, "status", "--porcelain", "--", *MEASURED)
     if changed:
         raise DataError(changed.split()[1], "is changed and not committed: its figures would be those of no commit", "commit it, or stash it")
-    return _git(root, "rev-parse", "HEAD")[:12]
+    return _git(root, "log", "-1", "--format=%H", "--", *MEASURED)[:12]
 
 
 def _git(root: Path, *words: str) -> str:
@@ -70,8 +71,10 @@ def header(part: str, commit: str) -> Row:
     """Return what tells under which conditions the figures of a part are measured."""
     found = machine()
     return {
-        "part": part, "command": f"make results PART={part}", "commit": commit, "date": datetime.now(timezone.utc).date().isoformat(),
-        "processor": found["cpu"], "cpus": found["cpus"], "python": found["python"], "packages": found["packages"],
+        "part": part, "command": f"make results PART={part}",
+        "commit": commit, "date": datetime.now(timezone.utc).date().isoformat(),
+        "processor": found["cpu"], "cpus": found["cpus"], "load": round(os.getloadavg()[2], 1),
+        "python": found["python"], "packages": found["packages"],
     }  # fmt: skip
 
 
