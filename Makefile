@@ -15,7 +15,7 @@ USABLE := 'import sys, venv, ensurepip; sys.exit(not (3, 10) <= sys.version_info
 PYTHON := $(shell for p in python3.14 python3.13 python3.12 python3.11 python3.10 python3 python; do \
 	$$p -c $(USABLE) >/dev/null 2>&1 && echo $$p && break; done)
 
-.PHONY: demo test test-slow test-newest benchmark table docs release lock install clean
+.PHONY: demo test test-slow test-newest benchmark table results docs release lock install clean
 .DELETE_ON_ERROR:
 
 demo: install  ## track the built-in synthetic room
@@ -51,6 +51,12 @@ table: install  ## the paper's study and its pages: every system on rooms and DA
 		--latex $(TABLE)/table.tex --json $(TABLE)/table.json
 	$(BIN)/trihedron paper $(TABLE) $(TABLE)_corridor --markdown $(TABLE)/paper.md
 	$(BIN)/trihedron site $(TABLE) $(TABLE)_corridor --out $(TABLE)/site
+
+PART := sequences
+results: install  ## measure docs/results/PART.json (PART=sequences or methods; DATA as for table) and write it into the pages; goes on where it was stopped
+	$(BIN)/python docs/results/measure.py $(PART) $(or $(foreach d,$(DATA),"$(d)"),$(if $(filter sequences,$(PART)),$(SEQUENCES)))
+	$(BIN)/python docs/results/render.py
+	$(BIN)/trihedron plugins --pages docs/reference/plugins --results docs/results/methods.json
 
 docs: install  ## the documentation as a site in build/site; executes the gallery
 	$(BIN)/python docs/site/gallery.py build/gallery

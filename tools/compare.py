@@ -151,7 +151,7 @@ def _known(metrics: dict[str, Any], timing: dict[str, Any], surface: dict[str, A
         "within 5 cm %": mesh.get("within_5_cm"),
         "p50 ms": frame.get("p50"),
         "p95 ms": frame.get("p95"),
-        "memory MB": timing.get("peak_memory_mb"),
+        "memory MB": timing.get("own_memory_mb"),
     }
 
 

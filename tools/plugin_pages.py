@@ -15,8 +15,10 @@ from trihedron.pipeline.core.slots import SLOTS
 from trihedron.tools.plugins import default_plugins, describe_plugin
 
 WITHOUT = {"pose": "refinement"}  # slot -> its name as in without=NAME, where that differs
+MEASURED_WITH = {"surface": "surface outputs=[trajectory,surface]", "building": "building outputs=[trajectory,building]", "model": "model pose=icp"}
 SIZE = {"width": 320, "height": 240, "length": 3}  # of the frame that figures show, its last
 QUALITY = 82  # of JPEG
+NEES_SCALE = "NEES is 5.35 where covariances are right"
 Results = dict[str, Any]
 
 
@@ -58,8 +60,36 @@ def page(slot: str, name: str, results: Results, figure: bool) -> str:
     ]
     parts += [f"![{slot}={name} on a frame of the synthetic room]({name}.jpg)"] if figure else []
     parts += ["## Options", _options(described["parameters"])] if described["parameters"] else []
-    measured = [part for part in (_runs(slot, name, results), _detected(slot, name, results), _without(slot, results)) if part]
+    own, without = f"{_runs(slot, name, results)}\n\n{_detected(slot, name, results)}".strip(), _without(slot, results)
+    instead = "" if own or name == "none" else how_to_measure(slot, name)
+    origin = f"*{source_line(results)}*" if own or without else ""
+    measured = [part for part in (own, instead, without, origin) if part]
     return "\n\n".join([*parts, *(["## Measured", *measured] if measured else [])]) + "\n"
+
+
+def how_to_measure(slot: str, name: str) -> str:
+    """The command that gives the figures of a plugin that the file has none of."""
+    if slot == "dataset":
+        return "A data set has no figures. `trihedron benchmark FOLDER` measures a run on the data in a folder."
+    if "model" in plugins_of(slot)[name].__dataclass_fields__:
+        command = f"trihedron run {slot}={name} {slot}.model=FILE.onnx"
+        return f"Needs a network in a file, and has no figures here. `{command}` and `trihedron compare` give them."
+    if slot in MEASURED_WITH:
+        words = f"'alternatives=[\"{MEASURED_WITH[slot]}\"]'"
+        return f"Not among the figures yet. `trihedron run -m experiment=methods {words} out=runs/{slot}` measures all plugins of the slot."
+    return f"Not among the figures yet. `trihedron ablate RUN.mcap {slot}={name} out=runs/{slot}` measures it on a recording."
+
+
+def source_line(results: Results) -> str:
+    """State the command, commit, date, versions and machine of the figures of a file, and what its note says of them."""
+    if "commit" not in results:
+        return "The figures state no commit."
+    packages = ", ".join(f"{name} {number}" for name, number in results["packages"].items())
+    machine = ", ".join(str(part) for part in (results["processor"], f"{results['cpus']} cores" if results["cpus"] else None) if part)
+    python = f", Python {results['python']}" if results["python"] else ""
+    load = f" at a load of {results['load']}" if results.get("load") else ""
+    note = f" {results['note'][0].upper()}{results['note'][1:]}." if results.get("note") else ""
+    return f"Measured on commit `{results['commit']}` ({results['date']}) with `{results['command']}`: {packages}{python}; {machine}{load}.{note}"
 
 
 def _options(parameters: list[dict[str, Any]]) -> str:
@@ -69,7 +99,8 @@ def _options(parameters: list[dict[str, Any]]) -> str:
 
 def _runs(slot: str, name: str, results: Results) -> str:
     """Figures of the default graph with this plugin, beside those of the default one."""
-    runs = {(row["change"], row["sequence"]): row for row in results["runs"]}
+    runs = {(row["change"].partition(" ")[0], row["sequence"]): row for row in results["runs"]}
+    change = next((row["change"] for row in results["runs"] if row["change"].partition(" ")[0] == f"{slot}={name}"), f"{slot}={name}")
     default = default_plugins().get(slot)
     own = {key: None for row in results["runs"] if row["change"].startswith(f"{slot}=") for key in row.get("measures", {})}  # columns, in order
     rows = []
@@ -79,7 +110,7 @@ def _runs(slot: str, name: str, results: Results) -> str:
         if row is not None and base is not None:
             rows.append((sequence, *_figures(row), _number(base["ate_mm"], 1), *(_number(row.get("measures", {}).get(key), 2) for key in own)))
     header = ["sequence", "ATE mm", "tracked %", "NEES", "ms", "frame ms", "MB", "ATE mm of the default", *own]
-    return "In the default graph (`trihedron run -m experiment=methods`):\n\n" + markdown(header, rows) if rows else ""
+    return f"In the default graph with `{change}` (`trihedron run -m experiment=methods`); {NEES_SCALE}:\n\n" + markdown(header, rows) if rows else ""
 
 
 def _figures(row: dict[str, Any]) -> tuple[str, ...]:
@@ -107,7 +138,7 @@ def _without(slot: str, results: Results) -> str:
     runs = [row for row in results["runs"] if row["change"] == change]
     rows = [(row["sequence"], *_figures(row)[:3], _number(base.get(row["sequence"], {}).get("ate_mm"), 1)) for row in runs]
     header = ["sequence", "ATE mm", "tracked %", "NEES", "ATE mm with it"]
-    return f"Without the stage (`{change}`):\n\n" + markdown(header, rows) if rows else ""
+    return f"Without the stage (`{change}`); {NEES_SCALE}:\n\n" + markdown(header, rows) if rows else ""
 
 
 def _number(value: float | None, places: int) -> str:

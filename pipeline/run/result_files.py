@@ -25,6 +25,7 @@ KINDS: dict[str, Any] = {  # of metrics.json, timing.json, surface.json and job.
     "consistency": {},
     "frame_ms": {EACH: NUMBER},
     "peak_memory_mb": NUMBER,
+    "own_memory_mb": NUMBER,
     "stages": {EACH: {EACH: NUMBER}},
     "parts": {EACH: SURFACE_PART},
     "state": str,

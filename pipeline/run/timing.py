@@ -28,9 +28,13 @@ class Timing:
         self._frames_ms = array("d")
         self._finish_ms: dict[str, float] = {}
         self._cpu_s = time.process_time()
+        self._earlier_peak_mb: float | None = None
+        self._begin_mb: float | None = None
 
     def begin(self) -> None:
-        """Start the measurement of this process's CPU time, at the first frame."""
+        """Start the measurement of this process's CPU time and of the run's own memory, at the first frame."""
+        self._earlier_peak_mb = peak_mb()
+        self._begin_mb = resident_mb() if forget_peak() else None
         self._cpu_s = time.process_time()
 
     def add_call(self, stage: str, ms: float) -> None:
@@ -47,8 +51,10 @@ class Timing:
 
     def summary(self, threads: int, wall_s: float, startup_s: float) -> dict[str, Any]:
         """Return frames, wall time and percentiles; `fps` is the whole run's, with reading and recording; `cpu_s` is the
-        process's CPU time since `begin`, of all threads, `startup_s` imports and composition."""
-        frames = len(self._frames_ms)
+        process's CPU time since `begin`, of all threads, `startup_s` imports and composition. `peak_memory_mb` is the process's, with its libraries;
+        `own_memory_mb` is the growth of the peak above the resident memory at `begin`, which earlier runs in the process do not change (None where
+        the peak cannot be restarted; of runs side by side it is that of all)."""
+        frames, peak = len(self._frames_ms), peak_mb()
         p50, p95, largest = _percentiles(self._frames_ms)
         stages: dict[str, dict[str, float]] = {}
         for name, calls in self._calls.items():
@@ -64,7 +70,8 @@ class Timing:
             "startup_s": round(startup_s, 3),
             "fps": round(frames / wall_s, 2) if wall_s > 0 else 0.0,
             "frame_ms": {"p50": p50, "p95": p95, "max": largest},
-            "peak_memory_mb": peak_mb(),
+            "peak_memory_mb": None if peak is None else max(peak, self._earlier_peak_mb or 0.0),
+            "own_memory_mb": None if peak is None or self._begin_mb is None else round(max(peak - self._begin_mb, 0.0), 1),
             "stages": stages,
         }
 
@@ -91,12 +98,14 @@ def peak_mb() -> float | None:
     return next((round(int(line.split()[1]) * 1.024e-3, 1) for line in lines if line.startswith("VmHWM:")), None)
 
 
-def forget_peak() -> None:
-    """Restart the measurement of the peak, without the memory of earlier runs. Where that is not permitted the peak is the process's."""
+def forget_peak() -> bool:
+    """Restart the measurement of the peak, without the memory of earlier runs. Returns False where that is not permitted."""
     gc.collect()
     malloc_trim()
     with suppress(OSError):
         Path("/proc/self/clear_refs").write_text("5")
+        return True
+    return False
 
 
 def _percentiles(values: Sequence[float]) -> tuple[float, float, float]:

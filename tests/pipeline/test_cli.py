@@ -162,7 +162,7 @@ def test_a_run_folder_is_complete(capsys, tmp_path, monkeypatch):
     assert all(str(out / name) in printed for name in expected - {".hydra"})
     timing, metrics = json.loads((out / "timing.json").read_text()), json.loads((out / "metrics.json").read_text())
     assert timing["frames"] == 12 == metrics["frames"] and timing["threads"] == 2
-    assert set(timing) == {"frames", "threads", "wall_s", "startup_s", "cpu_s", "fps", "frame_ms", "peak_memory_mb", "stages"}
+    assert set(timing) == {"frames", "threads", "wall_s", "startup_s", "cpu_s", "fps", "frame_ms", "peak_memory_mb", "own_memory_mb", "stages"}
     assert metrics["final"]["tracked_share"] == 1.0 and len(read_trajectory(out / "trajectory.txt")) == 12
     recording = Recording(out / "run.mcap")
     assert recording.metadata["version"] == version("trihedron") and set(SMALL) <= set(recording.overrides())

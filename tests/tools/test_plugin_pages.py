@@ -11,7 +11,7 @@ from trihedron.tools.plugin_pages import built_in, markdown, page, read_results
 
 ROOT = Path(__file__).parents[2]
 PAGES, RESULTS = ROOT / "docs" / "reference" / "plugins", ROOT / "docs" / "results" / "methods.json"
-AGAIN = "write them again: trihedron plugins --pages docs/reference/plugins --results docs/results/methods.json --figures"
+AGAIN = "write them again: trihedron plugins --pages docs/reference/plugins --results docs/results/methods.json"
 load_plugins()
 
 
@@ -58,6 +58,34 @@ def test_a_page(tmp_path):
     assert "| 400 | 1.0 | 3.46 |" in page("planes", "cape", {**results, "runs": [*results["runs"], measured]}, False)
     assert "| room | 0.25 |" in text and "Without the stage (`without=planes`)" in text and "| room | 3.0 | 50 | 1.00 | 1.0 |" in text
     assert "| `cone_deg` | `15.0` | above 0 and at most 45 | normals of one plane lie within this of it |" in text
+
+
+def test_a_page_states_commit_command_and_scale_of_its_figures():
+    run = {"sequence": "room", "ate_mm": 1.0, "tracked": 1.0, "nees": 5.0, "ms": 9.0, "frame_ms": 20.0, "mb": None, "note": ""}
+    head = {"commit": "abc", "date": "2026-01-02", "command": "make it", "packages": {"numpy": "2"}, "processor": None, "cpus": 2, "python": None}
+    runs = [{**run, "change": "default"}, {**run, "change": "model=tsdf pose=icp"}]
+    text = page("model", "tsdf", {**head, "runs": runs, "detectors": {}}, False)
+    assert "with `model=tsdf pose=icp` (`trihedron run -m experiment=methods`); NEES is 5.35 where covariances are right" in text
+    assert text.endswith("*Measured on commit `abc` (2026-01-02) with `make it`: numpy 2; 2 cores.*\n")
+
+
+@pytest.mark.parametrize(
+    "slot, name, command",
+    [
+        ("surface", "tsdf", "trihedron run -m experiment=methods 'alternatives=[\"surface outputs=[trajectory,surface]\"]' out=runs/surface"),
+        ("segments", "ransac", "trihedron ablate RUN.mcap segments=ransac out=runs/segments"),
+        ("normals", "onnx", "trihedron run normals=onnx normals.model=FILE.onnx"),
+        ("dataset", "tum", "trihedron benchmark FOLDER"),
+    ],
+)
+def test_a_page_without_figures_names_the_command_that_gives_them(slot, name, command):
+    text = page(slot, name, {"runs": [], "detectors": {}}, False)
+    assert f"`{command}`" in text.split("## Measured")[1]
+
+
+def test_only_stages_that_do_nothing_have_no_section_of_figures():
+    results = read_results(RESULTS)
+    assert {name for slot, name in built_in() if "## Measured" not in page(slot, name, results, False)} == {"none"}
 
 
 def test_bars_are_escaped():

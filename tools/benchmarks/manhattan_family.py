@@ -3,9 +3,9 @@
 A room is rendered at uniformly random orientations and goes through the default feature stages, with exact depth and with a Kinect's. Each estimator
 is asked twice: with no previous frame, and with one up to 10° off. An answer is right when it is claimed (`supported`) and within 1° of the true
 axes, by whichever of their 24 names; of several frames in view the nearest counts. The median error is that of what was claimed. A view counts for a
-case only when it shows, by its exact normals, what the case asks for. The third table is about the covariance: the squared error in units of it, the
-median over that of χ² with three degrees of freedom. It is 1 when the covariance is right; estimators expect walls to be off by tenths of a degree,
-and these are not. The last table holds views that show no Manhattan frame: every claim is false. mean_shift is also tried with normals alone and with
+case only when it shows, by its exact normals, what the case asks for. The third table is about the covariance: the median NEES of the rotation, 2.37
+(the median of χ² with three degrees of freedom) when the covariance is right; estimators expect walls to be off by tenths of a degree, and these are
+not. The last table holds views that show no Manhattan frame: every claim is false. mean_shift is also tried with normals alone and with
 lines alone. Times are of whole views with noisy depth, and as multiples of the reference workload of `trihedron benchmark` (ORB and LSD) on the same
 views.
 
@@ -32,7 +32,6 @@ from trihedron.tools.arguments import Parser, table
 from trihedron.tools.benchmarks import manhattan_views as seen
 
 START_DEG, RIGHT_DEG = 10.0, 1.0
-CHI2_MEDIAN = 2.366  # of χ² with three degrees of freedom
 STARTS = ("none", "near")
 ORIENTATIONS = range(1, 10_001)
 VARIANTS: dict[str, dict[str, bool]] = {  # of mean_shift
@@ -168,7 +167,7 @@ def figures(answers: Answers) -> list[dict[str, Any]]:
                 "within_1_deg": float(np.mean(claimed & (error <= RIGHT_DEG))),
                 "median_deg": float(np.median(known)) if len(known) else None,
                 "p95_deg": float(np.percentile(known, 95)) if len(known) else None,
-                "normalised": float(np.median(square[claimed]) / CHI2_MEDIAN) if len(known) else None,
+                "nees": float(np.median(square[claimed])) if len(known) else None,
                 "p50_ms": float(np.median(ms)),
                 "p95_ms": float(np.percentile(ms, 95)),
             }
@@ -190,8 +189,8 @@ def report(rows: Sequence[dict[str, Any]], reference_ms: float) -> str:
             parts.append(title + "\n" + table([["estimator", *heads], *lines], "l" + "r" * len(cases)))
     cases = [case for case in seen.CASES if any(key[1:3] == ("noisy", case) for key in cells)]
     if cases:
-        lines = [[name, *(_normalised([cells[name, "noisy", case, start] for start in STARTS]) for case in cases)] for name in names]
-        title = "Noisy depth: squared error in units of the covariance, 1 when that is right"
+        lines = [[name, *(_nees([cells[name, "noisy", case, start] for start in STARTS]) for case in cases)] for name in names]
+        title = "Noisy depth: median NEES of the rotation, 2.37 when the covariance is right"
         parts.append(title + "\n" + table([["estimator", *cases], *lines], "l" + "r" * len(cases)))
     keys = [(depth, case) for case in seen.WITHOUT_FRAME for depth in seen.DEPTHS if (names[0], depth, case, "none") in cells]
     heads = [f"{case}, {depth} ({cells[names[0], depth, case, 'none']['views']})" for depth, case in keys]
@@ -211,8 +210,8 @@ def _accuracy(pair: Sequence[dict[str, Any]]) -> str:
     return " ".join([*(f"{row['within_1_deg']:.3f}" for row in pair), error])
 
 
-def _normalised(pair: Sequence[dict[str, Any]]) -> str:
-    known = [row["normalised"] for row in pair if row["normalised"] is not None]
+def _nees(pair: Sequence[dict[str, Any]]) -> str:
+    known = [row["nees"] for row in pair if row["nees"] is not None]
     return f"{np.mean(known):.2f}" if known else "-"
 
 

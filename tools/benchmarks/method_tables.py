@@ -1,8 +1,8 @@
 """Tables of `experiment=methods`: each slot's plugins in the default graph over every sequence, and the systems.
 
 A cell is the ATE in mm, with the share of the frames that were tracked where it is not all, or where a sequence has no truth. NEES is the median over
-the sequences of the poses' normalised squared errors (1 where the covariance is right), ms those of the stage itself (of the whole frame for a
-system), MB the largest peak of memory.
+the sequences of `nees_median` of metrics.json (5.35 where covariances are right), ms those of the stage itself (of the whole frame for a system), MB
+the most memory that a run took for itself (`own_memory_mb` of timing.json, without the program and its libraries).
 
 Columns behind MB are the slot's own measures, means over the sequences that have them: those of `trihedron ablate` in the open loop, on the recording
 of the unchanged graph, of which refinement against the map hides nothing; of surfaces and buildings, errors against the true ones. They are computed
@@ -29,6 +29,7 @@ from trihedron.tools.ablation_statistics import nees_of
 from trihedron.tools.arguments import Parser, table
 from trihedron.tools.benchmarks import own_measures
 from trihedron.tools.compare import judge_surfaces, run_folders
+from trihedron.tools.fold_measures import Measures
 
 DEFAULT = "default"  # the change of a run that changes nothing
 Row = dict[str, Any]
@@ -79,7 +80,7 @@ def row_of(folder: Path) -> Row:
         "nees": _rounded(nees_of(metrics)),
         "ms": _rounded(stage.get("p50_ms")),
         "frame_ms": _rounded(timing.get("frame_ms", {}).get("p50")),
-        "mb": _rounded(timing.get("peak_memory_mb")),
+        "mb": _rounded(timing.get("own_memory_mb")),
         "note": "" if done else str(job.get("error") or "was stopped before its end"),
         "measures": {},
     }
@@ -120,7 +121,7 @@ def add_measures(runs: Runs, folder: Path) -> list[str]:
     return failures
 
 
-def _rounded_all(measures: own_measures.Measures) -> dict[str, float | None]:
+def _rounded_all(measures: Measures) -> dict[str, float | None]:
     return {name: _rounded(value) for name, value in measures.items()}
 
 

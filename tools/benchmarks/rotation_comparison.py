@@ -2,8 +2,8 @@
 
 FOLDER is of `trihedron ablate RUN.mcap 'manhattan=*' feedback=recorded`, which draws the same pictures. The truth is the one rotation from the
 scene's axes to the world that the claims of all runs agree on best, carried into each camera by the ground truth of the poses. An error is that of
-the nearest frame in view; a claim more than 3° off is false. `normalised` is the squared error of the others in units of their covariance, the
-median over that of χ²: 1 when that is right. Times are those of the replay.
+the nearest frame in view; a claim more than 3° off is false. NEES is the median of the others, 2.37 (χ² with three degrees of freedom) when their
+covariance is right. Times are those of the replay.
 
 Example: trihedron benchmark rotations runs/axes --frame 60
 """
@@ -29,7 +29,6 @@ from trihedron.pipeline.record.reader import Recording
 from trihedron.pipeline.record.trajectories import attached_truth
 from trihedron.plugins.shared.manhattan_frames_kernels import CUBE, nearest_equivalent
 from trihedron.tools.arguments import Parser, table
-from trihedron.tools.benchmarks.manhattan_family import CHI2_MEDIAN
 
 RECORDING, TIMING, ERRORS_PNG = "run.mcap", "timing.json", "rotation_error.png"
 LARGEST_DIFFERENCE_NS = 20_000_000
@@ -62,14 +61,14 @@ class Run:
         np.minimum.at(errors, rows, residuals_deg(rotations, world))
         return np.asarray(np.where(np.isfinite(errors), errors, np.nan))
 
-    def normalised(self, world: F64) -> float:
-        """Squared error of the claims that are not false, in units of their covariance: the median over that of χ²; NaN without any."""
+    def nees(self, world: F64) -> float:
+        """Median NEES of the claims that are not false, of three degrees of freedom; NaN without any."""
         squares = []
         for R, covariance in zip(*self.claims[1:]):
             phi = log_so3(nearest_equivalent(world, R) @ R.T)
             if np.linalg.norm(phi) <= np.radians(FALSE_DEG):
                 squares.append(float(phi @ np.linalg.solve(covariance, phi)))
-        return float(np.median(squares) / CHI2_MEDIAN) if squares else float("nan")
+        return float(np.median(squares)) if squares else float("nan")
 
 
 def main(argv: list[str]) -> int:
@@ -87,7 +86,7 @@ def compare(folder: Path, frame: int | None = None) -> str:
     runs = read_runs(folder, [folder, *sorted(path.parent for path in folder.glob(f"*/{RECORDING}"))])
     world = common_world(runs)
     written = draw(runs, world, folder, frame=frame)
-    heads = ["estimator", "frames", "claimed", "within 1°", "false", "median (deg)", "p95 (deg)", "max (deg)", "normalised", "p50 ms"]
+    heads = ["estimator", "frames", "claimed", "within 1°", "false", "median (deg)", "p95 (deg)", "max (deg)", "NEES", "p50 ms"]
     rows: list[list[str]] = []
     for run in runs:
         error = run.errors_deg(world)
@@ -95,7 +94,7 @@ def compare(folder: Path, frame: int | None = None) -> str:
         shares = [np.isfinite(error), error <= RIGHT_DEG, error > FALSE_DEG]
         largest = [np.median(known), np.percentile(known, 95), known.max()] if len(known) else []
         cells = [*(f"{share.mean():.3f}" for share in shares), *([f"{x:.3f}" for x in largest] or ["-"] * 3)]
-        last = [f"{x:.2f}" if np.isfinite(x) else "-" for x in (run.normalised(world), run.p50_ms)]
+        last = [f"{x:.2f}" if np.isfinite(x) else "-" for x in (run.nees(world), run.p50_ms)]
         rows.append([run.name, str(len(error)), *cells, *last])
     return "\n".join([table([heads, *rows], "lrrrrrrrrr"), *(str(path) for path in written)])
 

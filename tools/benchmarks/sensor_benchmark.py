@@ -2,7 +2,7 @@
 
 Each sensor records each room, with --seeds sensors of its kind (their hidden parameters, and the path through the room, differ by the seed). Columns:
 ok, degraded and lost frames in percent, ATE of the posed frames (as estimated at the time, each sub-map aligned by itself), wrong ok: frames with
-status ok that are off by more than 5 cm and 4 σ, or 2° and 4 σ, NEES (6 degrees of freedom, median; 5.3 is honest), frames inside its 95 % limit, AUC
+status ok that are off by more than 5 cm and 4 σ, or 2° and 4 σ, NEES (6 degrees of freedom; median, honest: 5.35), frames inside its 95 % limit, AUC
 of "error above its median" by σ (over all frames of the row), mean log-likelihood of an error in nats, and steps within 50 mm. With --quality, runs
 are judged without the truth, too (`trihedron evaluate RUN --no-reference`), and the rank correlation of each such figure with the ATE is printed.
 --runs keeps the runs in a folder, and judges those that it holds already without running them again. Other words are overrides of `trihedron run`.

@@ -1,0 +1,122 @@
+"""Published figures have one source: pages are what docs/results gives, and state no measured figure of their own without commit and command."""
+
+import importlib.util
+import json
+import re
+import subprocess
+from pathlib import Path
+
+import pytest
+
+from trihedron.pipeline.core.errors import DataError
+
+ROOT = Path(__file__).parents[2]
+RESULTS = ROOT / "docs" / "results"
+AGAIN = "write it again: python docs/results/render.py"
+OLDER = {"methods.json": "takes hours; its note says what has changed since"}  # files of other commits than sequences.json, and why
+UNITS = r"(?:mm|cm|deg|°|ms|frames/s|MB)"
+NUMBER = re.compile(rf"\d\s?{UNITS}(?![\w/])|NEES\D{{0,40}}\d")
+COLUMN = re.compile(r"\b(?:ATE|RPE|NEES|mm|deg|ms|MB)\b|frames/s|°")
+CONSTANTS = re.compile(r"\b(?:5\.35|2\.37|12\.6)\b")  # of χ²
+DATED = re.compile(r"Measured on commit `[0-9a-f]{7,12}` \(\d{4}-\d\d-\d\d\) with `trihedron [^`]+`")
+HIDDEN = re.compile(r"<!-- results: \w+ -->.*?<!-- end of results -->|^```.*?^```|`[^`\n]*`", re.MULTILINE | re.DOTALL)  # blocks and code
+JUDGED = [ROOT / "README.md", *(ROOT / "docs" / "explanation" / f"{name}.md" for name in ("results", "systems", "performance"))]
+
+
+def program(name):
+    spec = importlib.util.spec_from_file_location(name, RESULTS / f"{name}.py")
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+render, measure = program("render"), program("measure")
+
+
+def undated(page):
+    """Lines of a page with a measured figure outside of blocks and code, in sections that state neither commit nor command."""
+    found = []
+    for section in re.split(r"^(?=#+ )", page, flags=re.MULTILINE):
+        text = HIDDEN.sub("", section)
+        if DATED.search(section):
+            continue
+        header = ""
+        for line in text.splitlines():
+            header = (header or line) if line.startswith("|") else ""
+            cells = line.startswith("|") and line != header and COLUMN.search(header) and re.search(r"\d", line)
+            if cells or NUMBER.search(CONSTANTS.sub("", line)):
+                found.append(line)
+    return found
+
+
+@pytest.mark.parametrize("name", render.PAGES)
+def test_blocks_are_what_their_files_give(name):
+    page = (ROOT / name).read_text()
+    assert render.BLOCK.search(page) and render.rendered(page) == page, f"{name}: {AGAIN}"
+
+
+def test_every_file_states_its_commit_and_files_of_other_commits_a_reason():
+    files = {path.name: json.loads(path.read_text()) for path in RESULTS.glob("*.json")}
+    for found in files.values():
+        assert {"part", "command", "commit", "date", "processor", "cpus", "python", "packages"} <= set(found)
+        assert re.fullmatch("[0-9a-f]{12}", found["commit"])
+    others = {name for name, found in files.items() if found["commit"] != files["sequences.json"]["commit"]}
+    assert others <= set(OLDER)
+    for name in others:
+        assert files[name]["note"].lower() in render.source_line(files[name]).lower()
+
+
+@pytest.mark.parametrize("page", JUDGED, ids=lambda path: path.stem)
+def test_measured_figures_are_rendered_or_state_commit_and_command(page):
+    assert undated(page.read_text()) == []
+
+
+def test_pages_of_plugins_state_the_source_of_their_figures():
+    for page in (ROOT / "docs" / "reference" / "plugins").glob("*/*.md"):
+        measured = page.read_text().partition("## Measured")[2]
+        assert "| ATE mm" not in measured or DATED.search(measured), page
+
+
+@pytest.mark.parametrize(
+    "text, count",
+    [
+        ("The error is 5.2 mm.", 1),
+        ("It takes 20 ms a frame at 60 frames/s.", 1),
+        ("The median NEES is 33.", 1),
+        ("NEES is 5.35 where covariances are right.", 0),
+        ("| ATE, mm | NEES |\n|---|---|\n| 1.2 | 5.0 |", 1),
+        ("<!-- results: a -->\n| ATE mm |\n|---|\n| 1.0 |\n<!-- end of results -->", 0),
+        ("```text\nATE 5 mm\n```\n`--max 5 mm`", 0),
+        ("Measured on commit `0123abc` (2026-01-02) with `trihedron run`: 5 mm.\n\n## Next\n\n5 mm", 1),
+    ],
+)
+def test_a_figure_without_a_source_is_found(text, count):
+    assert len(undated(text)) == count
+
+
+def test_figures_of_changed_code_are_refused(tmp_path):
+    git = ["git", "-C", str(tmp_path), "-c", "user.name=a", "-c", "user.email=a@b.c"]
+    (tmp_path / "plugins").mkdir()
+    (tmp_path / "plugins" / "a.py").write_text("1\n")
+    for words in (["init", "-q"], ["add", "."], ["commit", "-qm", "a"]):
+        subprocess.run([*git, *words], check=True)
+    commit = measure.commit_of(tmp_path)
+    assert re.fullmatch("[0-9a-f]{12}", commit)
+    (tmp_path / "README.md").write_text("pages are not measured\n")
+    for words in (["add", "."], ["commit", "-qm", "b"]):
+        subprocess.run([*git, *words], check=True)
+    assert measure.commit_of(tmp_path) == commit
+    (tmp_path / "plugins" / "a.py").write_text("2\n")
+    with pytest.raises(DataError, match=r"plugins/a.py: is changed and not committed.*; commit it, or stash it"):
+        measure.commit_of(tmp_path)
+
+
+def test_a_sequence_that_this_commit_has_measured_is_not_measured_again(tmp_path, monkeypatch):
+    counted = []
+    monkeypatch.setattr(measure, "WORK", tmp_path)
+    monkeypatch.setattr(measure, "figures_of", lambda words, out: counted.append(words[0]) or {"seconds": 30.0})
+    first = measure.sequences(["tum:desk"], "a")
+    assert first == measure.sequences(["tum:desk"], "a") and len(counted) == 2
+    assert first == {"minutes": 1.0, "sequences": [{"sequence": "synthetic length=150", "seconds": 30.0}, {"sequence": "desk", "seconds": 30.0}]}
+    measure.sequences(["tum:desk"], "b")
+    assert len(counted) == 4
