@@ -281,7 +281,7 @@ def between(depth_m: Any, pixels: F64) -> F64:
 
     inverse = np.where(depth_m > 0.0, 1.0 / np.maximum(depth_m, 1e-6), np.nan).astype(np.float32)
     found = cv2.remap(inverse, pixels.astype(np.float32)[None], None, cv2.INTER_LINEAR, borderValue=(np.nan,))
-    return np.asarray(1.0 / found[0].astype(np.float64))
+    return 1.0 / found[0].astype(np.float64)
 
 
 def offsets_px(tracks: Tracks, points: Keypoints, camera: Camera, T: F64) -> F64:
