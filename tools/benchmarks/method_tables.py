@@ -29,6 +29,7 @@ from trihedron.tools.ablation_statistics import nees_of
 from trihedron.tools.arguments import Parser, table
 from trihedron.tools.benchmarks import own_measures
 from trihedron.tools.compare import judge_surfaces, run_folders
+from trihedron.tools.fold_measures import Measures
 
 DEFAULT = "default"  # the change of a run that changes nothing
 Row = dict[str, Any]
@@ -120,7 +121,7 @@ def add_measures(runs: Runs, folder: Path) -> list[str]:
     return failures
 
 
-def _rounded_all(measures: own_measures.Measures) -> dict[str, float | None]:
+def _rounded_all(measures: Measures) -> dict[str, float | None]:
     return {name: _rounded(value) for name, value in measures.items()}
 
 
