@@ -277,11 +277,11 @@ def warped(depth_m: Any, camera: Camera, T: F64) -> tuple[Any, F64, F64, Bool]:
 
 def between(depth_m: Any, pixels: F64) -> F64:
     """Return the depth (n,) at pixels (n, 2) with fractions, where the inverse depth is linear, as on a plane; NaN beside unknown depth."""
-    import cv2
+    from scipy.ndimage import map_coordinates
 
-    inverse = np.where(depth_m > 0.0, 1.0 / np.maximum(depth_m, 1e-6), np.nan).astype(np.float32)
-    found = cv2.remap(inverse, pixels.astype(np.float32)[None], None, cv2.INTER_LINEAR, borderValue=(np.nan,))
-    return 1.0 / found[0].astype(np.float64)
+    inverse = np.where(depth_m > 0.0, 1.0 / np.maximum(depth_m, 1e-6), np.nan)
+    depth: F64 = 1.0 / map_coordinates(inverse, pixels[:, ::-1].T, np.float64, order=1, cval=np.nan)
+    return depth
 
 
 def offsets_px(tracks: Tracks, points: Keypoints, camera: Camera, T: F64) -> F64:
