@@ -87,9 +87,8 @@ def source_line(results: Results) -> str:
     packages = ", ".join(f"{name} {number}" for name, number in results["packages"].items())
     machine = ", ".join(str(part) for part in (results["processor"], f"{results['cpus']} cores" if results["cpus"] else None) if part)
     python = f", Python {results['python']}" if results["python"] else ""
-    load = f" at a load of {results['load']}" if results.get("load") else ""
     note = f" {results['note'][0].upper()}{results['note'][1:]}." if results.get("note") else ""
-    return f"Measured on commit `{results['commit']}` ({results['date']}) with `{results['command']}`: {packages}{python}; {machine}{load}.{note}"
+    return f"Measured on commit `{results['commit']}` ({results['date']}) with `{results['command']}`: {packages}{python}; {machine}.{note}"
 
 
 def _options(parameters: list[dict[str, Any]]) -> str:

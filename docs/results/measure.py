@@ -10,7 +10,6 @@ commit: the measured folders may hold no change that is not committed.
 from __future__ import annotations
 
 import json
-import os
 import statistics
 import subprocess
 import sys
@@ -73,7 +72,7 @@ def header(part: str, commit: str) -> Row:
     return {
         "part": part, "command": f"make results PART={part}",
         "commit": commit, "date": datetime.now(timezone.utc).date().isoformat(),
-        "processor": found["cpu"], "cpus": found["cpus"], "load": round(os.getloadavg()[2], 1),
+        "processor": found["cpu"], "cpus": found["cpus"],
         "python": found["python"], "packages": found["packages"],
     }  # fmt: skip
 

@@ -91,7 +91,7 @@ def sequences() -> str:
 def durations() -> str:
     """How long measuring takes."""
     found = read("sequences")
-    taken = f"`make results PART=sequences` took {found['minutes']:.0f} minutes on {found['cpus']} cores at a load of {found['load']}"
+    taken = f"`make results PART=sequences` took {found['minutes']} minutes on {found['cpus']} cores"
     return f"{taken}; [the other part](../how-to/compare-plugins.md#conditions) is estimated from shorter runs.\n"
 
 
