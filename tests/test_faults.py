@@ -52,7 +52,10 @@ CASES = {
     "a clock set back": Case({"jump": 30, "jump_s": -10.0}, said="frame 30: the clock was set back by 9.967 s; time goes on from the frame before"),
     "a clock set forward": Case({"jump": 30, "jump_s": 3600.0}),
     "black images": Case({"cover": "20:40", "covered": "color"}, most_mm=60.0),
-    "white images": Case({"cover": "20:40", "covered": "color", "cover_with": "white"}, most_mm=60.0),
+    "white images": Case(
+        {"cover": "20:40", "covered": "color", "cover_with": "white"}, most_mm=60.0,
+        said="frame 22: its colour is that of frame 20, bit for bit, while depth has changed; it counts as missing",
+    ),
     "no depth": Case({"cover": "20:40", "covered": "depth"}),
     "nine tenths of the depth missing": Case({"depth_holes": 0.9}, most_mm=100.0),
     "depth that ends at 3 m": Case({"depth_limit_m": 3.0}, most_mm=60.0, said="depth readings are 3.000 m and none is more, which is a limit"),

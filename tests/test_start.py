@@ -11,7 +11,7 @@ import pytest
 import trihedron.pipeline.app.cli
 from trihedron.tools.benchmark import PROGRAM
 
-PACKAGE = Path(trihedron.pipeline.app.cli.__file__).parents[1]
+PACKAGE = Path(trihedron.pipeline.app.cli.__file__).parents[2]
 
 
 def test_the_help_imports_no_library():
