@@ -118,4 +118,4 @@ def test_a_recording_without_the_topics_is_refused(tmp_path, capsys):
     capsys.readouterr()
     assert main(["calibrate", str(tmp_path / "run.mcap")]) == 1
     cure = "record a run of graph=structural, or one that has this stage"
-    assert capsys.readouterr().err == f"trihedron: {tmp_path / 'run.mcap'}: holds no topic keypoints; {cure}\n"
+    assert capsys.readouterr().err == f"trihedron: {tmp_path / 'run.mcap'}: holds no topic matches; {cure}\n"
