@@ -15,6 +15,7 @@ from trihedron.pipeline.core.lie import rotation_angle_deg
 from trihedron.pipeline.core.registry import load_plugins, plugin_class
 from trihedron.pipeline.core.types import Pose
 from trihedron.pipeline.record.reader import Recording
+from trihedron.plugins.pose.refine import Refine
 
 DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
 SEQUENCES = {  # name -> data set, options of it, frames, frames covered for one second, margin of the ATE against the run without a cover
@@ -82,7 +83,7 @@ def test_what_is_seen_while_lost_becomes_a_sub_map_and_is_tied_when_the_turn_is_
     submaps = [pose.submap for pose in poses.values()]
     begun, tied = submaps.index(1), len(submaps) - submaps[::-1].index(1)
     print(f"sub-map from frame {begun} to {tied}, {metrics['untied']} frames untied, ATE {metrics['final']['ate_rmse_m']:.4f} m")
-    assert 270 <= begun <= 290 and 300 < tied < 560 and not map.keyframes.column("submap").any()
+    assert 260 + Refine().submap_after <= begun <= 285 and 300 < tied < 560 and not map.keyframes.column("submap").any()
     assert {pose.status for index, pose in poses.items() if begun <= index < tied} == {"degraded"}
     assert metrics["untied"] == 1 and metrics["status"]["lost"] == begun - 60
     assert metrics["final"]["ate_rmse_m"] < 0.01

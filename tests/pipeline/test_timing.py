@@ -41,7 +41,7 @@ def test_memory_of_a_job_does_not_grow_with_the_jobs_before_it(tmp_path):
     small = ["dataset.width=160", "dataset.height=120", "dataset.length=12"]
     large = ["dataset.width=640", "dataset.height=480", "dataset.length=6"]
     found = []
-    for number, words in enumerate([small, large, small]):
+    for number, words in enumerate([small, small, large, small]):  # the first loads libraries after its first frame
         assert main(["run", *words, f"out={tmp_path / str(number)}"]) == 0
         found.append(json.loads((tmp_path / str(number) / "timing.json").read_text())["own_memory_mb"])
-    assert found[2] == pytest.approx(found[0], abs=15.0) and found[1] > found[2]
+    assert found[3] == pytest.approx(found[1], abs=15.0) and found[2] > found[3]

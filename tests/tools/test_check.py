@@ -25,6 +25,7 @@ BUILT_IN = {(slot, name): kind for slot in SLOTS for name, kind in plugins_of(sl
 EVERY = [pytest.param(slot, name, id=f"{slot}={name}") for slot, name in BUILT_IN]
 KEYFRAMES = ["map.min_turn_deg=0.5", "map.min_frames=1", "map.min_shift=0.001"]  # every frame is one
 WORDS = {  # so that little work is done, or any at all
+    ("pose", "icp"): ["model=tsdf"],
     ("surface", "open3d_poisson"): ["surface.depth=5"],
     ("loop", "bag_of_words"): ["loop.away_m=0.01", "loop.every=1", "loop.shared=100000", *KEYFRAMES],
 }
