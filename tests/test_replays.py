@@ -25,7 +25,7 @@ COVERED = "14:18"  # where a graph can find a lost camera
 FIRST, STOP = 10, 20
 MAY_BE_SILENT = {
     "bundle": ["none"],
-    "loop": ["none", "planes", "appearance"],
+    "loop": ["none", "planes", "appearance", "bag_of_words"],
     "map": ["none"],
     "relocalise": ["none"],
 }  # on so short a way no loop is to close
