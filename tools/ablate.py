@@ -222,10 +222,8 @@ def _computed(computing: Alternatives, combinations: Sequence[Combination], fold
     computing.run(folders, on_frame)
     of_stages = [found.of_frames() for found in errors]
     own = [found.figures(of_frames) if alone else {} for found, of_frames in zip(errors, of_stages)]
-    figures = [
-        {**_figures(outcome), **of_stage, **of_folds(topics, folder, recording.path)}
-        for outcome, of_stage, folder in zip(computing.outcomes, own, folders)
-    ]
+    folds = of_folds(topics, folders, recording.path)
+    figures = [{**_figures(outcome), **of_stage, **of_fold} for outcome, of_stage, of_fold in zip(computing.outcomes, own, folds)]
     reference = attached_truth(recording.attachments, str(recording.path))
     judged = [
         {**(of_trajectory(runner.result, reference, ERRORS) if outcome.metrics.get("final") else {}), **of_frames}
@@ -287,7 +285,8 @@ def _draw_axes(out: Path, work: Work) -> None:
 
     try:
         runs = read_runs(out, work.folders)
-        files = draw(runs, common_world(runs), out, work.prefix and f"{work.prefix},")
+        world = common_world(runs)
+        files = draw(runs, world, [run.errors_deg(world) for run in runs], out, work.prefix and f"{work.prefix},")
         print(f"drawn: {', '.join(map(str, files))}", file=sys.stderr)
     except DataError as error:
         print(f"no pictures of the axes: {error}", file=sys.stderr)

@@ -127,7 +127,7 @@ def _topics(a: Recording, b: Recording, words: str) -> list[str]:
 
 def common_frames(a: Recording, b: Recording) -> list[int]:
     """The numbers of the frames that both have."""
-    numbers = [{value.index for value in recording.values(FRAMES_TOPIC)} for recording in (a, b)]
+    numbers = [{value.index for value in recording.references} for recording in (a, b)]
     if not numbers[0] & numbers[1]:
         raise DataError(f"{a.path}, {b.path}", "have no frame in common", "compare two runs over the same frames")
     return sorted(numbers[0] & numbers[1])

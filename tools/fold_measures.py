@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import json
 import sys
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from trihedron.pipeline.core.errors import DataError
+from trihedron.pipeline.core.files import sha256_of
 from trihedron.tools.evaluate_surface import FIGURES, SURFACE, evaluate_files
 
 BUILDING = {  # column -> key of the figures, the value where it is perfect, factor
@@ -22,24 +23,32 @@ COLUMNS = {"surface mm": 2, "missed surface %": 1, "walls mm": 1, "missed rooms 
 Measures = dict[str, float]  # error by column
 
 
-def of_folds(stages: Iterable[str], run: Path, source: Path) -> Measures:
-    """Return the measures of those folds of a run folder that are among the stages; `source` is the recording that it was computed from. A fold
-    without a truth has none, and a line says why."""
-    found: Measures = {}
+def of_folds(stages: Iterable[str], runs: Sequence[Path], source: Path) -> list[Measures]:
+    """Return for each run folder the measures of those of its folds that are among the stages; `source` is the recording that all were computed
+    from. Equal surfaces are judged once. A fold without a truth has none, and a line says why."""
+    found: list[Measures] = [{} for _ in runs]
+    judged: dict[str, dict[str, Any]] = {}  # SHA-256 of a surface -> its figures
     for stage in stages:
-        try:
-            if stage == "surface" and (run / SURFACE).exists():
-                found |= of_surface_figures(judge_surface(run, source))
-            elif stage == "building":
-                found |= of_building(run, source.parent)
-        except DataError as error:
-            print(f"{stage} of {run} is not judged: {error}", file=sys.stderr)
+        for run, measures in zip(runs, found):
+            try:
+                if stage == "surface" and (run / SURFACE).exists():
+                    digest = sha256_of(str(run / SURFACE))
+                    judged[digest] = figures = judged[digest] if digest in judged else evaluate_files(run / SURFACE, source)
+                    measures |= of_surface_figures(_kept(run, figures))
+                elif stage == "building":
+                    measures |= of_building(run, source.parent)
+            except DataError as error:
+                print(f"{stage} of {run} is not judged: {error}", file=sys.stderr)
     return found
 
 
 def judge_surface(run: Path, recording: Path) -> dict[str, Any]:
     """Judge the surface of a run folder by the truth of a recording's data set, and write surface.json. Raises DataError."""
-    figures = evaluate_files(run / SURFACE, recording)
+    return _kept(run, evaluate_files(run / SURFACE, recording))
+
+
+def _kept(run: Path, figures: dict[str, Any]) -> dict[str, Any]:
+    """Write the figures of a run's surface to surface.json."""
     (run / FIGURES).write_text(json.dumps(figures, indent=2) + "\n")
     return figures
 

@@ -13,7 +13,6 @@ import numpy as np
 from trihedron.pipeline.core.errors import DataError
 from trihedron.pipeline.core.options import frame_range
 from trihedron.pipeline.core.types import Frame, FrameReference, Map, Pose, Trajectory, Value
-from trihedron.pipeline.record.codec import FRAMES_TOPIC
 from trihedron.pipeline.record.mcap_file import in_use
 from trihedron.pipeline.record.reader import Recording
 from trihedron.pipeline.run.accounting import Result
@@ -58,7 +57,7 @@ def trajectory_of(recording: Recording) -> Trajectory:
 
 def references_of(recording: Recording) -> dict[int, FrameReference]:
     """Frame number -> camera and stamp."""
-    return {value.index: value for value in _values(recording, FRAMES_TOPIC) if isinstance(value, FrameReference)}
+    return {value.index: value for value in recording.references}
 
 
 def _values(recording: Recording, topic: str) -> Iterator[Value]:

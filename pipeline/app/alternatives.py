@@ -31,7 +31,8 @@ from trihedron.pipeline.run.recorder import Recorder
 from trihedron.pipeline.run.replay import TOPICS, Replay
 from trihedron.pipeline.run.run_folder import held, write_configuration
 from trihedron.pipeline.run.runner import Runner
-from trihedron.pipeline.run.side_by_side import SideBySide, changed_stages, swapped_stages
+from trihedron.pipeline.run.side_by_side import SideBySide, changed_stages, swapped_stages, with_one_dataset
+from trihedron.pipeline.run.timing import begin_together
 from trihedron.pipeline.run.warm_up import WARM_UP_FRAMES, compilation_reported
 
 NOT_REPEATED = ("out", "report", "replay", "only", "feedback", "view", "save_map", "live", "real_time", "threads")  # words of the recorded command
@@ -62,7 +63,8 @@ def alternatives_of(recording: Recording, words: Sequence[Sequence[str]]) -> lis
     """Compose one alternative for each list of words. Raises TrihedronError, one line."""
     recorded = recorded_config_of(recording)
     configs = composed_each(words, recorded)
-    return [Alternative(tuple(some), config, graph_of(config)) for some, config in zip(words, configs)]
+    graphs = with_one_dataset([graph_of(config) for config in configs])
+    return [Alternative(tuple(some), config, graph) for some, config, graph in zip(words, configs, graphs)]
 
 
 def recomputed_stages(alternatives: Sequence[Alternative], feedback: Feedback) -> frozenset[str]:
@@ -115,8 +117,8 @@ class Alternatives:
             cpu_began = time.process_time()
             together = SideBySide(self.runners, self.threads)
             try:
+                begin_together([runner.timing for runner in self.runners])
                 for runner, alternative, writer in zip(self.runners, self.alternatives, writers):
-                    runner.timing.begin()
                     topics = recorded_topics(self._as_run(alternative), alternative.graph, runner.replay) & self.stages
                     plan = replace(runner.plan, computed=tuple(name for name in runner.computed if name in self.stages))
                     runner.sinks = (Recorder(writer, plan, topics, False, truth),)

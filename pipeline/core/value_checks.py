@@ -140,7 +140,7 @@ def _target(name: str, inputs: Mapping[str, Any]) -> Any:
     if not path:
         return getattr(found, _ROWS_OF[parameter.removeprefix("previous_")])
     table = getattr(found, path[0])
-    return table if len(path) == 1 else table.column(path[1])
+    return table if len(path) == 1 else table.shared(path[1])
 
 
 def _fault_of_numbers(array: Any, rule: Within, owner: Any) -> str:
@@ -186,9 +186,9 @@ def _fault_of_table(table: Any, rule: Columns, owner: Any) -> str:
         if not known or any(wanted not in (None, size) for wanted, size in zip(shape, column.shape)):
             return f"has no column '{name}' of {np.dtype(dtype)}{list(shape)}"
         if constraints and alive is None and "alive" in rule.columns and "alive" in table.schema:
-            alive = table.column("alive")
+            alive = table.shared("alive")
         for constraint in constraints:
-            numbers = table.column(name)
+            numbers = table.shared(name)
             numbers = numbers if alive is None or isinstance(constraint, IndexInto) else numbers[alive]
             if cause := _CHECKS[type(constraint)](numbers, constraint, owner):
                 return f"has a column '{name}' that {cause}"

@@ -5,12 +5,14 @@ from __future__ import annotations
 import json
 from collections import deque
 from collections.abc import Iterator
+from dataclasses import replace
+from functools import cached_property
 from pathlib import Path
 
 from mcap.records import Channel, ChunkIndex
 
 from trihedron.pipeline.core.errors import RecordingError
-from trihedron.pipeline.core.types import FrameReference, Value
+from trihedron.pipeline.core.types import Camera, FrameReference, Value
 from trihedron.pipeline.core.value_checks import checked
 from trihedron.pipeline.record.codec import FRAMES_TOPIC, METADATA, READABLE, UPGRADE, Decoder, builds_on, is_value_schema
 from trihedron.pipeline.record.embedded_images import COLOR, DAMAGED, DEPTH, PARTS, frame_of, topic_of
@@ -67,6 +69,13 @@ class Recording:
         if not isinstance(found, list) or not all(isinstance(text, str) for text in found):
             raise RecordingError(str(self.path), "does not hold the command that made it", "the file is damaged; record it again")
         return found
+
+    @cached_property
+    def references(self) -> tuple[FrameReference, ...]:
+        """The references to the frames, in order; equal cameras are one object. Raises RecordingError for a damaged one."""
+        cameras: dict[Camera, Camera] = {}
+        values = (value for value in self.values(FRAMES_TOPIC) if isinstance(value, FrameReference))
+        return tuple(replace(value, camera=cameras.setdefault(value.camera, value.camera)) for value in values)
 
     def messages(self, channel: str) -> Iterator[tuple[int, bytes]]:
         """(log_time, data) of the messages of one channel (with slash), in the order they were written."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from array import array
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -19,7 +19,7 @@ UNREADABLE_SHARE = 0.1
 class Result:
     """The outcome of a run: poses in frame order, the last map, the results of folds, counts."""
 
-    poses: Sequence[Pose] = field(default_factory=Poses)
+    poses: Poses | list[Pose] = field(default_factory=Poses)
     map: Map | None = None
     loaded_keyframes: int = 0  # of another run, whose frame numbers mean nothing here
     folds: dict[str, Value] = field(default_factory=dict)
@@ -43,8 +43,7 @@ class Accounting:
     def __init__(self, stamps_ns: Mapping[int, int], fps: float | None, loaded: Map | None) -> None:
         """`stamps_ns` of frames that are known beforehand, `loaded` the map that the run begins with."""
         self.timing = Timing()
-        self._poses = Poses()
-        self.result = Result(self._poses, loaded, loaded_keyframes=len(loaded.keyframes) if loaded is not None else 0)
+        self.result = Result(Poses(), loaded, loaded_keyframes=len(loaded.keyframes) if loaded is not None else 0)
         self.result.fps = fps or self.result.fps
         self.stamps_ns = dict(stamps_ns)
         self.times: dict[int, FrameTimes] = {}
@@ -79,7 +78,7 @@ class Accounting:
         if isinstance(frame := values.get("dataset"), Frame):
             self.result.fps = frame.camera.fps
         if isinstance(pose := values.get("pose"), Pose):
-            self._poses.append(pose)
+            self.result.poses.append(pose)
         if isinstance(latest := values.get("map"), Map):
             self.result.map = latest
         return True

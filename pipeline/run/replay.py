@@ -61,8 +61,7 @@ class Replay:
 
     def references(self, first: int, stop: int | None) -> dict[int, FrameReference]:
         """Return frame number -> reference for the recorded frames in a range. Raises RecordingError when there is none."""
-        values = (value for value in self.recording.values(FRAMES_TOPIC) if isinstance(value, FrameReference))
-        found = {value.index: value for value in values if value.index >= first and (stop is None or value.index < stop)}
+        found = {value.index: value for value in self.recording.references if value.index >= first and (stop is None or value.index < stop)}
         if not found:
             wanted = f"{first or ''}:{'' if stop is None else stop}"
             raise RecordingError(str(self.recording.path), f"has none of the frames '{wanted}'", "give another dataset.frames")

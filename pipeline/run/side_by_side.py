@@ -19,6 +19,7 @@ from trihedron.pipeline.run.interrupts import Interrupts
 from trihedron.pipeline.run.runner import Runner
 from trihedron.pipeline.run.scheduler import Node, NodeFailure, Scheduler, single_threaded_libraries
 
+DATASET = "dataset"
 MAP = "map"  # what the end of a fold reads besides its wires
 Class = TypeVar("Class", bound=Hashable)
 
@@ -56,7 +57,7 @@ def equivalence(graphs: Sequence[Mapping[str, Vertex]]) -> list[dict[str, int]]:
 
 
 def _signature(own: Mapping[str, int], name: str, vertex: Vertex) -> tuple[Any, ...]:
-    """The class so far, which tells wires and delays, and those of all that is read."""
+    """The class so far, which differs where wires or delays do, and the classes of all that is read."""
     return own[name], *(own.get(wire.topic, wire.topic) for _, wire in sorted(vertex.inputs.items()))
 
 
@@ -81,6 +82,20 @@ def swapped_stages(graphs: Sequence[Graph]) -> frozenset[str]:
     """Return the stages that themselves differ between the graphs."""
     known: list[tuple[str, Vertex]] = []
     return _unequal(graphs, [{name: _numbered(known, name, vertex) for name, vertex in vertices_of(graph).items()} for graph in graphs])
+
+
+def with_one_dataset(graphs: Sequence[Graph]) -> list[Graph]:
+    """Return the graphs with one reader for all equal data sets, which is opened, and warns, once."""
+    known: list[Stage] = []
+    shared = [{name: _known(known, stage) if name == DATASET else stage for name, stage in graph.stages.items()} for graph in graphs]
+    return [replace(graph, stages=stages) for graph, stages in zip(graphs, shared)]
+
+
+def _known(known: list[Stage], stage: Stage) -> Stage:
+    """Return the known stage that has an equal plugin, else this one, which is known from now on."""
+    if (found := next((other for other in known if _same(other.plugin, stage.plugin)), None)) is None:
+        known.append(stage)
+    return found or stage
 
 
 def _unequal(graphs: Sequence[Graph], classes: Sequence[Mapping[str, int]]) -> frozenset[str]:

@@ -9,7 +9,6 @@ from typing import Any
 from trihedron.pipeline.core.graph import Stage
 from trihedron.pipeline.core.types import Value
 from trihedron.pipeline.core.wires import PREVIOUS
-from trihedron.pipeline.record.codec import FRAMES_TOPIC
 from trihedron.pipeline.record.reader import Recording, TopicReader
 
 
@@ -65,7 +64,7 @@ def recorded_delay_lines(recording: Recording, max_delay: Mapping[str, int], fir
     """Read the values that the wires of a run beginning with frame `first` would hold of a recording's topics, had it run from the start."""
     held: dict[str, Value] = {}
     recent: dict[str, dict[int, Value]] = {}
-    frames = sorted({value.index for value in recording.values(FRAMES_TOPIC) if value.index < first})  # a live run did not take them all
+    frames = sorted({value.index for value in recording.references if value.index < first})  # a live run did not take them all
     for topic in sorted(set(max_delay) & recording.topics):
         reader = TopicReader(recording, topic)
         recent[topic] = {}

@@ -27,15 +27,13 @@ class Timing:
         self._calls: dict[str, array[float]] = defaultdict(lambda: array("f"))
         self._frames_ms = array("d")
         self._finish_ms: dict[str, float] = {}
-        self._cpu_s = time.process_time()
-        self._earlier_peak_mb: float | None = None
-        self._begin_mb: float | None = None
+        self.cpu_s = time.process_time()  # at the beginning, and the memory there
+        self.earlier_peak_mb: float | None = None
+        self.begin_mb: float | None = None
 
     def begin(self) -> None:
         """Start the measurement of this process's CPU time and of the run's own memory, at the first frame."""
-        self._earlier_peak_mb = peak_mb()
-        self._begin_mb = resident_mb() if forget_peak() else None
-        self._cpu_s = time.process_time()
+        begin_together([self])
 
     def add_call(self, stage: str, ms: float) -> None:
         """Add one call of a stage."""
@@ -66,14 +64,22 @@ class Timing:
             "frames": frames,
             "threads": threads,
             "wall_s": round(wall_s, 3),
-            "cpu_s": round(time.process_time() - self._cpu_s, 3),
+            "cpu_s": round(time.process_time() - self.cpu_s, 3),
             "startup_s": round(startup_s, 3),
             "fps": round(frames / wall_s, 2) if wall_s > 0 else 0.0,
             "frame_ms": {"p50": p50, "p95": p95, "max": largest},
-            "peak_memory_mb": None if peak is None else max(peak, self._earlier_peak_mb or 0.0),
-            "own_memory_mb": None if peak is None or self._begin_mb is None else round(max(peak - self._begin_mb, 0.0), 1),
+            "peak_memory_mb": None if peak is None else max(peak, self.earlier_peak_mb or 0.0),
+            "own_memory_mb": None if peak is None or self.begin_mb is None else round(max(peak - self.begin_mb, 0.0), 1),
             "stages": stages,
         }
+
+
+def begin_together(timings: Sequence[Timing]) -> None:
+    """Begin the measurements of runs that advance side by side: the peak of the process is restarted once."""
+    earlier_mb = peak_mb()
+    begin_mb = resident_mb() if forget_peak() else None
+    for timing in timings:
+        timing.earlier_peak_mb, timing.begin_mb, timing.cpu_s = earlier_mb, begin_mb, time.process_time()
 
 
 def resident_mb() -> float:

@@ -13,7 +13,7 @@ from trihedron.pipeline.record.writer import RecordingWriter
 from trihedron.pipeline.run.recorder import Recorder
 from trihedron.pipeline.run.replay import Replay
 from trihedron.pipeline.run.runner import Runner
-from trihedron.pipeline.run.side_by_side import SideBySide, changed_stages, equivalence, swapped_stages, vertices_of
+from trihedron.pipeline.run.side_by_side import SideBySide, changed_stages, equivalence, swapped_stages, vertices_of, with_one_dataset
 
 sys.path.insert(0, str(Path(__file__).parent))
 from toys import TOPICS, ToyDataset, ToyKeypoints, ToyNormals, ToyRotation, contents, toy_graph
@@ -60,6 +60,14 @@ def test_stages_are_shared_by_those_that_agree():
     assert first["keypoints"] == second["keypoints"] == third["keypoints"]
     assert first["rotation"] != second["rotation"] == third["rotation"] and second["pose"] == third["pose"] != first["pose"]
     assert first["normals"] == second["normals"] != third["normals"]
+
+
+def test_equal_data_sets_are_one():
+    graphs = [toy_graph(), toy_graph(rotation=ToyRotation(gain=2.0)), toy_graph(dataset=ToyDataset(3))]
+    first, second, third = with_one_dataset(graphs)
+    assert first.stages["dataset"] is second.stages["dataset"] is graphs[0].stages["dataset"]
+    assert third.stages["dataset"] is graphs[2].stages["dataset"]
+    assert second.stages["rotation"] is graphs[1].stages["rotation"] and list(second.stages) == list(graphs[1].stages)
 
 
 @pytest.mark.parametrize("threads", [1, 3])

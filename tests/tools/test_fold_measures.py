@@ -6,7 +6,9 @@ from pathlib import Path
 import pytest
 
 from trihedron.pipeline.app.cli import main
+from trihedron.tools import fold_measures
 from trihedron.tools.benchmarks.building_benchmark import judged_run
+from trihedron.tools.evaluate_surface import SURFACE
 from trihedron.tools.fold_measures import COLUMNS, of_folds, of_surface, of_surface_figures
 
 SEEDS = Path(__file__).parents[1] / "fuzz" / "seeds"
@@ -19,11 +21,23 @@ def test_a_surface_is_off_and_misses_a_share():
 
 
 def test_what_was_not_made_or_has_no_truth_has_no_figures(tmp_path, capsys):
-    assert of_surface(tmp_path) == {} == of_folds(["surface", "manhattan"], tmp_path, SEEDS / "own.mcap")
+    assert of_surface(tmp_path) == {} and of_folds(["surface", "manhattan"], [tmp_path], SEEDS / "own.mcap") == [{}]
     assert capsys.readouterr().err == ""
     (tmp_path / "run.mcap").symlink_to(SEEDS / "own.mcap")
-    assert of_folds(["building"], tmp_path, SEEDS / "own.mcap") == {}
+    assert of_folds(["building"], [tmp_path], SEEDS / "own.mcap") == [{}]
     assert capsys.readouterr().err.startswith(f"building of {tmp_path} is not judged: {SEEDS / 'trajectory.txt'}: 0 of its poses have a truth")
+
+
+def test_equal_surfaces_are_judged_once(tmp_path, monkeypatch):
+    judged = []
+    figures = {"parts": {"all": {"mean_m": 0.006, "within_5_cm": 0.98}}}
+    monkeypatch.setattr(fold_measures, "evaluate_files", lambda surface, source: judged.append(surface.read_text()) or figures)
+    runs = [tmp_path / name for name in "abc"]
+    for run, content in zip(runs, ["one", "other", "one"]):
+        run.mkdir()
+        (run / SURFACE).write_text(content)
+    assert of_folds(["surface"], runs, SEEDS / "own.mcap") == [of_surface_figures(figures)] * 3
+    assert judged == ["one", "other"] and all(of_surface(run) == of_surface_figures(figures) for run in runs)
 
 
 @pytest.mark.slow

@@ -85,11 +85,11 @@ def compare(folder: Path, frame: int | None = None) -> str:
     """The table of all runs in `folder` and the paths of the pictures written there. Raises DataError when nothing can be compared."""
     runs = read_runs(folder, [folder, *sorted(path.parent for path in folder.glob(f"*/{RECORDING}"))])
     world = common_world(runs)
-    written = draw(runs, world, folder, frame=frame)
+    errors = [run.errors_deg(world) for run in runs]
+    written = draw(runs, world, errors, folder, frame=frame)
     heads = ["estimator", "frames", "claimed", "within 1°", "false", "median (deg)", "p95 (deg)", "max (deg)", "NEES", "p50 ms"]
     rows: list[list[str]] = []
-    for run in runs:
-        error = run.errors_deg(world)
+    for run, error in zip(runs, errors):
         known = error[np.isfinite(error)]
         shares = [np.isfinite(error), error <= RIGHT_DEG, error > FALSE_DEG]
         largest = [np.median(known), np.percentile(known, 95), known.max()] if len(known) else []
@@ -99,8 +99,9 @@ def compare(folder: Path, frame: int | None = None) -> str:
     return "\n".join([table([heads, *rows], "lrrrrrrrrr"), *(str(path) for path in written)])
 
 
-def draw(runs: Sequence[Run], world: F64, folder: Path, prefix: str = "", frame: int | None = None) -> list[Path]:
-    """Draw the errors against frame and the sphere of a frame, by default the middle one; returns the files. Raises DataError for an unknown one."""
+def draw(runs: Sequence[Run], world: F64, errors_deg: Sequence[F64], folder: Path, prefix: str = "", frame: int | None = None) -> list[Path]:
+    """Draw the errors (n,) of each run against frame, and the sphere of a frame, by default the middle one; returns the files. Raises DataError for
+    an unknown one."""
     from trihedron.tools.benchmarks import rotation_pictures
 
     numbers = [value.index for value in runs[0].found]
@@ -108,7 +109,7 @@ def draw(runs: Sequence[Run], world: F64, folder: Path, prefix: str = "", frame:
     if frame not in numbers:
         raise DataError(str(folder), f"there is no frame {frame}", f"give one of {numbers[0]}..{numbers[-1]}")
     written = [folder / f"{prefix}{name}" for name in (ERRORS_PNG, f"sphere_{frame}.png")]
-    rotation_pictures.errors_figure(runs, world, written[0])
+    rotation_pictures.errors_figure(runs, errors_deg, written[0])
     rotation_pictures.sphere_figure(runs, world, frame, written[1])
     return written
 

@@ -26,13 +26,13 @@ RING: dict[str, Any] = {"marker": "o", "markersize": 13, "fillstyle": "none", "m
 MARKERS = "os^D"  # of several frames
 
 
-def errors_figure(runs: Sequence[comparison.Run], world: F64, path: Path) -> None:
+def errors_figure(runs: Sequence[comparison.Run], errors_deg: Sequence[F64], path: Path) -> None:
     """A row for each estimator: its error (n,) by frame, false claims in red, frames without a claim marked below. Writes a PNG."""
     figure = _figure(10.0, 0.6 + 1.1 * len(runs))
     axes: Any = np.atleast_1d(figure.subplots(len(runs), 1, sharex=True, sharey=True))
-    for run, ax in zip(runs, axes):
+    for run, errors, ax in zip(runs, errors_deg, axes):
         numbers = np.array([value.index for value in run.found])
-        error = np.clip(run.errors_deg(world), LEAST_DEG, MOST_DEG)
+        error = np.clip(errors, LEAST_DEG, MOST_DEG)
         false, silent = error > comparison.FALSE_DEG, np.isnan(error)
         ax.plot(numbers, error, ".-", color="tab:blue", markersize=2, linewidth=0.7)
         ax.plot(numbers[false], error[false], "o", color="tab:red", markersize=3, label="more than 3° off")
