@@ -21,6 +21,7 @@ from trihedron.pipeline.core.types import F64, I32
 
 LIMIT_95 = 12.592  # χ² with 6 degrees of freedom
 ITERATIONS = 5
+CONVERGED = 1e-10  # of a step: metres, radians
 MEDIAN_3 = 2.366  # median of χ² with 3 degrees of freedom
 
 
@@ -110,5 +111,8 @@ def _gauge(poses: F64, information: F64, true_poses: F64) -> F64:
     H = np.einsum("nji,njk,nkl->il", J, information, J)
     for _ in range(ITERATIONS):
         gradient = np.einsum("nji,njk,nk->i", J, information, _errors(poses, true_poses, T))
-        T = matmul(T, exp_se3(solve(H, gradient)))
+        step = solve(H, gradient)
+        T = matmul(T, exp_se3(step))
+        if np.abs(step).max() < CONVERGED:
+            break
     return np.asarray(T)
