@@ -16,17 +16,17 @@ from trihedron.plugins.shared.depth_image_kernels import Grid, cells_by_componen
 
 @kernel
 def planar_components(
-    grid: Grid, edge: tuple[float, float], bend: float, gate: float, cone: float, turn: float, rounds: int, least: int, most: int
+    grid: Grid, edge: tuple[float, float], angle: float, gate: float, cone: float, turn: float, rounds: int, least: int, most: int
 ) -> tuple[U8, F64]:
     """Labels (h, w) of the cells that make up each plane, 0 = none, and the planes' q (k, 3), `most` at most.
 
-    Components of `least` cells or more, whose normals differ from their neighbours' by less than `bend` (rad), are sought on cells of twice the size
+    Components of `least` cells or more, whose normals differ from their neighbours' by less than `angle` (rad), are sought on cells of twice the size
     (a quarter of the work) without a step of more than `edge` (share of z, and m), and again among what is left: `rounds` times, with half the `cone`
     (rad) in each further round. The normals of a plane lie within the cone and turn by no more than `turn` cones."""
     coarse = coarser(grid, edge[0], edge[1])
     h, w = coarse.rho.shape
     labels, planes, found, before = np.zeros((h, w), np.uint8), np.zeros((most, 3)), 0, -1
-    links, free = smooth_links(coarse, np.cos(bend), gate), np.empty((h, w), np.bool_)
+    links, free = smooth_links(coarse, np.cos(angle), gate), np.empty((h, w), np.bool_)
     cells, starts = np.empty(0, np.int32), np.zeros(1, np.int32)
     for _ in range(rounds):
         if found > before:

@@ -36,7 +36,7 @@ def larger_surface(q: F64, grid: Grid, cells: I32, columns: F64, sample: F64, me
     apart = angle_between(q, normal)
     if not apart > MIN_DISAGREEMENT:
         return q, members, none
-    farther = _farther(_distances(normal, grid, cells, member), member)
+    farther = _mark_farther(_distances(normal, grid, cells, member), member)
     one, other = 0, 0
     for k in range(len(cells)):
         one += member[k] and farther[k]
@@ -71,7 +71,7 @@ def _mean_normal(q: F64, columns: F64, member: Bool) -> F64:
 def _distances(normal: F64, grid: Grid, cells: I32, member: Bool) -> F64:
     """Signed distances (n,) along the normal, negative, each the mean over the members in a square around the cell; 0 for non-members."""
     w = grid.rho.shape[1]
-    top, left, height, width = _box(cells, w)
+    top, left, height, width = _bounding_box(cells, w)
     sums, counts = np.zeros((height + 1, width + 1)), np.zeros((height + 1, width + 1), np.int32)
     for k in range(len(cells)):
         if member[k]:
@@ -89,18 +89,13 @@ def _distances(normal: F64, grid: Grid, cells: I32, member: Bool) -> F64:
         if member[k]:
             r = cells[k] // w
             r, c = r - top, cells[k] - r * w - left
-            a, b, d, e = (
-                max(r - RADIUS, 0),
-                min(r + RADIUS + 1, height),
-                max(c - RADIUS, 0),
-                min(c + RADIUS + 1, width),
-            )
+            a, b, d, e = max(r - RADIUS, 0), min(r + RADIUS + 1, height), max(c - RADIUS, 0), min(c + RADIUS + 1, width)
             out[k] = (sums[b, e] - sums[a, e] - sums[b, d] + sums[a, d]) / (counts[b, e] - counts[a, e] - counts[b, d] + counts[a, d])
     return out
 
 
 @kernel
-def _box(cells: I32, w: int) -> tuple[int, int, int, int]:
+def _bounding_box(cells: I32, w: int) -> tuple[int, int, int, int]:
     """Bounding box (top, left, height, width) of cells of a grid of w columns."""
     top, bottom, left, right = cells[0] // w, 0, w, 0
     for i in cells:
@@ -111,7 +106,7 @@ def _box(cells: I32, w: int) -> tuple[int, int, int, int]:
 
 
 @kernel
-def _farther(distances: F64, member: Bool) -> Bool:
+def _mark_farther(distances: F64, member: Bool) -> Bool:
     """Mark (n,) the members in the farther of two clusters of distances (2-means)."""
     out = np.zeros(len(distances), np.bool_)
     total, square, n = 0.0, 0.0, 0
