@@ -10,7 +10,7 @@ from trihedron.pipeline.core.lie import exp_so3
 from trihedron.pipeline.core.registry import load_plugins
 from trihedron.pipeline.core.types import ManhattanFrame
 from trihedron.plugins.manhattan.branch_and_bound import BranchAndBound
-from trihedron.plugins.manhattan.common import directions_of
+from trihedron.plugins.manhattan.modes import directions_of
 from trihedron.plugins.shared.manhattan_frames_kernels import CUBE
 from trihedron.tools.benchmarks import manhattan_views as seen
 from trihedron.tools.benchmarks.manhattan_family import error_of, estimators, figures, measure
