@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import combinations
-from typing import Annotated, NamedTuple
+from typing import Annotated, ClassVar, NamedTuple
 
 import numpy as np
 
@@ -20,12 +20,11 @@ from trihedron.plugins.manhattan.axis_fit_kernels import NOTHING_KNOWN, FitRules
 from trihedron.plugins.manhattan.directions import HALF_SPHERE, Directions, gather_directions
 from trihedron.plugins.manhattan.frame_association import lost_frames, retain_unseen, seen_frames, unmatched
 from trihedron.plugins.manhattan.mean_shift_kernels import densest, mode_statistics, shift_axes
-from trihedron.plugins.manhattan.modes import Modes, find_peaks, mode_limits, perpendicular_modes, track_modes
+from trihedron.plugins.manhattan.modes import Modes, find_peaks, mode_limits, perpendicular_modes, shift_limits, track_modes
 
 NOBODY = np.zeros(0, np.int32)
 CROSSED = 4  # of the densest directions whose cross products may be the vertical
 UP = np.array([0.0, -1.0, 0.0])  # in the image
-MAX_ITERATIONS, TOLERANCE_DEG = 20, 1e-3  # of mean shift
 
 
 class AtlantaModes(NamedTuple):
@@ -99,6 +98,10 @@ class Atlanta:
     normals_floor_deg: PositiveFloat = 0.5  # error of an axis however many normals it has
     floor_deg: PositiveFloat = 0.05  # of every rotation
     gate: PositiveFloat = 2.0  # σ at which a plane or line counts half
+
+    max_iterations: ClassVar[int] = 20  # of mean shift
+    tolerance_deg: ClassVar[float] = 1e-3
+    use_planes: ClassVar[bool] = True
 
     def __post_init__(self) -> None:
         check_increasing(self, "bandwidth_deg", "cone_deg")
@@ -181,8 +184,7 @@ class Atlanta:
         return azimuth_modes(*directions, vertical, np.radians(self.cone_deg), self.apart_deg, self.max_azimuths, least)
 
     def _shift(self, directions: Directions, axes: F64) -> F64:
-        limits = np.radians(self.cone_deg), np.radians(self.bandwidth_deg), MAX_ITERATIONS, np.radians(TOLERANCE_DEG)
-        return shift_axes(directions.vectors, directions.weights, axes, *limits)
+        return shift_axes(directions.vectors, directions.weights, axes, *shift_limits(self))
 
     def _about(self, directions: Directions, planes: Planes, vertical: F64, known: F64 | None, furthest: float) -> AtlantaModes:
         """The azimuths about a vertical, named, and those of them that are seen."""

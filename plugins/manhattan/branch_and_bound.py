@@ -27,7 +27,7 @@ from trihedron.plugins.manhattan.branch_and_bound_kernels import (
     search,
 )
 from trihedron.plugins.manhattan.directions import Directions
-from trihedron.plugins.manhattan.modes import ModeOptions, directions_of, fit_modes, modes_near, one_frame
+from trihedron.plugins.manhattan.modes import ModeOptions, directions_of, fit_modes, one_frame, track_modes
 from trihedron.plugins.shared.manhattan_frames_kernels import nearest_equivalent
 
 
@@ -63,9 +63,9 @@ class BranchAndBound(ModeOptions):
         vectors, weights = self._with_planes(directions.thinned(self.search_samples), planes)
         start = np.eye(3) if previous is None else previous.rotations[0]
         optimum = self._search(vectors, weights, start)
-        modes = modes_near(self, directions, planes, nearest_equivalent(optimum.R, start))
+        modes = track_modes(self, directions, planes, nearest_equivalent(optimum.R, start))
         if not modes.supported and previous is not None:
-            modes = modes_near(self, directions, planes, start)
+            modes = track_modes(self, directions, planes, start)
         R, covariance = fit_modes(self, modes, segments, planes)
         reached = self._search.consensus(vectors, weights, R) if modes.supported else 0.0
         return one_frame(modes, R, covariance, normals, float(optimum.upper / reached - 1.0) if reached > 0.0 else float("nan"))

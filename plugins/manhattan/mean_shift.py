@@ -12,7 +12,7 @@ from trihedron.pipeline.core.registry import register
 from trihedron.pipeline.core.types import F64, ManhattanFrame, Normals, Planes, Segments
 from trihedron.plugins.manhattan.directions import HALF_SPHERE, Directions
 from trihedron.plugins.manhattan.mean_shift_kernels import search_axes
-from trihedron.plugins.manhattan.modes import ModeOptions, Modes, directions_of, fit_modes, modes_near, one_frame
+from trihedron.plugins.manhattan.modes import ModeOptions, Modes, directions_of, fit_modes, one_frame, shift_limits, track_modes
 from trihedron.plugins.shared.manhattan_frames_kernels import nearest_equivalent
 
 
@@ -39,7 +39,7 @@ class MeanShift(ModeOptions):
         if previous is None:
             return self._anywhere(directions, planes, np.eye(3))
         start = np.array(previous.rotations[0])
-        near = modes_near(self, directions, planes, start)
+        near = track_modes(self, directions, planes, start)
         if previous.supported and near.supported and index - previous.index <= self.max_age:
             return near
         far = self._anywhere(directions, planes, start)
@@ -47,6 +47,6 @@ class MeanShift(ModeOptions):
 
     def _anywhere(self, directions: Directions, planes: Planes, names: F64) -> Modes:
         """Find the densest axes of all, in the order and with the signs nearest to those of `names` (3, 3)."""
-        few, cone, bandwidth = directions.thinned(self.search_samples), np.radians(self.cone_deg), np.radians(self.bandwidth_deg)
-        found = search_axes(few.vectors, few.weights, HALF_SPHERE, cone, bandwidth, self.primaries, self.turns)
-        return modes_near(self, directions, planes, nearest_equivalent(found, names))
+        few, shift = directions.thinned(self.search_samples), shift_limits(self)
+        found = search_axes(few.vectors, few.weights, HALF_SPHERE, shift.cone, shift.bandwidth, self.primaries, self.turns)
+        return track_modes(self, directions, planes, nearest_equivalent(found, names))

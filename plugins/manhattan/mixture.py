@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Annotated, NamedTuple
+from typing import Annotated, ClassVar, NamedTuple
 
 import numpy as np
 
@@ -77,6 +77,10 @@ class Mixture:
     line_floor_deg: PositiveFloat = 0.5  # an edge's
     normals_floor_deg: PositiveFloat = 0.5  # error of an axis however many normals it has
     floor_deg: PositiveFloat = 0.05  # of the whole rotation
+
+    max_iterations: ClassVar[int] = 20  # of mean shift
+    tolerance_deg: ClassVar[float] = 1e-3
+    use_planes: ClassVar[bool] = True
 
     def __post_init__(self) -> None:
         check_increasing(self, "bandwidth_deg", "cone_deg")

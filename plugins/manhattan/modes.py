@@ -61,16 +61,28 @@ class ModeRules(Protocol):
         """Standard deviation of the Gaussian kernel."""
 
     @property
+    def max_iterations(self) -> int:
+        """Most iterations of mean shift."""
+
+    @property
+    def tolerance_deg(self) -> float:
+        """Step of an axis below which mean shift has converged."""
+
+    @property
+    def use_planes(self) -> bool:
+        """True if planes may verify a mode."""
+
+    @property
     def min_share(self) -> float:
         """Share of all normals that an axis must gather."""
 
     @property
     def min_lines(self) -> int:
-        """Number of lines that an axis without normals must gather,"""
+        """Number of lines that an axis without normals must gather."""
 
     @property
     def min_line_share(self) -> float:
-        """And their share of the lines' length."""
+        """Share of the lines' length that these must have."""
 
     @property
     def max_width(self) -> float:
@@ -92,15 +104,15 @@ def mode_limits(rules: ModeRules) -> ModeLimits:
     return ModeLimits(cone, rules.min_share, rules.min_lines, rules.min_line_share, widest, rules.min_explained, np.radians(rules.max_skew_deg))
 
 
-def track_modes(
-    rules: ModeRules, directions: Directions, planes: Planes | None, start: F64, max_iterations: int = 20, tolerance_deg: float = 1e-3
-) -> Modes:
-    """Return the modes that mean shift reaches from three axes `start` (3, 3), verified; axes that are no modes stay where they started.
+def shift_limits(rules: ModeRules) -> ShiftLimits:
+    """Convert the options of mean shift to rad."""
+    return ShiftLimits(np.radians(rules.cone_deg), np.radians(rules.bandwidth_deg), rules.max_iterations, np.radians(rules.tolerance_deg))
 
-    `planes` help to verify them; None where they may not take part."""
-    limits = mode_limits(rules)
-    shift = ShiftLimits(limits.cone, np.radians(rules.bandwidth_deg), max_iterations, np.radians(tolerance_deg))
-    return Modes(*track_modes_kernel(*directions, np.array(start), shift, _surfaces(planes, limits), limits))
+
+def track_modes(rules: ModeRules, directions: Directions, planes: Planes, start: F64) -> Modes:
+    """Return the modes that mean shift reaches from three axes `start` (3, 3), verified; axes that are no modes stay where they started."""
+    limits, used = mode_limits(rules), planes if rules.use_planes else None
+    return Modes(*track_modes_kernel(*directions, np.array(start), shift_limits(rules), _surfaces(used, limits), limits))
 
 
 def verify_modes(limits: ModeLimits, modes: Modes, directions: Directions, planes: Planes | None) -> Modes:
@@ -161,11 +173,6 @@ def directions_of(options: ModeOptions, normals: Normals, segments: Segments) ->
     """Gather the directions of the normals and lines that the options include."""
     surface, lines = normals.normals if options.use_normals else None, segments if options.use_lines else None
     return gather_directions(surface, lines, options.samples, options.line_weight_per_px)
-
-
-def modes_near(options: ModeOptions, directions: Directions, planes: Planes, start: F64) -> Modes:
-    """Return the modes that mean shift reaches from three axes `start` (3, 3) with these options; see `track_modes`."""
-    return track_modes(options, directions, planes if options.use_planes else None, start, options.max_iterations, options.tolerance_deg)
 
 
 def fit_modes(options: ModeOptions, modes: Modes, segments: Segments, planes: Planes) -> tuple[F64, F64]:
