@@ -121,17 +121,17 @@ class Atlanta:
         order = np.argsort(-modes.weights * np.where(modes.rows == 0, self.loyalty, 1.0), kind="stable")
         rows, rotations = modes.rows[order], rotations[order]
         unseen = retain_unseen(unmatched(rows, len(known)), ids, self.max_azimuths - len(rows)) if previous is not None else NOBODY
-        expected = _beside(rotations, rows, known, unseen)
+        expected = _predict_unseen(rotations, rows, known, unseen)
         return seen_frames(normals, rotations, covariance[order], modes.inliers[order], modes.spread[order], rows, ids, unseen, expected)
 
     def _known(self, directions: Directions, previous: ManhattanFrame | None, recent: bool) -> tuple[F64, I32]:
-        """The rotations (k, 3, 3) known and their ids; while a single one is in view another of its axes may turn out to be the vertical."""
-        known, ids = _sharing(previous)
+        """Return the known rotations (k, 3, 3) and their ids; while a single one is in view another of its axes may turn out to be the vertical."""
+        known, ids = _with_first_vertical(previous)
         alone = previous is not None and np.count_nonzero(previous.inliers.any(axis=1)) == 1
         return self._better_vertical(directions, known, ids) if alone and recent else (known, ids)
 
     def _fit(self, modes: AtlantaModes, segments: Segments, planes: Planes) -> tuple[F64, F64]:
-        """(k, 3, 3) rotations fitted together to all that stands on the axes seen, and the covariance of phi of each."""
+        """Fit the rotations (k, 3, 3) together to all that lies on the axes seen; return them with the covariance of phi of each."""
         count = len(modes.rows)
         vertical = np.arange(3 * count) % 3 == 2
         normals = np.where((vertical & (np.arange(3 * count) > 2))[:, None], 0.0, modes.normals)  # one vertical counts once
@@ -145,14 +145,14 @@ class Atlanta:
         return rotations, shared_covariance(H / scale, rotations, NOTHING_KNOWN) + np.eye(3) * np.radians(self.floor_deg) ** 2
 
     def _near(self, directions: Directions, planes: Planes, known: F64) -> AtlantaModes:
-        """About the vertical of the known rotations (k, 3, 3), where mean shift takes it."""
+        """Find the azimuths about the vertical of the known rotations (k, 3, 3), tracked by mean shift."""
         vertical = self._shift(directions, known[0, :, 2:])[:, 0]
         return self._about(directions, planes, vertical, known, np.radians(self.furthest_deg))
 
     def _better_vertical(self, directions: Directions, known: F64, ids: I32) -> tuple[F64, I32]:
-        """The known rotations (k, 3, 3) and their ids; only the first, with another of its axes as the vertical, when azimuths about that gather
-        clearly more: which axis is the vertical cannot be decided while all that is seen is at right angles."""
-        few = directions.thinned(self.search_samples)
+        """Return the known rotations (k, 3, 3) and their ids; only the first, with another of its axes as the vertical, when azimuths about that
+        gather clearly more: which axis is the vertical cannot be decided while all that is seen is at right angles."""
+        few = directions.subsample(self.search_samples)
         scores = [self._score(few, v, False) for v in self._shift(few, known[0]).T]
         best = int(np.argmax(scores))
         if best == 2 or scores[best] <= self.loyalty * scores[2]:
@@ -160,8 +160,8 @@ class Atlanta:
         return known[:1, :, [(best + 1) % 3, (best + 2) % 3, best]], ids[:1]
 
     def _search(self, directions: Directions, planes: Planes, known: F64 | None) -> AtlantaModes:
-        """About the direction that makes most of the others vertical or horizontal, known or not."""
-        few = directions.thinned(self.search_samples)
+        """Find the azimuths about the direction that makes most of the others vertical or horizontal, known or not."""
+        few = directions.subsample(self.search_samples)
         starts = densest(few.vectors, few.weights, HALF_SPHERE, np.radians(self.cone_deg), 6)
         if len(starts) == 0:
             return NONE
@@ -172,7 +172,7 @@ class Atlanta:
         return self._about(directions, planes, vertical, known, np.pi)
 
     def _score(self, directions: Directions, vertical: F64, alone: bool) -> float:
-        """Weight that the vertical and the azimuths about it gather; upright counts more where nothing else determines the vertical."""
+        """Return the weight that the vertical and the azimuths about it gather; upright counts more where nothing else determines the vertical."""
         on_vertical = np.abs(matmul(directions.vectors, vertical)) > np.cos(np.radians(self.cone_deg))
         masses = self._azimuths(directions, vertical)[1]
         explained = float(directions.weights[on_vertical].sum() + masses.sum())
@@ -187,13 +187,13 @@ class Atlanta:
         return shift_axes(directions.vectors, directions.weights, axes, *shift_limits(self))
 
     def _about(self, directions: Directions, planes: Planes, vertical: F64, known: F64 | None, furthest: float) -> AtlantaModes:
-        """The azimuths about a vertical, named, and those of them that are seen."""
+        """Find the azimuths about a vertical, name and verify them."""
         rotations, _ = self._azimuths(directions, vertical)
         if len(rotations) == 0:
             return NONE
         up = np.sign(matmul(vertical, UP)) or 1.0
         known = matmul(rotations[:1], np.diag([1.0, up, up])) if known is None else known
-        rotations, rows = named_azimuths(rotations, known, np.radians(self.again_deg), furthest)
+        rotations, rows = match_azimuths(rotations, known, np.radians(self.again_deg), furthest)
         return self._verify(directions, planes, rotations, rows)
 
     def _verify(self, directions: Directions, planes: Planes, rotations: F64, rows: I32) -> AtlantaModes:
@@ -249,8 +249,8 @@ class Atlanta:
         return fit_rules(self, self.fit_deg, self.normals_floor_deg, self.gate)
 
 
-def _sharing(previous: ManhattanFrame | None) -> tuple[F64, I32]:
-    """Rotations (k, 3, 3) of the previous result with the first one's vertical, and their ids (k,)."""
+def _with_first_vertical(previous: ManhattanFrame | None) -> tuple[F64, I32]:
+    """Return the rotations (k, 3, 3) of the previous result with the first one's vertical, and their ids (k,)."""
     if previous is None:
         return np.eye(3)[None], np.zeros(1, np.int32)
     vertical = previous.rotations[:, :, 2]
@@ -258,8 +258,8 @@ def _sharing(previous: ManhattanFrame | None) -> tuple[F64, I32]:
     return previous.rotations[same], previous.ids[same]
 
 
-def _beside(rotations: F64, rows: I32, known: F64, unseen: I32) -> F64:
-    """(u, 3, 3) where those of the `known` that are out of sight must be: turned like the first one seen again, with the vertical of all."""
+def _predict_unseen(rotations: F64, rows: I32, known: F64, unseen: I32) -> F64:
+    """Predict those of the `known` that are out of sight, (u, 3, 3): rotated like the first one seen again, with the vertical of all."""
     again = int(np.argmax(rows >= 0))
     turn = matmul(rotations[again], known[max(rows[again], 0)].T)
     return np.array([shared_vertical(rotations[again], matmul(turn, R)) for R in known[unseen]]).reshape(-1, 3, 3)
@@ -274,7 +274,7 @@ def _rotation(vertical: F64, pair: F64, weights: F64) -> F64:
     return np.stack([first, np.cross(vertical, first), vertical], axis=1)
 
 
-def named_azimuths(found: F64, known: F64, limit: float, furthest: float) -> tuple[F64, I32]:
+def match_azimuths(found: F64, known: F64, limit: float, furthest: float) -> tuple[F64, I32]:
     """The rotations found (f, 3, 3) with their columns named like those of the known ones (k, 3, 3) that they are, and the rows (f,) of these, -1 for
     none; each set shares its third columns.
 
@@ -283,14 +283,14 @@ def named_azimuths(found: F64, known: F64, limit: float, furthest: float) -> tup
     flip = np.diag([1.0, -1.0, -1.0]) if matmul(found[0, :, 2], known[0, :, 2]) < 0.0 else np.eye(3)
     found = matmul(found, flip)
     azimuth = _azimuths(found, found[0])
-    expected = _azimuths(_tilted(known, found[0, :, 2]), found[0])
-    apart = _wrapped(azimuth[:, None] - expected[None])
+    expected = _azimuths(_tilt_to(known, found[0, :, 2]), found[0])
+    apart = _wrap_quarter(azimuth[:, None] - expected[None])
     turns = apart.ravel()
-    matched = np.abs(_wrapped(apart[None] - turns[:, None, None])) <= limit
+    matched = np.abs(_wrap_quarter(apart[None] - turns[:, None, None])) <= limit
     number = np.minimum(matched.any(axis=1).sum(axis=1), matched.any(axis=2).sum(axis=1))
     near = np.abs(turns) <= furthest
     turn = turns[np.lexsort((np.abs(turns), -number, ~near))[0]]
-    off = np.abs(_wrapped(apart - turn))
+    off = np.abs(_wrap_quarter(apart - turn))
     rows = np.full(len(found), -1, np.int32)
     while off.min() <= limit:
         f, k = np.unravel_index(int(np.argmin(off)), off.shape)
@@ -305,12 +305,12 @@ def _azimuths(rotations: F64, base: F64) -> F64:
     return np.asarray(np.arctan2(matmul(rotations[:, :, 0], base[:, 1]), matmul(rotations[:, :, 0], base[:, 0])))
 
 
-def _wrapped(angles: F64) -> F64:
-    """To -45° … 45°."""
+def _wrap_quarter(angles: F64) -> F64:
+    """Wrap angles to -45° … 45°."""
     return np.asarray(angles - np.round(angles / QUARTER) * QUARTER)
 
 
-def _tilted(rotations: F64, vertical: F64) -> F64:
+def _tilt_to(rotations: F64, vertical: F64) -> F64:
     """(k, 3, 3) with their common third column turned onto `vertical` the shortest way."""
     axis = np.cross(rotations[0, :, 2], vertical)
     sine, cosine = float(norm(axis)), float(matmul(rotations[0, :, 2], vertical))

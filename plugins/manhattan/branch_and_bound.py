@@ -60,7 +60,7 @@ class BranchAndBound(ModeOptions):
         """One rotation with id 0 and its `gap`; `supported` False, with a large covariance and no gap (NaN), where the scene shows no two axes at
         right angles. Only its naming, and the angles that the scene does not tell, are those of `previous`."""
         directions = directions_of(self, normals, segments)
-        vectors, weights = self._with_planes(directions.thinned(self.search_samples), planes)
+        vectors, weights = self._with_planes(directions.subsample(self.search_samples), planes)
         start = np.eye(3) if previous is None else previous.rotations[0]
         optimum = self._search(vectors, weights, start)
         modes = track_modes(self, directions, planes, nearest_equivalent(optimum.R, start))

@@ -19,7 +19,7 @@ class Directions(NamedTuple):
     weights: F64
     first_line: int
 
-    def thinned(self, most: int) -> Directions:
+    def subsample(self, most: int) -> Directions:
         """Keep about `most` of the normals at most, with larger weights, and all lines."""
         step = max(-(-self.first_line // most), 1)
         normals, lines = self.vectors[: self.first_line : step], self.vectors[self.first_line :]

@@ -47,6 +47,6 @@ class MeanShift(ModeOptions):
 
     def _anywhere(self, directions: Directions, planes: Planes, names: F64) -> Modes:
         """Find the densest axes of all, in the order and with the signs nearest to those of `names` (3, 3)."""
-        few, shift = directions.thinned(self.search_samples), shift_limits(self)
+        few, shift = directions.subsample(self.search_samples), shift_limits(self)
         found = search_axes(few.vectors, few.weights, HALF_SPHERE, shift.cone, shift.bandwidth, self.primaries, self.turns)
         return track_modes(self, directions, planes, nearest_equivalent(found, names))

@@ -111,7 +111,7 @@ class Mixture:
         return seen_frames(normals, rotations, covariance, inliers, spread, rows, ids, unseen, matmul(turn, known)[unseen])
 
     def _camera_rotation(self, tracked: list[Found], found: list[Found], known: F64) -> F64:
-        """(3, 3) how the known frames (k, 3, 3) have turned: with the heaviest tracked, unless another turn makes more of those found known ones."""
+        """Return the rotation (3, 3) of the known frames (k, 3, 3) since then: by the heaviest tracked, unless another associates more."""
         rotations, limit = np.array([one.R for one in found]).reshape(-1, 3, 3), np.radians(self.again_deg)
         if tracked:
             turn = matmul(tracked[0].R, known[tracked[0].row].T)
@@ -122,15 +122,15 @@ class Mixture:
         return turn if tracked and matched >= (associate_frames(rotations, matmul(other, known), limit) >= 0).sum() else other
 
     def _name_frames(self, found: list[Found], expected: F64) -> list[Found]:
-        """Each with the row of the expected frame (k, 3, 3) that it is, named as this is, in order of support; the one that came first before stays
-        there until another has clearly more."""
+        """Associate the frames found with those expected (k, 3, 3), name their axes alike, and sort them by support; the one that came first before
+        stays there until another has clearly more."""
         rows = associate_frames(np.array([one.R for one in found]).reshape(-1, 3, 3), expected, np.radians(self.again_deg))
         named = [Found(nearest_equivalent(one.R, expected[max(row, 0)]), one.modes, int(row)) for one, row in zip(found, rows)]
         return sorted(named, key=lambda one: -one.weight * (self.loyalty if one.row == 0 else 1.0))
 
     def _track_known(self, directions: Directions, planes: Planes, known: F64) -> list[Found]:
-        """Known rotations (k, 3, 3) that the scene still supports nearby, heaviest first. The turn of the first one found shows where to
-        expect those after it."""
+        """Return the known rotations (k, 3, 3) that the scene still supports nearby, heaviest first. The rotation of the first one found predicts
+        those after it."""
         found: list[Found] = []
         expected, again = known, np.radians(self.again_deg)
         for row in range(len(known)):
@@ -148,8 +148,8 @@ class Mixture:
         return kept
 
     def _search_more(self, directions: Directions, planes: Planes, found: list[Found]) -> list[Found]:
-        """Frames with those added to which the remaining directions lead."""
-        few = directions.thinned(self.search_samples)
+        """Append frames while the directions on no axis lead to another."""
+        few = directions.subsample(self.search_samples)
         while len(found) < self.max_frames:
             left = self._left(few, found)
             if found and self._densest(few, left) < self.min_own * few.weights.sum():
@@ -165,7 +165,7 @@ class Mixture:
         return found
 
     def _near(self, directions: Directions, planes: Planes, rotations: F64, row: int) -> Modes:
-        """Mean shift from one of the rotations (k, 3, 3), with the directions that belong to it."""
+        """Track the modes of one of the rotations (k, 3, 3), by the directions that belong to it."""
         if len(rotations) == 1:
             return track_modes(self, directions, planes, rotations[row])
         vectors, weights, first = directions
@@ -183,25 +183,25 @@ class Mixture:
         return bool(symmetric_angles(one.R[None], np.array([other.R for other in others])).min() > np.radians(self.merge_deg))
 
     def _left(self, directions: Directions, found: list[Found]) -> Bool:
-        """(n,) directions on no axis that is seen."""
+        """Return True (n,) for the directions on no axis that is seen."""
         axes = np.concatenate([np.zeros((3, 0)), *(one.modes.axes[:, one.modes.seen] for one in found)], axis=1)
         return np.asarray((np.abs(matmul(directions.vectors, axes)) < np.cos(np.radians(self.cone_deg))).all(axis=1))
 
     def _densest(self, directions: Directions, left: Bool) -> float:
-        """Most weight of the directions left that any cone gathers."""
+        """Return the largest weight of the directions left in any cone."""
         inside = np.abs(matmul(directions.vectors[left], HALF_SPHERE.T)) > np.cos(np.radians(self.cone_deg))
         return float(matmul(directions.weights[left], inside).max())
 
 
 def members(vectors: F64, rotations: F64, row: int, shared: float) -> Bool:
-    """(n,) whether a direction (n, 3) belongs to one of the frames (k, 3, 3): the nearest of all axes is the frame's, or one of the frame's axes is
-    within `shared` (rad) of that axis, as two frames have the floor in common."""
+    """Return True (n,) for each direction (n, 3) that belongs to frame `row` of (k, 3, 3): the nearest of all axes is the frame's, or
+    one of the frame's axes is within `shared` (rad) of that axis, as two frames have the floor in common."""
     axes = np.moveaxis(rotations, 2, 1).reshape(-1, 3)
     nearest = np.argmax(np.abs(matmul(vectors, axes.T)), axis=1)
     return np.asarray((np.abs(matmul(rotations[row].T, axes.T)).max(axis=0) > np.cos(shared))[nearest])
 
 
 def _rotation(modes: Modes) -> F64:
-    """(3, 3) nearest to the axes seen."""
+    """Return the rotation (3, 3) nearest to the axes seen."""
     weights = np.where(modes.seen, modes.weights, 1e-6)
     return orthonormal(modes.axes, weights / weights.max())

@@ -78,7 +78,7 @@ class VonMisesFisher:
             near = self._fit_from(directions, start)
             if previous.supported and near[2].supported and index - previous.index <= self.max_age:
                 return near
-        few = directions.thinned(self.search_samples)
+        few = directions.subsample(self.search_samples)
         found = search_axes(few.vectors, few.weights, HALF_SPHERE, np.radians(12.0), np.radians(4.0), 6, 2)
         far = self._fit_from(directions, nearest_equivalent(found, start))
         return far if far[2].supported or near is None else near

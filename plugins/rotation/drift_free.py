@@ -65,7 +65,7 @@ class DriftFree:
             before, refined = rotation_before(previous, previous_pose, self.pose_floor_deg)
             known = KnownFrames(previous.R_world_manhattan, previous.ids, previous.weights)
             if refined:
-                known = known.updated_by(previous, before.R, self.max_weight, self.gate * math.radians(self.gate_floor_deg))
+                known = known.update(previous, before.R, self.max_weight, self.gate * math.radians(self.gate_floor_deg))
             predicted = compose_with_tracks(self, before, previous.index, tracks, keypoints, segments, planes)
         known, estimate, seen = self._fuse(known, predicted, manhattan)
         return rotation_value(keypoints.index, keypoints.stamp_ns, estimate, known, seen)

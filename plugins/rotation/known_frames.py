@@ -39,7 +39,7 @@ class KnownFrames:
         """No known frame."""
         return KnownFrames(np.zeros((0, 3, 3)), np.zeros(0, np.int32), np.zeros(0))
 
-    def updated_by(self, previous: Rotation, R_world_camera: F64, cap: float, gate: float) -> KnownFrames:
+    def update(self, previous: Rotation, R_world_camera: F64, cap: float, gate: float) -> KnownFrames:
         """Update by the previous frame's observations at its refined rotation: the mean on SO(3) of all observations.
 
         Weights are limited to `cap`, so that the mean can follow a map that moves; observations off by more than `gate` (rad) are rejected."""
