@@ -35,7 +35,7 @@ from trihedron.plugins.shared.manhattan_frames_kernels import nearest_equivalent
 @dataclass(frozen=True)
 class BranchAndBound(ModeOptions):
     """The rotation with the greatest consensus of normals, planes and lines, found among all rotations whatever the previous frame was (Bazin et al.,
-    ACCV 2012; Joo et al., CVPR 2016; consensus and bounds in `axes.consensus`, the search in `axes.rotation_search`).
+    ACCV 2012; Joo et al., CVPR 2016).
 
     What is certified, for the directions that take part in the search (`search_samples` normals spread over the image, all planes and lines): `gap`
     is how much more consensus, as a share, any rotation could have than the one returned; and unless the work limit was met, none further than
