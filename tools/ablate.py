@@ -231,7 +231,7 @@ def _computed(computing: Alternatives, combinations: Sequence[Combination], fold
     ]
     full_s = read_results(recording.path.parent / "timing.json").get("cpu_s")
     variants = [
-        Variant(combination, str(folder), one, outcome.stages_s, outcome.total_s, parting, errors=of_frames)
+        Variant(combination, str(folder), one, outcome.stages_s, outcome.total_s, outcome.rest_s, parting, errors=of_frames)
         for combination, folder, one, outcome, parting, of_frames in zip(combinations, folders, figures, computing.outcomes, partings, judged)
     ]
     case = Case(

@@ -36,6 +36,7 @@ from trihedron.pipeline.run.timing import begin_together
 from trihedron.pipeline.run.warm_up import WARM_UP_FRAMES, compilation_reported
 
 NOT_REPEATED = ("out", "report", "replay", "only", "feedback", "view", "save_map", "live", "real_time", "threads")  # words of the recorded command
+FLUSH_SECONDS = 5.0  # between two writes of a recording: an alternative that is killed is computed again
 Frames = Callable[[int, Sequence[Mapping[str, Any]]], None]
 
 
@@ -50,12 +51,14 @@ class Alternative:
 
 @dataclass
 class Outcome:
-    """An alternative that was computed: its files' content, CPU seconds of its recomputed stages, and the same with its share of all else."""
+    """An alternative that was computed: its files' content; CPU seconds of the stages that are computed for it, as if for it alone; its share of all
+    CPU seconds, those of stages that serve several included; and the part of that which is no stage: reading, recording, scheduling, results."""
 
     metrics: dict[str, Any] = field(default_factory=dict)
     timing: dict[str, Any] = field(default_factory=dict)
     stages_s: float = 0.0
     total_s: float = 0.0
+    rest_s: float = 0.0
     stage_ms: float = 0.0  # CPU milliseconds a frame of the recomputed stages, as if computed alone
 
 
@@ -155,7 +158,7 @@ class Alternatives:
         config.out = literal_text(str(folder.absolute()))
         write_configuration(folder, config, words)
         metadata = {**metadata_of(config, words), TOPICS: json.dumps(sorted(self.stages & alternative.graph.stages.keys()))}
-        return opened(folder / RECORDING, metadata, self.recording.attachments)
+        return opened(folder / RECORDING, metadata, self.recording.attachments, flush_s=FLUSH_SECONDS)
 
     def _account(self, together: SideBySide) -> None:
         """Divide the CPU time: a node's among the alternatives it serves, the rest (reading, recording, scheduling, results) equally."""
@@ -164,8 +167,9 @@ class Alternatives:
         rest = self.cpu_s - sum(seconds[node] for node in stages)
         for outcome, runner, nodes in zip(self.outcomes, self.runners, together.node_of):
             own = [node for node in nodes.values() if node in stages]
-            outcome.stages_s = sum(seconds[node] / users[node] for node in own)
-            outcome.total_s = outcome.stages_s + rest / len(self.runners)
+            outcome.stages_s = sum(seconds[node] for node in own)
+            outcome.rest_s = rest / len(self.runners)
+            outcome.total_s = sum(seconds[node] / users[node] for node in own) + outcome.rest_s
             frames = max(1, len(runner.result.stamps_ns))
             outcome.stage_ms = 1e3 * sum(seconds[node] for name, node in nodes.items() if name in self.stages) / frames
 
