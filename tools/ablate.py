@@ -2,7 +2,7 @@
 
 From each recording every combination of the given plugins, options or wires is computed, side by side: what they have in common is read or computed
 once. Each alternative is a run folder in out=DIR. By default all that follows from a swap is computed again, as a full run would, to the same bytes;
-with feedback=recorded the swapped stages alone, on the recorded past.
+with feedback=recorded each swapped stage by itself, on what was recorded.
 
 First the verdicts, a line for each pair of alternatives and figure: both figures, their difference with its 95 % interval, the effect size, and
 "better", "worse" or "no difference shown" with how many seeds more would show one of 5 %. Of one recording the interval is from its frames (blocks of

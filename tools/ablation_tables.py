@@ -55,7 +55,7 @@ class Variant:
     figures: dict[str, float]
     stages_s: float
     total_s: float
-    rest_s: float = np.nan
+    rest_s: float = 0.0
     parting: Parting = field(default_factory=Parting)
     picture: str = ""
     errors: dict[str, F64] = field(default_factory=dict, compare=False, repr=False)  # of each frame (n,), by column, NaN where there is none

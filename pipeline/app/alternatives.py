@@ -1,7 +1,7 @@
 """Alternatives of a recorded run: other plugins or options of some stages, computed side by side from the recording, each into a run folder.
 
 What the alternatives have in common is read from the recording, or computed once where it is not recorded. `Feedback.new` computes the changed stages
-and all that follows from them, delayed wires included, as a full run would; `Feedback.recorded` the changed stages alone, on the recorded past.
+and all that follows from them, delayed wires included, as a full run would; `Feedback.recorded` each changed stage by itself, on what was recorded.
 """
 
 from __future__ import annotations
