@@ -77,7 +77,8 @@ def recomputed_stages(alternatives: Sequence[Alternative], feedback: Feedback) -
 
 
 class Alternatives:
-    """Alternatives that run side by side. `run` does the work, `outcomes` has the results afterwards."""
+    """Alternatives that run side by side. `run` does the work; `node_of` then has, for each alternative, the node that computes a stage, shared with
+    others or not, and `outcomes` the results afterwards."""
 
     def __init__(self, recording: Recording, alternatives: Sequence[Alternative], feedback: Feedback, threads: int) -> None:
         self.recording, self.alternatives, self.feedback, self.threads = recording, alternatives, feedback, threads
@@ -85,6 +86,7 @@ class Alternatives:
         self.runners = [self._runner(alternative) for alternative in alternatives]
         self.outcomes = [Outcome() for _ in alternatives]
         self.shared = tuple(sorted({name for runner in self.runners for name in runner.computed} - self.stages))  # computed, not recorded
+        self.node_of: list[dict[str, str]] = []
         self.cpu_s = 0.0
 
     def _runner(self, alternative: Alternative) -> Runner:
@@ -119,6 +121,7 @@ class Alternatives:
             writers = [self._opened(alternative, folder) for alternative, folder in zip(self.alternatives, folders)]
             cpu_began = time.process_time()
             together = SideBySide(self.runners, self.threads)
+            self.node_of = together.node_of
             try:
                 begin_together([runner.timing for runner in self.runners])
                 for runner, alternative, writer in zip(self.runners, self.alternatives, writers):

@@ -257,7 +257,7 @@ def test_remarks_on_the_truth_stand_below_the_attribution():
 def test_errors_of_a_stage_alone():
     errors = StageErrors({1000 * index: np.eye(4) for index in range(4)})
     for index in range(4):
-        errors.take(["translation"], {"translation": translation(index, 0.003) if index else None})
+        errors.take("translation", {"translation": translation(index, 0.003) if index else None})
     of_frames = errors.of_frames()
     figures = errors.figures(of_frames)
     assert figures["translation mm"] == pytest.approx(3.0) and figures["values %"] == 75.0
