@@ -2,7 +2,7 @@
 
 From each recording every combination of the given plugins, options or wires is computed, side by side: what they have in common is read or computed
 once. Each alternative is a run folder in out=DIR. By default all that follows from a swap is computed again, as a full run would, to the same bytes;
-with feedback=recorded the swapped stages alone, on the recorded past.
+with feedback=recorded each swapped stage by itself, on what was recorded.
 
 First the verdicts, a line for each pair of alternatives and figure: both figures, their difference with its 95 % interval, the effect size, and
 "better", "worse" or "no difference shown" with how many seeds more would show one of 5 %. Of one recording the interval is from its frames (blocks of
@@ -209,17 +209,21 @@ def _computed(computing: Alternatives, combinations: Sequence[Combination], fold
     topics = [name for name in graphs[0].stages if name in computing.stages]
     alone = computing.feedback is Feedback.recorded
     known, true = reference_of(recording) if alone else ({}, True)
-    errors, partings = [StageErrors(known) for _ in folders], [Parting() for _ in folders]
-
+    measured = [name for name in topics if name not in FOLDS] if alone else []
+    of_nodes: dict[str, StageErrors] = {}  # by the node that computes a stage, for one alternative or several
+    partings = [Parting() for _ in folders]
     images = TopicReader(recording, "dataset").at if alone and "dataset" in recording.topics else lambda index: None
 
     def on_frame(index: int, values: Sequence[Mapping[str, Any]]) -> None:
         embedded = {RECORDED + "dataset": image} if (image := images(index)) is not None else {}
-        for one, parting, found in zip(values, partings, errors):
+        for one, parting in zip(values, partings):
             parting.compare(index, topics, values[0], one)
-            found.take([name for name in topics if name not in FOLDS] if alone else (), {**embedded, **one})
+        computed = {nodes[topic]: (topic, one) for nodes, one in zip(computing.node_of, values) for topic in measured if topic in nodes}
+        for node, (topic, one) in computed.items():
+            of_nodes.setdefault(node, StageErrors(known)).take(topic, {**embedded, **one})
 
     computing.run(folders, on_frame)
+    errors = [StageErrors.joined([of_nodes[nodes[topic]] for topic in measured if topic in nodes]) for nodes in computing.node_of]
     of_stages = [found.of_frames() for found in errors]
     own = [found.figures(of_frames) if alone else {} for found, of_frames in zip(errors, of_stages)]
     folds = of_folds(topics, folders, recording.path)
@@ -231,7 +235,7 @@ def _computed(computing: Alternatives, combinations: Sequence[Combination], fold
     ]
     full_s = read_results(recording.path.parent / "timing.json").get("cpu_s")
     variants = [
-        Variant(combination, str(folder), one, outcome.stages_s, outcome.total_s, parting, errors=of_frames)
+        Variant(combination, str(folder), one, outcome.stages_s, outcome.total_s, outcome.rest_s, parting, errors=of_frames)
         for combination, folder, one, outcome, parting, of_frames in zip(combinations, folders, figures, computing.outcomes, partings, judged)
     ]
     case = Case(

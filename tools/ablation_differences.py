@@ -92,7 +92,7 @@ def _angle_deg(R: F64) -> float:
 
 @dataclass
 class StageErrors:
-    """Errors of the values of single stages against the true poses, frame by frame, and the share of frames with a value, of one alternative."""
+    """Errors of the values of a stage, or of several, against the true poses, frame by frame, and the share of frames with a value."""
 
     truth: Mapping[int, F64]  # true pose (4, 4) by frame stamp, or that of the recorded run
     rotations_deg: dict[int, float] = field(default_factory=dict)  # by the number of the frame
@@ -105,15 +105,13 @@ class StageErrors:
     _before: Seen | None = None
     _map: Any = None  # before this frame
 
-    def take(self, topics: Iterable[str], values: Mapping[str, Any]) -> None:
-        """Add a frame."""
-        now: Seen | None = None
-        for topic in topics:
-            value = values.get(topic)
-            self.seen, self.present = self.seen + 1, self.present + isinstance(value, Value)
-            if not isinstance(value, Value) or (T := self.truth.get(value.stamp_ns)) is None:
-                continue
-            now = Seen({**values, "map": self._map}, T)
+    def take(self, topic: str, values: Mapping[str, Any]) -> None:
+        """Add a frame: the value of the stage, and what it saw, which is what was recorded, where it was, whatever other stages compute."""
+        value, now = values.get(topic), None
+        self.seen, self.present = self.seen + 1, self.present + isinstance(value, Value)
+        if isinstance(value, Value) and (T := self.truth.get(value.stamp_ns)) is not None:
+            recorded = {name.removeprefix(RECORDED): item for name, item in values.items() if name.startswith(RECORDED)}
+            now = Seen({**values, **recorded, "map": self._map, topic: value}, T)
             for column, error in measured(topic, now, self._before).items():
                 self.measures.setdefault(column, {})[self.frames] = error
             if isinstance(value, Rotation):
@@ -124,6 +122,18 @@ class StageErrors:
                 self.axes[self.frames] = T[:3, :3] @ value.rotations[0]
         self._before, self.frames = now, self.frames + 1
         self._map = values.get(RECORDED + "map") or self._map
+
+    @staticmethod
+    def joined(stages: Sequence[StageErrors]) -> StageErrors:
+        """Return the errors of several stages over the same frames as one."""
+        whole = StageErrors({})
+        for one in stages:
+            whole.rotations_deg |= one.rotations_deg
+            whole.translations_m |= one.translations_m
+            whole.axes |= one.axes
+            whole.measures |= one.measures
+            whole.frames, whole.seen, whole.present = one.frames, whole.seen + one.seen, whole.present + one.present
+        return whole
 
     def of_frames(self) -> dict[str, F64]:
         """Return each kind of error there is as an array (frames,), NaN where a frame has none."""

@@ -47,14 +47,15 @@ UNKNOWN_TRUTH = "there is no ground truth: single stages are measured by the pos
 
 @dataclass
 class Variant:
-    """An alternative of one recording: its folder, figures by column (NaN: none), CPU seconds of its recomputed stages and with its share of all
-    else, and where it leaves the recorded configuration."""
+    """An alternative of one recording: its folder, figures by column (NaN: none), CPU seconds as in `Outcome`, and where it leaves the recorded
+    configuration."""
 
     combination: Combination
     folder: str
     figures: dict[str, float]
     stages_s: float
     total_s: float
+    rest_s: float = 0.0
     parting: Parting = field(default_factory=Parting)
     picture: str = ""
     errors: dict[str, F64] = field(default_factory=dict, compare=False, repr=False)  # of each frame (n,), by column, NaN where there is none
@@ -300,13 +301,14 @@ def farthest(group: Sequence[tuple[Case, Variant]]) -> tuple[Case, Variant]:
 
 def cost_table(cases: Sequence[Case]) -> Section:
     """CPU time of each alternative, over all recordings."""
-    rows = [["change", "stages s", "with all else s", "× its stages", "full run s", "× less"]]
+    rows = [["change", "stages alone s", "cost s", "of it no stage s", "× its stages", "full run s", "× less"]]
     for label, group in by_change(cases).items():
-        stages, total = (sum(getattr(variant, name) for _, variant in group) for name in ("stages_s", "total_s"))
+        stages, total, rest = (sum(getattr(variant, name) for _, variant in group) for name in ("stages_s", "total_s", "rest_s"))
         full = sum(case.full_s for case, _ in group)
         known = np.isfinite(full) and total > 0.0
         ratio = f"{total / stages:.2f}" if stages > 0.0 else "-"
-        rows.append([label, f"{stages:.2f}", f"{total:.2f}", ratio, f"{full:.2f}" if known else "-", f"{full / total:.1f}" if known else "-"])
+        against = [f"{full:.2f}", f"{full / total:.1f}"] if known else ["-", "-"]
+        rows.append([label, f"{stages:.2f}", f"{total:.2f}", f"{rest:.2f}", ratio, *against])
     shared = sorted({name for case in cases for name in case.shared})
-    note = "CPU seconds; nodes that serve several alternatives, reading and recording are divided among them"
-    return Section("Cost", rows, "lrrrrr", note + (f"; not recorded, so computed once for all: {', '.join(shared)}" if shared else ""))
+    note = "CPU seconds; a cost has a share of each stage that serves several alternatives; no stage are reading, recording, scheduling and results"
+    return Section("Cost", rows, "lrrrrrr", note + (f"; not recorded, so computed once for all: {', '.join(shared)}" if shared else ""))

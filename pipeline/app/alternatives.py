@@ -1,7 +1,7 @@
 """Alternatives of a recorded run: other plugins or options of some stages, computed side by side from the recording, each into a run folder.
 
 What the alternatives have in common is read from the recording, or computed once where it is not recorded. `Feedback.new` computes the changed stages
-and all that follows from them, delayed wires included, as a full run would; `Feedback.recorded` the changed stages alone, on the recorded past.
+and all that follows from them, delayed wires included, as a full run would; `Feedback.recorded` each changed stage by itself, on what was recorded.
 """
 
 from __future__ import annotations
@@ -36,6 +36,7 @@ from trihedron.pipeline.run.timing import begin_together
 from trihedron.pipeline.run.warm_up import WARM_UP_FRAMES, compilation_reported
 
 NOT_REPEATED = ("out", "report", "replay", "only", "feedback", "view", "save_map", "live", "real_time", "threads")  # words of the recorded command
+FLUSH_SECONDS = 5.0  # between two writes of a recording: an alternative that is killed is computed again
 Frames = Callable[[int, Sequence[Mapping[str, Any]]], None]
 
 
@@ -50,12 +51,14 @@ class Alternative:
 
 @dataclass
 class Outcome:
-    """An alternative that was computed: its files' content, CPU seconds of its recomputed stages, and the same with its share of all else."""
+    """An alternative that was computed: its files' content; CPU seconds of the stages that are computed for it, as if for it alone; its share of all
+    CPU seconds, those of stages that serve several included; and the part of that which is no stage: reading, recording, scheduling, results."""
 
     metrics: dict[str, Any] = field(default_factory=dict)
     timing: dict[str, Any] = field(default_factory=dict)
     stages_s: float = 0.0
     total_s: float = 0.0
+    rest_s: float = 0.0
     stage_ms: float = 0.0  # CPU milliseconds a frame of the recomputed stages, as if computed alone
 
 
@@ -74,7 +77,8 @@ def recomputed_stages(alternatives: Sequence[Alternative], feedback: Feedback) -
 
 
 class Alternatives:
-    """Alternatives that run side by side. `run` does the work, `outcomes` has the results afterwards."""
+    """Alternatives that run side by side. `run` does the work; `node_of` then has, for each alternative, the node that computes a stage, shared with
+    others or not, and `outcomes` the results afterwards."""
 
     def __init__(self, recording: Recording, alternatives: Sequence[Alternative], feedback: Feedback, threads: int) -> None:
         self.recording, self.alternatives, self.feedback, self.threads = recording, alternatives, feedback, threads
@@ -82,6 +86,7 @@ class Alternatives:
         self.runners = [self._runner(alternative) for alternative in alternatives]
         self.outcomes = [Outcome() for _ in alternatives]
         self.shared = tuple(sorted({name for runner in self.runners for name in runner.computed} - self.stages))  # computed, not recorded
+        self.node_of: list[dict[str, str]] = []
         self.cpu_s = 0.0
 
     def _runner(self, alternative: Alternative) -> Runner:
@@ -116,6 +121,7 @@ class Alternatives:
             writers = [self._opened(alternative, folder) for alternative, folder in zip(self.alternatives, folders)]
             cpu_began = time.process_time()
             together = SideBySide(self.runners, self.threads)
+            self.node_of = together.node_of
             try:
                 begin_together([runner.timing for runner in self.runners])
                 for runner, alternative, writer in zip(self.runners, self.alternatives, writers):
@@ -155,7 +161,7 @@ class Alternatives:
         config.out = literal_text(str(folder.absolute()))
         write_configuration(folder, config, words)
         metadata = {**metadata_of(config, words), TOPICS: json.dumps(sorted(self.stages & alternative.graph.stages.keys()))}
-        return opened(folder / RECORDING, metadata, self.recording.attachments)
+        return opened(folder / RECORDING, metadata, self.recording.attachments, flush_s=FLUSH_SECONDS)
 
     def _account(self, together: SideBySide) -> None:
         """Divide the CPU time: a node's among the alternatives it serves, the rest (reading, recording, scheduling, results) equally."""
@@ -164,8 +170,9 @@ class Alternatives:
         rest = self.cpu_s - sum(seconds[node] for node in stages)
         for outcome, runner, nodes in zip(self.outcomes, self.runners, together.node_of):
             own = [node for node in nodes.values() if node in stages]
-            outcome.stages_s = sum(seconds[node] / users[node] for node in own)
-            outcome.total_s = outcome.stages_s + rest / len(self.runners)
+            outcome.stages_s = sum(seconds[node] for node in own)
+            outcome.rest_s = rest / len(self.runners)
+            outcome.total_s = sum(seconds[node] / users[node] for node in own) + outcome.rest_s
             frames = max(1, len(runner.result.stamps_ns))
             outcome.stage_ms = 1e3 * sum(seconds[node] for name, node in nodes.items() if name in self.stages) / frames
 

@@ -59,7 +59,7 @@ Usage: trihedron run [-m] [key=value ...]
   view=foxglove | view=rerun         watch the run; view.port=8765; view.web=true serves rerun to a browser
   live=true                          play the data set in real time; frames that come while it is busy are dropped, latency is reported
   real_time=true                     the same without dropping any
-  feedback=recorded                  delayed wires of recomputed stages see the recorded past
+  feedback=recorded                  each recomputed stage by itself: all its inputs are as recorded
   -m                                 sweep over comma-separated values, on all cores; the same again does what is missing
   -m ... --dry-run                   say which jobs a sweep has, which are done, and which stages they share; run nothing
   sequences=[KIND:FOLDER,...]        of a sweep: several data sets, for example ["tum:/data/desk frames=0:300",synthetic]

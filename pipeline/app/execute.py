@@ -27,6 +27,7 @@ from trihedron.pipeline.core.overrides import literal_text, path_of, quoted
 from trihedron.pipeline.core.slots import SLOTS, output_of
 from trihedron.pipeline.core.types import Building, Surface, Trajectory
 from trihedron.pipeline.record.foxglove_server import FoxgloveServer
+from trihedron.pipeline.record.mcap_writer import FLUSH_SECONDS
 from trihedron.pipeline.record.reader import Recording
 from trihedron.pipeline.record.trajectories import TRUTH, attached_truth, format_trajectory
 from trihedron.pipeline.record.writer import RecordingWriter
@@ -105,9 +106,11 @@ def _execute(config: DictConfig, out: Path, overrides: list[str], began: float, 
     return metrics
 
 
-def opened(path: Path, metadata: Mapping[str, str], attachments: Mapping[str, str], server: FoxgloveServer | None = None) -> RecordingWriter:
+def opened(
+    path: Path, metadata: Mapping[str, str], attachments: Mapping[str, str], server: FoxgloveServer | None = None, flush_s: float = FLUSH_SECONDS
+) -> RecordingWriter:
     """Open the recording and attach its texts."""
-    writer = RecordingWriter(path, metadata, server)
+    writer = RecordingWriter(path, metadata, server, flush_s)
     for name, text in attachments.items():
         writer.attach(name, text)
     return writer

@@ -31,7 +31,7 @@ SWEEPER, SEARCH, DASK = (f"hydra_plugins.trihedron.{name}" for name in ("Sweeper
 
 
 class Feedback(Enum):
-    """Values that a recomputed stage's delayed wires read in a replay: the new ones, or those of the recording."""
+    """Values of recomputed stages that the others of them, and they themselves later, read in a replay: the new ones, or those of the recording."""
 
     new = "new"
     recorded = "recorded"

@@ -36,11 +36,11 @@ class McapWriter:
     """One file, or none; `server` sends the same messages to viewers at once. Once the disk refuses the file, a warning reports that, what follows is
     dropped, so that the run can go on, and `close` raises RecordingError."""
 
-    def __init__(self, path: Path | None, server: FoxgloveServer | None = None) -> None:
-        """Raises RecordingError when the file cannot be written or another process is writing it."""
-        self.path = path
+    def __init__(self, path: Path | None, server: FoxgloveServer | None = None, flush_s: float = FLUSH_SECONDS) -> None:
+        """`flush_s` is the most that a kill may cost. Raises RecordingError when the file cannot be written or another process is writing it."""
+        self.path, self._flush_s = path, flush_s
         self._context = server.context if server is not None else foxglove.Context()
-        self._period_s = LIVE_SECONDS if server is not None else FLUSH_SECONDS
+        self._period_s = LIVE_SECONDS if server is not None else flush_s
         self._file = _File(path) if path is not None else None
         options = MCAPWriteOptions(chunk_size=CHUNK_BYTES, compression_level=LEVEL, compression_threads=0, disable_seeking=True)
         self._writer = foxglove.open_mcap(self._file, context=self._context, writer_options=options) if self._file is not None else None
@@ -124,7 +124,7 @@ class McapWriter:
             closing = self._closing
             with self._writing:
                 pending = self._take_all() or pending
-                if pending and (closing or self._period_s == FLUSH_SECONDS or time.monotonic() - flushed_s >= FLUSH_SECONDS):
+                if pending and (closing or self._period_s == self._flush_s or time.monotonic() - flushed_s >= self._flush_s):
                     self._end_chunk()
                     pending, flushed_s = False, time.monotonic()
             self._room.set()

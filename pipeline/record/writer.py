@@ -15,7 +15,7 @@ from trihedron.pipeline.record.codec import FORMAT, FRAMES_TOPIC, METADATA, TIMI
 from trihedron.pipeline.record.embedded_images import messages_of
 from trihedron.pipeline.record.foxglove import TopicView
 from trihedron.pipeline.record.foxglove_server import FoxgloveServer
-from trihedron.pipeline.record.mcap_writer import McapWriter
+from trihedron.pipeline.record.mcap_writer import FLUSH_SECONDS, McapWriter
 from trihedron.pipeline.record.schemas import PACKAGE, definition, message_class
 
 SPARSE_BYTES = 1 << 15  # assumed size of a value of a topic that is not dense
@@ -26,10 +26,10 @@ class RecordingWriter:
 
     Metadata comes first. When the file cannot be written any more, a warning reports it, and `close` raises RecordingError."""
 
-    def __init__(self, path: Path | None, metadata: Mapping[str, str], server: FoxgloveServer | None = None) -> None:
-        """Write to a file, or none; what viewers show goes to `server` too."""
+    def __init__(self, path: Path | None, metadata: Mapping[str, str], server: FoxgloveServer | None = None, flush_s: float = FLUSH_SECONDS) -> None:
+        """Write to a file, or none, at least every `flush_s` seconds; what viewers show goes to `server` too."""
         self.path = path
-        self._file = McapWriter(path, server)
+        self._file = McapWriter(path, server, flush_s)
         self._file.metadata(METADATA, {"format": FORMAT, **metadata})
         self._channels: dict[str, int] = {}
         self._encoders: dict[str, Encoder] = {}

@@ -30,7 +30,8 @@ TOPICS = "topics"  # metadata of a recording: the stages whose values it holds, 
 
 @dataclass(frozen=True)
 class Replay:
-    """A recording to read from, the stages to compute again, and whether delayed wires of those see the recorded past."""
+    """A recording to read from, the stages to compute again, and whether these see the recording alone: not what others of them, or they themselves
+    a frame before, compute now. What the recording lacks they see as computed."""
 
     recording: Recording
     only: tuple[str, ...]
@@ -84,8 +85,8 @@ class Plan:
     def source(self, parameter: str, wire: Wire) -> Wire:
         """Return the wire of a computed stage's input as nodes have it: from another computed stage, or from the file."""
         topic = FRAMES_TOPIC if parameter == CAMERA else wire.topic
-        feedback = self.replay is not None and self.replay.recorded_feedback and wire.delay and wire.topic in self.replay.topics
-        return Wire(RECORDED + topic, wire.delay) if wire.topic not in self.computed or feedback else wire
+        recorded = self.replay is not None and self.replay.recorded_feedback and wire.topic in self.replay.topics
+        return Wire(RECORDED + topic, wire.delay) if wire.topic not in self.computed or recorded else wire
 
 
 def plan_run(graph: Graph, replay: Replay | None, frames: str) -> Plan:

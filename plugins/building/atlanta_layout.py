@@ -7,8 +7,8 @@ from functools import partial
 
 from trihedron.pipeline.core.registry import register
 from trihedron.pipeline.core.types import Building, Frame, Map, Planes, Pose, Rotation
-from trihedron.plugins.building.common import Gathered, add_view
-from trihedron.plugins.building.common_layout import AtlantaOptions, atlanta_directions, plan_building, preview_state
+from trihedron.plugins.building.layout import AtlantaOptions, atlanta_directions, plan_building
+from trihedron.plugins.building.views import BuildingState, add_view, preview_state
 
 
 @register("building", "atlanta_layout")
@@ -17,18 +17,18 @@ class AtlantaLayout(AtlantaOptions):
     """Extend `manhattan_layout` by further directions of walls: the peaks of the upright regions' normals about the vertical (Schindler, Dellaert,
     CVPR 2004, "Atlanta world"). An edge along none of the axes is turned to its own points."""
 
-    def start(self) -> Gathered:
+    def start(self) -> BuildingState:
         """Return an empty state."""
-        return Gathered()
+        return BuildingState()
 
-    def add(self, state: Gathered, frame: Frame, planes: Planes, rotation: Rotation | None, pose: Pose, map: Map | None) -> Gathered:
+    def add(self, state: BuildingState, frame: Frame, planes: Planes, rotation: Rotation | None, pose: Pose, map: Map | None) -> BuildingState:
         """Retain the frame if it became a keyframe."""
         return add_view(self, state, frame, planes, rotation, pose, map)
 
-    def preview(self, state: Gathered) -> Building:
+    def preview(self, state: BuildingState) -> Building:
         """Return the plan so far of a few views, at their poses as they are now."""
         return self.finish(preview_state(state), state.map)
 
-    def finish(self, state: Gathered, map: Map | None) -> Building:
+    def finish(self, state: BuildingState, map: Map | None) -> Building:
         """Return the plan at the final poses."""
         return plan_building(self, state, map, partial(atlanta_directions, self))

@@ -10,8 +10,9 @@ import numpy as np
 from trihedron.pipeline.core.options import PositiveFloat
 from trihedron.pipeline.core.registry import register
 from trihedron.pipeline.core.types import Bool, Building, Frame, Map, Planes, Pose, Rotation
-from trihedron.plugins.building.common import Gathered, add_view
-from trihedron.plugins.building.common_layout import AtlantaOptions, Cells, atlanta_directions, plan_building, preview_state
+from trihedron.plugins.building.cell_complex import Cells
+from trihedron.plugins.building.layout import AtlantaOptions, atlanta_directions, plan_building
+from trihedron.plugins.building.views import BuildingState, add_view, preview_state
 
 SCALE = 10_000  # capacities are whole numbers
 
@@ -24,19 +25,19 @@ class CellComplex(AtlantaOptions):
 
     open_border_m: PositiveFloat = 0.05  # area in m² that a metre of border without a wall costs
 
-    def start(self) -> Gathered:
+    def start(self) -> BuildingState:
         """Return an empty state."""
-        return Gathered()
+        return BuildingState()
 
-    def add(self, state: Gathered, frame: Frame, planes: Planes, rotation: Rotation | None, pose: Pose, map: Map | None) -> Gathered:
+    def add(self, state: BuildingState, frame: Frame, planes: Planes, rotation: Rotation | None, pose: Pose, map: Map | None) -> BuildingState:
         """Retain the frame if it became a keyframe."""
         return add_view(self, state, frame, planes, rotation, pose, map)
 
-    def preview(self, state: Gathered) -> Building:
+    def preview(self, state: BuildingState) -> Building:
         """Return the plan so far of a few views, at their poses as they are now."""
         return self.finish(preview_state(state), state.map)
 
-    def finish(self, state: Gathered, map: Map | None) -> Building:
+    def finish(self, state: BuildingState, map: Map | None) -> Building:
         """Return the plan at the final poses."""
         return plan_building(self, state, map, partial(atlanta_directions, self), self._inside)
 

@@ -6,8 +6,11 @@ from dataclasses import dataclass
 
 from trihedron.pipeline.core.registry import register
 from trihedron.pipeline.core.types import Building, Frame, Map, Planes, Pose, Rotation
-from trihedron.plugins.building.common import Evidence, Gathered, LayoutOptions, Storey, add_view, slanted_directions
-from trihedron.plugins.building.common_layout import AXES, plan_building, preview_state
+from trihedron.plugins.building.evidence import Evidence
+from trihedron.plugins.building.faces import slanted_directions
+from trihedron.plugins.building.layout import AXES, plan_building
+from trihedron.plugins.building.levels import Storey
+from trihedron.plugins.building.views import BuildingState, LayoutOptions, add_view, preview_state
 
 APART_DEG, LEAST_M2 = 6.0, 3.0  # from the axes, and area of tall points of all views, for which a slanted wall is mentioned
 
@@ -17,19 +20,19 @@ APART_DEG, LEAST_M2 = 6.0, 3.0  # from the axes, and area of tall points of all 
 class ManhattanLayout(LayoutOptions):
     """Cut the plan along the faces of walls in the two horizontal Manhattan axes; what rays passed is inside, what tall faces part are two rooms."""
 
-    def start(self) -> Gathered:
+    def start(self) -> BuildingState:
         """Return an empty state."""
-        return Gathered()
+        return BuildingState()
 
-    def add(self, state: Gathered, frame: Frame, planes: Planes, rotation: Rotation | None, pose: Pose, map: Map | None) -> Gathered:
+    def add(self, state: BuildingState, frame: Frame, planes: Planes, rotation: Rotation | None, pose: Pose, map: Map | None) -> BuildingState:
         """Retain the frame if it became a keyframe."""
         return add_view(self, state, frame, planes, rotation, pose, map)
 
-    def preview(self, state: Gathered) -> Building:
+    def preview(self, state: BuildingState) -> Building:
         """Return the plan so far of a few views, at their poses as they are now."""
         return self.finish(preview_state(state), state.map)
 
-    def finish(self, state: Gathered, map: Map | None) -> Building:
+    def finish(self, state: BuildingState, map: Map | None) -> Building:
         """Return the plan at the final poses."""
         return plan_building(self, state, map, lambda evidence, storey: AXES, remark=slanted_walls)
 

@@ -13,7 +13,7 @@ from trihedron.pipeline.core.linalg import matmul
 from trihedron.pipeline.core.options import NonNegativeInt, PositiveFloat, PositiveInt
 from trihedron.pipeline.core.registry import register
 from trihedron.pipeline.core.types import I32, Correction, Map
-from trihedron.plugins.bundle.common import BundleMeasurements, BundleState, BundleWindow, bundle_problem, bundle_window, free_poses
+from trihedron.plugins.bundle.window import BundleMeasurements, BundleState, BundleWindow, bundle_problem, bundle_window, free_poses
 from trihedron.plugins.mapping.covisibility_graph import newest_keyframes
 from trihedron.plugins.mapping.landmarks import ENDPOINTS, POSITION
 from trihedron.plugins.shared import libraries

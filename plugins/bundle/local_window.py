@@ -13,7 +13,6 @@ from trihedron.pipeline.core.linalg_kernels import solve_positive
 from trihedron.pipeline.core.options import NonNegativeInt, PositiveFloat, PositiveInt, Range
 from trihedron.pipeline.core.registry import register
 from trihedron.pipeline.core.types import F64, Correction, Map
-from trihedron.plugins.bundle.common import BundleMeasurements, BundleState, BundleWindow, bundle_problem, bundle_window, free_poses
 from trihedron.plugins.bundle.local_window_kernels import (
     HUBER,
     SQUARES,
@@ -25,6 +24,7 @@ from trihedron.plugins.bundle.local_window_kernels import (
     reduce_system,
     retract,
 )
+from trihedron.plugins.bundle.window import BundleMeasurements, BundleState, BundleWindow, bundle_problem, bundle_window, free_poses
 from trihedron.plugins.mapping.covisibility_graph import newest_keyframes
 from trihedron.plugins.mapping.landmarks import ENDPOINTS, POSITION
 from trihedron.plugins.shared.linalg import inverse

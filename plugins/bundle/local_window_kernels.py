@@ -14,7 +14,7 @@ import numpy as np
 from trihedron.pipeline.core.kernel import kernel
 from trihedron.pipeline.core.linalg_kernels import dot, invert_symmetric, matmul, matvec, tangent_columns
 from trihedron.pipeline.core.types import F64, I32
-from trihedron.plugins.bundle.common import BundleMeasurements, BundleState
+from trihedron.plugins.bundle.window import BundleMeasurements, BundleState
 from trihedron.plugins.mapping.landmark_kernels import EXTEND
 from trihedron.plugins.shared.lie_kernels import log_so3
 from trihedron.plugins.shared.pose_optimizer_kernels import (

@@ -11,7 +11,7 @@ import cv2
 from trihedron.pipeline.core.options import PositiveFloat, PositiveInt
 from trihedron.pipeline.core.registry import register
 from trihedron.pipeline.core.types import Frame, Keypoints
-from trihedron.plugins.keypoints.common import LiftOptions, detected
+from trihedron.plugins.keypoints.lifting import LiftOptions, detect_and_lift
 from trihedron.plugins.shared.per_thread import PerThread
 
 
@@ -29,12 +29,12 @@ class Akaze(LiftOptions):
 
     def __call__(self, frame: Frame) -> Keypoints:
         """Key points in OpenCV's order; (n, 61) binary descriptors."""
-        return detected(self, self._detector(), frame, 4.8, 61, "hamming", 40)
+        return detect_and_lift(self, self._detector(), frame, 4.8, 61, "hamming", 40)
 
     @cached_property
     def _detector(self) -> PerThread[Any]:
         """OpenCV's detector of each thread."""
-        return PerThread(self._made)
+        return PerThread(self._make_detector)
 
-    def _made(self) -> Any:
+    def _make_detector(self) -> Any:
         return cv2.xfeatures2d.AKAZE_create(threshold=self.threshold, nOctaves=self.octaves, nOctaveLayers=self.octave_layers)

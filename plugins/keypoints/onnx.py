@@ -11,7 +11,7 @@ import numpy as np
 from trihedron.pipeline.core.options import NonNegativeFloat, NonNegativeInt
 from trihedron.pipeline.core.registry import register
 from trihedron.pipeline.core.types import Frame, Keypoints
-from trihedron.plugins.keypoints.common import LiftOptions, lifted
+from trihedron.plugins.keypoints.lifting import LiftOptions, lift_keypoints
 from trihedron.plugins.shared.networks import NetworkOptions, bytes_of, network_image
 
 
@@ -74,4 +74,4 @@ class OnnxKeypoints(NetworkOptions, LiftOptions):
         inside = ((pixels >= 0.0) & (pixels <= [width - 1, height - 1])).all(axis=1) & (scores >= self.min_score)
         order = np.flatnonzero(inside)[np.argsort(-scores[inside], kind="stable")][: self.features or None]
         alike = np.ones(len(order)), np.zeros(len(order), np.float32)  # one scale, no direction
-        return lifted(self, frame, np.ascontiguousarray(pixels[order], np.float32), *alike, bytes_of(descriptors[order]), "l2")
+        return lift_keypoints(self, frame, np.ascontiguousarray(pixels[order], np.float32), *alike, bytes_of(descriptors[order]), "l2")

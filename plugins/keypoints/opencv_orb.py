@@ -11,7 +11,7 @@ import cv2
 from trihedron.pipeline.core.options import PositiveInt, Range
 from trihedron.pipeline.core.registry import register
 from trihedron.pipeline.core.types import Frame, Keypoints
-from trihedron.plugins.keypoints.common import LiftOptions, detected
+from trihedron.plugins.keypoints.lifting import LiftOptions, detect_and_lift
 from trihedron.plugins.shared.per_thread import PerThread
 
 
@@ -30,13 +30,13 @@ class OpenCvOrb(LiftOptions):
 
     def __call__(self, frame: Frame) -> Keypoints:
         """At most `features` key points in OpenCV's order; (n, 32) binary descriptors."""
-        return detected(self, self._detector(), frame, 31.0, 32, "hamming", 2 * self.edge_px + 1)
+        return detect_and_lift(self, self._detector(), frame, 31.0, 32, "hamming", 2 * self.edge_px + 1)
 
     @cached_property
     def _detector(self) -> PerThread[Any]:
         """OpenCV's detector of each thread."""
-        return PerThread(self._made)
+        return PerThread(self._make_detector)
 
-    def _made(self) -> Any:
+    def _make_detector(self) -> Any:
         options = {"nfeatures": self.features, "scaleFactor": self.scale, "nlevels": self.levels, "edgeThreshold": self.edge_px}
         return cv2.ORB_create(**options, fastThreshold=self.fast_threshold)

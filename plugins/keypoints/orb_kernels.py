@@ -26,9 +26,9 @@ def oriented_corners(
     pixels, levels, strengths = _candidates(pyramid, threshold_low, margin)
     cells, number = _grid_cells(pixels, levels, pyramid.shapes, cell_px)
     kept = _strong_or_rare(strengths >= threshold, cells, number, wanted)
-    pixels, levels, cells = _rows(kept, pixels, levels, cells)
-    kept = spread_over_cells(cells, number, descending(_measured(pyramid, pixels, levels, weights)), wanted)
-    pixels, levels, cells = _rows(kept, pixels, levels, cells)
+    pixels, levels, cells = _select(kept, pixels, levels, cells)
+    kept = spread_over_cells(cells, number, descending(_harris_scores(pyramid, pixels, levels, weights)), wanted)
+    pixels, levels, cells = _select(kept, pixels, levels, cells)
     return pixels, levels, _directions(pyramid, pixels, levels)
 
 
@@ -71,21 +71,21 @@ def _strong_or_rare(strong: Bool, cells: I32, number: int, wanted: int) -> Bool:
 
 
 @kernel
-def _rows(kept: Bool, pixels: I32, levels: I32, cells: I32) -> tuple[I32, I32, I32]:
-    """The kept ones of corners."""
+def _select(kept: Bool, pixels: I32, levels: I32, cells: I32) -> tuple[I32, I32, I32]:
+    """Select the corners that are kept: pixels, levels and cells."""
     n = 0
     for i in range(len(kept)):
         n += kept[i]
-    some, at, of, n = np.empty((n, 2), np.int32), np.empty(n, np.int32), np.empty(n, np.int32), 0
+    kept_pixels, kept_levels, kept_cells, n = np.empty((n, 2), np.int32), np.empty(n, np.int32), np.empty(n, np.int32), 0
     for i in range(len(kept)):
         if kept[i]:
-            some[n, 0], some[n, 1], at[n], of[n] = pixels[i, 0], pixels[i, 1], levels[i], cells[i]
+            kept_pixels[n, 0], kept_pixels[n, 1], kept_levels[n], kept_cells[n] = pixels[i, 0], pixels[i, 1], levels[i], cells[i]
             n += 1
-    return some, at, of
+    return kept_pixels, kept_levels, kept_cells
 
 
 @kernel
-def _measured(pyramid: Pyramid, pixels: I32, levels: I32, weights: F64) -> F64:
+def _harris_scores(pyramid: Pyramid, pixels: I32, levels: I32, weights: F64) -> F64:
     """(n,) Harris measure times the level's weight."""
     out = np.empty(len(pixels))
     for i in range(len(pixels)):

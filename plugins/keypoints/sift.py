@@ -11,7 +11,7 @@ import cv2
 from trihedron.pipeline.core.options import NonNegativeFloat, NonNegativeInt, PositiveFloat, PositiveInt
 from trihedron.pipeline.core.registry import register
 from trihedron.pipeline.core.types import Frame, Keypoints
-from trihedron.plugins.keypoints.common import LiftOptions, detected
+from trihedron.plugins.keypoints.lifting import LiftOptions, detect_and_lift
 from trihedron.plugins.shared.per_thread import PerThread
 
 
@@ -30,13 +30,13 @@ class Sift(LiftOptions):
 
     def __call__(self, frame: Frame) -> Keypoints:
         """Key points in OpenCV's order; (n, 128) descriptors, `metric` l2."""
-        return detected(self, self._detector(), frame, 2.0 * self.blur_px, 128, "l2", 8)
+        return detect_and_lift(self, self._detector(), frame, 2.0 * self.blur_px, 128, "l2", 8)
 
     @cached_property
     def _detector(self) -> PerThread[Any]:
         """OpenCV's detector of each thread."""
-        return PerThread(self._made)
+        return PerThread(self._make_detector)
 
-    def _made(self) -> Any:
+    def _make_detector(self) -> Any:
         thresholds = {"contrastThreshold": self.contrast_threshold, "edgeThreshold": self.edge_threshold}
         return cv2.SIFT_create(nfeatures=self.features, nOctaveLayers=self.octave_layers, sigma=self.blur_px, **thresholds)

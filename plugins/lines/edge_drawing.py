@@ -11,7 +11,7 @@ import cv2
 from trihedron.pipeline.core.options import NonNegativeFloat, Range
 from trihedron.pipeline.core.registry import register
 from trihedron.pipeline.core.types import Frame, LineSegments
-from trihedron.plugins.lines.common import SMALLEST, LineOptions, line_segments, reduced
+from trihedron.plugins.lines.segment_completion import MIN_SIDE_PX, LineOptions, line_segments, reduce_image
 from trihedron.plugins.shared.per_thread import PerThread
 
 
@@ -31,8 +31,8 @@ class EdgeDrawing(LineOptions):
 
     def __call__(self, frame: Frame) -> LineSegments:
         """The longest segments, longest first; (n, 32) binary descriptors."""
-        small, found = reduced(self, frame.gray), None
-        if min(small.shape) >= SMALLEST:
+        small, found = reduce_image(self, frame.gray), None
+        if min(small.shape) >= MIN_SIDE_PX:
             detector = self._detector()
             detector.detectEdges(small)
             found = detector.detectLines()
@@ -41,9 +41,9 @@ class EdgeDrawing(LineOptions):
     @cached_property
     def _detector(self) -> PerThread[Any]:
         """The detector of each thread: it holds the edges between its two steps."""
-        return PerThread(self._made)
+        return PerThread(self._make_detector)
 
-    def _made(self) -> Any:
+    def _make_detector(self) -> Any:
         options = cv2.ximgproc.EdgeDrawing.Params()
         options.EdgeDetectionOperator = cv2.ximgproc.EdgeDrawing_PREWITT
         options.GradientThresholdValue, options.AnchorThresholdValue = self.gradient, self.anchor

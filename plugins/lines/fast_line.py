@@ -11,7 +11,7 @@ import cv2
 from trihedron.pipeline.core.options import NonNegativeFloat, PositiveFloat, Range, check_increasing
 from trihedron.pipeline.core.registry import register
 from trihedron.pipeline.core.types import Frame, LineSegments
-from trihedron.plugins.lines.common import SMALLEST, LineOptions, line_segments, reduced
+from trihedron.plugins.lines.segment_completion import MIN_SIDE_PX, LineOptions, line_segments, reduce_image
 from trihedron.plugins.shared.per_thread import PerThread
 
 
@@ -33,16 +33,16 @@ class FastLine(LineOptions):
 
     def __call__(self, frame: Frame) -> LineSegments:
         """The longest segments, longest first; (n, 32) binary descriptors."""
-        small = reduced(self, frame.gray)
-        found = self._detector().detect(small) if min(small.shape) >= SMALLEST else None
+        small = reduce_image(self, frame.gray)
+        found = self._detector().detect(small) if min(small.shape) >= MIN_SIDE_PX else None
         return line_segments(self, frame, small, found)
 
     @cached_property
     def _detector(self) -> PerThread[Any]:
         """The detector of each thread."""
-        return PerThread(self._made)
+        return PerThread(self._make_detector)
 
-    def _made(self) -> Any:
+    def _make_detector(self) -> Any:
         """Make a detector. Runs half as long as the shortest segment wanted are kept: they may be fragments of one."""
         shortest = max(int(0.5 * self.min_length_px * self.scale), 3)
         return cv2.ximgproc.createFastLineDetector(shortest, self.straight_px, self.weak, self.strong, 3, False)

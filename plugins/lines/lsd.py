@@ -10,8 +10,8 @@ import numpy as np
 from trihedron.pipeline.core.options import PositiveFloat, PositiveShare, Range
 from trihedron.pipeline.core.registry import register
 from trihedron.pipeline.core.types import Frame, LineSegments
-from trihedron.plugins.lines.common import LineOptions, line_segments, reduced
 from trihedron.plugins.lines.lsd_kernels import line_support_segments
+from trihedron.plugins.lines.segment_completion import LineOptions, line_segments, reduce_image
 
 
 @register("lines", "lsd")
@@ -26,6 +26,6 @@ class Lsd(LineOptions):
 
     def __call__(self, frame: Frame) -> LineSegments:
         """The longest segments, longest first; (n, 32) binary descriptors."""
-        small = reduced(self, frame.gray)
+        small = reduce_image(self, frame.gray)
         found = line_support_segments(small, float(np.radians(self.tolerance_deg)), self.quantisation, self.density)
         return line_segments(self, frame, small, found)

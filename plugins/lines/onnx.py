@@ -13,7 +13,7 @@ import numpy as np
 from trihedron.pipeline.core.options import PositiveFloat, PositiveInt, Range, Share
 from trihedron.pipeline.core.registry import register
 from trihedron.pipeline.core.types import F32, F64, Frame, LineSegments
-from trihedron.plugins.lines.common import SMALLEST, LineOptions, line_segments, reduced
+from trihedron.plugins.lines.segment_completion import MIN_SIDE_PX, LineOptions, line_segments, reduce_image
 from trihedron.plugins.shared.networks import NetworkImage, NetworkOptions, network_image
 from trihedron.plugins.shared.per_thread import PerThread
 
@@ -45,27 +45,27 @@ class OnnxLines(NetworkOptions, LineOptions):
     def __call__(self, frame: Frame) -> LineSegments:
         """The longest segments, longest first; (n, 32) binary descriptors."""
         network = self.network
-        small = reduced(self, frame.gray)
-        if min(frame.gray.shape) < SMALLEST:
+        small = reduce_image(self, frame.gray)
+        if min(frame.gray.shape) < MIN_SIDE_PX:
             return line_segments(self, frame, small, None)
         image = network_image(frame, network, "image", 3 if self.channels > 1 else 1, self.multiple)
         if self.output is LineOutput.distance_field:
             field = network.rows("df", network.run({"image": image.tensor}, ("df",))[0], *image.tensor.shape[2:])
-            ends = self._traced(field)
+            ends = self._trace(field)
         else:
             outputs = network.run({"image": image.tensor}, ("lines", "scores"))
             ends = network.rows("lines", outputs[0], None, 4)
             ends = ends[network.rows("scores", outputs[1], len(ends)) >= self.min_score]
-        return line_segments(self, frame, small, self._clipped(ends, image, frame) * self.scale)
+        return line_segments(self, frame, small, self._clip(ends, image, frame) * self.scale)
 
-    def _clipped(self, ends: F32, image: NetworkImage, frame: Frame) -> F64:
+    def _clip(self, ends: F32, image: NetworkImage, frame: Frame) -> F64:
         """Segments (n, 4) in the frame's pixels, those that lie outside left out."""
         pixels = image.pixels(ends.reshape(-1, 2, 2))
         height, width = frame.gray.shape
         inside = ((pixels > -1.0) & (pixels < [width, height])).all(axis=(1, 2))
         return np.clip(pixels[inside], 0.0, [width - 1.0, height - 1.0]).reshape(-1, 4)
 
-    def _traced(self, field: F32) -> F32:
+    def _trace(self, field: F32) -> F32:
         """Straight runs (n, 4) of the pixels within `valley_px` of a line, thinned."""
         valley = np.where(field <= self.valley_px, 255, 0).astype(np.uint8)
         if not valley.any():

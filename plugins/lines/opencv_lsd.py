@@ -15,7 +15,7 @@ from trihedron.pipeline.core.options import PositiveFloat, PositiveInt, Positive
 from trihedron.pipeline.core.registry import register
 from trihedron.pipeline.core.types import F32, U8, Frame, LineSegments
 
-SMALLEST = 16  # px, side of an image that the detector is given
+MIN_SIDE_PX = 16  # px, side of an image that the detector is given
 LBD_BYTES = 32
 
 
@@ -39,14 +39,14 @@ class OpenCvLsd:
 
     def __call__(self, frame: Frame) -> LineSegments:
         """The longest segments, longest first; (n, 32) binary descriptors."""
-        found = self._detector.detect(frame.gray)[0] if min(frame.gray.shape) >= SMALLEST else None
+        found = self._detector.detect(frame.gray)[0] if min(frame.gray.shape) >= MIN_SIDE_PX else None
         endpoints = np.zeros((0, 2, 2), np.float32) if found is None else np.asarray(found, np.float32).reshape(-1, 2, 2)
         length = np.linalg.norm(endpoints[:, 1] - endpoints[:, 0], axis=1)
         order = np.argsort(-length, kind="stable")
         endpoints = np.ascontiguousarray(endpoints[order[length[order] >= self.min_length_px][: self.segments]])
-        return LineSegments(index=frame.index, stamp_ns=frame.stamp_ns, endpoints_px=endpoints, descriptors=self._described(frame.gray, endpoints))
+        return LineSegments(index=frame.index, stamp_ns=frame.stamp_ns, endpoints_px=endpoints, descriptors=self._describe(frame.gray, endpoints))
 
-    def _described(self, gray: U8, endpoints: F32) -> U8:
+    def _describe(self, gray: U8, endpoints: F32) -> U8:
         """(n, 32) LBD of segments (n, 2, 2); (n, 0) where the build has none."""
         if not hasattr(cv2, "line_descriptor"):
             return np.zeros((len(endpoints), 0), np.uint8)

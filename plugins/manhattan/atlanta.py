@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import combinations
-from typing import Annotated, NamedTuple
+from typing import Annotated, ClassVar, NamedTuple
 
 import numpy as np
 
@@ -15,150 +15,14 @@ from trihedron.pipeline.core.options import NonNegativeFloat, PositiveFloat, Pos
 from trihedron.pipeline.core.registry import register
 from trihedron.pipeline.core.types import F64, I32, Bool, ManhattanFrame, Normals, Planes, Segments
 from trihedron.plugins.manhattan.atlanta_kernels import QUARTER, azimuth_modes, fit_shared_vertical, shared_vertical
-from trihedron.plugins.manhattan.common import (
-    HALF_SPHERE,
-    AxisFit,
-    Directions,
-    ModeFinder,
-    Modes,
-    gather_directions,
-    lost_frames,
-    missing,
-    remembered,
-    seen_frames,
-)
-from trihedron.plugins.manhattan.common_kernels import (
-    NOTHING_KNOWN,
-    densest,
-    mode_statistics,
-    shift_axes,
-    variance_scale,
-)
+from trihedron.plugins.manhattan.axis_fit import fit_rules, measure_directions
+from trihedron.plugins.manhattan.axis_fit_kernels import NOTHING_KNOWN, FitRules, variance_scale
+from trihedron.plugins.manhattan.directions import HALF_SPHERE, Directions, gather_directions
+from trihedron.plugins.manhattan.frame_association import lost_frames, retain_unseen, seen_frames, unmatched
+from trihedron.plugins.manhattan.mean_shift_kernels import densest, mode_statistics, shift_axes
+from trihedron.plugins.manhattan.modes import Modes, find_peaks, mode_limits, perpendicular_modes, shift_limits, track_modes
 
 NOBODY = np.zeros(0, np.int32)
-
-
-@register("manhattan", "atlanta")
-@dataclass(frozen=True)
-class Atlanta:
-    """One vertical and several pairs of horizontal directions at right angles (Schindler and Dellaert, "Atlanta World", CVPR 2004), by modes instead
-    of their expectation–maximisation: of the modes of the sphere, antipodes being one, the vertical is that about which most other directions crowd
-    at few azimuths modulo 90°, the inliers that Joo, Oh, Kweon and Bazin ("Globally Optimal Inlier Set Maximization for Atlanta Frame Estimation",
-    CVPR 2018) maximise by branch and bound.
-
-    Each azimuth makes a rotation whose third column is the vertical, the same in all; vertical and azimuths are fitted together, so every wall
-    helps to hold the vertical upright. A pair keeps its id while it is seen, and out of sight as long as another determines its direction."""
-
-    cone_deg: Annotated[float, Range(1, 30)] = 12.0  # half-angle of the cone gathered around each axis
-    bandwidth_deg: Annotated[float, Range(0.1, 30)] = 3.0  # of the Gaussian kernel
-    samples: Annotated[int, Range(10)] = 1500  # most normals used
-    search_samples: Annotated[int, Range(10)] = 500  # and in a search
-    line_weight_per_px: NonNegativeFloat = 0.1  # a line weighs like this many normals per pixel of its length
-    max_azimuths: PositiveInt = 5  # pairs of horizontal directions, seen or remembered
-    apart_deg: Annotated[int, Range(4, 30)] = 6  # azimuths nearer than this are one
-    min_azimuth: Share = 0.04  # of all directions that an azimuth must gather
-    again_deg: PositiveFloat = 4.0  # an azimuth found this near to where the others tell it must be is that one
-    furthest_deg: PositiveFloat = 20.0  # turn about the vertical since a recent frame
-    upright: NonNegativeFloat = 0.1  # without a previous frame a vertical along the image's counts so much more than one across it
-    loyalty: Annotated[float, Range(1)] = 1.2  # another azimuth comes first, or another axis is the vertical, when it has so many times more
-    max_age: PositiveInt = 5  # frames; with an older result the search is from everywhere
-    min_share: Share = 0.05  # of all normals that an axis must gather
-    min_lines: PositiveInt = 4  # or this many lines,
-    min_line_share: Share = 0.15  # with this share of the lines' length
-    max_width: Share = 0.44  # cones, standard deviation of a mode; directions without order have 0.5 and more
-    min_explained: Share = 0.3  # share of all directions on the axes
-    max_skew_deg: PositiveFloat = 3.0  # a mode further from a right angle to the vertical is not horizontal
-    fit_deg: PositiveFloat = 6.0  # planes and lines this near to an axis refine it
-    plane_floor_deg: PositiveFloat = 0.3  # a wall's deviation from the axis
-    line_floor_deg: PositiveFloat = 0.5  # an edge's
-    normals_floor_deg: PositiveFloat = 0.5  # error of an axis however many normals it has
-    floor_deg: PositiveFloat = 0.05  # of every rotation
-    gate: PositiveFloat = 2.0  # σ at which a plane or line counts half
-
-    def __post_init__(self) -> None:
-        check_increasing(self, "bandwidth_deg", "cone_deg")
-
-    def __call__(self, normals: Normals, segments: Segments, planes: Planes, previous: ManhattanFrame | None) -> ManhattanFrame:
-        """Rotations with one vertical as their third column, the best supported first, then those known but out of sight: without inliers, with a
-        uninformative covariance. `supported` is False when no horizontal direction stands at right angles to the vertical or to another."""
-        directions = gather_directions(normals.normals, segments, self.samples, self.line_weight_per_px)
-        recent = previous is not None and previous.supported and normals.index - previous.index <= self.max_age
-        known, ids = self._known(directions, previous, recent)
-        modes = self._atlanta.near(directions, planes, known) if recent else NONE
-        if not modes.supported:
-            modes = self._atlanta.search(directions, planes, None if previous is None else known)
-        if not modes.supported:
-            return lost_frames(self._atlanta.finder.follow(directions, planes, known[0]), self._fit, segments, planes, normals, known, ids)
-        rotations, covariance = self._fitted(modes, segments, planes)
-        order = np.argsort(-modes.weights * np.where(modes.rows == 0, self.loyalty, 1.0), kind="stable")
-        rows, rotations = modes.rows[order], rotations[order]
-        unseen = remembered(missing(rows, len(known)), ids, self.max_azimuths - len(rows)) if previous is not None else NOBODY
-        expected = _beside(rotations, rows, known, unseen)
-        return seen_frames(normals, rotations, covariance[order], modes.inliers[order], modes.spread[order], rows, ids, unseen, expected)
-
-    def _known(self, directions: Directions, previous: ManhattanFrame | None, recent: bool) -> tuple[F64, I32]:
-        """The rotations (k, 3, 3) known and their ids; while a single one is in view another of its axes may turn out to be the vertical."""
-        known, ids = _sharing(previous)
-        alone = previous is not None and np.count_nonzero(previous.inliers.any(axis=1)) == 1
-        return self._atlanta.better_vertical(directions, known, ids) if alone and recent else (known, ids)
-
-    def _fitted(self, modes: AtlantaModes, segments: Segments, planes: Planes) -> tuple[F64, F64]:
-        """(k, 3, 3) rotations fitted together to all that stands on the axes seen, and the covariance of phi of each."""
-        count = len(modes.rows)
-        vertical = np.arange(3 * count) % 3 == 2
-        normals = np.where((vertical & (np.arange(3 * count) > 2))[:, None], 0.0, modes.normals)  # one vertical counts once
-        R = np.concatenate(list(modes.rotations), axis=1)
-        vectors, information, columns = self._fit.measured(R, modes.axes, normals, segments, planes)
-        columns[(columns >= 0) & ~modes.seen[columns]] = -1
-        rotations, H, chi2, components = fit_shared_vertical(
-            vectors, information, columns, len(vectors) - 3 * count, modes.rotations, 1e-6, self.gate, 5
-        )
-        scale = variance_scale(chi2, components - 2.0 - count)
-        return rotations, shared_covariance(H / scale, rotations, NOTHING_KNOWN) + np.eye(3) * np.radians(self.floor_deg) ** 2
-
-    @cached_property
-    def _atlanta(self) -> AtlantaFinder:
-        finder = ModeFinder(
-            cone=np.radians(self.cone_deg),
-            bandwidth=np.radians(self.bandwidth_deg),
-            max_iterations=20,
-            tolerance=np.radians(1e-3),
-            min_share=self.min_share,
-            min_lines=self.min_lines,
-            min_line_share=self.min_line_share,
-            max_width=self.max_width,
-            min_explained=self.min_explained,
-            max_skew=np.radians(self.max_skew_deg),
-            use_planes=True,
-        )
-        again, furthest = np.radians([self.again_deg, self.furthest_deg])
-        return AtlantaFinder(
-            finder, self.apart_deg, self.min_azimuth, self.max_azimuths, self.search_samples, self.upright, self.loyalty, again, furthest
-        )
-
-    @cached_property
-    def _fit(self) -> AxisFit:
-        return AxisFit(self.fit_deg, self.normals_floor_deg, self.plane_floor_deg, self.line_floor_deg, self.floor_deg, self.gate)
-
-
-def _sharing(previous: ManhattanFrame | None) -> tuple[F64, I32]:
-    """Rotations (k, 3, 3) of the previous result with the first one's vertical, and their ids (k,)."""
-    if previous is None:
-        return np.eye(3)[None], np.zeros(1, np.int32)
-    vertical = previous.rotations[:, :, 2]
-    same = matmul(vertical, vertical[0]) > 1.0 - 1e-9  # another estimator's frames need not have it
-    return previous.rotations[same], previous.ids[same]
-
-
-def _beside(rotations: F64, rows: I32, known: F64, unseen: I32) -> F64:
-    """(u, 3, 3) where those of the `known` that are out of sight must be: turned like the first one seen again, with the vertical of all."""
-    again = int(np.argmax(rows >= 0))
-    turn = matmul(rotations[again], known[max(rows[again], 0)].T)
-    return np.array([shared_vertical(rotations[again], matmul(turn, R)) for R in known[unseen]]).reshape(-1, 3, 3)
-
-
-# When modes of the sphere are one vertical and horizontal directions about it.
-
 CROSSED = 4  # of the densest directions whose cross products may be the vertical
 UP = np.array([0.0, -1.0, 0.0])  # in the image
 
@@ -198,50 +62,118 @@ class AtlantaModes(NamedTuple):
 NONE = AtlantaModes(np.zeros((0, 3, 3)), np.zeros(0, np.int32), np.zeros((3, 0)), np.zeros((0, 4)), np.zeros((0, 4)), np.zeros(0, np.bool_))
 
 
+@register("manhattan", "atlanta")
 @dataclass(frozen=True)
-class AtlantaFinder:
-    """The rules of `atlanta.Atlanta`, whose fields these are; angles in rad, `apart` in degrees."""
+class Atlanta:
+    """One vertical and several pairs of horizontal directions at right angles (Schindler and Dellaert, "Atlanta World", CVPR 2004), by modes instead
+    of their expectation–maximisation: of the modes of the sphere, antipodes being one, the vertical is that about which most other directions crowd
+    at few azimuths modulo 90°, the inliers that Joo, Oh, Kweon and Bazin ("Globally Optimal Inlier Set Maximization for Atlanta Frame Estimation",
+    CVPR 2018) maximise by branch and bound.
 
-    finder: ModeFinder
-    apart: int
-    min_azimuth: float
-    max_azimuths: int
-    search_samples: int
-    upright: float
-    loyalty: float
-    again: float
-    furthest: float
+    Each azimuth makes a rotation whose third column is the vertical, the same in all; vertical and azimuths are fitted together, so every wall
+    helps to hold the vertical upright. A pair keeps its id while it is seen, and out of sight as long as another determines its direction."""
 
-    def near(self, directions: Directions, planes: Planes, known: F64) -> AtlantaModes:
-        """About the vertical of the known rotations (k, 3, 3), where mean shift takes it."""
-        vertical = self._shifted(directions, known[0, :, 2:])[:, 0]
-        return self._about(directions, planes, vertical, known, self.furthest)
+    cone_deg: Annotated[float, Range(1, 30)] = 12.0  # half-angle of the cone gathered around each axis
+    bandwidth_deg: Annotated[float, Range(0.1, 30)] = 3.0  # of the Gaussian kernel
+    samples: Annotated[int, Range(10)] = 1500  # most normals used
+    search_samples: Annotated[int, Range(10)] = 500  # and in a search
+    line_weight_per_px: NonNegativeFloat = 0.1  # a line weighs like this many normals per pixel of its length
+    max_azimuths: PositiveInt = 5  # pairs of horizontal directions, seen or remembered
+    apart_deg: Annotated[int, Range(4, 30)] = 6  # azimuths nearer than this are one
+    min_azimuth: Share = 0.04  # of all directions that an azimuth must gather
+    again_deg: PositiveFloat = 4.0  # an azimuth found this near to where the others tell it must be is that one
+    furthest_deg: PositiveFloat = 20.0  # turn about the vertical since a recent frame
+    upright: NonNegativeFloat = 0.1  # without a previous frame a vertical along the image's counts so much more than one across it
+    loyalty: Annotated[float, Range(1)] = 1.2  # another azimuth comes first, or another axis is the vertical, when it has so many times more
+    max_age: PositiveInt = 5  # frames; with an older result the search is from everywhere
+    min_share: Share = 0.05  # of all normals that an axis must gather
+    min_lines: PositiveInt = 4  # or this many lines,
+    min_line_share: Share = 0.15  # with this share of the lines' length
+    max_width: Share = 0.44  # cones, standard deviation of a mode; directions without order have 0.5 and more
+    min_explained: Share = 0.3  # share of all directions on the axes
+    max_skew_deg: PositiveFloat = 3.0  # a mode further from a right angle to the vertical is not horizontal
+    fit_deg: PositiveFloat = 6.0  # planes and lines this near to an axis refine it
+    plane_floor_deg: PositiveFloat = 0.3  # a wall's deviation from the axis
+    line_floor_deg: PositiveFloat = 0.5  # an edge's
+    normals_floor_deg: PositiveFloat = 0.5  # error of an axis however many normals it has
+    floor_deg: PositiveFloat = 0.05  # of every rotation
+    gate: PositiveFloat = 2.0  # σ at which a plane or line counts half
 
-    def better_vertical(self, directions: Directions, known: F64, ids: I32) -> tuple[F64, I32]:
-        """The known rotations (k, 3, 3) and their ids; only the first, with another of its axes as the vertical, when azimuths about that gather
-        clearly more: which axis is the vertical cannot be decided while all that is seen is at right angles."""
-        few = directions.thinned(self.search_samples)
-        scores = [self._score(few, v, False) for v in self._shifted(few, known[0]).T]
+    max_iterations: ClassVar[int] = 20  # of mean shift
+    tolerance_deg: ClassVar[float] = 1e-3
+    use_planes: ClassVar[bool] = True
+
+    def __post_init__(self) -> None:
+        check_increasing(self, "bandwidth_deg", "cone_deg")
+
+    def __call__(self, normals: Normals, segments: Segments, planes: Planes, previous: ManhattanFrame | None) -> ManhattanFrame:
+        """Rotations with one vertical as their third column, the best supported first, then those known but out of sight: without inliers, with a
+        uninformative covariance. `supported` is False when no horizontal direction stands at right angles to the vertical or to another."""
+        directions = gather_directions(normals.normals, segments, self.samples, self.line_weight_per_px)
+        recent = previous is not None and previous.supported and normals.index - previous.index <= self.max_age
+        known, ids = self._known(directions, previous, recent)
+        modes = self._near(directions, planes, known) if recent else NONE
+        if not modes.supported:
+            modes = self._search(directions, planes, None if previous is None else known)
+        if not modes.supported:
+            return lost_frames(track_modes(self, directions, planes, known[0]), self._rules, segments, planes, normals, known, ids)
+        rotations, covariance = self._fit(modes, segments, planes)
+        order = np.argsort(-modes.weights * np.where(modes.rows == 0, self.loyalty, 1.0), kind="stable")
+        rows, rotations = modes.rows[order], rotations[order]
+        unseen = retain_unseen(unmatched(rows, len(known)), ids, self.max_azimuths - len(rows)) if previous is not None else NOBODY
+        expected = _predict_unseen(rotations, rows, known, unseen)
+        return seen_frames(normals, rotations, covariance[order], modes.inliers[order], modes.spread[order], rows, ids, unseen, expected)
+
+    def _known(self, directions: Directions, previous: ManhattanFrame | None, recent: bool) -> tuple[F64, I32]:
+        """Return the known rotations (k, 3, 3) and their ids; while a single one is in view another of its axes may turn out to be the vertical."""
+        known, ids = _with_first_vertical(previous)
+        alone = previous is not None and np.count_nonzero(previous.inliers.any(axis=1)) == 1
+        return self._better_vertical(directions, known, ids) if alone and recent else (known, ids)
+
+    def _fit(self, modes: AtlantaModes, segments: Segments, planes: Planes) -> tuple[F64, F64]:
+        """Fit the rotations (k, 3, 3) together to all that lies on the axes seen; return them with the covariance of phi of each."""
+        count = len(modes.rows)
+        vertical = np.arange(3 * count) % 3 == 2
+        normals = np.where((vertical & (np.arange(3 * count) > 2))[:, None], 0.0, modes.normals)  # one vertical counts once
+        R = np.concatenate(list(modes.rotations), axis=1)
+        vectors, information, columns = measure_directions(self._rules, R, modes.axes, normals, segments, planes)
+        columns[(columns >= 0) & ~modes.seen[columns]] = -1
+        rotations, H, chi2, components = fit_shared_vertical(
+            vectors, information, columns, len(vectors) - 3 * count, modes.rotations, 1e-6, self.gate, 5
+        )
+        scale = variance_scale(chi2, components - 2.0 - count)
+        return rotations, shared_covariance(H / scale, rotations, NOTHING_KNOWN) + np.eye(3) * np.radians(self.floor_deg) ** 2
+
+    def _near(self, directions: Directions, planes: Planes, known: F64) -> AtlantaModes:
+        """Find the azimuths about the vertical of the known rotations (k, 3, 3), tracked by mean shift."""
+        vertical = self._shift(directions, known[0, :, 2:])[:, 0]
+        return self._about(directions, planes, vertical, known, np.radians(self.furthest_deg))
+
+    def _better_vertical(self, directions: Directions, known: F64, ids: I32) -> tuple[F64, I32]:
+        """Return the known rotations (k, 3, 3) and their ids; only the first, with another of its axes as the vertical, when azimuths about that
+        gather clearly more: which axis is the vertical cannot be decided while all that is seen is at right angles."""
+        few = directions.subsample(self.search_samples)
+        scores = [self._score(few, v, False) for v in self._shift(few, known[0]).T]
         best = int(np.argmax(scores))
         if best == 2 or scores[best] <= self.loyalty * scores[2]:
             return known, ids
         return known[:1, :, [(best + 1) % 3, (best + 2) % 3, best]], ids[:1]
 
-    def search(self, directions: Directions, planes: Planes, known: F64 | None) -> AtlantaModes:
-        """About the direction that makes most of the others vertical or horizontal, known or not."""
-        few = directions.thinned(self.search_samples)
-        starts = densest(few.vectors, few.weights, HALF_SPHERE, self.finder.cone, 6)
+    def _search(self, directions: Directions, planes: Planes, known: F64 | None) -> AtlantaModes:
+        """Find the azimuths about the direction that makes most of the others vertical or horizontal, known or not."""
+        few = directions.subsample(self.search_samples)
+        starts = densest(few.vectors, few.weights, HALF_SPHERE, np.radians(self.cone_deg), 6)
         if len(starts) == 0:
             return NONE
-        modes = self._shifted(few, np.ascontiguousarray(starts.T))
+        modes = self._shift(few, np.ascontiguousarray(starts.T))
         crossed = [np.cross(modes[:, i], modes[:, j]) for i, j in combinations(range(min(modes.shape[1], CROSSED)), 2)]
         crossed = [c / norm(c) for c in crossed if norm(c) > 0.5]
         vertical = max([*modes.T, *crossed], key=lambda v: self._score(few, v, known is None))
         return self._about(directions, planes, vertical, known, np.pi)
 
     def _score(self, directions: Directions, vertical: F64, alone: bool) -> float:
-        """Weight that the vertical and the azimuths about it gather; upright counts more where nothing else determines the vertical."""
-        on_vertical = np.abs(matmul(directions.vectors, vertical)) > np.cos(self.finder.cone)
+        """Return the weight that the vertical and the azimuths about it gather; upright counts more where nothing else determines the vertical."""
+        on_vertical = np.abs(matmul(directions.vectors, vertical)) > np.cos(np.radians(self.cone_deg))
         masses = self._azimuths(directions, vertical)[1]
         explained = float(directions.weights[on_vertical].sum() + masses.sum())
         return explained * (1.0 + self.upright * alone * abs(float(matmul(vertical, UP))))
@@ -249,36 +181,35 @@ class AtlantaFinder:
     def _azimuths(self, directions: Directions, vertical: F64) -> tuple[F64, F64]:
         least = self.min_azimuth * float(directions.weights.sum())
         vertical = np.ascontiguousarray(vertical)
-        return azimuth_modes(*directions, vertical, self.finder.cone, self.apart, self.max_azimuths, least)
+        return azimuth_modes(*directions, vertical, np.radians(self.cone_deg), self.apart_deg, self.max_azimuths, least)
 
-    def _shifted(self, directions: Directions, axes: F64) -> F64:
-        f = self.finder
-        return shift_axes(directions.vectors, directions.weights, axes, f.cone, f.bandwidth, f.max_iterations, f.tolerance)
+    def _shift(self, directions: Directions, axes: F64) -> F64:
+        return shift_axes(directions.vectors, directions.weights, axes, *shift_limits(self))
 
     def _about(self, directions: Directions, planes: Planes, vertical: F64, known: F64 | None, furthest: float) -> AtlantaModes:
-        """The azimuths about a vertical, named, and those of them that are seen."""
+        """Find the azimuths about a vertical, name and verify them."""
         rotations, _ = self._azimuths(directions, vertical)
         if len(rotations) == 0:
             return NONE
         up = np.sign(matmul(vertical, UP)) or 1.0
         known = matmul(rotations[:1], np.diag([1.0, up, up])) if known is None else known
-        rotations, rows = named_azimuths(rotations, known, self.again, furthest)
-        return self._judged(directions, planes, rotations, rows)
+        rotations, rows = match_azimuths(rotations, known, np.radians(self.again_deg), furthest)
+        return self._verify(directions, planes, rotations, rows)
 
-    def _judged(self, directions: Directions, planes: Planes, rotations: F64, rows: I32) -> AtlantaModes:
+    def _verify(self, directions: Directions, planes: Planes, rotations: F64, rows: I32) -> AtlantaModes:
         """The rotations with a horizontal axis that is a peak of its own at right angles to the vertical; none without a vertical, be it seen or at
         right angles to two that are, or when all together explain too little."""
         vectors, weights, first = directions
         columns = [2] + [3 * k + j for k in range(len(rotations)) for j in (0, 1)]
-        axes = self._shifted(directions, np.concatenate(list(rotations), axis=1)[:, columns])
-        normals = mode_statistics(vectors[:first], weights[:first], axes, self.finder.cone)
-        lines = mode_statistics(vectors[first:], weights[first:], axes, self.finder.cone)
+        axes = self._shift(directions, np.concatenate(list(rotations), axis=1)[:, columns])
+        normals = mode_statistics(vectors[:first], weights[:first], axes, np.radians(self.cone_deg))
+        lines = mode_statistics(vectors[first:], weights[first:], axes, np.radians(self.cone_deg))
         modes = Modes(axes, normals, lines, np.zeros(len(columns), np.bool_), False)
-        seen = self.finder.peaks(modes, directions, planes)
+        seen = find_peaks(mode_limits(self), modes, directions, planes)
         seen = self._horizontal(modes, seen, float(weights.sum()))
         explained = modes.weights[seen].sum() / max(float(weights.sum()), 1e-9)
         kept = np.flatnonzero(seen[1:].reshape(-1, 2).any(axis=1))
-        if len(kept) == 0 or explained < self.finder.min_explained:
+        if len(kept) == 0 or explained < self.min_explained:
             return NONE
         if not seen[0]:
             pair = kept[seen[1:].reshape(-1, 2)[kept].all(axis=1)][0]
@@ -291,14 +222,14 @@ class AtlantaFinder:
     def _horizontal(self, modes: Modes, peaks: Bool, total: float) -> Bool:
         """(m,) the vertical, first, if it is a peak, and the peaks at right angles to it and to their partners, no two at one azimuth."""
         axes, weights = modes.axes.copy(), modes.weights
-        fits = self.finder.perpendicular(modes)
+        fits = perpendicular_modes(mode_limits(self), modes)
         pairs = [k for k in range(1, len(peaks), 2) if peaks[k] and peaks[k + 1] and fits[k, k + 1]]
         if not peaks[0]:
             if not pairs:
                 return np.zeros(len(peaks), np.bool_)
             best = max(pairs, key=lambda k: weights[k] + weights[k + 1])
             axes[:, 0] = np.cross(axes[:, best], axes[:, best + 1])
-            fits = self.finder.perpendicular(modes._replace(axes=axes))
+            fits = perpendicular_modes(mode_limits(self), modes._replace(axes=axes))
         seen = peaks & fits[0]
         seen[0] = peaks[0]
         for k in range(1, len(peaks), 2):
@@ -307,11 +238,31 @@ class AtlantaFinder:
         taken = np.zeros((3, 0))
         for k in sorted(range(1, len(peaks), 2), key=lambda k: -(weights[k] * seen[k] + weights[k + 1] * seen[k + 1])):
             own = seen[k : k + 2]
-            alone = (np.abs(matmul(axes[:, k : k + 2].T, taken)) < np.cos(np.radians(self.apart) * 0.7)).all(axis=1)
+            alone = (np.abs(matmul(axes[:, k : k + 2].T, taken)) < np.cos(np.radians(self.apart_deg) * 0.7)).all(axis=1)
             if not alone[own].all() or weights[k : k + 2][own].sum() < self.min_azimuth * total:
                 own[:] = False
             taken = np.concatenate([taken, axes[:, k : k + 2][:, own]], axis=1)
         return np.asarray(seen)
+
+    @cached_property
+    def _rules(self) -> FitRules:
+        return fit_rules(self, self.fit_deg, self.normals_floor_deg, self.gate)
+
+
+def _with_first_vertical(previous: ManhattanFrame | None) -> tuple[F64, I32]:
+    """Return the rotations (k, 3, 3) of the previous result with the first one's vertical, and their ids (k,)."""
+    if previous is None:
+        return np.eye(3)[None], np.zeros(1, np.int32)
+    vertical = previous.rotations[:, :, 2]
+    same = matmul(vertical, vertical[0]) > 1.0 - 1e-9  # another estimator's frames need not have it
+    return previous.rotations[same], previous.ids[same]
+
+
+def _predict_unseen(rotations: F64, rows: I32, known: F64, unseen: I32) -> F64:
+    """Predict those of the `known` that are out of sight, (u, 3, 3): rotated like the first one seen again, with the vertical of all."""
+    again = int(np.argmax(rows >= 0))
+    turn = matmul(rotations[again], known[max(rows[again], 0)].T)
+    return np.array([shared_vertical(rotations[again], matmul(turn, R)) for R in known[unseen]]).reshape(-1, 3, 3)
 
 
 def _rotation(vertical: F64, pair: F64, weights: F64) -> F64:
@@ -323,7 +274,7 @@ def _rotation(vertical: F64, pair: F64, weights: F64) -> F64:
     return np.stack([first, np.cross(vertical, first), vertical], axis=1)
 
 
-def named_azimuths(found: F64, known: F64, limit: float, furthest: float) -> tuple[F64, I32]:
+def match_azimuths(found: F64, known: F64, limit: float, furthest: float) -> tuple[F64, I32]:
     """The rotations found (f, 3, 3) with their columns named like those of the known ones (k, 3, 3) that they are, and the rows (f,) of these, -1 for
     none; each set shares its third columns.
 
@@ -332,14 +283,14 @@ def named_azimuths(found: F64, known: F64, limit: float, furthest: float) -> tup
     flip = np.diag([1.0, -1.0, -1.0]) if matmul(found[0, :, 2], known[0, :, 2]) < 0.0 else np.eye(3)
     found = matmul(found, flip)
     azimuth = _azimuths(found, found[0])
-    expected = _azimuths(_tilted(known, found[0, :, 2]), found[0])
-    apart = _wrapped(azimuth[:, None] - expected[None])
+    expected = _azimuths(_tilt_to(known, found[0, :, 2]), found[0])
+    apart = _wrap_quarter(azimuth[:, None] - expected[None])
     turns = apart.ravel()
-    matched = np.abs(_wrapped(apart[None] - turns[:, None, None])) <= limit
+    matched = np.abs(_wrap_quarter(apart[None] - turns[:, None, None])) <= limit
     number = np.minimum(matched.any(axis=1).sum(axis=1), matched.any(axis=2).sum(axis=1))
     near = np.abs(turns) <= furthest
     turn = turns[np.lexsort((np.abs(turns), -number, ~near))[0]]
-    off = np.abs(_wrapped(apart - turn))
+    off = np.abs(_wrap_quarter(apart - turn))
     rows = np.full(len(found), -1, np.int32)
     while off.min() <= limit:
         f, k = np.unravel_index(int(np.argmin(off)), off.shape)
@@ -354,12 +305,12 @@ def _azimuths(rotations: F64, base: F64) -> F64:
     return np.asarray(np.arctan2(matmul(rotations[:, :, 0], base[:, 1]), matmul(rotations[:, :, 0], base[:, 0])))
 
 
-def _wrapped(angles: F64) -> F64:
-    """To -45° … 45°."""
+def _wrap_quarter(angles: F64) -> F64:
+    """Wrap angles to -45° … 45°."""
     return np.asarray(angles - np.round(angles / QUARTER) * QUARTER)
 
 
-def _tilted(rotations: F64, vertical: F64) -> F64:
+def _tilt_to(rotations: F64, vertical: F64) -> F64:
     """(k, 3, 3) with their common third column turned onto `vertical` the shortest way."""
     axis = np.cross(rotations[0, :, 2], vertical)
     sine, cosine = float(norm(axis)), float(matmul(rotations[0, :, 2], vertical))

@@ -8,10 +8,8 @@ import numpy as np
 from trihedron.pipeline.core.kernel import kernel
 from trihedron.pipeline.core.linalg_kernels import solve_positive
 from trihedron.pipeline.core.types import F64, I32
-from trihedron.plugins.manhattan.common_kernels import (
-    NORMALS_PER_SAMPLE,
-    right_handed,
-)
+from trihedron.plugins.manhattan.directions_kernels import NORMALS_PER_SAMPLE
+from trihedron.plugins.manhattan.mean_shift_kernels import right_handed
 from trihedron.plugins.shared.lie_kernels import left_multiply_exp
 
 # Directions about a vertical, modulo a quarter turn: where they crowd more than by chance, and which crowd is which from image to image.

@@ -26,7 +26,8 @@ from trihedron.plugins.manhattan.branch_and_bound_kernels import (
     neighbours,
     search,
 )
-from trihedron.plugins.manhattan.common import Directions, ModeOptions, directions_of, fit_modes, one_frame
+from trihedron.plugins.manhattan.directions import Directions
+from trihedron.plugins.manhattan.modes import ModeOptions, directions_of, fit_modes, one_frame, track_modes
 from trihedron.plugins.shared.manhattan_frames_kernels import nearest_equivalent
 
 
@@ -34,7 +35,7 @@ from trihedron.plugins.shared.manhattan_frames_kernels import nearest_equivalent
 @dataclass(frozen=True)
 class BranchAndBound(ModeOptions):
     """The rotation with the greatest consensus of normals, planes and lines, found among all rotations whatever the previous frame was (Bazin et al.,
-    ACCV 2012; Joo et al., CVPR 2016; consensus and bounds in `axes.consensus`, the search in `axes.rotation_search`).
+    ACCV 2012; Joo et al., CVPR 2016).
 
     What is certified, for the directions that take part in the search (`search_samples` normals spread over the image, all planes and lines): `gap`
     is how much more consensus, as a share, any rotation could have than the one returned; and unless the work limit was met, none further than
@@ -59,12 +60,12 @@ class BranchAndBound(ModeOptions):
         """One rotation with id 0 and its `gap`; `supported` False, with a large covariance and no gap (NaN), where the scene shows no two axes at
         right angles. Only its naming, and the angles that the scene does not tell, are those of `previous`."""
         directions = directions_of(self, normals, segments)
-        vectors, weights = self._with_planes(directions.thinned(self.search_samples), planes)
+        vectors, weights = self._with_planes(directions.subsample(self.search_samples), planes)
         start = np.eye(3) if previous is None else previous.rotations[0]
         optimum = self._search(vectors, weights, start)
-        modes = self.finder.follow(directions, planes, nearest_equivalent(optimum.R, start))
+        modes = track_modes(self, directions, planes, nearest_equivalent(optimum.R, start))
         if not modes.supported and previous is not None:
-            modes = self.finder.follow(directions, planes, start)
+            modes = track_modes(self, directions, planes, start)
         R, covariance = fit_modes(self, modes, segments, planes)
         reached = self._search.consensus(vectors, weights, R) if modes.supported else 0.0
         return one_frame(modes, R, covariance, normals, float(optimum.upper / reached - 1.0) if reached > 0.0 else float("nan"))

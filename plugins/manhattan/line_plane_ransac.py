@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property
 from typing import Annotated, NamedTuple
 
 import numpy as np
@@ -12,7 +11,8 @@ from trihedron.pipeline.core.linalg import matmul
 from trihedron.pipeline.core.options import NonNegativeFloat, NonNegativeInt, PositiveFloat, PositiveInt, PositiveShare, Range, Share
 from trihedron.pipeline.core.registry import register
 from trihedron.pipeline.core.types import F64, Bool, ManhattanFrame, Normals, Planes, Segments
-from trihedron.plugins.manhattan.common import AxisFit, gather_directions
+from trihedron.plugins.manhattan.axis_fit import fit_axes, fit_rules
+from trihedron.plugins.manhattan.directions import gather_directions
 from trihedron.plugins.shared.manhattan_frames_kernels import assign_axes, best_frame, frames_through, inliers_and_spread, procrustes, square_angles
 
 
@@ -49,7 +49,7 @@ class LinePlaneRansac:
         start = np.eye(3) if previous is None else previous.rotations[0]
         features, reach = _features(planes, segments), np.radians(self.reach_deg)
         R, seen, supported = self._consensus(features, normals, start, previous is not None and previous.supported, rng)
-        R, covariance = self._fit(R, R, np.zeros((3, 4)), seen, segments, planes)
+        R, covariance = fit_axes(fit_rules(self, self.reach_deg, gate=self.gate), R, R, np.zeros((3, 4)), seen, segments, planes)
         axes = assign_axes(features.vectors, R, reach)
         axes[(axes >= 0) & ~seen[axes]] = -1
         inliers, spread = inliers_and_spread(square_angles(features.vectors, axes, R), axes, features.share)
@@ -74,7 +74,7 @@ class LinePlaneRansac:
             reach = np.radians(np.repeat([self.reach_deg, self.normals_reach_deg], [len(features.vectors), len(surface)]))
             weights = np.concatenate([features.share, np.full(len(surface), 1.0 / max(len(surface), 1))])
             R = best_frame(frames, vectors, weights, reach, start, self.loyalty if loyal else 1.0)
-            seen, supported = self._judged(features, R)
+            seen, supported = self._seen_axes(features, R)
             if supported:
                 return R, seen, True
         walls = features.vectors[: features.planes][features.share[: features.planes] >= self.min_share]
@@ -102,8 +102,8 @@ class LinePlaneRansac:
         second[on_wall] = _on_wall(vectors[i[on_wall]], vectors[j[on_wall]], features.across[j[on_wall]], np.cos(np.radians(self.reach_deg)))
         return frames_through(vectors[i], second)
 
-    def _judged(self, features: Features, R: F64) -> tuple[Bool, bool]:
-        """(3,) axes with a plane or enough lines, and whether that makes a Manhattan frame."""
+    def _seen_axes(self, features: Features, R: F64) -> tuple[Bool, bool]:
+        """Return the axes (3,) with a plane or enough lines, and True if they make a Manhattan frame."""
         axes = assign_axes(features.vectors, R, np.radians(self.reach_deg)) + 1
         p, share = features.planes, features.share
         walls, lines = np.bincount(axes[:p], share[:p], 4)[1:], np.bincount(axes[p:], share[p:], 4)[1:]
@@ -116,16 +116,6 @@ class LinePlaneRansac:
         wanted = 1 if by_planes.any() else (self.min_lines + 1) // 2
         seen = by_planes | ((counts >= wanted) & (lines * features.length_px >= self.min_line_px) & ordered)
         return seen, bool(seen.sum() >= 2 and walls.sum() >= self.min_plane_share * share[:p].sum())
-
-    @cached_property
-    def _fit(self) -> AxisFit:
-        return AxisFit(
-            cone_deg=self.reach_deg,
-            plane_floor_deg=self.plane_floor_deg,
-            line_floor_deg=self.line_floor_deg,
-            floor_deg=self.floor_deg,
-            gate=self.gate,
-        )
 
 
 class Features(NamedTuple):

@@ -10,8 +10,9 @@ import numpy as np
 from trihedron.pipeline.core.options import PositiveInt, Range
 from trihedron.pipeline.core.registry import register
 from trihedron.pipeline.core.types import F64, ManhattanFrame, Normals, Planes, Segments
-from trihedron.plugins.manhattan.common import HALF_SPHERE, Directions, ModeOptions, Modes, directions_of, fit_modes, one_frame
-from trihedron.plugins.manhattan.common_kernels import search_axes
+from trihedron.plugins.manhattan.directions import HALF_SPHERE, Directions
+from trihedron.plugins.manhattan.mean_shift_kernels import search_axes
+from trihedron.plugins.manhattan.modes import ModeOptions, Modes, directions_of, fit_modes, one_frame, shift_limits, track_modes
 from trihedron.plugins.shared.manhattan_frames_kernels import nearest_equivalent
 
 
@@ -34,18 +35,18 @@ class MeanShift(ModeOptions):
         return one_frame(modes, *fit_modes(self, modes, segments, planes), normals)
 
     def _modes(self, directions: Directions, planes: Planes, previous: ManhattanFrame | None, index: int) -> Modes:
-        """Near the previous axes; from everywhere when there are none, they are old or nothing supports them."""
+        """Find the modes near the previous axes; from everywhere when there are none, they are old or nothing supports them."""
         if previous is None:
             return self._anywhere(directions, planes, np.eye(3))
         start = np.array(previous.rotations[0])
-        near = self.finder.follow(directions, planes, start)
+        near = track_modes(self, directions, planes, start)
         if previous.supported and near.supported and index - previous.index <= self.max_age:
             return near
         far = self._anywhere(directions, planes, start)
         return far if far.supported else near
 
     def _anywhere(self, directions: Directions, planes: Planes, names: F64) -> Modes:
-        """The densest axes of all, in the order and with the signs nearest to those of `names` (3, 3)."""
-        finder, few = self.finder, directions.thinned(self.search_samples)
-        found = search_axes(few.vectors, few.weights, HALF_SPHERE, finder.cone, finder.bandwidth, self.primaries, self.turns)
-        return finder.follow(directions, planes, nearest_equivalent(found, names))
+        """Find the densest axes of all, in the order and with the signs nearest to those of `names` (3, 3)."""
+        few, shift = directions.subsample(self.search_samples), shift_limits(self)
+        found = search_axes(few.vectors, few.weights, HALF_SPHERE, shift.cone, shift.bandwidth, self.primaries, self.turns)
+        return track_modes(self, directions, planes, nearest_equivalent(found, names))

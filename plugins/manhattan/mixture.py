@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property
-from typing import Annotated, NamedTuple
+from typing import Annotated, ClassVar, NamedTuple
 
 import numpy as np
 
@@ -13,26 +12,37 @@ from trihedron.pipeline.core.linalg import matmul
 from trihedron.pipeline.core.options import NonNegativeFloat, PositiveFloat, PositiveInt, Range, Share, check_increasing
 from trihedron.pipeline.core.registry import register
 from trihedron.pipeline.core.types import F64, Bool, ManhattanFrame, Normals, Planes, Segments
-from trihedron.plugins.manhattan.common import (
-    HALF_SPHERE,
-    AxisFit,
-    Directions,
-    ModeFinder,
-    Modes,
-    gather_directions,
-    identified,
+from trihedron.plugins.manhattan.axis_fit import fit_axes, fit_rules
+from trihedron.plugins.manhattan.axis_fit_kernels import orthonormal
+from trihedron.plugins.manhattan.directions import HALF_SPHERE, Directions, gather_directions
+from trihedron.plugins.manhattan.frame_association import (
+    associate_frames,
+    camera_rotation,
     lost_frames,
-    missing,
-    mode_spread,
-    remembered,
+    retain_unseen,
     seen_frames,
     symmetric_angles,
-    turn_between,
+    unmatched,
 )
-from trihedron.plugins.manhattan.common_kernels import orthonormal, search_axes
+from trihedron.plugins.manhattan.mean_shift_kernels import search_axes
+from trihedron.plugins.manhattan.modes import Modes, mode_spread, track_modes
 from trihedron.plugins.shared.manhattan_frames_kernels import nearest_equivalent
 
 NOBODY = np.zeros(0, np.int32)
+SHARED_WEIGHT = 0.2  # what belongs to a known frame may still be an axis of another, but does not lead to one
+
+
+class Found(NamedTuple):
+    """A Manhattan frame seen: its rotation (3, 3), the modes behind it, and which row of the known frames it is (-1: none)."""
+
+    R: F64
+    modes: Modes
+    row: int
+
+    @property
+    def weight(self) -> float:
+        """Weight of the directions on its axes."""
+        return float(self.modes.weights[self.modes.seen].sum())
 
 
 @register("manhattan", "mixture")
@@ -68,25 +78,30 @@ class Mixture:
     normals_floor_deg: PositiveFloat = 0.5  # error of an axis however many normals it has
     floor_deg: PositiveFloat = 0.05  # of the whole rotation
 
+    max_iterations: ClassVar[int] = 20  # of mean shift
+    tolerance_deg: ClassVar[float] = 1e-3
+    use_planes: ClassVar[bool] = True
+
     def __post_init__(self) -> None:
         check_increasing(self, "bandwidth_deg", "cone_deg")
 
     def __call__(self, normals: Normals, segments: Segments, planes: Planes, previous: ManhattanFrame | None) -> ManhattanFrame:
         """Frames seen, the best supported first, then those known but out of sight: expected from the others, no inliers, an uninformative
         covariance. `supported` is False when none is seen."""
+        rules = fit_rules(self, self.fit_deg, self.normals_floor_deg)
         directions = gather_directions(normals.normals, segments, self.samples, self.line_weight_per_px)
         known = np.eye(3)[None] if previous is None else previous.rotations
         ids = np.zeros(1, np.int32) if previous is None else previous.ids
         recent = previous is not None and previous.supported and normals.index - previous.index <= self.max_age
-        followed = self._frames.followed(directions, planes, known) if recent else []
-        found = self._frames.searched(directions, planes, followed)
-        turn = self._turn(followed, found, known)
-        found = self._recognised(found, matmul(turn, known))
+        tracked = self._track_known(directions, planes, known) if recent else []
+        found = self._search_more(directions, planes, tracked)
+        turn = self._camera_rotation(tracked, found, known)
+        found = self._name_frames(found, matmul(turn, known))
         if not found:
-            return lost_frames(self._frames.finder.follow(directions, planes, known[0]), self._fit, segments, planes, normals, known, ids)
+            return lost_frames(track_modes(self, directions, planes, known[0]), rules, segments, planes, normals, known, ids)
         rows = np.array([one.row for one in found], np.int32)
-        unseen = remembered(missing(rows, len(known)), ids, self.max_frames - len(found)) if previous is not None else NOBODY
-        fits = [self._fit(one.R, one.modes.axes, one.modes.normals, np.ones(3, np.bool_), segments, planes) for one in found]
+        unseen = retain_unseen(unmatched(rows, len(known)), ids, self.max_frames - len(found)) if previous is not None else NOBODY
+        fits = [fit_axes(rules, one.R, one.modes.axes, one.modes.normals, np.ones(3, np.bool_), segments, planes) for one in found]
         rotations, covariance = (np.array(values) for values in zip(*fits))
         if rows.max() >= 0:  # with the fitted rotation, so that what is out of sight keeps its angles to it over many frames
             again = int(np.argmax(rows >= 0))
@@ -95,87 +110,34 @@ class Mixture:
         spread = np.array([mode_spread(one.modes) for one in found])
         return seen_frames(normals, rotations, covariance, inliers, spread, rows, ids, unseen, matmul(turn, known)[unseen])
 
-    def _turn(self, followed: list[Found], found: list[Found], known: F64) -> F64:
-        """(3, 3) how the known frames (k, 3, 3) have turned: with the heaviest followed, unless another turn makes more of those found known ones."""
+    def _camera_rotation(self, tracked: list[Found], found: list[Found], known: F64) -> F64:
+        """Return the rotation (3, 3) of the known frames (k, 3, 3) since then: by the heaviest tracked, unless another associates more."""
         rotations, limit = np.array([one.R for one in found]).reshape(-1, 3, 3), np.radians(self.again_deg)
-        if followed:
-            turn = matmul(followed[0].R, known[followed[0].row].T)
-            matched = (identified(rotations, matmul(turn, known), limit) >= 0).sum()
+        if tracked:
+            turn = matmul(tracked[0].R, known[tracked[0].row].T)
+            matched = (associate_frames(rotations, matmul(turn, known), limit) >= 0).sum()
             if matched >= min(len(found), len(known)):
                 return np.asarray(turn)
-        other = turn_between(rotations, known, limit)
-        return turn if followed and matched >= (identified(rotations, matmul(other, known), limit) >= 0).sum() else other
+        other = camera_rotation(rotations, known, limit)
+        return turn if tracked and matched >= (associate_frames(rotations, matmul(other, known), limit) >= 0).sum() else other
 
-    def _recognised(self, found: list[Found], expected: F64) -> list[Found]:
-        """Each with the row of the expected frame (k, 3, 3) that it is, named as this is, in order of support; the one that came first before stays
-        there until another has clearly more."""
-        rows = identified(np.array([one.R for one in found]).reshape(-1, 3, 3), expected, np.radians(self.again_deg))
+    def _name_frames(self, found: list[Found], expected: F64) -> list[Found]:
+        """Associate the frames found with those expected (k, 3, 3), name their axes alike, and sort them by support; the one that came first before
+        stays there until another has clearly more."""
+        rows = associate_frames(np.array([one.R for one in found]).reshape(-1, 3, 3), expected, np.radians(self.again_deg))
         named = [Found(nearest_equivalent(one.R, expected[max(row, 0)]), one.modes, int(row)) for one, row in zip(found, rows)]
         return sorted(named, key=lambda one: -one.weight * (self.loyalty if one.row == 0 else 1.0))
 
-    @cached_property
-    def _frames(self) -> FrameMixture:
-        finder = ModeFinder(
-            cone=np.radians(self.cone_deg),
-            bandwidth=np.radians(self.bandwidth_deg),
-            max_iterations=20,
-            tolerance=np.radians(1e-3),
-            min_share=self.min_share,
-            min_lines=self.min_lines,
-            min_line_share=self.min_line_share,
-            max_width=self.max_width,
-            min_explained=self.min_explained,
-            max_skew=np.radians(self.max_skew_deg),
-            use_planes=True,
-        )
-        shared, merge, again = np.radians([self.shared_deg, self.merge_deg, self.again_deg])
-        return FrameMixture(finder, shared, merge, again, self.min_own, self.max_frames, self.search_samples)
-
-    @cached_property
-    def _fit(self) -> AxisFit:
-        return AxisFit(self.fit_deg, self.normals_floor_deg, self.plane_floor_deg, self.line_floor_deg, self.floor_deg)
-
-
-# Several Manhattan frames in one scene: each from the directions that belong to it, more of them from what is left.
-
-SHARED_WEIGHT = 0.2  # what belongs to a known frame may still be an axis of another, but does not lead to one
-
-
-class Found(NamedTuple):
-    """A Manhattan frame seen: its rotation (3, 3), the modes behind it, and which row of the known frames it is (-1: none)."""
-
-    R: F64
-    modes: Modes
-    row: int
-
-    @property
-    def weight(self) -> float:
-        """Weight of the directions on its axes."""
-        return float(self.modes.weights[self.modes.seen].sum())
-
-
-@dataclass(frozen=True)
-class FrameMixture:
-    """The rules of `mixture.Mixture`, whose fields these are; angles in rad."""
-
-    finder: ModeFinder
-    shared: float
-    merge: float
-    again: float
-    min_own: float
-    max_frames: int
-    search_samples: int
-
-    def followed(self, directions: Directions, planes: Planes, known: F64) -> list[Found]:
-        """Known rotations (k, 3, 3) that the scene still supports nearby, heaviest first. The turn of the first one found shows where to
-        expect those after it."""
+    def _track_known(self, directions: Directions, planes: Planes, known: F64) -> list[Found]:
+        """Return the known rotations (k, 3, 3) that the scene still supports nearby, heaviest first. The rotation of the first one found predicts
+        those after it."""
         found: list[Found] = []
-        expected = known
+        expected, again = known, np.radians(self.again_deg)
         for row in range(len(known)):
             modes = self._near(directions, planes, expected, row)
             R = nearest_equivalent(_rotation(modes), expected[row])
             off = np.radians(rotation_angle_deg(matmul(R.T, expected[row])))
-            if modes.supported and off < (self.again if found else 2.0 * self.again):  # mean shift can wander off to another frame
+            if modes.supported and off < (again if found else 2.0 * again):  # mean shift can wander off to another frame
                 if not found:
                     expected = matmul(R, known[row].T, known)
                 found.append(Found(R, modes, row))
@@ -185,15 +147,15 @@ class FrameMixture:
                 kept.append(one)
         return kept
 
-    def searched(self, directions: Directions, planes: Planes, found: list[Found]) -> list[Found]:
-        """Frames with those added to which the remaining directions lead."""
-        few = directions.thinned(self.search_samples)
+    def _search_more(self, directions: Directions, planes: Planes, found: list[Found]) -> list[Found]:
+        """Append frames while the directions on no axis lead to another."""
+        few = directions.subsample(self.search_samples)
         while len(found) < self.max_frames:
             left = self._left(few, found)
             if found and self._densest(few, left) < self.min_own * few.weights.sum():
                 break
             weights = np.where(left, few.weights, SHARED_WEIGHT * few.weights)
-            R = search_axes(few.vectors, weights, HALF_SPHERE, self.finder.cone, self.finder.bandwidth, 4, 2)
+            R = search_axes(few.vectors, weights, HALF_SPHERE, np.radians(self.cone_deg), np.radians(self.bandwidth_deg), 4, 2)
             rotations = np.array([*(one.R for one in found), R])
             modes = self._near(directions, planes, rotations, len(found))
             one = Found(_rotation(modes), modes, -1)
@@ -203,43 +165,43 @@ class FrameMixture:
         return found
 
     def _near(self, directions: Directions, planes: Planes, rotations: F64, row: int) -> Modes:
-        """Mean shift from one of the rotations (k, 3, 3), with the directions that belong to it."""
+        """Track the modes of one of the rotations (k, 3, 3), by the directions that belong to it."""
         if len(rotations) == 1:
-            return self.finder.follow(directions, planes, rotations[row])
+            return track_modes(self, directions, planes, rotations[row])
         vectors, weights, first = directions
-        own = members(vectors, rotations, row, self.shared)
-        return self.finder.follow(Directions(vectors[own], weights[own], int(own[:first].sum())), planes, rotations[row])
+        own = members(vectors, rotations, row, np.radians(self.shared_deg))
+        return track_modes(self, Directions(vectors[own], weights[own], int(own[:first].sum())), planes, rotations[row])
 
     def _is_another(self, one: Found, others: list[Found], directions: Directions) -> bool:
         """Return True if it is none of the others and has enough on axes which are not theirs."""
         if not others:
             return True
         axes = np.concatenate([other.modes.axes[:, other.modes.seen] for other in others], axis=1)
-        own = one.modes.seen & (np.abs(matmul(one.modes.axes.T, axes)).max(axis=1) < np.cos(self.shared))
+        own = one.modes.seen & (np.abs(matmul(one.modes.axes.T, axes)).max(axis=1) < np.cos(np.radians(self.shared_deg)))
         if one.modes.weights[own].sum() < self.min_own * directions.weights.sum():
             return False
-        return bool(symmetric_angles(one.R[None], np.array([other.R for other in others])).min() > self.merge)
+        return bool(symmetric_angles(one.R[None], np.array([other.R for other in others])).min() > np.radians(self.merge_deg))
 
     def _left(self, directions: Directions, found: list[Found]) -> Bool:
-        """(n,) directions on no axis that is seen."""
+        """Return True (n,) for the directions on no axis that is seen."""
         axes = np.concatenate([np.zeros((3, 0)), *(one.modes.axes[:, one.modes.seen] for one in found)], axis=1)
-        return np.asarray((np.abs(matmul(directions.vectors, axes)) < np.cos(self.finder.cone)).all(axis=1))
+        return np.asarray((np.abs(matmul(directions.vectors, axes)) < np.cos(np.radians(self.cone_deg))).all(axis=1))
 
     def _densest(self, directions: Directions, left: Bool) -> float:
-        """Most weight of the directions left that any cone gathers."""
-        inside = np.abs(matmul(directions.vectors[left], HALF_SPHERE.T)) > np.cos(self.finder.cone)
+        """Return the largest weight of the directions left in any cone."""
+        inside = np.abs(matmul(directions.vectors[left], HALF_SPHERE.T)) > np.cos(np.radians(self.cone_deg))
         return float(matmul(directions.weights[left], inside).max())
 
 
 def members(vectors: F64, rotations: F64, row: int, shared: float) -> Bool:
-    """(n,) whether a direction (n, 3) belongs to one of the frames (k, 3, 3): the nearest of all axes is the frame's, or one of the frame's axes is
-    within `shared` (rad) of that axis, as two frames have the floor in common."""
+    """Return True (n,) for each direction (n, 3) that belongs to frame `row` of (k, 3, 3): the nearest of all axes is the frame's, or
+    one of the frame's axes is within `shared` (rad) of that axis, as two frames have the floor in common."""
     axes = np.moveaxis(rotations, 2, 1).reshape(-1, 3)
     nearest = np.argmax(np.abs(matmul(vectors, axes.T)), axis=1)
     return np.asarray((np.abs(matmul(rotations[row].T, axes.T)).max(axis=0) > np.cos(shared))[nearest])
 
 
 def _rotation(modes: Modes) -> F64:
-    """(3, 3) nearest to the axes seen."""
+    """Return the rotation (3, 3) nearest to the axes seen."""
     weights = np.where(modes.seen, modes.weights, 1e-6)
     return orthonormal(modes.axes, weights / weights.max())

@@ -11,7 +11,7 @@ from trihedron.pipeline.core.linalg import matmul
 from trihedron.pipeline.core.options import PositiveFloat, PositiveShare, Range, Share
 from trihedron.pipeline.core.registry import register
 from trihedron.pipeline.core.types import F64, I32, ManhattanFrame, Planes
-from trihedron.plugins.manhattan.common_kernels import NOTHING_KNOWN, variance_scale
+from trihedron.plugins.manhattan.axis_fit_kernels import NOTHING_KNOWN, variance_scale
 from trihedron.plugins.shared.manhattan_frames_kernels import (
     Walls,
     area_on_axes,

@@ -12,9 +12,13 @@ from trihedron.pipeline.core.linalg import inv
 from trihedron.pipeline.core.options import NonNegativeFloat, PositiveFloat, PositiveInt, Range, Share
 from trihedron.pipeline.core.registry import register
 from trihedron.pipeline.core.types import F64, ManhattanFrame, Normals, Segments
-from trihedron.plugins.manhattan.common import HALF_SPHERE, Directions, ModeFinder, Modes, gather_directions
-from trihedron.plugins.manhattan.common_kernels import NORMALS_PER_SAMPLE, NOTHING_KNOWN, mode_statistics, orthonormal, search_axes, shift_axes
-from trihedron.plugins.manhattan.von_mises_fisher_kernels import AxisMixture, converged
+from trihedron.plugins.manhattan.axis_fit_kernels import NOTHING_KNOWN, orthonormal
+from trihedron.plugins.manhattan.directions import HALF_SPHERE, Directions, gather_directions
+from trihedron.plugins.manhattan.directions_kernels import NORMALS_PER_SAMPLE
+from trihedron.plugins.manhattan.mean_shift_kernels import mode_statistics, search_axes, shift_axes
+from trihedron.plugins.manhattan.mode_verification_kernels import ModeLimits
+from trihedron.plugins.manhattan.modes import Modes, verify_modes
+from trihedron.plugins.manhattan.von_mises_fisher_kernels import AxisMixture, expectation_maximisation
 from trihedron.plugins.shared.manhattan_frames_kernels import nearest_equivalent
 
 
@@ -52,7 +56,7 @@ class VonMisesFisher:
         """One rotation with id 0; `inliers` counts the directions that belong to an axis, `spread` is √(2/κ). `supported` False, with a large
         covariance, where the scene shows no two axes at right angles."""
         directions = gather_directions(normals.normals, segments, self.samples, self.line_weight_per_px)
-        R, mixture, modes = self._settled(directions, previous, normals.index)
+        R, mixture, modes = self._fit(directions, previous, normals.index)
         R, covariance = self._rotation(mixture, modes, R)
         weight = np.where(self._strength(mixture) > 0.0, mixture.weight, 0.0)
         spread = (weight * 2.0 / mixture.concentration).sum(axis=0) / np.maximum(weight.sum(axis=0), 1e-9)
@@ -67,37 +71,37 @@ class VonMisesFisher:
             supported=modes.supported,
         )
 
-    def _settled(self, directions: Directions, previous: ManhattanFrame | None, index: int) -> tuple[F64, AxisMixture, Modes]:
-        """Fit from the previous axes; from everywhere when there are none, they are old or nothing supports them. See `_judged`."""
+    def _fit(self, directions: Directions, previous: ManhattanFrame | None, index: int) -> tuple[F64, AxisMixture, Modes]:
+        """Fit from the previous axes; from everywhere when there are none, they are old or nothing supports them. See `_fit_from`."""
         start, near = np.eye(3) if previous is None else previous.rotations[0], None
         if previous is not None:
-            near = self._judged(directions, start)
+            near = self._fit_from(directions, start)
             if previous.supported and near[2].supported and index - previous.index <= self.max_age:
                 return near
-        few = directions.thinned(self.search_samples)
+        few = directions.subsample(self.search_samples)
         found = search_axes(few.vectors, few.weights, HALF_SPHERE, np.radians(12.0), np.radians(4.0), 6, 2)
-        far = self._judged(directions, nearest_equivalent(found, start))
+        far = self._fit_from(directions, nearest_equivalent(found, start))
         return far if far[2].supported or near is None else near
 
-    def _judged(self, directions: Directions, start: F64) -> tuple[F64, AxisMixture, Modes]:
-        """The rotation EM reaches from a start (3, 3), the mixture when its axes are then let free, and the judgement on it: in a Manhattan world
-        they stay at right angles, elsewhere each goes to a wall of its own."""
-        mixture = self._converged(broad_mixture(start, np.radians(self.start_spread_deg) ** -2), directions, False)
-        free = self._converged(mixture, directions, True)
-        vectors, weights, first = directions
+    def _fit_from(self, directions: Directions, start: F64) -> tuple[F64, AxisMixture, Modes]:
+        """Return the rotation that EM reaches from a start (3, 3), the mixture when its axes are then free, and its modes, verified: in a
+        Manhattan world they stay at right angles, elsewhere each goes to a wall of its own."""
+        mixture = self._maximise(broad_mixture(start, np.radians(self.start_spread_deg) ** -2), directions, False)
+        free = self._maximise(mixture, directions, True)
+        limits, (vectors, weights, first) = self._limits, directions
         normals = np.stack([free.number[0], free.weight[0], 2.0 / free.concentration[0], 1.0 / free.concentration[0]], axis=1)
-        peaks = shift_axes(vectors, weights, free.R, self._rules.cone, np.radians(self.peak_spread_deg), 20, 1e-4)
+        peaks = shift_axes(vectors, weights, free.R, limits.cone, np.radians(self.peak_spread_deg), 20, 1e-4)
         shift = np.linalg.norm(np.cross(peaks, free.R, axis=0), axis=0)
         sigma = np.sqrt(normals[:, 2] / np.maximum(2.0 * normals[:, 0] / NORMALS_PER_SAMPLE, 1.0))
         normals[shift > np.radians(self.max_shift_deg) + 2.0 * sigma] = 0.0  # two walls taken for one
-        lines = mode_statistics(vectors[first:], weights[first:], free.R, self._rules.cone)
-        modes = self._rules.judged(Modes(free.R, normals, lines, np.zeros(3, np.bool_), False), directions, None)
+        lines = mode_statistics(vectors[first:], weights[first:], free.R, limits.cone)
+        modes = verify_modes(limits, Modes(free.R, normals, lines, np.zeros(3, np.bool_), False), directions, None)
         return mixture.R if modes.seen.any() else start, free, modes
 
-    def _converged(self, mixture: AxisMixture, directions: Directions, free: bool) -> AxisMixture:
-        """After expectation–maximisation with axes at right angles or free."""
+    def _maximise(self, mixture: AxisMixture, directions: Directions, free: bool) -> AxisMixture:
+        """Maximise the likelihood by expectation–maximisation, with axes at right angles or free."""
         prior = np.radians(self.prior_spread_deg) ** -2
-        return converged(mixture, *directions, self.prior, prior, free, self.max_iterations, np.radians(self.tolerance_deg))
+        return expectation_maximisation(mixture, *directions, self.prior, prior, free, self.max_iterations, np.radians(self.tolerance_deg))
 
     def _strength(self, mixture: AxisMixture) -> F64:
         """(2, 3) concentrations; 0 of those that are too wide to be an axis."""
@@ -116,11 +120,9 @@ class VonMisesFisher:
         return R, covariance
 
     @cached_property
-    def _rules(self) -> ModeFinder:
-        widest = np.radians(self.max_spread_deg)
-        return ModeFinder(
-            widest, widest, 1, 1.0, self.min_share, self.min_lines, self.min_line_share, 1.0, self.min_explained, np.radians(self.max_skew_deg), False
-        )
+    def _limits(self) -> ModeLimits:
+        cone, skew = np.radians(self.max_spread_deg), np.radians(self.max_skew_deg)
+        return ModeLimits(cone, self.min_share, self.min_lines, self.min_line_share, cone**2, self.min_explained, skew)
 
 
 def broad_mixture(R: F64, concentration: float) -> AxisMixture:

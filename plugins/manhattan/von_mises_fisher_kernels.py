@@ -30,7 +30,7 @@ class AxisMixture(NamedTuple):
 
 
 @kernel
-def improved(
+def em_step(
     mixture: AxisMixture, directions: F64, weights: F64, first_line: int, prior: float, concentration: float, free: bool = False
 ) -> AxisMixture:
     """One step of expectation–maximisation, antipodes being one.
@@ -38,7 +38,7 @@ def improved(
     Given what belongs to which axis, R in closed form maximises `Σ κ_k r w ±x·a_k` (Straub et al., IROS 2015), κ solves `coth κ − 1/κ = mean
     ±x·a_k`. As a priori knowledge each axis counts `prior` more directions of the given concentration. With `free` axes each of them maximises its
     own sum, at whatever angles to the others."""
-    sums = _belonging(directions, weights, first_line, mixture.R, mixture.concentration, mixture.share)
+    sums = _expectation(directions, weights, first_line, mixture.R, mixture.concentration, mixture.share)
     kappa, share, resultant, M = np.empty((2, 3)), np.empty((2, 4)), np.empty((2, 3, 3)), 1e-6 * mixture.R
     for kind in range(2):
         own = weights[:first_line] if kind == 0 else weights[first_line:]
@@ -61,7 +61,7 @@ def improved(
 
 
 @kernel
-def converged(
+def expectation_maximisation(
     mixture: AxisMixture,
     directions: F64,
     weights: F64,
@@ -72,10 +72,10 @@ def converged(
     most: int,
     tolerance: float,
 ) -> AxisMixture:
-    """After at most `most` steps; the last one turned the axes by less than `tolerance` (rad) and changed no concentration by a hundredth."""
+    """Take at most `most` steps of EM; the last one turned the axes by less than `tolerance` (rad) and changed no concentration by a hundredth."""
     for _ in range(most):
         before = mixture
-        mixture = improved(before, directions, weights, first_line, prior, concentration, free)
+        mixture = em_step(before, directions, weights, first_line, prior, concentration, free)
         moved = np.sqrt(0.5 * ((mixture.R - before.R) ** 2).sum())
         if moved < tolerance and np.abs(mixture.concentration / before.concentration - 1.0).max() < 0.01:
             break
@@ -83,7 +83,7 @@ def converged(
 
 
 @kernel
-def _belonging(directions: F64, weights: F64, first_line: int, R: F64, concentration: F64, share: F64) -> F64:
+def _expectation(directions: F64, weights: F64, first_line: int, R: F64, concentration: F64, share: F64) -> F64:
     """(2, 3, 6) per population and axis: number, weight, `Σ w (1 − |x·a|)` and `Σ w ±x` of the directions, each as far as it belongs to the axis."""
     out = np.zeros((2, 3, 6))
     p = np.empty(3)

@@ -9,7 +9,7 @@ import cv2
 
 from trihedron.pipeline.core.registry import register
 from trihedron.pipeline.core.types import Frame, Normals
-from trihedron.plugins.normals.common import CloudMethod, CloudOptions, cloud_normals
+from trihedron.plugins.normals.opencv_normals import CloudMethod, CloudOptions, cloud_normals
 from trihedron.plugins.shared.per_thread import PerThread
 
 

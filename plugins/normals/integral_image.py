@@ -8,8 +8,8 @@ from typing import Annotated
 from trihedron.pipeline.core.options import NonNegativeFloat, PositiveFloat, PositiveShare, Range, check_increasing
 from trihedron.pipeline.core.registry import register
 from trihedron.pipeline.core.types import Frame, Normals
-from trihedron.plugins.normals.common import patch_radii
-from trihedron.plugins.normals.common_kernels import patch_normals
+from trihedron.plugins.normals.integral_image_kernels import patch_normals
+from trihedron.plugins.normals.patch_size import patch_radii
 
 
 @register("normals", "integral_image")

@@ -11,9 +11,9 @@ from trihedron.pipeline.core.options import PositiveFloat, PositiveShare, Range
 from trihedron.pipeline.core.registry import register
 from trihedron.pipeline.core.types import Frame, Normals, Planes
 from trihedron.plugins.planes.ahc_kernels import cluster_blocks
-from trihedron.plugins.planes.common import RegionOptions, complete_planes, grid_of, least_cells
-from trihedron.plugins.planes.common_blocks_kernels import block_sums, blocks_to_cells
-from trihedron.plugins.planes.common_kernels import fit_labelled
+from trihedron.plugins.planes.blocks_kernels import block_sums, blocks_to_cells
+from trihedron.plugins.planes.regions import RegionOptions, complete_planes, grid_of, least_cells
+from trihedron.plugins.planes.trimmed_fit_kernels import fit_labelled
 
 
 @register("planes", "ahc")

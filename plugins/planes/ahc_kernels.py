@@ -7,7 +7,7 @@ import numpy as np
 
 from trihedron.pipeline.core.kernel import kernel
 from trihedron.pipeline.core.types import F64, I32
-from trihedron.plugins.planes.common_blocks_kernels import SUMS, block_mse, block_plane
+from trihedron.plugins.planes.blocks_kernels import DEPTHS, SUMS, block_mse, block_plane
 
 # Agglomerative hierarchical clustering of blocks into planes (Feng, Taguchi and Kamat, ICRA 2014).
 
@@ -59,7 +59,7 @@ def cluster_blocks(sums: F64, block_limit: float, limit: float, excess: float, l
                 best, partner = mse, j
         if partner < 0:
             closed[i] = True
-            finished[i] = flat[i, 10] >= least
+            finished[i] = flat[i, DEPTHS] >= least
             continue
         parent[partner] = i
         for k in range(SUMS):

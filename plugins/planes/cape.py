@@ -10,10 +10,10 @@ import numpy as np
 from trihedron.pipeline.core.options import AcuteDeg, PositiveFloat, PositiveInt, PositiveShare, Range
 from trihedron.pipeline.core.registry import register
 from trihedron.pipeline.core.types import Frame, Normals, Planes
+from trihedron.plugins.planes.blocks_kernels import block_planes, block_sums, blocks_to_cells
 from trihedron.plugins.planes.cape_kernels import grow_blocks
-from trihedron.plugins.planes.common import RegionOptions, complete_planes, grid_of, least_cells
-from trihedron.plugins.planes.common_blocks_kernels import block_planes, block_sums, blocks_to_cells
-from trihedron.plugins.planes.common_kernels import fit_labelled
+from trihedron.plugins.planes.regions import RegionOptions, complete_planes, grid_of, least_cells
+from trihedron.plugins.planes.trimmed_fit_kernels import fit_labelled
 
 
 @register("planes", "cape")

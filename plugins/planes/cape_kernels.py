@@ -7,7 +7,7 @@ import numpy as np
 
 from trihedron.pipeline.core.kernel import kernel
 from trihedron.pipeline.core.types import F64, I32, Bool
-from trihedron.plugins.planes.common_blocks_kernels import SUMS, block_mse, block_plane
+from trihedron.plugins.planes.blocks_kernels import SUMS, block_mse, block_plane
 
 # Growing of planes over blocks from the commonest directions (Proença & Gao, IROS 2018).
 

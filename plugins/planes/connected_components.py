@@ -9,9 +9,9 @@ from typing import Annotated
 from trihedron.pipeline.core.options import AcuteDeg, Range
 from trihedron.pipeline.core.registry import register
 from trihedron.pipeline.core.types import Frame, Normals, Planes
-from trihedron.plugins.planes.common import EDGE, EDGE_M, RegionOptions, complete_planes, grid_of, least_cells
-from trihedron.plugins.planes.common_kernels import MOST
 from trihedron.plugins.planes.connected_components_kernels import planar_components
+from trihedron.plugins.planes.regions import EDGE, EDGE_M, RegionOptions, complete_planes, grid_of, least_cells
+from trihedron.plugins.planes.trimmed_fit_kernels import MAX_REGIONS
 
 
 @register("planes", "connected_components")
@@ -25,7 +25,8 @@ class ConnectedComponents(RegionOptions):
 
     def __call__(self, frame: Frame, normals: Normals) -> Planes:
         """Planes, largest first; `labels` on the grid of the normals."""
-        grid, cone, bend = grid_of(frame, normals), math.radians(self.cone_deg), 2.0 * math.radians(self.angle_deg)  # the same bend per metre
+        grid, cone = grid_of(frame, normals), math.radians(self.cone_deg)
+        angle = 2.0 * math.radians(self.angle_deg)  # between cells of twice the size
         least = least_cells(self, 2 * normals.stride)
-        core, q = planar_components(grid, (EDGE, EDGE_M), bend, self.gate, cone, self.turn, self.rounds, least, MOST)
+        core, q = planar_components(grid, (EDGE, EDGE_M), angle, self.gate, cone, self.turn, self.rounds, least, MAX_REGIONS)
         return complete_planes(self, core, q, grid, frame, normals.stride)

@@ -12,9 +12,9 @@ from trihedron.pipeline.core.linalg import eigvalsh, matmul, solve
 from trihedron.pipeline.core.options import PositiveInt, Share
 from trihedron.pipeline.core.registry import register
 from trihedron.pipeline.core.types import F32, F64, I32, Frame, Normals, Planes
-from trihedron.plugins.planes.common import RegionOptions, complete_planes, grid_of, least_cells
-from trihedron.plugins.planes.common_kernels import fit_labelled
-from trihedron.plugins.planes.common_open3d import grid_points
+from trihedron.plugins.planes.grid_points import grid_points
+from trihedron.plugins.planes.regions import RegionOptions, complete_planes, grid_of, least_cells
+from trihedron.plugins.planes.trimmed_fit_kernels import fit_labelled
 from trihedron.plugins.shared.depth_image_kernels import Grid
 from trihedron.plugins.shared.networks import NetworkImage, NetworkOptions, network_image
 

@@ -11,9 +11,9 @@ from trihedron.pipeline.core.linalg import matmul
 from trihedron.pipeline.core.options import AcuteDeg, NonNegativeFloat, NonNegativeInt, Range
 from trihedron.pipeline.core.registry import register
 from trihedron.pipeline.core.types import F64, Frame, Normals, Planes
-from trihedron.plugins.planes.common import EDGE, EDGE_M, RegionOptions, complete_planes, grid_of, least_cells
-from trihedron.plugins.planes.common_kernels import fit_labelled
-from trihedron.plugins.planes.common_open3d import grid_points, on_finer_grid
+from trihedron.plugins.planes.grid_points import grid_points, on_finer_grid
+from trihedron.plugins.planes.regions import EDGE, EDGE_M, RegionOptions, complete_planes, grid_of, least_cells
+from trihedron.plugins.planes.trimmed_fit_kernels import fit_labelled
 from trihedron.plugins.shared.depth_image_kernels import coarser
 from trihedron.plugins.shared.libraries import open3d
 from trihedron.plugins.shared.open3d_clouds import cloud_with_normals

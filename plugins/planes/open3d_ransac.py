@@ -10,9 +10,9 @@ import numpy as np
 from trihedron.pipeline.core.options import PositiveFloat, Range, Share
 from trihedron.pipeline.core.registry import register
 from trihedron.pipeline.core.types import F64, I32, Frame, Normals, Planes
-from trihedron.plugins.planes.common import EDGE, EDGE_M, RegionOptions, complete_planes, grid_of, least_cells
-from trihedron.plugins.planes.common_kernels import MOST, fit_labelled
-from trihedron.plugins.planes.common_open3d import grid_points, on_finer_grid
+from trihedron.plugins.planes.grid_points import grid_points, on_finer_grid
+from trihedron.plugins.planes.regions import EDGE, EDGE_M, RegionOptions, complete_planes, grid_of, least_cells
+from trihedron.plugins.planes.trimmed_fit_kernels import MAX_REGIONS, fit_labelled
 from trihedron.plugins.shared.depth_image_kernels import coarser
 from trihedron.plugins.shared.libraries import RANDOM, open3d
 from trihedron.plugins.shared.open3d_clouds import point_cloud
@@ -30,7 +30,7 @@ class Open3dRansac(RegionOptions):
     points: Annotated[int, Range(3, 10)] = 3  # ransac_n
     iterations: Annotated[int, Range(1, 100000)] = 100  # num_iterations, at most
     probability: Annotated[float, Range(above=0, below=1)] = 0.99999999
-    rounds: Annotated[int, Range(1, MOST)] = 10  # planes taken away, at most
+    rounds: Annotated[int, Range(1, MAX_REGIONS)] = 10  # planes taken away, at most
     min_share: Share = 0.02  # of the points: a smaller plane ends the search
 
     def __call__(self, frame: Frame, normals: Normals, rng: np.random.Generator) -> Planes:

@@ -10,9 +10,9 @@ import numpy as np
 from trihedron.pipeline.core.options import PositiveFloat, PositiveInt, Range
 from trihedron.pipeline.core.registry import register
 from trihedron.pipeline.core.types import Frame, Normals, Planes
-from trihedron.plugins.planes.common import EDGE, EDGE_M, RegionOptions, complete_planes, grid_of, least_cells
-from trihedron.plugins.planes.common_kernels import MOST, fit_labelled
 from trihedron.plugins.planes.ransac_kernels import consensus_planes
+from trihedron.plugins.planes.regions import EDGE, EDGE_M, RegionOptions, complete_planes, grid_of, least_cells
+from trihedron.plugins.planes.trimmed_fit_kernels import MAX_REGIONS, fit_labelled
 from trihedron.plugins.shared.depth_image_kernels import coarser
 
 
@@ -23,7 +23,7 @@ class Ransac(RegionOptions):
     region, then the next among what is left; on cells of twice the size. It needs no smooth neighbourhoods, and its random numbers are `rng`'s."""
 
     hypotheses: Annotated[int, Range(1, 10000)] = 120  # planes drawn for each one found
-    rounds: Annotated[int, Range(1, MOST)] = 40  # at most
+    rounds: Annotated[int, Range(1, MAX_REGIONS)] = 40  # at most
     misses: PositiveInt = 5  # rounds in a row without a region, before the search ends
     sigma: PositiveFloat = 2.0  # σ_z of an inlier's depth
 

@@ -8,7 +8,8 @@ import numpy as np
 from trihedron.pipeline.core.kernel import kernel
 from trihedron.pipeline.core.linalg_kernels import dot
 from trihedron.pipeline.core.types import F64, I32, U8, Bool
-from trihedron.plugins.planes.common_kernels import columns_of, fit_cells
+from trihedron.plugins.planes.region_cells_kernels import gather_cells
+from trihedron.plugins.planes.trimmed_fit_kernels import fit_cells
 from trihedron.plugins.shared.depth_image_kernels import Grid, cells_by_component, connected_components
 
 # Sequential RANSAC of planes on an organised grid (Fischler and Bolles 1981), each plane a connected region of inliers.
@@ -39,7 +40,7 @@ def consensus_planes(grid: Grid, draws: F64, gate: float, cos_cone: float, least
                 break
             region = _connected_inliers(grid, q, cells, links, gate, cos_cone)
             member = np.zeros(len(region), np.bool_)
-            q, _ = fit_cells(q, columns_of(grid, region), cos_cone, gate, member)
+            q, _ = fit_cells(q, gather_cells(grid, region), cos_cone, gate, member)
         accepted = len(region) >= least and q.any()
         if accepted:
             planes[found] = q
@@ -120,7 +121,7 @@ def _score(grid: Grid, q: F64, cells: I32, gate: float, cos_cone: float) -> floa
 def _connected_inliers(grid: Grid, q: F64, cells: I32, links: U8, gate: float, cos_cone: float) -> I32:
     """The largest connected region of inliers among the cells."""
     member, inlier = np.zeros(len(cells), np.bool_), np.zeros(grid.rho.shape, np.bool_)
-    fit_cells(q, columns_of(grid, cells), cos_cone, gate, member)
+    fit_cells(q, gather_cells(grid, cells), cos_cone, gate, member)
     w = grid.rho.shape[1]
     for k in range(len(cells)):
         if member[k]:

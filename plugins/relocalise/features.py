@@ -14,8 +14,8 @@ from trihedron.pipeline.core.types import F64, I32, Frame, Keypoints, Map, Plane
 from trihedron.plugins.mapping.covisibility_graph import observed_by
 from trihedron.plugins.places.recognition import distinct_poses, rigid_hypotheses
 from trihedron.plugins.places.verification import FrameFeatures
-from trihedron.plugins.relocalise.common import RelocaliseOptions, recognise
 from trihedron.plugins.relocalise.features_kernels import BIN_M, NEAR_M, explained_share
+from trihedron.plugins.relocalise.hypothesis_verification import RelocaliseOptions, recognise
 from trihedron.plugins.shared.feature_matching import nearest_matches
 from trihedron.plugins.shared.manhattan_frames_kernels import CUBE
 

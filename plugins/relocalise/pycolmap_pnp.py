@@ -13,7 +13,7 @@ from trihedron.pipeline.core.registry import register
 from trihedron.pipeline.core.types import F64, I32, Frame, Keypoints, Map, Planes, Pose, Segments
 from trihedron.plugins.mapping.covisibility_graph import observed_by
 from trihedron.plugins.places.verification import FrameFeatures
-from trihedron.plugins.relocalise.common import RelocaliseOptions, recognise
+from trihedron.plugins.relocalise.hypothesis_verification import RelocaliseOptions, recognise
 from trihedron.plugins.shared.feature_matching import mutual_matches
 from trihedron.plugins.shared.pycolmap_pose import absolute_pose
 

@@ -11,7 +11,8 @@ from trihedron.pipeline.core.options import PositiveFloat
 from trihedron.pipeline.core.registry import register
 from trihedron.pipeline.core.types import Keypoints, Map, Pose, Rotation, Tracks
 from trihedron.plugins.mapping.reference_keyframe import transform_rotation_to_map
-from trihedron.plugins.rotation.common import Estimate, KnownFrames, rotation_before, rotation_value
+from trihedron.plugins.rotation.estimate import Estimate, rotation_before, rotation_value
+from trihedron.plugins.rotation.known_frames import KnownFrames
 
 FEWEST = 3  # features that fix a rotation
 

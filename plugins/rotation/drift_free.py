@@ -15,7 +15,9 @@ from trihedron.pipeline.core.options import NonNegativeInt, PositiveFloat, Posit
 from trihedron.pipeline.core.registry import register
 from trihedron.pipeline.core.types import F64, Keypoints, ManhattanFrame, Map, Planes, Pose, Rotation, Segments, Tracks
 from trihedron.plugins.mapping.reference_keyframe import transform_rotation_to_map
-from trihedron.plugins.rotation.common import IDENTITY, Estimate, KnownFrames, Observation, TrackedRotation, rotation_before, rotation_value
+from trihedron.plugins.rotation.estimate import IDENTITY, Estimate, rotation_before, rotation_value
+from trihedron.plugins.rotation.known_frames import KnownFrames, Observation
+from trihedron.plugins.rotation.tracked_rotation import compose_with_tracks
 
 
 @register("rotation", "drift_free")
@@ -63,9 +65,8 @@ class DriftFree:
             before, refined = rotation_before(previous, previous_pose, self.pose_floor_deg)
             known = KnownFrames(previous.R_world_manhattan, previous.ids, previous.weights)
             if refined:
-                known = known.updated_by(previous, before.R, self.max_weight, self.gate * math.radians(self.gate_floor_deg))
-            tracked = TrackedRotation(self.prior_deg, self.prior_m, self.measured_deg, self.angle_px, self.plane_floor_deg, self.predict_frames)
-            predicted = tracked(before, previous.index, tracks, keypoints, segments, planes)
+                known = known.update(previous, before.R, self.max_weight, self.gate * math.radians(self.gate_floor_deg))
+            predicted = compose_with_tracks(self, before, previous.index, tracks, keypoints, segments, planes)
         known, estimate, seen = self._fuse(known, predicted, manhattan)
         return rotation_value(keypoints.index, keypoints.stamp_ns, estimate, known, seen)
 

@@ -10,7 +10,8 @@ from trihedron.pipeline.core.linalg import matmul
 from trihedron.pipeline.core.options import PositiveFloat
 from trihedron.pipeline.core.registry import register
 from trihedron.pipeline.core.types import F64, Keypoints, ManhattanFrame, Rotation
-from trihedron.plugins.rotation.common import Estimate, KnownFrames, rotation_value
+from trihedron.plugins.rotation.estimate import Estimate, rotation_value
+from trihedron.plugins.rotation.known_frames import KnownFrames
 from trihedron.plugins.shared.manhattan_frames_kernels import nearest_equivalent
 
 UNSEEN = np.full((1, 3, 3), np.nan)

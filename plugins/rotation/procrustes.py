@@ -10,7 +10,9 @@ from trihedron.pipeline.core.options import NonNegativeInt, PositiveFloat
 from trihedron.pipeline.core.registry import register
 from trihedron.pipeline.core.types import Keypoints, Map, Planes, Pose, Rotation, Segments, Tracks
 from trihedron.plugins.mapping.reference_keyframe import transform_rotation_to_map
-from trihedron.plugins.rotation.common import Estimate, KnownFrames, TrackedRotation, rotation_before, rotation_value
+from trihedron.plugins.rotation.estimate import Estimate, rotation_before, rotation_value
+from trihedron.plugins.rotation.known_frames import KnownFrames
+from trihedron.plugins.rotation.tracked_rotation import compose_with_tracks
 
 
 @register("rotation", "procrustes")
@@ -42,6 +44,5 @@ class Procrustes:
         estimate = Estimate(np.eye(3), np.zeros((3, 3)), "prediction")
         if previous is not None:
             before, _ = rotation_before(*transform_rotation_to_map(previous, previous_pose, map), self.pose_floor_deg)
-            tracked = TrackedRotation(self.prior_deg, self.prior_m, self.measured_deg, self.angle_px, self.plane_floor_deg, self.predict_frames)
-            estimate = tracked(before, previous.index, tracks, keypoints, segments, planes)
+            estimate = compose_with_tracks(self, before, previous.index, tracks, keypoints, segments, planes)
         return rotation_value(keypoints.index, keypoints.stamp_ns, estimate, KnownFrames.none(), np.zeros((0, 3, 3)))

@@ -11,7 +11,7 @@ from trihedron.pipeline.core.registry import register
 from trihedron.pipeline.core.types import Camera, Keypoints, Planes, Segments, Tracks
 from trihedron.plugins.shared.feature_matching import mutual_matches
 from trihedron.plugins.shared.relative_motion import solve_motion
-from trihedron.plugins.tracks.common import NO_PAIRS, Features, StructureGates, tracks_value
+from trihedron.plugins.tracks.feature_pairs import NO_PAIRS, Features, StructureGates, tracks_value
 
 
 @register("tracks", "brute_force")

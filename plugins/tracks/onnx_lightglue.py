@@ -12,7 +12,7 @@ from trihedron.pipeline.core.registry import register
 from trihedron.pipeline.core.types import F32, I32, Camera, Keypoints, Planes, Segments, Tracks
 from trihedron.plugins.shared.networks import NetworkOptions, vectors_of
 from trihedron.plugins.shared.relative_motion import solve_motion
-from trihedron.plugins.tracks.common import NO_PAIRS, Features, StructureGates, tracks_value
+from trihedron.plugins.tracks.feature_pairs import NO_PAIRS, Features, StructureGates, tracks_value
 
 
 @register("tracks", "onnx_lightglue")

@@ -13,8 +13,8 @@ from trihedron.pipeline.core.options import NonNegativeInt, PositiveFloat, Posit
 from trihedron.pipeline.core.registry import register
 from trihedron.pipeline.core.types import F32, I32, Bool, Frame, Keypoints, Planes, Segments, Tracks
 from trihedron.plugins.shared.relative_motion import solve_motion
-from trihedron.plugins.tracks.common import NO_PAIRS, Features, StructureGates, tracks_value
-from trihedron.plugins.tracks.common_kernels import nearest_pixels
+from trihedron.plugins.tracks.feature_pairs import NO_PAIRS, Features, StructureGates, tracks_value
+from trihedron.plugins.tracks.optical_flow_kernels import nearest_pixels
 
 
 @register("tracks", "optical_flow")

@@ -18,8 +18,8 @@ from trihedron.plugins.shared.feature_matching_kernels import U64, associate_pla
 from trihedron.plugins.shared.linalg import constant
 from trihedron.plugins.shared.relative_motion import Motion, solve_motion
 from trihedron.plugins.shared.rigid_alignment import consensus, tracked_point_pairs
-from trihedron.plugins.tracks.common import NO_PAIRS, Features, tracks_value
-from trihedron.plugins.tracks.common_kernels import matched_pairs
+from trihedron.plugins.tracks.feature_pairs import NO_PAIRS, Features, tracks_value
+from trihedron.plugins.tracks.feature_pairs_kernels import pairs_of_matches
 from trihedron.plugins.tracks.projection_kernels import FeaturePositions, Intrinsics, consistent_pairs, predict_features
 
 NOT_MOVED = np.zeros(3)
@@ -195,7 +195,7 @@ class Search:
             gates.line_sine, float(radius_px), gates.line_overlap, gates.lines_compared_by, gates.line_bits, gates.ratio,
         )  # fmt: skip
         same = associate_planes_kernel(seen.coefficients, seen.samples_m, planes, samples, gates.plane_cosine, plane_m, True)
-        return tracks_value(self.now, self.before, (matched_pairs(points), matched_pairs(lines), np.ascontiguousarray(same[:, ::-1])), R)
+        return tracks_value(self.now, self.before, (pairs_of_matches(points), pairs_of_matches(lines), np.ascontiguousarray(same[:, ::-1])), R)
 
     def consistent(self, tracks: Tracks, motion: Motion, error_px: float) -> Tracks:
         """Reject the key points and lines farther than `error_px` σ from their prediction by the motion, and key points without depth in both."""

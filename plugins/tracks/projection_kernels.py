@@ -10,7 +10,7 @@ import numpy as np
 from trihedron.pipeline.core.kernel import kernel
 from trihedron.pipeline.core.types import F32, F64, I32
 from trihedron.plugins.shared.feature_matching_kernels import transform_plane_samples
-from trihedron.plugins.tracks.common_kernels import predicted_pixel
+from trihedron.plugins.tracks.feature_pairs_kernels import predict_pixel
 
 Intrinsics = tuple[float, float, float, float]
 
@@ -30,25 +30,25 @@ def predict_features(before: FeaturePositions, planes: F64, samples_m: F32, came
     """Predict pixels (n, 2) and ends of lines (m, 2, 2) of the previous frame, its planes (p, 4) and points on them (p, s, 3), by a motion."""
     pixels, ends = np.empty((len(before.pixels), 2), np.float32), np.empty((len(before.endpoints_px), 2, 2), np.float32)
     for i in range(len(pixels)):
-        pixels[i, 0], pixels[i, 1] = _predicted_point(before.pixels, before.points_m, i, camera, R, t)
+        pixels[i, 0], pixels[i, 1] = _predict_point(before.pixels, before.points_m, i, camera, R, t)
     for i in range(len(ends)):
         for e in range(2):
-            ends[i, e, 0], ends[i, e, 1] = _predicted_end(before, i, e, camera, R, t)
+            ends[i, e, 0], ends[i, e, 1] = _predict_end(before, i, e, camera, R, t)
     coefficients, samples = transform_plane_samples(planes, samples_m, R, t)
     return pixels, ends, coefficients, samples
 
 
 @kernel
-def _predicted_point(pixels: F32, points_m: F32, i: int, camera: Intrinsics, R: F64, t: F64) -> tuple[float, float]:
+def _predict_point(pixels: F32, points_m: F32, i: int, camera: Intrinsics, R: F64, t: F64) -> tuple[float, float]:
     """Predict key point i."""
-    return predicted_pixel(pixels[i, 0], pixels[i, 1], points_m[i, 0], points_m[i, 1], points_m[i, 2], camera, R, t)
+    return predict_pixel(pixels[i, 0], pixels[i, 1], points_m[i, 0], points_m[i, 1], points_m[i, 2], camera, R, t)
 
 
 @kernel
-def _predicted_end(shown: FeaturePositions, i: int, end: int, camera: Intrinsics, R: F64, t: F64) -> tuple[float, float]:
+def _predict_end(shown: FeaturePositions, i: int, end: int, camera: Intrinsics, R: F64, t: F64) -> tuple[float, float]:
     """Predict an end of line i."""
     px, m = shown.endpoints_px, shown.endpoints_m
-    return predicted_pixel(px[i, end, 0], px[i, end, 1], m[i, end, 0], m[i, end, 1], m[i, end, 2], camera, R, t)
+    return predict_pixel(px[i, end, 0], px[i, end, 1], m[i, end, 0], m[i, end, 1], m[i, end, 2], camera, R, t)
 
 
 @kernel
@@ -66,11 +66,11 @@ def consistent_pairs(
         i, j = points[k, 0], points[k, 1]
         then, since = float(before.points_m[i, 2]), float(now.points_m[j, 2])
         if np.isfinite(then):
-            u, v = _predicted_point(before.pixels, before.points_m, i, camera, R, t)
+            u, v = _predict_point(before.pixels, before.points_m, i, camera, R, t)
             x, y = u - now.pixels[j, 0], v - now.pixels[j, 1]
             depth = since if since < then else then
         elif np.isfinite(since):
-            u, v = _predicted_point(now.pixels, now.points_m, j, camera, R_back, t_back)
+            u, v = _predict_point(now.pixels, now.points_m, j, camera, R_back, t_back)
             x, y, depth = u - before.pixels[i, 0], v - before.pixels[i, 1], since
         else:
             continue
@@ -83,7 +83,7 @@ def consistent_pairs(
         along_x, along_y = now.endpoints_px[j, 1, 0] - x, now.endpoints_px[j, 1, 1] - y
         length, off = max(np.sqrt(along_x * along_x + along_y * along_y), 1e-9), 0.0
         for e in range(2):
-            u, v = _predicted_end(before, i, e, camera, R, t)
+            u, v = _predict_end(before, i, e, camera, R, t)
             off += 0.5 * abs((v - y) * along_x - (u - x) * along_y) / length
         depth = min(float(before.endpoints_m[i, 0, 2]), float(before.endpoints_m[i, 1, 2]))
         if off <= error_px * (1.0 + unsure_px / (depth if depth > 0.0 else 1.0)):

@@ -12,7 +12,8 @@ from trihedron.pipeline.core.options import PositiveFloat, Range
 from trihedron.pipeline.core.registry import register
 from trihedron.pipeline.core.types import Camera, Keypoints, Map, Pose, Rotation, Tracks, Translation
 from trihedron.plugins.mapping.reference_keyframe import transform_to_map
-from trihedron.plugins.translation.common import origin, point_equations, propagated_covariance, solve_translation, unmeasured
+from trihedron.plugins.translation.linear_translation import point_equations, solve_translation
+from trihedron.plugins.translation.predicted_position import origin, propagated_covariance, unmeasured
 
 
 @register("translation", "irls")

@@ -11,7 +11,7 @@ from trihedron.pipeline.core.linalg import eigh, inv, matmul
 from trihedron.pipeline.core.options import PositiveFloat, PositiveInt, Range
 from trihedron.pipeline.core.registry import register
 from trihedron.pipeline.core.types import F64, Camera, Keypoints, Planes, Pose, Rotation, Tracks, Translation
-from trihedron.plugins.translation.common import point_equations, solve_translation
+from trihedron.plugins.translation.linear_translation import point_equations, solve_translation
 
 
 @register("translation", "kalman")

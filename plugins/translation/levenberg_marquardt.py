@@ -15,8 +15,8 @@ from trihedron.plugins.mapping.reference_keyframe import transform_to_map
 from trihedron.plugins.shared.linalg import constant
 from trihedron.plugins.shared.pose_optimizer import Terms, solve_pose
 from trihedron.plugins.shared.relative_motion import pairs_of
-from trihedron.plugins.translation.common import origin, propagated_covariance, unmeasured
-from trihedron.plugins.translation.levenberg_marquardt_kernels import tracked_lines, tracked_planes, tracked_points
+from trihedron.plugins.translation.predicted_position import origin, propagated_covariance, unmeasured
+from trihedron.plugins.translation.tracked_terms_kernels import tracked_lines, tracked_planes, tracked_points
 
 
 @register("translation", "levenberg_marquardt")

@@ -12,7 +12,7 @@ from trihedron.pipeline.core.registry import register
 from trihedron.pipeline.core.types import F64, Bool, Keypoints, Map, Pose, Rotation, Tracks, Translation
 from trihedron.plugins.mapping.reference_keyframe import transform_to_map
 from trihedron.plugins.shared.rigid_alignment import tracked_point_pairs
-from trihedron.plugins.translation.common import origin, propagated_covariance, unmeasured
+from trihedron.plugins.translation.predicted_position import origin, propagated_covariance, unmeasured
 
 
 @register("translation", "ransac")

@@ -12,7 +12,7 @@ from trihedron.pipeline.core.options import PositiveFloat, PositiveInt
 from trihedron.pipeline.core.registry import register
 from trihedron.pipeline.core.types import F64, Camera, Keypoints, Map, Planes, Pose, Rotation, Segments, Tracks, Translation
 from trihedron.plugins.mapping.reference_keyframe import transform_to_map
-from trihedron.plugins.translation.common import origin, propagated_covariance, unmeasured
+from trihedron.plugins.translation.predicted_position import origin, propagated_covariance, unmeasured
 
 NEAR_M = 0.05  # nearer to the image plane than this a point is not projected
 GATE = 3.0  # standard deviations within which a feature is an inlier

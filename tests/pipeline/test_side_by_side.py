@@ -33,6 +33,14 @@ class CountedNormals(ToyNormals):
 
 
 @dataclass(frozen=True)
+class FewerKeypoints(ToyKeypoints):
+    """Key points of even frames alone."""
+
+    def __call__(self, frame, rng):
+        return super().__call__(frame, rng) if frame.index % 2 == 0 else None
+
+
+@dataclass(frozen=True)
 class FromNormals(ToyKeypoints):
     """Keypoints that read the frame: two of them compute alike."""
 
@@ -104,6 +112,19 @@ def test_recorded_feedback_is_as_old_as_the_wire_says(tmp_path, wire):
     again = record(tmp_path / "again.mcap", double, Replay(Recording(source), ("rotation",), True), frozenset({"rotation"}))
     for path, totals in ((source, recorded), (again, expected)):
         assert {value.index: value.covariance[0, 0] for value in Recording(path).values("rotation")} == totals
+
+
+def test_with_recorded_feedback_a_stage_sees_nothing_that_another_computes(tmp_path):
+    """Fewer key points change the total of the rotation, but not one that is computed on the recorded key points."""
+    source = record(tmp_path / "source.mcap", toy_graph())
+    changed = toy_graph(keypoints=FewerKeypoints())
+    found = {}
+    for feedback in (False, True):
+        replay = Replay(Recording(source), ("keypoints", "rotation"), feedback)
+        found[feedback] = contents(record(tmp_path / f"{feedback}.mcap", changed, replay, frozenset({"keypoints", "rotation"})))
+    recorded = contents(source)
+    assert found[True]["/keypoints"] == found[False]["/keypoints"] != recorded["/keypoints"]
+    assert found[True]["/rotation"] == recorded["/rotation"] != found[False]["/rotation"]
 
 
 def test_what_is_not_recorded_is_computed_once(tmp_path):

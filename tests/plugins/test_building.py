@@ -20,8 +20,10 @@ from trihedron.pipeline.core.types import OPENING_KINDS, Camera, Frame, Planes, 
 from trihedron.pipeline.record.foxglove import TopicView
 from trihedron.pipeline.run.building_files import building_json, floorplan_svg, summary, write_building
 from trihedron.pipeline.run.building_ifc import has_ifc, write_ifc
-from trihedron.plugins.building.common import LEVELS, Face
-from trihedron.plugins.building.common_layout import Edge, _cornered, _ended, _gap, _jambs, _relative, _turn
+from trihedron.plugins.building.edges import Edge, end_at_readings, intersect_edges, make_relative, rotate_edge
+from trihedron.plugins.building.faces import Face
+from trihedron.plugins.building.free_space_kernels import LEVELS
+from trihedron.plugins.building.openings import fit_jambs, widest_gap
 from trihedron.plugins.normals.integral_image import IntegralImage
 from trihedron.plugins.planes.connected_components import ConnectedComponents
 from trihedron.tools.benchmarks import building_benchmark
@@ -293,15 +295,15 @@ def test_a_plan_of_next_to_nothing_says_so(name):
 
 def test_a_crossed_stretch_is_no_opening_where_the_wall_was_read():
     wall = np.arange(0.0, 4.0, 0.01)
-    assert _gap(1.0, 2.0, wall) is None  # rays go through by their noise
+    assert widest_gap(1.0, 2.0, wall) is None  # rays go through by their noise
     door = wall[(wall < 1.2) | (wall > 2.1)]
-    assert _gap(1.0, 2.6, door) == pytest.approx((1.2, 2.1), abs=0.06)
-    assert _gap(1.2, 2.1, np.empty(0)) == pytest.approx((1.2, 2.1))
+    assert widest_gap(1.0, 2.6, door) == pytest.approx((1.2, 2.1), abs=0.06)
+    assert widest_gap(1.2, 2.1, np.empty(0)) == pytest.approx((1.2, 2.1))
 
 
 def test_a_jamb_that_was_hardly_read_does_not_close_an_opening():
     beside = np.concatenate([np.arange(0.0, 1.2, 0.001), np.full(40, 2.15)])
-    assert _jambs(1.2, 1.95, beside)[:2] == pytest.approx((1.2, 1.95), abs=0.02)
+    assert fit_jambs(1.2, 1.95, beside)[:2] == pytest.approx((1.2, 1.95), abs=0.02)
 
 
 def test_a_wall_ends_with_its_readings_where_nothing_bounds_the_room():
@@ -311,13 +313,13 @@ def test_a_wall_ends_with_its_readings_where_nothing_bounds_the_room():
     corners = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]])
     normals = np.array([[0.0, 1.0], [-1.0, 0.0], [0.0, -1.0], [1.0, 0.0]])
     ring = [Edge(n, float(p @ n), face if k == 0 else None, p, q) for k, (n, p, q) in enumerate(zip(normals, corners, np.roll(corners, -1, axis=0)))]
-    loop = _ended(ring, [face])
-    _cornered(loop)
+    loop = end_at_readings(ring, [face])
+    intersect_edges(loop)
     assert [edge.face is face for edge in loop] == [True, False, False, False, False]
     assert np.array([edge.begin for edge in loop]) == pytest.approx(np.insert(corners, 1, [0.6, 0.0], axis=0))
     behind = Face(np.array([1.0, 0.0]), 1.1, -1.5, np.ones((40, LEVELS), np.int32), np.ones(40, np.bool_), np.empty(0, np.int64))
     ring[0] = Edge(normals[0], 0.0, face, corners[0], corners[1])
-    assert len(_ended(ring, [face, behind])) == 4  # the wall there was seen from behind
+    assert len(end_at_readings(ring, [face, behind])) == 4  # the wall there was seen from behind
 
 
 @pytest.mark.parametrize("turn_deg", [-2.0, 1.0])
@@ -330,7 +332,7 @@ def test_an_edge_turns_to_its_own_points(turn_deg):
     edge = Edge(np.array([np.cos(guess), np.sin(guess)]), 0.0, None)
     edge.offset_m = float(np.mean(points @ edge.normal))
     for _ in range(2):
-        _turn(edge, points, np.linspace(1.0, 2.0, 50))
+        rotate_edge(edge, points, np.linspace(1.0, 2.0, 50))
         edge.offset_m = float(np.mean(points @ edge.normal))
     assert edge.normal == pytest.approx(normal, abs=1e-4) and edge.offset_m == pytest.approx(1.5, abs=1e-4)
 
@@ -344,7 +346,7 @@ def test_the_error_of_an_edge_is_relative_to_its_room(middle):
     edges = [Edge(n, float(p @ n), seen, p, q, 0.002) for n, p, q in zip(normals, corners, np.roll(corners, -1, axis=0))]
     for edge, drift_m2 in zip(edges, (5e-6, 1e-6, 1e-6, 9e-6)):
         edge.drift_m2 = drift_m2
-    _relative(edges)
+    make_relative(edges)
     expected = 0.002**2 + (0.0007 * np.array([3.0, 2.0, 3.0, 2.0])) ** 2 + [4e-6, 0.0, 0.0, 8e-6]
     assert np.square([edge.sigma_m for edge in edges]) == pytest.approx(expected, rel=1e-6)
     assert [edge.drift_m2 for edge in edges] == [1e-6] * 4

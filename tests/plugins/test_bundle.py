@@ -11,7 +11,6 @@ from trihedron.pipeline.core.geometry import invert, pose_matrix, tangent_basis
 from trihedron.pipeline.core.lie import exp_se3, log_se3
 from trihedron.pipeline.core.table import Table
 from trihedron.plugins.bundle.colmap import Colmap, solve_colmap
-from trihedron.plugins.bundle.common import bundle_problem, bundle_window
 from trihedron.plugins.bundle.local_window import LocalWindow, solve_bundle
 from trihedron.plugins.bundle.local_window_kernels import (
     HUBER,
@@ -24,6 +23,7 @@ from trihedron.plugins.bundle.local_window_kernels import (
     retract,
 )
 from trihedron.plugins.bundle.none import NoBundle
+from trihedron.plugins.bundle.window import bundle_problem, bundle_window
 from trihedron.plugins.mapping.correction import apply_correction
 
 sys.path.insert(0, str(Path(__file__).parent))

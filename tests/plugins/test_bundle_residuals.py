@@ -10,8 +10,8 @@ from trihedron.pipeline.core.geometry import invert, tangent_basis
 from trihedron.pipeline.core.lie import exp_se3, log_so3
 from trihedron.pipeline.core.linalg_kernels import tangent_columns
 from trihedron.plugins.bundle import local_window_kernels as terms_kernels
-from trihedron.plugins.bundle.common import BundleMeasurements, BundleState
 from trihedron.plugins.bundle.local_window_kernels import SQUARES, NormalEquations, line_basis, linearise_bundle
+from trihedron.plugins.bundle.window import BundleMeasurements, BundleState
 from trihedron.plugins.shared.pose_optimizer_kernels import PARALLEL, PERPENDICULAR, SAME, depth_direction, plane_residual
 
 sys.path.insert(0, str(Path(__file__).parent))

@@ -8,8 +8,8 @@ import pytest
 from trihedron.pipeline.core.geometry import tangent_basis
 from trihedron.pipeline.core.lie import exp_so3, log_so3, rotation_angle_deg
 from trihedron.pipeline.core.types import Normals, Planes, Segments
-from trihedron.plugins.manhattan.common_kernels import shift_axes
 from trihedron.plugins.manhattan.mean_shift import MeanShift
+from trihedron.plugins.manhattan.mean_shift_kernels import shift_axes
 from trihedron.plugins.shared.manhattan_frames_kernels import CUBE, nearest_equivalent
 
 ROWS, COLS, STRIDE = 120, 160, 4

@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from trihedron.pipeline.core.lie import exp_so3, log_so3, rotation_angle_deg
-from trihedron.plugins.manhattan.atlanta import Atlanta, named_azimuths, shared_covariance
+from trihedron.plugins.manhattan.atlanta import Atlanta, match_azimuths, shared_covariance
 from trihedron.plugins.manhattan.atlanta_kernels import fit_shared_vertical
 from trihedron.plugins.shared.manhattan_frames_kernels import nearest_equivalent
 
@@ -161,9 +161,9 @@ def test_azimuths_keep_their_angles_to_each_other(directions):
     rng = np.random.default_rng(9)
     known = directions.rotation(rng) @ world([0, 25, 60])
     now = exp_so3(np.radians(12.0) * known[0][:, 2]) @ known
-    named, rows = named_azimuths(now[[2, 0]] @ np.diag([-1.0, 1.0, -1.0]), known, np.radians(4.0), np.radians(20.0))
+    named, rows = match_azimuths(now[[2, 0]] @ np.diag([-1.0, 1.0, -1.0]), known, np.radians(4.0), np.radians(20.0))
     assert list(rows) == [2, 0] and np.allclose(named, now[[2, 0]])
-    named, rows = named_azimuths(world([40]) @ np.eye(3), world([0, 5]), np.radians(4.0), np.radians(20.0))
+    named, rows = match_azimuths(world([40]) @ np.eye(3), world([0, 5]), np.radians(4.0), np.radians(20.0))
     assert list(rows) == [1] and np.allclose(named[0], world([40])[0])
 
 

@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from trihedron.pipeline.core.lie import exp_so3, rotation_angle_deg
-from trihedron.plugins.manhattan.common import identified, symmetric_angles, turn_between
+from trihedron.plugins.manhattan.frame_association import associate_frames, camera_rotation, symmetric_angles
 from trihedron.plugins.manhattan.mixture import Mixture
 from trihedron.plugins.shared.manhattan_frames_kernels import CUBE, nearest_equivalent
 
@@ -163,9 +163,9 @@ def test_the_turn_that_brings_frames_onto_each_other(directions):
         before = np.array(apart(directions, rng, 3))
         Q = exp_so3(np.radians(50.0) * directions.spherical(rng, 1)[0])
         now = np.array([Q @ before[k] @ CUBE[rng.integers(24)] for k in (2, 0)])
-        assert np.allclose(turn_between(now, before, np.radians(5.0)), Q)
-        assert list(identified(now, Q @ before, np.radians(5.0))) == [2, 0]
-    assert np.allclose(turn_between(now[:0], before, 0.1), np.eye(3)) and len(identified(now[:0], before, 0.1)) == 0
+        assert np.allclose(camera_rotation(now, before, np.radians(5.0)), Q)
+        assert list(associate_frames(now, Q @ before, np.radians(5.0))) == [2, 0]
+    assert np.allclose(camera_rotation(now[:0], before, 0.1), np.eye(3)) and len(associate_frames(now[:0], before, 0.1)) == 0
 
 
 def test_one_wall_turns_all_that_is_known(directions):

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 
 from trihedron.pipeline.core.lie import exp_so3, rotation_angle_deg
 from trihedron.plugins.manhattan.von_mises_fisher import VonMisesFisher, broad_mixture
-from trihedron.plugins.manhattan.von_mises_fisher_kernels import improved
+from trihedron.plugins.manhattan.von_mises_fisher_kernels import em_step
 
 KINDS = [
     ("three planes, clean", 0.99, 0.1),
@@ -62,7 +62,7 @@ def test_each_step_makes_the_directions_more_likely(directions):
     mixture = broad_mixture(exp_so3(np.radians([8.0, -6.0, 5.0])) @ R, np.radians(10.0) ** -2)
     before, gains = likelihood(mixture), []
     for _ in range(20):
-        mixture = improved(mixture, vectors, weights, len(vectors), 1e-6, 200.0)
+        mixture = em_step(mixture, vectors, weights, len(vectors), 1e-6, 200.0)
         after = likelihood(mixture)
         gains.append(after - before)
         before = after

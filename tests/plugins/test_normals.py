@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from trihedron.plugins.normals.common import patch_radii
 from trihedron.plugins.normals.integral_image import IntegralImage
 from trihedron.plugins.normals.none import NoNormals
+from trihedron.plugins.normals.patch_size import patch_radii
 
 
 def errors_deg(normals, truth):

@@ -10,10 +10,11 @@ from trihedron.pipeline.core.geometry import tangent_basis
 from trihedron.plugins.normals.integral_image import IntegralImage
 from trihedron.plugins.planes.ahc import Ahc
 from trihedron.plugins.planes.cape import Cape
-from trihedron.plugins.planes.common_kernels import columns_of, fit_cells
 from trihedron.plugins.planes.connected_components import ConnectedComponents
 from trihedron.plugins.planes.none import NoPlanes
 from trihedron.plugins.planes.ransac import Ransac
+from trihedron.plugins.planes.region_cells_kernels import gather_cells
+from trihedron.plugins.planes.trimmed_fit_kernels import fit_cells
 from trihedron.plugins.shared.depth_image_kernels import Grid
 
 CORNER = (((0.6, 0.0, -0.8), 2.2), ((-0.6, 0.0, -0.8), 2.2), ((0.0, -0.96, -0.28), 1.2))  # two walls and the floor
@@ -214,7 +215,7 @@ def test_cells_in_one_line_are_no_plane():
     rho, sigma, count = np.full((1, w), 0.5, np.float32), np.full((1, w), 0.01, np.float32), np.ones((1, w), np.int32)
     member = np.zeros(w, np.bool_)
     grid = Grid(rho, sigma, count, np.linspace(-1.0, 1.0, w), np.zeros(1), normals)
-    q, members = fit_cells(np.array([0.0, 0.0, 0.5]), columns_of(grid, np.arange(w, dtype=np.int32)), 0.98, 3.0, member)
+    q, members = fit_cells(np.array([0.0, 0.0, 0.5]), gather_cells(grid, np.arange(w, dtype=np.int32)), 0.98, 3.0, member)
     assert members == 0 and not member.any() and not q.any()
 
 

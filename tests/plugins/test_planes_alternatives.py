@@ -10,9 +10,9 @@ from trihedron.plugins.normals.integral_image import IntegralImage
 from trihedron.plugins.normals.none import NoNormals
 from trihedron.plugins.planes.ahc import Ahc
 from trihedron.plugins.planes.ahc_kernels import cluster_blocks
+from trihedron.plugins.planes.blocks_kernels import block_mse, block_plane, block_planes, block_sums
 from trihedron.plugins.planes.cape import Cape
-from trihedron.plugins.planes.common_blocks_kernels import block_mse, block_plane, block_planes, block_sums
-from trihedron.plugins.planes.common_kernels import drop_engulfed, normals_of_regions
+from trihedron.plugins.planes.curvature_kernels import drop_engulfed, normal_statistics
 from trihedron.plugins.planes.ransac import Ransac
 from trihedron.plugins.shared.depth_image_kernels import Grid, cell_inverse_depths, cell_rays
 
@@ -147,7 +147,7 @@ def test_turn_of_a_cylinder_and_of_a_plane(analytic):
         labels[100:140, 140:181] = 1  # 81 px: 2 asin(40.5 · 1.41 m / 525 / 0.6 m) = 21 degrees, 10.5 to either side
         grid = grid_of(analytic.frame(depth))
         q = np.array([block_plane(block_sums(grid._replace(rho=np.where(labels > 0, grid.rho, 0).astype(np.float32)), 400, 0.0)[0, 0])[:3]])
-        turns, _, share = normals_of_regions(labels, q, grid, 0.5, 1)
+        turns, _, share = normal_statistics(labels, q, grid, 0.5, 1)
         assert share[0] == 1.0 and abs(np.degrees(turns[0]) - expected) < (0.1 if expected == 0.0 else 1.5)
 
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from trihedron.plugins.planes.common_kernels import merge_regions, neighbours
+from trihedron.plugins.planes.region_merging_kernels import count_adjacent, merge_regions
 
 
 def sums(normal, d, left, right, sigma_m, columns=80, rows=100, noise=None):
@@ -57,4 +57,4 @@ def test_a_small_region_is_merged_in_spite_of_its_noise():
 def test_regions_within_the_gap_touch(gap, expected):
     labels = np.zeros((4, 9), np.int32)
     labels[:, :3], labels[:, 5:] = 1, 2
-    assert neighbours(labels, 2, gap).tolist() == [[0.0, expected], [expected, 0.0]]
+    assert count_adjacent(labels, 2, gap).tolist() == [[0.0, expected], [expected, 0.0]]

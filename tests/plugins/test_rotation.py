@@ -8,9 +8,9 @@ import pytest
 from trihedron.pipeline.core.geometry import pose_matrix
 from trihedron.pipeline.core.lie import exp_so3, log_so3, rotation_angle_deg
 from trihedron.pipeline.core.types import LOST, OK, Frame, Pose
-from trihedron.plugins.rotation.common import KnownFrames
 from trihedron.plugins.rotation.constant_velocity import ConstantVelocity
 from trihedron.plugins.rotation.drift_free import DriftFree
+from trihedron.plugins.rotation.known_frames import KnownFrames
 from trihedron.plugins.rotation.procrustes import Procrustes
 from trihedron.plugins.shared.manhattan_frames_kernels import nearest_equivalent
 from trihedron.plugins.tracks.projection import Projection

@@ -5,7 +5,7 @@ import numpy as np
 from trihedron.pipeline.core.geometry import tangent_basis, transform, transform_planes
 from trihedron.pipeline.core.lie import exp_se3, exp_so3
 from trihedron.pipeline.core.types import Camera
-from trihedron.plugins.translation.levenberg_marquardt_kernels import placed_planes, placed_points
+from trihedron.plugins.translation.tracked_terms_kernels import placed_planes, placed_points
 
 CAMERA = Camera(640, 480, 525.0, 520.0, 319.5, 239.5)
 T = exp_se3(np.array([0.4, -0.2, 1.0, 0.3, -0.8, 0.2]))

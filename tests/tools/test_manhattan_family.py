@@ -10,7 +10,7 @@ from trihedron.pipeline.core.lie import exp_so3
 from trihedron.pipeline.core.registry import load_plugins
 from trihedron.pipeline.core.types import ManhattanFrame
 from trihedron.plugins.manhattan.branch_and_bound import BranchAndBound
-from trihedron.plugins.manhattan.common import directions_of
+from trihedron.plugins.manhattan.modes import directions_of
 from trihedron.plugins.shared.manhattan_frames_kernels import CUBE
 from trihedron.tools.benchmarks import manhattan_views as seen
 from trihedron.tools.benchmarks.manhattan_family import error_of, estimators, figures, measure
@@ -115,7 +115,7 @@ def test_the_gap_is_not_refuted_by_a_grid_over_all_rotations(scenes):
         _, view = list(seen.views(scenes[seen.WHOLE], index, False))[1]
         found = estimator(view.normals, view.segments, view.planes, None)
         directions = directions_of(estimator, view.normals, view.segments)
-        vectors, weights = estimator._with_planes(directions.thinned(estimator.search_samples), view.planes)
+        vectors, weights = estimator._with_planes(directions.subsample(estimator.search_samples), view.planes)
         inlier = np.radians(estimator.inlier_deg)
         reached = consensus(vectors, weights, found.rotations, inlier)[0]
         values = np.concatenate([consensus(vectors, weights, part, inlier) for part in np.array_split(grid, 20)])

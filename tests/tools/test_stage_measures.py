@@ -165,7 +165,7 @@ def test_frames_follow_each_other_and_the_first_has_no_error():
     for step in range(4):
         planes, _ = EXACT.plane_regions(camera_at(step), step)
         off = replace(planes, coefficients=planes.coefficients + np.array([0.0, 0.0, 0.0, 0.01 * (step == 2)]))
-        found.take(["planes"], {"dataset": EXACT.seen(camera_at(step), step), "planes": off})
+        found.take("planes", {"dataset": EXACT.seen(camera_at(step), step), "planes": off})
     assert found.of_frames()["planes mm"] == pytest.approx([np.nan, 0.0, 10.0, 0.0], abs=0.1, nan_ok=True)
     assert found.figures(found.of_frames())["planes mm"] == pytest.approx(10.0 / np.sqrt(3.0), abs=0.1)
 

@@ -1,4 +1,4 @@
-"""Final steps of every detector of line segments: fragments merged, placed on the edge to sub-pixel, directed, and described by LBD."""
+"""Final steps of every line detector: merge fragments, place segments on the edge to sub-pixel, direct them, and describe them by LBD."""
 
 from __future__ import annotations
 
@@ -11,9 +11,10 @@ import numpy as np
 
 from trihedron.pipeline.core.options import NonNegativeFloat, PositiveInt, Range
 from trihedron.pipeline.core.types import F32, F64, U8, Frame, LineSegments
-from trihedron.plugins.lines.common_kernels import Placing, line_band_descriptors, placed_segments
+from trihedron.plugins.lines.lbd_kernels import line_band_descriptors
+from trihedron.plugins.lines.segment_completion_kernels import SegmentRules, place_segments
 
-SMALLEST = 8  # px, side of an image a detector is asked to look at; some fail on less
+MIN_SIDE_PX = 8  # px, side of an image a detector is asked to look at; some fail on less
 
 
 @dataclass(frozen=True)
@@ -31,7 +32,7 @@ class LineOptions:
     band_px: Annotated[int, Range(1, 31)] = 7  # rows of an LBD band, on the reduced image
 
 
-def reduced(options: LineOptions, gray: U8) -> U8:
+def reduce_image(options: LineOptions, gray: U8) -> U8:
     """Return the image at `scale`."""
     if options.scale == 1.0:
         return gray
@@ -45,7 +46,7 @@ def line_segments(options: LineOptions, frame: Frame, small: U8, found: F32 | F6
     Segments are directed with the bright side on their right: start and end keep their meaning over time."""
     lines = np.zeros((0, 4)) if found is None else np.asarray(found, np.float64).reshape(-1, 4)
     angle, least_px, border_px = math.radians(options.merge_deg), float(options.min_length_px), float(options.border_px)
-    placing = Placing(angle, float(options.merge_offset_px), float(options.merge_gap_px), least_px, border_px, options.reach_px)
-    endpoints = placed_segments(frame.gray, lines, options.scale, placing, options.segments)
+    rules = SegmentRules(angle, float(options.merge_offset_px), float(options.merge_gap_px), least_px, border_px, options.reach_px)
+    endpoints = place_segments(frame.gray, lines, options.scale, rules, options.segments)
     descriptors = line_band_descriptors(small, endpoints, options.scale, options.band_px, 2.0)
     return LineSegments(index=frame.index, stamp_ns=frame.stamp_ns, endpoints_px=endpoints, descriptors=descriptors)

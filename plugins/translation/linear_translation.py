@@ -3,8 +3,7 @@
 With the previous point rotated into the current camera's axes, q = R_current_previous p, and the unknown translation s in `p_current = q + s`, a
 point observed at (x, y) on the image plane gives `(1, 0, -x)·s = x q_z - q_x` and `(0, 1, -y)·s = y q_z - q_y`; one without depth, of which only the
 rays b and b' are known, gives `(b × b')·s = 0` (Zhang, Kaess, Singh, IROS 2014; Kim, Coltin, Kim, ICRA 2018). That residual is normalised by |s|:
-noise would bias s towards zero.
-"""
+noise would bias s towards zero."""
 
 from __future__ import annotations
 
@@ -14,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from trihedron.pipeline.core.linalg import eigh, inv, matmul, norm, solve
-from trihedron.pipeline.core.types import F64, LOST, Camera, Keypoints, Pose, Rotation, Tracks, Translation
+from trihedron.pipeline.core.types import F64, Camera, Keypoints, Tracks
 
 ITERATIONS = 15
 CAUCHY = 2.385  # 95 % efficiency where the noise is Gaussian
@@ -106,23 +105,3 @@ def _linearise(equations: PointEquations, s: F64) -> tuple[F64, F64]:
     A[far, 0] -= off[:, None] * along
     b[far, 0] = -size * off
     return A, b
-
-
-# Values that every estimator of the position returns alike.
-
-
-def origin(rotation: Rotation) -> Translation:
-    """The first frame's position, the origin of the world, which is exact."""
-    return Translation(rotation.index, rotation.stamp_ns, np.zeros(3), np.zeros((3, 3)), np.empty((0, 3)), np.zeros(3, np.int32), True)
-
-
-def unmeasured(rotation: Rotation, t_world_camera: F64, covariance: F64) -> Translation:
-    """A predicted position (3,) with its covariance (3, 3)."""
-    return Translation(rotation.index, rotation.stamp_ns, t_world_camera, covariance, np.eye(3), np.zeros(3, np.int32), False)
-
-
-def propagated_covariance(previous: Pose, held_too: bool = False) -> F64:
-    """Covariance (3, 3) (world) that a previous pose propagates to the next: its own if it was lost, or with `held_too` unobservable in some
-    direction; else zero, since the world is defined by tracked poses."""
-    R, known = previous.T_world_camera[:3, :3], previous.status != LOST and not (held_too and previous.unobservable)
-    return np.zeros((3, 3)) if known else np.asarray(matmul(R, previous.local_covariance[:3, :3], R.T))

@@ -1,4 +1,4 @@
-"""Kernels of `levenberg_marquardt.py`: features of the previous frame in the world, with the covariance of their measurements, as terms."""
+"""Numba kernels of `levenberg_marquardt.py`: tracked features of the previous frame in the world, with covariance, as terms of `solve_pose`."""
 # mypy: disable-error-code="arg-type, assignment, index, return-value"
 
 from __future__ import annotations

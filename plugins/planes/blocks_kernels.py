@@ -1,8 +1,8 @@
 """Square blocks of a grid's cells, each with the sums from which its plane, or that of any union of blocks, follows in closed form.
 
-With 1 / z = q·r along the ray r = (x, y, 1) (see `organised_grid`) and weights w = 1/σ², a block's row of sums is
-(Σwx², Σwxy, Σwx, Σwy², Σwy, Σw, Σwxρ, Σwyρ, Σwρ, Σwρ², n), n the number of depths. Sums add when blocks are joined. The mean squared residual (mse)
-of a fit is in units of σ_z² of the sensor's noise model: the same threshold serves at every range, and no unit of length enters.
+With 1 / z = q·r along the ray r = (x, y, 1) and weights w = 1/σ², a block's sums are Σwx², Σwxy, Σwx, Σwy², Σwy, Σw, Σwxρ, Σwyρ, Σwρ, Σwρ² and the
+number of depths, at the places named below. Sums add when blocks are joined. The mean squared residual (mse) of a fit is in units of σ_z² of the
+sensor's noise model: the same threshold serves at every range, and no unit of length enters.
 """
 # mypy: disable-error-code="arg-type, assignment, index, return-value"
 
@@ -14,6 +14,7 @@ from trihedron.pipeline.core.kernel import kernel
 from trihedron.pipeline.core.types import F32, F64, I32
 from trihedron.plugins.shared.depth_image_kernels import Grid
 
+WXX, WXY, WX, WYY, WY, W, WXP, WYP, WP, WPP, DEPTHS = range(11)  # places of the sums; P is ρ, the inverse depth
 SUMS = 11
 
 
@@ -34,17 +35,17 @@ def block_sums(grid: Grid, side: int, share: float) -> F64:
             cells[r // side, c // side] += 1
             x, weight = rays_x[c], np.int32(count[r, c]) / (float(sigma[r, c]) * sigma[r, c])
             wx, wy, wp = weight * x, weight * y, weight * p
-            s[0] += wx * x
-            s[1] += wx * y
-            s[2] += wx
-            s[3] += wy * y
-            s[4] += wy
-            s[5] += weight
-            s[6] += wx * p
-            s[7] += wy * p
-            s[8] += wp
-            s[9] += wp * p
-            s[10] += count[r, c]
+            s[WXX] += wx * x
+            s[WXY] += wx * y
+            s[WX] += wx
+            s[WYY] += wy * y
+            s[WY] += wy
+            s[W] += weight
+            s[WXP] += wx * p
+            s[WYP] += wy * p
+            s[WP] += wp
+            s[WPP] += wp * p
+            s[DEPTHS] += count[r, c]
     for i in range(rows):
         for j in range(cols):
             if cells[i, j] < share * side * side:
@@ -54,28 +55,28 @@ def block_sums(grid: Grid, side: int, share: float) -> F64:
 
 @kernel
 def block_plane(s: F64) -> tuple[float, float, float, float]:
-    """q (three numbers) of the plane through a row of sums, and the mse; infinite without a plane. Centred first, so that nothing cancels."""
-    if s[5] <= 0.0:
+    """Fit a plane to a block's sums (11,): q (three numbers) and the mse, infinite without a plane. Centred first, so that nothing cancels."""
+    if s[W] <= 0.0:
         return 0.0, 0.0, 0.0, np.inf
-    x, y, p = s[2] / s[5], s[4] / s[5], s[8] / s[5]
-    xx, xy, yy = s[0] - x * s[2], s[1] - x * s[4], s[3] - y * s[4]
-    xp, yp, pp = s[6] - x * s[8], s[7] - y * s[8], s[9] - p * s[8]
+    x, y, p = s[WX] / s[W], s[WY] / s[W], s[WP] / s[W]
+    xx, xy, yy = s[WXX] - x * s[WX], s[WXY] - x * s[WY], s[WYY] - y * s[WY]
+    xp, yp, pp = s[WXP] - x * s[WP], s[WYP] - y * s[WP], s[WPP] - p * s[WP]
     det = xx * yy - xy * xy
     if not det > 1e-9 * xx * yy:
         return 0.0, 0.0, 0.0, np.inf
     a, b = (yy * xp - xy * yp) / det, (xx * yp - xy * xp) / det
-    return a, b, p - a * x - b * y, max(pp - a * xp - b * yp, 0.0) / s[10]
+    return a, b, p - a * x - b * y, max(pp - a * xp - b * yp, 0.0) / s[DEPTHS]
 
 
 @kernel
 def block_mse(s: F64, a: float, b: float, c: float) -> float:
-    """Mean squared residual, in σ_z², of a row of sums about the plane q = (a, b, c)."""
-    x, y = s[2] / s[5], s[4] / s[5]
-    mean = s[8] / s[5] - a * x - b * y - c
-    xx, xy, yy = s[0] - x * s[2], s[1] - x * s[4], s[3] - y * s[4]
-    xp, yp, pp = s[6] - x * s[8], s[7] - y * s[8], s[9] - s[8] * s[8] / s[5]
+    """Mean squared residual, in σ_z², of a block's sums (11,) about the plane q = (a, b, c)."""
+    x, y = s[WX] / s[W], s[WY] / s[W]
+    mean = s[WP] / s[W] - a * x - b * y - c
+    xx, xy, yy = s[WXX] - x * s[WX], s[WXY] - x * s[WY], s[WYY] - y * s[WY]
+    xp, yp, pp = s[WXP] - x * s[WP], s[WYP] - y * s[WP], s[WPP] - s[WP] * s[WP] / s[W]
     spread = pp - 2.0 * (a * xp + b * yp) + a * a * xx + 2.0 * a * b * xy + b * b * yy
-    return max(spread + s[5] * mean * mean, 0.0) / s[10]
+    return max(spread + s[W] * mean * mean, 0.0) / s[DEPTHS]
 
 
 @kernel
@@ -91,7 +92,7 @@ def block_planes(sums: F64) -> tuple[F64, F64]:
 
 @kernel
 def blocks_to_cells(blocks: I32, side: int, rho: F32) -> I32:
-    """Labels (h, w) of the cells that have depth from those (rows, cols) of their blocks."""
+    """Expand labels (rows, cols) of blocks to labels (h, w) of their cells; 0 without depth."""
     h, w = rho.shape
     out = np.zeros((h, w), np.int32)
     for r in range(h):

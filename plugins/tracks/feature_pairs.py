@@ -1,4 +1,4 @@
-"""Pairs of features of two frames as the topic `tracks`."""
+"""Pairs of features of two frames: lines and planes matched by a known motion, and the value of the topic `tracks`."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from trihedron.pipeline.core.linalg import matmul
 from trihedron.pipeline.core.types import F32, F64, I32, Camera, Keypoints, Planes, Segments, Tracks
 from trihedron.plugins.shared.feature_matching import associate_planes, match_lines
 from trihedron.plugins.shared.linalg import constant
-from trihedron.plugins.tracks.common_kernels import matched_pairs, predicted_kernel
+from trihedron.plugins.tracks.feature_pairs_kernels import pairs_of_matches, predict_pixels_kernel
 
 NO_PAIRS = np.zeros((0, 2), np.int32)
 
@@ -47,7 +47,7 @@ class StructureGates:
         known = transform_planes(pose_matrix(R, t), before.planes.coefficients)
         samples = (matmul(before.planes.samples_m, R.T) + t).astype(np.float32)
         planes = associate_planes(now.planes.coefficients, now.planes.samples_m, known, samples, self.plane_deg, self.plane_m, many_to_one=True)
-        return matched_pairs(lines), np.ascontiguousarray(planes[:, ::-1])
+        return pairs_of_matches(lines), np.ascontiguousarray(planes[:, ::-1])
 
 
 def tracks_value(now: Features, before: Features, pairs: tuple[I32, I32, I32], R_current_previous: F64) -> Tracks:
@@ -74,4 +74,4 @@ def predict_pixels(pixels: F32, points_m: F32, camera: Camera, R: F64, t: F64) -
     infinity."""
     intrinsics = (float(camera.fx), float(camera.fy), float(camera.cx), float(camera.cy))
     flat = constant(pixels.reshape(-1, 2), np.float32), constant(points_m.reshape(-1, 3), np.float32)
-    return np.asarray(predicted_kernel(*flat, intrinsics, constant(R, np.float64), constant(t, np.float64)).reshape(pixels.shape))
+    return np.asarray(predict_pixels_kernel(*flat, intrinsics, constant(R, np.float64), constant(t, np.float64)).reshape(pixels.shape))

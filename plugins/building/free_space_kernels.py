@@ -1,4 +1,4 @@
-"""Numba kernels of `common.py`."""
+"""Numba kernels of `free_space.py`."""
 # mypy: disable-error-code="arg-type, assignment, index, return-value"
 
 from __future__ import annotations

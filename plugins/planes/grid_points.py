@@ -17,7 +17,7 @@ def grid_points(grid: Grid) -> tuple[I32, I32, F64]:
 
 
 def on_finer_grid(labels: I32, grid: Grid) -> I32:
-    """Labels of cells of twice the size on a grid (h, w); 0 where that has no depth."""
+    """Expand labels of cells of twice the size to a grid (h, w); 0 where it has no depth."""
     h, w = grid.rho.shape
     finer = np.repeat(np.repeat(labels, 2, axis=0), 2, axis=1)[:h, :w]
     return np.ascontiguousarray(finer * (grid.rho > 0.0), np.int32)

@@ -1,4 +1,4 @@
-"""Key points of other detectors as the topic `keypoints`: with depth where it can be trusted, on the levels of a pyramid of 1.2."""
+"""Lift the key points of any detector to 3D: depth where it is reliable, sizes as levels of a pyramid of factor 1.2."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ LEVEL_SCALE = 1.2  # between levels, as the map expects (`octave_scale`)
 
 @dataclass(frozen=True)
 class LiftOptions:
-    """Options by which key points receive their depth, those of `orb`."""
+    """Options of the depth of key points, equal to those of `orb`."""
 
     sigma_px: PositiveFloat = 0.6  # of a position at level 0; grows with the key point's size
     depth_radius_px: Annotated[int, Range(1, 10)] = 2  # of the neighbourhood the depth is taken from
@@ -26,8 +26,9 @@ class LiftOptions:
     depth_edge: NonNegativeFloat = 0.01  # more than that, as a share of z, is a depth edge: no depth
 
 
-def lifted(options: LiftOptions, frame: Frame, pixels: F32, scales: F64, angles_deg: F32, descriptors: U8, metric: str) -> Keypoints:
-    """Key points at pixels (n, 2) with scales (n,), 1 for the finest, directions (n,) and descriptors (n, b)."""
+def lift_keypoints(options: LiftOptions, frame: Frame, pixels: F32, scales: F64, angles_deg: F32, descriptors: U8, metric: str) -> Keypoints:
+    """Lift key points at pixels (n, 2) with scales (n,), 1 for the finest, directions (n,) and descriptors (n, b); points are NaN without reliable
+    depth."""
     noise = frame.camera.depth_noise.coefficients
     depth, sigma = local_depth(frame.depth_m, pixels, options.depth_radius_px, options.depth_share, noise, options.depth_gate, options.depth_edge)
     scales = np.maximum(scales, 1.0)
@@ -45,14 +46,14 @@ def lifted(options: LiftOptions, frame: Frame, pixels: F32, scales: F64, angles_
     )
 
 
-def detected(options: LiftOptions, detector: Any, frame: Frame, smallest_px: float, width: int, metric: str, least_side: int) -> Keypoints:
-    """Detect and describe by a detector of OpenCV: key points with descriptors of `width` bytes; a size of `smallest_px` is level 0. None in an image
-    smaller than `least_side`."""
+def detect_and_lift(options: LiftOptions, detector: Any, frame: Frame, smallest_px: float, width: int, metric: str, least_side: int) -> Keypoints:
+    """Detect and describe key points by a detector of OpenCV, with descriptors of `width` bytes; a size of `smallest_px` is level 0. An image smaller
+    than `least_side` has none."""
     small = min(frame.gray.shape) < least_side
     found, described = ((), None) if small else detector.detectAndCompute(frame.gray, None)
     rows = np.array([(*point.pt, point.size, point.angle) for point in found], np.float32).reshape(-1, 4)
     descriptors = np.zeros((0, width), np.uint8) if described is None or not len(found) else _bytes(described)
-    return lifted(options, frame, rows[:, :2].copy(), rows[:, 2].astype(np.float64) / smallest_px, rows[:, 3].copy(), descriptors, metric)
+    return lift_keypoints(options, frame, rows[:, :2].copy(), rows[:, 2].astype(np.float64) / smallest_px, rows[:, 3].copy(), descriptors, metric)
 
 
 def _bytes(descriptors: NDArray[Any]) -> U8:

@@ -1,9 +1,8 @@
-"""OpenCV's normals of organised points, made fit for depth images with noise, holes and edges."""
+"""Normals by OpenCV's methods for organised points, made robust to the noise, holes and edges of depth images."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import lru_cache
 from typing import Annotated, Any
 
 import cv2
@@ -11,7 +10,8 @@ import numpy as np
 
 from trihedron.pipeline.core.options import NonNegativeFloat, PositiveFloat, Range
 from trihedron.pipeline.core.types import F32, F64, I32, U8, Camera, Frame, Normals
-from trihedron.plugins.normals.common_kernels import smooth_cells, smoothed_points, trusted_normals
+from trihedron.plugins.normals.opencv_normals_kernels import select_normals, smooth_cells, smooth_points
+from trihedron.plugins.normals.patch_size import patch_sides
 from trihedron.plugins.shared.depth_image_kernels import cell_inverse_depths, cell_rays
 from trihedron.plugins.shared.per_thread import PerThread
 
@@ -41,11 +41,11 @@ def cloud_normals(
     rays_x, rays_y = cell_rays(rho.shape[0], rho.shape[1], stride, intrinsics)
     clear = clearance(smooth_cells(rho, count, stride**2, options.jump, options.jump_m))
     radii = _radii(options, camera, window)
-    points = smoothed_points(rho, clear, radii, rays_x, rays_y)
+    points = smooth_points(rho, clear, radii, rays_x, rays_y)
     fx, fy = camera.fx / stride, camera.fy / stride
     calibration = np.array([[fx, 0.0, -rays_x[0] * fx], [0.0, fy, -rays_y[0] * fy], [0.0, 0.0, 1.0]])  # of the grid's cells
     found = normals_of()(points, calibration, method, window)
-    normals = trusted_normals(found, rho, clear, radii, reach, border, rays_x, rays_y)
+    normals = select_normals(found, rho, clear, radii, reach, border, rays_x, rays_y)
     return Normals(index=frame.index, stamp_ns=frame.stamp_ns, normals=normals, stride=stride)
 
 
@@ -78,24 +78,3 @@ class CloudMethod:
 def clearance(smooth: U8) -> F32:
     """(h, w) chessboard distance to the nearest cell that is not smooth; the image's border is far away."""
     return np.asarray(cv2.distanceTransform(smooth, cv2.DIST_C, 3), np.float32)
-
-
-@lru_cache(maxsize=16)
-def patch_sides(camera: Camera, noise_deg: float, least_px: float, most_px: float) -> F64:
-    """(100,) side in px of the patch whose normal has a predicted standard deviation of `noise_deg`, for depths of 0.1, 0.2 … 10 m, within bounds;
-    read-only.
-
-    The tangents of n × n px with independent depth noise σ at z have gradients of σ f / z · √12 / n² (least squares, to 7 %)."""
-    z = np.arange(1, 101) * 0.1
-    slope = camera.depth_noise.sigma_m(z) * camera.fx / z
-    side = np.asarray(np.clip(np.sqrt(np.sqrt(12.0) * slope / np.radians(noise_deg)), least_px, most_px))
-    side.flags.writeable = False
-    return side
-
-
-@lru_cache(maxsize=16)
-def patch_radii(camera: Camera, noise_deg: float, least_px: float, most_px: float, stride: int) -> I32:
-    """(100,) half-widths of the patches of `patch_sides` in cells of `stride` pixels, at least 1; read-only."""
-    radii = np.maximum(np.round((patch_sides(camera, noise_deg, least_px, most_px) / stride - 1.0) / 2.0), 1).astype(np.int32)
-    radii.flags.writeable = False
-    return radii

@@ -1,4 +1,4 @@
-"""Numba kernels of `common.py`."""
+"""Kernels of `integral_image.py`: normals from tangent vectors averaged over image patches by integral images (Holzer et al., IROS 2012)."""
 # mypy: disable-error-code="arg-type, assignment, index, return-value"
 
 from __future__ import annotations
@@ -8,81 +8,6 @@ from numpy.typing import NDArray
 
 from trihedron.pipeline.core.kernel import kernel
 from trihedron.pipeline.core.types import F32, F64, I32, U8
-
-# An organised cloud of points for detectors that expect clean ones: smoothed over patches that never cross a depth edge.
-
-
-@kernel
-def smooth_cells(rho: F32, count: U8, full: int, jump: float, jump_m: float) -> U8:
-    """(h, w) 1 where a cell's inverse depth rho is that of its centre, because all its `full` readings are there, and no neighbour in its row or
-    column differs from it by more than `jump` z + `jump_m`."""
-    h, w = rho.shape
-    out = (count == full).astype(np.uint8)
-    for r in range(h):
-        for c in range(w):
-            if rho[r, c] <= 0.0:
-                continue
-            z = 1.0 / rho[r, c]
-            for s, d in ((r, c + 1), (r + 1, c)):
-                if s < h and d < w and rho[s, d] > 0.0:
-                    other = 1.0 / rho[s, d]
-                    if abs(z - other) > jump * min(z, other) + jump_m:
-                        out[r, c], out[s, d] = 0, 0
-    return out
-
-
-@kernel
-def smoothed_points(rho: F32, clear: F32, radii: I32, rays_x: F64, rays_y: F64) -> F64:
-    """(h, w, 4) points of the cells, inverse depth averaged over a square around each; NaN where there is none, the last number is 0.
-
-    `radii[i]` is the square's half-width in cells at a depth of i decimetres, less where `clear` (as from `clearance`) or the image's border is
-    nearer. Inverse depth is linear in the image on a plane, so the mean over a square is that of its centre whatever the plane's slope."""
-    h, w = rho.shape
-    total = np.zeros((h + 1, w + 1))
-    for r in range(h):
-        row = 0.0
-        for c in range(w):
-            row += rho[r, c]
-            total[r + 1, c + 1] = total[r, c + 1] + row
-    out = np.zeros((h, w, 4))
-    for r in range(h):
-        for c in range(w):
-            if rho[r, c] <= 0.0:
-                out[r, c, 0] = out[r, c, 1] = out[r, c, 2] = np.nan
-                continue
-            p = float(rho[r, c])
-            k = min(radii[min(int(10.0 / p), len(radii) - 1)], int(clear[r, c]) - 1, r, c, h - 1 - r, w - 1 - c)
-            if k > 0:
-                p = total[r + k + 1, c + k + 1] - total[r - k, c + k + 1] - total[r + k + 1, c - k] + total[r - k, c - k]
-                p /= (2 * k + 1) * (2 * k + 1)
-            out[r, c, 0], out[r, c, 1], out[r, c, 2] = rays_x[c] / p, rays_y[r] / p, 1.0 / p
-    return out
-
-
-@kernel
-def trusted_normals(normals: F64, rho: F32, clear: F32, radii: I32, reach: int, border: int, rays_x: F64, rays_y: F64) -> F32:
-    """(h, w, 3) the first three of (h, w, 4) numbers, turned towards the camera; NaN where they are no direction, within `border` cells of the
-    image's border or `reach` of a cell that is not smooth, or where either left less than half of the square of `smoothed_points`."""
-    h, w = clear.shape
-    out = np.full((h, w, 3), np.nan, np.float32)
-    for r in range(border, h - border):
-        for c in range(border, w - border):
-            if rho[r, c] <= 0.0:
-                continue
-            least = radii[min(int(10.0 / rho[r, c]), len(radii) - 1)] // 2
-            if clear[r, c] <= reach + least or min(r, c, h - 1 - r, w - 1 - c) < least:
-                continue
-            x, y, z = normals[r, c, 0], normals[r, c, 1], normals[r, c, 2]
-            length = np.sqrt(x * x + y * y + z * z)
-            if not 0.5 < length < 2.0:
-                continue
-            if x * rays_x[c] + y * rays_y[r] + z > 0.0:
-                length = -length
-            out[r, c, 0], out[r, c, 1], out[r, c, 2] = x / length, y / length, z / length
-    return out
-
-
-# Surface normals from tangent vectors averaged over image patches, by integral images (Holzer et al., IROS 2012).
 
 SUMS = np.dtype([("n", "f8"), ("z", "f8"), ("uz", "f8"), ("vz", "f8")])  # over pixels with depth: their count, Σz, Σuz and Σvz
 VECTOR = np.dtype([("x", "f4"), ("y", "f4"), ("z", "f4")])
@@ -112,7 +37,7 @@ def patch_normals(
     done = 0
     for r in range(h):
         while done < min(r + most + 1, h):
-            _strip_of(depth, done * stride, strip)
+            _read_strip(depth, done * stride, strip)
             if stride == 2:  # a constant lets the compiler take several blocks at once
                 _block_row(strip, 2, done, block)
             else:
@@ -149,46 +74,46 @@ def _smooth_blocks(depth: F32, stride: int, edge: tuple[int, float, float]) -> U
     z, marks = np.empty(cols, np.float32), np.empty(cols, np.uint8)
     above, above_row = np.zeros(cols, np.float32), np.full(cols, -reach - 1, np.int32)
     for y in range(rows):
-        _known(depth[y], z)
-        if _marked(z, above, above_row, y, reach, jump, jump_m, marks):
-            _spoil(z, above_row, y, reach, jump, jump_m, marks, stride, smooth)
-        _remember(z, above, above_row, y)
+        _copy_valid(depth[y], z)
+        if _mark_edges(z, above, above_row, y, reach, jump, jump_m, marks):
+            _clear_edge_blocks(z, above_row, y, reach, jump, jump_m, marks, stride, smooth)
+        _update_above(z, above, above_row, y)
     return smooth
 
 
 @kernel
-def _known(depth: F32, z: F32) -> None:
-    """Copies a row of depths, 0 = none."""
+def _copy_valid(depth: F32, z: F32) -> None:
+    """Copy a row of depths, 0 = none."""
     for x in range(len(depth)):
         z[x] = depth[x] if depth[x] > 0.0 and depth[x] < np.inf else np.float32(0.0)
 
 
 @kernel
-def _strip_of(depth: F32, first: int, strip: F32) -> None:
-    """The depths of a row of blocks (stride, w · stride), 0 = none."""
+def _read_strip(depth: F32, first: int, strip: F32) -> None:
+    """Copy the depths of a row of blocks to `strip` (stride, w · stride), 0 = none."""
     rows, cols = depth.shape
     for i in range(len(strip)):
         if first + i < rows:
-            _known(depth[first + i], strip[i, :cols])
+            _copy_valid(depth[first + i], strip[i, :cols])
         else:
             strip[i] = 0.0
 
 
 @kernel
-def _step(z: float, other: float, jump: float, jump_m: float) -> bool:
+def _is_edge(z: float, other: float, jump: float, jump_m: float) -> bool:
     return abs(z - other) > jump * min(z, other) + jump_m
 
 
 @kernel
-def _marked(z: F32, above: F32, above_row: I32, y: int, reach: int, jump: float, jump_m: float, marks: U8) -> bool:
-    """Marks in a row of depths, 0 = none: 1 = a step from the depth above, 2 = from the pixel on the left, 4 = nothing is measured there. Returns
-    whether there are any."""
+def _mark_edges(z: F32, above: F32, above_row: I32, y: int, reach: int, jump: float, jump_m: float, marks: U8) -> bool:
+    """Mark the depth edges in a row of depths, 0 = none: 1 = a step from the depth above, 2 = from the pixel on the left, 4 = no depth on the left.
+    Returns True if there are any."""
     for x in range(len(z)):
-        marks[x] = (z[x] > 0.0) & (y - above_row[x] <= reach) & _step(z[x], above[x], jump, jump_m)
+        marks[x] = (z[x] > 0.0) & (y - above_row[x] <= reach) & _is_edge(z[x], above[x], jump, jump_m)
     here, left, after = z[1:], z[:-1], marks[1:]
     some = marks[0]
     for x in range(len(here)):
-        across = np.uint8(2) * _step(here[x], left[x], jump, jump_m) if left[x] > 0.0 else np.uint8(4)
+        across = np.uint8(2) * _is_edge(here[x], left[x], jump, jump_m) if left[x] > 0.0 else np.uint8(4)
         after[x] |= across if here[x] > 0.0 else np.uint8(0)
     for x in range(len(z)):
         some |= marks[x]
@@ -196,8 +121,8 @@ def _marked(z: F32, above: F32, above_row: I32, y: int, reach: int, jump: float,
 
 
 @kernel
-def _spoil(z: F32, above_row: I32, y: int, reach: int, jump: float, jump_m: float, marks: U8, stride: int, smooth: U8) -> None:
-    """Writes 0 to the blocks on both sides of a row's edges."""
+def _clear_edge_blocks(z: F32, above_row: I32, y: int, reach: int, jump: float, jump_m: float, marks: U8, stride: int, smooth: U8) -> None:
+    """Write 0 to the blocks on both sides of a row's edges."""
     r = y // stride
     for x in range(len(z)):
         if marks[x] == 0:
@@ -208,15 +133,15 @@ def _spoil(z: F32, above_row: I32, y: int, reach: int, jump: float, jump_m: floa
         if marks[x] & 4:
             while left >= 0 and x - left <= reach and z[left] == 0.0:
                 left -= 1
-            if left < 0 or x - left > reach or not _step(z[x], z[left], jump, jump_m):
+            if left < 0 or x - left > reach or not _is_edge(z[x], z[left], jump, jump_m):
                 continue
         if marks[x] & 6:
             smooth[r, x // stride] = smooth[r, left // stride] = 0
 
 
 @kernel
-def _remember(z: F32, above: F32, above_row: I32, y: int) -> None:
-    """The last depth measured in each column, and its row."""
+def _update_above(z: F32, above: F32, above_row: I32, y: int) -> None:
+    """Update the last depth measured in each column, and its row."""
     for x in range(len(z)):
         above[x] = z[x] if z[x] > 0.0 else above[x]
         above_row[x] = y if z[x] > 0.0 else above_row[x]
@@ -240,7 +165,7 @@ def _block_row(strip: F32, stride: int, r: int, out: F64) -> None:
 
 @kernel
 def _integrate(block: F64, above: Records, out: Records) -> None:
-    """The next row (w + 1,) of the integral images."""
+    """Compute the next row (w + 1,) of the integral images."""
     n, total, along, down = 0.0, 0.0, 0.0, 0.0
     out[0]["n"], out[0]["z"], out[0]["uz"], out[0]["vz"] = n, total, along, down
     for c in range(block.shape[1]):
@@ -251,7 +176,7 @@ def _integrate(block: F64, above: Records, out: Records) -> None:
 
 @kernel
 def _clear_rings(smooth: U8, most: int) -> U8:
-    """(h, w) how many rings of blocks about each, `most` at most, are free of depth edges, as it is itself; what is outside the image is free."""
+    """Count (h, w) the rings of blocks about each block, `most` at most, that are free of depth edges; outside the image is free."""
     h, w = smooth.shape
     free, across, out = np.ones((h, w + 2), np.uint8), np.ones((h + 2, w), np.uint8), np.zeros((h, w), np.uint8)
     for r in range(h):
@@ -279,7 +204,7 @@ def _decimetres(above: Records, below: Records, out: I32) -> None:
 
 
 @kernel
-def _boxes(flat: F64, a: int, b: int, c: int, d: int, out: F64, first: int, n: int) -> None:
+def _box_sums(flat: F64, a: int, b: int, c: int, d: int, out: F64, first: int, n: int) -> None:
     """Sums over boxes side by side, given by the places of their corners in the flat rows of the integral images: a − b − c + d. Numbers that cannot
     be negative need no test for indices that count from the end, so the compiler takes several at once."""
     i, j, k, m, o = np.uint64(a), np.uint64(b), np.uint64(c), np.uint64(d), np.uint64(first)
@@ -288,8 +213,8 @@ def _boxes(flat: F64, a: int, b: int, c: int, d: int, out: F64, first: int, n: i
 
 
 @kernel
-def _box(flat: F64, a: int, b: int, c: int, d: int, out: F64, first: int) -> None:
-    """`_boxes` of one box."""
+def _box_sum(flat: F64, a: int, b: int, c: int, d: int, out: F64, first: int) -> None:
+    """`_box_sums` of one box."""
     i, j, k, m, o = np.uint64(a), np.uint64(b), np.uint64(c), np.uint64(d), np.uint64(first)
     one, two, three = np.uint64(1), np.uint64(2), np.uint64(3)
     out[o], out[o + one] = flat[i] - flat[j] - flat[k] + flat[m], flat[i + one] - flat[j + one] - flat[k + one] + flat[m + one]
@@ -299,22 +224,22 @@ def _box(flat: F64, a: int, b: int, c: int, d: int, out: F64, first: int) -> Non
 
 @kernel
 def _halves(flat: F64, kept: int, h: int, w: int, r: int, first: int, end: int, k: int, least: float, halves: F64, needed: F64) -> None:
-    """The halves of the patches, k blocks to each side, of the blocks first … end of a row; only that of a single block may be cut by the image."""
+    """Sum over the half patches, k blocks to each side, of the blocks first … end of a row; only that of a single block may be cut by the image."""
     row, side, place, n = 4 * (w + 1), 4 * w, 4 * first, 4 * (end - first)
     r0, r1, c0, c1 = max(r - k, 0), min(r + k + 1, h), max(first - k, 0), min(first + k + 1, w)
     a, b = (r1 - r0) // 2, (c1 - c0) // 2
     top, bottom, upper, lower = row * (r0 % kept), row * (r1 % kept), row * ((r0 + a) % kept), row * ((r1 - a) % kept)
     west, east, t = 4 * c0, 4 * c1, 4 * b
     if n == 4:  # a single block, as most stretches are: nothing to prepare for many
-        _box(flat, bottom + east, top + east, bottom + east - t, top + east - t, halves, place)
-        _box(flat, bottom + west + t, top + west + t, bottom + west, top + west, halves, place + side)
-        _box(flat, bottom + east, lower + east, bottom + west, lower + west, halves, place + 2 * side)
-        _box(flat, upper + east, top + east, upper + west, top + west, halves, place + 3 * side)
+        _box_sum(flat, bottom + east, top + east, bottom + east - t, top + east - t, halves, place)
+        _box_sum(flat, bottom + west + t, top + west + t, bottom + west, top + west, halves, place + side)
+        _box_sum(flat, bottom + east, lower + east, bottom + west, lower + west, halves, place + 2 * side)
+        _box_sum(flat, upper + east, top + east, upper + west, top + west, halves, place + 3 * side)
     else:
-        _boxes(flat, bottom + east, top + east, bottom + east - t, top + east - t, halves, place, n)
-        _boxes(flat, bottom + west + t, top + west + t, bottom + west, top + west, halves, place + side, n)
-        _boxes(flat, bottom + east, lower + east, bottom + west, lower + west, halves, place + 2 * side, n)
-        _boxes(flat, upper + east, top + east, upper + west, top + west, halves, place + 3 * side, n)
+        _box_sums(flat, bottom + east, top + east, bottom + east - t, top + east - t, halves, place, n)
+        _box_sums(flat, bottom + west + t, top + west + t, bottom + west, top + west, halves, place + side, n)
+        _box_sums(flat, bottom + east, lower + east, bottom + west, lower + west, halves, place + 2 * side, n)
+        _box_sums(flat, upper + east, top + east, upper + west, top + west, halves, place + 3 * side, n)
     for c in range(first, end):
         needed[0, c] = max(least * (r1 - r0) * b, 1.0)
         needed[1, c] = max(least * (c1 - c0) * a, 1.0)

@@ -1,0 +1,224 @@
+"""The plan of all storeys as the slot's value."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from trihedron.pipeline.core.linalg import matmul, norm
+from trihedron.pipeline.core.types import ELEMENTS, F64, I32, OPENING_KINDS, SUPPORTS, Building, Map
+from trihedron.plugins.building.edges import FIT_M
+from trihedron.plugins.building.evidence import LEVEL_DEG, SCALE, Evidence
+from trihedron.plugins.building.faces import Face
+from trihedron.plugins.building.free_space import CELL_M
+from trihedron.plugins.building.levels import LEVEL_NEAR_M, Storey, at_level
+from trihedron.plugins.building.openings import OpeningPlan
+from trihedron.plugins.building.rooms import RoomPlan
+from trihedron.plugins.building.views import BuildingState
+from trihedron.plugins.building.walls import WallPlan
+
+AT_END = 4  # cells of an end of a wall, of which those at the wall that meets it there are seen with that
+
+
+@dataclass
+class StoreyPlan:
+    """Elements found in one storey."""
+
+    storey: Storey
+    rooms: list[RoomPlan]
+    walls: list[WallPlan]
+    openings: list[OpeningPlan]
+    faces: list[Face]
+    remark: str = ""
+
+
+def assemble_building(state: BuildingState, evidence: Evidence, plans: list[StoreyPlan], map: Map | None) -> Building:
+    """Put the storeys' elements into one value."""
+    support: list[tuple[int, int, int, int]] = []
+    walls: list[Any] = []
+    corners: list[Any] = []
+    edge_sigmas: list[float] = []
+    areas: list[float] = []
+    thickness, wall_covariance, unseen, wall_storeys = [], [], [], []
+    loops, corner_walls, variances, closed, room_storeys = [], [], [], [], []
+    spans: list[list[float]] = []
+    heights, kinds, opening_walls, opening_covariance, opening_rooms = [], [], [], [], []
+    used: set[int] = set()
+    for level, plan in enumerate(plans):
+        first_wall, first_room = len(walls), len(areas)
+        support += _supports("storey", level, *_level_support(plan.storey, evidence, map), evidence)
+        for number, wall in enumerate(plan.walls):
+            edge = wall.edge
+            foot = edge.offset_m * edge.normal
+            walls.append([foot + t * edge.along for t in wall.span])
+            wall_storeys.append(level)
+            thickness.append(wall.thickness_m)
+            angle = edge.angle_sigma
+            wall_covariance.append(np.diag([edge.sigma_m**2 + edge.drift_m2 + (SCALE * edge.offset_m) ** 2, wall.thickness_sigma_m**2, angle**2]))
+            unseen += [(first_wall + number, a - wall.span[0], b - wall.span[0]) for a, b in _unseen_stretches(wall, plan.openings, number)]
+            planes = _planes_of_wall(wall, evidence, map)
+            used.update(planes)
+            rows = np.unique(np.concatenate([e.views for _, e in wall.edges]))
+            support += _supports("wall", first_wall + number, planes, rows, evidence)
+        for number, room in enumerate(plan.rooms):
+            rows = np.unique(np.concatenate([edge.views for loop in room.loops for edge in loop]))
+            support += _supports("room", first_room + number, [], rows, evidence)
+            for loop in room.loops:
+                loops.append((first_room + number, len(corners), len(corners) + len(loop)))
+                corners += [edge.begin for edge in loop]
+                edge_sigmas += [edge.sigma_m for edge in loop]
+                corner_walls += [first_wall + edge.wall if edge.wall >= 0 else -1 for edge in loop]
+            area, variance = _area(room)
+            areas.append(area)
+            variances.append(variance)
+            room_storeys.append(level)
+            closed.append(all(edge.wall >= 0 for loop in room.loops for edge in loop))
+        for opening in plan.openings:
+            planes = _planes_of_wall(plan.walls[opening.wall], evidence, map)
+            support += _supports("opening", len(spans), planes, opening.views, evidence)
+            start = plan.walls[opening.wall].span[0]
+            spans.append([value - start for value in opening.span])
+            heights.append(opening.heights)
+            kinds.append(OPENING_KINDS.index(opening.kind))
+            opening_walls.append(first_wall + opening.wall)
+            opening_covariance.append(np.diag(np.square(opening.sigmas)))
+            opening_rooms.append([first_room + room if room >= 0 else -1 for room in opening.rooms])
+    return Building(
+        state.index, state.stamp_ns, evidence.T_world_building, _note(plans),
+        np.array([[plan.storey.floor_m, plan.storey.ceiling_m] for plan in plans]).reshape(-1, 2),
+        np.array([np.diag([plan.storey.floor_sigma_m**2, plan.storey.ceiling_sigma_m**2]) for plan in plans]).reshape(-1, 2, 2),
+        np.array(walls).reshape(-1, 2, 2), np.array(wall_storeys, np.int32), np.array(thickness, np.float64),
+        np.array(wall_covariance).reshape(-1, 3, 3), np.array(unseen, np.float64).reshape(-1, 3), np.array(room_storeys, np.int32),
+        np.array(loops, np.int32).reshape(-1, 3), np.array(corners, np.float64).reshape(-1, 2), np.array(corner_walls, np.int32),
+        np.array(edge_sigmas, np.float64),
+        np.array(areas, np.float64), np.array(variances, np.float64), np.array(closed, np.bool_), np.array(opening_walls, np.int32),
+        np.array(kinds, np.uint8), np.array(spans, np.float64).reshape(-1, 2), np.array(heights, np.float64).reshape(-1, 2),
+        np.array(opening_covariance).reshape(-1, 4, 4), np.array(opening_rooms, np.int32).reshape(-1, 2), _furniture(map, used, plans, evidence),
+        np.array(support, np.int32).reshape(-1, 4),
+    )  # fmt: skip
+
+
+def empty_building(state: BuildingState, note: str, T_world_building: F64 | None = None) -> Building:
+    """Return the plan without elements, with the reason."""
+    return Building.empty(state.index, state.stamp_ns, note, T_world_building)
+
+
+def _note(plans: list[StoreyPlan]) -> str:
+    """Say what the plan lacks."""
+    missing = []
+    if not any(np.isfinite(plan.storey.floor_m) for plan in plans):
+        missing.append("no floor was seen")
+    if not any(np.isfinite(plan.storey.ceiling_m) for plan in plans):
+        missing.append("no ceiling was seen")
+    if not any(plan.rooms for plan in plans):
+        count = sum(len(plan.walls) for plan in plans)
+        missing.append(f"{count} wall{'s' if count != 1 else ''} seen, which bound{'s' if count == 1 else ''} no room")
+    open_rooms = sum(any(edge.wall < 0 for loop in room.loops for edge in loop) for plan in plans for room in plan.rooms)
+    if open_rooms:
+        missing.append(f"{open_rooms} room{'s' if open_rooms != 1 else ''} not seen all round")
+    return "; ".join([*missing, *dict.fromkeys(plan.remark for plan in plans if plan.remark)])
+
+
+def _supports(kind: str, number: int, planes: list[int], rows: I32, evidence: Evidence) -> list[tuple[int, int, int, int]]:
+    """Return the rows of `support` of one element."""
+    out = [(ELEMENTS.index(kind), number, SUPPORTS.index("plane"), plane) for plane in planes]
+    views = [evidence.views[row] for row in rows]
+    out += [(ELEMENTS.index(kind), number, SUPPORTS.index("keyframe"), view.keyframe) for view in views if view.keyframe >= 0]
+    return out + [(ELEMENTS.index(kind), number, SUPPORTS.index("frame"), view.index) for view in views]
+
+
+def _unseen_stretches(wall: WallPlan, openings: list[OpeningPlan], number: int) -> list[tuple[float, float]]:
+    """Return the stretches along a wall without a reading on either face, in an edge of a room and not in an opening."""
+    a, b = wall.span
+    t = a + CELL_M / 2.0 + CELL_M * np.arange(max(int((b - a) / CELL_M), 0))
+    seen, claimed = np.zeros(len(t), bool), np.zeros(len(t), bool)
+    for _, edge in wall.edges:
+        if edge.face is None:
+            continue
+        along = t if matmul(edge.normal, wall.edge.normal) > 0.0 else -t
+        cell = ((along - edge.face.start_m) / CELL_M).astype(int)
+        inside = (cell >= 0) & (cell < len(edge.face.count))
+        seen[inside] |= edge.face.count[cell[inside]].any(axis=1)
+        claimed |= (along > edge.span[0]) & (along < edge.span[1])
+    for opening in openings:
+        if opening.wall == number:
+            seen |= (t > opening.span[0]) & (t < opening.span[1])
+    marked = np.nonzero(claimed & ~seen)[0]
+    runs = np.split(marked, np.nonzero(np.diff(marked) > 1)[0] + 1) if len(marked) else []
+    long = [run for run in runs if len(run) >= 3]
+    return [(a if run[0] < AT_END else a + CELL_M * run[0], b if run[-1] >= len(t) - AT_END else a + CELL_M * (run[-1] + 1)) for run in long]
+
+
+def _area(room: RoomPlan) -> tuple[float, float]:
+    """Return the area of a room and its variance: an edge that moves by 1 m changes the area by its length."""
+    area, variance = 0.0, 0.0
+    for loop in room.loops:
+        for edge in loop:
+            area += 0.5 * float(edge.begin[0] * edge.end[1] - edge.begin[1] * edge.end[0])
+            length = float(norm(edge.end - edge.begin))
+            sigma = edge.sigma_m if np.isfinite(edge.sigma_m) else CELL_M
+            variance += (length * sigma) ** 2
+    return area, variance
+
+
+def _planes_of_wall(wall: WallPlan, evidence: Evidence, map: Map | None) -> list[int]:
+    """Return the ids of the map's living planes that lie on either face of a wall."""
+    if map is None or len(map.planes) == 0:
+        return []
+    normals, _, points = _map_planes(evidence, map)
+    edge, depth, found = wall.edge, wall.thickness_m, []
+    for row in np.nonzero(map.planes.rows("alive", np.arange(len(map.planes))))[0]:
+        seen = points[row][np.isfinite(points[row]).all(axis=1)]
+        if len(seen) == 0:
+            continue
+        facing, off, t = (
+            float(matmul(normals[row, :2], edge.normal)),
+            matmul(seen[:, :2], edge.normal) - edge.offset_m,
+            matmul(seen[:, :2], edge.along),
+        )
+        between = ((t > wall.span[0] - 0.1) & (t < wall.span[1] + 0.1)).mean() > 0.5
+        near = np.abs(off).mean() < FIT_M if facing > 0.995 else facing < -0.995 and np.isfinite(depth) and np.abs(off + depth).mean() < FIT_M
+        if between and near:
+            found.append(int(row))
+    return found
+
+
+def _level_support(storey: Storey, evidence: Evidence, map: Map | None) -> tuple[list[int], I32]:
+    """Return the ids of the map's living planes at a storey's floor or ceiling, and the views that show either."""
+    rows, planes, levels = np.zeros(0, np.int32), list[int](), ((storey.floor_m, 1.0), (storey.ceiling_m, -1.0))
+    for height, facing in levels:
+        if np.isfinite(height):
+            rows = np.union1d(rows, evidence.rows[at_level(evidence, height, facing)])
+    if map is not None and len(map.planes):
+        normals, offsets, _ = _map_planes(evidence, map)
+        alive = map.planes.rows("alive", np.arange(len(map.planes)))
+        for height, facing in levels:
+            near = alive & (normals[:, 2] * facing > np.cos(np.radians(LEVEL_DEG))) & (np.abs(offsets + height * normals[:, 2]) < LEVEL_NEAR_M)
+            planes += [int(row) for row in np.nonzero(near)[0]]
+    return planes, rows.astype(np.int32)
+
+
+def _map_planes(evidence: Evidence, map: Map) -> tuple[F64, F64, F64]:
+    """Return normals (p, 3), offsets (p,) and samples (p, s, 3) of the map's planes in the building's frame."""
+    ids = np.arange(len(map.planes))
+    R, t = evidence.T_world_building[:3, :3], evidence.T_world_building[:3, 3]
+    coefficients = map.planes.rows("coefficients", ids)
+    samples = np.asarray(map.planes.rows("samples_m", ids), np.float64)
+    return matmul(coefficients[:, :3], R), coefficients[:, 3] + matmul(coefficients[:, :3], t), matmul(samples - t, R)
+
+
+def _furniture(map: Map | None, used: set[int], plans: list[StoreyPlan], evidence: Evidence) -> I32:
+    """Return the ids of the map's planes that are neither a wall's nor a floor nor a ceiling."""
+    if map is None or len(map.planes) == 0:
+        return np.empty(0, np.int32)
+    normals, offsets, _ = _map_planes(evidence, map)
+    alive = map.planes.rows("alive", np.arange(len(map.planes)))
+    levels = [height for plan in plans for height in (plan.storey.floor_m, plan.storey.ceiling_m)]
+    found = []
+    for row in np.nonzero(alive)[0]:
+        height = -offsets[row] / normals[row, 2] if abs(normals[row, 2]) > 0.9 else float("nan")
+        if row not in used and not any(abs(height - level) < 0.1 for level in levels):
+            found.append(int(row))
+    return np.array(found, np.int32)

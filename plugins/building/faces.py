@@ -1,0 +1,159 @@
+"""Faces of walls: vertical planes that planar regions of several views show, seen from one side.
+
+*Tall* stretches of a face reach above doors and furniture."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+
+from trihedron.pipeline.core.linalg import matmul
+from trihedron.pipeline.core.types import F64, I32, Bool
+from trihedron.plugins.building.evidence import UPRIGHT_DEG, Evidence
+from trihedron.plugins.building.free_space import CELL_M, LEVEL_M, FreeSpace
+from trihedron.plugins.building.free_space_kernels import LEVELS, U32
+from trihedron.plugins.building.levels import Storey, sliding_sum
+from trihedron.plugins.shared.voxel_hash_kernels import I64
+
+TALL_M = 2.15  # above doors and most furniture
+BELOW_CEILING_M = 0.25
+SNAP_DEG = 3.0  # a direction nearer to an axis of the building is that axis
+BINS = 180  # of 1°
+SAME_FACE = 10  # cm: of two faces of one direction that are nearer to each other, the lesser is furniture
+NEAR_FACE_M = 0.05
+LEAST_READINGS = 2  # for which a column reaches high
+HIGH_M = 1.5  # reached by a column that rays neither pass over nor get behind
+ASIDE_M = 0.1  # before and behind a face, where a ray that crosses it is sought
+CROSSED = 2  # levels of rays over a column, for which it ends below the ceiling
+
+
+@dataclass(frozen=True)
+class Face:
+    """A line n·p = offset in the plan, with n towards the side it was seen from, and its `count` (k, LEVELS) of readings: cells of CELL_M along
+    `along` from `start_m`, levels of LEVEL_M above the storey's floor."""
+
+    normal: F64
+    offset_m: float
+    start_m: float
+    count: I32
+    tall: Bool  # (k,) columns that reach high
+    members: I64  # its points in the evidence
+
+    @property
+    def along(self) -> F64:
+        """Return the unit direction (2,) with the seen side on its left."""
+        return np.array([self.normal[1], -self.normal[0]])
+
+    def share(self, begin_m: float, end_m: float, columns: Bool) -> float:
+        """Return the share of a stretch whose columns (k,) are marked."""
+        a, b = (round((value - self.start_m) / CELL_M) for value in (begin_m, end_m))
+        wanted = max(b - a, 1)
+        return float(columns[max(a, 0) : max(max(a, 0), b, 0)].sum()) / wanted if b > a else float(columns[min(max(a, 0), len(columns) - 1)])
+
+
+def tall_m(storey: Storey) -> float:
+    """Return the height above the floor that only walls reach, or that nothing much was seen above."""
+    top = storey.ceiling_m if np.isfinite(storey.ceiling_m) else storey.reach_m
+    return float(min(TALL_M, top - storey.bottom_m - BELOW_CEILING_M))
+
+
+def faces_of(evidence: Evidence, storey: Storey, space: FreeSpace, directions: F64, least_m: float, cone_deg: float = 6.0) -> list[Face]:
+    """Find the faces with unit normals among `directions` (d, 2) that reach high over a stretch of at least that length."""
+    found: list[Face] = []
+    height = evidence.points[:, 2] - storey.bottom_m
+    top = storey.ceiling_m - storey.bottom_m - 0.05 if np.isfinite(storey.ceiling_m) else LEVELS * LEVEL_M
+    upright = (np.abs(evidence.normals[:, 2]) < np.sin(np.radians(UPRIGHT_DEG))) & (height > 0.0) & (height < top)
+    for normal in directions:
+        facing = matmul(evidence.normals[:, :2], normal) > np.cos(np.radians(cone_deg))
+        found += _faces_along(evidence, height, normal, np.nonzero(upright & facing)[0], storey, space, least_m)
+    return found
+
+
+def _faces_along(evidence: Evidence, height: F64, normal: F64, members: I64, storey: Storey, space: FreeSpace, least_m: float) -> list[Face]:
+    """Find the faces of one direction: the peaks of the offsets of its high points."""
+    high = height[members] > min(HIGH_M, tall_m(storey))
+    if not high.any():
+        return []
+    offsets = matmul(evidence.points[members, :2], normal)
+    along = matmul(evidence.points[members, :2], np.array([normal[1], -normal[0]]))
+    levels = np.clip((height[members] / LEVEL_M).astype(int), 0, LEVELS - 1)
+    weight = np.sqrt(evidence.information[members]) * evidence.area_m2[members]
+    low = float(offsets[high].min()) - 0.1
+    bins = np.bincount(((offsets[high] - low) / 0.01).astype(int), weight[high])
+    smooth = sliding_sum(np.concatenate([bins, np.zeros(10)]), np.array([0.25, 0.5, 0.75, 1.0, 0.75, 0.5, 0.25]))
+    around = np.concatenate([np.full(SAME_FACE, -1.0), smooth, np.full(SAME_FACE, -1.0)])
+    found = []
+    for best in np.nonzero(smooth > 0.0)[0]:
+        near = np.abs(offsets[high] - (low + (best + 0.5) * 0.01)) < 0.03
+        if smooth[best] < around[best : best + 2 * SAME_FACE + 1].max() or not near.any():
+            continue
+        offset = float(np.average(offsets[high][near], weights=weight[high][near]))
+        close = np.nonzero(np.abs(offsets - offset) < NEAR_FACE_M)[0]
+        start = float(along[close].min())
+        columns = ((along[close] - start) / CELL_M).astype(int)
+        width = int(columns.max()) + 1
+        count = np.bincount(columns * LEVELS + levels[close], minlength=width * LEVELS).reshape(width, LEVELS).astype(np.int32)
+        reach = _close_gaps(_tall_columns(Face(normal, offset, start, count, np.zeros(len(count), np.bool_), members[close]), space, storey))
+        if _longest(reach) * CELL_M >= least_m:
+            found.append(Face(normal, offset, start, count, reach, members[close]))
+    return found
+
+
+def _tall_columns(face: Face, space: FreeSpace, storey: Storey) -> Bool:
+    """Return the columns (k,) of a face that reach high and that rays do not pass over: above doors and furniture, or to HIGH_M where rays get behind
+    at less than half of the levels that were read, which noise does."""
+    top = np.where(face.count.any(axis=1), LEVELS - 1 - np.argmax(face.count[:, ::-1] > 0, axis=1), -1)
+    levels = np.arange(LEVELS)
+    tall = face.count[:, levels * LEVEL_M > tall_m(storey)].sum(axis=1) >= LEAST_READINGS
+    line = (face.start_m + (np.arange(len(top)) + 0.5) * CELL_M)[:, None] * face.along + face.offset_m * face.normal
+    behind = space.at(line - ASIDE_M * face.normal)
+    crossed = behind & space.at(line) & space.at(line + ASIDE_M * face.normal)
+    passed, over = _bits(behind), _bits(crossed) & (levels > top[:, None] + 1)
+    solid = (top * LEVEL_M >= HIGH_M) & (2 * passed.sum(axis=1) < (face.count > 0).sum(axis=1))
+    return np.asarray((tall | solid) & (over.sum(axis=1) < CROSSED), np.bool_)
+
+
+def _bits(levels: U32) -> Bool:
+    """Return the bits (n, LEVELS) of levels (n,)."""
+    return np.asarray((levels[:, None] >> np.arange(LEVELS, dtype=np.uint32)) & np.uint32(1), np.bool_)
+
+
+def _longest(columns: Bool) -> int:
+    """Return the length of the longest run of marked columns."""
+    ends = np.nonzero(np.diff(np.concatenate([[False], columns, [False]])))[0]
+    return int(np.diff(ends)[::2].max(initial=0))
+
+
+def _close_gaps(columns: Bool, gap: int = 2) -> Bool:
+    """Close gaps of so many columns or fewer."""
+    out = columns.copy()
+    marked = np.nonzero(columns)[0]
+    for a, b in pairwise(marked):
+        if b - a <= gap + 1:
+            out[a:b] = True
+    return out
+
+
+def slanted_directions(evidence: Evidence, storey: Storey, apart_deg: float, least_m2: float) -> F64:
+    """Return the directions (n,) of walls along neither axis, degrees: peaks with at least that area of tall points."""
+    tall = (np.abs(evidence.normals[:, 2]) < np.sin(np.radians(UPRIGHT_DEG))) & (evidence.points[:, 2] - storey.bottom_m > tall_m(storey))
+    angles = np.mod(np.degrees(np.arctan2(evidence.normals[tall, 1], evidence.normals[tall, 0])), 180.0)
+    weight = evidence.area_m2[tall]
+    histogram = np.bincount(angles.astype(int) % BINS, weight, BINS)
+    smooth = sum((np.roll(histogram, k) for k in (-2, -1, 1, 2)), histogram)
+    found = [0.0, 90.0]
+    for best in np.argsort(-smooth, kind="stable"):
+        near = np.abs(_axial_difference(angles, best + 0.5)) < 2.5
+        if smooth[best] < least_m2 or not weight[near].any():
+            break
+        angle = best + 0.5 + float(np.average(_axial_difference(angles[near], best + 0.5), weights=weight[near]))
+        if all(abs(float(_axial_difference(np.array(angle), other))) > max(apart_deg, SNAP_DEG) for other in found):
+            found.append(angle)
+    return np.array(found[2:])
+
+
+def _axial_difference(angles: F64, middle: float) -> F64:
+    """Return by how much directions modulo 180° are turned from another, in degrees."""
+    return np.asarray(np.mod(angles - middle + 90.0, 180.0) - 90.0)

@@ -1,0 +1,52 @@
+"""Free space: a plan of cells, each with the heights that rays passed (Elfes, Computer 1989, without probabilities)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from trihedron.pipeline.core.types import F64, Bool
+from trihedron.plugins.building.evidence import LEVEL_DEG, Evidence
+from trihedron.plugins.building.free_space_kernels import U32, carve_kernel
+from trihedron.plugins.building.levels import Storey
+
+CELL_M = 0.05  # of the plan of free space, and of stretches along a wall
+LEVEL_M = 0.1  # of heights
+MARGIN = np.array([0.05, 0.006])  # m, 1/m: how far before its reading a ray ends, two standard deviations of a Kinect more than 5 cm
+BESIDE_M = 1.0  # on stairs
+
+
+@dataclass(frozen=True)
+class FreeSpace:
+    """The levels that rays passed, a bit each, in cells (h, w) of CELL_M from `origin` (2,), and where the floor was seen (h, w)."""
+
+    origin: F64
+    levels: U32
+    floor: Bool
+
+    def at(self, points: F64) -> U32:
+        """Return the levels (n,) at points (n, 2); none outside."""
+        column, row = np.floor((points - self.origin) / CELL_M).astype(int).T
+        h, w = self.levels.shape
+        inside = (row >= 0) & (row < h) & (column >= 0) & (column < w)
+        out = np.zeros(len(points), np.uint32)
+        out[inside] = self.levels[row[inside], column[inside]]
+        return out
+
+
+def free_space(evidence: Evidence, storey: Storey, margin_m: float = 0.5) -> FreeSpace:
+    """Carve the rays of all views from within a storey, or BESIDE_M below or above it."""
+    low = evidence.points[:, :2].min(axis=0) - margin_m
+    w, h = np.ceil((evidence.points[:, :2].max(axis=0) + margin_m - low) / CELL_M).astype(int)
+    once, twice = np.zeros((h, w), np.uint32), np.zeros((h, w), np.uint32)
+    above = storey.ceiling_m if np.isfinite(storey.ceiling_m) else float("inf")
+    for view, T in zip(evidence.views, evidence.poses):
+        if not storey.bottom_m - BESIDE_M < T[2, 3] < above + BESIDE_M:
+            continue
+        carve_kernel(view.depth_m, view.camera.intrinsics, T, low, CELL_M, storey.bottom_m, LEVEL_M, 2, MARGIN, once, twice)
+    floor = np.zeros((h, w), np.bool_)
+    level = (evidence.normals[:, 2] > np.cos(np.radians(LEVEL_DEG))) & (np.abs(evidence.points[:, 2] - storey.bottom_m) < 0.1)
+    column, row = np.floor((evidence.points[level, :2] - low) / CELL_M).astype(int).T
+    floor[row, column] = True
+    return FreeSpace(low, twice, floor)
