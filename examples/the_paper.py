@@ -95,7 +95,7 @@ def main(folder="", **options):
     """Track the sequence; return the poses and the mesh (section V)."""
     dataset = th.dataset.tum(path=folder, **options) if folder else th.dataset.synthetic(**options)
     poses, mesh, last, before_last = [], greedy.start(), Seen(), Seen()
-    for frame in map(dataset, range(len(dataset))):
+    for frame in filter(None, map(dataset, range(len(dataset)))):
         normals, now = extract(frame)
         now.axes = manhattan_frame(normals, now, last)
         now.tracks = track(frame.camera, now, last)

@@ -38,6 +38,36 @@ def test_camera_loop(tmp_path, capsys):
     assert len(printed) == 3 and "ok" in printed[1] and "triangles" in printed[2]
 
 
+FAR = Path(__file__).resolve().parents[2] / "shared" / "data" / "tum_fr3_structure_notexture_far"
+absent = pytest.mark.skipif(not FAR.is_dir(), reason="needs ../shared/data")
+
+
+@pytest.mark.parametrize(
+    "sequence",
+    [
+        {"length": 8, "width": 160, "height": 120},
+        pytest.param({"folder": str(FAR), "frames": "0:40"}, marks=[pytest.mark.slow, absent]),
+    ],
+    ids=["room", "far"],
+)
+def test_the_paper_is_its_graph(tmp_path, sequence):
+    poses, mesh = example("the_paper").main(**sequence)
+    kind = ["dataset=tum"] if "folder" in sequence else []
+    words = [f"dataset.{'path' if key == 'folder' else key}={value}" for key, value in sequence.items()]
+    th.run("graph=structural_paper", "outputs=[trajectory,surface]", *kind, *words, out=tmp_path)
+    run = th.Recording(tmp_path / "run.mcap")
+    assert len(poses) == len(run.poses) >= 8
+    for one, other in zip(poses, run.poses):
+        assert one.T_world_camera == pytest.approx(other.T_world_camera, abs=1e-9) and one.status == other.status
+    assert mesh.vertices_m == pytest.approx(run.mesh().vertices_m, abs=1e-9) and len(mesh.triangles) == len(run.mesh().triangles)
+
+
+def test_the_page_about_the_paper_quotes_the_example():
+    page = (EXAMPLES.parent / "docs" / "explanation" / "paper.md").read_text()
+    quoted = page.partition("```python\n")[2].partition("```")[0]
+    assert len(quoted.splitlines()) > 10 and quoted in (EXAMPLES / "the_paper.py").read_text()
+
+
 @pytest.mark.slow
 def test_plugin_on_one_image(capsys):
     example("plugin_on_one_image").main(length=12)
