@@ -30,9 +30,10 @@ from trihedron.pipeline.run.frame_validation import FrameValidation
 from trihedron.pipeline.run.interrupts import Interrupts
 from trihedron.pipeline.run.live import Pace, feed_of
 from trihedron.pipeline.run.memory import exhaustion, malloc_trim
+from trihedron.pipeline.run.node import Node, NodeFailure, NoMoreFrames
 from trihedron.pipeline.run.recorder import Recorder
 from trihedron.pipeline.run.replay import RECORDED, Replay, plan_run
-from trihedron.pipeline.run.scheduler import Node, NodeFailure, NoMoreFrames, Scheduler, single_threaded_libraries
+from trihedron.pipeline.run.scheduler import Scheduler, single_threaded_libraries
 from trihedron.pipeline.run.sinks import Sink
 from trihedron.pipeline.run.state import DelayLines, StateBuffer, max_delays, recorded_delay_lines
 

@@ -16,8 +16,9 @@ from trihedron.pipeline.core.errors import StageError, TrihedronError
 from trihedron.pipeline.core.graph import Graph, Stage
 from trihedron.pipeline.core.wires import Wire
 from trihedron.pipeline.run.interrupts import Interrupts
+from trihedron.pipeline.run.node import Node, NodeFailure
 from trihedron.pipeline.run.runner import Runner
-from trihedron.pipeline.run.scheduler import Node, NodeFailure, Scheduler, single_threaded_libraries
+from trihedron.pipeline.run.scheduler import Scheduler, single_threaded_libraries
 
 DATASET = "dataset"
 MAP = "map"  # what the end of a fold reads besides its wires

@@ -9,7 +9,11 @@ import pytest
 
 from trihedron.pipeline.core.wires import PREVIOUS, Wire
 from trihedron.pipeline.run import scheduler
-from trihedron.pipeline.run.scheduler import Node, NodeFailure, Scheduler
+from trihedron.pipeline.run.kept_values import KeptValues
+from trihedron.pipeline.run.node import Node, NodeFailure, consumers_of, lagging_nodes
+from trihedron.pipeline.run.readiness import Readiness
+from trihedron.pipeline.run.scheduler import Scheduler
+from trihedron.pipeline.run.task_order import ReadyTasks, TaskOrder
 
 NET_S = 120.0  # after which what waits for another thread fails: no measure of speed
 
@@ -121,8 +125,8 @@ def test_memory_is_bounded_by_the_reach_of_the_wires():
     scheduler = Scheduler([Node("a", lambda k, v: k, {}), Node("b", lambda k, v: k, {"x": Wire("a", 4), "y": Wire("a", PREVIOUS)})], 2, 3, {})
     largest = 0
     for position, _ in scheduler.run(200):
-        assert min(scheduler._values["a"]) > position - 4 and position not in scheduler._values["b"]  # which nobody asks for later
-        largest = max(largest, *(len(values) for values in scheduler._values.values()), *(len(held) for held in scheduler._held.values()))
+        assert min(scheduler.kept.values["a"]) > position - 4 and position not in scheduler.kept.values["b"]  # which nobody asks for later
+        largest = max(largest, *(len(values) for values in scheduler.kept.values.values()), *(len(held) for held in scheduler.kept.latest.values()))
     assert largest <= 4 + 3 + 5
 
 
@@ -178,3 +182,59 @@ def test_what_waits_for_a_frame_takes_none_of_the_workers():
     first = Node("first", lambda k, v: (time.sleep(0.05), k)[1], {"x": Wire("camera")})  # by its end frame 1 is asked for
     nodes = [Node("camera", camera, {}, ordered=True, waits=True), first, *(Node(name, meet, {"x": Wire("first")}) for name in "ab")]
     assert run(nodes, threads=2, lookahead=2, count=3) == [dict.fromkeys(("camera", "first", "a", "b"), k) for k in range(3)]
+
+
+CHAIN = [
+    Node("a", lambda k, v: k, {}),
+    Node("b", lambda k, v: k, {"x": Wire("a")}),
+    Node("c", lambda k, v: k, {"x": Wire("b"), "before": Wire("c", PREVIOUS), "old": Wire("a", 2)}),
+]
+
+
+def test_what_is_kept_is_what_wires_can_still_read():
+    kept = KeptValues(consumers_of(CHAIN), {"c": "initial"}, {"a": {-1: "recent"}})
+    assert kept.read(Wire("c", PREVIOUS), 0) == "initial" and kept.read(Wire("a", 2), 1) == "recent" and kept.read(Wire("a", 2), 0) is None
+    assert not kept.known(Wire("a"), 0) and kept.known(Wire("a", 2), 1) and kept.known(Wire("c", PREVIOUS), 0)
+    assert list(kept.put("c", 1, "one")) == [] and not kept.known(Wire("c", PREVIOUS), 2)  # frame 0 is not done
+    assert list(kept.put("c", 0, None)) == [1, 2] and kept.read(Wire("c", PREVIOUS), 1) == "initial" and kept.read(Wire("c", PREVIOUS), 2) == "one"
+    for position in range(4):
+        kept.put("a", position, position)
+    assert kept.of_frame(1) == {"a": 1, "c": "one"}
+    for position in range(3):
+        kept.forget(position)
+    assert kept.values["a"] == {1: 1, 2: 2, 3: 3} and kept.values["c"] == {}  # a@2 reads frame 1 at frame 3, @prev reads `latest`
+
+
+def test_who_may_run_are_those_whose_wires_are_known():
+    consumers = consumers_of(CHAIN)
+    kept = KeptValues(consumers, {}, {})
+    readiness = Readiness(CHAIN, consumers, kept)
+
+    def done(name, position):
+        return list(readiness.complete(name, position, kept.put(name, position, name)))
+
+    assert list(readiness.admit(0)) == [("a", 0)] and list(readiness.admit(1)) == [("a", 1)]
+    assert done("a", 1) == [("b", 1)] and done("b", 1) == []  # c waits for itself a frame before
+    assert done("a", 0) == [("b", 0)] and done("b", 0) == [("c", 0)] and done("c", 0) == [("c", 1)]
+    assert list(readiness.admit(2)) == [("a", 2)]
+    readiness.forget(2)
+    assert done("a", 2) == []
+
+
+def test_the_order_is_by_frame_then_by_the_longest_way_to_its_end():
+    nodes = [Node("short", lambda k, v: k, {}), Node("long", lambda k, v: k, {}), Node("end", lambda k, v: k, {"x": Wire("long")})]
+    order, ready = TaskOrder(nodes, consumers_of(nodes)), ReadyTasks()
+    for name, seconds in (("short", 2.0), ("long", 1.0), ("end", 3.0)):
+        order.measure(name, seconds)
+    order.update()
+    for task in (("short", 1), ("long", 1), ("end", 0), ("short", 0)):
+        ready.push(task, order.key(task))
+    assert ready.oldest == 0 and len(ready) == 4
+    assert [ready.pop() for _ in range(4)] == [("end", 0), ("short", 0), ("long", 1), ("short", 1)]
+
+
+def test_what_only_later_frames_read_may_lag():
+    nodes = [*CHAIN, Node("d", lambda k, v: k, {"x": Wire("b", 3)})]
+    assert lagging_nodes(consumers_of(nodes)) == set() and lagging_nodes(consumers_of([CHAIN[0], Node("d", nodes[3].call, {"x": Wire("a", 3)})])) == {
+        "a"
+    }
