@@ -172,8 +172,8 @@ class Building:
 
     def save(self, folder: str | Path) -> None:
         """Write the files of `trihedron building`, model.ifc where ifcopenshell is installed. Raises TrihedronError."""
-        from trihedron.pipeline.run.building_files import write_building
-        from trihedron.pipeline.run.building_ifc import IFC, has_ifc, write_ifc
+        from trihedron.plugins.building.files import write_building
+        from trihedron.plugins.building.ifc import IFC, has_ifc, write_ifc
 
         out = Path(folder).expanduser()
         try:
@@ -185,7 +185,7 @@ class Building:
             raise DataError(str(error.filename or out), f"cannot be written: {error.strerror}", "give another folder") from error
 
     def __repr__(self) -> str:
-        from trihedron.pipeline.run.building_files import summary
+        from trihedron.plugins.building.files import summary
 
         return f"Building({summary(self.plan).removeprefix('building: ')})"
 

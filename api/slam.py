@@ -26,7 +26,7 @@ from trihedron.api.words import words_of
 from trihedron.datasets.readers.cameras import Calibration
 from trihedron.datasets.simulation.synthetic import Synthetic
 from trihedron.pipeline.app.compilation import compile_once
-from trihedron.pipeline.app.execute import RECORDING, metadata_of, recorded_topics, remembered_of, source_of, write_files
+from trihedron.pipeline.app.execute import RECORDING, metadata_of, recorded_topics, remembered_of, source_of, write_files, write_models
 from trihedron.pipeline.app.viewers import Viewer, opened_viewer
 from trihedron.pipeline.core import types
 from trihedron.pipeline.core.config import check_added, composed, graph_of
@@ -36,7 +36,6 @@ from trihedron.pipeline.core.types import FrameReference, Map, Surface, Value
 from trihedron.pipeline.record.codec import FRAMES_TOPIC
 from trihedron.pipeline.record.writer import RecordingWriter
 from trihedron.pipeline.run import results
-from trihedron.pipeline.run.building_files import write_building
 from trihedron.pipeline.run.map_file import save_map
 from trihedron.pipeline.run.replay import TOPICS
 from trihedron.pipeline.run.run_folder import held, write_configuration
@@ -221,11 +220,7 @@ class Slam:
         with self._stack:
             if self._out is not None and self._last >= 0:
                 write_files(self._runner, None, self._out, self._started, self._began)
-                for value in self._runner.result.folds.values():
-                    if isinstance(value, Surface):
-                        results.write_surface(self._out, value)
-                    elif isinstance(value, types.Building):
-                        write_building(self._out, value)
+                write_models(self._out, self._runner)
         if self._failure is not None:
             raise self._failure
 

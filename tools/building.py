@@ -32,8 +32,8 @@ def main(argv: list[str]) -> int:
     from trihedron.pipeline.core.libraries import library_error
     from trihedron.pipeline.core.registry import load_plugins, plugins_of
     from trihedron.pipeline.record.reader import Recording
-    from trihedron.pipeline.run.building_files import DXF, GLB, JSON, SVG, write_building
-    from trihedron.pipeline.run.building_ifc import IFC, has_ifc, write_ifc
+    from trihedron.plugins.building.files import DXF, GLB, JSON, SVG, write_building
+    from trihedron.plugins.building.ifc import IFC, has_ifc, write_ifc
 
     load_plugins()
     if options.plugin is not None and options.plugin not in plugins_of("building"):

@@ -13,7 +13,7 @@ import numpy as np
 from trihedron.pipeline.core.errors import DataError
 from trihedron.pipeline.core.types import F64, PLANE_KINDS, Surface
 from trihedron.pipeline.record.reader import Recording
-from trihedron.pipeline.run.ply import triangle_planes, write_ply
+from trihedron.plugins.surface.ply import triangle_planes, write_ply
 from trihedron.tools.export import Format
 
 if TYPE_CHECKING:

@@ -26,10 +26,10 @@ from trihedron.pipeline.core.geometry import transform, umeyama
 from trihedron.pipeline.core.types import F64, Building, Trajectory
 from trihedron.pipeline.record.reader import Recording
 from trihedron.pipeline.record.trajectories import attached_truth, read_trajectory
-from trihedron.pipeline.run.building_files import floorplan_svg, summary
 from trihedron.pipeline.run.metrics import aligned_errors, associate
 from trihedron.pipeline.run.result_files import read_results
 from trihedron.pipeline.run.results import dotted
+from trihedron.plugins.building.files import floorplan_svg, summary
 from trihedron.tools import comparison_table
 from trihedron.tools.arguments import Parser
 from trihedron.tools.compare import Run, read_runs, rows_of

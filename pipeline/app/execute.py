@@ -24,15 +24,15 @@ from trihedron.pipeline.core.errors import ConfigError, DataError, RecordingErro
 from trihedron.pipeline.core.files import sha256_of
 from trihedron.pipeline.core.graph import Graph
 from trihedron.pipeline.core.overrides import literal_text, path_of, quoted
+from trihedron.pipeline.core.registry import write_files_of
 from trihedron.pipeline.core.slots import SLOTS, output_of
-from trihedron.pipeline.core.types import Building, Surface, Trajectory
+from trihedron.pipeline.core.types import Trajectory
 from trihedron.pipeline.record.foxglove_server import FoxgloveServer
 from trihedron.pipeline.record.mcap_writer import FLUSH_SECONDS
 from trihedron.pipeline.record.reader import Recording
 from trihedron.pipeline.record.trajectories import TRUTH, attached_truth, format_trajectory
 from trihedron.pipeline.record.writer import RecordingWriter
 from trihedron.pipeline.run import results
-from trihedron.pipeline.run.building_files import write_building
 from trihedron.pipeline.run.interrupts import uninterrupted
 from trihedron.pipeline.run.live import Pace, shows_once
 from trihedron.pipeline.run.map_file import load_map, save_map
@@ -275,10 +275,8 @@ def _attachments(graph: Graph, replay: Replay | None) -> dict[str, str]:
 
 
 def write_models(out: Path, runner: Runner) -> list[str]:
-    """Write the surface and the building of a run, and return lines that describe them."""
-    folds = list(runner.result.folds.values())
-    lines = [results.write_surface(out, value) for value in folds if isinstance(value, Surface)]
-    return lines + [line for value in folds if isinstance(value, Building) for line in write_building(out, value)]
+    """Write the files of a run's folds (surface, building), and return lines that describe them."""
+    return [line for slot, value in runner.result.folds.items() for line in write_files_of(slot, out, value)]
 
 
 def _replayed(replay: Replay, runner: Runner, timing: dict[str, Any]) -> str:

@@ -9,6 +9,7 @@ import inspect
 import pkgutil
 from collections.abc import Callable
 from importlib.metadata import entry_points
+from pathlib import Path
 from typing import Any, TypeVar, get_type_hints
 
 from trihedron.pipeline.core.errors import LibraryError, PluginError, did_you_mean
@@ -19,6 +20,8 @@ Plugin = TypeVar("Plugin", bound=type)
 _PLUGINS: dict[str, dict[str, type[Any]]] = {slot: {} for slot in SLOTS}
 _BUILT_IN = ("trihedron.datasets", "trihedron.plugins")
 ENTRY_POINT_GROUP = "trihedron.plugins"
+FileWriter = Callable[[Path, Any], list[str]]
+_FILES: dict[str, FileWriter] = {}
 
 
 def register(slot: str, name: str) -> Callable[[Plugin], Plugin]:
@@ -113,6 +116,21 @@ def plugin_class(slot: str, name: str) -> type[Any]:
     if name not in _PLUGINS[slot]:
         raise PluginError(slot, f"there is no plugin '{name}' for the slot '{slot}'", did_you_mean(name, _PLUGINS[slot]))
     return _PLUGINS[slot][name]
+
+
+def register_files(slot: str) -> Callable[[FileWriter], FileWriter]:
+    """Register the function that writes the files of a fold's value into a run folder, and returns lines that describe them (decorator)."""
+
+    def decorate(write: FileWriter) -> FileWriter:
+        _FILES[slot] = write
+        return write
+
+    return decorate
+
+
+def write_files_of(slot: str, folder: Path, value: Any) -> list[str]:
+    """Write the files of a fold's value into a folder; returns lines that describe them, none where the slot has no files."""
+    return _FILES[slot](folder, value) if slot in _FILES else []
 
 
 def plugins_of(slot: str) -> dict[str, type[Any]]:

@@ -14,17 +14,14 @@ import numpy as np
 
 from trihedron.pipeline.core.errors import DataError
 from trihedron.pipeline.core.linalg import matmul, norm
-from trihedron.pipeline.core.types import DEGRADED, LOST, OK, Map, Pose, Surface, Trajectory
+from trihedron.pipeline.core.types import DEGRADED, LOST, OK, Map, Pose, Trajectory
 from trihedron.pipeline.record.trajectories import write_trajectory
 from trihedron.pipeline.run.accounting import Result
 from trihedron.pipeline.run.consistency import pose_consistency, truth_noise
 from trihedron.pipeline.run.metrics import associate, evaluate_trajectory
 from trihedron.pipeline.run.plot import trajectory_figure
-from trihedron.pipeline.run.ply import triangle_planes, write_ply
 
 TRAJECTORY, CAUSAL, TIMING, METRICS, PLOT = "trajectory.txt", "trajectory_causal.txt", "timing.json", "metrics.json", "trajectory.png"
-SURFACE = "surface.ply"
-WORLD = "metres; the world of trajectory.txt: the first camera's frame, x right, y down, z forward"
 
 
 def causal_trajectory(result: Result) -> Trajectory:
@@ -91,15 +88,6 @@ def _commonest_reason(poses: Iterable[Pose], status: str) -> str:
     alike = [re.sub(r"\d+(\.\d+)?", "0", reason) for reason in reasons]
     commonest = Counter(alike).most_common(1)
     return next((reason for reason, kind in zip(reversed(reasons), reversed(alike)) if kind == commonest[0][0]), "")
-
-
-def write_surface(out: Path, surface: Surface) -> str:
-    """Write surface.ply, in the world of trajectory.txt, and return a line that describes it."""
-    write_ply(out / SURFACE, surface.vertices_m, surface.colors, surface.triangles, triangle_planes(surface), WORLD)
-    if len(surface.triangles) == 0:
-        return "the surface is empty: no tracked frame showed enough of one"
-    planar, planes = surface.instances >= 0, len(surface.plane_ids)
-    return f"surface: {len(surface.triangles)} triangles, {planar.sum()} of them in {planes} planes of {surface.areas_m2.sum():.1f} m²"
 
 
 def _consistency(result: Result, truth: Trajectory) -> dict[str, Any]:

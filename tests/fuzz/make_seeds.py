@@ -32,9 +32,9 @@ from trihedron.pipeline.core.lie import exp_se3
 from trihedron.pipeline.record.codec import is_value_schema
 from trihedron.pipeline.record.trajectories import TRUTH
 from trihedron.pipeline.record.writer import RecordingWriter
-from trihedron.pipeline.run.ply import write_ply
 from trihedron.pipeline.run.runner import Runner
 from trihedron.plugins.mapping.landmarks import empty_map
+from trihedron.plugins.surface.ply import write_ply
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "datasets"))
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "pipeline"))

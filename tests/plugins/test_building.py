@@ -18,11 +18,11 @@ from trihedron.pipeline.core.errors import LibraryError, TrihedronError
 from trihedron.pipeline.core.registry import load_plugins, plugin_class
 from trihedron.pipeline.core.types import OPENING_KINDS, Camera, Frame, Planes, Pose
 from trihedron.pipeline.record.foxglove import TopicView
-from trihedron.pipeline.run.building_files import building_json, floorplan_svg, summary, write_building
-from trihedron.pipeline.run.building_ifc import has_ifc, write_ifc
 from trihedron.plugins.building.edges import Edge, end_at_readings, intersect_edges, make_relative, rotate_edge
 from trihedron.plugins.building.faces import Face
+from trihedron.plugins.building.files import building_json, floorplan_svg, summary, write_building
 from trihedron.plugins.building.free_space_kernels import LEVELS
+from trihedron.plugins.building.ifc import has_ifc, write_ifc
 from trihedron.plugins.building.openings import fit_jambs, widest_gap
 from trihedron.plugins.normals.integral_image import IntegralImage
 from trihedron.plugins.planes.connected_components import ConnectedComponents

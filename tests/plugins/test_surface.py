@@ -12,8 +12,8 @@ import trimesh
 from trihedron.pipeline.core.registry import load_plugins, plugin_class, plugins_of
 from trihedron.pipeline.core.types import EXACT_DEPTH, LOST, PLANE_KINDS, Camera
 from trihedron.pipeline.record.codec import Encoder
-from trihedron.pipeline.run.results import write_surface
 from trihedron.plugins.surface.common_meshes import opposite_half_edges, without_pinholes
+from trihedron.plugins.surface.files import write_surface
 
 sys.path.insert(0, str(Path(__file__).parent))
 from surface_world import BACK, BALL, FLOOR, LEFT, RADIUS, faults, fold, off_truth, render, seen, walk
@@ -177,7 +177,7 @@ def test_degenerate_input_gives_a_valid_file(name, case, tmp_path):
         "a million points": [seen(0, T, (BACK,), ball=False, camera=large)],
     }[case]
     surface = fold(plugin_class("surface", name)(), inputs)
-    said = write_surface(tmp_path, surface)
+    (said,) = write_surface(tmp_path, surface)
     assert ("empty" in said) == (len(surface.triangles) == 0) and ("triangles" in said) == (len(surface.triangles) > 0)
     if case in ("nothing", "lost", "no depth"):
         assert len(surface.triangles) == len(surface.vertices_m) == len(surface.plane_ids) == 0

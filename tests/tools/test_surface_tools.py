@@ -14,7 +14,7 @@ from trihedron.pipeline.core.errors import DataError, UsageError
 from trihedron.pipeline.core.geometry import pose_matrix
 from trihedron.pipeline.core.types import Camera, Frame, Surface, Trajectory
 from trihedron.pipeline.record.writer import RecordingWriter
-from trihedron.pipeline.run.ply import write_ply
+from trihedron.plugins.surface.ply import write_ply
 from trihedron.tools import evaluate_surface, export, export_picture
 from trihedron.tools.evaluate_surface import judged
 from trihedron.tools.export_surface import upright

@@ -120,7 +120,7 @@ class _Fold:
 
     def cost(self) -> dict[str, Any]:
         """Times, size and memory."""
-        from trihedron.pipeline.run.ply import triangle_planes, write_ply
+        from trihedron.plugins.surface.ply import triangle_planes, write_ply
 
         with tempfile.TemporaryDirectory() as folder:
             path, surface = Path(folder) / "surface.ply", self.surface

@@ -28,12 +28,14 @@ from trihedron.pipeline.core.building_geometry import (
     wall_pieces,
 )
 from trihedron.pipeline.core.linalg import norm
+from trihedron.pipeline.core.registry import register_files
 from trihedron.pipeline.core.types import ELEMENTS, F64, OPENING_KINDS, SUPPORTS, Building
 
 JSON, SVG, DXF, GLB = "building.json", "floorplan.svg", "floorplan.dxf", "building.glb"
 SCHEMA_VERSION = 1
 
 
+@register_files("building")
 def write_building(out: Path, building: Building) -> list[str]:
     """Write the files of a run folder and return a line that describes them."""
     (out / JSON).write_text(json.dumps(building_json(building), indent=1) + "\n", encoding="utf-8")
