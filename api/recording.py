@@ -11,12 +11,12 @@ from typing import TYPE_CHECKING, Any
 from trihedron.api.building import Building
 from trihedron.api.trajectory import Trajectory
 from trihedron.api.words import words_of
+from trihedron.pipeline.app.recorded_values import frames_of, last_map, opened, poses_of, references_of, trajectory_of
 from trihedron.pipeline.core.errors import RecordingError, UsageError, did_you_mean
 from trihedron.pipeline.core.types import Frame, Map, Pose, Surface, Value
 from trihedron.pipeline.record import reader
 from trihedron.pipeline.record.codec import FRAMES_TOPIC
 from trihedron.tools.building import building_of
-from trihedron.tools.recorded import frames_of, last_map, opened, poses_of, references_of, trajectory_of
 
 if TYPE_CHECKING:
     from trihedron.api.ablations import Ablation

@@ -34,6 +34,7 @@ from trihedron.pipeline.core.errors import ConfigError, UsageError, did_you_mean
 from trihedron.pipeline.core.graph import Graph
 from trihedron.pipeline.core.types import FrameReference, Map, Surface, Value
 from trihedron.pipeline.record.codec import FRAMES_TOPIC
+from trihedron.pipeline.record.rescue import recover
 from trihedron.pipeline.record.writer import RecordingWriter
 from trihedron.pipeline.run import results
 from trihedron.pipeline.run.map_file import save_map
@@ -42,7 +43,6 @@ from trihedron.pipeline.run.run_folder import held, write_configuration
 from trihedron.pipeline.run.runner import Runner, Step
 from trihedron.pipeline.run.sinks import MemorySink, Sink
 from trihedron.pipeline.run.warm_up import WARM_UP_FRAMES, compilation_reported, warm_up
-from trihedron.tools.recover import recover
 
 REFUSED = ("replay", "only", "live", "real_time", "save_map", "sequences")  # root keys of a run that make no sense for pushed frames
 WARM_UP_PX = 640  # the largest width of the images of the warm-up

@@ -13,13 +13,13 @@ import numpy as np
 from trihedron.api.images import Frames, camera_of
 from trihedron.datasets.readers.cameras import Calibration
 from trihedron.pipeline.core import types
+from trihedron.pipeline.core.config import default_plugins
 from trihedron.pipeline.core.errors import ConfigError, UsageError, did_you_mean
 from trihedron.pipeline.core.registry import load_plugins, options_of, parameters_of_method, plugin_class, plugins_of
 from trihedron.pipeline.core.slots import CAMERA, FOLDS, RNG, accepts_none, default_wires, inputs_of, strip_none, summary
 from trihedron.pipeline.core.types import Frame, Value
 from trihedron.pipeline.run.scheduler import single_threaded_libraries
 from trihedron.pipeline.run.warm_up import compilation_reported
-from trihedron.tools.plugins import default_plugins
 
 COLOUR = {"keypoints", "lines"}  # slots whose plugins look at colour
 

@@ -76,10 +76,10 @@ def folded(recording: Recording, name: str) -> Building:
 
 def gathered(recording: Recording, name: str) -> tuple[Any, Any, Map | None]:
     """Return a plugin with its default options, its state after all frames of a recording, and the last map. Raises DataError as `folded` does."""
+    from trihedron.pipeline.app.recorded_values import frames_of, last_map, poses_of, references_of
     from trihedron.pipeline.core.registry import plugin_class
     from trihedron.pipeline.core.types import Pose
     from trihedron.pipeline.core.value_checks import check_together
-    from trihedron.tools.recorded import frames_of, last_map, poses_of, references_of
 
     if "planes" not in recording.topics:
         raise DataError(str(recording.path), "holds no planes", "record a run of a graph with planes")

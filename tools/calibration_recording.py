@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from trihedron.datasets.readers.registration import DepthCamera, Registration
+from trihedron.pipeline.app.recorded_values import frames_of, references_of, trajectory_of
 from trihedron.pipeline.core.errors import DataError
 from trihedron.pipeline.core.geometry import invert
 from trihedron.pipeline.core.lie import log_so3
@@ -16,7 +17,6 @@ from trihedron.pipeline.core.value_checks import check_together, checked
 from trihedron.pipeline.record.reader import Recording
 from trihedron.tools.calibration_judgement import blocks_of
 from trihedron.tools.calibration_pairs import Observations, Pairs
-from trihedron.tools.recorded import frames_of, references_of, trajectory_of
 
 NEEDED = ("frames", "keypoints", "matches", "pose")
 FRAMES = 48  # read, at most

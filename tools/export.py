@@ -14,10 +14,10 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
+from trihedron.pipeline.app.recorded_values import opened
 from trihedron.pipeline.core.errors import DataError, UsageError, did_you_mean
 from trihedron.pipeline.record.reader import Recording
 from trihedron.tools.arguments import Parser
-from trihedron.tools.recorded import opened
 
 RECORDING = "run.mcap"
 

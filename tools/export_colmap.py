@@ -11,13 +11,13 @@ from typing import Any
 import cv2
 import numpy as np
 
+from trihedron.pipeline.app.recorded_values import frames_of, last_map, references_of
 from trihedron.pipeline.core.errors import DataError
 from trihedron.pipeline.core.geometry import invert
 from trihedron.pipeline.core.libraries import imports_of
 from trihedron.pipeline.core.types import I32, U8, FrameReference, Map
 from trihedron.pipeline.record.reader import Recording
 from trihedron.tools.export import Format
-from trihedron.tools.recorded import colors_at, frames_of, last_map, references_of
 
 HALF_PIXEL = 0.5
 LEAST_VIEWS = 2  # of a point: COLMAP's tracks are no shorter
@@ -97,3 +97,9 @@ def _add_points(model: Any, map: Map, keyframes: I32, seen: Any, colors: U8) -> 
 
 
 FORMATS = (Format("colmap", "colmap", write_colmap),)
+
+
+def colors_at(image: Any, pixels: Any) -> Any:
+    """(n, 3) RGB at pixels (n, 2), the nearest."""
+    x, y = np.rint(pixels).astype(int).T
+    return image[np.clip(y, 0, image.shape[0] - 1), np.clip(x, 0, image.shape[1] - 1)]

@@ -9,13 +9,13 @@ from typing import Any
 
 from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
 
+from trihedron.pipeline.app.recorded_values import references_of
 from trihedron.pipeline.core.errors import DataError
 from trihedron.pipeline.record.foxglove import TopicView
 from trihedron.pipeline.record.reader import Recording
 from trihedron.pipeline.record.rerun_view import IMAGE, at, begin, blueprint, require_rerun, show_pinhole, show_value
 from trihedron.pipeline.record.trajectories import attached_truth
 from trihedron.tools.export import Format
-from trihedron.tools.recorded import references_of
 
 TOPICS = ("keypoints", "segments", "planes", "manhattan", "pose", "map", "surface", "building")  # what is shown
 MAP_EVERY = 10  # versions of the map; each is logged whole

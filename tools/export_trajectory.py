@@ -8,13 +8,13 @@ from typing import Any
 
 import numpy as np
 
+from trihedron.pipeline.app.recorded_values import poses_of, trajectory_of
 from trihedron.pipeline.core.geometry import quaternion_from_rotation
 from trihedron.pipeline.core.types import Pose
 from trihedron.pipeline.record.codec import TIMING_TOPIC, timing_of
 from trihedron.pipeline.record.reader import Recording
 from trihedron.pipeline.record.trajectories import format_stamp, write_trajectory
 from trihedron.tools.export import Format
-from trihedron.tools.recorded import poses_of, trajectory_of
 
 SIGMAS = ("var_x", "var_y", "var_z", "var_rx", "var_ry", "var_rz")  # m² and rad², in the camera's frame
 COUNTS = {"keypoints": "pixels", "segments": "endpoints_px", "planes": "coefficients"}  # rows that are counted

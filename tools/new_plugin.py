@@ -136,9 +136,9 @@ def main(argv: list[str]) -> int:
 
 def package_of(slot: str, name: str) -> dict[str, str]:
     """Return file -> text of the package. Raises UsageError."""
+    from trihedron.pipeline.core.config import default_plugins
     from trihedron.pipeline.core.registry import load_plugins, plugin_class, plugins_of
     from trihedron.pipeline.core.slots import SLOTS
-    from trihedron.tools.plugins import default_plugins
 
     slots = [known for known in SLOTS if known != "dataset"]
     if slot == "dataset":

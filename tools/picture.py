@@ -42,8 +42,8 @@ def draw(path: str, frame: int, out: Path) -> None:
     matplotlib.use("Agg")
     from matplotlib import pyplot
 
+    from trihedron.pipeline.app.recorded_values import opened
     from trihedron.pipeline.core.errors import RecordingError
-    from trihedron.tools.recorded import opened
 
     recording = opened(Path(path))
     poses = list(recording.values("pose"))

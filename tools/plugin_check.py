@@ -24,7 +24,7 @@ from typing import Any
 import numpy as np
 
 from trihedron.pipeline.core.comments import field_comments
-from trihedron.pipeline.core.config import composed, graph_of
+from trihedron.pipeline.core.config import composed, default_plugins, graph_of
 from trihedron.pipeline.core.errors import RecordingError, TrihedronError
 from trihedron.pipeline.core.graph import Graph, Stage
 from trihedron.pipeline.core.options import OneOf, Range, check_options, constraints_of
@@ -38,7 +38,7 @@ from trihedron.pipeline.record.reader import Recording
 from trihedron.pipeline.run.live import is_camera
 from trihedron.pipeline.run.runner import Runner
 from trihedron.pipeline.run.scheduler import single_threaded_libraries
-from trihedron.tools.plugins import default_plugins, first_sentence
+from trihedron.tools.plugins import first_sentence
 
 ROOM = ("dataset=synthetic", "dataset.width=320", "dataset.height=240", "dataset.length=8")
 BEFORE = 3  # ordinary frames of an adverse scene, from which there are a map and previous values

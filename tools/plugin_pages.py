@@ -10,9 +10,10 @@ from typing import Any
 
 import numpy as np
 
+from trihedron.pipeline.core.config import default_plugins
 from trihedron.pipeline.core.registry import plugins_of
 from trihedron.pipeline.core.slots import SLOTS
-from trihedron.tools.plugins import default_plugins, describe_plugin
+from trihedron.tools.plugins import describe_plugin
 
 WITHOUT = {"pose": "refinement"}  # slot -> its name as in without=NAME, where that differs
 MEASURED_WITH = {"surface": "surface outputs=[trajectory,surface]", "building": "building outputs=[trajectory,building]", "model": "model pose=icp"}

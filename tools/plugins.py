@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from trihedron.pipeline.core.comments import field_comments
+from trihedron.pipeline.core.config import default_plugins
 from trihedron.pipeline.core.errors import UsageError, did_you_mean
 from trihedron.tools.arguments import Parser, table
 
@@ -107,19 +108,6 @@ def describe_plugin(slot: str, name: str, plugin: type[Any]) -> dict[str, Any]:
         "inputs": parameters_of_method(slot, plugin),
         "parameters": options,
     }
-
-
-def default_plugins() -> dict[str, str]:
-    """Return slot -> plugin of `graph=structural` and of the root configuration."""
-    from importlib.resources import files
-
-    from omegaconf import OmegaConf
-
-    from trihedron.pipeline.core.config import RunOptions
-
-    graph: Any = OmegaConf.create((files("trihedron.conf") / "graph" / "structural.yaml").read_text())
-    chosen = [*RunOptions().defaults, *graph.defaults]
-    return {str(slot).lstrip("/"): str(plugin) for entry in chosen if not isinstance(entry, str) for slot, plugin in entry.items()}
 
 
 def type_name(hint: Any) -> str:

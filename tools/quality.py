@@ -82,8 +82,8 @@ class Parts:
 
 def quality_of_run(run: Path) -> Quality:
     """Judge a run folder or recording. Raises DataError where its frames are gone, or fewer than two are posed."""
+    from trihedron.pipeline.app.recorded_values import frames_of, references_of, trajectory_of
     from trihedron.pipeline.record.reader import Recording
-    from trihedron.tools.recorded import frames_of, references_of, trajectory_of
 
     recording = Recording(run / "run.mcap" if run.is_dir() else run)
     references = {reference.stamp_ns: reference for reference in references_of(recording).values()}

@@ -9,10 +9,10 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from trihedron.pipeline.app.recorded_values import opened
 from trihedron.pipeline.core.errors import UsageError
 from trihedron.tools.arguments import Parser
 from trihedron.tools.export import RECORDING
-from trihedron.tools.recorded import opened
 
 
 def main(argv: list[str]) -> int:

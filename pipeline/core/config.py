@@ -10,6 +10,7 @@ import dataclasses
 import re
 from collections.abc import Iterable, Mapping
 from enum import Enum
+from importlib.resources import files
 from typing import Any
 
 from hydra import compose, initialize_config_module
@@ -183,6 +184,13 @@ def _changed_wires(stage: str, wires: dict[str, str | None]) -> dict[str, str | 
     """Return the wires of a stage that differ from its slot's defaults; one that was deleted (`~graph.STAGE.INPUT`) is None: not wired."""
     default = _default_wiring(stage) if stage in SLOTS else {}
     return {parameter: wires.get(parameter) for parameter in {**default, **wires} if wires.get(parameter) != default.get(parameter)}
+
+
+def default_plugins() -> dict[str, str]:
+    """Return slot -> plugin of `graph=structural` and of the root configuration."""
+    graph: Any = OmegaConf.create((files("trihedron.conf") / "graph" / "structural.yaml").read_text())
+    chosen = [*RunOptions().defaults, *graph.defaults]
+    return {str(slot).lstrip("/"): str(plugin) for entry in chosen if not isinstance(entry, str) for slot, plugin in entry.items()}
 
 
 def make_plugin(slot: str, options: DictConfig) -> Any:

@@ -25,10 +25,10 @@ from trihedron.pipeline.core.recorded_config import recorded_config
 from trihedron.pipeline.record.codec import METADATA, Decoder
 from trihedron.pipeline.record.mcap_file import McapFile
 from trihedron.pipeline.record.reader import Recording
+from trihedron.pipeline.record.rescue import recover
 from trihedron.pipeline.record.trajectories import read_trajectory
 from trihedron.pipeline.run.map_file import load_map
 from trihedron.tools.mesh_files import read_mesh
-from trihedron.tools.recover import recover
 
 DECLARED = (TrihedronError, UnreadableImage, UnreadableMessage)
 BESIDE = {"associations.txt", "mesh.ply", "mesh.obj", "recovered.mcap"}  # what a target may write beside its input

@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 
 from trihedron.pipeline.app.cli import main
+from trihedron.pipeline.app.recorded_values import last_map
 from trihedron.pipeline.core.geometry import invert
 from trihedron.pipeline.record import rerun_view
 from trihedron.pipeline.record.reader import Recording
 from trihedron.pipeline.record.trajectories import read_trajectory
 from trihedron.tools import export_rerun
-from trihedron.tools.recorded import last_map
 
 FRAMES = 24
 

@@ -13,8 +13,8 @@ import pytest
 
 from trihedron.pipeline.core.types import Frame, FrameReference, ManhattanFrame, Planes, Pose, Segments, Trajectory
 from trihedron.pipeline.record.foxglove import TopicView
+from trihedron.pipeline.record.rescue import recover
 from trihedron.pipeline.record.writer import RecordingWriter
-from trihedron.tools.recover import recover
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "pipeline"))
 from toys import ToyDataset, ToyKeypoints

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from trihedron.pipeline.app.recorded_run import composed_run
+from trihedron.pipeline.app.recorded_values import frames_of, references_of
 from trihedron.pipeline.core.config import make_plugin
 from trihedron.pipeline.core.errors import TrihedronError
 from trihedron.pipeline.core.lie import rotation_angle_deg
@@ -16,7 +17,6 @@ from trihedron.pipeline.core.types import F64, Normals
 from trihedron.pipeline.record.reader import Recording
 from trihedron.plugins.shared.manhattan_frames_kernels import nearest_equivalent
 from trihedron.tools.benchmarks import rotation_comparison as comparison
-from trihedron.tools.recorded import frames_of, references_of
 
 AXIS_COLORS = ("tab:red", "tab:green", "tab:blue")
 NORMAL_STEP = 3  # every third normal is drawn, in both directions of the grid

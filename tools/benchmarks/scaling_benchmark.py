@@ -22,6 +22,7 @@ from typing import Any
 
 import numpy as np
 
+from trihedron.pipeline.app.recorded_values import last_map
 from trihedron.pipeline.core.errors import DataError, UsageError
 from trihedron.pipeline.core.types import Map
 from trihedron.pipeline.record.codec import TIMING_TOPIC, timing_of
@@ -30,7 +31,6 @@ from trihedron.tools.arguments import Parser, table
 from trihedron.tools.benchmark import machine, measure, reference_ms, sample_images
 from trihedron.tools.benchmarks.map_benchmark import FEATURES
 from trihedron.tools.benchmarks.scaling_plot import plot
-from trihedron.tools.recorded import last_map
 
 FIRST, STOP = 2200, 2300  # frames of the walk through ten rooms that are measured beside maps of several sizes
 PARTS: dict[str, dict[str, list[str]]] = {  # part -> what a row is called -> its overrides

@@ -101,10 +101,10 @@ def run_and_judge(run: Path, words: Sequence[str]) -> Judged:
 
 def judged_run(run: Path) -> Judged:
     """Compare the poses of a recorded run with the truth in it. Raises DataError where there is none."""
+    from trihedron.pipeline.app.recorded_values import poses_of, references_of
     from trihedron.pipeline.record.reader import Recording
     from trihedron.pipeline.record.trajectories import attached_truth
     from trihedron.pipeline.run.status_check import check_status
-    from trihedron.tools.recorded import poses_of, references_of
 
     recording = Recording(run / "run.mcap")
     truth = attached_truth(recording.attachments, str(recording.path))

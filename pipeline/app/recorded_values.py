@@ -6,19 +6,18 @@ import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any
 
-import numpy as np
-
+from trihedron.pipeline.app.recorded_run import composed_run
+from trihedron.pipeline.core.config import make_plugin
 from trihedron.pipeline.core.errors import DataError
 from trihedron.pipeline.core.options import frame_range
 from trihedron.pipeline.core.types import Frame, FrameReference, Map, Pose, Trajectory, Value
 from trihedron.pipeline.record.mcap_file import in_use
 from trihedron.pipeline.record.reader import Recording
+from trihedron.pipeline.record.rescue import recover
 from trihedron.pipeline.run.accounting import Result
 from trihedron.pipeline.run.poses import Poses
 from trihedron.pipeline.run.results import final_trajectory
-from trihedron.tools.recover import recover
 
 
 def opened(path: Path) -> Recording:
@@ -74,9 +73,6 @@ def frames_of(recording: Recording) -> Callable[[FrameReference], Frame | None]:
             return value if isinstance(value, Frame) else None
 
         return embedded
-    from trihedron.pipeline.app.recorded_run import composed_run
-    from trihedron.pipeline.core.config import make_plugin
-
     options = composed_run(recording).dataset
     dataset, first = make_plugin("dataset", options), frame_range(str(options.get("frames", "")))[0]
     try:
@@ -85,9 +81,3 @@ def frames_of(recording: Recording) -> Callable[[FrameReference], Frame | None]:
         cause = f"does not embed its frames, and the data set is gone ({error.place}: {error.cause})"
         raise DataError(str(recording.path), cause, "record with record.frames=true") from error
     return lambda reference: dataset(reference.index - first)
-
-
-def colors_at(image: Any, pixels: Any) -> Any:
-    """(n, 3) RGB at pixels (n, 2), the nearest."""
-    x, y = np.rint(pixels).astype(int).T
-    return image[np.clip(y, 0, image.shape[0] - 1), np.clip(x, 0, image.shape[1] - 1)]
