@@ -12,8 +12,9 @@ from trihedron.pipeline.core.linalg import matmul
 from trihedron.pipeline.core.options import AcuteDeg, NonNegativeFloat, PositiveFloat, PositiveInt, Range, Share
 from trihedron.pipeline.core.registry import register
 from trihedron.pipeline.core.types import F64, Frame, Pose, PredictedView
-from trihedron.plugins.pose.common import Gates, align, dense_pose, first_pose, huber_weights, lost_pose, source_of, target_of
-from trihedron.plugins.pose.common_kernels import Source, Target
+from trihedron.plugins.pose.dense_alignment import Gates, Weights, align, source_of, target_of
+from trihedron.plugins.pose.dense_alignment_kernels import Source, Target
+from trihedron.plugins.pose.dense_pose import dense_pose, first_pose, lost_pose
 from trihedron.plugins.shared.image_reduction import Level, brightness, halvings, pyramid, reduced_intrinsics
 from trihedron.plugins.shared.image_reduction_kernels import depth_normals, smoothed
 
@@ -67,3 +68,24 @@ class Icp:
             source = source_of(now, noise, stride, depth_normals(smoothed(now.depth_m, 3), now.intrinsics, 4))
             out.append((source, target_of(view, 3, np.array(model.normals) if i == 0 else None), self.iterations))
         return out[::-1]
+
+
+HUBER = 1.345
+
+
+def huber_weights(photometric: float, floor_m: float) -> Weights:
+    """Huber weights (n, 3) of point-to-plane distances in units of the sensor's noise and `floor_m`, and of brightness in units of its median
+    residual, the latter multiplied by `photometric`."""
+    return lambda residuals, source: np.asarray(_huber(residuals.r, residuals.cosine, source.sigma_m, photometric, floor_m))
+
+
+def _huber(r: F64, cosine: F64, sigma: F64, photometric: float, floor_m: float) -> F64:
+    W, seen = np.zeros((len(r), 3)), cosine > 0.0
+    if not seen.any():
+        return W
+    off = np.abs(r[seen])
+    scale = np.array([max(1.4826 * float(np.median(off[:, 0])), 1.0)]), np.hypot(sigma[seen] * cosine[seen], floor_m)
+    for k, column, share in ((0, 0, photometric), (1, 2, 1.0)):
+        e = off[:, k] / scale[k]
+        W[seen, column] = share * np.minimum(1.0, HUBER / np.maximum(e, 1e-9)) / scale[k] ** 2
+    return W
