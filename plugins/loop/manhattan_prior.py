@@ -30,6 +30,7 @@ from trihedron.plugins.mapping.covisibility_graph import current_submap, keyfram
 from trihedron.plugins.shared.manhattan_frames_kernels import Walls, area_on_axes, known_walls, measured_directions, perpendicular_pair, settled
 from trihedron.plugins.shared.pose_graph import Edges, concatenate_edges, solve_pose_graph
 
+LINKS = 3  # further keyframes each is connected to, so that a stretch that was observed often stays stiff
 UNKNOWN = 1e-6  # 1/m², information of the position of a direction: none
 PLAUSIBLE = 3.0  # standard deviations of the drift that the prior may correct; beyond, the directions are those of another wing
 WALLS = 60  # planes, those observed most often, from which the axes are estimated
@@ -138,9 +139,6 @@ def _solve_with_prior(before: F64, edges: Edges, prior: ManhattanPrior | None) -
     information[:, :3, :3], information[:, 3:, 3:] = UNKNOWN * np.eye(3), prior.information
     pairs = np.stack([np.full(count, count), np.arange(count)], axis=1).astype(np.int32)
     return solve_pose_graph(np.concatenate([before, axes[None]]), concatenate_edges(edges, Edges(pairs, measured, information)))[:count]
-
-
-LINKS = 3  # further keyframes each is connected to, so that a stretch that was observed often stays stiff
 
 
 def odometry_edges(map: Map, rows: I32, drift: float, rotation_drift: float) -> Edges:

@@ -1,4 +1,4 @@
-"""Residuals of one image's pixels warped into another: brightness, and distance from the surface there.
+"""Dense alignment by the residuals of one image's pixels warped into another: brightness, and distance from the surface there.
 
 A point p of the source, moved to `p' = R p + t`, projects to pixel (u, v) of the target. Its brightness residual is `I(u, v) - I_source`; its
 geometric residual `k (Z(u, v) - p'_z)` with `k = n·ray`: how far it is from the target's tangent plane, of normal n, at that pixel. So the depth

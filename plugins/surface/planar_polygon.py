@@ -30,5 +30,5 @@ class PlanarPolygon(PlanarOptions):
         return volume_preview(self, state)
 
     def finish(self, state: FusedViews, map: Map | None) -> Surface:
-        """The mesh at the final poses, coloured and pictured by the views."""
+        """The mesh at the final poses, coloured and textured by the views."""
         return planar_surface(self, state, map, rest=False)
