@@ -9,8 +9,8 @@ import numpy as np
 
 from trihedron.pipeline.core.registry import register
 from trihedron.pipeline.core.types import F32, I32, U8, Correction, Frame, Map
-from trihedron.plugins.loop.common_bag_of_words import HISTOGRAM, WordOptions, rank_by_words
-from trihedron.plugins.loop.common_loop_verification import close_loop
+from trihedron.plugins.loop.loop_closing import close_loop
+from trihedron.plugins.loop.tf_idf_ranking import HISTOGRAM, WordOptions, rank_by_words
 
 
 @register("loop", "bag_of_words")

@@ -13,7 +13,7 @@ from trihedron.pipeline.core.linalg import matmul, norm
 from trihedron.pipeline.core.options import PositiveInt, Share
 from trihedron.pipeline.core.registry import register
 from trihedron.pipeline.core.types import F32, Column, Correction, Frame, Map, PlaceCorrection, Table
-from trihedron.plugins.loop.common_loop_verification import LoopOptions, close_loop, within_reach
+from trihedron.plugins.loop.loop_closing import LoopOptions, close_loop, within_reach
 from trihedron.plugins.shared.networks import NetworkOptions, network_image
 
 MEAN, SPREAD = np.array([0.485, 0.456, 0.406], np.float32), np.array([0.229, 0.224, 0.225], np.float32)  # of ImageNet's colours
@@ -39,7 +39,7 @@ class OnnxDescriptor(NetworkOptions, LoopOptions):
         newest = len(map.keyframes) - 1
         if newest < 0 or map.keyframes.row("index", newest) != frame.index:
             return None
-        vector = self._described(frame)
+        vector = self._describe(frame)
         known = previous.places if isinstance(previous, PlaceCorrection) else None
         places = known if known is not None else Table.empty({"keyframe": Column("i4"), "descriptor": Column("f4", (len(vector),))})
         correction = close_loop(self, partial(self._rank, places=places, vector=vector), map, frame)
@@ -48,7 +48,7 @@ class OnnxDescriptor(NetworkOptions, LoopOptions):
             correction = _nothing(map)
         return PlaceCorrection(**{one.name: getattr(correction, one.name) for one in fields(Correction)}, places=places)
 
-    def _described(self, frame: Frame) -> F32:
+    def _describe(self, frame: Frame) -> F32:
         """The unit vector (d,) of an image."""
         network = self.network
         tensor = network_image(frame, network, "image", 3, self.multiple).tensor

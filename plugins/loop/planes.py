@@ -10,7 +10,8 @@ import numpy as np
 from trihedron.pipeline.core.options import NonNegativeFloat, PositiveInt
 from trihedron.pipeline.core.registry import register
 from trihedron.pipeline.core.types import Correction, Frame, Map
-from trihedron.plugins.loop.common_loop_verification import LoopOptions, close_loop, displacement_of_planes, drift_sigma_m, within_reach
+from trihedron.plugins.loop.loop_closing import LoopOptions, close_loop, drift_sigma_m, within_reach
+from trihedron.plugins.loop.plane_layout import displacement_of_planes
 from trihedron.plugins.mapping.covisibility_graph import observed_by
 
 

@@ -12,8 +12,9 @@ from trihedron.pipeline.core.linalg import inv, matmul
 from trihedron.pipeline.core.options import NonNegativeFloat, PositiveFloat, PositiveInt, Range
 from trihedron.pipeline.core.registry import register
 from trihedron.pipeline.core.types import F64, I32, Correction, Map
-from trihedron.plugins.loop.common_pose_graph import Edges, correct_keyframes, solve_pose_graph
+from trihedron.plugins.loop.keyframe_correction import correct_keyframes
 from trihedron.plugins.mapping.covisibility_graph import current_submap, keyframes_of
+from trihedron.plugins.shared.pose_graph import Edges, solve_pose_graph
 from trihedron.plugins.shared.rigid_alignment import fit_covariance, fitted, point_pair_sigma
 
 

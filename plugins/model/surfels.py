@@ -11,8 +11,7 @@ from numpy.typing import NDArray
 from trihedron.pipeline.core.options import AcuteDeg, PositiveFloat, PositiveInt, Range, check_increasing
 from trihedron.pipeline.core.registry import register
 from trihedron.pipeline.core.types import LOST, Bool, Column, Frame, Pose, PredictedView, Table
-from trihedron.plugins.model.common import downsample
-from trihedron.plugins.model.common_kernels import PosedCamera
+from trihedron.plugins.model.downsampled_frame import PosedCamera, downsample
 from trihedron.plugins.model.surfels_kernels import Images, fuse, index_map, splat
 from trihedron.plugins.shared.image_reduction_kernels import depth_normals, smoothed
 
@@ -44,8 +43,7 @@ class SurfelModel:
         smooth = smoothed(depth, 2)
         images = Images(depth, depth_normals(smooth, intrinsics, 2), color, frame.camera.depth_noise.sigma_m(np.arange(0.0, 16.0, 0.01)))
         table = previous.model if previous is not None else Table.empty(SURFELS)
-        cosine = float(np.cos(np.radians(self.most_deg)))
-        table = fuse_frame(table, images, camera, frame.index, self.apart, cosine, self.most, self.trial, self.stable)
+        table = fuse_frame(self, table, images, camera, frame.index)
         T = np.array(pose.T_world_camera)
         depth, normals, mean = splat(table.column("surfel"), camera, depth.shape, self.stable)
         normals = normals / np.maximum(np.linalg.norm(normals, axis=2, keepdims=True), np.float32(1e-6))
@@ -61,15 +59,15 @@ SURFELS = {
 }
 
 
-def fuse_frame(
-    table: Table, images: Images, camera: PosedCamera, index: int, apart: float, cosine: float, most: float, trial: int, stable: float
-) -> Table:
-    """Fuse a frame into the table. A pixel is fused with the surfel nearest to its ray within `apart` standard deviations and `cosine` of its normal,
-    else it becomes one. Confidence is the number of views, up to `most`; a surfel not `stable` after `trial` frames out of view is removed."""
+def fuse_frame(options: SurfelModel, table: Table, images: Images, camera: PosedCamera, index: int) -> Table:
+    """Fuse a frame into the table. A pixel is fused with the surfel nearest to its ray within `apart` standard deviations and `most_deg` of its
+    normal, else it becomes one. Confidence is the number of views, up to `most`; a surfel that is not `stable` after `trial` frames out of view is
+    removed."""
+    cosine = float(np.cos(np.radians(options.most_deg)))
     surfels, seen = table.column("surfel"), table.column("seen")
     pixels = index_map(surfels, camera, images.depth_m.shape)
-    changed, fresh = fuse(surfels, seen, pixels, images, camera, index, apart, cosine, most)
-    removed = (surfels[:, 10] > 0.0) & (surfels[:, 10] < stable) & (index - seen > trial)
+    changed, fresh = fuse(surfels, seen, pixels, images, camera, index, options.apart, cosine, options.most)
+    removed = (surfels[:, 10] > 0.0) & (surfels[:, 10] < options.stable) & (index - seen > options.trial)
     surfels[removed, 10] = 0.0
     free = np.flatnonzero(surfels[:, 10] == 0.0)[: len(fresh)]
     surfels[free], seen[free] = fresh[: len(free)], index

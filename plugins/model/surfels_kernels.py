@@ -9,7 +9,7 @@ import numpy as np
 
 from trihedron.pipeline.core.kernel import kernel
 from trihedron.pipeline.core.types import F32, F64, I32, U8, Bool
-from trihedron.plugins.model.common_kernels import NEAREST_M, PosedCamera
+from trihedron.plugins.model.downsampled_frame import NEAREST_M, PosedCamera
 
 SPLAT_PX = 4  # most pixels that a surfel reaches from its centre
 TOGETHER = 0.03  # share of the depth within which discs are one surface

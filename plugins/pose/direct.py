@@ -12,8 +12,10 @@ from trihedron.pipeline.core.linalg import matmul
 from trihedron.pipeline.core.options import PositiveFloat, PositiveInt, Range, Share
 from trihedron.pipeline.core.registry import register
 from trihedron.pipeline.core.types import F64, Frame, Pose
-from trihedron.plugins.pose.common import Gates, align, dense_pose, first_pose, source_of, student_weights, target_of
-from trihedron.plugins.pose.common_kernels import Source, Target
+from trihedron.plugins.pose.dense_alignment import Gates, align, source_of, target_of
+from trihedron.plugins.pose.dense_alignment_kernels import Residuals, Source, Target
+from trihedron.plugins.pose.dense_pose import dense_pose, first_pose
+from trihedron.plugins.pose.direct_kernels import student_weights_kernel
 from trihedron.plugins.shared.image_reduction import pyramid
 from trihedron.plugins.shared.image_reduction_kernels import depth_normals
 
@@ -60,3 +62,9 @@ class Direct:
             source = source_of(a, noise, stride, depth_normals(a.depth_m, a.intrinsics, REACH))
             out.append((source, target_of(b, REACH), self.iterations))
         return out[::-1]
+
+
+def student_weights(residuals: Residuals, source: Source) -> F64:
+    """Weights (n, 3) of a bivariate t-distribution of brightness and depth, its 2 × 2 scale estimated from the residuals (Kerl, Sturm, Cremers, IROS
+    2013); depth in units of the sensor's noise, which grows with its square."""
+    return np.asarray(student_weights_kernel(residuals.r, residuals.cosine, source.sigma_m))

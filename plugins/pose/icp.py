@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 from typing import Annotated, ClassVar
 
 import numpy as np
@@ -12,8 +13,9 @@ from trihedron.pipeline.core.linalg import matmul
 from trihedron.pipeline.core.options import AcuteDeg, NonNegativeFloat, PositiveFloat, PositiveInt, Range, Share
 from trihedron.pipeline.core.registry import register
 from trihedron.pipeline.core.types import F64, Frame, Pose, PredictedView
-from trihedron.plugins.pose.common import Gates, align, dense_pose, first_pose, huber_weights, lost_pose, source_of, target_of
-from trihedron.plugins.pose.common_kernels import Source, Target
+from trihedron.plugins.pose.dense_alignment import Gates, align, source_of, target_of
+from trihedron.plugins.pose.dense_alignment_kernels import Residuals, Source, Target
+from trihedron.plugins.pose.dense_pose import dense_pose, first_pose, lost_pose
 from trihedron.plugins.shared.image_reduction import Level, brightness, halvings, pyramid, reduced_intrinsics
 from trihedron.plugins.shared.image_reduction_kernels import depth_normals, smoothed
 
@@ -50,7 +52,7 @@ class Icp:
         prior = np.repeat([(self.motion_sigma_m * gap) ** -2, (np.radians(self.motion_sigma_deg) * gap) ** -2], 3)
         start = matmul(invert(model.T_world_camera), previous.T_world_camera)
         gates = Gates(self.least_gradient, self.farthest_m, float(np.cos(np.radians(self.most_deg))))
-        found = align(self._pairs(frame, model), start[:3, :3], start[:3, 3], gates, huber_weights(self.photometric, self.floor_m), prior)
+        found = align(self._pairs(frame, model), start[:3, :3], start[:3, 3], gates, partial(huber_weights, self), prior)
         T = matmul(model.T_world_camera, pose_matrix(found.R, found.t))
         return dense_pose(frame, previous, T, found, self.min_share, "of the pixels and the model", ends_loss=True)
 
@@ -67,3 +69,21 @@ class Icp:
             source = source_of(now, noise, stride, depth_normals(smoothed(now.depth_m, 3), now.intrinsics, 4))
             out.append((source, target_of(view, 3, np.array(model.normals) if i == 0 else None), self.iterations))
         return out[::-1]
+
+
+HUBER = 1.345
+
+
+def huber_weights(options: Icp, residuals: Residuals, source: Source) -> F64:
+    """Huber weights (n, 3) of point-to-plane distances in units of the sensor's noise and `options.floor_m`, and of brightness in units of its median
+    residual, the latter multiplied by `options.photometric`."""
+    W, seen = np.zeros((len(residuals.r), 3)), residuals.cosine > 0.0
+    if not seen.any():
+        return W
+    off = np.abs(residuals.r[seen])
+    brightness_scale = np.array([max(1.4826 * float(np.median(off[:, 0])), 1.0)])
+    scale = brightness_scale, np.hypot(source.sigma_m[seen] * residuals.cosine[seen], options.floor_m)
+    for k, column, share in ((0, 0, options.photometric), (1, 2, 1.0)):
+        e = off[:, k] / scale[k]
+        W[seen, column] = share * np.minimum(1.0, HUBER / np.maximum(e, 1e-9)) / scale[k] ** 2
+    return W

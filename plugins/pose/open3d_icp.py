@@ -12,8 +12,8 @@ from trihedron.pipeline.core.geometry import invert
 from trihedron.pipeline.core.options import PositiveFloat, PositiveInt, Range, Share
 from trihedron.pipeline.core.registry import register
 from trihedron.pipeline.core.types import F64, Frame, Pose
-from trihedron.plugins.pose.common import first_pose
-from trihedron.plugins.pose.common_open3d import relative_pose
+from trihedron.plugins.pose.dense_pose import first_pose
+from trihedron.plugins.pose.open3d_relative_pose import relative_pose
 from trihedron.plugins.shared.libraries import open3d
 from trihedron.plugins.shared.open3d_clouds import cloud_with_normals, depth_cells
 

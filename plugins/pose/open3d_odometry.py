@@ -12,8 +12,8 @@ import numpy as np
 from trihedron.pipeline.core.options import NonNegativeInt, PositiveFloat, Share
 from trihedron.pipeline.core.registry import register
 from trihedron.pipeline.core.types import F32, F64, U8, Frame, Pose
-from trihedron.plugins.pose.common import first_pose
-from trihedron.plugins.pose.common_open3d import relative_pose
+from trihedron.plugins.pose.dense_pose import first_pose
+from trihedron.plugins.pose.open3d_relative_pose import relative_pose
 from trihedron.plugins.shared.libraries import open3d
 from trihedron.plugins.shared.open3d_clouds import rgbd_image
 

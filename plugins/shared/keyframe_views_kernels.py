@@ -1,4 +1,4 @@
-"""Kernels of `common_views.py`: novel readings, and the information gathered in voxels."""
+"""Kernels of `keyframe_views.py`: novel readings, and the information gathered in voxels."""
 # mypy: disable-error-code="arg-type, assignment, index, return-value"
 
 from __future__ import annotations

@@ -13,7 +13,8 @@ from trihedron.pipeline.core.types import F64, I32, Frame, Map, Planes, Pose, Ro
 from trihedron.plugins.shared.keyframe_views import KeyframeView
 from trihedron.plugins.shared.libraries import open3d
 from trihedron.plugins.shared.open3d_clouds import cloud_with_normals
-from trihedron.plugins.surface.common import Gathered, ViewOptions, add_view, coloured
+from trihedron.plugins.surface.colored_mesh import colored_surface
+from trihedron.plugins.surface.retained_views import RetainedViews, ViewOptions, add_view
 
 LEAST = 100  # points of a cloud
 
@@ -32,19 +33,19 @@ class Open3dPoisson(ViewOptions):
     max_distance_m: PositiveFloat = 0.04  # to the nearest reading, beyond which vertices are removed
     point_weight: NonNegativeFloat = 2.0  # of the screening
 
-    def start(self) -> Gathered:
+    def start(self) -> RetainedViews:
         """Return an empty state."""
-        return Gathered()
+        return RetainedViews()
 
-    def add(self, state: Gathered, frame: Frame, planes: Planes, rotation: Rotation | None, pose: Pose, map: Map | None) -> Gathered:
+    def add(self, state: RetainedViews, frame: Frame, planes: Planes, rotation: Rotation | None, pose: Pose, map: Map | None) -> RetainedViews:
         """Retain the frame if it was tracked and shows something new."""
         add_view(self, state, frame, planes, rotation, pose, map)
         return state
 
-    def finish(self, state: Gathered, map: Map | None) -> Surface:
+    def finish(self, state: RetainedViews, map: Map | None) -> Surface:
         """The reconstructed surface, coloured by the views."""
         views = state.settled(map)
-        return coloured(state, map, *self._mesh(views)) if views else Surface.empty(state.index, state.stamp_ns)
+        return colored_surface(state, map, *self._mesh(views)) if views else Surface.empty(state.index, state.stamp_ns)
 
     def _mesh(self, views: list[tuple[KeyframeView, F64]]) -> tuple[F64, I32]:
         """Vertices (v, 3) and triangles (t, 3)."""

@@ -13,7 +13,8 @@ from trihedron.pipeline.core.registry import register
 from trihedron.pipeline.core.types import F64, I32, Frame, Map, Planes, Pose, Rotation, Surface
 from trihedron.plugins.shared.keyframe_views import KeyframeView
 from trihedron.plugins.shared.libraries import open3d
-from trihedron.plugins.surface.common import Gathered, ViewOptions, add_view, coloured
+from trihedron.plugins.surface.colored_mesh import colored_surface
+from trihedron.plugins.surface.retained_views import RetainedViews, ViewOptions, add_view
 
 
 @register("surface", "open3d_voxels")
@@ -29,21 +30,21 @@ class Open3dVoxels(ViewOptions):
     blocks: PositiveInt = 10000  # of 16³ voxels, reserved
     least_weight: PositiveFloat = 1.0  # readings of a voxel, of which fewer are none
 
-    def start(self) -> Gathered:
+    def start(self) -> RetainedViews:
         """Return an empty state."""
-        return Gathered()
+        return RetainedViews()
 
-    def add(self, state: Gathered, frame: Frame, planes: Planes, rotation: Rotation | None, pose: Pose, map: Map | None) -> Gathered:
+    def add(self, state: RetainedViews, frame: Frame, planes: Planes, rotation: Rotation | None, pose: Pose, map: Map | None) -> RetainedViews:
         """Retain the frame if it was tracked and shows something new."""
         add_view(self, state, frame, planes, rotation, pose, map)
         return state
 
-    def finish(self, state: Gathered, map: Map | None) -> Surface:
+    def finish(self, state: RetainedViews, map: Map | None) -> Surface:
         """The zero level of the distances, coloured by the views."""
         views = state.settled(map)
         if not views:
             return Surface.empty(state.index, state.stamp_ns)
-        return coloured(state, map, *self._mesh(views))
+        return colored_surface(state, map, *self._mesh(views))
 
     def _mesh(self, views: list[tuple[KeyframeView, F64]]) -> tuple[F64, I32]:
         """Vertices (v, 3) and triangles (t, 3)."""

@@ -11,10 +11,11 @@ from trihedron.pipeline.core.linalg import matmul
 from trihedron.pipeline.core.options import AcuteDeg, PositiveFloat, PositiveInt, Range
 from trihedron.pipeline.core.registry import register
 from trihedron.pipeline.core.types import F64, I32, Frame, Map, Planes, Pose, Rotation, Surface
-from trihedron.plugins.surface.common import Gathered, ViewOptions, add_view, map_planes, numbered, pictured
-from trihedron.plugins.surface.common_meshes import plane_axes
-from trihedron.plugins.surface.common_superpixels import gathered_points, observed_planes
-from trihedron.plugins.surface.planar_greedy_kernels import MOST, accepted
+from trihedron.plugins.surface.colored_mesh import map_planes, number_planes, textured_surface
+from trihedron.plugins.surface.observed_planes import observed_planes, points_on_planes
+from trihedron.plugins.surface.planar_greedy_kernels import MOST, accept_edges
+from trihedron.plugins.surface.plane_axes import plane_axes
+from trihedron.plugins.surface.retained_views import RetainedViews, ViewOptions, add_view
 
 
 @register("surface", "planar_greedy")
@@ -30,30 +31,30 @@ class PlanarGreedy(ViewOptions):
     pixel_step: PositiveInt = 4  # px between the readings that are gathered
     texel_m: Annotated[float, Range(0.001)] = 0.015  # of the picture of the planes
 
-    def start(self) -> Gathered:
+    def start(self) -> RetainedViews:
         """Return an empty state."""
-        return Gathered()
+        return RetainedViews()
 
-    def add(self, state: Gathered, frame: Frame, planes: Planes, rotation: Rotation | None, pose: Pose, map: Map | None) -> Gathered:
+    def add(self, state: RetainedViews, frame: Frame, planes: Planes, rotation: Rotation | None, pose: Pose, map: Map | None) -> RetainedViews:
         """Retain the frame if it was tracked and shows something new."""
         add_view(self, state, frame, planes, rotation, pose, map)
         return state
 
-    def finish(self, state: Gathered, map: Map | None) -> Surface:
+    def finish(self, state: RetainedViews, map: Map | None) -> Surface:
         """One mesh for each plane that was seen."""
         views = state.settled(map)
         ids, known = map_planes(map)
         found = observed_planes(views, known, self.angle_deg, self.distance_m)
         axes = [plane_axes(plane) for plane in found.planes]
-        points = gathered_points(views, found, axes, self.spacing_m, self.pixel_step)
+        points = points_on_planes(views, found, axes, self.spacing_m, self.pixel_step)
         meshes = [greedy_triangles(flat, self.radius_m, self.multiplier) for flat in points]
         first = np.cumsum([0, *(len(flat) for flat in points)])
         vertices = [matmul(flat, basis.T) - plane[3] * plane[:3] for flat, basis, plane in zip(points, axes, found.planes)]
         triangles = [mesh + np.int32(start) for mesh, start in zip(meshes, first)]
         labels = [np.full(len(mesh), p, np.int32) for p, mesh in enumerate(meshes)]
-        return pictured(
+        return textured_surface(
             state, map, np.concatenate([np.empty((0, 3)), *vertices]), np.concatenate([np.empty((0, 3), np.int32), *triangles]),
-            np.concatenate([np.empty(0, np.int32), *labels]), found.planes, numbered(ids, len(found.planes), map), [], self.texel_m,
+            np.concatenate([np.empty(0, np.int32), *labels]), found.planes, number_planes(ids, len(found.planes), map), [], self.texel_m,
         )  # fmt: skip
 
 
@@ -73,7 +74,7 @@ def greedy_triangles(points: F64, radius_m: float, multiplier: float) -> I32:
     edges = np.stack([keys // len(points), keys % len(points)], axis=1).astype(np.int32)
     length = np.linalg.norm(points[edges[:, 1]] - points[edges[:, 0]], axis=1)
     order = np.argsort(length, kind="stable")
-    return _faces(points, edges[order][accepted(points, edges[order], length[order], distance, nearest.astype(np.int32))])
+    return _faces(points, edges[order][accept_edges(points, edges[order], length[order], distance, nearest.astype(np.int32))])
 
 
 def _faces(points: F64, edges: I32) -> I32:

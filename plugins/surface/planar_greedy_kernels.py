@@ -14,7 +14,7 @@ MOST = 96  # neighbours of a point that may be joined to it
 
 
 @kernel
-def accepted(points: F64, edges: I32, length: F64, distance: F64, nearest: I32) -> I32:
+def accept_edges(points: F64, edges: I32, length: F64, distance: F64, nearest: I32) -> I32:
     """Rows of the edges, shortest first, that cross no edge accepted before. One that does is no longer, so one of its ends is as near to an end of
     the edge as that is long: among its neighbours (n, MOST), sorted by distance."""
     partners = np.full((len(points), MOST), -1, np.int32)

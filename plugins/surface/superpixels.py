@@ -10,8 +10,9 @@ import numpy as np
 from trihedron.pipeline.core.options import AcuteDeg, PositiveInt, Range
 from trihedron.pipeline.core.registry import register
 from trihedron.pipeline.core.types import Frame, Map, Planes, Pose, Rotation, Surface
-from trihedron.plugins.surface.common import Gathered, ViewOptions, add_view, coloured
-from trihedron.plugins.surface.common_superpixels import discs, fused, moved, superpixels
+from trihedron.plugins.surface.colored_mesh import colored_surface
+from trihedron.plugins.surface.retained_views import RetainedViews, ViewOptions, add_view
+from trihedron.plugins.surface.superpixel_surfels import cut_superpixels, discs, fuse_surfels, transform_surfels
 
 
 @register("surface", "superpixels")
@@ -24,19 +25,19 @@ class Superpixels(ViewOptions):
     angle_deg: AcuteDeg = 30.0  # between the normals of superpixels of one surfel
     least: PositiveInt = 3  # views that must agree on a surfel
 
-    def start(self) -> Gathered:
+    def start(self) -> RetainedViews:
         """Return an empty state."""
-        return Gathered()
+        return RetainedViews()
 
-    def add(self, state: Gathered, frame: Frame, planes: Planes, rotation: Rotation | None, pose: Pose, map: Map | None) -> Gathered:
+    def add(self, state: RetainedViews, frame: Frame, planes: Planes, rotation: Rotation | None, pose: Pose, map: Map | None) -> RetainedViews:
         """Retain the frame if it was tracked and shows something new, and cut it, as if it had no planes."""
         view = add_view(self, state, frame, planes, rotation, pose, map)
         if view is not None:
-            state.surfels.append(superpixels(replace(view, labels=np.zeros_like(view.labels)), self.side_px, self.side_px))
+            state.surfels.append(cut_superpixels(replace(view, labels=np.zeros_like(view.labels)), self.side_px, self.side_px))
         return state
 
-    def finish(self, state: Gathered, map: Map | None) -> Surface:
+    def finish(self, state: RetainedViews, map: Map | None) -> Surface:
         """The surfels of all views at their final poses, as discs of six corners."""
-        placed = [moved(surfels, T) for view, surfels in zip(state.views, state.surfels) if (T := view.settled(map)) is not None]
-        agreed = fused(placed, float(np.cos(np.radians(self.angle_deg))))
-        return coloured(state, map, *discs(agreed[agreed[:, 12] >= self.least]))
+        placed = [transform_surfels(surfels, T) for view, surfels in zip(state.views, state.surfels) if (T := view.settled(map)) is not None]
+        agreed = fuse_surfels(placed, float(np.cos(np.radians(self.angle_deg))))
+        return colored_surface(state, map, *discs(agreed[agreed[:, 12] >= self.least]))

@@ -10,8 +10,10 @@ import numpy as np
 from trihedron.pipeline.core.options import AcuteDeg, PositiveFloat, PositiveInt, Range, check_increasing
 from trihedron.pipeline.core.registry import register
 from trihedron.pipeline.core.types import Frame, Map, Planes, Pose, Rotation, Surface
-from trihedron.plugins.surface.common import Gathered, ViewOptions, add_view, map_planes, numbered, pictured
-from trihedron.plugins.surface.common_superpixels import discs, fused, moved, observed_planes, superpixels
+from trihedron.plugins.surface.colored_mesh import map_planes, number_planes, textured_surface
+from trihedron.plugins.surface.observed_planes import observed_planes
+from trihedron.plugins.surface.retained_views import RetainedViews, ViewOptions, add_view
+from trihedron.plugins.surface.superpixel_surfels import cut_superpixels, discs, fuse_surfels, transform_surfels
 
 
 @register("surface", "surfels")
@@ -30,30 +32,30 @@ class Surfels(ViewOptions):
     def __post_init__(self) -> None:
         check_increasing(self, "side_px", "coarse_px")
 
-    def start(self) -> Gathered:
+    def start(self) -> RetainedViews:
         """Return an empty state."""
-        return Gathered()
+        return RetainedViews()
 
-    def add(self, state: Gathered, frame: Frame, planes: Planes, rotation: Rotation | None, pose: Pose, map: Map | None) -> Gathered:
+    def add(self, state: RetainedViews, frame: Frame, planes: Planes, rotation: Rotation | None, pose: Pose, map: Map | None) -> RetainedViews:
         """Retain the frame if it was tracked and shows something new, and cut it."""
         view = add_view(self, state, frame, planes, rotation, pose, map)
         if view is not None:
-            state.surfels.append(superpixels(view, self.side_px, self.coarse_px))
+            state.surfels.append(cut_superpixels(view, self.side_px, self.coarse_px))
         return state
 
-    def finish(self, state: Gathered, map: Map | None) -> Surface:
+    def finish(self, state: RetainedViews, map: Map | None) -> Surface:
         """The surfels of all views at their final poses, as discs of six corners."""
         views = state.settled(map)
         ids, known = map_planes(map)
         found = observed_planes(views, known, self.region_deg, self.region_m)
         settled = [surfels for view, surfels in zip(state.views, state.surfels) if view.settled(map) is not None]
-        placed = [moved(surfels, T) for surfels, (_, T) in zip(settled, views)]
+        placed = [transform_surfels(surfels, T) for surfels, (_, T) in zip(settled, views)]
         for surfels, planes in zip(placed, found.regions):
             surfels[:, 11] = np.append(planes, -1)[surfels[:, 11].astype(int)]
-        agreed = fused(placed, float(np.cos(np.radians(self.angle_deg))))
+        agreed = fuse_surfels(placed, float(np.cos(np.radians(self.angle_deg))))
         agreed = agreed[agreed[:, 12] >= self.least]
         vertices, triangles = discs(agreed)
         labels = np.repeat(agreed[:, 11].astype(np.int32), len(triangles) // max(len(agreed), 1))
-        return pictured(
-            state, map, vertices, triangles, labels, found.planes, numbered(ids, len(found.planes), map), [], self.texel_m
+        return textured_surface(
+            state, map, vertices, triangles, labels, found.planes, number_planes(ids, len(found.planes), map), [], self.texel_m
         )  # fmt: skip

@@ -6,8 +6,9 @@ from dataclasses import dataclass
 
 from trihedron.pipeline.core.registry import register
 from trihedron.pipeline.core.types import Frame, Map, Planes, Pose, Rotation, Surface
-from trihedron.plugins.surface.common import add_view, coloured
-from trihedron.plugins.surface.common_iso_surface import Fused, VolumeOptions, final_mesh, fuse_view, volume_preview
+from trihedron.plugins.surface.colored_mesh import colored_surface
+from trihedron.plugins.surface.fused_volume import FusedViews, VolumeOptions, final_mesh, fuse_view, volume_preview
+from trihedron.plugins.surface.retained_views import add_view
 
 
 @register("surface", "tsdf")
@@ -15,18 +16,18 @@ from trihedron.plugins.surface.common_iso_surface import Fused, VolumeOptions, f
 class Tsdf(VolumeOptions):
     """Everything seen as one dense mesh (Curless and Levoy 1996), each reading weighed by its depth's variance; no planes."""
 
-    def start(self) -> Fused:
+    def start(self) -> FusedViews:
         """Return an empty state."""
-        return Fused()
+        return FusedViews()
 
-    def add(self, state: Fused, frame: Frame, planes: Planes, rotation: Rotation | None, pose: Pose, map: Map | None) -> Fused:
+    def add(self, state: FusedViews, frame: Frame, planes: Planes, rotation: Rotation | None, pose: Pose, map: Map | None) -> FusedViews:
         """Retain the frame if it was tracked and shows something new, and fuse it."""
         return fuse_view(self, state, add_view(self, state, frame, planes, rotation, pose, map))
 
-    def preview(self, state: Fused) -> Surface:
+    def preview(self, state: FusedViews) -> Surface:
         """Return the mesh so far, without planes: for viewers."""
         return volume_preview(self, state)
 
-    def finish(self, state: Fused, map: Map | None) -> Surface:
+    def finish(self, state: FusedViews, map: Map | None) -> Surface:
         """The zero level of the distances, coloured by the views."""
-        return coloured(state, map, *final_mesh(self, state, map))
+        return colored_surface(state, map, *final_mesh(self, state, map))

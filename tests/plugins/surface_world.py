@@ -5,7 +5,7 @@ import numpy as np
 from trihedron.pipeline.core.geometry import pose_matrix
 from trihedron.pipeline.core.lie import exp_so3
 from trihedron.pipeline.core.types import EXACT_DEPTH, OK, Camera, Frame, Planes, Pose, Rotation
-from trihedron.plugins.surface.common_meshes import opposite_half_edges
+from trihedron.plugins.surface.half_edges import opposite_half_edges
 
 CAMERA = Camera(160, 120, 130.0, 130.0, 79.5, 59.5, depth_noise=EXACT_DEPTH)
 FLOOR, LEFT, BACK = (0.0, -1.0, 0.0, 1.0), (1.0, 0.0, 0.0, 1.2), (0.0, 0.0, -1.0, 3.0)  # the corner of a room, seen from inside; y down

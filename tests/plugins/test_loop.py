@@ -11,13 +11,13 @@ from trihedron.pipeline.core.geometry import invert, pose_matrix
 from trihedron.pipeline.core.lie import exp_se3
 from trihedron.pipeline.core.types import Frame, Matches, Pose
 from trihedron.plugins.loop.appearance import AppearanceLoop
-from trihedron.plugins.loop.common_loop_verification import accept_loop, path_lengths, place_of
-from trihedron.plugins.loop.common_pose_graph import Edges, solve_pose_graph
+from trihedron.plugins.loop.loop_closing import accept_loop, path_lengths, place_of
 from trihedron.plugins.loop.planes import PlanesLoop
 from trihedron.plugins.map.covisibility import Covisibility
 from trihedron.plugins.mapping.correction import apply_correction
 from trihedron.plugins.mapping.covisibility_graph import observed_by
 from trihedron.plugins.matches.local_map import LocalMap
+from trihedron.plugins.shared.pose_graph import Edges, solve_pose_graph
 from trihedron.plugins.shared.pose_optimizer import solve_pose
 from trihedron.plugins.shared.pose_optimizer_kernels import PlaneTerms
 

@@ -9,7 +9,7 @@ from trihedron.pipeline.core.geometry import pose_matrix, transform_planes
 from trihedron.pipeline.core.lie import exp_so3, log_so3
 from trihedron.pipeline.core.types import Camera, Frame, Pose
 from trihedron.plugins.loop.appearance import AppearanceLoop
-from trihedron.plugins.loop.common_manhattan_prior import estimate_manhattan_prior
+from trihedron.plugins.loop.manhattan_prior import estimate_manhattan_prior
 from trihedron.plugins.loop.planes import PlanesLoop
 from trihedron.plugins.mapping import plane_fusion
 from trihedron.plugins.mapping.correction import apply_correction

@@ -12,8 +12,7 @@ from trihedron.pipeline.core import geometry as g
 from trihedron.pipeline.core import lie
 from trihedron.plugins.bundle import local_window_kernels
 from trihedron.plugins.bundle.local_window_kernels import line_basis
-from trihedron.plugins.loop import common_pose_graph
-from trihedron.plugins.shared import pose_optimizer, pose_optimizer_kernels, relative_motion_kernels
+from trihedron.plugins.shared import pose_graph, pose_optimizer, pose_optimizer_kernels, relative_motion_kernels
 from trihedron.plugins.shared.pose_optimizer import NO_LINES, NO_PLANES, solve_pose
 from trihedron.plugins.shared.pose_optimizer_kernels import PARALLEL, PERPENDICULAR, SAME, PlaneTerms, PointTerms, Weights
 
@@ -182,17 +181,17 @@ def test_the_gradient_of_a_graph_of_poses(rng, angle, scale_m):
     pairs = np.array([[0, 1], [1, 2], [0, 2]], np.int32)
     measured = np.array([g.invert(poses[a]) @ poses[b] @ lie.exp_se3(noise * rng.normal(size=6)) for a, b in pairs])
     information = np.tile(np.diag(noise**-2.0), (3, 1, 1))
-    edges = common_pose_graph.Edges(pairs, measured, information)
-    gradient = common_pose_graph._normal_equations(poses, edges)[2].reshape(3, 6)
+    edges = pose_graph.Edges(pairs, measured, information)
+    gradient = pose_graph._normal_equations(poses, edges)[2].reshape(3, 6)
     unit = np.repeat([scale_m, 1.0], 3)
 
     def half_cost(d):
-        return np.array([0.5 * common_pose_graph._normal_equations(common_pose_graph._retract(poses, unit * d.reshape(3, 6)), edges)[0]])
+        return np.array([0.5 * pose_graph._normal_equations(pose_graph._retract(poses, unit * d.reshape(3, 6)), edges)[0]])
 
     found = numeric(half_cost, 18, 1e-7)
     assert np.allclose(gradient * unit, found.reshape(3, 6), rtol=1e-3, atol=1e-3 * np.abs(found).max())
     moved = pose(rng, 2.0, 1.0) @ poses  # the gauge: where the world is does not matter
-    assert common_pose_graph._normal_equations(moved, edges)[0] == pytest.approx(common_pose_graph._normal_equations(poses, edges)[0], rel=1e-3)
+    assert pose_graph._normal_equations(moved, edges)[0] == pytest.approx(pose_graph._normal_equations(poses, edges)[0], rel=1e-3)
 
 
 def measured(rng, T, n):

@@ -11,7 +11,7 @@ import pytest
 
 from trihedron.pipeline.core.geometry import pose_matrix
 from trihedron.pipeline.core.lie import exp_se3, exp_so3, rotation_angle_deg
-from trihedron.plugins.loop.common_pose_graph import correct_keyframes
+from trihedron.plugins.loop.keyframe_correction import correct_keyframes
 from trihedron.plugins.loop.pose_graph import PoseGraph
 from trihedron.plugins.mapping.correction import apply_correction
 from trihedron.plugins.matches.keyframes import Keyframes

@@ -12,8 +12,9 @@ import trimesh
 from trihedron.pipeline.core.registry import load_plugins, plugin_class, plugins_of
 from trihedron.pipeline.core.types import EXACT_DEPTH, LOST, PLANE_KINDS, Camera
 from trihedron.pipeline.record.codec import Encoder
-from trihedron.plugins.surface.common_meshes import opposite_half_edges, without_pinholes
 from trihedron.plugins.surface.files import write_surface
+from trihedron.plugins.surface.half_edges import opposite_half_edges
+from trihedron.plugins.surface.outlines import close_pinholes
 
 sys.path.insert(0, str(Path(__file__).parent))
 from surface_world import BACK, BALL, FLOOR, LEFT, RADIUS, faults, fold, off_truth, render, seen, walk
@@ -112,7 +113,7 @@ def test_small_rings_of_open_edges_are_closed_and_large_ones_stay():
     place = (rows * 9 + columns)[:8, :8].ravel()
     sheet = np.concatenate([np.stack([place, place + 1, place + 10], 1), np.stack([place, place + 10, place + 9], 1)]).astype(np.int32)
     holed = np.delete(sheet, [10, 36, 36 + 64], axis=0)
-    whole, owners = without_pinholes(points, holed, np.arange(len(holed), dtype=np.int32) // 64)
+    whole, owners = close_pinholes(points, holed, np.arange(len(holed), dtype=np.int32) // 64)
     assert len(whole) == len(owners) == len(sheet) and set(owners.tolist()) == {0, 1}
     normals = np.cross(points[whole[:, 1]] - points[whole[:, 0]], points[whole[:, 2]] - points[whole[:, 0]])
     assert (normals[:, 2] > 0.0).all() and np.isclose(0.5 * normals[:, 2].sum(), 0.032**2)

@@ -13,10 +13,10 @@ from trihedron.pipeline.core.types import Camera
 from trihedron.plugins.mapping.insertion import add_keyframe
 from trihedron.plugins.mapping.landmarks import empty_map
 from trihedron.plugins.shared.keyframe_views import readings
-from trihedron.plugins.surface.common import with_measured_noise
-from trihedron.plugins.surface.common_iso_surface import final_volume
-from trihedron.plugins.surface.common_meshes import opposite_half_edges
-from trihedron.plugins.surface.common_planar import PlanarOptions, planar_labels
+from trihedron.plugins.surface.fused_volume import final_volume
+from trihedron.plugins.surface.half_edges import opposite_half_edges
+from trihedron.plugins.surface.measured_noise import with_measured_noise
+from trihedron.plugins.surface.planar_segmentation import PlanarOptions, planar_labels
 
 sys.path.insert(0, str(Path(__file__).parent))
 from surface_world import CAMERA, FLOOR, fold, off_truth, seen, walk

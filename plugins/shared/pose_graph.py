@@ -1,4 +1,4 @@
-"""The pose graph over keyframes (Grisetti et al., ITS Magazine 2010): its edges, its solution, and the correction of the map that follows from it."""
+"""The pose graph (Grisetti et al., ITS Magazine 2010): its edges, and its solution by sparse Levenberg–Marquardt."""
 
 from __future__ import annotations
 
@@ -7,21 +7,17 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from trihedron.pipeline.core.geometry import invert, transform_each
 from trihedron.pipeline.core.lie import exp_so3
 from trihedron.pipeline.core.linalg import matmul
-from trihedron.pipeline.core.types import F32, F64, I32, Correction, Map, Table
-from trihedron.plugins.loop.common_pose_graph_kernels import solve_envelope
-from trihedron.plugins.mapping.covisibility_graph import odometry
-from trihedron.plugins.mapping.landmarks import ENDPOINTS, POSITION
-from trihedron.plugins.mapping.plane_fusion import information_of
+from trihedron.pipeline.core.types import F64, I32
 from trihedron.plugins.shared.lie_kernels import log_so3_each
-from trihedron.plugins.shared.linalg import cross_matrices, inverse
+from trihedron.plugins.shared.linalg import cross_matrices
+from trihedron.plugins.shared.pose_graph_kernels import solve_envelope
 
 if TYPE_CHECKING:  # imported where it is needed: SciPy is slow to load, and most runs close no loop
     from scipy.sparse import bsr_matrix
 
-LINKS = 3  # further keyframes each is connected to, so that a stretch that was observed often stays stiff
+
 ITERATIONS, CONVERGED = 20, 1e-9  # squared length of a step, metres and radians
 FIXED = 1e12 * np.eye(6)  # information of a fixed pose
 MAX_DAMPING = 1e8
@@ -36,7 +32,7 @@ class Edges:
     information: F64  # (e, 6, 6)
 
 
-def joined(*edges: Edges) -> Edges:
+def concatenate_edges(*edges: Edges) -> Edges:
     """Concatenate edges."""
     pairs, measured, information = zip(*((e.pairs, e.measured, e.information) for e in edges))
     return Edges(np.concatenate(pairs), np.concatenate(measured), np.concatenate(information))
@@ -103,10 +99,10 @@ def _normal_equations(poses: F64, edges: Edges) -> tuple[float, bsr_matrix, F64]
     np.add.at(g, a, matmul(W_a, error[..., None])[..., 0])
     np.add.at(g, b, matmul(W_b, error[..., None])[..., 0])
     cost = float(np.einsum("ei,eij,ej->", error, edges.information, error))
-    return cost, _assembled(blocks, rows, columns, n), g.ravel()
+    return cost, _assemble(blocks, rows, columns, n), g.ravel()
 
 
-def _assembled(blocks: F64, rows: I32, columns: I32, n: int) -> bsr_matrix:
+def _assemble(blocks: F64, rows: I32, columns: I32, n: int) -> bsr_matrix:
     """(6n, 6n) sum of 6 × 6 blocks at rows and columns of blocks."""
     from scipy.sparse import bsr_matrix
 
@@ -115,54 +111,3 @@ def _assembled(blocks: F64, rows: I32, columns: I32, n: int) -> bsr_matrix:
     np.add.at(total, where, blocks)
     starts = np.searchsorted(keys // n, np.arange(n + 1))
     return bsr_matrix((total, keys % n, starts), shape=(6 * n, 6 * n))
-
-
-# Edges and corrections of a map.
-
-
-def odometry_edges(map: Map, rows: I32, drift: float, rotation_drift: float) -> Edges:
-    """Return edges between neighbours in time; their covariance is that of the later keyframe's pose plus the drift along the path: standard
-    deviations per square root of a metre, m and rad."""
-    pairs = np.concatenate([np.stack([np.arange(len(rows) - k), np.arange(k, len(rows))], axis=1) for k in range(1, LINKS + 1)])
-    return Edges(pairs.astype(np.int32), *odometry(map, rows[pairs], drift, rotation_drift, LINKS))
-
-
-def correct_keyframes(map: Map, rows: I32, before: F64, after: F64) -> Correction:
-    """Return the correction that moves keyframes `rows` from poses (n, 4, 4) to others, and each landmark by the mean motion of its observers."""
-    motions = np.broadcast_to(np.eye(4), (len(map.keyframes), 4, 4)).copy()
-    motions[rows] = matmul(after, invert(before))
-    (points, T_points), (lines, T_lines), (planes, T_planes) = (_mean_motion(table, motions) for table in (map.points, map.lines, map.planes))
-    coefficients = _transform_planes(T_planes, map.planes.rows("coefficients", planes))
-    moments = matmul(T_planes, map.planes.rows("moments", planes), np.swapaxes(T_planes, 1, 2))
-    return Correction(
-        map.index, map.stamp_ns, map.revision, rows, after,
-        points, POSITION.rounded(transform_each(T_points, map.points.rows("position_m", points)[:, None])[:, 0]),
-        _rotate_information(T_points, map.points.rows("information", points)),
-        lines, ENDPOINTS.rounded(transform_each(T_lines, map.lines.rows("endpoints_m", lines))),
-        _rotate_information(T_lines[:, None], map.lines.rows("information", lines)),
-        planes, coefficients, inverse(information_of(moments, coefficients)),
-    )  # fmt: skip
-
-
-def _mean_motion(table: Table, motions: F64) -> tuple[I32, F64]:
-    """Living landmarks (n,) and the mean (n, 4, 4) of the motions (k, 4, 4) of each one's observers; between similar motions it is rigid."""
-    ids = np.flatnonzero(table.column("alive")).astype(np.int32)
-    total, count = np.zeros((len(ids), 4, 4)), np.zeros(len(ids))
-    for column in table.rows("observers", ids).T:
-        known = column >= 0
-        total[known] += motions[column[known]]
-        count += known
-    total[count == 0.0], count[count == 0.0] = np.eye(4), 1.0
-    return ids, total / count[:, None, None]
-
-
-def _rotate_information(T: F64, information: F32) -> F32:
-    """Rotate information matrices (..., 3, 3) by motions (..., 4, 4)."""
-    return np.asarray(matmul(T[..., :3, :3], information, np.swapaxes(T[..., :3, :3], -1, -2)), np.float32)
-
-
-def _transform_planes(T: F64, planes: F64) -> F64:
-    """Transform planes (n, 4), each by its own motion (n, 4, 4)."""
-    n = matmul(T[:, :3, :3], planes[:, :3, None])[..., 0]
-    n /= np.linalg.norm(n, axis=1, keepdims=True)
-    return np.concatenate([n, planes[:, 3:] - np.einsum("ni,ni->n", n, T[:, :3, 3])[:, None]], axis=1)

@@ -9,7 +9,7 @@ import numpy as np
 
 from trihedron.pipeline.core.options import PositiveInt, Share
 from trihedron.pipeline.core.types import F64, I32, Map
-from trihedron.plugins.loop.common_loop_verification import LoopOptions, path_lengths, within_reach
+from trihedron.plugins.loop.loop_closing import LoopOptions, path_lengths, within_reach
 from trihedron.plugins.mapping.covisibility_graph import observed_by
 
 HISTOGRAM = 128  # least bytes of a histogram (SIFT) or learned descriptor: its bits are those above the median

@@ -11,18 +11,17 @@ from typing import Annotated
 
 import numpy as np
 
-from trihedron.pipeline.core.geometry import invert, pose_matrix, transform, umeyama
+from trihedron.pipeline.core.geometry import invert
 from trihedron.pipeline.core.lie import log_se3
 from trihedron.pipeline.core.linalg import inv, matmul, solve
 from trihedron.pipeline.core.options import NonNegativeInt, PositiveFloat, PositiveInt, Range, Share
-from trihedron.pipeline.core.types import F64, I32, Bool, Camera, Correction, Frame, Keypoints, Map, Matches
-from trihedron.plugins.loop.common_manhattan_prior import align_with_manhattan, correct_loop, estimate_manhattan_prior
+from trihedron.pipeline.core.types import F64, I32, Correction, Frame, Map, Matches
+from trihedron.plugins.loop.initial_alignment import initial_pose
+from trihedron.plugins.loop.manhattan_prior import align_with_manhattan, correct_loop, estimate_manhattan_prior
 from trihedron.plugins.mapping.covisibility_graph import LocalWindow, current_submap, keyframes_of, observed_by
 from trihedron.plugins.mapping.data_association import PredictedPose, SearchOptions, search_map
 from trihedron.plugins.mapping.keyframe_features import features_of
 from trihedron.plugins.places.verification import free_space_violation, solve_pose_in_map
-from trihedron.plugins.shared.feature_matching import associate_planes, match_near
-from trihedron.plugins.shared.feature_matching_kernels import overlap
 from trihedron.plugins.shared.pose_optimizer import LANDMARK_SCORE, PoseSolution
 
 CHI2_6 = 22.46  # 99.9 % of six degrees of freedom
@@ -96,9 +95,9 @@ def _verify(options: LoopOptions, map: Map, frame: Frame, place: Place) -> PoseS
     T = T_before = map.keyframes.row("T_world_camera", newest)
     sigma_m, sigma_rad = drift_sigma_m(options, place.path_m), 2.0 * np.radians(options.rotation_sigma_deg)
     expected = np.diag(np.repeat([sigma_m**2, sigma_rad**2], 3))
-    window = _seen_alone(map, newest, place.window)
+    window = _own_landmarks(map, newest, place.window)
     features = features_of(map, frame.camera, T_before, window)
-    T = _initial_pose(map, frame.camera, place, window, features[0], T, expected)
+    T = initial_pose(map, frame.camera, place.window, window, features[0], T, expected)
     information = np.asarray(inv(expected), np.float64)
     for radius_m in (0.03, 0.01):
         matches = search_map(SEARCH, frame.camera, PredictedPose(T, radius_m, 0.3 * radius_m, True), *features, map, place.window)
@@ -167,94 +166,8 @@ def place_of(options: LoopOptions, map: Map, keyframe: int, path_m: float) -> Pl
     return Place(LocalWindow(rows[near], *ids), path_m, found)
 
 
-def _seen_alone(map: Map, keyframe: int, place: LocalWindow) -> LocalWindow:
+def _own_landmarks(map: Map, keyframe: int, place: LocalWindow) -> LocalWindow:
     """Window of a keyframe with its landmarks that are not in the place's."""
     row = np.array([keyframe], np.int32)
     there = {"point": place.points, "line": place.lines, "plane": place.planes}
     return LocalWindow(row, *(np.setdiff1d(observed_by(map, row, kind), ids).astype(np.int32) for kind, ids in there.items()))
-
-
-# Initial poses: the drift is mostly a displacement, on which similar points, or the layout of planes, agree. The rotation hardly drifts, so the
-# refinement that follows finds it.
-
-MAX_BITS, MAX_L2, RATIO = 60, 200, 0.85  # between descriptors of two views, and best to second best (ORB-SLAM2: 50 to 100 bits)
-LAYOUT_DEG, LAYOUT_M = 10.0, 0.05  # between the normals of planes that may be one; between their offsets, displaced
-SCALES_M = (0.1, 0.3, 0.9, 3.0)  # between their offsets before
-EXTENT_M = 0.5  # within which a sample of one plane has one of the other where both extend
-ROUNDS, MIN_POINTS = 3, 6  # of a refinement; points
-
-
-def _initial_pose(map: Map, camera: Camera, place: Place, window: LocalWindow, keypoints: Keypoints, T: F64, expected: F64) -> F64:
-    """Select, from the pose without drift, the one where the planes lie on those of the place, and the one where similar points agree, that with most
-    agreeing points."""
-    sigma_m, sigma_rad = np.sqrt(expected[0, 0]), np.sqrt(expected[3, 3])
-    pairs = _match_points(map, camera, T, keypoints, place.window.points, sigma_m, sigma_rad)
-    points, there = keypoints.points_m[pairs[:, 0]].astype(np.float64), map.points.rows("position_m", pairs[:, 1])
-    sigma = 0.01 + keypoints.sigma_m[pairs[:, 0]].astype(np.float64) + sigma_rad * points[:, 2]
-    by_planes = displacement_of_planes(map, window.planes, place.window.planes, sigma_m)[0]
-    starts = [T, pose_matrix(T[:3, :3], T[:3, 3] + by_planes), matmul(_motion_of_points(transform(T, points), there, sigma), T)]
-    agreeing = [np.count_nonzero(np.linalg.norm(transform(start, points) - there, axis=1) < 3.0 * sigma) for start in starts]
-    return starts[int(np.argmax(agreeing))]
-
-
-def _match_points(map: Map, camera: Camera, T_world_camera: F64, keypoints: Keypoints, ids: I32, sigma_m: float, sigma_rad: float) -> I32:
-    """Pairs (row of the keyframe's points, id among `ids`), (n, 2), with similar descriptors within three standard deviations of the projection."""
-    local = transform(invert(T_world_camera), map.points.rows("position_m", ids))
-    ids, local = ids[local[:, 2] > 0.1], local[local[:, 2] > 0.1]
-    depth = np.maximum(keypoints.points_m[:, 2].astype(np.float64), 0.5)
-    radius = 3.0 * camera.fx * (sigma_m / depth + sigma_rad)
-    found = match_near(
-        keypoints.pixels, keypoints.descriptors, keypoints.octaves,
-        camera.project(local).astype(np.float32), map.points.rows("descriptor", ids), map.points.rows("octave", ids),
-        radius.astype(np.float32), 3, MAX_L2 if keypoints.metric == "l2" else MAX_BITS, RATIO, keypoints.metric,
-    )  # fmt: skip
-    rows = np.flatnonzero(found >= 0)
-    return np.stack([rows, ids[found[rows]]], axis=1).astype(np.int32)
-
-
-def _motion_of_points(here: F64, there: F64, sigma_m: F64) -> F64:
-    """Motion T (4, 4) with `there ≈ T here` for most of the pairs of points (n, 3) with errors `sigma_m` (n,): the displacement that most pairs
-    share, refined to a motion. The identity where fewer than MIN_POINTS agree."""
-    T = np.eye(4)
-    if len(here) < MIN_POINTS:
-        return T
-    shift = there - here
-    near = np.linalg.norm(shift[:, None] - shift[None], axis=2) < 3.0 * np.hypot(sigma_m[:, None], sigma_m[None])
-    chosen = near[np.argmax(near.sum(axis=1))]
-    for _ in range(ROUNDS):
-        if np.count_nonzero(chosen) < MIN_POINTS:
-            return np.eye(4)
-        T = umeyama(here[chosen], there[chosen])
-        chosen = np.linalg.norm(there - transform(T, here), axis=1) < 3.0 * sigma_m
-    return T
-
-
-def displacement_of_planes(map: Map, here: I32, there: I32, sigma_m: float) -> tuple[F64, float]:
-    """Return the displacement (3,) of the planes `here` onto those `there`, as far as they observe it, and the agreeing extent (in planes).
-
-    Planes with the same normal are paired when their offsets differ by little, then by more, up to three standard deviations; the displacement with
-    the largest agreeing extent is taken, the smaller one of two that are similar."""
-    planes = [map.planes.rows("coefficients", ids) for ids in (here, there)]
-    samples = [map.planes.rows("samples_m", ids) for ids in (here, there)]
-    best, agreed = np.zeros(3), 0.0
-    for reach_m in sorted({min(reach, 3.0 * sigma_m) for reach in SCALES_M}):
-        pairs = associate_planes(planes[0], samples[0], planes[1], samples[1], LAYOUT_DEG, reach_m, True)
-        n, offset = planes[0][pairs[:, 0], :3], planes[0][pairs[:, 0], 3] - planes[1][pairs[:, 1], 3]
-        shift, inliers = _solve_displacement(n, offset, sigma_m)
-        score = float(sum(overlap(samples[0][a] + shift.astype(np.float32), samples[1][b], EXTENT_M) for a, b in pairs[inliers]))
-        if score > 1.1 * agreed:
-            best, agreed = shift, score
-    return best, agreed
-
-
-def _solve_displacement(n: F64, offset: F64, sigma_m: float) -> tuple[F64, Bool]:
-    """Least squares of `n · shift = offset` (k, 3), (k,) with a prior, without outliers; the shift and the inliers."""
-    shift, inliers = np.zeros(3), np.ones(len(n), np.bool_)
-    for _ in range(len(n)):
-        A = matmul(n[inliers].T, n[inliers]) / LAYOUT_M**2 + np.eye(3) / max(sigma_m, 1e-3) ** 2
-        shift = np.asarray(solve(A, matmul(n[inliers].T, offset[inliers]) / LAYOUT_M**2), np.float64)
-        error = np.where(inliers, np.abs(matmul(n, shift) - offset), 0.0)
-        if error.max() < LAYOUT_M:
-            break
-        inliers[np.argmax(error)] = False
-    return shift, inliers

@@ -8,7 +8,8 @@ import numpy as np
 
 from trihedron.pipeline.core.linalg import inv, matmul
 from trihedron.pipeline.core.types import DEGRADED, F64, OK, Frame, Pose
-from trihedron.plugins.pose.common import CORRELATED, Alignment, dense_pose
+from trihedron.plugins.pose.dense_alignment import CORRELATED, Alignment
+from trihedron.plugins.pose.dense_pose import dense_pose
 
 LEAST_SIGMA_M = 0.001  # of a point, however well the clouds agree
 

@@ -1,4 +1,4 @@
-"""The iso-surface of a volume that fuses the retained views as they come: TSDF integration, and extraction by surface nets."""
+"""The volume that fuses the retained views as they come, and the mesh of its iso-surface."""
 
 from __future__ import annotations
 
@@ -10,16 +10,17 @@ from trihedron.pipeline.core.linalg import matmul
 from trihedron.pipeline.core.options import NonNegativeFloat, PositiveFloat
 from trihedron.pipeline.core.types import F64, I32, Map, Surface
 from trihedron.plugins.shared.keyframe_views import KeyframeView
-from trihedron.plugins.shared.tsdf_volume import CELLS, Volume
-from trihedron.plugins.surface.common import Gathered, ViewOptions, coloured
-from trihedron.plugins.surface.common_iso_surface_kernels import neighbours, signs_kernel, triangles_kernel, untangled, vertices_kernel
-from trihedron.plugins.surface.common_meshes import with_single_fans, without_crumbs
+from trihedron.plugins.shared.tsdf_volume import Volume
+from trihedron.plugins.surface.colored_mesh import colored_surface
+from trihedron.plugins.surface.half_edges import remove_small_components, split_fans
+from trihedron.plugins.surface.retained_views import RetainedViews, ViewOptions
+from trihedron.plugins.surface.surface_nets import extract_iso_surface
 
 AHEAD_M = 2.0  # a pose has moved by as much as the camera and a point this far before it have
 
 
 @dataclass
-class Fused(Gathered):
+class FusedViews(RetainedViews):
     """The state of a surface with a volume."""
 
     fused: list[F64 | None] = field(default_factory=list)  # the pose each view has in the volume
@@ -41,7 +42,7 @@ class VolumeOptions(ViewOptions):
             raise ValueError(f"truncation_m: {self.truncation_m} is less than two voxels of {self.voxel_m} m")
 
 
-def fuse_view(options: VolumeOptions, state: Fused, view: KeyframeView | None) -> Fused:
+def fuse_view(options: VolumeOptions, state: FusedViews, view: KeyframeView | None) -> FusedViews:
     """Fuse a view that was retained, unless it stands in another world as yet."""
     if view is None:
         return state
@@ -53,24 +54,24 @@ def fuse_view(options: VolumeOptions, state: Fused, view: KeyframeView | None) -
     return state
 
 
-def volume_preview(options: VolumeOptions, state: Fused) -> Surface:
+def volume_preview(options: VolumeOptions, state: FusedViews) -> Surface:
     """The mesh of the views as they were fused, coloured by them, without planes: for viewers."""
     if state.volume is None:
         return Surface.empty(state.index, state.stamp_ns)
-    return coloured(state, None, *_volume_mesh(options, state.volume))
+    return colored_surface(state, None, *_volume_mesh(options, state.volume))
 
 
-def final_mesh(options: VolumeOptions, state: Fused, map: Map | None) -> tuple[F64, I32]:
+def final_mesh(options: VolumeOptions, state: FusedViews, map: Map | None) -> tuple[F64, I32]:
     """Vertices (v, 3) and triangles (t, 3) of the zero level at the final poses, without small fragments."""
     return _volume_mesh(options, final_volume(options, state, map))
 
 
 def _volume_mesh(options: VolumeOptions, volume: Volume) -> tuple[F64, I32]:
     vertices, triangles = extract_iso_surface(volume, 1.0 / options.max_error_m**2)
-    return with_single_fans(vertices, without_crumbs(vertices, triangles, options.crumb_m2))
+    return split_fans(vertices, remove_small_components(vertices, triangles, options.crumb_m2))
 
 
-def final_volume(options: VolumeOptions, state: Fused, map: Map | None) -> Volume:
+def final_volume(options: VolumeOptions, state: FusedViews, map: Map | None) -> Volume:
     """The volume of all views at their final poses."""
     finals = [view.settled(map) for view in state.views]
     if state.volume is not None and all(_moved_m(fused_at, final) <= options.rebuild_m for fused_at, final in zip(state.fused, finals)):
@@ -88,24 +89,3 @@ def _moved_m(fused_at: F64 | None, final: F64 | None) -> float:
         return 0.0 if fused_at is final else float("inf")
     ahead = np.array([[0.0, 0.0, 0.0, 1.0], [0.0, 0.0, AHEAD_M, 1.0]])
     return float(np.linalg.norm(matmul(ahead, (final - fused_at).T)[:, :3], axis=1).max())
-
-
-PASSES = 20  # at most, over all voxels, to untangle signs
-NEAR = 2.0  # voxels from the surface, within which signs can tangle
-
-
-def extract_iso_surface(volume: Volume, least_weight: float) -> tuple[F64, I32]:
-    """Extract the iso-surface at distance 0 by surface nets: vertices (v, 3) in metres and triangles (t, 3), anticlockwise seen from outside, through
-    voxels of at least that weight (1/m²)."""
-    n = volume.count
-    places, distance, weight = volume.places[:n], volume.distance[:n], volume.weight[:n]
-    around = neighbours(volume.keys, volume.numbers, places)
-    signs = np.zeros((n, CELLS), np.int8)
-    signs_kernel(distance, weight, least_weight, signs)
-    distance = distance.copy()
-    for _ in range(PASSES):
-        if not untangled(distance, signs, around, NEAR * volume.voxel_m):
-            break
-    cells = np.full((n, CELLS), -1, np.int32)
-    vertices = vertices_kernel(places, distance, signs, around, cells, volume.voxel_m)
-    return vertices, triangles_kernel(signs, around, cells, vertices)

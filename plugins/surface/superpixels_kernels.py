@@ -1,4 +1,4 @@
-"""Numba kernels of `common_superpixels.py`."""
+"""Kernels of `superpixels.py`: a view cut into superpixels, and the surfel of each."""
 # mypy: disable-error-code="arg-type, assignment, index, return-value"
 
 from __future__ import annotations
@@ -8,9 +8,6 @@ import numpy as np
 from trihedron.pipeline.core.kernel import kernel
 from trihedron.pipeline.core.linalg_kernels import dot, eigh
 from trihedron.pipeline.core.types import F32, F64, I32, U8
-from trihedron.plugins.shared.voxel_hash_kernels import I64, key_of, slot_of
-
-# Views cut into superpixels, and superpixels fused to surfels (after Wang, Gao, Shen, ICRA 2019).
 
 ROUNDS = 3  # of assignment to the nearest centre
 COLOR, INVERSE_DEPTH = 0.03, 12.0  # weight of a grey level, and of 1/m, against a share of the superpixel's side
@@ -18,7 +15,7 @@ COLUMNS = 13  # of a surfel: position, normal, colour, radius, weight, plane, nu
 
 
 @kernel
-def assigned_kernel(depth: F32, gray: F32, labels: U8, mask: U8, side: int) -> I32:
+def assign_kernel(depth: F32, gray: F32, labels: U8, mask: U8, side: int) -> I32:
     """(h, w) number of the superpixel a pixel belongs to, -1 = none: the nearest of the centres about it in place, inverse depth and brightness,
     and of the same region (SLIC, Achanta et al. 2012)."""
     h, w = depth.shape
@@ -117,47 +114,3 @@ def surfels_kernel(depth: F32, color: U8, labels: U8, assigned: I32, intrinsics:
         out[found, 11] = region[k] - 1
         found += 1
     return out[:found].copy()
-
-
-CELL_M = 0.15  # surfels farther apart than this are never one
-
-
-@kernel
-def fuse(surfels: F64, out: F64, keys: I64, heads: I32, after: I32, count: int, cosine: float) -> int:
-    before = count
-    for i in range(len(surfels)):
-        s = surfels[i]
-        best, nearest = 1.0, -1
-        x, y, z = int(np.floor(s[0] / CELL_M)), int(np.floor(s[1] / CELL_M)), int(np.floor(s[2] / CELL_M))
-        for k in range(27):
-            slot = slot_of(keys, key_of(x + k // 9 - 1, y + k // 3 % 3 - 1, z + k % 3 - 1))
-            m = heads[slot] if keys[slot] >= 0 else -1
-            while m >= 0:
-                o = out[m]
-                if m < before and s[3] * o[3] + s[4] * o[4] + s[5] * o[5] > cosine:
-                    d = s[:3] - o[:3]
-                    height = d[0] * o[3] + d[1] * o[4] + d[2] * o[5]
-                    along = np.sqrt(max(dot(d, d) - height * height, 0.0))
-                    limit = 3.0 / np.sqrt(s[10]) + 0.01
-                    far = max(along / (0.7 * min(s[9], o[9])), abs(height) / limit)
-                    if far < best:
-                        best, nearest = far, m
-                m = after[m]
-        if nearest >= 0:
-            o = out[nearest]
-            share = s[10] / (s[10] + o[10])
-            for k in range(9):
-                o[k] += share * (s[k] - o[k])
-            length = np.sqrt(o[3] ** 2 + o[4] ** 2 + o[5] ** 2)
-            o[3:6] /= length
-            o[9] = min(o[9], s[9])
-            o[10] += s[10]
-            o[12] += 1.0
-        else:
-            out[count] = s
-            slot = slot_of(keys, key_of(x, y, z))
-            if keys[slot] < 0:
-                keys[slot], heads[slot] = key_of(x, y, z), -1
-            after[count], heads[slot] = heads[slot], count
-            count += 1
-    return count

@@ -39,7 +39,7 @@ def signs_kernel(distance: F32, weight: F32, least: float, signs: I8) -> None:
 
 
 @kernel
-def untangled(distance: F32, signs: I8, around: I32, near: float) -> int:
+def untangle(distance: F32, signs: I8, around: I32, near: float) -> int:
     """Wherever four in a square have signs like a chessboard's, put the one less far behind before the surface: noise, where that runs along a layer
     of voxels, and four triangles would meet in an edge. Always that way, so it comes to an end. Returns how many were turned."""
     turned = 0

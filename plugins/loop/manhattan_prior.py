@@ -7,19 +7,30 @@ once, at the middle one of its observers, so that a wall off the axes errs once 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from trihedron.pipeline.core.geometry import invert, pose_matrix
+from trihedron.pipeline.core.geometry import invert
 from trihedron.pipeline.core.lie import exp_so3
-from trihedron.pipeline.core.linalg import inv, matmul
+from trihedron.pipeline.core.linalg import matmul
 from trihedron.pipeline.core.types import F64, I32, Correction, Map, Table
-from trihedron.plugins.loop.common_manhattan_prior_kernels import keyframe_rotations
-from trihedron.plugins.loop.common_pose_graph import Edges, correct_keyframes, joined, odometry_edges, solve_pose_graph
-from trihedron.plugins.mapping.covisibility_graph import current_submap, keyframes_of
+from trihedron.plugins.mapping.covisibility_graph import odometry
 from trihedron.plugins.shared.linalg import inverse
-from trihedron.plugins.shared.manhattan_frames_kernels import Walls, area_on_axes, known_walls, measured_directions, perpendicular_pair, settled
 
+if TYPE_CHECKING:  # imported where it is needed: SciPy is slow to load, and most runs close no loop
+    pass
+
+
+from trihedron.pipeline.core.geometry import pose_matrix
+from trihedron.pipeline.core.linalg import inv
+from trihedron.plugins.loop.keyframe_correction import correct_keyframes
+from trihedron.plugins.loop.manhattan_prior_kernels import keyframe_rotations
+from trihedron.plugins.mapping.covisibility_graph import current_submap, keyframes_of
+from trihedron.plugins.shared.manhattan_frames_kernels import Walls, area_on_axes, known_walls, measured_directions, perpendicular_pair, settled
+from trihedron.plugins.shared.pose_graph import Edges, concatenate_edges, solve_pose_graph
+
+LINKS = 3  # further keyframes each is connected to, so that a stretch that was observed often stays stiff
 UNKNOWN = 1e-6  # 1/m², information of the position of a direction: none
 PLAUSIBLE = 3.0  # standard deviations of the drift that the prior may correct; beyond, the directions are those of another wing
 WALLS = 60  # planes, those observed most often, from which the axes are estimated
@@ -97,7 +108,7 @@ def correct_loop(
     place, newest = np.searchsorted(rows, [keyframe, len(map.keyframes) - 1])
     information = np.asarray(inv(covariance), np.float64)[None]
     closing = Edges(np.array([[place, newest]], np.int32), matmul(invert(before[place]), T_world_camera)[None], information)
-    edges = joined(odometry_edges(map, rows, drift, rotation_drift), closing)
+    edges = concatenate_edges(odometry_edges(map, rows, drift, rotation_drift), closing)
     return correct_keyframes(map, rows, before, _solve_with_prior(before, edges, prior))
 
 
@@ -127,4 +138,11 @@ def _solve_with_prior(before: F64, edges: Edges, prior: ManhattanPrior | None) -
     information = np.zeros((count, 6, 6))
     information[:, :3, :3], information[:, 3:, 3:] = UNKNOWN * np.eye(3), prior.information
     pairs = np.stack([np.full(count, count), np.arange(count)], axis=1).astype(np.int32)
-    return solve_pose_graph(np.concatenate([before, axes[None]]), joined(edges, Edges(pairs, measured, information)))[:count]
+    return solve_pose_graph(np.concatenate([before, axes[None]]), concatenate_edges(edges, Edges(pairs, measured, information)))[:count]
+
+
+def odometry_edges(map: Map, rows: I32, drift: float, rotation_drift: float) -> Edges:
+    """Return edges between neighbours in time; their covariance is that of the later keyframe's pose plus the drift along the path: standard
+    deviations per square root of a metre, m and rad."""
+    pairs = np.concatenate([np.stack([np.arange(len(rows) - k), np.arange(k, len(rows))], axis=1) for k in range(1, LINKS + 1)])
+    return Edges(pairs.astype(np.int32), *odometry(map, rows[pairs], drift, rotation_drift, LINKS))
