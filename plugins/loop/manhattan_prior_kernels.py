@@ -1,4 +1,4 @@
-"""Kernel of `common_manhattan_prior.py`: rotations of keyframes from the directions of their landmarks."""
+"""Kernel of `manhattan_prior.py`: rotations of keyframes from the directions of their landmarks."""
 # mypy: disable-error-code="arg-type, assignment, index, return-value"
 
 from __future__ import annotations

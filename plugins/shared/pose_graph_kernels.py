@@ -1,4 +1,4 @@
-"""Kernel of `common_pose_graph.py`: Cholesky factorisation of a sparse matrix within its envelope."""
+"""Kernel of `pose_graph.py`: Cholesky factorisation of a sparse matrix within its envelope."""
 # mypy: disable-error-code="arg-type, assignment, index, return-value"
 
 from __future__ import annotations

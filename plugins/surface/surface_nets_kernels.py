@@ -1,4 +1,4 @@
-"""Kernels of `common_iso_surface.py`: the iso-surface of a volume as triangles, by naive surface nets (Gibson 1998)."""
+"""Kernels of `surface_nets.py`: the iso-surface of a volume as triangles, by naive surface nets (Gibson 1998)."""
 # mypy: disable-error-code="arg-type, assignment, index, return-value"
 
 from __future__ import annotations
