@@ -2,7 +2,7 @@
 
 From each recording every combination of the given plugins, options or wires is computed, side by side: what they have in common is read or computed
 once. Each alternative is a run folder in out=DIR. By default all that follows from a swap is computed again, as a full run would, to the same bytes;
-with feedback=recorded each swapped stage by itself, on what was recorded.
+with feedback=recorded each swapped stage by itself, on what was recorded, and each swap is an alternative by itself.
 
 First the verdicts, a line for each pair of alternatives and figure: both figures, their difference with its 95 % interval, the effect size, and
 "better", "worse" or "no difference shown" with how many seeds more would show one of 5 %. Of one recording the interval is from its frames (blocks of
@@ -44,7 +44,7 @@ from trihedron.tools.ablation_differences import Parting, StageErrors, changed_b
 from trihedron.tools.ablation_errors import Errors, errors_file, of_trajectory, read_errors, write_errors
 from trihedron.tools.ablation_preview import preview
 from trihedron.tools.ablation_statistics import nees_of
-from trihedron.tools.ablation_swaps import Combination, combinations_of, folder_name, parsed, without_repeats
+from trihedron.tools.ablation_swaps import Combination, combinations_of, folder_name, parsed, single_swaps, without_repeats
 from trihedron.tools.ablation_tables import NEES, RESULT, Case, Variant
 from trihedron.tools.arguments import Parser
 from trihedron.tools.fold_measures import of_folds
@@ -165,7 +165,8 @@ def ablate(options: Options) -> list[Case]:
 def _works(options: Options, known: Mapping[str, Any]) -> Iterator[Work]:
     """Compose the alternatives of one recording after the other; `known` has the figures in out=DIR by key."""
     recordings = [Recording(path) for path in options.recordings]
-    combinations = combinations_of(without_repeats(parsed(options.swaps), recordings))
+    swaps = without_repeats(parsed(options.swaps), recordings)
+    combinations = single_swaps(swaps) if options.feedback is Feedback.recorded else combinations_of(swaps)
     for recording, prefix in zip(recordings, _prefixes(options.recordings)):
         alternatives = alternatives_of(recording, [combination.words for combination in combinations])
         computing = Alternatives(recording, alternatives, options.feedback, options.threads)

@@ -128,6 +128,11 @@ def combinations_of(swaps: Sequence[Swap]) -> list[Combination]:
     return [Combination(tuple((stage, level) for stage, level in levels if level)) for levels in chosen]
 
 
+def single_swaps(swaps: Sequence[Swap]) -> list[Combination]:
+    """Return what is recorded, then each level of each swap by itself: enough where no stage sees what another one computes."""
+    return [Combination(()), *(Combination(((swap.stage, level),)) for swap in swaps for level in swap.levels if level)]
+
+
 def folder_name(prefix: str, combination: Combination) -> str:
     """Return the name of an alternative's folder: its words, with what file systems and shells take badly replaced."""
     text = ",".join([*([prefix] if prefix else []), *(combination.words or ("as_recorded",))])

@@ -93,9 +93,14 @@ class Section:
 
 
 def verdicts(cases: Sequence[Case]) -> list[Verdict]:
-    """Return the verdict of each pair of alternatives, the earlier one first, in each figure."""
-    samples = {label: [_sample(case, variant) for case, variant in found] for label, found in by_change(cases).items()}
-    pairs = {(first, second): list(zip(samples[first], samples[second])) for first, second in combinations(samples, 2)}
+    """Return the verdict of each pair of alternatives, the earlier one first, in each figure; in the open loop of those that differ in one stage."""
+    groups = by_change(cases)
+    samples = {label: [_sample(case, variant) for case, variant in found] for label, found in groups.items()}
+    stages = {label: found[0][1].combination.stages for label, found in groups.items()}
+    compared = list(combinations(samples, 2))
+    if cases[0].feedback == Feedback.recorded.name:
+        compared = [(first, second) for first, second in compared if len(stages[first] | stages[second]) == 1]
+    pairs = {(first, second): list(zip(samples[first], samples[second])) for first, second in compared}
     return verdicts_of(pairs, {name: column for name, column in FIGURES.items() if name != NEES})  # of which neither more nor less is better
 
 

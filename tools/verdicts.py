@@ -85,14 +85,15 @@ class Verdict:
 
 def verdicts_of(comparisons: Mapping[tuple[str, str], Pairs], columns: Mapping[str, Column]) -> list[Verdict]:
     """Return the verdicts of each pair of alternatives (first, second) in each column that both have, in this order. Of one recording there are none
-    in a figure that is not of frames."""
+    in a figure that is not of frames. Pairs that are equal by construction do not count for the correction."""
     differences = [_difference(names, column, pairs) for names, pairs in comparisons.items() for column in columns]
     found = [one for one in differences if one is not None and (one.recordings > 1 or columns[one.figure].of_frames)]
     corrected: dict[int, tuple[float, int]] = {}
     for column in columns:
-        tested = [(number, one.p) for number, one in enumerate(found) if one.figure == column and one.p is not None]
+        open_ones = [(number, one) for number, one in enumerate(found) if one.figure == column and (one.error or one.difference)]
+        tested = [(number, one.p) for number, one in open_ones if one.p is not None]
         corrected |= {number: (p, len(tested)) for (number, _), p in zip(tested, holm([p for _, p in tested]))}
-    return [_answered(one, columns[one.figure], *corrected.get(number, (None, 1))) for number, one in enumerate(found)]
+    return [_answered(one, columns[one.figure], *corrected.get(number, (one.p, 1))) for number, one in enumerate(found)]
 
 
 def _difference(names: tuple[str, str], column: str, pairs: Pairs) -> Verdict | None:

@@ -5,6 +5,7 @@ import os
 import re
 import sys
 from dataclasses import replace
+from itertools import combinations
 from pathlib import Path
 
 import html5lib
@@ -18,7 +19,7 @@ from trihedron.pipeline.core.types import Translation
 from trihedron.pipeline.record.reader import Recording
 from trihedron.tools.ablation_differences import Parting, StageErrors, changed_by_code, distance
 from trihedron.tools.ablation_errors import read_errors, write_errors
-from trihedron.tools.ablation_swaps import combinations_of, folder_name, parsed
+from trihedron.tools.ablation_swaps import combinations_of, folder_name, parsed, single_swaps
 from trihedron.tools.ablation_tables import (
     Case,
     Variant,
@@ -89,6 +90,21 @@ def test_every_pair_of_alternatives_has_a_verdict():
     assert answers["as recorded", "manhattan=other"] == "worse" and answers["rotation=other", "manhattan=other"] == "worse"
     assert answers["as recorded", "rotation=other"].startswith("no difference shown; ")
     assert {one.answer for one in found if one.figure == "ms"} == {"equal"}
+
+
+def test_in_the_open_loop_each_swap_is_by_itself_and_compared_within_its_stage():
+    single = single_swaps(parsed(["planes=a", "manhattan=b,c"]))
+    assert [one.label for one in single] == ["as recorded", "planes=a", "manhattan=b", "manhattan=c"]
+    noise = np.random.default_rng(0).normal(0.0, 0.2, 6)
+    cases = []
+    for k, some in enumerate(noise):
+        variants = [Variant(one, one.label, {"axes deg": axes}, 1.0, 1.1) for one, axes in zip(single, [1.0, 1.0, 3.0 + some, 1.0 - some])]
+        cases.append(Case(f"{k}/run.mcap", 10, ["planes", "manhattan"], [], np.nan, 4.4, variants, feedback="recorded"))
+    found = {(one.first, one.second): one for one in verdicts(cases)}
+    assert list(found) == [(single[0].label, "planes=a"), *combinations(["as recorded", "manhattan=b", "manhattan=c"], 2)]
+    assert found["as recorded", "planes=a"].answer == "equal" and found["as recorded", "manhattan=b"].answer == "worse"
+    least = min(found.values(), key=lambda one: one.p)
+    assert least.corrected == pytest.approx(3 * least.p)  # the pair that is equal by construction does not count
 
 
 def test_verdicts_are_first_in_text_and_markdown():
@@ -362,22 +378,18 @@ def test_a_dry_run_says_what_is_computed_read_and_shared_and_writes_nothing(tmp_
     assert main(["ablate", *words, "--dry-run"]) == 0
     said = capsys.readouterr().out.splitlines()
     assert list(tmp_path.iterdir()) == [before.parent] and before.stat().st_size == 0
-    assert said[0] == f"{source}: 4 alternatives, 5 frames" and said[-1] == "32 stages, 10 of them different, which are computed"
+    assert said[0] == f"{source}: 3 alternatives, 5 frames" and said[-1] == "24 stages, 10 of them different, which are computed"
     assert said[1:8] == [
         "1  as recorded: to run",
         "   computes again: rotation, translation",
         "   computes once, not recorded: normals, lines, segments, planes, manhattan, tracks",
         "   reads: dataset, frames, keypoints, rotation, pose, map",
-        "   read for 2, 3, 4 too: dataset, frames, keypoints, rotation, pose, map",
-        "   computed for 2, 3, 4 too: normals, lines, segments, planes, manhattan, tracks",
-        "   computed for 2 too: rotation",
+        "   read for 2, 3 too: dataset, frames, keypoints, rotation, pose, map",
+        "   computed for 2, 3 too: normals, lines, segments, planes, manhattan, tracks",
+        "   computed for 3 too: rotation",
     ]
-    assert [line for line in said if line[0].isdigit()][1:4] == [
-        "2  translation=irls: to run",
-        "3  rotation=procrustes: to run again",
-        "4  rotation=procrustes translation=irls: to run",
-    ]
-    assert said[-2] == "   computed for 2 too: translation"
+    assert [line for line in said if line[0].isdigit()][1:3] == ["2  rotation=procrustes: to run again", "3  translation=irls: to run"]
+    assert said[-2] == "   computed for 1 too: rotation"
 
 
 def test_a_recording_ablates_itself_from_python(tmp_path):
@@ -385,12 +397,7 @@ def test_a_recording_ablates_itself_from_python(tmp_path):
 
     source = Path(__file__).parents[1] / "fuzz" / "seeds" / "own.mcap"
     found = th.Recording(source).ablate("lines=opencv_lsd", out=tmp_path, feedback="recorded", keypoints__features=200)
-    assert list(found.folders) == [
-        "as recorded",
-        "keypoints.features=200",
-        "lines=opencv_lsd",
-        "lines=opencv_lsd keypoints.features=200",
-    ]
+    assert list(found.folders) == ["as recorded", "lines=opencv_lsd", "keypoints.features=200"]
     assert all((folder / "run.mcap").is_file() for (folder,) in found.folders.values())
     assert str(found) == str(th.ablate(source, "lines=opencv_lsd", "keypoints.features=200", out=tmp_path, feedback="recorded"))
 
