@@ -124,7 +124,7 @@ def test_lines_by_segments_and_by_a_distance_field(tmp_path):
     assert len(near.endpoints_px) <= 1
     rows = np.abs(np.arange(224)[:, None] - 100.0) * np.ones((1, 320))
     path = answering(tmp_path / "field.onnx", 1, df=rows[None])
-    traced = OnnxLines(model=str(path), output=LineOutput.distance_field)._traced(rows.astype(np.float32))
+    traced = OnnxLines(model=str(path), output=LineOutput.distance_field)._trace(rows.astype(np.float32))
     assert len(traced) == 1 and np.allclose(traced[0, [1, 3]], 100.0, atol=1.0) and abs(traced[0, 0] - traced[0, 2]) > 250.0
     assert OnnxLines(model=str(path), output=LineOutput.distance_field)(FRAME).descriptors.shape[1] == 32
 
