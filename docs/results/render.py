@@ -137,11 +137,11 @@ def methods() -> str:
 
 
 def libraries() -> str:
-    """The default graph and that of libraries alone on each sequence: ATE in mm."""
+    """The default graph and that of libraries alone, on each sequence that both have tracked: ATE in mm."""
     found = read("methods")
     changes = ("default", "graph=libraries")
     cells = {(row["change"], row["sequence"]): cell_of(row) for row in found["runs"] if row["change"] in changes}
-    places = _ordered(place for _, place in cells)
+    places = _ordered(place for change, place in cells if change != "default")
     lines = [(f"`{change}`", *(cells.get((change, place), "") for place in places)) for change in changes]
     return f"{markdown(['graph', *places], lines)}\n\n*{source_line(found)}*\n"
 

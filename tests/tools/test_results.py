@@ -13,7 +13,7 @@ from trihedron.pipeline.core.errors import DataError
 ROOT = Path(__file__).parents[2]
 RESULTS = ROOT / "docs" / "results"
 AGAIN = "write it again: python docs/results/render.py"
-OLDER = {"methods.json": "takes hours; its note says what has changed since"}  # files of other commits than sequences.json, and why
+OLDER = {"methods.json": "takes an hour; its note says under which conditions"}  # files of other commits than sequences.json, and why
 UNITS = r"(?:mm|cm|deg|°|ms|frames/s|MB)"
 NUMBER = re.compile(rf"\d\s?{UNITS}(?![\w/])|NEES\D{{0,40}}\d")
 COLUMN = re.compile(r"\b(?:ATE|RPE|NEES|mm|deg|ms|MB)\b|frames/s|°")
