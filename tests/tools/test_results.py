@@ -18,7 +18,7 @@ UNITS = r"(?:mm|cm|deg|°|ms|frames/s|MB)"
 NUMBER = re.compile(rf"\d\s?{UNITS}(?![\w/])|NEES\D{{0,40}}\d")
 COLUMN = re.compile(r"\b(?:ATE|RPE|NEES|mm|deg|ms|MB)\b|frames/s|°")
 CONSTANTS = re.compile(r"\b(?:5\.35|2\.37|12\.6)\b")  # of χ²
-DATED = re.compile(r"Measured on commit `[0-9a-f]{7,12}` \(\d{4}-\d\d-\d\d\) with `trihedron [^`]+`")
+DATED = re.compile(r"Measured on commit `[0-9a-f]{7,12}` \(\d{4}-\d\d-\d\d\) with `(?:trihedron|make results) [^`]+`")
 HIDDEN = re.compile(r"<!-- results: \w+ -->.*?<!-- end of results -->|^```.*?^```|`[^`\n]*`", re.MULTILINE | re.DOTALL)  # blocks and code
 JUDGED = [ROOT / "README.md", *(ROOT / "docs" / "explanation" / f"{name}.md" for name in ("results", "systems", "performance"))]
 
