@@ -213,7 +213,7 @@ def test_unreadable_frames_are_skipped_and_summarised(capsys, tmp_path):
 def test_a_sweep_goes_on_after_a_job_that_fails(capsys, tmp_path):
     words = ["run", "-m", *SMALL, "dataset.frames=0:3,9:3,0:4", "out=sweep"]
     assert main(words) == 1
-    assert "trihedron: dataset.frames: '9:3' is not a range" in capsys.readouterr().err
+    assert "trihedron: job 1: dataset.frames: '9:3' is not a range" in capsys.readouterr().err
     lengths = [json.loads((tmp_path / "sweep" / job / "timing.json").read_text())["frames"] for job in ("0", "2")]
     assert lengths == [3, 4]
 
