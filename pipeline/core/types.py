@@ -192,6 +192,13 @@ class ManhattanFrame(Value):
     supported: bool
     gap: float = float("nan")
 
+    @staticmethod
+    def single(seen: Value, R: F64, covariance: F64, inliers: I32, spread: F64, supported: bool, gap: float = float("nan")) -> ManhattanFrame:
+        """Return one Manhattan frame with the id 0, of the time of the value that it was seen in: rotation and covariance (3, 3), inliers and spread
+        (3,)."""
+        ids = np.zeros(1, np.int32)
+        return ManhattanFrame(seen.index, seen.stamp_ns, R[None], ids, covariance[None], inliers[None], spread[None], supported, gap)
+
 
 @dataclass(frozen=True)
 class Tracks(Value):

@@ -53,16 +53,7 @@ class LinePlaneRansac:
         axes = assign_axes(features.vectors, R, reach)
         axes[(axes >= 0) & ~seen[axes]] = -1
         inliers, spread = inliers_and_spread(square_angles(features.vectors, axes, R), axes, features.share)
-        return ManhattanFrame(
-            index=normals.index,
-            stamp_ns=normals.stamp_ns,
-            rotations=R[None],
-            ids=np.zeros(1, np.int32),
-            covariance=covariance[None],
-            inliers=inliers[None],
-            spread=spread[None],
-            supported=supported,
-        )
+        return ManhattanFrame.single(normals, R, covariance, inliers, spread, supported)
 
     def _consensus(self, features: Features, normals: Normals, start: F64, loyal: bool, rng: np.random.Generator) -> tuple[F64, Bool, bool]:
         """The frame with most on its axes, named as is nearest to `start`, the axes (3,) that are seen and whether that is enough. Without a frame

@@ -189,14 +189,4 @@ def fit_modes(options: ModeOptions, modes: Modes, segments: Segments, planes: Pl
 def one_frame(modes: Modes, R: F64, covariance: F64, normals: Normals, gap: float = float("nan")) -> ManhattanFrame:
     """Convert the rotation R (3, 3) of three modes to the slot's value, with id 0."""
     counts = (modes.normals[:, 0] + modes.lines[:, 0]).astype(np.int32)
-    return ManhattanFrame(
-        index=normals.index,
-        stamp_ns=normals.stamp_ns,
-        rotations=R[None],
-        ids=np.zeros(1, np.int32),
-        covariance=covariance[None],
-        inliers=counts[None],
-        spread=mode_spread(modes)[None],
-        supported=modes.supported,
-        gap=gap,
-    )
+    return ManhattanFrame.single(normals, R, covariance, counts, mode_spread(modes), modes.supported, gap)

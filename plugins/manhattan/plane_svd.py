@@ -62,16 +62,7 @@ class PlaneSvd:
         scale = variance_scale(float(matmul(weights, square)), 2.0 * np.count_nonzero(axes >= 0) - 3.0)
         covariance = procrustes_covariance(walls.spatial, weights, axes, R, PRIOR, scale) + np.eye(3) * np.radians(self.floor_deg) ** 2
         inliers, spread = inliers_and_spread(square, axes, walls.area)
-        return ManhattanFrame(
-            index=planes.index,
-            stamp_ns=planes.stamp_ns,
-            rotations=R[None],
-            ids=np.zeros(1, np.int32),
-            covariance=covariance[None],
-            inliers=inliers[None],
-            spread=spread[None],
-            supported=supported,
-        )
+        return ManhattanFrame.single(planes, R, covariance, inliers, spread, supported)
 
     def _perpendicular(self, walls: Walls, enough: float, start: F64, loyal: bool) -> tuple[F64, bool]:
         """The rotation through the best pair of walls, named as is nearest to `start`, and whether enough of the scene stands on its axes."""

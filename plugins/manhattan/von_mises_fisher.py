@@ -60,16 +60,8 @@ class VonMisesFisher:
         R, covariance = self._rotation(mixture, modes, R)
         weight = np.where(self._strength(mixture) > 0.0, mixture.weight, 0.0)
         spread = (weight * 2.0 / mixture.concentration).sum(axis=0) / np.maximum(weight.sum(axis=0), 1e-9)
-        return ManhattanFrame(
-            index=normals.index,
-            stamp_ns=normals.stamp_ns,
-            rotations=R[None],
-            ids=np.zeros(1, np.int32),
-            covariance=covariance[None],
-            inliers=np.round(mixture.number.sum(axis=0)).astype(np.int32)[None],
-            spread=np.where(modes.seen, np.sqrt(spread), np.nan)[None],
-            supported=modes.supported,
-        )
+        inliers = np.round(mixture.number.sum(axis=0)).astype(np.int32)
+        return ManhattanFrame.single(normals, R, covariance, inliers, np.where(modes.seen, np.sqrt(spread), np.nan), modes.supported)
 
     def _fit(self, directions: Directions, previous: ManhattanFrame | None, index: int) -> tuple[F64, AxisMixture, Modes]:
         """Fit from the previous axes; from everywhere when there are none, they are old or nothing supports them. See `_fit_from`."""
