@@ -122,15 +122,20 @@ def _distinct(swaps: Sequence[Swap], recording: Recording) -> list[Swap]:
 
 def combinations_of(swaps: Sequence[Swap]) -> list[Combination]:
     """Return every combination of levels, that of none changed first. Raises UsageError for too many."""
-    chosen = list(itertools.product(*([(swap.stage, level) for level in swap.levels] for swap in swaps)))
-    if len(chosen) > MOST:
-        raise UsageError("ablate", f"these values make {len(chosen)} alternatives, more than {MOST}", "give fewer values at once")
-    return [Combination(tuple((stage, level) for stage, level in levels if level)) for levels in chosen]
+    chosen = itertools.product(*([(swap.stage, level) for level in swap.levels] for swap in swaps))
+    return _bounded([Combination(tuple((stage, level) for stage, level in levels if level)) for levels in chosen])
 
 
 def single_swaps(swaps: Sequence[Swap]) -> list[Combination]:
-    """Return what is recorded, then each level of each swap by itself: enough where no stage sees what another one computes."""
-    return [Combination(()), *(Combination(((swap.stage, level),)) for swap in swaps for level in swap.levels if level)]
+    """Return what is recorded, then each level of each swap by itself: enough where no stage sees what another one computes. Raises UsageError for
+    too many."""
+    return _bounded([Combination(()), *(Combination(((swap.stage, level),)) for swap in swaps for level in swap.levels if level)])
+
+
+def _bounded(found: list[Combination]) -> list[Combination]:
+    if len(found) > MOST:
+        raise UsageError("ablate", f"these values make {len(found)} alternatives, more than {MOST}", "give fewer values at once")
+    return found
 
 
 def folder_name(prefix: str, combination: Combination) -> str:

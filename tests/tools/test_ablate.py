@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from trihedron.pipeline.app.cli import main
-from trihedron.pipeline.core.errors import DataError
+from trihedron.pipeline.core.errors import DataError, UsageError
 from trihedron.pipeline.core.slots import SLOTS
 from trihedron.pipeline.core.types import Translation
 from trihedron.pipeline.record.reader import Recording
@@ -103,6 +103,8 @@ def test_in_the_open_loop_each_swap_is_by_itself_and_compared_within_its_stage()
     found = {(one.first, one.second): one for one in verdicts(cases)}
     assert list(found) == [(single[0].label, "planes=a"), *combinations(["as recorded", "manhattan=b", "manhattan=c"], 2)]
     assert found["as recorded", "planes=a"].answer == "equal" and found["as recorded", "manhattan=b"].answer == "worse"
+    with pytest.raises(UsageError, match="these values make 65 alternatives, more than 64; give fewer values at once"):
+        single_swaps(parsed([f"planes.angle_deg={','.join(map(str, range(64)))}"]))
     least = min(found.values(), key=lambda one: one.p)
     assert least.corrected == pytest.approx(3 * least.p)  # the pair that is equal by construction does not count
 
