@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from trihedron.pipeline.core.errors import DataError
-from trihedron.pipeline.core.files import sha256_of
+from trihedron.pipeline.core.files import file_sha256
 from trihedron.tools.evaluate_surface import FIGURES, SURFACE, evaluate_files
 
 BUILDING = {  # column -> key of the figures, the value where it is perfect, factor
@@ -32,9 +32,9 @@ def of_folds(stages: Iterable[str], runs: Sequence[Path], source: Path) -> list[
         for run, measures in zip(runs, found):
             try:
                 if stage == "surface" and (run / SURFACE).exists():
-                    digest = sha256_of(str(run / SURFACE))
+                    digest = file_sha256(run / SURFACE)
                     judged[digest] = figures = judged[digest] if digest in judged else evaluate_files(run / SURFACE, source)
-                    measures |= of_surface_figures(_kept(run, figures))
+                    measures |= of_surface_figures(_write_figures(run, figures))
                 elif stage == "building":
                     measures |= of_building(run, source.parent)
             except DataError as error:
@@ -44,11 +44,11 @@ def of_folds(stages: Iterable[str], runs: Sequence[Path], source: Path) -> list[
 
 def judge_surface(run: Path, recording: Path) -> dict[str, Any]:
     """Judge the surface of a run folder by the truth of a recording's data set, and write surface.json. Raises DataError."""
-    return _kept(run, evaluate_files(run / SURFACE, recording))
+    return _write_figures(run, evaluate_files(run / SURFACE, recording))
 
 
-def _kept(run: Path, figures: dict[str, Any]) -> dict[str, Any]:
-    """Write the figures of a run's surface to surface.json."""
+def _write_figures(run: Path, figures: dict[str, Any]) -> dict[str, Any]:
+    """Write the figures of a run's surface to surface.json, and return them."""
     (run / FIGURES).write_text(json.dumps(figures, indent=2) + "\n")
     return figures
 

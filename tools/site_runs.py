@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 import shlex
 from dataclasses import dataclass
@@ -13,7 +12,7 @@ from typing import Any
 import yaml
 
 from trihedron.pipeline.core.errors import DataError, RecordingError, TrihedronError
-from trihedron.pipeline.core.files import MAX_YAML_BYTES, YamlError, parse_yaml, read_text
+from trihedron.pipeline.core.files import MAX_YAML_BYTES, YamlError, file_sha256, parse_yaml, read_text
 from trihedron.pipeline.core.types import Pose, Trajectory
 from trihedron.pipeline.record.reader import Recording
 from trihedron.pipeline.record.trajectories import attached_truth, read_trajectory
@@ -93,7 +92,7 @@ def run_page(facts: RunFacts, title: str, other_commit: bool, pictures: bool) ->
         commit=facts.commit,
         summary=_summary(facts),
         command=facts.command,
-        checksums=[(name, sha256(folder / name)) for name in (TRAJECTORY, SURFACE, RECORDING) if (folder / name).is_file()],
+        checksums=[(name, file_sha256(folder / name)) for name in (TRAJECTORY, SURFACE, RECORDING) if (folder / name).is_file()],
         view=view,
         figures=[figure for figure in figures if figure is not None],
         pictures=_pictures(folder) if pictures and poses else [],
@@ -145,15 +144,6 @@ def _pictures(folder: Path) -> list[dict[str, Any]]:
             return []
         picture = embedded(file, "The middle frame with planes, 3D lines, key points and Manhattan axes; the map from above")
     return [picture] if picture else []
-
-
-def sha256(path: Path) -> str:
-    """Return the SHA-256 of a file, in hexadecimal digits."""
-    with open(path, "rb") as file:
-        found = hashlib.sha256()
-        while chunk := file.read(1 << 20):
-            found.update(chunk)
-    return found.hexdigest()
 
 
 def read_json(path: Path) -> dict[str, Any]:

@@ -46,6 +46,15 @@ def read_file(path: Path, limit: int) -> bytes:
     return data
 
 
+def file_sha256(path: Path) -> str:
+    """Return the SHA-256 of a file of any size, in hexadecimal digits. Raises OSError."""
+    with open(path, "rb") as file:
+        found = hashlib.sha256()
+        while chunk := file.read(1 << 20):
+            found.update(chunk)
+    return found.hexdigest()
+
+
 def sha256_of(path: str) -> str:
     """Return the SHA-256 of a file, in hexadecimal digits; nothing for one that cannot be read."""
     with suppress(OSError, RuntimeError):
