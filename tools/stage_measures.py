@@ -34,7 +34,6 @@ from trihedron.pipeline.core.types import (
     Translation,
     Value,
 )
-from trihedron.pipeline.run.replay import RECORDED
 
 NEAR_PX = 2.0  # of where a feature must be, to be found again
 WRONG_PX = 3.0  # from where a pair's landmark is: a wrong one
@@ -60,9 +59,8 @@ class Seen:
     T_world_camera: F64
 
     def get(self, topic: str) -> Any:
-        """Return the value of a topic, computed or recorded; None where there is none."""
-        value = self.values.get(topic)
-        return value if value is not None else self.values.get(RECORDED + topic)
+        """Return the value of a topic; None where there is none."""
+        return self.values.get(topic)
 
     @property
     def camera(self) -> Camera | None:

@@ -90,8 +90,8 @@ def verdicts_of(comparisons: Mapping[tuple[str, str], Pairs], columns: Mapping[s
     found = [one for one in differences if one is not None and (one.recordings > 1 or columns[one.figure].of_frames)]
     corrected: dict[int, tuple[float, int]] = {}
     for column in columns:
-        open_ones = [(number, one) for number, one in enumerate(found) if one.figure == column and (one.error or one.difference)]
-        tested = [(number, one.p) for number, one in open_ones if one.p is not None]
+        unequal = {number: one for number, one in enumerate(found) if one.figure == column and (one.error or one.difference)}
+        tested = [(number, one.p) for number, one in unequal.items() if one.p is not None]
         corrected |= {number: (p, len(tested)) for (number, _), p in zip(tested, holm([p for _, p in tested]))}
     return [_answered(one, columns[one.figure], *corrected.get(number, (one.p, 1))) for number, one in enumerate(found)]
 

@@ -87,16 +87,10 @@ def swapped_stages(graphs: Sequence[Graph]) -> frozenset[str]:
 
 def with_one_dataset(graphs: Sequence[Graph]) -> list[Graph]:
     """Return the graphs with one reader for all equal data sets, which is opened, and warns, once."""
-    known: list[Stage] = []
-    shared = [{name: _known(known, stage) if name == DATASET else stage for name, stage in graph.stages.items()} for graph in graphs]
-    return [replace(graph, stages=stages) for graph, stages in zip(graphs, shared)]
-
-
-def _known(known: list[Stage], stage: Stage) -> Stage:
-    """Return the known stage that has an equal plugin, else this one, which is known from now on."""
-    if (found := next((other for other in known if _same(other.plugin, stage.plugin)), None)) is None:
-        known.append(stage)
-    return found or stage
+    known: list[tuple[str, Vertex]] = []
+    readers = [graph.stages[DATASET] for graph in graphs]
+    numbers = [_numbered(known, DATASET, Vertex(reader.plugin, reader.inputs)) for reader in readers]
+    return [replace(graph, stages={**graph.stages, DATASET: readers[numbers.index(number)]}) for graph, number in zip(graphs, numbers)]
 
 
 def _unequal(graphs: Sequence[Graph], classes: Sequence[Mapping[str, int]]) -> frozenset[str]:
