@@ -106,7 +106,8 @@ class StageErrors:
     _map: Any = None  # before this frame
 
     def take(self, topic: str, values: Mapping[str, Any]) -> None:
-        """Add a frame: the value of the stage, and what it saw, which is what was recorded, where it was, whatever other stages compute."""
+        """Add the value of the stage in the next frame, measured beside its inputs there: recorded values, and computed ones where none is recorded.
+        Values that other swapped stages compute are not its inputs."""
         value, now = values.get(topic), None
         self.seen, self.present = self.seen + 1, self.present + isinstance(value, Value)
         if isinstance(value, Value) and (T := self.truth.get(value.stamp_ns)) is not None:

@@ -32,7 +32,7 @@ SWEEPER, SEARCH, DASK = (f"hydra_plugins.trihedron.{name}" for name in ("Sweeper
 
 
 class Feedback(Enum):
-    """Values of recomputed stages that the others of them, and they themselves later, read in a replay: the new ones, or those of the recording."""
+    """Inputs of recomputed stages in a replay, where these come from recomputed stages too: the new values, or the recorded ones."""
 
     new = "new"
     recorded = "recorded"

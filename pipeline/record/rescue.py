@@ -43,8 +43,7 @@ class Rescued:
 
 def recover(path: Path, out: Path, being_written: bool = False) -> Rescued:
     """Write the whole records of the file `path` to `out`, which may be the same; of a file that is being written those so far, if that is allowed.
-    Raises
-    RecordingError for a file that is missing, in use or no MCAP, DataError where nothing can be written."""
+    Raises RecordingError for a file that is missing, in use or no MCAP, DataError where nothing can be written."""
     partial = out.with_name(out.name + ".part")
     try:
         source = open_file(path)

@@ -30,8 +30,8 @@ TOPICS = "topics"  # metadata of a recording: the stages whose values it holds, 
 
 @dataclass(frozen=True)
 class Replay:
-    """A recording to read from, the stages to compute again, and whether these see the recording alone: not what others of them, or they themselves
-    a frame before, compute now. What the recording lacks they see as computed."""
+    """A recording to read from, and the stages to compute again. With `recorded_feedback` their inputs are the recorded values, also those from other
+    stages that are computed again and from their own earlier frames; only topics that the recording lacks are read as computed."""
 
     recording: Recording
     only: tuple[str, ...]

@@ -18,6 +18,7 @@ FLAT_M2 = 1e-9  # a triangle with less area has none
 def collapse_all(
     vertices: F64, triangles: I32, labels: I32, normals: F64, border: Bool, free: Bool, beside: I32, order: I32, alive: Bool
 ) -> None:  # fmt: skip
+    """Collapse half-edges in place, in the given order of vertices, as `decimation.py` allows it; `alive` (t,) are the triangles that remain."""
     n = len(vertices)
     head, tail, after = np.full(n, -1, np.int32), np.full(n, -1, np.int32), np.full(3 * len(triangles), -1, np.int32)
     for c in range(3 * len(triangles)):

@@ -101,6 +101,7 @@ def triangle_normals(vertices: F64, triangles: I32) -> F64:
 
 @kernel
 def sum_at_vertices(normals: F64, triangles: I32, total: F64) -> None:
+    """Add the normals (t, 3) of triangles to `total` (v, 3) at each of their vertices."""
     for t in range(len(triangles)):
         for k in range(3):
             for axis in range(3):

@@ -12,6 +12,7 @@ from trihedron.pipeline.core.types import F64, I32, Bool
 
 @kernel
 def simplify_borders(vertices: F64, begin: I32, end: I32, kinds: I32, fixed: Bool, tolerance: float) -> tuple[Bool, I32]:
+    """Simplify chains of border edges (Douglas and Peucker, 1973); returns the vertices (v,) kept and the neighbours (v, 2) of the others."""
     n = len(vertices)
     degree, kind, beside = np.zeros(n, np.int32), np.zeros(n, np.int64), np.full((n, 2), -1, np.int32)
     junction = fixed.copy()

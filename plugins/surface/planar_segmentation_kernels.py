@@ -174,6 +174,7 @@ def enclosing_planes(parts: I32, count: int, labels: I32, opposite: I32) -> I32:
 
 @kernel
 def curvature_kernel(parts: I32, count: int, labels: I32, middle: F64, area: F64, frames: F64) -> F64:
+    """Return the larger principal curvature (1/m) of each part (count,), by a quadric over the plane of its frame (3, 3)."""
     centre, total = np.zeros((count, 3)), np.zeros(count)
     for t in range(len(parts)):
         if labels[t] >= 0:

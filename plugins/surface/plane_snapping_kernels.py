@@ -45,6 +45,7 @@ def planes_about(count: int, triangles: I32, labels: I32) -> tuple[I32, I32]:
 
 @kernel
 def snap_kernel(vertices: F64, rows: I32, starts: I32, planes: F64, farthest: float) -> F64:
+    """Move vertices (v, 3) onto all of their planes, or onto the nearest one where that is farther than `farthest`; those without a plane stay."""
     out = vertices.copy()
     for v in range(len(vertices)):
         a, b = starts[v], starts[v + 1]

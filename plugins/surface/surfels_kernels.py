@@ -15,6 +15,7 @@ CELL_M = 0.15  # surfels farther apart than this are never one
 
 @kernel
 def fuse_kernel(surfels: F64, out: F64, keys: I64, heads: I32, after: I32, count: int, cosine: float) -> int:
+    """Fuse surfels (n, 13) into the first `count` rows of `out`, found by their cells, or append them; returns the new count."""
     before = count
     for i in range(len(surfels)):
         s = surfels[i]
