@@ -7,6 +7,7 @@ version never reads; a column whose rows change is copied. A version is never wr
 from __future__ import annotations
 
 import math
+import mmap
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -18,6 +19,7 @@ from numpy.typing import NDArray
 Array = NDArray[Any]
 CHUNK = 256  # rows whose memory is freed together
 GROWTH = 1.5
+PAGED = 32_768  # bytes of a column from which on its pages come from the system
 
 
 @dataclass(frozen=True)
@@ -42,6 +44,13 @@ class Column:
     def rounded(self, values: Array) -> Array:
         """Round values to the nearest multiples of the step, in this type."""
         return np.asarray(np.rint(values / self.step) * self.step if self.step else values, self.element)
+
+
+def _zeros(shape: tuple[int, ...], element: np.dtype[Any]) -> Array:
+    """Make an array of zeros whose pages take memory when they are written to. `np.zeros` does so for large arrays alone: smaller ones reuse memory
+    that the process returned, which is there already and has to be cleared."""
+    size = element.itemsize * math.prod(shape)
+    return np.zeros(shape, element) if size < PAGED else np.frombuffer(mmap.mmap(-1, size, access=mmap.ACCESS_COPY), element).reshape(shape)
 
 
 class _Buffer:
@@ -156,7 +165,7 @@ class Table:
     def _copied(self, name: str, capacity: int, freed: frozenset[int]) -> _Buffer:
         """Copy a column into memory of its own, but for the chunks that are freed: zeros that nobody wrote take no memory."""
         column, known = self.schema[name], self._buffers[name].rows
-        rows = np.zeros((capacity, *column.shape), column.element) if freed else np.empty((capacity, *column.shape), column.element)
+        rows = _zeros((capacity, *column.shape), column.element)
         live = np.zeros(-(-self.size // CHUNK) + 2, np.bool_)  # one more before and behind
         live[1:-1] = True
         live[1 + np.fromiter(freed, np.intp, len(freed))] = False

@@ -1,5 +1,8 @@
 """Tables share chunks between versions, and equal a plain array."""
 
+import mmap
+from pathlib import Path
+
 import numpy as np
 import pytest
 
@@ -128,3 +131,21 @@ def test_freed_chunks_hold_zeros():
     kept = before.keeping(np.array([[CHUNK - 1, CHUNK + 1], [5, 5]]))  # the last chunk is not full
     assert [kept.is_empty(number) for number in range(4)] == [False, False, True, False]
     assert [before.keeping(np.empty((0, 2), int)).is_empty(number) for number in range(4)] == [True, True, True, False]
+
+
+@pytest.mark.skipif(not Path("/proc/self/statm").exists(), reason="resident memory is read from /proc")
+def test_freed_chunks_take_no_memory():
+    """Columns of 98 kB, as those of a room: the process has returned as many, and its heap would give them again, cleared."""
+
+    def resident():
+        return int(Path("/proc/self/statm").read_text().split()[1]) * mmap.PAGESIZE
+
+    table, _ = Table.empty(SCHEMA).appended(**rows(16 * CHUNK))
+    returned = [np.ones(3 * len(table)) for _ in range(400)]
+    returned = returned[::2]  # every other one: what lies between keeps the heap from giving it back to the system
+    before = resident()
+    versions = [table.emptied(np.arange(15))]
+    while len(versions) < 300:
+        versions.append(versions[-1].updated(np.array([len(table) - 1]), x=np.ones((1, 3)), n=np.ones(1, np.int32)))
+    assert resident() - before < 10e6, "300 versions hold one chunk of sixteen each"
+    assert all(version.row("x", 0).tolist() == [0.0, 0.0, 0.0] for version in versions) and len(returned) == 200
