@@ -57,7 +57,7 @@ class StageError(TrihedronError):
 def printable(text: str, limit: int = 4000) -> str:
     """A text from a file as one line that may go to a terminal: what cannot be printed becomes `?`, and beyond `limit` characters it ends in `…`."""
     shown = text if len(text) <= limit else text[: max(limit - 1, 0)] + "…"
-    return "".join(c if c.isprintable() else "?" for c in shown)
+    return shown if shown.isprintable() else "".join(c if c.isprintable() else "?" for c in shown)
 
 
 def did_you_mean(name: str, known: Iterable[str]) -> str:

@@ -7,8 +7,7 @@ would reach compiled kernels, which check nothing. What a plugin of this run com
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping
-from dataclasses import fields, is_dataclass
-from typing import Annotated, Any, get_args, get_origin, get_type_hints
+from typing import Annotated, Any, NamedTuple, get_args, get_origin, get_type_hints
 
 import numpy as np
 
@@ -24,19 +23,27 @@ UNIT = 1e-6  # of |n| - 1
 CURE = "the file is damaged; record it again"
 
 
-_KNOWN: dict[type, tuple[tuple[str, Any], ...]] = {}
+class _Declared(NamedTuple):
+    """What the fields of a value type declare: (field, constraint) in order, and those that hold a camera, whose own fields are checked too."""
+
+    constraints: tuple[tuple[str, Any], ...]
+    cameras: tuple[str, ...]
+
+
+_KNOWN: dict[type, _Declared] = {}
 
 
 def constraints_of(kind: type) -> tuple[tuple[str, Any], ...]:
     """(field, constraint) of a value type, in order."""
+    return _declared(kind).constraints
+
+
+def _declared(kind: type) -> _Declared:
     if kind not in _KNOWN:
-        _KNOWN[kind] = _declared(kind)
+        hints = get_type_hints(kind, include_extras=True).items()
+        found = ((name, item) for name, hint in hints if get_origin(hint) is Annotated for item in get_args(hint)[1:] if type(item) in _CHECKS)
+        _KNOWN[kind] = _Declared(tuple(found), tuple(name for name, hint in hints if hint is Camera))
     return _KNOWN[kind]
-
-
-def _declared(kind: type) -> tuple[tuple[str, Any], ...]:
-    hints = get_type_hints(kind, include_extras=True).items()
-    return tuple((name, item) for name, hint in hints if get_origin(hint) is Annotated for item in get_args(hint)[1:] if type(item) in _CHECKS)
 
 
 def checked(topic: str, value: Value, place: str, expected: type[Value] = Value) -> Value:
@@ -80,9 +87,8 @@ def _faults(value: Any, prefix: str) -> Any:
             yield prefix + name, cause
     if isinstance(value, Frame) and value.color.shape[:2] != (value.camera.height, value.camera.width):
         yield f"{prefix}color", "has not the camera's size"
-    for field in fields(value):
-        if is_dataclass(item := getattr(value, field.name)) and isinstance(item, Camera):
-            yield from _faults(item, f"{prefix}{field.name}.")
+    for name in _declared(type(value)).cameras:
+        yield from _faults(getattr(value, name), f"{prefix}{name}.")
 
 
 def _fault_of_index(array: Any, rule: IndexInto, owner: Any) -> str:

@@ -191,6 +191,7 @@ def _allowed(shape: tuple[int, ...], itemsize: int) -> bool:
     return len(shape) <= MAX_AXES and min(shape, default=0) >= 0 and math.prod(max(n, 1) for n in shape) * itemsize <= MAX_BYTES
 
 
+@lru_cache(64)
 def element_type(name: str) -> np.dtype[Any]:
     """The type of that name, `object` for any but numbers and truth values."""
     return np.dtype(name if re.fullmatch(r"\?|b1|[iu][1248]|f[248]", name) else object)

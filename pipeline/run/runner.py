@@ -237,8 +237,8 @@ class Runner:
             check_together(arguments, self._sources, topics, computed)
 
     def finish(self) -> None:
-        """Take the map of a recording where none was computed, and finish the folds; after the last frame."""
-        if "map" not in self.computed:
+        """Take the map of a recording where none was computed and poses or folds need it, and finish the folds; after the last frame."""
+        if "map" not in self.computed and any(name == "pose" or self.graph.stages[name].fold for name in self.computed):
             self.result.map = self._recorded_map()
         for name in self.computed:
             if self.graph.stages[name].fold:
