@@ -41,7 +41,7 @@ from trihedron.pipeline.run.result_files import read_results
 from trihedron.pipeline.sweep.jobs import key_of
 from trihedron.tools import ablation_tables as tables
 from trihedron.tools.ablation_differences import Parting, StageErrors, changed_by_code, reference_of
-from trihedron.tools.ablation_errors import Errors, errors_file, of_trajectory, read_errors, write_errors
+from trihedron.tools.ablation_errors import Errors, errors_file, of_result, of_trajectory, read_errors, write_errors
 from trihedron.tools.ablation_preview import preview
 from trihedron.tools.ablation_statistics import nees_of
 from trihedron.tools.ablation_swaps import Combination, combinations_of, folder_name, parsed, single_swaps, without_repeats
@@ -231,7 +231,7 @@ def _computed(computing: Alternatives, combinations: Sequence[Combination], fold
     figures = [{**_figures(outcome), **of_stage, **of_fold} for outcome, of_stage, of_fold in zip(computing.outcomes, own, folds)]
     reference = attached_truth(recording.attachments, str(recording.path))
     judged = [
-        {**(of_trajectory(runner.result, reference, ERRORS) if outcome.metrics.get("final") else {}), **of_frames}
+        {**of_result(runner.result), **of_trajectory(runner.result, reference, ERRORS), **of_frames, "ms": outcome.frame_ms}
         for runner, outcome, of_frames in zip(computing.runners, computing.outcomes, of_stages)
     ]
     full_s = read_results(recording.path.parent / "timing.json").get("cpu_s")
@@ -264,7 +264,7 @@ def _figures(outcome: Outcome) -> dict[str, float]:
         figures["ok %"] = 100.0 * status["ok"] / max(1, outcome.metrics["frames"])
     if (nees := nees_of(outcome.metrics)) is not None:
         figures[NEES] = nees
-    return {**figures, "ms": outcome.stage_ms}
+    return {**figures, "ms": float(outcome.frame_ms.mean())}
 
 
 def _errors(final: Mapping[str, Any]) -> dict[str, float]:

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from trihedron.pipeline.core.errors import DataError
-from trihedron.pipeline.core.types import F64, Trajectory
+from trihedron.pipeline.core.types import F64, OK, Trajectory
 from trihedron.pipeline.run.accounting import Result
 from trihedron.pipeline.run.metrics import frame_errors
 from trihedron.pipeline.run.results import final_trajectory
@@ -24,6 +24,12 @@ def of_trajectory(result: Result, truth: Trajectory | None, columns: Mapping[str
         return {}
     found = frame_errors(estimate, truth, result.fps, np.array(result.stamps_ns, np.int64))
     return {column: factor * found[name] for column, (name, factor) in columns.items() if name in found}
+
+
+def of_result(result: Result) -> Errors:
+    """Return which frames of a run are `ok`, in per cent: 100 or 0 each. Empty where no pose was computed."""
+    ok = {pose.stamp_ns for pose in result.poses if pose.status == OK}
+    return {"ok %": np.array([100.0 * (stamp in ok) for stamp in result.stamps_ns])} if len(result.poses) else {}
 
 
 def errors_file(out: Path, key: str) -> Path:

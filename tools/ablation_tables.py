@@ -29,16 +29,16 @@ FIGURES = {  # in the order of columns
     "RPE 1 frame mm": Column(2),
     "RPE 1 s mm": Column(2),
     "RPE 1 s deg": Column(3),
-    "ok %": Column(1, more=True, of_frames=False),
-    NEES: Column(2, of_frames=False),
+    "ok %": Column(1, more=True, power=1),
+    NEES: Column(2, power=0),
     "axes deg": Column(3),
     "rotation deg": Column(3),
     "translation mm": Column(2),
-    "false axes %": Column(1, of_frames=False),
+    "false axes %": Column(1, power=0),
     **{name: Column(1 if name.endswith("%") else 2) for name in MEASURED},
-    **{name: Column(decimals, of_frames=False) for name, decimals in OF_FOLDS.items()},
-    "values %": Column(1, more=True, of_frames=False),
-    "ms": Column(2, of_frames=False),
+    **{name: Column(decimals, power=0) for name, decimals in OF_FOLDS.items()},
+    "values %": Column(1, more=True, power=0),
+    "ms": Column(2, power=1),
 }
 
 
@@ -231,11 +231,12 @@ def targets_of(case: Case) -> list[Combination]:
 
 def attribution(cases: Sequence[Case]) -> list[dict[str, Any]]:
     """Return for each combination of swaps, stage and figure the Shapley value: its mean over the recordings and half its confidence interval, of
-    one recording from its frames (None where there is none). The stage "" is their sum, the whole difference."""
+    one recording from its frames (None where there is none). The stage "" is their sum, the whole difference, where there are several."""
     found = []
     for target in targets_of(cases[0]):
         variants = [{variant.combination: variant for variant in case.variants} for case in cases]
-        weights = {**shapley_weights(target.stages), "": {frozenset(): -1.0, target.stages: 1.0}}
+        whole = {"": {frozenset(): -1.0, target.stages: 1.0}} if len(target.stages) > 1 else {}
+        weights = {**shapley_weights(target.stages), **whole}
         for name in columns_of(cases):
             for stage, of_parts in weights.items():
                 parts = [[one[target.part(part)] for part in of_parts] for one in variants]
@@ -251,9 +252,9 @@ def attribution(cases: Sequence[Case]) -> list[dict[str, Any]]:
 def _half_of_frames(case: Case, name: str, variants: Sequence[Variant], weights: Sequence[float]) -> float | None:
     """Half the confidence interval of a weighted sum of a figure, from the frames of one recording; None where there are none, or too few."""
     errors = [variant.errors.get(name, np.full(case.frames, np.nan)) for variant in variants]
-    if not np.isfinite(errors).all(axis=0).any():
+    if not FIGURES[name].power or not np.isfinite(errors).all(axis=0).any():
         return None
-    found = resampled(errors, weights, max(1, round(case.fps)))
+    found = resampled(errors, weights, max(1, round(case.fps)), FIGURES[name].power)
     return None if found.error is None else half_width(found.error, found.blocks - 1)
 
 
@@ -275,7 +276,7 @@ def attribution_table(cases: Sequence[Case]) -> Section:
         whole = budget.get("", {})
         if stages:
             rows.append([f"truth in the place of {stages}", *(number(n, figures.get(n, np.nan) - whole.get(n, np.nan), True) for n in columns)])
-    over = f"over {len(cases)} recordings" if len(cases) > 1 else "from the frames of one recording, where a figure is one of frames"
+    over = f"over {len(cases)} recordings" if len(cases) > 1 else "from the frames of one recording, where a figure is a mean over frames"
     interval = f"± half the {100 * CONFIDENCE:.0f} % interval {over}"
     note = "\n".join([f"Differences; {interval}", *(f"Truth: {sentence}" for case in cases if len(cases) == 1 for sentence in case.remarks)])
     return Section("Attribution: Shapley value of each swap", [["swap", *columns], *rows], "l" + "r" * len(columns), note)

@@ -1,4 +1,5 @@
-"""A weighted sum of root mean squares over the frames of one recording, and its standard error by the moving-block bootstrap (Künsch, 1989).
+"""A weighted sum of means, plain or root mean squares, over the frames of one recording, with its standard error by the moving-block bootstrap
+(Künsch, 1989).
 
 The errors of neighbouring frames are alike, so that frames are no independent samples; blocks of consecutive frames nearly are, when they are longer
 than the errors remember. Blocks are drawn with replacement, the same for all series, until the recording has its length again; the spread of the sum
@@ -22,7 +23,7 @@ BIAS = 0.1  # largest share by which blocks make the variance too small, before 
 
 @dataclass(frozen=True)
 class Resampled:
-    """Weighted sum of root mean squares, its standard error (None: fewer than `FEWEST_BLOCKS`), the number of blocks and the frames of one."""
+    """Weighted sum of means, its standard error (None: fewer than `FEWEST_BLOCKS`), the number of blocks and the frames of one."""
 
     value: float
     error: float | None
@@ -30,8 +31,13 @@ class Resampled:
     length: int
 
 
-def resampled(errors: Sequence[F64], weights: Sequence[float], shortest: int) -> Resampled:
-    """Sum the root mean squares of k series of errors (n,) of the same frames, each with its weight.
+def power_mean(values: F64, power: int) -> float:
+    """Return the mean of values that are not negative, (n,): plain for the power 1, their root mean square for 2."""
+    return float(np.mean(values**power) ** (1.0 / power))
+
+
+def resampled(errors: Sequence[F64], weights: Sequence[float], shortest: int, power: int = 2) -> Resampled:
+    """Sum the power means (as `power_mean`) of k series of errors (n,), none negative, of the same frames, each with its weight.
 
     Frames where one is not finite are left out; at least one must remain. A block has at least `shortest` frames. The standard error of b blocks is
     the spread of the resamples times sqrt(b / (b - 1)), as that of a mean of b values, and corrected for the bias of `block_length`; b - 1 are its
@@ -40,20 +46,21 @@ def resampled(errors: Sequence[F64], weights: Sequence[float], shortest: int) ->
     found = np.flatnonzero(np.isfinite(series).all(axis=0))
     series = series[:, found[0] : found[-1] + 1]
     known: Bool = np.asarray(np.isfinite(series).all(axis=0))
-    squares = np.where(known, np.square(series), 0.0)
-    roots = np.sqrt(squares.sum(axis=1) / known.sum())[:, None]
-    parts = (factors * squares / np.where(roots > 0.0, 2.0 * roots, 1.0)).sum(axis=0)  # each frame's part in the sum, to first order
+    powers = np.where(known, series**power, 0.0)
+    means = ((powers.sum(axis=1) / known.sum()) ** (1.0 / power))[:, None]
+    slopes = np.where(means > 0.0, power * means ** (power - 1), 1.0)
+    parts = (factors * powers / slopes).sum(axis=0)  # each frame's part in the sum, to first order
     length, bias = block_length(np.where(known, parts, np.nan), shortest)
     length = min(length, len(known))
-    value, blocks = float((factors * roots).sum()), len(known) // length
+    value, blocks = float((factors * means).sum()), len(known) // length
     if blocks < FEWEST_BLOCKS:
         return Resampled(value, None, blocks, length)
-    sums = np.concatenate([np.zeros((len(series) + 1, 1)), np.cumsum([*squares, known], axis=1)], axis=1)
+    sums = np.concatenate([np.zeros((len(series) + 1, 1)), np.cumsum([*powers, known], axis=1)], axis=1)
     of_blocks = sums[:, length:] - sums[:, :-length]
     drawn = np.random.default_rng(SEED).integers(0, of_blocks.shape[1], (RESAMPLES, blocks))
     *totals, counts = of_blocks[:, drawn].sum(axis=2)
-    drawn_roots = np.sqrt(np.maximum(totals, 0.0)[:, counts > 0] / counts[counts > 0])
-    spread = float(np.std((factors * drawn_roots).sum(axis=0)))
+    drawn_means = (np.maximum(totals, 0.0)[:, counts > 0] / counts[counts > 0]) ** (1.0 / power)
+    spread = float(np.std((factors * drawn_means).sum(axis=0)))
     return Resampled(value, float(spread * np.sqrt(blocks / (blocks - 1) / (1.0 - bias))), blocks, length)
 
 

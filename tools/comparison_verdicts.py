@@ -17,7 +17,7 @@ from trihedron.tools.comparison_table import FIGURES
 from trihedron.tools.verdicts import Column, Sample
 
 ERRORS = {"ATE mm": "ate_rmse_m", "RPE 1 s mm": "rpe_second_rmse_m", "RPE 1 s deg": "rpe_second_rmse_deg"}  # column -> name in the metrics
-COLUMNS = {name: Column(figure.decimals, figure.more, name in ERRORS) for name, figure in FIGURES.items()}
+COLUMNS = {name: Column(figure.decimals, figure.more, 2 if name in ERRORS else 0) for name, figure in FIGURES.items()}
 
 
 def paired_samples(first: Path, second: Path, figures: tuple[Mapping[str, float], Mapping[str, float]]) -> tuple[Sample, Sample]:

@@ -157,7 +157,8 @@ def error_figures(cases: Sequence[Case]) -> dict[str, Any]:
     has errors of frames, the legend, and the recording."""
     case, _ = tables.farthest([(case, variant) for case in cases for variant in case.variants])
     shown = case.variants[:MOST_CURVES]
-    names = [name for name in tables.FIGURES if any(np.isfinite(variant.errors.get(name, np.nan)).sum() > 1 for variant in shown)]
+    known = {name for variant in shown for name, values in variant.errors.items() if np.isfinite(values).sum() > 1}
+    names = [name for name, figure in tables.FIGURES.items() if name in known and figure.power == 2]
     figures: list[Figure] = []
     for name in names:
         curves = [variant.errors.get(name, np.full(case.frames, np.nan)) for variant in shown]

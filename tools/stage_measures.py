@@ -47,7 +47,8 @@ LINE_DEG = 5.0  # between the directions of a segment and the same one a frame l
 LEAST_SHARE = 0.5  # of a plane's points that must fall on one plane of the next frame
 COLUMNS = (
     "normals deg", "points lost %", "lines lost %", "segments mm", "planes mm", "planes deg", "planes lost %", "wrong pairs %", "missed pairs %",
-    "one-way pairs %", "wrong matches %", "missed matches %", "cycle px", "depth mm",
+    "one-way pairs %", "wrong matches %", "missed matches %",
+    *(f"{stage} {column}" for stage in ("rotation", "translation", "pose") for column in ("cycle px", "depth mm")),
 )  # fmt: skip
 
 
@@ -202,20 +203,20 @@ def one_way(pairs: Any, last: Keypoints, points: Keypoints) -> float:
 
 def of_motion(value: Rotation | Translation | Pose, now: Seen, before: Seen, T: F64) -> Errors:
     """By the estimated motion since the last frame: `cycle px`, median distance of the pairs' points, there by the motion and back by the pairs, and
-    `depth mm`, median difference of the last frame's depth from that of this one, on pixels that both see. A rotation is judged with the known
-    translation."""
-    ends, camera, errors = [estimated(type(value), frame) for frame in (now, before)], now.camera, {}
+    `depth mm`, median difference of the last frame's depth from that of this one, on pixels that both see; the name of the stage is before both. A
+    rotation is judged with the known translation."""
+    ends, camera, errors, stage = [estimated(type(value), frame) for frame in (now, before)], now.camera, {}, type(value).__name__.lower()
     if ends[0] is None or ends[1] is None or camera is None:
         return {}
     motion = invert(ends[0]) @ ends[1]
     tracks, points, depth, last_depth = now.get("tracks"), now.get("keypoints"), now.depth_m, before.depth_m
     if isinstance(tracks, Tracks) and isinstance(points, Keypoints):
-        errors["cycle px"] = median(offsets_px(tracks, points, camera, motion))
+        errors[f"{stage} cycle px"] = median(offsets_px(tracks, points, camera, motion))
     if depth is not None and last_depth is not None:
         _, moved, pixels, known = warped(last_depth, camera, motion)
         there = between(depth, pixels[known])
         off = np.abs(there - moved[known, 2])
-        errors["depth mm"] = median(1e3 * off[off < OCCLUDED * there])  # where it is unknown, off is NaN
+        errors[f"{stage} depth mm"] = median(1e3 * off[off < OCCLUDED * there])  # where it is unknown, off is NaN
     return errors
 
 

@@ -1,9 +1,9 @@
 """Verdicts in words: which of two alternatives is better in a figure, by how much, and how sure that is.
 
-Figures that are root mean squares over frames are compared on the frames that both alternatives have an error of. Of one recording their difference
-has an interval by the moving-block bootstrap. Of several recordings each is one difference, and the interval of their mean is Student's t: what
-varies between stretches of a recording varies between recordings too, and drawing blocks within them besides would count it twice (such intervals,
-of five simulated recordings, cover in 99 to 100 % instead of 95).
+Figures that are means over frames, plain or root mean squares, are compared on the frames of which both alternatives have a value. Of one recording
+their difference has an interval by the moving-block bootstrap. Of several recordings each is one difference, and the interval of their mean is
+Student's t: what varies between stretches of a recording varies between recordings too, and drawing blocks within them besides would count it twice
+(such intervals, of five simulated recordings, cover in 99 to 100 % instead of 95).
 
 P-values are corrected by Holm over all pairs of alternatives that are compared in the same figure: in a figure in which nothing differs, the chance
 of any "better" or "worse" is 5 %. Figures are not corrected for one another.
@@ -18,7 +18,7 @@ import numpy as np
 
 from trihedron.pipeline.core.types import F64
 from trihedron.pipeline.sweep.paired_statistics import LEVEL, MOST_REPEATS, POWER, half_width, holm, p_value, power, repeats_needed
-from trihedron.tools.block_bootstrap import resampled
+from trihedron.tools.block_bootstrap import power_mean, resampled
 
 SMALL_SHARE = 0.05  # of the first alternative's figure: the difference that further recordings would show
 ROUNDING = 1e-12  # of a figure: less is no difference, and no spread
@@ -34,17 +34,18 @@ NOTE = (
 
 @dataclass(frozen=True)
 class Column:
-    """A figure's decimals, whether more of it is better, and whether it is a root mean square over frames."""
+    """A figure's decimals, whether more of it is better, and the power of the mean over frames that it is: 2 a root mean square, 1 a plain mean, 0
+    no mean over frames."""
 
     decimals: int
     more: bool = False
-    of_frames: bool = True
+    power: int = 2
 
 
 @dataclass(frozen=True)
 class Sample:
-    """Outcome of an alternative on one recording: figures by column, and of those that are root mean squares over frames the error (n,) of each, NaN
-    where it has none, in the figure's unit. `second` is the number of frames in one second, which a block has at least."""
+    """Outcome of an alternative on one recording: figures by column, and of those that are means over frames the value (n,) of each, NaN where it
+    has none, in the figure's unit. `second` is the number of frames in one second, which a block has at least."""
 
     figures: Mapping[str, float]
     errors: Mapping[str, F64] = field(default_factory=dict)
@@ -86,8 +87,8 @@ class Verdict:
 def verdicts_of(comparisons: Mapping[tuple[str, str], Pairs], columns: Mapping[str, Column]) -> list[Verdict]:
     """Return the verdicts of each pair of alternatives (first, second) in each column that both have, in this order. Of one recording there are none
     in a figure that is not of frames. Pairs that are equal by construction do not count for the correction."""
-    differences = [_difference(names, column, pairs) for names, pairs in comparisons.items() for column in columns]
-    found = [one for one in differences if one is not None and (one.recordings > 1 or columns[one.figure].of_frames)]
+    differences = [_difference(names, name, column.power, pairs) for names, pairs in comparisons.items() for name, column in columns.items()]
+    found = [one for one in differences if one is not None and (one.recordings > 1 or columns[one.figure].power)]
     corrected: dict[int, tuple[float, int]] = {}
     for column in columns:
         unequal = {number: one for number, one in enumerate(found) if one.figure == column and (one.error or one.difference)}
@@ -96,9 +97,9 @@ def verdicts_of(comparisons: Mapping[tuple[str, str], Pairs], columns: Mapping[s
     return [_answered(one, columns[one.figure], *corrected.get(number, (one.p, 1))) for number, one in enumerate(found)]
 
 
-def _difference(names: tuple[str, str], column: str, pairs: Pairs) -> Verdict | None:
+def _difference(names: tuple[str, str], column: str, power: int, pairs: Pairs) -> Verdict | None:
     """Return the difference of a pair of alternatives with its interval, before the correction; None where no recording has both figures."""
-    values = np.array([_figures(column, a, b) for a, b in pairs]).reshape(-1, 2)
+    values = np.array([_figures(column, power, a, b) for a, b in pairs]).reshape(-1, 2)
     known = np.flatnonzero(np.isfinite(values).all(axis=1))
     if not len(known):
         return None
@@ -107,8 +108,8 @@ def _difference(names: tuple[str, str], column: str, pairs: Pairs) -> Verdict | 
     a, b = pairs[known[0]]
     if len(known) > 1:
         error: float | None = float(np.std(np.diff(values[known], axis=1), ddof=1) / np.sqrt(len(known)))
-    elif column in a.errors and column in b.errors:
-        found = resampled([a.errors[column], b.errors[column]], [-1.0, 1.0], max(1, a.second))
+    elif power and column in a.errors and column in b.errors:
+        found = resampled([a.errors[column], b.errors[column]], [-1.0, 1.0], max(1, a.second), power)
         one, error = replace(one, pieces=found.blocks, block_frames=found.length), found.error
         if np.array_equal(a.errors[column], b.errors[column], equal_nan=True):
             error = 0.0
@@ -117,14 +118,14 @@ def _difference(names: tuple[str, str], column: str, pairs: Pairs) -> Verdict | 
     return one if error is None else _with_interval(one, error)
 
 
-def _figures(column: str, a: Sample, b: Sample) -> tuple[float, float]:
-    """Return the figure of both, over the frames that both have an error of; as they are where it is not one of frames."""
-    if column not in a.errors or column not in b.errors:
+def _figures(column: str, power: int, a: Sample, b: Sample) -> tuple[float, float]:
+    """Return the figure of both, over the frames of which both have a value; as they are where it is no mean over frames."""
+    if not power or column not in a.errors or column not in b.errors:
         return a.figures.get(column, np.nan), b.figures.get(column, np.nan)
     both = np.isfinite(a.errors[column]) & np.isfinite(b.errors[column])
     if not both.any():
         return np.nan, np.nan
-    before, after = (float(np.sqrt(np.mean(np.square(one.errors[column][both])))) for one in (a, b))
+    before, after = (power_mean(one.errors[column][both], power) for one in (a, b))
     return before, after
 
 

@@ -14,6 +14,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from omegaconf import DictConfig, OmegaConf
 
 from trihedron.pipeline.app.compilation import compile_once
@@ -23,6 +24,7 @@ from trihedron.pipeline.core.config import Feedback, composed_each, graph_of
 from trihedron.pipeline.core.errors import TrihedronError
 from trihedron.pipeline.core.graph import Graph
 from trihedron.pipeline.core.overrides import literal_text
+from trihedron.pipeline.core.types import F64
 from trihedron.pipeline.record.reader import Recording
 from trihedron.pipeline.record.trajectories import attached_truth
 from trihedron.pipeline.record.writer import RecordingWriter
@@ -59,7 +61,7 @@ class Outcome:
     stages_s: float = 0.0
     total_s: float = 0.0
     rest_s: float = 0.0
-    stage_ms: float = 0.0  # CPU milliseconds a frame of the recomputed stages, as if computed alone
+    frame_ms: F64 = field(default_factory=lambda: np.zeros(0))  # CPU milliseconds of the recomputed stages in each frame, as if computed alone
 
 
 def alternatives_of(recording: Recording, words: Sequence[Sequence[str]]) -> list[Alternative]:
@@ -168,13 +170,12 @@ class Alternatives:
         seconds, users = together.cpu_s, together.users
         stages = {node for nodes in together.node_of for name, node in nodes.items() if name in self.stages or name in self.shared}
         rest = self.cpu_s - sum(seconds[node] for node in stages)
-        for outcome, runner, nodes in zip(self.outcomes, self.runners, together.node_of):
+        for outcome, nodes in zip(self.outcomes, together.node_of):
             own = [node for node in nodes.values() if node in stages]
             outcome.stages_s = sum(seconds[node] for node in own)
             outcome.rest_s = rest / len(self.runners)
             outcome.total_s = sum(seconds[node] / users[node] for node in own) + outcome.rest_s
-            frames = max(1, len(runner.result.stamps_ns))
-            outcome.stage_ms = 1e3 * sum(seconds[node] for name, node in nodes.items() if name in self.stages) / frames
+            outcome.frame_ms = together.cpu_ms_of_frames([node for name, node in nodes.items() if name in self.stages])
 
 
 def same(a: Alternative, b: Alternative) -> bool:

@@ -8,12 +8,15 @@ from __future__ import annotations
 
 import time
 from collections import defaultdict
-from collections.abc import Hashable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Hashable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from typing import Any, TypeVar
 
+import numpy as np
+
 from trihedron.pipeline.core.errors import StageError, TrihedronError
 from trihedron.pipeline.core.graph import Graph, Stage
+from trihedron.pipeline.core.types import F64
 from trihedron.pipeline.core.wires import Wire
 from trihedron.pipeline.run.interrupts import Interrupts
 from trihedron.pipeline.run.node import Node, NodeFailure
@@ -118,7 +121,7 @@ class SideBySide:
         classes = equivalence([self._vertices(runner, nodes) for runner, nodes in zip(runners, own)])
         self.node_of: list[dict[str, str]] = []
         self._owner: dict[str, tuple[int, str]] = {}  # node -> the runner that computes it, and the stage
-        self._calls: dict[str, list[float]] = defaultdict(list)
+        self._calls: dict[str, dict[int, float]] = defaultdict(dict)
         for number, (runner, nodes, numbers) in enumerate(zip(runners, own, classes)):
             self.node_of.append({name: f"{name}:{number if self._fold(runner, name) else ''}{numbers[name]}" for name in nodes})
             for name, node in self.node_of[-1].items():
@@ -144,7 +147,11 @@ class SideBySide:
     @property
     def cpu_s(self) -> dict[str, float]:
         """CPU seconds of the calls of each node so far."""
-        return {node: sum(calls) for node, calls in self._calls.items()}
+        return {node: sum(calls.values()) for node, calls in self._calls.items()}
+
+    def cpu_ms_of_frames(self, nodes: Collection[str]) -> F64:
+        """CPU milliseconds of the calls of some nodes in each frame (count,)."""
+        return np.array([1e3 * sum(self._calls[node].get(position, 0.0) for node in nodes) for position in range(self.count)])
 
     def _joined(self, name: str, number: int, stage: str, own: Sequence[Mapping[str, Node]]) -> Node:
         """The node of a runner under its common name, with its CPU time measured."""
@@ -153,7 +160,7 @@ class SideBySide:
         def call(position: int, inputs: Mapping[str, Any]) -> Any:
             began = time.thread_time()
             value = node.call(position, inputs)
-            seconds.append(time.thread_time() - began)
+            seconds[position] = time.thread_time() - began
             return value
 
         return replace(node, name=name, call=call, inputs={p: Wire(names[wire.topic], wire.delay) for p, wire in node.inputs.items()})

@@ -43,7 +43,7 @@ from faulty_plugins import faulty
 
 __all__ = ["faulty"]  # a fixture
 
-OF_FRAMES = "Differences; ± half the 95 % interval from the frames of one recording, where a figure is one of frames"
+OF_FRAMES = "Differences; ± half the 95 % interval from the frames of one recording, where a figure is a mean over frames"
 SMALL = ["dataset.width=320", "dataset.height=240", "threads=1"]
 
 

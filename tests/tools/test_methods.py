@@ -132,7 +132,7 @@ def test_a_sweep_over_alternatives_and_its_table(tmp_path, capsys, faulty):
     first, second = dict.fromkeys(sequence for _, sequence in rows)
     assert [change for change, sequence in rows if sequence == second] == ["default", "rotation=procrustes", "rotation=ransac"]
     assert all(row["tracked"] > 0.5 and 0.0 < row["ate_mm"] < 50.0 and row["measures"] for row in rows.values())
-    assert set(rows["default", first]["measures"]) == {"rotation deg", "translation mm", "cycle px"}
+    assert set(rows["default", first]["measures"]) == {"rotation deg", "translation mm", "translation cycle px"}
     default, wrong = rows["default", first], rows["translation=wrong_sign", first]
     assert abs(wrong["ate_mm"] - default["ate_mm"]) < 0.2 * default["ate_mm"]
     assert wrong["measures"]["translation mm"] > 3.0 * default["measures"]["translation mm"]

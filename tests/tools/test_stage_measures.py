@@ -139,15 +139,15 @@ def estimates(T):
 @pytest.mark.parametrize("topic", ["rotation", "translation", "pose"])
 def test_a_right_motion_closes_the_cycle_and_warps_the_depth(topic):
     found = measured(topic, moved(NOW), moved(BEFORE))
-    assert found["cycle px"] < 0.01 and found["depth mm"] < 0.5
+    assert found[f"{topic} cycle px"] < 0.01 and found[f"{topic} depth mm"] < 0.5
 
 
 @pytest.mark.parametrize("topic", ["translation", "pose"])
 def test_a_motion_towards_a_wall_that_is_20_mm_off_is_20_mm_off_in_depth(topic):
     wall, T, off = {"dataset": EXACT.frame(0)}, np.eye(4), pose_matrix(np.eye(3), np.array([0.0, 0.0, 0.02]))
     before, now = (Seen({**moved(BEFORE).values, **wall, **estimates(one)}, T) for one in (T, off))
-    assert measured(topic, now, before)["depth mm"] == pytest.approx(20.0, abs=0.01)
-    assert measured("rotation", now, before)["depth mm"] == pytest.approx(0.0, abs=0.01)  # with the known translation
+    assert measured(topic, now, before)[f"{topic} depth mm"] == pytest.approx(20.0, abs=0.01)
+    assert measured("rotation", now, before)["rotation depth mm"] == pytest.approx(0.0, abs=0.01)  # with the known translation
 
 
 def test_a_rotation_about_the_optical_axis_moves_points_by_their_radius():
@@ -156,7 +156,7 @@ def test_a_rotation_about_the_optical_axis_moves_points_by_their_radius():
     deep = tracks.keypoints[np.isfinite(tracks.points_m).all(axis=1), 1]
     radii = np.linalg.norm(keypoints.pixels[deep] - [319.5, 239.5], axis=1)
     for topic in ("rotation", "translation", "pose"):
-        assert measured(topic, off, moved(BEFORE))["cycle px"] == pytest.approx(2.0 * np.sin(np.radians(0.5)) * np.median(radii), rel=0.02)
+        assert measured(topic, off, moved(BEFORE))[f"{topic} cycle px"] == pytest.approx(2.0 * np.sin(np.radians(0.5)) * np.median(radii), rel=0.02)
 
 
 def test_frames_follow_each_other_and_the_first_has_no_error():

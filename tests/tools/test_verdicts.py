@@ -4,7 +4,7 @@ import re
 
 import numpy as np
 import pytest
-from scipy.stats import t
+from scipy.stats import norm, t
 
 from trihedron.tools.block_bootstrap import block_length, resampled
 from trihedron.tools.verdicts import Column, Sample, Verdict, line_of, named, recordings_needed, verdicts_of
@@ -41,6 +41,19 @@ def test_the_interval_covers_the_true_difference(memory, frames):
         if found.error is not None:
             covered.append(abs(found.value - 0.2) <= t.ppf(0.975, found.blocks - 1) * found.error)
     assert len(covered) > 190 and 0.90 <= np.mean(covered) <= 0.98
+
+
+@pytest.mark.parametrize("memory", [0.0, 0.8])
+def test_the_interval_of_a_share_covers_the_true_difference(memory):
+    """Frames are `ok` or not, 80 and 70 % of them: the figure is a plain mean."""
+    rng, covered = np.random.default_rng(3), []
+    for _ in range(200):
+        a, b = (100.0 * (series < z) for series, z in zip(autoregressive(rng, 2, 900, memory), norm.ppf([0.8, 0.7])))
+        found = resampled([a, b], DIFFERENCE, 30, 1)
+        assert found.value == pytest.approx(np.mean(b) - np.mean(a), abs=1e-9)
+        if found.error is not None:
+            covered.append(abs(found.value + 10.0) <= t.ppf(0.975, found.blocks - 1) * found.error)
+    assert len(covered) > 180 and 0.90 <= np.mean(covered) <= 0.99
 
 
 @pytest.mark.parametrize("memory", [0.95, 0.99])
@@ -165,7 +178,7 @@ def test_the_words():
 
 def test_one_recording_has_no_verdict_in_a_figure_without_frames():
     pair = (Sample({"ms": 5.0, "ATE mm": 1.0}), Sample({"ms": 6.0, "ATE mm": 2.0}))
-    columns = {**ATE, "ms": Column(2, of_frames=False)}
+    columns = {**ATE, "ms": Column(2, power=0)}
     assert [(one.figure, one.answer) for one in verdicts_of({("a", "b"): [pair]}, columns)] == [("ATE mm", "one recording, no interval")]
     assert [one.figure for one in verdicts_of({("a", "b"): [pair, pair]}, columns)] == ["ATE mm", "ms"]
 
