@@ -18,7 +18,7 @@ from trihedron.pipeline.core.libraries import declared, distribution_of
 
 ROOT = Path(__file__).resolve().parents[1]
 PROJECT = load_file(ROOT / "pyproject.toml")["project"]
-PROGRAM = ("pipeline", "plugins", "datasets", "tools", "api", "src/trihedron/__init__.py")
+PROGRAM = ("pipeline", "plugins", "datasets", "tools", "src/trihedron")
 BESIDE = ("tests", "docs/site", "examples", ".ci")
 OF_EXTRAS_FOR_DEVELOPERS = {"docs", "dev"}
 NAMESPACES = {"hydra_plugins"}  # which several distributions share: the module below tells them apart

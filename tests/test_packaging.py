@@ -17,7 +17,7 @@ from setuptools.config.pyprojecttoml import load_file
 from trihedron.tools.benchmark import COMPARISONS
 
 ROOT = Path(__file__).resolve().parents[1]
-FOLDERS = ("api", "pipeline", "plugins", "datasets", "tools", "conf")
+FOLDERS = ("pipeline", "plugins", "datasets", "tools", "conf")
 PROJECT = load_file(ROOT / "pyproject.toml")
 
 
@@ -60,7 +60,8 @@ def test_content_of_the_wheel(wheel):
     names = zipfile.ZipFile(wheel).namelist()
     assert {name.split("/")[0] for name in names} == {"trihedron", wheel.name.removesuffix("-py3-none-any.whl") + ".dist-info"}
     ours = [path for folder in FOLDERS for path in (ROOT / folder).rglob("*") if path.suffix in (".py", ".yaml", ".json", ".html", ".css", ".js")]
-    expected = {f"trihedron/{path.relative_to(ROOT)}" for path in ours} | {"trihedron/__init__.py", "trihedron/py.typed"}
+    own = {path.relative_to(ROOT / "src").as_posix() for path in (ROOT / "src" / "trihedron").rglob("*.py")}  # behind no link
+    expected = {f"trihedron/{path.relative_to(ROOT)}" for path in ours} | own | {"trihedron/py.typed"}
     assert {name for name in names if name.startswith("trihedron/")} == expected
 
 

@@ -15,6 +15,7 @@ from mcap.writer import Writer
 from omegaconf import OmegaConf
 
 import trihedron
+from trihedron.comparison.other_programs import _kitti_poses
 from trihedron.datasets.readers.foxglove_messages import UnreadableMessage, reader
 from trihedron.datasets.readers.icl_nuim import IclNuim
 from trihedron.datasets.readers.tum import Tum
@@ -29,7 +30,6 @@ from trihedron.pipeline.record.reader import Recording
 from trihedron.pipeline.record.writer import RecordingWriter
 from trihedron.pipeline.run.replay import Replay
 from trihedron.tools.download import _read_calibration
-from trihedron.tools.other_programs import _kitti_poses
 
 ROOT = Path(__file__).resolve().parents[1]
 FOLDERS = ("pipeline", "plugins", "datasets", "tools", "conf")

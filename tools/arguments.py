@@ -5,10 +5,10 @@ from __future__ import annotations
 import argparse
 import inspect
 import sys
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from typing import NoReturn
 
-from trihedron.pipeline.core.errors import UsageError, did_you_mean, printable
+from trihedron.pipeline.core.errors import UsageError, did_you_mean
 
 
 class Parser(argparse.ArgumentParser):
@@ -34,11 +34,3 @@ class Parser(argparse.ArgumentParser):
     def error(self, message: str) -> NoReturn:
         """Raise UsageError, with the command's own help as the cure."""
         raise UsageError(self.prog.removeprefix("trihedron "), message, f"see {self.prog} --help")
-
-
-def table(rows: Sequence[Sequence[object]], right: str = "") -> str:
-    """Rows as aligned columns two blanks apart; `right` has an r for each column to be aligned to the right, for example "lrr"."""
-    cells = [[printable(str(cell)) for cell in row] for row in rows]
-    widths = [max(len(row[i]) for row in cells) for i in range(len(cells[0]))]
-    aligned = [[cell.rjust(w) if right[i : i + 1] == "r" else cell.ljust(w) for i, (cell, w) in enumerate(zip(row, widths))] for row in cells]
-    return "\n".join("  ".join(row).rstrip() for row in aligned)

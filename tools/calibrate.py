@@ -23,10 +23,11 @@ import yaml
 from trihedron.datasets.readers.cameras import Calibration, choose_calibration
 from trihedron.datasets.readers.registration import DepthCamera
 from trihedron.pipeline.core.errors import DataError
+from trihedron.pipeline.core.text_table import table
 from trihedron.pipeline.core.types import F64, Camera
 from trihedron.pipeline.record.reader import Recording
 from trihedron.tools import calibration_edges, calibration_pairs
-from trihedron.tools.arguments import Parser, table
+from trihedron.tools.arguments import Parser
 from trihedron.tools.calibration_edges import Edges, block_scores, edges_of, registered
 from trihedron.tools.calibration_judgement import Costs, Judgement, judge
 from trihedron.tools.calibration_pairs import Fit, Pairs, fit, scale_of

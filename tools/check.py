@@ -12,7 +12,8 @@ from __future__ import annotations
 
 import sys
 
-from trihedron.tools.arguments import Parser, table
+from trihedron.pipeline.core.text_table import table
+from trihedron.tools.arguments import Parser
 
 
 def main(argv: list[str]) -> int:

@@ -15,7 +15,8 @@ from importlib.util import find_spec
 from pathlib import Path
 
 from trihedron.pipeline.core.libraries import declared, install_command
-from trihedron.tools.arguments import Parser, table
+from trihedron.pipeline.core.text_table import table
+from trihedron.tools.arguments import Parser
 from trihedron.tools.system_check import OPTIONAL, REQUIRED, check
 
 

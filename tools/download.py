@@ -21,7 +21,8 @@ from typing import Any
 import yaml
 
 from trihedron.pipeline.core.errors import DataError, UsageError, did_you_mean
-from trihedron.tools.arguments import Parser, table
+from trihedron.pipeline.core.text_table import table
+from trihedron.tools.arguments import Parser
 
 DEFAULT_FOLDER = Path("data")
 GIGABYTE = 1e9

@@ -19,7 +19,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from trihedron.pipeline.core.errors import DataError, RecordingError, UsageError
-from trihedron.tools.arguments import Parser, table
+from trihedron.pipeline.core.text_table import table
+from trihedron.tools.arguments import Parser
 
 if TYPE_CHECKING:
     from trihedron.pipeline.core.types import Trajectory

@@ -16,15 +16,16 @@ from typing import Any
 
 import numpy as np
 
+from trihedron.comparison.run_tables import COMPARED, figure_text
+from trihedron.comparison.runs import groups_of, judge_surfaces, read_runs, row_of
 from trihedron.pipeline.core.errors import DataError, RecordingError
 from trihedron.pipeline.core.geometry import invert
+from trihedron.pipeline.core.text_table import table
 from trihedron.pipeline.record.reader import Recording
 from trihedron.pipeline.record.trajectories import attached_truth, read_trajectory
 from trihedron.pipeline.run.metrics import associate
 from trihedron.tools import published
-from trihedron.tools.arguments import Parser, table
-from trihedron.tools.compare import groups_of, judge_surfaces, read_runs, row_of
-from trihedron.tools.comparison_table import COMPARED, figure_text
+from trihedron.tools.arguments import Parser
 from trihedron.tools.site_runs import RunFacts, facts_of, read_json
 
 Known = Sequence[tuple[RunFacts, dict[str, Any]]]  # the first run of a cell, and its row

@@ -17,7 +17,8 @@ from typing import Any
 from trihedron.pipeline.core.comments import field_comments
 from trihedron.pipeline.core.config import default_plugins
 from trihedron.pipeline.core.errors import UsageError, did_you_mean
-from trihedron.tools.arguments import Parser, table
+from trihedron.pipeline.core.text_table import table
+from trihedron.tools.arguments import Parser
 
 
 def main(argv: list[str]) -> int:

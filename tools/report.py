@@ -19,6 +19,8 @@ from typing import Any
 
 import numpy as np
 
+from trihedron.comparison import run_tables as comparison_table
+from trihedron.comparison.runs import Run, read_runs, rows_of
 from trihedron.pipeline.core.building_geometry import MODEL_COLORS, parts_of
 from trihedron.pipeline.core.errors import DataError, TrihedronError
 from trihedron.pipeline.core.files import MAX_YAML_BYTES, YamlError, parse_yaml, read_text
@@ -30,9 +32,7 @@ from trihedron.pipeline.run.metrics import aligned_errors, associate
 from trihedron.pipeline.run.result_files import read_results
 from trihedron.pipeline.run.results import dotted
 from trihedron.plugins.building.files import floorplan_svg, summary
-from trihedron.tools import comparison_table
 from trihedron.tools.arguments import Parser
-from trihedron.tools.compare import Run, read_runs, rows_of
 from trihedron.tools.export_surface import surface_of
 
 MOST_PICTURES = 12  # a page of a large sweep would be too big to open
@@ -265,7 +265,7 @@ def _pictures(runs: dict[str, Run]) -> list[str]:
     """The middle frame of each run, as `trihedron picture` draws it."""
     import tempfile
 
-    from trihedron.tools.picture import draw
+    from trihedron.comparison.pictures import draw
 
     parts = []
     with tempfile.TemporaryDirectory() as folder:

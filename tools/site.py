@@ -18,12 +18,12 @@ from typing import Any
 
 import yaml
 
+from trihedron.comparison.run_tables import COMPARED, FIGURES, TRACKED, figure_text
+from trihedron.comparison.runs import Run, groups_of, read_runs, row_of
 from trihedron.pipeline.core.errors import DataError
 from trihedron.pipeline.core.files import MAX_YAML_BYTES, YamlError, parse_yaml, read_text
 from trihedron.tools import published
 from trihedron.tools.arguments import Parser
-from trihedron.tools.compare import Run, groups_of, read_runs, row_of
-from trihedron.tools.comparison_table import COMPARED, FIGURES, TRACKED, figure_text
 from trihedron.tools.site_ablations import Ablation, ablation_page, ablations_of
 from trihedron.tools.site_pages import render
 from trihedron.tools.site_runs import RunFacts, facts_of, run_page

@@ -12,18 +12,18 @@ from typing import Any
 
 import numpy as np
 
+from trihedron.comparison import ablation_tables as tables
+from trihedron.comparison.ablation_tables import RESULT, Case, Variant, by_change, number
+from trihedron.comparison.frame_errors import errors_file, read_errors
+from trihedron.comparison.swaps import AS_RECORDED
+from trihedron.comparison.verdicts import NOTE, Verdict, line_of
 from trihedron.pipeline.core.config import Feedback
 from trihedron.pipeline.core.errors import DataError
 from trihedron.pipeline.run.result_files import read_results
 from trihedron.pipeline.sweep.paired_statistics import half_interval
-from trihedron.tools import ablation_tables as tables
-from trihedron.tools.ablation_errors import errors_file, read_errors
-from trihedron.tools.ablation_swaps import AS_RECORDED
-from trihedron.tools.ablation_tables import RESULT, Case, Variant, by_change, number
 from trihedron.tools.site_figures import MOST_CURVES, Figure, curve_look, curves_figure
 from trihedron.tools.site_pages import render
 from trihedron.tools.site_pictures import embedded
-from trihedron.tools.verdicts import NOTE, Verdict, line_of
 
 SHOWN = ("ATE mm", "RPE 1 frame mm", "RPE 1 s mm", "axes deg", "rotation deg", "translation mm", "ms")
 MARGIN = 4.0  # of a chart, per cent of its width, on both sides

@@ -13,11 +13,11 @@ import numpy as np
 from markupsafe import Markup, escape
 from numpy.typing import NDArray
 
+from trihedron.comparison.mesh_files import read_mesh, vertex_colors
 from trihedron.pipeline.core.errors import DataError
 from trihedron.pipeline.core.geometry import transform, umeyama
 from trihedron.pipeline.core.types import DEGRADED, F64, LOST, OK, Trajectory
 from trihedron.pipeline.run.metrics import aligned_errors, associate
-from trihedron.tools.mesh_files import read_mesh, vertex_colors
 
 WIDTH, HEIGHT = 560, 240
 LEFT, RIGHT, TOP, BOTTOM = 52, 12, 12, 34

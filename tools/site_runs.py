@@ -11,6 +11,8 @@ from typing import Any
 
 import yaml
 
+from trihedron.comparison.run_tables import FIGURES
+from trihedron.comparison.runs import Run
 from trihedron.pipeline.core.errors import DataError, RecordingError, TrihedronError
 from trihedron.pipeline.core.files import MAX_YAML_BYTES, YamlError, file_sha256, parse_yaml, read_text
 from trihedron.pipeline.core.types import Pose, Trajectory
@@ -18,8 +20,6 @@ from trihedron.pipeline.record.reader import Recording
 from trihedron.pipeline.record.trajectories import attached_truth, read_trajectory
 from trihedron.pipeline.run.result_files import read_results
 from trihedron.tools import site_figures
-from trihedron.tools.compare import Run
-from trihedron.tools.comparison_table import FIGURES
 from trihedron.tools.site_pages import render
 from trihedron.tools.site_pictures import embedded
 
@@ -134,7 +134,7 @@ def _results(folder: Path) -> tuple[Trajectory | None, Trajectory | None, list[P
 
 def _pictures(folder: Path) -> list[dict[str, Any]]:
     """Return the middle frame with its features, and the map from above, as JPEG; none where the recording cannot be drawn."""
-    from trihedron.tools.picture import draw
+    from trihedron.comparison.pictures import draw
 
     with TemporaryDirectory() as temporary:
         file = Path(temporary) / "picture.png"

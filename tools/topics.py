@@ -11,7 +11,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from trihedron.pipeline.core.errors import printable
-from trihedron.tools.arguments import Parser, table
+from trihedron.pipeline.core.text_table import table
+from trihedron.tools.arguments import Parser
 
 LEGACY_SCHEMA = "trihedron.Value"
 

@@ -33,20 +33,20 @@ Docstrings of the names in `import trihedron as th`. [The Python API](python.md)
 
 ## Track, record, replay
 
-::: trihedron.api.slam.Slam
+::: trihedron.slam.Slam
     options: {members: [track, values, map, trajectory, causal_trajectory, mesh, save, save_map, close]}
-::: trihedron.api.recording.Recording
+::: trihedron.recording.Recording
     options: {members: [topics, metadata, values, frame, image, frames, poses, trajectory, map, mesh, replay]}
-::: trihedron.api.runs.run
-::: trihedron.api.runs.Run
-::: trihedron.api.runs.compare
-::: trihedron.api.camera.Camera
-::: trihedron.api.trajectory.Trajectory
+::: trihedron.runs.run
+::: trihedron.runs.Run
+::: trihedron.runs.compare
+::: trihedron.camera.Camera
+::: trihedron.trajectory.Trajectory
 
 ## Stages and plugins
 
-::: trihedron.api.stages.Slot
-::: trihedron.api.stages.Stage
+::: trihedron.stages.Slot
+::: trihedron.stages.Stage
 ::: trihedron.pipeline.core.registry.register
 ::: trihedron.pipeline.core.errors.TrihedronError
 

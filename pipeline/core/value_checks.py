@@ -24,7 +24,7 @@ CURE = "the file is damaged; record it again"
 
 
 class _Declared(NamedTuple):
-    """What the fields of a value type declare: (field, constraint) in order, and those that hold a camera, whose own fields are checked too."""
+    """Declarations of a value type: (field, constraint) in order, and the fields that hold a camera, whose own fields are checked too."""
 
     constraints: tuple[tuple[str, Any], ...]
     cameras: tuple[str, ...]

@@ -20,14 +20,9 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from trihedron.api.ablations import ablate
-    from trihedron.api.building import Building
-    from trihedron.api.camera import Camera
-    from trihedron.api.recording import Recording
-    from trihedron.api.runs import Run, compare, run
-    from trihedron.api.slam import Slam
-    from trihedron.api.stages import Slot
-    from trihedron.api.trajectory import Trajectory
+    from trihedron.ablations import ablate
+    from trihedron.buildings import Building
+    from trihedron.camera import Camera
     from trihedron.pipeline.core.errors import TrihedronError
     from trihedron.pipeline.core.registry import register
     from trihedron.pipeline.core.types import (
@@ -44,6 +39,11 @@ if TYPE_CHECKING:
         Surface,
         Translation,
     )
+    from trihedron.recording import Recording
+    from trihedron.runs import Run, compare, run
+    from trihedron.slam import Slam
+    from trihedron.stages import Slot
+    from trihedron.trajectory import Trajectory
 
     __version__: str
     dataset: Slot
@@ -74,17 +74,17 @@ _SLOTS = (
     "bundle", "loop", "relocalise", "model", "surface", "building",
 )  # fmt: skip
 _HOMES = {
-    "ablate": "api.ablations",
-    "Building": "api.building",
-    "Camera": "api.camera",
-    "Recording": "api.recording",
-    "Run": "api.runs",
-    "Slam": "api.slam",
-    "Trajectory": "api.trajectory",
+    "ablate": "ablations",
+    "Building": "buildings",
+    "Camera": "camera",
+    "Recording": "recording",
+    "Run": "runs",
+    "Slam": "slam",
+    "Trajectory": "trajectory",
     "TrihedronError": "pipeline.core.errors",
-    "compare": "api.runs",
+    "compare": "runs",
     "register": "pipeline.core.registry",
-    "run": "api.runs",
+    "run": "runs",
     **dict.fromkeys(_TYPES, "pipeline.core.types"),
 }
 
@@ -101,7 +101,7 @@ def __getattr__(name: str) -> Any:
     if name in _HOMES:
         found = getattr(importlib.import_module(f"trihedron.{_HOMES[name]}"), name)
     elif name in _SLOTS:
-        found = importlib.import_module("trihedron.api.stages").Slot(name)
+        found = importlib.import_module("trihedron.stages").Slot(name)
     elif name == "__version__":
         from importlib.metadata import version
 

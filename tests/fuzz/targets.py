@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from trihedron.comparison.mesh_files import read_mesh
 from trihedron.datasets.readers import foxglove_messages
 from trihedron.datasets.readers.association import read_file_list
 from trihedron.datasets.readers.cameras import read_camera_file
@@ -28,7 +29,6 @@ from trihedron.pipeline.record.reader import Recording
 from trihedron.pipeline.record.rescue import recover
 from trihedron.pipeline.record.trajectories import read_trajectory
 from trihedron.pipeline.run.map_file import load_map
-from trihedron.tools.mesh_files import read_mesh
 
 DECLARED = (TrihedronError, UnreadableImage, UnreadableMessage)
 BESIDE = {"associations.txt", "mesh.ply", "mesh.obj", "recovered.mcap"}  # what a target may write beside its input

@@ -6,13 +6,13 @@ import sys
 import numpy as np
 import pytest
 
+from trihedron.comparison.mesh_files import read_mesh
 from trihedron.pipeline.app.cli import main
 from trihedron.pipeline.core.errors import LibraryError
 from trihedron.pipeline.core.libraries import imports_of, library_error
 from trihedron.pipeline.core.types import Camera
 from trihedron.plugins.shared import libraries
 from trihedron.plugins.shared.pycolmap_pose import absolute_pose
-from trihedron.tools.mesh_files import read_mesh
 
 TINY = ["dataset=synthetic", "dataset.width=64", "dataset.height=48", "dataset.length=3"]
 SWEEP = ["-m", *TINY, "outputs=[keypoints]", "keypoints=opencv_orb", "seed=0,1"]

@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from trihedron.comparison.error_budget import rewrite
 from trihedron.pipeline.app.cli import main
 from trihedron.pipeline.app.recorded_run import recorded_config_of
 from trihedron.pipeline.core.config import composed, graph_of
@@ -14,7 +15,6 @@ from trihedron.pipeline.record.codec import Encoder
 from trihedron.pipeline.record.reader import Recording
 from trihedron.pipeline.run.replay import Replay
 from trihedron.pipeline.run.runner import Runner
-from trihedron.tools.error_budget import rewrite
 
 DAMAGED = "the file is damaged; record it again"
 AT = 5  # the frame whose value is changed

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 import trihedron as th
+from trihedron.comparison.building_errors import judged
 from trihedron.datasets.simulation.synthetic import Scene, Synthetic
 from trihedron.pipeline.core.building_geometry import door_swing, doors_on, label_place, wall_pieces
 from trihedron.pipeline.core.errors import LibraryError, TrihedronError
@@ -27,7 +28,6 @@ from trihedron.plugins.building.openings import fit_jambs, widest_gap
 from trihedron.plugins.normals.integral_image import IntegralImage
 from trihedron.plugins.planes.connected_components import ConnectedComponents
 from trihedron.tools.benchmarks import building_benchmark
-from trihedron.tools.benchmarks.building_benchmark import judged
 
 load_plugins()
 LAYOUTS = ("manhattan_layout", "atlanta_layout", "cells")

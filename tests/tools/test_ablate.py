@@ -12,15 +12,7 @@ import html5lib
 import numpy as np
 import pytest
 
-from trihedron.pipeline.app.cli import main
-from trihedron.pipeline.core.errors import DataError, UsageError
-from trihedron.pipeline.core.slots import SLOTS
-from trihedron.pipeline.core.types import Translation
-from trihedron.pipeline.record.reader import Recording
-from trihedron.tools.ablation_differences import Parting, StageErrors, changed_by_code, distance
-from trihedron.tools.ablation_errors import read_errors, write_errors
-from trihedron.tools.ablation_swaps import combinations_of, folder_name, parsed, single_swaps
-from trihedron.tools.ablation_tables import (
+from trihedron.comparison.ablation_tables import (
     Case,
     Variant,
     alternatives_table,
@@ -35,6 +27,14 @@ from trihedron.tools.ablation_tables import (
     sections_of,
     verdicts,
 )
+from trihedron.comparison.frame_errors import read_errors, write_errors
+from trihedron.comparison.partings import Parting, StageErrors, changed_by_code, distance
+from trihedron.comparison.swaps import combinations_of, folder_name, parsed, single_swaps
+from trihedron.pipeline.app.cli import main
+from trihedron.pipeline.core.errors import DataError, UsageError
+from trihedron.pipeline.core.slots import SLOTS
+from trihedron.pipeline.core.types import Translation
+from trihedron.pipeline.record.reader import Recording
 from trihedron.tools.site import write_site
 from trihedron.tools.site_ablations import ablation_page, ablations_of, attribution_bars, charts_of
 

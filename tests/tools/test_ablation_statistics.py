@@ -2,8 +2,8 @@
 
 import pytest
 
+from trihedron.comparison.attribution import shapley_weights
 from trihedron.pipeline.sweep.paired_statistics import half_interval, half_width, holm, p_value, power, repeats_needed
-from trihedron.tools.ablation_statistics import shapley_weights
 
 
 def shapley(worth, players):

@@ -10,6 +10,11 @@ import pytest
 from hydra import compose, initialize_config_module
 
 import trihedron.conf
+from trihedron.comparison import other_programs
+from trihedron.comparison.run_samples import COLUMNS
+from trihedron.comparison.run_tables import WRITERS, as_latex, as_markdown, as_text
+from trihedron.comparison.runs import read_runs, rows_of, verdicts_against
+from trihedron.comparison.verdicts import line_of
 from trihedron.pipeline.app.cli import main
 from trihedron.pipeline.core.config import graph_of, register_configs
 from trihedron.pipeline.core.errors import UsageError
@@ -17,11 +22,6 @@ from trihedron.pipeline.core.geometry import pose_matrix
 from trihedron.pipeline.core.registry import load_plugins
 from trihedron.pipeline.core.types import Trajectory
 from trihedron.pipeline.record.trajectories import write_trajectory
-from trihedron.tools import other_programs
-from trihedron.tools.compare import read_runs, rows_of, verdicts_against
-from trihedron.tools.comparison_table import WRITERS, as_latex, as_markdown, as_text
-from trihedron.tools.comparison_verdicts import COLUMNS
-from trihedron.tools.verdicts import line_of
 
 GRAPHS = Path(trihedron.conf.__file__).parent / "graph"
 SMALL = ["dataset.width=160", "dataset.height=120", "dataset.length=4"]

@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from trihedron.comparison.error_budget import Rerun, remarks
 from trihedron.pipeline.app.cli import main
-from trihedron.tools.error_budget import Rerun, remarks
 
 sys.path.insert(0, str(Path(__file__).parent))
 from faulty_plugins import faulty

@@ -5,11 +5,11 @@ from pathlib import Path
 
 import pytest
 
+from trihedron.comparison import fold_measures
+from trihedron.comparison.building_errors import judged_run
+from trihedron.comparison.fold_measures import COLUMNS, of_folds, of_surface, of_surface_figures
 from trihedron.pipeline.app.cli import main
-from trihedron.tools import fold_measures
-from trihedron.tools.benchmarks.building_benchmark import judged_run
 from trihedron.tools.evaluate_surface import SURFACE
-from trihedron.tools.fold_measures import COLUMNS, of_folds, of_surface, of_surface_figures
 
 SEEDS = Path(__file__).parents[1] / "fuzz" / "seeds"
 

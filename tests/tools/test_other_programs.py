@@ -8,12 +8,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from trihedron.comparison.runs import read_runs, read_trajectories
 from trihedron.datasets.readers.icl_nuim import reflect
 from trihedron.pipeline.app.cli import main
 from trihedron.pipeline.core.errors import DataError, UsageError
 from trihedron.pipeline.core.types import Trajectory
 from trihedron.pipeline.record.trajectories import read_trajectory, write_trajectory
-from trihedron.tools.compare import read_runs, read_trajectories
 
 SMALL = ["dataset.width=160", "dataset.height=120", "dataset.length=40"]
 

@@ -7,12 +7,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from trihedron.comparison.axes import common_world, read_runs, residuals_deg
 from trihedron.pipeline.app.cli import main
 from trihedron.pipeline.core import registry
 from trihedron.pipeline.core.lie import exp_so3
 from trihedron.pipeline.core.types import ManhattanFrame, Normals
 from trihedron.plugins.shared.manhattan_frames_kernels import CUBE
-from trihedron.tools.benchmarks.rotation_comparison import common_world, read_runs, residuals_deg
 
 SMALL = ["dataset=synthetic", "dataset.width=160", "dataset.height=120", "dataset.length=5", "outputs=[manhattan]"]
 

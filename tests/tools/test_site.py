@@ -12,11 +12,11 @@ import html5lib
 import pytest
 import yaml
 
+from trihedron.comparison.runs import read_runs
 from trihedron.pipeline.app.cli import main as trihedron
 from trihedron.pipeline.core.errors import DataError
 from trihedron.pipeline.record.reader import Recording
 from trihedron.tools import site
-from trihedron.tools.compare import read_runs
 
 SMALL = ["dataset.width=160", "dataset.height=120", "dataset.length=12", "outputs=[trajectory,surface]"]
 FAR = "/data/tum_fr3_structure_notexture_far"

@@ -7,13 +7,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from trihedron.comparison.partings import StageErrors
+from trihedron.comparison.stage_measures import MEASURES, Seen, measured
 from trihedron.pipeline.core.geometry import pose_matrix
 from trihedron.pipeline.core.lie import exp_so3
 from trihedron.pipeline.core.types import LineSegments, Normals
 from trihedron.plugins.map.covisibility import Covisibility
 from trihedron.plugins.matches.local_map import LocalMap
-from trihedron.tools.ablation_differences import StageErrors
-from trihedron.tools.stage_measures import MEASURES, Seen, measured
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "plugins"))
 from landmark_world import World, camera_at, pose_of, rotation_of, tracks_of, translation_of

@@ -9,6 +9,10 @@ import numpy as np
 import pytest
 import trimesh
 
+from trihedron.comparison.mesh_distance import FAR_M, NearestTriangle, sampled
+from trihedron.comparison.mesh_files import read_mesh
+from trihedron.comparison.surface_errors import judged
+from trihedron.comparison.surface_truth import Truth, truth_of
 from trihedron.datasets.simulation.synthetic import Synthetic
 from trihedron.pipeline.core.errors import DataError, UsageError
 from trihedron.pipeline.core.geometry import pose_matrix
@@ -16,11 +20,7 @@ from trihedron.pipeline.core.types import Camera, Frame, Surface, Trajectory
 from trihedron.pipeline.record.writer import RecordingWriter
 from trihedron.plugins.surface.ply import write_ply
 from trihedron.tools import evaluate_surface, export, export_picture
-from trihedron.tools.evaluate_surface import judged
 from trihedron.tools.export_surface import upright
-from trihedron.tools.mesh_distance import FAR_M, NearestTriangle, sampled
-from trihedron.tools.mesh_files import read_mesh
-from trihedron.tools.surface_truth import Truth, truth_of
 
 SQUARE = np.array([[0, 0, 0], [2, 0, 0], [2, 1, 0], [0, 1, 0]], float)
 TWO = np.array([[0, 1, 2], [0, 2, 3]], np.int32)

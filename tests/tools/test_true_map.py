@@ -3,14 +3,14 @@
 import numpy as np
 import pytest
 
+from trihedron.comparison.error_budget import recomputed, rewrite, true_poses
+from trihedron.comparison.true_map import true_map
 from trihedron.pipeline.app.cli import main
 from trihedron.pipeline.core.geometry import pose_matrix, rotation_from_quaternion
 from trihedron.pipeline.core.linalg import matmul
 from trihedron.pipeline.core.types import Map
 from trihedron.pipeline.record.reader import Recording
 from trihedron.plugins.mapping.correction import transform_landmarks
-from trihedron.tools.error_budget import recomputed, rewrite, true_poses
-from trihedron.tools.true_map import true_map
 
 TABLES = ("keyframes", "points", "lines", "planes", "point_observations", "line_observations", "plane_observations")
 MICROMETRE = 2e-6  # positions are stored in steps of one

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from scipy.stats import norm, t
 
-from trihedron.tools.block_bootstrap import block_length, resampled
-from trihedron.tools.verdicts import Column, Sample, Verdict, line_of, named, recordings_needed, verdicts_of
+from trihedron.comparison.block_bootstrap import block_length, resampled
+from trihedron.comparison.verdicts import Column, Sample, Verdict, line_of, named, recordings_needed, verdicts_of
 
 ATE = {"ATE mm": Column(2)}
 DIFFERENCE = [-1.0, 1.0]

@@ -29,10 +29,11 @@ from trihedron.pipeline.core.config import default_plugins
 from trihedron.pipeline.core.errors import TrihedronError, UsageError, did_you_mean
 from trihedron.pipeline.core.geometry import invert, transform
 from trihedron.pipeline.core.registry import load_plugins, options_of, parameters_of_method, plugin_class, plugins_of
+from trihedron.pipeline.core.text_table import table
 from trihedron.pipeline.core.types import F64, I32, Bool, Frame, Keypoints, LineSegments, Normals, Planes
 from trihedron.pipeline.run.scheduler import single_threaded_libraries
 from trihedron.plugins.shared.feature_matching import mutual_matches
-from trihedron.tools.arguments import Parser, table
+from trihedron.tools.arguments import Parser
 
 SCENES: dict[str, dict[str, bool]] = {"room": {}, "plain": {"texture": False}, "slanted": {"slanted": True}}
 APART = 5  # frames of a pair

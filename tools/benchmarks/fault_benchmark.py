@@ -18,7 +18,8 @@ from pathlib import Path
 import numpy as np
 
 from trihedron.pipeline.core.errors import UsageError
-from trihedron.tools.arguments import Parser, table
+from trihedron.pipeline.core.text_table import table
+from trihedron.tools.arguments import Parser
 from trihedron.tools.benchmarks.sensor_benchmark import Judged, chosen, run_and_judge
 
 LENGTH = 90  # frames of the data set underneath where the case states none

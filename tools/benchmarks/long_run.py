@@ -23,12 +23,13 @@ import numpy as np
 from trihedron.pipeline.core.errors import UsageError
 from trihedron.pipeline.core.graph import Graph
 from trihedron.pipeline.core.slots import output_of
+from trihedron.pipeline.core.text_table import table
 from trihedron.pipeline.core.types import F64, OK, Frame, Map, Pose, Trajectory
 from trihedron.pipeline.record.codec import TIMING_TOPIC, timing_of
 from trihedron.pipeline.record.reader import Recording
 from trihedron.pipeline.record.writer import RecordingWriter
 from trihedron.pipeline.run.runner import Runner
-from trihedron.tools.arguments import Parser, table
+from trihedron.tools.arguments import Parser
 from trihedron.tools.benchmarks.map_benchmark import FEATURES, bytes_of, promises
 from trihedron.tools.benchmarks.recording_benchmark import graph_of_words
 

@@ -26,9 +26,10 @@ import numpy as np
 from trihedron.pipeline.core.errors import UsageError, did_you_mean
 from trihedron.pipeline.core.lie import exp_so3, log_so3
 from trihedron.pipeline.core.registry import load_plugins, plugin_class, plugins_of
+from trihedron.pipeline.core.text_table import table
 from trihedron.pipeline.core.types import F64, ManhattanFrame
 from trihedron.plugins.shared.manhattan_frames_kernels import CUBE
-from trihedron.tools.arguments import Parser, table
+from trihedron.tools.arguments import Parser
 from trihedron.tools.benchmarks import manhattan_views as seen
 
 START_DEG, RIGHT_DEG = 10.0, 1.0

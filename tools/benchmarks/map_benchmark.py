@@ -25,12 +25,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from trihedron.pipeline.core.errors import UsageError
+from trihedron.pipeline.core.text_table import table
 from trihedron.pipeline.core.types import F64, LOST, Map, Pose, Table, Trajectory
 from trihedron.pipeline.record.codec import TIMING_TOPIC, timing_of
 from trihedron.pipeline.record.reader import Recording
 from trihedron.pipeline.record.trajectories import attached_truth, read_trajectory
 from trihedron.pipeline.run.metrics import associate, relative_errors
-from trihedron.tools.arguments import Parser, table
+from trihedron.tools.arguments import Parser
 
 LOOPS = ("none", "planes", "appearance")
 ROOMS = {"built-in room": {}, "built-in room, bare": {"texture": "false"}}

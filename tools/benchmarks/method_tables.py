@@ -22,14 +22,15 @@ from typing import Any
 
 import yaml
 
+from trihedron.comparison.attribution import nees_of
+from trihedron.comparison.fold_measures import Measures
+from trihedron.comparison.runs import judge_surfaces, run_folders
 from trihedron.pipeline.core.errors import DataError, TrihedronError
+from trihedron.pipeline.core.text_table import table
 from trihedron.pipeline.run.results import METRICS, TIMING
 from trihedron.pipeline.sweep.sweep import GRAPH_KEYS, is_graph_word
-from trihedron.tools.ablation_statistics import nees_of
-from trihedron.tools.arguments import Parser, table
+from trihedron.tools.arguments import Parser
 from trihedron.tools.benchmarks import own_measures
-from trihedron.tools.compare import judge_surfaces, run_folders
-from trihedron.tools.fold_measures import Measures
 
 DEFAULT = "default"  # the change of a run that changes nothing
 Row = dict[str, Any]

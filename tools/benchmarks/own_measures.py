@@ -11,16 +11,16 @@ from pathlib import Path
 
 import numpy as np
 
+from trihedron.comparison.ablation import Options, ablate
+from trihedron.comparison.ablation_tables import FIGURES
+from trihedron.comparison.fold_measures import COLUMNS, Measures, of_building, of_surface
+from trihedron.comparison.partings import FALSE_AXES, OPEN_LOOP
+from trihedron.comparison.stage_measures import MEASURES
+from trihedron.comparison.surface_errors import RECORDING
 from trihedron.pipeline.core.config import Feedback
 from trihedron.pipeline.core.errors import DataError
 from trihedron.pipeline.core.slots import FOLDS, SLOTS, output_of, strip_none
 from trihedron.pipeline.core.types import ManhattanFrame, Pose
-from trihedron.tools.ablate import Options, ablate
-from trihedron.tools.ablation_differences import FALSE_AXES, OPEN_LOOP
-from trihedron.tools.ablation_tables import FIGURES
-from trihedron.tools.evaluate_surface import RECORDING
-from trihedron.tools.fold_measures import COLUMNS, Measures, of_building, of_surface
-from trihedron.tools.stage_measures import MEASURES
 
 FOLDER = "open_loop"
 MEASURED = [slot for slot in SLOTS if slot not in FOLDS and strip_none(output_of(slot)) in {*MEASURES, ManhattanFrame} - {Pose}]

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from trihedron.pipeline.core.errors import DataError
-from trihedron.tools.arguments import table
+from trihedron.pipeline.core.text_table import table
 
 SLOWER = 1.1  # times as long as then; less is the noise of a run
 TINY_MS = 0.2  # below which a stage's share of the noise is too large to tell

@@ -17,12 +17,13 @@ import numpy as np
 
 from trihedron.datasets.simulation.synthetic import Synthetic
 from trihedron.pipeline.core.errors import UsageError
+from trihedron.pipeline.core.text_table import table
 from trihedron.pipeline.core.types import U8
 from trihedron.plugins.keypoints.orb import brief_tests, image_pyramid
 from trihedron.plugins.keypoints.orb_kernels import fast_corners, oriented_corners, steered_brief
 from trihedron.plugins.lines.lsd_kernels import line_support_segments
 from trihedron.plugins.shared.feature_matching import match_near
-from trihedron.tools.arguments import Parser, table
+from trihedron.tools.arguments import Parser
 
 CALLS = range(2, 10_001)
 MARGIN, SCALE, LEVELS = 19, 1.2, 8

@@ -22,12 +22,13 @@ import numpy as np
 
 from trihedron.pipeline.core.graph import Graph
 from trihedron.pipeline.core.slots import output_of
+from trihedron.pipeline.core.text_table import table
 from trihedron.pipeline.core.types import Frame, Value
 from trihedron.pipeline.record.codec import FRAMES_TOPIC
 from trihedron.pipeline.record.reader import Recording
 from trihedron.pipeline.record.writer import RecordingWriter
 from trihedron.pipeline.run.runner import Runner
-from trihedron.tools.arguments import Parser, table
+from trihedron.tools.arguments import Parser
 from trihedron.tools.topics import topics_of
 
 MOST_SHARE, MOST_KB, LEAST_FRAMES_S, MOST_OPEN_S = 0.08, 170.0, 60.0, 0.5

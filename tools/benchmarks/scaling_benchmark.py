@@ -24,10 +24,11 @@ import numpy as np
 
 from trihedron.pipeline.app.recorded_values import last_map
 from trihedron.pipeline.core.errors import DataError, UsageError
+from trihedron.pipeline.core.text_table import table
 from trihedron.pipeline.core.types import Map
 from trihedron.pipeline.record.codec import TIMING_TOPIC, timing_of
 from trihedron.pipeline.record.reader import Recording
-from trihedron.tools.arguments import Parser, table
+from trihedron.tools.arguments import Parser
 from trihedron.tools.benchmark import machine, measure, reference_ms, sample_images
 from trihedron.tools.benchmarks.map_benchmark import FEATURES
 from trihedron.tools.benchmarks.scaling_plot import plot

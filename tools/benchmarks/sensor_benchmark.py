@@ -21,7 +21,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from trihedron.pipeline.core.errors import DataError, UsageError, did_you_mean
-from trihedron.tools.arguments import Parser, table
+from trihedron.pipeline.core.text_table import table
+from trihedron.tools.arguments import Parser
 
 if TYPE_CHECKING:
     from trihedron.pipeline.run.status_check import FrameErrors, StatusCheck

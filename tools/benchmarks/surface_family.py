@@ -20,9 +20,10 @@ import numpy as np
 
 from trihedron.pipeline.core.errors import UsageError, did_you_mean
 from trihedron.pipeline.core.registry import load_plugins, plugin_class, plugins_of
+from trihedron.pipeline.core.text_table import table
 from trihedron.pipeline.core.types import Map, Surface
 from trihedron.pipeline.record.reader import Recording
-from trihedron.tools.arguments import Parser, table
+from trihedron.tools.arguments import Parser
 
 SCENE = ("dataset=synthetic", "dataset.curved=true")
 MESHES = 2  # the faster one counts: other programs slow down the other
@@ -67,8 +68,8 @@ def tracked(out: Path, frames: int) -> Path:
 
 def measured(run: Path, names: list[str]) -> dict[str, Any]:
     """The figures of each surface over the recording of a run."""
+    from trihedron.comparison.surface_errors import judged, prepared
     from trihedron.pipeline.run.scheduler import single_threaded_libraries
-    from trihedron.tools.evaluate_surface import judged, prepared
 
     recording = Recording(run / "run.mcap")
     inputs = {topic: {value.index: value for value in recording.values(topic)} for topic in ("planes", "rotation", "pose", "map")}

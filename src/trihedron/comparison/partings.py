@@ -8,6 +8,9 @@ from typing import Any
 
 import numpy as np
 
+from trihedron.comparison.error_budget import true_poses
+from trihedron.comparison.stage_measures import COLUMNS, Seen, measured
+from trihedron.comparison.value_differences import common_frames, difference, differing
 from trihedron.pipeline.core.errors import DataError
 from trihedron.pipeline.core.geometry import nearest_rotation
 from trihedron.pipeline.core.types import F64, LOST, ManhattanFrame, Pose, Rotation, Translation, Value
@@ -15,9 +18,6 @@ from trihedron.pipeline.record.reader import Recording
 from trihedron.pipeline.run.metrics import rotation_angles_deg
 from trihedron.pipeline.run.replay import RECORDED
 from trihedron.plugins.shared.manhattan_frames_kernels import nearest_equivalent
-from trihedron.tools.diff import common_frames, difference, differing
-from trihedron.tools.error_budget import true_poses
-from trihedron.tools.stage_measures import COLUMNS, Seen, measured
 
 MEASURED = ("pose", "translation", "rotation", "manhattan")  # topics with a distance of two values; the first that is there finds the worst
 OPEN_LOOP = ("axes deg", "rotation deg", "translation mm", *COLUMNS)  # columns of the errors of single stages

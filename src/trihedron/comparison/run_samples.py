@@ -7,14 +7,14 @@ from pathlib import Path
 
 import numpy as np
 
+from trihedron.comparison import other_programs
+from trihedron.comparison.run_tables import FIGURES
+from trihedron.comparison.verdicts import Column, Sample
 from trihedron.pipeline.core.errors import DataError
 from trihedron.pipeline.core.types import F64
 from trihedron.pipeline.record.trajectories import read_trajectory
 from trihedron.pipeline.run.metrics import I64, frame_errors
 from trihedron.pipeline.run.results import TRAJECTORY
-from trihedron.tools import other_programs
-from trihedron.tools.comparison_table import FIGURES
-from trihedron.tools.verdicts import Column, Sample
 
 ERRORS = {"ATE mm": "ate_rmse_m", "RPE 1 s mm": "rpe_second_rmse_m", "RPE 1 s deg": "rpe_second_rmse_deg"}  # column -> name in the metrics
 COLUMNS = {name: Column(figure.decimals, figure.more, 2 if name in ERRORS else 0) for name, figure in FIGURES.items()}

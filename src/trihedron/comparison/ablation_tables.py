@@ -10,17 +10,17 @@ from typing import Any
 
 import numpy as np
 
+from trihedron.comparison.attribution import shapley_weights
+from trihedron.comparison.block_bootstrap import resampled
+from trihedron.comparison.fold_measures import COLUMNS as OF_FOLDS
+from trihedron.comparison.partings import OPEN_LOOP, Parting
+from trihedron.comparison.stage_measures import COLUMNS as MEASURED
+from trihedron.comparison.swaps import AS_RECORDED, Combination
+from trihedron.comparison.verdicts import NOTE, VERDICTS, Column, Sample, Verdict, line_of, verdicts_of
 from trihedron.pipeline.core.config import Feedback
+from trihedron.pipeline.core.text_table import table
 from trihedron.pipeline.core.types import F64
 from trihedron.pipeline.sweep.paired_statistics import CONFIDENCE, half_interval, half_width
-from trihedron.tools.ablation_differences import OPEN_LOOP, Parting
-from trihedron.tools.ablation_statistics import shapley_weights
-from trihedron.tools.ablation_swaps import AS_RECORDED, Combination
-from trihedron.tools.arguments import table
-from trihedron.tools.block_bootstrap import resampled
-from trihedron.tools.fold_measures import COLUMNS as OF_FOLDS
-from trihedron.tools.stage_measures import COLUMNS as MEASURED
-from trihedron.tools.verdicts import NOTE, VERDICTS, Column, Sample, Verdict, line_of, verdicts_of
 
 RESULT = "ablation.json"
 NEES = "NEES"

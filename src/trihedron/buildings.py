@@ -115,7 +115,7 @@ class Building:
 
     @property
     def note(self) -> str:
-        """What the plan lacks; empty when nothing."""
+        """Sentences on what the plan lacks; empty when nothing."""
         return self.plan.note
 
     @cached_property

@@ -7,11 +7,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from trihedron.api.runs import Run, as_table
-from trihedron.api.words import words_of
-from trihedron.tools.ablate import ablate as computed
-from trihedron.tools.ablate import options_of
-from trihedron.tools.ablation_tables import as_json, as_text, lines_of, sections_of, verdicts
+from trihedron.comparison.ablation import ablate as computed
+from trihedron.comparison.ablation import options_of
+from trihedron.comparison.ablation_tables import as_json, as_text, lines_of, sections_of, verdicts
+from trihedron.runs import Run, as_table
+from trihedron.words import words_of
 
 
 @dataclass(frozen=True)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 
+from trihedron.comparison.swaps import Combination
 from trihedron.pipeline.app.alternatives import Alternatives
 from trihedron.pipeline.app.execute import RECORDING
 from trihedron.pipeline.core.errors import printable
@@ -12,7 +13,6 @@ from trihedron.pipeline.run.replay import RECORDED
 from trihedron.pipeline.run.side_by_side import SideBySide, users_of
 from trihedron.pipeline.sweep.jobs import DONE
 from trihedron.pipeline.sweep.preview import AGAIN, TO_RUN
-from trihedron.tools.ablation_swaps import Combination
 
 
 def preview(computing: Alternatives, combinations: Sequence[Combination], folders: Sequence[Path], done: bool) -> str:

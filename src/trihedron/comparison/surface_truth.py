@@ -7,9 +7,9 @@ from typing import Any, Protocol
 
 import numpy as np
 
+from trihedron.comparison.mesh_distance import FAR_M, NearestTriangle
 from trihedron.pipeline.core.errors import DataError
 from trihedron.pipeline.core.types import F64, Bool, Camera, Trajectory
-from trihedron.tools.mesh_distance import FAR_M, NearestTriangle
 
 VIEWS = 100  # frames, evenly chosen, whose pixels say what was seen
 PIXEL_STEP = 4

@@ -18,13 +18,11 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any
 
-from trihedron.api.building import Building
-from trihedron.api.camera import Camera
-from trihedron.api.images import Frames, camera_of, stamp_of
-from trihedron.api.trajectory import Trajectory
-from trihedron.api.words import words_of
+from trihedron.buildings import Building
+from trihedron.camera import Camera
 from trihedron.datasets.readers.cameras import Calibration
 from trihedron.datasets.simulation.synthetic import Synthetic
+from trihedron.images import Frames, camera_of, stamp_of
 from trihedron.pipeline.app.compilation import compile_once
 from trihedron.pipeline.app.execute import RECORDING, metadata_of, recorded_topics, remembered_of, source_of, write_files, write_models
 from trihedron.pipeline.app.viewers import Viewer, opened_viewer
@@ -43,6 +41,8 @@ from trihedron.pipeline.run.run_folder import held, write_configuration
 from trihedron.pipeline.run.runner import Runner, Step
 from trihedron.pipeline.run.sinks import MemorySink, Sink
 from trihedron.pipeline.run.warm_up import WARM_UP_FRAMES, compilation_reported, warm_up
+from trihedron.trajectory import Trajectory
+from trihedron.words import words_of
 
 REFUSED = ("replay", "only", "live", "real_time", "save_map", "sequences")  # root keys of a run that make no sense for pushed frames
 WARM_UP_PX = 640  # the largest width of the images of the warm-up

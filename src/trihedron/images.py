@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from trihedron.api.camera import Camera
+from trihedron.camera import Camera
 from trihedron.datasets.readers.cameras import Calibration
 from trihedron.datasets.readers.images import metres
 from trihedron.pipeline.core import types

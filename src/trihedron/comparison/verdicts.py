@@ -16,9 +16,9 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from trihedron.comparison.block_bootstrap import power_mean, resampled
 from trihedron.pipeline.core.types import F64
 from trihedron.pipeline.sweep.paired_statistics import LEVEL, MOST_REPEATS, POWER, half_width, holm, p_value, power, repeats_needed
-from trihedron.tools.block_bootstrap import power_mean, resampled
 
 SMALL_SHARE = 0.05  # of the first alternative's figure: the difference that further recordings would show
 ROUNDING = 1e-12  # of a figure: less is no difference, and no spread

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from trihedron.comparison.axes import FALSE_DEG, RIGHT_DEG, Run, config_of, in_view
 from trihedron.pipeline.app.recorded_run import composed_run
 from trihedron.pipeline.app.recorded_values import frames_of, references_of
 from trihedron.pipeline.core.config import make_plugin
@@ -16,7 +17,6 @@ from trihedron.pipeline.core.lie import rotation_angle_deg
 from trihedron.pipeline.core.types import F64, Normals
 from trihedron.pipeline.record.reader import Recording
 from trihedron.plugins.shared.manhattan_frames_kernels import nearest_equivalent
-from trihedron.tools.benchmarks import rotation_comparison as comparison
 
 AXIS_COLORS = ("tab:red", "tab:green", "tab:blue")
 NORMAL_STEP = 3  # every third normal is drawn, in both directions of the grid
@@ -26,18 +26,18 @@ RING: dict[str, Any] = {"marker": "o", "markersize": 13, "fillstyle": "none", "m
 MARKERS = "os^D"  # of several frames
 
 
-def errors_figure(runs: Sequence[comparison.Run], errors_deg: Sequence[F64], path: Path) -> None:
+def errors_figure(runs: Sequence[Run], errors_deg: Sequence[F64], path: Path) -> None:
     """A row for each estimator: its error (n,) by frame, false claims in red, frames without a claim marked below. Writes a PNG."""
     figure = _figure(10.0, 0.6 + 1.1 * len(runs))
     axes: Any = np.atleast_1d(figure.subplots(len(runs), 1, sharex=True, sharey=True))
     for run, errors, ax in zip(runs, errors_deg, axes):
         numbers = np.array([value.index for value in run.found])
         error = np.clip(errors, LEAST_DEG, MOST_DEG)
-        false, silent = error > comparison.FALSE_DEG, np.isnan(error)
+        false, silent = error > FALSE_DEG, np.isnan(error)
         ax.plot(numbers, error, ".-", color="tab:blue", markersize=2, linewidth=0.7)
         ax.plot(numbers[false], error[false], "o", color="tab:red", markersize=3, label="more than 3° off")
         ax.plot(numbers[silent], np.full(silent.sum(), 0.04), "|", color="0.45", transform=ax.get_xaxis_transform(), label="no claim")
-        ax.axhline(comparison.RIGHT_DEG, color="0.6", linewidth=0.7, linestyle="--")
+        ax.axhline(RIGHT_DEG, color="0.6", linewidth=0.7, linestyle="--")
         ax.set_yscale("log")
         ax.set_ylim(LEAST_DEG, MOST_DEG)
         ax.set_yticks([0.1, 1.0, 10.0], ["0.1", "1", "10"])
@@ -49,7 +49,7 @@ def errors_figure(runs: Sequence[comparison.Run], errors_deg: Sequence[F64], pat
     figure.savefig(path, dpi=100)
 
 
-def sphere_figure(runs: Sequence[comparison.Run], world: F64, frame: int, path: Path) -> None:
+def sphere_figure(runs: Sequence[Run], world: F64, frame: int, path: Path) -> None:
     """A half sphere for each estimator, in Lambert's equal-area projection along the camera's axis, opposite directions folded together: normals,
     planes and lines of the frame, the true axes and those it estimates. Writes a PNG."""
     from matplotlib.lines import Line2D
@@ -103,10 +103,10 @@ def _draw_directions(ax: Any, features: dict[str, Any]) -> None:
         ax.scatter(x, y, s=8.0 + 0.15 * np.sqrt(planes.pixels), marker="s", alpha=0.8, color="tab:purple", linewidth=0, label="planes")
 
 
-def _draw_axes(ax: Any, run: comparison.Run, row: int, truth: F64) -> str:
+def _draw_axes(ax: Any, run: Run, row: int, truth: F64) -> str:
     """Rings around the axes of each frame in view, coloured as the nearest true axis; returns what was claimed and how far off that is."""
     value, errors = run.found[row], []
-    for number, R in enumerate(comparison.in_view(value)[0]):
+    for number, R in enumerate(in_view(value)[0]):
         named = nearest_equivalent(R, truth)
         errors.append(rotation_angle_deg(truth.T @ named))
         for axis, color in zip(named.T, AXIS_COLORS):
@@ -126,7 +126,7 @@ def _disc(directions: F64) -> F64:
 
 def _features(recording: Recording, frame: int) -> dict[str, Any]:
     """Normals, planes and segments of a frame, from the run or what it replayed; the normals computed again where they were not recorded."""
-    source = comparison.config_of(recording).get("replay")
+    source = config_of(recording).get("replay")
     sources = [recording, *([Recording(source)] if source and Path(source).exists() else [])]
     found: dict[str, Any] = {}
     for topic in ("normals", "planes", "segments"):

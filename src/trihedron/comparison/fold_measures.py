@@ -10,9 +10,9 @@ from typing import Any
 
 import numpy as np
 
+from trihedron.comparison.surface_errors import FIGURES, SURFACE, evaluate_files
 from trihedron.pipeline.core.errors import DataError
 from trihedron.pipeline.core.files import file_sha256
-from trihedron.tools.evaluate_surface import FIGURES, SURFACE, evaluate_files
 
 BUILDING = {  # column -> key of the figures, the value where it is perfect, factor
     "walls mm": ("wall_m", 0.0, 1e3),
@@ -68,7 +68,7 @@ def of_surface_figures(figures: Mapping[str, Any]) -> Measures:
 def of_building(run: Path, beside: Path | None = None) -> Measures:
     """`walls mm`: median offset of walls from the true ones. `missed rooms %`, `false rooms %`: of the true ones, of those that are found.
     `beside` has the trajectory where the run folder has none. Raises DataError where the data set has no true plan."""
-    from trihedron.tools.benchmarks.building_benchmark import judged_run
+    from trihedron.comparison.building_errors import judged_run
 
     figures = judged_run(run, beside=beside)
     found = {name: factor * abs(figures[key] - perfect) for name, (key, perfect, factor) in BUILDING.items()}

@@ -11,14 +11,14 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-from trihedron.api.building import Building
-from trihedron.api.recording import Recording
-from trihedron.api.trajectory import Trajectory
-from trihedron.api.words import words_of
+from trihedron.buildings import Building
+from trihedron.comparison.runs import read_runs, rows_of
 from trihedron.pipeline.app.cli import RUN_FLAGS, run_once
 from trihedron.pipeline.core.errors import UsageError
 from trihedron.pipeline.run.results import dotted
-from trihedron.tools import compare as comparison
+from trihedron.recording import Recording
+from trihedron.trajectory import Trajectory
+from trihedron.words import words_of
 
 
 @dataclass(frozen=True)
@@ -75,7 +75,7 @@ def compare(folders: Iterable[str | Path | Run] | str | Path, baseline: str = ""
     Returns a pandas DataFrame where pandas is installed, else a list of dicts. Raises TrihedronError where a folder holds no runs."""
     given: Sequence[Any] = [folders] if isinstance(folders, (str, Path, Run)) else list(folders)
     paths = [item.folder if isinstance(item, Run) else Path(item).expanduser() for item in given]
-    rows = comparison.rows_of([found for path in paths for found in comparison.read_runs(path)], baseline)
+    rows = rows_of([found for path in paths for found in read_runs(path)], baseline)
     return as_table([_flat(row) for row in rows])
 
 

@@ -10,8 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from trihedron.api.images import Frames, camera_of
 from trihedron.datasets.readers.cameras import Calibration
+from trihedron.images import Frames, camera_of
 from trihedron.pipeline.core import types
 from trihedron.pipeline.core.config import default_plugins
 from trihedron.pipeline.core.errors import ConfigError, UsageError, did_you_mean

@@ -8,18 +8,18 @@ from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from trihedron.api.building import Building
-from trihedron.api.trajectory import Trajectory
-from trihedron.api.words import words_of
+from trihedron.buildings import Building
 from trihedron.pipeline.app.recorded_values import frames_of, last_map, opened, poses_of, references_of, trajectory_of
 from trihedron.pipeline.core.errors import RecordingError, UsageError, did_you_mean
 from trihedron.pipeline.core.types import Frame, Map, Pose, Surface, Value
 from trihedron.pipeline.record import reader
 from trihedron.pipeline.record.codec import FRAMES_TOPIC
-from trihedron.tools.building import building_of
+from trihedron.recorded_building import building_of
+from trihedron.trajectory import Trajectory
+from trihedron.words import words_of
 
 if TYPE_CHECKING:
-    from trihedron.api.ablations import Ablation
+    from trihedron.ablations import Ablation
 
 
 class Recording:
@@ -111,7 +111,7 @@ class Recording:
             options: as of `Slam`, for example `manhattan="branch_and_bound"`.
 
         Raises TrihedronError, for example where a stage needs images that the recording does not embed."""
-        from trihedron.api.runs import run
+        from trihedron.runs import run
 
         if isinstance(only, str):
             raise UsageError("only", f"is the text '{only}'", f'give a list, only=["{only}"]')
@@ -124,7 +124,7 @@ class Recording:
 
     def ablate(self, *swaps: str, out: str | Path, feedback: str = "new", budget: bool = False, **options: Any) -> Ablation:
         """Swap stages and compute again only what follows from them; arguments and result are those of `trihedron.ablate`."""
-        from trihedron.api.ablations import ablate
+        from trihedron.ablations import ablate
 
         return ablate(self.path, *swaps, out=out, feedback=feedback, budget=budget, **options)
 

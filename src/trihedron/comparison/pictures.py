@@ -1,0 +1,191 @@
+"""Pictures of a frame with what a run found in it, of one run or of two side by side."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from trihedron.pipeline.core.types import Camera, Map, Planes
+    from trihedron.pipeline.record.reader import Recording
+
+AXIS_COLORS = ((220, 50, 50), (50, 170, 50), (60, 90, 230))
+AXIS_LENGTH_PX = 60
+SIZE_INCHES, DPI = (16, 6.4), 120  # 1920 × 768 px
+FRAMED = (0.5, 99.5)  # percentiles of the landmarks between two edges of the map, which holds 98 % of them
+MARGIN_M = 0.2
+PAIR_COLORS = ("#0072b2", "#d55e00")  # of two runs; told apart by the colour-blind (Okabe and Ito)
+
+
+def draw(path: str, frame: int, out: Path) -> None:
+    """Image with features left, map from above right. Raises RecordingError when the recording lacks poses or the frame."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    from matplotlib import pyplot
+
+    from trihedron.pipeline.app.recorded_values import opened
+    from trihedron.pipeline.core.errors import RecordingError
+
+    recording = opened(Path(path))
+    poses = list(recording.values("pose"))
+    if not poses:
+        raise RecordingError(path, "holds no poses", "record a run with outputs=[trajectory]")
+    numbers = [pose.index for pose in poses]
+    frame = numbers[len(numbers) // 2] if frame < 0 else frame
+    if frame not in numbers:
+        raise RecordingError(path, f"has no frame {frame}", f"give one of {numbers[0]}..{numbers[-1]}")
+    figure, (left, right) = pyplot.subplots(1, 2, figsize=SIZE_INCHES, width_ratios=[4, 3], layout="constrained")
+    left.imshow(_annotated([recording], frame))
+    left.set_axis_off()
+    left.set_title(f"frame {frame}: planes, 3D lines, key points, Manhattan axes", fontsize=10)
+    _map_from_above(right, recording, poses)
+    figure.savefig(out, dpi=DPI)
+    pyplot.close(figure)
+
+
+def draw_pair(sides: Sequence[tuple[str, Sequence[Recording]]], frame: int, out: Path) -> None:
+    """Draw one frame of two runs beside each other, with both paths from above. A side is a title and the recordings in which its topics are looked
+    up, the first that has one; the last holds the images."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    from matplotlib import pyplot
+
+    figure, axes = pyplot.subplots(1, 3, figsize=(15, 4.2), layout="constrained")
+    for side, (title, recordings) in zip(axes, sides):
+        side.imshow(_annotated(recordings, frame))
+        side.set_axis_off()
+        side.set_title(f"frame {frame}: {title}", fontsize=10)
+    for (title, recordings), color, style in zip(sides, PAIR_COLORS, ("-", "--")):
+        _path_from_above(axes[2], _values(recordings, "pose"), frame, title, color, style)
+    axes[2].set_aspect("equal", adjustable="datalim")
+    axes[2].set_xlabel("x [m]")
+    axes[2].set_ylabel("z [m]")
+    axes[2].legend(loc="best", fontsize=8)
+    figure.savefig(out, dpi=80)
+    pyplot.close(figure)
+
+
+def _path_from_above(axes: Any, poses: Iterable[Any], frame: int, title: str, color: str, style: str) -> None:
+    """The path, with a mark at a frame."""
+    import numpy as np
+
+    tracked = [pose for pose in poses if pose.status != "lost"]
+    path = np.array([pose.T_world_camera[:3, 3] for pose in tracked]).reshape(-1, 3)
+    axes.plot(path[:, 0], path[:, 2], style, color=color, linewidth=1.5, label=title)
+    here = path[[pose.index == frame for pose in tracked]]
+    axes.plot(here[:, 0], here[:, 2], "o", color=color, markersize=7, markerfacecolor="none")
+
+
+def _values(recordings: Sequence[Recording], topic: str) -> Iterator[Any]:
+    """The values of a topic in the first recording that has it."""
+    return next((recording.values(topic) for recording in recordings if topic in recording.topics), iter(()))
+
+
+def _annotated(recordings: Sequence[Recording], frame: int) -> Any:
+    """The frame's image (the nearest one that was kept to look at) with the features of that very frame."""
+    import cv2
+    import numpy as np
+
+    reference: Any = next(v for v in recordings[-1].values("frames") if v.index == frame)
+    camera = reference.camera
+    image = _image(recordings[-1], reference.stamp_ns, camera)
+    topics = ("planes", "segments", "keypoints", "manhattan")
+    values: dict[str, Any] = {topic: next((v for v in _values(recordings, topic) if v.index == frame), None) for topic in topics}
+    if values["planes"] is not None:
+        image = _tinted(image, values["planes"])
+    if values["segments"] is not None:
+        lifted = np.isfinite(values["segments"].endpoints_m).all(axis=(1, 2))
+        for ends, in_space in zip(np.rint(values["segments"].endpoints_px).astype(int), lifted):
+            cv2.line(image, tuple(map(int, ends[0])), tuple(map(int, ends[1])), (255, 230, 0) if in_space else (150, 150, 150), 2, cv2.LINE_AA)
+    if values["keypoints"] is not None:
+        for x, y in np.rint(values["keypoints"].pixels).astype(int):
+            cv2.circle(image, (int(x), int(y)), 2, (0, 230, 120), 1, cv2.LINE_AA)
+    if values["manhattan"] is not None and values["manhattan"].supported:
+        _axes(image, values["manhattan"].rotations[0])
+    return image
+
+
+def _image(recording: Recording, stamp_ns: int, camera: Camera) -> Any:
+    """The embedded frame, else the small image nearest in time, at full size (RGB)."""
+    import cv2
+    import numpy as np
+    from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
+
+    from trihedron.datasets.readers.picture_headers import UnreadableImage
+    from trihedron.datasets.readers.pixels import color_of
+    from trihedron.datasets.readers.robot_values import Picture
+    from trihedron.pipeline.core.errors import RecordingError
+
+    whole: Any = recording.value("dataset", stamp_ns) if "dataset" in recording.topics else None
+    if whole is not None:
+        return np.array(whole.color)
+    messages = list(recording.messages("/view/image"))
+    if not messages:
+        return np.full((camera.height, camera.width, 3), 255, np.uint8)
+    nearest = min(messages, key=lambda message: abs(message[0] - stamp_ns))
+    data = CompressedImage.FromString(nearest[1]).data
+    try:
+        small = color_of(Picture(nearest[0], "", "jpeg", data, compressed=True))
+    except UnreadableImage as error:
+        raise RecordingError(str(recording.path), f"topic /view/image: an image {error}", "the file is damaged; record it again") from error
+    return cv2.resize(small, (camera.width, camera.height))
+
+
+def _tinted(image: Any, planes: Planes) -> Any:
+    import cv2
+    import numpy as np
+    from matplotlib import colormaps
+
+    height, width = image.shape[:2]
+    labels = cv2.resize(planes.labels, (width, height), interpolation=cv2.INTER_NEAREST)
+    palette = np.vstack([[0, 0, 0], 255 * np.array([colormaps["tab20"](i % 20)[:3] for i in range(255)])])
+    mixed = np.where(labels[..., None] > 0, 0.55 * image + 0.45 * palette[labels], image)
+    return np.ascontiguousarray(mixed.astype(np.uint8))
+
+
+def _axes(image: Any, R_camera_manhattan: Any) -> None:
+    """The three axes as arrows in the lower left corner."""
+    import cv2
+
+    origin = (AXIS_LENGTH_PX + 15, image.shape[0] - AXIS_LENGTH_PX - 15)
+    for axis, color in enumerate(AXIS_COLORS):
+        x, y = R_camera_manhattan[:2, axis] * AXIS_LENGTH_PX
+        cv2.arrowedLine(image, origin, (round(origin[0] + x), round(origin[1] + y)), color, 3, cv2.LINE_AA, tipLength=0.2)
+
+
+def _map_from_above(axes: Any, recording: Recording, poses: list[Any]) -> None:
+    """Landmarks and the path, seen along the scene's vertical as far as the first camera knows it (y down)."""
+    import numpy as np
+
+    versions: list[Any] = list(recording.values("map")) if "map" in recording.topics else []
+    path = np.array([pose.T_world_camera[:3, 3] for pose in poses])
+    shown = [path[:, [0, 2]]]
+    if versions:
+        _landmarks(axes, versions[-1])
+        points = versions[-1].points.column("position_m")[versions[-1].points.column("alive")]
+        if len(points):
+            shown.append(np.percentile(points[:, [0, 2]], FRAMED, axis=0))
+    low, high = np.concatenate(shown).min(axis=0) - MARGIN_M, np.concatenate(shown).max(axis=0) + MARGIN_M
+    axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]))
+    axes.plot(path[:, 0], path[:, 2], color="crimson", linewidth=2, label="camera")
+    axes.set_aspect("equal")
+    axes.set_xlabel("x [m]")
+    axes.set_ylabel("z [m]")
+    axes.set_title("map from above: points, lines, planes", fontsize=10)
+    axes.legend(loc="upper right", fontsize=8)
+
+
+def _landmarks(axes: Any, map: Map) -> None:
+    import numpy as np
+
+    points = map.points.column("position_m")[map.points.column("alive")]
+    axes.scatter(points[:, 0], points[:, 2], s=1, color="0.6")
+    for ends in map.lines.column("endpoints_m")[map.lines.column("alive")]:
+        axes.plot(ends[:, 0], ends[:, 2], color="tab:blue", linewidth=0.8)
+    alive = map.planes.column("alive")
+    for k, samples in enumerate(map.planes.column("samples_m")[alive]):
+        samples = samples[np.isfinite(samples[:, 0])]
+        axes.scatter(samples[:, 0], samples[:, 2], s=10, marker="s", color=f"C{k % 10}")

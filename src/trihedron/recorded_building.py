@@ -1,0 +1,61 @@
+"""The building of a recorded run: as recorded, or folded from its frames, planes and poses."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+from trihedron.pipeline.core.errors import DataError
+
+if TYPE_CHECKING:
+    from trihedron.pipeline.core.types import Building, Map
+    from trihedron.pipeline.record.reader import Recording
+
+RECORDING = "run.mcap"
+
+
+def building_of(recording: Recording, plugin: str | None = None) -> Building:
+    """Return the recorded building, or the one that a plugin (default: manhattan_layout) makes of the recording. Raises DataError."""
+    from trihedron.pipeline.core.types import Building
+
+    if plugin is None and "building" in recording.topics:
+        for value in recording.values("building"):
+            if isinstance(value, Building):
+                return value
+    return folded(recording, plugin or "manhattan_layout")
+
+
+def folded(recording: Recording, name: str) -> Building:
+    """Fold the recording's frames by a plugin with its default options. Raises DataError when planes are not recorded, or the frames are gone."""
+    fold, state, final = gathered(recording, name)
+    building: Building = fold.finish(state, final)
+    return building
+
+
+def gathered(recording: Recording, name: str) -> tuple[Any, Any, Map | None]:
+    """Return a plugin with its default options, its state after all frames of a recording, and the last map. Raises DataError as `folded` does."""
+    from trihedron.pipeline.app.recorded_values import frames_of, last_map, poses_of, references_of
+    from trihedron.pipeline.core.registry import plugin_class
+    from trihedron.pipeline.core.types import Pose
+    from trihedron.pipeline.core.value_checks import check_together
+
+    if "planes" not in recording.topics:
+        raise DataError(str(recording.path), "holds no planes", "record a run of a graph with planes")
+    frame_of, references, final = frames_of(recording), references_of(recording), last_map(recording)
+    poses: dict[int, Pose] = {pose.index: pose for pose in poses_of(recording)}
+    others = {topic: {v.index: v for v in recording.values(topic) if topic == "map"} for topic in ("map",) if topic in recording.topics}
+    maps = others.get("map", {})
+    fold = plugin_class("building", name)()
+    state = fold.start()
+    rotations = {v.index: v for v in recording.values("rotation")} if "rotation" in recording.topics else {}
+    wanted = set(maps) if maps else set(poses)
+    given = ("frame", "planes", "rotation", "pose", "map")
+    for planes in recording.values("planes"):
+        index = planes.index
+        if index not in wanted or index not in poses or index not in references:
+            continue
+        frame = frame_of(references[index])
+        if frame is not None:
+            values = dict(zip(given, (frame, planes, rotations.get(index), poses[index], maps.get(index))))
+            check_together(values, str(recording.path), {topic: topic for topic in given})
+            state = fold.add(state, **values) if name != "none" else fold.add(state, pose=values["pose"])
+    return fold, state, final
