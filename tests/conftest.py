@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from trihedron.pipeline.run import results
+from trihedron.pipeline.app import execute
 
 sys.path.insert(0, str(Path(__file__).parent))
 from skips import pytest_collection_modifyitems, pytest_sessionfinish, pytest_terminal_summary  # noqa: F401
@@ -18,10 +18,10 @@ SLOW_S = 3600  # limit of a slow test that states none; the others have that of 
 
 @pytest.fixture(scope="session", autouse=True)
 def no_pictures():
-    """Runs leave an empty file in the place of the picture of their trajectory: to draw it takes longer than a short run. tests/pipeline/test_plot.py
-    draws, and so does the test of a complete run folder."""
+    """Runs leave an empty file in the place of the picture of their trajectory: to draw it takes longer than a short run.
+    tests/pipeline/test_trajectory_plot.py draws, and so does the test of a complete run folder."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(results, "trajectory_figure", lambda estimate, truth, path, status=(): path.touch())
+        patch.setattr(execute, "draw_trajectory", lambda result, truth, path: path.touch())
         yield
 
 

@@ -77,8 +77,8 @@ PROGRAM = """
 import sys
 import {first}
 from trihedron.pipeline.app.cli import main
-from trihedron.pipeline.run import results
-results.trajectory_figure = lambda *arguments, **options: None
+from trihedron.pipeline.app import execute
+execute.draw_trajectory = lambda *arguments, **options: None
 sys.exit(main(["run", *sys.argv[1:]]))
 """
 PROCESSORS = [

@@ -18,6 +18,7 @@ from omegaconf import DictConfig, OmegaConf
 from tqdm import tqdm
 
 from trihedron.pipeline.app.compilation import compile_once
+from trihedron.pipeline.app.trajectory_plot import PLOT, draw_trajectory
 from trihedron.pipeline.app.viewers import Viewer, opened_viewer
 from trihedron.pipeline.core.config import Feedback, graph_of
 from trihedron.pipeline.core.errors import ConfigError, DataError, RecordingError, did_you_mean, printable
@@ -252,14 +253,16 @@ def _progress(steps: Iterator[Step]) -> Iterator[Step]:
 def write_files(
     runner: Runner, truth: Trajectory | None, out: Path, started: float, began: float, plot: bool = True
 ) -> tuple[dict[str, Any], dict[str, Any]]:
-    """The files beside the recording; returns metrics and times. A trajectory, and its `plot`, are written only where poses were computed."""
+    """Write the files beside the recording; returns metrics and times. A trajectory, with its picture if `plot`, is there only with poses."""
     metrics: dict[str, Any] = {}
     timing = runner.timing.summary(runner.threads, time.perf_counter() - started, started - began)
     if runner.feed is not None:
         timing["live"] = runner.feed.summary(timing["frame_ms"])
     try:
         if "pose" in runner.computed:
-            metrics = results.write_results(out, runner.result, truth, plot)
+            metrics = results.write_results(out, runner.result, truth)
+            if plot:
+                draw_trajectory(runner.result, truth, out / PLOT)
         results.write_json(out / results.TIMING, timing)
     except OSError as error:
         raise DataError(str(error.filename or out), f"cannot be written: {error.strerror}", "make room, or give another out=FOLDER") from error

@@ -1,4 +1,4 @@
-"""The files of a run folder besides the recording: trajectories, timing, metrics, the plot."""
+"""The files of a run folder besides the recording: trajectories, timing, metrics."""
 
 from __future__ import annotations
 
@@ -19,9 +19,8 @@ from trihedron.pipeline.record.trajectories import write_trajectory
 from trihedron.pipeline.run.accounting import Result
 from trihedron.pipeline.run.consistency import pose_consistency, truth_noise
 from trihedron.pipeline.run.metrics import associate, evaluate_trajectory
-from trihedron.pipeline.run.plot import trajectory_figure
 
-TRAJECTORY, CAUSAL, TIMING, METRICS, PLOT = "trajectory.txt", "trajectory_causal.txt", "timing.json", "metrics.json", "trajectory.png"
+TRAJECTORY, CAUSAL, TIMING, METRICS = "trajectory.txt", "trajectory_causal.txt", "timing.json", "metrics.json"
 
 
 def causal_trajectory(result: Result) -> Trajectory:
@@ -53,8 +52,8 @@ def _trajectory(stamps_ns: list[int], poses: list[Any]) -> Trajectory:
     return Trajectory(np.array(stamps_ns, np.int64), np.array(poses, np.float64).reshape(-1, 4, 4))
 
 
-def write_results(out: Path, result: Result, truth: Trajectory | None, plot: bool = True) -> dict[str, Any]:
-    """Write trajectories, `plot` and, with ground truth, metrics; return the metrics. Statuses are counted in any case."""
+def write_results(out: Path, result: Result, truth: Trajectory | None) -> dict[str, Any]:
+    """Write trajectories and, with ground truth, metrics; return the metrics. Statuses are counted in any case."""
     result = replace(result, poses=list(result.poses))  # unpacked once
     final, causal = final_trajectory(result), causal_trajectory(result)
     write_trajectory(out / TRAJECTORY, final)
@@ -77,8 +76,6 @@ def write_results(out: Path, result: Result, truth: Trajectory | None, plot: boo
         except DataError as error:
             metrics["note"] = str(error)
     write_json(out / METRICS, metrics)
-    if plot and len(final):
-        trajectory_figure(final, truth, out / PLOT, [(pose.stamp_ns, pose.status) for pose in result.poses])
     return metrics
 
 

@@ -15,12 +15,12 @@ import pytest
 import yaml
 
 from trihedron.datasets.simulation.synthetic import Synthetic
+from trihedron.pipeline.app import execute
 from trihedron.pipeline.app.cli import main
+from trihedron.pipeline.app.trajectory_plot import draw_trajectory
 from trihedron.pipeline.record.reader import Recording
 from trihedron.pipeline.record.trajectories import read_trajectory
 from trihedron.pipeline.record.writer import RecordingWriter
-from trihedron.pipeline.run import results
-from trihedron.pipeline.run.plot import trajectory_figure
 from trihedron.tools.benchmark import PROGRAM
 
 SMALL = ["dataset=synthetic", "dataset.width=160", "dataset.height=120", "dataset.length=12"]
@@ -153,7 +153,7 @@ def test_debug_shows_the_traceback():
 
 
 def test_a_run_folder_is_complete(capsys, tmp_path, monkeypatch):
-    monkeypatch.setattr(results, "trajectory_figure", trajectory_figure)
+    monkeypatch.setattr(execute, "draw_trajectory", draw_trajectory)
     assert main(["run", *SMALL]) == 0
     printed = capsys.readouterr().out
     out = (tmp_path / "runs" / "latest").resolve()

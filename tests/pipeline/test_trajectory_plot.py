@@ -4,11 +4,11 @@ import cv2
 import numpy as np
 import pytest
 
+from trihedron.pipeline.app import trajectory_plot as plot
 from trihedron.pipeline.core.errors import DataError
 from trihedron.pipeline.core.geometry import pose_matrix
 from trihedron.pipeline.core.lie import exp_se3, exp_so3
 from trihedron.pipeline.core.types import DEGRADED, LOST, OK, Trajectory
-from trihedron.pipeline.run import plot
 
 
 def circle(count: int = 90) -> Trajectory:
