@@ -10,7 +10,7 @@ at least a second; fewer than 8 blocks are "too short to tell"), of several from
 
 The tables: every alternative's figures; the Shapley value of each swap, and with --budget what the truth in the place of a stage changes; where they
 part, with a picture of the worst frame; the cost.
-The same command again computes only what is missing; with --dry-run it says what that is, and what the alternatives share.
+The same command again computes only what is missing; with --dry-run it lists that, and what the alternatives share.
 
 Example: trihedron ablate runs/a/run.mcap manhattan=mean_shift,plane_svd rotation=drift_free,procrustes out=runs/ablation
 Example: trihedron ablate runs/a/run.mcap 'manhattan=*' feedback=recorded out=runs/axes

@@ -5,8 +5,9 @@ The near side of a jump of depth, at pixel p and depth z, was seen by a camera o
     X = z ((p - c_d) / f_d, 1) + t,  moved by the camera's motion during the delay τ of depth,  u = f_c X / Z + c_c
 
 The parameters are log(f_c / f_d), the shift s in `u = f_c / f_d (p - c_c) + c_c + s + …` (px), the sideways offset t (m) and τ (s). They maximise the
-mean gradient of the colour image at u over the edges of all frames, in units of the image's mean gradient. Depths that differ tell t from s, motion
-tells τ. The covariance is that of an M-estimator whose terms are blocks of frames ("sandwich": Huber, 1967), since neighbouring frames err alike.
+mean gradient of the colour image at u over the edges of all frames, in units of the image's mean gradient. Depths that differ separate t from s;
+motion determines τ. The covariance is that of an M-estimator whose terms are blocks of frames ("sandwich": Huber, 1967), since neighbouring frames
+err alike.
 """
 
 from __future__ import annotations

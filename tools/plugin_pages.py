@@ -82,7 +82,7 @@ def how_to_measure(slot: str, name: str) -> str:
 
 
 def source_line(results: Results) -> str:
-    """State the command, commit, date, versions and machine of the figures of a file, and what its note says of them."""
+    """State the command, commit, date, versions and machine of the figures of a file, and its note on them."""
     if "commit" not in results:
         return "The figures state no commit."
     packages = ", ".join(f"{name} {number}" for name, number in results["packages"].items())

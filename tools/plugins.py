@@ -131,7 +131,7 @@ def _plain(value: Any) -> Any:
 def report_names(slots: list[dict[str, Any]]) -> str:
     """Format the slots for people: a line of names each."""
     names = [[slot["name"], ", ".join("*" * plugin["default"] + plugin["name"] for plugin in slot["plugins"])] for slot in slots]
-    return f"{table(names, 'll')}\n\ntrihedron plugins SLOT tells what each does, trihedron plugins SLOT PLUGIN its options"
+    return f"{table(names, 'll')}\n\ntrihedron plugins SLOT describes each, trihedron plugins SLOT PLUGIN its options"
 
 
 def report(slot: dict[str, Any]) -> str:

@@ -106,8 +106,8 @@ def stage_figure(stages: dict[str, dict[str, float]]) -> Figure | None:
         f'<text x="{left + scale * ms + 5:.1f}" y="{row * k + 15}">{ms:.1f}</text>'
         for k, (name, ms) in enumerate(shown.items())
     )
-    said = ", ".join(f"{name} {ms:.1f}" for name, ms in shown.items())
-    return Figure(_svg(body, f"Median ms of the stages: {said}", row * len(shown) + 8), "Median time of each stage, ms.")
+    listed = ", ".join(f"{name} {ms:.1f}" for name, ms in shown.items())
+    return Figure(_svg(body, f"Median ms of the stages: {listed}", row * len(shown) + 8), "Median time of each stage, ms.")
 
 
 def status_figure(statuses: Sequence[str], seconds: Sequence[float]) -> Figure:

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from trihedron.pipeline.core.libraries import imports_of
 
-# Ten colours that are told apart (Okabe and Ito 2008, without black, and three more); the instances after the tenth begin again.
+# Ten distinguishable colours (Okabe and Ito 2008, without black, and three more); the instances after the tenth begin again.
 PALETTE = np.array(
     [[230, 159, 0], [86, 180, 233], [0, 158, 115], [240, 228, 66], [0, 114, 178], [213, 94, 0], [204, 121, 167], [150, 90, 200], [140, 200, 60],
      [170, 120, 80]], np.uint8,

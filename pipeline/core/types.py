@@ -288,8 +288,8 @@ class Pose(Value):
     `repeats` is the number of images in a row, up to this one, that repeat the one before bit for bit.
 
     The last five fields are what the pose's error owes to an imperfect calibration (`plugins.shared.calibration_error`, which defines the parameters
-    and their units): `sensitivity` is the derivative of the error by them, `calibration_information` and `calibration_score` what the residuals have
-    told of them so far. `twist` is the camera's velocity (m/s, rad/s) in its own frame, `reference_twist` that of the reference keyframe."""
+    and their units): `sensitivity` is the derivative of the error by them, `calibration_information` and `calibration_score` the information of the
+    residuals on them so far. `twist` is the camera's velocity (m/s, rad/s) in its own frame, `reference_twist` that of the reference keyframe."""
 
     version: ClassVar[int] = 4
 

@@ -55,7 +55,7 @@ class FrameErrors:
 @dataclass(frozen=True)
 class StatusCheck:
     """Figures of a run; None where too few frames are posed. Honest covariances have `nees_median` 5.35 and `share_within_95` 0.95. `sigma_auc`
-    is the probability that of two frames, one above the median error and one below, the former has the larger σ: 0.5 tells nothing."""
+    is the probability that of two frames, one above the median error and one below, the former has the larger σ: 0.5 is that of a σ by chance."""
 
     frames: int
     ok: int

@@ -62,7 +62,7 @@ class Watched:
 
 
 class Progress:
-    """A context that counts the jobs which are done, says which failed and why, and about how long the rest will take."""
+    """A context that counts the jobs which are done, reports which failed and why, and about how long the rest will take."""
 
     def __init__(self, folders: Sequence[Path], changes: Sequence[str], before: int, total: int, failed: int = 0) -> None:
         """`before` jobs of `total` are done and `failed` are refused; those of `folders`, which change what `changes` say, are done or will be."""
@@ -153,7 +153,7 @@ def _result(job: Watched) -> str:
 
 
 def reason(folder: Path, error: object) -> str:
-    """Return the line that says why the job of a folder failed."""
+    """Return the line with the reason why the job of a folder failed."""
     return f"trihedron: job {folder.name}: {error}"
 
 

@@ -1,7 +1,7 @@
 """The building as IFC4, by ifcopenshell: project, site, building, storeys, walls with thickness, slabs, openings and spaces; metres.
 
-Slabs and the thickness of walls whose other face was not seen are nominal, and a property of each says so. An opening is a void in its wall: whether
-a leaf or a pane hangs in it was not measured."""
+Slabs and the thickness of walls whose other face was not seen are nominal, and a property of each states it. An opening is a void in its wall:
+whether a leaf or a pane hangs in it was not measured."""
 
 from __future__ import annotations
 

@@ -15,7 +15,7 @@ from trihedron.pipeline.core.types import F64, I32, Correction, Map
 from trihedron.plugins.loop.keyframe_correction import correct_keyframes
 from trihedron.plugins.mapping.covisibility_graph import current_submap, keyframes_of
 from trihedron.plugins.shared.pose_graph import Edges, solve_pose_graph
-from trihedron.plugins.shared.rigid_alignment import fit_covariance, fitted, point_pair_sigma
+from trihedron.plugins.shared.rigid_alignment import fit_covariance, fit_motion, point_pair_sigma
 
 
 @register("loop", "pose_graph")
@@ -78,7 +78,7 @@ def _edge(a: tuple[I32, F64, F64, F64], b: tuple[I32, F64, F64, F64], least: int
     agree = np.ones(len(i), bool)
     R, t = np.eye(3), np.zeros(3)
     for _ in range(3):
-        R, t = fitted(here[agree], there[agree], sigma[agree])
+        R, t = fit_motion(here[agree], there[agree], sigma[agree])
         agree = np.linalg.norm(matmul(here, R.T) + t - there, axis=1) < gate * sigma
         if agree.sum() < least:
             return None

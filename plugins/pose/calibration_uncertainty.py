@@ -42,7 +42,7 @@ def with_velocity(pose: Pose, previous: Pose, map: Map) -> Pose:
 
 
 def with_calibration(pose: Pose, previous: Pose, solution: PoseSolution, problem: MapAlignment, keyframes: I32, groups: Groups) -> Pose:
-    """Give a refined pose, whose landmarks are from `keyframes` (k,), its sensitivity to the calibration, and what residuals have told of that."""
+    """Give a refined pose, whose landmarks are from `keyframes` (k,), its sensitivity to the calibration and what its residuals add."""
     equations = _equations(pose, solution, problem, keyframes, groups)
     before = matmul(adjoint(matmul(invert(pose.T_world_camera), previous.T_world_camera)), previous.sensitivity)
     to_pose = inv(equations.H + problem.information)

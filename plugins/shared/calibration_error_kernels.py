@@ -30,7 +30,7 @@ from trihedron.plugins.shared.pose_optimizer_kernels import (
 
 EXPECTATIONS = 8  # iterations for the common scale
 PRIOR_COUNT = 4.0  # parameters that the prior of the common scale counts as
-LEAST_SAMPLES = 4  # of a plane in both views, from which on it tells of the calibration
+LEAST_SAMPLES = 4  # of a plane in both views, from which on it informs on the calibration
 
 
 class Keyframes(NamedTuple):
@@ -271,11 +271,11 @@ def calibration_equations(
 
 @kernel
 def calibration_moment(information: F64, score: F64) -> F64:
-    """Second moment (12, 12) of the parameters given what residuals told of them, `information` (12, 12) and `score` (12,): the covariance, and the
+    """Second moment (12, 12) of the parameters given the evidence of residuals, `information` (12, 12) and `score` (12,): the covariance, and the
     square of the mean, which nothing is corrected by.
 
     They are independent with a common variance v, which is learned by expectation maximisation (MacKay, Neural Computation 1992) from 1, its value
-    for a camera of a kind that nothing is known of. It falls with what residuals rule out: an exact camera is told from one that is not."""
+    for a camera of a kind without a prior. It falls with what residuals rule out: an exact camera ends with a smaller one."""
     v = 1.0
     for _ in range(EXPECTATIONS + 1):
         covariance = inverse_positive(information + np.eye(CALIBRATION) / v)

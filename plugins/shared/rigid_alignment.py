@@ -57,11 +57,11 @@ def consensus(before: F64, after: F64, sigma: F64, gate: float, rounds: int, rng
         agree = _distances(before, after, R, t) < gate * sigma
         if agree.sum() < 3:
             break
-        R, t = fitted(before[agree], after[agree], sigma[agree])
+        R, t = fit_motion(before[agree], after[agree], sigma[agree])
     return Consensus(R, t, _distances(before, after, R, t) < gate * sigma)
 
 
-def fitted(before: F64, after: F64, sigma: F64) -> tuple[F64, F64]:
+def fit_motion(before: F64, after: F64, sigma: F64) -> tuple[F64, F64]:
     """Fit R (3, 3) and t (3,) by least squares, each pair weighted by 1/sigma² (Umeyama, PAMI 1991)."""
     w = 1.0 / sigma**2
     a, b = matmul(w, before) / w.sum(), matmul(w, after) / w.sum()

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 import trihedron as th
-from trihedron.comparison.building_errors import judged
+from trihedron.comparison.building_errors import plan_errors
 from trihedron.datasets.simulation.synthetic import Scene, Synthetic
 from trihedron.pipeline.core.building_geometry import door_swing, doors_on, label_place, wall_pieces
 from trihedron.pipeline.core.errors import LibraryError, TrihedronError
@@ -74,7 +74,7 @@ def test_the_true_plan_of_the_offices_is_that_of_its_walls():
 
 @pytest.mark.parametrize("name", LAYOUTS)
 def test_rooms_walls_and_doorways_of_the_offices_are_found(walk, offices, name):
-    figures = judged(offices[name], np.eye(4), walk[0].plans())
+    figures = plan_errors(offices[name], np.eye(4), walk[0].plans())
     assert figures["room_recall"] == figures["room_precision"] == figures["door_recall"] == 1.0
     assert figures["iou"] >= 0.97 and figures["wall_m"] <= 0.01 and figures["height_m"] <= 0.01 and figures["area_error"] <= 0.02
     assert figures["door_precision"] == 1.0
@@ -219,7 +219,7 @@ def test_wardrobes_slanted_walls_and_storeys(scene, name):
     truth = dataset.truth()
     frames = [dataset(k) for k in range(len(dataset))]
     building = folded(name, [(frame, planes_of(frame), pose_at(k, truth.poses[k])) for k, frame in enumerate(frames)])
-    figures = judged(building, np.eye(4), dataset.plans())
+    figures = plan_errors(building, np.eye(4), dataset.plans())
     assert figures["room_recall"] == figures["room_precision"] == figures["door_recall"] == figures["door_precision"] == 1.0
     assert figures["iou"] >= 0.98 and figures["wall_m"] <= 0.01 and figures["area_error"] <= 0.02 and len(building.storeys) == len(dataset.plans())
     windows = [building.opening_heights_m[k] for k, kind in enumerate(building.opening_kinds) if OPENING_KINDS[kind] == "window"]

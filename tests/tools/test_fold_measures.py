@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from trihedron.comparison import fold_measures
-from trihedron.comparison.building_errors import judged_run
+from trihedron.comparison.building_errors import plan_errors_of_run
 from trihedron.comparison.fold_measures import COLUMNS, of_folds, of_surface, of_surface_figures
 from trihedron.pipeline.app.cli import main
 from trihedron.tools.evaluate_surface import SURFACE
@@ -51,7 +51,7 @@ def test_alternatives_have_the_figures_of_full_runs(tmp_path, capsys):
     found = {name: value for name, value in variants[0]["figures"].items() if name in COLUMNS}
     assert main(["evaluate-surface", f"{tmp_path}/run"]) == 0
     assert of_surface(tmp_path / "run").items() <= found.items()
-    assert found["walls mm"] == pytest.approx(1e3 * judged_run(tmp_path / "run")["wall_m"])
+    assert found["walls mm"] == pytest.approx(1e3 * plan_errors_of_run(tmp_path / "run")["wall_m"])
     building, surface = (one["figures"] for one in variants[1:])
     assert surface["surface mm"] != found["surface mm"] > 0.0 and building["surface mm"] == found["surface mm"]
     assert building["missed rooms %"] == 100.0 > found["missed rooms %"] == surface["missed rooms %"]

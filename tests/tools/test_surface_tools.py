@@ -11,7 +11,7 @@ import trimesh
 
 from trihedron.comparison.mesh_distance import FAR_M, NearestTriangle, sampled
 from trihedron.comparison.mesh_files import read_mesh
-from trihedron.comparison.surface_errors import judged
+from trihedron.comparison.surface_errors import mesh_errors
 from trihedron.comparison.surface_truth import Truth, truth_of
 from trihedron.datasets.simulation.synthetic import Synthetic
 from trihedron.pipeline.core.errors import DataError, UsageError
@@ -158,7 +158,7 @@ def square_truth():
 
 def test_figures_of_a_mesh_that_is_a_centimetre_off_and_half_there():
     half = SQUARE * [0.5, 1.0, 1.0] + [0.0, 0.0, 0.01]
-    found = judged(half, TWO, square_truth())
+    found = mesh_errors(half, TWO, square_truth())
     assert found["triangles"] == 2 and found["area_m2"] == pytest.approx(1.0)
     planar, curved, whole = (found["parts"][part] for part in ("planar", "curved", "all"))
     for name in ("mean_m", "rmse_m", "p95_m"):
@@ -170,7 +170,7 @@ def test_figures_of_a_mesh_that_is_a_centimetre_off_and_half_there():
 def test_area_counts_not_the_number_of_triangles():
     many = np.concatenate([SQUARE + np.array([0.0, 0.0, 0.03]), SQUARE * 0.1 + np.array([0.5, 0.5, 0.0])])
     tiny = TWO + 4
-    found = judged(many, np.concatenate([TWO, *[tiny] * 50]), square_truth())["parts"]["all"]
+    found = mesh_errors(many, np.concatenate([TWO, *[tiny] * 50]), square_truth())["parts"]["all"]
     assert found["mean_m"] == pytest.approx(0.03 * 2.0 / 3.0, rel=1e-3)
 
 
@@ -184,7 +184,7 @@ def test_distances_to_triangles_are_exact():
 
 
 def test_an_empty_mesh_is_judged_too():
-    found = judged(np.empty((0, 3)), np.empty((0, 3), np.int32), square_truth())["parts"]["all"]
+    found = mesh_errors(np.empty((0, 3)), np.empty((0, 3), np.int32), square_truth())["parts"]["all"]
     assert found["mean_m"] is None and found["within_5_cm"] == 0.0
 
 

@@ -26,7 +26,7 @@ from trihedron.tools.arguments import Parser
 
 if TYPE_CHECKING:
     pass
-from trihedron.comparison.building_errors import judged_run
+from trihedron.comparison.building_errors import plan_errors_of_run
 
 SCENES = ("offices", "rooms", "corridor", "flat", "slanted_flat", "house")
 LAYOUTS = {"slanted_flat": "atlanta_layout"}  # of the slot building; the other scenes have the graph's own
@@ -97,7 +97,7 @@ def _figures(run: Path, plugin: str, anew: bool) -> dict[str, float]:
     """Return the figures of a run folder: of its plan as recorded, or made anew by a plugin or by its own."""
     stage = json.loads((run / "timing.json").read_text())["stages"]["building"]
     own = LAYOUTS.get(run.name.split(".")[0], "manhattan_layout")
-    figures = {"final_s": stage["finish_ms"] / 1e3} | judged_run(run, plugin or (own if anew else None))
+    figures = {"final_s": stage["finish_ms"] / 1e3} | plan_errors_of_run(run, plugin or (own if anew else None))
     return figures if plugin else figures | {"frame_ms": stage["p50_ms"]}
 
 

@@ -167,7 +167,7 @@ def _mean_of(rows: list[Row], name: str) -> str:
 
 
 def cell_of(row: Row | None) -> str:
-    """ATE in mm, and the share tracked where it says something."""
+    """ATE in mm, and the share tracked where it is not all."""
     if row is None:
         return ""
     if row["note"]:

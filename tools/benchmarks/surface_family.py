@@ -68,7 +68,7 @@ def tracked(out: Path, frames: int) -> Path:
 
 def measured(run: Path, names: list[str]) -> dict[str, Any]:
     """The figures of each surface over the recording of a run."""
-    from trihedron.comparison.surface_errors import judged, prepared
+    from trihedron.comparison.surface_errors import mesh_errors, prepared
     from trihedron.pipeline.run.scheduler import single_threaded_libraries
 
     recording = Recording(run / "run.mcap")
@@ -89,7 +89,7 @@ def measured(run: Path, names: list[str]) -> dict[str, Any]:
     found = {}
     for name, fold in folds.items():
         vertices = fold.surface.vertices_m.astype(np.float64) @ T[:3, :3].T + T[:3, 3]
-        found[name] = {**judged(vertices, fold.surface.triangles, truth), **fold.cost()}
+        found[name] = {**mesh_errors(vertices, fold.surface.triangles, truth), **fold.cost()}
     return {"frames": len(dataset), "surfaces": found}
 
 

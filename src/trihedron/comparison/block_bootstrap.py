@@ -48,8 +48,8 @@ def resampled(errors: Sequence[F64], weights: Sequence[float], shortest: int, po
     known: Bool = np.asarray(np.isfinite(series).all(axis=0))
     powers = np.where(known, series**power, 0.0)
     means = ((powers.sum(axis=1) / known.sum()) ** (1.0 / power))[:, None]
-    slopes = np.where(means > 0.0, power * means ** (power - 1), 1.0)
-    parts = (factors * powers / slopes).sum(axis=0)  # each frame's part in the sum, to first order
+    derivatives = np.where(means > 0.0, power * means ** (power - 1), 1.0)
+    parts = (factors * powers / derivatives).sum(axis=0)  # each frame's part in the sum, to first order
     length, bias = block_length(np.where(known, parts, np.nan), shortest)
     length = min(length, len(known))
     value, blocks = float((factors * means).sum()), len(known) // length

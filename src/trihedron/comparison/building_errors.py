@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 FOUND_IOU, DOOR_M, EDGE_M, LEAST_EDGE_M = 0.5, 0.3, 0.15, 0.5
 
 
-def judged_run(run: Path, plugin: str | None = None, beside: Path | None = None) -> dict[str, float]:
+def plan_errors_of_run(run: Path, plugin: str | None = None, beside: Path | None = None) -> dict[str, float]:
     """Return the figures of a run folder of a synthetic scene; its plan as recorded, or made by a plugin, with the CPU time. The trajectory is that
     of the folder `beside` where the run has none. Raises DataError."""
     from trihedron.comparison.surface_errors import alignment, trajectory_in
@@ -34,15 +34,15 @@ def judged_run(run: Path, plugin: str | None = None, beside: Path | None = None)
         raise DataError(str(run), "is of a data set without an exact plan", "judge a run of dataset=synthetic")
     T = alignment(trajectory_in(run, beside or run), dataset.truth())
     if plugin is None:
-        return judged(building_of(recording), T, dataset.plans())
+        return plan_errors(building_of(recording), T, dataset.plans())
     fold, state, final = gathered(recording, plugin)
     began = time.process_time()
     building = fold.finish(state, final)
     spent = time.process_time() - began
-    return judged(building, T, dataset.plans()) | {"final_s": spent}
+    return plan_errors(building, T, dataset.plans()) | {"final_s": spent}
 
 
-def judged(building: Building, T_truth_world: F64, plans: list[TruePlan]) -> dict[str, float]:
+def plan_errors(building: Building, T_truth_world: F64, plans: list[TruePlan]) -> dict[str, float]:
     """Return the figures of a plan, each storey by the true one that is nearest in height: NaN where there is nothing to judge."""
     import shapely
 

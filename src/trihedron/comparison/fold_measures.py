@@ -25,7 +25,7 @@ Measures = dict[str, float]  # error by column
 
 def of_folds(stages: Iterable[str], runs: Sequence[Path], source: Path) -> list[Measures]:
     """Return for each run folder the measures of those of its folds that are among the stages; `source` is the recording that all were computed
-    from. Equal surfaces are judged once. A fold without a truth has none, and a line says why."""
+    from. Equal surfaces are judged once. A fold without a truth has none, and a line has the reason."""
     found: list[Measures] = [{} for _ in runs]
     judged: dict[str, dict[str, Any]] = {}  # SHA-256 of a surface -> its figures
     for stage in stages:
@@ -68,8 +68,8 @@ def of_surface_figures(figures: Mapping[str, Any]) -> Measures:
 def of_building(run: Path, beside: Path | None = None) -> Measures:
     """`walls mm`: median offset of walls from the true ones. `missed rooms %`, `false rooms %`: of the true ones, of those that are found.
     `beside` has the trajectory where the run folder has none. Raises DataError where the data set has no true plan."""
-    from trihedron.comparison.building_errors import judged_run
+    from trihedron.comparison.building_errors import plan_errors_of_run
 
-    figures = judged_run(run, beside=beside)
+    figures = plan_errors_of_run(run, beside=beside)
     found = {name: factor * abs(figures[key] - perfect) for name, (key, perfect, factor) in BUILDING.items()}
     return {name: value for name, value in found.items() if np.isfinite(value)}

@@ -15,7 +15,7 @@ AXIS_LENGTH_PX = 60
 SIZE_INCHES, DPI = (16, 6.4), 120  # 1920 × 768 px
 FRAMED = (0.5, 99.5)  # percentiles of the landmarks between two edges of the map, which holds 98 % of them
 MARGIN_M = 0.2
-PAIR_COLORS = ("#0072b2", "#d55e00")  # of two runs; told apart by the colour-blind (Okabe and Ito)
+PAIR_COLORS = ("#0072b2", "#d55e00")  # of two runs; distinguishable for the colour-blind (Okabe and Ito)
 
 
 def draw(path: str, frame: int, out: Path) -> None:

@@ -1,8 +1,8 @@
 """Errors of single stages, frame by frame, by known poses of the camera: the measure of each slot, for the open loop of `trihedron ablate`.
 
-A measure compares what a stage says of a frame with what it, or its inputs, said of the frame before, moved by the motion between the two. So it
-needs no labelled scene, and later stages hide nothing. All measures are errors: less is better, 0 is perfect; over frames their root mean square
-counts. The poses are the ground truth where there is any; else those of the recorded run, and what is measured then is agreement with it.
+A measure compares what a stage reports for a frame with what it, or its inputs, reported for the frame before, moved by the motion between the two.
+So it needs no labelled scene, and later stages hide nothing. All measures are errors: less is better, 0 is perfect; over frames their root mean
+square counts. The poses are the ground truth where there is any; else those of the recorded run, and what is measured then is agreement with it.
 `cycle px`, `depth mm` and `one-way pairs %` need no truth: they compare an estimate with the pairs, the depth and the descriptors of the two frames.
 """
 

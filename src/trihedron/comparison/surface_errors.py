@@ -21,12 +21,12 @@ TRUTHS = 8  # kept for further runs of their data sets: rendering one takes ten 
 
 
 def evaluate_files(mesh: Path, recording: Path) -> dict[str, Any]:
-    """The figures of `judged` for a mesh file in the world of the trajectory.txt beside it, or beside the recording. Raises DataError."""
+    """Return `mesh_errors` of a mesh file in the world of the trajectory.txt beside it, or beside the recording. Raises DataError."""
     from trihedron.comparison.mesh_files import read_mesh
 
     vertices, triangles = read_mesh(mesh)
     T, truth = prepared(trajectory_in(mesh.parent, recording.parent), recording)
-    return {**judged(vertices @ T[:3, :3].T + T[:3, 3], triangles, truth), "bytes": mesh.stat().st_size}
+    return {**mesh_errors(vertices @ T[:3, :3].T + T[:3, 3], triangles, truth), "bytes": mesh.stat().st_size}
 
 
 def trajectory_in(*folders: Path) -> Path:
@@ -78,7 +78,7 @@ def _dataset(recording: Any) -> Any:
     return make_plugin("dataset", composed_run(recording).dataset)
 
 
-def judged(vertices: F64, triangles: I32, truth: Truth) -> dict[str, Any]:
+def mesh_errors(vertices: F64, triangles: I32, truth: Truth) -> dict[str, Any]:
     """The figures of a mesh in the world of the truth: triangles, and per part accuracy in metres (mean, RMSE, 95 %) and completeness within
     WITHIN_M. A point of the mesh belongs to the part that is nearest to it."""
     import numpy as np

@@ -189,7 +189,7 @@ def line_of(one: Verdict, column: Column) -> str:
 
 
 def named(first: str, second: str) -> str:
-    """Return "first against second"; a key that both single words have is said once."""
+    """Return "first against second"; a key that both single words have is written once."""
     key, value = first.partition("=")[0], second.partition("=")[2]
     short = " " not in first + second and value and second.startswith(f"{key}=")
     return f"{first} against {value if short else second}"
