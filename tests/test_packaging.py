@@ -18,6 +18,7 @@ from trihedron.tools.benchmark import COMPARISONS
 
 ROOT = Path(__file__).resolve().parents[1]
 FOLDERS = ("pipeline", "plugins", "datasets", "tools", "conf")
+OF_CHECKOUT = ROOT / "tools" / "benchmarks"  # no wheel has it
 PROJECT = load_file(ROOT / "pyproject.toml")
 
 
@@ -33,6 +34,12 @@ def test_commands_are_registered():
     modules = {path.stem for path in (ROOT / "tools").glob("*.py") if "\ndef main(argv: list[str]) -> int:" in path.read_text()}
     sub_words = {module.rpartition(".")[2] for module in COMPARISONS.values()}  # of `trihedron benchmark`
     assert {target.removesuffix(":main").removeprefix("trihedron.tools.") for target in commands.values()} == modules - sub_words
+
+
+def test_nothing_outside_the_benchmarks_needs_them():
+    """The table of commands names them: what it says where they are missing is below."""
+    files = [path for folder in (*FOLDERS, "src/trihedron") for path in (ROOT / folder).rglob("*.py") if not path.is_relative_to(OF_CHECKOUT)]
+    assert [path.relative_to(ROOT).as_posix() for path in files if "tools.benchmarks" in path.read_text()] == ["tools/benchmark.py"]
 
 
 @pytest.fixture(scope="module")
@@ -61,8 +68,28 @@ def test_content_of_the_wheel(wheel):
     assert {name.split("/")[0] for name in names} == {"trihedron", wheel.name.removesuffix("-py3-none-any.whl") + ".dist-info"}
     ours = [path for folder in FOLDERS for path in (ROOT / folder).rglob("*") if path.suffix in (".py", ".yaml", ".json", ".html", ".css", ".js")]
     own = {path.relative_to(ROOT / "src").as_posix() for path in (ROOT / "src" / "trihedron").rglob("*.py")}  # behind no link
-    expected = {f"trihedron/{path.relative_to(ROOT)}" for path in ours} | own | {"trihedron/py.typed"}
+    expected = {f"trihedron/{path.relative_to(ROOT)}" for path in ours if not path.is_relative_to(OF_CHECKOUT)} | own | {"trihedron/py.typed"}
     assert {name for name in names if name.startswith("trihedron/")} == expected
+
+
+@pytest.mark.parametrize(
+    "words, code, said",
+    [
+        ("scaling", 2, "benchmark scaling: is in the source checkout, and not in the installed package; get the sources, and in their folder: pip"),
+        ("map --help", 2, "benchmark map: is in the source checkout, and not in the installed package; get the sources, and in their folder: pip"),
+        ("rotations .", 1, ".: holds no runs"),
+        ("methods .", 1, ".: holds no runs; give the out=FOLDER of a sweep"),
+        ("--compare none.json", 1, "none.json: cannot be read (No such file or directory); give a file written by trihedron benchmark --json"),
+    ],
+)
+def test_benchmarks_of_the_wheel(words, code, said, wheel, tmp_path):
+    """Those of the source checkout say so in one line; the others are there."""
+    zipfile.ZipFile(wheel).extractall(tmp_path / "site")
+    program = "import sys; from trihedron.pipeline.app.cli import main; sys.exit(main(sys.argv[1:]))"
+    command = [sys.executable, "-c", program, "benchmark", *words.split()]
+    environment = {**os.environ, "PYTHONPATH": str(tmp_path / "site")}
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, env=environment)
+    assert done.returncode == code and done.stderr.startswith(f"trihedron: {said}") and done.stderr.count("\n") == 1, done.stderr
 
 
 def installed(wheel: Path, folder: Path, *, with_dependencies: bool) -> Path:
@@ -109,6 +136,8 @@ def test_wheel_in_an_empty_environment(wheel, tmp_path):
     programs = installed(wheel, tmp_path / "env", with_dependencies=False)
     check_installation(programs, tmp_path / "elsewhere")
     run_five_frames(programs, tmp_path / "elsewhere", "outputs=[keypoints]")
+    measured = run(programs / "trihedron", "benchmark", "dataset.frames=0:5", "outputs=[keypoints]", folder=tmp_path / "elsewhere")
+    assert "5 frames, " in measured and "throughput " in measured
     topics = run(programs / "trihedron", "topics", "five/run.mcap", folder=tmp_path / "elsewhere")
     assert ["/keypoints", "trihedron.Keypoints", "5"] in [line.split()[:3] for line in topics.splitlines()]
 

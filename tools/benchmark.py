@@ -5,13 +5,14 @@ one thread, measured before and after each run. --paced runs the frames a second
 frame's files to its pose, and the time it waits behind others does not count. --cold runs one frame with an empty kernel cache. --compare lists what
 became slower since a --json file.
 
-Other comparisons, each with its --help: `trihedron benchmark scaling` (threads, image size, features, length), `trihedron benchmark manhattan`
-(estimators of the Manhattan frame on rendered rooms), `trihedron benchmark rotations` (the same over one recording), `trihedron benchmark
-detectors` (all detectors, by the truth of rendered scenes), `trihedron benchmark methods` (every plugin in the default graph), `trihedron benchmark
-surface` (all surfaces, by the true one), `trihedron benchmark map` (drift, recovery and growth of the map), `trihedron benchmark long` (what a long
-run leaves behind), `trihedron benchmark parts` (features and matching beside OpenCV's), `trihedron benchmark recording` (what recording costs),
-`trihedron benchmark building`, `trihedron benchmark sensors` (honesty on simulated sensors of several kinds), `trihedron benchmark faults` (the same
-under degenerate input).
+Other comparisons, each with its --help: `trihedron benchmark methods` (every plugin in the default graph) and `trihedron benchmark rotations`
+(estimators of the Manhattan frame over one recording). The source checkout has more, which an installed package has not: `trihedron benchmark
+manhattan` (these estimators on rendered rooms), `trihedron benchmark detectors` (all detectors, by the truth of rendered scenes), `trihedron
+benchmark surface` (all surfaces, by the true one), `trihedron benchmark map` (drift, recovery and growth of the map), `trihedron benchmark long`
+(what a long run leaves behind), `trihedron benchmark scaling` (threads, image size, features, length), `trihedron benchmark parts` (features and
+matching beside OpenCV's), `trihedron benchmark recording` (what recording costs), `trihedron benchmark building`, `trihedron benchmark sensors`
+(honesty on simulated sensors of several kinds), `trihedron benchmark faults` (the same under degenerate input).
+
 `trihedron compare` makes a table of the runs of any sweep.
 
 Example: trihedron benchmark FOLDER dataset.frames=0:150 --json benchmark.json
@@ -37,24 +38,25 @@ from trihedron.pipeline.core.errors import UsageError, did_you_mean
 from trihedron.pipeline.core.layouts import data_set_words
 from trihedron.pipeline.core.types import U8
 from trihedron.tools.arguments import Parser
-from trihedron.tools.benchmarks.paired import compared, read_figures, times
+from trihedron.tools.benchmark_comparison import compared, read_figures, times
 
 PROGRAM = (sys.executable, "-c", "import sys; from trihedron.pipeline.app.cli import main; sys.exit(main(sys.argv[1:]))")
 REFERENCE_FRAMES = 40  # at most
+OF_CHECKOUT = "trihedron.tools.benchmarks"  # which wheels lack
 COMPARISONS = {  # other words after `benchmark`, and whose `main` they stand for
-    "building": "trihedron.tools.benchmarks.building_benchmark",
-    "detectors": "trihedron.tools.benchmarks.detector_truth",
-    "faults": "trihedron.tools.benchmarks.fault_benchmark",
-    "long": "trihedron.tools.benchmarks.long_run",
-    "manhattan": "trihedron.tools.benchmarks.manhattan_family",
-    "map": "trihedron.tools.benchmarks.map_benchmark",
-    "methods": "trihedron.tools.benchmarks.method_tables",
-    "parts": "trihedron.tools.benchmarks.part_times",
-    "recording": "trihedron.tools.benchmarks.recording_benchmark",
-    "rotations": "trihedron.tools.benchmarks.rotation_comparison",
-    "scaling": "trihedron.tools.benchmarks.scaling_benchmark",
-    "sensors": "trihedron.tools.benchmarks.sensor_benchmark",
-    "surface": "trihedron.tools.benchmarks.surface_family",
+    "building": f"{OF_CHECKOUT}.building_benchmark",
+    "detectors": f"{OF_CHECKOUT}.detector_truth",
+    "faults": f"{OF_CHECKOUT}.fault_benchmark",
+    "long": f"{OF_CHECKOUT}.long_run",
+    "manhattan": f"{OF_CHECKOUT}.manhattan_family",
+    "map": f"{OF_CHECKOUT}.map_benchmark",
+    "methods": "trihedron.tools.method_tables",
+    "parts": f"{OF_CHECKOUT}.part_times",
+    "recording": f"{OF_CHECKOUT}.recording_benchmark",
+    "rotations": "trihedron.tools.rotation_comparison",
+    "scaling": f"{OF_CHECKOUT}.scaling_benchmark",
+    "sensors": f"{OF_CHECKOUT}.sensor_benchmark",
+    "surface": f"{OF_CHECKOUT}.surface_family",
 }
 
 
@@ -62,8 +64,7 @@ def main(argv: list[str]) -> int:
     """Run `trihedron run` with the given overrides in a process of its own, then the reference; print a table and optionally write JSON.
     A word of COMPARISONS hands over to that."""
     if argv[:1] and argv[0] in COMPARISONS:
-        comparison: Any = importlib.import_module(COMPARISONS[argv[0]])
-        return int(comparison.main(argv[1:]))
+        return int(comparison(argv[0]).main(argv[1:]))
     parser = Parser("benchmark", __name__)
     parser.add_argument("overrides", nargs="*", help="as for trihedron run, or the folder of a data set")
     parser.add_argument("--json", type=Path, metavar="FILE", help="write the figures too")
@@ -93,6 +94,17 @@ def main(argv: list[str]) -> int:
     if options.json:
         options.json.write_text(json.dumps(figures, indent=2) + "\n")
     return 0
+
+
+def comparison(word: str) -> Any:
+    """Return the module of a word of COMPARISONS. Raises UsageError where only the source checkout has it."""
+    try:
+        return importlib.import_module(COMPARISONS[word])
+    except ModuleNotFoundError as error:
+        if not (error.name or "").startswith(OF_CHECKOUT):
+            raise
+        cure = "get the sources, and in their folder: pip install -e ."
+        raise UsageError(f"benchmark {word}", "is in the source checkout, and not in the installed package", cure) from None
 
 
 def _checked(overrides: list[str]) -> None:

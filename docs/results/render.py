@@ -15,7 +15,7 @@ from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
-from trihedron.tools.benchmarks.method_tables import cell_of
+from trihedron.tools.method_tables import cell_of
 from trihedron.tools.plugin_pages import markdown, source_line
 from trihedron.tools.published import peer_figures, peers, published_ate_m, sequence_of
 

@@ -10,7 +10,6 @@ import numpy as np
 from trihedron.pipeline.core.options import PositiveFloat, PositiveInt, PositiveShare, Range, Share
 from trihedron.pipeline.core.registry import register
 from trihedron.pipeline.core.types import DEGRADED, I32, LOST, Correction, Frame, Keypoints, Map, Matches, Planes, Pose, Segments
-from trihedron.plugins.map.none import NoMap
 from trihedron.plugins.mapping.correction import apply_correction
 from trihedron.plugins.mapping.covisibility_graph import keyframes_of, local_window
 from trihedron.plugins.mapping.culling import cull_landmarks, cull_redundant_keyframe, cull_repeated_keyframe, free_dead_rows
@@ -30,6 +29,7 @@ from trihedron.plugins.mapping.merging import merge_lines, merge_planes, merge_p
 from trihedron.plugins.mapping.projection import visible_planes
 from trihedron.plugins.mapping.reference_keyframe import submap_of, transform_to_map
 from trihedron.plugins.mapping.submaps import merge_submaps
+from trihedron.plugins.none import NoMap
 
 NEARBY = {"newest": 2, "covisible": 10, "near": 3}  # keyframes whose planes should be observed again: as many as tracking searches
 

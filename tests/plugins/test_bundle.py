@@ -22,9 +22,9 @@ from trihedron.plugins.bundle.local_window_kernels import (
     linearise_bundle,
     retract,
 )
-from trihedron.plugins.bundle.none import NoBundle
 from trihedron.plugins.bundle.window import bundle_problem, bundle_window
 from trihedron.plugins.mapping.correction import apply_correction
+from trihedron.plugins.none import NoBundle
 
 sys.path.insert(0, str(Path(__file__).parent))
 from derivatives import numeric

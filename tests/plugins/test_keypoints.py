@@ -6,8 +6,8 @@ import cv2
 import numpy as np
 import pytest
 
-from trihedron.plugins.keypoints.none import NoKeypoints
 from trihedron.plugins.keypoints.orb import Orb
+from trihedron.plugins.none import NoKeypoints
 
 FLAT = np.full((480, 640), 2.0)
 FIELDS = ("pixels", "points_m", "sigma_px", "sigma_m", "octaves", "angles_deg", "descriptors")

@@ -9,7 +9,7 @@ import pytest
 from trihedron.plugins.lines.edge_drawing import EdgeDrawing
 from trihedron.plugins.lines.fast_line import FastLine
 from trihedron.plugins.lines.lsd import Lsd
-from trihedron.plugins.lines.none import NoLines
+from trihedron.plugins.none import NoLines
 
 DEPTH = np.ones((480, 640))
 each = pytest.mark.parametrize("plugin", [Lsd, FastLine, EdgeDrawing], ids=lambda plugin: plugin.__name__)

@@ -10,10 +10,10 @@ import pytest
 from trihedron.pipeline.core.geometry import invert, tangent_basis, transform, transform_planes
 from trihedron.pipeline.core.lie import exp_se3
 from trihedron.plugins.map.covisibility import Covisibility
-from trihedron.plugins.map.none import NoMap
 from trihedron.plugins.mapping import plane_fusion
 from trihedron.plugins.mapping.landmark_kernels import fuse_lines
 from trihedron.plugins.matches.local_map import LocalMap
+from trihedron.plugins.none import NoMap
 
 sys.path.insert(0, str(Path(__file__).parent))
 from landmark_world import World, camera_at, rotation_of, translation_of

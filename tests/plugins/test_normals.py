@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
+from trihedron.plugins.none import NoNormals
 from trihedron.plugins.normals.integral_image import IntegralImage
-from trihedron.plugins.normals.none import NoNormals
 from trihedron.plugins.normals.patch_size import patch_radii
 
 

@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 
 from trihedron.pipeline.core.geometry import tangent_basis
+from trihedron.plugins.none import NoPlanes
 from trihedron.plugins.normals.integral_image import IntegralImage
 from trihedron.plugins.planes.ahc import Ahc
 from trihedron.plugins.planes.cape import Cape
 from trihedron.plugins.planes.connected_components import ConnectedComponents
-from trihedron.plugins.planes.none import NoPlanes
 from trihedron.plugins.planes.ransac import Ransac
 from trihedron.plugins.planes.region_cells_kernels import gather_cells
 from trihedron.plugins.planes.trimmed_fit_kernels import fit_cells

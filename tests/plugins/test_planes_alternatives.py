@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from trihedron.pipeline.core.types import DepthNoise
+from trihedron.plugins.none import NoNormals
 from trihedron.plugins.normals.integral_image import IntegralImage
-from trihedron.plugins.normals.none import NoNormals
 from trihedron.plugins.planes.ahc import Ahc
 from trihedron.plugins.planes.ahc_kernels import cluster_blocks
 from trihedron.plugins.planes.blocks_kernels import block_mse, block_plane, block_planes, block_sums

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from trihedron.pipeline.core.types import LineSegments
-from trihedron.plugins.segments.none import NoSegments
+from trihedron.plugins.none import NoSegments
 from trihedron.plugins.segments.ransac import Ransac
 
 

@@ -9,7 +9,7 @@ import pytest
 
 from trihedron.pipeline.app.cli import main
 from trihedron.tools.benchmark import measure
-from trihedron.tools.benchmarks.paired import compared
+from trihedron.tools.benchmark_comparison import compared
 
 FIGURES = {
     "frames": 10, "threads": 2, "fps": 50.0, "frame_ms": {"p50": 20.0, "p95": 30.0}, "reference_ms": 10.0,

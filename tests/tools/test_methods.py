@@ -16,7 +16,7 @@ from trihedron.pipeline.sweep.sweep import words_of_alternatives
 from trihedron.plugins.normals.integral_image import IntegralImage
 from trihedron.plugins.planes.connected_components import ConnectedComponents
 from trihedron.tools.benchmarks.detector_truth import _view, judge_keypoints, judge_lines, judge_normals, judge_planes, true_regions
-from trihedron.tools.benchmarks.method_tables import sequence_of
+from trihedron.tools.method_tables import sequence_of
 
 sys.path.insert(0, str(Path(__file__).parent))
 from faulty_plugins import faulty

@@ -29,8 +29,8 @@ from trihedron.pipeline.core.errors import DataError, TrihedronError
 from trihedron.pipeline.core.text_table import table
 from trihedron.pipeline.run.results import METRICS, TIMING
 from trihedron.pipeline.sweep.sweep import GRAPH_KEYS, is_graph_word
+from trihedron.tools import own_measures
 from trihedron.tools.arguments import Parser
-from trihedron.tools.benchmarks import own_measures
 
 DEFAULT = "default"  # the change of a run that changes nothing
 Row = dict[str, Any]
