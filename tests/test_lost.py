@@ -82,10 +82,10 @@ def test_what_is_seen_while_lost_becomes_a_sub_map_and_is_tied_when_the_turn_is_
     *_, map = Recording(tmp_path / "run" / "run.mcap").values("map")
     submaps = [pose.submap for pose in poses.values()]
     begun, tied = submaps.index(1), len(submaps) - submaps[::-1].index(1)
-    print(f"sub-map from frame {begun} to {tied}, {metrics['untied']} frames untied, ATE {metrics['final']['ate_rmse_m']:.4f} m")
+    print(f"sub-map from frame {begun} to {tied}, {metrics['unmerged']} frames unmerged, ATE {metrics['final']['ate_rmse_m']:.4f} m")
     assert 260 + Refine().submap_after <= begun <= 285 and 300 < tied < 560 and not map.keyframes.column("submap").any()
     assert {pose.status for index, pose in poses.items() if begun <= index < tied} == {"degraded"}
-    assert metrics["untied"] == 1 and metrics["status"]["lost"] == begun - 60
+    assert metrics["unmerged"] == 1 and metrics["status"]["lost"] == begun - 60
     assert metrics["final"]["ate_rmse_m"] < 0.01
 
 

@@ -61,7 +61,7 @@ def write_results(out: Path, result: Result, truth: Trajectory | None) -> dict[s
     metrics: dict[str, Any] = {
         "frames": len(result.stamps_ns),
         "unreadable": result.unreadable,
-        "untied": sum(pose.status != LOST and not is_merged(pose, result.map) for pose in result.poses),
+        "unmerged": sum(pose.status != LOST and not is_merged(pose, result.map) for pose in result.poses),
         "status": {status: sum(pose.status == status for pose in result.poses) for status in (OK, DEGRADED, LOST)},
         "reasons": {status: reason for status in (DEGRADED, LOST) if (reason := _commonest_reason(result.poses, status))},
     }

@@ -81,7 +81,7 @@ def test_a_camera_that_is_only_localised_stays_lost_where_the_map_does_not_reach
     poses = list(Recording(runs / "nowhere" / "run.mcap").values("pose"))
     assert len(poses) == 5 and {(pose.status, pose.submap) for pose in poses} == {("lost", 0)}
     metrics = json.loads((runs / "nowhere" / "metrics.json").read_text())
-    assert metrics["untied"] == 0 and metrics["status"]["lost"] == 5
+    assert metrics["unmerged"] == 0 and metrics["status"]["lost"] == 5
     assert (runs / "nowhere" / "trajectory.txt").read_text().count("\n") <= 1
 
 
