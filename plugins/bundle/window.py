@@ -10,6 +10,7 @@ import numpy as np
 from trihedron.pipeline.core.linalg import matmul
 from trihedron.pipeline.core.types import F64, I32, Map, Table
 from trihedron.plugins.mapping.covisibility_graph import covisible_keyframes, current_submap, keyframes_of, newest_keyframes, observed_by, odometry
+from trihedron.plugins.mapping.landmark_kinds import KINDS, LINE, PLANE, POINT, LandmarkKind, observed_rows
 from trihedron.plugins.mapping.landmarks import index_of
 from trihedron.plugins.shared.linalg import inverse
 from trihedron.plugins.shared.pose_optimizer_kernels import PARALLEL, PERPENDICULAR
@@ -83,7 +84,7 @@ def bundle_window(map: Map, free: int, fixed: int, least_fixed: int = 1) -> Bund
     held = covisible_keyframes(map, moving, fixed)
     while len(moving) and (len(held) < least_fixed or moving[0] == 0):
         held, moving = np.append(held, moving[:1]), moving[1:]
-    points, lines, planes = (observed_by(map, moving, kind) for kind in ("point", "line", "plane"))
+    points, lines, planes = (observed_by(map, moving, kind) for kind in KINDS)
     return BundleWindow(moving, np.sort(held), points, lines, planes)
 
 
@@ -109,9 +110,9 @@ def bundle_problem(
         map.lines.rows("endpoints_m", window.lines),
         map.planes.rows("coefficients", window.planes),
     )
-    point_rows, point_keyframes, point_starts = _observations(map, "point", keyframes, window.points)
-    line_rows, line_keyframes, line_starts = _observations(map, "line", keyframes, window.lines)
-    plane_rows, plane_keyframes, plane_starts = _observations(map, "plane", keyframes, window.planes)
+    point_rows, point_keyframes, point_starts = _observations(map, POINT, keyframes, window.points)
+    line_rows, line_keyframes, line_starts = _observations(map, LINE, keyframes, window.lines)
+    plane_rows, plane_keyframes, plane_starts = _observations(map, PLANE, keyframes, window.planes)
     relations, variance = _relations(state.planes, relation_sigma_deg, parallel_deg)
     neighbours = _neighbours(map, keyframes, len(window.free))
     return state, BundleMeasurements(
@@ -154,14 +155,12 @@ def _column(table: Table, name: str, rows: I32) -> F64:
     return np.asarray(table.rows(name, rows), np.float64)
 
 
-def _observations(map: Map, kind: str, keyframes: I32, ids: I32) -> tuple[I32, I32, I32]:
+def _observations(map: Map, kind: LandmarkKind, keyframes: I32, ids: I32) -> tuple[I32, I32, I32]:
     """Rows of the observation table of these keyframes and landmarks, ordered by landmark; the index among `keyframes` of each; and where each
     landmark's rows begin, (n + 1,)."""
-    table: Table = getattr(map, f"{kind}_observations")
-    spans = map.keyframes.rows(f"{kind}s", keyframes)
-    rows = np.concatenate([np.empty(0, np.int32), *(np.arange(a, b, dtype=np.int32) for a, b in spans)])
-    who = np.repeat(np.arange(len(keyframes), dtype=np.int32), spans[:, 1] - spans[:, 0])
-    place = index_of(table.rows(kind, rows), ids)
+    rows, observed, counts = observed_rows(map, keyframes, kind)
+    who = np.repeat(np.arange(len(keyframes), dtype=np.int32), counts)
+    place = index_of(observed, ids)
     known = np.flatnonzero(place >= 0)
     place = place[known]
     short = place.astype(np.uint16) if len(ids) < 1 << 16 else place  # numbers of two bytes NumPy sorts in a third of the time

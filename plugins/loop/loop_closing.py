@@ -21,6 +21,7 @@ from trihedron.plugins.loop.manhattan_prior import align_with_manhattan, correct
 from trihedron.plugins.mapping.covisibility_graph import LocalWindow, current_submap, keyframes_of, observed_by
 from trihedron.plugins.mapping.data_association import PredictedPose, SearchOptions, search_map
 from trihedron.plugins.mapping.keyframe_features import features_of
+from trihedron.plugins.mapping.landmark_kinds import KINDS, LINE, PLANE, POINT
 from trihedron.plugins.places.verification import free_space_violation, solve_pose_in_map
 from trihedron.plugins.shared.pose_optimizer import LANDMARK_SCORE, PoseSolution
 
@@ -160,14 +161,14 @@ def place_of(options: LoopOptions, map: Map, keyframe: int, path_m: float) -> Pl
     near = np.linalg.norm(poses[:, :3, 3] - own[:3, 3], axis=1) < options.view_m
     near &= (matmul(poses[:, :3, 2], own[:3, 2]) > np.cos(np.radians(options.view_deg))) & (way > 0.5 * options.away_m)
     recent = rows[way <= 0.5 * options.away_m]
-    there = {kind: observed_by(map, rows[near], kind) for kind in ("point", "line", "plane")}
+    there = {kind: observed_by(map, rows[near], kind) for kind in KINDS}
     ids = [np.setdiff1d(there[kind], observed_by(map, recent, kind)).astype(np.int32) for kind in there]
-    found = sum(int(np.isin(observed_by(map, rows[-1:], kind), there[kind]).sum()) for kind in ("point", "line"))
+    found = sum(int(np.isin(observed_by(map, rows[-1:], kind), there[kind]).sum()) for kind in (POINT, LINE))
     return Place(LocalWindow(rows[near], *ids), path_m, found)
 
 
 def _own_landmarks(map: Map, keyframe: int, place: LocalWindow) -> LocalWindow:
     """Window of a keyframe with its landmarks that are not in the place's."""
     row = np.array([keyframe], np.int32)
-    there = {"point": place.points, "line": place.lines, "plane": place.planes}
+    there = {POINT: place.points, LINE: place.lines, PLANE: place.planes}
     return LocalWindow(row, *(np.setdiff1d(observed_by(map, row, kind), ids).astype(np.int32) for kind, ids in there.items()))

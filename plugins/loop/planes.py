@@ -13,6 +13,7 @@ from trihedron.pipeline.core.types import Correction, Frame, Map
 from trihedron.plugins.loop.loop_closing import LoopOptions, close_loop, drift_sigma_m, within_reach
 from trihedron.plugins.loop.plane_layout import displacement_of_planes
 from trihedron.plugins.mapping.covisibility_graph import observed_by
+from trihedron.plugins.mapping.landmark_kinds import PLANE
 
 
 @register("loop", "planes")
@@ -32,8 +33,8 @@ class PlanesLoop(LoopOptions):
     def _rank(self, map: Map) -> Iterator[tuple[int, float]]:
         """Keyframes within reach, best layout first, with the length of the path since."""
         rows, path_m = within_reach(self, map, self.looked_at)
-        here = observed_by(map, np.array([len(map.keyframes) - 1], np.int32), "plane")
-        places = [observed_by(map, rows[k : k + 1], "plane") for k in range(len(rows))]
+        here = observed_by(map, np.array([len(map.keyframes) - 1], np.int32), PLANE)
+        places = [observed_by(map, rows[k : k + 1], PLANE) for k in range(len(rows))]
         scores = np.array([displacement_of_planes(map, here, there, float(drift_sigma_m(self, path_m[k])))[1] for k, there in enumerate(places)])
         for k in np.argsort(-scores, kind="stable"):
             if scores[k] >= self.min_layout:

@@ -11,6 +11,7 @@ from trihedron.pipeline.core.options import PositiveInt, Share
 from trihedron.pipeline.core.types import F64, I32, Map
 from trihedron.plugins.loop.loop_closing import LoopOptions, path_lengths, within_reach
 from trihedron.plugins.mapping.covisibility_graph import observed_by
+from trihedron.plugins.mapping.landmark_kinds import POINT
 
 HISTOGRAM = 128  # least bytes of a histogram (SIFT) or learned descriptor: its bits are those above the median
 Words = Callable[[Map, I32], tuple[I32, int]]  # word (n,) of each of some points, and the length of the vocabulary; 0: too few points
@@ -35,7 +36,7 @@ def rank_by_words(options: WordOptions, words_of: Words, map: Map) -> Iterator[t
     if not len(rows) or len(living) < 2:
         return
     spread = living[np.linspace(0, len(living) - 1, min(options.context, len(living))).round().astype(int)]
-    ids = [observed_by(map, np.array([row], np.int32), "point") for row in (*spread, living[-2], *rows, living[-1])]
+    ids = [observed_by(map, np.array([row], np.int32), POINT) for row in (*spread, living[-2], *rows, living[-1])]
     known = np.unique(np.concatenate(ids)).astype(np.int32)
     words, count = words_of(map, known)
     if not count:

@@ -11,6 +11,7 @@ from trihedron.pipeline.core.geometry import invert, rigid, transform, transform
 from trihedron.pipeline.core.linalg import matmul
 from trihedron.pipeline.core.types import F64, I32, Bool, Correction, Map, Table
 from trihedron.plugins.mapping.covisibility_graph import observed_by
+from trihedron.plugins.mapping.landmark_kinds import LINE, PLANE, POINT, LandmarkKind, landmarks_of
 from trihedron.plugins.mapping.landmarks import isin
 from trihedron.plugins.mapping.plane_fusion import equivalent_moments, motions_between
 from trihedron.plugins.shared.linalg import transform_plane_covariance
@@ -69,7 +70,7 @@ def _move_later(map: Map, correction: Correction, newest: int, T_corrected: F64)
     if not len(later):
         return map
     T = rigid(matmul(T_corrected, invert(map.keyframes.row("T_world_camera", newest))))
-    corrected = {"point": correction.point_ids, "line": correction.line_ids, "plane": correction.plane_ids}
+    corrected = {POINT: correction.point_ids, LINE: correction.line_ids, PLANE: correction.plane_ids}
     return transform_landmarks(map, T, later, *(_created_after(map, kind, newest, later, ids) for kind, ids in corrected.items()))
 
 
@@ -92,10 +93,10 @@ def transform_landmarks(map: Map, T: F64, keyframes: I32, points: I32, lines: I3
     return replace(map, **changes)
 
 
-def _created_after(map: Map, kind: str, keyframe: int, later: I32, corrected: I32) -> I32:
+def _created_after(map: Map, kind: LandmarkKind, keyframe: int, later: I32, corrected: I32) -> I32:
     """Living landmarks created after the keyframe, by one of those later, without the corrected ones."""
     ids = observed_by(map, later, kind)
-    ids = ids[getattr(map, f"{kind}s").rows("first", ids) > keyframe]
+    ids = ids[landmarks_of(map)[kind].rows("first", ids) > keyframe]
     return np.asarray(ids[~isin(ids, corrected)])
 
 

@@ -12,12 +12,13 @@ from numpy.typing import NDArray
 
 from trihedron.pipeline.core.geometry import invert
 from trihedron.pipeline.core.linalg import inv, matmul, norm
-from trihedron.pipeline.core.types import F64, I32, Bool, Map, Table
+from trihedron.pipeline.core.types import F64, I32, Bool, Map
+from trihedron.plugins.mapping.landmark_kinds import KINDS, LINE, PLANE, POINT, LandmarkKind, landmarks_of, observed_rows
 from trihedron.plugins.mapping.landmarks import distinct, index_of, isin
 
 P = ParamSpec("P")
 T = TypeVar("T")
-WEIGHTS = {"point": 1, "line": 5, "plane": 20}  # of a shared landmark, by kind: a bare room has few landmarks, all of them large
+WEIGHTS = {POINT: 1, LINE: 5, PLANE: 20}  # of a shared landmark, by kind: a bare room has few landmarks, all of them large
 VICINITY_M, VICINITY_DEG = 2.0, 60.0  # of a place, within which keyframes observed it
 
 
@@ -44,16 +45,14 @@ class LocalWindow:
     lines: I32
     planes: I32
 
-    def columns(self, map: Map, kind: str, *names: str) -> list[NDArray[Any]]:
-        """Gather columns of the landmarks of a kind ('points', 'lines', 'planes'); a window stays the same from frame to frame until a keyframe
-        comes."""
-        return _columns(map, getattr(self, kind), kind, names)
+    def columns(self, map: Map, kind: LandmarkKind, *names: str) -> list[NDArray[Any]]:
+        """Gather columns of the landmarks of a kind; a window stays the same from frame to frame until a keyframe comes."""
+        return _columns(map, {POINT: self.points, LINE: self.lines, PLANE: self.planes}[kind], kind, names)
 
 
 @once_per_version
-def _columns(map: Map, ids: I32, kind: str, names: tuple[str, ...]) -> list[NDArray[Any]]:
-    columns: list[NDArray[Any]] = getattr(map, kind).gathered(ids, *names)
-    return columns
+def _columns(map: Map, ids: I32, kind: LandmarkKind, names: tuple[str, ...]) -> list[NDArray[Any]]:
+    return landmarks_of(map)[kind].gathered(ids, *names)
 
 
 # Keyframes and sub-maps.
@@ -91,30 +90,22 @@ def current_submap(map: Map) -> int:
 # Edges: shared landmarks.
 
 
-def observed_by(map: Map, keyframes: I32, kind: str) -> I32:
-    """Return the ids of the living `kind` landmarks ('point', 'line', 'plane') that the keyframes observed, sorted."""
-    return _living(map, _observed(map, keyframes, kind)[0], kind)
+def observed_by(map: Map, keyframes: I32, kind: LandmarkKind) -> I32:
+    """Return the ids of the living landmarks of a kind that the keyframes observed, sorted."""
+    return _living(map, observed_rows(map, keyframes, kind)[1], kind)
 
 
-def observed_by_each(map: Map, keyframes: I32, kind: str) -> tuple[I32, I32, NDArray[np.int64]]:
+def observed_by_each(map: Map, keyframes: I32, kind: LandmarkKind) -> tuple[I32, I32, NDArray[np.int64]]:
     """Return `observed_by` of all the keyframes, the index among those of every observation of each keyframe in turn (-1: dead by now), and where
     the observations of each keyframe end (n,)."""
-    observed, ends = _observed(map, keyframes, kind)
+    _, observed, counts = observed_rows(map, keyframes, kind)
     ids = _living(map, observed, kind)
-    return ids, index_of(observed, ids), ends
+    return ids, index_of(observed, ids), np.cumsum(counts)
 
 
-def _observed(map: Map, keyframes: I32, kind: str) -> tuple[I32, NDArray[np.int64]]:
-    """Ids of the landmarks of every observation of each keyframe in turn, dead or alive, and where those of each keyframe end, (n,)."""
-    ranges = map.keyframes.rows(f"{kind}s", keyframes)
-    rows = np.concatenate([np.arange(a, b, dtype=np.int32) for a, b in ranges]) if len(ranges) else np.empty(0, np.int32)
-    table: Table = getattr(map, f"{kind}_observations")
-    return table.rows(kind, rows), np.cumsum(ranges[:, 1] - ranges[:, 0])
-
-
-def _living(map: Map, ids: I32, kind: str) -> I32:
+def _living(map: Map, ids: I32, kind: LandmarkKind) -> I32:
     ids = distinct(ids)
-    alive: Bool = getattr(map, f"{kind}s").rows("alive", ids)
+    alive: Bool = landmarks_of(map)[kind].rows("alive", ids)
     return ids[alive]
 
 
@@ -122,9 +113,9 @@ def _living(map: Map, ids: I32, kind: str) -> I32:
 def covisible_keyframes(map: Map, keyframes: I32, count: int) -> I32:
     """Return at most `count` further living keyframes that share most landmarks with the given ones, most first and of equals the newest."""
     weights = np.zeros(len(map.keyframes), np.int64)
-    for kind, weight in WEIGHTS.items():
-        observers = getattr(map, f"{kind}s").rows("observers", observed_by(map, keyframes, kind))
-        weights += weight * np.bincount(observers[observers >= 0], minlength=len(weights))
+    for kind, table in landmarks_of(map).items():
+        observers = table.rows("observers", observed_by(map, keyframes, kind))
+        weights += WEIGHTS[kind] * np.bincount(observers[observers >= 0], minlength=len(weights))
     living = living_keyframes(map)
     weights = np.where(isin(living, keyframes), 0, weights[living])
     order = len(weights) - 1 - np.argsort(-weights[::-1], kind="stable")[:count]
@@ -166,7 +157,7 @@ def local_window(
 @once_per_version
 def window_of(map: Map, keyframes: I32) -> LocalWindow:
     """Return the window of the keyframes (sorted rows)."""
-    return LocalWindow(keyframes, *(observed_by(map, keyframes, kind) for kind in ("point", "line", "plane")))
+    return LocalWindow(keyframes, *(observed_by(map, keyframes, kind) for kind in KINDS))
 
 
 def are_distinct(T: F64, other: F64) -> bool:

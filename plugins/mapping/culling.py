@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 
@@ -20,6 +19,7 @@ from trihedron.plugins.mapping.covisibility_graph import (
     observed_by_each,
 )
 from trihedron.plugins.mapping.landmark_kernels import count_redundant
+from trihedron.plugins.mapping.landmark_kinds import LINE, PLANE, POINT, LandmarkKind, landmarks_of, observations_of, with_tables
 from trihedron.plugins.mapping.landmarks import isin, remove_rows, union
 
 RETAINED = 4  # newest keyframes that are never redundant yet: the newest one's landmarks are still on trial
@@ -29,15 +29,16 @@ def cull_landmarks(map: Map, keyframe: int, matches: Matches | None, planes: I32
     """Remove points and lines that were expected by this keyframe or created `trial` keyframes ago, and `planes` expected by it, whose found ratio is
     too low. The cost depends on the view, not on the size of the map."""
     young = np.array([keyframe - trial], np.int32) if keyframe >= trial else np.empty(0, np.int32)
-    changes: dict[str, Any] = {}
-    for kind, visible in (("point", "visible_points"), ("line", "visible_lines")):
-        table: Table = getattr(map, f"{kind}s")
-        ids = union(observed_by(map, young, kind), getattr(matches, visible) if matches is not None else young[:0])
+    visible = (matches.visible_points, matches.visible_lines) if matches is not None else (young[:0], young[:0])
+    tables = landmarks_of(map)
+    for kind, expected in zip((POINT, LINE), visible):
+        table, ids = tables[kind], union(observed_by(map, young, kind), expected)
         found, seen, first = table.gathered(ids, "found", "visible", "first")
         seldom = (found < min_found * seen) | ((first == keyframe - trial) & (found < trial) & (seen >= trial))
-        changes[f"{kind}s"] = remove_rows(table, ids[seldom])
+        tables[kind] = remove_rows(table, ids[seldom])
     found, seen = map.planes.gathered(planes, "found", "visible")
-    return replace(map, planes=remove_rows(map.planes, planes[found < min_found * seen]), **changes)
+    tables[PLANE] = remove_rows(map.planes, planes[found < min_found * seen])
+    return with_tables(map, tables)
 
 
 def cull_redundant_keyframe(map: Map, others: int, share: float) -> Map:
@@ -70,8 +71,8 @@ def cull_repeated_keyframe(map: Map, shift_m: float, turn_deg: float, share: flo
         own = observed_by(map, keyframe, kind)
         seen += weight * len(own)
         known += weight * int(np.count_nonzero(isin(own, observed_by(map, near, kind))))
-    planes = observed_by(map, keyframe, "plane")
-    if not len(near) or known < share * seen or not isin(planes, observed_by(map, older, "plane")).all():
+    planes = observed_by(map, keyframe, PLANE)
+    if not len(near) or known < share * seen or not isin(planes, observed_by(map, older, PLANE)).all():
         return map
     return remove_keyframe(map, int(keyframe[0]))
 
@@ -79,23 +80,22 @@ def cull_repeated_keyframe(map: Map, shift_m: float, turn_deg: float, share: flo
 def _redundancies(map: Map, keyframes: I32, others: int) -> F64:
     """(n,) weighted share of each keyframe's living landmarks that at least so many other living keyframes observed from as near."""
     seen, redundant = np.zeros(len(keyframes)), np.zeros(len(keyframes))
-    for kind, weight in WEIGHTS.items():
-        table: Table = getattr(map, f"{kind}s")
+    for kind, table in landmarks_of(map).items():
         ids, observed, ends = observed_by_each(map, keyframes, kind)
         observers, centres = table.rows("observers", ids), _centres(table, kind, ids)
         rows = union(observers[observers >= 0], keyframes)
         known, alive = map.keyframes.gathered(rows, "T_world_camera", "alive")
         counts = count_redundant(observed, ends, keyframes, observers, centres, rows, known, alive, others)
-        seen += weight * counts[0]
-        redundant += weight * counts[1]
+        seen += WEIGHTS[kind] * counts[0]
+        redundant += WEIGHTS[kind] * counts[1]
     return redundant / np.maximum(seen, 1.0)
 
 
-def _centres(table: Table, kind: str, ids: I32) -> F64:
+def _centres(table: Table, kind: LandmarkKind, ids: I32) -> F64:
     """(n, 3) centres of landmarks."""
-    if kind == "point":
+    if kind == POINT:
         return table.rows("position_m", ids)
-    if kind == "line":
+    if kind == LINE:
         return np.asarray(table.rows("endpoints_m", ids).mean(axis=1), np.float64)
     samples = table.rows("samples_m", ids).astype(np.float64)
     known = np.isfinite(samples).all(axis=2, keepdims=True)
@@ -106,23 +106,22 @@ def remove_keyframe(map: Map, keyframe: int) -> Map:
     """Remove a keyframe from every window. Its row remains, for poses relative to it; its observations are freed. Points and lines without another
     observer are removed too, since no window would contain them; planes remain, for the surface."""
     row = np.array([keyframe], np.int32)
-    changes: dict[str, Any] = {}
-    for kind in WEIGHTS:
-        ids, table = observed_by(map, row, kind), getattr(map, f"{kind}s")
+    tables = landmarks_of(map)
+    for kind, table in tables.items():
+        ids = observed_by(map, row, kind)
         observers = table.rows("observers", ids)
         observers = -np.sort(-np.where(observers == keyframe, -1, observers), axis=1)  # newest first, as before
         table = table.updated(ids, observers=observers)
-        changes[f"{kind}s"] = remove_rows(table, ids[observers[:, 0] < 0]) if kind != "plane" else table
-    nothing = {f"{kind}s": np.zeros((1, 2), np.int32) for kind in WEIGHTS}
-    return replace(map, keyframes=remove_rows(map.keyframes.updated(row, **nothing), row), **changes)
+        tables[kind] = remove_rows(table, ids[observers[:, 0] < 0]) if kind != PLANE else table
+    nothing = {kind.span_column: np.zeros((1, 2), np.int32) for kind in tables}
+    return replace(with_tables(map, tables), keyframes=remove_rows(map.keyframes.updated(row, **nothing), row))
 
 
 def free_dead_rows(map: Map) -> Map:
     """Free the chunks of the tables without a living landmark, or without an observation of a living keyframe; rows keep their numbers."""
-    changes: dict[str, Any] = {}
-    for kind in WEIGHTS:
-        landmarks, measured = getattr(map, f"{kind}s"), getattr(map, f"{kind}_observations")
-        ids = np.flatnonzero(landmarks.column("alive"))
-        changes[f"{kind}s"] = landmarks.keeping(np.stack([ids, ids + 1], axis=1))
-        changes[f"{kind}_observations"] = measured.keeping(map.keyframes.rows(f"{kind}s", living_keyframes(map)))
-    return replace(map, **changes)
+    landmarks, observations, living = landmarks_of(map), observations_of(map), living_keyframes(map)
+    for kind, table in landmarks.items():
+        ids = np.flatnonzero(table.column("alive"))
+        landmarks[kind] = table.keeping(np.stack([ids, ids + 1], axis=1))
+        observations[kind] = observations[kind].keeping(map.keyframes.rows(kind.span_column, living))
+    return with_tables(map, landmarks, observations)

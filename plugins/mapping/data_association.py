@@ -13,6 +13,7 @@ from trihedron.pipeline.core.options import NonNegativeInt, PositiveFloat, Range
 from trihedron.pipeline.core.types import F64, I32, U8, Camera, Keypoints, Map, Matches, Planes, Segments
 from trihedron.plugins.mapping.covisibility_graph import LocalWindow
 from trihedron.plugins.mapping.landmark_kernels import pairs_by_row, related_planes
+from trihedron.plugins.mapping.landmark_kinds import LINE, PLANE, POINT
 from trihedron.plugins.mapping.projection import POINT_COLUMNS, VisiblePoints, clip_segments, visible_points
 from trihedron.plugins.shared.feature_matching import associate_planes, match_lines, match_near
 from trihedron.plugins.shared.feature_matching_kernels import transform_plane_samples
@@ -73,7 +74,7 @@ def _match_points(
     options: SearchOptions, camera: Camera, prediction: PredictedPose, keypoints: Keypoints, map: Map, window: LocalWindow
 ) -> tuple[I32, I32]:
     """Pairs (row, id) and the ids expected in view."""
-    *position, descriptors = window.columns(map, "points", *POINT_COLUMNS, "descriptor")
+    *position, descriptors = window.columns(map, POINT, *POINT_COLUMNS, "descriptor")
     visible = visible_points(position, prediction.T_world_camera, camera, options.view_deg, options.octave_scale)
     ids, descriptors = window.points[visible.rows], descriptors[visible.rows]
     sigma = prediction.sigma_m / np.maximum(visible.depth_m, 0.1)  # of the projection, rad; three standard deviations are searched
@@ -96,7 +97,7 @@ def _match_visible(options: SearchOptions, visible: VisiblePoints, descriptors: 
 
 def _match_lines(options: SearchOptions, camera: Camera, T_camera_world: F64, segments: Segments, map: Map, window: LocalWindow) -> tuple[I32, I32]:
     """Pairs (row, id) and the ids expected in view."""
-    endpoints, descriptors = window.columns(map, "lines", "endpoints_m", "descriptor")
+    endpoints, descriptors = window.columns(map, LINE, "endpoints_m", "descriptor")
     pixels, inside = clip_segments(endpoints, T_camera_world, camera)
     found = match_lines(
         pixels[inside].astype(np.float32), descriptors[inside], segments.endpoints_px, segments.descriptors,
@@ -107,7 +108,7 @@ def _match_lines(options: SearchOptions, camera: Camera, T_camera_world: F64, se
 
 def _match_planes(options: SearchOptions, T_camera_world: F64, planes: Planes, map: Map, window: LocalWindow) -> tuple[I32, I32, I32]:
     """Pairs (row, id) of the same plane, of parallel and of perpendicular ones."""
-    world, samples, covariance = window.columns(map, "planes", "coefficients", "samples_m", "covariance")
+    world, samples, covariance = window.columns(map, PLANE, "coefficients", "samples_m", "covariance")
     R, t = constant(T_camera_world[:3, :3], np.float64), constant(T_camera_world[:3, 3], np.float64)
     known, samples = transform_plane_samples(world, samples, R, t)
     same = associate_planes(planes.coefficients, planes.samples_m, known, samples, options.plane_angle_deg, options.plane_distance_m, True)

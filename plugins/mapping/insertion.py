@@ -14,6 +14,7 @@ from trihedron.pipeline.core.geometry import tangent_basis, transform, transform
 from trihedron.pipeline.core.linalg import matmul
 from trihedron.pipeline.core.types import F32, F64, I32, Bool, Camera, Keypoints, Map, Matches, Planes, Pose, Segments, Table
 from trihedron.plugins.mapping.landmark_kernels import farthest_samples, fuse_lines, fuse_points
+from trihedron.plugins.mapping.landmark_kinds import LINE, PLANE, POINT, LandmarkKind, observations_of, with_tables
 from trihedron.plugins.mapping.landmarks import OBSERVERS
 from trihedron.plugins.mapping.plane_fusion import equivalent_moments, fit_planes, move_moments, project_to_planes
 from trihedron.plugins.mapping.projection import line_terms, parameters_on, plane_terms, point_terms, points_along
@@ -139,13 +140,12 @@ def _new_landmark(count: int, keyframe: int) -> dict[str, Any]:
     return {"first": one * keyframe, "observers": observers, "found": one, "visible": one, "alive": np.ones(count, np.bool_)}
 
 
-def _append_observations(map: Map, kind: str, keyframe: int, **columns: Any) -> Map:
-    """Append the rows of a keyframe to the observation table of `kind`, and their range to the keyframe."""
-    table, rows = getattr(map, f"{kind}_observations").appended(keyframe=np.full(len(columns[kind]), keyframe, np.int32), **columns)
+def _append_observations(map: Map, kind: LandmarkKind, keyframe: int, ids: I32, columns: dict[str, Any]) -> Map:
+    """Append the observations of the landmarks `ids` by a keyframe, with these further columns, and their range to the keyframe."""
+    columns = {"keyframe": np.full(len(ids), keyframe, np.int32), kind.id_column: ids, **columns}
+    table, rows = observations_of(map)[kind].appended(**columns)
     span = np.array([[table.size - len(rows), table.size]], np.int32)
-    keyframes = map.keyframes.updated(np.array([keyframe]), **{f"{kind}s": span})
-    changes: dict[str, Any] = {f"{kind}_observations": table, "keyframes": keyframes}
-    return replace(map, **changes)
+    return replace(with_tables(map, {}, {kind: table}), keyframes=map.keyframes.updated(np.array([keyframe]), **{kind.span_column: span}))
 
 
 def _rows(features: Keypoints | Segments | Planes, rows: I32, *names: str) -> dict[str, Any]:
@@ -177,7 +177,7 @@ def insert_points(map: Map, view: Observations, keypoints: Keypoints, pairs: I32
     )
     all_rows = np.concatenate([rows, new])
     measured = {"pixel": keypoints.pixels[all_rows], "depth_m": keypoints.points_m[all_rows, 2], **_rows(keypoints, all_rows, "sigma_px", "sigma_m")}
-    return _append_observations(replace(map, points=table), "point", view.keyframe, point=np.concatenate([ids, created]), **measured)
+    return _append_observations(replace(map, points=table), POINT, view.keyframe, np.concatenate([ids, created]), measured)
 
 
 def _appearance(view: Observations, keypoints: Keypoints, rows: I32, position: F64) -> dict[str, Any]:
@@ -215,7 +215,7 @@ def insert_lines(map: Map, view: Observations, segments: Segments, pairs: I32, n
         **_new_landmark(len(new), view.keyframe),
     )
     measured = _rows(segments, np.concatenate([rows, new]), "endpoints_px", "endpoints_m", "covariance_m2")
-    return _append_observations(replace(map, lines=table), "line", view.keyframe, line=np.concatenate([ids, created]), **measured)
+    return _append_observations(replace(map, lines=table), LINE, view.keyframe, np.concatenate([ids, created]), measured)
 
 
 def extend_lines(endpoints: F64, information: F32 | F64, observed: F64) -> tuple[F64, F64]:
@@ -254,7 +254,7 @@ def insert_planes(map: Map, view: Observations, planes: Planes, pairs: I32, new:
         **_new_landmark(len(new), view.keyframe),
     )
     measured = _rows(planes, np.concatenate([pairs[:, 0], new]), "coefficients", "covariance", "moments")
-    return _append_observations(replace(map, planes=table), "plane", view.keyframe, plane=np.concatenate([pairs[:, 1], created]), **measured)
+    return _append_observations(replace(map, planes=table), PLANE, view.keyframe, np.concatenate([pairs[:, 1], created]), measured)
 
 
 def _plane_covariance(planes: Planes, view: Observations) -> F64:

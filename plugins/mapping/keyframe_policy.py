@@ -43,7 +43,7 @@ def needs_keyframe(options: KeyframeOptions, frame: Frame, pose: Pose, planes: P
     if not newest or keyframes.row("submap", newest[0]) != pose.submap:
         return True
     frames = frame.index - int(keyframes.row("index", newest[0]))
-    spans = [keyframes.row(kind, newest[0]).tolist() for kind in ("points", "lines", "planes")]
+    spans = [keyframes.row(kind.span_column, newest[0]).tolist() for kind in WEIGHTS]
     tracked_share = _weighted(pose.inliers.tolist()) / max(_weighted([end - begin for begin, end in spans]), 1)
     urgent = tracked_share < options.urgent_share
     if 0 <= frames < options.min_frames and not urgent:  # less than 0: a keyframe of another sequence

@@ -13,6 +13,7 @@ from trihedron.pipeline.core.types import I32, Bool, Map, Table
 from trihedron.plugins.mapping.covisibility_graph import newest_keyframes, observed_by
 from trihedron.plugins.mapping.insertion import Observations, extend_lines
 from trihedron.plugins.mapping.landmark_kernels import farthest_samples
+from trihedron.plugins.mapping.landmark_kinds import LINE, PLANE, POINT, LandmarkKind, landmarks_of, observations_of, observed_rows, with_tables
 from trihedron.plugins.mapping.landmarks import OBSERVERS, isin, remove_rows
 from trihedron.plugins.mapping.plane_fusion import fit_planes, project_to_planes
 from trihedron.plugins.mapping.projection import clip_segments, parameters_on, points_along
@@ -28,7 +29,7 @@ LINE_DEG, LINE_OVERLAP, LINE_BITS = 2.0, 0.3, 60
 
 def merge_points(map: Map, view: Observations, visible: I32, metric: str) -> Map:
     """Merge points expected by this keyframe but not matched with those it observed, where pixel, descriptor and position agree."""
-    seen = observed_by(map, np.array([view.keyframe], np.int32), "point")
+    seen = observed_by(map, np.array([view.keyframe], np.int32), POINT)
     unmatched = visible[map.points.rows("alive", visible) & ~isin(visible, seen)]
     sides = []
     for ids in (unmatched, seen):
@@ -52,12 +53,12 @@ def merge_points(map: Map, view: Observations, visible: I32, metric: str) -> Map
     names = ("descriptor", "direction", "distance_m", "octave")
     newer: dict[str, Any] = dict(zip(names, map.points.gathered(pairs[:, 1], *names)))
     points = map.points.updated(kept, position_m=merged, information=0.5 * total, **newer)  # half: both contain some of the same observations
-    return _remove_merged(replace(map, points=points), "point", kept, gone)
+    return _remove_merged(replace(map, points=points), POINT, kept, gone)
 
 
 def merge_lines(map: Map, view: Observations, visible: I32) -> Map:
     """Merge lines expected by this keyframe but not matched with those it observed, where image, descriptor and position agree."""
-    seen = observed_by(map, np.array([view.keyframe], np.int32), "line")
+    seen = observed_by(map, np.array([view.keyframe], np.int32), LINE)
     unmatched = visible[map.lines.rows("alive", visible) & ~isin(visible, seen)]
     sides = []
     for ids in (unmatched, seen):
@@ -74,7 +75,7 @@ def merge_lines(map: Map, view: Observations, visible: I32) -> Map:
     endpoints, information = map.lines.gathered(kept, "endpoints_m", "information")
     endpoints, information = extend_lines(endpoints, information, reach)
     lines = map.lines.updated(kept, endpoints_m=endpoints, information=information, descriptor=descriptor)
-    return _remove_merged(replace(map, lines=lines), "line", kept, gone)
+    return _remove_merged(replace(map, lines=lines), LINE, kept, gone)
 
 
 def _collinear(lines: Table, a: I32, b: I32) -> Bool:
@@ -89,8 +90,8 @@ def _collinear(lines: Table, a: I32, b: I32) -> Bool:
 
 def merge_planes(map: Map, keyframe: int, max_deg: float, max_m: float) -> Map:
     """Merge planes observed by this keyframe with duplicates observed by the newest few."""
-    fresh = observed_by(map, np.array([keyframe], np.int32), "plane")
-    around = observed_by(map, newest_keyframes(map, 5), "plane")
+    fresh = observed_by(map, np.array([keyframe], np.int32), PLANE)
+    around = observed_by(map, newest_keyframes(map, 5), PLANE)
     is_fresh, parallel = isin(around, fresh), _parallel(map.planes, around, max_deg)
     for k in range(len(around) - 1, 0, -1):
         older = parallel[k, :k] if is_fresh[k] else parallel[k, :k] & is_fresh[:k]
@@ -142,12 +143,12 @@ def _merge_pair(map: Map, a: int, b: int) -> Map:
     samples = table.rows("samples_m", ids)
     spread = farthest_samples(samples.reshape(-1, 3), samples.shape[1])
     table = table.updated(ids[:1], coefficients=fitted, covariance=covariance, moments=moments, samples_m=project_to_planes(spread[None], fitted))
-    return _remove_merged(replace(map, planes=table), "plane", ids[:1], ids[1:])
+    return _remove_merged(replace(map, planes=table), PLANE, ids[:1], ids[1:])
 
 
-def _remove_merged(map: Map, kind: str, kept: I32, gone: I32) -> Map:
+def _remove_merged(map: Map, kind: LandmarkKind, kept: I32, gone: I32) -> Map:
     """Remove the landmarks `gone`; their observers, counts and observations pass to the distinct ids `kept`."""
-    table: Table = getattr(map, f"{kind}s")
+    table = landmarks_of(map)[kind]
     mine, theirs = (table.gathered(ids, "observers", "found", "visible") for ids in (kept, gone))
     both = np.concatenate([mine[0], theirs[0]], axis=1)
     both = -np.sort(-both, axis=1)
@@ -155,19 +156,14 @@ def _remove_merged(map: Map, kind: str, kept: I32, gone: I32) -> Map:
     table = table.updated(
         kept, observers=-np.sort(-both, axis=1)[:, :OBSERVERS], found=np.maximum(mine[1], theirs[1]), visible=np.maximum(mine[2], theirs[2])
     )
-    observations = _replace_ids(map, kind, kept, gone)
-    changes: dict[str, Any] = {f"{kind}s": remove_rows(table, gone), f"{kind}_observations": observations}
-    return replace(map, **changes)
+    return with_tables(map, {kind: remove_rows(table, gone)}, {kind: _replace_ids(map, kind, kept, gone)})
 
 
-def _replace_ids(map: Map, kind: str, kept: I32, gone: I32) -> Table:
+def _replace_ids(map: Map, kind: LandmarkKind, kept: I32, gone: I32) -> Table:
     """Replace the ids `gone` by `kept` in the observations of their observers."""
-    observations: Table = getattr(map, f"{kind}_observations")
-    observers = np.unique(getattr(map, f"{kind}s").rows("observers", gone))
-    spans = map.keyframes.rows(f"{kind}s", observers[observers >= 0])
-    rows = np.concatenate([np.empty(0, np.int32), *(np.arange(x, y, dtype=np.int32) for x, y in spans)])
-    ids = observations.rows(kind, rows)
+    observations, observers = observations_of(map)[kind], np.unique(landmarks_of(map)[kind].rows("observers", gone))
+    rows, ids, _ = observed_rows(map, observers[observers >= 0], kind)
     order = np.argsort(gone)
     place = np.minimum(np.searchsorted(gone[order], ids), max(len(gone) - 1, 0))
     hit = gone[order][place] == ids if len(gone) else np.zeros(len(ids), np.bool_)
-    return observations.updated(rows[hit], **{kind: kept[order][place[hit]]})
+    return observations.updated(rows[hit], **{kind.id_column: kept[order][place[hit]]})

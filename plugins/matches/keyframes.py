@@ -12,6 +12,7 @@ from trihedron.pipeline.core.options import NonNegativeInt, PositiveFloat, Posit
 from trihedron.pipeline.core.registry import register
 from trihedron.pipeline.core.types import I32, Camera, Keypoints, Map, Matches, Rotation
 from trihedron.plugins.mapping.covisibility_graph import current_submap, keyframes_of, observed_by
+from trihedron.plugins.mapping.landmark_kinds import POINT
 from trihedron.plugins.shared.feature_matching import mutual_matches
 from trihedron.plugins.shared.rigid_alignment import consensus, point_pair_sigma, rows_with_depth
 
@@ -56,7 +57,7 @@ class Keyframes:
 
     def _verified(self, camera: Camera, keypoints: Keypoints, map: Map, keyframe: int, rng: np.random.Generator) -> I32:
         """Rows of key points and ids of the keyframe's points (n, 2) that agree on one motion; none where too few do."""
-        ids, mine = observed_by(map, np.array([keyframe], np.int32), "point"), rows_with_depth(keypoints)
+        ids, mine = observed_by(map, np.array([keyframe], np.int32), POINT), rows_with_depth(keypoints)
         descriptors, positions = map.points.gathered(ids, "descriptor", "position_m")
         found = mutual_matches(descriptors, keypoints.descriptors[mine], keypoints.metric, self.ratio)
         if len(found) < self.min_points:

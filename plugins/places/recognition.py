@@ -6,6 +6,7 @@ import numpy as np
 
 from trihedron.pipeline.core.types import F64, I32, Keypoints, Map, Segments
 from trihedron.plugins.mapping.covisibility_graph import WEIGHTS, are_distinct, observed_by
+from trihedron.plugins.mapping.landmark_kinds import LINE, POINT, landmarks_of
 from trihedron.plugins.shared.feature_matching import nearest_matches
 from trihedron.plugins.shared.rigid_alignment_kernels import rigid_hypotheses_kernel
 
@@ -16,9 +17,9 @@ def candidate_keyframes(map: Map, keypoints: Keypoints, segments: Segments, keyf
     if len(keyframes) <= count:
         return keyframes
     votes = np.zeros(len(map.keyframes), np.int64)
-    for kind, features, weight in (("point", keypoints, 1), ("line", segments, WEIGHTS["line"])):
+    for kind, features, weight in ((POINT, keypoints, 1), (LINE, segments, WEIGHTS[LINE])):
         ids = observed_by(map, keyframes, kind)
-        table = getattr(map, f"{kind}s")
+        table = landmarks_of(map)[kind]
         rows = nearest_matches(features.descriptors, table.rows("descriptor", ids), max_bits, 1.0)
         observers = table.rows("observers", ids[np.unique(rows[rows >= 0])])
         votes += weight * np.bincount(observers[observers >= 0], minlength=len(votes))

@@ -9,6 +9,7 @@ to it. Where the other matches contradict these static ones, the static ones are
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from enum import Enum
 
 import numpy as np
 
@@ -25,7 +26,15 @@ from trihedron.plugins.shared.pose_optimizer_kernels import Flags, LineTerms, Po
 VERIFIED_VIEWS = 2  # keyframes that measured a landmark in the same place, from which on it is verified
 MIN_POINTS = 30  # of each kind below which their shares are not significant
 FIRST_STEP_SHARE = 0.5  # of the gate that a first step must reach before the static matches are solved for
-ON_PLANES, VERIFIED, PLANES, ALL = "matches on planes", "verified landmarks", "the planes", "all"  # names of selections of matches
+
+
+class Selection(Enum):
+    """A selection of matches that a pose is estimated by. The values are for messages."""
+
+    ON_PLANES = "matches on planes"
+    VERIFIED = "verified landmarks"
+    PLANES = "the planes"
+    ALL = "all"
 
 
 @dataclass(frozen=True)
@@ -40,44 +49,46 @@ class DynamicObjectOptions:
     least: float
 
 
-def solve_with_static(problem: MapAlignment, options: DynamicObjectOptions) -> tuple[PoseSolution, str]:
+def solve_with_static(problem: MapAlignment, options: DynamicObjectOptions) -> tuple[PoseSolution, Selection | None]:
     """Estimate the pose by all matches; or, where something moves and pulls the pose away, by static matches, with all matches classified by it.
 
-    Also returns the name of the static matches, '' for all matches. Where most matches are outliers even so (ALL), the covariance is widened to
-    what the planes alone support."""
+    Also returns the selection of static matches, None for all matches. Where most matches are outliers even so (`ALL` without a selection), the
+    covariance is widened to what the planes alone support."""
     terms = problem.terms(problem.T_start)
-    solution, name = problem.solve(terms), ""
+    solution, selection = problem.solve(terms), None
     inliers = problem.statistics(solution)
     for static in static_selections(problem.map, problem.matches, problem.keypoints, problem.segments, problem.planes):
         alone = _solve_alone(solution, inliers, problem, terms, static, options)
         if alone is not None:
-            solution, name = problem.classify(alone), static.name
+            solution, selection = problem.classify(alone), static.selection
             break
-    if len(solution.points) >= MIN_POINTS and _is_contradicted(problem, solution, name, options):
-        name = name or ALL
+    if len(solution.points) >= MIN_POINTS and _is_contradicted(problem, solution, selection, options):
+        selection = selection or Selection.ALL
         by_planes = problem.solve(planes_alone(problem.matches).select(terms))
         solution = replace(solution, covariance=covariance_about(solution, by_planes))
-    return solution, name
+    return solution, selection
 
 
 def status_with_static(
-    status: TrackingStatus, solution: PoseSolution, problem: MapAlignment, name: str, options: DynamicObjectOptions
+    status: TrackingStatus, solution: PoseSolution, problem: MapAlignment, selection: Selection, options: DynamicObjectOptions
 ) -> TrackingStatus:
-    """Status of a pose estimated by the static matches `name`; degraded where most matches contradict it, or only the planes support it, since these
-    may be the moving ones."""
-    if name == PLANES or (status.status == OK and _is_contradicted(problem, solution, name, options)):
+    """Status of a pose estimated by this selection; degraded where most matches contradict it, or only the planes support it, since these may be the
+    moving ones."""
+    if selection is Selection.PLANES or (status.status == OK and _is_contradicted(problem, solution, selection, options)):
         inliers = problem.statistics(solution)
-        reason = f"something moves: only {inliers.total} of {inliers.matches} matches agree" + (f" with {name}" if name != ALL else "")
-        return replace(status, status=DEGRADED, reason=reason)
-    return replace(status, reason=f"{status.reason}, by {name} alone") if name != ALL else status
+        support = f" with {selection.value}" if selection is not Selection.ALL else ""
+        return replace(status, status=DEGRADED, reason=f"something moves: only {inliers.total} of {inliers.matches} matches agree{support}")
+    return replace(status, reason=f"{status.reason}, by {selection.value} alone") if selection is not Selection.ALL else status
 
 
 def _solve_alone(
     solution: PoseSolution, inliers: InlierStatistics, problem: MapAlignment, terms: Terms, static: StaticMatches, options: DynamicObjectOptions
 ) -> PoseSolution | None:
     """Estimate the pose by static matches alone; None unless the other matches pull it significantly away from that."""
-    far = options.unproven if static.name == PLANES else options.sure
-    contradicted = static.outlier_difference(solution.points) >= options.share or (static.name == VERIFIED and inliers.most_planes_disagree)
+    by_planes = static.selection is Selection.PLANES
+    far = options.unproven if by_planes else options.sure
+    planes_disagree = static.selection is Selection.VERIFIED and inliers.most_planes_disagree
+    contradicted = planes_disagree or static.outlier_difference(solution.points) >= options.share
     if not contradicted and (1.0 - inliers.total / max(inliers.matches, 1) < options.share or inliers.matched[2] == 0):
         return None
     if not contradicted:
@@ -85,15 +96,15 @@ def _solve_alone(
         if mahalanobis2(xi, covariance, 3) < FIRST_STEP_SHARE * far:
             return None
     alone = problem.solve(static.select(terms))
-    if static.name == ON_PLANES and problem.statistics(alone).most_planes_disagree:  # planes that contradict each other are no evidence
-        return None
-    if static.name == PLANES and problem.statistics(problem.classify(alone)).total < options.least * inliers.matches:  # nothing else supports them
+    if static.selection is Selection.ON_PLANES and problem.statistics(alone).most_planes_disagree:
+        return None  # planes that contradict each other are no evidence
+    if by_planes and problem.statistics(problem.classify(alone)).total < options.least * inliers.matches:  # nothing else supports them
         return None
     pulled = distance2(alone, solution) >= options.gate if contradicted else distance2(alone, solution, 3) > far
-    return alone if pulled and (static.name == PLANES or not alone.unobservable.shape[1]) else None
+    return alone if pulled and (by_planes or not alone.unobservable.shape[1]) else None
 
 
-def _is_contradicted(problem: MapAlignment, solution: PoseSolution, name: str, options: DynamicObjectOptions) -> bool:
+def _is_contradicted(problem: MapAlignment, solution: PoseSolution, selection: Selection | None, options: DynamicObjectOptions) -> bool:
     """Return True if most matches are outliers of a pose.
 
     If most planes are outliers too, a majority is enough, by more than one standard deviation of such a count. A pose by matches on planes is
@@ -101,7 +112,7 @@ def _is_contradicted(problem: MapAlignment, solution: PoseSolution, name: str, o
     inliers = problem.statistics(solution)
     same = inliers.matched[2]
     majority = 2.0 * inliers.total < inliers.matches - inliers.matches**0.5
-    if name == ON_PLANES:
+    if selection is Selection.ON_PLANES:
         verified = verified_planes(problem.map, problem.matches)
         return majority and bool(2 * np.count_nonzero(solution.planes[:same][verified]) <= np.count_nonzero(verified))
     return inliers.total < options.most * inliers.matches or (majority and 2 * inliers.inliers[2] <= same)
@@ -109,9 +120,9 @@ def _is_contradicted(problem: MapAlignment, solution: PoseSolution, name: str, o
 
 @dataclass(frozen=True)
 class StaticMatches:
-    """A selection of matches assumed static, masks of points (n,) and lines (m,), and its name. Planes are always included."""
+    """A selection of matches assumed static, as masks of points (n,) and lines (m,). Planes are always included."""
 
-    name: str
+    selection: Selection
     points: Bool
     lines: Bool
 
@@ -137,19 +148,20 @@ def static_selections(map: Map, matches: Matches, keypoints: Keypoints, segments
     and, while nothing can be verified, until a third keyframe, the planes themselves."""
     kinds = matches_on_planes(matches, keypoints, segments, planes), verified_matches(map, matches)
     enough = [kind for kind in kinds if np.count_nonzero(kind.points) >= MIN_POINTS]
-    return enough if len(map.keyframes) > VERIFIED_VIEWS or any(kind.name == VERIFIED for kind in enough) else [*enough, planes_alone(matches)]
+    verifiable = len(map.keyframes) > VERIFIED_VIEWS or any(kind.selection is Selection.VERIFIED for kind in enough)
+    return enough if verifiable else [*enough, planes_alone(matches)]
 
 
 def planes_alone(matches: Matches) -> StaticMatches:
     """Select no point and no line."""
-    return StaticMatches(PLANES, np.zeros(len(matches.keypoints), np.bool_), np.zeros(len(matches.segments), np.bool_))
+    return StaticMatches(Selection.PLANES, np.zeros(len(matches.keypoints), np.bool_), np.zeros(len(matches.segments), np.bool_))
 
 
 def verified_matches(map: Map, matches: Matches) -> StaticMatches:
     """Select the matches with landmarks that at least two keyframes measured in the same place."""
     pairs = (map.points, matches.keypoints), (map.lines, matches.segments)
     points, lines = (table.rows("found", matched[:, 1]) >= VERIFIED_VIEWS for table, matched in pairs)
-    return StaticMatches(VERIFIED, points, lines)
+    return StaticMatches(Selection.VERIFIED, points, lines)
 
 
 def verified_planes(map: Map, matches: Matches) -> Bool:
@@ -160,7 +172,8 @@ def verified_planes(map: Map, matches: Matches) -> Bool:
 def matches_on_planes(matches: Matches, keypoints: Keypoints, segments: Segments, planes: Planes) -> StaticMatches:
     """Select the matches of features that lie within matched planes, away from their borders."""
     same, points, lines = (constant(pairs, np.int32) for pairs in (matches.planes, matches.keypoints, matches.segments))
-    return StaticMatches(ON_PLANES, *on_planes_kernel(planes.labels, same, planes.stride, keypoints.pixels, points, segments.endpoints_px, lines))
+    within = on_planes_kernel(planes.labels, same, planes.stride, keypoints.pixels, points, segments.endpoints_px, lines)
+    return StaticMatches(Selection.ON_PLANES, *within)
 
 
 def _difference(one: PoseSolution, other: PoseSolution) -> F64:

@@ -28,7 +28,7 @@ from trihedron.pipeline.core.types import (
 )
 from trihedron.plugins.mapping.reference_keyframe import reference_of, submap_of, transform_to_map
 from trihedron.plugins.pose.decoupled_pose import FIRST_SIGMA, Decoupled, decoupled_pose
-from trihedron.plugins.pose.dynamic_objects import DynamicObjectOptions, solve_with_static, status_with_static
+from trihedron.plugins.pose.dynamic_objects import DynamicObjectOptions, Selection, solve_with_static, status_with_static
 from trihedron.plugins.pose.map_alignment import InlierStatistics, MapAlignment, TrackingStatus
 from trihedron.plugins.pose.world_uncertainty import carried, in_world, widened_by_keyframes
 from trihedron.plugins.shared.pose_optimizer import PoseSolution
@@ -133,10 +133,10 @@ class Refine:
         information[:3, :3], information[3:, 3:] = inv(both)
         return information
 
-    def _solve(self, problem: MapAlignment, start: Decoupled) -> tuple[PoseSolution, str]:
-        """Estimate the pose; also the name of the static matches that it was estimated from, '' for all matches."""
+    def _solve(self, problem: MapAlignment, start: Decoupled) -> tuple[PoseSolution, Selection | None]:
+        """Estimate the pose; also the selection of static matches that it was estimated by, None for all matches."""
         if start.status == LOST:
-            return problem.solve(problem.terms(problem.T_start)), ""
+            return problem.solve(problem.terms(problem.T_start)), None
         return solve_with_static(problem, self.dynamic_object_options)
 
     def _is_tracked(self, inliers: InlierStatistics) -> bool:
@@ -156,11 +156,11 @@ class Refine:
         return expected >= DETAILED and continued < self.min_continued * with_depth
 
     def _status(
-        self, problem: MapAlignment, solution: PoseSolution, static: str, inliers: InlierStatistics, rotation: Rotation, submap: int
+        self, problem: MapAlignment, solution: PoseSolution, static: Selection | None, inliers: InlierStatistics, rotation: Rotation, submap: int
     ) -> TrackingStatus:
         """Status of a refined pose: by its inliers, dynamic objects, keyframes and sub-map."""
         status = self._inlier_status(solution, inliers, rotation)
-        if static:
+        if static is not None:
             status = status_with_static(status, solution, problem, static, self.dynamic_object_options)
         if status.status == OK:
             status = widened_by_keyframes(status, solution, problem, self.weak_foundation)

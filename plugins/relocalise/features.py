@@ -12,6 +12,7 @@ from trihedron.pipeline.core.options import PositiveFloat, PositiveInt
 from trihedron.pipeline.core.registry import register
 from trihedron.pipeline.core.types import F64, I32, Frame, Keypoints, Map, Planes, Pose, Rotation, Segments
 from trihedron.plugins.mapping.covisibility_graph import observed_by
+from trihedron.plugins.mapping.landmark_kinds import LINE, PLANE, POINT
 from trihedron.plugins.places.recognition import distinct_poses, rigid_hypotheses
 from trihedron.plugins.places.verification import FrameFeatures
 from trihedron.plugins.relocalise.features_kernels import BIN_M, NEAR_M, explained_share
@@ -57,7 +58,7 @@ class Features(RelocaliseOptions):
         keypoints = view.keypoints
         if keypoints.metric != "hamming":
             return np.empty((0, 4, 4))
-        ids, rows = observed_by(map, keyframes, "point"), np.flatnonzero(np.isfinite(keypoints.points_m[:, 2])).astype(np.int32)
+        ids, rows = observed_by(map, keyframes, POINT), np.flatnonzero(np.isfinite(keypoints.points_m[:, 2])).astype(np.int32)
         matched = nearest_matches(keypoints.descriptors[rows], map.points.rows("descriptor", ids), self.max_bits, self.ratio)
         rows, ids = rows[matched >= 0], ids[matched[matched >= 0]]
         points = keypoints.points_m[rows].astype(np.float64)
@@ -69,7 +70,7 @@ class Features(RelocaliseOptions):
     def _by_layout(self, view: FrameFeatures, map: Map, keyframes: I32, rotation: Rotation) -> F64:
         """Poses (n, 4, 4) by the layout of planes and lines about each known Manhattan frame in view, best first."""
         found, scores = np.empty((0, 4, 4)), np.empty(0)
-        plane_ids, line_ids = observed_by(map, keyframes, "plane"), observed_by(map, keyframes, "line")
+        plane_ids, line_ids = observed_by(map, keyframes, PLANE), observed_by(map, keyframes, LINE)
         for R_world, R_camera in zip(rotation.R_world_manhattan, rotation.R_camera_manhattan):
             if np.isfinite(R_camera).all():
                 poses, values = layout_poses(map, plane_ids, line_ids, view.planes, view.segments, R_world, R_camera)

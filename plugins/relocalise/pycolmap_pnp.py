@@ -12,6 +12,7 @@ from trihedron.pipeline.core.options import PositiveFloat
 from trihedron.pipeline.core.registry import register
 from trihedron.pipeline.core.types import F64, I32, Frame, Keypoints, Map, Planes, Pose, Segments
 from trihedron.plugins.mapping.covisibility_graph import observed_by
+from trihedron.plugins.mapping.landmark_kinds import POINT
 from trihedron.plugins.places.verification import FrameFeatures
 from trihedron.plugins.relocalise.hypothesis_verification import RelocaliseOptions, recognise
 from trihedron.plugins.shared.feature_matching import mutual_matches
@@ -44,7 +45,7 @@ class PycolmapPnp(RelocaliseOptions):
 
     def _by_points(self, view: FrameFeatures, map: Map, keyframes: I32, rng: np.random.Generator) -> F64:
         """(n, 4, 4) poses, none or one."""
-        ids, seed = observed_by(map, keyframes, "point"), int(rng.integers(2**31 - 1))
+        ids, seed = observed_by(map, keyframes, POINT), int(rng.integers(2**31 - 1))
         pairs = mutual_matches(map.points.rows("descriptor", ids), view.keypoints.descriptors, view.keypoints.metric, self.ratio)
         known = map.points.rows("position_m", ids[pairs[:, 0]])
         found = absolute_pose(known, view.keypoints.pixels[pairs[:, 1]], view.frame.camera, self.max_error_px, seed)

@@ -13,6 +13,7 @@ from trihedron.pipeline.core.table import CHUNK
 from trihedron.plugins.mapping import plane_fusion
 from trihedron.plugins.mapping.correction import apply_correction
 from trihedron.plugins.mapping.covisibility_graph import local_window, observed_by
+from trihedron.plugins.mapping.landmark_kinds import LINE, POINT
 
 sys.path.insert(0, str(Path(__file__).parent))
 from landmark_world import World, camera_at
@@ -110,7 +111,7 @@ def test_a_way_gone_again_and_again_leaves_the_map_as_it_was_after_the_first_tim
     assert keyframes.max() <= keyframes[0] + 2 < 20 and landmarks.max() < 1.1 * landmarks[0] and chunks.max() < 9
     alive = np.flatnonzero(map.keyframes.column("alive")).astype(np.int32)
     assert {0, 1, 2} <= set(alive) and (alive[-4:] == np.arange(116, 120)).all()
-    for kind, table in (("point", map.points), ("line", map.lines)):  # what lives is seen by what lives
+    for kind, table in ((POINT, map.points), (LINE, map.lines)):  # what lives is seen by what lives
         assert np.array_equal(observed_by(map, alive, kind), np.flatnonzero(table.column("alive")))
         assert np.isin(table.column("observers")[table.column("alive")], [*alive, -1]).all()
 

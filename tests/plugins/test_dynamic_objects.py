@@ -12,6 +12,7 @@ from trihedron.pipeline.core.lie import exp_se3, log_se3
 from trihedron.plugins.matches.local_map import LocalMap
 from trihedron.plugins.pose.dynamic_objects import (
     MIN_POINTS,
+    Selection,
     StaticMatches,
     covariance_about,
     distance2,
@@ -99,7 +100,7 @@ def test_what_lies_within_planes_that_are_matched_is_at_rest(world, map):
     assert (planes.labels[at[less.points, 1], at[less.points, 0]] == label).all() and not (less.points & ~found.points).any()
     border = dataclasses.replace(planes, labels=np.where(np.indices(planes.labels.shape).sum(0) % 3 == 0, 0, planes.labels).astype(np.uint8))
     assert not matches_on_planes(matches, keypoints, segments, border).points.any()  # something else within a cell of each
-    assert [kind.name for kind in static_selections(map, matches, keypoints, segments, planes)] == ["matches on planes", "verified landmarks"]
+    assert [kind.selection for kind in static_selections(map, matches, keypoints, segments, planes)] == [Selection.ON_PLANES, Selection.VERIFIED]
 
 
 def test_a_plane_met_once_is_not_known_to_be_at_rest_unless_there_is_but_one_keyframe(world, map, single):
@@ -116,7 +117,7 @@ def denied(world, map, points, planes):
     counts = (len(matches.keypoints), int(points * len(matches.keypoints))), (len(matches.segments), 0), (len(matches.planes), planes)
     flags = [(np.arange(count) < agree).astype(np.uint8) for count, agree in counts]
     found = PoseSolution(camera_at(STEP), 1e-6 * np.eye(6), np.empty((6, 0)), *flags, 0.0)
-    status = status_with_static(TrackingStatus("ok", "", found.covariance), found, problem, "matches on planes", Refine().dynamic_object_options)
+    status = status_with_static(TrackingStatus("ok", "", found.covariance), found, problem, Selection.ON_PLANES, Refine().dynamic_object_options)
     assert status.status == "ok" or status.reason.startswith("something moves")
     return status.status == "degraded"
 
@@ -127,13 +128,13 @@ def test_a_pose_by_what_lies_on_planes_is_denied_by_most_of_what_is_seen_and_hal
 
 
 def test_new_points_contradict_proven_ones_by_the_difference_of_their_shares():
-    known = StaticMatches("", np.arange(200) < 100, np.empty(0, bool))
+    known = StaticMatches(Selection.VERIFIED, np.arange(200) < 100, np.empty(0, bool))
     agree = np.ones(200, np.uint8)
     assert known.outlier_difference(agree) == 0.0
     agree[:10], agree[100:140] = 0, 0  # 10 % of the proven, 40 % of the new
-    others = StaticMatches("", ~known.points, known.lines)
+    others = StaticMatches(Selection.VERIFIED, ~known.points, known.lines)
     assert known.outlier_difference(agree) == pytest.approx(0.3) and others.outlier_difference(agree) == pytest.approx(0.3)
-    assert StaticMatches("", np.arange(200) < MIN_POINTS - 1, known.lines).outlier_difference(agree) == 0.0
+    assert StaticMatches(Selection.VERIFIED, np.arange(200) < MIN_POINTS - 1, known.lines).outlier_difference(agree) == 0.0
 
 
 def test_the_distance_is_in_standard_deviations_of_the_first():

@@ -16,6 +16,7 @@ from trihedron.plugins.loop.planes import PlanesLoop
 from trihedron.plugins.map.covisibility import Covisibility
 from trihedron.plugins.mapping.correction import apply_correction
 from trihedron.plugins.mapping.covisibility_graph import observed_by
+from trihedron.plugins.mapping.landmark_kinds import KINDS, LINE, POINT
 from trihedron.plugins.matches.local_map import LocalMap
 from trihedron.plugins.shared.pose_graph import Edges, solve_pose_graph
 from trihedron.plugins.shared.pose_optimizer import solve_pose
@@ -121,13 +122,13 @@ def test_landmarks_that_recent_keyframes_observed_are_no_evidence_of_a_loop(walk
     _, map = walked
     rows, way = path_lengths(map)
     place, recent = place_of(LOOPS["planes"], map, 12, float(way[12])), rows[way <= 0.5 * OPTIONS["away_m"]]
-    for kind in ("point", "line", "plane"):
+    for kind, ids in zip(KINDS, (place.window.points, place.window.lines, place.window.planes)):
         there, since = observed_by(map, place.window.keyframes, kind), observed_by(map, recent, kind)
         assert len(np.intersect1d(there, since)) > 0
-        assert set(getattr(place.window, f"{kind}s").tolist()) == set(there.tolist()) - set(since.tolist())
+        assert set(ids.tolist()) == set(there.tolist()) - set(since.tolist())
     near = place_of(dataclasses.replace(LOOPS["planes"], away_m=0.02), map, STEPS - 6, float(way[STEPS - 6]))
-    here = [observed_by(map, rows[-1:], kind) for kind in ("point", "line")]
-    assert near.found == sum(np.isin(ids, observed_by(map, near.window.keyframes, kind)).sum() for ids, kind in zip(here, ("point", "line"))) > 0
+    here = [observed_by(map, rows[-1:], kind) for kind in (POINT, LINE)]
+    assert near.found == sum(np.isin(ids, observed_by(map, near.window.keyframes, kind)).sum() for ids, kind in zip(here, (POINT, LINE))) > 0
 
 
 @pytest.mark.parametrize(("values", "field"), [({"every": 0}, "every"), ({"drift_share": 0.0}, "drift_share"), ({"view_deg": 120.0}, "view_deg")])

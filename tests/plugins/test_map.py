@@ -12,6 +12,7 @@ from trihedron.pipeline.core.lie import exp_se3
 from trihedron.plugins.map.covisibility import Covisibility
 from trihedron.plugins.mapping import plane_fusion
 from trihedron.plugins.mapping.landmark_kernels import fuse_lines
+from trihedron.plugins.mapping.landmark_kinds import landmarks_of, observations_of
 from trihedron.plugins.matches.local_map import LocalMap
 from trihedron.plugins.none import NoMap
 
@@ -30,10 +31,10 @@ def test_the_first_frame_makes_a_keyframe_of_everything_with_depth():
     assert np.array_equal(map.points.column("descriptor"), keypoints.descriptors[with_depth])
     assert len(map.lines) == np.isfinite(segments.endpoints_m).all(axis=(1, 2)).sum() > 0
     assert np.allclose(map.planes.column("coefficients"), planes.coefficients, atol=1e-6)
-    for kind in ("point", "line", "plane"):
-        table, landmarks = getattr(map, f"{kind}_observations"), getattr(map, f"{kind}s")
-        assert np.array_equal(table.column(kind), np.arange(len(landmarks))) and not table.column("keyframe").any()
-        assert list(map.keyframes.column(f"{kind}s")[0]) == [0, len(landmarks)]
+    for kind, landmarks in landmarks_of(map).items():
+        table = observations_of(map)[kind]
+        assert np.array_equal(table.column(kind.id_column), np.arange(len(landmarks))) and not table.column("keyframe").any()
+        assert list(map.keyframes.column(kind.span_column)[0]) == [0, len(landmarks)]
         assert (landmarks.column("observers")[:, 0] == 0).all() and (landmarks.column("observers")[:, 1:] == -1).all()
 
 

@@ -11,6 +11,7 @@ from trihedron.pipeline.core.lie import exp_se3
 from trihedron.pipeline.core.types import Keypoints, Pose
 from trihedron.plugins.map.covisibility import Covisibility
 from trihedron.plugins.mapping.covisibility_graph import local_window, observed_by
+from trihedron.plugins.mapping.landmark_kinds import POINT
 from trihedron.plugins.mapping.projection import clip_segments
 from trihedron.plugins.matches.local_map import LocalMap
 
@@ -163,7 +164,7 @@ def test_the_window_is_bounded_and_reaches_what_was_seen_from_here():
     assert len(map.keyframes) == len(steps)
     window = local_window(map, camera_at(0), newest=2, covisible=6, near=3)
     assert len(window.keyframes) <= 11 and {58, 59} <= set(window.keyframes) and 0 in window.keyframes
-    assert set(window.points) == set(observed_by(map, window.keyframes, "point")) and len(window.planes) >= 3
+    assert set(window.points) == set(observed_by(map, window.keyframes, POINT)) and len(window.planes) >= 3
 
 
 def test_segments_are_cut_at_the_image_and_at_the_camera():

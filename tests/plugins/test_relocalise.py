@@ -11,6 +11,7 @@ from trihedron.pipeline.core.geometry import invert, pose_matrix
 from trihedron.pipeline.core.lie import exp_se3, exp_so3, rotation_angle_deg
 from trihedron.pipeline.core.types import LOST, Pose
 from trihedron.plugins.map.covisibility import Covisibility
+from trihedron.plugins.mapping.landmark_kinds import observations_of
 from trihedron.plugins.matches.local_map import LocalMap
 from trihedron.plugins.places.verification import least_share
 from trihedron.plugins.relocalise.features import Features
@@ -142,8 +143,8 @@ def shifted(map, step):
             columns["first"] += counts["keyframe"]
         if name == "keyframes":
             columns["T_world_camera"][:, :3, 3] += step
-            for kind in ("point", "line", "plane"):
-                columns[f"{kind}s"] += len(getattr(map, f"{kind}_observations"))
+            for kind, table in observations_of(map).items():
+                columns[kind.span_column] += len(table)
         if name == "points":
             columns["position_m"] += step
         if name == "lines":
