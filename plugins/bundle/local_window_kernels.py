@@ -17,18 +17,8 @@ from trihedron.pipeline.core.types import F64, I32
 from trihedron.plugins.bundle.window import BundleMeasurements, BundleState
 from trihedron.plugins.mapping.landmark_kernels import EXTEND
 from trihedron.plugins.shared.lie_kernels import log_so3
-from trihedron.plugins.shared.pose_optimizer_kernels import (
-    BEHIND,
-    CHI2_95,
-    NEAR_M,
-    PARALLEL,
-    SAME,
-    depth_direction,
-    line_depth_residual,
-    line_residual,
-    plane_residual,
-    retract_pose,
-)
+from trihedron.plugins.shared.pose_optimizer_kernels import BEHIND, CHI2_95, retract_pose
+from trihedron.plugins.shared.residuals_kernels import NEAR_M, PARALLEL, SAME, depth_direction, line_depth_residual, line_residual, plane_residual
 
 # Residuals and Jacobians of lines, planes and their relations by the landmark; those by the pose are the pose optimiser's.
 #

@@ -13,7 +13,7 @@ from trihedron.plugins.mapping.covisibility_graph import covisible_keyframes, cu
 from trihedron.plugins.mapping.landmark_kinds import KINDS, LINE, PLANE, POINT, LandmarkKind, observed_rows
 from trihedron.plugins.mapping.landmarks import index_of
 from trihedron.plugins.shared.linalg import inverse
-from trihedron.plugins.shared.pose_optimizer_kernels import PARALLEL, PERPENDICULAR
+from trihedron.plugins.shared.residuals_kernels import PARALLEL, PERPENDICULAR
 
 
 class BundleState(NamedTuple):

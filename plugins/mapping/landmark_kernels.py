@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from trihedron.pipeline.core.kernel import kernel
 from trihedron.pipeline.core.linalg_kernels import invert_symmetric
 from trihedron.pipeline.core.types import F32, F64, I32, U8, Bool
-from trihedron.plugins.shared.pose_optimizer_kernels import (
+from trihedron.plugins.shared.residuals_kernels import (
     NEAR_M,
     PARALLEL,
     PERPENDICULAR,

@@ -21,7 +21,7 @@ from trihedron.plugins.mapping.landmark_kernels import (
     visible_points_kernel,
 )
 from trihedron.plugins.shared.linalg import constant
-from trihedron.plugins.shared.pose_optimizer_kernels import LineTerms, PlaneTerms, PointTerms
+from trihedron.plugins.shared.residuals_kernels import LineTerms, PlaneTerms, PointTerms
 
 POINT_COLUMNS = "position_m", "direction", "distance_m", "octave"  # of the map, that `visible_points` needs
 HIDDEN_M, HIDDEN_SIGMAS = 0.1, 5.0  # of depth, by which an occluding surface is in front

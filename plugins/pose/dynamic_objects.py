@@ -21,7 +21,8 @@ from trihedron.plugins.pose.dynamic_objects_kernels import mahalanobis2, on_plan
 from trihedron.plugins.pose.map_alignment import InlierStatistics, MapAlignment, TrackingStatus
 from trihedron.plugins.shared.linalg import constant
 from trihedron.plugins.shared.pose_optimizer import PoseSolution, Terms
-from trihedron.plugins.shared.pose_optimizer_kernels import Flags, LineTerms, PointTerms
+from trihedron.plugins.shared.pose_optimizer_kernels import Flags
+from trihedron.plugins.shared.residuals_kernels import LineTerms, PointTerms
 
 VERIFIED_VIEWS = 2  # keyframes that measured a landmark in the same place, from which on it is verified
 MIN_POINTS = 30  # of each kind below which their shares are not significant

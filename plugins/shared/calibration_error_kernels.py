@@ -13,11 +13,10 @@ import numpy as np
 from trihedron.pipeline.core.kernel import kernel
 from trihedron.pipeline.core.linalg_kernels import inverse_positive, matmul, matvec, tangent_columns
 from trihedron.pipeline.core.types import CALIBRATION, F32, F64, I32, U8
-from trihedron.plugins.shared.pose_optimizer_kernels import (
+from trihedron.plugins.shared.pose_optimizer_kernels import Flags, Groups
+from trihedron.plugins.shared.residuals_kernels import (
     NEAR_M,
     SAME,
-    Flags,
-    Groups,
     LineTerms,
     PlaneTerms,
     PointTerms,

@@ -13,17 +13,8 @@ import numpy as np
 from trihedron.pipeline.core.linalg import cholesky, eigh, inv, matmul
 from trihedron.pipeline.core.linalg_kernels import inverse_positive
 from trihedron.pipeline.core.types import F64, U8, Camera
-from trihedron.plugins.shared.pose_optimizer_kernels import (
-    INLIER,
-    ROUNDS,
-    Flags,
-    Groups,
-    LineTerms,
-    PlaneTerms,
-    PointTerms,
-    add_scores,
-    solve,
-)
+from trihedron.plugins.shared.pose_optimizer_kernels import INLIER, ROUNDS, Flags, Groups, add_scores, solve
+from trihedron.plugins.shared.residuals_kernels import LineTerms, PlaneTerms, PointTerms
 
 PLANE_SLACK = 4.0  # multiplies the planes' gates when a direction would become unobservable without the planes beyond them
 LEAST_FREEDOM = 1.0  # degrees of freedom with which the scale of the residuals can be estimated

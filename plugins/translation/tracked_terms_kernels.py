@@ -9,8 +9,8 @@ from trihedron.pipeline.core.kernel import kernel
 from trihedron.pipeline.core.linalg_kernels import tangent_columns
 from trihedron.pipeline.core.types import F32, F64
 from trihedron.plugins.shared.depth_image_kernels import sigma_z
-from trihedron.plugins.shared.pose_optimizer_kernels import SAME, LineTerms, PlaneTerms, PointTerms
 from trihedron.plugins.shared.relative_motion_kernels import LinePairs, PlanePairs, PointPairs
+from trihedron.plugins.shared.residuals_kernels import SAME, LineTerms, PlaneTerms, PointTerms
 
 
 @kernel

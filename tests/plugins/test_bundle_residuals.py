@@ -12,7 +12,7 @@ from trihedron.pipeline.core.linalg_kernels import tangent_columns
 from trihedron.plugins.bundle import local_window_kernels as terms_kernels
 from trihedron.plugins.bundle.local_window_kernels import SQUARES, NormalEquations, line_basis, linearise_bundle
 from trihedron.plugins.bundle.window import BundleMeasurements, BundleState
-from trihedron.plugins.shared.pose_optimizer_kernels import PARALLEL, PERPENDICULAR, SAME, depth_direction, plane_residual
+from trihedron.plugins.shared.residuals_kernels import PARALLEL, PERPENDICULAR, SAME, depth_direction, plane_residual
 
 sys.path.insert(0, str(Path(__file__).parent))
 from derivatives import numeric

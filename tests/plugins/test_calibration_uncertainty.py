@@ -18,7 +18,8 @@ from trihedron.plugins.shared.calibration_error_kernels import (
     plane_point_error,
 )
 from trihedron.plugins.shared.pose_optimizer import NO_PLANES, solve_pose
-from trihedron.plugins.shared.pose_optimizer_kernels import Flags, Groups, PointTerms
+from trihedron.plugins.shared.pose_optimizer_kernels import Flags, Groups
+from trihedron.plugins.shared.residuals_kernels import PointTerms
 
 CAMERA = Camera(640, 480, 520.0, 530.0, 315.0, 245.0)
 TWIST = np.array([0.3, -0.2, 0.1, 0.2, -0.4, 0.3])

@@ -25,7 +25,7 @@ from trihedron.plugins.pose.dynamic_objects import (
 from trihedron.plugins.pose.map_alignment import MapAlignment, TrackingStatus
 from trihedron.plugins.pose.refine import Refine
 from trihedron.plugins.shared.pose_optimizer import PoseSolution
-from trihedron.plugins.shared.pose_optimizer_kernels import LineTerms, PointTerms
+from trihedron.plugins.shared.residuals_kernels import LineTerms, PointTerms
 
 sys.path.insert(0, str(Path(__file__).parent))
 from landmark_world import World, camera_at, rotation_of, translation_of

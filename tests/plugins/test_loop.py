@@ -20,7 +20,7 @@ from trihedron.plugins.mapping.landmark_kinds import KINDS, LINE, POINT
 from trihedron.plugins.matches.local_map import LocalMap
 from trihedron.plugins.shared.pose_graph import Edges, solve_pose_graph
 from trihedron.plugins.shared.pose_optimizer import solve_pose
-from trihedron.plugins.shared.pose_optimizer_kernels import PlaneTerms
+from trihedron.plugins.shared.residuals_kernels import PlaneTerms
 
 sys.path.insert(0, str(Path(__file__).parent))
 from landmark_world import CAMERA, World, rotation_of, translation_of

@@ -12,9 +12,9 @@ from trihedron.pipeline.core import geometry as g
 from trihedron.pipeline.core import lie
 from trihedron.plugins.bundle import local_window_kernels
 from trihedron.plugins.bundle.local_window_kernels import line_basis
-from trihedron.plugins.shared import pose_graph, pose_optimizer, pose_optimizer_kernels, relative_motion_kernels
+from trihedron.plugins.shared import pose_graph, pose_optimizer, pose_optimizer_kernels, relative_motion_kernels, residuals_kernels
 from trihedron.plugins.shared.pose_optimizer import NO_LINES, NO_PLANES, solve_pose
-from trihedron.plugins.shared.pose_optimizer_kernels import PARALLEL, PERPENDICULAR, SAME, PlaneTerms, PointTerms, Weights
+from trihedron.plugins.shared.residuals_kernels import PARALLEL, PERPENDICULAR, SAME, PlaneTerms, PointTerms, Weights
 
 sys.path.insert(0, str(Path(__file__).parent))
 from derivatives import numeric
@@ -82,11 +82,11 @@ def test_a_point_s_derivatives(rng, angle, scale_m, with_depth):
     r, D, J = np.empty(3), np.empty((3, 3)), np.empty((3, 6))
 
     def residual(T):
-        assert pose_optimizer_kernels.point_residual(g.transform(g.invert(T), world), pixel, seen, INTRINSICS, r, D)
+        assert residuals_kernels.point_residual(g.transform(g.invert(T), world), pixel, seen, INTRINSICS, r, D)
         return r.copy()
 
     residual(T)
-    pose_optimizer_kernels.pose_jacobian(D, 3, g.transform(g.invert(T), world), J)
+    residuals_kernels.pose_jacobian(D, 3, g.transform(g.invert(T), world), J)
     step = np.array([depth, depth, depth, 1.0, 1.0, 1.0])
     assert agree(J * step, numeric(lambda d: residual(T @ lie.exp_se3(step * d)), 6), 1e3)
     W = np.diag([1.0, 0.7, depth**2 if with_depth else 0.0])
@@ -112,7 +112,7 @@ def test_a_line_s_derivatives(rng, angle, scale_m):
     line, segment, observed = g.transform(T, local), np.array([[380.0, 160.0], [210.0, 260.0]]), local * rng.uniform(0.95, 1.05, (2, 1))
     N, m, J, p = np.empty((3, 2)), np.empty(3), np.empty(10), np.empty(3)
     line_basis(line, N)
-    assert pose_optimizer_kernels.depth_direction(observed, m)
+    assert residuals_kernels.depth_direction(observed, m)
 
     def image(T, line):
         return np.array([local_window_kernels.line_term(*parts(T), line, N, 0.3, segment, INTRINSICS, J, p)[0]])
@@ -141,7 +141,7 @@ def test_a_plane_s_derivatives(rng, angle, scale_m, kind):
 
     def residual(T, J=None):
         r, J = np.empty(3), np.empty((3, 6)) if J is None else J
-        assert pose_optimizer_kernels.plane_residual(kind, *parts(T), world, observed, B, r, J) == rows
+        assert residuals_kernels.plane_residual(kind, *parts(T), world, observed, B, r, J) == rows
         return r[:rows] / np.array([1.0, 1.0, scale_m])[:rows]
 
     J, step = np.empty((3, 6)), np.repeat([scale_m, 1.0], 3)

@@ -7,22 +7,10 @@ from trihedron.pipeline.core.geometry import invert, pose_matrix, tangent_basis,
 from trihedron.pipeline.core.lie import exp_se3, exp_so3, log_se3
 from trihedron.pipeline.core.linalg_kernels import tangent_columns
 from trihedron.pipeline.core.types import Camera
-from trihedron.plugins.shared import pose_optimizer_kernels as terms_kernels
+from trihedron.plugins.shared import pose_optimizer_kernels, residuals_kernels
 from trihedron.plugins.shared.pose_optimizer import NO_LINES, NO_PLANES, NO_POINTS, classify_terms, first_step, solve_pose
-from trihedron.plugins.shared.pose_optimizer_kernels import (
-    INLIER,
-    NO_DEPTH,
-    OUTLIER,
-    PARALLEL,
-    PERPENDICULAR,
-    SAME,
-    Chi2,
-    Flags,
-    LineTerms,
-    PlaneTerms,
-    PointTerms,
-    Weights,
-)
+from trihedron.plugins.shared.pose_optimizer_kernels import INLIER, NO_DEPTH, OUTLIER, Chi2, Flags
+from trihedron.plugins.shared.residuals_kernels import PARALLEL, PERPENDICULAR, SAME, LineTerms, PlaneTerms, PointTerms, Weights
 
 CAMERA = Camera(640, 480, 525.0, 520.0, 319.5, 239.5)
 INTRINSICS = np.array([525.0, 520.0, 319.5, 239.5])
@@ -153,7 +141,7 @@ def random_pose(rng):
 
 def local_of(T, world):
     out = np.empty(3)
-    terms_kernels.to_camera(np.ascontiguousarray(T[:3, :3]), np.ascontiguousarray(T[:3, 3]), world, out)
+    residuals_kernels.to_camera(np.ascontiguousarray(T[:3, :3]), np.ascontiguousarray(T[:3, 3]), world, out)
     return out
 
 
@@ -166,11 +154,11 @@ def test_jacobian_of_a_point():
 
         def residual(T, world=world, depth=depth):
             r, D = np.empty(3), np.empty((3, 3))
-            assert terms_kernels.point_residual(local_of(T, world), np.array([300.0, 200.0]), depth, INTRINSICS, r, D)
+            assert residuals_kernels.point_residual(local_of(T, world), np.array([300.0, 200.0]), depth, INTRINSICS, r, D)
             return r
 
-        terms_kernels.point_residual(local_of(T, world), np.array([300.0, 200.0]), depth, INTRINSICS, r, D)
-        terms_kernels.pose_jacobian(D, 3, local_of(T, world), J)
+        residuals_kernels.point_residual(local_of(T, world), np.array([300.0, 200.0]), depth, INTRINSICS, r, D)
+        residuals_kernels.pose_jacobian(D, 3, local_of(T, world), J)
         assert np.allclose(J, numeric(residual, T), rtol=1e-6, atol=1e-5)
         assert np.isfinite(depth) == (abs(J[2]).max() > 0)
 
@@ -181,14 +169,14 @@ def test_jacobian_of_a_line_in_the_image_and_in_depth():
     world = transform(T, np.array([0.3, -0.4, 2.2]))
     segment_px, segment_m = np.array([[100.0, 50.0], [400.0, 330.0]]), np.array([[-0.5, 0.2, 2.0], [0.6, 0.3, 2.6]])
     m, D, J = np.empty(3), np.empty((1, 3)), np.empty((1, 6))
-    assert terms_kernels.depth_direction(segment_m, m)
+    assert residuals_kernels.depth_direction(segment_m, m)
     assert abs(m @ (segment_m[1] - segment_m[0])) < 1e-12 and abs(m @ np.cross(*segment_m)) < 1e-12
-    terms_kernels.line_residual(local_of(T, world), segment_px, INTRINSICS, D[0])
-    terms_kernels.pose_jacobian(D, 1, local_of(T, world), J)
-    image = numeric(lambda T: np.array([terms_kernels.line_residual(local_of(T, world), segment_px, INTRINSICS, np.empty(3))[0]]), T)
+    residuals_kernels.line_residual(local_of(T, world), segment_px, INTRINSICS, D[0])
+    residuals_kernels.pose_jacobian(D, 1, local_of(T, world), J)
+    image = numeric(lambda T: np.array([residuals_kernels.line_residual(local_of(T, world), segment_px, INTRINSICS, np.empty(3))[0]]), T)
     assert np.allclose(J, image, rtol=1e-6, atol=1e-5)
-    terms_kernels.pose_jacobian(m[None].copy(), 1, local_of(T, world), J)
-    depth = numeric(lambda T: np.array([terms_kernels.line_depth_residual(local_of(T, world), segment_m, m)[0]]), T)
+    residuals_kernels.pose_jacobian(m[None].copy(), 1, local_of(T, world), J)
+    depth = numeric(lambda T: np.array([residuals_kernels.line_depth_residual(local_of(T, world), segment_m, m)[0]]), T)
     assert np.allclose(J, depth, rtol=1e-6, atol=1e-7)
 
 
@@ -206,11 +194,11 @@ def test_jacobian_of_planes_at_every_normal(kind, rows):
         def residual(T, world=world, observed=observed, B=B):
             r, J = np.empty(3), np.empty((3, 6))
             R, t = np.ascontiguousarray(T[:3, :3]), np.ascontiguousarray(T[:3, 3])
-            assert terms_kernels.plane_residual(kind, R, t, world, observed, B, r, J) == rows
+            assert residuals_kernels.plane_residual(kind, R, t, world, observed, B, r, J) == rows
             return r[:rows].copy()
 
         J = np.empty((3, 6))
-        terms_kernels.plane_residual(kind, T[:3, :3].copy(), T[:3, 3].copy(), world, observed, B, np.empty(3), J)
+        residuals_kernels.plane_residual(kind, T[:3, :3].copy(), T[:3, 3].copy(), world, observed, B, np.empty(3), J)
         assert np.allclose(J[:rows], numeric(residual, T), atol=1e-7)
         assert kind == PERPENDICULAR or np.abs(residual(T)[:2]).max() < 0.05
 
@@ -321,7 +309,7 @@ def test_residuals_are_counted():
     points = scene.points._replace(depth_m=np.array([1.0, np.nan, 2.0, np.nan]))
     lines, planes = np.array([INLIER, NO_DEPTH, OUTLIER, INLIER], np.uint8), np.array([INLIER, INLIER, INLIER, OUTLIER], np.uint8)
     flags = Flags(np.array([INLIER, INLIER, OUTLIER, INLIER], np.uint8), lines, planes)
-    assert terms_kernels._residual_count(points, scene.planes, flags) == (3 + 2 + 2) + (4 + 2 + 4) + (3 + 2 + 1)
+    assert pose_optimizer_kernels._residual_count(points, scene.planes, flags) == (3 + 2 + 2) + (4 + 2 + 4) + (3 + 2 + 1)
 
 
 def linearised(points, lines, robust):
@@ -329,10 +317,10 @@ def linearised(points, lines, robust):
     n, m = len(points.positions_m), len(lines.endpoints_m)
     weights = Weights(np.empty((n, 3, 3)), np.empty((m, 2, 2)), np.empty((m, 2, 2)), np.empty((0, 3, 3)))
     pose, H, g = (np.eye(3), np.zeros(3), INTRINSICS), np.empty((6, 6)), np.empty(6)
-    terms_kernels.fill_weights(*pose, points, lines, NO_PLANES, weights)
+    residuals_kernels.fill_weights(*pose, points, lines, NO_PLANES, weights)
     flags = Flags(np.full(n, INLIER, np.uint8), np.full(m, INLIER, np.uint8), np.empty(0, np.uint8))
     chi2 = Chi2(np.empty(n), np.empty(m), np.empty(m), np.empty(0))
-    cost = terms_kernels.linearise(*pose, points, lines, NO_PLANES, weights, flags, robust, 6, H, g, chi2)
+    cost = pose_optimizer_kernels.linearise(*pose, points, lines, NO_PLANES, weights, flags, robust, 6, H, g, chi2)
     return cost, 2.0 * g, weights
 
 
@@ -369,9 +357,9 @@ def test_the_ends_of_a_line_seen_in_part_err_together():
     image, depth, D, m = [], [], np.empty(3), np.empty(3)
     for _ in range(3000):
         shaken_px, shaken_m = seen_px + 0.3 * rng.normal(size=(2, 2)), seen_m + 0.003 * rng.normal(size=(2, 3))
-        assert terms_kernels.depth_direction(shaken_m, m)
-        image.append([terms_kernels.line_residual(p, shaken_px, INTRINSICS, D)[0] for p in map_m])
-        depth.append([terms_kernels.line_depth_residual(p, shaken_m, m)[0] for p in map_m])
+        assert residuals_kernels.depth_direction(shaken_m, m)
+        image.append([residuals_kernels.line_residual(p, shaken_px, INTRINSICS, D)[0] for p in map_m])
+        depth.append([residuals_kernels.line_depth_residual(p, shaken_m, m)[0] for p in map_m])
     for residuals, information in ((image, weights.lines[0]), (depth, weights.line_depths[0])):
         stated = np.linalg.inv(information)
         assert np.allclose(np.cov(np.transpose(residuals)), stated, rtol=0.1) and stated[0, 1] < -0.8 * stated[0, 0]
