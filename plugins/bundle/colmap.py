@@ -10,10 +10,19 @@ from numpy.typing import NDArray
 
 from trihedron.pipeline.core.geometry import invert, pose_matrix, transform_each, transform_planes
 from trihedron.pipeline.core.linalg import matmul
-from trihedron.pipeline.core.options import NonNegativeInt, PositiveFloat, PositiveInt
+from trihedron.pipeline.core.options import PositiveFloat, PositiveInt
 from trihedron.pipeline.core.registry import register
 from trihedron.pipeline.core.types import I32, Correction, Map
-from trihedron.plugins.bundle.window import BundleMeasurements, BundleState, BundleWindow, bundle_problem, bundle_window, free_poses
+from trihedron.plugins.bundle.window import (
+    BundleMeasurements,
+    BundleOptions,
+    BundleState,
+    BundleWindow,
+    WindowOptions,
+    bundle_problem,
+    bundle_window,
+    free_poses,
+)
 from trihedron.plugins.mapping.covisibility_graph import newest_keyframes
 from trihedron.plugins.mapping.landmarks import ENDPOINTS, POSITION
 from trihedron.plugins.shared import libraries
@@ -22,14 +31,12 @@ from trihedron.plugins.shared.linalg import transform_plane_covariance
 
 @register("bundle", "colmap")
 @dataclass(frozen=True)
-class Colmap:
+class Colmap(WindowOptions):
     """The window of `local_window` with COLMAP's own solver (Schönberger and Frahm, CVPR 2016): reprojected points alone, σ = 1 px.
 
     For comparison. Depth is not used, so two keyframes are fixed to keep the scale. Lines, planes and points observed once move rigidly with the
     newest keyframe that observed them. COLMAP returns no covariance here: each landmark retains that of the map."""
 
-    keyframes: PositiveInt = 8  # at most, that are adjusted: the newest and the most covisible
-    fixed: NonNegativeInt = 8  # at most, that are fixed
     iterations: PositiveInt = 20
     loss_px: PositiveFloat = 2.0  # beyond which Huber's cost is linear
 
@@ -38,10 +45,10 @@ class Colmap:
         newest = newest_keyframes(map, 1)
         if not len(newest) or map.keyframes.rows("index", newest)[0] != map.index:
             return None
-        window = bundle_window(map, self.keyframes, self.fixed, least_fixed=2)
+        window = bundle_window(self, map, least_fixed=2)
         if not len(window.free):
             return None
-        state, seen = bundle_problem(map, window)
+        state, seen = bundle_problem(BundleOptions(), map, window)
         return _correction(map, window, seen, solve_colmap(state, seen, self.iterations, self.loss_px))
 
 

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Annotated
 
 import numpy as np
 
 from trihedron.pipeline.core.geometry import tangent_basis
 from trihedron.pipeline.core.linalg import matmul
 from trihedron.pipeline.core.linalg_kernels import solve_positive
-from trihedron.pipeline.core.options import NonNegativeInt, PositiveFloat, PositiveInt, Range
+from trihedron.pipeline.core.options import PositiveInt
 from trihedron.pipeline.core.registry import register
 from trihedron.pipeline.core.types import F64, Correction, Map
 from trihedron.plugins.bundle.local_window_kernels import (
@@ -24,7 +23,7 @@ from trihedron.plugins.bundle.local_window_kernels import (
     reduce_system,
     retract,
 )
-from trihedron.plugins.bundle.window import BundleMeasurements, BundleState, BundleWindow, bundle_problem, bundle_window, free_poses
+from trihedron.plugins.bundle.window import BundleMeasurements, BundleOptions, BundleState, BundleWindow, bundle_problem, bundle_window, free_poses
 from trihedron.plugins.mapping.covisibility_graph import newest_keyframes
 from trihedron.plugins.mapping.landmarks import ENDPOINTS, POSITION
 from trihedron.plugins.shared.linalg import inverse
@@ -35,7 +34,7 @@ CONVERGED = 1e-2  # squared Mahalanobis norm of the step of poses and planes, on
 
 @register("bundle", "local_window")
 @dataclass(frozen=True)
-class LocalWindow:
+class LocalWindow(BundleOptions):
     """Levenberg–Marquardt over the newest keyframes, their points, lines, planes and the right angles between the planes, once per keyframe.
 
     Points and lines are eliminated by the Schur complement (Triggs et al., "Bundle Adjustment – A Modern Synthesis", 2000). Every residual is
@@ -43,26 +42,17 @@ class LocalWindow:
     world. The motion between keyframes that are neighbours in time is a measurement too, by odometry: a window that few landmarks, perhaps
     wrong ones, connect with the map stays where tracking saw it."""
 
-    keyframes: PositiveInt = 8  # at most, that are adjusted: the newest and the most covisible
-    fixed: NonNegativeInt = 8  # at most, that are fixed
     iterations: PositiveInt = 10
-    line_sigma_px: PositiveFloat = 1.0  # of a segment's end point across it, as in the map
-    relation_sigma_deg: PositiveFloat = 0.5  # walls are parallel or perpendicular to within this
-    parallel_deg: Annotated[float, Range(above=0, below=45)] = 5.0  # planes nearer to parallel, or to a right angle, are constrained to it
-    drift_share: PositiveFloat = 0.01  # of the motion between neighbours in time, per root metre
-    rotation_drift_deg: PositiveFloat = 0.05  # likewise
 
     def __call__(self, map: Map) -> Correction | None:
         """Return the correction, or None when this version of the map has no new keyframe, or none to adjust."""
         newest = newest_keyframes(map, 1)
         if not len(newest) or map.keyframes.rows("index", newest)[0] != map.index:
             return None
-        window = bundle_window(map, self.keyframes, self.fixed)
+        window = bundle_window(self, map)
         if not len(window.free):
             return None
-        drift = self.drift_share, self.rotation_drift_deg
-        problem = bundle_problem(map, window, self.line_sigma_px, self.relation_sigma_deg, self.parallel_deg, *drift)
-        return bundle_correction(map, window, solve_bundle(*problem, self.iterations))
+        return bundle_correction(map, window, solve_bundle(*bundle_problem(self, map, window), self.iterations))
 
 
 @dataclass(frozen=True)

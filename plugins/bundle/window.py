@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Annotated, NamedTuple
 
 import numpy as np
 
 from trihedron.pipeline.core.linalg import matmul
+from trihedron.pipeline.core.options import NonNegativeInt, PositiveFloat, PositiveInt, Range
 from trihedron.pipeline.core.types import F64, I32, Map, Table
 from trihedron.plugins.mapping.covisibility_graph import covisible_keyframes, current_submap, keyframes_of, newest_keyframes, observed_by, odometry
 from trihedron.plugins.mapping.landmark_kinds import KINDS, LINE, PLANE, POINT, LandmarkKind, observed_rows
@@ -57,6 +58,25 @@ class BundleMeasurements(NamedTuple):
 
 
 @dataclass(frozen=True)
+class WindowOptions:
+    """Options of the window of keyframes."""
+
+    keyframes: PositiveInt = 8  # at most, that are adjusted: the newest and the most covisible
+    fixed: NonNegativeInt = 8  # at most, that are fixed
+
+
+@dataclass(frozen=True)
+class BundleOptions(WindowOptions):
+    """Options of the residuals."""
+
+    line_sigma_px: PositiveFloat = 1.0  # of a segment's end point across it, as in the map
+    relation_sigma_deg: PositiveFloat = 0.5  # walls are parallel or perpendicular to within this
+    parallel_deg: Annotated[float, Range(above=0, below=45)] = 5.0  # planes nearer to parallel, or to a right angle, are constrained to it
+    drift_share: PositiveFloat = 0.01  # of the motion between neighbours in time, per root metre
+    rotation_drift_deg: PositiveFloat = 0.05  # likewise
+
+
+@dataclass(frozen=True)
 class BundleWindow:
     """Rows of the map, each sorted: the adjusted and the fixed keyframes, and the landmarks that the former observe."""
 
@@ -74,33 +94,22 @@ def free_poses(state: BundleState, free: int) -> F64:
     return poses
 
 
-def bundle_window(map: Map, free: int, fixed: int, least_fixed: int = 1) -> BundleWindow:
-    """Select the newest keyframe and at most `free` - 1 most covisible ones, and at most `fixed` further keyframes that observe the same landmarks.
+def bundle_window(options: WindowOptions, map: Map, least_fixed: int = 1) -> BundleWindow:
+    """Select the newest keyframe and the most covisible ones, and further keyframes, fixed ones, that observe the same landmarks.
 
     The first keyframe defines the world and is always fixed. With fewer than `least_fixed` fixed keyframes the oldest of the window are fixed too,
     which may leave none to adjust."""
     newest = newest_keyframes(map, 1)
-    moving = np.sort(np.concatenate([newest, covisible_keyframes(map, newest, free - 1)]))
-    held = covisible_keyframes(map, moving, fixed)
+    moving = np.sort(np.concatenate([newest, covisible_keyframes(map, newest, options.keyframes - 1)]))
+    held = covisible_keyframes(map, moving, options.fixed)
     while len(moving) and (len(held) < least_fixed or moving[0] == 0):
         held, moving = np.append(held, moving[:1]), moving[1:]
     points, lines, planes = (observed_by(map, moving, kind) for kind in KINDS)
     return BundleWindow(moving, np.sort(held), points, lines, planes)
 
 
-def bundle_problem(
-    map: Map,
-    window: BundleWindow,
-    line_sigma_px: float = 1.0,
-    relation_sigma_deg: float = 0.5,
-    parallel_deg: float = 5.0,
-    drift_share: float = 0.01,
-    rotation_drift_deg: float = 0.05,
-) -> tuple[BundleState, BundleMeasurements]:
-    """Gather the initial state of the window from the map, and all observations of its landmarks by its keyframes.
-
-    Planes within `parallel_deg` of parallel or of a right angle are constrained to it with σ = `relation_sigma_deg`; `drift_share` and
-    `rotation_drift_deg` are those of odometry per root metre."""
+def bundle_problem(options: BundleOptions, map: Map, window: BundleWindow) -> tuple[BundleState, BundleMeasurements]:
+    """Gather the initial state of the window from the map, and all observations of its landmarks by its keyframes."""
     keyframes = np.concatenate([window.free, window.fixed])
     poses = map.keyframes.rows("T_world_camera", keyframes)
     state = BundleState(
@@ -113,7 +122,7 @@ def bundle_problem(
     point_rows, point_keyframes, point_starts = _observations(map, POINT, keyframes, window.points)
     line_rows, line_keyframes, line_starts = _observations(map, LINE, keyframes, window.lines)
     plane_rows, plane_keyframes, plane_starts = _observations(map, PLANE, keyframes, window.planes)
-    relations, variance = _relations(state.planes, relation_sigma_deg, parallel_deg)
+    relations, variance = _relations(options, state.planes)
     neighbours = _neighbours(map, keyframes, len(window.free))
     return state, BundleMeasurements(
         len(window.free),
@@ -129,7 +138,7 @@ def bundle_problem(
         _column(map.line_observations, "endpoints_px", line_rows),
         _column(map.line_observations, "endpoints_m", line_rows),
         _column(map.line_observations, "covariance_m2", line_rows),
-        line_sigma_px,
+        options.line_sigma_px,
         plane_keyframes,
         np.repeat(np.arange(len(window.planes), dtype=np.int32), np.diff(plane_starts)),
         map.plane_observations.rows("coefficients", plane_rows),
@@ -137,7 +146,7 @@ def bundle_problem(
         relations,
         variance,
         neighbours,
-        *odometry(map, keyframes[neighbours], drift_share, np.radians(rotation_drift_deg)),
+        *odometry(options, map, keyframes[neighbours]),
         True,
     )
 
@@ -169,15 +178,15 @@ def _observations(map: Map, kind: LandmarkKind, keyframes: I32, ids: I32) -> tup
     return rows[order], who[order], starts
 
 
-def _relations(planes: F64, sigma_deg: float, parallel_deg: float) -> tuple[I32, F64]:
+def _relations(options: BundleOptions, planes: F64) -> tuple[I32, F64]:
     """Pairs of planes that are parallel or perpendicular, (s, 3), and the variance of each angle (rad²).
 
     Walls deviate one by one, so the k relations of a plane count as one in total."""
     cosine = np.abs(matmul(planes[:, :3], planes[:, :3].T))
-    limit = np.radians(parallel_deg)
+    limit = np.radians(options.parallel_deg)
     related = np.triu((cosine > np.cos(limit)) | (cosine < np.sin(limit)), 1)
     a, b = np.nonzero(related)
     kinds = np.where(cosine[a, b] > 0.5, PARALLEL, PERPENDICULAR)
     partners = (related | related.T).sum(axis=1)
-    variance = np.radians(sigma_deg) ** 2 * 0.5 * (partners[a] + partners[b])
+    variance = np.radians(options.relation_sigma_deg) ** 2 * 0.5 * (partners[a] + partners[b])
     return np.stack([kinds, a, b], axis=-1).astype(np.int32), np.asarray(variance, np.float64)

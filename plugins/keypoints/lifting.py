@@ -17,28 +17,34 @@ LEVEL_SCALE = 1.2  # between levels, as the map expects (`octave_scale`)
 
 @dataclass(frozen=True)
 class LiftOptions:
-    """Options of the depth of key points, equal to those of `orb`."""
+    """Options of the position and depth of key points."""
 
-    sigma_px: PositiveFloat = 0.6  # of a position at level 0; grows with the key point's size
+    sigma_px: PositiveFloat = 0.6  # of a position at level 0; grows with the level's scale, or the key point's size
     depth_radius_px: Annotated[int, Range(1, 10)] = 2  # of the neighbourhood the depth is taken from
     depth_share: PositiveShare = 0.5  # of the neighbourhood that must have depth
     depth_gate: PositiveFloat = 3.0  # σ_z a neighbourhood may spread about a linear surface
     depth_edge: NonNegativeFloat = 0.01  # more than that, as a share of z, is a depth edge: no depth
 
 
+def lift_pixels(options: LiftOptions, frame: Frame, pixels: F32) -> tuple[F32, F32]:
+    """Return the points (n, 3) at pixels (n, 2), NaN without reliable depth, and the standard deviation (n,) of their depth."""
+    noise = frame.camera.depth_noise.coefficients
+    depth, sigma = local_depth(frame.depth_m, pixels, options.depth_radius_px, options.depth_share, noise, options.depth_gate, options.depth_edge)
+    return frame.camera.back_project(pixels, depth).astype(np.float32), sigma
+
+
 def lift_keypoints(options: LiftOptions, frame: Frame, pixels: F32, scales: F64, angles_deg: F32, descriptors: U8, metric: str) -> Keypoints:
     """Lift key points at pixels (n, 2) with scales (n,), 1 for the finest, directions (n,) and descriptors (n, b); points are NaN without reliable
     depth."""
-    noise = frame.camera.depth_noise.coefficients
-    depth, sigma = local_depth(frame.depth_m, pixels, options.depth_radius_px, options.depth_share, noise, options.depth_gate, options.depth_edge)
+    points_m, sigma_m = lift_pixels(options, frame, pixels)
     scales = np.maximum(scales, 1.0)
     return Keypoints(
         index=frame.index,
         stamp_ns=frame.stamp_ns,
         pixels=pixels,
-        points_m=frame.camera.back_project(pixels, depth).astype(np.float32),
+        points_m=points_m,
         sigma_px=(options.sigma_px * scales).astype(np.float32),
-        sigma_m=sigma,
+        sigma_m=sigma_m,
         octaves=np.clip(np.rint(np.log(scales) / np.log(LEVEL_SCALE)), 0, 255).astype(np.uint8),
         angles_deg=angles_deg,
         descriptors=descriptors,

@@ -10,18 +10,18 @@ from typing import Annotated
 import cv2
 import numpy as np
 
-from trihedron.pipeline.core.options import NonNegativeFloat, PositiveFloat, PositiveInt, PositiveShare, Range, check_increasing
+from trihedron.pipeline.core.options import NonNegativeFloat, PositiveInt, Range, check_increasing
 from trihedron.pipeline.core.registry import register
 from trihedron.pipeline.core.types import F32, U8, Frame, Keypoints
+from trihedron.plugins.keypoints.lifting import LiftOptions, lift_pixels
 from trihedron.plugins.keypoints.orb_kernels import BITS, REACH_PX, Pyramid, full_pixels, oriented_corners, steered_brief
-from trihedron.plugins.shared.depth_image_kernels import local_depth
 
 MARGIN_PX = 19  # of a level, within which its descriptors would reach over the border
 
 
 @register("keypoints", "orb")
 @dataclass(frozen=True)
-class Orb:
+class Orb(LiftOptions):
     """Oriented FAST and rotated BRIEF (Rublee et al., ICCV 2011), chosen per grid cell so that a textured corner does not take them all."""
 
     features: PositiveInt = 1000  # most key points kept
@@ -31,11 +31,6 @@ class Orb:
     fast_threshold_low: Annotated[int, Range(1, 255)] = 7  # where a grid cell has few
     cell_px: Annotated[int, Range(4)] = 64  # side of the grid cells
     fineness: NonNegativeFloat = 2.0  # strengths are compared after division by the level's scale to this power: fine levels place points better
-    sigma_px: PositiveFloat = 0.6  # of a position at level 0; grows with the level's scale
-    depth_radius_px: Annotated[int, Range(1, 10)] = 2  # of the neighbourhood the depth is taken from
-    depth_share: PositiveShare = 0.5  # of the neighbourhood that must have depth
-    depth_gate: PositiveFloat = 3.0  # σ_z a neighbourhood may spread about a linear surface
-    depth_edge: NonNegativeFloat = 0.01  # more than that, as a share of z, is a depth edge: no depth
 
     def __post_init__(self) -> None:
         check_increasing(self, "fast_threshold_low", "fast_threshold")
@@ -48,15 +43,14 @@ class Orb:
         cells, levels, angles = oriented_corners(pyramid, *thresholds, MARGIN_PX, self.cell_px, self.features, weights)
         descriptors = steered_brief(pyramid, cells, levels, angles, self._tests)
         pixels = full_pixels(cells, levels, pyramid.shapes).astype(np.float32)
-        noise = frame.camera.depth_noise.coefficients
-        depth, sigma = local_depth(frame.depth_m, pixels, self.depth_radius_px, self.depth_share, noise, self.depth_gate, self.depth_edge)
+        points_m, sigma_m = lift_pixels(self, frame, pixels)
         return Keypoints(
             index=frame.index,
             stamp_ns=frame.stamp_ns,
             pixels=pixels,
-            points_m=frame.camera.back_project(pixels, depth).astype(np.float32),
+            points_m=points_m,
             sigma_px=(self.sigma_px * self.scale**levels).astype(np.float32),
-            sigma_m=sigma,
+            sigma_m=sigma_m,
             octaves=levels.astype(np.uint8),
             angles_deg=angles,
             descriptors=descriptors,

@@ -45,8 +45,14 @@ def line_segments(options: LineOptions, frame: Frame, small: U8, found: F32 | F6
 
     Segments are directed with the bright side on their right: start and end keep their meaning over time."""
     lines = np.zeros((0, 4)) if found is None else np.asarray(found, np.float64).reshape(-1, 4)
-    angle, least_px, border_px = math.radians(options.merge_deg), float(options.min_length_px), float(options.border_px)
-    rules = SegmentRules(angle, float(options.merge_offset_px), float(options.merge_gap_px), least_px, border_px, options.reach_px)
+    rules = SegmentRules(
+        angle=math.radians(options.merge_deg),
+        offset_px=float(options.merge_offset_px),
+        gap_px=float(options.merge_gap_px),
+        least_px=float(options.min_length_px),
+        border_px=float(options.border_px),
+        reach_px=options.reach_px,
+    )
     endpoints = place_segments(frame.gray, lines, options.scale, rules, options.segments)
     descriptors = line_band_descriptors(small, endpoints, options.scale, options.band_px, 2.0)
     return LineSegments(index=frame.index, stamp_ns=frame.stamp_ns, endpoints_px=endpoints, descriptors=descriptors)

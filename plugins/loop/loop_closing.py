@@ -67,7 +67,7 @@ def close_loop(options: LoopOptions, rank: Callable[[Map], Candidates], map: Map
     count = len(map.keyframes)
     if count % (options.straighten << (count // (16 * options.straighten)).bit_length()):
         return None
-    return align_with_manhattan(map, options.drift_share, np.radians(options.rotation_drift_deg), np.radians(options.straighten_deg))
+    return align_with_manhattan(options, map)
 
 
 def _first_verified(options: LoopOptions, map: Map, frame: Frame, candidates: Candidates) -> Correction | None:
@@ -84,9 +84,8 @@ def _first_verified(options: LoopOptions, map: Map, frame: Frame, candidates: Ca
         examined |= set(place.window.keyframes.tolist())
         found = _verify(options, map, frame, place) if place.found < options.shared else None
         if found is not None:
-            drift = options.drift_share, np.radians(options.rotation_drift_deg)
             prior = estimate_manhattan_prior(map) if options.straighten else None
-            return correct_loop(map, keyframe, found.T_world_camera, found.covariance, *drift, prior)
+            return correct_loop(options, map, keyframe, found, prior)
     return None
 
 

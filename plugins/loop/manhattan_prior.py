@@ -7,28 +7,21 @@ once, at the middle one of its observers, so that a wall off the axes errs once 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import Protocol
 
 import numpy as np
 
-from trihedron.pipeline.core.geometry import invert
+from trihedron.pipeline.core.geometry import invert, pose_matrix
 from trihedron.pipeline.core.lie import exp_so3
-from trihedron.pipeline.core.linalg import matmul
+from trihedron.pipeline.core.linalg import inv, matmul
 from trihedron.pipeline.core.types import F64, I32, Correction, Map, Table
-from trihedron.plugins.mapping.covisibility_graph import odometry
-from trihedron.plugins.shared.linalg import inverse
-
-if TYPE_CHECKING:  # imported where it is needed: SciPy is slow to load, and most runs close no loop
-    pass
-
-
-from trihedron.pipeline.core.geometry import pose_matrix
-from trihedron.pipeline.core.linalg import inv
 from trihedron.plugins.loop.keyframe_correction import correct_keyframes
 from trihedron.plugins.loop.manhattan_prior_kernels import keyframe_rotations
-from trihedron.plugins.mapping.covisibility_graph import current_submap, keyframes_of
+from trihedron.plugins.mapping.covisibility_graph import DriftOptions, current_submap, keyframes_of, odometry
+from trihedron.plugins.shared.linalg import inverse
 from trihedron.plugins.shared.manhattan_frames_kernels import Walls, area_on_axes, known_walls, measured_directions, perpendicular_pair, settled
 from trihedron.plugins.shared.pose_graph import Edges, concatenate_edges, solve_pose_graph
+from trihedron.plugins.shared.pose_optimizer import PoseSolution
 
 LINKS = 3  # further keyframes each is connected to, so that a stretch that was observed often stays stiff
 UNKNOWN = 1e-6  # 1/m², information of the position of a direction: none
@@ -99,31 +92,37 @@ def _axes(planes: F64, covariance: F64, views: I32) -> F64 | None:
 # Corrections.
 
 
-def correct_loop(
-    map: Map, keyframe: int, T_world_camera: F64, covariance: F64, drift: float, rotation_drift: float, prior: ManhattanPrior | None
-) -> Correction:
-    """Correct the tracked sub-map by a verified loop: the newest keyframe's pose (4, 4), and covariance (6, 6) of xi, relative to `keyframe`."""
+class StraighteningOptions(DriftOptions, Protocol):
+    """Options of the alignment with the Manhattan frame."""
+
+    @property
+    def straighten_deg(self) -> float:
+        """Least rotation of the newest keyframe for which the map is corrected."""
+
+
+def correct_loop(options: DriftOptions, map: Map, keyframe: int, found: PoseSolution, prior: ManhattanPrior | None) -> Correction:
+    """Correct the tracked sub-map by a verified loop: the newest keyframe's pose, with its covariance, relative to `keyframe`."""
     rows = keyframes_of(map, current_submap(map))
     before = map.keyframes.rows("T_world_camera", rows)
     place, newest = np.searchsorted(rows, [keyframe, len(map.keyframes) - 1])
-    information = np.asarray(inv(covariance), np.float64)[None]
-    closing = Edges(np.array([[place, newest]], np.int32), matmul(invert(before[place]), T_world_camera)[None], information)
-    edges = concatenate_edges(odometry_edges(map, rows, drift, rotation_drift), closing)
+    information = np.asarray(inv(found.covariance), np.float64)[None]
+    closing = Edges(np.array([[place, newest]], np.int32), matmul(invert(before[place]), found.T_world_camera)[None], information)
+    edges = concatenate_edges(odometry_edges(options, map, rows), closing)
     return correct_keyframes(map, rows, before, _solve_with_prior(before, edges, prior))
 
 
-def align_with_manhattan(map: Map, drift: float, rotation_drift: float, least: float) -> Correction | None:
-    """Rotate every keyframe back to the Manhattan frame of the map; None without one, where the newest would rotate by less than `least` (rad), or
-    some keyframe by more than its plausible drift."""
+def align_with_manhattan(options: StraighteningOptions, map: Map) -> Correction | None:
+    """Rotate every keyframe back to the Manhattan frame of the map; None without one, where the newest would hardly rotate, or some keyframe by more
+    than its plausible drift."""
     prior = estimate_manhattan_prior(map)
     if prior is None:
         return None
     before = map.keyframes.rows("T_world_camera", prior.keyframes)
-    after = _solve_with_prior(before, odometry_edges(map, prior.keyframes, drift, rotation_drift), prior)
+    after = _solve_with_prior(before, odometry_edges(options, map, prior.keyframes), prior)
     cosine = 0.5 * (np.einsum("kij,kij->k", before[:, :3, :3], after[:, :3, :3]) - 1.0)
     angle = np.arccos(np.clip(cosine, -1.0, 1.0))
     path_m = np.linalg.norm(np.diff(before[:, :3, 3], axis=0), axis=1).sum()
-    if angle[-1] < least or angle.max() > PLAUSIBLE * rotation_drift * np.sqrt(path_m):
+    if angle[-1] < np.radians(options.straighten_deg) or angle.max() > PLAUSIBLE * np.radians(options.rotation_drift_deg) * np.sqrt(path_m):
         return None
     return correct_keyframes(map, prior.keyframes, before, after)
 
@@ -141,8 +140,7 @@ def _solve_with_prior(before: F64, edges: Edges, prior: ManhattanPrior | None) -
     return solve_pose_graph(np.concatenate([before, axes[None]]), concatenate_edges(edges, Edges(pairs, measured, information)))[:count]
 
 
-def odometry_edges(map: Map, rows: I32, drift: float, rotation_drift: float) -> Edges:
-    """Return edges between neighbours in time; their covariance is that of the later keyframe's pose plus the drift along the path: standard
-    deviations per square root of a metre, m and rad."""
+def odometry_edges(options: DriftOptions, map: Map, rows: I32) -> Edges:
+    """Return edges between neighbours in time; their covariance is that of the later keyframe's pose plus the drift along the path."""
     pairs = np.concatenate([np.stack([np.arange(len(rows) - k), np.arange(k, len(rows))], axis=1) for k in range(1, LINKS + 1)])
-    return Edges(pairs.astype(np.int32), *odometry(map, rows[pairs], drift, rotation_drift, LINKS))
+    return Edges(pairs.astype(np.int32), *odometry(options, map, rows[pairs], LINKS))

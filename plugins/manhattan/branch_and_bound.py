@@ -79,7 +79,7 @@ class BranchAndBound(ModeOptions):
 
     @cached_property
     def _search(self) -> RotationSearch:
-        return RotationSearch(np.radians(self.inlier_deg), np.radians(self.certificate_deg), self.max_gap, self.max_cubes)
+        return RotationSearch(self)
 
 
 FACE = (12, 24, 48)  # cells a face of the maps for the first levels, whose cubes are 9.7°, 4.9° and 2.4° in radius
@@ -97,16 +97,13 @@ class Optimum(NamedTuple):
 
 @dataclass(frozen=True)
 class RotationSearch:
-    """Best rotation for weighted directions, from anywhere, with a proof. Angles in rad.
+    """Best rotation for weighted directions, from anywhere, with a proof.
 
     The rotations are covered by cubes of rotation vectors `v` in `R_start Exp(v)`, of half side σ; every rotation of a cube is within √3 σ of its
     centre (Hartley and Kahl). Level by level a cube is dropped when even its upper bound is not above the best consensus found, else split in eight.
     The first bounds are three look-ups in maps on the sphere, the later ones sums over all directions (`consensus_bound`)."""
 
-    inlier: float  # τ of the consensus
-    certificate: float  # rotations this near to the best one need not be distinguished from it
-    slack: float  # share of the best consensus by which another must be better to count
-    max_cubes: int  # work limit
+    options: BranchAndBound
 
     def __call__(self, vectors: F64, weights: F64, start: F64) -> Optimum:
         """The optimum for directions (n, 3) of any length but 0 and weights (n,); rows that are not finite or weigh nothing are left out. `start`
@@ -114,18 +111,24 @@ class RotationSearch:
         unit, weights = _usable(vectors, weights)
         if len(unit) == 0:
             return Optimum(start, 0.0, 0.0, 0, 0)
-        cells = image(unit, weights, self._grid, self._cones, self.inlier)
+        cells = image(unit, weights, self._grid, self._cones, self._inlier)
         middle = coarser(cells, FACE[2])
         near = [largest_near(values, reach) for values, reach in zip((coarser(middle, FACE[1]), middle, cells), self._reaches)]
         maps = Maps(cells, (near[0], near[1], near[2]))
-        found = search(group_directions(unit, weights), maps, start, self.inlier, self.certificate, self.slack, self.max_cubes)
+        certificate, options = np.radians(self.options.certificate_deg), self.options
+        found = search(group_directions(unit, weights), maps, start, self._inlier, certificate, options.max_gap, options.max_cubes)
         return Optimum(*found)
 
     def consensus(self, vectors: F64, weights: F64, R: F64) -> float:
         """C(R) of the same directions."""
         unit, weights = _usable(vectors, weights)
         square = np.max(matmul(unit, R) ** 2, axis=1, initial=0.0)
-        return float(float(matmul(weights, np.maximum(square - np.cos(self.inlier) ** 2, 0.0))) / np.sin(self.inlier) ** 2)
+        return float(float(matmul(weights, np.maximum(square - np.cos(self._inlier) ** 2, 0.0))) / np.sin(self._inlier) ** 2)
+
+    @property
+    def _inlier(self) -> float:
+        """τ of the consensus, rad."""
+        return float(np.radians(self.options.inlier_deg))
 
     @cached_property
     def _grid(self) -> SphereGrid:
@@ -134,7 +137,7 @@ class RotationSearch:
     @cached_property
     def _cones(self) -> Neighbours:
         """Cells within τ of each."""
-        return neighbours(self._grid, self.inlier)
+        return neighbours(self._grid, self._inlier)
 
     @cached_property
     def _reaches(self) -> list[Neighbours]:

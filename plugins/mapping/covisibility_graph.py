@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import wraps
-from typing import Any, Concatenate, ParamSpec, TypeVar
+from typing import Any, Concatenate, ParamSpec, Protocol, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -171,15 +171,26 @@ def are_distinct(T: F64, other: F64) -> bool:
 LEAST_SIGMA_M, LEAST_SIGMA = 1e-3, 1e-4  # standard deviations between two keyframes at one place, m and rad
 
 
-def odometry(map: Map, pairs: I32, drift: float, rotation_drift: float, times: float = 1.0) -> tuple[F64, F64]:
+class DriftOptions(Protocol):
+    """Options of every plugin that measures the motion between keyframes by odometry."""
+
+    @property
+    def drift_share(self) -> float:
+        """Standard deviation of the position (m) per root metre."""
+
+    @property
+    def rotation_drift_deg(self) -> float:
+        """Standard deviation of the rotation per root metre."""
+
+
+def odometry(options: DriftOptions, map: Map, pairs: I32, times: float = 1.0) -> tuple[F64, F64]:
     """Return the motions `T_a_b` (e, 4, 4) between pairs (e, 2) of keyframes, the earlier first, and the information (e, 6, 6) of their xi.
 
-    The covariance is `times` that of the later keyframe's pose plus the drift along the path: standard deviations per square root of a metre, m and
-    rad."""
+    The covariance is `times` that of the later keyframe's pose plus the drift along the path."""
     poses = map.keyframes.rows("T_world_camera", pairs.ravel()).reshape(-1, 2, 4, 4)
     motions = matmul(invert(poses[:, 0]), poses[:, 1])
     length = np.linalg.norm(motions[:, :3, 3], axis=1)[:, None, None]
     covariance = times * map.keyframes.rows("covariance", pairs[:, 1])
-    covariance[:, :3, :3] += times * (drift**2 * length + LEAST_SIGMA_M**2) * np.eye(3)
-    covariance[:, 3:, 3:] += times * (rotation_drift**2 * length + LEAST_SIGMA**2) * np.eye(3)
+    covariance[:, :3, :3] += times * (options.drift_share**2 * length + LEAST_SIGMA_M**2) * np.eye(3)
+    covariance[:, 3:, 3:] += times * (np.radians(options.rotation_drift_deg) ** 2 * length + LEAST_SIGMA**2) * np.eye(3)
     return np.ascontiguousarray(motions), np.asarray(inv(covariance), np.float64)

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,13 +30,28 @@ LIMIT_M = 0.01  # σ by brightness below which a direction is observable, where 
 Weights = Callable[[Residuals, Source], F64]
 
 
-@dataclass(frozen=True)
-class Gates:
-    """Conditions under which a point is seen, see `fill_residuals`."""
+class DenseOptions(Protocol):
+    """Options of every plugin that aligns images densely."""
 
-    least_gradient: float
-    farthest_m: float
-    least_cosine: float
+    @property
+    def least_gradient(self) -> float:
+        """Brightness gradient (a pixel) below which brightness is not used."""
+
+    @property
+    def farthest_m(self) -> float:
+        """Distance from the surface beyond which a point is not seen."""
+
+    @property
+    def least_cosine(self) -> float:
+        """Cosine between the normals of a point and of the surface below which the point is not seen; -1 where normals are not compared."""
+
+    @property
+    def motion_sigma_m(self) -> float:
+        """Standard deviation of no motion, per frame."""
+
+    @property
+    def motion_sigma_deg(self) -> float:
+        """Standard deviation of no rotation, per frame."""
 
 
 @dataclass(frozen=True)
@@ -51,16 +67,16 @@ class Alignment:
     share: float
 
 
-def align(levels: Sequence[tuple[Source, Target, int]], R: F64, t: F64, gates: Gates, weights: Weights, prior: F64) -> Alignment:
+def align(options: DenseOptions, levels: Sequence[tuple[Source, Target, int]], R: F64, t: F64, weights: Weights, gap: int) -> Alignment:
     """Gauss–Newton from (R, t) over pairs of images with a number of iterations each, coarse to fine.
 
-    `prior` (6,) is the information of no motion since the start; where neither surfaces nor brightness observe a direction the translation is
-    held."""
+    A weak prior is no motion since the start, `gap` frames ago; where neither surfaces nor brightness observe a direction the translation is held."""
+    prior = np.repeat([(options.motion_sigma_m * gap) ** -2, (np.radians(options.motion_sigma_deg) * gap) ** -2], 3)
     start, R, t = t.copy(), R.copy(), t.copy()
     for source, target, iterations in levels:
         residuals = residual_buffers(source)
         for _ in range(iterations):
-            H, g, held, seen = _linearise(residuals, source, target, R, t, gates, weights)
+            H, g, held, seen = _linearise(options, residuals, source, target, R, t, weights)
             information = np.diag(prior)
             information[:3, :3] += matmul(held.T, held) * max(float(np.trace(H)), 1.0) * 1e3
             moved = np.concatenate([t - start, np.zeros(3)])
@@ -69,7 +85,7 @@ def align(levels: Sequence[tuple[Source, Target, int]], R: F64, t: F64, gates: G
             R, t = matmul(dR, R), matmul(dR, t) + step[:3]
             if matmul(step, step) < CONVERGED:
                 break
-    H, g, held, seen = _linearise(residuals, source, target, R, t, gates, weights)
+    H, g, held, seen = _linearise(options, residuals, source, target, R, t, weights)
     W = weights(residuals, source)
     agreeing = float(np.count_nonzero((residuals.cosine > 0.0) & (_mahalanobis2(residuals, W) < 9.0))) / max(len(W), 1)
     covariance = inv(H / CORRELATED + np.diag(np.maximum(prior, 1.0)))
@@ -77,10 +93,10 @@ def align(levels: Sequence[tuple[Source, Target, int]], R: F64, t: F64, gates: G
 
 
 def _linearise(
-    residuals: Residuals, source: Source, target: Target, R: F64, t: F64, gates: Gates, weights: Weights
+    options: DenseOptions, residuals: Residuals, source: Source, target: Target, R: F64, t: F64, weights: Weights
 ) -> tuple[F64, F64, F64, int]:  # fmt: skip
     """Linearise at R, t: H, g, the unobservable unit vectors (u, 3), and the number of points seen."""
-    fill_residuals(source, target, R, t, gates.least_gradient, gates.farthest_m, gates.least_cosine, residuals)
+    fill_residuals(source, target, R, t, options.least_gradient, options.farthest_m, options.least_cosine, residuals)
     W = weights(residuals, source)
     H, g = normal_equations(residuals, W)
     spread, texture, seen = observability(residuals, W)

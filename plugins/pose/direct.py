@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Annotated
+from typing import Annotated, ClassVar
 
 import numpy as np
 
@@ -12,7 +12,7 @@ from trihedron.pipeline.core.linalg import matmul
 from trihedron.pipeline.core.options import PositiveFloat, PositiveInt, Range, Share
 from trihedron.pipeline.core.registry import register
 from trihedron.pipeline.core.types import F64, Frame, Pose
-from trihedron.plugins.pose.dense_alignment import Gates, align, source_of, target_of
+from trihedron.plugins.pose.dense_alignment import align, source_of, target_of
 from trihedron.plugins.pose.dense_alignment_kernels import Residuals, Source, Target
 from trihedron.plugins.pose.dense_pose import dense_pose, first_pose
 from trihedron.plugins.pose.direct_kernels import student_weights_kernel
@@ -30,6 +30,8 @@ class Direct:
 
     Its odometry alone, without the publication's keyframes and pose graph. Directions that neither brightness nor depth observes are held."""
 
+    least_cosine: ClassVar[float] = -1.0  # normals are not compared
+
     width: Annotated[int, Range(32)] = 320  # px, about, of the finest level
     levels: PositiveInt = 3
     most: Annotated[int, Range(100)] = 10000  # pixels of the finest level that are used, about
@@ -45,10 +47,7 @@ class Direct:
         if previous is None or previous_frame is None:
             return first_pose(frame)
         gap = max(frame.index - previous_frame.index, 1)
-        prior = np.repeat([(self.motion_sigma_m * gap) ** -2, (np.radians(self.motion_sigma_deg) * gap) ** -2], 3)
-        found = align(
-            self._pairs(previous_frame, frame), np.eye(3), np.zeros(3), Gates(self.least_gradient, self.farthest_m, -1.0), student_weights, prior
-        )
+        found = align(self, self._pairs(previous_frame, frame), np.eye(3), np.zeros(3), student_weights, gap)
         T = matmul(previous.T_world_camera, pose_matrix(found.R.T, matmul(-found.R.T, found.t)))
         reaching = previous_frame.index == previous.index
         return dense_pose(frame, previous, T, found, self.min_share if reaching else 2.0, "of the previous frame's pixels")

@@ -16,6 +16,7 @@ import numpy as np
 from trihedron.pipeline.core.geometry import invert
 from trihedron.pipeline.core.lie import log_se3
 from trihedron.pipeline.core.linalg import matmul
+from trihedron.pipeline.core.options import PositiveFloat, PositiveShare, Share
 from trihedron.pipeline.core.types import DEGRADED, F64, OK, U8, Bool, Keypoints, Map, Matches, Planes, Segments
 from trihedron.plugins.pose.dynamic_objects_kernels import mahalanobis2, on_planes_kernel
 from trihedron.plugins.pose.map_alignment import InlierStatistics, MapAlignment, TrackingStatus
@@ -39,18 +40,18 @@ class Selection(Enum):
 
 
 @dataclass(frozen=True)
-class DynamicObjectOptions:
-    """The options `moving_*` of `Refine`, where they are documented."""
+class MovingOptions:
+    """Options of a pose that is estimated although something moves."""
 
-    share: float
-    gate: float
-    sure: float
-    unproven: float
-    most: float
-    least: float
+    moving_share: PositiveShare = 0.15  # difference between the outlier shares of new and verified points beyond which something may move
+    moving_gate: PositiveFloat = 2.2  # Mahalanobis distance² (0.1 quantile of χ² with 6 dof) from the pose by static matches that then selects it
+    moving_sure: PositiveFloat = 13.9  # the same of the position (0.997 quantile, 3 dof) that selects it although the outlier shares are alike
+    moving_unproven: PositiveFloat = 9.0  # the same from the position by planes alone, which are selected while no landmark is verified
+    moving_most: Share = 0.4  # of all matches that must be inliers, half if most planes are outliers too, else the pose is degraded to the planes' σ
+    min_share: Share = 0.25  # of the matches that must be inliers, else the pose is degraded
 
 
-def solve_with_static(problem: MapAlignment, options: DynamicObjectOptions) -> tuple[PoseSolution, Selection | None]:
+def solve_with_static(problem: MapAlignment, options: MovingOptions) -> tuple[PoseSolution, Selection | None]:
     """Estimate the pose by all matches; or, where something moves and pulls the pose away, by static matches, with all matches classified by it.
 
     Also returns the selection of static matches, None for all matches. Where most matches are outliers even so (`ALL` without a selection), the
@@ -71,7 +72,7 @@ def solve_with_static(problem: MapAlignment, options: DynamicObjectOptions) -> t
 
 
 def status_with_static(
-    status: TrackingStatus, solution: PoseSolution, problem: MapAlignment, selection: Selection, options: DynamicObjectOptions
+    status: TrackingStatus, solution: PoseSolution, problem: MapAlignment, selection: Selection, options: MovingOptions
 ) -> TrackingStatus:
     """Status of a pose estimated by this selection; degraded where most matches contradict it, or only the planes support it, since these may be the
     moving ones."""
@@ -83,14 +84,14 @@ def status_with_static(
 
 
 def _solve_alone(
-    solution: PoseSolution, inliers: InlierStatistics, problem: MapAlignment, terms: Terms, static: StaticMatches, options: DynamicObjectOptions
+    solution: PoseSolution, inliers: InlierStatistics, problem: MapAlignment, terms: Terms, static: StaticMatches, options: MovingOptions
 ) -> PoseSolution | None:
     """Estimate the pose by static matches alone; None unless the other matches pull it significantly away from that."""
     by_planes = static.selection is Selection.PLANES
-    far = options.unproven if by_planes else options.sure
+    far = options.moving_unproven if by_planes else options.moving_sure
     planes_disagree = static.selection is Selection.VERIFIED and inliers.most_planes_disagree
-    contradicted = planes_disagree or static.outlier_difference(solution.points) >= options.share
-    if not contradicted and (1.0 - inliers.total / max(inliers.matches, 1) < options.share or inliers.matched[2] == 0):
+    contradicted = planes_disagree or static.outlier_difference(solution.points) >= options.moving_share
+    if not contradicted and (1.0 - inliers.total / max(inliers.matches, 1) < options.moving_share or inliers.matched[2] == 0):
         return None
     if not contradicted:
         xi, covariance = problem.first_step(solution.T_world_camera, terms, static.flags(terms))
@@ -99,13 +100,13 @@ def _solve_alone(
     alone = problem.solve(static.select(terms))
     if static.selection is Selection.ON_PLANES and problem.statistics(alone).most_planes_disagree:
         return None  # planes that contradict each other are no evidence
-    if by_planes and problem.statistics(problem.classify(alone)).total < options.least * inliers.matches:  # nothing else supports them
+    if by_planes and problem.statistics(problem.classify(alone)).total < options.min_share * inliers.matches:  # nothing else supports them
         return None
-    pulled = distance2(alone, solution) >= options.gate if contradicted else distance2(alone, solution, 3) > far
+    pulled = distance2(alone, solution) >= options.moving_gate if contradicted else distance2(alone, solution, 3) > far
     return alone if pulled and (by_planes or not alone.unobservable.shape[1]) else None
 
 
-def _is_contradicted(problem: MapAlignment, solution: PoseSolution, selection: Selection | None, options: DynamicObjectOptions) -> bool:
+def _is_contradicted(problem: MapAlignment, solution: PoseSolution, selection: Selection | None, options: MovingOptions) -> bool:
     """Return True if most matches are outliers of a pose.
 
     If most planes are outliers too, a majority is enough, by more than one standard deviation of such a count. A pose by matches on planes is
@@ -116,7 +117,7 @@ def _is_contradicted(problem: MapAlignment, solution: PoseSolution, selection: S
     if selection is Selection.ON_PLANES:
         verified = verified_planes(problem.map, problem.matches)
         return majority and bool(2 * np.count_nonzero(solution.planes[:same][verified]) <= np.count_nonzero(verified))
-    return inliers.total < options.most * inliers.matches or (majority and 2 * inliers.inliers[2] <= same)
+    return inliers.total < options.moving_most * inliers.matches or (majority and 2 * inliers.inliers[2] <= same)
 
 
 @dataclass(frozen=True)

@@ -13,7 +13,7 @@ from trihedron.pipeline.core.linalg import matmul
 from trihedron.pipeline.core.options import AcuteDeg, NonNegativeFloat, PositiveFloat, PositiveInt, Range, Share
 from trihedron.pipeline.core.registry import register
 from trihedron.pipeline.core.types import F64, Frame, Pose, PredictedView
-from trihedron.plugins.pose.dense_alignment import Gates, align, source_of, target_of
+from trihedron.plugins.pose.dense_alignment import align, source_of, target_of
 from trihedron.plugins.pose.dense_alignment_kernels import Residuals, Source, Target
 from trihedron.plugins.pose.dense_pose import dense_pose, first_pose, lost_pose
 from trihedron.plugins.shared.image_reduction import Level, brightness, halvings, pyramid, reduced_intrinsics
@@ -49,12 +49,15 @@ class Icp:
         if model is None:
             return lost_pose(frame, previous, "there is no view of a model")
         gap = max(frame.index - previous.index, 1)
-        prior = np.repeat([(self.motion_sigma_m * gap) ** -2, (np.radians(self.motion_sigma_deg) * gap) ** -2], 3)
         start = matmul(invert(model.T_world_camera), previous.T_world_camera)
-        gates = Gates(self.least_gradient, self.farthest_m, float(np.cos(np.radians(self.most_deg))))
-        found = align(self._pairs(frame, model), start[:3, :3], start[:3, 3], gates, partial(huber_weights, self), prior)
+        found = align(self, self._pairs(frame, model), start[:3, :3], start[:3, 3], partial(huber_weights, self), gap)
         T = matmul(model.T_world_camera, pose_matrix(found.R, found.t))
         return dense_pose(frame, previous, T, found, self.min_share, "of the pixels and the model", ends_loss=True)
+
+    @property
+    def least_cosine(self) -> float:
+        """Cosine of `most_deg`."""
+        return float(np.cos(np.radians(self.most_deg)))
 
     def _pairs(self, frame: Frame, model: PredictedView) -> list[tuple[Source, Target, int]]:
         """The frame's pixels and the model's view on each level, the coarsest first."""

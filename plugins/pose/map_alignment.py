@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 
@@ -57,10 +58,23 @@ class InlierStatistics:
         return 2 * self.inliers[2] < self.matched[2]
 
 
+class AlignmentNoise(Protocol):
+    """Options of the measurements that have no covariance of their own."""
+
+    @property
+    def line_sigma_px(self) -> float:
+        """Standard deviation of a segment's end point across it."""
+
+    @property
+    def relation_sigma_deg(self) -> float:
+        """Standard deviation of walls that are parallel or perpendicular."""
+
+
 @dataclass(frozen=True)
 class MapAlignment:
     """The matches of a frame with the map, and the decoupled pose (4, 4) with its information (6, 6) as the prior."""
 
+    options: AlignmentNoise
     T_start: F64
     information: F64
     camera: Camera
@@ -69,16 +83,14 @@ class MapAlignment:
     segments: Segments
     planes: Planes
     map: Map
-    line_sigma_px: float
-    relation_sigma_deg: float
 
     def terms(self, T_world_camera: F64) -> Terms:
         """All matches as terms; the extent of lines is that seen from a pose."""
         map, matches = self.map, self.matches
         return (
             point_terms(map, self.keypoints, matches.keypoints),
-            line_terms(map, self.segments, matches.segments, T_world_camera, self.camera, self.line_sigma_px),
-            plane_terms(map, self.planes, matches.planes, matches.parallel, matches.perpendicular, self.relation_sigma_deg),
+            line_terms(map, self.segments, matches.segments, T_world_camera, self.camera, self.options.line_sigma_px),
+            plane_terms(map, self.planes, matches.planes, matches.parallel, matches.perpendicular, self.options.relation_sigma_deg),
         )
 
     def solve(self, terms: Terms) -> PoseSolution:

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from trihedron.pipeline.core.linalg import inv
-from trihedron.pipeline.core.options import NonNegativeInt, PositiveFloat, PositiveShare, Share, check_increasing
+from trihedron.pipeline.core.options import NonNegativeInt, PositiveFloat, Share, check_increasing
 from trihedron.pipeline.core.registry import register
 from trihedron.pipeline.core.types import (
     DEGRADED,
@@ -28,7 +28,7 @@ from trihedron.pipeline.core.types import (
 )
 from trihedron.plugins.mapping.reference_keyframe import reference_of, submap_of, transform_to_map
 from trihedron.plugins.pose.decoupled_pose import FIRST_SIGMA, Decoupled, decoupled_pose
-from trihedron.plugins.pose.dynamic_objects import DynamicObjectOptions, Selection, solve_with_static, status_with_static
+from trihedron.plugins.pose.dynamic_objects import MovingOptions, Selection, solve_with_static, status_with_static
 from trihedron.plugins.pose.map_alignment import InlierStatistics, MapAlignment, TrackingStatus
 from trihedron.plugins.pose.world_uncertainty import carried, in_world, widened_by_keyframes
 from trihedron.plugins.shared.pose_optimizer import PoseSolution
@@ -39,7 +39,7 @@ DETAILED = 100  # key points with which a frame is expected to be recognised by 
 
 @register("pose", "refine")
 @dataclass(frozen=True)
-class Refine:
+class Refine(MovingOptions):
     """Map-to-frame refinement with parallel and perpendicular planes (section IV-C, eq. 8), from the decoupled pose.
 
     The decoupled rotation is a prior with its own covariance; the decoupled position is a weak prior (`position_sigma_m`), since the same features
@@ -52,14 +52,8 @@ class Refine:
     line_sigma_px: PositiveFloat = 1.0  # of a segment's end point across it
     relation_sigma_deg: PositiveFloat = 0.5  # walls are parallel or perpendicular to within this
     min_inliers: NonNegativeInt = 10  # points + 2 lines + 5 planes below which the pose is degraded
-    min_share: Share = 0.25  # of the matches that must be inliers, else the pose is degraded
     found_inliers: NonNegativeInt = 30  # points + 2 lines + 5 planes that relocalise a lost pose
     found_share: Share = 0.5  # of the matches that must be inliers for that
-    moving_share: PositiveShare = 0.15  # difference between the outlier shares of new and verified points beyond which something may move
-    moving_gate: PositiveFloat = 2.2  # Mahalanobis distance² (0.1 quantile of χ² with 6 dof) from the pose by static matches that then selects it
-    moving_sure: PositiveFloat = 13.9  # the same of the position (0.997 quantile, 3 dof) that selects it although the outlier shares are alike
-    moving_unproven: PositiveFloat = 9.0  # the same from the position by planes alone, which are selected while no landmark is verified
-    moving_most: Share = 0.4  # of all matches that must be inliers, half if most planes are outliers too, else the pose is degraded to the planes' σ
     min_continued: Share = 0.025  # of the key points with depth that the previous frame or the map must explain, else it is another place
     weak_foundation: PositiveFloat = 3.0  # times the pose's σ beyond which the nearby keyframes' σ is added to it
     submap_after: NonNegativeInt = 5  # frames without relocalisation, of those that show enough, after which a sub-map begins; 0 = never
@@ -88,8 +82,7 @@ class Refine:
         if map is None or matches is None or previous is None:
             return start.to_pose(rotation, map)
         submap = relocalise.submap if relocalise is not None and relocalise.status == OK else submap_of(previous, map)
-        prior, sigmas = (start.T_world_camera, self._information(start)), (self.line_sigma_px, self.relation_sigma_deg)
-        problem = MapAlignment(*prior, camera, matches, keypoints, segments, planes, map, *sigmas)
+        problem = MapAlignment(self, start.T_world_camera, self._information(start), camera, matches, keypoints, segments, planes, map)
         solution, static = self._solve(problem, start)
         inliers = problem.statistics(solution)
         found_again = self._is_relocalised(solution, inliers) and not self._is_another_place(keypoints, matches, inliers.inliers[0])
@@ -119,11 +112,6 @@ class Refine:
         """Return the refinement of a camera that begins no sub-map: where the loaded map does not reach it stays lost."""
         return replace(self, submap_after=0)
 
-    @property
-    def dynamic_object_options(self) -> DynamicObjectOptions:
-        """The options `moving_*`."""
-        return DynamicObjectOptions(self.moving_share, self.moving_gate, self.moving_sure, self.moving_unproven, self.moving_most, self.min_share)
-
     def _information(self, start: Decoupled) -> F64:
         """Information (6, 6) of the decoupled pose as a prior."""
         information = np.zeros((6, 6))
@@ -137,7 +125,7 @@ class Refine:
         """Estimate the pose; also the selection of static matches that it was estimated by, None for all matches."""
         if start.status == LOST:
             return problem.solve(problem.terms(problem.T_start)), None
-        return solve_with_static(problem, self.dynamic_object_options)
+        return solve_with_static(problem, self)
 
     def _is_tracked(self, inliers: InlierStatistics) -> bool:
         """Return True if enough of the map agrees with a tracked pose."""
@@ -161,7 +149,7 @@ class Refine:
         """Status of a refined pose: by its inliers, dynamic objects, keyframes and sub-map."""
         status = self._inlier_status(solution, inliers, rotation)
         if static is not None:
-            status = status_with_static(status, solution, problem, static, self.dynamic_object_options)
+            status = status_with_static(status, solution, problem, static, self)
         if status.status == OK:
             status = widened_by_keyframes(status, solution, problem, self.weak_foundation)
         if submap:

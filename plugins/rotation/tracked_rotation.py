@@ -11,31 +11,15 @@ from trihedron.pipeline.core.linalg import matmul
 from trihedron.pipeline.core.linalg_kernels import solve_positive
 from trihedron.pipeline.core.types import Keypoints, Planes, Segments, Tracks
 from trihedron.plugins.rotation.estimate import IDENTITY, Estimate
-from trihedron.plugins.shared.relative_motion import solve_motion
+from trihedron.plugins.shared.relative_motion import MotionOptions, solve_motion
 
 
-class TrackOptions(Protocol):
+class TrackOptions(MotionOptions, Protocol):
     """Options of every plugin that measures the rotation by the tracks."""
-
-    @property
-    def prior_deg(self) -> float:
-        """Standard deviation of the predicted rotation, per frame."""
-
-    @property
-    def prior_m(self) -> float:
-        """Standard deviation of the motion, per frame."""
 
     @property
     def measured_deg(self) -> float:
         """Standard deviation above which the tracks have not measured the rotation."""
-
-    @property
-    def angle_px(self) -> float:
-        """Angle of a pixel, rad."""
-
-    @property
-    def plane_floor_deg(self) -> float:
-        """Least error of a tracked plane's normal."""
 
     @property
     def predict_frames(self) -> int:
@@ -58,9 +42,7 @@ def compose_with_tracks(
     gap = max(keypoints.index - previous_index, 1)
     if tracks is None or tracks.previous_index != previous_index:
         return Estimate(before.R, before.covariance + IDENTITY * math.radians(options.prior_deg * gap) ** 2, "prediction")
-    motion = solve_motion(
-        tracks, keypoints, segments, planes, options.angle_px, options.plane_floor_deg, options.prior_deg * gap, options.prior_m * gap
-    )
+    motion = solve_motion(options, tracks, keypoints, segments, planes, gap)
     added = motion.covariance[:3, :3]
     if motion.support == 0.0 and before.covariance.trace() / 3.0 >= options.predict_frames * math.radians(options.prior_deg) ** 2:  # long ago
         return Estimate(before.R, before.covariance + added, "prediction")

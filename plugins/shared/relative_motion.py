@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 
@@ -30,13 +31,32 @@ class Motion:
     support: float
 
 
-def solve_motion(
-    tracks: Tracks, keypoints: Keypoints, segments: Segments, planes: Planes, rad_per_px: float, floor_deg: float, sigma_deg: float, sigma_m: float
-) -> Motion:
-    """Estimate the motion that most tracks agree on, with priors on their predicted rotation (`sigma_deg`) and on no translation (`sigma_m`).
+class MotionOptions(Protocol):
+    """Options of every plugin that estimates the motion between two frames from tracks."""
 
-    `rad_per_px` converts sigma_px to an angle; `floor_deg` is the least σ of a plane's normal. Pairs that are not finite, or without covariance, are
-    skipped. Graduated non-convexity (Yang et al., RA-L 2020): the Geman–McClure scale comes down from the median residual, so that up to half of the
-    terms may be outliers. Never raises: without terms the prediction is returned, with the covariance of the prior."""
-    noise = float(rad_per_px), float(np.radians(floor_deg)), float(np.radians(sigma_deg)), float(sigma_m)
+    @property
+    def prior_deg(self) -> float:
+        """Standard deviation of the predicted rotation, per frame."""
+
+    @property
+    def prior_m(self) -> float:
+        """Standard deviation of the motion, per frame."""
+
+    @property
+    def angle_px(self) -> float:
+        """Angle of a pixel, rad."""
+
+    @property
+    def plane_floor_deg(self) -> float:
+        """Least error of a tracked plane's normal."""
+
+
+def solve_motion(options: MotionOptions, tracks: Tracks, keypoints: Keypoints, segments: Segments, planes: Planes, gap: int) -> Motion:
+    """Estimate the motion that most tracks agree on, with priors on their predicted rotation and on no translation over `gap` frames.
+
+    Pairs that are not finite, or without covariance, are skipped. Graduated non-convexity (Yang et al., RA-L 2020): the Geman–McClure scale comes
+    down from the median residual, so that up to half of the terms may be outliers. Never raises: without terms the prediction is returned, with the
+    covariance of the prior."""
+    floor, sigma, sigma_m = np.radians(options.plane_floor_deg), np.radians(options.prior_deg * gap), options.prior_m * gap
+    noise = float(options.angle_px), float(floor), float(sigma), float(sigma_m)
     return Motion(*estimate_motion(*pairs_of(tracks, keypoints, segments, planes), tracks.R_current_previous, noise))

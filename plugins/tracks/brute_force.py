@@ -47,5 +47,5 @@ class BruteForce:
             return tracks_value(now, before, (NO_PAIRS, NO_PAIRS, NO_PAIRS), np.eye(3))
         points = mutual_matches(before.keypoints.descriptors, keypoints.descriptors, keypoints.metric, self.ratio)
         tracks = tracks_value(now, before, (points, NO_PAIRS, NO_PAIRS), np.eye(3))
-        motion = solve_motion(tracks, keypoints, segments, planes, self.angle_px, self.plane_floor_deg, self.prior_deg * gap, self.prior_m * gap)
+        motion = solve_motion(self, tracks, keypoints, segments, planes, gap)
         return tracks_value(now, before, (points, *StructureGates().pairs(now, before, camera, motion.R, motion.t)), motion.R)

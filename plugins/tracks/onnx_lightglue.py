@@ -52,7 +52,7 @@ class OnnxLightGlue(NetworkOptions):
             return tracks_value(now, before, (NO_PAIRS, NO_PAIRS, NO_PAIRS), np.eye(3))
         points = self._matched(previous_keypoints, keypoints, camera)
         tracks = tracks_value(now, before, (points, NO_PAIRS, NO_PAIRS), np.eye(3))
-        motion = solve_motion(tracks, keypoints, segments, planes, self.angle_px, self.plane_floor_deg, self.prior_deg * gap, self.prior_m * gap)
+        motion = solve_motion(self, tracks, keypoints, segments, planes, gap)
         return tracks_value(now, before, (points, *StructureGates().pairs(now, before, camera, motion.R, motion.t)), motion.R)
 
     def _matched(self, before: Keypoints, now: Keypoints, camera: Camera) -> I32:

@@ -57,7 +57,7 @@ class OpticalFlow:
             return tracks_value(now, before, (NO_PAIRS, NO_PAIRS, NO_PAIRS), R)
         points = self._points(frame, previous_frame, keypoints, before.keypoints)
         tracks = tracks_value(now, before, (points, NO_PAIRS, NO_PAIRS), R)
-        motion = solve_motion(tracks, keypoints, segments, planes, self.angle_px, self.plane_floor_deg, self.prior_deg * gap, self.prior_m * gap)
+        motion = solve_motion(self, tracks, keypoints, segments, planes, gap)
         return tracks_value(now, before, (points, *StructureGates().pairs(now, before, frame.camera, motion.R, motion.t)), motion.R)
 
     def _points(self, frame: Frame, previous_frame: Frame, now: Keypoints, before: Keypoints) -> I32:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import NamedTuple
 
 import numpy as np
 
@@ -84,7 +83,7 @@ class Projection:
         rotations = self._predictions(gap, before.keypoints.index, manhattan, previous_manhattan, previous)
         if gap > self.max_age:
             return tracks_value(now, before, (NO_PAIRS, NO_PAIRS, NO_PAIRS), rotations[0])
-        search = Search(before, now, camera, self._gates(now, before))
+        search = Search(self, before, now, camera)
         radius = self.radius_px * min(gap, 3)
         first = max((search(R, NOT_MOVED, radius, self.plane_m) for R in rotations), key=_count)
         if len(first.keypoints) < min(self.enough, len(keypoints.pixels)):
@@ -92,7 +91,7 @@ class Projection:
         motion = self._motion(first, now, gap)
         again = search(motion.R, motion.t, self.near_px, self.plane_near_m)
         again = again if _count(again) >= 0.7 * _count(first) else first
-        found = search.consistent(again, self._motion(again, now, gap), self.error_px)
+        found = search.consistent(again, self._motion(again, now, gap))
         if len(found.keypoints) >= min(self.wide_below, len(keypoints.pixels)):
             return found
         wide = self._wide_baseline(search, now, before, gap, rng)
@@ -108,7 +107,7 @@ class Projection:
             return None
         motion = self._motion(search(rigid.R, rigid.t, self.radius_px, self.plane_m), now, gap)
         again = search(motion.R, motion.t, self.near_px, self.plane_near_m)
-        return search.consistent(again, self._motion(again, now, gap), self.error_px)
+        return search.consistent(again, self._motion(again, now, gap))
 
     def _predictions(
         self, gap: int, previous_index: int, manhattan: ManhattanFrame | None, previous_manhattan: ManhattanFrame | None, previous: Tracks | None
@@ -124,24 +123,8 @@ class Projection:
                 found.append(relative)
         return found or [np.eye(3)]
 
-    def _gates(self, now: Features, before: Features) -> Gates:
-        described, lines_described = now.keypoints.descriptors, now.segments.descriptors
-        limit = self.max_bits if now.keypoints.metric == "hamming" else self.max_l2
-        return Gates(
-            self.octave_step,
-            compared_by(before.keypoints.descriptors, described, limit, now.keypoints.metric),
-            float(limit),
-            self.ratio,
-            float(np.sin(np.radians(self.line_deg))),
-            self.line_overlap,
-            compared_by(before.segments.descriptors, lines_described, self.line_bits, "hamming"),
-            float(self.line_bits),
-            float(np.cos(np.radians(self.plane_deg))),
-        )
-
     def _motion(self, tracks: Tracks, now: Features, gap: int) -> Motion:
-        seen = now.keypoints, now.segments, now.planes
-        return solve_motion(tracks, *seen, self.angle_px, self.plane_floor_deg, self.prior_deg * gap, self.prior_m * gap)
+        return solve_motion(self, tracks, now.keypoints, now.segments, now.planes, gap)
 
 
 def _manhattan_rotation(now: ManhattanFrame, before: ManhattanFrame) -> F64 | None:
@@ -157,51 +140,40 @@ def _count(tracks: Tracks) -> int:
     return len(tracks.keypoints) + len(tracks.segments) + len(tracks.planes)
 
 
-class Gates(NamedTuple):
-    """Limits on the difference of two matched features, apart from position; see `match_near`, `match_lines` and `associate_planes`."""
-
-    octave_step: int
-    compared_by: int
-    distance: float  # of descriptors
-    ratio: float
-    line_sine: float
-    line_overlap: float
-    lines_compared_by: int
-    line_bits: float
-    plane_cosine: float
-
-
 @dataclass(frozen=True)
 class Search:
     """Matches the features of one frame with the next."""
 
+    options: Projection
     before: Features
     now: Features
     camera: Camera
-    gates: Gates
 
     def __call__(self, R: F64, t: F64, radius_px: float, plane_m: float) -> Tracks:
         """Match near the prediction by `p_current = R p_previous + t`: points and lines within `radius_px`, planes within `plane_m`."""
-        gates, walls, seen, found = self.gates, self.before.planes, self.now.planes, self._now
+        options, walls, seen, found = self.options, self.before.planes, self.now.planes, self._now
         motion = constant(R, np.float64), constant(t, np.float64)
         pixels, ends, planes, samples = predict_features(self._before, walls.coefficients, walls.samples_m, self._camera, *motion)
         (words, line_words), (words_now, line_words_now) = self._words
+        compared, limit, lines_compared = self._comparison
+        sine, cosine = float(np.sin(np.radians(options.line_deg))), float(np.cos(np.radians(options.plane_deg)))
         points = near_matches(
             pixels, *words, self.before.keypoints.octaves, found.pixels, *words_now, self.now.keypoints.octaves,
-            np.full(len(pixels), radius_px, np.float32), gates.octave_step, gates.compared_by, gates.distance, gates.ratio,
+            np.full(len(pixels), radius_px, np.float32), options.octave_step, compared, limit, options.ratio,
         )  # fmt: skip
         lines = line_matches(
             ends, line_words, found.endpoints_px, line_words_now,
-            gates.line_sine, float(radius_px), gates.line_overlap, gates.lines_compared_by, gates.line_bits, gates.ratio,
+            sine, float(radius_px), options.line_overlap, lines_compared, float(options.line_bits), options.ratio,
         )  # fmt: skip
-        same = associate_planes_kernel(seen.coefficients, seen.samples_m, planes, samples, gates.plane_cosine, plane_m, True)
+        same = associate_planes_kernel(seen.coefficients, seen.samples_m, planes, samples, cosine, plane_m, True)
         return tracks_value(self.now, self.before, (pairs_of_matches(points), pairs_of_matches(lines), np.ascontiguousarray(same[:, ::-1])), R)
 
-    def consistent(self, tracks: Tracks, motion: Motion, error_px: float) -> Tracks:
+    def consistent(self, tracks: Tracks, motion: Motion) -> Tracks:
         """Reject the key points and lines farther than `error_px` σ from their prediction by the motion, and key points without depth in both."""
         R, t = constant(motion.R, np.float64), constant(motion.t, np.float64)
         unsure_px = float(self.camera.fx * np.sqrt(eigvalsh(motion.covariance[3:, 3:])[-1]))
-        points, lines = consistent_pairs(tracks.keypoints, tracks.segments, self._before, self._now, self._camera, R, t, unsure_px, error_px)
+        features = tracks.keypoints, tracks.segments, self._before, self._now
+        points, lines = consistent_pairs(*features, self._camera, R, t, unsure_px, self.options.error_px)
         return tracks_value(self.now, self.before, (points, lines, tracks.planes), motion.R)
 
     @cached_property
@@ -215,6 +187,14 @@ class Search:
     @cached_property
     def _now(self) -> FeaturePositions:
         return _positions(self.now)
+
+    @cached_property
+    def _comparison(self) -> tuple[int, float, int]:
+        """Kinds of comparison of the descriptors of points, with their largest distance, and of lines; see `compared_by`."""
+        before, now, options = self.before, self.now, self.options
+        limit = options.max_bits if now.keypoints.metric == "hamming" else options.max_l2
+        points = compared_by(before.keypoints.descriptors, now.keypoints.descriptors, limit, now.keypoints.metric)
+        return points, float(limit), compared_by(before.segments.descriptors, now.segments.descriptors, options.line_bits, "hamming")
 
     @cached_property
     def _words(self) -> tuple[tuple[tuple[U64, U8], U64], tuple[tuple[U64, U8], U64]]:

@@ -22,7 +22,7 @@ from trihedron.plugins.bundle.local_window_kernels import (
     linearise_bundle,
     retract,
 )
-from trihedron.plugins.bundle.window import bundle_problem, bundle_window
+from trihedron.plugins.bundle.window import BundleOptions, WindowOptions, bundle_problem, bundle_window
 from trihedron.plugins.mapping.correction import apply_correction
 from trihedron.plugins.none import NoBundle
 
@@ -53,10 +53,10 @@ def disturbed(map, window, sigma=(0.01, 0.005), seed=0):
 def small_problem(room, lines=6):
     """Few landmarks of every kind, so that dense algebra is quick, the points measured more than once: others are not in H and g."""
     _, map = room
-    window = bundle_window(map, 4, 3)
-    twice = window.points[np.diff(bundle_problem(map, window)[1].point_starts) > 1]
+    window = bundle_window(WindowOptions(4, 3), map)
+    twice = window.points[np.diff(bundle_problem(BundleOptions(), map, window)[1].point_starts) > 1]
     window = dataclasses.replace(window, points=twice[:40], lines=window.lines[:lines])
-    state, seen = bundle_problem(disturbed(map, window), window)
+    state, seen = bundle_problem(BundleOptions(), disturbed(map, window), window)
     return state, seen
 
 
@@ -119,12 +119,12 @@ def test_the_schur_complement_gives_the_covariance_of_the_whole(room):
 
 def test_a_point_measured_once_follows_its_keyframe_and_says_nothing_of_it(room):
     _, map = room
-    window = bundle_window(map, 4, 3)
+    window = bundle_window(WindowOptions(4, 3), map)
     map = disturbed(map, window)
-    once = np.diff(bundle_problem(map, window)[1].point_starts) == 1
+    once = np.diff(bundle_problem(BundleOptions(), map, window)[1].point_starts) == 1
     others = dataclasses.replace(window, points=window.points[~once])
-    _, seen = bundle_problem(map, window)
-    found, without = (solve_bundle(*bundle_problem(map, points), 10) for points in (window, others))
+    _, seen = bundle_problem(BundleOptions(), map, window)
+    found, without = (solve_bundle(*bundle_problem(BundleOptions(), map, points), 10) for points in (window, others))
     assert once.sum() > 10
     assert np.allclose(found.state.rotations, without.state.rotations, atol=1e-12)
     assert np.allclose(found.covariance, without.covariance, rtol=1e-9)
@@ -152,8 +152,8 @@ def test_a_disturbed_window_goes_back_to_the_truth_within_its_covariance():
     for seed in range(4):
         world = World(4000, seed=seed)
         map = walk(world, 10, stride=4)
-        window = bundle_window(map, 6, 4)
-        state, seen = bundle_problem(disturbed(map, window, seed=seed), window)
+        window = bundle_window(WindowOptions(6, 4), map)
+        state, seen = bundle_problem(BundleOptions(), disturbed(map, window, seed=seed), window)
         found = solve_bundle(state, seen, 15)
         assert found.cost < 0.6 * linearise_bundle(state, seen, TRUNCATED, room_for(state, seen)) and found.iterations < 20
         rows = len(seen.pixels) * 2 + np.isfinite(seen.depth_m).sum() + 4 * len(seen.endpoints_px) + 3 * len(seen.plane_landmarks)
@@ -173,7 +173,7 @@ def test_a_disturbed_window_goes_back_to_the_truth_within_its_covariance():
 
 def test_the_map_takes_the_correction_and_is_nearer_to_the_truth(room):
     world, map = room
-    window = bundle_window(map, 8, 8)
+    window = bundle_window(WindowOptions(8, 8), map)
     off = disturbed(map, window)
     adjusted = apply_correction(off, LocalWindow()(off))
     for k in window.free:
@@ -191,11 +191,11 @@ def test_the_map_takes_the_correction_and_is_nearer_to_the_truth(room):
 
 def test_the_first_keyframe_never_moves_and_one_keyframe_is_nothing_to_adjust(room):
     _, map = room
-    window = bundle_window(map, 20, 20)
+    window = bundle_window(WindowOptions(20, 20), map)
     assert 0 in window.fixed and 0 not in window.free and len(window.free) == 9
-    window = bundle_window(map, 3, 0)  # nothing outside holds it, so its oldest does
+    window = bundle_window(WindowOptions(3, 0), map)  # nothing outside holds it, so its oldest does
     assert len(window.free) == 2 and len(window.fixed) == 1 and window.fixed[0] < window.free.min() and 9 in window.free
-    assert not len(bundle_window(walk(World(300), 1), 8, 8).free)
+    assert not len(bundle_window(WindowOptions(8, 8), walk(World(300), 1)).free)
     assert LocalWindow()(walk(World(300), 1)) is None and NoBundle()(map) is None
 
 
@@ -241,7 +241,7 @@ def test_two_walls_leave_the_motion_along_them_where_it_was(room):
     _, map = room
     bare = without_kinds(map, "points", "lines")
     bare = dataclasses.replace(bare, planes=bare.planes.updated(np.array([2]), alive=np.array([False])))
-    window = bundle_window(bare, 8, 8)
+    window = bundle_window(WindowOptions(8, 8), bare)
     off = disturbed(bare, window)
     found = LocalWindow()(off)
     n = off.planes.rows("coefficients", window.planes)[:, :3]
@@ -280,11 +280,11 @@ def test_culled_keyframes_move_with_the_living_one_nearest_to_them(room):
 def points_only(room):
     """Pixels alone of points seen at least three times, from a disturbed state: what COLMAP adjusts."""
     _, map = room
-    window = bundle_window(map, 6, 4, least_fixed=2)
+    window = bundle_window(WindowOptions(6, 4), map, least_fixed=2)
     often = map.points.rows("found", window.points) >= 3
     none = np.empty(0, np.int32)
     window = dataclasses.replace(window, points=window.points[often], lines=none, planes=none)
-    state, seen = bundle_problem(disturbed(map, window), window)
+    state, seen = bundle_problem(BundleOptions(), disturbed(map, window), window)
     unknown = np.zeros_like(seen.motion_information)
     return state, seen._replace(depth_m=np.full(len(seen.depth_m), np.nan), motion_information=unknown, robust=False)
 
@@ -304,7 +304,7 @@ def test_the_same_minimum_as_colmap(room):
 
 def test_colmap_as_a_stage(room):
     _, map = room
-    window = bundle_window(map, 8, 8, least_fixed=2)
+    window = bundle_window(WindowOptions(8, 8), map, least_fixed=2)
     off = disturbed(map, window)
     adjusted = apply_correction(off, Colmap()(off))
     before, after = (

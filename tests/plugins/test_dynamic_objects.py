@@ -113,11 +113,11 @@ def test_a_plane_met_once_is_not_known_to_be_at_rest_unless_there_is_but_one_key
 def denied(world, map, points, planes):
     """Return True if a pose by matches on planes is degraded, when so many of the points and planes agree with it."""
     (rotation, _), features, matches = matched(world, map)
-    problem = MapAlignment(rotation.R_world_camera, np.eye(6), world.frame(STEP).camera, matches, *features, map, 1.0, 0.5)
+    problem = MapAlignment(Refine(), rotation.R_world_camera, np.eye(6), world.frame(STEP).camera, matches, *features, map)
     counts = (len(matches.keypoints), int(points * len(matches.keypoints))), (len(matches.segments), 0), (len(matches.planes), planes)
     flags = [(np.arange(count) < agree).astype(np.uint8) for count, agree in counts]
     found = PoseSolution(camera_at(STEP), 1e-6 * np.eye(6), np.empty((6, 0)), *flags, 0.0)
-    status = status_with_static(TrackingStatus("ok", "", found.covariance), found, problem, Selection.ON_PLANES, Refine().dynamic_object_options)
+    status = status_with_static(TrackingStatus("ok", "", found.covariance), found, problem, Selection.ON_PLANES, Refine())
     assert status.status == "ok" or status.reason.startswith("something moves")
     return status.status == "degraded"
 

@@ -8,7 +8,7 @@ import pytest
 from trihedron.pipeline.core.geometry import nearest_rotation
 from trihedron.pipeline.core.lie import exp_so3, log_so3, rotation_angle_deg
 from trihedron.plugins.manhattan import branch_and_bound, branch_and_bound_kernels
-from trihedron.plugins.manhattan.branch_and_bound import FACE, RotationSearch, sphere_grid
+from trihedron.plugins.manhattan.branch_and_bound import FACE, BranchAndBound, RotationSearch, sphere_grid
 from trihedron.plugins.manhattan.branch_and_bound_kernels import (
     angle_to_equivalent,
     cell_of,
@@ -25,7 +25,13 @@ from trihedron.plugins.manhattan.branch_and_bound_kernels import (
 from trihedron.plugins.shared.manhattan_frames_kernels import CUBE, nearest_equivalent
 
 INLIER = np.radians(12.0)
-SEARCH = RotationSearch(INLIER, np.radians(1.0), 0.0, 200_000)
+
+
+def search_with(max_gap=0.0, max_cubes=200_000):
+    return RotationSearch(BranchAndBound(inlier_deg=12.0, certificate_deg=1.0, max_gap=max_gap, max_cubes=max_cubes))
+
+
+SEARCH = search_with()
 
 
 def consensus(vectors, weights, rotations):
@@ -123,7 +129,7 @@ def test_a_work_limit_leaves_a_gap_that_is_true(directions):
     start = directions.rotation(rng)
     best, gaps = brute_force(vectors, weights, np.eye(3))[0], []
     for limit in (1, 600, 1500, 200_000):
-        found = RotationSearch(INLIER, np.radians(1.0), 0.0, limit)(vectors, weights, start)
+        found = search_with(max_cubes=limit)(vectors, weights, start)
         gaps.append(found.upper / found.consensus - 1.0)
         assert found.upper >= best and found.cubes <= max(limit, 512) and (found.open == 0) == (limit == 200_000)
     assert gaps[0] >= gaps[1] >= gaps[2] > gaps[3] and gaps[3] < 0.02 < gaps[0]
@@ -132,7 +138,7 @@ def test_a_work_limit_leaves_a_gap_that_is_true(directions):
 def test_slack_saves_work_and_is_told(directions):
     rng = np.random.default_rng(5)
     _, vectors, weights = walls(directions, rng, (0.9,))
-    strict, loose = (RotationSearch(INLIER, np.radians(1.0), slack, 200_000)(vectors, weights, np.eye(3)) for slack in (0.0, 0.01))
+    strict, loose = (search_with(slack)(vectors, weights, np.eye(3)) for slack in (0.0, 0.01))
     assert loose.cubes < 0.5 * strict.cubes and strict.consensus <= loose.upper <= loose.consensus * 1.0101
 
 

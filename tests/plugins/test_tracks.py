@@ -170,7 +170,7 @@ def test_motion_covariance_is_realistic(room):
         kinds = [{}, {"points": False}, {"lines": False}][seed % 3]
         before, now = world.see(START, 0, rng, **kinds), world.see(T, 1, rng, **kinds)
         found = track(world, now, before)
-        motion = solve_motion(found, *now, 0.001, 0.01, 2.0, 0.1)
+        motion = solve_motion(Projection(angle_px=0.001, plane_floor_deg=0.01), found, *now, 1)
         truth = invert(T)
         e = np.concatenate([_vector(truth[:3, :3] @ motion.R.T), truth[:3, 3] - motion.t])
         errors.append(e @ np.linalg.solve(motion.covariance, e) / 6.0)
@@ -187,7 +187,7 @@ def test_motion_without_terms_is_the_prediction_with_the_prior(room):
         np.zeros((0, 2, 3), np.float32), np.zeros((0, 2), np.int32), np.zeros((0, 4)), np.zeros((0, 3, 3)), exp_so3(np.array([0.1, 0.0, 0.0])),
     )  # fmt: skip
     world, rng = room(), np.random.default_rng(7)
-    motion = solve_motion(none, *world.see(START, 1, rng), 0.002, 0.3, 2.0, 0.1)
+    motion = solve_motion(Projection(), none, *world.see(START, 1, rng), 1)
     assert np.allclose(motion.R, exp_so3(np.array([0.1, 0.0, 0.0]))) and np.allclose(motion.t, 0.0) and motion.support == 0.0
     assert np.allclose(np.sqrt(np.diag(motion.covariance)), np.repeat([np.radians(2.0), 0.1], 3))
 
