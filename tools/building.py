@@ -17,7 +17,9 @@ from trihedron.tools.arguments import Parser
 
 if TYPE_CHECKING:
     pass
-from trihedron.recorded_building import RECORDING, building_of
+from trihedron.recorded_building import building_of
+
+RECORDING = "run.mcap"
 
 
 def main(argv: list[str]) -> int:

@@ -101,9 +101,9 @@ class Table:
 
     def rows(self, name: str, ids: Array) -> Array:
         """Copy rows `ids` of one column, (n, *shape). Raises IndexError for an id outside 0..size-1."""
-        return self.gathered(ids, name)[0]
+        return self.columns_at(ids, name)[0]
 
-    def gathered(self, ids: Array, *names: str) -> list[Array]:
+    def columns_at(self, ids: Array, *names: str) -> list[Array]:
         """Copy rows `ids` of several columns, like `rows` of each."""
         numbers = self._checked(ids)
         return [self._buffers[name].rows.take(numbers, axis=0) for name in names]

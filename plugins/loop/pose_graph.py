@@ -92,7 +92,7 @@ def measured_points(map: Map, keyframe: int) -> tuple[I32, F64, F64, F64]:
     first, end = map.keyframes.row("points", keyframe)
     fx, fy, cx, cy = map.keyframes.row("intrinsics", keyframe)
     names = ("point", "pixel", "depth_m", "sigma_m", "sigma_px")
-    ids, pixel, depth, sigma_m, sigma_px = map.point_observations.gathered(np.arange(first, end), *names)
+    ids, pixel, depth, sigma_m, sigma_px = map.point_observations.columns_at(np.arange(first, end), *names)
     pixel, depth = pixel.astype(np.float64), depth.astype(np.float64)
     places = np.stack([(pixel[:, 0] - cx) / fx * depth, (pixel[:, 1] - cy) / fy * depth, depth], axis=1)
     known = np.flatnonzero(np.isfinite(depth))

@@ -103,7 +103,7 @@ def _created_after(map: Map, kind: LandmarkKind, keyframe: int, later: I32, corr
 def _moved_planes(table: Table, ids: I32, coefficients: F64, covariance: F64, T: F64 | None = None) -> Table:
     """Give planes new coefficients and covariance, as if these were one measurement. Their samples move by T, or by the smallest motion between old
     and new plane."""
-    old, samples, moments = table.gathered(ids, "coefficients", "samples_m", "moments")
+    old, samples, moments = table.columns_at(ids, "coefficients", "samples_m", "moments")
     if T is None:
         motions = motions_between(old, coefficients, moments[:, :3, 3] / moments[:, 3, 3:])
     else:

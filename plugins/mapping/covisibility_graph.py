@@ -52,7 +52,7 @@ class LocalWindow:
 
 @once_per_version
 def _columns(map: Map, ids: I32, kind: LandmarkKind, names: tuple[str, ...]) -> list[NDArray[Any]]:
-    return landmarks_of(map)[kind].gathered(ids, *names)
+    return landmarks_of(map)[kind].columns_at(ids, *names)
 
 
 # Keyframes and sub-maps.

@@ -33,10 +33,10 @@ def cull_landmarks(map: Map, keyframe: int, matches: Matches | None, planes: I32
     tables = landmarks_of(map)
     for kind, expected in zip((POINT, LINE), visible):
         table, ids = tables[kind], union(observed_by(map, young, kind), expected)
-        found, seen, first = table.gathered(ids, "found", "visible", "first")
+        found, seen, first = table.columns_at(ids, "found", "visible", "first")
         seldom = (found < min_found * seen) | ((first == keyframe - trial) & (found < trial) & (seen >= trial))
         tables[kind] = remove_rows(table, ids[seldom])
-    found, seen = map.planes.gathered(planes, "found", "visible")
+    found, seen = map.planes.columns_at(planes, "found", "visible")
     tables[PLANE] = remove_rows(map.planes, planes[found < min_found * seen])
     return with_tables(map, tables)
 
@@ -84,7 +84,7 @@ def _redundancies(map: Map, keyframes: I32, others: int) -> F64:
         ids, observed, ends = observed_by_each(map, keyframes, kind)
         observers, centres = table.rows("observers", ids), _centres(table, kind, ids)
         rows = union(observers[observers >= 0], keyframes)
-        known, alive = map.keyframes.gathered(rows, "T_world_camera", "alive")
+        known, alive = map.keyframes.columns_at(rows, "T_world_camera", "alive")
         counts = count_redundant(observed, ends, keyframes, observers, centres, rows, known, alive, others)
         seen += WEIGHTS[kind] * counts[0]
         redundant += WEIGHTS[kind] * counts[1]

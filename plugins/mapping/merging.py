@@ -33,7 +33,7 @@ def merge_points(map: Map, view: Observations, visible: I32, metric: str) -> Map
     unmatched = visible[map.points.rows("alive", visible) & ~isin(visible, seen)]
     sides = []
     for ids in (unmatched, seen):
-        position, descriptors, octaves = map.points.gathered(ids, "position_m", "descriptor", "octave")
+        position, descriptors, octaves = map.points.columns_at(ids, "position_m", "descriptor", "octave")
         pixels = view.camera.project(transform(invert(view.T_world_camera), position)).astype(np.float32)
         sides.append((pixels, descriptors, octaves))
     limit = MAX_BITS if metric == "hamming" else MAX_L2
@@ -41,7 +41,7 @@ def merge_points(map: Map, view: Observations, visible: I32, metric: str) -> Map
     pairs = np.stack([unmatched[found >= 0], seen[found[found >= 0]]], axis=-1)
     if not len(pairs):
         return map
-    position, information = map.points.gathered(pairs.ravel(), "position_m", "information")
+    position, information = map.points.columns_at(pairs.ravel(), "position_m", "information")
     position, information = position.reshape(-1, 2, 3), information.reshape(-1, 2, 3, 3).astype(np.float64)
     apart = position[:, 1] - position[:, 0]
     covariance = inverse(information).sum(axis=1)
@@ -51,7 +51,7 @@ def merge_points(map: Map, view: Observations, visible: I32, metric: str) -> Map
     merged = solve(total, np.einsum("nkij,nkj->ni", information, position)[..., None])[..., 0]
     kept, gone = pairs.min(axis=1), pairs.max(axis=1)
     names = ("descriptor", "direction", "distance_m", "octave")
-    newer: dict[str, Any] = dict(zip(names, map.points.gathered(pairs[:, 1], *names)))
+    newer: dict[str, Any] = dict(zip(names, map.points.columns_at(pairs[:, 1], *names)))
     points = map.points.updated(kept, position_m=merged, information=0.5 * total, **newer)  # half: both contain some of the same observations
     return _remove_merged(replace(map, points=points), POINT, kept, gone)
 
@@ -71,8 +71,8 @@ def merge_lines(map: Map, view: Observations, visible: I32) -> Map:
     if not len(pairs):
         return map
     kept, gone = pairs[:, 0], pairs[:, 1]
-    reach, descriptor = map.lines.gathered(gone, "endpoints_m", "descriptor")
-    endpoints, information = map.lines.gathered(kept, "endpoints_m", "information")
+    reach, descriptor = map.lines.columns_at(gone, "endpoints_m", "descriptor")
+    endpoints, information = map.lines.columns_at(kept, "endpoints_m", "information")
     endpoints, information = extend_lines(endpoints, information, reach)
     lines = map.lines.updated(kept, endpoints_m=endpoints, information=information, descriptor=descriptor)
     return _remove_merged(replace(map, lines=lines), LINE, kept, gone)
@@ -80,7 +80,7 @@ def merge_lines(map: Map, view: Observations, visible: I32) -> Map:
 
 def _collinear(lines: Table, a: I32, b: I32) -> Bool:
     """Return True (n,) where both ends of line b lie on line a within their uncertainty (χ² test)."""
-    (on, known), (ends, other) = (lines.gathered(ids, "endpoints_m", "information") for ids in (a, b))
+    (on, known), (ends, other) = (lines.columns_at(ids, "endpoints_m", "information") for ids in (a, b))
     foot, covariance = points_along(on, inverse(known), parameters_on(on, ends))
     covariance += inverse(other)
     chi2 = np.einsum("nki,nkij,nkj->nk", ends - foot, inverse(covariance), ends - foot)
@@ -127,7 +127,7 @@ def _merge_with_first(map: Map, others: I32, plane: int, max_m: float) -> Map:
 def _is_duplicate(planes: Table, a: int, b: int, max_m: float) -> bool:
     """Return True if two living planes with the same normal lie within `max_m` of each other on average, both ways, and overlap."""
     ids = np.array([a, b], np.int32)
-    alive, coefficients, samples = planes.gathered(ids, "alive", "coefficients", "samples_m")
+    alive, coefficients, samples = planes.columns_at(ids, "alive", "coefficients", "samples_m")
     if not alive.all():
         return False
     apart = max(mean_distance(coefficients[0], samples[1]), mean_distance(coefficients[1], samples[0]))
@@ -149,7 +149,7 @@ def _merge_pair(map: Map, a: int, b: int) -> Map:
 def _remove_merged(map: Map, kind: LandmarkKind, kept: I32, gone: I32) -> Map:
     """Remove the landmarks `gone`; their observers, counts and observations pass to the distinct ids `kept`."""
     table = landmarks_of(map)[kind]
-    mine, theirs = (table.gathered(ids, "observers", "found", "visible") for ids in (kept, gone))
+    mine, theirs = (table.columns_at(ids, "observers", "found", "visible") for ids in (kept, gone))
     both = np.concatenate([mine[0], theirs[0]], axis=1)
     both = -np.sort(-both, axis=1)
     both[:, 1:][both[:, 1:] == both[:, :-1]] = -1  # observed by the same keyframe

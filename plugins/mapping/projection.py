@@ -54,7 +54,7 @@ def _pinhole(camera: Camera) -> tuple[float, float, float, float, int, int]:
 
 def visible_planes(planes: Table, ids: I32, T_world_camera: F64, frame: Frame) -> I32:
     """Select the planes `ids` that face the camera and of which at least half the samples lie in the image, not occluded by the frame's depth."""
-    coefficients, samples = planes.gathered(ids, "coefficients", "samples_m")
+    coefficients, samples = planes.columns_at(ids, "coefficients", "samples_m")
     local = transform(invert(T_world_camera), samples.astype(np.float64))
     pixels = frame.camera.project(local)
     inside = (local[..., 2] > MIN_DEPTH_M) & in_image(pixels, frame.camera)
@@ -86,14 +86,14 @@ def clip_segments(endpoints_m: F64, T_camera_world: F64, camera: Camera) -> tupl
 def point_terms(map: Map, keypoints: Keypoints, pairs: I32) -> PointTerms:
     """Pair key points (rows `pairs[:, 0]`) with their landmarks (ids `pairs[:, 1]`)."""
     rows = pairs[:, 0].copy()
-    positions_m, information = map.points.gathered(pairs[:, 1], "position_m", "information")
+    positions_m, information = map.points.columns_at(pairs[:, 1], "position_m", "information")
     return point_terms_kernel(positions_m, information, rows, keypoints.pixels, keypoints.points_m, keypoints.sigma_px, keypoints.sigma_m)
 
 
 def line_terms(map: Map, segments: Segments, pairs: I32, T_world_camera: F64, camera: Camera, sigma_px: float) -> LineTerms:
     """Pair segments with their map lines, each line given by its points opposite the segment's ends: its parts beyond them were not observed."""
     rows = pairs[:, 0].copy()
-    ends_m, information = map.lines.gathered(pairs[:, 1], "endpoints_m", "information")
+    ends_m, information = map.lines.columns_at(pairs[:, 1], "endpoints_m", "information")
     seen_px, seen_m, noise = segments.endpoints_px, segments.endpoints_m, segments.covariance_m2
     return line_terms_kernel(ends_m, information, rows, seen_px, seen_m, noise, T_world_camera.copy(), camera.intrinsics, sigma_px)
 
@@ -117,7 +117,7 @@ def plane_terms(map: Map, planes: Planes, same: I32, parallel: I32, perpendicula
 
     The covariance of an observed normal that takes part in k relations is multiplied by k in each: it was measured once."""
     pairs = np.concatenate([same, parallel, perpendicular])
-    coefficients, covariance = map.planes.gathered(pairs[:, 1], "coefficients", "covariance")
+    coefficients, covariance = map.planes.columns_at(pairs[:, 1], "coefficients", "covariance")
     extra = math.radians(relation_sigma_deg) ** 2
     rows = len(same), len(same) + len(parallel)
     kinds, observed, noise = plane_terms_kernel(covariance, pairs, *rows, planes.coefficients, planes.covariance, extra)

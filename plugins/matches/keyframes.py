@@ -58,7 +58,7 @@ class Keyframes:
     def _verified(self, camera: Camera, keypoints: Keypoints, map: Map, keyframe: int, rng: np.random.Generator) -> I32:
         """Rows of key points and ids of the keyframe's points (n, 2) that agree on one motion; none where too few do."""
         ids, mine = observed_by(map, np.array([keyframe], np.int32), POINT), rows_with_depth(keypoints)
-        descriptors, positions = map.points.gathered(ids, "descriptor", "position_m")
+        descriptors, positions = map.points.columns_at(ids, "descriptor", "position_m")
         found = mutual_matches(descriptors, keypoints.descriptors[mine], keypoints.metric, self.ratio)
         if len(found) < self.min_points:
             return NO_PAIRS

@@ -10,8 +10,6 @@ if TYPE_CHECKING:
     from trihedron.pipeline.core.types import Building, Map
     from trihedron.pipeline.record.reader import Recording
 
-RECORDING = "run.mcap"
-
 
 def building_of(recording: Recording, plugin: str | None = None) -> Building:
     """Return the recorded building, or the one that a plugin (default: manhattan_layout) makes of the recording. Raises DataError."""
@@ -21,18 +19,18 @@ def building_of(recording: Recording, plugin: str | None = None) -> Building:
         for value in recording.values("building"):
             if isinstance(value, Building):
                 return value
-    return folded(recording, plugin or "manhattan_layout")
+    return building_by(recording, plugin or "manhattan_layout")
 
 
-def folded(recording: Recording, name: str) -> Building:
+def building_by(recording: Recording, name: str) -> Building:
     """Fold the recording's frames by a plugin with its default options. Raises DataError when planes are not recorded, or the frames are gone."""
-    fold, state, final = gathered(recording, name)
+    fold, state, final = fold_recording(recording, name)
     building: Building = fold.finish(state, final)
     return building
 
 
-def gathered(recording: Recording, name: str) -> tuple[Any, Any, Map | None]:
-    """Return a plugin with its default options, its state after all frames of a recording, and the last map. Raises DataError as `folded` does."""
+def fold_recording(recording: Recording, name: str) -> tuple[Any, Any, Map | None]:
+    """Return a plugin with its default options, its state after all frames of a recording, and the last map. Raises DataError."""
     from trihedron.pipeline.app.recorded_values import frames_of, last_map, poses_of, references_of
     from trihedron.pipeline.core.registry import plugin_class
     from trihedron.pipeline.core.types import Pose

@@ -48,7 +48,7 @@ def test_rows_are_found_in_every_version_once_asked_for_in_one():
             for values in plain.values():
                 values[int(dead[0]) * CHUNK : (int(dead[0]) + 1) * CHUNK] = 0
         for ids in (rng.permutation(len(table)), np.arange(0, len(table), 3, dtype=np.int32), np.arange(len(table))[::-2]):
-            for name, values in zip(SCHEMA, table.gathered(ids, *SCHEMA)):
+            for name, values in zip(SCHEMA, table.columns_at(ids, *SCHEMA)):
                 np.testing.assert_array_equal(values, plain[name][ids])
                 assert values.dtype == SCHEMA[name].dtype
 
@@ -103,7 +103,7 @@ def test_wrong_use_is_refused():
 def test_several_columns_gathered_are_the_rows_of_each():
     table, ids = Table.empty({"a": Column("f8", (3,)), "b": Column("i4")}).appended(a=np.random.rand(700, 3), b=np.arange(700))
     for chosen in (ids[::7], ids[::-3], np.array([699, 0, 256, 255, 0]), ids[:0]):
-        a, b = table.gathered(chosen, "a", "b")
+        a, b = table.columns_at(chosen, "a", "b")
         np.testing.assert_array_equal(a, table.column("a")[chosen])
         np.testing.assert_array_equal(b, table.rows("b", chosen))
         np.testing.assert_array_equal(b, chosen)

@@ -25,7 +25,7 @@ def plan_errors_of_run(run: Path, plugin: str | None = None, beside: Path | None
     from trihedron.pipeline.core.config import make_plugin
     from trihedron.pipeline.core.registry import load_plugins
     from trihedron.pipeline.record.reader import Recording
-    from trihedron.recorded_building import building_of, gathered
+    from trihedron.recorded_building import building_of, fold_recording
 
     load_plugins()
     recording = Recording(run / "run.mcap")
@@ -35,7 +35,7 @@ def plan_errors_of_run(run: Path, plugin: str | None = None, beside: Path | None
     T = alignment(trajectory_in(run, beside or run), dataset.truth())
     if plugin is None:
         return plan_errors(building_of(recording), T, dataset.plans())
-    fold, state, final = gathered(recording, plugin)
+    fold, state, final = fold_recording(recording, plugin)
     began = time.process_time()
     building = fold.finish(state, final)
     spent = time.process_time() - began

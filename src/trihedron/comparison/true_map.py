@@ -53,7 +53,7 @@ def mean_motions(table: Table, ids: I32, motions: F64) -> F64:
     """Return the mean (n, 4, 4) of the motions of the keyframes that observed each landmark, of the one that made it where none is remembered.
 
     Applied to a point this is the mean of where the motions take it. Its rotation is shortened by what the motions differ in, squared."""
-    observers, first = table.gathered(ids, "observers", "first")
+    observers, first = table.columns_at(ids, "observers", "first")
     seen = observers >= 0
     observers = np.where(seen, observers, first[:, None])
     weights = np.where(seen.any(axis=1, keepdims=True), seen, 1.0)
@@ -67,7 +67,7 @@ def _living(table: Table) -> I32:
 def _points(table: Table, motions: F64) -> Table:
     ids = _living(table)
     M = mean_motions(table, ids, motions)
-    position, information, direction = table.gathered(ids, "position_m", "information", "direction")
+    position, information, direction = table.columns_at(ids, "position_m", "information", "direction")
     moved = transform_each(M, position[:, None])[:, 0]
     return table.updated(ids, position_m=moved, information=_rotated(M, information), direction=_turned(M, direction[:, None])[:, 0])
 
@@ -75,7 +75,7 @@ def _points(table: Table, motions: F64) -> Table:
 def _lines(table: Table, motions: F64) -> Table:
     ids = _living(table)
     M = mean_motions(table, ids, motions)
-    ends, information = table.gathered(ids, "endpoints_m", "information")
+    ends, information = table.columns_at(ids, "endpoints_m", "information")
     return table.updated(ids, endpoints_m=transform_each(M, ends), information=_rotated(M[:, None], information))
 
 
@@ -83,7 +83,7 @@ def _planes(table: Table, motions: F64) -> Table:
     """Planes whose normals take the mean direction, and whose centres keep their distance from them."""
     ids = _living(table)
     M = mean_motions(table, ids, motions)
-    old, covariance, moments, samples = table.gathered(ids, "coefficients", "covariance", "moments", "samples_m")
+    old, covariance, moments, samples = table.columns_at(ids, "coefficients", "covariance", "moments", "samples_m")
     centres = moments[:, :3, 3] / moments[:, 3, 3:]
     moved = transform_each(M, centres[:, None])[:, 0]
     new = np.empty_like(old)
