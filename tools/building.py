@@ -10,14 +10,10 @@ Example: trihedron building runs/latest
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from trihedron.pipeline.core.errors import DataError, UsageError, did_you_mean
-from trihedron.tools.arguments import Parser
-
-if TYPE_CHECKING:
-    pass
 from trihedron.recorded_building import building_of
+from trihedron.tools.arguments import Parser
 
 RECORDING = "run.mcap"
 

@@ -15,14 +15,11 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+from trihedron.comparison.surface_errors import FIGURES, RECORDING, SURFACE, WITHIN_M, evaluate_files
 from trihedron.pipeline.core.text_table import table
 from trihedron.tools.arguments import Parser
-
-if TYPE_CHECKING:
-    pass
-from trihedron.comparison.surface_errors import FIGURES, RECORDING, SURFACE, WITHIN_M, evaluate_files
 
 
 def main(argv: list[str]) -> int:

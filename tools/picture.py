@@ -6,13 +6,9 @@ Example: trihedron picture runs/latest/run.mcap --frame 60 --out picture.png
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING
 
-from trihedron.tools.arguments import Parser
-
-if TYPE_CHECKING:
-    pass
 from trihedron.comparison.pictures import draw
+from trihedron.tools.arguments import Parser
 
 
 def main(argv: list[str]) -> int:

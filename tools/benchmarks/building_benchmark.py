@@ -16,17 +16,13 @@ import shutil
 import statistics
 import tempfile
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 
+from trihedron.comparison.building_errors import plan_errors_of_run
 from trihedron.pipeline.core.errors import UsageError, did_you_mean
 from trihedron.pipeline.core.text_table import table
 from trihedron.tools.arguments import Parser
-
-if TYPE_CHECKING:
-    pass
-from trihedron.comparison.building_errors import plan_errors_of_run
 
 SCENES = ("offices", "rooms", "corridor", "flat", "slanted_flat", "house")
 LAYOUTS = {"slanted_flat": "atlanta_layout"}  # of the slot building; the other scenes have the graph's own
