@@ -1,5 +1,9 @@
 """The method of Li, Yunus, Brasch, Navab & Tombari, RGB-D SLAM with Structural Regularities (ICRA 2021), in the order of the paper.
 
+As published it has no bundle adjustment, loop closure or relocalisation. Each step is one plugin of this project with its default options; the
+docstring of its file has the equations, thresholds and weights, and docs/explanation/paper.md what differs from the paper. A stage keeps no state:
+what it needs of the past is passed to it, and is None before there is one.
+
 python examples/the_paper.py [FOLDER]    # a sequence of the TUM benchmark; without one the built-in room
 """
 
@@ -11,28 +15,28 @@ from typing import Any
 
 import trihedron as th
 
-# One plugin a step. Another one is another name: th.manhattan.plane_svd(), th.planes.cape(angle_deg=3).
+# Another plugin is another name, options are arguments: th.manhattan.plane_svd(), th.planes.cape(angle_deg=3).
 orb, lsd, line_ransac = th.keypoints.orb(), th.lines.lsd(), th.segments.ransac()
 integral_image, connected_components, mean_shift = th.normals.integral_image(), th.planes.connected_components(), th.manhattan.mean_shift()
 projection, drift_free, levenberg_marquardt = th.tracks.projection(), th.rotation.drift_free(), th.translation.levenberg_marquardt()
 local_map, refinement, covisibility = th.matches.local_map(), th.pose.refine(), th.map.covisibility()
-greedy = th.surface.planar_greedy().plugin
+greedy = th.surface.planar_greedy().plugin  # itself, since a surface is no function of a frame: start, add every frame, finish
 
 
 @dataclass
 class Seen:
-    """What is known of a frame; of the first frame's past, nothing."""
+    """What is known of a frame; of the first frame's past, nothing. The types are those of trihedron.pipeline.core.types."""
 
-    points: Any = None
-    segments: Any = None
-    planes: Any = None
-    axes: Any = None
-    tracks: Any = None
-    rotation: Any = None
-    translation: Any = None
-    matches: Any = None
-    pose: Any = None
-    map: Any = None  # with this frame, if it is a keyframe
+    points: Any = None  # Keypoints: pixels, and 3D points in the camera's frame with their σ and descriptors
+    segments: Any = None  # Segments: end points in pixels and in 3D
+    planes: Any = None  # Planes: coefficients with covariance, and the regions of the image
+    axes: Any = None  # ManhattanFrame: the rotation from the room's axes to the camera
+    tracks: Any = None  # Tracks: pairs of features, last frame and this one
+    rotation: Any = None  # Rotation: of the camera in the world, the frame of the first camera
+    translation: Any = None  # Translation: position of the camera in the world
+    matches: Any = None  # Matches: features and their landmarks of the map
+    pose: Any = None  # Pose: T_world_camera, its covariance, and status ok, degraded or lost
+    map: Any = None  # Map: keyframes and landmarks, with this frame if it is a keyframe
 
 
 def extract(frame):
@@ -48,7 +52,8 @@ def manhattan_frame(normals, now, last):
 
 
 def track(camera, now, last):
-    """Points, lines and planes of the last frame that are seen again."""
+    """Points, lines and planes of the last frame that are seen again: searched where the rotation between the axes of both frames, else the last
+    motion (`last.tracks`), projects them."""
     return projection(
         camera, keypoints=now.points, segments=now.segments, planes=now.planes, manhattan=now.axes, previous=last.tracks,
         previous_keypoints=last.points, previous_segments=last.segments, previous_planes=last.planes, previous_manhattan=last.axes,
@@ -56,7 +61,8 @@ def track(camera, now, last):
 
 
 def rotation(now, last):
-    """Section IV-A: the camera's rotation from the axes alone, so that it does not drift; without axes, from the tracked features."""
+    """Section IV-A: the camera's rotation from the axes, so that it does not drift, weighed by covariance against that of the tracks; where no axes
+    are in view, from the tracks alone. The map has where the last pose is now, should its keyframe have moved."""
     return drift_free(
         manhattan=now.axes, tracks=now.tracks, keypoints=now.points, segments=now.segments, planes=now.planes,
         previous=last.rotation, previous_pose=last.pose, map=last.map,
@@ -64,7 +70,8 @@ def rotation(now, last):
 
 
 def translation(camera, now, last, before_last):
-    """Section IV-B: with that rotation held, the translation that minimises the residuals of tracked points, lines and planes."""
+    """Section IV-B: with that rotation held, the position that minimises the residuals of tracked points, lines and planes (eq. 7). Without any, it
+    is predicted by the velocity between the earlier poses."""
     return levenberg_marquardt(
         camera, rotation=now.rotation, tracks=now.tracks, keypoints=now.points, segments=now.segments, planes=now.planes,
         previous_pose=last.pose, earlier_pose=before_last.pose, map=last.map,
@@ -72,14 +79,16 @@ def translation(camera, now, last, before_last):
 
 
 def match(camera, now, last):
-    """Sections III-A and V-A: landmarks of the local map that are seen from there; planes by angle and distance."""
+    """Sections III-A and V-A: landmarks of the local map that are in view of the camera at that rotation and position, by descriptors; planes by
+    angle and distance."""
     return local_map(
         camera, rotation=now.rotation, translation=now.translation, keypoints=now.points, segments=now.segments, planes=now.planes, map=last.map
     )
 
 
 def refine(camera, now, last):
-    """Section IV-C: all six degrees of freedom, by matched landmarks and by planes that are parallel or perpendicular to those of the map."""
+    """Section IV-C: all six degrees of freedom, by matched landmarks and by planes that are parallel or perpendicular to those of the map (eq. 8).
+    A frame without matches retains the tracked pose."""
     return refinement(
         camera, rotation=now.rotation, translation=now.translation, tracks=now.tracks, matches=now.matches,
         keypoints=now.points, segments=now.segments, planes=now.planes, previous=last.pose, map=last.map,
@@ -87,15 +96,17 @@ def refine(camera, now, last):
 
 
 def keyframe(frame, now, last):
-    """Section V-A: a frame that shows enough new becomes a keyframe, and its features landmarks of the map."""
+    """Section V-A: a frame that shows enough new becomes a keyframe: its features become landmarks, or observations of those that they match, and
+    landmarks that are seldom found again are removed. None for another frame."""
     return covisibility(frame, pose=now.pose, keypoints=now.points, segments=now.segments, planes=now.planes, matches=now.matches, map=last.map)
 
 
 def main(folder="", **options):
-    """Track the sequence; return the poses and the mesh (section V)."""
+    """Track the sequence; return the poses and the mesh (section V-B): points on each plane of the map are joined by
+    greedy triangulation. `options` are those of the data set."""
     dataset = th.dataset.tum(path=folder, **options) if folder else th.dataset.synthetic(**options)
     poses, mesh, last, before_last = [], greedy.start(), Seen(), Seen()
-    for frame in filter(None, map(dataset, range(len(dataset)))):
+    for frame in filter(None, map(dataset, range(len(dataset)))):  # None: an image that cannot be read
         normals, now = extract(frame)
         now.axes = manhattan_frame(normals, now, last)
         now.tracks = track(frame.camera, now, last)

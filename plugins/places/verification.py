@@ -1,4 +1,6 @@
-"""Geometric verification of a place: search the map from a hypothesis, solve the pose, and test for free-space violations."""
+"""Geometric verification of a place for relocalisation: search the map from a hypothesis, solve the pose, and test for free-space violations.
+
+Loops are verified in `plugins/loop/loop_closing.py`, which solves and tests with these functions."""
 
 from __future__ import annotations
 

@@ -1,4 +1,6 @@
-"""Planes as polygons: the planar parts of a dense mesh on their planes, simplified, cut into few triangles, and joined to what is beside them."""
+"""Planes as polygons: the planar parts of a dense mesh on their planes, simplified, cut into few triangles, and joined to what is beside them.
+
+The meshing of the paper (section V-B) is `planar_greedy.py`."""
 
 from __future__ import annotations
 

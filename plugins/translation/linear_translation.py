@@ -1,4 +1,4 @@
-"""Translation from tracked points with a known rotation: the de-rotated reprojection error, which is linear in it.
+"""Translation from tracked points with a known rotation for `irls` and `kalman`: the de-rotated reprojection error, which is linear in it.
 
 With the previous point rotated into the current camera's axes, q = R_current_previous p, and the unknown translation s in `p_current = q + s`, a
 point observed at (x, y) on the image plane gives `(1, 0, -x)·s = x q_z - q_x` and `(0, 1, -y)·s = y q_z - q_y`; one without depth, of which only the
