@@ -2,7 +2,8 @@
 
 As published it has no bundle adjustment, loop closure or relocalisation. Each step is one plugin of this project with its default options; the
 docstring of its file has the equations, thresholds and weights, and docs/explanation/paper.md what differs from the paper. A stage keeps no state:
-what it needs of the past is passed to it, and is None before there is one.
+what it needs of the past is passed to it, and is None before there is one. A lost frame has a pose of status `lost`, which no keyframe and no
+mesh is made of.
 
 python examples/the_paper.py [FOLDER]    # a sequence of the TUM benchmark; without one the built-in room
 """
@@ -47,7 +48,8 @@ def extract(frame):
 
 
 def manhattan_frame(normals, now, last):
-    """Section IV-A: the three axes of the room, by mean shift of the normals and line directions on the sphere."""
+    """Section IV-A: the three axes of the room in the camera's frame, by mean shift of the normals and line directions on the sphere, then fitted to
+    the planes and lines on them."""
     return mean_shift(normals=normals, segments=now.segments, planes=now.planes, previous=last.axes)
 
 
@@ -123,4 +125,5 @@ def main(folder="", **options):
 
 if __name__ == "__main__":
     found, surface = main(*sys.argv[1:])
-    print(f"{len(found)} frames, {len(surface.triangles)} triangles; the last camera is at", found[-1].T_world_camera[:3, 3].round(3), "m")
+    ok = sum(pose.status == "ok" for pose in found)
+    print(f"{len(found)} frames, {ok} ok; {len(surface.triangles)} triangles; the last camera is at", found[-1].T_world_camera[:3, 3].round(3), "m")
