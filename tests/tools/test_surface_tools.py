@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from trihedron.comparison.mesh_distance import FAR_M, NearestTriangle, sampled
+from trihedron.comparison.mesh_distance import FAR_M, NearestTriangle, sample_triangles
 from trihedron.comparison.mesh_files import read_mesh
 from trihedron.comparison.surface_errors import mesh_errors
 from trihedron.comparison.surface_truth import Truth, truth_of
@@ -148,7 +148,7 @@ def test_mistakes_of_export_are_one_line(tmp_path):
 
 
 def square_truth():
-    nearest, seen = NearestTriangle(SQUARE, TWO), sampled(SQUARE, TWO, 0.02)[0]
+    nearest, seen = NearestTriangle(SQUARE, TWO), sample_triangles(SQUARE, TWO, 0.02)[0]
 
     def distance(points):
         return nearest.query(points)[0], points[:, 0] > 1.0

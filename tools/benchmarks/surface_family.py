@@ -68,7 +68,7 @@ def tracked(out: Path, frames: int) -> Path:
 
 def measured(run: Path, names: list[str]) -> dict[str, Any]:
     """The figures of each surface over the recording of a run."""
-    from trihedron.comparison.surface_errors import mesh_errors, prepared
+    from trihedron.comparison.surface_errors import alignment_and_truth, mesh_errors
     from trihedron.pipeline.run.scheduler import single_threaded_libraries
 
     recording = Recording(run / "run.mcap")
@@ -85,7 +85,7 @@ def measured(run: Path, names: list[str]) -> dict[str, Any]:
                 fold.add(frame, inputs)
         for fold in folds.values():
             fold.finish(maps[-1] if maps else None)
-    T, truth = prepared(run / "trajectory.txt", recording.path)
+    T, truth = alignment_and_truth(run / "trajectory.txt", recording.path)
     found = {}
     for name, fold in folds.items():
         vertices = fold.surface.vertices_m.astype(np.float64) @ T[:3, :3].T + T[:3, 3]
