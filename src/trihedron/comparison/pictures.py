@@ -25,10 +25,10 @@ def draw(path: str, frame: int, out: Path) -> None:
     matplotlib.use("Agg")
     from matplotlib import pyplot
 
-    from trihedron.pipeline.app.recorded_values import opened
+    from trihedron.pipeline.app.recorded_values import open_recording
     from trihedron.pipeline.core.errors import RecordingError
 
-    recording = opened(Path(path))
+    recording = open_recording(Path(path))
     poses = list(recording.values("pose"))
     if not poses:
         raise RecordingError(path, "holds no poses", "record a run with outputs=[trajectory]")
