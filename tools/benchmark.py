@@ -38,7 +38,7 @@ from trihedron.pipeline.core.errors import UsageError, did_you_mean
 from trihedron.pipeline.core.layouts import data_set_words
 from trihedron.pipeline.core.types import U8
 from trihedron.tools.arguments import Parser
-from trihedron.tools.benchmark_comparison import compared, read_figures, times
+from trihedron.tools.benchmark_comparison import comparison_table, read_figures, times
 
 PROGRAM = (sys.executable, "-c", "import sys; from trihedron.pipeline.app.cli import main; sys.exit(main(sys.argv[1:]))")
 REFERENCE_FRAMES = 40  # at most
@@ -73,7 +73,7 @@ def main(argv: list[str]) -> int:
     parser.add_argument("--cold", action="store_true", help="time the first frame with an empty kernel cache, too (half a minute)")
     options, rest = parser.parse_known_args(argv)
     overrides = [override for word in (*options.overrides, *rest) for override in data_set_words(word)]
-    _checked(overrides)
+    _check_overrides(overrides)
     old = read_figures(options.compare) if options.compare else None
     with tempfile.TemporaryDirectory() as folder:
         images = sample_images(overrides)
@@ -90,7 +90,7 @@ def main(argv: list[str]) -> int:
     figures["machine"] = machine()
     print(report(figures))
     if old is not None:
-        print("\n" + compared(old, figures))
+        print("\n" + comparison_table(old, figures))
     if options.json:
         options.json.write_text(json.dumps(figures, indent=2) + "\n")
     return 0
@@ -107,7 +107,7 @@ def comparison(word: str) -> Any:
         raise UsageError(f"benchmark {word}", "is in the source checkout, and not in the installed package", cure) from None
 
 
-def _checked(overrides: list[str]) -> None:
+def _check_overrides(overrides: list[str]) -> None:
     """Raise UsageError for a word that is no override: it may be a comparison misspelt."""
     for word in overrides:
         if "=" not in word:

@@ -36,7 +36,7 @@ def read_figures(path: Path) -> dict[str, Any]:
     return figures
 
 
-def compared(old: dict[str, Any], new: dict[str, Any]) -> str:
+def comparison_table(old: dict[str, Any], new: dict[str, Any]) -> str:
     """A table of then and now, in multiples of the reference, and which became slower by more than a tenth."""
     before, after = _multiples(old), _multiples(new)
     rows: list[tuple[str, ...]] = [("x reference", "then", "now", "change", "")]

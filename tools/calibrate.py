@@ -28,7 +28,7 @@ from trihedron.pipeline.core.types import F64, Camera
 from trihedron.pipeline.record.reader import Recording
 from trihedron.tools import calibration_edges, calibration_pairs
 from trihedron.tools.arguments import Parser
-from trihedron.tools.calibration_edges import Edges, block_scores, edges_of, registered
+from trihedron.tools.calibration_edges import Edges, block_scores, edges_of, register_depth
 from trihedron.tools.calibration_judgement import Costs, Judgement, judge
 from trihedron.tools.calibration_pairs import Fit, Pairs, fit, scale_of
 from trihedron.tools.calibration_recording import Recorded, pairs_of, read_recording
@@ -99,12 +99,12 @@ def _by_edges(edges: Edges, judgements: dict[str, Judgement]) -> tuple[F64, tupl
     halves = [edges.select(edges.blocks % 2 == half) for half in (0, 1)]
 
     @lru_cache
-    def estimated(half: int, free: tuple[int, ...]) -> tuple[float, ...]:
-        return tuple(registered(halves[half], free).parameters) if len(halves[half].pixels) else (0.0,) * 6
+    def estimate_half(half: int, free: tuple[int, ...]) -> tuple[float, ...]:
+        return tuple(register_depth(halves[half], free).parameters) if len(halves[half].pixels) else (0.0,) * 6
 
-    def judged(before: tuple[int, ...], after: tuple[int, ...]) -> Judgement:
+    def judge_change(before: tuple[int, ...], after: tuple[int, ...]) -> Judgement:
         def costs(half: int) -> tuple[Costs, Costs]:
-            scores = (block_scores(halves[1 - half], np.array(estimated(half, free))) for free in (before, after))
+            scores = (block_scores(halves[1 - half], np.array(estimate_half(half, free))) for free in (before, after))
             low, high = ({block: -score for block, score in found.items()} for found in scores)
             return low, high
 
@@ -113,18 +113,18 @@ def _by_edges(edges: Edges, judgements: dict[str, Judgement]) -> tuple[F64, tupl
     accepted: tuple[int, ...] = ()
     judgements["registration"] = NONE
     for free in REGISTRATIONS:
-        found = judged(accepted + DELAY, free + DELAY)
+        found = judge_change(accepted + DELAY, free + DELAY)
         if found.recommended:
-            judgements["registration"], accepted = found if not accepted else judged(DELAY, free + DELAY), free
+            judgements["registration"], accepted = found if not accepted else judge_change(DELAY, free + DELAY), free
         elif not accepted and found.gain > judgements["registration"].gain:
             judgements["registration"] = found
-    judgements["delay"] = judged(accepted, accepted + DELAY)
-    everything = registered(edges, REGISTRATIONS[-1] + DELAY)
+    judgements["delay"] = judge_change(accepted, accepted + DELAY)
+    everything = register_depth(edges, REGISTRATIONS[-1] + DELAY)
     chosen = accepted + (DELAY if judgements["delay"].recommended else ())
-    parameters = registered(edges, accepted + DELAY).parameters if accepted else np.zeros(6)
+    parameters = register_depth(edges, accepted + DELAY).parameters if accepted else np.zeros(6)
     parameters[5] = parameters[5] if DELAY[0] in chosen else 0.0
     if not accepted and chosen:
-        parameters = registered(edges, chosen).parameters
+        parameters = register_depth(edges, chosen).parameters
     return parameters, (everything.parameters, np.sqrt(np.diag(everything.covariance)))
 
 
@@ -143,23 +143,23 @@ def _by_pairs(pairs: Pairs, judgements: dict[str, Judgement], has_ratio: bool) -
         found: Fit = fit(other, (), scale, held=parameters)[0]
         return {int(block): float(found.costs[other.blocks == block].mean()) for block in np.unique(other.blocks)}
 
-    def judged(before: tuple[int, ...], after: tuple[int, ...]) -> Judgement:
+    def judge_change(before: tuple[int, ...], after: tuple[int, ...]) -> Judgement:
         return judge(lambda half: (held_out(half, before), held_out(half, after))) if halves else NONE
 
     accepted: tuple[int, ...] = SHUTTER
     remaining: dict[str, tuple[int, ...]] = dict(CHANGES)
     if has_ratio:
         free = remaining.pop("focal lengths")
-        judgements["focal lengths"] = replace(judged(accepted, accepted + free), recommended=True)
+        judgements["focal lengths"] = replace(judge_change(accepted, accepted + free), recommended=True)
         accepted += free
     while remaining:
-        found = {name: judged(accepted, accepted + free) for name, free in remaining.items()}
+        found = {name: judge_change(accepted, accepted + free) for name, free in remaining.items()}
         judgements.update(found)
         best = max(found, key=lambda name: found[name].gain if found[name].recommended else -np.inf)
         if not found[best].recommended:
             break
         accepted += remaining.pop(best)
-    judgements["readout"] = judged(tuple(k for k in accepted if k != SHUTTER[0]), accepted)
+    judgements["readout"] = judge_change(tuple(k for k in accepted if k != SHUTTER[0]), accepted)
     everything = fit(pairs, range(len(calibration_pairs.NAMES)), scale)[0]
     chosen = fit(pairs, accepted, scale)[0].parameters
     recommended = np.where(np.isin(np.arange(len(chosen)), accepted), chosen, 0.0)
@@ -244,11 +244,13 @@ def keys_of(calibration: Calibration) -> dict[str, Any]:
     keys |= {name: round(value, 6) for name in ("depth_offset", "depth_radial") if (value := getattr(calibration, name))}
     if given is not None:
         own: dict[str, Any] = {name: round(float(getattr(given, name)), 3) for name in ("fx", "fy", "cx", "cy")}
-        keys["depth_camera"] = own | {name: _rounded(getattr(given, name)) for name in ("translation_m", "rotation_deg") if any(getattr(given, name))}
+        keys["depth_camera"] = own | {
+            name: _round_each(getattr(given, name)) for name in ("translation_m", "rotation_deg") if any(getattr(given, name))
+        }
     return keys
 
 
-def _rounded(values: Sequence[float]) -> list[float]:
+def _round_each(values: Sequence[float]) -> list[float]:
     return [round(float(value), 5) for value in values]
 
 

@@ -87,7 +87,7 @@ def _gradient(frame: Frame, blur_px: float) -> F32:
     return np.asarray(gradient / max(float(gradient.mean()), 1e-6), np.float32)
 
 
-def projected(edges: Edges, parameters: F64) -> F64:
+def project_edges(edges: Edges, parameters: F64) -> F64:
     """(n, 2) pixels of the edges in colour."""
     camera, size = edges.camera, edges.camera.width / 640.0
     focal, center = np.array([camera.fx, camera.fy]), np.array([camera.cx, camera.cy])
@@ -103,7 +103,7 @@ def gradients_at(edges: Edges, parameters: F64, blur: int = -1) -> F64:
     """(n,) gradient of colour at the edges, bilinear."""
     image = edges.gradients[blur]
     h, w = image.shape[1:]
-    x, y = np.clip(projected(edges, parameters), 0.0, [w - 1.001, h - 1.001]).T
+    x, y = np.clip(project_edges(edges, parameters), 0.0, [w - 1.001, h - 1.001]).T
     column, row, k = x.astype(np.int64), y.astype(np.int64), edges.frames
     a, b = x - column, y - row
     upper = (1.0 - a) * image[k, row, column] + a * image[k, row, column + 1]
@@ -117,7 +117,7 @@ def block_scores(edges: Edges, parameters: F64) -> dict[int, float]:
     return {int(block): float(values[edges.blocks == block].mean()) for block in np.unique(edges.blocks)}
 
 
-def registered(edges: Edges, free: Sequence[int]) -> Registered:
+def register_depth(edges: Edges, free: Sequence[int]) -> Registered:
     """Estimate the `free` parameters; the others are 0."""
     chosen = list(free)
     if not chosen:

@@ -48,7 +48,7 @@ class Observations:
         return Observations(*(getattr(self, field.name)[rows] for field in fields(self)))
 
     @classmethod
-    def joined(cls, parts: Sequence[Observations]) -> Observations:
+    def concatenate(cls, parts: Sequence[Observations]) -> Observations:
         """Return the rows of all parts."""
         return cls(*(np.concatenate([getattr(part, field.name) for part in parts]) for field in fields(cls)))
 

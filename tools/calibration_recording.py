@@ -83,7 +83,7 @@ def _motion(trajectory: Trajectory, row: int) -> F64:
 def pairs_of(recorded: Recorded, depth_camera: DepthCamera | None) -> Pairs | None:
     """Pair frames of the same half that share landmarks; depth is registered with `depth_camera` first. None where there are none."""
     camera, blocks = recorded.camera, recorded.blocks
-    seen = [_observations(recorded, row, _registered(frame, depth_camera)) for row, frame in enumerate(recorded.frames)]
+    seen = [_observations(recorded, row, _register_depth(frame, depth_camera)) for row, frame in enumerate(recorded.frames)]
     first, second, motions, of = [], [], [], []
     for i in range(len(seen)):
         for j in range(i + 1, len(seen)):
@@ -99,10 +99,10 @@ def pairs_of(recorded: Recorded, depth_camera: DepthCamera | None) -> Pairs | No
     if not of:
         return None
     pair = np.repeat(np.arange(len(of)), [len(one.depths_m) for one in first])
-    return Pairs(camera, Observations.joined(first), Observations.joined(second), pair, np.array(motions), np.array(of))
+    return Pairs(camera, Observations.concatenate(first), Observations.concatenate(second), pair, np.array(motions), np.array(of))
 
 
-def _registered(frame: Frame, depth_camera: DepthCamera | None) -> F32:
+def _register_depth(frame: Frame, depth_camera: DepthCamera | None) -> F32:
     if depth_camera is None:
         return frame.depth_m
     camera = frame.camera

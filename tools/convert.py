@@ -39,7 +39,7 @@ def main(argv: list[str]) -> int:
         raise UsageError("convert", f"'{destination}' does not end in {SUFFIX}", f"give for example {destination.name or 'far'}{SUFFIX}")
     if destination.exists() and not arguments.overwrite:
         raise UsageError(str(destination), "exists", "give another name or --overwrite")
-    if arguments.source.suffix == SUFFIX and arguments.source.is_file() and not arguments.dataset and _upgraded(arguments.source, destination):
+    if arguments.source.suffix == SUFFIX and arguments.source.is_file() and not arguments.dataset and _upgrade_file(arguments.source, destination):
         return 0
     options = {"path": str(arguments.source), "frames": arguments.frames, "camera": arguments.camera}
     frames, unreadable = convert(arguments.dataset or layout_of(arguments.source), options, destination)
@@ -48,7 +48,7 @@ def main(argv: list[str]) -> int:
     return 0
 
 
-def _upgraded(source: Path, destination: Path) -> bool:
+def _upgrade_file(source: Path, destination: Path) -> bool:
     """Upgrade a recording or map of an older format; returns False for any other file."""
     from trihedron.pipeline.record.upgrade import is_outdated, upgrade
 

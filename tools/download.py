@@ -47,19 +47,19 @@ class Sequence:
     @property
     def archive(self) -> str:
         """Return the address of the archive; empty where only the collection's page is known."""
-        return self._filled("archive")
+        return self._fill_template("archive")
 
     @property
     def nested(self) -> str:
         """Return the name of the archive inside the archive; empty where there is none."""
-        return self._filled("nested")
+        return self._fill_template("nested")
 
     @property
     def folder(self) -> str:
         """Return the folder's name inside an archive that holds several sequences; empty where it holds one."""
         return self.published if self.entry.get("shared") else ""
 
-    def _filled(self, key: str) -> str:
+    def _fill_template(self, key: str) -> str:
         return str(self.entry.get(key, "")).format(published=self.published, group=re.split("[_/]", self.published)[0])
 
 

@@ -131,16 +131,16 @@ def _zip_members(archive: Path) -> Iterator[_Member]:
     with zipfile.ZipFile(archive) as opened:
         for number, info in enumerate(opened.infolist()):
             kind = info.external_attr >> 28 & 0xF  # of Unix: 0 unknown, 4 folder, 8 file
-            path = _checked(archive, info.filename, number, kind in (0, 4, 8))
+            path = _checked_path(archive, info.filename, number, kind in (0, 4, 8))
             if not info.is_dir():
                 with opened.open(info) as stream:
                     yield _Member(path, stream)
 
 
 def _tar_members(archive: Path) -> Iterator[_Member]:
-    with _decompressed(archive) as stream, tarfile.open(fileobj=stream, mode="r:") as opened:
+    with _open_decompressed(archive) as stream, tarfile.open(fileobj=stream, mode="r:") as opened:
         for number, info in enumerate(opened):
-            path = _checked(archive, info.name, number, info.isfile() or info.isdir())
+            path = _checked_path(archive, info.name, number, info.isfile() or info.isdir())
             content = opened.extractfile(info) if info.isfile() else None
             if content is not None:
                 yield _Member(path, content)
@@ -148,7 +148,7 @@ def _tar_members(archive: Path) -> Iterator[_Member]:
             pass
 
 
-def _decompressed(archive: Path) -> IO[bytes]:
+def _open_decompressed(archive: Path) -> IO[bytes]:
     with open(archive, "rb") as file:
         begin = file.read(6)
     for magic, opener in COMPRESSIONS.items():
@@ -158,7 +158,7 @@ def _decompressed(archive: Path) -> IO[bytes]:
     return open(archive, "rb")
 
 
-def _checked(archive: Path, name: str, number: int, plain: bool) -> PurePosixPath:
+def _checked_path(archive: Path, name: str, number: int, plain: bool) -> PurePosixPath:
     path = PurePosixPath(name)
     shown = printable(name, SHOWN)
     if number >= MOST_MEMBERS:

@@ -61,7 +61,7 @@ class Cache:
         try:
             path = pooch.retrieve(address, sha256 or pin.get("sha256"), file, self.folder, downloader=_Download(self.folder / f"{file}.part", limit))
         except ValueError as error:
-            raise self._changed(address, sha256, pin, error) from error
+            raise self._mismatch_error(address, sha256, pin, error) from error
         except requests.RequestException as error:
             raise DataError(
                 address, f"cannot be fetched ({_reason(error)})", "check the network, or give --from with another address or file"
@@ -103,7 +103,7 @@ class Cache:
             raise DataError(str(path), f"has the SHA-256 {found[:12]}… instead of {sha256[:12]}…", "fetch the archive again")
         return Archive(path, str(path), found, cached=False)
 
-    def _changed(self, address: str, sha256: str, pin: dict[str, Any], error: ValueError) -> DataError:
+    def _mismatch_error(self, address: str, sha256: str, pin: dict[str, Any], error: ValueError) -> DataError:
         if sha256:
             return DataError(address, f"the archive does not have the published SHA-256 {sha256[:12]}…", "do not use it; ask its publisher")
         if not pin:

@@ -20,7 +20,7 @@ from pathlib import Path
 
 import numpy as np
 
-from trihedron.comparison.error_budget import ATE, named, remarks, reruns
+from trihedron.comparison.error_budget import ATE, remarks, reruns, row_name
 from trihedron.pipeline.core.text_table import table
 from trihedron.pipeline.record.reader import Recording
 from trihedron.tools.arguments import Parser
@@ -36,7 +36,7 @@ def main(argv: list[str]) -> int:
     for stages, one in found.items():
         ate, *relative = (_number(one.metrics.get(key)) for key in (ATE, "rpe_second_rmse_m", "rpe_second_rmse_deg"))
         share = (one.metrics.get(ATE) or 0.0) / whole if ATE in one.metrics else np.nan
-        rows.append([named(stages), ate, f"{share:.2f}" if np.isfinite(share) else "-", *relative])
+        rows.append([row_name(stages), ate, f"{share:.2f}" if np.isfinite(share) else "-", *relative])
     print(table(rows, "lrrrr"))
     for sentence in remarks(found):
         print(sentence)

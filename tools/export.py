@@ -14,7 +14,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-from trihedron.pipeline.app.recorded_values import opened
+from trihedron.pipeline.app.recorded_values import open_recording
 from trihedron.pipeline.core.errors import DataError, UsageError, did_you_mean
 from trihedron.pipeline.record.reader import Recording
 from trihedron.tools.arguments import Parser
@@ -52,7 +52,7 @@ def main(argv: list[str]) -> int:
     recording: Path = arguments.run / RECORDING if arguments.run.is_dir() else arguments.run
     out: Path = arguments.out or recording.parent / chosen.file
     try:
-        content = chosen.write(opened(recording), out)
+        content = chosen.write(open_recording(recording), out)
     except OSError as error:
         raise DataError(str(out), f"cannot be written: {error.strerror}", "give another --out") from error
     print(f"{out}: {content}")

@@ -40,32 +40,32 @@ PALETTE = np.array(
 
 def write_picture(recording: Recording, path: Path) -> str:
     """PNG: two views beside or above each other, whichever is larger."""
-    picture, count = drawn(surface_of(recording))
+    picture, count = draw_surface(surface_of(recording))
     path.write_bytes(bytes(cv2.imencode(".png", picture[..., ::-1], [cv2.IMWRITE_PNG_COMPRESSION, 9])[1]))
     size = f"{picture.shape[1]} × {picture.shape[0]} px"
     return f"{size}, {count} triangles below the ceiling, as they were seen and by planes" if count else f"{size}, empty: no surface"
 
 
-def drawn(surface: Surface, size: tuple[int, int] = SIZE) -> tuple[U8, int]:
+def draw_surface(surface: Surface, size: tuple[int, int] = SIZE) -> tuple[U8, int]:
     """Draw a surface: (h, w, 3) RGB, and the number of triangles that are shown."""
-    shown = np.flatnonzero(_shown(surface)).astype(np.int32)
+    shown = np.flatnonzero(_visible_triangles(surface)).astype(np.int32)
     w, h = size
     if len(shown) == 0:
         return np.full((h, w, 3), int(PAPER), np.uint8), 0
-    points, lit = _seen(surface, shown)
+    points, lit = _view_vertices(surface, shown)
     low, high = _frame(points, surface.triangles[shown])
     half = max(((w // 2, h), (w, h // 2)), key=lambda part: _scale(part, high - low))  # beside each other or above
-    triangle, weights, depth = _rasterised(points, surface.triangles[shown], half, low, high)
+    triangle, weights, depth = _rasterise_triangles(points, surface.triangles[shown], half, low, high)
     triangle = np.where(triangle >= 0, shown[triangle], -1).astype(np.int32)
     light = lit[triangle] * (1.0 - EDGE * _outlines(surface.instances[triangle], depth))
     halves = []
-    for color in (_brightened(_colors(surface, triangle, weights)), _tints(surface, triangle)):
+    for color in (_brighten_colors(_colors(surface, triangle, weights)), _tints(surface, triangle)):
         full = np.where((triangle >= 0)[..., None], color * light[..., None], PAPER).astype(np.float32)
         halves.append(cv2.resize(full, half, interpolation=cv2.INTER_AREA))
     return np.clip(np.concatenate(halves, axis=1 if half[1] == h else 0), 0, 255).astype(np.uint8), len(shown)
 
 
-def _shown(surface: Surface) -> Bool:
+def _visible_triangles(surface: Surface) -> Bool:
     """(t,) True for the triangles that are no ceiling, lie below it, and belong to no small island."""
     triangles, vertices = surface.triangles, surface.vertices_m @ upright(surface.up).T
     if len(triangles) == 0:
@@ -83,7 +83,7 @@ def _shown(surface: Surface) -> Bool:
     return np.asarray(large & ~ceiling & (corners[:, :, 2].min(axis=1) < lowest))
 
 
-def _seen(surface: Surface, shown: I32) -> tuple[F64, F64]:
+def _view_vertices(surface: Surface, shown: I32) -> tuple[F64, F64]:
     """(v, 3) vertices as the viewer sees them, x right, y down, z away, from where most of the area shows its front; (t,) light on the triangles."""
     vertices = surface.vertices_m @ upright(surface.up).T
     corners = vertices[surface.triangles]
@@ -118,7 +118,7 @@ def _scale(size: tuple[int, int], extent: F64) -> float:
     return (1.0 - 2.0 * MARGIN) * float(np.min(size / np.maximum(extent, 1e-6)))
 
 
-def _rasterised(points: F64, triangles: I32, half: tuple[int, int], low: F64, high: F64) -> tuple[I32, F32, F32]:
+def _rasterise_triangles(points: F64, triangles: I32, half: tuple[int, int], low: F64, high: F64) -> tuple[I32, F32, F32]:
     """(h, w) row of the triangle seen in a pixel, -1 = none, (h, w, 3) its weights of the corners, and (h, w) the depth from 0 to 1; supersampled."""
     w, h = (SUPERSAMPLING * side for side in half)
     away = points[np.unique(triangles), 2]
@@ -181,7 +181,7 @@ def _tints(surface: Surface, triangle: I32) -> F64:
     return np.concatenate([PALETTE[chosen[:count]], [REST]])[instance]
 
 
-def _brightened(color: F64) -> F64:
+def _brighten_colors(color: F64) -> F64:
     """Lift the colours of a dark room: the square root of their share of the brightest."""
     bright = max(float(np.percentile(color[color.any(axis=-1)], 99)), 1.0) if color.any() else 1.0
     return np.asarray(BRIGHT * np.clip(color / bright, 0.0, 1.1) ** 0.6)

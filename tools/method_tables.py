@@ -76,12 +76,12 @@ def row_of(folder: Path) -> Row:
     return {
         "change": change,
         "sequence": sequence_of([*of_data, *(word for word in words[len(of_data) :] if word.startswith("dataset."))]),
-        "ate_mm": _rounded(1e3 * final["ate_rmse_m"] if "ate_rmse_m" in final else None),
-        "tracked": _rounded(tracked if metrics else None),
-        "nees": _rounded(nees_of(metrics)),
-        "ms": _rounded(stage.get("p50_ms")),
-        "frame_ms": _rounded(timing.get("frame_ms", {}).get("p50")),
-        "mb": _rounded(timing.get("own_memory_mb")),
+        "ate_mm": _round_value(1e3 * final["ate_rmse_m"] if "ate_rmse_m" in final else None),
+        "tracked": _round_value(tracked if metrics else None),
+        "nees": _round_value(nees_of(metrics)),
+        "ms": _round_value(stage.get("p50_ms")),
+        "frame_ms": _round_value(timing.get("frame_ms", {}).get("p50")),
+        "mb": _round_value(timing.get("own_memory_mb")),
         "note": "" if done else str(job.get("error") or "was stopped before its end"),
         "measures": {},
     }
@@ -123,7 +123,7 @@ def add_measures(runs: Runs, folder: Path) -> list[str]:
 
 
 def _rounded_all(measures: Measures) -> dict[str, float | None]:
-    return {name: _rounded(value) for name, value in measures.items()}
+    return {name: _round_value(value) for name, value in measures.items()}
 
 
 def report(rows: list[Row]) -> str:
@@ -183,5 +183,5 @@ def _read(file: Path) -> Row:
     return found
 
 
-def _rounded(value: float | None) -> float | None:
+def _round_value(value: float | None) -> float | None:
     return None if value is None else float(f"{value:.4g}")

@@ -152,11 +152,11 @@ class PluginCheck:
 
     def static(self) -> list[Result]:
         """Run the checks that need no call."""
-        return [self._documented(), self._options()]
+        return [self._check_documentation(), self._options()]
 
     def digest(self) -> str:
         """SHA-256 of the plugin's values in the room."""
-        return hashlib.sha256(b"".join(self._called(room(self._upstream)))).hexdigest()
+        return hashlib.sha256(b"".join(self._call_on_scene(room(self._upstream)))).hexdigest()
 
     # The graph that feeds the plugin has the default plugin in its place.
 
@@ -166,11 +166,11 @@ class PluginCheck:
         needed = ("model=tsdf",) if self.slot == "pose" else ()
         return (*needed, *(word for word in self.words if not word.startswith((f"{self.slot}.", f"{self.slot}="))))
 
-    def _called(self, scene: Scene) -> list[bytes]:
+    def _call_on_scene(self, scene: Scene) -> list[bytes]:
         """Bytes of the plugin's values in a scene, frame by frame; its own earlier values are its own."""
-        return [encoded(value) for value in values_of(self.plugin, self.slot, scene)]
+        return [encode_value(value) for value in values_of(self.plugin, self.slot, scene)]
 
-    def _documented(self) -> Result:
+    def _check_documentation(self) -> Result:
         kind = type(self.plugin)
         text, comments, ranges = inspect.getdoc(kind) or "", field_comments(kind), constraints_of(kind)
         own = "__doc__" in vars(kind) and text and not text.startswith(f"{kind.__name__}(")
@@ -203,7 +203,7 @@ class PluginCheck:
         except TrihedronError as error:
             return Result("frames", True, f"not read: {error}")
         for frame, other in zip(frames, again):
-            if not isinstance(frame, Frame) or not isinstance(other, Frame) or encoded(frame) != encoded(other):
+            if not isinstance(frame, Frame) or not isinstance(other, Frame) or encode_value(frame) != encode_value(other):
                 return Result("frames", False, "a frame that is read twice is not the same")
         stamps = [frame.stamp_ns for frame in frames if frame is not None]
         return Result("frames", stamps == sorted(set(stamps)), f"{count} frames, stamps increase")
@@ -251,16 +251,16 @@ class PluginCheck:
     def _state(self) -> Result:
         scene = room(self._upstream)
         if self.slot in FOLDS:
-            return Result("no hidden state", self._called(scene) == self._called(scene), "a second fold gives the same bytes")
-        calls = [(arguments, encoded(value)) for arguments, value in calls_of(self.plugin, self.slot, scene) if arguments is not None]
-        same = all(encoded(self.plugin(**_fresh(arguments))) == before for arguments, before in reversed(calls))
+            return Result("no hidden state", self._call_on_scene(scene) == self._call_on_scene(scene), "a second fold gives the same bytes")
+        calls = [(arguments, encode_value(value)) for arguments, value in calls_of(self.plugin, self.slot, scene) if arguments is not None]
+        same = all(encode_value(self.plugin(**_fresh(arguments))) == before for arguments, before in reversed(calls))
         return Result("no hidden state", same, "calls in the opposite order give the same bytes" if same else "calls depend on earlier ones")
 
     def _threads(self) -> Result:
         scene = room(self._upstream)
-        expected = self._called(scene)
+        expected = self._call_on_scene(scene)
         with ThreadPoolExecutor(WORKERS) as pool, single_threaded_libraries():
-            same = all(found == expected for found in pool.map(lambda _: self._called(scene), range(WORKERS)))
+            same = all(found == expected for found in pool.map(lambda _: self._call_on_scene(scene), range(WORKERS)))
         return Result("threads", same, f"{WORKERS} at once give {'the same' if same else 'other'} bytes")
 
     def _processes(self) -> Result:
@@ -283,17 +283,17 @@ class PluginCheck:
                 run_once(only, time.perf_counter())
             except TrihedronError as error:
                 return Result("replay", False, str(error))
-            first, second = ([encoded(v) for v in _topic(Path(folder) / run / "run.mcap", self.slot)] for run in ("run", "again"))
+            first, second = ([encode_value(v) for v in _topic(Path(folder) / run / "run.mcap", self.slot)] for run in ("run", "again"))
         return Result("replay", first == second, f"{len(first)} values are {'the same' if first == second else 'others'}")
 
     @property
-    def _named(self) -> list[str]:
+    def _named_modules(self) -> list[str]:
         """Modules of the libraries that the docstring names."""
         text = inspect.getdoc(type(self.plugin)) or ""
         return [module for name, module in LIBRARIES.items() if re.search(rf"Librar(y|ies): [^.]*{name}", text)]
 
     def _library(self) -> Result:
-        named = self._named
+        named = self._named_modules
         if not named:
             return Result("library", True, "none is named")
         scene, called = room(self._upstream), set[str]()
@@ -308,8 +308,8 @@ class PluginCheck:
             return Result("differs", True, "it is the default")
         scene = room(self._upstream)
         plugin = graph_of(composed([f"outputs=[{self.slot}]", *self._upstream])).stages[self.slot].plugin
-        differing = sum(a != b for a, b in zip(self._called(scene), [encoded(v) for v in values_of(plugin, self.slot, scene)]))
-        good = differing > 0 or not self._named or self.slot in SILENT  # other methods may agree in a plain room
+        differing = sum(a != b for a, b in zip(self._call_on_scene(scene), [encode_value(v) for v in values_of(plugin, self.slot, scene)]))
+        good = differing > 0 or not self._named_modules or self.slot in SILENT  # other methods may agree in a plain room
         return Result("differs", good, f"from {default} in {differing} values")
 
     def _time(self) -> Result:
@@ -331,14 +331,14 @@ def room(words: tuple[str, ...]) -> Scene:
 
 def adverse(slot: str, words: tuple[str, ...]) -> Iterator[Scene]:
     """The adverse scenes."""
-    yield from (_changed(name, words) for name in (*ADVERSE, REPEATED))
+    yield from (_changed_scene(name, words) for name in (*ADVERSE, REPEATED))
     for name, few in FEW.items():
         free = [word for of, word in few.items() if of != slot and not any(given.startswith((f"{of}=", f"{of}.")) for given in words)]
         yield replace(room((*words, f"dataset.length={BEFORE}", *free)), name=name)
 
 
 @lru_cache(maxsize=64)
-def _changed(name: str, words: tuple[str, ...]) -> Scene:
+def _changed_scene(name: str, words: tuple[str, ...]) -> Scene:
     """The room whose last frames are changed."""
     ordinary = tuple(value["dataset"] for value in room(words).values)
     if name == REPEATED:
@@ -353,7 +353,7 @@ def _scene(name: str, words: tuple[str, ...], frames: tuple[Frame, ...] | None) 
     graph = graph_of(config)
     if frames is not None:
         graph = Graph({**graph.stages, "dataset": replace(graph.stages["dataset"], plugin=Frames(frames))}, graph.outputs)
-    with muted():
+    with mute_warnings():
         return Scene(name, graph, tuple(dict(step.values) for step in Runner(graph, threads=1).steps(None, frozenset())))
 
 
@@ -377,7 +377,7 @@ def calls_of(plugin: Any, slot: str, scene: Scene, watch: bool = False, spent: l
             arguments = _arguments(stage, slot, scene, position, own)
             value = None
             if arguments is not None:
-                before = [encoded(item) for item in arguments.values()] if watch else []
+                before = [encode_value(item) for item in arguments.values()] if watch else []
                 began = time.perf_counter()
                 if slot in FOLDS:
                     state = plugin.add(state, **_fresh(arguments))
@@ -388,7 +388,7 @@ def calls_of(plugin: Any, slot: str, scene: Scene, watch: bool = False, spent: l
                 if value is not None:
                     check_value(slot, value, _index(scene, position))
                 own.append(value)
-                if watch and before != [encoded(item) for item in arguments.values()]:
+                if watch and before != [encode_value(item) for item in arguments.values()]:
                     yield arguments, "changed"
                     continue
             else:
@@ -414,7 +414,7 @@ def _arguments(stage: Stage, slot: str, scene: Scene, position: int, own: list[A
     hints, arguments = inputs_of(slot), dict.fromkeys(stage.absent)
     for parameter, wire in stage.inputs.items():
         topic = own if wire.topic == slot else [value.get(wire.topic) for value in scene.values]
-        value = _delayed(topic, wire, position)
+        value = _delayed_value(topic, wire, position)
         if value is None and (parameter == CAMERA or not accepts_none(hints[parameter])):
             return None
         if slot == "relocalise" and isinstance(value, Pose) and position >= BEFORE:
@@ -425,7 +425,7 @@ def _arguments(stage: Stage, slot: str, scene: Scene, position: int, own: list[A
     return arguments
 
 
-def _delayed(topic: list[Any], wire: Wire, position: int) -> Any:
+def _delayed_value(topic: list[Any], wire: Wire, position: int) -> Any:
     if wire.delay == PREVIOUS:
         return next((value for value in reversed(topic[:position]) if value is not None), None)
     return topic[position - wire.delay] if position >= wire.delay else None
@@ -441,7 +441,7 @@ def _index(scene: Scene, position: int) -> int:
     return frame.index if isinstance(frame, Frame) else position
 
 
-def encoded(value: Any) -> bytes:
+def encode_value(value: Any) -> bytes:
     """A value as the bytes of a recording; anything else by its text."""
     return Encoder().encode(value) if isinstance(value, Value) else repr(value).encode()
 
@@ -467,7 +467,7 @@ def _out_of_range(kind: type[Any]) -> Iterator[tuple[str, Any]]:
 
 
 @contextmanager
-def muted() -> Iterator[None]:
+def mute_warnings() -> Iterator[None]:
     """Within this the program's warnings, which adverse frames deserve, are not shown."""
     logger = logging.getLogger("trihedron")
     before = logger.disabled

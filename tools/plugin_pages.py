@@ -61,7 +61,7 @@ def page(slot: str, name: str, results: Results, figure: bool) -> str:
     ]
     parts += [f"![{slot}={name} on a frame of the synthetic room]({name}.jpg)"] if figure else []
     parts += ["## Options", _options(described["parameters"])] if described["parameters"] else []
-    own, without = f"{_runs(slot, name, results)}\n\n{_detected(slot, name, results)}".strip(), _without(slot, results)
+    own, without = f"{_runs(slot, name, results)}\n\n{_detection_figures(slot, name, results)}".strip(), _without(slot, results)
     instead = "" if own or name == "none" else how_to_measure(slot, name)
     origin = f"*{source_line(results)}*" if own or without else ""
     measured = [part for part in (own, instead, without, origin) if part]
@@ -121,7 +121,7 @@ def _figures(row: dict[str, Any]) -> tuple[str, ...]:
     return tuple(_number(value, places) for value, places in digits)
 
 
-def _detected(slot: str, name: str, results: Results) -> str:
+def _detection_figures(slot: str, name: str, results: Results) -> str:
     """Figures by the truth of rendered scenes."""
     scenes = results["detectors"].get(slot, {}).get(name, {})
     if not scenes or "note" in scenes:

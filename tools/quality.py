@@ -102,7 +102,7 @@ def quality_of_run(run: Path) -> Quality:
 
 def quality_of(frames: PosedFrames, count: int) -> Quality:
     """Judge posed frames; `count` is the number of all frames."""
-    warped = {apart: _warped(frames, apart) for apart in APART}
+    warped = {apart: _warp_errors(frames, apart) for apart in APART}
     medians = {apart: float(np.mean([m for m, _ in found])) if found else None for apart, found in warped.items()}
     shifts = [shift for _, shift in warped[APART[-1]] if np.isfinite(shift)]
     points, views = point_cloud(frames)
@@ -125,7 +125,7 @@ def quality_of(frames: PosedFrames, count: int) -> Quality:
     )
 
 
-def _warped(frames: PosedFrames, apart: int) -> list[tuple[float, float]]:
+def _warp_errors(frames: PosedFrames, apart: int) -> list[tuple[float, float]]:
     """Compare up to PAIRS pairs of frames: median absolute difference of depth, and RMS over parts of the image of the signed one, in metres."""
     second = np.searchsorted(frames.numbers, frames.numbers + apart)
     first = np.flatnonzero(second < len(frames.numbers))

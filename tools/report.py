@@ -30,7 +30,7 @@ from trihedron.pipeline.record.reader import Recording
 from trihedron.pipeline.record.trajectories import attached_truth, read_trajectory
 from trihedron.pipeline.run.metrics import aligned_errors, associate
 from trihedron.pipeline.run.result_files import read_results
-from trihedron.pipeline.run.results import dotted
+from trihedron.pipeline.run.results import flatten_dict
 from trihedron.plugins.building.files import floorplan_svg, summary
 from trihedron.tools.arguments import Parser
 from trihedron.tools.export_surface import surface_of
@@ -240,7 +240,7 @@ def _stages(runs: dict[str, Run], colors: dict[str, str]) -> list[dict[str, Any]
 
 def _configurations(runs: dict[str, Run]) -> str:
     """Every value of the composed configurations that is not the same in all runs; an option that a run's plugin does not have is a dash."""
-    flat = {name: dotted(_config(run)) for name, run in runs.items()}
+    flat = {name: flatten_dict(_config(run)) for name, run in runs.items()}
     keys = sorted({key for values in flat.values() for key in values})
     differing = [key for key in keys if len({repr(values.get(key)) for values in flat.values()}) > 1 and key != "out"]
     if not differing:

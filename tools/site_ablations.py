@@ -23,7 +23,7 @@ from trihedron.pipeline.run.result_files import read_results
 from trihedron.pipeline.sweep.paired_statistics import half_interval
 from trihedron.tools.site_figures import MOST_CURVES, Figure, curve_look, curves_figure
 from trihedron.tools.site_pages import render
-from trihedron.tools.site_pictures import embedded
+from trihedron.tools.site_pictures import embed_picture
 
 SHOWN = ("ATE mm", "RPE 1 frame mm", "RPE 1 s mm", "axes deg", "rotation deg", "translation mm", "ms")
 MARGIN = 4.0  # of a chart, per cent of its width, on both sides
@@ -182,5 +182,5 @@ def worst_frames(cases: Sequence[Case], pictures: bool) -> list[dict[str, Any]]:
         apart = f", {parting.distance:.3g} {parting.unit} apart" if parting.unit else ""
         text = f"{label}: frame {parting.worst} of {case.recording}{apart}; {parting.frames} of {case.frames} frames differ"
         alt = f"Frame {parting.worst} as recorded, with {label}, and both paths from above"
-        found.append({"text": text, "picture": embedded(picture, alt) if pictures and picture.is_file() else None})
+        found.append({"text": text, "picture": embed_picture(picture, alt) if pictures and picture.is_file() else None})
     return found

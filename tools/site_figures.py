@@ -56,7 +56,7 @@ def path_figure(estimate: Trajectory, truth: Trajectory | None) -> Figure:
 
     step = nice_step(size)
     bar = f'<path d="M{LEFT},{HEIGHT - 14}h{scale * step:.1f}" stroke="#333" stroke-width="3"/><text x="{LEFT}" y="{HEIGHT - 20}">{step:g} m</text>'
-    body = polyline(place(_thinned(true)), TRUTH, DASHES[1]) + polyline(place(_thinned(ours)), OURS) + bar
+    body = polyline(place(_thin_points(true)), TRUTH, DASHES[1]) + polyline(place(_thin_points(ours)), OURS) + bar
     return Figure(_svg(body, f"Path from above, {len(ours)} poses"), "Path from above: ours in orange, ground truth in blue, dashed.")
 
 
@@ -67,7 +67,7 @@ def error_figure(estimate: Trajectory, truth: Trajectory) -> Figure | None:
         return None
     errors = 1e3 * aligned_errors(estimate.poses[pairs[:, 0]], truth.poses[pairs[:, 1]])
     seconds = (estimate.stamps_ns[pairs[:, 0]] - estimate.stamps_ns[0]) / 1e9
-    body = _axes(seconds[-1], errors.max(), "s", "mm") + polyline(_thinned(_placed(seconds, errors, seconds[-1], errors.max())), OURS)
+    body = _axes(seconds[-1], errors.max(), "s", "mm") + polyline(_thin_points(_place_points(seconds, errors, seconds[-1], errors.max())), OURS)
     text = f"Position error over time: median {np.median(errors):.2f} mm, largest {errors.max():.2f} mm"
     return Figure(_svg(body, text), text + ".")
 
@@ -87,8 +87,8 @@ def curves_figure(name: str, curves: Sequence[F64], fps: float) -> Figure:
     for number, values in enumerate(curves):
         known = np.flatnonzero(np.isfinite(values))
         for piece in np.split(known, np.flatnonzero(np.diff(known) > 1) + 1):
-            places = _placed(seconds[piece], values[piece], float(seconds[-1]), top)
-            body += polyline(_thinned(places), *curve_look(number))
+            places = _place_points(seconds[piece], values[piece], float(seconds[-1]), top)
+            body += polyline(_thin_points(places), *curve_look(number))
     text = f"{title} over time, {unit}; the largest is {largest:.3g}"
     return Figure(_svg(body, text), text + ".")
 
@@ -144,21 +144,21 @@ def aligned_truth(estimate: Trajectory, truth: Trajectory | None) -> F64 | None:
 def scene(estimate: Trajectory, truth: Trajectory | None, mesh_file: Path) -> Markup:
     """Return the 3D view's JSON: mesh and paths as base64 of 16-bit numbers, centred and scaled, z up."""
     R_view_world = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
-    paths = [("ours", _thinned(estimate.poses[:, :3, 3]), (213, 94, 0), False)]
+    paths = [("ours", _thin_points(estimate.poses[:, :3, 3]), (213, 94, 0), False)]
     if (true := aligned_truth(estimate, truth)) is not None:
-        paths.append(("ground truth", _thinned(true), (0, 114, 178), True))
+        paths.append(("ground truth", _thin_points(true), (0, 114, 178), True))
     mesh = _small_mesh(mesh_file) if mesh_file.is_file() else None
     points = [path[1] for path in paths] + ([mesh[0]] if mesh is not None else [])
     everything = np.concatenate(points) @ R_view_world.T
     low, high = np.percentile(everything, [0.5, 99.5], axis=0)
     middle, size = 0.5 * (low + high), max(0.5 * float(np.linalg.norm(high - low)), 1e-3)
 
-    def packed(xyz: F64) -> str:
+    def pack_points(xyz: F64) -> str:
         return _base64(np.clip(np.rint((xyz @ R_view_world.T - middle) / size * LARGEST), -LARGEST, LARGEST).astype("<i2"))
 
-    content: dict[str, Any] = {"paths": [{"name": n, "points": packed(p), "color": c, "dashed": d} for n, p, c, d in paths]}
+    content: dict[str, Any] = {"paths": [{"name": n, "points": pack_points(p), "color": c, "dashed": d} for n, p, c, d in paths]}
     if mesh is not None:
-        content["mesh"] = {"vertices": packed(mesh[0]), "colors": _base64(mesh[1]), "triangles": _base64(mesh[2].astype("<u2"))}
+        content["mesh"] = {"vertices": pack_points(mesh[0]), "colors": _base64(mesh[1]), "triangles": _base64(mesh[2].astype("<u2"))}
     return Markup(json.dumps(content))  # names of ours and numbers
 
 
@@ -174,12 +174,12 @@ def _small_mesh(path: Path) -> tuple[F64, NDArray[np.uint8], NDArray[np.int64]] 
     cell = float(np.linalg.norm(vertices.max(axis=0) - vertices.min(axis=0))) / 1000
     triangles = faces.astype(np.int64)
     while len(triangles) > MOST_TRIANGLES:
-        vertices, colors, triangles = _clustered(vertices, colors, triangles, cell)
+        vertices, colors, triangles = _cluster_vertices(vertices, colors, triangles, cell)
         cell *= 1.25
     return vertices, colors, triangles
 
 
-def _clustered(
+def _cluster_vertices(
     vertices: F64, colors: NDArray[np.uint8], triangles: NDArray[np.int64], cell_m: float
 ) -> tuple[F64, NDArray[np.uint8], NDArray[np.int64]]:
     """Merge the vertices of each cell of a grid into their mean, and remove the triangles that collapse or become the same."""
@@ -198,11 +198,11 @@ def _base64(values: Any) -> str:
     return base64.b64encode(np.ascontiguousarray(values).tobytes()).decode()
 
 
-def _thinned(points: F64) -> F64:
+def _thin_points(points: F64) -> F64:
     return points if len(points) <= MOST_POINTS else points[np.linspace(0, len(points) - 1, MOST_POINTS).astype(int)]
 
 
-def _placed(x: F64, y: F64, largest_x: float, largest_y: float) -> F64:
+def _place_points(x: F64, y: F64, largest_x: float, largest_y: float) -> F64:
     across, up = (WIDTH - LEFT - RIGHT) / max(largest_x, 1e-9), (HEIGHT - TOP - BOTTOM) / max(largest_y, 1e-9)
     return np.stack([LEFT + across * x, HEIGHT - BOTTOM - up * y], axis=1)
 
@@ -225,10 +225,10 @@ def nice_step(span: float) -> float:
 def _axes(largest_x: float, largest_y: float, unit_x: str, unit_y: str) -> str:
     parts = [f'<path d="M{LEFT},{TOP}V{HEIGHT - BOTTOM}H{WIDTH - RIGHT}" fill="none" stroke="#888"/>']
     for value in np.arange(0.0, largest_x + 1e-9, nice_step(largest_x)):
-        x = _placed(np.array([value]), np.zeros(1), largest_x, 1.0)[0, 0]
+        x = _place_points(np.array([value]), np.zeros(1), largest_x, 1.0)[0, 0]
         parts.append(f'<text x="{x:.1f}" y="{HEIGHT - BOTTOM + 16}" text-anchor="middle">{value:g}</text>')
     for value in np.arange(0.0, largest_y + 1e-9, nice_step(largest_y)):
-        y = _placed(np.zeros(1), np.array([value]), 1.0, largest_y)[0, 1]
+        y = _place_points(np.zeros(1), np.array([value]), 1.0, largest_y)[0, 1]
         parts.append(
             f'<path d="M{LEFT},{y:.1f}H{WIDTH - RIGHT}" stroke="#e2e2e2"/><text x="{LEFT - 6}" y="{y + 4:.1f}" text-anchor="end">{value:g}</text>'
         )

@@ -9,7 +9,7 @@ from typing import Any
 WIDTH, QUALITY = 900, 65
 
 
-def embedded(file: Path, alt: str) -> dict[str, Any] | None:
+def embed_picture(file: Path, alt: str) -> dict[str, Any] | None:
     """Return a picture for a page: JPEG as base64, its alternative text, width and height; None for a file that is no picture."""
     import cv2
 

@@ -21,7 +21,7 @@ from trihedron.pipeline.record.trajectories import attached_truth, read_trajecto
 from trihedron.pipeline.run.result_files import read_results
 from trihedron.tools import site_figures
 from trihedron.tools.site_pages import render
-from trihedron.tools.site_pictures import embedded
+from trihedron.tools.site_pictures import embed_picture
 
 RECORDING, TRAJECTORY, SURFACE = "run.mcap", "trajectory.txt", "surface.ply"
 CONFIGURATION = Path(".hydra") / "config.yaml"
@@ -142,7 +142,7 @@ def _pictures(folder: Path) -> list[dict[str, Any]]:
             draw(str(folder / RECORDING), -1, file)
         except TrihedronError:
             return []
-        picture = embedded(file, "The middle frame with planes, 3D lines, key points and Manhattan axes; the map from above")
+        picture = embed_picture(file, "The middle frame with planes, 3D lines, key points and Manhattan axes; the map from above")
     return [picture] if picture else []
 
 

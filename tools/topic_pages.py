@@ -94,10 +94,10 @@ def write_pages(folder: Path) -> list[Path]:
 
 def topic_types() -> dict[str, type[Any] | None]:
     """Return topic -> type of its values, in the order of the data; None for the times."""
-    return {FRAMES_TOPIC: FrameReference, **{slot: _returned(kind) for slot, kind in SLOTS.items()}, TIMING_TOPIC.lstrip("/"): None}
+    return {FRAMES_TOPIC: FrameReference, **{slot: _returned_type(kind) for slot, kind in SLOTS.items()}, TIMING_TOPIC.lstrip("/"): None}
 
 
-def _returned(slot: type[Any]) -> type[Any]:
+def _returned_type(slot: type[Any]) -> type[Any]:
     """The type that a slot's stage returns; of a fold, what it ends with."""
     method: Any = slot.finish if hasattr(slot, "finish") else slot.__call__
     hint = get_type_hints(method)["return"]
@@ -144,13 +144,13 @@ def page(topic: str) -> str:
     back = "[all topics](README.md)"
     if kind is Frame:
         return "\n\n".join([f"# `/{topic}/color`, `/{topic}/depth`: images", inspect.cleandoc(kind.__doc__ or ""), ABOUT[topic], back, "## Fields",
-                            IMAGE_FIELDS, "## Decoder", _fenced(IMAGES)]) + "\n"  # fmt: skip
+                            IMAGE_FIELDS, "## Decoder", _code_block(IMAGES)]) + "\n"  # fmt: skip
     if kind is None:
         text = "Times of a frame in milliseconds, of each stage that was called, and the resident memory of the process. `index` is the frame's."
         fields = (
             "| field | type |\n|---|---|\n| `index` | int64 |\n| `frame_ms` | double |\n| `stage_ms.<stage>` | double |\n| `memory_mb` | double |"
         )
-        return "\n\n".join([f"# `/{topic}`: `trihedron.Timing`", text, back, "## Fields", fields, "## Decoder", _fenced(decoder(topic))]) + "\n"
+        return "\n\n".join([f"# `/{topic}`: `trihedron.Timing`", text, back, "## Fields", fields, "## Decoder", _code_block(decoder(topic))]) + "\n"
     rows = [["`index`, `stamp_ns`", "int64", "number of the frame; its time, ns"], *_rows(kind, "")]
     fields = "| field | type | |\n|---|---|---|\n" + "\n".join(f"| {' | '.join(row)} |" for row in rows)
     dense = [DENSE.format(topic)] if getattr(kind, "dense", False) and topic not in ABOUT else []
@@ -158,7 +158,8 @@ def page(topic: str) -> str:
     about += ["Columns of the tables are explained in [landmarks.py](../../../plugins/mapping/landmarks.py)."] if topic == "map" else []
     heading = f"# `/{topic}`: `trihedron.{kind.__name__}`"
     return (
-        "\n\n".join([heading, inspect.cleandoc(kind.__doc__ or ""), *about, back, "## Fields", fields, "## Decoder", _fenced(decoder(topic))]) + "\n"
+        "\n\n".join([heading, inspect.cleandoc(kind.__doc__ or ""), *about, back, "## Fields", fields, "## Decoder", _code_block(decoder(topic))])
+        + "\n"
     )
 
 
@@ -188,7 +189,7 @@ def decoder(topic: str) -> str:
         return IMAGES
     if kind is None:
         lines = ["times = {field.name: ms for field, ms in message.stage_ms.ListFields()}", "print(message.index, message.frame_ms, times)"]
-        return _trimmed(IMPORTS, ("numpy", "zstandard")) + "\n" + _loop(topic, lines)
+        return _remove_imports(IMPORTS, ("numpy", "zstandard")) + "\n" + _loop(topic, lines)
     names = [name for name in own_fields(kind) if not is_nested(hints_of(kind)[name])]
     hints = hints_of(kind)
     tables = [name for name in names if hints[name] is Table]
@@ -197,13 +198,13 @@ def decoder(topic: str) -> str:
     lines += [f'{name} = table(message.{name}, known["{name}"])' for name in tables]
     lines += [f"{name} = message.{name}" for name in own_fields(kind) if name not in arrays and name not in tables]
     if not arrays and not tables:
-        return _trimmed(IMPORTS, ("numpy", "zstandard")) + "\n" + _loop(topic, lines)
+        return _remove_imports(IMPORTS, ("numpy", "zstandard")) + "\n" + _loop(topic, lines)
     before = f"known = {{{', '.join(f'{chr(34)}{name}{chr(34)}: []' for name in tables)}}}\n" if tables else ""
     imports = ("import json\n\n" if tables else "") + IMPORTS
     return f"{imports}\n{ARRAY}\n{TABLE + chr(10) if tables else ''}\n{before}{_loop(topic, lines)}"
 
 
-def _trimmed(imports: str, unused: tuple[str, ...]) -> str:
+def _remove_imports(imports: str, unused: tuple[str, ...]) -> str:
     return "".join(line for line in imports.splitlines(keepends=True) if not any(name in line for name in unused))
 
 
@@ -211,5 +212,5 @@ def _loop(topic: str, lines: list[str]) -> str:
     return LOOP.format(topic=f"/{topic}") + "".join(f"        {line}\n" for line in lines)
 
 
-def _fenced(program: str) -> str:
+def _code_block(program: str) -> str:
     return f"```python\n{program}```"

@@ -54,11 +54,11 @@ def main(argv: list[str]) -> int:
 def topics_of(path: Path) -> list[Topic]:
     """The topics that have messages, by name, so far where the file is still being written; our own values show the type they hold. Raises
     RecordingError."""
-    from trihedron.pipeline.record.mcap_file import McapFile, damaged, in_use
+    from trihedron.pipeline.record.mcap_file import McapFile, damaged_file_error, in_use
 
     file = McapFile(path)
     if not file.complete and not in_use(path):
-        raise damaged(path)
+        raise damaged_file_error(path)
     found: dict[int, Topic] = {}
     for channel, log_time, data in file.messages():
         topic = found.get(channel)

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from trihedron.pipeline.app.recorded_values import opened
+from trihedron.pipeline.app.recorded_values import open_recording
 from trihedron.pipeline.core.errors import UsageError
 from trihedron.tools.arguments import Parser
 from trihedron.tools.export import RECORDING
@@ -25,7 +25,7 @@ def main(argv: list[str]) -> int:
     parser.add_argument("run", metavar="RUN", type=Path, help="a run folder or its recording")
     run: Path = parser.parse_args(argv).run
     rerun = require_rerun()
-    recording = opened(run / RECORDING if run.is_dir() else run)
+    recording = open_recording(run / RECORDING if run.is_dir() else run)
     stream = rerun.RecordingStream("trihedron")
     try:
         stream.spawn()

@@ -18,7 +18,17 @@ import numpy as np
 from omegaconf import DictConfig, OmegaConf
 
 from trihedron.pipeline.app.compilation import compile_once
-from trihedron.pipeline.app.execute import RECORDING, Warnings, closed, metadata_of, opened, recorded_topics, remembered_of, write_files, write_models
+from trihedron.pipeline.app.execute import (
+    RECORDING,
+    Warnings,
+    close_writer,
+    metadata_of,
+    open_writer,
+    recorded_topics,
+    remembered_of,
+    write_files,
+    write_models,
+)
 from trihedron.pipeline.app.recorded_run import recorded_config_of
 from trihedron.pipeline.core.config import Feedback, composed_each, graph_of
 from trihedron.pipeline.core.errors import TrihedronError
@@ -31,7 +41,7 @@ from trihedron.pipeline.record.writer import RecordingWriter
 from trihedron.pipeline.run.memory import malloc_trim
 from trihedron.pipeline.run.recorder import Recorder
 from trihedron.pipeline.run.replay import TOPICS, Replay
-from trihedron.pipeline.run.run_folder import held, write_configuration
+from trihedron.pipeline.run.run_folder import lock_folder, write_configuration
 from trihedron.pipeline.run.runner import Runner
 from trihedron.pipeline.run.side_by_side import SideBySide, changed_stages, swapped_stages, with_one_dataset
 from trihedron.pipeline.run.timing import begin_together
@@ -119,8 +129,8 @@ class Alternatives:
         began, truth = time.perf_counter(), attached_truth(self.recording.attachments, str(self.recording.path))
         with ExitStack() as stack:
             for folder in folders:
-                stack.enter_context(held(folder))
-            writers = [self._opened(alternative, folder) for alternative, folder in zip(self.alternatives, folders)]
+                stack.enter_context(lock_folder(folder))
+            writers = [self._open_recording(alternative, folder) for alternative, folder in zip(self.alternatives, folders)]
             cpu_began = time.process_time()
             together = SideBySide(self.runners, self.threads)
             self.node_of = together.node_of
@@ -133,7 +143,7 @@ class Alternatives:
                 for index, values in together.steps():
                     on_frame(index, values)
             finally:
-                failures = [failure for writer in writers if (failure := closed(writer)) is not None]
+                failures = [failure for writer in writers if (failure := close_writer(writer)) is not None]
             if failures:
                 raise failures[0]
             for outcome, runner, folder in zip(self.outcomes, self.runners, folders):
@@ -158,12 +168,12 @@ class Alternatives:
         given = [word for word in self.recording.overrides() if word.lstrip("+").partition("=")[0] not in {*NOT_REPEATED, *changed}]
         return [*given, *alternative.words]
 
-    def _opened(self, alternative: Alternative, folder: Path) -> RecordingWriter:
+    def _open_recording(self, alternative: Alternative, folder: Path) -> RecordingWriter:
         config, words = self._as_run(alternative), self._words(alternative)
         config.out = literal_text(str(folder.absolute()))
         write_configuration(folder, config, words)
         metadata = {**metadata_of(config, words), TOPICS: json.dumps(sorted(self.stages & alternative.graph.stages.keys()))}
-        return opened(folder / RECORDING, metadata, self.recording.attachments, flush_s=FLUSH_SECONDS)
+        return open_writer(folder / RECORDING, metadata, self.recording.attachments, flush_s=FLUSH_SECONDS)
 
     def _account(self, together: SideBySide) -> None:
         """Divide the CPU time: a node's among the alternatives it serves, the rest (reading, recording, scheduling, results) equally."""

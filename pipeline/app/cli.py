@@ -185,7 +185,7 @@ def _run(words: list[str]) -> int:
         from trihedron.pipeline.core.config import check_added
 
         check_added(words)
-        return _sweep(words, _recorded(words))
+        return _sweep(words, _recorded_config(words))
     run_once(words, _BEGAN)
     return 0
 
@@ -212,10 +212,10 @@ def run_help() -> str:
 
     load_plugins()
     graphs = sorted(entry.name.removesuffix(".yaml") for entry in (files("trihedron.conf") / "graph").iterdir() if entry.name.endswith(".yaml"))
-    return RUN_HELP.format(datasets=_listed(plugins_of("dataset"), "synthetic"), graphs=_listed(graphs, "structural"))
+    return RUN_HELP.format(datasets=_list_names(plugins_of("dataset"), "synthetic"), graphs=_list_names(graphs, "structural"))
 
 
-def _listed(names: Iterable[str], default: str) -> str:
+def _list_names(names: Iterable[str], default: str) -> str:
     """The names, the default first, as lines of the help's second column."""
     others = [f"{default} (default)", *(name for name in sorted(names) if name not in (default, "pushed"))]
     return textwrap.fill(", ".join(others), 110).replace("\n", "\n" + " " * 37)
@@ -237,7 +237,7 @@ def run_once(words: list[str], began: float) -> tuple[Path, dict[str, Any]]:
         from trihedron.pipeline.core.config import check_added, composed, rewritten
 
         check_added(words)
-        config = composed(words, _recorded(words))
+        config = composed(words, _recorded_config(words))
     if config.dry_run:
         raise UsageError(DRY_RUN[0], "is of a sweep, and this is one run", "add -m to run once with each of several values")
     from trihedron.pipeline.app.execute import execute
@@ -332,7 +332,7 @@ def _job(config: DictConfig, out: Path, work: Callable[[], dict[str, Any]]) -> d
     return metrics
 
 
-def _recorded(words: list[str]) -> RecordedConfig | None:
+def _recorded_config(words: list[str]) -> RecordedConfig | None:
     """The configuration of the recording that the words replay, or None."""
     from trihedron.pipeline.app.recorded_run import recorded_config_of
     from trihedron.pipeline.record.reader import Recording

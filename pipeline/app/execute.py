@@ -34,11 +34,11 @@ from trihedron.pipeline.record.reader import Recording
 from trihedron.pipeline.record.trajectories import TRUTH, attached_truth, format_trajectory
 from trihedron.pipeline.record.writer import RecordingWriter
 from trihedron.pipeline.run import results
-from trihedron.pipeline.run.interrupts import uninterrupted
+from trihedron.pipeline.run.interrupts import defer_interrupts
 from trihedron.pipeline.run.live import Pace, shows_once
 from trihedron.pipeline.run.map_file import load_map, save_map
 from trihedron.pipeline.run.replay import TOPICS, Replay
-from trihedron.pipeline.run.run_folder import held, write_configuration
+from trihedron.pipeline.run.run_folder import lock_folder, write_configuration
 from trihedron.pipeline.run.runner import Runner, Step
 from trihedron.pipeline.run.state import DelayLines, max_delays
 from trihedron.pipeline.run.timing import forget_peak
@@ -74,7 +74,7 @@ def _execute(config: DictConfig, out: Path, overrides: list[str], began: float, 
     _announce(runner)
     trial = partial(Runner, graph, config.seed, config.threads, replay, frames, remembered)
     compile_once(runner.computed, runner.feed is not None)
-    with held(out):
+    with lock_folder(out):
         write_configuration(out, config, overrides)
         with Warnings() as warnings, compilation_reported():
             warm_up(trial())
@@ -84,30 +84,30 @@ def _execute(config: DictConfig, out: Path, overrides: list[str], began: float, 
             truth = attached_truth(attachments, str(out / RECORDING))
             started, writer, failure = time.perf_counter(), None, None
             try:
-                with uninterrupted():
-                    writer = opened(out / RECORDING, metadata, attachments, viewer.server)
+                with defer_interrupts():
+                    writer = open_writer(out / RECORDING, metadata, attachments, viewer.server)
                 for _ in _progress(runner.steps(writer, topics, "dataset" in topics, truth, viewer.sinks)):
                     pass
                 if config.save_map:
                     save_map(Path(config.save_map).expanduser(), runner.state, metadata_of(config, overrides), source)
             except KeyboardInterrupt as error:
-                error.add_note(_kept(runner, out))
+                error.add_note(_interruption_summary(runner, out))
                 raise
             finally:
-                with uninterrupted():
+                with defer_interrupts():
                     if writer is not None:
-                        failure = closed(writer)
+                        failure = close_writer(writer)
                         metrics, timing = write_files(runner, truth, out, started, began)
                     warnings.summarise()
         if replay is not None:
-            print(_replayed(replay, runner, timing))
+            print(_replay_summary(replay, runner, timing))
         _report(out, metrics, timing, write_models(out, runner))
     if failure is not None:
         raise failure
     return metrics
 
 
-def opened(
+def open_writer(
     path: Path, metadata: Mapping[str, str], attachments: Mapping[str, str], server: FoxgloveServer | None = None, flush_s: float = FLUSH_SECONDS
 ) -> RecordingWriter:
     """Open the recording and attach its texts."""
@@ -117,13 +117,13 @@ def opened(
     return writer
 
 
-def _kept(runner: Runner, out: Path) -> str:
+def _interruption_summary(runner: Runner, out: Path) -> str:
     """Say what an interrupted run leaves behind."""
     count = len(runner.result.stamps_ns)
     return f"frames done: {count}, kept in {out}" if count else "no frame was done"
 
 
-def closed(writer: RecordingWriter) -> RecordingError | None:
+def close_writer(writer: RecordingWriter) -> RecordingError | None:
     """Close the recording; what goes wrong must not cost the trajectory."""
     try:
         writer.close()
@@ -282,7 +282,7 @@ def write_models(out: Path, runner: Runner) -> list[str]:
     return [line for slot, value in runner.result.folds.items() for line in write_files_of(slot, out, value)]
 
 
-def _replayed(replay: Replay, runner: Runner, timing: dict[str, Any]) -> str:
+def _replay_summary(replay: Replay, runner: Runner, timing: dict[str, Any]) -> str:
     """Describe in one line what a replay computed."""
     counts = [f"{name} ({stage['calls']} calls)" for name, stage in timing["stages"].items() if name in runner.computed]
     return f"computed: {', '.join(counts) or 'nothing'}; the rest is read from {replay.recording.path}"

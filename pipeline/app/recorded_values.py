@@ -20,7 +20,7 @@ from trihedron.pipeline.run.poses import Poses
 from trihedron.pipeline.run.results import final_trajectory
 
 
-def opened(path: Path) -> Recording:
+def open_recording(path: Path) -> Recording:
     """Open a recording; of one that is still being written, a copy of what the file holds so far. Raises RecordingError."""
     if not in_use(path):
         return Recording(path)
@@ -68,11 +68,11 @@ def frames_of(recording: Recording) -> Callable[[FrameReference], Frame | None]:
     """Access to a frame's images: those embedded, else those of the data set that was tracked. DataError when that is gone."""
     if "dataset" in recording.topics:
 
-        def embedded(reference: FrameReference) -> Frame | None:
+        def embedded_frame(reference: FrameReference) -> Frame | None:
             value = recording.value("dataset", reference.stamp_ns)
             return value if isinstance(value, Frame) else None
 
-        return embedded
+        return embedded_frame
     options = composed_run(recording).dataset
     dataset, first = make_plugin("dataset", options), frame_range(str(options.get("frames", "")))[0]
     try:

@@ -173,7 +173,7 @@ def get_array(array: Any, place: str, name: str = "") -> Any:
         return array.data.decode("utf-8", "replace")
     dtype = element_type({"bool": "?", "int": "i8", "float": "f8"}.get(array.dtype, array.dtype))
     shape = tuple(array.shape)
-    if dtype.hasobject or not _allowed(shape, dtype.itemsize) or (shape and array.dtype in SCALARS):
+    if dtype.hasobject or not _is_allowed_shape(shape, dtype.itemsize) or (shape and array.dtype in SCALARS):
         raise RecordingError(place, f"{title} claims type '{printable(array.dtype, 20)}' and shape {shape[:4]}", DAMAGED)
     if array.encoding not in ENCODINGS:
         cause = f"{title} has the encoding '{printable(array.encoding, 40)}', this program reads {', '.join(ENCODINGS)}"
@@ -186,7 +186,7 @@ def get_array(array: Any, place: str, name: str = "") -> Any:
     return SCALARS[array.dtype](content[()]) if array.dtype in SCALARS else content
 
 
-def _allowed(shape: tuple[int, ...], itemsize: int) -> bool:
+def _is_allowed_shape(shape: tuple[int, ...], itemsize: int) -> bool:
     """Check that a shape has few axes and few bytes; beside an axis of length 0 NumPy counts the others, too."""
     return len(shape) <= MAX_AXES and min(shape, default=0) >= 0 and math.prod(max(n, 1) for n in shape) * itemsize <= MAX_BYTES
 
@@ -200,9 +200,9 @@ def element_type(name: str) -> np.dtype[Any]:
 def _plain(array: Any, shape: tuple[int, ...], size: int) -> bytes | None:
     """The plain bytes of an array, or None when they cannot be had."""
     if array.encoding == "zstd":
-        return _unpacked(array.data, size)
+        return _decompress(array.data, size)
     if array.encoding == "rows":
-        steps = _unpacked(array.data, size) if len(shape) == 3 and size == int(np.prod(shape)) else None
+        steps = _decompress(array.data, size) if len(shape) == 3 and size == int(np.prod(shape)) else None
         return bytes(np.add.accumulate(np.frombuffer(steps, np.uint8).reshape(shape), axis=0, dtype=np.uint8).tobytes()) if steps else None
     if array.encoding == "columns":
         if len(array.data) != size or not size or not shape:
@@ -218,7 +218,7 @@ def _row_steps(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
     return steps
 
 
-def _unpacked(data: bytes, size: int) -> bytes | None:
+def _decompress(data: bytes, size: int) -> bytes | None:
     """The bytes under zstd, None unless they are as many."""
     try:
         possible = zstandard.frame_content_size(data) == size <= max_plain_bytes(len(data))

@@ -34,7 +34,7 @@ from trihedron.pipeline.record.array_codec import (
     text_field,
 )
 from trihedron.pipeline.record.schemas import PACKAGE, TIMING, VALUE_TYPES, hints_of, is_nested, message_class, own_fields
-from trihedron.pipeline.record.table_codec import TableReader, TableWriter, bytes_of, change_of, joined, messages_back
+from trihedron.pipeline.record.table_codec import TableReader, TableWriter, apply_changes, bytes_of, change_of, messages_back
 
 FORMAT = "6"
 # until 5 embedded images were values; until 4 all values were of one schema; in 3 a table was always a change of the message before
@@ -149,15 +149,15 @@ class Decoder:
 
     def decode(self, data: bytes) -> Value:
         """A value from its bytes. Raises RecordingError for damaged bytes, an unknown type or another version of a type."""
-        return self._made(self._parsed(data), lambda name, arrays: self._tables[name].next(name, change_of(name, arrays)))
+        return self._made(self._parse_message(data), lambda name, arrays: self._tables[name].next(name, change_of(name, arrays)))
 
     def decode_last(self, chain: Sequence[bytes]) -> Value:
         """The last of messages of which each builds on the one before and the first stands alone. Raises RecordingError as `decode`."""
-        parsed = [self._parsed(data) for data in chain]
+        parsed = [self._parse_message(data) for data in chain]
         earlier = [self._arrays(message)[1] for message in parsed[:-1]]
-        return self._made(parsed[-1], lambda name, arrays: joined(name, [change_of(name, tables) for tables in (*earlier, arrays)]))
+        return self._made(parsed[-1], lambda name, arrays: apply_changes(name, [change_of(name, tables) for tables in (*earlier, arrays)]))
 
-    def _parsed(self, data: bytes) -> Any:
+    def _parse_message(self, data: bytes) -> Any:
         try:
             message = LegacyMessage.FromString(data)
         except Exception as error:

@@ -77,7 +77,7 @@ class TopicView:
 
     def messages(self, value: Value) -> Iterator[tuple[str, Any]]:
         """Yield (channel, message) pairs of one value; none for values that are not shown."""
-        return self.drawn(value) if self.wants(value) else iter(())
+        return self.draw_messages(value) if self.wants(value) else iter(())
 
     def wants(self, value: Value) -> bool:
         """Return whether the value is to be drawn. Call it once for each value, in order."""
@@ -86,7 +86,7 @@ class TopicView:
             period = MAP_PERIOD_NS * max(1, len(value.points) // MAP_POINTS)
         return period is not None and (period == 0 or self._due(type(value).__name__, value.stamp_ns, period))
 
-    def drawn(self, value: Value) -> Iterator[tuple[str, Any]]:
+    def draw_messages(self, value: Value) -> Iterator[tuple[str, Any]]:
         """Yield (channel, message) pairs of a value for which `wants` is True."""
         if isinstance(value, Pose):
             yield from self._pose_messages(value)

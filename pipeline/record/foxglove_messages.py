@@ -117,13 +117,13 @@ def _in_world(value: Value, name: str) -> tuple[SceneUpdate, SceneEntity]:
 
 def _fill(message: Any, field: str, rows: Any) -> None:
     """Add rows (n, k) to a field that repeats messages of k doubles (points, colours): their bytes at once, not object by object."""
-    message.MergeFromString(_repeated(message, field, rows).tobytes())
+    message.MergeFromString(_encode_repeated(message, field, rows).tobytes())
 
 
-def _repeated(message: Any, field: str, rows: Any) -> Any:
+def _encode_repeated(message: Any, field: str, rows: Any) -> Any:
     """Rows (n, k) as bytes (n,) of a field that repeats messages of k doubles."""
     rows = np.asarray(rows, np.float64).reshape(-1, rows.shape[-1])
-    packed = np.zeros(len(rows), _packed(rows.shape[1]))
+    packed = np.zeros(len(rows), _packed_dtype(rows.shape[1]))
     packed["tag"], packed["size"] = message.DESCRIPTOR.fields_by_name[field].number << 3 | 2, 9 * rows.shape[1]
     for i in range(rows.shape[1]):
         packed[f"key{i}"], packed[f"value{i}"] = (i + 1) << 3 | 1, rows[:, i]
@@ -131,7 +131,7 @@ def _repeated(message: Any, field: str, rows: Any) -> Any:
 
 
 @cache
-def _packed(doubles: int) -> np.dtype[Any]:
+def _packed_dtype(doubles: int) -> np.dtype[Any]:
     """The bytes of a message of so many doubles in a field."""
     return np.dtype([("tag", "u1"), ("size", "u1"), *((f"{part}{i}", kind) for i in range(doubles) for part, kind in _DOUBLE)])
 
@@ -160,7 +160,7 @@ def _half(pixels: F32) -> F64:
 def planes(planes: Planes) -> SceneUpdate:
     """Each region as the convex hull of its samples, in the camera frame."""
     update, entity = _scene(planes, "planes")
-    samples, points = planes.samples_m, _repeated(TriangleListPrimitive, "points", planes.samples_m).reshape(planes.samples_m.shape[:2])
+    samples, points = planes.samples_m, _encode_repeated(TriangleListPrimitive, "points", planes.samples_m).reshape(planes.samples_m.shape[:2])
     flat = matmul(samples, tangent_basis(planes.coefficients[:, :3])).astype(np.float32)
     for i, finite in enumerate(np.isfinite(samples[:, :, 0])):
         seen = np.flatnonzero(finite)

@@ -79,7 +79,7 @@ class McapFile:
         except OSError as error:
             raise RecordingError(str(path), f"cannot be read: {error.strerror}", "give the path of an MCAP file") from error
         if not self._size or self._bytes(0, min(len(MCAP0_MAGIC), self._size)) != MCAP0_MAGIC:
-            raise damaged(path)
+            raise damaged_file_error(path)
         self.channels: dict[int, Channel] = {}
         self.schemas: dict[int, Schema] = {}
         self.metadata: dict[str, dict[str, str]] = {}
@@ -358,7 +358,7 @@ def _check_total(total: int, most: int) -> None:
         raise ValueError(f"its index asks for {total} bytes of {most}")
 
 
-def damaged(path: Path | str) -> RecordingError:
+def damaged_file_error(path: Path | str) -> RecordingError:
     """Why a file cannot be read as MCAP, and the cure: it is none, is still being written, was cut off or damaged."""
     try:
         with open(path, "rb") as file:

@@ -16,7 +16,7 @@ from trihedron.pipeline.core.types import Camera, FrameReference, Value
 from trihedron.pipeline.core.value_checks import checked
 from trihedron.pipeline.record.codec import FRAMES_TOPIC, METADATA, READABLE, UPGRADE, Decoder, builds_on, is_value_schema
 from trihedron.pipeline.record.embedded_images import COLOR, DAMAGED, DEPTH, PARTS, frame_of, topic_of
-from trihedron.pipeline.record.mcap_file import McapFile, damaged
+from trihedron.pipeline.record.mcap_file import McapFile, damaged_file_error
 
 
 class Recording:
@@ -26,7 +26,7 @@ class Recording:
         self.path = Path(path)
         self._file = McapFile(self.path)
         if not self._file.complete or not self._file.indexed:
-            raise damaged(self.path)
+            raise damaged_file_error(self.path)
         if METADATA not in self._file.metadata:
             raise RecordingError(str(path), "is an MCAP file, but not a recording of trihedron", "convert it with: trihedron convert SRC DST.mcap")
         self.metadata = self._file.metadata[METADATA]
@@ -87,12 +87,12 @@ class Recording:
         the declarations of its type."""
         if topic in self.embedded:
             for frame in self._frames(topic):
-                yield checked(topic, frame, str(self.path), _expected(topic)) if check else frame
+                yield checked(topic, frame, str(self.path), _expected_type(topic)) if check else frame
             return
         decoder, place = self._decoder(topic), str(self.path)
         for _, data in self.messages(f"/{topic}"):
             value = decoder.decode(data)
-            yield checked(topic, value, place, _expected(topic)) if check else value
+            yield checked(topic, value, place, _expected_type(topic)) if check else value
 
     def _frames(self, topic: str) -> Iterator[Value]:
         """The frames of embedded images, whose numbers and cameras are in the topic `frames`."""
@@ -122,7 +122,7 @@ class Recording:
             if not isinstance(reference, FrameReference) or color is None or depth is None:
                 return None
             frame = frame_of(reference, color, depth, f"{self.path}: topic /{topic}")
-            return checked(topic, frame, str(self.path), _expected(topic)) if check else frame
+            return checked(topic, frame, str(self.path), _expected_type(topic)) if check else frame
         chain: list[bytes] = []
         channel, skipped = f"/{topic}", 0
         for chunk in reversed(self._holding(channel)):
@@ -139,7 +139,7 @@ class Recording:
                     back = builds_on(data)
                     if back == 0:
                         value = self._decoder(topic).decode_last(chain[::-1])
-                        return checked(topic, value, str(self.path), _expected(topic)) if check else value
+                        return checked(topic, value, str(self.path), _expected_type(topic)) if check else value
                     skipped = back - 1
         return None
 
@@ -176,7 +176,7 @@ class Recording:
         return None
 
 
-def _expected(topic: str) -> type[Value]:
+def _expected_type(topic: str) -> type[Value]:
     """The type of the values of a topic that is of no slot."""
     return FrameReference if topic == FRAMES_TOPIC else Value
 

@@ -13,7 +13,7 @@ from mcap.writer import MCAP0_MAGIC, CompressionType, Writer
 
 from trihedron.pipeline.core.errors import DataError, RecordingError
 from trihedron.pipeline.core.files import open_file
-from trihedron.pipeline.record.mcap_file import chunk_records, damaged, is_being_written, max_plain_bytes
+from trihedron.pipeline.record.mcap_file import chunk_records, damaged_file_error, is_being_written, max_plain_bytes
 
 CHUNK_BYTES = 4 << 20
 
@@ -51,7 +51,7 @@ def recover(path: Path, out: Path, being_written: bool = False) -> Rescued:
         raise RecordingError(str(path), f"cannot be read: {error.strerror}", "give the path of an MCAP file") from error
     with source:
         if source.read(len(MCAP0_MAGIC)) != MCAP0_MAGIC or (not being_written and is_being_written(source.fileno())):
-            raise damaged(path)
+            raise damaged_file_error(path)
         source.seek(0)
         try:
             with open(partial, "wb") as file:

@@ -158,7 +158,7 @@ _FILES: dict[str, Any] = {}  # those in the pool
 _ADDING = threading.RLock()
 
 
-def _added(name: str) -> Any:
+def _add_message_file(name: str) -> Any:
     """Add the file that declares a message to the pool, with those it needs; returns it. Several recordings may be written at once."""
     with _ADDING:
         if name not in _FILES:
@@ -170,7 +170,7 @@ def _add(name: str) -> Any:
     makers = {"Array": lambda: _ARRAYS, "Value": _value_file, "Timing": _timing_file}
     file = makers[name]() if name in makers else _type_file(VALUE_TYPES[name])
     if file.dependency:
-        _added("Array")
+        _add_message_file("Array")
     _POOL.AddSerializedFile(file.SerializeToString())
     return file
 
@@ -178,11 +178,11 @@ def _add(name: str) -> Any:
 @cache
 def message_class(name: str) -> Any:
     """Return the protobuf class of `trihedron.<name>`: a type of value, Value, Timing."""
-    _added(name)
+    _add_message_file(name)
     return message_factory.GetMessageClass(_POOL.FindMessageTypeByName(f"{PACKAGE}.{name}"))
 
 
 def definition(name: str) -> bytes:
     """Return the schema of `trihedron.<name>` as a FileDescriptorSet with comments."""
-    file = _added(name)
+    file = _add_message_file(name)
     return bytes(descriptor_pb2.FileDescriptorSet(file=[*([_ARRAYS] if file.dependency else []), file]).SerializeToString())

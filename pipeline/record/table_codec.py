@@ -188,13 +188,13 @@ class TableReader:
         """Apply the next change. Raises ValueError where it does not fit."""
         self._back += 1
         known = self._latest if change.back == 1 else self._checkpoint if change.back == self._back else None
-        self._latest = _applied(name, known, change)
+        self._latest = _apply_change(name, known, change)
         if change.back != 1:
             self._checkpoint, self._back = self._latest, 0
         return self._latest
 
 
-def _applied(name: str, known: Table | None, change: Change) -> Table:
+def _apply_change(name: str, known: Table | None, change: Change) -> Table:
     """Apply a change to a version, which stays as it is."""
     table = known if change.back else Table.empty(change.schema)
     if table is None or table.schema != change.schema:
@@ -211,7 +211,7 @@ def _applied(name: str, known: Table | None, change: Change) -> Table:
     return table.emptied(change.freed) if len(change.freed) else table
 
 
-def joined(name: str, changes: Sequence[Change]) -> Table:
+def apply_changes(name: str, changes: Sequence[Change]) -> Table:
     """Apply changes of which each builds on the one before, without making the versions between. Raises ValueError where they do not fit."""
     changes = changes[max((k for k, change in enumerate(changes) if change.back == 0), default=0) :]
     schema, size = changes[0].schema, 0

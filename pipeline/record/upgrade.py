@@ -27,7 +27,7 @@ from trihedron.pipeline.record.codec import (
     timing_of,
 )
 from trihedron.pipeline.record.embedded_images import messages_of
-from trihedron.pipeline.record.mcap_file import McapFile, damaged
+from trihedron.pipeline.record.mcap_file import McapFile, damaged_file_error
 from trihedron.pipeline.record.mcap_writer import McapWriter
 from trihedron.pipeline.record.schemas import PACKAGE, definition, message_class
 
@@ -74,7 +74,7 @@ def upgrade(source: Path, destination: Path) -> Upgraded:
     cannot be read, or the destination cannot be written."""
     file = McapFile(source)
     if not file.complete or not file.indexed:
-        raise damaged(source)
+        raise damaged_file_error(source)
     unreadable = _unreadable(file, rename=True)
     result = Upgraded(skipped={file.channels[channel].topic: why for channel, why in unreadable.items()})
     if f"/{FRAMES_TOPIC}" in result.skipped:
@@ -113,22 +113,22 @@ def _of_today(file: McapFile, channel: int, data: bytes, codecs: dict[int, tuple
     declared, schema = file.channels[channel], file.schemas.get(file.channels[channel].schema_id)
     if _is_value(file, channel):
         decoder, encoder = codecs.setdefault(channel, (_decoder(file, channel), Encoder()))
-        value = decoder.decode(_renamed(data))
+        value = decoder.decode(_rename_fields(data))
         if isinstance(value, Frame):
             for part, message in messages_of(value):
                 definition = build_file_descriptor_set(type(message)).SerializeToString()
                 described = (message.DESCRIPTOR.full_name, "protobuf", definition, "protobuf")
                 yield declared.topic + part, described, message.SerializeToString()
         else:
-            yield declared.topic, _described(type(value).__name__), encoder.encode(value)
+            yield declared.topic, _schema_of(type(value).__name__), encoder.encode(value)
     elif declared.topic == TIMING_TOPIC:
-        yield declared.topic, _described("Timing"), bytes(message_class("Timing")(**timing_of(data)).SerializeToString())
+        yield declared.topic, _schema_of("Timing"), bytes(message_class("Timing")(**timing_of(data)).SerializeToString())
     else:
         described = (schema.name, schema.encoding, schema.data, declared.message_encoding) if schema is not None else ("", "", b"", "")
         yield declared.topic, described, data
 
 
-def _described(name: str) -> _Schema:
+def _schema_of(name: str) -> _Schema:
     return f"{PACKAGE}.{name}", "protobuf", definition(name), "protobuf"
 
 
@@ -139,7 +139,7 @@ def _unreadable(file: McapFile, rename: bool) -> dict[int, str]:
         chunks = file.chunks(channel) if _is_value(file, channel) else []
         for _, data in file.in_chunk(chunks[0], channel)[:1] if chunks else ():
             try:
-                _decoder(file, channel).decode(_renamed(data) if rename else data)
+                _decoder(file, channel).decode(_rename_fields(data) if rename else data)
             except RecordingError as error:
                 causes[channel] = error.cause
     return causes
@@ -153,7 +153,7 @@ def _decoder(file: McapFile, channel: int) -> Decoder:
     return Decoder(f"{file.path}: topic {printable(file.channels[channel].topic, 80)}")
 
 
-def _renamed(data: bytes) -> bytes:
+def _rename_fields(data: bytes) -> bytes:
     """A message with the names, fields and columns of today."""
     message = LegacyMessage.FromString(data)
     if not message.arrays:
@@ -176,7 +176,7 @@ def _renamed(data: bytes) -> bytes:
         array = np.asarray(value)
         kind = array.dtype.str.lstrip("<") if array.ndim else type(value).__name__
         message.arrays.add(name=name, dtype=kind, shape=array.shape, encoding="raw", data=array.tobytes())
-    return _renamed(bytes(message.SerializeToString()))  # which may be an older version still
+    return _rename_fields(bytes(message.SerializeToString()))  # which may be an older version still
 
 
 def _add_keyframe_column(message: Any, column: str, shape: tuple[int, ...] | None) -> None:

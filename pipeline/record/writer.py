@@ -59,12 +59,14 @@ class RecordingWriter:
 
     def _add(self, topic: str, value: Value) -> None:
         if self.path is not None:
-            self._file.add(_memory_bytes(value), lambda: self._encoded(topic, value))
+            self._file.add(_memory_bytes(value), lambda: self._encode_messages(topic, value))
 
     def show(self, view: TopicView, value: Value, stamp_ns: int) -> None:
         """Add the viewer messages of a value; they are drawn by the writer's thread."""
         if view.wants(value):
-            self._file.add(_memory_bytes(value), lambda: [self._message(channel, message, stamp_ns) for channel, message in view.drawn(value)])
+            self._file.add(
+                _memory_bytes(value), lambda: [self._message(channel, message, stamp_ns) for channel, message in view.draw_messages(value)]
+            )
 
     def write_message(self, channel: str, message: Any, stamp_ns: int) -> None:
         """Add a protobuf message to a channel (with slash), made on first use."""
@@ -74,7 +76,7 @@ class RecordingWriter:
         """Add a frame's times, and the memory the process holds after it."""
         self._file.add(0, lambda: [(self._own_channel(TIMING_TOPIC, "Timing"), stamp_ns, _timing(index, frame_ms, stage_ms, memory_mb))])
 
-    def _encoded(self, topic: str, value: Value) -> list[tuple[int, int, bytes]]:
+    def _encode_messages(self, topic: str, value: Value) -> list[tuple[int, int, bytes]]:
         if isinstance(value, Frame):
             return [self._message(f"/{topic}{part}", message, value.stamp_ns) for part, message in messages_of(value)]
         if topic not in self._encoders:

@@ -38,7 +38,7 @@ def ending_signals_interrupt() -> Iterator[None]:
 
 
 class Interrupts:
-    """While this is entered, a signal that comes in a `with self.held():` raises KeyboardInterrupt at the block's end, and any other at once, as
+    """While this is entered, a signal that comes in a `with self.defer():` raises KeyboardInterrupt at the block's end, and any other at once, as
     always. Entering asks the system, holding does not. Off the main thread, and for signals that others handle, nothing changes."""
 
     count = 0  # of those that came to this process, for threads that wait for something
@@ -67,7 +67,7 @@ class Interrupts:
         self._came = number
 
     @contextmanager
-    def held(self) -> Iterator[None]:
+    def defer(self) -> Iterator[None]:
         """Do the block whole."""
         self._holding = True
         try:
@@ -80,9 +80,9 @@ class Interrupts:
 
 
 @contextmanager
-def uninterrupted() -> Iterator[None]:
+def defer_interrupts() -> Iterator[None]:
     """Do the block whole: a signal that asks the program to end is handled at its end."""
-    with Interrupts() as interrupts, interrupts.held():
+    with Interrupts() as interrupts, interrupts.defer():
         yield
 
 

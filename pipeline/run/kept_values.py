@@ -33,7 +33,7 @@ class KeptValues:
         self._done[name] = end
         return range(begin + 1, end + 1)
 
-    def known(self, wire: Wire, position: int) -> bool:
+    def is_known(self, wire: Wire, position: int) -> bool:
         """Return whether what a wire reads at a position is known, if only as nothing."""
         if wire.delay == PREVIOUS:
             return self._done[wire.topic] >= position

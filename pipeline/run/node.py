@@ -24,7 +24,7 @@ class Node:
     waits: bool = False
 
     @property
-    def awaited(self) -> tuple[Wire, ...]:
+    def awaited_wires(self) -> tuple[Wire, ...]:
         """The wires whose values must be there before a call: those of the inputs, and of an ordered node its own earlier frames."""
         return (*self.inputs.values(), *([Wire(self.name, PREVIOUS)] if self.ordered else []))
 
@@ -45,7 +45,7 @@ def consumers_of(nodes: Sequence[Node]) -> Consumers:
     """Return for each node those that wait for its values."""
     found: dict[str, list[tuple[str, int]]] = defaultdict(list)
     for node in nodes:
-        for wire in node.awaited:
+        for wire in node.awaited_wires:
             found[wire.topic].append((node.name, wire.delay))
     return {node.name: found[node.name] for node in nodes}
 

@@ -15,14 +15,14 @@ class Readiness:
     """Counts for each task of the admitted frames the wires whose values are not known yet."""
 
     def __init__(self, nodes: Sequence[Node], consumers: Consumers, kept: KeptValues) -> None:
-        self._awaited = {node.name: node.awaited for node in nodes}
+        self._awaited = {node.name: node.awaited_wires for node in nodes}
         self._consumers, self._kept = consumers, kept
         self._unmet: dict[Task, int] = {}
 
     def admit(self, position: int) -> Iterator[Task]:
         """Take in a frame; returns its tasks that are ready at once, in the order of the nodes."""
         for name, wires in self._awaited.items():
-            self._unmet[name, position] = sum(not self._kept.known(wire, position) for wire in wires)
+            self._unmet[name, position] = sum(not self._kept.is_known(wire, position) for wire in wires)
         return ((name, position) for name in self._awaited if self._unmet[name, position] == 0)
 
     def complete(self, name: str, position: int, known: range) -> Iterator[Task]:

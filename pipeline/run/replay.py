@@ -46,7 +46,7 @@ class Replay:
         silent = {topic for topic in stated if topic in SLOTS} if isinstance(stated, list) and all(isinstance(t, str) for t in stated) else set()
         return frozenset(self.recording.topics | silent)
 
-    def computed(self, graph: Graph) -> tuple[str, ...]:
+    def computed_stages(self, graph: Graph) -> tuple[str, ...]:
         """Return the stages that compute, in order: those chosen, and those whose topics these read and the recording lacks."""
         pending, found = list(self.only), set()
         while pending:
@@ -94,7 +94,7 @@ def plan_run(graph: Graph, replay: Replay | None, frames: str) -> Plan:
     first, stop = frame_range(frames)
     if replay is None:
         return Plan(graph, None, tuple(graph.stages), first, range(first, first + len(graph.stages["dataset"].plugin)), {})
-    computed = replay.computed(graph)
+    computed = replay.computed_stages(graph)
     if "dataset" in computed and "dataset" not in replay.only:
         _check_images(graph, replay)
     references = replay.references(first, stop)

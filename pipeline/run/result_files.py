@@ -53,13 +53,13 @@ def _check(value: Any, kind: Any, path: Path, key: str) -> None:
         return
     if isinstance(kind, dict):
         if not isinstance(value, dict):
-            raise DataError(str(path), f"holds {_named(key)}that is not an object", CURE)
+            raise DataError(str(path), f"holds {_quoted_name(key)}that is not an object", CURE)
         for name, item in value.items():
             if (found := kind.get(name, kind.get(EACH))) is not None:
                 _check(item, found, path, f"{key}.{name}" if key else name)
     elif isinstance(value, bool) or not isinstance(value, kind) or (isinstance(value, int) and abs(value) > LARGEST):
-        raise DataError(str(path), f"holds {_named(key)}of the wrong kind", CURE)
+        raise DataError(str(path), f"holds {_quoted_name(key)}of the wrong kind", CURE)
 
 
-def _named(key: str) -> str:
+def _quoted_name(key: str) -> str:
     return f"'{printable(key, SHOWN)}' " if key else "a value "

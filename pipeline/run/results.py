@@ -105,9 +105,9 @@ def write_json(path: Path, content: dict[str, Any]) -> None:
     path.write_text(json.dumps(content, indent=2) + "\n")
 
 
-def dotted(values: dict[str, Any], prefix: str = "") -> dict[str, Any]:
+def flatten_dict(values: dict[str, Any], prefix: str = "") -> dict[str, Any]:
     """Flatten nested dictionaries: values by dotted name, as `final.ate_rmse_m`."""
     flat: dict[str, Any] = {}
     for name, value in values.items():
-        flat |= dotted(value, f"{prefix}{name}.") if isinstance(value, dict) else {prefix + name: value}
+        flat |= flatten_dict(value, f"{prefix}{name}.") if isinstance(value, dict) else {prefix + name: value}
     return flat

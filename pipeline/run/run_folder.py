@@ -18,7 +18,7 @@ CURE = "give another out=FOLDER"
 
 
 @contextmanager
-def held(folder: Path) -> Iterator[None]:
+def lock_folder(folder: Path) -> Iterator[None]:
     """Make the folder and lock it for the block (`flock`, which ends with the process); a file system without locks gives none.
 
     Raises ConfigError or DataError, and has written nothing then."""

@@ -78,7 +78,7 @@ class Runner:
         delays = max_delays(graph.stages[name] for name in self.computed)
         self.initial = initial(self.indices[0]) if initial is not None else DelayLines()
         if replay is not None:
-            self.initial = self.initial.updated(recorded_delay_lines(replay.recording, delays, self.indices[0]), RECORDED)
+            self.initial = self.initial.merge_with_prefix(recorded_delay_lines(replay.recording, delays, self.indices[0]), RECORDED)
         self.state = StateBuffer(delays, self.initial, self.indices[0])
         loaded = self.initial.held.get("map")
         self.accounts = Accounting(self.plan.stamps_ns, self.plan.fps, loaded if isinstance(loaded, Map) else None)
@@ -106,7 +106,7 @@ class Runner:
         try:
             with single_threaded_libraries(), self._feeding(), Interrupts() as interrupts:
                 for position, values in scheduler.run(self.count):
-                    with interrupts.held():
+                    with interrupts.defer():
                         self.take(position, values)
                     yield Step(position, self.count, self.indices[position], values)
                 self.finish()
@@ -159,13 +159,13 @@ class Runner:
             if wire.topic.startswith(RECORDED) and wire.topic not in readers:
                 readers[wire.topic] = self._reader_node(wire.topic)
         if stage.name == "dataset":
-            read = self._reported(stage.name, lambda position, _: self._read_frame(stage, position))
+            read = self._report_value(stage.name, lambda position, _: self._read_frame(stage, position))
             return Node(stage.name, read, inputs, ordered=True, waits=self.feed is not None)
         if self.feed is not None:
             inputs[FRAME_TAKEN] = Wire("dataset")
-        return Node(stage.name, self._reported(stage.name, partial(self._call, stage)), inputs, stage.fold)
+        return Node(stage.name, self._report_value(stage.name, partial(self._call, stage)), inputs, stage.fold)
 
-    def _reported(self, stage: str, call: NodeCall) -> NodeCall:
+    def _report_value(self, stage: str, call: NodeCall) -> NodeCall:
         """Wrap the call of a stage so that its value is handed to `on_value`."""
         if (report := self._on_value) is None:
             return call

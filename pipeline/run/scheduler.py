@@ -87,7 +87,7 @@ class Scheduler:
                 with self._lock:
                     self._consumed = position
                     self._admit()
-                    while not self._settled(position):
+                    while not self._is_finished(position):
                         self._frame_there.wait()
                     if position >= self._count:
                         return
@@ -104,7 +104,7 @@ class Scheduler:
             for worker in workers:
                 worker.join()
 
-    def _settled(self, position: int) -> bool:
+    def _is_finished(self, position: int) -> bool:
         """Return True if the frame is complete, or none of its nodes will run any more."""
         if self._undone.get(position) == 0:
             return True
@@ -164,7 +164,7 @@ class Scheduler:
                     self._admit(lane)
                 elif self._failure is None or self._before(failure, self._failure):
                     self._failure = failure
-                if self._failure is not None or self._count <= self._consumed or self._settled(self._consumed):
+                if self._failure is not None or self._count <= self._consumed or self._is_finished(self._consumed):
                     self._frame_there.notify()
 
     def _before(self, one: NodeFailure, other: NodeFailure) -> bool:

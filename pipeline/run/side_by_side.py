@@ -48,7 +48,7 @@ def _inputs(stage: Stage, inputs: Mapping[str, Wire], graph: Graph) -> dict[str,
 def equivalence(graphs: Sequence[Mapping[str, Vertex]]) -> list[dict[str, int]]:
     """Return for each graph stage -> number of its class: equal numbers compute equal values. A topic that is no stage is equal in all of them."""
     known: list[tuple[str, Vertex]] = []
-    classes = [{name: _numbered(known, name, vertex) for name, vertex in graph.items()} for graph in graphs]
+    classes = [{name: _class_number(known, name, vertex) for name, vertex in graph.items()} for graph in graphs]
     while True:
         numbers: dict[Any, int] = {}
         refined = [
@@ -65,7 +65,7 @@ def _signature(own: Mapping[str, int], name: str, vertex: Vertex) -> tuple[Any, 
     return own[name], *(own.get(wire.topic, wire.topic) for _, wire in sorted(vertex.inputs.items()))
 
 
-def _numbered(known: list[tuple[str, Vertex]], name: str, vertex: Vertex) -> int:
+def _class_number(known: list[tuple[str, Vertex]], name: str, vertex: Vertex) -> int:
     for number, (other, candidate) in enumerate(known):
         if other == name and candidate.inputs == vertex.inputs and _same(candidate.plugin, vertex.plugin):
             return number
@@ -85,14 +85,14 @@ def changed_stages(graphs: Sequence[Graph]) -> frozenset[str]:
 def swapped_stages(graphs: Sequence[Graph]) -> frozenset[str]:
     """Return the stages that themselves differ between the graphs."""
     known: list[tuple[str, Vertex]] = []
-    return _unequal(graphs, [{name: _numbered(known, name, vertex) for name, vertex in vertices_of(graph).items()} for graph in graphs])
+    return _unequal(graphs, [{name: _class_number(known, name, vertex) for name, vertex in vertices_of(graph).items()} for graph in graphs])
 
 
 def with_one_dataset(graphs: Sequence[Graph]) -> list[Graph]:
     """Return the graphs with one reader for all equal data sets, which is opened, and warns, once."""
     known: list[tuple[str, Vertex]] = []
     readers = [graph.stages[DATASET] for graph in graphs]
-    numbers = [_numbered(known, DATASET, Vertex(reader.plugin, reader.inputs)) for reader in readers]
+    numbers = [_class_number(known, DATASET, Vertex(reader.plugin, reader.inputs)) for reader in readers]
     return [replace(graph, stages={**graph.stages, DATASET: readers[numbers.index(number)]}) for graph, number in zip(graphs, numbers)]
 
 
@@ -126,7 +126,7 @@ class SideBySide:
             self.node_of.append({name: f"{name}:{number if self._fold(runner, name) else ''}{numbers[name]}" for name in nodes})
             for name, node in self.node_of[-1].items():
                 self._owner.setdefault(node, (number, name))
-        self._nodes = [self._joined(node, *self._owner[node], own) for node in self._owner]
+        self._nodes = [self._timed_node(node, *self._owner[node], own) for node in self._owner]
         for runner in runners:
             runner.validation = runners[0].validation
 
@@ -153,7 +153,7 @@ class SideBySide:
         """CPU milliseconds of the calls of some nodes in each frame (count,)."""
         return np.array([1e3 * sum(self._calls[node].get(position, 0.0) for node in nodes) for position in range(self.count)])
 
-    def _joined(self, name: str, number: int, stage: str, own: Sequence[Mapping[str, Node]]) -> Node:
+    def _timed_node(self, name: str, number: int, stage: str, own: Sequence[Mapping[str, Node]]) -> Node:
         """The node of a runner under its common name, with its CPU time measured."""
         node, names, seconds = own[number][stage], self.node_of[number], self._calls[name]
 
@@ -175,7 +175,7 @@ class SideBySide:
             with single_threaded_libraries(), Interrupts() as interrupts:
                 for position, values in scheduler.run(self.count):
                     each = [{name: values[node] for name, node in nodes.items() if node in values} for nodes in self.node_of]
-                    with interrupts.held():
+                    with interrupts.defer():
                         self._share_times(position)
                         for runner, one in zip(self.runners, each):
                             runner.take(position, one)

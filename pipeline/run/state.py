@@ -19,7 +19,7 @@ class DelayLines:
     held: Mapping[str, Value] = field(default_factory=dict)
     recent: Mapping[str, Mapping[int, Value]] = field(default_factory=dict)
 
-    def updated(self, other: DelayLines, prefix: str) -> DelayLines:
+    def merge_with_prefix(self, other: DelayLines, prefix: str) -> DelayLines:
         """Return these with the topics of others, and all of them once more under names with a prefix."""
         held, recent = {**self.held, **other.held}, {**self.recent, **other.recent}
         more = {prefix + topic: value for topic, value in held.items()}

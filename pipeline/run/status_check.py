@@ -131,7 +131,7 @@ def _frame_errors(poses: Sequence[Pose], truth: Trajectory) -> tuple[FrameErrors
         if len(rows) < 2:
             continue
         covariances = S[rows] + _noise_of_truth([known[row] for row in rows], true[rows]).covariance
-        nees[rows], likelihood[rows] = _normalised(T[rows], covariances, true[rows])
+        nees[rows], likelihood[rows] = _normalised_errors(T[rows], covariances, true[rows])
     sigma = np.sqrt(np.diagonal(S, axis1=1, axis2=2))
     ok, indices = np.array([pose.status == OK for pose in known], bool), np.array([pose.index for pose in known], float)
     sigma_m, sigma_deg = sigma[:, :3].max(axis=1, initial=0.0), np.degrees(sigma[:, 3:].max(axis=1, initial=0.0))
@@ -157,7 +157,7 @@ def _noise_of_truth(poses: Sequence[Pose], true: F64) -> TruthNoise:
     return truth_noise(T, local, true, indices)
 
 
-def _normalised(T: F64, covariances: F64, true: F64) -> tuple[F64, F64]:
+def _normalised_errors(T: F64, covariances: F64, true: F64) -> tuple[F64, F64]:
     """Return (n,) NEES and log-likelihood in nats of the errors of poses."""
     errors = gauge_free_errors(T, covariances, true)
     nees = np.einsum("ni,nij,nj->n", errors, inv(covariances), errors)

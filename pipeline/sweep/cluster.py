@@ -39,15 +39,15 @@ class Dask(Launcher):
 
     def launch(self, job_overrides: Sequence[Sequence[str]], initial_job_idx: int) -> list[JobReturn]:
         """Run the jobs and wait for them. Raises ConfigError when nobody answers at the address."""
-        with _connected(self.address) as client:
+        with _connect_client(self.address) as client:
             if not client.scheduler_info()["workers"]:
                 print(f"sweep: the scheduler at {self.address} has no worker yet; waiting for one", file=sys.stderr)
-            jobs = [self._packed(list(words), initial_job_idx + number) for number, words in enumerate(job_overrides)]
+            jobs = [self._pack_job(list(words), initial_job_idx + number) for number, words in enumerate(job_overrides)]
             calls = client.map(run_apart, jobs, self._folders(job_overrides), [str(Path.cwd())] * len(jobs), pure=False)
             client.gather(calls, errors="skip")
         return []
 
-    def _packed(self, words: list[str], number: int) -> bytes:
+    def _pack_job(self, words: list[str], number: int) -> bytes:
         """All that a job needs, to be read by `main`."""
         with imports_of("cloudpickle"):
             import cloudpickle
@@ -60,7 +60,7 @@ class Dask(Launcher):
         return [str(Path(str(self.config.hydra.sweep.dir)).absolute() / name) for name in names]
 
 
-def _connected(address: str) -> Any:
+def _connect_client(address: str) -> Any:
     """A client of the scheduler. Raises ConfigError, LibraryError."""
     if not address:
         raise ConfigError(PLACE, "is not given", f"give {PLACE}=tcp://HOST:8786, where `dask scheduler` runs")

@@ -34,7 +34,7 @@ def state_of(folder: Path, key: str) -> str:
     return AGAIN if job.get("state") in (DONE, FAILED) else TO_RUN
 
 
-def refused(folder: Path, words: Sequence[str], error: Exception) -> Planned:
+def refused_job(folder: Path, words: Sequence[str], error: Exception) -> Planned:
     """Return the job whose configuration cannot be composed."""
     return Planned(folder, words, REFUSED, str(error if isinstance(error, TrihedronError) else rewritten(error)))
 

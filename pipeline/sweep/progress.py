@@ -50,7 +50,7 @@ class Watched:
         return None if found is None else 1e3 * float(found)
 
     @property
-    def repeated(self) -> str:
+    def words_without_seeds(self) -> str:
         """The words but for seeds, which all repeats have."""
         return " ".join(word for word in self.change.split(" ") if word.lstrip("+").partition("=")[0] not in SEEDS)
 
@@ -141,7 +141,7 @@ class Progress:
         groups: dict[str, list[float]] = {}
         for job in self._jobs:
             if job.ate_mm is not None:
-                groups.setdefault(job.repeated, []).append(job.ate_mm)
+                groups.setdefault(job.words_without_seeds, []).append(job.ate_mm)
         return [f"  {repeats_text(values)}  {printable(change)}".rstrip() for change, values in groups.items() if len(values) > 1]
 
 

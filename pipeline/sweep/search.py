@@ -26,7 +26,7 @@ from trihedron.pipeline.core.errors import ConfigError, UsageError, did_you_mean
 from trihedron.pipeline.core.graph import Graph
 from trihedron.pipeline.core.libraries import imports_of
 from trihedron.pipeline.core.plugin_configs import PLUGIN_KEY
-from trihedron.pipeline.run.results import METRICS, dotted
+from trihedron.pipeline.run.results import METRICS, flatten_dict
 from trihedron.pipeline.sweep.sweep import OUTCOMES, Outcome, Overrides, Sweeper, failure_of
 
 SEARCH_FILE = "search.json"
@@ -62,10 +62,10 @@ class Search(Sweeper):
         if self.options.dry_run:
             raise UsageError("--dry-run", "a search chooses its jobs from the results of earlier ones", "leave it out, or give values A,B")
         searched, words = self._split(arguments)
-        first = self.composed(self.jobs(words)[0])
+        first = self.compose_config(self.jobs(words)[0])
         space = {key: _distribution(override, _chosen(first, key)) for key, override in searched.items()}
         words += self._what_follows(first, list(space))
-        default = self._tried([{key: _chosen(first, key) for key in space}], [words], 0)[0]
+        default = self._run_trials([{key: _chosen(first, key) for key in space}], [words], 0)[0]
         if default.objective is None:
             raise ConfigError("hydra.sweeper", f"the default configuration gives no value: {default.reason}", "search from one that does")
         study = optuna.create_study(sampler=optuna.samplers.TPESampler(seed=self.seed, constant_liar=True), direction=self.direction)
@@ -74,8 +74,8 @@ class Search(Sweeper):
         while len(tried) <= self.trials:
             asked = [study.ask(space) for _ in range(min(self.batch, self.trials + 1 - len(tried)))]
             values = [dict(trial.params) for trial in asked]
-            for trial, found in zip(asked, self._tried(values, [words + _words(of_trial) for of_trial in values], len(tried))):
-                found = _judged(found, default)
+            for trial, found in zip(asked, self._run_trials(values, [words + _words(of_trial) for of_trial in values], len(tried))):
+                found = _discard_incomparable(found, default)
                 study.tell(trial, found.objective, state=None if found.objective is not None else optuna.trial.TrialState.FAIL)
                 tried.append(found)
         self._conclude(tried, words)
@@ -83,7 +83,7 @@ class Search(Sweeper):
     def _split(self, arguments: list[str]) -> tuple[dict[str, Override], Overrides]:
         """Split words into search spaces, by key, and all others; a later word replaces an earlier one of its key."""
         parser = OverridesParser.create(config_loader=self.loader)
-        words, self.params = [*self.given, *arguments], {}
+        words, self.params = [*self.param_overrides, *arguments], {}
         parsed = {override.get_key_element(): (override, word) for word, override in zip(words, parser.parse_overrides(words))}
         searched = {key: override for key, (override, _) in parsed.items() if _is_searched(override)}
         if not searched:
@@ -101,19 +101,19 @@ class Search(Sweeper):
         print(f"search: computes {', '.join(again)} again; reads {', '.join(read)} from {config.replay}", file=sys.stderr)
         return [f"only=[{','.join(again)}]"]
 
-    def _tried(self, values: list[dict[str, Any]], words: list[Overrides], before: int) -> list[Trial]:
+    def _run_trials(self, values: list[dict[str, Any]], words: list[Overrides], before: int) -> list[Trial]:
         """The trials of given values and words, after `before` others; their jobs are run unless they are done."""
         jobs = [self.jobs(of_trial) for of_trial in words]
         each = len(jobs[0])
         folders = self.run([job for of_trial in jobs for job in of_trial], each * (self.trials + 1), each * before)
-        return [self._measured(of_trial, folders[i * each : (i + 1) * each]) for i, of_trial in enumerate(values)]
+        return [self._trial_from_jobs(of_trial, folders[i * each : (i + 1) * each]) for i, of_trial in enumerate(values)]
 
-    def _measured(self, values: dict[str, Any], folders: list[Path]) -> Trial:
+    def _trial_from_jobs(self, values: dict[str, Any], folders: list[Path]) -> Trial:
         """The trial whose jobs are in the folders."""
         jobs = [folder.name for folder in folders]
         if why := next((why for folder in folders if (why := failure_of(folder))), ""):
             return Trial(values, None, jobs, why)
-        metrics = [_figures(folder / METRICS) for folder in folders if (folder / METRICS).exists()]
+        metrics = [_job_metrics(folder / METRICS) for folder in folders if (folder / METRICS).exists()]
         if len(metrics) < len(folders) or any(self.objective not in found for found in metrics):
             known = did_you_mean(self.objective, metrics[0]) if metrics else "no pose was computed"
             return Trial(values, None, jobs, f"no {self.objective} in {METRICS}, {known}")
@@ -134,7 +134,7 @@ class Search(Sweeper):
         OUTCOMES.append(Outcome(self.folder, str(self.options.report), len(tried)))
 
 
-def _judged(trial: Trial, default: Trial) -> Trial:
+def _discard_incomparable(trial: Trial, default: Trial) -> Trial:
     """A trial that tracks fewer frames than the default has no value: errors are of what was tracked."""
     if trial.objective is None or trial.tracked_share >= default.tracked_share:
         return trial
@@ -210,6 +210,6 @@ def _words(values: Mapping[str, Any]) -> Overrides:
     return [f"{key}={value}" for key, value in values.items()]
 
 
-def _figures(file: Path) -> dict[str, float]:
+def _job_metrics(file: Path) -> dict[str, float]:
     """The numbers of a job's metrics, by dotted name."""
-    return {name: value for name, value in dotted(json.loads(file.read_text())).items() if isinstance(value, (int, float))}
+    return {name: value for name, value in flatten_dict(json.loads(file.read_text())).items() if isinstance(value, (int, float))}

@@ -34,7 +34,7 @@ from trihedron.pipeline.core.registry import load_plugins, options_of, plugins_o
 from trihedron.pipeline.core.slots import SLOTS
 from trihedron.pipeline.sweep.cluster import all_awaited
 from trihedron.pipeline.sweep.jobs import DONE, FAILED, RUNNING, key_of, read_job, write_job
-from trihedron.pipeline.sweep.preview import Planned, common_words, preview, refused, state_of
+from trihedron.pipeline.sweep.preview import Planned, common_words, preview, refused_job, state_of
 from trihedron.pipeline.sweep.progress import Progress, reason
 
 Overrides = list[str]
@@ -79,7 +79,7 @@ class Sweeper(HydraSweeper):
         """Run what is missing. Raises TrihedronError when no job can be composed."""
         jobs = self.jobs(arguments)
         if self.options.dry_run:
-            print(preview([self._planned(job, self.folder / str(number)) for job, number in zip(jobs, _numbers(self.folder, jobs))]))
+            print(preview([self._plan_job(job, self.folder / str(number)) for job, number in zip(jobs, _numbers(self.folder, jobs))]))
             return
         folders = self.run(jobs, len(jobs))
         failures = [why for folder in folders if (why := failure_of(folder))]
@@ -113,7 +113,7 @@ class Sweeper(HydraSweeper):
         for job, folder in zip(jobs, folders):
             words = [*job, f"hydra.sweep.subdir={folder.name}"]  # the last is its own alone
             try:
-                key = key_of(self.composed(words))
+                key = key_of(self.compose_config(words))
             except Exception as error:
                 errors.append(error if isinstance(error, TrihedronError) else rewritten(error))
                 _keep_overrides(folder, job)
@@ -133,15 +133,15 @@ class Sweeper(HydraSweeper):
                 self._launch(missing)
         return folders
 
-    def _planned(self, job: Overrides, folder: Path) -> Planned:
+    def _plan_job(self, job: Overrides, folder: Path) -> Planned:
         """The job as a dry run describes it."""
         try:
-            config = self.composed([*job, f"hydra.sweep.subdir={folder.name}"])
+            config = self.compose_config([*job, f"hydra.sweep.subdir={folder.name}"])
             return Planned(folder, job, state_of(folder, key_of(config)), graph=graph_of(config))
         except Exception as error:
-            return refused(folder, job, error)
+            return refused_job(folder, job, error)
 
-    def composed(self, words: Overrides) -> DictConfig:
+    def compose_config(self, words: Overrides) -> DictConfig:
         """The configuration of a job."""
         return self.loader.load_sweep_config(self.options, words)
 
@@ -162,7 +162,7 @@ class Sweeper(HydraSweeper):
         for words, folder in missing:
             _keep_overrides(folder, words[:-1])
             if read_job(folder).get("state") not in (DONE, FAILED):
-                _died(folder)
+                _record_death(folder)
         if self.options.hydra.launcher.get("n_jobs", 1) != 1:
             get_reusable_executor().shutdown()  # its processes would keep this folder and environment for the next sweep
 
@@ -170,7 +170,7 @@ class Sweeper(HydraSweeper):
         """A process that died took those beside it along. What had begun is run again, one at a time, so that only the job at fault fails; then
         what had not."""
         if len(missing) == 1:
-            _died(missing[0][1])
+            _record_death(missing[0][1])
             return
         begun = [job for job in missing if read_job(job[1]).get("state") == RUNNING]
         if not begun:
@@ -183,7 +183,7 @@ class Sweeper(HydraSweeper):
     def jobs(self, arguments: list[str]) -> list[Overrides]:
         """The overrides of every job: the cross product of sequences, of all values given and of the alternatives."""
         parser = OverridesParser.create(config_loader=self.loader)
-        words = [word for word in [*self.given, *arguments] if not word.startswith(OF_SWEEPS)]
+        words = [word for word in [*self.param_overrides, *arguments] if not word.startswith(OF_SWEEPS)]
         words += [] if any(word.startswith("threads=") for word in words) else [f"threads={self._threads}"]
         sequences = list(self.options.sequences)
         alternatives = words_of_alternatives(list(self.options.alternatives)) or [[]]
@@ -194,7 +194,7 @@ class Sweeper(HydraSweeper):
         return [job for one in given for job in _product(parser.parse_overrides(one))]
 
     @property
-    def given(self) -> Overrides:
+    def param_overrides(self) -> Overrides:
         """The overrides `params`."""
         return [f"{key}={value}" for key, value in self.params.items()]
 
@@ -318,6 +318,6 @@ def _keep_overrides(folder: Path, job: Overrides) -> None:
         file.write_text(yaml.safe_dump(job))
 
 
-def _died(folder: Path) -> None:
+def _record_death(folder: Path) -> None:
     """Say so of a job that cannot."""
     write_job(folder, "", FAILED, f"{folder}: its process died; it crashed, or memory ran out")

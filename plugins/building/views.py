@@ -80,7 +80,7 @@ def preview_state(state: BuildingState) -> BuildingState:
 
 def gather_evidence(state: BuildingState, map: Map | None) -> Evidence | None:
     """Gather the planar points of all views at their final poses; None when no view shows a plane."""
-    kept = [(view, T, C) for view, C in zip(state.views, state.covariances) if (T := view.settled(map)) is not None]
+    kept = [(view, T, C) for view, C in zip(state.views, state.covariances) if (T := view.final_pose(map)) is not None]
     if not kept:
         return None
     views, regions = [(view, T) for view, T, _ in kept], [_regions(view) for view, *_ in kept]

@@ -19,7 +19,14 @@ from trihedron.plugins.loop.keyframe_correction import correct_keyframes
 from trihedron.plugins.loop.manhattan_prior_kernels import keyframe_rotations
 from trihedron.plugins.mapping.covisibility_graph import DriftOptions, current_submap, keyframes_of, odometry
 from trihedron.plugins.shared.linalg import inverse
-from trihedron.plugins.shared.manhattan_frames_kernels import Walls, area_on_axes, known_walls, measured_directions, perpendicular_pair, settled
+from trihedron.plugins.shared.manhattan_frames_kernels import (
+    Walls,
+    area_on_axes,
+    known_walls,
+    measured_directions,
+    perpendicular_pair,
+    refine_rotation,
+)
 from trihedron.plugins.shared.pose_graph import Edges, concatenate_edges, solve_pose_graph
 from trihedron.plugins.shared.pose_optimizer import PoseSolution
 
@@ -85,7 +92,7 @@ def _axes(planes: F64, covariance: F64, views: I32) -> F64 | None:
     on_axes = area_on_axes(walls, R, REACH)
     if np.count_nonzero(on_axes) < 2 or on_axes.sum() < EXPLAINED * walls.area.sum():
         return None
-    on_walls: F64 = settled(walls, R, REACH, GATE, 0.0, 3)[0]
+    on_walls: F64 = refine_rotation(walls, R, REACH, GATE, 0.0, 3)[0]
     return on_walls
 
 

@@ -18,7 +18,7 @@ from trihedron.plugins.manhattan.atlanta_kernels import QUARTER, azimuth_modes, 
 from trihedron.plugins.manhattan.axis_fit import fit_rules, measure_directions
 from trihedron.plugins.manhattan.axis_fit_kernels import NOTHING_KNOWN, FitRules, variance_scale
 from trihedron.plugins.manhattan.directions import HALF_SPHERE, Directions, gather_directions
-from trihedron.plugins.manhattan.frame_association import lost_frames, retain_unseen, seen_frames, unmatched
+from trihedron.plugins.manhattan.frame_association import lost_frames, retain_unseen, seen_frames, unmatched_rows
 from trihedron.plugins.manhattan.mean_shift_kernels import densest, mode_statistics, shift_axes
 from trihedron.plugins.manhattan.modes import Modes, find_peaks, mode_limits, perpendicular_modes, shift_limits, track_modes
 
@@ -111,7 +111,7 @@ class Atlanta:
         uninformative covariance. `supported` is False when no horizontal direction stands at right angles to the vertical or to another."""
         directions = gather_directions(normals.normals, segments, self.samples, self.line_weight_per_px)
         recent = previous is not None and previous.supported and normals.index - previous.index <= self.max_age
-        known, ids = self._known(directions, previous, recent)
+        known, ids = self._known_rotations(directions, previous, recent)
         modes = self._near(directions, planes, known) if recent else NONE
         if not modes.supported:
             modes = self._search(directions, planes, None if previous is None else known)
@@ -120,11 +120,11 @@ class Atlanta:
         rotations, covariance = self._fit(modes, segments, planes)
         order = np.argsort(-modes.weights * np.where(modes.rows == 0, self.loyalty, 1.0), kind="stable")
         rows, rotations = modes.rows[order], rotations[order]
-        unseen = retain_unseen(unmatched(rows, len(known)), ids, self.max_azimuths - len(rows)) if previous is not None else NOBODY
+        unseen = retain_unseen(unmatched_rows(rows, len(known)), ids, self.max_azimuths - len(rows)) if previous is not None else NOBODY
         expected = _predict_unseen(rotations, rows, known, unseen)
         return seen_frames(normals, rotations, covariance[order], modes.inliers[order], modes.spread[order], rows, ids, unseen, expected)
 
-    def _known(self, directions: Directions, previous: ManhattanFrame | None, recent: bool) -> tuple[F64, I32]:
+    def _known_rotations(self, directions: Directions, previous: ManhattanFrame | None, recent: bool) -> tuple[F64, I32]:
         """Return the known rotations (k, 3, 3) and their ids; while a single one is in view another of its axes may turn out to be the vertical."""
         known, ids = _with_first_vertical(previous)
         alone = previous is not None and np.count_nonzero(previous.inliers.any(axis=1)) == 1

@@ -40,7 +40,7 @@ def azimuth_modes(vectors: F64, weights: F64, first_line: int, vertical: F64, co
         if inside <= 0.0 or inside < max(least, CONTRAST * expected, chance):
             continue
         angle = (peak + 0.5 + moment / inside) * QUARTER / BINS
-        masses[found], rotations[found] = inside, _turned(base, angle)
+        masses[found], rotations[found] = inside, _rotate_about_vertical(base, angle)
         found += 1
         if found == most:
             break
@@ -50,7 +50,7 @@ def azimuth_modes(vectors: F64, weights: F64, first_line: int, vertical: F64, co
 
 
 @kernel
-def _turned(base: F64, angle: float) -> F64:
+def _rotate_about_vertical(base: F64, angle: float) -> F64:
     """`base` (3, 3) turned about its third column."""
     out, c, s = base.copy(), np.cos(angle), np.sin(angle)
     for k in range(3):

@@ -364,16 +364,16 @@ def _hessian(sure: F64, R: F64, pulls: F64, out: F64) -> None:
         M = sure[k]
         along = R[0, k] * pulls[0, k] + R[1, k] * pulls[1, k] + R[2, k] * pulls[2, k]
         for a in range(3):
-            x, y, z = _moved(R, k, a)
+            x, y, z = _axis_derivative(R, k, a)
             u, v, w = M[0] * x + M[1] * y + M[2] * z, M[1] * x + M[3] * y + M[4] * z, M[2] * x + M[4] * y + M[5] * z
             out[a, a] -= 2.0 * along
             for b in range(3):
-                p, q, r = _moved(R, k, b)
+                p, q, r = _axis_derivative(R, k, b)
                 out[a, b] += 2.0 * (u * p + v * q + w * r) + R[a, k] * pulls[b, k] + pulls[a, k] * R[b, k]
 
 
 @kernel
-def _moved(R: F64, k: int, a: int) -> tuple[float, float, float]:
+def _axis_derivative(R: F64, k: int, a: int) -> tuple[float, float, float]:
     """e_a × r_k: how the axis moves with phi_a."""
     if a == 0:
         return 0.0, -R[2, k], R[1, k]

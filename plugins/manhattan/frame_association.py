@@ -50,7 +50,7 @@ def camera_rotation(found: F64, before: F64, limit: float) -> F64:
     return rotation
 
 
-def unmatched(rows: I32, count: int) -> I32:
+def unmatched_rows(rows: I32, count: int) -> I32:
     """Return the rows of `count` that are not in `rows`."""
     left = np.ones(count, np.bool_)
     left[rows[rows >= 0]] = False

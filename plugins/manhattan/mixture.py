@@ -22,7 +22,7 @@ from trihedron.plugins.manhattan.frame_association import (
     retain_unseen,
     seen_frames,
     symmetric_angles,
-    unmatched,
+    unmatched_rows,
 )
 from trihedron.plugins.manhattan.mean_shift_kernels import search_axes
 from trihedron.plugins.manhattan.modes import Modes, mode_spread, track_modes
@@ -100,7 +100,7 @@ class Mixture:
         if not found:
             return lost_frames(track_modes(self, directions, planes, known[0]), rules, segments, planes, normals, known, ids)
         rows = np.array([one.row for one in found], np.int32)
-        unseen = retain_unseen(unmatched(rows, len(known)), ids, self.max_frames - len(found)) if previous is not None else NOBODY
+        unseen = retain_unseen(unmatched_rows(rows, len(known)), ids, self.max_frames - len(found)) if previous is not None else NOBODY
         fits = [fit_axes(rules, one.R, one.modes.axes, one.modes.normals, np.ones(3, np.bool_), segments, planes) for one in found]
         rotations, covariance = (np.array(values) for values in zip(*fits))
         if rows.max() >= 0:  # with the fitted rotation, so that what is out of sight keeps its angles to it over many frames

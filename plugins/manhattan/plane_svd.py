@@ -21,7 +21,7 @@ from trihedron.plugins.shared.manhattan_frames_kernels import (
     perpendicular_pair,
     procrustes,
     procrustes_covariance,
-    settled,
+    refine_rotation,
     square_angles,
 )
 
@@ -55,7 +55,7 @@ class PlaneSvd:
         enough = self.min_share * planes.labels.size * planes.stride**2
         R, supported = self._perpendicular(walls, enough, start, previous is not None and previous.supported)
         if supported:
-            R, axes, weights = settled(walls, R, np.radians(self.reach_deg), self.gate, PRIOR, 2)
+            R, axes, weights = refine_rotation(walls, R, np.radians(self.reach_deg), self.gate, PRIOR, 2)
         else:
             R, axes, weights = _alone(walls, enough, start)
         square = square_angles(walls.normals, axes, R)

@@ -44,7 +44,7 @@ def needs_keyframe(options: KeyframeOptions, frame: Frame, pose: Pose, planes: P
         return True
     frames = frame.index - int(keyframes.row("index", newest[0]))
     spans = [keyframes.row(kind.span_column, newest[0]).tolist() for kind in WEIGHTS]
-    tracked_share = _weighted(pose.inliers.tolist()) / max(_weighted([end - begin for begin, end in spans]), 1)
+    tracked_share = _weighted_total(pose.inliers.tolist()) / max(_weighted_total([end - begin for begin, end in spans]), 1)
     urgent = tracked_share < options.urgent_share
     if 0 <= frames < options.min_frames and not urgent:  # less than 0: a keyframe of another sequence
         return False
@@ -61,7 +61,7 @@ def needs_keyframe(options: KeyframeOptions, frame: Frame, pose: Pose, planes: P
 def _in_doubt(options: KeyframeOptions, pose: Pose, keyframes: Table) -> bool:
     """Return True if a tracked pose is much less certain than its reference keyframe: its error would propagate to every new landmark. A later frame
     decides."""
-    if pose.reference < 0 or _weighted(pose.inliers.tolist()) < options.doubt_score:
+    if pose.reference < 0 or _weighted_total(pose.inliers.tolist()) < options.doubt_score:
         return False
     covariances: list[F64] = [pose.local_covariance, keyframes.row("covariance", pose.reference)]
     sigma, reference = (float(eigvalsh(covariance[:3, :3])[-1]) ** 0.5 for covariance in covariances)
@@ -78,6 +78,6 @@ def keyframe_distance_m(options: KeyframeOptions, frame: Frame) -> float:
     return options.min_shift * float(np.partition(depth, middle)[middle].mean())
 
 
-def _weighted(counts: list[int]) -> int:
+def _weighted_total(counts: list[int]) -> int:
     """Total of points, lines and planes, weighted as in covisibility."""
     return sum(weight * count for weight, count in zip(WEIGHTS.values(), counts))

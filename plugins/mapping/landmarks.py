@@ -122,14 +122,14 @@ def distinct(ids: I32) -> I32:
 
 def union(a: I32, b: I32) -> I32:
     """Return the ids of both (n,), once each and sorted."""
-    marked = _marked(b, _end(a, b))
+    marked = _membership_mask(b, _end(a, b))
     marked[a] = True
     return np.flatnonzero(marked).astype(np.int32)
 
 
 def isin(ids: I32, others: I32) -> Bool:
     """Return True (n,) for the ids that are among the others."""
-    found: Bool = _marked(others, _end(ids, others))[ids]
+    found: Bool = _membership_mask(others, _end(ids, others))[ids]
     return found
 
 
@@ -147,7 +147,7 @@ def _end(*parts: I32) -> int:
     return max((int(part.max()) + 1 for part in parts if len(part)), default=0)
 
 
-def _marked(ids: I32, size: int) -> Bool:
+def _membership_mask(ids: I32, size: int) -> Bool:
     marked = np.zeros(size, np.bool_)
     marked[ids] = True
     return marked

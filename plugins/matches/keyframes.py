@@ -36,7 +36,7 @@ class Keyframes:
 
     def __call__(self, camera: Camera, rotation: Rotation, keypoints: Keypoints, map: Map | None, rng: np.random.Generator) -> Matches:
         """Return the pairs of key points and points of verified keyframes; these points count as visible."""
-        pairs = [self._verified(camera, keypoints, map, row, rng) for row in self._candidates(map, rng)] if map is not None else []
+        pairs = [self._verified_matches(camera, keypoints, map, row, rng) for row in self._candidates(map, rng)] if map is not None else []
         pairs = sorted(pairs, key=len, reverse=True)
         found = np.concatenate([NO_PAIRS, *pairs])
         for column in (0, 1):
@@ -55,7 +55,7 @@ class Keyframes:
         drawn = rng.choice(earlier, min(self.drawn, len(earlier)), replace=False) if len(earlier) else earlier
         return [int(row) for row in (*newest, *np.sort(drawn))]
 
-    def _verified(self, camera: Camera, keypoints: Keypoints, map: Map, keyframe: int, rng: np.random.Generator) -> I32:
+    def _verified_matches(self, camera: Camera, keypoints: Keypoints, map: Map, keyframe: int, rng: np.random.Generator) -> I32:
         """Rows of key points and ids of the keyframe's points (n, 2) that agree on one motion; none where too few do."""
         ids, mine = observed_by(map, np.array([keyframe], np.int32), POINT), rows_with_depth(keypoints)
         descriptors, positions = map.points.columns_at(ids, "descriptor", "position_m")

@@ -8,7 +8,7 @@ import numpy as np
 
 from trihedron.pipeline.core.types import F32, F64, U8, Frame, Pose
 from trihedron.plugins.shared.image_reduction import reduced_intrinsics, step_to
-from trihedron.plugins.shared.image_reduction_kernels import reduced
+from trihedron.plugins.shared.image_reduction_kernels import average_blocks
 
 NEAREST_M = 0.1
 
@@ -34,7 +34,7 @@ def downsample(frame: Frame, pose: Pose, width: int) -> DownsampledFrame:
     """Downsample a frame and attach its pose."""
     step = step_to(frame, width)
     intrinsics = reduced_intrinsics(frame, step)
-    depth_m, color = reduced(frame.depth_m, frame.color, step)
+    depth_m, color = average_blocks(frame.depth_m, frame.color, step)
     return DownsampledFrame(depth_m, color, intrinsics, posed_camera(intrinsics, pose.T_world_camera))
 
 

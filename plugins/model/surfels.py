@@ -13,7 +13,7 @@ from trihedron.pipeline.core.registry import register
 from trihedron.pipeline.core.types import LOST, Bool, Column, Frame, Pose, PredictedView, Table
 from trihedron.plugins.model.downsampled_frame import PosedCamera, downsample
 from trihedron.plugins.model.surfels_kernels import Images, fuse, index_map, splat
-from trihedron.plugins.shared.image_reduction_kernels import depth_normals, smoothed
+from trihedron.plugins.shared.image_reduction_kernels import depth_normals, smooth_depth
 
 
 @register("model", "surfels")
@@ -40,7 +40,7 @@ class SurfelModel:
         if pose.status == LOST:
             return None
         depth, color, intrinsics, camera = downsample(frame, pose, self.width)
-        smooth = smoothed(depth, 2)
+        smooth = smooth_depth(depth, 2)
         images = Images(depth, depth_normals(smooth, intrinsics, 2), color, frame.camera.depth_noise.sigma_m(np.arange(0.0, 16.0, 0.01)))
         table = previous.model if previous is not None else Table.empty(SURFELS)
         table = fuse_frame(self, table, images, camera, frame.index)

@@ -12,7 +12,7 @@ from trihedron.pipeline.core.registry import register
 from trihedron.pipeline.core.types import F32, I32, LOST, Column, Frame, Pose, PredictedView, Table
 from trihedron.plugins.model.downsampled_frame import PosedCamera, downsample
 from trihedron.plugins.model.tsdf_kernels import Blocks, cast_kernel, in_view, insert, integrate, ranges_kernel
-from trihedron.plugins.shared.image_reduction_kernels import depth_normals, smoothed
+from trihedron.plugins.shared.image_reduction_kernels import depth_normals, smooth_depth
 from trihedron.plugins.shared.tsdf_volume import CELLS, blocks_about
 from trihedron.plugins.shared.tsdf_volume_kernels import SIDE
 from trihedron.plugins.shared.voxel_hash_kernels import I64, absent, empty_table
@@ -44,7 +44,7 @@ class TsdfModel:
         table, seen = fuse_depth(self, table, depth, camera)
         shown = cast(self, seen, camera, depth)
         T = np.array(pose.T_world_camera)
-        return PredictedView(frame.index, frame.stamp_ns, T, shown, depth_normals(smoothed(shown, 3), intrinsics, 4), np.zeros_like(color), table)
+        return PredictedView(frame.index, frame.stamp_ns, T, shown, depth_normals(smooth_depth(shown, 3), intrinsics, 4), np.zeros_like(color), table)
 
 
 # The blocks of 8 × 8 × 8 voxels are the rows of a table, so that they are the value of a wire: versions of it share the chunks that a frame does not

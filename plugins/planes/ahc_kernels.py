@@ -68,11 +68,11 @@ def cluster_blocks(sums: F64, block_limit: float, limit: float, excess: float, l
         own[i] = best
         version[i] += 1
         size = _push(heap, size, best, i, version[i])
-    return _labelled(parent, finished, flat, rows, cols)
+    return _label_blocks(parent, finished, flat, rows, cols)
 
 
 @kernel
-def _labelled(parent: I32, finished: np.ndarray, flat: F64, rows: int, cols: int) -> tuple[I32, F64]:
+def _label_blocks(parent: I32, finished: np.ndarray, flat: F64, rows: int, cols: int) -> tuple[I32, F64]:
     """Labels of the blocks and q of the clusters that are finished, in the order of their first blocks."""
     n = rows * cols
     number, labels = np.zeros(n, np.int32), np.zeros(n, np.int32)

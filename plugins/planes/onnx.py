@@ -44,7 +44,7 @@ class OnnxPlanes(NetworkOptions, RegionOptions):
         masks = network.rows("masks", outputs[0], None, None, None)
         scores = network.rows("scores", outputs[1], len(masks))
         labels = self._labels(masks, scores, image, grid, normals.stride)
-        labels, q = _started(labels, grid)
+        labels, q = _initial_planes(labels, grid)
         core, fitted = fit_labelled(grid, labels, q, float(np.radians(self.cone_deg)), self.gate, least_cells(self, normals.stride))
         return complete_planes(self, core, fitted, grid, frame, normals.stride, flat=False)
 
@@ -63,7 +63,7 @@ class OnnxPlanes(NetworkOptions, RegionOptions):
         return labels
 
 
-def _started(labels: I32, grid: Grid) -> tuple[I32, F64]:
+def _initial_planes(labels: I32, grid: Grid) -> tuple[I32, F64]:
     """Labels 1 … k of the regions that a plane can be fitted to, and q (k, 3) of each by least squares, with `q · (x, y, z) = 1`."""
     rows, columns, points = grid_points(grid)
     numbers, out, planes = labels[rows, columns], np.zeros_like(labels), []

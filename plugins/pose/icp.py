@@ -17,7 +17,7 @@ from trihedron.plugins.pose.dense_alignment import align, source_of, target_of
 from trihedron.plugins.pose.dense_alignment_kernels import Residuals, Source, Target
 from trihedron.plugins.pose.dense_pose import dense_pose, first_pose, lost_pose
 from trihedron.plugins.shared.image_reduction import Level, brightness, halvings, pyramid, reduced_intrinsics
-from trihedron.plugins.shared.image_reduction_kernels import depth_normals, smoothed
+from trihedron.plugins.shared.image_reduction_kernels import depth_normals, smooth_depth
 
 
 @register("pose", "icp")
@@ -69,7 +69,7 @@ class Icp:
         out = []
         for i, (now, view) in enumerate(zip(pyramid(frame, width, self.levels), views)):
             stride = max(1, round((now.gray.size / self.most) ** 0.5))
-            source = source_of(now, noise, stride, depth_normals(smoothed(now.depth_m, 3), now.intrinsics, 4))
+            source = source_of(now, noise, stride, depth_normals(smooth_depth(now.depth_m, 3), now.intrinsics, 4))
             out.append((source, target_of(view, 3, np.array(model.normals) if i == 0 else None), self.iterations))
         return out[::-1]
 

@@ -50,10 +50,10 @@ class Open3dIcp:
         source, target = (depth_cells(one, self.stride)[2] for one in (frame, previous_frame))
         if previous_frame.index != previous.index or min(len(source), len(target)) < LEAST:
             return relative_pose(frame, previous, np.eye(4), np.eye(6), 0.0, 1.0, self.min_share)
-        T, share, rmse, information = self._aligned(cloud_with_normals(source), cloud_with_normals(target))
+        T, share, rmse, information = self._align_clouds(cloud_with_normals(source), cloud_with_normals(target))
         return relative_pose(frame, previous, T, information, share, rmse, self.min_share)
 
-    def _aligned(self, source: Any, target: Any) -> tuple[F64, float, float, F64]:
+    def _align_clouds(self, source: Any, target: Any) -> tuple[F64, float, float, F64]:
         """T_target_source (4, 4), the share of the points with a partner, their RMSE and Open3D's information matrix (6, 6)."""
         registration = open3d().pipelines.registration
         criteria = registration.ICPConvergenceCriteria(max_iteration=self.iterations)

@@ -52,10 +52,10 @@ class Open3dOdometry:
         if previous is None or previous_frame is None:
             return first_pose(frame)
         reaching = previous_frame.index == previous.index and frame.depth_m.shape == previous_frame.depth_m.shape
-        T, share, rmse, information = self._aligned(frame, previous_frame) if reaching else _nothing()
+        T, share, rmse, information = self._align_images(frame, previous_frame) if reaching else _nothing()
         return relative_pose(frame, previous, T, information, share, rmse, self.min_share)
 
-    def _aligned(self, frame: Frame, before: Frame) -> tuple[F64, float, float, F64]:
+    def _align_images(self, frame: Frame, before: Frame) -> tuple[F64, float, float, F64]:
         """T_before_frame (4, 4), the share of the pixels that agree, the RMSE of these and Open3D's information matrix (6, 6)."""
         if min(frame.depth_m.shape) < 4 * LEAST_SIDE or not (before.depth_m > 0.0).any() or not (frame.depth_m > 0.0).any():
             return _nothing()
@@ -86,11 +86,11 @@ class Open3dOdometry:
         near = (frame.depth_m > 0.0) & (frame.depth_m < self.depth_max_m)
         levels = [(frame.color, np.where(near, frame.depth_m, np.float32(0.0)))]
         for _ in range(2):
-            levels.append(halved(*levels[-1], 2.0 * self.depth_outlier_m))
+            levels.append(halve_rgbd(*levels[-1], 2.0 * self.depth_outlier_m))
         return levels
 
 
-def halved(color: U8, depth_m: F32, jump_m: float) -> tuple[U8, F32]:
+def halve_rgbd(color: U8, depth_m: F32, jump_m: float) -> tuple[U8, F32]:
     """Halve colour (h, w, 3) and depth (h, w): pixel (x, y) is a binomial mean about (2x, 2y).
 
     Depth is the mean of the readings within `jump_m` of that in the middle; 0 where that has none. The values depend on no address, number of

@@ -30,7 +30,7 @@ from trihedron.plugins.mapping.reference_keyframe import reference_of, submap_of
 from trihedron.plugins.pose.decoupled_pose import FIRST_SIGMA, Decoupled, decoupled_pose
 from trihedron.plugins.pose.dynamic_objects import MovingOptions, Selection, solve_with_static, status_with_static
 from trihedron.plugins.pose.map_alignment import InlierStatistics, MapAlignment, TrackingStatus
-from trihedron.plugins.pose.world_uncertainty import carried, in_world, widened_by_keyframes
+from trihedron.plugins.pose.world_uncertainty import in_world, propagate_world_covariance, widened_by_keyframes
 from trihedron.plugins.shared.pose_optimizer import PoseSolution
 
 EYE = np.eye(3)
@@ -91,13 +91,15 @@ class Refine(MovingOptions):
             return self._stay_lost(start, rotation, previous, searched, map, submap)
         if rotation.source == "prediction" and not self._is_tracked(inliers):
             reason = f"the rotation was not measured, and only {inliers.total} of {inliers.matches} matches with the map agree"
-            return carried(replace(start, status=LOST, reason=reason).to_pose(rotation, map, submap=submap), previous)
+            return propagate_world_covariance(replace(start, status=LOST, reason=reason).to_pose(rotation, map, submap=submap), previous)
         if start.status != LOST and self._is_another_place(keypoints, matches, max(int(translation.inliers[0]), inliers.inliers[0])):
             continued = f"{translation.inliers[0]} key points continue the previous frame and {inliers.inliers[0]} are in the map"
             reason = f"another place: of {len(keypoints.pixels)}, {continued}"
-            return carried(replace(start, status=LOST, reason=reason).to_pose(rotation, map, submap=submap), previous)
+            return propagate_world_covariance(replace(start, status=LOST, reason=reason).to_pose(rotation, map, submap=submap), previous)
         if not inliers.total:
-            return carried(start.to_pose(rotation, map, "nothing of the map was found, pose from the previous frame", submap), previous)
+            return propagate_world_covariance(
+                start.to_pose(rotation, map, "nothing of the map was found, pose from the previous frame", submap), previous
+            )
         status = self._status(problem, solution, static, inliers, rotation, submap)
         repeats = previous.repeats + 1 if tracks is not None and _repeats(tracks, keypoints, planes) else 0
         if status.status == OK and repeats > 1:  # a Kinect repeats single images
@@ -175,7 +177,7 @@ class Refine(MovingOptions):
         definition."""
         unrecognised = previous.unrecognised + int(searched)
         if not self.submap_after or unrecognised < self.submap_after:
-            return carried(replace(start.to_pose(rotation, map, submap=submap), unrecognised=unrecognised), previous)
+            return propagate_world_covariance(replace(start.to_pose(rotation, map, submap=submap), unrecognised=unrecognised), previous)
         number = int(map.keyframes.column("submap").max(initial=0)) + 1
         reason = f"first frame of sub-map {number}: relocalisation failed for {unrecognised} frames"
         new = replace(start, covariance=FIRST_SIGMA**2 * np.eye(6), status=DEGRADED, reason=reason)

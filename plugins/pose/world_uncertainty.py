@@ -88,10 +88,10 @@ def in_world(pose: Pose, previous: Pose, solution: PoseSolution, problem: MapAli
         poses, covariances = (problem.map.keyframes.rows(name, keyframes) for name in ("T_world_camera", "world_covariance"))
         by_drift = covariance_of_keyframes(pose.T_world_camera, poses, covariances, information)
     moving = with_velocity(replace(pose, noise_scale=noise_scale), previous, problem.map)
-    return _composed(with_calibration(moving, previous, solution, problem, keyframes, groups), by_drift)
+    return _with_world_covariance(with_calibration(moving, previous, solution, problem, keyframes, groups), by_drift)
 
 
-def _composed(pose: Pose, by_drift: F64) -> Pose:
+def _with_world_covariance(pose: Pose, by_drift: F64) -> Pose:
     """Turn a pose whose `covariance` is the one relative to the landmarks near it into one whose `covariance` is that in the world."""
     of_map = by_drift + calibration_covariance(pose)
     return replace(pose, covariance=pose.noise_scale * pose.covariance + of_map, map_covariance=of_map)
@@ -116,6 +116,6 @@ def drift_of_previous(pose: Pose, previous: Pose) -> F64:
     return np.asarray(matmul(to_camera, previous.map_covariance - calibration_covariance(previous), to_camera.T))
 
 
-def carried(pose: Pose, previous: Pose) -> Pose:
+def propagate_world_covariance(pose: Pose, previous: Pose) -> Pose:
     """Give a pose that was not refined, by its own covariance relative to the previous one, its covariance in the world."""
-    return _composed(carried_calibration(replace(pose, noise_scale=previous.noise_scale), previous), drift_of_previous(pose, previous))
+    return _with_world_covariance(carried_calibration(replace(pose, noise_scale=previous.noise_scale), previous), drift_of_previous(pose, previous))

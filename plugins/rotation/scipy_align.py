@@ -42,10 +42,10 @@ class ScipyAlign:
             estimate = Estimate(before.R, before.covariance + np.eye(3) * np.radians(self.held_deg * gap) ** 2, "prediction")
             if tracks is not None and tracks.previous_index == previous.index:
                 vectors = tracked_vectors(tracks, keypoints, segments, planes, np.radians(self.plane_floor_deg))
-                estimate = self._aligned(before, *vectors) or estimate
+                estimate = self._align_vectors(before, *vectors) or estimate
         return rotation_value(keypoints.index, keypoints.stamp_ns, estimate, KnownFrames.none(), np.zeros((0, 3, 3)))
 
-    def _aligned(self, before: Estimate, then: F64, now: F64, sigma: F64) -> Estimate | None:
+    def _align_vectors(self, before: Estimate, then: F64, now: F64, sigma: F64) -> Estimate | None:
         """The previous rotation with that of the vectors on top; None where these leave some axis less certain than `measured_deg`."""
         from scipy.spatial.transform import Rotation as Aligned
 

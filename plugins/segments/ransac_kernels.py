@@ -108,7 +108,7 @@ def _sample(
         return 0.0, 0.0, 0.0
     s = sigma_z(z, noise)
     if offset == 0:
-        near, between, spread = _interpolated(depth, x, y)
+        near, between, spread = _interpolate_depth(depth, x, y)
         if near and spread <= gate * s + edge * z:
             return between, np.sqrt(s * s + (0.3 * slope) ** 2), 0.0
     px, py = x - offset * uy, y + offset * ux
@@ -117,7 +117,7 @@ def _sample(
 
 
 @kernel
-def _interpolated(depth: F32, x: float, y: float) -> tuple[bool, float, float]:
+def _interpolate_depth(depth: F32, x: float, y: float) -> tuple[bool, float, float]:
     """Return True if the four depths around (x, y) exist, their bilinear value, and their spread."""
     c, r = int(np.floor(x)), int(np.floor(y))
     if not ((c >= 0) & (c < depth.shape[1] - 1) & (r >= 0) & (r < depth.shape[0] - 1)):

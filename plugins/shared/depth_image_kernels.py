@@ -252,10 +252,10 @@ def smooth_links(grid: Grid, cos_angle: float, gate: float) -> U8:
                 normal[k, c] = normals[r, c, k]
         _tangent_planes(rho[r], sigma[r], rays_x, rays_y[r], normal, gate, here)
         if r > 0:
-            _joined(here, normal, above, upper, cos_angle, bits)
+            _link_cells(here, normal, above, upper, cos_angle, bits)
             for c in range(w):
                 links[r, c] = 2 * bits[c]
-        _joined(here[:, 1:], normal[:, 1:], here[:, :-1], normal[:, :-1], cos_angle, bits[1:])
+        _link_cells(here[:, 1:], normal[:, 1:], here[:, :-1], normal[:, :-1], cos_angle, bits[1:])
         for c in range(1, w):
             links[r, c] |= bits[c]
     return links
@@ -275,7 +275,7 @@ def _tangent_planes(rho: F32, sigma: F32, rays_x: F64, ray_y: float, normal: F32
 
 
 @kernel
-def _joined(one: F64, normal: F32, other: F64, normal2: F32, cos_angle: float, out: U8) -> None:
+def _link_cells(one: F64, normal: F32, other: F64, normal2: F32, cos_angle: float, out: U8) -> None:
     """1 where cells lie on one smooth surface with others, whose offsets may be as far off as the limit of the ones."""
     for c in range(out.size):
         a, b, d, e, f, g = normal[0, c], normal[1, c], normal[2, c], normal2[0, c], normal2[1, c], normal2[2, c]

@@ -8,7 +8,7 @@ import numpy as np
 
 from trihedron.pipeline.core.linalg import matmul
 from trihedron.pipeline.core.types import F32, F64, U8, Frame
-from trihedron.plugins.shared.image_reduction_kernels import halved, reduced
+from trihedron.plugins.shared.image_reduction_kernels import average_blocks, halve_images
 
 LUMINANCE = (0.299, 0.587, 0.114)  # of red, green and blue (Rec. 601)
 
@@ -36,7 +36,7 @@ def reduced_intrinsics(frame: Frame, step: int) -> F64:
 def pyramid(frame: Frame, width: int, levels: int) -> list[Level]:
     """Build the pyramid of a frame from about `width` columns, the finest level first."""
     step = step_to(frame, width)
-    depth, color = reduced(frame.depth_m, frame.color, step)
+    depth, color = average_blocks(frame.depth_m, frame.color, step)
     return halvings(Level(brightness(color), depth, reduced_intrinsics(frame, step)), levels)
 
 
@@ -45,7 +45,7 @@ def halvings(finest: Level, levels: int) -> list[Level]:
     out = [finest]
     for _ in range(levels - 1):
         fx, fy, cx, cy = out[-1].intrinsics
-        gray, depth = halved(out[-1].gray, out[-1].depth_m)
+        gray, depth = halve_images(out[-1].gray, out[-1].depth_m)
         out.append(Level(gray, depth, np.array([fx / 2.0, fy / 2.0, (cx - 0.5) / 2.0, (cy - 0.5) / 2.0])))
     return out
 

@@ -12,7 +12,7 @@ EDGE = 0.03  # a reading farther than the nearest of its block by more than this
 
 
 @kernel
-def halved(gray: F32, depth: F32) -> tuple[F32, F32]:
+def halve_images(gray: F32, depth: F32) -> tuple[F32, F32]:
     """Halve intensity and depth (h, w), the depth without readings behind an edge."""
     h, w = gray.shape[0] // 2, gray.shape[1] // 2
     out, small = np.empty((h, w), np.float32), np.zeros((h, w), np.float32)
@@ -51,7 +51,7 @@ def gradients(gray: F32) -> tuple[F32, F32]:
 
 
 @kernel
-def smoothed(depth: F32, radius: int) -> F32:
+def smooth_depth(depth: F32, radius: int) -> F32:
     """Smooth depth (h, w) by the mean of the readings within `radius` pixels that are not across an edge; 0 stays 0."""
     h, w = depth.shape
     out = np.zeros((h, w), np.float32)
@@ -98,7 +98,7 @@ def depth_normals(depth: F32, intrinsics: F64, reach: int) -> F32:
 
 
 @kernel
-def reduced(depth: F32, color: U8, step: int) -> tuple[F32, U8]:
+def average_blocks(depth: F32, color: U8, step: int) -> tuple[F32, U8]:
     """Average depth (h, w) and colour over blocks of step × step pixels; of the depth only the readings that are not behind an edge."""
     h, w = depth.shape[0] // step, depth.shape[1] // step
     small, paint = np.zeros((h, w), np.float32), np.empty((h, w, 3), np.uint8)

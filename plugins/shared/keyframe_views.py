@@ -11,7 +11,7 @@ import numpy as np
 
 from trihedron.pipeline.core.linalg import matmul
 from trihedron.pipeline.core.types import F32, F64, I32, U8, Camera, Frame, Map, Planes, Pose
-from trihedron.plugins.shared.image_reduction_kernels import reduced
+from trihedron.plugins.shared.image_reduction_kernels import average_blocks
 from trihedron.plugins.shared.keyframe_views_kernels import add_readings, count_novel
 from trihedron.plugins.shared.voxel_hash_kernels import I64, empty_table, reserve
 
@@ -33,11 +33,11 @@ class KeyframeView:
     submap: int
 
     @property
-    def fused(self) -> tuple[Camera, F32, U8, F64]:
+    def tsdf_input(self) -> tuple[Camera, F32, U8, F64]:
         """Return what a TSDF fuses: camera, depth, labels and planes."""
         return self.camera, self.depth_m, self.labels, self.coefficients
 
-    def settled(self, map: Map | None) -> F64 | None:
+    def final_pose(self, map: Map | None) -> F64 | None:
         """Return the final pose (4, 4): the keyframe's that the frame became, else relative to its reference keyframe; None when its sub-map is not
         merged with the first."""
         row = self.keyframe if self.keyframe >= 0 else self.reference
@@ -52,7 +52,7 @@ class KeyframeView:
 def view_of(frame: Frame, planes: Planes, pose: Pose, map: Map | None, width: int, max_sigma_m: float) -> KeyframeView:
     """Reduce a frame to a view; depth whose standard deviation is above `max_sigma_m` is skipped. `map` is that of this very frame, or None."""
     step = max(1, round(frame.camera.width / width))
-    depth, color = reduced(frame.depth_m, frame.color, step)
+    depth, color = average_blocks(frame.depth_m, frame.color, step)
     camera, noise = frame.camera, frame.camera.depth_noise
     depth[~(noise.sigma_m(depth) <= max_sigma_m)] = 0.0  # NaN too
     h, w = depth.shape

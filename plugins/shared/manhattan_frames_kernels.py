@@ -342,7 +342,7 @@ def area_on_axes(walls: Walls, R: F64, reach: float) -> F64:
 
 
 @kernel
-def settled(walls: Walls, R: F64, reach: float, gate: float, prior: float, rounds: int) -> tuple[F64, I32, F64]:
+def refine_rotation(walls: Walls, R: F64, reach: float, gate: float, prior: float, rounds: int) -> tuple[F64, I32, F64]:
     """Refine R to the rotation nearest to the walls within `reach` of its axes, again with new axes and with Cauchy weights, one half at `gate` σ:
     the rotation, the axis of each wall (n,), -1 for none, and its weight (n,), 1/rad²."""
     axes, weights = assign_axes(walls.normals, R, reach), 1.0 / walls.variance

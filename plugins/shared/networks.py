@@ -40,7 +40,7 @@ class NetworkOptions:
     @cached_property
     def network(self) -> Network:
         """The opened network. Raises ConfigError."""
-        return Network.opened(self.slot, self.model, self.sha256)
+        return Network.load(self.slot, self.model, self.sha256)
 
 
 @dataclass(frozen=True)
@@ -52,7 +52,7 @@ class Network:
     session: Any
 
     @staticmethod
-    def opened(slot: str, path: str, sha256: str) -> Network:
+    def load(slot: str, path: str, sha256: str) -> Network:
         """Open the file of the option `SLOT.model`. Raises ConfigError where it is not given, missing, another one, or no network, and LibraryError
         without ONNX Runtime."""
         place = f"{slot}.model"
@@ -76,7 +76,7 @@ class Network:
         try:
             session = runtime.InferenceSession(content, options, providers=["CPUExecutionProvider"])
         except Exception as error:  # ONNX Runtime has a class for each of its codes
-            raise ConfigError(place, f"{path} is no network that ONNX Runtime can run: {_said(error)}", WHERE) from error
+            raise ConfigError(place, f"{path} is no network that ONNX Runtime can run: {_error_text(error)}", WHERE) from error
         return Network(slot, path, session)
 
     @cached_property
@@ -94,20 +94,20 @@ class Network:
         for name in given:
             self._check_input(name, given[name].shape)
         if missing := [name for name in self.inputs if name not in given]:
-            raise self._refused(f"takes the input '{missing[0]}' {tuple(self.inputs[missing[0]][0])}, which this stage does not give")
+            raise self._config_error(f"takes the input '{missing[0]}' {tuple(self.inputs[missing[0]][0])}, which this stage does not give")
         if missing := [name for name in wanted if name not in self.outputs]:
-            raise self._refused(f"has no output '{missing[0]}', only {', '.join(self.outputs)}")
+            raise self._config_error(f"has no output '{missing[0]}', only {', '.join(self.outputs)}")
         try:
             return [np.asarray(value) for value in self.session.run(list(wanted), dict(given))]
         except Exception as error:
-            raise self._refused(f"fails: {_said(error)}") from error
+            raise self._config_error(f"fails: {_error_text(error)}") from error
 
     def size(self, name: str) -> tuple[int | None, int | None]:
         """Height and width of an input image (1, c, h, w), None where any is taken. Raises ConfigError for an input of another shape."""
         self._check_input(name, None)
         shape = self.inputs[name][0]
         if len(shape) != 4:
-            raise self._refused(f"takes '{name}' as {tuple(shape)}, which is no image (1, c, h, w)")
+            raise self._config_error(f"takes '{name}' as {tuple(shape)}, which is no image (1, c, h, w)")
         height, width = (side if isinstance(side, int) else None for side in shape[2:])
         return height, width
 
@@ -118,28 +118,28 @@ class Network:
             found = found[0]
         if found.ndim != len(shape) or any(want not in (None, have) for want, have in zip(shape, found.shape)):
             wanted = ", ".join("n" if side is None else str(side) for side in shape)
-            raise self._refused(f"gives '{name}' as {tuple(np.shape(value))}, and ({wanted}) is required")
+            raise self._config_error(f"gives '{name}' as {tuple(np.shape(value))}, and ({wanted}) is required")
         if found.dtype.kind not in "fiub":
-            raise self._refused(f"gives '{name}' as {found.dtype}, and numbers are required")
+            raise self._config_error(f"gives '{name}' as {found.dtype}, and numbers are required")
         found = np.ascontiguousarray(found, np.float32)
         if not np.isfinite(found).all():
-            raise self._refused(f"gives '{name}' that is not finite")
+            raise self._config_error(f"gives '{name}' that is not finite")
         return found
 
     def _check_input(self, name: str, shape: tuple[int, ...] | None) -> None:
         if name not in self.inputs:
-            raise self._refused(f"has no input '{name}', only {', '.join(self.inputs)}")
+            raise self._config_error(f"has no input '{name}', only {', '.join(self.inputs)}")
         wanted, kind = self.inputs[name]
         if kind != "tensor(float)":
-            raise self._refused(f"takes '{name}' as {kind}, and tensor(float) is given")
+            raise self._config_error(f"takes '{name}' as {kind}, and tensor(float) is given")
         if shape is not None and (len(wanted) != len(shape) or any(isinstance(w, int) and w != s for w, s in zip(wanted, shape))):
-            raise self._refused(f"takes '{name}' as {tuple(wanted)}, and {shape} is given")
+            raise self._config_error(f"takes '{name}' as {tuple(wanted)}, and {shape} is given")
 
-    def _refused(self, cause: str) -> ConfigError:
+    def _config_error(self, cause: str) -> ConfigError:
         return ConfigError(f"{self.slot}.model", f"{self.path} {cause}", f"see trihedron plugins {self.slot} for what a network must take and give")
 
 
-def _said(error: Exception) -> str:
+def _error_text(error: Exception) -> str:
     return " ".join(str(error).split())[:MESSAGE]
 
 

@@ -18,7 +18,7 @@ from trihedron.plugins.surface.vertex_colors import fill_unseen, view_colors
 
 def colored_surface(state: RetainedViews, map: Map | None, vertices: F64, triangles: I32) -> Surface:
     """A surface of triangles (t, 3) that belong to no plane."""
-    views = state.settled(map)
+    views = state.views_at_final_poses(map)
     vertices, triangles, _ = remove_unused_vertices(vertices, triangles)
     colors = fill_unseen(vertices, *view_colors(vertices, vertex_normals(vertices, triangles), views))
     return replace(
@@ -42,7 +42,7 @@ def textured_surface(
     used, rows = np.unique(labels, return_inverse=True)
     rows, used = (rows - 1, used[1:]) if len(used) and used[0] < 0 else (rows, used)
     planes, points = planes[used], plain.vertices_m.astype(np.float64)
-    atlas = bake_atlas(points, plain.triangles, rows, planes, state.settled(map), texel_m)
+    atlas = bake_atlas(points, plain.triangles, rows, planes, state.views_at_final_poses(map), texel_m)
     rings = [(int(np.searchsorted(used, plane)), renamed[ring]) for plane, ring in loops]
     ends = np.cumsum([0, *(len(ring) for _, ring in rings)])
     areas = np.bincount(rows + 1, triangle_areas(points, plain.triangles), len(used) + 1)[1:].astype(np.float32)

@@ -42,7 +42,7 @@ def collapse_all(
             for v in targets[: _targets(u, mine[:count], vertices, triangles, border, beside, targets, far)]:
                 stamp += 2
                 size = _incident(v, alive, head, tail, after, theirs)
-                if _allowed(u, v, mine[:count], theirs[:size], vertices, triangles, labels, normals, mark, stamp):
+                if _may_collapse(u, v, mine[:count], theirs[:size], vertices, triangles, labels, normals, mark, stamp):
                     _collapse(u, v, mine[:count], triangles, alive, head, tail, after)
                     if border[u]:
                         other = beside[u, 0] if beside[u, 1] == v else beside[u, 1]
@@ -96,7 +96,7 @@ def _targets(u: int, mine: I32, vertices: F64, triangles: I32, border: Bool, bes
 
 
 @kernel
-def _allowed(u: int, v: int, mine: I32, theirs: I32, vertices: F64, triangles: I32, labels: I32, normals: F64, mark: I64, stamp: int) -> bool:
+def _may_collapse(u: int, v: int, mine: I32, theirs: I32, vertices: F64, triangles: I32, labels: I32, normals: F64, mark: I64, stamp: int) -> bool:
     """Return True if u may be drawn into v: the two have no common neighbours but those across from their edge (link condition), and no triangle
     turns over."""
     removed = 0
@@ -121,14 +121,14 @@ def _allowed(u: int, v: int, mine: I32, theirs: I32, vertices: F64, triangles: I
         if a == v or b == v or c == v:
             continue
         x, y, z = normals[labels[t], 0], normals[labels[t], 1], normals[labels[t], 2]
-        then = _signed(vertices, v if a == u else a, v if b == u else b, v if c == u else c, x, y, z)
-        if then < FLAT_M2 and then < _signed(vertices, a, b, c, x, y, z) - 1e-3 * FLAT_M2:  # one that has no area already may stay so
+        then = _signed_area(vertices, v if a == u else a, v if b == u else b, v if c == u else c, x, y, z)
+        if then < FLAT_M2 and then < _signed_area(vertices, a, b, c, x, y, z) - 1e-3 * FLAT_M2:  # one that has no area already may stay so
             return False
     return True
 
 
 @kernel(inline="always")
-def _signed(vertices: F64, a: int, b: int, c: int, x: float, y: float, z: float) -> float:
+def _signed_area(vertices: F64, a: int, b: int, c: int, x: float, y: float, z: float) -> float:
     """Area of a triangle seen against the normal (x, y, z), negative when it is seen from behind."""
     x1, y1, z1 = vertices[b, 0] - vertices[a, 0], vertices[b, 1] - vertices[a, 1], vertices[b, 2] - vertices[a, 2]
     x2, y2, z2 = vertices[c, 0] - vertices[a, 0], vertices[c, 1] - vertices[a, 1], vertices[c, 2] - vertices[a, 2]

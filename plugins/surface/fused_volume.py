@@ -49,7 +49,7 @@ def fuse_view(options: VolumeOptions, state: FusedViews, view: KeyframeView | No
     if state.volume is None:
         state.volume = Volume(options.voxel_m, options.truncation_m)
     if view.submap == 0:
-        state.volume.integrate(*view.fused, view.T_world_camera)
+        state.volume.integrate(*view.tsdf_input, view.T_world_camera)
     state.fused.append(view.T_world_camera if view.submap == 0 else None)
     return state
 
@@ -73,13 +73,13 @@ def _volume_mesh(options: VolumeOptions, volume: Volume) -> tuple[F64, I32]:
 
 def final_volume(options: VolumeOptions, state: FusedViews, map: Map | None) -> Volume:
     """The volume of all views at their final poses."""
-    finals = [view.settled(map) for view in state.views]
+    finals = [view.final_pose(map) for view in state.views]
     if state.volume is not None and all(_moved_m(fused_at, final) <= options.rebuild_m for fused_at, final in zip(state.fused, finals)):
         return state.volume
     volume = Volume(options.voxel_m, options.truncation_m)
     for view, T in zip(state.views, finals):
         if T is not None:
-            volume.integrate(*view.fused, T)
+            volume.integrate(*view.tsdf_input, T)
     return volume
 
 

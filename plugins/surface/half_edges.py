@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from trihedron.pipeline.core.types import F64, I32
-from trihedron.plugins.surface.half_edges_kernels import connected, fans_kernel, pair_half_edges, sum_at_vertices, triangle_normals
+from trihedron.plugins.surface.half_edges_kernels import fans_kernel, pair_half_edges, sum_at_vertices, triangle_components, triangle_normals
 
 
 def opposite_half_edges(triangles: I32) -> I32:
@@ -31,7 +31,7 @@ def split_fans(vertices: F64, triangles: I32) -> tuple[F64, I32]:
 
 def remove_small_components(vertices: F64, triangles: I32, least_m2: float) -> I32:
     """The triangles (n, 3) of those connected sets that have at least that area."""
-    parts, count = connected(opposite_half_edges(triangles), np.zeros(len(triangles), np.int32))
+    parts, count = triangle_components(opposite_half_edges(triangles), np.zeros(len(triangles), np.int32))
     return np.asarray(triangles[np.bincount(parts, triangle_areas(vertices, triangles), count)[parts] >= least_m2])
 
 

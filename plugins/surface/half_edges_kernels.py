@@ -40,7 +40,7 @@ def pair_half_edges(triangles: I32, count: int) -> I32:
 
 
 @kernel
-def connected(opposite: I32, labels: I32) -> tuple[I32, int]:
+def triangle_components(opposite: I32, labels: I32) -> tuple[I32, int]:
     """(t,) numbers of the connected sets of triangles of equal label, from 0 in the order of their first triangle, and their count."""
     n = len(labels)
     parts, stack, count = np.full(n, -1, np.int32), np.empty(n, np.int32), 0

@@ -44,7 +44,7 @@ class Open3dPoisson(ViewOptions):
 
     def finish(self, state: RetainedViews, map: Map | None) -> Surface:
         """The reconstructed surface, coloured by the views."""
-        views = state.settled(map)
+        views = state.views_at_final_poses(map)
         return colored_surface(state, map, *self._mesh(views)) if views else Surface.empty(state.index, state.stamp_ns)
 
     def _mesh(self, views: list[tuple[KeyframeView, F64]]) -> tuple[F64, I32]:

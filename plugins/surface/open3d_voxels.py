@@ -41,7 +41,7 @@ class Open3dVoxels(ViewOptions):
 
     def finish(self, state: RetainedViews, map: Map | None) -> Surface:
         """The zero level of the distances, coloured by the views."""
-        views = state.settled(map)
+        views = state.views_at_final_poses(map)
         if not views:
             return Surface.empty(state.index, state.stamp_ns)
         return colored_surface(state, map, *self._mesh(views))

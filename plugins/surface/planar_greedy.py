@@ -42,7 +42,7 @@ class PlanarGreedy(ViewOptions):
 
     def finish(self, state: RetainedViews, map: Map | None) -> Surface:
         """One mesh for each plane that was seen."""
-        views = state.settled(map)
+        views = state.views_at_final_poses(map)
         ids, known = map_planes(map)
         found = observed_planes(views, known, self.angle_deg, self.distance_m)
         axes = [plane_axes(plane) for plane in found.planes]

@@ -15,7 +15,7 @@ from trihedron.plugins.surface.colored_mesh import map_planes, number_planes, te
 from trihedron.plugins.surface.decimation import decimate
 from trihedron.plugins.surface.fused_volume import FusedViews, final_mesh
 from trihedron.plugins.surface.half_edges import non_manifold_half_edges, opposite_half_edges, split_fans, vertex_normals
-from trihedron.plugins.surface.half_edges_kernels import connected, triangle_normals
+from trihedron.plugins.surface.half_edges_kernels import triangle_components, triangle_normals
 from trihedron.plugins.surface.outlines import REST, border_half_edges, border_vertices, close_pinholes, fixed_vertices
 from trihedron.plugins.surface.outlines_kernels import loops
 from trihedron.plugins.surface.planar_segmentation import PlanarOptions, planar_labels
@@ -59,7 +59,7 @@ def flatten(options: PlanarOptions, vertices: F64, triangles: I32, opposite: I32
     if not (labels >= 0).any():
         return FlatMesh(vertices, triangles, labels, [])
     points = snap_to_planes(vertices, triangles, labels, planes, options.snap_m)
-    parts, _ = connected(opposite, labels)
+    parts, _ = triangle_components(opposite, labels)
     parts = np.where(labels >= 0, parts, REST).astype(np.int32)
     border = border_half_edges(parts, opposite)
     fixed = fixed_vertices(len(vertices), triangles, parts, opposite)

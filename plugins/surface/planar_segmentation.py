@@ -12,7 +12,7 @@ from trihedron.pipeline.core.options import AcuteDeg, NonNegativeFloat, NonNegat
 from trihedron.pipeline.core.types import F64, I32
 from trihedron.plugins.surface.fused_volume import VolumeOptions
 from trihedron.plugins.surface.half_edges import triangle_areas
-from trihedron.plugins.surface.half_edges_kernels import connected
+from trihedron.plugins.surface.half_edges_kernels import triangle_components
 from trihedron.plugins.surface.planar_segmentation_kernels import (
     add_rim,
     curvature_kernel,
@@ -107,7 +107,7 @@ def _fit_planes(labels: I32, middle: F64, area: F64, planes: F64) -> F64:
 
 def _remove_small_or_curved(labels: I32, middle: F64, opposite: I32, area: F64, planes: F64, options: PlanarOptions) -> I32:
     """The labels without the connected parts that are too small, or bent."""
-    parts, count = connected(opposite, labels)
+    parts, count = triangle_components(opposite, labels)
     total = np.bincount(parts, area, count)
     bend = part_curvatures(parts, count, labels, middle, area, planes)
     return np.where((total[parts] >= options.area_m2) & (bend[parts] <= options.bend_per_m), labels, -1).astype(np.int32)
@@ -115,7 +115,7 @@ def _remove_small_or_curved(labels: I32, middle: F64, opposite: I32, area: F64, 
 
 def _fill_holes(labels: I32, vertices: F64, triangles: I32, opposite: I32, planes: F64, options: PlanarOptions) -> I32:
     """Small holes in a planar part, all about it and near its plane, belong to it."""
-    parts, count = connected(opposite, labels)
+    parts, count = triangle_components(opposite, labels)
     around = enclosing_planes(parts, count, labels, opposite)
     near = np.ones(count, np.bool_)
     area = np.bincount(parts, triangle_areas(vertices, triangles), count)

@@ -29,9 +29,9 @@ class RetainedViews:
     index: int = 0
     stamp_ns: int = 0
 
-    def settled(self, map: Map | None) -> list[tuple[KeyframeView, F64]]:
+    def views_at_final_poses(self, map: Map | None) -> list[tuple[KeyframeView, F64]]:
         """The views that stand in the first frame's world in the end, with their final poses `T_world_camera`."""
-        return [(view, T) for view in self.views if (T := view.settled(map)) is not None]
+        return [(view, T) for view in self.views if (T := view.final_pose(map)) is not None]
 
     def up(self, views: Sequence[tuple[KeyframeView, F64]]) -> F64:
         """(3,) the Manhattan axis nearest to the mean of the views' upward directions; NaN without axes or views."""

@@ -38,6 +38,6 @@ class Superpixels(ViewOptions):
 
     def finish(self, state: RetainedViews, map: Map | None) -> Surface:
         """The surfels of all views at their final poses, as discs of six corners."""
-        placed = [transform_surfels(surfels, T) for view, surfels in zip(state.views, state.surfels) if (T := view.settled(map)) is not None]
+        placed = [transform_surfels(surfels, T) for view, surfels in zip(state.views, state.surfels) if (T := view.final_pose(map)) is not None]
         agreed = fuse_surfels(placed, float(np.cos(np.radians(self.angle_deg))))
         return colored_surface(state, map, *discs(agreed[agreed[:, 12] >= self.least]))

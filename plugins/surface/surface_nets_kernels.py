@@ -153,7 +153,7 @@ def triangles_kernel(signs: I8, around: I32, cells: I32, vertices: F64) -> I32:
                     out = larger
                 if here > 0:  # before the surface at the lower end: outside is towards -axis
                     q[1], q[3] = q[3], q[1]
-                first = _squared(vertices, q[0], q[2]) <= _squared(vertices, q[1], q[3])
+                first = _squared_distance(vertices, q[0], q[2]) <= _squared_distance(vertices, q[1], q[3])
                 for k in range(2):
                     start = 2 * k if first else 2 * k + 1
                     out[count, 0], out[count, 1], out[count, 2] = q[start], q[(start + 1) % 4], q[(start + 2) % 4]
@@ -162,6 +162,6 @@ def triangles_kernel(signs: I8, around: I32, cells: I32, vertices: F64) -> I32:
 
 
 @kernel(inline="always")
-def _squared(vertices: F64, i: int, j: int) -> float:
+def _squared_distance(vertices: F64, i: int, j: int) -> float:
     x, y, z = vertices[i, 0] - vertices[j, 0], vertices[i, 1] - vertices[j, 1], vertices[i, 2] - vertices[j, 2]
     return x * x + y * y + z * z

@@ -45,10 +45,10 @@ class Surfels(ViewOptions):
 
     def finish(self, state: RetainedViews, map: Map | None) -> Surface:
         """The surfels of all views at their final poses, as discs of six corners."""
-        views = state.settled(map)
+        views = state.views_at_final_poses(map)
         ids, known = map_planes(map)
         found = observed_planes(views, known, self.region_deg, self.region_m)
-        settled = [surfels for view, surfels in zip(state.views, state.surfels) if view.settled(map) is not None]
+        settled = [surfels for view, surfels in zip(state.views, state.surfels) if view.final_pose(map) is not None]
         placed = [transform_surfels(surfels, T) for surfels, (_, T) in zip(settled, views)]
         for surfels, planes in zip(placed, found.regions):
             surfels[:, 11] = np.append(planes, -1)[surfels[:, 11].astype(int)]

@@ -50,19 +50,19 @@ class OnnxLightGlue(NetworkOptions):
         gap = keypoints.index - previous_keypoints.index
         if gap > self.max_age:
             return tracks_value(now, before, (NO_PAIRS, NO_PAIRS, NO_PAIRS), np.eye(3))
-        points = self._matched(previous_keypoints, keypoints, camera)
+        points = self._match_keypoints(previous_keypoints, keypoints, camera)
         tracks = tracks_value(now, before, (points, NO_PAIRS, NO_PAIRS), np.eye(3))
         motion = solve_motion(self, tracks, keypoints, segments, planes, gap)
         return tracks_value(now, before, (points, *StructureGates().pairs(now, before, camera, motion.R, motion.t)), motion.R)
 
-    def _matched(self, before: Keypoints, now: Keypoints, camera: Camera) -> I32:
+    def _match_keypoints(self, before: Keypoints, now: Keypoints, camera: Camera) -> I32:
         """Pairs (n, 2) of rows, each row once, those with the best scores."""
         network = self.network
         if not len(before.pixels) or not len(now.pixels) or before.metric != "l2" or now.metric != "l2":
             return NO_PAIRS
         width = network.inputs["desc0"][0][-1] if "desc0" in network.inputs else None
         width = width if isinstance(width, int) else now.descriptors.shape[1]
-        given = {"kpts0": _normalised(before.pixels, camera), "kpts1": _normalised(now.pixels, camera)}
+        given = {"kpts0": _normalise_pixels(before.pixels, camera), "kpts1": _normalise_pixels(now.pixels, camera)}
         given |= {"desc0": vectors_of(before.descriptors, width)[None], "desc1": vectors_of(now.descriptors, width)[None]}
         outputs = network.run(given, ("matches0", "mscores0"))
         pairs = np.rint(network.rows("matches0", outputs[0], None, 2)).astype(np.int32)
@@ -74,7 +74,7 @@ class OnnxLightGlue(NetworkOptions):
         return np.ascontiguousarray(pairs[np.argsort(pairs[:, 0], kind="stable")], np.int32)
 
 
-def _normalised(pixels: F32, camera: Camera) -> F32:
+def _normalise_pixels(pixels: F32, camera: Camera) -> F32:
     """Pixels (n, 2) about the image's centre, in units of half its longer side, as (1, n, 2)."""
     size = np.array([camera.width, camera.height], np.float32)
     return np.ascontiguousarray(((pixels - size / 2.0) / (size.max() / 2.0))[None], np.float32)

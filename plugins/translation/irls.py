@@ -13,7 +13,7 @@ from trihedron.pipeline.core.registry import register
 from trihedron.pipeline.core.types import Camera, Keypoints, Map, Pose, Rotation, Tracks, Translation
 from trihedron.plugins.mapping.reference_keyframe import transform_to_map
 from trihedron.plugins.translation.linear_translation import point_equations, solve_translation
-from trihedron.plugins.translation.predicted_position import origin, propagated_covariance, unmeasured
+from trihedron.plugins.translation.predicted_position import origin, predicted_translation, propagated_covariance
 
 
 @register("translation", "irls")
@@ -55,4 +55,4 @@ class Irls:
                 covariance = matmul(R, found.covariance, R.T) + propagated
                 held = np.ascontiguousarray(matmul(found.unobservable, R.T))
                 return Translation(rotation.index, rotation.stamp_ns, before[:3, 3] - matmul(R, found.s), covariance, held, inliers, True)
-        return unmeasured(rotation, before[:3, 3].copy(), propagated + prior_m**2 * np.eye(3))
+        return predicted_translation(rotation, before[:3, 3].copy(), propagated + prior_m**2 * np.eye(3))

@@ -51,7 +51,7 @@ class Kalman:
         before = OffsetFilter.of(previous)
         step, noise, points = self._translation(camera, rotation, tracks, keypoints, previous_keypoints, previous_pose)
         state, matched = before.predict(step, noise).update(observations, self.gate, self.gate_m)
-        unobservable = _unmeasured(noise, observations[:matched], 0.5 * self.motion_sigma_m)
+        unobservable = _unobserved_directions(noise, observations[:matched], 0.5 * self.motion_sigma_m)
         return self._value(rotation, state, unobservable, (points, 0, matched), points + matched > 0)
 
     def _translation(
@@ -74,7 +74,7 @@ class Kalman:
         )  # fmt: skip
 
 
-def _unmeasured(noise: F64, matched: list[AxisPlane], limit_m: float) -> F64:
+def _unobserved_directions(noise: F64, matched: list[AxisPlane], limit_m: float) -> F64:
     """Unit vectors (u, 3) (world) along which neither the points nor a known plane measured the position to `limit_m`."""
     information = inv(noise) + sum((np.outer(s.normal, s.normal) / s.variance for s in matched), np.zeros((3, 3)))
     values, vectors = eigh(information)

@@ -15,7 +15,7 @@ from trihedron.plugins.mapping.reference_keyframe import transform_to_map
 from trihedron.plugins.shared.linalg import constant
 from trihedron.plugins.shared.pose_optimizer import Terms, solve_pose
 from trihedron.plugins.shared.relative_motion import pairs_of
-from trihedron.plugins.translation.predicted_position import origin, propagated_covariance, unmeasured
+from trihedron.plugins.translation.predicted_position import origin, predicted_translation, propagated_covariance
 from trihedron.plugins.translation.tracked_terms_kernels import tracked_lines, tracked_planes, tracked_points
 
 
@@ -52,7 +52,7 @@ class LevenbergMarquardt:
         previous_pose = transform_to_map(previous_pose, map)
         frames = max(rotation.index - previous_pose.index, 1)
         if tracks is None or tracks.previous_index != previous_pose.index:
-            return self._predicted(rotation, previous_pose, earlier_pose, map, frames)
+            return self._predict_position(rotation, previous_pose, earlier_pose, map, frames)
         T, R = previous_pose.T_world_camera, rotation.R_world_camera
         start = pose_matrix(R, T[:3, 3])
         prior = np.diag(np.repeat([(self.motion_sigma_m * frames) ** -2, 1.0], 3))
@@ -60,19 +60,19 @@ class LevenbergMarquardt:
         terms = self._terms(tracks, keypoints, segments, planes, camera, T, uncertain)
         found = solve_pose(start, camera, start, prior, *terms, fixed_rotation=True)
         if not (found.points.any() or found.lines.any() or found.planes.any()):
-            return self._predicted(rotation, previous_pose, earlier_pose, map, frames)
+            return self._predict_position(rotation, previous_pose, earlier_pose, map, frames)
         inliers = np.array([np.count_nonzero(kind) for kind in (found.points, found.lines, found.planes)], np.int32)
         unobservable = np.ascontiguousarray(matmul(R, found.unobservable).T)
         covariance = matmul(R, found.covariance, R.T) + propagated_covariance(previous_pose, held_too=True)
         return Translation(rotation.index, rotation.stamp_ns, found.T_world_camera[:3, 3].copy(), covariance, unobservable, inliers, True)
 
-    def _predicted(self, rotation: Rotation, previous: Pose, earlier: Pose | None, map: Map | None, frames: int) -> Translation:
+    def _predict_position(self, rotation: Rotation, previous: Pose, earlier: Pose | None, map: Map | None, frames: int) -> Translation:
         """Predict the position by constant velocity, for at most `predict_frames`, else by no motion."""
         t, propagated = previous.T_world_camera[:3, 3].copy(), propagated_covariance(previous, held_too=True)
         recently = np.trace(propagated) / 3.0 < self.predict_frames * self.motion_sigma_m**2
         if earlier is not None and recently:
             t += (t - transform_to_map(earlier, map).T_world_camera[:3, 3]) * frames / (previous.index - earlier.index)
-        return unmeasured(rotation, t, propagated + (self.motion_sigma_m * frames) ** 2 * np.eye(3))
+        return predicted_translation(rotation, t, propagated + (self.motion_sigma_m * frames) ** 2 * np.eye(3))
 
     def _terms(self, tracks: Tracks, keypoints: Keypoints, segments: Segments, planes: Planes, camera: Camera, T: F64, uncertain: F64) -> Terms:
         """Convert the tracks to terms, the previous pose being T (4, 4) and the covariance of the fixed rotation `uncertain` (3, 3)."""

@@ -13,7 +13,7 @@ def origin(rotation: Rotation) -> Translation:
     return Translation(rotation.index, rotation.stamp_ns, np.zeros(3), np.zeros((3, 3)), np.empty((0, 3)), np.zeros(3, np.int32), True)
 
 
-def unmeasured(rotation: Rotation, t_world_camera: F64, covariance: F64) -> Translation:
+def predicted_translation(rotation: Rotation, t_world_camera: F64, covariance: F64) -> Translation:
     """A predicted position (3,) with its covariance (3, 3)."""
     return Translation(rotation.index, rotation.stamp_ns, t_world_camera, covariance, np.eye(3), np.zeros(3, np.int32), False)
 

@@ -12,7 +12,7 @@ from trihedron.pipeline.core.registry import register
 from trihedron.pipeline.core.types import F64, Bool, Keypoints, Map, Pose, Rotation, Tracks, Translation
 from trihedron.plugins.mapping.reference_keyframe import transform_to_map
 from trihedron.plugins.shared.rigid_alignment import tracked_point_pairs
-from trihedron.plugins.translation.predicted_position import origin, propagated_covariance, unmeasured
+from trihedron.plugins.translation.predicted_position import origin, predicted_translation, propagated_covariance
 
 
 @register("translation", "ransac")
@@ -47,7 +47,7 @@ class Ransac:
                 t = T[:3, 3] + matmul(w, translations[agree]) / w.sum()
                 return Translation(rotation.index, rotation.stamp_ns, t, covariance, np.empty((0, 3)), inliers, True)
         prior_m = self.motion_sigma_m * max(rotation.index - previous_pose.index, 1)
-        return unmeasured(rotation, T[:3, 3].copy(), propagated + prior_m**2 * np.eye(3))
+        return predicted_translation(rotation, T[:3, 3].copy(), propagated + prior_m**2 * np.eye(3))
 
     def _inliers(self, steps: F64, sigma: F64, rng: np.random.Generator) -> Bool:
         """Inlier mask (n,) of translations (n, 3): of the best hypothesis, then of the weighted mean of its inliers."""

@@ -12,7 +12,7 @@ from trihedron.pipeline.core.options import PositiveFloat, PositiveInt
 from trihedron.pipeline.core.registry import register
 from trihedron.pipeline.core.types import F64, Camera, Keypoints, Map, Planes, Pose, Rotation, Segments, Tracks, Translation
 from trihedron.plugins.mapping.reference_keyframe import transform_to_map
-from trihedron.plugins.translation.predicted_position import origin, propagated_covariance, unmeasured
+from trihedron.plugins.translation.predicted_position import origin, predicted_translation, propagated_covariance
 
 NEAR_M = 0.05  # nearer to the image plane than this a point is not projected
 GATE = 3.0  # standard deviations within which a feature is an inlier
@@ -46,16 +46,16 @@ class ScipyLeastSquares:
         T, R, propagated = pose.T_world_camera, rotation.R_world_camera, propagated_covariance(pose, held_too=True)
         prior_m = self.motion_sigma_m * max(rotation.index - pose.index, 1)
         if tracks is None or tracks.previous_index != pose.index:
-            return unmeasured(rotation, T[:3, 3].copy(), propagated + prior_m**2 * np.eye(3))
+            return predicted_translation(rotation, T[:3, 3].copy(), propagated + prior_m**2 * np.eye(3))
         terms = tracked_terms(tracks, keypoints, segments, planes, matmul(R.T, T[:3, :3]), self.line_sigma_px, self.plane_floor_m)
-        found = self._solved(terms, camera, prior_m)
+        found = self._solve_problem(terms, camera, prior_m)
         if not found.inliers.any():
-            return unmeasured(rotation, T[:3, 3].copy(), propagated + prior_m**2 * np.eye(3))
+            return predicted_translation(rotation, T[:3, 3].copy(), propagated + prior_m**2 * np.eye(3))
         held = np.ascontiguousarray(matmul(found.unobservable, R.T))
         covariance = matmul(R, found.covariance, R.T) + propagated
         return Translation(rotation.index, rotation.stamp_ns, T[:3, 3] - matmul(R, found.s), covariance, held, found.inliers, True)
 
-    def _solved(self, terms: Terms, camera: Camera, prior_m: float) -> Solved:
+    def _solve_problem(self, terms: Terms, camera: Camera, prior_m: float) -> Solved:
         from scipy.optimize import least_squares
 
         count = sum(map(len, residuals(terms, camera, np.zeros(3))))

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from trihedron.buildings import Building
-from trihedron.pipeline.app.recorded_values import frames_of, last_map, opened, poses_of, references_of, trajectory_of
+from trihedron.pipeline.app.recorded_values import frames_of, last_map, open_recording, poses_of, references_of, trajectory_of
 from trihedron.pipeline.core.errors import RecordingError, UsageError, did_you_mean
 from trihedron.pipeline.core.types import Frame, Map, Pose, Surface, Value
 from trihedron.pipeline.record import reader
@@ -30,7 +30,7 @@ class Recording:
     def __init__(self, path: str | Path) -> None:
         file = Path(path).expanduser()
         self.path = file / "run.mcap" if file.is_dir() else file
-        self._file: reader.Recording = opened(self.path)
+        self._file: reader.Recording = open_recording(self.path)
         self._temporary: tempfile.TemporaryDirectory[str] | None = None  # of a replay: it lives as long as this object
 
     @property

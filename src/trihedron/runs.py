@@ -15,7 +15,7 @@ from trihedron.buildings import Building
 from trihedron.comparison.runs import read_runs, rows_of
 from trihedron.pipeline.app.cli import RUN_FLAGS, run_once
 from trihedron.pipeline.core.errors import UsageError
-from trihedron.pipeline.run.results import dotted
+from trihedron.pipeline.run.results import flatten_dict
 from trihedron.recording import Recording
 from trihedron.trajectory import Trajectory
 from trihedron.words import words_of
@@ -45,7 +45,7 @@ class Run:
 
     def table(self) -> Any:
         """Return the metrics, one row a figure: a pandas DataFrame where pandas is installed, else a list of dicts."""
-        rows = [{"figure": name, "value": value} for name, value in dotted(self.metrics).items()]
+        rows = [{"figure": name, "value": value} for name, value in flatten_dict(self.metrics).items()]
         return as_table(rows)
 
 

@@ -37,7 +37,7 @@ from trihedron.pipeline.record.writer import RecordingWriter
 from trihedron.pipeline.run import results
 from trihedron.pipeline.run.map_file import save_map
 from trihedron.pipeline.run.replay import TOPICS
-from trihedron.pipeline.run.run_folder import held, write_configuration
+from trihedron.pipeline.run.run_folder import lock_folder, write_configuration
 from trihedron.pipeline.run.runner import Runner, Step
 from trihedron.pipeline.run.sinks import MemorySink, Sink
 from trihedron.pipeline.run.warm_up import WARM_UP_FRAMES, compilation_reported, warm_up
@@ -107,7 +107,7 @@ class Slam:
     def _open(self, graph: Graph, viewer: Viewer) -> None:
         """Open the run folder and its recording, then compile and load what the first frames need."""
         if self._out is not None:
-            self._stack.enter_context(held(self._out))
+            self._stack.enter_context(lock_folder(self._out))
             self._config.out = str(self._out)
             write_configuration(self._out, self._config, self._words)
         compile_once(self._runner.computed, True)

@@ -8,7 +8,7 @@ from typing import Any
 from trihedron.pipeline.core import types
 from trihedron.pipeline.core.errors import DataError
 from trihedron.pipeline.record.trajectories import write_trajectory
-from trihedron.pipeline.run.results import dotted
+from trihedron.pipeline.run.results import flatten_dict
 
 
 class Trajectory(types.Trajectory):
@@ -31,4 +31,4 @@ class Trajectory(types.Trajectory):
         """Return the errors against a true trajectory as in metrics.json: `ate_rmse_m`, `rpe_second_rmse_m` and others. Raises TrihedronError."""
         from trihedron.pipeline.run.metrics import evaluate_trajectory
 
-        return dotted(evaluate_trajectory(self, truth).to_dict())
+        return flatten_dict(evaluate_trajectory(self, truth).to_dict())

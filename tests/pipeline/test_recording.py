@@ -88,7 +88,7 @@ def test_what_cannot_be_encoded_or_shown_is_said_and_what_came_before_is_kept(tm
         def wants(self, value):
             return True
 
-        def drawn(self, value):
+        def draw_messages(self, value):
             raise ZeroDivisionError(f"frame {value.index}")
 
     writer = RecordingWriter(tmp_path / "a.mcap", {"overrides": "[]"})

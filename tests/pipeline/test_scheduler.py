@@ -194,8 +194,8 @@ CHAIN = [
 def test_what_is_kept_is_what_wires_can_still_read():
     kept = KeptValues(consumers_of(CHAIN), {"c": "initial"}, {"a": {-1: "recent"}})
     assert kept.read(Wire("c", PREVIOUS), 0) == "initial" and kept.read(Wire("a", 2), 1) == "recent" and kept.read(Wire("a", 2), 0) is None
-    assert not kept.known(Wire("a"), 0) and kept.known(Wire("a", 2), 1) and kept.known(Wire("c", PREVIOUS), 0)
-    assert list(kept.put("c", 1, "one")) == [] and not kept.known(Wire("c", PREVIOUS), 2)  # frame 0 is not done
+    assert not kept.is_known(Wire("a"), 0) and kept.is_known(Wire("a", 2), 1) and kept.is_known(Wire("c", PREVIOUS), 0)
+    assert list(kept.put("c", 1, "one")) == [] and not kept.is_known(Wire("c", PREVIOUS), 2)  # frame 0 is not done
     assert list(kept.put("c", 0, None)) == [1, 2] and kept.read(Wire("c", PREVIOUS), 1) == "initial" and kept.read(Wire("c", PREVIOUS), 2) == "one"
     for position in range(4):
         kept.put("a", position, position)

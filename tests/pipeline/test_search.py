@@ -11,7 +11,7 @@ from trihedron.pipeline.app.cli import main
 from trihedron.pipeline.core.config import graph_of, register_configs
 from trihedron.pipeline.core.errors import UsageError
 from trihedron.pipeline.core.registry import load_plugins
-from trihedron.pipeline.sweep.search import Trial, _distribution, _is_searched, _judged, followers
+from trihedron.pipeline.sweep.search import Trial, _discard_incomparable, _distribution, _is_searched, followers
 
 ROOM = ["dataset.width=160", "dataset.height=120", "dataset.length=8"]
 SEARCH = ["run", "-m", "hydra/sweeper=optuna", "hydra/launcher=basic", "hydra.sweeper.trials=2"]
@@ -87,8 +87,11 @@ def test_a_trial_that_fails_has_no_value_and_plain_values_are_averaged(tmp_path)
 def test_a_trial_that_tracks_fewer_frames_has_no_value():
     default = Trial({"a": 1}, 0.002, ["0"], tracked_share=1.0)
     trial = Trial({"a": 2}, 0.001, ["1"], tracked_share=0.9)
-    assert _judged(trial, default).objective is None and "tracks 90.0% of the frames, the default 100.0%" in _judged(trial, default).reason
-    assert _judged(replace(trial, tracked_share=1.0), default).objective == 0.001
+    assert (
+        _discard_incomparable(trial, default).objective is None
+        and "tracks 90.0% of the frames, the default 100.0%" in _discard_incomparable(trial, default).reason
+    )
+    assert _discard_incomparable(replace(trial, tracked_share=1.0), default).objective == 0.001
 
 
 @pytest.mark.parametrize(

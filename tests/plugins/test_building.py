@@ -238,7 +238,7 @@ def test_a_benchmark_that_was_stopped_goes_on(tmp_path, monkeypatch):
     monkeypatch.setattr("trihedron.tools.benchmark.measure", measure)
     (tmp_path / "flat.kinect.1.unfinished").mkdir()
     for _ in range(2):
-        assert [building_benchmark._tracked("flat", "kinect", seed, 15.0, tmp_path / f"flat.kinect.{seed}").name for seed in range(2)] == [
+        assert [building_benchmark._track_scene("flat", "kinect", seed, 15.0, tmp_path / f"flat.kinect.{seed}").name for seed in range(2)] == [
             "flat.kinect.0", "flat.kinect.1"
         ]  # fmt: skip
     assert began == ["flat.kinect.0.unfinished", "flat.kinect.1.unfinished"]

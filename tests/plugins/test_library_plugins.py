@@ -18,7 +18,7 @@ from trihedron.pipeline.run.scheduler import single_threaded_libraries
 from trihedron.plugins.keypoints.opencv_orb import OpenCvOrb
 from trihedron.plugins.keypoints.sift import Sift
 from trihedron.plugins.loop.bag_of_words import as_vectors
-from trihedron.plugins.pose.open3d_odometry import OdometryMethod, Open3dOdometry, halved
+from trihedron.plugins.pose.open3d_odometry import OdometryMethod, Open3dOdometry, halve_rgbd
 from trihedron.tools.plugin_check import PluginCheck, room, values_of
 
 CAMERA = Camera(640, 480, 525.0, 525.0, 319.5, 239.5)
@@ -89,7 +89,7 @@ def test_depth_is_halved_without_a_mean_over_an_edge():
     depth = np.full((9, 13), 2.0, np.float32)
     depth[:, 6:], depth[:, 10] = 3.0, 0.0
     color = np.full((9, 13, 3), 200, np.uint8)
-    smaller, halves = halved(color, depth, 0.1)
+    smaller, halves = halve_rgbd(color, depth, 0.1)
     assert smaller.shape == (4, 6, 3) and (smaller == 200).all()
     assert np.array_equal(halves, np.tile(np.float32([2, 2, 2, 3, 3, 0]), (4, 1)))
 

@@ -5,7 +5,7 @@ import pytest
 
 from trihedron.pipeline.core.table import Column, Table
 from trihedron.pipeline.core.types import Map, Pose
-from trihedron.plugins.pose.world_uncertainty import carried, covariance_of_keyframes, keyframe_uncertainty
+from trihedron.plugins.pose.world_uncertainty import covariance_of_keyframes, keyframe_uncertainty, propagate_world_covariance
 from trihedron.plugins.shared.pose_optimizer import residual_scale
 
 
@@ -46,7 +46,7 @@ def test_a_pose_that_was_not_refined_carries_the_uncertainty_of_the_map():
     previous = Pose(0, 0, np.eye(4), 5.0 * np.eye(6), np.eye(4), 0, np.zeros(3, np.int32), 0, "ok", "", 0, 0, np.diag([0, 0, 0, 1e-4, 0, 0]), 2.0)
     T = np.eye(4)
     T[2, 3] = 2.0
-    pose = carried(Pose(1, 1, T, np.eye(6), np.eye(4), 0, np.zeros(3, np.int32), 0, "degraded", ""), previous)
+    pose = propagate_world_covariance(Pose(1, 1, T, np.eye(6), np.eye(4), 0, np.zeros(3, np.int32), 0, "degraded", ""), previous)
     assert pose.map_covariance[[1, 3, 0], [1, 3, 0]] == pytest.approx([4e-4, 1e-4, 0.0])
     assert pose.noise_scale == 2.0 and pose.local_covariance == pytest.approx(np.eye(6))
     assert pose.covariance == pytest.approx(2.0 * np.eye(6) + pose.map_covariance)

@@ -29,7 +29,7 @@ from trihedron.comparison.ablation_tables import (
 )
 from trihedron.comparison.frame_errors import read_errors, write_errors
 from trihedron.comparison.partings import Parting, StageErrors, changed_by_code, distance
-from trihedron.comparison.swaps import combinations_of, folder_name, parsed, single_swaps
+from trihedron.comparison.swaps import combinations_of, folder_name, parse_swaps, single_swaps
 from trihedron.pipeline.app.cli import main
 from trihedron.pipeline.core.errors import DataError, UsageError
 from trihedron.pipeline.core.slots import SLOTS
@@ -49,13 +49,13 @@ SMALL = ["dataset.width=320", "dataset.height=240", "threads=1"]
 
 def case(number, figures, stages=("manhattan", "rotation")):
     """Alternatives of one recording: all combinations of one change a stage, with these ATE."""
-    combinations = combinations_of(parsed([f"{stage}=other" for stage in stages]))
+    combinations = combinations_of(parse_swaps([f"{stage}=other" for stage in stages]))
     variants = [Variant(one, f"{number}/{one.label}", {"ATE mm": ate, "ms": 1.0}, 1.0, 1.1) for one, ate in zip(combinations, figures)]
     return Case(f"{number}/run.mcap", 10, list(stages), [], np.nan, 4.4, variants)
 
 
 def test_swaps_are_combined_by_stage():
-    swaps = parsed(["planes.angle_deg=2,3", "planes.min_points=100", "manhattan=mean_shift,plane_svd", "graph.tracks.manhattan=manhattan@prev"])
+    swaps = parse_swaps(["planes.angle_deg=2,3", "planes.min_points=100", "manhattan=mean_shift,plane_svd", "graph.tracks.manhattan=manhattan@prev"])
     assert [(swap.stage, len(swap.levels)) for swap in swaps] == [("planes", 6), ("manhattan", 3), ("tracks", 2)]
     combinations = combinations_of(swaps)
     assert len(combinations) == 36 and combinations[0].label == "as recorded" and combinations[0].stages == frozenset()
@@ -93,7 +93,7 @@ def test_every_pair_of_alternatives_has_a_verdict():
 
 
 def test_in_the_open_loop_each_swap_is_by_itself_and_compared_within_its_stage():
-    single = single_swaps(parsed(["planes=a", "manhattan=b,c"]))
+    single = single_swaps(parse_swaps(["planes=a", "manhattan=b,c"]))
     assert [one.label for one in single] == ["as recorded", "planes=a", "manhattan=b", "manhattan=c"]
     noise = np.random.default_rng(0).normal(0.0, 0.2, 6)
     cases = []
@@ -104,7 +104,7 @@ def test_in_the_open_loop_each_swap_is_by_itself_and_compared_within_its_stage()
     assert list(found) == [(single[0].label, "planes=a"), *combinations(["as recorded", "manhattan=b", "manhattan=c"], 2)]
     assert found["as recorded", "planes=a"].answer == "equal" and found["as recorded", "manhattan=b"].answer == "worse"
     with pytest.raises(UsageError, match="these values make 65 alternatives, more than 64; give fewer values at once"):
-        single_swaps(parsed([f"planes.angle_deg={','.join(map(str, range(64)))}"]))
+        single_swaps(parse_swaps([f"planes.angle_deg={','.join(map(str, range(64)))}"]))
     least = min(found.values(), key=lambda one: one.p)
     assert least.corrected == pytest.approx(3 * least.p)  # the pair that is equal by construction does not count
 
@@ -212,10 +212,10 @@ def translation(index, x):
 
 
 def test_a_star_stands_for_all_plugins_that_can_be_chosen_alone():
-    (swap,) = parsed(["pose=*"])
+    (swap,) = parse_swaps(["pose=*"])
     names = {word.partition("=")[2] for (word,) in swap.levels[1:]}
     assert {"refine", "direct", "open3d_icp"} <= names and not {"icp", "none"} & names  # icp needs a model
-    (swap,) = parsed(["lines=*"])
+    (swap,) = parse_swaps(["lines=*"])
     assert ("lines=onnx",) not in swap.levels  # which needs a file
 
 
@@ -242,7 +242,7 @@ def test_every_plugin_is_computed_alone_on_the_recorded_past_of_another(tmp_path
     room = ["dataset.width=320", "dataset.height=240", "dataset.length=8", "model=tsdf"]
     assert main(["run", *room, f"out={tmp_path}/run"]) == 0
     recorded = {topic for topic in Recording(tmp_path / "run" / "run.mcap").topics if topic in SLOTS}
-    slots = [slot for slot in SLOTS if slot in recorded and len(parsed([f"{slot}=*"])[0].levels) > 2]
+    slots = [slot for slot in SLOTS if slot in recorded and len(parse_swaps([f"{slot}=*"])[0].levels) > 2]
     assert {"planes", "manhattan", "tracks", "rotation", "translation", "matches", "pose"} <= set(slots)
     for slot in slots:
         assert main(["ablate", f"{tmp_path}/run", f"{slot}=*", "feedback=recorded", f"out={tmp_path}/{slot}"]) == 0, capsys.readouterr().err

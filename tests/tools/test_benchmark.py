@@ -9,7 +9,7 @@ import pytest
 
 from trihedron.pipeline.app.cli import main
 from trihedron.tools.benchmark import measure
-from trihedron.tools.benchmark_comparison import compared
+from trihedron.tools.benchmark_comparison import comparison_table
 
 FIGURES = {
     "frames": 10, "threads": 2, "fps": 50.0, "frame_ms": {"p50": 20.0, "p95": 30.0}, "reference_ms": 10.0,
@@ -23,7 +23,7 @@ def test_a_slower_machine_makes_nothing_slower():
     slow["reference_ms"], slow["fps"], slow["frame_ms"]["p50"] = 20.0, 25.0, 40.0
     for stage in slow["stages"].values():
         stage["p50_ms"] *= 2.0
-    said = compared(FIGURES, slow)
+    said = comparison_table(FIGURES, slow)
     assert "nothing became slower" in said and said.count("+0 %") == 4
 
 
@@ -31,7 +31,7 @@ def test_what_became_slower_is_named_and_tiny_stages_are_not():
     new = copy.deepcopy(FIGURES)
     new["stages"]["planes"]["p50_ms"], new["stages"]["loop"]["p50_ms"] = 6.0, 0.1
     new["stages"]["lines"] = {"p50_ms": 1.0, "p95_ms": 1.0}
-    said = compared(FIGURES, new)
+    said = comparison_table(FIGURES, new)
     assert said.splitlines()[-1] == "slower: planes"
     assert "+20 %" in said and "new" in said
 

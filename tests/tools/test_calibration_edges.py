@@ -10,7 +10,7 @@ import pytest
 
 from trihedron.pipeline.core.types import F32, F64, U8, Camera, Frame
 from trihedron.tools.calibrate import REGISTRATIONS, _by_edges
-from trihedron.tools.calibration_edges import NAMES, Edges, edges_of, registered
+from trihedron.tools.calibration_edges import NAMES, Edges, edges_of, register_depth
 from trihedron.tools.calibration_judgement import Judgement, blocks_of
 
 CAMERA = Camera(320, 240, 262.5, 262.5, 159.5, 119.5)
@@ -58,7 +58,7 @@ def edges(wrong: bool) -> Edges:
 
 
 def test_scale_shift_offset_and_delay_are_found() -> None:
-    found = registered(edges(True), range(len(NAMES)))
+    found = register_depth(edges(True), range(len(NAMES)))
     sigmas, errors = np.sqrt(np.diag(found.covariance)), found.parameters - TRUE
     print(found.parameters, sigmas)
     assert (np.abs(errors) < 4.0 * sigmas + [0.002, 0.7, 0.7, 0.003, 0.003, 0.003]).all()

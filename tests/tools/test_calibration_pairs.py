@@ -61,7 +61,7 @@ def pairs_of(hidden: dict[str, float], seed: int) -> Pairs:
                 motions.append(invert(pose(times[j])) @ pose(times[i]))
                 of.append(blocks[i])
     pair = np.repeat(np.arange(len(of)), POINTS)
-    return Pairs(CAMERA, Observations.joined(first), Observations.joined(second), pair, np.array(motions), np.array(of))
+    return Pairs(CAMERA, Observations.concatenate(first), Observations.concatenate(second), pair, np.array(motions), np.array(of))
 
 
 @pytest.mark.parametrize("name", NAMES)

@@ -14,8 +14,8 @@ SMALL = ["dataset.width=160", "dataset.height=120"]
 
 def test_frames_come_forwards_and_backwards():
     shown = BackAndForth((None,) * 4, 20)
-    assert [shown.shown(index) for index in range(9)] == [0, 1, 2, 3, 2, 1, 0, 1, 2] and len(shown) == 20
-    assert [BackAndForth((None,), 3).shown(index) for index in range(3)] == [0, 0, 0]
+    assert [shown.source_index(index) for index in range(9)] == [0, 1, 2, 3, 2, 1, 0, 1, 2] and len(shown) == 20
+    assert [BackAndForth((None,), 3).source_index(index) for index in range(3)] == [0, 0, 0]
 
 
 @pytest.mark.parametrize("worse, verdict", [({}, 0), ({"memory_mb": 530.0}, 1), ({"handles": 8}, 1), ({"p95_ms": 34.0}, 1), ({"multiple": 1.2}, 1)])

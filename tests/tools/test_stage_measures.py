@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from trihedron.comparison.partings import StageErrors
-from trihedron.comparison.stage_measures import MEASURES, Seen, measured
+from trihedron.comparison.stage_measures import MEASURES, Seen, stage_errors
 from trihedron.pipeline.core.geometry import pose_matrix
 from trihedron.pipeline.core.lie import exp_so3
 from trihedron.pipeline.core.types import LineSegments, Normals
@@ -30,7 +30,7 @@ def seen(step, **values):
 
 
 def errors(topic, before=None, **values):
-    return measured(topic, seen(NOW, **values), before or seen(BEFORE))
+    return stage_errors(topic, seen(NOW, **values), before or seen(BEFORE))
 
 
 def with_share(values, share, seed=0):
@@ -89,7 +89,7 @@ def test_normals_that_are_askew():
         normals.append(Normals(step, frame.stamp_ns, table[planes.labels], 8))
     before = Seen({"dataset": frames[0], "normals": normals[0]}, camera_at(BEFORE))
     turned = replace(normals[1], normals=(normals[1].normals @ exp_so3(np.radians([0.0, 0.0, 2.0]))).astype(np.float32))
-    found = [measured("normals", Seen({"dataset": frames[1], "normals": one}, camera_at(NOW)), before) for one in (normals[1], turned)]
+    found = [stage_errors("normals", Seen({"dataset": frames[1], "normals": one}, camera_at(NOW)), before) for one in (normals[1], turned)]
     right, askew = (one["normals deg"] for one in found)
     assert right < 0.05 and 0.5 < askew <= 2.01  # a turn about the optical axis moves normals that are across it by 2 degrees
 
@@ -138,7 +138,7 @@ def estimates(T):
 
 @pytest.mark.parametrize("topic", ["rotation", "translation", "pose"])
 def test_a_right_motion_closes_the_cycle_and_warps_the_depth(topic):
-    found = measured(topic, moved(NOW), moved(BEFORE))
+    found = stage_errors(topic, moved(NOW), moved(BEFORE))
     assert found[f"{topic} cycle px"] < 0.01 and found[f"{topic} depth mm"] < 0.5
 
 
@@ -146,8 +146,8 @@ def test_a_right_motion_closes_the_cycle_and_warps_the_depth(topic):
 def test_a_motion_towards_a_wall_that_is_20_mm_off_is_20_mm_off_in_depth(topic):
     wall, T, off = {"dataset": EXACT.frame(0)}, np.eye(4), pose_matrix(np.eye(3), np.array([0.0, 0.0, 0.02]))
     before, now = (Seen({**moved(BEFORE).values, **wall, **estimates(one)}, T) for one in (T, off))
-    assert measured(topic, now, before)[f"{topic} depth mm"] == pytest.approx(20.0, abs=0.01)
-    assert measured("rotation", now, before)["rotation depth mm"] == pytest.approx(0.0, abs=0.01)  # with the known translation
+    assert stage_errors(topic, now, before)[f"{topic} depth mm"] == pytest.approx(20.0, abs=0.01)
+    assert stage_errors("rotation", now, before)["rotation depth mm"] == pytest.approx(0.0, abs=0.01)  # with the known translation
 
 
 def test_a_rotation_about_the_optical_axis_moves_points_by_their_radius():
@@ -156,7 +156,9 @@ def test_a_rotation_about_the_optical_axis_moves_points_by_their_radius():
     deep = tracks.keypoints[np.isfinite(tracks.points_m).all(axis=1), 1]
     radii = np.linalg.norm(keypoints.pixels[deep] - [319.5, 239.5], axis=1)
     for topic in ("rotation", "translation", "pose"):
-        assert measured(topic, off, moved(BEFORE))[f"{topic} cycle px"] == pytest.approx(2.0 * np.sin(np.radians(0.5)) * np.median(radii), rel=0.02)
+        assert stage_errors(topic, off, moved(BEFORE))[f"{topic} cycle px"] == pytest.approx(
+            2.0 * np.sin(np.radians(0.5)) * np.median(radii), rel=0.02
+        )
 
 
 def test_frames_follow_each_other_and_the_first_has_no_error():
@@ -174,5 +176,5 @@ def test_a_measure_without_what_it_needs_says_nothing():
     for topic in ("planes", "keypoints", "segments"):
         value = seen(NOW).values[topic]
         assert type(value) in MEASURES
-        assert measured(topic, Seen({topic: value}, camera_at(NOW)), Seen({}, camera_at(BEFORE))) == {}
-        assert measured(topic, seen(NOW), None) == {}
+        assert stage_errors(topic, Seen({topic: value}, camera_at(NOW)), Seen({}, camera_at(BEFORE))) == {}
+        assert stage_errors(topic, seen(NOW), None) == {}

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from trihedron.comparison.mesh_distance import FAR_M, NearestTriangle, sampled
+from trihedron.comparison.mesh_distance import FAR_M, NearestTriangle, sample_triangles
 from trihedron.comparison.mesh_files import read_mesh
 from trihedron.comparison.surface_errors import mesh_errors
 from trihedron.comparison.surface_truth import Truth, truth_of
@@ -101,7 +101,7 @@ def corner(island_m=0.1):
 
 
 def test_the_picture_shows_the_room_without_its_ceiling_and_without_islands():
-    picture, count = export_picture.drawn(corner(), (320, 200))
+    picture, count = export_picture.draw_surface(corner(), (320, 200))
     assert picture.shape == (200, 320, 3) and count == 6  # floor and walls
     half = picture[:, 160:] if (picture[100, 157:163] == 255).all() else picture[100:]
     drawn = (half != 255).any(axis=2)
@@ -110,8 +110,8 @@ def test_the_picture_shows_the_room_without_its_ceiling_and_without_islands():
     colors, counts = np.unique(half.reshape(-1, 3), axis=0, return_counts=True)
     flat = colors[np.argsort(-counts)[:4]].astype(int)  # paper and three planes
     assert min(np.abs(a - b).max() for i, a in enumerate(flat) for b in flat[:i]) > 25
-    assert export_picture.drawn(corner(island_m=2.0), (32, 20))[1] == 8
-    assert (export_picture.drawn(Surface.empty(0, 0))[0] == np.full((1200, 1920, 3), 255)).all()
+    assert export_picture.draw_surface(corner(island_m=2.0), (32, 20))[1] == 8
+    assert (export_picture.draw_surface(Surface.empty(0, 0))[0] == np.full((1200, 1920, 3), 255)).all()
 
 
 def test_planes_json_holds_identity_boundary_and_equation(tmp_path):
@@ -148,7 +148,7 @@ def test_mistakes_of_export_are_one_line(tmp_path):
 
 
 def square_truth():
-    nearest, seen = NearestTriangle(SQUARE, TWO), sampled(SQUARE, TWO, 0.02)[0]
+    nearest, seen = NearestTriangle(SQUARE, TWO), sample_triangles(SQUARE, TWO, 0.02)[0]
 
     def distance(points):
         return nearest.query(points)[0], points[:, 0] > 1.0

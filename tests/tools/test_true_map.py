@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from trihedron.comparison.error_budget import recomputed, rewrite, true_poses
+from trihedron.comparison.error_budget import dependent_stages, rewrite, true_poses
 from trihedron.comparison.true_map import true_map
 from trihedron.pipeline.app.cli import main
 from trihedron.pipeline.core.geometry import pose_matrix, rotation_from_quaternion
@@ -118,7 +118,7 @@ def test_a_known_drift_is_removed(last):
 
 def test_what_depends_on_a_true_stage_is_computed_again(recording):
     """A true map is given, so what corrects it is not computed; poses feed back into rotation and translation, which are."""
-    after_map = recomputed(recording, ("map",))
+    after_map = dependent_stages(recording, ("map",))
     assert {"rotation", "translation", "matches", "pose"} <= set(after_map) and not {"map", "bundle", "loop"} & set(after_map)
-    assert {"map", "bundle", "matches", "pose", "translation"} <= set(recomputed(recording, ("rotation",)))
-    assert not {"keypoints", "planes", "normals"} & set(recomputed(recording, ()))
+    assert {"map", "bundle", "matches", "pose", "translation"} <= set(dependent_stages(recording, ("rotation",)))
+    assert not {"keypoints", "planes", "normals"} & set(dependent_stages(recording, ()))

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from scipy.stats import norm, t
 
-from trihedron.comparison.block_bootstrap import block_length, resampled
-from trihedron.comparison.verdicts import Column, Sample, Verdict, line_of, named, recordings_needed, verdicts_of
+from trihedron.comparison.block_bootstrap import block_length, bootstrap_blocks
+from trihedron.comparison.verdicts import Column, Sample, Verdict, comparison_name, line_of, recordings_needed, verdicts_of
 
 ATE = {"ATE mm": Column(2)}
 DIFFERENCE = [-1.0, 1.0]
@@ -37,7 +37,7 @@ def sample(values, **figures):
 def test_the_interval_covers_the_true_difference(memory, frames):
     rng, covered = np.random.default_rng(2), []
     for _ in range(200):
-        found = resampled(errors(rng, frames, memory, 1.0, 1.2), DIFFERENCE, 30)
+        found = bootstrap_blocks(errors(rng, frames, memory, 1.0, 1.2), DIFFERENCE, 30)
         if found.error is not None:
             covered.append(abs(found.value - 0.2) <= t.ppf(0.975, found.blocks - 1) * found.error)
     assert len(covered) > 190 and 0.90 <= np.mean(covered) <= 0.98
@@ -49,7 +49,7 @@ def test_the_interval_of_a_share_covers_the_true_difference(memory):
     rng, covered = np.random.default_rng(3), []
     for _ in range(200):
         a, b = (100.0 * (series < z) for series, z in zip(autoregressive(rng, 2, 900, memory), norm.ppf([0.8, 0.7])))
-        found = resampled([a, b], DIFFERENCE, 30, 1)
+        found = bootstrap_blocks([a, b], DIFFERENCE, 30, 1)
         assert found.value == pytest.approx(np.mean(b) - np.mean(a), abs=1e-9)
         if found.error is not None:
             covered.append(abs(found.value + 10.0) <= t.ppf(0.975, found.blocks - 1) * found.error)
@@ -146,8 +146,8 @@ def test_the_number_of_seeds_shows_5_percent_in_8_of_10_simulated_studies(kind, 
 def test_seeds_are_seeds_of_the_recording_that_was_resampled():
     """The spread that one recording's blocks foretell is that of the differences of further recordings."""
     rng = np.random.default_rng(6)
-    foretold = np.median([resampled(errors(rng, 600, 0.8, 10.0, 10.0), DIFFERENCE, 30).error for _ in range(60)])
-    differences = [resampled(errors(rng, 600, 0.8, 10.0, 10.0), DIFFERENCE, 600).value for _ in range(200)]
+    foretold = np.median([bootstrap_blocks(errors(rng, 600, 0.8, 10.0, 10.0), DIFFERENCE, 30).error for _ in range(60)])
+    differences = [bootstrap_blocks(errors(rng, 600, 0.8, 10.0, 10.0), DIFFERENCE, 600).value for _ in range(200)]
     assert foretold == pytest.approx(np.std(differences), rel=0.15)
 
 
@@ -194,6 +194,6 @@ def test_the_words_of_a_short_recording():
 
 
 def test_the_names_of_a_pair():
-    assert named("planes.angle_deg=2", "planes.angle_deg=3") == "planes.angle_deg=2 against 3"
-    assert named("as recorded", "bundle=none") == "as recorded against bundle=none"
-    assert named("bundle=none", "bundle=none loop=none") == "bundle=none against bundle=none loop=none"
+    assert comparison_name("planes.angle_deg=2", "planes.angle_deg=3") == "planes.angle_deg=2 against 3"
+    assert comparison_name("as recorded", "bundle=none") == "as recorded against bundle=none"
+    assert comparison_name("bundle=none", "bundle=none loop=none") == "bundle=none against bundle=none loop=none"

@@ -51,14 +51,14 @@ def main(argv: list[str]) -> int:
         raise UsageError("benchmark building", f"--seeds {options.seeds} is out of range", "give 1 to 100")
     if not 1.0 <= options.fps <= 60.0:
         raise UsageError("benchmark building", f"--fps {options.fps:g} is out of range", "give 1 to 60")
-    scenes, sensors = _listed("scene", options.scenes, SCENES), _listed("sensor", options.sensors, SENSORS)
+    scenes, sensors = _split_names("scene", options.scenes, SCENES), _split_names("sensor", options.sensors, SENSORS)
     found: dict[str, list[dict[str, float]]] = {}
     with tempfile.TemporaryDirectory() as folder:
         for scene in scenes:
             for sensor in sensors:
                 runs = [(options.out or Path(folder)) / f"{scene}.{sensor}.{seed}" for seed in range(options.seeds)]
                 found[f"{scene} {sensor}"] = [
-                    _figures(_tracked(scene, sensor, seed, options.fps, run), options.plugin, options.anew) for seed, run in enumerate(runs)
+                    _figures(_track_scene(scene, sensor, seed, options.fps, run), options.plugin, options.anew) for seed, run in enumerate(runs)
                 ]
     print(report(found))
     if options.json:
@@ -66,7 +66,7 @@ def main(argv: list[str]) -> int:
     return 0
 
 
-def _listed(kind: str, names: str, known: tuple[str, ...]) -> list[str]:
+def _split_names(kind: str, names: str, known: tuple[str, ...]) -> list[str]:
     """Return the names of a list with commas. Raises UsageError for an unknown one."""
     listed = [name for name in names.split(",") if name]
     for name in listed:
@@ -75,7 +75,7 @@ def _listed(kind: str, names: str, known: tuple[str, ...]) -> list[str]:
     return listed
 
 
-def _tracked(scene: str, sensor: str, seed: int, fps: float, out: Path) -> Path:
+def _track_scene(scene: str, sensor: str, seed: int, fps: float, out: Path) -> Path:
     """Return the folder of one run, tracked in a process of its own unless it is there. A run that was stopped is begun again."""
     from trihedron.tools.benchmark import measure
 

@@ -90,7 +90,7 @@ def main(argv: list[str]) -> int:
     scenes = {name: views_of(options.pairs, **changes) for name, changes in SCENES.items()}
     found: dict[str, Any] = {}
     for slot in options.slots.split(","):
-        found[slot] = judged(slot, scenes)
+        found[slot] = judge_plugins(slot, scenes)
         print(report(slot, found[slot]), end="\n\n", flush=True)
     if options.json:
         options.json.write_text(json.dumps(found, indent=1) + "\n")
@@ -109,7 +109,7 @@ def _view(data: Synthetic, index: int) -> TrueView:
     return TrueView(frame, data.true_pose(index), *data.true_planes(index))
 
 
-def judged(slot: str, scenes: dict[str, list[tuple[TrueView, TrueView]]]) -> dict[str, Any]:
+def judge_plugins(slot: str, scenes: dict[str, list[tuple[TrueView, TrueView]]]) -> dict[str, Any]:
     """Plugin -> scene -> figures; for one that cannot run here, why."""
     found: dict[str, Any] = {}
     for name, kind in plugins_of(slot).items():
@@ -125,17 +125,17 @@ def judged(slot: str, scenes: dict[str, list[tuple[TrueView, TrueView]]]) -> dic
 
 def _figures(slot: str, kind: type[Any], pairs: list[tuple[TrueView, TrueView]]) -> Figures:
     plugin = kind()
-    _called(plugin, slot, pairs[0][0])  # compiles
+    _call_plugin(plugin, slot, pairs[0][0])  # compiles
     values, spent = [], []
     for pair in pairs:
         began = time.perf_counter()
-        values.append(tuple(_called(plugin, slot, view) for view in pair))
+        values.append(tuple(_call_plugin(plugin, slot, view) for view in pair))
         spent.append(0.5e3 * (time.perf_counter() - began))
     rows = [JUDGES[slot](*pair, *value) for pair, value in zip(pairs, values)]
     return {key: float(np.mean([row[key] for row in rows])) for key in rows[0]} | {"ms": statistics.median(spent)}
 
 
-def _called(plugin: Any, slot: str, view: TrueView) -> Any:
+def _call_plugin(plugin: Any, slot: str, view: TrueView) -> Any:
     given = {"frame": view.frame, "normals": view.normals, "rng": np.random.default_rng(0)}
     return plugin(**{name: given[name] for name in parameters_of_method(slot, type(plugin))})
 

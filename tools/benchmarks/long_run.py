@@ -51,13 +51,13 @@ class BackAndForth:
 
     def __call__(self, index: int) -> Frame | None:
         """The frame shown at place `index`, as if it were new."""
-        return replace(self.frames[self.shown(index)], index=index, stamp_ns=index * PERIOD_NS)
+        return replace(self.frames[self.source_index(index)], index=index, stamp_ns=index * PERIOD_NS)
 
     def truth(self) -> Trajectory | None:
         """None: the errors are this command's to count."""
         return None
 
-    def shown(self, index: int) -> int:
+    def source_index(self, index: int) -> int:
         """Frames that are shown."""
         there = index % max(2 * len(self.frames) - 2, 1)
         return min(there, 2 * len(self.frames) - 2 - there)
@@ -128,7 +128,7 @@ def measure(graph: Graph, path: Path, count: int, loop: int, span: int) -> list[
 
 def _off_mm(pose: Pose, places: F64, shown: BackAndForth) -> float:
     """Error of the position, in the world of the first frame."""
-    true = np.linalg.solve(places[0], places[shown.shown(pose.index)])
+    true = np.linalg.solve(places[0], places[shown.source_index(pose.index)])
     return 1e3 * float(np.linalg.norm(true[:3, 3] - pose.T_world_camera[:3, 3]))
 
 

@@ -125,7 +125,7 @@ class Scene:
         return np.where(cosine.max(axis=1) > np.cos(np.radians(0.1)), cosine.argmax(axis=1), -1).astype(np.int8)
 
     @cached_property
-    def rendered(self) -> tuple[Geometry, Atlas]:
+    def geometry_and_atlas(self) -> tuple[Geometry, Atlas]:
         """Scene in the form that the ray tracer takes."""
         return geometry_of(self.room), bake(all_faces(self.room), True, 0)
 
@@ -146,7 +146,7 @@ def views(scene: Scene, index: int, without_frame: bool) -> Iterator[tuple[str, 
     R = rotation_from_quaternion(rng.standard_normal(4))
     middle = np.array([*np.mean(RECTANGLE, axis=0), HEIGHT_M / 2.0])
     position = middle + scene.shear @ (rng.uniform(*FREE_M) - middle)
-    geometry, atlas = scene.rendered
+    geometry, atlas = scene.geometry_and_atlas
     color, exact, faces, cosine = render(geometry, atlas, _camera("clean"), pose_matrix(R, position))
     if without_frame and scene.shows_right_angle(faces):
         return
@@ -163,7 +163,7 @@ def views(scene: Scene, index: int, without_frame: bool) -> Iterator[tuple[str, 
 
 def gray_images(count: int) -> list[U8]:
     """The images of the first views of the Manhattan room, for the reference workload."""
-    (geometry, atlas), found = scenes()[WHOLE].rendered, []
+    (geometry, atlas), found = scenes()[WHOLE].geometry_and_atlas, []
     for index in range(count):
         rng = np.random.default_rng([7, index])
         R = rotation_from_quaternion(rng.standard_normal(4))
@@ -181,11 +181,11 @@ def _features(frame: Frame) -> tuple[Normals, Segments, Planes]:
     """By the default feature stages."""
     values: dict[str, Any] = {"frame": frame}
     for slot, name in STAGES.items():
-        values[slot] = called(plugin_class(slot, name)(), slot, frame.index, values)
+        values[slot] = call_stage(plugin_class(slot, name)(), slot, frame.index, values)
     return values["normals"], values["segments"], values["planes"]
 
 
-def called(plugin: Any, slot: str, index: int, given: dict[str, Any]) -> Any:
+def call_stage(plugin: Any, slot: str, index: int, given: dict[str, Any]) -> Any:
     """Call a stage with those of the inputs that it takes, and with the randomness of its frame."""
     return plugin(**inputs_of(plugin, slot, index, given))
 
@@ -221,7 +221,7 @@ def case_of(view: DirectionView, case: str) -> DirectionView | None:
         visible = view.covered * (1.0 - CLUTTERED) >= AXIS_SHARE
     if visible.sum() < 2:
         return None
-    return _cluttered(view, np.random.default_rng([9, view.normals.index])) if case == CLUTTER else view
+    return _add_clutter(view, np.random.default_rng([9, view.normals.index])) if case == CLUTTER else view
 
 
 def _only(view: DirectionView, cells: Bool, rows: Bool) -> DirectionView:
@@ -239,7 +239,7 @@ def _without_lines(view: DirectionView) -> DirectionView:
     return replace(view, segments=replace(s, **none))
 
 
-def _cluttered(view: DirectionView, rng: np.random.Generator) -> DirectionView:
+def _add_clutter(view: DirectionView, rng: np.random.Generator) -> DirectionView:
     """Half of all cells and lines turned any way; the lines about their middles."""
     normals, ends = view.normals.normals.copy(), view.segments.endpoints_m.copy()
     cells = (rng.random(normals.shape[:2]) < CLUTTERED) & np.isfinite(normals[..., 0])

@@ -120,14 +120,14 @@ def _reading(folder: Path, count: int) -> list[tuple[str, bool]]:
     begin = count * 2 // 3 // len(of_frame) * len(of_frame)
     longest, topics = 0.0, 0
     for frame in np.linspace(begin, min(begin + len(of_frame), count) - 1, 10).astype(int).tolist():
-        seconds, topics = min(_opened(path, frame) for _ in range(3))
+        seconds, topics = min(_time_to_open(path, frame) for _ in range(3))
         longest = max(longest, seconds)
     size = path.stat().st_size / 1e6
     text = f"{count} frames, {size:.0f} MB: opened and the {topics} topics of one frame read in {longest:.3f} s, under {MOST_OPEN_S} s"
     return [(text, longest < MOST_OPEN_S and topics > 1)]
 
 
-def _opened(path: Path, frame: int) -> tuple[float, int]:
+def _time_to_open(path: Path, frame: int) -> tuple[float, int]:
     """Seconds for opening a recording and reading a frame, and the number of its topics."""
     began = time.perf_counter()
     topics = len(Recording(path).frame(frame))

@@ -74,7 +74,7 @@ def main(argv: list[str]) -> int:
     else:
         for part, rows in {part: _rows(part, options.lengths) for part in options.parts}.items():
             words = [*OF_PART.get(part, []), *options.overrides]
-            figures[part] = [_measured(part, name, [*words, *overrides]) for name, overrides in rows.items()]
+            figures[part] = [_measure_run(part, name, [*words, *overrides]) for name, overrides in rows.items()]
             print(report(part, figures[part]) + "\n", flush=True)
             _write(figures, options.json)
     if options.png:
@@ -102,7 +102,7 @@ def _rows(part: str, lengths: str) -> dict[str, list[str]]:
     return {word: [f"dataset.length={word}"] for word in lengths.split(",")}
 
 
-def _measured(part: str, name: str, overrides: Sequence[str]) -> dict[str, Any]:
+def _measure_run(part: str, name: str, overrides: Sequence[str]) -> dict[str, Any]:
     """One run: ms of a frame's stages, throughput, size of the map, memory and error."""
     with tempfile.TemporaryDirectory() as folder:
         out = Path(folder) / "run"

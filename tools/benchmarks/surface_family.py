@@ -48,15 +48,15 @@ def main(argv: list[str]) -> int:
         if name not in known:
             raise UsageError("benchmark surface", f"there is no surface '{name}'", did_you_mean(name, known))
     with tempfile.TemporaryDirectory() as folder:
-        run = options.run or tracked(Path(folder) / "run", options.frames)
-        figures = measured(run, names)
+        run = options.run or track_room(Path(folder) / "run", options.frames)
+        figures = measure_surfaces(run, names)
     print(report(figures))
     if options.json:
         options.json.write_text(json.dumps(figures, indent=2) + "\n")
     return 0
 
 
-def tracked(out: Path, frames: int) -> Path:
+def track_room(out: Path, frames: int) -> Path:
     """Track the room in a process of its own, which ends with the default surface. Returns the run folder."""
     from trihedron.tools.benchmark import measure
 
@@ -66,9 +66,9 @@ def tracked(out: Path, frames: int) -> Path:
     return out
 
 
-def measured(run: Path, names: list[str]) -> dict[str, Any]:
+def measure_surfaces(run: Path, names: list[str]) -> dict[str, Any]:
     """The figures of each surface over the recording of a run."""
-    from trihedron.comparison.surface_errors import mesh_errors, prepared
+    from trihedron.comparison.surface_errors import alignment_and_truth, mesh_errors
     from trihedron.pipeline.run.scheduler import single_threaded_libraries
 
     recording = Recording(run / "run.mcap")
@@ -85,7 +85,7 @@ def measured(run: Path, names: list[str]) -> dict[str, Any]:
                 fold.add(frame, inputs)
         for fold in folds.values():
             fold.finish(maps[-1] if maps else None)
-    T, truth = prepared(run / "trajectory.txt", recording.path)
+    T, truth = alignment_and_truth(run / "trajectory.txt", recording.path)
     found = {}
     for name, fold in folds.items():
         vertices = fold.surface.vertices_m.astype(np.float64) @ T[:3, :3].T + T[:3, 3]

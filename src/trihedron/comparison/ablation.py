@@ -18,7 +18,7 @@ from trihedron.comparison.attribution import nees_of
 from trihedron.comparison.fold_measures import of_folds
 from trihedron.comparison.frame_errors import Errors, errors_file, of_result, of_trajectory, read_errors, write_errors
 from trihedron.comparison.partings import Parting, StageErrors, changed_by_code, reference_of
-from trihedron.comparison.swaps import Combination, combinations_of, folder_name, parsed, single_swaps, without_repeats
+from trihedron.comparison.swaps import Combination, combinations_of, folder_name, parse_swaps, single_swaps, without_repeats
 from trihedron.pipeline.app.alternatives import Alternatives, Outcome, alternatives_of
 from trihedron.pipeline.app.execute import MAX_THREADS, RECORDING
 from trihedron.pipeline.core.config import Feedback
@@ -102,7 +102,7 @@ def ablate(options: Options) -> list[Case]:
                 variant.errors = one
         else:
             print(f"{recording.path} ({number} of {len(options.recordings)}): {len(work.combinations)} alternatives", file=sys.stderr)
-            case = _computed(work.computing, work.combinations, work.folders)
+            case = _compute_case(work.computing, work.combinations, work.folders)
             if options.pictures and "manhattan" in case.stages and options.feedback is Feedback.recorded:
                 _draw_axes(options.out, work)
             if options.budget:
@@ -121,7 +121,7 @@ def ablate(options: Options) -> list[Case]:
 def works_of(options: Options, known: Mapping[str, Any]) -> Iterator[Work]:
     """Compose the alternatives of one recording after the other; `known` has the figures in out=DIR by key."""
     recordings = [Recording(path) for path in options.recordings]
-    swaps = without_repeats(parsed(options.swaps), recordings)
+    swaps = without_repeats(parse_swaps(options.swaps), recordings)
     combinations = single_swaps(swaps) if options.feedback is Feedback.recorded else combinations_of(swaps)
     for recording, prefix in zip(recordings, _prefixes(options.recordings)):
         alternatives = alternatives_of(recording, [combination.words for combination in combinations])
@@ -161,7 +161,7 @@ def _write(out: Path, cases: Mapping[str, Any]) -> None:
         raise DataError(str(out), f"cannot be written: {error.strerror}", "give another out=DIR") from error
 
 
-def _computed(computing: Alternatives, combinations: Sequence[Combination], folders: Sequence[Path]) -> Case:
+def _compute_case(computing: Alternatives, combinations: Sequence[Combination], folders: Sequence[Path]) -> Case:
     """Compute all alternatives of a recording."""
     recording, graphs = computing.recording, [alternative.graph for alternative in computing.alternatives]
     topics = [name for name in graphs[0].stages if name in computing.stages]
@@ -181,11 +181,11 @@ def _computed(computing: Alternatives, combinations: Sequence[Combination], fold
             of_nodes.setdefault(node, StageErrors(known)).take(topic, {**embedded, **one})
 
     computing.run(folders, on_frame)
-    errors = [StageErrors.joined([of_nodes[nodes[topic]] for topic in measured if topic in nodes]) for nodes in computing.node_of]
+    errors = [StageErrors.merge_stages([of_nodes[nodes[topic]] for topic in measured if topic in nodes]) for nodes in computing.node_of]
     of_stages = [found.of_frames() for found in errors]
     own = [found.figures(of_frames) if alone else {} for found, of_frames in zip(errors, of_stages)]
     folds = of_folds(topics, folders, recording.path)
-    figures = [{**_figures(outcome), **of_stage, **of_fold} for outcome, of_stage, of_fold in zip(computing.outcomes, own, folds)]
+    figures = [{**_alternative_figures(outcome), **of_stage, **of_fold} for outcome, of_stage, of_fold in zip(computing.outcomes, own, folds)]
     reference = attached_truth(recording.attachments, str(recording.path))
     judged = [
         {**of_result(runner.result), **of_trajectory(runner.result, reference, ERRORS), **of_frames, "ms": outcome.frame_ms}
@@ -213,7 +213,7 @@ def _computed(computing: Alternatives, combinations: Sequence[Combination], fold
     return case
 
 
-def _figures(outcome: Outcome) -> dict[str, float]:
+def _alternative_figures(outcome: Outcome) -> dict[str, float]:
     """Figures of an alternative by column, NaN where there is none."""
     final, status = outcome.metrics.get("final") or {}, outcome.metrics.get("status") or {}
     figures = _errors(final)

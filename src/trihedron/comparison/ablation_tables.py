@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from trihedron.comparison.attribution import shapley_weights
-from trihedron.comparison.block_bootstrap import resampled
+from trihedron.comparison.block_bootstrap import bootstrap_blocks
 from trihedron.comparison.fold_measures import COLUMNS as OF_FOLDS
 from trihedron.comparison.partings import OPEN_LOOP, Parting
 from trihedron.comparison.stage_measures import COLUMNS as MEASURED
@@ -254,7 +254,7 @@ def _half_of_frames(case: Case, name: str, variants: Sequence[Variant], weights:
     errors = [variant.errors.get(name, np.full(case.frames, np.nan)) for variant in variants]
     if not FIGURES[name].power or not np.isfinite(errors).all(axis=0).any():
         return None
-    found = resampled(errors, weights, max(1, round(case.fps)), FIGURES[name].power)
+    found = bootstrap_blocks(errors, weights, max(1, round(case.fps)), FIGURES[name].power)
     return None if found.error is None else half_width(found.error, found.blocks - 1)
 
 

@@ -36,7 +36,7 @@ def power_mean(values: F64, power: int) -> float:
     return float(np.mean(values**power) ** (1.0 / power))
 
 
-def resampled(errors: Sequence[F64], weights: Sequence[float], shortest: int, power: int = 2) -> Resampled:
+def bootstrap_blocks(errors: Sequence[F64], weights: Sequence[float], shortest: int, power: int = 2) -> Resampled:
     """Sum the power means (as `power_mean`) of k series of errors (n,), none negative, of the same frames, each with its weight.
 
     Frames where one is not finite are left out; at least one must remain. A block has at least `shortest` frames. The standard error of b blocks is

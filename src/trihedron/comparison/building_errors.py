@@ -55,7 +55,7 @@ def plan_errors(building: Building, T_truth_world: F64, plans: list[TruePlan]) -
     areas = np.array([mine[a].area - truth[b][2].area for a, b in pairs])
     walls = [error for a, b in pairs for error in _edges(building, a, truth[b][1], T)]
     heights = _heights(building, at, plans)
-    found = [_doors(building, plan, T, building.wall_storeys[building.opening_walls] == storey) for storey, plan in _matched(at, plans)]
+    found = [_doors(building, plan, T, building.wall_storeys[building.opening_walls] == storey) for storey, plan in _storey_plan_pairs(at, plans)]
     doors, false, doorways = sum(hits for hits, _ in found), sum(wrong for _, wrong in found), sum(len(plan.doorways) for plan in plans)
     honest = [abs(error) < 1.96 * np.sqrt(building.area_variance[a]) for error, (a, _) in zip(areas, pairs)]
     honest += [abs(off) < 1.96 * sigma for off, _, sigma in walls if np.isfinite(sigma)]
@@ -80,7 +80,7 @@ def storeys_at(building: Building, T: F64, plans: list[TruePlan]) -> list[int]:
     return [int(np.argmin([abs(floor - plan.floor_m) for plan in plans])) for floor in floors]
 
 
-def _matched(at: list[int], plans: list[TruePlan]) -> list[tuple[int, TruePlan]]:
+def _storey_plan_pairs(at: list[int], plans: list[TruePlan]) -> list[tuple[int, TruePlan]]:
     return [(storey, plans[true]) for storey, true in enumerate(at)]
 
 
@@ -98,7 +98,7 @@ def _median(values: list[Any]) -> float:
     return float(np.median(values)) if len(values) else float("nan")
 
 
-def _moved(points: F64, T: F64) -> F64:
+def _transform_to_truth(points: F64, T: F64) -> F64:
     """Return points (n, 2) of the building's plan on that of the truth."""
     return np.asarray(points @ T[:2, :2].T + T[:2, 3])
 
@@ -106,7 +106,7 @@ def _moved(points: F64, T: F64) -> F64:
 def _polygon(building: Building, room: int, T: F64) -> Any:
     import shapely
 
-    rings = [_moved(building.corners_m[a:b], T) for of, a, b in building.loops if of == room]
+    rings = [_transform_to_truth(building.corners_m[a:b], T) for of, a, b in building.loops if of == room]
     return shapely.make_valid(shapely.Polygon(rings[0], rings[1:]))
 
 
@@ -119,7 +119,7 @@ def _edges(building: Building, room: int, rings: list[F64], T: F64) -> list[tupl
     ends = [(p, q) for ring in rings for p, q in zip(ring, np.roll(ring, -1, axis=0))]
     found = []
     for of, a, b in building.loops:
-        corners = _moved(building.corners_m[a:b], T)
+        corners = _transform_to_truth(building.corners_m[a:b], T)
         for p, q, wall in zip(corners, np.roll(corners, -1, axis=0), building.corner_walls[a:b]) if of == room else ():
             if wall < 0 or np.linalg.norm(q - p) < LEAST_EDGE_M:
                 continue
@@ -127,7 +127,7 @@ def _edges(building: Building, room: int, rings: list[F64], T: F64) -> list[tupl
             near = [(_off(middle, *end), _angle(along, *end)) for end in ends if _beside(middle, *end)]
             near = [item for item in near if abs(item[0]) < EDGE_M and abs(item[1]) < 10.0]
             if near:
-                face = _moved(building.walls_m[wall], T)
+                face = _transform_to_truth(building.walls_m[wall], T)
                 own = abs(_off(middle, face[0], face[1])) < 1e-6
                 sigma = float(np.sqrt(building.wall_covariance[wall, 0, 0])) if own else float("nan")
                 found.append((*min(near, key=lambda item: abs(item[0])), sigma))
@@ -156,7 +156,7 @@ def _doors(building: Building, plan: TruePlan, T: F64, chosen: Bool) -> tuple[in
 
     middles = []
     for wall, span, kind in zip(building.opening_walls[chosen], building.spans_m[chosen], building.opening_kinds[chosen]):
-        start, end = _moved(building.walls_m[wall], T)
+        start, end = _transform_to_truth(building.walls_m[wall], T)
         if OPENING_KINDS[kind] != "window":
             middles.append(start + (end - start) / np.linalg.norm(end - start) * span.mean())
     hits = {k for k, door in enumerate(plan.doorways) for middle in middles if np.linalg.norm(door.middle - middle) < DOOR_M}

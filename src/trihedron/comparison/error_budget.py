@@ -63,7 +63,7 @@ class Rerun:
     errors: dict[str, F64]
 
 
-def named(stages: tuple[str, ...]) -> str:
+def row_name(stages: tuple[str, ...]) -> str:
     """Return the name of a row."""
     return " + ".join(stages) or "nothing"
 
@@ -80,10 +80,10 @@ def remarks(found: Mapping[tuple[str, ...], Rerun]) -> list[str]:
     whole = found[()]
     second = int(whole.metrics.get("rpe_second_frames") or 1)
     samples = {stages: Sample({}, {"ATE m": one.errors[ATE]}, second) for stages, one in found.items() if ATE in one.errors}
-    pairs = {("", named(stages)): [(samples[()], sample)] for stages, sample in samples.items() if stages and () in samples}
+    pairs = {("", row_name(stages)): [(samples[()], sample)] for stages, sample in samples.items() if stages and () in samples}
     verdicts = verdicts_of(pairs, {"ATE m": Column(4)})
     frames = whole.metrics.get("poses_with_truth", 0)
-    fewer = [named(stages) for stages, one in found.items() if one.metrics.get("poses_with_truth", 0) < frames]
+    fewer = [row_name(stages) for stages, one in found.items() if one.metrics.get("poses_with_truth", 0) < frames]
     short = [one.second for one in verdicts if one.answer == TOO_SHORT]
     equal = [one.second for one in verdicts if one.answer not in (TOO_SHORT, "better", "worse")]
     rows = len(found) - 1
@@ -121,7 +121,7 @@ def rerun(recording: Recording, truth: Truth, stages: tuple[str, ...], folder: P
     """Replay with the topics of `stages` true."""
     source, out = folder / "source.mcap", folder / "run"
     rewrite(recording, source, {name: getattr(truth, name) for name in stages})
-    metrics = replayed(source, recomputed(recording, stages), out)
+    metrics = replay_metrics(source, dependent_stages(recording, stages), out)
     reference = attached_truth(recording.attachments, str(recording.path))
     if reference is None or not metrics:
         return Rerun({}, {})
@@ -130,7 +130,7 @@ def rerun(recording: Recording, truth: Truth, stages: tuple[str, ...], folder: P
     return Rerun(metrics, frame_errors(estimate, reference, float(metrics["rpe_second_frames"]), stamps))
 
 
-def recomputed(recording: Recording, stages: tuple[str, ...]) -> tuple[str, ...]:
+def dependent_stages(recording: Recording, stages: tuple[str, ...]) -> tuple[str, ...]:
     """Return the stages that depend on one of these, over any number of wires, without these; of none, those of the first row."""
     graph = graph_of(composed_run(recording))
     first = [stage for stage in stages or ("rotation",) if stage in graph.stages]
@@ -149,7 +149,7 @@ def rewrite(recording: Recording, path: Path, changed: Mapping[str, Callable[[Va
     writer.close()
 
 
-def replayed(source: Path, stages: tuple[str, ...], out: Path) -> dict[str, Any]:
+def replay_metrics(source: Path, stages: tuple[str, ...], out: Path) -> dict[str, Any]:
     """Run the stages again over the recording; the final metrics."""
     from trihedron.pipeline.app.cli import main as trihedron
 

@@ -20,7 +20,7 @@ def areas(vertices: F64, triangles: I32) -> F64:
     return np.asarray(0.5 * np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1), np.float64)
 
 
-def sampled(vertices: F64, triangles: I32, spacing_m: float) -> tuple[F64, I32, F64]:
+def sample_triangles(vertices: F64, triangles: I32, spacing_m: float) -> tuple[F64, I32, F64]:
     """Points (n, 3) on a regular barycentric grid of each triangle, at most about `spacing_m` apart, their triangles (n,), and the area (m²) each
     stands for."""
     corners = vertices[triangles]
@@ -58,7 +58,7 @@ class NearestTriangle:
         from scipy.spatial import cKDTree
 
         self._corners = vertices[triangles]
-        points, self._owner, _ = sampled(vertices, triangles, SPACING_M)
+        points, self._owner, _ = sample_triangles(vertices, triangles, SPACING_M)
         self._tree = cKDTree(points) if len(points) else None
 
     def query(self, points: F64) -> tuple[F64, I32]:

@@ -25,7 +25,7 @@ def read_mesh(path: Path) -> tuple[F64, I32]:
     if kind not in ("ply", "obj"):
         raise DataError(str(path), f"'{path.suffix}' is not a mesh file this program reads", CURE)
     try:
-        found = _loaded(path, kind)
+        found = _load_mesh(path, kind)
         points = np.asarray(found.vertices, np.float64).reshape(-1, 3)
         triangles = np.asarray(getattr(found, "faces", np.empty((0, 3))), np.int64).reshape(-1, 3)
     except LibraryError:
@@ -41,11 +41,11 @@ def read_mesh(path: Path) -> tuple[F64, I32]:
 
 def vertex_colors(path: Path, count: int, default: int = 180) -> U8:
     """Return the (count, 3) RGB of the vertices of a PLY file that `read_mesh` read; grey where it has none."""
-    found = np.asarray(getattr(_loaded(path, "ply").visual, "vertex_colors", ()), np.uint8)
+    found = np.asarray(getattr(_load_mesh(path, "ply").visual, "vertex_colors", ()), np.uint8)
     return found[:, :3].copy() if found.ndim == 2 and len(found) == count else np.full((count, 3), default, np.uint8)
 
 
-def _loaded(path: Path, kind: str) -> Any:
+def _load_mesh(path: Path, kind: str) -> Any:
     with imports_of("trimesh"):
         import trimesh
 

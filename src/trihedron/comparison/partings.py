@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from trihedron.comparison.error_budget import true_poses
-from trihedron.comparison.stage_measures import COLUMNS, Seen, measured
+from trihedron.comparison.stage_measures import COLUMNS, Seen, stage_errors
 from trihedron.comparison.value_differences import common_frames, difference, differing
 from trihedron.pipeline.core.errors import DataError
 from trihedron.pipeline.core.geometry import nearest_rotation
@@ -113,7 +113,7 @@ class StageErrors:
         if isinstance(value, Value) and (T := self.truth.get(value.stamp_ns)) is not None:
             recorded = {name.removeprefix(RECORDED): item for name, item in values.items() if name.startswith(RECORDED)}
             now = Seen({**values, **recorded, "map": self._map, topic: value}, T)
-            for column, error in measured(topic, now, self._before).items():
+            for column, error in stage_errors(topic, now, self._before).items():
                 self.measures.setdefault(column, {})[self.frames] = error
             if isinstance(value, Rotation):
                 self.rotations_deg[self.frames] = _angle_deg(T[:3, :3].T @ value.R_world_camera)
@@ -125,7 +125,7 @@ class StageErrors:
         self._map = values.get(RECORDED + "map") or self._map
 
     @staticmethod
-    def joined(stages: Sequence[StageErrors]) -> StageErrors:
+    def merge_stages(stages: Sequence[StageErrors]) -> StageErrors:
         """Return the errors of several stages over the same frames as one."""
         whole = StageErrors({})
         for one in stages:

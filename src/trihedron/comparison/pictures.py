@@ -25,10 +25,10 @@ def draw(path: str, frame: int, out: Path) -> None:
     matplotlib.use("Agg")
     from matplotlib import pyplot
 
-    from trihedron.pipeline.app.recorded_values import opened
+    from trihedron.pipeline.app.recorded_values import open_recording
     from trihedron.pipeline.core.errors import RecordingError
 
-    recording = opened(Path(path))
+    recording = open_recording(Path(path))
     poses = list(recording.values("pose"))
     if not poses:
         raise RecordingError(path, "holds no poses", "record a run with outputs=[trajectory]")
@@ -37,7 +37,7 @@ def draw(path: str, frame: int, out: Path) -> None:
     if frame not in numbers:
         raise RecordingError(path, f"has no frame {frame}", f"give one of {numbers[0]}..{numbers[-1]}")
     figure, (left, right) = pyplot.subplots(1, 2, figsize=SIZE_INCHES, width_ratios=[4, 3], layout="constrained")
-    left.imshow(_annotated([recording], frame))
+    left.imshow(_annotate_frame([recording], frame))
     left.set_axis_off()
     left.set_title(f"frame {frame}: planes, 3D lines, key points, Manhattan axes", fontsize=10)
     _map_from_above(right, recording, poses)
@@ -55,7 +55,7 @@ def draw_pair(sides: Sequence[tuple[str, Sequence[Recording]]], frame: int, out:
 
     figure, axes = pyplot.subplots(1, 3, figsize=(15, 4.2), layout="constrained")
     for side, (title, recordings) in zip(axes, sides):
-        side.imshow(_annotated(recordings, frame))
+        side.imshow(_annotate_frame(recordings, frame))
         side.set_axis_off()
         side.set_title(f"frame {frame}: {title}", fontsize=10)
     for (title, recordings), color, style in zip(sides, PAIR_COLORS, ("-", "--")):
@@ -84,7 +84,7 @@ def _values(recordings: Sequence[Recording], topic: str) -> Iterator[Any]:
     return next((recording.values(topic) for recording in recordings if topic in recording.topics), iter(()))
 
 
-def _annotated(recordings: Sequence[Recording], frame: int) -> Any:
+def _annotate_frame(recordings: Sequence[Recording], frame: int) -> Any:
     """The frame's image (the nearest one that was kept to look at) with the features of that very frame."""
     import cv2
     import numpy as np
@@ -95,7 +95,7 @@ def _annotated(recordings: Sequence[Recording], frame: int) -> Any:
     topics = ("planes", "segments", "keypoints", "manhattan")
     values: dict[str, Any] = {topic: next((v for v in _values(recordings, topic) if v.index == frame), None) for topic in topics}
     if values["planes"] is not None:
-        image = _tinted(image, values["planes"])
+        image = _tint_planes(image, values["planes"])
     if values["segments"] is not None:
         lifted = np.isfinite(values["segments"].endpoints_m).all(axis=(1, 2))
         for ends, in_space in zip(np.rint(values["segments"].endpoints_px).astype(int), lifted):
@@ -134,7 +134,7 @@ def _image(recording: Recording, stamp_ns: int, camera: Camera) -> Any:
     return cv2.resize(small, (camera.width, camera.height))
 
 
-def _tinted(image: Any, planes: Planes) -> Any:
+def _tint_planes(image: Any, planes: Planes) -> Any:
     import cv2
     import numpy as np
     from matplotlib import colormaps

@@ -27,13 +27,13 @@ def preview(computing: Alternatives, combinations: Sequence[Combination], folder
         lines += _line("computes again", (name for name in runner.computed if name in computing.stages))
         lines += _line("computes once, not recorded", (name for name in runner.computed if name not in computing.stages))
         lines += _line("reads", read)
-        for (verb, others), names in _shared(number, nodes, users).items():
+        for (verb, others), names in _group_shared_nodes(number, nodes, users).items():
             lines += _line(f"{verb} for {', '.join(str(other + 1) for other in others)} too", names)
     stages = [len(users[node]) for node in users if not node.startswith(RECORDED)]
     return "\n".join([*map(printable, lines), f"{sum(stages)} stages, {len(stages)} of them different, which are computed"])
 
 
-def _shared(number: int, nodes: Mapping[str, str], users: Mapping[str, Sequence[int]]) -> dict[tuple[str, tuple[int, ...]], list[str]]:
+def _group_shared_nodes(number: int, nodes: Mapping[str, str], users: Mapping[str, Sequence[int]]) -> dict[tuple[str, tuple[int, ...]], list[str]]:
     """Group the stages and topics of an alternative by the others that have the same."""
     found: dict[tuple[str, tuple[int, ...]], list[str]] = {}
     for name, node in nodes.items():

@@ -73,7 +73,7 @@ def _best(rows: Sequence[Row], name: str) -> str | None:
     competing = [row for row in rows if name in row["figures"]]
     if figure.error:
         most = max((row["figures"].get(TRACKED, {"median": 0.0})["median"] for row in competing), default=0.0)
-        competing = [row for row in competing if _tracked(row) >= most - TRACKED_SLACK]
+        competing = [row for row in competing if _tracked_share(row) >= most - TRACKED_SLACK]
     found = sorted((row["figures"][name] for row in competing), key=lambda one: -one["median"] if figure.more else one["median"])
     if len(found) < 2:
         return None
@@ -82,7 +82,7 @@ def _best(rows: Sequence[Row], name: str) -> str | None:
     return None if any(one["min"] <= found[0]["max"] and found[0]["min"] <= one["max"] for one in others) else text
 
 
-def _tracked(row: Row) -> float:
+def _tracked_share(row: Row) -> float:
     return float(row["figures"].get(TRACKED, {"median": 0.0})["median"])
 
 
@@ -121,14 +121,14 @@ def as_text(rows: Sequence[Row], bold: bool | None = None) -> str:
     bold = sys.stdout.isatty() if bold is None else bold
     widths = [max(len(line[i]) for line in [header, *([cell.text for cell in row] for row in cells)]) for i in range(len(header))]
     left = {i for i, name in enumerate(header) if name in ("data", "change", "note")}
-    lines = ["  ".join(_aligned(name, w, i in left) for i, (name, w) in enumerate(zip(header, widths))).rstrip()]
+    lines = ["  ".join(_align_cell(name, w, i in left) for i, (name, w) in enumerate(zip(header, widths))).rstrip()]
     for row in cells:
-        padded = [_aligned(cell.text, w, i in left) for i, (cell, w) in enumerate(zip(row, widths))]
+        padded = [_align_cell(cell.text, w, i in left) for i, (cell, w) in enumerate(zip(row, widths))]
         lines.append("  ".join(f"\033[1m{text}\033[0m" if cell.best and bold else text for cell, text in zip(row, padded)).rstrip())
     return "\n".join(lines)
 
 
-def _aligned(text: str, width: int, left: bool) -> str:
+def _align_cell(text: str, width: int, left: bool) -> str:
     return text.ljust(width) if left else text.rjust(width)
 
 
@@ -145,12 +145,15 @@ def as_latex(rows: Sequence[Row], verdicts: Sequence[str] = ()) -> str:
     """A tabular of LaTeX, best in bold; without the verdicts."""
     header, cells = cells_of(rows)
     columns = "".join("l" if name in ("data", "change", "note") else "r" for name in header)
-    body = [[_escaped(name) for name in header], *([rf"\textbf{{{_escaped(c.text)}}}" if c.best else _escaped(c.text) for c in row] for row in cells)]
+    body = [
+        [_escape_latex(name) for name in header],
+        *([rf"\textbf{{{_escape_latex(c.text)}}}" if c.best else _escape_latex(c.text) for c in row] for row in cells),
+    ]
     lines = [" & ".join(line) + r" \\" for line in body]
     return "\n".join([rf"\begin{{tabular}}{{{columns}}}", r"\hline", lines[0], r"\hline", *lines[1:], r"\hline", r"\end{tabular}", ""])
 
 
-def _escaped(text: str) -> str:
+def _escape_latex(text: str) -> str:
     return "".join(LATEX.get(letter, letter) for letter in text)
 
 

@@ -62,7 +62,7 @@ def read_trajectories(files: Sequence[Path], runs: Sequence[Run], labels: Sequen
     for number, file in enumerate(files):
         label = other_programs.label_of(file, labels, number, len(files))
         reference, final = other_programs.judge(file, candidates, y_up)
-        found.append(Run(file, reference.overrides, _figures({"final": final}, {}, {}), label=label))
+        found.append(Run(file, reference.overrides, _figures_in_units({"final": final}, {}, {}), label=label))
     return found
 
 
@@ -71,7 +71,7 @@ def _run(folder: Path) -> Run:
     metrics, timing, job = (read_results(folder / name) for name in ("metrics.json", "timing.json", "job.json"))
     if job.get("state", "done") != "done":
         return Run(folder, overrides, dict.fromkeys(FIGURES, np.nan), str(job.get("error") or "was stopped before its end"))
-    figures = _figures(metrics, timing, read_results(folder / SURFACE_FIGURES))
+    figures = _figures_in_units(metrics, timing, read_results(folder / SURFACE_FIGURES))
     return Run(folder, overrides, figures, str(metrics.get("note", "")) if metrics or timing else "holds no results")
 
 
@@ -86,13 +86,13 @@ def _words(file: Path) -> list[str]:
     return [printable(str(word)) for word in words]
 
 
-def _figures(metrics: dict[str, Any], timing: dict[str, Any], surface: dict[str, Any]) -> dict[str, float]:
+def _figures_in_units(metrics: dict[str, Any], timing: dict[str, Any], surface: dict[str, Any]) -> dict[str, float]:
     """Return every column's value in the column's unit, NaN where there is none."""
-    known = _known(metrics, timing, surface)
+    known = _values_by_column(metrics, timing, surface)
     return {name: np.nan if known.get(name) is None else figure.factor * float(known[name]) for name, figure in FIGURES.items()}
 
 
-def _known(metrics: dict[str, Any], timing: dict[str, Any], surface: dict[str, Any]) -> dict[str, Any]:
+def _values_by_column(metrics: dict[str, Any], timing: dict[str, Any], surface: dict[str, Any]) -> dict[str, Any]:
     """Every figure a run's files have, by column, in SI units; too short a run has no RPE over a second, and few have a surface."""
     final, frame, mesh = metrics.get("final") or {}, timing.get("frame_ms") or {}, (surface.get("parts") or {}).get("all") or {}
     status = metrics.get("status") or {}
@@ -133,8 +133,8 @@ def groups_of(runs: Sequence[Run]) -> dict[tuple[str, str], list[Run]]:
     varying = sorted(key for key in keys if len({run.overrides.get(key) for run in own}) > 1)
     groups: dict[tuple[str, str], list[Run]] = {}
     for run in runs:
-        change = run.label or _said(run, [k for k in varying if not _of_data(k)])
-        groups.setdefault((_said(run, [k for k in varying if _of_data(k)]), change), []).append(run)
+        change = run.label or _override_text(run, [k for k in varying if not _of_data(k)])
+        groups.setdefault((_override_text(run, [k for k in varying if _of_data(k)]), change), []).append(run)
     order = list(dict.fromkeys(data for data, _ in groups))
     return dict(sorted(groups.items(), key=lambda group: order.index(group[0][0])))
 
@@ -224,6 +224,6 @@ def _of_data(key: str) -> bool:
     return key.partition(".")[0] == "dataset"
 
 
-def _said(run: Run, keys: Sequence[str]) -> str:
+def _override_text(run: Run, keys: Sequence[str]) -> str:
     """Overrides of a run for these keys; of a path its last part."""
     return " ".join(f"{key}={Path(run.overrides[key]).name}" for key in keys if run.overrides.get(key, "null") != "null")

@@ -80,7 +80,7 @@ Errors = dict[str, float]  # of one frame, by column
 Measure = Callable[[Any, Seen, Seen, F64], Errors]  # the value, its frame, the frame before, T_now_before (4, 4)
 
 
-def measured(topic: str, now: Seen, before: Seen | None) -> Errors:
+def stage_errors(topic: str, now: Seen, before: Seen | None) -> Errors:
     """Return the errors of a stage's value in one frame, by column; none in the first frame, and where the measure lacks what it needs."""
     value = now.get(topic)
     measure = MEASURES.get(type(value)) if isinstance(value, Value) else None
@@ -95,7 +95,7 @@ def of_normals(value: Normals, now: Seen, before: Seen, T: F64) -> Errors:
     last, camera, depth, last_depth = before.get("normals"), now.camera, now.depth_m, before.depth_m
     if not isinstance(last, Normals) or camera is None or depth is None or last_depth is None:
         return {}
-    (v, u), points, pixels, known = warped(last_depth, camera, T)
+    (v, u), points, pixels, known = warp_grid(last_depth, camera, T)
     pixels = np.rint(pixels)
     known[known] = np.abs(at(depth, pixels[known]) - points[known, 2]) < DEPTH_EDGE * points[known, 2]
     old = last.normals[v[known] // last.stride, u[known] // last.stride] @ T[:3, :3].T
@@ -205,7 +205,7 @@ def of_motion(value: Rotation | Translation | Pose, now: Seen, before: Seen, T: 
     """By the estimated motion since the last frame: `cycle px`, median distance of the pairs' points, there by the motion and back by the pairs, and
     `depth mm`, median difference of the last frame's depth from that of this one, on pixels that both see; the name of the stage is before both. A
     rotation is judged with the known translation."""
-    ends, camera, errors, stage = [estimated(type(value), frame) for frame in (now, before)], now.camera, {}, type(value).__name__.lower()
+    ends, camera, errors, stage = [estimated_pose(type(value), frame) for frame in (now, before)], now.camera, {}, type(value).__name__.lower()
     if ends[0] is None or ends[1] is None or camera is None:
         return {}
     motion = invert(ends[0]) @ ends[1]
@@ -213,14 +213,14 @@ def of_motion(value: Rotation | Translation | Pose, now: Seen, before: Seen, T: 
     if isinstance(tracks, Tracks) and isinstance(points, Keypoints):
         errors[f"{stage} cycle px"] = median(offsets_px(tracks, points, camera, motion))
     if depth is not None and last_depth is not None:
-        _, moved, pixels, known = warped(last_depth, camera, motion)
+        _, moved, pixels, known = warp_grid(last_depth, camera, motion)
         there = between(depth, pixels[known])
         off = np.abs(there - moved[known, 2])
         errors[f"{stage} depth mm"] = median(1e3 * off[off < OCCLUDED * there])  # where it is unknown, off is NaN
     return errors
 
 
-def estimated(kind: type[Any], seen: Seen) -> F64 | None:
+def estimated_pose(kind: type[Any], seen: Seen) -> F64 | None:
     """Return the pose (4, 4) that a stage of a kind estimates, with what it does not estimate as known; None without an estimate."""
     pose, rotation, translation = (seen.get(topic) for topic in ("pose", "rotation", "translation"))
     if kind is Pose:
@@ -265,7 +265,7 @@ MEASURES: dict[type[Any], Measure] = {
 }
 
 
-def warped(depth_m: Any, camera: Camera, T: F64) -> tuple[Any, F64, F64, Bool]:
+def warp_grid(depth_m: Any, camera: Camera, T: F64) -> tuple[Any, F64, F64, Bool]:
     """Return rows and columns (2, n) of the pixels of a grid, their points (n, 3) moved by T, the pixels (n, 2) where these are, and which have a
     depth and are in the image."""
     v, u = np.mgrid[0 : depth_m.shape[0] : STEP_PX, 0 : depth_m.shape[1] : STEP_PX].reshape(2, -1)

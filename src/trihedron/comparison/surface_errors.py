@@ -25,7 +25,7 @@ def evaluate_files(mesh: Path, recording: Path) -> dict[str, Any]:
     from trihedron.comparison.mesh_files import read_mesh
 
     vertices, triangles = read_mesh(mesh)
-    T, truth = prepared(trajectory_in(mesh.parent, recording.parent), recording)
+    T, truth = alignment_and_truth(trajectory_in(mesh.parent, recording.parent), recording)
     return {**mesh_errors(vertices @ T[:3, :3].T + T[:3, 3], triangles, truth), "bytes": mesh.stat().st_size}
 
 
@@ -34,7 +34,7 @@ def trajectory_in(*folders: Path) -> Path:
     return next((folder / TRAJECTORY for folder in folders if (folder / TRAJECTORY).is_file()), folders[0] / TRAJECTORY)
 
 
-def prepared(trajectory: Path, recording: Path) -> tuple[F64, Truth]:
+def alignment_and_truth(trajectory: Path, recording: Path) -> tuple[F64, Truth]:
     """(4, 4) `T_truth_world` that aligns the trajectory with the recording's ground truth, and the true surface of its data set. Raises DataError."""
     from trihedron.pipeline.record.reader import Recording
     from trihedron.pipeline.record.trajectories import attached_truth
@@ -83,9 +83,9 @@ def mesh_errors(vertices: F64, triangles: I32, truth: Truth) -> dict[str, Any]:
     WITHIN_M. A point of the mesh belongs to the part that is nearest to it."""
     import numpy as np
 
-    from trihedron.comparison.mesh_distance import NearestTriangle, sampled
+    from trihedron.comparison.mesh_distance import NearestTriangle, sample_triangles
 
-    points, _, area = sampled(vertices, triangles, SAMPLE_M)
+    points, _, area = sample_triangles(vertices, triangles, SAMPLE_M)
     off, bent = truth.distance(points)
     missed, _ = NearestTriangle(vertices, triangles).query(truth.seen_m)
     figures: dict[str, Any] = {"triangles": len(triangles), "area_m2": float(area.sum()), "parts": {}}

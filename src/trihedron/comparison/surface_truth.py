@@ -58,7 +58,7 @@ def _of_scene(dataset: Any, trajectory: Trajectory, chosen: Any) -> Truth:
         seen, rows = _world(np.where(frame.depth_m > 0.0, depth, 0.0), frame.camera, _pose(trajectory, frame.stamp_ns))
         points.append(seen)
         curved.append(bent[PIXEL_STEP // 2 :: PIXEL_STEP, PIXEL_STEP // 2 :: PIXEL_STEP].ravel()[rows])
-    seen, first = _thinned(np.concatenate(points))
+    seen, first = _downsample_points(np.concatenate(points))
     return Truth(distance, seen, np.concatenate(curved)[first], True)
 
 
@@ -76,7 +76,7 @@ def _of_depth(dataset: Any, trajectory: Trajectory, chosen: Any) -> Truth:
         normals.append(directions)
     if not points:
         raise DataError("the data set", "has no frame with a true pose of its very stamp, so its depth is no truth", "give a rendered data set")
-    cloud, first = _thinned(np.concatenate(points), CELL_M / 2.0)
+    cloud, first = _downsample_points(np.concatenate(points), CELL_M / 2.0)
     about = np.concatenate(normals)[first]
     tree = cKDTree(cloud)
 
@@ -88,7 +88,7 @@ def _of_depth(dataset: Any, trajectory: Trajectory, chosen: Any) -> Truth:
         found[near] = np.abs(np.einsum("ij,ij->i", offset, about[row[near]]))
         return found, np.zeros(len(points), np.bool_)
 
-    seen, _ = _thinned(cloud)
+    seen, _ = _downsample_points(cloud)
     return Truth(distance, seen, np.zeros(len(seen), np.bool_), False)
 
 
@@ -119,7 +119,7 @@ def _with_normals(depth: F64, camera: Camera, T: F64) -> tuple[F64, F64]:
     return points @ T[:3, :3].T + T[:3, 3], normals @ T[:3, :3].T
 
 
-def _thinned(points: F64, cell_m: float = CELL_M) -> tuple[F64, Any]:
+def _downsample_points(points: F64, cell_m: float = CELL_M) -> tuple[F64, Any]:
     """The first point of each cell, and its row."""
     _, first = np.unique(np.floor(points / cell_m).astype(np.int64), axis=0, return_index=True)
     return points[first], first

@@ -56,7 +56,7 @@ class Combination:
         return Combination(tuple(level for level in self.levels if level[0] in stages))
 
 
-def parsed(words: Sequence[str]) -> list[Swap]:
+def parse_swaps(words: Sequence[str]) -> list[Swap]:
     """Parse words `KEY=VALUE,VALUE` into one swap a stage, each value of a key with each of the stage's other keys. Raises UsageError."""
     keys: dict[str, dict[str, list[str]]] = {}
     for word in words:
@@ -123,16 +123,16 @@ def _distinct(swaps: Sequence[Swap], recording: Recording) -> list[Swap]:
 def combinations_of(swaps: Sequence[Swap]) -> list[Combination]:
     """Return every combination of levels, that of none changed first. Raises UsageError for too many."""
     chosen = itertools.product(*([(swap.stage, level) for level in swap.levels] for swap in swaps))
-    return _bounded([Combination(tuple((stage, level) for stage, level in levels if level)) for levels in chosen])
+    return _check_count([Combination(tuple((stage, level) for stage, level in levels if level)) for levels in chosen])
 
 
 def single_swaps(swaps: Sequence[Swap]) -> list[Combination]:
     """Return what is recorded, then each level of each swap by itself: enough where no stage sees what another one computes. Raises UsageError for
     too many."""
-    return _bounded([Combination(()), *(Combination(((swap.stage, level),)) for swap in swaps for level in swap.levels if level)])
+    return _check_count([Combination(()), *(Combination(((swap.stage, level),)) for swap in swaps for level in swap.levels if level)])
 
 
-def _bounded(found: list[Combination]) -> list[Combination]:
+def _check_count(found: list[Combination]) -> list[Combination]:
     if len(found) > MOST:
         raise UsageError("ablate", f"these values make {len(found)} alternatives, more than {MOST}", "give fewer values at once")
     return found

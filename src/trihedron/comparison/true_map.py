@@ -69,14 +69,16 @@ def _points(table: Table, motions: F64) -> Table:
     M = mean_motions(table, ids, motions)
     position, information, direction = table.columns_at(ids, "position_m", "information", "direction")
     moved = transform_each(M, position[:, None])[:, 0]
-    return table.updated(ids, position_m=moved, information=_rotated(M, information), direction=_turned(M, direction[:, None])[:, 0])
+    return table.updated(
+        ids, position_m=moved, information=_rotate_information(M, information), direction=_rotate_directions(M, direction[:, None])[:, 0]
+    )
 
 
 def _lines(table: Table, motions: F64) -> Table:
     ids = _living(table)
     M = mean_motions(table, ids, motions)
     ends, information = table.columns_at(ids, "endpoints_m", "information")
-    return table.updated(ids, endpoints_m=transform_each(M, ends), information=_rotated(M[:, None], information))
+    return table.updated(ids, endpoints_m=transform_each(M, ends), information=_rotate_information(M[:, None], information))
 
 
 def _planes(table: Table, motions: F64) -> Table:
@@ -87,7 +89,7 @@ def _planes(table: Table, motions: F64) -> Table:
     centres = moments[:, :3, 3] / moments[:, 3, 3:]
     moved = transform_each(M, centres[:, None])[:, 0]
     new = np.empty_like(old)
-    normals = _turned(M, old[:, None, :3])[:, 0]
+    normals = _rotate_directions(M, old[:, None, :3])[:, 0]
     new[:, :3] = normals / np.linalg.norm(normals, axis=1)[:, None]
     new[:, 3] = old[:, 3] + np.einsum("ni,ni->n", old[:, :3], centres) - np.einsum("ni,ni->n", new[:, :3], moved)
     T = motions_between(old, new, centres)
@@ -98,11 +100,11 @@ def _planes(table: Table, motions: F64) -> Table:
     return table.updated(ids, coefficients=new, covariance=covariance, moments=moments, samples_m=transform_each(T, samples))
 
 
-def _turned(M: F64, directions: NDArray[np.floating]) -> F64:
+def _rotate_directions(M: F64, directions: NDArray[np.floating]) -> F64:
     """Directions (n, k, 3), each row by the rotation of its own (n, 4, 4)."""
     return np.asarray(matmul(directions, np.swapaxes(M[:, :3, :3], 1, 2)))
 
 
-def _rotated(M: F64, information: NDArray[np.floating]) -> F64:
+def _rotate_information(M: F64, information: NDArray[np.floating]) -> F64:
     R = M[..., :3, :3]
     return np.asarray(R @ information @ np.swapaxes(R, -1, -2))

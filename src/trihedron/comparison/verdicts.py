@@ -16,7 +16,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from trihedron.comparison.block_bootstrap import power_mean, resampled
+from trihedron.comparison.block_bootstrap import bootstrap_blocks, power_mean
 from trihedron.pipeline.core.types import F64
 from trihedron.pipeline.sweep.paired_statistics import LEVEL, MOST_REPEATS, POWER, half_width, holm, p_value, power, repeats_needed
 
@@ -94,12 +94,12 @@ def verdicts_of(comparisons: Mapping[tuple[str, str], Pairs], columns: Mapping[s
         unequal = {number: one for number, one in enumerate(found) if one.figure == column and (one.error or one.difference)}
         tested = [(number, one.p) for number, one in unequal.items() if one.p is not None]
         corrected |= {number: (p, len(tested)) for (number, _), p in zip(tested, holm([p for _, p in tested]))}
-    return [_answered(one, columns[one.figure], *corrected.get(number, (one.p, 1))) for number, one in enumerate(found)]
+    return [_with_answer(one, columns[one.figure], *corrected.get(number, (one.p, 1))) for number, one in enumerate(found)]
 
 
 def _difference(names: tuple[str, str], column: str, power: int, pairs: Pairs) -> Verdict | None:
     """Return the difference of a pair of alternatives with its interval, before the correction; None where no recording has both figures."""
-    values = np.array([_figures(column, power, a, b) for a, b in pairs]).reshape(-1, 2)
+    values = np.array([_paired_figures(column, power, a, b) for a, b in pairs]).reshape(-1, 2)
     known = np.flatnonzero(np.isfinite(values).all(axis=1))
     if not len(known):
         return None
@@ -109,7 +109,7 @@ def _difference(names: tuple[str, str], column: str, power: int, pairs: Pairs) -
     if len(known) > 1:
         error: float | None = float(np.std(np.diff(values[known], axis=1), ddof=1) / np.sqrt(len(known)))
     elif power and column in a.errors and column in b.errors:
-        found = resampled([a.errors[column], b.errors[column]], [-1.0, 1.0], max(1, a.second), power)
+        found = bootstrap_blocks([a.errors[column], b.errors[column]], [-1.0, 1.0], max(1, a.second), power)
         one, error = replace(one, pieces=found.blocks, block_frames=found.length), found.error
         if np.array_equal(a.errors[column], b.errors[column], equal_nan=True):
             error = 0.0
@@ -118,7 +118,7 @@ def _difference(names: tuple[str, str], column: str, power: int, pairs: Pairs) -
     return one if error is None else _with_interval(one, error)
 
 
-def _figures(column: str, power: int, a: Sample, b: Sample) -> tuple[float, float]:
+def _paired_figures(column: str, power: int, a: Sample, b: Sample) -> tuple[float, float]:
     """Return the figure of both, over the frames of which both have a value; as they are where it is no mean over frames."""
     if not power or column not in a.errors or column not in b.errors:
         return a.figures.get(column, np.nan), b.figures.get(column, np.nan)
@@ -144,11 +144,11 @@ def _with_interval(one: Verdict, error: float) -> Verdict:
     )
 
 
-def _answered(one: Verdict, column: Column, corrected: float | None, tests: int) -> Verdict:
+def _with_answer(one: Verdict, column: Column, corrected: float | None, tests: int) -> Verdict:
     """Add the words; `tests` is the number of comparisons that the correction is for."""
     if corrected is None or one.error is None:
         return replace(one, answer=NO_INTERVAL if one.block_frames is None else TOO_SHORT)
-    if not any(float(_signed(value, column)) for value in (one.low, one.high) if value is not None):  # zero to the digits shown
+    if not any(float(_signed_text(value, column)) for value in (one.low, one.high) if value is not None):  # zero to the digits shown
         return replace(one, corrected=corrected, answer=EQUAL)
     if corrected < LEVEL:
         return replace(one, corrected=corrected, answer="better" if (one.difference > 0.0) == column.more else "worse")
@@ -178,9 +178,9 @@ def line_of(one: Verdict, column: Column) -> str:
     """Return a verdict as one line: `A against B: ATE 12.31 -> 13.08 mm, +0.77 (95 %: +0.21 to +1.40), d 0.90: worse`."""
     name, _, unit = one.figure.rpartition(" ")
     figure = f"{name or 'time'} {one.before:.{column.decimals}f} -> {one.after:.{column.decimals}f} {unit}"
-    text = f"{named(one.first, one.second)}: {figure}, {_signed(one.difference, column)}"
+    text = f"{comparison_name(one.first, one.second)}: {figure}, {_signed_text(one.difference, column)}"
     if one.low is not None and one.high is not None:
-        text += f" (95 %: {_signed(one.low, column)} to {_signed(one.high, column)})"
+        text += f" (95 %: {_signed_text(one.low, column)} to {_signed_text(one.high, column)})"
     elif one.block_frames is not None:
         text += f" ({one.pieces} block{'' if one.pieces == 1 else 's'} of {one.block_frames} frames)"
     if one.effect is not None:
@@ -188,13 +188,13 @@ def line_of(one: Verdict, column: Column) -> str:
     return f"{text}: {one.answer}"
 
 
-def named(first: str, second: str) -> str:
+def comparison_name(first: str, second: str) -> str:
     """Return "first against second"; a key that both single words have is written once."""
     key, value = first.partition("=")[0], second.partition("=")[2]
     short = " " not in first + second and value and second.startswith(f"{key}=")
     return f"{first} against {value if short else second}"
 
 
-def _signed(value: float, column: Column) -> str:
+def _signed_text(value: float, column: Column) -> str:
     text = f"{value:+.{column.decimals}f}"
     return text if float(text) else text.lstrip("+-")
