@@ -8,7 +8,7 @@ from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
 
 
-def locked(path: Path, environment: dict[str, str] | None = None) -> dict[str, str]:
+def locked_versions(path: Path, environment: dict[str, str] | None = None) -> dict[str, str]:
     """Return the versions of a lock by canonical name: those for an environment of markers (PEP 508), of this interpreter unless given.
 
     Raises ValueError where two versions of a package apply."""
@@ -25,7 +25,7 @@ def locked(path: Path, environment: dict[str, str] | None = None) -> dict[str, s
 
 def main() -> None:
     """Print the differences and their number."""
-    versions = locked(Path(sys.argv[1]))
+    versions = locked_versions(Path(sys.argv[1]))
     installed = {canonicalize_name(found.name): found.version for found in importlib.metadata.distributions()}
     differing = sorted(name for name in installed if name != "trihedron" and versions.get(name) != installed[name])
     for name in differing:

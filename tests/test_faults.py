@@ -92,7 +92,7 @@ def run(tmp_path, capsys, case):
     poses, said = list(recording.values("pose")), capsys.readouterr().err
     used = OmegaConf.create(recording.metadata["config"]).dataset
     dataset = Faults(of="synthetic", options=dict(used.options), drop=used.drop, every=used.every, reverse=used.reverse)
-    shown = [Faults(freeze=used.freeze)._delivery.shown(int(dataset._delivered[pose.index])) for pose in poses]
+    shown = [Faults(freeze=used.freeze)._delivery.source_frame(int(dataset._delivered_frames[pose.index])) for pose in poses]
     true = np.array([camera_pose(MOTION.get(used.options.get("motion"), Motion.walk), 0, number / 30.0) for number in shown])
     true = invert(true[0]) @ true
     true[:, :3, 3] *= used.depth_times  # a scale that is wrong is wrong for all

@@ -16,7 +16,7 @@ LOCK = ROOT / "constraints.txt"
 PROJECT = load_file(ROOT / "pyproject.toml")["project"]
 PYTHONS = [line.rpartition(" ")[2] for line in PROJECT["classifiers"] if re.search(r"Python :: 3\.\d+$", line)]
 sys.path.insert(0, str(ROOT / ".ci"))
-from differences import locked  # noqa: E402
+from differences import locked_versions  # noqa: E402
 
 
 def environment(python: str) -> dict[str, str]:
@@ -27,7 +27,7 @@ def environment(python: str) -> dict[str, str]:
 
 @pytest.mark.parametrize("python", PYTHONS)
 def test_it_satisfies_every_requirement(python):
-    versions = locked(LOCK, environment(python))
+    versions = locked_versions(LOCK, environment(python))
     groups = {"": PROJECT["dependencies"], **PROJECT["optional-dependencies"]}
     for extra, lines in groups.items():
         for requirement in map(Requirement, lines):
@@ -38,7 +38,7 @@ def test_it_satisfies_every_requirement(python):
 
 def test_it_is_complete():
     """Every package that an installed one requires is in it; those of another version than the locked one may require others."""
-    versions = locked(LOCK)
+    versions = locked_versions(LOCK)
     pending, seen = [Requirement("trihedron[dev]")], set()
     while pending:
         requirement = pending.pop()
@@ -57,9 +57,9 @@ def test_it_is_complete():
 def test_two_versions_for_one_interpreter_are_an_error(tmp_path):
     lock = tmp_path / "lock.txt"
     lock.write_text("# by hand\nnumpy==2.2.6 ; python_full_version < '3.11'\nnumpy==2.4.6 ; python_full_version >= '3.10'\n")
-    assert locked(lock, environment("3.12")) == {"numpy": "2.4.6"}
+    assert locked_versions(lock, environment("3.12")) == {"numpy": "2.4.6"}
     with pytest.raises(ValueError, match="two versions of numpy apply"):
-        locked(lock, environment("3.10"))
+        locked_versions(lock, environment("3.10"))
 
 
 def test_everything_installs_by_it():

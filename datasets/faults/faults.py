@@ -92,8 +92,8 @@ class Faults:
     def __call__(self, index: int) -> Frame | None:
         """Frame `index` of the selection. Raises DataError where depth and colour differ in size."""
         arrived = self._range[0] + index
-        number = int(self._delivered[arrived])
-        shown = self._delivery.shown(number)
+        number = int(self._delivered_frames[arrived])
+        shown = self._delivery.source_frame(number)
         frame: Frame | None = self._inner(shown)
         timed: Frame | None = frame if shown == number else self._inner(number)
         if frame is None or timed is None:
@@ -101,7 +101,7 @@ class Faults:
         if shown != number and self.frozen is not Covered.both:
             frozen = {"color": frame.color} if self.frozen is Covered.color else {"depth_m": frame.depth_m}
             shown, frame = number, replace(timed, **frozen)
-        color, depth, camera = self._covered(number, *self._spoilt(shown, frame))
+        color, depth, camera = self._cover_images(number, *self._spoilt(shown, frame))
         return Frame(arrived, self._delivery.stamp_ns(timed.stamp_ns, number), color, depth, camera)
 
     def truth(self) -> Trajectory | None:
@@ -109,7 +109,7 @@ class Faults:
         truth: Trajectory | None = self._inner.truth()
         return truth
 
-    def _covered(self, number: int, color: U8, depth: F32, camera: Camera) -> tuple[U8, F32, Camera]:
+    def _cover_images(self, number: int, color: U8, depth: F32, camera: Camera) -> tuple[U8, F32, Camera]:
         if not inside(self.cover, np.array([number]))[0]:
             return color, depth, camera
         if self.covered is not Covered.depth:
@@ -135,14 +135,14 @@ class Faults:
             color, depth = spoil.with_reflections(color, depth, self.reflecting, self._rng(ALL, 1))
         if (self.exposure_ms or self.readout_ms) and (flow := self._flow(number, frame)) is not None:
             period_ms = 1e3 / camera.fps
-            color = spoil.blurred(color, flow, self.exposure_ms / period_ms) if self.exposure_ms else color
-            color, depth = spoil.rolled(color, depth, flow, self.readout_ms / period_ms) if self.readout_ms else (color, depth)
+            color = spoil.add_motion_blur(color, flow, self.exposure_ms / period_ms) if self.exposure_ms else color
+            color, depth = spoil.add_rolling_shutter(color, depth, flow, self.readout_ms / period_ms) if self.readout_ms else (color, depth)
         if self.shuffle and (other := self._inner(int(self._rng(SHUFFLED, number).integers(len(self._inner))))) is not None:
             color = other.color
         color = np.ascontiguousarray(color[:, ::-1]) if self.mirror else color
         color = spoil.with_gamma(color, self.gamma) if self.gamma != 1.0 else color
         if self.resize != 1.0:
-            color, depth, camera = spoil.resized(color, depth, camera, self.resize)
+            color, depth, camera = spoil.resize_frame(color, depth, camera, self.resize)
         if self.depth_resize != 1.0:
             _refuse_sizes(number, depth, self.depth_resize)
         return color, self._wrong_depth(depth, camera, rng), replace(camera, fx=camera.fx * self.focal_times, fy=camera.fy * self.focal_times)
@@ -175,12 +175,12 @@ class Faults:
         return Delivery(self.drop, self.drop_share, self.every, self.freeze, self.reverse, self.jump, self.jump_s)
 
     @cached_property
-    def _delivered(self) -> Any:
-        return self._delivery.delivered(len(self._inner), self.seed)
+    def _delivered_frames(self) -> Any:
+        return self._delivery.frame_numbers(len(self._inner), self.seed)
 
     @cached_property
     def _range(self) -> tuple[int, int]:
-        return clip_range(self.frames, len(self._delivered), f"the {self.of} data set, as far as they are delivered")
+        return clip_range(self.frames, len(self._delivered_frames), f"the {self.of} data set, as far as they are delivered")
 
     @cached_property
     def _inner(self) -> Any:

@@ -51,7 +51,7 @@ def not_finite(depth_m: F32, share: float, rng: np.random.Generator) -> F32:
     return np.where(chosen, values, depth_m)
 
 
-def resized(color: U8, depth_m: F32, camera: Camera, times: float) -> tuple[U8, F32, Camera]:
+def resize_frame(color: U8, depth_m: F32, camera: Camera, times: float) -> tuple[U8, F32, Camera]:
     """Another resolution, with its camera: colour by area, depth by nearest neighbour."""
     width, height = round(camera.width * times), round(camera.height * times)
     sx, sy = width / camera.width, height / camera.height
@@ -107,22 +107,22 @@ def flow_px(gray: U8, other: U8) -> F32:
     return np.asarray(cv2.DISOpticalFlow_create(cv2.DISOPTICAL_FLOW_PRESET_FAST).calc(gray, other, None), np.float32)
 
 
-def blurred(color: U8, flow: F32, exposure: float) -> U8:
+def add_motion_blur(color: U8, flow: F32, exposure: float) -> U8:
     """The mean over an exposure that lasts `exposure` of the time in which the image moves by `flow`."""
     total = np.zeros(color.shape, np.float32)
     for when in exposure * ((np.arange(SUB_FRAMES) + 0.5) / SUB_FRAMES - 0.5):
-        total += _moved(color, flow, np.float32(when), cv2.INTER_LINEAR)
+        total += _warp_by_flow(color, flow, np.float32(when), cv2.INTER_LINEAR)
     return np.rint(total / SUB_FRAMES).astype(np.uint8)
 
 
-def rolled(color: U8, depth_m: F32, flow: F32, readout: float) -> tuple[U8, F32]:
+def add_rolling_shutter(color: U8, depth_m: F32, flow: F32, readout: float) -> tuple[U8, F32]:
     """Rows read one after the other; the whole image takes `readout` of the time in which it moves by `flow`, its middle row is on time."""
     h = len(depth_m)
     when = (readout * ((np.arange(h) + 0.5) / h - 0.5)).astype(np.float32)[:, None]
-    return _moved(color, flow, when, cv2.INTER_LINEAR), _moved(depth_m, flow, when, cv2.INTER_NEAREST)
+    return _warp_by_flow(color, flow, when, cv2.INTER_LINEAR), _warp_by_flow(depth_m, flow, when, cv2.INTER_NEAREST)
 
 
-def _moved(image: NDArray[Any], flow: F32, when: Any, how: int) -> NDArray[Any]:
+def _warp_by_flow(image: NDArray[Any], flow: F32, when: Any, how: int) -> NDArray[Any]:
     """The image a part `when` of the flow later."""
     h, w = image.shape[:2]
     x, y = np.meshgrid(np.arange(w, dtype=np.float32), np.arange(h, dtype=np.float32))

@@ -25,7 +25,7 @@ class Delivery:
     jump: int = 0
     jump_s: float = 0.0
 
-    def delivered(self, count: int, seed: int) -> Numbers:
+    def frame_numbers(self, count: int, seed: int) -> Numbers:
         """(n,) numbers of the frames of a sequence of `count` that arrive, in the order in which they do. The first frame always does."""
         numbers = np.arange(count)
         lost = inside(self.drop, numbers) | (np.random.default_rng([seed, STREAM]).random(count) < self.drop_share)
@@ -34,7 +34,7 @@ class Delivery:
         kept[turned] = kept[turned][::-1]
         return np.asarray(kept)
 
-    def shown(self, number: int) -> int:
+    def source_frame(self, number: int) -> int:
         """The frame whose images arrive as those of frame `number`: another one while the camera is frozen."""
         return frame_range(self.freeze)[0] if bool(inside(self.freeze, np.array([number]))[0]) else number
 

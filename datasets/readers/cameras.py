@@ -101,7 +101,7 @@ def read_camera_file(path: Path) -> Calibration:
         raise DataError(str(path), "holds no keys", f"give {' '.join(REQUIRED)}, one 'key: value' a line")
     unknown = next((key for key in content if key not in REQUIRED + OPTIONAL), None)
     if unknown is not None:
-        raise DataError(str(path), f"unknown key '{_shown(unknown)}'", did_you_mean(_shown(unknown), REQUIRED + OPTIONAL))
+        raise DataError(str(path), f"unknown key '{_printable_value(unknown)}'", did_you_mean(_printable_value(unknown), REQUIRED + OPTIONAL))
     missing = next((key for key in REQUIRED if key not in content), None)
     if missing is not None:
         raise DataError(str(path), f"the key '{missing}' is missing", f"give {' '.join(REQUIRED)}")
@@ -114,17 +114,21 @@ def _calibration(path: Path, content: dict[str, Any]) -> Calibration:
         raise DataError(str(path), "fy is negative (y up)", "give it positive; dataset=icl_nuim reflects the published poses itself")
     for key in ("width", "height", "fx", "fy", "depth_scale", "fps"):
         if values.get(key, 1.0) <= 0.0 or (key in ("width", "height") and values[key] % 1.0):
-            raise DataError(str(path), f"{key} is {_shown(content[key])}", f"give a positive {'whole ' if key in ('width', 'height') else ''}number")
+            raise DataError(
+                str(path), f"{key} is {_printable_value(content[key])}", f"give a positive {'whole ' if key in ('width', 'height') else ''}number"
+            )
     if values["width"] * values["height"] > MAX_PIXELS or not all(SMALLEST < values.get(key, 1.0) < LARGEST for key in BOUNDED):
         raise DataError(str(path), "describes no camera", f"give an image of at most {MAX_PIXELS} pixels; {', '.join(BOUNDED)} above {SMALLEST:g}")
     noise = content.get("depth_noise", "kinect")
     if not isinstance(noise, str) or noise not in NOISES:
-        raise DataError(str(path), f"depth_noise is '{_shown(noise)}'", did_you_mean(_shown(noise), NOISES))
+        raise DataError(str(path), f"depth_noise is '{_printable_value(noise)}'", did_you_mean(_printable_value(noise), NOISES))
     fx, fy, cx, cy = (values[key] for key in ("fx", "fy", "cx", "cy"))
     camera = Camera(int(values["width"]), int(values["height"]), fx, fy, cx, cy, values.get("fps", Camera.fps), NOISES[noise])
     offset, radial = values.get("depth_offset", 0.0), values.get("depth_radial", 0.0)
     if abs(radial) > LARGEST_RADIAL:
-        raise DataError(str(path), f"depth_radial is {_shown(content['depth_radial'])}", f"give a relative error within ±{LARGEST_RADIAL:g}")
+        raise DataError(
+            str(path), f"depth_radial is {_printable_value(content['depth_radial'])}", f"give a relative error within ±{LARGEST_RADIAL:g}"
+        )
     distortion, depth_camera = _distortion(path, content.get("distortion")), _depth_camera(path, content.get("depth_camera"))
     return Calibration(camera, values["depth_scale"], distortion, offset, radial, depth_camera)
 
@@ -138,7 +142,7 @@ def _depth_camera(path: Path, given: Any) -> DepthCamera | None:
         raise DataError(str(path), "depth_camera holds no keys", f"give it {' '.join(known)}")
     unknown = next((key for key in given if key not in known), None)
     if unknown is not None:
-        raise DataError(str(path), f"unknown key 'depth_camera.{_shown(unknown)}'", did_you_mean(_shown(unknown), known))
+        raise DataError(str(path), f"unknown key 'depth_camera.{_printable_value(unknown)}'", did_you_mean(_printable_value(unknown), known))
     missing = next((key for key in known[:4] if key not in given), None)
     if missing is not None:
         raise DataError(str(path), f"the key 'depth_camera.{missing}' is missing", f"give it {' '.join(known[:4])}")
@@ -165,7 +169,7 @@ def _distortion(path: Path, given: Any) -> tuple[float, ...]:
     if isinstance(given, dict):
         unknown = next((key for key in given if key not in COEFFICIENTS), None)
         if unknown is not None:
-            raise DataError(str(path), f"unknown key 'distortion.{_shown(unknown)}'", did_you_mean(_shown(unknown), COEFFICIENTS))
+            raise DataError(str(path), f"unknown key 'distortion.{_printable_value(unknown)}'", did_you_mean(_printable_value(unknown), COEFFICIENTS))
         given = [given.get(key, 0.0) for key in COEFFICIENTS]
     if isinstance(given, str):
         given = given.replace(",", " ").split()
@@ -175,7 +179,7 @@ def _distortion(path: Path, given: Any) -> tuple[float, ...]:
     return values if any(values) else ()
 
 
-def _shown(value: Any) -> str:
+def _printable_value(value: Any) -> str:
     """A value of the file in a message: one line, bounded."""
     try:
         return printable(str(value), SHOWN)
@@ -189,7 +193,7 @@ def _number(path: Path, key: str, value: Any) -> float:
     except (TypeError, ValueError, OverflowError):
         number = math.nan
     if not math.isfinite(number):
-        raise DataError(str(path), f"{key} is '{_shown(value)}'", "give a finite number")
+        raise DataError(str(path), f"{key} is '{_printable_value(value)}'", "give a finite number")
     return number
 
 

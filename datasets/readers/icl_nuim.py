@@ -16,7 +16,7 @@ from trihedron.datasets.readers import povray
 from trihedron.datasets.readers.association import Stamps, file_inside
 from trihedron.datasets.readers.cameras import Calibration, choose_calibration, with_noise
 from trihedron.datasets.readers.images import read_depth
-from trihedron.datasets.readers.matrices import numbered
+from trihedron.datasets.readers.matrices import files_by_number
 from trihedron.datasets.readers.sequence import DepthReader, ImageSequence, SequenceReader
 from trihedron.pipeline.core.errors import DataError, printable
 from trihedron.pipeline.core.files import SHOWN
@@ -49,10 +49,10 @@ class IclNuim(SequenceReader):
         else:
             numbers, colors, depths = _associations(folder) if (folder / "associations.txt").is_file() else _numbered_pairs(folder)
             truth, reader = _truth_file(folder), _png_reader(calibration)
-        return ImageSequence(numbers, colors, depths, calibration, _reflected(truth), depth_reader=reader)
+        return ImageSequence(numbers, colors, depths, calibration, _reflect_trajectory(truth), depth_reader=reader)
 
 
-def _reflected(truth: Trajectory | None) -> Trajectory | None:
+def _reflect_trajectory(truth: Trajectory | None) -> Trajectory | None:
     return None if truth is None else Trajectory(truth.stamps_ns, reflect(truth.poses))
 
 
@@ -88,7 +88,7 @@ def _associations(folder: Path) -> tuple[Stamps, list[Path], list[Path]]:
 
 def _numbered_pairs(folder: Path) -> tuple[Stamps, list[Path], list[Path]]:
     """The pairs rgb/N.png, depth/N.png, in order of N."""
-    colors, depths = numbered(folder / "rgb", r"(\d+)\.png"), numbered(folder / "depth", r"(\d+)\.png")
+    colors, depths = files_by_number(folder / "rgb", r"(\d+)\.png"), files_by_number(folder / "depth", r"(\d+)\.png")
     numbers = [number for number in colors if number in depths]
     if not numbers:
         cure = "give the folder that holds rgb/0.png and depth/0.png, or scene_00_0000.png and .depth"

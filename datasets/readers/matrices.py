@@ -52,7 +52,7 @@ def pose_files(stamps_ns: Stamps, files: Sequence[Path]) -> Trajectory | None:
     return trajectory_of(stamps_ns[rows], [read_matrix(files[row]) for row in rows], [str(files[row]) for row in rows])
 
 
-def numbered(folder: Path, pattern: str) -> dict[int, Path]:
+def files_by_number(folder: Path, pattern: str) -> dict[int, Path]:
     """The files of a folder whose whole name fits a pattern with the number as its first group, in order of their numbers."""
     found = {}
     if folder.is_dir():

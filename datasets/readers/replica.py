@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from trihedron.datasets.readers.cameras import Calibration, choose_calibration, with_noise
-from trihedron.datasets.readers.matrices import frame_stamps, matrix, numbered, trajectory_of
+from trihedron.datasets.readers.matrices import files_by_number, frame_stamps, matrix, trajectory_of
 from trihedron.datasets.readers.sequence import ImageSequence, SequenceReader
 from trihedron.pipeline.core.errors import DataError
 from trihedron.pipeline.core.files import MAX_YAML_BYTES, read_text
@@ -33,8 +33,8 @@ class Replica(SequenceReader):
     exact_depth: bool = True  # rendered without sensor noise; false = a Kinect's
 
     def _open(self, folder: Path) -> ImageSequence:
-        colors = numbered(folder / "results", r"frame(\d+)\.(?:jpg|png)")
-        depths = numbered(folder / "results", r"depth(\d+)\.png")
+        colors = files_by_number(folder / "results", r"frame(\d+)\.(?:jpg|png)")
+        depths = files_by_number(folder / "results", r"depth(\d+)\.png")
         numbers = [number for number in colors if number in depths]
         if not numbers:
             raise DataError(str(folder), "holds no frames of Replica", "give the folder that holds results/frame000000.jpg and depth000000.png")

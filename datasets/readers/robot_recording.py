@@ -68,12 +68,12 @@ class RobotRecording:
         """The pair at a place; None, after a warning, where one of its images cannot be decoded."""
         stamp_ns, color_row, depth_row = self._pairs[position].tolist()
         try:
-            color = self._decoded(self._color, color_row, self._first_color.shape)
-            depth = self._decoded(self._depth, depth_row, self._first_depth.shape)
+            color = self._decode_image(self._color, color_row, self._first_color.shape)
+            depth = self._decode_image(self._depth, depth_row, self._first_depth.shape)
         except (UnreadableImage, UnreadableMessage, RecordingError) as error:
             log.warning("%s; frame %d is skipped", error, position)
             return None
-        return Frame(position, stamp_ns, self._undistortion.color(color), self._registered(depth), self.camera)
+        return Frame(position, stamp_ns, self._undistortion.color(color), self._register_depth(depth), self.camera)
 
     def truth(self) -> Trajectory | None:
         """`T_world_camera` from the poses or transforms that were chosen. Raises DataError where there is none."""
@@ -111,7 +111,7 @@ class RobotRecording:
     @cached_property
     def _pairs(self) -> Stamps:
         """(n, 3) stamp, row of colour, row of depth; in order of time."""
-        color, depth = _ordered(self._color.stamps_ns()), _ordered(self._depth.stamps_ns())
+        color, depth = _sort_stamps(self._color.stamps_ns()), _sort_stamps(self._depth.stamps_ns())
         pairs = associate(color[:, 0], depth[:, 0] + self.depth_delay_ns, self.max_difference_ns)
         if not len(pairs):
             cause = f"no image of {self._color.topic} is within {self.max_difference_ns / 1e6:g} ms of one of {self._depth.topic}"
@@ -157,13 +157,13 @@ class RobotRecording:
         why = "it is empty"
         for row in range(len(stream.index)):
             try:
-                shape = self._decoded(stream, row).shape
+                shape = self._decode_image(stream, row).shape
                 return _Sample(stream.at(row).frame_id, (shape[0], shape[1]))
             except (UnreadableImage, UnreadableMessage, RecordingError) as error:
                 why = str(error)
         raise DataError(str(self.file.path), f"no image of {stream.topic} can be read: {why}", "record them again, or name another topic")
 
-    def _decoded(self, stream: Stream, row: int, shape: tuple[int, int] | None = None) -> Any:
+    def _decode_image(self, stream: Stream, row: int, shape: tuple[int, int] | None = None) -> Any:
         try:
             picture: Picture = stream.at(row)
             pixels = color_of(picture) if stream is self._color else depth_of(picture, self.depth_scale)
@@ -201,7 +201,7 @@ class RobotRecording:
         K = _matrix(found, self._depth.topic)
         return Registration(found.width, found.height, K, _distortion(found, self._depth.topic), self._T_color_depth, self.camera)
 
-    def _registered(self, depth: F32) -> F32:
+    def _register_depth(self, depth: F32) -> F32:
         return self._registration(depth) if self._registration is not None else self._undistortion.depth(depth)
 
     @cached_property
@@ -220,14 +220,14 @@ class RobotRecording:
     def _pose_links(self) -> list[Link]:
         """The poses of a topic, transformed to the camera where the transforms give its mounting."""
         camera, found = self._first_color.frame_id, []
-        for value in self._streams.named(self.topics.truth, "truth_from", Role.pose).values():
+        for value in self._streams.stream_named(self.topics.truth, "truth_from", Role.pose).values():
             for link in value:
                 mount = self._tree.lookup(link.child, camera) if link.child else None
                 found.append(link if mount is None else Link(link.stamp_ns, link.parent, camera, matmul(link.T_parent_child, mount)))
         return found
 
 
-def _ordered(stamps: Stamps) -> Stamps:
+def _sort_stamps(stamps: Stamps) -> Stamps:
     """(n, 2) stamp and row of the messages that have a stamp, increasing, of equal stamps the first."""
     unique, rows = np.unique(stamps, return_index=True)
     return np.column_stack([unique, rows])[unique >= 0]

@@ -134,7 +134,7 @@ class Streams:
         """Content of the first readable image of each topic of images."""
         return {stream.topic: _first_kind(stream) for stream in self.of(Role.picture)}
 
-    def named(self, topic: str, option: str, role: Role) -> Stream:
+    def stream_named(self, topic: str, option: str, role: Role) -> Stream:
         """The topic that an option names. Raises DataError where it is not there or of another role."""
         there = {stream.topic: stream for stream in self.of(role)}
         if topic not in there:
@@ -145,7 +145,7 @@ class Streams:
     def images(self, kind: Kind, option: str, given: str) -> Stream:
         """The topic of colour or depth images: the one named, else the only one. Raises DataError where there is none, or several."""
         if given:
-            return self.named(given, option, Role.picture)
+            return self.stream_named(given, option, Role.picture)
         found = self._of_kind(kind) or (self._of_kind(Kind.grey) if kind is Kind.color else [])
         if not found:
             unknown = [topic for topic, shown in self.kinds.items() if shown is None]
@@ -167,7 +167,7 @@ class Streams:
         """The intrinsics that belong to a topic of images: of the topic named, else of the one beside it, else of the same coordinate frame.
         None where there is none. Raises DataError where several fit."""
         if given:
-            return _first(self.named(given, option, Role.intrinsics))
+            return _first(self.stream_named(given, option, Role.intrinsics))
         streams = {stream.topic: stream for stream in self.of(Role.intrinsics)}
         folder = plain_topic(images.topic).rpartition("/")[0]
         beside = [topic for topic in streams if topic.rpartition("/")[0] == folder]

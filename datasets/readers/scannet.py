@@ -11,7 +11,7 @@ import numpy as np
 
 from trihedron.datasets.readers.cameras import Calibration
 from trihedron.datasets.readers.images import read_color, read_depth
-from trihedron.datasets.readers.matrices import frame_stamps, numbered, pose_files, read_matrix
+from trihedron.datasets.readers.matrices import files_by_number, frame_stamps, pose_files, read_matrix
 from trihedron.datasets.readers.picture_headers import UnreadableImage
 from trihedron.datasets.readers.sequence import ImageSequence, SequenceReader
 from trihedron.pipeline.core.errors import DataError
@@ -32,7 +32,7 @@ class ScanNet(SequenceReader):
     Depth is registered to colour, which is larger: colour is reduced to the depth camera, whose intrinsics a frame has."""
 
     def _open(self, folder: Path) -> ImageSequence:
-        colors, depths = numbered(folder / "color", r"(\d+)\.(?:jpg|png)"), numbered(folder / "depth", r"(\d+)\.png")
+        colors, depths = files_by_number(folder / "color", r"(\d+)\.(?:jpg|png)"), files_by_number(folder / "depth", r"(\d+)\.png")
         numbers = [number for number in colors if number in depths]
         if not numbers:
             raise DataError(str(folder), "holds no frames of ScanNet", LAYOUT)

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from trihedron.datasets.readers.cameras import Calibration, choose_calibration
 from trihedron.datasets.readers.images import read_depth
-from trihedron.datasets.readers.matrices import frame_stamps, numbered, pose_files
+from trihedron.datasets.readers.matrices import files_by_number, frame_stamps, pose_files
 from trihedron.datasets.readers.sequence import DepthReader, ImageSequence, SequenceReader
 from trihedron.pipeline.core.errors import DataError
 from trihedron.pipeline.core.geometry import invert
@@ -32,8 +32,8 @@ class SevenScenes(SequenceReader):
     camera: str = ""  # preset or camera.yaml; empty = the folder's file, else the data set's camera
 
     def _open(self, folder: Path) -> ImageSequence:
-        colors = numbered(folder, r"frame-(\d+)\.color\.(?:png|jpe?g)")
-        depths = numbered(folder, r"frame-(\d+)\.depth\.png")
+        colors = files_by_number(folder, r"frame-(\d+)\.color\.(?:png|jpe?g)")
+        depths = files_by_number(folder, r"frame-(\d+)\.depth\.png")
         numbers = [number for number in colors if number in depths]
         if not numbers:
             inside = sorted(entry.name for entry in folder.glob("seq-*") if entry.is_dir())

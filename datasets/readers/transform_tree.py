@@ -64,7 +64,7 @@ class TransformTree:
         return T
 
     def _at(self, frame: str, stamp_ns: int | None) -> F64 | None:
-        stamps, poses = self._sorted[frame]
+        stamps, poses = self._sorted_links[frame]
         if stamp_ns is None or len(stamps) == 1:
             return np.asarray(poses[0])
         after = int(np.searchsorted(stamps, stamp_ns))
@@ -76,7 +76,7 @@ class TransformTree:
         return interpolate(poses[before], poses[after], float(stamp_ns - stamps[before]) / float(span))
 
     @cached_property
-    def _sorted(self) -> dict[str, tuple[NDArray[np.int64], F64]]:
+    def _sorted_links(self) -> dict[str, tuple[NDArray[np.int64], F64]]:
         """Stamps (n,), increasing, and poses (n, 4, 4) of each moving frame."""
         found = {}
         for frame, links in self._moving.items():

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from trihedron.datasets.simulation.furniture import furnished
+from trihedron.datasets.simulation.furniture import furniture_along
 from trihedron.datasets.simulation.room import HEIGHT_M, UP, Room, Solid, Wall, box, shell, turned_box, walls_of
 from trihedron.datasets.simulation.walks import Walk
 from trihedron.pipeline.core.linalg import norm
@@ -32,7 +32,7 @@ def _rectangle(x: tuple[float, float], y: tuple[float, float]) -> tuple[tuple[fl
 
 
 def _skirting(wall: Wall) -> Solid:
-    return wall.mounted(wall.length_m / 2.0, (0.0, 0.08), wall.length_m, 0.015, "plastic")
+    return wall.mount_box(wall.length_m / 2.0, (0.0, 0.08), wall.length_m, 0.015, "plastic")
 
 
 def _lamps(places: list[tuple[float, float]], ceiling_m: float = HEIGHT_M) -> tuple[list[Solid], tuple[tuple[float, float, float], ...]]:
@@ -54,14 +54,14 @@ def corridor() -> Building:
     inner_west, inner_north, inner_east, inner_south = walls_of(((2.0, 2.0), (2.0, y - 2.0), (x - 2.0, y - 2.0), (x - 2.0, 2.0)))
     solids = [box((2.0, x - 2.0), (2.0, y - 2.0), (0.0, HEIGHT_M), "wall")]
     solids += [_skirting(wall) for wall in (south, east, north, west, inner_west, inner_north, inner_east, inner_south)]
-    solids += furnished(south, "door 2.6, picture 4.1, cabinet 5.6, portrait 7.0, door 8.4, bin 9.4, picture 10.6, crates 12.0, door 13.9")
-    solids += furnished(east, "window 1.6, portrait 3.3, door 4.6, bench 6.2, picture 7.6, pilaster 8.6, door 9.8")
-    solids += furnished(north, "picture 1.0, shelf 2.6, door 4.3, portrait 5.6, window 7.2, globe 9.1, door 10.8, picture 12.2, locker 13.6")
-    solids += furnished(west, "door 1.3, picture 2.7, locker 4.2, portrait 5.3, door 6.5, crates 7.6, window 9.4")
-    solids += furnished(inner_south, "pilaster 1.1, picture 2.4, door 4.0, portrait 5.3, bench 6.6, picture 7.9, door 9.5, pilaster 10.7")
-    solids += furnished(inner_east, "portrait 0.8, door 2.2, pilaster 3.4, picture 4.6, door 6.0")
-    solids += furnished(inner_north, "door 1.5, picture 3.2, pilaster 4.4, cabinet 5.8, picture 7.4, door 9.0, portrait 10.5")
-    solids += furnished(inner_west, "picture 1.0, pilaster 2.2, door 3.6, picture 5.2, bin 6.3")
+    solids += furniture_along(south, "door 2.6, picture 4.1, cabinet 5.6, portrait 7.0, door 8.4, bin 9.4, picture 10.6, crates 12.0, door 13.9")
+    solids += furniture_along(east, "window 1.6, portrait 3.3, door 4.6, bench 6.2, picture 7.6, pilaster 8.6, door 9.8")
+    solids += furniture_along(north, "picture 1.0, shelf 2.6, door 4.3, portrait 5.6, window 7.2, globe 9.1, door 10.8, picture 12.2, locker 13.6")
+    solids += furniture_along(west, "door 1.3, picture 2.7, locker 4.2, portrait 5.3, door 6.5, crates 7.6, window 9.4")
+    solids += furniture_along(inner_south, "pilaster 1.1, picture 2.4, door 4.0, portrait 5.3, bench 6.6, picture 7.9, door 9.5, pilaster 10.7")
+    solids += furniture_along(inner_east, "portrait 0.8, door 2.2, pilaster 3.4, picture 4.6, door 6.0")
+    solids += furniture_along(inner_north, "door 1.5, picture 3.2, pilaster 4.4, cabinet 5.8, picture 7.4, door 9.0, portrait 10.5")
+    solids += furniture_along(inner_west, "picture 1.0, pilaster 2.2, door 3.6, picture 5.2, bin 6.3")
     lamps = [(1.0, 1.0), (5.5, 1.0), (10.0, 1.0), (14.7, 1.0), (14.7, 5.5), (14.7, 10.1), (10.0, 10.1), (5.5, 10.1), (1.0, 10.1), (1.0, 5.5)]
     path = ((6.0, 1.0), (x - 1.0, 1.0), (x - 1.0, y - 1.0), (1.0, y - 1.0), (1.0, 1.0))
     return _building(x, y, solids, lamps, Walk(path, 1.0, 1.0))
@@ -74,7 +74,7 @@ def _doorway(along_x: bool, across: tuple[float, float], span: tuple[float, floa
     return [box(part, across, z, "wall") if along_x else box(across, part, z, "wall") for part, z in pieces]
 
 
-def _pierced(start: tuple[float, float], end: tuple[float, float], gaps: list[tuple[float, float, float, float]]) -> list[Solid]:
+def _wall_with_gaps(start: tuple[float, float], end: tuple[float, float], gaps: list[tuple[float, float, float, float]]) -> list[Solid]:
     """A wall along the middle line from `start` to `end` with gaps (middle along it, width, bottom, top)."""
     a, b = np.array([*start, 0.0]), np.array([*end, 0.0])
     length = float(norm(b - a))
@@ -96,8 +96,8 @@ def flat() -> Building:
     x, y = 8.0, 6.0
     door, window = (DOORWAY_M[0], 0.0, DOORWAY_M[1]), (1.0, 0.9, 2.0)
     solids = [box((5.0, x), (3.5, y), (0.0, HEIGHT_M), "wall"), box((0.0, 1.2), (5.0, y), (0.0, HEIGHT_M), "wall")]
-    solids += _pierced((0.0, 3.55), (5.0, 3.55), [(1.4, *window), (3.6, *door)])
-    solids += _pierced((5.05, 0.0), (5.05, 3.5), [(1.75, *door)])
+    solids += _wall_with_gaps((0.0, 3.55), (5.0, 3.55), [(1.4, *window), (3.6, *door)])
+    solids += _wall_with_gaps((5.05, 0.0), (5.05, 3.5), [(1.75, *door)])
     ajar, leaf = np.radians(75.0), np.array([0.42, 0.02, 1.02])
     hinge = np.array([5.12, 2.2, 1.02])
     solids.append(turned_box(hinge + leaf[0] * np.array([np.sin(ajar), np.cos(ajar), 0.0]), leaf, np.pi / 2.0 - float(ajar), "wood", "door", 3))
@@ -105,9 +105,11 @@ def flat() -> Building:
     south, _, _, _ = walls_of(_rectangle((0.0, 5.0), (0.0, 3.5)))
     _, east, north, _ = walls_of(_rectangle((1.2, 5.0), (3.6, y)))
     solids += (
-        furnished(south, "picture 1.0, portrait 2.4, picture 4.0") + furnished(east, "picture 1.2") + furnished(north, "portrait 1.0, picture 2.4")
+        furniture_along(south, "picture 1.0, portrait 2.4, picture 4.0")
+        + furniture_along(east, "picture 1.2")
+        + furniture_along(north, "portrait 1.0, picture 2.4")
     )
-    solids += furnished(walls_of(_rectangle((0.0, 5.0), (0.0, 3.5)))[3], "picture 1.2, portrait 2.5")
+    solids += furniture_along(walls_of(_rectangle((0.0, 5.0), (0.0, 3.5)))[3], "picture 1.2, portrait 2.5")
     path = [(2.2, 0.9), (4.2, 1.75), (5.9, 1.75), (6.7, 1.3), (6.8, 2.4), (5.9, 2.0), (4.2, 1.75), (3.6, 2.6), (3.6, 4.2), (4.3, 4.9), (2.6, 5.1)]
     path += [(1.0, 4.4), (1.8, 4.1), (3.6, 4.4), (3.6, 2.6), (1.4, 2.6), (0.9, 1.5)]
     return _building(x, y, solids, [(2.5, 1.7), (6.5, 1.7), (2.8, 4.6)], Walk(tuple(path), 0.5, 0.5))
@@ -118,9 +120,9 @@ def slanted_flat() -> Building:
     footprint = ((0.0, 0.0), (8.0, 0.0), (8.0, 5.0), (1.5, 4.0))
     planes, faces = shell(footprint)
     south, east, north, west = walls_of(footprint)
-    solids = _pierced((3.6, -0.2), (4.8, 5.2), [(2.3, DOORWAY_M[0], 0.0, DOORWAY_M[1])])
-    solids += furnished(south, "picture 1.5, portrait 5.6, picture 7.0") + furnished(east, "picture 1.2, portrait 3.4")
-    solids += furnished(north, "portrait 1.6, picture 5.0") + furnished(west, "picture 1.2, portrait 2.8")
+    solids = _wall_with_gaps((3.6, -0.2), (4.8, 5.2), [(2.3, DOORWAY_M[0], 0.0, DOORWAY_M[1])])
+    solids += furniture_along(south, "picture 1.5, portrait 5.6, picture 7.0") + furniture_along(east, "picture 1.2, portrait 3.4")
+    solids += furniture_along(north, "portrait 1.6, picture 5.0") + furniture_along(west, "picture 1.2, portrait 2.8")
     hanging, lights = _lamps([(2.5, 2.0), (6.2, 2.3)])
     path = ((2.4, 1.0), (3.4, 1.9), (4.2, 2.05), (5.4, 1.6), (6.9, 1.1), (7.0, 3.6), (5.6, 3.4), (4.2, 2.05), (3.2, 2.6), (2.3, 3.1), (1.4, 1.6))
     return Building(Room(planes, faces, (*solids, *hanging), lights, DETAIL), Walk(path, 0.5, 0.5))
@@ -136,7 +138,7 @@ def house() -> Building:
     footprint = _rectangle((0.0, x), (0.0, y))
     planes, faces = shell(footprint, top)
     divide = _doorway(False, (4.0, 4.1), (0.0, y), 2.0)
-    solids = [*divide, *(_lifted(solid) for solid in _doorway(False, (4.0, 4.1), (0.0, y), 4.2))]
+    solids = [*divide, *(_lift_to_upper_floor(solid) for solid in _doorway(False, (4.0, 4.1), (0.0, y), 4.2))]
     hole = ((0.0, 1.1), (0.9, 4.5))
     for part in (((1.1, x), (0.0, y)), ((0.0, 1.1), (0.0, 0.9)), ((0.0, 1.1), (4.5, y))):
         solids += [box(*part, (HEIGHT_M, UPPER_M - 0.004), "ceiling"), box(*part, (UPPER_M - 0.004, UPPER_M), "floor")]
@@ -146,11 +148,14 @@ def house() -> Building:
         solids.append(box((0.0, 1.0), (begin, begin + going), (max(rise * (step - 1), 0.0), rise * (step + 1)), "wood"))
     solids += [box((1.1, 1.14), (0.9, 4.5), (UPPER_M, UPPER_M + 0.9), "plastic"), box((0.0, 1.14), (0.86, 0.9), (UPPER_M, UPPER_M + 0.9), "plastic")]
     south, east, north, west = walls_of(footprint)
-    solids += furnished(south, "cabinet 2.4, picture 2.4, sofa 5.6, picture 5.6") + furnished(east, "shelf 1.5, picture 3.2, desk 4.8")
-    solids += furnished(north, "locker 1.2, picture 2.4, portrait 4.4, picture 5.8") + furnished(west, "portrait 0.8")
-    solids += [_lifted(solid) for solid in furnished(south, "picture 2.2, portrait 3.2, desk 5.6, picture 5.6")]
-    solids += [_lifted(solid) for solid in furnished(east, "picture 1.2, shelf 3.0, portrait 4.8") + furnished(west, "portrait 0.6, picture 3.4")]
-    solids += [_lifted(solid) for solid in furnished(north, "cabinet 1.4, picture 1.4, picture 4.6, portrait 6.2")]
+    solids += furniture_along(south, "cabinet 2.4, picture 2.4, sofa 5.6, picture 5.6") + furniture_along(east, "shelf 1.5, picture 3.2, desk 4.8")
+    solids += furniture_along(north, "locker 1.2, picture 2.4, portrait 4.4, picture 5.8") + furniture_along(west, "portrait 0.8")
+    solids += [_lift_to_upper_floor(solid) for solid in furniture_along(south, "picture 2.2, portrait 3.2, desk 5.6, picture 5.6")]
+    solids += [
+        _lift_to_upper_floor(solid)
+        for solid in furniture_along(east, "picture 1.2, shelf 3.0, portrait 4.8") + furniture_along(west, "portrait 0.6, picture 3.4")
+    ]
+    solids += [_lift_to_upper_floor(solid) for solid in furniture_along(north, "cabinet 1.4, picture 1.4, picture 4.6, portrait 6.2")]
     low, low_lights = _lamps([(2.5, 3.0), (5.5, 3.0)])
     high, high_lights = _lamps([(2.5, 3.0), (5.5, 3.0)], top)
     room = Room(planes, faces, (*solids, *low, *high), (*low_lights, *high_lights), DETAIL, ((0.0, HEIGHT_M), (UPPER_M, top)))
@@ -161,7 +166,7 @@ def house() -> Building:
     return Building(room, Walk(tuple(path), 0.55, 0.5, tuple(floors)))
 
 
-def _lifted(solid: Solid) -> Solid:
+def _lift_to_upper_floor(solid: Solid) -> Solid:
     """Return a solid as it stands on the upper floor."""
     shift = UPPER_M * UP
     return replace(solid, centre=solid.centre + shift, faces=tuple(replace(face, origin=face.origin + shift) for face in solid.faces))
@@ -175,8 +180,8 @@ def _office(west: float) -> list[Solid]:
     solids += [box(x, (6.1, 6.2), (0.0, HEIGHT_M), "wall")]
     solids += [box(x, y, (0.0, 0.004), "floor"), box(x, y, (HEIGHT_M - 0.004, HEIGHT_M), "ceiling")]
     south, to_east, north, to_west = walls_of(_rectangle(x, y))
-    solids += furnished(south, "portrait 0.8, bin 3.6") + furnished(to_east, "shelf 1.5, picture 3.1")
-    solids += furnished(north, "desk 1.4, window 1.4, globe 3.2") + furnished(to_west, "picture 1.0, sofa 2.7")
+    solids += furniture_along(south, "portrait 0.8, bin 3.6") + furniture_along(to_east, "shelf 1.5, picture 3.1")
+    solids += furniture_along(north, "desk 1.4, window 1.4, globe 3.2") + furniture_along(to_west, "picture 1.0, sofa 2.7")
     return [_looking(solid, number) for number, solid in enumerate(solids)]
 
 
@@ -192,8 +197,8 @@ def offices() -> Building:
     blocks = [box(gap, (2.0, 6.2), (0.0, HEIGHT_M), "wall") for gap in gaps]
     south, east, _, west = walls_of(_rectangle((0.0, x), (0.0, 2.0)))
     solids = [*blocks, *_office(first), *_office(second), _skirting(south), _skirting(east), _skirting(west)]
-    solids += furnished(south, "door 1.2, picture 2.7, portrait 4.4, door 6.0, picture 7.4, door 9.4, portrait 10.6, picture 11.8, door 13.2")
-    solids += furnished(east, "window 1.0") + furnished(west, "picture 1.0")
+    solids += furniture_along(south, "door 1.2, picture 2.7, portrait 4.4, door 6.0, picture 7.4, door 9.4, portrait 10.6, picture 11.8, door 13.2")
+    solids += furniture_along(east, "window 1.0") + furniture_along(west, "picture 1.0")
     lamps = [(3.6, 1.0), (10.4, 1.0), (7.0, 1.0), (first + 2.0, 4.1), (second + 2.0, 4.1)]
     path = [(2.2, 0.85)]
     for door in (first + 2.0, second + 2.0):
@@ -235,7 +240,7 @@ def rooms() -> Building:
         south, east, north, west = walls_of(_rectangle((k * pitch, k * pitch + width), (row * (depth + WALL_M), row * (depth + WALL_M) + depth)))
         sides = (south, east, north, west) if row == 0 else (north, east, south, west)  # the furniture stands along the outer wall
         for wall, plan in zip(sides, plans):
-            solids += furnished(wall, plan)
+            solids += furniture_along(wall, plan)
     centres = [(k * pitch + width / 2.0, at) for at in (2.0, y - 2.0) for k in range(5)]
     return _building(x, y, solids, centres, Walk(_circuit(pitch, doors, openings), 0.62, 0.6))
 

@@ -41,7 +41,7 @@ def gain_for(mean_gray: float, strength: float) -> float:
     return float(np.clip((MID_GRAY / max(mean_gray, 1.0)) ** strength, *GAINS))
 
 
-def exposed(color: U8, gain: float, jpeg_quality: int, rng: np.random.Generator) -> U8:
+def expose_image(color: U8, gain: float, jpeg_quality: int, rng: np.random.Generator) -> U8:
     """Brightness times gain, darker corners, noise that grows with the gain, clipped; compressed unless `jpeg_quality` is 0."""
     h, w = color.shape[:2]
     y, x = np.mgrid[:h, :w].astype(np.float32)

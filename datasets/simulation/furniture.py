@@ -13,32 +13,32 @@ Piece = Callable[[Wall, float], list[Solid]]
 
 def _door(wall: Wall, at: float) -> list[Solid]:
     """A closed door in its frame."""
-    jambs = [wall.mounted(at + side, (0.0, 2.05), 0.08, 0.07, "plastic") for side in (-0.49, 0.49)]
-    return [wall.mounted(at, (0.0, 2.05), 0.9, 0.03, "wood", "door"), wall.mounted(at, (2.05, 2.14), 1.06, 0.07, "plastic"), *jambs]
+    jambs = [wall.mount_box(at + side, (0.0, 2.05), 0.08, 0.07, "plastic") for side in (-0.49, 0.49)]
+    return [wall.mount_box(at, (0.0, 2.05), 0.9, 0.03, "wood", "door"), wall.mount_box(at, (2.05, 2.14), 1.06, 0.07, "plastic"), *jambs]
 
 
 def _picture(wall: Wall, at: float) -> list[Solid]:
-    return [wall.mounted(at, (1.2, 1.85), 0.8, 0.025, "plastic", "picture")]
+    return [wall.mount_box(at, (1.2, 1.85), 0.8, 0.025, "plastic", "picture")]
 
 
 def _portrait(wall: Wall, at: float) -> list[Solid]:
-    return [wall.mounted(at, (1.25, 1.9), 0.45, 0.025, "plastic", "picture")]
+    return [wall.mount_box(at, (1.25, 1.9), 0.45, 0.025, "plastic", "picture")]
 
 
 def _window(wall: Wall, at: float) -> list[Solid]:
-    return [wall.mounted(at, (1.1, 2.2), 1.5, 0.03, "plastic", "picture"), wall.mounted(at, (1.04, 1.1), 1.7, 0.12, "plastic")]
+    return [wall.mount_box(at, (1.1, 2.2), 1.5, 0.03, "plastic", "picture"), wall.mount_box(at, (1.04, 1.1), 1.7, 0.12, "plastic")]
 
 
 def _pilaster(wall: Wall, at: float) -> list[Solid]:
-    return [wall.mounted(at, (0.0, HEIGHT_M), 0.4, 0.15, "marble")]
+    return [wall.mount_box(at, (0.0, HEIGHT_M), 0.4, 0.15, "marble")]
 
 
 def _cabinet(wall: Wall, at: float) -> list[Solid]:
-    return [wall.mounted(at, (0.0, 0.9), 1.2, 0.4, "wood", "drawers")]
+    return [wall.mount_box(at, (0.0, 0.9), 1.2, 0.4, "wood", "drawers")]
 
 
 def _locker(wall: Wall, at: float) -> list[Solid]:
-    return [wall.mounted(at, (0.0, 1.8), 0.8, 0.38, "plastic", "door")]
+    return [wall.mount_box(at, (0.0, 1.8), 0.8, 0.38, "plastic", "door")]
 
 
 def _globe(wall: Wall, at: float) -> list[Solid]:
@@ -54,34 +54,37 @@ def _bin(wall: Wall, at: float) -> list[Solid]:
 
 def _crates(wall: Wall, at: float) -> list[Solid]:
     """One along the wall, and a turned one on top."""
-    low = wall.mounted(at, (0.0, 0.45), 0.6, 0.4, "crate")
+    low = wall.mount_box(at, (0.0, 0.45), 0.6, 0.4, "crate")
     centre = low.centre + UP * 0.4
     return [low, turned_box(centre, np.array([0.16, 0.12, 0.175]), low.yaw + np.radians(20.0), "crate")]
 
 
 def _shelf(wall: Wall, at: float) -> list[Solid]:
     """An open shelf with three rows of books."""
-    sides = [wall.mounted(at + side, (0.0, 2.0), 0.03, 0.3, "wood") for side in (-0.585, 0.585)]
-    boards = [wall.mounted(at, (z, z + 0.03), 1.14, 0.3, "wood") for z in (0.05, 0.5, 0.95, 1.4, 1.97)]
-    books = [wall.mounted(at + side, (z, z + 0.29), 0.75, 0.24, "paper", "books") for z, side in ((0.53, -0.18), (0.98, 0.15), (1.43, -0.1))]
+    sides = [wall.mount_box(at + side, (0.0, 2.0), 0.03, 0.3, "wood") for side in (-0.585, 0.585)]
+    boards = [wall.mount_box(at, (z, z + 0.03), 1.14, 0.3, "wood") for z in (0.05, 0.5, 0.95, 1.4, 1.97)]
+    books = [wall.mount_box(at + side, (z, z + 0.29), 0.75, 0.24, "paper", "books") for z, side in ((0.53, -0.18), (0.98, 0.15), (1.43, -0.1))]
     return [*sides, *boards, *books]
 
 
 def _desk(wall: Wall, at: float) -> list[Solid]:
     """A table with a monitor."""
-    legs = [wall.mounted(at + side, (0.0, 0.71), 0.06, 0.06, "wood", off_m=off) for side in (-0.65, 0.65) for off in (0.02, 0.52)]
-    monitor = [wall.mounted(at, (0.87, 1.22), 0.6, 0.04, "plastic", "screen", 0.18), wall.mounted(at, (0.75, 0.87), 0.2, 0.2, "plastic", off_m=0.1)]
-    return [wall.mounted(at, (0.71, 0.75), 1.4, 0.6, "wood"), *legs, *monitor]
+    legs = [wall.mount_box(at + side, (0.0, 0.71), 0.06, 0.06, "wood", off_m=off) for side in (-0.65, 0.65) for off in (0.02, 0.52)]
+    monitor = [
+        wall.mount_box(at, (0.87, 1.22), 0.6, 0.04, "plastic", "screen", 0.18),
+        wall.mount_box(at, (0.75, 0.87), 0.2, 0.2, "plastic", off_m=0.1),
+    ]
+    return [wall.mount_box(at, (0.71, 0.75), 1.4, 0.6, "wood"), *legs, *monitor]
 
 
 def _sofa(wall: Wall, at: float) -> list[Solid]:
-    arms = [wall.mounted(at + side, (0.0, 0.6), 0.2, 0.65, "fabric") for side in (-0.8, 0.8)]
-    return [wall.mounted(at, (0.0, 0.42), 1.4, 0.65, "fabric"), wall.mounted(at, (0.42, 0.85), 1.4, 0.2, "fabric"), *arms]
+    arms = [wall.mount_box(at + side, (0.0, 0.6), 0.2, 0.65, "fabric") for side in (-0.8, 0.8)]
+    return [wall.mount_box(at, (0.0, 0.42), 1.4, 0.65, "fabric"), wall.mount_box(at, (0.42, 0.85), 1.4, 0.2, "fabric"), *arms]
 
 
 def _bench(wall: Wall, at: float) -> list[Solid]:
-    legs = [wall.mounted(at + side, (0.0, 0.41), 0.06, 0.3, "wood", off_m=0.03) for side in (-0.55, 0.55)]
-    return [wall.mounted(at, (0.41, 0.46), 1.3, 0.38, "wood"), *legs]
+    legs = [wall.mount_box(at + side, (0.0, 0.41), 0.06, 0.3, "wood", off_m=0.03) for side in (-0.55, 0.55)]
+    return [wall.mount_box(at, (0.41, 0.46), 1.3, 0.38, "wood"), *legs]
 
 
 PIECES: dict[str, Piece] = {
@@ -90,7 +93,7 @@ PIECES: dict[str, Piece] = {
 }  # fmt: skip
 
 
-def furnished(wall: Wall, plan: str) -> list[Solid]:
+def furniture_along(wall: Wall, plan: str) -> list[Solid]:
     """The solids of a plan `piece at, piece at, …` along a wall."""
     entries = (entry.split() for entry in plan.split(",") if entry.strip())
     return [solid for name, at in entries for solid in PIECES[name](wall, float(at))]

@@ -236,7 +236,7 @@ def _globe(h: int, w: int, per_metre: float, rng: np.random.Generator) -> F32:
     return image
 
 
-def speckled(h: int, w: int, per_metre: float, rng: np.random.Generator) -> F32:
+def paint_speckles(h: int, w: int, per_metre: float, rng: np.random.Generator) -> F32:
     """Plain material with faint marks."""
     image = _ground(h, w, PLAIN["plastic"])
     _scatter(image, int(60 * h * w / per_metre**2), (0.004 * per_metre, 0.012 * per_metre), rng, contrast=120.0)

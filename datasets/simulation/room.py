@@ -122,7 +122,9 @@ class Wall:
     normal: F64
     length_m: float
 
-    def mounted(self, at: float, z: tuple[float, float], width: float, thickness: float, material: str, front: str = "", off_m: float = 0.0) -> Solid:
+    def mount_box(
+        self, at: float, z: tuple[float, float], width: float, thickness: float, material: str, front: str = "", off_m: float = 0.0
+    ) -> Solid:
         """A box on the wall, or `off_m` from it, its middle `at` metres from its start; `front` is the material of the face towards the room."""
         centre = self.start + self.along * at + self.normal * (off_m + thickness / 2.0) + UP * ((z[0] + z[1]) / 2.0)
         half = np.array([width / 2.0, thickness / 2.0, (z[1] - z[0]) / 2.0])
@@ -163,11 +165,11 @@ def leaning_room() -> Room:
     """The rectangular room, bare, under the shear LEAN about its middle: no two of its surfaces are at right angles."""
     upright = furnished_room()
     middle = np.array([*np.mean(RECTANGLE, axis=0), HEIGHT_M / 2.0])
-    faces = [_leaned(face, middle) for face in upright.faces]
+    faces = [_lean_face(face, middle) for face in upright.faces]
     return Room(np.array([[*face.normal, -float(matmul(face.normal, face.origin))] for face in faces]), tuple(faces))
 
 
-def _leaned(face: Face, middle: F64) -> Face:
+def _lean_face(face: Face, middle: F64) -> Face:
     """A flat face under the shear; its texture covers the parallelogram that it becomes."""
     width, height = face.u * face.size_m[0], face.v * face.size_m[1]
     corners = face.origin + np.array([0.0 * width, width, height, width + height])
@@ -206,16 +208,16 @@ def _furniture() -> list[Solid]:
 
 def _on_the_walls(walls: list[Wall]) -> list[Solid]:
     south, east, north, west = walls
-    skirting = [wall.mounted(wall.length_m / 2.0, (0.0, 0.08), wall.length_m, 0.015, "plastic") for wall in walls]
-    door = west.mounted(2.4, (0.0, 2.05), 0.9, 0.04, "wood", "door")
+    skirting = [wall.mount_box(wall.length_m / 2.0, (0.0, 0.08), wall.length_m, 0.015, "plastic") for wall in walls]
+    door = west.mount_box(2.4, (0.0, 2.05), 0.9, 0.04, "wood", "door")
     pictures = [
-        north.mounted(2.9, (1.25, 1.85), 0.8, 0.025, "plastic", "picture"),
-        north.mounted(4.15, (1.4, 2.0), 0.45, 0.025, "plastic", "picture"),
-        south.mounted(3.55, (1.2, 1.9), 0.55, 0.025, "plastic", "picture"),
-        south.mounted(1.0, (1.3, 1.8), 0.7, 0.025, "plastic", "picture"),
-        west.mounted(0.9, (1.2, 1.9), 0.55, 0.025, "plastic", "picture"),
-        west.mounted(3.4, (1.3, 1.7), 0.5, 0.025, "plastic", "picture"),
+        north.mount_box(2.9, (1.25, 1.85), 0.8, 0.025, "plastic", "picture"),
+        north.mount_box(4.15, (1.4, 2.0), 0.45, 0.025, "plastic", "picture"),
+        south.mount_box(3.55, (1.2, 1.9), 0.55, 0.025, "plastic", "picture"),
+        south.mount_box(1.0, (1.3, 1.8), 0.7, 0.025, "plastic", "picture"),
+        west.mount_box(0.9, (1.2, 1.9), 0.55, 0.025, "plastic", "picture"),
+        west.mount_box(3.4, (1.3, 1.7), 0.5, 0.025, "plastic", "picture"),
     ]
-    window = east.mounted(1.9, (1.1, 2.2), 1.5, 0.03, "plastic", "picture")
-    sill = east.mounted(1.9, (1.04, 1.1), 1.7, 0.12, "plastic")
+    window = east.mount_box(1.9, (1.1, 2.2), 1.5, 0.03, "plastic", "picture")
+    sill = east.mount_box(1.9, (1.04, 1.1), 1.7, 0.12, "plastic")
     return [*skirting, door, *pictures, window, sill]

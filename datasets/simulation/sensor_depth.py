@@ -59,11 +59,11 @@ def stereo_depth(depth_m: F64, gray: U8, fx: float, noise: float, rng: np.random
     disparity = focal_m / fat + noise * SUBPIXEL_PX * white / max(float(white.std()), 1e-6)
     disparity = np.round(disparity * STEREO_STEPS) / STEREO_STEPS
     read = focal_m / np.maximum(disparity, 1e-3)
-    lost = _unmatched(gray, fat, rng, size) | _hidden_from_left(fat, focal_m) | (fat < STEREO_RANGE_M[0]) | (fat > STEREO_RANGE_M[1])
+    lost = _low_contrast_mask(gray, fat, rng, size) | _hidden_from_left(fat, focal_m) | (fat < STEREO_RANGE_M[0]) | (fat > STEREO_RANGE_M[1])
     return np.where(lost, np.float32(0.0), read).astype(np.float32)
 
 
-def _unmatched(gray: U8, depth_m: F32, rng: np.random.Generator, size: float) -> Bool:
+def _low_contrast_mask(gray: U8, depth_m: F32, rng: np.random.Generator, size: float) -> Bool:
     """(h, w) whether the contrast in the window is too low to be matched; the limit varies in blobs."""
     window = (2 * round(TEXTURE_WINDOW_PX * size / 2.0) + 1,) * 2
     seen = gray.astype(np.float32) + GRAY_NOISE * rng.standard_normal(gray.shape, dtype=np.float32)

@@ -10,7 +10,7 @@ import numpy as np
 
 from trihedron.datasets.readers.sequence import clip_range
 from trihedron.datasets.simulation.depth_noise import kinect_depth
-from trihedron.datasets.simulation.exposure import exposed, gain_for, motion_blurred, motion_px
+from trihedron.datasets.simulation.exposure import expose_image, gain_for, motion_blurred, motion_px
 from trihedron.datasets.simulation.motion import Motion
 from trihedron.datasets.simulation.sensor_depth import coarse, lidar_depth, stereo_depth, tof_depth
 from trihedron.datasets.simulation.sensor_models import MODELS, Sensor, SensorParameters, drawn_parameters
@@ -97,19 +97,19 @@ class SimulatedSensor:
 
     def _color(self, time_s: float, rng: np.random.Generator) -> U8:
         hidden = self.hidden
-        color, exact, _ = self._rolled(self.color_camera, time_s, hidden.readout_ms / 1e3)
+        color, exact, _ = self._render_rolling_shutter(self.color_camera, time_s, hidden.readout_ms / 1e3)
         half_s = 0.5e-3 * hidden.exposure_ms
         before, after = self._world.pose_at(time_s - half_s), self._world.pose_at(time_s + half_s)
         color = motion_blurred(color, motion_px(exact, self.color_camera, before, after))
         meter = replace(self.camera, width=METER_PX[0], height=METER_PX[1], fx=self.camera.fx * METER_PX[0] / self.width,
                         fy=self.camera.fy * METER_PX[1] / self.height, cx=(METER_PX[0] - 1) / 2.0, cy=(METER_PX[1] - 1) / 2.0)  # fmt: skip
         metered, *_ = self._world.seen_by(meter, self._world.pose_at(time_s - METER_LAG_S))
-        return exposed(color, gain_for(float(metered.mean()), hidden.gain_strength), hidden.jpeg_quality, rng)
+        return expose_image(color, gain_for(float(metered.mean()), hidden.gain_strength), hidden.jpeg_quality, rng)
 
     def _depth(self, time_s: float, rng: np.random.Generator) -> F32:
         """(h, w) readings in metres: of the sensor's kind, then its systematic errors."""
         hidden, camera = self.hidden, self.depth_camera
-        color, exact, cosine = self._rolled(camera, time_s + hidden.delay_ms / 1e3, hidden.depth_readout_ms / 1e3)
+        color, exact, cosine = self._render_rolling_shutter(camera, time_s + hidden.delay_ms / 1e3, hidden.depth_readout_ms / 1e3)
         gray = np.asarray(matmul(color, np.array([0.299, 0.587, 0.114])), np.uint8)
         if self.sensor is Sensor.kinect_v1:
             noise = camera.depth_noise
@@ -128,7 +128,7 @@ class SimulatedSensor:
         wrong = read * (1.0 + hidden.radial_bias * radius2) / (1.0 - hidden.inverse_depth_offset_per_m * read)
         return np.where(read > 0.0, wrong, 0.0).astype(np.float32)
 
-    def _rolled(self, camera: Camera, time_s: float, readout_s: float) -> tuple[U8, F64, F32]:
+    def _render_rolling_shutter(self, camera: Camera, time_s: float, readout_s: float) -> tuple[U8, F64, F32]:
         """Colour, exact depth and cosine of incidence; rows are read one after the other, the middle one on time.
 
         Bands of BAND_ROWS rows are rendered each at its own pose, with a row more on either side: the renderer smooths no border of its image."""

@@ -171,7 +171,7 @@ class Synthetic:
 
     @cached_property
     def _scene(self) -> tuple[Geometry, Atlas]:
-        return _painted(self.scene, self.slanted, self.curved, self.texture, self.seed)
+        return _paint_scene(self.scene, self.slanted, self.curved, self.texture, self.seed)
 
     @cached_property
     def _room(self) -> Room:
@@ -192,7 +192,7 @@ def _room_of(scene: Scene, slanted: bool, curved: bool) -> Room:
 
 
 @lru_cache(maxsize=2)
-def _painted(scene: Scene, slanted: bool, curved: bool, texture: bool, seed: int) -> tuple[Geometry, Atlas]:
+def _paint_scene(scene: Scene, slanted: bool, curved: bool, texture: bool, seed: int) -> tuple[Geometry, Atlas]:
     """Shapes and textures of a scene: to paint them takes as long as a hundred small frames, and runs of one process share them."""
     room = _room_of(scene, slanted, curved)
     return geometry_of(room), bake(all_faces(room), texture, seed, room.detail)

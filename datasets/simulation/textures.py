@@ -5,7 +5,7 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from trihedron.datasets.simulation.materials import PAINTERS, PLAIN, clouds, speckled
+from trihedron.datasets.simulation.materials import PAINTERS, PLAIN, clouds, paint_speckles
 from trihedron.datasets.simulation.room import Face
 from trihedron.datasets.simulation.shading import Atlas
 from trihedron.pipeline.core.types import U8
@@ -33,7 +33,7 @@ def bake(faces: list[Face], textured: bool, seed: int, detail: float = 1.0) -> A
             levels[number] = levels[baked[key]]
             continue
         baked[key] = number
-        image = _padded(_texture(number, face, float(per_metre[number]), seed) if textured else _bare(face.material))
+        image = _pad_image(_texture(number, face, float(per_metre[number]), seed) if textured else _bare(face.material))
         for level in range(LEVELS):
             levels[number, level] = offset, image.shape[1], image.shape[0]
             chunks.append(image.reshape(-1))
@@ -72,7 +72,7 @@ def _bare(material: str) -> U8:
     return np.full((1, 1, 3), tint, dtype=np.uint8)
 
 
-def _padded(image: U8) -> U8:
+def _pad_image(image: U8) -> U8:
     """Repeat the border until the sides can be halved exactly down to the last level, which keeps 2 texels."""
     multiple = 2**LEVELS
     bottom, right = -image.shape[0] % multiple, -image.shape[1] % multiple
@@ -82,7 +82,7 @@ def _padded(image: U8) -> U8:
 def paint(material: str, size_m: tuple[float, float], per_metre: float, rng: np.random.Generator) -> U8:
     """(h, w, 3) texture of a face of the given width and height in metres."""
     w, h = (max(4, round(length * per_metre)) for length in size_m)
-    image = PAINTERS.get(material, speckled)(h, w, per_metre, rng)
+    image = PAINTERS.get(material, paint_speckles)(h, w, per_metre, rng)
     image += 3.0 * clouds(h, w, (0.01 * per_metre,), rng)[:, :, None]
     cv2.GaussianBlur(image, (0, 0), BLUR_TEXELS, dst=image)
     return np.asarray(np.clip(np.rint(image, out=image), 0, 255, out=image).astype(np.uint8))

@@ -26,7 +26,7 @@ class TrueSurface:
 
 def surface_of(room: Room) -> TrueSurface:
     """The faces of the room, clipped to where it is, then those of each solid, in the order of `room.all_faces`."""
-    patches = [_clipped(_rectangle(face), room.planes) for face in room.faces]
+    patches = [_clip_polygon(_rectangle(face), room.planes) for face in room.faces]
     for solid in room.solids:
         patches += _patches(solid)
     vertices, triangles, faces, first = [], [], [], 0
@@ -52,7 +52,7 @@ def _fan(polygon: F64) -> tuple[F64, I32]:
     return polygon, np.stack([0 * k, k, k + 1], axis=1).astype(np.int32)
 
 
-def _clipped(polygon: F64, planes: F64) -> tuple[F64, I32]:
+def _clip_polygon(polygon: F64, planes: F64) -> tuple[F64, I32]:
     """The part of a convex polygon (n, 3) on the positive side of all planes (k, 4) (Sutherland and Hodgman)."""
     for plane in planes:
         height = matmul(polygon, plane[:3]) + plane[3]

@@ -73,13 +73,13 @@ class Walk:
         yaw = first + np.concatenate([[0.0], np.cumsum(turning[:-1])])[side]
         ramp = turns * along / self.length_m  # what is left of the yaw without it is periodic
         step = self.length_m / count
-        heading = _blurred((yaw - ramp)[:, None], self.looking_ahead_m / step) + ramp[:, None]
+        heading = _blur_values((yaw - ramp)[:, None], self.looking_ahead_m / step) + ramp[:, None]
         floor = np.interp(along, ends, [*self.floors_m, self.floors_m[0]])[:, None] if self.floors_m else np.zeros((count, 1))
-        smooth = np.column_stack([_blurred(xy, ROUNDING_M / step), heading, _blurred(floor, ROUNDING_M / step)])
+        smooth = np.column_stack([_blur_values(xy, ROUNDING_M / step), heading, _blur_values(floor, ROUNDING_M / step)])
         return np.concatenate([smooth, smooth[:1] + np.array([0.0, 0.0, turns, 0.0])]), turns
 
 
-def _blurred(values: F64, sigma: float) -> F64:
+def _blur_values(values: F64, sigma: float) -> F64:
     """(n, k) periodic values under a Gaussian of `sigma` samples."""
     frequency = np.fft.rfftfreq(len(values))
     return np.asarray(np.fft.irfft(np.fft.rfft(values, axis=0) * np.exp(-2.0 * (np.pi * sigma * frequency) ** 2)[:, None], len(values), axis=0))

@@ -42,11 +42,11 @@ def main() -> int:
     """Write all blocks; returns the exit code."""
     for name in PAGES:
         path = ROOT / name
-        path.write_text(rendered(path.read_text()))
+        path.write_text(render_page(path.read_text()))
     return 0
 
 
-def rendered(page: str) -> str:
+def render_page(page: str) -> str:
     """Return a page with its blocks as the files of results give them."""
     return BLOCK.sub(lambda match: f"{match[1]}{BLOCKS[match['name']]()}\n{match[4]}", page)
 
@@ -125,8 +125,8 @@ def consistency() -> str:
 def methods() -> str:
     """Each plugin in the default graph: ATE in mm by sequence, and medians of NEES and of the stage's time."""
     found = read("methods")
-    places = _ordered(row["sequence"] for row in found["runs"])[:PLACES_OF_METHODS]
-    changes = [change for change in _ordered(row["change"] for row in found["runs"]) if not change.startswith(("graph=", "without="))]
+    places = _without_repeats(row["sequence"] for row in found["runs"])[:PLACES_OF_METHODS]
+    changes = [change for change in _without_repeats(row["change"] for row in found["runs"]) if not change.startswith(("graph=", "without="))]
     lines = []
     for change in changes:
         rows = {row["sequence"]: row for row in found["runs"] if row["change"] == change and row["sequence"] in places}
@@ -141,7 +141,7 @@ def libraries() -> str:
     found = read("methods")
     changes = ("default", "graph=libraries")
     cells = {(row["change"], row["sequence"]): cell_of(row) for row in found["runs"] if row["change"] in changes}
-    places = _ordered(place for change, place in cells if change != "default")
+    places = _without_repeats(place for change, place in cells if change != "default")
     lines = [(f"`{change}`", *(cells.get((change, place), "") for place in places)) for change in changes]
     return f"{markdown(['graph', *places], lines)}\n\n*{source_line(found)}*\n"
 
@@ -162,7 +162,7 @@ BLOCKS: dict[str, Callable[[], str]] = {
 }  # fmt: skip
 
 
-def _ordered(names: Iterable[str]) -> list[str]:
+def _without_repeats(names: Iterable[str]) -> list[str]:
     return list(dict.fromkeys(names))
 
 

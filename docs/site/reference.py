@@ -60,12 +60,12 @@ Docstrings of the names in `import trihedron as th`. [The Python API](python.md)
 def command_line() -> str:
     """Every command with its help."""
     names = ["run", *sorted(entry.name for entry in entry_points(group=COMMAND_GROUP) if entry.module.startswith("trihedron."))]
-    blocks = [f"## trihedron {name}\n\n```text\n{printed(name, '--help')}\n```\n" for name in names]
+    blocks = [f"## trihedron {name}\n\n```text\n{command_output(name, '--help')}\n```\n" for name in names]
     head = "# The command line\n\nThis page is what `trihedron COMMAND --help` prints. Exit codes are listed in [The run folder](run-folder.md).\n\n"
     return head + "\n".join(blocks)
 
 
-def printed(*words: str) -> str:
+def command_output(*words: str) -> str:
     """The output of a command, as wide as a page."""
     stream = io.StringIO()
     with contextlib.redirect_stdout(stream), contextlib.suppress(SystemExit):

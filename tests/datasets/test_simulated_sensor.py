@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from trihedron.datasets.simulation import sensor_depth
-from trihedron.datasets.simulation.exposure import exposed, gain_for, motion_px
+from trihedron.datasets.simulation.exposure import expose_image, gain_for, motion_px
 from trihedron.datasets.simulation.motion import Motion
 from trihedron.datasets.simulation.sensor_models import MODELS, Sensor, SensorParameters, drawn_parameters
 from trihedron.datasets.simulation.simulated_sensor import SimulatedSensor
@@ -47,9 +47,9 @@ def test_hidden_parameters_stay_within_their_ranges_and_differ_by_the_seed() -> 
 def test_a_rolling_shutter_shows_each_row_from_its_own_pose() -> None:
     """Exact depth of a pan: the first and last rows are those of global shutters half a readout before and after."""
     dataset = with_hidden(SimulatedSensor(**SMALL))
-    _, rolled, _ = dataset._rolled(dataset.camera, 0.5, 0.04)
-    _, early, _ = dataset._rolled(dataset.camera, 0.5 - 0.02 * (1 - 8 / 120), 0.0)
-    _, late, _ = dataset._rolled(dataset.camera, 0.5 + 0.02 * (1 - 8 / 120), 0.0)
+    _, rolled, _ = dataset._render_rolling_shutter(dataset.camera, 0.5, 0.04)
+    _, early, _ = dataset._render_rolling_shutter(dataset.camera, 0.5 - 0.02 * (1 - 8 / 120), 0.0)
+    _, late, _ = dataset._render_rolling_shutter(dataset.camera, 0.5 + 0.02 * (1 - 8 / 120), 0.0)
     assert np.abs(rolled[:8] - early[:8]).max() < 1e-6 and np.abs(rolled[-8:] - late[-8:]).max() < 1e-6
     assert np.abs(rolled[:8] - late[:8]).max() > 0.01
 
@@ -119,7 +119,7 @@ def test_the_motion_of_pixels_is_that_of_the_camera() -> None:
 def test_exposure_brightens_what_is_dark_and_jpeg_leaves_its_traces() -> None:
     assert gain_for(55.0, 1.0) == 2.0 and gain_for(55.0, 0.0) == 1.0 and 0.5 <= gain_for(250.0, 1.0) < 1.0
     color = np.random.default_rng(0).integers(40, 90, (96, 128, 3)).astype(np.uint8)
-    plain = exposed(color, 2.0, 0, np.random.default_rng(0))
-    packed = exposed(color, 2.0, 60, np.random.default_rng(0))
+    plain = expose_image(color, 2.0, 0, np.random.default_rng(0))
+    packed = expose_image(color, 2.0, 60, np.random.default_rng(0))
     assert plain[40:56, 56:72].mean() == pytest.approx(2.0 * color[40:56, 56:72].mean(), rel=0.03)
     assert 1.0 < np.abs(plain.astype(int) - packed).mean() < 40.0

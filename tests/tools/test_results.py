@@ -52,7 +52,7 @@ def undated(page):
 @pytest.mark.parametrize("name", render.PAGES)
 def test_blocks_are_what_their_files_give(name):
     page = (ROOT / name).read_text()
-    assert render.BLOCK.search(page) and render.rendered(page) == page, f"{name}: {AGAIN}"
+    assert render.BLOCK.search(page) and render.render_page(page) == page, f"{name}: {AGAIN}"
 
 
 def test_every_file_states_its_commit_and_files_of_other_commits_a_reason():
