@@ -39,12 +39,11 @@ def test_a_short_run_holds_what_it_did(tmp_path, capsys):
 
 @pytest.mark.slow
 def test_four_thousand_frames(capsys):
-    """Memory, handles and the map are as flat as for twenty thousand; times are as the machine is, their multiple of the features' is not."""
+    """Memory, handles and the map are as flat as for twenty thousand. Times are as the machine is, and so are their multiples beside other work."""
     main(["benchmark", "long", "--frames", "4000", "--loop", "60", "--warm-up", "1000", *SMALL])
     said = capsys.readouterr().out
     print(said)
     assert re.search(r"^met: memory grew", said, re.M) and "\nmet: no more handles" in said
-    assert re.search(r"^met: the stages after the features", said, re.M)
     figures = np.array([line.split() for line in said.splitlines() if re.match(r" *\d+ ", line)][1:], float)
     assert np.ptp(figures[:, 4]) <= 4 and figures[-1, 6] < 1.5 * figures[0, 6] and not figures[:, 11].any()
 
