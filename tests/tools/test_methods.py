@@ -124,7 +124,7 @@ def test_a_sweep_over_alternatives_and_its_table(tmp_path, capsys, faulty):
     again = capsys.readouterr()
     lines = again.out.splitlines()
     assert lines == printed[: len(lines)] and again.err.count("done already") == 3
-    assert lines[0].split() == ["translation", "ATE", "1", "NEES", "ms", "MB", "translation", "mm", "cycle", "px"]
+    assert lines[0].split() == ["translation", "ATE", "1", "NEES", "ms", "MB", "translation", "mm", "translation", "cycle", "px"]
     assert lines[5].split() == ["rotation", "ATE", "1", "ATE", "2", "NEES", "ms", "MB", "rotation", "deg"]
     assert [line.split()[0] for line in lines[6:9]] == ["default", "rotation=procrustes", "rotation=ransac"]
     assert lines[-1] == "8 runs, 0 failed" and lines[-3].startswith("ATE 2: room ") and lines[-3].endswith("texture=False without=loop")
