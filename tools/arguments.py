@@ -1,4 +1,4 @@
-"""Shared parts of the commands: an argument parser that speaks the program's one-line errors, and tables of text."""
+"""The argument parser of the commands, whose mistakes are the program's one-line errors."""
 
 from __future__ import annotations
 

@@ -65,15 +65,15 @@ class Run:
 def draw(runs: Sequence[Run], world: F64, errors_deg: Sequence[F64], folder: Path, prefix: str = "", frame: int | None = None) -> list[Path]:
     """Draw the errors (n,) of each run against frame, and the sphere of a frame, by default the middle one; returns the files. Raises DataError for
     an unknown one."""
-    from trihedron.comparison import axes_pictures as rotation_pictures
+    from trihedron.comparison.axes_pictures import errors_figure, sphere_figure
 
     numbers = [value.index for value in runs[0].found]
     frame = numbers[len(numbers) // 2] if frame is None else frame
     if frame not in numbers:
         raise DataError(str(folder), f"there is no frame {frame}", f"give one of {numbers[0]}..{numbers[-1]}")
     written = [folder / f"{prefix}{name}" for name in (ERRORS_PNG, f"sphere_{frame}.png")]
-    rotation_pictures.errors_figure(runs, errors_deg, written[0])
-    rotation_pictures.sphere_figure(runs, world, frame, written[1])
+    errors_figure(runs, errors_deg, written[0])
+    sphere_figure(runs, world, frame, written[1])
     return written
 
 
