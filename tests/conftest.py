@@ -21,7 +21,7 @@ def no_pictures():
     """Runs leave an empty file in the place of the picture of their trajectory: to draw it takes longer than a short run.
     tests/pipeline/test_trajectory_plot.py draws, and so does the test of a complete run folder."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(execute, "draw_trajectory", lambda result, truth, path: path.touch())
+        patch.setattr(execute, "trajectory_figure", lambda estimate, truth, path, status=(): path.touch())
         yield
 
 

@@ -78,7 +78,7 @@ import sys
 import {first}
 from trihedron.pipeline.app.cli import main
 from trihedron.pipeline.app import execute
-execute.draw_trajectory = lambda *arguments, **options: None
+execute.trajectory_figure = lambda *arguments, **options: None
 sys.exit(main(["run", *sys.argv[1:]]))
 """
 PROCESSORS = [

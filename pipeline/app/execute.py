@@ -18,7 +18,7 @@ from omegaconf import DictConfig, OmegaConf
 from tqdm import tqdm
 
 from trihedron.pipeline.app.compilation import compile_once
-from trihedron.pipeline.app.trajectory_plot import PLOT, draw_trajectory
+from trihedron.pipeline.app.trajectory_plot import PLOT, trajectory_figure
 from trihedron.pipeline.app.viewers import Viewer, opened_viewer
 from trihedron.pipeline.core.config import Feedback, graph_of
 from trihedron.pipeline.core.errors import ConfigError, DataError, RecordingError, did_you_mean, printable
@@ -260,9 +260,11 @@ def write_files(
         timing["live"] = runner.feed.summary(timing["frame_ms"])
     try:
         if "pose" in runner.computed:
-            metrics = results.write_results(out, runner.result, truth)
-            if plot:
-                draw_trajectory(runner.result, truth, out / PLOT)
+            result = results.with_unpacked_poses(runner.result)
+            final = results.final_trajectory(result)
+            metrics = results.write_results(out, result, final, truth)
+            if plot and len(final):
+                trajectory_figure(final, truth, out / PLOT, [(pose.stamp_ns, pose.status) for pose in result.poses])
         results.write_json(out / results.TIMING, timing)
     except OSError as error:
         raise DataError(str(error.filename or out), f"cannot be written: {error.strerror}", "make room, or give another out=FOLDER") from error

@@ -13,9 +13,7 @@ from trihedron.pipeline.core.errors import DataError
 from trihedron.pipeline.core.geometry import nearest_rotation, transform, umeyama
 from trihedron.pipeline.core.linalg import matmul
 from trihedron.pipeline.core.types import DEGRADED, F64, LOST, Trajectory
-from trihedron.pipeline.run.accounting import Result
 from trihedron.pipeline.run.metrics import FEWEST_POSES, associate, rotation_angles_deg
-from trihedron.pipeline.run.results import final_trajectory
 
 PLOT = "trajectory.png"
 AXES = "xyz"
@@ -23,12 +21,6 @@ MARGINS = {"left": 0.07, "right": 0.98, "bottom": 0.07, "top": 0.93, "wspace": 0
 ESTIMATE_COLOR, TRUTH_COLOR = "tab:blue", "tab:green"
 STATUS_COLORS = {DEGRADED: "tab:orange", LOST: "tab:red"}
 GAP_STEPS = 5.0  # a curve is broken where its stamps are that many median steps apart, instead of a straight line across
-
-
-def draw_trajectory(result: Result, truth: Trajectory | None, path: Path) -> None:
-    """Write the picture of a run's final trajectory; none where no frame was tracked. Raises DataError when the file cannot be written."""
-    if len(final := final_trajectory(result)):
-        trajectory_figure(final, truth, path, [(pose.stamp_ns, pose.status) for pose in result.poses])
 
 
 def trajectory_figure(estimate: Trajectory, truth: Trajectory | None, path: Path, status: Sequence[tuple[int, str]] = ()) -> None:

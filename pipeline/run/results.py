@@ -52,10 +52,14 @@ def _trajectory(stamps_ns: list[int], poses: list[Any]) -> Trajectory:
     return Trajectory(np.array(stamps_ns, np.int64), np.array(poses, np.float64).reshape(-1, 4, 4))
 
 
-def write_results(out: Path, result: Result, truth: Trajectory | None) -> dict[str, Any]:
-    """Write trajectories and, with ground truth, metrics; return the metrics. Statuses are counted in any case."""
-    result = replace(result, poses=list(result.poses))  # unpacked once
-    final, causal = final_trajectory(result), causal_trajectory(result)
+def with_unpacked_poses(result: Result) -> Result:
+    """Return a result whose poses are a list: those of a run are packed, and unpacked at each reading."""
+    return replace(result, poses=list(result.poses))
+
+
+def write_results(out: Path, result: Result, final: Trajectory, truth: Trajectory | None) -> dict[str, Any]:
+    """Write the final and the causal trajectory and, with ground truth, metrics; return the metrics. Statuses are counted in any case."""
+    causal = causal_trajectory(result)
     write_trajectory(out / TRAJECTORY, final)
     write_trajectory(out / CAUSAL, causal)
     metrics: dict[str, Any] = {

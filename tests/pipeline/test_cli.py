@@ -17,7 +17,7 @@ import yaml
 from trihedron.datasets.simulation.synthetic import Synthetic
 from trihedron.pipeline.app import execute
 from trihedron.pipeline.app.cli import main
-from trihedron.pipeline.app.trajectory_plot import draw_trajectory
+from trihedron.pipeline.app.trajectory_plot import trajectory_figure
 from trihedron.pipeline.record.reader import Recording
 from trihedron.pipeline.record.trajectories import read_trajectory
 from trihedron.pipeline.record.writer import RecordingWriter
@@ -153,7 +153,7 @@ def test_debug_shows_the_traceback():
 
 
 def test_a_run_folder_is_complete(capsys, tmp_path, monkeypatch):
-    monkeypatch.setattr(execute, "draw_trajectory", draw_trajectory)
+    monkeypatch.setattr(execute, "trajectory_figure", trajectory_figure)
     assert main(["run", *SMALL]) == 0
     printed = capsys.readouterr().out
     out = (tmp_path / "runs" / "latest").resolve()

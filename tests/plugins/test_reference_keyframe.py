@@ -147,7 +147,7 @@ def test_the_final_trajectory_has_no_step(still, shoved):
 
 def test_both_trajectories_are_written(shoved, tmp_path):
     result, _ = shoved
-    write_results(tmp_path, result, None)
+    write_results(tmp_path, result, final_trajectory(result), None)
     causal, final = (read_trajectory(tmp_path / name).poses for name in ("trajectory_causal.txt", "trajectory.txt"))
     assert np.allclose(causal, causal_trajectory(result).poses, atol=1e-6) and np.allclose(final, final_trajectory(result).poses, atol=1e-6)
     assert not np.allclose(causal, final, atol=0.1)

@@ -16,7 +16,7 @@ from trihedron.comparison import ablation_tables as tables
 from trihedron.comparison.ablation_tables import NEES, RESULT, Case, Variant
 from trihedron.comparison.attribution import nees_of
 from trihedron.comparison.fold_measures import of_folds
-from trihedron.comparison.frame_errors import Errors, errors_file, of_result, of_trajectory, read_errors, write_errors
+from trihedron.comparison.frame_errors import Errors, errors_file, of_result, read_errors, write_errors
 from trihedron.comparison.partings import Parting, StageErrors, changed_by_code, reference_of
 from trihedron.comparison.swaps import Combination, combinations_of, folder_name, parse_swaps, single_swaps, without_repeats
 from trihedron.pipeline.app.alternatives import Alternatives, Outcome, alternatives_of
@@ -28,6 +28,7 @@ from trihedron.pipeline.record.reader import Recording, TopicReader
 from trihedron.pipeline.record.trajectories import attached_truth
 from trihedron.pipeline.run.replay import RECORDED
 from trihedron.pipeline.run.result_files import read_results
+from trihedron.pipeline.run.results import with_unpacked_poses
 from trihedron.pipeline.sweep.jobs import key_of
 
 PICTURE = "differs.png"
@@ -188,7 +189,11 @@ def _compute_case(computing: Alternatives, combinations: Sequence[Combination], 
     figures = [{**_alternative_figures(outcome), **of_stage, **of_fold} for outcome, of_stage, of_fold in zip(computing.outcomes, own, folds)]
     reference = attached_truth(recording.attachments, str(recording.path))
     judged = [
-        {**of_result(runner.result), **of_trajectory(runner.result, reference, ERRORS), **of_frames, "ms": outcome.frame_ms}
+        {
+            **of_result(with_unpacked_poses(runner.result), reference if outcome.metrics.get("final") else None, ERRORS),
+            **of_frames,
+            "ms": outcome.frame_ms,
+        }
         for runner, outcome, of_frames in zip(computing.runners, computing.outcomes, of_stages)
     ]
     full_s = read_results(recording.path.parent / "timing.json").get("cpu_s")

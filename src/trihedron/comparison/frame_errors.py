@@ -17,19 +17,18 @@ from trihedron.pipeline.run.results import final_trajectory
 Errors = dict[str, F64]  # of each frame (n,) by column, NaN where it has none
 
 
-def of_trajectory(result: Result, truth: Trajectory | None, columns: Mapping[str, tuple[str, float]]) -> Errors:
-    """Return the errors of a run's final trajectory; `columns` -> name in the metrics, factor. Empty without ground truth."""
+def of_result(result: Result, truth: Trajectory | None, columns: Mapping[str, tuple[str, float]]) -> Errors:
+    """Return `ok %` of each frame of a run (100 or 0) and, with ground truth, the errors of its final trajectory; `columns` -> name in the metrics,
+    factor. Empty where no pose was computed."""
+    if not len(result.poses):
+        return {}
+    ok = {pose.stamp_ns for pose in result.poses if pose.status == OK}
+    share = {"ok %": np.array([100.0 * (stamp in ok) for stamp in result.stamps_ns])}
     estimate = final_trajectory(result)
     if truth is None or not len(estimate):
-        return {}
+        return share
     found = frame_errors(estimate, truth, result.fps, np.array(result.stamps_ns, np.int64))
-    return {column: factor * found[name] for column, (name, factor) in columns.items() if name in found}
-
-
-def of_result(result: Result) -> Errors:
-    """Return which frames of a run are `ok`, in per cent: 100 or 0 each. Empty where no pose was computed."""
-    ok = {pose.stamp_ns for pose in result.poses if pose.status == OK}
-    return {"ok %": np.array([100.0 * (stamp in ok) for stamp in result.stamps_ns])} if len(result.poses) else {}
+    return share | {column: factor * found[name] for column, (name, factor) in columns.items() if name in found}
 
 
 def errors_file(out: Path, key: str) -> Path:
