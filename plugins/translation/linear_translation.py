@@ -12,15 +12,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from trihedron.pipeline.core.linalg import eigh, inv, matmul, norm, solve
+from trihedron.pipeline.core.linalg import eigh, inv, matmul
 from trihedron.pipeline.core.types import F64, Camera, Keypoints, Tracks
-
-ITERATIONS = 15
-CAUCHY = 2.385  # 95 % efficiency where the noise is Gaussian
-GATE = 3.0  # standard deviations, beyond which a point is an outlier
-FLOOR_M = 0.01  # least |s| in the noise of points without depth, which is proportional to it
-SIGMAS = 0.849  # standard deviation in each of two directions, where the median length is 1
-ALONE = 4  # first iterations, by points with depth alone: at s = 0 the others agree with everything
+from trihedron.plugins.translation.linear_translation_kernels import iterate_translation
 
 
 class PointEquations(NamedTuple):
@@ -70,38 +64,7 @@ def solve_translation(equations: PointEquations, start: F64, prior_m: float) -> 
     """Iteratively reweighted least squares with Cauchy's weights at the scale of the median residual, from `start`.
 
     `prior_m` is the standard deviation of the translation about `start`; a direction whose σ is above half of that is unobservable."""
-    s, prior = start.copy(), np.eye(3) / prior_m**2
-    H, normalised = np.zeros((3, 3)), np.empty((0, 2))
-    with_depth = np.isfinite(equations.z)
-    for iteration in range(ITERATIONS if len(equations.z) else 0):
-        A, b = _linearise(equations, s)
-        reach = np.where(with_depth, np.maximum(equations.z + s[2], 0.1), norm(s) + FLOOR_M)
-        noise = reach * equations.sigma
-        normalised = (np.einsum("nij,j->ni", A, s) - b) / noise[:, None]
-        size = np.linalg.norm(normalised, axis=1)
-        scale = max(SIGMAS * float(np.median(size[with_depth])) if with_depth.any() else 1.0, 0.3)
-        w = 1.0 / (1.0 + (size / (CAUCHY * scale)) ** 2) / (noise * scale) ** 2
-        if iteration < ALONE and with_depth.any():
-            w = np.where(with_depth, w, 0.0)
-        H = np.einsum("n,nij,nik->jk", w, A, A)
-        g = np.einsum("n,nij,ni->j", w, A, b)
-        step = solve(H + prior, g + matmul(prior, start)) - s
-        s = s + step
-        normalised = normalised / scale
-        if matmul(step, step) < 1e-14 and iteration >= ALONE:
-            break
+    s, H, inliers = iterate_translation(*equations, start, prior_m)
     values, vectors = eigh(H)
-    inliers = int(np.count_nonzero(np.linalg.norm(normalised, axis=1) < GATE))
-    return LinearTranslation(s, np.asarray(inv(H + prior), np.float64), inliers, vectors[:, values < (2.0 / prior_m) ** 2].T)
-
-
-def _linearise(equations: PointEquations, s: F64) -> tuple[F64, F64]:
-    """The equations with those of points without depth as `(b × b')·s / |s| = 0`, linearised about s, times |s|."""
-    size = max(float(norm(s)), 1e-9)
-    along = s / size
-    A, b = equations.A.copy(), equations.b.copy()
-    far = np.isnan(equations.z)
-    off = matmul(equations.A[far, 0], along)
-    A[far, 0] -= off[:, None] * along
-    b[far, 0] = -size * off
-    return A, b
+    unobservable = vectors[:, values < (2.0 / prior_m) ** 2].T
+    return LinearTranslation(s, np.asarray(inv(H + np.eye(3) / prior_m**2), np.float64), inliers, unobservable)
