@@ -54,7 +54,7 @@ table: install  ## the paper's study and its pages: every system on rooms and DA
 
 PART := sequences
 results: install  ## measure docs/results/PART.json (PART=sequences or methods; DATA as for table) and write it into the pages; goes on where it was stopped
-	$(BIN)/python docs/results/measure.py $(PART) $(or $(foreach d,$(DATA),"$(d)"),$(if $(filter sequences,$(PART)),$(SEQUENCES)))
+	$(BIN)/python docs/results/measure.py $(PART) $(or $(foreach d,$(DATA),"$(d)"),$(SEQUENCES))
 	$(BIN)/python docs/results/render.py
 	$(BIN)/trihedron plugins --pages docs/reference/plugins --results docs/results/methods.json
 

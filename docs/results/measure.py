@@ -1,7 +1,7 @@
 """Measure the figures of the pages, and write docs/results/PART.json with the commit, versions, processor, date and command. `make results` runs it.
 
     python docs/results/measure.py sequences FOLDER KIND:FOLDER ...     # every run of the default graph in a process of its own
-    python docs/results/measure.py methods KIND:FOLDER ...              # experiment=methods, and detectors by rendered scenes
+    python docs/results/measure.py methods FOLDER KIND:FOLDER ...       # experiment=methods, over these too, and detectors by rendered scenes
 
 What is measured already by the same commit is not measured again, so that a command that was stopped goes on. Figures of some code are those of its
 commit: the measured folders may hold no change that is not committed.
@@ -20,6 +20,8 @@ from datetime import datetime, timezone
 from pathlib import Path
 from typing import Any
 
+import yaml
+
 from trihedron.pipeline.core.errors import DataError, TrihedronError
 from trihedron.pipeline.core.layouts import layout_of
 from trihedron.pipeline.run.results import TIMING
@@ -28,8 +30,12 @@ from trihedron.tools.benchmark import PROGRAM, machine, measure, reference_ms, s
 
 ROOT = Path(__file__).resolve().parents[2]
 RESULTS, WORK = ROOT / "docs" / "results", ROOT / "runs" / "results"
-MEASURED = ("pipeline", "plugins", "datasets", "conf")  # folders whose code decides on figures
+MEASURED = ("pipeline", "plugins", "datasets", "conf", "src")  # folders whose code decides on figures
 ROOM = "synthetic length=150"
+EXPERIMENT = ROOT / "conf" / "experiment" / "methods.yaml"
+TRACKING = (
+    "alternatives=planes,manhattan,tracks,rotation,translation,matches,pose"  # on recorded sequences: slots of tracking, whose plugins differ there
+)
 Row = dict[str, Any]
 
 
@@ -121,16 +127,24 @@ def figures_of(words: Sequence[str], out: Path) -> Row:
 
 
 def methods(data: Sequence[str], commit: str) -> Row:
-    """Run experiment=methods (its own sequences unless some are given) and the detectors; jobs of a sweep are resumed by their keys."""
-    out, detectors, runs = WORK / "methods", WORK / "detectors.json", WORK / "methods.json"
-    given = [f"sequences=[{','.join(json.dumps(sequence_text(word)) for word in data)}]"] if data else []
+    """Run experiment=methods over its own sequences and these, and the detectors. What this commit has measured is kept in a folder of its name."""
+    folder = WORK / commit
+    folder.mkdir(exist_ok=True)
+    out, detectors, runs = folder / "methods", folder / "detectors.json", folder / "methods.json"
     began = time.perf_counter()
-    _program("run", "-m", "experiment=methods", f"out={out}", *given)
+    _program("run", "-m", "experiment=methods", f"out={out}", f"sequences=[{','.join(map(json.dumps, sequences_of_methods(data)))}]")
     if not detectors.exists():
         _program("benchmark", "detectors", "--json", str(detectors))
     _program("benchmark", "methods", str(out), "--detectors", str(detectors), "--json", str(runs))
     found: Row = json.loads(runs.read_text())
     return {"minutes": round((time.perf_counter() - began) / 60.0, 1), **found}
+
+
+def sequences_of_methods(data: Sequence[str]) -> list[str]:
+    """Return the sequences of experiment=methods, then the given ones, with the slots of tracking where a word names no alternatives. Raises
+    DataError."""
+    given = [text if "alternatives=" in text else f"{text} {TRACKING}" for text in map(sequence_text, data)]
+    return [*yaml.safe_load(EXPERIMENT.read_text())["sequences"], *given]
 
 
 def _program(*words: str) -> None:

@@ -120,3 +120,24 @@ def test_a_sequence_that_this_commit_has_measured_is_not_measured_again(tmp_path
     assert first == {"minutes": 1.0, "sequences": [{"sequence": "synthetic length=150", "seconds": 30.0}, {"sequence": "desk", "seconds": 30.0}]}
     measure.sequences(["tum:desk"], "b")
     assert len(counted) == 4
+
+
+def test_methods_are_measured_on_the_experiments_sequences_and_the_given_ones():
+    found = measure.sequences_of_methods(["tum:desk", "tum:hall frames=0:60 alternatives=manhattan"])
+    assert found[0].startswith("synthetic length=60 alternatives=normals") and len(found) == 14
+    assert found[12:] == ["tum:desk " + measure.TRACKING, "tum:hall frames=0:60 alternatives=manhattan"]
+
+
+def test_methods_of_another_commit_are_measured_again(tmp_path, monkeypatch):
+    def program(*words):
+        called.append(words)
+        (tmp_path / "b" / "methods.json").write_text('{"runs": []}')
+
+    called = []
+    monkeypatch.setattr(measure, "WORK", tmp_path)
+    monkeypatch.setattr(measure, "_program", program)
+    (tmp_path / "a").mkdir()
+    (tmp_path / "a" / "detectors.json").write_text("{}")
+    assert measure.methods([], "b")["runs"] == []
+    assert [words[:2] for words in called] == [("run", "-m"), ("benchmark", "detectors"), ("benchmark", "methods")]
+    assert f"out={tmp_path / 'b' / 'methods'}" in called[0]
