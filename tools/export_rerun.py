@@ -11,6 +11,7 @@ from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
 
 from trihedron.pipeline.app.recorded_values import references_of
 from trihedron.pipeline.core.errors import DataError
+from trihedron.pipeline.core.registry import load_plugins
 from trihedron.pipeline.record.foxglove import TopicView
 from trihedron.pipeline.record.reader import Recording
 from trihedron.pipeline.record.rerun_view import IMAGE, at, begin, blueprint, require_rerun, show_pinhole, show_value
@@ -36,6 +37,7 @@ def show(recording: Recording, stream: Any) -> int:
     references = references_of(recording)
     if not references:
         raise DataError(str(recording.path), "holds no frames", "record a run")
+    load_plugins()  # they draw their values
     begin(stream)
     _show_images(recording, stream)
     for topic in TOPICS:

@@ -21,7 +21,7 @@ import numpy as np
 
 from trihedron.comparison import run_tables as comparison_table
 from trihedron.comparison.runs import Run, read_runs, rows_of
-from trihedron.pipeline.core.building_geometry import MODEL_COLORS, parts_of
+from trihedron.pipeline.core.drawings import drawing_of
 from trihedron.pipeline.core.errors import DataError, TrihedronError
 from trihedron.pipeline.core.files import MAX_YAML_BYTES, YamlError, parse_yaml, read_text
 from trihedron.pipeline.core.geometry import transform, umeyama
@@ -209,10 +209,10 @@ def _model(runs: dict[str, Run]) -> list[dict[str, Any]]:
     building = next(iter(_buildings(runs).values()), None)
     if building is None:
         return []
-    T, traces = building.T_world_building, []
-    for number, part in enumerate(parts_of(building, ceilings=False)):
-        (x, y, z), (i, j, k) = np.round(part.vertices_m @ T[:3, :3].T + T[:3, 3], 3).T.tolist(), part.triangles.T.tolist()
-        red, green, blue, opacity = MODEL_COLORS[part.kind]
+    traces = []
+    for number, solid in enumerate(drawing_of(building).solids):
+        (x, y, z), (i, j, k) = np.round(solid.vertices_m, 3).T.tolist(), solid.triangles.T.tolist()
+        red, green, blue, opacity = solid.rgba
         look = {"color": f"rgb({red},{green},{blue})", "opacity": opacity / 255.0, "flatshading": True, "hoverinfo": "skip"}
         group = {"name": "building", "legendgroup": "building", "showlegend": number == 0, "visible": "legendonly"}
         traces.append({"type": "mesh3d", "x": x, "y": y, "z": z, "i": i, "j": j, "k": k, **look, **group})

@@ -109,7 +109,7 @@ class TopicView:
         elif isinstance(value, Surface) and len(value.triangles):
             yield "/view/surface", show.surface(value)
         elif isinstance(value, Building) and len(value.walls_m):
-            yield "/view/building", show.building(value)
+            yield "/view/building", show.solids(value, "building")
 
     def _pose_messages(self, pose: Pose) -> Iterator[tuple[str, Any]]:
         placed = show.in_frame(pose)

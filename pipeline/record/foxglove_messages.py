@@ -27,14 +27,13 @@ from foxglove_schemas_protobuf.Vector3_pb2 import Vector3
 from google.protobuf.duration_pb2 import Duration
 from google.protobuf.timestamp_pb2 import Timestamp
 
-from trihedron.pipeline.core.building_geometry import MODEL_COLORS, parts_of
+from trihedron.pipeline.core.drawings import drawing_of
 from trihedron.pipeline.core.geometry import quaternion_from_rotation, tangent_basis
 from trihedron.pipeline.core.linalg import matmul
 from trihedron.pipeline.core.types import (  # fmt: skip
     F32,
     F64,
     I32,
-    Building,
     Frame,
     Keypoints,
     ManhattanFrame,
@@ -245,16 +244,15 @@ def surface(surface: Surface) -> SceneUpdate:
     return update
 
 
-def building(building: Building) -> SceneUpdate:
-    """Make the model of a building without its ceilings, in the world; it stays."""
-    update, entity = _in_world(building, "building")
-    T = building.T_world_building
-    for part in parts_of(building, ceilings=False):
-        r, g, b, a = MODEL_COLORS[part.kind]
+def solids(value: Value, name: str) -> SceneUpdate:
+    """Make the solids that a value's slot draws of it, in the world; they stay."""
+    update, entity = _in_world(value, name)
+    for solid in drawing_of(value).solids:
+        r, g, b, a = solid.rgba
         mesh = entity.triangles.add(
-            pose=IDENTITY, indices=part.triangles.ravel().tolist(), color=_color((r / 255.0, g / 255.0, b / 255.0), a / 255.0)
+            pose=IDENTITY, indices=solid.triangles.ravel().tolist(), color=_color((r / 255.0, g / 255.0, b / 255.0), a / 255.0)
         )
-        _fill(mesh, "points", matmul(part.vertices_m, T[:3, :3].T) + T[:3, 3])
+        _fill(mesh, "points", solid.vertices_m)
     return update
 
 

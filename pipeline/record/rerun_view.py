@@ -6,9 +6,8 @@ from typing import Any
 
 import numpy as np
 
-from trihedron.pipeline.core.building_geometry import MODEL_COLORS, parts_of, rings_of
+from trihedron.pipeline.core.drawings import drawing_of
 from trihedron.pipeline.core.libraries import imports_of
-from trihedron.pipeline.core.linalg import matmul
 from trihedron.pipeline.core.types import OK, Building, Camera, Frame, Keypoints, ManhattanFrame, Map, Planes, Pose, Segments, Surface, Value
 from trihedron.pipeline.record.foxglove_messages import AXES, COLORS
 
@@ -148,21 +147,19 @@ def _show_surface(stream: Any, value: Surface) -> None:
     stream.log("world/surface", mesh)
 
 
-def _show_building(stream: Any, value: Building) -> None:
-    """Log the model without its ceilings, and the outlines of rooms with their areas."""
+def _show_drawing(stream: Any, value: Building) -> None:
+    """Log what its slot draws of a value: solids, and outlines with their labels."""
     import rerun
 
     stream.log("world/building", rerun.Clear(recursive=True))
-    T = value.T_world_building
-    for part in parts_of(value, ceilings=False):
-        vertices = matmul(part.vertices_m, T[:3, :3].T) + T[:3, 3]
-        color = np.tile(np.array(MODEL_COLORS[part.kind], np.uint8), (len(vertices), 1))
-        mesh = rerun.Mesh3D(vertex_positions=vertices, triangle_indices=part.triangles, vertex_colors=color)
-        stream.log(f"world/building/{part.storey}/{part.kind}", mesh)
-    for room, (area, storey) in enumerate(zip(value.areas_m2, value.room_storeys)):
-        ring, height = rings_of(value, room)[0], float(np.nan_to_num(value.storeys[storey, 0]))
-        closed = matmul(np.column_stack([ring, np.full(len(ring), height)])[[*range(len(ring)), 0]], T[:3, :3].T) + T[:3, 3]
-        stream.log(f"world/building/room_{room}", rerun.LineStrips3D([closed], labels=[f"room {room}: {area:.1f} m²"], colors=(40, 40, 40)))
+    drawing = drawing_of(value)
+    for solid in drawing.solids:
+        color = np.tile(np.array(solid.rgba, np.uint8), (len(solid.vertices_m), 1))
+        mesh = rerun.Mesh3D(vertex_positions=solid.vertices_m, triangle_indices=solid.triangles, vertex_colors=color)
+        stream.log(f"world/building/{solid.name}", mesh)
+    for outline in drawing.outlines:
+        lines = rerun.LineStrips3D([outline.corners_m], labels=[outline.label], colors=(40, 40, 40))
+        stream.log(f"world/building/{outline.name}", lines)
 
 
 _SHOWN: dict[type[Value], Any] = {
@@ -174,5 +171,5 @@ _SHOWN: dict[type[Value], Any] = {
     Pose: _show_pose,
     Map: _show_map,
     Surface: _show_surface,
-    Building: _show_building,
+    Building: _show_drawing,
 }

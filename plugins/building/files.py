@@ -13,7 +13,10 @@ from xml.sax.saxutils import escape
 
 import numpy as np
 
-from trihedron.pipeline.core.building_geometry import (
+from trihedron.pipeline.core.linalg import norm
+from trihedron.pipeline.core.registry import register_files
+from trihedron.pipeline.core.types import ELEMENTS, F64, OPENING_KINDS, SUPPORTS, Building
+from trihedron.plugins.building.geometry import (
     CEILING,
     MODEL_COLORS,
     door_swing,
@@ -27,9 +30,6 @@ from trihedron.pipeline.core.building_geometry import (
     wall_corners,
     wall_pieces,
 )
-from trihedron.pipeline.core.linalg import norm
-from trihedron.pipeline.core.registry import register_files
-from trihedron.pipeline.core.types import ELEMENTS, F64, OPENING_KINDS, SUPPORTS, Building
 
 JSON, SVG, DXF, GLB = "building.json", "floorplan.svg", "floorplan.dxf", "building.glb"
 SCHEMA_VERSION = 1

@@ -12,10 +12,10 @@ from typing import Any
 
 import numpy as np
 
-from trihedron.pipeline.core.building_geometry import SHEET_M, opening_name, rings_of, rooms_on, storey_levels
 from trihedron.pipeline.core.libraries import imports_of
 from trihedron.pipeline.core.linalg import norm
 from trihedron.pipeline.core.types import F64, Building
+from trihedron.plugins.building.geometry import SHEET_M, opening_name, rings_of, rooms_on, storey_levels
 
 IFC = "model.ifc"
 SLAB_M = 0.2  # thickness of a slab, but between two storeys, where it was measured

@@ -63,4 +63,4 @@ def iterate_translation(A: F64, b: F64, z: F64, sigma: F64, start: F64, prior_m:
         s[:] = solution
         if step2 < STEP2 and iteration >= ALONE:
             break
-    return s, H, np.sum(size < GATE * scale)
+    return s, H, int(np.count_nonzero(size < GATE * scale))

@@ -10,10 +10,10 @@ from typing import Any
 import numpy as np
 
 from trihedron.pipeline.core import types
-from trihedron.pipeline.core.building_geometry import rings_of
 from trihedron.pipeline.core.errors import DataError, UsageError
 from trihedron.pipeline.core.linalg import matmul, norm
 from trihedron.pipeline.core.types import F64, OPENING_KINDS, Pose
+from trihedron.plugins.building.geometry import rings_of
 
 OPEN_SIGMA_M = 0.05  # of an edge that nothing bounds, and of where a wall was last seen
 PARALLEL_DEG = 5.0  # between walls that have a distance

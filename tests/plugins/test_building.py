@@ -14,7 +14,7 @@ import pytest
 import trihedron as th
 from trihedron.comparison.building_errors import plan_errors
 from trihedron.datasets.simulation.synthetic import Scene, Synthetic
-from trihedron.pipeline.core.building_geometry import door_swing, doors_on, label_place, wall_pieces
+from trihedron.pipeline.core.drawings import Drawing, drawing_of
 from trihedron.pipeline.core.errors import LibraryError, TrihedronError
 from trihedron.pipeline.core.registry import load_plugins, plugin_class
 from trihedron.pipeline.core.types import OPENING_KINDS, Camera, Frame, Planes, Pose
@@ -23,6 +23,7 @@ from trihedron.plugins.building.edges import Edge, end_at_readings, intersect_ed
 from trihedron.plugins.building.faces import Face
 from trihedron.plugins.building.files import building_json, floorplan_svg, summary, write_building
 from trihedron.plugins.building.free_space_kernels import LEVELS
+from trihedron.plugins.building.geometry import door_swing, doors_on, label_place, wall_pieces
 from trihedron.plugins.building.ifc import has_ifc, write_ifc
 from trihedron.plugins.building.openings import fit_jambs, widest_gap
 from trihedron.plugins.normals.integral_image import IntegralImage
@@ -274,6 +275,14 @@ def test_viewers_get_a_layer(offices):
     messages = dict(TopicView().messages(offices["manhattan_layout"]))
     (entity,) = messages["/view/building"].entities
     assert entity.frame_id == "world" and len(entity.triangles) >= 2
+
+
+def test_a_building_is_drawn_by_its_slot_and_other_values_by_none(offices):
+    found = drawing_of(offices["manhattan_layout"])
+    assert {solid.name for solid in found.solids} >= {"0/floor", "0/wall"} and not any("ceiling" in solid.name for solid in found.solids)
+    assert [outline.name for outline in found.outlines] == [f"room_{k}" for k in range(len(offices["manhattan_layout"].areas_m2))]
+    assert all(np.array_equal(outline.corners_m[0], outline.corners_m[-1]) for outline in found.outlines)
+    assert drawing_of(pose_at(0, np.eye(4))) == Drawing()
 
 
 def flat(depth: np.ndarray, index: int = 0) -> tuple[Frame, Planes, Pose]:
