@@ -56,7 +56,6 @@ PART := sequences
 results: install  ## measure docs/results/PART.json (PART=sequences or methods; DATA as for table) and write it into the pages; goes on where it was stopped
 	$(BIN)/python docs/results/measure.py $(PART) $(or $(foreach d,$(DATA),"$(d)"),$(SEQUENCES))
 	$(BIN)/python docs/results/render.py
-	$(BIN)/trihedron plugins --pages docs/reference/plugins --results docs/results/methods.json
 
 docs: install  ## the documentation as a site in build/site; executes the gallery
 	$(BIN)/python docs/site/gallery.py build/gallery

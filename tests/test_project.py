@@ -61,9 +61,14 @@ def test_the_site_is_built_strictly_and_needs_no_network(tmp_path):
         "reference/command-line",
         "gallery/index",
         "reference/python-objects",
+        "reference/plugins",
+        "reference/plugins/manhattan/mean_shift",
+        "reference/topics/index",
+        "reference/topics/pose",
     ):
         assert (site / f"{part}.html").is_file(), part
     assert "trihedron compare" in (site / "reference" / "command-line.html").read_text()
+    assert "plugins/planes/cape.html" in (site / "source" / "plugins" / "planes" / "cape.py.html").read_text()
     assert "R_world_camera" in (site / "reference" / "python-objects.html").read_text()
 
 

@@ -11,7 +11,6 @@ import inspect
 import json
 import re
 from enum import Enum
-from pathlib import Path
 from typing import Any
 
 from trihedron.pipeline.core.comments import field_comments
@@ -27,9 +26,6 @@ def main(argv: list[str]) -> int:
     parser.add_argument("slot", metavar="SLOT", nargs="?", help="only this slot")
     parser.add_argument("plugin", metavar="PLUGIN", nargs="?", help="only this plugin of it, with its options")
     parser.add_argument("--json", action="store_true", help="print everything as JSON")
-    parser.add_argument("--pages", type=Path, metavar="FOLDER", help="write a page for each plugin of this package instead")
-    parser.add_argument("--results", type=Path, metavar="FILE", help="measured figures for the pages (trihedron benchmark methods --json FILE)")
-    parser.add_argument("--figures", action="store_true", help="draw what each finds, for the pages")
     arguments = parser.parse_args(argv)
     from trihedron.pipeline.core.registry import load_plugins
     from trihedron.pipeline.core.slots import SLOTS
@@ -37,12 +33,6 @@ def main(argv: list[str]) -> int:
     if arguments.slot is not None and arguments.slot not in SLOTS:
         raise UsageError("plugins", f"there is no slot '{arguments.slot}'", did_you_mean(arguments.slot, SLOTS))
     load_plugins()
-    if arguments.pages is not None:
-        from trihedron.tools.plugin_pages import read_results, write_pages
-
-        pages = write_pages(arguments.pages, read_results(arguments.results or Path()), arguments.figures)
-        print(f"{len(pages)} pages in {arguments.pages}")
-        return 0
     described = [describe_slot(slot) for slot in SLOTS if arguments.slot in (None, slot)]
     if arguments.plugin is not None:
         described[0]["plugins"] = [_chosen(described[0], arguments.plugin)]

@@ -32,17 +32,8 @@ class Topic:
 def main(argv: list[str]) -> int:
     """Run the command; returns the exit code. Raises RecordingError for a file that is missing, cut off or no MCAP."""
     parser = Parser("topics", __name__)
-    parser.add_argument("file", metavar="FILE.mcap", type=Path, nargs="?")
-    parser.add_argument("--pages", type=Path, metavar="FOLDER", help="write a page for each topic of our recordings instead, with a decoder")
-    arguments = parser.parse_args(argv)
-    if arguments.pages is not None:
-        from trihedron.tools.topic_pages import write_pages
-
-        print(f"{len(write_pages(arguments.pages))} pages in {arguments.pages}")
-        return 0
-    if arguments.file is None:
-        parser.error("the following arguments are required: FILE.mcap")
-    found = topics_of(arguments.file)
+    parser.add_argument("file", metavar="FILE.mcap", type=Path)
+    found = topics_of(parser.parse_args(argv).file)
     rows: list[list[str]] = [["topic", "schema", "messages", "first (s)", "last (s)", "bytes"]]
     for topic in found:
         first, last = (f"{stamp_ns / 1e9:.6f}" for stamp_ns in (topic.first_ns, topic.last_ns))

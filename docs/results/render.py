@@ -1,6 +1,6 @@
 """Write the figures of docs/results/*.json into the pages: into each block between `<!-- results: NAME -->` and `<!-- end of results -->`.
 
-    python docs/results/render.py       # and the pages of the plugins: trihedron plugins --pages docs/reference/plugins --results FILE
+    python docs/results/render.py
 
 Under each table stand the command, commit and date of its figures.
 """
@@ -15,8 +15,10 @@ from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
+sys.path.insert(0, str(Path(__file__).parents[1] / "site"))
+from plugin_pages import markdown, source_line
+
 from trihedron.tools.method_tables import cell_of
-from trihedron.tools.plugin_pages import markdown, source_line
 from trihedron.tools.published import peer_figures, peers, published_ate_m, sequence_of
 
 ROOT = Path(__file__).resolve().parents[2]

@@ -14,21 +14,23 @@ from mkdocs.structure.pages import Page
 
 sys.path.insert(0, str(Path(__file__).parent))
 import gallery
+import plugin_pages
 import reference
+import topic_pages
+
+from trihedron.pipeline.core.registry import load_plugins
 
 ROOT = Path(__file__).resolve().parents[2]
 RESULTS = Path(os.environ.get("TRIHEDRON_GALLERY", ROOT / "build" / "gallery"))
 LINK = re.compile(r"(\]\()([^)\s#]+)((?:#[^)\s]*)?\))")
-TOP = {"README.md": "index.md"}  # page of the repository's top -> page of the site; others keep their names, in lower case
+TOP = {"README.md": "index.md", "plugins": f"{plugin_pages.FOLDER}.md"}  # what the repository's top has -> its page of the site
 LANGUAGES = {".py": "python", ".yaml": "yaml", ".yml": "yaml", ".toml": "toml", ".json": "json", ".ipynb": "json", "": "text"}
 
 
 def page_of(target: Path) -> str:
     """The page of the site that shows a file which is outside the folder of documentation."""
     name = target.relative_to(ROOT).as_posix()
-    if target.suffix == ".md":
-        return TOP.get(name, name.lower())
-    return f"source/{name}.md"
+    return TOP.get(name, name.lower() if target.suffix == ".md" else f"source/{name}.md")
 
 
 def outside(page: str, link: str) -> Path | None:
@@ -57,11 +59,14 @@ def from_docs(link: str) -> str:
 
 
 def source_page(target: Path) -> str:
-    """Show a file, or list a folder; not part of the search."""
+    """Show a file with links to the plugins in it, or list a folder; not part of the search."""
     name = target.relative_to(ROOT).as_posix()
     head = f"---\nsearch: {{exclude: true}}\n---\n# `{name}`\n\n"
     if target.is_dir():
         return head + "\n".join(f"- `{path.name}`" for path in sorted(target.iterdir()) if not path.name.startswith(("__", ".")))
+    top = posixpath.relpath(".", posixpath.dirname(page_of(target)))
+    found = [(slot, plugin) for slot, plugin in plugin_pages.built_in() if plugin_pages.source_of(slot, plugin) == name]
+    head += "".join(f"[`{slot}={plugin}`]({top}/{plugin_pages.FOLDER}/{slot}/{plugin}.md)\n\n" for slot, plugin in found)
     return f"{head}``````{LANGUAGES.get(target.suffix, 'text')}\n{target.read_text()}\n``````\n"
 
 
@@ -74,8 +79,9 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
         raise PluginError(f"{RESULTS} holds no results of the gallery; write them with: python docs/site/gallery.py build/gallery")
     for picture in sorted(RESULTS.glob("*.jpg")):
         files.append(File.generated(config, f"gallery/{picture.name}", abs_src_path=str(picture)))
-    for name, text in (reference.pages() | gallery.pages(RESULTS)).items():
-        files.append(File.generated(config, name, content=text))
+    load_plugins()
+    for name, content in {**reference.pages(), **plugin_pages.pages(), **topic_pages.pages(), **gallery.pages(RESULTS)}.items():
+        files.append(File.generated(config, name, content=content))
     linked = set()
     for file in files.documentation_pages():
         linked |= {target for _, link, _ in LINK.findall(file.content_string) if (target := outside(file.src_uri, link))}

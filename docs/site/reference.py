@@ -12,11 +12,11 @@ from importlib.metadata import entry_points
 from pathlib import Path
 from typing import Any
 
+from plugin_pages import markdown
+
 from trihedron.pipeline.app.cli import COMMAND_GROUP, main
+from trihedron.pipeline.core.comments import field_comments
 from trihedron.pipeline.core.config import FoxgloveView, RecordOptions, RerunView, RunOptions, SearchOptions
-from trihedron.pipeline.core.registry import load_plugins
-from trihedron.tools.plugin_pages import markdown
-from trihedron.tools.plugins import field_comments
 
 ROOT = Path(__file__).resolve().parents[2]
 GROUPS = {"graph": "Systems", "experiment": "Sweeps with a table at their end", "without": "The default graph without one ingredient"}
@@ -116,5 +116,4 @@ def about(path: Path) -> str:
 
 def pages() -> dict[str, str]:
     """Text of each generated page by its place below docs/."""
-    load_plugins()
     return {"reference/python-objects.md": PYTHON, "reference/command-line.md": command_line(), "reference/configuration.md": configuration()}

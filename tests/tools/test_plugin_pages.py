@@ -1,31 +1,42 @@
-"""The pages of the plugins are those that their sources and the file of measured figures give."""
+"""The page of a plugin has its documentation, its options, and its measured figures with their commit."""
 
 import json
+import re
+import sys
 from pathlib import Path
 
 import pytest
 
-from trihedron.pipeline.app.cli import main
-from trihedron.pipeline.core.registry import load_plugins, plugin_class
-from trihedron.tools.plugin_pages import built_in, markdown, page, read_results
+from trihedron.pipeline.core.options import constraints_of
+from trihedron.pipeline.core.registry import load_plugins, options_of, plugin_class
 
 ROOT = Path(__file__).parents[2]
-PAGES, RESULTS = ROOT / "docs" / "reference" / "plugins", ROOT / "docs" / "results" / "methods.json"
-AGAIN = "write them again: trihedron plugins --pages docs/reference/plugins --results docs/results/methods.json"
+sys.path.insert(0, str(ROOT / "docs" / "site"))
+from plugin_pages import RESULTS, built_in, draw, markdown, overview, page, pages, source_of  # noqa: E402
+
 load_plugins()
 
 
-def test_pages_are_up_to_date():
-    results = read_results(RESULTS)
-    for slot, name in built_in():
-        path = PAGES / slot / f"{name}.md"
-        assert path.is_file(), f"{path}: {AGAIN}"
-        assert path.read_text() == page(slot, name, results, path.with_suffix(".jpg").exists()), f"{path}: {AGAIN}"
-    assert {(path.parent.name, path.stem) for path in PAGES.glob("*/*.md")} == set(built_in())
+@pytest.mark.parametrize("slot, name", built_in())
+def test_the_page_of_a_plugin_has_its_options_source_and_dated_figures(slot, name):
+    kind, text = plugin_class(slot, name), page(slot, name, json.loads(RESULTS.read_text()), False)
+    assert text.startswith(f"# `{slot}={name}`\n\n{(kind.__doc__ or '').split(chr(10))[0]}")
+    assert f"[Source](../../../../{source_of(slot, name)})" in text and (ROOT / source_of(slot, name)).is_file()
+    rows = [line.split(" | ") for line in text.partition("## Options")[2].partition("## ")[0].splitlines() if line.startswith("| `")]
+    ranges = {option: " and ".join(map(str, found)) for option, found in constraints_of(kind).items()}
+    expected = [(f"| `{option.name}`", ranges.get(option.name, "")) for option in options_of(kind)]
+    assert [(row[0], row[2]) for row in rows] == expected
+    dated = r"Measured on commit `[0-9a-f]{12}` \(\d{4}-\d\d-\d\d\) with `make results PART=methods`"
+    assert "| ATE mm" not in text or re.search(dated, text)
+
+
+def test_the_index_links_each_plugin_the_default_of_its_slot_first():
+    assert sorted(re.findall(r"\]\(plugins/(\w+)/(\w+)\.md\)", overview())) == sorted(built_in())
+    assert "| `planes` | **[`connected_components`](plugins/planes/connected_components.md)**, [`ahc`](plugins/planes/ahc.md), " in overview()
 
 
 def test_every_plugin_was_measured_and_none_failed():
-    results = read_results(RESULTS)
+    results = json.loads(RESULTS.read_text())
     assert [row for row in results["runs"] if row["note"]] == []
     measured = {row["change"] for row in results["runs"]}
     for slot in ("normals", "keypoints", "lines", "planes", "manhattan", "tracks", "rotation", "translation", "matches", "pose", "bundle", "loop"):
@@ -37,7 +48,7 @@ def test_every_plugin_was_measured_and_none_failed():
     assert {"default", "graph=libraries"} <= measured
 
 
-def test_a_page(tmp_path):
+def test_a_page():
     run = {
         "change": "planes=cape",
         "sequence": "room",
@@ -84,7 +95,7 @@ def test_a_page_without_figures_names_the_command_that_gives_them(slot, name, co
 
 
 def test_only_stages_that_do_nothing_have_no_section_of_figures():
-    results = read_results(RESULTS)
+    results = json.loads(RESULTS.read_text())
     assert {name for slot, name in built_in() if "## Measured" not in page(slot, name, results, False)} == {"none"}
 
 
@@ -92,9 +103,14 @@ def test_bars_are_escaped():
     assert markdown(["a"], [("x | y",)]).splitlines()[-1] == r"| x \| y |"
 
 
+def test_what_needs_a_file_is_not_drawn():
+    assert draw("planes", "onnx") is None
+
+
 @pytest.mark.slow
-def test_the_command_writes_all_pages_with_figures(tmp_path, capsys):
-    (tmp_path / "results.json").write_text(json.dumps({"runs": [], "detectors": {}}))
-    assert main(["plugins", "--pages", str(tmp_path), "--results", str(tmp_path / "results.json"), "--figures"]) == 0
-    assert capsys.readouterr().out.startswith(f"{len(built_in())} pages in ")
-    assert (tmp_path / "planes" / "cape.jpg").stat().st_size > 5000
+def test_pages_show_what_a_plugin_finds():
+    written = pages()
+    assert len([place for place in written if place.endswith(".md")]) == 1 + len(built_in())
+    picture = written["reference/plugins/planes/cape.jpg"]
+    assert picture.startswith(b"\xff\xd8") and len(picture) > 5000
+    assert "](cape.jpg)" in written["reference/plugins/planes/cape.md"] and "reference/plugins/planes/onnx.jpg" not in written

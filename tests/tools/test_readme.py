@@ -1,4 +1,4 @@
-"""README and docs: the table of plugins is that of the registry, commands exist, links resolve."""
+"""README and docs: commands exist, links resolve."""
 
 import contextlib
 import io
@@ -8,37 +8,14 @@ from importlib.metadata import entry_points
 from pathlib import Path
 
 import pytest
-import yaml
 
 from trihedron.datasets.simulation.synthetic import Synthetic
 from trihedron.pipeline.app.cli import main
 from trihedron.pipeline.core.config import composed, graph_of
-from trihedron.pipeline.core.registry import load_plugins, plugins_of
-from trihedron.pipeline.core.slots import SLOTS, summary
 from trihedron.tools.benchmark import COMPARISONS
 
 ROOT = Path(__file__).parents[2]
 PAGES = [*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md")]
-PLUGINS = ROOT / "docs" / "reference" / "plugins.md"
-BEGIN, END = "<!-- plugins: written by tests/tools/test_readme.py -->\n", "<!-- end of plugins -->"
-
-
-def plugin_table():
-    """The table of built-in plugins, those of the default graph in bold."""
-    load_plugins()
-    graph = yaml.safe_load((ROOT / "conf" / "graph" / "structural.yaml").read_text())
-    default = {key.strip("/"): name for entry in graph["defaults"] for key, name in entry.items()} | {"dataset": "synthetic"}
-    lines = ["| slot | plugins (**default**) | gives |", "|---|---|---|"]
-    for slot in SLOTS:
-        built_in = [name for name, plugin in plugins_of(slot).items() if plugin.__module__.startswith("trihedron.")]
-        linked = {name: f"[`{name}`](plugins/{slot}/{name}.md)" for name in built_in}
-        names = [f"**{linked[default[slot]]}**", *(linked[name] for name in built_in if name != default[slot])]
-        lines.append(f"| `{slot}` | {', '.join(names)} | {summary(slot).rstrip('.')} |")
-    return "\n".join(lines) + "\n"
-
-
-def test_the_table_of_plugins_is_the_registry():
-    assert PLUGINS.read_text().split(BEGIN)[1].split(END)[0] == plugin_table()
 
 
 def test_the_commands_exist():
@@ -88,7 +65,7 @@ def test_links_resolve_and_pictures_are_small():
     for page in PAGES:
         for picture, name in re.findall(r"(!?)\[[^]]*\]\(([^)#]+)[^)]*\)", page.read_text()):
             if not name.startswith("http"):
-                assert (page.parent / name).is_file(), f"{page}: {name}"
+                assert (page.parent / name).exists(), f"{page}: {name}"
                 assert not picture or (page.parent / name).stat().st_size < 300_000
 
 
@@ -104,8 +81,3 @@ def test_the_python_of_the_readme_runs(capsys, tmp_path, monkeypatch):
     exec(compile(program, "README.md", "exec"), {"my_camera": ((frame.color, frame.depth_m, frame.stamp_ns / 1e9) for frame in frames)})
     revision, planes, *topics = capsys.readouterr().out.split()
     assert int(revision) > 0 and int(planes) > 0 and topics == ["('frames',", "'manhattan')"]
-
-
-if __name__ == "__main__":
-    head, rest = PLUGINS.read_text().split(BEGIN)
-    PLUGINS.write_text(head + BEGIN + plugin_table() + END + rest.split(END, 1)[1])

@@ -71,12 +71,6 @@ def test_measured_figures_are_rendered_or_state_commit_and_command(page):
     assert undated(page.read_text()) == []
 
 
-def test_pages_of_plugins_state_the_source_of_their_figures():
-    for page in (ROOT / "docs" / "reference" / "plugins").glob("*/*.md"):
-        measured = page.read_text().partition("## Measured")[2]
-        assert "| ATE mm" not in measured or DATED.search(measured), page
-
-
 @pytest.mark.parametrize(
     "text, count",
     [

@@ -1,11 +1,10 @@
-"""Pages of the topics of a recording, one each, generated from the types: `trihedron topics --pages FOLDER`.
+"""Write the pages of the topics of a recording from the types.
 
 Each has the fields with their element types, shapes and units, and a decoder in plain mcap and NumPy, which the tests run."""
 
 from __future__ import annotations
 
 import inspect
-from pathlib import Path
 from typing import Any, get_args, get_type_hints
 
 import numpy as np
@@ -82,14 +81,10 @@ LOOP = """with open("run.mcap", "rb") as file:
 """
 
 
-def write_pages(folder: Path) -> list[Path]:
-    """Write FOLDER/README.md and a page for each topic; returns them."""
-    folder.mkdir(parents=True, exist_ok=True)
-    written = []
-    for name, text in {"README": overview(), **{topic: page(topic) for topic in topic_types()}}.items():
-        written.append(folder / f"{name}.md")
-        written[-1].write_text(text, encoding="utf-8")
-    return written
+def pages() -> dict[str, str]:
+    """Text of each page by its place below docs/."""
+    texts = {"README": overview(), **{topic: page(topic) for topic in topic_types()}}
+    return {f"reference/topics/{name}.md": text for name, text in texts.items()}
 
 
 def topic_types() -> dict[str, type[Any] | None]:
@@ -125,7 +120,6 @@ def overview() -> str:
         "arrays are a column's new rows, `rows<k>` their numbers, and `emptied` the numbers of chunks of "
         f"{CHUNK} rows that are zero again. "
         "[`map`](map.md) has the decoder. Rows that are not `alive` are no landmarks any more.",
-        "These pages are written by `trihedron topics --pages docs/reference/topics`.",
     ]) + "\n"  # fmt: skip
 
 

@@ -1,4 +1,4 @@
-"""Pages of the plugins, one each, from their docstrings, their options and a file of measured figures: `trihedron plugins --pages FOLDER`."""
+"""Write the pages of the plugins from their docstrings, their options, the measured figures of docs/results and what they find in one frame."""
 
 from __future__ import annotations
 
@@ -12,28 +12,35 @@ import numpy as np
 
 from trihedron.pipeline.core.config import default_plugins
 from trihedron.pipeline.core.registry import plugins_of
-from trihedron.pipeline.core.slots import SLOTS
+from trihedron.pipeline.core.slots import SLOTS, summary
 from trihedron.tools.plugins import describe_plugin
 
+FOLDER = "reference/plugins"  # below docs/
+RESULTS = Path(__file__).resolve().parents[1] / "results" / "methods.json"
 WITHOUT = {"pose": "refinement"}  # slot -> its name as in without=NAME, where that differs
 MEASURED_WITH = {"surface": "surface outputs=[trajectory,surface]", "building": "building outputs=[trajectory,building]", "model": "model pose=icp"}
 SIZE = {"width": 320, "height": 240, "length": 3}  # of the frame that figures show, its last
 QUALITY = 82  # of JPEG
 NEES_SCALE = "NEES is 5.35 where covariances are right"
+HEAD = """# Plugins
+
+`trihedron plugins` prints each one's options, defaults and source; `trihedron check SLOT PLUGIN` checks one, ours or yours. Figures were measured by
+`make results PART=methods`, which runs `trihedron run -m experiment=methods` ([columns](../how-to/compare-plugins.md)) and, in
+[a checkout](../how-to/install.md#benchmarks), `trihedron benchmark detectors`. Pictures show a frame of the synthetic room.
+"""
 Results = dict[str, Any]
 
 
-def write_pages(folder: Path, results: Results, figures: bool) -> list[Path]:
-    """Write FOLDER/SLOT/NAME.md for each plugin of this package, and with `figures` FOLDER/SLOT/NAME.jpg; returns the pages."""
-    pages = []
+def pages() -> dict[str, str | bytes]:
+    """Text of each page, and its figure as a JPEG file, by its place below docs/."""
+    results = json.loads(RESULTS.read_text())
+    written: dict[str, str | bytes] = {f"{FOLDER}.md": overview()}
     for slot, name in built_in():
-        path = folder / slot / f"{name}.md"
-        path.parent.mkdir(parents=True, exist_ok=True)
-        if figures and slot in DRAWN:
-            draw(slot, name, path.with_suffix(".jpg"))
-        path.write_text(page(slot, name, results, path.with_suffix(".jpg").exists()), encoding="utf-8")
-        pages.append(path)
-    return pages
+        figure = draw(slot, name) if slot in DRAWN else None
+        written[f"{FOLDER}/{slot}/{name}.md"] = page(slot, name, results, figure is not None)
+        if figure is not None:
+            written[f"{FOLDER}/{slot}/{name}.jpg"] = figure
+    return written
 
 
 def built_in() -> list[tuple[str, str]]:
@@ -41,23 +48,31 @@ def built_in() -> list[tuple[str, str]]:
     return [(slot, name) for slot in SLOTS for name, kind in plugins_of(slot).items() if kind.__module__.startswith("trihedron.")]
 
 
-def read_results(file: Path) -> Results:
-    """The figures of `trihedron benchmark methods --json`; none where there is no file."""
-    found: Results = json.loads(file.read_text()) if file.is_file() else {"runs": [], "detectors": {}}
-    return found
+def source_of(slot: str, name: str) -> str:
+    """The file of a plugin, from the top of the repository."""
+    return Path(*plugins_of(slot)[name].__module__.split(".")[1:]).with_suffix(".py").as_posix()
+
+
+def overview() -> str:
+    """The table of the plugins of this package, those of the default graph first and in bold."""
+    names: dict[str, list[str]] = {slot: [] for slot in SLOTS}
+    for slot, name in built_in():
+        link = f"[`{name}`](plugins/{slot}/{name}.md)"
+        names[slot] = [f"**{link}**", *names[slot]] if default_plugins().get(slot) == name else [*names[slot], link]
+    rows = [(f"`{slot}`", ", ".join(links), summary(slot).rstrip(".")) for slot, links in names.items()]
+    return HEAD + "\n" + markdown(["slot", "plugins (**default**)", "gives"], rows) + "\n"
 
 
 def page(slot: str, name: str, results: Results, figure: bool) -> str:
     """The page of a plugin."""
     kind = plugins_of(slot)[name]
     described = describe_plugin(slot, name, kind)
-    source = Path(*kind.__module__.split(".")[1:]).with_suffix(".py")
     default = "The default. " if default_plugins().get(slot) == name else ""
     parts = [
         f"# `{slot}={name}`",
         inspect.cleandoc(kind.__doc__ or ""),
         f"{default}Inputs: {', '.join(f'`{one}`' for one in described['inputs']) or 'none'}. "
-        f"[Source](../../../../{source.as_posix()}) · [all plugins](../../plugins.md)",
+        f"[Source](../../../../{source_of(slot, name)}) · [all plugins](../../plugins.md)",
     ]
     parts += [f"![{slot}={name} on a frame of the synthetic room]({name}.jpg)"] if figure else []
     parts += ["## Options", _options(described["parameters"])] if described["parameters"] else []
@@ -154,8 +169,8 @@ def markdown(header: list[str], rows: Sequence[tuple[Any, ...]]) -> str:
 # Figures: what a stage finds in one frame.
 
 
-def draw(slot: str, name: str, out: Path) -> None:
-    """Draw what a plugin finds; nothing where it needs a file or a library that is not there."""
+def draw(slot: str, name: str) -> bytes | None:
+    """Draw what a plugin finds, as a JPEG file; None where it needs a file or a library that is not there."""
     import cv2
 
     from trihedron.pipeline.core.errors import TrihedronError
@@ -165,11 +180,12 @@ def draw(slot: str, name: str, out: Path) -> None:
     try:
         value = values_of(PluginCheck(slot, name).plugin, slot, scene)[-1]
     except TrihedronError:
-        return
+        return None
     if value is None:
-        return
+        return None
     picture = DRAWN[slot](scene.values[-1]["dataset"].color.copy(), value)
-    cv2.imwrite(str(out), cv2.cvtColor(picture, cv2.COLOR_RGB2BGR), [cv2.IMWRITE_JPEG_QUALITY, QUALITY])
+    encoded = cv2.imencode(".jpg", cv2.cvtColor(picture, cv2.COLOR_RGB2BGR), [cv2.IMWRITE_JPEG_QUALITY, QUALITY])[1]
+    return bytes(encoded)
 
 
 def _colors(count: int) -> Any:
