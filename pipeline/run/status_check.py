@@ -1,8 +1,9 @@
 """Compare the status of poses with their errors: wrong `ok`, and how well the stated σ predicts the error.
 
-Poses count as they were estimated at the time. Each sub-map has a world of its own and is aligned with the truth by itself, robustly, over its posed
-frames; smaller ones than LEAST_POSES are left out. An `ok` frame is wrong where it is off by more than WRONG_M and SIGMAS standard deviations, or by
-more than WRONG_DEG and SIGMAS. Positions are in the camera frame.
+Poses count as they were estimated at the time. Each sub-map has a world of its own and is aligned with the truth by itself, robustly, over its `ok`
+frames, since the others claim nothing, or over all posed ones where it has fewer than LEAST_OK of these; smaller sub-maps are left out. An `ok`
+frame is wrong where it is off by more than WRONG_M and SIGMAS standard deviations, or by more than WRONG_DEG and SIGMAS; the first pose, which defines
+the world, is never. Positions are in the camera frame.
 """
 
 from __future__ import annotations
@@ -21,6 +22,7 @@ from trihedron.pipeline.run.metrics import associate, relative_errors, rotation_
 
 WRONG_M, WRONG_DEG, SIGMAS = 0.05, 2.0, 4.0
 LEAST_POSES = 10  # of a sub-map that is judged
+LEAST_OK = 3  # poses with status ok, by which a sub-map is aligned
 INLIER = 3.0  # times the median error
 ROUNDS = 5
 STEP_M = 0.05
@@ -32,11 +34,12 @@ EXACT = 1e-10  # total variance below which a pose is exact by definition, as th
 class FrameErrors:
     """Errors (n,) of the posed frames with truth: metres, degrees, the largest stated standard deviations, NEES (6 degrees of freedom), and the
     logarithm of the likelihood of the error (nats). The latter two are NaN of a pose that is exact by definition. `ok` is the status; `judged` is
-    False in sub-maps that are too small, whose errors are NaN."""
+    False in sub-maps that are too small, whose errors are NaN; `exact` is True of poses that are exact by definition."""
 
     indices: F64
     judged: Bool
     ok: Bool
+    exact: Bool
     error_m: F64
     error_deg: F64
     sigma_m: F64
@@ -49,7 +52,7 @@ class FrameErrors:
         """Return (n,) whether an `ok` frame is off by more than it states."""
         far = (self.error_m > WRONG_M) & (self.error_m > SIGMAS * self.sigma_m)
         turned = (self.error_deg > WRONG_DEG) & (self.error_deg > SIGMAS * self.sigma_deg)
-        return np.asarray(self.ok & self.judged & (far | turned))
+        return np.asarray(self.ok & self.judged & ~self.exact & (far | turned))
 
 
 @dataclass(frozen=True)
@@ -120,32 +123,34 @@ def _frame_errors(poses: Sequence[Pose], truth: Trajectory) -> tuple[FrameErrors
     judged = np.zeros(n, bool)
     T = np.array([pose.T_world_camera for pose in known]).reshape(-1, 4, 4)
     S = np.array([pose.covariance for pose in known]).reshape(-1, 6, 6) + TINY * np.eye(6)
-    submaps = np.array([pose.submap for pose in known], int)
+    submaps, ok = np.array([pose.submap for pose in known], int), np.array([pose.status == OK for pose in known], bool)
+    exact = np.trace(S, axis1=1, axis2=2) <= EXACT
     for submap in np.unique(submaps):
         rows = np.flatnonzero(submaps == submap)
         if len(rows) < LEAST_POSES:
             continue
         judged[rows] = True
-        error_m[rows], error_deg[rows] = _robustly_aligned(T[rows], true[rows])
-        rows = rows[np.trace(S[rows], axis1=1, axis2=2) > EXACT]
+        aligned = ok[rows] if np.count_nonzero(ok[rows]) >= LEAST_OK else np.ones(len(rows), bool)
+        error_m[rows], error_deg[rows] = _robustly_aligned(T[rows], true[rows], aligned)
+        rows = rows[~exact[rows]]
         if len(rows) < 2:
             continue
         covariances = S[rows] + _noise_of_truth([known[row] for row in rows], true[rows]).covariance
         nees[rows], likelihood[rows] = _normalised_errors(T[rows], covariances, true[rows])
     sigma = np.sqrt(np.diagonal(S, axis1=1, axis2=2))
-    ok, indices = np.array([pose.status == OK for pose in known], bool), np.array([pose.index for pose in known], float)
+    indices = np.array([pose.index for pose in known], float)
     sigma_m, sigma_deg = sigma[:, :3].max(axis=1, initial=0.0), np.degrees(sigma[:, 3:].max(axis=1, initial=0.0))
-    return FrameErrors(indices, judged, ok, error_m, error_deg, sigma_m, sigma_deg, nees, likelihood), known, true
+    return FrameErrors(indices, judged, ok, exact, error_m, error_deg, sigma_m, sigma_deg, nees, likelihood), known, true
 
 
-def _robustly_aligned(T: F64, true: F64) -> tuple[F64, F64]:
-    """Return (n,) metres and degrees by which poses (n, 4, 4) are off after alignment of their positions, without the worst ones."""
-    inlier, error = np.ones(len(T), bool), np.zeros(len(T))
+def _robustly_aligned(T: F64, true: F64, aligned: Bool) -> tuple[F64, F64]:
+    """Return (n,) metres and degrees by which poses (n, 4, 4) are off after alignment of the positions of those `aligned`, without the worst ones."""
+    inlier, error = aligned, np.zeros(len(T))
     motion = np.eye(4)
     for _ in range(ROUNDS):
         motion = umeyama(T[inlier, :3, 3], true[inlier, :3, 3])
         error = np.linalg.norm(matmul(motion, T)[:, :3, 3] - true[:, :3, 3], axis=1)
-        inlier = error <= max(INLIER * float(np.median(error)), 1e-4)
+        inlier = aligned & (error <= max(INLIER * float(np.median(error[aligned])), 1e-4))
     angle = rotation_angles_deg(matmul(invert(true), motion, T)[:, :3, :3])
     return error, np.asarray(angle - np.median(angle[inlier]))  # a path without turns leaves the rotation of the alignment uncertain
 

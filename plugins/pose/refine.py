@@ -27,6 +27,7 @@ from trihedron.pipeline.core.types import (
     Translation,
 )
 from trihedron.plugins.mapping.reference_keyframe import reference_of, submap_of, transform_to_map
+from trihedron.plugins.pose.calibration_uncertainty import contradicted_calibration
 from trihedron.plugins.pose.decoupled_pose import FIRST_SIGMA, Decoupled, decoupled_pose
 from trihedron.plugins.pose.dynamic_objects import MovingOptions, Selection, solve_with_static, status_with_static
 from trihedron.plugins.pose.map_alignment import InlierStatistics, MapAlignment, TrackingStatus
@@ -54,7 +55,7 @@ class Refine(MovingOptions):
     min_inliers: NonNegativeInt = 10  # points + 2 lines + 5 planes below which the pose is degraded
     found_inliers: NonNegativeInt = 30  # points + 2 lines + 5 planes that relocalise a lost pose
     found_share: Share = 0.5  # of the matches that must be inliers for that
-    min_continued: Share = 0.025  # of the key points with depth that the previous frame or the map must explain, else it is another place
+    min_continued: Share = 0.06  # of the key points with depth, known from the previous frame or the map; two rooms: 0.04, fast walks: at least 0.087
     weak_foundation: PositiveFloat = 3.0  # times the pose's σ beyond which the nearby keyframes' σ is added to it
     submap_after: NonNegativeInt = 5  # frames without relocalisation, of those that show enough, after which a sub-map begins; 0 = never
 
@@ -96,6 +97,9 @@ class Refine(MovingOptions):
             continued = f"{translation.inliers[0]} key points continue the previous frame and {inliers.inliers[0]} are in the map"
             reason = f"another place: of {len(keypoints.pixels)}, {continued}"
             return propagate_world_covariance(replace(start, status=LOST, reason=reason).to_pose(rotation, map, submap=submap), previous)
+        if submap and not self._is_tracked(inliers):  # it ties the sub-map to nothing, and is looked for in the others
+            reason = f"sub-map {submap} does not show what the frame does: only {inliers.total} of {inliers.matches} matches agree"
+            return propagate_world_covariance(replace(start, status=LOST, reason=reason).to_pose(rotation, map, submap=submap), previous)
         if not inliers.total:
             return propagate_world_covariance(
                 start.to_pose(rotation, map, "nothing of the map was found, pose from the previous frame", submap), previous
@@ -108,7 +112,9 @@ class Refine(MovingOptions):
         reference, T_reference_camera = reference_of(map, T, submap)
         stamps = rotation.index, rotation.stamp_ns
         pose = Pose(*stamps, T, status.covariance, T_reference_camera, reference, counts, held, status.status, status.reason, submap, repeats=repeats)
-        return in_world(pose, previous, solution, problem)
+        pose = in_world(pose, previous, solution, problem)
+        contradiction = contradicted_calibration(pose) if pose.status == OK else ""
+        return replace(pose, status=DEGRADED, reason=contradiction) if contradiction else pose
 
     def localising(self) -> Refine:
         """Return the refinement of a camera that begins no sub-map: where the loaded map does not reach it stays lost."""

@@ -21,6 +21,11 @@ from trihedron.plugins.shared.calibration_error_kernels import calibration_momen
 
 FOCAL, CENTRE, REGISTRATION = 0.003, 0.0019, 0.0022  # of the focal length; of the image's width, twice
 INVERSE_DEPTH_PER_M, RADIAL = 0.002, 0.007
+CALIBRATION_NAMES = (
+    "the focal length fx", "the focal length fy", "the principal point in x", "the principal point in y", "the focal length of depth",
+    "the registration of depth in x", "the registration of depth in y", "inverse depth", "depth in the corners", "the readout of colour",
+    "the delay of depth", "the readout of depth",
+)  # fmt: skip
 READOUT_S, DELAY_S, DEPTH_READOUT_S = 0.02, 0.012, 0.015
 
 
