@@ -186,7 +186,7 @@ class Recording:
 
         Raises:
             UsageError: `only` is a text, or a word is no override.
-            ConfigError: a stage or an option is unknown, or an option out of range.
+            ConfigError: a stage, plugin or option is unknown, or an option out of range.
             RecordingError: a stage needs images that the recording does not embed and that are gone.
             StageError: a stage failed.
 

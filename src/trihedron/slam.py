@@ -64,8 +64,8 @@ class Slam:
     Raises:
         DataError: `camera` is none, or another run writes to the folder `out`.
         UsageError: a word is no override, or makes no sense for pushed frames, as that of a data set.
-        ConfigError: a key or an option is unknown or out of range, or the folder cannot be written.
-        PluginError: there is no plugin of this name.
+        ConfigError: a key, plugin or option is unknown, an option out of range, or the folder cannot be written.
+        PluginError: an installed package of plugins does not load.
         GraphError: the wires of the graph do not fit together.
 
     Examples:
