@@ -34,19 +34,25 @@ Docstrings of the names in `import trihedron as th`. [The Python API](python.md)
 ## Track, record, replay
 
 ::: trihedron.slam.Slam
-    options: {members: [track, values, map, trajectory, causal_trajectory, mesh, save, save_map, close]}
+    options: {members: [track, values, map, trajectory, causal_trajectory, mesh, building, save, save_map, close]}
 ::: trihedron.recording.Recording
-    options: {members: [topics, metadata, values, frame, image, frames, poses, trajectory, map, mesh, replay]}
+    options: {members: [topics, metadata, values, frame, image, frames, poses, trajectory, map, mesh, building, replay, ablate]}
 ::: trihedron.runs.run
 ::: trihedron.runs.Run
 ::: trihedron.runs.compare
+::: trihedron.ablations.ablate
+::: trihedron.ablations.Ablation
 ::: trihedron.camera.Camera
 ::: trihedron.trajectory.Trajectory
+::: trihedron.buildings.Building
 
 ## Stages and plugins
 
 ::: trihedron.stages.Slot
+::: trihedron.stages.StageFactory
+    options: {members: [__call__]}
 ::: trihedron.stages.Stage
+    options: {members: [__call__]}
 ::: trihedron.pipeline.core.registry.register
 ::: trihedron.pipeline.core.errors.TrihedronError
 

@@ -11,7 +11,16 @@ from collections.abc import Iterable
 
 
 class TrihedronError(Exception):
-    """An error with a place (file, key, stage), a cause and a cure; printed as one line."""
+    """An error with a place (file, key, stage), a cause and a cure; printed as one line.
+
+    Its kinds are UsageError, ConfigError, GraphError, PluginError, DataError, RecordingError, LibraryError and StageError, in
+    `trihedron.pipeline.core.errors`; `except trihedron.TrihedronError` catches them all.
+
+    Args:
+        place: where it is: a file, a key, an argument or a stage.
+        cause: what is wrong there.
+        cure: what to do; none where it is empty.
+    """
 
     exit_code = 1
 

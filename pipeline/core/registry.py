@@ -27,8 +27,16 @@ _FILES: dict[str, FileWriter] = {}
 def register(slot: str, name: str) -> Callable[[Plugin], Plugin]:
     """Register a frozen dataclass as the plugin `name` of `slot` (class decorator). Each construction then checks the ranges of its options.
 
-    Raises PluginError, naming the plugin and its file, when the slot is unknown, the name is taken, the class is not a frozen dataclass,
-    or its method's parameters or return type are not the slot's.
+    Args:
+        slot: as "planes".
+        name: the word of the command line that chooses it, as in `planes=mine`.
+
+    Returns:
+        The decorator, which returns the class.
+
+    Raises:
+        PluginError: from the decorator, naming the plugin and its file: the slot is unknown, the name is taken, the class is not a frozen dataclass,
+            or its method's parameters or return type are not the slot's.
     """
 
     def decorate(plugin: Plugin) -> Plugin:

@@ -119,7 +119,11 @@ class Keypoints(Value):
         return self.points_m[np.isfinite(self.points_m).all(axis=1)]
 
     def to_open3d(self) -> Any:
-        """Return the points that have depth as an `open3d.geometry.PointCloud`."""
+        """Return the points that have depth as an `open3d.geometry.PointCloud`.
+
+        Raises:
+            LibraryError: Open3D is not installed, or does not load.
+        """
         return conversions.points_to_open3d(self.to_numpy())
 
     def to_trimesh(self) -> Any:
@@ -166,7 +170,11 @@ class Planes(Value):
         return {"coefficients": self.coefficients, "points_m": self.samples_m[finite], "plane": np.nonzero(finite)[0].astype(np.int32)}
 
     def to_open3d(self) -> Any:
-        """Return `points_m` of `to_numpy` as an `open3d.geometry.PointCloud`, a colour for each plane."""
+        """Return `points_m` of `to_numpy` as an `open3d.geometry.PointCloud`, a colour for each plane.
+
+        Raises:
+            LibraryError: Open3D is not installed, or does not load.
+        """
         arrays = self.to_numpy()
         return conversions.points_to_open3d(arrays["points_m"], conversions.color_of_rows(arrays["plane"]))
 
@@ -194,8 +202,20 @@ class ManhattanFrame(Value):
 
     @staticmethod
     def single(seen: Value, R: F64, covariance: F64, inliers: I32, spread: F64, supported: bool, gap: float = float("nan")) -> ManhattanFrame:
-        """Return one Manhattan frame with the id 0, of the time of the value that it was seen in: rotation and covariance (3, 3), inliers and spread
-        (3,)."""
+        """Return one Manhattan frame with the id 0.
+
+        Args:
+            seen: the value that it was seen in, which gives number and time.
+            R: (3, 3) `R_camera_manhattan`.
+            covariance: (3, 3), rad².
+            inliers: (3,) per axis.
+            spread: (3,) per axis, rad; NaN = not seen.
+            supported: False where the scene shows no Manhattan frame.
+            gap: relative distance to a certified optimum; NaN without a certificate.
+
+        Returns:
+            The value, with one row in each array.
+        """
         ids = np.zeros(1, np.int32)
         return ManhattanFrame(seen.index, seen.stamp_ns, R[None], ids, covariance[None], inliers[None], spread[None], supported, gap)
 
@@ -364,7 +384,14 @@ class DepthNoise:
         return float(self.a_m), float(self.b), float(self.c_per_m), float(self.floor_m)
 
     def sigma_m(self, depth_m: Any) -> Any:
-        """Standard deviation in metres for depth(s) in metres; same shape."""
+        """Return the standard deviation of depths.
+
+        Args:
+            depth_m: a number or an array of any shape, m.
+
+        Returns:
+            The standard deviations, m, of the same shape.
+        """
         return np.maximum(self.floor_m, self.a_m + self.b * depth_m + self.c_per_m * depth_m * depth_m)
 
 
@@ -395,12 +422,27 @@ class Camera:
         return np.array([self.fx, self.fy, self.cx, self.cy])
 
     def project(self, points_m: F64) -> F64:
-        """Project (n, 3) points in the camera frame to (n, 2) pixels; points behind the camera give NaN."""
+        """Project points in the camera frame to pixels.
+
+        Args:
+            points_m: (n, 3), camera frame, m.
+
+        Returns:
+            (n, 2) pixels (x, y); NaN for points that are not in front of the camera.
+        """
         z = np.where(points_m[..., 2] > 1e-6, points_m[..., 2], np.nan)
         return np.stack([self.fx * points_m[..., 0] / z + self.cx, self.fy * points_m[..., 1] / z + self.cy], axis=-1)
 
     def back_project(self, pixels: NDArray[Any], depth_m: NDArray[Any]) -> NDArray[Any]:
-        """Back-project (n, 2) pixels with (n,) depths to (n, 3) points in the camera frame."""
+        """Back-project pixels with depths to points in the camera frame.
+
+        Args:
+            pixels: (n, 2), (x, y).
+            depth_m: (n,) along the optical axis, m.
+
+        Returns:
+            (n, 3) points, camera frame, m.
+        """
         x = (pixels[..., 0] - self.cx) / self.fx * depth_m
         y = (pixels[..., 1] - self.cy) / self.fy * depth_m
         return np.stack([x, y, depth_m], axis=-1)
@@ -518,7 +560,11 @@ class Map(Value):
         }
 
     def to_open3d(self) -> Any:
-        """Return the points in use as an `open3d.geometry.PointCloud`, world frame."""
+        """Return the points in use as an `open3d.geometry.PointCloud`, world frame.
+
+        Raises:
+            LibraryError: Open3D is not installed, or does not load.
+        """
         return conversions.points_to_open3d(self.to_numpy()["points_m"])
 
     def to_trimesh(self) -> Any:
@@ -594,7 +640,11 @@ class Surface(Value):
         return {"vertices_m": self.vertices_m, "colors": self.colors, "triangles": self.triangles, "plane": self.instances}
 
     def to_open3d(self) -> Any:
-        """Return the mesh as an `open3d.geometry.TriangleMesh` with coloured vertices."""
+        """Return the mesh as an `open3d.geometry.TriangleMesh` with coloured vertices.
+
+        Raises:
+            LibraryError: Open3D is not installed, or does not load.
+        """
         return conversions.mesh_to_open3d(self.vertices_m, self.triangles, self.colors)
 
     def to_trimesh(self) -> Any:
@@ -603,7 +653,15 @@ class Surface(Value):
 
     @staticmethod
     def empty(index: int, stamp_ns: int) -> Surface:
-        """Make a mesh without triangles and planes."""
+        """Make a mesh without triangles and planes.
+
+        Args:
+            index: the number of the frame.
+            stamp_ns: its time, ns.
+
+        Returns:
+            The mesh, in which up is not known.
+        """
         none, no_number, no_color = np.empty((0, 3), np.float32), np.empty(0, np.int32), np.empty((0, 3), np.uint8)
         atlas, texels = np.empty((0, 0, 3), np.uint8), np.empty((0, 3, 2), np.float32)
         return Surface(
@@ -662,7 +720,17 @@ class Building(Value):
 
     @staticmethod
     def empty(index: int, stamp_ns: int, note: str, T_world_building: F64 | None = None) -> Building:
-        """Make a plan without any element, with the reason."""
+        """Make a plan without any element, with the reason.
+
+        Args:
+            index: the number of the frame.
+            stamp_ns: its time, ns.
+            note: the reason, a sentence.
+            T_world_building: (4, 4); the identity by default.
+
+        Returns:
+            The plan.
+        """
         T = np.eye(4) if T_world_building is None else T_world_building
         number, none, rows = np.empty(0, np.int32), np.empty(0), np.empty((0, 2))
         return Building(

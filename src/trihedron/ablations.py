@@ -47,7 +47,23 @@ def ablate(
         budget: of a single recording, the error budget too.
         options: swaps by name; two underscores stand for a dot, as `planes__angle_deg=3`.
 
-    Raises TrihedronError, one line."""
+    Returns:
+        Verdicts, tables and run folders of all alternatives, with the recorded configuration, computed anew, as the first.
+
+    Raises:
+        UsageError: nothing is swapped, `feedback` is none of the two, or a budget of several recordings is asked for.
+        ConfigError: a plugin or option of a swap is unknown, or out of range.
+        RecordingError: a recording cannot be read.
+
+    Examples:
+        >>> import trihedron as th
+        >>> run = th.run("dataset.length=6", "dataset.width=160", "dataset.height=120", out="runs/recorded", quiet=True)
+        >>> ablation = th.ablate(run, "manhattan=plane_svd", out="runs/ablation")
+        >>> list(ablation.folders)
+        ['as recorded', 'manhattan=plane_svd']
+        >>> ablation.verdicts[0].partition(":")[0]
+        'as recorded against manhattan=plane_svd'
+    """
     given = [recordings] if isinstance(recordings, (str, Path, Run)) else list(recordings)
     paths = [str(item.folder if isinstance(item, Run) else item) for item in given]
     words = [*paths, *words_of(swaps, options), f"out={out}", f"feedback={feedback}"]

@@ -108,7 +108,11 @@ class Opening:
 
 
 class Building:
-    """The plan of a building; `plan` is the value as it is recorded. Positions are in the building's frame (`plan.T_world_building`), metres."""
+    """The plan of a building; `plan` is the value as it is recorded. Positions are in the building's frame (`plan.T_world_building`), metres.
+
+    Args:
+        plan: as the topic `building` has it.
+    """
 
     def __init__(self, plan: types.Building) -> None:
         self.plan = plan
@@ -141,7 +145,17 @@ class Building:
         return tuple(self._opening(k) for k in range(len(self.plan.spans_m)))
 
     def room_of(self, pose: Any) -> Room | None:
-        """Return the room in which a camera is, or None: a `Pose`, `T_world_camera` (4, 4) or a point (3,) of the world. Raises TrihedronError."""
+        """Return the room in which a camera is.
+
+        Args:
+            pose: a `Pose`, `T_world_camera` (4, 4) or a point (3,) of the world, m.
+
+        Returns:
+            The first room whose outline and heights hold the point; None where none does.
+
+        Raises:
+            UsageError: `pose` is no place.
+        """
         import shapely
 
         x, y, z = self._point(pose, "room_of")[0]
@@ -154,8 +168,18 @@ class Building:
 
     def distance(self, a: Any, b: Any) -> Measurement:
         """Return the distance of two things, m: of two parallel walls between the faces that face each other, of a wall and a point at right angles
-        to its face, of two points in a straight line. A point is an `Opening` (its middle), a `Pose`, `T_world_camera` (4, 4) or (3,) of the world.
-        Raises TrihedronError for walls that are not parallel."""
+        to its face, of two points in a straight line.
+
+        Args:
+            a: a `Wall`, or a point: an `Opening` (its middle), a `Pose`, `T_world_camera` (4, 4) or (3,) of the world, m.
+            b: likewise.
+
+        Returns:
+            The distance and its standard deviation, m; that of a matrix or of (3,) is taken as exact.
+
+        Raises:
+            UsageError: two walls are not parallel, or something is no place.
+        """
         if isinstance(a, Wall) and isinstance(b, Wall):
             return _between(a, b)
         if isinstance(b, Wall):
@@ -171,7 +195,14 @@ class Building:
         return Measurement(length, float(np.sqrt(max(float(matmul(along, first + second, along)), 0.0))))
 
     def save(self, folder: str | Path) -> None:
-        """Write the files of `trihedron building`, model.ifc where ifcopenshell is installed. Raises TrihedronError."""
+        """Write the files of `trihedron building`, model.ifc where ifcopenshell is installed.
+
+        Args:
+            folder: it is made where there is none.
+
+        Raises:
+            DataError: a file cannot be written.
+        """
         from trihedron.plugins.building.files import write_building
         from trihedron.plugins.building.ifc import IFC, has_ifc, write_ifc
 

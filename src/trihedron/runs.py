@@ -44,7 +44,7 @@ class Run:
         return self.recording.building
 
     def table(self) -> Any:
-        """Return the metrics, one row a figure: a pandas DataFrame where pandas is installed, else a list of dicts."""
+        """Return the metrics, one row a figure, as `figure` and `value`: a pandas DataFrame where pandas is installed, else a list of dicts."""
         rows = [{"figure": name, "value": value} for name, value in flatten_dict(self.metrics).items()]
         return as_table(rows)
 
@@ -58,7 +58,26 @@ def run(*overrides: str, out: str | Path | None = None, quiet: bool = False, **o
         quiet: print nothing but warnings.
         options: root keys and plugins by name; two underscores stand for a dot, as `dataset__path="..."`.
 
-    Raises TrihedronError, one line."""
+    Returns:
+        The finished run: its folder and its metrics, and through them its recording.
+
+    Raises:
+        UsageError: a word is no override, is of a sweep, or holds a value that no option takes.
+        ConfigError: a key, plugin or option is unknown, an option out of range, or the folder cannot be written.
+        PluginError: an installed package of plugins does not load.
+        GraphError: the wires of the graph do not fit together.
+        DataError: the data set cannot be read, or another run writes to the folder.
+        RecordingError: the recording to replay cannot be read, or lacks what the stages need.
+        StageError: a stage failed.
+
+    Examples:
+        >>> import trihedron as th
+        >>> run = th.run("dataset.length=6", "dataset.width=160", dataset__height=120, manhattan="mean_shift", out="runs/mine", quiet=True)
+        >>> run.metrics["status"]
+        {'ok': 6, 'degraded': 0, 'lost': 0}
+        >>> run.recording.frames
+        (0, 1, 2, 3, 4, 5)
+    """
     words = words_of(overrides, options)
     if flag := next((word for word in words if word in RUN_FLAGS), None):
         raise UsageError(flag, "is a sweep, which is no single run", "start it with: trihedron run -m ...")
@@ -72,7 +91,27 @@ def run(*overrides: str, out: str | Path | None = None, quiet: bool = False, **o
 def compare(folders: Iterable[str | Path | Run] | str | Path, baseline: str = "") -> Any:
     """Compare runs, or the jobs of sweeps: a row for each data set and change, with the median of each figure over its runs.
 
-    Returns a pandas DataFrame where pandas is installed, else a list of dicts. Raises TrihedronError where a folder holds no runs."""
+    Args:
+        folders: run folders, folders of sweeps, or runs; runs that differ in their seeds alone share a row.
+        baseline: the `change` of the row from which the others' differences are taken, paired by data set and seeds; none without it.
+
+    Returns:
+        A pandas DataFrame where pandas is installed, else a list of dicts: `data`, `change`, `runs`, the figures, their mean differences from the
+            baseline as `Δ figure`, and `note`.
+
+    Raises:
+        DataError: a folder holds no runs.
+        UsageError: no row is the baseline.
+
+    Examples:
+        >>> import trihedron as th
+        >>> words = ["dataset.length=3", "dataset.width=160", "dataset.height=120", "outputs=[planes]"]
+        >>> runs = [th.run(*words, planes=name, out=f"runs/{name}", quiet=True) for name in ("ransac", "cape")]
+        >>> table = th.compare(runs)
+        >>> rows = table if isinstance(table, list) else table.to_dict("records")
+        >>> [row["change"] for row in rows]
+        ['planes=ransac', 'planes=cape']
+    """
     given: Sequence[Any] = [folders] if isinstance(folders, (str, Path, Run)) else list(folders)
     paths = [item.folder if isinstance(item, Run) else Path(item).expanduser() for item in given]
     rows = rows_of([found for path in paths for found in read_runs(path)], baseline)

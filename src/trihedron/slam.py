@@ -51,22 +51,39 @@ WARM_UP_PX = 640  # the largest width of the images of the warm-up
 class Slam:
     """Track a camera frame by frame.
 
-    ```python
-    slam = trihedron.Slam(trihedron.Camera.from_yaml("camera.yaml"), manhattan="mean_shift", outputs=["surface"])
-    for rgb, depth, t in my_camera:
-        pose = slam.track(rgb, depth, t)
-    slam.save("run.mcap")
-    ```
+    Frames are pushed from one thread. Used as a context manager it is closed at the end of the block. Constructing compiles what is not compiled yet,
+    and a message names it. While it is open, OpenCV and BLAS use one thread in this process.
 
     Args:
         camera: intrinsics of both images, which are registered; a camera file's distortion and unit of depth are applied.
         overrides: words of the command line, as "manhattan.cone_deg=8" or "graph=points".
         out: a folder to which the recording is streamed, and in which `close` writes trajectory, times and surface, as `out=` of the command line.
-        history: number of frames whose images and values `save` writes where there is no `out`.
+        history: number of frames whose images and values `save` writes where there is no `out`; at least 1.
         options: root keys and plugins by name, as `manhattan="mean_shift"`, `threads=2`, `outputs=["surface"]`.
 
-    Frames are pushed from one thread. Used as a context manager it is closed at the end of the block. Constructing compiles what is not compiled yet,
-    and a message names it. While it is open, OpenCV and BLAS use one thread in this process. Raises TrihedronError: one line, place, cause and cure.
+    Raises:
+        DataError: `camera` is none, or another run writes to the folder `out`.
+        UsageError: a word is no override, or makes no sense for pushed frames, as that of a data set.
+        ConfigError: a key, plugin or option is unknown, an option out of range, or the folder cannot be written.
+        PluginError: an installed package of plugins does not load.
+        GraphError: the wires of the graph do not fit together.
+
+    Examples:
+        The images of a synthetic room stand for those of a camera.
+
+        >>> import trihedron as th
+        >>> room = th.dataset.synthetic(length=6, width=160, height=120)
+        >>> with th.Slam(room(0).camera, manhattan="mean_shift", outputs=["trajectory", "surface"]) as slam:
+        ...     for number in range(6):
+        ...         frame = room(number)
+        ...         pose = slam.track(frame.color, frame.depth_m, frame.stamp_ns / 1e9)
+        ...     slam.save("run.mcap")
+        >>> pose.status
+        'ok'
+        >>> len(slam.trajectory), len(slam.mesh().triangles) > 100
+        (6, True)
+        >>> th.Recording("run.mcap").frames
+        (0, 1, 2, 3, 4, 5)
     """
 
     def __init__(self, camera: types.Camera | Calibration, *overrides: str, out: str | Path | None = None, history: int = 10, **options: Any) -> None:
@@ -132,7 +149,25 @@ class Slam:
             depth: (h, w) float metres or uint16 divided by the camera's `depth_scale`, 0 where there is none; copied.
             t: seconds, later than that of the frame before.
 
-        Raises TrihedronError for an argument that does not fit, naming it, and for a stage that failed."""
+        Returns:
+            The `Pose`: `T_world_camera` (4, 4), where the world is the frame of the first camera, with covariance and status.
+
+        Raises:
+            DataError: an argument does not fit; it names it.
+            UsageError: the object is closed.
+            StageError: a stage failed, at this frame or one before.
+
+        Examples:
+            >>> import trihedron as th
+            >>> room = th.dataset.synthetic(length=2, width=160, height=120)
+            >>> with th.Slam(room(0).camera) as slam:
+            ...     poses = [slam.track(room(k).color, room(k).depth_m, room(k).stamp_ns / 1e9) for k in range(2)]
+            ...     coefficients = slam.values["planes"].coefficients
+            >>> poses[1].T_world_camera.shape, poses[1].covariance.shape, coefficients.shape[1]
+            ((4, 4), (6, 6), 4)
+            >>> float(abs(poses[0].T_world_camera[:3, 3]).max())  # the world begins at the first camera
+            0.0
+        """
         self._check_open()
         stamp_ns = stamp_of(t, self._last_ns)
         frame = self._frames(self._last + 1, stamp_ns, rgb, depth)
@@ -167,13 +202,20 @@ class Slam:
         return Trajectory.of(results.causal_trajectory(self._runner.result))
 
     def mesh(self) -> Surface:
-        """Return the surface so far. Raises TrihedronError unless `surface` is among the outputs."""
+        """Return the surface so far, in the world frame.
+
+        Raises:
+            ConfigError: `surface` is not among the outputs.
+        """
         surface: Surface = self._fold("surface")
         return surface
 
     def building(self) -> Building:
-        """Return the plan of the building so far: before `close`, of some of the keyframes only. Raises TrihedronError unless `building` is among the
-        outputs."""
+        """Return the plan of the building so far: before `close`, of some of the keyframes only.
+
+        Raises:
+            ConfigError: `building` is not among the outputs.
+        """
         return Building(self._fold("building", preview=True))
 
     def _fold(self, name: str, preview: bool = False) -> Any:
@@ -191,7 +233,15 @@ class Slam:
 
     def save(self, path: str | Path) -> None:
         """Write a recording: all of it so far where frames are streamed to `out`; else all poses, the surface so far, and the images and values of
-        the last `history` frames. Raises TrihedronError where the file cannot be written."""
+        the last `history` frames.
+
+        Args:
+            path: the file, as "run.mcap", in a folder that exists; it is overwritten.
+
+        Raises:
+            RecordingError: the file cannot be written.
+            DataError: it cannot be written, where frames are streamed to `out`.
+        """
         self._settle()
         file = Path(path).expanduser()
         if self._out is not None and self._writer is not None:
@@ -205,12 +255,23 @@ class Slam:
             writer.close()
 
     def save_map(self, path: str | Path) -> None:
-        """Write the map, to localise or to go on in it with `load_map=`. Raises TrihedronError where there is none."""
+        """Write the map, to localise or to go on in it with `load_map=`.
+
+        Args:
+            path: the file, as "office.mcap", in a folder that exists; it is overwritten.
+
+        Raises:
+            RecordingError: there is no map, or the file cannot be written.
+        """
         self._settle()
         save_map(Path(path).expanduser(), self._runner.state, metadata_of(self._config, self._words), source_of(self._config))
 
     def close(self) -> None:
-        """End the run: finish the surface, and write the files of `out`. Raises TrihedronError for what failed. Closing twice does nothing."""
+        """End the run: finish the surface, and write the files of `out`. Closing twice does nothing.
+
+        Raises:
+            TrihedronError: a stage failed, or the recording could not be written.
+        """
         if self._closed:
             return
         self._closed = True
@@ -327,7 +388,15 @@ class Values(Mapping[str, Any]):
         return topic in self._stages
 
     def get(self, topic: str, default: Any = None) -> Any:
-        """Return the value of a topic, or the default for one that no stage writes."""
+        """Return the value of a topic, or the default for one that no stage writes.
+
+        Args:
+            topic: the name of a stage of the graph.
+            default: returned where the graph has no such stage.
+
+        Returns:
+            The value at the last frame, once its stage is done; None where that wrote nothing.
+        """
         return self._read(topic) if topic in self._stages else default
 
     def __iter__(self) -> Iterator[str]:

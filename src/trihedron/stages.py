@@ -25,7 +25,10 @@ COLOUR = {"keypoints", "lines"}  # slots whose plugins look at colour
 
 
 class Slot:
-    """The plugins of one slot as attributes: `trihedron.planes.ransac(angle_deg=3)` makes a stage."""
+    """The plugins of one slot as attributes: `trihedron.planes.connected_components(angle_deg=3)` makes a stage.
+
+    `dir(trihedron.planes)` names them; one that does not exist raises PluginError.
+    """
 
     def __init__(self, name: str) -> None:
         load_plugins()
@@ -52,7 +55,17 @@ class StageFactory:
         self.__doc__ = kind.__doc__
 
     def __call__(self, **options: Any) -> Any:
-        """Make the stage. Raises TrihedronError for an option that is unknown or out of range."""
+        """Make the stage.
+
+        Args:
+            options: as `trihedron plugins SLOT PLUGIN` lists them; the others have their defaults.
+
+        Returns:
+            A `Stage`; of the slot `dataset` the data set, whose `dataset(0)` is its first frame.
+
+        Raises:
+            ConfigError: an option is unknown or out of range.
+        """
         place = f"{self._slot}.{self._name}"
         known = {option.name for option in options_of(self._kind)}
         for name in options:
@@ -73,8 +86,16 @@ class Stage:
     """A plugin with its options that is called on arrays, frames and values.
 
     `stage(depth, camera)`, `stage(rgb, depth, camera)` or `stage(frame)`, then any inputs of the slot: by their names, as `normals=normals`, or by
-    their types alone. What is missing and cannot be None is computed by the default plugin of its slot, which is printed once. Raises TrihedronError
-    naming the argument that does not fit."""
+    their types alone. What is missing and cannot be None is computed by the default plugin of its slot, which is printed once.
+
+    Examples:
+        >>> import trihedron as th
+        >>> frame = th.dataset.synthetic(length=1, width=160, height=120)(0)
+        >>> normals = th.normals.integral_image()(frame.depth_m, frame.camera)
+        >>> planes = th.planes.connected_components(angle_deg=3)(frame, normals=normals)
+        >>> len(planes.coefficients) > 0, planes.coefficients.shape[1]
+        (True, 4)
+    """
 
     def __init__(self, slot: str, name: str, plugin: Any) -> None:
         self.slot, self.name, self.plugin = slot, name, plugin
@@ -82,7 +103,19 @@ class Stage:
         self.__doc__ = type(plugin).__doc__
 
     def __call__(self, *arguments: Any, **inputs: Any) -> Any:
-        """Compute the slot's value, or None."""
+        """Compute the slot's value, or None.
+
+        Args:
+            arguments: images, a camera, a frame and values, recognised by shape and type: rgb (h, w, 3), depth (h, w).
+            inputs: the same by the names of the slot's inputs, and `rgb`, `depth`, `camera`.
+
+        Returns:
+            The value, with the largest number and time of the given values, 0 for images alone; None where the plugin has none to give.
+
+        Raises:
+            UsageError: an argument is missing, unknown, or of no type that the slot takes, or the slot gathers many frames.
+            DataError: an image has another shape or type than the camera's.
+        """
         if self.slot in FOLDS:
             cure = f'give Slam(..., {self.slot}="{self.name}", outputs=["{self.slot}"])'
             raise UsageError(f"{self.slot}.{self.name}", "gathers many frames", cure)
@@ -91,7 +124,12 @@ class Stage:
             return given.compute(self.slot, self.plugin)
 
     def say_default(self, slot: str, plugin: str) -> None:
-        """Print, once, that an input is computed by the default plugin."""
+        """Print, once, that an input is computed by the default plugin.
+
+        Args:
+            slot: of the input.
+            plugin: the name of its default.
+        """
         if slot not in self._printed:
             self._printed.add(slot)
             print(f"trihedron: {self.slot}.{self.name}: '{slot}' is not given; it is computed by {slot}.{plugin}, the default", file=sys.stderr)

@@ -12,6 +12,7 @@ import html5lib
 import numpy as np
 import pytest
 
+from trihedron.comparison.ablation import options_of
 from trihedron.comparison.ablation_tables import (
     Case,
     Variant,
@@ -281,6 +282,13 @@ def test_errors_of_a_stage_alone():
     assert figures["translation mm"] == pytest.approx(3.0) and figures["values %"] == 75.0
     assert np.isnan(of_frames["translation mm"][0]) and of_frames["translation mm"][1:] == pytest.approx([3.0] * 3)
     assert np.isnan(figures["axes deg"]) and distance(translation(0, 0.0), None) is None
+
+
+def test_a_run_folder_of_an_ablation_is_a_recording(tmp_path):
+    folder = tmp_path / "manhattan=plane_svd"
+    folder.mkdir()
+    options = options_of([str(folder), "manhattan=mixture", f"out={tmp_path / 'o'}"])
+    assert options.recordings == (folder / "run.mcap",) and options.swaps == ("manhattan=mixture",)
 
 
 @pytest.mark.parametrize(

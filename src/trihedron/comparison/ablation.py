@@ -68,8 +68,9 @@ class Work:
 
 
 def options_of(words: Sequence[str], budget: bool = False) -> Options:
-    """Sort words into recordings, swaps and settings. Raises UsageError."""
-    recordings = [word for word in words if "=" not in word or Path(word).is_file()]
+    """Sort words into recordings, swaps and settings. A run folder whose name has an equals sign, as those of an ablation have, is one with its path:
+    `runs/axes/manhattan=mixture`, `./manhattan=mixture`. Raises UsageError."""
+    recordings = [word for word in words if "=" not in word or Path(word).is_file() or ("/" in word and Path(word).is_dir())]
     rest = [word for word in words if word not in recordings]
     settings = {key: value for key, _, value in (word.partition("=") for word in rest) if key in SETTINGS}
     swaps = tuple(word for word in rest if word.partition("=")[0] not in SETTINGS)
