@@ -21,6 +21,8 @@ from trihedron.pipeline.core.lie import log_se3
 from trihedron.pipeline.core.types import LOST, OK
 from trihedron.pipeline.record.reader import Recording
 from trihedron.pipeline.run.consistency import pose_consistency
+from trihedron.tools.benchmarks.fault_benchmark import words_of
+from trihedron.tools.benchmarks.sensor_benchmark import run_and_judge
 
 SMALL = {"width": 320, "height": 240}
 HONEST = 24.0  # median normalised error of the frames that are ok: their errors are within twice what they say (6 is exact)
@@ -189,6 +191,20 @@ def test_a_camera_at_rest_stays_where_it_is_and_its_map_as_large_as_it_was(tmp_p
     print(f"drift {drift_mm:.2f} mm, keyframes {len(maps[-1].keyframes)}, {np.count_nonzero(maps[-1].points.column('alive'))} points")
     assert {pose.status for pose in poses} == {OK} and drift_mm < 1.0
     assert len(maps[-1].keyframes) <= 2 and maps[-1].index < 30
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("case", ["two_recordings", "wrong_scale_for_a_second", "wrong_focal_length", "mirrored_color"])
+def test_no_frame_is_ok_and_wrong_where_images_contradict_each_other(tmp_path, case):
+    """A cut to another room, depth and colour that do not belong together: what contradicts is not ok, what was right before stays so."""
+    small = [f"+dataset.options.{name}={value}" for name, value in SMALL.items()]
+    check, errors = run_and_judge(tmp_path / "run", words_of(case, small))
+    assert check.wrong_ok == 0
+    expected_ok = {"two_recordings": 45, "wrong_scale_for_a_second": 50, "wrong_focal_length": 10, "mirrored_color": 3}
+    assert check.ok >= expected_ok[case] and errors.error_m[errors.ok].max() < 0.05
+    if case == "two_recordings":
+        poses = list(Recording(tmp_path / "run" / "run.mcap").values("pose"))
+        assert [pose.status for pose in poses[45:50]] == ["lost"] * 5 and poses[50].submap == 1
 
 
 def test_the_room_is_the_same_without_faults():

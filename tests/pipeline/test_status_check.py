@@ -82,3 +82,19 @@ def test_a_run_without_poses_has_no_figures() -> None:
     poses, truth = run_of(20)
     check, _ = check_status([replace(pose, status=LOST, reason="covered") for pose in poses], truth)
     assert (check.lost, check.ate_m, check.nees_median, check.sigma_auc, check.steps_within_50mm) == (20, None, None, None, None)
+
+
+def test_a_world_is_aligned_by_the_frames_that_are_ok() -> None:
+    """Frames that claim nothing do not move the alignment: 100 degraded ones are 1 m off, the others as good as they say."""
+    poses, truth = run_of()
+    for i in range(300, 400):
+        poses[i] = replace(poses[i], status="degraded", T_world_camera=poses[i].T_world_camera @ exp_se3(np.array([1.0, 0, 0, 0, 0, 0])))
+    check, errors = check_status(poses, truth)
+    assert check.wrong_ok == 0 and errors.error_m[errors.ok].max() < 0.05 < errors.error_m[~errors.ok].min()
+
+
+def test_the_pose_that_defines_the_world_is_never_wrong() -> None:
+    poses, truth = run_of()
+    poses[0] = replace(poses[0], T_world_camera=poses[0].T_world_camera @ exp_se3(np.array([0.2, 0, 0, 0, 0, 0])), covariance=1e-12 * np.eye(6))
+    check, errors = check_status(poses, truth)
+    assert check.wrong_ok == 0 and errors.exact.tolist() == [True, *[False] * 399]

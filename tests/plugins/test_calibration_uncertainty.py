@@ -8,7 +8,7 @@ import pytest
 from trihedron.pipeline.core.geometry import invert
 from trihedron.pipeline.core.lie import adjoint, exp_se3, log_se3
 from trihedron.pipeline.core.types import CALIBRATION, Camera, Pose
-from trihedron.plugins.pose.calibration_uncertainty import carried_calibration
+from trihedron.plugins.pose.calibration_uncertainty import carried_calibration, contradicted_calibration
 from trihedron.plugins.shared.calibration_error import calibration_covariance, calibration_scales
 from trihedron.plugins.shared.calibration_error_kernels import (
     Keyframes,
@@ -157,3 +157,13 @@ def test_a_pose_that_was_not_refined_keeps_the_error_of_the_previous_one():
     assert pose.sensitivity[[0, 4], 3] == pytest.approx([0.02, 0.01])
     assert calibration_covariance(pose) == pytest.approx(pose.sensitivity @ pose.sensitivity.T)
     assert pose.sensitivity == pytest.approx(adjoint(invert(moved)) @ sensitivity)
+
+
+@pytest.mark.parametrize(("theta", "said"), [(1.0, ""), (4.0, ""), (40.0, "the focal length fy is off by 40 times what is usual")])
+def test_a_camera_that_is_not_the_stated_one_is_named(theta: float, said: str) -> None:
+    """Residuals that know a parameter to a tenth of what is usual; four times what is usual is within what cameras without a prior may have."""
+    information, score = np.zeros((CALIBRATION, CALIBRATION)), np.zeros(CALIBRATION)
+    information[1, 1], score[1] = 100.0, 100.0 * theta
+    stamps = 0, 0, np.eye(4), np.zeros((6, 6)), np.eye(4), -1, np.zeros(3, np.int32), 0, "ok", ""
+    pose = replace(Pose(*stamps), calibration_information=information, calibration_score=score)
+    assert contradicted_calibration(pose) == (said and f"the images contradict the camera's calibration: {said}")

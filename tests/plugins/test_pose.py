@@ -288,6 +288,28 @@ def test_a_place_whose_points_are_unknown_is_another_one():
     assert shown_elsewhere("lost", 400).status == "lost"  # continuing a lost frame says nothing about the place
 
 
+def test_a_few_key_points_in_common_by_chance_are_no_place():
+    """Two rooms have some four percent of their key points in common."""
+    world = World(2000)
+    with_depth = int(np.isfinite(world.features(camera_at(5), 5)[0].points_m[:, 2]).sum())
+    assert shown_elsewhere("ok", int(0.05 * with_depth)).status == "lost" and shown_elsewhere("ok", int(0.08 * with_depth)).status != "lost"
+
+
+def test_a_sub_map_that_does_not_show_the_frame_is_left():
+    """Tied to nothing: a frame that is recognised elsewhere must not merge it there."""
+    world, map = World(), first_map(World())
+    of_submap = dataclasses.replace(map, keyframes=map.keyframes.updated(np.zeros(1, np.int32), submap=np.ones(1, np.int32)))
+    features = world.features(camera_at(5), 5)
+    far = camera_at(5) @ exp_se3(np.array([0.3, 0.0, 0.0, 0.0, 0.0, 0.0]))
+    rotation, translation = rotation_of(camera_at(5), 5, 0.5), translation_of(camera_at(5), 5, sigma_m=0.03)
+    matches = LocalMap()(world.frame(5).camera, rotation, translation, *features, of_submap, None)
+    shuffled = dataclasses.replace(matches, keypoints=np.stack([matches.keypoints[:, 0], np.roll(matches.keypoints[:, 1], 7)], axis=1))
+    previous = dataclasses.replace(pose_of(camera_at(4), 4), submap=1, reference=0)
+    pose = Refine()(world.frame(5).camera, rotation, translation_of(far, 5, sigma_m=0.03), None, shuffled, *features, previous, of_submap, None)
+    assert pose.status == "lost" and pose.submap == 1
+    assert pose.reason.startswith("sub-map 1 does not show what the frame does: only ")
+
+
 def test_images_that_repeat_twice_are_degraded():
     """The first repetition is one of a Kinect, the second is not; whatever differs ends it."""
     world, map = World(), first_map(World())
