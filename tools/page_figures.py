@@ -25,7 +25,7 @@ MOST_CURVES = 12  # of a figure
 MOST_LABELLED = 4  # runs whose bars have numbers
 STATUS_LOOK = {OK: ("#009e73", "ok"), DEGRADED: ("#e69f00", "degraded"), LOST: ("#000000", "lost")}
 MOST_POINTS = 500  # of a curve or path
-MOST_TRIANGLES = 10_000
+MOST_VERTICES = 65_536  # of a mesh: the view numbers them by 16 bits
 LARGEST = 32767
 LIGHT = np.array([0.3, 0.5, 0.8])  # its direction on the model of a building
 PICTURE_WIDTH, QUALITY = 900, 65
@@ -41,12 +41,13 @@ class Figure:
 
 @dataclass(frozen=True)
 class CameraPath:
-    """Positions (n, 3) of a camera in metres, z up, with their name and look."""
+    """Positions (n, 3) of a camera in metres, z up, with their name and look; in 3D dots of some size, 0 for a line alone."""
 
     name: str
-    positions_m: F64
     color: str
-    dashes: str = ""
+    dashes: str
+    positions_m: F64
+    dot_px: int
 
 
 @dataclass(frozen=True)
@@ -139,13 +140,13 @@ def status_figure(statuses: Sequence[str], seconds: Sequence[float]) -> Figure:
     )
 
 
-def surface_mesh(surface: Surface) -> Mesh | None:
-    """Return a surface, simplified to what a page can carry; None for an empty one."""
+def surface_mesh(surface: Surface, most: int) -> Mesh | None:
+    """Return a surface, simplified to some number of triangles at most; None for an empty one."""
     vertices, colors, triangles = surface.vertices_m @ upright(surface.up).T, surface.colors, surface.triangles.astype(np.int64)
     if not len(triangles):
         return None
     cell = float(np.linalg.norm(vertices.max(axis=0) - vertices.min(axis=0))) / 1000
-    while len(triangles) > MOST_TRIANGLES:
+    while len(triangles) > most or len(vertices) > MOST_VERTICES:
         vertices, colors, triangles = _cluster_vertices(vertices, colors, triangles, cell)
         cell *= 1.25
     return Mesh("surface", vertices, np.column_stack([colors, np.full(len(colors), 255, np.uint8)]), triangles)
@@ -173,7 +174,7 @@ def scene(paths: Sequence[CameraPath], meshes: Sequence[Mesh]) -> dict[str, Any]
         return encode(np.clip(np.rint((xyz - middle) / size * LARGEST), -LARGEST, LARGEST).astype("<i2"))
 
     return {
-        "paths": [{"name": one.name, "points": pack(_thin_points(one.positions_m)), "color": one.color, "dashes": one.dashes} for one in paths],
+        "paths": [{**vars(one), "positions_m": pack(_thin_points(one.positions_m))} for one in paths],
         "meshes": [
             {
                 "name": one.name,

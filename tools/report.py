@@ -23,6 +23,7 @@ from trihedron.tools.pages import render
 from trihedron.tools.run_pages import CONFIGURATION, MOST_PICTURES, RECORDING, TRAJECTORY, RunFacts, drawings_of, facts_of, frame_picture
 
 TITLE_NAMES = 6
+MOST_TRIANGLES = 40_000  # of the page's one surface
 
 
 def main(argv: list[str]) -> int:
@@ -48,16 +49,11 @@ def page(runs: Sequence[Run], title: str | None = None) -> str:
     return render(
         "report.html",
         title=title or title_of(facts),
-        origins={
-            "title": "Origins",
-            "note": "",
-            "header": ("run", "data set", "date", "command"),
-            "rows": [_origin(*item) for item in facts.items()],
-        },
-        results={"title": "Results", "note": "± is half the distance from the smallest to the largest.", "header": header, "rows": cells},
+        origins=_table("Origins", "The commands as they were given.", ["run", "data set", "date", "command"], [*map(_origin, facts, facts.values())]),
+        results=_table("Results", "± is half the distance from the smallest to the largest.", header, cells),
         configurations=_configurations(facts),
         frames=[_frame(name, run.folder) for name, run in list(named.items())[:MOST_PICTURES]],
-        **drawings_of({name: run.folder for name, run in named.items()}),
+        **drawings_of({name: run.folder for name, run in named.items()}, MOST_TRIANGLES),
     )
 
 
@@ -85,7 +81,12 @@ def _configurations(runs: Mapping[str, RunFacts]) -> dict[str, Any]:
     flat = [flatten_dict(facts.config) for facts in runs.values()]
     keys = sorted({key for values in flat for key in values} - {"out"})
     rows = [[key, *(str(values.get(key, "-")) for values in flat)] for key in keys if len({repr(values.get(key)) for values in flat}) > 1]
-    return {"title": "Configurations", "note": "Options that differ; - where a plugin has no such option.", "header": ["option", *runs], "rows": rows}
+    return _table("Configurations", "Options that differ; - where a plugin has no such option.", ["option", *runs], rows)
+
+
+def _table(title: str, note: str, header: Sequence[str], rows: Sequence[Sequence[Any]]) -> dict[str, Any]:
+    """Return a table as `plain_table` of the templates takes it."""
+    return {"title": title, "note": note, "header": header, "rows": rows}
 
 
 def _frame(name: str, folder: Path) -> dict[str, Any]:

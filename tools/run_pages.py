@@ -1,4 +1,4 @@
-"""What the pages show of runs, from the files of their folders: facts, figures, plans and pictures; and the page of one run."""
+"""Facts, figures, plans and pictures of runs, from the files of their folders, and the page of one run."""
 
 from __future__ import annotations
 
@@ -45,6 +45,7 @@ from trihedron.tools.pages import render
 
 V = TypeVar("V", bound=Value)
 TRUTH_LOOK = ("ground truth", TRUTH, DASHES[1])
+MOST_TRIANGLES = 10_000  # of a surface; there is a page for each run
 MOST_PICTURES = 12  # a page of a large sweep would be too big to open
 RECORDING, TRAJECTORY, SURFACE = "run.mcap", "trajectory.txt", "surface.ply"
 CONFIGURATION = Path(".hydra") / "config.yaml"
@@ -150,19 +151,19 @@ def results_of(folder: Path) -> Results:
         return Results(estimate)
 
 
-def drawings_of(folders: Mapping[str, Path]) -> dict[str, Any]:
+def drawings_of(folders: Mapping[str, Path], triangles: int = MOST_TRIANGLES) -> dict[str, Any]:
     """Return what a page draws of runs, by the names they have there: the 3D `view`, None without a trajectory, `figures`, their `looks` and the
-    `plans` of buildings. Paths are in the world of the first run, the ground truth is that of the first that has one."""
+    `plans` of buildings. A path is in the world of its run, the ground truth in that of the first run that has one."""
     runs = {name: results_of(folder) for name, folder in folders.items()}
     surface = next((found for run in runs.values() for found in run.values("surface", Surface)), None)
     buildings = {name: found for name, run in runs.items() for found in run.values("building", Building)}
     R_view_world = upright(surface.up if surface is not None else np.full(3, np.nan))
     looks = [(name, *look_of(number)) for number, name in enumerate(runs)]
-    places = [(look, run.estimate.poses[:, :3, 3]) for look, run in zip(looks, runs.values()) if run.estimate is not None]
-    truth = [(TRUTH_LOOK, found) for run in runs.values() if (found := run.true_positions_m) is not None]
-    paths = [CameraPath(name, found @ R_view_world.T, color, dashes) for (name, color, dashes), found in (*places, *truth[:1])]
+    places = [(looks[k], run.estimate.poses[:, :3, 3], max(5 - k, 2)) for k, run in enumerate(runs.values()) if run.estimate is not None]
+    truth = [(TRUTH_LOOK, found, 0) for run in runs.values() if (found := run.true_positions_m) is not None]
+    paths = [CameraPath(*look, found @ R_view_world.T, dot_px) for look, found, dot_px in (*places, *truth[:1])]  # a later one on those before
     model = [model_mesh(drawing_of(building).solids, R_view_world, surface is None) for building in list(buildings.values())[:1]]
-    meshes = [mesh for mesh in (surface_mesh(surface) if surface is not None else None, *model) if mesh is not None]
+    meshes = [mesh for mesh in (surface_mesh(surface, triangles) if surface is not None else None, *model) if mesh is not None]
     curves = [run.errors_mm for run in runs.values()]
     figures = [path_figure(paths) if paths else None]
     figures.append(curves_figure("Position error", "mm", curves) if any(len(seconds) for seconds, _ in curves) else None)
@@ -172,7 +173,7 @@ def drawings_of(folders: Mapping[str, Path]) -> dict[str, Any]:
     return {
         "view": scene(paths, meshes) if paths else None,
         "figures": [figure for figure in figures if figure is not None],
-        "looks": [*looks, *(look for look, _ in truth[:1])],
+        "looks": [*looks, *([TRUTH_LOOK] if truth else [])],
         "plans": [_plan(name, building) for name, building in list(buildings.items())[:MOST_PICTURES]],
     }
 

@@ -29,7 +29,7 @@ def page(tmp_path_factory):
 def test_a_page_is_valid_and_needs_no_network(page):
     text = page.read_text()
     html5lib.HTMLParser(strict=True).parse(text)
-    assert not re.findall(r"""(?:src|href)\s*=\s*["']?(?:https?:)?//|@import|url\(""", text) and len(text) < 300_000
+    assert not re.findall(r"""(?:src|href)\s*=\s*["']?(?:https?:)?//|@import|url\(""", text) and len(text) < 1_000_000
     assert len(re.findall("<img[^>]*data:image/jpeg;base64,", text)) == 2 and text.count("<figure><svg") == 3
     assert '<th scope="row">dataset.seed</th><td>0</td><td>1</td>' in text
     scene = json.loads(re.findall(r'id="scene">(.*?)</script>', text)[0])

@@ -18,12 +18,13 @@
       p: buffer(gl.ARRAY_BUFFER, vertices), c: buffer(gl.ARRAY_BUFFER, new Uint8Array(bytes(mesh.colors))) });
   });
   scene.paths.forEach((path, k) => {
-    const points = new Int16Array(bytes(path.points)), count = points.length / 3, color = [1, 3, 5].map((i) => parseInt(path.color.slice(i, i + 2), 16));
+    const points = new Int16Array(bytes(path.positions_m)), count = points.length / 3, color = [1, 3, 5].map((i) => parseInt(path.color.slice(i, i + 2), 16));
     const colors = Uint8Array.from({ length: 4 * count }, (_, i) => [...color, 255][i % 4]);
     const one = { box: boxes[scene.meshes.length + k], count, p: buffer(gl.ARRAY_BUFFER, points), c: buffer(gl.ARRAY_BUFFER, colors) };
-    drawn.push({ ...one, mode: path.dashes ? gl.LINES : gl.LINE_STRIP }, { ...one, mode: gl.POINTS, size: path.dashes ? 2 : 5 });
+    drawn.push({ ...one, mode: path.dashes ? gl.LINES : gl.LINE_STRIP });
+    if (path.dot_px) drawn.push({ ...one, mode: gl.POINTS, size: path.dot_px });
   });
-  const start = { yaw: 0.5, pitch: 0.5, distance: 1.7 };
+  const start = { yaw: 0.5, pitch: 0.5, distance: 1.45 };
   let eye = { ...start };
   const multiply = (a, b) => { const o = new Float32Array(16); for (let c = 0; c < 4; c++) for (let r = 0; r < 4; r++) for (let k = 0; k < 4; k++) o[4 * c + r] += a[4 * k + r] * b[4 * c + k]; return o; };
   function matrix() {
