@@ -26,7 +26,7 @@ from trihedron.pipeline.record.trajectories import attached_truth, read_trajecto
 from trihedron.pipeline.run.metrics import associate
 from trihedron.tools import published
 from trihedron.tools.arguments import Parser
-from trihedron.tools.site_runs import RunFacts, facts_of, read_json
+from trihedron.tools.run_pages import RunFacts, facts_of, read_json
 
 Known = Sequence[tuple[RunFacts, dict[str, Any]]]  # the first run of a cell, and its row
 STAGE_GROUPS = {  # column of Table II -> our stages

@@ -24,9 +24,9 @@ from trihedron.pipeline.core.errors import DataError
 from trihedron.pipeline.core.files import MAX_YAML_BYTES, YamlError, parse_yaml, read_text
 from trihedron.tools import published
 from trihedron.tools.arguments import Parser
+from trihedron.tools.pages import render
+from trihedron.tools.run_pages import RunFacts, facts_of, run_page
 from trihedron.tools.site_ablations import Ablation, ablation_page, ablations_of
-from trihedron.tools.site_pages import render
-from trihedron.tools.site_runs import RunFacts, facts_of, run_page
 
 COLUMNS = [TRACKED, COMPARED, "RPE 1 s mm", "RPE 1 s deg", "end to start mm", "surface mm", "p50 ms"]
 TOLERANCE = 0.1  # of the published figure, which has no spread of its own

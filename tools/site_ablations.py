@@ -21,9 +21,8 @@ from trihedron.pipeline.core.config import Feedback
 from trihedron.pipeline.core.errors import DataError
 from trihedron.pipeline.run.result_files import read_results
 from trihedron.pipeline.sweep.paired_statistics import half_interval
-from trihedron.tools.site_figures import MOST_CURVES, Figure, curve_look, curves_figure
-from trihedron.tools.site_pages import render
-from trihedron.tools.site_pictures import embed_picture
+from trihedron.tools.page_figures import MOST_CURVES, Figure, curves_figure, embed_picture, look_of
+from trihedron.tools.pages import render
 
 SHOWN = ("ATE mm", "RPE 1 frame mm", "RPE 1 s mm", "axes deg", "rotation deg", "translation mm", "ms")
 MARGIN = 4.0  # of a chart, per cent of its width, on both sides
@@ -162,8 +161,9 @@ def error_figures(cases: Sequence[Case]) -> dict[str, Any]:
     figures: list[Figure] = []
     for name in names:
         curves = [variant.errors.get(name, np.full(case.frames, np.nan)) for variant in shown]
-        figures.append(curves_figure(name, curves, case.fps))
-    legend = [(variant.combination.label, *curve_look(k)) for k, variant in enumerate(shown)]
+        title, _, unit = name.rpartition(" ")
+        figures.append(curves_figure(title, unit, [(np.arange(len(values)) / case.fps, values) for values in curves]))
+    legend = [(variant.combination.label, *look_of(k)) for k, variant in enumerate(shown)]
     more = len(case.variants) - len(shown)
     return {"figures": figures, "legend": legend, "recording": case.recording, "more": more}
 

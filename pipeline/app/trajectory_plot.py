@@ -28,12 +28,10 @@ def trajectory_figure(estimate: Trajectory, truth: Trajectory | None, path: Path
 
     The estimate is aligned to the truth (SE(3)). `status` are (stamp_ns, ok | degraded | lost) of all frames; those that are not ok are marked.
     Truth that has fewer than 3 stamps in common is skipped. Raises DataError when the file cannot be written."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
     pairs = associate(estimate.stamps_ns, truth.stamps_ns) if truth is not None else np.empty((0, 2), np.int64)
     figure = Figure(figsize=(11, 8))
-    FigureCanvasAgg(figure)
     if truth is not None and len(pairs) >= FEWEST_POSES:
         _with_truth(figure, estimate, truth, pairs, status)
     else:

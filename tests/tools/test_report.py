@@ -1,17 +1,19 @@
 """The page of a run stands alone, and a browser draws it without a complaint."""
 
+import html
+import json
 import re
 import shutil
 import subprocess
 
 import cv2
+import html5lib
 import numpy as np
 import pytest
 
 from trihedron.pipeline.app.cli import main
 
-LEGEND_PX = 50  # at the top of a figure
-ROOM = ["dataset.width=160", "dataset.height=120", "dataset.length=8"]
+ROOM = ["dataset.width=160", "dataset.height=120", "dataset.length=20"]
 
 
 @pytest.fixture(scope="module")
@@ -24,49 +26,80 @@ def page(tmp_path_factory):
     return folder / "report.html"
 
 
-def test_a_page_needs_no_network(page):
+def test_a_page_is_valid_and_needs_no_network(page):
     text = page.read_text()
-    assert not re.search(r"<(script|link|img)[^>]*(src|href)=['\"]https?:", text)
-    assert len(re.findall("<img[^>]*data:image/png;base64,", text)) == 2 and text.count("Plotly.newPlot('figure") == 3
-    assert "<td>dataset.seed</td><td>0</td><td>1</td>" in text
+    html5lib.HTMLParser(strict=True).parse(text)
+    assert not re.findall(r"""(?:src|href)\s*=\s*["']?(?:https?:)?//|@import|url\(""", text) and len(text) < 1_000_000
+    assert len(re.findall("<img[^>]*data:image/jpeg;base64,", text)) == 2 and text.count("<figure><svg") == 3
+    assert '<th scope="row">dataset.seed</th><td>0</td><td>1</td>' in text
+    scene = json.loads(re.findall(r'id="scene">(.*?)</script>', text)[0])
+    assert [path["name"] for path in scene["paths"]] == ["0", "1", "ground truth"] and [mesh["name"] for mesh in scene["meshes"]] == ["surface"]
+
+
+def test_names_of_runs_are_escaped(page, tmp_path):
+    folder = tmp_path / "<script>alert(1)<" / "script>&"
+    shutil.copytree(page.parent / "1", folder)
+    assert main(["report", str(folder), "--out", str(tmp_path / "page.html")]) == 0
+    text = (tmp_path / "page.html").read_text()
+    html5lib.HTMLParser(strict=True).parse(text)
+    assert "<script>alert" not in text and "script>&<" not in text
+
+
+def test_the_building_of_a_run_is_drawn(tmp_path):
+    words = ["dataset.scene=flat", "dataset.fps=10", "dataset.width=160", "dataset.height=120", "dataset.length=8", "outputs=[trajectory,building]"]
+    assert main(["run", *words, f"out={tmp_path / 'flat'}"]) == 0
+    assert main(["report", str(tmp_path / "flat"), "--out", str(tmp_path / "page.html")]) == 0
+    text = (tmp_path / "page.html").read_text()
+    [mesh] = json.loads(re.findall(r'id="scene">(.*?)</script>', text)[0])["meshes"]
+    assert mesh["name"] == "building" and mesh["shown"] and len(mesh["vertices"]) > 100
+    assert "<figcaption>flat: building: 1 storey" in text and 'src="data:image/svg+xml;base64,' in text
 
 
 def test_a_page_names_data_set_runs_date_and_commands(page, tmp_path):
     text = page.read_text()
     assert "<title>synthetic: 0, 1</title>" in text and "<h1>synthetic: 0, 1</h1>" in text
     command = f"trihedron run {' '.join(ROOM)} dataset.seed=1 out={page.parent}/1"
-    assert re.search(rf"<td>1</td><td>synthetic</td><td>20\d\d-\d\d-\d\d \d\d:\d\d \w+</td><td>{re.escape(command)}</td>", text)
+    assert re.search(
+        rf'<th scope="row">1</th><td>synthetic</td><td>20\d\d-\d\d-\d\d \d\d:\d\d \w+</td><td class="note">{re.escape(command)}</td>', text
+    )
     assert main(["report", str(page.parent / "0"), "--title", "Room & more", "--out", str(tmp_path / "other.html")]) == 0
     assert "<h1>Room &amp; more</h1>" in (tmp_path / "other.html").read_text()
 
 
 PLACES = """<script>addEventListener("load", () => setTimeout(() => {
     const box = (plot) => Object.values(plot.getBoundingClientRect().toJSON()).slice(0, 4).join();
-    document.body.dataset.places = [...document.querySelectorAll(".js-plotly-plot")].map(box).join(";");
-}, 3000))</script>"""  # x, y, width and height of each figure
+    document.body.dataset.places = [...document.querySelectorAll("canvas, .pair svg")].map(box).join(";");
+    document.body.dataset.width = document.documentElement.scrollWidth;
+}, 1000))</script>"""  # x, y, width and height of each figure, and the width of the page
+
+FRAMED = """<script>addEventListener("load", () => setTimeout(() => {
+    document.body.dataset.width = document.querySelector("iframe").contentDocument.body.dataset.width;
+}, 2000))</script>"""
 
 
 @pytest.mark.slow
 def test_a_browser_draws_it(page):
-    """Without a complaint, and all figures are to be seen: both runs' colours below the legends, and the surface as an area."""
+    """Without a complaint, on a telephone too, and all figures are to be seen: both runs' colours, and the surface as an area."""
     browser = shutil.which("chromium") or shutil.which("google-chrome")
     if browser is None:
         pytest.skip("no chromium or google-chrome here; install it with: apt-get install chromium")
-    told, picture = page.with_name("told.html"), page.with_name("picture.png")
+    told, picture, frame = page.with_name("told.html"), page.with_name("picture.png"), page.with_name("frame.html")
     told.write_text(page.read_text().replace("</body>", PLACES + "</body>"))
+    frame.write_text(f'<iframe style="width: 400px" srcdoc="{html.escape(told.read_text())}"></iframe>' + FRAMED)
     options = ["--headless", "--no-sandbox", "--enable-unsafe-swiftshader", "--enable-logging=stderr", "--virtual-time-budget=8000"]
-    options += ["--window-size=1200,3000"]
+    options += ["--window-size=1200,3000", "--hide-scrollbars"]
     done = subprocess.run([browser, *options, "--dump-dom", told.as_uri()], capture_output=True, text=True, timeout=300)
-    assert len(re.findall(r'class="main-svg"', done.stdout)) >= 3 and "<canvas" in done.stdout
     assert not re.search(r"CONSOLE.*(Uncaught|Error)", done.stderr)
+    narrow = subprocess.run([browser, *options, "--dump-dom", frame.as_uri()], capture_output=True, text=True, timeout=300)
+    assert re.search('<body data-width="400"', narrow.stdout)  # nothing but its own regions scrolls sideways
     subprocess.run([browser, *options, f"--screenshot={picture}", page.as_uri()], capture_output=True, check=True, timeout=300)
     pixels = cv2.imread(str(picture))[..., ::-1].astype(int)
     places = [[round(float(number)) for number in place.split(",")] for place in re.search('data-places="([^"]*)"', done.stdout)[1].split(";")]
     seen = []
     for x, y, width, height in places:
-        drawn = pixels[y + LEGEND_PX : y + height, x : x + width]
-        runs = [int((np.abs(drawn - color).max(axis=-1) < 30).sum()) for color in ((31, 119, 180), (214, 39, 40))]
+        drawn = pixels[y : y + height, x : x + width]
+        runs = [int((np.abs(drawn - color).max(axis=-1) < 30).sum()) for color in ((213, 94, 0), (0, 158, 115))]
         seen.append((*runs, float((drawn.min(axis=-1) < 225).mean())))
     print(seen)
-    assert len(seen) == 3 and min(*seen[0][:2]) >= 3 and seen[0][2] > 0.04  # a path of a quarter of a second, and the wall behind
-    assert min(*seen[1][:2], *seen[2][:2]) > 300
+    assert len(seen) == 4 and min(*seen[0][:2]) >= 3 and seen[0][2] > 0.04  # a path of two thirds of a second, and the wall behind
+    assert min(*seen[1][:2]) >= 30 and min(*seen[2][:2], *seen[3][:2]) > 200

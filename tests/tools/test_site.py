@@ -99,7 +99,7 @@ def test_a_run_page_has_its_command_checksums_and_figures(run: Path, pages: Path
     for caption in ("Path from above", "Position error over time", "Status over time: 12 ok, 0 degraded, 0 lost", "Median time of each stage"):
         assert caption in page
     scene = json.loads(re.findall(r'id="scene">(.*?)</script>', page)[0])
-    assert [path["name"] for path in scene["paths"]] == ["ours", "ground truth"] and set(scene["mesh"]) == {"vertices", "colors", "triangles"}
+    assert [path["name"] for path in scene["paths"]] == ["ours", "ground truth"] and [mesh["name"] for mesh in scene["meshes"]] == ["surface"]
     assert "data:image/jpeg;base64," in page
 
 

@@ -26,12 +26,10 @@ def figure_of(parts: Mapping[str, Rows]) -> Any:
     """Draw, from above: ms of a frame's stages, these as multiples of the reference workload, memory. The rows of panels share their scale,
     which begins at zero; what is varied is on a logarithmic one, marked where it was measured."""
     from matplotlib import rc_context
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
     with rc_context({"font.size": FONT_PT, "lines.markersize": 4}):
         figure = Figure(figsize=(WIDTH_IN * max(len(parts), 2), HEIGHT_IN), layout="constrained")
-        FigureCanvasAgg(figure)
         grid = figure.subplots(3, len(parts), squeeze=False, sharey="row", sharex="col")
         for column, (part, rows) in enumerate(parts.items()):
             _draw(grid[:, column], part, rows)

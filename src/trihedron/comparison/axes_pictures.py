@@ -28,7 +28,9 @@ MARKERS = "os^D"  # of several frames
 
 def errors_figure(runs: Sequence[Run], errors_deg: Sequence[F64], path: Path) -> None:
     """A row for each estimator: its error (n,) by frame, false claims in red, frames without a claim marked below. Writes a PNG."""
-    figure = _figure(10.0, 0.6 + 1.1 * len(runs))
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(10.0, 0.6 + 1.1 * len(runs)), layout="constrained")
     axes: Any = np.atleast_1d(figure.subplots(len(runs), 1, sharex=True, sharey=True))
     for run, errors, ax in zip(runs, errors_deg, axes):
         numbers = np.array([value.index for value in run.found])
@@ -52,11 +54,12 @@ def errors_figure(runs: Sequence[Run], errors_deg: Sequence[F64], path: Path) ->
 def sphere_figure(runs: Sequence[Run], world: F64, frame: int, path: Path) -> None:
     """A half sphere for each estimator, in Lambert's equal-area projection along the camera's axis, opposite directions folded together: normals,
     planes and lines of the frame, the true axes and those it estimates. Writes a PNG."""
+    from matplotlib.figure import Figure
     from matplotlib.lines import Line2D
 
     count = min(COLUMNS, len(runs))
     rows = -(-len(runs) // count)
-    figure = _figure(3.6 * count, 3.75 * rows + 0.5)
+    figure = Figure(figsize=(3.6 * count, 3.75 * rows + 0.5), layout="constrained")
     grid: Any = np.atleast_1d(figure.subplots(rows, count)).ravel()
     features = _features(runs[0].recording, frame)
     for run, ax in zip(runs, grid):
@@ -76,15 +79,6 @@ def sphere_figure(runs: Sequence[Run], world: F64, frame: int, path: Path) -> No
     figure.legend(handles=handles, loc="outside lower center", ncols=len(handles), fontsize=9, frameon=False)
     figure.suptitle(f"directions of frame {frame}, opposite ones folded", fontsize=11)
     figure.savefig(path, dpi=100)
-
-
-def _figure(width: float, height: float) -> Any:
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(width, height), layout="constrained")
-    FigureCanvasAgg(figure)
-    return figure
 
 
 def _draw_directions(ax: Any, features: dict[str, Any]) -> None:

@@ -11,7 +11,7 @@ import numpy as np
 from trihedron.pipeline.core.errors import DataError, LibraryError, printable
 from trihedron.pipeline.core.files import SHOWN, read_file
 from trihedron.pipeline.core.libraries import imports_of
-from trihedron.pipeline.core.types import F64, I32, U8
+from trihedron.pipeline.core.types import F64, I32
 
 MAX_BYTES = 1 << 31
 CURE = "give a .ply or .obj file"
@@ -37,12 +37,6 @@ def read_mesh(path: Path) -> tuple[F64, I32]:
     if len(triangles) and (triangles.min() < 0 or triangles.max() >= len(points)):
         raise DataError(str(path), "a face names a vertex that is not there", "the file is damaged; write it again")
     return points, triangles.astype(np.int32)
-
-
-def vertex_colors(path: Path, count: int, default: int = 180) -> U8:
-    """Return the (count, 3) RGB of the vertices of a PLY file that `read_mesh` read; grey where it has none."""
-    found = np.asarray(getattr(_load_mesh(path, "ply").visual, "vertex_colors", ()), np.uint8)
-    return found[:, :3].copy() if found.ndim == 2 and len(found) == count else np.full((count, 3), default, np.uint8)
 
 
 def _load_mesh(path: Path, kind: str) -> Any:

@@ -20,10 +20,7 @@ PAIR_COLORS = ("#0072b2", "#d55e00")  # of two runs; distinguishable for the col
 
 def draw(path: str, frame: int, out: Path) -> None:
     """Image with features left, map from above right. Raises RecordingError when the recording lacks poses or the frame."""
-    import matplotlib
-
-    matplotlib.use("Agg")
-    from matplotlib import pyplot
+    from matplotlib.figure import Figure
 
     from trihedron.pipeline.app.recorded_values import open_recording
     from trihedron.pipeline.core.errors import RecordingError
@@ -36,24 +33,22 @@ def draw(path: str, frame: int, out: Path) -> None:
     frame = numbers[len(numbers) // 2] if frame < 0 else frame
     if frame not in numbers:
         raise RecordingError(path, f"has no frame {frame}", f"give one of {numbers[0]}..{numbers[-1]}")
-    figure, (left, right) = pyplot.subplots(1, 2, figsize=SIZE_INCHES, width_ratios=[4, 3], layout="constrained")
+    figure = Figure(figsize=SIZE_INCHES, layout="constrained")
+    left, right = figure.subplots(1, 2, width_ratios=[4, 3])
     left.imshow(_annotate_frame([recording], frame))
     left.set_axis_off()
     left.set_title(f"frame {frame}: planes, 3D lines, key points, Manhattan axes", fontsize=10)
     _map_from_above(right, recording, poses)
     figure.savefig(out, dpi=DPI)
-    pyplot.close(figure)
 
 
 def draw_pair(sides: Sequence[tuple[str, Sequence[Recording]]], frame: int, out: Path) -> None:
     """Draw one frame of two runs beside each other, with both paths from above. A side is a title and the recordings in which its topics are looked
     up, the first that has one; the last holds the images."""
-    import matplotlib
+    from matplotlib.figure import Figure
 
-    matplotlib.use("Agg")
-    from matplotlib import pyplot
-
-    figure, axes = pyplot.subplots(1, 3, figsize=(15, 4.2), layout="constrained")
+    figure = Figure(figsize=(15, 4.2), layout="constrained")
+    axes = figure.subplots(1, 3)
     for side, (title, recordings) in zip(axes, sides):
         side.imshow(_annotate_frame(recordings, frame))
         side.set_axis_off()
@@ -65,7 +60,6 @@ def draw_pair(sides: Sequence[tuple[str, Sequence[Recording]]], frame: int, out:
     axes[2].set_ylabel("z [m]")
     axes[2].legend(loc="best", fontsize=8)
     figure.savefig(out, dpi=80)
-    pyplot.close(figure)
 
 
 def _path_from_above(axes: Any, poses: Iterable[Any], frame: int, title: str, color: str, style: str) -> None:

@@ -6,25 +6,25 @@
   const bytes = (text) => Uint8Array.from(atob(text), (c) => c.charCodeAt(0)).buffer;
   const shader = (kind, source) => { const s = gl.createShader(kind); gl.shaderSource(s, source); gl.compileShader(s); return s; };
   const program = gl.createProgram();
-  gl.attachShader(program, shader(gl.VERTEX_SHADER, "attribute vec3 p; attribute vec3 c; uniform mat4 m; varying vec3 v; void main() { v = c; gl_Position = m * vec4(p, 1.0); gl_PointSize = 4.0; }"));
-  gl.attachShader(program, shader(gl.FRAGMENT_SHADER, "precision mediump float; varying vec3 v; void main() { gl_FragColor = vec4(v, 1.0); }"));
-  gl.linkProgram(program); gl.useProgram(program); gl.enable(gl.DEPTH_TEST);
-  const at = { p: gl.getAttribLocation(program, "p"), c: gl.getAttribLocation(program, "c"), m: gl.getUniformLocation(program, "m") };
+  gl.attachShader(program, shader(gl.VERTEX_SHADER, "attribute vec3 p; attribute vec4 c; uniform mat4 m; uniform float s; varying vec4 v; void main() { v = c; gl_Position = m * vec4(p, 1.0); gl_PointSize = s; }"));
+  gl.attachShader(program, shader(gl.FRAGMENT_SHADER, "precision mediump float; varying vec4 v; void main() { gl_FragColor = v; }"));
+  gl.linkProgram(program); gl.useProgram(program); gl.enable(gl.BLEND); gl.blendFuncSeparate(gl.SRC_ALPHA, gl.ONE_MINUS_SRC_ALPHA, gl.ONE, gl.ONE);
+  const at = { p: gl.getAttribLocation(program, "p"), c: gl.getAttribLocation(program, "c"), m: gl.getUniformLocation(program, "m"), s: gl.getUniformLocation(program, "s") };
   const buffer = (target, data) => { const b = gl.createBuffer(); gl.bindBuffer(target, b); gl.bufferData(target, data, gl.STATIC_DRAW); return b; };
-  const drawn = [];
-  if (scene.mesh) {
-    const triangles = new Uint16Array(bytes(scene.mesh.triangles));
-    drawn.push({ mode: gl.TRIANGLES, count: triangles.length, index: buffer(gl.ELEMENT_ARRAY_BUFFER, triangles),
-      p: buffer(gl.ARRAY_BUFFER, new Int16Array(bytes(scene.mesh.vertices))), c: buffer(gl.ARRAY_BUFFER, new Uint8Array(bytes(scene.mesh.colors))) });
-  }
-  for (const path of scene.paths) {
-    const points = new Int16Array(bytes(path.points)), colors = new Uint8Array(points.length);
-    for (let i = 0; i < colors.length; i++) colors[i] = path.color[i % 3];
-    const one = { count: points.length / 3, p: buffer(gl.ARRAY_BUFFER, points), c: buffer(gl.ARRAY_BUFFER, colors) };
-    drawn.push({ ...one, mode: path.dashed ? gl.LINES : gl.LINE_STRIP });
-    if (!path.dashed) drawn.push({ ...one, mode: gl.POINTS });
-  }
-  const start = { yaw: 0.5, pitch: 0.5, distance: 1.7 };
+  const drawn = [], boxes = [...document.querySelectorAll("input.layer")];
+  scene.meshes.forEach((mesh, k) => {
+    const vertices = new Int16Array(bytes(mesh.vertices)), triangles = mesh.triangles && new Uint16Array(bytes(mesh.triangles));
+    drawn.push({ box: boxes[k], mode: gl.TRIANGLES, count: triangles ? triangles.length : vertices.length / 3, index: triangles && buffer(gl.ELEMENT_ARRAY_BUFFER, triangles),
+      p: buffer(gl.ARRAY_BUFFER, vertices), c: buffer(gl.ARRAY_BUFFER, new Uint8Array(bytes(mesh.colors))) });
+  });
+  scene.paths.forEach((path, k) => {
+    const points = new Int16Array(bytes(path.positions_m)), count = points.length / 3, color = [1, 3, 5].map((i) => parseInt(path.color.slice(i, i + 2), 16));
+    const colors = Uint8Array.from({ length: 4 * count }, (_, i) => [...color, 255][i % 4]);
+    const one = { box: boxes[scene.meshes.length + k], count, p: buffer(gl.ARRAY_BUFFER, points), c: buffer(gl.ARRAY_BUFFER, colors) };
+    drawn.push({ ...one, mode: path.dashes ? gl.LINES : gl.LINE_STRIP });
+    if (path.dot_px) drawn.push({ ...one, mode: gl.POINTS, size: path.dot_px });
+  });
+  const start = { yaw: 0.5, pitch: 0.5, distance: 1.45 };
   let eye = { ...start };
   const multiply = (a, b) => { const o = new Float32Array(16); for (let c = 0; c < 4; c++) for (let r = 0; r < 4; r++) for (let k = 0; k < 4; k++) o[4 * c + r] += a[4 * k + r] * b[4 * c + k]; return o; };
   function matrix() {
@@ -41,10 +41,11 @@
     canvas.width = canvas.clientWidth * ratio; canvas.height = canvas.clientHeight * ratio;
     gl.viewport(0, 0, canvas.width, canvas.height); gl.clearColor(0.93, 0.94, 0.95, 1); gl.clear(gl.COLOR_BUFFER_BIT | gl.DEPTH_BUFFER_BIT);
     gl.uniformMatrix4fv(at.m, false, matrix());
-    for (const one of drawn) {
-      if (one.index) gl.enable(gl.DEPTH_TEST); else gl.disable(gl.DEPTH_TEST);
+    for (const one of drawn.filter((layer) => layer.box.checked)) {
+      if (one.mode === gl.TRIANGLES) gl.enable(gl.DEPTH_TEST); else gl.disable(gl.DEPTH_TEST);
+      gl.uniform1f(at.s, one.size || 1);
       gl.bindBuffer(gl.ARRAY_BUFFER, one.p); gl.enableVertexAttribArray(at.p); gl.vertexAttribPointer(at.p, 3, gl.SHORT, false, 0, 0);
-      gl.bindBuffer(gl.ARRAY_BUFFER, one.c); gl.enableVertexAttribArray(at.c); gl.vertexAttribPointer(at.c, 3, gl.UNSIGNED_BYTE, true, 0, 0);
+      gl.bindBuffer(gl.ARRAY_BUFFER, one.c); gl.enableVertexAttribArray(at.c); gl.vertexAttribPointer(at.c, 4, gl.UNSIGNED_BYTE, true, 0, 0);
       if (one.index) { gl.bindBuffer(gl.ELEMENT_ARRAY_BUFFER, one.index); gl.drawElements(one.mode, one.count, gl.UNSIGNED_SHORT, 0); } else gl.drawArrays(one.mode, 0, one.count);
     }
   }
@@ -62,5 +63,6 @@
   canvas.addEventListener("pointermove", (event) => { if (last) { change(0.008 * (event.clientX - last.clientX), 0.008 * (event.clientY - last.clientY), 1); last = event; } });
   canvas.addEventListener("wheel", (event) => { if (document.activeElement === canvas) { change(0, 0, event.deltaY > 0 ? 1.1 : 0.9); event.preventDefault(); } }, { passive: false });
   window.addEventListener("resize", draw);
+  for (const box of boxes) box.addEventListener("change", draw);
   draw();
 })();

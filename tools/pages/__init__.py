@@ -1,4 +1,4 @@
-"""Templates of the pages of results (Jinja2), their style and the 3D view; all of it is put into each page."""
+"""Templates of the pages (Jinja2), their style and the 3D view; all of it is put into each page."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ def _environment() -> Any:
     from jinja2 import Environment, PackageLoader, StrictUndefined
 
     found = Environment(
-        loader=PackageLoader("trihedron.tools.site_pages", ""), autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
+        loader=PackageLoader("trihedron.tools.pages", ""), autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
     )
     return found
 
