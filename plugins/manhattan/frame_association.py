@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from trihedron.pipeline.core.geometry import nearest_rotation
 from trihedron.pipeline.core.linalg import matmul
 from trihedron.pipeline.core.types import F64, I32, ManhattanFrame, Normals, Planes, Segments
 from trihedron.plugins.manhattan.axis_fit import fit_axes
@@ -71,7 +72,10 @@ def retain_unseen(unseen: I32, ids: I32, room: int) -> I32:
 
 def lost_frames(modes: Modes, rules: FitRules, segments: Segments, planes: Planes, normals: Normals, known: F64, ids: I32) -> ManhattanFrame:
     """Manhattan frames that are not supported: a single axis of the first still rotates all that are known (k, 3, 3), and measures two of its three
-    angles."""
+    angles.
+
+    The known ones are rotated by `R · known[0]ᵀ`, which triples their rounding error; each is replaced by the nearest rotation, since a scene may
+    show no frame for hundreds of images."""
     R, covariance = known[0], np.eye(3) * NOTHING_KNOWN
     if modes.seen.sum() == 1:
         rotated = orthonormal(modes.axes, np.where(modes.seen, 1.0, 1e-6))
@@ -83,7 +87,7 @@ def lost_frames(modes: Modes, rules: FitRules, segments: Segments, planes: Plane
     return ManhattanFrame(
         index=normals.index,
         stamp_ns=normals.stamp_ns,
-        rotations=matmul(R, known[0].T, known),
+        rotations=np.array([nearest_rotation(rotation) for rotation in matmul(R, known[0].T, known)]),
         ids=ids,
         covariance=np.concatenate([covariance[None], np.tile(np.eye(3) * NOTHING_KNOWN, (count - 1, 1, 1))]),
         inliers=inliers,

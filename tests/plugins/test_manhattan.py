@@ -8,8 +8,10 @@ import pytest
 from trihedron.pipeline.core.geometry import tangent_basis
 from trihedron.pipeline.core.lie import exp_so3, log_so3, rotation_angle_deg
 from trihedron.pipeline.core.types import Normals, Planes, Segments
+from trihedron.plugins.manhattan.atlanta import Atlanta
 from trihedron.plugins.manhattan.mean_shift import MeanShift
 from trihedron.plugins.manhattan.mean_shift_kernels import shift_axes
+from trihedron.plugins.manhattan.mixture import Mixture
 from trihedron.plugins.shared.manhattan_frames_kernels import CUBE, nearest_equivalent
 
 ROWS, COLS, STRIDE = 120, 160, 4
@@ -258,6 +260,19 @@ def test_same_bytes_again():
 def test_fields_out_of_range(wrong):
     with pytest.raises(ValueError, match=next(iter(wrong))):
         MeanShift(**wrong)
+
+
+@pytest.mark.parametrize("estimator", [Atlanta(), Mixture(), MeanShift()], ids=lambda one: type(one).__name__)
+def test_a_hundred_images_without_a_frame_leave_a_rotation(directions, estimator):
+    """What is known is handed on from image to image, turned by the one axis in view; rounding errors must not grow with their number."""
+    rng = np.random.default_rng(0)
+    R = directions.rotation(rng)
+    found = directions.estimate(estimator, directions.room(rng, R))
+    scenes = directions.without_frame(rng, R)
+    for number in range(100):
+        found = directions.estimate(estimator, scenes["one wall" if number % 2 else "nothing"], found)
+    assert not found.supported
+    assert np.abs(found.rotations @ np.swapaxes(found.rotations, 1, 2) - np.eye(3)).max() < 1e-12
 
 
 def lesser_modes(estimator, directions):
