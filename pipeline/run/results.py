@@ -41,6 +41,12 @@ def final_trajectory(result: Result) -> Trajectory:
     return _trajectory([pose.stamp_ns for pose in poses], [own.get(pose.index, T) for pose, T in zip(poses, moved)])
 
 
+def judged_poses(poses: Iterable[Pose]) -> list[Pose]:
+    """Return the poses whose covariances are judged: tracked, in the first world, as they were estimated at the time, and without the first of them,
+    which is exact by definition."""
+    return [pose for pose in poses if pose.status != LOST and pose.submap == 0][1:]
+
+
 def is_merged(pose: Pose, map: Map | None) -> bool:
     """Return True if the pose was tracked and is, in the end, in the world of the first frame."""
     if pose.status == LOST or map is None or pose.reference < 0:
@@ -92,8 +98,8 @@ def _commonest_reason(poses: Iterable[Pose], status: str) -> str:
 
 
 def _consistency(result: Result, truth: Trajectory) -> dict[str, Any]:
-    """Return the consistency of the tracked poses without the first, which is exact by definition."""
-    poses = [pose for pose in result.poses if pose.status != LOST][1:]
+    """Return the consistency of the poses that are judged."""
+    poses = judged_poses(result.poses)
     pairs = associate(np.array([pose.stamp_ns for pose in poses], np.int64), truth.stamps_ns)
     known = [poses[row] for row, _ in pairs]
     if len(known) < 2:
