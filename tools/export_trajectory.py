@@ -15,7 +15,7 @@ from trihedron.pipeline.core.types import Pose, Trajectory
 from trihedron.pipeline.record.codec import TIMING_TOPIC, timing_of
 from trihedron.pipeline.record.reader import Recording
 from trihedron.pipeline.record.trajectories import format_stamp, write_trajectory
-from trihedron.pipeline.run.results import judged_poses
+from trihedron.pipeline.run.consistency import judged_poses
 from trihedron.tools.export import Format
 
 SIGMAS = ("var_x", "var_y", "var_z", "var_rx", "var_ry", "var_rz")  # m² and rad², in the camera's frame

@@ -31,6 +31,7 @@ from trihedron.pipeline.record.trajectories import attached_truth, read_trajecto
 from trihedron.pipeline.run.metrics import aligned_errors, associate
 from trihedron.pipeline.run.result_files import read_results
 from trihedron.pipeline.run.results import flatten_dict
+from trihedron.pipeline.run.stated_sigma import CAUSES, dominant_cause
 from trihedron.plugins.building.files import floorplan_svg, summary
 from trihedron.tools.arguments import Parser
 from trihedron.tools.export_surface import surface_of
@@ -83,6 +84,7 @@ def page(runs: Sequence[Run], title: str | None = None) -> str:
         _origins(drawn),
         "<h2>Results</h2>",
         _table(runs),
+        _sigmas(drawn),
         *body,
         *_plans(drawn),
         "<h2>Configurations</h2>",
@@ -137,6 +139,20 @@ def _table(runs: Sequence[Run]) -> str:
         texts = [f"<b>{html.escape(cell.text)}</b>" if cell.best else html.escape(cell.text) for cell in row]
         lines.append("".join(f"<td>{text}</td>" for text in texts))
     return "<table>" + "".join(f"<tr>{line}</tr>" for line in lines) + "</table>"
+
+
+def _sigmas(runs: dict[str, Run]) -> str:
+    """σ that each run states of its ok poses, and what has the largest share of it; nothing where no run states any."""
+    found = {name: read_results(run.folder / "metrics.json").get("sigma") or {} for name, run in runs.items()}
+    if not any(found.values()):
+        return ""
+    header = ("run", "σ mm, median", "worst", "σ deg, median", "worst", "mostly")
+    figures = {"median_m": 1e3, "worst_m": 1e3, "median_deg": 1.0, "worst_deg": 1.0}
+    lines = ["".join(f"<th>{name}</th>" for name in header)]
+    for name, sigma in found.items():
+        cells = [f"{factor * sigma[key]:.2f}" if sigma.get(key) is not None else "-" for key, factor in figures.items()]
+        lines.append("".join(f"<td>{html.escape(text)}</td>" for text in (name, *cells, CAUSES.get(dominant_cause(sigma), "-"))))
+    return "<h2>Stated uncertainty of ok poses</h2><table>" + "".join(f"<tr>{line}</tr>" for line in lines) + "</table>"
 
 
 def _trajectories(runs: dict[str, Run], colors: dict[str, str]) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:

@@ -9,6 +9,7 @@ drifted, and are counted in.
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import asdict, dataclass
 from typing import Any
 
@@ -17,7 +18,7 @@ import numpy as np
 from trihedron.pipeline.core.geometry import invert
 from trihedron.pipeline.core.lie import adjoint, exp_se3, log_se3
 from trihedron.pipeline.core.linalg import inv, matmul, solve
-from trihedron.pipeline.core.types import F64, I32
+from trihedron.pipeline.core.types import F64, I32, LOST, Pose
 
 LIMIT_95 = 12.592  # χ² with 6 degrees of freedom
 LIMIT_90_3 = 6.251  # χ² with 3 degrees of freedom
@@ -59,6 +60,12 @@ class TruthNoise:
     def covariance(self) -> F64:
         """Covariance (6, 6) of xi."""
         return np.diag(np.repeat([self.sigma_m**2, self.sigma_rad**2], 3))
+
+
+def judged_poses(poses: Iterable[Pose]) -> list[Pose]:
+    """Return the poses whose covariances are judged: tracked, in the first world, as they were estimated at the time, and without the first of them,
+    which is exact by definition."""
+    return [pose for pose in poses if pose.status != LOST and pose.submap == 0][1:]
 
 
 def truth_noise(poses: F64, local_covariances: F64, true_poses: F64, indices: I32) -> TruthNoise:

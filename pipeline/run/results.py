@@ -17,8 +17,9 @@ from trihedron.pipeline.core.linalg import matmul, norm
 from trihedron.pipeline.core.types import DEGRADED, LOST, OK, Map, Pose, Trajectory
 from trihedron.pipeline.record.trajectories import write_trajectory
 from trihedron.pipeline.run.accounting import Result
-from trihedron.pipeline.run.consistency import pose_consistency, truth_noise
+from trihedron.pipeline.run.consistency import judged_poses, pose_consistency, truth_noise
 from trihedron.pipeline.run.metrics import associate, evaluate_trajectory
+from trihedron.pipeline.run.stated_sigma import stated_sigma
 
 TRAJECTORY, CAUSAL, TIMING, METRICS = "trajectory.txt", "trajectory_causal.txt", "timing.json", "metrics.json"
 
@@ -41,12 +42,6 @@ def final_trajectory(result: Result) -> Trajectory:
     return _trajectory([pose.stamp_ns for pose in poses], [own.get(pose.index, T) for pose, T in zip(poses, moved)])
 
 
-def judged_poses(poses: Iterable[Pose]) -> list[Pose]:
-    """Return the poses whose covariances are judged: tracked, in the first world, as they were estimated at the time, and without the first of them,
-    which is exact by definition."""
-    return [pose for pose in poses if pose.status != LOST and pose.submap == 0][1:]
-
-
 def is_merged(pose: Pose, map: Map | None) -> bool:
     """Return True if the pose was tracked and is, in the end, in the world of the first frame."""
     if pose.status == LOST or map is None or pose.reference < 0:
@@ -64,7 +59,8 @@ def with_unpacked_poses(result: Result) -> Result:
 
 
 def write_results(out: Path, result: Result, final: Trajectory, truth: Trajectory | None) -> dict[str, Any]:
-    """Write the final and the causal trajectory and, with ground truth, metrics; return the metrics. Statuses are counted in any case."""
+    """Write the final and the causal trajectory and, with ground truth, metrics; return the metrics. Statuses are counted and σ is
+    stated in any case."""
     causal = causal_trajectory(result)
     write_trajectory(out / TRAJECTORY, final)
     write_trajectory(out / CAUSAL, causal)
@@ -75,6 +71,8 @@ def write_results(out: Path, result: Result, final: Trajectory, truth: Trajector
         "status": {status: sum(pose.status == status for pose in result.poses) for status in (OK, DEGRADED, LOST)},
         "reasons": {status: reason for status in (DEGRADED, LOST) if (reason := _commonest_reason(result.poses, status))},
     }
+    if sigma := stated_sigma(result.poses, result.calibration_m2):
+        metrics["sigma"] = sigma.to_dict()
     if len(final):  # of a walk that ends where it began, the drift
         metrics["start_to_end_m"] = float(norm(final.poses[-1, :3, 3] - final.poses[0, :3, 3]))
     if truth is not None:

@@ -18,8 +18,8 @@ from trihedron.pipeline.core.lie import adjoint, exp_se3, log_se3
 from trihedron.pipeline.core.types import OK, Pose, Trajectory
 from trihedron.pipeline.record.reader import Recording
 from trihedron.pipeline.record.trajectories import TRUTH, attached_truth, write_trajectory
+from trihedron.pipeline.run.consistency import judged_poses
 from trihedron.pipeline.run.metrics import associate
-from trihedron.pipeline.run.results import judged_poses
 from trihedron.tools.export_trajectory import write_covariances
 
 DATA = Path(__file__).resolve().parents[3] / "shared" / "data"
