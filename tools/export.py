@@ -4,6 +4,8 @@ RUN is a run folder or its recording. Lengths are metres. tum and kitti are the 
 images, rerun what `trihedron view` shows, all in the world of trajectory.txt. Meshes are
 turned so that up, an axis of the Manhattan frame, is +z (ply, obj,
 planes.json) or +y (gltf, by its standard), and what the first camera saw is ahead: +y, or -z.
+With --covariance, tum is the poses as they were estimated at the time, and a file
+beside it (.cov) their covariances, which smfeval judges.
 
 Example: trihedron export runs/latest --to colmap
 """
@@ -29,6 +31,7 @@ class Format:
     name: str  # as given to --to
     file: str  # its default name, in the run folder
     write: Callable[[Recording, Path], str]
+    covariance: Format | None = None  # with --covariance, where it can hold one
 
 
 def formats() -> dict[str, Format]:
@@ -45,10 +48,16 @@ def main(argv: list[str]) -> int:
     parser.add_argument("run", metavar="RUN", type=Path, help="a run folder or its recording")
     parser.add_argument("--to", metavar="FORMAT", required=True, help=f"one of {', '.join(formats())}")
     parser.add_argument("--out", metavar="FILE", type=Path, help="(default: in the run folder)")
+    parser.add_argument("--covariance", action="store_true", help="with the covariance of each pose (tum)")
     arguments = parser.parse_args(argv)
     if arguments.to not in formats():
         raise UsageError("export", f"there is no format '{arguments.to}'", did_you_mean(arguments.to, formats()))
     chosen = formats()[arguments.to]
+    if arguments.covariance:
+        if chosen.covariance is None:
+            able = ", ".join(format.name for format in formats().values() if format.covariance)
+            raise UsageError("export", f"the format '{chosen.name}' holds no covariances", f"give --to {able}, or leave out --covariance")
+        chosen = chosen.covariance
     recording: Path = arguments.run / RECORDING if arguments.run.is_dir() else arguments.run
     out: Path = arguments.out or recording.parent / chosen.file
     try:

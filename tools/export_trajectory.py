@@ -9,15 +9,23 @@ from typing import Any
 import numpy as np
 
 from trihedron.pipeline.app.recorded_values import poses_of, trajectory_of
+from trihedron.pipeline.core.errors import DataError
 from trihedron.pipeline.core.geometry import quaternion_from_rotation
-from trihedron.pipeline.core.types import Pose
+from trihedron.pipeline.core.types import Pose, Trajectory
 from trihedron.pipeline.record.codec import TIMING_TOPIC, timing_of
 from trihedron.pipeline.record.reader import Recording
 from trihedron.pipeline.record.trajectories import format_stamp, write_trajectory
+from trihedron.pipeline.run.consistency import judged_poses
 from trihedron.tools.export import Format
 
 SIGMAS = ("var_x", "var_y", "var_z", "var_rx", "var_ry", "var_rz")  # m² and rad², in the camera's frame
 COUNTS = {"keypoints": "pixels", "segments": "endpoints_px", "planes": "coefficients"}  # rows that are counted
+SIDECAR = ".cov"  # after the name of the trajectory
+CONVENTION = (
+    "#%TANGENT_CONVENTION right_perturbation",
+    "#%TANGENT_ORDER translation_rotation",
+    "# stamp c11 c21 c22 c31 ... c66: the lower triangle, row by row, in m and rad, of xi = (rho, phi) in T_world_camera = T_estimate Exp(xi)",
+)
 PAIRS = ("keypoints", "segments", "planes")
 
 
@@ -26,6 +34,25 @@ def write_tum(recording: Recording, path: Path) -> str:
     trajectory = trajectory_of(recording)
     write_trajectory(path, trajectory)
     return f"{len(trajectory)} poses"
+
+
+def write_tum_with_covariance(recording: Recording, path: Path) -> str:
+    """Write the poses whose covariances are judged, as they were estimated at the time, and beside them the covariances (`write_covariances`). Raises
+    DataError for a run without such poses."""
+    poses = judged_poses(poses_of(recording))
+    if not poses:
+        raise DataError(str(recording.path), "has no tracked pose after the first, which is exact by definition", "record a longer run")
+    write_trajectory(path, Trajectory(np.array([pose.stamp_ns for pose in poses], np.int64), np.array([pose.T_world_camera for pose in poses])))
+    sidecar = path.with_name(path.name + SIDECAR)
+    write_covariances(sidecar, poses)
+    return f"{len(poses)} poses as they were estimated at the time, with their covariances in {sidecar}"
+
+
+def write_covariances(path: Path, poses: list[Pose]) -> None:
+    """Write a row for each pose, its stamp and the lower triangle of `Pose.covariance`, row by row: 22 numbers. That is the convention of smfeval:
+    perturbation on the right, so in the camera frame, translation first, m and rad."""
+    rows = (" ".join([format_stamp(pose.stamp_ns), *(f"{value:.12e}" for value in pose.covariance[np.tril_indices(6)])]) for pose in poses)
+    path.write_text("\n".join([*CONVENTION, *rows]) + "\n", encoding="utf-8")
 
 
 def write_kitti(recording: Recording, path: Path) -> str:
@@ -75,7 +102,7 @@ def _stage_columns(topic: str, value: Any) -> dict[str, Any]:
 
 
 FORMATS = (
-    Format("tum", "trajectory_final.txt", write_tum),
+    Format("tum", "trajectory_final.txt", write_tum, Format("tum", "trajectory_estimated.txt", write_tum_with_covariance)),
     Format("kitti", "trajectory_kitti.txt", write_kitti),
     Format("csv", "frames.csv", write_csv),
 )

@@ -17,7 +17,9 @@ from typing import Any
 from trihedron.comparison import run_tables
 from trihedron.comparison.runs import Run, read_runs, rows_of
 from trihedron.pipeline.core.errors import DataError, TrihedronError
+from trihedron.pipeline.run.result_files import read_results
 from trihedron.pipeline.run.results import flatten_dict
+from trihedron.pipeline.run.stated_sigma import CAUSES, dominant_cause
 from trihedron.tools.arguments import Parser
 from trihedron.tools.pages import render
 from trihedron.tools.run_pages import CONFIGURATION, MOST_PICTURES, RECORDING, TRAJECTORY, RunFacts, drawings_of, facts_of, frame_picture
@@ -51,6 +53,7 @@ def page(runs: Sequence[Run], title: str | None = None) -> str:
         title=title or title_of(facts),
         origins=_table("Origins", "The commands as they were given.", ["run", "data set", "date", "command"], [*map(_origin, facts, facts.values())]),
         results=_table("Results", "± is half the distance from the smallest to the largest.", header, cells),
+        sigmas=_sigmas({name: run.folder for name, run in named.items()}),
         configurations=_configurations(facts),
         frames=[_frame(name, run.folder) for name, run in list(named.items())[:MOST_PICTURES]],
         **drawings_of({name: run.folder for name, run in named.items()}, MOST_TRIANGLES),
@@ -82,6 +85,18 @@ def _configurations(runs: Mapping[str, RunFacts]) -> dict[str, Any]:
     keys = sorted({key for values in flat for key in values} - {"out"})
     rows = [[key, *(str(values.get(key, "-")) for values in flat)] for key in keys if len({repr(values.get(key)) for values in flat}) > 1]
     return _table("Configurations", "Options that differ; - where a plugin has no such option.", ["option", *runs], rows)
+
+
+def _sigmas(folders: Mapping[str, Path]) -> dict[str, Any]:
+    """σ that each run states of its ok poses, and what has the largest share of it; without rows where no run states any."""
+    found = {name: read_results(folder / "metrics.json").get("sigma") or {} for name, folder in folders.items()}
+    header = ("run", "σ mm, median", "worst", "σ deg, median", "worst", "mostly")
+    figures = {"median_m": 1e3, "worst_m": 1e3, "median_deg": 1.0, "worst_deg": 1.0}
+    rows = []
+    for name, sigma in found.items():
+        cells = (f"{factor * sigma[key]:.2f}" if sigma.get(key) is not None else "-" for key, factor in figures.items())
+        rows.append((name, *cells, CAUSES.get(dominant_cause(sigma), "-")))
+    return _table("Stated uncertainty", "σ of the ok poses, and the cause with the largest share of it.", header, rows if any(found.values()) else [])
 
 
 def _table(title: str, note: str, header: Sequence[str], rows: Sequence[Sequence[Any]]) -> dict[str, Any]:

@@ -41,6 +41,7 @@ from trihedron.pipeline.run.replay import TOPICS, Replay
 from trihedron.pipeline.run.run_folder import lock_folder, write_configuration
 from trihedron.pipeline.run.runner import Runner, Step
 from trihedron.pipeline.run.state import DelayLines, max_delays
+from trihedron.pipeline.run.stated_sigma import sigma_line
 from trihedron.pipeline.run.timing import forget_peak
 from trihedron.pipeline.run.warm_up import compilation_reported, warm_up
 
@@ -294,6 +295,8 @@ def _report(out: Path, metrics: dict[str, Any], timing: dict[str, Any], surfaces
     status = metrics.get("status", {})
     if status:
         print("frames: " + ", ".join(f"{count} {name}" for name, count in status.items() if count))
+    if sigma := metrics.get("sigma"):
+        print(sigma_line(sigma, out))
     for name, reason in metrics.get("reasons", {}).items():
         print(f"{name}, most of them: {reason}")
     if live := timing.get("live"):

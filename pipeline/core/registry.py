@@ -12,9 +12,12 @@ from importlib.metadata import entry_points
 from pathlib import Path
 from typing import Any, TypeVar, get_type_hints
 
+import numpy as np
+
 from trihedron.pipeline.core.errors import LibraryError, PluginError, did_you_mean
 from trihedron.pipeline.core.options import check_options
 from trihedron.pipeline.core.slots import FOLDS, RESERVED, SLOTS, inputs_of, method_of, output_of, strip_none
+from trihedron.pipeline.core.types import F64, Pose
 
 Plugin = TypeVar("Plugin", bound=type)
 _PLUGINS: dict[str, dict[str, type[Any]]] = {slot: {} for slot in SLOTS}
@@ -22,6 +25,8 @@ _BUILT_IN = ("trihedron.datasets", "trihedron.plugins")
 ENTRY_POINT_GROUP = "trihedron.plugins"
 FileWriter = Callable[[Path, Any], list[str]]
 _FILES: dict[str, FileWriter] = {}
+CovariancePart = Callable[[Pose], F64]
+_COVARIANCES: dict[str, CovariancePart] = {}
 
 
 def register(slot: str, name: str) -> Callable[[Plugin], Plugin]:
@@ -139,6 +144,21 @@ def register_files(slot: str) -> Callable[[FileWriter], FileWriter]:
 def write_files_of(slot: str, folder: Path, value: Any) -> list[str]:
     """Write the files of a fold's value into a folder; returns lines that describe them, none where the slot has no files."""
     return _FILES[slot](folder, value) if slot in _FILES else []
+
+
+def register_covariance(cause: str) -> Callable[[CovariancePart], CovariancePart]:
+    """Register the function that gives the part (6, 6) of a pose's covariance that is due to `cause` (decorator)."""
+
+    def decorate(part: CovariancePart) -> CovariancePart:
+        _COVARIANCES[cause] = part
+        return part
+
+    return decorate
+
+
+def covariance_due_to(cause: str, pose: Pose) -> F64:
+    """Return the part (6, 6) of a pose's covariance that is due to `cause`; zero where no plugin knows of it."""
+    return _COVARIANCES[cause](pose) if cause in _COVARIANCES else np.zeros((6, 6))
 
 
 def plugins_of(slot: str) -> dict[str, type[Any]]:

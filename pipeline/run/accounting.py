@@ -10,6 +10,7 @@ from typing import Any
 from trihedron.pipeline.core.errors import DataError
 from trihedron.pipeline.core.types import Frame, Map, Pose, Value
 from trihedron.pipeline.run.poses import Poses
+from trihedron.pipeline.run.stated_sigma import calibration_variance_m2
 from trihedron.pipeline.run.timing import Timing
 
 UNREADABLE_SHARE = 0.1
@@ -26,6 +27,7 @@ class Result:
     stamps_ns: array[int] = field(default_factory=lambda: array("q"))  # of every readable frame
     unreadable: int = 0
     fps: float = 30.0  # nominal, of the camera
+    calibration_m2: array[float] = field(default_factory=lambda: array("d"))  # of each pose, what its position's variance owes to the calibration
 
 
 @dataclass
@@ -79,6 +81,7 @@ class Accounting:
             self.result.fps = frame.camera.fps
         if isinstance(pose := values.get("pose"), Pose):
             self.result.poses.append(pose)
+            self.result.calibration_m2.append(calibration_variance_m2(pose))
         if isinstance(latest := values.get("map"), Map):
             self.result.map = latest
         return True

@@ -23,6 +23,7 @@ KINDS: dict[str, Any] = {  # of metrics.json, timing.json, surface.json and job.
     "final": {"share_basis": str, EACH: NUMBER},
     "causal": {"share_basis": str, EACH: NUMBER},
     "consistency": {},
+    "sigma": {"share": {EACH: NUMBER}, EACH: NUMBER},
     "frame_ms": {EACH: NUMBER},
     "peak_memory_mb": NUMBER,
     "own_memory_mb": NUMBER,

@@ -17,8 +17,9 @@ from trihedron.pipeline.core.linalg import matmul, norm
 from trihedron.pipeline.core.types import DEGRADED, LOST, OK, Map, Pose, Trajectory
 from trihedron.pipeline.record.trajectories import write_trajectory
 from trihedron.pipeline.run.accounting import Result
-from trihedron.pipeline.run.consistency import pose_consistency, truth_noise
+from trihedron.pipeline.run.consistency import judged_poses, pose_consistency, truth_noise
 from trihedron.pipeline.run.metrics import associate, evaluate_trajectory
+from trihedron.pipeline.run.stated_sigma import stated_sigma
 
 TRAJECTORY, CAUSAL, TIMING, METRICS = "trajectory.txt", "trajectory_causal.txt", "timing.json", "metrics.json"
 
@@ -58,7 +59,8 @@ def with_unpacked_poses(result: Result) -> Result:
 
 
 def write_results(out: Path, result: Result, final: Trajectory, truth: Trajectory | None) -> dict[str, Any]:
-    """Write the final and the causal trajectory and, with ground truth, metrics; return the metrics. Statuses are counted in any case."""
+    """Write the final and the causal trajectory and, with ground truth, metrics; return the metrics. Statuses are counted and σ is
+    stated in any case."""
     causal = causal_trajectory(result)
     write_trajectory(out / TRAJECTORY, final)
     write_trajectory(out / CAUSAL, causal)
@@ -69,6 +71,8 @@ def write_results(out: Path, result: Result, final: Trajectory, truth: Trajector
         "status": {status: sum(pose.status == status for pose in result.poses) for status in (OK, DEGRADED, LOST)},
         "reasons": {status: reason for status in (DEGRADED, LOST) if (reason := _commonest_reason(result.poses, status))},
     }
+    if sigma := stated_sigma(result.poses, result.calibration_m2):
+        metrics["sigma"] = sigma.to_dict()
     if len(final):  # of a walk that ends where it began, the drift
         metrics["start_to_end_m"] = float(norm(final.poses[-1, :3, 3] - final.poses[0, :3, 3]))
     if truth is not None:
@@ -92,8 +96,8 @@ def _commonest_reason(poses: Iterable[Pose], status: str) -> str:
 
 
 def _consistency(result: Result, truth: Trajectory) -> dict[str, Any]:
-    """Return the consistency of the tracked poses without the first, which is exact by definition."""
-    poses = [pose for pose in result.poses if pose.status != LOST][1:]
+    """Return the consistency of the poses that are judged."""
+    poses = judged_poses(result.poses)
     pairs = associate(np.array([pose.stamp_ns for pose in poses], np.int64), truth.stamps_ns)
     known = [poses[row] for row, _ in pairs]
     if len(known) < 2:

@@ -2,8 +2,8 @@
 
 Poses count as they were estimated at the time. Each sub-map has a world of its own and is aligned with the truth by itself, robustly, over its `ok`
 frames, since the others claim nothing, or over all posed ones where it has fewer than LEAST_OK of these; smaller sub-maps are left out. An `ok`
-frame is wrong where it is off by more than WRONG_M and SIGMAS standard deviations, or by more than WRONG_DEG and SIGMAS; the first pose, which defines
-the world, is never. Positions are in the camera frame.
+frame is wrong where it is off by more than WRONG_M and SIGMAS standard deviations, or by more than WRONG_DEG and SIGMAS; the first pose, which
+defines the world, is never. Positions are in the camera frame.
 """
 
 from __future__ import annotations

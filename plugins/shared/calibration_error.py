@@ -16,6 +16,7 @@ from __future__ import annotations
 import numpy as np
 
 from trihedron.pipeline.core.linalg import matmul
+from trihedron.pipeline.core.registry import register_covariance
 from trihedron.pipeline.core.types import F64, Camera, Pose
 from trihedron.plugins.shared.calibration_error_kernels import calibration_moment
 
@@ -36,6 +37,7 @@ def calibration_scales(camera: Camera) -> F64:
     return np.array([FOCAL, FOCAL, centre, centre, FOCAL, shift, shift, INVERSE_DEPTH_PER_M, RADIAL, READOUT_S, DELAY_S, DEPTH_READOUT_S])
 
 
+@register_covariance("calibration")
 def calibration_covariance(pose: Pose) -> F64:
     """Covariance (6, 6) of a pose's error by the calibration, part of its `map_covariance`."""
     moment = calibration_moment(pose.calibration_information, pose.calibration_score)
