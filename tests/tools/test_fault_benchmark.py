@@ -48,7 +48,7 @@ def test_a_row_counts_wrong_frames() -> None:
     (case,) = fault_cases("frozen", ())
     (found,) = rows_of([JudgedCase(case, *check_status(poses, Trajectory(stamps, truth), 41))])
     row = dict(zip(HEADER, cells_of(found), strict=True))
-    assert (row[""], row["frames"], row["ok %"], row["lost %"], row["wrong ok"]) == ("frozen", "41", "97.6", "0.0", "1")
+    assert (row["name"], row["frames"], row["ok %"], row["lost %"], row["wrong ok"]) == ("frozen", "41", "97.6", "0.0", "1")
 
 
 def test_misspelt_cases_are_refused(capsys: pytest.CaptureFixture[str]) -> None:

@@ -54,9 +54,10 @@ def main(argv: list[str]) -> int:
     return 0
 
 
-def fault_cases(names: str, overrides: Sequence[str]) -> list[Case]:
-    """Return the runs of the cases A,B. Raises UsageError for an unknown one."""
-    return [Case(name, words_of(name, overrides), {FAULT: name}) for name in chosen(names, CASES)]
+def fault_cases(names: str, overrides: Sequence[str], seed: int = 0) -> list[Case]:
+    """Return the runs of the cases A,B with a seed of the room underneath. Raises UsageError for an unknown one."""
+    words = [*overrides, *([f"+dataset.options.seed={seed}"] if seed else [])]
+    return [Case(name, words_of(name, words), {FAULT: name}, seed) for name in chosen(names, CASES)]
 
 
 def words_of(case: str, overrides: Sequence[str] = ()) -> list[str]:

@@ -12,8 +12,8 @@ all clean runs, which are those without a fault. Columns:
   σ/error       sharpness against error: the root of the mean stated variance of the position over the root mean square of its error (spread–skill
                 ratio); honest: 1, less is overconfident
 A figure is the mean over runs, geometric of NEES and σ/error, with a 95 % interval (Student's t) where there are three runs or more. Seeds begin
-behind those that the program was developed with (0 to 4). --runs keeps the runs in a folder, and takes from it what was run with the same words.
-Other words with = are overrides of each run. Empty names, as in --cases "", leave a part out.
+behind those that the program was developed with (0 to 4); a fault is run with the first. --runs keeps the runs in a folder, and takes from it what
+was run with the same words. Other words with = are overrides of each run. Empty names, as in --cases "", leave a part out.
 
 Example: trihedron benchmark honesty ../shared/data/*/ --runs runs/honesty --json honesty.json
 """
@@ -72,7 +72,8 @@ def all_cases(options: Namespace, data: Sequence[str], overrides: Sequence[str])
     """Return the runs of all parts, each under a name of its own. Raises UsageError, and DataError for a folder that is not there."""
     width, height = size_of(options.size)
     sensors = sensor_cases(COMMAND, options, [f"dataset.width={width}", f"dataset.height={height}", *overrides])
-    faults = fault_cases(options.cases, [f"+dataset.options.width={width}", f"+dataset.options.height={height}", *overrides])
+    size = [f"+dataset.options.width={width}", f"+dataset.options.height={height}"]
+    faults = fault_cases(options.cases, [*size, *overrides], options.first_seed)
     return [*sensors, *(sequence_case(text, overrides) for text in map(sequence_text, data)), *faults]
 
 

@@ -103,7 +103,7 @@ FIGURES = (
     Figure("log_likelihood", "log-lik", lambda check: check.log_likelihood),
     Figure("spread_over_error", "σ/error", lambda check: check.spread_over_error, 1.0, 2, geometric=True),
 )
-HEADER = ["", "runs", "frames", "wrong ok", *(figure.title for figure in FIGURES)]
+HEADER = ["of", "name", "runs", "frames", "wrong ok", *(figure.title for figure in FIGURES)]
 
 
 def judged_cases(cases: Iterable[Case], folder: Path) -> Iterator[JudgedCase]:
@@ -170,7 +170,7 @@ def rows_of(found: Sequence[JudgedCase]) -> list[Row]:
     groups = dict.fromkeys((kind, one.case.groups[kind]) for kind in kinds for one in found if kind in one.case.groups)
     rows = [_row(kind, name, [one.check for one in found if one.case.groups.get(kind) == name]) for kind, name in groups]
     clean = [one.check for one in found if one.case.clean]
-    every = [_row("clean", "all clean runs", clean)] if clean else []
+    every = [_row("all", "clean runs", clean)] if clean else []
     return [*(row for row in rows if row["kind"] != FAULT), *every, *(row for row in rows if row["kind"] == FAULT)]
 
 
@@ -203,7 +203,7 @@ def alarm_figure(test: str) -> Figure:
 def cells_of(row: Row) -> list[str]:
     """Write a row as the cells of HEADER."""
     wrong = "–" if row["wrong_ok"] is None else str(row["wrong_ok"])
-    return [row["name"], str(row["runs"]), str(row["frames"]), wrong, *(figure.text(row[figure.name]) for figure in FIGURES)]
+    return [row["kind"], row["name"], str(row["runs"]), str(row["frames"]), wrong, *(figure.text(row[figure.name]) for figure in FIGURES)]
 
 
 def alarm_cells(row: Row) -> list[str]:
@@ -213,7 +213,7 @@ def alarm_cells(row: Row) -> list[str]:
 
 def report(found: Sequence[JudgedCase]) -> str:
     """Make the table, and that of false alarms by the test where there are any."""
-    text = table([HEADER, *map(cells_of, rows_of(found))], "l" + "r" * (len(HEADER) - 1))
+    text = table([HEADER, *map(cells_of, rows_of(found))], "ll" + "r" * (len(HEADER) - 2))
     alarms = [alarm_cells(row) for row in alarms_of(found)]
     return text + ("\n\n" + table([["false alarms, by the test", "frames", "share %"], *alarms], "lrr") if alarms else "")
 
