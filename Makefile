@@ -53,7 +53,7 @@ table: install  ## the paper's study and its pages: every system on rooms and DA
 	$(BIN)/trihedron site $(TABLE) $(TABLE)_corridor --out $(TABLE)/site
 
 PART := sequences
-results: install  ## measure docs/results/PART.json (PART=sequences or methods; DATA as for table) and write it into the pages; goes on where it was stopped
+results: install  ## measure docs/results/PART.json (PART=sequences, honesty or methods; DATA as for table) and write it into the pages; goes on where it was stopped
 	$(BIN)/python docs/results/measure.py $(PART) $(or $(foreach d,$(DATA),"$(d)"),$(SEQUENCES))
 	$(BIN)/python docs/results/render.py
 

@@ -22,7 +22,7 @@ from trihedron.pipeline.core.types import LOST, OK
 from trihedron.pipeline.record.reader import Recording
 from trihedron.pipeline.run.consistency import pose_consistency
 from trihedron.tools.benchmarks.fault_benchmark import words_of
-from trihedron.tools.benchmarks.sensor_benchmark import run_and_judge
+from trihedron.tools.benchmarks.judged_runs import run_and_judge
 
 SMALL = {"width": 320, "height": 240}
 HONEST = 24.0  # median normalised error of the frames that are ok: their errors are within twice what they say (6 is exact)

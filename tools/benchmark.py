@@ -11,7 +11,8 @@ manhattan` (these estimators on rendered rooms), `trihedron benchmark detectors`
 benchmark surface` (all surfaces, by the true one), `trihedron benchmark map` (drift, recovery and growth of the map), `trihedron benchmark long`
 (what a long run leaves behind), `trihedron benchmark scaling` (threads, image size, features, length), `trihedron benchmark parts` (features and
 matching beside OpenCV's), `trihedron benchmark recording` (what recording costs), `trihedron benchmark building`, `trihedron benchmark sensors`
-(honesty on simulated sensors of several kinds), `trihedron benchmark faults` (the same under degenerate input).
+and `trihedron benchmark faults` (how honest status and covariances are on simulated sensors of several kinds and under degenerate input), `trihedron
+benchmark honesty` (both in one table, with recorded sequences).
 
 `trihedron compare` makes a table of the runs of any sweep.
 
@@ -47,6 +48,7 @@ COMPARISONS = {  # other words after `benchmark`, and whose `main` they stand fo
     "building": f"{OF_CHECKOUT}.building_benchmark",
     "detectors": f"{OF_CHECKOUT}.detector_truth",
     "faults": f"{OF_CHECKOUT}.fault_benchmark",
+    "honesty": f"{OF_CHECKOUT}.honesty",
     "long": f"{OF_CHECKOUT}.long_run",
     "manhattan": f"{OF_CHECKOUT}.manhattan_family",
     "map": f"{OF_CHECKOUT}.map_benchmark",

@@ -1,6 +1,7 @@
 """Measure the figures of the pages, and write docs/results/PART.json with the commit, versions, processor, date and command. `make results` runs it.
 
     python docs/results/measure.py sequences FOLDER KIND:FOLDER ...     # every run of the default graph in a process of its own
+    python docs/results/measure.py honesty FOLDER KIND:FOLDER ...       # `trihedron benchmark honesty` over these, sensors and faults
     python docs/results/measure.py methods FOLDER KIND:FOLDER ...       # experiment=methods, over these too, and detectors by rendered scenes
 
 What is measured already by the same commit is not measured again, so that a command that was stopped goes on. Figures of some code are those of its
@@ -23,10 +24,10 @@ from typing import Any
 import yaml
 
 from trihedron.pipeline.core.errors import DataError, TrihedronError
-from trihedron.pipeline.core.layouts import layout_of
 from trihedron.pipeline.run.results import TIMING
 from trihedron.pipeline.sweep.sweep import words_of_sequence
 from trihedron.tools.benchmark import PROGRAM, machine, measure, reference_ms, sample_images
+from trihedron.tools.benchmarks.honesty import sequence_text
 
 ROOT = Path(__file__).resolve().parents[2]
 RESULTS, WORK = ROOT / "docs" / "results", ROOT / "runs" / "results"
@@ -99,11 +100,6 @@ def sequences(data: Sequence[str], commit: str) -> Row:
     return {"minutes": round(sum(row["seconds"] for row in rows) / 60.0, 1), "sequences": rows}
 
 
-def sequence_text(word: str) -> str:
-    """Return KIND:FOLDER for a folder, whose kind is that of its files; any other word as it is. Raises DataError."""
-    return word if ":" in word or "=" in word else f"{layout_of(Path(word))}:{word.rstrip('/')}"
-
-
 def figures_of(words: Sequence[str], out: Path) -> Row:
     """Run the default graph in a process of its own, and return its figures: metres, degrees, milliseconds, MB (10⁶ bytes), seconds. Errors are None
     without ground truth. `reference_ms` is the reference workload of `trihedron benchmark`, before and after. Raises TrihedronError."""
@@ -147,6 +143,19 @@ def sequences_of_methods(data: Sequence[str]) -> list[str]:
     return [*yaml.safe_load(EXPERIMENT.read_text())["sequences"], *given]
 
 
+def honesty(data: Sequence[str], commit: str) -> Row:
+    """Judge sensors, faults and these sequences. What this commit has run is kept in a folder of its name."""
+    folder = WORK / commit / "honesty"
+    folder.mkdir(parents=True, exist_ok=True)
+    file, began = folder / "honesty.json", time.perf_counter()
+    file.unlink(missing_ok=True)
+    _program("benchmark", "honesty", *map(sequence_text, data), "--runs", str(folder), "--json", str(file))
+    if not file.exists():
+        raise DataError("trihedron benchmark honesty", "did not end", "mend what it names, and run it again: what is done is kept")
+    found: Row = json.loads(file.read_text())
+    return {"minutes": round((time.perf_counter() - began) / 60.0, 1), **found}
+
+
 def _program(*words: str) -> None:
     done = subprocess.run([*PROGRAM, *words])
     if done.returncode not in (0, 1):  # 1: some jobs failed, which the table names
@@ -168,7 +177,7 @@ def _lines(value: Any) -> str:
     return json.dumps(value, ensure_ascii=False)
 
 
-PARTS = {"sequences": sequences, "methods": methods}
+PARTS = {"sequences": sequences, "honesty": honesty, "methods": methods}
 
 if __name__ == "__main__":
     sys.exit(main(sys.argv[1:]))

@@ -18,6 +18,7 @@ from typing import Any
 sys.path.insert(0, str(Path(__file__).parents[1] / "site"))
 from plugin_pages import markdown, source_line
 
+from trihedron.tools.benchmarks.judged_runs import FAULT, HEADER, alarm_cells, cells_of
 from trihedron.tools.method_tables import cell_of
 from trihedron.tools.published import peer_figures, peers, published_ate_m, sequence_of
 
@@ -159,9 +160,31 @@ def detectors() -> str:
     return "\n\n".join(parts) + f"\n\n*{source_line({**found, 'command': 'trihedron benchmark detectors'})}*\n"
 
 
-BLOCKS: dict[str, Callable[[], str]] = {
-    one.__name__: one for one in (accuracy, sequences, durations, other_programs, consistency, methods, libraries, detectors)
-}  # fmt: skip
+def honesty_sensors() -> str:
+    """Honesty of clean runs: by sensor, room and sequence, and over all; and their false alarms by the test."""
+    found = read("honesty")
+    rows = [cells_of({**row, "name": TITLES.get(row["name"], row["name"])}) for row in found["rows"] if row["kind"] != FAULT]
+    alarms = markdown(["false alarm", "frames", "% of a run"], [tuple(alarm_cells(row)) for row in found["alarms"]])
+    none = "No frame of a clean run is less than `ok`."
+    return f"{markdown(HEADER, [tuple(row) for row in rows])}\n\n{alarms if found['alarms'] else none}\n\n*{source_line(found)}*\n"
+
+
+def honesty_faults() -> str:
+    """Honesty under degenerate input, and the tests that tell it."""
+    found = read("honesty")
+    rows = [row for row in found["rows"] if row["kind"] == FAULT]
+    lines = [(f"`{row['name']}`", *cells_of(row)[3:], _tests(row["not_ok"])) for row in rows]
+    wrong = [f"`{row['name']}` ({row['wrong_ok']})" for row in rows if row["wrong_ok"]]
+    sentence = f"Cases with wrong `ok` frames: {', '.join(wrong)}." if wrong else "No case has a wrong `ok` frame."
+    return f"{markdown(['case', *HEADER[3:], 'frames not ok, by the test'], lines)}\n\n{sentence}\n\n*{source_line(found)}*\n"
+
+
+def _tests(counts: Row) -> str:
+    return ", ".join(f"{test} ({frames})" for test, frames in counts.items()) or "–"
+
+
+DRAWN = (accuracy, sequences, durations, other_programs, consistency, honesty_sensors, honesty_faults, methods, libraries, detectors)
+BLOCKS: dict[str, Callable[[], str]] = {one.__name__: one for one in DRAWN}
 
 
 def _without_repeats(names: Iterable[str]) -> list[str]:

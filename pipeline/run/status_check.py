@@ -4,10 +4,16 @@ Poses count as they were estimated at the time. Each sub-map has a world of its 
 frames, since the others claim nothing, or over all posed ones where it has fewer than LEAST_OK of these; smaller sub-maps are left out. An `ok`
 frame is wrong where it is off by more than WRONG_M and SIGMAS standard deviations, or by more than WRONG_DEG and SIGMAS; the first pose, which
 defines the world, is never. Positions are in the camera frame.
+
+Sharpness is compared with the error by the spread–skill ratio (Fortin et al., Journal of Hydrometeorology 2014): the root of the mean stated variance
+of the position over the root mean square of its error, after the alignment that the covariances make most likely, as NEES. 1 is honest, more is too
+cautious, less overconfident.
 """
 
 from __future__ import annotations
 
+import re
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
@@ -26,6 +32,8 @@ LEAST_OK = 3  # poses with status ok, by which a sub-map is aligned
 INLIER = 3.0  # times the median error
 ROUNDS = 5
 STEP_M = 0.05
+FIGURES = re.compile(r"\d+(?:\.\d+)?")  # in a reason
+CLAUSE_ENDS = re.compile(r"[:;,]")
 TINY = 1e-12  # variance, m² and rad²
 EXACT = 1e-10  # total variance below which a pose is exact by definition, as the first: it has no NEES
 
@@ -33,8 +41,9 @@ EXACT = 1e-10  # total variance below which a pose is exact by definition, as th
 @dataclass(frozen=True)
 class FrameErrors:
     """Errors (n,) of the posed frames with truth: metres, degrees, the largest stated standard deviations, NEES (6 degrees of freedom), and the
-    logarithm of the likelihood of the error (nats). The latter two are NaN of a pose that is exact by definition. `ok` is the status; `judged` is
-    False in sub-maps that are too small, whose errors are NaN; `exact` is True of poses that are exact by definition."""
+    logarithm of the likelihood of the error (nats). `likely_m` is the error of the position after the alignment that the covariances make most
+    likely, `spread_m` the root of its stated variance, along all axes. The latter four are NaN of a pose that is exact by definition. `ok` is the
+    status; `judged` is False in sub-maps that are too small, whose errors are NaN; `exact` is True of poses that are exact by definition."""
 
     indices: F64
     judged: Bool
@@ -46,6 +55,8 @@ class FrameErrors:
     sigma_deg: F64
     nees: F64
     log_likelihood: F64
+    likely_m: F64
+    spread_m: F64
 
     @property
     def wrong_ok(self) -> Bool:
@@ -58,7 +69,8 @@ class FrameErrors:
 @dataclass(frozen=True)
 class StatusCheck:
     """Figures of a run; None where too few frames are posed. Honest covariances have `nees_median` 5.35 and `share_within_95` 0.95. `sigma_auc`
-    is the probability that of two frames, one above the median error and one below, the former has the larger σ: 0.5 is that of a σ by chance."""
+    is the probability that of two frames, one above the median error and one below, the former has the larger σ: 0.5 is that of a σ by chance.
+    `spread_over_error` is the spread–skill ratio. `not_ok` counts the frames that are not ok by the test that found them so."""
 
     frames: int
     ok: int
@@ -72,6 +84,8 @@ class StatusCheck:
     log_likelihood: float | None
     steps_within_50mm: float | None
     steps: int
+    spread_over_error: float | None
+    not_ok: dict[str, int]
 
     def to_dict(self) -> dict[str, Any]:
         """Return field name -> value, ready for JSON."""
@@ -99,8 +113,22 @@ def check_status(poses: Sequence[Pose], truth: Trajectory, frames: int | None = 
         log_likelihood=float(likelihood.mean()) if len(likelihood) else None,
         steps_within_50mm=close / steps if steps else None,
         steps=steps,
+        spread_over_error=_spread_over_error(errors),
+        not_ok=dict(Counter(name_of_test(pose.reason) for pose in poses if pose.status != OK).most_common()),
     )
     return figures, errors
+
+
+def name_of_test(reason: str) -> str:
+    """Return what stays the same of the reason of a status, its first clause without figures: "only … of … matches with the map agree"."""
+    return FIGURES.sub("…", CLAUSE_ENDS.split(reason)[0]) or "no reason"
+
+
+def _spread_over_error(errors: FrameErrors) -> float | None:
+    """Return the spread–skill ratio; None where no pose has an error."""
+    known = np.isfinite(errors.likely_m)
+    squared = float(np.mean(errors.likely_m[known] ** 2)) if known.any() else 0.0
+    return float(np.sqrt(np.mean(errors.spread_m[known] ** 2) / squared)) if squared > 0.0 else None
 
 
 def sigma_auc(error_m: F64, sigma_m: F64) -> float | None:
@@ -119,7 +147,7 @@ def _frame_errors(poses: Sequence[Pose], truth: Trajectory) -> tuple[FrameErrors
     pairs = associate(np.array([pose.stamp_ns for pose in posed], np.int64), truth.stamps_ns)
     known, true = [posed[row] for row, _ in pairs], truth.poses[pairs[:, 1]].reshape(-1, 4, 4)
     n = len(known)
-    error_m, error_deg, nees, likelihood = (np.full(n, np.nan) for _ in range(4))
+    error_m, error_deg, nees, likelihood, likely, spread = (np.full(n, np.nan) for _ in range(6))
     judged = np.zeros(n, bool)
     T = np.array([pose.T_world_camera for pose in known]).reshape(-1, 4, 4)
     S = np.array([pose.covariance for pose in known]).reshape(-1, 6, 6) + TINY * np.eye(6)
@@ -136,11 +164,13 @@ def _frame_errors(poses: Sequence[Pose], truth: Trajectory) -> tuple[FrameErrors
         if len(rows) < 2:
             continue
         covariances = S[rows] + _noise_of_truth([known[row] for row in rows], true[rows]).covariance
-        nees[rows], likelihood[rows] = _normalised_errors(T[rows], covariances, true[rows])
+        nees[rows], likelihood[rows], likely[rows] = _normalised_errors(T[rows], covariances, true[rows])
+        spread[rows] = np.sqrt(np.trace(covariances[:, :3, :3], axis1=1, axis2=2))
     sigma = np.sqrt(np.diagonal(S, axis1=1, axis2=2))
     indices = np.array([pose.index for pose in known], float)
     sigma_m, sigma_deg = sigma[:, :3].max(axis=1, initial=0.0), np.degrees(sigma[:, 3:].max(axis=1, initial=0.0))
-    return FrameErrors(indices, judged, ok, exact, error_m, error_deg, sigma_m, sigma_deg, nees, likelihood), known, true
+    errors = FrameErrors(indices, judged, ok, exact, error_m, error_deg, sigma_m, sigma_deg, nees, likelihood, likely, spread)
+    return errors, known, true
 
 
 def _robustly_aligned(T: F64, true: F64, aligned: Bool) -> tuple[F64, F64]:
@@ -162,12 +192,12 @@ def _noise_of_truth(poses: Sequence[Pose], true: F64) -> TruthNoise:
     return truth_noise(T, local, true, indices)
 
 
-def _normalised_errors(T: F64, covariances: F64, true: F64) -> tuple[F64, F64]:
-    """Return (n,) NEES and log-likelihood in nats of the errors of poses."""
+def _normalised_errors(T: F64, covariances: F64, true: F64) -> tuple[F64, F64, F64]:
+    """Return (n,) NEES, log-likelihood in nats and metres of the errors of poses."""
     errors = gauge_free_errors(T, covariances, true)
     nees = np.einsum("ni,nij,nj->n", errors, inv(covariances), errors)
     log_determinants = 2.0 * np.log(np.diagonal(cholesky(2.0 * np.pi * covariances), axis1=1, axis2=2)).sum(axis=1)
-    return nees, -0.5 * (nees + log_determinants)
+    return nees, -0.5 * (nees + log_determinants), np.linalg.norm(errors[:, :3], axis=1)
 
 
 def _steps(known: Sequence[Pose], true: F64) -> tuple[int, int]:

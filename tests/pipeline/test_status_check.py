@@ -9,7 +9,7 @@ import pytest
 
 from trihedron.pipeline.core.lie import exp_se3
 from trihedron.pipeline.core.types import LOST, OK, Pose, Trajectory
-from trihedron.pipeline.run.status_check import check_status, sigma_auc
+from trihedron.pipeline.run.status_check import check_status, name_of_test, sigma_auc
 
 SOMEWHERE = exp_se3(np.array([3.0, -1.0, 2.0, 0.4, -2.0, 1.0]))
 
@@ -67,6 +67,37 @@ def test_each_sub_map_is_aligned_by_itself_and_lost_frames_do_not_count() -> Non
     joined, _ = check_status([replace(pose, submap=0) for pose in poses], truth)
     assert joined.wrong_ok > 150
     assert len(errors.error_m) == 399
+
+
+def test_the_spread_is_that_of_the_errors_where_sigma_is_honest_and_follows_it() -> None:
+    poses, truth = run_of()
+    honest = check_status(poses, truth)[0].spread_over_error
+    poses = [replace(pose, covariance=9.0 * pose.covariance) for pose in poses]
+    cautious = check_status(poses, truth)[0].spread_over_error
+    assert honest is not None and 1.0 < honest < 1.5  # errors independent from frame to frame count as the truth's, too
+    assert cautious is not None and cautious > 2.0 * honest
+    unknown = check_status(poses, Trajectory(np.zeros(0, np.int64), np.zeros((0, 4, 4))))[0]
+    assert (unknown.ok, unknown.ate_m, unknown.spread_over_error) == (400, None, None)
+
+
+def test_frames_that_are_not_ok_are_counted_by_the_test() -> None:
+    poses, truth = run_of()
+    for i, (status, reason) in enumerate([("degraded", "only 5 of 40 matches agree"), ("degraded", "only 7 of 9 matches agree"), (LOST, "covered")]):
+        poses[i] = replace(poses[i], status=status, reason=reason)
+    assert check_status(poses, truth)[0].not_ok == {"only … of … matches agree": 2, "covered": 1}
+
+
+@pytest.mark.parametrize(
+    "reason, test",
+    [
+        ("something moves: only 5 of 40 matches agree", "something moves"),
+        ("in sub-map 2, which is not merged with the first yet: 3 points", "in sub-map …"),
+        ("images are 0.31 px off, 4.2 times what is stated", "images are … px off"),
+        ("", "no reason"),
+    ],
+)
+def test_a_test_is_named_by_the_first_clause_of_its_reason_without_figures(reason: str, test: str) -> None:
+    assert name_of_test(reason) == test
 
 
 def test_sigma_tells_large_errors_from_small_ones() -> None:

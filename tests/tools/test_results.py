@@ -13,7 +13,10 @@ from trihedron.pipeline.core.errors import DataError
 ROOT = Path(__file__).parents[2]
 RESULTS = ROOT / "docs" / "results"
 AGAIN = "write it again: python docs/results/render.py"
-OLDER = {"methods.json": "takes an hour; its note says under which conditions"}  # files of other commits than sequences.json, and why
+OLDER = {  # files of other commits than sequences.json, and why
+    "methods.json": "takes an hour; its note says under which conditions",
+    "honesty.json": "takes half an hour",
+}
 UNITS = r"(?:mm|cm|deg|°|ms|frames/s|MB)"
 NUMBER = re.compile(rf"\d\s?{UNITS}(?![\w/])|NEES\D{{0,40}}\d")
 COLUMN = re.compile(r"\b(?:ATE|RPE|NEES|mm|deg|ms|MB)\b|frames/s|°")
@@ -63,7 +66,7 @@ def test_every_file_states_its_commit_and_files_of_other_commits_a_reason():
     others = {name for name, found in files.items() if found["commit"] != files["sequences.json"]["commit"]}
     assert others <= set(OLDER)
     for name in others:
-        assert files[name]["note"].lower() in render.source_line(files[name]).lower()
+        assert files[name].get("note", "").lower() in render.source_line(files[name]).lower()
 
 
 @pytest.mark.parametrize("page", JUDGED, ids=lambda path: path.stem)
@@ -135,3 +138,33 @@ def test_methods_of_another_commit_are_measured_again(tmp_path, monkeypatch):
     assert measure.methods([], "b")["runs"] == []
     assert [words[:2] for words in called] == [("run", "-m"), ("benchmark", "detectors"), ("benchmark", "methods")]
     assert f"out={tmp_path / 'b' / 'methods'}" in called[0]
+
+
+def test_honesty_is_measured_on_the_given_sequences_and_kept_by_commit(tmp_path, monkeypatch):
+    def program(*words):
+        called.append(words)
+        (tmp_path / "b" / "honesty" / "honesty.json").write_text('{"rows": [], "alarms": [], "runs": []}')
+
+    called = []
+    monkeypatch.setattr(measure, "WORK", tmp_path)
+    monkeypatch.setattr(measure, "_program", program)
+    assert measure.honesty(["tum:desk"], "b") == {"minutes": 0.0, "rows": [], "alarms": [], "runs": []}
+    folder = tmp_path / "b" / "honesty"
+    assert called == [("benchmark", "honesty", "tum:desk", "--runs", str(folder), "--json", str(folder / "honesty.json"))]
+
+
+def test_blocks_of_honesty_part_clean_runs_from_faults(monkeypatch):
+    figures = {name: {"mean": 1.0, "interval": [0.5, 1.5]} for name in ("ok_share", "lost_share", "ate_m", "nees_median", "share_within_95")}
+    figures |= dict.fromkeys(("sigma_auc", "log_likelihood", "spread_over_error"))
+    row = {"runs": 3, "frames": 30, "not_ok": {}, **figures}
+    found = {
+        "rows": [
+            {"kind": "sensor", "name": "tof", "wrong_ok": 0, **row},
+            {"kind": "fault", "name": "frozen", "wrong_ok": 2, **row, "not_ok": {"the images repeat": 7}},
+        ],
+        "alarms": [{"test": "something moves", "frames": 1, "share": {"mean": 0.01, "interval": None}}],
+    }
+    monkeypatch.setattr(render, "read", lambda part: found)
+    clean, faults = render.honesty_sensors(), render.honesty_faults()
+    assert "| sensor | tof | 3 | 30 | 0 | 100.0 [50.0, 150.0] |" in clean and "| something moves | 1 | 1.00 |" in clean and "frozen" not in clean
+    assert "the images repeat (7) |" in faults and "Cases with wrong `ok` frames: `frozen` (2)." in faults and "tof" not in faults

@@ -1,9 +1,8 @@
 """Judge the status of poses under degenerate input: each case is a run of `dataset=faults`, one row of one table.
 
-Columns: frames, those ok, degraded and lost, ATE of the posed frames (as estimated at the time, each sub-map aligned by itself), the largest error of
-an ok frame, and wrong ok: ok frames that are off by more than 5 cm and 4 σ, or 2° and 4 σ. Poses are compared
-without a change of scale. --runs keeps the runs in a folder, and judges those it holds already, without another run. Other words are overrides of
-`trihedron run`; options of the data set underneath are +dataset.options.NAME=VALUE.
+Columns are those of `trihedron benchmark honesty`, which has these rows beside those of clean runs. Poses are compared without a change of scale.
+--runs keeps the runs in a folder, and judges those it holds already, without another run. Other words are overrides of `trihedron run`; options of
+the data set underneath are +dataset.options.NAME=VALUE.
 
 Example: trihedron benchmark faults --cases frozen_depth,black_color
 """
@@ -11,16 +10,11 @@ Example: trihedron benchmark faults --cases frozen_depth,black_color
 from __future__ import annotations
 
 import json
-import tempfile
 from collections.abc import Sequence
 from pathlib import Path
 
-import numpy as np
-
-from trihedron.pipeline.core.errors import UsageError
-from trihedron.pipeline.core.text_table import table
 from trihedron.tools.arguments import Parser
-from trihedron.tools.benchmarks.sensor_benchmark import Judged, chosen, run_and_judge
+from trihedron.tools.benchmarks.judged_runs import FAULT, Case, check_overrides, chosen, judged_cases, kept_or_temporary, plain, report
 
 LENGTH = 90  # frames of the data set underneath where the case states none
 CASES = {  # name -> what the data set is given
@@ -42,7 +36,6 @@ CASES = {  # name -> what the data set is given
     "mirrored_for_a_second": ("dataset.mirror=true", "dataset.during=30:60"),
     "two_recordings": ("dataset.join=45", "+dataset.joined.seed=1", "+dataset.joined.slanted=true"),
 }
-HEADER = ["case", "frames", "ok", "degraded", "lost", "ATE mm", "largest ok mm", "wrong ok", "NEES"]
 
 
 def main(argv: list[str]) -> int:
@@ -52,18 +45,19 @@ def main(argv: list[str]) -> int:
     parser.add_argument("--runs", type=Path, metavar="FOLDER", help="keep the runs here, and judge those that are there")
     parser.add_argument("--json", type=Path, metavar="FILE", help="write the figures of each case")
     options, overrides = parser.parse_known_args(argv)
-    for word in overrides:
-        if "=" not in word:
-            raise UsageError("benchmark faults", f"'{word}' is not key=value", "see trihedron benchmark faults --help")
-    found: dict[str, Judged] = {}
-    with tempfile.TemporaryDirectory() as temporary:
-        folder: Path = options.runs or Path(temporary)
-        for case in chosen(options.cases, CASES):
-            found[case] = run_and_judge(folder / case, words_of(case, overrides))
-    print(table([HEADER, *(row_of(case, judged) for case, judged in found.items())], "lrrrrrrrr"))
+    check_overrides("benchmark faults", overrides)
+    with kept_or_temporary(options.runs) as folder:
+        found = list(judged_cases(fault_cases(options.cases, overrides), folder))
+    print("\n" + report(found))
     if options.json:
-        options.json.write_text(json.dumps({case: check.to_dict() for case, (check, _) in found.items()}, indent=2) + "\n")
+        options.json.write_text(json.dumps([plain(one) for one in found], indent=2) + "\n")
     return 0
+
+
+def fault_cases(names: str, overrides: Sequence[str], seed: int = 0) -> list[Case]:
+    """Return the runs of the cases A,B with a seed of the room underneath. Raises UsageError for an unknown one."""
+    words = [*overrides, *([f"+dataset.options.seed={seed}"] if seed else [])]
+    return [Case(name, words_of(name, words), {FAULT: name}, seed) for name in chosen(names, CASES)]
 
 
 def words_of(case: str, overrides: Sequence[str] = ()) -> list[str]:
@@ -71,13 +65,3 @@ def words_of(case: str, overrides: Sequence[str] = ()) -> list[str]:
     own = any("options.length" in word for word in CASES[case])
     length = () if own else (f"+dataset.options.length={LENGTH}",)
     return ["dataset=faults", *length, *CASES[case], "outputs=[trajectory]", *overrides]
-
-
-def row_of(case: str, judged: Judged) -> list[str]:
-    """Fill the row of a case."""
-    check, errors = judged
-    ok = errors.error_m[errors.ok & errors.judged]
-    ate = "-" if check.ate_m is None else f"{1e3 * check.ate_m:.1f}"
-    largest = f"{1e3 * float(np.max(ok)):.1f}" if len(ok) else "-"
-    nees = "-" if check.nees_median is None else f"{check.nees_median:.1f}"
-    return [case, *(str(n) for n in (check.frames, check.ok, check.degraded, check.lost)), ate, largest, str(check.wrong_ok), nees]
