@@ -14,7 +14,7 @@ from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
 from setuptools.config.pyprojecttoml import load_file
 
-from trihedron.pipeline.core.libraries import declared, distribution_of
+from trihedron.pipeline.core.libraries import declared_requirements, distribution_of
 
 ROOT = Path(__file__).resolve().parents[1]
 PROJECT = load_file(ROOT / "pyproject.toml")["project"]
@@ -156,7 +156,7 @@ def test_modules_belong_to_the_distributions_that_install_them():
 
 def test_the_installed_package_requires_what_the_project_declares():
     """Else it is to be installed again: pip install -e '.[dev]'."""
-    assert {extra: set(names) for extra, names in declared().items()} == {"": BASE, **EXTRAS}
+    assert {extra: set(names) for extra, names in declared_requirements().items()} == {"": BASE, **EXTRAS}
 
 
 def test_it_can_fail():

@@ -20,7 +20,7 @@ from trihedron.datasets.readers.foxglove_messages import UnreadableMessage, read
 from trihedron.datasets.readers.icl_nuim import IclNuim
 from trihedron.datasets.readers.tum import Tum
 from trihedron.pipeline.app.cli import main
-from trihedron.pipeline.core.config import composed
+from trihedron.pipeline.core.config import compose_run
 from trihedron.pipeline.core.errors import DataError, RecordingError
 from trihedron.pipeline.core.files import read_file
 from trihedron.pipeline.core.slots import SLOTS
@@ -195,7 +195,7 @@ def test_what_else_a_recording_holds_is_ignored(tmp_path):
     from trihedron.pipeline.app.recorded_run import composed_run
 
     file = recording(tmp_path / "hostile.mcap", IGNORED, ["hydra.run.dir=/elsewhere", "+hydra.callbacks.x._target_=os.system", "-m"])
-    mine, plain = composed_run(Recording(file), ["out=x"]), composed(["dataset.seed=3", "seed=5", "out=x"])
+    mine, plain = composed_run(Recording(file), ["out=x"]), compose_run(["dataset.seed=3", "seed=5", "out=x"])
     assert OmegaConf.to_yaml(mine) == OmegaConf.to_yaml(plain)
 
 
@@ -212,7 +212,7 @@ def test_the_command_line_comes_on_top_of_a_recording(tmp_path):
     from trihedron.pipeline.app.recorded_run import composed_run
 
     words = ["manhattan.cone_deg=5", "dataset=tum", "dataset.path=/data", "without=bundle", "planes.rounds=2", "outputs=[trajectory,surface]"]
-    made = composed(words)
+    made = compose_run(words)
     recorded = Recording(recording(tmp_path / "run.mcap", OmegaConf.to_yaml(made, resolve=True)))
     same = composed_run(recorded)
     assert all(same[slot] == made[slot] for slot in (*SLOTS, "graph", "outputs", "seed"))
@@ -221,8 +221,8 @@ def test_the_command_line_comes_on_top_of_a_recording(tmp_path):
     assert (swapped.manhattan.plugin, swapped.bundle.plugin, swapped.dataset.plugin) == ("branch_and_bound", "local_window", "synthetic")
     assert swapped.planes.rounds == 2 and swapped.manhattan.cone_deg == 12.0
     other = composed_run(recorded, ["graph=points", "without=relocalise"])
-    assert other.dataset.path == "/data" and other.graph == composed(["graph=points"]).graph and other.relocalise.plugin == "none"
-    assert composed([]).manhattan.cone_deg == 12.0 and composed([]).dataset.plugin == "synthetic"  # nothing stays of it
+    assert other.dataset.path == "/data" and other.graph == compose_run(["graph=points"]).graph and other.relocalise.plugin == "none"
+    assert compose_run([]).manhattan.cone_deg == 12.0 and compose_run([]).dataset.plugin == "synthetic"  # nothing stays of it
 
 
 def test_the_frames_of_a_recording_are_no_paths():

@@ -172,9 +172,9 @@ def machine() -> dict[str, Any]:
 
 def sample_images(overrides: list[str]) -> list[U8]:
     """Grey images (h, w) of frames spread over the run."""
-    from trihedron.pipeline.core.config import composed, make_plugin
+    from trihedron.pipeline.core.config import compose_run, make_plugin
 
-    dataset = make_plugin("dataset", composed(overrides).dataset)
+    dataset = make_plugin("dataset", compose_run(overrides).dataset)
     frames = [dataset(i) for i in range(0, len(dataset), max(-(-len(dataset) // REFERENCE_FRAMES), 1))]
     return [frame.gray for frame in frames if frame is not None]
 

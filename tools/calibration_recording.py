@@ -13,7 +13,7 @@ from trihedron.pipeline.core.errors import DataError
 from trihedron.pipeline.core.geometry import invert
 from trihedron.pipeline.core.lie import log_so3
 from trihedron.pipeline.core.types import F32, F64, Camera, Frame, Keypoints, Matches, Trajectory
-from trihedron.pipeline.core.value_checks import check_together, checked
+from trihedron.pipeline.core.value_checks import check_together, validate_value
 from trihedron.pipeline.record.reader import Recording
 from trihedron.tools.calibration_judgement import blocks_of
 from trihedron.tools.calibration_pairs import Observations, Pairs
@@ -54,8 +54,8 @@ def read_recording(recording: Recording) -> Recorded:
         raise DataError(place, "has fewer than three posed frames", "calibrate from a run that tracked its camera")
     chosen = [posed[row] for row in np.unique(np.linspace(0, len(posed) - 1, FRAMES).astype(int))]
     known = [(frame, rows[reference.stamp_ns]) for reference in chosen if (frame := read(reference)) is not None]
-    keypoints = {v.index: v for found in recording.values("keypoints") if isinstance(v := checked("keypoints", found, place), Keypoints)}
-    matches = {v.index: v for found in recording.values("matches") if isinstance(v := checked("matches", found, place), Matches)}
+    keypoints = {v.index: v for found in recording.values("keypoints") if isinstance(v := validate_value("keypoints", found, place), Keypoints)}
+    matches = {v.index: v for found in recording.values("matches") if isinstance(v := validate_value("matches", found, place), Matches)}
     pixels, sigmas, landmarks = [], [], []
     for frame, _ in known:
         points, matched = keypoints.get(frame.index), matches.get(frame.index)

@@ -127,8 +127,8 @@ def _metadata(destination: Path) -> dict[str, str]:
 
     import yaml
 
-    from trihedron.pipeline.core.overrides import quoted
+    from trihedron.pipeline.core.overrides import quote
 
     path = str(destination.resolve())
-    overrides, config = ["dataset=mcap", f"dataset.path={quoted(path)}"], {"dataset": {"plugin": "mcap", "path": path}}
+    overrides, config = ["dataset=mcap", f"dataset.path={quote(path)}"], {"dataset": {"plugin": "mcap", "path": path}}
     return {"version": version("trihedron"), "commit": "", "overrides": json.dumps(overrides), "config": yaml.safe_dump(config)}

@@ -14,7 +14,7 @@ import sys
 from importlib.util import find_spec
 from pathlib import Path
 
-from trihedron.pipeline.core.libraries import declared, install_command
+from trihedron.pipeline.core.libraries import declared_requirements, install_command
 from trihedron.pipeline.core.text_table import table
 from trihedron.tools.arguments import Parser
 from trihedron.tools.system_check import OPTIONAL, REQUIRED, check
@@ -23,7 +23,7 @@ from trihedron.tools.system_check import OPTIONAL, REQUIRED, check
 def main(argv: list[str]) -> int:
     """Run the command; returns the exit code."""
     Parser("doctor", __name__).parse_args(argv)
-    libraries = declared()
+    libraries = declared_requirements()
     missing = [name for name in libraries.get("", ()) if version_of(name) is None]
     broken = {module: problem for module in (*REQUIRED, *OPTIONAL) if find_spec(module) is not None and (problem := check(module))}
     rows = [

@@ -24,14 +24,14 @@ from typing import Any
 import numpy as np
 
 from trihedron.pipeline.core.comments import field_comments
-from trihedron.pipeline.core.config import composed, default_plugins, graph_of
+from trihedron.pipeline.core.config import compose_run, default_plugins, graph_of
 from trihedron.pipeline.core.errors import RecordingError, TrihedronError
 from trihedron.pipeline.core.graph import Graph, Stage
 from trihedron.pipeline.core.options import OneOf, Range, check_options, constraints_of
 from trihedron.pipeline.core.registry import check_value, options_of
 from trihedron.pipeline.core.slots import CAMERA, FOLDS, RNG, SLOTS, accepts_none, inputs_of, output_of
 from trihedron.pipeline.core.types import LOST, Frame, Pose, Trajectory, Value
-from trihedron.pipeline.core.value_checks import check_together, checked
+from trihedron.pipeline.core.value_checks import check_together, validate_value
 from trihedron.pipeline.core.wires import PREVIOUS, Wire
 from trihedron.pipeline.record.codec import Encoder
 from trihedron.pipeline.record.reader import Recording
@@ -132,7 +132,7 @@ class PluginCheck:
         if self.given is not None:
             return self.given
         outputs = [] if self.slot == "dataset" else [f"outputs=[{self.slot}]"]
-        return graph_of(composed([f"{self.slot}={self.name}", *outputs, *self.words])).stages[self.slot].plugin
+        return graph_of(compose_run([f"{self.slot}={self.name}", *outputs, *self.words])).stages[self.slot].plugin
 
     @property
     def summary(self) -> str:
@@ -215,7 +215,7 @@ class PluginCheck:
                 if value is None:
                     continue
                 found += 1
-                checked(self.slot, value, "value")
+                validate_value(self.slot, value, "value")
                 check_together({**arguments, self.slot: value}, "value", {})
         except RecordingError as error:
             return Result("values", False, error.cause)
@@ -234,7 +234,7 @@ class PluginCheck:
             try:
                 for arguments, value in calls_of(self.plugin, self.slot, scene):
                     if value is not None:
-                        checked(self.slot, value, "value")
+                        validate_value(self.slot, value, "value")
                         check_together({**arguments, self.slot: value}, "value", {})
             except RecordingError as error:
                 return Result("adverse scenes", False, f"{scene.name}: {error.cause}")
@@ -307,7 +307,7 @@ class PluginCheck:
         if default == self.name:
             return Result("differs", True, "it is the default")
         scene = room(self._upstream)
-        plugin = graph_of(composed([f"outputs=[{self.slot}]", *self._upstream])).stages[self.slot].plugin
+        plugin = graph_of(compose_run([f"outputs=[{self.slot}]", *self._upstream])).stages[self.slot].plugin
         differing = sum(a != b for a, b in zip(self._call_on_scene(scene), [encode_value(v) for v in values_of(plugin, self.slot, scene)]))
         good = differing > 0 or not self._named_modules or self.slot in SILENT  # other methods may agree in a plain room
         return Result("differs", good, f"from {default} in {differing} values")
@@ -348,7 +348,7 @@ def _changed_scene(name: str, words: tuple[str, ...]) -> Scene:
 
 def _scene(name: str, words: tuple[str, ...], frames: tuple[Frame, ...] | None) -> Scene:
     """Run the default graph, without folds, on the room or on other frames."""
-    config = composed([*ROOM, *words])
+    config = compose_run([*ROOM, *words])
     config.outputs = [topic for topic in config.graph if topic not in FOLDS and config.get(topic) is not None and topic in SLOTS]
     graph = graph_of(config)
     if frames is not None:

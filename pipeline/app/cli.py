@@ -234,10 +234,10 @@ def _data_set(word: str) -> list[str]:
 def run_once(words: list[str], began: float) -> tuple[Path, dict[str, Any]]:
     """Make one run of these words, which began at a time (perf_counter). Returns its folder and its metrics. Raises TrihedronError."""
     with memory.gc_paused():
-        from trihedron.pipeline.core.config import check_added, composed, rewritten
+        from trihedron.pipeline.core.config import check_added, compose_run, rewrite_error
 
         check_added(words)
-        config = composed(words, _recorded_config(words))
+        config = compose_run(words, _recorded_config(words))
     if config.dry_run:
         raise UsageError(DRY_RUN[0], "is of a sweep, and this is one run", "add -m to run once with each of several values")
     from trihedron.pipeline.app.execute import execute
@@ -245,7 +245,7 @@ def run_once(words: list[str], began: float) -> tuple[Path, dict[str, Any]]:
     try:
         out = Path(config.out).expanduser().absolute()
     except Exception as error:  # an interpolation of the user's that leads nowhere
-        raise rewritten(error) from error
+        raise rewrite_error(error) from error
     config.out = literal_text(str(out))  # with the time of its beginning
     metrics = execute(config, out, with_literal_paths(words), began)
     if not config.replay:  # a part of a run, and no run to look at
@@ -257,20 +257,20 @@ def _sweep(words: list[str], recorded: RecordedConfig | None) -> int:
     """Let Hydra's multirun carry the jobs; then report."""
     import hydra
 
-    from trihedron.pipeline.core.config import register_configs, rewritten
+    from trihedron.pipeline.core.config import register_configs, rewrite_error
     from trihedron.pipeline.core.registry import load_plugins
 
     os.environ["HYDRA_FULL_ERROR"] = "1"  # exceptions come to us instead of being printed
     load_plugins()
     register_configs(recorded)
     overrides = with_literal_paths(words, sweep=True)
-    outcomes = _swept(words)
+    outcomes = _run_sweep(words)
     _FAILURES.clear()
     sys.argv = ["trihedron run", *sorted(overrides, key=lambda word: word not in RUN_FLAGS)]  # flags first
     try:
         hydra.main(config_path="pkg://trihedron.conf", config_name="root", version_base="1.3")(_task)()
     except Exception as error:
-        raise error if isinstance(error, TrihedronError) else rewritten(error) from error
+        raise error if isinstance(error, TrihedronError) else rewrite_error(error) from error
     for outcome in outcomes:
         if len(outcome.failures) < outcome.jobs:
             _dispatch([*(shlex.split(outcome.report) or ["compare"]), str(outcome.folder)])
@@ -281,7 +281,7 @@ def _sweep(words: list[str], recorded: RecordedConfig | None) -> int:
     return 0
 
 
-def _swept(words: list[str]) -> list[Outcome]:
+def _run_sweep(words: list[str]) -> list[Outcome]:
     """Path of the outcomes of the sweeps that the words ask for; a single run does not wait for the engines of sweeps to be imported."""
     if not _is_sweep(words):
         return []

@@ -24,7 +24,7 @@ from trihedron.pipeline.core.config import Feedback, graph_of
 from trihedron.pipeline.core.errors import ConfigError, DataError, RecordingError, did_you_mean, printable
 from trihedron.pipeline.core.files import sha256_of
 from trihedron.pipeline.core.graph import Graph
-from trihedron.pipeline.core.overrides import literal_text, path_of, quoted
+from trihedron.pipeline.core.overrides import literal_text, path_of, quote
 from trihedron.pipeline.core.registry import write_files_of
 from trihedron.pipeline.core.slots import SLOTS, output_of
 from trihedron.pipeline.core.types import Trajectory
@@ -220,7 +220,7 @@ def _absolute(path: str) -> str:
 
 def _absolute_word(word: str) -> str:
     found = path_of(word)
-    return word if found is None or found[0].lstrip("+") not in READ_PATHS else f"{found[0]}={quoted(_absolute(found[1]))}"
+    return word if found is None or found[0].lstrip("+") not in READ_PATHS else f"{found[0]}={quote(_absolute(found[1]))}"
 
 
 @cache

@@ -6,7 +6,7 @@ from collections.abc import Iterable
 
 from omegaconf import DictConfig
 
-from trihedron.pipeline.core.config import RecordedConfig, composed
+from trihedron.pipeline.core.config import RecordedConfig, compose_run
 from trihedron.pipeline.core.recorded_config import recorded_config
 from trihedron.pipeline.record.reader import Recording
 
@@ -18,4 +18,4 @@ def recorded_config_of(recording: Recording) -> RecordedConfig:
 
 def composed_run(recording: Recording, overrides: Iterable[str] = ()) -> DictConfig:
     """Compose the recorded run with the user's own overrides on top. Raises TrihedronError, one line."""
-    return composed(overrides, recorded_config_of(recording))
+    return compose_run(overrides, recorded_config_of(recording))

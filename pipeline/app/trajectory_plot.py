@@ -81,7 +81,7 @@ def _draw_top(axes: Any, estimate: Trajectory, truth: Trajectory | None) -> None
     across, up = sorted(np.argsort(-np.ptp(points, axis=0), kind="stable")[:2])
     for trajectory, color, label in ((truth, TRUTH_COLOR, "ground truth"), (estimate, ESTIMATE_COLOR, "estimate")):
         if trajectory is not None:
-            broken = _broken(trajectory.stamps_ns, trajectory.poses[:, :3, 3])
+            broken = _break_at_gaps(trajectory.stamps_ns, trajectory.poses[:, :3, 3])
             axes.plot(broken[:, across], broken[:, up], color=color, label=label, linewidth=1.5 if color == ESTIMATE_COLOR else 3.0)
     start = estimate.poses[0, :3, 3]
     axes.plot(start[across], start[up], "o", color="black", markersize=5, label="start")
@@ -96,7 +96,7 @@ def _draw_curves(figure: Any, grid: Any, stamps_ns: NDArray[np.int64], curves: l
     axes = None
     for row, (label, values) in enumerate(curves):
         axes = figure.add_subplot(grid[row, 1], sharex=axes)
-        curve = _broken(stamps_ns, np.column_stack([(stamps_ns - stamps_ns[0]) / 1e9, values]))
+        curve = _break_at_gaps(stamps_ns, np.column_stack([(stamps_ns - stamps_ns[0]) / 1e9, values]))
         axes.plot(curve[:, 0], curve[:, 1], color=ESTIMATE_COLOR, linewidth=1.0)
         for name, color in STATUS_COLORS.items():
             times = [(stamp_ns - stamps_ns[0]) / 1e9 for stamp_ns, found in status if found == name]
@@ -108,7 +108,7 @@ def _draw_curves(figure: Any, grid: Any, stamps_ns: NDArray[np.int64], curves: l
         axes.grid(alpha=0.3)
 
 
-def _broken(stamps_ns: NDArray[np.int64], rows: F64) -> F64:
+def _break_at_gaps(stamps_ns: NDArray[np.int64], rows: F64) -> F64:
     """Insert a NaN row into rows over time at each gap, so that the line breaks."""
     steps = np.diff(stamps_ns)
     gaps = np.flatnonzero(steps > GAP_STEPS * np.median(steps)) + 1 if len(steps) else np.empty(0, np.int64)

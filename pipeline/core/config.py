@@ -215,7 +215,7 @@ def check_added(overrides: Iterable[str]) -> None:
             raise UsageError(added[1], "there is no such key to add to", cure if cure.startswith("did") else "see trihedron run --help")
 
 
-def composed(overrides: Iterable[str], recorded: RecordedConfig | None = None) -> DictConfig:
+def compose_run(overrides: Iterable[str], recorded: RecordedConfig | None = None) -> DictConfig:
     """Compose the configuration that `trihedron run` makes of these overrides, over the values of a recording. Raises TrihedronError, one line."""
     return composed_each([overrides], recorded)[0]
 
@@ -228,10 +228,10 @@ def composed_each(overrides: Iterable[Iterable[str]], recorded: RecordedConfig |
         with initialize_config_module("trihedron.conf", version_base="1.3"):
             return [compose("root", overrides=with_literal_paths(words)) for words in overrides]
     except Exception as error:
-        raise rewritten(error) from error
+        raise rewrite_error(error) from error
 
 
-def rewritten(error: Exception) -> TrihedronError:
+def rewrite_error(error: Exception) -> TrihedronError:
     """Rewrite an error that Hydra or OmegaConf raises while composing as one line with place, cause and cure."""
     text = " ".join(str(error).split())
     cause: BaseException = error.__cause__ or error

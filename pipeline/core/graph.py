@@ -41,7 +41,7 @@ class Graph:
     stages: Mapping[str, Stage]
     outputs: tuple[str, ...]
 
-    def needed(self, targets: Iterable[str], given: Container[str] = ()) -> set[str]:
+    def required_stages(self, targets: Iterable[str], given: Container[str] = ()) -> set[str]:
         """Return the stages that `targets` depend on, delayed wires included, and the targets; without those `given`, and what only they need."""
         found: set[str] = set()
         pending = list(targets)
@@ -65,8 +65,8 @@ def build_graph(plugins: Mapping[str, Any], outputs: Iterable[str], wiring: Mapp
     for stage in stages.values():
         for parameter, wire in stage.inputs.items():
             _check_wire(stage, parameter, wire, stages)
-    graph = Graph({name: stages[name] for name in _sorted(stages)}, tuple(outputs))
-    needed = graph.needed(_targets(graph))
+    graph = Graph({name: stages[name] for name in _topological_order(stages)}, tuple(outputs))
+    needed = graph.required_stages(_targets(graph))
     return Graph({name: stage for name, stage in graph.stages.items() if name in needed}, graph.outputs)
 
 
@@ -123,7 +123,7 @@ def _check_wire(stage: Stage, parameter: str, wire: Wire, stages: Mapping[str, S
         raise GraphError(place, cause, f"wire it to '{wire.topic}', or take the input as optional")
 
 
-def _sorted(stages: Mapping[str, Stage]) -> list[str]:
+def _topological_order(stages: Mapping[str, Stage]) -> list[str]:
     """Sort topologically by the wires within a frame, ties in the order of the slots. Raises GraphError naming a cycle."""
     order: list[str] = []
     waiting = [name for name in SLOTS if name in stages]

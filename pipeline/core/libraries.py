@@ -57,11 +57,11 @@ def distribution_of(module: str) -> str:
 def install_command(module: str) -> str:
     """Return the command that installs the library of a module, or a distribution: by the extra that declares it, else by its own name."""
     name = distribution_of(module)
-    extra = next((extra for extra, names in declared().items() if extra and name in names), "")
+    extra = next((extra for extra, names in declared_requirements().items() if extra and name in names), "")
     return f"pip install 'trihedron[{extra}]'" if extra else f"pip install {name}"
 
 
-def declared() -> dict[str, list[str]]:
+def declared_requirements() -> dict[str, list[str]]:
     """Return the distributions that the installed package requires: of its base under "", then of each extra."""
     found: dict[str, list[str]] = defaultdict(list)
     for line in importlib.metadata.requires("trihedron") or ():

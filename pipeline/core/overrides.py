@@ -23,7 +23,7 @@ def literal_text(text: str) -> str:
     return re.sub(r"(\\*)\$\{", lambda match: match[1] * 2 + r"\${", text)
 
 
-def quoted(text: str) -> str:
+def quote(text: str) -> str:
     """The text as one quoted value of Hydra's grammar; a plain word stays as it is."""
     if PLAIN.fullmatch(text):
         return text
@@ -48,14 +48,14 @@ def with_literal_paths(words: Iterable[str], sweep: bool = False) -> list[str]:
 
 def _literal_word(word: str, sweep: bool) -> str:
     if (found_list := word.partition("="))[0] in LISTS and found_list[2].startswith("["):
-        return f"{found_list[0]}=[{','.join(quoted(element) for element in list_elements(found_list[2]))}]"
+        return f"{found_list[0]}=[{','.join(quote(element) for element in list_elements(found_list[2]))}]"
     found = path_of(word)
     if found is None or not found[1]:
         return word
     key, value = found
     if sweep and key != "out" and SWEPT.match(value) and not Path(value).expanduser().exists():
         return word
-    return f"{key}={quoted(value)}"
+    return f"{key}={quote(value)}"
 
 
 def list_elements(text: str) -> list[str]:

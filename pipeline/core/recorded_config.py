@@ -35,15 +35,15 @@ def recorded_config(text: str, place: str) -> RecordedConfig:
 
     Raises RecordingError, one line, for anything else; keys that a replay does not take are ignored."""
     load_plugins()
-    content = _parsed(text, place)
+    content = _parse_mapping(text, place)
     options = {slot: _options(content[slot], slot, place) for slot in SLOTS if content.get(slot) is not None}
     graph = _graph(content["graph"], place) if content.get("graph") is not None else None
     node = OmegaConf.structured(RunOptions)
-    root = {key: _typed(node, key, content[key], key, place) for key in ROOT_KEYS if key in content}
+    root = {key: _convert_value(node, key, content[key], key, place) for key in ROOT_KEYS if key in content}
     return RecordedConfig(options, graph, root)
 
 
-def _parsed(text: str, place: str) -> Mapping[str, Any]:
+def _parse_mapping(text: str, place: str) -> Mapping[str, Any]:
     """The mapping in YAML of limited length and depth, without aliases."""
     if len(text) > MAX_CHARACTERS:
         raise RecordingError(place, f"has a configuration of {len(text)} characters, more than {MAX_CHARACTERS}", CURE)
@@ -59,27 +59,27 @@ def _parsed(text: str, place: str) -> Mapping[str, Any]:
 def _options(given: Any, slot: str, place: str) -> Mapping[str, Any]:
     """The options of a slot's plugin."""
     if not isinstance(given, dict) or not isinstance(given.get(PLUGIN_KEY), str):
-        raise RecordingError(place, f"was made with '{slot}: {_shown(given)}', which names no plugin", CURE)
+        raise RecordingError(place, f"was made with '{slot}: {_abbreviate(given)}', which names no plugin", CURE)
     name = current_plugin(slot, given[PLUGIN_KEY])
     try:
         node = plugin_config(name, plugin_class(slot, name))
     except TrihedronError as error:
-        cause = f"was made with {slot}={_shown(name)}, and there is no such plugin for the slot '{slot}'"
+        cause = f"was made with {slot}={_abbreviate(name)}, and there is no such plugin for the slot '{slot}'"
         raise RecordingError(place, cause, "install the package that has it") from error
     for key, value in given.items():
         key = current_option(slot, name, key) if isinstance(key, str) else key
         if key not in (PLUGIN_KEY, None):
-            _typed(node, key, value, f"{slot}.{_shown(key)}", place)
+            _convert_value(node, key, value, f"{slot}.{_abbreviate(key)}", place)
     try:
         make_plugin(slot, node)
     except Exception as error:  # of a third party's plugin anything, for a value that nobody would choose
         cause = f"{error.place}: {error.cause}" if isinstance(error, TrihedronError) else f"{slot}: {type(error).__name__}: {error}"
-        raise RecordingError(place, f"was made with a value out of range: {_shown(cause, 4 * SHOWN)}", CURE) from error
+        raise RecordingError(place, f"was made with a value out of range: {_abbreviate(cause, 4 * SHOWN)}", CURE) from error
     plain: Any = OmegaConf.to_container(node, resolve=False)
     return dict(plain)
 
 
-def _typed(node: DictConfig, key: Any, value: Any, name: str, place: str) -> Any:
+def _convert_value(node: DictConfig, key: Any, value: Any, name: str, place: str) -> Any:
     """Put a value into its typed node; returns it as converted there, its text escaped."""
     if not isinstance(key, str) or key not in node:
         raise RecordingError(place, f"was made with {name}, an option that this program does not have", CURE)
@@ -88,18 +88,18 @@ def _typed(node: DictConfig, key: Any, value: Any, name: str, place: str) -> Any
         plain: Any = OmegaConf.to_container(node, resolve=False)
     except (OmegaConfBaseException, ValueError, TypeError, OverflowError) as error:
         cause = " ".join(str(getattr(error, "msg", None) or error).split()).partition(" full_key")[0]
-        raise RecordingError(place, f"was made with {name}={_shown(value)}: {_shown(cause, 4 * SHOWN)}", CURE) from error
+        raise RecordingError(place, f"was made with {name}={_abbreviate(value)}: {_abbreviate(cause, 4 * SHOWN)}", CURE) from error
     return plain[key]
 
 
 def _graph(given: Any, place: str) -> Mapping[str, Mapping[str, str | None]]:
     """The wires: stage -> input -> topic, all plain words."""
     if not isinstance(given, dict):
-        raise RecordingError(place, f"was made with 'graph: {_shown(given)}', which holds no wires", CURE)
+        raise RecordingError(place, f"was made with 'graph: {_abbreviate(given)}', which holds no wires", CURE)
     for stage, wires in given.items():
         words = [stage, *wires, *(wire for wire in wires.values() if wire is not None)] if isinstance(wires, dict) else [None]
         if not all(isinstance(word, str) and re.fullmatch(r"\w+(@\w+)?", word) for word in words):
-            raise RecordingError(place, f"was made with 'graph.{_shown(stage)}: {_shown(wires)}', which are not wires", CURE)
+            raise RecordingError(place, f"was made with 'graph.{_abbreviate(stage)}: {_abbreviate(wires)}', which are not wires", CURE)
     return {stage: dict(wires) for stage, wires in given.items()}
 
 
@@ -114,7 +114,7 @@ def _literal(value: Any) -> Any:
     return literal_text(value) if isinstance(value, str) else value
 
 
-def _shown(value: Any, length: int = SHOWN) -> str:
+def _abbreviate(value: Any, length: int = SHOWN) -> str:
     """A stranger's text in a message, shortened."""
     text = " ".join(str(value).split())
     return text if len(text) <= length else text[: length - 1] + "…"

@@ -105,7 +105,7 @@ class Table:
 
     def columns_at(self, ids: Array, *names: str) -> list[Array]:
         """Copy rows `ids` of several columns, like `rows` of each."""
-        numbers = self._checked(ids)
+        numbers = self._check_ids(ids)
         return [self._buffers[name].rows.take(numbers, axis=0) for name in names]
 
     def row(self, name: str, number: int) -> Any:
@@ -122,10 +122,10 @@ class Table:
         """Make a version in which rows `ids` (distinct) of the given columns hold new values. Raises IndexError for an id outside 0..size-1."""
         if len(ids) == 0:
             return self
-        numbers, buffers = self._checked(ids), dict(self._buffers)
+        numbers, buffers = self._check_ids(ids), dict(self._buffers)
         for name, given in columns.items():
             column = self.schema[name]
-            buffers[name] = changed = self._copied(name, len(buffers[name].rows), self.freed)
+            buffers[name] = changed = self._copy(name, len(buffers[name].rows), self.freed)
             changed.rows[numbers] = column.rounded(given).reshape(len(numbers), *column.shape)
         written = (numbers // CHUNK).tolist() if self.freed else []
         return Table(self.schema, self.size, self.freed if self.freed.isdisjoint(written) else self.freed.difference(written), buffers)
@@ -140,7 +140,7 @@ class Table:
         for name, given in columns.items():
             column, buffer = self.schema[name], buffers[name]
             if buffer.used != self.size or len(buffer.rows) < size:  # another version has grown from this one, or there is no room
-                buffers[name] = buffer = self._copied(name, max(CHUNK, int(GROWTH * size)), self.freed)
+                buffers[name] = buffer = self._copy(name, max(CHUNK, int(GROWTH * size)), self.freed)
             buffer.rows[self.size : size] = column.rounded(given).reshape(count, *column.shape)
             buffer.used = size
         return Table(self.schema, size, self.freed, buffers), np.arange(self.size, size, dtype=np.int32)
@@ -156,13 +156,13 @@ class Table:
         freed = self.freed.union(numbers.tolist())
         if freed == self.freed:
             return self
-        return Table(self.schema, self.size, freed, {name: self._copied(name, len(buffer.rows), freed) for name, buffer in self._buffers.items()})
+        return Table(self.schema, self.size, freed, {name: self._copy(name, len(buffer.rows), freed) for name, buffer in self._buffers.items()})
 
     def is_empty(self, number: int) -> bool:
         """Return whether this chunk was freed."""
         return number in self.freed
 
-    def _copied(self, name: str, capacity: int, freed: frozenset[int]) -> _Buffer:
+    def _copy(self, name: str, capacity: int, freed: frozenset[int]) -> _Buffer:
         """Copy a column into memory of its own, but for the chunks that are freed: zeros that nobody wrote take no memory."""
         column, known = self.schema[name], self._buffers[name].rows
         rows = _zeros((capacity, *column.shape), column.element)
@@ -173,7 +173,7 @@ class Table:
             rows[first : min(end, self.size)] = known[first : min(end, self.size)]
         return _Buffer(rows, self.size)
 
-    def _checked(self, ids: Array) -> Array:
+    def _check_ids(self, ids: Array) -> Array:
         """Row numbers, after a check. Raises IndexError for one outside 0..size-1."""
         numbers = np.asarray(ids, np.intp)
         if numbers.size and (numbers.min() < 0 or numbers.max() >= self.size):

@@ -46,7 +46,7 @@ def _declared(kind: type) -> _Declared:
     return _KNOWN[kind]
 
 
-def checked(topic: str, value: Value, place: str, expected: type[Value] = Value) -> Value:
+def validate_value(topic: str, value: Value, place: str, expected: type[Value] = Value) -> Value:
     """The value, after the checks that need no other value: of the type of its slot, or an `expected` one. Raises RecordingError naming the file,
     topic, frame and field."""
     expected = output_of(topic) if topic in SLOTS else expected

@@ -149,13 +149,13 @@ class Decoder:
 
     def decode(self, data: bytes) -> Value:
         """A value from its bytes. Raises RecordingError for damaged bytes, an unknown type or another version of a type."""
-        return self._made(self._parse_message(data), lambda name, arrays: self._tables[name].next(name, change_of(name, arrays)))
+        return self._make_value(self._parse_message(data), lambda name, arrays: self._tables[name].next(name, change_of(name, arrays)))
 
     def decode_last(self, chain: Sequence[bytes]) -> Value:
         """The last of messages of which each builds on the one before and the first stands alone. Raises RecordingError as `decode`."""
         parsed = [self._parse_message(data) for data in chain]
         earlier = [self._arrays(message)[1] for message in parsed[:-1]]
-        return self._made(parsed[-1], lambda name, arrays: apply_changes(name, [change_of(name, tables) for tables in (*earlier, arrays)]))
+        return self._make_value(parsed[-1], lambda name, arrays: apply_changes(name, [change_of(name, tables) for tables in (*earlier, arrays)]))
 
     def _parse_message(self, data: bytes) -> Any:
         try:
@@ -200,7 +200,7 @@ class Decoder:
             elif message.HasField(name):
                 fields[prefix + name] = get_array(found, self.place, name)
 
-    def _made(self, message: Any, table: Callable[[str, dict[str, Any]], Table]) -> Value:
+    def _make_value(self, message: Any, table: Callable[[str, dict[str, Any]], Table]) -> Value:
         """The value of a message, whose tables are made of their arrays."""
         kind: Any = VALUE_TYPES[message.type]
         arrays, tables = self._arrays(message)

@@ -13,7 +13,7 @@ from mcap.records import Channel, ChunkIndex
 
 from trihedron.pipeline.core.errors import RecordingError
 from trihedron.pipeline.core.types import Camera, FrameReference, Value
-from trihedron.pipeline.core.value_checks import checked
+from trihedron.pipeline.core.value_checks import validate_value
 from trihedron.pipeline.record.codec import FRAMES_TOPIC, METADATA, READABLE, UPGRADE, Decoder, builds_on, is_value_schema
 from trihedron.pipeline.record.embedded_images import COLOR, DAMAGED, DEPTH, PARTS, frame_of, topic_of
 from trihedron.pipeline.record.mcap_file import McapFile, damaged_file_error
@@ -87,12 +87,12 @@ class Recording:
         the declarations of its type."""
         if topic in self.embedded:
             for frame in self._frames(topic):
-                yield checked(topic, frame, str(self.path), _expected_type(topic)) if check else frame
+                yield validate_value(topic, frame, str(self.path), _expected_type(topic)) if check else frame
             return
         decoder, place = self._decoder(topic), str(self.path)
         for _, data in self.messages(f"/{topic}"):
             value = decoder.decode(data)
-            yield checked(topic, value, place, _expected_type(topic)) if check else value
+            yield validate_value(topic, value, place, _expected_type(topic)) if check else value
 
     def _frames(self, topic: str) -> Iterator[Value]:
         """The frames of embedded images, whose numbers and cameras are in the topic `frames`."""
@@ -122,7 +122,7 @@ class Recording:
             if not isinstance(reference, FrameReference) or color is None or depth is None:
                 return None
             frame = frame_of(reference, color, depth, f"{self.path}: topic /{topic}")
-            return checked(topic, frame, str(self.path), _expected_type(topic)) if check else frame
+            return validate_value(topic, frame, str(self.path), _expected_type(topic)) if check else frame
         chain: list[bytes] = []
         channel, skipped = f"/{topic}", 0
         for chunk in reversed(self._holding(channel)):
@@ -139,7 +139,7 @@ class Recording:
                     back = builds_on(data)
                     if back == 0:
                         value = self._decoder(topic).decode_last(chain[::-1])
-                        return checked(topic, value, str(self.path), _expected_type(topic)) if check else value
+                        return validate_value(topic, value, str(self.path), _expected_type(topic)) if check else value
                     skipped = back - 1
         return None
 

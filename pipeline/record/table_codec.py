@@ -127,7 +127,7 @@ class Change:
         """Raise ValueError where rows beyond `known` are missing, freed chunks excepted, or anything does not fit."""
         freed = self.freed
         if freed.dtype != np.int32 or freed.ndim != 1 or (freed[:1] < 0).any() or (np.diff(freed) <= 0).any() or (freed >= self.size // CHUNK).any():
-            raise ValueError(f"{name}: chunks that are not there")
+            raise ValueError(f"{name}: freed chunks that the table does not have")
         if not 0 <= known <= self.size or self.size * max(sum(column.row_bytes for column in self.schema.values()), ROW_NUMBER) > MAX_BYTES:
             raise ValueError(f"{name}: a table of {self.size} rows")
         if self.size - known > len(freed) * CHUNK + min((len(ids) for ids, _ in self.columns.values()), default=0):

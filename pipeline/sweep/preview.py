@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from trihedron.pipeline.core.config import rewritten
+from trihedron.pipeline.core.config import rewrite_error
 from trihedron.pipeline.core.errors import TrihedronError, printable
 from trihedron.pipeline.core.graph import Graph
 from trihedron.pipeline.run.side_by_side import equivalence, users_of, vertices_of
@@ -36,7 +36,7 @@ def state_of(folder: Path, key: str) -> str:
 
 def refused_job(folder: Path, words: Sequence[str], error: Exception) -> Planned:
     """Return the job whose configuration cannot be composed."""
-    return Planned(folder, words, REFUSED, str(error if isinstance(error, TrihedronError) else rewritten(error)))
+    return Planned(folder, words, REFUSED, str(error if isinstance(error, TrihedronError) else rewrite_error(error)))
 
 
 def preview(jobs: Sequence[Planned]) -> str:

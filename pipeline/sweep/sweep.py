@@ -26,7 +26,7 @@ from hydra.types import HydraContext, TaskFunction
 from joblib.externals.loky import get_reusable_executor
 from omegaconf import DictConfig
 
-from trihedron.pipeline.core.config import graph_of, rewritten
+from trihedron.pipeline.core.config import graph_of, rewrite_error
 from trihedron.pipeline.core.errors import TrihedronError, UsageError, did_you_mean
 from trihedron.pipeline.core.libraries import library_error
 from trihedron.pipeline.core.overrides import with_literal_paths
@@ -115,7 +115,7 @@ class Sweeper(HydraSweeper):
             try:
                 key = key_of(self.compose_config(words))
             except Exception as error:
-                errors.append(error if isinstance(error, TrihedronError) else rewritten(error))
+                errors.append(error if isinstance(error, TrihedronError) else rewrite_error(error))
                 _keep_overrides(folder, job)
                 write_job(folder, "", FAILED, str(errors[-1]))
                 print(reason(folder, errors[-1]), file=sys.stderr)

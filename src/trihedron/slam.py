@@ -27,7 +27,7 @@ from trihedron.pipeline.app.compilation import compile_once
 from trihedron.pipeline.app.execute import RECORDING, metadata_of, recorded_topics, remembered_of, source_of, write_files, write_models
 from trihedron.pipeline.app.viewers import Viewer, opened_viewer
 from trihedron.pipeline.core import types
-from trihedron.pipeline.core.config import check_added, composed, graph_of
+from trihedron.pipeline.core.config import check_added, compose_run, graph_of
 from trihedron.pipeline.core.errors import ConfigError, UsageError, did_you_mean
 from trihedron.pipeline.core.graph import Graph
 from trihedron.pipeline.core.types import FrameReference, Map, Surface, Value
@@ -91,7 +91,7 @@ class Slam:
         self._frames = Frames(camera_of(camera))
         words = words_of(overrides, options)
         _check_words(words)
-        self._config = composed(["dataset=pushed", *words])
+        self._config = compose_run(["dataset=pushed", *words])
         self._words = words
         graph = graph_of(self._config)
         self._queue = graph.stages["dataset"].plugin.queue

@@ -8,7 +8,7 @@ from os import PathLike, fspath
 from typing import Any
 
 from trihedron.pipeline.core.errors import UsageError
-from trihedron.pipeline.core.overrides import PATH_KEYS, quoted
+from trihedron.pipeline.core.overrides import PATH_KEYS, quote
 
 
 def words_of(overrides: tuple[str, ...], options: Mapping[str, Any]) -> list[str]:
@@ -36,9 +36,9 @@ def _text(key: str, value: Any) -> str:
     if isinstance(value, Enum):
         return value.name
     if isinstance(value, PathLike):
-        return quoted(fspath(value))
+        return quote(fspath(value))
     if isinstance(value, str):
-        return quoted(value) if value else "''"
+        return quote(value) if value else "''"
     if isinstance(value, (list, tuple)):
         return f"[{','.join(_text(key, item) for item in value)}]"
     if hasattr(value, "item"):  # a number of NumPy's

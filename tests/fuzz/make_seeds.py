@@ -26,7 +26,7 @@ from omegaconf import OmegaConf
 
 from trihedron.datasets.readers import foxglove_messages
 from trihedron.datasets.readers.robot_streams import ROS
-from trihedron.pipeline.core.config import composed
+from trihedron.pipeline.core.config import compose_run
 from trihedron.pipeline.core.geometry import quaternion_from_rotation
 from trihedron.pipeline.core.lie import exp_se3
 from trihedron.pipeline.record.codec import is_value_schema
@@ -75,7 +75,7 @@ def make_seeds(folder: Path) -> None:
     camera = {"w": 1200, "h": 680, "fx": 600.0, "fy": 600.0, "cx": 599.5, "cy": 339.5, "scale": 6553.5}
     (folder / "cam_params.json").write_text(json.dumps({"camera": camera}))
     (folder / "trajectory.txt").write_text(f"# stamp tx ty tz qx qy qz qw\n{TRUE_POSES}")
-    (folder / "config.yaml").write_text(OmegaConf.to_yaml(composed(["load_map=map.mcap"]), resolve=True))
+    (folder / "config.yaml").write_text(OmegaConf.to_yaml(compose_run(["load_map=map.mcap"]), resolve=True))
     (folder / "matrix.txt").write_text("\n".join(" ".join(f"{x:.6f}" for x in row) for row in exp_se3(np.arange(6) / 10)))
     _pictures_and_meshes(folder)
     _robots(folder)

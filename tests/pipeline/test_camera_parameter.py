@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from trihedron.pipeline.app.cli import main
-from trihedron.pipeline.core.config import composed, graph_of
+from trihedron.pipeline.core.config import compose_run, graph_of
 from trihedron.pipeline.core.errors import DataError
 from trihedron.pipeline.core.types import Camera, Keypoints, Pose, Rotation
 from trihedron.pipeline.record.reader import Recording
@@ -90,7 +90,7 @@ def recorded(tmp_path_factory):
 def test_a_stage_of_the_default_graph_that_reads_intrinsics_alone_needs_no_images(recorded, tmp_path, stage):
     """The recording holds no images, and the stages that found nothing all along (loop, relocalise) are not asked again."""
     replay = Replay(Recording(recorded), (stage,))
-    assert replay.computed_stages(graph_of(composed(SMALL))) == (stage,)
+    assert replay.computed_stages(graph_of(compose_run(SMALL))) == (stage,)
     assert main(["run", f"replay={recorded}", f"only=[{stage}]", "threads=1", f"out={tmp_path}/again"]) == 0
     assert contents(tmp_path / "again" / "run.mcap")[f"/{stage}"] == contents(recorded)[f"/{stage}"]
 

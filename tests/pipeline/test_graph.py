@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import pytest
 
 from trihedron.pipeline.core import registry
-from trihedron.pipeline.core.config import composed, graph_of
+from trihedron.pipeline.core.config import compose_run, graph_of
 from trihedron.pipeline.core.errors import GraphError
 from trihedron.pipeline.core.graph import build_graph
 from trihedron.pipeline.core.slots import SLOTS, accepts_none, default_wires, inputs_of, output_of, strip_none
@@ -70,11 +70,11 @@ def test_an_input_that_a_plugin_needs_is_written(monkeypatch):
 def test_icp_without_a_model_is_refused():
     """It would hold the first pose, and call it tracked."""
     with pytest.raises(GraphError) as error:
-        graph_of(composed(["pose=icp"]))
+        graph_of(compose_run(["pose=icp"]))
     assert str(error.value) == "graph.pose.model: pose=icp needs it, and model=none writes nothing; choose another plugin for model, or for pose"
     with pytest.raises(GraphError, match="pose=icp needs it, and it is not wired; choose another plugin for model, or for pose"):
-        graph_of(composed(["pose=icp", "model=tsdf", "~graph.pose.model"]))
-    assert "model" in graph_of(composed(["pose=icp", "model=tsdf"])).stages
+        graph_of(compose_run(["pose=icp", "model=tsdf", "~graph.pose.model"]))
+    assert "model" in graph_of(compose_run(["pose=icp", "model=tsdf"])).stages
 
 
 def test_an_input_reads_the_topic_of_its_name_unless_the_slot_declares_another():

@@ -6,7 +6,7 @@ from typing import Annotated
 import pytest
 
 from trihedron.pipeline.core import registry
-from trihedron.pipeline.core.config import composed
+from trihedron.pipeline.core.config import compose_run
 from trihedron.pipeline.core.options import FrameRange, Frames, OneOf, PositiveFloat, Range, Share, check_increasing, constraints_of, frame_range
 from trihedron.pipeline.core.recorded_config import recorded_config
 from trihedron.pipeline.core.registry import load_plugins, plugins_of, register
@@ -16,7 +16,7 @@ from trihedron.pipeline.core.types import Frame, Normals
 
 def test_options_of_a_recording_are_forgotten_by_the_next_composition():
     recorded = recorded_config("{pose: {plugin: refine, line_sigma_px: 2.0}}", "a.mcap")
-    assert [composed([], given).pose.line_sigma_px for given in (None, recorded, None)] == [1.0, 2.0, 1.0]
+    assert [compose_run([], given).pose.line_sigma_px for given in (None, recorded, None)] == [1.0, 2.0, 1.0]
 
 
 BOUNDS = [  # range, its text, permitted, refused

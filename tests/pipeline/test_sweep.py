@@ -12,7 +12,7 @@ import yaml
 from hydra import compose, initialize_config_module
 
 from trihedron.pipeline.app.cli import main
-from trihedron.pipeline.core.config import composed, register_configs
+from trihedron.pipeline.core.config import compose_run, register_configs
 from trihedron.pipeline.core.errors import UsageError
 from trihedron.pipeline.core.overrides import list_elements
 from trihedron.pipeline.core.registry import load_plugins
@@ -88,7 +88,7 @@ def test_a_folder_with_blanks_and_equal_signs_is_the_longest_that_exists(tmp_pat
 ])  # fmt: skip
 def test_a_list_of_data_sets_is_taken_literally(text, elements):
     assert list_elements(text) == elements
-    assert list(composed([f"sequences={text}"]).sequences) == elements
+    assert list(compose_run([f"sequences={text}"]).sequences) == elements
 
 
 ALL_AT_ONCE = 'it\'s "b" [1] (2) {3},a=b #1 größe'

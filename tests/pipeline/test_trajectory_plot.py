@@ -70,7 +70,7 @@ def test_rotation_errors_do_not_depend_on_the_world_frame():
 
 def test_a_line_is_broken_over_a_gap():
     stamps = np.array([0, 1, 2, 20, 21]) * 33_000_000
-    assert np.isnan(plot._broken(stamps, np.ones((5, 2)))).any(axis=1).tolist() == [False, False, False, True, False, False]
+    assert np.isnan(plot._break_at_gaps(stamps, np.ones((5, 2)))).any(axis=1).tolist() == [False, False, False, True, False, False]
 
 
 def test_a_folder_that_is_not_there(tmp_path):

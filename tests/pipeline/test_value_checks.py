@@ -9,7 +9,7 @@ import pytest
 from trihedron.comparison.error_budget import rewrite
 from trihedron.pipeline.app.cli import main
 from trihedron.pipeline.app.recorded_run import recorded_config_of
-from trihedron.pipeline.core.config import composed, graph_of
+from trihedron.pipeline.core.config import compose_run, graph_of
 from trihedron.pipeline.core.errors import RecordingError
 from trihedron.pipeline.record.codec import Encoder
 from trihedron.pipeline.record.reader import Recording
@@ -30,7 +30,7 @@ def source(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def graph(source):
-    return graph_of(composed([], recorded_config_of(source)))
+    return graph_of(compose_run([], recorded_config_of(source)))
 
 
 def with_number(field, number, column=...):

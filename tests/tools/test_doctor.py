@@ -3,7 +3,7 @@
 import importlib.metadata
 from importlib.metadata import version
 
-from trihedron.pipeline.core.libraries import declared
+from trihedron.pipeline.core.libraries import declared_requirements
 from trihedron.tools import doctor
 
 
@@ -17,7 +17,7 @@ def test_versions(capsys, monkeypatch):
     lines = lines_of(capsys)
     assert lines["trihedron"].split()[1] == version("trihedron")
     assert lines["numpy"].split() == ["numpy", version("numpy")]
-    for extra, names in declared().items():  # all libraries, of the base and of every extra
+    for extra, names in declared_requirements().items():  # all libraries, of the base and of every extra
         assert names and {f"{name} [{extra}]" if extra else name for name in names} <= set(lines)
     assert lines["optuna [search]"].split() == ["optuna", "[search]", version("optuna")]
     assert doctor.processor() in lines["processor"] and "GB free" in lines["memory"]

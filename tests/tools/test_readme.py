@@ -11,7 +11,7 @@ import pytest
 
 from trihedron.datasets.simulation.synthetic import Synthetic
 from trihedron.pipeline.app.cli import main
-from trihedron.pipeline.core.config import composed, graph_of
+from trihedron.pipeline.core.config import compose_run, graph_of
 from trihedron.tools.benchmark import COMPARISONS
 
 ROOT = Path(__file__).parents[2]
@@ -56,7 +56,7 @@ def test_the_runs_shown_can_be_composed():
     counted = 0
     for page, (name, *words) in shown_commands():
         if name == "run" and "-m" not in words and page.parent.name != "tutorial" and not any(word.startswith("replay=") for word in words):
-            graph_of(composed([word for word in words if not word.startswith(("load_map=", "save_map="))]))
+            graph_of(compose_run([word for word in words if not word.startswith(("load_map=", "save_map="))]))
             counted += 1
     assert counted > 25
 

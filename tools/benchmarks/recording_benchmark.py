@@ -136,6 +136,6 @@ def _time_to_open(path: Path, frame: int) -> tuple[float, int]:
 
 def graph_of_words(overrides: Sequence[str]) -> Graph:
     """The graph that `trihedron run` would make of these overrides."""
-    from trihedron.pipeline.core.config import composed, graph_of
+    from trihedron.pipeline.core.config import compose_run, graph_of
 
-    return graph_of(composed(overrides))
+    return graph_of(compose_run(overrides))

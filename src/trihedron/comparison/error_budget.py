@@ -134,7 +134,7 @@ def dependent_stages(recording: Recording, stages: tuple[str, ...]) -> tuple[str
     """Return the stages that depend on one of these, over any number of wires, without these; of none, those of the first row."""
     graph = graph_of(composed_run(recording))
     first = [stage for stage in stages or ("rotation",) if stage in graph.stages]
-    found = graph.needed([name for name in ("pose", "map") if name in graph.stages], stages)
+    found = graph.required_stages([name for name in ("pose", "map") if name in graph.stages], stages)
     return tuple(stage for stage in followers(graph, first) if stage not in stages and stage in found)
 
 

@@ -11,7 +11,7 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.errors import OverrideParseException
 
 from trihedron.pipeline.app.alternatives import Alternative, alternatives_of, same
-from trihedron.pipeline.core.config import rewritten
+from trihedron.pipeline.core.config import rewrite_error
 from trihedron.pipeline.core.errors import DataError, UsageError, did_you_mean
 from trihedron.pipeline.core.slots import SLOTS
 from trihedron.pipeline.record.reader import Recording
@@ -88,7 +88,7 @@ def _values_of(word: str) -> tuple[str, list[str]]:
     try:
         override = OverridesParser.create().parse_override(word)
     except OverrideParseException as error:
-        raise rewritten(error) from error
+        raise rewrite_error(error) from error
     key = word.partition("=")[0]
     if not override.is_sweep_override():
         return key, [override.get_value_element_as_str()]
