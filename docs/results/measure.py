@@ -132,7 +132,7 @@ def methods(data: Sequence[str], commit: str) -> Row:
     if not detectors.exists():
         _program("benchmark", "detectors", "--json", str(detectors))
     _program("benchmark", "methods", str(out), "--detectors", str(detectors), "--json", str(runs))
-    found: Row = json.loads(runs.read_text())
+    found: Row = json.loads(runs.read_text().replace(f"{ROOT}/", ""))
     return {"minutes": round((time.perf_counter() - began) / 60.0, 1), **found}
 
 

@@ -126,17 +126,30 @@ def consistency() -> str:
 
 
 def methods() -> str:
-    """Each plugin in the default graph: ATE in mm by sequence, and medians of NEES and of the stage's time."""
+    """Each plugin in the default graph in rooms: ATE in mm by sequence, and medians of NEES and of the stage's time."""
     found = read("methods")
-    places = _without_repeats(row["sequence"] for row in found["runs"])[:PLACES_OF_METHODS]
-    changes = [change for change in _without_repeats(row["change"] for row in found["runs"]) if not change.startswith(("graph=", "without="))]
+    return _table_of_methods(found, _without_repeats(row["sequence"] for row in found["runs"])[:PLACES_OF_METHODS])
+
+
+def methods_recorded() -> str:
+    """Each plugin of the slots of tracking in the default graph on the recorded sequences with truth, likewise."""
+    found = read("methods")
+    known = {row["sequence"] for row in found["runs"] if row["ate_mm"] is not None}
+    return _table_of_methods(found, [place for place in TITLES if place in known])
+
+
+def _table_of_methods(found: Row, places: Sequence[str]) -> str:
+    changes = _without_repeats(row["change"] for row in found["runs"] if row["sequence"] in places)
     lines = []
     for change in changes:
+        if change.startswith(("graph=", "without=")):
+            continue
         rows = {row["sequence"]: row for row in found["runs"] if row["change"] == change and row["sequence"] in places}
         key = "frame_ms" if change == "default" else "ms"
         name = "default (whole frame)" if change == "default" else f"`{change}`"
         lines.append((name, *(cell_of(rows.get(place)) for place in places), _median(rows.values(), "nees", 2), _median(rows.values(), key, 1)))
-    return f"{markdown(['change', *places, 'NEES', 'ms'], lines)}\n\n*{source_line(found)}*\n"
+    header = ["change", *(TITLES.get(place, place) for place in places), "NEES", "ms"]
+    return f"{markdown(header, lines)}\n\n*{source_line(found)}*\n"
 
 
 def libraries() -> str:
@@ -183,8 +196,9 @@ def _tests(counts: Row) -> str:
     return ", ".join(f"{test} ({frames})" for test, frames in counts.items()) or "–"
 
 
-DRAWN = (accuracy, sequences, durations, other_programs, consistency, honesty_sensors, honesty_faults, methods, libraries, detectors)
-BLOCKS: dict[str, Callable[[], str]] = {one.__name__: one for one in DRAWN}
+OF_SEQUENCES = (accuracy, sequences, durations, other_programs, consistency)
+OF_HONESTY, OF_METHODS = (honesty_sensors, honesty_faults), (methods, methods_recorded, libraries, detectors)
+BLOCKS: dict[str, Callable[[], str]] = {one.__name__: one for one in (*OF_SEQUENCES, *OF_HONESTY, *OF_METHODS)}
 
 
 def _without_repeats(names: Iterable[str]) -> list[str]:
