@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Any, ParamSpec, TypeVar, overload
 
 import numba
+import numpy as np
 
 PACKAGE = __name__.partition(".")[0]
 ROOT = Path(__file__).parents[2]  # of the package
@@ -40,6 +41,14 @@ def kernel(function: Any = None, /, **options: Any) -> Any:
     """Compile a function with the project's options; `@kernel`, or `@kernel(forceinline=True)` with further options of `numba.njit`."""
     compiler = numba.njit(**{**OPTIONS, **options})
     return compiler if function is None else compiler(function)
+
+
+def constant(array: Any, dtype: type[np.generic]) -> Any:
+    """Return a contiguous read-only view of an array, or of a copy, for kernels. numba compiles a kernel anew for each mixture of read-only and
+    writable arrays, which takes seconds; the arrays of topics are read-only."""
+    view = np.ascontiguousarray(array, dtype).view()
+    view.flags.writeable = False
+    return view
 
 
 def cache_folder() -> Path:

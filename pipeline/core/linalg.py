@@ -15,7 +15,7 @@ from numpy.linalg import LinAlgError
 from numpy.typing import ArrayLike, NDArray
 
 from trihedron.pipeline.core import linalg_kernels as kernels
-from trihedron.pipeline.core.types import F64
+from trihedron.pipeline.core.types import F32, F64
 
 SUBSCRIPTS = {(1, 1): "i,i->", (1, 2): "j,...jk->...k", (2, 1): "...ij,j->...i", (2, 2): "...ij,...jk->...ik"}  # by dimensions, two at most
 SMALL = 1000  # multiplications, below which the call of a kernel takes longer than they do
@@ -93,6 +93,16 @@ def inv(A: ArrayLike) -> NDArray[Any]:
     if not kernels.solve_each(matrices, out)[0]:
         raise LinAlgError("singular matrix")
     return out.reshape(np.shape(A)).astype(dtype, copy=False)
+
+
+def inv_symmetric(matrices: F32 | F64) -> F64:
+    """Invert symmetric matrices (..., k, k): covariance to information or the other way round. Raises LinAlgError if one is singular."""
+    if matrices.shape[-1] != 3:
+        return np.asarray(inv(matrices.astype(np.float64)), np.float64)
+    out = np.array(matrices, np.float64, order="C")
+    if not kernels.invert_each(out.reshape(-1, 3, 3)):
+        raise LinAlgError("Singular matrix")
+    return out
 
 
 def det(A: ArrayLike) -> Any:

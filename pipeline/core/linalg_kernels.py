@@ -125,6 +125,30 @@ def invert_symmetric(S: F64, out: F64) -> float:
 
 
 @kernel(forceinline=True)
+def invert_small(S: F64, rows: int, W: F64) -> None:
+    """Invert the leading block of 1, 2 or 3 rows of a symmetric matrix into W; the rest is 0."""
+    W[:] = 0.0
+    if rows == 1:
+        W[0, 0] = 1.0 / S[0, 0]
+        return
+    if rows == 2:
+        det = S[0, 0] * S[1, 1] - S[0, 1] * S[1, 0]
+        W[0, 0], W[1, 1], W[0, 1], W[1, 0] = S[1, 1] / det, S[0, 0] / det, -S[0, 1] / det, -S[1, 0] / det
+        return
+    W[0, 0] = S[1, 1] * S[2, 2] - S[1, 2] * S[2, 1]
+    W[0, 1] = S[0, 2] * S[2, 1] - S[0, 1] * S[2, 2]
+    W[0, 2] = S[0, 1] * S[1, 2] - S[0, 2] * S[1, 1]
+    W[1, 1] = S[0, 0] * S[2, 2] - S[0, 2] * S[2, 0]
+    W[1, 2] = S[0, 2] * S[1, 0] - S[0, 0] * S[1, 2]
+    W[2, 2] = S[0, 0] * S[1, 1] - S[0, 1] * S[1, 0]
+    W[1, 0], W[2, 0], W[2, 1] = W[0, 1], W[0, 2], W[1, 2]
+    det = S[0, 0] * W[0, 0] + S[0, 1] * W[1, 0] + S[0, 2] * W[2, 0]
+    for i in range(3):
+        for j in range(3):
+            W[i, j] /= det
+
+
+@kernel(forceinline=True)
 def tangent_columns(n: F64, B: F64) -> None:
     """Fill the columns of B (3, 2) with `geometry.tangent_basis` of a unit vector n (3,)."""
     s = 1.0 if n[2] >= 0.0 else -1.0

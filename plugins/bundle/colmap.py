@@ -26,7 +26,7 @@ from trihedron.plugins.bundle.window import (
 from trihedron.plugins.mapping.covisibility_graph import newest_keyframes
 from trihedron.plugins.mapping.landmarks import ENDPOINTS, POSITION
 from trihedron.plugins.shared import libraries
-from trihedron.plugins.shared.linalg import transform_plane_covariance
+from trihedron.plugins.shared.covariances import transform_plane_covariance
 
 
 @register("bundle", "colmap")

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from trihedron.pipeline.core.geometry import tangent_basis
-from trihedron.pipeline.core.linalg import matmul
+from trihedron.pipeline.core.linalg import inv_symmetric, matmul
 from trihedron.pipeline.core.linalg_kernels import solve_positive
 from trihedron.pipeline.core.options import PositiveInt
 from trihedron.pipeline.core.registry import register
@@ -26,7 +26,6 @@ from trihedron.plugins.bundle.local_window_kernels import (
 from trihedron.plugins.bundle.window import BundleMeasurements, BundleOptions, BundleState, BundleWindow, bundle_problem, bundle_window, free_poses
 from trihedron.plugins.mapping.covisibility_graph import newest_keyframes
 from trihedron.plugins.mapping.landmarks import ENDPOINTS, POSITION
-from trihedron.plugins.shared.linalg import inverse
 
 DAMPING, MIN_DAMPING = 1e-4, 1e-9
 CONVERGED = 1e-2  # squared Mahalanobis norm of the step of poses and planes, on average over these parameters
@@ -79,7 +78,7 @@ def solve_bundle(state: BundleState, seen: BundleMeasurements, iterations: int) 
         state, cost, steps, now, trial = _minimise(state, seen, loss, iterations, now, trial, loss == losses[-1])
         used += steps
     reduce_system(now, seen, 0.0, S, y, inverses)
-    covariance = inverse(S)
+    covariance = inv_symmetric(S)
     landmarks = np.empty_like(now.V)
     landmark_covariances(now, seen, inverses, covariance, landmarks)
     return BundleSolution(state, cost, used, covariance, landmarks)
@@ -137,10 +136,10 @@ def bundle_correction(map: Map, window: BundleWindow, found: BundleSolution) -> 
         T_world_keyframe=free_poses(state, free),
         point_ids=window.points,
         points_m=POSITION.rounded(state.points),
-        point_information=_symmetrise(inverse(points)).astype(np.float32),
+        point_information=_symmetrise(inv_symmetric(points)).astype(np.float32),
         line_ids=window.lines,
         endpoints_m=ENDPOINTS.rounded(state.lines),
-        line_information=_symmetrise(inverse(ends)).astype(np.float32),
+        line_information=_symmetrise(inv_symmetric(ends)).astype(np.float32),
         plane_ids=window.planes,
         coefficients=state.planes,
         plane_covariance=_symmetrise(np.array(planes, np.float64).reshape(-1, 3, 3)),
@@ -152,7 +151,7 @@ def _ends(map: Map, window: BundleWindow, lines: F64, covariance: F64) -> F64:
     position of a line was adjusted, not its extent."""
     direction = lines[:, 1] - lines[:, 0]
     direction = direction / np.linalg.norm(direction, axis=1, keepdims=True)
-    known = inverse(map.lines.rows("information", window.lines))
+    known = inv_symmetric(map.lines.rows("information", window.lines))
     along = np.einsum("mi,meij,mj->me", direction, known, direction)
     N = tangent_basis(direction)
     across = np.stack([covariance[:, :2, :2], covariance[:, 2:, 2:]], axis=1)

@@ -7,13 +7,12 @@ from typing import Annotated, NamedTuple
 
 import numpy as np
 
-from trihedron.pipeline.core.linalg import matmul
+from trihedron.pipeline.core.linalg import inv_symmetric, matmul
 from trihedron.pipeline.core.options import NonNegativeInt, PositiveFloat, PositiveInt, Range
 from trihedron.pipeline.core.types import F64, I32, Map, Table
 from trihedron.plugins.mapping.covisibility_graph import covisible_keyframes, current_submap, keyframes_of, newest_keyframes, observed_by, odometry
 from trihedron.plugins.mapping.landmark_kinds import KINDS, LINE, PLANE, POINT, LandmarkKind, observed_rows
 from trihedron.plugins.mapping.landmarks import index_of
-from trihedron.plugins.shared.linalg import inverse
 from trihedron.plugins.shared.residuals_kernels import PARALLEL, PERPENDICULAR
 
 
@@ -142,7 +141,7 @@ def bundle_problem(options: BundleOptions, map: Map, window: BundleWindow) -> tu
         plane_keyframes,
         np.repeat(np.arange(len(window.planes), dtype=np.int32), np.diff(plane_starts)),
         map.plane_observations.rows("coefficients", plane_rows),
-        inverse(map.plane_observations.rows("covariance", plane_rows)),
+        inv_symmetric(map.plane_observations.rows("covariance", plane_rows)),
         relations,
         variance,
         neighbours,

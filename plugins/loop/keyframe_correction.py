@@ -5,11 +5,10 @@ from __future__ import annotations
 import numpy as np
 
 from trihedron.pipeline.core.geometry import invert, transform_each
-from trihedron.pipeline.core.linalg import matmul
+from trihedron.pipeline.core.linalg import inv_symmetric, matmul
 from trihedron.pipeline.core.types import F32, F64, I32, Correction, Map, Table
 from trihedron.plugins.mapping.landmarks import ENDPOINTS, POSITION
 from trihedron.plugins.mapping.plane_fusion import information_of
-from trihedron.plugins.shared.linalg import inverse
 
 
 def correct_keyframes(map: Map, rows: I32, before: F64, after: F64) -> Correction:
@@ -25,7 +24,7 @@ def correct_keyframes(map: Map, rows: I32, before: F64, after: F64) -> Correctio
         _rotate_information(T_points, map.points.rows("information", points)),
         lines, ENDPOINTS.rounded(transform_each(T_lines, map.lines.rows("endpoints_m", lines))),
         _rotate_information(T_lines[:, None], map.lines.rows("information", lines)),
-        planes, coefficients, inverse(information_of(moments, coefficients)),
+        planes, coefficients, inv_symmetric(information_of(moments, coefficients)),
     )  # fmt: skip
 
 

@@ -13,12 +13,11 @@ import numpy as np
 
 from trihedron.pipeline.core.geometry import invert, pose_matrix
 from trihedron.pipeline.core.lie import exp_so3
-from trihedron.pipeline.core.linalg import inv, matmul
+from trihedron.pipeline.core.linalg import inv, inv_symmetric, matmul
 from trihedron.pipeline.core.types import F64, I32, Correction, Map, Table
 from trihedron.plugins.loop.keyframe_correction import correct_keyframes
 from trihedron.plugins.loop.manhattan_prior_kernels import keyframe_rotations
 from trihedron.plugins.mapping.covisibility_graph import DriftOptions, current_submap, keyframes_of, odometry
-from trihedron.plugins.shared.linalg import inverse
 from trihedron.plugins.shared.manhattan_frames_kernels import (
     Walls,
     area_on_axes,
@@ -62,7 +61,7 @@ def estimate_manhattan_prior(map: Map) -> ManhattanPrior | None:
     R = _axes(coefficients, covariance, map.planes.rows("found", planes))
     if R is None:
         return None
-    ends, end_covariance = map.lines.rows("endpoints_m", lines), inverse(map.lines.rows("information", lines))
+    ends, end_covariance = map.lines.rows("endpoints_m", lines), inv_symmetric(map.lines.rows("information", lines))
     vectors, information = measured_directions(
         coefficients, covariance, WALL_SIGMA, ends.astype(np.float32), end_covariance.astype(np.float32), EDGE_SIGMA, NO_MEANS, NO_MEANS[:, 0]
     )

@@ -14,7 +14,7 @@ from trihedron.plugins.mapping.covisibility_graph import observed_by
 from trihedron.plugins.mapping.landmark_kinds import LINE, PLANE, POINT, LandmarkKind, landmarks_of
 from trihedron.plugins.mapping.landmarks import isin
 from trihedron.plugins.mapping.plane_fusion import equivalent_moments, motions_between
-from trihedron.plugins.shared.linalg import transform_plane_covariance
+from trihedron.plugins.shared.covariances import transform_plane_covariance
 
 
 def apply_correction(map: Map, correction: Correction) -> Map:

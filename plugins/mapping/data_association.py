@@ -9,6 +9,7 @@ from typing import Annotated
 import numpy as np
 
 from trihedron.pipeline.core.geometry import invert
+from trihedron.pipeline.core.kernel import constant
 from trihedron.pipeline.core.options import NonNegativeInt, PositiveFloat, Range, check_increasing
 from trihedron.pipeline.core.types import F64, I32, U8, Camera, Keypoints, Map, Matches, Planes, Segments
 from trihedron.plugins.mapping.covisibility_graph import LocalWindow
@@ -17,7 +18,6 @@ from trihedron.plugins.mapping.landmark_kinds import LINE, PLANE, POINT
 from trihedron.plugins.mapping.projection import POINT_COLUMNS, VisiblePoints, clip_segments, visible_points
 from trihedron.plugins.shared.feature_matching import associate_planes, match_lines, match_near
 from trihedron.plugins.shared.feature_matching_kernels import transform_plane_samples
-from trihedron.plugins.shared.linalg import constant
 
 
 @dataclass(frozen=True)

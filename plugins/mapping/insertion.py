@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from trihedron.pipeline.core.geometry import tangent_basis, transform, transform_planes
-from trihedron.pipeline.core.linalg import matmul
+from trihedron.pipeline.core.linalg import inv_symmetric, matmul
 from trihedron.pipeline.core.types import F32, F64, I32, Bool, Camera, Keypoints, Map, Matches, Planes, Pose, Segments, Table
 from trihedron.plugins.mapping.landmark_kernels import farthest_samples, fuse_lines, fuse_points
 from trihedron.plugins.mapping.landmark_kinds import LINE, PLANE, POINT, LandmarkKind, observations_of, with_tables
@@ -19,7 +19,7 @@ from trihedron.plugins.mapping.landmarks import OBSERVERS
 from trihedron.plugins.mapping.plane_fusion import equivalent_moments, fit_planes, move_moments, project_to_planes
 from trihedron.plugins.mapping.projection import line_terms, parameters_on, plane_terms, point_terms, points_along
 from trihedron.plugins.shared.calibration_error import calibration_covariance
-from trihedron.plugins.shared.linalg import inverse, point_covariance, propagate_pose_covariance
+from trihedron.plugins.shared.covariances import point_covariance, propagate_pose_covariance
 from trihedron.plugins.shared.pose_optimizer import classify_terms
 
 NO_PAIRS = np.empty((0, 2), np.int32)
@@ -171,7 +171,7 @@ def insert_points(map: Map, view: Observations, keypoints: Keypoints, pairs: I32
     position, R = transform(view.T_world_camera, local), view.T_world_camera[:3, :3]
     table, created = table.appended(
         position_m=position,
-        information=inverse(matmul(R, covariance, R.T)),
+        information=inv_symmetric(matmul(R, covariance, R.T)),
         **_appearance(view, keypoints, new, position),
         **_new_landmark(len(new), view.keyframe),
     )
@@ -210,7 +210,7 @@ def insert_lines(map: Map, view: Observations, segments: Segments, pairs: I32, n
     R, total = view.T_world_camera[:3, :3], covariance[new] + propagate_pose_covariance(local, view.covariance)
     table, created = table.appended(
         endpoints_m=transform(view.T_world_camera, local),
-        information=inverse(matmul(R, total, R.T)),
+        information=inv_symmetric(matmul(R, total, R.T)),
         descriptor=segments.descriptors[new],
         **_new_landmark(len(new), view.keyframe),
     )
@@ -222,8 +222,8 @@ def extend_lines(endpoints: F64, information: F32 | F64, observed: F64) -> tuple
     """Extend lines (n, 2, 3) along their direction to the observed ends (n, 2, 3; NaN = unknown); also returns their information."""
     share = parameters_on(endpoints, observed)
     reach = np.stack([np.fmin(share.min(axis=1), 0.0), np.fmax(share.max(axis=1), 1.0)], axis=1)
-    points, covariance = points_along(endpoints, inverse(information), reach)
-    return points, inverse(covariance)
+    points, covariance = points_along(endpoints, inv_symmetric(information), reach)
+    return points, inv_symmetric(covariance)
 
 
 def insert_planes(map: Map, view: Observations, planes: Planes, pairs: I32, new: I32, memory: float) -> Map:

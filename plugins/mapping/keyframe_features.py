@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 
 from trihedron.pipeline.core.geometry import invert, transform, transform_planes
-from trihedron.pipeline.core.linalg import matmul
+from trihedron.pipeline.core.linalg import inv_symmetric, matmul
 from trihedron.pipeline.core.types import F64, I32, Camera, Keypoints, Map, Planes, Segments
 from trihedron.plugins.mapping.covisibility_graph import LocalWindow
 from trihedron.plugins.mapping.projection import clip_segments
-from trihedron.plugins.shared.linalg import inverse, transform_plane_covariance
+from trihedron.plugins.shared.covariances import transform_plane_covariance
 
 L2_BYTES = 128  # least length of descriptors that are compared by Euclidean distance (SIFT, learned ones); binary ones are shorter
 PLANE_PX = 1000  # size of a region where it is unknown
@@ -26,7 +26,7 @@ def _points(map: Map, camera: Camera, T_camera_world: F64, ids: I32) -> Keypoint
     front = local[:, 2] > 0.1
     ids, local = ids[front], local[front]
     R = T_camera_world[:3, :3]
-    covariance = matmul(R, inverse(map.points.rows("information", ids)), R.T)
+    covariance = matmul(R, inv_symmetric(map.points.rows("information", ids)), R.T)
     across = np.sqrt(0.5 * (covariance[:, 0, 0] + covariance[:, 1, 1]))
     descriptors = map.points.rows("descriptor", ids)
     pixels, sigma_px = camera.project(local).astype(np.float32), np.maximum(camera.fx * across / local[:, 2], 0.3).astype(np.float32)
@@ -41,7 +41,7 @@ def _lines(map: Map, camera: Camera, T_camera_world: F64, ids: I32) -> Segments:
     pixels, inside = clip_segments(world, T_camera_world, camera)
     ids, local, pixels = ids[inside], transform(T_camera_world, world[inside]), pixels[inside]
     R = T_camera_world[:3, :3]
-    covariance = matmul(R, inverse(map.lines.rows("information", ids)), R.T)
+    covariance = matmul(R, inv_symmetric(map.lines.rows("information", ids)), R.T)
     descriptors = map.lines.rows("descriptor", ids)
     return Segments(map.index, map.stamp_ns, pixels.astype(np.float32), local.astype(np.float32), covariance.astype(np.float32), descriptors)
 

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from trihedron.pipeline.core.kernel import kernel
-from trihedron.pipeline.core.linalg_kernels import invert_symmetric
+from trihedron.pipeline.core.linalg_kernels import invert_small, invert_symmetric
 from trihedron.pipeline.core.types import F32, F64, I32, U8, Bool
 from trihedron.plugins.shared.residuals_kernels import (
     NEAR_M,
@@ -18,7 +18,6 @@ from trihedron.plugins.shared.residuals_kernels import (
     LineTerms,
     PointTerms,
     depth_direction,
-    invert_small,
     line_depth_residual,
     line_residual,
     point_residual,

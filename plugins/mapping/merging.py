@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from trihedron.pipeline.core.geometry import invert, transform
-from trihedron.pipeline.core.linalg import matmul, solve
+from trihedron.pipeline.core.linalg import inv_symmetric, matmul, solve
 from trihedron.pipeline.core.types import I32, Bool, Map, Table
 from trihedron.plugins.mapping.covisibility_graph import newest_keyframes, observed_by
 from trihedron.plugins.mapping.insertion import Observations, extend_lines
@@ -19,7 +19,6 @@ from trihedron.plugins.mapping.plane_fusion import fit_planes, project_to_planes
 from trihedron.plugins.mapping.projection import clip_segments, parameters_on, points_along
 from trihedron.plugins.shared.feature_matching import match_lines, match_near
 from trihedron.plugins.shared.feature_matching_kernels import mean_distance, overlap
-from trihedron.plugins.shared.linalg import inverse
 from trihedron.plugins.shared.pose_optimizer_kernels import CHI2_95
 
 NEAR_PX = 3.0  # between the projections of duplicates
@@ -44,8 +43,8 @@ def merge_points(map: Map, view: Observations, visible: I32, metric: str) -> Map
     position, information = map.points.columns_at(pairs.ravel(), "position_m", "information")
     position, information = position.reshape(-1, 2, 3), information.reshape(-1, 2, 3, 3).astype(np.float64)
     apart = position[:, 1] - position[:, 0]
-    covariance = inverse(information).sum(axis=1)
-    same: Bool = np.einsum("ni,nij,nj->n", apart, inverse(covariance), apart) <= CHI2_95[3]
+    covariance = inv_symmetric(information).sum(axis=1)
+    same: Bool = np.einsum("ni,nij,nj->n", apart, inv_symmetric(covariance), apart) <= CHI2_95[3]
     pairs, position, information = pairs[same], position[same], information[same]
     total = information.sum(axis=1)
     merged = solve(total, np.einsum("nkij,nkj->ni", information, position)[..., None])[..., 0]
@@ -81,9 +80,9 @@ def merge_lines(map: Map, view: Observations, visible: I32) -> Map:
 def _collinear(lines: Table, a: I32, b: I32) -> Bool:
     """Return True (n,) where both ends of line b lie on line a within their uncertainty (χ² test)."""
     (on, known), (ends, other) = (lines.columns_at(ids, "endpoints_m", "information") for ids in (a, b))
-    foot, covariance = points_along(on, inverse(known), parameters_on(on, ends))
-    covariance += inverse(other)
-    chi2 = np.einsum("nki,nkij,nkj->nk", ends - foot, inverse(covariance), ends - foot)
+    foot, covariance = points_along(on, inv_symmetric(known), parameters_on(on, ends))
+    covariance += inv_symmetric(other)
+    chi2 = np.einsum("nki,nkij,nkj->nk", ends - foot, inv_symmetric(covariance), ends - foot)
     good: Bool = (chi2 <= CHI2_95[2]).all(axis=1)
     return good
 

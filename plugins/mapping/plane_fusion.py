@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 
 from trihedron.pipeline.core.geometry import tangent_basis
-from trihedron.pipeline.core.linalg import eigh, matmul
+from trihedron.pipeline.core.linalg import eigh, inv_symmetric, matmul
 from trihedron.pipeline.core.types import F32, F64
-from trihedron.plugins.shared.linalg import cross_matrices, inverse
+from trihedron.plugins.shared.covariances import cross_matrices
 
 
 def information_of(moments: F64, coefficients: F64) -> F64:
@@ -28,7 +28,7 @@ def equivalent_moments(coefficients: F64, covariance: F64) -> F64:
     L[:, :2, :3] = np.swapaxes(tangent_basis(n), -1, -2)
     L[:, 2, :3] = -d[:, None] * n
     L[:, 2, 3] = 1.0
-    return matmul(np.swapaxes(L, -1, -2), inverse(covariance), L)
+    return matmul(np.swapaxes(L, -1, -2), inv_symmetric(covariance), L)
 
 
 def move_moments(T_a_b: F64, moments_b: F64) -> F64:
@@ -44,7 +44,7 @@ def fit_planes(moments: F64, like: F64) -> tuple[F64, F64]:
     normal = np.asarray(eigh(scatter)[1][:, :, 0], np.float64)
     normal = normal * np.where(np.einsum("ij,ij->i", normal, like[:, :3]) < 0.0, -1.0, 1.0)[:, None]
     planes = np.concatenate([normal, -np.einsum("ij,ij->i", normal, centre)[:, None]], axis=1)
-    return planes, inverse(information_of(moments, planes))
+    return planes, inv_symmetric(information_of(moments, planes))
 
 
 def motions_between(old: F64, new: F64, centres: F64) -> F64:

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from trihedron.pipeline.core.geometry import invert, transform
+from trihedron.pipeline.core.kernel import constant
 from trihedron.pipeline.core.linalg import matmul
 from trihedron.pipeline.core.types import F32, F64, I32, U8, Bool, Camera, Frame, Keypoints, Map, Planes, Segments, Table
 from trihedron.plugins.mapping.landmark_kernels import (
@@ -20,7 +21,6 @@ from trihedron.plugins.mapping.landmark_kernels import (
     point_terms_kernel,
     visible_points_kernel,
 )
-from trihedron.plugins.shared.linalg import constant
 from trihedron.plugins.shared.residuals_kernels import LineTerms, PlaneTerms, PointTerms
 
 POINT_COLUMNS = "position_m", "direction", "distance_m", "octave"  # of the map, that `visible_points` needs

@@ -14,13 +14,13 @@ from enum import Enum
 import numpy as np
 
 from trihedron.pipeline.core.geometry import invert
+from trihedron.pipeline.core.kernel import constant
 from trihedron.pipeline.core.lie import log_se3
 from trihedron.pipeline.core.linalg import matmul
 from trihedron.pipeline.core.options import PositiveFloat, PositiveShare, Share
 from trihedron.pipeline.core.types import DEGRADED, F64, OK, U8, Bool, Keypoints, Map, Matches, Planes, Segments
 from trihedron.plugins.pose.dynamic_objects_kernels import mahalanobis2, on_planes_kernel
 from trihedron.plugins.pose.map_alignment import InlierStatistics, MapAlignment, TrackingStatus
-from trihedron.plugins.shared.linalg import constant
 from trihedron.plugins.shared.pose_optimizer import PoseSolution, Terms
 from trihedron.plugins.shared.pose_optimizer_kernels import Flags
 from trihedron.plugins.shared.residuals_kernels import LineTerms, PointTerms

@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from trihedron.pipeline.core.kernel import constant
 from trihedron.pipeline.core.linalg import matmul
 from trihedron.pipeline.core.types import F32, F64, I32, U8
 from trihedron.plugins.shared.feature_matching_kernels import (
@@ -23,7 +24,6 @@ from trihedron.plugins.shared.feature_matching_kernels import (
     near_matches,
     nearest_descriptors,
 )
-from trihedron.plugins.shared.linalg import constant
 
 METRICS = ("hamming", "l2")
 

@@ -10,8 +10,8 @@ import numpy as np
 from trihedron.pipeline.core.lie import exp_so3
 from trihedron.pipeline.core.linalg import matmul
 from trihedron.pipeline.core.types import F64, I32
+from trihedron.plugins.shared.covariances import cross_matrices
 from trihedron.plugins.shared.lie_kernels import log_so3_each
-from trihedron.plugins.shared.linalg import cross_matrices
 from trihedron.plugins.shared.pose_graph_kernels import solve_envelope
 
 if TYPE_CHECKING:  # imported where it is needed: SciPy is slow to load, and most runs close no loop

@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 
 from trihedron.pipeline.core.kernel import kernel
-from trihedron.pipeline.core.linalg_kernels import tangent_columns
+from trihedron.pipeline.core.linalg_kernels import invert_small, tangent_columns
 from trihedron.pipeline.core.types import F64, I32
 
 # The parameters of the problem: world landmarks and their observations.
@@ -215,30 +215,6 @@ def plane_landmark_jacobians(kind: int, R: F64, t: F64, world: F64, observed: F6
 
 
 # Information matrices of the residuals: noise of the measurement plus the landmark's covariance, at the pose of a round.
-
-
-@kernel(forceinline=True)
-def invert_small(S: F64, rows: int, W: F64) -> None:
-    """Invert the leading block of 1, 2 or 3 rows of a symmetric matrix into W; the rest is 0."""
-    W[:] = 0.0
-    if rows == 1:
-        W[0, 0] = 1.0 / S[0, 0]
-        return
-    if rows == 2:
-        det = S[0, 0] * S[1, 1] - S[0, 1] * S[1, 0]
-        W[0, 0], W[1, 1], W[0, 1], W[1, 0] = S[1, 1] / det, S[0, 0] / det, -S[0, 1] / det, -S[1, 0] / det
-        return
-    W[0, 0] = S[1, 1] * S[2, 2] - S[1, 2] * S[2, 1]
-    W[0, 1] = S[0, 2] * S[2, 1] - S[0, 1] * S[2, 2]
-    W[0, 2] = S[0, 1] * S[1, 2] - S[0, 2] * S[1, 1]
-    W[1, 1] = S[0, 0] * S[2, 2] - S[0, 2] * S[2, 0]
-    W[1, 2] = S[0, 2] * S[1, 0] - S[0, 0] * S[1, 2]
-    W[2, 2] = S[0, 0] * S[1, 1] - S[0, 1] * S[1, 0]
-    W[1, 0], W[2, 0], W[2, 1] = W[0, 1], W[0, 2], W[1, 2]
-    det = S[0, 0] * W[0, 0] + S[0, 1] * W[1, 0] + S[0, 2] * W[2, 0]
-    for i in range(3):
-        for j in range(3):
-            W[i, j] /= det
 
 
 @kernel(forceinline=True)

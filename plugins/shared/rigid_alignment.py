@@ -9,7 +9,7 @@ import numpy as np
 from trihedron.pipeline.core.geometry import nearest_rotation
 from trihedron.pipeline.core.linalg import inv, matmul
 from trihedron.pipeline.core.types import F32, F64, I32, Bool, Keypoints, Tracks
-from trihedron.plugins.shared.linalg import pose_jacobians
+from trihedron.plugins.shared.covariances import pose_jacobians
 from trihedron.plugins.shared.rigid_alignment_kernels import best_motion
 
 RAD_PER_PX = 0.002  # of a pixel, about: 1/fx of a common camera

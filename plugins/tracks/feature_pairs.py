@@ -7,10 +7,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from trihedron.pipeline.core.geometry import pose_matrix, transform_planes
+from trihedron.pipeline.core.kernel import constant
 from trihedron.pipeline.core.linalg import matmul
 from trihedron.pipeline.core.types import F32, F64, I32, Camera, Keypoints, Planes, Segments, Tracks
 from trihedron.plugins.shared.feature_matching import associate_planes, match_lines
-from trihedron.plugins.shared.linalg import constant
 from trihedron.plugins.tracks.feature_pairs_kernels import pairs_of_matches, predict_pixels_kernel
 
 NO_PAIRS = np.zeros((0, 2), np.int32)

@@ -7,6 +7,7 @@ from functools import cached_property
 
 import numpy as np
 
+from trihedron.pipeline.core.kernel import constant
 from trihedron.pipeline.core.lie import exp_so3, log_so3, rotation_angle_deg
 from trihedron.pipeline.core.linalg import eigvalsh, matmul
 from trihedron.pipeline.core.options import AcuteDeg, NonNegativeInt, PositiveFloat, PositiveInt, PositiveShare, Share, check_increasing
@@ -14,7 +15,6 @@ from trihedron.pipeline.core.registry import register
 from trihedron.pipeline.core.types import F64, U8, Camera, Keypoints, ManhattanFrame, Planes, Segments, Tracks
 from trihedron.plugins.shared.feature_matching import compared_by, mutual_matches, words_of
 from trihedron.plugins.shared.feature_matching_kernels import U64, associate_planes_kernel, line_matches, near_matches
-from trihedron.plugins.shared.linalg import constant
 from trihedron.plugins.shared.relative_motion import Motion, solve_motion
 from trihedron.plugins.shared.rigid_alignment import consensus, tracked_point_pairs
 from trihedron.plugins.tracks.feature_pairs import NO_PAIRS, Features, tracks_value

@@ -7,12 +7,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from trihedron.pipeline.core.geometry import pose_matrix
+from trihedron.pipeline.core.kernel import constant
 from trihedron.pipeline.core.linalg import matmul
 from trihedron.pipeline.core.options import NonNegativeFloat, NonNegativeInt, PositiveFloat
 from trihedron.pipeline.core.registry import register
 from trihedron.pipeline.core.types import F64, Camera, Keypoints, Map, Planes, Pose, Rotation, Segments, Tracks, Translation
 from trihedron.plugins.mapping.reference_keyframe import transform_to_map
-from trihedron.plugins.shared.linalg import constant
 from trihedron.plugins.shared.pose_optimizer import Terms, solve_pose
 from trihedron.plugins.shared.relative_motion import pairs_of
 from trihedron.plugins.translation.predicted_position import origin, predicted_translation, propagated_covariance

@@ -8,7 +8,7 @@ from trihedron.pipeline.core.geometry import invert, pose_matrix, tangent_basis,
 from trihedron.pipeline.core.lie import exp_se3
 from trihedron.pipeline.core.types import Camera, Frame, Keypoints, Planes, Pose, Rotation, Segments, Tracks, Translation
 from trihedron.plugins.mapping.projection import clip_segments
-from trihedron.plugins.shared.linalg import point_covariance
+from trihedron.plugins.shared.covariances import point_covariance
 
 CAMERA = Camera(640, 480, 525.0, 520.0, 319.5, 239.5)
 SIZE = np.array([5.0, 3.0, 6.0])  # of the room; its axes are not the world's

@@ -16,7 +16,7 @@ from trihedron.pipeline.run.results import causal_trajectory, final_trajectory, 
 from trihedron.pipeline.run.runner import Runner
 from trihedron.plugins.mapping.landmarks import KEYFRAMES, empty_map
 from trihedron.plugins.mapping.reference_keyframe import transform_rotation_to_map, transform_to_map
-from trihedron.plugins.shared.linalg import transform_plane_covariance
+from trihedron.plugins.shared.covariances import transform_plane_covariance
 
 SHIFT = pose_matrix(exp_so3(np.radians([3.0, 4.0, 0.0])), np.array([0.2, -0.1, 0.2]))  # 5° and 0.3 m
 

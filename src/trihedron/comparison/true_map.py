@@ -17,7 +17,7 @@ from trihedron.pipeline.core.geometry import invert, transform_each
 from trihedron.pipeline.core.linalg import matmul
 from trihedron.pipeline.core.types import F64, I32, Map, Table
 from trihedron.plugins.mapping.plane_fusion import motions_between
-from trihedron.plugins.shared.linalg import transform_plane_covariance
+from trihedron.plugins.shared.covariances import transform_plane_covariance
 
 
 def true_map(map: Map, poses: Mapping[int, F64]) -> Map:

@@ -1,23 +1,12 @@
-"""Linear algebra of many small matrices, and propagation of covariances."""
+"""Covariances of points and planes, and how they change with the pose that they are seen from."""
 
 from __future__ import annotations
-
-from typing import Any
 
 import numpy as np
 
 from trihedron.pipeline.core.geometry import tangent_basis
-from trihedron.pipeline.core.linalg import inv, matmul
-from trihedron.pipeline.core.linalg_kernels import invert_each
-from trihedron.pipeline.core.types import F32, F64, Camera
-
-
-def constant(array: Any, dtype: type[np.generic]) -> Any:
-    """Return a contiguous read-only view of an array, or of a copy, for kernels. numba compiles a kernel anew for each mixture of read-only and
-    writable arrays, which takes seconds; the arrays of topics are read-only."""
-    view = np.ascontiguousarray(array, dtype).view()
-    view.flags.writeable = False
-    return view
+from trihedron.pipeline.core.linalg import matmul
+from trihedron.pipeline.core.types import F64, Camera
 
 
 def point_covariance(points_m: F64, sigma_px: F64, sigma_m: F64, camera: Camera) -> F64:
@@ -29,16 +18,6 @@ def point_covariance(points_m: F64, sigma_px: F64, sigma_m: F64, camera: Camera)
     covariance[..., 0, 0] += (z * sigma_px / camera.fx) ** 2
     covariance[..., 1, 1] += (z * sigma_px / camera.fy) ** 2
     return covariance
-
-
-def inverse(matrices: F32 | F64) -> F64:
-    """Invert symmetric matrices (..., k, k): covariance to information or the other way round. Raises LinAlgError if one is singular."""
-    if matrices.shape[-1] != 3:
-        return np.asarray(inv(matrices.astype(np.float64)), np.float64)
-    out = np.array(matrices, np.float64, order="C")
-    if not invert_each(out.reshape(-1, 3, 3)):
-        raise np.linalg.LinAlgError("Singular matrix")
-    return out
 
 
 def cross_matrices(points: F64) -> F64:
