@@ -29,8 +29,8 @@ class ErrorFloors(Protocol):
 def fit_rules(
     options: ErrorFloors,
     cone_deg: float,
-    normals_floor_deg: float = 0.5,
-    gate: float = 2.0,
+    normals_floor_deg: float,
+    gate: float,
     use_planes: bool = True,
     use_lines: bool = True,
 ) -> FitRules:

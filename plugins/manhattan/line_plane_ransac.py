@@ -49,7 +49,8 @@ class LinePlaneRansac:
         start = np.eye(3) if previous is None else previous.rotations[0]
         features, reach = _features(planes, segments), np.radians(self.reach_deg)
         R, seen, supported = self._consensus(features, normals, start, previous is not None and previous.supported, rng)
-        R, covariance = fit_axes(fit_rules(self, self.reach_deg, gate=self.gate), R, R, np.zeros((3, 4)), seen, segments, planes)
+        rules = fit_rules(self, self.reach_deg, self.plane_floor_deg, self.gate)  # of normals, which take no part, the floor is that of planes
+        R, covariance = fit_axes(rules, R, R, np.zeros((3, 4)), seen, segments, planes)
         axes = assign_axes(features.vectors, R, reach)
         axes[(axes >= 0) & ~seen[axes]] = -1
         inliers, spread = inliers_and_spread(square_angles(features.vectors, axes, R), axes, features.share)

@@ -78,6 +78,7 @@ class Mixture:
     normals_floor_deg: PositiveFloat = 0.5  # error of an axis however many normals it has
     floor_deg: PositiveFloat = 0.05  # of the whole rotation
 
+    gate: ClassVar[float] = 2.0  # σ at which a plane or line counts half
     max_iterations: ClassVar[int] = 20  # of mean shift
     tolerance_deg: ClassVar[float] = 1e-3
     use_planes: ClassVar[bool] = True
@@ -88,7 +89,7 @@ class Mixture:
     def __call__(self, normals: Normals, segments: Segments, planes: Planes, previous: ManhattanFrame | None) -> ManhattanFrame:
         """Frames seen, the best supported first, then those known but out of sight: expected from the others, no inliers, an uninformative
         covariance. `supported` is False when none is seen."""
-        rules = fit_rules(self, self.fit_deg, self.normals_floor_deg)
+        rules = fit_rules(self, self.fit_deg, self.normals_floor_deg, self.gate)
         directions = gather_directions(normals.normals, segments, self.samples, self.line_weight_per_px)
         known = np.eye(3)[None] if previous is None else previous.rotations
         ids = np.zeros(1, np.int32) if previous is None else previous.ids
