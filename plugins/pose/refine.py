@@ -35,7 +35,8 @@ from trihedron.plugins.pose.world_uncertainty import in_world, propagate_world_c
 from trihedron.plugins.shared.pose_optimizer import PoseSolution
 
 EYE = np.eye(3)
-DETAILED = 100  # key points with which a frame is expected to be recognised by them
+DETAILED = 100  # key points, or matches, with which a frame is expected to be recognised by them
+BY_CHANCE = 0.15  # of these matches that agree by chance: after a jump at most 0.08, between frames of a walk at least 0.31
 
 
 @register("pose", "refine")
@@ -96,6 +97,9 @@ class Refine(MovingOptions):
         if start.status != LOST and self._is_another_place(keypoints, matches, max(int(translation.inliers[0]), inliers.inliers[0])):
             continued = f"{translation.inliers[0]} key points continue the previous frame and {inliers.inliers[0]} are in the map"
             reason = f"another place: of {len(keypoints.pixels)}, {continued}"
+            return propagate_world_covariance(replace(start, status=LOST, reason=reason).to_pose(rotation, map, submap=submap), previous)
+        if start.status != LOST and inliers.matches >= DETAILED and inliers.total < BY_CHANCE * inliers.matches:
+            reason = f"the frame contradicts the map: only {inliers.total} of {inliers.matches} matches agree"
             return propagate_world_covariance(replace(start, status=LOST, reason=reason).to_pose(rotation, map, submap=submap), previous)
         if submap and not self._is_tracked(inliers):  # it ties the sub-map to nothing, and is looked for in the others
             reason = f"sub-map {submap} does not show what the frame does: only {inliers.total} of {inliers.matches} matches agree"

@@ -295,6 +295,22 @@ def test_a_few_key_points_in_common_by_chance_are_no_place():
     assert shown_elsewhere("ok", int(0.05 * with_depth)).status == "lost" and shown_elsewhere("ok", int(0.08 * with_depth)).status != "lost"
 
 
+def test_a_frame_that_most_of_the_map_contradicts_is_lost():
+    """Nine in ten of the matched landmarks are others than those seen: what agrees does so by chance, and must not become part of the map."""
+    world, map = World(4000), first_map(World(4000))
+    features = world.features(camera_at(5), 5)
+    rotation, translation = rotation_of(camera_at(5), 5, 0.5), translation_of(camera_at(5), 5, sigma_m=0.03)
+    matches = LocalMap()(world.frame(5).camera, rotation, translation, *features, map, None)
+    ids = matches.keypoints[:, 1].copy()
+    ids[len(ids) // 10 :] = np.roll(ids[len(ids) // 10 :], 50)
+    wrong = dataclasses.replace(
+        matches, keypoints=np.stack([matches.keypoints[:, 0], ids], axis=1), segments=matches.segments[:0], planes=matches.planes[:0],
+        parallel=matches.parallel[:0], perpendicular=matches.perpendicular[:0],
+    )  # fmt: skip
+    pose = Refine()(world.frame(5).camera, rotation, translation, None, wrong, *features, pose_of(camera_at(4), 4), map, None)
+    assert pose.reason.startswith("the frame contradicts the map: only ") and pose.status == "lost"
+
+
 def test_a_sub_map_that_does_not_show_the_frame_is_left():
     """Tied to nothing: a frame that is recognised elsewhere must not merge it there."""
     world, map = World(), first_map(World())
