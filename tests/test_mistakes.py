@@ -76,8 +76,8 @@ MISTAKES = [  # words of the command, exit code, what is said after "trihedron: 
      "benchmark long: there are too few frames for two rows after the warm-up; give more --frames, or a shorter --span"),
     ("benchmark maps", 2, "benchmark: 'maps' is neither key=value, a comparison nor an existing folder; did you mean 'map'?"),
     ("benchmark threads=1 quickly", 2,
-     "benchmark: 'quickly' is neither key=value, a comparison nor an existing folder; known: building, detectors, faults, long, manhattan, map, "
-     "methods, parts, recording, rotations, scaling, sensors, surface"),
+     "benchmark: 'quickly' is neither key=value, a comparison nor an existing folder; known: building, detectors, faults, honesty, long, manhattan, "
+     "map, methods, parts, recording, rotations, scaling, sensors, surface"),
     ("run +foo=1", 2, "foo: there is no such key to add to; see trihedron run --help"),
     ("run +thread=1", 2, "thread: there is no such key to add to; did you mean 'threads'?"),
     ("compare empty", 1,
