@@ -16,7 +16,9 @@ from typing import Any
 
 import trihedron as th
 
-# Another plugin is another name, options are arguments: th.manhattan.plane_svd(), th.planes.cape(angle_deg=3).
+# Another plugin is another name, options are arguments: th.manhattan.plane_svd(), th.planes.cape(angle_deg=3). `trihedron
+# plugins manhattan` lists the plugins of a slot, with the name of one its options and defaults; its file is plugins/SLOT/NAME.py. Every plugin of a
+# slot takes the same keywords, and any function that takes and returns the same types can stand in its place.
 orb, lsd, line_ransac = th.keypoints.orb(), th.lines.lsd(), th.segments.ransac()
 integral_image, connected_components, mean_shift = th.normals.integral_image(), th.planes.connected_components(), th.manhattan.mean_shift()
 projection, drift_free, levenberg_marquardt = th.tracks.projection(), th.rotation.drift_free(), th.translation.levenberg_marquardt()
@@ -26,18 +28,19 @@ greedy = th.surface.planar_greedy().plugin  # itself, since a surface is no func
 
 @dataclass
 class Seen:
-    """What is known of a frame; of the first frame's past, nothing. The types are those of trihedron.pipeline.core.types."""
+    """What is known of a frame; of the first frame's past, nothing. After a lost frame tracks go on from it, and poses stay lost until enough of the
+    map agrees. The types are those of trihedron.pipeline.core.types."""
 
     points: Any = None  # Keypoints: pixels, and 3D points in the camera's frame with their σ and descriptors
     segments: Any = None  # Segments: end points in pixels and in 3D
     planes: Any = None  # Planes: coefficients with covariance, and the regions of the image
     axes: Any = None  # ManhattanFrame: the rotation from the room's axes to the camera
-    tracks: Any = None  # Tracks: pairs of features, last frame and this one
-    rotation: Any = None  # Rotation: of the camera in the world, the frame of the first camera
+    tracks: Any = None  # Tracks: pairs of features, last frame and this one, and the rotation between them
+    rotation: Any = None  # Rotation: of the camera in the world, the frame of the first camera; and R_mw of eq. 1, that of the room's axes
     translation: Any = None  # Translation: position of the camera in the world
     matches: Any = None  # Matches: features and their landmarks of the map
-    pose: Any = None  # Pose: T_world_camera, its covariance, and status ok, degraded or lost
-    map: Any = None  # Map: keyframes and landmarks, with this frame if it is a keyframe
+    pose: Any = None  # Pose: T_world_camera, its covariance (position, then rotation, camera frame), stamp_ns, and status ok, degraded or lost
+    map: Any = None  # Map: keyframes and landmarks, with this frame if it is a keyframe; a value, which nothing changes
 
 
 def extract(frame):
@@ -63,8 +66,9 @@ def track(camera, now, last):
 
 
 def rotation(now, last):
-    """Section IV-A: the camera's rotation from the axes, so that it does not drift, weighed by covariance against that of the tracks; where no axes
-    are in view, from the tracks alone. The map has where the last pose is now, should its keyframe have moved."""
+    """Section IV-A, eq. 1: the camera's rotation from the axes and R_mw, known since the first frame that showed them, so that it does not drift.
+    Beyond the paper it is weighed by covariance against that of the tracks, which stand alone where no axes are in view. Of the map it takes where
+    the last pose is now: with bundle adjustment or loops its keyframe would move, here nothing moves it."""
     return drift_free(
         manhattan=now.axes, tracks=now.tracks, keypoints=now.points, segments=now.segments, planes=now.planes,
         previous=last.rotation, previous_pose=last.pose, map=last.map,
@@ -72,8 +76,8 @@ def rotation(now, last):
 
 
 def translation(camera, now, last, before_last):
-    """Section IV-B: with that rotation held, the position that minimises the residuals of tracked points, lines and planes (eq. 7). Without any, it
-    is predicted by the velocity between the earlier poses."""
+    """Section IV-B: with that rotation held, the position that minimises the residuals of tracked points, lines and planes of the last frame (eqs. 2
+    to 7). Without any, and not in the paper, it is predicted by the velocity between the earlier poses. The map is taken as above."""
     return levenberg_marquardt(
         camera, rotation=now.rotation, tracks=now.tracks, keypoints=now.points, segments=now.segments, planes=now.planes,
         previous_pose=last.pose, earlier_pose=before_last.pose, map=last.map,
@@ -81,7 +85,7 @@ def translation(camera, now, last, before_last):
 
 
 def match(camera, now, last):
-    """Sections III-A and V-A: landmarks of the local map that are in view of the camera at that rotation and position, by descriptors; planes by
+    """Sections III-A and IV-C: landmarks of the local map that are in view of the camera at that rotation and position, by descriptors; planes by
     angle and distance."""
     return local_map(
         camera, rotation=now.rotation, translation=now.translation, keypoints=now.points, segments=now.segments, planes=now.planes, map=last.map
@@ -89,8 +93,8 @@ def match(camera, now, last):
 
 
 def refine(camera, now, last):
-    """Section IV-C: all six degrees of freedom, by matched landmarks and by planes that are parallel or perpendicular to those of the map (eq. 8).
-    A frame without matches retains the tracked pose."""
+    """Section IV-C: all six degrees of freedom, by matched landmarks and by planes that are parallel or perpendicular to those of the map (eqs. 7
+    and 8 together). A frame without matches retains the tracked pose; the first is the origin. Of the tracks it takes whether the image repeats."""
     return refinement(
         camera, rotation=now.rotation, translation=now.translation, tracks=now.tracks, matches=now.matches,
         keypoints=now.points, segments=now.segments, planes=now.planes, previous=last.pose, map=last.map,
@@ -99,7 +103,7 @@ def refine(camera, now, last):
 
 def keyframe(frame, now, last):
     """Section V-A: a frame that shows enough new becomes a keyframe: its features become landmarks, or observations of those that they match, and
-    landmarks that are seldom found again are removed. None for another frame."""
+    landmarks that are seldom found again are removed. Returns a new map, None where the frame is no keyframe."""
     return covisibility(frame, pose=now.pose, keypoints=now.points, segments=now.segments, planes=now.planes, matches=now.matches, map=last.map)
 
 

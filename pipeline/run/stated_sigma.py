@@ -96,5 +96,5 @@ def sigma_line(sigma: Mapping[str, Any], folder: Path) -> str:
     if cause := dominant_cause(sigma):
         line += f"; mostly {CAUSES[cause]}{cures.get(cause, '')}"
     if few := sigma["few_features"]:
-        line += f"; {few} degraded frames show little of the map: {SEE_MORE}"
+        line += f"; {few} degraded frame{'s' * (few > 1)} show{'s' * (few == 1)} little of the map: {SEE_MORE}"
     return line
