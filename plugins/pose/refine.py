@@ -91,18 +91,7 @@ class Refine(MovingOptions):
         if start.status == LOST and not found_again:
             searched = relocalise is not None and translation.estimated
             return self._stay_lost(start, rotation, previous, searched, map, submap)
-        if rotation.source == "prediction" and not self._is_tracked(inliers):
-            reason = f"the rotation was not measured, and only {inliers.total} of {inliers.matches} matches with the map agree"
-            return propagate_world_covariance(replace(start, status=LOST, reason=reason).to_pose(rotation, map, submap=submap), previous)
-        if start.status != LOST and self._is_another_place(keypoints, matches, max(int(translation.inliers[0]), inliers.inliers[0])):
-            continued = f"{translation.inliers[0]} key points continue the previous frame and {inliers.inliers[0]} are in the map"
-            reason = f"another place: of {len(keypoints.pixels)}, {continued}"
-            return propagate_world_covariance(replace(start, status=LOST, reason=reason).to_pose(rotation, map, submap=submap), previous)
-        if start.status != LOST and inliers.matches >= DETAILED and inliers.total < BY_CHANCE * inliers.matches:
-            reason = f"the frame contradicts the map: only {inliers.total} of {inliers.matches} matches agree"
-            return propagate_world_covariance(replace(start, status=LOST, reason=reason).to_pose(rotation, map, submap=submap), previous)
-        if submap and not self._is_tracked(inliers):  # it ties the sub-map to nothing, and is looked for in the others
-            reason = f"sub-map {submap} does not show what the frame does: only {inliers.total} of {inliers.matches} matches agree"
+        if reason := self._contradiction(start, rotation, translation, keypoints, matches, inliers, submap):
             return propagate_world_covariance(replace(start, status=LOST, reason=reason).to_pose(rotation, map, submap=submap), previous)
         if not inliers.total:
             return propagate_world_covariance(
@@ -154,6 +143,30 @@ class Refine(MovingOptions):
         with_depth = int(np.count_nonzero(np.isfinite(keypoints.points_m[:, 2])))
         expected = min(with_depth, len(matches.visible_points))
         return expected >= DETAILED and continued < self.min_continued * with_depth
+
+    def _contradiction(
+        self,
+        start: Decoupled,
+        rotation: Rotation,
+        translation: Translation,
+        keypoints: Keypoints,
+        matches: Matches,
+        inliers: InlierStatistics,
+        submap: int,
+    ) -> str:
+        """Return why a frame is lost although the previous one, or relocalisation, gave it a pose; empty where nothing contradicts that."""
+        tracked, agree = self._is_tracked(inliers), f"only {inliers.total} of {inliers.matches} matches"
+        if rotation.source == "prediction" and not tracked:
+            return f"the rotation was not measured, and {agree} with the map agree"
+        continued = int(translation.inliers[0]), inliers.inliers[0]
+        if start.status != LOST and self._is_another_place(keypoints, matches, max(continued)):
+            known = f"{continued[0]} key points continue the previous frame and {continued[1]} are in the map"
+            return f"another place: of {len(keypoints.pixels)}, {known}"
+        if start.status != LOST and inliers.matches >= DETAILED and inliers.total < BY_CHANCE * inliers.matches:
+            return f"the frame contradicts the map: {agree} agree"
+        if submap and not tracked:  # nothing ties it to the sub-map: it is searched for in the others
+            return f"sub-map {submap} does not show what the frame does: {agree} agree"
+        return ""
 
     def _status(
         self, problem: MapAlignment, solution: PoseSolution, static: Selection | None, inliers: InlierStatistics, rotation: Rotation, submap: int
