@@ -83,10 +83,11 @@ def in_world(pose: Pose, previous: Pose, solution: PoseSolution, problem: MapAli
     scale, noise_scale = residual_scale(information, scores), previous.noise_scale
     if scale is not None:
         noise_scale += (min(scale, SCALE_OUTLIER * noise_scale) - noise_scale) / SCALE_FRAMES
-    by_drift = drift_of_previous(pose, previous)
     if information.any():
         poses, covariances = (problem.map.keyframes.rows(name, keyframes) for name in ("T_world_camera", "world_covariance"))
         by_drift = covariance_of_keyframes(pose.T_world_camera, poses, covariances, information)
+    else:
+        by_drift = drift_of_previous(pose, previous)
     moving = with_velocity(replace(pose, noise_scale=noise_scale), previous, problem.map)
     return _with_world_covariance(with_calibration(moving, previous, solution, problem, keyframes, groups), by_drift)
 
