@@ -90,7 +90,7 @@ def pose_consistency(poses: F64, covariances: F64, true_poses: F64, noise: Truth
     noise = noise or TruthNoise()
     covariances = covariances + noise.covariance
     errors = gauge_free_errors(poses, covariances, true_poses)
-    nees, moved = _normalised_squares(errors, covariances), _normalised_squares(errors[:, :3], covariances[:, :3, :3])
+    nees, moved = normalised_squares(errors, covariances), normalised_squares(errors[:, :3], covariances[:, :3, :3])
     sigma = np.sqrt(np.diagonal(covariances, axis1=1, axis2=2))
     return Consistency(
         poses=len(poses),
@@ -105,7 +105,7 @@ def pose_consistency(poses: F64, covariances: F64, true_poses: F64, noise: Truth
     )
 
 
-def _normalised_squares(errors: F64, covariances: F64) -> F64:
+def normalised_squares(errors: F64, covariances: F64) -> F64:
     """Return (n,) `eᵀ C⁻¹ e` of errors (n, d) with covariances (n, d, d)."""
     return np.asarray(np.einsum("ni,nij,nj->n", errors, inv(covariances), errors))
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import re
 from collections import Counter
 from collections.abc import Iterable
 from dataclasses import replace
@@ -20,6 +19,7 @@ from trihedron.pipeline.run.accounting import Result
 from trihedron.pipeline.run.consistency import judged_poses, pose_consistency, truth_noise
 from trihedron.pipeline.run.metrics import associate, evaluate_trajectory
 from trihedron.pipeline.run.stated_sigma import stated_sigma
+from trihedron.pipeline.run.status_check import without_figures
 
 TRAJECTORY, CAUSAL, TIMING, METRICS = "trajectory.txt", "trajectory_causal.txt", "timing.json", "metrics.json"
 
@@ -90,7 +90,7 @@ def write_results(out: Path, result: Result, final: Trajectory, truth: Trajector
 def _commonest_reason(poses: Iterable[Pose], status: str) -> str:
     """Return the reason that most frames of a status have, as the last of them has it; reasons that differ in numbers alone are one. '' for none."""
     reasons = [pose.reason for pose in poses if pose.status == status]
-    alike = [re.sub(r"\d+(\.\d+)?", "0", reason) for reason in reasons]
+    alike = list(map(without_figures, reasons))
     commonest = Counter(alike).most_common(1)
     return next((reason for reason, kind in zip(reversed(reasons), reversed(alike)) if kind == commonest[0][0]), "")
 

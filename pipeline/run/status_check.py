@@ -21,9 +21,9 @@ from typing import Any
 import numpy as np
 
 from trihedron.pipeline.core.geometry import invert, umeyama
-from trihedron.pipeline.core.linalg import cholesky, inv, matmul
+from trihedron.pipeline.core.linalg import cholesky, matmul
 from trihedron.pipeline.core.types import DEGRADED, F64, LOST, OK, Bool, Pose, Trajectory
-from trihedron.pipeline.run.consistency import LIMIT_95, TruthNoise, gauge_free_errors, truth_noise
+from trihedron.pipeline.run.consistency import LIMIT_95, TruthNoise, gauge_free_errors, normalised_squares, truth_noise
 from trihedron.pipeline.run.metrics import associate, relative_errors, rotation_angles_deg
 
 WRONG_M, WRONG_DEG, SIGMAS = 0.05, 2.0, 4.0
@@ -121,7 +121,12 @@ def check_status(poses: Sequence[Pose], truth: Trajectory, frames: int | None = 
 
 def name_of_test(reason: str) -> str:
     """Return what stays the same of the reason of a status, its first clause without figures: "only … of … matches with the map agree"."""
-    return FIGURES.sub("…", CLAUSE_ENDS.split(reason)[0]) or "no reason"
+    return without_figures(CLAUSE_ENDS.split(reason)[0]) or "no reason"
+
+
+def without_figures(reason: str) -> str:
+    """Return a reason with an ellipsis in the place of each number: reasons that differ in numbers alone are one."""
+    return FIGURES.sub("…", reason)
 
 
 def _spread_over_error(errors: FrameErrors) -> float | None:
@@ -195,7 +200,7 @@ def _noise_of_truth(poses: Sequence[Pose], true: F64) -> TruthNoise:
 def _normalised_errors(T: F64, covariances: F64, true: F64) -> tuple[F64, F64, F64]:
     """Return (n,) NEES, log-likelihood in nats and metres of the errors of poses."""
     errors = gauge_free_errors(T, covariances, true)
-    nees = np.einsum("ni,nij,nj->n", errors, inv(covariances), errors)
+    nees = normalised_squares(errors, covariances)
     log_determinants = 2.0 * np.log(np.diagonal(cholesky(2.0 * np.pi * covariances), axis1=1, axis2=2)).sum(axis=1)
     return nees, -0.5 * (nees + log_determinants), np.linalg.norm(errors[:, :3], axis=1)
 
