@@ -14,19 +14,24 @@ from typing import Any, TypeVar, get_type_hints
 
 import numpy as np
 
+from trihedron.pipeline.core.drawings import Drawing
 from trihedron.pipeline.core.errors import LibraryError, PluginError, did_you_mean
 from trihedron.pipeline.core.options import check_options
 from trihedron.pipeline.core.slots import FOLDS, RESERVED, SLOTS, inputs_of, method_of, output_of, strip_none
-from trihedron.pipeline.core.types import F64, Pose
+from trihedron.pipeline.core.types import F64, Pose, Value
 
 Plugin = TypeVar("Plugin", bound=type)
+Key = TypeVar("Key")
+Function = TypeVar("Function", bound=Callable[..., Any])
 _PLUGINS: dict[str, dict[str, type[Any]]] = {slot: {} for slot in SLOTS}
 _BUILT_IN = ("trihedron.datasets", "trihedron.plugins")
 ENTRY_POINT_GROUP = "trihedron.plugins"
 FileWriter = Callable[[Path, Any], list[str]]
 _FILES: dict[str, FileWriter] = {}
 CovariancePart = Callable[[Pose], F64]
+DrawingOf = Callable[[Any], Drawing]
 _COVARIANCES: dict[str, CovariancePart] = {}
+_DRAWINGS: dict[type[Value], DrawingOf] = {}
 
 
 def register(slot: str, name: str) -> Callable[[Plugin], Plugin]:
@@ -131,14 +136,19 @@ def plugin_class(slot: str, name: str) -> type[Any]:
     return _PLUGINS[slot][name]
 
 
-def register_files(slot: str) -> Callable[[FileWriter], FileWriter]:
-    """Register the function that writes the files of a fold's value into a run folder, and returns lines that describe them (decorator)."""
+def _register_in(known: dict[Key, Function], key: Key) -> Callable[[Function], Function]:
+    """Keep a function under a key; the last one stays (decorator)."""
 
-    def decorate(write: FileWriter) -> FileWriter:
-        _FILES[slot] = write
-        return write
+    def decorate(function: Function) -> Function:
+        known[key] = function
+        return function
 
     return decorate
+
+
+def register_files(slot: str) -> Callable[[FileWriter], FileWriter]:
+    """Register the function that writes the files of a fold's value into a run folder, and returns lines that describe them (decorator)."""
+    return _register_in(_FILES, slot)
 
 
 def write_files_of(slot: str, folder: Path, value: Any) -> list[str]:
@@ -146,14 +156,19 @@ def write_files_of(slot: str, folder: Path, value: Any) -> list[str]:
     return _FILES[slot](folder, value) if slot in _FILES else []
 
 
+def register_drawing(kind: type[Value]) -> Callable[[DrawingOf], DrawingOf]:
+    """Register the function that draws the values of a type (decorator)."""
+    return _register_in(_DRAWINGS, kind)
+
+
+def drawing_of(value: Value) -> Drawing:
+    """Return what is drawn of a value; nothing where the plugins of its slot are not loaded (`load_plugins`)."""
+    return _DRAWINGS[type(value)](value) if type(value) in _DRAWINGS else Drawing()
+
+
 def register_covariance(cause: str) -> Callable[[CovariancePart], CovariancePart]:
     """Register the function that gives the part (6, 6) of a pose's covariance that is due to `cause` (decorator)."""
-
-    def decorate(part: CovariancePart) -> CovariancePart:
-        _COVARIANCES[cause] = part
-        return part
-
-    return decorate
+    return _register_in(_COVARIANCES, cause)
 
 
 def covariance_due_to(cause: str, pose: Pose) -> F64:

@@ -27,9 +27,9 @@ from foxglove_schemas_protobuf.Vector3_pb2 import Vector3
 from google.protobuf.duration_pb2 import Duration
 from google.protobuf.timestamp_pb2 import Timestamp
 
-from trihedron.pipeline.core.drawings import drawing_of
 from trihedron.pipeline.core.geometry import quaternion_from_rotation, tangent_basis
 from trihedron.pipeline.core.linalg import matmul
+from trihedron.pipeline.core.registry import drawing_of
 from trihedron.pipeline.core.types import (  # fmt: skip
     F32,
     F64,

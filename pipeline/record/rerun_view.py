@@ -6,8 +6,8 @@ from typing import Any
 
 import numpy as np
 
-from trihedron.pipeline.core.drawings import drawing_of
 from trihedron.pipeline.core.libraries import imports_of
+from trihedron.pipeline.core.registry import drawing_of
 from trihedron.pipeline.core.types import OK, Building, Camera, Frame, Keypoints, ManhattanFrame, Map, Planes, Pose, Segments, Surface, Value
 from trihedron.pipeline.record.foxglove_messages import AXES, COLORS
 

@@ -12,8 +12,10 @@ from typing import Any
 
 import numpy as np
 
-from trihedron.pipeline.core.drawings import Drawing, Outline, Solid, draws
+from trihedron.pipeline.core.drawings import Drawing, Outline, Solid
+from trihedron.pipeline.core.geometry import transform
 from trihedron.pipeline.core.linalg import matmul, norm
+from trihedron.pipeline.core.registry import register_drawing
 from trihedron.pipeline.core.types import F64, I32, OPENING_KINDS, Building
 
 SHEET_M = 0.06  # thickness that a wall is drawn with where its other face was not seen
@@ -209,22 +211,19 @@ def parts_of(building: Building, ceilings: bool = True) -> list[Part]:
     return [part for part in out if len(part.triangles)]
 
 
-@draws(Building)
+@register_drawing(Building)
 def drawing_of_building(building: Building) -> Drawing:
     """Draw the model without its ceilings, and the outline of each room with its area."""
-    parts = parts_of(building, ceilings=False)
-    solids = (Solid(f"{part.storey}/{part.kind}", MODEL_COLORS[part.kind], _in_world(building, part.vertices_m), part.triangles) for part in parts)
-    outlines = []
+    T, outlines = building.T_world_building, []
+    solids = (
+        Solid(f"{part.storey}/{part.kind}", MODEL_COLORS[part.kind], transform(T, part.vertices_m), part.triangles)
+        for part in parts_of(building, ceilings=False)
+    )
     for room, (area, storey) in enumerate(zip(building.areas_m2, building.room_storeys)):
         ring, height = rings_of(building, room)[0], float(np.nan_to_num(building.storeys[storey, 0]))
         closed = np.column_stack([ring, np.full(len(ring), height)])[[*range(len(ring)), 0]]
-        outlines.append(Outline(f"room_{room}", f"room {room}: {area:.1f} m²", _in_world(building, closed)))
+        outlines.append(Outline(f"room_{room}", f"room {room}: {area:.1f} m²", transform(T, closed)))
     return Drawing(tuple(solids), tuple(outlines))
-
-
-def _in_world(building: Building, points_m: F64) -> F64:
-    T = building.T_world_building
-    return np.asarray(matmul(points_m, T[:3, :3].T) + T[:3, 3], np.float64)
 
 
 def _box(corners: F64, bottom: float, top: float) -> F64:

@@ -14,9 +14,9 @@ import pytest
 import trihedron as th
 from trihedron.comparison.building_errors import plan_errors
 from trihedron.datasets.simulation.synthetic import Scene, Synthetic
-from trihedron.pipeline.core.drawings import Drawing, drawing_of
+from trihedron.pipeline.core.drawings import Drawing
 from trihedron.pipeline.core.errors import LibraryError, TrihedronError
-from trihedron.pipeline.core.registry import load_plugins, plugin_class
+from trihedron.pipeline.core.registry import drawing_of, load_plugins, plugin_class
 from trihedron.pipeline.core.types import OPENING_KINDS, Camera, Frame, Planes, Pose
 from trihedron.pipeline.record.foxglove import TopicView
 from trihedron.plugins.building.edges import Edge, end_at_readings, intersect_edges, make_relative, rotate_edge
