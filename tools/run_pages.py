@@ -6,6 +6,7 @@ import json
 import shlex
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any, TypeVar
@@ -15,10 +16,10 @@ import yaml
 
 from trihedron.comparison.run_tables import FIGURES
 from trihedron.comparison.runs import Run
-from trihedron.pipeline.core.drawings import drawing_of
 from trihedron.pipeline.core.errors import DataError, RecordingError, TrihedronError
 from trihedron.pipeline.core.files import MAX_YAML_BYTES, YamlError, file_sha256, parse_yaml, read_text
 from trihedron.pipeline.core.geometry import transform, umeyama
+from trihedron.pipeline.core.registry import drawing_of
 from trihedron.pipeline.core.types import F64, Building, Pose, Surface, Trajectory, Value
 from trihedron.pipeline.record.reader import Recording
 from trihedron.pipeline.record.trajectories import attached_truth, read_trajectory
@@ -120,15 +121,16 @@ class Results:
     @property
     def true_positions_m(self) -> F64 | None:
         """Return the true positions (n, 3) at the poses of the trajectory, in its world; None for fewer than three."""
-        poses, expected, _ = self._pairs()
+        poses, expected, _ = self._pairs
         return transform(umeyama(expected[:, :3, 3], poses[:, :3, 3]), expected[:, :3, 3]) if len(poses) >= FEWEST_POSES else None
 
     @property
     def errors_mm(self) -> tuple[F64, F64]:
         """Return seconds, and distances of the positions from the ground truth after SE(3) alignment; both empty for fewer than three."""
-        poses, expected, seconds = self._pairs()
+        poses, expected, seconds = self._pairs
         return (seconds, 1e3 * aligned_errors(poses, expected)) if len(poses) >= FEWEST_POSES else (np.empty(0), np.empty(0))
 
+    @cached_property
     def _pairs(self) -> tuple[F64, F64, F64]:
         """Return the poses that have a true one, these, and their seconds since the first pose."""
         if self.estimate is None or self.truth is None:

@@ -24,7 +24,7 @@ def iterate_translation(A: F64, b: F64, z: F64, sigma: F64, start: F64, prior_m:
     """Solve the equations (`PointEquations`: (n, 2, 3), (n, 2), (n,), (n,)) for the translation `s` (3,), from `start`, about which its standard
     deviation is `prior_m`. Returns it, the information (3, 3) of the points alone, and the number of inliers.
 
-    A point without depth says `(b × b')·s = 0`; its residual is divided by |s|, linearised, and multiplied by it again."""
+    The equation of a point without depth is `(b × b')·s = 0`; its residual is divided by |s|, linearised, and multiplied by it again."""
     n, with_depth = len(z), np.isfinite(z)
     any_depth = np.any(with_depth)
     s, along, a = start.copy(), np.zeros(3), np.zeros(3)
