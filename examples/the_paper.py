@@ -1,9 +1,8 @@
 """The method of Li, Yunus, Brasch, Navab & Tombari, RGB-D SLAM with Structural Regularities (ICRA 2021), in the order of the paper.
 
-As published it has no bundle adjustment, loop closure or relocalisation. Each step is one plugin of this project with its default options; the
-docstring of its file has the equations, thresholds and weights, and docs/explanation/paper.md what differs from the paper. A stage keeps no state:
-what it needs of the past is passed to it, and is None before there is one. A lost frame has a pose of status `lost`, which no keyframe and no
-mesh is made of.
+The paper describes no bundle adjustment, loop closure or relocalisation, and here is none. Each step is one plugin of this project with its default
+options; the docstring of its file has the equations, thresholds and weights, and docs/explanation/paper.md every difference from the paper. What the
+docstrings below call an addition is one of them. A stage keeps no state: what it needs of the past is passed to it, and is None before there is one.
 
 python examples/the_paper.py [FOLDER]    # a sequence of the TUM benchmark; without one the built-in room
 """
@@ -28,18 +27,18 @@ greedy = th.surface.planar_greedy().plugin  # itself, since a surface is no func
 
 @dataclass
 class Seen:
-    """What is known of a frame; of the first frame's past, nothing. After a lost frame tracks go on from it, and poses stay lost until enough of the
-    map agrees. The types are those of trihedron.pipeline.core.types."""
+    """What is known of a frame, and nothing before the first. Types are those of trihedron.pipeline.core.types. Every value has the number (`index`)
+    and the time (`stamp_ns`) of its frame, so frames may be missing; everything estimated has a covariance, by which it is weighed."""
 
-    points: Any = None  # Keypoints: pixels, and 3D points in the camera's frame with their σ and descriptors
-    segments: Any = None  # Segments: end points in pixels and in 3D
-    planes: Any = None  # Planes: coefficients with covariance, and the regions of the image
-    axes: Any = None  # ManhattanFrame: the rotation from the room's axes to the camera
-    tracks: Any = None  # Tracks: pairs of features, last frame and this one, and the rotation between them
-    rotation: Any = None  # Rotation: of the camera in the world, the frame of the first camera; and R_mw of eq. 1, that of the room's axes
+    points: Any = None  # Keypoints: pixels, ORB descriptors, and where there is depth 3D points in the camera's frame
+    segments: Any = None  # Segments: end points in pixels and, where there is depth, in 3D; LBD descriptors
+    planes: Any = None  # Planes: coefficients (normal, distance), and the regions of the image
+    axes: Any = None  # ManhattanFrame: R_camera_manhattan; with `supported` False, a frame without axes in view passes on those of the last one
+    tracks: Any = None  # Tracks: pairs (feature of the last frame, of this one), the 3D of the former, and the rotation R_current_previous they give
+    rotation: Any = None  # Rotation: R_world_camera, the world being the frame of the first camera, and R_world_manhattan, the transpose of R_mw
     translation: Any = None  # Translation: position of the camera in the world
-    matches: Any = None  # Matches: features and their landmarks of the map
-    pose: Any = None  # Pose: T_world_camera, its covariance (position, then rotation, camera frame), stamp_ns, and status ok, degraded or lost
+    matches: Any = None  # Matches: pairs (feature, landmark of the map), and pairs of planes that are parallel or perpendicular
+    pose: Any = None  # Pose: T_world_camera; its newest keyframe (`reference`); status ok, degraded (little evidence) or lost (not measured)
     map: Any = None  # Map: keyframes and landmarks, with this frame if it is a keyframe; a value, which nothing changes
 
 
@@ -51,14 +50,14 @@ def extract(frame):
 
 
 def manhattan_frame(normals, now, last):
-    """Section IV-A: the three axes of the room in the camera's frame, by mean shift of the normals and line directions on the sphere, then fitted to
-    the planes and lines on them."""
+    """Section IV-A: the three axes of the room in the camera's frame, by mean shift of the normals and line directions on the sphere, from the axes
+    of the last frame. An addition: the result is fitted to the whole planes and lines that lie along an axis."""
     return mean_shift(normals=normals, segments=now.segments, planes=now.planes, previous=last.axes)
 
 
 def track(camera, now, last):
-    """Points, lines and planes of the last frame that are seen again: searched where the rotation between the axes of both frames, else the last
-    motion (`last.tracks`), projects them."""
+    """Points and lines of the last frame that are seen again, by descriptors, and planes, by angle and distance: searched where the rotation between
+    the axes of both frames, else the rotation before (`last.tracks`), projects them; the translation is unknown, so the search is wide."""
     return projection(
         camera, keypoints=now.points, segments=now.segments, planes=now.planes, manhattan=now.axes, previous=last.tracks,
         previous_keypoints=last.points, previous_segments=last.segments, previous_planes=last.planes, previous_manhattan=last.axes,
@@ -66,9 +65,10 @@ def track(camera, now, last):
 
 
 def rotation(now, last):
-    """Section IV-A, eq. 1: the camera's rotation from the axes and R_mw, known since the first frame that showed them, so that it does not drift.
-    Beyond the paper it is weighed by covariance against that of the tracks, which stand alone where no axes are in view. Of the map it takes where
-    the last pose is now: with bundle adjustment or loops its keyframe would move, here nothing moves it."""
+    """Section IV-A, eq. 1: the camera's rotation from the axes and R_mw, which the first frame that showed axes defined, so that it does not drift
+    from then on. Of the 24 ways to name three axes it takes the one nearest to the predicted rotation. An addition: it is fused by covariance with
+    the last rotation and that of the tracks (computed from points, segments and planes), which stands alone where no axes are in view. The map tells
+    where the last pose is now, because bundle adjustment or a loop would move it with its keyframe `pose.reference`; here nothing does."""
     return drift_free(
         manhattan=now.axes, tracks=now.tracks, keypoints=now.points, segments=now.segments, planes=now.planes,
         previous=last.rotation, previous_pose=last.pose, map=last.map,
@@ -76,8 +76,9 @@ def rotation(now, last):
 
 
 def translation(camera, now, last, before_last):
-    """Section IV-B: with that rotation held, the position that minimises the residuals of tracked points, lines and planes of the last frame (eqs. 2
-    to 7). Without any, and not in the paper, it is predicted by the velocity between the earlier poses. The map is taken as above."""
+    """Section IV-B: with that rotation held, the position that minimises the residuals (eqs. 2 to 7) of this frame's points, lines and planes against
+    their pairs in the last frame, whose 3D geometry is in the tracks; the paper takes lines from the keyframe and planes from the map. An addition:
+    without pairs the position is predicted by the velocity between the two poses before. The map is taken as above."""
     return levenberg_marquardt(
         camera, rotation=now.rotation, tracks=now.tracks, keypoints=now.points, segments=now.segments, planes=now.planes,
         previous_pose=last.pose, earlier_pose=before_last.pose, map=last.map,
@@ -85,16 +86,18 @@ def translation(camera, now, last, before_last):
 
 
 def match(camera, now, last):
-    """Sections III-A and IV-C: landmarks of the local map that are in view of the camera at that rotation and position, by descriptors; planes by
-    angle and distance."""
+    """Sections III-A and IV-C: landmarks of the local map (of the newest keyframes, and those that see most of the same) in view of the camera at
+    that rotation and position: points and lines by descriptors, planes by angle and distance; other planes as parallel or perpendicular, by angle."""
     return local_map(
         camera, rotation=now.rotation, translation=now.translation, keypoints=now.points, segments=now.segments, planes=now.planes, map=last.map
     )
 
 
 def refine(camera, now, last):
-    """Section IV-C: all six degrees of freedom, by matched landmarks and by planes that are parallel or perpendicular to those of the map (eqs. 7
-    and 8 together). A frame without matches retains the tracked pose; the first is the origin. Of the tracks it takes whether the image repeats."""
+    """Section IV-C: all six degrees of freedom, by matched landmarks and by planes that are parallel or perpendicular to those of the map (eqs. 7 and
+    8 together), from rotation and translation above; the first pose is the origin. Additions: the status. With few matches it is `degraded`; `lost`
+    where neither the last frame nor the map is seen, with the predicted pose, which the next frame starts from, until enough of the map agrees again.
+    Images that repeat the last one bit for bit (the tracks tell) measure nothing: from the second on, `degraded`."""
     return refinement(
         camera, rotation=now.rotation, translation=now.translation, tracks=now.tracks, matches=now.matches,
         keypoints=now.points, segments=now.segments, planes=now.planes, previous=last.pose, map=last.map,
@@ -102,14 +105,16 @@ def refine(camera, now, last):
 
 
 def keyframe(frame, now, last):
-    """Section V-A: a frame that shows enough new becomes a keyframe: its features become landmarks, or observations of those that they match, and
-    landmarks that are seldom found again are removed. Returns a new map, None where the frame is no keyframe."""
+    """Section V-A: a frame becomes a keyframe where the camera moved, turned or lost half of the landmarks since the last one (the paper does not
+    say): its features become landmarks, or observations of those that they match, and landmarks that few of the next keyframes find are removed.
+    Returns a new map, None where the frame is no keyframe; a lost frame is none."""
     return covisibility(frame, pose=now.pose, keypoints=now.points, segments=now.segments, planes=now.planes, matches=now.matches, map=last.map)
 
 
 def main(folder="", **options):
-    """Track the sequence; return the poses and the mesh (section V-B): points on each plane of the map are joined by
-    greedy triangulation. `options` are those of the data set."""
+    """Track the sequence; return the poses and the mesh (section V-B): `add` retains each frame that is not lost and shows surface not seen before,
+    and the axes of its rotation, which tell what is up; `finish` joins the points on each plane of the map, found by angle and distance, by greedy
+    triangulation. `options` are those of the data set."""
     dataset = th.dataset.tum(path=folder, **options) if folder else th.dataset.synthetic(**options)
     poses, mesh, last, before_last = [], greedy.start(), Seen(), Seen()
     for frame in filter(None, map(dataset, range(len(dataset)))):  # None: an image that cannot be read
