@@ -13,7 +13,7 @@ import numpy as np
 
 from trihedron.pipeline.core.constraints import Columns, CoversImage, Finite, IndexInto, OneOf, Rotations, SameWidth, UnitNormals, Within
 from trihedron.pipeline.core.errors import RecordingError
-from trihedron.pipeline.core.linalg import det, matmul
+from trihedron.pipeline.core.linalg import matmul
 from trihedron.pipeline.core.slots import SLOTS, output_of
 from trihedron.pipeline.core.types import Camera, Frame, Value
 
@@ -24,9 +24,11 @@ CURE = "the file is damaged; record it again"
 
 
 class _Declared(NamedTuple):
-    """Declarations of a value type: (field, constraint) in order, and the fields that hold a camera, whose own fields are checked too."""
+    """Declarations of a value type: (field, constraint) in order, those of them that name other inputs, and the fields that hold a camera, whose own
+    fields are checked too."""
 
     constraints: tuple[tuple[str, Any], ...]
+    together: tuple[tuple[str, Any], ...]
     cameras: tuple[str, ...]
 
 
@@ -41,8 +43,9 @@ def constraints_of(kind: type) -> tuple[tuple[str, Any], ...]:
 def _declared(kind: type) -> _Declared:
     if kind not in _KNOWN:
         hints = get_type_hints(kind, include_extras=True).items()
-        found = ((name, item) for name, hint in hints if get_origin(hint) is Annotated for item in get_args(hint)[1:] if type(item) in _CHECKS)
-        _KNOWN[kind] = _Declared(tuple(found), tuple(name for name, hint in hints if hint is Camera))
+        found = [(name, item) for name, hint in hints if get_origin(hint) is Annotated for item in get_args(hint)[1:] if type(item) in _CHECKS]
+        together = [(name, item) for name, item in found if isinstance(item, IndexInto | SameWidth | CoversImage)]
+        _KNOWN[kind] = _Declared(tuple(found), tuple(together), tuple(name for name, hint in hints if hint is Camera))
     return _KNOWN[kind]
 
 
@@ -63,7 +66,7 @@ def check_together(inputs: Mapping[str, Any], place: str, topics: Mapping[str, s
     for parameter, value in inputs.items():
         if not isinstance(value, Value) or topics.get(parameter) in computed:
             continue
-        for name, constraint in constraints_of(type(value)):
+        for name, constraint in _declared(type(value)).together:
             if cause := _fault_together(getattr(value, name), constraint, value, _of_its_time(parameter, value, inputs)):
                 topic = topics.get(parameter, parameter)
                 others = any(topics.get(other) in computed for other in inputs)
@@ -170,7 +173,8 @@ def _fault_of_rotations(array: Any, rule: Rotations, owner: Any) -> str:
         array = array[~np.isnan(array).all(axis=(1, 2))]
     R = array[:, :3, :3]
     with np.errstate(all="ignore"):
-        fits = (np.abs(matmul(np.swapaxes(R, 1, 2), R) - np.eye(3)) <= ORTHONORMAL).all() and (det(R) > 0).all()
+        right_handed = (np.cross(R[:, 0], R[:, 1]) * R[:, 2]).sum(axis=1) > 0
+        fits = (np.abs(matmul(np.swapaxes(R, 1, 2), R) - np.eye(3)) <= ORTHONORMAL).all() and right_handed.all()
     if array.shape[-1] == 4:
         fits = fits and np.isfinite(array).all() and (array[:, 3] == [0, 0, 0, 1]).all()
     return "" if fits else "is not a rotation" + " with a translation" * (array.shape[-1] == 4)

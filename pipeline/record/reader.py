@@ -106,11 +106,25 @@ class Recording:
     def frame(self, index: int, check: bool = True) -> dict[str, Value]:
         """Read the values of every topic at one frame, checked as in `values`; empty when there is none of this number. Reads only the chunks it
         needs."""
-        reference = self._reference(index)
+        reference = self.reference(index)
         if reference is None:
             return {}
         found = {topic: self.value(topic, reference.stamp_ns, check) for topic in sorted(self.topics)}
         return {topic: value for topic, value in found.items() if value is not None and value.index == index}
+
+    def reference(self, index: int) -> FrameReference | None:
+        """The reference of a frame, found by bisection, since frame numbers grow; None where there is none of this number."""
+        channel, decoder = f"/{FRAMES_TOPIC}", self._decoder(FRAMES_TOPIC)
+        chunks = self._holding(channel)
+        low, high = 0, len(chunks)
+        while low < high:
+            middle = (low + high) // 2
+            found = [decoder.decode(data) for _, data in self._file.in_chunk(chunks[middle], self.channels[channel].id)]
+            for value in found:
+                if value.index == index and isinstance(value, FrameReference):
+                    return value
+            low, high = (middle + 1, high) if not found or found[-1].index < index else (low, middle)
+        return None
 
     def value(self, topic: str, stamp_ns: int, check: bool = True) -> Value | None:
         """The value of a topic with this stamp, checked as in `values`, or None."""
@@ -160,20 +174,6 @@ class Recording:
 
     def _decoder(self, topic: str) -> Decoder:
         return Decoder(f"{self.path}: topic /{topic}")
-
-    def _reference(self, index: int) -> Value | None:
-        """The FrameReference of a frame, by bisection: frame numbers grow."""
-        channel, decoder = f"/{FRAMES_TOPIC}", self._decoder(FRAMES_TOPIC)
-        chunks = self._holding(channel)
-        low, high = 0, len(chunks)
-        while low < high:
-            middle = (low + high) // 2
-            found = [decoder.decode(data) for _, data in self._file.in_chunk(chunks[middle], self.channels[channel].id)]
-            for value in found:
-                if value.index == index:
-                    return value
-            low, high = (middle + 1, high) if not found or found[-1].index < index else (low, middle)
-        return None
 
 
 def _expected_type(topic: str) -> type[Value]:

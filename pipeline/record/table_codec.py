@@ -200,14 +200,14 @@ def _apply_change(name: str, known: Table | None, change: Change) -> Table:
     if table is None or table.schema != change.schema:
         raise ValueError(f"{name}: a change without the version before it")
     change.check(name, table.size)
-    size, added = table.size, {}
-    for column, kind in change.schema.items():
-        ids, values = change.columns.get(column, (np.empty(0, np.int32), np.empty((0, *kind.shape), kind.element)))
+    size, grows = table.size, change.size > table.size
+    added = {column: np.zeros((change.size - size, *kind.shape), kind.element) for column, kind in change.schema.items()} if grows else {}
+    for column, (ids, values) in change.columns.items():
         old = int(np.searchsorted(ids, size))
         table = table.updated(ids[:old], **{column: values[:old]})
-        added[column] = np.zeros((change.size - size, *kind.shape), kind.element)
-        added[column][ids[old:] - size] = values[old:]
-    table = table.appended(**added)[0] if added and change.size > size else table
+        if added:
+            added[column][ids[old:] - size] = values[old:]
+    table = table.appended(**added)[0] if added else table
     return table.emptied(change.freed) if len(change.freed) else table
 
 

@@ -13,6 +13,7 @@ from trihedron.pipeline.core.options import NonNegativeFloat, PositiveInt, Range
 from trihedron.pipeline.core.registry import register
 from trihedron.pipeline.core.types import F64, ManhattanFrame, Normals, Planes, Segments
 from trihedron.plugins.manhattan.branch_and_bound_kernels import (
+    CELLS,
     FIRST,
     HALF_WIDTH,
     Maps,
@@ -111,12 +112,13 @@ class RotationSearch:
         unit, weights = _usable(vectors, weights)
         if len(unit) == 0:
             return Optimum(start, 0.0, 0.0, 0, 0)
-        cells = image(unit, weights, self._grid, self._cones, self._inlier)
+        groups = group_directions(unit, weights)
+        cells = image(groups, self._grid, self._cones, self._inlier)
         middle = coarser(cells, FACE[2])
         near = [largest_near(values, reach) for values, reach in zip((coarser(middle, FACE[1]), middle, cells), self._reaches)]
         maps = Maps(cells, (near[0], near[1], near[2]))
         certificate, options = np.radians(self.options.certificate_deg), self.options
-        found = search(group_directions(unit, weights), maps, start, self._inlier, certificate, options.max_gap, options.max_cubes)
+        found = search(groups, maps, start, self._inlier, certificate, options.max_gap, options.max_cubes)
         return Optimum(*found)
 
     def consensus(self, vectors: F64, weights: F64, R: F64) -> float:
@@ -136,8 +138,8 @@ class RotationSearch:
 
     @cached_property
     def _cones(self) -> Neighbours:
-        """Cells within τ of each."""
-        return neighbours(self._grid, self._inlier)
+        """Cells within τ of a direction whose group's mean is in the cell."""
+        return neighbours(self._grid, self._inlier + 2.0 * float(sphere_grid(CELLS).radii.max()))
 
     @cached_property
     def _reaches(self) -> list[Neighbours]:

@@ -30,20 +30,23 @@ class Maps(NamedTuple):
 
 
 @kernel
-def image(vectors: F64, weights: F64, grid: SphereGrid, cones: Neighbours, inlier: float) -> F64:
-    """(cells,) upper bound of the consensus of one axis anywhere in a cell: directions count by their angle to the cell, not to its centre."""
+def image(groups: Groups, grid: SphereGrid, cones: Neighbours, inlier: float) -> F64:
+    """(cells,) upper bound of the consensus of one axis anywhere in a cell: all of a group count by the least angle that one of them can have to the
+    cell. `cones` reach from a group's mean over the group and `inlier`."""
     out, face, steep = np.zeros(len(grid.radii)), int(np.sqrt(len(grid.radii) / 3.0) + 0.5), 1.0 / np.sin(inlier) ** 2
-    cosine, sine = np.cos(grid.radii), np.sin(grid.radii)
-    for i in range(len(vectors)):
-        x, y, z, w = vectors[i, 0], vectors[i, 1], vectors[i, 2], weights[i]
-        own = cell_of(x, y, z, face)
+    cell_cosine, cell_sine = np.cos(grid.radii), np.sin(grid.radii)
+    for g in range(len(groups.means)):
+        x, y, z, group_cosine, group_sine = groups.means[g]
+        w, own = groups.moments[g, 6], cell_of(x, y, z, face)
         for k in range(cones.first[own], cones.first[own + 1]):
             c = cones.cells[k]
             dot = abs(x * grid.centres[c, 0] + y * grid.centres[c, 1] + z * grid.centres[c, 2])
-            if dot >= cosine[c]:
+            cosine = cell_cosine[c] * group_cosine - cell_sine[c] * group_sine  # of both radii together
+            if dot >= cosine:
                 out[c] += w
             else:
-                off = np.sqrt(max(1.0 - dot * dot, 0.0)) * cosine[c] - dot * sine[c]  # sine of the angle to the cell
+                sine = cell_sine[c] * group_cosine + cell_cosine[c] * group_sine
+                off = np.sqrt(max(1.0 - dot * dot, 0.0)) * cosine - dot * sine  # sine of the angle between group and cell
                 out[c] += w * max(1.0 - off * off * steep, 0.0)
     return out
 
@@ -384,7 +387,7 @@ def _axis_derivative(R: F64, k: int, a: int) -> tuple[float, float, float]:
 
 # Directions on the sphere, antipodes being one, sorted into groups of neighbours with their moments.
 
-CELLS = 64  # a face of the sphere's grid: groups reach 1.3° from their mean at most
+CELLS = 128
 
 
 class Groups(NamedTuple):

@@ -180,15 +180,15 @@ def observe_axis_planes(planes: Planes, rotation: Rotation, axis_deg: float, flo
     if not seen.any():
         return []
     axes = rotation.R_world_manhattan[int(np.argmax(np.where(seen, rotation.weights, -1.0)))]
-    rotation_variance = float(np.trace(rotation.covariance)) / 3.0
-    found = []
-    for plane, moments, pixels in zip(planes.coefficients, planes.moments, planes.pixels):
-        along = matmul(axes.T, rotation.R_world_camera, plane[:3])
-        k = int(np.argmax(np.abs(along)))
-        if abs(along[k]) < np.cos(np.radians(axis_deg)) or pixels < min_pixels:
-            continue
-        normal = np.asarray(axes[:, k] * np.sign(along[k]))
-        centre, local = moments[:3, 3] / moments[3, 3], matmul(rotation.R_world_camera.T, normal)
-        aside2 = float(matmul(centre, centre) - matmul(centre, local) ** 2)
-        found.append(AxisPlane(normal, float(matmul(-local, centre)), 1.0 / float(moments[3, 3]) + rotation_variance * aside2 + floor_m**2))
-    return found
+    along = matmul(planes.coefficients[:, :3], matmul(axes.T, rotation.R_world_camera).T)
+    nearest = np.argmax(np.abs(along), axis=1)
+    cosines = along[np.arange(len(along)), nearest]
+    normals = axes.T[nearest] * np.sign(cosines)[:, None]
+    local = matmul(normals, rotation.R_world_camera)
+    information = planes.moments[:, 3, 3]
+    centres = planes.moments[:, :3, 3] / information[:, None]
+    distances = (centres * local).sum(axis=1)
+    aside2 = (centres * centres).sum(axis=1) - distances**2
+    variances = 1.0 / information + float(np.trace(rotation.covariance)) / 3.0 * aside2 + floor_m**2
+    stand = (np.abs(cosines) >= np.cos(np.radians(axis_deg))) & (planes.pixels >= min_pixels)
+    return [AxisPlane(normals[row], -float(distances[row]), float(variances[row])) for row in np.flatnonzero(stand)]

@@ -9,10 +9,11 @@ import numpy as np
 from trihedron.pipeline.core.linalg import matmul
 from trihedron.pipeline.core.options import PositiveFloat, PositiveInt
 from trihedron.pipeline.core.registry import register
-from trihedron.pipeline.core.types import F64, Bool, Keypoints, Map, Pose, Rotation, Tracks, Translation
+from trihedron.pipeline.core.types import Keypoints, Map, Pose, Rotation, Tracks, Translation
 from trihedron.plugins.mapping.reference_keyframe import transform_to_map
 from trihedron.plugins.shared.rigid_alignment import tracked_point_pairs
 from trihedron.plugins.translation.predicted_position import origin, predicted_translation, propagated_covariance
+from trihedron.plugins.translation.ransac_kernels import step_inliers
 
 
 @register("translation", "ransac")
@@ -39,7 +40,7 @@ class Ransac:
         if tracks is not None and tracks.previous_index == previous_pose.index:
             before, after, sigma = tracked_point_pairs(tracks, keypoints)
             translations = matmul(before, T[:3, :3].T) - matmul(after, R.T)
-            agree = self._inliers(translations, sigma, rng)
+            agree = step_inliers(translations, self.gate * sigma, rng.integers(0, max(len(translations), 1), self.rounds))
             if agree.sum() >= self.min_points:
                 w = 1.0 / sigma[agree] ** 2
                 covariance = np.eye(3) / w.sum() + propagated
@@ -48,17 +49,3 @@ class Ransac:
                 return Translation(rotation.index, rotation.stamp_ns, t, covariance, np.empty((0, 3)), inliers, True)
         prior_m = self.motion_sigma_m * max(rotation.index - previous_pose.index, 1)
         return predicted_translation(rotation, T[:3, 3].copy(), propagated + prior_m**2 * np.eye(3))
-
-    def _inliers(self, steps: F64, sigma: F64, rng: np.random.Generator) -> Bool:
-        """Inlier mask (n,) of translations (n, 3): of the best hypothesis, then of the weighted mean of its inliers."""
-        if not len(steps):
-            return np.zeros(0, bool)
-        tried = steps[rng.integers(0, len(steps), self.rounds)]
-        within = np.linalg.norm(steps[None] - tried[:, None], axis=2) < self.gate * sigma
-        agree = within[int(np.argmax(within.sum(axis=1)))]
-        for _ in range(3):
-            if not agree.any():
-                break
-            mean = (steps[agree] / sigma[agree, None] ** 2).sum(axis=0) / (1.0 / sigma[agree] ** 2).sum()
-            agree = np.linalg.norm(steps - mean, axis=1) < self.gate * sigma
-        return np.asarray(agree)

@@ -238,7 +238,7 @@ def test_derivatives_are_bounded_and_the_bounds_attained(directions):
 def test_maps_hold_wherever_the_axes_are_in_their_cells(directions):
     rng = np.random.default_rng(12)
     R, vectors, weights = walls(directions, rng, (0.3, 0.2, 0.1))
-    cells = branch_and_bound_kernels.image(vectors, weights, SEARCH._grid, SEARCH._cones, INLIER)
+    cells = branch_and_bound_kernels.image(group_directions(vectors, weights), SEARCH._grid, SEARCH._cones, INLIER)
     middle = coarser(cells, FACE[2])
     maps = (coarser(middle, FACE[1]), middle, cells)
     for level, radius_deg in enumerate((9.742, 4.871, 2.435)):

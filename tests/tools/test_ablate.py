@@ -24,6 +24,7 @@ from trihedron.comparison.ablation_tables import (
     attribution_table,
     case_from_dict,
     case_to_dict,
+    cost_table,
     lines_of,
     sections_of,
     verdicts,
@@ -119,6 +120,16 @@ def test_verdicts_are_first_in_text_and_markdown():
     assert as_markdown(lines, sections).startswith(f"## Verdicts\n\n- {lines[0]}\n- {lines[1]}\n")
     written = json.loads(json.dumps(as_json(cases, found, sections)))["verdicts"]
     assert [one["text"] for one in written] == lines and written[0]["difference"] == -2.0 and written[0]["answer"] == "better"
+
+
+def test_cost_is_against_a_full_run_with_the_same_swap():
+    """The recorded run took 9 s; the swap adds 50 ms to each of 10 frames, so a full run with it takes 9.5 s."""
+    one = replace(case(0, [1.0, 2.0], stages=("manhattan",)), full_s=9.0)
+    one.variants[1].figures["ms"] = 51.0
+    assert cost_table([one]).rows[1:] == [
+        ["as recorded", "1.00", "1.10", "0.00", "1.10", "9.00", "8.2"],
+        ["manhattan=other", "1.00", "1.10", "0.00", "1.10", "9.50", "8.6"],
+    ]
 
 
 def test_errors_of_frames_are_kept_beside(tmp_path):

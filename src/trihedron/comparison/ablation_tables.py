@@ -310,11 +310,14 @@ def cost_table(cases: Sequence[Case]) -> Section:
     rows = [["change", "stages alone s", "cost s", "of it no stage s", "× its stages", "full run s", "× less"]]
     for label, group in by_change(cases).items():
         stages, total, rest = (sum(getattr(variant, name) for _, variant in group) for name in ("stages_s", "total_s", "rest_s"))
-        full = sum(case.full_s for case, _ in group)
+        full = sum(case.full_s + 1e-3 * case.frames * (variant.figures["ms"] - case.variants[0].figures["ms"]) for case, variant in group)
         known = np.isfinite(full) and total > 0.0
         ratio = f"{total / stages:.2f}" if stages > 0.0 else "-"
         against = [f"{full:.2f}", f"{full / total:.1f}"] if known else ["-", "-"]
         rows.append([label, f"{stages:.2f}", f"{total:.2f}", f"{rest:.2f}", ratio, *against])
     shared = sorted({name for case in cases for name in case.shared})
-    note = "CPU seconds; a cost has a share of each stage that serves several alternatives; no stage are reading, recording, scheduling and results"
+    note = (
+        "CPU seconds; a cost has a share of each stage that serves several alternatives; no stage are reading, recording, scheduling, measures and "
+        "results; the full run with a swap is the recorded one, with the stages that the swap changes"
+    )
     return Section("Cost", rows, "lrrrrrr", note + (f"; not recorded, so computed once for all: {', '.join(shared)}" if shared else ""))

@@ -78,16 +78,22 @@ def _values(recordings: Sequence[Recording], topic: str) -> Iterator[Any]:
     return next((recording.values(topic) for recording in recordings if topic in recording.topics), iter(()))
 
 
+def _value(recordings: Sequence[Recording], topic: str, stamp_ns: int) -> Any:
+    """The value of a topic with this stamp in the first recording that has the topic, or None."""
+    return next((recording.value(topic, stamp_ns) for recording in recordings if topic in recording.topics), None)
+
+
 def _annotate_frame(recordings: Sequence[Recording], frame: int) -> Any:
     """The frame's image (the nearest one that was kept to look at) with the features of that very frame."""
     import cv2
     import numpy as np
 
-    reference: Any = next(v for v in recordings[-1].values("frames") if v.index == frame)
+    reference = recordings[-1].reference(frame)
+    assert reference is not None, "the frame is one of the recording's"
     camera = reference.camera
     image = _image(recordings[-1], reference.stamp_ns, camera)
     topics = ("planes", "segments", "keypoints", "manhattan")
-    values: dict[str, Any] = {topic: next((v for v in _values(recordings, topic) if v.index == frame), None) for topic in topics}
+    values: dict[str, Any] = {topic: _value(recordings, topic, reference.stamp_ns) for topic in topics}
     if values["planes"] is not None:
         image = _tint_planes(image, values["planes"])
     if values["segments"] is not None:
