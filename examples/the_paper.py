@@ -57,7 +57,7 @@ def manhattan_frame(normals, now, last):
 
 def track(camera, now, last):
     """Points and lines of the last frame that are seen again, by descriptors, and planes, by angle and distance: searched where the rotation between
-    the axes of both frames, else the rotation before (`last.tracks`), projects them; the translation is unknown, so the search is wide."""
+    the axes of both frames, else that of the frames before (`last.tracks`), projects them; the translation is unknown, so the search is wide."""
     return projection(
         camera, keypoints=now.points, segments=now.segments, planes=now.planes, manhattan=now.axes, previous=last.tracks,
         previous_keypoints=last.points, previous_segments=last.segments, previous_planes=last.planes, previous_manhattan=last.axes,
@@ -65,10 +65,10 @@ def track(camera, now, last):
 
 
 def rotation(now, last):
-    """Section IV-A, eq. 1: the camera's rotation from the axes and R_mw, which the first frame that showed axes defined, so that it does not drift
-    from then on. Of the 24 ways to name three axes it takes the one nearest to the predicted rotation. An addition: it is fused by covariance with
-    the last rotation and that of the tracks (computed from points, segments and planes), which stands alone where no axes are in view. The map tells
-    where the last pose is now, because bundle adjustment or a loop would move it with its keyframe `pose.reference`; here nothing does."""
+    """Section IV-A, eq. 1: the camera's rotation from the axes and R_mw (in `last.rotation`), which the first frame that showed axes defined, so that
+    it does not drift from then on. An addition: it is fused by covariance with a prediction, the refined rotation of `last.pose` turned by the motion
+    of the pairs; that names the axes (the nearest of their 24 names), and stands alone where none are in view. With bundle adjustment or loops the
+    map would tell where the keyframe `last.pose.reference` is now, and the last pose with it; here nothing moves it."""
     return drift_free(
         manhattan=now.axes, tracks=now.tracks, keypoints=now.points, segments=now.segments, planes=now.planes,
         previous=last.rotation, previous_pose=last.pose, map=last.map,
@@ -95,9 +95,10 @@ def match(camera, now, last):
 
 def refine(camera, now, last):
     """Section IV-C: all six degrees of freedom, by matched landmarks and by planes that are parallel or perpendicular to those of the map (eqs. 7 and
-    8 together), from rotation and translation above; the first pose is the origin. Additions: the status. With few matches it is `degraded`; `lost`
-    where neither the last frame nor the map is seen, with the predicted pose, which the next frame starts from, until enough of the map agrees again.
-    Images that repeat the last one bit for bit (the tracks tell) measure nothing: from the second on, `degraded`."""
+    8 together). It starts at the rotation and position above, which are a prior with their covariances; the pairs of the tracks add nothing, and tell
+    only whether the image repeats the last one bit for bit. The first pose is the origin. An addition is the status: `degraded` with few matches, or
+    from the second such repeat on; `lost` where neither the last frame nor the map is seen. A lost pose is the predicted one, and stays lost until
+    enough of the map agrees, however well it fits the last frame."""
     return refinement(
         camera, rotation=now.rotation, translation=now.translation, tracks=now.tracks, matches=now.matches,
         keypoints=now.points, segments=now.segments, planes=now.planes, previous=last.pose, map=last.map,
@@ -112,9 +113,9 @@ def keyframe(frame, now, last):
 
 
 def main(folder="", **options):
-    """Track the sequence; return the poses and the mesh (section V-B): `add` retains each frame that is not lost and shows surface not seen before,
-    and the axes of its rotation, which tell what is up; `finish` joins the points on each plane of the map, found by angle and distance, by greedy
-    triangulation. `options` are those of the data set."""
+    """Track the sequence; return the poses and the mesh (section V-B): `add` retains each frame that is not lost and shows surface not seen before;
+    `finish` assigns its planes to those of the map, by angle and distance, and joins the points of its depth on each by greedy triangulation (the
+    rotation's axes tell which way of the mesh is up). `options` are those of the data set."""
     dataset = th.dataset.tum(path=folder, **options) if folder else th.dataset.synthetic(**options)
     poses, mesh, last, before_last = [], greedy.start(), Seen(), Seen()
     for frame in filter(None, map(dataset, range(len(dataset)))):  # None: an image that cannot be read
