@@ -103,7 +103,8 @@ class Normals(Value):
 
 @dataclass(frozen=True)
 class Keypoints(Value):
-    """Points of interest. `points_m` is the back-projection (camera frame), NaN without a trustworthy depth; `sigma_px` grows with the octave."""
+    """Points of interest. `points_m` is the back-projection (camera frame), NaN without a trustworthy depth; `sigma_px` grows with the octave and
+    includes `blur_px`, by which the whole image is blurred beyond a sharp one (standard deviation)."""
 
     pixels: Annotated[F32, Shape("n", 2), Finite()]
     points_m: Annotated[F32, Shape("n", 3)]
@@ -113,6 +114,7 @@ class Keypoints(Value):
     angles_deg: Annotated[F32, Shape("n")]
     descriptors: Annotated[U8, Shape("n", "b"), SameWidth(("previous_keypoints.descriptors", "map.points.descriptor"))]
     metric: Annotated[str, OneOf(("hamming", "l2"))] = "hamming"  # distance between descriptors: hamming | l2
+    blur_px: Annotated[float, Within(0.0, 1e3)] = 0.0
 
     def to_numpy(self) -> F32:
         """Return the (k, 3) points that have depth, camera frame."""

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from trihedron.pipeline.core.options import NonNegativeFloat, PositiveFloat, PositiveShare, Range
 from trihedron.pipeline.core.types import F32, F64, U8, Frame, Keypoints
 from trihedron.plugins.shared.depth_image_kernels import local_depth
+from trihedron.plugins.shared.edge_width import motion_blur_px
 
 LEVEL_SCALE = 1.2  # between levels, as the map expects (`octave_scale`)
 
@@ -33,22 +34,28 @@ def lift_pixels(options: LiftOptions, frame: Frame, pixels: F32) -> tuple[F32, F
     return frame.camera.back_project(pixels, depth).astype(np.float32), sigma
 
 
+def sigmas_px(options: LiftOptions, scales: F64, blur_px: float) -> F32:
+    """Return the standard deviations (n,) of the pixels of key points of these scales (n,) in an image that is blurred by `blur_px`."""
+    return np.hypot(options.sigma_px * scales, blur_px).astype(np.float32)
+
+
 def lift_keypoints(options: LiftOptions, frame: Frame, pixels: F32, scales: F64, angles_deg: F32, descriptors: U8, metric: str) -> Keypoints:
     """Lift key points at pixels (n, 2) with scales (n,), 1 for the finest, directions (n,) and descriptors (n, b); points are NaN without reliable
     depth."""
     points_m, sigma_m = lift_pixels(options, frame, pixels)
-    scales = np.maximum(scales, 1.0)
+    scales, blur_px = np.maximum(scales, 1.0), motion_blur_px(frame.gray)
     return Keypoints(
         index=frame.index,
         stamp_ns=frame.stamp_ns,
         pixels=pixels,
         points_m=points_m,
-        sigma_px=(options.sigma_px * scales).astype(np.float32),
+        sigma_px=sigmas_px(options, scales, blur_px),
         sigma_m=sigma_m,
         octaves=np.clip(np.rint(np.log(scales) / np.log(LEVEL_SCALE)), 0, 255).astype(np.uint8),
         angles_deg=angles_deg,
         descriptors=descriptors,
         metric=metric,
+        blur_px=blur_px,
     )
 
 

@@ -5,6 +5,7 @@ Every function takes a map and returns a new version of it.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -50,7 +51,7 @@ def associate(
     points, lines, same = (matched[_alive(table, matched[:, 1])] for matched, table in zip(pairs, (map.points, map.lines, map.planes)))
     inliers = same
     if judge and matches is not None:
-        on_lines = line_terms(map, segments, lines, T_world_camera, camera, line_sigma_px)
+        on_lines = line_terms(map, segments, lines, T_world_camera, camera, math.hypot(line_sigma_px, keypoints.blur_px))
         on_planes = plane_terms(map, planes, same, NO_PAIRS, NO_PAIRS, 1.0)
         flags = classify_terms(T_world_camera, camera, point_terms(map, keypoints, points), on_lines, on_planes)
         points, lines, inliers = points[flags.points > 0], lines[flags.lines > 0], same[flags.planes > 0]

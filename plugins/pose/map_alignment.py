@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -87,9 +88,10 @@ class MapAlignment:
     def terms(self, T_world_camera: F64) -> Terms:
         """All matches as terms; the extent of lines is that seen from a pose."""
         map, matches = self.map, self.matches
+        line_sigma_px = math.hypot(self.options.line_sigma_px, self.keypoints.blur_px)
         return (
             point_terms(map, self.keypoints, matches.keypoints),
-            line_terms(map, self.segments, matches.segments, T_world_camera, self.camera, self.options.line_sigma_px),
+            line_terms(map, self.segments, matches.segments, T_world_camera, self.camera, line_sigma_px),
             plane_terms(map, self.planes, matches.planes, matches.parallel, matches.perpendicular, self.options.relation_sigma_deg),
         )
 

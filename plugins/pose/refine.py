@@ -36,6 +36,7 @@ from trihedron.plugins.shared.pose_optimizer import PoseSolution
 
 EYE = np.eye(3)
 DETAILED = 100  # key points, or matches, with which a frame is expected to be recognised by them
+BLURRED_PX = 1.0  # blur that is worth a word: with more the covariance is half as large again
 BY_CHANCE = 0.15  # of these matches that agree by chance: after a jump at most 0.08, between frames of a walk at least 0.31
 
 
@@ -177,6 +178,8 @@ class Refine(MovingOptions):
             status = status_with_static(status, solution, problem, static, self)
         if status.status == OK:
             status = widened_by_keyframes(status, solution, problem, self.weak_foundation)
+        if problem.keypoints.blur_px >= BLURRED_PX:
+            status = replace(status, reason=f"{status.reason}; the image is blurred by {problem.keypoints.blur_px:.1f} px: turn slower")
         if submap:
             status = replace(status, status=DEGRADED, reason=f"in sub-map {submap}, which is not merged with the first yet: {status.reason}")
         return status

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -81,6 +82,6 @@ class LevenbergMarquardt:
         fx, fy, noise = float(camera.fx), float(camera.fy), camera.depth_noise.coefficients
         return (
             tracked_points(points, keypoints.pixels, fx, fy, T, uncertain),
-            tracked_lines(lines, segments.endpoints_px, self.line_sigma_px, noise, fx, fy, T, uncertain),
+            tracked_lines(lines, segments.endpoints_px, math.hypot(self.line_sigma_px, keypoints.blur_px), noise, fx, fy, T, uncertain),
             tracked_planes(walls, T, uncertain),
         )

@@ -200,3 +200,21 @@ def test_where_most_denies_all_that_is_seen_the_pose_is_known_no_better_than_pla
 def test_at_rest_one_keyframe_is_enough(world, single):
     pose, squared = judged(world, single, 0.0)
     assert pose.status == "ok" and "alone" not in pose.reason and squared < 24.0
+
+
+def in_motion(world, map, off_px, blur_px):
+    """The pose of a camera whose key points are off by so much at random, in an image blurred by `blur_px`."""
+    start, (keypoints, *others), matches = matched(world, map)
+    off = off_px * np.random.default_rng(0).normal(size=keypoints.pixels.shape)
+    pixels = (keypoints.pixels + off).astype(np.float32)
+    blurred = dataclasses.replace(keypoints, pixels=pixels, sigma_px=np.hypot(keypoints.sigma_px, np.float32(blur_px)), blur_px=blur_px)
+    before = pose_of(camera_at(STEP - 1), STEP - 1)
+    return Refine()(world.frame(STEP).camera, *start, None, matches, blurred, *others, before, map, None)
+
+
+def test_blur_is_no_contradiction_and_the_reason_names_it(world, map):
+    """Points of a blurred image are pixels off without anything that moves; in a sharp one most of them contradict the pose."""
+    blurred, sharp = in_motion(world, map, 4.0, 4.0), in_motion(world, map, 4.0, 0.0)
+    assert blurred.status == "ok" and blurred.reason.endswith("; the image is blurred by 4.0 px: turn slower")
+    assert sharp.inliers[0] < 0.5 * blurred.inliers[0] and sharp.status == "degraded"
+    assert error(blurred, STEP)[0] < 0.01 and "blurred" not in sharp.reason

@@ -1,0 +1,42 @@
+"""The blur of an image by the width of its edges."""
+
+import dataclasses
+
+import cv2
+import numpy as np
+import pytest
+
+import trihedron as th
+from trihedron.plugins.shared.edge_width import SHARP_PX, motion_blur_px
+
+
+def boxes(blur_x=0.0, blur_y=0.0):
+    """An image (480, 640) of grey boxes with sharp borders, blurred by Gaussians of these standard deviations along x and y."""
+    rng = np.random.default_rng(0)
+    grey = np.kron(rng.choice([40.0, 130.0, 220.0], (12, 16)), np.ones((40, 40)))
+    return np.rint(cv2.GaussianBlur(grey, (0, 0), max(blur_x, 1e-3), sigmaY=max(blur_y, 1e-3))).astype(np.uint8)
+
+
+@pytest.mark.parametrize("sigma", [1.5, 2.0, 3.0])
+def test_blur_is_that_of_the_edges_beyond_sharp_ones(sigma):
+    excess = np.sqrt(sigma**2 - SHARP_PX**2)
+    assert motion_blur_px(boxes(sigma, sigma)) == pytest.approx(excess, rel=0.12)
+    along_x = motion_blur_px(boxes(sigma, 0.0))  # the other axis is sharp
+    assert along_x == pytest.approx(excess / np.sqrt(2.0), rel=0.12) == motion_blur_px(boxes(0.0, sigma))
+
+
+def test_a_sharp_image_and_one_without_edges_have_none():
+    assert motion_blur_px(boxes()) == motion_blur_px(boxes(1.0, 1.0)) == 0.0
+    assert motion_blur_px(np.full((480, 640), 90, np.uint8)) == motion_blur_px(np.zeros((0, 0), np.uint8)) == 0.0
+    noise = np.random.default_rng(0).integers(80, 100, (480, 640)).astype(np.uint8)
+    assert motion_blur_px(cv2.GaussianBlur(noise, (0, 0), 5.0)) == 0.0  # no edge of 40 grey levels
+
+
+@pytest.mark.parametrize("plugin", ["orb", "sift", "akaze", "opencv_orb"])
+def test_the_noise_of_key_points_includes_the_blur(plugin):
+    frame = th.dataset.synthetic()(0)
+    blurred = dataclasses.replace(frame, color=cv2.GaussianBlur(frame.color, (0, 0), 3.0))
+    detect = getattr(th.keypoints, plugin)()
+    sharp, found = detect(frame), detect(blurred)
+    assert sharp.blur_px == 0.0 and found.blur_px == motion_blur_px(blurred.gray) > 1.5
+    assert len(found.pixels) and (found.sigma_px > found.blur_px).all()
