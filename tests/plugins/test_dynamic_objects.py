@@ -218,3 +218,18 @@ def test_blur_is_no_contradiction_and_the_reason_names_it(world, map):
     assert blurred.status == "ok" and blurred.reason.endswith("; the image is blurred by 4.0 px: turn slower")
     assert sharp.inliers[0] < 0.5 * blurred.inliers[0] and sharp.status == "degraded"
     assert error(blurred, STEP)[0] < 0.01 and "blurred" not in sharp.reason
+
+
+def test_what_disagrees_for_long_is_a_contradiction(world, map):
+    """A frame of which most agrees, after ten of which less than half did; and after ten of which a little more did."""
+    start, features, matches = matched(world, map)
+    before = dataclasses.replace(pose_of(camera_at(STEP - 1), STEP - 1), agreement=0.43)
+    poses = [
+        Refine()(world.frame(STEP).camera, *start, None, matches, *features, dataclasses.replace(before, agreement=agreement), map, None)
+        for agreement in (0.43, 0.5)
+    ]
+    share = poses[0].inliers[0] / len(matches.keypoints)
+    assert share > 0.9 and poses[0].agreement == pytest.approx(0.43 + (share - 0.43) / 10)
+    assert poses[0].status == "degraded"
+    assert poses[0].reason == f"colour, depth and map contradict each other: of late {100 * poses[0].agreement:.0f} % of the matched points agree"
+    assert poses[1].status == "ok" and 0.5 < poses[1].agreement < 0.56
