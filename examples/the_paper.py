@@ -36,7 +36,7 @@ class Seen:
     axes: Any = None  # ManhattanFrame: R_camera_manhattan; with `supported` False, a frame without axes in view passes on those of the last one
     tracks: Any = None  # Tracks: pairs (feature of the last frame, of this one), the 3D of the former, and the rotation R_current_previous they give
     rotation: Any = None  # Rotation: R_world_camera, the world being the frame of the first camera, and R_world_manhattan, the transpose of R_mw
-    translation: Any = None  # Translation: position of the camera in the world
+    translation: Any = None  # Translation: position of the camera in the world; `estimated` False where it is only predicted
     matches: Any = None  # Matches: pairs (feature, landmark of the map), and pairs of planes that are parallel or perpendicular
     pose: Any = None  # Pose: T_world_camera; its newest keyframe (`reference`); status ok, degraded (little evidence) or lost (not measured)
     map: Any = None  # Map: keyframes and landmarks, with this frame if it is a keyframe; a value, which nothing changes
@@ -67,8 +67,9 @@ def track(camera, now, last):
 def rotation(now, last):
     """Section IV-A, eq. 1: the camera's rotation from the axes and R_mw (in `last.rotation`), which the first frame that showed axes defined, so that
     it does not drift from then on. An addition: it is fused by covariance with a prediction, the refined rotation of `last.pose` turned by the motion
-    of the pairs; that names the axes (the nearest of their 24 names), and stands alone where none are in view. With bundle adjustment or loops the
-    map would tell where the keyframe `last.pose.reference` is now, and the last pose with it; here nothing moves it."""
+    of the pairs; that names the axes (the nearest of their 24 names), and stands alone where none are in view; without pairs, too, the last turn goes
+    on. With bundle adjustment or loops the map would tell where the keyframe `last.pose.reference` is now, and the last pose with it; here nothing
+    moves it."""
     return drift_free(
         manhattan=now.axes, tracks=now.tracks, keypoints=now.points, segments=now.segments, planes=now.planes,
         previous=last.rotation, previous_pose=last.pose, map=last.map,
@@ -95,10 +96,10 @@ def match(camera, now, last):
 
 def refine(camera, now, last):
     """Section IV-C: all six degrees of freedom, by matched landmarks and by planes that are parallel or perpendicular to those of the map (eqs. 7 and
-    8 together). It starts at the rotation and position above, which are a prior with their covariances; the pairs of the tracks add nothing, and tell
-    only whether the image repeats the last one bit for bit. The first pose is the origin. An addition is the status: `degraded` with few matches, or
-    from the second such repeat on; `lost` where neither the last frame nor the map is seen. A lost pose is the predicted one, and stays lost until
-    enough of the map agrees, however well it fits the last frame."""
+    8 together). It starts at the rotation and position above, which are a prior with their covariances; the pairs of the tracks add no residuals, and
+    tell whether the image repeats the last one bit for bit. The first pose is the origin. An addition is the status: `degraded` with few matches, or
+    from the second such repeat on; `lost` where neither the last frame (`now.translation.estimated`) nor the map is seen. A lost pose is the
+    predicted one, and stays lost until enough of the map agrees, however well it fits the last frame."""
     return refinement(
         camera, rotation=now.rotation, translation=now.translation, tracks=now.tracks, matches=now.matches,
         keypoints=now.points, segments=now.segments, planes=now.planes, previous=last.pose, map=last.map,

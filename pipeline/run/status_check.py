@@ -68,9 +68,11 @@ class FrameErrors:
 
 @dataclass(frozen=True)
 class StatusCheck:
-    """Figures of a run; None where too few frames are posed. Honest covariances have `nees_median` 5.35 and `share_within_95` 0.95. `sigma_auc`
-    is the probability that of two frames, one above the median error and one below, the former has the larger σ: 0.5 is that of a σ by chance.
-    `spread_over_error` is the spread–skill ratio. `not_ok` counts the frames that are not ok by the test that found them so."""
+    """Figures of a run; None where too few frames are posed. Honest covariances have `nees_median` 5.35 and `share_within_95` 0.95. `sigma_auc` is
+    the probability that of two frames, one above the median error and one below, the former has the larger σ: 0.5 is that of a σ by chance. Like
+    NEES it takes errors after the alignment that the covariances make most likely: σ is that of a pose in the world of the first camera, and grows
+    with the way from there, where the alignment of the ATE spreads a drift evenly. `spread_over_error` is the spread–skill ratio. `not_ok` counts
+    the frames that are not ok by the test that found them so."""
 
     frames: int
     ok: int
@@ -99,7 +101,7 @@ def check_status(poses: Sequence[Pose], truth: Trajectory, frames: int | None = 
     e = errors.error_m[errors.judged]
     nees, likelihood = (values[np.isfinite(values)] for values in (errors.nees, errors.log_likelihood))
     status = [pose.status for pose in poses]
-    found = len(e) > 0
+    found, likely = len(e) > 0, np.isfinite(errors.likely_m)
     figures = StatusCheck(
         frames=frames if frames is not None else len(poses),
         ok=status.count(OK),
@@ -109,7 +111,7 @@ def check_status(poses: Sequence[Pose], truth: Trajectory, frames: int | None = 
         wrong_ok=int(errors.wrong_ok.sum()),
         nees_median=float(np.median(nees)) if len(nees) else None,
         share_within_95=float((nees <= LIMIT_95).mean()) if len(nees) else None,
-        sigma_auc=sigma_auc(e, errors.sigma_m[errors.judged]),
+        sigma_auc=sigma_auc(errors.likely_m[likely], errors.spread_m[likely]),
         log_likelihood=float(likelihood.mean()) if len(likelihood) else None,
         steps_within_50mm=close / steps if steps else None,
         steps=steps,

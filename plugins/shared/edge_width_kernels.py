@@ -13,7 +13,7 @@ def edge_widths(gray: U8, stride: int, contrast: int) -> tuple[F64, F64]:
     """Widths (px) of the edges that every `stride`-th row of an image (h, w) crosses, and those of every `stride`-th column: the rise of a monotone
     run, of at least `contrast` grey levels, by its steepest step."""
     h, w = gray.shape
-    along_rows, along_columns = np.empty((h // stride + 1) * w // 2), np.empty((w // stride + 1) * h // 2)
+    along_rows, along_columns = np.empty((h // stride + 1) * w), np.empty((w // stride + 1) * h)  # at most one edge a pixel
     rows, columns = 0, 0
     for y in range(stride // 2, h, stride):
         rows = _add_widths(gray[y], contrast, along_rows, rows)

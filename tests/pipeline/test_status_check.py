@@ -109,6 +109,20 @@ def test_sigma_tells_large_errors_from_small_ones() -> None:
     assert sigma_auc(np.zeros(0), np.zeros(0)) is None
 
 
+def test_sigma_of_a_drift_is_compared_in_the_world_of_the_first_camera() -> None:
+    """A drift that is stated tells early frames from late ones, although the alignment of the ATE spreads it over all of them."""
+    poses, truth = run_of(sigma=0.0005)
+    sigmas = 0.0005 + 0.05 * np.linspace(0.0, 1.0, len(poses))
+    drifting = []
+    for pose, sigma in zip(poses, sigmas):
+        off = exp_se3(np.array([sigma, 0.5 * sigma, 0.0, 0.0, 0.0, 0.0]))
+        drifting.append(replace(pose, T_world_camera=off @ pose.T_world_camera, covariance=sigma**2 * np.eye(6)))
+    check, errors = check_status(drifting, truth)
+    assert check.sigma_auc is not None and check.sigma_auc > 0.95
+    by_alignment = sigma_auc(errors.error_m, errors.sigma_m)
+    assert by_alignment is not None and by_alignment < 0.7
+
+
 def test_a_run_without_poses_has_no_figures() -> None:
     poses, truth = run_of(20)
     check, _ = check_status([replace(pose, status=LOST, reason="covered") for pose in poses], truth)

@@ -8,6 +8,7 @@ import pytest
 
 import trihedron as th
 from trihedron.plugins.shared.edge_width import SHARP_PX, motion_blur_px
+from trihedron.plugins.shared.edge_width_kernels import edge_widths
 
 
 def boxes(blur_x=0.0, blur_y=0.0):
@@ -40,3 +41,14 @@ def test_the_noise_of_key_points_includes_the_blur(plugin):
     sharp, found = detect(frame), detect(blurred)
     assert sharp.blur_px == 0.0 and found.blur_px == motion_blur_px(blurred.gray) > 1.5
     assert len(found.pixels) and (found.sigma_px > found.blur_px).all()
+
+
+def test_an_edge_at_every_pixel_is_counted_within_the_arrays():
+    """Black and white by turns: one edge a pixel along a row, all of them sharp; and no more edges than pixels in noise."""
+    stripes = np.tile(np.array([0, 255], np.uint8), (48, 32))
+    rows, columns = edge_widths(stripes, 8, 40)
+    assert len(rows) == 6 * 63 and (rows == 1.0).all() and not len(columns)
+    for seed in range(20):
+        noise = np.random.default_rng(seed).integers(0, 256, (41, 67), dtype=np.uint8)
+        rows, columns = edge_widths(noise, 1, 1)
+        assert 0 < len(rows) < 41 * 67 and 0 < len(columns) < 41 * 67 and motion_blur_px(noise) >= 0.0

@@ -51,7 +51,8 @@ def recognise(world, map, T, index, kinds=("points", "lines", "planes"), status=
     """What the stage says of the view from T, with the features of the given kinds."""
     keypoints, segments, planes = world.features(T, index)
     if "points" not in kinds:
-        keypoints = dataclasses.replace(keypoints, **{f.name: getattr(keypoints, f.name)[:0] for f in dataclasses.fields(keypoints)[2:-1]})
+        arrays = {field.name: getattr(keypoints, field.name) for field in dataclasses.fields(keypoints)}
+        keypoints = dataclasses.replace(keypoints, **{name: rows[:0] for name, rows in arrays.items() if isinstance(rows, np.ndarray)})
     rng = np.random.default_rng(index)
     previous = pose_of(np.eye(4), index - 1, status)
     frame = world.seen(T, index, farther)

@@ -7,7 +7,7 @@ all clean runs, which are those without a fault. Columns:
   ATE mm        of the posed frames as estimated at the time, each sub-map aligned by itself
   NEES          median over the frames, 6 degrees of freedom; honest: 5.35
   in 95 %       frames below the 95 % limit of NEES; honest: 95
-  AUC           of "error above its median" by σ; 0.5 is chance
+  AUC           of "error above its median" by σ, after the alignment that the covariances make most likely, as NEES; 0.5 is chance
   log-lik       mean log-likelihood of an error, in nats
   σ/error       sharpness against error: the root of the mean stated variance of the position over the root mean square of its error (spread–skill
                 ratio); honest: 1, less is overconfident
