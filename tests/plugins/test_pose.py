@@ -12,6 +12,7 @@ from trihedron.pipeline.core.lie import exp_se3, log_se3, rotation_angle_deg
 from trihedron.pipeline.core.types import Pose
 from trihedron.plugins.map.covisibility import Covisibility
 from trihedron.plugins.matches.local_map import LocalMap
+from trihedron.plugins.pose.judgement import is_tracked
 from trihedron.plugins.pose.map_alignment import InlierStatistics
 from trihedron.plugins.pose.none import NoRefinement
 from trihedron.plugins.pose.refine import Refine
@@ -201,7 +202,7 @@ def test_too_small_a_share_of_inliers_degrades_a_pose():
 )
 def test_a_tracked_pose_needs_a_number_and_a_share_of_inliers(inliers, matched, tracked):
     """At least ten, of points + 2 lines + 5 planes, and half of the matches."""
-    assert Refine(min_share=0.5)._is_tracked(InlierStatistics(inliers, matched)) is tracked
+    assert is_tracked(Refine(min_share=0.5), InlierStatistics(inliers, matched)) is tracked
 
 
 def test_a_rotation_that_was_not_measured_needs_the_map():

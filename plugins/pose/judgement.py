@@ -1,0 +1,160 @@
+"""Judgement of a refined pose: ok, degraded or lost, and why.
+
+A pose is not trusted because an optimiser converged. Five tests look for reasons to doubt it; the first that finds one gives the reason of the
+status, with its figures:
+
+- **Information**: landmarks of the map determine all six directions, and there are enough of them.
+- **Agreement**: more matches agree with the pose than would by chance, and most of them did over ten frames.
+- **Contradiction**: what disagrees is not explained by something that moves (`dynamic_objects.py` asks static matches, and planes), and the residuals
+  so far do not contradict the camera's calibration (`calibration_uncertainty.py`).
+- **Continuity**: the rotation was measured, and the frame continues the previous one, or the map knows its details: of a place that is built alike,
+  walls and lines agree, and points do not.
+- **Freshness**: an image that repeats the one before measures nothing.
+
+Limits are options of `pose=refine`, or the constants below. `trihedron benchmark honesty` counts the clean frames that each test degrades (false
+alarms in docs/explanation/results.md)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from trihedron.pipeline.core.options import NonNegativeInt, PositiveFloat, Share
+from trihedron.pipeline.core.types import DEGRADED, LOST, OK, Keypoints, Planes, Pose, Rotation, Tracks, Translation
+from trihedron.plugins.pose.calibration_uncertainty import contradicted_calibration
+from trihedron.plugins.pose.dynamic_objects import MovingOptions, Selection, status_with_static
+from trihedron.plugins.pose.map_alignment import InlierStatistics, MapAlignment, TrackingStatus
+from trihedron.plugins.pose.world_uncertainty import widened_by_keyframes
+from trihedron.plugins.shared.pose_optimizer import PoseSolution
+
+DETAILED = 100  # key points, or matches, with which a frame is expected to be recognised by them
+AGREEMENT_FRAMES = 10  # that the agreement of matched points is averaged over
+LEAST_AGREEMENT = 0.5  # less is no moment of blur and nobody who walks by; at least 0.65 of five cameras and three simulated ones
+BY_CHANCE = 0.15  # of DETAILED matches that agree by chance: after a jump at most 0.08, between frames of a walk at least 0.31
+BLURRED_PX = 1.0  # blur that is worth a word: with more the covariance is half as large again
+
+
+@dataclass(frozen=True)
+class JudgementOptions(MovingOptions):
+    """Limits of the tests."""
+
+    min_inliers: NonNegativeInt = 10  # points + 2 lines + 5 planes below which the pose is degraded
+    found_inliers: NonNegativeInt = 30  # points + 2 lines + 5 planes that relocalise a lost pose
+    found_share: Share = 0.5  # of the matches that must be inliers for that
+    min_continued: Share = 0.06  # of the key points with depth, known from the previous frame or the map; two rooms: 0.04, fast walks: at least 0.087
+    weak_foundation: PositiveFloat = 3.0  # times the pose's σ beyond which the nearby keyframes' σ is added to it
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """Evidence of a frame for and against a solution: its matches with the map (`problem`), the selection of static ones that the pose was estimated
+    by (None: all), those that agree with it, and the results of the stages before. `submap` is the part of the map that the frame is in."""
+
+    problem: MapAlignment
+    solution: PoseSolution
+    static: Selection | None
+    inliers: InlierStatistics
+    rotation: Rotation
+    translation: Translation
+    tracks: Tracks | None
+    submap: int
+
+
+def is_found_again(options: JudgementOptions, evidence: Evidence) -> bool:
+    """Return True if the map alone determines the pose of a lost camera, and shows its details."""
+    inliers = evidence.inliers
+    enough = inliers.score >= options.found_inliers and inliers.total >= options.found_share * inliers.matches
+    known = inliers.inliers[0]
+    return enough and evidence.solution.unobservable.shape[1] == 0 and not _is_another_place(options, evidence.problem, known)
+
+
+def reason_to_be_lost(options: JudgementOptions, evidence: Evidence, start_status: str) -> str:
+    """Return why a frame is lost although the previous one, or relocalisation, gave it a pose (`start_status`); empty where nothing says so."""
+    inliers, tracked = evidence.inliers, is_tracked(options, evidence.inliers)
+    agree = f"only {inliers.total} of {inliers.matches} matches"
+    if evidence.rotation.source == "prediction" and not tracked:
+        return f"the rotation was not measured, and {agree} with the map agree"
+    continued = int(evidence.translation.inliers[0]), inliers.inliers[0]
+    if start_status != LOST and _is_another_place(options, evidence.problem, max(continued)):
+        known = f"{continued[0]} key points continue the previous frame and {continued[1]} are in the map"
+        return f"another place: of {len(evidence.problem.keypoints.pixels)}, {known}"
+    if start_status != LOST and inliers.matches >= DETAILED and inliers.total < BY_CHANCE * inliers.matches:
+        return f"the frame contradicts the map: {agree} agree"
+    if evidence.submap and not tracked:  # nothing ties it to the sub-map: it is searched for in the others
+        return f"sub-map {evidence.submap} does not show what the frame does: {agree} agree"
+    return ""
+
+
+def status_of(options: JudgementOptions, evidence: Evidence, repeats: int) -> TrackingStatus:
+    """Judge a refined pose by this frame; `repeats` images in a row repeat the one before. The covariance is widened where the keyframes that it
+    rests on are uncertain."""
+    problem, solution = evidence.problem, evidence.solution
+    status = _by_information(options, evidence)
+    if evidence.static is not None:
+        status = status_with_static(status, solution, problem, evidence.static, options)
+    if status.status == OK:
+        status = widened_by_keyframes(status, solution, problem, options.weak_foundation)
+    if problem.keypoints.blur_px >= BLURRED_PX:
+        status = replace(status, reason=f"{status.reason}; the image is blurred by {problem.keypoints.blur_px:.1f} px: turn slower")
+    if evidence.submap:
+        reason = f"in sub-map {evidence.submap}, which is not merged with the first yet: {status.reason}"
+        status = replace(status, status=DEGRADED, reason=reason)
+    if status.status == OK and repeats > 1:  # a Kinect repeats single images
+        return replace(status, status=DEGRADED, reason="the images repeat the previous frame bit for bit: at rest, or frozen")
+    return status
+
+
+def judged_by_the_run(pose: Pose) -> Pose:
+    """Degrade an ok pose that what was seen so far contradicts: matched points that have disagreed for ten frames, or the calibration."""
+    reason = (_lasting_disagreement(pose) or contradicted_calibration(pose)) if pose.status == OK else ""
+    return replace(pose, status=DEGRADED, reason=reason) if reason else pose
+
+
+def agreement(previous: Pose, inliers: InlierStatistics) -> float:
+    """Return the moving average of the share of matched points that agree; a frame with few of them says nothing."""
+    if inliers.matched[0] < DETAILED:
+        return previous.agreement
+    return previous.agreement + (inliers.inliers[0] / inliers.matched[0] - previous.agreement) / AGREEMENT_FRAMES
+
+
+def repeats_previous(tracks: Tracks, keypoints: Keypoints, planes: Planes) -> bool:
+    """Return True if every tracked key point and plane is bit-identical to that of the previous frame, which no two images of a sensor are."""
+    points, walls = keypoints.points_m[tracks.keypoints[:, 1]], planes.coefficients[tracks.planes[:, 1]]
+    return bool(len(points) + len(walls)) and np.array_equal(tracks.points_m, points, True) and np.array_equal(tracks.coefficients, walls, True)
+
+
+def _by_information(options: JudgementOptions, evidence: Evidence) -> TrackingStatus:
+    """Status by the number and share of the inliers, and by the rotation that they were searched with."""
+    solution, inliers = evidence.solution, evidence.inliers
+    points, lines, planes = inliers.inliers
+    status, reason = OK, f"{points} points, {lines} lines and {planes} planes of the map"
+    if solution.unobservable.shape[1]:
+        status, reason = DEGRADED, f"{solution.unobservable.shape[1]} directions of motion are unobservable, held at the prediction"
+    elif inliers.score < options.min_inliers:
+        status, reason = DEGRADED, f"only {points} points, {lines} lines and {planes} planes of the map were found"
+    elif inliers.total < options.min_share * inliers.matches:
+        status, reason = DEGRADED, f"only {inliers.total} of {inliers.matches} matches with the map agree"
+    elif evidence.rotation.source == "prediction":
+        status, reason = DEGRADED, "the rotation was predicted, not measured, before refinement"
+    return TrackingStatus(status, reason, solution.covariance)
+
+
+def is_tracked(options: JudgementOptions, inliers: InlierStatistics) -> bool:
+    """Return True if enough of the map agrees with a tracked pose."""
+    return inliers.score >= options.min_inliers and inliers.total >= options.min_share * inliers.matches
+
+
+def _is_another_place(options: JudgementOptions, problem: MapAlignment, continued: int) -> bool:
+    """Return True if the frame has details where details are expected, and hardly one of them is known from the previous frame or the map: what its
+    planes and lines agree with is then a place built alike."""
+    with_depth = int(np.count_nonzero(np.isfinite(problem.keypoints.points_m[:, 2])))
+    expected = min(with_depth, len(problem.matches.visible_points))
+    return expected >= DETAILED and continued < options.min_continued * with_depth
+
+
+def _lasting_disagreement(pose: Pose) -> str:
+    """Return why what is seen has contradicted the map for a while, empty where most of it agrees."""
+    if pose.agreement >= LEAST_AGREEMENT:
+        return ""
+    return f"colour, depth and map contradict each other: of late {100.0 * pose.agreement:.0f} % of the matched points agree"
