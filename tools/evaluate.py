@@ -4,8 +4,8 @@ Trajectories are text files in the TUM format (stamp tx ty tz qx qy qz qw). TRUT
 run. The share of frames tracked needs to know the frames: they come from --frames, else from the recording run.mcap beside TRAJECTORY; without
 either they are taken to be those of the whole ground truth, thinned to the trajectory's rate. ICL-NUIM publishes poses with y up: --y-up.
 
-Without a ground truth, --no-reference judges a run by its own depth: images moved into later ones by the estimate, thickness of walls that several
-frames saw, entropy of the map, spread of mutually orthogonal planes (Kornilova and Ferrer, 2021). Smaller is better.
+Without a ground truth, --no-reference judges a run by the σ that its poses state, and by its own depth: images moved into later ones by the estimate,
+thickness of walls that several frames saw, entropy of the map, spread of mutually orthogonal planes (Kornilova and Ferrer, 2021). Smaller is better.
 
 Example: trihedron evaluate runs/latest/trajectory.txt groundtruth.txt
 Example: trihedron evaluate runs/latest --no-reference

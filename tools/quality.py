@@ -1,7 +1,8 @@
-"""Quality of a run without ground truth: how well its own depth images agree under the estimated trajectory.
+"""Quality of a run without ground truth: the error that it states, and how well its own depth images agree under the estimated trajectory.
 
-Three kinds of figure, all in metres but the entropy:
+Four kinds of figure, all in metres but the entropy:
 
+- `sigma_m`: median σ of the positions of the `ok` poses, as their covariances state it.
 - `warped_1_m`, `warped_10_m`, `warped_30_m`: the depth image of frame i is moved into frame i + 1, i + 10 and i + 30 by the estimate; median of the
   absolute difference to the depth measured there, mean over pairs. The sensor's noise is in it. `shifted_30_m` is without: the RMS over TILES × TILES
   parts of the image of the median difference, signed.
@@ -46,6 +47,7 @@ class Quality:
 
     frames: int
     posed: int
+    sigma_m: float | None
     warped_1_m: float | None
     warped_10_m: float | None
     warped_30_m: float | None
@@ -83,7 +85,9 @@ class Parts:
 def quality_of_run(run: Path) -> Quality:
     """Judge a run folder or recording. Raises DataError where its frames are gone, or fewer than two are posed."""
     from trihedron.pipeline.app.recorded_values import frames_of, references_of, trajectory_of
+    from trihedron.pipeline.core.types import Pose
     from trihedron.pipeline.record.reader import Recording
+    from trihedron.pipeline.run.stated_sigma import stated_sigma
 
     recording = Recording(run / "run.mcap" if run.is_dir() else run)
     references = {reference.stamp_ns: reference for reference in references_of(recording).values()}
@@ -97,11 +101,13 @@ def quality_of_run(run: Path) -> Quality:
     def read(row: int) -> Frame | None:
         return frame_of(known[row])
 
-    return quality_of(PosedFrames(np.array([reference.index for reference in known]), trajectory.poses[posed], read), len(references))
+    stated = stated_sigma([pose for pose in recording.values("pose") if isinstance(pose, Pose)] if "pose" in recording.topics else [], [])
+    frames = PosedFrames(np.array([reference.index for reference in known]), trajectory.poses[posed], read)
+    return quality_of(frames, len(references), stated.median_m if stated is not None else None)
 
 
-def quality_of(frames: PosedFrames, count: int) -> Quality:
-    """Judge posed frames; `count` is the number of all frames."""
+def quality_of(frames: PosedFrames, count: int, sigma_m: float | None = None) -> Quality:
+    """Judge posed frames; `count` is the number of all frames, `sigma_m` the σ that the run states."""
     warped = {apart: _warp_errors(frames, apart) for apart in APART}
     medians = {apart: float(np.mean([m for m, _ in found])) if found else None for apart, found in warped.items()}
     shifts = [shift for _, shift in warped[APART[-1]] if np.isfinite(shift)]
@@ -114,6 +120,7 @@ def quality_of(frames: PosedFrames, count: int) -> Quality:
     return Quality(
         frames=count,
         posed=len(frames.numbers),
+        sigma_m=sigma_m,
         warped_1_m=medians[1],
         warped_10_m=medians[10],
         warped_30_m=medians[30],

@@ -99,6 +99,8 @@ def test_a_run_is_judged_by_the_command(tmp_path: Path, capsys: pytest.CaptureFi
     assert main(["evaluate", str(tmp_path / "run"), "--no-reference", "--json"]) == 0
     figures = json.loads(capsys.readouterr().out)
     assert figures["frames"] == 20 and 0.0 < figures["warped_1_m"] < 0.05 and figures["warped_30_m"] is None
+    stated = json.loads((tmp_path / "run" / "metrics.json").read_text())["sigma"]
+    assert figures["sigma_m"] == pytest.approx(stated["median_m"]) and 0.0 < figures["sigma_m"] < 0.05
     assert main(["evaluate", str(tmp_path / "run"), "--no-reference"]) == 0
     assert "wall_thickness" in capsys.readouterr().out
 
