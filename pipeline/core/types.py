@@ -307,8 +307,8 @@ class Pose(Value):
     of these landmarks' common pose in the world, by drift and by an imperfect calibration. `noise_scale` is the variance of the residuals relative to
     the stated one.
 
-    `repeats` is the number of images in a row, up to this one, that repeat the one before bit for bit; `agreement` the share of the matched points
-    that agree with their frame's pose, as a moving average over ten frames.
+    `repeats` is the number of images in a row, up to this one, that repeat the one before bit for bit; `disagreement` the share of the matched points
+    that do not agree with their frame's pose, as a moving average over ten frames.
 
     Five fields are what the pose's error owes to an imperfect calibration (`plugins.shared.calibration_error`, which defines the parameters and their
     units): `sensitivity` is the derivative of the error by them, `calibration_information` and `calibration_score` the information of the residuals
@@ -336,7 +336,7 @@ class Pose(Value):
         default_factory=lambda: np.zeros((CALIBRATION, CALIBRATION))
     )
     calibration_score: Annotated[F64, Shape(CALIBRATION), Finite()] = field(default_factory=lambda: np.zeros(CALIBRATION))
-    agreement: Annotated[float, Within(0.0, 1.0)] = 1.0
+    disagreement: Annotated[float, Within(0.0, 1.0)] = 0.0
 
     @property
     def local_covariance(self) -> F64:

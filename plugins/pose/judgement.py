@@ -29,8 +29,8 @@ from trihedron.plugins.pose.world_uncertainty import widened_by_keyframes
 from trihedron.plugins.shared.pose_optimizer import PoseSolution
 
 DETAILED = 100  # key points, or matches, with which a frame is expected to be recognised by them
-AGREEMENT_FRAMES = 10  # that the agreement of matched points is averaged over
-LEAST_AGREEMENT = 0.5  # less is no moment of blur and nobody who walks by; at least 0.65 of five cameras and three simulated ones
+DISAGREEMENT_FRAMES = 10  # that the disagreement of matched points is averaged over
+MOST_DISAGREEMENT = 0.5  # more is no moment of blur and nobody who walks by; at most 0.35 of five cameras and three simulated ones
 BY_CHANCE = 0.15  # of DETAILED matches that agree by chance: after a jump at most 0.08, between frames of a walk at least 0.31
 BLURRED_PX = 1.0  # blur that is worth a word: with more the covariance is half as large again
 
@@ -111,11 +111,11 @@ def judged_by_the_run(pose: Pose) -> Pose:
     return replace(pose, status=DEGRADED, reason=reason) if reason else pose
 
 
-def agreement(previous: Pose, inliers: InlierStatistics) -> float:
-    """Return the moving average of the share of matched points that agree; a frame with few of them says nothing."""
+def disagreement(previous: Pose, inliers: InlierStatistics) -> float:
+    """Return the moving average of the share of matched points that do not agree; a frame with few of them says nothing."""
     if inliers.matched[0] < DETAILED:
-        return previous.agreement
-    return previous.agreement + (inliers.inliers[0] / inliers.matched[0] - previous.agreement) / AGREEMENT_FRAMES
+        return previous.disagreement
+    return previous.disagreement + (1.0 - inliers.inliers[0] / inliers.matched[0] - previous.disagreement) / DISAGREEMENT_FRAMES
 
 
 def repeats_previous(tracks: Tracks, keypoints: Keypoints, planes: Planes) -> bool:
@@ -155,6 +155,6 @@ def _is_another_place(options: JudgementOptions, problem: MapAlignment, continue
 
 def _lasting_disagreement(pose: Pose) -> str:
     """Return why what is seen has contradicted the map for a while, empty where most of it agrees."""
-    if pose.agreement >= LEAST_AGREEMENT:
+    if pose.disagreement <= MOST_DISAGREEMENT:
         return ""
-    return f"colour, depth and map contradict each other: of late {100.0 * pose.agreement:.0f} % of the matched points agree"
+    return f"colour, depth and map contradict each other: of late {100.0 * pose.disagreement:.0f} % of the matched points disagree"

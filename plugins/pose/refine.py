@@ -32,7 +32,7 @@ from trihedron.plugins.pose.dynamic_objects import Selection, solve_with_static
 from trihedron.plugins.pose.judgement import (
     Evidence,
     JudgementOptions,
-    agreement,
+    disagreement,
     is_found_again,
     judged_by_the_run,
     reason_to_be_lost,
@@ -105,7 +105,7 @@ class Refine(JudgementOptions):
         reference, T_reference_camera = reference_of(map, T, submap)
         stamps = rotation.index, rotation.stamp_ns
         pose = Pose(*stamps, T, status.covariance, T_reference_camera, reference, counts, held, status.status, status.reason, submap, repeats=repeats)
-        return judged_by_the_run(replace(in_world(pose, previous, solution, problem), agreement=agreement(previous, inliers)))
+        return judged_by_the_run(replace(in_world(pose, previous, solution, problem), disagreement=disagreement(previous, inliers)))
 
     def localising(self) -> Refine:
         """Return the refinement of a camera that begins no sub-map: where the loaded map does not reach it stays lost."""

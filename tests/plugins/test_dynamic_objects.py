@@ -223,13 +223,15 @@ def test_blur_is_no_contradiction_and_the_reason_names_it(world, map):
 def test_what_disagrees_for_long_is_a_contradiction(world, map):
     """A frame of which most agrees, after ten of which less than half did; and after ten of which a little more did."""
     start, features, matches = matched(world, map)
-    before = dataclasses.replace(pose_of(camera_at(STEP - 1), STEP - 1), agreement=0.43)
+    before = dataclasses.replace(pose_of(camera_at(STEP - 1), STEP - 1), disagreement=0.57)
     poses = [
-        Refine()(world.frame(STEP).camera, *start, None, matches, *features, dataclasses.replace(before, agreement=agreement), map, None)
-        for agreement in (0.43, 0.5)
+        Refine()(world.frame(STEP).camera, *start, None, matches, *features, dataclasses.replace(before, disagreement=disagreement), map, None)
+        for disagreement in (0.57, 0.5)
     ]
     share = poses[0].inliers[0] / len(matches.keypoints)
-    assert share > 0.9 and poses[0].agreement == pytest.approx(0.43 + (share - 0.43) / 10)
+    assert share > 0.9 and poses[0].disagreement == pytest.approx(0.57 + (1.0 - share - 0.57) / 10)
     assert poses[0].status == "degraded"
-    assert poses[0].reason == f"colour, depth and map contradict each other: of late {100 * poses[0].agreement:.0f} % of the matched points agree"
-    assert poses[1].status == "ok" and 0.5 < poses[1].agreement < 0.56
+    assert (
+        poses[0].reason == f"colour, depth and map contradict each other: of late {100 * poses[0].disagreement:.0f} % of the matched points disagree"
+    )
+    assert poses[1].status == "ok" and 0.44 < poses[1].disagreement < 0.5
