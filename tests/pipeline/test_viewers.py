@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import json
+import re
 import socket
 import struct
 import subprocess
 import sys
 import threading
+import time
 from pathlib import Path
 from typing import Any
 
@@ -40,7 +42,8 @@ def free_port() -> int:
 
 
 class Client:
-    """Subscribes to channels of the server as they are advertised, and collects their messages."""
+    """Subscribes to channels of the server as they are advertised, and collects their messages. A channel that the server advertises before it
+    knows it for this client, which happens on a busy machine, is asked for again."""
 
     def __init__(self, port: int, topics: set[str]) -> None:
         self.socket = connect(f"ws://localhost:{port}", subprotocols=["foxglove.sdk.v1"], max_size=None).__enter__()  # type: ignore[list-item]
@@ -60,8 +63,13 @@ class Client:
             content = json.loads(message)
             if content["op"] == "advertise":
                 self.channels |= {channel["id"]: channel for channel in content["channels"]}
-                chosen = [channel["id"] for channel in content["channels"] if channel["topic"] in self._topics]
-                self.socket.send(json.dumps({"op": "subscribe", "subscriptions": [{"id": id, "channelId": id} for id in chosen]}))
+                self._subscribe([channel["id"] for channel in content["channels"] if channel["topic"] in self._topics])
+            elif content["op"] == "status" and (unknown := re.match(r"Unknown channel ID: (\d+)", content["message"])):
+                time.sleep(0.05)
+                self._subscribe([int(unknown[1])])
+
+    def _subscribe(self, ids: list[int]) -> None:
+        self.socket.send(json.dumps({"op": "subscribe", "subscriptions": [{"id": id, "channelId": id} for id in ids]}))
 
     def closed(self) -> list[tuple[str, int, bytes]]:
         """Wait until the server closes the connection; return the messages."""
