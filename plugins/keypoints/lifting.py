@@ -34,24 +34,21 @@ def lift_pixels(options: LiftOptions, frame: Frame, pixels: F32) -> tuple[F32, F
     return frame.camera.back_project(pixels, depth).astype(np.float32), sigma
 
 
-def sigmas_px(options: LiftOptions, scales: F64, blur_px: float) -> F32:
-    """Return the standard deviations (n,) of the pixels of key points of these scales (n,) in an image that is blurred by `blur_px`."""
-    return np.hypot(options.sigma_px * scales, blur_px).astype(np.float32)
-
-
-def lift_keypoints(options: LiftOptions, frame: Frame, pixels: F32, scales: F64, angles_deg: F32, descriptors: U8, metric: str) -> Keypoints:
-    """Lift key points at pixels (n, 2) with scales (n,), 1 for the finest, directions (n,) and descriptors (n, b); points are NaN without reliable
-    depth."""
+def lift_keypoints(
+    options: LiftOptions, frame: Frame, pixels: F32, scales: F64, octaves: U8, angles_deg: F32, descriptors: U8, metric: str = "hamming"
+) -> Keypoints:  # fmt: skip
+    """Lift key points at pixels (n, 2) with scales (n,), 1 for the finest, octaves (n,), directions (n,) and descriptors (n, b); points are NaN
+    without reliable depth. The noise of pixels grows with the scale and includes the blur of the image."""
     points_m, sigma_m = lift_pixels(options, frame, pixels)
-    scales, blur_px = np.maximum(scales, 1.0), motion_blur_px(frame.gray)
+    blur_px = motion_blur_px(frame.gray)
     return Keypoints(
         index=frame.index,
         stamp_ns=frame.stamp_ns,
         pixels=pixels,
         points_m=points_m,
-        sigma_px=sigmas_px(options, scales, blur_px),
+        sigma_px=np.hypot(options.sigma_px * scales, blur_px).astype(np.float32),
         sigma_m=sigma_m,
-        octaves=np.clip(np.rint(np.log(scales) / np.log(LEVEL_SCALE)), 0, 255).astype(np.uint8),
+        octaves=octaves,
         angles_deg=angles_deg,
         descriptors=descriptors,
         metric=metric,
@@ -66,7 +63,9 @@ def detect_and_lift(options: LiftOptions, detector: Any, frame: Frame, smallest_
     found, described = ((), None) if small else detector.detectAndCompute(frame.gray, None)
     rows = np.array([(*point.pt, point.size, point.angle) for point in found], np.float32).reshape(-1, 4)
     descriptors = np.zeros((0, width), np.uint8) if described is None or not len(found) else _bytes(described)
-    return lift_keypoints(options, frame, rows[:, :2].copy(), rows[:, 2].astype(np.float64) / smallest_px, rows[:, 3].copy(), descriptors, metric)
+    scales = np.maximum(rows[:, 2].astype(np.float64) / smallest_px, 1.0)
+    octaves = np.clip(np.rint(np.log(scales) / np.log(LEVEL_SCALE)), 0, 255).astype(np.uint8)
+    return lift_keypoints(options, frame, rows[:, :2].copy(), scales, octaves, rows[:, 3].copy(), descriptors, metric)
 
 
 def _bytes(descriptors: NDArray[Any]) -> U8:

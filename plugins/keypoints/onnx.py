@@ -73,5 +73,5 @@ class OnnxKeypoints(NetworkOptions, LiftOptions):
         height, width = frame.gray.shape
         inside = ((pixels >= 0.0) & (pixels <= [width - 1, height - 1])).all(axis=1) & (scores >= self.min_score)
         order = np.flatnonzero(inside)[np.argsort(-scores[inside], kind="stable")][: self.features or None]
-        alike = np.ones(len(order)), np.zeros(len(order), np.float32)  # one scale, no direction
+        alike = np.ones(len(order)), np.zeros(len(order), np.uint8), np.zeros(len(order), np.float32)  # one scale, no direction
         return lift_keypoints(self, frame, np.ascontiguousarray(pixels[order], np.float32), *alike, bytes_of(descriptors[order]), "l2")

@@ -13,9 +13,8 @@ import numpy as np
 from trihedron.pipeline.core.options import NonNegativeFloat, PositiveInt, Range, check_increasing
 from trihedron.pipeline.core.registry import register
 from trihedron.pipeline.core.types import F32, U8, Frame, Keypoints
-from trihedron.plugins.keypoints.lifting import LiftOptions, lift_pixels, sigmas_px
+from trihedron.plugins.keypoints.lifting import LiftOptions, lift_keypoints
 from trihedron.plugins.keypoints.orb_kernels import BITS, REACH_PX, Pyramid, full_pixels, oriented_corners, steered_brief
-from trihedron.plugins.shared.edge_width import motion_blur_px
 
 MARGIN_PX = 19  # of a level, within which its descriptors would reach over the border
 
@@ -44,20 +43,7 @@ class Orb(LiftOptions):
         cells, levels, angles = oriented_corners(pyramid, *thresholds, MARGIN_PX, self.cell_px, self.features, weights)
         descriptors = steered_brief(pyramid, cells, levels, angles, self._tests)
         pixels = full_pixels(cells, levels, pyramid.shapes).astype(np.float32)
-        points_m, sigma_m = lift_pixels(self, frame, pixels)
-        blur_px = motion_blur_px(frame.gray)
-        return Keypoints(
-            index=frame.index,
-            stamp_ns=frame.stamp_ns,
-            pixels=pixels,
-            points_m=points_m,
-            sigma_px=sigmas_px(self, np.asarray(self.scale**levels, np.float64), blur_px),
-            sigma_m=sigma_m,
-            octaves=levels.astype(np.uint8),
-            angles_deg=angles,
-            descriptors=descriptors,
-            blur_px=blur_px,
-        )
+        return lift_keypoints(self, frame, pixels, self.scale ** levels.astype(np.float64), levels.astype(np.uint8), angles, descriptors)
 
     @cached_property
     def _tests(self) -> F32:

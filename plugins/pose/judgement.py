@@ -57,7 +57,6 @@ class Evidence:
     inliers: InlierStatistics
     rotation: Rotation
     translation: Translation
-    tracks: Tracks | None
     submap: int
 
 
@@ -70,7 +69,7 @@ def is_found_again(options: JudgementOptions, evidence: Evidence) -> bool:
 
 
 def reason_to_be_lost(options: JudgementOptions, evidence: Evidence, start_status: str) -> str:
-    """Return why a frame is lost although the previous one, or relocalisation, gave it a pose (`start_status`); empty where nothing says so."""
+    """Return why a frame is lost although the previous one, or relocalisation, gave it a pose (`start_status`); empty where it is not."""
     inliers, tracked = evidence.inliers, is_tracked(options, evidence.inliers)
     agree = f"only {inliers.total} of {inliers.matches} matches"
     if evidence.rotation.source == "prediction" and not tracked:
@@ -105,23 +104,28 @@ def status_of(options: JudgementOptions, evidence: Evidence, repeats: int) -> Tr
     return status
 
 
-def judged_by_the_run(pose: Pose) -> Pose:
-    """Degrade an ok pose that what was seen so far contradicts: matched points that have disagreed for ten frames, or the calibration."""
+def judge_by_run(pose: Pose) -> Pose:
+    """Degrade an ok pose that contradicts the run so far: its matched points have disagreed for ten frames, or its residuals contradict the
+    calibration."""
     reason = (_lasting_disagreement(pose) or contradicted_calibration(pose)) if pose.status == OK else ""
     return replace(pose, status=DEGRADED, reason=reason) if reason else pose
 
 
 def disagreement(previous: Pose, inliers: InlierStatistics) -> float:
-    """Return the moving average of the share of matched points that do not agree; a frame with few of them says nothing."""
+    """Return the moving average of the share of matched points that do not agree; a frame with few of them leaves it as it is."""
     if inliers.matched[0] < DETAILED:
         return previous.disagreement
     return previous.disagreement + (1.0 - inliers.inliers[0] / inliers.matched[0] - previous.disagreement) / DISAGREEMENT_FRAMES
 
 
-def repeats_previous(tracks: Tracks, keypoints: Keypoints, planes: Planes) -> bool:
-    """Return True if every tracked key point and plane is bit-identical to that of the previous frame, which no two images of a sensor are."""
+def repeated_images(previous: Pose, tracks: Tracks | None, keypoints: Keypoints, planes: Planes) -> int:
+    """Return how many images in a row repeat the one before: every tracked key point and plane is bit-identical, which two images of a sensor never
+    are."""
+    if tracks is None:
+        return 0
     points, walls = keypoints.points_m[tracks.keypoints[:, 1]], planes.coefficients[tracks.planes[:, 1]]
-    return bool(len(points) + len(walls)) and np.array_equal(tracks.points_m, points, True) and np.array_equal(tracks.coefficients, walls, True)
+    same = np.array_equal(tracks.points_m, points, True) and np.array_equal(tracks.coefficients, walls, True)
+    return previous.repeats + 1 if len(points) + len(walls) and same else 0
 
 
 def _by_information(options: JudgementOptions, evidence: Evidence) -> TrackingStatus:

@@ -34,9 +34,9 @@ from trihedron.plugins.pose.judgement import (
     JudgementOptions,
     disagreement,
     is_found_again,
-    judged_by_the_run,
+    judge_by_run,
     reason_to_be_lost,
-    repeats_previous,
+    repeated_images,
     status_of,
 )
 from trihedron.plugins.pose.map_alignment import MapAlignment
@@ -89,7 +89,7 @@ class Refine(JudgementOptions):
         problem = MapAlignment(self, start.T_world_camera, self._information(start), camera, matches, keypoints, segments, planes, map)
         solution, static = self._solve(problem, start)
         inliers = problem.statistics(solution)
-        evidence = Evidence(problem, solution, static, inliers, rotation, translation, tracks, submap)
+        evidence = Evidence(problem, solution, static, inliers, rotation, translation, submap)
         if start.status == LOST and not is_found_again(self, evidence):
             searched = relocalise is not None and translation.estimated
             return self._stay_lost(start, rotation, previous, searched, map, submap)
@@ -99,13 +99,13 @@ class Refine(JudgementOptions):
             return propagate_world_covariance(
                 start.to_pose(rotation, map, "nothing of the map was found, pose from the previous frame", submap), previous
             )
-        repeats = previous.repeats + 1 if tracks is not None and repeats_previous(tracks, keypoints, planes) else 0
+        repeats = repeated_images(previous, tracks, keypoints, planes)
         status = status_of(self, evidence, repeats)
         T, held, counts = solution.T_world_camera, solution.unobservable.shape[1], np.array(inliers.inliers, np.int32)
         reference, T_reference_camera = reference_of(map, T, submap)
         stamps = rotation.index, rotation.stamp_ns
         pose = Pose(*stamps, T, status.covariance, T_reference_camera, reference, counts, held, status.status, status.reason, submap, repeats=repeats)
-        return judged_by_the_run(replace(in_world(pose, previous, solution, problem), disagreement=disagreement(previous, inliers)))
+        return judge_by_run(replace(in_world(pose, previous, solution, problem), disagreement=disagreement(previous, inliers)))
 
     def localising(self) -> Refine:
         """Return the refinement of a camera that begins no sub-map: where the loaded map does not reach it stays lost."""
