@@ -305,7 +305,8 @@ class Pose(Value):
 
     `covariance` is that of the pose in the world: `noise_scale` times the covariance relative to the landmarks near it, plus `map_covariance`, that
     of these landmarks' common pose in the world, by drift and by an imperfect calibration. `noise_scale` is the variance of the residuals relative to
-    the stated one.
+    the stated one. `keyframe_covariance` is that of the keyframes which created these landmarks where it is much more than the pose's own, else zero:
+    landmarks made from this pose count it in their weights.
 
     `repeats` is the number of images in a row, up to this one, that repeat the one before bit for bit; `disagreement` the share of the matched points
     that do not agree with their frame's pose, as a moving average over ten frames.
@@ -314,7 +315,7 @@ class Pose(Value):
     units): `sensitivity` is the derivative of the error by them, `calibration_information` and `calibration_score` the information of the residuals
     on them so far. `twist` is the camera's velocity (m/s, rad/s) in its own frame, `reference_twist` that of the reference keyframe."""
 
-    version: ClassVar[int] = 4
+    version: ClassVar[int] = 5
 
     T_world_camera: Annotated[F64, Shape(4, 4), Rotations()]
     covariance: Annotated[F64, Shape(6, 6), Finite()]
@@ -337,11 +338,13 @@ class Pose(Value):
     )
     calibration_score: Annotated[F64, Shape(CALIBRATION), Finite()] = field(default_factory=lambda: np.zeros(CALIBRATION))
     disagreement: Annotated[float, Within(0.0, 1.0)] = 0.0
+    keyframe_covariance: Annotated[F64, Shape(6, 6), Finite()] = field(default_factory=lambda: np.zeros((6, 6)))
 
     @property
     def local_covariance(self) -> F64:
-        """Covariance (6, 6) relative to the landmarks near the pose, by the stated noise of the measurements."""
-        return (self.covariance - self.map_covariance) / self.noise_scale
+        """Covariance (6, 6) relative to the landmarks near the pose, by the stated noise of the measurements, with that of uncertain keyframes: what
+        estimates that begin from this pose count."""
+        return (self.covariance - self.map_covariance) / self.noise_scale + self.keyframe_covariance
 
 
 @dataclass(frozen=True)

@@ -42,6 +42,7 @@ ADDED_FIELDS: dict[tuple[str, int], dict[str, Any]] = {  # type and older versio
         "calibration_information": np.zeros((CALIBRATION, CALIBRATION)),
         "calibration_score": np.zeros(CALIBRATION),
     },
+    ("Pose", 4): {"keyframe_covariance": np.zeros((6, 6))},
     ("Map", 5): {"loop_closed": 0},
 }
 # likewise -> the columns of keyframes that it lacks, each a copy of the column `covariance`, or zeros of this shape wherever that changes

@@ -103,7 +103,7 @@ def _consistency(result: Result, truth: Trajectory) -> dict[str, Any]:
     if len(known) < 2:
         return {}
     estimated, true = np.array([pose.T_world_camera for pose in known]), truth.poses[pairs[:, 1]]
-    local = np.array([pose.noise_scale * pose.local_covariance for pose in known])
+    local = np.array([pose.covariance - pose.map_covariance for pose in known])
     noise = truth_noise(estimated, local, true, np.array([pose.index for pose in known], np.int32))
     return pose_consistency(estimated, np.array([pose.covariance for pose in known]), true, noise).to_dict()
 

@@ -194,7 +194,7 @@ def _robustly_aligned(T: F64, true: F64, aligned: Bool) -> tuple[F64, F64]:
 
 def _noise_of_truth(poses: Sequence[Pose], true: F64) -> TruthNoise:
     """Estimate errors of the truth that are independent from frame to frame."""
-    local = np.array([pose.noise_scale * pose.local_covariance for pose in poses])
+    local = np.array([pose.covariance - pose.map_covariance for pose in poses])
     T, indices = np.array([pose.T_world_camera for pose in poses]), np.array([pose.index for pose in poses], np.int32)
     return truth_noise(T, local, true, indices)
 

@@ -25,7 +25,6 @@ from trihedron.pipeline.core.types import DEGRADED, LOST, OK, Keypoints, Planes,
 from trihedron.plugins.pose.calibration_uncertainty import contradicted_calibration
 from trihedron.plugins.pose.dynamic_objects import MovingOptions, Selection, status_with_static
 from trihedron.plugins.pose.map_alignment import InlierStatistics, MapAlignment, TrackingStatus
-from trihedron.plugins.pose.world_uncertainty import widened_by_keyframes
 from trihedron.plugins.shared.pose_optimizer import PoseSolution
 
 DETAILED = 100  # key points, or matches, with which a frame is expected to be recognised by them
@@ -85,15 +84,17 @@ def reason_to_be_lost(options: JudgementOptions, evidence: Evidence, start_statu
     return ""
 
 
-def status_of(options: JudgementOptions, evidence: Evidence, repeats: int) -> TrackingStatus:
-    """Judge a refined pose by this frame; `repeats` images in a row repeat the one before. The covariance is widened where the keyframes that it
-    rests on are uncertain."""
-    problem, solution = evidence.problem, evidence.solution
+def status_by_matches(options: JudgementOptions, evidence: Evidence) -> TrackingStatus:
+    """Judge a refined pose by the matches of this frame with the map: whether they are enough, and agree."""
     status = _by_information(options, evidence)
-    if evidence.static is not None:
-        status = status_with_static(status, solution, problem, evidence.static, options)
-    if status.status == OK:
-        status = widened_by_keyframes(status, solution, problem, options.weak_foundation)
+    if evidence.static is None:
+        return status
+    return status_with_static(status, evidence.solution, evidence.problem, evidence.static, options)
+
+
+def status_by_images(status: TrackingStatus, evidence: Evidence, repeats: int) -> TrackingStatus:
+    """Judge further by what is known of this frame besides; `repeats` images in a row repeat the one before."""
+    problem = evidence.problem
     if problem.keypoints.blur_px >= BLURRED_PX:
         status = replace(status, reason=f"{status.reason}; the image is blurred by {problem.keypoints.blur_px:.1f} px: turn slower")
     if evidence.submap:
@@ -141,7 +142,7 @@ def _by_information(options: JudgementOptions, evidence: Evidence) -> TrackingSt
         status, reason = DEGRADED, f"only {inliers.total} of {inliers.matches} matches with the map agree"
     elif evidence.rotation.source == "prediction":
         status, reason = DEGRADED, "the rotation was predicted, not measured, before refinement"
-    return TrackingStatus(status, reason, solution.covariance)
+    return TrackingStatus(status, reason)
 
 
 def is_tracked(options: JudgementOptions, inliers: InlierStatistics) -> bool:

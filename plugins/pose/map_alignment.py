@@ -10,6 +10,7 @@ import numpy as np
 
 from trihedron.pipeline.core.types import F64, I32, Camera, Keypoints, Map, Matches, Planes, Segments
 from trihedron.plugins.mapping.projection import line_terms, plane_terms, point_terms
+from trihedron.plugins.shared.calibration_error_kernels import Observers
 from trihedron.plugins.shared.pose_optimizer import (
     LANDMARK_SCORE,
     PoseSolution,
@@ -24,11 +25,10 @@ from trihedron.plugins.shared.pose_optimizer_kernels import Flags, Groups
 
 @dataclass(frozen=True)
 class TrackingStatus:
-    """Status of a pose (ok | degraded | lost), its reason, and the pose's covariance (6, 6)."""
+    """Status of a pose (ok | degraded | lost), and its reason."""
 
     status: str
     reason: str
-    covariance: F64
 
 
 @dataclass(frozen=True)
@@ -128,6 +128,15 @@ class MapAlignment:
         first = [table.rows("first", ids) for table, ids in tables]
         keyframes, numbers = np.unique(np.concatenate(first), return_inverse=True)
         return keyframes, Groups(*(part.astype(np.int32) for part in np.split(numbers, np.cumsum([len(part) for part in first[:2]]))))
+
+    def observed_by(self) -> tuple[I32, Observers]:
+        """The keyframes (k,) that observed the matched points and planes, and which of them observed each."""
+        points, planes = self.map.points.rows("observers", self.matches.keypoints[:, 1]), self.map.planes.rows("observers", self.plane_ids())
+        number = np.zeros(len(self.map.keyframes) + 1, np.int32)  # the last is that of -1, no keyframe
+        number[points], number[planes], number[-1] = 1, 1, 0
+        keyframes = np.flatnonzero(number).astype(np.int32)
+        number[keyframes], number[-1] = np.arange(len(keyframes)), -1
+        return keyframes, Observers(number[points], number[planes])
 
     def equations_by_keyframe(self, solution: PoseSolution, keyframes: I32, groups: Groups) -> tuple[F64, F64]:
         """The normal equations of each keyframe's landmarks that agree with a solution: information (k, 6, 6) and score (k, 6)."""

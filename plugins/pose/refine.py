@@ -37,10 +37,11 @@ from trihedron.plugins.pose.judgement import (
     judge_by_run,
     reason_to_be_lost,
     repeated_images,
-    status_of,
+    status_by_images,
+    status_by_matches,
 )
 from trihedron.plugins.pose.map_alignment import MapAlignment
-from trihedron.plugins.pose.world_uncertainty import in_world, propagate_world_covariance
+from trihedron.plugins.pose.world_uncertainty import in_world, keyframe_covariance, propagate_world_covariance
 from trihedron.plugins.shared.pose_optimizer import PoseSolution
 
 EYE = np.eye(3)
@@ -99,12 +100,14 @@ class Refine(JudgementOptions):
             return propagate_world_covariance(
                 start.to_pose(rotation, map, "nothing of the map was found, pose from the previous frame", submap), previous
             )
-        repeats = repeated_images(previous, tracks, keypoints, planes)
-        status = status_of(self, evidence, repeats)
+        repeats, status = repeated_images(previous, tracks, keypoints, planes), status_by_matches(self, evidence)
+        shared = keyframe_covariance(solution, problem, self.weak_foundation) if status.status == OK else np.zeros((6, 6))
+        status = status_by_images(status, evidence, repeats)
         T, held, counts = solution.T_world_camera, solution.unobservable.shape[1], np.array(inliers.inliers, np.int32)
         reference, T_reference_camera = reference_of(map, T, submap)
         stamps = rotation.index, rotation.stamp_ns
-        pose = Pose(*stamps, T, status.covariance, T_reference_camera, reference, counts, held, status.status, status.reason, submap, repeats=repeats)
+        pose = Pose(*stamps, T, solution.covariance, T_reference_camera, reference, counts, held, status.status, status.reason, submap)
+        pose = replace(pose, repeats=repeats, keyframe_covariance=shared)
         return judge_by_run(replace(in_world(pose, previous, solution, problem), disagreement=disagreement(previous, inliers)))
 
     def localising(self) -> Refine:

@@ -17,7 +17,7 @@ from trihedron.pipeline.core.linalg import eigvalsh, matmul
 from trihedron.pipeline.core.linalg_kernels import inverse_positive
 from trihedron.pipeline.core.types import F64, I32, Map, Pose
 from trihedron.plugins.pose.calibration_uncertainty import carried_calibration, with_calibration, with_velocity
-from trihedron.plugins.pose.map_alignment import MapAlignment, TrackingStatus
+from trihedron.plugins.pose.map_alignment import MapAlignment
 from trihedron.plugins.shared.calibration_error import calibration_covariance
 from trihedron.plugins.shared.pose_optimizer import LANDMARK_SCORE, PoseSolution, residual_scale
 
@@ -67,13 +67,13 @@ def _sigmas_m(map: Map, keyframes: list[int]) -> dict[int, float]:
     return sigmas_m
 
 
-def widened_by_keyframes(status: TrackingStatus, solution: PoseSolution, problem: MapAlignment, factor: float) -> TrackingStatus:
-    """Add the covariance of the keyframes to that of a pose where they are uncertain by more than `factor` times its own standard deviation:
-    landmarks made from this pose would average it away."""
+def keyframe_covariance(solution: PoseSolution, problem: MapAlignment, factor: float) -> F64:
+    """Covariance (6, 6) of the keyframes as that of a pose, where they are uncertain by more than `factor` times its own standard deviation:
+    landmarks made from this pose would average it away. Zero elsewhere."""
     base = keyframe_uncertainty(problem.map, *problem.landmarks(solution))
     if base.sigma_m <= factor * np.sqrt(eigvalsh(solution.covariance[:3, :3])[-1]):
-        return status
-    return replace(status, covariance=status.covariance + base.covariance(problem.map, solution.T_world_camera))
+        return np.zeros((6, 6))
+    return base.covariance(problem.map, solution.T_world_camera)
 
 
 def in_world(pose: Pose, previous: Pose, solution: PoseSolution, problem: MapAlignment) -> Pose:
@@ -89,7 +89,7 @@ def in_world(pose: Pose, previous: Pose, solution: PoseSolution, problem: MapAli
     else:
         by_drift = drift_of_previous(pose, previous)
     moving = with_velocity(replace(pose, noise_scale=noise_scale), previous, problem.map)
-    return _with_world_covariance(with_calibration(moving, previous, solution, problem, keyframes, groups), by_drift)
+    return _with_world_covariance(with_calibration(moving, previous, solution, problem), by_drift)
 
 
 def _with_world_covariance(pose: Pose, by_drift: F64) -> Pose:

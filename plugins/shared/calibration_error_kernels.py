@@ -1,7 +1,7 @@
 """Kernels of `calibration_error.py`: what residuals tell of the calibration, and its second moments.
 
 A measurement errs by `M θ`: `keypoint_errors` in the image and in inverse depth, `plane_point_error` along a plane's normal. A landmark was placed by
-the same camera from the keyframe that created it, and errs with that. What a residual shows is the difference, and the keyframe's own error."""
+the same camera from the keyframes that observed it, and errs with their mean. A residual shows the difference, and the keyframes' own errors."""
 # mypy: disable-error-code="arg-type, assignment, index, return-value"
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ import numpy as np
 from trihedron.pipeline.core.kernel import kernel
 from trihedron.pipeline.core.linalg_kernels import inverse_positive, matmul, matvec, tangent_columns
 from trihedron.pipeline.core.types import CALIBRATION, F32, F64, I32, U8
-from trihedron.plugins.shared.pose_optimizer_kernels import Flags, Groups
+from trihedron.plugins.shared.pose_optimizer_kernels import Flags
 from trihedron.plugins.shared.residuals_kernels import (
     NEAR_M,
     SAME,
@@ -33,13 +33,20 @@ LEAST_SAMPLES = 4  # of a plane in both views, from which on it informs on the c
 
 
 class Keyframes(NamedTuple):
-    """The m keyframes that created landmarks: rotations and positions of `T_world_keyframe`, velocities, and errors by the calibration as those of xi
-    of the camera."""
+    """The m keyframes that observed landmarks: rotations and positions of `T_world_keyframe`, velocities, and errors by the calibration as those of
+    xi of the camera."""
 
     R: F64  # (m, 3, 3)
     t: F64  # (m, 3)
     twists: F64  # (m, 6)
     errors: F64  # (m, 6, 12)
+
+
+class Observers(NamedTuple):
+    """Numbers of the keyframes that observed each point (n, o) and each plane (p, o); -1 for none."""
+
+    points: I32
+    planes: I32
 
 
 class Equations(NamedTuple):
@@ -115,7 +122,7 @@ def _add(J: F64, W: F64, K: F64, r: F64, total: Equations) -> None:
 
 @kernel
 def _scale_and_subtract(scales: F64, J: F64, A: F64, K: F64) -> None:
-    """Express K (3, 12) in units of `scales`; and subtract J A, since a landmark moves with the keyframe that created it, whose error by the
+    """Express K (3, 12) in units of `scales`; and subtract J A, since a landmark moves with the keyframes that observed it, whose mean error by the
     calibration is A (6, 12) as that of the camera."""
     for i in range(3):
         for k in range(CALIBRATION):
@@ -135,26 +142,50 @@ def _to_keyframe(R: F64, t: F64, plane: F64, out: F64) -> None:
 
 
 @kernel
-def _point_calibration_jacobian(
-    p: F64, q: F64, plane: F64, of_plane: F64, Q: F64, twist: F64, twist_then: F64, camera: F64, width: int, height: int, D: F64, K: F64
-) -> None:
-    """Fill K (3, 12): `D Q dq/dθ` of the landmark, q (3,) in its keyframe's frame, less the errors at p (3,) in the camera's, with Q from that frame
-    to this one and D = dr/dp. `plane` and `of_plane` (4,) are the surface in the camera's and in the keyframe's frame."""
-    E, L = np.empty((3, CALIBRATION)), np.empty((3, 3))
-    keypoint_errors(q, of_plane, twist_then, camera, width, height, E)
-    for i in range(3):  # L = D Q dq/d(u, v, 1/z)
+def _add_point_error(q: F64, of_plane: F64, Q: F64, twist: F64, camera: F64, width: int, height: int, D: F64, E: F64, K: F64) -> None:
+    """Add `D Q dq/dθ` to K (3, 12): the error of a landmark as a keyframe saw it, q (3,) in its frame, with Q from that frame to the camera's and
+    D = dr/dp; `of_plane` (4,) is the surface there. E (3, 12) is overwritten."""
+    keypoint_errors(q, of_plane, twist, camera, width, height, E)
+    for i in range(3):  # D Q dq/d(u, v, 1/z)
         x, y, z = 0.0, 0.0, 0.0
         for j in range(3):
             x, y, z = x + D[i, j] * Q[j, 0], y + D[i, j] * Q[j, 1], z + D[i, j] * Q[j, 2]
-        L[i, 0], L[i, 1], L[i, 2] = x * q[2] / camera[0], y * q[2] / camera[1], -q[2] * (x * q[0] + y * q[1] + z * q[2])
+        u, v, w = x * q[2] / camera[0], y * q[2] / camera[1], -q[2] * (x * q[0] + y * q[1] + z * q[2])
+        for k in range(CALIBRATION):
+            K[i, k] += u * E[0, k] + v * E[1, k] + w * E[2, k]
+
+
+@kernel
+def _point_calibration_jacobian(
+    R: F64, world: F64, p: F64, surface: F64, observers: I32, keyframes: Keyframes, twist: F64, camera: F64, width: int, height: int,
+    D: F64, K: F64, A: F64,
+) -> bool:  # fmt: skip
+    """Fill K (3, 12): the mean error of a landmark over its observers, less that of its measurement at p (3,) in the camera's frame; and A (6, 12),
+    the observers' mean error. Returns False where no keyframe is known to have seen it."""
+    q, then, Q, E = np.empty(3), np.empty(4), np.empty((3, 3)), np.empty((3, CALIBRATION))
+    K[:], A[:], seen = 0.0, 0.0, 0
+    for k in observers:
+        if k < 0:
+            continue
+        _local(keyframes.R[k], keyframes.t[k], world, q)
+        if not q[2] > NEAR_M:
+            continue
+        for a in range(3):
+            for b in range(3):
+                Q[a, b] = R[0, a] * keyframes.R[k, 0, b] + R[1, a] * keyframes.R[k, 1, b] + R[2, a] * keyframes.R[k, 2, b]
+        _plane_then(surface, Q, p, q, then)
+        _add_point_error(q, then, Q, keyframes.twists[k], camera, width, height, D, E, K)
+        A += keyframes.errors[k]
+        seen += 1
+    if seen == 0:
+        return False
+    keypoint_errors(p, surface, twist, camera, width, height, E)
+    rows = 3 if D[2, 2] != 0.0 else 2
     for i in range(3):
         for k in range(CALIBRATION):
-            K[i, k] = L[i, 0] * E[0, k] + L[i, 1] * E[1, k] + L[i, 2] * E[2, k]
-    keypoint_errors(p, plane, twist, camera, width, height, E)
-    rows = 3 if D[2, 2] != 0.0 else 2
-    for i in range(rows):
-        for k in range(CALIBRATION):
-            K[i, k] -= E[i, k]
+            K[i, k] = K[i, k] / seen - (E[i, k] if i < rows else 0.0)
+    A /= seen
+    return True
 
 
 @kernel
@@ -180,77 +211,104 @@ def _plane_then(surface: F64, Q: F64, p: F64, q: F64, out: F64) -> None:
 @kernel
 def _add_points(
     R: F64, t: F64, camera: F64, width: int, height: int, scales: F64, twist: F64, points: PointTerms, W: F64, flags: U8, surfaces: F64,
-    first: I32, keyframes: Keyframes, total: Equations,
+    observers: I32, keyframes: Keyframes, total: Equations,
 ) -> None:  # fmt: skip
     """Add the inliers among the points; `surfaces` (n, 4) are the planes that they lie on, in the camera frame (NaN: none)."""
-    p, q, r, then = np.empty(3), np.empty(3), np.empty(3), np.empty(4)
-    D, J, K, Q = np.zeros((3, 3)), np.empty((3, 6)), np.empty((3, CALIBRATION)), np.empty((3, 3))
+    p, r, D, J = np.empty(3), np.empty(3), np.zeros((3, 3)), np.empty((3, 6))
+    K, A = np.empty((3, CALIBRATION)), np.empty((6, CALIBRATION))
     for i in range(len(flags)):
         if not flags[i]:
             continue
-        k = first[i]
-        _local(R, t, points.positions_m[i], p)
-        _local(keyframes.R[k], keyframes.t[k], points.positions_m[i], q)
-        if not (q[2] > NEAR_M and point_residual(p, points.pixels[i], points.depth_m[i], camera, r, D)):
+        world = points.positions_m[i]
+        _local(R, t, world, p)
+        if not point_residual(p, points.pixels[i], points.depth_m[i], camera, r, D):
             continue
-        Q[:] = 0.0
+        if _point_calibration_jacobian(R, world, p, surfaces[i], observers[i], keyframes, twist, camera, width, height, D, K, A):
+            pose_jacobian(D, 3, p, J)
+            _scale_and_subtract(scales, J, A, K)
+            _add(J, W[i], K, r, total)
+
+
+@kernel
+def _in_view(p: F64, camera: F64, width: int, height: int) -> bool:
+    if not p[2] > NEAR_M:
+        return False
+    u, v = camera[0] * p[0] / p[2] + camera[2], camera[1] * p[1] / p[2] + camera[3]
+    return bool(0.0 <= u < width and 0.0 <= v < height)
+
+
+@kernel
+def _plane_calibration_jacobian(
+    R: F64, t: F64, plane: F64, samples: F32, observers: I32, keyframes: Keyframes, twist: F64, camera: F64, width: int, height: int,
+    B: F64, K: F64, A: F64,
+) -> bool:  # fmt: skip
+    """Fill K (3, 12): what the calibration does to a plane (4,), fitted to what it does to those of its samples (n, 3) that are in view of the camera
+    and of an observer; and A (6, 12), the observers' mean error. Returns False for too few of them. B (3, 2) are the tangents of its residual."""
+    p, q, then = np.empty(3), np.empty(3), np.empty((len(observers), 4))
+    now, E, F, mean, row = np.empty(4), np.empty(CALIBRATION), np.empty(CALIBRATION), np.empty(CALIBRATION), np.ones(3)
+    _to_keyframe(R, t, plane, now)
+    for o in range(len(observers)):
+        if observers[o] >= 0:
+            _to_keyframe(keyframes.R[observers[o]], keyframes.t[observers[o]], plane, then[o])
+    N, X, seen, total = np.zeros((3, 3)), np.zeros((3, CALIBRATION)), 0, 0
+    A[:] = 0.0
+    for j in range(len(samples)):
+        point = samples[j].astype(np.float64)
+        _local(R, t, point, p)
+        if not _in_view(p, camera, width, height):
+            continue
+        mean[:], count = 0.0, 0
+        for o in range(len(observers)):
+            k = observers[o]
+            if k < 0:
+                continue
+            _local(keyframes.R[k], keyframes.t[k], point, q)
+            if not _in_view(q, camera, width, height):
+                continue
+            plane_point_error(q, then[o], keyframes.twists[k], camera, width, height, E)
+            mean += E
+            A += keyframes.errors[k]
+            count += 1
+        if count == 0:
+            continue
+        seen, total = seen + 1, total + count
+        plane_point_error(p, now, twist, camera, width, height, F)
+        row[0], row[1] = B[0, 0] * p[0] + B[1, 0] * p[1] + B[2, 0] * p[2], B[0, 1] * p[0] + B[1, 1] * p[1] + B[2, 1] * p[2]
         for a in range(3):
             for b in range(3):
-                for c in range(3):
-                    Q[a, b] += R[c, a] * keyframes.R[k, c, b]
-        _plane_then(surfaces[i], Q, p, q, then)
-        _point_calibration_jacobian(p, q, surfaces[i], then, Q, twist, keyframes.twists[k], camera, width, height, D, K)
-        pose_jacobian(D, 3, p, J)
-        _scale_and_subtract(scales, J, keyframes.errors[k], K)
-        _add(J, W[i], K, r, total)
+                N[a, b] += row[a] * row[b]
+            for c in range(CALIBRATION):
+                X[a, c] += row[a] * (F[c] - mean[c] / count)
+    if seen < LEAST_SAMPLES:
+        return False
+    K[:] = matmul(inverse_positive(N), X)
+    A /= total
+    return True
 
 
 @kernel
 def _add_planes(
     R: F64, t: F64, camera: F64, width: int, height: int, scales: F64, twist: F64, planes: PlaneTerms, W: F64, flags: U8, samples: F32,
-    first: I32, keyframes: Keyframes, total: Equations,
+    observers: I32, keyframes: Keyframes, total: Equations,
 ) -> None:  # fmt: skip
-    """Add the inliers among the identical planes; `samples` (p, n, 3) are points on them, world: what the calibration does to a plane is fitted to
-    what it does to those in view."""
-    p, q, r, B, J, K = np.empty(3), np.empty(3), np.empty(3), np.empty((3, 2)), np.empty((3, 6)), np.empty((3, CALIBRATION))
-    now, then, E, F, row = np.empty(4), np.empty(4), np.empty(CALIBRATION), np.empty(CALIBRATION), np.ones(3)
+    """Add the inliers among the identical planes; `samples` (p, n, 3) are points on them, world."""
+    r, B, J = np.empty(3), np.empty((3, 2)), np.empty((3, 6))
+    K, A = np.empty((3, CALIBRATION)), np.empty((6, CALIBRATION))
     for i in range(len(flags)):
         if not flags[i] or planes.kinds[i] != SAME:
             continue
-        k = first[i]
+        plane = planes.coefficients[i]
         tangent_columns(planes.observed[i], B)
-        plane_residual(SAME, R, t, planes.coefficients[i], planes.observed[i], B, r, J)
-        _to_keyframe(R, t, planes.coefficients[i], now)
-        _to_keyframe(keyframes.R[k], keyframes.t[k], planes.coefficients[i], then)
-        N, X, seen = np.zeros((3, 3)), np.zeros((3, CALIBRATION)), 0
-        for j in range(samples.shape[1]):
-            point = samples[i, j].astype(np.float64)
-            _local(R, t, point, p)
-            _local(keyframes.R[k], keyframes.t[k], point, q)
-            if not (p[2] > NEAR_M and q[2] > NEAR_M):
-                continue
-            u, v = camera[0] * p[0] / p[2] + camera[2], camera[1] * p[1] / p[2] + camera[3]
-            if not (0.0 <= u < width and 0.0 <= v < height):
-                continue
-            seen += 1
-            plane_point_error(q, then, keyframes.twists[k], camera, width, height, E)
-            plane_point_error(p, now, twist, camera, width, height, F)
-            row[0], row[1] = B[0, 0] * p[0] + B[1, 0] * p[1] + B[2, 0] * p[2], B[0, 1] * p[0] + B[1, 1] * p[1] + B[2, 1] * p[2]
-            for a in range(3):
-                for b in range(3):
-                    N[a, b] += row[a] * row[b]
-                for c in range(CALIBRATION):
-                    X[a, c] += row[a] * (F[c] - E[c])
-        if seen >= LEAST_SAMPLES:
-            K[:] = matmul(inverse_positive(N), X)
-            _scale_and_subtract(scales, J, keyframes.errors[k], K)
+        plane_residual(SAME, R, t, plane, planes.observed[i], B, r, J)
+        if _plane_calibration_jacobian(R, t, plane, samples[i], observers[i], keyframes, twist, camera, width, height, B, K, A):
+            _scale_and_subtract(scales, J, A, K)
             _add(J, W[i], K, r, total)
 
 
 @kernel
 def calibration_equations(
     T: F64, camera: F64, width: int, height: int, scales: F64, twist: F64, points: PointTerms, planes: PlaneTerms, flags: Flags, surfaces: F64,
-    samples: F32, groups: Groups, keyframes: Keyframes,
+    samples: F32, observers: Observers, keyframes: Keyframes,
 ) -> Equations:  # fmt: skip
     """Normal equations of the inliers among points and identical planes at the pose T (4, 4), for parameters in units of `scales` (12,)."""
     R, t = np.ascontiguousarray(T[:3, :3]), np.ascontiguousarray(T[:3, 3])
@@ -263,8 +321,8 @@ def calibration_equations(
     n, p = len(points.positions_m), len(planes.kinds)
     weights = Weights(np.empty((n, 3, 3)), np.empty((0, 2, 2)), np.empty((0, 2, 2)), np.empty((p, 3, 3)))
     fill_weights(R, t, camera, points, no_lines, planes, weights)
-    _add_points(R, t, camera, width, height, scales, twist, points, weights.points, flags.points, surfaces, groups.points, keyframes, total)
-    _add_planes(R, t, camera, width, height, scales, twist, planes, weights.planes, flags.planes, samples, groups.planes, keyframes, total)
+    _add_points(R, t, camera, width, height, scales, twist, points, weights.points, flags.points, surfaces, observers.points, keyframes, total)
+    _add_planes(R, t, camera, width, height, scales, twist, planes, weights.planes, flags.planes, samples, observers.planes, keyframes, total)
     return total
 
 

@@ -12,14 +12,15 @@ from trihedron.plugins.pose.calibration_uncertainty import carried_calibration, 
 from trihedron.plugins.shared.calibration_error import calibration_covariance, calibration_scales
 from trihedron.plugins.shared.calibration_error_kernels import (
     Keyframes,
+    Observers,
     calibration_equations,
     calibration_moment,
     keypoint_errors,
     plane_point_error,
 )
 from trihedron.plugins.shared.pose_optimizer import NO_PLANES, solve_pose
-from trihedron.plugins.shared.pose_optimizer_kernels import Flags, Groups
-from trihedron.plugins.shared.residuals_kernels import PointTerms
+from trihedron.plugins.shared.pose_optimizer_kernels import Flags
+from trihedron.plugins.shared.residuals_kernels import PlaneTerms, PointTerms
 
 CAMERA = Camera(640, 480, 520.0, 530.0, 315.0, 245.0)
 TWIST = np.array([0.3, -0.2, 0.1, 0.2, -0.4, 0.3])
@@ -75,15 +76,26 @@ def test_errors_of_measurements_are_those_of_a_camera_with_that_error(parameter)
         assert along[parameter] == pytest.approx(plane[:3] @ (seen[i] - seen2[i]) / (2.0 * step[parameter]), rel=1e-4, abs=1e-6)
 
 
-def two_views(theta):
-    """A keyframe at the origin and a camera 0.4 m and 9° from it, both with the calibration error theta: the terms of the points, the surfaces that
-    they lie on, and the true pose."""
+AT_REST = ((np.eye(4), np.zeros(6)),)
+MOVING = ((np.eye(4), TWIST[::-1]), (exp_se3(np.array([-0.1, 0.1, 0.0, 0.02, 0.03, 0.05])), -0.5 * TWIST))
+
+
+def seen_from(T, twist, world, wall, theta):
+    """The points (n, 3) of the world as a keyframe at T with this velocity places them."""
+    local = world @ T[:3, :3] - T[:3, 3] @ T[:3, :3]
+    plane = np.append(T[:3, :3].T @ wall[:3], wall[3] + wall[:3] @ T[:3, 3])
+    pixels, depth, _ = measured(local, plane, theta, twist)
+    return CAMERA.back_project(pixels, depth) @ T[:3, :3].T + T[:3, 3]
+
+
+def two_views(theta, keyframes=AT_REST):
+    """Keyframes, each with its pose and velocity, and a camera 0.4 m and 9° from the origin, all with the calibration error theta: the terms of the
+    points, which are where the keyframes place them on average, the surfaces that they lie on, and the true pose."""
     rng, T = np.random.default_rng(1), exp_se3(np.array([0.3, 0.05, 0.25, 0.05, 0.14, -0.03]))
     terms, surfaces = [], []
     for wall in WALLS:
         world, local, plane = points_on(rng, wall, T, 60)
-        pixels, depth, _ = measured(world, wall, theta, np.zeros(6))
-        landmarks = CAMERA.back_project(pixels, depth)
+        landmarks = np.mean([seen_from(*keyframe, world, wall, theta) for keyframe in keyframes], axis=0)
         terms.append((landmarks, *measured(local, plane, theta, TWIST)[:2]))
         surfaces.append(np.tile(plane, (60, 1)))
     landmarks, pixels, depth = (np.concatenate(parts) for parts in zip(*terms))
@@ -92,25 +104,33 @@ def two_views(theta):
     return points, np.concatenate(surfaces), T
 
 
-def equations_of(points, surfaces, T):
-    """The equations at pose T of landmarks that a keyframe at the origin created."""
-    keyframes = Keyframes(np.eye(3)[None], np.zeros((1, 3)), np.zeros((1, 6)), np.zeros((1, 6, CALIBRATION)))
+def keyframes_of(observers):
+    """Keyframes without an error of their own."""
+    T, twists = (np.array(part) for part in zip(*observers))
+    return Keyframes(np.ascontiguousarray(T[:, :3, :3]), T[:, :3, 3].copy(), twists, np.zeros((len(T), 6, CALIBRATION)))
+
+
+def equations_of(points, surfaces, T, keyframes=AT_REST):
+    """The equations at pose T of landmarks that all of these keyframes observed."""
     flags = Flags(np.ones(len(surfaces), np.uint8), np.empty(0, np.uint8), np.empty(0, np.uint8))
-    groups = Groups(np.zeros(len(surfaces), np.int32), np.empty(0, np.int32), np.empty(0, np.int32))
+    seen_by = np.append(np.arange(len(keyframes), dtype=np.int32), np.int32(-1))  # and by none besides
+    observers = Observers(np.tile(seen_by, (len(surfaces), 1)), np.empty((0, len(seen_by)), np.int32))
     samples, size = np.empty((0, 8, 3), np.float32), (CAMERA.width, CAMERA.height)
     return calibration_equations(
-        T, CAMERA.intrinsics, *size, calibration_scales(CAMERA), TWIST, points, NO_PLANES, flags, surfaces, samples, groups, keyframes
-    )
+        T, CAMERA.intrinsics, *size, calibration_scales(CAMERA), TWIST, points, NO_PLANES, flags, surfaces, samples, observers,
+        keyframes_of(keyframes),
+    )  # fmt: skip
 
 
+@pytest.mark.parametrize("keyframes", [AT_REST, MOVING], ids=["one keyframe", "two moving ones"])
 @pytest.mark.parametrize("parameter", range(CALIBRATION))
-def test_sensitivity_is_the_error_of_the_pose(parameter):
-    """The pose estimated from what a miscalibrated camera measures, in both views, is off by the sensitivity times the error."""
+def test_sensitivity_is_the_error_of_the_pose(parameter, keyframes):
+    """The pose estimated from what a miscalibrated camera measures, in all views, is off by the sensitivity times the error."""
     unit = 0.1 * np.eye(CALIBRATION)[parameter]
-    points, surfaces, T = two_views(unit * calibration_scales(CAMERA))
+    points, surfaces, T = two_views(unit * calibration_scales(CAMERA), keyframes)
     solution = solve_pose(T, CAMERA, T, 1e-6 * np.eye(6), points)
     assert (solution.points > 0).all()
-    equations = equations_of(points, surfaces, solution.T_world_camera)
+    equations = equations_of(points, surfaces, solution.T_world_camera, keyframes)
     expected = -np.linalg.solve(equations.H, equations.C @ unit)
     error = log_se3(invert(T) @ solution.T_world_camera)
     assert error == pytest.approx(expected, rel=0.1, abs=0.03 * np.abs(expected).max() + 1e-6)
@@ -130,6 +150,34 @@ def test_residuals_tell_of_the_calibration():
     assert error @ np.linalg.solve(covariance, error) < CALIBRATION
     assert error @ error < 0.7 * (true @ true)
     assert np.trace(covariance) < 0.7 * CALIBRATION
+
+
+def test_of_a_plane_count_the_samples_that_both_views_show():
+    """Samples far outside the keyframe's image, where an error with the square of the radius is large, change nothing; too few others are none."""
+    T, keyframes = exp_se3(np.array([0.3, 0.05, 0.25, 0.05, 0.14, -0.03])), keyframes_of(AT_REST)
+    wall = WALLS[1]
+    local = np.append(T[:3, :3].T @ wall[:3], wall[3] + wall[:3] @ T[:3, 3])
+    small = 1e-6 * np.eye(3)[None]
+    planes = PlaneTerms(np.zeros(1, np.int32), wall[None], small, local[None], small)
+    points = PointTerms(np.empty((0, 3)), np.empty((0, 3, 3)), np.empty((0, 2)), np.empty(0), np.empty(0), np.empty(0))
+    both = CAMERA.back_project(np.array([[u, v] for u in (340.0, 460.0, 600.0) for v in (100.0, 400.0)]), np.ones(6))
+    beside = CAMERA.back_project(np.array([[u, 240.0] for u in (645.0, 650.0, 660.0)]), np.ones(3))  # in view of the camera alone
+    both, beside = (rays * (-wall[3] / (rays @ wall[:3]))[:, None] for rays in (both, beside))
+
+    def equations(samples):
+        flags = Flags(np.empty(0, np.uint8), np.empty(0, np.uint8), np.ones(1, np.uint8))
+        observers = Observers(np.empty((0, 1), np.int32), np.zeros((1, 1), np.int32))
+        return calibration_equations(
+            T, CAMERA.intrinsics, CAMERA.width, CAMERA.height, calibration_scales(CAMERA), TWIST, points, planes, flags, np.empty((0, 4)),
+            samples[None].astype(np.float32), observers, keyframes,
+        )  # fmt: skip
+
+    for sample in beside:
+        pixel = CAMERA.project((invert(T) @ [*sample, 1.0])[None, :3])[0]
+        assert 0.0 <= pixel[0] < CAMERA.width and 0.0 <= pixel[1] < CAMERA.height
+    for a, b in zip(equations(both), equations(np.concatenate([both, beside]))):
+        assert np.array_equal(a, b)
+    assert equations(both).G.any() and not equations(np.concatenate([both[:3], beside])).G.any()
 
 
 def test_moments_of_the_calibration():

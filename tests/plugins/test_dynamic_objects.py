@@ -117,7 +117,7 @@ def denied(world, map, points, planes):
     counts = (len(matches.keypoints), int(points * len(matches.keypoints))), (len(matches.segments), 0), (len(matches.planes), planes)
     flags = [(np.arange(count) < agree).astype(np.uint8) for count, agree in counts]
     found = PoseSolution(camera_at(STEP), 1e-6 * np.eye(6), np.empty((6, 0)), *flags, 0.0)
-    status = status_with_static(TrackingStatus("ok", "", found.covariance), found, problem, Selection.ON_PLANES, Refine())
+    status = status_with_static(TrackingStatus("ok", ""), found, problem, Selection.ON_PLANES, Refine())
     assert status.status == "ok" or status.reason.startswith("something moves")
     return status.status == "degraded"
 

@@ -1,11 +1,18 @@
 """Covariance of a refined pose in the world, on errors that are known."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
 from trihedron.pipeline.core.table import Column, Table
 from trihedron.pipeline.core.types import Map, Pose
-from trihedron.plugins.pose.world_uncertainty import covariance_of_keyframes, keyframe_uncertainty, propagate_world_covariance
+from trihedron.plugins.pose.world_uncertainty import (
+    covariance_of_keyframes,
+    keyframe_covariance,
+    keyframe_uncertainty,
+    propagate_world_covariance,
+)
 from trihedron.plugins.shared.pose_optimizer import residual_scale
 
 
@@ -72,3 +79,17 @@ def test_a_pose_is_as_uncertain_as_the_median_of_its_landmarks_keyframes():
         assert found.sigma_m == pytest.approx(each[len(each) // 2]) == pytest.approx(sigmas_m[found.keyframe])
     nothing = np.zeros(0, np.int32)
     assert keyframe_uncertainty(map_of([0.1], [], [], []), nothing, nothing, nothing).keyframe == -1
+
+
+def test_uncertain_keyframes_count_once_in_the_world_and_in_the_weights_of_landmarks():
+    """Keyframes of σ 3 cm, a pose of σ 1 mm relative to them: landmarks made from it count both; a pose of σ 2 cm has that in its own."""
+    count, rows = 4, np.arange(4, dtype=np.int32)
+    map = map_of(np.full(count, 0.03), rows, [], [])
+    problem = SimpleNamespace(map=map, landmarks=lambda solution: (rows, np.zeros(0, np.int32), np.zeros(0, np.int32)))
+    certain, vague = (SimpleNamespace(T_world_camera=np.eye(4), covariance=sigma_m**2 * np.eye(6)) for sigma_m in (1e-3, 0.02))
+    shared = keyframe_covariance(certain, problem, 3.0)
+    assert shared[:3, :3] == pytest.approx(0.03**2 * np.eye(3)) and not keyframe_covariance(vague, problem, 3.0).any()
+    noise, drift = 2.0, 0.05**2 * np.eye(6)
+    stamps = 0, 0, np.eye(4), noise * certain.covariance + drift, np.eye(4), 0, np.zeros(3, np.int32), 0, "ok", ""
+    pose = Pose(*stamps, map_covariance=drift, noise_scale=noise, keyframe_covariance=shared)
+    assert pose.local_covariance == pytest.approx(certain.covariance + shared)
