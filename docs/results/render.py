@@ -18,7 +18,7 @@ from typing import Any
 sys.path.insert(0, str(Path(__file__).parents[1] / "site"))
 from plugin_pages import markdown, source_line
 
-from trihedron.tools.benchmarks.judged_runs import FAULT, HEADER, alarm_cells, cells_of
+from trihedron.tools.benchmarks.judged_runs import FAULT, HEADER, alarm_cells, cells_of, rank_sentence
 from trihedron.tools.method_tables import cell_of
 from trihedron.tools.published import peer_figures, peers, published_ate_m, sequence_of
 
@@ -179,7 +179,8 @@ def honesty_sensors() -> str:
     rows = [cells_of({**row, "name": TITLES.get(row["name"], row["name"])}) for row in found["rows"] if row["kind"] != FAULT]
     alarms = markdown(["false alarm", "frames", "% of a run"], [tuple(alarm_cells(row)) for row in found["alarms"]])
     none = "No frame of a clean run is less than `ok`."
-    return f"{markdown(HEADER, [tuple(row) for row in rows])}\n\n{alarms if found['alarms'] else none}\n\n*{source_line(found)}*\n"
+    rank = f"\n\n{rank_sentence(found['rank'])}" if found.get("rank") else ""
+    return f"{markdown(HEADER, [tuple(row) for row in rows])}\n\n{alarms if found['alarms'] else none}{rank}\n\n*{source_line(found)}*\n"
 
 
 def honesty_faults() -> str:

@@ -25,6 +25,7 @@ from trihedron.pipeline.core.linalg import cholesky, matmul
 from trihedron.pipeline.core.types import DEGRADED, F64, LOST, OK, Bool, Pose, Trajectory
 from trihedron.pipeline.run.consistency import LIMIT_95, TruthNoise, gauge_free_errors, normalised_squares, truth_noise
 from trihedron.pipeline.run.metrics import associate, relative_errors, rotation_angles_deg
+from trihedron.pipeline.run.stated_sigma import stated_sigma
 
 WRONG_M, WRONG_DEG, SIGMAS = 0.05, 2.0, 4.0
 LEAST_POSES = 10  # of a sub-map that is judged
@@ -72,7 +73,7 @@ class StatusCheck:
     the probability that of two frames, one above the median error and one below, the former has the larger σ: 0.5 is that of a σ by chance. Like
     NEES it takes errors after the alignment that the covariances make most likely: σ is that of a pose in the world of the first camera, and grows
     with the way from there, where the alignment of the ATE spreads a drift evenly. `spread_over_error` is the spread–skill ratio. `not_ok` counts
-    the frames that are not ok by the test that found them so."""
+    the frames that are not ok by the test that found them so. `sigma_m` is the median σ of the positions of ok poses, which needs no truth."""
 
     frames: int
     ok: int
@@ -88,6 +89,7 @@ class StatusCheck:
     steps: int
     spread_over_error: float | None
     not_ok: dict[str, int]
+    sigma_m: float | None
 
     def to_dict(self) -> dict[str, Any]:
         """Return field name -> value, ready for JSON."""
@@ -116,6 +118,7 @@ def check_status(poses: Sequence[Pose], truth: Trajectory, frames: int | None = 
         steps_within_50mm=close / steps if steps else None,
         steps=steps,
         spread_over_error=_spread_over_error(errors),
+        sigma_m=stated.median_m if (stated := stated_sigma(poses, [])) is not None else None,
         not_ok=dict(Counter(name_of_test(pose.reason) for pose in poses if pose.status != OK).most_common()),
     )
     return figures, errors

@@ -19,11 +19,11 @@ from trihedron.pipeline.run.status_check import StatusCheck, check_status
 from trihedron.tools import benchmark
 from trihedron.tools.benchmarks import judged_runs
 from trihedron.tools.benchmarks.honesty import all_cases
-from trihedron.tools.benchmarks.judged_runs import HEADER, Case, JudgedCase, alarms_of, cells_of, report, rows_of, run_and_judge
+from trihedron.tools.benchmarks.judged_runs import HEADER, Case, JudgedCase, alarms_of, cells_of, rank_by_sigma, report, rows_of, run_and_judge
 
 SMALL = ["--rooms", "room", "--seeds", "1", "--length", "12", "--size", "160x120"]
 NO_ERRORS = check_status([], Trajectory(np.zeros(0, np.int64), np.zeros((0, 4, 4))))[1]
-CHECK = StatusCheck(100, 100, 0, 0, 0.01, 0, 5.0, 0.9, 0.5, 10.0, 1.0, 99, 1.0, {})
+CHECK = StatusCheck(100, 100, 0, 0, 0.01, 0, 5.0, 0.9, 0.5, 10.0, 1.0, 99, 1.0, {}, 0.01)
 
 
 def judged(groups: Mapping[str, str], **figures: Any) -> JudgedCase:
@@ -50,6 +50,15 @@ def test_three_runs_have_an_interval_and_two_have_none() -> None:
     assert row["ok_share"]["mean"] == pytest.approx(0.99) and row["ok_share"]["interval"][1] == 1.0
     assert rows_of(runs[:2])[0]["ate_m"] == {"mean": pytest.approx(0.015), "interval": None}
     assert dict(zip(HEADER, cells_of(row), strict=True))["NEES"].startswith("10.0 [0.0, ")
+
+
+def test_the_stated_sigma_ranks_runs_of_sensors() -> None:
+    """Of four sensors σ ranks all but two as their errors do, Spearman's 0.8; faults, and runs without σ, do not count."""
+    found = [judged({"sensor": "tof"}, sigma_m=sigma, ate_m=ate) for sigma, ate in ((0.01, 0.011), (0.02, 0.03), (0.03, 0.02), (0.04, 0.5))]
+    others = [judged({"fault": "frozen"}, sigma_m=1.0, ate_m=0.0), judged({"sensor": "tof"}, sigma_m=None)]
+    assert rank_by_sigma([*found, *others]) == {"rank_correlation": pytest.approx(0.8), "runs": 4}
+    assert report(found).endswith("ranks 4 runs of simulated sensors as their ATE does: rank correlation +0.80.")
+    assert rank_by_sigma(found[:2]) is None and "rank" not in report(found[:2])
 
 
 def test_runs_without_truth_count_frames_and_nothing_else() -> None:

@@ -11,6 +11,7 @@ all clean runs, which are those without a fault. Columns:
   log-lik       mean log-likelihood of an error, in nats
   σ/error       sharpness against error: the root of the mean stated variance of the position over the root mean square of its error (spread–skill
                 ratio); honest: 1, less is overconfident
+A last line has the rank correlation of the σ that runs of simulated sensors state with their ATE.
 A figure is the mean over runs, geometric of NEES and σ/error, with a 95 % interval (Student's t) where there are three runs or more. Seeds begin
 behind those that the program was developed with (0 to 4); a fault is run with the first. --runs keeps the runs in a folder, and takes from it what
 was run with the same words. Other words with = are overrides of each run. Empty names, as in --cases "", leave a part out.
@@ -31,7 +32,7 @@ from trihedron.pipeline.core.layouts import layout_of
 from trihedron.pipeline.sweep.sweep import words_of_sequence
 from trihedron.tools.arguments import Parser
 from trihedron.tools.benchmarks.fault_benchmark import CASES, fault_cases
-from trihedron.tools.benchmarks.judged_runs import Case, alarms_of, judged_cases, kept_or_temporary, plain, report, rows_of
+from trihedron.tools.benchmarks.judged_runs import Case, alarms_of, judged_cases, kept_or_temporary, plain, rank_by_sigma, report, rows_of
 from trihedron.tools.benchmarks.sensor_benchmark import add_arguments, sensor_cases
 
 COMMAND = "benchmark honesty"
@@ -57,7 +58,7 @@ def main(argv: list[str]) -> int:
         found = list(judged_cases(cases, folder))
     print("\n" + report(found))
     if options.json:
-        content = {"rows": rows_of(found), "alarms": alarms_of(found), "runs": [plain(one) for one in found]}
+        content = {"rows": rows_of(found), "alarms": alarms_of(found), "rank": rank_by_sigma(found), "runs": [plain(one) for one in found]}
         options.json.write_text(json.dumps(content, indent=2, ensure_ascii=False) + "\n")
     return 0
 

@@ -26,6 +26,7 @@ if TYPE_CHECKING:
 LEAST_RUNS = 3  # with an interval
 WORDS = "words.json"  # in the folder of a run: the overrides that it was run with
 FAULT = "fault"  # the group of cases that are not clean
+SENSOR = "sensor"  # the group of simulated ones
 Judged = tuple["StatusCheck", "FrameErrors"]
 Row = dict[str, Any]
 
@@ -200,6 +201,23 @@ def alarm_figure(test: str) -> Figure:
     return Figure(test, "share %", lambda check: share_of(check.not_ok.get(test, 0), check), 100.0, 2, limits=SHARE)
 
 
+def rank_by_sigma(found: Sequence[JudgedCase]) -> Row | None:
+    """Return Spearman's rank correlation of the σ that runs of simulated sensors state, which needs no truth, with their ATE, and the number of these
+    runs; None for fewer than three."""
+    from scipy.stats import spearmanr
+
+    checks = [one.check for one in found if SENSOR in one.case.groups]
+    pairs = [(check.sigma_m, check.ate_m) for check in checks if check.sigma_m is not None and check.ate_m is not None]
+    return {"rank_correlation": float(spearmanr(*zip(*pairs))[0]), "runs": len(pairs)} if len(pairs) >= LEAST_RUNS else None
+
+
+def rank_sentence(rank: Row) -> str:
+    """Write what `rank_by_sigma` found."""
+    return (
+        f"The σ that a run states ranks {rank['runs']} runs of simulated sensors as their ATE does: rank correlation {rank['rank_correlation']:+.2f}."
+    )
+
+
 def cells_of(row: Row) -> list[str]:
     """Write a row as the cells of HEADER."""
     wrong = "–" if row["wrong_ok"] is None else str(row["wrong_ok"])
@@ -212,10 +230,13 @@ def alarm_cells(row: Row) -> list[str]:
 
 
 def report(found: Sequence[JudgedCase]) -> str:
-    """Make the table, and that of false alarms by the test where there are any."""
-    text = table([HEADER, *map(cells_of, rows_of(found))], "ll" + "r" * (len(HEADER) - 2))
-    alarms = [alarm_cells(row) for row in alarms_of(found)]
-    return text + ("\n\n" + table([["false alarms, by the test", "frames", "share %"], *alarms], "lrr") if alarms else "")
+    """Make the table, that of false alarms by the test where there are any, and the sentence of `rank_by_sigma`."""
+    parts = [table([HEADER, *map(cells_of, rows_of(found))], "ll" + "r" * (len(HEADER) - 2))]
+    if alarms := [alarm_cells(row) for row in alarms_of(found)]:
+        parts.append(table([["false alarms, by the test", "frames", "share %"], *alarms], "lrr"))
+    if rank := rank_by_sigma(found):
+        parts.append(rank_sentence(rank))
+    return "\n\n".join(parts)
 
 
 def plain(one: JudgedCase) -> Row:

@@ -21,7 +21,7 @@ import numpy as np
 from trihedron.pipeline.core.errors import UsageError
 from trihedron.pipeline.core.text_table import table
 from trihedron.tools.arguments import Parser
-from trihedron.tools.benchmarks.judged_runs import Case, JudgedCase, check_overrides, chosen, judged_cases, kept_or_temporary, plain, report
+from trihedron.tools.benchmarks.judged_runs import SENSOR, Case, JudgedCase, check_overrides, chosen, judged_cases, kept_or_temporary, plain, report
 
 SENSORS = ("kinect_v1", "tof", "realsense_stereo", "hololens", "phone")
 ROOMS = {  # name -> what the data set is given
@@ -74,7 +74,7 @@ def sensor_cases(command: str, options: Namespace, overrides: Sequence[str]) -> 
         raise UsageError(command, "--seeds, --first-seed or --length is out of range", cure)
     seeds = range(options.first_seed, options.first_seed + options.seeds)
     return [
-        Case(f"{sensor}-{room}-{seed}", [*words_of(sensor, room, seed, options.length), *overrides], {"sensor": sensor, "room": room}, seed)
+        Case(f"{sensor}-{room}-{seed}", [*words_of(sensor, room, seed, options.length), *overrides], {SENSOR: sensor, "room": room}, seed)
         for sensor in chosen(options.sensors, SENSORS)
         for room in chosen(options.rooms, ROOMS)
         for seed in seeds
@@ -113,4 +113,4 @@ def _hidden(one: JudgedCase) -> dict[str, Any]:
     """Return the parameters of the sensor of a run that its stated camera does not tell."""
     from trihedron.datasets.simulation.sensor_models import Sensor, drawn_parameters
 
-    return drawn_parameters(Sensor[one.case.groups["sensor"]], one.case.seed).to_dict()
+    return drawn_parameters(Sensor[one.case.groups[SENSOR]], one.case.seed).to_dict()
