@@ -553,8 +553,8 @@ class Map(Value):
     """Keyframes and landmarks; a row number is an id for good, dead rows have `alive` False. Columns are listed in `plugins.mapping.landmarks`.
 
     `revision` counts versions, `loop_closed` is that of the last one with a correction by `loop` or a merged sub-map; a row of `point_observations`
-    and its siblings is a keyframe (row), a landmark, and its measurement. A row of `proposals` is a frame of one sub-map that was recognised in an older
-    one: its pose relative to a keyframe of each, and the sum of both covariances (camera frame). Several that agree merge the two."""
+    and its siblings is a keyframe (row), a landmark, and its measurement. A row of `proposals` is a frame of one sub-map that was recognised in an
+    older one: its pose relative to a keyframe of each, and the sum of both covariances (camera frame). Several that agree merge the two."""
 
     version: ClassVar[int] = 8
     revision: int
