@@ -12,14 +12,15 @@ from itertools import combinations
 import numpy as np
 
 from trihedron.pipeline.core.geometry import invert, rigid
-from trihedron.pipeline.core.lie import adjoint, exp_se3, log_se3
+from trihedron.pipeline.core.lie import adjoint, exp_se3, log_se3, rotation_angle_deg
 from trihedron.pipeline.core.linalg import inv_symmetric, matmul, solve
 from trihedron.pipeline.core.types import F64, I32, Map, Pose
 from trihedron.plugins.mapping.reference_keyframe import submap_of
 
 CHI2_99 = 16.812  # 99 % limit of χ² with 6 degrees of freedom
 FLOOR = np.diag(np.repeat(np.square([0.02, np.deg2rad(1.0)]), 3))  # (2 cm)² and (1°)²: drift of both sub-maps between two recognitions
-MIN_FRAMES = 5  # between recognitions relative to the same keyframe of the sub-map: of fewer, the views are the same
+VIEW_M, VIEW_DEG = 0.05, 2.0  # that the camera moves between two views: recognitions from nearer ones err alike
+LOOK_FRAMES = 15  # after a proposal, in which each frame looks for more
 MAX_AGE = 300  # frames after which a proposal no longer counts
 
 
@@ -51,6 +52,14 @@ def _recent_proposals(map: Map, index: int) -> I32:
     return np.flatnonzero((age > 0) & (age <= MAX_AGE)).astype(np.int32)
 
 
+def proposed_submaps(map: Map, submap: int, index: int) -> I32:
+    """Older sub-maps that one of the last LOOK_FRAMES frames proposed to merge a sub-map with."""
+    recent = _recent_proposals(map, index)
+    recent = recent[index - map.proposals.rows("index", recent) <= LOOK_FRAMES]
+    of, older = (map.keyframes.rows("submap", ids) for ids in map.proposals.columns_at(recent, "keyframe", "older_keyframe"))
+    return np.unique(older[(of == submap) & (older != submap)]).astype(np.int32)
+
+
 def _between(map: Map, rows: I32, submap: int, older: int) -> I32:
     """The `rows` of proposals between two sub-maps. Those of merged sub-maps are between none: both keyframes have the same number."""
     of, older_of = (map.keyframes.rows("submap", ids) for ids in map.proposals.columns_at(rows, "keyframe", "older_keyframe"))
@@ -58,9 +67,10 @@ def _between(map: Map, rows: I32, submap: int, older: int) -> I32:
 
 
 def _repeats(map: Map, latest: I32, pose: Pose) -> bool:
-    """True where the latest proposal (at most one row) is of this frame's reference keyframe and of a frame just before."""
-    keyframes, indices = map.proposals.columns_at(latest, "keyframe", "index")
-    return bool(((keyframes == pose.reference) & (pose.index - indices < MIN_FRAMES)).any())
+    """True where the latest proposal (at most one row) is of this frame's view."""
+    keyframes, T_keyframe_camera = map.proposals.columns_at(latest, "keyframe", "T_keyframe_camera")
+    T_camera = matmul(map.keyframes.rows("T_world_camera", keyframes), T_keyframe_camera)
+    return any(np.linalg.norm(T[:3, 3]) < VIEW_M and rotation_angle_deg(T[:3, :3]) < VIEW_DEG for T in matmul(invert(T_camera), pose.T_world_camera))
 
 
 def _add_proposal(map: Map, recent: I32, pose: Pose, recognised: Pose) -> tuple[Map, I32]:

@@ -11,7 +11,7 @@ from trihedron.pipeline.core.types import CALIBRATION, Pose
 from trihedron.pipeline.record.codec import Decoder, Encoder
 from trihedron.plugins.map.covisibility import Covisibility
 from trihedron.plugins.mapping.landmarks import empty_map
-from trihedron.plugins.mapping.merge_verification import MAX_AGE, propose_merge
+from trihedron.plugins.mapping.merge_verification import MAX_AGE, propose_merge, proposed_submaps
 
 AWAY = exp_se3(np.array([3.0, -1.0, 0.5, 0.1, 1.2, -0.3]))  # from the world to that of the sub-map
 COVARIANCE = np.diag(np.repeat(np.square([1e-3, 1e-3]), 3))
@@ -87,9 +87,17 @@ def test_a_rotation_that_disagrees_does_not(map):
     assert recognise(map, 30, 6, (0, 0, 0, 0, np.radians(6.0), 0))[1] is None
 
 
-def test_frames_of_one_keyframe_count_five_frames_apart(map):
-    assert outcomes(map, (20, 4, 0.0), (22, 4, 0.0), (24, 4, 0.0), (25, 4, 0.0), (27, 4, 0.0), (30, 4, 0.0)) == [False] * 5 + [True]
-    assert outcomes(map, (20, 4, 0.0), (21, 5, 0.0), (22, 6, 0.0)) == [False, False, True]
+def test_views_count_where_the_camera_moved_between_them(map):
+    """A step is 2.4 cm and 0.6°: the third counts, and the third after that, relative to the same keyframe or not."""
+    assert outcomes(map, (20, 4, 0.0), (22, 5, 0.0), (23, 4, 0.0), (25, 4, 0.0), (26, 4, 0.0)) == [False] * 4 + [True]
+
+
+def test_each_frame_looks_for_more_after_a_proposal(map):
+    """For 15 frames, in the older sub-map that was proposed; not from the sub-map that is proposed, nor once both are merged."""
+    map, _ = recognise(map, 20, 4)
+    assert proposed_submaps(map, 1, 35).tolist() == [0] and not len(proposed_submaps(map, 1, 36)) and not len(proposed_submaps(map, 0, 21))
+    merged = replace(map, keyframes=map.keyframes.updated(np.array(NEWER), submap=np.zeros(len(NEWER), np.int32)))
+    assert not len(proposed_submaps(merged, 0, 21))
 
 
 def test_what_is_too_old_does_not_count(map):

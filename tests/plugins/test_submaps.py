@@ -86,7 +86,7 @@ def test_a_sub_map_is_merged_by_the_third_keyframe_that_is_recognised(both):
     """The first two only propose it."""
     world, map = both
     stage, older = dataclasses.replace(EVERY, verified_by=3), map.keyframes.row("T_world_camera", 5)
-    for index, step in ((12, 33), (17, 34), (22, 35)):
+    for index, step in ((12, 33), (17, 36), (22, 39)):
         T = camera_at(step)
         recognised = pose_of(T, index, "degraded", reference=5, T_reference_camera=invert(older) @ T)
         reference = len(map.keyframes) - 1
